@@ -1,0 +1,152 @@
+"""The plant of loop 1: a state-space model of heaters and motor -> barrel temperatures, the constants of the BAAM study, simulation and plant spread."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+
+class Plant(NamedTuple):
+    """x(t+1) = A x + B u + b + K e,  y = C x + D u + d + e   (seed 1, (1), with an offset and the innovation form of an identified model).
+
+    A (n, n), B (n, m), C (p, n), D (p, m), b (n,), d (p,), K (n, p) the Kalman gain; one step is `sample_time_s` seconds, u in percent of duty, y in °C.
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    D: np.ndarray
+    b: np.ndarray
+    d: np.ndarray
+    K: np.ndarray
+    sample_time_s: float = 1.0
+
+    @property
+    def n(self) -> int:
+        return self.A.shape[0]
+
+    @property
+    def m(self) -> int:
+        return self.B.shape[1]
+
+    @property
+    def p(self) -> int:
+        return self.C.shape[0]
+
+
+def plant(A, B, C, D=None, b=None, d=None, K=None, sample_time_s: float = 1.0) -> Plant:
+    """A Plant with the shapes checked; what is left out is zero. Raises ValueError naming the matrix, the shape expected and the shape found."""
+    A, B, C = (np.atleast_2d(np.asarray(M, float)) for M in (A, B, C))
+    n, m, p = A.shape[0], B.shape[1], C.shape[0]
+    expected = {"A": (n, n), "B": (n, m), "C": (p, n), "D": (p, m), "b": (n,), "d": (p,), "K": (n, p)}
+    given = {"A": A, "B": B, "C": C, "D": D, "b": b, "d": d, "K": K}
+    arrays = {name: np.zeros(shape) if given[name] is None else np.asarray(given[name], float) for name, shape in expected.items()}
+    for name, shape in expected.items():
+        if arrays[name].shape != shape:
+            raise ValueError(f"plant: {name} should have shape {shape} but has {arrays[name].shape}; A is {A.shape}, B {B.shape}, C {C.shape}")
+        if not np.isfinite(arrays[name]).all():
+            raise ValueError(f"plant: {name} holds a number that is not finite; identify the plant again on a clean record")
+    return Plant(**arrays, sample_time_s=float(sample_time_s))
+
+
+def baam() -> Plant:
+    """The big-area extruder of seed 1, (44) and (45): six heated cells and a motor -> five sensors; by convention one step is 1 s and u is in percent."""
+    A = np.diag([0.992, 0.9919, 1.0009, 0.9979, 0.9972, 0.9953])
+    A[0, 1], A[1, 0], A[1, 2], A[2, 1], A[2, 3], A[3, 2] = 0.0018, 0.0023, 0.0043, -0.0042, 0.0024, 0.0013
+    B = np.column_stack([np.diag([1.0033, 1.0460, 1.0326, 0.4798, 0.8882, 1.1699]), [-0.2175, -0.0788, -0.0020, -0.0669, 0.1273, -0.1792]])
+    C = np.array(
+        [
+            [0.992, 0.00018, 0.0, 0.0, -0.0001, 0.0],
+            [0.0023, 1.3, 0.0043, 0.0, 0.0, 0.0],
+            [0.0, -0.0042, 1.0109, 0.0024, 0.0, 0.201],
+            [0.0, 0.0, 0.0013, 0.989, 0.00031, 0.64],
+            [0.0, 0.0, 0.0, 0.0, 0.923, 0.3],
+        ]
+    )
+    return plant(A, B, C)
+
+
+def simulate(plant: Plant, u: np.ndarray, x0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Noise-free states x (T+1, n) and outputs y (T, p) of (1) under inputs u (T, m) from x0 (n,)."""
+    x = np.empty((len(u) + 1, plant.n))
+    x[0] = x0
+    drive = u @ plant.B.T + plant.b
+    for t in range(len(u)):
+        x[t + 1] = plant.A @ x[t] + drive[t]
+    return x, x[:-1] @ plant.C.T + u @ plant.D.T + plant.d
+
+
+def markov_parameters(plant: Plant, lags: int) -> np.ndarray:
+    """h (lags, p, m) with h[k-1] = C A^(k-1) B, the response of y at lag k to a unit pulse of u."""
+    h, column = np.empty((lags, plant.p, plant.m)), plant.B
+    for k in range(lags):
+        h[k] = plant.C @ column
+        column = plant.A @ column
+    return h
+
+
+def observability_matrix(A: np.ndarray, C: np.ndarray, blocks: int) -> np.ndarray:
+    """[C; CA; ...; CA^(blocks-1)] (7)."""
+    rows = [C]
+    for _ in range(blocks - 1):
+        rows.append(rows[-1] @ A)
+    return np.vstack(rows)
+
+
+class RankTest(NamedTuple):
+    passed: bool
+    rank: int
+    singular_values: np.ndarray
+    reason: str
+
+
+def _rank_test(matrix: np.ndarray, n: int, name: str, remedy: str) -> RankTest:
+    sv = np.linalg.svd(matrix, compute_uv=False)
+    rank = int((sv > sv[0] * max(matrix.shape) * np.finfo(float).eps).sum()) if sv[0] > 0 else 0
+    reason = "" if rank == n else f"the plant is not {name}: rank {rank} of {n}, smallest singular values {np.array2string(sv[-2:], precision=2)}; {remedy}"
+    return RankTest(rank == n, rank, sv, reason)
+
+
+def observability(plant: Plant) -> RankTest:
+    """Rank test of (7) with its singular values; fails with a reason where some state never shows in y."""
+    return _rank_test(observability_matrix(plant.A, plant.C, plant.n), plant.n, "observable", "add a sensor, or lower the order of the model")
+
+
+def controllability(plant: Plant) -> RankTest:
+    """Rank test of [B AB ... A^(n-1)B] (10) with its singular values; fails with a reason where some state obeys no input."""
+    return _rank_test(
+        observability_matrix(plant.A.T, plant.B.T, plant.n), plant.n, "controllable", "add an input, or lower the order of the model"
+    )
+
+
+def hold_state(plant: Plant, x: np.ndarray) -> np.ndarray:
+    """The steady input u (m,) of least norm that holds the plant at state x (n,): (I - A) x = B u + b; the nearest one where none is exact."""
+    return np.linalg.lstsq(plant.B, (np.eye(plant.n) - plant.A) @ x - plant.b, rcond=None)[0]
+
+
+def hold_output(plant: Plant, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Steady state x (n,) and input u (m,) of least norm in u with C x + d as near as possible to y (p,), and x = A x + B u + b exactly."""
+    n, m = plant.n, plant.m
+    balance = np.hstack([np.eye(n) - plant.A, -plant.B])
+    free = scipy.linalg.null_space(balance)
+    particular = np.linalg.lstsq(balance, plant.b, rcond=None)[0]
+    measured = np.hstack([plant.C, plant.D])
+    miss = y - plant.d - measured @ particular
+    best = np.linalg.lstsq(measured @ free, miss, rcond=None)[0]
+    still = free @ scipy.linalg.null_space(measured @ free)
+    point = particular + free @ best
+    if still.size:
+        point = point - still @ np.linalg.lstsq(still[n:], point[n:], rcond=None)[0]
+    return point[:n], point[n:]
+
+
+def spread(nominal: Plant, *, input_gain: float, loss: float, scale: Sequence[float] = (-1.0, 1.0)) -> list[Plant]:
+    """The declared family around a plant: the plant itself, each column of B by 1 +- input_gain, and A - loss I, in that order."""
+    family = [nominal]
+    for column in range(nominal.m):
+        for sign in scale:
+            B = nominal.B.copy()
+            B[:, column] *= 1 + sign * input_gain
+            family.append(nominal._replace(B=B))
+    return [*family, nominal._replace(A=nominal.A - loss * np.eye(nominal.n))]
