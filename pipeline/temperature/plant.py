@@ -127,7 +127,7 @@ def hold_state(plant: Plant, x: np.ndarray) -> np.ndarray:
 
 def hold_output(plant: Plant, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Steady state x (n,) and input u (m,) of least norm in u with C x + d as near as possible to y (p,), and x = A x + B u + b exactly."""
-    n, m = plant.n, plant.m
+    n = plant.n
     balance = np.hstack([np.eye(n) - plant.A, -plant.B])
     free = scipy.linalg.null_space(balance)
     particular = np.linalg.lstsq(balance, plant.b, rcond=None)[0]

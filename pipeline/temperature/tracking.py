@@ -1,0 +1,204 @@
+"""Linear-quadratic tracking of a known model: Riccati gains, observer, Algorithm 1 of seed 1, and the feasible target within the limits of the inputs."""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+
+from pipeline.temperature.plant import Plant
+
+
+class Gains(NamedTuple):
+    """u = -K_x x - K_r r - k minimises (3); P (n, n) is the quadratic part of the value. K_x (m, n), K_r (m, p), k (m,)."""
+
+    K_x: np.ndarray
+    K_r: np.ndarray
+    k: np.ndarray
+    P: np.ndarray
+
+
+class Law(NamedTuple):
+    """A controller as it runs: memory z, measured y, reference r, and the input that was really applied (clipped or not).
+
+    u = -K z - D y - K_r (r + xi) - k,   z(t+1) = A z + B_u u_applied + B_y y + B_r r + c,   xi(t+1) = xi + integral (r - y)
+
+    Shapes with q memories: A (q, q), B_u (q, m), B_y (q, p), B_r (q, p), c (q,), K (m, q), D (m, p), K_r (m, p), k (m,).
+    It takes over from a plant that was held by u0 at y0 with z = start_u u0 + start_y y0 + start and xi = 0.
+    """
+
+    A: np.ndarray
+    B_u: np.ndarray
+    B_y: np.ndarray
+    B_r: np.ndarray
+    c: np.ndarray
+    K: np.ndarray
+    D: np.ndarray
+    K_r: np.ndarray
+    k: np.ndarray
+    start_u: np.ndarray
+    start_y: np.ndarray
+    start: np.ndarray
+    integral: float = 0.0
+
+
+def riccati(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray, *, tolerance: float = 1e-14, max_doublings: int = 60) -> np.ndarray:
+    """P = Q + A'PA - A'PB (R + B'PB)^-1 B'PA by structure-preserving doubling (Chu, Fan, Lin, Wang 2004): each step doubles the horizon.
+
+    A (n, n), B (n, m), Q (n, n) and R (m, m) symmetric, R > 0. Raises ValueError where the recursion does not settle: (A, B) is not stabilisable.
+    """
+    G = B @ np.linalg.solve(R, B.T)
+    P, identity = Q, np.eye(len(A))
+    for _ in range(max_doublings):
+        W = np.linalg.solve(identity + G @ P, np.hstack([A, G]))
+        WA, WG = W[:, : len(A)], W[:, len(A) :]
+        step = A.T @ P @ WA
+        G, A = G + A @ WG @ A.T, A @ WA
+        P, G = P + (step + step.T) / 2, (G + G.T) / 2
+        if not np.isfinite(P).all():
+            break
+        if np.abs(step).max() <= tolerance * np.abs(P).max():
+            return P
+    raise ValueError(
+        "the Riccati equation has no stabilising solution: expected every mode slower than the discount to obey an input, found one that does not; "
+        "check the columns of B, or add the input that moves it"
+    )
+
+
+def gains(plant: Plant, Q: np.ndarray, R: np.ndarray, gamma: float, F: np.ndarray | None = None) -> Gains:
+    """The optimal u = -K_x x - K_r r - k for (3) with r(t+1) = F r(t) (default: constant): discrete Riccati equation on sqrt(gamma) (A, B).
+
+    With w = [r; 1], x+ = A x + B u + E w and y - r = C x + G w:  K_w = S^-1 gamma B'(P E + P_xw F_w),  P_xw = C'QG + gamma (A - B K_x)'(P E + P_xw F_w).
+    """
+    _strictly_proper(plant)
+    p, F = plant.p, np.eye(plant.p) if F is None else F
+    P = riccati(np.sqrt(gamma) * plant.A, np.sqrt(gamma) * plant.B, plant.C.T @ Q @ plant.C, R)
+    S = R + gamma * plant.B.T @ P @ plant.B
+    K_x = np.linalg.solve(S, gamma * plant.B.T @ P @ plant.A)
+    E, G = np.column_stack([np.zeros((plant.n, p)), plant.b]), np.column_stack([-np.eye(p), plant.d])
+    F_w = scipy.linalg.block_diag(F, 1.0)
+    closed = gamma * (plant.A - plant.B @ K_x).T
+    P_xw = stein(closed, F_w, plant.C.T @ Q @ G + closed @ P @ E)
+    K_w = np.linalg.solve(S, gamma * plant.B.T @ (P @ E + P_xw @ F_w))
+    return Gains(K_x, K_w[:, :p], K_w[:, p], P)
+
+
+def stein(A: np.ndarray, F: np.ndarray, C: np.ndarray) -> np.ndarray:
+    """X with X = A X F + C; one linear solve where F is the identity (a constant reference), by Kronecker products otherwise."""
+    if np.array_equal(F, np.eye(len(F))):
+        return np.linalg.solve(np.eye(len(A)) - A, C)
+    x = np.linalg.solve(np.eye(C.size) - np.kron(F.T, A), C.ravel(order="F"))
+    return x.reshape(C.shape, order="F")
+
+
+def augmented(plant: Plant, Q: np.ndarray, F: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """T, B_1 of (12) and Q_1 of (14) for the state [x; r]."""
+    CQ = plant.C.T @ Q
+    T = scipy.linalg.block_diag(plant.A, F)
+    return T, np.vstack([plant.B, np.zeros((plant.p, plant.m))]), np.block([[CQ @ plant.C, -CQ], [-CQ.T, Q]])
+
+
+class Iterated(NamedTuple):
+    """K (m, n+p) of u = -K [x; r] (15), and how many policies were evaluated; `settled` is False where the limit of iterations ended it."""
+
+    K: np.ndarray
+    iterations: int
+    settled: bool
+
+
+def algorithm_1(plant: Plant, Q, R, gamma, K0, *, tolerance: float, max_iterations: int = 100) -> Iterated:
+    """Algorithm 1 as the study's script runs it: its Lyapunov equation carries gamma in place of sqrt(gamma), and it stops on the one-norm of K's change.
+
+    From a K0 under which the cost is infinite, the P of (ii) is no cost, and the iteration can settle on a gain that does not stabilise: nothing here notices.
+    """
+    T, B_1, Q_1 = augmented(plant, Q, np.eye(plant.p))
+    K = K0
+    for j in range(1, max_iterations + 1):
+        P = scipy.linalg.solve_discrete_lyapunov(gamma * (T - B_1 @ K).T, Q_1 + K.T @ R @ K)
+        K, previous = np.linalg.solve(R + gamma * B_1.T @ P @ B_1, gamma * B_1.T @ P @ T), K
+        if np.linalg.norm(K - previous, 1) < tolerance:
+            return Iterated(K, j, True)
+    return Iterated(K, max_iterations, False)
+
+
+def policy_iteration(plant: Plant, Q, R, gamma, K0, *, tolerance: float = 1e-9, max_iterations: int = 200) -> Iterated:
+    """Algorithm 1 made safe: a policy is evaluated only under a discount for which its cost is finite, and the discount rises to gamma as the policy improves.
+
+    With rho the spectral radius of A - B K_x, the cost of K is finite for every discount below 1 / rho^2, so that P of (ii) is a cost, and the improvement
+    (iii) improves. Raises ValueError where no policy reaches gamma.
+    """
+    T, B_1, Q_1 = augmented(plant, Q, np.eye(plant.p))
+    K = K0
+    for j in range(1, max_iterations + 1):
+        rho = np.abs(np.linalg.eigvals(plant.A - plant.B @ K[:, : plant.n])).max()
+        discount = gamma if gamma * rho**2 < 0.999 else 0.95 / rho**2
+        P = scipy.linalg.solve_discrete_lyapunov(np.sqrt(discount) * (T - B_1 @ K).T, Q_1 + K.T @ R @ K)
+        K, previous = np.linalg.solve(R + discount * B_1.T @ P @ B_1, discount * B_1.T @ P @ T), K
+        if discount == gamma and np.linalg.norm(K - previous, 1) < tolerance:
+            return Iterated(K, j, True)
+    raise ValueError(f"policy iteration did not settle in {max_iterations} policies (discount {discount:.3g} of {gamma:g}); is every slow mode moved by an input?")
+
+
+def stabilises(plant: Plant, K_x: np.ndarray) -> bool:
+    """Whether every eigenvalue of A - B K_x lies inside the unit circle."""
+    return bool(np.abs(np.linalg.eigvals(plant.A - plant.B @ K_x)).max() < 1)
+
+
+def observer_gain(plant: Plant, tau: float) -> np.ndarray:
+    """L = A C'(C C' + tau I)^-1 (8); an identified plant brings its own Kalman gain K instead."""
+    return plant.A @ plant.C.T @ np.linalg.inv(plant.C @ plant.C.T + tau * np.eye(plant.p))
+
+
+def observer_law(plant: Plant, gains: Gains, L: np.ndarray, *, integral: float = 0.0) -> Law:
+    """Observer (6) and gains as one law: z = x-hat, started from the first measurement at pinv(C) (y(0) - d), which costs nothing and saves 4.8 % of J."""
+    n, m, p = plant.n, plant.m, plant.p
+    _strictly_proper(plant)
+    C_inverse = np.linalg.pinv(plant.C)
+    return Law(
+        A=plant.A - L @ plant.C, B_u=plant.B, B_y=L, B_r=np.zeros((n, p)), c=plant.b - L @ plant.d, K=gains.K_x, D=np.zeros((m, p)),
+        K_r=gains.K_r, k=gains.k, start_u=np.zeros((n, m)), start_y=C_inverse, start=-C_inverse @ plant.d, integral=integral,
+    )  # fmt: skip
+
+
+def state_feedback(plant: Plant, gains: Gains) -> Law:
+    """The optimum, which no sensor allows: a law that reads x through an observer that is told x. Use `scorecard` with `states_known` to run it."""
+    return observer_law(plant._replace(C=np.eye(plant.n), D=np.zeros((plant.n, plant.m)), d=np.zeros(plant.n)), gains, plant.A)
+
+
+class Target(NamedTuple):
+    """A steady state x (n,), u (m,) inside the limits with y (p,) as near the reference as the limits allow; `miss` (p,) is y - r in °C."""
+
+    x: np.ndarray
+    u: np.ndarray
+    y: np.ndarray
+    miss: np.ndarray
+
+
+def feasible_target(plant: Plant, r: np.ndarray, low: np.ndarray, high: np.ndarray) -> Target:
+    """min |C x + d - r|^2 + small |u|^2 over x = A x + B u + b, low <= u <= high.
+
+    The unlimited optimum asks heaters for negative heat; aimed at this target instead, the same gains settle on the reference (temperature notes, 6).
+    The balance enters as heavily weighted rows: at a direct-current gain of 5e5 the eliminated form would lose its digits.
+    """
+    n, m = plant.n, plant.m
+    heavy, light = 1e4, 1e-6
+    rows = np.vstack(
+        [np.hstack([plant.C, plant.D]), heavy * np.hstack([np.eye(n) - plant.A, -plant.B]), light * np.hstack([np.zeros((m, n)), np.eye(m)])]
+    )
+    right = np.concatenate([r - plant.d, heavy * plant.b, np.zeros(m)])
+    bounds = (np.concatenate([np.full(n, -np.inf), low]), np.concatenate([np.full(n, np.inf), high]))
+    solution = scipy.optimize.lsq_linear(rows, right, bounds, method="bvls", tol=1e-15).x
+    u = np.clip(solution[n:], low, high)
+    y = plant.C @ solution[:n] + plant.D @ u + plant.d
+    return Target(solution[:n], u, y, y - r)
+
+
+def aimed(law: Law, r: np.ndarray, u: np.ndarray, y: np.ndarray) -> Law:
+    """The law with its feed-forward replaced so that it rests at input u and output y while the reference is r: u - K (z - z_rest) - K_r xi."""
+    z = np.linalg.solve(np.eye(len(law.A)) - law.A, law.B_u @ u + law.B_y @ y + law.B_r @ r + law.c)
+    return law._replace(k=-u - law.K @ z - law.D @ y - law.K_r @ r)
+
+
+def _strictly_proper(plant: Plant) -> None:
+    if np.any(plant.D):
+        raise ValueError("the design expects outputs that do not jump with the input (D = 0) but the model has feed-through; identify it with feedthrough: false")

@@ -1,0 +1,96 @@
+"""The indirect data-driven route: a long VARX window learned from the record is the state of a predictor, and the Riccati equation does the rest.
+
+y(t) = Theta [u(t-1); ...; u(t-N); y(t-1); ...; y(t-N)] + theta_0 + e(t). Nothing is assumed about the order of the plant; noise costs little, because the
+long window averages it as a Kalman filter would (Chiuso 2007 on VARX and subspace methods).
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.temperature.kernel import Tuples, window_law, window_shift, windows
+from pipeline.temperature.plant import Plant, observability_matrix
+from pipeline.temperature.plant import plant as make_plant
+from pipeline.temperature.tracking import Law, gains
+
+
+class Window(NamedTuple):
+    """Theta (p, N (m+p)), theta_0 (p,), the innovation's covariance (p, p), and the table by which N was chosen: (past, parameters, criterion) rows."""
+
+    Theta: np.ndarray
+    theta_0: np.ndarray
+    covariance: np.ndarray
+    N: int
+    samples: int
+    table: np.ndarray
+
+
+def learn(u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, longest: int, offset: bool = False) -> Window:
+    """Least-squares VARX on segments u (T, m), y (T, p), its window N <= `longest` chosen by Akaike's criterion on the samples that the longest one leaves.
+
+    One QR factorisation serves every N, because the columns are ordered lag by lag. Raises ValueError where the record is shorter than the shortest window needs.
+    """
+    w, _, y_now = windows(u, y, longest)
+    m, p = u[0].shape[1], y[0].shape[1]
+    samples = len(w)
+    if samples <= 2 * (m + p + offset):
+        raise ValueError(f"the window cannot be learned: expected more than {2 * (m + p + offset)} complete windows of {longest} samples, found {samples}; record longer")
+    lags = [np.r_[lag * m : (lag + 1) * m, longest * m + lag * p : longest * m + (lag + 1) * p] for lag in range(longest)]
+    order = np.concatenate(lags)
+    columns = np.hstack([np.ones((samples, int(offset))), w[:, order], y_now])
+    triangle = np.linalg.qr(columns, mode="r")
+    table = np.array([_criterion(triangle, offset, N, m, p, samples) for N in range(1, longest + 1) if 2 * (offset + N * (m + p)) < samples])
+    N = int(table[table[:, 2].argmin(), 0])
+    k = offset + N * (m + p)
+    solution = np.linalg.lstsq(triangle[:k, :k], triangle[:k, -p:], rcond=1e-12)[0]
+    rest = triangle[k:, -p:]
+    Theta = np.empty((p, N * (m + p)))
+    by_lag = solution[offset:].reshape(N, m + p, p)
+    Theta[:, : N * m] = by_lag[:, :m].transpose(2, 0, 1).reshape(p, N * m)
+    Theta[:, N * m :] = by_lag[:, m:].transpose(2, 0, 1).reshape(p, N * p)
+    return Window(Theta, solution[0] if offset else np.zeros(p), rest.T @ rest / (samples - k), N, samples, table)
+
+
+def _criterion(triangle: np.ndarray, offset: bool, N: int, m: int, p: int, samples: int) -> tuple[int, int, float]:
+    """Akaike's criterion of the window N, its residual read off the triangle; a residual below rounding counts as rounding, so that the shortest exact N wins."""
+    k = offset + N * (m + p)
+    rest, whole = triangle[k:, -p:], triangle[:, -p:]
+    floor = 1e-20 * np.trace(whole.T @ whole) / samples
+    logdet = np.log(np.maximum(np.linalg.eigvalsh(rest.T @ rest / samples), floor)).sum()
+    return N, k * p, samples * logdet + 2 * k * p
+
+
+def predictor(window: Window, sample_time_s: float = 1.0) -> Plant:
+    """The window as a plant in innovation form: x = w, A = shift + B_y Theta, B = B_u, C = Theta, K = B_y."""
+    p = len(window.Theta)
+    A, B_u, B_y = window_shift(window.Theta.shape[1] // window.N - p, p, window.N)
+    return make_plant(A + B_y @ window.Theta, B_u, window.Theta, b=B_y @ window.theta_0, d=window.theta_0, K=B_y, sample_time_s=sample_time_s)
+
+
+def law(window: Window, Q: np.ndarray, R: np.ndarray, gamma: float, *, integral: float = 0.0) -> Law:
+    """Optimal tracking (3) of the predictor: u = -K w - K_r r - k on the window of past inputs and outputs."""
+    K_x, K_r, k, _ = gains(predictor(window), Q, R, gamma)
+    return window_law(K_x, K_r, k, window.N, integral=integral)
+
+
+def denoised_tuples(window: Window, u: Sequence[np.ndarray], y: Sequence[np.ndarray], order: int, *, horizon: int = 10, offset: bool = False) -> Tuples:
+    """Tuples for Algorithm 2 whose state is not the noisy window but the `order` directions of it that predict the next `horizon` outputs best.
+
+    x-hat = features w, from the singular vectors of (observability matrix of the predictor) x (root of the window's second moment), as in subspace identification.
+    x-hat is uncorrelated with the noise still to come, so that the least squares of Algorithm 2 lose the bias that noise in the regressors causes.
+    """
+    w, u_now, y_now = windows(u, y, window.N)
+    model = predictor(window)
+    free = observability_matrix(model.A, model.C, horizon)
+    root = np.linalg.qr(w, mode="r").T / np.sqrt(len(w))
+    left = np.linalg.svd(free @ root, full_matrices=False)[0][:, :order]
+    T = left.T @ free
+    T /= np.sqrt(((w @ T.T) ** 2).mean(axis=0))[:, None]
+    A, B_u, B_y = window_shift(u_now.shape[1], y_now.shape[1], window.N)
+    w_next = w @ A.T + u_now @ B_u.T + y_now @ B_y.T
+    one = np.ones((len(w), int(offset)))
+    features = np.zeros((order + offset, w.shape[1] + 1))
+    features[:order, :-1] = T
+    features[order:, -1] = 1.0
+    return Tuples(np.hstack([w @ T.T, one]), u_now, y_now, np.hstack([w_next @ T.T, one]), features, window.N)
