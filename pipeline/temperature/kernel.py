@@ -65,7 +65,8 @@ def quadratic_gram(Z: np.ndarray, *, block: int = 1024) -> np.ndarray:
 class Tuples(NamedTuple):
     """One row a sample: state s (samples, k), input u (samples, m), error e (samples, p), successor s_next (samples, k).
 
-    s = features [w; 1]: `features` (k, N (m+p) + 1) maps the raw window w and a constant, so that a gain on s is a gain on w.
+    s = features [w; 1]: `features` (k, N (m+p) + 1) maps the raw window w and a constant, so that a gain on s is a gain on w. e = y - base: the closer the base
+    (p,) lies to the record, the less its noise costs, since the noise of the regression is 2 e'Q times the sensors'.
     """
 
     s: np.ndarray
@@ -74,6 +75,7 @@ class Tuples(NamedTuple):
     s_next: np.ndarray
     features: np.ndarray
     N: int
+    base: np.ndarray
 
 
 def window_shift(m: int, p: int, N: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -100,13 +102,15 @@ def windows(u: Sequence[np.ndarray], y: Sequence[np.ndarray], N: int) -> tuple[n
 
 
 def tuples(u: Sequence[np.ndarray], y: Sequence[np.ndarray], N: int, *, offset: bool = False) -> Tuples:
-    """The windows of segments u (T, m), y (T, p) for any reference: none is in s, e is y. `offset` puts a constant 1 into s (ambient, operating point)."""
+    """The windows of segments u (T, m), y (T, p) for any reference: none is in s. `offset` puts a constant 1 into s (ambient, operating point), and then the mean
+    of y is the base that e is counted from."""
     w, u_now, y_now = windows(u, y, N)
     A, B_u, B_y = window_shift(u_now.shape[1], y_now.shape[1], N)
     one = np.ones((len(w), int(offset)))
     w_next = w @ A.T + u_now @ B_u.T + y_now @ B_y.T
     features = np.eye(w.shape[1] + offset, w.shape[1] + 1)
-    return Tuples(np.hstack([w, one]), u_now, y_now, np.hstack([w_next, one]), features, N)
+    base = y_now.mean(axis=0) * offset
+    return Tuples(np.hstack([w, one]), u_now, y_now - base, np.hstack([w_next, one]), features, N, base)
 
 
 def tuples_with_reference(u: Sequence[np.ndarray], y: Sequence[np.ndarray], N: int, r: np.ndarray, F: np.ndarray) -> Tuples:
@@ -114,7 +118,7 @@ def tuples_with_reference(u: Sequence[np.ndarray], y: Sequence[np.ndarray], N: i
     plain = tuples(u, y, N)
     rows = (len(plain.s), 1)
     features = np.vstack([plain.features, np.hstack([np.zeros((len(r), plain.features.shape[1] - 1)), r[:, None]])])
-    return Tuples(np.hstack([plain.s, np.tile(r, rows)]), plain.u, plain.e - r, np.hstack([plain.s_next, np.tile(F @ r, rows)]), features, N)
+    return Tuples(np.hstack([plain.s, np.tile(r, rows)]), plain.u, plain.e - r, np.hstack([plain.s_next, np.tile(F @ r, rows)]), features, N, r)
 
 
 class Regression(NamedTuple):
@@ -133,6 +137,7 @@ class Regression(NamedTuple):
     output: np.ndarray
     W: np.ndarray
     u_scale: np.ndarray
+    base: np.ndarray
     N: int
     singular_values: np.ndarray
     rank: int
@@ -184,7 +189,7 @@ def regress(data: Tuples, *, mu: float = 0.0, tolerance: float = 1e-9, limit: fl
     solution, condition = _solve(normal, right, limit, samples, unknowns)
     G, G_e, G_u = np.split(solution, np.cumsum([q * (q + 1) // 2, p * (p + 1) // 2]), axis=1)
     return Regression(
-        G, G_e, G_u, linear.T[:q], linear.T[q:], W @ data.features, u_scale, data.N, sv, q + m, unknowns, (k + m) * (k + m + 1) // 2, samples, condition
+        G, G_e, G_u, linear.T[:q], linear.T[q:], W @ data.features, u_scale, data.base, data.N, sv, q + m, unknowns, (k + m) * (k + m + 1) // 2, samples, condition
     )  # fmt: skip
 
 
@@ -197,7 +202,8 @@ def _innovation(residual: np.ndarray, size: np.ndarray, tolerance: float) -> tup
 
 def _solve(normal: np.ndarray, right: np.ndarray, limit: float, samples: int, unknowns: int) -> tuple[np.ndarray, float]:
     """The normal equations by Cholesky after Jacobi scaling, and the condition number of the scaled matrix (LAPACK's estimate)."""
-    scale = 1 / np.sqrt(np.diag(normal))
+    size = np.diag(normal)
+    scale = 1 / np.sqrt(np.where(size > 0, size, 1.0))
     scaled = normal * scale * scale[:, None]
     factor, failed = scipy.linalg.lapack.dpotrf(scaled, lower=1)
     reciprocal = 0.0 if failed else scipy.linalg.lapack.dpocon(factor, np.abs(scaled).sum(axis=0).max(), uplo="L")[0]
@@ -303,7 +309,8 @@ def _kernel(data: Regression, H: np.ndarray, K: np.ndarray, Q: np.ndarray, gamma
     H_ur = (-data.output.T @ Q + gamma * data.step.T @ P_sr @ F)[q:]
     u = data.u_scale[:, None]
     K_w = u * (K @ data.W)
-    return Kernel(H, K_w[:, :-1], u * np.linalg.solve(H[q:, q:], H_ur), K_w[:, -1], iterations, change)
+    K_r = u * np.linalg.solve(H[q:, q:], H_ur)
+    return Kernel(H, K_w[:, :-1], K_r, K_w[:, -1] - K_r @ data.base, iterations, change)
 
 
 def window_law(K: np.ndarray, K_r: np.ndarray, k: np.ndarray, N: int, *, integral: float = 0.0) -> Law:

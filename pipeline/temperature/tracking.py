@@ -166,31 +166,46 @@ def state_feedback(plant: Plant, gains: Gains) -> Law:
 
 
 class Target(NamedTuple):
-    """A steady state x (n,), u (m,) inside the limits with y (p,) as near the reference as the limits allow; `miss` (p,) is y - r in °C."""
+    """A steady state x (n,), u (m,) inside the limits with y (p,) as near the reference as the limits allow; `miss` (p,) is y - r in °C, `slack` the distance of u
+    from the nearest limit in percent."""
 
     x: np.ndarray
     u: np.ndarray
     y: np.ndarray
     miss: np.ndarray
+    slack: float
 
 
-def feasible_target(plant: Plant, r: np.ndarray, low: np.ndarray, high: np.ndarray) -> Target:
-    """min |C x + d - r|^2 + small |u|^2 over x = A x + B u + b, low <= u <= high.
+def feasible_target(plant: Plant, r: np.ndarray, low: np.ndarray, high: np.ndarray, *, tolerance: float = 1e-3) -> Target:
+    """min |C x + d - r|^2 over x = A x + B u + b, low <= u <= high, and among its solutions one that keeps all inputs as far from their limits as it can.
 
-    The unlimited optimum asks heaters for negative heat; aimed at this target instead, the same gains settle on the reference (temperature notes, 6).
-    The balance enters as heavily weighted rows: at a direct-current gain of 5e5 the eliminated form would lose its digits.
+    The unlimited optimum asks heaters for negative heat; aimed at this target instead, the same gains settle on the reference (temperature notes, 6). The slack
+    costs at most `tolerance` °C of reach.
     """
-    n, m = plant.n, plant.m
-    heavy, light = 1e4, 1e-6
+    nearest = _steady(plant, r, low, high, 0.0)
+    reach, slack, step = np.linalg.norm(nearest.miss) + tolerance, 0.0, (high - low).min() / 4
+    while step > 1e-3:
+        wider = _steady(plant, r, low, high, slack + step)
+        if np.linalg.norm(wider.miss) <= reach:
+            nearest, slack = wider, slack + step
+        else:
+            step /= 2
+    return nearest
+
+
+def _steady(plant: Plant, r: np.ndarray, low: np.ndarray, high: np.ndarray, slack: float) -> Target:
+    """Bounded least squares with the balance as heavily weighted rows: at a direct-current gain of 5e5 the eliminated form would lose its digits."""
+    n, m, heavy, light = plant.n, plant.m, 1e4, 1e-6
     rows = np.vstack(
         [np.hstack([plant.C, plant.D]), heavy * np.hstack([np.eye(n) - plant.A, -plant.B]), light * np.hstack([np.zeros((m, n)), np.eye(m)])]
     )
     right = np.concatenate([r - plant.d, heavy * plant.b, np.zeros(m)])
-    bounds = (np.concatenate([np.full(n, -np.inf), low]), np.concatenate([np.full(n, np.inf), high]))
+    slack = min(slack, 0.49 * (high - low).min())
+    bounds = (np.concatenate([np.full(n, -np.inf), low + slack]), np.concatenate([np.full(n, np.inf), high - slack]))
     solution = scipy.optimize.lsq_linear(rows, right, bounds, method="bvls", tol=1e-15).x
-    u = np.clip(solution[n:], low, high)
+    u = np.clip(solution[n:], low + slack, high - slack)
     y = plant.C @ solution[:n] + plant.D @ u + plant.d
-    return Target(solution[:n], u, y, y - r)
+    return Target(solution[:n], u, y, y - r, slack)
 
 
 def aimed(law: Law, r: np.ndarray, u: np.ndarray, y: np.ndarray) -> Law:

@@ -74,23 +74,28 @@ def law(window: Window, Q: np.ndarray, R: np.ndarray, gamma: float, *, integral:
     return window_law(K_x, K_r, k, window.N, integral=integral)
 
 
-def denoised_tuples(window: Window, u: Sequence[np.ndarray], y: Sequence[np.ndarray], order: int, *, horizon: int = 10, offset: bool = False) -> Tuples:
-    """Tuples for Algorithm 2 whose state is not the noisy window but the `order` directions of it that predict the next `horizon` outputs best.
+def predicted_tuples(window: Window, u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, horizon: int = 2, offset: bool = False) -> Tuples:
+    """Tuples for Algorithm 2 whose state is not the noisy window but the directions of it that predict the next `horizon` outputs.
 
-    x-hat = features w, from the singular vectors of (observability matrix of the predictor) x (root of the window's second moment), as in subspace identification.
-    x-hat is uncorrelated with the noise still to come, so that the least squares of Algorithm 2 lose the bias that noise in the regressors causes.
+    x-hat = features [w; 1], from the singular vectors of (observability matrix of the predictor) x (root of the window's second moment), as in subspace
+    identification. x-hat is uncorrelated with the noise still to come, so that the least squares of Algorithm 2 lose the bias that noise in the regressors causes.
+    Kept are directions that move the outputs by more than twice the innovation: the value of a weaker one cannot be told from noise, and is not worth more.
     """
     w, u_now, y_now = windows(u, y, window.N)
     model = predictor(window)
     free = observability_matrix(model.A, model.C, horizon)
-    root = np.linalg.qr(w, mode="r").T / np.sqrt(len(w))
-    left = np.linalg.svd(free @ root, full_matrices=False)[0][:, :order]
-    T = left.T @ free
-    T /= np.sqrt(((w @ T.T) ** 2).mean(axis=0))[:, None]
+    centre = w.mean(axis=0) * offset
+    root = np.linalg.qr(w - centre, mode="r").T / np.sqrt(len(w))
+    left, sv, _ = np.linalg.svd(free @ root, full_matrices=False)
+    noise = np.sqrt(np.diag(window.covariance).max())
+    order = int((sv > np.maximum(2 * noise, 1e-9 * sv[0])).sum())
+    if order == 0:
+        raise ValueError("the window predicts nothing beyond the noise of the sensors; probe with a larger amplitude, or record longer")
+    T = left[:, :order].T @ free / sv[:order, None]
     A, B_u, B_y = window_shift(u_now.shape[1], y_now.shape[1], window.N)
     w_next = w @ A.T + u_now @ B_u.T + y_now @ B_y.T
     one = np.ones((len(w), int(offset)))
     features = np.zeros((order + offset, w.shape[1] + 1))
-    features[:order, :-1] = T
-    features[order:, -1] = 1.0
-    return Tuples(np.hstack([w @ T.T, one]), u_now, y_now, np.hstack([w_next @ T.T, one]), features, window.N)
+    features[:order, :-1], features[:order, -1], features[order:, -1] = T, -T @ centre, 1.0
+    base = y_now.mean(axis=0) * offset
+    return Tuples(np.hstack([(w - centre) @ T.T, one]), u_now, y_now - base, np.hstack([(w_next - centre) @ T.T, one]), features, window.N, base)

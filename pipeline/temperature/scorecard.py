@@ -1,0 +1,297 @@
+"""One panel, one yardstick, every controller: the same plants, starts, references and noise; costs only under the same weights, judged by true outputs.
+
+Two runs of every scenario: unclipped, where the discrete Riccati equation gives the optimum (regret J / J* - 1), and with inputs clipped to the machine's limits,
+where an engineer's figures are read off.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from pipeline.temperature.plant import Plant, hold_output, hold_state
+from pipeline.temperature.tracking import Gains, Law, aimed, gains
+
+
+class Panel(NamedTuple):
+    """Scenarios, one a row: plant[i] of `plants` (all of one order), held at x0 by u0, reference r, sensor noise of `noise` °C drawn from `seed`.
+
+    The controller watches the hold for `hold` steps before it takes over, so that its memory holds what a machine would have put there, then runs for `steps`.
+    """
+
+    plants: list[Plant]
+    plant: np.ndarray
+    x0: np.ndarray
+    u0: np.ndarray
+    r: np.ndarray
+    noise: np.ndarray
+    seed: np.ndarray
+    start: np.ndarray
+    steps: int
+    hold: int
+
+
+class Yardstick(NamedTuple):
+    """The weights diag(q), diag(r) and the discount under which every J of one comparison is computed."""
+
+    q: np.ndarray
+    r: np.ndarray
+    gamma: float
+
+
+class Cost(NamedTuple):
+    """J of each scenario, together with the yardstick that it was computed with."""
+
+    J: np.ndarray
+    yardstick: Yardstick
+
+
+class Run(NamedTuple):
+    """True outputs y, commanded and applied inputs (steps, scenarios, p or m), and the sensors' errors that the controller saw."""
+
+    y: np.ndarray
+    command: np.ndarray
+    u: np.ndarray
+
+
+class Figures(NamedTuple):
+    """An engineer's figures of each scenario (scenarios,): °C, seconds, percent; NaN in settling_s where the outputs never stay within the band."""
+
+    tracking_degC: np.ndarray
+    effort_percent: np.ndarray
+    settled_error_degC: np.ndarray
+    settled_zone: np.ndarray
+    settling_s: np.ndarray
+    overshoot_degC: np.ndarray
+    at_limits_percent: np.ndarray
+    input_low_percent: np.ndarray
+    input_high_percent: np.ndarray
+
+
+def panel(
+    plants: Sequence[Plant], *, starts: Sequence[float], references: Sequence[Sequence[float]], noise: Sequence[float], seeds: Sequence[int], steps: int,
+    hold: int, cells: bool,
+) -> Panel:  # fmt: skip
+    """Every plant x start x reference x noise level, once without noise and once a seed with it.
+
+    A start is a temperature in °C at which the plant is held by its steady input: of every cell where the states are `cells`, of every sensor otherwise.
+    """
+    rows = []
+    for index, plant in enumerate(plants):
+        for start in starts:
+            x0, u0 = (np.full(plant.n, start), None) if cells else hold_output(plant, np.full(plant.p, start))
+            u0 = hold_state(plant, x0) if u0 is None else u0
+            for reference in references:
+                for level in noise:
+                    rows += [(index, x0, u0, reference, level, seed, start) for seed in (seeds if level > 0 else seeds[:1])]
+    index, x0, u0, r, level, seed, start = (np.array(column) for column in zip(*rows, strict=True))
+    return Panel(list(plants), index, x0, u0, np.asarray(r, float), level.astype(float), seed, start.astype(float), steps, hold)
+
+
+def disturbances(panel: Panel) -> np.ndarray:
+    """Sensor noise (hold + steps, scenarios, p): each scenario draws from its own seed, so that every controller sees the same."""
+    unit = {int(seed): np.random.default_rng(seed).standard_normal((panel.hold + panel.steps, panel.r.shape[1])) for seed in np.unique(panel.seed)}
+    return np.stack([level * unit[int(seed)] for level, seed in zip(panel.noise, panel.seed, strict=True)], axis=1)
+
+
+def simulate(panel: Panel, law: Law, k: np.ndarray, *, limits: tuple[np.ndarray, np.ndarray] | None, integral_band: float = np.inf) -> Run:
+    """Every scenario at once under one law with feed-forward k (scenarios, m); limits (low, high) in percent clip what is applied and what enters the memory.
+
+    The outer integrator xi sees errors no larger than `integral_band` °C, so that the way up winds nothing up.
+    """
+    A, B, C, b, d = (np.stack([getattr(panel.plants[i], name) for i in panel.plant]) for name in ("A", "B", "C", "b", "d"))
+    steps, (scenarios, p) = panel.steps, panel.r.shape
+    y, command = np.empty((steps, scenarios, p)), np.empty((steps, scenarios, law.K.shape[0]))
+    applied, noise = np.empty_like(command), disturbances(panel)
+    x, xi = panel.x0.copy(), np.zeros((scenarios, p))
+    held = np.einsum("sij,sj->si", C, x) + d
+    z = panel.u0 @ law.start_u.T + (held + noise[0]) @ law.start_y.T + law.start
+    for t in range(panel.hold):
+        z = z @ law.A.T + panel.u0 @ law.B_u.T + (held + noise[t]) @ law.B_y.T + panel.r @ law.B_r.T + law.c
+    noise = noise[panel.hold :]
+    for t in range(steps):
+        y[t] = np.einsum("sij,sj->si", C, x) + d
+        measured = y[t] + noise[t]
+        u = -(z @ law.K.T + measured @ law.D.T + (panel.r + xi) @ law.K_r.T + k)
+        command[t] = u
+        u = u if limits is None else np.clip(u, *limits)
+        applied[t] = u
+        z = z @ law.A.T + u @ law.B_u.T + measured @ law.B_y.T + panel.r @ law.B_r.T + law.c
+        if law.integral:
+            xi += law.integral * np.clip(panel.r - measured, -integral_band, integral_band)
+        x = np.einsum("sij,sj->si", A, x) + np.einsum("sij,sj->si", B, u) + b
+        if not np.abs(x).max() < 1e9:
+            x = np.clip(np.nan_to_num(x), -1e9, 1e9)
+            z = np.clip(np.nan_to_num(z), -1e9, 1e9)
+    return Run(y, command, applied)
+
+
+def feed_forward(panel: Panel, law: Law, targets: dict[bytes, tuple[np.ndarray, np.ndarray]] | None) -> np.ndarray:
+    """k (scenarios, m): the law's own, or, with the steady (u, y) of each reference in `targets`, the one that rests there (tracking.feasible_target)."""
+    if targets is None:
+        return np.tile(law.k, (len(panel.r), 1))
+    rest = {key: aimed(law, np.frombuffer(key), *target).k for key, target in targets.items()}
+    return np.stack([rest[r.tobytes()] for r in panel.r])
+
+
+def cost(panel: Panel, run: Run, yardstick: Yardstick) -> Cost:
+    """(3) of every scenario: discounted, on true outputs and applied inputs."""
+    error = run.y - panel.r
+    stage = error**2 @ yardstick.q + run.u**2 @ yardstick.r
+    return Cost(yardstick.gamma ** np.arange(len(stage)) @ stage, yardstick)
+
+
+def optimum(panel: Panel, yardstick: Yardstick) -> Cost:
+    """J* of every scenario: the Riccati law of its own plant, which knows the state, unclipped."""
+    best = [gains(plant, np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma) for plant in panel.plants]
+    return cost(panel, _state_feedback(panel, best), yardstick)
+
+
+def _state_feedback(panel: Panel, best: Sequence[Gains]) -> Run:
+    plants = [panel.plants[i] for i in panel.plant]
+    A, B, C, b, d = (np.stack([getattr(plant, name) for plant in plants]) for name in ("A", "B", "C", "b", "d"))
+    K_x = np.stack([best[i].K_x for i in panel.plant])
+    feed = np.stack([best[i].K_r @ r + best[i].k for i, r in zip(panel.plant, panel.r, strict=True)])
+    x, y, u = panel.x0.copy(), np.empty((panel.steps, *panel.r.shape)), np.empty((panel.steps, *feed.shape))
+    for t in range(panel.steps):
+        y[t] = np.einsum("sij,sj->si", C, x) + d
+        u[t] = -np.einsum("sij,sj->si", K_x, x) - feed
+        x = np.einsum("sij,sj->si", A, x) + np.einsum("sij,sj->si", B, u[t]) + b
+    return Run(y, u, u)
+
+
+def regret(J: Cost, best: Cost) -> np.ndarray:
+    """J / J* - 1 (scenarios,). Raises ValueError where the two were computed under different weights: such costs say nothing about each other."""
+    a, b = J.yardstick, best.yardstick
+    if not (np.array_equal(a.q, b.q) and np.array_equal(a.r, b.r) and a.gamma == b.gamma):
+        raise ValueError(
+            f"costs under different weights cannot be compared: one was computed with q = {_short(a.q)}, r = {_short(a.r)}, gamma = {a.gamma:g}, the other with "
+            f"q = {_short(b.q)}, r = {_short(b.r)}, gamma = {b.gamma:g}; compute both under one yardstick (section tracking of params.yaml)"
+        )
+    return J.J / best.J - 1
+
+
+def _short(values: np.ndarray) -> str:
+    return np.array2string(np.asarray(values), precision=3, threshold=4, edgeitems=2)
+
+
+def figures(panel: Panel, run: Run, *, limits: tuple[np.ndarray, np.ndarray], band: float, sample_time_s: float) -> Figures:
+    """What an engineer reads off a run. Settled: the mean error over the last third, of the worst zone. Settling: the first time after which every zone stays
+    within `band` °C of its reference. Overshoot: past the reference, in the direction of the step. At limits: share of (input, step) with a command outside."""
+    error = run.y - panel.r
+    late = error[2 * len(error) // 3 :].mean(axis=0)
+    outside = (np.abs(error) > band).any(axis=2)
+    last = len(outside) - outside[::-1].argmax(axis=0)
+    settling = np.where(outside.any(axis=0), last, 0).astype(float)
+    settling[outside[-1]] = np.nan
+    past = np.where(panel.r - run.y[0] >= 0, 1.0, -1.0) * error
+    beyond = (run.command < limits[0]) | (run.command > limits[1])
+    return Figures(
+        tracking_degC=np.sqrt((error**2).mean(axis=(0, 2))),
+        effort_percent=np.sqrt((run.u**2).mean(axis=(0, 2))),
+        settled_error_degC=np.abs(late).max(axis=1),
+        settled_zone=np.abs(late).argmax(axis=1),
+        settling_s=settling * sample_time_s,
+        overshoot_degC=np.maximum(past.max(axis=(0, 2)), 0.0),
+        at_limits_percent=100.0 * beyond.mean(axis=(0, 2)),
+        input_low_percent=run.u.min(axis=(0, 2)),
+        input_high_percent=run.u.max(axis=(0, 2)),
+    )
+
+
+class Allowance(NamedTuple):
+    """What the engineering cost counts as one: seconds of settling, °C of overshoot and of settled error, percent of commands outside the limits and of effort."""
+
+    settling_s: float
+    overshoot_degC: float
+    settled_error_degC: float
+    at_limits_percent: float
+    effort_percent: float
+    worst_case: float
+
+
+def engineering_cost(found: Figures, plant: np.ndarray, allowance: Allowance, *, longest_s: float) -> float:
+    """The declared cost of practical tuning: mean over scenarios of figure / allowance, summed, plus `worst_case` times that of the worst plant.
+
+    A run that never settles counts as one that settles at the end of the panel. Raises ValueError where a run leaves every scale: the candidate has failed.
+    """
+    settling = np.where(np.isnan(found.settling_s), longest_s, found.settling_s)
+    parts = [
+        settling / allowance.settling_s,
+        found.overshoot_degC / allowance.overshoot_degC,
+        found.settled_error_degC / allowance.settled_error_degC,
+        found.at_limits_percent / allowance.at_limits_percent,
+        found.effort_percent / allowance.effort_percent,
+    ]
+    each = np.sum(parts, axis=0)
+    if not (np.isfinite(each).all() and found.tracking_degC.max() < 1e4):
+        raise ValueError("the loop is unstable on a plant of the training panel")
+    worst = max(each[plant == index].mean() for index in np.unique(plant))
+    return float((each.mean() + allowance.worst_case * worst) / (1 + allowance.worst_case))
+
+
+# ---- margins
+
+
+class Margins(NamedTuple):
+    """`disk`: the smaller of the disk margins at the plant's inputs and at its outputs, all channels at once (conservative); `delay_s`: extra delay in all sensors
+    at once; `stable`: every eigenvalue of the closed loop inside the unit circle, the largest of size `radius`."""
+
+    disk: float
+    delay_s: float
+    stable: bool
+    radius: float
+
+
+def margins(plants: Sequence[Plant], law: Law, *, grid: int = 400) -> list[Margins]:
+    """Of each plant: disk margin 1 / max |S - I/2| (Seiler, Packard, Gahinet 2020, skew 0) and delay margin min (pi + arg lambda(L)) / omega over |lambda(L)| = 1."""
+    omega = np.concatenate([np.geomspace(1e-4, 0.3, grid // 2, endpoint=False), np.linspace(0.3, np.pi, grid - grid // 2)])
+    z = np.exp(1j * omega)
+    K = law_response(law, z)
+    return [_margins(plant, law, omega, z, K) for plant in plants]
+
+
+def _margins(plant: Plant, law: Law, omega: np.ndarray, z: np.ndarray, K: np.ndarray) -> Margins:
+    radius = np.abs(np.linalg.eigvals(closed_loop(plant, law))).max()
+    if radius >= 1:
+        return Margins(0.0, 0.0, False, float(radius))
+    G = plant.C @ np.linalg.solve(z[:, None, None] * np.eye(plant.n) - plant.A, np.broadcast_to(plant.B, (len(z), plant.n, plant.m)))
+    loops = (G @ K, K @ G)
+    disk = min(1 / np.linalg.norm(np.linalg.inv(np.eye(L.shape[1]) + L) - np.eye(L.shape[1]) / 2, ord=2, axis=(1, 2)).max() for L in loops)
+    return Margins(float(disk), _delay_margin(omega, np.linalg.eigvals(loops[0])) * plant.sample_time_s, True, float(radius))
+
+
+def closed_loop(plant: Plant, law: Law) -> np.ndarray:
+    """The state matrix of plant, memory and integrator together, [x; z; xi], unclipped."""
+    C, D, Kz, Kr = plant.C, law.D, law.K, law.K_r if law.integral else np.zeros_like(law.K_r)
+    p, q = plant.p, len(law.A)
+    u = np.hstack([-D @ C, -Kz, -Kr])
+    rows = [
+        np.hstack([plant.A, np.zeros((plant.n, q + p))]) + plant.B @ u,
+        np.hstack([law.B_y @ C, law.A, np.zeros((q, p))]) + law.B_u @ u,
+        np.hstack([-law.integral * C, np.zeros((p, q)), np.eye(p)]),
+    ]
+    whole = np.vstack(rows)
+    return whole if law.integral else whole[: plant.n + q, : plant.n + q]
+
+
+def law_response(law: Law, z: np.ndarray) -> np.ndarray:
+    """Frequency response K (grid, m, p) of the law, u = -K(z) y, its memory fed with its own command; by one Schur form, triangular at every frequency."""
+    T, V = scipy.linalg.schur(law.A - law.B_u @ law.K, output="complex")
+    from_y, from_xi = V.conj().T @ (law.B_y - law.B_u @ law.D), V.conj().T @ law.B_u @ law.K_r
+    K, identity = law.K @ V, np.eye(len(T))
+    response = np.empty((len(z), *law.D.shape), complex)
+    for i, point in enumerate(z):
+        xi = -law.integral / (point - 1) if law.integral else 0.0
+        response[i] = K @ scipy.linalg.solve_triangular(point * identity - T, from_y - xi * from_xi, check_finite=False) + law.D + xi * law.K_r
+    return response
+
+
+def _delay_margin(omega: np.ndarray, loci: np.ndarray) -> float:
+    """Smallest delay in samples that takes an eigenvalue of the loop to -1: both sides of each unit crossing are tried, the smaller counts."""
+    size = np.abs(loci)
+    crossing = (size[:-1] - 1) * (size[1:] - 1) < 0
+    lag = np.minimum((np.angle(loci[:-1]) + np.pi) / omega[:-1, None], (np.angle(loci[1:]) + np.pi) / omega[1:, None])
+    peak = (size > 1).any()
+    return float(lag[crossing].min()) if crossing.any() else (0.0 if peak else float("inf"))

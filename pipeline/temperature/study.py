@@ -1,0 +1,105 @@
+"""What the learners reach on the study's machine, where the optimum is known: without noise, and on many noisy data sets; the yardstick beside the paper's figures."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.temperature import window as window_route
+from pipeline.temperature.kernel import Kernel, exact_gains, regress, tuples, value_iteration, window_law
+from pipeline.temperature.plant import baam
+from pipeline.temperature.probing import study_probe, study_signal
+from pipeline.temperature.published import GAMMA, K_DATA, REFERENCE, TAU
+from pipeline.temperature.scorecard import Panel, Yardstick, cost, feed_forward, optimum, panel, regret, simulate
+from pipeline.temperature.tracking import Law, gains, observer_gain, observer_law
+
+YARDSTICK = Yardstick(np.ones(5), np.ones(7), GAMMA)
+AMPLITUDES, BANDWIDTH, VARIANCE = np.arange(100.0, 0.0, -10.0), 1.65, 1.5
+
+
+def study_panel(references: np.ndarray, *, noise: float = 0.0, seeds: tuple[int, ...] = (0,), hold: int = 0) -> Panel:
+    """The study's machine, held at 20 °C in every cell by its steady input, for each reference (k, 5); 1,000 steps."""
+    return panel([baam()], starts=[20.0], references=references, noise=[noise], seeds=seeds, steps=1000, hold=hold, cells=True)
+
+
+def gap(law: Law, scenarios: Panel) -> np.ndarray:
+    """J / J* - 1 of each scenario, unclipped, Q = R = I."""
+    run = simulate(scenarios, law, feed_forward(scenarios, law, None), limits=None)
+    return regret(cost(scenarios, run, YARDSTICK), optimum(scenarios, YARDSTICK))
+
+
+def data_sets(rng: np.random.Generator, samples: int, sets: int) -> tuple[np.ndarray, np.ndarray]:
+    """`sets` runs of the study's probing (50) from 50 °C, noise-free: u (samples, sets, 7), y (samples, sets, 5)."""
+    signal = study_signal(rng, samples, 7 * sets, amplitudes=AMPLITUDES, bandwidth=BANDWIDTH, variance=VARIANCE).reshape(samples, sets, 7)
+    found = study_probe(baam(), signal, K_DATA, x0=np.full(6, 50.0), noise=np.zeros((samples, sets, 5)))
+    return found.u, found.y
+
+
+def kernel_of(u: np.ndarray, y: np.ndarray, N: int) -> Kernel:
+    """Algorithm 2 at Q = R = I on one record, mu = 0."""
+    return value_iteration(regress(tuples([u], [y], N)), np.eye(y.shape[1]), np.eye(u.shape[1]), GAMMA)
+
+
+def law_of(kernel: Kernel, N: int) -> Law:
+    return window_law(kernel.K, kernel.K_r, kernel.k, N)
+
+
+class Exact(NamedTuple):
+    """J over 1,000 (100) steps from 20 °C, Q = R = I: the optimum that knows the state, and the observer that does not; and two prices of the start."""
+
+    optimal_J1000: float
+    optimal_J100: float
+    observer_J1000: float
+    observer_published_start_J1000: float
+    zero_history_gap: float
+
+
+def exact() -> Exact:
+    """The model-based figures of the common yardstick, and what a wrong start costs: the paper's 50 °C estimate, and a window filled with u = 0 and y(0)."""
+    plant, scenarios = baam(), study_panel(REFERENCE[None])
+    best = gains(plant, np.eye(5), np.eye(7), GAMMA)
+    short = scenarios._replace(steps=100)
+    law = observer_law(plant, best, observer_gain(plant, TAU))
+    from_50 = law._replace(start_y=np.zeros_like(law.start_y), start=np.full(plant.n, 50.0))
+    K, K_r = exact_gains(plant, best, 2)
+    history = window_law(K, K_r, best.k, 2)
+    empty = history._replace(start_u=np.zeros_like(history.start_u))
+    J = [float(cost(scenarios, simulate(scenarios, run, feed_forward(scenarios, run, None), limits=None), YARDSTICK).J[0]) for run in (law, from_50)]
+    return Exact(
+        float(optimum(scenarios, YARDSTICK).J[0]), float(optimum(short, YARDSTICK).J[0]), *J, float(gap(empty, scenarios)[0])
+    )  # fmt: skip
+
+
+class NoiseFree(NamedTuple):
+    """Gaps of Algorithm 2 on noise-free data: window of 2 on 500 and of 6 on 1,610 samples for the study's reference; one set of 540 for random references."""
+
+    gap: float
+    gap_window_6: float
+    any_reference_gap: float
+
+
+def noise_free(u: np.ndarray, y: np.ndarray, rng: np.random.Generator, *, references: int = 20) -> NoiseFree:
+    """From the study's own record u (T, 7), y (T, 5) without its first row; the worst of `references` drawn from 100 to 220 °C."""
+    one, many = study_panel(REFERENCE[None]), study_panel(rng.uniform(100.0, 220.0, (references, 5)))
+    figures = []
+    for N, samples, scenarios in ((2, 500, one), (6, 1610, one), (2, 540, many)):
+        rows = slice(0, samples + N)
+        figures.append(float(np.abs(gap(law_of(kernel_of(u[rows], y[rows], N), N), scenarios)).max()))
+    return NoiseFree(*figures)
+
+
+ROUTES = ("window", "kernel", "kernel_predicted_state")
+
+
+def under_noise(u: np.ndarray, y: np.ndarray, *, noise: float, seed: int, longest: int = 24) -> dict[str, tuple[float, float]]:
+    """(gap, r.m.s. error in °C over steps 500-1000) of each route on one data set with `noise` °C on y; the controller sees the same noise while it is judged."""
+    y = y + noise * np.random.default_rng(seed).standard_normal(y.shape)
+    scenarios, identity = study_panel(REFERENCE[None], noise=noise, seeds=(seed,), hold=longest), (np.eye(5), np.eye(7))
+    long = window_route.learn([u], [y], longest=longest)
+    predicted = value_iteration(regress(window_route.predicted_tuples(long, [u], [y])), *identity, GAMMA)
+    laws = (window_route.law(long, *identity, GAMMA), law_of(kernel_of(u, y, 2), 2), law_of(predicted, long.N))
+    result = {}
+    for name, law in zip(ROUTES, laws, strict=True):
+        run = simulate(scenarios, law, feed_forward(scenarios, law, None), limits=None)
+        late = (run.y - scenarios.r)[500:]
+        result[name] = (float(regret(cost(scenarios, run, YARDSTICK), optimum(scenarios, YARDSTICK))[0]), float(np.sqrt((late**2).mean())))
+    return result
