@@ -150,6 +150,35 @@ class Regression(NamedTuple):
     def samples_needed(self) -> int:
         return self.unknowns
 
+    def stored(self) -> dict[str, tuple[np.ndarray, str, str]]:
+        """The regression as named arrays with unit and meaning, for an artifact; `restored` reads them back."""
+        return {name: (np.asarray(getattr(self, name), float), *_STORED[name]) for name in self._fields}
+
+
+_STORED = {
+    "G": ("1", "half-vector of the whitened state's second moment a step later, on that of v"),
+    "G_e": ("degC^2", "half-vector of e e' on that of v"),
+    "G_u": ("percent^2", "half-vector of u u' on that of v"),
+    "step": ("1", "whitened state a step later, on v"),
+    "output": ("degC", "e on v"),
+    "W": ("1 per degC | 1 per percent", "whitened state on the raw window and a constant"),
+    "u_scale": ("percent", "scale of u in v"),
+    "base": ("degC", "what e is counted from"),
+    "N": ("steps", "length of the raw window"),
+    "singular_values": ("degC | percent", "of the state over the record, r.m.s."),
+    "rank": ("1", "length of v"),
+    "unknowns": ("1", "identifiable entries of the kernel"),
+    "entries": ("1", "entries of the kernel in the published form"),
+    "samples": ("1", "complete windows"),
+    "condition": ("1", "of the scaled Gram matrix"),
+}
+
+
+def restored(arrays: dict[str, np.ndarray]) -> Regression:
+    """The Regression whose `stored` arrays these are."""
+    whole = ("N", "rank", "unknowns", "entries", "samples")
+    return Regression(**{name: int(value) if name in whole else float(value) if name == "condition" else value for name, value in arrays.items()})
+
 
 def whitening(s: np.ndarray, s_next: np.ndarray, *, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
     """W (q, k) that maps s on its range and makes its second moment the identity, from s and its successor together; and all singular values (r.m.s.)."""

@@ -150,3 +150,17 @@ def spread(nominal: Plant, *, input_gain: float, loss: float, scale: Sequence[fl
             B[:, column] *= 1 + sign * input_gain
             family.append(nominal._replace(B=B))
     return [*family, nominal._replace(A=nominal.A - loss * np.eye(nominal.n))]
+
+
+def stored(plants: Sequence[Plant]) -> dict[str, tuple[np.ndarray, str, str]]:
+    """Plants of one order as named arrays with unit and meaning, stacked along the first axis, for an artifact; `restored` reads them back."""
+    meaning = {
+        "A": ("1", "state matrix"), "B": ("per percent", "input matrix"), "C": ("degC", "output matrix"), "D": ("degC per percent", "feed-through"),
+        "b": ("1", "offset of the state"), "d": ("degC", "offset of the output"), "K": ("per degC", "Kalman gain"),
+        "sample_time_s": ("s", "one step"),
+    }  # fmt: skip
+    return {name: (np.stack([np.asarray(getattr(plant, name), float) for plant in plants]), *meaning[name]) for name in Plant._fields}
+
+
+def restored(arrays: dict[str, np.ndarray]) -> list[Plant]:
+    return [plant(*(arrays[name][i] for name in Plant._fields)) for i in range(len(arrays["A"]))]

@@ -72,13 +72,13 @@ def model_based(weights: tuple[np.ndarray, np.ndarray], K0: np.ndarray) -> Figur
 
 
 def kernel_gains(u: np.ndarray, y: np.ndarray, weights: list[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarray]:
-    """Algorithm 2 with the study's settings on its log u (15000, 7), y (15000, 5): N = 6, mu = 1e-4, data / 1000, H from I, stop at 1e-3. K (7, 77) on [w; r]."""
+    """Algorithm 2 with the study's settings on its log u (15000, 7), y (15000, 5): N = 6, mu = 1e-4, data / 1000, H from I, stop at 1e-3. K (7, 73) on [w; constant], the constant for the study's reference."""
     N, scale = 6, 1000.0
     r = REFERENCE / scale
     # the last row has no successor in the script
     data = regress(tuples_with_reference([u[:-1] / scale], [y[:-1] / scale], N, r, np.eye(5)), mu=1e-4)
     learned = [value_iteration(data, np.diag(q), np.diag(rho), GAMMA, tolerance=1e-7) for q, rho in weights]
-    return [np.column_stack([kernel.K, kernel.k]) for kernel in learned]
+    return [np.column_stack([kernel.K, kernel.k + kernel.K_r @ r]) for kernel in learned]
 
 
 def data_driven(q: np.ndarray, K: np.ndarray) -> Figures:

@@ -1,5 +1,6 @@
 """What the learners reach on the study's machine, where the optimum is known: without noise, and on many noisy data sets; the yardstick beside the paper's figures."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -8,7 +9,7 @@ from pipeline.temperature import window as window_route
 from pipeline.temperature.kernel import Kernel, exact_gains, regress, tuples, value_iteration, window_law
 from pipeline.temperature.plant import baam
 from pipeline.temperature.probing import study_probe, study_signal
-from pipeline.temperature.published import GAMMA, K_DATA, REFERENCE, TAU
+from pipeline.temperature.published import GAMMA, K_DATA, PRINTED, REFERENCE, TAU, Figures
 from pipeline.temperature.scorecard import Panel, Yardstick, cost, feed_forward, optimum, panel, regret, simulate
 from pipeline.temperature.tracking import Law, gains, observer_gain, observer_law
 
@@ -87,6 +88,7 @@ def noise_free(u: np.ndarray, y: np.ndarray, rng: np.random.Generator, *, refere
     return NoiseFree(*figures)
 
 
+NOISE = (0.1, 0.5)
 ROUTES = ("window", "kernel", "kernel_predicted_state")
 
 
@@ -102,4 +104,37 @@ def under_noise(u: np.ndarray, y: np.ndarray, *, noise: float, seed: int, longes
         run = simulate(scenarios, law, feed_forward(scenarios, law, None), limits=None)
         late = (run.y - scenarios.r)[500:]
         result[name] = (float(regret(cost(scenarios, run, YARDSTICK), optimum(scenarios, YARDSTICK))[0]), float(np.sqrt((late**2).mean())))
+    return result
+
+
+def rows(work: Sequence[tuple[float, int]], found: Sequence[dict[str, tuple[float, float]]]) -> dict[str, list]:
+    """`under_noise` of each (noise, data set) as columns, one row a route."""
+    table = [(route, noise, index, *result[route]) for (noise, index), result in zip(work, found, strict=True) for route in ROUTES]
+    route, noise, index, gaps, errors = (list(column) for column in zip(*table, strict=True))
+    finite = [[value if np.isfinite(value) else np.nan for value in column] for column in (gaps, errors)]
+    return {"route": route, "noise_degC": noise, "data_set": index, "gap": finite[0], "error_degC": finite[1]}
+
+
+def metrics(as_published: dict[str, Figures], exact: Exact, noise_free: NoiseFree, table: dict[str, list], *, failures: int, starts: int) -> dict:
+    """The figures by which the learners are known: as published, on the common yardstick without noise, and over the noisy data sets."""
+    result = {
+        "as_published": {name: found._asdict() for name, found in as_published.items()},
+        "printed": PRINTED,
+        "algorithm_1": {"failures": failures, "of": starts},
+        "optimal": {"J1000": exact.optimal_J1000, "J100": exact.optimal_J100},
+        "observer": {"J1000": exact.observer_J1000, "J1000_from_50_degC": exact.observer_published_start_J1000},
+        "takeover": {"zero_history_gap": exact.zero_history_gap},
+        "kernel": {"gap": noise_free.gap, "gap_window_6": noise_free.gap_window_6, "any_reference_gap": noise_free.any_reference_gap},
+        "window": {},
+        "kernel_predicted_state": {},
+    }
+    for route in ROUTES:
+        for noise in NOISE:
+            mine = [i for i, (r, n) in enumerate(zip(table["route"], table["noise_degC"], strict=True)) if (r, n) == (route, noise)]
+            gaps, errors = (np.nan_to_num([table[name][i] for i in mine], nan=np.inf) for name in ("gap", "error_degC"))
+            stable = int((gaps < 1).sum())
+            figures = {"median_gap": np.median(gaps), "worst_gap": gaps.max(), "median_error_degC": np.median(errors)}
+            result[route][f"noise_{noise:g}".replace(".", "_")] = {
+                **{name: float(value) if np.isfinite(value) else None for name, value in figures.items()}, "stable": stable, "of": len(mine),
+            }  # fmt: skip
     return result

@@ -99,3 +99,19 @@ def predicted_tuples(window: Window, u: Sequence[np.ndarray], y: Sequence[np.nda
     features[:order, :-1], features[:order, -1], features[order:, -1] = T, -T @ centre, 1.0
     base = y_now.mean(axis=0) * offset
     return Tuples(np.hstack([(w - centre) @ T.T, one]), u_now, y_now - base, np.hstack([(w_next - centre) @ T.T, one]), features, window.N, base)
+
+
+def stored(window: Window) -> dict[str, tuple[np.ndarray, str, str]]:
+    """The window as named arrays with unit and meaning, for an artifact; `restored` reads them back."""
+    return {
+        "Theta": (window.Theta, "degC per percent | degC per degC", "one-step predictor on [u(t-1); ...; u(t-N); y(t-1); ...; y(t-N)]"),
+        "theta_0": (window.theta_0, "degC", "its constant"),
+        "covariance": (window.covariance, "degC^2", "covariance of the innovation"),
+        "N": (np.array(window.N), "steps", "length of the window"),
+        "samples": (np.array(window.samples), "1", "complete windows that it was learned from"),
+        "table": (window.table, "1", "per candidate: length, parameters, Akaike's criterion"),
+    }
+
+
+def restored(arrays: dict[str, np.ndarray]) -> Window:
+    return Window(**{**arrays, "N": int(arrays["N"]), "samples": int(arrays["samples"])})

@@ -1,0 +1,147 @@
+"""A folder of recordings -> one record: which files, which were done before, which are broken; the work itself is recordings.py's.
+
+The memo is content-addressed: the hash of the recording, of the job's parameters and of the code that reads names the result, so that one more recording costs one.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import joblib
+import numpy as np
+
+from pipeline import artifacts, schemas
+from pipeline.params import Execution, Plant
+from pipeline.quality import flag
+from pipeline.recordings import Source, Table, nearest_names, read
+from pipeline.resampling import resample
+
+CODE = Path(__file__).parent
+
+
+class Job(NamedTuple):
+    """What to take from every recording: the machine's signals, mapping {signal: (source, unit, scale, offset)} (empty: our own names), the clock, the gap limit."""
+
+    machine: Plant
+    mapping: dict[str, tuple[str, str, float, float]]
+    time: str
+    max_gap_s: float
+
+    def sources(self) -> list[Source]:
+        signals = [*self.machine.inputs, *self.machine.outputs]
+        unknown = sorted(set(self.mapping) - {signal.name for signal in signals})
+        if unknown:
+            raise ValueError(f"params.yaml: ingest.mapping.{unknown[0]} is no signal of the plant; {nearest_names(unknown[0], [s.name for s in signals])}")
+        found = []
+        for signal in signals:
+            source, unit, scale, offset = self.mapping.get(signal.name, (signal.name, signal.unit, 1.0, 0.0))
+            if unit != signal.unit:
+                raise ValueError(
+                    f"params.yaml: ingest.mapping.{signal.name}.unit is {unit} but the plant's {signal.name} is in {signal.unit}; "
+                    f"convert with scale and offset, and write unit: {signal.unit}"
+                )
+            found.append(Source(signal.name, source, unit, scale, offset))
+        return found
+
+
+class Result(NamedTuple):
+    """One recording's share of the record and of its findings; `reason` is why it was quarantined, empty where it was not."""
+
+    name: str
+    record: dict[str, np.ndarray]
+    quality: dict[str, np.ndarray]
+    reason: str
+    reused: bool
+
+
+class Filled(NamedTuple):
+    schema: schemas.Schema
+    columns: dict[str, np.ndarray]
+
+
+def process(folder: Path, job: Job, execution: Execution, *, memo: Path) -> list[Result]:
+    """Every recording below `folder`, in the order of names, on as many workers as `execution` says. Raises ValueError where there is none."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and not path.name.startswith(".") and path.suffix.lower() not in {".md", ".txt", ".yaml"})
+    if not files:
+        raise ValueError(f"{folder}: expected at least one recording (CSV, Parquet or MCAP), found none; copy one there, or set generate_probing.source: simulated")
+    job.sources()
+    code = "".join(artifacts.sha256(path) for path in sorted(CODE.glob("*.py")))
+    keys = [joblib.hash((artifacts.sha256(path), path.relative_to(folder).as_posix(), job.machine.model_dump(), job[1:], code)) for path in files]
+    done = [(memo / f"{key}.record.parquet").exists() and (memo / f"{key}.quality.parquet").exists() for key in keys]
+    todo = [(path, key) for path, key, known in zip(files, keys, done, strict=True) if not known]
+    reasons = dict(zip([key for _, key in todo], _run(todo, folder, job, execution, memo), strict=True))
+    return [_result(path.relative_to(folder).as_posix(), key, job, memo, reasons.get(key, ""), known) for path, key, known in zip(files, keys, done, strict=True)]
+
+
+def _run(todo: Sequence[tuple[Path, str]], folder: Path, job: Job, execution: Execution, memo: Path) -> list[str]:
+    if len(todo) < 2 and execution.backend == "loky":
+        return [_one(path, key, folder, job, memo) for path, key in todo]
+    if execution.backend == "dask":
+        try:
+            import distributed
+        except ImportError:
+            raise ValueError("params.yaml: execution.backend is dask but dask is not installed; run with ./run --group cluster, or set execution.backend: loky") from None
+        with distributed.Client(execution.scheduler, timeout="20s"), joblib.parallel_config(backend="dask"):
+            return joblib.Parallel()(joblib.delayed(_one)(path.resolve(), key, folder.resolve(), job, memo.resolve()) for path, key in todo)
+    return joblib.Parallel(n_jobs=execution.jobs, backend="loky")(joblib.delayed(_one)(path, key, folder, job, memo) for path, key in todo)
+
+
+def _one(path: Path, key: str, folder: Path, job: Job, memo: Path) -> str:
+    """Read, resample and flag one recording into the memo; the reason why it cannot be, or an empty text."""
+    name = path.relative_to(folder).as_posix()
+    inputs, outputs = [s.name for s in job.machine.inputs], [s.name for s in job.machine.outputs]
+    try:
+        raw = read(path, job.sources(), time=job.time)
+        table = resample(raw, sample_time_s=job.machine.sample_time_s, inputs=inputs, outputs=outputs, max_gap_s=job.max_gap_s)
+    except ValueError as reason:
+        return " ".join(str(reason).split())
+    limits = {s.name: (s.low, s.high) for s in job.machine.inputs}
+    table = flag(table, units={s.name: s.unit for s in [*job.machine.inputs, *job.machine.outputs]}, limits=limits)
+    findings = [(f.kind, f.signal, f.start_s, f.end_s, f.count, f.message) for f in table.flags]
+    findings += [(n.kind, n.signal, np.nan, np.nan, n.count, n.message) for n in raw.notes]
+    artifacts.write_table(memo / f"{key}.record.parquet", schemas.record(job.machine.inputs, job.machine.outputs), _columns(name, table))
+    kinds, signals, starts, ends, counts, messages = [list(column) for column in zip(*findings, strict=True)] if findings else [[]] * 6
+    quality = {"recording": [name] * len(findings), "signal": signals, "kind": kinds, "start_s": starts, "end_s": ends, "count": counts, "message": messages}
+    artifacts.write_table(memo / f"{key}.quality.parquet", schemas.QUALITY, quality)
+    return ""
+
+
+def _columns(name: str, table: Table) -> dict[str, np.ndarray | list[str]]:
+    columns = {"recording": [name] * len(table.time_s), "segment": table.segment, "time_s": table.time_s}
+    for signal, values in table.values.items():
+        columns |= {signal: values, f"{signal}_masked": table.masked[signal]}
+    return columns
+
+
+def _result(name: str, key: str, job: Job, memo: Path, reason: str, reused: bool) -> Result:
+    if reason:
+        return Result(name, {}, {}, reason, False)
+    record = artifacts.read_table(memo / f"{key}.record.parquet", schemas.record(job.machine.inputs, job.machine.outputs))
+    return Result(name, record, artifacts.read_table(memo / f"{key}.quality.parquet", schemas.QUALITY), "", reused)
+
+
+def collect(results: Sequence[Result], machine: Plant, *, strict: bool) -> tuple[Filled, Filled, dict]:
+    """One record and one table of findings in the order of names, and the metrics. Raises ValueError where no recording is left, or `strict` and one is broken."""
+    broken = [result for result in results if result.reason]
+    if broken and (strict or len(broken) == len(results)):
+        raise ValueError(broken[0].reason + (f" ({len(broken)} of {len(results)} recordings are broken)" if len(results) > 1 else ""))
+    good = [result for result in results if not result.reason]
+    schema = schemas.record(machine.inputs, machine.outputs)
+    record = {column.name: np.concatenate([result.record[column.name] for result in good]) for column in schema.columns}
+    quality = {column.name: np.concatenate([result.quality[column.name] for result in good]) for column in schemas.QUALITY.columns}
+    for result in broken:
+        row = {"recording": result.name, "signal": "", "kind": "quarantined", "start_s": np.nan, "end_s": np.nan, "count": 1, "message": result.reason}
+        quality = {name: np.append(values, np.array([row[name]], values.dtype)) for name, values in quality.items()}
+    counts: dict[str, dict[str, int]] = {}
+    for signal, kind, count in zip(quality["signal"], quality["kind"], quality["count"], strict=True):
+        of = counts.setdefault(str(signal) or "recording", {})
+        of[str(kind)] = of.get(str(kind), 0) + int(count)
+    metrics = {
+        "recordings": len(results), "processed": sum(not r.reused and not r.reason for r in results), "reused": sum(r.reused for r in results),
+        "quarantined": len(broken), "samples": len(record["time_s"]), "segments": int(_segments(record)), "findings": counts,
+    }  # fmt: skip
+    return Filled(schema, record), Filled(schemas.QUALITY, quality), metrics
+
+
+def _segments(record: dict[str, np.ndarray]) -> int:
+    return 1 + ((record["recording"][1:] != record["recording"][:-1]) | (record["segment"][1:] != record["segment"][:-1])).sum()

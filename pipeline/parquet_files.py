@@ -1,0 +1,112 @@
+"""Parquet from other people's programs, read a part at a time."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from pipeline.formats import Column, Columns, column_place, every, is_time_name, seconds, time_column
+from pipeline.signals import Note
+
+ROWS_AT_ONCE = 50_000
+
+
+def _parquet(path: Path) -> pq.ParquetFile:
+    try:
+        return pq.ParquetFile(path, page_checksum_verification=True)
+    except (OSError, pa.ArrowException) as error:
+        raise ValueError(f"{path} is not a whole Parquet file ({_first_line(error)}); its index is at its end, so copy the recording again") from None
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0]
+
+
+def _flat(table: pa.Table) -> pa.Table:
+    while any(pa.types.is_struct(field.type) for field in table.schema):
+        table = table.flatten()
+    return table
+
+
+def _is_numeric(kind: pa.DataType) -> bool:
+    return pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind) or pa.types.is_decimal(kind)
+
+
+def parquet_columns(path: Path) -> list[Column]:
+    """The columns of a Parquet file; of a structure its parts as "a.b"."""
+    columns = []
+    for name, field in _leaves(_parquet(path).schema_arrow, ""):
+        kind = "number" if _is_numeric(field.type) else "time" if pa.types.is_timestamp(field.type) else str(field.type)
+        columns.append(Column(name, kind, (field.metadata or {}).get(b"unit", b"").decode(errors="replace")))
+    return columns
+
+
+def _leaves(fields: pa.Schema | pa.StructType, prefix: str) -> Iterator[tuple[str, pa.Field]]:
+    for field in fields:
+        if pa.types.is_struct(field.type):
+            yield from _leaves(field.type, f"{prefix}{field.name}.")
+        else:
+            yield prefix + field.name, field
+
+
+def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns, list[Note]]:
+    """The wanted columns, NaN where a value is null. Raises ValueError for a missing column, one that is no number, or a damaged file."""
+    columns = parquet_columns(path)
+    names = [column.name for column in columns]
+    interval = every(time)
+    clock = ""
+    if not interval:
+        stamps = [column.name for column in columns if column.type == "time"]
+        clock = stamps[0] if not time and stamps and all(not is_time_name(name) for name in names) else time_column(path, names, time)
+    for name in wanted:
+        column = columns[column_place(path, names, name)]
+        if column.type != "number":
+            raise ValueError(f"{path}: column {name} should hold numbers but is of type {column.type}; write numbers, or map another column")
+    read = list(dict.fromkeys([*wanted, *([clock] if clock else [])]))
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in read}
+    rows = 0
+    try:
+        for batch in _parquet(path).iter_batches(ROWS_AT_ONCE, columns=sorted({name.split(".")[0] if "." in name else name for name in read} | set(read))):
+            table = _flat(pa.Table.from_batches([batch]))
+            rows += table.num_rows
+            for name in read:
+                parts[name].append(_array(path, name, table[name], clock))
+    except (OSError, pa.ArrowException) as error:
+        raise ValueError(f"{path}: a column cannot be read ({_first_line(error)}); the file is damaged, so copy the recording again") from None
+    if not rows:
+        raise ValueError(f"{path}: the table should have rows but has none; record it again or remove it")
+    values = {name: np.concatenate(part) for name, part in parts.items()}
+    notes: list[Note] = []
+    if interval:
+        clock_values, said = np.arange(rows) * interval, ""
+    else:
+        clock_values, said = (values[clock], "") if values[clock].dtype == np.int64 else seconds(clock, values[clock])
+    if said:
+        notes.append(Note("clock", "", 1, said))
+    return Columns("rows", clock_values, {name: values[name] for name in wanted}, lambda i: f"row {i}"), notes
+
+
+def _array(path: Path, name: str, column: pa.ChunkedArray, clock: str) -> np.ndarray:
+    if pa.types.is_timestamp(column.type):
+        if column.null_count:
+            raise ValueError(f"{path}: time {name} is missing in {column.null_count} rows; remove them")
+        instants = column.cast(pa.timestamp("ns", column.type.tz)).cast(pa.int64())
+        return _numbers(instants, np.int64)
+    if name == clock and not _is_numeric(column.type):
+        raise ValueError(f"{path}: time {name} should be seconds or a timestamp but is of type {column.type}; convert it, or name another column")
+    return _numbers(column.cast(pa.float64(), safe=False), np.float64)
+
+
+def _numbers(column: pa.ChunkedArray, kind: type) -> np.ndarray:
+    """The values of a column, NaN for null; to_numpy and fill_null would do it too, but load pandas, which takes longer than all the rest."""
+    parts = [np.empty(0, kind)]
+    for chunk in column.chunks:
+        valid, content = chunk.buffers()
+        part = np.frombuffer(content, kind)[chunk.offset : chunk.offset + len(chunk)]
+        if chunk.null_count:
+            bits = np.unpackbits(np.frombuffer(valid, np.uint8), bitorder="little")[chunk.offset : chunk.offset + len(chunk)]
+            part = np.where(bits.astype(bool), part, np.nan)
+        parts.append(part)
+    return np.concatenate(parts)

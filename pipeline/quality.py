@@ -1,0 +1,283 @@
+"""What is doubtful in a table: spikes, frozen sensors, rails, constants, quantisation, units, two devices under one name; said with place and count, and masked where wrong."""
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from pipeline.signals import Flag, Table
+
+SPIKE_WINDOW = 7
+# a spike is beyond eight robust standard deviations of the residual of the local median, and beyond three times what its neighbours do among themselves
+SPIKE_SIGMAS, SPIKE_OVER_NEIGHBOURS = 8.0, 3.0
+SPIKE_LONGEST = 2
+FROZEN_SHORTEST, FROZEN_OVER_USUAL = 30, 5.0
+RAIL_SHORTEST = 10
+# an extruder's barrel, nozzle and bed: beyond it a number in °C is doubtful; rooms in °C, K and °F for a machine at rest
+HOTTEST_DEGC = 450.0
+ROOM_KELVIN, ROOM_FAHRENHEIT = (283.0, 313.0), (55.0, 100.0)
+_CELSIUS = {"degc", "°c", "c", "celsius"}
+_PERCENT = {"percent", "%", "pct"}
+
+
+def flag(table: Table, *, units: Mapping[str, str], limits: Mapping[str, tuple[float, float]]) -> Table:
+    """The table with what is doubtful flagged and, where it is no measurement, masked; values stay as they are.
+
+    `limits` are {input: (low, high)} in its unit: its signals are the inputs, all others outputs. Masked: spike, frozen. Reported only: quantised, saturated,
+    outside (an input beyond its limits), constant, unit (looks like kelvin, fahrenheit, a duty of 0-1), mixed (as if two devices wrote in turn).
+    """
+    outputs = [name for name in table.values if name not in limits]
+    flags, masked = list(table.flags), {name: mask.copy() for name, mask in table.masked.items()}
+    for name in outputs:
+        for found in (_spikes(table, name), _frozen(table, name)):
+            for one, where in found:
+                flags.append(one)
+                masked[name][where] = True
+    checked = table._replace(masked=masked)
+    for name in outputs:
+        for check in (_constant, _quantised, _rails, _mixed):
+            flags += check(checked, name)
+    for name, (low, high) in limits.items():
+        if name in table.values:
+            flags += _constant(checked, name) + _at_limits(checked, name, low, high)
+    flags += _unit_flags(checked, units, limits)
+    return checked._replace(flags=flags)
+
+
+def _usable(table: Table, name: str) -> np.ndarray:
+    return table.values[name][~table.masked[name]]
+
+
+def _flag(table: Table, name: str, kind: str, where: np.ndarray, message: str) -> Flag:
+    return Flag(name, kind, float(table.time_s[where[0]]), float(table.time_s[where[-1]]), len(where), message)
+
+
+def _groups(where: np.ndarray, segment: np.ndarray) -> list[np.ndarray]:
+    """Sorted indices split where they are not neighbours or where a segment ends."""
+    if not len(where):
+        return []
+    return np.split(where, np.flatnonzero((np.diff(where) > 1) | (np.diff(segment[where]) != 0)) + 1)
+
+
+def _in_segments(table: Table, name: str, of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """`of` the values of each segment, gaps of masked values bridged by the last one before."""
+    found = np.zeros(len(table.time_s))
+    values = np.where(table.masked[name], np.nan, table.values[name])
+    for one in range(int(table.segment[-1]) + 1):
+        inside = np.flatnonzero(table.segment == one)
+        known = inside[np.isfinite(values[inside])]
+        if len(known):
+            last = np.maximum(np.searchsorted(known, inside, side="right") - 1, 0)
+            found[inside] = of(values[known[last]])
+    return found
+
+
+# ---- spikes
+
+
+def _spikes(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
+    """Isolated samples that leave the local median and come back (Hampel 1974, with guards for quantised and for smooth signals)."""
+    residual = _in_segments(table, name, lambda y: y - median_filter(y, SPIKE_WINDOW, mode="nearest"))
+    usable = ~table.masked[name]
+    size = np.abs(residual)
+    if usable.sum() < 3 * SPIKE_WINDOW:
+        return []
+    # the median alone is 0 for a quantised signal, so the 90th percentile and the step of the values count too
+    sigma = max(1.4826 * np.median(size[usable]), np.percentile(size[usable], 90) / 1.645, quantisation_step(table.values[name][usable]))
+    found = []
+    for group in _groups(np.flatnonzero(usable & (size > SPIKE_SIGMAS * sigma)), table.segment):
+        if len(group) <= SPIKE_LONGEST and _stands_alone(table, name, group, size[group].min()):
+            at, value = float(table.time_s[group[0]]), float(table.values[name][group[0]])
+            local = value - float(residual[group[0]])
+            message = f"{name} is {value:g} at {at:g} s while its neighbours are at {local:g}: a spike of the sensor, masked"
+            found.append((_flag(table, name, "spike", group, message), group))
+    return found
+
+
+def _stands_alone(table: Table, name: str, group: np.ndarray, size: float) -> bool:
+    """Whether the neighbours on both sides go on as if the group were not there."""
+    inside = np.flatnonzero(table.segment == table.segment[group[0]])
+    near = inside[(inside >= group[0] - SPIKE_WINDOW) & (inside <= group[-1] + SPIKE_WINDOW)]
+    others = near[~np.isin(near, group) & ~table.masked[name][near]]
+    if not (others < group[0]).any() or not (others > group[-1]).any():
+        return False
+    changes = np.abs(np.diff(table.values[name][others]))
+    return size > SPIKE_OVER_NEIGHBOURS * changes.max(initial=0.0)
+
+
+def quantisation_step(values: np.ndarray) -> float:
+    """The step of a quantised signal; 0 where the levels have no common step.
+
+    The median distance d of neighbouring levels is the step if nine tenths of the distances are whole multiples of it (to a tenth: rounded print-outs of
+    0.0322 differ by 0.032 or 0.033) and if values come back to their levels, at least three times each.
+    """
+    levels = np.unique(values)
+    if len(levels) < 2 or len(levels) > len(values) / 3:
+        return 0.0
+    distances = np.diff(levels)
+    # levels that differ by rounding alone are one
+    distances = distances[distances > 1e-9 * max(1.0, float(np.abs(levels).max()))]
+    if not len(distances):
+        return 0.0
+    step = float(np.median(distances))
+    ratio = distances / step
+    whole = np.abs(ratio - np.rint(ratio)) <= 0.1 * np.maximum(1.0, np.rint(ratio))
+    return step if np.mean(whole & (ratio > 0.5)) >= 0.9 else 0.0
+
+
+# ---- frozen, rails, constants
+
+
+def _runs(table: Table, name: str) -> list[tuple[int, int]]:
+    """(first, last) of stretches of equal values within segments; masked samples end a stretch."""
+    values = np.where(table.masked[name], np.nan, table.values[name])
+    same = (values[1:] == values[:-1]) & (table.segment[1:] == table.segment[:-1])
+    starts = np.flatnonzero(np.r_[True, ~same])
+    ends = np.r_[starts[1:], len(values)] - 1
+    return [(int(a), int(b)) for a, b in zip(starts, ends, strict=True) if np.isfinite(values[a])]
+
+
+def _long(runs: list[tuple[int, int]], shortest: int) -> float:
+    """A stretch beyond that is unusual for this signal: a slow or coarse one rests long, and often."""
+    lengths = [b - a + 1 for a, b in runs]
+    return max(float(shortest), FROZEN_OVER_USUAL * float(np.percentile(lengths, 95))) if lengths else np.inf
+
+
+def _frozen(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
+    """Stretches of one value, far longer than usual for the signal, in which what drives or surrounds it moves on."""
+    runs = _runs(table, name)
+    limit = _long(runs, FROZEN_SHORTEST)
+    found = []
+    for first, last in runs:
+        if last - first + 1 <= limit or (first, last) == (0, len(table.time_s) - 1) or _is_rail(table, name, first, last):
+            continue
+        moving = [other for other in table.values if other != name and _moves(table, other, first, last)]
+        if moving:
+            where = np.arange(first + 1, last + 1)
+            message = f"{name} stays at {table.values[name][first]:g} for {last - first + 1} samples while {', '.join(moving[:3])} move: a frozen sensor, masked"
+            found.append((_flag(table, name, "frozen", where, message), where))
+    return found
+
+
+def _moves(table: Table, name: str, first: int, last: int) -> bool:
+    """Whether a signal changes over a stretch by a tenth of its own range."""
+    values = np.where(table.masked[name], np.nan, table.values[name])
+    inside = values[first : last + 1]
+    inside, all_values = inside[np.isfinite(inside)], values[np.isfinite(values)]
+    return len(inside) > 1 and np.ptp(all_values) > 0 and np.ptp(inside) >= 0.1 * np.ptp(all_values)
+
+
+def _is_rail(table: Table, name: str, first: int, last: int) -> bool:
+    """Whether a stretch lies on the largest or smallest value of all, and the signal came there from elsewhere: a machine at rest begins at its smallest."""
+    usable = _usable(table, name)
+    begins = first == 0 or table.segment[first] != table.segment[first - 1]
+    value = table.values[name][first]
+    return not begins and bool(value in (usable.max(), usable.min()))
+
+
+def _rails(table: Table, name: str) -> list[Flag]:
+    runs = _runs(table, name)
+    limit = _long(runs, RAIL_SHORTEST)
+    flags = []
+    for value, side in ((np.max, "largest"), (np.min, "smallest")):
+        usable = _usable(table, name)
+        if not len(usable) or np.ptp(usable) == 0:
+            continue
+        rail = value(usable)
+        long = [(a, b) for a, b in runs if table.values[name][a] == rail and b - a + 1 > limit and _is_rail(table, name, a, b)]
+        if long:
+            where = np.concatenate([np.arange(a, b + 1) for a, b in long])
+            message = f"{name} stays at {rail:g}, its {side} value, for {len(where)} samples in {len(long)} stretches: the sensor or its converter is saturated"
+            flags.append(_flag(table, name, "saturated", where, message))
+    return flags
+
+
+def _constant(table: Table, name: str) -> list[Flag]:
+    usable = _usable(table, name)
+    if not len(usable) or np.ptp(usable) > 0:
+        return []
+    message = f"{name} is {usable[0]:g} throughout: the recording says nothing of what it does; move it, or leave it out"
+    return [_flag(table, name, "constant", np.arange(len(table.time_s)), message)]
+
+
+def _at_limits(table: Table, name: str, low: float, high: float) -> list[Flag]:
+    values, usable, flags = table.values[name], ~table.masked[name], []
+    tolerance = 1e-6 * (high - low)
+    for limit, at in ((low, np.abs(values - low) <= tolerance), (high, np.abs(values - high) <= tolerance)):
+        where = np.flatnonzero(at & usable)
+        if len(where) and np.ptp(values[usable]) > 0:
+            message = f"{name} is at its limit {limit:g} in {len(where)} of {usable.sum()} samples: there it follows the limit, not the controller"
+            flags.append(_flag(table, name, "saturated", where, message))
+    where = np.flatnonzero(usable & ((values < low - tolerance) | (values > high + tolerance)))
+    if len(where):
+        message = f"{name} is beyond its limits {low:g} to {high:g} in {len(where)} samples (up to {values[where].max():g}); mend the limits or the mapping"
+        flags.append(_flag(table, name, "outside", where, message))
+    return flags
+
+
+def _quantised(table: Table, name: str) -> list[Flag]:
+    usable = _usable(table, name)
+    step = quantisation_step(usable) if len(usable) else 0.0
+    if not step:
+        return []
+    levels = len(np.unique(usable))
+    message = f"{name} comes in steps of {step:.3g} ({levels} levels): that is a noise of {step / np.sqrt(12):.2g} that no model explains"
+    return [_flag(table, name, "quantised", np.flatnonzero(~table.masked[name]), message)]
+
+
+def _mixed(table: Table, name: str) -> list[Flag]:
+    """Whether every second sample goes on as one record and those between as another."""
+    values = np.where(table.masked[name], np.nan, table.values[name])
+    one, two = np.abs(values[1:] - values[:-1]), np.abs(values[2:] - values[:-2])
+    one, two = one[np.isfinite(one)], two[np.isfinite(two)]
+    if len(two) < 20 or np.median(one) <= 10 * np.median(two) or np.percentile(one, 10) <= 3 * np.percentile(two, 90):
+        return []
+    message = f"{name} jumps by {np.median(one):g} at every sample but moves by {np.median(two):g} over two: two devices seem to write under one name"
+    return [_flag(table, name, "mixed", np.arange(len(table.time_s)), message)]
+
+
+# ---- units
+
+
+def _unit_flags(table: Table, units: Mapping[str, str], limits: Mapping[str, tuple[float, float]]) -> list[Flag]:
+    resting = _at_rest(table, units, limits)
+    flags = []
+    for name in table.values:
+        usable, unit = _usable(table, name), units.get(name, "").casefold()
+        if not len(usable):
+            continue
+        said = _doubtful_celsius(name, usable, resting) if unit in _CELSIUS else _doubtful_percent(name, usable, limits.get(name, (0.0, 100.0))[1]) if unit in _PERCENT else ""
+        if said:
+            flags.append(_flag(table, name, "unit", np.flatnonzero(~table.masked[name]), said))
+    return flags
+
+
+def _at_rest(table: Table, units: Mapping[str, str], limits: Mapping[str, tuple[float, float]]) -> bool:
+    """Whether the recording begins on a machine at the room's temperature: every input at 0 or its lowest, or several temperatures that are alike."""
+    first = {name: float(_usable(table, name)[0]) for name in table.values if len(_usable(table, name))}
+    idle = bool(limits) and all(first.get(name, np.nan) in (0.0, low) for name, (low, _) in limits.items())
+    starts = [value for name, value in first.items() if name not in limits and units.get(name, "").casefold() in _CELSIUS]
+    return idle or (len(starts) > 1 and np.ptp(starts) <= 3.0)
+
+
+def _doubtful_celsius(name: str, values: np.ndarray, resting: bool) -> str:
+    first, middle = values[0], float(np.median(values))
+    if values.min() < -273.15:
+        return f"{name} falls to {values.min():g} °C, which no temperature does; mend the mapping's scale and offset"
+    if middle > HOTTEST_DEGC or (resting and ROOM_KELVIN[0] <= first <= ROOM_KELVIN[1]):
+        return f"{name} begins at {first:g} and is {middle:g} in the middle: it looks like kelvin; set offset: -273.15 if it is"
+    if resting and ROOM_FAHRENHEIT[0] <= first <= ROOM_FAHRENHEIT[1]:
+        return f"{name} begins at {first:g} on a machine at rest: it looks like fahrenheit; set scale: 0.555556 and offset: -17.7778 if it is"
+    if resting and values.max() <= 1.0 and values.min() >= 0.0:
+        return f"{name} lies within 0 to 1: it looks like a share or a voltage; set the sensor's scale and offset if it is"
+    return ""
+
+
+def _doubtful_percent(name: str, values: np.ndarray, high: float) -> str:
+    top = values.max()
+    if 0.0 < top <= 1.0 and values.min() >= 0.0:
+        return f"{name} lies within {values.min():g} to {top:g}: it looks like a duty of 0 to 1; set scale: 100 if it is"
+    for full in (255, 1023, 4095, 65535):
+        if max(100.0, high) < top <= full and values.min() >= 0.0 and (values == np.rint(values)).all():
+            return f"{name} reaches {top:g} in whole numbers: it looks like a converter's 0 to {full}; set scale: {100 / full:.6g} if it is"
+    return ""

@@ -1,0 +1,214 @@
+"""Signals on their own clocks -> one table on one sample time: inputs are held, outputs interpolated between near neighbours, gaps make segments."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.signals import Flag, Raw, Table, intervals
+
+# a sample within that share of the sample time from the grid is on it: what a temperature does in a hundredth of a sample is far below any sensor's step
+ON_GRID = 0.01
+GAP_INTERVALS = 3.0
+# commands are sent periodically if nearly all of their intervals are alike; else they are events, and a long silence is no gap
+PERIODIC_SHARE = 0.95
+
+
+class _Clock(NamedTuple):
+    """One clock and who is on it; a gap is an interval beyond `gap_limit_s` (infinite for commands that come as events)."""
+
+    time_s: np.ndarray
+    signals: list[str]
+    gap_limit_s: float
+
+
+def resample(raw: Raw, *, sample_time_s: float, inputs: Sequence[str], outputs: Sequence[str], max_gap_s: float | None = None) -> Table:
+    """The table of a recording on the grid t_k = t_0 + k T of each segment.
+
+    Inputs: u_k is the last command at or before t_k. Outputs: y_k is the sample at t_k where there is one (within T / 100: the record's own numbers, unaltered),
+    else the straight line between its neighbours. An interval longer than `max_gap_s` (default: three sample times or three median intervals, whichever is
+    longer) on any clock is a gap: nothing is interpolated or held across it, and a new segment begins behind it. Segments span what all clocks have in common.
+    A value whose neighbours are missing is NaN and masked. Flags say what was done: gap, filled, step_inside, step_lost, missing, trimmed, short, rate.
+    Raises ValueError where a signal is not in the recording, clocks have no time in common, or no segment has two samples.
+    """
+    _check(raw, sample_time_s, inputs, outputs, max_gap_s)
+    clocks = _clocks(raw, sample_time_s, inputs, outputs, max_gap_s)
+    pieces = _pieces(raw, clocks, sample_time_s)
+    grids = [start + sample_time_s * np.arange(int(np.floor((end - start) / sample_time_s + ON_GRID)) + 1) for start, end in pieces]
+    whole = [grid for grid in grids if len(grid) > 1]
+    if not whole:
+        raise ValueError(
+            f"{raw.path}: the recording should have two samples {sample_time_s:g} s apart without a gap but its longest stretch is"
+            f" {max(end - start for start, end in pieces):g} s; record longer, or set a smaller sample time or a larger gap limit"
+        )
+    time = np.concatenate(whole)
+    segment = np.repeat(np.arange(len(whole), dtype=np.int32), [len(grid) for grid in whole])
+    values = {name: _held(*raw.signals[name], time, sample_time_s) for name in inputs}
+    values |= {name: np.concatenate([_interpolated(*raw.signals[name], grid, sample_time_s) for grid in whole]) for name in outputs}
+    masked = {name: ~np.isfinite(found) for name, found in values.items()}
+    flags = _gap_flags(clocks, whole) + _trim_flags(raw, clocks, pieces, grids)
+    for name in outputs:
+        flags += _filled_flags(name, raw.signals[name][0], time, sample_time_s) + _rate_flags(name, raw.signals[name][0], sample_time_s)
+    for name in inputs:
+        flags += _step_flags(name, *raw.signals[name], time, segment, sample_time_s)
+    for name in [*inputs, *outputs]:
+        flags += _missing_flags(name, masked[name], time)
+    jitter = {name: intervals(clock.time_s, clock.gap_limit_s) for clock in clocks for name in clock.signals if len(clock.time_s) > 1}
+    return Table(raw.path, segment, time, values, masked, flags, jitter)
+
+
+def _check(raw: Raw, sample_time_s: float, inputs: Sequence[str], outputs: Sequence[str], max_gap_s: float | None) -> None:
+    for name in [*inputs, *outputs]:
+        if name not in raw.signals:
+            raise ValueError(f"{raw.path}: signal {name} is wanted but the mapping gives {', '.join(raw.signals)}; map it to a column or topic")
+    if not outputs:
+        raise ValueError(f"{raw.path}: no output is wanted; name at least one measured signal")
+    if not 0 < sample_time_s < np.inf:
+        raise ValueError(f"{raw.path}: the sample time should be more than 0 s but is {sample_time_s:g}; set it to about the recording's interval")
+    if max_gap_s is not None and not max_gap_s >= sample_time_s:
+        raise ValueError(f"{raw.path}: the gap limit {max_gap_s:g} s should be at least the sample time {sample_time_s:g} s; raise it")
+    for name in outputs:
+        if len(raw.signals[name][0]) < 2:
+            raise ValueError(f"{raw.path}: output {name} should have at least two samples but has {len(raw.signals[name][0])}; record longer")
+
+
+# ---- clocks, gaps and the time in common
+
+
+def _clocks(raw: Raw, sample_time_s: float, inputs: Sequence[str], outputs: Sequence[str], max_gap_s: float | None) -> list[_Clock]:
+    clocks: list[_Clock] = []
+    for name in [*outputs, *inputs]:
+        time = raw.signals[name][0]
+        same = next((clock for clock in clocks if clock.time_s is time or np.array_equal(clock.time_s, time)), None)
+        if same:
+            same.signals.append(name)
+            continue
+        median = np.median(np.diff(time)) if len(time) > 1 else np.inf
+        limit = max_gap_s if max_gap_s is not None else GAP_INTERVALS * max(sample_time_s, median)
+        # outputs come first, so a new clock among the inputs is theirs alone
+        events = name in inputs and not (np.mean(np.diff(time) < 2 * median) >= PERIODIC_SHARE if len(time) > 2 else False)
+        clocks.append(_Clock(time, [name], np.inf if events else limit))
+    return clocks
+
+
+def _pieces(raw: Raw, clocks: Sequence[_Clock], sample_time_s: float) -> list[tuple[float, float]]:
+    """Stretches (start, end) in which every clock runs without a gap."""
+    pieces = [(-np.inf, np.inf)]
+    for clock in clocks:
+        cuts = np.flatnonzero(np.diff(clock.time_s) > clock.gap_limit_s)
+        starts, ends = clock.time_s[np.r_[0, cuts + 1]], clock.time_s[np.r_[cuts, len(clock.time_s) - 1]].astype(float)
+        if np.isinf(clock.gap_limit_s):
+            ends[-1] = np.inf  # the last event holds on
+        pieces = _common(pieces, list(zip(starts.tolist(), ends.tolist(), strict=True)), sample_time_s * ON_GRID)
+    if not pieces:
+        spans = "; ".join(f"{', '.join(clock.signals[:3])} from {clock.time_s[0]:g} to {clock.time_s[-1]:g} s" for clock in clocks)
+        raise ValueError(f"{raw.path}: the signals have no time in common ({spans}); map signals that were recorded together, or name their clock")
+    return pieces
+
+
+def _common(left: Sequence[tuple[float, float]], right: Sequence[tuple[float, float]], tolerance: float) -> list[tuple[float, float]]:
+    """Intersections of two sorted lists of intervals."""
+    found, i, j = [], 0, 0
+    while i < len(left) and j < len(right):
+        start, end = max(left[i][0], right[j][0]), min(left[i][1], right[j][1])
+        if end - start >= -tolerance:
+            found.append((start, max(start, end)))
+        if left[i][1] < right[j][1]:
+            i += 1
+        else:
+            j += 1
+    return found
+
+
+# ---- values
+
+
+def _held(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, sample_time_s: float) -> np.ndarray:
+    """u(t_k): the last command at or before t_k. Pieces begin at or behind the first command, so there is one."""
+    return values[np.maximum(np.searchsorted(time_s, grid + ON_GRID * sample_time_s, side="right") - 1, 0)]
+
+
+def _nearest(time_s: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """Index of the sample nearest to each t_k."""
+    after = np.clip(np.searchsorted(time_s, grid), 1, len(time_s) - 1)
+    return np.where(grid - time_s[after - 1] <= time_s[after] - grid, after - 1, after)
+
+
+def _interpolated(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, sample_time_s: float) -> np.ndarray:
+    """y(t_k): the sample on t_k itself, else the line between its neighbours; a NaN neighbour gives NaN."""
+    after = np.clip(np.searchsorted(time_s, grid), 1, len(time_s) - 1)
+    share = (grid - time_s[after - 1]) / (time_s[after] - time_s[after - 1])
+    line = values[after - 1] + np.clip(share, 0.0, 1.0) * (values[after] - values[after - 1])
+    nearest = _nearest(time_s, grid)
+    return np.where(np.abs(time_s[nearest] - grid) <= ON_GRID * sample_time_s, values[nearest], line)
+
+
+# ---- what was done
+
+
+def _flag(signal: str, kind: str, where_s: np.ndarray, message: str) -> list[Flag]:
+    return [Flag(signal, kind, float(where_s[0]), float(where_s[-1]), len(where_s), message)] if len(where_s) else []
+
+
+def _gap_flags(clocks: Sequence[_Clock], grids: Sequence[np.ndarray]) -> list[Flag]:
+    flags = []
+    for clock in clocks:
+        for i in np.flatnonzero(np.diff(clock.time_s) > clock.gap_limit_s):
+            start, end = float(clock.time_s[i]), float(clock.time_s[i + 1])
+            message = f"no sample of {', '.join(clock.signals)} for {end - start:g} s (limit {clock.gap_limit_s:g} s): a new segment begins behind it"
+            flags.append(Flag("", "gap", start, end, 1, message))
+    return flags
+
+
+def _trim_flags(raw: Raw, clocks: Sequence[_Clock], pieces: Sequence[tuple[float, float]], grids: Sequence[np.ndarray]) -> list[Flag]:
+    flags = []
+    if len(clocks) > 1:
+        start, end = pieces[0][0], pieces[-1][1]
+        cut = sum(int(((clock.time_s < start) | (clock.time_s > end)).sum()) for clock in clocks if np.isfinite(clock.gap_limit_s))
+        message = f"{len(clocks)} clocks were aligned over their common time {start:g} to {end:g} s; {cut} samples lie outside"
+        flags.append(Flag("", "trimmed", start, end, cut, message))
+    for grid in grids:
+        if len(grid) < 2:
+            flags.append(Flag("", "short", float(grid[0]), float(grid[0]), 1, f"the stretch at {grid[0]:g} s is shorter than two samples and was left out"))
+    return flags
+
+
+def _filled_flags(name: str, time_s: np.ndarray, grid: np.ndarray, sample_time_s: float) -> list[Flag]:
+    off = grid[np.abs(time_s[_nearest(time_s, grid)] - grid) > ON_GRID * sample_time_s]
+    message = f"{len(off)} of {len(grid)} samples of {name} lie between its own samples and are interpolated"
+    return _flag(name, "filled", off, message)
+
+
+def _rate_flags(name: str, time_s: np.ndarray, sample_time_s: float) -> list[Flag]:
+    interval = float(np.median(np.diff(time_s)))
+    span = time_s[[0, -1]]
+    if interval < sample_time_s / 2:
+        message = f"{name} is sampled every {interval:g} s, the table every {sample_time_s:g} s: only the samples at its times are used, without averaging"
+        return [Flag(name, "rate", float(span[0]), float(span[1]), len(time_s), message)]
+    if interval > 1.5 * sample_time_s:
+        message = f"{name} is sampled every {interval:g} s but the table every {sample_time_s:g} s: what lies between is interpolated, no measurement"
+        return [Flag(name, "rate", float(span[0]), float(span[1]), len(time_s), message)]
+    return []
+
+
+def _step_flags(name: str, time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, segment: np.ndarray, sample_time_s: float) -> list[Flag]:
+    """Commands that change between two samples act from the next sample on; those that another overtakes before it are lost."""
+    changes = np.flatnonzero(values[1:] != values[:-1]) + 1
+    when = time_s[changes]
+    following = np.searchsorted(grid, when - ON_GRID * sample_time_s)
+    inside = (following > 0) & (following < len(grid))
+    when, following = when[inside], following[inside]
+    same = segment[following] == segment[following - 1]
+    when, following = when[same], following[same]
+    late = grid[following] - when
+    between = late > ON_GRID * sample_time_s
+    mean = f"{late[between].mean():.3g} s later on average" if between.any() else ""
+    message = f"{name} changes {between.sum()} times between two samples; it is not smeared but acts from the next sample on, {mean}"
+    flags = _flag(name, "step_inside", when[between], message)
+    overtaken = np.r_[following[1:] == following[:-1], False] if len(following) else np.zeros(0, bool)
+    message = f"{overtaken.sum()} commands of {name} were overtaken by another before the next sample and do not appear; a smaller sample time shows them"
+    return flags + _flag(name, "step_lost", when[overtaken], message)
+
+
+def _missing_flags(name: str, masked: np.ndarray, grid: np.ndarray) -> list[Flag]:
+    return _flag(name, "missing", grid[masked], f"{masked.sum()} samples of {name} have no measured value and are masked")

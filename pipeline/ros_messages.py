@@ -1,0 +1,328 @@
+"""Numbers out of ROS messages: the message definition becomes a short program of struct formats, made once, run for each message.
+
+Layouts: CDR as ROS 2 writes it (OMG DDSI-RTPS 10.2, "classic CDR", and XCDR2 for final types), aligned to the size of each number behind a header of four
+bytes; ROS 1 has no header and no alignment. Sequences and text begin with their length (uint32); text is skipped, wide text ends what can be read.
+"""
+
+import re
+import struct
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+ROS2_NUMBERS = {
+    "bool": "?", "byte": "B", "char": "B", "octet": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I",
+    "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
+}  # fmt: skip
+ROS1_NUMBERS = {**ROS2_NUMBERS, "byte": "b"}
+ROS1_NUMBERS.pop("octet")
+# left out of many schema texts because every reader knows them
+KNOWN = {
+    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
+    "builtin_interfaces/Duration": "int32 sec\nuint32 nanosec",
+    "ros1/time": "uint32 secs\nuint32 nsecs",
+    "ros1/duration": "int32 secs\nint32 nsecs",
+}
+LARGEST_LAYOUT = 20_000
+LONGEST_LISTED = 64
+_FIELD = re.compile(r"^([A-Za-z]\w*(?:/\w+)*)(?:<=\d+)?\s*(\[(?:<=)?(\d*)\])?\s+([A-Za-z]\w*)\s*(=?)")
+# representation -> byte order, largest alignment; the lists of parameters (0x0002, 0x0003 and others) are not written by ROS
+_REPRESENTATIONS = {b"\x00\x00": (">", 8), b"\x00\x01": ("<", 8), b"\x00\x06": (">", 4), b"\x00\x07": ("<", 4)}
+_LENGTH = {order: struct.Struct(order + "I") for order in "<>"}
+
+
+class UnreadableMessage(ValueError):
+    """A message that is not what its schema says."""
+
+
+class Item(NamedTuple):
+    """A stretch of the layout: `count` numbers of one `format`, text, or a sequence of `items` (an empty sequence of numbers has one item of count 1)."""
+
+    kind: str
+    path: str
+    format: str = ""
+    count: int = 1
+    array: bool = False
+    items: tuple = ()
+
+
+def layout(definition: str, name: str, *, version: int) -> list[Item]:
+    """The message's numbers, texts and sequences in the order of the wire; `version` is 1 or 2. Raises ValueError where the definition cannot be read."""
+    if re.search(r"^---", definition, re.MULTILINE):
+        raise ValueError(f"the schema of {name} is a service's (---), not a message's")
+    types = _types(definition, name, version)
+    return _expand(_plain(name), "", types, version, [LARGEST_LAYOUT])
+
+
+def _types(definition: str, name: str, version: int) -> dict[str, list[tuple[str, str, str | None]]]:
+    """{type: [(field, its type, None | "" | length)]}; "" is a sequence without a fixed length."""
+    parts = re.split(r"^={3,}\s*$", definition, flags=re.MULTILINE)
+    texts = {known: text for known, text in KNOWN.items()} | {_plain(name): parts[0]}
+    for part in parts[1:]:
+        head, _, body = part.strip().partition("\n")
+        if not head.startswith("MSG:"):
+            raise ValueError(f"the schema of {name} should have MSG: behind ==== but has {head[:40]!r}")
+        texts[_plain(head[4:].strip())] = body
+    return {kind: _fields(text, kind) for kind, text in texts.items()}
+
+
+def _plain(name: str) -> str:
+    return name.replace("/msg/", "/")
+
+
+def _fields(text: str, kind: str) -> list[tuple[str, str, str | None]]:
+    fields = []
+    for line in text.splitlines():
+        line = line.split("#")[0].strip()
+        if not line:
+            continue
+        found = _FIELD.match(line)
+        if not found:
+            raise ValueError(f"the schema of {kind} has the line {line[:60]!r}, which is no field")
+        if not found[5]:  # NAME=value is a constant and not on the wire
+            fields.append((found[4], found[1], found[3] if found[2] else None))
+    return fields
+
+
+def _resolve(kind: str, parent: str, types: dict) -> str:
+    candidates = [_plain(kind), f"{parent.rpartition('/')[0]}/{kind}", f"std_msgs/{kind}", f"ros1/{kind}"]
+    candidates += [known for known in types if known.endswith(f"/{kind}")]
+    for candidate in candidates:
+        if candidate in types:
+            return candidate
+    raise ValueError(f"the schema of {parent} uses {kind} but does not define it")
+
+
+def _expand(kind: str, prefix: str, types: dict, version: int, room: list[int]) -> list[Item]:
+    items: list[Item] = []
+    for field, of, length in types[kind]:
+        path = f"{prefix}.{field}" if prefix else field
+        if length == "":
+            element = _element(of, path, kind, types, version, room)
+            items.append(Item("sequence", path, items=tuple(element)))
+        elif of in _numbers(version):
+            items.append(Item("numbers", path, _numbers(version)[of], int(length or 1), length is not None))
+        else:
+            for i in range(int(length or 1)):
+                items += _element(of, f"{path}[{i}]" if length else path, kind, types, version, room)
+        room[0] -= 1
+        if room[0] < 0:
+            raise ValueError(f"the schema of {kind} has more than {LARGEST_LAYOUT} parts")
+    if not items and version == 2:
+        items.append(Item("numbers", prefix + "._", "B"))  # ROS 2 gives a message without fields one byte
+    return items
+
+
+def _numbers(version: int) -> dict[str, str]:
+    return ROS2_NUMBERS if version == 2 else ROS1_NUMBERS
+
+
+def _element(of: str, path: str, parent: str, types: dict, version: int, room: list[int]) -> list[Item]:
+    if of in _numbers(version):
+        return [Item("numbers", path, _numbers(version)[of])]
+    if of in ("string", "wstring"):
+        return [Item(of, path)]
+    if path.count(".") > 30:
+        raise ValueError(f"the schema of {parent} contains itself in {path}")
+    return _expand(_resolve(of, parent, types), path, types, version, room)
+
+
+# ---- which numbers a message has
+
+
+def fields(items: Sequence[Item], sample: bytes | None, *, version: int) -> list[str]:
+    """Paths of the numbers; of a sequence those that the message `sample` has, up to LONGEST_LISTED."""
+    names: list[str] = []
+    sequences = []
+    for item in _readable(items):
+        if item.kind == "numbers" and not item.path.endswith("._"):
+            names += [f"{item.path}[{i}]" for i in range(min(item.count, LONGEST_LISTED))] if item.array else [item.path]
+        elif item.kind == "sequence" and all(part.kind == "numbers" for part in item.items):
+            sequences.append(item)
+    if sample is not None and sequences:
+        try:
+            lengths = decoder(items, [f"{item.path}[#]" for item in sequences], version=version)([sample])[0]
+        except UnreadableMessage:
+            return names
+        for item, length in zip(sequences, lengths, strict=True):
+            for i in range(min(int(length), LONGEST_LISTED)):
+                names += [f"{item.path}[{i}]{part.path[len(item.path) :]}" for part in item.items if not part.array]
+    return names
+
+
+def _readable(items: Sequence[Item]) -> list[Item]:
+    """The items up to the first wide text: writers do not agree on how long its characters are."""
+    for i, item in enumerate(items):
+        if item.kind == "wstring" or (item.kind == "sequence" and len(_readable(item.items)) < len(item.items)):
+            return list(items[:i])
+    return list(items)
+
+
+# ---- programs
+
+
+class _Run:
+    """Numbers of fixed size in a row; `layouts[phase]` unpacks the wanted ones when the run begins at that phase of the alignment."""
+
+    def __init__(self, items: Sequence[Item], wanted: set[str], order: str, alignment: int):
+        self.layouts = [struct.Struct(order + _run_format(items, wanted, phase, alignment)) for phase in range(8)]
+        self.names = [name for item in items for name in _names(item) if name in wanted]
+
+    def read(self, data: bytes, pos: int, values: list[float]) -> int:
+        unpack = self.layouts[pos & 7]
+        values += unpack.unpack_from(data, pos)
+        return pos + unpack.size
+
+
+def _names(item: Item) -> list[str]:
+    return [f"{item.path}[{i}]" for i in range(item.count)] if item.array else [item.path]
+
+
+def _run_format(items: Sequence[Item], wanted: set[str], phase: int, alignment: int) -> str:
+    parts, pos = [], phase
+    for item in items:
+        size = struct.calcsize("=" + item.format)
+        pad = -pos % min(size, alignment) if item.count else 0
+        parts.append(f"{pad}x")
+        names = _names(item)
+        if wanted.isdisjoint(names):
+            parts.append(f"{size * item.count}x")
+        else:
+            parts += [item.format if name in wanted else f"{size}x" for name in names]
+        pos += pad + size * item.count
+    return "".join(part for part in parts if part != "0x")
+
+
+class _Text:
+    names: Sequence[str] = ()
+
+    def __init__(self, order: str, alignment: int):
+        self.unpack, self.alignment = _LENGTH[order].unpack_from, min(4, alignment)
+
+    def read(self, data: bytes, pos: int, values: list[float]) -> int:
+        pos += -pos % self.alignment
+        return pos + 4 + self.unpack(data, pos)[0]
+
+
+class _Sequence:
+    """A length and so many elements; those asked for by index are read (NaN where there are fewer), the others skipped. "[#]" is the length itself."""
+
+    def __init__(self, item: Item, wanted: set[str], order: str, alignment: int):
+        self.unpack, self.alignment = _LENGTH[order].unpack_from, min(4, alignment)
+        indices = {int(found[1]) for name in wanted if (found := re.match(re.escape(item.path) + r"\[(\d+)\]", name))}
+        self.skip = _program(item.items, set(), order, alignment)
+        self.elements = {i: _program(_at(item, i), wanted, order, alignment) for i in sorted(indices)}
+        self.length = f"{item.path}[#]" in wanted
+        self.names = [f"{item.path}[#]"] * self.length + [name for steps in self.elements.values() for step in steps for name in step.names]
+        only = item.items[0] if len(item.items) == 1 and item.items[0].kind == "numbers" and not item.items[0].array else None
+        self.size = struct.calcsize("=" + only.format) if only else 0
+        self.element_alignment = min(self.size, alignment) if only else 1
+        self.number = struct.Struct(order + only.format).unpack_from if only else None
+
+    def read(self, data: bytes, pos: int, values: list[float]) -> int:
+        pos += -pos % self.alignment
+        length = self.unpack(data, pos)[0]
+        pos += 4
+        if length > len(data):
+            raise UnreadableMessage(f"a sequence of {length} elements in {len(data)} bytes")
+        if self.length:
+            values.append(length)
+        if self.number:
+            return self._numbers(data, pos, length, values)
+        for i in range(length):
+            for step in self.elements.get(i, self.skip):
+                pos = step.read(data, pos, values)
+        for i, steps in self.elements.items():
+            if i >= length:
+                values += [np.nan] * sum(len(step.names) for step in steps)
+        return pos
+
+    def _numbers(self, data: bytes, pos: int, length: int, values: list[float]) -> int:
+        if length:
+            pos += -pos % self.element_alignment
+        for i in self.elements:
+            values.append(self.number(data, pos + i * self.size)[0] if i < length else np.nan)
+        return pos + length * self.size
+
+
+def _at(item: Item, i: int) -> list[Item]:
+    """The elements of a sequence with the paths that they have at index i."""
+    start = len(item.path)
+    return [part._replace(path=f"{item.path}[{i}]{part.path[start:]}", items=tuple(_at_prefix(part, item.path, i))) for part in item.items]
+
+
+def _at_prefix(part: Item, prefix: str, i: int) -> list[Item]:
+    moved = [inner._replace(path=f"{prefix}[{i}]{inner.path[len(prefix) :]}") for inner in part.items]
+    return [inner._replace(items=tuple(_at_prefix(inner, prefix, i))) for inner in moved]
+
+
+def _program(items: Sequence[Item], wanted: set[str], order: str, alignment: int) -> list:
+    steps, run = [], []
+    for item in [*items, None]:
+        if item is not None and item.kind == "numbers":
+            run.append(item)
+            continue
+        if run:
+            steps.append(_Run(run, wanted, order, alignment))
+            run = []
+        if item is not None:
+            steps.append(_Text(order, alignment) if item.kind == "string" else _Sequence(item, wanted, order, alignment))
+    return steps
+
+
+def decoder(items: Sequence[Item], names: Sequence[str], *, version: int) -> Callable[[list[bytes]], np.ndarray]:
+    """A function from n messages to their numbers (n, len(names)). It raises UnreadableMessage where one is not what the layout says."""
+    readable = _readable(items)
+    exact = len(readable) == len(items)
+    if version == 1:
+        steps = _program(readable, set(names), "<", 1)
+        order = _order(steps, names)
+        return lambda messages: _decode(messages, steps, exact, 0)[:, order]
+    programs = {code: _program(readable, set(names), *how) for code, how in _REPRESENTATIONS.items()}
+    order = _order(programs[b"\x00\x01"], names)
+
+    def decode(messages: list[bytes]) -> np.ndarray:
+        codes = {message[:2] for message in messages}
+        if len(codes) > 1:
+            return np.concatenate([decode([message]) for message in messages])
+        code = codes.pop()
+        if code not in programs:
+            raise UnreadableMessage(f"CDR representation 0x{code.hex()} is not read; 0x0000, 0x0001, 0x0006 and 0x0007 are")
+        # alignment counts from behind the header of four bytes
+        return _decode([message[4:] for message in messages], programs[code], exact, 7)[:, order]
+
+    return decode
+
+
+def _order(steps: list, names: Sequence[str]) -> list[int]:
+    found = [name for step in steps for name in step.names]
+    missing = [name for name in names if name not in found]
+    if missing:
+        raise ValueError(f"no numeric field {missing[0]}")
+    return [found.index(name) for name in names]
+
+
+def _decode(messages: list[bytes], steps: list, exact: bool, padding: int) -> np.ndarray:
+    """Runs the steps; behind the last one there may be up to `padding` bytes that fill a message up."""
+    rows = []
+    try:
+        if len(steps) == 1 and isinstance(steps[0], _Run):
+            layout = steps[0].layouts[0]
+            unpack, shortest, longest = layout.unpack_from, layout.size, layout.size + padding if exact else np.inf
+            rows = [unpack(data) for data in messages if shortest <= len(data) <= longest]
+            if len(rows) < len(messages):
+                wrong = next(len(data) for data in messages if not shortest <= len(data) <= longest)
+                raise UnreadableMessage(f"a message of {wrong} bytes where {shortest} are expected")
+        else:
+            for data in messages:
+                values: list[float] = []
+                pos = 0
+                for step in steps:
+                    pos = step.read(data, pos, values)
+                if pos > len(data) or (exact and len(data) - pos > padding):
+                    raise UnreadableMessage(f"a message of {len(data)} bytes where {pos} are expected")
+                rows.append(values)
+    except struct.error as error:
+        raise UnreadableMessage(f"a message that is too short ({error})") from None
+    return np.array(rows, float).reshape(len(messages), -1)

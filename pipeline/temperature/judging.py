@@ -1,0 +1,259 @@
+"""Every controller of the temperature loop on one panel: built from what the stages learned, judged on plants that nothing was learned from."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.temperature import window as window_route
+from pipeline.temperature.baseline import pairing, pi_law
+from pipeline.temperature.kernel import Kernel, Regression, regress, tuples, value_iteration, window_law
+from pipeline.temperature.plant import Plant
+from pipeline.temperature.scorecard import (
+    Figures,
+    Margins,
+    Panel,
+    Run,
+    Yardstick,
+    cost,
+    feed_forward,
+    figures,
+    margins,
+    optimum,
+    panel,
+    regret,
+    simulate,
+)
+from pipeline.temperature.tracking import Law, feasible_target, gains, observer_gain, observer_law
+
+Limits = tuple[np.ndarray, np.ndarray]
+Targets = dict[bytes, tuple[np.ndarray, np.ndarray]]
+
+
+class Controller(NamedTuple):
+    """One way to control: `design(q, r, integral)` gives its law for weights diag(q), diag(r); `model` is what its feasible targets are computed on.
+
+    `own_feed_forward`: unclipped, the law's own feed-forward is part of its optimum; a rule that has none aims at the target there too.
+    """
+
+    name: str
+    design: Callable[[np.ndarray, np.ndarray, float], Law]
+    model: Plant
+    own_feed_forward: bool = True
+
+
+class Judged(NamedTuple):
+    """Of one controller: regret (scenarios,) unclipped under the yardstick, share of its unclipped commands outside the limits in percent, figures and margins as
+    deployed (clipped, aimed at feasible targets, integrator on), margins one a plant; and both runs."""
+
+    name: str
+    regret: np.ndarray
+    outside_percent: np.ndarray
+    figures: Figures
+    margins: list[Margins]
+    unclipped: Run
+    deployed: Run
+    law: Law
+
+
+def model_based(plant: Plant, gamma: float, *, tau: float, name: str = "model_based") -> Controller:
+    """Observer and Riccati gains of a model; its Kalman gain where it was identified with one, (8) otherwise."""
+    L = plant.K if np.any(plant.K) else observer_gain(plant, tau)
+
+    def design(q: np.ndarray, r: np.ndarray, integral: float) -> Law:
+        return observer_law(plant, gains(plant, np.diag(q), np.diag(r), gamma), L, integral=integral)
+
+    return Controller(name, design, plant)
+
+
+def window(learned: window_route.Window, gamma: float) -> Controller:
+    """VARX window and Riccati."""
+    return Controller("window", lambda q, r, integral: window_route.law(learned, np.diag(q), np.diag(r), gamma, integral=integral), window_route.predictor(learned))
+
+
+def kernel(learned: Regression, gamma: float, model: Plant) -> Controller:
+    """Algorithm 2; its feasible targets come from the window that was learned from the same record."""
+
+    def design(q: np.ndarray, r: np.ndarray, integral: float) -> Law:
+        found: Kernel = value_iteration(learned, np.diag(q), np.diag(r), gamma)
+        return window_law(found.K, found.K_r, found.k, learned.N, integral=integral)
+
+    return Controller("kernel", design, model)
+
+
+def baseline(plant: Plant, limits: Limits, *, horizon: int) -> Controller:
+    """PI a zone, tuned by SIMC; the weights mean nothing to it."""
+    law = pi_law(pairing(plant, *limits, horizon=horizon), inputs=plant.m)
+    return Controller("baseline", lambda q, r, integral: law, plant, own_feed_forward=False)
+
+
+def controllers(
+    model: Plant, long: window_route.Window, learned: Regression | None, *, limits: Limits, gamma: float, tau: float, horizon: int, truth: Plant | None
+) -> list[Controller]:  # fmt: skip
+    """All that the scorecard compares; the kernel where it could be learned, and where the true plant is known a controller that was told its model, as a yardstick."""
+    found = [model_based(model, gamma, tau=tau), window(long, gamma)]
+    if learned is not None:
+        found.append(kernel(learned, gamma, found[1].model))
+    found.append(baseline(model, limits, horizon=horizon))
+    return [*found, model_based(truth, gamma, tau=tau, name="exact_model")] if truth is not None else found
+
+
+def targets(model: Plant, references: np.ndarray, limits: Limits) -> Targets:
+    """The feasible steady (u, y) of every reference (scenarios, p) on the panel, by the controller's own model."""
+    found = {}
+    for r in np.unique(references, axis=0):
+        aim = feasible_target(model, r, *limits)
+        found[r.tobytes()] = (aim.u, aim.y)
+    return found
+
+
+def judge(
+    controller: Controller, scenarios: Panel, *, yardstick: Yardstick, q: np.ndarray, r: np.ndarray, limits: Limits, band: float, integral: float, integral_limit: float
+) -> Judged:  # fmt: skip
+    """Run one controller on the panel twice: designed for the yardstick's weights and unclipped; designed for (q, r), clipped, as it would be deployed."""
+    plain = controller.design(yardstick.q, yardstick.r, 0.0)
+    aims = targets(controller.model, scenarios.r, limits)
+    unclipped = simulate(scenarios, plain, feed_forward(scenarios, plain, None if controller.own_feed_forward else aims), limits=None)
+    outside = (unclipped.command < limits[0]) | (unclipped.command > limits[1])
+    law = controller.design(q, r, integral)
+    deployed = simulate(scenarios, law, feed_forward(scenarios, law, aims), limits=limits, integral_band=integral_limit)
+    sample_time_s = scenarios.plants[0].sample_time_s
+    return Judged(
+        controller.name, regret(cost(scenarios, unclipped, yardstick), optimum(scenarios, yardstick)), 100.0 * outside.mean(axis=(0, 2)),
+        figures(scenarios, deployed, limits=limits, band=band, sample_time_s=sample_time_s), margins(scenarios.plants, law), unclipped, deployed, law,
+    )  # fmt: skip
+
+
+def summary(judged: Judged, scenarios: Panel, *, noise: float) -> dict[str, dict[str, float | str | None]]:
+    """Median and 90 % band over starts, references and seeds on the nominal plant at one noise level, and the worst over every plant of the panel."""
+    nominal, level = scenarios.plant == 0, scenarios.noise == noise
+    columns = {
+        "gap_percent": 100.0 * judged.regret,
+        **{name: getattr(judged.figures, name) for name in ("settled_error_degC", "settling_s", "overshoot_degC", "at_limits_percent", "tracking_degC", "effort_percent")},
+        "outside_limits_percent": judged.outside_percent,
+    }
+    result: dict[str, dict] = {}
+    for name, values in columns.items():
+        # a run that never settles is infinitely late: it sorts last, and shows as null
+        typical, worst = (np.where(np.isnan(values[rows]), np.inf, values[rows]) for rows in (nominal & level, level))
+        low, median, high = np.quantile(typical, [0.05, 0.5, 0.95], method="nearest")
+        result[name] = {key: _number(value) for key, value in (("median", median), ("low", low), ("high", high), ("worst", worst.max()))}
+    for name in ("disk", "delay_s"):
+        values = np.array([getattr(margin, name) for margin in judged.margins])
+        result[name] = {"median": _number(values[0]), "low": _number(values.min()), "high": _number(values[0]), "worst": _number(values.min())}
+    worst = np.where(nominal & level, judged.figures.settled_error_degC, -1.0).argmax()
+    result["settled_error_degC"]["zone"] = int(judged.figures.settled_zone[worst])
+    result["stable_plants"] = {"count": sum(margin.stable for margin in judged.margins), "of": len(judged.margins)}
+    return result
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+class Sufficiency(NamedTuple):
+    """`half_gap`: what a controller learned from half of the record costs more than one from all of it, on the model from all of it; `needed`: the samples at which
+    a controller from all of them would cost `allowed` more than the best, since the excess falls as one over the samples."""
+
+    half_gap: float
+    samples: int
+    needed: int
+
+
+def sufficiency(
+    u: Sequence[np.ndarray], y: Sequence[np.ndarray], learned: window_route.Window, yardstick: Yardstick, *, start: float, reference: np.ndarray, allowed: float, offset: bool,
+    steps: int,
+) -> Sufficiency:  # fmt: skip
+    """Whether the record is long enough for its noise, asked of the record alone: learn from each half of it, judge by the model of the whole."""
+    model = window_route.predictor(learned)
+    scenarios = panel([model], starts=[start], references=[reference], noise=[0.0], seeds=[0], steps=steps, hold=0, cells=False)
+    best = optimum(scenarios, yardstick)
+    gaps = []
+    for part in (0, 1):
+        halves = [(us[part * len(us) // 2 : (part + 1) * len(us) // 2], ys[part * len(ys) // 2 : (part + 1) * len(ys) // 2]) for us, ys in zip(u, y, strict=True)]
+        half = window_route.learn([h[0] for h in halves], [h[1] for h in halves], longest=learned.N, offset=offset)
+        law = window_route.law(half, np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma)
+        gaps.append(regret(cost(scenarios, simulate(scenarios, law, feed_forward(scenarios, law, None), limits=None), yardstick), best)[0])
+    half_gap = float(np.mean(gaps))
+    return Sufficiency(half_gap, learned.samples, int(np.ceil(learned.samples * min(half_gap / 2 / allowed, 1e3))))
+
+
+class Candidate(NamedTuple):
+    """One state that Algorithm 2 was tried on: what it found, the gap of its gain on the window's model (inf where it was refused), and the sentence of a refusal."""
+
+    state: str
+    learned: Regression | None
+    gap: float
+    refusal: str
+
+
+def kernel_candidates(
+    u: Sequence[np.ndarray], y: Sequence[np.ndarray], long: window_route.Window, yardstick: Yardstick, *, largest: int, offset: bool, start: float, reference: np.ndarray, steps: int
+) -> list[Candidate]:  # fmt: skip
+    """Algorithm 2 on windows of 1 to `largest` samples and on the predicted state, each checked on the model of the long window: all from the one record.
+
+    The shortest window that holds the plant's state is exact without noise; with noise longer ones are biased, and the predicted state is not.
+    """
+    model = window_route.predictor(long)
+    scenarios = panel([model], starts=[start], references=[reference], noise=[0.0], seeds=[0], steps=steps, hold=0, cells=False)
+    best = optimum(scenarios, yardstick)
+    tried = [(f"window of {N}", lambda N=N: tuples(u, y, N, offset=offset)) for N in range(1, largest + 1)]
+    tried.append(("predicted state", lambda: window_route.predicted_tuples(long, u, y, offset=offset)))
+    found = []
+    for state, features in tried:
+        try:
+            learned = regress(features())
+            law = kernel(learned, yardstick.gamma, model).design(yardstick.q, yardstick.r, 0.0)
+        except ValueError as refusal:
+            found.append(Candidate(state, None, float("inf"), str(refusal)))
+            continue
+        run = simulate(scenarios, law, feed_forward(scenarios, law, None), limits=None)
+        gap = float(regret(cost(scenarios, run, yardstick), best)[0])
+        found.append(Candidate(state, learned, gap if np.isfinite(gap) else float("inf"), ""))
+    return found
+
+
+def rows(judged: Sequence[Judged], scenarios: Panel, zones: Sequence[str]) -> dict[str, list | np.ndarray]:
+    """The scorecard as columns: one row a controller and scenario."""
+    count = len(judged)
+    columns: dict[str, list | np.ndarray] = {
+        "controller": [j.name for j in judged for _ in scenarios.seed],
+        "plant": np.tile(scenarios.plant, count).astype(np.int32),
+        "start_degC": np.tile(scenarios.start, count),
+        "reference_degC": np.tile(scenarios.r[:, 0], count),
+        "noise_degC": np.tile(scenarios.noise, count),
+        "seed": np.tile(scenarios.seed, count),
+        "regret": np.concatenate([np.where(np.isfinite(j.regret), j.regret, np.nan) for j in judged]),
+        "outside_percent": np.concatenate([j.outside_percent for j in judged]),
+        "settled_zone": [zones[zone] for j in judged for zone in j.figures.settled_zone],
+    }
+    for name in Figures._fields:
+        if name != "settled_zone":
+            columns[name] = np.concatenate([getattr(j.figures, name) for j in judged])
+    return columns
+
+
+def featured(scenarios: Panel, noise: float) -> int:
+    """The scenario that the pictures show: nominal plant, first start, reference and seed, at this noise."""
+    return int(np.flatnonzero((scenarios.plant == 0) & (scenarios.noise == noise))[0])
+
+
+def trajectories(judged: Sequence[Judged], scenarios: Panel, inputs: Sequence[str], outputs: Sequence[str], *, noise: float, yardstick: Yardstick) -> dict[str, list | np.ndarray]:
+    """The featured scenario under every controller, in both modes, as columns."""
+    i = featured(scenarios, noise)
+    runs = [(j.name, mode, run) for j in judged for mode, run in (("unclipped", j.unclipped), ("deployed", j.deployed))]
+    time_s = scenarios.plants[0].sample_time_s * np.arange(scenarios.steps)
+    discount = yardstick.gamma ** np.arange(scenarios.steps)
+    stages = [discount * ((run.y[:, i] - scenarios.r[i]) ** 2 @ yardstick.q + run.u[:, i] ** 2 @ yardstick.r) for _, _, run in runs]
+    columns: dict[str, list | np.ndarray] = {
+        "controller": [name for name, _, _ in runs for _ in time_s],
+        "mode": [mode for _, mode, _ in runs for _ in time_s],
+        "time_s": np.tile(time_s, len(runs)),
+        "cost": np.concatenate([np.cumsum(stage) for stage in stages]),
+    }
+    for channel, name in enumerate(outputs):
+        columns[name] = np.concatenate([run.y[:, i, channel] for _, _, run in runs])
+    for channel, name in enumerate(inputs):
+        columns[f"{name}_command"] = np.concatenate([run.command[:, i, channel] for _, _, run in runs])
+        columns[f"{name}_applied"] = np.concatenate([run.u[:, i, channel] for _, _, run in runs])
+    return columns

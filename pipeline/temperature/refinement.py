@@ -1,0 +1,328 @@
+"""Prediction-error refinement of an identified plant: Gauss-Newton on one-step or simulation errors over whole records (Ljung, System Identification, ch. 7 and 10).
+
+Both criteria are one output-error problem  x(t+1) = F x + G v,  ŷ = C x + H v:
+  prediction  v = [u; 1; y],  F = A - K C,  G = [B - K D, b - K d, K],  H = [D, d, 0]
+  simulation  v = [u; 1],     F = A,        G = [B, b],                 H = [D, d]
+so one routine serves both. It needs no filter per parameter: in block-modal coordinates every sensitivity is a first-order filter of one signal.
+"""
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+import scipy.signal
+
+from pipeline.temperature.plant import Plant
+
+
+class Predictor(NamedTuple):
+    """x(t+1) = F x + G v,  ŷ = C x + H v, with one initial state a segment: F (n, n), G (n, r), C (p, n), H (p, r), x0 list of (n,)."""
+
+    F: np.ndarray
+    G: np.ndarray
+    C: np.ndarray
+    H: np.ndarray
+    x0: list[np.ndarray]
+
+
+class Refined(NamedTuple):
+    """A refined plant, the initial state of each segment, and the sum of squared weighted errors before the first and after each step."""
+
+    plant: Plant
+    x0: list[np.ndarray]
+    costs: list[float]
+
+
+def linear_recurrence(F: np.ndarray, g: np.ndarray, x0: np.ndarray) -> np.ndarray:
+    """x (T+1, n) of x(t+1) = F x(t) + g(t) from x0, by doubling: pass k adds F^(2^k) times what lies 2^k samples back (Hillis and Steele 1986)."""
+    x, power, lag = np.vstack([x0[None], g]), F, 1
+    while lag < len(x) and np.abs(power).max() > 1e-20:
+        x[lag:] += x[:-lag] @ power.T
+        power, lag = power @ power, 2 * lag
+    return x
+
+
+def respond(model: Predictor, v: np.ndarray, x0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """States x (T, n) and outputs ŷ (T, p) of the predictor under v (T, r)."""
+    x = linear_recurrence(model.F, v @ model.G.T, x0)[:-1]
+    return x, x @ model.C.T + v @ model.H.T
+
+
+def estimate_state(model: Predictor, v: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """x(0) (n,) that fits y (T, p) best in least squares under v; NaN in y is left out. A direction of x(0) that y does not show stays zero."""
+    T, (p, n) = len(v), model.C.shape
+    free = respond(model, v, np.zeros(n))[1]
+    gamma, row = np.empty((T, p, n)), model.C
+    for t in range(T):
+        gamma[t] = row
+        row = row @ model.F
+    seen = np.isfinite(y)
+    return np.linalg.lstsq(gamma[seen], (y - free)[seen], rcond=1e-10)[0]
+
+
+def _block_modal(model: Predictor) -> tuple[Predictor, list[tuple[int, complex]], np.ndarray]:
+    """The predictor with F block diagonal (1 x 1 real, 2 x 2 [[a, b], [-b, a]] for a + ib), (first row, eigenvalue) of each block, and the basis."""
+    eigenvalues, vectors = np.linalg.eig(model.F)
+    columns, blocks = [], []
+    for eigenvalue, vector in zip(eigenvalues, vectors.T, strict=True):
+        if eigenvalue.imag < 0:
+            continue
+        blocks.append((len(columns), complex(eigenvalue)))
+        columns += [vector.real, vector.imag] if eigenvalue.imag > 0 else [vector.real]
+    T = np.array(columns).T
+    inverse = np.linalg.inv(T)
+    return Predictor(inverse @ model.F @ T, inverse @ model.G, model.C @ T, model.H, [inverse @ x for x in model.x0]), blocks, T
+
+
+def _sensitivities(model: Predictor, blocks: list[tuple[int, complex]], s: np.ndarray, numerator: list[float]) -> np.ndarray:
+    """S (p, T, n, k): response of ŷ to signal s_j (T, k) entering at state i, in block-modal coordinates; numerator [0, 1] for an input, [1] for x0."""
+    p, n = model.C.shape
+    S = np.empty((p, len(s), n, s.shape[1]))
+    for k, eigenvalue in blocks:
+        pair = eigenvalue.imag > 0
+        f = scipy.signal.lfilter(numerator, [1.0, -eigenvalue if pair else -eigenvalue.real], s, axis=0)
+        for o in range(p):
+            if pair:
+                S[o, :, k] = model.C[o, k] * f.real - model.C[o, k + 1] * f.imag
+                S[o, :, k + 1] = model.C[o, k] * f.imag + model.C[o, k + 1] * f.real
+            else:
+                S[o, :, k] = model.C[o, k] * f
+    return S
+
+
+def _normal_equations(model: Predictor, blocks, free: np.ndarray, v_all, y_all) -> tuple[np.ndarray, np.ndarray]:
+    """J'J and J'e over every segment; parameters: [F G] row by row, then C and the free columns of H for each output, then x0 of each segment."""
+    n, r = model.G.shape
+    p, h = len(model.C), len(free)
+    state, output = n * (n + r), n + h
+    size = state + p * output + n * len(v_all)
+    JJ, Je = np.zeros((size, size)), np.zeros(size)
+    for segment, (v, y) in enumerate(zip(v_all, y_all, strict=True)):
+        x, predicted = respond(model, v, model.x0[segment])
+        pulse = np.zeros((len(v), 1))
+        pulse[0] = 1.0
+        S, S0 = _sensitivities(model, blocks, np.hstack([x, v]), [0.0, 1.0]), _sensitivities(model, blocks, pulse, [1.0])
+        first = size - n * (len(v_all) - segment)
+        for o in range(p):
+            seen = np.isfinite(y[:, o])
+            J = np.hstack([S[o].reshape(len(v), state), x, v[:, free], S0[o, :, :, 0]])[seen]
+            at = np.r_[0:state, state + o * output : state + (o + 1) * output, first : first + n]
+            JJ[np.ix_(at, at)] += J.T @ J
+            Je[at] += J.T @ (y - predicted)[seen, o]
+    return JJ, Je
+
+
+def _stepped(model: Predictor, step: np.ndarray, free: np.ndarray) -> Predictor:
+    n, r = model.G.shape
+    p, state = len(model.C), n * (n + r)
+    FG = step[:state].reshape(n, n + r)
+    CH = step[state : state + p * (n + len(free))].reshape(p, n + len(free))
+    H = model.H.copy()
+    H[:, free] += CH[:, n:]
+    x0 = step[state + CH.size :].reshape(-1, n)
+    return Predictor(model.F + FG[:, :n], model.G + FG[:, n:], model.C + CH[:, :n], H, [a + b for a, b in zip(model.x0, x0, strict=True)])
+
+
+def _cost(model: Predictor, v_all, y_all) -> float:
+    with np.errstate(over="ignore", invalid="ignore"):  # a trial step may explode; its cost is then infinite and the step refused
+        cost = sum(np.nansum((y - respond(model, v, x0)[1]) ** 2) for v, y, x0 in zip(v_all, y_all, model.x0, strict=True))
+        finite = all(np.isfinite(respond(model, v[-1:], x0)[1]).all() for v, x0 in zip(v_all, model.x0, strict=True))
+    return float(cost) if finite and np.isfinite(cost) else np.inf
+
+
+def gauss_newton(model: Predictor, v_all, y_all, *, free: np.ndarray, admissible, max_iterations: int, tolerance: float) -> tuple[Predictor, list[float]]:
+    """Levenberg-Marquardt on sum |y - ŷ|² over F, G, C, the columns `free` of H and every x0; NaN in y is left out.
+
+    The parameters are redundant (any change of state basis); the damping picks the step of least norm among equals. `admissible(F, G, C)` refuses steps,
+    which is how stability is kept by construction. Stops when a step gains less than `tolerance` of the cost.
+    """
+    costs, damping = [_cost(model, v_all, y_all)], 1e-4
+    for _ in range(max_iterations):
+        model, blocks, _ = _block_modal(model)
+        JJ, Je = _normal_equations(model, blocks, free, v_all, y_all)
+        scale = np.sqrt(np.diag(JJ))
+        scale[scale == 0] = 1.0
+        JJ = JJ / np.outer(scale, scale)
+        while damping < 1e8:
+            trial = _stepped(model, np.linalg.solve(JJ + damping * np.eye(len(JJ)), Je / scale) / scale, free)
+            cost = _cost(trial, v_all, y_all) if admissible(trial.F, trial.G, trial.C) else np.inf
+            if cost < costs[-1]:
+                break
+            damping *= 10
+        else:
+            break
+        model, damping = trial, max(damping / 10, 1e-10)
+        costs.append(cost)
+        if costs[-2] - cost <= tolerance * costs[-2]:
+            break
+    return model, costs
+
+
+def fit_inputs(A, C, u, y, *, feedthrough: bool, offset: bool) -> Predictor:
+    """B, b, D, d and every x0 that simulate y best for given A (n, n), C (p, n): a linear least-squares problem (Verhaegen 1994; SLICOT IB01CD).
+
+    Returns the simulator in its block-modal basis, v = [u; 1]. b is left at zero, and d too, where `offset` is False.
+    """
+    n, m, p, segments = len(A), u[0].shape[1], len(C), len(u)
+    model, blocks, _ = _block_modal(Predictor(A, np.zeros((n, m + 1)), C, np.zeros((p, m + 1)), [np.zeros(n)] * segments))
+    inputs = np.arange(m + 1) if offset else np.arange(m)
+    direct = np.r_[np.arange(m) if feedthrough else [], m if offset else []].astype(int)
+    size = n * len(inputs) + p * len(direct)
+    rows, target = [], []
+    for segment, (a, b) in enumerate(zip(u, y, strict=True)):
+        v, T = drives("simulation", a, b), len(a)
+        pulse = np.zeros((T, 1))
+        pulse[0] = 1.0
+        S, S0 = _sensitivities(model, blocks, v[:, inputs], [0.0, 1.0]), _sensitivities(model, blocks, pulse, [1.0])
+        for o in range(p):
+            J = np.zeros((T, size + n * segments))
+            J[:, : n * len(inputs)] = S[o].reshape(T, -1)
+            J[:, n * len(inputs) + o * len(direct) : n * len(inputs) + (o + 1) * len(direct)] = v[:, direct]
+            J[:, size + segment * n : size + (segment + 1) * n] = S0[o, :, :, 0]
+            seen = np.isfinite(b[:, o])
+            rows.append(J[seen])
+            target.append(b[seen, o])
+    J = np.vstack(rows)
+    scale = np.linalg.norm(J, axis=0)
+    scale[scale == 0] = 1.0
+    found = np.linalg.lstsq(J / scale, np.concatenate(target), rcond=1e-12)[0] / scale
+    G, H = np.zeros((n, m + 1)), np.zeros((p, m + 1))
+    G[:, inputs] = found[: n * len(inputs)].reshape(n, -1)
+    H[:, direct] = found[n * len(inputs) : size].reshape(p, -1)
+    return model._replace(G=G, H=H, x0=list(found[size:].reshape(segments, n)))
+
+
+def prediction_form(plant: Plant, x0: Sequence[np.ndarray]) -> Predictor:
+    """The one-step predictor of a plant: v = [u; 1; y], F = A - K C, G = [B - K D, b - K d, K], H = [D, d, 0]."""
+    A, B, C, D, b, d, K, _ = plant
+    G = np.hstack([B - K @ D, (b - K @ d)[:, None], K])
+    return Predictor(A - K @ C, G, C, np.hstack([D, d[:, None], np.zeros((plant.p, plant.p))]), list(x0))
+
+
+def simulation_form(plant: Plant, x0: Sequence[np.ndarray]) -> Predictor:
+    """The simulator of a plant: v = [u; 1], F = A, G = [B, b], H = [D, d]."""
+    return Predictor(plant.A, np.hstack([plant.B, plant.b[:, None]]), plant.C, np.hstack([plant.D, plant.d[:, None]]), list(x0))
+
+
+def drives(criterion: str, u: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """v (T, r) of the criterion's predictor."""
+    one = np.ones((len(u), 1))
+    return np.hstack([u, one, y]) if criterion == "prediction" else np.hstack([u, one])
+
+
+def filled(plant: Plant, u: np.ndarray, y: np.ndarray, x0: np.ndarray) -> np.ndarray:
+    """y (T, p) with each masked entry replaced by its one-step prediction, which is what a Kalman filter without that measurement does."""
+    if np.isfinite(y).all():
+        return y
+    y, x = y.copy(), x0
+    for t in range(len(y)):
+        predicted = plant.C @ x + plant.D @ u[t] + plant.d
+        y[t] = np.where(np.isfinite(y[t]), y[t], predicted)
+        x = plant.A @ x + plant.B @ u[t] + plant.b + plant.K @ (y[t] - predicted)
+    return y
+
+
+def refine(
+    plant: Plant,
+    u: Sequence[np.ndarray],
+    y: Sequence[np.ndarray],
+    *,
+    criterion: Literal["prediction", "simulation"] = "prediction",
+    feedthrough: bool = False,
+    offset: bool = True,
+    max_radius: float | None = None,
+    max_iterations: int = 20,
+    tolerance: float = 1e-5,
+) -> Refined:
+    """The plant moved to the least sum of weighted squared errors, one step ahead or in free simulation, over every segment u (T, m), y (T, p).
+
+    Errors are weighted by the covariance of the starting model's (the full one for predictions, its diagonal for simulation). The predictor stays stable, and
+    so does A within `max_radius` where given (it must hold at the start). With `simulation` K is fitted last, to the one-step errors. NaN in y is a masked sample; in u it is refused.
+    Raises ValueError where u holds NaN, or the start violates `max_radius`.
+    """
+    if any(not np.isfinite(a).all() for a in u):
+        raise ValueError("refine: expected inputs without gaps but found NaN in u; split the record into segments at the gaps")
+    if max_radius is not None and np.abs(np.linalg.eigvals(plant.A)).max() > max_radius:
+        raise ValueError(f"refine: the start has a pole at {np.abs(np.linalg.eigvals(plant.A)).max():.6f}, outside max_radius {max_radius}; start from a stabilised plant")
+    m, p, ahead = plant.m, plant.p, criterion == "prediction"
+    start = prediction_form(plant, []) if ahead else simulation_form(plant, [])
+    y_full = y if not ahead else [filled(plant, a, b, _first_state(plant, start, criterion, a, b)) for a, b in zip(u, y, strict=True)]
+    v = [drives(criterion, a, b) for a, b in zip(u, y_full, strict=True)]
+    x0 = [estimate_state(start, a, b) for a, b in zip(v, y, strict=True)]
+    errors = np.vstack([b - respond(start, a, x)[1] for a, b, x in zip(v, y, x0, strict=True)])
+    weight, unweight = _weights(errors, diagonal=not ahead)
+    y_weighted = [b @ weight.T for b in y]
+    if ahead:
+        start = start._replace(G=np.hstack([start.G[:, : m + 1], start.G[:, m + 1 :] @ unweight]))
+        v = [np.hstack([a[:, : m + 1], a[:, m + 1 :] @ weight.T]) for a in v]
+    start = start._replace(C=weight @ start.C, H=weight @ start.H, x0=x0)
+    free = np.r_[np.arange(m) if feedthrough else [], m if offset else []].astype(int)
+
+    def admissible(F, G, C):
+        if ahead and np.abs(np.linalg.eigvals(F)).max() >= 1:
+            return False
+        return max_radius is None or np.abs(np.linalg.eigvals(F + G[:, m + 1 :] @ C if ahead else F)).max() <= max_radius
+
+    best, costs = gauss_newton(start, v, y_weighted, free=free, admissible=admissible, max_iterations=max_iterations, tolerance=tolerance)
+    C, H = unweight @ best.C, unweight @ best.H
+    K = best.G[:, m + 1 :] @ weight if ahead else np.zeros((plant.n, p))
+    D, d = H[:, :m], H[:, m]
+    found = Plant(best.F + K @ C, best.G[:, :m] + K @ D, C, D, best.G[:, m] + K @ d, d, K, plant.sample_time_s)
+    return Refined(found if ahead else kalman_gain(found, u, y), best.x0, costs)
+
+
+def kalman_gain(plant: Plant, u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, max_iterations: int = 20) -> Plant:
+    """The plant with the gain K that makes the one-step errors least, all else kept; Gauss-Newton from K = 0, where dŷ/dK_ij answers e_j entering at state i.
+
+    Errors are weighted by their variance in simulation. Raises ValueError where A is not stable (then K = 0 is no predictor to start from).
+    """
+    if np.abs(np.linalg.eigvals(plant.A)).max() >= 1:
+        return plant
+    n, p, K = plant.n, plant.p, np.zeros((plant.n, plant.p))
+    v = [drives("prediction", a, filled(plant, a, b, np.zeros(n))) for a, b in zip(u, y, strict=True)]
+
+    def errors(K):
+        model = prediction_form(plant._replace(K=K), [])
+        x0 = [estimate_state(model, a, b) for a, b in zip(v, y, strict=True)]
+        return model, x0, [np.nan_to_num(b - respond(model, a, x)[1]) for a, b, x in zip(v, y, x0, strict=True)]
+
+    model, x0, e = errors(K)
+    weight = 1.0 / np.sqrt(np.maximum(np.mean(np.vstack(e) ** 2, axis=0), np.finfo(float).tiny))
+    cost, damping = sum(np.sum((a * weight) ** 2) for a in e), 1e-4
+    for _ in range(max_iterations):
+        modal, blocks, basis = _block_modal(model._replace(x0=[]))
+        J = np.vstack([_sensitivities(modal, blocks, a, [0.0, 1.0]).transpose(1, 0, 2, 3).reshape(-1, n * p) for a in e])
+        w = np.tile(weight, len(J) // p)
+        JJ, Je = (J * w[:, None]).T @ (J * w[:, None]), (J * w[:, None]).T @ (np.vstack(e).ravel() * w)
+        scale = np.sqrt(np.maximum(np.diag(JJ), np.finfo(float).tiny))
+        while damping < 1e6:
+            step = np.linalg.solve(JJ / np.outer(scale, scale) + damping * np.eye(n * p), Je / scale) / scale
+            trial = K + basis @ step.reshape(n, p)
+            if np.abs(np.linalg.eigvals(plant.A - trial @ plant.C)).max() < 1:
+                model_t, _, e_t = errors(trial)
+                cost_t = sum(np.sum((a * weight) ** 2) for a in e_t)
+                if cost_t < cost:
+                    break
+            damping *= 10
+        else:
+            break
+        gained, K, model, e, cost, damping = cost - cost_t, trial, model_t, e_t, cost_t, damping / 10
+        if gained < 1e-6 * cost:
+            break
+    return plant._replace(K=K)
+
+
+def _first_state(plant, start, criterion, u, y):
+    rows = np.isfinite(y).all(1)
+    stop = len(rows) if rows.all() else max(int(np.argmin(rows)), 1)
+    return estimate_state(start, drives(criterion, u[:stop], np.nan_to_num(y[:stop])), y[:stop])
+
+
+def _weights(errors: np.ndarray, *, diagonal: bool) -> tuple[np.ndarray, np.ndarray]:
+    """W and its inverse with W'W = S^-1, S (p, p) the covariance of the errors; noise-free channels are floored at rounding."""
+    rows = errors[np.isfinite(errors).all(1)]
+    S = rows.T @ rows / max(len(rows), 1)
+    S = np.diag(np.diag(S)) if diagonal else S
+    S = S + np.eye(len(S)) * max(1e-12 * np.trace(S), 1e-300)
+    L = np.linalg.cholesky(S)
+    return np.linalg.inv(L), L

@@ -1,0 +1,231 @@
+"""Subspace identification: VARX, PBSID with a Kalman gain (Chiuso 2007), and past-output MOESP (Verhaegen 1994), over several segments.
+
+Records come as segments u (T, m), y (T, p); a NaN is a masked sample, and every row whose window touches one is dropped and counted. Everything that PBSID needs
+is in one triangular factor of the lagged record, so neither the order nor the horizon costs another pass over the samples.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.temperature.plant import Plant
+from pipeline.temperature.plant import plant as make_plant
+from pipeline.temperature.refinement import fit_inputs
+
+ROUNDING = 1e-13  # relative ridge on second moments: what their own rounding amounts to
+RANK = 1e-11  # directions of the record below this share of the largest are rounding
+Segments = Sequence[np.ndarray]
+
+
+class Varx(NamedTuple):
+    """y(t) = sum_k B_k u(t-k) + A_k y(t-k) + constant + e(t), k = 1..past: B (past, p, m), A (past, p, p), constant (p,), covariance of e (p, p)."""
+
+    B: np.ndarray
+    A: np.ndarray
+    constant: np.ndarray
+    covariance: np.ndarray
+    rows: int
+    dropped_rows: int
+
+
+class Lagged(NamedTuple):
+    """Triangular factor of the lagged record, columns [u(t) if feed-through, w(t-1), ..., w(t-past), u(t) if not, y(t)], w = [u; y] shifted and scaled.
+
+    R'R is the second moment of those columns about their mean (with an offset) or about zero (without); means (past+1, m+p) holds the mean of w(t-lag) over the rows.
+    """
+
+    R: np.ndarray
+    m: int
+    p: int
+    past: int
+    feedthrough: bool
+    means: np.ndarray
+    rows: int
+    dropped_rows: int
+
+    @property
+    def now_u(self) -> np.ndarray:
+        start = 0 if self.feedthrough else self.past * (self.m + self.p)
+        return np.arange(start, start + self.m)
+
+    @property
+    def now_y(self) -> np.ndarray:
+        return np.arange(self.R.shape[1] - self.p, self.R.shape[1])
+
+    def lags(self, first: int, last: int) -> np.ndarray:
+        """Columns of w(t-first) ... w(t-last); lag 0 is w(t) itself."""
+        q, start = self.m + self.p, self.m if self.feedthrough else 0
+        past = [start + (lag - 1) * q + np.arange(q) for lag in range(max(first, 1), last + 1)]
+        return np.concatenate([np.r_[self.now_u, self.now_y], *past] if first == 0 else past)
+
+
+def complete_runs(u: Segments, y: Segments) -> list[np.ndarray]:
+    """The stretches w = [u, y] (L, m+p) of the segments in which nothing is masked."""
+    runs = []
+    for a, b in zip(u, y, strict=True):
+        w = np.hstack([a, b])
+        edges = np.flatnonzero(np.diff(np.r_[0, np.isfinite(w).all(axis=1), 0]))
+        runs += [w[start:stop] for start, stop in zip(edges[::2], edges[1::2], strict=True)]
+    return runs
+
+
+def lagged_moments(w: np.ndarray, past: int) -> np.ndarray:
+    """Sum over t = past..L-1 of z z', z = [w(t); w(t-1); ...; w(t-past)], for w (L, q).
+
+    Only the first block row is a product over the samples; the rest follows from the shift S(i+1, j+1) = S(i, j) + w(past-1-i) w(past-1-j)' - w(L-1-i) w(L-1-j)'.
+    """
+    L, q = w.shape
+    S = np.empty((past + 1, q, past + 1, q))
+    for j in range(past + 1):
+        S[0, :, j] = w[past:].T @ w[past - j : L - j]
+        S[j, :, 0] = S[0, :, j].T
+    for i in range(past):
+        for j in range(i, past):
+            S[i + 1, :, j + 1] = S[i, :, j] + np.outer(w[past - 1 - i], w[past - 1 - j]) - np.outer(w[L - 1 - i], w[L - 1 - j])
+            S[j + 1, :, i + 1] = S[i + 1, :, j + 1].T
+    return S.reshape((past + 1) * q, -1)
+
+
+def _columns(m: int, p: int, past: int, feedthrough: bool) -> np.ndarray:
+    """Order of the columns of `Lagged` taken from z = [w(t); w(t-1); ...]."""
+    q = m + p
+    lags, now_u, now_y = np.arange(q, q * (past + 1)), np.arange(m), np.arange(m, q)
+    return np.concatenate([now_u, lags, now_y] if feedthrough else [lags, now_u, now_y])
+
+
+def lagged(u: Segments, y: Segments, past: int, *, feedthrough: bool = False, offset: bool = True, exact: bool = False) -> Lagged:
+    """The triangular factor of a record. An offset is estimated with every regression (Frisch-Waugh: the moments are taken about the mean of the same rows).
+
+    `exact` takes the QR of the rows themselves, for records whose noise is below the root of rounding; otherwise Cholesky of the moments.
+    Raises ValueError where no window of past + 1 complete samples is left, or fewer than there are unknowns.
+    """
+    m, p = u[0].shape[1], y[0].shape[1]
+    runs = [w for w in complete_runs(u, y) if len(w) > past]
+    rows, unknowns = sum(len(w) - past for w in runs), past * (m + p) + m * feedthrough + offset
+    if rows < unknowns + m + p:
+        raise ValueError(
+            f"the record is too short for a window of {past} samples: expected at least {unknowns + m + p} complete windows, found {rows};"
+            f" record {unknowns + m + p - rows} samples more, or shorten the window"
+        )
+    shift = sum(w.sum(axis=0) for w in runs) / sum(len(w) for w in runs) if offset else np.zeros(m + p)
+    runs = [w - shift for w in runs]
+    sums = sum(np.array([w[past - lag : len(w) - lag].sum(axis=0) for lag in range(past + 1)]) for w in runs)
+    R = (_exact_factor if exact else _moment_factor)(runs, past, _columns(m, p, past, feedthrough), sums.ravel() / rows * offset, rows)
+    possible = sum(max(len(a) - past, 0) for a in u)
+    return Lagged(R, m, p, past, feedthrough, (shift + sums / rows) * offset, rows, possible - rows)
+
+
+def _moment_factor(runs, past, columns, mean, rows) -> np.ndarray:
+    S = sum(lagged_moments(w, past) for w in runs) - rows * np.outer(mean, mean)
+    S = S[np.ix_(columns, columns)]
+    scale = np.sqrt(np.maximum(np.diag(S), np.finfo(float).tiny))
+    return np.linalg.cholesky(S / np.outer(scale, scale) + ROUNDING * np.eye(len(S))).T * scale
+
+
+def _exact_factor(runs, past, columns, mean, rows) -> np.ndarray:
+    z = np.vstack([np.hstack([w[past - lag : len(w) - lag] for lag in range(past + 1)]) for w in runs]) - mean
+    return np.linalg.qr(z[:, columns], mode="r")
+
+
+def one_step(data: Lagged, past: int) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients (features, p) of the one-step predictor with the first `past` lags (and u(t) with feed-through), and its errors as rows of the factor."""
+    features = np.concatenate([data.now_u if data.feedthrough else [], data.lags(1, past)]).astype(int)
+    k = len(features)  # the features lead the columns, so the factor is already theirs
+    R = data.R[:k, :k]
+    coefficients = np.linalg.lstsq(R, data.R[:k, data.now_y], rcond=RANK)[0]
+    return coefficients, data.R[:, data.now_y] - data.R[:, features] @ coefficients
+
+
+def varx(u: Segments, y: Segments, past: int, *, offset: bool = True) -> Varx:
+    """Least-squares one-step predictor of `past` samples (Chiuso 2007). Raises ValueError where the record has fewer complete windows than unknowns."""
+    data = lagged(u, y, past, offset=offset)
+    coefficients, errors = one_step(data, past)
+    by_lag = coefficients.reshape(past, data.m + data.p, data.p).transpose(0, 2, 1)
+    constant = data.means[0, data.m :] - np.einsum("kij,kj->i", by_lag, data.means[1:])
+    freedom = data.rows - len(coefficients) - offset
+    return Varx(by_lag[:, :, : data.m], by_lag[:, :, data.m :], constant, errors.T @ errors / freedom, data.rows, data.dropped_rows)
+
+
+class Subspace(NamedTuple):
+    """What the singular value decomposition of the extended predictor leaves: states = basis[:n] z for order n, and all singular values in units of noise."""
+
+    basis: np.ndarray
+    singular_values: np.ndarray
+
+
+def subspace(data: Lagged, future: int) -> Subspace:
+    """PBSID-opt (Chiuso 2007): the predictor's coefficients shifted into Gamma_f K, weighted by the noise, times the past, and its singular values.
+
+    Row block i holds the coefficients of lags i+1, i+2, ... : the effect that the past still has i steps ahead. The coefficients' error adds to the singular values
+    about as much as a (future p) x (past (m+p)) matrix of unit noise does, at most sqrt(future p) + sqrt(past (m+p)).
+    """
+    q, p, past = data.m + data.p, data.p, data.past
+    coefficients, errors = one_step(data, past)
+    first = data.m if data.feedthrough else 0
+    S = errors.T @ errors / data.rows
+    whiten = np.linalg.inv(np.linalg.cholesky(S + ROUNDING * np.diag(np.diag(S)) + np.eye(p) * np.finfo(float).tiny))
+    phi = whiten @ coefficients[first:].T
+    extended = np.zeros((future, p, past * q))
+    for i in range(future):
+        extended[i, :, : (past - i) * q] = phi[:, i * q :]
+    extended = extended.reshape(future * p, past * q)
+    U, singular_values, _ = np.linalg.svd(extended @ data.R[:, data.lags(1, past)].T, full_matrices=False)
+    return Subspace((U.T @ extended) / np.sqrt(np.maximum(singular_values, np.finfo(float).tiny))[:, None], singular_values)
+
+
+def realise(data: Lagged, basis: np.ndarray, sample_time_s: float) -> Plant:
+    """The plant whose states are basis (n, past (m+p)) times the past: C, D from y, then A, B, K from the states one step later, all by least squares."""
+    n, m = len(basis), data.m
+    x, x_next = data.R[:, data.lags(1, data.past)] @ basis.T, data.R[:, data.lags(0, data.past - 1)] @ basis.T
+    u, y = data.R[:, data.now_u], data.R[:, data.now_y]
+    CD = np.linalg.lstsq(np.hstack([x, u]) if data.feedthrough else x, y, rcond=RANK)[0].T
+    C, D = CD[:, :n], CD[:, n:] if data.feedthrough else np.zeros((data.p, m))
+    e = y - x @ C.T - u @ D.T
+    ABK = np.linalg.lstsq(np.hstack([x, u, e]), x_next, rcond=RANK)[0].T
+    A, B, K = ABK[:, :n], ABK[:, n : n + m], ABK[:, n + m :]
+    u_mean, y_mean = data.means[0, :m], data.means[0, m:]
+    drift = basis @ (data.means[:-1] - data.means[1:]).ravel()
+    return make_plant(A, B, C, D, drift - B @ u_mean, y_mean - D @ u_mean, K, sample_time_s)
+
+
+def _future_past_factor(u: Segments, y: Segments, block_rows: int, offset: bool) -> np.ndarray:
+    """R of [1, U_f, U_p, Y_p, Y_f] with block_rows samples of each, as SLICOT's IB01MD orders them; every run of complete samples adds its rows."""
+    s, m, blocks = block_rows, u[0].shape[1], []
+    for w in complete_runs(u, y):
+        N = len(w) - 2 * s + 1
+        if N > 0:
+            hankel = [np.hstack([part[start + i : start + i + N] for i in range(s)]) for part, start in ((w[:, :m], s), (w[:, :m], 0), (w[:, m:], 0), (w[:, m:], s))]
+            blocks.append(np.hstack([np.ones((N, int(offset))), *hankel]))
+    rows, columns = sum(len(b) for b in blocks), 2 * s * (m + y[0].shape[1]) + offset
+    if rows < columns:
+        raise ValueError(f"the record is too short for {s} block rows: expected at least {columns} complete windows of {2 * s} samples, found {rows}; record {columns - rows} samples more, or take fewer block rows")
+    return np.linalg.qr(np.vstack(blocks), mode="r")
+
+
+def _moesp_svd(u: Segments, y: Segments, block_rows: int, offset: bool) -> tuple[np.ndarray, np.ndarray]:
+    m, p, s = u[0].shape[1], y[0].shape[1], block_rows
+    R = _future_past_factor(u, y, s, offset)
+    first, last = s * m + offset, s * (2 * m + p) + offset
+    U, singular_values, _ = np.linalg.svd(R[first:last, last:].T)
+    return U, singular_values
+
+
+def moesp_singular_values(u: Segments, y: Segments, block_rows: int, *, offset: bool = False) -> np.ndarray:
+    """Singular values of the future outputs on the past, future inputs projected out (past-output MOESP); SLICOT's IB01AD prints the same (METH = 'M')."""
+    return _moesp_svd(u, y, block_rows, offset)[1]
+
+
+def moesp(u: Segments, y: Segments, block_rows: int, order: int, *, feedthrough: bool = True, offset: bool = False, sample_time_s: float = 1.0) -> tuple[Plant, list[np.ndarray]]:
+    """Past-output MOESP: A, C from the shift of the extended observability matrix, then B, D, x0 by least squares on the simulation error (SLICOT's slmoesm).
+
+    Returns the plant, without Kalman gain, and the initial state of each segment.
+    """
+    p = y[0].shape[1]
+    if not 1 <= order <= (block_rows - 1) * p:
+        raise ValueError(f"moesp: {block_rows} block rows of {p} outputs allow orders 1 to {(block_rows - 1) * p} but {order} was asked for; take more block rows")
+    gamma = _moesp_svd(u, y, block_rows, offset)[0][:, :order]
+    A = np.linalg.lstsq(gamma[:-p], gamma[p:], rcond=None)[0]
+    model = fit_inputs(A, gamma[:p], u, y, feedthrough=feedthrough, offset=offset)
+    m = u[0].shape[1]
+    return make_plant(model.F, model.G[:, :m], model.C, model.H[:, :m], model.G[:, m], model.H[:, m], None, sample_time_s), model.x0
