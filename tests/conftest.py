@@ -1,0 +1,41 @@
+"""What every test may ask for: the repository's root, other people's data (or the reason why not), and slow tests only when they are asked for."""
+
+import os
+from pathlib import Path
+
+import hypothesis
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+SHARED = ROOT / os.environ.get("BEADLINE_SHARED", "../shared")
+
+# the same examples in every run, and no folder of remembered ones
+hypothesis.settings.register_profile("repeatable", derandomize=True, database=None, deadline=None)
+hypothesis.settings.load_profile("repeatable")
+
+
+@pytest.fixture(scope="session")
+def root() -> Path:
+    return ROOT
+
+
+@pytest.fixture(scope="session")
+def shared():
+    """shared("data/tclab_mlid_prbs/prbs.csv"): the path of other people's data; the test is skipped where it is absent."""
+
+    def path(name: str) -> Path:
+        if not (SHARED / name).exists():
+            pytest.skip(f"{name} is not in BEADLINE_SHARED ({os.environ.get('BEADLINE_SHARED', '../shared')})")
+        return SHARED / name
+
+    return path
+
+
+def pytest_collection_modifyitems(config, items):
+    """Slow tests run with -m slow, or when they are named by ::."""
+    if config.option.markexpr or any("::" in argument for argument in config.args):
+        return
+    slow = [item for item in items if item.get_closest_marker("slow")]
+    if slow:
+        config.hook.pytest_deselected(items=slow)
+        items[:] = [item for item in items if item not in slow]

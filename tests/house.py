@@ -1,0 +1,333 @@
+"""The house, read off the syntax tree: who imports whom, who opens files, and the dvc.yaml that the stages ask for."""
+
+import ast
+import functools
+import graphlib
+import re
+import typing
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import yaml
+
+from pipeline import params
+
+LOOPS = ("temperature", "deposition", "setpoint")
+# text or arrays in, arrays out: any loop may import them
+PURE = ("pipeline/gcode.py", "pipeline/first_order.py")
+NUMERICS = {"numpy", "scipy", "control", "sklearn", "cv2", "jax", "equinox", "optax", "jaxtyping"}
+LANGUAGE = {
+    "__future__",
+    "abc",
+    "bisect",
+    "collections",
+    "dataclasses",
+    "enum",
+    "fractions",
+    "functools",
+    "heapq",
+    "itertools",
+    "math",
+    "numbers",
+}
+LANGUAGE |= {"operator", "re", "string", "types", "typing", "warnings"}
+FORMATS = {"csv", "h5py", "json", "mcap", "orjson", "pandas", "pickle", "pyarrow", "yaml"}
+READS = {"read_text", "read_bytes", "load", "loadtxt", "genfromtxt", "fromfile", "memmap", "read_csv", "read_parquet", "read_table", "open"}
+WRITES = {
+    "write_text",
+    "write_bytes",
+    "write_table",
+    "save",
+    "savez",
+    "savez_compressed",
+    "savetxt",
+    "tofile",
+    "to_csv",
+    "to_parquet",
+    "dump",
+}
+EDGE_CALLS = {"artifacts", "params", "recordings"}
+GENERATORS = {"Generator", "default_rng", "SeedSequence", "BitGenerator", "PCG64"}
+
+
+# ---- the syntax tree
+
+
+class File(NamedTuple):
+    name: str
+    tree: ast.Module
+
+    @property
+    def room(self) -> str:
+        """temperature, deposition, setpoint, runtime, stages, pure; all else of pipeline/ is the edge."""
+        parts = self.name.split("/")
+        if self.name in PURE:
+            return "pure"
+        if parts[0] == "stages":
+            return "stages"
+        return parts[1] if len(parts) > 2 and parts[1] in (*LOOPS, "runtime") else "edge"
+
+
+def parsed(path: Path) -> ast.Module:
+    return _parsed(path.read_text(encoding="utf-8"))
+
+
+# every stage imports the same edge; nothing changes a tree
+_parsed = functools.cache(ast.parse)
+
+
+def files(root: Path, *folders: str) -> Iterator[File]:
+    for folder in folders:
+        for path in sorted((root / folder).rglob("*.py")):
+            yield File(path.relative_to(root).as_posix(), parsed(path))
+
+
+def imports(tree: ast.AST) -> Iterator[tuple[int, str]]:
+    """(line, dotted name) of what is imported, `from a import b` as a.b; a relative import begins with a dot."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield from ((node.lineno, "." * node.level + f"{node.module or ''}.{alias.name}".strip(".")) for alias in node.names)
+
+
+def project_file(root: Path, name: str) -> str | None:
+    """The file of the project that holds the dotted name, None for a library."""
+    parts = name.split(".")
+    for end in range(len(parts), 0, -1):
+        for candidate in ("/".join(parts[:end]) + ".py", "/".join([*parts[:end], "__init__.py"])):
+            if (root / candidate).exists():
+                return candidate
+    return None
+
+
+def calls(tree: ast.AST) -> Iterator[tuple[ast.Call, str, str]]:
+    """(call, receiver, function): artifacts.write_text(...) is ("artifacts", "write_text"), open(...) ("", "open")."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            *receiver, function = ast.unparse(node.func).rsplit(".", 1)
+            yield node, "".join(receiver), function
+
+
+# ---- who may know whom
+
+
+def forbidden_imports(root: Path) -> list[str]:
+    found = []
+    for file in files(root, "pipeline", "stages"):
+        for line, name in imports(file.tree):
+            target = project_file(root, name)
+            room = File(target, file.tree).room if target else ""
+            if name.startswith("."):
+                why = "write the whole name"
+            elif room == "stages" or name.split(".")[0] == "tests":
+                why = "nothing imports a stage or a test"
+            elif file.room in (*LOOPS, "pure") and target:
+                why = (
+                    ""
+                    if room in (file.room, "pure") or target == "pipeline/__init__.py"
+                    else f"{file.room} knows itself, gcode and first_order only"
+                )
+            elif file.room in (*LOOPS, "pure"):
+                why = (
+                    ""
+                    if name.split(".")[0] in NUMERICS | LANGUAGE
+                    else f"{file.room} knows arrays, nothing of files, clocks, processes or figures"
+                )
+            elif file.room == "runtime" and target:
+                why = "" if room in ("runtime", "temperature") else "runtime knows temperature only"
+            elif file.room == "stages":
+                why = "only artifacts opens artifacts" if name.split(".")[0] in FORMATS else ""
+            else:
+                why = ""
+            if why:
+                found.append(f"{file.name}:{line} imports {name}: {why}")
+    return found
+
+
+def forbidden_files(root: Path) -> list[str]:
+    """Loops and stages read and write nothing by themselves; the edge writes through artifacts."""
+    found = []
+    for file in files(root, "pipeline", "stages"):
+        forbidden = WRITES if file.room in ("edge", "runtime") else WRITES | READS
+        for call, receiver, function in calls(file.tree):
+            modes = call.args[:1] if receiver else call.args[1:2]
+            modes += [keyword.value for keyword in call.keywords if keyword.arg == "mode"]
+            opened_to_write = function == "open" and any(
+                isinstance(mode, ast.Constant) and set(str(mode.value)) & set("wax+") for mode in modes
+            )
+            if file.name != "pipeline/artifacts.py" and receiver not in EDGE_CALLS and (function in forbidden or opened_to_write):
+                found.append(f"{file.name}:{call.lineno} {ast.unparse(call.func)}: only artifacts opens artifacts")
+    return found
+
+
+def forbidden_randomness(root: Path) -> list[str]:
+    found = []
+    for file in files(root, "pipeline", "stages"):
+        for call, receiver, function in calls(file.tree):
+            if receiver in ("np.random", "numpy.random") and (function not in GENERATORS or (function == "default_rng" and not call.args)):
+                found.append(f"{file.name}:{call.lineno} {ast.unparse(call)}: the stage makes a seeded generator and hands it on")
+    return found
+
+
+def unframed(root: Path) -> list[str]:
+    """What a stage reads outside `with artifacts.stage(...)`: there bad input would end in a traceback, not in one sentence."""
+    found = []
+    for file in files(root, "stages"):
+        mains = [node for node in file.tree.body if isinstance(node, ast.FunctionDef) and node.name == "main"]
+        for statement in [statement for main in mains for statement in main.body]:
+            framed = isinstance(statement, ast.With) and ast.unparse(statement.items[0]).startswith("artifacts.stage(")
+            for call, receiver, _ in calls(statement):
+                if not framed and receiver in EDGE_CALLS:
+                    found.append(f"{file.name}:{call.lineno} {ast.unparse(call)}: move it into `with artifacts.stage(...)`")
+    return found
+
+
+# ---- dvc.yaml
+
+
+def modules(root: Path, name: str) -> set[str]:
+    """The file itself and every file of the project that it imports, and that those import; empty __init__.py left out."""
+    reached, todo = set(), [name]
+    while todo:
+        here = todo.pop()
+        if here not in reached and (root / here).stat().st_size:
+            reached.add(here)
+            todo += [target for _, module in imports(parsed(root / here)) if (target := project_file(root, module))]
+    return reached
+
+
+def data_files(root: Path, modules: set[str]) -> set[str]:
+    """Templates and the like beside the modules: a file, or a folder without modules."""
+    found = set()
+    for folder in {(root / name).parent for name in modules}:
+        for path in folder.iterdir():
+            inside = [file for file in (path, *path.rglob("*")) if file.is_file() and "__pycache__" not in file.parts]
+            if inside and not path.name.startswith(".") and all(file.suffix != ".py" for file in inside):
+                found.add(path.relative_to(root).as_posix())
+    return found
+
+
+def literal(file: str, call: ast.Call, position: int) -> str:
+    argument = call.args[position] if len(call.args) > position else None
+    assert isinstance(argument, ast.Constant), f"{file}:{call.lineno} {ast.unparse(call)}: write the name out, so that one can grep for it"
+    return argument.value
+
+
+def loads(name: str, tree: ast.AST) -> Iterator[tuple[str, str]]:
+    """(model, key): the sections that params.load reads whole, and with model "" the keys that params.value reads."""
+    for call, receiver, function in calls(tree):
+        if receiver == "params" and function == "load":
+            yield ast.unparse(call.args[0]), literal(name, call, 1)
+        elif receiver == "params" and function == "value":
+            yield "", literal(name, call, 0)
+
+
+def paths(stage: str, name: str, tree: ast.Module) -> tuple[set[str], set[str]]:
+    """Literal paths in datasets/ and reports/ that are read, and those that are written."""
+    written, read = set(), set()
+    targets = {id(call.args[0]) for call, _, function in calls(tree) if function.startswith("write_") and call.args}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr) and re.match(r"f['\"](datasets|reports)/", ast.unparse(node)):
+            raise AssertionError(f"{name}:{node.lineno} {ast.unparse(node)}: write the path out, so that one can grep for it")
+        if isinstance(node, ast.Constant) and re.fullmatch(r"(datasets|reports)/[\w./-]+", str(node.value)):
+            (written if id(node) in targets else read).add(node.value.rstrip("/"))
+    read |= {f"reports/metrics/{literal(name, call, 0)}.json" for call, _, function in calls(tree) if function == "read_metrics"}
+    # a memo is no artifact: whatever is in it, the results are the same
+    return {path for path in read if not path.startswith(("datasets/memo", f"datasets/{stage}/"))}, written
+
+
+def expected(root: Path, stage: str) -> dict[str, Any]:
+    """The entry of dvc.yaml: deps, params, outs and metrics are what stages/<stage>.py imports and opens, directly or through what it imports."""
+    name = f"stages/{stage}.py"
+    code = modules(root, name)
+    read, written, keys = set(), set(), set()
+    for module in code:
+        tree = parsed(root / module)
+        found = paths(stage, module, tree)
+        read, written = read | found[0], written | found[1]
+        keys |= {key for _, key in loads(module, tree)}
+    tree = parsed(root / name)
+    frames = [
+        item
+        for node in ast.walk(tree)
+        if isinstance(node, ast.With)
+        for item in node.items
+        if ast.unparse(item).startswith("artifacts.stage(")
+    ]
+    if any(frame.optional_vars for frame in frames):
+        written.add(f"datasets/{stage}")
+    for call, _, function in calls(tree):
+        assert function not in ("stage", "write_metrics") or literal(name, call, 0) == stage, (
+            f"{name}:{call.lineno} the stage's name is {stage}"
+        )
+    metrics = [f"reports/metrics/{stage}.json"] if any(function == "write_metrics" for *_, function in calls(tree)) else []
+    entry = {
+        "cmd": f"python -m stages.{stage}",
+        "deps": [name, *sorted(code - {name}), *sorted(data_files(root, code)), *sorted(read)],
+        "params": sorted(keys),
+        # DVC deletes outs before it runs a stage unless they persist, and the last good artifacts must outlive a stage that fails
+        "outs": [{path: {"persist": True}} for path in sorted(written)],
+        "metrics": [{path: {"cache": False, "persist": True}} for path in metrics],
+    }
+    return {key: value for key, value in entry.items() if value}
+
+
+def stages(root: Path) -> list[str]:
+    return sorted(path.stem for path in (root / "stages").glob("*.py") if path.stem != "__init__")
+
+
+def pipeline(root: Path) -> dict[str, Any]:
+    """All stages, each after those whose results it reads."""
+    entries = {stage: expected(root, stage) for stage in stages(root)}
+    made = {path: stage for stage, entry in entries.items() for kind in ("outs", "metrics") for out in entry.get(kind, []) for path in out}
+    order = {
+        stage: [made[out] for out in made for dep in entry["deps"] if f"{dep}/".startswith(f"{out}/")] for stage, entry in entries.items()
+    }
+    return {"stages": {stage: entries[stage] for stage in graphlib.TopologicalSorter(order).static_order()}}
+
+
+def differences(found: dict[str, Any], wanted: dict[str, Any]) -> list[str]:
+    """Sentences, empty where dvc.yaml is what the stages ask for; the order of entries and `desc` are free."""
+
+    def flat(entry, kind):
+        value = entry.get(kind, [])
+        return (
+            {value}
+            if isinstance(value, str)
+            else {yaml.safe_dump(item, default_flow_style=True, width=999).replace("\n...", "").strip() for item in value}
+        )
+
+    sentences = [
+        f"{stage}: stage is {'missing' if stage in wanted else 'not in stages/'}" for stage in sorted(found.keys() ^ wanted.keys())
+    ]
+    for stage in found.keys() & wanted.keys():
+        for kind in sorted((found[stage].keys() | wanted[stage].keys()) - {"desc"}):
+            have, want = flat(found[stage], kind), flat(wanted[stage], kind)
+            sentences += [f"{stage}: {kind} lacks {item}" for item in sorted(want - have)] + [
+                f"{stage}: {kind} has {item}" for item in sorted(have - want)
+            ]
+    return sentences
+
+
+# ---- bounds
+
+
+def unbounded(kind: Any, place: str, limits: tuple = ()) -> list[str]:
+    """The places in a type where a number has no lower or no upper bound, or a key has a default."""
+    if typing.get_origin(kind) is Annotated:
+        kind, *extra = typing.get_args(kind)
+        limits = (*limits, *(limit for item in extra for limit in getattr(item, "metadata", [item])))
+        return unbounded(kind, place, limits)
+    if isinstance(kind, type) and issubclass(kind, params.Section):
+        fields = kind.model_fields.items()
+        defaults = [f"{place}.{name} has a default" for name, field in fields if not field.is_required()]
+        return defaults + [item for name, field in fields for item in unbounded(field.annotation, f"{place}.{name}", tuple(field.metadata))]
+    if kind in (int, float):
+        has = {name for limit in limits for name in ("ge", "gt", "le", "lt") if getattr(limit, name, None) is not None}
+        sides = ["no lower bound"] * (not has & {"ge", "gt"}) + ["no upper bound"] * (not has & {"le", "lt"})
+        return [f"{place} has {side}" for side in sides]
+    union = typing.get_origin(kind) in (typing.Union, typing.get_origin(int | None))
+    arguments = [] if typing.get_origin(kind) is typing.Literal else typing.get_args(kind)
+    return [item for argument in arguments for item in unbounded(argument, place, limits if union else ())]

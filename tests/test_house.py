@@ -1,0 +1,240 @@
+"""Who may know whom, and dvc.yaml: both read off the syntax tree. `./run python -m tests.test_house` prints the dvc.yaml that the stages ask for."""
+
+import ast
+import importlib
+import sys
+import typing
+from pathlib import Path
+from typing import Annotated
+
+import pytest
+import yaml
+from pydantic import Field
+
+from pipeline import params
+from tests.house import (
+    differences,
+    expected,
+    forbidden_files,
+    forbidden_imports,
+    forbidden_randomness,
+    loads,
+    pipeline,
+    stages,
+    unbounded,
+    unframed,
+)
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+# ---- the house as it stands
+
+
+@pytest.mark.parametrize("rule", [forbidden_imports, forbidden_files, forbidden_randomness, unframed])
+def test_the_house_keeps_the_rule(rule):
+    assert rule(ROOT) == []
+
+
+def test_dvc_yaml_is_what_the_stages_import_and_open():
+    path = ROOT / "dvc.yaml"
+    found = yaml.safe_load(path.read_text(encoding="utf-8"))["stages"] if path.exists() else {}
+    assert differences(found, pipeline(ROOT)["stages"]) == [], "paste the output of ./run python -m tests.test_house into dvc.yaml"
+
+
+@pytest.mark.parametrize("stage", stages(ROOT))
+def test_the_parameters_of_a_stage_are_bounded_and_others_are_refused_by_name(stage, tmp_path):
+    module = importlib.import_module(f"stages.{stage}")
+    tree = ast.parse((ROOT / f"stages/{stage}.py").read_text(encoding="utf-8"))
+    for model, section in loads(stage, tree):
+        if not model:
+            continue
+        kind = getattr(params if model.startswith("params.") else module, model.removeprefix("params."))
+        assert unbounded(kind, section) == []
+        params.load(kind, section, ROOT / "params.yaml")
+        sections = params.read(ROOT / "params.yaml")
+        sections[section]["colour"] = 1
+        (tmp_path / "params.yaml").write_text(yaml.safe_dump(sections))
+        with pytest.raises(ValueError, match=rf"params.yaml: {section}.colour is unknown; "):
+            params.load(kind, section, tmp_path / "params.yaml")
+
+
+def test_every_section_of_params_yaml_is_read_by_a_stage():
+    read = {key.split(".")[0] for stage in stages(ROOT) for key in expected(ROOT, stage).get("params", [])}
+    found = set(params.read(ROOT / "params.yaml")) if stages(ROOT) else set()
+    assert found - {"plant", "execution"} <= read
+    assert read <= found
+
+
+# ---- the rules see what they should see
+
+
+def house(root: Path, **sources: str) -> Path:
+    """A project of the files given, `__` in a name for a slash."""
+    for name, text in sources.items():
+        path = root / (name.replace("__", "/") + ".py")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return root
+
+
+def test_a_loop_that_knows_another_loop_or_the_edge_or_a_clock_is_seen(tmp_path):
+    house(
+        tmp_path,
+        pipeline__artifacts="import pyarrow",
+        pipeline__gcode="import re",
+        pipeline__temperature__plant="import numpy as np\nfrom pipeline import gcode\nfrom pipeline.temperature import plant",
+        pipeline__temperature__bad="import time\nfrom pipeline import artifacts\nfrom pipeline.deposition.ilc import law\nfrom . import plant",
+        pipeline__deposition__ilc="import scipy.linalg\nfrom stages import ingest",
+        pipeline__runtime__guard="import time\nfrom pipeline.temperature import plant\nfrom pipeline import artifacts",
+        stages__ingest="import json\nfrom pipeline import artifacts",
+        stages__learn="from stages import ingest",
+    )
+    places = [sentence.split(": ")[0] for sentence in forbidden_imports(tmp_path)]
+    assert places == [
+        "pipeline/deposition/ilc.py:2 imports stages.ingest",
+        "pipeline/runtime/guard.py:3 imports pipeline.artifacts",
+        "pipeline/temperature/bad.py:1 imports time",
+        "pipeline/temperature/bad.py:2 imports pipeline.artifacts",
+        "pipeline/temperature/bad.py:3 imports pipeline.deposition.ilc.law",
+        "pipeline/temperature/bad.py:4 imports .plant",
+        "stages/ingest.py:1 imports json",
+        "stages/learn.py:1 imports stages.ingest",
+    ]
+
+
+def test_a_file_opened_or_a_global_seed_outside_the_edge_is_seen(tmp_path):
+    house(
+        tmp_path,
+        pipeline__artifacts="open('a', 'w')",
+        pipeline__recordings="open('a', 'rb')\nopen('a', 'wb')\npath.open()\npath.write_text('')",
+        pipeline__temperature__bad="open('a')\nnp.load('a')\npath.write_text('')\nnp.random.seed(0)\nnp.random.default_rng()\nnp.random.default_rng(1)",
+        stages__ingest="artifacts.write_text('a', '')\nparams.load(A, 'a')\npath.read_text()",
+    )
+    assert [sentence.split(":")[0] + sentence.split(":")[1][:2] for sentence in forbidden_files(tmp_path)] == [
+        "pipeline/recordings.py2 ",
+        "pipeline/recordings.py4 ",
+        "pipeline/temperature/bad.py1 ",
+        "pipeline/temperature/bad.py2 ",
+        "pipeline/temperature/bad.py3 ",
+        "stages/ingest.py3 ",
+    ]
+    assert [sentence.split(" ")[0] for sentence in forbidden_randomness(tmp_path)] == [
+        "pipeline/temperature/bad.py:4",
+        "pipeline/temperature/bad.py:5",
+    ]
+
+
+def test_input_read_outside_the_frame_of_a_stage_is_seen(tmp_path):
+    house(
+        tmp_path,
+        stages__good="def main():\n    with artifacts.stage('good') as out:\n        params.load(Good, 'good')",
+        stages__bad="def main():\n    p = params.load(Bad, 'bad')\n    with artifacts.stage('bad') as out:\n        artifacts.read_json('a')",
+    )
+    assert unframed(tmp_path) == ["stages/bad.py:2 params.load(Bad, 'bad'): move it into `with artifacts.stage(...)`"]
+
+
+STAGE = '''"""Reads datasets/raw/temperature; writes datasets/learn."""
+from pipeline import artifacts, params
+from pipeline.report import page
+params.load(Learn, "learn")
+params.value("probe.source", one_of=("a",))
+with artifacts.stage("learn") as out:
+    artifacts.read_table("datasets/ingest/record.parquet", RECORD)
+    artifacts.read_metrics("ingest")
+    memo = "datasets/memo/learn"
+    artifacts.write_text("reports/learn.html", "")
+    artifacts.write_metrics("learn", {})
+'''
+
+
+@pytest.fixture
+def toy(tmp_path):
+    house(
+        tmp_path,
+        pipeline__artifacts="import pyarrow",
+        pipeline__params="",
+        pipeline__report__page="import pipeline.schemas",
+        pipeline__schemas="import numpy",
+        pipeline__unused="1",
+        stages__learn=STAGE,
+        stages__ingest="from pipeline import artifacts\nwith artifacts.stage('ingest') as out:\n    artifacts.write_metrics('ingest', {})\n",
+    )
+    (tmp_path / "pipeline/report/templates").mkdir()
+    (tmp_path / "pipeline/report/templates/page.html").write_text("")
+    (tmp_path / "pipeline/report/__pycache__").mkdir()
+    (tmp_path / "pipeline/report/__pycache__/page.pyc").write_text("")
+    return tmp_path
+
+
+def test_an_entry_of_dvc_yaml_is_derived_from_the_stage(toy):
+    assert expected(toy, "learn") == {
+        "cmd": "python -m stages.learn",
+        "deps": [
+            "stages/learn.py",
+            "pipeline/artifacts.py",
+            "pipeline/report/page.py",
+            "pipeline/schemas.py",
+            "pipeline/report/templates",
+            "datasets/ingest/record.parquet",
+            "reports/metrics/ingest.json",
+        ],
+        "params": ["learn", "probe.source"],
+        "outs": [{"datasets/learn": {"persist": True}}, {"reports/learn.html": {"persist": True}}],
+        "metrics": [{"reports/metrics/learn.json": {"cache": False, "persist": True}}],
+    }
+    assert list(pipeline(toy)["stages"]) == ["ingest", "learn"]
+
+
+def test_a_dvc_yaml_that_lacks_or_has_too_much_is_seen(toy):
+    wanted = pipeline(toy)["stages"]
+    found = yaml.safe_load(yaml.safe_dump(wanted))
+    assert differences(found, wanted) == []
+    found["learn"]["deps"].remove("pipeline/schemas.py")
+    found["learn"]["outs"][0] = "datasets/learn"
+    found["learn"]["always_changed"] = "yes"
+    found["old"] = {}
+    assert differences(found, wanted) == [
+        "old: stage is not in stages/",
+        "learn: always_changed has yes",
+        "learn: deps lacks pipeline/schemas.py",
+        "learn: outs lacks {datasets/learn: {persist: true}}",
+        "learn: outs has datasets/learn",
+    ]
+
+
+@pytest.mark.parametrize(
+    "line", ["params.load(Learn, name)", "artifacts.read_metrics(name)", "artifacts.read_json(f'datasets/{name}/a.json')"]
+)
+def test_a_path_or_section_that_cannot_be_read_off_is_refused(toy, line):
+    (toy / "stages/learn.py").write_text(STAGE + f"    {line}\n")
+    with pytest.raises(AssertionError, match=r"stages/learn.py:12 .* out, so that one can grep for it"):
+        expected(toy, "learn")
+
+
+def test_a_number_without_bounds_and_a_default_are_seen():
+    class Inner(params.Section):
+        gain: float = Field(ge=0)
+
+    class Outer(params.Section):
+        seed: int
+        good: int = Field(ge=0, le=9)
+        several: tuple[Annotated[float, Field(gt=0, lt=1)], ...]
+        loose: list[float] = Field(min_length=1)
+        maybe: int | None = Field(ge=0, le=9)
+        method: typing.Literal[1, 2]
+        inner: list[Inner]
+        other: bool = True
+
+    assert unbounded(Outer, "learn") == [
+        "learn.other has a default",
+        "learn.seed has no lower bound",
+        "learn.seed has no upper bound",
+        "learn.loose has no lower bound",
+        "learn.loose has no upper bound",
+        "learn.inner.gain has no upper bound",
+    ]
+
+
+if __name__ == "__main__":
+    yaml.safe_dump(pipeline(ROOT), sys.stdout, sort_keys=False, width=200)
