@@ -173,7 +173,9 @@ def read_published(folder: str | Path = "datasets/published") -> tuple[np.ndarra
         log = pq.read_table(Path(folder) / "probing_log_seed1.parquet")
         u, y = (np.column_stack([log[f"{letter}{i}"].to_numpy() for i in range(1, count + 1)]) for letter, count in (("u", 7), ("y", 5)))
     except (OSError, KeyError, ValueError) as error:
-        raise ValueError(f"{folder}: the study's draws cannot be read ({_reason(error)}); restore them with `git checkout {folder}`") from None
+        raise ValueError(
+            f"{folder}: the study's draws cannot be read ({_reason(error)}); restore them with `git checkout {folder}`"
+        ) from None
     return K0, u, y
 
 
@@ -183,7 +185,9 @@ def read_published(folder: str | Path = "datasets/published") -> tuple[np.ndarra
 def read_record(path: str | Path, inputs: Sequence, outputs: Sequence) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """The record of ingest as segments u (T, m) and y (T, p), masked samples as NaN; a segment ends at a gap and at the end of a recording."""
     table = read_table(path, schemas.record(inputs, outputs))
-    columns = [np.stack([np.where(table[f"{s.name}_masked"], np.nan, table[s.name]) for s in signals], axis=1) for signals in (inputs, outputs)]
+    columns = [
+        np.stack([np.where(table[f"{s.name}_masked"], np.nan, table[s.name]) for s in signals], axis=1) for signals in (inputs, outputs)
+    ]
     first = (table["recording"][1:] != table["recording"][:-1]) | (table["segment"][1:] != table["segment"][:-1])
     starts = np.flatnonzero(first) + 1
     return np.split(columns[0], starts), np.split(columns[1], starts)

@@ -1,4 +1,5 @@
-"""CSV and its relatives from other people's programs: encoding, delimiter, decimal mark and header are found, and every refusal names the line."""
+"""CSV and its relatives from other people's programs: encoding, delimiter, decimal mark and header are found, and every refusal names the
+line."""
 
 import csv
 import datetime
@@ -34,7 +35,8 @@ class CsvLayout(NamedTuple):
 def csv_layout(path: Path) -> CsvLayout:
     """Encoding, delimiter, decimal mark and header of a text file. Raises ValueError where it has no rows of numbers."""
     with path.open("rb") as stream:
-        start = stream.read(1 << 16)
+        # zeros behind the text are what a file system leaves after a power failure
+        start = stream.read(1 << 16).rstrip(b"\0")
     encoding, notes = _encoding(path, start)
     lines = start.decode(encoding, errors="replace").splitlines()[: 400 if len(start) < 1 << 16 else -1]
     delimiter, decimal = _delimiter([line for line in lines if line.strip() and not line.lstrip().startswith(_COMMENT)])
@@ -43,7 +45,9 @@ def csv_layout(path: Path) -> CsvLayout:
     data = [i for i, row in enumerate(rows) if not comment[i] and any(_is_number(field, decimal) for field in row)]
     if not data:
         found = "a header" if any(row and not c for row, c in zip(rows, comment, strict=True)) else "only blank or comment lines"
-        raise ValueError(f"{path}: line 2 on should hold rows of numbers, but the file has {found} and no data; record it again or remove it")
+        raise ValueError(
+            f"{path}: line 2 on should hold rows of numbers, but the file has {found} and no data; record it again or remove it"
+        )
     first, width = data[0], len(rows[data[0]])
     heads = [i for i in range(first) if len(rows[i]) >= width and any(rows[i]) and not any(_is_number(field, decimal) for field in rows[i])]
     if not heads:
@@ -59,10 +63,13 @@ def _encoding(path: Path, start: bytes) -> tuple[str, list[Note]]:
     for mark, encoding in ((b"\xef\xbb\xbf", "utf-8-sig"), (b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16")):
         if start.startswith(mark):
             return encoding, []
-    if start[1::2].count(0) > len(start) // 4:
+    if start[1::2].count(0) > len(start) // 4 and not start[0::2].count(0):
         return "utf-16-le", [Note("encoding", "", 1, "the text is UTF-16 without a byte order mark")]
     if start.count(0) > len(start) // 100:
-        raise ValueError(f"{path}: the bytes at offset 0 ({start[:8].hex(' ')}) are neither text nor Parquet nor MCAP; convert the recording to one of them")
+        raise ValueError(
+            f"{path}: the bytes at offset 0 ({start[:8].hex(' ')}) are neither text nor Parquet nor MCAP; convert the"
+            f" recording to one of them"
+        )
     try:
         # a letter of several bytes may be cut at the end of the part that was read
         start.decode("utf-8") if len(start) < 1 << 16 else start[: start.rfind(b"\n") + 1].decode("utf-8")
@@ -108,7 +115,10 @@ def csv_columns(path: Path) -> list[Column]:
 
 
 def read_csv(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns, list[Note]]:
-    """The wanted columns, NaN where a field is empty. Raises ValueError with the line for text, a row of another length, or a missing column."""
+    """The wanted columns, NaN where a field is empty.
+
+    Raises ValueError with the line for text, a row of another length, or a missing column.
+    """
     layout = csv_layout(path)
     notes = list(layout.notes)
     interval = every(time)
@@ -165,7 +175,9 @@ def _whole_rows(path: Path, layout: CsvLayout, notes: list[Note]) -> Iterator[tu
     broken = None
     for line, row in _rows(path, layout):
         if broken:
-            raise ValueError(f"{path}: line {broken[0]} has {broken[1]} fields but the header has {width} columns; mend or remove that line")
+            raise ValueError(
+                f"{path}: line {broken[0]} has {broken[1]} fields but the header has {width} columns; mend or remove that line"
+            )
         if len(row) == width or (len(row) > width and not any(field.strip() for field in row[width:])):
             yield line, row
         else:
@@ -190,7 +202,9 @@ def _float(path: Path, name: str, field: str, line: int) -> float:
     try:
         return float(field)
     except ValueError:
-        raise ValueError(f"{path}: line {line}, column {name} should be a number but is {field.strip()[:40]!r}; mend that line, or leave the field empty") from None
+        raise ValueError(
+            f"{path}: line {line}, column {name} should be a number but is {field.strip()[:40]!r}; mend that line, or leave the field empty"
+        ) from None
 
 
 _EPOCH = datetime.datetime(1970, 1, 1)
@@ -204,10 +218,10 @@ def _instants(path: Path, name: str, fields: list[str], lines: list[int]) -> np.
             instant = datetime.datetime.fromisoformat(field.strip())
         except ValueError:
             expected = "seconds or ISO 8601 such as 2025-11-21T13:00:00.5"
-            raise ValueError(f"{path}: line {line}, time {name} should be {expected} but is {field.strip()[:40]!r}; convert it, or name another column") from None
+            raise ValueError(
+                f"{path}: line {line}, time {name} should be {expected} but is {field.strip()[:40]!r}; convert it, or name another column"
+            ) from None
         if instant.tzinfo is not None:
             instant = instant.astimezone(datetime.UTC).replace(tzinfo=None)
         instants.append((instant - _EPOCH) // datetime.timedelta(microseconds=1) * 1000)
     return np.array(instants, np.int64)
-
-

@@ -11,9 +11,23 @@ from pipeline.signals import nearest_names
 
 # a number beyond that is no time in seconds but an epoch in ms, us or ns (1e11 s is the year 5138)
 _EPOCHS = ((1e17, 1e9, "ns"), (1e14, 1e6, "us"), (1e11, 1e3, "ms"))
-_TIME_NAMES = ("t", "time", "elapsed", "elapsed_time", "seconds", "timestamp", "time_stamp", "stamp", "log_time", "datetime", "date_time", "date", "index")
-_PER_SECOND = {"s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e3, "msec": 1e3, "us": 1e6, "µs": 1e6, "usec": 1e6, "ns": 1e9,
-               "nsec": 1e9, "min": 1 / 60, "h": 1 / 3600}  # fmt: skip
+_TIME_NAMES = (
+    "t",
+    "time",
+    "elapsed",
+    "elapsed_time",
+    "seconds",
+    "timestamp",
+    "time_stamp",
+    "stamp",
+    "log_time",
+    "datetime",
+    "date_time",
+    "date",
+    "index",
+)
+_PER_SECOND = {"s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e3, "msec": 1e3, "us": 1e6, "µs": 1e6,
+               "usec": 1e6, "ns": 1e9, "nsec": 1e9, "min": 1 / 60, "h": 1 / 3600}  # fmt: skip
 
 _PARQUET = b"PAR1"
 _STRANGERS = {
@@ -53,7 +67,7 @@ class Column(NamedTuple):
 
 
 def file_format(path: Path) -> str:
-    """"mcap", "parquet" or "csv", by the file's first bytes, whatever its name ends in. Raises ValueError for what is none of them."""
+    """ "mcap", "parquet" or "csv", by the file's first bytes, whatever its name ends in. Raises ValueError for what is none of them."""
     if path.is_dir():
         raise ValueError(f"{path} is a folder but should be one recording; name a file in it")
     try:
@@ -75,7 +89,10 @@ def file_format(path: Path) -> str:
     if not start.strip(b"\0"):
         raise ValueError(f"{path} begins with {len(start)} zero bytes but should be MCAP, Parquet or CSV; copy the recording again")
     if path.suffix in (".mcap", ".parquet"):
-        raise ValueError(f"{path}: the bytes at offset 0 are {start[:8].hex(' ')}, which begin no {path.suffix[1:]} file; copy the recording again as binary")
+        raise ValueError(
+            f"{path}: the bytes at offset 0 are {start[:8].hex(' ')}, which begin no {path.suffix[1:]} file; copy the"
+            f" recording again as binary"
+        )
     return "csv"
 
 
@@ -91,7 +108,9 @@ def time_column(path: Path, names: Sequence[str], time: str) -> str:
     ranked = [(rank, name) for name in names if (rank := _time_rank(name)) is not None]
     if not ranked:
         shown = ", ".join(names[:12])
-        raise ValueError(f"{path}: no column is called like a time (t_s, time, timestamp, ...) among {shown}; name it, or write time: every 1.0 s")
+        raise ValueError(
+            f"{path}: no column is called like a time (t_s, time, timestamp, ...) among {shown}; name it, or write time: every 1.0 s"
+        )
     return min(ranked)[1]
 
 
@@ -123,7 +142,8 @@ def _time_unit(name: str) -> tuple[str, str]:
 
 
 def seconds(name: str, numbers: np.ndarray) -> tuple[np.ndarray, str]:
-    """Time in seconds from numbers in the unit of the column's name; without one, in seconds or in what the size of an epoch tells (then said)."""
+    """Time in seconds from numbers in the unit of the column's name; without one, in seconds or in what the size of an epoch tells (then
+    said)."""
     unit = _time_unit(name)[1]
     if unit:
         return numbers / _PER_SECOND[unit], ""
@@ -155,7 +175,11 @@ def check_clock(path: Path, group: Columns) -> None:
         remedy = "name a finer clock, or separate two devices that write under one name"
     else:
         said = f"is at {now:.9g} s{since}, which is before the sample ahead of it at {before:.9g} s"
-        remedy = "split the recording where its clock was set back" if group.name == "rows" else "sort it with: mcap sort, or split it where its clock was set back"
+        remedy = (
+            "split the recording where its clock was set back"
+            if group.name == "rows"
+            else "sort it with: mcap sort, or split it where its clock was set back"
+        )
     times = f", the first of {count}" if count > 1 else ""
     raise ValueError(f"{path}: {group.place(i + 1)} {said}{times}, but time should only run forward; {remedy}")
 
@@ -168,5 +192,3 @@ def every(time: str) -> float | None:
     except ValueError:
         return None
     return interval if interval is not None and 0 < interval < np.inf else None
-
-

@@ -31,7 +31,9 @@ class Job(NamedTuple):
         signals = [*self.machine.inputs, *self.machine.outputs]
         unknown = sorted(set(self.mapping) - {signal.name for signal in signals})
         if unknown:
-            raise ValueError(f"params.yaml: ingest.mapping.{unknown[0]} is no signal of the plant; {nearest_names(unknown[0], [s.name for s in signals])}")
+            raise ValueError(
+                f"params.yaml: ingest.mapping.{unknown[0]} is no signal of the plant; {nearest_names(unknown[0], [s.name for s in signals])}"
+            )
         found = []
         for signal in signals:
             source, unit, scale, offset = self.mapping.get(signal.name, (signal.name, signal.unit, 1.0, 0.0))
@@ -61,16 +63,28 @@ class Filled(NamedTuple):
 
 def process(folder: Path, job: Job, execution: Execution, *, memo: Path) -> list[Result]:
     """Every recording below `folder`, in the order of names, on as many workers as `execution` says. Raises ValueError where there is none."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file() and not path.name.startswith(".") and path.suffix.lower() not in {".md", ".txt", ".yaml"})
+    files = sorted(
+        path
+        for path in folder.rglob("*")
+        if path.is_file() and not path.name.startswith(".") and path.suffix.lower() not in {".md", ".txt", ".yaml"}
+    )
     if not files:
-        raise ValueError(f"{folder}: expected at least one recording (CSV, Parquet or MCAP), found none; copy one there, or set generate_probing.source: simulated")
+        raise ValueError(
+            f"{folder}: expected at least one recording (CSV, Parquet or MCAP), found none; copy one there, or set generate_probing.source: simulated"
+        )
     job.sources()
     code = "".join(artifacts.sha256(path) for path in sorted(CODE.glob("*.py")))
-    keys = [joblib.hash((artifacts.sha256(path), path.relative_to(folder).as_posix(), job.machine.model_dump(), job[1:], code)) for path in files]
+    keys = [
+        joblib.hash((artifacts.sha256(path), path.relative_to(folder).as_posix(), job.machine.model_dump(), job[1:], code))
+        for path in files
+    ]
     done = [(memo / f"{key}.record.parquet").exists() and (memo / f"{key}.quality.parquet").exists() for key in keys]
     todo = [(path, key) for path, key, known in zip(files, keys, done, strict=True) if not known]
     reasons = dict(zip([key for _, key in todo], _run(todo, folder, job, execution, memo), strict=True))
-    return [_result(path.relative_to(folder).as_posix(), key, job, memo, reasons.get(key, ""), known) for path, key, known in zip(files, keys, done, strict=True)]
+    return [
+        _result(path.relative_to(folder).as_posix(), key, job, memo, reasons.get(key, ""), known)
+        for path, key, known in zip(files, keys, done, strict=True)
+    ]
 
 
 def _run(todo: Sequence[tuple[Path, str]], folder: Path, job: Job, execution: Execution, memo: Path) -> list[str]:
@@ -80,7 +94,9 @@ def _run(todo: Sequence[tuple[Path, str]], folder: Path, job: Job, execution: Ex
         try:
             import distributed
         except ImportError:
-            raise ValueError("params.yaml: execution.backend is dask but dask is not installed; run with ./run --group cluster, or set execution.backend: loky") from None
+            raise ValueError(
+                "params.yaml: execution.backend is dask but dask is not installed; run with ./run --group cluster, or set execution.backend: loky"
+            ) from None
         with distributed.Client(execution.scheduler, timeout="20s"), joblib.parallel_config(backend="dask"):
             return joblib.Parallel()(joblib.delayed(_one)(path.resolve(), key, folder.resolve(), job, memo.resolve()) for path, key in todo)
     return joblib.Parallel(n_jobs=execution.jobs, backend="loky")(joblib.delayed(_one)(path, key, folder, job, memo) for path, key in todo)
@@ -101,7 +117,15 @@ def _one(path: Path, key: str, folder: Path, job: Job, memo: Path) -> str:
     findings += [(n.kind, n.signal, np.nan, np.nan, n.count, n.message) for n in raw.notes]
     artifacts.write_table(memo / f"{key}.record.parquet", schemas.record(job.machine.inputs, job.machine.outputs), _columns(name, table))
     kinds, signals, starts, ends, counts, messages = [list(column) for column in zip(*findings, strict=True)] if findings else [[]] * 6
-    quality = {"recording": [name] * len(findings), "signal": signals, "kind": kinds, "start_s": starts, "end_s": ends, "count": counts, "message": messages}
+    quality = {
+        "recording": [name] * len(findings),
+        "signal": signals,
+        "kind": kinds,
+        "start_s": starts,
+        "end_s": ends,
+        "count": counts,
+        "message": messages,
+    }
     artifacts.write_table(memo / f"{key}.quality.parquet", schemas.QUALITY, quality)
     return ""
 
@@ -130,7 +154,15 @@ def collect(results: Sequence[Result], machine: Plant, *, strict: bool) -> tuple
     record = {column.name: np.concatenate([result.record[column.name] for result in good]) for column in schema.columns}
     quality = {column.name: np.concatenate([result.quality[column.name] for result in good]) for column in schemas.QUALITY.columns}
     for result in broken:
-        row = {"recording": result.name, "signal": "", "kind": "quarantined", "start_s": np.nan, "end_s": np.nan, "count": 1, "message": result.reason}
+        row = {
+            "recording": result.name,
+            "signal": "",
+            "kind": "quarantined",
+            "start_s": np.nan,
+            "end_s": np.nan,
+            "count": 1,
+            "message": result.reason,
+        }
         quality = {name: np.append(values, np.array([row[name]], values.dtype)) for name, values in quality.items()}
     counts: dict[str, dict[str, int]] = {}
     for signal, kind, count in zip(quality["signal"], quality["kind"], quality["count"], strict=True):

@@ -1,4 +1,5 @@
-"""What is in a recording, in words: format, clocks with rate, jitter and gaps, signals with their ranges, damage; and a mapping to paste into params.yaml."""
+"""What is in a recording, in words: format, clocks with rate, jitter and gaps, signals with their ranges, damage; and a mapping to paste
+into params.yaml."""
 
 import json
 import re
@@ -41,7 +42,10 @@ class _Signal(NamedTuple):
 
 
 def inspect(path: str | Path) -> str:
-    """A description of the recording to read, and at its end YAML to paste under `ingest.mapping` and `plant`. Raises ValueError where nothing can be read."""
+    """A description of the recording to read, and at its end YAML to paste under `ingest.mapping` and `plant`.
+
+    Raises ValueError where nothing can be read.
+    """
     path = Path(path)
     kind = file_format(path)
     if kind == "mcap":
@@ -67,7 +71,9 @@ def _table(path: Path, kind: str) -> tuple[list[str], list[tuple[Columns, str]],
     lines = []
     if kind == "csv":
         layout = csv_layout(path)
-        lines.append(f"{layout.encoding}, delimiter {layout.delimiter!r}, decimal mark {layout.decimal!r}, data from line {layout.skip + 1}")
+        lines.append(
+            f"{layout.encoding}, delimiter {layout.delimiter!r}, decimal mark {layout.decimal!r}, data from line {layout.skip + 1}"
+        )
     others = [f"{column.name or '(no name)'} ({column.type})" for column in columns if column.name not in numeric]
     lines += [f"{len(columns)} columns, {len(numeric)} of them numbers"] + ([f"not numbers: {', '.join(others[:20])}"] if others else [])
     reader: Callable = read_csv if kind == "csv" else read_parquet
@@ -78,7 +84,14 @@ def _table(path: Path, kind: str) -> tuple[list[str], list[tuple[Columns, str]],
         if "no column is called like a time" not in str(error):
             raise
         group, notes = reader(path, wanted, "every 1.0 s")
-        notes.append(Note("clock", "", 1, "no column is called like a time; write its name, or time: every 1.0 s with the sample time, beside the mapping"))
+        notes.append(
+            Note(
+                "clock",
+                "",
+                1,
+                "no column is called like a time; write its name, or time: every 1.0 s with the sample time, beside the mapping",
+            )
+        )
     return lines, [(group, "")], {column.name: column.unit for column in columns}, notes
 
 
@@ -88,7 +101,9 @@ def _mcap(path: Path) -> tuple[list[str], list[tuple[Columns, str]], dict[str, s
     bare = [field for topic in found.values() for field in topic.fields]
     for topic in found.values():
         schemas = sorted({f"{channel.encoding}, {channel.schema_name or 'no schema'}" for channel in topic.channels})
-        said = f"cannot be read: {topic.unreadable}" if topic.unreadable else f"{len(topic.fields)} numbers" if topic.fields else "no numbers"
+        said = (
+            f"cannot be read: {topic.unreadable}" if topic.unreadable else f"{len(topic.fields)} numbers" if topic.fields else "no numbers"
+        )
         lines.append(f"  {topic.name}: {topic.count} messages, {'; '.join(schemas)}, {said}")
         if topic.fields and topic.count:
             group, more = _topic(path, topic)
@@ -178,7 +193,9 @@ def _proposal(signals: Sequence[_Signal], groups: Sequence[tuple[Columns, str]])
     left = [signal.source for signal in taken if signal.role == "set-point"]
     lines = [f"# a proposal from {how}", "ingest:", "  mapping:", *mapping]
     lines += [f"# set-points, which a plant's model has no use for: {', '.join(left)}"] if left else []
-    lines += ["# nothing looks like a heater or a motor: map the inputs by hand, a plant cannot be identified without"] if not inputs else []
+    lines += (
+        ["# nothing looks like a heater or a motor: map the inputs by hand, a plant cannot be identified without"] if not inputs else []
+    )
     lines += ["plant:", "  inputs:" if inputs else "  inputs: []", *inputs, "  outputs:" if outputs else "  outputs: []", *outputs]
     return [*lines, f"  sample_time_s: {_sample_time(groups)!r}"]
 
@@ -194,7 +211,8 @@ def _role(signal: _Signal) -> str:
         return ""
     if re.search(_SET_POINT, name):
         return "set-point"
-    if unit in ("degc", "°c", "k", "°f", "degf") or (re.search(_TEMPERATURE, name) and not re.search(r"heater|duty|pwm|power|pct|%", name)):
+    warm = re.search(_TEMPERATURE, name) and not re.search(r"heater|duty|pwm|power|pct|%", name)
+    if warm or unit in ("degc", "°c", "k", "°f", "degf"):
         return "output"
     return "input" if unit in ("%", "percent") or re.search(_INPUT, name) else ""
 

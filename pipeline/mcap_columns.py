@@ -68,7 +68,10 @@ class _Growing:
 
 
 def topics(path: Path, samples: int | None = SAMPLES) -> dict[str, Topic]:
-    """The topics of a file, after its summary and the first `samples` messages of each channel (None: all). Raises ValueError where it is no MCAP."""
+    """The topics of a file, after its summary and the first `samples` messages of each channel (None: all).
+
+    Raises ValueError where it is no MCAP.
+    """
     file = McapFile(path)
     seen: dict[int, list[bytes]] = {}
     room = samples or np.inf
@@ -104,7 +107,9 @@ def resolve(path: Path, source: str, found: dict[str, Topic]) -> tuple[str, str]
     if len(having) == 1:
         return having[0], source
     if having:
-        raise ValueError(f"{path}: {len(having)} topics have a field {source!r} ({', '.join(having)}); write which, as in {having[0]}:{source}")
+        raise ValueError(
+            f"{path}: {len(having)} topics have a field {source!r} ({', '.join(having)}); write which, as in {having[0]}:{source}"
+        )
     names = [f"{topic.name}:{field}" for topic in found.values() for field in topic.fields]
     raise ValueError(f"{path}: no message has a number {source!r}; {nearest_names(source, names)}")
 
@@ -117,10 +122,13 @@ def _element(field: str, known: Sequence[str]) -> bool:
 # ---- reading
 
 
-def mcap_columns(path: Path, sources: Sequence[str], time: str) -> tuple[list[Columns], dict[str, tuple[str, str]], dict[str, int], list[Note]]:
+def mcap_columns(
+    path: Path, sources: Sequence[str], time: str
+) -> tuple[list[Columns], dict[str, tuple[str, str]], dict[str, int], list[Note]]:
     """The columns of each topic that `sources` need, {source: (topic, field)}, messages of each topic, and notes.
 
-    The clock is log_time, or publish_time, or a field of each topic such as header.stamp. Raises ValueError for what is not there and for what has no whole chunk.
+    The clock is log_time, or publish_time, or a field of each topic such as header.stamp. Raises ValueError for what is not there and for
+    what has no whole chunk.
     """
     places = _places(path, sources)
     found = topics(path)
@@ -195,7 +203,9 @@ def _decoder(path: Path, channel: Channel, names: Sequence[str]) -> Decode:
         raise ValueError(f"{path}: topic {channel.topic} cannot be read because {error}; map another topic") from None
 
 
-def _numbers(path: Path, channel: Channel, decode: Decode, messages: Messages, need: _Wanted, time: str) -> tuple[np.ndarray, np.ndarray, int]:
+def _numbers(
+    path: Path, channel: Channel, decode: Decode, messages: Messages, need: _Wanted, time: str
+) -> tuple[np.ndarray, np.ndarray, int]:
     """Times (n,), values (n, fields), and how many messages were no messages."""
     data, kept = messages.data, None
     try:
@@ -209,7 +219,11 @@ def _numbers(path: Path, channel: Channel, decode: Decode, messages: Messages, n
     if need.clock:
         stamp = values[:, len(need.fields) :]
         # both parts are whole numbers below 2^53, so that floats hold them and the nanoseconds are exact
-        times = np.rint(stamp[:, 0] * 1e9).astype(np.int64) if stamp.shape[1] == 1 else stamp[:, 0].astype(np.int64) * 10**9 + stamp[:, 1].astype(np.int64)
+        times = (
+            np.rint(stamp[:, 0] * 1e9).astype(np.int64)
+            if stamp.shape[1] == 1
+            else stamp[:, 0].astype(np.int64) * 10**9 + stamp[:, 1].astype(np.int64)
+        )
     else:
         times = np.array(messages.publish_time if time == "publish_time" else messages.log_time, np.uint64).astype(np.int64)
         times = times if kept is None else times[kept]
@@ -236,15 +250,25 @@ def _join(path: Path, need: _Wanted, file: McapFile, parts: dict[int, _Growing],
     if not pieces:
         why = f"all of its {bad[need.topic]} messages are not what its schema says" if bad.get(need.topic) else "it has no whole message"
         said = "; ".join(note.message for note in notes[:2])
-        raise ValueError(f"{path}: nothing of topic {need.topic} could be read because {why}{f' ({said})' if said else ''}; copy the recording again")
+        raise ValueError(
+            f"{path}: nothing of topic {need.topic} could be read because {why}{f' ({said})' if said else ''}; copy the recording again"
+        )
     for before, after in itertools.pairwise(pieces):
         if after[1].min() <= before[1].max():
             raise ValueError(
-                f"{path}: topic {need.topic} comes from channels {before[0]} and {after[0]} at the same time, as if two devices had one name; record each"
+                f"{path}: topic {need.topic} comes from channels {before[0]} and {after[0]} at the same time, as if two"
+                f" devices had one name; record each"
                 " under a topic of its own"
             )
     if len(pieces) > 1:
-        notes.append(Note("channels", "", len(pieces), f"topic {need.topic} was recorded by {len(pieces)} channels one after the other, which were joined"))
+        notes.append(
+            Note(
+                "channels",
+                "",
+                len(pieces),
+                f"topic {need.topic} was recorded by {len(pieces)} channels one after the other, which were joined",
+            )
+        )
         time = np.concatenate([piece[1] for piece in pieces])
         values = [np.concatenate(found) for found in zip(*(piece[2] for piece in pieces), strict=True)]
     else:

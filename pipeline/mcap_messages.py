@@ -1,4 +1,5 @@
-"""Numbers out of the messages of an MCAP channel, whatever they are written in: ROS 2 CDR, ROS 1, protobuf, JSON; a message may be compressed by itself."""
+"""Numbers out of the messages of an MCAP channel, whatever they are written in: ROS 2 CDR, ROS 1, protobuf, JSON; a message may be
+compressed by itself."""
 
 import json
 import operator
@@ -35,7 +36,10 @@ class Channel(NamedTuple):
 
 
 def fields(channel: Channel, samples: Sequence[bytes]) -> list[str]:
-    """Paths of the numbers in the channel's messages, after its schema and a few messages of it. Raises ValueError where they cannot be read, and why."""
+    """Paths of the numbers in the channel's messages, after its schema and a few messages of it.
+
+    Raises ValueError where they cannot be read, and why.
+    """
     kind = _kind(channel)
     samples = [plain(sample) for sample in samples]
     if kind == "json":
@@ -120,7 +124,9 @@ def decompress(method: str, data: bytes, size: int | None) -> bytes:
         else:
             raise UnreadableMessage(f"the compression {method!r} is not known; zstd and lz4 are")
     except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError, OverflowError) as error:
-        raise UnreadableMessage(f"{method} data that cannot be unpacked ({str(error).splitlines()[0] if str(error) else 'too large'})") from None
+        raise UnreadableMessage(
+            f"{method} data that cannot be unpacked ({str(error).splitlines()[0] if str(error) else 'too large'})"
+        ) from None
     if size is not None and len(found) != size:
         raise UnreadableMessage(f"{method} data that unpack to {len(found)} bytes, not {size}")
     return found
@@ -196,7 +202,9 @@ def _json_decoder(names: Sequence[str]) -> Decode:
             numbers = None
         # other kinds are text, null, or a mixture; they are looked at one by one
         if numbers is None or numbers.dtype.kind not in "fiub":
-            numbers = np.array([[_value(document, name, path) for name, path in zip(names, steps, strict=True)] for document in documents], float)
+            numbers = np.array(
+                [[_value(document, name, path) for name, path in zip(names, steps, strict=True)] for document in documents], float
+            )
         return numbers.astype(float, copy=False)
 
     return decode

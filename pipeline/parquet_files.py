@@ -17,7 +17,9 @@ def _parquet(path: Path) -> pq.ParquetFile:
     try:
         return pq.ParquetFile(path, page_checksum_verification=True)
     except (OSError, pa.ArrowException) as error:
-        raise ValueError(f"{path} is not a whole Parquet file ({_first_line(error)}); its index is at its end, so copy the recording again") from None
+        raise ValueError(
+            f"{path} is not a whole Parquet file ({_first_line(error)}); its index is at its end, so copy the recording again"
+        ) from None
 
 
 def _first_line(error: Exception) -> str:
@@ -63,18 +65,24 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns,
     for name in wanted:
         column = columns[column_place(path, names, name)]
         if column.type != "number":
-            raise ValueError(f"{path}: column {name} should hold numbers but is of type {column.type}; write numbers, or map another column")
+            raise ValueError(
+                f"{path}: column {name} should hold numbers but is of type {column.type}; write numbers, or map another column"
+            )
     read = list(dict.fromkeys([*wanted, *([clock] if clock else [])]))
     parts: dict[str, list[np.ndarray]] = {name: [] for name in read}
     rows = 0
     try:
-        for batch in _parquet(path).iter_batches(ROWS_AT_ONCE, columns=sorted({name.split(".")[0] if "." in name else name for name in read} | set(read))):
+        for batch in _parquet(path).iter_batches(
+            ROWS_AT_ONCE, columns=sorted({name.split(".")[0] if "." in name else name for name in read} | set(read))
+        ):
             table = _flat(pa.Table.from_batches([batch]))
             rows += table.num_rows
             for name in read:
                 parts[name].append(_array(path, name, table[name], clock))
     except (OSError, pa.ArrowException) as error:
-        raise ValueError(f"{path}: a column cannot be read ({_first_line(error)}); the file is damaged, so copy the recording again") from None
+        raise ValueError(
+            f"{path}: a column cannot be read ({_first_line(error)}); the file is damaged, so copy the recording again"
+        ) from None
     if not rows:
         raise ValueError(f"{path}: the table should have rows but has none; record it again or remove it")
     values = {name: np.concatenate(part) for name, part in parts.items()}
@@ -95,12 +103,14 @@ def _array(path: Path, name: str, column: pa.ChunkedArray, clock: str) -> np.nda
         instants = column.cast(pa.timestamp("ns", column.type.tz)).cast(pa.int64())
         return _numbers(instants, np.int64)
     if name == clock and not _is_numeric(column.type):
-        raise ValueError(f"{path}: time {name} should be seconds or a timestamp but is of type {column.type}; convert it, or name another column")
+        raise ValueError(
+            f"{path}: time {name} should be seconds or a timestamp but is of type {column.type}; convert it, or name another column"
+        )
     return _numbers(column.cast(pa.float64(), safe=False), np.float64)
 
 
 def _numbers(column: pa.ChunkedArray, kind: type) -> np.ndarray:
-    """The values of a column, NaN for null; to_numpy and fill_null would do it too, but load pandas, which takes longer than all the rest."""
+    """The values of a column, NaN for null; to_numpy and fill_null would do it too, but load pandas, which takes longer."""
     parts = [np.empty(0, kind)]
     for chunk in column.chunks:
         valid, content = chunk.buffers()

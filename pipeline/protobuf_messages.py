@@ -1,4 +1,5 @@
-"""Numbers out of protobuf messages: the FileDescriptorSet of the schema says where the fields are, and the wire is walked for those that are wanted.
+"""Numbers out of protobuf messages: the FileDescriptorSet of the schema says where the fields are, and the wire is walked for those that
+are wanted.
 
 Wire format: protobuf.dev/programming-guides/encoding; numbers of the descriptor's fields: google/protobuf/descriptor.proto.
 """
@@ -15,16 +16,17 @@ from pipeline.ros_messages import LONGEST_LISTED, UnreadableMessage
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
 # FieldDescriptorProto.Type -> wire type and struct format, or how a varint is read
 _NUMBERS = {
-    1: (FIXED64, "<d"), 2: (FIXED32, "<f"), 3: (VARINT, "signed"), 4: (VARINT, "unsigned"), 5: (VARINT, "signed"), 6: (FIXED64, "<Q"), 7: (FIXED32, "<I"),
-    8: (VARINT, "unsigned"), 13: (VARINT, "unsigned"), 14: (VARINT, "signed"), 15: (FIXED32, "<i"), 16: (FIXED64, "<q"), 17: (VARINT, "zigzag"),
-    18: (VARINT, "zigzag"),
+    1: (FIXED64, "<d"), 2: (FIXED32, "<f"), 3: (VARINT, "signed"), 4: (VARINT, "unsigned"), 5: (VARINT, "signed"), 6: (FIXED64, "<Q"),
+    7: (FIXED32, "<I"), 8: (VARINT, "unsigned"), 13: (VARINT, "unsigned"), 14: (VARINT, "signed"), 15: (FIXED32, "<i"), 16: (FIXED64, "<q"),
+    17: (VARINT, "zigzag"), 18: (VARINT, "zigzag"),
 }  # fmt: skip
 _MESSAGE = 11
 _DEEPEST = 6
 
 
 class Field(NamedTuple):
-    """A field of a message type. Without `presence` (proto3's plain numbers) a field that is not on the wire is 0; with it, it has no value."""
+    """A field of a message type. Without `presence` (proto3's plain numbers) a field that is not on the wire is 0; with it, it has no
+    value."""
 
     name: str
     type: int
@@ -34,7 +36,7 @@ class Field(NamedTuple):
 
 
 class _Node(NamedTuple):
-    """What is wanted of one field: places of its numbers by index, and plans of its messages by index; `length` is the place of the count."""
+    """What is wanted of one field: places of its numbers and plans of its messages by index; `length` is the place of the count."""
 
     field: Field
     places: dict[int, int]
@@ -153,7 +155,7 @@ def fields(types: dict[str, dict[int, Field]], name: str, sample: bytes | None) 
         except UnreadableMessage:
             return names
         for (path, inner), length in zip(repeated, lengths, strict=True):
-            names += [f"{path}[{i}]{part}" for i in range(min(int(length), LONGEST_LISTED)) for part in inner]
+            names += [f"{path}[{i}]{part}" for i in range(min(int(np.nan_to_num(length)), LONGEST_LISTED)) for part in inner]
     return names
 
 
@@ -186,7 +188,10 @@ def _plain_fields(types: dict, name: str, prefix: str, depth: int) -> tuple[list
 
 
 def decoder(types: dict[str, dict[int, Field]], name: str, names: Sequence[str]) -> Callable[[list[bytes]], np.ndarray]:
-    """A function from n messages to their numbers (n, len(names)), NaN where a field with presence is absent. It raises UnreadableMessage."""
+    """A function from n messages to their numbers (n, len(names)), NaN where a field with presence is absent.
+
+    It raises UnreadableMessage.
+    """
     plan = _plan(types, _known(types, name), {path: place for place, path in enumerate(names)})
     count = len(names)
 

@@ -1,4 +1,5 @@
-"""What is doubtful in a table: spikes, frozen sensors, rails, constants, quantisation, units, two devices under one name; said with place and count, and masked where wrong."""
+"""What is doubtful in a table: spikes, frozen sensors, rails, constants, quantisation, units, two devices under one name; said with place
+and count, and masked where wrong."""
 
 from collections.abc import Callable, Mapping
 
@@ -8,7 +9,8 @@ from scipy.ndimage import median_filter
 from pipeline.signals import Flag, Table
 
 SPIKE_WINDOW = 7
-# a spike is beyond eight robust standard deviations of the residual of the local median, and beyond three times what its neighbours do among themselves
+# a spike is beyond eight robust standard deviations of the residual of the local median, and beyond three times what its neighbours do
+# among themselves
 SPIKE_SIGMAS, SPIKE_OVER_NEIGHBOURS = 8.0, 3.0
 SPIKE_LONGEST = 2
 FROZEN_SHORTEST, FROZEN_OVER_USUAL = 30, 5.0
@@ -23,8 +25,9 @@ _PERCENT = {"percent", "%", "pct"}
 def flag(table: Table, *, units: Mapping[str, str], limits: Mapping[str, tuple[float, float]]) -> Table:
     """The table with what is doubtful flagged and, where it is no measurement, masked; values stay as they are.
 
-    `limits` are {input: (low, high)} in its unit: its signals are the inputs, all others outputs. Masked: spike, frozen. Reported only: quantised, saturated,
-    outside (an input beyond its limits), constant, unit (looks like kelvin, fahrenheit, a duty of 0-1), mixed (as if two devices wrote in turn).
+    `limits` are {input: (low, high)} in its unit: its signals are the inputs, all others outputs. Masked: spike, frozen. Reported only:
+    quantised, saturated, outside (an input beyond its limits), constant, unit (looks like kelvin, fahrenheit, a duty of 0-1), mixed (as if
+    two devices wrote in turn).
     """
     outputs = [name for name in table.values if name not in limits]
     flags, masked = list(table.flags), {name: mask.copy() for name, mask in table.masked.items()}
@@ -63,8 +66,7 @@ def _in_segments(table: Table, name: str, of: Callable[[np.ndarray], np.ndarray]
     """`of` the values of each segment, gaps of masked values bridged by the last one before."""
     found = np.zeros(len(table.time_s))
     values = np.where(table.masked[name], np.nan, table.values[name])
-    for one in range(int(table.segment[-1]) + 1):
-        inside = np.flatnonzero(table.segment == one)
+    for inside in np.split(np.arange(len(values)), np.flatnonzero(np.diff(table.segment)) + 1):
         known = inside[np.isfinite(values[inside])]
         if len(known):
             last = np.maximum(np.searchsorted(known, inside, side="right") - 1, 0)
@@ -108,8 +110,8 @@ def _stands_alone(table: Table, name: str, group: np.ndarray, size: float) -> bo
 def quantisation_step(values: np.ndarray) -> float:
     """The step of a quantised signal; 0 where the levels have no common step.
 
-    The median distance d of neighbouring levels is the step if nine tenths of the distances are whole multiples of it (to a tenth: rounded print-outs of
-    0.0322 differ by 0.032 or 0.033) and if values come back to their levels, at least three times each.
+    The median distance d of neighbouring levels is the step if nine tenths of the distances are whole multiples of it (to a tenth: rounded
+    print-outs of 0.0322 differ by 0.032 or 0.033) and if values come back to their levels, at least three times each.
     """
     levels = np.unique(values)
     if len(levels) < 2 or len(levels) > len(values) / 3:
@@ -154,7 +156,10 @@ def _frozen(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
         moving = [other for other in table.values if other != name and _moves(table, other, first, last)]
         if moving:
             where = np.arange(first + 1, last + 1)
-            message = f"{name} stays at {table.values[name][first]:g} for {last - first + 1} samples while {', '.join(moving[:3])} move: a frozen sensor, masked"
+            message = (
+                f"{name} stays at {table.values[name][first]:g} for {last - first + 1} samples while"
+                f" {', '.join(moving[:3])} move: a frozen sensor, masked"
+            )
             found.append((_flag(table, name, "frozen", where, message), where))
     return found
 
@@ -168,7 +173,8 @@ def _moves(table: Table, name: str, first: int, last: int) -> bool:
 
 
 def _is_rail(table: Table, name: str, first: int, last: int) -> bool:
-    """Whether a stretch lies on the largest or smallest value of all, and the signal came there from elsewhere: a machine at rest begins at its smallest."""
+    """Whether a stretch lies on the largest or smallest value of all, and the signal came there from elsewhere: a machine at rest begins
+    at its smallest."""
     usable = _usable(table, name)
     begins = first == 0 or table.segment[first] != table.segment[first - 1]
     value = table.values[name][first]
@@ -187,7 +193,10 @@ def _rails(table: Table, name: str) -> list[Flag]:
         long = [(a, b) for a, b in runs if table.values[name][a] == rail and b - a + 1 > limit and _is_rail(table, name, a, b)]
         if long:
             where = np.concatenate([np.arange(a, b + 1) for a, b in long])
-            message = f"{name} stays at {rail:g}, its {side} value, for {len(where)} samples in {len(long)} stretches: the sensor or its converter is saturated"
+            message = (
+                f"{name} stays at {rail:g}, its {side} value, for {len(where)} samples in {len(long)} stretches:"
+                f" the sensor or its converter is saturated"
+            )
             flags.append(_flag(table, name, "saturated", where, message))
     return flags
 
@@ -206,11 +215,17 @@ def _at_limits(table: Table, name: str, low: float, high: float) -> list[Flag]:
     for limit, at in ((low, np.abs(values - low) <= tolerance), (high, np.abs(values - high) <= tolerance)):
         where = np.flatnonzero(at & usable)
         if len(where) and np.ptp(values[usable]) > 0:
-            message = f"{name} is at its limit {limit:g} in {len(where)} of {usable.sum()} samples: there it follows the limit, not the controller"
+            message = (
+                f"{name} is at its limit {limit:g} in {len(where)} of {usable.sum()} samples: there it follows"
+                f" the limit, not the controller"
+            )
             flags.append(_flag(table, name, "saturated", where, message))
     where = np.flatnonzero(usable & ((values < low - tolerance) | (values > high + tolerance)))
     if len(where):
-        message = f"{name} is beyond its limits {low:g} to {high:g} in {len(where)} samples (up to {values[where].max():g}); mend the limits or the mapping"
+        message = (
+            f"{name} is beyond its limits {low:g} to {high:g} in {len(where)} samples (up to"
+            f" {values[where].max():g}); mend the limits or the mapping"
+        )
         flags.append(_flag(table, name, "outside", where, message))
     return flags
 
@@ -232,7 +247,10 @@ def _mixed(table: Table, name: str) -> list[Flag]:
     one, two = one[np.isfinite(one)], two[np.isfinite(two)]
     if len(two) < 20 or np.median(one) <= 10 * np.median(two) or np.percentile(one, 10) <= 3 * np.percentile(two, 90):
         return []
-    message = f"{name} jumps by {np.median(one):g} at every sample but moves by {np.median(two):g} over two: two devices seem to write under one name"
+    message = (
+        f"{name} jumps by {np.median(one):g} at every sample but moves by {np.median(two):g} over two: two"
+        f" devices seem to write under one name"
+    )
     return [_flag(table, name, "mixed", np.arange(len(table.time_s)), message)]
 
 
@@ -246,14 +264,21 @@ def _unit_flags(table: Table, units: Mapping[str, str], limits: Mapping[str, tup
         usable, unit = _usable(table, name), units.get(name, "").casefold()
         if not len(usable):
             continue
-        said = _doubtful_celsius(name, usable, resting) if unit in _CELSIUS else _doubtful_percent(name, usable, limits.get(name, (0.0, 100.0))[1]) if unit in _PERCENT else ""
+        said = (
+            _doubtful_celsius(name, usable, resting)
+            if unit in _CELSIUS
+            else _doubtful_percent(name, usable, limits.get(name, (0.0, 100.0))[1])
+            if unit in _PERCENT
+            else ""
+        )
         if said:
             flags.append(_flag(table, name, "unit", np.flatnonzero(~table.masked[name]), said))
     return flags
 
 
 def _at_rest(table: Table, units: Mapping[str, str], limits: Mapping[str, tuple[float, float]]) -> bool:
-    """Whether the recording begins on a machine at the room's temperature: every input at 0 or its lowest, or several temperatures that are alike."""
+    """Whether the recording begins on a machine at the room's temperature: every input at 0 or its lowest, or several temperatures that
+    are alike."""
     first = {name: float(_usable(table, name)[0]) for name in table.values if len(_usable(table, name))}
     idle = bool(limits) and all(first.get(name, np.nan) in (0.0, low) for name, (low, _) in limits.items())
     starts = [value for name, value in first.items() if name not in limits and units.get(name, "").casefold() in _CELSIUS]
@@ -267,7 +292,9 @@ def _doubtful_celsius(name: str, values: np.ndarray, resting: bool) -> str:
     if middle > HOTTEST_DEGC or (resting and ROOM_KELVIN[0] <= first <= ROOM_KELVIN[1]):
         return f"{name} begins at {first:g} and is {middle:g} in the middle: it looks like kelvin; set offset: -273.15 if it is"
     if resting and ROOM_FAHRENHEIT[0] <= first <= ROOM_FAHRENHEIT[1]:
-        return f"{name} begins at {first:g} on a machine at rest: it looks like fahrenheit; set scale: 0.555556 and offset: -17.7778 if it is"
+        return (
+            f"{name} begins at {first:g} on a machine at rest: it looks like fahrenheit; set scale: 0.555556 and offset: -17.7778 if it is"
+        )
     if resting and values.max() <= 1.0 and values.min() >= 0.0:
         return f"{name} lies within 0 to 1: it looks like a share or a voltage; set the sensor's scale and offset if it is"
     return ""

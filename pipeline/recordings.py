@@ -1,4 +1,5 @@
-"""Recordings of other people's machines: MCAP, Parquet and CSV -> signals on their own clocks, with what was damaged, missing or left out counted.
+"""Recordings of other people's machines: MCAP, Parquet and CSV -> signals on their own clocks, with what was damaged, missing or left out
+counted.
 
 `read` is the door; `resample` and `flag` make a table of it, `inspect` says in words what is in a file.
 """
@@ -20,17 +21,19 @@ from pipeline.signals import Flag, Jitter, Note, Raw, Source, Table, nearest_nam
 
 __all__ = ["Flag", "Jitter", "Note", "Raw", "Source", "Table", "flag", "inspect", "nearest_names", "read", "resample"]
 
-# a clock that begins later than three years is one of the calendar; it is counted from the record's first whole second, so that floats hold nanoseconds
+# a clock that begins later than three years is one of the calendar; it is counted from the record's first whole second, so that floats hold
+# nanoseconds
 CALENDAR_S = 1e8
 
 
 def read(path: str | Path, sources: Sequence[Source], *, time: str = "") -> Raw:
     """The signals of a recording, each on its own clock, in our units.
 
-    `time` names the clock: in a table a column (by default one that is called like a time) or "every 0.5 s" where there is none; in MCAP log_time (the default),
-    publish_time, or a field of every topic such as header.stamp. A clock of the calendar is counted from the first whole second of the record.
-    Missing numbers are NaN, and counted in a note. Raises ValueError, one sentence with file, place, expected, found and remedy, for a source that is not there,
-    text in place of a number, a signal without any number, a time that is missing, repeated or runs backwards, and a file that cannot be read.
+    `time` names the clock: in a table a column (by default one that is called like a time) or "every 0.5 s" where there is none; in MCAP
+    log_time (the default), publish_time, or a field of every topic such as header.stamp. A clock of the calendar is counted from the first
+    whole second of the record. Missing numbers are NaN, and counted in a note. Raises ValueError, one sentence with file, place, expected,
+    found and remedy, for a source that is not there, text in place of a number, a signal without any number, a time that is missing,
+    repeated or runs backwards, and a file that cannot be read.
     """
     path = Path(path)
     _check_sources(path, sources)
@@ -57,14 +60,19 @@ def read(path: str | Path, sources: Sequence[Source], *, time: str = "") -> Raw:
 
 def _check_sources(path: Path, sources: Sequence[Source]) -> None:
     if not sources:
-        raise ValueError(f"{path}: the mapping names no signal; map each input and output to a column or topic (beadline inspect proposes a mapping)")
+        raise ValueError(
+            f"{path}: the mapping names no signal; map each input and output to a column or topic (beadline inspect proposes a mapping)"
+        )
     signals = [source.signal for source in sources]
     twice = sorted({signal for signal in signals if signals.count(signal) > 1})
     if twice:
         raise ValueError(f"{path}: the mapping gives {twice[0]} more than one source; give it one")
     for source in sources:
         if not (np.isfinite(source.scale) and np.isfinite(source.offset) and source.scale != 0):
-            raise ValueError(f"{path}: the mapping of {source.signal} has scale {source.scale:g} and offset {source.offset:g}; both must be finite, scale not 0")
+            raise ValueError(
+                f"{path}: the mapping of {source.signal} has scale {source.scale:g} and offset {source.offset:g}; both"
+                f" must be finite, scale not 0"
+            )
 
 
 def _clocks(path: Path, columns: Sequence[Columns], notes: list[Note]) -> dict[str, np.ndarray]:
@@ -81,18 +89,28 @@ def _clocks(path: Path, columns: Sequence[Columns], notes: list[Note]) -> dict[s
     return {group.name: (group.time - start) / unit for group in columns}
 
 
-def _signal(path: Path, source: Source, time: np.ndarray, group: Columns, found: np.ndarray, notes: list[Note]) -> tuple[np.ndarray, np.ndarray]:
-    """Time and values in our unit; a signal that is there in less than half of the rows, spread among them, keeps only those: it has its own clock."""
+def _signal(
+    path: Path, source: Source, time: np.ndarray, group: Columns, found: np.ndarray, notes: list[Note]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Time and values in our unit; a signal that is there in less than half of the rows, spread among them, keeps only those: it has its
+    own clock."""
     present = np.isfinite(found)
     where = np.flatnonzero(present)
     if not where.size:
-        raise ValueError(f"{path}: {source.source} should hold numbers for {source.signal} but all of its {len(found)} values are missing; map another source")
+        raise ValueError(
+            f"{path}: {source.source} should hold numbers for {source.signal} but all of its {len(found)} values are"
+            f" missing; map another source"
+        )
     values = found if (source.scale, source.offset) == (1.0, 0.0) else found * source.scale + source.offset
     missing = len(found) - where.size
     if not missing:
         return time, values
     if where.size < len(found) / 2 and where.size > 1 and np.median(np.diff(where)) > 1:
-        notes.append(Note("sparse", source.signal, missing, f"{source.source} has a value in {where.size} of {len(found)} rows; those are its samples"))
+        notes.append(
+            Note(
+                "sparse", source.signal, missing, f"{source.source} has a value in {where.size} of {len(found)} rows; those are its samples"
+            )
+        )
         return time[where], values[where]
     first = int(np.flatnonzero(~present)[0])
     infinite = int(np.isinf(found).sum())

@@ -1,4 +1,5 @@
-"""Signals on their own clocks -> one table on one sample time: inputs are held, outputs interpolated between near neighbours, gaps make segments."""
+"""Signals on their own clocks -> one table on one sample time: inputs are held, outputs interpolated between near neighbours, gaps make
+segments."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -7,7 +8,8 @@ import numpy as np
 
 from pipeline.signals import Flag, Raw, Table, intervals
 
-# a sample within that share of the sample time from the grid is on it: what a temperature does in a hundredth of a sample is far below any sensor's step
+# a sample within that share of the sample time from the grid is on it: what a temperature does in a hundredth of a sample is far below any
+# sensor's step
 ON_GRID = 0.01
 GAP_INTERVALS = 3.0
 # commands are sent periodically if nearly all of their intervals are alike; else they are events, and a long silence is no gap
@@ -25,11 +27,12 @@ class _Clock(NamedTuple):
 def resample(raw: Raw, *, sample_time_s: float, inputs: Sequence[str], outputs: Sequence[str], max_gap_s: float | None = None) -> Table:
     """The table of a recording on the grid t_k = t_0 + k T of each segment.
 
-    Inputs: u_k is the last command at or before t_k. Outputs: y_k is the sample at t_k where there is one (within T / 100: the record's own numbers, unaltered),
-    else the straight line between its neighbours. An interval longer than `max_gap_s` (default: three sample times or three median intervals, whichever is
-    longer) on any clock is a gap: nothing is interpolated or held across it, and a new segment begins behind it. Segments span what all clocks have in common.
-    A value whose neighbours are missing is NaN and masked. Flags say what was done: gap, filled, step_inside, step_lost, missing, trimmed, short, rate.
-    Raises ValueError where a signal is not in the recording, clocks have no time in common, or no segment has two samples.
+    Inputs: u_k is the last command at or before t_k. Outputs: y_k is the sample at t_k where there is one (within T / 100: the record's own
+    numbers, unaltered), else the straight line between its neighbours. An interval longer than `max_gap_s` (default: three sample times or
+    three median intervals, whichever is longer) on any clock is a gap: nothing is interpolated or held across it, and a new segment begins
+    behind it. Segments span what all clocks have in common. A value whose neighbours are missing is NaN and masked. Flags say what was
+    done: gap, filled, step_inside, step_lost, missing, trimmed, short, rate. Raises ValueError where a signal is not in the recording,
+    clocks have no time in common, or no segment has two samples.
     """
     _check(raw, sample_time_s, inputs, outputs, max_gap_s)
     clocks = _clocks(raw, sample_time_s, inputs, outputs, max_gap_s)
@@ -60,16 +63,22 @@ def resample(raw: Raw, *, sample_time_s: float, inputs: Sequence[str], outputs: 
 def _check(raw: Raw, sample_time_s: float, inputs: Sequence[str], outputs: Sequence[str], max_gap_s: float | None) -> None:
     for name in [*inputs, *outputs]:
         if name not in raw.signals:
-            raise ValueError(f"{raw.path}: signal {name} is wanted but the mapping gives {', '.join(raw.signals)}; map it to a column or topic")
+            raise ValueError(
+                f"{raw.path}: signal {name} is wanted but the mapping gives {', '.join(raw.signals)}; map it to a column or topic"
+            )
     if not outputs:
         raise ValueError(f"{raw.path}: no output is wanted; name at least one measured signal")
     if not 0 < sample_time_s < np.inf:
-        raise ValueError(f"{raw.path}: the sample time should be more than 0 s but is {sample_time_s:g}; set it to about the recording's interval")
+        raise ValueError(
+            f"{raw.path}: the sample time should be more than 0 s but is {sample_time_s:g}; set it to about the recording's interval"
+        )
     if max_gap_s is not None and not max_gap_s >= sample_time_s:
         raise ValueError(f"{raw.path}: the gap limit {max_gap_s:g} s should be at least the sample time {sample_time_s:g} s; raise it")
     for name in outputs:
         if len(raw.signals[name][0]) < 2:
-            raise ValueError(f"{raw.path}: output {name} should have at least two samples but has {len(raw.signals[name][0])}; record longer")
+            raise ValueError(
+                f"{raw.path}: output {name} should have at least two samples but has {len(raw.signals[name][0])}; record longer"
+            )
 
 
 # ---- clocks, gaps and the time in common
@@ -102,7 +111,9 @@ def _pieces(raw: Raw, clocks: Sequence[_Clock], sample_time_s: float) -> list[tu
         pieces = _common(pieces, list(zip(starts.tolist(), ends.tolist(), strict=True)), sample_time_s * ON_GRID)
     if not pieces:
         spans = "; ".join(f"{', '.join(clock.signals[:3])} from {clock.time_s[0]:g} to {clock.time_s[-1]:g} s" for clock in clocks)
-        raise ValueError(f"{raw.path}: the signals have no time in common ({spans}); map signals that were recorded together, or name their clock")
+        raise ValueError(
+            f"{raw.path}: the signals have no time in common ({spans}); map signals that were recorded together, or name their clock"
+        )
     return pieces
 
 
@@ -155,7 +166,10 @@ def _gap_flags(clocks: Sequence[_Clock], grids: Sequence[np.ndarray]) -> list[Fl
     for clock in clocks:
         for i in np.flatnonzero(np.diff(clock.time_s) > clock.gap_limit_s):
             start, end = float(clock.time_s[i]), float(clock.time_s[i + 1])
-            message = f"no sample of {', '.join(clock.signals)} for {end - start:g} s (limit {clock.gap_limit_s:g} s): a new segment begins behind it"
+            message = (
+                f"no sample of {', '.join(clock.signals)} for {end - start:g} s (limit {clock.gap_limit_s:g} s):"
+                f" a new segment begins behind it"
+            )
             flags.append(Flag("", "gap", start, end, 1, message))
     return flags
 
@@ -169,7 +183,16 @@ def _trim_flags(raw: Raw, clocks: Sequence[_Clock], pieces: Sequence[tuple[float
         flags.append(Flag("", "trimmed", start, end, cut, message))
     for grid in grids:
         if len(grid) < 2:
-            flags.append(Flag("", "short", float(grid[0]), float(grid[0]), 1, f"the stretch at {grid[0]:g} s is shorter than two samples and was left out"))
+            flags.append(
+                Flag(
+                    "",
+                    "short",
+                    float(grid[0]),
+                    float(grid[0]),
+                    1,
+                    f"the stretch at {grid[0]:g} s is shorter than two samples and was left out",
+                )
+            )
     return flags
 
 
@@ -183,15 +206,23 @@ def _rate_flags(name: str, time_s: np.ndarray, sample_time_s: float) -> list[Fla
     interval = float(np.median(np.diff(time_s)))
     span = time_s[[0, -1]]
     if interval < sample_time_s / 2:
-        message = f"{name} is sampled every {interval:g} s, the table every {sample_time_s:g} s: only the samples at its times are used, without averaging"
+        message = (
+            f"{name} is sampled every {interval:g} s, the table every {sample_time_s:g} s: only the samples at"
+            f" its times are used, without averaging"
+        )
         return [Flag(name, "rate", float(span[0]), float(span[1]), len(time_s), message)]
     if interval > 1.5 * sample_time_s:
-        message = f"{name} is sampled every {interval:g} s but the table every {sample_time_s:g} s: what lies between is interpolated, no measurement"
+        message = (
+            f"{name} is sampled every {interval:g} s but the table every {sample_time_s:g} s: what lies between"
+            f" is interpolated, no measurement"
+        )
         return [Flag(name, "rate", float(span[0]), float(span[1]), len(time_s), message)]
     return []
 
 
-def _step_flags(name: str, time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, segment: np.ndarray, sample_time_s: float) -> list[Flag]:
+def _step_flags(
+    name: str, time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, segment: np.ndarray, sample_time_s: float
+) -> list[Flag]:
     """Commands that change between two samples act from the next sample on; those that another overtakes before it are lost."""
     changes = np.flatnonzero(values[1:] != values[:-1]) + 1
     when = time_s[changes]
@@ -206,7 +237,10 @@ def _step_flags(name: str, time_s: np.ndarray, values: np.ndarray, grid: np.ndar
     message = f"{name} changes {between.sum()} times between two samples; it is not smeared but acts from the next sample on, {mean}"
     flags = _flag(name, "step_inside", when[between], message)
     overtaken = np.r_[following[1:] == following[:-1], False] if len(following) else np.zeros(0, bool)
-    message = f"{overtaken.sum()} commands of {name} were overtaken by another before the next sample and do not appear; a smaller sample time shows them"
+    message = (
+        f"{overtaken.sum()} commands of {name} were overtaken by another before the next sample and do not"
+        f" appear; a smaller sample time shows them"
+    )
     return flags + _flag(name, "step_lost", when[overtaken], message)
 
 

@@ -1,7 +1,8 @@
 """Numbers out of ROS messages: the message definition becomes a short program of struct formats, made once, run for each message.
 
-Layouts: CDR as ROS 2 writes it (OMG DDSI-RTPS 10.2, "classic CDR", and XCDR2 for final types), aligned to the size of each number behind a header of four
-bytes; ROS 1 has no header and no alignment. Sequences and text begin with their length (uint32); text is skipped, wide text ends what can be read.
+Layouts: CDR as ROS 2 writes it (OMG DDSI-RTPS 10.2, "classic CDR", and XCDR2 for final types), aligned to the size of each number behind a
+header of four bytes; ROS 1 has no header and no alignment. Sequences and text begin with their length (uint32); text is skipped, wide text
+ends what can be read.
 """
 
 import re
@@ -12,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 ROS2_NUMBERS = {
-    "bool": "?", "byte": "B", "char": "B", "octet": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I",
-    "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
+    "bool": "?", "byte": "B", "char": "B", "octet": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i",
+    "uint32": "I", "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
 }  # fmt: skip
 ROS1_NUMBERS = {**ROS2_NUMBERS, "byte": "b"}
 ROS1_NUMBERS.pop("octet")
@@ -37,7 +38,8 @@ class UnreadableMessage(ValueError):
 
 
 class Item(NamedTuple):
-    """A stretch of the layout: `count` numbers of one `format`, text, or a sequence of `items` (an empty sequence of numbers has one item of count 1)."""
+    """A stretch of the layout: `count` numbers of one `format`, text, or a sequence of `items` (an empty sequence of numbers has one item
+    of count 1)."""
 
     kind: str
     path: str
@@ -48,7 +50,10 @@ class Item(NamedTuple):
 
 
 def layout(definition: str, name: str, *, version: int) -> list[Item]:
-    """The message's numbers, texts and sequences in the order of the wire; `version` is 1 or 2. Raises ValueError where the definition cannot be read."""
+    """The message's numbers, texts and sequences in the order of the wire; `version` is 1 or 2.
+
+    Raises ValueError where the definition cannot be read.
+    """
     if re.search(r"^---", definition, re.MULTILINE):
         raise ValueError(f"the schema of {name} is a service's (---), not a message's")
     types = _types(definition, name, version)
@@ -206,7 +211,10 @@ class _Text:
 
 
 class _Sequence:
-    """A length and so many elements; those asked for by index are read (NaN where there are fewer), the others skipped. "[#]" is the length itself."""
+    """A length and so many elements; those asked for by index are read (NaN where there are fewer), the others skipped.
+
+    "[#]" is the length itself.
+    """
 
     def __init__(self, item: Item, wanted: set[str], order: str, alignment: int):
         self.unpack, self.alignment = _LENGTH[order].unpack_from, min(4, alignment)

@@ -1,4 +1,5 @@
-"""What passes between a recording and the learners: a mapping's source, raw signals on their own clocks, a table on one clock, and findings with place and count."""
+"""What passes between a recording and the learners: a mapping's source, raw signals on their own clocks, a table on one clock, and
+findings with place and count."""
 
 import difflib
 from collections.abc import Iterable
@@ -30,7 +31,10 @@ class Note(NamedTuple):
 
 
 class Raw(NamedTuple):
-    """A recording as it was made: {signal: (time_s (n,), values (n,))} with a clock each; NaN where no value was written. `messages` counts each topic's, or rows."""
+    """A recording as it was made: {signal: (time_s (n,), values (n,))} with a clock each; NaN where no value was written.
+
+    `messages` counts each topic's, or rows.
+    """
 
     path: str
     signals: dict[str, tuple[np.ndarray, np.ndarray]]
@@ -60,7 +64,8 @@ class Jitter(NamedTuple):
 class Table(NamedTuple):
     """A recording on one sample time: T samples in segments without a gap.
 
-    `values` are as measured, never altered; `masked` says which are not to be used. `jitter` is that of each signal's own clock before resampling.
+    `values` are as measured, never altered; `masked` says which are not to be used. `jitter` is that of each signal's own clock before
+    resampling.
     """
 
     recording: str

@@ -29,13 +29,13 @@ class GenerateProbing(params.Section):
 
 
 def main() -> None:
-    p, machine = params.load(GenerateProbing, "generate_probing"), params.load(params.Plant, "plant")
-    low, high = np.array([(i.low, i.high) for i in machine.inputs]).T
-    rng = np.random.default_rng(p.seed)
-    shape = {"amplitude": p.amplitude_percent, **({"shortest": p.shortest_steps} if p.signal == "prbs" else {})}
-    signal = {"multisine": multisine, "prbs": prbs}[p.signal](rng, p.samples, len(machine.inputs), **shape)
-    time_s = machine.sample_time_s * np.arange(p.samples)
     with artifacts.stage("generate_probing") as out:
+        p, machine = params.load(GenerateProbing, "generate_probing"), params.load(params.Plant, "plant")
+        low, high = np.array([(i.low, i.high) for i in machine.inputs]).T
+        rng = np.random.default_rng(p.seed)
+        shape = {"amplitude": p.amplitude_percent, **({"shortest": p.shortest_steps} if p.signal == "prbs" else {})}
+        signal = {"multisine": multisine, "prbs": prbs}[p.signal](rng, p.samples, len(machine.inputs), **shape)
+        time_s = machine.sample_time_s * np.arange(p.samples)
         if p.source == "recordings":
             centre = np.full(len(low), p.centre_percent) if p.centre_percent is not None else (low + high) / 2
             u = np.clip(centre + signal, low, high)
@@ -44,7 +44,11 @@ def main() -> None:
         else:
             run = _simulated(p, machine, signal, low, high, rng)
             columns = zip([*machine.inputs, *machine.outputs], np.hstack([run.u, run.y]).T, strict=True)
-            artifacts.write_recording(out / "probing.mcap", time_s, {s.name: (values, s.unit, f"{s.name} of the study's extruder, simulated") for s, values in columns})
+            artifacts.write_recording(
+                out / "probing.mcap",
+                time_s,
+                {s.name: (values, s.unit, f"{s.name} of the study's extruder, simulated") for s, values in columns},
+            )
             found, limited = excitation(run.u, 12), run.limited
         artifacts.write_metrics(
             "generate_probing",
@@ -66,7 +70,11 @@ def _simulated(p, machine, signal, low, high, rng):
     target = feasible_target(plant, np.array([o.reference for o in machine.outputs]), low, high)
     centre = target.u if p.centre_percent is None else np.full(plant.m, p.centre_percent)
     feedback = p.feedback_percent_per_degC * np.eye(plant.m, plant.p)
-    limits = {"low": np.maximum(low, centre - p.amplitude_percent), "high": np.minimum(high, centre + p.amplitude_percent), "rate": p.rate_percent_per_step}
+    limits = {
+        "low": np.maximum(low, centre - p.amplitude_percent),
+        "high": np.minimum(high, centre + p.amplitude_percent),
+        "rate": p.rate_percent_per_step,
+    }
     noise = p.noise_degC * rng.standard_normal((len(signal), plant.p))
     return probe(plant, signal, x0=target.x, u_centre=centre, y_centre=target.y, feedback=feedback, noise=noise, **limits)
 

@@ -25,11 +25,15 @@ class Ingest(params.Section):
 
 
 def main() -> None:
-    p, machine, execution = params.load(Ingest, "ingest"), params.load(params.Plant, "plant"), params.load(params.Execution, "execution")
-    source = params.value("generate_probing.source", one_of=("simulated", "recordings"))
-    folder = Path({"simulated": "datasets/generate_probing", "recordings": "datasets/raw/temperature"}[source])
-    mapping = p.mapping if source == "recordings" else {}
     with artifacts.stage("ingest") as out:
+        p, machine, execution = (
+            params.load(Ingest, "ingest"),
+            params.load(params.Plant, "plant"),
+            params.load(params.Execution, "execution"),
+        )
+        source = params.value("generate_probing.source", one_of=("simulated", "recordings"))
+        folder = Path({"simulated": "datasets/generate_probing", "recordings": "datasets/raw/temperature"}[source])
+        mapping = p.mapping if source == "recordings" else {}
         job = Job(machine, {name: (m.source, m.unit, m.scale, m.offset) for name, m in mapping.items()}, p.time, p.max_gap_s)
         results = process(folder, job, execution, memo=Path("datasets/memo/ingest"))
         record, quality, metrics = collect(results, machine, strict=p.strict or "--strict" in sys.argv)

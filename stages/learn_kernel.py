@@ -18,12 +18,18 @@ class LearnKernel(params.Section):
 
 
 def main() -> None:
-    p, machine = params.load(LearnKernel, "learn_kernel"), params.load(params.Plant, "plant")
-    tracking, panel = params.load(params.Tracking, "tracking"), params.load(params.Panel, "panel")
-    yardstick = Yardstick(np.full(len(machine.outputs), tracking.yardstick_q), np.full(len(machine.inputs), tracking.yardstick_r), tracking.gamma)
     with artifacts.stage("learn_kernel") as out:
+        p, machine = params.load(LearnKernel, "learn_kernel"), params.load(params.Plant, "plant")
+        tracking, panel = params.load(params.Tracking, "tracking"), params.load(params.Panel, "panel")
+        yardstick = Yardstick(
+            np.full(len(machine.outputs), tracking.yardstick_q), np.full(len(machine.inputs), tracking.yardstick_r), tracking.gamma
+        )
         u, y = artifacts.read_record("datasets/ingest/record.parquet", machine.inputs, machine.outputs)
-        scenario = {"start": panel.training.starts_degC[0], "reference": np.array([o.reference for o in machine.outputs]), "steps": panel.steps}
+        scenario = {
+            "start": panel.training.starts_degC[0],
+            "reference": np.array([o.reference for o in machine.outputs]),
+            "steps": panel.steps,
+        }
         long = window.learn(u, y, longest=p.longest_window, offset=p.offset)
         enough = sufficiency(u, y, long, yardstick, allowed=p.allowed_gap_percent / 100, offset=p.offset, **scenario)
         tried = kernel_candidates(u, y, long, yardstick, largest=p.largest_kernel_window, offset=p.offset, **scenario)

@@ -32,7 +32,9 @@ def pairing(plant: Plant, low: np.ndarray, high: np.ndarray, *, horizon: int) ->
     effect = np.abs(fastest) * (high - low)
     outputs, inputs = scipy.optimize.linear_sum_assignment(-effect)
     if len(outputs) < plant.p or (effect[outputs, inputs] <= 1e-9 * effect.max()).any():
-        raise ValueError(f"PI needs an input for each of the {plant.p} outputs; found {plant.m} inputs, or an output that none of the free ones moves")
+        raise ValueError(
+            f"PI needs an input for each of the {plant.p} outputs; found {plant.m} inputs, or an output that none of the free ones moves"
+        )
     slope, at = fastest[outputs, inputs], steepest[outputs, inputs]
     reached = np.cumsum(slopes, axis=0)[at, outputs, inputs]
     theta = np.maximum(at + 1 - reached / slope, 1.0)

@@ -5,34 +5,35 @@ The rules, each with its reason:
   feed-through  Schwarz's criterion with and without u(t), where `feedthrough` is None
   largest order singular values, in units of the noise, above what coefficient errors alone reach: sqrt(2) (sqrt(rows) + sqrt(columns)) of the noise matrix
   dead time     lags at which the largest model's impulse response stays under 5 % of its peak, kept only where the cross-validation below prefers it
-  order         the fewest parameters whose error in simulation of left-out blocks is within one standard error (of the paired differences) of the best
+  order         the fewest parameters whose error in simulation of left-out blocks is within one standard error (of the paired differences), or 2 %, of the best
 """
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
+from pipeline.temperature.order import Candidate, cross_validate, fit, shifted, simplest, with_delays
 from pipeline.temperature.plant import Plant, markov_parameters
-from pipeline.temperature.plant import plant as make_plant
-from pipeline.temperature.refinement import drives, estimate_state, fit_inputs, refine, respond, simulation_form
-from pipeline.temperature.subspace import Lagged, Segments, Varx, lagged, moesp, moesp_singular_values, one_step, realise, subspace, varx
+from pipeline.temperature.refinement import drives, estimate_state, simulation_form
+from pipeline.temperature.subspace import (
+    Lagged,
+    Segments,
+    Varx,
+    complete_runs,
+    lagged,
+    moesp,
+    moesp_singular_values,
+    one_step,
+    realise,
+    subspace,
+    varx,
+)
 
-__all__ = ["Candidate", "Identified", "Varx", "moesp", "moesp_singular_values", "varx"]
+__all__ = ["Candidate", "Identified", "Varx", "check_inputs", "identify", "moesp", "moesp_singular_values", "varx"]
 
-
-class Candidate(NamedTuple):
-    """One row of the order table: the model's class, and its error on left-out blocks (share of each output's variation about the block mean, 1 = no better)."""
-
-    order: int
-    delays: tuple[int, ...]
-    fit: str
-    parameters: int
-    singular_value: float
-    errors: tuple[float, ...]
-
-    @property
-    def error(self) -> float:
-        return float(np.mean(self.errors))
+NOISE_FREE = 1e-10  # share of the outputs' power that a noise-free record's one-step errors stay under
+EXACT_RANK = 1e-7  # singular values of a noise-free record below this share of the largest are rounding
+WIDEST = 360  # columns of the lagged record: the cost of a fit grows with their square
 
 
 class Identified(NamedTuple):
@@ -43,6 +44,7 @@ class Identified(NamedTuple):
     past: int
     delays: tuple[int, ...]
     feedthrough: bool
+    offset: bool
     fit: str
     singular_values: np.ndarray
     noise_edge: float
@@ -67,23 +69,27 @@ def check_inputs(u: Segments, *, offset: bool = True) -> None:
         weights = np.linalg.lstsq(scaled[:, :j], scaled[:, j], rcond=None)[0]
         if np.linalg.norm(scaled[:, j] - scaled[:, :j] @ weights) < 1e-6 * np.linalg.norm(scaled[:, j]):
             others = ", ".join(f"u{k + 1}" for k in range(j) if abs(weights[k]) > 1e-6)
-            raise ValueError(f"input u{j + 1} is a linear combination of {others}, so its column of B is not identified; move it independently, or leave it out")
+            raise ValueError(
+                f"input u{j + 1} is a linear combination of {others}, so its column of B is not identified; move it independently, or leave it out"
+            )
 
 
 def choose_past(data: Lagged) -> tuple[int, bool]:
-    """Window with the least corrected Akaike criterion, and whether it predicts exactly (errors at rounding), in which case the shortest such window is taken."""
-    p, y = data.p, data.R[:, data.now_y]
-    whole = np.sum(y**2)
-    best = (np.inf, 1)
+    """Window: twice the lags with the least corrected Akaike criterion (Bauer 2005: the window of a subspace method must outgrow the order's criterion).
+
+    True beside the shortest window that predicts to rounding, where there is one: the record is noise-free. The errors of every lag stand in the one factor.
+    """
+    p, whole, best = data.p, np.sum(data.R[:, data.now_y] ** 2), (np.inf, 1)
     for past in range(1, data.past + 1):
-        coefficients, errors = one_step(data, past)
-        if np.sum(errors**2) < 1e-10 * whole:
+        k = past * (data.m + p)
+        errors = data.R[k:, data.now_y]
+        if np.sum(errors**2) < NOISE_FREE * whole:
             return past, True
-        count, numbers = p * len(coefficients) + p * (p + 1) / 2, data.rows * p
+        count, numbers = p * k + p * (p + 1) / 2, data.rows * p
         if numbers > count + 1:
             criterion = data.rows * np.linalg.slogdet(errors.T @ errors / data.rows)[1] + 2 * count * numbers / (numbers - count - 1)
             best = min(best, (criterion, past))
-    return best[1], False
+    return min(2 * best[1], data.past), False
 
 
 def choose_feedthrough(u: Segments, y: Segments, past: int, offset: bool) -> bool:
@@ -103,111 +109,146 @@ def dead_time(plant: Plant, longest: int) -> tuple[int, ...]:
     return tuple(min(int(np.argmax(started[:, j])), longest) for j in range(plant.m))
 
 
-def shifted(u: Segments, y: Segments, delays: tuple[int, ...]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """u_j(t - delay_j) beside y(t), the first max(delays) samples of each segment left out."""
-    most = max(delays)
-    return [np.column_stack([a[most - d : len(a) - d, j] for j, d in enumerate(delays)]) for a in u], [b[most:] for b in y]
+def noise_edge(data: Lagged, past: int) -> float:
+    """sqrt(2) (sqrt(past p) + sqrt(past (m+p))): above what the coefficients' error alone puts into the singular values.
 
-
-def with_delays(plant: Plant, delays: tuple[int, ...]) -> Plant:
-    """The plant behind a chain of delays: u_j(t-1) ... u_j(t-delay_j) become states, and B_j acts through the last of them."""
-    if not any(delays):
-        return plant
-    n, size = plant.n, plant.n + sum(delays)
-    A, B, C, D = np.zeros((size, size)), np.zeros((size, plant.m)), np.zeros((plant.p, size)), np.zeros_like(plant.D)
-    A[:n, :n], C[:, :n], at = plant.A, plant.C, n
-    for j, delay in enumerate(delays):
-        if delay == 0:
-            B[:n, j], D[:, j] = plant.B[:, j], plant.D[:, j]
-            continue
-        B[at, j] = 1.0
-        A[at + 1 : at + delay, at : at + delay - 1] = np.eye(delay - 1)
-        A[:n, at + delay - 1], C[:, at + delay - 1] = plant.B[:, j], plant.D[:, j]
-        at += delay
-    rest = np.zeros(size - n)
-    return make_plant(A, B, C, D, np.r_[plant.b, rest], plant.d, np.vstack([plant.K, np.zeros((size - n, plant.p))]), plant.sample_time_s)
-
-
-def stabilised(plant: Plant, radius: float) -> Plant:
-    """The plant with every pole beyond `radius` drawn back onto it along its ray, in the modal basis."""
-    eigenvalues, T = np.linalg.eig(plant.A)
-    size = np.abs(eigenvalues)
-    if size.max() <= radius:
-        return plant
-    drawn = eigenvalues * np.where(size > radius, radius * (1 - 1e-9) / np.maximum(size, 1e-300), 1.0)
-    return plant._replace(A=np.real((T * drawn) @ np.linalg.inv(T)))
-
-
-def simulation_errors(plant: Plant, u: Segments, y: Segments) -> np.ndarray:
-    """For each segment and output, the size of the simulation error about its mean as a share of the output's variation, at most 1; shape (segments, p).
-
-    The initial state is fitted to the segment. The mean is left to the ambient, which no order can foretell.
+    A matrix of independent unit noise of that shape stays under the bracket; here each error stands in up to `past` rows, which adds some tenth (measured).
     """
-    model, shares = simulation_form(plant, []), []
-    for a, b in zip(u, y, strict=True):
-        v = drives("simulation", a, b)
-        with np.errstate(over="ignore", invalid="ignore"):  # an unstable candidate may overflow; it then counts as no better than the mean
-            seen = np.isfinite(b)
-            error = np.where(seen, b - respond(model, v, estimate_state(model, v, b))[1], np.nan)
-            share = np.nanstd(error, axis=0) / np.maximum(np.nanstd(b, axis=0), np.finfo(float).tiny)
-        shares.append(np.where(np.isfinite(share), np.minimum(share, 1.0), 1.0))
-    return np.array(shares)
+    return float(np.sqrt(2) * (np.sqrt(past * data.p) + np.sqrt(past * (data.m + data.p))))
 
 
-def folds(u: Segments, y: Segments, count: int) -> list[tuple[list, list, list, list]]:
-    """(u, y, u left out, y left out) with one of `count` blocks of each segment left out in turn; what remains on either side are segments of their own."""
-    out = []
-    for k in range(count):
-        fold = ([], [], [], [])
-        for a, b in zip(u, y, strict=True):
-            start, stop = len(a) * k // count, len(a) * (k + 1) // count
-            for part in (slice(0, start), slice(stop, len(a))):
-                if part.stop > part.start:
-                    fold[0].append(a[part])
-                    fold[1].append(b[part])
-            fold[2].append(a[start:stop])
-            fold[3].append(b[start:stop])
-        out.append(fold)
-    return out
+def identify(
+    u: Segments,
+    y: Segments,
+    *,
+    sample_time_s: float,
+    order: int | None = None,
+    past: int | None = None,
+    method: Literal["pbsid", "moesp"] = "pbsid",
+    feedthrough: bool | None = False,
+    offset: bool = True,
+    refinement: Literal["none", "prediction", "simulation", "validated"] = "none",
+    max_order: int = 12,
+    blocks: int = 5,
+) -> Identified:
+    """The plant that a record shows, by the rules at the head of this module; u segments (T, m), y segments (T, p), NaN where a sample is masked.
 
-
-def _fit(kind: str, start: Plant, u: Segments, y: Segments, feedthrough: bool, offset: bool, iterations: int) -> Plant:
-    """The plant that the named fit makes of the subspace start: the start itself, refined on one-step errors, or refined on simulation errors."""
-    if kind == "subspace":
-        return start
-    start = stabilised(start, 1.0)
-    if kind in ("inputs", "simulation"):
-        linear = fit_inputs(start.A, start.C, u, y, feedthrough=feedthrough, offset=offset)
-        m = start.m
-        start = make_plant(linear.F, linear.G[:, :m], linear.C, linear.H[:, :m], linear.G[:, m], linear.H[:, m], None, start.sample_time_s)
-    if kind == "inputs":
-        return start
-    try:
-        return refine(start, u, y, criterion=kind, feedthrough=feedthrough, offset=offset, max_radius=1.0 + 1e-9, max_iterations=iterations).plant
-    except np.linalg.LinAlgError:
-        return start
-
-
-def _table(u, y, *, past, future, orders, delays, kinds, feedthrough, offset, count, singular_values) -> list[Candidate]:
-    """Cross-validated errors of every order and fit for one choice of delays."""
-    u, y = shifted(u, y, delays)
-    errors = {}
-    for train_u, train_y, test_u, test_y in folds(u, y, count):
-        data = lagged(train_u, train_y, past, feedthrough=feedthrough, offset=offset)
-        basis = subspace(data, future).basis
-        for order in orders:
-            start = realise(data, basis[:order], 1.0)
-            for kind in kinds:
-                plant = _fit(kind, start, train_u, train_y, feedthrough, offset, 10)
-                errors.setdefault((order, kind), []).append(simulation_errors(plant, test_u, test_y).mean())
+    `refinement` "prediction" or "simulation" moves the subspace plant to the least errors of that kind; "validated" does so only where the left-out blocks prefer
+    it by more than one standard error. `feedthrough` None lets the data decide. Works in closed loop, unless refined on simulation errors.
+    Raises ValueError for a constant or collinear input, a record too short for the order, and shapes that do not agree.
+    """
+    u, y = [np.atleast_2d(a) for a in u], [np.atleast_2d(b) for b in y]
+    _check_shapes(u, y)
+    check_inputs(u, offset=offset)
     m, p = u[0].shape[1], y[0].shape[1]
-    size = lambda order: order * (m + p) + p * m * feedthrough + p + sum(delays)
-    return [Candidate(order, delays, kind, size(order), float(singular_values[order - 1]), tuple(e)) for (order, kind), e in errors.items()]
+    q, samples = m + p, sum(len(w) for w in complete_runs(u, y))
+    _check_length(samples, order, m, p)
+    notes: list[str] = []
+    longest = max(min(WIDEST // q, samples // (4 * q)), 2)
+    exact = False
+    if past is None:
+        past, exact = choose_past(lagged(u, y, min(longest, 6), offset=offset))  # a few lags tell whether the record is noise-free
+        past, exact = (past, exact) if exact else choose_past(lagged(u, y, longest, offset=offset))
+    if feedthrough is None:
+        feedthrough = choose_feedthrough(u, y, past, offset)
+        notes.append(f"direct feed-through {'kept' if feedthrough else 'left out'} by Schwarz's criterion")
+    data = lagged(u, y, past, feedthrough=feedthrough, offset=offset, exact=exact)
+    sub, edge = subspace(data, past), noise_edge(data, past)
+    settings = {"past": past, "feedthrough": feedthrough, "offset": offset}
+    delays, kind, table = (0,) * m, "subspace" if refinement == "validated" else refinement.replace("none", "subspace"), []
+    if exact:
+        notes.append(f"the record is noise-free: {past} past samples predict it to rounding, and the order is a rank")
+        order = order or int((sub.singular_values > EXACT_RANK * sub.singular_values[0]).sum())
+    elif order is None or refinement == "validated":
+        chosen, table = _choose(u, y, data, sub, edge, order, max_order, blocks, refinement == "validated", settings)
+        order, delays, kind = chosen.order, chosen.delays, chosen.fit if refinement == "validated" else kind
+    return _fit_all(u, y, data, sub, edge, order, delays, kind, method, settings, sample_time_s, table, notes)
 
 
-def choose(table: list[Candidate]) -> Candidate:
-    best = min(table, key=lambda row: row.error)
-    def within(row):
-        difference = np.array(row.errors) - np.array(best.errors)
-        return difference.mean() <= difference.std(ddof=1) / np.sqrt(len(difference))
-    return min((row for row in table if within(row)), key=lambda row: (row.parameters, row.error))
+def _choose(u, y, data, sub, edge, order, max_order, blocks, validated, settings) -> tuple[Candidate, list[Candidate]]:
+    """The candidate that the rules take, and the table: orders and dead times of the subspace fit, then the refined fits of the winner."""
+    m = data.m
+    if order is None:
+        largest = max(1, min(int((sub.singular_values > edge).sum()), max_order, len(sub.singular_values)))
+        orders = range(1, min(largest + 1, max_order, len(sub.singular_values)) + 1)
+        delays = sorted({(0,) * m, dead_time(realise(data, sub.basis[:largest], 1.0), max(data.past // 2, 1))})
+    else:
+        orders, delays = [order], [(0,) * m]
+    settings = settings | {"blocks": blocks, "singular_values": sub.singular_values}
+    table = [row for d in delays for row in cross_validate(u, y, orders, d, ("subspace",), **settings)]
+    chosen = simplest(table)
+    if validated:
+        refined = cross_validate(u, y, [chosen.order], chosen.delays, ("prediction", "simulation"), **settings)
+        table += refined
+        for row in sorted(refined, key=lambda row: row.error)[:1]:
+            gain = np.subtract(chosen.errors, row.errors)
+            chosen = row if gain.mean() > gain.std(ddof=1) / np.sqrt(len(gain)) else chosen
+    return chosen, table
+
+
+def _fit_all(u, y, data, sub, edge, order, delays, kind, method, settings, sample_time_s, table, notes) -> Identified:
+    """One fit of the chosen model on all of the record."""
+    rest = {"feedthrough": settings["feedthrough"], "offset": settings["offset"]}
+    if order > len(sub.singular_values):
+        raise ValueError(
+            f"order {order} needs a longer window: {data.past} past samples give at most {len(sub.singular_values)} states; raise past"
+        )
+    us, ys = shifted(u, y, delays)
+    if any(delays):
+        data = lagged(us, ys, settings["past"], **rest)
+        sub_delayed = subspace(data, data.past)
+    else:
+        sub_delayed = sub
+    if method == "moesp":
+        plant = moesp(us, ys, data.past, order, sample_time_s=sample_time_s, **rest)[0]
+    else:
+        plant = realise(data, sub_delayed.basis[:order], sample_time_s)
+    plant = with_delays(fit(kind, plant, us, ys, max_iterations=30, **rest), delays)
+    model = simulation_form(plant, [])
+    x0 = [
+        estimate_state(model, drives("simulation", a, np.nan_to_num(b)), b) if np.isfinite(a).all() else np.full(plant.n, np.nan)
+        for a, b in zip(u, y, strict=True)
+    ]
+    if data.dropped_rows:
+        notes.append(f"{data.dropped_rows} rows touch a masked sample and were left out of the fit")
+    radius = float(np.abs(np.linalg.eigvals(plant.A)).max())
+    if radius > 1:
+        notes.append(
+            f"the largest pole is at {radius:.5f}, outside the unit circle; refine with a limit, or record longer, before simulating far ahead"
+        )
+    return Identified(
+        plant,
+        order,
+        data.past,
+        delays,
+        rest["feedthrough"],
+        rest["offset"],
+        kind,
+        sub.singular_values,
+        edge,
+        table,
+        x0,
+        data.rows,
+        data.dropped_rows,
+        notes,
+    )
+
+
+def _check_shapes(u: Segments, y: Segments) -> None:
+    if not u or len(u) != len(y):
+        raise ValueError(f"identify: expected as many segments of u as of y, at least one, but found {len(u)} and {len(y)}")
+    for k, (a, b) in enumerate(zip(u, y, strict=True)):
+        if a.ndim != 2 or b.ndim != 2 or len(a) != len(b) or a.shape[1] != u[0].shape[1] or b.shape[1] != y[0].shape[1]:
+            raise ValueError(
+                f"identify: segment {k} has u of shape {a.shape} and y of shape {b.shape}; expected (T, {u[0].shape[1]}) and (T, {y[0].shape[1]})"
+            )
+
+
+def _check_length(samples: int, order: int | None, m: int, p: int) -> None:
+    """As many complete samples as ten for each unknown of the smallest window that carries the order."""
+    lags = max(2, -(-(order or 1) // p) + 1)
+    needed = 10 * lags * (m + p)
+    if samples < needed:
+        raise ValueError(
+            f"the record is too short for order {order or 1}: expected at least {needed} complete samples, found {samples}; record {needed - samples} samples more"
+        )

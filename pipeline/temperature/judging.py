@@ -10,12 +10,14 @@ from pipeline.temperature.baseline import pairing, pi_law
 from pipeline.temperature.kernel import Kernel, Regression, regress, tuples, value_iteration, window_law
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.scorecard import (
+    Allowance,
     Figures,
     Margins,
     Panel,
     Run,
     Yardstick,
     cost,
+    engineering_cost,
     feed_forward,
     figures,
     margins,
@@ -24,7 +26,8 @@ from pipeline.temperature.scorecard import (
     regret,
     simulate,
 )
-from pipeline.temperature.tracking import Law, feasible_target, gains, observer_gain, observer_law
+from pipeline.temperature.tracking import Law, feasible_target, gains, observer_gain, observer_law, robust_observer_gain
+from pipeline.temperature.tuning import Result
 
 Limits = tuple[np.ndarray, np.ndarray]
 Targets = dict[bytes, tuple[np.ndarray, np.ndarray]]
@@ -56,10 +59,17 @@ class Judged(NamedTuple):
     law: Law
 
 
-def model_based(plant: Plant, gamma: float, *, tau: float, name: str = "model_based") -> Controller:
-    """Observer and Riccati gains of a model; its Kalman gain where it was identified with one, (8) otherwise."""
-    L = plant.K if np.any(plant.K) else observer_gain(plant, tau)
+def model_based(plant: Plant, gamma: float, *, tau: float) -> Controller:
+    """Riccati gains of an identified model, and an observer that stands its errors (tracking.robust_observer_gain)."""
+    return _observed("model_based", plant, gamma, robust_observer_gain(plant, tau))
 
+
+def exact_model(plant: Plant, gamma: float, *, tau: float) -> Controller:
+    """The paper's controller, told the true plant: Riccati gains and (8)."""
+    return _observed("exact_model", plant, gamma, observer_gain(plant, tau))
+
+
+def _observed(name: str, plant: Plant, gamma: float, L: np.ndarray) -> Controller:
     def design(q: np.ndarray, r: np.ndarray, integral: float) -> Law:
         return observer_law(plant, gains(plant, np.diag(q), np.diag(r), gamma), L, integral=integral)
 
@@ -68,7 +78,11 @@ def model_based(plant: Plant, gamma: float, *, tau: float, name: str = "model_ba
 
 def window(learned: window_route.Window, gamma: float) -> Controller:
     """VARX window and Riccati."""
-    return Controller("window", lambda q, r, integral: window_route.law(learned, np.diag(q), np.diag(r), gamma, integral=integral), window_route.predictor(learned))
+    return Controller(
+        "window",
+        lambda q, r, integral: window_route.law(learned, np.diag(q), np.diag(r), gamma, integral=integral),
+        window_route.predictor(learned),
+    )
 
 
 def kernel(learned: Regression, gamma: float, model: Plant) -> Controller:
@@ -88,14 +102,14 @@ def baseline(plant: Plant, limits: Limits, *, horizon: int) -> Controller:
 
 
 def controllers(
-    model: Plant, long: window_route.Window, learned: Regression | None, *, limits: Limits, gamma: float, tau: float, horizon: int, truth: Plant | None
+    model: Plant, long: window_route.Window, learned: Regression | None, *, limits: Limits, gamma: float, tau: float, exact_tau: float, horizon: int, truth: Plant | None
 ) -> list[Controller]:  # fmt: skip
     """All that the scorecard compares; the kernel where it could be learned, and where the true plant is known a controller that was told its model, as a yardstick."""
     found = [model_based(model, gamma, tau=tau), window(long, gamma)]
     if learned is not None:
         found.append(kernel(learned, gamma, found[1].model))
     found.append(baseline(model, limits, horizon=horizon))
-    return [*found, model_based(truth, gamma, tau=tau, name="exact_model")] if truth is not None else found
+    return [*found, exact_model(truth, gamma, tau=exact_tau)] if truth is not None else found
 
 
 def targets(model: Plant, references: np.ndarray, limits: Limits) -> Targets:
@@ -129,7 +143,10 @@ def summary(judged: Judged, scenarios: Panel, *, noise: float) -> dict[str, dict
     nominal, level = scenarios.plant == 0, scenarios.noise == noise
     columns = {
         "gap_percent": 100.0 * judged.regret,
-        **{name: getattr(judged.figures, name) for name in ("settled_error_degC", "settling_s", "overshoot_degC", "at_limits_percent", "tracking_degC", "effort_percent")},
+        **{
+            name: getattr(judged.figures, name)
+            for name in ("settled_error_degC", "settling_s", "overshoot_degC", "at_limits_percent", "tracking_degC", "effort_percent")
+        },
         "outside_limits_percent": judged.outside_percent,
     }
     result: dict[str, dict] = {}
@@ -140,7 +157,12 @@ def summary(judged: Judged, scenarios: Panel, *, noise: float) -> dict[str, dict
         result[name] = {key: _number(value) for key, value in (("median", median), ("low", low), ("high", high), ("worst", worst.max()))}
     for name in ("disk", "delay_s"):
         values = np.array([getattr(margin, name) for margin in judged.margins])
-        result[name] = {"median": _number(values[0]), "low": _number(values.min()), "high": _number(values[0]), "worst": _number(values.min())}
+        result[name] = {
+            "median": _number(values[0]),
+            "low": _number(values.min()),
+            "high": _number(values[0]),
+            "worst": _number(values.min()),
+        }
     worst = np.where(nominal & level, judged.figures.settled_error_degC, -1.0).argmax()
     result["settled_error_degC"]["zone"] = int(judged.figures.settled_zone[worst])
     result["stable_plants"] = {"count": sum(margin.stable for margin in judged.margins), "of": len(judged.margins)}
@@ -170,7 +192,10 @@ def sufficiency(
     best = optimum(scenarios, yardstick)
     gaps = []
     for part in (0, 1):
-        halves = [(us[part * len(us) // 2 : (part + 1) * len(us) // 2], ys[part * len(ys) // 2 : (part + 1) * len(ys) // 2]) for us, ys in zip(u, y, strict=True)]
+        halves = [
+            (us[part * len(us) // 2 : (part + 1) * len(us) // 2], ys[part * len(ys) // 2 : (part + 1) * len(ys) // 2])
+            for us, ys in zip(u, y, strict=True)
+        ]
         half = window_route.learn([h[0] for h in halves], [h[1] for h in halves], longest=learned.N, offset=offset)
         law = window_route.law(half, np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma)
         gaps.append(regret(cost(scenarios, simulate(scenarios, law, feed_forward(scenarios, law, None), limits=None), yardstick), best)[0])
@@ -238,7 +263,9 @@ def featured(scenarios: Panel, noise: float) -> int:
     return int(np.flatnonzero((scenarios.plant == 0) & (scenarios.noise == noise))[0])
 
 
-def trajectories(judged: Sequence[Judged], scenarios: Panel, inputs: Sequence[str], outputs: Sequence[str], *, noise: float, yardstick: Yardstick) -> dict[str, list | np.ndarray]:
+def trajectories(
+    judged: Sequence[Judged], scenarios: Panel, inputs: Sequence[str], outputs: Sequence[str], *, noise: float, yardstick: Yardstick
+) -> dict[str, list | np.ndarray]:
     """The featured scenario under every controller, in both modes, as columns."""
     i = featured(scenarios, noise)
     runs = [(j.name, mode, run) for j in judged for mode, run in (("unclipped", j.unclipped), ("deployed", j.deployed))]
@@ -257,3 +284,39 @@ def trajectories(judged: Sequence[Judged], scenarios: Panel, inputs: Sequence[st
         columns[f"{name}_command"] = np.concatenate([run.command[:, i, channel] for _, _, run in runs])
         columns[f"{name}_applied"] = np.concatenate([run.u[:, i, channel] for _, _, run in runs])
     return columns
+
+
+def engineering_objective(
+    plant: Plant, scenarios: Panel, *, gamma: float, limits: Limits, band: float, integral: float, integral_limit: float, allowance: Allowance
+) -> Callable[[np.ndarray], float]:  # fmt: skip
+    """Practical tuning's cost of theta = [q; r; tau]: weights and observer of the model's controller, deployed on the training panel, counted by `allowance`."""
+    aims, p, m = targets(plant, scenarios.r, limits), plant.p, plant.m
+
+    def objective(theta: np.ndarray) -> float:
+        law = model_based(plant, gamma, tau=theta[-1]).design(theta[:p], theta[p : p + m], integral)
+        run = simulate(scenarios, law, feed_forward(scenarios, law, aims), limits=limits, integral_band=integral_limit)
+        found = figures(scenarios, run, limits=limits, band=band, sample_time_s=plant.sample_time_s)
+        return engineering_cost(found, scenarios.plant, allowance, longest_s=scenarios.steps * plant.sample_time_s)
+
+    return objective
+
+
+def yardstick_regret(controller: Controller, scenarios: Panel, yardstick: Yardstick, q: np.ndarray, r: np.ndarray) -> float:
+    """What weights q, r cost on the common yardstick: median regret, unclipped, noise-free scenarios on the nominal plant only."""
+    law = controller.design(q, r, 0.0)
+    found = regret(
+        cost(scenarios, simulate(scenarios, law, feed_forward(scenarios, law, None), limits=None), yardstick), optimum(scenarios, yardstick)
+    )
+    return float(np.median(found[(scenarios.plant == 0) & (scenarios.noise == 0)]))
+
+
+def histories(results: dict[str, Result]) -> dict[str, list | np.ndarray]:
+    """The candidates of several searches as columns, one row a candidate."""
+    of = {mode: result.history for mode, result in results.items()}
+    return {
+        "mode": [mode for mode, history in of.items() for _ in history.cost],
+        "evaluation": [k + 1 for history in of.values() for k in range(len(history.cost))],
+        "cost": np.concatenate([history.cost for history in of.values()]),
+        "incumbent": np.concatenate([history.incumbent for history in of.values()]),
+        "failure": [reason for history in of.values() for reason in history.failed],
+    }

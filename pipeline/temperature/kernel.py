@@ -118,7 +118,9 @@ def tuples_with_reference(u: Sequence[np.ndarray], y: Sequence[np.ndarray], N: i
     plain = tuples(u, y, N)
     rows = (len(plain.s), 1)
     features = np.vstack([plain.features, np.hstack([np.zeros((len(r), plain.features.shape[1] - 1)), r[:, None]])])
-    return Tuples(np.hstack([plain.s, np.tile(r, rows)]), plain.u, plain.e - r, np.hstack([plain.s_next, np.tile(F @ r, rows)]), features, N, r)
+    return Tuples(
+        np.hstack([plain.s, np.tile(r, rows)]), plain.u, plain.e - r, np.hstack([plain.s_next, np.tile(F @ r, rows)]), features, N, r
+    )
 
 
 class Regression(NamedTuple):
@@ -177,7 +179,9 @@ _STORED = {
 def restored(arrays: dict[str, np.ndarray]) -> Regression:
     """The Regression whose `stored` arrays these are."""
     whole = ("N", "rank", "unknowns", "entries", "samples")
-    return Regression(**{name: int(value) if name in whole else float(value) if name == "condition" else value for name, value in arrays.items()})
+    return Regression(
+        **{name: int(value) if name in whole else float(value) if name == "condition" else value for name, value in arrays.items()}
+    )
 
 
 def whitening(s: np.ndarray, s_next: np.ndarray, *, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
@@ -249,7 +253,9 @@ def _refuse(data: Tuples, W: np.ndarray, u_scale: np.ndarray, unknowns: int, sam
     """The refusals that name what is missing: an input that is silent, an input that only repeats the window, too few samples."""
     silent = np.flatnonzero((u_scale == 0) | (np.ptp(data.u, axis=0) == 0))
     if silent.size:
-        raise ValueError(f"the kernel cannot be learned: input {silent[0] + 1} of {len(u_scale)} is constant in the record; move every input while recording")
+        raise ValueError(
+            f"the kernel cannot be learned: input {silent[0] + 1} of {len(u_scale)} is constant in the record; move every input while recording"
+        )
     if samples < unknowns and mu == 0:
         raise ValueError(
             f"the kernel cannot be learned: expected at least {unknowns} samples for its {unknowns} unknowns, found {samples}; "
@@ -283,13 +289,23 @@ def _greedy(H: np.ndarray, q: int) -> tuple[np.ndarray, np.ndarray]:
     """K = H_uu^-1 H_us of (32), and P = H_ss - H_su K, the value after the greedy input. Raises where H_uu is not positive definite."""
     factor, failed = scipy.linalg.lapack.dpotrf(H[q:, q:], lower=1)
     if failed:
-        raise ValueError("the learned kernel has no minimum in u (H_uu is not positive definite): the record is too noisy or too short for this window; lower the window or record longer")
+        raise ValueError(
+            "the learned kernel has no minimum in u (H_uu is not positive definite): the record is too noisy or too short for this window; lower the window or record longer"
+        )
     K = scipy.linalg.lapack.dpotrs(factor, H[q:, :q], lower=1)[0]
     return K, H[:q, :q] - H[:q, q:] @ K
 
 
 def value_iteration(
-    data: Regression, Q: np.ndarray, R: np.ndarray, gamma: float, *, F: np.ndarray | None = None, tolerance: float = 1e-6, max_iterations: int = 2000, H0=None
+    data: Regression,
+    Q: np.ndarray,
+    R: np.ndarray,
+    gamma: float,
+    *,
+    F: np.ndarray | None = None,
+    tolerance: float = 1e-6,
+    max_iterations: int = 2000,
+    H0=None,
 ) -> Kernel:
     """Algorithm 2, steps 5-9: h <- h_0 + gamma G svec(P(H)) until the gain changes by less than `tolerance`, relatively; then the reference's share of (32).
 
@@ -311,11 +327,23 @@ def value_iteration(
         if not change < 1e12:
             break
     if not (np.isfinite(K).all() and change < max(tolerance, 1e-2)):
-        raise ValueError(f"value iteration did not settle in {iteration} iterations (last relative change of the gain {change:.1g}); record longer, or lower the window")
+        raise ValueError(
+            f"value iteration did not settle in {iteration} iterations (last relative change of the gain {change:.1g}); record longer, or lower the window"
+        )
     return _kernel(data, H, K, Q, gamma, np.eye(data.output.shape[0]) if F is None else F, iteration, change)
 
 
-def policy_iteration(data: Regression, Q: np.ndarray, R: np.ndarray, gamma: float, K0: np.ndarray, *, F=None, tolerance: float = 1e-9, max_iterations: int = 50) -> Kernel:
+def policy_iteration(
+    data: Regression,
+    Q: np.ndarray,
+    R: np.ndarray,
+    gamma: float,
+    K0: np.ndarray,
+    *,
+    F=None,
+    tolerance: float = 1e-9,
+    max_iterations: int = 50,
+) -> Kernel:
     """The same kernel by policies: each is evaluated exactly, (I - gamma G [I -K']-congruence) h = h_0, then improved; K0 (m, q) must stabilise (whitened state)."""
     q, m = len(data.W), len(data.u_scale)
     h_0, K = data.G_e @ svec(Q) + data.G_u @ svec(R), K0
@@ -330,7 +358,9 @@ def policy_iteration(data: Regression, Q: np.ndarray, R: np.ndarray, gamma: floa
     raise ValueError(f"policy iteration on the kernel did not settle in {max_iterations} policies; start from a gain that stabilises")
 
 
-def _kernel(data: Regression, H: np.ndarray, K: np.ndarray, Q: np.ndarray, gamma: float, F: np.ndarray, iterations: int, change: float) -> Kernel:
+def _kernel(
+    data: Regression, H: np.ndarray, K: np.ndarray, Q: np.ndarray, gamma: float, F: np.ndarray, iterations: int, change: float
+) -> Kernel:
     """Gains in the machine's units. The reference enters the value as 2 v'H_vr r, H_vr = -output'Q + gamma step'P_sr F, P_sr = [I -K'] H_vr: exact for every r."""
     q = len(data.W)
     closed = np.hstack([np.eye(q), -K.T])

@@ -44,7 +44,9 @@ def plant(A, B, C, D=None, b=None, d=None, K=None, sample_time_s: float = 1.0) -
     arrays = {name: np.zeros(shape) if given[name] is None else np.asarray(given[name], float) for name, shape in expected.items()}
     for name, shape in expected.items():
         if arrays[name].shape != shape:
-            raise ValueError(f"plant: {name} should have shape {shape} but has {arrays[name].shape}; A is {A.shape}, B {B.shape}, C {C.shape}")
+            raise ValueError(
+                f"plant: {name} should have shape {shape} but has {arrays[name].shape}; A is {A.shape}, B {B.shape}, C {C.shape}"
+            )
         if not np.isfinite(arrays[name]).all():
             raise ValueError(f"plant: {name} holds a number that is not finite; identify the plant again on a clean record")
     return Plant(**arrays, sample_time_s=float(sample_time_s))
@@ -104,13 +106,19 @@ class RankTest(NamedTuple):
 def _rank_test(matrix: np.ndarray, n: int, name: str, remedy: str) -> RankTest:
     sv = np.linalg.svd(matrix, compute_uv=False)
     rank = int((sv > sv[0] * max(matrix.shape) * np.finfo(float).eps).sum()) if sv[0] > 0 else 0
-    reason = "" if rank == n else f"the plant is not {name}: rank {rank} of {n}, smallest singular values {np.array2string(sv[-2:], precision=2)}; {remedy}"
+    reason = (
+        ""
+        if rank == n
+        else f"the plant is not {name}: rank {rank} of {n}, smallest singular values {np.array2string(sv[-2:], precision=2)}; {remedy}"
+    )
     return RankTest(rank == n, rank, sv, reason)
 
 
 def observability(plant: Plant) -> RankTest:
     """Rank test of (7) with its singular values; fails with a reason where some state never shows in y."""
-    return _rank_test(observability_matrix(plant.A, plant.C, plant.n), plant.n, "observable", "add a sensor, or lower the order of the model")
+    return _rank_test(
+        observability_matrix(plant.A, plant.C, plant.n), plant.n, "observable", "add a sensor, or lower the order of the model"
+    )
 
 
 def controllability(plant: Plant) -> RankTest:

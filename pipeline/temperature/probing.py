@@ -7,7 +7,9 @@ import numpy as np
 from pipeline.temperature.plant import Plant
 
 
-def study_signal(rng: np.random.Generator, samples: int, inputs: int, *, amplitudes: np.ndarray, bandwidth: float, variance: float, redrawn: bool = True) -> np.ndarray:
+def study_signal(
+    rng: np.random.Generator, samples: int, inputs: int, *, amplitudes: np.ndarray, bandwidth: float, variance: float, redrawn: bool = True
+) -> np.ndarray:
     """omega_pr (samples, inputs) of (51), (52): a sinusoid at the bandwidth, one for each further amplitude at a random frequency below it, and Gaussian noise.
 
     `redrawn` draws the frequencies anew every step, as the study's script does (nearly white); without it they are fixed, as the text reads. bandwidth in rad a step.
@@ -91,7 +93,9 @@ def excitation(u: np.ndarray, order: int, *, bands: int = 8) -> Excitation:
     """Persistency of excitation of u (samples, m): of the order `order` where the rank is m x order. Raises ValueError where the record is shorter than that asks."""
     samples, m = u.shape
     if samples < (m + 1) * order:
-        raise ValueError(f"excitation of order {order} with {m} inputs expects at least {(m + 1) * order} samples, found {samples}; record {(m + 1) * order - samples} more")
+        raise ValueError(
+            f"excitation of order {order} with {m} inputs expects at least {(m + 1) * order} samples, found {samples}; record {(m + 1) * order - samples} more"
+        )
     centred = u - u.mean(axis=0)
     hankel = np.hstack([centred[lag : samples - order + 1 + lag] for lag in range(order)])
     sv = np.linalg.svd(np.linalg.qr(hankel, mode="r"), compute_uv=False)

@@ -48,16 +48,19 @@ def respond(model: Predictor, v: np.ndarray, x0: np.ndarray) -> tuple[np.ndarray
     return x, x @ model.C.T + v @ model.H.T
 
 
-def estimate_state(model: Predictor, v: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """x(0) (n,) that fits y (T, p) best in least squares under v; NaN in y is left out. A direction of x(0) that y does not show stays zero."""
+def estimate_state(model: Predictor, v: np.ndarray, y: np.ndarray, *, free_mean: bool = False) -> np.ndarray:
+    """x(0) (n,) that fits y (T, p) best in least squares under v; NaN in y is left out. A direction of x(0) that y does not show stays zero.
+
+    With `free_mean` a constant for each output is fitted along and dropped, for scores that remove the mean of the error.
+    """
     T, (p, n) = len(v), model.C.shape
-    free = respond(model, v, np.zeros(n))[1]
-    gamma, row = np.empty((T, p, n)), model.C
-    for t in range(T):
-        gamma[t] = row
-        row = row @ model.F
+    error = y - respond(model, v, np.zeros(n))[1]
+    gamma, power = model.C[None], model.F
+    while len(gamma) < T:  # [C; CF; ...] doubles with each pass
+        gamma, power = np.concatenate([gamma, gamma @ power]), power @ power
     seen = np.isfinite(y)
-    return np.linalg.lstsq(gamma[seen], (y - free)[seen], rcond=1e-10)[0]
+    regressors = gamma[:T] if not free_mean else np.concatenate([gamma[:T], np.broadcast_to(np.eye(p), (T, p, p))], axis=2)
+    return np.linalg.lstsq(regressors[seen], error[seen], rcond=1e-10)[0][:n]
 
 
 def _block_modal(model: Predictor) -> tuple[Predictor, list[tuple[int, complex]], np.ndarray]:
@@ -130,7 +133,9 @@ def _cost(model: Predictor, v_all, y_all) -> float:
     return float(cost) if finite and np.isfinite(cost) else np.inf
 
 
-def gauss_newton(model: Predictor, v_all, y_all, *, free: np.ndarray, admissible, max_iterations: int, tolerance: float) -> tuple[Predictor, list[float]]:
+def gauss_newton(
+    model: Predictor, v_all, y_all, *, free: np.ndarray, admissible, max_iterations: int, tolerance: float
+) -> tuple[Predictor, list[float]]:
     """Levenberg-Marquardt on sum |y - ŷ|² over F, G, C, the columns `free` of H and every x0; NaN in y is left out.
 
     The parameters are redundant (any change of state basis); the damping picks the step of least norm among equals. `admissible(F, G, C)` refuses steps,
@@ -243,7 +248,9 @@ def refine(
     if any(not np.isfinite(a).all() for a in u):
         raise ValueError("refine: expected inputs without gaps but found NaN in u; split the record into segments at the gaps")
     if max_radius is not None and np.abs(np.linalg.eigvals(plant.A)).max() > max_radius:
-        raise ValueError(f"refine: the start has a pole at {np.abs(np.linalg.eigvals(plant.A)).max():.6f}, outside max_radius {max_radius}; start from a stabilised plant")
+        raise ValueError(
+            f"refine: the start has a pole at {np.abs(np.linalg.eigvals(plant.A)).max():.6f}, outside max_radius {max_radius}; start from a stabilised plant"
+        )
     m, p, ahead = plant.m, plant.p, criterion == "prediction"
     start = prediction_form(plant, []) if ahead else simulation_form(plant, [])
     y_full = y if not ahead else [filled(plant, a, b, _first_state(plant, start, criterion, a, b)) for a, b in zip(u, y, strict=True)]
@@ -284,9 +291,9 @@ def kalman_gain(plant: Plant, u: Sequence[np.ndarray], y: Sequence[np.ndarray], 
     def errors(K):
         model = prediction_form(plant._replace(K=K), [])
         x0 = [estimate_state(model, a, b) for a, b in zip(v, y, strict=True)]
-        return model, x0, [np.nan_to_num(b - respond(model, a, x)[1]) for a, b, x in zip(v, y, x0, strict=True)]
+        return model, [np.nan_to_num(b - respond(model, a, x)[1]) for a, b, x in zip(v, y, x0, strict=True)]
 
-    model, x0, e = errors(K)
+    model, e = errors(K)
     weight = 1.0 / np.sqrt(np.maximum(np.mean(np.vstack(e) ** 2, axis=0), np.finfo(float).tiny))
     cost, damping = sum(np.sum((a * weight) ** 2) for a in e), 1e-4
     for _ in range(max_iterations):
@@ -299,7 +306,7 @@ def kalman_gain(plant: Plant, u: Sequence[np.ndarray], y: Sequence[np.ndarray], 
             step = np.linalg.solve(JJ / np.outer(scale, scale) + damping * np.eye(n * p), Je / scale) / scale
             trial = K + basis @ step.reshape(n, p)
             if np.abs(np.linalg.eigvals(plant.A - trial @ plant.C)).max() < 1:
-                model_t, _, e_t = errors(trial)
+                model_t, e_t = errors(trial)
                 cost_t = sum(np.sum((a * weight) ** 2) for a in e_t)
                 if cost_t < cost:
                     break

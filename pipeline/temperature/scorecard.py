@@ -91,7 +91,10 @@ def panel(
 
 def disturbances(panel: Panel) -> np.ndarray:
     """Sensor noise (hold + steps, scenarios, p): each scenario draws from its own seed, so that every controller sees the same."""
-    unit = {int(seed): np.random.default_rng(seed).standard_normal((panel.hold + panel.steps, panel.r.shape[1])) for seed in np.unique(panel.seed)}
+    unit = {
+        int(seed): np.random.default_rng(seed).standard_normal((panel.hold + panel.steps, panel.r.shape[1]))
+        for seed in np.unique(panel.seed)
+    }
     return np.stack([level * unit[int(seed)] for level, seed in zip(panel.noise, panel.seed, strict=True)], axis=1)
 
 
@@ -284,7 +287,9 @@ def law_response(law: Law, z: np.ndarray) -> np.ndarray:
     response = np.empty((len(z), *law.D.shape), complex)
     for i, point in enumerate(z):
         xi = -law.integral / (point - 1) if law.integral else 0.0
-        response[i] = K @ scipy.linalg.solve_triangular(point * identity - T, from_y - xi * from_xi, check_finite=False) + law.D + xi * law.K_r
+        response[i] = (
+            K @ scipy.linalg.solve_triangular(point * identity - T, from_y - xi * from_xi, check_finite=False) + law.D + xi * law.K_r
+        )
     return response
 
 

@@ -12,6 +12,7 @@ from pipeline.temperature.probing import study_probe, study_signal
 from pipeline.temperature.published import GAMMA, K_DATA, PRINTED, REFERENCE, TAU, Figures
 from pipeline.temperature.scorecard import Panel, Yardstick, cost, feed_forward, optimum, panel, regret, simulate
 from pipeline.temperature.tracking import Law, gains, observer_gain, observer_law
+from pipeline.temperature.tuning import fitness
 
 YARDSTICK = Yardstick(np.ones(5), np.ones(7), GAMMA)
 AMPLITUDES, BANDWIDTH, VARIANCE = np.arange(100.0, 0.0, -10.0), 1.65, 1.5
@@ -64,7 +65,10 @@ def exact() -> Exact:
     K, K_r = exact_gains(plant, best, 2)
     history = window_law(K, K_r, best.k, 2)
     empty = history._replace(start_u=np.zeros_like(history.start_u))
-    J = [float(cost(scenarios, simulate(scenarios, run, feed_forward(scenarios, run, None), limits=None), YARDSTICK).J[0]) for run in (law, from_50)]
+    J = [
+        float(cost(scenarios, simulate(scenarios, run, feed_forward(scenarios, run, None), limits=None), YARDSTICK).J[0])
+        for run in (law, from_50)
+    ]
     return Exact(
         float(optimum(scenarios, YARDSTICK).J[0]), float(optimum(short, YARDSTICK).J[0]), *J, float(gap(empty, scenarios)[0])
     )  # fmt: skip
@@ -115,7 +119,9 @@ def rows(work: Sequence[tuple[float, int]], found: Sequence[dict[str, tuple[floa
     return {"route": route, "noise_degC": noise, "data_set": index, "gap": finite[0], "error_degC": finite[1]}
 
 
-def metrics(as_published: dict[str, Figures], exact: Exact, noise_free: NoiseFree, table: dict[str, list], *, failures: int, starts: int) -> dict:
+def metrics(
+    as_published: dict[str, Figures], exact: Exact, noise_free: NoiseFree, table: dict[str, list], *, failures: int, starts: int
+) -> dict:
     """The figures by which the learners are known: as published, on the common yardstick without noise, and over the noisy data sets."""
     result = {
         "as_published": {name: found._asdict() for name, found in as_published.items()},
@@ -138,3 +144,27 @@ def metrics(as_published: dict[str, Figures], exact: Exact, noise_free: NoiseFre
                 **{name: float(value) if np.isfinite(value) else None for name, value in figures.items()}, "stable": stable, "of": len(mine),
             }  # fmt: skip
     return result
+
+
+def tuning_objective(theta: np.ndarray) -> float:
+    """(37) of theta = [q (5,); r (7,)] on the study's machine: l = 100, from 20 °C, the state known, the gain from the discounted Riccati equation."""
+    plant = baam()
+    best = gains(plant, np.diag(theta[:5]), np.diag(theta[5:]), GAMMA)
+    return fitness(plant, best.K_x, best.K_r, reference=REFERENCE, gamma=GAMMA, steps=100, x0=np.full(plant.n, 20.0))
+
+
+class ScaledWeights(NamedTuple):
+    """Q = R = 0.4 I beside Q = R = I: the change of the index when each is computed with its own weights, in percent, and the largest difference of the gains."""
+
+    change_percent: float
+    gain_difference: float
+
+
+def scaled_weights(scale: float = 0.4) -> ScaledWeights:
+    """Why indices with different weights say nothing: scaling all weights changes the printed index by as much, and the controller not at all."""
+    plant, scenarios = baam(), study_panel(REFERENCE[None])
+    one, other = (gains(plant, factor * np.eye(5), factor * np.eye(7), GAMMA) for factor in (1.0, scale))
+    law = observer_law(plant, other, observer_gain(plant, TAU))
+    run = simulate(scenarios, law, feed_forward(scenarios, law, None), limits=None)
+    J = [cost(scenarios, run, Yardstick(np.full(5, factor), np.full(7, factor), GAMMA)).J[0] for factor in (1.0, scale)]
+    return ScaledWeights(float(100 * (J[1] / J[0] - 1)), float(np.abs(one.K_x - other.K_x).max()))

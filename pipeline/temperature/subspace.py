@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.plant import plant as make_plant
@@ -43,6 +44,7 @@ class Lagged(NamedTuple):
     means: np.ndarray
     rows: int
     dropped_rows: int
+    exact: bool
 
     @property
     def now_u(self) -> np.ndarray:
@@ -113,7 +115,7 @@ def lagged(u: Segments, y: Segments, past: int, *, feedthrough: bool = False, of
     sums = sum(np.array([w[past - lag : len(w) - lag].sum(axis=0) for lag in range(past + 1)]) for w in runs)
     R = (_exact_factor if exact else _moment_factor)(runs, past, _columns(m, p, past, feedthrough), sums.ravel() / rows * offset, rows)
     possible = sum(max(len(a) - past, 0) for a in u)
-    return Lagged(R, m, p, past, feedthrough, (shift + sums / rows) * offset, rows, possible - rows)
+    return Lagged(R, m, p, past, feedthrough, (shift + sums / rows) * offset, rows, possible - rows, exact)
 
 
 def _moment_factor(runs, past, columns, mean, rows) -> np.ndarray:
@@ -132,8 +134,10 @@ def one_step(data: Lagged, past: int) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients (features, p) of the one-step predictor with the first `past` lags (and u(t) with feed-through), and its errors as rows of the factor."""
     features = np.concatenate([data.now_u if data.feedthrough else [], data.lags(1, past)]).astype(int)
     k = len(features)  # the features lead the columns, so the factor is already theirs
-    R = data.R[:k, :k]
-    coefficients = np.linalg.lstsq(R, data.R[:k, data.now_y], rcond=RANK)[0]
+    if data.exact:
+        coefficients = np.linalg.lstsq(data.R[:, features], data.R[:, data.now_y], rcond=RANK)[0]
+    else:
+        coefficients = scipy.linalg.solve_triangular(data.R[:k, :k], data.R[:k, data.now_y])
     return coefficients, data.R[:, data.now_y] - data.R[:, features] @ coefficients
 
 
@@ -174,16 +178,26 @@ def subspace(data: Lagged, future: int) -> Subspace:
     return Subspace((U.T @ extended) / np.sqrt(np.maximum(singular_values, np.finfo(float).tiny))[:, None], singular_values)
 
 
+def _least_squares(regressors: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Theta with target = regressors Theta'; columns are scaled first, so that the rank test does not depend on units."""
+    scale = np.linalg.norm(regressors, axis=0)
+    scale[scale == 0] = 1.0
+    return (np.linalg.lstsq(regressors / scale, target, rcond=RANK)[0] / scale[:, None]).T
+
+
 def realise(data: Lagged, basis: np.ndarray, sample_time_s: float) -> Plant:
     """The plant whose states are basis (n, past (m+p)) times the past: C, D from y, then A, B, K from the states one step later, all by least squares."""
     n, m = len(basis), data.m
     x, x_next = data.R[:, data.lags(1, data.past)] @ basis.T, data.R[:, data.lags(0, data.past - 1)] @ basis.T
     u, y = data.R[:, data.now_u], data.R[:, data.now_y]
-    CD = np.linalg.lstsq(np.hstack([x, u]) if data.feedthrough else x, y, rcond=RANK)[0].T
+    CD = _least_squares(np.hstack([x, u]) if data.feedthrough else x, y)
     C, D = CD[:, :n], CD[:, n:] if data.feedthrough else np.zeros((data.p, m))
-    e = y - x @ C.T - u @ D.T
-    ABK = np.linalg.lstsq(np.hstack([x, u, e]), x_next, rcond=RANK)[0].T
-    A, B, K = ABK[:, :n], ABK[:, n : n + m], ABK[:, n + m :]
+    if data.exact:  # errors are rounding and tell nothing of K; the gain by which the window's own predictor takes up y(t-1) is used
+        AB = _least_squares(np.hstack([x, u]), x_next)
+        A, B, K = AB[:, :n], AB[:, n:], basis[:, m : m + data.p]
+    else:
+        ABK = _least_squares(np.hstack([x, u, y - x @ C.T - u @ D.T]), x_next)
+        A, B, K = ABK[:, :n], ABK[:, n : n + m], ABK[:, n + m :]
     u_mean, y_mean = data.means[0, :m], data.means[0, m:]
     drift = basis @ (data.means[:-1] - data.means[1:]).ravel()
     return make_plant(A, B, C, D, drift - B @ u_mean, y_mean - D @ u_mean, K, sample_time_s)
@@ -195,11 +209,16 @@ def _future_past_factor(u: Segments, y: Segments, block_rows: int, offset: bool)
     for w in complete_runs(u, y):
         N = len(w) - 2 * s + 1
         if N > 0:
-            hankel = [np.hstack([part[start + i : start + i + N] for i in range(s)]) for part, start in ((w[:, :m], s), (w[:, :m], 0), (w[:, m:], 0), (w[:, m:], s))]
+            hankel = [
+                np.hstack([part[start + i : start + i + N] for i in range(s)])
+                for part, start in ((w[:, :m], s), (w[:, :m], 0), (w[:, m:], 0), (w[:, m:], s))
+            ]
             blocks.append(np.hstack([np.ones((N, int(offset))), *hankel]))
     rows, columns = sum(len(b) for b in blocks), 2 * s * (m + y[0].shape[1]) + offset
     if rows < columns:
-        raise ValueError(f"the record is too short for {s} block rows: expected at least {columns} complete windows of {2 * s} samples, found {rows}; record {columns - rows} samples more, or take fewer block rows")
+        raise ValueError(
+            f"the record is too short for {s} block rows: expected at least {columns} complete windows of {2 * s} samples, found {rows}; record {columns - rows} samples more, or take fewer block rows"
+        )
     return np.linalg.qr(np.vstack(blocks), mode="r")
 
 
@@ -216,14 +235,18 @@ def moesp_singular_values(u: Segments, y: Segments, block_rows: int, *, offset: 
     return _moesp_svd(u, y, block_rows, offset)[1]
 
 
-def moesp(u: Segments, y: Segments, block_rows: int, order: int, *, feedthrough: bool = True, offset: bool = False, sample_time_s: float = 1.0) -> tuple[Plant, list[np.ndarray]]:
+def moesp(
+    u: Segments, y: Segments, block_rows: int, order: int, *, feedthrough: bool = True, offset: bool = False, sample_time_s: float = 1.0
+) -> tuple[Plant, list[np.ndarray]]:
     """Past-output MOESP: A, C from the shift of the extended observability matrix, then B, D, x0 by least squares on the simulation error (SLICOT's slmoesm).
 
     Returns the plant, without Kalman gain, and the initial state of each segment.
     """
     p = y[0].shape[1]
     if not 1 <= order <= (block_rows - 1) * p:
-        raise ValueError(f"moesp: {block_rows} block rows of {p} outputs allow orders 1 to {(block_rows - 1) * p} but {order} was asked for; take more block rows")
+        raise ValueError(
+            f"moesp: {block_rows} block rows of {p} outputs allow orders 1 to {(block_rows - 1) * p} but {order} was asked for; take more block rows"
+        )
     gamma = _moesp_svd(u, y, block_rows, offset)[0][:, :order]
     A = np.linalg.lstsq(gamma[:-p], gamma[p:], rcond=None)[0]
     model = fit_inputs(A, gamma[:p], u, y, feedthrough=feedthrough, offset=offset)

@@ -136,7 +136,9 @@ def policy_iteration(plant: Plant, Q, R, gamma, K0, *, tolerance: float = 1e-9, 
         K, previous = np.linalg.solve(R + discount * B_1.T @ P @ B_1, discount * B_1.T @ P @ T), K
         if discount == gamma and np.linalg.norm(K - previous, 1) < tolerance:
             return Iterated(K, j, True)
-    raise ValueError(f"policy iteration did not settle in {max_iterations} policies (discount {discount:.3g} of {gamma:g}); is every slow mode moved by an input?")
+    raise ValueError(
+        f"policy iteration did not settle in {max_iterations} policies (discount {discount:.3g} of {gamma:g}); is every slow mode moved by an input?"
+    )
 
 
 def stabilises(plant: Plant, K_x: np.ndarray) -> bool:
@@ -145,8 +147,18 @@ def stabilises(plant: Plant, K_x: np.ndarray) -> bool:
 
 
 def observer_gain(plant: Plant, tau: float) -> np.ndarray:
-    """L = A C'(C C' + tau I)^-1 (8); an identified plant brings its own Kalman gain K instead."""
+    """L = A C'(C C' + tau I)^-1 (8)."""
     return plant.A @ plant.C.T @ np.linalg.inv(plant.C @ plant.C.T + tau * np.eye(plant.p))
+
+
+def robust_observer_gain(plant: Plant, tau: float) -> np.ndarray:
+    """L = A P C'(C P C' + tau I)^-1 with P of the dual Riccati equation for process noise B B': stable for every tau > 0, and the same in any coordinates.
+
+    The Kalman gain of a record trusts its model wherever it goes. What a model gets wrong on another day acts like its inputs (their gain, heat lost), so that it is
+    those directions that the observer follows; tau in °C^2 per percent^2 says how much noisier than that the sensors are.
+    """
+    P = riccati(plant.A.T, plant.C.T, plant.B @ plant.B.T, tau * np.eye(plant.p))
+    return plant.A @ P @ plant.C.T @ np.linalg.inv(plant.C @ P @ plant.C.T + tau * np.eye(plant.p))
 
 
 def observer_law(plant: Plant, gains: Gains, L: np.ndarray, *, integral: float = 0.0) -> Law:
@@ -197,7 +209,11 @@ def _steady(plant: Plant, r: np.ndarray, low: np.ndarray, high: np.ndarray, slac
     """Bounded least squares with the balance as heavily weighted rows: at a direct-current gain of 5e5 the eliminated form would lose its digits."""
     n, m, heavy, light = plant.n, plant.m, 1e4, 1e-6
     rows = np.vstack(
-        [np.hstack([plant.C, plant.D]), heavy * np.hstack([np.eye(n) - plant.A, -plant.B]), light * np.hstack([np.zeros((m, n)), np.eye(m)])]
+        [
+            np.hstack([plant.C, plant.D]),
+            heavy * np.hstack([np.eye(n) - plant.A, -plant.B]),
+            light * np.hstack([np.zeros((m, n)), np.eye(m)]),
+        ]
     )
     right = np.concatenate([r - plant.d, heavy * plant.b, np.zeros(m)])
     slack = min(slack, 0.49 * (high - low).min())
@@ -216,4 +232,6 @@ def aimed(law: Law, r: np.ndarray, u: np.ndarray, y: np.ndarray) -> Law:
 
 def _strictly_proper(plant: Plant) -> None:
     if np.any(plant.D):
-        raise ValueError("the design expects outputs that do not jump with the input (D = 0) but the model has feed-through; identify it with feedthrough: false")
+        raise ValueError(
+            "the design expects outputs that do not jump with the input (D = 0) but the model has feed-through; identify it with feedthrough: false"
+        )

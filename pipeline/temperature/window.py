@@ -35,12 +35,16 @@ def learn(u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, longest: int, off
     m, p = u[0].shape[1], y[0].shape[1]
     samples = len(w)
     if samples <= 2 * (m + p + offset):
-        raise ValueError(f"the window cannot be learned: expected more than {2 * (m + p + offset)} complete windows of {longest} samples, found {samples}; record longer")
+        raise ValueError(
+            f"the window cannot be learned: expected more than {2 * (m + p + offset)} complete windows of {longest} samples, found {samples}; record longer"
+        )
     lags = [np.r_[lag * m : (lag + 1) * m, longest * m + lag * p : longest * m + (lag + 1) * p] for lag in range(longest)]
     order = np.concatenate(lags)
     columns = np.hstack([np.ones((samples, int(offset))), w[:, order], y_now])
     triangle = np.linalg.qr(columns, mode="r")
-    table = np.array([_criterion(triangle, offset, N, m, p, samples) for N in range(1, longest + 1) if 2 * (offset + N * (m + p)) < samples])
+    table = np.array(
+        [_criterion(triangle, offset, N, m, p, samples) for N in range(1, longest + 1) if 2 * (offset + N * (m + p)) < samples]
+    )
     N = int(table[table[:, 2].argmin(), 0])
     k = offset + N * (m + p)
     solution = np.linalg.lstsq(triangle[:k, :k], triangle[:k, -p:], rcond=1e-12)[0]
@@ -65,7 +69,9 @@ def predictor(window: Window, sample_time_s: float = 1.0) -> Plant:
     """The window as a plant in innovation form: x = w, A = shift + B_y Theta, B = B_u, C = Theta, K = B_y."""
     p = len(window.Theta)
     A, B_u, B_y = window_shift(window.Theta.shape[1] // window.N - p, p, window.N)
-    return make_plant(A + B_y @ window.Theta, B_u, window.Theta, b=B_y @ window.theta_0, d=window.theta_0, K=B_y, sample_time_s=sample_time_s)
+    return make_plant(
+        A + B_y @ window.Theta, B_u, window.Theta, b=B_y @ window.theta_0, d=window.theta_0, K=B_y, sample_time_s=sample_time_s
+    )
 
 
 def law(window: Window, Q: np.ndarray, R: np.ndarray, gamma: float, *, integral: float = 0.0) -> Law:
@@ -98,7 +104,9 @@ def predicted_tuples(window: Window, u: Sequence[np.ndarray], y: Sequence[np.nda
     features = np.zeros((order + offset, w.shape[1] + 1))
     features[:order, :-1], features[:order, -1], features[order:, -1] = T, -T @ centre, 1.0
     base = y_now.mean(axis=0) * offset
-    return Tuples(np.hstack([(w - centre) @ T.T, one]), u_now, y_now - base, np.hstack([(w_next - centre) @ T.T, one]), features, window.N, base)
+    return Tuples(
+        np.hstack([(w - centre) @ T.T, one]), u_now, y_now - base, np.hstack([(w_next - centre) @ T.T, one]), features, window.N, base
+    )
 
 
 def stored(window: Window) -> dict[str, tuple[np.ndarray, str, str]]:

@@ -1,0 +1,129 @@
+"""Messages per second and peak memory of reading MCAP recordings with numeric messages, CRCs checked, on one core.
+
+`./run python -m benchmarks.recordings` prints the figures beside the bars and writes benchmarks/results/recordings.json.
+"""
+
+import json
+import resource
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+LENGTHS = (100_000, 1_000_000)
+BARS = {"json": 150_000, "cdr": 80_000, "cdr_header": 80_000}
+NAMES = [f"heater_{i}" for i in range(1, 4)] + [f"temperature_{i}" for i in range(1, 6)]
+RESULTS = Path(__file__).parent / "results" / "recordings.json"
+HEADER = "std_msgs/Header header\n"
+HEADER_TYPES = f"""{"=" * 80}
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+{"=" * 80}
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+
+
+def rows(count: int) -> Iterator[list[float]]:
+    """Eight signals with all their digits, the same at every run."""
+    rng = np.random.default_rng(0)
+    for _ in range(count // 10_000):
+        yield from np.cumsum(rng.normal(size=(10_000, len(NAMES))), axis=0).tolist()
+
+
+def write(path: Path, kind: str, count: int) -> None:
+    """A recording of `count` messages at 100 Hz in chunks of 1 MiB, compressed with zstd."""
+    numbers = "".join(f"float64 {name}\n" for name in NAMES)
+    schema = {"json": b"", "cdr": numbers.encode(), "cdr_header": (HEADER + numbers + HEADER_TYPES).encode()}[kind]
+    fixed, headed = struct.Struct(f"<4x{len(NAMES)}d"), struct.Struct(f"<4xiII12s4x{len(NAMES)}d")
+
+    def message(k: int, row: list[float]) -> bytes:
+        if kind == "json":
+            return json.dumps(dict(zip(NAMES, row, strict=True))).encode()
+        if kind == "cdr":
+            return b"\x00\x01\x00\x00" + fixed.pack(*row)[4:]
+        return b"\x00\x01\x00\x00" + headed.pack(k // 100, k % 100 * 10_000_000, 12, b"base_barrel\x00", *row)[4:]
+
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2" if kind != "json" else "", "benchmark")
+        number = writer.register_schema("machine/msg/State", "ros2msg", schema) if schema else 0
+        channel = writer.register_channel("/machine", "json" if kind == "json" else "cdr", number)
+        for k, row in enumerate(rows(count)):
+            writer.add_message(channel, k * 10_000_000, message(k, row), k * 10_000_000, k)
+        writer.finish()
+
+
+def ours(path: Path) -> int:
+    """Reads three of the eight signals; returns how many samples came out."""
+    from pipeline.recordings import Source, read
+
+    raw = read(path, [Source(name, name, "1") for name in (NAMES[0], NAMES[3], NAMES[7])])
+    return len(raw.signals[NAMES[7]][1])
+
+
+def package(path: Path) -> int:
+    """The mcap package's own reader, messages not even decoded: the yardstick."""
+    with path.open("rb") as stream:
+        return sum(1 for _ in make_reader(stream, validate_crcs=True).iter_messages(log_time_order=False))
+
+
+def measure(reader: Callable[[Path], int], path: Path) -> dict[str, float]:
+    """CPU time and peak memory in this process; the imports are paid before, by reading a few rows."""
+    with tempfile.TemporaryDirectory() as folder:
+        warm = Path(folder) / "warm.mcap"
+        write(warm, "json" if "json" in path.name else "cdr", 10_000)
+        reader(warm)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    start = time.process_time()
+    count = reader(path)
+    seconds = time.process_time() - start
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return {"messages": count, "messages_per_s": count / seconds, "peak_MB": peak / 1024, "above_warm_MB": (peak - before) / 1024}
+
+
+def apart(reader: str, path: Path) -> dict[str, float]:
+    """`measure` in a process of its own, so that its peak is its own."""
+    call = f"b.measure(b.{reader}, Path({str(path)!r}))"
+    code = f"import json; from pathlib import Path; from benchmarks import recordings as b; print(json.dumps({call}))"
+    return json.loads(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout)
+
+
+def main() -> None:
+    results: dict[str, dict] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for kind in ("json", "cdr", "cdr_header"):
+            for count in LENGTHS:
+                path = Path(folder) / f"{kind}_{count}.mcap"
+                write(path, kind, count)
+                found = apart("ours", path)
+                # the samples that are kept: time and three signals of eight bytes
+                found["kept_MB"] = count * 4 * 8 / 2**20
+                results[f"{kind}_{count}"] = found
+                bar = f"(bar {BARS[kind]:,})"
+                print(
+                    f"{kind:>11} {count:>9,} messages: {found['messages_per_s']:>9,.0f} per second {bar:>14}, peak"
+                    f" {found['peak_MB']:.0f} MB,"
+                    f" {found['above_warm_MB']:.1f} MB above warm, of which kept {found['kept_MB']:.1f} MB"
+                )
+                if count == LENGTHS[0]:
+                    results[f"{kind}_mcap_package_undecoded"] = apart("package", path)
+                    print(
+                        f"{'':>11} mcap package, undecoded: {results[f'{kind}_mcap_package_undecoded']['messages_per_s']:>9,.0f} per second"
+                    )
+                path.unlink()
+    RESULTS.parent.mkdir(parents=True, exist_ok=True)
+    RESULTS.write_text(json.dumps(results, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

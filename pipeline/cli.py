@@ -1,0 +1,48 @@
+"""`./run beadline COMMAND`: what is not a stage."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from pipeline import artifacts, params
+
+
+def accept(_: argparse.Namespace) -> None:
+    """Mark the figures of this run as good: later reports show their differences against them."""
+    metrics = {path.stem: artifacts.read_json(path) for path in sorted(Path("reports/metrics").glob("*.json"))}
+    if not metrics:
+        raise ValueError("reports/metrics: expected the figures of a run, found none; run ./run dvc repro first")
+    files = sorted(
+        path
+        for path in Path("datasets").rglob("*")
+        if path.is_file() and path.parts[1] not in {"memo"} and not path.parts[1].startswith(".")
+    )
+    hashes = {path.as_posix(): artifacts.sha256(path) for path in files}
+    artifacts.write_json("reports/accepted.json", {"metrics": metrics, "params": params.read("params.yaml"), "hashes": hashes})
+    print(f"reports/accepted.json: accepted {len(metrics)} stages' figures and {len(hashes)} artifacts; commit it to keep it")
+
+
+def inspect(arguments: argparse.Namespace) -> None:
+    """What is in a recording: signals, rates, jitter, gaps, ranges, damage; and a mapping to paste into params.yaml."""
+    from pipeline.recordings import inspect as describe
+
+    print(describe(arguments.file))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="beadline", description="Extrusion-printer recordings into controllers that can be trusted.")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    commands.add_parser("accept", help=accept.__doc__).set_defaults(run=accept)
+    command = commands.add_parser("inspect", help=inspect.__doc__)
+    command.add_argument("file", type=Path)
+    command.set_defaults(run=inspect)
+    arguments = parser.parse_args()
+    try:
+        arguments.run(arguments)
+    except (ValueError, OSError) as error:
+        print(f"beadline: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,118 @@
+"""This run against the last accepted one: what changed, and which figures moved beyond their noise."""
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+from pipeline.report.digits import MINUS, THIN, decimals, number
+from pipeline.report.sources import Sources, digest
+from pipeline.report.verdict import Figure, Missing, Question, state
+
+
+class Move(NamedTuple):
+    """A figure in both runs. `moved`: its bands no longer overlap; `word`: better, worse, within noise, unchanged, or why it cannot be said."""
+
+    question: Question
+    before: Figure | None
+    now: Figure | Missing
+    moved: bool
+    word: str
+
+    def text(self) -> str:
+        """"+0.39 °C · worse"; a change of a percentage is in points."""
+        if not self.moved:
+            return self.word
+        change = self.now.value - self.before.value
+        if math.isinf(change) or math.isnan(change):
+            return self.word
+        places = max(decimals(f.low, f.high, value=f.value) for f in (self.before, self.now))
+        unit = {"%": "points", "×": "×"}.get(self.question.unit, self.question.unit)
+        sign = "+" if change > 0 else MINUS
+        return f"{sign}{number(abs(change), places)}{THIN + unit if unit else ''} · {self.word}"
+
+
+class Difference(NamedTuple):
+    """`inputs`, `parameters` (name, before, now), `code` and `artifacts` (path, new | changed | gone) that changed; `same`: how many artifacts did not."""
+
+    inputs: list[str]
+    parameters: list[tuple[str, str, str]]
+    code: str
+    artifacts: list[tuple[str, str]]
+    same: int
+    accepted: str
+
+    @property
+    def empty(self) -> bool:
+        return not (self.inputs or self.parameters or self.artifacts or self.code == "changed")
+
+
+def difference(sources: Sources) -> Difference | None:
+    """None where no run was accepted yet."""
+    before = sources.accepted
+    if before is None or isinstance(before, Missing):
+        return None
+    hashes = before.get("hashes") or {}
+    now = {path: source.sha256 for path, source in sources.read.items()}
+    known = {path: value for path, value in hashes.items() if path.startswith(("datasets/", "reports/metrics/")) and path != "reports/metrics/report.json"}
+    changes = [(path, "changed" if path in known else "new") for path in sorted(now) if known.get(path) != now[path]]
+    changes += [(path, "gone") for path in sorted(known) if path not in now and path.rsplit("/", 1)[0] in {p.rsplit("/", 1)[0] for p in now}]
+    inputs = [path for path, _ in changes if path.startswith(("datasets/ingest/record", "datasets/raw"))]
+    code = (before.get("metrics") or {}).get("report", {}).get("code")
+    return Difference(
+        inputs, list(_parameters(before.get("params") or {}, sources.declared.everything)),
+        "not recorded" if code is None else "unchanged" if code == sources.code else "changed",
+        [change for change in changes if change[0] not in inputs], sum(known.get(path) == now[path] for path in now), digest(before)[:8],
+    )  # fmt: skip
+
+
+def _parameters(before: Mapping, now: Mapping) -> Iterator[tuple[str, str, str]]:
+    old, new = dict(_flat("", before)), dict(_flat("", now))
+    for name in sorted(old.keys() | new.keys()):
+        if old.get(name) != new.get(name):
+            yield name, _shown(old, name), _shown(new, name)
+
+
+def _shown(values: Mapping[str, Any], name: str) -> str:
+    return "none" if name not in values else "null" if values[name] is None else str(values[name])
+
+
+def _flat(prefix: str, data: Any) -> Iterator[tuple[str, Any]]:
+    items = data.items() if isinstance(data, Mapping) and data else enumerate(data) if isinstance(data, list) and data else None
+    if items is None:
+        yield prefix, data
+        return
+    for key, value in items:
+        place = f"{prefix}[{key}]" if isinstance(data, list) else f"{prefix}.{key}" if prefix else str(key)
+        yield from _flat(place, value)
+
+
+def accepted_figure(accepted: Mapping, controller: str, key: str) -> Figure | None:
+    """A figure of the accepted run, as its report showed it."""
+    metrics = accepted.get("metrics") or {}
+    shown = (((metrics.get("report") or {}).get("figures") or {}).get(controller) or {}).get(key)
+    if not shown:
+        shown = (((metrics.get("evaluate_temperature") or {}).get("controllers") or {}).get(controller) or {}).get(key)
+    if not isinstance(shown, Mapping) or "median" not in shown:
+        return None
+    return Figure(*(math.inf if shown.get(end) is None else float(shown[end]) for end in ("median", "low", "high")))
+
+
+def moves(sources: Sources, asked: list[Question], controller: str, answers: Mapping[str, Figure | Missing]) -> list[Move]:
+    """Every figure of a controller against the accepted run's."""
+    return [_move(question, accepted_figure(sources.accepted, controller, question.key), answers[question.key]) for question in asked]
+
+
+def _move(question: Question, before: Figure | None, now: Figure | Missing) -> Move:
+    if isinstance(now, Missing):
+        return Move(question, before, now, False, now.state)
+    if before is None:
+        return Move(question, None, now, False, "not in the accepted run")
+    if before[:3] == now[:3]:
+        return Move(question, before, now, False, "unchanged")
+    if now.low <= before.high and before.low <= now.high:
+        return Move(question, before, now, False, "within noise")
+    return Move(question, before, now, True, "better" if (now.value < before.value) != question.at_least else "worse")
+
+
+def worse_and_failing(move: Move) -> bool:
+    return move.moved and move.word == "worse" and state(move.question, move.now) != "passed"

@@ -1,0 +1,70 @@
+"""Numbers as a reader meets them: as many decimals as their band supports, a true minus, thin spaces before units, "never" for what never comes."""
+
+import math
+
+MINUS, THIN, DASH = "\u2212", "\u202f", "\u2013"
+
+
+def decimals(low: float, high: float, *, value: float = 0.0) -> int:
+    """Decimals that a band supports: steps of at most a fifth of its width, and at most three significant digits of the value, but at least one of them."""
+    size = abs(value) if math.isfinite(value) else 0.0
+    enough, most = (_places(1 / size), _places(100 / size)) if size else (0, 9)
+    width = high - low
+    if math.isfinite(width) and width > 0:
+        return min(max(_places(5 / width), enough), max(most, 0))
+    return 0 if float(size).is_integer() else most
+
+
+def _places(step: float) -> int:
+    return min(max(math.ceil(math.log10(step) - 1e-9), 0), 9)
+
+
+def number(value: float, places: int) -> str:
+    """1234.5 -> "1,234.5"; -0.04 at one place -> "0.0", not a minus nothing."""
+    text = f"{abs(value):,.{places}f}"
+    return MINUS + text if value < 0 and float(text.replace(",", "")) != 0 else text
+
+
+def quantity(value: float, unit: str, places: int, *, beyond: str = "never") -> str:
+    """The number with its unit after a thin space; `beyond` in place of infinity."""
+    if math.isinf(value):
+        return beyond
+    return number(value, places) + (THIN + unit if unit else "")
+
+
+def band(low: float, high: float, places: int, *, beyond: str = "never") -> str:
+    """ "0.61-0.84" with an en dash; "to" where an end is negative or in words."""
+    if low == high:
+        return ""
+    ends = [beyond if math.isinf(end) else number(end, places) for end in (low, high)]
+    worded = low < 0 or math.isinf(low) or math.isinf(high)
+    return f" to {ends[1]}".join([ends[0], ""]) if worded else DASH.join(ends)
+
+
+def short(value: float, digits: int = 3) -> str:
+    """A number outside a band, to `digits` significant digits: 0.00123, 45.6, 183,362, 3.1 x 10^-8 in superscript."""
+    if value == 0 or not math.isfinite(value):
+        return "0" if value == 0 else "none"
+    exponent = math.floor(math.log10(abs(value)))
+    if -4 <= exponent < 7:
+        return number(value, min(max(digits - 1 - exponent, 0), 9))
+    return f"{number(value / 10.0**exponent, digits - 1)} × 10{_superscript(exponent)}"
+
+
+def percent(value: float, digits: int = 3) -> str:
+    return short(value, digits) + THIN + "%"
+
+
+def _superscript(exponent: int) -> str:
+    return str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+
+
+def count(value: int, one: str, many: str = "") -> str:
+    """1 -> "one run", 24 -> "24 runs"; small numbers are words."""
+    words = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
+    return f"{words[value] if 0 <= value < len(words) else f'{value:,}'} {one if value == 1 else many or one + 's'}"
+
+
+def shortened(text: str, longest: int = 60) -> str:
+    """Long names lose their middle."""
+    return text if len(text) <= longest else text[: longest // 2 - 1] + "…" + text[-(longest // 2) :]

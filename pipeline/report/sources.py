@@ -1,0 +1,112 @@
+"""What the pages are made of: every artifact that is there, read and hashed; in the place of one that is not, the reason."""
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pipeline import artifacts, schemas
+from pipeline.params import Panel, Plant, Tracking
+from pipeline.report.verdict import Missing, ReportRules
+
+Table = dict[str, np.ndarray]
+
+
+class Declared(NamedTuple):
+    """What params.yaml says: the sections that figures are labelled with, and all of it as text for the difference."""
+
+    rules: ReportRules
+    machine: Plant
+    panel: Panel
+    tracking: Tracking
+    everything: dict[str, Any]
+
+
+class Source(NamedTuple):
+    """One file that the pages show: the stage that wrote it, name and version of its schema, and the digest of its bytes."""
+
+    path: str
+    stage: str
+    schema: str
+    sha256: str
+
+
+class Sources(NamedTuple):
+    """`metrics` by stage and `tables` by name, each with a Missing where it could not be read; `read`: what was; `accepted`: the last accepted run, or None."""
+
+    declared: Declared
+    metrics: Mapping[str, dict | Missing]
+    tables: Mapping[str, Table | Missing]
+    read: Mapping[str, Source]
+    accepted: dict | Missing | None
+    code: str
+
+    def source(self, *paths: str) -> list[Source]:
+        return [self.read[path] for path in paths if path in self.read]
+
+
+def collect(declared: Declared, metrics: Mapping[str, str], folders: Mapping[str, str], accepted: str, code: tuple[str, ...]) -> Sources:
+    """Reads the metrics files and the folders of stages, {stage: path} each. What is missing or broken is no error here: its place on the page says so."""
+    read: dict[str, Source] = {}
+    figures = {stage: _read(read, path, stage, "metrics", artifacts.read_json) for stage, path in metrics.items()}
+    tables: dict[str, Table | Missing] = {}
+    for name, stage, file, kind, reader in _tables(declared.machine):
+        if stage in folders:
+            tables[name] = _read(read, f"{folders[stage]}/{file}", stage, kind, reader)
+    before = _read({}, accepted, "accept", "accepted", artifacts.read_json) if artifacts.exists(accepted) else None
+    return Sources(declared, figures, tables, read, before or None, digest({folder: artifacts.sha256(folder) for folder in code}))
+
+
+def digest(data: Any) -> str:
+    """SHA-256 of the canonical JSON of plain data."""
+    return hashlib.sha256(json.dumps(data, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], Any]]]:
+    """(name, stage, file, schema, reader) of every table that the pages show."""
+
+    def table(schema: schemas.Schema) -> tuple[str, Callable[[str], Table]]:
+        return f"{schema.name} {schema.version}", lambda path: artifacts.read_table(path, schema)
+
+    def arrays(name: str) -> tuple[str, Callable[[str], Table]]:
+        return f"{name} 1", lambda path: artifacts.read_arrays(path, name, 1)
+
+    return [
+        ("record", "ingest", "record.parquet", *table(schemas.record(machine.inputs, machine.outputs))),
+        ("quality", "ingest", "quality.parquet", *table(schemas.QUALITY)),
+        ("plant", "identify_plant", "plant.parquet", *arrays("plant")),
+        ("window", "learn_kernel", "window.parquet", *arrays("window")),
+        ("kernel", "learn_kernel", "kernel.parquet", *arrays("kernel")),
+        ("tuning", "tune_weights", "history.parquet", *table(schemas.TUNING)),
+        ("weights", "tune_weights", "weights.json", "weights", artifacts.read_json),
+        ("summary", "evaluate_temperature", "summary.json", "summary", artifacts.read_json),
+        ("scorecard", "evaluate_temperature", "scorecard.parquet", *table(schemas.SCORECARD)),
+        ("trajectories", "evaluate_temperature", "trajectories.parquet", *table(schemas.trajectories(machine.inputs, machine.outputs))),
+        ("study", "evaluate_temperature", "study.parquet", *table(schemas.STUDY)),
+    ]
+
+
+def _read(read: dict[str, Source], path: str, stage: str, schema: str, reader: Callable[[str], Any]) -> Any:
+    if not artifacts.exists(path):
+        return Missing("not measured", f"{Path(path).name} of {stage} is not there", f"Run ./run dvc repro {stage}")
+    try:
+        found = reader(path)
+    except ValueError as error:
+        return Missing("failed", str(error))
+    read[path] = Source(path, stage, schema, artifacts.sha256(path))
+    return found
+
+
+def lookup(data: Any, dotted: str, *, what: str = "") -> Any:
+    """data["a"]["b"] of "a.b", or the Missing that stands for it; null is missing too."""
+    found = data
+    for key in dotted.split("."):
+        if isinstance(found, Missing):
+            return found
+        found = found.get(key) if isinstance(found, Mapping) else None
+        if found is None:
+            return Missing("not measured", f"{what or dotted} is not among what the stage measured")
+    return found

@@ -1,0 +1,2 @@
+def render(sources, judged):
+    return "<p></p>"

@@ -1,0 +1,117 @@
+"""The plant: what it simulates, what can be seen and moved in it, where it rests, and what it refuses."""
+
+import re
+import tomllib
+
+import numpy as np
+import pytest
+
+from pipeline.temperature import plant as plants
+from pipeline.temperature.plant import (
+    baam,
+    controllability,
+    hold_output,
+    hold_state,
+    markov_parameters,
+    observability,
+    plant,
+    simulate,
+    spread,
+)
+
+# a plant with everything in it: offsets, feed-through, two inputs for one output
+SMALL = plant([[0.5, 0.1], [0.0, 0.8]], [[1.0, 0.0], [0.5, 2.0]], [[1.0, 3.0]], D=[[0.25, 0.0]], b=[1.0, -1.0], d=[10.0])
+
+
+def test_the_study_s_machine_is_the_one_of_its_tables(shared):
+    table = tomllib.loads(shared("spec/baam.toml").read_text())["plant"]
+    for name in "ABC":
+        np.testing.assert_array_equal(getattr(baam(), name), table[name])
+
+
+def test_the_study_s_machine_nearly_integrates():
+    slowest = np.abs(np.linalg.eigvals(baam().A)).max()
+    assert slowest == pytest.approx(1.00000285, abs=1e-8)  # printed digits of the temperature notes' "open-loop pole at 1 + its band"
+
+
+def test_two_steps_by_hand():
+    x, y = simulate(SMALL, np.array([[2.0, 0.0], [0.0, 1.0]]), np.array([4.0, 2.0]))
+    # x1 = (2 + 0.2 + 2 + 1, 1.6 + 1 - 1), y0 = 4 + 6 + 0.5 + 10, y1 = 5.2 + 4.8 + 10
+    np.testing.assert_allclose(x[1], [5.2, 1.6], rtol=1e-15)  # rounding of three sums
+    np.testing.assert_allclose(x[2], [0.5 * 5.2 + 0.16 + 1, 0.8 * 1.6 + 2 - 1], rtol=1e-15)
+    np.testing.assert_allclose(y[:, 0], [20.5, 20.0], rtol=1e-15)
+
+
+def test_markov_parameters_are_the_response_to_a_unit_pulse():
+    machine, lags = baam(), 7
+    h = markov_parameters(machine, lags)
+    for channel in range(machine.m):
+        pulse = np.zeros((lags + 1, machine.m))
+        pulse[0, channel] = 1.0
+        np.testing.assert_allclose(h[:, :, channel], simulate(machine, pulse, np.zeros(machine.n))[1][1:], atol=1e-14)  # rounding of numbers near 1
+
+
+def test_the_study_s_machine_shows_every_state_and_obeys_in_every_state():
+    for test in (observability(baam()), controllability(baam())):
+        assert (test.passed, test.rank, test.reason) == (True, 6, "")
+        assert (np.diff(test.singular_values) <= 0).all()
+
+
+def test_a_state_that_never_shows_fails_with_a_reason():
+    hidden = observability(SMALL._replace(C=np.array([[0.0, 1.0]])))
+    assert (hidden.passed, hidden.rank) == (False, 1)
+    assert re.match(r"the plant is not observable: rank 1 of 2, smallest singular values \[.*\]; add a sensor, or lower", hidden.reason)
+    deaf = controllability(SMALL._replace(B=np.array([[1.0, 0.0], [0.0, 0.0]])))
+    assert (deaf.passed, deaf.rank) == (False, 1)
+    assert "not controllable: rank 1 of 2" in deaf.reason
+    assert controllability(SMALL._replace(B=np.zeros((2, 2)))).rank == 0
+
+
+def test_the_holding_input_holds_every_cell():
+    machine, x = baam(), np.full(6, 20.0)
+    u = hold_state(machine, x)
+    states, _ = simulate(machine, np.tile(u, (1000, 1)), x)
+    np.testing.assert_allclose(states, 20.0, atol=1e-9)  # 1,000 steps of rounding at 20 °C
+    assert np.linalg.norm(u) <= np.linalg.norm(hold_state(machine._replace(B=machine.B * [1, 1, 1, 1, 1, 1, 0]), x))
+
+
+@pytest.mark.parametrize("machine", [baam(), SMALL, baam()._replace(b=np.linspace(-1, 1, 6), d=np.linspace(5, -5, 5))])
+def test_the_holding_input_of_an_output_rests_there_and_is_the_smallest(machine):
+    y = np.linspace(40.0, 60.0, machine.p)
+    x, u = hold_output(machine, y)
+    np.testing.assert_allclose(machine.A @ x + machine.B @ u + machine.b, x, atol=1e-11)  # rounding at 60 °C
+    np.testing.assert_allclose(machine.C @ x + machine.D @ u + machine.d, y, atol=1e-8)  # rounding times the gain of 5e5 of the study's machine at rest
+    # smallest: the map from u to y at rest is surjective here, and its pseudo-inverse gives the least norm
+    rest = machine.C @ np.linalg.inv(np.eye(machine.n) - machine.A)
+    expected = np.linalg.pinv(rest @ machine.B + machine.D) @ (y - machine.d - rest @ machine.b)
+    np.testing.assert_allclose(u, expected, atol=1e-6)  # both lose the digits of that gain, far below a percent of duty
+
+
+def test_an_integrator_holds_its_output_too():
+    x, u = hold_output(plant([[1.0]], [[2.0]], [[1.0]]), np.array([150.0]))
+    np.testing.assert_allclose([x[0], u[0]], [150.0, 0.0], atol=1e-10)  # rounding at 150 °C
+
+
+def test_the_declared_spread_is_each_column_of_B_both_ways_and_one_more_loss():
+    family = spread(baam(), input_gain=0.15, loss=0.005)
+    assert len(family) == 1 + 2 * 7 + 1
+    np.testing.assert_allclose(family[5].B[:, 2], 0.85 * baam().B[:, 2])
+    np.testing.assert_allclose(family[6].B[:, 2], 1.15 * baam().B[:, 2])
+    np.testing.assert_array_equal(np.delete(family[6].B, 2, axis=1), np.delete(baam().B, 2, axis=1))
+    np.testing.assert_array_equal(family[-1].A, baam().A - 0.005 * np.eye(6))
+
+
+def test_stored_plants_come_back_as_they_were():
+    family = [SMALL._replace(K=np.array([[0.1], [0.2]]), sample_time_s=2.0), SMALL]
+    arrays = plants.stored(family)
+    assert all(unit and meaning for _, unit, meaning in arrays.values())
+    for before, after in zip(family, plants.restored({name: values for name, (values, _, _) in arrays.items()}), strict=True):
+        for one, other in zip(before, after, strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_a_matrix_of_the_wrong_shape_is_named():
+    with pytest.raises(ValueError, match=re.escape("plant: b should have shape (2,) but has (3,); A is (2, 2), B (2, 2), C (1, 2)")):
+        plant(SMALL.A, SMALL.B, SMALL.C, b=np.zeros(3))
+    with pytest.raises(ValueError, match="plant: C holds a number that is not finite; identify the plant again on a clean record"):
+        plant(SMALL.A, SMALL.B, [[np.nan, 1.0]])

@@ -1,0 +1,186 @@
+import numpy as np
+import pytest
+
+from pipeline.recordings import Flag, Source, Table, flag, read, resample
+
+LIMITS = {"u": (0.0, 100.0)}
+UNITS = {"u": "percent", "y": "degC", "z": "degC"}
+
+
+def rig(samples: int = 2000, seed: int = 0, step: float = 0.03) -> dict[str, np.ndarray]:
+    """Duty in levels held 100 s, two slow temperatures after it with noise, as a converter with steps of 0.03 °C shows them."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.choice([20.0, 30, 40], samples // 100), 100)
+    y, z = np.full(samples, 40.0), np.full(samples, 35.0)
+    for k in range(1, samples):
+        y[k] = y[k - 1] + 0.01 * (20 + 0.8 * u[k - 1] - y[k - 1])
+        z[k] = z[k - 1] + 0.01 * (18 + 0.6 * u[k - 1] - z[k - 1])
+    noisy = [np.round((x + rng.normal(0, 0.05, samples)) / step) * step for x in (y, z)]
+    return {"u": u, "y": noisy[0], "z": noisy[1]}
+
+
+def flagged(values: dict[str, np.ndarray], limits=LIMITS, units=UNITS, segment: np.ndarray | None = None) -> Table:
+    count = len(next(iter(values.values())))
+    segment = np.zeros(count, np.int32) if segment is None else segment
+    masked = {name: ~np.isfinite(found) for name, found in values.items()}
+    return flag(Table("rig.csv", segment, np.arange(float(count)), values, masked, [], {}), units=units, limits=limits)
+
+
+def of(table: Table, *kinds: str) -> list[Flag]:
+    return [one for one in table.flags if one.kind in kinds]
+
+
+def test_a_healthy_record_has_no_finding_but_its_quantisation_and_nothing_is_masked():
+    for seed in range(5):
+        table = flagged(rig(seed=seed))
+        assert {(one.signal, one.kind) for one in table.flags} == {("y", "quantised"), ("z", "quantised")}
+        assert not any(mask.any() for mask in table.masked.values())
+        assert all("steps of 0.03 " in one.message for one in table.flags)
+
+
+def test_values_are_never_altered():
+    values = rig()
+    values["y"][500] = 0.0
+    before = {name: found.copy() for name, found in values.items()}
+    table = flagged(values)
+    for name, found in before.items():
+        np.testing.assert_array_equal(table.values[name], found)
+
+
+@pytest.mark.parametrize("size", [1.5, -1.5, 5.0, -40.0])
+@pytest.mark.parametrize("length", [1, 2])
+def test_isolated_spikes_are_found_where_they_are_and_masked(size, length):
+    rng = np.random.default_rng(1)
+    for place in rng.integers(20, 1980, 10):
+        values = rig()
+        values["y"][place : place + length] += size
+        table = flagged(values)
+        (spike,) = of(table, "spike")
+        assert (spike.signal, spike.start_s, spike.end_s, spike.count) == ("y", place, place + length - 1, length)
+        assert np.flatnonzero(table.masked["y"]).tolist() == list(range(place, place + length))
+        assert not table.masked["z"].any()
+
+
+def test_steps_ramps_and_smooth_peaks_are_no_spikes():
+    time = np.arange(400.0)
+    for found in (
+        np.where(time < 200, 20.0, 60.0),
+        np.maximum(0, time - 200),
+        50 - 0.01 * (time - 200) ** 2,
+        10 * np.sin(time / 3),
+        np.abs(time - 200),
+        20 + 30 * (1 - np.exp(-np.maximum(0, time - 100) / 20)),
+    ):
+        assert of(flagged({"u": time % 50, "y": found}), "spike") == []
+
+
+def test_a_spike_at_the_edge_of_a_segment_is_left_alone_for_nothing_tells_which_side_is_right():
+    values = rig()
+    values["y"][1000:] += 10
+    segment = np.repeat([0, 1], 1000).astype(np.int32)
+    assert of(flagged(values, segment=segment), "spike") == []
+
+
+def test_a_frozen_sensor_is_masked_from_its_second_sample_on():
+    values = rig()
+    values["y"][700:1000] = values["y"][700]
+    table = flagged(values)
+    (frozen,) = of(table, "frozen")
+    assert (frozen.signal, frozen.start_s, frozen.end_s) == ("y", 701, 999)
+    assert table.masked["y"][701:1000].all()
+    assert table.masked["y"].sum() == 299
+    assert "while u" in frozen.message
+
+
+def test_a_coarse_slow_or_resting_signal_is_not_frozen():
+    values = rig(step=1.0)
+    assert of(flagged(values), "frozen") == []
+    values = {"u": np.full(500, 30.0), "y": np.r_[np.linspace(20, 40, 100), np.full(400, 40.0)], "z": np.full(500, 25.0)}
+    assert of(flagged(values), "frozen") == []
+
+
+def test_an_output_on_its_rail_is_saturated_and_not_masked():
+    values = rig()
+    top = float(np.percentile(values["y"], 80))
+    values["y"] = np.minimum(values["y"], top)
+    table = flagged(values)
+    (rail,) = of(table, "saturated")
+    assert rail.signal == "y"
+    assert rail.count <= (values["y"] == top).sum()
+    assert "its largest value" in rail.message
+    assert not table.masked["y"].any()
+
+
+def test_inputs_at_and_beyond_their_limits_are_counted():
+    values = rig()
+    values["u"] = np.where(values["u"] == 40, 100.0, values["u"])
+    values["u"][:5] = 120.0
+    table = flagged(values)
+    assert [(one.signal, one.count) for one in of(table, "saturated")] == [("u", (values["u"] == 100).sum())]
+    assert [(one.signal, one.count) for one in of(table, "outside")] == [("u", 5)]
+    assert "beyond its limits 0 to 100 in 5 samples (up to 120)" in of(table, "outside")[0].message
+
+
+def test_constant_signals_are_named():
+    values = rig() | {"u": np.full(2000, 30.0)}
+    (constant,) = of(flagged(values), "constant")
+    assert (constant.signal, constant.count) == ("u", 2000)
+    assert "u is 30 throughout" in constant.message
+
+
+def test_two_devices_that_write_in_turn_are_seen():
+    values = rig()
+    values["y"] = np.where(np.arange(2000) % 2, values["y"], values["z"] + 20)
+    assert [one.signal for one in of(flagged(values), "mixed")] == ["y"]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda v: v | {"y": v["y"] - 20 + 273.15, "z": v["z"] - 15 + 273.15}, "looks like kelvin; set offset: -273.15"),
+        (lambda v: v | {"y": v["y"] + 480}, "looks like kelvin"),
+        (lambda v: v | {"y": (v["y"] - 20) * 1.8 + 32, "z": (v["z"] - 15) * 1.8 + 32}, "looks like fahrenheit; set scale: 0.555556"),
+        (lambda v: v | {"u": v["u"] / 100}, "looks like a duty of 0 to 1; set scale: 100"),
+        (lambda v: v | {"u": np.round(v["u"] * 2.55 * 2)}, "a converter's 0 to 255; set scale: 0.392157"),
+        (lambda v: v | {"y": v["y"] - 400}, "which no temperature does"),
+    ],
+)
+def test_suspicious_units_are_said_and_nothing_is_changed(change, said):
+    values = change(rig())
+    table = flagged(values)
+    found = of(table, "unit")
+    assert found
+    assert all(said in one.message for one in found)
+    for name in values:
+        np.testing.assert_array_equal(table.values[name], values[name])
+        assert not table.masked[name].any()
+
+
+def test_plausible_units_are_not_suspected():
+    assert of(flagged(rig()), "unit") == []
+    hot = rig()
+    hot["y"], hot["z"] = hot["y"] + 190, hot["z"] + 200
+    assert of(flagged(hot), "unit") == []
+    flow = rig()
+    flow["u"] = np.round(flow["u"] * 5)
+    assert of(flagged(flow, limits={"u": (0.0, 200.0)}), "unit") == []
+
+
+def test_a_signal_without_any_value_gets_no_finding():
+    table = flagged(rig() | {"y": np.full(2000, np.nan)})
+    assert {one.signal for one in table.flags} == {"z"}
+
+
+def test_the_spike_of_the_two_heater_kit_and_nothing_else_is_masked(shared):
+    columns = {"heater_1": "Q1_pct", "heater_2": "Q2_pct", "temperature_1": "T1_C", "temperature_2": "T2_C"}
+    raw = read(shared("data/tclab_mlid_prbs/prbs.csv"), [Source(name, column, "") for name, column in columns.items()])
+    inputs, outputs = ["heater_1", "heater_2"], ["temperature_1", "temperature_2"]
+    table = resample(raw, sample_time_s=1.0, inputs=inputs, outputs=outputs)
+    table = flag(
+        table, units={**dict.fromkeys(inputs, "percent"), **dict.fromkeys(outputs, "degC")}, limits=dict.fromkeys(inputs, (0.0, 100.0))
+    )
+    found = {(one.signal, one.kind, one.start_s, one.count) for one in table.flags}
+    assert found == {("temperature_1", "spike", 1789, 1), ("temperature_1", "quantised", 0, 5099), ("temperature_2", "quantised", 0, 5100)}
+    assert np.flatnonzero(table.masked["temperature_1"]).tolist() == [1789]
+    assert table.values["temperature_1"][1789] == 40.718
+    assert not table.masked["temperature_2"].any()
