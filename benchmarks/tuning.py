@@ -1,9 +1,9 @@
 """Costs that 150 evaluations reach: our two searches beside random search, Optuna's TPE and CMA-ES, all on log-weights, over seeds.
 
-`./run --group peers python -m benchmarks.tuning [seeds]` prints the excess over the optimum and writes benchmarks/results/tuning.json; a peer
-that is not installed is left out, and said so. (37) is the paper's fitness; the others have their optimum elsewhere: the index at the
-paper's tuned weights, a rotated bowl of 20 weights with optima on bounds, a curved valley of 8, and a bowl of 12 beside a wall behind which
-more than half of the domain fails.
+`./run --group peers python -m benchmarks.tuning [seeds]` prints the excess over the optimum and writes benchmarks/results/tuning.json;
+a peer that is not installed is left out, and said so. (37) is the paper's fitness; the others have their optimum elsewhere: the index at
+the paper's tuned weights, a rotated bowl of 20 weights with its optimum on bounds, a curved valley of 8, and a bowl of 12 whose optimum
+lies beside a wall behind which more than half of the domain fails.
 """
 
 import importlib.util
@@ -38,12 +38,12 @@ class Problem(NamedTuple):
     optimum: float
 
 
-def unit(theta: np.ndarray, problem_lower: np.ndarray, problem_upper: np.ndarray) -> np.ndarray:
-    return np.log(theta / problem_lower) / np.log(problem_upper / problem_lower)
+def unit(theta: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    return np.log(theta / lower) / np.log(upper / lower)
 
 
 def tracking_index(weights: np.ndarray) -> Problem:
-    """The index (3) with fixed weights (12,), l = 100, from 20 °C, of the controller that the candidate's weights design; (37) where they are 1."""
+    """The index (3) with fixed weights (12,), l = 100, from 20 °C, of the controller that a candidate designs; (37) where they are 1."""
     machine, reference = baam(), np.array([150.0, 160.0, 170.0, 175.0, 180.0])
     scale_y, scale_u = np.sqrt(weights[:5]), np.sqrt(weights[5:])
     # the same loop in units of sqrt(q) y and sqrt(r) u, so that (37) is the index with these weights
@@ -58,7 +58,7 @@ def tracking_index(weights: np.ndarray) -> Problem:
 
 
 def bowl(d: int, seed: int, *, at_bounds: int = 0, wall: bool = False) -> Problem:
-    """A rotated quadratic in log-weights, condition 100; some coordinates of its optimum at their lower bounds; with a wall 5 % of the domain away."""
+    """A rotated quadratic in log-weights, condition 100; its optimum on `at_bounds` lower bounds; with a wall 5 % of the domain away."""
     rng = np.random.default_rng(seed)
     lower, upper, axes = np.full(d, 1e-3), np.full(d, 10.0), np.linalg.qr(rng.standard_normal((d, d)))[0]
     H, optimum, normal = axes @ np.diag(np.geomspace(1, 100, d)) @ axes.T, rng.uniform(0.1, 0.9, d), rng.standard_normal(d)
@@ -122,7 +122,7 @@ def optuna_tpe(problem: Problem, seed: int) -> float:
 
 
 def cma_es(problem: Problem, seed: int) -> float:
-    """CMA-ES from the best of the same kind of first design; a failure is resampled as infinite."""
+    """CMA-ES from the best of the same kind of first design; a failure counts as infinite."""
     import cma
 
     points = qmc.Sobol(len(problem.lower), rng=np.random.default_rng(seed)).random_base2(6)[:INITIAL]

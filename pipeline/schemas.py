@@ -210,3 +210,25 @@ TUNING = Schema(
         Column("failure", TEXT, NONE, "why the candidate failed; empty where it did not"),
     ),
 )
+
+ORDER = Schema(
+    "order",
+    1,
+    (
+        Column("order", INDEX, NONE, "states of the candidate", low=1),
+        Column("singular_value", FLOAT, NONE, "that this order keeps last", low=0),
+        Column("noise_edge", FLOAT, NONE, "what noise alone puts into the singular values", low=0),
+        Column("parameters", COUNT, NONE, "free numbers of the candidate", low=0),
+        Column("error", FLOAT, NONE, "error on left-out blocks, as a share of the outputs' variation; missing where only the rank decided", nullable=True),
+        Column("chosen", BOOL, NONE, "the candidate that was taken"),
+    ),
+)
+
+
+def holdout(outputs: Sequence[_Signal]) -> Schema:
+    """The part of the record that judged the model: measured, and simulated from its inputs alone."""
+    columns = [Column("segment", INDEX, NONE, "stretch of the record", low=0), Column("time_s", FLOAT, "s", "time since the hold-out began")]
+    for signal in outputs:
+        columns.append(Column(f"{signal.name}_measured", FLOAT, signal.unit, f"{signal.name} as recorded", nullable=True))
+        columns.append(Column(f"{signal.name}_simulated", FLOAT, signal.unit, f"{signal.name} by the model, from the inputs alone", nullable=True))
+    return Schema("holdout", 1, tuple(columns))

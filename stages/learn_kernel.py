@@ -14,6 +14,7 @@ class LearnKernel(params.Section):
     longest_window: int = Field(ge=1, le=200)
     largest_kernel_window: int = Field(ge=1, le=10)
     offset: bool
+    gain_spread: float = Field(ge=0, le=1)
     allowed_gap_percent: float = Field(gt=0, le=100)
 
 
@@ -30,8 +31,8 @@ def main() -> None:
             "reference": np.array([o.reference for o in machine.outputs]),
             "steps": panel.steps,
         }
-        long = window.learn(u, y, longest=p.longest_window, offset=p.offset)
-        enough = sufficiency(u, y, long, yardstick, allowed=p.allowed_gap_percent / 100, offset=p.offset, **scenario)
+        long = window.learn(u, y, longest=p.longest_window, offset=p.offset, gain_spread=p.gain_spread)
+        enough = sufficiency(u, y, long, yardstick, allowed=p.allowed_gap_percent / 100, offset=p.offset, gain_spread=p.gain_spread, **scenario)
         tried = kernel_candidates(u, y, long, yardstick, largest=p.largest_kernel_window, offset=p.offset, **scenario)
         best = min(tried, key=lambda candidate: candidate.gap)
         artifacts.write_arrays(out / "window.parquet", "window", 1, window.stored(long))

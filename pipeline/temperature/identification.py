@@ -252,3 +252,17 @@ def _check_length(samples: int, order: int | None, m: int, p: int) -> None:
         raise ValueError(
             f"the record is too short for order {order or 1}: expected at least {needed} complete samples, found {samples}; record {needed - samples} samples more"
         )
+
+
+def rows(found: Identified) -> dict[str, list]:
+    """The table by which the order was chosen, as columns: every candidate, or the singular values alone where they decided."""
+    tried = {row.order: row for row in found.order_table if row.fit == found.fit or row.order != found.order}
+    shown = [k for k in range(1, len(found.singular_values) + 1) if k <= 30 or k in tried]
+    return {
+        "order": np.array(shown, np.int32),
+        "singular_value": found.singular_values[np.array(shown) - 1],
+        "noise_edge": np.full(len(shown), found.noise_edge),
+        "parameters": [tried[k].parameters if k in tried else 0 for k in shown],
+        "error": np.array([tried[k].error if k in tried else np.nan for k in shown]),
+        "chosen": [k == found.order for k in shown],
+    }

@@ -184,7 +184,7 @@ class Sufficiency(NamedTuple):
 
 def sufficiency(
     u: Sequence[np.ndarray], y: Sequence[np.ndarray], learned: window_route.Window, yardstick: Yardstick, *, start: float, reference: np.ndarray, allowed: float, offset: bool,
-    steps: int,
+    gain_spread: float, steps: int,
 ) -> Sufficiency:  # fmt: skip
     """Whether the record is long enough for its noise, asked of the record alone: learn from each half of it, judge by the model of the whole."""
     model = window_route.predictor(learned)
@@ -196,11 +196,13 @@ def sufficiency(
             (us[part * len(us) // 2 : (part + 1) * len(us) // 2], ys[part * len(ys) // 2 : (part + 1) * len(ys) // 2])
             for us, ys in zip(u, y, strict=True)
         ]
-        half = window_route.learn([h[0] for h in halves], [h[1] for h in halves], longest=learned.N, offset=offset)
+        half = window_route.learn([h[0] for h in halves], [h[1] for h in halves], longest=learned.N, offset=offset, gain_spread=gain_spread)
         law = window_route.law(half, np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma)
         gaps.append(regret(cost(scenarios, simulate(scenarios, law, feed_forward(scenarios, law, None), limits=None), yardstick), best)[0])
     half_gap = float(np.mean(gaps))
-    return Sufficiency(half_gap, learned.samples, int(np.ceil(learned.samples * min(half_gap / 2 / allowed, 1e3))))
+    # never fewer than twice the numbers of one output's predictor: below that the half-record test itself means nothing
+    needed = max(np.ceil(learned.samples * min(half_gap / 2 / allowed, 1e3)), 2 * (learned.Theta.shape[1] + offset))
+    return Sufficiency(half_gap, learned.samples, int(needed))
 
 
 class Candidate(NamedTuple):

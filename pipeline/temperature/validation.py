@@ -162,7 +162,7 @@ def excitation(u: Segments, past: int) -> Excitation:
 
     def rank_and_condition(columns):
         values = np.linalg.eigvalsh(columns.T @ columns / len(columns))
-        return int((values > 1e-9 * values[-1]).sum()), float(values[-1] / max(values[0], np.finfo(float).tiny))
+        return int((values > 1e-9 * values[-1]).sum()), float(values[-1] / values[0]) if values[0] > 0 else np.inf
 
     rank, condition = rank_and_condition(stacked.reshape(len(stacked), -1))
     alone = [rank_and_condition(stacked[:, j]) for j in range(stacked.shape[1])]
@@ -250,3 +250,15 @@ def advice(tests: Residuals, excited: Excitation, fit_percent: np.ndarray, *, ou
             f"the inputs together excite {excited.rank} of {excited.full} directions: they move alike; move one at a time, or with different sequences"
         )
     return sentences
+
+
+def rows(measured: Segments, simulated: Segments, outputs: Sequence[str], sample_time_s: float) -> dict[str, np.ndarray]:
+    """Measured and simulated outputs of the held-out segments as columns."""
+    columns = {
+        "segment": np.repeat(np.arange(len(measured), dtype=np.int32), [len(y) for y in measured]),
+        "time_s": np.concatenate([sample_time_s * np.arange(len(y)) for y in measured]),
+    }
+    for channel, name in enumerate(outputs):
+        columns[f"{name}_measured"] = np.concatenate([y[:, channel] for y in measured])
+        columns[f"{name}_simulated"] = np.concatenate([y[:, channel] for y in simulated])
+    return columns

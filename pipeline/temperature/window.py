@@ -26,10 +26,12 @@ class Window(NamedTuple):
     table: np.ndarray
 
 
-def learn(u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, longest: int, offset: bool = False) -> Window:
+def learn(u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, longest: int, offset: bool = False, gain_spread: float = 0.0) -> Window:
     """Least-squares VARX on segments u (T, m), y (T, p), its window N <= `longest` chosen by Akaike's criterion on the samples that the longest one leaves.
 
-    One QR factorisation serves every N, because the columns are ordered lag by lag. Raises ValueError where the record is shorter than the shortest window needs.
+    One QR factorisation serves every N, because the columns are ordered lag by lag. With `gain_spread` sigma the predictor is the best on average over plants whose
+    columns of B differ by a random 1 + sigma: of such a plant, (u / (1 + sigma), y) is a record too, so that the expected moments are those of the record plus
+    sigma^2 times each input's own. It then leans on measured y where a long memory of u would carry a wrong gain along. Raises ValueError where the record is shorter than the shortest window needs.
     """
     w, _, y_now = windows(u, y, longest)
     m, p = u[0].shape[1], y[0].shape[1]
@@ -47,13 +49,25 @@ def learn(u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, longest: int, off
     )
     N = int(table[table[:, 2].argmin(), 0])
     k = offset + N * (m + p)
-    solution = np.linalg.lstsq(triangle[:k, :k], triangle[:k, -p:], rcond=1e-12)[0]
-    rest = triangle[k:, -p:]
+    robust = np.linalg.qr(np.vstack([triangle[:, np.r_[:k, -p:0]], gain_spread * _own_moments(triangle[:, :k], offset, m, p)]), mode="r") if gain_spread else triangle
+    solution = np.linalg.lstsq(robust[:k, :k], robust[:k, -p:], rcond=1e-12)[0]
+    rest = triangle[:, -p:] - triangle[:, :k] @ solution
     Theta = np.empty((p, N * (m + p)))
     by_lag = solution[offset:].reshape(N, m + p, p)
     Theta[:, : N * m] = by_lag[:, :m].transpose(2, 0, 1).reshape(p, N * m)
     Theta[:, N * m :] = by_lag[:, m:].transpose(2, 0, 1).reshape(p, N * p)
     return Window(Theta, solution[0] if offset else np.zeros(p), rest.T @ rest / (samples - k), N, samples, table)
+
+
+def _own_moments(triangle: np.ndarray, offset: bool, m: int, p: int) -> np.ndarray:
+    """Rows whose squares sum to each input's own second moment over its lags, inputs apart from one another; the outputs' columns stay 0."""
+    k, rows = triangle.shape[1], []
+    for channel in range(m):
+        lags = np.arange(offset + channel, k, m + p)
+        own = np.zeros((len(lags), k + p))
+        own[:, lags] = np.linalg.qr(triangle[:, lags], mode="r")
+        rows.append(own)
+    return np.vstack(rows)
 
 
 def _criterion(triangle: np.ndarray, offset: bool, N: int, m: int, p: int, samples: int) -> tuple[int, int, float]:

@@ -1,5 +1,4 @@
 import re
-import tomllib
 
 import numpy as np
 import pytest
@@ -7,6 +6,8 @@ import pytest
 from pipeline.temperature.identification import dead_time, identify, moesp, moesp_singular_values, varx
 from pipeline.temperature.order import with_delays
 from pipeline.temperature.plant import baam, markov_parameters, plant, simulate
+from pipeline.temperature.probing import study_probe, study_signal
+from pipeline.temperature.published import K_DATA
 from pipeline.temperature.refinement import estimate_state, linear_recurrence, refine, simulation_form
 from pipeline.temperature.subspace import lagged
 from pipeline.temperature.validation import simulated
@@ -32,29 +33,12 @@ def two_zones(T=3000, noise=0.05, seed=0, offset=20.0):
     return true, u, y + noise * rng.standard_normal(y.shape)
 
 
-@pytest.fixture(scope="module")
-def probed(shared_constants):
-    """Records of the study's plant under its own probing, frequencies drawn anew at every step as the authors' script does."""
-    K_data, amplitudes = shared_constants
-
-    def record(seed, noise, T=15000):
-        rng, true = np.random.default_rng(seed), baam()
-        x, u, y = np.full(6, 50.0), np.empty((T, 7)), np.empty((T, 5))
-        frequencies = np.concatenate([np.full((T, 7, 1), 1.65), rng.uniform(0, 1.65, (T, 7, 9))], axis=2)
-        omega = rng.normal(0, 1.5**0.25, (T, 7)) + np.sin(frequencies * np.arange(T)[:, None, None]) @ amplitudes
-        for t in range(T):
-            u[t] = omega[t] - K_data @ x
-            y[t] = true.C @ x
-            x = true.A @ x + true.B @ u[t]
-        return u, y + noise * rng.standard_normal(y.shape)
-
-    return record
-
-
-@pytest.fixture(scope="module")
-def shared_constants(shared):
-    probing = tomllib.loads(shared("spec/baam.toml").read_text())["probing"]
-    return np.array(probing["K_data"]), np.array(probing["amplitudes"])
+def probed(seed, noise, T=15000):
+    """A record of the study's plant under its own probing, frequencies drawn anew at every step as the authors' script does."""
+    rng = np.random.default_rng(seed)
+    signal = study_signal(rng, T, 7, amplitudes=np.arange(100.0, 0.0, -10.0), bandwidth=1.65, variance=1.5)
+    found = study_probe(baam(), signal, K_DATA, x0=np.full(6, 50.0), noise=noise * rng.standard_normal((T, 5)))
+    return found.u, found.y
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +82,7 @@ def test_moesp_simulates_the_benchmark_sets_as_well_as_slicot(shared, name, inpu
 
 
 def test_a_noise_free_record_gives_the_plant_back_to_rounding(shared):
-    import pyarrow.parquet as parquet
+    from pyarrow import parquet
 
     record = parquet.read_table(shared("data/paper_reference/probing_log_seed1.parquet")).to_pandas().to_numpy()[1:]
     found = identify([record[:, :7]], [record[:, 7:]], sample_time_s=1.0)
@@ -107,7 +91,7 @@ def test_a_noise_free_record_gives_the_plant_back_to_rounding(shared):
 
 
 @pytest.mark.parametrize(("noise", "bar"), [(0.1, 2e-3), (0.5, 1.5e-2)])
-def test_the_studys_plant_is_found_with_its_order_under_noise(probed, noise, bar):
+def test_the_studys_plant_is_found_with_its_order_under_noise(noise, bar):
     u, y = probed(100, noise)
     found = identify([u], [y], sample_time_s=1.0)
     assert found.order == 6
@@ -116,13 +100,13 @@ def test_the_studys_plant_is_found_with_its_order_under_noise(probed, noise, bar
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("noise", "bar"), [(0.1, 2e-3), (0.5, 1.5e-2)])
-def test_order_six_in_twenty_of_twenty_records(probed, noise, bar):
+def test_order_six_in_twenty_of_twenty_records(noise, bar):
     found = [identify(*([a] for a in probed(seed, noise)), sample_time_s=1.0) for seed in range(20)]
     assert [f.order for f in found] == [6] * 20
     assert max(markov_error(f.plant, baam()) for f in found) <= bar
 
 
-def test_refinement_on_one_step_errors_brings_a_noisy_plant_nearer(probed):
+def test_refinement_on_one_step_errors_brings_a_noisy_plant_nearer():
     u, y = probed(7, 0.5, T=3000)
     rough = identify([u], [y], sample_time_s=1.0, order=6, past=24).plant
     refined = refine(rough, [u], [y], offset=False)
@@ -161,7 +145,9 @@ def test_the_offset_of_the_room_is_found_and_moves_with_it():
     _, u, y = two_zones(noise=0.01)
     cold, warm = identify([u], [y], sample_time_s=1.0), identify([u], [y + 300.0], sample_time_s=1.0)
     assert cold.order == warm.order
-    np.testing.assert_allclose(markov_parameters(cold.plant, 50), markov_parameters(warm.plant, 50), atol=1e-7)  # rounding of 300 °C squared
+    np.testing.assert_allclose(
+        markov_parameters(cold.plant, 50), markov_parameters(warm.plant, 50), atol=1e-7
+    )  # rounding of 300 °C squared
     np.testing.assert_allclose(simulated(warm.plant, u, y + 300.0) - simulated(cold.plant, u, y), 300.0, atol=1e-4)
 
 

