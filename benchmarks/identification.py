@@ -81,15 +81,15 @@ def nfoursid_plant(u: np.ndarray, y: np.ndarray, order: int) -> Plant:
 def sippy_plant(u: np.ndarray, y: np.ndarray, order: int) -> Plant:
     from sippy_unipi import system_identification
 
-    model = system_identification(y.T, u.T, id_method="N4SID", SS_fixed_order=order, SS_horizon=10)
+    model = system_identification(y.T, u.T, id_method="N4SID", SS_fixed_order=order, SS_f=10, SS_p=10)
     return make_plant(model.A, model.B, model.C, model.D)
 
 
 def control_plant(u: np.ndarray, y: np.ndarray, order: int) -> Plant:
     """Markov parameters by python-control's least squares, realised by its eigensystem algorithm."""
-    lags = max(20, 4 * order)
-    H = control.markov(y.T, u.T, lags)
-    model, _ = control.eigensys_realization(np.asarray(H).reshape(y.shape[1], u.shape[1], -1), order)
+    lags = max(20, 6 * order)
+    H = control.markov(y.T, u.T, m=lags)
+    model, _ = control.eigensys_realization(np.asarray(H).reshape(y.shape[1], u.shape[1], -1), order, m=lags // 2, n=lags // 2 - 1)
     return make_plant(model.A, model.B, model.C, model.D)
 
 
@@ -111,7 +111,7 @@ def installed_peers() -> dict[str, Callable]:
 
 
 def hold_out(name: str, u: np.ndarray, y: np.ndarray, cut: int, peers: dict[str, Callable]) -> dict:
-    """Mean NRMSE over the outputs, means of the hold-out removed to score, for ours and each peer at our order; the peers get data without their means."""
+    """Mean NRMSE over the outputs, means of the hold-out removed to score, for ours and each peer at our number of states, delays included; the peers get data without their means."""
     settings = {"sample_time_s": 1.0, "feedthrough": None, "refinement": "none" if name.startswith("baam") else "validated"}
     ours, seconds = timed(identify, [u[:cut]], [y[:cut]], **settings)
     test = ([u[cut:]], [y[cut:]])
@@ -124,7 +124,7 @@ def hold_out(name: str, u: np.ndarray, y: np.ndarray, cut: int, peers: dict[str,
     for peer, function in peers.items():
         mean_u, mean_y = u[:cut].mean(axis=0), y[:cut].mean(axis=0)
         try:
-            found, seconds = timed(function, u[:cut] - mean_u, y[:cut] - mean_y, max(ours.order, 2))
+            found, seconds = timed(function, u[:cut] - mean_u, y[:cut] - mean_y, ours.plant.n)
             with np.errstate(all="ignore"):
                 score = simulate_fit(found, [u[cut:] - mean_u], [y[cut:] - mean_y], means_removed=True)
             row[peer] = {"error_percent": round(100 - float(score.mean()), 2), "s": round(seconds, 2)}

@@ -1,8 +1,11 @@
-"""Artifacts -> pages: reads the metrics and tables of every stage and reports/accepted.json; writes reports/index.html and reports/temperature.html. What is missing
-is shown as missing; what was read is hashed, and the pages carry the hashes."""
+"""Artifacts -> pages: reads the metrics and tables of every stage and reports/accepted.json; writes reports/index.html and temperature.html.
+
+What is missing is shown as missing; what was read is hashed, and the pages carry the hashes.
+"""
 
 from pipeline import artifacts, params
 from pipeline.report import index, temperature
+from pipeline.report.judgement import judgement, shown
 from pipeline.report.sources import Declared, collect, digest
 from pipeline.report.verdict import ReportRules
 
@@ -10,30 +13,44 @@ from pipeline.report.verdict import ReportRules
 def main() -> None:
     with artifacts.stage("report"):
         declared = Declared(
-            params.load(ReportRules, "report"), params.load(params.Plant, "plant"), params.load(params.Panel, "panel"), params.load(params.Tracking, "tracking"), params.read()
+            params.load(ReportRules, "report"),
+            params.load(params.Plant, "plant"),
+            params.load(params.Panel, "panel"),
+            params.load(params.Tracking, "tracking"),
+            params.read(),
         )
         metrics = {
-            "generate_probing": "reports/metrics/generate_probing.json", "ingest": "reports/metrics/ingest.json", "identify_plant": "reports/metrics/identify_plant.json",
-            "learn_kernel": "reports/metrics/learn_kernel.json", "tune_weights": "reports/metrics/tune_weights.json",
+            "generate_probing": "reports/metrics/generate_probing.json",
+            "ingest": "reports/metrics/ingest.json",
+            "identify_plant": "reports/metrics/identify_plant.json",
+            "learn_kernel": "reports/metrics/learn_kernel.json",
+            "tune_weights": "reports/metrics/tune_weights.json",
             "evaluate_temperature": "reports/metrics/evaluate_temperature.json",
-        }  # fmt: skip
+        }
         folders = {
-            "ingest": "datasets/ingest", "identify_plant": "datasets/identify_plant", "learn_kernel": "datasets/learn_kernel", "tune_weights": "datasets/tune_weights",
+            "ingest": "datasets/ingest",
+            "identify_plant": "datasets/identify_plant",
+            "learn_kernel": "datasets/learn_kernel",
+            "tune_weights": "datasets/tune_weights",
             "evaluate_temperature": "datasets/evaluate_temperature",
-        }  # fmt: skip
+        }
         sources = collect(declared, metrics, folders, "reports/accepted.json", ("pipeline", "stages"))
-        judged = index.judgement(sources)
+        judged = judgement(sources)
         pages = {"index": index.render(sources, judged), "temperature": temperature.render(sources, judged)}
         artifacts.write_text("reports/index.html", pages["index"])
         artifacts.write_text("reports/temperature.html", pages["temperature"])
         artifacts.write_metrics(
             "report",
             {
-                "verdict": judged.verdict._asdict(), "figures": index.shown(judged), "bytes": {name: len(text.encode()) for name, text in pages.items()},
-                "pictures": {name: text.count('role="img"') for name, text in pages.items()}, "read": {path: source.sha256 for path, source in sources.read.items()},
-                "parameters": digest(declared.everything), "code": sources.code,
+                "verdict": judged.verdict._asdict(),
+                "figures": shown(judged),
+                "bytes": {name: len(text.encode()) for name, text in pages.items()},
+                "pictures": {name: text.count('role="img"') for name, text in pages.items()},
+                "read": {path: source.sha256 for path, source in sources.read.items()},
+                "parameters": digest(declared.everything),
+                "code": sources.code,
             },
-        )  # fmt: skip
+        )
 
 
 if __name__ == "__main__":

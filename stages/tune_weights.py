@@ -30,6 +30,7 @@ class TuneWeights(params.Section):
     allow_at_limits_percent: float = Field(gt=0, le=100)
     allow_effort_percent: float = Field(gt=0, le=100)
     worst_case: float = Field(ge=0, le=1000)
+    least_disk_margin: float = Field(ge=0, le=2)
 
 
 def main() -> None:
@@ -55,7 +56,7 @@ def main() -> None:
             "integral": tracking.integral,
             "integral_limit": tracking.integral_limit_degC,
         }
-        practical_cost = judging.engineering_objective(model, scenarios, allowance=allowance, **settings)
+        practical_cost = judging.engineering_objective(model, scenarios, allowance=allowance, least_disk_margin=p.least_disk_margin, **settings)
         parity = _search("parity", study.tuning_objective, p, [p.q_low] * 5 + [p.r_low] * 7, [p.q_high] * 5 + [p.r_high] * 7)
         practical = _search(
             "practical",

@@ -244,11 +244,14 @@ def expected(root: Path, stage: str) -> dict[str, Any]:
     code = modules(root, name)
     read, written, keys = set(), set(), set()
     for module in code:
-        tree = parsed(root / module)
-        found = paths(stage, module, tree)
-        read, written = read | found[0], written | found[1]
-        keys |= {key for _, key in loads(module, tree)}
+        keys |= {key for _, key in loads(module, parsed(root / module))}
     tree = parsed(root / name)
+    # paths stand in the stage's file, where one can grep for them: what it imports takes them as arguments
+    found = paths(stage, name, tree)
+    read, written = read | found[0], written | found[1]
+    # a stage that hashes whole folders of code, or reads params.yaml whole, depends on them whole
+    read |= {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and node.value in ("pipeline", "stages")}
+    read |= {"params.yaml" for _, receiver, function in calls(tree) if (receiver, function) == ("params", "read")}
     frames = [
         item
         for node in ast.walk(tree)
@@ -265,7 +268,7 @@ def expected(root: Path, stage: str) -> dict[str, Any]:
     metrics = [f"reports/metrics/{stage}.json"] if any(function == "write_metrics" for *_, function in calls(tree)) else []
     entry = {
         "cmd": f"python -m stages.{stage}",
-        "deps": [name, *sorted(code - {name}), *sorted(data_files(root, code)), *sorted(read)],
+        "deps": [dep for dep in (name, *sorted(code - {name}), *sorted(data_files(root, code))) if dep.split("/")[0] not in read] + sorted(read),
         "params": sorted(keys),
         # DVC deletes outs before it runs a stage unless they persist, and the last good artifacts must outlive a stage that fails
         "outs": [{path: {"persist": True}} for path in sorted(written)],

@@ -10,7 +10,7 @@ from pipeline.report.digits import DASH, number
 from pipeline.report.sources import Sources, Table, lookup
 from pipeline.report.verdict import Figure, Missing, Question
 
-# role on page one -> the controller's name in the artifacts; the window is the data-driven route, because the record alone ranks it before the kernel
+# role on page one -> the controller's name in the artifacts; the window is the data-driven route: the record alone ranks it before the kernel
 CONTROLLERS = {"data_driven": "window", "model_based": "model_based", "baseline": "baseline"}
 LABELS = {
     "model_based": ("Model-based", "model + Riccati"),
@@ -20,9 +20,12 @@ LABELS = {
     "exact_model": ("Exact model", "told the truth"),
 }
 RUNS = {
-    "gap_percent": ("regret", 100.0), "settled_error_degC": ("settled_error_degC", 1.0), "settling_s": ("settling_s", 1.0),
-    "overshoot_degC": ("overshoot_degC", 1.0), "at_limits_percent": ("at_limits_percent", 1.0),
-}  # fmt: skip
+    "gap_percent": ("regret", 100.0),
+    "settled_error_degC": ("settled_error_degC", 1.0),
+    "settling_s": ("settling_s", 1.0),
+    "overshoot_degC": ("overshoot_degC", 1.0),
+    "at_limits_percent": ("at_limits_percent", 1.0),
+}
 
 
 def all_answers(sources: Sources, asked: list[Question]) -> dict[str, dict[str, Figure | Missing]]:
@@ -110,7 +113,9 @@ def _data(sources: Sources, name: str) -> Figure | Missing:
 
 
 def _model_data(sources: Sources) -> Figure | Missing:
-    """The model has fewer unknowns than the window, so that noise asks no more of it; its own first step, a long VARX, asks for its unknowns."""
+    """The model has fewer unknowns than the window, so that noise asks no more of it; its own first step, a long VARX, asks for its
+    unknowns.
+    """
     found, machine = sources.metrics["identify_plant"], sources.declared.machine
     samples, past = lookup(found, "rows"), lookup(found, "past")
     needed = lookup(found, "samples_needed")

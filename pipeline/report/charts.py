@@ -1,4 +1,5 @@
-"""Figures as inline SVG in the theme's colours: axes, lines, bands, dots and the strip. Each states its finding in words; nothing here knows of a stage."""
+"""Figures as inline SVG in the theme's colours: axes, lines, bands, dots and the strip. Each states its finding in words; nothing here
+knows of a stage."""
 
 import math
 from collections.abc import Sequence
@@ -19,7 +20,9 @@ def _n(value: float) -> str:
 
 
 def strip(question: Question, shown: Sequence[tuple[str, str, Figure | Missing]]) -> Markup:
-    """Share of the allowance from 0 to twice the limit, the limit in the middle of every row; (name, class, figure) in two lanes that never overlap."""
+    """Share of the allowance from 0 to twice the limit, the limit in the middle of every row; (name, class, figure) in two lanes that
+    never overlap.
+    """
     parts = [Markup('<rect class="beyond" x="50%" width="50%" height="100%"/><line class="limit" x1="50%" x2="50%" y1="0" y2="100%"/>')]
     said = []
     for (name, css, figure), y in zip(shown, (11, 23), strict=False):
@@ -37,13 +40,19 @@ def _used(question: Question, figure: Figure) -> str:
     if math.isinf(used):
         return "uses more than any allowance"
     words = "beyond its limit" if state(question, figure) == FAILED else "of its allowance"
-    return f"is {number(100 * used, 0)} % of the limit, {words}" if words.startswith("beyond") else f"uses {number(100 * used, 0 if used > 0.01 else 1)} % {words}"
+    return (
+        f"is {number(100 * used, 0)} % of the limit, {words}"
+        if words.startswith("beyond")
+        else f"uses {number(100 * used, 0 if used > 0.01 else 1)} % {words}"
+    )
 
 
 def _lane(question: Question, css: str, figure: Figure, y: int) -> Markup:
     low, middle, high = sorted(min(share(question, v), 2.0) for v in (figure.low, figure.value, figure.high))
     css = f"{css} bad" if css != "acc" and state(question, figure) == FAILED else css
-    bar = Markup('<line class="{}" x1="{}%" x2="{}%" y1="{}" y2="{}"/>').format(css, _n(50 * low), _n(50 * high), y, y) if high > low else ""
+    bar = (
+        Markup('<line class="{}" x1="{}%" x2="{}%" y1="{}" y2="{}"/>').format(css, _n(50 * low), _n(50 * high), y, y) if high > low else ""
+    )
     middle = min(share(question, figure.value), 2.0)
     if middle >= 2.0:
         # beyond the scale: the mark keeps its shape, and an arrow says that it goes on
@@ -66,7 +75,10 @@ def before_and_now(question: Question, css: str, before: Figure, now: Figure, li
         '<rect class="beyond" x="50%" width="50%" y="20" height="40"/><line class="limit" x1="50%" x2="50%" y1="20" y2="60"/>'
         '<text x="50%" y="14" text-anchor="middle">limit {}</text>'
     ).format(limit)
-    alt = f"{question.title} was {number(100 * min(share(question, before.value), 99), 0)} % of its limit and is {number(100 * min(share(question, now.value), 99), 0)} %"
+    alt = (
+        f"{question.title} was {number(100 * min(share(question, before.value), 99), 0)} % of its limit "
+        f"and is {number(100 * min(share(question, now.value), 99), 0)} %"
+    )
     return Markup('<svg role="img" aria-label="{}">{}{}{}</svg>').format(alt, frame, old, new)
 
 
@@ -139,14 +151,20 @@ def panel(frame: Frame, layers: Sequence[Markup], *, alt: str, css: str = "mb", 
     axes = []
     for value, label in frame.y.ticks:
         y = float(frame.py(value))
-        axes.append(Markup('<line class="tk" x1="{}" x2="{}" y1="{}" y2="{}"/><text x="{}" y="{}" text-anchor="end">{}</text>').format(
-            frame.left, frame.width - frame.right, _n(y), _n(y), frame.left - 4, _n(y + 3.5), label))  # fmt: skip
+        axes.append(
+            Markup('<line class="tk" x1="{}" x2="{}" y1="{}" y2="{}"/><text x="{}" y="{}" text-anchor="end">{}</text>').format(
+                frame.left, frame.width - frame.right, _n(y), _n(y), frame.left - 4, _n(y + 3.5), label
+            )
+        )
     base = frame.height - frame.below
     for value, label in frame.x.ticks if x_ticks else ():
         x = float(frame.px(value))
         anchor = "start" if x < frame.left + 5 else "end" if x > frame.width - frame.right - 8 else "middle"
-        axes.append(Markup('<line class="ax" x1="{}" x2="{}" y1="{}" y2="{}"/><text x="{}" y="{}" text-anchor="{}">{}</text>').format(
-            _n(x), _n(x), base, base + 3, _n(x), frame.height - 2, anchor, label))  # fmt: skip
+        axes.append(
+            Markup('<line class="ax" x1="{}" x2="{}" y1="{}" y2="{}"/><text x="{}" y="{}" text-anchor="{}">{}</text>').format(
+                _n(x), _n(x), base, base + 3, _n(x), frame.height - 2, anchor, label
+            )
+        )
     axes.append(Markup('<line class="ax" x1="{}" x2="{}" y1="{}" y2="{}"/>').format(frame.left, frame.width - frame.right, base, base))
     head = Markup('<text class="yt" x="0" y="9">{}</text>').format(title) if title else ""
     return Markup('<svg class="plot {}" viewBox="0 0 {} {}" role="img" aria-label="{}">{}{}{}</svg>').format(
@@ -161,14 +179,11 @@ def decimated(x: np.ndarray, y: np.ndarray, most: int = 240) -> tuple[np.ndarray
     """At most 2 `most` points: of each of `most` stretches its lowest and its highest, so that no peak is lost."""
     if len(x) <= 2 * most:
         return x, y
-    kept = []
-    for part in np.array_split(np.arange(len(x)), most):
-        values = y[part]
-        if np.isnan(values).all():
-            kept.append(part[:1])
-        else:
-            kept.append(np.unique([part[np.nanargmin(values)], part[np.nanargmax(values)]]))
-    index = np.concatenate(kept)
+    size = -(-len(x) // most)
+    rows = np.append(y, np.full(-len(y) % size, np.nan)).reshape(-1, size)
+    lowest = np.where(np.isnan(rows), np.inf, rows).argmin(axis=1)
+    highest = np.where(np.isnan(rows), -np.inf, rows).argmax(axis=1)
+    index = np.unique(np.stack([lowest, highest], axis=1) + size * np.arange(len(rows))[:, None])
     return x[index], y[index]
 
 
@@ -192,33 +207,53 @@ def line(frame: Frame, x, y, css: str = "line", *, steps: bool = False) -> Marku
 def level(frame: Frame, value: float, css: str, label: str = "", *, above: bool = True) -> Markup:
     """A horizontal line across the panel, such as a limit or the optimum, with its name at the right end."""
     y = float(frame.py(value))
-    text = Markup('<text x="{}" y="{}" text-anchor="end">{}</text>').format(frame.width - frame.right, _n(y - 4 if above else y + 11), label) if label else ""
-    return Markup('<line class="{}" x1="{}" x2="{}" y1="{}" y2="{}"/>{}').format(css, frame.left, frame.width - frame.right, _n(y), _n(y), text)
+    text = (
+        Markup('<text x="{}" y="{}" text-anchor="end">{}</text>').format(frame.width - frame.right, _n(y - 4 if above else y + 11), label)
+        if label
+        else ""
+    )
+    return Markup('<line class="{}" x1="{}" x2="{}" y1="{}" y2="{}"/>{}').format(
+        css, frame.left, frame.width - frame.right, _n(y), _n(y), text
+    )
 
 
 def tint(frame: Frame, low: float, high: float, css: str = "allow") -> Markup:
     top, bottom = float(frame.py(high)), float(frame.py(low))
-    return Markup('<rect class="{}" x="{}" width="{}" y="{}" height="{}"/>').format(css, frame.left, frame.width - frame.left - frame.right, _n(top), _n(max(bottom - top, 0)))
+    return Markup('<rect class="{}" x="{}" width="{}" y="{}" height="{}"/>').format(
+        css, frame.left, frame.width - frame.left - frame.right, _n(top), _n(max(bottom - top, 0))
+    )
 
 
 def interval(frame: Frame, start: float, end: float, css: str = "flag") -> Markup:
     """A stretch of time, at least a pixel wide."""
     a, b = (float(frame.px(v)) for v in (start, end))
-    return Markup('<rect class="{}" x="{}" width="{}" y="{}" height="{}"/>').format(css, _n(a), _n(max(b - a, 1)), frame.above, frame.height - frame.below - frame.above)
+    return Markup('<rect class="{}" x="{}" width="{}" y="{}" height="{}"/>').format(
+        css, _n(a), _n(max(b - a, 1)), frame.above, frame.height - frame.below - frame.above
+    )
 
 
 def dots(frame: Frame, x, y, css: str = "dot", radius: float = 2.2) -> Markup:
     pairs = zip(np.atleast_1d(frame.px(x)), np.atleast_1d(frame.py(y)), strict=True)
-    return Markup("").join(Markup('<circle class="{}" cx="{}" cy="{}" r="{}"/>').format(css, _n(a), _n(b), radius) for a, b in pairs if not math.isnan(b))
+    return Markup("").join(
+        Markup('<circle class="{}" cx="{}" cy="{}" r="{}"/>').format(css, _n(a), _n(b), radius) for a, b in pairs if not math.isnan(b)
+    )
 
 
 def label(frame: Frame, x: float, y: float, text: str, *, anchor: str = "start", dx: float = 0, dy: float = 0) -> Markup:
-    return Markup('<text x="{}" y="{}" text-anchor="{}">{}</text>').format(_n(float(frame.px(x)) + dx), _n(float(frame.py(y)) + dy), anchor, text)
+    return Markup('<text x="{}" y="{}" text-anchor="{}">{}</text>').format(
+        _n(float(frame.px(x)) + dx), _n(float(frame.py(y)) + dy), anchor, text
+    )
 
 
-def spark(x: np.ndarray, y: np.ndarray, axis: Axis, *, css: str, limit: float, alt: str, named: bool, bad: bool, limit_label: str) -> Markup:
+def spark(
+    x: np.ndarray, y: np.ndarray, axis: Axis, *, css: str, limit: float, alt: str, named: bool, bad: bool, limit_label: str
+) -> Markup:
     """A panel of a loop's card: no ticks, the allowed region grey, the last point marked, vermillion where it lies outside."""
     frame = Frame(Axis(float(x[0]), float(x[-1]), ()), axis, 104, 88, 1, 4, 4, 4)
-    end = Markup('<circle class="end{}" cx="{}" cy="{}" r="3"/>').format(" bad" if bad else "", _n(float(frame.px(x[-1]))), _n(float(frame.py(y[-1]))))
+    end = Markup('<circle class="end{}" cx="{}" cy="{}" r="3"/>').format(
+        " bad" if bad else "", _n(float(frame.px(x[-1]))), _n(float(frame.py(y[-1])))
+    )
     layers = [tint(frame, axis.low, limit), line(frame, x, y), level(frame, limit, "lim", limit_label if named else ""), end]
-    return Markup('<svg class="spark {}" viewBox="0 0 104 88" role="img" aria-label="{}">{}</svg>').format(css, alt, Markup("").join(layers))
+    return Markup('<svg class="spark {}" viewBox="0 0 104 88" role="img" aria-label="{}">{}</svg>').format(
+        css, alt, Markup("").join(layers)
+    )

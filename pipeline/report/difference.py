@@ -4,13 +4,16 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
+from pipeline.report.answers import all_answers
 from pipeline.report.digits import MINUS, THIN, decimals, number
 from pipeline.report.sources import Sources, digest
-from pipeline.report.verdict import Figure, Missing, Question, state
+from pipeline.report.verdict import Figure, Missing, Question
 
 
 class Move(NamedTuple):
-    """A figure in both runs. `moved`: its bands no longer overlap; `word`: better, worse, within noise, unchanged, or why it cannot be said."""
+    """A figure in both runs. `moved`: its bands no longer overlap; `word`: better, worse, within noise, unchanged, or why it cannot be
+    said.
+    """
 
     question: Question
     before: Figure | None
@@ -19,7 +22,7 @@ class Move(NamedTuple):
     word: str
 
     def text(self) -> str:
-        """"+0.39 °C · worse"; a change of a percentage is in points."""
+        """ "+0.39 °C · worse"; a change of a percentage is in points."""
         if not self.moved:
             return self.word
         change = self.now.value - self.before.value
@@ -32,7 +35,9 @@ class Move(NamedTuple):
 
 
 class Difference(NamedTuple):
-    """`inputs`, `parameters` (name, before, now), `code` and `artifacts` (path, new | changed | gone) that changed; `same`: how many artifacts did not."""
+    """`inputs`, `parameters` (name, before, now), `code` and `artifacts` (path, new | changed | gone) that changed; `same`: how many
+    artifacts did not.
+    """
 
     inputs: list[str]
     parameters: list[tuple[str, str, str]]
@@ -53,16 +58,29 @@ def difference(sources: Sources) -> Difference | None:
         return None
     hashes = before.get("hashes") or {}
     now = {path: source.sha256 for path, source in sources.read.items()}
-    known = {path: value for path, value in hashes.items() if path.startswith(("datasets/", "reports/metrics/")) and path != "reports/metrics/report.json"}
+    known = {
+        path: value
+        for path, value in hashes.items()
+        if path.startswith(("datasets/", "reports/metrics/")) and path != "reports/metrics/report.json"
+    }
+    recorded = {path.split("/", 1)[0] for path in known}
+    now = {path: value for path, value in now.items() if path.split("/", 1)[0] in recorded}
     changes = [(path, "changed" if path in known else "new") for path in sorted(now) if known.get(path) != now[path]]
-    changes += [(path, "gone") for path in sorted(known) if path not in now and path.rsplit("/", 1)[0] in {p.rsplit("/", 1)[0] for p in now}]
+    changes += [
+        (path, "gone") for path in sorted(known) if path not in now and path.rsplit("/", 1)[0] in {p.rsplit("/", 1)[0] for p in now}
+    ]
     inputs = [path for path, _ in changes if path.startswith(("datasets/ingest/record", "datasets/raw"))]
-    code = (before.get("metrics") or {}).get("report", {}).get("code")
+    # the accepted run may know the code by its folders, as it knows artifacts
+    folders = {path: value for path, value in hashes.items() if path in ("pipeline", "stages")}
+    code = digest(folders) if folders else None
     return Difference(
-        inputs, list(_parameters(before.get("params") or {}, sources.declared.everything)),
+        inputs,
+        list(_parameters(before.get("params") or {}, sources.declared.everything)),
         "not recorded" if code is None else "unchanged" if code == sources.code else "changed",
-        [change for change in changes if change[0] not in inputs], sum(known.get(path) == now[path] for path in now), digest(before)[:8],
-    )  # fmt: skip
+        [change for change in changes if change[0] not in inputs],
+        sum(known.get(path) == now[path] for path in now),
+        digest(before)[:8],
+    )
 
 
 def _parameters(before: Mapping, now: Mapping) -> Iterator[tuple[str, str, str]]:
@@ -86,33 +104,33 @@ def _flat(prefix: str, data: Any) -> Iterator[tuple[str, Any]]:
         yield from _flat(place, value)
 
 
-def accepted_figure(accepted: Mapping, controller: str, key: str) -> Figure | None:
-    """A figure of the accepted run, as its report showed it."""
-    metrics = accepted.get("metrics") or {}
-    shown = (((metrics.get("report") or {}).get("figures") or {}).get(controller) or {}).get(key)
-    if not shown:
-        shown = (((metrics.get("evaluate_temperature") or {}).get("controllers") or {}).get(controller) or {}).get(key)
-    if not isinstance(shown, Mapping) or "median" not in shown:
-        return None
-    return Figure(*(math.inf if shown.get(end) is None else float(shown[end]) for end in ("median", "low", "high")))
+def accepted_answers(sources: Sources, asked: list[Question]) -> Mapping[str, Mapping[str, Figure | Missing]]:
+    """The figures of the accepted run; only metrics were kept of it, no tables."""
+    gone = Missing("not measured", "the accepted run keeps no table")
+    metrics = {stage: sources.accepted.get("metrics", {}).get(stage, gone) for stage in sources.metrics}
+    return all_answers(sources._replace(metrics=metrics, tables=dict.fromkeys(sources.tables, gone)), asked)
 
 
-def moves(sources: Sources, asked: list[Question], controller: str, answers: Mapping[str, Figure | Missing]) -> list[Move]:
-    """Every figure of a controller against the accepted run's."""
-    return [_move(question, accepted_figure(sources.accepted, controller, question.key), answers[question.key]) for question in asked]
+def moves(sources: Sources, asked: list[Question], answers: Mapping[str, Mapping[str, Figure | Missing]]) -> dict[str, list[Move]]:
+    """{controller: every figure against the accepted run's}; unchanged is what the metrics alone say, moved what the bands say."""
+    before = accepted_answers(sources, asked)
+    plain = all_answers(sources._replace(tables=dict.fromkeys(sources.tables, Missing("not measured", ""))), asked)
+    return {
+        name: [
+            _move(question, before.get(name, {}).get(question.key), plain[name][question.key], answers[name][question.key])
+            for question in asked
+        ]
+        for name in answers
+    }
 
 
-def _move(question: Question, before: Figure | None, now: Figure | Missing) -> Move:
+def _move(question: Question, before: Figure | Missing | None, plain: Figure | Missing, now: Figure | Missing) -> Move:
     if isinstance(now, Missing):
-        return Move(question, before, now, False, now.state)
-    if before is None:
-        return Move(question, None, now, False, "not in the accepted run")
-    if before[:3] == now[:3]:
+        return Move(question, None, now, False, now.state)
+    if before is None or isinstance(before, Missing):
+        return Move(question, None, now, False, "new")
+    if isinstance(plain, Figure) and before[:3] == plain[:3]:
         return Move(question, before, now, False, "unchanged")
     if now.low <= before.high and before.low <= now.high:
         return Move(question, before, now, False, "within noise")
     return Move(question, before, now, True, "better" if (now.value < before.value) != question.at_least else "worse")
-
-
-def worse_and_failing(move: Move) -> bool:
-    return move.moved and move.word == "worse" and state(move.question, move.now) != "passed"

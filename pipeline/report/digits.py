@@ -1,4 +1,5 @@
-"""Numbers as a reader meets them: as many decimals as their band supports, a true minus, thin spaces before units, "never" for what never comes."""
+"""Numbers as a reader meets them: as many decimals as their band supports, a true minus, thin spaces before units, "never" for what
+never comes."""
 
 import math
 
@@ -6,7 +7,9 @@ MINUS, THIN, DASH = "\u2212", "\u202f", "\u2013"
 
 
 def decimals(low: float, high: float, *, value: float = 0.0) -> int:
-    """Decimals that a band supports: steps of at most a fifth of its width, and at most three significant digits of the value, but at least one of them."""
+    """Decimals that a band supports: steps of at most a fifth of its width, and at most three significant digits of the value, but at
+    least one of them.
+    """
     size = abs(value) if math.isfinite(value) else 0.0
     enough, most = (_places(1 / size), _places(100 / size)) if size else (0, 9)
     width = high - low
@@ -34,9 +37,9 @@ def quantity(value: float, unit: str, places: int, *, beyond: str = "never") -> 
 
 def band(low: float, high: float, places: int, *, beyond: str = "never") -> str:
     """ "0.61-0.84" with an en dash; "to" where an end is negative or in words."""
-    if low == high:
-        return ""
     ends = [beyond if math.isinf(end) else number(end, places) for end in (low, high)]
+    if ends[0] == ends[1]:
+        return ""
     worded = low < 0 or math.isinf(low) or math.isinf(high)
     return f" to {ends[1]}".join([ends[0], ""]) if worded else DASH.join(ends)
 

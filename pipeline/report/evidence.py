@@ -1,6 +1,5 @@
-"""The figures of the temperature page that show what the learning rests on: orders, optimiser, excitation, and the record with its flaws."""
+"""The figures of the temperature page that show what the learning rests on: lengths and orders, the hold-out, and the optimiser."""
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,23 +11,32 @@ from pipeline.report.pictures import Column, Picture, hole
 from pipeline.report.sources import Sources, Table, lookup
 from pipeline.report.verdict import Missing
 
-QUALITY, RECORD = "datasets/ingest/quality.parquet", "datasets/ingest/record.parquet"
-WINDOW, KERNEL, PLANT, HISTORY = (
-    "datasets/learn_kernel/window.parquet", "datasets/learn_kernel/kernel.parquet", "datasets/identify_plant/plant.parquet", "datasets/tune_weights/history.parquet",
-)  # fmt: skip
+WINDOW, KERNEL = "datasets/learn_kernel/window.parquet", "datasets/learn_kernel/kernel.parquet"
+PLANT, ORDER, HOLDOUT = (
+    "datasets/identify_plant/plant.parquet",
+    "datasets/identify_plant/order.parquet",
+    "datasets/identify_plant/holdout.parquet",
+)
+HISTORY = "datasets/tune_weights/history.parquet"
 
 
 def orders(sources: Sources) -> Picture:
-    """How long a window, how many states: Akaike's criterion, the kernel's singular values, the identified poles."""
-    shown = [_criterion(sources), _singular(sources), _poles(sources)]
-    model = sources.metrics["identify_plant"]
+    """How long a window, how many states: Akaike's criterion, singular values against the noise, the error of each order, the poles."""
+    shown = [_criterion(sources), _singular(sources), _left_out(sources), _poles(sources)]
+    learned, model = sources.metrics["learn_kernel"], sources.metrics["identify_plant"]
+    window, state, order = lookup(learned, "window"), lookup(learned, "state"), lookup(model, "order")
     parts = [
-        (f"window of {lookup(sources.metrics['learn_kernel'], 'window')} samples", lookup(sources.metrics["learn_kernel"], "window")),
-        (f"kernel on the {lookup(sources.metrics['learn_kernel'], 'state')}", lookup(sources.metrics["learn_kernel"], "state")),
-        (f"model of order {lookup(model, 'order')}", lookup(model, "order")),
+        "" if isinstance(window, Missing) else f"a window of {window} samples",
+        "" if isinstance(order, Missing) else f"a model of order {order}",
+        ""
+        if isinstance(state, Missing)
+        else f"the kernel on the {state}, whose {lookup(learned, 'identifiable')} unknowns the data determine",
     ]
-    said = ", ".join(text for text, value in parts if not isinstance(value, Missing))
-    return Picture("orders", "How much memory the data ask for", f"Chosen from the record alone: {said or 'nothing'}.", shown, "", page.origin(sources.source(WINDOW, KERNEL, PLANT)))
+    text = "; ".join(filter(None, parts)) or "nothing"
+    title = "How much memory the data ask for"
+    return Picture(
+        "orders", title, f"Chosen from the record alone: {text}.", shown, "", page.origin(sources.source(WINDOW, KERNEL, ORDER, PLANT))
+    )
 
 
 def _holed(head: str, small: str, missing: Missing, mark: str = "") -> Column:
@@ -36,48 +44,88 @@ def _holed(head: str, small: str, missing: Missing, mark: str = "") -> Column:
 
 
 def _criterion(sources: Sources) -> Column:
-    head, small = "Length of the window", "Akaike’s criterion, above its least value; log"
+    head, small = "Length of the window", "Akaike’s criterion over its least; log"
     window = sources.tables["window"]
     if isinstance(window, Missing):
         return _holed(head, small, window, "window")
     table = window["table"]
     above = table[:, 2] - table[:, 2].min() + 1
     chosen = float(table[above.argmin(), 0])
-    frame = charts.Frame(charts.linear(0, float(table[-1, 0])), charts.logarithmic(1, float(above.max())), width=360, height=170, left=44)
-    layers = [charts.line(frame, table[:, 0], above), charts.dots(frame, table[:, 0], above, "dot dd"), charts.label(frame, chosen, 1, f"{chosen:g} samples", anchor="end", dx=-6, dy=-6)]
-    alt = f"Akaike’s criterion is least at a window of {chosen:g} samples, {'the longest tried' if chosen == table[-1, 0] else f'of up to {table[-1, 0]:g} tried'}"
-    return Column(head, small, "window", [charts.panel(frame, layers, alt=alt, css="dd", title="criterion + 1 − least")])
+    frame = charts.Frame(charts.linear(0, float(table[-1, 0])), charts.logarithmic(1, float(above.max())), **_SMALL)
+    layers = [
+        charts.line(frame, table[:, 0], above),
+        charts.dots(frame, table[:, 0], above, "dot dd"),
+        charts.label(frame, chosen, 1, f"{chosen:g} samples", anchor="end", dx=-6, dy=-6),
+    ]
+    alt = (
+        f"Akaike’s criterion is least at a window of {chosen:g} samples, "
+        f"{'the longest tried' if chosen == table[-1, 0] else f'of up to {table[-1, 0]:g} tried'}"
+    )
+    return Column(head, small, "window", [charts.panel(frame, layers, alt=alt, css="dd")])
+
+
+_SMALL = {"width": 270, "height": 160, "left": 44}
 
 
 def _singular(sources: Sources) -> Column:
-    head, small = "State of the kernel", "singular values of the record, r.m.s.; log"
-    kernel = sources.tables["kernel"]
-    if isinstance(kernel, Missing):
-        refused = lookup(sources.metrics["learn_kernel"], "refused")
-        return _holed(head, small, kernel if isinstance(refused, Missing) else Missing("failed", str(refused)), "kernel")
-    values = kernel["singular_values"]
-    values = values[values > 0]
-    index = np.arange(1, len(values) + 1)
-    kept = int(kernel["rank"]) - len(kernel["u_scale"])
-    frame = charts.Frame(charts.linear(0, len(values) + 1, ticks=min(len(values) + 1, 6)), charts.logarithmic(float(values.min()), float(values.max())), width=360, height=170, left=44)
-    layers = [charts.dots(frame, index[:kept], values[:kept], "dot dd", 3.2), charts.dots(frame, index[kept:], values[kept:], "try", 3.2)]
-    alt = f"{len(values)} singular values from {short(float(values.max()))} down to {short(float(values.min()))}; {kept} directions are kept"
-    return Column(head, f"{small}; {kept} kept", "kernel", [charts.panel(frame, layers, alt=alt, css="dd")])
+    head, small = "Singular values", "of the identification, by order; log"
+    table = sources.tables["order"]
+    if isinstance(table, Missing):
+        return _holed(head, small, table, "model_based")
+    order, values, edge = table["order"], table["singular_value"], float(table["noise_edge"][0])
+    positive = np.append(values[values > 0], edge if edge > 0 else values.max())
+    frame = charts.Frame(charts.linear(0, float(order[-1]) + 1), charts.logarithmic(float(positive.min()), float(positive.max())), **_SMALL)
+    chosen = table["chosen"]
+    last = int(order[chosen][0]) if chosen.any() else 0
+    layers = [
+        charts.dots(frame, order[order <= last], values[order <= last], "dot", 3),
+        charts.dots(frame, order[order > last], values[order > last], "try", 2.4),
+    ]
+    if edge > 0:
+        layers.append(charts.level(frame, edge, "lim", "noise alone"))
+    kept = values[order == last]
+    alt = f"Order {last} is chosen: its singular value {short(float(kept[0])) if len(kept) else 'none'}, noise alone reaches {short(edge)}"
+    return Column(head, small, "model_based", [charts.panel(frame, layers, alt=alt, css="mb")])
+
+
+def _left_out(sources: Sources) -> Column:
+    head, small = "Error of each order", "on blocks left out, share of the outputs’ variation"
+    table = sources.tables["order"]
+    if isinstance(table, Missing):
+        return _holed(head, small, table, "model_based")
+    known = np.isfinite(table["error"])
+    if not known.any():
+        return _holed(head, small, Missing("not applicable", "the rank alone decided, or the order was given"), "model_based")
+    order, error, chosen = (table[name][known] for name in ("order", "error", "chosen"))
+    frame = charts.Frame(charts.linear(0, float(order[-1]) + 1), charts.linear(0, 1.1 * float(error.max())), **_SMALL)
+    layers = [charts.line(frame, order, error), charts.dots(frame, order, error, "dot", 2.4)]
+    said = "none chosen"
+    if chosen.any():
+        at, least = float(order[chosen][0]), float(error[chosen][0])
+        layers += [
+            charts.dots(frame, [at], [least], "dot", 4),
+            charts.label(frame, frame.x.high, frame.y.high, f"order {at:g}: {number(least, 3)}", anchor="end", dy=10),
+        ]
+        said = f"order {at:g} leaves {percent(100 * least, 2)} of the variation unexplained"
+    alt = f"Error on left-out blocks by order: {said}"
+    return Column(head, small, "model_based", [charts.panel(frame, layers, alt=alt, css="mb")])
 
 
 def _poles(sources: Sources) -> Column:
-    head, small = "Poles of the identified model", "real part against imaginary part; line: unit circle"
+    head, small = "Poles of the model", "real, imaginary part; line: unit circle"
     plant = sources.tables["plant"]
     if isinstance(plant, Missing):
         return _holed(head, small, plant, "model_based")
     poles = np.linalg.eigvals(plant["A"][0])
     largest = float(np.abs(poles).max())
-    # the poles of a barrel crowd at one: the picture shows where they are, at equal scales
-    left, height = float(min(poles.real.min(), 0.9)), 0.5 * (1.02 - min(poles.real.min(), 0.9)) * (170 - 30) / (360 - 50)
-    reach = max(height, 1.1 * float(np.abs(poles.imag).max()))
-    frame = charts.Frame(charts.linear(left - 0.01, 1.02), charts.linear(-reach, reach), width=360, height=170, left=44)
+    # the poles of a barrel crowd at one: near enough to see them, at equal scales
+    left = float(poles.real.min())
+    room = max(1 - left, 2 * float(np.abs(poles.imag).max()), 1e-3)
+    low, high = left - 0.3 * room, 1 + 0.15 * room
+    reach = 0.5 * (high - low) * (160 - 30) / (270 - 46)
+    frame = charts.Frame(charts.linear(low, high, ticks=3), charts.linear(-reach, reach, ticks=3), **_SMALL)
     angle = np.linspace(-np.arcsin(min(reach, 1)), np.arcsin(min(reach, 1)), 60)
-    layers = [charts.line(frame, np.cos(angle), np.sin(angle), "lim line thin"), charts.dots(frame, poles.real, poles.imag, "dot", 3.2)]
+    layers = [charts.line(frame, np.cos(angle), np.sin(angle), "lim line thin"), charts.dots(frame, poles.real, poles.imag, "dot", 3)]
     alt = f"{len(poles)} poles, the largest of size {number(largest, 4)}, {'inside' if largest < 1 else 'on or outside'} the unit circle"
     return Column(head, small, "model_based", [charts.panel(frame, layers, alt=alt, css="mb")])
 
@@ -91,17 +139,33 @@ def tuning(sources: Sources) -> Picture:
     if isinstance(table, Missing):
         return hole("tuning", title, table)
     best, optimum = lookup(found, "parity.best_cost_perfect_state"), lookup(found, "parity.optimum")
-    cost, identity = lookup(found, "practical.cost"), lookup(found, "practical.cost_identity")
+    cost, default = lookup(found, "practical.cost"), default_cost(found)
     shown = [
         _progress(table, "parity", "The study’s objective", "excess over the optimum in %, log", optimum, excess=True),
-        _progress(table, "practical", "The declared engineering cost", "cost, beside equal weights", identity, excess=False),
+        _progress(table, "practical", "The declared engineering cost", "log; default: Q = R = I", default, excess=False),
     ]
     said = []
     if not isinstance(best, Missing) and not isinstance(optimum, Missing):
-        said.append(f"On the study’s objective the search ends {percent(100 * (best / optimum - 1), 2)} above the optimum, {number(optimum, 0)}, which is Q = R = I itself.")
-    if not isinstance(cost, Missing) and not isinstance(identity, Missing):
-        said.append(f"On the engineering cost it gains {percent(100 * (1 - cost / identity), 2)} over equal weights, on the training half of the panel.")
-    return Picture("tuning", title, " ".join(said), shown, "Dots: candidates; line: best so far. Crosses at the foot: candidates that failed.", page.origin(sources.source(HISTORY)))
+        excess = percent(100 * (best / optimum - 1), 2)
+        said.append(
+            f"On the study’s objective the search ends {excess} above the optimum, {number(optimum, 0)}, which Q = R = I itself reaches."
+        )
+    if not isinstance(cost, Missing) and not isinstance(default, Missing):
+        said.append(
+            f"On the engineering cost it ends at {short(cost)}, the default weights at {short(default)}, both "
+            "on the training half of the panel."
+        )
+    failed = int(np.isnan(table["cost"].astype(float)).sum())
+    caption = "Dots: candidates; line: best so far." + (
+        f" Vermillion at the foot: {count(failed, 'candidate')} that failed." if failed else " No candidate failed."
+    )
+    return Picture("tuning", title, " ".join(said), shown, caption, page.origin(sources.source(HISTORY)))
+
+
+def default_cost(found: Any) -> Any:
+    """The engineering cost of the weights that the search started against."""
+    cost = lookup(found, "practical.cost_default", what="the cost of the default weights")
+    return lookup(found, "practical.cost_identity", what="the cost of equal weights") if isinstance(cost, Missing) else cost
 
 
 def _progress(table: Table, mode: str, head: str, small: str, level: Any, *, excess: bool) -> Column:
@@ -111,110 +175,61 @@ def _progress(table: Table, mode: str, head: str, small: str, level: Any, *, exc
     at, cost, best = (table[name][rows].astype(float) for name in ("evaluation", "cost", "incumbent"))
     if excess:
         cost, best = (100 * (values / level - 1) for values in (cost, best))
-        y = charts.logarithmic(max(float(np.nanmin(np.maximum(best, 1e-6))), 1e-6), float(np.nanmax(cost)))
-    else:
-        y = charts.linear(0.98 * min(float(np.nanmin(best)), level), min(float(np.nanmax(cost)), 2 * level))
-    frame = charts.Frame(charts.linear(0, float(at[-1])), y, width=540, height=190, left=44)
+    least = max(float(np.nanmin(best)), 1e-6)
+    frame = charts.Frame(
+        charts.linear(0, float(at[-1])), charts.logarithmic(least, float(np.nanmax(cost))), width=540, height=190, left=44, above=20
+    )
     failed = at[np.isnan(cost)]
-    layers = [charts.dots(frame, at, cost, "try", 1.8), charts.line(frame, at, best, "line"), charts.dots(frame, failed, np.full(len(failed), y.low), "gone", 2)]
+    layers = [
+        charts.dots(frame, at, cost, "try", 1.8),
+        charts.line(frame, at, best, "line"),
+        charts.dots(frame, failed, np.full(len(failed), frame.y.low), "gone", 2),
+    ]
     if not excess:
-        layers.append(charts.level(frame, level, "ref", f"equal weights {short(level)}"))
+        layers.append(charts.level(frame, level, "ref", f"default {short(level)}"))
     end = float(best[-1])
-    layers.append(charts.label(frame, float(at[-1]), end, f"{percent(end, 2)} above" if excess else short(end), anchor="end", dy=-7))
-    alt = f"{head}: after {count(len(at), 'evaluation')} " + (f"the best is {percent(end, 2)} above the optimum" if excess else f"the best costs {short(end)}, equal weights {short(level)}")
+    layers.append(
+        charts.label(
+            frame, float(at[-1]), frame.y.high, f"best {percent(end, 2)} above" if excess else f"best {short(end)}", anchor="end", dy=-6
+        )
+    )
+    alt = f"{head}: after {count(len(at), 'evaluation')} " + (
+        f"the best is {percent(end, 2)} above the optimum" if excess else f"the best costs {short(end)}, the default weights {short(level)}"
+    )
     return Column(head, small, "", [charts.panel(frame, layers, alt=alt, css="mb")])
 
 
-# ---- the record
+# ---- the hold-out
 
 
-def excitation(sources: Sources) -> Picture:
-    """How strongly each input was moved, by frequency."""
-    found, title = sources.metrics["generate_probing"], "What the probing excites"
-    levels = lookup(found, "level_percent_per_band")
-    if isinstance(levels, Missing):
-        return hole("excitation", title, levels)
-    levels, machine = np.array(levels), sources.declared.machine
-    y = charts.linear(0, 1.1 * float(levels.max()), ticks=3)
-    names = [signal.name for signal in machine.inputs] if levels.shape[1] == len(machine.inputs) else [f"input {i + 1}" for i in range(levels.shape[1])]
+def holdout(sources: Sources) -> Picture:
+    """The part of the record that judged the model, measured against simulated."""
+    table, title = sources.tables["holdout"], "The model on the part of the record that it did not see"
+    if isinstance(table, Missing):
+        return hole("holdout", title, table)
+    machine, fits = sources.declared.machine, lookup(sources.metrics["identify_plant"], "fit_holdout")
     shown = []
-    for i, name in enumerate(names):
-        edges = np.linspace(0, 1, len(levels) + 1)
-        frame = charts.Frame(charts.Axis(0, 1, ((0, "0"), (1, "π"))), y, width=150, height=96, left=24)
-        layer = charts.line(frame, edges, np.append(levels[:, i], levels[-1, i]), steps=True)
-        alt = f"{name}: level {number(float(levels[:, i].min()), 2)} to {number(float(levels[:, i].max()), 2)} % in eight bands from 0 to π rad a step"
-        shown.append(Column(name, "", "", [charts.panel(frame, [layer], alt=alt, title="%" if i == 0 else "")]))
-    rank, full, order = (lookup(found, f"excitation_{key}") for key in ("rank", "full_rank", "order"))
-    condition, limited = lookup(found, "excitation_condition"), lookup(found, "limited_share")
-    text = f"Exciting of order {order}: rank {rank} of {full}" + ("." if isinstance(condition, Missing) else f", condition {short(condition)}.")
-    text += "" if isinstance(limited, Missing) else f" {number(100 * limited, 0)}{THIN}% of all commands met a limit of amplitude, rate or machine; what was applied is what is recorded."
-    return Picture("excitation", title, text, shown, "R.m.s. level in per cent within equal bands of frequency, 0 to π rad a step.", page.origin(sources.source("reports/metrics/generate_probing.json")))
-
-
-def record(sources: Sources) -> Picture:
-    """Every signal of the record, what is masked and what was found strange."""
-    table, quality, title = sources.tables["record"], sources.tables["quality"], "The record, with what was flagged and masked"
-    if isinstance(table, Missing):
-        return hole("record", title, table)
-    machine, time = sources.declared.machine, _elapsed(table, sources.declared.machine.sample_time_s)
-    masked_total = 0
-    halves: list[list[Markup]] = [[], []]
-    for half, signals in enumerate((machine.inputs, machine.outputs)):
-        for i, signal in enumerate(signals):
-            values, masked = table[signal.name], table[f"{signal.name}_masked"]
-            masked_total += int(masked.sum())
-            halves[half].append(_signal(signal, time, values, masked, quality, last=i == len(signals) - 1))
-    recordings = count(len(np.unique(table["recording"])), "recording")
-    text = f"{number(len(time), 0)} samples of {recordings}; {count(masked_total, 'value is', 'values are')} masked and not used. {_found(sources.metrics['ingest'])}"
-    heads = (("Inputs", f"{machine.inputs[0].unit}, as applied"), ("Outputs", "°C, as measured"))
-    shown = [Column(head, small, "", panels) for (head, small), panels in zip(heads, halves, strict=True)]
-    return Picture("record", title, text, shown, "Against time in s, recordings one after the other; at most 480 points a signal, highest and lowest of each stretch kept. Grey: flagged; vermillion: masked.", page.origin(sources.source(RECORD, QUALITY)))
-
-
-def _found(metrics: Any) -> str:
-    quarantined = lookup(metrics, "quarantined")
-    if isinstance(quarantined, Missing):
-        return ""
-    return "No recording is quarantined." if quarantined == 0 else f"{count(quarantined, 'recording is', 'recordings are').capitalize()} quarantined: see the findings."
-
-
-def _elapsed(table: Table, step: float) -> np.ndarray:
-    return step * np.arange(len(table["time_s"]))
-
-
-def _signal(signal, time: np.ndarray, values: np.ndarray, masked: np.ndarray, quality: Table | Missing, *, last: bool) -> Markup:
-    finite = values[np.isfinite(values)]
-    low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
-    frame = charts.Frame(charts.linear(0, float(time[-1]) or 1.0), charts.linear(low, high, ticks=2), width=540, height=70 if last else 56, left=44, below=16 if last else 4, above=13)
-    layers = [charts.line(frame, time, np.where(masked, np.nan, values), "line thin")]
-    stretches = _stretches(masked)
-    layers += [charts.interval(frame, float(time[a]), float(time[b - 1]), "gone") for a, b in stretches[:200]]
-    mine = [] if isinstance(quality, Missing) else np.flatnonzero(quality["signal"] == signal.name)
-    # a flag that spans the record says where it is in words, not in grey over everything
-    short_ones = [i for i in mine if quality["end_s"][i] - quality["start_s"][i] < 0.5 * float(time[-1])]
-    layers = [charts.interval(frame, float(quality["start_s"][i]), float(quality["end_s"][i])) for i in short_ones[:100]] + layers
-    flags = ", ".join(sorted({str(quality["kind"][i]) for i in mine}))
-    alt = f"{signal.name}: {short(low)} to {short(high)} {'°C' if signal.unit == 'degC' else signal.unit}, {count(int(masked.sum()), 'sample')} masked" + (f"; flagged {flags}" if flags else "")
-    return charts.panel(frame, layers, alt=alt, css="mb", title=signal.name + (f": {flags}" if flags else ""), x_ticks=last)
-
-
-def _stretches(mask: np.ndarray) -> list[tuple[int, int]]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
-
-
-def findings(sources: Sources, most: int = 40) -> tuple[list[Mapping[str, str]], int, Missing | None]:
-    """The quality findings as rows, quarantined recordings first, and how many more there are."""
-    table = sources.tables["quality"]
-    if isinstance(table, Missing):
-        return [], 0, table
-    order = sorted(range(len(table["kind"])), key=lambda i: (table["kind"][i] != "quarantined", str(table["recording"][i]), str(table["signal"][i]), str(table["kind"][i]), float(np.nan_to_num(table["start_s"][i]))))
-    rows = [
-        {
-            "recording": str(table["recording"][i]), "signal": str(table["signal"][i]) or "whole recording", "kind": str(table["kind"][i]),
-            "place": "" if np.isnan(table["start_s"][i]) else f"{short(float(table['start_s'][i]), 5)} to {short(float(table['end_s'][i]), 5)}{THIN}s",
-            "count": number(float(table["count"][i]), 0), "message": str(table["message"][i]), "bad": table["kind"][i] == "quarantined",
-        }
-        for i in order[:most]
-    ]  # fmt: skip
-    return rows, max(len(order) - most, 0), None
+    for output in machine.outputs:
+        measured, simulated = (table[f"{output.name}_{kind}"] for kind in ("measured", "simulated"))
+        values = np.concatenate([measured, simulated])
+        values = values[np.isfinite(values)]
+        frame = charts.Frame(
+            charts.linear(0, max(len(measured) - 1, 1) * machine.sample_time_s, ticks=3),
+            charts.linear(float(values.min()), float(values.max()), ticks=3),
+            height=120,
+        )
+        time = machine.sample_time_s * np.arange(len(measured))
+        fit = None if isinstance(fits, Missing) else fits.get(output.name)
+        small = "fit not measured" if fit is None else f"fit {number(fit, 1)}{THIN}%"
+        alt = f"{output.name}: {small} in simulation on the hold-out"
+        layers = [charts.line(frame, time, measured, "line seen"), charts.line(frame, time, simulated, "line thin")]
+        shown.append(Column(output.name, small, "", [charts.panel(frame, layers, alt=alt, css="mb", title="°C" if not shown else "")]))
+    text = "The model runs from the inputs alone; a fit of 100 % would be perfect, 0 % no better than the mean."
+    return Picture(
+        "holdout",
+        title,
+        text,
+        shown,
+        "Grey: measured; ink: simulated from the inputs alone. Time in s.",
+        page.origin(sources.source(HOLDOUT)),
+    )

@@ -18,7 +18,11 @@ MARKS = {"data_driven": "dd", "window": "dd", "model_based": "mb", "baseline": "
 def environment() -> jinja2.Environment:
     """Escapes everything that is not Markup; a name that a template misspells is an error."""
     found = jinja2.Environment(
-        loader=jinja2.PackageLoader("pipeline.report", "templates"), autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=jinja2.PackageLoader("pipeline.report", "templates"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
     found.globals |= {"glyph": glyph, "mark": mark, "bdi": bdi, "origin": origin, "missing": missing, "anchor": anchor}
     found.filters |= {"shortened": digits.shortened, "count": digits.count}

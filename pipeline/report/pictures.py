@@ -1,7 +1,7 @@
 """The figures of the temperature page that show controllers at work: trajectories, errors, cost, inputs, and the learners under noise."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from markupsafe import Markup
@@ -14,7 +14,7 @@ from pipeline.report.verdict import Missing
 
 ORDER = ("model_based", "window", "kernel", "baseline", "exact_model")
 TRAJECTORIES, STUDY = "datasets/evaluate_temperature/trajectories.parquet", "datasets/evaluate_temperature/study.parquet"
-SPAN_S = 60.0
+SPAN_S = 40.0
 
 
 class Column(NamedTuple):
@@ -100,22 +100,39 @@ def trajectories(sources: Sources) -> Picture:
             frame = charts.Frame(charts.linear(0, SPAN_S, ticks=3), y, height=92 if last else 78, below=16 if last else 4)
             values, reference = run.rows[output.name][early], output.reference + offset
             past = float(np.nanmax(np.sign(reference - values[0]) * (values - reference)))
-            alt = f"{LABELS[run.name][0]}, zone {i + 1}: from {number(float(values[0]), 0)} to {number(float(values[-1]), 1)} °C of {reference:g} °C in {SPAN_S:g} s, {number(max(past, 0), 1)} °C past it"
-            layers = [charts.level(frame, reference, "ref"), charts.line(frame, run.time[early], values), charts.label(frame, SPAN_S, y.low, f"zone {i + 1}", anchor="end", dy=-5)]
+            alt = (
+                f"{LABELS[run.name][0]}, zone {i + 1}: from {number(float(values[0]), 0)} to "
+                f"{number(float(values[-1]), 1)} °C of {reference:g} °C in {SPAN_S:g} s, {number(max(past, 0), 1)} "
+                "°C past it"
+            )
+            layers = [
+                charts.level(frame, reference, "ref"),
+                charts.line(frame, run.time[early], values),
+                charts.label(frame, SPAN_S, y.low, f"zone {i + 1}: {reference:g}", anchor="end", dy=-5),
+            ]
             panels.append(charts.panel(frame, layers, alt=alt, css=run.css, title="°C" if i == 0 else "", x_ticks=last))
         return panels
 
     return Picture(
-        "trajectories", title, _reach(found, machine, offset), absent(sources, columns(found, draw)),
-        f"True temperature in °C over the first {SPAN_S:g} s as deployed (inputs clipped, feasible target, integrator); dashed: reference. One run: {featured(sources)}.",
+        "trajectories",
+        title,
+        _reach(found, machine, offset),
+        absent(sources, columns(found, draw)),
+        (
+            f"True temperature in °C over the first {SPAN_S:g} s as deployed (inputs clipped, feasible target, "
+            f"integrator); dashed: reference. One run: {featured(sources)}."
+        ),
         page.origin(sources.source(TRAJECTORIES)),
-    )  # fmt: skip
+    )
 
 
 def _reach(found: list[Run], machine, offset: float) -> str:
     parts = []
     for run in found[:4]:
-        past = max(float(np.nanmax(np.sign(o.reference + offset - run.rows[o.name][0]) * (run.rows[o.name] - o.reference - offset))) for o in machine.outputs)
+        past = max(
+            float(np.nanmax(np.sign(o.reference + offset - run.rows[o.name][0]) * (run.rows[o.name] - o.reference - offset)))
+            for o in machine.outputs
+        )
         parts.append(f"{LABELS[run.name][0]} {number(max(past, 0.0), 1)}{THIN}°C")
     return f"Largest way past a reference in this run: {', '.join(parts)}."
 
@@ -126,7 +143,11 @@ def errors(sources: Sources) -> Picture:
     title = "The worst zone’s error, to the end of the run"
     if isinstance(found, Missing):
         return hole("errors", title, found)
-    machine, offset, limit = sources.declared.machine, sources.declared.panel.judging.reference_offsets_degC[0], sources.declared.rules.settled_error_degC
+    machine, offset, limit = (
+        sources.declared.machine,
+        sources.declared.panel.judging.reference_offsets_degC[0],
+        sources.declared.rules.settled_error_degC,
+    )
     last: dict[str, float] = {}
 
     def draw(run: Run, column: int) -> list[Markup]:
@@ -134,13 +155,31 @@ def errors(sources: Sources) -> Picture:
         frame = charts.Frame(charts.linear(0, float(run.time[-1]), ticks=3), charts.logarithmic(0.01, 300), height=120)
         late = float(np.median(error[2 * len(error) // 3 :]))
         last[LABELS[run.name][0]] = late
-        alt = f"{LABELS[run.name][0]}: worst zone {short(late, 2)} °C from its reference over the last third, {'above' if late > limit else 'below'} the {limit:g} °C limit"
-        layers = [charts.tint(frame, 0.01, limit), charts.level(frame, limit, "lim", f"limit {limit:g}" if column == 0 else ""), charts.line(frame, run.time, error)]
+        alt = (
+            f"{LABELS[run.name][0]}: worst zone {short(late, 2)} °C from its reference over the last third, "
+            f"{'above' if late > limit else 'below'} the {limit:g} °C limit"
+        )
+        layers = [
+            charts.tint(frame, 0.01, limit),
+            charts.level(frame, limit, "lim", f"limit {limit:g}" if column == 0 else ""),
+            charts.line(frame, run.time, error),
+        ]
         return [charts.panel(frame, layers, alt=alt, css=run.css, title="°C, log" if column == 0 else "")]
 
     shown = columns(found, draw)
-    text = f"Median over the last third: {', '.join(f'{name} {short(value, 2)}{THIN}°C' for name, value in last.items())}; the rule allows {limit:g}{THIN}°C of settled error."
-    return Picture("errors", title, text, absent(sources, shown), "Largest distance of a zone from its reference, in °C, log scale, against time in s. Grey: what the rule allows once settled.", page.origin(sources.source(TRAJECTORIES)))
+    text = (
+        "Median over the last third: "
+        f"{', '.join(f'{name} {short(value, 2)}{THIN}°C' for name, value in last.items())}; the rule "
+        f"allows {limit:g}{THIN}°C of settled error."
+    )
+    return Picture(
+        "errors",
+        title,
+        text,
+        absent(sources, shown),
+        "Largest distance of a zone from its reference, in °C, log scale, against time in s. Grey: what the rule allows once settled.",
+        page.origin(sources.source(TRAJECTORIES)),
+    )
 
 
 def costs(sources: Sources) -> Picture:
@@ -151,7 +190,8 @@ def costs(sources: Sources) -> Picture:
         return hole("costs", title, found)
     exact = next((run for run in found if run.name == "exact_model"), None)
     finals = {run.name: float(run.rows["cost"][-1]) for run in found}
-    y = charts.linear(0, 1.08 * max(finals.values()) / 1000)
+    first_step = min(float(run.rows["cost"][0]) for run in found)
+    y = charts.linear(0.97 * first_step / 1000, 1.03 * max(finals.values()) / 1000)
 
     def draw(run: Run, column: int) -> list[Markup]:
         frame = charts.Frame(charts.logarithmic(1, 1000), y, height=120)
@@ -159,17 +199,31 @@ def costs(sources: Sources) -> Picture:
         other = [charts.line(frame, exact.time + 1, exact.rows["cost"] / 1000, "ref")] if exact and run is not exact else []
         above = finals[run.name] / finals["exact_model"] - 1 if exact else 0.0
         text = f"{number(finals[run.name] / 1000, 1)}{f', {_signed(100 * above)}' if exact and run is not exact else ''}"
-        end = charts.label(frame, 1000, finals[run.name] / 1000, text, anchor="end", dy=14 if finals[run.name] / 1000 > 0.85 * y.high else -5)
-        alt = f"{LABELS[run.name][0]}: cost {number(finals[run.name], 0)} after {number(float(run.time[-1]) + 1, 0)} s" + (f", {_signed(100 * above)} against the exact model" if exact else "")
+        end = charts.label(
+            frame, 1000, finals[run.name] / 1000, text, anchor="end", dy=14 if finals[run.name] / 1000 > 0.85 * y.high else -5
+        )
+        alt = f"{LABELS[run.name][0]}: cost {number(finals[run.name], 0)} after {number(float(run.time[-1]) + 1, 0)} s" + (
+            f", {_signed(100 * above)} against the exact model" if exact else ""
+        )
         return [charts.panel(frame, [*other, mine, end], alt=alt, css=run.css, title="thousands" if column == 0 else "")]
 
     shown = columns(found, draw)
     first = float(found[0].rows["cost"][0]) / finals[found[0].name]
     return Picture(
-        "costs", title, f"The first step alone makes {number(100 * first, 0)}{THIN}% of the {LABELS[found[0].name][0].lower()} controller’s cost: the way up is long, whoever steers.", absent(sources, shown),
-        f"Discounted cost at the yardstick’s weights (Q = {sources.declared.tracking.yardstick_q:g} I, R = {sources.declared.tracking.yardstick_r:g} I, γ = {sources.declared.tracking.gamma:g}), unclipped, true outputs, in thousands, against time in s (log). Dashed: exact model.",
+        "costs",
+        title,
+        (
+            f"The first step alone makes {number(100 * first, 0)}{THIN}% of the "
+            f"{LABELS[found[0].name][0].lower()} controller’s cost: the way up is long, whoever steers."
+        ),
+        absent(sources, shown),
+        (
+            f"Discounted cost at the yardstick’s weights (Q = {sources.declared.tracking.yardstick_q:g} I, R = "
+            f"{sources.declared.tracking.yardstick_r:g} I, γ = {sources.declared.tracking.gamma:g}), "
+            "unclipped, true outputs, in thousands, against time in s (log). Dashed: exact model."
+        ),
         page.origin(sources.source(TRAJECTORIES)),
-    )  # fmt: skip
+    )
 
 
 def _signed(value: float) -> str:
@@ -191,25 +245,51 @@ def inputs(sources: Sources) -> Picture:
         panels, early = [], run.time <= SPAN_S
         for i, signal in enumerate(machine.inputs):
             last = i == len(machine.inputs) - 1
-            frame = charts.Frame(charts.linear(0, SPAN_S, ticks=3), y, height=74 if last else 60, below=16 if last else 4, above=10 if i else 14)
+            frame = charts.Frame(
+                charts.linear(0, SPAN_S, ticks=3), y, height=74 if last else 60, below=16 if last else 4, above=10 if i else 14
+            )
             command = run.rows[f"{signal.name}_command"]
             outside = 100 * float(((command < signal.low) | (command > signal.high)).mean())
-            alt = f"{LABELS[run.name][0]}, {signal.name}: asked for {number(float(np.nanmin(command)), 0)} to {number(float(np.nanmax(command)), 0)} %, beyond its limits {number(outside, 1)} % of the time"
-            layers = [charts.tint(frame, signal.low, signal.high), charts.line(frame, run.time[early], command[early], steps=True), charts.label(frame, SPAN_S, y.low, signal.name, anchor="end", dy=-2)]
+            alt = (
+                f"{LABELS[run.name][0]}, {signal.name}: asked for {number(float(np.nanmin(command)), 0)} to "
+                f"{number(float(np.nanmax(command)), 0)} %, beyond its limits {number(outside, 1)} % of the time"
+            )
+            layers = [
+                charts.tint(frame, signal.low, signal.high),
+                charts.line(frame, run.time[early], command[early], steps=True),
+                charts.label(frame, SPAN_S, signal.high, signal.name, anchor="end", dy=10),
+            ]
             panels.append(charts.panel(frame, layers, alt=alt, css=run.css, title="%" if i == 0 else "", x_ticks=last))
         return panels
 
-    free = [(LABELS[run.name][0], lookup(sources.metrics["evaluate_temperature"], f"controllers.{run.name}.outside_limits_percent.median")) for run in found]
+    free = [
+        (LABELS[run.name][0], lookup(sources.metrics["evaluate_temperature"], f"controllers.{run.name}.outside_limits_percent.median"))
+        for run in found
+    ]
     said = ", ".join(f"{name} {number(value, 0)}{THIN}%" for name, value in free if not isinstance(value, Missing))
     return Picture(
-        "inputs", title, f"Left unclipped, as the published law is, the controllers ask for what no machine can give (heat below 0, a motor that cools): {said} of their commands lie outside the limits.",
-        absent(sources, columns(found, draw)), f"Command in per cent over the first {SPAN_S:g} s as deployed; grey: what the machine can give, to which a command is clipped.", page.origin(sources.source(TRAJECTORIES)),
-    )  # fmt: skip
+        "inputs",
+        title,
+        (
+            "Left unclipped, as the published law is, the controllers ask for what no machine can give (heat "
+            f"below 0, a motor that cools): {said} of their commands lie outside the limits."
+        ),
+        absent(sources, columns(found, draw)),
+        (
+            f"Command in per cent over the first {SPAN_S:g} s as deployed; grey: what the machine can give, to "
+            "which a command is clipped. A command far outside runs along the edge."
+        ),
+        page.origin(sources.source(TRAJECTORIES)),
+    )
 
 
 # ---- the learners under noise
 
-ROUTES = {"window": ("Window + Riccati", "dd"), "kernel": ("Kernel, raw window", "dd ring"), "kernel_predicted_state": ("Kernel, predicted state", "dd ring")}
+ROUTES = {
+    "window": ("Window + Riccati", "dd"),
+    "kernel": ("Kernel, raw window", "dd ring"),
+    "kernel_predicted_state": ("Kernel, predicted state", "dd ring"),
+}
 
 
 def noise(sources: Sources) -> Picture:
@@ -218,14 +298,29 @@ def noise(sources: Sources) -> Picture:
     if isinstance(table, Missing):
         return hole("noise", title, table)
     shown = [
-        Column(f"{level:g} °C of noise", "in the data, and under the controller", "", [_cloud(table, level, "gap", 100.0, "gap to the optimum in %, log"), _cloud(table, level, "error_degC", 1.0, "r.m.s. error over steps 500–1000 in °C, log")])
+        Column(
+            f"{level:g} °C of noise",
+            "in the data, and under the controller",
+            "",
+            [
+                _cloud(table, level, "gap", 100.0, "gap to the optimum in %, log"),
+                _cloud(table, level, "error_degC", 1.0, "r.m.s. error over steps 500–1000 in °C, log"),
+            ],
+        )
         for level in np.unique(table["noise_degC"])
-    ]  # fmt: skip
+    ]
     return Picture(
-        "noise", title, _ranking(table), shown,
-        f"Each dot is one of {len(np.unique(table['data_set']))} data sets of 15,000 samples of the study’s probing; the bar is their median. Learned from noisy data, judged on the true plant under the same noise.",
+        "noise",
+        title,
+        _ranking(table),
+        shown,
+        (
+            f"Each dot is one of {len(np.unique(table['data_set']))} data sets of 15,000 samples of the "
+            "study’s probing; the bar is their median. Learned from noisy data, judged on the true plant "
+            "under the same noise."
+        ),
         page.origin(sources.source(STUDY)),
-    )  # fmt: skip
+    )
 
 
 def _cloud(table: Table, level: float, column: str, factor: float, title: str) -> Markup:
@@ -245,11 +340,16 @@ def _cloud(table: Table, level: float, column: str, factor: float, title: str) -
             spread = at + 0.28 * (np.arange(len(mine)) % 5 - 2) / 2
             middle = float(np.median(mine))
             px, top, bottom = float(frame.px(middle)), float(frame.py(at + 0.36)), float(frame.py(at - 0.36))
-            layers += [charts.dots(frame, mine, spread, f"dot {css}"), Markup('<line class="med" x1="{0:.1f}" x2="{0:.1f}" y1="{1:.1f}" y2="{2:.1f}"/>').format(px, top, bottom)]
+            layers += [
+                charts.dots(frame, mine, spread, f"dot {css}"),
+                Markup('<line class="med" x1="{0:.1f}" x2="{0:.1f}" y1="{1:.1f}" y2="{2:.1f}"/>').format(px, top, bottom),
+            ]
             said.append(f"{name} {short(middle, 2)}" + (f" ({failed} unstable)" if failed else ""))
         elif failed:
             said.append(f"{name}: unstable in all {failed}")
-    return charts.panel(frame, layers, alt=f"At {level:g} °C of noise, median {title.split(',')[0]}: {', '.join(said)}", css="dd", title=title)
+    return charts.panel(
+        frame, layers, alt=f"At {level:g} °C of noise, median {title.split(',')[0]}: {', '.join(said)}", css="dd", title=title
+    )
 
 
 def _ranking(table: Table) -> str:
@@ -257,8 +357,9 @@ def _ranking(table: Table) -> str:
     for level in np.unique(table["noise_degC"]):
         medians = {route: float(np.nanmedian(table["gap"][(table["route"] == route) & (table["noise_degC"] == level)])) for route in ROUTES}
         by = medians["kernel"] / medians["window"], medians["kernel_predicted_state"] / medians["window"]
-        parts.append(f"at {level:g} °C the kernel on the raw window costs {number(by[0], 0)} times the window’s gap, on the predicted state {number(by[1], 1)} times")
+        parts.append(
+            f"at {level:g} °C the kernel on the raw window costs {number(by[0], 0)} times the window’s gap, on "
+            f"the predicted state {number(by[1], 1)} times"
+        )
     text = "; ".join(parts)
     return f"{text[:1].upper()}{text[1:]}. All gaps are small; the order of the routes is what stays."
-
-

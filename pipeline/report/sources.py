@@ -35,7 +35,9 @@ class Source(NamedTuple):
 
 
 class Sources(NamedTuple):
-    """`metrics` by stage and `tables` by name, each with a Missing where it could not be read; `read`: what was; `accepted`: the last accepted run, or None."""
+    """`metrics` by stage and `tables` by name, each with a Missing where it could not be read; `read`: what was; `accepted`: the last
+    accepted run, or None.
+    """
 
     declared: Declared
     metrics: Mapping[str, dict | Missing]
@@ -49,7 +51,9 @@ class Sources(NamedTuple):
 
 
 def collect(declared: Declared, metrics: Mapping[str, str], folders: Mapping[str, str], accepted: str, code: tuple[str, ...]) -> Sources:
-    """Reads the metrics files and the folders of stages, {stage: path} each. What is missing or broken is no error here: its place on the page says so."""
+    """Reads the metrics files and the folders of stages, {stage: path} each. What is missing or broken is no error here: its place on
+    the page says so.
+    """
     read: dict[str, Source] = {}
     figures = {stage: _read(read, path, stage, "metrics", artifacts.read_json) for stage, path in metrics.items()}
     tables: dict[str, Table | Missing] = {}
@@ -78,6 +82,8 @@ def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], An
         ("record", "ingest", "record.parquet", *table(schemas.record(machine.inputs, machine.outputs))),
         ("quality", "ingest", "quality.parquet", *table(schemas.QUALITY)),
         ("plant", "identify_plant", "plant.parquet", *arrays("plant")),
+        ("order", "identify_plant", "order.parquet", *table(schemas.ORDER)),
+        ("holdout", "identify_plant", "holdout.parquet", *table(schemas.holdout(machine.outputs))),
         ("window", "learn_kernel", "window.parquet", *arrays("window")),
         ("kernel", "learn_kernel", "kernel.parquet", *arrays("kernel")),
         ("tuning", "tune_weights", "history.parquet", *table(schemas.TUNING)),

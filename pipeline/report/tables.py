@@ -1,18 +1,21 @@
-"""The tables of the temperature page: every controller on the common yardstick, the study's figures as published, panel, weights, and the findings in words."""
+"""The tables of the temperature page: every controller on the common yardstick, the study's figures as published, panel, weights, and
+the findings in words."""
 
 import math
 from typing import Any
 
-
 from pipeline.report.answers import LABELS, all_answers
 from pipeline.report.digits import MINUS, THIN, band, decimals, number, percent, quantity, short
+from pipeline.report.evidence import default_cost
 from pipeline.report.pictures import ORDER
 from pipeline.report.sources import Sources, lookup
 from pipeline.report.verdict import FAILED, UNDECIDED, Figure, Missing, Question, state
 
 EXTRA = (
-    ("tracking_degC", "Tracking error, r.m.s.", "°C"), ("effort_percent", "Effort, r.m.s. input", "%"), ("outside_limits_percent", "Commands outside limits, if unclipped", "%"),
-)  # fmt: skip
+    ("tracking_degC", "Tracking error, r.m.s.", "°C"),
+    ("effort_percent", "Effort, r.m.s. input", "%"),
+    ("outside_limits_percent", "Commands outside limits, if unclipped", "%"),
+)
 
 
 def yardstick(sources: Sources, asked: list[Question]) -> dict[str, Any]:
@@ -25,7 +28,16 @@ def yardstick(sources: Sources, asked: list[Question]) -> dict[str, Any]:
         question = Question(0, key, title, unit, math.inf, False, "")
         rows.append(_row(question, [_extra(sources, name, key) for name in names]))
     stable = [lookup(sources.metrics["evaluate_temperature"], f"controllers.{name}.stable_plants") for name in names]
-    cells = [{"value": s.state if isinstance(s, Missing) else f"{s['count']} of {s['of']}", "band": "", "bad": not isinstance(s, Missing) and s["count"] < s["of"], "best": False, "title": ""} for s in stable]
+    cells = [
+        {
+            "value": s.state if isinstance(s, Missing) else f"{s['count']} of {s['of']}",
+            "band": "",
+            "bad": not isinstance(s, Missing) and s["count"] < s["of"],
+            "best": False,
+            "title": "",
+        }
+        for s in stable
+    ]
     rows.append({"title": "Plants of the spread held stable", "limit": "", "cells": cells})
     return {"heads": heads, "rows": rows}
 
@@ -58,22 +70,46 @@ def _row(question: Question, figures: list[Figure | Missing]) -> dict[str, Any]:
         held = state(question, figure) if math.isfinite(question.limit) else ""
         note = figure.note if question.key in ("data", "settled_error_degC") else ""
         bands = band(figure.low, figure.high, places, beyond=question.beyond)
-        cells.append({
-            "value": quantity(figure.value, question.unit, places, beyond=question.beyond), "band": ", ".join(filter(None, [bands, note.split(" samples")[0], held if held == UNDECIDED else ""])),
-            "bad": held == FAILED, "best": figure.value == best and figure is not figures[-1] and question.key != "data", "title": "",
-        })  # fmt: skip
-    limit = "" if math.isinf(question.limit) else f"{'≥' if question.at_least else '≤'} {quantity(question.limit, question.unit, min(limit_places, 1 if question.limit < 10 else 0))}"
+        cells.append(
+            {
+                "value": quantity(figure.value, question.unit, places, beyond=question.beyond),
+                "band": ", ".join(filter(None, [bands, note.split(" samples")[0], held if held == UNDECIDED else ""])),
+                "bad": held == FAILED,
+                "best": figure.value == best and figure is not figures[-1] and question.key != "data",
+                "title": "",
+            }
+        )
+    limit = (
+        ""
+        if math.isinf(question.limit)
+        else (
+            f"{'≥' if question.at_least else '≤'} "
+            f"{quantity(question.limit, question.unit, min(limit_places, 1 if question.limit < 10 else 0))}"
+        )
+    )
     return {"title": question.title, "limit": limit, "cells": cells}
 
 
 # ---- as published
 
 CONVENTIONS = {
-    "model_based": ("Model-based, Q = R = I", "J counts the observer’s temperatures, not the barrel’s, its first stage twice; the observer starts at 50 °C; “100” is the 100th sample."),
-    "model_based_tuned": ("Model-based, tuned", "The same, and J weighs with the tuned Q and R: another currency. The fifth q is 0.0514, not the printed 0.514."),
-    "data_driven": ("Data-driven, Q = R = I", "Seven start-up steps first drive the barrel to 0 °C, and make 80 % of J; u′Ru is not discounted; all data are divided by 1000."),
+    "model_based": (
+        "Model-based, Q = R = I",
+        (
+            "J counts the observer’s temperatures, not the barrel’s, its first stage twice; the observer "
+            "starts at 50 °C; “100” is the 100th sample."
+        ),
+    ),
+    "model_based_tuned": (
+        "Model-based, tuned",
+        "The same, and J weighs with the tuned Q and R: another currency. The fifth q is 0.0514, not the printed 0.514.",
+    ),
+    "data_driven": (
+        "Data-driven, Q = R = I",
+        "Seven start-up steps first drive the barrel to 0 °C, and make 80 % of J; u′Ru is not discounted; all data are divided by 1000.",
+    ),
     "data_driven_tuned": ("Data-driven, tuned", "The same; J weighs u with R = I although the controller was tuned for another R."),
-}  # fmt: skip
+}
 
 
 def published(sources: Sources) -> dict[str, Any]:
@@ -89,7 +125,9 @@ def published(sources: Sources) -> dict[str, Any]:
             for name, places in (("J100", 1), ("J1000", 1), ("error", 4)):
                 theirs, ours = printed[key][name], found[key][name]
                 off = abs(ours / theirs - 1)
-                cells.append({"printed": number(theirs, places), "ours": number(ours, places), "off": percent(100 * off, 2) if off > 1e-3 else "", "bad": off > 0.01})
+                cells.append(
+                    {"printed": number(theirs, places), "ours": number(ours, places), "off": percent(100 * off, 2) if off > 1e-3 else ""}
+                )
             rows.append({"title": title, "convention": convention, "cells": cells})
     return {"missing": None, "rows": rows}
 
@@ -98,14 +136,22 @@ def honest(sources: Sources) -> list[tuple[str, str]]:
     """The same machine, counted once: true outputs, Q = R = I, from 20 °C."""
     found = sources.metrics["evaluate_temperature"]
     items = (
-        ("optimal.J1000", "Exact optimum, J over 1,000 steps", 1), ("observer.J1000", "Observer started from the first measurement", 1), ("observer.J1000_from_50_degC", "Observer started at 50 °C, as published", 1),
-    )  # fmt: skip
-    rows = [(title, value.state if isinstance(value := lookup(found, key), Missing) else number(value, places)) for key, title, places in items]
+        ("optimal.J1000", "Exact optimum, J over 1,000 steps", 1),
+        ("observer.J1000", "Observer started from the first measurement", 1),
+        ("observer.J1000_from_50_degC", "Observer started at 50 °C, as published", 1),
+    )
+    rows = [
+        (title, value.state if isinstance(value := lookup(found, key), Missing) else number(value, places)) for key, title, places in items
+    ]
     gaps = (
-        ("kernel.gap", "Kernel, noise-free, 500 samples: gap"), ("kernel.gap_window_6", "Kernel, window of 6, 1,610 samples: gap"), ("kernel.any_reference_gap", "Kernel, 20 random references from 540 samples: worst gap"),
+        ("kernel.gap", "Kernel, noise-free, 500 samples: gap"),
+        ("kernel.gap_window_6", "Kernel, window of 6, 1,610 samples: gap"),
+        ("kernel.any_reference_gap", "Kernel, 20 random references from 540 samples: worst gap"),
         ("takeover.zero_history_gap", "Taking over with an empty history: gap"),
-    )  # fmt: skip
-    return rows + [(title, value.state if isinstance(value := lookup(found, key), Missing) else percent(100 * value, 2)) for key, title in gaps]
+    )
+    return rows + [
+        (title, value.state if isinstance(value := lookup(found, key), Missing) else percent(100 * value, 2)) for key, title in gaps
+    ]
 
 
 # ---- what was declared
@@ -119,13 +165,22 @@ def panel(sources: Sources) -> list[tuple[str, str]]:
         return ", ".join(short(float(v), 4).replace("-", MINUS) for v in values) + (THIN + unit if unit else "")
 
     def half(part) -> str:
-        return f"held at {listed(part.starts_degC, '°C')}; references {listed(part.reference_offsets_degC, '°C')} off the ones below; seeds {', '.join(map(str, part.seeds))}"
+        return (
+            f"held at {listed(part.starts_degC, '°C')}; references {listed(part.reference_offsets_degC, '°C')} "
+            f"off the ones below; seeds {', '.join(map(str, part.seeds))}"
+        )
 
     plants = lookup(sources.tables["summary"], "plants")
     simulated = sources.declared.everything.get("generate_probing", {}).get("source") == "simulated"
     spread = f"each column of B by 1 ± {p.input_gain:g} and A {MINUS} {p.loss:g} I" if simulated else "the identified model’s uncertainty"
     return [
-        ("Judged on", f"{'' if isinstance(plants, Missing) else f'{plants} plants: '}{'the study’s machine and ' if simulated else ''}its spread, {spread}"),
+        (
+            "Judged on",
+            (
+                f"{'' if isinstance(plants, Missing) else f'{plants} plants: '}{'the study’s machine and ' if simulated else ''}its "
+                f"spread, {spread}"
+            ),
+        ),
         ("Judging half", half(p.judging)),
         ("Training half", f"{half(p.training)}; weights are tuned here and nowhere else"),
         ("References", ", ".join(f"{o.name} {o.reference:g}" for o in machine.outputs) + f"{THIN}°C"),
@@ -133,7 +188,14 @@ def panel(sources: Sources) -> list[tuple[str, str]]:
         ("Run", f"{p.hold_steps} steps of watching the plant held, then {number(p.steps, 0)} steps of {machine.sample_time_s:g}{THIN}s"),
         ("Settled", f"every zone within {p.band_degC:g}{THIN}°C for good; the settled error is the mean of the last third"),
         ("Yardstick", f"Q = {tracking.yardstick_q:g} I, R = {tracking.yardstick_r:g} I, γ = {tracking.gamma:g}, true outputs"),
-        ("As deployed", f"commands clipped to {min(i.low for i in machine.inputs):g} to {max(i.high for i in machine.inputs):g}{THIN}%; feasible target; outer integrator {tracking.integral:g} a step on errors up to {tracking.integral_limit_degC:g}{THIN}°C"),
+        (
+            "As deployed",
+            (
+                f"commands clipped to {min(i.low for i in machine.inputs):g} to "
+                f"{max(i.high for i in machine.inputs):g}{THIN}%; feasible target; outer integrator "
+                f"{tracking.integral:g} a step on errors up to {tracking.integral_limit_degC:g}{THIN}°C"
+            ),
+        ),
     ]
 
 
@@ -146,8 +208,9 @@ def weights(sources: Sources) -> dict[str, Any]:
     names = {"practical": "practical, deployed", "parity": "the study’s objective"}
     rows = [
         {"title": names[mode], "q": [short(v, 2) for v in found[mode]["q"]], "r": [short(v, 2) for v in found[mode]["r"]]}
-        for mode in names if mode in found and len(found[mode]["q"]) == len(heads[0]) and len(found[mode]["r"]) == len(heads[1])
-    ]  # fmt: skip
+        for mode in names
+        if mode in found and len(found[mode]["q"]) == len(heads[0]) and len(found[mode]["r"]) == len(heads[1])
+    ]
     return {"missing": None, "heads": heads, "rows": rows}
 
 
@@ -159,9 +222,25 @@ def findings(sources: Sources) -> list[tuple[str, str]]:
     evaluated, tuned = sources.metrics["evaluate_temperature"], sources.metrics["tune_weights"]
     found = [_claim(sources), _scaled(tuned), _algorithm_1(evaluated), _start(evaluated), _regret(tuned)]
     units = sources.declared.machine.sample_time_s
-    found.append(("Units are our convention.", f"The study names no unit of time and none of duty. Here a step is {units:g}{THIN}s and inputs are in per cent; read seconds as steps."))
+    found.append(
+        (
+            "Units are our convention.",
+            (
+                f"The study names no unit of time and none of duty. Here a step is {units:g}{THIN}s and inputs are "
+                "in per cent; read seconds as steps."
+            ),
+        )
+    )
     if sources.declared.everything.get("generate_probing", {}).get("source") == "simulated":
-        found.append(("The probing is simulated, the judging is separate.", "The record comes from the study’s machine, simulated within limits; every controller is judged on plants that nothing was fitted to. None of it is a claim about a real printer."))
+        found.append(
+            (
+                "The probing is simulated, the judging is separate.",
+                (
+                    "The record comes from the study’s machine, simulated within limits; every controller is judged "
+                    "on plants that nothing was fitted to. None of it is a claim about a real printer."
+                ),
+            )
+        )
     return [item for item in found if item]
 
 
@@ -173,7 +252,11 @@ def _claim(sources: Sources) -> tuple[str, str] | None:
     data = 100 * (1 - printed["data_driven_tuned"]["J100"] / printed["data_driven"]["J100"])
     return (
         f"“{number(model, 1)} % and {number(data, 1)} % better after tuning” compares two currencies.",
-        "The cost before tuning is counted with Q = R = I, the cost after it with the tuned, smaller weights. The objective that was tuned is the cost at Q = R = I, whose optimum is Q = R = I: no weights can be better.",
+        (
+            "The cost before tuning is counted with Q = R = I, the cost after it with the tuned, smaller "
+            "weights. The objective that was tuned is the cost at Q = R = I, whose optimum is Q = R = I: no "
+            "weights can be better."
+        ),
     )
 
 
@@ -181,33 +264,47 @@ def _scaled(tuned: Any) -> tuple[str, str]:
     change, apart = lookup(tuned, "parity.scaled_weights.change_percent"), lookup(tuned, "parity.scaled_weights.gain_difference")
     if isinstance(change, Missing) or isinstance(apart, Missing):
         return "The same controller, “improved”.", "Not measured: tune_weights did not try Q = R = 0.4 I."
-    return f"Q = R = 0.4 I “improves” the cost by {number(abs(change), 1)} % without changing the controller.", f"Its gain differs from that of Q = R = I by {short(apart, 1)}, which is rounding; every temperature and every input is the same."
+    return (
+        f"Q = R = 0.4 I “improves” the cost by {number(abs(change), 1)} % without changing the controller.",
+        f"Its gain differs from that of Q = R = I by {short(apart, 1)}, which is rounding; every temperature and every input is the same.",
+    )
 
 
 def _algorithm_1(evaluated: Any) -> tuple[str, str]:
     failed, of = lookup(evaluated, "algorithm_1.failures"), lookup(evaluated, "algorithm_1.of")
     if isinstance(failed, Missing) or isinstance(of, Missing):
         return "Algorithm 1 from random starts.", "Not measured."
-    return f"Algorithm 1 as published misses the stabilising gain in {failed} of {of} random starts.", "It has no guard against a start that does not stabilise. The controllers here take the Riccati equation’s solution instead, which needs no start."
+    return (
+        f"Algorithm 1 as published misses the stabilising gain in {failed} of {of} random starts.",
+        (
+            "It has no guard against a start that does not stabilise. The controllers here take the Riccati "
+            "equation’s solution instead, which needs no start."
+        ),
+    )
 
 
 def _start(evaluated: Any) -> tuple[str, str]:
     best, late = lookup(evaluated, "optimal.J1000"), lookup(evaluated, "observer.J1000_from_50_degC")
     if isinstance(best, Missing) or isinstance(late, Missing):
         return "Where the observer starts.", "Not measured."
-    return f"Starting the observer at 50 °C costs {percent(100 * (late / best - 1), 2)} for nothing.", "Starting it from the first measurement costs next to nothing, and asks for nothing that is not known."
+    return (
+        f"Starting the observer at 50 °C costs {percent(100 * (late / best - 1), 2)} for nothing.",
+        "Starting it from the first measurement costs next to nothing, and asks for nothing that is not known.",
+    )
 
 
 def _regret(tuned: Any) -> tuple[str, str]:
-    regret, cost, identity = (lookup(tuned, f"practical.{key}") for key in ("regret_identity", "cost", "cost_identity"))
+    regret, cost, identity = lookup(tuned, "practical.regret_identity"), lookup(tuned, "practical.cost"), default_cost(tuned)
     if any(isinstance(v, Missing) for v in (regret, cost, identity)):
         return "What tuning buys.", "Not measured."
     return (
         f"Practical tuning lowers the engineering cost by {percent(100 * (1 - cost / identity), 2)}, and says what it pays.",
-        f"On the common yardstick the tuned weights cost {percent(100 * regret, 2)} more than equal weights: settling, overshoot and limits are bought with quadratic cost. Unclipped gaps on these pages are at equal weights, all else is as deployed, with the tuned ones.",
+        f"On the common yardstick the tuned weights cost {percent(100 * regret, 2)} more than the default ones: settling, overshoot and "
+        + (
+            "limits are bought with quadratic cost. Gaps on these pages are at the yardstick’s weights, "
+            "unclipped; everything else is as deployed."
+        ),
     )
-
-
 
 
 def identified(sources: Sources) -> list[tuple[str, str]]:
@@ -215,13 +312,48 @@ def identified(sources: Sources) -> list[tuple[str, str]]:
     found = sources.metrics["identify_plant"]
     if isinstance(found, Missing):
         return [("Model", f"{found.state}: {found.sentence()}")]
-    rows = [(title, str(found[key])) for key, title in (("order", "Order"), ("past", "Past samples used"), ("rows", "Rows of the regression"), ("dropped_rows", "Rows left out")) if key in found]
+    rows = [
+        (title, str(found[key]))
+        for key, title in (
+            ("order", "Order"),
+            ("past", "Past samples used"),
+            ("rows", "Rows of the regression"),
+            ("dropped_rows", "Rows left out"),
+        )
+        if key in found
+    ]
     fit = found.get("fit_holdout")
     if isinstance(fit, dict):
-        rows.append(("Fit on the hold-out", ", ".join(f"{name} {number(value, 1)}{THIN}%" if isinstance(value, int | float) else f"{name} {value}" for name, value in fit.items())))
+        rows.append(
+            (
+                "Fit on the hold-out",
+                ", ".join(
+                    f"{name} {number(value, 1)}{THIN}%" if isinstance(value, int | float) else f"{name} {value}"
+                    for name, value in fit.items()
+                ),
+            )
+        )
     else:
         rows.append(("Fit on the hold-out", "not measured"))
+    ahead = found.get("fit_holdout_ahead")
+    if isinstance(ahead, dict):
+        rows.append(
+            (
+                f"Fit {found.get('ahead_steps', '')} steps ahead",
+                ", ".join(f"{name} {number(value, 1)}{THIN}%" for name, value in ahead.items()),
+            )
+        )
     white = found.get("whiteness_passed")
-    words = {True: "passed: what the model leaves over looks like noise", False: "failed: the model leaves something over that it should explain"}
-    rows.append(("Whiteness of the residuals", words.get(white, "not measured") if not isinstance(white, dict) else ", ".join(f"{k} {'passed' if v else 'failed'}" for k, v in white.items())))
-    return rows + [("Note", str(note)) for note in found.get("notes") or []]
+    words = {
+        True: "passed: what the model leaves over looks like noise",
+        False: "failed: the model leaves something over that it should explain",
+    }
+    rows.append(
+        (
+            "Whiteness of the residuals",
+            words.get(white, "not measured")
+            if not isinstance(white, dict)
+            else ", ".join(f"{k} {'passed' if v else 'failed'}" for k, v in white.items()),
+        )
+    )
+    return rows + [(title, str(note)) for key, title in (("notes", "Note"), ("advice", "Advice")) for note in found.get(key) or []]

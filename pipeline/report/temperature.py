@@ -1,21 +1,58 @@
 """The page of the temperature loop: verdict, tables, findings, figures, what was declared, words, provenance."""
 
-from pipeline.report import evidence, index, page, pictures, tables, words
+from pipeline.report import evidence, index, page, pictures, recording, tables, words
+from pipeline.report.answers import featured, repetitions
+from pipeline.report.judgement import Judgement
 from pipeline.report.sources import Sources
 
-WORDS = ("model_based", "window", "kernel", "baseline", "exact_model", "study", "gap", "band", "settled", "at_limits", "margin_disk", "margin_delay", "spread", "worst", "data", "step")
+WORDS = (
+    "model_based",
+    "window",
+    "kernel",
+    "baseline",
+    "exact_model",
+    "study",
+    "gap",
+    "band",
+    "settled",
+    "at_limits",
+    "margin_disk",
+    "margin_delay",
+    "spread",
+    "worst",
+    "data",
+    "step",
+)
 
 
-def render(sources: Sources, judged: index.Judgement) -> str:
+def render(sources: Sources, judged: Judgement) -> str:
     """reports/temperature.html."""
-    flaws, more, no_quality = evidence.findings(sources)
+    flaws, more, no_quality = recording.findings(sources)
     return page.render(
-        "temperature.html", here="temperature", title=f"Temperature: {judged.verdict.decision.rstrip('.')}", verdict=index.verdict_parts(judged), featured=index.featured(sources),
-        repetitions=index.repetitions(sources), yardstick=tables.yardstick(sources, judged.asked), published=tables.published(sources), honest=tables.honest(sources),
-        findings=tables.findings(sources), at_work=[pictures.trajectories(sources), pictures.errors(sources), pictures.costs(sources), pictures.inputs(sources)],
-        learning=[pictures.noise(sources), evidence.orders(sources), evidence.tuning(sources)], record=[evidence.excitation(sources), evidence.record(sources)],
-        flaws=flaws, more=more, no_quality=no_quality, panel=tables.panel(sources), weights=tables.weights(sources), identified=tables.identified(sources),
-        words=words.chosen(sources, WORDS), sources=list(sources.read.values()), hashes=index.hashes(sources),
-        from_scorecard=sources.source("datasets/evaluate_temperature/scorecard.parquet", "reports/metrics/evaluate_temperature.json"), from_metrics=sources.source("reports/metrics/evaluate_temperature.json"),
-        from_weights=sources.source("datasets/tune_weights/weights.json"), from_model=sources.source("reports/metrics/identify_plant.json", "datasets/identify_plant/plant.parquet"),
-    )  # fmt: skip
+        "temperature.html",
+        here="temperature",
+        title=f"Temperature: {judged.verdict.decision.rstrip('.')}",
+        verdict=index.verdict_parts(judged),
+        featured=featured(sources),
+        repetitions=repetitions(sources),
+        yardstick=tables.yardstick(sources, judged.asked),
+        published=tables.published(sources),
+        honest=tables.honest(sources),
+        findings=tables.findings(sources),
+        at_work=[pictures.trajectories(sources), pictures.errors(sources), pictures.costs(sources), pictures.inputs(sources)],
+        learning=[pictures.noise(sources), evidence.orders(sources), evidence.holdout(sources), evidence.tuning(sources)],
+        record=[recording.excitation(sources), recording.record(sources)],
+        flaws=flaws,
+        more=more,
+        no_quality=no_quality,
+        panel=tables.panel(sources),
+        weights=tables.weights(sources),
+        identified=tables.identified(sources),
+        words=words.chosen(sources, WORDS),
+        sources=list(sources.read.values()),
+        hashes=index.hashes(sources),
+        from_scorecard=sources.source("datasets/evaluate_temperature/scorecard.parquet", "reports/metrics/evaluate_temperature.json"),
+        from_metrics=sources.source("reports/metrics/evaluate_temperature.json"),
+        from_weights=sources.source("datasets/tune_weights/weights.json"),
+        from_model=sources.source("reports/metrics/identify_plant.json", "datasets/identify_plant/plant.parquet"),
+    )

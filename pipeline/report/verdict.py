@@ -26,7 +26,9 @@ class ReportRules(params.Section):
 
 
 class Figure(NamedTuple):
-    """A median and its 90 % band; infinite where a run never settles, or no delay breaks a loop. `runs` are the repetitions behind them, where they are known."""
+    """A median and its 90 % band; infinite where a run never settles, or no delay breaks a loop. `runs` are the repetitions behind them,
+    where they are known.
+    """
 
     value: float
     low: float
@@ -52,7 +54,9 @@ def _ended(text: str) -> str:
 
 
 class Question(NamedTuple):
-    """One row of page one: the answer's number, the figure's key, what is asked, its unit, its limit, and which of the five rules it belongs to."""
+    """One row of page one: the answer's number, the figure's key, what is asked, its unit, its limit, and which of the five rules it
+    belongs to.
+    """
 
     answer: int
     key: str
@@ -200,7 +204,11 @@ def _deploy(
         ((q, answers[best][q.key]) for q in asked if q.rule != "data sufficiency"), key=lambda pair: -share(pair[0], _worst_end(*pair))
     )
     places = decimals(figure.low, figure.high, value=figure.value)
-    closest = f"closest to its limit: {_name(question)}, {quantity(figure.value, question.unit, places, beyond=question.beyond)} of {_rule_allows(question, places)}."
+    closest = (
+        f"closest to its limit: {_name(question)}, "
+        f"{quantity(figure.value, question.unit, places, beyond=question.beyond)} of "
+        f"{_rule_allows(question, places)}."
+    )
     remedy = "" if whole else "Drift is not measured: the nightly job measures it once the controller runs."
     if best != "data_driven":
         remedy = f"The data-driven controller passes too, but is no better. {remedy}"
@@ -246,7 +254,9 @@ def reason(question: Question | None, answers: Answers) -> str:
     value, limit = (quantity(v, question.unit, places, beyond=question.beyond) for v in (figure.value, question.limit))
     said = {
         "gap_percent": f"It costs {value} more than the optimum; the rule allows {limit}.",
-        "settled_error_degC": f"{figure.note[:1].upper()}{figure.note[1:] or 'The worst zone'} settles {value} from its reference; the rule allows {limit}.",
+        "settled_error_degC": (
+            f"{figure.note[:1].upper()}{figure.note[1:] or 'The worst zone'} settles {value} from its reference; the rule allows {limit}."
+        ),
         "settling_s": f"It {'never settles' if math.isinf(figure.value) else f'needs {value} to settle'}; the rule allows {limit}.",
         "overshoot_degC": f"It overshoots by {value}; the rule allows {limit}.",
         "at_limits_percent": f"Its commands lie beyond the limits {value} of the time; the rule allows {limit}.",
@@ -258,7 +268,9 @@ def reason(question: Question | None, answers: Answers) -> str:
 
 
 def undecided(question: Question, figure: Figure) -> str:
-    """What more runs would do for a band that straddles its limit: enough of them tell, at 95 %, whether more than one run in twenty lies outside."""
+    """What more runs would do for a band that straddles its limit: enough of them tell, at 95 %, whether more than one run in twenty
+    lies outside.
+    """
     places = decimals(figure.low, figure.high, value=figure.value)
     straddles = f"Its band, {band(figure.low, figure.high, places, beyond=question.beyond)}, straddles that"
     runs = len(figure.runs)

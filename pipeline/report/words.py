@@ -5,30 +5,68 @@ from pipeline.report.sources import Sources
 INDEX = ("gap", "band", "passed", "settled", "margin_disk", "margin_delay", "spread", "worst", "data", "accepted")
 
 
+FIXED = {
+    "gap": (
+        "Gap to the optimum",
+        "How much more a controller costs than the best possible one on the same plant, from the same start, judged by true temperatures.",
+    ),
+    "band": (
+        "Band",
+        "The range that holds a figure in 90 of 100 repetitions: other starts, references and noise on the nominal plant. "
+        + "Of a margin it is the range over the plants of the spread; of the worst case, over the noise.",
+    ),
+    "passed": (
+        "Passed",
+        "The whole band lies inside the limit. Failed: the whole band lies outside. Undecided: it straddles the limit, and does not pass.",
+    ),
+    "margin_disk": (
+        "Disk margin",
+        "Change of gain and phase, in all channels at once, that the loop bears before it oscillates; 0.4 bears gains from 2/3 to 3/2.",
+    ),
+    "margin_delay": ("Delay margin", "Extra delay of all sensors, in seconds, that the loop bears before it oscillates."),
+    "worst": ("Worst case", "The largest gap over all plants of the spread, starts and references."),
+    "data": (
+        "Samples needed",
+        "So many that a controller learned from them costs no more than learn_kernel.allowed_gap_percent above the best, "
+        + "and no fewer than it has unknowns to learn.",
+    ),
+    "accepted": ("Accepted run", "The last run that a person marked as good with ./run beadline accept."),
+    "at_limits": ("Time at limits", "Share of all commands beyond what the machine can give; they are clipped to it."),
+    "model_based": (
+        "Model-based",
+        "A plant model is identified from the record; an observer estimates its state, and the Riccati equation gives the gains.",
+    ),
+    "window": (
+        "Data-driven, window",
+        "A long window of past inputs and outputs predicts the next output; the Riccati equation does the rest. No order, no state to choose.",
+    ),
+    "kernel": (
+        "Kernel",
+        "Algorithm 2 of the study: the value of state and action is fitted to the record directly, and the gain is read off it.",
+    ),
+    "baseline": ("Baseline", "One PI controller a zone, tuned by SIMC from the identified model, with the same feasible target."),
+    "exact_model": ("Exact model", "The model-based controller, told the true plant: what a perfect identification would give."),
+    "study": ("The study", "The published work whose method this is; “as published” repeats its own way of counting, digit by digit."),
+}
+
+
 def glossary(sources: Sources) -> dict[str, tuple[str, str]]:
     """{key: (word, meaning)}; figures in a meaning are those of params.yaml."""
     panel, machine = sources.declared.panel, sources.declared.machine
-    gain, loss = f"{100 * panel.input_gain:g} %", f"{panel.loss:g}"
-    return {
-        "gap": ("Gap to the optimum", "How much more a controller costs than the best possible one on the same plant, in per cent, from the same start, judged by true temperatures."),
-        "band": ("Band", "The range that holds a figure in 90 of 100 repetitions: other starts, references and sensor noise on the nominal plant. Of a margin it is the range over the plants of the spread; of the worst case, over the noise."),
-        "passed": ("Passed", "The whole band lies inside the limit. Failed: the whole band lies outside. A band that straddles the limit is undecided and does not pass."),
-        "settled": ("Settled error", f"Mean distance from the reference over the last third of {panel.steps} steps, for the zone where it is largest."),
-        "margin_disk": ("Disk margin", "Change of gain and phase, in all channels at once, that the loop bears before it oscillates; 0.4 bears gains from 2/3 to 3/2. Larger is safer."),
-        "margin_delay": ("Delay margin", "Extra delay of all sensors, in seconds, that the loop bears before it oscillates. Larger is safer."),
-        "spread": ("Plant spread", f"Plants on which nothing was fitted: each column of B by 1 ± {gain}, and A less {loss} I (more heat lost)."),
-        "worst": ("Worst case", "The largest gap over all plants of the spread, starts and references."),
-        "data": ("Samples needed", "So many that a controller learned from them costs no more than learn_kernel.allowed_gap_percent above the best, and no fewer than it has unknowns to learn."),
-        "accepted": ("Accepted run", "The last run that a person marked as good with ./run beadline accept."),
-        "at_limits": ("Time at limits", "Share of all commands beyond what the machine can give; they are clipped to it."),
+    simulated = sources.declared.everything.get("generate_probing", {}).get("source") == "simulated"
+    spread = (
+        f"Plants on which nothing was fitted: each column of B by 1 ± {100 * panel.input_gain:g} %, and A less {panel.loss:g} I (more heat lost)."
+        if simulated
+        else "Plants within the uncertainty of the identified model, of another order than the model."
+    )
+    return FIXED | {
+        "settled": (
+            "Settled error",
+            f"Mean distance from the reference over the last third of {panel.steps} steps, for the zone where it is largest.",
+        ),
+        "spread": ("Plant spread", spread),
         "step": ("Step", f"One sample of the controller, {machine.sample_time_s:g} s here."),
-        "model_based": ("Model-based", "A plant model is identified from the record; an observer estimates its state, and the Riccati equation gives the gains."),
-        "window": ("Data-driven, window", "A long window of past inputs and outputs predicts the next output; the Riccati equation does the rest. No order, no state to choose."),
-        "kernel": ("Kernel", "Algorithm 2 of the study: the value of state and action is fitted to the record directly, and the gain is read off it."),
-        "baseline": ("Baseline", "One PI controller a zone, tuned by SIMC from the identified model, with the same feasible target and anti-windup."),
-        "exact_model": ("Exact model", "The model-based controller, told the true plant: what a perfect identification would give. Not for sale."),
-        "study": ("The study", "The published work whose method this is; \"as published\" repeats its own way of counting, digit by digit."),
-    }  # fmt: skip
+    }
 
 
 def chosen(sources: Sources, keys: tuple[str, ...]) -> list[tuple[str, str]]:

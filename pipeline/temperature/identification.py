@@ -37,7 +37,10 @@ WIDEST = 360  # columns of the lagged record: the cost of a fit grows with their
 
 
 class Identified(NamedTuple):
-    """An identified plant and how it was chosen. order: states without those of the delays; past: window; order_table: candidates with their errors."""
+    """An identified plant and how it was chosen. order: states without those of the delays; past: window; order_table: candidates with their errors.
+
+    x0 has the initial state of each segment, or of each piece where masked inputs cut one (`gapless`).
+    """
 
     plant: Plant
     order: int
@@ -72,6 +75,25 @@ def check_inputs(u: Segments, *, offset: bool = True) -> None:
             raise ValueError(
                 f"input u{j + 1} is a linear combination of {others}, so its column of B is not identified; move it independently, or leave it out"
             )
+
+
+def gapless(u: Segments, y: Segments) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """The segments cut where an input is masked: no plant can be run over an unknown input. Pieces of one sample, or without a single y, are dropped."""
+    us, ys = [], []
+    for a, b in zip(u, y, strict=True):
+        edges = np.flatnonzero(np.diff(np.r_[0, np.isfinite(a).all(axis=1), 0]))
+        for start, stop in zip(edges[::2], edges[1::2], strict=True):
+            if stop - start > 1 and np.isfinite(b[start:stop]).any():
+                us.append(a[start:stop])
+                ys.append(b[start:stop])
+    return us, ys
+
+
+def longest_window(u: Segments, y: Segments) -> int:
+    """Most lags that leave four complete windows for each unknown of a VARX model, within the width that is paid for."""
+    q, lengths = u[0].shape[1] + y[0].shape[1], np.array([len(w) for w in complete_runs(u, y)])
+    supported = [past for past in range(2, WIDEST // q + 1) if np.maximum(lengths - past, 0).sum() >= 4 * q * past]
+    return max(supported, default=2)
 
 
 def choose_past(data: Lagged) -> tuple[int, bool]:
@@ -139,12 +161,14 @@ def identify(
     """
     u, y = [np.atleast_2d(a) for a in u], [np.atleast_2d(b) for b in y]
     _check_shapes(u, y)
-    check_inputs(u, offset=offset)
     m, p = u[0].shape[1], y[0].shape[1]
-    q, samples = m + p, sum(len(w) for w in complete_runs(u, y))
-    _check_length(samples, order, m, p)
-    notes: list[str] = []
-    longest = max(min(WIDEST // q, samples // (4 * q)), 2)
+    whole = sum(map(len, u))
+    u, y = gapless(u, y)
+    cut = whole - sum(map(len, u))
+    _check_length(sum(len(w) for w in complete_runs(u, y)), order, m, p)
+    check_inputs(u, offset=offset)
+    notes = [f"{cut} samples with a masked input, or without any output, were cut out"] if cut else []
+    longest = longest_window(u, y)
     exact = False
     if past is None:
         past, exact = choose_past(lagged(u, y, min(longest, 6), offset=offset))  # a few lags tell whether the record is noise-free
@@ -162,7 +186,8 @@ def identify(
     elif order is None or refinement == "validated":
         chosen, table = _choose(u, y, data, sub, edge, order, max_order, blocks, refinement == "validated", settings)
         order, delays, kind = chosen.order, chosen.delays, chosen.fit if refinement == "validated" else kind
-    return _fit_all(u, y, data, sub, edge, order, delays, kind, method, settings, sample_time_s, table, notes)
+    found = _fit_all(u, y, data, sub, edge, order, delays, kind, method, settings, sample_time_s, table, notes)
+    return found._replace(dropped_rows=found.dropped_rows + cut)
 
 
 def _choose(u, y, data, sub, edge, order, max_order, blocks, validated, settings) -> tuple[Candidate, list[Candidate]]:
@@ -170,7 +195,7 @@ def _choose(u, y, data, sub, edge, order, max_order, blocks, validated, settings
     m = data.m
     if order is None:
         largest = max(1, min(int((sub.singular_values > edge).sum()), max_order, len(sub.singular_values)))
-        orders = range(1, min(largest + 1, max_order, len(sub.singular_values)) + 1)
+        orders = range(1, largest + 1)
         delays = sorted({(0,) * m, dead_time(realise(data, sub.basis[:largest], 1.0), max(data.past // 2, 1))})
     else:
         orders, delays = [order], [(0,) * m]

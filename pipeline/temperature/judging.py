@@ -289,13 +289,19 @@ def trajectories(
 
 
 def engineering_objective(
-    plant: Plant, scenarios: Panel, *, gamma: float, limits: Limits, band: float, integral: float, integral_limit: float, allowance: Allowance
+    plant: Plant, scenarios: Panel, *, gamma: float, limits: Limits, band: float, integral: float, integral_limit: float, allowance: Allowance, least_disk_margin: float
 ) -> Callable[[np.ndarray], float]:  # fmt: skip
-    """Practical tuning's cost of theta = [q; r; tau]: weights and observer of the model's controller, deployed on the training panel, counted by `allowance`."""
+    """Practical tuning's cost of theta = [q; r; tau]: weights and observer of the model's controller, deployed on the training panel, counted by `allowance`.
+
+    A candidate whose disk margin on its own model is below `least_disk_margin` fails: figures in simulation are no reason to give robustness away.
+    """
     aims, p, m = targets(plant, scenarios.r, limits), plant.p, plant.m
 
     def objective(theta: np.ndarray) -> float:
         law = model_based(plant, gamma, tau=theta[-1]).design(theta[:p], theta[p : p + m], integral)
+        disk = margins([plant], law, grid=80)[0].disk
+        if disk < least_disk_margin:
+            raise ValueError(f"the disk margin is {disk:.2f}, below the least of {least_disk_margin:.2f}")
         run = simulate(scenarios, law, feed_forward(scenarios, law, aims), limits=limits, integral_band=integral_limit)
         found = figures(scenarios, run, limits=limits, band=band, sample_time_s=plant.sample_time_s)
         return engineering_cost(found, scenarios.plant, allowance, longest_s=scenarios.steps * plant.sample_time_s)

@@ -81,19 +81,23 @@ def simulation_errors(plant: Plant, u: Segments, y: Segments) -> np.ndarray:
 
 
 def folds(u: Segments, y: Segments, count: int) -> list[tuple[list, list, list, list]]:
-    """(u, y, u left out, y left out) with one of `count` blocks of each segment left out in turn; what remains on either side are segments of their own."""
+    """(u, y, u left out, y left out) with one of `count` blocks of each segment left out in turn; what remains on either side are segments of their own.
+
+    Segments too short to be cut into blocks of 10 samples are left out whole, every count-th of them in turn.
+    """
     out = []
     for k in range(count):
         fold = ([], [], [], [])
-        for a, b in zip(u, y, strict=True):
+        for s, (a, b) in enumerate(zip(u, y, strict=True)):
             start, stop = len(a) * k // count, len(a) * (k + 1) // count
-            for part in (slice(0, start), slice(stop, len(a))):
+            if len(a) < 10 * count:
+                start, stop = (0, len(a)) if s % count == k else (0, 0)
+            for part, at in ((slice(0, start), 0), (slice(stop, len(a)), 0), (slice(start, stop), 2)):
                 if part.stop > part.start:
-                    fold[0].append(a[part])
-                    fold[1].append(b[part])
-            fold[2].append(a[start:stop])
-            fold[3].append(b[start:stop])
-        out.append(fold)
+                    fold[at].append(a[part])
+                    fold[at + 1].append(b[part])
+        if fold[2] and any(np.isfinite(b).any() for b in fold[3]):
+            out.append(fold)
     return out
 
 

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg.lapack
 
 from pipeline.temperature.kernel import Tuples, window_law, window_shift, windows
 from pipeline.temperature.plant import Plant, observability_matrix
@@ -43,7 +44,7 @@ def learn(u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, longest: int, off
     lags = [np.r_[lag * m : (lag + 1) * m, longest * m + lag * p : longest * m + (lag + 1) * p] for lag in range(longest)]
     order = np.concatenate(lags)
     columns = np.hstack([np.ones((samples, int(offset))), w[:, order], y_now])
-    triangle = np.linalg.qr(columns, mode="r")
+    triangle = _triangle(columns)
     table = np.array(
         [_criterion(triangle, offset, N, m, p, samples) for N in range(1, longest + 1) if 2 * (offset + N * (m + p)) < samples]
     )
@@ -57,6 +58,14 @@ def learn(u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, longest: int, off
     Theta[:, : N * m] = by_lag[:, :m].transpose(2, 0, 1).reshape(p, N * m)
     Theta[:, N * m :] = by_lag[:, m:].transpose(2, 0, 1).reshape(p, N * p)
     return Window(Theta, solution[0] if offset else np.zeros(p), rest.T @ rest / (samples - k), N, samples, table)
+
+
+def _triangle(columns: np.ndarray) -> np.ndarray:
+    """R of the QR factorisation: by Cholesky from the moments where those keep enough digits (a noisy record), by Householder reflections otherwise."""
+    size = np.sqrt(np.einsum("ij,ij->j", columns, columns))
+    size[size == 0] = 1.0
+    factor, failed = scipy.linalg.lapack.dpotrf((columns.T @ columns) / size / size[:, None], lower=0, clean=1)
+    return factor * size if not failed and np.diag(factor).min() > 1e-4 else np.linalg.qr(columns, mode="r")
 
 
 def _own_moments(triangle: np.ndarray, offset: bool, m: int, p: int) -> np.ndarray:
@@ -105,21 +114,21 @@ def predicted_tuples(window: Window, u: Sequence[np.ndarray], y: Sequence[np.nda
     model = predictor(window)
     free = observability_matrix(model.A, model.C, horizon)
     centre = w.mean(axis=0) * offset
-    root = np.linalg.qr(w - centre, mode="r").T / np.sqrt(len(w))
-    left, sv, _ = np.linalg.svd(free @ root, full_matrices=False)
+    power, axes = np.linalg.eigh((w - centre).T @ (w - centre) / len(w))
+    left, sv, _ = np.linalg.svd(free @ (axes * np.sqrt(np.maximum(power, 0.0))), full_matrices=False)
     noise = np.sqrt(np.diag(window.covariance).max())
-    order = int((sv > np.maximum(2 * noise, 1e-9 * sv[0])).sum())
+    order = int((sv > np.maximum(2 * noise, 1e-7 * sv[0])).sum())
     if order == 0:
         raise ValueError("the window predicts nothing beyond the noise of the sensors; probe with a larger amplitude, or record longer")
     T = left[:, :order].T @ free / sv[:order, None]
     A, B_u, B_y = window_shift(u_now.shape[1], y_now.shape[1], window.N)
-    w_next = w @ A.T + u_now @ B_u.T + y_now @ B_y.T
+    x_next = w @ (T @ A).T + u_now @ (T @ B_u).T + y_now @ (T @ B_y).T - T @ centre
     one = np.ones((len(w), int(offset)))
     features = np.zeros((order + offset, w.shape[1] + 1))
     features[:order, :-1], features[:order, -1], features[order:, -1] = T, -T @ centre, 1.0
     base = y_now.mean(axis=0) * offset
     return Tuples(
-        np.hstack([(w - centre) @ T.T, one]), u_now, y_now - base, np.hstack([(w_next - centre) @ T.T, one]), features, window.N, base
+        np.hstack([(w - centre) @ T.T, one]), u_now, y_now - base, np.hstack([x_next, one]), features, window.N, base
     )
 
 

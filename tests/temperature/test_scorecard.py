@@ -306,9 +306,10 @@ def test_every_controller_is_judged_on_the_same_scenarios(judged):
     found, all_of_them = judged
     assert [j.name for j in all_of_them] == ["model_based", "window", "kernel", "baseline", "exact_model"]
     by_name = {j.name: j for j in all_of_them}
-    np.testing.assert_array_equal(by_name["model_based"].regret, by_name["exact_model"].regret)  # here the model is the truth
     nominal = (found.plant == 0) & (found.noise == 0)
-    assert by_name["exact_model"].regret[nominal].max() < by_name["window"].regret[nominal].max() < by_name["baseline"].regret[nominal].max()
+    assert by_name["exact_model"].regret[nominal].max() < 1e-6  # it is not told the state
+    assert by_name["window"].regret[nominal].max() < by_name["baseline"].regret[nominal].max()
+    assert by_name["kernel"].regret[nominal].max() < by_name["baseline"].regret[nominal].max()
     for j in all_of_them:
         assert (j.regret > -1e-9).all(), j.name
         assert (j.deployed.u >= LIMITS[0]).all(), j.name
@@ -351,7 +352,7 @@ def test_rows_and_trajectories_hold_one_line_each(judged):
 
 def test_a_longer_record_is_asked_for_where_noise_costs_too_much(learned):
     u, y, long = learned
-    ask = {"start": 20.0, "reference": REFERENCE, "allowed": 0.01, "offset": False, "steps": 200}
+    ask = {"start": 20.0, "reference": REFERENCE, "allowed": 0.01, "offset": False, "gain_spread": 0.0, "steps": 200}
     enough = judging.sufficiency([u], [y], long, YARDSTICK, **ask)
     assert 0 < enough.half_gap < 0.01
     assert enough.samples == long.samples

@@ -18,6 +18,7 @@ from pipeline.temperature.tracking import (
     observer_law,
     policy_iteration,
     riccati,
+    robust_observer_gain,
     stabilises,
     stein,
 )
@@ -173,6 +174,17 @@ def test_the_observer_follows_the_state_of_a_plant_with_offsets():
         z = law.A @ z + law.B_u @ u[t] + law.B_y @ y[t] + law.c
     slowest = np.abs(np.linalg.eigvals(law.A)).max()
     assert np.abs(z - x[400]).max() < 100 * slowest**400 + 1e-12  # the error decays as the slowest pole of A - L C
+
+
+@pytest.mark.parametrize("tau", [1e-3, 1.0, 1e3])
+def test_the_robust_observer_is_stable_and_the_same_in_any_coordinates(tau):
+    machine = baam()
+    L, V = robust_observer_gain(machine, tau), np.random.default_rng(0).normal(size=(6, 6))
+    assert np.abs(np.linalg.eigvals(machine.A - L @ machine.C)).max() < 1
+    other = machine._replace(A=V @ machine.A @ np.linalg.inv(V), B=V @ machine.B, C=machine.C @ np.linalg.inv(V))
+    np.testing.assert_allclose(robust_observer_gain(other, tau), V @ L, atol=1e-6)  # rounding times the square of the condition of V, 1e3
+    P = scipy.linalg.solve_discrete_are(machine.A.T, machine.C.T, machine.B @ machine.B.T, tau * I5)
+    np.testing.assert_allclose(L, machine.A @ P @ machine.C.T @ np.linalg.inv(machine.C @ P @ machine.C.T + tau * I5), atol=1e-8)  # scipy's rounding
 
 
 def test_a_feasible_reference_is_hit_exactly_with_every_input_off_its_limits():

@@ -50,6 +50,17 @@ def test_one_factorisation_gives_the_least_squares_fit_of_its_window(record):
     np.testing.assert_allclose(found.covariance, rest.T @ rest / (len(w) - columns.shape[1]), rtol=1e-8)
 
 
+def test_a_spread_of_gains_adds_to_each_input_its_own_moments(record):
+    u, y = record[0][:900], noisy(record[1], 0.5)[:900]
+    found = learn([u], [y], longest=3, gain_spread=0.2)
+    w, _, y_now = windows([u[3 - found.N :]], [y[3 - found.N :]], found.N)
+    own = np.zeros((found.N * 12,) * 2)
+    own[: found.N * 7, : found.N * 7] = np.kron(np.ones((found.N, found.N)), np.eye(7))  # lags of one input with one another, no two inputs
+    moments = w.T @ w
+    np.testing.assert_allclose(found.Theta.T, np.linalg.solve(moments + 0.04 * own * moments, w.T @ y_now), atol=1e-8)  # rounding times a condition of 1e5
+    assert np.abs(found.Theta - learn([u], [y], longest=3).Theta).max() > 1e-3
+
+
 def test_the_table_holds_akaike_s_criterion(record):
     u, y = record[0][:900], noisy(record[1], 0.5)[:900]
     found = learn([u], [y], longest=4)

@@ -1,0 +1,232 @@
+"""The stage on a small project: what the pages say, what they do with missing and hostile input, their size, and that equal inputs give equal bytes."""
+
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline import artifacts
+from stages.report import main
+from tests.report import conftest as made
+
+INDEX, TEMPERATURE = Path("reports/index.html"), Path("reports/temperature.html")
+
+
+class Page(HTMLParser):
+    """Tags with attributes, ids, text, and the addresses that a page points to."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.tags, self.ids, self.links, self.words = [], [], [], []
+        self.feed(path.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag, attributes):
+        found = dict(attributes)
+        self.tags.append((tag, found))
+        self.ids += [found["id"]] if "id" in found else []
+        self.links += [found[key] for key in ("href", "src", "xlink:href", "action", "data", "poster", "srcset") if found.get(key)]
+
+    def handle_data(self, data):
+        self.words.append(data)
+
+    @property
+    def text(self):
+        return " ".join(" ".join(self.words).split())
+
+
+def figures():
+    return json.loads(Path("reports/metrics/report.json").read_text())
+
+
+def change(stage, **values):
+    """Metrics of a stage with some dotted keys changed."""
+    found = artifacts.read_metrics(stage)
+    for dotted, value in values.items():
+        *path, last = dotted.split("__")
+        place = found
+        for key in path:
+            place = place[key]
+        place[last] = value
+    artifacts.write_metrics(stage, found)
+
+
+def test_equal_inputs_give_equal_bytes(project):
+    main()
+    first = INDEX.read_bytes(), TEMPERATURE.read_bytes(), Path("reports/metrics/report.json").read_bytes()
+    main()
+    assert first == (INDEX.read_bytes(), TEMPERATURE.read_bytes(), Path("reports/metrics/report.json").read_bytes())
+
+
+def test_page_one_holds_the_twelve_answers_in_order_and_its_title_is_the_verdict(project):
+    main()
+    text = INDEX.read_text(encoding="utf-8")
+    numbers = [int(n) for n in re.findall(r'<td role="cell" class="n">(\d+)</td>', text)]
+    assert numbers == list(range(2, 13))
+    decision = re.search(r"<h1>(.*?)</h1>", text)[1]
+    assert decision.rstrip(".") in re.search(r"<title>(.*?)</title>", text)[1]
+
+
+def test_a_failed_rule_fails_the_verdict_and_its_row_only(project):
+    change("evaluate_temperature", controllers__window__settled_error_degC=made.figure(0.72, 0.61, 0.84, zone=1))
+    main()
+    page = Page(INDEX).text
+    assert "Do not deploy the data‑driven temperature controller." in page
+    assert "First failed rule: settled error. Zone 2 settles 0.72\u202f°C from its reference; the rule allows 0.50\u202f°C." in page
+    assert INDEX.read_text().count('class="fail ') == 1
+    assert figures()["verdict"]["winner"] == "model_based"
+
+
+def test_the_worst_case_is_the_largest_gap_over_plants_with_its_band_over_seeds(project):
+    made.write(project, worst={"window": 110.0})
+    main()
+    found = figures()["figures"]["window"]["worst_case_gap_percent"]
+    # by hand: 110 (0.01 + 0.99 + 0.0001 seed), seeds 1, 2, 3
+    np.testing.assert_allclose([found["low"], found["median"], found["high"]], [110.011, 110.022, 110.033], rtol=1e-12)
+    assert figures()["verdict"]["rule"] == "limits"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "datasets/evaluate_temperature/scorecard.parquet", "datasets/evaluate_temperature/trajectories.parquet", "datasets/evaluate_temperature/study.parquet",
+        "datasets/evaluate_temperature/summary.json", "datasets/learn_kernel/kernel.parquet", "datasets/learn_kernel/window.parquet",
+        "datasets/identify_plant/plant.parquet", "datasets/identify_plant/order.parquet", "datasets/identify_plant/holdout.parquet",
+        "datasets/tune_weights/history.parquet", "datasets/tune_weights/weights.json", "datasets/ingest/record.parquet", "datasets/ingest/quality.parquet",
+        "reports/metrics/generate_probing.json", "reports/metrics/ingest.json", "reports/metrics/identify_plant.json", "reports/metrics/learn_kernel.json",
+        "reports/metrics/tune_weights.json", "reports/metrics/evaluate_temperature.json",
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("how", ["missing", "broken"])
+def test_an_artifact_that_is_missing_or_broken_is_said_so_in_its_place(project, path, how):
+    main()
+    whole = INDEX.read_text() + TEMPERATURE.read_text()
+    if how == "missing":
+        Path(path).unlink()
+    else:
+        Path(path).write_bytes(b"{")
+    main()
+    text = INDEX.read_text() + TEMPERATURE.read_text()
+    assert f'<tr id="from-{re.sub("[^a-z0-9]", "-", path.lower())}">' in whole.replace("from-reports-metrics", "from-reports-metrics").lower()
+    assert path not in figures()["read"]
+    assert len(re.findall("not measured|failed", text.lower())) > len(re.findall("not measured|failed", whole.lower()))
+
+
+def test_with_nothing_at_all_the_pages_are_there_and_every_place_says_not_measured(project):
+    for path in [*Path("datasets").rglob("*.parquet"), *Path("datasets").rglob("*.json"), *Path("reports/metrics").glob("*.json")]:
+        path.unlink()
+    main()
+    page = Page(INDEX).text
+    assert "Do not decide yet." in page
+    assert figures()["verdict"]["winner"] is None
+    assert Page(TEMPERATURE).text.lower().count("not measured") > 10
+
+
+def test_a_kernel_that_was_refused_is_shown_as_failed_with_its_sentence(project):
+    change("learn_kernel", refused="the record does not determine the kernel; record longer", samples_needed=None)
+    Path("datasets/learn_kernel/kernel.parquet").unlink()
+    for stage in ("evaluate_temperature",):
+        found = artifacts.read_metrics(stage)
+        del found["controllers"]["kernel"]
+        artifacts.write_metrics(stage, found)
+    main()
+    assert "failed: the record does not determine the kernel; record longer" in Page(INDEX).text
+    assert "Failed. the record does not determine the kernel; record longer." in Page(TEMPERATURE).text
+
+
+def test_never_settling_is_said_in_words(project):
+    change("evaluate_temperature", controllers__window__settling_s={"median": None, "low": 12.0, "high": None, "worst": None})
+    main()
+    text = INDEX.read_text()
+    assert '<span class="v">never</span><span class="b">12 to never</span>' in text
+
+
+def test_hostile_text_from_the_data_is_escaped_and_isolated(project):
+    main()
+    for path in (INDEX, TEMPERATURE):
+        page = Page(path)
+        assert not any(tag in ("script", "img", "iframe", "object", "embed") for tag, _ in page.tags)
+        assert not any(name.startswith("on") for _, attributes in page.tags for name in attributes)
+    text = TEMPERATURE.read_text(encoding="utf-8")
+    assert "&lt;script&gt;" in text
+    for found in re.finditer("&lt;script&gt;", text):
+        before = text[: found.start()]
+        assert before.rfind("<bdi") > before.rfind("</bdi>")
+
+
+def test_no_address_leaves_the_folder_and_every_link_leads_somewhere(project):
+    main()
+    pages = {path.name: Page(path) for path in (INDEX, TEMPERATURE)}
+    for name, page in pages.items():
+        assert len(page.ids) == len(set(page.ids)), name
+        for link in page.links:
+            file, _, place = link.partition("#")
+            assert (file or name) in pages, link
+            assert not place or place in pages[file or name].ids, link
+        css = " ".join(re.findall(r"<style>(.*?)</style>", (Path("reports") / name).read_text(), re.S))
+        assert not re.search(r"url\(|@import|https?:", css)
+
+
+def test_every_picture_states_something_and_no_figure_is_nan(project):
+    main()
+    for path in (INDEX, TEMPERATURE):
+        for tag, attributes in Page(path).tags:
+            if tag == "svg" and attributes.get("role") == "img":
+                assert re.search(r"\d|not measured|failed", attributes["aria-label"]), attributes["aria-label"]
+        assert not re.search(r"\bnan\b|\binf\b|None", path.read_text(), re.I)
+
+
+def test_a_long_record_is_thinned_and_keeps_its_peak(project):
+    machine = made.declared(project)
+    columns = made.record(machine, 200_000, "long.mcap")
+    columns["zone_1"][123_456] = 999.0
+    artifacts.write_table("datasets/ingest/record.parquet", made.schemas.record(machine.inputs, machine.outputs), columns)
+    main()
+    size = figures()["bytes"]
+    # the limits of the pages: 1 MB and 1.5 MB
+    assert size["index"] <= 1_000_000 and size["temperature"] <= 1_500_000
+    assert "zone_1: 40.0 to 999" in TEMPERATURE.read_text()
+
+
+def test_first_run_equal_runs_and_a_moved_figure(project):
+    main()
+    assert "First run: nothing to compare with." in Page(INDEX).text
+    accepted = {
+        "metrics": {path.stem: artifacts.read_json(path) for path in Path("reports/metrics").glob("*.json")},
+        "params": made.params.read("params.yaml"),
+        "hashes": {str(p): artifacts.sha256(p) for p in Path("datasets").rglob("*") if p.is_file()} | {f: artifacts.sha256(f) for f in ("pipeline", "stages")},
+    }
+    artifacts.write_json("reports/accepted.json", accepted)
+    main()
+    page = Page(INDEX).text
+    assert "Nothing changed; no figure moved." in page
+    assert "first run" not in page
+
+    change("evaluate_temperature", controllers__window__settled_error_degC=made.figure(0.45, 0.41, 0.49, zone=0))
+    change("evaluate_temperature", controllers__window__settling_s=made.figure(2.0, 1.0, 3.0))
+    change("evaluate_temperature", controllers__window__overshoot_degC=made.figure(0.6, 0.4, 1.0))
+    Path("params.yaml").write_text(Path("params.yaml").read_text().replace("gap_percent: 5.0", "gap_percent: 6.0", 1))
+    Path("pipeline/code.py").write_text("2\n")
+    main()
+    page = Page(INDEX).text
+    assert "2 of 9 figures moved beyond their noise: worst settled zone error worse, settling to within 1 °C better." in page.replace("\xa0", " ")
+    assert "+0.35\u202f°C · worse" in page and "within noise" in page
+    assert "report.gap_percent 5.0 → 6.0" in page
+    assert re.search("Code changed", page)
+
+
+def test_a_broken_accepted_run_is_said_so(project):
+    Path("reports/accepted.json").write_text("{")
+    main()
+    assert "The accepted run cannot be read." in Page(INDEX).text
+    Path("reports/accepted.json").write_text("{}")
+    main()
+    assert "First run: nothing to compare with." in Page(INDEX).text
+
+
+def test_a_signal_of_another_schema_is_shown_as_failed_not_read(project):
+    artifacts.write_arrays("datasets/learn_kernel/window.parquet", "other", 1, {"table": (np.eye(3), "1", "criterion")})
+    main()
+    assert "Failed. datasets/learn_kernel/window.parquet holds schema other version 1 but window version 1 is expected" in Page(TEMPERATURE).text
