@@ -36,6 +36,8 @@ def main() -> None:
         tests, excited = validation.residual_tests(chosen.plant, *last), validation.excitation(first[0], chosen.past)
         advice = validation.advice(tests, excited, fit, outputs=outputs, inputs=inputs)
         found = identification.identify(u, y, order=chosen.order, past=chosen.past, **settings)
+        if not (observed := plant.observability(found.plant)).passed:
+            raise ValueError(f"datasets/ingest/record.parquet: {observed.reason}")
         family = validation.bootstrap_spread(u, y, found, count=p.spread_plants, order=found.order + 1, rng=np.random.default_rng(p.seed))
         simulated = [validation.simulated(chosen.plant, us, ys) for us, ys in zip(*last, strict=True)]
         artifacts.write_arrays(out / "plant.parquet", "plant", 1, plant.stored([found.plant]))
@@ -46,7 +48,7 @@ def main() -> None:
             "order": found.order, "past": found.past, "fit": found.fit, "rows": found.rows, "dropped_rows": found.dropped_rows, "notes": [*chosen.notes, *found.notes],
             "fit_holdout": dict(zip(outputs, fit, strict=True)), "fit_holdout_ahead": dict(zip(outputs, ahead, strict=True)), "ahead_steps": p.ahead_steps,
             "whiteness_passed": dict(zip(outputs, tests.whiteness_passed, strict=True)), "excitation": {"rank": excited.rank, "full": excited.full, "condition": excited.condition},
-            "largest_pole": np.abs(np.linalg.eigvals(found.plant.A)).max(), "advice": advice,
+            "controllable": plant.controllability(found.plant).passed, "largest_pole": np.abs(np.linalg.eigvals(found.plant.A)).max(), "advice": advice,
         }  # fmt: skip
         artifacts.write_metrics("identify_plant", metrics)
 

@@ -62,7 +62,9 @@ def _zone(sources: Sources, found: Mapping) -> str:
 def _noise(sources: Sources) -> float:
     """The noise level that the figures were judged at, in °C."""
     found = lookup(sources.tables["summary"], "noise_degC")
-    return sources.declared.panel.noise_degC[-1] if isinstance(found, Missing) else found
+    if not isinstance(found, Missing):
+        return found
+    return sources.declared.everything.get("evaluate_temperature", {}).get("report_noise_degC", sources.declared.panel.noise_degC[0])
 
 
 def _mine(table: Table, name: str, noise: float) -> np.ndarray:

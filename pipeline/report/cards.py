@@ -69,7 +69,7 @@ def _win(judged: Judgement) -> tuple[str, str]:
     best = judged.verdict.winner
     settled = next(q for q in judged.asked if q.key == "settled_error_degC")
     if best is None:
-        return "None wins.", "No controller passes its rules."
+        return "No controller wins.", "Not one of them passes its rules."
     mine = judged.roles[best]["settled_error_degC"]
     places = row_places(settled, [mine])
     holds = f"It holds every zone within {quantity(mine.high, '°C', places)} of its reference."

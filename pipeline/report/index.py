@@ -38,6 +38,7 @@ def render(sources: Sources, judged: Judgement) -> str:
         difference=difference_parts(sources, judged),
         words=words.chosen(sources, words.INDEX),
         sources=list(sources.read.values()),
+        absent=sources.absent,
         code=sources.code,
         here="index",
     )

@@ -1,4 +1,4 @@
-"""The figures of the temperature page that show controllers at work: trajectories, errors, cost, inputs, and the learners under noise."""
+"""The figures of the temperature page that show controllers at work: trajectories, errors, cost and inputs."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from pipeline.report.sources import Sources, Table, lookup
 from pipeline.report.verdict import Missing
 
 ORDER = ("model_based", "window", "kernel", "baseline", "exact_model")
-TRAJECTORIES, STUDY = "datasets/evaluate_temperature/trajectories.parquet", "datasets/evaluate_temperature/study.parquet"
+TRAJECTORIES = "datasets/evaluate_temperature/trajectories.parquet"
 SPAN_S = 40.0
 
 
@@ -281,85 +281,3 @@ def inputs(sources: Sources) -> Picture:
         ),
         page.origin(sources.source(TRAJECTORIES)),
     )
-
-
-# ---- the learners under noise
-
-ROUTES = {
-    "window": ("Window + Riccati", "dd"),
-    "kernel": ("Kernel, raw window", "dd ring"),
-    "kernel_predicted_state": ("Kernel, predicted state", "dd ring"),
-}
-
-
-def noise(sources: Sources) -> Picture:
-    """Gap and error of each route, a dot a data set."""
-    table, title = sources.tables["study"], "What noise costs the learners"
-    if isinstance(table, Missing):
-        return hole("noise", title, table)
-    shown = [
-        Column(
-            f"{level:g} °C of noise",
-            "in the data, and under the controller",
-            "",
-            [
-                _cloud(table, level, "gap", 100.0, "gap to the optimum in %, log"),
-                _cloud(table, level, "error_degC", 1.0, "r.m.s. error over steps 500–1000 in °C, log"),
-            ],
-        )
-        for level in np.unique(table["noise_degC"])
-    ]
-    return Picture(
-        "noise",
-        title,
-        _ranking(table),
-        shown,
-        (
-            f"Each dot is one of {len(np.unique(table['data_set']))} data sets of 15,000 samples of the "
-            "study’s probing; the bar is their median. Learned from noisy data, judged on the true plant "
-            "under the same noise."
-        ),
-        page.origin(sources.source(STUDY)),
-    )
-
-
-def _cloud(table: Table, level: float, column: str, factor: float, title: str) -> Markup:
-    values = factor * np.abs(table[column])
-    positive = values[np.isfinite(values) & (values > 0)]
-    x = charts.logarithmic(float(positive.min()), float(positive.max()))
-    y = charts.Axis(-0.5, len(ROUTES) - 0.5, ())
-    frame = charts.Frame(x, y, width=440, height=120, left=128, below=18, above=18, right=10)
-    layers, said = [], []
-    for lane, (route, (name, css)) in enumerate(ROUTES.items()):
-        at = len(ROUTES) - 1 - lane
-        mine = values[(table["route"] == route) & (table["noise_degC"] == level)]
-        failed = int((~np.isfinite(mine)).sum())
-        mine = mine[np.isfinite(mine)]
-        layers.append(charts.label(frame, x.low, at, name, anchor="end", dx=-8, dy=3.5))
-        if len(mine):
-            spread = at + 0.28 * (np.arange(len(mine)) % 5 - 2) / 2
-            middle = float(np.median(mine))
-            px, top, bottom = float(frame.px(middle)), float(frame.py(at + 0.36)), float(frame.py(at - 0.36))
-            layers += [
-                charts.dots(frame, mine, spread, f"dot {css}"),
-                Markup('<line class="med" x1="{0:.1f}" x2="{0:.1f}" y1="{1:.1f}" y2="{2:.1f}"/>').format(px, top, bottom),
-            ]
-            said.append(f"{name} {short(middle, 2)}" + (f" ({failed} unstable)" if failed else ""))
-        elif failed:
-            said.append(f"{name}: unstable in all {failed}")
-    return charts.panel(
-        frame, layers, alt=f"At {level:g} °C of noise, median {title.split(',')[0]}: {', '.join(said)}", css="dd", title=title
-    )
-
-
-def _ranking(table: Table) -> str:
-    parts = []
-    for level in np.unique(table["noise_degC"]):
-        medians = {route: float(np.nanmedian(table["gap"][(table["route"] == route) & (table["noise_degC"] == level)])) for route in ROUTES}
-        by = medians["kernel"] / medians["window"], medians["kernel_predicted_state"] / medians["window"]
-        parts.append(
-            f"at {level:g} °C the kernel on the raw window costs {number(by[0], 0)} times the window’s gap, on "
-            f"the predicted state {number(by[1], 1)} times"
-        )
-    text = "; ".join(parts)
-    return f"{text[:1].upper()}{text[1:]}. All gaps are small; the order of the routes is what stays."

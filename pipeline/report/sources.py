@@ -35,14 +35,15 @@ class Source(NamedTuple):
 
 
 class Sources(NamedTuple):
-    """`metrics` by stage and `tables` by name, each with a Missing where it could not be read; `read`: what was; `accepted`: the last
-    accepted run, or None.
+    """`metrics` by stage and `tables` by name, each with a Missing where it could not be read; `read`: what was;
+    `absent`: what was not, by path; `accepted`: the last accepted run, or None.
     """
 
     declared: Declared
     metrics: Mapping[str, dict | Missing]
     tables: Mapping[str, Table | Missing]
     read: Mapping[str, Source]
+    absent: Mapping[str, Missing]
     accepted: dict | Missing | None
     code: str
 
@@ -55,13 +56,16 @@ def collect(declared: Declared, metrics: Mapping[str, str], folders: Mapping[str
     the page says so.
     """
     read: dict[str, Source] = {}
-    figures = {stage: _read(read, path, stage, "metrics", artifacts.read_json) for stage, path in metrics.items()}
-    tables: dict[str, Table | Missing] = {}
-    for name, stage, file, kind, reader in _tables(declared.machine):
-        if stage in folders:
-            tables[name] = _read(read, f"{folders[stage]}/{file}", stage, kind, reader)
+    wanted = [(path, stage, stage, "metrics", artifacts.read_json) for stage, path in metrics.items()]
+    tables = _tables(declared.machine)
+    wanted += [(f"{folders[stage]}/{file}", name, stage, kind, reader) for name, stage, file, kind, reader in tables]
+    found = {(path, name): _read(read, path, stage, kind, reader) for path, name, stage, kind, reader in wanted}
+    absent = {path: value for (path, _), value in found.items() if isinstance(value, Missing)}
+    by_name = [
+        {name: value for (_, name), value in part} for part in (list(found.items())[: len(metrics)], list(found.items())[len(metrics) :])
+    ]
     before = _read({}, accepted, "accept", "accepted", artifacts.read_json) if artifacts.exists(accepted) else None
-    return Sources(declared, figures, tables, read, before or None, digest({folder: artifacts.sha256(folder) for folder in code}))
+    return Sources(declared, *by_name, read, absent, before or None, digest({folder: artifacts.sha256(folder) for folder in code}))
 
 
 def digest(data: Any) -> str:

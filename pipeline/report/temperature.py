@@ -1,6 +1,6 @@
 """The page of the temperature loop: verdict, tables, findings, figures, what was declared, words, provenance."""
 
-from pipeline.report import evidence, index, page, pictures, recording, tables, words
+from pipeline.report import evidence, findings, index, page, pictures, recording, tables, words
 from pipeline.report.answers import featured, repetitions
 from pipeline.report.judgement import Judgement
 from pipeline.report.sources import Sources
@@ -38,9 +38,9 @@ def render(sources: Sources, judged: Judgement) -> str:
         yardstick=tables.yardstick(sources, judged.asked),
         published=tables.published(sources),
         honest=tables.honest(sources),
-        findings=tables.findings(sources),
+        findings=findings.findings(sources),
         at_work=[pictures.trajectories(sources), pictures.errors(sources), pictures.costs(sources), pictures.inputs(sources)],
-        learning=[pictures.noise(sources), evidence.orders(sources), evidence.holdout(sources), evidence.tuning(sources)],
+        learning=[evidence.noise(sources), evidence.orders(sources), evidence.holdout(sources), evidence.tuning(sources)],
         record=[recording.excitation(sources), recording.record(sources)],
         flaws=flaws,
         more=more,
@@ -50,6 +50,7 @@ def render(sources: Sources, judged: Judgement) -> str:
         identified=tables.identified(sources),
         words=words.chosen(sources, WORDS),
         sources=list(sources.read.values()),
+        absent=sources.absent,
         hashes=index.hashes(sources),
         from_scorecard=sources.source("datasets/evaluate_temperature/scorecard.parquet", "reports/metrics/evaluate_temperature.json"),
         from_metrics=sources.source("reports/metrics/evaluate_temperature.json"),

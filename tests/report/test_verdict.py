@@ -5,7 +5,21 @@ import math
 import pytest
 
 from pipeline import params
-from pipeline.report.verdict import FAILED, OPEN, PASSED, UNDECIDED, Figure, Missing, ReportRules, decide, questions, share, state, undecided, winner
+from pipeline.report.verdict import (
+    FAILED,
+    OPEN,
+    PASSED,
+    UNDECIDED,
+    Figure,
+    Missing,
+    ReportRules,
+    decide,
+    questions,
+    share,
+    state,
+    undecided,
+    winner,
+)
 
 RULES = ReportRules(
     gap_percent=5.0, settled_error_degC=0.5, settling_s=60.0, overshoot_degC=5.0, at_limits_percent=10.0, disk_margin=0.4, delay_margin_s=1.0, worst_case_gap_percent=50.0,
@@ -78,7 +92,9 @@ def test_open_says_what_is_missing_and_how_much_more_of_it():
     undecided_data = decide("temperature", ASKED, roles(data_driven=short_record))
     assert (undecided_data.state, undecided_data.lead) == (FAILED, "First failed rule: data sufficiency.")
     assert undecided_data.reason == "700 of 1,610 samples; record 910 more."
-    unmeasured = decide("temperature", ASKED, roles(data_driven=answers(gap_percent=Missing("not measured", "The scorecard is not there", "Run it"))))
+    unmeasured = decide(
+        "temperature", ASKED, roles(data_driven=answers(gap_percent=Missing("not measured", "The scorecard is not there", "Run it")))
+    )
     assert (unmeasured.state, unmeasured.decision) == (OPEN, "Do not decide yet.")
     assert unmeasured.reason == "The scorecard is not there. Run it."
     assert unmeasured.remedy.startswith("Until then keep the model-based controller")
@@ -94,7 +110,10 @@ def test_where_no_controller_passes_it_says_so_and_names_the_first_rule_of_each(
 def test_the_winner_has_the_smallest_settled_error_and_within_noise_the_smallest_gap():
     assert winner(ASKED, roles(baseline=answers(settled_error_degC=Figure(0.1, 0.09, 0.11)))) == "baseline"
     assert winner(ASKED, roles(model_based=answers(gap_percent=Figure(0.1, 0.09, 0.11)))) == "model_based"
-    assert winner(ASKED, roles(data_driven=answers(gap_percent=Figure(9.0, 8.0, 10.0)), model_based=answers(disk=Figure(0.1, 0.1, 0.1)))) == "baseline"
+    assert (
+        winner(ASKED, roles(data_driven=answers(gap_percent=Figure(9.0, 8.0, 10.0)), model_based=answers(disk=Figure(0.1, 0.1, 0.1))))
+        == "baseline"
+    )
 
 
 def test_where_the_better_controller_is_the_other_one_the_verdict_deploys_that():

@@ -119,6 +119,12 @@ def test_the_memory_is_fed_with_what_was_applied():
     np.testing.assert_allclose(run.command[0], 150 - 0.5 * found.u0, rtol=1e-12)  # the window holds the steady input
 
 
+def test_a_cost_counts_true_outputs_and_applied_inputs():
+    found = scenarios(steps=3)
+    run = Run(np.tile(REFERENCE + 2.0, (3, 1, 1)), np.full((3, 1, 7), 500.0), np.full((3, 1, 7), 100.0))
+    assert cost(found, run, YARDSTICK).J[0] == pytest.approx((1 + 0.99 + 0.99**2) * (5 * 4.0 + 7 * 1e4), rel=1e-14)
+
+
 def test_a_law_aimed_at_the_hold_does_not_move_it():
     found = scenarios(references=[baam().C @ np.full(6, 20.0)], hold=10)
     learned = window_law(np.random.default_rng(0).normal(size=(7, 24)) * 0.01, I7[:, :5], np.zeros(7), 2)

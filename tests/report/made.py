@@ -1,0 +1,185 @@
+"""A small project with every artifact that the pages show, made by hand: two inputs, two zones, five controllers."""
+
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from pipeline import artifacts, params, schemas
+
+ROOT = Path(__file__).resolve().parents[2]
+CONTROLLERS = ("model_based", "window", "kernel", "baseline", "exact_model")
+HOSTILE = '"><script>alert(1)</script><img src=http://evil.example/x onerror=alert(2)>\u202egpj.mcap'
+
+
+def figure(median, low, high, **more):
+    return {"median": median, "low": low, "high": high, "worst": high, **more}
+
+
+def controller(gap=0.4):
+    """Figures that pass every rule of params.yaml."""
+    return {
+        "gap_percent": figure(gap, 0.8 * gap, 1.3 * gap),
+        "settled_error_degC": figure(0.1, 0.05, 0.2, zone=1),
+        "settling_s": figure(6.0, 5.0, 8.0),
+        "overshoot_degC": figure(0.5, 0.3, 0.9),
+        "at_limits_percent": figure(1.0, 0.5, 2.0),
+        "tracking_degC": figure(4.0, 2.0, 6.0),
+        "effort_percent": figure(2.0, 1.0, 3.0),
+        "outside_limits_percent": figure(20.0, 18.0, 22.0),
+        "disk": figure(0.7, 0.6, 0.7),
+        "delay_s": figure(3.0, 2.5, 3.0),
+        "stable_plants": {"count": 2, "of": 2},
+    }
+
+
+def metrics():
+    both = {
+        name: {"J100": 100.0, "J1000": 110.0, "error": 0.04}
+        for name in ("model_based", "model_based_tuned", "data_driven", "data_driven_tuned")
+    }
+    return {
+        "generate_probing": {
+            "source": "simulated", "samples": 400, "excitation_order": 12, "excitation_rank": 24, "excitation_full_rank": 24,
+            "excitation_condition": 18.0, "limited_share": 0.1, "level_percent_per_band": [[0.3, 0.4]] * 8,
+        },
+        "ingest": {"recordings": 2, "processed": 2, "reused": 0, "quarantined": 1, "samples": 400, "segments": 1, "findings": {}},
+        "identify_plant": {
+            "order": 2, "past": 5, "rows": 380, "dropped_rows": 0, "notes": [], "fit_holdout": {"zone_1": 90.0, "zone_2": 80.0},
+            "whiteness_passed": {"zone_1": True, "zone_2": False},
+        },
+        "learn_kernel": {
+            "window": 4, "samples": 380, "half_record_gap_percent": 0.01, "samples_needed_for_noise": 30, "state": "predicted state",
+            "refused": None, "rank": 5, "identifiable": 15, "samples_needed": 15, "condition": 1e3, "candidates": {},
+        },
+        "tune_weights": {
+            "parity": {"best_cost_perfect_state": 101.0, "optimum": 100.0, "scaled_weights": {"change_percent": -60.0, "gain_difference": 1e-15}},
+            "practical": {"cost": 2.0, "cost_default": 8.0, "regret_identity": 0.5, "failed": 1},
+        },
+        "evaluate_temperature": {
+            "as_published": both, "printed": both, "algorithm_1": {"failures": 106, "of": 300}, "optimal": {"J1000": 100.0},
+            "observer": {"J1000": 100.1, "J1000_from_50_degC": 105.0}, "takeover": {"zero_history_gap": 1e-6},
+            "kernel": {"gap": 1e-8, "gap_window_6": 1e-8, "any_reference_gap": 1e-8},
+            "controllers": {name: controller() for name in CONTROLLERS},
+        },
+    }  # fmt: skip
+
+
+def declared(root):
+    """params.yaml of the repository with a smaller machine and panel."""
+    sections = params.read(ROOT / "params.yaml")
+    sections["plant"] = {
+        "sample_time_s": 1.0,
+        "inputs": [{"name": f"heater_{i}", "unit": "percent", "low": 0, "high": 100} for i in (1, 2)],
+        "outputs": [{"name": f"zone_{i}", "unit": "degC", "reference": 100.0 + i} for i in (1, 2)],
+    }
+    sections["panel"] |= {
+        "noise_degC": [0.1],
+        "steps": 60,
+        "judging": {"starts_degC": [20], "reference_offsets_degC": [0], "seeds": [1, 2, 3]},
+    }
+    (root / "params.yaml").write_text(yaml.safe_dump(sections))
+    return params.load(params.Plant, "plant", root / "params.yaml")
+
+
+def scorecard(worst):
+    """Two plants, three seeds; the second plant is the worst: `worst` by controller, in percent."""
+    rows = [(name, plant, seed) for name in CONTROLLERS for plant in (0, 1) for seed in (1, 2, 3)]
+    columns = {column.name: [0.0] * len(rows) for column in schemas.SCORECARD.columns}
+    names, plants, seeds = zip(*rows, strict=True)
+    gap = [worst.get(name, 10.0) / 100 * (0.01 + 0.99 * plant + 0.0001 * seed) for name, plant, seed in rows]
+    return columns | {
+        "controller": list(names), "plant": np.array(plants, np.int32), "seed": np.array(seeds), "regret": gap, "noise_degC": [0.1] * len(rows),
+        "start_degC": [20.0] * len(rows), "reference_degC": [101.0] * len(rows), "settled_zone": ["zone_1"] * len(rows),
+    }  # fmt: skip
+
+
+def trajectories(machine, steps=60):
+    time = np.arange(float(steps))
+    names = [(name, mode) for name in CONTROLLERS for mode in ("unclipped", "deployed")]
+    columns = {
+        "controller": [name for name, _ in names for _ in time], "mode": [mode for _, mode in names for _ in time],
+        "time_s": np.tile(time, len(names)), "cost": np.tile(1000.0 * (1 - 0.5 ** (time + 1)), len(names)),
+    }  # fmt: skip
+    for output in machine.outputs:
+        columns[output.name] = np.tile(output.reference - 80.0 * 0.5**time + 0.05, len(names))
+    for signal in machine.inputs:
+        columns |= {
+            f"{signal.name}_command": np.tile(50.0 * 0.5**time - 1.0, len(names)),
+            f"{signal.name}_applied": np.tile(50.0 * 0.5**time, len(names)),
+        }
+    return columns
+
+
+def record(machine, samples, recording):
+    time = np.arange(float(samples))
+    columns = {"recording": [recording] * samples, "segment": np.zeros(samples, np.int32), "time_s": time}
+    for i, signal in enumerate([*machine.inputs, *machine.outputs]):
+        masked = np.zeros(samples, bool)
+        masked[100:110] = i == 2
+        columns |= {signal.name: 50 + 10 * np.sin(time / (3 + i)), f"{signal.name}_masked": masked}
+    return columns
+
+
+def write(root, *, samples=400, recording="good.mcap", worst=None):
+    """Every artifact below `root`, which is the working directory."""
+    machine = declared(root)
+    for stage, figures in metrics().items():
+        artifacts.write_metrics(stage, figures)
+    data = Path("datasets")
+    artifacts.write_table(
+        data / "ingest/record.parquet", schemas.record(machine.inputs, machine.outputs), record(machine, samples, recording)
+    )
+    flaw = {
+        "recording": [HOSTILE],
+        "signal": ["zone_1"],
+        "kind": ["quarantined"],
+        "start_s": [np.nan],
+        "end_s": [np.nan],
+        "count": [1],
+        "message": [HOSTILE],
+    }
+    artifacts.write_table(data / "ingest/quality.parquet", schemas.QUALITY, flaw)
+    plant = {"A": (np.diag([0.99, 0.9])[None], "1", "state matrix")}
+    artifacts.write_arrays(data / "identify_plant/plant.parquet", "plant", 1, plant)
+    order = {
+        "order": np.arange(1, 4, dtype=np.int32),
+        "singular_value": [9.0, 5.0, 0.1],
+        "noise_edge": [0.5] * 3,
+        "parameters": [3, 6, 9],
+        "error": [0.5, 0.1, np.nan],
+        "chosen": [False, True, False],
+    }
+    artifacts.write_table(data / "identify_plant/order.parquet", schemas.ORDER, order)
+    seen = {"segment": np.zeros(50, np.int32), "time_s": np.arange(50.0)}
+    seen |= {f"{o.name}_{kind}": np.sin(np.arange(50.0)) for o in machine.outputs for kind in ("measured", "simulated")}
+    artifacts.write_table(data / "identify_plant/holdout.parquet", schemas.holdout(machine.outputs), seen)
+    table = np.array([[1, 8, -10.0], [2, 16, -30.0], [3, 24, -20.0]])
+    artifacts.write_arrays(data / "learn_kernel/window.parquet", "window", 1, {"table": (table, "1", "criterion")})
+    artifacts.write_arrays(
+        data / "learn_kernel/kernel.parquet",
+        "kernel",
+        1,
+        {
+            "rank": (np.array(5), "1", "length of v"),
+            "singular_values": (np.array([9.0, 3.0, 1e-9]), "1", ""),
+            "u_scale": (np.ones(2), "1", ""),
+        },
+    )
+    history = {
+        "mode": ["parity"] * 3 + ["practical"] * 3,
+        "evaluation": [1, 2, 3] * 2,
+        "cost": [120.0, 101.0, 103.0, 9.0, np.nan, 2.0],
+        "incumbent": [120.0, 101.0, 101.0, 9.0, 9.0, 2.0],
+        "failure": ["", "", "", "", HOSTILE, ""],
+    }
+    artifacts.write_table(data / "tune_weights/history.parquet", schemas.TUNING, history)
+    artifacts.write_json(data / "tune_weights/weights.json", {"practical": {"q": [1.0, 2.0], "r": [0.1, 0.2]}})
+    folder = data / "evaluate_temperature"
+    artifacts.write_table(folder / "scorecard.parquet", schemas.SCORECARD, scorecard(worst or {}))
+    artifacts.write_table(folder / "trajectories.parquet", schemas.trajectories(machine.inputs, machine.outputs), trajectories(machine))
+    routes = [(route, noise, i) for route in ("window", "kernel", "kernel_predicted_state") for noise in (0.1, 0.5) for i in range(4)]
+    study = dict(zip(("route", "noise_degC", "data_set"), map(list, zip(*routes, strict=True)), strict=True))
+    study |= {"gap": [1e-5 * (1 + i) for i in range(len(routes))], "error_degC": [0.01 * (1 + i) for i in range(len(routes))]}
+    artifacts.write_table(folder / "study.parquet", schemas.STUDY, study)
+    artifacts.write_json(folder / "summary.json", {"noise_degC": 0.1, "scenarios": 6, "plants": 2})
