@@ -28,7 +28,7 @@ class Move(NamedTuple):
         change = self.now.value - self.before.value
         if math.isinf(change) or math.isnan(change):
             return self.word
-        places = max(decimals(f.low, f.high, value=f.value) for f in (self.before, self.now))
+        places = min(decimals(f.low, f.high, value=f.value) for f in (self.before, self.now))
         unit = {"%": "points", "×": "×"}.get(self.question.unit, self.question.unit)
         sign = "+" if change > 0 else MINUS
         return f"{sign}{number(abs(change), places)}{THIN + unit if unit else ''} · {self.word}"

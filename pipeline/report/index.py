@@ -10,6 +10,7 @@ from pipeline.report.judgement import NAMES, Judgement, row_places
 from pipeline.report.sources import Sources, digest
 from pipeline.report.verdict import (
     ANSWERS,
+    BRIEF,
     FAILED,
     OPEN,
     PASSED,
@@ -99,7 +100,7 @@ def _row(question: Question, judged: Judgement) -> dict[str, Any]:
         "strip": charts.strip(question, [(ROLES[role], page.MARKS[role], figure) for role, figure in pair]),
         "change": move.text() if move else "first run",
         "moved": bool(move and move.moved),
-        "worse": bool(move and move.moved and move.word == "worse"),
+        "worse": bool(move and move.moved and move.word == "worse" and state(question, pair[0][1]) != PASSED),
         "quiet": state(question, pair[0][1]) == PASSED and state(question, pair[1][1]) == PASSED and not (move and move.moved),
     }
 
@@ -138,8 +139,9 @@ def _change_sentence(judged: Judgement, accepted: dict | Missing | None) -> dict
             move.word in ("unchanged", "not measured", "failed") for move in judged.moved["data_driven"]
         )
         return {"strong": "Nothing changed; no figure moved." if unchanged else "No figure moved beyond its noise.", "text": ""}
-    said = ", ".join(f"{move.question.title[:1].lower()}{move.question.title[1:]} {move.word}" for move in found)
-    return {"strong": f"{len(found)} of {len(judged.asked)} figures moved beyond their noise:", "text": f"{said}."}
+    groups = [(word, [BRIEF[move.question.key] for move in found if move.word == word]) for word in ("worse", "better")]
+    said = "; ".join(f"{word}: {', '.join(names)}" for word, names in groups if names)
+    return {"strong": f"{len(found)} of {len(judged.asked)} figures moved beyond their noise.", "text": f"{said[:1].upper()}{said[1:]}."}
 
 
 def hashes(sources: Sources) -> list[tuple[str, str]]:
@@ -183,7 +185,7 @@ def difference_parts(sources: Sources, judged: Judgement) -> dict[str, Any]:
                         "role": role,
                         "name": NAMES[role],
                         "word": move.word,
-                        "worse": move.word == "worse",
+                        "worse": move.word == "worse" and state(move.question, move.now) != PASSED,
                         "before": quantity(move.before.value, move.question.unit, places, beyond=move.question.beyond),
                         "now": quantity(move.now.value, move.question.unit, places, beyond=move.question.beyond),
                         "svg": charts.before_and_now(move.question, page.MARKS[role], move.before, move.now, limit),
@@ -192,7 +194,7 @@ def difference_parts(sources: Sources, judged: Judgement) -> dict[str, Any]:
     rest: dict[str, list[str]] = {}
     for move in judged.moved["data_driven"]:
         if not move.moved:
-            rest.setdefault(move.word, []).append(move.question.title[:1].lower() + move.question.title[1:])
+            rest.setdefault(move.word, []).append(BRIEF[move.question.key])
     still = [f"{word[:1].upper()}{word[1:]}: {', '.join(names)}." for word, names in rest.items()]
     return {
         "accepted": changed.accepted,

@@ -1,5 +1,6 @@
 """Rules and figures -> verdict: which controller to run, the first rule that failed or is open, what to do instead. No page, no file."""
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -156,23 +157,23 @@ class Verdict(NamedTuple):
 ROLES = {"data_driven": "data-driven", "model_based": "model-based", "baseline": "baseline"}
 
 
+# what tells two controllers apart that both pass, in this order, where their bands separate
+PREFERENCE = ("settled_error_degC", "gap_percent", "worst_case_gap_percent")
+
+
+def preferred(answers: Mapping[str, Answers], a: str, b: str) -> tuple[str, str]:
+    """The better of two roles, and the figure that tells them apart; an empty text where only the medians of the gap do."""
+    for key in PREFERENCE:
+        one, two = answers[a][key], answers[b][key]
+        if one.high < two.low or two.high < one.low:
+            return (a if one.value < two.value else b), key
+    return (a if answers[a]["gap_percent"].value <= answers[b]["gap_percent"].value else b), ""
+
+
 def winner(asked: Sequence[Question], answers: Mapping[str, Answers]) -> str | None:
-    """Of the controllers that pass, the one with the smallest settled error; within its noise, the smallest gap."""
+    """Of the controllers that pass, the one with the smallest settled error; within its noise the smallest gap, then the smallest worst case."""
     fit = [role for role in ROLES if passes(outcomes(asked, answers[role]))]
-    if not fit:
-        return None
-
-    def better(a: str, b: str) -> str:
-        for key in ("settled_error_degC", "gap_percent"):
-            one, two = answers[a][key], answers[b][key]
-            if one.high < two.low or two.high < one.low:
-                return a if one.value < two.value else b
-        return a if answers[a]["gap_percent"].value <= answers[b]["gap_percent"].value else b
-
-    best = fit[0]
-    for role in fit[1:]:
-        best = better(best, role)
-    return best
+    return functools.reduce(lambda best, role: preferred(answers, best, role)[0], fit) if fit else None
 
 
 def decide(loop: str, asked: Sequence[Question], answers: Mapping[str, Answers]) -> Verdict:
@@ -205,14 +206,26 @@ def _deploy(
     )
     places = decimals(figure.low, figure.high, value=figure.value)
     closest = (
-        f"closest to its limit: {_name(question)}, "
+        f"closest to its limit: {BRIEF[question.key]}, "
         f"{quantity(figure.value, question.unit, places, beyond=question.beyond)} of "
         f"{_rule_allows(question, places)}."
     )
-    remedy = "" if whole else "Drift is not measured: the nightly job measures it once the controller runs."
-    if best != "data_driven":
-        remedy = f"The data-driven controller passes too, but is no better. {remedy}"
-    return Verdict(PASSED, decision, lead, closest, remedy.strip(), "", best)
+    drift = "" if whole else "Drift is not measured: the nightly job measures it once the controller runs."
+    other = "model_based" if best == "data_driven" else "data_driven"
+    told = _told_apart(asked, answers, best, other) if passes(found[other]) else ""
+    return Verdict(PASSED, decision, lead, closest, f"{told} {drift}".strip(), "", best)
+
+
+def _told_apart(asked: Sequence[Question], answers: Mapping[str, Answers], best: str, other: str) -> str:
+    """Why the better of two that pass is the better one."""
+    key = preferred(answers, best, other)[1]
+    if not key:
+        return f"The {ROLES[other]} controller passes too and is as good within noise."
+    question = next(q for q in asked if q.key == key)
+    mine, theirs = answers[best][key], answers[other][key]
+    places = min(decimals(figure.low, figure.high, value=figure.value) for figure in (mine, theirs))
+    figures = [quantity(figure.value, question.unit, places) for figure in (theirs, mine)]
+    return f"The {ROLES[other]} controller passes too; its {BRIEF[key]} is {figures[0]} against {figures[1]}."
 
 
 def _worst_end(question: Question, figure: Figure) -> float:
@@ -231,10 +244,17 @@ def _none_passes(asked: Sequence[Question], answers: Mapping[str, Answers], foun
     return f"No controller passes: {', '.join(others)}. Keep what runs on the machine now."
 
 
-def _name(question: Question) -> str:
-    return {"disk": "disk margin", "delay_s": "delay margin", "worst_case_gap_percent": "worst case over plant spread"}.get(
-        question.key, question.title.split(":")[0].lower()
-    )
+BRIEF = {
+    "gap_percent": "gap",
+    "settled_error_degC": "settled error",
+    "settling_s": "settling",
+    "overshoot_degC": "overshoot",
+    "at_limits_percent": "time at limits",
+    "disk": "disk margin",
+    "delay_s": "delay margin",
+    "worst_case_gap_percent": "worst case over plant spread",
+    "data": "data",
+}
 
 
 def _rule_allows(question: Question, places: int) -> str:

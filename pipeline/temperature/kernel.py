@@ -11,53 +11,9 @@ import numpy as np
 import scipy.linalg
 import scipy.linalg.lapack
 
+from pipeline.temperature.half_vector import ROOT2, quadratic_gram, skron, smat, svec
 from pipeline.temperature.plant import Plant, observability_matrix
 from pipeline.temperature.tracking import Gains, Law, stein
-
-ROOT2 = np.sqrt(2.0)
-
-
-# ---- half-vectors
-
-
-def svec(S: np.ndarray) -> np.ndarray:
-    """Half-vector of a symmetric S (d, d): upper triangle by rows, sqrt 2 off the diagonal, so that svec(S) . svec(T) = trace(S T)."""
-    i, j = np.triu_indices(len(S))
-    return S[i, j] * np.where(i == j, 1.0, ROOT2)
-
-
-def smat(h: np.ndarray, d: int) -> np.ndarray:
-    """The symmetric (d, d) matrix whose half-vector is h."""
-    i, j = np.triu_indices(d)
-    S = np.empty((d, d))
-    S[i, j] = S[j, i] = h / np.where(i == j, 1.0, ROOT2)
-    return S
-
-
-def skron(X: np.ndarray) -> np.ndarray:
-    """The matrix with svec((X z)(X z)') = skron(X) svec(z z'), for X (a, d): shape (a (a+1)/2, d (d+1)/2)."""
-    (p, q), (k, j) = np.triu_indices(X.shape[0]), np.triu_indices(X.shape[1])
-    product = X[p][:, k] * X[q][:, j]
-    off = k != j
-    product[:, off] = (product[:, off] + X[p][:, j[off]] * X[q][:, k[off]]) / ROOT2
-    return product * np.where(p == q, 1.0, ROOT2)[:, None]
-
-
-def quadratic_gram(Z: np.ndarray, *, block: int = 1024) -> np.ndarray:
-    """Sum over samples of svec(z z') svec(z z')' for Z (d, samples), accumulated in blocks: memory does not grow with the number of samples."""
-    d, samples = Z.shape
-    i, j = np.triu_indices(d)
-    gram, features = np.zeros((len(i), len(i))), np.empty((len(i), block))
-    starts = np.concatenate([[0], np.cumsum(np.arange(d, 0, -1))])
-    for first in range(0, samples, block):
-        z = np.ascontiguousarray(Z[:, first : first + block])
-        phi = features[:, : z.shape[1]]
-        for row in range(d):
-            np.multiply(z[row], z[row:], out=phi[starts[row] : starts[row + 1]])
-        gram += phi @ phi.T
-    weight = np.where(i == j, 1.0, ROOT2)
-    return gram * weight * weight[:, None]
-
 
 # ---- data -> regression
 
@@ -316,17 +272,20 @@ def value_iteration(
     h_0 = data.G_e @ svec(Q) + data.G_u @ svec(R)
     row, column = np.triu_indices(q)
     weight = np.where(row == column, 1.0, ROOT2)
+    # smat once for all iterations: which entry of h each entry of H is, and its weight
+    place, unweighted = smat(np.arange(len(h_0), dtype=float), q + m), smat(np.ones(len(h_0)), q + m)
+    place = np.rint(place / unweighted).astype(int)
     H = smat(h_0, q + m) if H0 is None else H0
     K, P = _greedy(H, q)
     for iteration in range(1, max_iterations + 1):
-        H = smat(h_0 + gamma * (data.G @ (P[row, column] * weight)), q + m)
+        H = (h_0 + gamma * (data.G @ (P[row, column] * weight)))[place] * unweighted
         previous, (K, P) = K, _greedy(H, q)
         change = float(np.abs(K - previous).max() / np.abs(K).max())
         if change < tolerance:
             break
         if not change < 1e12:
             break
-    if not (np.isfinite(K).all() and change < max(tolerance, 1e-2)):
+    if not (np.isfinite(K).all() and change < (tolerance or 1e-2)):
         raise ValueError(
             f"value iteration did not settle in {iteration} iterations (last relative change of the gain {change:.1g}); record longer, or lower the window"
         )
@@ -364,12 +323,16 @@ def _kernel(
     """Gains in the machine's units. The reference enters the value as 2 v'H_vr r, H_vr = -output'Q + gamma step'P_sr F, P_sr = [I -K'] H_vr: exact for every r."""
     q = len(data.W)
     closed = np.hstack([np.eye(q), -K.T])
-    P_sr = stein(gamma * closed @ data.step.T, F, -closed @ data.output.T @ Q)
-    H_ur = (-data.output.T @ Q + gamma * data.step.T @ P_sr @ F)[q:]
     u = data.u_scale[:, None]
+
+    def share(F: np.ndarray) -> np.ndarray:
+        P_sr = stein(gamma * closed @ data.step.T, F, -closed @ data.output.T @ Q)
+        H_ur = (-data.output.T @ Q + gamma * data.step.T @ P_sr @ F)[q:]
+        return u * np.linalg.solve(H[q:, q:], H_ur)
+
     K_w = u * (K @ data.W)
-    K_r = u * np.linalg.solve(H[q:, q:], H_ur)
-    return Kernel(H, K_w[:, :-1], K_r, K_w[:, -1] - K_r @ data.base, iterations, change)
+    # e = y - base: the base is a reference too, but one that stays whatever F does
+    return Kernel(H, K_w[:, :-1], share(F), K_w[:, -1] - share(np.eye(len(F))) @ data.base, iterations, change)
 
 
 def window_law(K: np.ndarray, K_r: np.ndarray, k: np.ndarray, N: int, *, integral: float = 0.0) -> Law:

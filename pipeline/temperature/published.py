@@ -72,7 +72,7 @@ def model_based(weights: tuple[np.ndarray, np.ndarray], K0: np.ndarray) -> Figur
 
 
 def kernel_gains(u: np.ndarray, y: np.ndarray, weights: list[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarray]:
-    """Algorithm 2 with the study's settings on its log u (15000, 7), y (15000, 5): N = 6, mu = 1e-4, data / 1000, H from I, stop at 1e-3. K (7, 73) on [w; constant], the constant for the study's reference."""
+    """Algorithm 2 with the study's settings on its log u (15000, 7), y (15000, 5): N = 6, mu = 1e-4, data / 1000; stopped on the gain, which the script's stop at 1e-3 on H leaves the same in the digits printed. K (7, 73) on [w; constant], the constant for the study's reference."""
     N, scale = 6, 1000.0
     r = REFERENCE / scale
     # the last row has no successor in the script

@@ -312,5 +312,7 @@ def _delay_margin(omega: np.ndarray, loci: np.ndarray) -> float:
     size = np.abs(loci)
     crossing = (size[:-1] - 1) * (size[1:] - 1) < 0
     lag = np.minimum((np.angle(loci[:-1]) + np.pi) / omega[:-1, None], (np.angle(loci[1:]) + np.pi) / omega[1:, None])
-    peak = (size > 1).any()
-    return float(lag[crossing].min()) if crossing.any() else (0.0 if peak else float("inf"))
+    # a delay of whole samples turns the locus at pi by pi a sample: where it is larger than one there, it meets -1 without crossing the circle
+    last = (np.angle(loci[-1]) + np.pi) / omega[-1]
+    lags = np.concatenate([lag[crossing], last[size[-1] > 1]])
+    return float(lags.min()) if lags.size else float("inf")

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
+import scipy.linalg.lapack
 import scipy.optimize
 
 from pipeline.temperature.plant import Plant
@@ -50,7 +51,7 @@ def riccati(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray, *, toler
     G = B @ np.linalg.solve(R, B.T)
     P, identity = Q, np.eye(len(A))
     for _ in range(max_doublings):
-        W = np.linalg.solve(identity + G @ P, np.hstack([A, G]))
+        W = scipy.linalg.lapack.dgesv(identity + G @ P, np.concatenate([A, G], axis=1))[2]
         WA, WG = W[:, : len(A)], W[:, len(A) :]
         step = A.T @ P @ WA
         G, A = G + A @ WG @ A.T, A @ WA
@@ -172,11 +173,6 @@ def observer_law(plant: Plant, gains: Gains, L: np.ndarray, *, integral: float =
     )  # fmt: skip
 
 
-def state_feedback(plant: Plant, gains: Gains) -> Law:
-    """The optimum, which no sensor allows: a law that reads x through an observer that is told x. Use `scorecard` with `states_known` to run it."""
-    return observer_law(plant._replace(C=np.eye(plant.n), D=np.zeros((plant.n, plant.m)), d=np.zeros(plant.n)), gains, plant.A)
-
-
 class Target(NamedTuple):
     """A steady state x (n,), u (m,) inside the limits with y (p,) as near the reference as the limits allow; `miss` (p,) is y - r in °C, `slack` the distance of u
     from the nearest limit in percent."""
@@ -207,7 +203,7 @@ def feasible_target(plant: Plant, r: np.ndarray, low: np.ndarray, high: np.ndarr
 
 def _steady(plant: Plant, r: np.ndarray, low: np.ndarray, high: np.ndarray, slack: float) -> Target:
     """Bounded least squares with the balance as heavily weighted rows: at a direct-current gain of 5e5 the eliminated form would lose its digits."""
-    n, m, heavy, light = plant.n, plant.m, 1e4, 1e-6
+    n, m, heavy, light = plant.n, plant.m, 1e7, 1e-6
     rows = np.vstack(
         [
             np.hstack([plant.C, plant.D]),

@@ -214,7 +214,7 @@ def test_first_run_equal_runs_and_a_moved_figure(project):
     Path("pipeline/code.py").write_text("2\n")
     main()
     page = Page(INDEX).text
-    assert "2 of 9 figures moved beyond their noise: worst settled zone error worse, settling to within 1 °C better." in page
+    assert "2 of 9 figures moved beyond their noise. Worse: settled error; better: settling." in page
     assert "+0.35 °C · worse" in page and "within noise" in page
     assert "report.gap_percent 5.0 → 6.0" in page
     assert re.search("Code changed", page)
