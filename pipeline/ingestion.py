@@ -1,14 +1,17 @@
 """A folder of recordings -> one record: which files, which were done before, which are broken; the work itself is recordings.py's.
 
 The memo is content-addressed: the hash of the recording, of the job's parameters and of the code that reads names the result, so that one more recording costs one.
+An entry counts once its digests are written and as long as its files have them; anything else is read again.
 """
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import joblib
 import numpy as np
+from joblib.externals.loky.process_executor import TerminatedWorkerError
 
 from pipeline import artifacts, schemas
 from pipeline.params import Execution, Plant
@@ -78,44 +81,75 @@ def process(folder: Path, job: Job, execution: Execution, *, memo: Path) -> list
         joblib.hash((artifacts.sha256(path), path.relative_to(folder).as_posix(), job.machine.model_dump(), job[1:], code))
         for path in files
     ]
-    done = [(memo / f"{key}.record.parquet").exists() and (memo / f"{key}.quality.parquet").exists() for key in keys]
-    todo = [(path, key) for path, key, known in zip(files, keys, done, strict=True) if not known]
+    remembered = [_remembered(memo, key, job.machine) for key in keys]
+    todo = [(path, key) for path, key, known in zip(files, keys, remembered, strict=True) if known is None]
     reasons = dict(zip([key for _, key in todo], _run(todo, folder, job, execution, memo), strict=True))
     return [
-        _result(path.relative_to(folder).as_posix(), key, job, memo, reasons.get(key, ""), known)
-        for path, key, known in zip(files, keys, done, strict=True)
+        _result(path.relative_to(folder).as_posix(), known or _remembered(memo, key, job.machine), reasons.get(key, ""), known is not None)
+        for path, key, known in zip(files, keys, remembered, strict=True)
     ]
 
 
 def _run(todo: Sequence[tuple[Path, str]], folder: Path, job: Job, execution: Execution, memo: Path) -> list[str]:
-    if len(todo) < 2 and execution.backend == "loky":
-        return [_one(path, key, folder, job, memo) for path, key in todo]
+    """The reasons of `_one`, in the order of `todo`; workers of a cluster see the same file system under absolute paths."""
+    if not todo:
+        return []
     if execution.backend == "dask":
-        try:
-            import distributed
-        except ImportError:
-            raise ValueError(
-                "params.yaml: execution.backend is dask but dask is not installed; run with ./run --group cluster, or set execution.backend: loky"
-            ) from None
-        with distributed.Client(execution.scheduler, timeout="20s"), joblib.parallel_config(backend="dask"):
-            return joblib.Parallel()(joblib.delayed(_one)(path.resolve(), key, folder.resolve(), job, memo.resolve()) for path, key in todo)
-    return joblib.Parallel(n_jobs=execution.jobs, backend="loky")(joblib.delayed(_one)(path, key, folder, job, memo) for path, key in todo)
+        with _cluster(execution.scheduler):
+            calls = [joblib.delayed(_one)(path.resolve(), key, folder, job, memo.resolve()) for path, key in todo]
+            return joblib.Parallel()(calls)
+    if len(todo) == 1 or execution.jobs == 1:
+        return [_one(path, key, folder, job, memo) for path, key in todo]
+    try:
+        return joblib.Parallel(n_jobs=execution.jobs, backend="loky")(joblib.delayed(_one)(path, key, folder, job, memo) for path, key in todo)
+    except TerminatedWorkerError:
+        raise ValueError(
+            f"{folder}: one of {execution.jobs} workers was killed while it read a recording, as a system does that runs out of memory; "
+            "lower execution.jobs in params.yaml, and run it again: what was read is kept"
+        ) from None
+
+
+@contextlib.contextmanager
+def _cluster(scheduler: str) -> Iterator[None]:
+    """joblib's work goes to the dask cluster of this address; what goes wrong with the cluster is one sentence."""
+    try:
+        import distributed
+    except ImportError:
+        raise ValueError(
+            "params.yaml: execution.backend is dask but dask is not installed; run with ./run --group cluster, or set execution.backend: loky"
+        ) from None
+    try:
+        with distributed.Client(scheduler, timeout="20s") as client:
+            client.wait_for_workers(1, timeout=20)
+            with joblib.parallel_config(backend="dask"):
+                yield
+    except OSError as error:
+        raise ValueError(
+            f"params.yaml: execution.scheduler: expected a dask scheduler with a worker at {scheduler}, found none within 20 s "
+            f"({' '.join(str(error).split())}); start `dask scheduler` and `dask worker {scheduler}`, or set execution.backend: loky"
+        ) from None
+    except distributed.KilledWorker as error:
+        raise ValueError(
+            f"params.yaml: execution.scheduler: {error.allowed_failures + 1} workers of {scheduler} died over the same recordings; "
+            "give each worker more memory, and run it again: what was read is kept"
+        ) from None
 
 
 def _one(path: Path, key: str, folder: Path, job: Job, memo: Path) -> str:
     """Read, resample and flag one recording into the memo; the reason why it cannot be, or an empty text."""
-    name = path.relative_to(folder).as_posix()
+    shown = folder / path.relative_to(folder.resolve() if path.is_absolute() else folder)
+    name = shown.relative_to(folder).as_posix()
     inputs, outputs = [s.name for s in job.machine.inputs], [s.name for s in job.machine.outputs]
+    units, limits = {s.name: s.unit for s in [*job.machine.inputs, *job.machine.outputs]}, {s.name: (s.low, s.high) for s in job.machine.inputs}
     try:
         raw = read(path, job.sources(), time=job.time)
         table = resample(raw, sample_time_s=job.machine.sample_time_s, inputs=inputs, outputs=outputs, max_gap_s=job.max_gap_s)
+        table = flag(table, units=units, limits=limits)
     except ValueError as reason:
-        return " ".join(str(reason).split())
-    limits = {s.name: (s.low, s.high) for s in job.machine.inputs}
-    table = flag(table, units={s.name: s.unit for s in [*job.machine.inputs, *job.machine.outputs]}, limits=limits)
+        # on a cluster the path is absolute; what is said is the same wherever the work is done
+        return " ".join(str(reason).split()).replace(str(path), str(shown))
     findings = [(f.kind, f.signal, f.start_s, f.end_s, f.count, f.message) for f in table.flags]
-    findings += [(n.kind, n.signal, np.nan, np.nan, n.count, n.message) for n in raw.notes]
-    artifacts.write_table(memo / f"{key}.record.parquet", schemas.record(job.machine.inputs, job.machine.outputs), _columns(name, table))
+    findings += [(n.kind, n.signal, np.nan, np.nan, n.count, n.message.replace(str(path), str(shown))) for n in raw.notes]
     kinds, signals, starts, ends, counts, messages = [list(column) for column in zip(*findings, strict=True)] if findings else [[]] * 6
     quality = {
         "recording": [name] * len(findings),
@@ -126,8 +160,25 @@ def _one(path: Path, key: str, folder: Path, job: Job, memo: Path) -> str:
         "count": counts,
         "message": messages,
     }
+    artifacts.write_table(memo / f"{key}.record.parquet", schemas.record(job.machine.inputs, job.machine.outputs), _columns(name, table))
     artifacts.write_table(memo / f"{key}.quality.parquet", schemas.QUALITY, quality)
+    artifacts.write_json(memo / f"{key}.json", _digests(memo, key))
     return ""
+
+
+def _digests(memo: Path, key: str) -> dict[str, str]:
+    return {part: artifacts.sha256(memo / f"{key}.{part}.parquet") for part in ("record", "quality")}
+
+
+def _remembered(memo: Path, key: str, machine: Plant) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]] | None:
+    """Record and quality of an entry whose digests, written last, are those of its files; None where it is absent, half written or damaged."""
+    try:
+        if artifacts.read_json(memo / f"{key}.json") != _digests(memo, key):
+            return None
+        record = artifacts.read_table(memo / f"{key}.record.parquet", schemas.record(machine.inputs, machine.outputs))
+        return record, artifacts.read_table(memo / f"{key}.quality.parquet", schemas.QUALITY)
+    except (OSError, ValueError):
+        return None
 
 
 def _columns(name: str, table: Table) -> dict[str, np.ndarray | list[str]]:
@@ -137,11 +188,14 @@ def _columns(name: str, table: Table) -> dict[str, np.ndarray | list[str]]:
     return columns
 
 
-def _result(name: str, key: str, job: Job, memo: Path, reason: str, reused: bool) -> Result:
+def _result(name: str, entry: tuple[dict, dict] | None, reason: str, reused: bool) -> Result:
     if reason:
         return Result(name, {}, {}, reason, False)
-    record = artifacts.read_table(memo / f"{key}.record.parquet", schemas.record(job.machine.inputs, job.machine.outputs))
-    return Result(name, record, artifacts.read_table(memo / f"{key}.quality.parquet", schemas.QUALITY), "", reused)
+    if entry is None:
+        raise ValueError(
+            f"{name} was read by a worker but its entry is not in datasets/memo/ingest; let the workers share this folder, or set execution.backend: loky"
+        )
+    return Result(name, *entry, "", reused)
 
 
 def collect(results: Sequence[Result], machine: Plant, *, strict: bool) -> tuple[Filled, Filled, dict]:

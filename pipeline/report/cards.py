@@ -10,9 +10,9 @@ from markupsafe import Markup
 from pipeline.report import charts, page
 from pipeline.report.answers import CONTROLLERS, LABELS, featured
 from pipeline.report.digits import decimals, number, quantity
-from pipeline.report.judgement import NAMES, Judgement, row_places
+from pipeline.report.judgement import NAMES, Judgement
 from pipeline.report.sources import Sources, Table
-from pipeline.report.verdict import FAILED, OPEN, ROLES, UNDECIDED, Figure, Missing, Question, outcomes, state
+from pipeline.report.verdict import FAILED, OPEN, ROLES, UNDECIDED, Figure, Missing, Question, outcomes, row_places, state
 
 
 def temperature(sources: Sources, judged: Judgement) -> dict[str, Any]:

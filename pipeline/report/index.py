@@ -6,7 +6,7 @@ from typing import Any
 from pipeline.report import cards, charts, page, words
 from pipeline.report.answers import repetitions
 from pipeline.report.digits import band, count, quantity
-from pipeline.report.judgement import NAMES, Judgement, row_places
+from pipeline.report.judgement import NAMES, Judgement
 from pipeline.report.sources import Sources, digest
 from pipeline.report.verdict import (
     ANSWERS,
@@ -20,6 +20,7 @@ from pipeline.report.verdict import (
     Question,
     Verdict,
     outcomes,
+    row_places,
     state,
 )
 

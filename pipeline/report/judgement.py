@@ -1,12 +1,11 @@
 """What both pages say of the temperature loop: questions, answers, verdict, and how the figures moved."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 from pipeline.report.answers import CONTROLLERS, all_answers
 from pipeline.report.difference import Difference, Move, difference, moves
-from pipeline.report.digits import decimals
 from pipeline.report.sources import Sources
 from pipeline.report.verdict import Figure, Missing, Question, Verdict, decide, questions
 
@@ -32,17 +31,6 @@ def judgement(sources: Sources) -> Judgement:
     found = moves(sources, asked, by_name) if changed else {}
     moved = {role: found[name] for role, name in CONTROLLERS.items()} if changed else {}
     return Judgement(asked, by_name, roles, decide("temperature", asked, roles), changed, moved)
-
-
-def row_places(question: Question, figures: Sequence[Figure | Missing]) -> int:
-    """One number of decimals for a row: what the widest band supports, but enough to show the smallest value at all."""
-    mine = [(f, decimals(f.low, f.high, value=f.value)) for f in figures if isinstance(f, Figure)]
-    if question.key == "data":
-        return 0 if all(f.value >= 10 for f, _ in mine) else 2
-    if not mine:
-        return decimals(0, 0, value=question.limit)
-    places = min(found for _, found in mine)
-    return max([places, *(found for f, found in mine if f.value and round(f.value, places) == 0)])
 
 
 def shown(judged: Judgement) -> dict[str, dict[str, dict[str, float | None]]]:

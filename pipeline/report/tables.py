@@ -22,10 +22,10 @@ def yardstick(sources: Sources, asked: list[Question]) -> dict[str, Any]:
     answers = all_answers(sources, asked)
     names = [name for name in ORDER if name in answers or name == "kernel"]
     heads = [{"mark": name, "name": LABELS[name][0], "method": LABELS[name][1]} for name in names]
-    rows = [_row(question, [answers.get(name, {}).get(question.key, _no_kernel(sources)) for name in names]) for question in asked]
+    rows = [_row(question, names, [answers.get(name, {}).get(question.key, _no_kernel(sources)) for name in names]) for question in asked]
     for key, title, unit in EXTRA:
         question = Question(0, key, title, unit, math.inf, False, "")
-        rows.append(_row(question, [_extra(sources, name, key) for name in names]))
+        rows.append(_row(question, names, [_extra(sources, name, key) for name in names]))
     stable = [lookup(sources.metrics["evaluate_temperature"], f"controllers.{name}.stable_plants") for name in names]
     cells = [
         {
@@ -54,14 +54,14 @@ def _extra(sources: Sources, name: str, key: str) -> Figure | Missing:
     return Figure(*(math.inf if found.get(end) is None else found[end] for end in ("median", "low", "high")))
 
 
-def _row(question: Question, figures: list[Figure | Missing]) -> dict[str, Any]:
+def _row(question: Question, names: list[str], figures: list[Figure | Missing]) -> dict[str, Any]:
     # the controller that was told the truth is a yardstick, not a competitor
-    values = [f.value for f in figures[:-1] if isinstance(f, Figure)]
+    values = [f.value for name, f in zip(names, figures, strict=True) if isinstance(f, Figure) and name != "exact_model"]
     best = (max if question.at_least else min)(values, default=math.nan)
     finite = [f for f in figures if isinstance(f, Figure) and math.isfinite(f.value)]
     limit_places = max((decimals(f.low, f.high, value=f.value) for f in finite), default=1)
     cells = []
-    for figure in figures:
+    for name, figure in zip(names, figures, strict=True):
         if isinstance(figure, Missing):
             cells.append({"value": figure.state, "band": "", "bad": figure.state == FAILED, "best": False, "title": figure.sentence()})
             continue
@@ -74,7 +74,7 @@ def _row(question: Question, figures: list[Figure | Missing]) -> dict[str, Any]:
                 "value": quantity(figure.value, question.unit, places, beyond=question.beyond),
                 "band": ", ".join(filter(None, [bands, note.split(" samples")[0], held if held == UNDECIDED else ""])),
                 "bad": held == FAILED,
-                "best": figure.value == best and figure is not figures[-1] and question.key != "data",
+                "best": figure.value == best and name != "exact_model" and question.key != "data",
                 "title": "",
             }
         )

@@ -108,6 +108,17 @@ def state(question: Question, figure: Figure | Missing) -> str:
     return PASSED if inside(worst) else UNDECIDED if inside(best) else FAILED
 
 
+def row_places(question: Question, figures: Sequence[Figure | Missing]) -> int:
+    """One number of decimals for a row: what the widest band supports, but enough to show the smallest value at all."""
+    mine = [(f, decimals(f.low, f.high, value=f.value)) for f in figures if isinstance(f, Figure)]
+    if question.key == "data":
+        return 0 if all(f.value >= 10 for f, _ in mine) else 2
+    if not mine:
+        return decimals(0, 0, value=question.limit)
+    places = min(found for _, found in mine)
+    return max([places, *(found for f, found in mine if f.value and round(f.value, places) == 0)])
+
+
 def share(question: Question, value: float) -> float:
     """Share of the allowance used: value / limit, or required / actual where more is better."""
     if question.at_least:
@@ -192,7 +203,7 @@ def decide(loop: str, asked: Sequence[Question], answers: Mapping[str, Answers])
         if best
         else _none_passes(asked, answers, found)
     )
-    return Verdict(FAILED if failed else OPEN, decision, lead, reason(first.question, answers["data_driven"]), keep, first.rule, best)
+    return Verdict(FAILED if failed else OPEN, decision, lead, reason(first.question, answers), keep, first.rule, best)
 
 
 def _deploy(
@@ -261,16 +272,16 @@ def _rule_allows(question: Question, places: int) -> str:
     return f"at {'least' if question.at_least else 'most'} {quantity(question.limit, question.unit, places)}"
 
 
-def reason(question: Question | None, answers: Answers) -> str:
-    """The figure of a rule that failed or is open, and its limit, in one or two sentences."""
+def reason(question: Question | None, answers: Mapping[str, Answers]) -> str:
+    """The data-driven controller's figure of a rule that failed or is open, and its limit, in one or two sentences."""
     if question is None:
         return "The nightly job measures it and has not run."
-    figure = answers[question.key]
+    figure = answers["data_driven"][question.key]
     if isinstance(figure, Missing):
         return figure.sentence()
     if question.key == "data":
         return f"{figure.note} needed." if not figure.note.endswith(".") else figure.note
-    places = decimals(figure.low, figure.high, value=figure.value)
+    places = row_places(question, [figure, answers["model_based"][question.key]])
     value, limit = (quantity(v, question.unit, places, beyond=question.beyond) for v in (figure.value, question.limit))
     said = {
         "gap_percent": f"It costs {value} more than the optimum; the rule allows {limit}.",

@@ -82,7 +82,7 @@ def tuples_with_reference(u: Sequence[np.ndarray], y: Sequence[np.ndarray], N: i
 class Regression(NamedTuple):
     """What the data say, whatever the weights: in the coordinates v = [W s; u / u_scale] with q = len(W) whitened states,
 
-    E[svec(s s')(t+1) | v] = svec(v v')' G,  E[svec(e e') | v] = svec(v v')' G_e,  E[svec(u u') | v] = svec(v v')' G_u,  E[s(t+1) | v] = step v,  E[e | v] = output v.
+    E[svec(s s')(t+1) | v] = svec(v v')' (skron(step)' + G),  E[svec(e e') | v] = svec(v v')' G_e,  E[svec(u u') | v] = svec(v v')' G_u,  E[s(t+1) | v] = step v,  E[e | v] = output v.
 
     W maps the raw window and a constant, [w; 1], on the whitened state. `unknowns` half-vector entries are identifiable of `entries` in the published form, and
     as many samples are needed; `condition` is that of the Gram matrix.
@@ -114,7 +114,7 @@ class Regression(NamedTuple):
 
 
 _STORED = {
-    "G": ("1", "half-vector of the whitened state's second moment a step later, on that of v"),
+    "G": ("1", "half-vector of the whitened state's second moment a step later, beyond skron(step), on that of v; empty where nothing is beyond"),
     "G_e": ("degC^2", "half-vector of e e' on that of v"),
     "G_u": ("percent^2", "half-vector of u u' on that of v"),
     "step": ("1", "whitened state a step later, on v"),
@@ -169,14 +169,21 @@ def regress(data: Tuples, *, mu: float = 0.0, tolerance: float = 1e-9, limit: fl
     action = np.hstack([np.zeros((m, q)), np.diag(u_scale), np.zeros((m, news.shape[1]))])
     gram = quadratic_gram(np.hstack([v, news]).T)
     row, column = np.triu_indices(of_j.shape[1])
-    inside = np.flatnonzero((row < q + m) & (column < q + m))
-    right = gram[inside] @ np.vstack([skron(of_j[:q]), skron(of_j[q:]), skron(action)]).T
+    known = (row < q + m) & (column < q + m)
+    inside, outside = np.flatnonzero(known), np.flatnonzero(~known)
+    wanted = np.vstack([skron(of_j[:q]), skron(of_j[q:]), skron(action)])
     normal = gram[np.ix_(inside, inside)]
+    # what is linear in v regresses on itself; left to solve for is the share of the news, and what the ridge holds back
+    rest = gram[np.ix_(inside, outside)] @ wanted[:, outside].T
     if mu:
         size = np.concatenate([1 / np.linalg.norm(W, axis=1), u_scale])
-        normal[np.diag_indices_from(normal)] += mu / (size[row[inside]] * size[column[inside]]) ** 2
-    solution, condition = _solve(normal, right, limit, samples, unknowns)
-    G, G_e, G_u = np.split(solution, np.cumsum([q * (q + 1) // 2, p * (p + 1) // 2]), axis=1)
+        ridge = mu / (size[row[inside]] * size[column[inside]]) ** 2
+        normal[np.diag_indices_from(normal)] += ridge
+        rest -= ridge[:, None] * wanted[:, inside].T
+    solution, condition = _solve(normal, rest if mu or len(outside) else rest[:, :0], limit, samples, unknowns)
+    squares = q * (q + 1) // 2
+    G, own = solution[:, :squares], wanted[squares:, inside].T + (solution[:, squares:] if solution.size else 0.0)
+    G_e, G_u = np.split(own, [p * (p + 1) // 2], axis=1)
     return Regression(
         G, G_e, G_u, linear.T[:q], linear.T[q:], W @ data.features, u_scale, data.base, data.N, sv, q + m, unknowns, (k + m) * (k + m + 1) // 2, samples, condition
     )  # fmt: skip
@@ -278,7 +285,10 @@ def value_iteration(
     H = smat(h_0, q + m) if H0 is None else H0
     K, P = _greedy(H, q)
     for iteration in range(1, max_iterations + 1):
-        H = (h_0 + gamma * (data.G @ (P[row, column] * weight)))[place] * unweighted
+        h = h_0 + gamma * svec(data.step.T @ P @ data.step)
+        if data.G.size:
+            h += gamma * (data.G @ (P[row, column] * weight))
+        H = h[place] * unweighted
         previous, (K, P) = K, _greedy(H, q)
         change = float(np.abs(K - previous).max() / np.abs(K).max())
         if change < tolerance:
@@ -306,9 +316,10 @@ def policy_iteration(
     """The same kernel by policies: each is evaluated exactly, (I - gamma G [I -K']-congruence) h = h_0, then improved; K0 (m, q) must stabilise (whitened state)."""
     q, m = len(data.W), len(data.u_scale)
     h_0, K = data.G_e @ svec(Q) + data.G_u @ svec(R), K0
+    successor = skron(data.step).T + (data.G if data.G.size else 0.0)
     for iteration in range(1, max_iterations + 1):
         value_of = skron(np.vstack([np.eye(q), -K])).T
-        h = np.linalg.solve(np.eye(len(h_0)) - gamma * data.G @ value_of, h_0)
+        h = np.linalg.solve(np.eye(len(h_0)) - gamma * successor @ value_of, h_0)
         H = smat(h, q + m)
         previous, K = K, _greedy(H, q)[0]
         change = float(np.abs(K - previous).max() / np.abs(K).max())
