@@ -26,7 +26,8 @@ def main() -> None:
     with artifacts.stage("identify_plant") as out:
         p, machine = params.load(IdentifyPlant, "identify_plant"), params.load(params.Plant, "plant")
         inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
-        u, y = artifacts.read_record("datasets/ingest/record.parquet", machine.inputs, machine.outputs)
+        recorded = artifacts.read_record("datasets/ingest/record.parquet", machine.inputs, machine.outputs)
+        u, y = identification.gapless(*recorded)
         cuts = [round(len(us) * (1 - p.holdout_share)) for us in u]
         first = [[signal[:cut] for signal, cut in zip(signals, cuts, strict=True)] for signals in (u, y)]
         last = [[signal[cut:] for signal, cut in zip(signals, cuts, strict=True)] for signals in (u, y)]
@@ -45,7 +46,8 @@ def main() -> None:
         artifacts.write_table(out / "order.parquet", schemas.ORDER, identification.rows(chosen))
         artifacts.write_table(out / "holdout.parquet", schemas.holdout(machine.outputs), validation.rows(last[1], simulated, outputs, machine.sample_time_s))
         metrics = {
-            "order": found.order, "past": found.past, "fit": found.fit, "rows": found.rows, "dropped_rows": found.dropped_rows, "notes": [*chosen.notes, *found.notes],
+            "order": found.order, "past": found.past, "fit": found.fit, "rows": found.rows, "dropped_rows": found.dropped_rows,
+            "samples_cut": sum(map(len, recorded[0])) - sum(map(len, u)), "notes": [*chosen.notes, *found.notes],
             "fit_holdout": dict(zip(outputs, fit, strict=True)), "fit_holdout_ahead": dict(zip(outputs, ahead, strict=True)), "ahead_steps": p.ahead_steps,
             "whiteness_passed": dict(zip(outputs, tests.whiteness_passed, strict=True)), "excitation": {"rank": excited.rank, "full": excited.full, "condition": excited.condition},
             "controllable": plant.controllability(found.plant).passed, "largest_pole": np.abs(np.linalg.eigvals(found.plant.A)).max(), "advice": advice,

@@ -27,7 +27,9 @@ def pairing(plant: Plant, low: np.ndarray, high: np.ndarray, *, horizon: int) ->
     Raises ValueError where an output obeys no input of its own.
     """
     slopes = markov_parameters(plant, horizon)
-    steepest = np.abs(slopes).argmax(axis=0)
+    response = np.cumsum(slopes, axis=0)
+    # the way an output goes in the end is its direction: a first answer the other way counts as dead time, as SIMC has it
+    steepest = (slopes * np.where(response[-1] < 0, -1.0, 1.0)).argmax(axis=0)
     fastest = np.take_along_axis(slopes, steepest[None], axis=0)[0]
     effect = np.abs(fastest) * (high - low)
     outputs, inputs = scipy.optimize.linear_sum_assignment(-effect)
@@ -36,7 +38,7 @@ def pairing(plant: Plant, low: np.ndarray, high: np.ndarray, *, horizon: int) ->
             f"PI needs an input for each of the {plant.p} outputs; found {plant.m} inputs, or an output that none of the free ones moves"
         )
     slope, at = fastest[outputs, inputs], steepest[outputs, inputs]
-    reached = np.cumsum(slopes, axis=0)[at, outputs, inputs]
+    reached = response[at, outputs, inputs]
     theta = np.maximum(at + 1 - reached / slope, 1.0)
     return Pairing(inputs, 1 / (2 * theta * slope), 8 * theta)
 
