@@ -96,12 +96,13 @@ def _run(todo: Sequence[tuple[Path, str]], folder: Path, job: Job, execution: Ex
         return []
     if execution.backend == "dask":
         with _cluster(execution.scheduler):
-            calls = [joblib.delayed(_one)(path.resolve(), key, folder, job, memo.resolve()) for path, key in todo]
+            calls = [joblib.delayed(_one)(path.resolve(), path, folder, key, job, memo.resolve()) for path, key in todo]
             return joblib.Parallel()(calls)
     if len(todo) == 1 or execution.jobs == 1:
-        return [_one(path, key, folder, job, memo) for path, key in todo]
+        return [_one(path, path, folder, key, job, memo) for path, key in todo]
     try:
-        return joblib.Parallel(n_jobs=execution.jobs, backend="loky")(joblib.delayed(_one)(path, key, folder, job, memo) for path, key in todo)
+        calls = [joblib.delayed(_one)(path, path, folder, key, job, memo) for path, key in todo]
+        return joblib.Parallel(n_jobs=execution.jobs, backend="loky")(calls)
     except TerminatedWorkerError:
         raise ValueError(
             f"{folder}: one of {execution.jobs} workers was killed while it read a recording, as a system does that runs out of memory; "
@@ -118,29 +119,32 @@ def _cluster(scheduler: str) -> Iterator[None]:
         raise ValueError(
             "params.yaml: execution.backend is dask but dask is not installed; run with ./run --group cluster, or set execution.backend: loky"
         ) from None
-    try:
-        with distributed.Client(scheduler, timeout="20s") as client:
-            client.wait_for_workers(1, timeout=20)
+    with contextlib.ExitStack() as connected:
+        try:
+            connected.enter_context(distributed.Client(scheduler, timeout="20s")).wait_for_workers(1, timeout=20)
+        except OSError as error:
+            raise ValueError(
+                f"params.yaml: execution.scheduler: expected a dask scheduler with a worker at {scheduler}, found none within 20 s "
+                f"({' '.join(str(error).split())}); start `dask scheduler` and `dask worker {scheduler}`, or set execution.backend: loky"
+            ) from None
+        try:
             with joblib.parallel_config(backend="dask"):
                 yield
-    except OSError as error:
-        raise ValueError(
-            f"params.yaml: execution.scheduler: expected a dask scheduler with a worker at {scheduler}, found none within 20 s "
-            f"({' '.join(str(error).split())}); start `dask scheduler` and `dask worker {scheduler}`, or set execution.backend: loky"
-        ) from None
-    except distributed.KilledWorker as error:
-        raise ValueError(
-            f"params.yaml: execution.scheduler: {error.allowed_failures + 1} workers of {scheduler} died over the same recordings; "
-            "give each worker more memory, and run it again: what was read is kept"
-        ) from None
+        except distributed.KilledWorker as error:
+            raise ValueError(
+                f"params.yaml: execution.scheduler: {error.allowed_failures + 1} workers of {scheduler} died over the same recordings; "
+                "give each worker more memory, and run it again: what was read is kept"
+            ) from None
 
 
-def _one(path: Path, key: str, folder: Path, job: Job, memo: Path) -> str:
-    """Read, resample and flag one recording into the memo; the reason why it cannot be, or an empty text."""
-    shown = folder / path.relative_to(folder.resolve() if path.is_absolute() else folder)
+def _one(path: Path, shown: Path, folder: Path, key: str, job: Job, memo: Path) -> str:
+    """Read, resample and flag one recording into the memo, under the path that is `shown`; the reason why it cannot be, or an empty text."""
     name = shown.relative_to(folder).as_posix()
     inputs, outputs = [s.name for s in job.machine.inputs], [s.name for s in job.machine.outputs]
-    units, limits = {s.name: s.unit for s in [*job.machine.inputs, *job.machine.outputs]}, {s.name: (s.low, s.high) for s in job.machine.inputs}
+    units, limits = (
+        {s.name: s.unit for s in [*job.machine.inputs, *job.machine.outputs]},
+        {s.name: (s.low, s.high) for s in job.machine.inputs},
+    )
     try:
         raw = read(path, job.sources(), time=job.time)
         table = resample(raw, sample_time_s=job.machine.sample_time_s, inputs=inputs, outputs=outputs, max_gap_s=job.max_gap_s)

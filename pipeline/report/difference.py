@@ -61,7 +61,7 @@ def difference(sources: Sources) -> Difference | None:
     known = {
         path: value
         for path, value in hashes.items()
-        if path.startswith(("datasets/", "reports/metrics/")) and path != "reports/metrics/report.json"
+        if path.startswith(("datasets/", "reports/metrics/")) and path.rsplit("/", 1)[-1] != "report.json"
     }
     recorded = {path.split("/", 1)[0] for path in known}
     now = {path: value for path, value in now.items() if path.split("/", 1)[0] in recorded}
@@ -69,7 +69,7 @@ def difference(sources: Sources) -> Difference | None:
     changes += [
         (path, "gone") for path in sorted(known) if path not in now and path.rsplit("/", 1)[0] in {p.rsplit("/", 1)[0] for p in now}
     ]
-    inputs = [path for path, _ in changes if path.startswith(("datasets/ingest/record", "datasets/raw"))]
+    inputs = [path for path, _ in changes if path.split("/")[1] == "raw" or path.split("/")[1:] == ["ingest", "record.parquet"]]
     # the accepted run may know the code by its folders, as it knows artifacts
     folders = {path: value for path, value in hashes.items() if path in ("pipeline", "stages")}
     code = digest(folders) if folders else None

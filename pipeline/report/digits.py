@@ -11,11 +11,13 @@ def decimals(low: float, high: float, *, value: float = 0.0) -> int:
     least one of them.
     """
     size = abs(value) if math.isfinite(value) else 0.0
+    if all(float(number).is_integer() for number in (low, high, value) if math.isfinite(number)):
+        return 0
     enough, most = (_places(1 / size), _places(100 / size)) if size else (0, 9)
     width = high - low
     if math.isfinite(width) and width > 0:
         return min(max(_places(5 / width), enough), max(most, 0))
-    return 0 if float(size).is_integer() else most
+    return most
 
 
 def _places(step: float) -> int:

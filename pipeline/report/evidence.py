@@ -11,15 +11,6 @@ from pipeline.report.pictures import Column, Picture, hole
 from pipeline.report.sources import Sources, Table, lookup
 from pipeline.report.verdict import Missing
 
-WINDOW, KERNEL = "datasets/learn_kernel/window.parquet", "datasets/learn_kernel/kernel.parquet"
-PLANT, ORDER, HOLDOUT = (
-    "datasets/identify_plant/plant.parquet",
-    "datasets/identify_plant/order.parquet",
-    "datasets/identify_plant/holdout.parquet",
-)
-HISTORY, STUDY = "datasets/tune_weights/history.parquet", "datasets/evaluate_temperature/study.parquet"
-
-
 # ---- the learners under noise
 
 ROUTES = {
@@ -56,7 +47,7 @@ def noise(sources: Sources) -> Picture:
             "study’s probing; the bar is their median. Learned from noisy data, judged on the true plant "
             "under the same noise."
         ),
-        page.origin(sources.source(STUDY)),
+        page.origin(sources.source("study")),
     )
 
 
@@ -120,7 +111,12 @@ def orders(sources: Sources) -> Picture:
     text = "; ".join(filter(None, parts)) or "nothing"
     title = "How much memory the data ask for"
     return Picture(
-        "orders", title, f"Chosen from the record alone: {text}.", shown, "", page.origin(sources.source(WINDOW, KERNEL, ORDER, PLANT))
+        "orders",
+        title,
+        f"Chosen from the record alone: {text}.",
+        shown,
+        "",
+        page.origin(sources.source("window", "kernel", "order", "plant")),
     )
 
 
@@ -265,7 +261,7 @@ def tuning(sources: Sources) -> Picture:
     caption = "Dots: candidates; line: best so far." + (
         f" Vermillion at the foot: {count(failed, 'candidate')} that failed." if failed else " No candidate failed."
     )
-    return Picture("tuning", title, " ".join(said), shown, caption, page.origin(sources.source(HISTORY)))
+    return Picture("tuning", title, " ".join(said), shown, caption, page.origin(sources.source("tuning")))
 
 
 def default_cost(found: Any) -> Any:
@@ -337,5 +333,5 @@ def holdout(sources: Sources) -> Picture:
         text,
         shown,
         "Grey: measured; ink: simulated from the inputs alone. Time in s.",
-        page.origin(sources.source(HOLDOUT)),
+        page.origin(sources.source("holdout")),
     )

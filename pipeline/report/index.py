@@ -26,7 +26,7 @@ from pipeline.report.verdict import (
 
 
 def render(sources: Sources, judged: Judgement) -> str:
-    """reports/index.html."""
+    """The text of index.html."""
     return page.render(
         "index.html",
         title=_title(judged.verdict),

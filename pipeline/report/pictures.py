@@ -13,7 +13,6 @@ from pipeline.report.sources import Sources, Table, lookup
 from pipeline.report.verdict import Missing
 
 ORDER = ("model_based", "window", "kernel", "baseline", "exact_model")
-TRAJECTORIES = "datasets/evaluate_temperature/trajectories.parquet"
 SPAN_S = 40.0
 
 
@@ -122,7 +121,7 @@ def trajectories(sources: Sources) -> Picture:
             f"True temperature in °C over the first {SPAN_S:g} s as deployed (inputs clipped, feasible target, "
             f"integrator); dashed: reference. One run: {featured(sources)}."
         ),
-        page.origin(sources.source(TRAJECTORIES)),
+        page.origin(sources.source("trajectories")),
     )
 
 
@@ -178,7 +177,7 @@ def errors(sources: Sources) -> Picture:
         text,
         absent(sources, shown),
         "Largest distance of a zone from its reference, in °C, log scale, against time in s. Grey: what the rule allows once settled.",
-        page.origin(sources.source(TRAJECTORIES)),
+        page.origin(sources.source("trajectories")),
     )
 
 
@@ -222,7 +221,7 @@ def costs(sources: Sources) -> Picture:
             f"{sources.declared.tracking.yardstick_r:g} I, γ = {sources.declared.tracking.gamma:g}), "
             "unclipped, true outputs, in thousands, against time in s (log). Dashed: exact model."
         ),
-        page.origin(sources.source(TRAJECTORIES)),
+        page.origin(sources.source("trajectories")),
     )
 
 
@@ -279,5 +278,5 @@ def inputs(sources: Sources) -> Picture:
             f"Command in per cent over the first {SPAN_S:g} s as deployed; grey: what the machine can give, to "
             "which a command is clipped. A command far outside runs along the edge."
         ),
-        page.origin(sources.source(TRAJECTORIES)),
+        page.origin(sources.source("trajectories")),
     )

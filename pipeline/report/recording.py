@@ -13,8 +13,6 @@ from pipeline.report.pictures import Column, Picture, hole
 from pipeline.report.sources import Sources, Table, lookup
 from pipeline.report.verdict import Missing
 
-QUALITY, RECORD = "datasets/ingest/quality.parquet", "datasets/ingest/record.parquet"
-
 
 def excitation(sources: Sources) -> Picture:
     """How strongly each input was moved, by frequency."""
@@ -58,7 +56,7 @@ def excitation(sources: Sources) -> Picture:
         text,
         shown,
         "R.m.s. level in per cent within equal bands of frequency, 0 to π rad a step.",
-        page.origin(sources.source("reports/metrics/generate_probing.json")),
+        page.origin(sources.source("generate_probing")),
     )
 
 
@@ -89,7 +87,7 @@ def record(sources: Sources) -> Picture:
             "Against time in s, recordings one after the other; at most 480 points a signal, highest and "
             "lowest of each stretch kept. Grey: flagged; vermillion: masked."
         ),
-        page.origin(sources.source(RECORD, QUALITY)),
+        page.origin(sources.source("record", "quality")),
     )
 
 
@@ -115,10 +113,10 @@ def _signal(signal, time: np.ndarray, values: np.ndarray, masked: np.ndarray, qu
         charts.linear(0, float(time[-1]) or 1.0),
         charts.Axis(low, high, ((low, short(low, 3)), (high, short(high, 3)))) if high > low else charts.linear(low, high),
         width=540,
-        height=70 if last else 56,
+        height=80 if last else 66,
         left=44,
         below=16 if last else 4,
-        above=13,
+        above=22,
     )
     layers = [charts.line(frame, time, np.where(masked, np.nan, values), "line thin")]
     stretches = _stretches(masked)

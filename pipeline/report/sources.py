@@ -26,8 +26,11 @@ class Declared(NamedTuple):
 
 
 class Source(NamedTuple):
-    """One file that the pages show: the stage that wrote it, name and version of its schema, and the digest of its bytes."""
+    """One file that the pages show: what it is called here (a table's name, or the stage of metrics), the stage that wrote it, name and
+    version of its schema, and the digest of its bytes.
+    """
 
+    name: str
     path: str
     stage: str
     schema: str
@@ -47,8 +50,9 @@ class Sources(NamedTuple):
     accepted: dict | Missing | None
     code: str
 
-    def source(self, *paths: str) -> list[Source]:
-        return [self.read[path] for path in paths if path in self.read]
+    def source(self, *names: str) -> list[Source]:
+        """Those of the files that could be read."""
+        return [source for name in names for source in self.read.values() if source.name == name]
 
 
 def collect(declared: Declared, metrics: Mapping[str, str], folders: Mapping[str, str], accepted: str, code: tuple[str, ...]) -> Sources:
@@ -59,12 +63,12 @@ def collect(declared: Declared, metrics: Mapping[str, str], folders: Mapping[str
     wanted = [(path, stage, stage, "metrics", artifacts.read_json) for stage, path in metrics.items()]
     tables = _tables(declared.machine)
     wanted += [(f"{folders[stage]}/{file}", name, stage, kind, reader) for name, stage, file, kind, reader in tables]
-    found = {(path, name): _read(read, path, stage, kind, reader) for path, name, stage, kind, reader in wanted}
+    found = {(path, name): _read(read, path, name, stage, kind, reader) for path, name, stage, kind, reader in wanted}
     absent = {path: value for (path, _), value in found.items() if isinstance(value, Missing)}
     by_name = [
         {name: value for (_, name), value in part} for part in (list(found.items())[: len(metrics)], list(found.items())[len(metrics) :])
     ]
-    before = _read({}, accepted, "accept", "accepted", artifacts.read_json) if artifacts.exists(accepted) else None
+    before = _read({}, accepted, "accepted", "accept", "accepted", artifacts.read_json) if artifacts.exists(accepted) else None
     return Sources(declared, *by_name, read, absent, before or None, digest({folder: artifacts.sha256(folder) for folder in code}))
 
 
@@ -99,14 +103,14 @@ def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], An
     ]
 
 
-def _read(read: dict[str, Source], path: str, stage: str, schema: str, reader: Callable[[str], Any]) -> Any:
+def _read(read: dict[str, Source], path: str, name: str, stage: str, schema: str, reader: Callable[[str], Any]) -> Any:
     if not artifacts.exists(path):
         return Missing("not measured", f"{Path(path).name} of {stage} is not there", f"Run ./run dvc repro {stage}")
     try:
         found = reader(path)
     except ValueError as error:
         return Missing("failed", str(error))
-    read[path] = Source(path, stage, schema, artifacts.sha256(path))
+    read[path] = Source(name, path, stage, schema, artifacts.sha256(path))
     return found
 
 

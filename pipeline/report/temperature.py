@@ -26,7 +26,7 @@ WORDS = (
 
 
 def render(sources: Sources, judged: Judgement) -> str:
-    """reports/temperature.html."""
+    """The text of temperature.html."""
     flaws, more, no_quality = recording.findings(sources)
     return page.render(
         "temperature.html",
@@ -52,8 +52,8 @@ def render(sources: Sources, judged: Judgement) -> str:
         sources=list(sources.read.values()),
         absent=sources.absent,
         hashes=index.hashes(sources),
-        from_scorecard=sources.source("datasets/evaluate_temperature/scorecard.parquet", "reports/metrics/evaluate_temperature.json"),
-        from_metrics=sources.source("reports/metrics/evaluate_temperature.json"),
-        from_weights=sources.source("datasets/tune_weights/weights.json"),
-        from_model=sources.source("reports/metrics/identify_plant.json", "datasets/identify_plant/plant.parquet"),
+        from_scorecard=sources.source("scorecard", "evaluate_temperature"),
+        from_metrics=sources.source("evaluate_temperature"),
+        from_weights=sources.source("weights"),
+        from_model=sources.source("identify_plant", "plant"),
     )

@@ -215,7 +215,7 @@ def _deploy(
     question, figure = min(
         ((q, answers[best][q.key]) for q in asked if q.rule != "data sufficiency"), key=lambda pair: -share(pair[0], _worst_end(*pair))
     )
-    places = decimals(figure.low, figure.high, value=figure.value)
+    places = row_places(question, [answers[role][question.key] for role in ("data_driven", "model_based")])
     closest = (
         f"closest to its limit: {BRIEF[question.key]}, "
         f"{quantity(figure.value, question.unit, places, beyond=question.beyond)} of "

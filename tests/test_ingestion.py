@@ -1,0 +1,294 @@
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline import artifacts, ingestion, params
+from pipeline.ingestion import Job, collect, process
+
+MACHINE = params.Plant.model_validate(
+    {
+        "sample_time_s": 1.0,
+        "inputs": [{"name": "heater", "unit": "percent", "low": 0.0, "high": 100.0}],
+        "outputs": [{"name": "zone", "unit": "degC", "reference": 50.0}],
+    }
+)
+JOB = Job(MACHINE, {}, "", 5.0)
+INLINE = params.Execution(backend="loky", jobs=1, scheduler="")
+LOKY = params.Execution(backend="loky", jobs=2, scheduler="")
+NAMES = ("record.parquet", "quality.parquet", "metrics.json")
+
+
+def recording(path: Path, seed: int, samples: int = 120) -> Path:
+    """A heater that is switched now and then, and the zone that follows it, with noise."""
+    rng = np.random.default_rng(seed)
+    heater = np.repeat(rng.choice([20.0, 40.0], size=-(-samples // 15)), 15)[:samples]
+    zone = 20 + np.convolve(heater, 0.02 * 0.95 ** np.arange(samples))[:samples] + 0.05 * rng.standard_normal(samples)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    artifacts.write_csv(path, {"time_s": np.arange(samples, dtype=float), "heater": heater, "zone": zone})
+    return path
+
+
+def folder(root: Path, count: int) -> Path:
+    for k in range(count):
+        recording(root / "raw" / f"{k:03d}.csv", seed=k)
+    return root / "raw"
+
+
+def ingested(raw: Path, out: Path, execution=INLINE, job=JOB, memo: Path | None = None, strict: bool = False) -> dict:
+    """What the stage does with a folder; the tables land in `out` for a look at their bytes."""
+    record, quality, metrics = collect(process(raw, job, execution, memo=memo or out / "memo"), MACHINE, strict=strict)
+    artifacts.write_table(out / "record.parquet", record.schema, record.columns)
+    artifacts.write_table(out / "quality.parquet", quality.schema, quality.columns)
+    artifacts.write_json(out / "metrics.json", metrics)
+    return metrics
+
+
+def tables(out: Path) -> list[bytes]:
+    return [(out / name).read_bytes() for name in NAMES[:2]]
+
+
+def done(metrics: dict) -> tuple[int, int, int]:
+    return metrics["processed"], metrics["reused"], metrics["quarantined"]
+
+
+# ---- the memo
+
+
+def test_one_recording_more_among_a_hundred_costs_one(tmp_path):
+    raw = folder(tmp_path, 100)
+    assert done(ingested(raw, tmp_path / "a")) == (100, 0, 0)
+    recording(raw / "new.csv", seed=1000)
+    start = time.perf_counter()
+    assert done(ingested(raw, tmp_path / "b", memo=tmp_path / "a/memo")) == (1, 100, 0)
+    assert time.perf_counter() - start < 8  # the bar on top of the work, which is milliseconds here
+    ingested(raw, tmp_path / "fresh")
+    assert tables(tmp_path / "b") == tables(tmp_path / "fresh")
+
+
+def test_a_changed_recording_parameter_mapping_or_name_is_read_again_and_nothing_else(tmp_path):
+    raw, memo = folder(tmp_path, 3), tmp_path / "memo"
+    ingested(raw, tmp_path, memo=memo)
+    recording(raw / "001.csv", seed=99)
+    assert done(ingested(raw, tmp_path, memo=memo)) == (1, 2, 0)
+    (raw / "002.csv").rename(raw / "other.csv")
+    assert done(ingested(raw, tmp_path, memo=memo)) == (1, 2, 0)
+    assert done(ingested(raw, tmp_path, memo=memo, job=JOB._replace(max_gap_s=7.0))) == (3, 0, 0)
+    turned = JOB._replace(mapping={"zone": ("zone", "degC", 1.0, -0.5)})
+    assert done(ingested(raw, tmp_path, memo=memo, job=turned)) == (3, 0, 0)
+    assert done(ingested(raw, tmp_path, memo=memo)) == (0, 3, 0)
+
+
+def test_changed_code_reads_everything_again(tmp_path, monkeypatch):
+    raw = folder(tmp_path, 2)
+    ingested(raw, tmp_path)
+    code = tmp_path / "code"
+    code.mkdir()
+    (code / "recordings.py").write_text("another version")
+    monkeypatch.setattr(ingestion, "CODE", code)
+    assert done(ingested(raw, tmp_path)) == (2, 0, 0)
+
+
+@pytest.mark.parametrize("part", ["record.parquet", "quality.parquet", "json"])
+@pytest.mark.parametrize("damage", ["cut", "flipped", "empty", "gone", "another's"])
+def test_a_damaged_entry_of_the_memo_is_read_again_and_never_trusted(tmp_path, part, damage):
+    raw, memo = folder(tmp_path, 2), tmp_path / "memo"
+    ingested(raw, tmp_path, memo=memo)
+    before = tables(tmp_path)
+    entry, other = sorted(memo.glob(f"*.{part}"))[:2]
+    content = entry.read_bytes()
+    middle = len(content) // 2
+    damaged = {
+        "cut": content[:middle],
+        "flipped": content[:middle] + bytes([content[middle] ^ 4]) + content[middle + 1 :],
+        "empty": b"",
+        "another's": other.read_bytes(),
+    }
+    entry.unlink()
+    if damage in damaged:
+        entry.write_bytes(damaged[damage])
+    # the findings of two such recordings are the same bytes where neither has any
+    same = damage in damaged and damaged[damage] == content
+    assert done(ingested(raw, tmp_path, memo=memo)) == ((0, 2, 0) if same else (1, 1, 0))
+    assert tables(tmp_path) == before
+    assert done(ingested(raw, tmp_path, memo=memo)) == (0, 2, 0)
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from pipeline import artifacts
+from tests.test_ingestion import INLINE, JOB, process
+
+write_table, written = artifacts.write_table, []
+
+def killed_in_the_second_entry(path, schema, columns):
+    if len(written) == int(sys.argv[3]):
+        os.kill(os.getpid(), signal.SIGKILL)
+    written.append(path)
+    write_table(path, schema, columns)
+
+artifacts.write_table = killed_in_the_second_entry
+process(Path(sys.argv[1]), JOB, INLINE, memo=Path(sys.argv[2]))
+"""
+
+
+@pytest.mark.parametrize("tables_before", [2, 3])
+def test_a_killed_run_leaves_whole_entries_only_and_they_are_kept(tmp_path, root, tables_before):
+    raw, memo = folder(tmp_path, 3), tmp_path / "memo"
+    ended = subprocess.run([sys.executable, "-c", KILLED, raw, memo, str(tables_before)], cwd=root, check=False)
+    assert ended.returncode == -signal.SIGKILL
+    assert done(ingested(raw, tmp_path / "after", memo=memo)) == (2, 1, 0)
+    ingested(raw, tmp_path / "fresh")
+    assert tables(tmp_path / "after") == tables(tmp_path / "fresh")
+
+
+# ---- quarantine
+
+
+def broken(raw: Path) -> None:
+    (raw / "backwards.csv").write_text("time_s,heater,zone\n0,1,20\n2,1,20\n1,1,20\n")
+    (raw / "lacks.csv").write_text("time_s,heater\n0,1\n1,1\n")
+
+
+def test_broken_recordings_are_quarantined_with_their_reasons_and_the_others_go_on(tmp_path):
+    raw = folder(tmp_path, 3)
+    ingested(raw, tmp_path / "good")
+    broken(raw)
+    assert done(ingested(raw, tmp_path / "all")) == (3, 0, 2)
+    assert tables(tmp_path / "all")[0] == tables(tmp_path / "good")[0]
+    quality = artifacts.read_table(tmp_path / "all/quality.parquet", ingestion.schemas.QUALITY)
+    reasons = {
+        name: text
+        for name, kind, text in zip(quality["recording"], quality["kind"], quality["message"], strict=True)
+        if kind == "quarantined"
+    }
+    assert set(reasons) == {"backwards.csv", "lacks.csv"}
+    assert "before" in reasons["backwards.csv"]
+    assert "zone" in reasons["lacks.csv"]
+    # what was refused once is refused again, and is no reuse
+    assert done(ingested(raw, tmp_path / "all")) == (0, 3, 2)
+
+
+def test_strict_and_a_folder_of_broken_recordings_alone_end_with_the_first_reason(tmp_path):
+    raw = folder(tmp_path, 1)
+    broken(raw)
+    with pytest.raises(ValueError, match=r"backwards\.csv.*\(2 of 3 recordings are broken\)"):
+        ingested(raw, tmp_path, strict=True)
+    (raw / "000.csv").unlink()
+    with pytest.raises(ValueError, match=r"backwards\.csv.*\(2 of 2 recordings are broken\)"):
+        ingested(raw, tmp_path)
+    with pytest.raises(ValueError, match=r"expected at least one recording \(CSV, Parquet or MCAP\), found none"):
+        ingested(tmp_path / "nothing", tmp_path)
+
+
+def test_a_mapping_that_names_no_signal_gives_the_nearest_names(tmp_path):
+    with pytest.raises(ValueError, match=r"ingest\.mapping\.zoone is no signal of the plant; the nearest names are zone"):
+        ingested(folder(tmp_path, 1), tmp_path, job=JOB._replace(mapping={"zoone": ("zone", "degC", 1.0, 0.0)}))
+
+
+# ---- more than one process
+
+
+def test_two_workers_of_this_machine_give_the_bytes_of_one(tmp_path):
+    raw = folder(tmp_path, 6)
+    broken(raw)
+    ingested(raw, tmp_path / "one", INLINE)
+    ingested(raw, tmp_path / "two", LOKY)
+    for name in NAMES:
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+
+
+class Cluster:
+    """A dask scheduler and two workers, processes of their own on loopback."""
+
+    def __init__(self, root: Path, scratch: Path):
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        self.address, self.processes, self.root, self.scratch = f"tcp://127.0.0.1:{port}", [], root, scratch
+        self.start("dask_scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard", "--no-show", "--no-jupyter")
+        for _ in range(2):
+            # no nanny: a killed worker stays dead
+            self.start("dask_worker", self.address, "--no-nanny", "--nthreads", "1", "--host", "127.0.0.1", "--no-dashboard")
+
+    def start(self, module: str, *arguments: str) -> None:
+        # another folder than the caller's: the workers of a cluster do not share its working directory
+        log = (self.scratch / f"{len(self.processes)}.log").open("wb")
+        environment = os.environ | {"PYTHONPATH": str(self.root), "DASK_TEMPORARY_DIRECTORY": str(self.scratch)}
+        command = [sys.executable, "-m", f"distributed.cli.{module}", *arguments]
+        self.processes.append(subprocess.Popen(command, cwd=self.scratch, env=environment, stdout=log, stderr=log))
+
+    def ready(self, seconds: float = 120) -> None:
+        """Both workers have found the scheduler; a busy machine takes its time for that."""
+        until = time.monotonic() + seconds
+        while not all(b"Registered to" in (self.scratch / f"{k}.log").read_bytes() for k in (1, 2)):
+            assert time.monotonic() < until, "the workers did not start"
+            time.sleep(0.05)
+
+    def stop(self) -> None:
+        for process_ in reversed(self.processes):
+            process_.kill()
+            process_.wait()
+
+
+@pytest.fixture(scope="module")
+def cluster(root, tmp_path_factory):
+    made = Cluster(root, tmp_path_factory.mktemp("cluster"))
+    try:
+        made.ready()
+        yield made
+    finally:
+        made.stop()
+
+
+def test_a_dask_cluster_of_two_workers_gives_the_bytes_of_one_machine(tmp_path, root, cluster, monkeypatch):
+    raw = folder(tmp_path, 6)
+    broken(raw)
+    monkeypatch.chdir(tmp_path)  # as the stage names them: relative paths
+    ingested(Path("raw"), Path("one"))
+    ingested(Path("raw"), Path("cluster"), params.Execution(backend="dask", jobs=2, scheduler=cluster.address))
+    for name in NAMES:
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "cluster" / name).read_bytes()
+
+
+KILLER = """
+import os, sys, time
+
+while not os.listdir(sys.argv[1]):
+    time.sleep(0.001)
+os.kill(int(sys.argv[2]), 9)
+print(sum(name.endswith(".json") for name in os.listdir(sys.argv[1])))
+"""
+
+
+def test_a_worker_killed_at_its_work_costs_nothing_but_time(tmp_path, cluster):
+    raw = tmp_path / "raw"
+    for k in range(8):
+        recording(raw / f"{k:02d}.csv", seed=k, samples=10_000)
+    ingested(raw, tmp_path / "one")
+    # the second worker is killed as soon as anything is in the memo, with most of the work before it
+    memo = tmp_path / "cluster/memo"
+    memo.mkdir(parents=True)
+    killer = subprocess.Popen([sys.executable, "-c", KILLER, memo, str(cluster.processes[2].pid)], stdout=subprocess.PIPE)
+    ingested(raw, tmp_path / "cluster", params.Execution(backend="dask", jobs=2, scheduler=cluster.address))
+    assert int(killer.communicate(timeout=20)[0]) < 8  # entries that were whole when it died: there was work left
+    assert cluster.processes[2].wait(timeout=20) == -signal.SIGKILL
+    for name in NAMES:
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "cluster" / name).read_bytes()
+    assert json.loads((tmp_path / "cluster/metrics.json").read_text())["processed"] == 8
+
+
+@pytest.mark.slow  # waits the 20 s that a scheduler is given
+def test_no_scheduler_at_the_address_is_one_sentence(tmp_path):
+    with pytest.raises(
+        ValueError, match=r"execution\.scheduler: expected a dask scheduler with a worker at tcp://127\.0\.0\.1:9, found none"
+    ):
+        ingested(folder(tmp_path, 2), tmp_path, params.Execution(backend="dask", jobs=2, scheduler="tcp://127.0.0.1:9"))
