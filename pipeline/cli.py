@@ -17,9 +17,23 @@ def accept(_: argparse.Namespace) -> None:
         for path in Path("datasets").rglob("*")
         if path.is_file() and path.parts[1] not in {"memo"} and not path.parts[1].startswith(".")
     )
-    hashes = {path.as_posix(): artifacts.sha256(path) for path in files}
+    hashes = {path.as_posix(): artifacts.sha256(path) for path in [*files, Path("pipeline"), Path("stages")]}
     artifacts.write_json("reports/accepted.json", {"metrics": metrics, "params": params.read("params.yaml"), "hashes": hashes})
     print(f"reports/accepted.json: accepted {len(metrics)} stages' figures and {len(hashes)} artifacts; commit it to keep it")
+
+
+def verify(_: argparse.Namespace) -> None:
+    """Hold what the pages say they were made from against the files as they are now; what no longer matches is named, with exit status 1."""
+    read = artifacts.read_json("reports/metrics/report.json")["read"]
+    wrong = []
+    for path, recorded in read.items():
+        if not Path(path).exists():
+            wrong.append(f"{path} is gone")
+        elif artifacts.sha256(path) != recorded:
+            wrong.append(f"{path} has changed since")
+    if wrong:
+        raise ValueError(f"reports: {len(wrong)} of {len(read)} sources no longer match the pages: {'; '.join(wrong)}; run ./run dvc repro")
+    print(f"reports: all {len(read)} sources are as the pages say")
 
 
 def inspect(arguments: argparse.Namespace) -> None:
@@ -33,6 +47,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="beadline", description="Extrusion-printer recordings into controllers that can be trusted.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     commands.add_parser("accept", help=accept.__doc__).set_defaults(run=accept)
+    commands.add_parser("verify", help=verify.__doc__).set_defaults(run=verify)
     command = commands.add_parser("inspect", help=inspect.__doc__)
     command.add_argument("file", type=Path)
     command.set_defaults(run=inspect)

@@ -51,7 +51,9 @@ def main() -> None:
             "integral": tracking.integral,
             "integral_limit": tracking.integral_limit_degC,
         }
-        judged = [judging.judge(c, scenarios, yardstick=yardstick, q=weights["q"], r=weights["r"], **settings) for c in compared]
+        refused = judging.refusals(compared, [(yardstick.q, yardstick.r), (weights["q"], weights["r"])])
+        kept = [c for c in compared if c.name not in refused]
+        judged = [judging.judge(c, scenarios, yardstick=yardstick, q=weights["q"], r=weights["r"], **settings) for c in kept]
         summary = {j.name: judging.summary(j, scenarios, noise=p.report_noise_degC) for j in judged}
         K0, u, y = artifacts.read_published("datasets/published")
         sets_u, sets_y = study.data_sets(np.random.default_rng(p.seed), 15_000, p.data_sets)
@@ -71,7 +73,7 @@ def main() -> None:
             out / "summary.json",
             {"noise_degC": p.report_noise_degC, "scenarios": len(scenarios.r), "plants": len(plants), "controllers": summary},
         )
-        artifacts.write_metrics("evaluate_temperature", figures | {"controllers": summary})
+        artifacts.write_metrics("evaluate_temperature", figures | {"controllers": summary, "refused": refused})
 
 
 if __name__ == "__main__":

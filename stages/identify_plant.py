@@ -38,7 +38,7 @@ def main() -> None:
         advice = validation.advice(tests, excited, fit, outputs=outputs, inputs=inputs)
         found = identification.identify(u, y, order=chosen.order, past=chosen.past, **settings)
         if not (observed := plant.observability(found.plant)).passed:
-            raise ValueError(f"datasets/ingest/record.parquet: {observed.reason}")
+            raise ValueError("datasets/ingest/record.parquet: " + observed.reason)
         family = validation.bootstrap_spread(u, y, found, count=p.spread_plants, order=found.order + 1, rng=np.random.default_rng(p.seed))
         simulated = [validation.simulated(chosen.plant, us, ys) for us, ys in zip(*last, strict=True)]
         artifacts.write_arrays(out / "plant.parquet", "plant", 1, plant.stored([found.plant]))

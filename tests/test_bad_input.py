@@ -1,6 +1,7 @@
 """What bad input gets: exit status 1 and one sentence with file, place, expected, found and remedy; the last good artifacts stay as they were."""
 
 import os
+import re
 import runpy
 import shutil
 import subprocess
@@ -12,6 +13,7 @@ import pytest
 import yaml
 
 from pipeline import artifacts, params
+from pipeline.temperature import identification
 from pipeline.temperature.plant import plant, simulate
 
 SAMPLES = 600
@@ -118,6 +120,14 @@ def refused(monkeypatch, capfd):
     return refused
 
 
+def changed(**columns: tuple[int | slice, float]) -> dict[str, np.ndarray]:
+    """The good record with {column: (where, value)} written over it."""
+    made = signals()
+    for name, (where, value) in columns.items():
+        made[name][where] = value
+    return made
+
+
 # ---- params.yaml
 
 
@@ -131,7 +141,6 @@ def refused(monkeypatch, capfd):
         ("learn_kernel", "tracking.gamma", 1.5, "params.yaml: tracking.gamma is 1.5 but must be at most 1"),
         ("identify_plant", "plant.sample_time_s", "one", 'params.yaml: plant.sample_time_s is "one" but must be a number'),
         ("ingest", "generate_probing.source", "recording", "did you mean recordings?"),
-        ("ingest", "ingest.mapping.heater_1.source", "Q3", "rig.csv"),
     ],
 )
 def test_a_parameter_that_cannot_be_is_refused_by_name(tree, refused, stage, key, value, said):
@@ -139,49 +148,144 @@ def test_a_parameter_that_cannot_be_is_refused_by_name(tree, refused, stage, key
     assert said in refused(tree, stage)
 
 
-def test_xx(tree, monkeypatch, capfd):
-    def t(name, columns=None, stages=("ingest",), **declared):
-        import shutil as s
-        w = tree.parent / name
-        s.copytree(tree, w)
-        if columns is not None:
-            record(w, columns)
-        declare(w, {k.replace("__", "."): v for k, v in declared.items()})
-        codes = [run(w, x, monkeypatch) for x in stages]
-        open("/tmp/realrec/said.txt", "a").write(f"### {name} {codes} {capfd.readouterr().err} \n")
-    S = signals()
-    def with_(**k):
-        c = {n: v.copy() for n, v in S.items()}
-        for n, (i, v) in k.items():
-            c[n][i] = v
-        return c
-    three = ("ingest", "identify_plant", "learn_kernel")
-    import contextlib
-    def tt(*a, **k):
-        try:
-            t(*a, **k)
-        except BaseException as e:
-            open("/tmp/realrec/said.txt", "a").write(f"!!! {a[0]} {type(e)} {e}\n")
-    real = print
-    global_print = open("/tmp/realrec/said.txt", "a")
-    tt("missing", ingest__mapping__heater_1__source="Q3")
-    tt("unit", ingest__mapping__zone_1__unit="degF")
-    tt("back", with_(t_s=(300, 20.0)))
-    tt("twice", with_(t_s=(300, 299.0)))
-    tt("nan", with_(T1=(slice(None), np.nan)))
-    tt("const", with_(Q1=(slice(None), 30.0)), three)
-    tt("const2", with_(Q1=(slice(None), 30.0)), ("ingest", "learn_kernel"))
-    tt("collinear", S | {"Q2": S["Q1"]}, three)
-    tt("collinear2", S | {"Q2": S["Q1"]}, ("ingest", "learn_kernel"))
-    tt("constout", with_(T1=(slice(None), 30.0)), three)
-    tt("constout2", with_(T1=(slice(None), 30.0)), ("ingest", "learn_kernel"))
-    tt("short", signals(40), three)
-    tt("short2", signals(40), ("ingest", "learn_kernel"))
-    tt("one", signals(1), three)
-    tt("same", S | {"T2": S["T1"]}, three)
-    tt("same2", S | {"T2": S["T1"]}, ("ingest", "learn_kernel"))
-    tt("noise", S | {"T1": np.random.default_rng(0).normal(size=600), "T2": np.random.default_rng(3).normal(size=600)}, (*three,"tune_weights"), tune_weights__initial=3, tune_weights__evaluations=4)
-    tt("signal", ingest__mapping={"heater_11": {"source": "Q1", "unit": "percent", "scale": 1.0, "offset": 0.0}})
-    tt("order", stages=("identify_plant",), identify_plant__order=40)
-    tt("text", stages=("identify_plant",))
-    tt("sim", stages=("generate_probing",), generate_probing__source="simulated")
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("heater_1.source", "Q3", "datasets/raw/temperature/rig.csv: there is no column 'Q3'; the nearest names are Q2, Q1"),
+        (
+            "zone_1.unit",
+            "degF",
+            "params.yaml: ingest.mapping.zone_1.unit is degF but the plant's zone_1 is in degC; convert with scale and offset, and write unit: degC",
+        ),
+        ("zone_1.scale", 0.0, "rig.csv: the mapping of zone_1 has scale 0 and offset 0; both must be finite, scale not 0"),
+    ],
+)
+def test_a_mapping_to_a_missing_column_or_in_a_wrong_unit_is_refused(tree, refused, key, value, said):
+    declare(tree, {f"ingest.mapping.{key}": value})
+    assert said in refused(tree, "ingest")
+
+
+def test_a_mapping_that_names_no_signal_is_refused_with_the_nearest_names(tree, refused):
+    declare(tree, {"ingest.mapping.heater_11": {"source": "Q1", "unit": "percent", "scale": 1.0, "offset": 0.0}})
+    assert "params.yaml: ingest.mapping.heater_11 is no signal of the plant; the nearest names are heater_1, heater_2" in refused(
+        tree, "ingest"
+    )
+
+
+# ---- recordings
+
+
+@pytest.mark.parametrize(
+    ("columns", "said"),
+    [
+        (
+            changed(t_s=(300, 20.0)),
+            (
+                "line 302 is at 20 s, which is before the sample ahead of it at 299 s, but time should only run forward; "
+                "split the recording where its clock was set back"
+            ),
+        ),
+        (
+            changed(t_s=(300, 299.0)),
+            (
+                "line 302 has the same time as the sample before it, 299 s, but time should only run forward; "
+                "name a finer clock, or separate two devices that write under one name"
+            ),
+        ),
+        (changed(T1=(slice(None), np.nan)), "T1 should hold numbers for zone_1 but all of its 600 values are missing; map another source"),
+        (signals(1), "output zone_1 should have at least two samples but has 1; record longer"),
+    ],
+    ids=["backwards", "two at one time", "NaN only", "one sample"],
+)
+def test_a_recording_that_is_no_record_is_refused_with_its_place(tree, refused, columns, said):
+    record(tree, columns)
+    assert f"datasets/raw/temperature/rig.csv: {said}" in refused(tree, "ingest")
+
+
+def test_no_recording_at_all_is_refused_with_the_folder(tree, refused):
+    (tree / "datasets/raw/temperature/rig.csv").unlink()
+    assert "datasets/raw/temperature: expected at least one recording (CSV, Parquet or MCAP), found none" in refused(tree, "ingest")
+
+
+def test_strict_makes_one_broken_recording_among_good_ones_fatal(tree, refused):
+    (tree / "datasets/raw/temperature/broken.csv").write_text("t_s,Q1,Q2,T1\n0,1,1,20\n1,1,1,20\n")
+    declare(tree, {"ingest.strict": True})
+    said = refused(tree, "ingest")
+    assert "datasets/raw/temperature/broken.csv: there is no column 'T2'" in said
+    assert "(1 of 2 recordings are broken)" in said
+
+
+# ---- what a record does not say
+
+
+@pytest.mark.parametrize(
+    ("columns", "said"),
+    [
+        (
+            changed(Q1=(slice(None), 30.0)),
+            r"input (u1|heater_1) is constant, so its column of B is not identified; excite it, or leave it out",
+        ),
+        (
+            signals() | {"Q2": signals()["Q1"]},
+            r"input (u2|heater_2) is a linear combination of (u1|heater_1), so its column of B is not identified; move it independently",
+        ),
+        # 28 of the 40 samples identify, the others judge
+        (signals(40), r"the record is too short for order 1: expected at least 80 complete samples, found 28; record 52 samples more"),
+    ],
+    ids=["a constant input", "a collinear input", "too few samples"],
+)
+def test_a_record_that_does_not_determine_the_plant_is_refused(tree, refused, monkeypatch, columns, said):
+    record(tree, columns)
+    assert run(tree, "ingest", monkeypatch) == 0
+    assert re.search(said, refused(tree, "identify_plant"))
+
+
+def test_an_order_that_the_record_cannot_carry_is_refused_with_what_it_lacks(tree, refused):
+    declare(tree, {"identify_plant.order": 40})
+    said = refused(tree, "identify_plant")
+    assert "the record is too short for order 40: expected at least 840 complete samples, found 420; record 420 samples more" in said
+
+
+def test_an_unobservable_plant_is_refused_with_its_rank(tree, refused, monkeypatch):
+    """No record shows a state that nothing measures; the stage must refuse whatever says that it found one."""
+    hidden = plant([[0.95, 0.0], [0.0, 0.9]], [[0.02, 0.0], [0.0, 0.04]], [[1.0, 0.0], [2.0, 0.0]], d=[20.0, 20.0])
+    found = identification.identify
+
+    def hiding(*signals, **settings):
+        return found(*signals, **settings)._replace(plant=hidden)
+
+    monkeypatch.setattr(identification, "identify", hiding)
+    said = refused(tree, "identify_plant")
+    assert re.search(
+        r"datasets/ingest/record\.parquet: the plant is not observable: rank 1 of 2, .*; add a sensor, or lower the order", said
+    )
+
+
+# ---- artifacts of another stage
+
+
+@pytest.mark.parametrize("damage", ["missing", "cut"])
+def test_an_artifact_that_is_missing_or_damaged_is_refused_with_the_command_that_makes_it(tree, refused, damage):
+    path = tree / "datasets/ingest/record.parquet"
+    content = path.read_bytes()
+    path.unlink()
+    if damage == "cut":
+        path.write_bytes(content[:-100])
+    said = refused(tree, "identify_plant")
+    assert said.startswith("identify_plant: datasets/ingest/record.parquet is ")
+    assert said.endswith("make it again with ./run dvc repro ingest\n")
+
+
+# ---- as a command
+
+
+def test_the_command_ends_with_status_1_and_one_sentence_without_a_traceback(tree, root):
+    record(tree, changed(t_s=(300, 20.0)))
+    before = good(tree)
+    environment = os.environ | {"PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1"}
+    ended = subprocess.run(
+        [sys.executable, "-m", "stages.ingest"], cwd=tree, env=environment, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert ended.returncode == 1
+    assert re.fullmatch(r"ingest: datasets/raw/temperature/rig\.csv: line 302 is at 20 s, .*; split the recording .*\n", ended.stderr)
+    assert good(tree) == before

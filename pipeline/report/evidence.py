@@ -1,4 +1,5 @@
-"""The figures of the temperature page that show what the learning rests on: the routes under noise, lengths and orders, the hold-out, and the optimiser."""
+"""The figures of the temperature page that show what the learning rests on: the routes under noise, lengths and orders, the hold-out,
+and the optimiser."""
 
 from typing import Any
 

@@ -182,7 +182,9 @@ def preferred(answers: Mapping[str, Answers], a: str, b: str) -> tuple[str, str]
 
 
 def winner(asked: Sequence[Question], answers: Mapping[str, Answers]) -> str | None:
-    """Of the controllers that pass, the one with the smallest settled error; within its noise the smallest gap, then the smallest worst case."""
+    """Of the controllers that pass, the one with the smallest settled error; within its noise the smallest gap, then the smallest worst
+    case.
+    """
     fit = [role for role in ROLES if passes(outcomes(asked, answers[role]))]
     return functools.reduce(lambda best, role: preferred(answers, best, role)[0], fit) if fit else None
 

@@ -38,7 +38,10 @@ FIXED = {
     ),
     "window": (
         "Data-driven, window",
-        "A long window of past inputs and outputs predicts the next output; the Riccati equation does the rest. No order, no state to choose.",
+        (
+            "A long window of past inputs and outputs predicts the next output; the Riccati equation does the "
+            "rest. No order, no state to choose."
+        ),
     ),
     "kernel": (
         "Kernel",
@@ -55,7 +58,10 @@ def glossary(sources: Sources) -> dict[str, tuple[str, str]]:
     panel, machine = sources.declared.panel, sources.declared.machine
     simulated = sources.declared.everything.get("generate_probing", {}).get("source") == "simulated"
     spread = (
-        f"Plants on which nothing was fitted: each column of B by 1 ± {100 * panel.input_gain:g} %, and A less {panel.loss:g} I (more heat lost)."
+        (
+            f"Plants on which nothing was fitted: each column of B by 1 ± {100 * panel.input_gain:g} %, and A "
+            f"less {panel.loss:g} I (more heat lost)."
+        )
         if simulated
         else "Plants within the uncertainty of the identified model, of another order than the model."
     )

@@ -112,6 +112,18 @@ def controllers(
     return [*found, exact_model(truth, gamma, tau=exact_tau)] if truth is not None else found
 
 
+def refusals(compared: Sequence[Controller], designs: Sequence[tuple[np.ndarray, np.ndarray]]) -> dict[str, str]:
+    """The controllers that have no law for one of these (q, r), each with the reason: a kernel can be learned, and still have no minimum at other weights."""
+    found = {}
+    for controller in compared:
+        for q, r in designs:
+            try:
+                controller.design(q, r, 0.0)
+            except ValueError as reason:
+                found[controller.name] = str(reason)
+    return found
+
+
 def targets(model: Plant, references: np.ndarray, limits: Limits) -> Targets:
     """The feasible steady (u, y) of every reference (scenarios, p) on the panel, by the controller's own model."""
     found = {}

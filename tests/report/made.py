@@ -40,29 +40,57 @@ def metrics():
     }
     return {
         "generate_probing": {
-            "source": "simulated", "samples": 400, "excitation_order": 12, "excitation_rank": 24, "excitation_full_rank": 24,
-            "excitation_condition": 18.0, "limited_share": 0.1, "level_percent_per_band": [[0.3, 0.4]] * 8,
+            "source": "simulated",
+            "samples": 400,
+            "excitation_order": 12,
+            "excitation_rank": 24,
+            "excitation_full_rank": 24,
+            "excitation_condition": 18.0,
+            "limited_share": 0.1,
+            "level_percent_per_band": [[0.3, 0.4]] * 8,
         },
         "ingest": {"recordings": 2, "processed": 2, "reused": 0, "quarantined": 1, "samples": 400, "segments": 1, "findings": {}},
         "identify_plant": {
-            "order": 2, "past": 5, "rows": 380, "dropped_rows": 0, "notes": [], "fit_holdout": {"zone_1": 90.0, "zone_2": 80.0},
+            "order": 2,
+            "past": 5,
+            "rows": 380,
+            "dropped_rows": 0,
+            "notes": [],
+            "fit_holdout": {"zone_1": 90.0, "zone_2": 80.0},
             "whiteness_passed": {"zone_1": True, "zone_2": False},
         },
         "learn_kernel": {
-            "window": 4, "samples": 380, "half_record_gap_percent": 0.01, "samples_needed_for_noise": 30, "state": "predicted state",
-            "refused": None, "rank": 5, "identifiable": 15, "samples_needed": 15, "condition": 1e3, "candidates": {},
+            "window": 4,
+            "samples": 380,
+            "half_record_gap_percent": 0.01,
+            "samples_needed_for_noise": 30,
+            "state": "predicted state",
+            "refused": None,
+            "rank": 5,
+            "identifiable": 15,
+            "samples_needed": 15,
+            "condition": 1e3,
+            "candidates": {},
         },
         "tune_weights": {
-            "parity": {"best_cost_perfect_state": 101.0, "optimum": 100.0, "scaled_weights": {"change_percent": -60.0, "gain_difference": 1e-15}},
+            "parity": {
+                "best_cost_perfect_state": 101.0,
+                "optimum": 100.0,
+                "scaled_weights": {"change_percent": -60.0, "gain_difference": 1e-15},
+            },
             "practical": {"cost": 2.0, "cost_default": 8.0, "regret_identity": 0.5, "failed": 1},
         },
         "evaluate_temperature": {
-            "as_published": both, "printed": both, "algorithm_1": {"failures": 106, "of": 300}, "optimal": {"J1000": 100.0},
-            "observer": {"J1000": 100.1, "J1000_from_50_degC": 105.0}, "takeover": {"zero_history_gap": 1e-6},
+            "as_published": both,
+            "printed": both,
+            "algorithm_1": {"failures": 106, "of": 300},
+            "optimal": {"J1000": 100.0},
+            "observer": {"J1000": 100.1, "J1000_from_50_degC": 105.0},
+            "takeover": {"zero_history_gap": 1e-6},
             "kernel": {"gap": 1e-8, "gap_window_6": 1e-8, "any_reference_gap": 1e-8},
             "controllers": {name: controller() for name in CONTROLLERS},
         },
-    }  # fmt: skip
+    }
 
 
 def declared(root):
@@ -89,18 +117,26 @@ def scorecard(worst):
     names, plants, seeds = zip(*rows, strict=True)
     gap = [worst.get(name, 10.0) / 100 * (0.01 + 0.99 * plant + 0.0001 * seed) for name, plant, seed in rows]
     return columns | {
-        "controller": list(names), "plant": np.array(plants, np.int32), "seed": np.array(seeds), "regret": gap, "noise_degC": [0.1] * len(rows),
-        "start_degC": [20.0] * len(rows), "reference_degC": [101.0] * len(rows), "settled_zone": ["zone_1"] * len(rows),
-    }  # fmt: skip
+        "controller": list(names),
+        "plant": np.array(plants, np.int32),
+        "seed": np.array(seeds),
+        "regret": gap,
+        "noise_degC": [0.1] * len(rows),
+        "start_degC": [20.0] * len(rows),
+        "reference_degC": [101.0] * len(rows),
+        "settled_zone": ["zone_1"] * len(rows),
+    }
 
 
 def trajectories(machine, steps=60):
     time = np.arange(float(steps))
     names = [(name, mode) for name in CONTROLLERS for mode in ("unclipped", "deployed")]
     columns = {
-        "controller": [name for name, _ in names for _ in time], "mode": [mode for _, mode in names for _ in time],
-        "time_s": np.tile(time, len(names)), "cost": np.tile(1000.0 * (1 - 0.5 ** (time + 1)), len(names)),
-    }  # fmt: skip
+        "controller": [name for name, _ in names for _ in time],
+        "mode": [mode for _, mode in names for _ in time],
+        "time_s": np.tile(time, len(names)),
+        "cost": np.tile(1000.0 * (1 - 0.5 ** (time + 1)), len(names)),
+    }
     for output in machine.outputs:
         columns[output.name] = np.tile(output.reference - 80.0 * 0.5**time + 0.05, len(names))
     for signal in machine.inputs:

@@ -1,4 +1,5 @@
-"""The pages in headless Chromium: what fits, what overflows, what is asked of the network, what the console says; skipped where there is no browser."""
+"""The pages in headless Chromium: what fits, what overflows, what is asked of the network, what the console says; skipped where there is
+no browser."""
 
 import html
 import json
@@ -11,9 +12,19 @@ import pytest
 from stages.report import main
 
 OPTIONS = [
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
-    "--hide-scrollbars", "--host-resolver-rules=MAP * ~NOTFOUND", "--enable-logging=stderr", "--v=0",
-]  # fmt: skip
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--hide-scrollbars",
+    "--host-resolver-rules=MAP * ~NOTFOUND",
+    "--enable-logging=stderr",
+    "--v=0",
+]
 # a page in a frame of the parent's own origin, so that the parent may measure it at any width and in any theme
 FRAME = """<!doctype html><body style="margin:0"><iframe id="f" width="{width}" height="800" style="border:0" srcdoc="{page}"></iframe><pre id="out"></pre><script>
 const f = document.getElementById("f");

@@ -1,4 +1,5 @@
-"""The stage on a small project: what the pages say, what they do with missing and hostile input, their size, and that equal inputs give equal bytes."""
+"""The stage on a small project: what the pages say, what they do with missing and hostile input, their size, and that equal inputs give
+equal bytes."""
 
 import json
 import re
@@ -92,14 +93,27 @@ def test_the_worst_case_is_the_largest_gap_over_plants_with_its_band_over_seeds(
 @pytest.mark.parametrize(
     "path",
     [
-        "datasets/evaluate_temperature/scorecard.parquet", "datasets/evaluate_temperature/trajectories.parquet", "datasets/evaluate_temperature/study.parquet",
-        "datasets/evaluate_temperature/summary.json", "datasets/learn_kernel/kernel.parquet", "datasets/learn_kernel/window.parquet",
-        "datasets/identify_plant/plant.parquet", "datasets/identify_plant/order.parquet", "datasets/identify_plant/holdout.parquet",
-        "datasets/tune_weights/history.parquet", "datasets/tune_weights/weights.json", "datasets/ingest/record.parquet", "datasets/ingest/quality.parquet",
-        "reports/metrics/generate_probing.json", "reports/metrics/ingest.json", "reports/metrics/identify_plant.json", "reports/metrics/learn_kernel.json",
-        "reports/metrics/tune_weights.json", "reports/metrics/evaluate_temperature.json",
+        "datasets/evaluate_temperature/scorecard.parquet",
+        "datasets/evaluate_temperature/trajectories.parquet",
+        "datasets/evaluate_temperature/study.parquet",
+        "datasets/evaluate_temperature/summary.json",
+        "datasets/learn_kernel/kernel.parquet",
+        "datasets/learn_kernel/window.parquet",
+        "datasets/identify_plant/plant.parquet",
+        "datasets/identify_plant/order.parquet",
+        "datasets/identify_plant/holdout.parquet",
+        "datasets/tune_weights/history.parquet",
+        "datasets/tune_weights/weights.json",
+        "datasets/ingest/record.parquet",
+        "datasets/ingest/quality.parquet",
+        "reports/metrics/generate_probing.json",
+        "reports/metrics/ingest.json",
+        "reports/metrics/identify_plant.json",
+        "reports/metrics/learn_kernel.json",
+        "reports/metrics/tune_weights.json",
+        "reports/metrics/evaluate_temperature.json",
     ],
-)  # fmt: skip
+)
 @pytest.mark.parametrize("how", ["missing", "broken"])
 def test_an_artifact_that_is_missing_or_broken_is_said_so_in_its_place(project, path, how):
     main()

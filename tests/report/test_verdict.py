@@ -22,8 +22,15 @@ from pipeline.report.verdict import (
 )
 
 RULES = ReportRules(
-    gap_percent=5.0, settled_error_degC=0.5, settling_s=60.0, overshoot_degC=5.0, at_limits_percent=10.0, disk_margin=0.4, delay_margin_s=1.0, worst_case_gap_percent=50.0,
-)  # fmt: skip
+    gap_percent=5.0,
+    settled_error_degC=0.5,
+    settling_s=60.0,
+    overshoot_degC=5.0,
+    at_limits_percent=10.0,
+    disk_margin=0.4,
+    delay_margin_s=1.0,
+    worst_case_gap_percent=50.0,
+)
 ASKED = questions(RULES, band_degC=1.0)
 BY_KEY = {question.key: question for question in ASKED}
 
@@ -31,10 +38,16 @@ BY_KEY = {question.key: question for question in ASKED}
 def answers(**changed):
     """A controller that passes every rule, with some figures changed."""
     good = {
-        "gap_percent": Figure(0.42, 0.31, 0.58), "settled_error_degC": Figure(0.31, 0.26, 0.37, note="zone 4"), "settling_s": Figure(9.0, 8.0, 10.0), "overshoot_degC": Figure(0.9, 0.7, 1.2),
-        "at_limits_percent": Figure(6.1, 4.8, 7.9), "disk": Figure(0.46, 0.43, 0.49), "delay_s": Figure(3.1, 2.8, 3.3), "worst_case_gap_percent": Figure(2.8, 2.3, 3.4),
+        "gap_percent": Figure(0.42, 0.31, 0.58),
+        "settled_error_degC": Figure(0.31, 0.26, 0.37, note="zone 4"),
+        "settling_s": Figure(9.0, 8.0, 10.0),
+        "overshoot_degC": Figure(0.9, 0.7, 1.2),
+        "at_limits_percent": Figure(6.1, 4.8, 7.9),
+        "disk": Figure(0.46, 0.43, 0.49),
+        "delay_s": Figure(3.1, 2.8, 3.3),
+        "worst_case_gap_percent": Figure(2.8, 2.3, 3.4),
         "data": Figure(1.24, 1.24, 1.24, note="2,000 of 1,610"),
-    }  # fmt: skip
+    }
     return good | changed
 
 
