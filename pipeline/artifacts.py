@@ -182,6 +182,15 @@ def read_published(folder: str | Path = "datasets/published") -> tuple[np.ndarra
 # ---- recordings
 
 
+@contextlib.contextmanager
+def about(path: str | Path) -> Iterator[None]:
+    """What the body refuses is said of this file."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
 def read_record(path: str | Path, inputs: Sequence, outputs: Sequence) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """The record of ingest as segments u (T, m) and y (T, p), masked samples as NaN; a segment ends at a gap and at the end of a recording."""
     table = read_table(path, schemas.record(inputs, outputs))

@@ -24,6 +24,10 @@ def main() -> None:
         )
         declared, execution = params.load(params.Panel, "panel"), params.load(params.Execution, "execution")
         simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
+        if p.report_noise_degC not in declared.noise_degC:
+            raise ValueError(
+                f"params.yaml: evaluate_temperature.report_noise_degC is {p.report_noise_degC:g} but must be one of panel.noise_degC {declared.noise_degC}; change one of the two"
+            )
         reference, limits = np.array([o.reference for o in machine.outputs]), tuple(np.array([(i.low, i.high) for i in machine.inputs]).T)
         inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
         yardstick = scorecard.Yardstick(

@@ -28,11 +28,15 @@ def main() -> None:
         inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
         recorded = artifacts.read_record("datasets/ingest/record.parquet", machine.inputs, machine.outputs)
         u, y = identification.gapless(*recorded)
+        with artifacts.about("datasets/ingest/record.parquet"):
+            identification.check_inputs(u, offset=p.offset, names=inputs)
+            identification.check_outputs(y, names=outputs)
         cuts = [round(len(us) * (1 - p.holdout_share)) for us in u]
         first = [[signal[:cut] for signal, cut in zip(signals, cuts, strict=True)] for signals in (u, y)]
         last = [[signal[cut:] for signal, cut in zip(signals, cuts, strict=True)] for signals in (u, y)]
         settings = {"sample_time_s": machine.sample_time_s, "offset": p.offset, "refinement": p.refinement, "max_order": p.max_order}
-        chosen = identification.identify(*first, order=p.order or None, **settings)
+        with artifacts.about("datasets/ingest/record.parquet"):
+            chosen = identification.identify(*first, order=p.order or None, **settings)
         fit, ahead = validation.simulate_fit(chosen.plant, *last), validation.predict_fit(chosen.plant, *last, p.ahead_steps)
         tests, excited = validation.residual_tests(chosen.plant, *last), validation.excitation(first[0], chosen.past)
         advice = validation.advice(tests, excited, fit, outputs=outputs, inputs=inputs)

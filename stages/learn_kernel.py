@@ -5,7 +5,7 @@ import numpy as np
 from pydantic import Field
 
 from pipeline import artifacts, params
-from pipeline.temperature import window
+from pipeline.temperature import identification, window
 from pipeline.temperature.judging import kernel_candidates, sufficiency
 from pipeline.temperature.scorecard import Yardstick
 
@@ -26,6 +26,9 @@ def main() -> None:
             np.full(len(machine.outputs), tracking.yardstick_q), np.full(len(machine.inputs), tracking.yardstick_r), tracking.gamma
         )
         u, y = artifacts.read_record("datasets/ingest/record.parquet", machine.inputs, machine.outputs)
+        with artifacts.about("datasets/ingest/record.parquet"):
+            identification.check_inputs(u, offset=p.offset, names=[i.name for i in machine.inputs])
+            identification.check_outputs(y, names=[o.name for o in machine.outputs])
         scenario = {
             "start": panel.training.starts_degC[0],
             "reference": np.array([o.reference for o in machine.outputs]),

@@ -17,6 +17,8 @@ class TuneWeights(params.Section):
     seed: int = Field(ge=0, le=2**31)
     initial: int = Field(ge=4, le=5000)
     evaluations: int = Field(ge=8, le=5000)
+    practical_initial: int = Field(ge=4, le=5000)
+    practical_evaluations: int = Field(ge=8, le=5000)
     acquisition: Literal["expected_improvement", "upper_confidence_bound"]
     q_low: float = Field(gt=0, le=1e6)
     q_high: float = Field(gt=0, le=1e6)
@@ -57,7 +59,7 @@ def main() -> None:
             "integral_limit": tracking.integral_limit_degC,
         }
         practical_cost = judging.engineering_objective(model, scenarios, allowance=allowance, least_disk_margin=p.least_disk_margin, **settings)
-        parity = _search("parity", study.tuning_objective, p, [p.q_low] * 5 + [p.r_low] * 7, [p.q_high] * 5 + [p.r_high] * 7)
+        parity = _search("parity", study.tuning_objective, p, p.initial, p.evaluations, [p.q_low] * 5 + [p.r_low] * 7, [p.q_high] * 5 + [p.r_high] * 7)
         practical = _search(
             "practical",
             practical_cost,
@@ -76,16 +78,16 @@ def main() -> None:
         metrics = {
             "parity": {"best_cost_perfect_state": parity.cost, "optimum": study.tuning_objective(np.ones(12)), "scaled_weights": study.scaled_weights()},
             "practical": {
-                "cost": practical.cost, "cost_default": practical_cost(default), "regret_identity": judging.yardstick_regret(tuned, scenarios, yardstick, q, r),
+                "cost": practical.cost, "cost_default": judging.cost_or_none(practical_cost, default), "regret_identity": judging.yardstick_regret(tuned, scenarios, yardstick, q, r),
                 "failed": int(np.isnan(practical.history.cost).sum()), "q": q, "r": r, "observer_tau": float(tau[0]),
             },
         }  # fmt: skip
         artifacts.write_metrics("tune_weights", metrics)
 
 
-def _search(name: str, cost, p: TuneWeights, low: list[float], high: list[float]) -> tuning.Result:
-    with tqdm(total=p.evaluations, desc=f"tune_weights: {name}", unit="candidate", mininterval=2) as bar:
-        rng, sizes = np.random.default_rng(p.seed), {"initial": p.initial, "evaluations": p.evaluations}
+def _search(name: str, cost, p: TuneWeights, initial: int, evaluations: int, low: list[float], high: list[float]) -> tuning.Result:
+    with tqdm(total=evaluations, desc=f"tune_weights: {name}", unit="candidate", mininterval=2) as bar:
+        rng, sizes = np.random.default_rng(p.seed), {"initial": initial, "evaluations": evaluations}
         return tuning.minimise(
             cost, np.array(low), np.array(high), rng=rng, acquisition=p.acquisition, on_step=lambda _: bar.update(), **sizes
         )

@@ -21,25 +21,28 @@ class Pairing(NamedTuple):
 
 
 def pairing(plant: Plant, low: np.ndarray, high: np.ndarray, *, horizon: int) -> Pairing:
-    """Pairs whose full range heats fastest, one input an output; SIMC on the steepest slope k' within `horizon` samples and the dead time theta before it:
+    """Pairs whose full range heats fastest, one input an output; SIMC on the slope k' and the dead time theta of each pair's step response:
 
     K_c = 1 / (k' (tau_c + theta)),  T_i = 4 (tau_c + theta),  tau_c = theta >= 1 sample: the rule for near-integrating plants (Skogestad 2003, table 1).
-    Raises ValueError where an output obeys no input of its own.
+    The slope is the secant over the second half of the way to the point t* where the line from the step's origin touches the response; t* is no earlier than a
+    hundredth of `horizon`, so that a ripple of the first Markov parameters is not taken for the plant. Raises ValueError where an output obeys no input of its own.
     """
-    slopes = markov_parameters(plant, horizon)
-    response = np.cumsum(slopes, axis=0)
+    if plant.m < plant.p:
+        raise ValueError(f"PI needs an input for each of the {plant.p} outputs; found {plant.m} inputs")
+    rise = np.concatenate([np.zeros((1, plant.p, plant.m)), np.cumsum(markov_parameters(plant, horizon), axis=0)])
     # the way an output goes in the end is its direction: a first answer the other way counts as dead time, as SIMC has it
-    steepest = (slopes * np.where(response[-1] < 0, -1.0, 1.0)).argmax(axis=0)
-    fastest = np.take_along_axis(slopes, steepest[None], axis=0)[0]
-    effect = np.abs(fastest) * (high - low)
+    forward = rise * np.where(rise[-1] < 0, -1.0, 1.0)
+    t = np.arange(horizon + 1)[:, None, None]
+    shortest = max(horizon // 100, 2)
+    touch = shortest + (forward[shortest:] / t[shortest:]).argmax(axis=0)
+    at, half = (np.take_along_axis(rise, when[None], axis=0)[0] for when in (touch, touch // 2))
+    slope = (at - half) / (touch - touch // 2)
+    effect = np.abs(slope) * (high - low)
     outputs, inputs = scipy.optimize.linear_sum_assignment(-effect)
-    if len(outputs) < plant.p or (effect[outputs, inputs] <= 1e-9 * effect.max()).any():
-        raise ValueError(
-            f"PI needs an input for each of the {plant.p} outputs; found {plant.m} inputs, or an output that none of the free ones moves"
-        )
-    slope, at = fastest[outputs, inputs], steepest[outputs, inputs]
-    reached = response[at, outputs, inputs]
-    theta = np.maximum(at + 1 - reached / slope, 1.0)
+    if (effect[outputs, inputs] <= 1e-9 * effect.max()).any():
+        raise ValueError(f"PI needs an input for each of the {plant.p} outputs; found an output that none of the free inputs moves")
+    slope, at, touch = slope[outputs, inputs], at[outputs, inputs], touch[outputs, inputs]
+    theta = np.maximum(touch - at / slope, 1.0)
     return Pairing(inputs, 1 / (2 * theta * slope), 8 * theta)
 
 

@@ -8,6 +8,7 @@ The rules, each with its reason:
   order         the fewest parameters whose error in simulation of left-out blocks is within one standard error (of the paired differences), or 2 %, of the best
 """
 
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -58,7 +59,19 @@ class Identified(NamedTuple):
     notes: list[str]
 
 
-def check_inputs(u: Segments, *, offset: bool = True) -> None:
+def check_outputs(y: Segments, *, names: Sequence[str] = ()) -> None:
+    """Raises ValueError where an output never moves: no model of it is possible."""
+    rows = np.vstack(y)
+    for j in range(rows.shape[1]):
+        seen = rows[np.isfinite(rows[:, j]), j]
+        if seen.size == 0 or np.ptp(seen) == 0:
+            shown = f"{seen[0]:g} in every sample" if seen.size else "missing in every sample"
+            raise ValueError(
+                f"output {names[j] if names else f'y{j + 1}'} is constant ({shown}), so no model of it is possible; check the sensor, or leave it out of plant.outputs"
+            )
+
+
+def check_inputs(u: Segments, *, offset: bool = True, names: Sequence[str] = ()) -> None:
     """Raises ValueError where an input is constant or a linear combination of the others: its column of B is then not identified."""
     rows = np.vstack(u)
     rows = rows[np.isfinite(rows).all(axis=1)]
@@ -66,14 +79,14 @@ def check_inputs(u: Segments, *, offset: bool = True) -> None:
     size = np.sqrt(np.mean(rows**2, axis=0))
     for j in range(rows.shape[1]):
         if size[j] <= 1e-9 * max(np.abs(np.vstack(u)[:, j]).max(initial=0.0), 1e-300):
-            raise ValueError(f"input u{j + 1} is constant, so its column of B is not identified; excite it, or leave it out of the inputs")
+            raise ValueError(f"input {names[j] if names else f'u{j + 1}'} is constant, so its column of B is not identified; excite it, or leave it out of the inputs")
     scaled = rows / size
     for j in range(1, rows.shape[1]):
         weights = np.linalg.lstsq(scaled[:, :j], scaled[:, j], rcond=None)[0]
         if np.linalg.norm(scaled[:, j] - scaled[:, :j] @ weights) < 1e-6 * np.linalg.norm(scaled[:, j]):
-            others = ", ".join(f"u{k + 1}" for k in range(j) if abs(weights[k]) > 1e-6)
+            others = ", ".join(names[k] if names else f"u{k + 1}" for k in range(j) if abs(weights[k]) > 1e-6)
             raise ValueError(
-                f"input u{j + 1} is a linear combination of {others}, so its column of B is not identified; move it independently, or leave it out"
+                f"input {names[j] if names else f'u{j + 1}'} is a linear combination of {others}, so its column of B is not identified; move it independently, or leave it out"
             )
 
 

@@ -202,22 +202,19 @@ def feasible_target(plant: Plant, r: np.ndarray, low: np.ndarray, high: np.ndarr
 
 
 def _steady(plant: Plant, r: np.ndarray, low: np.ndarray, high: np.ndarray, slack: float) -> Target:
-    """Bounded least squares with the balance as heavily weighted rows: at a direct-current gain of 5e5 the eliminated form would lose its digits."""
-    n, m, heavy, light = plant.n, plant.m, 1e7, 1e-6
-    rows = np.vstack(
-        [
-            np.hstack([plant.C, plant.D]),
-            heavy * np.hstack([np.eye(n) - plant.A, -plant.B]),
-            light * np.hstack([np.zeros((m, n)), np.eye(m)]),
-        ]
-    )
-    right = np.concatenate([r - plant.d, heavy * plant.b, np.zeros(m)])
+    """Bounded least squares over u, the state eliminated: x = (I - A)^-1 (B u + b); a plant that only integrates is taken to leak 1e-9 a step."""
+    m, light = plant.m, 1e-6
+    balance = np.eye(plant.n) - plant.A
+    if np.linalg.cond(balance) > 1e13:
+        balance = balance + 1e-9 * np.eye(plant.n)
+    per_u, at_rest = np.linalg.solve(balance, plant.B), np.linalg.solve(balance, plant.b)
+    rows = np.vstack([plant.C @ per_u + plant.D, light * np.eye(m)])
+    right = np.concatenate([r - plant.d - plant.C @ at_rest, np.zeros(m)])
     slack = min(slack, 0.49 * (high - low).min())
-    bounds = (np.concatenate([np.full(n, -np.inf), low + slack]), np.concatenate([np.full(n, np.inf), high - slack]))
-    solution = scipy.optimize.lsq_linear(rows, right, bounds, method="bvls", tol=1e-15).x
-    u = np.clip(solution[n:], low + slack, high - slack)
-    y = plant.C @ solution[:n] + plant.D @ u + plant.d
-    return Target(solution[:n], u, y, y - r, slack)
+    u = scipy.optimize.lsq_linear(rows, right, (low + slack, high - slack), method="bvls", tol=1e-15).x
+    x = per_u @ u + at_rest
+    y = plant.C @ x + plant.D @ u + plant.d
+    return Target(x, u, y, y - r, slack)
 
 
 def aimed(law: Law, r: np.ndarray, u: np.ndarray, y: np.ndarray) -> Law:
