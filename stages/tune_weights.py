@@ -64,6 +64,8 @@ def main() -> None:
             "practical",
             practical_cost,
             p,
+            p.practical_initial,
+            p.practical_evaluations,
             *([q] * model.p + [r] * model.m + [tau] for q, r, tau in ((p.q_low, p.r_low, p.tau_low), (p.q_high, p.r_high, p.tau_high))),
         )
         default = np.array([tracking.yardstick_q] * model.p + [tracking.yardstick_r] * model.m + [tracking.observer_tau])
