@@ -251,7 +251,7 @@ class Margins(NamedTuple):
     radius: float
 
 
-def margins(plants: Sequence[Plant], law: Law, *, grid: int = 400) -> list[Margins]:
+def margins(plants: Sequence[Plant], law: Law, *, grid: int = 240) -> list[Margins]:
     """Of each plant: disk margin 1 / max |S - I/2| (Seiler, Packard, Gahinet 2020, skew 0) and delay margin min (pi + arg lambda(L)) / omega over |lambda(L)| = 1."""
     omega = np.concatenate([np.geomspace(1e-4, 0.3, grid // 2, endpoint=False), np.linspace(0.3, np.pi, grid - grid // 2)])
     z = np.exp(1j * omega)
