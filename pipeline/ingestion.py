@@ -15,9 +15,9 @@ from joblib.externals.loky.process_executor import TerminatedWorkerError
 
 from pipeline import artifacts, schemas
 from pipeline.params import Execution, Plant
-from pipeline.quality import flag
+from pipeline.reading.quality import flag
+from pipeline.reading.resampling import resample
 from pipeline.recordings import Source, Table, nearest_names, read
-from pipeline.resampling import resample
 
 CODE = Path(__file__).parent
 

@@ -9,15 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.csv_files import read_csv
-from pipeline.formats import Columns, check_clock, file_format
-from pipeline.inspection import inspect
-from pipeline.mcap_columns import mcap_columns
-from pipeline.mcap_files import check_magic
-from pipeline.parquet_files import read_parquet
-from pipeline.quality import flag
-from pipeline.resampling import resample
-from pipeline.signals import Flag, Jitter, Note, Raw, Source, Table, nearest_names
+from pipeline.reading.csv_files import read_csv
+from pipeline.reading.formats import Columns, check_clock, file_format
+from pipeline.reading.inspection import inspect
+from pipeline.reading.mcap_columns import mcap_columns
+from pipeline.reading.mcap_files import check_magic
+from pipeline.reading.parquet_files import read_parquet
+from pipeline.reading.quality import flag
+from pipeline.reading.resampling import resample
+from pipeline.reading.signals import Flag, Jitter, Note, Raw, Source, Table, nearest_names
 
 __all__ = ["Flag", "Jitter", "Note", "Raw", "Source", "Table", "flag", "inspect", "nearest_names", "read", "resample"]
 

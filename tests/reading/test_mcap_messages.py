@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import zstandard
 
-from pipeline.mcap_messages import Channel, decoder, fields, plain
+from pipeline.reading.mcap_messages import Channel, decoder, fields, plain
+from pipeline.reading.ros_messages import UnreadableMessage
 from pipeline.recordings import Source, read
-from pipeline.ros_messages import UnreadableMessage
 from tests.mcap_writing import Written, cdr
-from tests.test_protobuf_messages import DESCRIPTOR, MESSAGE
+from tests.reading.test_protobuf_messages import DESCRIPTOR, MESSAGE
 
 JSON = Channel(1, "/machine", "json", {}, "", "", b"")
 

@@ -12,8 +12,8 @@ import numpy as np
 import orjson
 import zstandard
 
-from pipeline import protobuf_messages, ros_messages
-from pipeline.ros_messages import LONGEST_LISTED, UnreadableMessage
+from pipeline.reading import protobuf_messages, ros_messages
+from pipeline.reading.ros_messages import LONGEST_LISTED, UnreadableMessage
 
 LARGEST_MESSAGE = 1 << 30
 ENCODINGS = "cdr with ros2msg, ros1 with ros1msg, protobuf, and json"

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from scipy.ndimage import median_filter
 
-from pipeline.signals import Flag, Table
+from pipeline.reading.signals import Flag, Table
 
 SPIKE_WINDOW = 7
 # a spike is beyond eight robust standard deviations of the residual of the local median, and beyond three times what its neighbours do

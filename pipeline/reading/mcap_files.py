@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-from pipeline.mcap_messages import Channel, UnreadableMessage, decompress
-from pipeline.signals import Note
+from pipeline.reading.mcap_messages import Channel, UnreadableMessage, decompress
+from pipeline.reading.signals import Note
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, STATISTICS, DATA_END = 1, 2, 3, 4, 5, 6, 7, 0x0B, 0x0F

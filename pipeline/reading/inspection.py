@@ -9,13 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.csv_files import csv_columns, csv_layout, read_csv
-from pipeline.formats import Columns, check_clock, file_format, is_time_name
-from pipeline.mcap_columns import Topic, mcap_columns, topics
-from pipeline.parquet_files import parquet_columns, read_parquet
-from pipeline.quality import ROOM_KELVIN, quantisation_step
-from pipeline.resampling import GAP_INTERVALS
-from pipeline.signals import Note, intervals
+from pipeline.reading.csv_files import csv_columns, csv_layout, read_csv
+from pipeline.reading.formats import Columns, check_clock, file_format, is_time_name
+from pipeline.reading.mcap_columns import Topic, mcap_columns, topics
+from pipeline.reading.parquet_files import parquet_columns, read_parquet
+from pipeline.reading.quality import ROOM_KELVIN, quantisation_step
+from pipeline.reading.resampling import GAP_INTERVALS
+from pipeline.reading.signals import Note, intervals
 
 MOST_FIELDS = 64
 _SET_POINT = r"set.?point|target|reference|\bsp\b|_sp$|^sp_"

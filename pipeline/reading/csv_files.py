@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.formats import Column, Columns, column_place, every, seconds, time_column
-from pipeline.signals import Note
+from pipeline.reading.formats import Column, Columns, column_place, every, seconds, time_column
+from pipeline.reading.signals import Note
 
 MISSING = {"", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "?"}
 ROWS_AT_ONCE = 50_000

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from pipeline.ros_messages import UnreadableMessage, decoder, fields, layout
+from pipeline.reading.ros_messages import UnreadableMessage, decoder, fields, layout
 from tests.mcap_writing import cdr
 
 SEPARATOR = "=" * 80 + "\n"

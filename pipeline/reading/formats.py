@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.signals import nearest_names
+from pipeline.reading.signals import nearest_names
 
 # a number beyond that is no time in seconds but an epoch in ms, us or ns (1e11 s is the year 5138)
 _EPOCHS = ((1e17, 1e9, "ns"), (1e14, 1e6, "us"), (1e11, 1e3, "ms"))

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.signals import Flag, Raw, Table, intervals
+from pipeline.reading.signals import Flag, Raw, Table, intervals
 
 # a sample within that share of the sample time from the grid is on it: what a temperature does in a hundredth of a sample is far below any
 # sensor's step

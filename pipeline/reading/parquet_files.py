@@ -7,8 +7,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline.formats import Column, Columns, column_place, every, is_time_name, seconds, time_column
-from pipeline.signals import Note
+from pipeline.reading.formats import Column, Columns, column_place, every, is_time_name, seconds, time_column
+from pipeline.reading.signals import Note
 
 ROWS_AT_ONCE = 50_000
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.ros_messages import LONGEST_LISTED, UnreadableMessage
+from pipeline.reading.ros_messages import LONGEST_LISTED, UnreadableMessage
 
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
 # FieldDescriptorProto.Type -> wire type and struct format, or how a varint is read

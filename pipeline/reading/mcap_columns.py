@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.formats import Columns
-from pipeline.mcap_files import McapFile, Messages
-from pipeline.mcap_messages import Channel, Decode, UnreadableMessage, compressed, decoder, fields, plain
-from pipeline.signals import Note, nearest_names
+from pipeline.reading.formats import Columns
+from pipeline.reading.mcap_files import McapFile, Messages
+from pipeline.reading.mcap_messages import Channel, Decode, UnreadableMessage, compressed, decoder, fields, plain
+from pipeline.reading.signals import Note, nearest_names
 
 SAMPLES = 20
 # a summary may promise what is not there

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from pipeline.protobuf_messages import decoder, fields, message_types
-from pipeline.ros_messages import UnreadableMessage
+from pipeline.reading.protobuf_messages import decoder, fields, message_types
+from pipeline.reading.ros_messages import UnreadableMessage
 
 # protoc --descriptor_set_out of: syntax = "proto3"; package machine;
 # message Zone { float celsius = 1; sint32 trim = 2; optional double limit = 3; }
