@@ -4,22 +4,23 @@ The memo is content-addressed: the hash of the recording, of the job's parameter
 An entry counts once its digests are written and as long as its files have them; anything else is read again.
 """
 
-import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import joblib
 import numpy as np
-from joblib.externals.loky.process_executor import TerminatedWorkerError
 
 from pipeline import artifacts, schemas
+from pipeline.execution import run_all
 from pipeline.params import Execution, Plant
 from pipeline.reading.quality import flag
 from pipeline.reading.resampling import resample
 from pipeline.recordings import Source, Table, nearest_names, read
 
 CODE = Path(__file__).parent
+# what decides what an entry of the memo holds: changed code reads everything again
+READING = ("artifacts.py", "ingestion.py", "params.py", "recordings.py", "schemas.py", "reading/*.py")
 
 
 class Job(NamedTuple):
@@ -69,72 +70,44 @@ def process(folder: Path, job: Job, execution: Execution, *, memo: Path) -> list
     files = sorted(
         path
         for path in folder.rglob("*")
-        if path.is_file() and not path.name.startswith(".") and path.suffix.lower() not in {".md", ".txt", ".yaml"}
+        if path.is_file()
+        and not path.name.startswith(".")
+        and path.suffix.lower() not in {".md", ".yaml", ".dvc"}
+        and path.name.lower() not in {"readme.txt", "license.txt", "source.txt", "notes.txt"}
     )
     if not files:
         raise ValueError(
             f"{folder}: expected at least one recording (CSV, Parquet or MCAP), found none; copy one there, or set generate_probing.source: simulated"
         )
     job.sources()
-    code = "".join(artifacts.sha256(path) for path in sorted(CODE.glob("*.py")))
-    keys = [
-        joblib.hash((artifacts.sha256(path), path.relative_to(folder).as_posix(), job.machine.model_dump(), job[1:], code))
-        for path in files
-    ]
-    remembered = [_remembered(memo, key, job.machine) for key in keys]
-    todo = [(path, key) for path, key, known in zip(files, keys, remembered, strict=True) if known is None]
-    reasons = dict(zip([key for _, key in todo], _run(todo, folder, job, execution, memo), strict=True))
+    code = "".join(artifacts.sha256(path) for pattern in READING for path in sorted(CODE.glob(pattern)))
+    hashes = [artifacts.sha256(path) for path in files]
+    names = [path.relative_to(folder).as_posix() for path in files]
+    keys = [joblib.hash((content, name, job.machine.model_dump(), job[1:], code)) for content, name in zip(hashes, names, strict=True)]
+    twice = _twice(files, hashes)
+    remembered = [None if path in twice else _remembered(memo, key, job.machine) for path, key in zip(files, keys, strict=True)]
+    todo = [(path, key) for path, key, known in zip(files, keys, remembered, strict=True) if known is None and path not in twice]
+    reasons = twice | dict(zip([path for path, _ in todo], _run(todo, folder, job, execution, memo), strict=True))
     return [
-        _result(path.relative_to(folder).as_posix(), known or _remembered(memo, key, job.machine), reasons.get(key, ""), known is not None)
-        for path, key, known in zip(files, keys, remembered, strict=True)
+        _result(name, known or _remembered(memo, key, job.machine), reasons.get(path, ""), known is not None)
+        for path, name, key, known in zip(files, names, keys, remembered, strict=True)
     ]
+
+
+def _twice(files: Sequence[Path], hashes: Sequence[str]) -> dict[Path, str]:
+    """Why a file is left out that is a copy of another: what is learned from twice is trusted twice, and judged by what it was learned from."""
+    first: dict[str, Path] = {}
+    return {
+        path: f"{path} is {first[content].name} once more, byte for byte; remove one of the two"
+        for path, content in zip(files, hashes, strict=True)
+        if first.setdefault(content, path) != path
+    }
 
 
 def _run(todo: Sequence[tuple[Path, str]], folder: Path, job: Job, execution: Execution, memo: Path) -> list[str]:
     """The reasons of `_one`, in the order of `todo`; workers of a cluster see the same file system under absolute paths."""
-    if not todo:
-        return []
-    if execution.backend == "dask":
-        with _cluster(execution.scheduler):
-            calls = [joblib.delayed(_one)(path.resolve(), path, folder, key, job, memo.resolve()) for path, key in todo]
-            return joblib.Parallel()(calls)
-    if len(todo) == 1 or execution.jobs == 1:
-        return [_one(path, path, folder, key, job, memo) for path, key in todo]
-    try:
-        calls = [joblib.delayed(_one)(path, path, folder, key, job, memo) for path, key in todo]
-        return joblib.Parallel(n_jobs=execution.jobs, backend="loky")(calls)
-    except TerminatedWorkerError:
-        raise ValueError(
-            f"{folder}: one of {execution.jobs} workers was killed while it read a recording, as a system does that runs out of memory; "
-            "lower execution.jobs in params.yaml, and run it again: what was read is kept"
-        ) from None
-
-
-@contextlib.contextmanager
-def _cluster(scheduler: str) -> Iterator[None]:
-    """joblib's work goes to the dask cluster of this address; what goes wrong with the cluster is one sentence."""
-    try:
-        import distributed
-    except ImportError:
-        raise ValueError(
-            "params.yaml: execution.backend is dask but dask is not installed; run with ./run --group cluster, or set execution.backend: loky"
-        ) from None
-    with contextlib.ExitStack() as connected:
-        try:
-            connected.enter_context(distributed.Client(scheduler, timeout="20s")).wait_for_workers(1, timeout=20)
-        except OSError as error:
-            raise ValueError(
-                f"params.yaml: execution.scheduler: expected a dask scheduler with a worker at {scheduler}, found none within 20 s "
-                f"({' '.join(str(error).split())}); start `dask scheduler` and `dask worker {scheduler}`, or set execution.backend: loky"
-            ) from None
-        try:
-            with joblib.parallel_config(backend="dask"):
-                yield
-        except distributed.KilledWorker as error:
-            raise ValueError(
-                f"params.yaml: execution.scheduler: {error.allowed_failures + 1} workers of {scheduler} died over the same recordings; "
-                "give each worker more memory, and run it again: what was read is kept"
-            ) from None
+    calls = [joblib.delayed(_one)(path.resolve(), path, folder, key, job, memo.resolve()) for path, key in todo]
+    return list(run_all(calls, execution, kept=": what was read is kept"))
 
 
 def _one(path: Path, shown: Path, folder: Path, key: str, job: Job, memo: Path) -> str:
@@ -149,6 +122,9 @@ def _one(path: Path, shown: Path, folder: Path, key: str, job: Job, memo: Path) 
         raw = read(path, job.sources(), time=job.time)
         table = resample(raw, sample_time_s=job.machine.sample_time_s, inputs=inputs, outputs=outputs, max_gap_s=job.max_gap_s)
         table = flag(table, units=units, limits=limits)
+        for found in table.flags:
+            if found.kind == "mixed" and table.masked[found.signal].mean() > 0.5:
+                raise ValueError(f"{path}: {found.message}")
     except ValueError as reason:
         # on a cluster the path is absolute; what is said is the same wherever the work is done
         return " ".join(str(reason).split()).replace(str(path), str(shown))

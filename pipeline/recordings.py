@@ -13,7 +13,7 @@ from pipeline.reading.csv_files import read_csv
 from pipeline.reading.formats import Columns, check_clock, file_format
 from pipeline.reading.inspection import inspect
 from pipeline.reading.mcap_columns import mcap_columns
-from pipeline.reading.mcap_files import check_magic
+from pipeline.reading.mcap_records import check_magic
 from pipeline.reading.parquet_files import read_parquet
 from pipeline.reading.quality import flag
 from pipeline.reading.resampling import resample
@@ -85,7 +85,8 @@ def _clocks(path: Path, columns: Sequence[Columns], notes: list[Note]) -> dict[s
     start = first // unit * unit if first > CALENDAR_S * unit else 0
     if start:
         zero = np.datetime64(int(start // unit), "s")
-        notes.append(Note("clock", "", 1, f"time is counted from {zero} (UTC, as the recording's clock says)"))
+        zones = sorted({group.zone or "of no zone" for group in columns})
+        notes.append(Note("clock", "", 1, f"time is counted from {zero} ({', '.join(zones)}, as the recording's clock says)"))
     return {group.name: (group.time - start) / unit for group in columns}
 
 

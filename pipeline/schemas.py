@@ -226,9 +226,217 @@ ORDER = Schema(
 
 
 def holdout(outputs: Sequence[_Signal]) -> Schema:
-    """The part of the record that judged the model: measured, and simulated from its inputs alone."""
+    """The part of the record that judged the model: measured, simulated from its inputs alone, and predicted from outputs so many steps before."""
     columns = [Column("segment", INDEX, NONE, "stretch of the record", low=0), Column("time_s", FLOAT, "s", "time since the hold-out began")]
     for signal in outputs:
         columns.append(Column(f"{signal.name}_measured", FLOAT, signal.unit, f"{signal.name} as recorded", nullable=True))
         columns.append(Column(f"{signal.name}_simulated", FLOAT, signal.unit, f"{signal.name} by the model, from the inputs alone", nullable=True))
-    return Schema("holdout", 1, tuple(columns))
+        columns.append(Column(f"{signal.name}_ahead", FLOAT, signal.unit, f"{signal.name} by the model, identify_plant.ahead_steps before", nullable=True))
+    return Schema("holdout", 2, tuple(columns))
+
+
+RESIDUALS = Schema(
+    "residuals",
+    1,
+    (
+        Column("output", TEXT, NONE, "output whose one-step errors on the hold-out these are"),
+        Column("against", TEXT, NONE, "the same output, or the input that they are correlated with"),
+        Column("lag", INDEX, NONE, "samples by which the error comes later"),
+        Column("correlation", FLOAT, NONE, "both about zero mean and of unit power; missing where one of them never moves", nullable=True),
+        Column("band", FLOAT, NONE, "what 99 % of such correlations stay under where nothing is left over", low=0),
+        Column("passed", BOOL, NONE, "the test over all lags, at 99 %"),
+    ),
+)
+
+STEPS = Schema(
+    "steps",
+    1,
+    (
+        Column("output", TEXT, NONE, "output that answers"),
+        Column("input", TEXT, NONE, "input that steps by one percent"),
+        Column("time_s", FLOAT, "s", "time since the step", low=0),
+        Column("response", FLOAT, "degC per percent", "of the model, from rest"),
+        Column("low", FLOAT, "degC per percent", "lower end of the 90 % band over the plants of the spread"),
+        Column("high", FLOAT, "degC per percent", "upper end of that band"),
+    ),
+)
+
+DYNAMICS = Schema(
+    "dynamics",
+    1,
+    (
+        Column("output", TEXT, NONE, "output that answers"),
+        Column("input", TEXT, NONE, "input that steps"),
+        Column("seen", BOOL, NONE, "the band of the response's largest excursion does not hold zero"),
+        *(
+            Column(f"{name}{end}", FLOAT, unit, meaning + of, low, nullable=unit == "s")
+            for name, unit, meaning, low in (
+                ("gain", "degC per percent", "the step response at its end", None),
+                ("peak", "degC per percent", "its largest excursion", None),
+                ("time_constant_s", "s", "1.5 times the way from 28.3 to 63.2 % of the largest excursion", 0),
+                ("delay_s", "s", "what is left of the time to 63.2 % without one time constant", 0),
+            )
+            for end, of in (("", ""), ("_low", ", lower end of its 90 % band"), ("_high", ", upper end of its 90 % band"))
+        ),
+    ),
+)
+
+POLES = Schema(
+    "poles",
+    1,
+    (
+        Column("member", INDEX, NONE, "0 the model, from 1 the plants of the spread", low=0),
+        Column("pole", INDEX, NONE, "number of the model's pole that it belongs to, the largest 0; -1 for one that the model does not have", low=-1),
+        Column("real", FLOAT, NONE, "real part"),
+        Column("imag", FLOAT, NONE, "imaginary part"),
+    ),
+)
+
+LEVELS = Schema(
+    "levels",
+    1,
+    (
+        Column("input", TEXT, NONE, "input"),
+        Column("low_rad", FLOAT, "rad per sample", "lower edge of the band of frequencies", low=0),
+        Column("high_rad", FLOAT, "rad per sample", "upper edge of that band"),
+        Column("level", FLOAT, "percent", "root mean square of the input within the band", low=0),
+    ),
+)
+
+
+# ---- the deposition loop
+
+TRIALS = Schema(
+    "trials",
+    1,
+    (
+        Column("material", TEXT, NONE, "material"),
+        Column("law", TEXT, NONE, "paper: law (2) of the study; ours: inverse of the identified model; pixels: ours, the flow measured from camera frames"),
+        Column("routine", INDEX, NONE, "which training routine, counted from 0", low=0),
+        Column("speed_mm_per_s", FLOAT, "mm/s", "printing speed of the routine", low=0),
+        Column("pause_s", FLOAT, "s", "its pause", low=0),
+        Column("trial", INDEX, NONE, "updates before this trial", low=0),
+        Column("rms_true", FLOAT, "mm^3/s", "root mean square error of the true flow; missing on a real machine", low=0, nullable=True),
+        Column("rms_measured", FLOAT, "mm^3/s", "root mean square error of the measured flow", low=0),
+        Column("ratio", FLOAT, NONE, "error as share of trial 0's: of the true flow where known, of the measured one elsewhere", low=0),
+        Column("peak_over_steady", FLOAT, NONE, "largest command as multiple of the steady one", low=0),
+        Column("saturated", FLOAT, NONE, "share of time at the limit of the command", 0, 1),
+        Column("rolled_back", BOOL, NONE, "the error rose, and the next command went back to the best trial"),
+    ),
+)
+
+LESSONS = Schema(
+    "lessons",
+    1,
+    (
+        Column("material", TEXT, NONE, "material"),
+        Column("law", TEXT, NONE, "paper, ours or pixels"),
+        Column("routine", INDEX, NONE, "which training routine, counted from 0", low=0),
+        Column("trial", INDEX, NONE, "updates before this trial", low=0),
+        Column("time_s", FLOAT, "s", "time since the trial began"),
+        Column("wanted_mm3_per_s", FLOAT, "mm^3/s", "wanted flow"),
+        Column("command_mm", FLOAT, "mm", "plunger command as the drive applied it"),
+        Column("measured_mm3_per_s", FLOAT, "mm^3/s", "measured flow; missing where it could not be observed", nullable=True),
+        Column("true_mm3_per_s", FLOAT, "mm^3/s", "true flow; missing on a real machine", nullable=True),
+    ),
+)
+
+LIBRARY = Schema(
+    "library",
+    1,
+    (
+        Column("task", TEXT, NONE, "Stop, Start, Corner, Steady-State or No-Flow"),
+        Column("material", TEXT, NONE, "material"),
+        Column("nozzle_mm", FLOAT, "mm", "inner diameter of the nozzle", low=0),
+        Column("speed_mm_per_s", FLOAT, "mm/s", "printing speed that it was learned at", low=0),
+        Column("pause_s", FLOAT, "s", "pause that it was learned with; 0 but for a Corner", low=0),
+        Column("lead", COUNT, NONE, "samples that it begins ahead of its event", low=0),
+        Column("length", COUNT, NONE, "samples that follow", low=0),
+        Column("signal_mm", pa.list_(FLOAT), "mm", "the basis signal"),
+    ),
+)
+
+FILMED = Schema(
+    "filmed",
+    1,
+    (
+        Column("material", TEXT, NONE, "material"),
+        Column("routine", INDEX, NONE, "which training routine, counted from 0", low=0),
+        Column("trial", INDEX, NONE, "updates before this trial", low=0),
+        Column("frames", COUNT, NONE, "frames read", low=0),
+        Column("rejected", COUNT, NONE, "frames without a usable bead", low=0),
+        Column("reasons", TEXT, NONE, "why, with counts"),
+        Column("deviation_mm3_per_s", FLOAT, "mm^3/s", "median standard deviation of the measured flow", low=0),
+        Column("observable", FLOAT, NONE, "share of the time in which the flow could be observed", 0, 1),
+        Column("outliers", COUNT, NONE, "places that disagreed with their neighbours and count less", low=0),
+    ),
+)
+
+SIGNALS = Schema(
+    "signals",
+    1,
+    (
+        Column("part", TEXT, NONE, "part program"),
+        Column("tool", INDEX, NONE, "tool", low=0),
+        Column("material", TEXT, NONE, "its material"),
+        Column("time_s", FLOAT, "s", "time since the plunger may move first"),
+        Column("x_mm", FLOAT, "mm", "gantry"),
+        Column("y_mm", FLOAT, "mm", "gantry"),
+        Column("wanted_mm3_per_s", FLOAT, "mm^3/s", "wanted flow"),
+        Column("command_mm", FLOAT, "mm", "plunger command of the composer that was chosen"),
+        Column("predicted_mm3_per_s", FLOAT, "mm^3/s", "flow that the identified chain predicts for it"),
+        Column("on_off_mm3_per_s", FLOAT, "mm^3/s", "true flow of on-off control; predicted on a real machine"),
+        Column("priority_mm3_per_s", FLOAT, "mm^3/s", "the same of the library by the priority rule"),
+        Column("superposition_mm3_per_s", FLOAT, "mm^3/s", "the same of the library by superposition"),
+        Column("basis_mm3_per_s", FLOAT, "mm^3/s", "the same of the basis functions"),
+        Column("ilc_mm3_per_s", FLOAT, "mm^3/s", "the same after learning the whole structure; missing on a real machine", nullable=True),
+    ),
+)
+
+SCORES = Schema(
+    "scores",
+    1,
+    (
+        Column("part", TEXT, NONE, "part program"),
+        Column("material", TEXT, NONE, "material"),
+        Column("composer", TEXT, NONE, "on_off, priority, superposition, basis, or ilc on the whole structure"),
+        Column("chosen", BOOL, NONE, "predicted to do best, and taken"),
+        Column("rms_percent_of_on_off", FLOAT, "percent", "root mean square error of the true flow, as share of on-off control's; predicted on a real machine", low=0),
+        Column("predicted_percent", FLOAT, "percent", "the same as predicted beforehand; missing where nothing predicts it", low=0, nullable=True),
+        Column("worst_line_volume_percent", FLOAT, "percent", "largest error of a printed line's volume, of lines long enough to be judged; missing where there is none", nullable=True),
+    ),
+)
+
+TASKS = Schema(
+    "tasks",
+    1,
+    (
+        Column("part", TEXT, NONE, "part program"),
+        Column("task", TEXT, NONE, "No-Flow, Start, Steady-State, Corner, Stop or Dwell"),
+        Column("tool", INDEX, NONE, "tool", low=0),
+        Column("line", COUNT, NONE, "line of the program that calls for it", low=0),
+        Column("begin_s", FLOAT, "s", "its event"),
+        Column("end_s", FLOAT, "s", "its end"),
+        Column("speed_mm_per_s", FLOAT, "mm/s", "printing speed", low=0),
+        Column("pause_s", FLOAT, "s", "time lost at a Corner", low=0),
+        Column("error_percent", FLOAT, "percent", "predicted error of the library's signal; missing where nothing tells it", nullable=True),
+    ),
+)
+
+LINES = Schema(
+    "lines",
+    1,
+    (
+        Column("part", TEXT, NONE, "part program"),
+        Column("line", COUNT, NONE, "line of the program", low=0),
+        Column("tool", INDEX, NONE, "tool", low=0),
+        Column("begin_s", FLOAT, "s", "begin"),
+        Column("duration_s", FLOAT, "s", "duration", low=0),
+        Column("length_mm", FLOAT, "mm", "length", low=0),
+        Column("planned_mm3", FLOAT, "mm^3", "planned volume: bead area x length", low=0),
+        Column("predicted_mm3", FLOAT, "mm^3", "predicted volume"),
+        Column("on_off_mm3", FLOAT, "mm^3", "predicted volume of on-off control"),
+        Column("error_percent", FLOAT, "percent", "predicted less planned"),
+        Column("shorter_than_lead", BOOL, NONE, "its whole run is shorter than the lead of Stop"),
+    ),
+)

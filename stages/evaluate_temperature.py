@@ -2,11 +2,12 @@
 scorecard.parquet, trajectories.parquet, study.parquet and summary.json."""
 
 import numpy as np
-from joblib import Parallel, delayed
+from joblib import delayed
 from pydantic import Field
 from tqdm import tqdm
 
 from pipeline import artifacts, params, schemas
+from pipeline.execution import run_all
 from pipeline.temperature import judging, kernel, plant, published, scorecard, study, window
 
 
@@ -58,15 +59,16 @@ def main() -> None:
         }
         refused = judging.refusals(compared, [(yardstick.q, yardstick.r), (weights["q"], weights["r"])])
         kept = [c for c in compared if c.name not in refused]
-        judged = [judging.judge(c, scenarios, yardstick=yardstick, q=weights["q"], r=weights["r"], **settings) for c in tqdm(kept, desc="evaluate_temperature: controllers", mininterval=2)]
+        judged = [
+            judging.judge(c, scenarios, yardstick=yardstick, q=weights["q"], r=weights["r"], **settings)
+            for c in tqdm(kept, desc="evaluate_temperature: controllers", mininterval=2)
+        ]
         summary = {j.name: judging.summary(j, scenarios, noise=p.report_noise_degC) for j in judged}
         K0, u, y = artifacts.read_published("datasets/published")
         sets_u, sets_y = study.data_sets(np.random.default_rng(p.seed), 15_000, p.data_sets)
         work = [(noise, i) for noise in study.NOISE for i in range(p.data_sets)]
-        learning = Parallel(n_jobs=execution.jobs, return_as="generator")(
-            delayed(study.under_noise)(sets_u[:, i], sets_y[:, i], noise=noise, seed=i) for noise, i in work
-        )
-        found = list(tqdm(learning, total=len(work), desc="evaluate_temperature: noisy data sets", mininterval=2))
+        calls = [delayed(study.under_noise)(sets_u[:, i], sets_y[:, i], noise=noise, seed=i) for noise, i in work]
+        found = list(tqdm(run_all(calls, execution), total=len(work), desc="evaluate_temperature: noisy data sets", mininterval=2))
         noisy, noise_free = study.rows(work, found), study.noise_free(u[1:], y[1:], np.random.default_rng(p.seed))
         figures = study.metrics(
             published.figures(K0, u, y), study.exact(), noise_free, noisy, failures=published.algorithm_1_failures(300), starts=300

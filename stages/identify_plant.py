@@ -1,4 +1,5 @@
-"""Record -> plant and its spread: reads datasets/ingest/record.parquet; writes datasets/identify_plant: plant.parquet, spread.parquet, order.parquet, holdout.parquet.
+"""Record -> plant and its spread: reads datasets/ingest/record.parquet; writes datasets/identify_plant: plant, spread, order, and what the page of the identification
+shows: holdout, residuals, steps, dynamics, poles, levels.
 
 Order and window are chosen on the first part of every segment; the last part judges; the plant that is handed on is fitted to both with what was chosen."""
 
@@ -8,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from pipeline import artifacts, params, schemas
-from pipeline.temperature import identification, plant, validation
+from pipeline.temperature import identification, order, plant, trust, validation
 
 
 class IdentifyPlant(params.Section):
@@ -37,24 +38,32 @@ def main() -> None:
         settings = {"sample_time_s": machine.sample_time_s, "offset": p.offset, "refinement": p.refinement, "max_order": p.max_order}
         with artifacts.about("datasets/ingest/record.parquet"):
             chosen = identification.identify(*first, order=p.order or None, **settings)
-        fit, ahead = validation.simulate_fit(chosen.plant, *last), validation.predict_fit(chosen.plant, *last, p.ahead_steps)
-        tests, excited = validation.residual_tests(chosen.plant, *last), validation.excitation(first[0], chosen.past)
-        advice = validation.advice(tests, excited, fit, outputs=outputs, inputs=inputs)
+        judged = trust.holdout(chosen.plant, *last, p.ahead_steps, block=2 * chosen.past, rng=np.random.default_rng(p.seed))
+        tests, excited = validation.residual_tests(chosen.plant, *last, lags=trust.residual_lags(last[0])), validation.excitation(first[0], chosen.past)
         found = identification.identify(u, y, order=chosen.order, past=chosen.past, **settings)
         if not (observed := plant.observability(found.plant)).passed:
             raise ValueError("datasets/ingest/record.parquet: " + observed.reason)
         family = validation.bootstrap_spread(u, y, found, count=p.spread_plants, order=found.order + 1, rng=np.random.default_rng(p.seed))
-        simulated = [validation.simulated(chosen.plant, us, ys) for us, ys in zip(*last, strict=True)]
+        steps = trust.steps(found.plant, family, max(map(len, u)))
         artifacts.write_arrays(out / "plant.parquet", "plant", 1, plant.stored([found.plant]))
         artifacts.write_arrays(out / "spread.parquet", "spread", 1, plant.stored(family))
-        artifacts.write_table(out / "order.parquet", schemas.ORDER, identification.rows(chosen))
-        artifacts.write_table(out / "holdout.parquet", schemas.holdout(machine.outputs), validation.rows(last[1], simulated, outputs, machine.sample_time_s))
+        for name, schema, rows in (
+            ("order", schemas.ORDER, identification.rows(chosen)),
+            ("holdout", schemas.holdout(machine.outputs), trust.holdout_rows(last[1], judged, outputs, machine.sample_time_s)),
+            ("residuals", schemas.RESIDUALS, trust.residual_rows(tests, outputs, inputs)),
+            ("steps", schemas.STEPS, trust.step_rows(steps, outputs, inputs, machine.sample_time_s)),
+            ("dynamics", schemas.DYNAMICS, trust.dynamics_rows(steps, outputs, inputs, machine.sample_time_s)),
+            ("poles", schemas.POLES, trust.pole_rows(found.plant, family)),
+            ("levels", schemas.LEVELS, trust.level_rows(trust.input_levels(u), inputs)),
+        ):
+            artifacts.write_table(out / f"{name}.parquet", schema, rows)
         metrics = {
-            "order": found.order, "past": found.past, "fit": found.fit, "rows": found.rows, "dropped_rows": found.dropped_rows,
-            "samples_cut": sum(map(len, recorded[0])) - sum(map(len, u)), "notes": [*chosen.notes, *found.notes],
-            "fit_holdout": dict(zip(outputs, fit, strict=True)), "fit_holdout_ahead": dict(zip(outputs, ahead, strict=True)), "ahead_steps": p.ahead_steps,
-            "whiteness_passed": dict(zip(outputs, tests.whiteness_passed, strict=True)), "excitation": {"rank": excited.rank, "full": excited.full, "condition": excited.condition},
-            "controllable": plant.controllability(found.plant).passed, "largest_pole": np.abs(np.linalg.eigvals(found.plant.A)).max(), "advice": advice,
+            "order": found.order, "order_tolerance_percent": 100 * order.WORTH_A_STATE, "past": found.past, "fit": found.fit, "rows": found.rows, "dropped_rows": found.dropped_rows,
+            "samples": sum(map(len, recorded[0])), "samples_cut": sum(map(len, recorded[0])) - sum(map(len, u)), "samples_holdout": sum(map(len, last[0])),
+            "delays": dict(zip(inputs, found.delays, strict=True)), "notes": list(dict.fromkeys([*chosen.notes, *found.notes])), "ahead_steps": p.ahead_steps,
+            **trust.fit_figures(judged, outputs), **trust.outcome_figures(tests, excited, outputs, inputs),
+            "controllable": plant.controllability(found.plant).passed, "largest_pole": np.abs(np.linalg.eigvals(found.plant.A)).max(),
+            "advice": validation.advice(tests, excited, judged.fit[0], outputs=outputs, inputs=inputs),
         }  # fmt: skip
         artifacts.write_metrics("identify_plant", metrics)
 

@@ -1,10 +1,11 @@
-"""Artifacts -> pages: reads the metrics and tables of every stage and reports/accepted.json; writes reports/index.html and temperature.html.
+"""Artifacts -> pages: reads the metrics and tables of every stage and reports/accepted.json; writes reports/index.html, temperature.html and
+identification.html.
 
 What is missing is shown as missing; what was read is hashed, and the pages carry the hashes.
 """
 
 from pipeline import artifacts, params
-from pipeline.report import index, temperature
+from pipeline.report import identification, index, temperature
 from pipeline.report.judgement import judgement, shown
 from pipeline.report.sources import Declared, collect, digest
 from pipeline.report.verdict import ReportRules
@@ -36,9 +37,14 @@ def main() -> None:
         }
         sources = collect(declared, metrics, folders, "reports/accepted.json", ("pipeline", "stages"))
         judged = judgement(sources)
-        pages = {"index": index.render(sources, judged), "temperature": temperature.render(sources, judged)}
+        pages = {
+            "index": index.render(sources, judged),
+            "temperature": temperature.render(sources, judged),
+            "identification": identification.render(sources),
+        }
         artifacts.write_text("reports/index.html", pages["index"])
         artifacts.write_text("reports/temperature.html", pages["temperature"])
+        artifacts.write_text("reports/identification.html", pages["identification"])
         artifacts.write_metrics(
             "report",
             {

@@ -189,7 +189,7 @@ def test_a_mapping_that_names_no_signal_is_refused_with_the_nearest_names(tree, 
             changed(t_s=(300, 299.0)),
             (
                 "line 302 has the same time as the sample before it, 299 s, but time should only run forward; "
-                "name a finer clock, or separate two devices that write under one name"
+                "name a finer clock, or give each device or tag that writes here a column of its own"
             ),
         ),
         (changed(T1=(slice(None), np.nan)), "T1 should hold numbers for zone_1 but all of its 600 values are missing; map another source"),

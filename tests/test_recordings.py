@@ -70,12 +70,25 @@ def test_scale_and_offset_turn_kelvin_and_duty_into_our_units(tmp_path):
         "timestamp,u,y\n2025-11-21T13:00:00Z,1.5,2\n2025-11-21 14:00:01+01:00,2.5,3\n",
         "timestamp,u,y\n1763730000000,1.5,2\n1763730001000,2.5,3\n",
         "time_min,u,y\n0,1.5,2\n0.016666666666666666,2.5,3\n",
+        # of controllers, spreadsheets and historians
+        "Recorder;R-7\nSerial;12345\n\nDatum;Uhrzeit;u;y\n;;%;C\n21.11.2025;13:00:00;1,5;2\n21.11.2025;13:00:01;2,5;3\n",
+        "sep=;\nZeit;u;y\n21.11.2025 23:59:59,5;1,5;2,0\n22.11.2025 00:00:00,5;2,5;3,0\n",
+        "time,u,y\n23:59:59,1.5,2\n00:00:00,2.5,3\n",
+        "Timestamp (UTC),u,y\n11/21/2025 01:00:00 PM,1.5,2\n11/21/2025 01:00:01 PM,2.5,3\n",
+        "stamp,u,y\n20251121130000,1.5,2\n20251121130001,2.5,3\n",
+        "Date,u,y\n45982.5416666667,1.5,2\n45982.5416782407,2.5,3\n",
+        '"t","u","y"\n"0,0","1,5","2,0"\n"1,0","2,5","3,0"\n',
+        "t,u,y\n0,1.5,2\nt,u,y\n1,2.5,3\n",
+        "t,u,y\n0,1.5,2\n1,2.5,3\n\nTotal,,\nAverage,2,2.5\n-- end of log --\n",
+        "timestamp,u,y\n2025-11-21 13:00:01,2.5,3\n2025-11-21 13:00:00,1.5,2\n",
+        "time,1,u,y\n0,7,1.5,2\n1,7,2.5,3\n",
     ],
 )
 def test_csv_of_many_programs_is_the_same_record(tmp_path, content):
     raw = opened(tmp_path, content)
-    # a minute's sixtieth is rounded
-    np.testing.assert_allclose(raw.signals["u"][0], [0, 1], rtol=1e-15)
+    # a minute's sixtieth is rounded; ten digits of a spreadsheet's day are 9 us
+    time = raw.signals["u"][0]
+    np.testing.assert_allclose(time - np.floor(time[0]), np.array([0, 1]) + time[0] % 1, rtol=1e-15, atol=9e-6 if "Date," in content else 0)
     assert raw.signals["u"][1].tolist() == [1.5, 2.5]
     assert raw.signals["y"][1].tolist() == [2, 3]
 
@@ -110,6 +123,30 @@ def test_a_column_that_is_filled_now_and_then_has_its_own_clock(tmp_path):
     assert [(note.kind, note.signal, note.count) for note in raw.notes] == [("sparse", "u", 16)]
 
 
+def test_what_is_passed_over_or_taken_for_granted_is_noted_with_its_place(tmp_path):
+    def notes(content: str) -> list[tuple[str, int, str]]:
+        return [(note.kind, note.count, note.message) for note in opened(tmp_path, content).notes]
+
+    assert notes("t,u,y\n0,1,2\nt,u,y\n1,2,3\n") == [("header", 1, "the header is repeated 1 times, first in line 3")]
+    tail = "2 lines behind the data were left out, from line 4 on, which is 'Total,,'"
+    assert notes("t,u,y\n0,1,2\n1,2,3\nTotal,,\nMax,2,3\n") == [("trailing", 2, tail)]
+    midnight = "the time of day runs over midnight 1 times: a day was added each time"
+    assert notes("time,u,y\n23:59:59,1,2\n00:00:00,2,3\n") == [("clock", 1, midnight)]
+    newest = ("clock", 2, "the newest sample stands first: the rows were read from the last to the first")
+    assert notes("t,u,y\n1,2,3\n0,1,2\n") == [newest]
+    switch = ("words", 1, "u is written as OFF and ON, which were read as 1 and 0")
+    assert notes("t,u,y\n0,OFF,2\n1,ON,3\n") == [switch]
+    serial = "column Date holds 45982.542 to 45982.542 and was taken as days, as spreadsheets count them"
+    assert notes("Date,u,y\n45982.541666667,1,2\n45982.541678241,2,3\n")[0] == ("clock", 1, serial)
+    assert notes("time,u,y\n2025-11-21T13:00:00,1,2\n")[0][2].endswith("13:00:00 (of no zone, as the recording's clock says)")
+
+
+def test_words_of_a_historian_for_no_value_are_missing_and_counted(tmp_path):
+    raw = opened(tmp_path, "t,u,y\n0,1,2\n1,Bad,3\n2,No Data,3\n3,#REF!,3\n4,2,3\n5,2,3\n6,2,3\n")
+    np.testing.assert_array_equal(raw.signals["u"][1], [1, np.nan, np.nan, np.nan, 2, 2, 2])
+    assert [(note.kind, note.count) for note in raw.notes] == [("missing", 3)]
+
+
 def test_a_last_line_that_breaks_off_is_left_out_and_noted(tmp_path):
     raw = opened(tmp_path, "t,u,y\n0,1,2\n1,2,3\n2,3")
     assert raw.signals["u"][1].tolist() == [1, 2]
@@ -133,10 +170,28 @@ def test_zeros_after_a_power_failure_are_left_out_and_noted(tmp_path):
             "line 4 is at 1 s, which is before the sample ahead of it at 2 s, but time should only run forward; split",
         ),
         ("t,u,y\n0,1,2\n1,1,2\n1,1,2\n2,1,2\n2,1,2\n", "line 4 has the same time as the sample before it, 1 s, the first of 2, but time"),
-        ("t,u,y\n0,1,2\n,1,2\n", "line 3 should have a time but has none, the first of 1; fill it in or remove the row"),
+        ("t,u,y\n0,1,2\n,1,2\n2,1,2\n", "line 3 should have a time in t but has none; mend or remove that line"),
+        ("t,u,y\n0,1,2\nTotal,1,2\n2,1,2\n", "line 3 should have a time in t but has 'Total'; mend or remove that line"),
         ("t,u,y\n0,1,2\n1,warm,2\n", "line 3, column u should be a number but is 'warm'; mend that line, or leave the field empty"),
         ("t,u,y\n0,1,2\n1,1\n2,1,2\n", "line 3 has 2 fields but the header has 3 columns; mend or remove that line"),
-        ("t,u,y\n0,1,2\nt,u,y\n1,1,2\n", "line 3, column u should be a number but is 'u'"),
+        ("t,u,y\n0,1,2\n1,1,2\nt,u,y\n0,1,2\n", "line 5 is at 0 s, which is before the sample ahead of it at 1 s"),
+        ("t,u,y\n0,1,2\n1,20 %,2\n", "line 3, column u should be a number but is '20 %'; write the numbers without their unit"),
+        (
+            "t;u;y\n0;1,5;2\n1;1.234,5;2\n",
+            "line 3, column u should be a number but is '1.234,5'; write the numbers without marks between thousands",
+        ),
+        (
+            "t;u;y\n0;1,5;2\n1;1.234;2\n2;2,5;2\n",
+            "line 3, column u should be a number but is '1.234'; write the numbers without marks between thousands",
+        ),
+        (
+            "t,u,y\n" + "".join(f"{k + 100 * (k % 2)},1,2\n" for k in range(40)),
+            "the first of 19, but time should only run forward; two devices with clocks of their own seem to write under one name",
+        ),
+        (
+            "time,u,y\n" + "".join(f"2025-10-26 02:{minute}:{k:02d},1,2\n" for minute in ("59", "00") for k in range(60)),
+            "an hour is what the end of summer time takes away: write the times with their zone or in UTC",
+        ),
         ("t,u,y\n0,,2\n1,,2\n", "u should hold numbers for u but all of its 2 values are missing; map another source"),
         ("t,u,z\n0,1,2\n", "there is no column 'y'; it has t, u, z"),
         ("t,u,yy\n0,1,2\n", "there is no column 'y'; the nearest names are yy"),
@@ -146,10 +201,14 @@ def test_zeros_after_a_power_failure_are_left_out_and_noted(tmp_path):
             "no column is called like a time (t_s, time, timestamp, ...) among a, u, y; name it, or write time: every 1.0 s",
         ),
         (
-            "time,u,y\n21.11.2025 13:00,1,2\n",
-            "line 2, time time should be seconds or ISO 8601 such as 2025-11-21T13:00:00.5 but is '21.11.2025 13:00'",
+            "time,u,y\n05/03/2025 13:00,1,2\n06/03/2025 13:00,1,2\n",
+            "line 2, time time should be seconds or ISO 8601 such as 2025-11-21T13:00:00.5 but is '05/03/2025 13:00' (day and month, or month and day?)",
         ),
         ("t,u,y\n", "the file has a header and no data"),
+        ("name,owner\n" + "rig,bob\n" * 20, "the file has 21 lines of text and no data"),
+        ("a word, and 3 more.\nThen nothing\n7 dwarfs,\n\nthe end of 1 tale\n" * 9, "is text but no table"),
+        ('{"t": 0, "u": 1}\n', "is JSON but should be MCAP, Parquet or CSV"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(100), "is a PNG picture but should be MCAP, Parquet or CSV; name the recording"),
         ("\n\n# nothing\n", "the file has only blank or comment lines and no data"),
         ("", "is empty (0 bytes) but should be MCAP, Parquet or CSV; copy the recording again"),
         (bytes(3000), "begins with 512 zero bytes"),

@@ -7,27 +7,48 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.reading.signals import nearest_names
+from pipeline.reading.signals import Note, nearest_names
 
-# a number beyond that is no time in seconds but an epoch in ms, us or ns (1e11 s is the year 5138)
-_EPOCHS = ((1e17, 1e9, "ns"), (1e14, 1e6, "us"), (1e11, 1e3, "ms"))
+# a number beyond that is no time in seconds but an epoch in ms, us, ns, or 100 ns as Windows counts from 1601 (1e11 s is the year 5138)
+_EPOCHS = ((5e17, 1e9, "ns"), (1e17, 1e7, "100 ns"), (1e14, 1e6, "us"), (1e11, 1e3, "ms"))
+# days since 1899-12-30 and since the year 0, from 1954 to 2119, and 1970-01-01 in them
+_SERIAL_DAYS = ((20_000, 80_000, 25_569, "spreadsheets"), (713_000, 774_000, 719_529, "MATLAB"))
+# so many days are 86 s; numbers of that size in seconds that are as near to one another come from no machine of ours
+_SERIAL_INTERVAL = 1e-3
+# a clock that runs on for no more than so many samples before it falls back is not one clock
+OTHER_DEVICE_RUN = 8
 _TIME_NAMES = (
     "t",
     "time",
     "elapsed",
     "elapsed_time",
+    "relative_time",
     "seconds",
     "timestamp",
     "time_stamp",
     "stamp",
+    "ts",
     "log_time",
+    "_time",
     "datetime",
     "date_time",
+    "zeitstempel",
+    "zeit",
+    "uhrzeit",
+    "epoch",
+    "unix_time",
+    "unixtime",
+    "uptime",
+    "runtime",
+    "timestring",
     "date",
+    "datum",
     "index",
 )
+DATE_NAMES = ("date", "datum")
 _PER_SECOND = {"s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e3, "msec": 1e3, "us": 1e6, "µs": 1e6,
-               "usec": 1e6, "ns": 1e9, "nsec": 1e9, "min": 1 / 60, "h": 1 / 3600}  # fmt: skip
+               "usec": 1e6, "ns": 1e9, "nsec": 1e9, "min": 1 / 60, "mins": 1 / 60, "minutes": 1 / 60, "h": 1 / 3600, "hours": 1 / 3600,
+               "d": 1 / 86400, "days": 1 / 86400}  # fmt: skip
 
 _PARQUET = b"PAR1"
 _STRANGERS = {
@@ -43,16 +64,29 @@ _STRANGERS = {
     b"MATLAB 5.0": ("a MATLAB file", "save the signals as CSV or Parquet"),
     b"\x80\x04": ("a pickle", "save the signals as CSV or Parquet"),
     b"<": ("HTML or XML", "save the signals as CSV or Parquet"),
+    b"{": ("JSON", "save the signals as CSV or Parquet"),
+    b"[{": ("JSON", "save the signals as CSV or Parquet"),
+    b"\x89PNG": ("a PNG picture", "name the recording"),
+    b"\xff\xd8\xff": ("a JPEG picture", "name the recording"),
+    b"GIF8": ("a GIF picture", "name the recording"),
+    b"%PDF": ("a PDF document", "export the numbers as CSV"),
+    b"\x7fELF": ("a program (ELF)", "name the recording"),
+    b"\x93NUMPY": ("a NumPy array", "save the signals as CSV or Parquet"),
+    b"TDSm": ("TDMS of LabVIEW", "export it as CSV"),
+    b"\xd0\xcf\x11\xe0": ("Excel 97", "save the sheet as CSV"),
+    b"ARROW1": ("an Arrow file", "write it as Parquet"),
 }
 
 
 class Columns(NamedTuple):
-    """Columns on one clock: time_s (n,) or, where it is on a calendar, time_ns (n,); `place(i)` says where sample i stands in the file."""
+    """Columns on one clock: time_s (n,) or, where it is on a calendar, time_ns (n,); `place(i)` says where sample i stands in the file;
+    `zone` is that of the calendar, empty where the file does not say it."""
 
     name: str
     time: np.ndarray
     values: dict[str, np.ndarray]
     place: Callable[[int], str]
+    zone: str = "UTC"
 
 
 class Column(NamedTuple):
@@ -61,6 +95,30 @@ class Column(NamedTuple):
     name: str
     type: str
     unit: str
+
+
+class Growing:
+    """Columns (n,) that grow in place as parts of a file come in: parts that are joined at the end would need twice the memory."""
+
+    def __init__(self, kinds: Sequence[type], expected: int = 0):
+        self.count = 0
+        self._columns = [np.empty(max(expected, 1), kind) for kind in kinds]
+
+    def append(self, *parts: np.ndarray) -> None:
+        end = self.count + len(parts[0])
+        if end > len(self._columns[0]):
+            self._resize(end + end // 4)
+        for column, part in zip(self._columns, parts, strict=True):
+            column[self.count : end] = part
+        self.count = end
+
+    def _resize(self, size: int) -> None:
+        for column in self._columns:
+            column.resize(size, refcheck=False)
+
+    def finished(self) -> list[np.ndarray]:
+        self._resize(self.count)
+        return self._columns
 
 
 # ---- format
@@ -134,24 +192,53 @@ def _time_rank(name: str) -> tuple[bool, int] | None:
 
 
 def _time_unit(name: str) -> tuple[str, str]:
-    """("time", "ms") of "Time [ms]", "time_ms" and the like."""
-    found = re.match(r"^(.*?)[\s_.]*[(\[/_\s]\s*(\w+)\s*[)\]]?$", name.strip().casefold())
+    """("time", "ms") of "Time [ms]", "time_ms" and the like; a time zone at the end is no part of the name."""
+    plain = re.sub(r"[\s_.]*[(\[/_\s]\s*(utc|gmt|local)\s*[)\]]?$", "", name.strip().casefold())
+    found = re.match(r"^(.*?)[\s_.]*[(\[/_\s]\s*(\w+)\s*[)\]]?$", plain)
     if found and found[2] in _PER_SECOND:
-        return re.sub(r"\W+", "_", found[1]).strip("_"), found[2]
-    return re.sub(r"\W+", "_", name.strip().casefold()).strip("_"), ""
+        return _word(found[1]), found[2]
+    return _word(plain), ""
+
+
+def _word(name: str) -> str:
+    return name if name in _TIME_NAMES else re.sub(r"\W+", "_", name).strip("_")
+
+
+def date_column(names: Sequence[str], clock: str) -> str | None:
+    """The column of the date beside that of the time of day."""
+    return next((name for name in names if name != clock and _time_unit(name)[0] in DATE_NAMES), None)
 
 
 def seconds(name: str, numbers: np.ndarray) -> tuple[np.ndarray, str]:
-    """Time in seconds from numbers in the unit of the column's name; without one, in seconds or in what the size of an epoch tells (then
-    said)."""
+    """Time in seconds from numbers in the unit of the column's name; without one, in seconds or in what the size of an epoch or of a
+    spreadsheet's days tells (then said)."""
     unit = _time_unit(name)[1]
     if unit:
         return numbers / _PER_SECOND[unit], ""
-    largest = np.nanmax(np.abs(numbers), initial=0.0)
+    known = numbers[np.isfinite(numbers)]
+    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
     for limit, per_second, unit in _EPOCHS:
-        if largest > limit:
-            return numbers / per_second, f"column {name} holds numbers up to {largest:.3g} and was taken as an epoch in {unit}"
+        if high > limit:
+            return numbers / per_second, f"column {name} holds numbers up to {high:.3g} and was taken as an epoch in {unit}"
+    for first, last, epoch, program in _SERIAL_DAYS:
+        if first <= low and high <= last and len(known) > 1 and np.median(np.abs(np.diff(known))) < _SERIAL_INTERVAL:
+            said = f"column {name} holds {low:.8g} to {high:.8g} and was taken as days, as {program} count them"
+            # to the microsecond: what is left of a double there
+            return np.round((numbers - epoch) * 86400, 6), said
     return numbers, ""
+
+
+# ---- which way the time runs
+
+
+def forward(columns: Columns) -> tuple[Columns, list[Note]]:
+    """The columns from the oldest sample on where they stand newest first; nothing else is sorted."""
+    last = len(columns.time) - 1
+    if last < 1 or not (np.diff(columns.time) < 0).all():
+        return columns, []
+    values = {name: found[::-1] for name, found in columns.values.items()}
+    turned = columns._replace(time=columns.time[::-1], values=values, place=lambda i: columns.place(last - i))
+    return turned, [Note("clock", "", last + 1, "the newest sample stands first: the rows were read from the last to the first")]
 
 
 def check_clock(path: Path, group: Columns) -> None:
@@ -161,27 +248,35 @@ def check_clock(path: Path, group: Columns) -> None:
         i = int(np.flatnonzero(~np.isfinite(time))[0])
         missing = int((~np.isfinite(time)).sum())
         raise ValueError(f"{path}: {group.place(i)} should have a time but has none, the first of {missing}; fill it in or remove the row")
-    steps = np.diff(time)
-    if (steps > 0).all():
+    if (time[1:] > time[:-1]).all():
         return
-    i = int(np.flatnonzero(steps <= 0)[0])
+    steps = np.diff(time)
+    back = np.flatnonzero(steps <= 0)
+    i, count = int(back[0]), len(back)
     unit = 1e9 if time.dtype == np.int64 else 1.0
     start = time[0] if unit == 1e9 else 0
     now, before = (float(time[j] - start) / unit for j in (i + 1, i))
     since = " after the first" if start else ""
-    count = int((steps <= 0).sum())
-    if steps[i] == 0:
-        said = f"has the same time as the sample before it, {now:.9g} s{since}"
-        remedy = "name a finer clock, or separate two devices that write under one name"
-    else:
-        said = f"is at {now:.9g} s{since}, which is before the sample ahead of it at {before:.9g} s"
-        remedy = (
-            "split the recording where its clock was set back"
-            if group.name == "rows"
-            else "sort it with: mcap sort, or split it where its clock was set back"
-        )
+    said = (
+        f"has the same time as the sample before it, {now:.9g} s{since}"
+        if steps[i] == 0
+        else f"is at {now:.9g} s{since}, which is before the sample ahead of it at {before:.9g} s"
+    )
     times = f", the first of {count}" if count > 1 else ""
-    raise ValueError(f"{path}: {group.place(i + 1)} {said}{times}, but time should only run forward; {remedy}")
+    raise ValueError(f"{path}: {group.place(i + 1)} {said}{times}, but time should only run forward; {_remedy(group, steps / unit, back)}")
+
+
+def _remedy(group: Columns, steps_s: np.ndarray, back: np.ndarray) -> str:
+    """What to do about a clock that stands still or runs backwards, by how it does."""
+    if steps_s[back[0]] == 0:
+        return "name a finer clock, or give each device or tag that writes here a column of its own"
+    if len(back) >= 3 and len(steps_s) <= OTHER_DEVICE_RUN * (len(back) + 1):
+        return "two devices with clocks of their own seem to write under one name: record each under a name of its own"
+    if len(back) == 1 and abs(steps_s[back[0]] + 3600) <= 3 * np.median(np.abs(steps_s)):
+        return "an hour is what the end of summer time takes away: write the times with their zone or in UTC, or split the recording there"
+    if group.name == "rows":
+        return "split the recording where its clock was set back"
+    return "sort it with: mcap sort, or split it where its clock was set back"
 
 
 def every(time: str) -> float | None:

@@ -18,8 +18,13 @@ from pipeline.reading.resampling import GAP_INTERVALS
 from pipeline.reading.signals import Note, intervals
 
 MOST_FIELDS = 64
+_NO_TIME = "no column is called like a time; write its name, or time: every 1.0 s with the sample time, beside the mapping"
 _SET_POINT = r"set.?point|target|reference|\bsp\b|_sp$|^sp_"
-_TEMPERATURE = r"temp|celsius|deg_?c|°c|hot.?end|nozzle|barrel|zone|\bbed\b|^bed|thermo|^t_?\d+|^t[_\[(]|_[ckf]$|[\[(][ckf°]"
+_TEMPERATURE = (
+    r"temp|celsius|deg_?c|°c|hot.?end|nozzle|barrel|zone|\bbed\b|^bed|thermo|tool_?\d|chamber|^t_?\d+|^t[_\[(]|_[ckf]$|[\[(][ckf°]"
+)
+# a temperature whatever else the name says, such as heater_bed.temperature
+_SURELY_TEMPERATURE = r"temperature|celsius|deg_?c|°c|(?<!set)[\s._](temp|actual)$"
 _INPUT = r"heat|duty|pwm|power|percent|pct|%|^q_?\d|^u_?\d*$|motor|screw|rpm|fan|voltage|current"
 _MOVER = r"motor|screw|rpm|fan"
 _STAMP = r"(^|\.)(sec|secs|seconds|nsec|nsecs|nanosec|nanos|seq|sequence)$|class$|(^|_)(id|num|index)$"
@@ -59,7 +64,10 @@ def inspect(path: str | Path) -> str:
             lines.append(f"  {name:<32} {_range(values)}")
             signals.append(_Signal(prefix + name, units.get(name, ""), values))
     lines += ["", "Findings:" if notes else "Findings: none", *(f"  {note.kind}: {note.message}" for note in notes)]
-    return "\n".join([f"{path}: {kind}, {path.stat().st_size} bytes", *lines, "", *_proposal(signals, groups)]) + "\n"
+    proposal = _proposal(signals, groups)
+    if any(note.message == _NO_TIME for note in notes):
+        proposal.insert(2, "  time: every 1.0 s    # write the sample time here, for the file does not say it; or the name of a column")
+    return "\n".join([f"{path}: {kind}, {path.stat().st_size} bytes", *lines, "", *proposal]) + "\n"
 
 
 # ---- formats
@@ -76,22 +84,24 @@ def _table(path: Path, kind: str) -> tuple[list[str], list[tuple[Columns, str]],
         )
     others = [f"{column.name or '(no name)'} ({column.type})" for column in columns if column.name not in numeric]
     lines += [f"{len(columns)} columns, {len(numeric)} of them numbers"] + ([f"not numbers: {', '.join(others[:20])}"] if others else [])
+    names = [column.name for column in columns]
+    twice = [f"{name} ({names.count(name)} times)" for name in dict.fromkeys(names) if name and names.count(name) > 1]
+    lines += [f"the same name twice, so that none of them can be mapped; give each its own: {', '.join(twice)}"] if twice else []
+    wanted = [name for name in numeric if names.count(name) == 1]
+    signals = [name for name in wanted if not is_time_name(name)]
+    if not signals:
+        raise ValueError(
+            f"{path}: none of its {len(columns)} columns holds numbers beside the time ({', '.join(others[:6] + twice)}); write numbers without"
+            " units, with one decimal mark, and a name for each column"
+        )
     reader: Callable = read_csv if kind == "csv" else read_parquet
-    wanted = [name for name in dict.fromkeys(numeric) if numeric.count(name) == 1]
     try:
-        group, notes = reader(path, [name for name in wanted if not is_time_name(name)], "")
+        group, notes = reader(path, signals, "")
     except ValueError as error:
         if "no column is called like a time" not in str(error):
             raise
         group, notes = reader(path, wanted, "every 1.0 s")
-        notes.append(
-            Note(
-                "clock",
-                "",
-                1,
-                "no column is called like a time; write its name, or time: every 1.0 s with the sample time, beside the mapping",
-            )
-        )
+        notes.append(Note("clock", "", 1, _NO_TIME))
     return lines, [(group, "")], {column.name: column.unit for column in columns}, notes
 
 
@@ -211,7 +221,8 @@ def _role(signal: _Signal) -> str:
         return ""
     if re.search(_SET_POINT, name):
         return "set-point"
-    warm = re.search(_TEMPERATURE, name) and not re.search(r"heater|duty|pwm|power|pct|%", name)
+    power = re.search(r"duty|pwm|power|pct|%", name)
+    warm = not power and (re.search(_SURELY_TEMPERATURE, name) or (re.search(_TEMPERATURE, name) and "heater" not in name))
     if warm or unit in ("degc", "°c", "k", "°f", "degf"):
         return "output"
     return "input" if unit in ("%", "percent") or re.search(_INPUT, name) else ""

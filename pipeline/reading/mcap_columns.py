@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.reading.formats import Columns
+from pipeline.reading.formats import Columns, Growing
 from pipeline.reading.mcap_files import McapFile, Messages
 from pipeline.reading.mcap_messages import Channel, Decode, UnreadableMessage, compressed, decoder, fields, plain
 from pipeline.reading.signals import Note, nearest_names
@@ -16,6 +16,8 @@ from pipeline.reading.signals import Note, nearest_names
 SAMPLES = 20
 # a summary may promise what is not there
 MOST_EXPECTED = 1 << 26
+# a network brings messages out of order now and then; two publishers with clocks of their own do all the time
+OUT_OF_ORDER = 0.05
 # (seconds, nanoseconds) as the fields of a time stamp are called in ROS 2, Foxglove JSON, ROS 1 and protobuf
 _STAMPS = (("sec", "nanosec"), ("sec", "nsec"), ("secs", "nsecs"), ("seconds", "nanos"))
 
@@ -38,32 +40,6 @@ class _Wanted(NamedTuple):
     clock: list[str]
 
 
-class _Growing:
-    """Times (n,) in ns and n numbers of each field, that grow in place: joining parts at the end would need twice the memory."""
-
-    def __init__(self, fields: int, expected: int):
-        self.count = 0
-        self._time = np.empty(max(expected, 1), np.int64)
-        self._values = [np.empty(max(expected, 1)) for _ in range(fields)]
-
-    def append(self, time: np.ndarray, values: np.ndarray) -> None:
-        end = self.count + len(time)
-        if end > len(self._time):
-            self._resize(end + end // 4)
-        self._time[self.count : end] = time
-        for column, found in zip(self._values, values.T, strict=True):
-            column[self.count : end] = found
-        self.count = end
-
-    def _resize(self, size: int) -> None:
-        for column in (self._time, *self._values):
-            column.resize(size, refcheck=False)
-
-    def finished(self) -> tuple[np.ndarray, list[np.ndarray]]:
-        self._resize(self.count)
-        return self._time, self._values
-
-
 # ---- what there is
 
 
@@ -73,25 +49,35 @@ def topics(path: Path, samples: int | None = SAMPLES) -> dict[str, Topic]:
     Raises ValueError where it is no MCAP.
     """
     file = McapFile(path)
-    seen: dict[int, list[bytes]] = {}
-    room = samples or np.inf
-    for batch in file.batches(lambda channel: len(seen.get(channel.id, ())) < room):
+    looked_at: dict[int, int] = {}
+    names: dict[int, dict[str, None]] = {}
+    unreadable: dict[int, str] = {}
+    for batch in file.batches(lambda channel: samples is None or looked_at.get(channel.id, 0) < samples):
         for number, messages in batch.items():
-            have = seen.setdefault(number, [])
-            have += messages.data[: None if samples is None else samples - len(have)]
-        if samples and file.promised and all(len(seen.get(number, ())) >= min(samples, count) for number, count in file.promised.items()):
+            data = messages.data[: None if samples is None else samples - looked_at.get(number, 0)]
+            looked_at[number] = looked_at.get(number, 0) + len(data)
+            if number in file.channels and data:
+                _look(file.channels[number], data, names, unreadable)
+        if samples and file.promised and all(looked_at.get(number, 0) >= min(samples, count) for number, count in file.promised.items()):
             break
     counts = file.counts if samples is None or file.promised is None else file.promised
     found: dict[str, Topic] = {}
     for number, channel in sorted(file.channels.items()):
+        if number not in looked_at:
+            _look(channel, [], names, unreadable)
         before = found.get(channel.topic, Topic(channel.topic, [], [], "", 0))
-        try:
-            names, unreadable = fields(channel, seen.get(number, [])), before.unreadable
-        except (ValueError, RecursionError) as error:
-            names, unreadable = [], str(error)
-        together = list(dict.fromkeys([*before.fields, *names]))
-        found[channel.topic] = Topic(channel.topic, [*before.channels, channel], together, unreadable, before.count + counts.get(number, 0))
+        together = list(dict.fromkeys([*before.fields, *names.get(number, ())]))
+        why = unreadable.get(number, before.unreadable)
+        found[channel.topic] = Topic(channel.topic, [*before.channels, channel], together, why, before.count + counts.get(number, 0))
     return found
+
+
+def _look(channel: Channel, data: Sequence[bytes], names: dict[int, dict[str, None]], unreadable: dict[int, str]) -> None:
+    """Adds the numbers that are in `data` to the names of the channel, or why they cannot be read."""
+    try:
+        names.setdefault(channel.id, {}).update(dict.fromkeys(fields(channel, data)))
+    except (ValueError, RecursionError) as error:
+        unreadable.setdefault(channel.id, str(error))
 
 
 def resolve(path: Path, source: str, found: dict[str, Topic]) -> tuple[str, str]:
@@ -130,16 +116,16 @@ def mcap_columns(
     The clock is log_time, or publish_time, or a field of each topic such as header.stamp. Raises ValueError for what is not there and for
     what has no whole chunk.
     """
-    places = _places(path, sources)
-    found = topics(path)
+    places, found = _places(path, sources)
     wanted = {}
     for topic in dict.fromkeys(topic for topic, _ in places.values()):
         names = list(dict.fromkeys(field for at, field in places.values() if at == topic))
         wanted[topic] = _Wanted(topic, names, _clock(path, found[topic], time))
     file = McapFile(path)
-    parts: dict[int, _Growing] = {}
+    parts: dict[int, Growing] = {}
     decoders: dict[int, Decode] = {}
     bad: dict[str, int] = {}
+    backwards: dict[str, int] = {}
     for batch in file.batches(lambda channel: channel.topic in wanted):
         for number, messages in batch.items():
             channel = file.channels.get(number)
@@ -148,10 +134,12 @@ def mcap_columns(
             need = wanted[channel.topic]
             if number not in decoders:
                 decoders[number] = _decoder(path, channel, [*need.fields, *need.clock])
-                parts[number] = _Growing(len(need.fields), min((file.promised or {}).get(number, 0), MOST_EXPECTED))
+                parts[number] = Growing([np.int64, *[float] * len(need.fields)], min((file.promised or {}).get(number, 0), MOST_EXPECTED))
             times, values, dropped = _numbers(path, channel, decoders[number], messages, need, time)
             bad[channel.topic] = bad.get(channel.topic, 0) + dropped
-            parts[number].append(times, values)
+            parts[number].append(times, *values.T)
+            back = np.count_nonzero(np.diff(np.array(messages.publish_time, np.uint64).astype(np.int64)) < 0)
+            backwards[channel.topic] = backwards.get(channel.topic, 0) + int(back)
     counts: dict[str, int] = {}
     for number, count in file.counts.items():
         topic = file.channels[number].topic if number in file.channels else f"channel {number}"
@@ -160,11 +148,18 @@ def mcap_columns(
     for topic, count in bad.items():
         if count:
             notes.append(Note("unreadable", "", count, f"{count} messages of {topic} are not what its schema says and were left out"))
+    for topic, count in backwards.items():
+        if count > OUT_OF_ORDER * counts[topic]:
+            message = (
+                f"the publish times of {topic} run back {count} times in {counts[topic]} messages: two devices with clocks of their own"
+            )
+            notes.append(Note("mixed", "", count, f"{message} seem to publish it; record each under a topic of its own"))
     columns = [_join(path, need, file, parts, notes, bad) for need in wanted.values()]
     return columns, places, counts, notes
 
 
-def _places(path: Path, sources: Sequence[str]) -> dict[str, tuple[str, str]]:
+def _places(path: Path, sources: Sequence[str]) -> tuple[dict[str, tuple[str, str]], dict[str, Topic]]:
+    """{source: (topic, field)}, and the topics."""
     found = topics(path)
     if not any(topic.fields for topic in found.values()):
         reasons = [f"{topic.name}: {topic.unreadable}" for topic in found.values() if topic.unreadable]
@@ -175,11 +170,11 @@ def _places(path: Path, sources: Sequence[str]) -> dict[str, tuple[str, str]]:
         why = "; ".join([*reasons, *notes][:3]) or "its messages hold text or nothing"
         raise ValueError(f"{path}: no topic with numbers could be read ({why}); record numeric topics, or copy the recording again")
     try:
-        return {source: resolve(path, source, found) for source in sources}
+        return {source: resolve(path, source, found) for source in sources}, found
     except ValueError:
         # a key that JSON messages get later than the first ones
         found = topics(path, None)
-        return {source: resolve(path, source, found) for source in sources}
+        return {source: resolve(path, source, found) for source in sources}, found
 
 
 def _clock(path: Path, topic: Topic, time: str) -> list[str]:
@@ -241,11 +236,12 @@ def _one_by_one(decode: Decode, data: Sequence[bytes], width: int) -> tuple[np.n
     return np.concatenate(rows), kept
 
 
-def _join(path: Path, need: _Wanted, file: McapFile, parts: dict[int, _Growing], notes: list[Note], bad: dict[str, int]) -> Columns:
+def _join(path: Path, need: _Wanted, file: McapFile, parts: dict[int, Growing], notes: list[Note], bad: dict[str, int]) -> Columns:
     """The topic's channels one behind the other; two that run at the same time are two devices under one name."""
     pieces = []
     for number in [number for number in parts if file.channels[number].topic == need.topic]:
-        pieces.append((number, *parts.pop(number).finished()))
+        time, *values = parts.pop(number).finished()
+        pieces.append((number, time, values))
     pieces = sorted((piece for piece in pieces if len(piece[1])), key=lambda piece: piece[1].min())
     if not pieces:
         why = f"all of its {bad[need.topic]} messages are not what its schema says" if bad.get(need.topic) else "it has no whole message"

@@ -1,12 +1,10 @@
-"""The frame of an MCAP file: records, chunks, CRCs; what is whole comes out a chunk at a time, what is damaged is left out, counted and
-named by its offset.
+"""Walks an MCAP file: chunks and their CRCs; what is whole comes out a chunk at a time, what is damaged is left out, counted and named by
+its offset.
 
-Layout: mcap.dev/spec. The mcap package's reader takes 7 us a message and stops at the first damage; here it is 3 us, and the next chunk is
+The mcap package's reader takes 7 us a message and stops at the first damage; here it is 3 us, and the next chunk is
 looked for.
 """
 
-import mmap
-import re
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -14,18 +12,32 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
 from pipeline.reading.mcap_messages import Channel, UnreadableMessage, decompress
+from pipeline.reading.mcap_records import (
+    CHANNEL,
+    CHUNK,
+    CHUNK_HEAD,
+    DATA_END,
+    FOOTER,
+    FOOTER_RECORD,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_HEAD,
+    MESSAGE_INDEX,
+    RECORD_HEAD,
+    SCHEMA,
+    STATISTICS,
+    check_magic,
+    next_chunk,
+    pairs,
+    prefixed,
+    records,
+    string,
+)
 from pipeline.reading.signals import Note
 
-MAGIC = b"\x89MCAP0\r\n"
-HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, STATISTICS, DATA_END = 1, 2, 3, 4, 5, 6, 7, 0x0B, 0x0F
 LARGEST_CHUNK = 1 << 31
 # messages outside chunks are handed on in groups of that many bytes
 GROUP_BYTES = 1 << 20
-_RECORD = struct.Struct("<BQ")
-_MESSAGE = struct.Struct("<BQHIQQ")
-_CHUNK = struct.Struct("<QQQII")
-_FOOTER = struct.Struct("<BQQQI")
-_CHUNK_START = re.compile(rb"\x06(.{8}).{28}(\x00\x00\x00\x00|\x03\x00\x00\x00lz4|\x04\x00\x00\x00zstd)(.{8})", re.DOTALL)
 
 
 class Messages(NamedTuple):
@@ -64,23 +76,23 @@ class McapFile:
     # ---- the summary: channels and schemas even of a chunk that is lost
 
     def _read_summary(self, stream: BinaryIO) -> None:
-        end = self.size - 8 - _FOOTER.size
+        end = self.size - 8 - FOOTER_RECORD.size
         if end < 8:
             return
         stream.seek(end)
         tail = stream.read()
-        opcode, length, start, _, crc = _FOOTER.unpack_from(tail)
+        opcode, length, start, _, crc = FOOTER_RECORD.unpack_from(tail)
         self.has_footer = tail.endswith(MAGIC) and opcode == FOOTER and length == 20
         if not self.has_footer or not 8 <= start <= end:
             return
         stream.seek(start)
         summary = stream.read(end - start)
-        found = zlib.crc32(summary + tail[: _FOOTER.size - 4])
+        found = zlib.crc32(summary + tail[: FOOTER_RECORD.size - 4])
         if crc and found != crc:
             self._remark("damage", 1, f"the summary at byte {start} has CRC 0x{found:08x} instead of 0x{crc:08x} and was not used")
             return
         try:
-            for opcode, record in _records(summary):
+            for opcode, record in records(summary):
                 self._define(opcode, record)
                 if opcode == STATISTICS:
                     size = struct.unpack_from("<I", record, 42)[0]
@@ -96,16 +108,16 @@ class McapFile:
     def _define(self, opcode: int, record: bytes) -> None:
         if opcode == SCHEMA:
             number = struct.unpack_from("<H", record)[0]
-            name, pos = _string(record, 2)
-            encoding, pos = _string(record, pos)
-            data, _ = _bytes(record, pos)
+            name, pos = string(record, 2)
+            encoding, pos = string(record, pos)
+            data, _ = prefixed(record, pos)
             self.schemas[number] = (name, encoding, data)
         elif opcode == CHANNEL:
             number, schema = struct.unpack_from("<HH", record)
-            topic, pos = _string(record, 4)
-            encoding, pos = _string(record, pos)
-            metadata, _ = _bytes(record, pos)
-            self.channels[number] = Channel(number, topic, encoding, _pairs(metadata), *self.schemas.get(schema, ("", "", b"")))
+            topic, pos = string(record, 4)
+            encoding, pos = string(record, pos)
+            metadata, _ = prefixed(record, pos)
+            self.channels[number] = Channel(number, topic, encoding, pairs(metadata), *self.schemas.get(schema, ("", "", b"")))
 
     # ---- the data
 
@@ -142,7 +154,7 @@ class McapFile:
             head = stream.read(9)
             reason, record = "the file ends in it", b""
             if len(head) == 9:
-                opcode, length = _RECORD.unpack(head)
+                opcode, length = RECORD_HEAD.unpack(head)
                 reason = self._unsound(opcode, length, offset)
                 if not reason:
                     record = stream.read(length)
@@ -153,7 +165,7 @@ class McapFile:
                         return
                     offset += 9 + length
                     continue
-            resumed = _next_chunk(stream, offset + 1)
+            resumed = next_chunk(stream, offset + 1)
             if resumed is None:
                 self._cut_off(offset, reason)
                 return
@@ -174,7 +186,7 @@ class McapFile:
         """Whether the lengths inside agree with the record's own; where they do not, the next record is not where it seems."""
         try:
             if opcode == CHUNK:
-                start = _CHUNK.size + _CHUNK.unpack_from(record)[4]
+                start = CHUNK_HEAD.size + CHUNK_HEAD.unpack_from(record)[4]
                 sound = len(record) == start + 8 + struct.unpack_from("<Q", record, start)[0]
             elif opcode == MESSAGE_INDEX:
                 sound = len(record) == 6 + struct.unpack_from("<I", record, 2)[0]
@@ -197,10 +209,10 @@ class McapFile:
             )
 
     def _chunk(self, offset: int, record: bytes, wanted: Callable[[Channel], bool]) -> dict[int, Messages] | None:
-        first, last, size, crc, length = _CHUNK.unpack_from(record)
-        start = _CHUNK.size + length
+        first, last, size, crc, length = CHUNK_HEAD.unpack_from(record)
+        start = CHUNK_HEAD.size + length
         try:
-            method, content = record[_CHUNK.size : start].decode(), record[start + 8 :]
+            method, content = record[CHUNK_HEAD.size : start].decode(), record[start + 8 :]
             if size > LARGEST_CHUNK:
                 raise UnreadableMessage(f"it says that it unpacks to {size} bytes")
             content = decompress(method, content, size) if method else content
@@ -228,10 +240,10 @@ class McapFile:
 
     def _split(self, data: bytes, wanted: Callable[[Channel], bool], batch: dict[int, Messages]) -> None:
         """Sorts the records of a chunk by channel into `batch`; raises UnreadableMessage where one runs over the end."""
-        pos, end, unpack, current, messages, kept = 0, len(data), _MESSAGE.unpack_from, -1, None, False
+        pos, end, unpack, current, messages, kept = 0, len(data), MESSAGE_HEAD.unpack_from, -1, None, False
         while pos < end:
             if data[pos] != MESSAGE:
-                opcode, length = _RECORD.unpack_from(data, pos)
+                opcode, length = RECORD_HEAD.unpack_from(data, pos)
                 following = pos + 9 + length
                 self._define(opcode, data[pos + 9 : following])
             else:
@@ -302,70 +314,3 @@ class McapFile:
                 Note("unchecked", "", self.unchecked or self.unchunked, f"{what} have no CRC, so damage in them would not be seen")
             )
         return notes
-
-
-def check_magic(path: Path, start: bytes) -> None:
-    """Raises ValueError where the first 8 bytes are not MCAP's, saying so where text-mode copying converted them."""
-    if start[:8] == MAGIC:
-        return
-    converted = {
-        b"\x89MCAP0\n": "CR LF to LF",
-        b"\x89MCAP0\r\r\n": "LF to CR LF",
-        b"\x89MCAP0\r\x0b": "CR LF",
-        b"\x89MCAP0\r": "CR LF to CR",
-    }
-    for damaged, how in converted.items():
-        if start.startswith(damaged):
-            raise ValueError(
-                f"{path}: the bytes at offset 0 should be {MAGIC.hex(' ')} but are {start[:8].hex(' ')}: line ends were"
-                f" converted ({how}), which destroys the"
-                " whole file; copy it again as binary (*.mcap binary in .gitattributes)"
-            )
-    raise ValueError(
-        f"{path}: the bytes at offset 0 should be MCAP's {MAGIC.hex(' ')} but are {start[:8].hex(' ')}; copy the recording again as binary"
-    )
-
-
-def _next_chunk(stream: BinaryIO, offset: int) -> int | None:
-    """Offset of the next whole chunk from `offset` on, by its own agreement of lengths."""
-    size = stream.seek(0, 2)
-    if offset >= size:
-        return None
-    with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        pos = offset
-        while found := _CHUNK_START.search(content, pos):
-            length, method, held = struct.unpack("<Q", found[1])[0], len(found[2]), struct.unpack("<Q", found[3])[0]
-            if length == 28 + method + 8 + held and found.start() + 9 + length <= size:
-                return found.start()
-            pos = found.start() + 1
-    return None
-
-
-def _records(data: bytes) -> Iterator[tuple[int, bytes]]:
-    pos = 0
-    while pos < len(data):
-        opcode, length = _RECORD.unpack_from(data, pos)
-        if pos + 9 + length > len(data):
-            raise UnreadableMessage("a record that does not fit")
-        yield opcode, data[pos + 9 : pos + 9 + length]
-        pos += 9 + length
-
-
-def _bytes(data: bytes, pos: int) -> tuple[bytes, int]:
-    length = struct.unpack_from("<I", data, pos)[0]
-    if pos + 4 + length > len(data):
-        raise UnreadableMessage("text that does not fit")
-    return data[pos + 4 : pos + 4 + length], pos + 4 + length
-
-
-def _string(data: bytes, pos: int) -> tuple[str, int]:
-    text, pos = _bytes(data, pos)
-    return text.decode(), pos
-
-
-def _pairs(data: bytes) -> dict[str, str]:
-    pairs, pos = {}, 0
-    while pos < len(data):
-        key, pos = _string(data, pos)
-        pairs[key], pos = _string(data, pos)
-    return pairs

@@ -7,15 +7,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline.reading.formats import Column, Columns, column_place, every, is_time_name, seconds, time_column
+from pipeline.reading.formats import Column, Columns, Growing, column_place, every, forward, is_time_name, seconds, time_column
 from pipeline.reading.signals import Note
 
 ROWS_AT_ONCE = 50_000
+# an index may promise what is not there
+MOST_EXPECTED = 1 << 26
 
 
 def _parquet(path: Path) -> pq.ParquetFile:
     try:
-        return pq.ParquetFile(path, page_checksum_verification=True)
+        return pq.ParquetFile(path, page_checksum_verification=True, pre_buffer=False, buffer_size=1 << 16)
     except (OSError, pa.ArrowException) as error:
         raise ValueError(
             f"{path} is not a whole Parquet file ({_first_line(error)}); its index is at its end, so copy the recording again"
@@ -55,7 +57,7 @@ def _leaves(fields: pa.Schema | pa.StructType, prefix: str) -> Iterator[tuple[st
 
 def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns, list[Note]]:
     """The wanted columns, NaN where a value is null. Raises ValueError for a missing column, one that is no number, or a damaged file."""
-    columns = parquet_columns(path)
+    file, columns = _parquet(path), parquet_columns(path)
     names = [column.name for column in columns]
     interval = every(time)
     clock = ""
@@ -69,31 +71,32 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns,
                 f"{path}: column {name} should hold numbers but is of type {column.type}; write numbers, or map another column"
             )
     read = list(dict.fromkeys([*wanted, *([clock] if clock else [])]))
-    parts: dict[str, list[np.ndarray]] = {name: [] for name in read}
-    rows = 0
+    kinds = {column.name: np.int64 if column.type == "time" else float for column in columns}
+    parts = Growing([kinds[name] for name in read], min(file.metadata.num_rows, MOST_EXPECTED))
     try:
-        for batch in _parquet(path).iter_batches(
+        for batch in file.iter_batches(
             ROWS_AT_ONCE, columns=sorted({name.split(".")[0] if "." in name else name for name in read} | set(read))
         ):
             table = _flat(pa.Table.from_batches([batch]))
-            rows += table.num_rows
-            for name in read:
-                parts[name].append(_array(path, name, table[name], clock))
+            parts.append(*(_array(path, name, table[name], clock) for name in read))
     except (OSError, pa.ArrowException) as error:
         raise ValueError(
             f"{path}: a column cannot be read ({_first_line(error)}); the file is damaged, so copy the recording again"
         ) from None
-    if not rows:
+    if not parts.count:
         raise ValueError(f"{path}: the table should have rows but has none; record it again or remove it")
-    values = {name: np.concatenate(part) for name, part in parts.items()}
+    values = dict(zip(read, parts.finished(), strict=True))
     notes: list[Note] = []
+    zoned = clock and kinds[clock] is np.int64 and next(field.type.tz for name, field in _leaves(file.schema_arrow, "") if name == clock)
+    zone = "UTC" if zoned or not clock or kinds[clock] is float else ""
     if interval:
-        clock_values, said = np.arange(rows) * interval, ""
+        clock_values, said = np.arange(parts.count) * interval, ""
     else:
-        clock_values, said = (values[clock], "") if values[clock].dtype == np.int64 else seconds(clock, values[clock])
+        clock_values, said = (values[clock], "") if kinds[clock] is np.int64 else seconds(clock, values[clock])
     if said:
         notes.append(Note("clock", "", 1, said))
-    return Columns("rows", clock_values, {name: values[name] for name in wanted}, lambda i: f"row {i}"), notes
+    found, turned = forward(Columns("rows", clock_values, {name: values[name] for name in wanted}, lambda i: f"row {i}", zone))
+    return found, notes + turned
 
 
 def _array(path: Path, name: str, column: pa.ChunkedArray, clock: str) -> np.ndarray:

@@ -1,5 +1,5 @@
-"""What is doubtful in a table: spikes, frozen sensors, rails, constants, quantisation, units, two devices under one name; said with place
-and count, and masked where wrong."""
+"""What is doubtful in a table: spikes, frozen sensors, rails, constants, quantisation, units; said with place and count, and masked where
+wrong."""
 
 from collections.abc import Callable, Mapping
 
@@ -7,14 +7,15 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from pipeline.reading.signals import Flag, Table
+from pipeline.reading.stuck import frozen, rails
 
 SPIKE_WINDOW = 7
 # a spike is beyond eight robust standard deviations of the residual of the local median, and beyond three times what its neighbours do
 # among themselves
 SPIKE_SIGMAS, SPIKE_OVER_NEIGHBOURS = 8.0, 3.0
 SPIKE_LONGEST = 2
-FROZEN_SHORTEST, FROZEN_OVER_USUAL = 30, 5.0
-RAIL_SHORTEST = 10
+# an input with no more levels than that between its limits follows a plan, and is not held back by the lower one
+PLANNED_LEVELS = 20
 # an extruder's barrel, nozzle and bed: beyond it a number in °C is doubtful; rooms in °C, K and °F for a machine at rest
 HOTTEST_DEGC = 450.0
 ROOM_KELVIN, ROOM_FAHRENHEIT = (283.0, 313.0), (55.0, 100.0)
@@ -26,19 +27,18 @@ def flag(table: Table, *, units: Mapping[str, str], limits: Mapping[str, tuple[f
     """The table with what is doubtful flagged and, where it is no measurement, masked; values stay as they are.
 
     `limits` are {input: (low, high)} in its unit: its signals are the inputs, all others outputs. Masked: spike, frozen. Reported only:
-    quantised, saturated, outside (an input beyond its limits), constant, unit (looks like kelvin, fahrenheit, a duty of 0-1), mixed (as if
-    two devices wrote in turn).
+    quantised, saturated, outside (an input beyond its limits), constant, unit (looks like kelvin, fahrenheit, a duty of 0-1).
     """
     outputs = [name for name in table.values if name not in limits]
     flags, masked = list(table.flags), {name: mask.copy() for name, mask in table.masked.items()}
     for name in outputs:
-        for found in (_spikes(table, name), _frozen(table, name)):
+        for found in (_spikes(table, name), frozen(table, name)):
             for one, where in found:
                 flags.append(one)
                 masked[name][where] = True
     checked = table._replace(masked=masked)
     for name in outputs:
-        for check in (_constant, _quantised, _rails, _mixed):
+        for check in (_constant, _quantised, rails):
             flags += check(checked, name)
     for name, (low, high) in limits.items():
         if name in table.values:
@@ -88,6 +88,8 @@ def _spikes(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
     sigma = max(1.4826 * np.median(size[usable]), np.percentile(size[usable], 90) / 1.645, quantisation_step(table.values[name][usable]))
     found = []
     for group in _groups(np.flatnonzero(usable & (size > SPIKE_SIGMAS * sigma)), table.segment):
+        # beside a spike the median of a smooth signal is off by what it does in a sample
+        group = group[size[group] > size[group].max() / 2]
         if len(group) <= SPIKE_LONGEST and _stands_alone(table, name, group, size[group].min()):
             at, value = float(table.time_s[group[0]]), float(table.values[name][group[0]])
             local = value - float(residual[group[0]])
@@ -127,78 +129,7 @@ def quantisation_step(values: np.ndarray) -> float:
     return step if np.mean(whole & (ratio > 0.5)) >= 0.9 else 0.0
 
 
-# ---- frozen, rails, constants
-
-
-def _runs(table: Table, name: str) -> list[tuple[int, int]]:
-    """(first, last) of stretches of equal values within segments; masked samples end a stretch."""
-    values = np.where(table.masked[name], np.nan, table.values[name])
-    same = (values[1:] == values[:-1]) & (table.segment[1:] == table.segment[:-1])
-    starts = np.flatnonzero(np.r_[True, ~same])
-    ends = np.r_[starts[1:], len(values)] - 1
-    return [(int(a), int(b)) for a, b in zip(starts, ends, strict=True) if np.isfinite(values[a])]
-
-
-def _long(runs: list[tuple[int, int]], shortest: int) -> float:
-    """A stretch beyond that is unusual for this signal: a slow or coarse one rests long, and often."""
-    lengths = [b - a + 1 for a, b in runs]
-    return max(float(shortest), FROZEN_OVER_USUAL * float(np.percentile(lengths, 95))) if lengths else np.inf
-
-
-def _frozen(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
-    """Stretches of one value, far longer than usual for the signal, in which what drives or surrounds it moves on."""
-    runs = _runs(table, name)
-    limit = _long(runs, FROZEN_SHORTEST)
-    found = []
-    for first, last in runs:
-        if last - first + 1 <= limit or (first, last) == (0, len(table.time_s) - 1) or _is_rail(table, name, first, last):
-            continue
-        moving = [other for other in table.values if other != name and _moves(table, other, first, last)]
-        if moving:
-            where = np.arange(first + 1, last + 1)
-            message = (
-                f"{name} stays at {table.values[name][first]:g} for {last - first + 1} samples while"
-                f" {', '.join(moving[:3])} move: a frozen sensor, masked"
-            )
-            found.append((_flag(table, name, "frozen", where, message), where))
-    return found
-
-
-def _moves(table: Table, name: str, first: int, last: int) -> bool:
-    """Whether a signal changes over a stretch by a tenth of its own range."""
-    values = np.where(table.masked[name], np.nan, table.values[name])
-    inside = values[first : last + 1]
-    inside, all_values = inside[np.isfinite(inside)], values[np.isfinite(values)]
-    return len(inside) > 1 and np.ptp(all_values) > 0 and np.ptp(inside) >= 0.1 * np.ptp(all_values)
-
-
-def _is_rail(table: Table, name: str, first: int, last: int) -> bool:
-    """Whether a stretch lies on the largest or smallest value of all, and the signal came there from elsewhere: a machine at rest begins
-    at its smallest."""
-    usable = _usable(table, name)
-    begins = first == 0 or table.segment[first] != table.segment[first - 1]
-    value = table.values[name][first]
-    return not begins and bool(value in (usable.max(), usable.min()))
-
-
-def _rails(table: Table, name: str) -> list[Flag]:
-    runs = _runs(table, name)
-    limit = _long(runs, RAIL_SHORTEST)
-    flags = []
-    for value, side in ((np.max, "largest"), (np.min, "smallest")):
-        usable = _usable(table, name)
-        if not len(usable) or np.ptp(usable) == 0:
-            continue
-        rail = value(usable)
-        long = [(a, b) for a, b in runs if table.values[name][a] == rail and b - a + 1 > limit and _is_rail(table, name, a, b)]
-        if long:
-            where = np.concatenate([np.arange(a, b + 1) for a, b in long])
-            message = (
-                f"{name} stays at {rail:g}, its {side} value, for {len(where)} samples in {len(long)} stretches:"
-                f" the sensor or its converter is saturated"
-            )
-            flags.append(_flag(table, name, "saturated", where, message))
-    return flags
+# ---- constants, limits, quantisation
 
 
 def _constant(table: Table, name: str) -> list[Flag]:
@@ -212,9 +143,11 @@ def _constant(table: Table, name: str) -> list[Flag]:
 def _at_limits(table: Table, name: str, low: float, high: float) -> list[Flag]:
     values, usable, flags = table.values[name], ~table.masked[name], []
     tolerance = 1e-6 * (high - low)
+    inside = values[usable & (values > low + tolerance) & (values < high - tolerance)]
+    planned = len(np.unique(inside)) <= PLANNED_LEVELS
     for limit, at in ((low, np.abs(values - low) <= tolerance), (high, np.abs(values - high) <= tolerance)):
         where = np.flatnonzero(at & usable)
-        if len(where) and np.ptp(values[usable]) > 0:
+        if len(where) and np.ptp(values[usable]) > 0 and not (planned and limit == low):
             message = (
                 f"{name} is at its limit {limit:g} in {len(where)} of {usable.sum()} samples: there it follows"
                 f" the limit, not the controller"
@@ -238,20 +171,6 @@ def _quantised(table: Table, name: str) -> list[Flag]:
     levels = len(np.unique(usable))
     message = f"{name} comes in steps of {step:.3g} ({levels} levels): that is a noise of {step / np.sqrt(12):.2g} that no model explains"
     return [_flag(table, name, "quantised", np.flatnonzero(~table.masked[name]), message)]
-
-
-def _mixed(table: Table, name: str) -> list[Flag]:
-    """Whether every second sample goes on as one record and those between as another."""
-    values = np.where(table.masked[name], np.nan, table.values[name])
-    one, two = np.abs(values[1:] - values[:-1]), np.abs(values[2:] - values[:-2])
-    one, two = one[np.isfinite(one)], two[np.isfinite(two)]
-    if len(two) < 20 or np.median(one) <= 10 * np.median(two) or np.percentile(one, 10) <= 3 * np.percentile(two, 90):
-        return []
-    message = (
-        f"{name} jumps by {np.median(one):g} at every sample but moves by {np.median(two):g} over two: two"
-        f" devices seem to write under one name"
-    )
-    return [_flag(table, name, "mixed", np.arange(len(table.time_s)), message)]
 
 
 # ---- units

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.reading.mixing import alternate, mixed
 from pipeline.reading.signals import Flag, Raw, Table, intervals
 
 # a sample within that share of the sample time from the grid is on it: what a temperature does in a hundredth of a sample is far below any
@@ -14,6 +15,7 @@ ON_GRID = 0.01
 GAP_INTERVALS = 3.0
 # commands are sent periodically if nearly all of their intervals are alike; else they are events, and a long silence is no gap
 PERIODIC_SHARE = 0.95
+JITTER_SHARE, JITTER_OFTEN = 0.1, 0.01
 
 
 class _Clock(NamedTuple):
@@ -31,7 +33,7 @@ def resample(raw: Raw, *, sample_time_s: float, inputs: Sequence[str], outputs: 
     numbers, unaltered), else the straight line between its neighbours. An interval longer than `max_gap_s` (default: three sample times or
     three median intervals, whichever is longer) on any clock is a gap: nothing is interpolated or held across it, and a new segment begins
     behind it. Segments span what all clocks have in common. A value whose neighbours are missing is NaN and masked. Flags say what was
-    done: gap, filled, step_inside, step_lost, missing, trimmed, short, rate. Raises ValueError where a signal is not in the recording,
+    done: gap, jitter, filled, step_inside, step_lost, missing, mixed, trimmed, short, rate. Raises ValueError where a signal is not in the recording,
     clocks have no time in common, or no segment has two samples.
     """
     _check(raw, sample_time_s, inputs, outputs, max_gap_s)
@@ -49,13 +51,15 @@ def resample(raw: Raw, *, sample_time_s: float, inputs: Sequence[str], outputs: 
     values = {name: _held(*raw.signals[name], time, sample_time_s) for name in inputs}
     values |= {name: np.concatenate([_interpolated(*raw.signals[name], grid, sample_time_s) for grid in whole]) for name in outputs}
     masked = {name: ~np.isfinite(found) for name, found in values.items()}
-    flags = _gap_flags(clocks, whole) + _trim_flags(raw, clocks, pieces, grids)
+    flags = _gap_flags(clocks) + _jitter_flags(clocks) + _trim_flags(raw, clocks, pieces, grids)
     for name in outputs:
         flags += _filled_flags(name, raw.signals[name][0], time, sample_time_s) + _rate_flags(name, raw.signals[name][0], sample_time_s)
     for name in inputs:
         flags += _step_flags(name, *raw.signals[name], time, segment, sample_time_s)
     for name in [*inputs, *outputs]:
         flags += _missing_flags(name, masked[name], time)
+    for name in outputs:
+        flags += _mixed_flags(name, *raw.signals[name], time, masked[name])
     jitter = {name: intervals(clock.time_s, clock.gap_limit_s) for clock in clocks for name in clock.signals if len(clock.time_s) > 1}
     return Table(raw.path, segment, time, values, masked, flags, jitter)
 
@@ -161,16 +165,53 @@ def _flag(signal: str, kind: str, where_s: np.ndarray, message: str) -> list[Fla
     return [Flag(signal, kind, float(where_s[0]), float(where_s[-1]), len(where_s), message)] if len(where_s) else []
 
 
-def _gap_flags(clocks: Sequence[_Clock], grids: Sequence[np.ndarray]) -> list[Flag]:
+def _gap_flags(clocks: Sequence[_Clock]) -> list[Flag]:
     flags = []
     for clock in clocks:
+        median = float(np.median(np.diff(clock.time_s))) if len(clock.time_s) > 1 else 0.0
         for i in np.flatnonzero(np.diff(clock.time_s) > clock.gap_limit_s):
             start, end = float(clock.time_s[i]), float(clock.time_s[i + 1])
+            summer = " (an hour and an interval: a clock without a zone does so where summer time begins)"
             message = (
-                f"no sample of {', '.join(clock.signals)} for {end - start:g} s (limit {clock.gap_limit_s:g} s):"
-                f" a new segment begins behind it"
+                f"no sample of {', '.join(clock.signals)} for {end - start:g} s (limit {clock.gap_limit_s:g} s)"
+                f"{summer if abs(end - start - 3600) <= 2 * median else ''}: a new segment begins behind it"
             )
             flags.append(Flag("", "gap", start, end, 1, message))
+    return flags
+
+
+def _jitter_flags(clocks: Sequence[_Clock]) -> list[Flag]:
+    """Clocks of which one interval in a hundred is off by a tenth, or any by a half; commands that come as events have no interval."""
+    flags = []
+    for clock in clocks:
+        if not np.isfinite(clock.gap_limit_s) or len(clock.time_s) < 3:
+            continue
+        jitter, steps = intervals(clock.time_s, clock.gap_limit_s), np.diff(clock.time_s)
+        kept = np.flatnonzero(steps <= clock.gap_limit_s)
+        off = kept[np.abs(steps[kept] - jitter.interval_s) > JITTER_SHARE * jitter.interval_s]
+        if len(off) < JITTER_OFTEN * len(kept) and jitter.max_s <= 0.5 * jitter.interval_s:
+            continue
+        said = ", by turns longer and shorter: two devices may write under one name" if alternate(steps[kept]) else ""
+        message = (
+            f"the intervals of {', '.join(clock.signals)} differ from {jitter.interval_s:.4g} s by {jitter.std_s:.2g} s (standard) and"
+            f" {jitter.max_s:.2g} s (largest), {len(off)} of {len(kept)} by more than a tenth{said}"
+        )
+        flags.append(Flag("", "jitter", float(clock.time_s[off[0]]), float(clock.time_s[off[-1] + 1]), len(off), message))
+    return flags
+
+
+def _mixed_flags(name: str, time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, masked: np.ndarray) -> list[Flag]:
+    """Stretches in which two devices write under one name, found in the record's own samples; they are masked, for nobody knows which of the
+    two a sample of the table is."""
+    flags = []
+    for first, last, distance in mixed(values):
+        start, end = float(time_s[first]), float(time_s[last])
+        masked[(grid >= start) & (grid <= end)] = True
+        message = (
+            f"{name} jumps to and fro between two courses {distance:.3g} apart from {start:g} to {end:g} s, masked: two devices seem to write"
+            f" under one name; record each under a name of its own"
+        )
+        flags.append(Flag(name, "mixed", start, end, last - first + 1, message))
     return flags
 
 

@@ -11,6 +11,7 @@ from pipeline.report import charts, page
 from pipeline.report.answers import CONTROLLERS, LABELS, featured
 from pipeline.report.digits import decimals, number, quantity
 from pipeline.report.judgement import NAMES, Judgement
+from pipeline.report.model import trust
 from pipeline.report.sources import Sources, Table
 from pipeline.report.verdict import FAILED, OPEN, ROLES, UNDECIDED, Figure, Missing, Question, outcomes, row_places, state
 
@@ -39,6 +40,7 @@ def temperature(sources: Sources, judged: Judgement) -> dict[str, Any]:
         "heads": [{"mark": role, "name": LABELS[CONTROLLERS[role]][0], "method": LABELS[CONTROLLERS[role]][1]} for role in order],
         "rows": rows,
         "note": _kernel_note(kernel, sources),
+        "model": trust(sources),
         "missing": None,
     }
 
@@ -196,6 +198,7 @@ def unbuilt() -> list[dict[str, Any]]:
                 ],
                 "rows": [],
                 "note": "No figure, so no claim.",
+                "model": None,
                 "missing": True,
             }
         )

@@ -19,13 +19,13 @@ def _n(value: float) -> str:
 # ---- the strip of page one
 
 
-def strip(question: Question, shown: Sequence[tuple[str, str, Figure | Missing]]) -> Markup:
-    """Share of the allowance from 0 to twice the limit, the limit in the middle of every row; (name, class, figure) in two lanes that
+def strip(question: Question, shown: Sequence[tuple[str, str, Figure | Missing]], lanes: Sequence[int] = (11, 23)) -> Markup:
+    """Share of the allowance from 0 to twice the limit, the limit in the middle of every row; (name, class, figure) in `lanes`, which
     never overlap.
     """
     parts = [Markup('<rect class="beyond" x="50%" width="50%" height="100%"/><line class="limit" x1="50%" x2="50%" y1="0" y2="100%"/>')]
     said = []
-    for (name, css, figure), y in zip(shown, (11, 23), strict=False):
+    for (name, css, figure), y in zip(shown, lanes, strict=False):
         if isinstance(figure, Missing):
             said.append(f"{name}: {figure.state}")
             continue
@@ -110,8 +110,16 @@ def linear(low: float, high: float, *, ticks: int = 4) -> Axis:
     power = 10.0 ** math.floor(math.log10(rough))
     step = next(factor * power for factor in (1, 2, 2.5, 5, 10) if factor * power >= rough * 0.999)
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
-    places = max(-math.floor(math.log10(step) + 1e-9), 0) + (1 if abs(step / power - 2.5) < 1e-9 else 0)
+    places = max(-math.floor(math.log10(step) + 1e-9) + (1 if abs(step / power - 2.5) < 1e-9 else 0), 0)
     return Axis(low, high, tuple((k * step, number(k * step, places)) for k in range(first, last + 1)))
+
+
+def balanced(reach: float) -> Axis:
+    """From -reach to reach, with zero and the largest round number on either side."""
+    power = 10.0 ** math.floor(math.log10(0.95 * reach))
+    tick = max(factor * power for factor in (1, 2, 5) if factor * power <= 0.95 * reach)
+    places = max(-math.floor(math.log10(tick) + 1e-9), 0)
+    return Axis(-reach, reach, tuple((value, number(value, places)) for value in (-tick, 0.0, tick)))
 
 
 def logarithmic(low: float, high: float, *, every: int = 0) -> Axis:
@@ -176,20 +184,25 @@ def panel(frame: Frame, layers: Sequence[Markup], *, alt: str, css: str = "mb", 
 
 
 def decimated(x: np.ndarray, y: np.ndarray, most: int = 240) -> tuple[np.ndarray, np.ndarray]:
-    """At most 2 `most` points: of each of `most` stretches its lowest and its highest, so that no peak is lost."""
+    """At most 3 `most` points: of each of `most` stretches its lowest and its highest, so that no peak is lost, and a missing one."""
     if len(x) <= 2 * most:
         return x, y
     size = -(-len(x) // most)
     rows = np.append(y, np.full(-len(y) % size, np.nan)).reshape(-1, size)
     lowest = np.where(np.isnan(rows), np.inf, rows).argmin(axis=1)
     highest = np.where(np.isnan(rows), -np.inf, rows).argmax(axis=1)
-    index = np.unique(np.stack([lowest, highest], axis=1) + size * np.arange(len(rows))[:, None])
+    # and one that is missing, where any is: the line must break there
+    missing = np.isnan(rows).argmax(axis=1)
+    index = np.unique(
+        np.stack([lowest, highest, np.where(np.isnan(rows).any(axis=1), missing, lowest)], axis=1) + size * np.arange(len(rows))[:, None]
+    )
+    index = index[index < len(x)]
     return x[index], y[index]
 
 
-def line(frame: Frame, x, y, css: str = "line", *, steps: bool = False) -> Markup:
-    """A line; it breaks where y is missing. `steps` holds a value until the next sample, as inputs do."""
-    x, y = decimated(np.asarray(x, float), np.asarray(y, float))
+def line(frame: Frame, x, y, css: str = "line", *, steps: bool = False, most: int = 240) -> Markup:
+    """A line; it breaks where y is missing. `steps` holds a value until the next sample, as inputs do; `most` as in `decimated`."""
+    x, y = decimated(np.asarray(x, float), np.asarray(y, float), most)
     px, py = frame.px(x), frame.py(y)
     path, pen = [], "M"
     for i, (a, b) in enumerate(zip(px, py, strict=True)):
@@ -224,12 +237,44 @@ def tint(frame: Frame, low: float, high: float, css: str = "allow") -> Markup:
     )
 
 
+def stretches(mask: np.ndarray) -> list[tuple[int, int]]:
+    """(start, stop) of each run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
 def interval(frame: Frame, start: float, end: float, css: str = "flag") -> Markup:
     """A stretch of time, at least a pixel wide."""
     a, b = (float(frame.px(v)) for v in (start, end))
     return Markup('<rect class="{}" x="{}" width="{}" y="{}" height="{}"/>').format(
         css, _n(a), _n(max(b - a, 1)), frame.above, frame.height - frame.below - frame.above
     )
+
+
+def ribbon(frame: Frame, x, low, high, css: str = "ribbon") -> Markup:
+    """The area between two lines, such as a band that moves along."""
+    px, ends = frame.px(x), [frame.py(np.asarray(side, float)) for side in (high, low)]
+    there, back = (
+        "L".join(f"{_n(a)} {_n(b)}" for a, b in zip(px[::step], side[::step], strict=True))
+        for side, step in zip(ends, (1, -1), strict=True)
+    )
+    return Markup('<path class="{}" d="M{}L{}Z"/>').format(css, there, back)
+
+
+def stems(frame: Frame, x, y, css: str = "stem") -> Markup:
+    """A stroke from zero to each value."""
+    zero = _n(float(frame.py(0.0)))
+    strokes = "".join(f"M{_n(a)} {zero}V{_n(b)}" for a, b in zip(frame.px(x), frame.py(y), strict=True) if not math.isnan(b))
+    return Markup('<path class="{}" d="{}"/>').format(css, strokes) if strokes else Markup("")
+
+
+def crosses(frame: Frame, x, y, css: str = "cross", size: float = 3.5) -> Markup:
+    """Poles, as the field draws them."""
+    back = _n(2 * size)
+    strokes = "".join(
+        f"M{_n(a - size)} {_n(b - size)}l{back} {back}m-{back} 0l{back} -{back}" for a, b in zip(frame.px(x), frame.py(y), strict=True)
+    )
+    return Markup('<path class="{}" d="{}"/>').format(css, strokes)
 
 
 def dots(frame: Frame, x, y, css: str = "dot", radius: float = 2.2) -> Markup:

@@ -99,7 +99,7 @@ def _ranking(table: Table) -> str:
 
 def orders(sources: Sources) -> Picture:
     """How long a window, how many states: Akaike's criterion, singular values against the noise, the error of each order, the poles."""
-    shown = [_criterion(sources), *_kernel_state(sources), _singular(sources), _left_out(sources), _poles(sources)]
+    shown = [_criterion(sources), *_kernel_state(sources), singular(sources), left_out(sources), _poles(sources)]
     learned, model = sources.metrics["learn_kernel"], sources.metrics["identify_plant"]
     window, state, order = lookup(learned, "window"), lookup(learned, "state"), lookup(model, "order")
     parts = [
@@ -149,7 +149,7 @@ def _criterion(sources: Sources) -> Column:
 _SMALL = {"width": 270, "height": 160, "left": 44}
 
 
-def _singular(sources: Sources) -> Column:
+def singular(sources: Sources) -> Column:
     head, small = "Singular values", "of the identification, by order; log"
     table = sources.tables["order"]
     if isinstance(table, Missing):
@@ -191,7 +191,7 @@ def _kernel_state(sources: Sources) -> list[Column]:
     return [Column(head, f"{small}; {kept} kept", "kernel", [charts.panel(frame, layers, alt=alt, css="dd")])]
 
 
-def _left_out(sources: Sources) -> Column:
+def left_out(sources: Sources) -> Column:
     head, small = "Error of each order", "on blocks left out, share of the outputs’ variation"
     table = sources.tables["order"]
     if isinstance(table, Missing):

@@ -119,7 +119,7 @@ def _signal(signal, time: np.ndarray, values: np.ndarray, masked: np.ndarray, qu
         above=22,
     )
     layers = [charts.line(frame, time, np.where(masked, np.nan, values), "line thin")]
-    stretches = _stretches(masked)
+    stretches = charts.stretches(masked)
     layers += [charts.interval(frame, float(time[a]), float(time[b - 1]), "gone") for a, b in stretches[:200]]
     mine = [] if isinstance(quality, Missing) else np.flatnonzero(quality["signal"] == signal.name)
     # a flag that spans the record says where it is in words, not in grey over everything
@@ -131,11 +131,6 @@ def _signal(signal, time: np.ndarray, values: np.ndarray, masked: np.ndarray, qu
         f"{count(int(masked.sum()), 'sample')} masked"
     ) + (f"; flagged {flags}" if flags else "")
     return charts.panel(frame, layers, alt=alt, css="mb", title=signal.name + (f": {flags}" if flags else ""), x_ticks=last)
-
-
-def _stretches(mask: np.ndarray) -> list[tuple[int, int]]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
 def findings(sources: Sources, most: int = 40) -> tuple[list[Mapping[str, str]], int, Missing | None]:

@@ -3,6 +3,7 @@
 from pipeline.report import evidence, findings, index, page, pictures, recording, tables, words
 from pipeline.report.answers import featured, repetitions
 from pipeline.report.judgement import Judgement
+from pipeline.report.model import trust
 from pipeline.report.sources import Sources
 
 WORDS = (
@@ -48,6 +49,7 @@ def render(sources: Sources, judged: Judgement) -> str:
         panel=tables.panel(sources),
         weights=tables.weights(sources),
         identified=tables.identified(sources),
+        trusted=trust(sources),
         words=words.chosen(sources, WORDS),
         sources=list(sources.read.values()),
         absent=sources.absent,

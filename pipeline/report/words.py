@@ -49,6 +49,31 @@ FIXED = {
     ),
     "baseline": ("Baseline", "One PI controller a zone, tuned by SIMC from the identified model, with the same feasible target."),
     "exact_model": ("Exact model", "The model-based controller, told the true plant: what a perfect identification would give."),
+    "trusted": (
+        "Trusted",
+        "To simulate: the rules simulation and stability. To predict: the rule ahead. To design controllers: ahead, inputs used up, "
+        + "excitation, effects known and stability. Whiteness is a reservation: where it fails, a better observer exists.",
+    ),
+    "fit": (
+        "Fit",
+        "100 % less the size of the error as a share of the size of the output’s movement about its mean. 100 % is perfect, 0 % is the mean, "
+        + "below 0 % is worse than the mean.",
+    ),
+    "simulation": ("Simulation", "The model runs from the inputs alone and never sees an output; only where it starts is fitted."),
+    "ahead": ("Ahead", "The model predicts so far ahead from all outputs until then, and from the inputs throughout."),
+    "held": ("Held", "The last output seen, held so long: what any prediction must beat."),
+    "holdout": ("Hold-out", "The last part of every stretch of the record. Order, window and model are chosen without it."),
+    "fit_band": (
+        "Band of a fit",
+        "Where 90 of 100 hold-outs of this length would lie, by resampling blocks of it. A fit whose band straddles its limit is undecided.",
+    ),
+    "whiteness": ("Whiteness", "The errors of predicting one step ahead are noise: none tells the next. Ljung and Box’s test at 99 %."),
+    "inputs_left": ("Inputs used up", "No error follows an input: what inputs do, the model explains. At 99 %, over all lags."),
+    "excitation": ("Excitation", "In how many directions the inputs moved over the window: a direction without movement teaches nothing."),
+    "identified_spread": (
+        "Spread",
+        "Plants identified anew from records rebuilt with resampled errors: as different as the record allows, and one order higher.",
+    ),
     "study": ("The study", "The published work whose method this is; “as published” repeats its own way of counting, digit by digit."),
 }
 

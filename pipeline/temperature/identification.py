@@ -1,11 +1,12 @@
 """From a record to a plant: window, dead time, feed-through, order and refinement chosen on the identification data by stated rules, then one fit on all of it.
 
 The rules, each with its reason:
-  window        Akaike's criterion (corrected for few samples) over the lags of a VARX model: long enough to whiten, not longer than the record supports
-  feed-through  Schwarz's criterion with and without u(t), where `feedthrough` is None
+  window        twice the lags of Akaike's criterion (corrected for few samples) over VARX models: long enough to whiten; and Schwarz's lags, for records that say little
+  feed-through  with and without u(t), where `feedthrough` is None and Schwarz's criterion of the one-step predictor prefers it
   largest order singular values, in units of the noise, above what coefficient errors alone reach: sqrt(2) (sqrt(rows) + sqrt(columns)) of the noise matrix
-  dead time     lags at which the largest model's impulse response stays under 5 % of its peak, kept only where the cross-validation below prefers it
-  order         the fewest parameters whose error in simulation of left-out blocks is within one standard error (of the paired differences), or 2 %, of the best
+  dead time     none; the lags at which the largest model's impulse response stays under 5 % of its peak; those under a quarter that Wald's test finds silent too
+  order         of all these, the fewest parameters whose error in simulation of left-out blocks (geometric mean) is within 2 % of the best
+  refinement    where `refinement` is "validated": prediction-error fits of the chosen model, where one takes more than 5 % off the error on the left-out blocks
 """
 
 from collections.abc import Sequence
@@ -13,18 +14,32 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from pipeline.temperature.order import Candidate, cross_validate, fit, shifted, simplest, with_delays
-from pipeline.temperature.plant import Plant, markov_parameters
-from pipeline.temperature.refinement import drives, estimate_state, simulation_form
+from pipeline.temperature.order import (
+    WORTH_REFINING,
+    Candidate,
+    Structure,
+    cross_validate,
+    dead_time,
+    feedthrough_shows,
+    fit,
+    longest_window,
+    noise_edge,
+    shifted,
+    simplest,
+    tested_dead_times,
+    windows,
+    with_delays,
+)
+from pipeline.temperature.plant import Plant
+from pipeline.temperature.refinement import drives, estimate_state, kalman_gain, simulation_form
 from pipeline.temperature.subspace import (
-    Lagged,
     Segments,
     Varx,
     complete_runs,
+    gapless,
     lagged,
     moesp,
     moesp_singular_values,
-    one_step,
     realise,
     subspace,
     varx,
@@ -32,21 +47,21 @@ from pipeline.temperature.subspace import (
 
 __all__ = ["Candidate", "Identified", "Varx", "check_inputs", "identify", "moesp", "moesp_singular_values", "varx"]
 
-NOISE_FREE = 1e-10  # share of the outputs' power that a noise-free record's one-step errors stay under
 EXACT_RANK = 1e-7  # singular values of a noise-free record below this share of the largest are rounding
-WIDEST = 360  # columns of the lagged record: the cost of a fit grows with their square
 
 
 class Identified(NamedTuple):
     """An identified plant and how it was chosen. order: states without those of the delays; past: window; order_table: candidates with their errors.
 
-    x0 has the initial state of each segment, or of each piece where masked inputs cut one (`gapless`).
+    delays are the dead times in the plant, in samples for each input; silent marks inputs that no output answers. x0 has the initial state of each segment, or of
+    each piece where masked inputs cut one (`gapless`).
     """
 
     plant: Plant
     order: int
     past: int
     delays: tuple[int, ...]
+    silent: tuple[bool, ...]
     feedthrough: bool
     offset: bool
     fit: str
@@ -59,15 +74,19 @@ class Identified(NamedTuple):
     notes: list[str]
 
 
+def name_of(names: Sequence[str], letter: str, j: int) -> str:
+    return names[j] if names else f"{letter}{j + 1}"
+
+
 def check_outputs(y: Segments, *, names: Sequence[str] = ()) -> None:
     """Raises ValueError where an output never moves: no model of it is possible."""
     rows = np.vstack(y)
     for j in range(rows.shape[1]):
         seen = rows[np.isfinite(rows[:, j]), j]
-        if seen.size == 0 or np.ptp(seen) == 0:
+        if seen.size == 0 or np.ptp(seen) <= 1e-12 * np.abs(seen).max():
             shown = f"{seen[0]:g} in every sample" if seen.size else "missing in every sample"
             raise ValueError(
-                f"output {names[j] if names else f'y{j + 1}'} is constant ({shown}), so no model of it is possible; check the sensor, or leave it out of plant.outputs"
+                f"output {name_of(names, 'y', j)} is constant ({shown}), so no model of it is possible; check the sensor, or leave it out of plant.outputs"
             )
 
 
@@ -75,81 +94,47 @@ def check_inputs(u: Segments, *, offset: bool = True, names: Sequence[str] = ())
     """Raises ValueError where an input is constant or a linear combination of the others: its column of B is then not identified."""
     rows = np.vstack(u)
     rows = rows[np.isfinite(rows).all(axis=1)]
+    if not len(rows):
+        raise ValueError("no sample has all inputs, so no plant can be run over the record; check plant.inputs and the mapping")
+    largest = np.abs(rows).max(axis=0)
     rows = rows - rows.mean(axis=0) if offset else rows
     size = np.sqrt(np.mean(rows**2, axis=0))
     for j in range(rows.shape[1]):
-        if size[j] <= 1e-9 * max(np.abs(np.vstack(u)[:, j]).max(initial=0.0), 1e-300):
-            raise ValueError(f"input {names[j] if names else f'u{j + 1}'} is constant, so its column of B is not identified; excite it, or leave it out of the inputs")
+        if size[j] <= max(1e-9 * largest[j], np.finfo(float).tiny):
+            raise ValueError(
+                f"input {name_of(names, 'u', j)} is constant, so its column of B is not identified; excite it, or leave it out of the inputs"
+            )
     scaled = rows / size
     for j in range(1, rows.shape[1]):
         weights = np.linalg.lstsq(scaled[:, :j], scaled[:, j], rcond=None)[0]
         if np.linalg.norm(scaled[:, j] - scaled[:, :j] @ weights) < 1e-6 * np.linalg.norm(scaled[:, j]):
-            others = ", ".join(names[k] if names else f"u{k + 1}" for k in range(j) if abs(weights[k]) > 1e-6)
+            others = ", ".join(name_of(names, "u", k) for k in range(j) if abs(weights[k]) > 1e-6)
             raise ValueError(
-                f"input {names[j] if names else f'u{j + 1}'} is a linear combination of {others}, so its column of B is not identified; move it independently, or leave it out"
+                f"input {name_of(names, 'u', j)} is a linear combination of {others}, so its column of B is not identified; move it independently, or leave it out"
             )
 
 
-def gapless(u: Segments, y: Segments) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """The segments cut where an input is masked: no plant can be run over an unknown input. Pieces of one sample, or without a single y, are dropped."""
-    us, ys = [], []
-    for a, b in zip(u, y, strict=True):
-        edges = np.flatnonzero(np.diff(np.r_[0, np.isfinite(a).all(axis=1), 0]))
-        for start, stop in zip(edges[::2], edges[1::2], strict=True):
-            if stop - start > 1 and np.isfinite(b[start:stop]).any():
-                us.append(a[start:stop])
-                ys.append(b[start:stop])
-    return us, ys
+def within_limits(
+    u: Segments, limits: tuple[Sequence[float], Sequence[float]], *, names: Sequence[str] = ()
+) -> tuple[list[np.ndarray], list[str]]:
+    """The inputs that the actuators could follow, min(max(u, low), high), and a sentence for each input that was asked beyond its limits.
 
-
-def longest_window(u: Segments, y: Segments) -> int:
-    """Most lags that leave four complete windows for each unknown of a VARX model, within the width that is paid for."""
-    q, lengths = u[0].shape[1] + y[0].shape[1], np.array([len(w) for w in complete_runs(u, y)])
-    supported = [past for past in range(2, WIDEST // q + 1) if np.maximum(lengths - past, 0).sum() >= 4 * q * past]
-    return max(supported, default=2)
-
-
-def choose_past(data: Lagged) -> tuple[int, bool]:
-    """Window: twice the lags with the least corrected Akaike criterion (Bauer 2005: the window of a subspace method must outgrow the order's criterion).
-
-    True beside the shortest window that predicts to rounding, where there is one: the record is noise-free. The errors of every lag stand in the one factor.
+    Clipping at a known limit loses nothing; masking the same samples would cut the record wherever the actuator stands at its stop.
     """
-    p, whole, best = data.p, np.sum(data.R[:, data.now_y] ** 2), (np.inf, 1)
-    for past in range(1, data.past + 1):
-        k = past * (data.m + p)
-        errors = data.R[k:, data.now_y]
-        if np.sum(errors**2) < NOISE_FREE * whole:
-            return past, True
-        count, numbers = p * k + p * (p + 1) / 2, data.rows * p
-        if numbers > count + 1:
-            criterion = data.rows * np.linalg.slogdet(errors.T @ errors / data.rows)[1] + 2 * count * numbers / (numbers - count - 1)
-            best = min(best, (criterion, past))
-    return min(2 * best[1], data.past), False
-
-
-def choose_feedthrough(u: Segments, y: Segments, past: int, offset: bool) -> bool:
-    """Whether Schwarz's criterion of the one-step predictor falls when u(t) is added to it."""
-    criterion = []
-    for feedthrough in (False, True):
-        data = lagged(u, y, past, feedthrough=feedthrough, offset=offset)
-        coefficients, errors = one_step(data, past)
-        criterion.append(data.rows * np.linalg.slogdet(errors.T @ errors / data.rows)[1] + np.log(data.rows) * coefficients.size)
-    return bool(criterion[1] < criterion[0])
-
-
-def dead_time(plant: Plant, longest: int) -> tuple[int, ...]:
-    """Samples, for each input, beyond the one that every strictly proper plant has, before any output answers with 5 % of its peak impulse response."""
-    h = np.abs(markov_parameters(plant, 10 * longest))
-    started = (h >= 0.05 * h.max(axis=0)).any(axis=1)
-    return tuple(min(int(np.argmax(started[:, j])), longest) for j in range(plant.m))
-
-
-def noise_edge(data: Lagged, past: int) -> float:
-    """sqrt(2) (sqrt(past p) + sqrt(past (m+p))): above what the coefficients' error alone puts into the singular values.
-
-    A matrix of independent unit noise of that shape stays under the bracket; here each error stands in up to `past` rows, which adds some tenth (measured).
-    """
-    return float(np.sqrt(2) * (np.sqrt(past * data.p) + np.sqrt(past * (data.m + data.p))))
+    low, high = (np.asarray(side, float) for side in limits)
+    m, said = u[0].shape[1], []
+    if low.shape != (m,) or high.shape != (m,) or not (low < high).all():
+        raise ValueError(
+            f"limits: expected {m} low and {m} high limits with low < high but found {low.tolist()} and {high.tolist()}; give one pair for each input"
+        )
+    rows = np.vstack(u)
+    for j in range(m):
+        beyond = int(((rows[:, j] < low[j]) | (rows[:, j] > high[j])).sum())
+        if beyond:
+            said.append(
+                f"{name_of(names, 'u', j)} was asked beyond {low[j]:g}..{high[j]:g} in {beyond} of {len(rows)} samples: the limit is taken as its input there"
+            )
+    return [np.clip(a, low, high) for a in u], said
 
 
 def identify(
@@ -165,136 +150,198 @@ def identify(
     refinement: Literal["none", "prediction", "simulation", "validated"] = "none",
     max_order: int = 12,
     blocks: int = 5,
+    limits: tuple[Sequence[float], Sequence[float]] | None = None,
+    names: Sequence[str] = (),
 ) -> Identified:
     """The plant that a record shows, by the rules at the head of this module; u segments (T, m), y segments (T, p), NaN where a sample is masked.
 
-    `refinement` "prediction" or "simulation" moves the subspace plant to the least errors of that kind; "validated" does so only where the left-out blocks prefer
-    it by more than one standard error. `feedthrough` None lets the data decide. Works in closed loop, unless refined on simulation errors.
-    Raises ValueError for a constant or collinear input, a record too short for the order, and shapes that do not agree.
+    `method` makes the start: PBSID, or past-output MOESP with the Kalman gain of its one-step errors; both give the innovation form. `refinement` "prediction" or
+    "simulation" moves it to the least errors of that kind; "validated" does so only where the left-out blocks prefer it. `feedthrough` None lets the data decide.
+    `limits` (low, high) of the actuators clip u. Works in closed loop, unless refined on simulation errors.
+    Raises ValueError for a constant or collinear input, a constant output, a record too short for the order, and shapes that do not agree.
     """
-    u, y = [np.atleast_2d(a) for a in u], [np.atleast_2d(b) for b in y]
+    u, y = [np.atleast_2d(np.asarray(a, float)) for a in u], [np.atleast_2d(np.asarray(b, float)) for b in y]
     _check_shapes(u, y)
-    m, p = u[0].shape[1], y[0].shape[1]
-    whole = sum(map(len, u))
+    m, whole = u[0].shape[1], sum(map(len, u))
+    u, notes = within_limits(u, limits, names=names) if limits is not None else (u, [])
     u, y = gapless(u, y)
     cut = whole - sum(map(len, u))
-    _check_length(sum(len(w) for w in complete_runs(u, y)), order, m, p)
-    check_inputs(u, offset=offset)
-    notes = [f"{cut} samples with a masked input, or without any output, were cut out"] if cut else []
-    longest = longest_window(u, y)
-    exact = False
-    if past is None:
-        past, exact = choose_past(lagged(u, y, min(longest, 6), offset=offset))  # a few lags tell whether the record is noise-free
-        past, exact = (past, exact) if exact else choose_past(lagged(u, y, longest, offset=offset))
+    _check_length(u, y, order, past)
+    check_inputs(u, offset=offset, names=names)
+    check_outputs(y)
+    notes += [f"{cut} samples with a masked input, or without any output, were cut out"] if cut else []
+    pasts, exact = _windows(u, y, order, past, offset)
+    direct = (feedthrough,)
     if feedthrough is None:
-        feedthrough = choose_feedthrough(u, y, past, offset)
-        notes.append(f"direct feed-through {'kept' if feedthrough else 'left out'} by Schwarz's criterion")
-    data = lagged(u, y, past, feedthrough=feedthrough, offset=offset, exact=exact)
-    sub, edge = subspace(data, past), noise_edge(data, past)
-    settings = {"past": past, "feedthrough": feedthrough, "offset": offset}
-    delays, kind, table = (0,) * m, "subspace" if refinement == "validated" else refinement.replace("none", "subspace"), []
+        direct = (False, True) if feedthrough_shows(u, y, pasts[0], offset) else (False,)
+    structure, kind, table = Structure(pasts[0], direct[-1], offset, (0,) * m), refinement.replace("none", "subspace"), []
     if exact:
-        notes.append(f"the record is noise-free: {past} past samples predict it to rounding, and the order is a rank")
-        order = order or int((sub.singular_values > EXACT_RANK * sub.singular_values[0]).sum())
+        notes.append(f"the record is noise-free: {pasts[0]} past samples predict it to rounding, and the order is a rank")
+        sub = subspace(lagged(u, y, pasts[0], feedthrough=direct[-1], offset=offset, exact=True), pasts[0])
+        order = order or max(int((sub.singular_values > EXACT_RANK * sub.singular_values[0]).sum()), 1)
+        kind = kind.replace("validated", "subspace")
     elif order is None or refinement == "validated":
-        chosen, table = _choose(u, y, data, sub, edge, order, max_order, blocks, refinement == "validated", settings)
-        order, delays, kind = chosen.order, chosen.delays, chosen.fit if refinement == "validated" else kind
-    found = _fit_all(u, y, data, sub, edge, order, delays, kind, method, settings, sample_time_s, table, notes)
-    return found._replace(dropped_rows=found.dropped_rows + cut)
+        structures = [structure._replace(past=n, feedthrough=d) for n in pasts for d in direct]
+        chosen, table = _choose(u, y, structures, order, max_order, blocks, refinement == "validated")
+        order, structure, kind = chosen.order, chosen.structure, chosen.fit if refinement == "validated" else kind
+    if feedthrough is None:
+        notes.append(
+            f"direct feed-through {'kept' if structure.feedthrough else 'left out'} by Schwarz's criterion and the left-out blocks"
+        )
+    found = _fit_all(u, y, structure, exact, order, kind, method, sample_time_s, table)
+    return found._replace(dropped_rows=found.dropped_rows + cut, notes=notes + _remarks(found, names))
 
 
-def _choose(u, y, data, sub, edge, order, max_order, blocks, validated, settings) -> tuple[Candidate, list[Candidate]]:
-    """The candidate that the rules take, and the table: orders and dead times of the subspace fit, then the refined fits of the winner."""
-    m = data.m
-    if order is None:
-        largest = max(1, min(int((sub.singular_values > edge).sum()), max_order, len(sub.singular_values)))
-        orders = range(1, largest + 1)
-        delays = sorted({(0,) * m, dead_time(realise(data, sub.basis[:largest], 1.0), max(data.past // 2, 1))})
-    else:
-        orders, delays = [order], [(0,) * m]
-    settings = settings | {"blocks": blocks, "singular_values": sub.singular_values}
-    table = [row for d in delays for row in cross_validate(u, y, orders, d, ("subspace",), **settings)]
+def _windows(u, y, order, past, offset) -> tuple[tuple[int, ...], bool]:
+    """The windows to try, each long enough for the order asked, and whether the record is noise-free."""
+    if past:
+        return (past,), False
+    longest = longest_window(u, y)
+    pasts, exact = windows(lagged(u, y, min(longest, 6), offset=offset))  # a few lags tell whether the record is noise-free
+    if not exact:
+        pasts, exact = windows(lagged(u, y, longest, offset=offset))
+    least = -(-(order or 1) // y[0].shape[1])
+    return tuple(sorted({max(n, least) for n in pasts}, reverse=True)), exact
+
+
+def _choose(u, y, structures, order, max_order, blocks, validated) -> tuple[Candidate, list[Candidate]]:
+    """The candidate that the rules take, and the table: structures and orders of the subspace fit, then the refined fits of the winner."""
+    table = []
+    for structure in structures:
+        data = lagged(u, y, structure.past, feedthrough=structure.feedthrough, offset=structure.offset)
+        sub = subspace(data, structure.past)
+        orders, delays, furthest = [order], {structure.delays}, max(data.past // 2, 1)
+        if order is None:
+            largest = max(1, min(int((sub.singular_values > noise_edge(data, structure.past)).sum()), max_order, len(sub.singular_values)))
+            orders = range(1, largest + 1)
+            model = realise(data, sub.basis[:largest], 1.0)
+            quiet = np.minimum(tested_dead_times(data, furthest)[0], dead_time(model, furthest, 0.25))
+            delays |= {dead_time(model, furthest), tuple(quiet.tolist())}
+        for d in sorted(delays):
+            table += cross_validate(
+                u, y, orders, structure._replace(delays=d), ("subspace",), blocks=blocks, singular_values=sub.singular_values
+            )
+    if not table:
+        raise ValueError(
+            f"the record is too short to choose a model by leaving out one of {blocks} blocks: {sum(map(len, u))} samples do not carry a window of"
+            f" {structures[-1].past} without one; record longer, or give order and past"
+        )
     chosen = simplest(table)
     if validated:
-        refined = cross_validate(u, y, [chosen.order], chosen.delays, ("prediction", "simulation"), **settings)
+        known = {row.order: row.singular_value for row in table if row.structure == chosen.structure}
+        values = np.array([known.get(n, np.nan) for n in range(1, chosen.order + 1)])
+        refined = cross_validate(
+            u, y, [chosen.order], chosen.structure, ("prediction", "simulation"), blocks=blocks, singular_values=values
+        )
         table += refined
-        for row in sorted(refined, key=lambda row: row.error)[:1]:
-            gain = np.subtract(chosen.errors, row.errors)
-            chosen = row if gain.mean() > gain.std(ddof=1) / np.sqrt(len(gain)) else chosen
+        best = min(refined, key=lambda row: row.error, default=chosen)
+        chosen = best if best.error < (1 - WORTH_REFINING) * chosen.error else chosen
     return chosen, table
 
 
-def _fit_all(u, y, data, sub, edge, order, delays, kind, method, settings, sample_time_s, table, notes) -> Identified:
+def _fit_all(u, y, structure, exact, order, kind, method, sample_time_s, table) -> Identified:
     """One fit of the chosen model on all of the record."""
-    rest = {"feedthrough": settings["feedthrough"], "offset": settings["offset"]}
+    past, rest = structure.past, {"feedthrough": structure.feedthrough, "offset": structure.offset}
+    us, ys = shifted(u, y, structure.delays)
+    data = lagged(us, ys, past, **rest, exact=exact)
+    sub = subspace(data, past)
     if order > len(sub.singular_values):
         raise ValueError(
-            f"order {order} needs a longer window: {data.past} past samples give at most {len(sub.singular_values)} states; raise past"
+            f"order {order} needs a longer window: {past} past samples give at most {len(sub.singular_values)} states; raise past"
         )
-    us, ys = shifted(u, y, delays)
-    if any(delays):
-        data = lagged(us, ys, settings["past"], **rest)
-        sub_delayed = subspace(data, data.past)
-    else:
-        sub_delayed = sub
     if method == "moesp":
-        plant = moesp(us, ys, data.past, order, sample_time_s=sample_time_s, **rest)[0]
+        plant = kalman_gain(moesp(us, ys, past, order, sample_time_s=sample_time_s, **rest)[0], us, ys)
     else:
-        plant = realise(data, sub_delayed.basis[:order], sample_time_s)
-    plant = with_delays(fit(kind, plant, us, ys, max_iterations=30, **rest), delays)
+        plant = realise(data, sub.basis[:order], sample_time_s)
+    plant = with_delays(fit(kind, plant, us, ys, max_iterations=30, **rest), structure.delays)
     model = simulation_form(plant, [])
-    x0 = [
-        estimate_state(model, drives("simulation", a, np.nan_to_num(b)), b) if np.isfinite(a).all() else np.full(plant.n, np.nan)
-        for a, b in zip(u, y, strict=True)
+    return Identified(
+        plant=plant,
+        order=order,
+        past=past,
+        delays=structure.delays,
+        silent=(False,) * plant.m if exact else tested_dead_times(data, past)[1],
+        feedthrough=structure.feedthrough,
+        offset=structure.offset,
+        fit=kind,
+        singular_values=sub.singular_values,
+        noise_edge=noise_edge(data, past),
+        order_table=table,
+        x0=[estimate_state(model, drives("simulation", a, b), b) for a, b in zip(u, y, strict=True)],
+        rows=data.rows,
+        dropped_rows=data.dropped_rows,
+        notes=[],
+    )
+
+
+def _remarks(found: Identified, names: Sequence[str]) -> list[str]:
+    """What a user should know of the fit, a sentence each."""
+    said = []
+    if found.dropped_rows:
+        said.append(f"{found.dropped_rows} rows touch a masked sample and were left out of the fit")
+    said += [
+        f"dead time of {name_of(names, 'u', j)}: {delay} samples beyond the one of sampling"
+        for j, delay in enumerate(found.delays)
+        if delay
     ]
-    if data.dropped_rows:
-        notes.append(f"{data.dropped_rows} rows touch a masked sample and were left out of the fit")
-    radius = float(np.abs(np.linalg.eigvals(plant.A)).max())
+    said += [
+        f"no output answers {name_of(names, 'u', j)} (99.9 %): leave it out, or excite it more"
+        for j in range(found.plant.m)
+        if found.silent[j]
+    ]
+    determined = int((found.singular_values > found.noise_edge).sum())
+    if found.order > max(determined, 1) and not found.order_table:
+        said.append(f"order {found.order} was asked but the record determines {determined} states above its noise; the others fit noise")
+    radius = float(np.abs(np.linalg.eigvals(found.plant.A)).max())
     if radius > 1:
-        notes.append(
+        said.append(
             f"the largest pole is at {radius:.5f}, outside the unit circle; refine with a limit, or record longer, before simulating far ahead"
         )
-    return Identified(
-        plant,
-        order,
-        data.past,
-        delays,
-        rest["feedthrough"],
-        rest["offset"],
-        kind,
-        sub.singular_values,
-        edge,
-        table,
-        x0,
-        data.rows,
-        data.dropped_rows,
-        notes,
-    )
+    return said
 
 
 def _check_shapes(u: Segments, y: Segments) -> None:
     if not u or len(u) != len(y):
         raise ValueError(f"identify: expected as many segments of u as of y, at least one, but found {len(u)} and {len(y)}")
     for k, (a, b) in enumerate(zip(u, y, strict=True)):
-        if a.ndim != 2 or b.ndim != 2 or len(a) != len(b) or a.shape[1] != u[0].shape[1] or b.shape[1] != y[0].shape[1]:
+        if (
+            a.ndim != 2
+            or b.ndim != 2
+            or len(a) != len(b)
+            or a.shape[1] != u[0].shape[1]
+            or b.shape[1] != y[0].shape[1]
+            or 0 in (a.shape[1], b.shape[1])
+        ):
             raise ValueError(
-                f"identify: segment {k} has u of shape {a.shape} and y of shape {b.shape}; expected (T, {u[0].shape[1]}) and (T, {y[0].shape[1]})"
+                f"identify: segment {k} has u of shape {a.shape} and y of shape {b.shape}; expected (T, {u[0].shape[1]}) and (T, {y[0].shape[1]}), one column at least"
             )
 
 
-def _check_length(samples: int, order: int | None, m: int, p: int) -> None:
-    """As many complete samples as ten for each unknown of the smallest window that carries the order."""
-    lags = max(2, -(-(order or 1) // p) + 1)
-    needed = 10 * lags * (m + p)
+def _check_length(u: Segments, y: Segments, order: int | None, past: int | None) -> None:
+    """Four complete windows for each unknown of the smallest window that carries the order, and 20; a window is one unbroken stretch."""
+    if not u:
+        raise ValueError("the record is empty: no sample has all inputs beside at least one output; check the mapping, and what was masked")
+    p, q = y[0].shape[1], u[0].shape[1] + y[0].shape[1]
+    lags = past or max(2, -(-(order or 1) // p))
+    lengths = np.array([len(w) for w in complete_runs(u, y)])
+    needed, samples = max(4 * lags * q + lags, 20), int(lengths.sum())
     if samples < needed:
         raise ValueError(
             f"the record is too short for order {order or 1}: expected at least {needed} complete samples, found {samples}; record {needed - samples} samples more"
+        )
+    windows, unknowns = int(np.maximum(lengths - lags, 0).sum()), (lags + 1) * q + 1
+    if windows < unknowns:
+        raise ValueError(
+            f"the segments are too short for a window of {lags} samples: the longest complete stretch has {lengths.max()}, and {windows} windows do not determine"
+            f" {unknowns} unknowns; record longer without gaps"
         )
 
 
 def rows(found: Identified) -> dict[str, list]:
     """The table by which the order was chosen, as columns: every candidate, or the singular values alone where they decided."""
-    tried = {row.order: row for row in found.order_table if row.fit == found.fit or row.order != found.order}
+    structure = Structure(found.past, found.feedthrough, found.offset, found.delays)
+    shown_rows = [row for row in found.order_table if row.structure == structure]
+    tried = {row.order: row for row in shown_rows if row.fit == found.fit or row.order != found.order}
     shown = [k for k in range(1, len(found.singular_values) + 1) if k <= 30 or k in tried]
     return {
         "order": np.array(shown, np.int32),

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
+import scipy.linalg
 import scipy.signal
 
 from pipeline.temperature.plant import Plant
@@ -48,19 +49,29 @@ def respond(model: Predictor, v: np.ndarray, x0: np.ndarray) -> tuple[np.ndarray
     return x, x @ model.C.T + v @ model.H.T
 
 
+def free_response(model: Predictor, T: int) -> np.ndarray:
+    """[C; CF; ...; CF^(T-1)] (T, p, n), the outputs' response to each state at the start; doubles with each pass."""
+    gamma, power = model.C[None], model.F
+    while len(gamma) < T:
+        gamma, power = np.concatenate([gamma, gamma @ power]), power @ power
+    return gamma[:T]
+
+
 def estimate_state(model: Predictor, v: np.ndarray, y: np.ndarray, *, free_mean: bool = False) -> np.ndarray:
     """x(0) (n,) that fits y (T, p) best in least squares under v; NaN in y is left out. A direction of x(0) that y does not show stays zero.
 
     With `free_mean` a constant for each output is fitted along and dropped, for scores that remove the mean of the error.
     """
-    T, (p, n) = len(v), model.C.shape
-    error = y - respond(model, v, np.zeros(n))[1]
-    gamma, power = model.C[None], model.F
-    while len(gamma) < T:  # [C; CF; ...] doubles with each pass
-        gamma, power = np.concatenate([gamma, gamma @ power]), power @ power
-    seen = np.isfinite(y)
-    regressors = gamma[:T] if not free_mean else np.concatenate([gamma[:T], np.broadcast_to(np.eye(p), (T, p, p))], axis=2)
-    return np.linalg.lstsq(regressors[seen], error[seen], rcond=1e-10)[0][:n]
+    n = len(model.F)
+    return fitted_state(free_response(model, len(v)), y - respond(model, v, np.zeros(n))[1], free_mean=free_mean)[:n]
+
+
+def fitted_state(gamma: np.ndarray, error: np.ndarray, *, free_mean: bool) -> np.ndarray:
+    """x(0), and with `free_mean` a constant for each output after it, that leave the least of error (T, p); NaN is left out."""
+    T, p, _ = gamma.shape
+    regressors = gamma if not free_mean else np.concatenate([gamma, np.broadcast_to(np.eye(p), (T, p, p))], axis=2)
+    seen = np.isfinite(error)
+    return np.linalg.lstsq(regressors[seen], error[seen], rcond=1e-10)[0]
 
 
 def _block_modal(model: Predictor) -> tuple[Predictor, list[tuple[int, complex]], np.ndarray]:
@@ -77,41 +88,70 @@ def _block_modal(model: Predictor) -> tuple[Predictor, list[tuple[int, complex]]
     return Predictor(inverse @ model.F @ T, inverse @ model.G, model.C @ T, model.H, [inverse @ x for x in model.x0]), blocks, T
 
 
-def _sensitivities(model: Predictor, blocks: list[tuple[int, complex]], s: np.ndarray, numerator: list[float]) -> np.ndarray:
-    """S (p, T, n, k): response of ŷ to signal s_j (T, k) entering at state i, in block-modal coordinates; numerator [0, 1] for an input, [1] for x0."""
-    p, n = model.C.shape
-    S = np.empty((p, len(s), n, s.shape[1]))
+def _filtered(blocks: list[tuple[int, complex]], s: np.ndarray, numerator: list[float]) -> np.ndarray:
+    """f (T, n, k): signal s_j (T, k) through the first-order filter of each mode, real and imaginary part of a pair in its two rows; numerator [0, 1] for an input, [1] for x0.
+
+    The response of ŷ_o to s_j entering at state i is a mixture of f by C alone (`_mixed`), so one set of filtered signals serves every output.
+    """
+    f = np.empty((len(s), sum(1 + (eigenvalue.imag > 0) for _, eigenvalue in blocks), s.shape[1]))
     for k, eigenvalue in blocks:
-        pair = eigenvalue.imag > 0
-        f = scipy.signal.lfilter(numerator, [1.0, -eigenvalue if pair else -eigenvalue.real], s, axis=0)
-        for o in range(p):
-            if pair:
-                S[o, :, k] = model.C[o, k] * f.real - model.C[o, k + 1] * f.imag
-                S[o, :, k + 1] = model.C[o, k] * f.imag + model.C[o, k + 1] * f.real
-            else:
-                S[o, :, k] = model.C[o, k] * f
-    return S
+        if eigenvalue.imag > 0:
+            z = scipy.signal.lfilter(numerator, [1.0, -eigenvalue], s, axis=0)
+            f[:, k], f[:, k + 1] = z.real, z.imag
+        else:
+            f[:, k] = scipy.signal.lfilter(numerator, [1.0, -eigenvalue.real], s, axis=0)
+    return f
+
+
+def _mixing(c: np.ndarray, blocks: list[tuple[int, complex]]) -> np.ndarray:
+    """M (n, n) with sensitivity = M f for the output whose row of C is c: [c_k] for a real mode, [[c_k, -c_k+1], [c_k+1, c_k]] for a pair."""
+    M = np.zeros((len(c), len(c)))
+    for k, eigenvalue in blocks:
+        M[k, k] = c[k]
+        if eigenvalue.imag > 0:
+            M[k, k + 1], M[k + 1, k], M[k + 1, k + 1] = -c[k + 1], c[k + 1], c[k]
+    return M
+
+
+def _mixed(c: np.ndarray, blocks: list[tuple[int, complex]], f: np.ndarray) -> np.ndarray:
+    """Sensitivities (T, n k) of the output whose row of C is c."""
+    return np.einsum("il,tlj->tij", _mixing(c, blocks), f, optimize=True).reshape(len(f), -1)
 
 
 def _normal_equations(model: Predictor, blocks, free: np.ndarray, v_all, y_all) -> tuple[np.ndarray, np.ndarray]:
-    """J'J and J'e over every segment; parameters: [F G] row by row, then C and the free columns of H for each output, then x0 of each segment."""
+    """J'J and J'e over every segment; parameters: [F G] row by row, then C and the free columns of H for each output, then x0 of each segment.
+
+    With J_o = Z M_o the products over the samples, Z'Z and Z'e, are the same for every output that is measured at the same samples: taken once.
+    """
     n, r = model.G.shape
     p, h = len(model.C), len(free)
     state, output = n * (n + r), n + h
     size = state + p * output + n * len(v_all)
     JJ, Je = np.zeros((size, size)), np.zeros(size)
+    mixing = [scipy.linalg.block_diag(np.kron(M, np.eye(n + r)), np.eye(output), M) for M in (_mixing(c, blocks) for c in model.C)]
     for segment, (v, y) in enumerate(zip(v_all, y_all, strict=True)):
         x, predicted = respond(model, v, model.x0[segment])
         pulse = np.zeros((len(v), 1))
         pulse[0] = 1.0
-        S, S0 = _sensitivities(model, blocks, np.hstack([x, v]), [0.0, 1.0]), _sensitivities(model, blocks, pulse, [1.0])
+        Z = np.hstack(
+            [
+                _filtered(blocks, np.hstack([x, v]), [0.0, 1.0]).reshape(len(v), state),
+                x,
+                v[:, free],
+                _filtered(blocks, pulse, [1.0])[:, :, 0],
+            ]
+        )
+        e, seen, ZZ = y - predicted, None, None
         first = size - n * (len(v_all) - segment)
         for o in range(p):
-            seen = np.isfinite(y[:, o])
-            J = np.hstack([S[o].reshape(len(v), state), x, v[:, free], S0[o, :, :, 0]])[seen]
+            if seen is None or not np.array_equal(seen, np.isfinite(y[:, o])):
+                seen = np.isfinite(y[:, o])
+                Z_seen = Z if seen.all() else Z[seen]
+                ZZ = Z_seen.T @ Z_seen
+            M = mixing[o]
             at = np.r_[0:state, state + o * output : state + (o + 1) * output, first : first + n]
-            JJ[np.ix_(at, at)] += J.T @ J
-            Je[at] += J.T @ (y - predicted)[seen, o]
+            JJ[np.ix_(at, at)] += M @ ZZ @ M.T
+            Je[at] += M @ (Z_seen.T @ e[seen, o])
     return JJ, Je
 
 
@@ -139,18 +179,19 @@ def gauss_newton(
     """Levenberg-Marquardt on sum |y - ŷ|² over F, G, C, the columns `free` of H and every x0; NaN in y is left out.
 
     The parameters are redundant (any change of state basis); the damping picks the step of least norm among equals. `admissible(F, G, C)` refuses steps,
-    which is how stability is kept by construction. Stops when a step gains less than `tolerance` of the cost.
+    which is how stability is kept by construction. Stops when a step gains less than `tolerance` of the cost; a start whose errors are not finite is returned as it is.
     """
     costs, damping = [_cost(model, v_all, y_all)], 1e-4
-    for _ in range(max_iterations):
+    for _ in range(max_iterations if np.isfinite(costs[0]) else 0):
         model, blocks, _ = _block_modal(model)
         JJ, Je = _normal_equations(model, blocks, free, v_all, y_all)
         scale = np.sqrt(np.diag(JJ))
         scale[scale == 0] = 1.0
         JJ = JJ / np.outer(scale, scale)
         while damping < 1e8:
-            trial = _stepped(model, np.linalg.solve(JJ + damping * np.eye(len(JJ)), Je / scale) / scale, free)
-            cost = _cost(trial, v_all, y_all) if admissible(trial.F, trial.G, trial.C) else np.inf
+            step = np.linalg.solve(JJ + damping * np.eye(len(JJ)), Je / scale) / scale
+            trial = _stepped(model, step, free)
+            cost = _cost(trial, v_all, y_all) if np.isfinite(step).all() and admissible(trial.F, trial.G, trial.C) else np.inf
             if cost < costs[-1]:
                 break
             damping *= 10
@@ -178,12 +219,12 @@ def fit_inputs(A, C, u, y, *, feedthrough: bool, offset: bool) -> Predictor:
         v, T = drives("simulation", a, b), len(a)
         pulse = np.zeros((T, 1))
         pulse[0] = 1.0
-        S, S0 = _sensitivities(model, blocks, v[:, inputs], [0.0, 1.0]), _sensitivities(model, blocks, pulse, [1.0])
+        f, f0 = _filtered(blocks, v[:, inputs], [0.0, 1.0]), _filtered(blocks, pulse, [1.0])
         for o in range(p):
             J = np.zeros((T, size + n * segments))
-            J[:, : n * len(inputs)] = S[o].reshape(T, -1)
+            J[:, : n * len(inputs)] = _mixed(model.C[o], blocks, f)
             J[:, n * len(inputs) + o * len(direct) : n * len(inputs) + (o + 1) * len(direct)] = v[:, direct]
-            J[:, size + segment * n : size + (segment + 1) * n] = S0[o, :, :, 0]
+            J[:, size + segment * n : size + (segment + 1) * n] = _mixed(model.C[o], blocks, f0)
             seen = np.isfinite(b[:, o])
             rows.append(J[seen])
             target.append(b[seen, o])
@@ -242,7 +283,7 @@ def refine(
     """The plant moved to the least sum of weighted squared errors, one step ahead or in free simulation, over every segment u (T, m), y (T, p).
 
     Errors are weighted by the covariance of the starting model's (the full one for predictions, its diagonal for simulation). The predictor stays stable, and
-    so does A within `max_radius` where given (it must hold at the start). With `simulation` K is fitted last, to the one-step errors. NaN in y is a masked sample; in u it is refused.
+    so does A within `max_radius` where given (it must hold at the start). With `simulation` K is left zero: `kalman_gain` fits it. NaN in y is a masked sample; in u it is refused.
     Raises ValueError where u holds NaN, or the start violates `max_radius`.
     """
     if any(not np.isfinite(a).all() for a in u):
@@ -275,17 +316,31 @@ def refine(
     K = best.G[:, m + 1 :] @ weight if ahead else np.zeros((plant.n, p))
     D, d = H[:, :m], H[:, m]
     found = Plant(best.F + K @ C, best.G[:, :m] + K @ D, C, D, best.G[:, m] + K @ d, d, K, plant.sample_time_s)
-    return Refined(found if ahead else kalman_gain(found, u, y), best.x0, costs)
+    return Refined(found, best.x0, costs)
+
+
+def stabilising_gain(plant: Plant) -> np.ndarray:
+    """K (n, p) with A - K C stable: zero where A is, else the Kalman gain for process noise that enters as the inputs do (or into every state, where there are none)."""
+    if np.abs(np.linalg.eigvals(plant.A)).max() < 1:
+        return np.zeros((plant.n, plant.p))
+    A, C = plant.A, plant.C
+    size = max(np.trace(plant.B @ plant.B.T), np.finfo(float).tiny)
+    Q = plant.B @ plant.B.T / size + 1e-3 * np.eye(plant.n)
+    R = np.eye(plant.p) * max(np.trace(C @ Q @ C.T) / plant.p, np.finfo(float).tiny)
+    P = scipy.linalg.solve_discrete_are(A.T, C.T, Q, R)
+    return A @ P @ C.T @ np.linalg.inv(C @ P @ C.T + R)
 
 
 def kalman_gain(plant: Plant, u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, max_iterations: int = 20) -> Plant:
-    """The plant with the gain K that makes the one-step errors least, all else kept; Gauss-Newton from K = 0, where dŷ/dK_ij answers e_j entering at state i.
+    """The plant with the gain K that makes the one-step errors least, all else kept; Gauss-Newton from a gain that stabilises, where dŷ/dK_ij answers e_j entering at state i.
 
-    Errors are weighted by their variance in simulation. Raises ValueError where A is not stable (then K = 0 is no predictor to start from).
+    Errors are weighted by their variance at the start. A plant with an unstable mode that no output shows has no such gain, and is returned as it is.
     """
-    if np.abs(np.linalg.eigvals(plant.A)).max() >= 1:
+    try:
+        K = stabilising_gain(plant)
+    except np.linalg.LinAlgError:
         return plant
-    n, p, K = plant.n, plant.p, np.zeros((plant.n, plant.p))
+    n, p, plant = plant.n, plant.p, plant._replace(K=K)
     v = [drives("prediction", a, filled(plant, a, b, np.zeros(n))) for a, b in zip(u, y, strict=True)]
 
     def errors(K):
@@ -298,7 +353,8 @@ def kalman_gain(plant: Plant, u: Sequence[np.ndarray], y: Sequence[np.ndarray], 
     cost, damping = sum(np.sum((a * weight) ** 2) for a in e), 1e-4
     for _ in range(max_iterations):
         modal, blocks, basis = _block_modal(model._replace(x0=[]))
-        J = np.vstack([_sensitivities(modal, blocks, a, [0.0, 1.0]).transpose(1, 0, 2, 3).reshape(-1, n * p) for a in e])
+        f = [_filtered(blocks, a, [0.0, 1.0]) for a in e]
+        J = np.vstack([np.stack([_mixed(c, blocks, a) for c in modal.C], axis=1).reshape(-1, n * p) for a in f])
         w = np.tile(weight, len(J) // p)
         JJ, Je = (J * w[:, None]).T @ (J * w[:, None]), (J * w[:, None]).T @ (np.vstack(e).ravel() * w)
         scale = np.sqrt(np.maximum(np.diag(JJ), np.finfo(float).tiny))

@@ -72,6 +72,18 @@ def complete_runs(u: Segments, y: Segments) -> list[np.ndarray]:
     return runs
 
 
+def gapless(u: Segments, y: Segments) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """The segments cut where an input is masked: no plant can be run over an unknown input. Pieces of one sample, or without a single y, are dropped."""
+    us, ys = [], []
+    for a, b in zip(u, y, strict=True):
+        edges = np.flatnonzero(np.diff(np.r_[0, np.isfinite(a).all(axis=1), 0]))
+        for start, stop in zip(edges[::2], edges[1::2], strict=True):
+            if stop - start > 1 and np.isfinite(b[start:stop]).any():
+                us.append(a[start:stop])
+                ys.append(b[start:stop])
+    return us, ys
+
+
 def lagged_moments(w: np.ndarray, past: int) -> np.ndarray:
     """Sum over t = past..L-1 of z z', z = [w(t); w(t-1); ...; w(t-past)], for w (L, q).
 

@@ -7,7 +7,7 @@ import numpy as np
 import scipy.stats
 
 from pipeline.temperature.order import LARGEST_RADIUS, fit, shifted, stabilised, with_delays
-from pipeline.temperature.plant import Plant, simulate
+from pipeline.temperature.plant import Plant, markov_parameters
 from pipeline.temperature.refinement import drives, estimate_state, filled, linear_recurrence, prediction_form, respond, simulation_form
 from pipeline.temperature.subspace import Segments, lagged, realise, subspace
 
@@ -208,9 +208,8 @@ def _reidentified(u: Segments, y: Segments, identified, order: int) -> Plant:
 
 
 def step_response(plant: Plant, steps: int) -> np.ndarray:
-    """Response (steps, p, m) of each output to a unit step of each input from rest, without offsets."""
-    still = plant._replace(b=np.zeros(plant.n), d=np.zeros(plant.p))
-    return np.stack([simulate(still, np.tile(np.eye(plant.m)[j], (steps, 1)), np.zeros(plant.n))[1] for j in range(plant.m)], axis=2)
+    """Response (steps, p, m) of each output to a unit step of each input from rest, without offsets: D, then D + C B + C A B + ..."""
+    return plant.D + np.concatenate([np.zeros((1, plant.p, plant.m)), np.cumsum(markov_parameters(plant, steps - 1), axis=0)])
 
 
 def spread_bands(nominal: Plant, family: Sequence[Plant], steps: int, *, level: float = 0.99) -> Spread:
@@ -250,15 +249,3 @@ def advice(tests: Residuals, excited: Excitation, fit_percent: np.ndarray, *, ou
             f"the inputs together excite {excited.rank} of {excited.full} directions: they move alike; move one at a time, or with different sequences"
         )
     return sentences
-
-
-def rows(measured: Segments, simulated: Segments, outputs: Sequence[str], sample_time_s: float) -> dict[str, np.ndarray]:
-    """Measured and simulated outputs of the held-out segments as columns."""
-    columns = {
-        "segment": np.repeat(np.arange(len(measured), dtype=np.int32), [len(y) for y in measured]),
-        "time_s": np.concatenate([sample_time_s * np.arange(len(y)) for y in measured]),
-    }
-    for channel, name in enumerate(outputs):
-        columns[f"{name}_measured"] = np.concatenate([y[:, channel] for y in measured])
-        columns[f"{name}_simulated"] = np.concatenate([y[:, channel] for y in simulated])
-    return columns

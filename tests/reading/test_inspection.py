@@ -1,9 +1,11 @@
 import json
+import sys
 
 import numpy as np
 import pytest
 import yaml
 
+from pipeline import cli
 from pipeline.artifacts import write_recording
 from pipeline.params import Plant
 from pipeline.recordings import Source, inspect, read
@@ -46,7 +48,7 @@ def test_rates_jitter_gaps_and_ranges_are_those_of_the_file(tmp_path):
     assert "0.1 s (largest); 1 gaps beyond 1.5 s, the longest 7 s at 2 s" in text
     assert "heater_1                         0 to 2, median 1, 3 levels" in text
     assert "T1_C                             20 to 27, median 23, 7 levels, 1 missing" in text
-    assert "not numbers: note (text)" in text
+    assert "not numbers: note (text such as 'ok')" in text
 
 
 def test_topics_with_their_encodings_and_what_cannot_be_read_are_listed(tmp_path):
@@ -124,3 +126,50 @@ def test_mcap_files_of_others_are_inspected(shared, name):
     text = inspect(shared(f"data/mcap_ros2/{name}.mcap"))
     assert "topics" in text
     assert "Findings" in text
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "is empty (0 bytes)"),
+        (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", "is a PNG picture but should be MCAP, Parquet or CSV"),
+        (bytes(np.random.default_rng(0).integers(1, 256, 4000, np.uint8)), "are neither text nor Parquet nor MCAP"),
+        (b"name,owner\nrig,bob\nrig,eve\n", "has 3 lines of text and no data"),
+        (b"import numpy as np\n\ndef f(x, y):\n    return 1 + x, 2\n\n\nclass A:\n    a: int = 3\n", "is text but no table"),
+        (b"t,Q1,T1\n0,20 %,21 C\n1,20 %,21 C\n", "none of its 3 columns holds numbers beside the time (Q1 (text such as '20 %')"),
+    ],
+    ids=["empty", "picture", "bytes", "text", "program", "units"],
+)
+def test_what_is_no_recording_is_refused_in_one_sentence_of_the_command(tmp_path, monkeypatch, capsys, content, said):
+    path = tmp_path / "rig.csv"
+    path.write_bytes(content)
+    monkeypatch.setattr(sys, "argv", ["beadline", "inspect", str(path)])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    printed = capsys.readouterr()
+    assert ended.value.code == 1
+    assert printed.out == ""
+    assert printed.err.startswith(f"beadline: {path}")
+    assert printed.err.count("\n") == 1
+    assert said in printed.err
+
+
+def test_a_table_without_a_time_is_told_what_to_write_and_the_proposal_has_it(tmp_path):
+    path = tmp_path / "rig.csv"
+    path.write_text("Q1,T1\n" + "".join(f"{k % 30},{20 + k / 7}\n" for k in range(100)))
+    text = inspect(path)
+    assert "no column is called like a time; write its name, or time: every 1.0 s with the sample time" in text
+    assert proposal(text)["ingest"]["time"] == "every 1.0 s"
+
+
+def test_columns_of_one_name_are_named_and_those_of_other_programs_are_recognised(tmp_path):
+    path = tmp_path / "rig.csv"
+    names = "timestamp,tool0 actual,tool0 target,heater_bed.temperature,extruder.power,x,x"
+    path.write_text(names + "\n" + "".join(f"2025-11-21 13:00:{k:02d},{20 + k / 7},60,{30 + k / 9},0.{k % 9},{k},{k}\n" for k in range(60)))
+    text = inspect(path)
+    assert "the same name twice, so that none of them can be mapped; give each its own: x (2 times)" in text
+    assert {name: one["source"] for name, one in proposal(text)["ingest"]["mapping"].items()} == {
+        "temperature_0": "tool0 actual",
+        "temperature_1": "heater_bed.temperature",
+        "heater_1": "extruder.power",
+    }

@@ -175,3 +175,18 @@ def test_two_channels_of_one_topic_are_joined_one_after_the_other_and_refused_at
     assert kinds(raw) == {"channels"}
     with pytest.raises(ValueError, match="topic /machine comes from channels 1 and 2 at the same time, as if two devices had one name"):
         opened(tmp_path, recorded(5))
+
+
+def test_two_publishers_whose_clocks_differ_are_told_and_a_late_message_is_not(tmp_path):
+    def recorded(late: list[int], behind_s: float) -> bytes:
+        made = Written()
+        channel = made.topic("/machine", "json")
+        for k in range(200):
+            made.message(channel, k, {"heater_1": k, "temperature_1": 20 + k / 8}, published_s=k + 50 - behind_s * (k in late))
+        return made.bytes()
+
+    assert kinds(opened(tmp_path, recorded([20, 90], 3.5))) == set()
+    raw = opened(tmp_path, recorded(list(range(0, 200, 2)), 3.5))
+    (note,) = [note for note in raw.notes if note.kind == "mixed"]
+    assert note.count == 99
+    assert "two devices with clocks of their own seem to publish it; record each under a topic of its own" in note.message

@@ -99,6 +99,57 @@ def test_a_coarse_slow_or_resting_signal_is_not_frozen():
     assert of(flagged(values), "frozen") == []
 
 
+def approach(samples: int = 3000, *, time_constant: float = 120.0, step: float = 0.0) -> dict[str, np.ndarray]:
+    """A heater that is switched now and then for long, and a temperature that comes to rest each time, without noise, as a sensor of that step
+    shows it."""
+    u = np.zeros(samples)
+    u[20:1200], u[1200:2000], u[2000:] = 40.0, 70.0, 30.0
+    y = np.full(samples, 21.5)
+    for k in range(1, samples):
+        y[k] = y[k - 1] + (21.5 + 0.7 * u[k - 1] - y[k - 1]) / time_constant
+    other = 20 + 5 * np.sin(np.arange(samples) / 90)
+    return {"u": u, "y": np.round(y / step) * step if step else y, "z": other}
+
+
+@pytest.mark.parametrize("time_constant", [8.0, 40.0, 120.0, 900.0])
+@pytest.mark.parametrize("step", [0.0, 0.001, 0.01, 0.1, 0.25, 1.0])
+def test_a_clean_slow_record_that_comes_to_rest_has_no_finding_but_its_quantisation(time_constant, step):
+    table = flagged(approach(time_constant=time_constant, step=step))
+    assert {one.kind for one in table.flags} <= {"quantised"}
+    assert not any(mask.any() for mask in table.masked.values())
+
+
+def test_a_smooth_signal_that_stops_at_once_and_jumps_on_release_was_frozen():
+    values = approach()
+    values["y"][60:140] = values["y"][60]
+    (frozen,) = of(flagged(values), "frozen")
+    assert (frozen.signal, frozen.start_s, frozen.end_s) == ("y", 61, 139)
+
+
+def test_noise_that_ends_for_good_is_a_frozen_sensor_though_nothing_else_moves():
+    values = {"u": np.full(1000, 30.0), "y": rig(1000)["z"]}
+    values["y"][800:] = values["y"][:800].mean()
+    (frozen,) = of(flagged(values), "frozen")
+    assert (frozen.start_s, frozen.end_s) == (801, 999)
+
+
+def test_a_spike_on_a_record_without_noise_is_found():
+    values = approach()
+    values["y"][[300, 1250]] = [0.0, 85.0]
+    table = flagged(values)
+    assert [(one.start_s, one.count) for one in of(table, "spike")] == [(300, 1), (1250, 1)]
+    assert np.flatnonzero(table.masked["y"]).tolist() == [300, 1250]
+
+
+def test_a_heater_that_is_switched_off_is_not_held_back_by_its_limit_and_a_controller_at_it_is():
+    values = approach()
+    assert of(flagged(values), "saturated") == []
+    controlled = np.clip(60 - values["y"] + values["z"] - 20, 0.0, 100.0)
+    found = of(flagged(values | {"u": controlled}), "saturated")
+    assert [(one.signal, one.count) for one in found] == [("u", (controlled == 0).sum())]
+    assert "at its limit 0" in found[0].message
+
+
 def test_an_output_on_its_rail_is_saturated_and_not_masked():
     values = rig()
     top = float(np.percentile(values["y"], 80))
@@ -126,12 +177,6 @@ def test_constant_signals_are_named():
     (constant,) = of(flagged(values), "constant")
     assert (constant.signal, constant.count) == ("u", 2000)
     assert "u is 30 throughout" in constant.message
-
-
-def test_two_devices_that_write_in_turn_are_seen():
-    values = rig()
-    values["y"] = np.where(np.arange(2000) % 2, values["y"], values["z"] + 20)
-    assert [one.signal for one in of(flagged(values), "mixed")] == ["y"]
 
 
 @pytest.mark.parametrize(

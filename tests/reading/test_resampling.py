@@ -160,3 +160,37 @@ def test_a_printer_s_log_with_holes_becomes_segments(shared):
     # twelve holes of some seven seconds, where the data set's makers left rows out
     assert found.segment[-1] == 12
     assert all(7 < flag.end_s - flag.start_s < 8 for flag in found.flags if flag.kind == "gap")
+
+
+def flags_of(time: np.ndarray, *kinds: str) -> list:
+    signals = {"u": (time, np.zeros(len(time))), "y": (time, np.sqrt(np.arange(len(time))))}
+    table = resample(Raw("rig.csv", signals, {}, []), sample_time_s=1.0, inputs=["u"], outputs=["y"], max_gap_s=5.0)
+    return [one for one in table.flags if one.kind in kinds]
+
+
+def test_jitter_is_told_with_its_size_and_place_and_a_steady_clock_has_none():
+    time = np.arange(300.0)
+    assert flags_of(time, "jitter") == []
+    assert flags_of(time + 0.01 * np.random.default_rng(0).standard_normal(300), "jitter") == []
+    (found,) = flags_of(time + np.random.default_rng(0).uniform(-0.3, 0.3, 300), "jitter")
+    assert "the intervals of y, u differ from" in found.message
+    assert "two devices" not in found.message
+    late = time.copy()
+    late[100] += 0.6
+    (found,) = flags_of(late, "jitter")
+    assert (found.start_s, found.end_s, found.count) == (99.0, 101.0, 2)
+
+
+def test_two_clocks_one_behind_the_other_are_told():
+    (found,) = flags_of(np.sort(np.r_[np.arange(100.0), np.arange(100) + 0.3]), "jitter")
+    assert "by turns longer and shorter: two devices may write under one name" in found.message
+
+
+def test_a_gap_of_an_hour_and_an_interval_may_be_summer_time():
+    time = np.arange(300.0)
+    time[150:] += 3600
+    (found,) = flags_of(time, "gap")
+    assert "where summer time begins" in found.message
+    time[150:] += 60
+    (found,) = flags_of(time, "gap")
+    assert "summer" not in found.message

@@ -56,8 +56,28 @@ def metrics():
             "rows": 380,
             "dropped_rows": 0,
             "notes": [],
+            "order_tolerance_percent": 2.0,
+            "samples": 400,
+            "samples_cut": 0,
+            "samples_holdout": 120,
+            "delays": {"heater_1": 0, "heater_2": 3},
+            "ahead_steps": 10,
             "fit_holdout": {"zone_1": 90.0, "zone_2": 80.0},
+            "fit_holdout_band": {"zone_1": [88.0, 91.0], "zone_2": [75.0, 84.0]},
+            "fit_holdout_ahead": {"zone_1": 95.0, "zone_2": 91.0},
+            "fit_holdout_ahead_band": {"zone_1": [94.0, 96.0], "zone_2": [89.0, 92.0]},
+            "fit_holdout_held": {"zone_1": 20.0, "zone_2": -10.0},
             "whiteness_passed": {"zone_1": True, "zone_2": False},
+            "independence_passed": {f"zone_{i}": {"heater_1": True, "heater_2": True} for i in (1, 2)},
+            "excitation": {
+                "rank": 10,
+                "full": 10,
+                "condition": 40.0,
+                "lags": 5,
+                "inputs": {f"heater_{i}": {"rank": 5, "level": 2.0} for i in (1, 2)},
+            },
+            "largest_pole": 0.99,
+            "advice": ["the residuals of zone_2 are not white (correlation +0.42 at lag 1): lengthen the window, or model the disturbance"],
         },
         "learn_kernel": {
             "window": 4,
@@ -157,6 +177,41 @@ def record(machine, samples, recording):
     return columns
 
 
+def model(machine):
+    """What the page of the identification shows: zone_2's errors are not noise, and heater_2 does nothing that is known to zone_1."""
+    names = [s.name for s in machine.outputs], [s.name for s in machine.inputs]
+    residuals = []
+    for output in names[0]:
+        residuals += [(output, output, k, 0.5 ** (4 * k) if output == "zone_1" else 0.42**k, 0.1, output == "zone_1") for k in range(6)]
+        residuals += [(output, name, k, 0.02 * k / 5, 0.1, True) for name in names[1] for k in range(-5, 6)]
+    pairs = [(output, name) for output in names[0] for name in names[1]]
+    time = np.arange(0.0, 50.0, 10.0)
+    rise = [(o, i, t, 2 * (1 - np.exp(-t / 10)), 1.5 * (1 - np.exp(-t / 10)), 2.5 * (1 - np.exp(-t / 10))) for o, i in pairs for t in time]
+    dynamics = []
+    for output, name in pairs:
+        seen = (output, name) != ("zone_1", "heater_2")
+        known = (10.0, 9.0, 11.0, 1.0, 0.5, 1.5) if seen else (np.nan,) * 6
+        dynamics.append((output, name, seen, *(2.0, 1.5 if seen else -1.0, 2.5) * 2, *known))
+    poles = [
+        (0, 0, 0.99, 0.0),
+        (0, 1, 0.9, 0.0),
+        *((k, i, 0.99 - 0.001 * k - 0.09 * i, 0.0) for k in (1, 2) for i in (0, 1)),
+        (1, -1, 0.2, 0.0),
+    ]
+    levels = [(name, np.pi * k / 8, np.pi * (k + 1) / 8, 0.5) for name in names[1] for k in range(8)]
+    rows = {
+        "residuals": (schemas.RESIDUALS, residuals),
+        "steps": (schemas.STEPS, rise),
+        "dynamics": (schemas.DYNAMICS, dynamics),
+        "poles": (schemas.POLES, poles),
+        "levels": (schemas.LEVELS, levels),
+    }
+    return {
+        name: (schema, dict(zip((c.name for c in schema.columns), map(list, zip(*found, strict=True)), strict=True)))
+        for name, (schema, found) in rows.items()
+    }
+
+
 def write(root, *, samples=400, recording="good.mcap", worst=None):
     """Every artifact below `root`, which is the working directory."""
     machine = declared(root)
@@ -187,9 +242,12 @@ def write(root, *, samples=400, recording="good.mcap", worst=None):
         "chosen": [False, True, False],
     }
     artifacts.write_table(data / "identify_plant/order.parquet", schemas.ORDER, order)
-    seen = {"segment": np.zeros(50, np.int32), "time_s": np.arange(50.0)}
-    seen |= {f"{o.name}_{kind}": np.sin(np.arange(50.0)) for o in machine.outputs for kind in ("measured", "simulated")}
+    seen = {"segment": np.repeat([0, 1], 25).astype(np.int32), "time_s": np.tile(np.arange(25.0), 2)}
+    seen |= {f"{o.name}_{kind}": np.sin(np.arange(50.0)) for o in machine.outputs for kind in ("measured", "simulated", "ahead")}
+    seen["zone_2_measured"][5:9] = np.nan
     artifacts.write_table(data / "identify_plant/holdout.parquet", schemas.holdout(machine.outputs), seen)
+    for name, (schema, columns) in model(machine).items():
+        artifacts.write_table(data / f"identify_plant/{name}.parquet", schema, columns)
     table = np.array([[1, 8, -10.0], [2, 16, -30.0], [3, 24, -20.0]])
     artifacts.write_arrays(data / "learn_kernel/window.parquet", "window", 1, {"table": (table, "1", "criterion")})
     artifacts.write_arrays(

@@ -13,7 +13,8 @@ from pipeline import artifacts
 from stages.report import main
 from tests.report import made
 
-INDEX, TEMPERATURE = Path("reports/index.html"), Path("reports/temperature.html")
+INDEX, TEMPERATURE, IDENTIFICATION = (Path(f"reports/{name}.html") for name in ("index", "temperature", "identification"))
+PAGES = (INDEX, TEMPERATURE, IDENTIFICATION)
 
 
 class Page(HTMLParser):
@@ -57,9 +58,9 @@ def change(stage, **values):
 
 def test_equal_inputs_give_equal_bytes(project):
     main()
-    first = INDEX.read_bytes(), TEMPERATURE.read_bytes(), Path("reports/metrics/report.json").read_bytes()
+    first = [path.read_bytes() for path in (*PAGES, Path("reports/metrics/report.json"))]
     main()
-    assert first == (INDEX.read_bytes(), TEMPERATURE.read_bytes(), Path("reports/metrics/report.json").read_bytes())
+    assert first == [path.read_bytes() for path in (*PAGES, Path("reports/metrics/report.json"))]
 
 
 def test_page_one_holds_the_twelve_answers_in_order_and_its_title_is_the_verdict(project):
@@ -161,7 +162,7 @@ def test_never_settling_is_said_in_words(project):
 
 def test_hostile_text_from_the_data_is_escaped_and_isolated(project):
     main()
-    for path in (INDEX, TEMPERATURE):
+    for path in PAGES:
         page = Page(path)
         assert not any(tag in ("script", "img", "iframe", "object", "embed") for tag, _ in page.tags)
         assert not any(name.startswith("on") for _, attributes in page.tags for name in attributes)
@@ -174,7 +175,7 @@ def test_hostile_text_from_the_data_is_escaped_and_isolated(project):
 
 def test_no_address_leaves_the_folder_and_every_link_leads_somewhere(project):
     main()
-    pages = {path.name: Page(path) for path in (INDEX, TEMPERATURE)}
+    pages = {path.name: Page(path) for path in PAGES}
     for name, page in pages.items():
         assert len(page.ids) == len(set(page.ids)), name
         for link in page.links:
@@ -187,7 +188,7 @@ def test_no_address_leaves_the_folder_and_every_link_leads_somewhere(project):
 
 def test_every_picture_states_something_and_no_figure_is_nan(project):
     main()
-    for path in (INDEX, TEMPERATURE):
+    for path in PAGES:
         for tag, attributes in Page(path).tags:
             if tag == "svg" and attributes.get("role") == "img":
                 assert re.search(r"\d|not measured|failed", attributes["aria-label"]), attributes["aria-label"]

@@ -3,8 +3,8 @@ import re
 import numpy as np
 import pytest
 
-from pipeline.temperature.identification import dead_time, identify, moesp, moesp_singular_values, varx
-from pipeline.temperature.order import with_delays
+from pipeline.temperature.identification import identify, moesp, moesp_singular_values, varx
+from pipeline.temperature.order import dead_time, with_delays
 from pipeline.temperature.plant import baam, markov_parameters, plant, simulate
 from pipeline.temperature.probing import study_probe, study_signal
 from pipeline.temperature.published import K_DATA

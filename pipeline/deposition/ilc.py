@@ -1,0 +1,358 @@
+"""Iterative learning control of the flow: the paper's law (Hoelzle 2009, eq. 2), the inverse of the identified model averaged over trials, the convergence
+test before anything runs, what the limits of the drive allow, and the learning loop with roll-back."""
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy.fft
+import scipy.ndimage
+import scipy.signal
+
+from pipeline.deposition import norm_optimal
+from pipeline.deposition.extruder import Extruder, flow, frequency_response, pressed
+from pipeline.deposition.trial_model import TrialModel, identify
+
+# of the steady gain squared: only keeps the inverse finite where half a sample of delay makes a zero, far above any Q
+EPSILON = 1e-9
+# the ink is brought to its yield over this time before flow is wanted, and let down over it afterwards
+YIELD_LEAD_S = 0.4
+# ooze is told from noise on the mean flow over this time, which has a fraction of the noise
+OOZE_S = 0.5
+
+
+class Trial(NamedTuple):
+    """Command u (T,) in mm as the drive applied it, measured flow y (T,) in mm^3/s with NaN where it was not observable, true flow where simulated."""
+
+    u: np.ndarray
+    y: np.ndarray
+    truth: np.ndarray | None = None
+
+
+Law = Callable[[Sequence[Trial]], np.ndarray]
+
+
+# ---- Q
+
+
+@functools.cache
+def _butterworth(order: int, cutoff_hz: float, sample_time_s: float) -> np.ndarray:
+    if not 0 < cutoff_hz < 0.5 / sample_time_s:
+        raise ValueError(
+            f"Q filter: expected a cut-off between 0 and half the sampling rate, {0.5 / sample_time_s:g} Hz, but found {cutoff_hz:g} Hz; lower the cut-off or sample faster"
+        )
+    return scipy.signal.butter(order, cutoff_hz, fs=1 / sample_time_s, output="sos")
+
+
+def zero_phase(x: np.ndarray, *, order: int, cutoff_hz: float, sample_time_s: float) -> np.ndarray:
+    """Q x (..., T): Butterworth low-pass of `order` run forward and backward, |Q|^2 without phase; x is zero before and after, as no-flow is."""
+    sos, pad = _butterworth(order, cutoff_hz, sample_time_s), round(order / cutoff_hz / sample_time_s)
+    padded = np.zeros((*x.shape[:-1], x.shape[-1] + 2 * pad))
+    padded[..., pad : padded.shape[-1] - pad] = x
+    return scipy.signal.sosfilt(sos, scipy.signal.sosfilt(sos, padded)[..., ::-1])[..., ::-1][..., pad : padded.shape[-1] - pad]
+
+
+def causal(x: np.ndarray, *, order: int, cutoff_hz: float, sample_time_s: float) -> np.ndarray:
+    """Q x (T,) run forward only: the other reading of the paper's Q, which delays the command and never gets below a third of the error."""
+    return scipy.signal.sosfilt(_butterworth(order, cutoff_hz, sample_time_s), x)
+
+
+def magnitude(frequency_hz: np.ndarray, *, order: int, cutoff_hz: float, sample_time_s: float) -> np.ndarray:
+    """|Q(f)| (F,) of one run of the Butterworth filter; squared it is the response of `zero_phase`."""
+    sos = _butterworth(order, cutoff_hz, sample_time_s)
+    return np.abs(scipy.signal.sosfreqz(sos, frequency_hz, fs=1 / sample_time_s)[1])
+
+
+# ---- L
+
+
+def _slow_inverse(model: Extruder, learning_gain: float, fast_zero_s: float, sample_time_s: float) -> tuple[np.ndarray, np.ndarray]:
+    scale = learning_gain / model.gain
+    return scipy.signal.bilinear([scale * model.time_constant_s, scale], [fast_zero_s, 1.0], 1 / sample_time_s)
+
+
+def paper_filter(
+    frequency_hz: np.ndarray, model: Extruder, *, learning_gain: float, fast_zero_s: float, sample_time_s: float
+) -> np.ndarray:
+    """L(f) = k_p / P̂ (F,), P̂ = K (fast_zero s + 1) / (tau s + 1): the fast zero makes the inverse proper (Hoelzle 2009, eq. 2); bilinear."""
+    return scipy.signal.freqz(*_slow_inverse(model, learning_gain, fast_zero_s, sample_time_s), frequency_hz, fs=1 / sample_time_s)[1]
+
+
+def paper_law(
+    r: np.ndarray,
+    model: Extruder,
+    q: Callable[..., np.ndarray],
+    *,
+    learning_gain: float,
+    fast_zero_s: float,
+    order: int,
+    cutoff_hz: float,
+    limit: float,
+    sample_time_s: float,
+) -> Law:
+    """u_{j+1} = Q (u_j + L e_j) of the last trial (Hoelzle 2009, eq. 2); q is `zero_phase` or `causal`, the model the nominal (1).
+
+    u_j is what the drive applied, so that nothing winds up at the limit; e_j = 0 where the flow was not observable.
+    """
+    b, a = _slow_inverse(model, learning_gain, fast_zero_s, sample_time_s)
+
+    def law(trials: Sequence[Trial]) -> np.ndarray:
+        u, y, _ = trials[-1]
+        e = np.where(np.isfinite(y), r - y, 0.0)
+        return np.clip(q(u + scipy.signal.lfilter(b, a, e), order=order, cutoff_hz=cutoff_hz, sample_time_s=sample_time_s), -limit, limit)
+
+    return law
+
+
+def inverse_filter(frequency_hz: np.ndarray, model: Extruder, *, sample_time_s: float) -> np.ndarray:
+    """L(f) = conj(H) / (|H|^2 + eps) (F,), H the response of the identified model with its delay."""
+    H = frequency_response(model, frequency_hz, sample_time_s=sample_time_s)
+    return np.conj(H) / (np.abs(H) ** 2 + EPSILON * model.gain**2)
+
+
+def inverse(x: np.ndarray, model: Extruder, *, sample_time_s: float) -> np.ndarray:
+    """L x (T,) by FFT, with zeros for as long as the model's delay and a second more, so that nothing comes round."""
+    n = scipy.fft.next_fast_len(len(x) + round((model.delay_s + 1.0) / sample_time_s), real=True)
+    f = np.fft.rfftfreq(n, sample_time_s)
+    return np.fft.irfft(np.fft.rfft(x, n) * inverse_filter(f, model, sample_time_s=sample_time_s), n)[: len(x)]
+
+
+def wanted(r: np.ndarray, yield_: float, *, sample_time_s: float) -> np.ndarray:
+    """x (T,) in mm^3/s that gives the flow r: r + yield while ink is wanted, brought up to the yield just before and let down just after; r, yield in mm^3/s."""
+    half = round(YIELD_LEAD_S / sample_time_s)
+    near = np.convolve(r > 0, np.ones(2 * half + 1), "full")[half : half + len(r)] / (half + 1)
+    return r + yield_ * np.where(r > 0, 1.0, np.minimum(near, 1.0))
+
+
+def disturbance(trials: Sequence[Trial], r: np.ndarray, model: TrialModel, *, floor: float, sample_time_s: float) -> np.ndarray:
+    """d (T,) in mm^3/s, what repeats beyond the model: x = G u + d, y = max(x - yield, 0); a Kalman filter over trials with the weight k_j = max(1/j, floor).
+
+    d <- d + k_j (y + yield - (G u_j + d)), the first two trials in full: the command moves far after trial 0. Nothing is learned where the flow was not
+    observable, nor where none is wanted, predicted or seen: below the yield y says nothing of x, and noise would be summed up trial after trial.
+    """
+    extruder, d = model.extruder, np.zeros(len(r))
+    y = np.array([trial.y for trial in trials])
+    seen, y = np.isfinite(y), np.nan_to_num(y)
+    linear = pressed(extruder, np.array([trial.u for trial in trials]), sample_time_s=sample_time_s)
+    oozing = scipy.ndimage.uniform_filter1d(y, max(round(OOZE_S / sample_time_s), 1)) > model.noise
+    for j in range(len(trials)):
+        x = linear[j] + d
+        flowing = (r > 0) | (x > extruder.yield_) | oozing[j]
+        d = d + max(1 / max(j, 1), floor) * np.where(seen[j] & flowing, y[j] + extruder.yield_ - x, 0.0)
+    return d
+
+
+def command(x: np.ndarray, r: np.ndarray, model: Extruder, *, limit: float, sample_time_s: float) -> np.ndarray:
+    """u (T,) in mm that presses x (T,) out of the model; where that takes more than `limit`, the u whose flow comes nearest (`norm_optimal.nearest`)."""
+    u = inverse(x, model, sample_time_s=sample_time_s)
+    if np.abs(u).max() <= limit:
+        return u
+    a = math.exp(-sample_time_s / model.time_constant_s)
+    scale, t = model.gain * (1 - a), np.arange(len(x)) * sample_time_s
+    # u(t) shows in the flow one sample and the delay later
+    later = t + sample_time_s + model.delay_s
+    free = np.interp(later, t, r) <= 0
+    v = norm_optimal.nearest(np.interp(later, t, x), free, pole=a, bound=scale * limit)
+    return np.clip(np.diff(v, prepend=0.0) / scale + np.concatenate([[0.0], v[:-1]]) / model.gain, -limit, limit)
+
+
+class InverseLaw:
+    """Our law, u_{j+1} = Q sum_i w_i (u_i + L e_i) over all trials i <= j, L the inverse of the model identified from the first ones; it remembers that model.
+
+    Written with the average d of what the model misses: u_{j+1} = Q L (r + yield - d), the same thing, and for one trial Q (u + L e). The weights w_i average
+    what does not repeat; Q stays outside, so that it erodes nothing as they fall, and |1 - k + k Q (1 - L P)| < 1 wherever |Q (1 - L P)| < 1, for any k.
+
+    `identify_trials` trials are identified together: beyond the on-off trial 0 the first learned commands show the extruder as it will be driven. `floor` is
+    the least weight of a new trial; `order` and `cutoff_hz` are those of Q.
+    """
+
+    def __init__(
+        self, r: np.ndarray, *, identify_trials: int, floor: float, order: int, cutoff_hz: float, limit: float, sample_time_s: float
+    ):
+        self.r, self.identify_trials, self.floor, self.limit, self.sample_time_s = r, identify_trials, floor, limit, sample_time_s
+        self.q = {"order": order, "cutoff_hz": cutoff_hz, "sample_time_s": sample_time_s}
+        self._first: list[Trial] = []
+        self.model: TrialModel | None = None
+
+    def __call__(self, trials: Sequence[Trial]) -> np.ndarray:
+        first = list(trials[: self.identify_trials])
+        if self.model is None or len(first) != len(self._first) or any(a is not b for a, b in zip(first, self._first, strict=True)):
+            self._first, self.model = first, identify([t.u for t in first], [t.y for t in first], sample_time_s=self.sample_time_s)
+        extruder = self.model.extruder
+        d = disturbance(trials, self.r, self.model, floor=self.floor, sample_time_s=self.sample_time_s)
+        x = zero_phase(wanted(self.r, extruder.yield_, sample_time_s=self.sample_time_s) - d, **self.q)
+        return command(x, self.r, extruder, limit=self.limit, sample_time_s=self.sample_time_s)
+
+
+def norm_optimal_law(r: np.ndarray, model: Extruder, *, R_u: float, R_d: float, limit: float, sample_time_s: float) -> Law:
+    """u_{j+1} = u_j + argmin |e - G du|^2 + |u + du|_Ru^2 + |du|_Rd^2 of the last trial; R_u and R_d as shares of the squared steady gain of the model."""
+    ones = np.ones(len(r))
+    plan = norm_optimal.plan(
+        norm_optimal.transfer(model, sample_time_s=sample_time_s), W=ones, R_u=R_u * model.gain**2 * ones, R_d=R_d * model.gain**2 * ones
+    )
+
+    def law(trials: Sequence[Trial]) -> np.ndarray:
+        u, y, _ = trials[-1]
+        return np.clip(u + norm_optimal.step(plan, u, np.where(np.isfinite(y), r - y, 0.0)), -limit, limit)
+
+    return law
+
+
+# ---- before anything runs
+
+
+def gamma(Q: np.ndarray, L: np.ndarray, P: np.ndarray) -> np.ndarray:
+    """max over frequency of |Q (1 - L P)|: below 1 the error shrinks monotonically, above 1 it grows in the end (Bristow, Tharayil and Alleyne 2006).
+
+    Q (F,) is |Q|^2 where Q runs both ways; L (F,); P (F,) or (plants, F), with all the delay there is: the result is one number a plant.
+    """
+    return np.max(np.abs(Q * (1 - L * P)), axis=-1)
+
+
+class Authority(NamedTuple):
+    """What a limit on the command leaves: peak and steady command (mm) that r needs, the least error as a share of trial 0's, and the ramp that would do."""
+
+    peak: float
+    steady: float
+    ratio: float
+    ramp_s: float
+
+
+def authority(
+    r: np.ndarray, u0: np.ndarray, model: Extruder, *, order: int, cutoff_hz: float, limit: float, sample_time_s: float
+) -> Authority:
+    """Authority of the drive over the model for r (T,): the least error is that of the nearest flow within the limit, as a share of what u0 (T,) leaves.
+
+    ramp_s solves (1 + tau / t_ramp) steady = limit; it is infinite where the limit does not even hold the steady flow.
+    """
+    x = zero_phase(wanted(r, model.yield_, sample_time_s=sample_time_s), order=order, cutoff_hz=cutoff_hz, sample_time_s=sample_time_s)
+    peak, steady = np.abs(inverse(x, model, sample_time_s=sample_time_s)).max(), (r.max() + model.yield_) / model.gain
+    best = flow(model, command(x, r, model, limit=limit, sample_time_s=sample_time_s), sample_time_s=sample_time_s)
+    first = flow(model, u0, sample_time_s=sample_time_s, limit=limit)
+    ramp_s = model.time_constant_s / (limit / steady - 1) if limit > steady else math.inf
+    return Authority(float(peak), float(steady), rms(r - best) / rms(r - first), ramp_s)
+
+
+def check_authority(found: Authority, *, limit: float, worst_ratio: float) -> None:
+    """Raises ValueError where no law can come below `worst_ratio` of trial 0's error: the sentence names the ramp that would do."""
+    if found.ratio <= worst_ratio:
+        return
+    needs = f"these ramps need a peak command of {found.peak / found.steady:.1f} x steady and the limit is {limit / found.steady:.1f} x"
+    do = (
+        f"ramps of {found.ramp_s:.2f} s would do"
+        if math.isfinite(found.ramp_s)
+        else "no ramp would do: print slower, or raise the limit above the steady command"
+    )
+    raise ValueError(f"authority: {needs}, so no law comes below {found.ratio:.0%} of the error of trial 0; {do}")
+
+
+# ---- the learning loop
+
+
+class Step(NamedTuple):
+    """The next command u (T,) in mm; best is the trial with the least measured error; stopped: u is that trial's command, and learning is over."""
+
+    u: np.ndarray
+    best: int
+    rolled_back: bool
+    stopped: bool
+
+
+def rms(e: np.ndarray) -> float:
+    """Root mean square over what was observable."""
+    seen = e[np.isfinite(e)]
+    return float(np.sqrt(seen @ seen / len(seen)))
+
+
+class Judged(NamedTuple):
+    """The trials to learn from, the one with the least error, whether each has risen, and whether two have without a better one between: learning is over."""
+
+    keep: list[int]
+    best: int
+    risen: list[bool]
+    stopped: bool
+
+
+def judge(errors: Sequence[float], *, rise: float) -> Judged:
+    """Which trials to learn from: one whose error exceeds the best so far by more than `rise` of trial 0's has risen, and all since the best are left."""
+    keep, best, rises, risen = [0], 0, 0, [False]
+    for j in range(1, len(errors)):
+        risen.append(errors[j] > errors[best] + rise * errors[0])
+        if risen[j]:
+            rises, keep = rises + 1, keep[: keep.index(best) + 1]
+        else:
+            keep.append(j)
+        if errors[j] < errors[best]:
+            best, rises = j, 0
+        if rises == 2:
+            return Judged(keep, best, risen + [False] * (len(errors) - j - 1), True)
+    return Judged(keep, best, risen, False)
+
+
+def next_step(trials: Sequence[Trial], r: np.ndarray, law: Law, *, rise: float) -> Step:
+    """What follows from the trials so far; nothing else is remembered, so that a folder of recordings can be continued.
+
+    After a trial that has risen (`judge`) the next command goes back to the best trial and takes half the law's step from there; after the second,
+    with no better trial between, learning stops at the best.
+    """
+    for j, (u, y, _) in enumerate(trials):
+        if u.shape != r.shape or y.shape != r.shape or not np.isfinite(y).any():
+            raise ValueError(
+                f"trial {j}: expected command and flow of {len(r)} samples, as the reference has, some of it observable, but found {u.shape} and {y.shape} "
+                f"with {np.isfinite(y).sum()} observable; leave the trial out or record it again"
+            )
+    keep, best, risen, stopped = judge([rms(r - trial.y) for trial in trials], rise=rise)
+    if stopped:
+        return Step(trials[best].u, best, True, True)
+    u = law([trials[i] for i in keep])
+    return Step((u + trials[best].u) / 2 if risen[-1] else u, best, risen[-1], False)
+
+
+def learn(
+    law: Law,
+    measure: Callable[[np.ndarray], Trial],
+    u0: np.ndarray,
+    r: np.ndarray,
+    *,
+    trials: int,
+    rise: float,
+    on_step: Callable[[Trial], None] = lambda trial: None,
+) -> list[Trial]:
+    """Trial 0 with u0 and at most `trials` updates; ends early where the loop stops. `measure` runs one command on a plant."""
+    done = [measure(u0)]
+    on_step(done[0])
+    while len(done) <= trials:
+        step = next_step(done, r, law, rise=rise)
+        if step.stopped:
+            break
+        done.append(measure(step.u))
+        on_step(done[-1])
+    return done
+
+
+class Row(NamedTuple):
+    """One trial: errors in mm^3/s (true is NaN where nothing was simulated), ratio to trial 0 of the true error where known, else of the measured one."""
+
+    trial: int
+    rms_true: float
+    rms_measured: float
+    ratio: float
+    peak_over_steady: float
+    saturated: float
+    rolled_back: bool
+
+
+def table(trials: Sequence[Trial], r: np.ndarray, *, steady: float, limit: float, rise: float) -> list[Row]:
+    """A row a trial; `steady` is the steady command in mm, saturated the share of time at the limit, rolled_back whether the trial was left for a better one."""
+    measured = [rms(r - trial.y) for trial in trials]
+    true = [np.nan if trial.truth is None else rms(r - trial.truth) for trial in trials]
+    risen = judge(measured, rise=rise).risen
+    rows = []
+    for j, (u, _, truth) in enumerate(trials):
+        ratio = measured[j] / measured[0] if truth is None else true[j] / true[0]
+        rows.append(
+            Row(j, true[j], measured[j], ratio, float(np.abs(u).max() / steady), float(np.mean(np.abs(u) >= 0.999 * limit)), risen[j])
+        )
+    return rows

@@ -1,0 +1,143 @@
+"""What one measured trial tells of the extruder: gain, time constant, total delay and yield by least squares, each with its uncertainty; up and down apart."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy.optimize
+
+from pipeline.deposition.extruder import Extruder, flow, pressed
+
+# coarse search before the fine one: any material that flows within a minute, any delay that a plunger has
+TIME_CONSTANTS_S = np.geomspace(0.2, 30.0, 12)
+DELAYS_S = np.array([0.0, 0.08, 0.16, 0.3, 0.5])
+LONGEST_DELAY_S = 1.0
+# an extruder of another kind still reaches 60 %; noise alone gives 0
+LEAST_FIT_PERCENT = 20.0
+
+
+class TrialModel(NamedTuple):
+    """y = max(K / (tau s + 1) e^(-delay s) u - yield, 0), the delay holding all that is late (transport and lag).
+
+    `extruder` holds K (mm^3/s per mm), tau, delay (s) and yield (mm^3/s). noise is the r.m.s. of what the model leaves, mm^3/s; fit_percent the NRMSE
+    100 (1 - |y - ŷ| / |y - mean y|).
+    """
+
+    extruder: Extruder
+    noise: float
+    fit_percent: float
+
+
+def identify(u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, sample_time_s: float, yield_: float | None = None) -> TrialModel:
+    """The model that simulates the trials best from rest: min over (K, tau, delay, yield) of the sum of (max(x - yield, 0) - y)^2.
+
+    u (T,) in mm and measured flow y (T,) in mm^3/s of each trial; NaN in y is a sample that was not observable. `yield_` in
+    mm^3/s where it is known and not sought. Raises ValueError where a command holds
+    NaN or never moves, or the flow never leaves its noise.
+    """
+    u, y = [np.asarray(a, float) for a in u], [np.asarray(b, float) for b in y]
+    _check(u, y)
+    seen = [np.isfinite(b) for b in y]
+    measured = np.concatenate([b[s] for b, s in zip(y, seen, strict=True)])
+
+    def predicted(gain, tau, delay, yield_):
+        model = Extruder(gain, tau, delay)
+        x = np.concatenate([pressed(model, a, sample_time_s=sample_time_s)[s] for a, s in zip(u, seen, strict=True)])
+        return np.maximum(x - yield_, 0.0)
+
+    starts = []
+    for tau in TIME_CONSTANTS_S:
+        for delay in DELAYS_S:
+            shape = predicted(1.0, tau, delay, 0.0)
+            gain = shape @ measured / max(shape @ shape, np.finfo(float).tiny)
+            starts.append((float(np.sum((gain * shape - measured) ** 2)), gain, tau, delay))
+    _, gain, tau, delay = min(starts)
+    if gain <= 0:
+        raise ValueError(
+            f"identify: expected a flow that rises with the command but found a best gain of {gain:.3g} mm^3/s per mm; check the command's sign and its clock against the frames'"
+        )
+    # the yield is a share of the flow that was seen; the command's peaks say nothing of it
+    span = float(np.quantile(measured, 0.95))
+
+    def four(theta):
+        return float(np.exp(theta[0])), float(np.exp(theta[1])), float(theta[2]), float(theta[3] * span) if yield_ is None else yield_
+
+    n = 4 if yield_ is None else 3
+    low = [np.log(gain) - 3, np.log(tau) - 3, 0.0, 0.0][:n]
+    high = [np.log(gain) + 3, np.log(tau) + 3, LONGEST_DELAY_S, 1.0][:n]
+    start = [np.log(gain), np.log(tau), max(delay, sample_time_s), 0.02][:n]
+    fit = scipy.optimize.least_squares(
+        lambda theta: predicted(*four(theta)) - measured, start, bounds=(low, high), x_scale=[0.1, 0.1, 0.02, 0.02][:n], diff_step=1e-4, xtol=1e-7, ftol=1e-9
+    )  # fmt: skip
+    K, tau, delay, found = four(fit.x)
+    extruder = Extruder(K, tau, delay, yield_=found)
+    spread = max(np.linalg.norm(measured - measured.mean()), np.finfo(float).tiny)
+    fit_percent = float(100 * (1 - np.linalg.norm(fit.fun) / spread))
+    if fit_percent < LEAST_FIT_PERCENT:
+        raise ValueError(
+            f"identify: expected a flow that follows the command but the best model fits {fit_percent:.0f} %; check that command and frames are of the same trial and clock"
+        )
+    return TrialModel(extruder, float(np.sqrt(np.mean(fit.fun**2))), fit_percent)
+
+
+def deviations(
+    model: TrialModel, u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, drift: float, trial_gain: float, sample_time_s: float
+) -> tuple[float, float, float, float]:
+    """One standard deviation of K (mm^3/s per mm), tau (s), delay (s) and yield (mm^3/s) of `identify` on the trials u, y.
+
+    The estimate moves by J^+ w, J the change of the predicted flow with the four; w is white noise of the model's own r.m.s., a random walk whose r.m.s.
+    over a trial is `drift` of the highest flow, and a share `trial_gain` of the flow itself: the last two are not to be seen in one trial's residual.
+    """
+    e = model.extruder
+    theta = np.array([e.gain, e.time_constant_s, e.delay_s, e.yield_])
+    steps = np.array([1e-4 * e.gain, 1e-4 * e.time_constant_s, 1e-2 * sample_time_s, 1e-4 * e.gain * max(np.abs(a).max() for a in u)])
+
+    def predicted(theta, a):
+        K, tau, delay, yield_ = theta
+        return flow(Extruder(K, tau, delay, yield_=yield_), a, sample_time_s=sample_time_s)
+
+    J, ends = [], [0]
+    for a, b in zip(u, y, strict=True):
+        columns = [predicted(theta + h, a) - predicted(np.maximum(theta - h, 0.0), a) for h in np.diag(steps)]
+        J.append(np.column_stack(columns)[np.isfinite(b)] / (steps + np.minimum(steps, theta)))
+        ends.append(ends[-1] + len(J[-1]))
+    gain_of = np.linalg.pinv(np.vstack(J))
+    variance = model.noise**2 * np.sum(gain_of**2, axis=1)
+    for j, (a, b) in enumerate(zip(u, y, strict=True)):
+        part, flows = gain_of[:, ends[j] : ends[j + 1]], predicted(theta, a)
+        # a walk is the sum of its steps: each step moves every later sample
+        walk = drift * flows.max() * np.sqrt(2 / len(a)) * np.cumsum(part[:, ::-1], axis=1)
+        variance += np.sum(walk**2, axis=1) + (trial_gain * part @ flows[np.isfinite(b)]) ** 2
+    return tuple(float(v) for v in np.sqrt(variance))
+
+
+def directions(
+    u: np.ndarray, y: np.ndarray, *, start_s: float, stop_s: float, window_s: float, yield_: float, sample_time_s: float
+) -> tuple[TrialModel, TrialModel]:
+    """The models of the upward and of the downward step alone (Hoelzle 2009, table I is downward): only the flow within `window_s` of start or stop counts.
+
+    The yield (mm^3/s) is that of the whole trial: in one step it cannot be told from delay. Where the two differ by more than their deviations, the
+    extruder fills and relaxes at different speeds, and one first-order model is a compromise.
+    """
+    t = np.arange(len(y)) * sample_time_s
+    near = [np.where((t >= at - window_s / 10) & (t < at + window_s), y, np.nan) for at in (start_s, stop_s)]
+    up, down = (identify([u], [part], sample_time_s=sample_time_s, yield_=yield_) for part in near)
+    return up, down
+
+
+def _check(u: list[np.ndarray], y: list[np.ndarray]) -> None:
+    if not u or len(u) != len(y) or any(a.shape != b.shape or a.ndim != 1 for a, b in zip(u, y, strict=True)):
+        raise ValueError(
+            f"identify: expected one command and one flow of equal length a trial but found shapes {[a.shape for a in u]} and {[b.shape for b in y]}"
+        )
+    for j, (a, b) in enumerate(zip(u, y, strict=True)):
+        if not np.isfinite(a).all():
+            raise ValueError(f"identify: expected a command without gaps but trial {j} holds NaN; record the trial again")
+        if np.isfinite(b).sum() < 50:
+            raise ValueError(
+                f"identify: expected at least 50 observable samples of flow but trial {j} has {np.isfinite(b).sum()}; check the frames of that trial"
+            )
+    if all(np.ptp(a) == 0 for a in u):
+        raise ValueError(
+            "identify: the command never moves, so neither gain nor delay is identified; record a trial with a start and a stop"
+        )

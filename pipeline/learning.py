@@ -1,0 +1,310 @@
+"""What train_ilc does for its materials: a simulated machine taught in flow and in pictures, or the trials of a real one and the command of the next."""
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field
+from tqdm import tqdm
+
+from pipeline import filming, trials
+from pipeline.deposition import bead, ilc, training
+from pipeline.deposition.extruder import Extruder, Routine, draw
+from pipeline.deposition.ilc import Trial
+from pipeline.deposition.training import Lesson, Noise, Run, Settings, on_off, ours, run
+from pipeline.filming import Watched
+from pipeline.params import Section
+from pipeline.printer import Camera, Material, Printer
+
+
+class TrialNoise(Section):
+    white_percent: float = Field(ge=0, le=100)
+    drift_percent: float = Field(ge=0, le=100)
+    gain_percent: float = Field(ge=0, le=100)
+
+    def shares(self) -> Noise:
+        return Noise(self.white_percent / 100, self.drift_percent / 100, self.gain_percent / 100)
+
+
+class PaperLaw(Section):
+    learning_gain: float = Field(gt=0, le=2)
+    fast_zero_s: float = Field(gt=0, le=10)
+    order: int = Field(ge=1, le=10)
+    cutoff_hz: float = Field(gt=0, le=1000)
+
+
+class OurLaw(Section):
+    identify_trials: int = Field(ge=1, le=100)
+    floor: float = Field(gt=0, le=1)
+    order: int = Field(ge=1, le=10)
+    cutoff_hz: float = Field(gt=0, le=1000)
+    rise: float = Field(gt=0, le=10)
+
+
+class TrainIlc(Section):
+    """Section `train_ilc`."""
+
+    source: Literal["simulated", "recordings"]
+    seed: int = Field(ge=0, le=2**31)
+    trials: int = Field(ge=1, le=1000)
+    pixel_trials: int = Field(ge=1, le=1000)
+    family_plants: int = Field(ge=1, le=100_000)
+    noise: TrialNoise
+    paper: PaperLaw
+    law: OurLaw
+
+    def settings(self, printer: Printer) -> Settings:
+        paper, law = self.paper, self.law
+        return Settings(
+            printer.sample_time_s, printer.limit, paper.learning_gain, paper.fast_zero_s, paper.order, paper.cutoff_hz,
+            law.identify_trials, law.floor, law.order, law.cutoff_hz, law.rise,
+        )  # fmt: skip
+
+
+class Work(NamedTuple):
+    """Section train_ilc and what it shares with others."""
+
+    p: TrainIlc
+    settings: Settings
+    noise: Noise
+    printer: Printer
+    camera: Camera
+
+
+class Part(NamedTuple):
+    """What came of one material, or of all, by material and number of the routine: runs, what was filmed, models and metrics by material."""
+
+    runs: dict[tuple[str, int], list[Run]]
+    watched: dict[tuple[str, int], list[Watched]]
+    models: dict[str, dict[str, Any]]
+    metrics: dict[str, dict[str, Any]]
+
+
+def joined(parts: Iterable[Part]) -> Part:
+    """All parts as one; dictionaries of one material are put together."""
+    whole = Part({}, {}, {}, {})
+    for part in parts:
+        for key, found in part.runs.items():
+            whole.runs.setdefault(key, []).extend(found)
+        whole.watched.update(part.watched)
+        for mine, others in ((whole.models, part.models), (whole.metrics, part.metrics)):
+            for name, found in others.items():
+                mine.setdefault(name, {}).update(found)
+    return whole
+
+
+def _nominal(material: Material) -> Extruder:
+    return Extruder(material.gain_mm3_per_s_per_mm, material.time_constant_s)
+
+
+def _plain(extruder: Extruder) -> dict[str, float | None]:
+    """As JSON: no lag is null."""
+    return {name: float(value) if np.isfinite(value) else None for name, value in extruder._asdict().items()}
+
+
+def extruders(models: dict[str, dict[str, Any]], which: str) -> dict[str, Extruder]:
+    """The nominal extruders, or the true ones of simulated machines, of models.json by material."""
+    return {
+        name: Extruder(**{key: np.inf if value is None else value for key, value in found[which].items()})
+        for name, found in models.items()
+        if which in found
+    }
+
+
+def _model(found: ilc.TrialModel | None) -> dict[str, float] | None:
+    if found is None:
+        return None
+    e = found.extruder
+    return {
+        "gain": e.gain, "time_constant_s": e.time_constant_s, "delay_s": e.delay_s, "yield": e.yield_, "noise": found.noise, "fit_percent": found.fit_percent,
+    }  # fmt: skip
+
+
+# ---- a simulated machine
+
+
+def simulate(folder: Path, work: Work, index: int, kind: str) -> Part:
+    """Material `index` on a machine drawn from the family: in "flow", measured with noise, by the paper's law and by ours; in "pixels", through recordings in `folder`."""
+    material, routines = work.printer.materials[index], work.printer.trained()
+    nominal, steady = _nominal(material), work.printer.steady_flow
+    plant = draw(
+        np.random.default_rng([work.p.seed, index]), gain=nominal.gain, time_constant_s=nominal.time_constant_s, steady_flow=steady
+    )
+    lesson, s, name = Lesson(nominal, plant, routines), work.settings, material.name
+    rngs = tuple(np.random.default_rng([work.p.seed, index, number]) for number in range(1, 5))
+    updates = work.p.trials * (len(routines) + 1) if kind == "flow" else work.p.pixel_trials
+    with tqdm(
+        total=updates, desc=f"train_ilc: {name} in {kind}", position=1 + 2 * index + (kind == "pixels"), mininterval=2, leave=False
+    ) as bar:
+        if kind == "pixels":
+            done, seen, calibration = _pictures(
+                folder,
+                material,
+                lesson,
+                rngs[:2],
+                work.noise,
+                trials=work.p.pixel_trials,
+                printer=work.printer,
+                camera=work.camera,
+                s=s,
+                on_step=lambda _: bar.update(),
+            )
+            figures = {"pixels": training.figures(done, rise=s.rise) | _seen(seen, routines[0])}
+            return Part({(name, 0): [done]}, {(name, 0): seen}, {name: {"calibration": calibration._asdict()}}, {name: figures})
+        taught = training.teach(lesson, rngs[2], work.noise, trials=work.p.trials, s=s, on_step=lambda _: bar.update())
+    before = training.convergence(nominal, rngs[3], plants=work.p.family_plants, steady_flow=steady, s=s)
+    figures = {
+        "gamma": before.nominal, "gamma_worst": before.family.max(), "gamma_above_1_percent": 100 * np.mean(before.family > 1),
+        "paper": training.figures(taught[0], rise=s.rise), "ours": training.figures(taught[1], rise=s.rise),
+        "other_routines": [training.figures(done, rise=s.rise) for done in taught[2:]],
+    }  # fmt: skip
+    runs = {(name, 0): taught[:2]} | {(name, i): [done] for i, done in enumerate(taught[2:], 1)}
+    models = {
+        "nominal": _plain(nominal),
+        "plant": _plain(plant),
+        "identified": _model(taught[1].model),
+    }
+    return Part(runs, {}, {name: models}, {name: figures})
+
+
+def _seen(seen: Sequence[Watched], routine: Routine) -> dict[str, float]:
+    """How well the pictures told the flow, over all trials: r.m.s. error in % of the steady flow, in the whole trial and around its pause, and frames without a bead."""
+    errors = np.array([w.flow.flow - w.trial.truth for w in seen]) / routine.r.max()
+    near = (routine.time_s > routine.pause_s[0] - 0.3) & (routine.time_s < routine.pause_s[1] + 0.3)
+    whole, corner = (100 * np.sqrt(np.mean(part**2, axis=1)) for part in (errors, errors[:, near]))
+    frames = sum(w.frames for w in seen)
+    return {
+        "flow_error_percent": float(np.median(whole)), "flow_error_corner_percent": float(np.median(corner)),
+        "rejected_percent": 100 * sum(sum(w.rejected.values()) for w in seen) / frames,
+    }  # fmt: skip
+
+
+def _pictures(
+    folder: Path,
+    material: Material,
+    lesson: Lesson,
+    rngs: tuple[np.random.Generator, np.random.Generator],
+    noise: Noise,
+    *,
+    trials: int,
+    printer: Printer,
+    camera: Camera,
+    s: Settings,
+    on_step: Callable[[Trial], None],
+) -> tuple[Run, list[Watched], bead.Calibration]:
+    """Our law on the reference routine of a simulated machine, the flow measured from pictures: every trial is one recording in `folder`, written and read back;
+    those of the first and last trial are kept. `rngs` draw what the camera sees, and what does not repeat."""
+    routine, seen = lesson.routines[0], []
+    looks = filming.scene(camera, rngs[0])
+    calibration = filming.calibrate(looks, camera, rngs[0])
+
+    def measure(u: np.ndarray) -> Trial:
+        j = len(seen)
+        path = folder / f"{material.name}_{j:02d}.mcap"
+        known = filming.conditions(
+            material, routine, j, "pixels" if j else "on_off", printer=printer, camera=camera, calibration=calibration
+        )
+        filming.film(path, known, lesson.plant, routine, u, printer=printer, camera=camera, scene=looks, noise=noise, rng=rngs[1])
+        seen.append(filming.watch(path, routine, printer=printer, camera=camera))
+        if j > 1:
+            (folder / f"{material.name}_{j - 1:02d}.mcap").unlink()
+        return seen[-1].trial
+
+    done = run("pixels", ours(routine, s), measure, routine, lesson.nominal, trials=trials, s=s, on_step=on_step)
+    return done, seen, calibration
+
+
+# ---- trials of a real machine
+
+
+def _recorded(folder: Path, printer: Printer, camera: Camera, routines: Sequence[Routine]) -> dict[tuple[str, int], list[Watched]]:
+    """The trials that lie in `folder`, by (material, number of the routine) in the order of their numbers.
+
+    Raises ValueError, naming the file, for an unknown material, nozzle or routine, and where a trial is missing or there twice.
+    """
+    found: dict[tuple[str, int], dict[int, tuple[Path, Watched]]] = {}
+    for path in sorted(file for file in folder.rglob("*.mcap") if not file.name.startswith(".")):
+        known = trials.read_trial(path, unreadable_share=camera.unreadable_share).conditions
+        if known is None:
+            raise ValueError(
+                f"{path}: expected the metadata record {trials.SCHEMA} with material and trial, found none; copy it from the command in datasets/train_ilc/next"
+            )
+        key = (known.material, _routine(path, known, printer, routines))
+        done = found.setdefault(key, {})
+        if known.trial in done:
+            raise ValueError(
+                f"{path}: trial {known.trial} of material {known.material} is in {done[known.trial][0]} too; keep one of the two"
+            )
+        done[known.trial] = (path, filming.watch(path, routines[key[1]], printer=printer, camera=camera))
+    for (material, index), done in found.items():
+        lacking = sorted(set(range(max(done))) - set(done))
+        if lacking:
+            raise ValueError(
+                f"{folder}: trial {lacking[0]} of material {material}, routine {index}, is missing beside trial {max(done)}; add it, or renumber the others"
+            )
+    return {key: [done[j][1] for j in sorted(done)] for key, done in sorted(found.items())}
+
+
+def _routine(path: Path, known: trials.Conditions, printer: Printer, routines: Sequence[Routine]) -> int:
+    names = [material.name for material in printer.materials]
+    if known.material not in names:
+        raise ValueError(
+            f"{path}: material {known.material} is not among printer.materials {', '.join(names)}; add it to params.yaml, or take the file away"
+        )
+    if known.nozzle != f"{printer.nozzle_mm:g}":
+        raise ValueError(
+            f"{path}: expected a nozzle of {printer.nozzle_mm:g} mm (printer.nozzle_mm), found {known.nozzle}; what one nozzle learned does not hold for another"
+        )
+    for index, routine in enumerate(routines):
+        if abs(routine.speed.max() - known.speed_mm_per_s) < 1e-6 and abs(routine.pause_s[1] - routine.pause_s[0] - known.pause_s) < 1e-6:
+            return index
+    asked = ", ".join(f"{r.speed.max():g} mm/s with {r.pause_s[1] - r.pause_s[0]:g} s" for r in routines)
+    raise ValueError(
+        f"{path}: expected one of the routines of train_ilc ({asked}), found {known.speed_mm_per_s:g} mm/s with a pause of {known.pause_s:g} s; add that routine to params.yaml"
+    )
+
+
+def _resume(watched: Sequence[Watched], routine: Routine, nominal: Extruder, s: Settings) -> tuple[Run | None, ilc.Step]:
+    """What was learned in the trials so far, and what follows: trial 0 is on-off control."""
+    u0 = on_off(routine.r, nominal)
+    done = [one.trial for one in watched]
+    if not done:
+        return None, ilc.Step(u0, 0, False, False)
+    law = ours(routine, s)
+    step = ilc.next_step(done, routine.r, law, rise=s.rise)
+    rows = ilc.table(done, routine.r, steady=float(u0.max()), limit=s.limit, rise=s.rise)
+    return Run("pixels", routine, done, rows, law.model), step
+
+
+def recordings(folder: Path, following: Path, work: Work) -> Part:
+    """The trials in `folder`, and in `following` the command of the next trial of every material and routine, on-off where there is none yet."""
+    printer, camera, s = work.printer, work.camera, work.settings
+    routines, whole = printer.trained(), Part({}, {}, {}, {})
+    seen = _recorded(Path(folder), printer, camera, routines)
+    px = abs(camera.mm_per_px)
+    following.mkdir()
+    for material in printer.materials:
+        nominal, figures = _nominal(material), {}
+        models: dict[str, Any] = {"nominal": _plain(nominal)}
+        for index, routine in enumerate(routines):
+            watched = seen.get((material.name, index), [])
+            done, step = _resume(watched, routine, nominal, s)
+            name = f"{material.name}_routine_{index}_trial_{len(watched):02d}"
+            known = filming.conditions(
+                material,
+                routine,
+                len(watched),
+                "ours" if watched else "on_off",
+                printer=printer,
+                camera=camera,
+                calibration=bead.Calibration(px, 0.0, 0.0, np.zeros(0)),
+            )
+            trials.write_command(following / name, known, time_s=routine.time_s, command_mm=step.u)
+            figures[f"routine_{index}"] = {"next": name, "best_trial": step.best, "rolled_back": step.rolled_back, "stopped": step.stopped}
+            if done:
+                whole.runs[material.name, index], whole.watched[material.name, index] = [done], list(watched)
+                figures["pixels" if index == 0 else f"pixels_{index}"] = training.figures(done, rise=s.rise)
+                models["identified" if index == 0 else f"identified_{index}"] = _model(done.model)
+        whole.metrics[material.name], whole.models[material.name] = figures, models
+    return whole

@@ -1,0 +1,137 @@
+"""Times that are written as text: ISO 8601, the dates of other countries, times of day; each becomes nanoseconds on one calendar."""
+
+import calendar
+import datetime
+import functools
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+DAY_NS = 86_400 * 10**9
+_EPOCH = datetime.date(1970, 1, 1).toordinal()
+_MONTHS = {name: i for i, name in enumerate(calendar.month_abbr)}
+_DATE = r"(?P<date>\d{4}(?P<m>[-/.])\d{1,2}(?P=m)\d{1,2}|\d{8}|\d{1,2}(?P<k>[./-])(?:\d{1,2}|[A-Za-z]{3})(?P=k)(?:\d{4}|\d{2}))"
+_TIME = r"(?P<hours>\d+):(?P<minutes>\d\d)(?::(?P<seconds>\d\d)(?:[.,:](?P<fraction>\d+))?)?\s*(?P<half>[AaPp]\.?[Mm]\.?)?"
+_TEXT = re.compile(rf"\s*(?:{_DATE}(?:[T,\s]+|$))?(?:{_TIME})?\s*(?P<zone>Z|z|UTC|GMT|[+-]\d\d(?::?\d\d)?)?\s*$")
+_PARTS = ("date", "hours", "minutes", "seconds", "fraction", "half", "zone")
+# 20251121130000 and 20251121130000250, as controllers stamp
+_COMPACT = re.compile(r"\s*((?:19|20)\d\d(?:0[1-9]|1[0-2])[0-3]\d)([0-2]\d)([0-5]\d)([0-5]\d)(\d{3})?\s*$")
+EXPECTED = "seconds or ISO 8601 such as 2025-11-21T13:00:00.5"
+
+
+class Instants(NamedTuple):
+    """ns (n,) since 1970, or since midnight where the text has no date; `zoned` where every time names its zone."""
+
+    ns: np.ndarray
+    zoned: bool
+    dated: bool
+
+
+def is_compact(text: str) -> bool:
+    """Whether a number is a date and a time without marks between, 20251121130000."""
+    return bool(_COMPACT.match(text))
+
+
+def instants(path: Path, name: str, fields: Sequence[str], lines: Sequence[int], *, month_first: bool | None) -> Instants:
+    """The instants that `fields` name. `month_first` says how 05/03/2025 is meant; None refuses it.
+
+    Raises ValueError with the line for what is no time.
+    """
+    found = np.empty(len(fields), np.int64)
+    zoned, dated = True, False
+    for i, (field, line) in enumerate(zip(fields, lines, strict=True)):
+        try:
+            found[i], has_zone, dated = _instant(field, month_first)
+        except ValueError as error:
+            why = f" ({error}?)" if str(error).startswith(("day", "hours")) else ""
+            raise ValueError(
+                f"{path}: line {line}, time {name} should be {EXPECTED} but is {field.strip()[:40]!r}{why}; convert it, or name another column"
+            ) from None
+        zoned = zoned and has_zone
+    return Instants(found, zoned, dated)
+
+
+def _instant(field: str, month_first: bool | None) -> tuple[int, bool, bool]:
+    """(ns, has a zone, has a date) of one text; ValueError where it is none."""
+    compact = _COMPACT.match(field)
+    if compact:
+        date, hours, minutes, seconds, fraction = compact.groups()
+        half, zone = None, None
+    else:
+        match = _TEXT.match(field)
+        if not match or not (match["date"] or match["hours"]):
+            return _iso(field)
+        date, hours, minutes, seconds, fraction, half, zone = match.group(*_PARTS)
+        if not date and seconds is None:
+            raise ValueError("hours and minutes, or minutes and seconds")
+    hours, minutes, seconds = int(hours or 0), int(minutes or 0), int(seconds or 0)
+    if minutes > 59 or seconds > 60 or (date and hours > 24) or (half and not 1 <= hours <= 12):
+        raise ValueError
+    if half:
+        hours = hours % 12 + 12 * (half[0] in "Pp")
+    ns = ((hours * 60 + minutes) * 60 + seconds) * 10**9 + int(f"{fraction or 0:0<9}"[:9])
+    return ns + (_day(date, month_first) * DAY_NS if date else 0) - _offset_ns(zone or ""), bool(zone), bool(date)
+
+
+def _iso(field: str) -> tuple[int, bool, bool]:
+    """The rarer forms of ISO 8601, such as 20251121T130000Z."""
+    instant = datetime.datetime.fromisoformat(field.strip())
+    zone = instant.utcoffset()
+    since = instant.replace(tzinfo=None) - datetime.datetime(1970, 1, 1) - (zone or datetime.timedelta())
+    return since // datetime.timedelta(microseconds=1) * 1000, zone is not None, True
+
+
+@functools.lru_cache(maxsize=4096)
+def _day(date: str, month_first: bool | None) -> int:
+    """Days since 1970 of one date; recordings have few of them."""
+    if date.isdigit():
+        year, month, day = int(date[:4]), int(date[4:6]), int(date[6:])
+    else:
+        mark = re.search(r"[-/.]", date)[0]
+        first, second, third = date.split(mark)
+        if len(first) == 4:
+            year, month, day = int(first), int(second), int(third)
+        else:
+            year = int(third) + (2000 if len(third) == 2 else 0)
+            if second.isalpha():
+                day, month = int(first), _MONTHS.get(second.title(), 0)
+            else:
+                day, month = _day_and_month(int(first), int(second), mark, month_first)
+    return datetime.date(year, month, day).toordinal() - _EPOCH
+
+
+def _day_and_month(first: int, second: int, mark: str, month_first: bool | None) -> tuple[int, int]:
+    if mark == "." or first > 12 or month_first is False:
+        return first, second
+    if second > 12 or month_first:
+        return second, first
+    raise ValueError("day and month, or month and day")
+
+
+def month_first(dates: Iterable[str], sample: str) -> bool | None:
+    """How dates such as 05/03/2025 are meant: by one that can be only one of both, or by the am and pm of `sample`; a single day is the same
+    either way. None where that is not known."""
+    pairs = {(int(found[1]), int(found[2])) for date in dates if (found := re.match(r"\s*(\d{1,2})[/-](\d{1,2})[/-]\d", date))}
+    if any(first > 12 for first, _ in pairs):
+        return False
+    american = re.search(r"\d\s*[AaPp]\.?[Mm]", sample)
+    return True if american or len(pairs) == 1 or any(second > 12 for _, second in pairs) else None
+
+
+def _offset_ns(zone: str) -> int:
+    if not zone or zone[0] not in "+-":
+        return 0
+    digits = zone[1:].replace(":", "")
+    minutes = int(digits[:2]) * 60 + int(digits[2:] or 0)
+    if minutes > 14 * 60:
+        raise ValueError  # no zone; some programs write the fraction of the second behind a hyphen
+    return (-1 if zone[0] == "-" else 1) * minutes * 60 * 10**9
+
+
+def over_midnight(ns: np.ndarray) -> tuple[np.ndarray, int]:
+    """Times of day made to run on over midnight, and how often they do: a day is added where they fall by more than half of one."""
+    midnights = np.cumsum(np.r_[0, np.diff(ns) < -DAY_NS // 2])
+    return ns + midnights * DAY_NS, int(midnights[-1])

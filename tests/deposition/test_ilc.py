@@ -1,0 +1,333 @@
+"""The laws on plants that they were not fitted to, judged by the true flow; the convergence test, the limits of the drive, and the loop with roll-back."""
+
+import numpy as np
+import pytest
+
+from pipeline.deposition import ilc
+from pipeline.deposition.extruder import Extruder, disturb, draw, flow, frequency_response, pressed, routine
+from pipeline.deposition.trial_model import identify
+
+TS = 0.02
+MATERIALS = {"A": Extruder(1.08, 2.7), "B": Extruder(0.89, 4.5)}
+NOISE = {"white": 0.03, "drift": 0.01, "gain": 0.01}
+PAPER = {"learning_gain": 0.25, "fast_zero_s": 0.03, "sample_time_s": TS}
+PAPER_Q = {"order": 2, "cutoff_hz": 3.0}
+OURS = {"identify_trials": 3, "floor": 0.1, "order": 4, "cutoff_hz": 5.0}
+F = np.linspace(0.0, 24.9, 2000)
+
+
+def reference(ramp_s=0.15, sample_time_s=TS):
+    phases = {"off_s": 4, "on_s": 6, "pause_s": 0.6, "tail_s": 8}
+    return routine(**phases, speed=8.0, bead_area_mm2=0.304, ramp_s=ramp_s, sample_time_s=sample_time_s).r
+
+
+R = reference()
+STEADY = R.max()
+
+
+def family(seed, count):
+    rng = np.random.default_rng(seed)
+    for name in ("AB" * count)[:count]:
+        yield name, draw(rng, gain=MATERIALS[name].gain, time_constant_s=MATERIALS[name].time_constant_s, steady_flow=STEADY)
+
+
+def machine(plant, seed=0, limit=np.inf, noise=NOISE, sample_time_s=TS, run=flow):
+    rng = np.random.default_rng(seed)
+
+    def measure(u):
+        y = run(plant, u, sample_time_s=sample_time_s, limit=limit)
+        return ilc.Trial(np.clip(u, -limit, limit), disturb(y, rng, steady_flow=STEADY, **noise), y)
+
+    return measure
+
+
+def paper(nominal, q=ilc.zero_phase, limit=np.inf):
+    return ilc.paper_law(R, nominal, q, limit=limit, **PAPER, **PAPER_Q)
+
+
+def ours(r=R, limit=np.inf, sample_time_s=TS, **changes):
+    return ilc.InverseLaw(r, limit=limit, sample_time_s=sample_time_s, **(OURS | changes))
+
+
+def ratios(law, measure, nominal, trials, r=R, limit=np.inf, rise=0.1):
+    """Percent of trial 0, (trials + 1,), by the true flow; a loop that stopped goes on with its best command."""
+    done = ilc.learn(law, measure, np.clip(r / nominal.gain, -limit, limit), r, trials=trials, rise=rise)
+    rows = ilc.table(done, r, steady=STEADY / nominal.gain, limit=limit, rise=rise)
+    best = min(rows, key=lambda row: row.rms_measured)
+    return 100 * np.array([row.ratio for row in rows] + [best.ratio] * (trials + 1 - len(rows)))
+
+
+# ---- Q
+
+
+def test_the_zero_phase_filter_keeps_a_symmetric_pulse_symmetric_and_the_causal_one_delays_it():
+    pulse = np.exp(-(((np.arange(401) - 200) / 15.0) ** 2))
+    both, once = (q(pulse, order=4, cutoff_hz=3.0, sample_time_s=TS) for q in (ilc.zero_phase, ilc.causal))
+    np.testing.assert_allclose(both, both[::-1], atol=1e-9)  # what the filter still rings at the padding's end
+    assert np.argmax(both) == 200 and np.argmax(once) > 203
+
+
+def test_a_sine_passes_the_zero_phase_filter_with_the_square_of_its_magnitude():
+    t = np.arange(4000) * TS
+    passed = ilc.zero_phase(np.sin(2 * np.pi * 2.0 * t), order=2, cutoff_hz=3.0, sample_time_s=TS)[1500:2500]
+    gain = ilc.magnitude(np.array([2.0]), order=2, cutoff_hz=3.0, sample_time_s=TS)[0] ** 2
+    np.testing.assert_allclose(passed, gain * np.sin(2 * np.pi * 2.0 * t[1500:2500]), atol=1e-9)  # the ends have died out
+
+
+def test_a_cut_off_above_half_the_sampling_rate_is_refused():
+    with pytest.raises(
+        ValueError,
+        match=r"expected a cut-off between 0 and half the sampling rate, 5 Hz, but found 6 Hz; lower the cut-off or sample faster",
+    ):
+        ilc.zero_phase(R, order=4, cutoff_hz=6.0, sample_time_s=0.1)
+
+
+# ---- the convergence test
+
+
+@pytest.mark.parametrize("delay_s, expected", [(0.0, 0.76), (0.1, 0.92), (0.12, 0.96), (0.15, 1.03)])
+@pytest.mark.parametrize("name", "AB")
+def test_gamma_of_the_papers_law_grows_with_unmodelled_delay_and_passes_one_at_150_ms(name, delay_s, expected):
+    nominal = MATERIALS[name]
+    Q = ilc.magnitude(F, sample_time_s=TS, **PAPER_Q) ** 2
+    P = frequency_response(nominal._replace(delay_s=delay_s), F, sample_time_s=TS)
+    found = ilc.gamma(Q, ilc.paper_filter(F, nominal, **PAPER), P)
+    assert found == pytest.approx(expected, abs=0.01)  # published to two digits, for their own discretisation
+    assert (found > 1) == (delay_s == 0.15)
+
+
+def test_gamma_is_the_factor_by_which_the_worst_sine_shrinks():
+    nominal, plant = MATERIALS["A"], MATERIALS["A"]._replace(delay_s=0.15)
+    L, P = ilc.paper_filter(F, nominal, **PAPER), frequency_response(plant, F, sample_time_s=TS)
+    Q = ilc.magnitude(F, sample_time_s=TS, **PAPER_Q) ** 2
+    worst = F[np.argmax(np.abs(Q * (1 - L * P)))]
+    # the law's homogeneous part on a long sine: Q (u - L P u), away from the ends
+    t = np.arange(6000) * TS
+    u = np.sin(2 * np.pi * worst * t)
+    y = flow(plant._replace(yield_=-1e6), u, sample_time_s=TS) - 1e6
+    after = ilc.paper_law(np.zeros(6000), nominal, ilc.zero_phase, limit=np.inf, **PAPER, **PAPER_Q)([ilc.Trial(u, y)])[2500:3500]
+    assert np.sqrt(np.mean(after**2) / 0.5) == pytest.approx(
+        ilc.gamma(Q, L, P), rel=0.01
+    )  # a frequency on a grid of 0.012 Hz, 1000 samples of it
+
+
+def test_gamma_of_our_law_stays_far_below_one_on_every_plant_of_the_family():
+    Q = ilc.magnitude(F, order=4, cutoff_hz=5.0, sample_time_s=TS) ** 2
+    for i, (name, plant) in enumerate(family(5, 12)):
+        law, measure = ours(), machine(plant, seed=i)
+        law([measure(R / MATERIALS[name].gain)])
+        L = ilc.inverse_filter(F, law.model.extruder, sample_time_s=TS)
+        assert ilc.gamma(Q, L, frequency_response(plant, F, sample_time_s=TS)) < 0.8  # 0.45 to 0.6 were seen after one trial
+
+
+# ---- the paper's law
+
+
+@pytest.mark.parametrize("name", "AB")
+def test_the_papers_law_on_the_nominal_plant_comes_below_20_percent_by_trial_8_and_to_4_to_6_at_30(name):
+    found = ratios(paper(MATERIALS[name]), machine(MATERIALS[name]), MATERIALS[name], 30)
+    assert found[8] < 20 and 4 <= found[30] <= 6
+
+
+@pytest.mark.parametrize("name", "AB")
+def test_the_papers_law_survives_100_ms_and_diverges_at_150_ms_unless_rolled_back(name):
+    nominal = MATERIALS[name]
+    assert ratios(paper(nominal), machine(nominal._replace(delay_s=0.1)), nominal, 30)[30] <= 15
+    late = nominal._replace(delay_s=0.15)
+    alone = ratios(paper(nominal), machine(late), nominal, 120, rise=np.inf)
+    assert alone[16] < 25 and alone[120] > 40 and alone[120] > 2 * alone[16]
+    done = ilc.learn(paper(nominal), machine(late), R / nominal.gain, R, trials=120, rise=0.1)
+    step = ilc.next_step(done, R, paper(nominal), rise=0.1)
+    errors = [ilc.rms(R - trial.truth) for trial in done]
+    # noise may pick a trial a little above the least true error
+    assert errors[step.best] < 1.1 * min(errors) and 100 * max(errors[3:]) / errors[0] < 50
+
+
+@pytest.mark.parametrize("name", "AB")
+def test_a_causal_q_leaves_a_third_of_the_error(name):
+    found = ratios(
+        paper(MATERIALS[name], ilc.causal), machine(MATERIALS[name], noise=dict.fromkeys(NOISE, 0.0)), MATERIALS[name], 40, rise=np.inf
+    )
+    assert found.min() > 35
+
+
+# ---- our law
+
+
+def test_of_one_trial_our_law_is_q_of_u_plus_l_e():
+    plant, u = Extruder(1.2, 3.0, 0.1), R / 1.08
+    y = flow(plant, u, sample_time_s=TS) + 0.05 * np.sin(np.arange(len(R)) / 20)
+    law = ours()
+    found = law([ilc.Trial(u, y)])
+    model = law.model.extruder
+    plain = ilc.zero_phase(u + ilc.inverse(R - y, model._replace(yield_=0.0), sample_time_s=TS), order=4, cutoff_hz=5.0, sample_time_s=TS)
+    printing = R > 0  # outside the law leaves alone what no flow tells of
+    # the sine stays in the yield, which is a few percent of the flow; both are brought through the same Q
+    assert np.abs(found - plain)[printing].mean() < 0.05 * np.abs(plain)[printing].mean()
+
+
+def test_the_inverse_presses_out_the_flow_that_is_asked_for():
+    model, x = Extruder(1.2, 3.0, 0.113), ilc.zero_phase(R, order=4, cutoff_hz=5.0, sample_time_s=TS)
+    u = ilc.inverse(x, model, sample_time_s=TS)
+    np.testing.assert_allclose(pressed(model, u, sample_time_s=TS), x, atol=1e-4 * STEADY)  # EPSILON at 5 Hz, where |H| is K / 100
+
+
+def test_our_law_on_a_dozen_plants_of_the_family():
+    found = np.array([ratios(ours(), machine(plant, seed=i), MATERIALS[name], 20) for i, (name, plant) in enumerate(family(11, 12))])
+    assert found[:, 2].max() <= 20 and found[:, 3].max() <= 10  # the bars for 95 % and 90 % of 200 plants
+    assert np.median(found[:, 15]) <= 1.5 and found[:, 20].max() <= 3  # 3 and 6 are asked for; 0.9 and 2 are usual
+
+
+def test_our_law_within_ten_times_the_steady_command_and_half_second_ramps():
+    r = reference(0.5)
+    limits = {name: 10 * STEADY / nominal.gain for name, nominal in MATERIALS.items()}
+    found = [
+        ratios(ours(r, limits[name]), machine(plant, i, limits[name]), MATERIALS[name], 15, r, limits[name])[15]
+        for i, (name, plant) in enumerate(family(12, 8))
+    ]
+    assert np.median(found) <= 2 and max(found) <= 6  # the bar is a median of 4
+
+
+@pytest.mark.parametrize(
+    "gain, time_constant_s, sample_time_s, ramp_s",
+    [(0.5, 1.0, 0.02, 0.15), (2.0, 8.0, 0.02, 0.3), (1.08, 2.7, 0.01, 0.15), (0.89, 4.5, 0.05, 1.0)],
+)
+def test_other_materials_sample_times_and_ramps_are_learned_alike(gain, time_constant_s, sample_time_s, ramp_s):
+    r, rng, nominal = reference(ramp_s, sample_time_s), np.random.default_rng(3), Extruder(gain, time_constant_s)
+    plant = draw(rng, gain=gain, time_constant_s=time_constant_s, steady_flow=STEADY)
+    found = ratios(ours(r, sample_time_s=sample_time_s), machine(plant, 3, sample_time_s=sample_time_s), nominal, 15, r)
+    assert found[2] <= 20 and found[3] <= 10 and found[15] <= 3
+
+
+def thinning(plant, u, *, sample_time_s, limit):
+    """A plant that no model here can be: flow as pressure to the power 0.7."""
+    x = flow(plant._replace(yield_=0.0), u, sample_time_s=sample_time_s, limit=limit) / STEADY
+    return STEADY * x**0.7
+
+
+def test_a_plant_of_another_kind_is_learned_because_the_first_learned_trial_is_identified_too():
+    plant = Extruder(1.2, 3.0, 0.1, 4.5, 0.05)
+    with_it = ratios(ours(), machine(plant, run=thinning), MATERIALS["A"], 12)
+    without = ratios(ours(identify_trials=1), machine(plant, run=thinning), MATERIALS["A"], 12)
+    assert with_it[2] < 12 and with_it[12] < 4 and without[12] > 3 * with_it[12]
+
+
+def test_averaging_over_trials_goes_below_what_one_trial_at_a_time_can():
+    name, plant = next(family(13, 1))
+    averaged, last_only = (ratios(ours(floor=floor), machine(plant), MATERIALS[name], 30)[10:].mean() for floor in (0.1, 1.0))
+    assert averaged < 0.6 * last_only  # sqrt(0.1 / 1.9) of the noise, plus what Q and the ramps leave
+
+
+def test_a_pause_that_no_camera_sees_does_not_disturb_what_is_learned():
+    name, plant = next(family(14, 1))
+    seen = machine(plant)
+
+    def blind(u):
+        trial = seen(u)
+        hidden = (np.arange(len(R)) * TS > 10.1) & (np.arange(len(R)) * TS < 10.5)
+        return trial._replace(y=np.where(hidden, np.nan, trial.y))
+
+    assert ratios(ours(), blind, MATERIALS[name], 15)[15] < 4  # 1 where the pause is seen
+
+
+def test_the_norm_optimal_law_learns_too():
+    name, plant = next(family(15, 1))
+    u0 = R / MATERIALS[name].gain
+    model = identify([u0], [machine(plant)(u0).y], sample_time_s=TS).extruder
+    law = ilc.norm_optimal_law(R, model, R_u=1e-5, R_d=1e-3, limit=np.inf, sample_time_s=TS)
+    found = ratios(law, machine(plant), MATERIALS[name], 15)
+    assert found[2] < 20 and found[15] < 6
+
+
+# ---- limits
+
+
+def test_the_forecast_says_what_the_limit_will_leave():
+    name, plant = "B", next(p for n, p in family(16, 2) if n == "B")
+    for times in (5, 20):
+        limit = times * STEADY / MATERIALS[name].gain
+        law, u0 = ours(limit=limit), np.clip(R / MATERIALS[name].gain, -limit, limit)
+        found = ratios(law, machine(plant, limit=limit), MATERIALS[name], 8, limit=limit)[8]
+        forecast = ilc.authority(R, u0, law.model.extruder, order=4, cutoff_hz=5.0, limit=limit, sample_time_s=TS)
+        assert found == pytest.approx(100 * forecast.ratio, abs=3.0)  # the bar
+
+
+def test_the_peak_that_a_ramp_needs_follows_the_rule_of_thumb():
+    model = Extruder(0.89, 4.5, 0.1)
+    found = ilc.authority(reference(0.5), reference(0.5) / 0.89, model, order=4, cutoff_hz=5.0, limit=99.0, sample_time_s=TS)
+    assert found.peak / found.steady == pytest.approx(1 + 4.5 / 0.5, rel=0.1)  # the steepest point lies half way up: 0.5 + tau / t_ramp
+
+
+def test_a_command_never_leaves_its_limit_and_ends_nearer_than_one_that_is_cut():
+    model, limit = Extruder(0.89, 4.5, 0.1), 5 * STEADY / 0.89
+    x = ilc.zero_phase(R, order=4, cutoff_hz=5.0, sample_time_s=TS)
+    u = ilc.command(x, R, model, limit=limit, sample_time_s=TS)
+    cut = np.clip(ilc.inverse(x, model, sample_time_s=TS), -limit, limit)
+    assert np.abs(u).max() <= limit
+    near, far = (ilc.rms(R - flow(model, v, sample_time_s=TS)) for v in (u, cut))
+    assert near < 0.5 * far
+
+
+def test_limits_that_no_law_can_meet_are_refused_with_the_ramp_that_would_do():
+    model = Extruder(0.89, 4.5)
+    u0 = R / 0.89
+    for times, sentence in (
+        (
+            2,
+            r"need a peak command of 2\d\.\d x steady and the limit is 2\.0 x, so no law comes below \d\d% of the error of trial 0; ramps of 4\.50 s would do",
+        ),
+        (0.9, r"the limit is 0\.9 x, .*; no ramp would do: print slower, or raise the limit above the steady command"),
+    ):
+        limit = times * STEADY / 0.89
+        found = ilc.authority(R, u0, model, order=4, cutoff_hz=5.0, limit=limit, sample_time_s=TS)
+        with pytest.raises(ValueError, match=sentence):
+            ilc.check_authority(found, limit=limit, worst_ratio=0.2)
+    wide = ilc.authority(R, u0, model, order=4, cutoff_hz=5.0, limit=100 * STEADY, sample_time_s=TS)
+    ilc.check_authority(wide, limit=100 * STEADY, worst_ratio=0.2)
+    assert wide.ratio < 0.01  # what a Q of 5 Hz takes off these ramps
+
+
+# ---- the loop
+
+
+def test_trials_that_rise_are_left_by_hand():
+    # trial 2 rises above 40 + 10, the best is 1; 3 is better again; 4 and 5 rise
+    found = ilc.judge([100.0, 40.0, 55.0, 30.0, 45.0, 60.0, 20.0], rise=0.1)
+    assert found == ilc.Judged(keep=[0, 1, 3], best=3, risen=[False, False, True, False, True, True, False], stopped=True)
+    assert ilc.judge([100.0, 40.0, 49.0, 48.0], rise=0.1) == ilc.Judged([0, 1, 2, 3], 1, [False] * 4, False)
+
+
+def test_after_a_rise_the_next_command_is_half_a_step_from_the_best_and_after_two_the_best():
+    r = np.ones(4)
+    trials = [ilc.Trial(np.full(4, float(j)), r - error) for j, error in enumerate((1.0, 0.4, 0.9))]
+    step = ilc.next_step(trials, r, lambda kept: kept[-1].u + 2, rise=0.1)
+    assert (step.best, step.rolled_back, step.stopped) == (1, True, False)
+    np.testing.assert_array_equal(step.u, np.full(4, 2.0))  # best 1, law 1 + 2, half way
+    step = ilc.next_step([*trials, ilc.Trial(step.u, r - 0.8)], r, lambda kept: kept[-1].u + 2, rise=0.1)
+    assert step.stopped and step.best == 1
+    np.testing.assert_array_equal(step.u, np.ones(4))
+
+
+def test_a_folder_of_trials_continues_where_the_loop_left():
+    name, plant = next(family(17, 1))
+    done = ilc.learn(ours(), machine(plant), R / MATERIALS[name].gain, R, trials=5, rise=0.1)
+    for j in (1, 3, 5):
+        np.testing.assert_array_equal(ilc.next_step(done[:j], R, ours(), rise=0.1).u, done[j].u)
+
+
+def test_the_table_says_what_each_trial_was():
+    u, r = np.array([0.0, 2.0, -2.0, 1.0]), np.ones(4)
+    trials = [ilc.Trial(u, r - 0.5, r - 0.4), ilc.Trial(u / 2, np.array([0.9, np.nan, 1.1, 0.9]), r - 0.1)]
+    first, second = ilc.table(trials, r, steady=0.5, limit=2.0, rise=0.1)
+    assert first == ilc.Row(0, pytest.approx(0.4), pytest.approx(0.5), 1.0, 4.0, 0.5, False)
+    assert second == ilc.Row(1, pytest.approx(0.1), pytest.approx(0.1), pytest.approx(0.25), 2.0, 0.0, False)
+
+
+def test_a_trial_of_another_length_or_without_flow_is_refused_by_number():
+    trials = [ilc.Trial(R, R), ilc.Trial(R[:-1], R[:-1])]
+    with pytest.raises(
+        ValueError, match=r"trial 1: expected command and flow of 1230 samples, as the reference has, .* but found \(1229,\)"
+    ):
+        ilc.next_step(trials, R, ours(), rise=0.1)
+    with pytest.raises(ValueError, match=r"trial 0: .* with 0 observable; leave the trial out or record it again"):
+        ilc.next_step([ilc.Trial(R, np.full(1230, np.nan))], R, ours(), rise=0.1)

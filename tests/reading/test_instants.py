@@ -1,0 +1,84 @@
+import datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.reading.instants import Instants, instants, month_first, over_midnight
+
+NOON = int(datetime.datetime(2025, 11, 21, 12, tzinfo=datetime.UTC).timestamp()) * 10**9
+
+
+def read(*fields: str, order: bool | None = None) -> Instants:
+    return instants(Path("rig.csv"), "time", fields, range(2, 2 + len(fields)), month_first=order)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "2025-11-21T12:00:00",
+        "2025-11-21 12:00:00.000",
+        "2025/11/21 12:00",
+        "20251121T120000",
+        "20251121120000",
+        "21.11.2025 12:00:00,000",
+        "21.11.25 12:00:00",
+        "21-Nov-2025 12:00:00",
+        "21/11/2025 12:00:00",
+        "11/21/2025 12:00:00 PM",
+        " 2025-11-21T12:00:00Z ",
+        "2025-11-21T13:00:00+01:00",
+        "2025-11-21T06:30:00-0530",
+        "2025-11-21 12:00:00 UTC",
+    ],
+)
+def test_one_instant_is_the_same_however_it_is_written(text):
+    assert read(text).ns.tolist() == [NOON]
+
+
+def test_fractions_are_kept_to_the_nanosecond():
+    assert (read("2025-11-21T12:00:00.123456789").ns - NOON).tolist() == [123456789]
+    assert (read("20251121120000250").ns - NOON).tolist() == [250_000_000]
+
+
+def test_the_zone_counts_as_known_only_where_every_time_names_it():
+    assert read("2025-11-21T12:00:00Z").zoned
+    assert not read("2025-11-21T12:00:00Z", "2025-11-21T12:00:01").zoned
+
+
+def test_times_of_day_count_from_midnight_and_run_on_over_the_next():
+    found = read("23:59:58", "23:59:59.5", "0:00:01")
+    assert not found.dated
+    times, midnights = over_midnight(found.ns)
+    np.testing.assert_allclose(np.diff(times) / 1e9, [1.5, 1.5], rtol=1e-12)
+    assert midnights == 1
+    # an elapsed time may have more than 24 hours
+    assert read("25:00:00").ns.tolist() == [25 * 3600 * 10**9]
+
+
+def test_day_and_month_are_told_by_a_date_that_can_be_only_one_of_both():
+    assert month_first(["05/03/2025", "13/03/2025"], "05/03/2025") is False
+    assert month_first(["05/03/2025", "05/13/2025"], "05/03/2025") is True
+    assert month_first(["05/03/2025", "06/03/2025"], "05/03/2025 1:00:00 PM") is True
+    assert month_first(["05/03/2025", "06/03/2025"], "05/03/2025 13:00:00") is None
+    # of one day alone only the time of day matters
+    assert month_first(["05/03/2025"], "05/03/2025") is not None
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("warm", "is 'warm'; convert it"),
+        ("05/03/2025 12:00", "is '05/03/2025 12:00' (day and month, or month and day?); convert it"),
+        ("12:34", "is '12:34' (hours and minutes, or minutes and seconds?)"),
+        ("31.02.2025 12:00", "is '31.02.2025 12:00' (day is out of range for month?); convert it"),
+        ("2025-11-21T12:61:00", "is '2025-11-21T12:61:00'"),
+        # a fraction behind a hyphen, as a printer's camera program writes it, and no zone
+        ("2025-11-21T12:00:00-34", "is '2025-11-21T12:00:00-34'"),
+    ],
+)
+def test_what_is_no_time_is_refused_with_its_line(text, said):
+    with pytest.raises(ValueError, match=r"^rig\.csv: line 3, time time should be seconds or ISO 8601") as refusal:
+        read("2025-11-21T12:00:00", text)
+    assert said in str(refusal.value)
+    assert str(refusal.value).endswith("; convert it, or name another column")
