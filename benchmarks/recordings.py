@@ -1,10 +1,9 @@
-"""Messages per second and peak memory of reading MCAP recordings with numeric messages, CRCs checked, on one core.
+"""Rows or messages per second and peak memory of reading recordings of three lengths, CRCs checked, on one core.
 
 `./run python -m benchmarks.recordings` prints the figures beside the bars and writes benchmarks/results/recordings.json.
 """
 
 import json
-import resource
 import struct
 import subprocess
 import sys
@@ -14,10 +13,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-LENGTHS = (100_000, 1_000_000)
+LENGTHS = (25_000, 250_000, 1_000_000)  # 1, 10 and 40 times
 BARS = {"json": 150_000, "cdr": 80_000, "cdr_header": 80_000}
 NAMES = [f"heater_{i}" for i in range(1, 4)] + [f"temperature_{i}" for i in range(1, 6)]
 RESULTS = Path(__file__).parent / "results" / "recordings.json"
@@ -36,12 +37,21 @@ uint32 nanosec
 def rows(count: int) -> Iterator[list[float]]:
     """Eight signals with all their digits, the same at every run."""
     rng = np.random.default_rng(0)
-    for _ in range(count // 10_000):
-        yield from np.cumsum(rng.normal(size=(10_000, len(NAMES))), axis=0).tolist()
+    for start in range(0, count, 10_000):
+        yield from np.cumsum(rng.normal(size=(min(10_000, count - start), len(NAMES))), axis=0).tolist()
 
 
 def write(path: Path, kind: str, count: int) -> None:
-    """A recording of `count` messages at 100 Hz in chunks of 1 MiB, compressed with zstd."""
+    """A recording of `count` rows or messages at 100 Hz; MCAP in chunks of 1 MiB, compressed with zstd."""
+    if kind == "csv":
+        with path.open("w") as stream:
+            stream.write(",".join(["t_s", *NAMES]) + "\n")
+            stream.writelines(f"{k / 100}," + ",".join(map(repr, row)) + "\n" for k, row in enumerate(rows(count)))
+        return
+    if kind == "parquet":
+        columns = np.array(list(rows(count))).T
+        pq.write_table(pa.table({"t_s": np.arange(count) / 100, **dict(zip(NAMES, columns, strict=True))}), path, row_group_size=count)
+        return
     numbers = "".join(f"float64 {name}\n" for name in NAMES)
     schema = {"json": b"", "cdr": numbers.encode(), "cdr_header": (HEADER + numbers + HEADER_TYPES).encode()}[kind]
     fixed, headed = struct.Struct(f"<4x{len(NAMES)}d"), struct.Struct(f"<4xiII12s4x{len(NAMES)}d")
@@ -77,23 +87,30 @@ def package(path: Path) -> int:
         return sum(1 for _ in make_reader(stream, validate_crcs=True).iter_messages(log_time_order=False))
 
 
-def measure(reader: Callable[[Path], int], path: Path) -> dict[str, float]:
-    """CPU time and peak memory in this process; the imports are paid before, by reading a few rows."""
+def measure(reader: Callable[[Path], int], path: Path, kind: str) -> dict[str, float]:
+    """CPU time and peak memory in this process; the imports are paid before, by reading the shortest one."""
     with tempfile.TemporaryDirectory() as folder:
-        warm = Path(folder) / "warm.mcap"
-        write(warm, "json" if "json" in path.name else "cdr", 10_000)
+        warm = Path(folder) / "warm"
+        write(warm, kind, LENGTHS[0])
         reader(warm)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    before = peak_MB(again=True)
     start = time.process_time()
     count = reader(path)
     seconds = time.process_time() - start
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return {"messages": count, "messages_per_s": count / seconds, "peak_MB": peak / 1024, "above_warm_MB": (peak - before) / 1024}
+    return {"rows": count, "rows_per_s": count / seconds, "peak_MB": peak_MB(), "above_warm_MB": peak_MB() - before}
 
 
-def apart(reader: str, path: Path) -> dict[str, float]:
+def peak_MB(*, again: bool = False) -> float:
+    """The largest memory that this process has had, `again` from now on; what its parent had is not in it, as in getrusage it is."""
+    if again:
+        Path("/proc/self/clear_refs").write_text("5")
+    found = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
+    return int(found.split()[1]) / 1024
+
+
+def apart(reader: str, path: Path, kind: str) -> dict[str, float]:
     """`measure` in a process of its own, so that its peak is its own."""
-    call = f"b.measure(b.{reader}, Path({str(path)!r}))"
+    call = f"b.measure(b.{reader}, Path({str(path)!r}), {kind!r})"
     code = f"import json; from pathlib import Path; from benchmarks import recordings as b; print(json.dumps({call}))"
     return json.loads(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout)
 
@@ -101,25 +118,21 @@ def apart(reader: str, path: Path) -> dict[str, float]:
 def main() -> None:
     results: dict[str, dict] = {}
     with tempfile.TemporaryDirectory() as folder:
-        for kind in ("json", "cdr", "cdr_header"):
+        for kind in ("json", "cdr", "cdr_header", "csv", "parquet"):
             for count in LENGTHS:
-                path = Path(folder) / f"{kind}_{count}.mcap"
+                path = Path(folder) / f"{kind}_{count}"
                 write(path, kind, count)
-                found = apart("ours", path)
+                found = results[f"{kind}_{count}"] = apart("ours", path, kind)
                 # the samples that are kept: time and three signals of eight bytes
                 found["kept_MB"] = count * 4 * 8 / 2**20
-                results[f"{kind}_{count}"] = found
-                bar = f"(bar {BARS[kind]:,})"
+                bar = f" (bar {BARS[kind]:,})" if kind in BARS else ""
                 print(
-                    f"{kind:>11} {count:>9,} messages: {found['messages_per_s']:>9,.0f} per second {bar:>14}, peak"
-                    f" {found['peak_MB']:.0f} MB,"
+                    f"{kind:>11} {count:>9,} rows: {found['rows_per_s']:>9,.0f} per second{bar}, peak {found['peak_MB']:.0f} MB,"
                     f" {found['above_warm_MB']:.1f} MB above warm, of which kept {found['kept_MB']:.1f} MB"
                 )
-                if count == LENGTHS[0]:
-                    results[f"{kind}_mcap_package_undecoded"] = apart("package", path)
-                    print(
-                        f"{'':>11} mcap package, undecoded: {results[f'{kind}_mcap_package_undecoded']['messages_per_s']:>9,.0f} per second"
-                    )
+                if kind in BARS and count == LENGTHS[1]:
+                    undecoded = results[f"{kind}_mcap_package_undecoded"] = apart("package", path, kind)
+                    print(f"{'':>11} the mcap package, undecoded: {undecoded['rows_per_s']:>9,.0f} per second")
                 path.unlink()
     RESULTS.parent.mkdir(parents=True, exist_ok=True)
     RESULTS.write_text(json.dumps(results, indent=2) + "\n")

@@ -45,7 +45,7 @@ def write_table(path: str | Path, schema: Schema, columns: Mapping[str, np.ndarr
         raise ValueError(f"{path}: columns should have one length but have {lengths}; give one value a row in each")
     table = pa.Table.from_arrays(arrays, schema=schemas.arrow(schema))
     schemas.check_values(path, schema, table, "the file was not written")
-    with _beside(path) as temporary:
+    with beside(path) as temporary:
         pq.write_table(table, temporary, compression="zstd", write_page_checksum=True)
 
 
@@ -130,14 +130,14 @@ def read_metrics(stage: str) -> dict:
 
 def write_text(path: str | Path, text: str) -> None:
     """UTF-8 with Unix line ends."""
-    with _beside(path) as temporary:
+    with beside(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
 def write_csv(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
-    """Numbers for people and machines that read no Parquet: a header line of names, then one line a sample, floats by repr."""
-    rows = zip(*(np.asarray(values).tolist() for values in columns.values()), strict=True)
-    write_text(path, ",".join(columns) + "\n" + "".join(",".join(map(repr, row)) + "\n" for row in rows))
+    """Numbers and plain words for people and machines that read no Parquet: a header line of names, then one line a sample, floats by repr."""
+    rows = zip(*(map(str, np.asarray(values).tolist()) for values in columns.values()), strict=True)
+    write_text(path, ",".join(columns) + "\n" + "".join(",".join(row) + "\n" for row in rows))
 
 
 def _plain(path: str | Path, place: str, data):
@@ -227,7 +227,7 @@ def write_recording(
     # a float's repr is a JSON number, so a message is one formatting of a row; json.dumps takes six times as long
     message = "{" + ", ".join(json.dumps(name).replace("%", "%%") + ": %r" for name in signals) + "}"
     rows = zip(*(np.asarray(values, float).tolist() for values, _, _ in signals.values()), strict=True)
-    with _beside(path) as temporary, temporary.open("wb") as stream:
+    with beside(path) as temporary, temporary.open("wb") as stream:
         writer = mcap.writer.Writer(stream, compression=mcap.writer.CompressionType.ZSTD, enable_data_crcs=True)
         writer.start(profile="", library="beadline")
         channel = writer.register_channel(topic, "json", writer.register_schema("recording", "jsonschema", json_schema), metadata)
@@ -319,7 +319,7 @@ def _alive(pid: int) -> bool:
 
 
 @contextlib.contextmanager
-def _beside(path: str | Path) -> Iterator[Path]:
+def beside(path: str | Path) -> Iterator[Path]:
     """A temporary file that takes the target's place when the body ends well; inside a stage, one in reports/ waits for its end."""
     target, waiting = Path(path), _waiting.get()
     place = waiting / target if waiting and target.parts[0] == REPORTS.name else target

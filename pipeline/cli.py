@@ -43,6 +43,19 @@ def inspect(arguments: argparse.Namespace) -> None:
     print(describe(arguments.file))
 
 
+def compose(arguments: argparse.Namespace) -> None:
+    """A part program into plunger commands: signal and tasks as CSV, and whether it will print, line by line."""
+    from pipeline import composing
+    from pipeline.printer import Printer
+
+    learned = composing.read_learned("datasets/segment_library/library.parquet", "datasets/segment_library/learned.json")
+    part = composing.compose(arguments.part, learned, params.load(Printer, "printer"), params.load(composing.ComposeParts, "compose_parts"))
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    files = composing.write(part, arguments.out)
+    print(composing.told(part))
+    print("written: " + ", ".join(str(file) for file in files))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(prog="beadline", description="Extrusion-printer recordings into controllers that can be trusted.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
@@ -51,6 +64,10 @@ def main() -> None:
     command = commands.add_parser("inspect", help=inspect.__doc__)
     command.add_argument("file", type=Path)
     command.set_defaults(run=inspect)
+    command = commands.add_parser("compose", help=compose.__doc__)
+    command.add_argument("part", type=Path, help="the part program (G-code)")
+    command.add_argument("--out", type=Path, default=Path("."), help="folder for signal, tasks and report")
+    command.set_defaults(run=compose)
     arguments = parser.parse_args()
     try:
         arguments.run(arguments)

@@ -48,13 +48,15 @@ def trainings(lessons: dict[str, np.ndarray], law: str, routines: Sequence[Routi
     """All trials of a law, by material and routine; those of the reference routine only where there is no other. Raises ValueError where there is none."""
     mine = lessons["law"] == law
     if not mine.any():
-        there = ", ".join(sorted(set(lessons["law"]))) or "no trial at all"
+        there = ", ".join(sorted(set(lessons["law"])))
+        do = "print the commands in datasets/train_ilc/next, and put their recordings into datasets/raw/deposition"
         raise ValueError(
-            f"datasets/train_ilc/lessons.parquet: expected trials of law {law} (segment_library.law), found {there}; name one of those, or run more trials"
+            f"datasets/train_ilc/lessons.parquet: expected trials of law {law} (segment_library.law), "
+            + (f"found {there}; name one of those" if there else f"found none yet; {do}")
         )
-    numbers = sorted(set(lessons["routine"][mine].tolist()))
     found = []
     for material in sorted(set(lessons["material"][mine])):
+        numbers = sorted(set(lessons["routine"][mine & (lessons["material"] == material)].tolist()))
         for number in [n for n in numbers if n > 0] or numbers:
             here = mine & (lessons["material"] == material) & (lessons["routine"] == number)
             if here.any():
@@ -142,6 +144,69 @@ def compose(path: Path, learned: Learned, printer: Printer, p: ComposeParts) -> 
     return Part(path.stem, program, planned, composed, report)
 
 
+def compose_all(folder: Path, learned: Learned, printer: Printer, p: ComposeParts) -> tuple[list[Part], dict[str, str]]:
+    """Every part program in `folder`, and the reasons of those that cannot be composed; raises ValueError where none can."""
+    parts, refused = [], {}
+    for path in programs(folder):
+        try:
+            parts.append(compose(path, learned, printer, p))
+        except ValueError as error:
+            refused[path.stem] = str(error)
+    if not parts:
+        raise ValueError(f"{folder}: none of {len(refused)} part programs can be composed; the first: {next(iter(refused.values()))}")
+    return parts, refused
+
+
+def write(part: Part, folder: Path) -> list[Path]:
+    """The commands of all tools and the tasks as CSV, and the conformance report as JSON, beside one another in `folder`."""
+    composed = part.composed
+    signal = {"time_s": np.arange(len(composed.streams[0].u)) * composed.sample_time_s}
+    signal |= {f"T{stream.tool}_{stream.material}_mm": stream.u for stream in composed.streams}
+    files = [folder / f"{part.name}.{kind}" for kind in ("signal.csv", "tasks.csv", "conformance.json")]
+    artifacts.write_csv(files[0], signal)
+    artifacts.write_csv(files[1], task_rows(part))
+    lines = line_rows(part)
+    rows = [
+        {name: _finite(values[i].item() if hasattr(values[i], "item") else values[i]) for name, values in lines.items() if name != "part"}
+        for i in range(len(lines["line"]))
+    ]
+    artifacts.write_json(files[2], report(part) | {"lines": rows})
+    return files
+
+
+def told(part: Part) -> str:
+    """The conformance report in words."""
+    found, composed = part.conformance, part.composed
+    lines, text = found.lines, []
+    duration = len(composed.streams[0].u) * composed.sample_time_s
+    text.append(
+        f"{part.name}: {len(lines.line)} printed lines in {int(composed.lines.run[-1]) + 1} runs, {duration:.1f} s; the gantry sets out {composed.lead_in_s:.2f} s after the signal"
+    )
+    for stream in composed.streams:
+        predicted = {q.composer: q.rms_percent_of_on_off for q in composed.predictions if q.tool == stream.tool}
+        others = ", ".join(f"{name} {percent:.1f} %" for name, percent in sorted(predicted.items(), key=lambda item: item[1]))
+        text.append(f"T{stream.tool} {stream.material}: by {stream.composer}; predicted flow error, of on-off control's: {others}")
+        sat = found.saturation[stream.tool]
+        if not sat.enough:
+            ramp = found.ramp_that_would_do_s[stream.tool]
+            do = f"ramps of {ramp:.2f} s would do" if math.isfinite(ramp) else "no ramp would do: print slower, or raise printer.limit_mm"
+            text.append(
+                f"  the command reaches its limit {sat.share_percent:.1f} % of the printing time (peak {sat.peak_over_steady:.1f} x steady); {do}"
+            )
+    if found.judged:
+        worst = int(np.argmax(np.where(lines.duration_s >= 0, np.abs(lines.error_percent), 0)))
+        text.append(
+            f"volume of {found.judged} lines within {found.worst_line_volume_percent:.1f} % of the plan; "
+            f"of all lines the worst is line {lines.line[worst]}: {lines.error_percent[worst]:+.1f} % of {lines.planned_mm3[worst]:.3g} mm^3"
+        )
+    if np.any(lines.shorter_than_lead):
+        text.append(
+            f"{int(np.sum(lines.shorter_than_lead))} lines belong to runs shorter than the lead of Stop: the priority rule would not print them"
+        )
+    text += [f"line {one.line}: {one.why}" for one in found.refused]
+    return "\n".join(text)
+
+
 # ---- as tables
 
 
@@ -205,11 +270,17 @@ def report(part: Part) -> dict[str, Any]:
             p.material: {q.composer: _finite(q.rms_percent_of_on_off) for q in composed.predictions if q.material == p.material}
             for p in composed.predictions
         },
-        "saturation": {name: {key: _finite(value) for key, value in one._asdict().items()} for name, one in found.saturation.items()},
-        "ramp_that_would_do_s": {name: _finite(value) for name, value in found.ramp_that_would_do_s.items()},
+        "saturation": {
+            name: {key: _finite(value) for key, value in one._asdict().items()} for name, one in _by_material(part, found.saturation)
+        },
+        "ramp_that_would_do_s": {name: _finite(value) for name, value in _by_material(part, found.ramp_that_would_do_s)},
         "refused": refused,
         "unknown_words": len(part.program.other_line),
     }
+
+
+def _by_material(part: Part, of_tool: dict[int, Any]) -> list[tuple[str, Any]]:
+    return [(stream.material, of_tool[stream.tool]) for stream in part.composed.streams]
 
 
 def figures(judged: Sequence[tuple[Part, Sequence[Score]]]) -> dict[str, Any]:

@@ -113,7 +113,9 @@ def watch(path: str | Path, routine: Routine, *, printer: Printer, camera: Camer
         )
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-    return Watched(Trial(signals["command_mm"], found.flow, signals.get("flow_mm3_per_s")), found, len(times), rejected)
+    # within a pause only its volume was measured: a law learns nothing there
+    y = np.where(found.observable, found.flow, np.nan)
+    return Watched(Trial(signals["command_mm"], y, signals.get("flow_mm3_per_s")), found, len(times), rejected)
 
 
 def _beads(recording: trials.Trial, camera: Camera) -> Iterator[tuple[float, bead.Bead]]:

@@ -87,7 +87,7 @@ def _clocks(path: Path, columns: Sequence[Columns], notes: list[Note]) -> dict[s
         zero = np.datetime64(int(start // unit), "s")
         zones = sorted({group.zone or "of no zone" for group in columns})
         notes.append(Note("clock", "", 1, f"time is counted from {zero} ({', '.join(zones)}, as the recording's clock says)"))
-    return {group.name: (group.time - start) / unit for group in columns}
+    return {group.name: (group.time - start if start else group.time) / unit for group in columns}
 
 
 def _signal(
@@ -96,16 +96,16 @@ def _signal(
     """Time and values in our unit; a signal that is there in less than half of the rows, spread among them, keeps only those: it has its
     own clock."""
     present = np.isfinite(found)
-    where = np.flatnonzero(present)
-    if not where.size:
+    if not present.any():
         raise ValueError(
             f"{path}: {source.source} should hold numbers for {source.signal} but all of its {len(found)} values are"
             f" missing; map another source"
         )
     values = found if (source.scale, source.offset) == (1.0, 0.0) else found * source.scale + source.offset
-    missing = len(found) - where.size
-    if not missing:
+    if present.all():
         return time, values
+    where = np.flatnonzero(present)
+    missing = len(found) - len(where)
     if where.size < len(found) / 2 and where.size > 1 and np.median(np.diff(where)) > 1:
         notes.append(
             Note(

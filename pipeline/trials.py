@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from pipeline.artifacts import _beside, write_csv
+from pipeline.artifacts import beside, write_csv
 from pipeline.reading import image_messages
 from pipeline.reading.formats import Columns, check_clock, file_format
 from pipeline.reading.image_topics import Frames, Walk, columns, frame_times, image_topic
@@ -110,6 +110,14 @@ def write_command(path: str | Path, conditions: Conditions, *, time_s: np.ndarra
     write_csv(f"{path}.csv", {"time_s": np.asarray(time_s, float), COMMAND.source.partition(":")[2]: np.asarray(command_mm, float)})
 
 
+def read_command(path: str | Path) -> np.ndarray:
+    """The command u (T,) in mm of the CSV that write_command wrote. Raises ValueError where it is none."""
+    try:
+        return np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)[:, 1]
+    except (OSError, ValueError, IndexError) as error:
+        raise ValueError(f"{path}: expected two columns, time_s and the command in mm, found none ({error}); write it again with train_ilc") from None
+
+
 def _tables(path: str | Path, time_s: np.ndarray, signals: Sequence[tuple[Source, np.ndarray]]) -> dict[str, dict[str, np.ndarray]]:
     """{topic: {field: values}}, checked."""
     time = np.asarray(time_s, float)
@@ -130,7 +138,7 @@ def _tables(path: str | Path, time_s: np.ndarray, signals: Sequence[tuple[Source
 
 
 def _write(path: str | Path, conditions: Conditions, tables: dict, time_s: np.ndarray, pictures: tuple[str, Iterable] | None) -> None:
-    with _beside(path) as temporary:
+    with beside(path) as temporary:
         # by its name: only artifacts opens a file to write. Chunks, summary and conditions have a CRC each; one over all of it would be summed twice
         writer = Writer(str(temporary), compression=CompressionType.NONE)
         writer.start(profile="ros2", library="beadline")

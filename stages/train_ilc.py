@@ -7,13 +7,14 @@ from tqdm import tqdm
 from pipeline import artifacts, filming, learning, params, schemas
 from pipeline.deposition import training
 from pipeline.execution import run_all
+from pipeline.learning import TrainIlc
 from pipeline.printer import Camera, Printer
 
 
 def main() -> None:
     with artifacts.stage("train_ilc") as out:
         p, printer, camera, execution = (
-            params.load(learning.TrainIlc, "train_ilc"), params.load(Printer, "printer"), params.load(Camera, "camera"), params.load(params.Execution, "execution"),
+            params.load(TrainIlc, "train_ilc"), params.load(Printer, "printer"), params.load(Camera, "camera"), params.load(params.Execution, "execution"),
         )  # fmt: skip
         work = learning.Work(p, p.settings(printer), p.noise.shares(), printer, camera)
         (out / "recordings").mkdir()

@@ -141,6 +141,30 @@ def test_what_is_passed_over_or_taken_for_granted_is_noted_with_its_place(tmp_pa
     assert notes("time,u,y\n2025-11-21T13:00:00,1,2\n")[0][2].endswith("13:00:00 (of no zone, as the recording's clock says)")
 
 
+def test_an_epoch_of_another_program_counts_to_its_own_year(tmp_path):
+    def calendar(stamps: str, name: str = "timestamp") -> str:
+        rows = "".join(f"{stamp},1,2\n" for stamp in stamps.split())
+        return opened(tmp_path, f"{name},u,y\n{rows}").notes[-1].message[len("time is counted from ") :][:19]
+
+    for stamps in (
+        "1763730000000 1763730001000",
+        "1763730000000000 1763730001000000",
+        "1763730000000000000 1763730001000000000",
+        "134082036000000000 134082036010000000",  # Windows: 100 ns since 1601
+        "45982.541666667 45982.541678241",  # spreadsheets: days since 1899-12-30
+        "739942.541666667 739942.541678241",  # MATLAB: days since the year 0
+    ):
+        assert calendar(stamps) == "2025-11-21T13:00:00"
+
+
+@pytest.mark.parametrize("rate", [1, 50, 100, 500, 1000, 2000, 5000, 10_000])
+def test_seconds_since_a_machine_was_switched_on_are_no_days(tmp_path, rate):
+    """45,000 s are half a day of work, and as days they are the year 2023."""
+    raw = opened(tmp_path, "t,u,y\n" + "".join(f"{45000 + k / rate:.6f},1,2\n" for k in range(100)))
+    assert raw.notes == []
+    np.testing.assert_allclose(raw.signals["u"][0], 45000 + np.arange(100) / rate, rtol=0, atol=1e-9)
+
+
 def test_words_of_a_historian_for_no_value_are_missing_and_counted(tmp_path):
     raw = opened(tmp_path, "t,u,y\n0,1,2\n1,Bad,3\n2,No Data,3\n3,#REF!,3\n4,2,3\n5,2,3\n6,2,3\n")
     np.testing.assert_array_equal(raw.signals["u"][1], [1, np.nan, np.nan, np.nan, 2, 2, 2])

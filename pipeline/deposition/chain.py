@@ -17,6 +17,8 @@ HIGH = np.array([math.log(1e3), math.log(100.0), 1.0, math.log(20.0), 0.3, 0.5, 
 # steps of the central part of the Jacobian, small against what a trial can tell and large against rounding
 STEP = np.array([1e-3, 1e-3, 1e-3, 1e-2, 1e-3, 1e-3, 2e-3, 1e-2])
 AVERAGE_S = 0.2
+# a measured flow wanders from trial to trial: changes slower than this are trusted less than white noise would be
+DRIFT_S = 4.0
 LINEAR, CREEP = np.arange(6), np.arange(8)
 
 
@@ -118,9 +120,21 @@ def _extruder(z: np.ndarray, steady_flow: float) -> Extruder:
     return Extruder(gain, math.exp(z[1]), float(z[2]), math.exp(z[3]), float(play), float(yield_), float(z[6]), math.exp(z[7]))
 
 
-def fit(rows: Records, z: np.ndarray, free: np.ndarray, steady_flow: float, sample_time_s: float, *, evaluations: int) -> np.ndarray:
-    """The unknowns z with those in `free` moved to min |weight (simulated - measured flow)|^2 over the rows (output error, Gauss-Newton within bounds)."""
-    seen = rows.weight > 0
+def innovations(error: np.ndarray, weight: np.ndarray, sample_time_s: float) -> np.ndarray:
+    """Weighted errors (P, N, T) without what white noise upon a random walk lets one foresee: (1 - q^-1) / (1 - theta q^-1), theta = exp(-Ts / DRIFT_S).
+
+    That is the whitening filter of such a measurement (Muth 1960). Where nothing was seen (weight (N, T) 0) the last error seen stays.
+    """
+    seen = np.maximum.accumulate(np.where(weight > 0, np.arange(weight.shape[1]), 0), axis=1)
+    held = np.take_along_axis(error * weight, np.broadcast_to(seen, error.shape), axis=-1)
+    return scipy.signal.lfilter([1.0, -1.0], [1.0, -math.exp(-sample_time_s / DRIFT_S)], held)[..., weight > 0]
+
+
+def fit(
+    rows: Records, z: np.ndarray, free: np.ndarray, steady_flow: float, sample_time_s: float, *, evaluations: int
+) -> tuple[np.ndarray, float]:
+    """The unknowns z with those in `free` moved to the least sum of squared innovations of simulated - measured flow (output error, Gauss-Newton within bounds);
+    and that sum."""
 
     def moved(part):
         full = z.copy()
@@ -128,7 +142,7 @@ def fit(rows: Records, z: np.ndarray, free: np.ndarray, steady_flow: float, samp
         return full
 
     def weighted(difference):
-        return (difference * rows.weight)[seen] / steady_flow
+        return innovations(difference, rows.weight, sample_time_s) / steady_flow
 
     def errors(part):
         return weighted(simulate([_extruder(moved(part), steady_flow)], rows.u, sample_time_s=sample_time_s)[0] - rows.y)
@@ -138,13 +152,13 @@ def fit(rows: Records, z: np.ndarray, free: np.ndarray, steady_flow: float, samp
         sides = np.where(at + STEP < HIGH, STEP, -STEP)
         shifted = [at] + [at + np.where(np.arange(len(at)) == i, sides, 0.0) for i in free]
         flows = simulate([_extruder(p, steady_flow) for p in shifted], rows.u, sample_time_s=sample_time_s)
-        return np.stack([weighted(flows[k + 1] - flows[0]) / sides[i] for k, i in enumerate(free)], axis=1)
+        return weighted(flows[1:] - flows[0]).T / sides[free]
 
     start = np.clip(z[free], LOW[free], HIGH[free])
     found = scipy.optimize.least_squares(
         errors, start, jacobian, bounds=(LOW[free], HIGH[free]), x_scale=100 * STEP[free], ftol=1e-6, xtol=1e-6, max_nfev=evaluations
     )
-    return moved(found.x)
+    return moved(found.x), 2 * float(found.cost)
 
 
 def _start(rows: Records, steady_flow: float, sample_time_s: float) -> np.ndarray:
@@ -170,7 +184,7 @@ def _held_out(rows: Records, folds: np.ndarray, z: np.ndarray, free: np.ndarray,
     for fold in np.unique(folds):
         out = folds == fold
         rest = Records(*(part[~out] for part in rows))
-        left = _extruder(fit(rest, z, free, steady_flow, sample_time_s, evaluations=8), steady_flow)
+        left = _extruder(fit(rest, z, free, steady_flow, sample_time_s, evaluations=8)[0], steady_flow)
         last = np.flatnonzero(out)[-1:]
         error = simulate([left], rows.u[last], sample_time_s=sample_time_s)[0] - rows.y[last]
         squares.append(averaged(error[0], rows.weight[last[0]] > 0, sample_time_s) ** 2)
@@ -197,18 +211,14 @@ def identify(trainings: Sequence[Training], *, sample_time_s: float) -> Chain:
     steady_flow = max(float(np.max(training.r)) for training in trainings)
     rows = records(trainings)
     folds = rows.routine if len(trainings) > 1 else np.arange(len(rows.routine))
-    z = fit(rows, _start(rows, steady_flow, sample_time_s), LINEAR, steady_flow, sample_time_s, evaluations=40)
-    slow = fit(rows, np.where(np.arange(8) == 6, 0.05, z), CREEP, steady_flow, sample_time_s, evaluations=40)
-    residuals = [_residual(rows, at, steady_flow, sample_time_s) for at in (z, slow)]
+    z, cost = fit(rows, _start(rows, steady_flow, sample_time_s), LINEAR, steady_flow, sample_time_s, evaluations=40)
+    slow, slow_cost = fit(rows, np.where(np.arange(8) == 6, 0.05, z), CREEP, steady_flow, sample_time_s, evaluations=40)
     error, creeps = _held_out(rows, folds, z, LINEAR, steady_flow, sample_time_s), False
-    # less than this is drift that a slow mode happens to fit
-    if residuals[1] < 0.998 * residuals[0]:
+    # less than this is noise that a slow mode happens to fit
+    if slow_cost < 0.996 * cost:
         slow_error = _held_out(rows, folds, slow, CREEP, steady_flow, sample_time_s)
         creeps = slow_error < error
-    best, residual, error = (slow, residuals[1], slow_error) if creeps else (z, residuals[0], error)
+    best, error = (slow, slow_error) if creeps else (z, error)
+    left = simulate([_extruder(best, steady_flow)], rows.u, sample_time_s=sample_time_s)[0] - rows.y
+    residual = math.sqrt(np.sum((left * rows.weight) ** 2) / np.sum(rows.weight**2)) / steady_flow
     return Chain(_extruder(best, steady_flow), 100 * residual, 100 * error, creeps, sum(len(t.u) for t in trainings), len(rows.routine))
-
-
-def _residual(rows: Records, z: np.ndarray, steady_flow: float, sample_time_s: float) -> float:
-    error = simulate([_extruder(z, steady_flow)], rows.u, sample_time_s=sample_time_s)[0] - rows.y
-    return math.sqrt(np.sum((error * rows.weight) ** 2) / np.sum(rows.weight**2)) / steady_flow

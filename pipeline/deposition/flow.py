@@ -11,7 +11,8 @@ import scipy.linalg
 import scipy.optimize
 import scipy.sparse
 
-from pipeline.deposition.bead import BLOCK, area
+from pipeline.deposition.bead import area
+from pipeline.deposition.edges import BLOCK
 
 # instants a sample at which the nozzle is placed: at 8 mm/s and 50 Hz every 20 um, a third of a place
 INSTANTS = 8
@@ -96,7 +97,7 @@ def sections(
     """A(s) from widths (F, m) in mm at the `columns` (m,) of F frames taken with the gantry at `position` (F,); NaN is unread, 0 is bare substrate.
 
     Readings are gathered by place. Those closer to the nozzle than its radius, where the bead still grows, are left out; so are those beyond five robust
-    deviations from the median of their place. Raises ValueError where nothing is left.
+    deviations from the median of their place. Raises ValueError where nothing is left, or where the gantry does not move away from what the camera sees.
     """
     position, columns, widths = np.asarray(position, float), np.asarray(columns, float), np.asarray(widths, float)
     if widths.shape != (len(position), len(columns)):
@@ -108,6 +109,13 @@ def sections(
     if not used.any():
         raise ValueError(
             f"sections: none of {widths.size} readings is usable; look at why the frames were rejected, and at the nozzle's column in the view"
+        )
+    travel = -np.sign(np.median(behind)) * position[np.isfinite(position)]
+    retreat = float(np.max(np.maximum.accumulate(travel) - travel))
+    if retreat > nozzle_radius_mm:
+        raise ValueError(
+            f"sections: the gantry goes back by {retreat:.3g} mm, towards where the camera looks, so a place is seen before it is printed; "
+            "cut the record to one pass along the line, or turn the sign of the view's mm per px"
         )
     s, w = (position[:, None] + behind)[used], widths[used]
     length = BLOCK * abs(view.mm_per_px)
@@ -121,7 +129,7 @@ def sections(
     miss = np.abs(w - median[of])
     # one scatter for all places, a dozen readings each do not tell it; beside it the width may change along a place
     scatter = max(1.4826 * float(np.median(miss[w > 0])) if (w > 0).any() else 0.0, 0.02 * abs(view.mm_per_px))
-    keep = miss <= (GATE * scatter + np.abs(np.gradient(median) if len(median) > 1 else 0.0))[of]
+    keep = miss <= (GATE * scatter + np.abs(np.gradient(np.pad(median, 1, "edge"))[1:-1]))[of]
     kept = np.bincount(of, keep)
     A, where = np.bincount(of, area(w, contact_angle_deg) * keep) / kept, np.bincount(of, s * keep) / kept
     slope, blind = np.sqrt(4 * area(1.0, contact_angle_deg) * A), area(BLIND_PX * abs(view.mm_per_px), contact_angle_deg)

@@ -201,4 +201,4 @@ def lessons(runs: dict[tuple[str, int], list[Run]]) -> dict[str, np.ndarray]:
                 values = (*names, np.full(n, index), np.full(n, j), r.time_s, r.r, u, y, np.full(n, np.nan) if truth is None else truth)
                 for name, value in zip(parts, values, strict=True):
                     parts[name].append(value)
-    return {name: np.concatenate(values) for name, values in parts.items()}
+    return {name: np.concatenate(values) if values else np.array([]) for name, values in parts.items()}

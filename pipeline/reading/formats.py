@@ -10,11 +10,9 @@ import numpy as np
 from pipeline.reading.signals import Note, nearest_names
 
 # a number beyond that is no time in seconds but an epoch in ms, us, ns, or 100 ns as Windows counts from 1601 (1e11 s is the year 5138)
-_EPOCHS = ((5e17, 1e9, "ns"), (1e17, 1e7, "100 ns"), (1e14, 1e6, "us"), (1e11, 1e3, "ms"))
+_EPOCHS = ((5e17, 1e9, 0, "ns"), (1e17, 1e7, 11_644_473_600, "100 ns since 1601"), (1e14, 1e6, 0, "us"), (1e11, 1e3, 0, "ms"))
 # days since 1899-12-30 and since the year 0, from 1954 to 2119, and 1970-01-01 in them
 _SERIAL_DAYS = ((20_000, 80_000, 25_569, "spreadsheets"), (713_000, 774_000, 719_529, "MATLAB"))
-# so many days are 86 s; numbers of that size in seconds that are as near to one another come from no machine of ours
-_SERIAL_INTERVAL = 1e-3
 # a clock that runs on for no more than so many samples before it falls back is not one clock
 OTHER_DEVICE_RUN = 8
 _TIME_NAMES = (
@@ -217,15 +215,22 @@ def seconds(name: str, numbers: np.ndarray) -> tuple[np.ndarray, str]:
         return numbers / _PER_SECOND[unit], ""
     known = numbers[np.isfinite(numbers)]
     low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
-    for limit, per_second, unit in _EPOCHS:
+    for limit, per_second, epoch, unit in _EPOCHS:
         if high > limit:
-            return numbers / per_second, f"column {name} holds numbers up to {high:.3g} and was taken as an epoch in {unit}"
+            return numbers / per_second - epoch, f"column {name} holds numbers up to {high:.3g} and was taken as an epoch in {unit}"
     for first, last, epoch, program in _SERIAL_DAYS:
-        if first <= low and high <= last and len(known) > 1 and np.median(np.abs(np.diff(known))) < _SERIAL_INTERVAL:
+        if first <= low and high <= last and len(known) > 1 and _in_days(float(np.median(np.abs(np.diff(known))))):
             said = f"column {name} holds {low:.8g} to {high:.8g} and was taken as days, as {program} count them"
             # to the microsecond: what is left of a double there
             return np.round((numbers - epoch) * 86400, 6), said
     return numbers, ""
+
+
+def _in_days(interval: float) -> bool:
+    """Whether an interval is one of days: up to a second, or whole seconds up to a minute. Taken as seconds it would be 80 kHz, or a rate that no
+    machine of ours has: 1 kHz would be 86.4 s."""
+    in_seconds = interval * 86400
+    return 0 < in_seconds < 1.05 or (in_seconds < 61 and abs(in_seconds - round(in_seconds)) < 0.02)
 
 
 # ---- which way the time runs
@@ -270,6 +275,8 @@ def _remedy(group: Columns, steps_s: np.ndarray, back: np.ndarray) -> str:
     """What to do about a clock that stands still or runs backwards, by how it does."""
     if steps_s[back[0]] == 0:
         return "name a finer clock, or give each device or tag that writes here a column of its own"
+    if len(back) > 0.9 * len(steps_s):
+        return "sort the rows by time, from the oldest on"
     if len(back) >= 3 and len(steps_s) <= OTHER_DEVICE_RUN * (len(back) + 1):
         return "two devices with clocks of their own seem to write under one name: record each under a name of its own"
     if len(back) == 1 and abs(steps_s[back[0]] + 3600) <= 3 * np.median(np.abs(steps_s)):

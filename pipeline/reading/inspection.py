@@ -90,8 +90,9 @@ def _table(path: Path, kind: str) -> tuple[list[str], list[tuple[Columns, str]],
     wanted = [name for name in numeric if names.count(name) == 1]
     signals = [name for name in wanted if not is_time_name(name)]
     if not signals:
+        found = f" ({', '.join(others[:6] + twice)})" if others or twice else ""
         raise ValueError(
-            f"{path}: none of its {len(columns)} columns holds numbers beside the time ({', '.join(others[:6] + twice)}); write numbers without"
+            f"{path}: none of its {len(columns)} columns holds numbers beside the time{found}; write numbers without"
             " units, with one decimal mark, and a name for each column"
         )
     reader: Callable = read_csv if kind == "csv" else read_parquet

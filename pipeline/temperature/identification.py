@@ -149,6 +149,7 @@ def identify(
     offset: bool = True,
     refinement: Literal["none", "prediction", "simulation", "validated"] = "none",
     max_order: int = 12,
+    max_radius: float | None = None,
     blocks: int = 5,
     limits: tuple[Sequence[float], Sequence[float]] | None = None,
     names: Sequence[str] = (),
@@ -157,7 +158,7 @@ def identify(
 
     `method` makes the start: PBSID, or past-output MOESP with the Kalman gain of its one-step errors; both give the innovation form. `refinement` "prediction" or
     "simulation" moves it to the least errors of that kind; "validated" does so only where the left-out blocks prefer it. `feedthrough` None lets the data decide.
-    `limits` (low, high) of the actuators clip u. Works in closed loop, unless refined on simulation errors.
+    `limits` (low, high) of the actuators clip u; `max_radius` bounds every pole. Works in closed loop, unless refined on simulation errors.
     Raises ValueError for a constant or collinear input, a constant output, a record too short for the order, and shapes that do not agree.
     """
     u, y = [np.atleast_2d(np.asarray(a, float)) for a in u], [np.atleast_2d(np.asarray(b, float)) for b in y]
@@ -182,13 +183,13 @@ def identify(
         kind = kind.replace("validated", "subspace")
     elif order is None or refinement == "validated":
         structures = [structure._replace(past=n, feedthrough=d) for n in pasts for d in direct]
-        chosen, table = _choose(u, y, structures, order, max_order, blocks, refinement == "validated")
+        chosen, table = _choose(u, y, structures, order, max_order, refinement == "validated", {"blocks": blocks, "max_radius": max_radius})
         order, structure, kind = chosen.order, chosen.structure, chosen.fit if refinement == "validated" else kind
     if feedthrough is None:
         notes.append(
             f"direct feed-through {'kept' if structure.feedthrough else 'left out'} by Schwarz's criterion and the left-out blocks"
         )
-    found = _fit_all(u, y, structure, exact, order, kind, method, sample_time_s, table)
+    found = _fit_all(u, y, structure, exact, order, kind, method, sample_time_s, table, max_radius)
     return found._replace(dropped_rows=found.dropped_rows + cut, notes=notes + _remarks(found, names))
 
 
@@ -204,7 +205,7 @@ def _windows(u, y, order, past, offset) -> tuple[tuple[int, ...], bool]:
     return tuple(sorted({max(n, least) for n in pasts}, reverse=True)), exact
 
 
-def _choose(u, y, structures, order, max_order, blocks, validated) -> tuple[Candidate, list[Candidate]]:
+def _choose(u, y, structures, order, max_order, validated, settings) -> tuple[Candidate, list[Candidate]]:
     """The candidate that the rules take, and the table: structures and orders of the subspace fit, then the refined fits of the winner."""
     table = []
     for structure in structures:
@@ -219,27 +220,25 @@ def _choose(u, y, structures, order, max_order, blocks, validated) -> tuple[Cand
             delays |= {dead_time(model, furthest), tuple(quiet.tolist())}
         for d in sorted(delays):
             table += cross_validate(
-                u, y, orders, structure._replace(delays=d), ("subspace",), blocks=blocks, singular_values=sub.singular_values
+                u, y, orders, structure._replace(delays=d), ("subspace",), singular_values=sub.singular_values, **settings
             )
     if not table:
         raise ValueError(
-            f"the record is too short to choose a model by leaving out one of {blocks} blocks: {sum(map(len, u))} samples do not carry a window of"
+            f"the record is too short to choose a model by leaving out one of {settings['blocks']} blocks: {sum(map(len, u))} samples do not carry a window of"
             f" {structures[-1].past} without one; record longer, or give order and past"
         )
     chosen = simplest(table)
     if validated:
         known = {row.order: row.singular_value for row in table if row.structure == chosen.structure}
         values = np.array([known.get(n, np.nan) for n in range(1, chosen.order + 1)])
-        refined = cross_validate(
-            u, y, [chosen.order], chosen.structure, ("prediction", "simulation"), blocks=blocks, singular_values=values
-        )
+        refined = cross_validate(u, y, [chosen.order], chosen.structure, ("prediction", "simulation"), singular_values=values, **settings)
         table += refined
         best = min(refined, key=lambda row: row.error, default=chosen)
         chosen = best if best.error < (1 - WORTH_REFINING) * chosen.error else chosen
     return chosen, table
 
 
-def _fit_all(u, y, structure, exact, order, kind, method, sample_time_s, table) -> Identified:
+def _fit_all(u, y, structure, exact, order, kind, method, sample_time_s, table, max_radius) -> Identified:
     """One fit of the chosen model on all of the record."""
     past, rest = structure.past, {"feedthrough": structure.feedthrough, "offset": structure.offset}
     us, ys = shifted(u, y, structure.delays)
@@ -250,10 +249,10 @@ def _fit_all(u, y, structure, exact, order, kind, method, sample_time_s, table) 
             f"order {order} needs a longer window: {past} past samples give at most {len(sub.singular_values)} states; raise past"
         )
     if method == "moesp":
-        plant = kalman_gain(moesp(us, ys, past, order, sample_time_s=sample_time_s, **rest)[0], us, ys)
+        plant = kalman_gain(moesp(us, ys, block_rows(us, ys, past, order), order, sample_time_s=sample_time_s, **rest)[0], us, ys)
     else:
         plant = realise(data, sub.basis[:order], sample_time_s)
-    plant = with_delays(fit(kind, plant, us, ys, max_iterations=30, **rest), structure.delays)
+    plant = with_delays(fit(kind, plant, us, ys, max_iterations=30, max_radius=max_radius, **rest), structure.delays)
     model = simulation_form(plant, [])
     return Identified(
         plant=plant,
@@ -272,6 +271,13 @@ def _fit_all(u, y, structure, exact, order, kind, method, sample_time_s, table) 
         dropped_rows=data.dropped_rows,
         notes=[],
     )
+
+
+def block_rows(u: Segments, y: Segments, past: int, order: int) -> int:
+    """Block rows s for past-output MOESP: the window, but at least what the order needs, (s - 1) p >= order, and else no more than give as many rows as columns."""
+    p, q, lengths = y[0].shape[1], u[0].shape[1] + y[0].shape[1], np.array([len(w) for w in complete_runs(u, y)])
+    least = -(-order // p) + 1
+    return max([s for s in range(least, past + 1) if np.maximum(lengths - 2 * s + 1, 0).sum() >= 2 * s * q + 1], default=least)
 
 
 def _remarks(found: Identified, names: Sequence[str]) -> list[str]:

@@ -18,7 +18,7 @@ WIDEST = 360  # columns of the lagged record: the cost of a fit grows with their
 WORTH_REFINING = 0.05  # a refined fit must take this share off the error: its own cost of computing and of fitting noise
 WORTH_A_STATE = 0.02  # a state that takes less than this share off the error is not worth carrying in a controller
 SMALLEST = 1e-9  # share of an output's variation below which an error is rounding
-LARGEST_RADIUS = 1.0 - 1e-6  # refined plants are kept stable: no record shows a time constant of a million samples
+LARGEST_RADIUS = 1.0 - 1e-6  # of the plants of a spread, which are simulated for ever: no record shows a time constant of a million samples
 
 
 class Structure(NamedTuple):
@@ -208,25 +208,45 @@ def folds(u: Segments, y: Segments, count: int) -> list[tuple[list, list, list, 
     return out
 
 
+def largest_radius(u: Segments) -> float:
+    """e^(3/T): a mode that refinement leaves in the plant may grow 20-fold over the longest segment of T samples, no more; so slow an instability is real or harmless."""
+    return float(np.exp(3.0 / max(map(len, u))))
+
+
 def fit(
-    kind: Fit, start: Plant, u: Segments, y: Segments, *, feedthrough: bool, offset: bool, max_iterations: int, gain: bool = True
+    kind: Fit,
+    start: Plant,
+    u: Segments,
+    y: Segments,
+    *,
+    feedthrough: bool,
+    offset: bool,
+    max_iterations: int,
+    max_radius: float | None = None,
+    gain: bool = True,
 ) -> Plant:
-    """The plant that the named fit makes of the subspace start: the start itself, refined on one-step errors, or refined on simulation errors; `gain` False leaves the last without K."""
+    """The plant that the named fit makes of the subspace start: the start itself, refined on one-step errors, or refined on simulation errors.
+
+    Every pole stays within `max_radius` where given, and a refined plant's within `largest_radius`. `gain` False leaves a plant refined on simulation errors without K.
+    """
+    radius = max_radius or largest_radius(u)
     if kind == "subspace":
-        return start
-    start = stabilised(start, LARGEST_RADIUS)
+        return stabilised(start, radius) if max_radius else start
+    start = stabilised(start, radius)
     if kind == "prediction" and np.abs(np.linalg.eigvals(start.A - start.K @ start.C)).max() >= 1:
         start = kalman_gain(start, u, y)
     if kind == "simulation":
         linear = fit_inputs(start.A, start.C, u, y, feedthrough=feedthrough, offset=offset)
         m = start.m
         start = make_plant(linear.F, linear.G[:, :m], linear.C, linear.H[:, :m], linear.G[:, m], linear.H[:, m], None, start.sample_time_s)
-    settings = {"feedthrough": feedthrough, "offset": offset, "max_radius": LARGEST_RADIUS, "max_iterations": max_iterations}
+    settings = {"feedthrough": feedthrough, "offset": offset, "max_radius": radius * (1 + 1e-12), "max_iterations": max_iterations}
     found = refine(start, u, y, criterion=kind, **settings).plant
     return kalman_gain(found, u, y) if gain and kind == "simulation" else found
 
 
-def cross_validate(u, y, orders, structure: Structure, kinds: tuple[Fit, ...], *, blocks: int, singular_values) -> list[Candidate]:
+def cross_validate(
+    u, y, orders, structure: Structure, kinds: tuple[Fit, ...], *, blocks: int, singular_values, max_radius: float | None = None
+) -> list[Candidate]:
     """The order table's rows for one structure: each order and fit, identified without a block and simulated on it, for each of `blocks` blocks.
 
     A structure whose window does not fit into what remains of the record has no rows.
@@ -242,7 +262,7 @@ def cross_validate(u, y, orders, structure: Structure, kinds: tuple[Fit, ...], *
         for order in orders:
             start = realise(data, basis[:order], 1.0)
             for kind in kinds:
-                plant = fit(kind, start, train_u, train_y, **rest, max_iterations=10, gain=False)
+                plant = fit(kind, start, train_u, train_y, **rest, max_iterations=8, max_radius=max_radius, gain=False)
                 errors.setdefault((order, kind), []).append(max(float(simulation_errors(plant, test_u, test_y).mean()), SMALLEST))
     m, p = u[0].shape[1], y[0].shape[1]
     more = (

@@ -361,7 +361,7 @@ def kalman_gain(plant: Plant, u: Sequence[np.ndarray], y: Sequence[np.ndarray], 
         while damping < 1e6:
             step = np.linalg.solve(JJ / np.outer(scale, scale) + damping * np.eye(n * p), Je / scale) / scale
             trial = K + basis @ step.reshape(n, p)
-            if np.abs(np.linalg.eigvals(plant.A - trial @ plant.C)).max() < 1:
+            if np.isfinite(trial).all() and np.abs(np.linalg.eigvals(plant.A - trial @ plant.C)).max() < 1:
                 model_t, e_t = errors(trial)
                 cost_t = sum(np.sum((a * weight) ** 2) for a in e_t)
                 if cost_t < cost:

@@ -134,7 +134,10 @@ def _moment_factor(runs, past, columns, mean, rows) -> np.ndarray:
     S = sum(lagged_moments(w, past) for w in runs) - rows * np.outer(mean, mean)
     S = S[np.ix_(columns, columns)]
     scale = np.sqrt(np.maximum(np.diag(S), np.finfo(float).tiny))
-    return np.linalg.cholesky(S / np.outer(scale, scale) + ROUNDING * np.eye(len(S))).T * scale
+    try:
+        return np.linalg.cholesky(S / np.outer(scale, scale) + ROUNDING * np.eye(len(S))).T * scale
+    except np.linalg.LinAlgError:  # a channel whose movement is lost in the rounding of its mean: the rows themselves, with the same ridge
+        return np.linalg.qr(np.vstack([_exact_factor(runs, past, columns, mean, rows), np.sqrt(ROUNDING) * np.diag(scale)]), mode="r")
 
 
 def _exact_factor(runs, past, columns, mean, rows) -> np.ndarray:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.deposition.bead import area, calibrate, drawn, drift, gray, measure, millimetres
+from pipeline.deposition.bead import area, calibrate, drawn, drift, gray, measure, measure_all, millimetres
 from pipeline.deposition.rendering import HARD, NOMINAL, Camera
 
 VIEW = {"columns": (0, 600), "longest_blur_px": 6.0}
@@ -179,7 +179,27 @@ def test_colour_becomes_gray_by_the_usual_weights():
     assert gray(np.full((60, 60, 3), (10, 20, 30), np.uint8))[0, 0] == round(0.114 * 10 + 0.587 * 20 + 0.299 * 30)
 
 
-# ---- calibration, cross-section, picture
+@pytest.mark.parametrize("level", [NOMINAL, HARD])
+def test_many_frames_at_once_give_the_same_numbers_as_each_alone(level):
+    camera = Camera(level, np.random.default_rng(112))
+    widths = [110.0, 0.0, 25.0, np.where(np.arange(640) < 300, 0.0, 200.0), 70.0]
+    frames = [camera.frame(w, stage_px=97 * i) for i, w in enumerate(widths)] + [strip(110.0, level=255.0), strip(150.0, middle=60.0)]
+    together = measure_all(frames, **VIEW)
+    assert [bead.reason for bead in together] == ["", "no bead", "", "", "", "saturated", "cut by the frame"]
+    for bead, frame in zip(together, frames, strict=True):
+        alone = measure(frame, **VIEW)
+        assert bead.reason == alone.reason
+        np.testing.assert_allclose(bead.widths, alone.widths, atol=1e-3)  # rounds of the blur end together
+        np.testing.assert_allclose(bead.width, alone.width, atol=1e-3)
+    assert measure_all([], **VIEW) == []
+
+
+def test_frames_of_two_sizes_are_not_measured_together():
+    with pytest.raises(ValueError, match=r"frames of one size and kind but found .*\(240, 320\).*\(480, 640\)"):
+        measure_all([strip(110.0), strip(110.0, h=240, w=320)], columns=(0, 320), longest_blur_px=6.0)
+
+
+# ---- calibration
 
 
 def test_gain_and_offset_come_back_and_the_residuals_are_what_is_left():
@@ -220,6 +240,9 @@ def test_the_alarm_goes_when_the_lens_has_moved_and_not_for_scatter():
 def test_a_calibration_that_determines_nothing_is_refused(px, mm, message):
     with pytest.raises(ValueError, match=message):
         calibrate(np.array(px), np.array(mm))
+
+
+# ---- cross-section, picture
 
 
 def test_the_cross_section_of_a_half_round_bead_is_a_half_circle():

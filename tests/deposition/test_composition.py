@@ -9,7 +9,7 @@ import pytest
 from pipeline import gcode
 from pipeline.deposition import basis
 from pipeline.deposition.composition import BASIS, commands, compose, priority, superposition
-from pipeline.deposition.library import learned
+from pipeline.deposition.library import Basis, Library, learned
 from pipeline.deposition.motion import plan
 from tests.deposition.trained import AREA, CREEPING, NOZZLE, PLANT, RAMP, TS, known, percent_of_on_off, protocol, trainings
 
@@ -80,6 +80,22 @@ def test_the_library_composed_for_its_own_routine_is_what_was_learned():
     start = round(lesson.start_s / TS)
     ours, theirs = u[begin - 20 : begin + 500], taught[start - 20 : start + 500]
     assert np.linalg.norm(ours - theirs) < 0.2 * np.linalg.norm(theirs)  # Start is the mean over two pauses, and each plateau its mean
+
+
+def test_where_tasks_overlap_the_higher_one_rules_and_superposition_adds_them():
+    """A line of 0.5 s between Start (3, from 0.2 s before to 0.4 s after) and Stop (-5, from 0.3 s before to 0.2 s after), Steady-State 1 at 8 mm/s."""
+    columns = [Basis("Stop", "A", NOZZLE, 8.0, 0.0, 15, np.full(25, -5.0)), Basis("Start", "A", NOZZLE, 8.0, 0.0, 10, np.full(30, 3.0))]
+    columns += [Basis("Steady-State", "A", NOZZLE, 8.0, 0.0, 0, np.ones(1)), Basis("No-Flow", "A", NOZZLE, 8.0, 0.0, 0, np.zeros(1))]
+    made = composed("G21\nG90\nM83\nT0\nG0 X40 Y0 F480\nG1 X44 E1\nG0 X84\nG4 P3000")
+    k = round(made.lines.begin_s[0] / TS)
+    where = (Library(tuple(columns), TS, {}), "A", NOZZLE, made.tasks, made.lines, 0)
+    by_rank, added = (by(*where, samples=len(made.streams[0].r)) for by in (priority, superposition))
+    assert round((made.lines.end_s[0] - made.lines.begin_s[0]) / TS) == 25
+    expected = np.repeat([0.0, 3.0, -5.0, 0.0], [5, 20, 25, 5])  # before; Start until Stop takes over; Stop; after
+    np.testing.assert_array_equal(by_rank[k - 15 : k + 40], expected)
+    # from 0.2 s to 0.4 s both: 3 + (-5 - 1); then Stop alone
+    expected = np.repeat([0.0, 3.0, -3.0, -5.0, 0.0], [5, 20, 10, 15, 5])
+    np.testing.assert_allclose(added[k - 15 : k + 40], expected, atol=1e-12)
 
 
 def test_the_wanted_flow_holds_the_volume_of_every_line_and_of_no_travel():

@@ -1,10 +1,13 @@
 """Widths of many frames -> A(s) -> Q(t): exact without noise, within the bars through rendered pixels, honest about pauses, refusals."""
 
+import itertools
+
 import cv2
 import numpy as np
 import pytest
 
-from pipeline.deposition.bead import BLOCK, area, measure
+from pipeline.deposition.bead import area, measure
+from pipeline.deposition.edges import BLOCK
 from pipeline.deposition.extruder import draw, flow, routine
 from pipeline.deposition.flow import Sections, View, deposit_share, estimate, sections
 from pipeline.deposition.rendering import HARD, NOMINAL, Camera
@@ -16,7 +19,16 @@ LENGTH = BLOCK / 125
 
 
 def reference(**changes):
-    settings = {"off_s": 4.0, "on_s": 6.0, "pause_s": 0.6, "tail_s": 8.0, "speed": SPEED, "bead_area_mm2": AREA, "ramp_s": 0.15, "sample_time_s": 0.02}
+    settings = {
+        "off_s": 4.0,
+        "on_s": 6.0,
+        "pause_s": 0.6,
+        "tail_s": 8.0,
+        "speed": SPEED,
+        "bead_area_mm2": AREA,
+        "ramp_s": 0.15,
+        "sample_time_s": 0.02,
+    }
     return routine(**{**settings, **changes})
 
 
@@ -28,7 +40,7 @@ def exact_sections(time_s, Q, position) -> Sections:
     t = np.linspace(time_s[0], time_s[-1], 40 * (len(time_s) - 1) + 1)
     x, volume = np.interp(t, time_s, position), np.interp(t, time_s, Q) * (t[1] - t[0])
     faces = position[0] - 0.5 + LENGTH * np.arange(int((np.ptp(position) + 1.0) / LENGTH))
-    A = np.array([volume @ (deposit_share(b - x, RADIUS) - deposit_share(a - x, RADIUS)) for a, b in zip(faces[:-1], faces[1:], strict=True)]) / LENGTH
+    A = np.array([volume @ (deposit_share(b - x, RADIUS) - deposit_share(a - x, RADIUS)) for a, b in itertools.pairwise(faces)]) / LENGTH
     return Sections((faces[:-1] + faces[1:]) / 2, A, np.full(len(A), 1e-4), np.full(len(A), 17), LENGTH, 0)
 
 
@@ -62,7 +74,9 @@ def test_the_footprint_is_the_chord_of_the_nozzle():
     assert deposit_share(np.array([-9.0, -0.25, 0.0, 0.25, 9.0]), 0.25) == pytest.approx([0.0, 0.0, 0.5, 1.0, 1.0])
     z = np.linspace(-0.25, 0.25, 2001)
     chord = 2 * np.sqrt(0.25**2 - z**2) / (np.pi * 0.25**2)
-    np.testing.assert_allclose(np.gradient(deposit_share(z, 0.25), z)[5:-5], chord[5:-5], rtol=1e-2)  # difference quotient beside the steep ends
+    np.testing.assert_allclose(
+        np.gradient(deposit_share(z, 0.25), z)[5:-5], chord[5:-5], rtol=1e-2
+    )  # difference quotient beside the steep ends
 
 
 @pytest.mark.parametrize("name", ["wanted", "on-off"])
@@ -96,7 +110,9 @@ def test_the_deviation_is_that_of_the_errors_under_white_noise():
     exact, rng = exact_sections(SHORT.time_s, on_off(SHORT), SHORT.position), np.random.default_rng(8)
     clean, errors, deviations = inverted(SHORT, exact), [], []
     for _ in range(8):
-        noisy = exact._replace(area=exact.area + np.where(exact.area > 0, 2e-3, 0) * rng.standard_normal(len(exact.s)), deviation=np.full(len(exact.s), 2e-3))
+        noisy = exact._replace(
+            area=exact.area + np.where(exact.area > 0, 2e-3, 0) * rng.standard_normal(len(exact.s)), deviation=np.full(len(exact.s), 2e-3)
+        )
         found = inverted(SHORT, noisy)
         steady = (SHORT.time_s > 2.2) & (SHORT.time_s < 3.0)
         errors.append((found.flow - clean.flow)[steady])
@@ -107,7 +123,13 @@ def test_the_deviation_is_that_of_the_errors_under_white_noise():
 def test_a_shift_of_the_calibration_is_in_the_deviation():
     exact = exact_sections(SHORT.time_s, SHORT.r, SHORT.position)
     found = estimate(
-        SHORT.time_s, SHORT.position, exact, nozzle_radius_mm=RADIUS, shapes=SHORT.r[None], contact_angle_deg=90.0, width_deviation_mm=0.0088
+        SHORT.time_s,
+        SHORT.position,
+        exact,
+        nozzle_radius_mm=RADIUS,
+        shapes=SHORT.r[None],
+        contact_angle_deg=90.0,
+        width_deviation_mm=0.0088,
     )
     steady = (SHORT.time_s > 2.2) & (SHORT.time_s < 3.0)
     np.testing.assert_allclose(found.deviation[steady] / found.flow[steady], 0.02, rtol=0.05)  # 2 x 1 % of 0.88 mm
@@ -143,6 +165,27 @@ def test_columns_under_the_nozzle_and_unread_blocks_are_left_out():
     np.testing.assert_allclose(found.s, [-88 / 125])
     with pytest.raises(ValueError, match=r"none of 4 readings is usable; look at why the frames were rejected"):
         sections(np.array([0.0, 0.5]), columns, np.full((2, 2), np.nan), view=VIEW, nozzle_radius_mm=RADIUS, contact_angle_deg=90.0)
+
+
+def test_a_gantry_that_comes_back_is_refused():
+    columns, widths = np.array([100.0, 300.0]), np.full((40, 2), 0.88)
+    there_and_back = np.concatenate([np.arange(20.0), np.arange(20.0)[::-1]])
+    for position, view in ((there_and_back, VIEW), (np.arange(40.0), View(-1 / 125, 648.0))):
+        with pytest.raises(
+            ValueError, match=r"the gantry goes back by (19|39) mm, .* cut the record to one pass along the line, or turn the sign"
+        ):
+            sections(position, columns, widths, view=view, nozzle_radius_mm=RADIUS, contact_angle_deg=90.0)
+
+
+def test_what_no_frame_saw_is_not_observable_and_the_rest_does_not_suffer():
+    exact = exact_sections(SHORT.time_s, SHORT.r, SHORT.position)
+    dark = (exact.s > 18.0) & (exact.s < 21.0)
+    kept = Sections(*(part[~dark] for part in exact[:4]), LENGTH, 0)
+    found = inverted(SHORT, kept)
+    blind = (SHORT.position > 18.3) & (SHORT.position < 20.7)
+    assert not found.observable[blind].any()
+    assert found.observable[SHORT.position < 17.5].all()
+    assert percent(found, SHORT.r, found.observable) < 0.5
 
 
 # ---- through pixels

@@ -92,6 +92,16 @@ def test_noise_on_the_command_hardly_moves_the_marks():
         )  # s; cut on the raw command the noise alone would exceed 2 % of the peak
 
 
+def test_a_vibration_that_the_filter_takes_out_does_not_move_the_marks():
+    training = handmade()
+    t = training.routine.time_s
+    # a tenth of the peak at 12 Hz, for a second before the Start: on the command as it is, the Start would begin with it
+    shaken = training._replace(
+        u=training.u + 10 * np.sin(2 * np.pi * 12 * t) * ((t > training.routine.start_s - 1.6) & (t < training.routine.start_s - 0.6))
+    )
+    assert demarcate([shaken], sample_time_s=TS)["Start"][0] < demarcate([training], sample_time_s=TS)["Start"][0] + 0.1
+
+
 def test_all_materials_are_cut_at_the_same_points():
     library = build([handmade("A"), handmade("B", level=3.0)], sample_time_s=TS)
     for task in ("Start", "Corner", "Stop"):

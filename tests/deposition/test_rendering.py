@@ -38,7 +38,7 @@ def test_a_tilted_bead_is_as_wide_across_its_line():
 
 def test_the_volume_on_the_stage_is_the_volume_that_flowed():
     flow = np.where((TIME > 0.3) & (TIME < 0.6), 2.4, 0.0)
-    frame = trial(CLEAN, flow, 4.0 * TIME)[-1][1]
+    frame = trial(CLEAN, flow, 2.0 * TIME)[-1][1]
     widths = summed_width(frame[:, :600]) / 125
     volume = area(np.maximum(widths, 0), 90.0).sum() / 125
     assert volume == pytest.approx(np.trapezoid(flow, TIME), rel=0.01)  # widths dithered by a quarter of a pixel
@@ -50,7 +50,9 @@ def test_a_pause_lays_its_volume_over_one_footprint():
     frame = trial(CLEAN, flow, position)[45][1]  # 1.5 s: the nozzle is 4 mm past the pause
     widths = np.where(summed_width(frame) > 3, summed_width(frame), 0)[:600]
     there = np.flatnonzero(widths) + 0.0
-    assert np.ptp(there) / 125 == pytest.approx(2 * NOZZLE[0], abs=0.03)  # two samples of the flow's edges and a pixel's blur do not move the nozzle
+    assert np.ptp(there) / 125 == pytest.approx(
+        2 * NOZZLE[0], abs=0.03
+    )  # two samples of the flow's edges and a pixel's blur do not move the nozzle
     assert there.mean() == pytest.approx(648 - 4.0 * 125, abs=2.0)
 
 
@@ -85,5 +87,8 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_others():
 
 def test_one_camera_lays_every_trial_on_a_fresh_part_of_the_stage():
     camera = Camera(NOMINAL._replace(noise=0.0), np.random.default_rng(7))
-    first, second = (next(camera.trial(TIME, 0 * TIME, 0 * TIME, view=VIEW, frame_rate_hz=30.0, nozzle_mm=NOZZLE, contact_angle_deg=90.0))[1] for _ in range(2))
+    first, second = (
+        next(camera.trial(TIME, 0 * TIME, 0 * TIME, view=VIEW, frame_rate_hz=30.0, nozzle_mm=NOZZLE, contact_angle_deg=90.0))[1]
+        for _ in range(2)
+    )
     assert not np.array_equal(first, second)
