@@ -54,7 +54,7 @@ def write(path: Path, kind: str, count: int) -> None:
         return
     numbers = "".join(f"float64 {name}\n" for name in NAMES)
     schema = {"json": b"", "cdr": numbers.encode(), "cdr_header": (HEADER + numbers + HEADER_TYPES).encode()}[kind]
-    fixed, headed = struct.Struct(f"<4x{len(NAMES)}d"), struct.Struct(f"<4xiII12s4x{len(NAMES)}d")
+    fixed, headed = struct.Struct(f"<4x{len(NAMES)}d"), struct.Struct(f"<4xiII12s{len(NAMES)}d")
 
     def message(k: int, row: list[float]) -> bytes:
         if kind == "json":
@@ -78,6 +78,7 @@ def ours(path: Path) -> int:
     from pipeline.recordings import Source, read
 
     raw = read(path, [Source(name, name, "1") for name in (NAMES[0], NAMES[3], NAMES[7])])
+    assert raw.signals[NAMES[7]][1][0] == next(rows(1))[7], "what is read is not what was written"
     return len(raw.signals[NAMES[7]][1])
 
 

@@ -187,7 +187,7 @@ def estimate(
     deviation = np.hypot(deviation, share * Q)
     speed = np.abs(np.gradient(position, dt))
     moving = speed > SLOW * speed.max()
-    lit = np.asarray(K.sum(axis=0)).ravel() * seen.length > 0.5 * dt
+    lit = np.asarray(K.sum(axis=0)).ravel() * seen.length > 0.4 * dt
     per_travel = np.where(moving, Q / np.where(moving, speed, 1.0), np.nan)
     pauses = tuple(_pause(a, b, time_s, Q, fit.factor, spread) for a, b in _runs(~moving))
     return Flow(Q, deviation, moving & lit, per_travel, pauses, fit.a, float(np.exp(best.x)), noise, int(np.sum(robust < 0.5)))

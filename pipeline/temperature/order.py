@@ -9,7 +9,17 @@ import scipy.stats
 
 from pipeline.temperature.plant import Plant, markov_parameters
 from pipeline.temperature.plant import plant as make_plant
-from pipeline.temperature.refinement import drives, fit_inputs, fitted_state, free_response, kalman_gain, refine, respond, simulation_form
+from pipeline.temperature.refinement import (
+    drawn_in,
+    drives,
+    fit_inputs,
+    fitted_state,
+    free_response,
+    kalman_gain,
+    refine,
+    respond,
+    simulation_form,
+)
 from pipeline.temperature.subspace import Lagged, Segments, complete_runs, lagged, one_step, realise, subspace
 
 Fit = Literal["subspace", "prediction", "simulation"]
@@ -158,13 +168,8 @@ def with_delays(plant: Plant, delays: tuple[int, ...]) -> Plant:
 
 
 def stabilised(plant: Plant, radius: float) -> Plant:
-    """The plant with every pole beyond `radius` drawn back onto it along its ray, in the modal basis."""
-    eigenvalues, T = np.linalg.eig(plant.A)
-    size = np.abs(eigenvalues)
-    if size.max() <= radius:
-        return plant
-    drawn = eigenvalues * np.where(size > radius, radius * (1 - 1e-9) / np.maximum(size, 1e-300), 1.0)
-    return plant._replace(A=np.real((T * drawn) @ np.linalg.inv(T)))
+    """The plant with every pole beyond `radius` drawn back onto it along its ray."""
+    return plant._replace(A=drawn_in(plant.A, radius))
 
 
 def simulation_errors(plant: Plant, u: Segments, y: Segments) -> np.ndarray:

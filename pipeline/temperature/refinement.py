@@ -204,6 +204,16 @@ def gauss_newton(
     return model, costs
 
 
+def drawn_in(A: np.ndarray, radius: float) -> np.ndarray:
+    """A with every eigenvalue beyond `radius` drawn back onto it along its ray, in the modal basis."""
+    eigenvalues, T = np.linalg.eig(A)
+    size = np.abs(eigenvalues)
+    if size.max() <= radius:
+        return A
+    drawn = eigenvalues * np.where(size > radius, radius * (1 - 1e-9) / np.maximum(size, 1e-300), 1.0)
+    return np.real((T * drawn) @ np.linalg.inv(T))
+
+
 def fit_inputs(A, C, u, y, *, feedthrough: bool, offset: bool) -> Predictor:
     """B, b, D, d and every x0 that simulate y best for given A (n, n), C (p, n): a linear least-squares problem (Verhaegen 1994; SLICOT IB01CD).
 

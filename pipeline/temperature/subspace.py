@@ -12,10 +12,11 @@ import scipy.linalg
 
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.plant import plant as make_plant
-from pipeline.temperature.refinement import fit_inputs
+from pipeline.temperature.refinement import drawn_in, fit_inputs
 
 ROUNDING = 1e-13  # relative ridge on second moments: what their own rounding amounts to
 RANK = 1e-11  # directions of the record below this share of the largest are rounding
+GROWTH = 1e6  # a mode that grows more than this over a segment has lost the digits by which it could be fitted
 Segments = Sequence[np.ndarray]
 
 
@@ -263,7 +264,7 @@ def moesp(
             f"moesp: {block_rows} block rows of {p} outputs allow orders 1 to {(block_rows - 1) * p} but {order} was asked for; take more block rows"
         )
     gamma = _moesp_svd(u, y, block_rows, offset)[0][:, :order]
-    A = np.linalg.lstsq(gamma[:-p], gamma[p:], rcond=None)[0]
+    A = drawn_in(np.linalg.lstsq(gamma[:-p], gamma[p:], rcond=None)[0], GROWTH ** (1.0 / max(map(len, u))))
     model = fit_inputs(A, gamma[:p], u, y, feedthrough=feedthrough, offset=offset)
     m = u[0].shape[1]
     return make_plant(model.F, model.G[:, :m], model.C, model.H[:, :m], model.G[:, m], model.H[:, m], None, sample_time_s), model.x0

@@ -95,9 +95,9 @@ def test_noise_on_the_command_hardly_moves_the_marks():
 def test_a_vibration_that_the_filter_takes_out_does_not_move_the_marks():
     training = handmade()
     t = training.routine.time_s
-    # a tenth of the peak at 12 Hz, for a second before the Start: on the command as it is, the Start would begin with it
+    # a tenth of the peak at 12 Hz, for a second up to the Start: on the command as it is, the Start would begin with it
     shaken = training._replace(
-        u=training.u + 10 * np.sin(2 * np.pi * 12 * t) * ((t > training.routine.start_s - 1.6) & (t < training.routine.start_s - 0.6))
+        u=training.u + 10 * np.sin(2 * np.pi * 12 * t) * ((t > training.routine.start_s - 1.6) & (t < training.routine.start_s - 0.4))
     )
     assert demarcate([shaken], sample_time_s=TS)["Start"][0] < demarcate([training], sample_time_s=TS)["Start"][0] + 0.1
 

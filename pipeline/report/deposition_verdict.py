@@ -1,0 +1,329 @@
+"""Scores of the composers, the learning and the conformance -> whose signal to use and whether the parts will print, in words. No page, no file."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from pipeline.report.digits import THIN, count, number, percent
+from pipeline.report.sources import Sources, lookup
+from pipeline.report.verdict import FAILED, OPEN, PASSED, Missing
+
+# largest r.m.s. flow error in % of on-off control's; largest volume error of a line in %; points above learning the structure itself; best error of a law, in % of trial 0
+FLOW, LINE, ABOVE, LEARNED = 6.0, 3.0, 1.0, 20.0
+# errors closer than this, in points of on-off control's, are one: the simpler composer is taken
+SAME = 0.5
+OURS, LIBRARY = "basis", "priority"
+# simplest first
+COMPOSERS = ("on_off", "priority", "superposition", "basis")
+NAMES = {
+    "on_off": "On\u2011off",
+    "priority": "Library, priority",
+    "superposition": "Library, superposition",
+    "basis": "Basis functions",
+    "ilc": "Learned whole",
+}
+PAPER = {
+    "on_off": "wanted flow over gain",
+    "priority": "the paper’s rule",
+    "superposition": "overlaps are added",
+    "basis": "identified chain, inverted",
+    "ilc": "trials of this very part",
+}
+USE = {
+    "on_off": "on\u2011off control",
+    "priority": "the library by its priority rule",
+    "superposition": "the library by superposition",
+    "basis": "the basis functions",
+}
+# marks of the other pages: circle data-driven, square model-based, ring baseline; hollow: a second of its kind
+MARK = {"basis": "data_driven", "priority": "model_based", "superposition": "exact_model", "on_off": "baseline", "ilc": "kernel"}
+
+
+class Score(NamedTuple):
+    """r.m.s. flow error in % of on-off control's, true where the machine is simulated; the same as forecast; largest volume error of a line in %."""
+
+    error: float
+    predicted: float | None
+    worst_line: float | None
+
+
+class Structure(NamedTuple):
+    """One material of one part program, its scores by composer, and the composer that was chosen beforehand."""
+
+    part: str
+    material: str
+    scores: Mapping[str, Score]
+    chosen: str
+
+    def best(self) -> str:
+        """The composer, on-off control too, with the least error; what learned the part itself is a yardstick."""
+        return min((name for name in COMPOSERS if name in self.scores), key=lambda name: self.scores[name].error, default="")
+
+    def state(self) -> str:
+        """Of the composer that was chosen, by flow and volume."""
+        score = self.scores.get(self.chosen)
+        if score is None:
+            return OPEN
+        return FAILED if score.error > FLOW or (score.worst_line or 0.0) > LINE else PASSED
+
+
+class Rule(NamedTuple):
+    """One test: where its figures stand; state and figure by column, ours and the paper's; as a sentence of the composer in use, and what to do."""
+
+    name: str
+    limit: str
+    place: str
+    states: tuple[str, str]
+    figures: tuple[str, str]
+    reason: str
+    remedy: str
+
+
+class Verdict(NamedTuple):
+    """`state`: passed, failed, open; the composer to use ("" where none is known); decision, lead, reason, price and caution as the page says them."""
+
+    state: str
+    composer: str
+    decision: str
+    lead: str
+    reason: str
+    remedy: str
+    price: str
+    rules: tuple[Rule, ...]
+    first: str
+    real: bool
+
+
+def structures(sources: Sources) -> list[Structure] | Missing:
+    """Every material of every part, in the order of the table."""
+    table = sources.tables["scores"]
+    if isinstance(table, Missing):
+        return table
+    found: dict[tuple[str, str], Structure] = {}
+    names = ("part", "material", "composer", "chosen", "rms_percent_of_on_off", "predicted_percent", "worst_line_volume_percent")
+    for part, material, composer, chosen, *figures in zip(*(table[name] for name in names), strict=True):
+        one = found.setdefault((part, material), Structure(str(part), str(material), {}, ""))
+        error, predicted, line = (None if figure is None or math.isnan(figure) else float(figure) for figure in figures)
+        if error is not None:
+            found[part, material] = one._replace(
+                scores={**one.scores, str(composer): Score(error, predicted, line)}, chosen=str(composer) if chosen else one.chosen
+            )
+    return list(found.values()) or Missing("not measured", "no part was composed", "Copy a part program to datasets/parts")
+
+
+def real(sources: Sources) -> bool:
+    """Whether the trials are a machine's own, so that nobody knows its true flow."""
+    return sources.declared.everything.get("train_ilc", {}).get("source") == "recordings"
+
+
+def worst(found: Sequence[Structure], composer: str) -> tuple[float, Structure] | None:
+    """The largest error of a composer and where."""
+    return max(((one.scores[composer].error, one) for one in found if composer in one.scores), key=lambda pair: pair[0], default=None)
+
+
+def winner(found: Sequence[Structure]) -> str:
+    """The composer with the least worst error; among those as good, the simplest."""
+    errors = {name: pair[0] for name in COMPOSERS if (pair := worst(found, name))}
+    return next((name for name, error in errors.items() if error <= min(errors.values()) + SAME), "")
+
+
+# ---- the rules
+
+
+def rules(sources: Sources, found: Sequence[Structure]) -> tuple[Rule, ...]:
+    return (
+        _flow(found),
+        _line(found),
+        _above(found),
+        _learning(sources),
+        _convergence(sources),
+        _limit(sources),
+        _printed(sources),
+    )
+
+
+def _rule(name: str, limit: str, place: str, pairs: Sequence[tuple[float | None, str]], bound: float, reason: str, remedy: str) -> Rule:
+    """Two figures, or None where not measured, that should be at most `bound`."""
+    states = tuple(OPEN if value is None else PASSED if value <= bound else FAILED for value, _ in pairs)
+    return Rule(name, limit, place, states, tuple(text for _, text in pairs), reason, remedy)
+
+
+def _flow(found: Sequence[Structure]) -> Rule:
+    pairs = [worst(found, name) for name in (OURS, LIBRARY)]
+    shown = [(None, OPEN) if pair is None else (pair[0], percent(pair[0], 2)) for pair in pairs]
+    reason = (
+        "" if pairs[0] is None else f"{_where(pairs[0][1])} keeps {percent(pairs[0][0], 2)} of on\u2011off control’s flow error; {FLOW:g}{THIN}% are allowed."
+    )
+    remedy = "Run more trials, or train the speeds and pauses of that part (printer.routines)."
+    return _rule("Flow error", f"≤ {FLOW:g}{THIN}%", "scoreboard", shown, FLOW, reason, remedy)
+
+
+def _where(one: Structure) -> str:
+    return f"{one.part}, material {one.material},"
+
+
+def _line(found: Sequence[Structure]) -> Rule:
+    pairs = [
+        max(((one.scores[name].worst_line, one) for one in found if name in one.scores and one.scores[name].worst_line is not None), default=None, key=lambda p: p[0])
+        for name in (OURS, LIBRARY)
+    ]
+    shown = [(None, OPEN) if pair is None else (pair[0], f"±{percent(pair[0], 2)}") for pair in pairs]
+    reason = "" if pairs[0] is None else f"A line of {_where(pairs[0][1])} is {percent(pairs[0][0], 2)} off its volume; ±{LINE:g}{THIN}% is allowed."
+    return _rule("Line volume", f"±{LINE:g}{THIN}%", "lines", shown, LINE, reason, "Print that line slower, or longer: the table of lines names it.")
+
+
+def _above(found: Sequence[Structure]) -> Rule:
+    shown, place = [], None
+    for name in (OURS, LIBRARY):
+        above = [(one.scores[name].error - one.scores["ilc"].error, one) for one in found if name in one.scores and "ilc" in one.scores]
+        most = max(above, key=lambda pair: pair[0], default=None)
+        place = place or most
+        shown.append((None, OPEN) if most is None else (most[0], f"{'+' if most[0] > 0 else '−'}{number(abs(most[0]), 1)} points"))
+    reason = "" if place is None else f"{_where(place[1])} lies {number(place[0], 1)} points above what learning it trial by trial reaches; {ABOVE:g} is allowed."
+    return _rule("Above learning it whole", f"≤ {ABOVE:g} point", "scoreboard", shown, ABOVE, reason, "Learn that part itself, where it is printed often.")
+
+
+def _learning(sources: Sources) -> Rule:
+    shown = []
+    laws = [[name for name in ("pixels", "ours") if name in _laws(sources)][:1], ["paper"]]
+    for names in laws:
+        ratios = [100 * value for name in names for _, value in best(sources, name)]
+        shown.append((max(ratios), percent(max(ratios), 2)) if ratios else (None, OPEN))
+    reason = f"The error after learning is still {shown[0][1]} of trial 0’s; {LEARNED:g}{THIN}% are asked for." if shown[0][0] is not None else "No trial was learned from."
+    return _rule("Learned to", f"≤ {LEARNED:g}{THIN}%", "learning", shown, LEARNED, reason, "Run more trials (train_ilc.trials).")
+
+
+def _laws(sources: Sources) -> set[str]:
+    metrics = sources.metrics["train_ilc"]
+    return set() if isinstance(metrics, Missing) else {law for found in metrics.values() if isinstance(found, Mapping) for law in found}
+
+
+def best(sources: Sources, law: str) -> list[tuple[str, float]]:
+    """(material, least error as share of trial 0's) of a law."""
+    metrics = sources.metrics["train_ilc"]
+    pairs = [] if isinstance(metrics, Missing) else [(name, lookup(found, f"{law}.best_ratio")) for name, found in metrics.items()]
+    return [(name, float(value)) for name, value in pairs if not isinstance(value, Missing)]
+
+
+def gamma(sources: Sources) -> dict[str, float] | None:
+    """Of the paper's law, before anything ran: nominal, worst of the family, and the share of it above 1 in %, each the worst of all materials."""
+    metrics = sources.metrics["train_ilc"]
+    found = {}
+    for key in ("gamma", "gamma_worst", "gamma_above_1_percent"):
+        values = [] if isinstance(metrics, Missing) else [lookup(one, key) for one in metrics.values()]
+        values = [float(value) for value in values if not isinstance(value, Missing)]
+        if not values:
+            return None
+        found[key] = max(values)
+    return found
+
+
+def _convergence(sources: Sources) -> Rule:
+    found = gamma(sources)
+    paper = (OPEN, OPEN) if found is None else (PASSED if found["gamma_worst"] < 1 else FAILED, f"γ up to {number(found['gamma_worst'], 2)}")
+    return Rule("Safe before it runs", "γ < 1", "beforehand", ("not applicable", paper[0]), ("rolls back", paper[1]), "", "")
+
+
+def _limit(sources: Sources) -> Rule:
+    found = sources.tables["conformance"]
+    if isinstance(found, Missing):
+        return Rule("Command limit", "0", "saturation", (OPEN, OPEN), (OPEN, OPEN), found.sentence(), "")
+    shares = [(float(one["share_percent"]), part, name, one) for part, report in found.items() for name, one in report.get("saturation", {}).items()]
+    if not shares:
+        return Rule("Command limit", "0", "saturation", (OPEN, OPEN), (OPEN, OPEN), "No part was composed.", "")
+    share, part, name, one = max(shares, key=lambda s: (not s[3]["enough"], s[0]))
+    limited = any(s[3].get("limit") is not None for s in shares)
+    text = percent(share, 2) if not one["enough"] else f"0{THIN}%" if limited else "none set"
+    ramp = lookup(found, f"{part}.ramp_that_would_do_s.{name}") if "." not in part else Missing("not measured", "")
+    remedy = "Print slower, or raise printer.limit_mm: no ramp would do." if isinstance(ramp, Missing) else f"Ramps of {ramp:.2f}{THIN}s would do (printer.ramp_s)."
+    reason = f"The command for {part}, material {name}, is at its limit {percent(share, 2)} of the printing time, and no signal can make up for it."
+    state = PASSED if one["enough"] else FAILED
+    return Rule("Time at the command’s limit", f"0{THIN}%", "saturation", (state, state), (text, text), reason, remedy)
+
+
+def _printed(sources: Sources) -> Rule:
+    found = sources.tables["conformance"]
+    if isinstance(found, Missing):
+        return Rule("Every line printed", "all", "refused", (OPEN, OPEN), (OPEN, OPEN), found.sentence(), "")
+    refused = [(part, one) for part, report in found.items() for one in _listed(report.get("refused", []))]
+    short = sum(report.get("shorter_than_lead", 0) for report in found.values())
+    states = (FAILED if refused else PASSED, FAILED if refused or short else PASSED)
+    texts = tuple("all" if not n else f"{n:,} not" for n in (len(refused), len(refused) + short))
+    reason = f"{count(len(refused), 'line was', 'lines were')} refused".capitalize() + (f", the first in {refused[0][0]}: {refused[0][1]}" if refused else "")
+    return Rule("Every line printed", "all", "refused", states, texts, reason, "Mend these lines of the program, or print without them.")
+
+
+def _listed(refused: Any) -> list[str]:
+    return [refused] if isinstance(refused, str) else [f"line {one['line']}, {one['why']}" for one in refused]
+
+
+# ---- the verdict
+
+
+def verdict(sources: Sources) -> Verdict:
+    """Whose signal to use: the composer with the least worst error; then the rules, for it."""
+    found, machine = structures(sources), real(sources)
+    if isinstance(found, Missing):
+        tested = rules(sources, [])
+        return Verdict(OPEN, "", "Do not print by this loop yet.", "Nothing was composed.", found.sentence(), "", _price(sources, []), tested, "", machine)
+    use, tested = winner(found), rules(sources, found)
+    # ours' column for the basis functions, the paper's for the library; the paper's law is not what the library was learned by
+    column = 0 if use == OURS else 1
+    needed = [rule for rule in tested if rule.name != "Safe before it runs"]
+    if use != OURS:
+        needed = [rule for rule in needed if rule.name != "Learned to"]
+    states = [rule.states[column] for rule in needed]
+    state = FAILED if FAILED in states or use == "on_off" else OPEN if OPEN in states and not machine else PASSED
+    first = next((rule for wanted in (FAILED, OPEN) for rule in needed if rule.states[column] == wanted), None) if state != PASSED else None
+    if state == PASSED:
+        decision = f"{'By forecast, t' if machine else 'T'}his machine prints these parts: use {USE[use]}."
+        lead = f"All {count(len(needed), 'rule')} passed."
+    else:
+        decision = f"{'Do not print these parts yet' if state == FAILED else 'Do not decide yet'}: {USE[use]} {'comes' if use == 'on_off' or use != OURS else 'come'} closest."
+        lead = f"First {'failed' if state == FAILED else 'open'} rule: {first.name[:1].lower()}{first.name[1:]}." if first else "Nothing beats on\u2011off control."
+    reason = " ".join(part for part in (first.reason if first and column == 0 else "", told(found, use, machine)) if part)
+    return Verdict(state, use, decision, lead, reason, first.remedy if first else "", _price(sources, found), tested, first.name if first else "", machine)
+
+
+def told(found: Sequence[Structure], use: str, machine: bool) -> str:
+    """The composer in use with its figure and its yardsticks: on-off control, the others, and what learning each structure reaches."""
+    error, place = worst(found, use)
+    others = [f"{_bare(name)} {percent(pair[0], 2)}" for name in COMPOSERS if name not in (use, "on_off") and (pair := worst(found, name))]
+    whole = worst(found, "ilc")
+    others += [f"learning each part from scratch {percent(whole[0], 2)}"] if whole else []
+    lines = [one.scores[use].worst_line for one in found if use in one.scores and one.scores[use].worst_line is not None]
+    volume = f" Worst printed line: {percent(max(lines), 2)} off its volume, ±{LINE:g}{THIN}% allowed." if lines else ""
+    known = " These figures are forecasts of the identified machine: the true flow of a real one is not known." if machine else ""
+    return (
+        f"{_bare(use)[:1].upper()}{_bare(use)[1:]} {'leave' if use == OURS else 'leaves'} at most {percent(error, 2)} of on\u2011off control’s flow error "
+        f"({place.part}, {place.material}); {', '.join(others)}.{volume}{known}"
+    )
+
+
+def _bare(name: str) -> str:
+    return USE[name].removeprefix("the ")
+
+
+def _price(sources: Sources, found: Sequence[Structure]) -> str:
+    """What the signals cost: trials, peak command, what the paper's law would have done, and the lines that the priority rule would lose."""
+    metrics, parts = sources.metrics["train_ilc"], []
+    if not isinstance(metrics, Missing):
+        laws = [one[law] for one in metrics.values() for law in ("ours", "pixels") if law in one]
+        routines = max((len(one.get("other_routines", [])) for one in metrics.values()), default=0)
+        if laws:
+            trials, peak = max(law["trials"] for law in laws), max(law["peak_over_steady"] for law in laws)
+            of = f"{count(routines, 'routine')} of {trials + 1} trials" if routines else f"{trials + 1} trials"
+            parts.append(f"Price: {of} for each material, and commands up to {number(peak, 0)} times the steady one.")
+    before = gamma(sources)
+    if before:
+        safe = before["gamma_worst"] < 1
+        parts.append(
+            f"Before anything ran, γ of the paper’s law was {number(before['gamma'], 2)} on the nominal plant and {number(before['gamma_worst'], 2)} on the worst of its family, "
+            f"above 1 on {percent(before['gamma_above_1_percent'], 2)}: {'it may be run' if safe else 'do not run it'} on this machine."
+        )
+    conformance = sources.tables["conformance"]
+    short = {} if isinstance(conformance, Missing) else {part: report.get("shorter_than_lead", 0) for part, report in conformance.items()}
+    parts += [f"{count(n, 'line', 'lines').capitalize()} of {part} {'is' if n == 1 else 'are'} shorter than the lead: the priority rule would not print {'it' if n == 1 else 'them'}." for part, n in short.items() if n][:2]
+    missed = [one for one in found if one.chosen and one.chosen != one.best() and one.scores[one.chosen].error > one.scores[one.best()].error + SAME]
+    parts += [f"The forecast chose wrongly for {_where(missed[0])[:-1]}: {_bare(missed[0].best())} is better." ] if missed else []
+    return " ".join(parts)
