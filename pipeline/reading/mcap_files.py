@@ -68,6 +68,7 @@ class McapFile:
         self.remarks: list[Note] = []
         self.promised: dict[int, int] | None = None  # messages of each channel, as the summary counts them
         self.has_footer = self.verified = False  # verified: by the CRC of the whole data section
+        self.summed = True  # whether the data section may have a CRC, as its last record says
         self.size = path.stat().st_size
         with path.open("rb") as stream:
             check_magic(path, stream.read(16))
@@ -83,6 +84,9 @@ class McapFile:
         tail = stream.read()
         opcode, length, start, _, crc = FOOTER_RECORD.unpack_from(tail)
         self.has_footer = tail.endswith(MAGIC) and opcode == FOOTER and length == 20
+        if self.has_footer:
+            stream.seek(max((start or end) - 13, 0))
+            self.summed = not stream.read(13).startswith(RECORD_HEAD.pack(DATA_END, 4) + bytes(4))
         if not self.has_footer or not 8 <= start <= end:
             return
         stream.seek(start)
@@ -130,14 +134,15 @@ class McapFile:
                 if opcode == DATA_END:
                     self._check_data_crc(struct.unpack_from("<I", record)[0] if len(record) >= 4 else 0, crc)
                     break
-                crc = zlib.crc32(record, zlib.crc32(head, crc))
+                if self.summed:
+                    crc = zlib.crc32(record, zlib.crc32(head, crc))
                 if opcode == CHUNK:
                     batch = self._chunk(offset, record, wanted)
                     if batch is not None:
                         yield self._counted(batch)
                 elif opcode == MESSAGE:
                     self.unchunked += 1
-                    self._split(head + record, wanted, group)
+                    self._split(head + record, 0, wanted, group)
                     grouped += len(record)
                 elif opcode == MESSAGE_INDEX and self._losing:
                     self._losing.lost[0] += (len(record) - 6) // 16
@@ -212,17 +217,18 @@ class McapFile:
         first, last, size, crc, length = CHUNK_HEAD.unpack_from(record)
         start = CHUNK_HEAD.size + length
         try:
-            method, content = record[CHUNK_HEAD.size : start].decode(), record[start + 8 :]
+            method, begin = record[CHUNK_HEAD.size : start].decode(), start + 8
             if size > LARGEST_CHUNK:
                 raise UnreadableMessage(f"it says that it unpacks to {size} bytes")
-            content = decompress(method, content, size) if method else content
-            if len(content) != size:
-                raise UnreadableMessage(f"it should hold {size} bytes but holds {len(content)}")
-            found = zlib.crc32(content) if crc else 0
+            # what is not compressed stays where it is: copying a chunk takes as long as its CRC
+            content, begin = (decompress(method, record[begin:], size), 0) if method else (record, begin)
+            if len(content) - begin != size:
+                raise UnreadableMessage(f"it should hold {size} bytes but holds {len(content) - begin}")
+            found = zlib.crc32(memoryview(content)[begin:]) if crc else 0
             if found != crc:
                 raise UnreadableMessage(f"the CRC of its contents should be 0x{crc:08x} but is 0x{found:08x}")
             batch: dict[int, Messages] = {}
-            self._split(content, wanted, batch)
+            self._split(content, begin, wanted, batch)
         except (UnreadableMessage, struct.error, UnicodeDecodeError) as error:
             self._losing = _Damage(offset, str(error), [0])
             self.damage.append(self._losing)
@@ -238,9 +244,9 @@ class McapFile:
             self._remark("damage", 1, f"{message} {'agree with their CRC and' if crc else 'have no CRC and'} were kept")
         return batch
 
-    def _split(self, data: bytes, wanted: Callable[[Channel], bool], batch: dict[int, Messages]) -> None:
-        """Sorts the records of a chunk by channel into `batch`; raises UnreadableMessage where one runs over the end."""
-        pos, end, unpack, current, messages, kept = 0, len(data), MESSAGE_HEAD.unpack_from, -1, None, False
+    def _split(self, data: bytes, begin: int, wanted: Callable[[Channel], bool], batch: dict[int, Messages]) -> None:
+        """Sorts the records in data[begin:] by channel into `batch`; raises UnreadableMessage where one runs over the end."""
+        pos, end, unpack, current, messages, kept = begin, len(data), MESSAGE_HEAD.unpack_from, -1, None, False
         while pos < end:
             if data[pos] != MESSAGE:
                 opcode, length = RECORD_HEAD.unpack_from(data, pos)
@@ -258,7 +264,7 @@ class McapFile:
                     messages.publish_time.append(publish_time)
                     messages.data.append(data[pos + 31 : following])
             if following > end or (data[pos] == MESSAGE and length < 22):
-                raise UnreadableMessage(f"a record at byte {pos} of its contents has length {length} and does not fit")
+                raise UnreadableMessage(f"a record at byte {pos - begin} of its contents has length {length} and does not fit")
             pos = following
 
     def _counted(self, batch: dict[int, Messages]) -> dict[int, Messages]:
