@@ -127,7 +127,9 @@ def heat_exchanger(rng):
 def wall(rng):
     """A wall of twenty layers between two temperatures, heat flow as output, 1,680 samples, slow weather."""
     T, n = 1680, 20
-    weather = np.column_stack([10 + 8 * np.sin(np.arange(T) / 40) + 3 * coloured(rng, T, 1, 0.98)[:, 0], 20 + levels(rng, T, 1, 60, -2, 2)[:, 0]])
+    weather = np.column_stack(
+        [10 + 8 * np.sin(np.arange(T) / 40) + 3 * coloured(rng, T, 1, 0.98)[:, 0], 20 + levels(rng, T, 1, 60, -2, 2)[:, 0]]
+    )
     x, y = np.linspace(10, 20, n), np.empty((T, 1))
     for t in range(T):
         for _ in range(4):

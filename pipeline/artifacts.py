@@ -21,8 +21,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline import schemas
-from pipeline.schemas import ARRAYS, Column, Schema
+from pipeline import schemas, table_schema
+from pipeline.schemas import ARRAYS
+from pipeline.table_schema import Column, Schema
 
 DATASETS, REPORTS = Path("datasets"), Path("reports")
 
@@ -38,13 +39,13 @@ def write_table(path: str | Path, schema: Schema, columns: Mapping[str, np.ndarr
 
     Missing floats are NaN. Raises ValueError naming the column and the row.
     """
-    schemas.check_names(path, schema, columns, "give exactly the columns of the schema")
+    table_schema.check_names(path, schema, columns, "give exactly the columns of the schema")
     arrays = [_array(path, column, columns[column.name]) for column in schema.columns]
     lengths = {column.name: len(array) for column, array in zip(schema.columns, arrays, strict=True)}
     if len(set(lengths.values())) > 1:
         raise ValueError(f"{path}: columns should have one length but have {lengths}; give one value a row in each")
-    table = pa.Table.from_arrays(arrays, schema=schemas.arrow(schema))
-    schemas.check_values(path, schema, table, "the file was not written")
+    table = pa.Table.from_arrays(arrays, schema=table_schema.arrow(schema))
+    table_schema.check_values(path, schema, table, "the file was not written")
     with beside(path) as temporary:
         pq.write_table(table, temporary, compression="zstd", write_page_checksum=True)
 
@@ -59,7 +60,7 @@ def read_table(path: str | Path, schema: Schema) -> dict[str, np.ndarray]:
         raise ValueError(f"{path} is missing; {remedy}") from None
     except (OSError, pa.ArrowException) as error:
         raise ValueError(f"{path} is not a whole Parquet file ({_reason(error)}); {remedy}") from None
-    schemas.check(path, schema, table, remedy)
+    table_schema.check(path, schema, table, remedy)
     return {column.name: np.array(table[column.name].to_numpy(zero_copy_only=False)) for column in schema.columns}
 
 

@@ -1,12 +1,15 @@
 """A trial in pictures: a simulated machine filmed into one recording, and a recording, ours or a machine's own, measured to the flow that a law learns from."""
 
-from collections.abc import Iterator
+import itertools
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 
 from pipeline import trials
+from pipeline.artifacts import beside
 from pipeline.deposition import bead, flow, rendering
 from pipeline.deposition.extruder import Extruder, Routine, disturb
 from pipeline.deposition.extruder import flow as true_flow
@@ -17,6 +20,8 @@ from pipeline.printer import Camera, Material, Printer
 SCENES = {"nominal": rendering.NOMINAL, "hard": rendering.HARD}
 # a recording may begin and end so much later and earlier than its routine
 SLACK_S = 0.2
+# frames measured together
+TOGETHER = 16
 # frames of each known width, spread over the stage
 CALIBRATION_FRAMES = 12
 
@@ -109,7 +114,7 @@ def watch(path: str | Path, routine: Routine, *, printer: Printer, camera: Camer
             nozzle_radius_mm=printer.nozzle_mm / 2,
             shapes=routine.r[None],
             contact_angle_deg=known.contact_angle_deg,
-            width_deviation_mm=0.0,
+            width_deviation_mm=camera.width_deviation_mm,
         )
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
@@ -119,8 +124,11 @@ def watch(path: str | Path, routine: Routine, *, printer: Printer, camera: Camer
 
 
 def _beads(recording: trials.Trial, camera: Camera) -> Iterator[tuple[float, bead.Bead]]:
-    for time, frame in recording.frames:
-        yield time, bead.measure(frame, columns=tuple(camera.columns), longest_blur_px=camera.longest_blur_px)
+    """Beads of a few frames at a time: memory stays flat, and what a frame costs beyond its decoding is shared."""
+    frames = iter(recording.frames)
+    while batch := list(itertools.islice(frames, TOGETHER)):
+        times, pictures = zip(*batch, strict=True)
+        yield from zip(times, bead.measure_all(pictures, columns=tuple(camera.columns), longest_blur_px=camera.longest_blur_px), strict=True)
 
 
 def conditions(
@@ -132,6 +140,78 @@ def conditions(
         material.name, f"{printer.nozzle_mm:g}", trial, law, float(routine.speed.max()), round(pause, 9), printer.bead_area_mm2, 1 / calibration.gain,
         -calibration.offset / calibration.gain, camera.contact_angle_deg, camera.mm_per_px, camera.nozzle_column,
     )  # fmt: skip
+
+
+# ---- a few frames for the page
+
+
+def first_and_last(paths: Sequence[Path], camera: Camera) -> list[Path]:
+    """Of recordings with conditions those of the first and the last trial of each material, in the order of their names."""
+    found: dict[str, list[tuple[int, Path]]] = {}
+    for path in paths:
+        known = trials.read_trial(path, unreadable_share=camera.unreadable_share).conditions
+        if known:
+            found.setdefault(known.material, []).append((known.trial, path))
+    return sorted({path for done in found.values() for _, path in (min(done), max(done))})
+
+
+def shown(path: Path, folder: Path, camera: Camera) -> list[dict[str, Any]]:
+    """Writes a few frames of a recording with the measured edges drawn in as JPEG to `folder`, start, steady line, corner, and the first that was rejected for each
+    reason, and returns a row for each: where it is from, what was measured, and why it was rejected."""
+    recording = trials.read_trial(path, unreadable_share=camera.unreadable_share)
+    known, beads = recording.conditions, list(_beads(recording, camera))
+    if known is None or not beads:
+        return []
+    wanted = _places(recording, beads, camera)
+    rows = []
+    for k, (time, frame) in enumerate(recording.frames):
+        if k not in wanted:
+            continue
+        found, name = beads[k][1], f"{path.stem}_{k:05d}.jpg"
+        _save(folder / name, bead.drawn(frame, found), found)
+        width = {"width_mm": (found.width - known.offset_px) / known.px_per_mm, "deviation_px": found.deviation}
+        conditions = {"material": known.material, "trial": known.trial, "recording": path.name, "topic": recording.frames.topic}
+        rows.append({"file": name, "place": wanted[k], **conditions, "time_s": round(time, 6), "reason": found.reason, "blur_px": found.blur_px, **width})
+    return [{key: None if isinstance(value, float) and not np.isfinite(value) else value for key, value in row.items()} for row in rows]
+
+
+def _places(recording: trials.Trial, beads: Sequence[tuple[float, bead.Bead]], camera: Camera) -> dict[int, str]:
+    """Numbers of the frames to show, and what they show. After the pause of the gantry the corner takes a while to come to the middle of what is measured."""
+    time_s, speed = recording.signals["speed_mm_per_s"]
+    full = np.nanmedian([found.width for _, found in beads if not found.reason] or [np.nan])
+    good = [k for k, (_, found) in enumerate(beads) if not found.reason and found.width > 0.7 * full]
+    rejected = {found.reason: k for k, (_, found) in reversed(list(enumerate(beads))) if found.reason}
+    places = {k: "rejected" for k in rejected.values()}
+    if not good:
+        return places
+    begin = beads[good[0]][0]
+    still = time_s[(speed < 0.05 * speed.max()) & (time_s > begin)]
+    pause = float(still[0]) if len(still) else beads[good[-1]][0]
+    # the gantry stands at the end too: the pause ends where its first stretch does
+    ends = np.flatnonzero(np.diff(still) > 1.5 * np.median(np.diff(time_s))) if len(still) else []
+    resumed = float(still[ends[0]]) if len(ends) else float(still[-1]) if len(still) else pause
+    travelled = (np.mean(camera.columns) - camera.nozzle_column) * abs(camera.mm_per_px) / max(float(speed.max()), 1e-9)
+    for place, at in (("start", begin), ("steady line", (begin + pause) / 2), ("corner", resumed + travelled)):
+        places.setdefault(min(good, key=lambda k: abs(beads[k][0] - at)), place)
+    return places
+
+
+def _save(path: Path, picture: np.ndarray, found: bead.Bead) -> None:
+    """The picture (h, w, 3) in RGB as JPEG, cut to its middle half around the bead, at three quarters of its size."""
+    h = picture.shape[0]
+    rows = np.concatenate([found.top, found.bottom])
+    middle = float(np.nanmean(rows)) if np.isfinite(rows).any() and not found.reason else h / 2
+    first = int(np.clip(middle - h / 4, 0, h - h // 2))
+    cut = cv2.resize(picture[first : first + h // 2], None, fx=0.75, fy=0.75, interpolation=cv2.INTER_AREA)
+    with beside(path) as temporary:
+        # OpenCV tells the format by the suffix; only artifacts opens a file to write
+        written = temporary.with_suffix(".jpg")
+        if not cv2.imwrite(str(written), cv2.cvtColor(cut, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 80]):
+            raise OSError(f"{path} cannot be written")
+        written.replace(temporary)
+
+
+# ---- as a table
 
 
 def rows(watched: dict[tuple[str, int], list[Watched]]) -> dict[str, np.ndarray]:

@@ -136,15 +136,21 @@ def _deviations(u, y, gain, tau, delay, sample_time_s, error) -> tuple[float, fl
     return tuple(float(v) for v in np.sqrt(np.maximum(np.diag(np.linalg.pinv(J.T @ J)) * variance, 0.0)))
 
 
-def fit_steps(u: np.ndarray, y: np.ndarray, *, sample_time_s: float, shortest_hold: int = 20) -> list[StepFit]:
+def fit_steps(
+    u: np.ndarray, y: np.ndarray, *, sample_time_s: float, shortest_hold: int = 20, others: np.ndarray | None = None
+) -> list[StepFit]:
     """A model for each step of u (T,) that is held for at least `shortest_hold` samples before and after it, in the order of the steps.
 
-    Up- and downward steps stand apart, so a plant that heats faster than it cools shows as two groups. Raises ValueError where no step is held that long.
+    Where the machine has `others` (T, k), further inputs, a step counts only as long as these stand still: their effect is not u's. Up- and downward steps stand
+    apart, so a plant that heats faster than it cools shows as two groups. A hold much shorter than the time constant shows as deviations as large as the values.
+    Raises ValueError where no step is held that long.
     """
     u, y = np.asarray(u, float), np.asarray(y, float)
     edges = np.r_[0, np.flatnonzero(np.diff(u) != 0) + 1, len(u)]
     fits = []
+    moves = np.flatnonzero((np.diff(others, axis=0) != 0).any(axis=1)) + 1 if others is not None else np.zeros(0, int)
     for before, at, after in zip(edges[:-2], edges[1:-1], edges[2:], strict=True):
+        before, after = max([before, *moves[moves <= at]]), min([after, *moves[moves > at]])
         if at - before < shortest_hold or after - at < shortest_hold:
             continue
         start = at - min(at - before, shortest_hold)

@@ -50,6 +50,7 @@ class TrainIlc(Section):
     trials: int = Field(ge=1, le=1000)
     pixel_trials: int = Field(ge=1, le=1000)
     family_plants: int = Field(ge=1, le=100_000)
+    worst_ratio: float = Field(gt=0, le=1)
     noise: TrialNoise
     paper: PaperLaw
     law: OurLaw
@@ -133,7 +134,8 @@ def simulate(folder: Path, work: Work, index: int, kind: str) -> Part:
     )
     lesson, s, name = Lesson(nominal, plant, routines), work.settings, material.name
     rngs = tuple(np.random.default_rng([work.p.seed, index, number]) for number in range(1, 5))
-    updates = work.p.trials * (len(routines) + 1) if kind == "flow" else work.p.pixel_trials
+    before = _before(nominal, routines, work)
+    updates = work.p.trials * (len(routines) + 2) if kind == "flow" else work.p.pixel_trials
     with tqdm(
         total=updates, desc=f"train_ilc: {name} in {kind}", position=1 + 2 * index + (kind == "pixels"), mininterval=2, leave=False
     ) as bar:
@@ -153,19 +155,30 @@ def simulate(folder: Path, work: Work, index: int, kind: str) -> Part:
             figures = {"pixels": training.figures(done, rise=s.rise) | _seen(seen, routines[0])}
             return Part({(name, 0): [done]}, {(name, 0): seen}, {name: {"calibration": calibration._asdict()}}, {name: figures})
         taught = training.teach(lesson, rngs[2], work.noise, trials=work.p.trials, s=s, on_step=lambda _: bar.update())
-    before = training.convergence(nominal, rngs[3], plants=work.p.family_plants, steady_flow=steady, s=s)
-    figures = {
-        "gamma": before.nominal, "gamma_worst": before.family.max(), "gamma_above_1_percent": 100 * np.mean(before.family > 1),
-        "paper": training.figures(taught[0], rise=s.rise), "ours": training.figures(taught[1], rise=s.rise),
-        "other_routines": [training.figures(done, rise=s.rise) for done in taught[2:]],
+    after = training.convergence_of_ours(taught[1], rngs[3], work.noise, plants=work.p.family_plants, s=s)
+    figures = before | {
+        "gamma_ours": after.nominal, "gamma_ours_worst": after.family.max(),
+        "paper": training.figures(taught[-1], rise=s.rise), "paper_on_machine": training.figures(taught[0], rise=s.rise), "ours": training.figures(taught[1], rise=s.rise),
+        "other_routines": [training.figures(done, rise=s.rise) for done in taught[2:-1]],
     }  # fmt: skip
-    runs = {(name, 0): taught[:2]} | {(name, i): [done] for i, done in enumerate(taught[2:], 1)}
+    runs = {(name, 0): [taught[-1], *taught[:2]]} | {(name, i): [done] for i, done in enumerate(taught[2:-1], 1)}
     models = {
         "nominal": _plain(nominal),
         "plant": _plain(plant),
         "identified": _model(taught[1].model),
     }
     return Part(runs, {}, {name: models}, {name: figures})
+
+
+def _before(nominal: Extruder, routines: Sequence[Routine], work: Work) -> dict[str, Any]:
+    """What is known before anything runs: gamma of the paper's law on the nominal model and over the family, and the authority of the drive over each routine."""
+    s, steady = work.settings, work.printer.steady_flow
+    found = training.convergence(nominal, np.random.default_rng([work.p.seed, 0, 0]), plants=work.p.family_plants, steady_flow=steady, s=s)
+    has = [training.authority(routine, nominal, worst_ratio=work.p.worst_ratio, s=s) for routine in routines]
+    return {
+        "gamma": found.nominal, "gamma_worst": found.family.max(), "gamma_above_1_percent": 100 * np.mean(found.family > 1),
+        "authority": [{"peak_over_steady": a.peak / a.steady, "least_ratio": a.ratio, "ramp_s": a.ramp_s} for a in has],
+    }  # fmt: skip
 
 
 def _seen(seen: Sequence[Watched], routine: Routine) -> dict[str, float]:
@@ -285,7 +298,8 @@ def recordings(folder: Path, following: Path, work: Work) -> Part:
     px = abs(camera.mm_per_px)
     following.mkdir()
     for material in printer.materials:
-        nominal, figures = _nominal(material), {}
+        nominal = _nominal(material)
+        figures = _before(nominal, routines, work)
         models: dict[str, Any] = {"nominal": _plain(nominal)}
         for index, routine in enumerate(routines):
             watched = seen.get((material.name, index), [])

@@ -87,6 +87,7 @@ class Camera(Section):
     columns: list[Annotated[int, Field(ge=0, le=10_000)]] = Field(min_length=2, max_length=2)
     contact_angle_deg: float = Field(gt=0, lt=180)
     known_widths_mm: list[Annotated[float, Field(gt=0, le=100)]] = Field(min_length=3, max_length=20)
+    width_deviation_mm: float = Field(ge=0, le=10)
     longest_blur_px: float = Field(gt=0, le=50)
     unreadable_share: float = Field(ge=0, le=1)
     scene: Literal["nominal", "hard"]

@@ -1,11 +1,11 @@
-"""Artifacts -> pages: reads the metrics and tables of every stage and reports/accepted.json; writes reports/index.html, temperature.html and
-identification.html.
+"""Artifacts -> pages: reads the metrics and tables of every stage and reports/accepted.json; writes reports/index.html, temperature.html,
+identification.html and deposition.html.
 
 What is missing is shown as missing; what was read is hashed, and the pages carry the hashes.
 """
 
 from pipeline import artifacts, params
-from pipeline.report import identification, index, temperature
+from pipeline.report import deposition, identification, index, temperature
 from pipeline.report.judgement import judgement, shown
 from pipeline.report.sources import Declared, collect, digest
 from pipeline.report.verdict import ReportRules
@@ -27,6 +27,9 @@ def main() -> None:
             "learn_kernel": "reports/metrics/learn_kernel.json",
             "tune_weights": "reports/metrics/tune_weights.json",
             "evaluate_temperature": "reports/metrics/evaluate_temperature.json",
+            "train_ilc": "reports/metrics/train_ilc.json",
+            "segment_library": "reports/metrics/segment_library.json",
+            "compose_parts": "reports/metrics/compose_parts.json",
         }
         folders = {
             "ingest": "datasets/ingest",
@@ -34,6 +37,9 @@ def main() -> None:
             "learn_kernel": "datasets/learn_kernel",
             "tune_weights": "datasets/tune_weights",
             "evaluate_temperature": "datasets/evaluate_temperature",
+            "train_ilc": "datasets/train_ilc",
+            "segment_library": "datasets/segment_library",
+            "compose_parts": "datasets/compose_parts",
         }
         sources = collect(declared, metrics, folders, "reports/accepted.json", ("pipeline", "stages"))
         judged = judgement(sources)
@@ -41,10 +47,12 @@ def main() -> None:
             "index": index.render(sources, judged),
             "temperature": temperature.render(sources, judged),
             "identification": identification.render(sources),
+            "deposition": deposition.render(sources),
         }
         artifacts.write_text("reports/index.html", pages["index"])
         artifacts.write_text("reports/temperature.html", pages["temperature"])
         artifacts.write_text("reports/identification.html", pages["identification"])
+        artifacts.write_text("reports/deposition.html", pages["deposition"])
         artifacts.write_metrics(
             "report",
             {

@@ -1,5 +1,7 @@
 """Trials -> learned commands: reads datasets/raw/deposition where the source is recordings; writes datasets/train_ilc: trials.parquet, lessons.parquet, filmed.parquet,
-models.json, recordings of the first and the last trial, and, for a real machine, the command of the next one in next/."""
+models.json, recordings of the first and the last trial, frames of these with the measured edges, and, for a real machine, the command of the next one in next/."""
+
+from pathlib import Path
 
 from joblib import delayed
 from tqdm import tqdm
@@ -30,6 +32,11 @@ def main() -> None:
         artifacts.write_table(out / "lessons.parquet", schemas.LESSONS, training.lessons(found.runs))
         artifacts.write_table(out / "filmed.parquet", schemas.FILMED, filming.rows(found.watched))
         artifacts.write_json(out / "models.json", found.models)
+        kept = sorted((out / "recordings").glob("*.mcap"))
+        if p.source == "recordings":
+            kept = filming.first_and_last(sorted(Path("datasets/raw/deposition").rglob("[!.]*.mcap")), camera)
+        frames = run_all([delayed(filming.shown)(path, out / "frames", camera) for path in kept], execution)
+        artifacts.write_json(out / "frames/frames.json", [row for rows in frames for row in rows])
         artifacts.write_metrics("train_ilc", found.metrics)
 
 

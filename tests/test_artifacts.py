@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline import artifacts, schemas
+from pipeline import artifacts, schemas, table_schema
 from pipeline.params import Input, Output
 
 RECORD = schemas.record([Input(name="heater_1", unit="percent", low=0, high=100)], [Output(name="zone_1", unit="°C", reference=200)])
@@ -112,7 +112,7 @@ def test_a_table_that_breaks_its_schema_is_not_written(project, changed, sentenc
 
 
 def table(schema=SCORES, share=(3.0, None)) -> pa.Table:
-    return pa.table(scores(share=list(share)), schema=schemas.arrow(schema))
+    return pa.table(scores(share=list(share)), schema=table_schema.arrow(schema))
 
 
 def with_column(number, **changed):

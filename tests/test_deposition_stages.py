@@ -206,3 +206,11 @@ def test_learning_is_what_its_parts_are():
     whole = learning.joined([a, b])
     assert whole.runs == {("A", 0): [1, 2], ("B", 0): [3]} and whole.models == {"A": {"x": 1, "y": 2}}
     assert whole.metrics == {"A": {"gamma": 1, "pixels": 2}, "B": {}}
+
+
+def test_a_limit_that_no_law_can_meet_is_refused_with_the_ramp_that_would_do(project, capsys):
+    printer = params.load(Printer, "printer")
+    # 1.2 times the steady command, where ramps of 0.15 s need about (1 + 0.8 / 0.15) times it
+    declare({"printer.limit_mm": 1.2 * printer.steady_flow / 1.08, "train_ilc.worst_ratio": 0.1})
+    said = refusal("train_ilc", capsys)
+    assert "authority" in said and "ramps of" in said and "would do" in said

@@ -8,6 +8,7 @@ import numpy as np
 from pipeline.deposition import ilc
 from pipeline.deposition.extruder import Extruder, Routine, disturb, draw, flow, frequency_response
 from pipeline.deposition.ilc import Law, Trial
+from pipeline.deposition.trial_model import deviations
 
 # the frequencies of the convergence test reach to half the sampling rate
 FREQUENCIES = 2000
@@ -121,11 +122,16 @@ def run(
 def teach(
     lesson: Lesson, rng: np.random.Generator, noise: Noise, *, trials: int, s: Settings, on_step: Callable[[Trial], None]
 ) -> list[Run]:
-    """The paper's law on the reference routine, ours on every routine, all on the simulated machine."""
-    done = []
-    for name, routine in [("paper", lesson.routines[0]), *(("ours", routine) for routine in lesson.routines)]:
-        measure = simulated(lesson.plant, rng, noise, steady_flow=float(routine.r.max()), s=s)
-        law = paper(routine, lesson.nominal, s) if name == "paper" else ours(routine, s)
+    """The paper's law on the reference routine and ours on every routine, on the simulated machine; last the paper's law on its own nominal model, as the paper ran it."""
+    first, done = lesson.routines[0], []
+    work = [
+        ("paper", first, lesson.plant),
+        *(("ours", routine, lesson.plant) for routine in lesson.routines),
+        ("paper_nominal", first, lesson.nominal),
+    ]
+    for name, routine, plant in work:
+        measure = simulated(plant, rng, noise, steady_flow=float(routine.r.max()), s=s)
+        law = ours(routine, s) if name == "ours" else paper(routine, lesson.nominal, s)
         done.append(run(name, law, measure, routine, lesson.nominal, trials=trials, s=s, on_step=on_step))
     return done
 
@@ -160,6 +166,32 @@ def convergence(nominal: Extruder, rng: np.random.Generator, *, plants: int, ste
     P = np.stack([frequency_response(plant, f, sample_time_s=s.sample_time_s) for plant in [nominal, *family]])
     found = ilc.gamma(Q, L, P)
     return Convergence(float(found[0]), found[1:])
+
+
+def convergence_of_ours(run: Run, rng: np.random.Generator, noise: Noise, *, plants: int, s: Settings) -> Convergence:
+    """gamma = max |Q (1 - L P)| of our law once its model is identified: of that model, and over plants that the first trials cannot tell from it."""
+    e, first = run.model.extruder, run.trials[: s.identify_trials]
+    spread = deviations(
+        run.model, [t.u for t in first], [t.y for t in first], drift=noise.drift, trial_gain=noise.gain, sample_time_s=s.sample_time_s
+    )
+    near = np.array([e.gain, e.time_constant_s, e.delay_s]) + np.array(spread[:3]) * rng.standard_normal((plants, 3))
+    f = np.linspace(0.0, 0.5 / s.sample_time_s, FREQUENCIES)
+    Q = ilc.magnitude(f, order=s.order, cutoff_hz=s.cutoff_hz, sample_time_s=s.sample_time_s) ** 2
+    L = ilc.inverse_filter(f, e, sample_time_s=s.sample_time_s)
+    family = [Extruder(K, tau, max(delay, 0.0)) for K, tau, delay in np.maximum(near, 1e-6).tolist()]
+    P = np.stack([frequency_response(plant, f, sample_time_s=s.sample_time_s) for plant in [e, *family]])
+    found = ilc.gamma(Q, L, P)
+    return Convergence(float(found[0]), found[1:])
+
+
+def authority(routine: Routine, nominal: Extruder, *, worst_ratio: float, s: Settings) -> ilc.Authority:
+    """What the limit of the command leaves of the routine, on the nominal model, before anything runs. Raises ValueError where no law can come below worst_ratio of
+    the error of on-off control; the sentence names the ramp that would do."""
+    found = ilc.authority(
+        routine.r, on_off(routine.r, nominal), nominal, order=s.order, cutoff_hz=s.cutoff_hz, limit=s.limit, sample_time_s=s.sample_time_s
+    )
+    ilc.check_authority(found, limit=s.limit, worst_ratio=worst_ratio)
+    return found
 
 
 # ---- as tables

@@ -1,4 +1,4 @@
-"""A card a loop: the winner in words, three small multiples on one scale, three figures. A loop that is not built yet keeps its frame."""
+"""A card a loop: the winner in words, three small multiples on one scale, three figures. A loop that is not measured keeps its frame."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -8,12 +8,17 @@ import numpy as np
 from markupsafe import Markup
 
 from pipeline.report import charts, page
+from pipeline.report import deposition_verdict as loop
 from pipeline.report.answers import CONTROLLERS, LABELS, featured
-from pipeline.report.digits import decimals, number, quantity
+from pipeline.report.digits import decimals, number, percent, quantity, shortened
 from pipeline.report.judgement import NAMES, Judgement
 from pipeline.report.model import trust
 from pipeline.report.sources import Sources, Table
 from pipeline.report.verdict import FAILED, OPEN, ROLES, UNDECIDED, Figure, Missing, Question, outcomes, row_places, state
+
+
+# composer of the deposition loop -> its place in the card
+ROLE = {"basis": "data_driven", "priority": "model_based", "superposition": "model_based", "on_off": "baseline"}
 
 
 def temperature(sources: Sources, judged: Judgement) -> dict[str, Any]:
@@ -162,44 +167,116 @@ def _kernel_note(gap: Figure | Missing | None, sources: Sources) -> str:
     return f"Algorithm 2’s kernel failed: {refused}" if refused else f"Algorithm 2’s kernel: not measured. {noise}"
 
 
-def unbuilt() -> list[dict[str, Any]]:
-    """Loops that no stage measures yet: the same frame, and the sentence in it."""
-    heads = {
-        "deposition": (
-            "Deposition",
-            "Plunger command to flow at the nozzle",
-            ("library + priority", "basis functions", "on-off control"),
-            "train_ilc, segment_library, compose_parts",
-        ),
-        "setpoint": (
-            "Setpoint",
-            "Nozzle camera to flow and temperature setpoints",
-            ("Bayes filter", "Q-learning agent", "sequential test"),
-            "train_classifier, train_agent, evaluate_setpoint",
-        ),
+def deposition(sources: Sources) -> dict[str, Any]:
+    """In this loop's terms: model-based is the paper's law and its library by priority, data-driven our law and the basis functions, baseline on-off control."""
+    judged, found = loop.verdict(sources), loop.structures(sources)
+    if isinstance(found, Missing):
+        return _unbuilt("deposition", found.sentence()) | {"link": "deposition.html"}
+    parts = list(dict.fromkeys(one.part for one in found))
+    # the parts on which the library fares worst say most
+    parts.sort(key=lambda part: -max((one.scores["priority"].error for one in found if one.part == part and "priority" in one.scores), default=0.0))
+    names = ("priority", "basis", "on_off")
+    rows = [
+        {"title": f"Flow error, {shortened(part, 30)}", "cells": _worst([[one.scores[name].error for one in found if one.part == part and name in one.scores] for name in names], loop.FLOW)}
+        for part in parts[:2]
+    ]
+    lines = [[one.scores[name].worst_line for one in found if name in one.scores and one.scores[name].worst_line is not None] for name in names]
+    rows.append({"title": "Worst line’s volume", "cells": _worst(lines, loop.LINE)})
+    role = ROLE.get(judged.composer)
+    trials = [_learned(sources, law) for law in ("paper", "ours", "")]
+    return {
+        "id": "deposition",
+        "name": "Deposition",
+        "link": "deposition.html",
+        "moves": "Plunger command to flow at the nozzle",
+        "state": f"Run {ROLES[role]}" if judged.state == loop.PASSED else "Do not print yet",
+        "mark": role if judged.state == loop.PASSED else None,
+        "win": _deposition_win(found, judged, role),
+        "caption": "Error while learning, in % of on\u2011off control’s, log scale 0.3 to 200\u00a0%, the worse material: the paper’s law, ours, none. Grey: what is asked for.",
+        "panels": [_learning_spark(curve, css, named=i == 1) for i, (curve, css) in enumerate(zip(trials, ("mb", "dd", "bl"), strict=True))],
+        "heads": [
+            {"mark": key, "name": LABELS[CONTROLLERS[key]][0], "method": method}
+            for key, method in (("model_based", "library + priority"), ("data_driven", "basis functions"), ("baseline", "on\u2011off control"))
+        ],
+        "rows": rows,
+        "note": "Forecasts of the identified machine: the true flow of a real one is not known." if judged.real else "Judged by the true flow of simulated machines that nothing was fitted to.",
+        "model": None,
+        "missing": None,
     }
-    cards = []
-    for key, (name, moved, methods, stages) in heads.items():
-        order = ("model_based", "data_driven", "baseline")
-        cards.append(
-            {
-                "id": key,
-                "name": name,
-                "link": "",
-                "moves": moved,
-                "state": "Not measured",
-                "mark": None,
-                "win": ("Not measured.", f"Its stages are not built yet: {stages}."),
-                "caption": "Nothing is shown before it is measured.",
-                "panels": [Markup('<div class="hole">{}not measured</div>').format(page.glyph(OPEN)) for _ in order],
-                "heads": [
-                    {"mark": role, "name": LABELS[CONTROLLERS[role]][0], "method": method}
-                    for role, method in zip(order, methods, strict=True)
-                ],
-                "rows": [],
-                "note": "No figure, so no claim.",
-                "model": None,
-                "missing": True,
-            }
-        )
-    return cards
+
+
+def _deposition_win(found: Sequence[loop.Structure], judged: loop.Verdict, role: str | None) -> tuple[str, str]:
+    if judged.state != loop.PASSED or role is None:
+        return judged.lead or judged.decision, judged.reason
+    name = "The baseline" if role == "baseline" else NAMES[role]
+    mine, _ = loop.worst(found, judged.composer) or (0.0, None)
+    other = loop.worst(found, "priority" if judged.composer == "basis" else "basis")
+    beside = f" {loop.USE['priority' if judged.composer == 'basis' else 'basis'].capitalize()}: {percent(other[0], 2)}." if other else ""
+    price = judged.price.split(". ")[0].rstrip(".")
+    return f"{name} wins.", f"{loop.NAMES[judged.composer]}: at most {percent(mine, 2)} of on\u2011off control’s flow error on any part.{beside} {price}." if price else ""
+
+
+def _worst(groups: Sequence[Sequence[float]], limit: float) -> list[dict[str, Any]]:
+    """A cell for each group: its largest value, the least of all bold."""
+    values = [max(group) if group else math.inf for group in groups]
+    least = min(values)
+    return [
+        {"text": percent(value, 2) if math.isfinite(value) else "not measured", "best": value == least and math.isfinite(value), "bad": limit < value < math.inf}
+        for value in values
+    ]
+
+
+def _learned(sources: Sources, law: str) -> np.ndarray | Missing:
+    """The larger of the materials' errors after each trial of the reference routine, in % of trial 0's; on-off control learns nothing."""
+    table = sources.tables["trials"]
+    if isinstance(table, Missing):
+        return table
+    if not law:
+        return np.full(2, 100.0)
+    law = law if (table["law"] == law).any() else "pixels"
+    rows = (table["law"] == law) & (table["routine"] == 0)
+    if not rows.any():
+        return Missing("not measured", "this law was not run")
+    return np.array([100 * float(table["ratio"][rows & (table["trial"] == j)].max()) for j in sorted(set(table["trial"][rows].tolist()))])
+
+
+def _learning_spark(curve: np.ndarray | Missing, css: str, *, named: bool) -> Markup:
+    if isinstance(curve, Missing):
+        return Markup('<div class="hole">{}</div>').format(page.missing(curve))
+    curve = curve if len(curve) > 1 else np.repeat(curve, 2)
+    bad = bool(curve[-1] > loop.LEARNED)
+    alt = f"{'On-off control learns nothing' if css == 'bl' else f'The error ends at {percent(float(curve[-1]), 2)} of trial 0’s after {len(curve) - 1} trials'}, {'above' if bad else 'below'} the {loop.LEARNED:g} % asked for"
+    return charts.spark(
+        np.arange(float(len(curve))), curve, charts.Axis(0.3, 200.0, (), True), css=css, limit=loop.LEARNED, alt=alt, named=named, bad=bad, limit_label=f"limit {loop.LEARNED:g}"
+    )
+
+
+def unbuilt() -> list[dict[str, Any]]:
+    """The loop that no stage measures yet."""
+    return [_unbuilt("setpoint", "")]
+
+
+def _unbuilt(key: str, why: str) -> dict[str, Any]:
+    """A loop without figures: the same frame, and the sentence in it."""
+    heads = {
+        "deposition": ("Deposition", "Plunger command to flow at the nozzle", ("library + priority", "basis functions", "on-off control")),
+        "setpoint": ("Setpoint", "Nozzle camera to flow and temperature setpoints", ("Bayes filter", "Q-learning agent", "sequential test")),
+    }
+    name, moved, methods = heads[key]
+    order = ("model_based", "data_driven", "baseline")
+    return {
+        "id": key,
+        "name": name,
+        "link": "",
+        "moves": moved,
+        "state": "Not measured",
+        "mark": None,
+        "win": ("Not measured.", why or "Its stages are not built yet: train_classifier, train_agent, evaluate_setpoint."),
+        "caption": "Nothing is shown before it is measured.",
+        "panels": [Markup('<div class="hole">{}not measured</div>').format(page.glyph(OPEN)) for _ in order],
+        "heads": [{"mark": role, "name": LABELS[CONTROLLERS[role]][0], "method": method} for role, method in zip(order, methods, strict=True)],
+        "rows": [],
+        "note": "No figure, so no claim.",
+        "model": None,
+        "missing": True,
+    }

@@ -63,7 +63,7 @@ def errors(sources: Sources) -> Picture:
         return hole("learning-error", title, table)
     materials, laws, machine = _materials(table), _laws(table), real(sources)
     last = max(int(table["trial"].max()), 1)
-    y = charts.Axis(0.3, 200.0, ((1.0, "1"), (10.0, "10"), (100.0, "100")), True)
+    y = charts.Axis(0.3, 200.0, ((1.0, "1"), (10.0, "10"), (20.0, "20"), (100.0, "100")), True)
     ends: dict[str, list[str]] = {law: [] for law in laws}
 
     def draw(law: str, column: int) -> list[Markup]:
@@ -84,14 +84,14 @@ def errors(sources: Sources) -> Picture:
                 + (f"below 20 % from trial {int(mine['trial'][first[0]])}" if len(first) else "never below 20 %")
             )
             layers = [
-                charts.level(frame, 20, "lim", "20 %" if column == 0 else ""),
-                charts.level(frame, 10, "lim", "10 %" if column == 0 else "", above=False),
+                charts.level(frame, 20, "lim"),
+                charts.level(frame, 10, "lim"),
                 *([charts.dots(frame, mine["trial"], measured, "try", 1.8)] if not machine else []),
                 charts.line(frame, mine["trial"], true),
                 charts.dots(frame, mine["trial"][best : best + 1], true[best : best + 1], f"dot {LAWS[law][2]}", 3),
-                charts.label(frame, last, 120, f"material {material}", anchor="end"),
+                charts.label(frame, last, 130, f"material {material}", anchor="end"),
             ]
-            panels.append(charts.panel(frame, layers, alt=alt, css=LAWS[law][2], title="% of trial 0, log" if column == 0 else "", x_ticks=bottom))
+            panels.append(charts.panel(frame, layers, alt=alt, css=LAWS[law][2], title="% of trial 0, log" if column == i == 0 else "", x_ticks=bottom))
         return panels
 
     shown = _columns(laws, draw)
@@ -101,7 +101,7 @@ def errors(sources: Sources) -> Picture:
         if machine
         else "Line: r.m.s. error of the true flow; grey dots: of the measured one, which ends higher because noise that does not repeat counts in it, and cannot be learned away."
     )
-    return Picture("learning-error", title, f"{text}.", shown, f"{floor} In % of trial 0’s, log scale, against the trial. Filled dot: the best trial.", page.origin(sources.source("trials")))
+    return Picture("learning-error", title, f"{text}.", shown, f"{floor} In % of trial 0’s, log scale, against the trial; the lines at 20 and 10 are the guides. Filled dot: the best trial.", page.origin(sources.source("trials")))
 
 
 # ---- commands
@@ -138,7 +138,7 @@ def commands(sources: Sources) -> Picture:
                 charts.label(frame, float(mine["time_s"][-1]), 10, f"material {material}: peak {short(peak, 2)} ×", anchor="end"),
             ]
             alt = f"Trial {trial}, material {material}: the command peaks at {short(peak, 2)} times the steady one"
-            panels.append(charts.panel(frame, layers, alt=alt, css="dd", title="× steady" if column == 0 else "", x_ticks=bottom))
+            panels.append(charts.panel(frame, layers, alt=alt, css="dd", title="× steady" if column == i == 0 else "", x_ticks=bottom))
         return panels
 
     heads = {0: "on\u2011off control", 1: "after one update", last: "the last"}
@@ -186,7 +186,7 @@ def corner(sources: Sources) -> Picture:
             begin, end = _pause(mine)
             near = (mine["time_s"] >= begin - 1.0) & (mine["time_s"] <= end + 1.5)
             t, flow, wanted = mine["time_s"][near] - begin, mine[kind][near], mine["wanted_mm3_per_s"][near]
-            top, bottom = 1.6 * float(wanted.max()), i == len(materials) - 1
+            top, bottom = 1.45 * float(wanted.max()), i == len(materials) - 1
             frame = charts.Frame(charts.linear(-1.0, end - begin + 1.5, ticks=4), charts.linear(0, top, ticks=3), 270, 128 if bottom else 116, 26, 16 if bottom else 6)
             error = 100 * float(np.sqrt(np.nanmean((flow - wanted) ** 2))) / float(wanted.max())
             low[f"{law}{after}"] = max(low.get(f"{law}{after}", 0.0), error)
@@ -196,7 +196,7 @@ def corner(sources: Sources) -> Picture:
                 charts.line(frame, t, flow),
                 charts.label(frame, frame.x.high, top, f"material {material}: {percent(error, 2)} off", anchor="end", dy=8),
             ]
-            panels.append(charts.panel(frame, layers, alt=alt, css=css, title="mm³/s" if column == 0 else "", x_ticks=bottom))
+            panels.append(charts.panel(frame, layers, alt=alt, css=css, title="mm³/s" if column == i == 0 else "", x_ticks=bottom))
         return panels
 
     shown = [Column(head, small, mark, draw(law, css, after, i)) for i, (head, small, mark, css, law, after) in enumerate(stories)]
@@ -221,7 +221,7 @@ def frames(sources: Sources) -> dict[str, Any]:
     if isinstance(found, Missing):
         return {"missing": found, "shown": [], "origin": Markup("")}
     # the corner tells most, then what was rejected
-    order = {"start": 0, "corner": 1, "steady": 2, "rejected": 3}
+    order = {"start": 0, "steady line": 1, "corner": 2, "rejected": 3}
     rows = sorted(found, key=lambda one: (one["material"], one["trial"], order.get(one["place"], 9)))
     shown = [
         {
@@ -251,30 +251,13 @@ def measured(sources: Sources) -> Picture:
     materials, machine = _materials(table), real(sources)
 
     def draw(material: str, column: int) -> list[Markup]:
-        panels, last = [], int(_trials(table, material, "pixels")["trial"].max(initial=0))
-        for i, trial in enumerate(dict.fromkeys((0, last))):
+        last = int(_trials(table, material, "pixels")["trial"].max(initial=0))
+        panels = []
+        for trial in dict.fromkeys((0, last)):
             mine = _trial(table, material, "pixels", trial)
             here = (film["material"] == material) & (film["routine"] == 0) & (film["trial"] == trial)
-            if not len(mine["time_s"]) or not here.any():
-                continue
-            t, seen, true = mine["time_s"], mine["measured_mm3_per_s"], mine["true_mm3_per_s"]
-            wide = 1.645 * float(film["deviation_mm3_per_s"][here][0])
-            steady = float(mine["wanted_mm3_per_s"].max())
-            frame = charts.Frame(charts.linear(0, float(t[-1]), ticks=5), charts.linear(0, 1.3 * steady, ticks=3), 568, 138, 28)
-            blind = [charts.interval(frame, float(t[a]), float(t[min(b, len(t) - 1)])) for a, b in charts.stretches(np.isnan(seen))]
-            thin = [charts.ribbon(frame, t[a:b:2], seen[a:b:2] - wide, seen[a:b:2] + wide) for a, b in charts.stretches(~np.isnan(seen)) if b - a > 3]
-            off = 100 * float(np.sqrt(np.nanmean((seen - true) ** 2))) / steady if not machine else float("nan")
-            said = f"{percent(off, 2)} of a full line’s flow from the true one, r.m.s." if not machine else f"a standard deviation of {short(wide / 1.645, 2)} mm³/s"
-            layers = [
-                *blind,
-                *thin,
-                *([charts.line(frame, t, true, "ref")] if not machine else []),
-                charts.line(frame, t, seen, most=400),
-                charts.label(frame, float(t[-1]), 1.3 * steady, f"trial {trial}{'' if machine else f': {percent(off, 2)} off'}", anchor="end", dy=8),
-            ]
-            panels.append(
-                charts.panel(frame, layers, alt=f"Material {material}, trial {trial}: the measured flow lies {said}", css="dd wide", title="mm³/s" if column == 0 else "")
-            )
+            if len(mine["time_s"]) and here.any():
+                panels += _told(mine, 1.645 * float(film["deviation_mm3_per_s"][here][0]), f"Material {material}, trial {trial}", machine, titled=column == 0 and not panels)
         return panels
 
     shown = [Column(f"Material {material}", "first and last filmed trial", "", draw(material, i)) for i, material in enumerate(materials)]
@@ -293,10 +276,30 @@ def measured(sources: Sources) -> Picture:
         title,
         finding,
         shown,
-        f"Flow in mm³/s against time in s. Line: measured; band: where 90{THIN}% of its own uncertainty lies (narrow as a hair){'' if machine else '; dashed: the true flow'}. "
+        f"Measured flow in mm³/s against time in s{'' if machine else '; below it measured less true, in % of a full line’s flow, with the band in which 90 % of the measurement’s own uncertainty lies. The camera rightly sees what does not repeat from trial to trial, too; the true flow here is without it'}. "
         "Grey: the gantry stands, only the volume of the pause is seen, and nothing is learned there.",
         page.origin(sources.source("lessons", "filmed")),
     )
+
+
+def _told(mine: Table, wide: float, name: str, machine: bool, *, titled: bool) -> list[Markup]:
+    """The measured flow of a trial, and, where it is known, its distance from the true one with the band of its uncertainty."""
+    t, seen, true, steady = mine["time_s"], mine["measured_mm3_per_s"], mine["true_mm3_per_s"], float(mine["wanted_mm3_per_s"].max())
+    frame = charts.Frame(charts.linear(0, float(t[-1]), ticks=5), charts.linear(0, 1.4 * steady, ticks=3), 568, 112, 28, 6 if not machine else 16)
+    blind = [(float(t[a]), float(t[min(b, len(t) - 1)])) for a, b in charts.stretches(np.isnan(seen))]
+    alt = f"{name}: the flow as measured, between {number(float(np.nanmin(seen)), 1)} and {number(float(np.nanmax(seen)), 1)} mm³/s; standard deviation {short(wide / 1.645, 2)}"
+    text = charts.label(frame, float(t[-1]), 1.4 * steady, name, anchor="end", dy=6)
+    layers = [*(charts.interval(frame, *stretch) for stretch in blind), charts.line(frame, t, seen, most=400), text]
+    panels = [charts.panel(frame, layers, alt=alt, css="dd wide", title="mm³/s" if titled else "", x_ticks=machine)]
+    if machine:
+        return panels
+    error, band = 100 * (seen - true) / steady, 100 * wide / steady
+    off = float(np.sqrt(np.nanmean(error**2)))
+    frame = charts.Frame(frame.x, charts.Axis(-12.0, 12.0, ((-10.0, "−10"), (0.0, "0"), (10.0, "10"))), 568, 84, 28)
+    text = charts.label(frame, float(t[-1]), 12, f"measured less true: {percent(off, 2)}, r.m.s.", anchor="end", dy=6)
+    layers = [charts.tint(frame, -band, band), charts.line(frame, t, error, "line thin", most=400), text]
+    alt = f"{name}: measured less true is {percent(off, 2)} of a full line’s flow, r.m.s., of which its own uncertainty explains ±{percent(band, 2)}"
+    return [*panels, charts.panel(frame, layers, alt=alt, css="dd wide", title="%" if titled else "")]
 
 
 def camera(sources: Sources) -> dict[str, Any]:

@@ -45,7 +45,7 @@ def signals(sources: Sources) -> Picture:
             if not len(rows):
                 continue
             leads[task] = max(leads.get(task, 0.0), Ts * float(table["lead"][rows].max()))
-            panels.append(_panel(table, rows, task, material, Ts, i == 0))
+            panels.append(_panel(table, rows, task, material, Ts, titled=i == 0 and not panels))
         shown.append(Column(f"Material {material}", "", "", panels))
     text = ", ".join(f"{task} {number(seconds, 2)}{THIN}s" for task, seconds in leads.items())
     return Picture(
@@ -64,7 +64,7 @@ def _steady(table: Table, material: str, speed: float) -> float:
     return abs(found[0]) if found and found[0] else 1.0
 
 
-def _panel(table: Table, rows: np.ndarray, task: str, material: str, Ts: float, titled: bool) -> Markup:
+def _panel(table: Table, rows: np.ndarray, task: str, material: str, Ts: float, *, titled: bool) -> Markup:
     # the whole task is drawn: the samples that it begins ahead, and those that follow
     scaled = {int(k): np.asarray(table["signal_mm"][k], float) / _steady(table, material, table["speed_mm_per_s"][k]) for k in rows}
     lead = Ts * float(table["lead"][rows].max())
@@ -107,12 +107,13 @@ def assumptions(sources: Sources) -> dict[str, Any]:
 def chains(sources: Sources) -> dict[str, Any]:
     """Parameters of each machine: as known beforehand, as identified, and, where it is simulated, as it truly is."""
     models, learned = sources.tables["models"], lookup(sources.tables["learned"], "materials")
-    if isinstance(learned, Missing):
-        return {"missing": learned, "rows": [], "heads": []}
+    for found in (learned, models):
+        if isinstance(found, Missing):
+            return {"missing": found, "rows": [], "heads": []}
     heads, values = [], []
     for known in learned[:MATERIALS]:
         name = str(known["material"])
-        nominal, true = (None if isinstance(models, Missing) or not isinstance(models.get(name), dict) else models[name].get(key) for key in ("nominal", "plant"))
+        nominal, true = (models.get(name, {}).get(key) for key in ("nominal", "plant"))
         for word, found in (("beforehand", nominal), ("identified", known["chain"]["extruder"]), ("true", true)):
             if found:
                 heads.append({"material": name, "word": word})

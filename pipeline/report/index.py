@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from pipeline.report import cards, charts, page, words
+from pipeline.report import cards, charts, deposition_verdict, page, words
 from pipeline.report.answers import repetitions
 from pipeline.report.digits import band, count, quantity
 from pipeline.report.judgement import NAMES, Judgement
@@ -27,16 +27,17 @@ from pipeline.report.verdict import (
 
 def render(sources: Sources, judged: Judgement) -> str:
     """The text of index.html."""
+    headline = _headline(sources, judged)
     return page.render(
         "index.html",
-        title=_title(judged.verdict),
-        verdict=verdict_parts(judged),
+        title=headline["title"],
+        verdict=headline,
         answers=_rows(judged),
         repetitions=repetitions(sources),
         seeds=len(sources.declared.panel.judging.seeds),
         change=_change_sentence(judged, sources.accepted),
         hashes=hashes(sources),
-        cards=[cards.temperature(sources, judged), *cards.unbuilt()],
+        cards=[cards.temperature(sources, judged), cards.deposition(sources), *cards.unbuilt()],
         difference=difference_parts(sources, judged),
         words=words.chosen(sources, words.INDEX),
         sources=list(sources.read.values()),
@@ -53,6 +54,32 @@ def _title(verdict: Verdict) -> str:
 
 
 # ---- the verdict
+
+WORSE = {"passed": 0, "open": 1, "failed": 2}
+
+
+def _headline(sources: Sources, judged: Judgement) -> dict[str, Any]:
+    """The verdict of the worst loop that was measured, the temperature loop's in case of a tie, and beside it what the other says."""
+    mine, other = verdict_parts(judged), deposition_verdict.verdict(sources)
+    state = "open" if other.state == OPEN else other.state
+    mine |= {"title": _title(judged.verdict), "also": "Deposition", "link": "deposition.html", "told": other.decision, "glyph": other.state}
+    if not other.composer or WORSE[state] <= WORSE[mine["state"]]:
+        return mine
+    rules = [{"rule": rule.name, "answers": "", "states": list(rule.states), "first": rule.name == other.first} for rule in other.rules]
+    return {
+        "title": f"{other.decision.rstrip('.')}: {other.lead[:1].lower()}{other.lead[1:].rstrip('.')}",
+        "state": state,
+        "decision": other.decision,
+        "lead": other.lead,
+        "reason": other.reason,
+        "remedy": f"{other.remedy} The answers below are the temperature loop’s.".strip(),
+        "rules": rules,
+        "changed": mine["changed"],
+        "also": "Temperature",
+        "link": "temperature.html",
+        "told": judged.verdict.decision,
+        "glyph": judged.verdict.state,
+    }
 
 
 def verdict_parts(judged: Judgement) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """What the pages are made of: every artifact that is there, read and hashed; in the place of one that is not, the reason."""
 
+import base64
 import hashlib
 import json
 from collections.abc import Callable, Mapping
@@ -105,7 +106,34 @@ def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], An
         ("scorecard", "evaluate_temperature", "scorecard.parquet", *table(schemas.SCORECARD)),
         ("trajectories", "evaluate_temperature", "trajectories.parquet", *table(schemas.trajectories(machine.inputs, machine.outputs))),
         ("study", "evaluate_temperature", "study.parquet", *table(schemas.STUDY)),
+        ("trials", "train_ilc", "trials.parquet", *table(schemas.TRIALS)),
+        ("lessons", "train_ilc", "lessons.parquet", *table(schemas.LESSONS)),
+        ("filmed", "train_ilc", "filmed.parquet", *table(schemas.FILMED)),
+        ("models", "train_ilc", "models.json", "models", artifacts.read_json),
+        ("frames", "train_ilc", "frames", "frames 1", _frames),
+        ("library", "segment_library", "library.parquet", *table(schemas.LIBRARY)),
+        ("learned", "segment_library", "learned.json", "learned", artifacts.read_json),
+        ("signals", "compose_parts", "signals.parquet", *table(schemas.SIGNALS)),
+        ("scores", "compose_parts", "scores.parquet", *table(schemas.SCORES)),
+        ("tasks", "compose_parts", "tasks.parquet", *table(schemas.TASKS)),
+        ("lines", "compose_parts", "lines.parquet", *table(schemas.LINES)),
+        ("conformance", "compose_parts", "conformance.json", "conformance", artifacts.read_json),
     ]
+
+
+def _frames(folder: str) -> list[dict[str, Any]]:
+    """The index of a folder of frames, each with its picture as a data URI. Raises ValueError where a picture is missing or no JPEG."""
+    found = artifacts.read_json(f"{folder}/frames.json")
+    for one in found:
+        path = Path(folder) / Path(one["file"]).name
+        try:
+            data = path.read_bytes()
+        except OSError as error:
+            raise ValueError(f"{path} cannot be read ({error.strerror}); run ./run dvc repro train_ilc") from None
+        if not data.startswith(b"\xff\xd8"):
+            raise ValueError(f"{path} is no JPEG; run ./run dvc repro train_ilc")
+        one["uri"] = "data:image/jpeg;base64," + base64.b64encode(data).decode()
+    return found
 
 
 def _read(read: dict[str, Source], path: str, name: str, stage: str, schema: str, reader: Callable[[str], Any]) -> Any:

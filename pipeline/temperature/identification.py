@@ -177,18 +177,18 @@ def identify(
         direct = (False, True) if feedthrough_shows(u, y, pasts[0], offset) else (False,)
     structure, kind, table = Structure(pasts[0], direct[-1], offset, (0,) * m), refinement.replace("none", "subspace"), []
     if exact:
-        notes.append(f"the record is noise-free: {pasts[0]} past samples predict it to rounding, and the order is a rank")
         sub = subspace(lagged(u, y, pasts[0], feedthrough=direct[-1], offset=offset, exact=True), pasts[0])
-        order = order or max(int((sub.singular_values > EXACT_RANK * sub.singular_values[0]).sum()), 1)
-        kind = kind.replace("validated", "subspace")
+        rank = max(int((sub.singular_values > EXACT_RANK * sub.singular_values[0]).sum()), 1)
+        exact = rank <= max_order  # else no rank but a nonlinearity without noise, and the order is a choice as with noise
+    if exact:
+        notes.append(f"the record is noise-free: {pasts[0]} past samples predict it to rounding, and the order is a rank")
+        order, kind = order or rank, kind.replace("validated", "subspace")
     elif order is None or refinement == "validated":
         structures = [structure._replace(past=n, feedthrough=d) for n in pasts for d in direct]
         chosen, table = _choose(u, y, structures, order, max_order, refinement == "validated", {"blocks": blocks, "max_radius": max_radius})
         order, structure, kind = chosen.order, chosen.structure, chosen.fit if refinement == "validated" else kind
     if feedthrough is None:
-        notes.append(
-            f"direct feed-through {'kept' if structure.feedthrough else 'left out'} by Schwarz's criterion and the left-out blocks"
-        )
+        notes.append(f"direct feed-through {'kept' if structure.feedthrough else 'left out'} as the data prefer")
     found = _fit_all(u, y, structure, exact, order, kind, method, sample_time_s, table, max_radius)
     return found._replace(dropped_rows=found.dropped_rows + cut, notes=notes + _remarks(found, names))
 

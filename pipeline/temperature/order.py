@@ -7,10 +7,9 @@ import numpy as np
 import scipy.linalg
 import scipy.stats
 
-from pipeline.temperature.plant import Plant, markov_parameters
+from pipeline.temperature.plant import Plant, drawn_in, markov_parameters
 from pipeline.temperature.plant import plant as make_plant
 from pipeline.temperature.refinement import (
-    drawn_in,
     drives,
     fit_inputs,
     fitted_state,
@@ -122,10 +121,13 @@ def tested_dead_times(data: Lagged, longest: int) -> tuple[tuple[int, ...], tupl
     late, silent = [], []
     for j in range(m):
         at = first + j + (m + p) * np.arange(data.past)
-        theta, rows = coefficients[at] @ whiten.T, G[at]
+        size = np.maximum(np.linalg.norm(G[at], axis=1, keepdims=True), np.finfo(float).tiny)
+        theta, rows = coefficients[at] @ whiten.T / size, G[at] / size
 
         def silent_up_to(lag, theta=theta, rows=rows):
             covariance = rows[:lag] @ rows[:lag].T
+            if not np.isfinite(theta[:lag]).all() or not np.isfinite(covariance).all():
+                return False
             statistic = np.sum(theta[:lag] * np.linalg.lstsq(covariance, theta[:lag], rcond=1e-12)[0])
             return statistic <= scipy.stats.chi2.ppf(0.999, lag * p)
 

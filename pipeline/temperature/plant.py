@@ -88,6 +88,17 @@ def markov_parameters(plant: Plant, lags: int) -> np.ndarray:
     return h
 
 
+def drawn_in(A: np.ndarray, radius: float) -> np.ndarray:
+    """A with every eigenvalue beyond `radius` drawn back onto it along its ray, in the modal basis."""
+    eigenvalues, T = np.linalg.eig(A)
+    size = np.abs(eigenvalues)
+    if size.max() <= radius:
+        return A
+    drawn = eigenvalues * np.where(size > radius, radius * (1 - 1e-9) / np.maximum(size, 1e-300), 1.0)
+    found = np.real((T * drawn) @ np.linalg.inv(T))
+    return found * min(1.0, radius * (1 - 1e-9) / np.abs(np.linalg.eigvals(found)).max())  # a defective A has no modal basis to draw in
+
+
 def observability_matrix(A: np.ndarray, C: np.ndarray, blocks: int) -> np.ndarray:
     """[C; CA; ...; CA^(blocks-1)] (7)."""
     rows = [C]

@@ -52,8 +52,9 @@ def respond(model: Predictor, v: np.ndarray, x0: np.ndarray) -> tuple[np.ndarray
 def free_response(model: Predictor, T: int) -> np.ndarray:
     """[C; CF; ...; CF^(T-1)] (T, p, n), the outputs' response to each state at the start; doubles with each pass."""
     gamma, power = model.C[None], model.F
-    while len(gamma) < T:
-        gamma, power = np.concatenate([gamma, gamma @ power]), power @ power
+    with np.errstate(over="ignore", invalid="ignore"):  # an unstable model may overflow far ahead; `fitted_state` leaves those rows out
+        while len(gamma) < T:
+            gamma, power = np.concatenate([gamma, gamma @ power]), power @ power
     return gamma[:T]
 
 
@@ -67,10 +68,10 @@ def estimate_state(model: Predictor, v: np.ndarray, y: np.ndarray, *, free_mean:
 
 
 def fitted_state(gamma: np.ndarray, error: np.ndarray, *, free_mean: bool) -> np.ndarray:
-    """x(0), and with `free_mean` a constant for each output after it, that leave the least of error (T, p); NaN is left out."""
+    """x(0), and with `free_mean` a constant for each output after it, that leave the least of error (T, p); what is not finite is left out."""
     T, p, _ = gamma.shape
     regressors = gamma if not free_mean else np.concatenate([gamma, np.broadcast_to(np.eye(p), (T, p, p))], axis=2)
-    seen = np.isfinite(error)
+    seen = np.isfinite(error) & (np.abs(gamma).max(axis=2, initial=0.0) < 1e100)
     return np.linalg.lstsq(regressors[seen], error[seen], rcond=1e-10)[0]
 
 
@@ -202,16 +203,6 @@ def gauss_newton(
         if costs[-2] - cost <= tolerance * costs[-2]:
             break
     return model, costs
-
-
-def drawn_in(A: np.ndarray, radius: float) -> np.ndarray:
-    """A with every eigenvalue beyond `radius` drawn back onto it along its ray, in the modal basis."""
-    eigenvalues, T = np.linalg.eig(A)
-    size = np.abs(eigenvalues)
-    if size.max() <= radius:
-        return A
-    drawn = eigenvalues * np.where(size > radius, radius * (1 - 1e-9) / np.maximum(size, 1e-300), 1.0)
-    return np.real((T * drawn) @ np.linalg.inv(T))
 
 
 def fit_inputs(A, C, u, y, *, feedthrough: bool, offset: bool) -> Predictor:

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from pipeline.temperature.plant import Plant
+from pipeline.temperature.plant import Plant, drawn_in
 from pipeline.temperature.plant import plant as make_plant
-from pipeline.temperature.refinement import drawn_in, fit_inputs
+from pipeline.temperature.refinement import fit_inputs
 
 ROUNDING = 1e-13  # relative ridge on second moments: what their own rounding amounts to
 RANK = 1e-11  # directions of the record below this share of the largest are rounding

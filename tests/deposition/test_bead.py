@@ -1,4 +1,4 @@
-"""Frame -> width: exact on drawn edges, robust on rendered frames that nothing was tuned on, refusals with their reason; calibration, drift, cross-section."""
+"""Frame -> width: exact on drawn edges, robust on rendered frames, refusals with their reason; calibration, drift, cross-section."""
 
 import math
 
@@ -63,7 +63,7 @@ def test_hard_frames_scatter_less_than_0_3_px_and_err_less_than_0_2_px_after_cal
         {"blur_px": 2.2, "offset_px": -60.0, "contrast": 45.0},
     ],
 )
-def test_scenes_that_nothing_was_tuned_on_err_less_than_0_2_px(changes):
+def test_tilted_dark_bright_sharp_and_dim_scenes_err_less_than_0_2_px(changes):
     bias, deviation = figures(NOMINAL._replace(**changes), seed=103, frames=8)
     assert np.abs(bias).max() <= 0.2
     assert deviation.max() <= 0.12

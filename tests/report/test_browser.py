@@ -57,7 +57,7 @@ def measured(chromium, tmp_path, page, *, width, theme="light"):
     return json.loads(html.unescape(re.search(r'<pre id="out">(.*?)</pre>', dom, re.DOTALL)[1])), console
 
 
-@pytest.mark.parametrize("name", ["index.html", "temperature.html", "identification.html"])
+@pytest.mark.parametrize("name", ["index.html", "temperature.html", "identification.html", "deposition.html"])
 @pytest.mark.parametrize(("width", "theme"), [(1280, "light"), (1024, "dark"), (390, "light")])
 def test_nothing_overflows_nothing_is_fetched_and_the_console_is_silent(project, chromium, tmp_path, name, width, theme):
     main()
@@ -77,7 +77,7 @@ def test_the_twelve_answers_end_within_the_first_screen(project, chromium, tmp_p
 
 def test_a_page_prints_to_a4_landscape(project, chromium, tmp_path):
     main()
-    for name in ("index", "temperature", "identification"):
+    for name in ("index", "temperature", "identification", "deposition"):
         run(
             chromium,
             tmp_path,
