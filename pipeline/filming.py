@@ -128,7 +128,9 @@ def _beads(recording: trials.Trial, camera: Camera) -> Iterator[tuple[float, bea
     frames = iter(recording.frames)
     while batch := list(itertools.islice(frames, TOGETHER)):
         times, pictures = zip(*batch, strict=True)
-        yield from zip(times, bead.measure_all(pictures, columns=tuple(camera.columns), longest_blur_px=camera.longest_blur_px), strict=True)
+        yield from zip(
+            times, bead.measure_all(pictures, columns=tuple(camera.columns), longest_blur_px=camera.longest_blur_px), strict=True
+        )
 
 
 def conditions(
@@ -171,7 +173,17 @@ def shown(path: Path, folder: Path, camera: Camera) -> list[dict[str, Any]]:
         _save(folder / name, bead.drawn(frame, found), found)
         width = {"width_mm": (found.width - known.offset_px) / known.px_per_mm, "deviation_px": found.deviation}
         conditions = {"material": known.material, "trial": known.trial, "recording": path.name, "topic": recording.frames.topic}
-        rows.append({"file": name, "place": wanted[k], **conditions, "time_s": round(time, 6), "reason": found.reason, "blur_px": found.blur_px, **width})
+        rows.append(
+            {
+                "file": name,
+                "place": wanted[k],
+                **conditions,
+                "time_s": round(time, 6),
+                "reason": found.reason,
+                "blur_px": found.blur_px,
+                **width,
+            }
+        )
     return [{key: None if isinstance(value, float) and not np.isfinite(value) else value for key, value in row.items()} for row in rows]
 
 

@@ -230,7 +230,7 @@ def test_strict_makes_one_broken_recording_among_good_ones_fatal(tree, refused):
             r"input (u2|heater_2) is a linear combination of (u1|heater_1), so its column of B is not identified; move it independently",
         ),
         # 28 of the 40 samples identify, the others judge
-        (signals(40), r"the record is too short for order 1: expected at least 80 complete samples, found 28; record 52 samples more"),
+        (signals(40), r"the record is too short for order 1: expected at least 48 complete samples, found 28; record 20 samples more"),
     ],
     ids=["a constant input", "a collinear input", "too few samples"],
 )
@@ -243,7 +243,7 @@ def test_a_record_that_does_not_determine_the_plant_is_refused(tree, refused, mo
 def test_an_order_that_the_record_cannot_carry_is_refused_with_what_it_lacks(tree, refused):
     declare(tree, {"identify_plant.order": 40})
     said = refused(tree, "identify_plant")
-    assert "the record is too short for order 40: expected at least 840 complete samples, found 420; record 420 samples more" in said
+    assert "the record is too short for order 40: expected at least 504 complete samples, found 420; record 84 samples more" in said
 
 
 def test_an_unobservable_plant_is_refused_with_its_rank(tree, refused, monkeypatch):

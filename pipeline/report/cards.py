@@ -16,7 +16,6 @@ from pipeline.report.model import trust
 from pipeline.report.sources import Sources, Table
 from pipeline.report.verdict import FAILED, OPEN, ROLES, UNDECIDED, Figure, Missing, Question, outcomes, row_places, state
 
-
 # composer of the deposition loop -> its place in the card
 ROLE = {"basis": "data_driven", "priority": "model_based", "superposition": "model_based", "on_off": "baseline"}
 
@@ -174,13 +173,22 @@ def deposition(sources: Sources) -> dict[str, Any]:
         return _unbuilt("deposition", found.sentence()) | {"link": "deposition.html"}
     parts = list(dict.fromkeys(one.part for one in found))
     # the parts on which the library fares worst say most
-    parts.sort(key=lambda part: -max((one.scores["priority"].error for one in found if one.part == part and "priority" in one.scores), default=0.0))
+    parts.sort(
+        key=lambda part: -max((one.scores["priority"].error for one in found if one.part == part and "priority" in one.scores), default=0.0)
+    )
     names = ("priority", "basis", "on_off")
     rows = [
-        {"title": f"Flow error, {shortened(part, 30)}", "cells": _worst([[one.scores[name].error for one in found if one.part == part and name in one.scores] for name in names], loop.FLOW)}
+        {
+            "title": f"Flow error, {shortened(part, 30)}",
+            "cells": _worst(
+                [[one.scores[name].error for one in found if one.part == part and name in one.scores] for name in names], loop.FLOW
+            ),
+        }
         for part in parts[:2]
     ]
-    lines = [[one.scores[name].worst_line for one in found if name in one.scores and one.scores[name].worst_line is not None] for name in names]
+    lines = [
+        [one.scores[name].worst_line for one in found if name in one.scores and one.scores[name].worst_line is not None] for name in names
+    ]
     rows.append({"title": "Worst line’s volume", "cells": _worst(lines, loop.LINE)})
     role = ROLE.get(judged.composer)
     trials = [_learned(sources, law) for law in ("paper", "ours", "")]
@@ -193,13 +201,21 @@ def deposition(sources: Sources) -> dict[str, Any]:
         "mark": role if judged.state == loop.PASSED else None,
         "win": _deposition_win(found, judged, role),
         "caption": "Error while learning, in % of on\u2011off control’s, log scale 0.3 to 200\u00a0%, the worse material: the paper’s law, ours, none. Grey: what is asked for.",
-        "panels": [_learning_spark(curve, css, named=i == 1) for i, (curve, css) in enumerate(zip(trials, ("mb", "dd", "bl"), strict=True))],
+        "panels": [
+            _learning_spark(curve, css, named=i == 1) for i, (curve, css) in enumerate(zip(trials, ("mb", "dd", "bl"), strict=True))
+        ],
         "heads": [
             {"mark": key, "name": LABELS[CONTROLLERS[key]][0], "method": method}
-            for key, method in (("model_based", "library + priority"), ("data_driven", "basis functions"), ("baseline", "on\u2011off control"))
+            for key, method in (
+                ("model_based", "library + priority"),
+                ("data_driven", "basis functions"),
+                ("baseline", "on\u2011off control"),
+            )
         ],
         "rows": rows,
-        "note": "Forecasts of the identified machine: the true flow of a real one is not known." if judged.real else "Judged by the true flow of simulated machines that nothing was fitted to.",
+        "note": "Forecasts of the identified machine: the true flow of a real one is not known."
+        if judged.real
+        else "Judged by the true flow of simulated machines that nothing was fitted to.",
         "model": None,
         "missing": None,
     }
@@ -213,7 +229,12 @@ def _deposition_win(found: Sequence[loop.Structure], judged: loop.Verdict, role:
     other = loop.worst(found, "priority" if judged.composer == "basis" else "basis")
     beside = f" {loop.USE['priority' if judged.composer == 'basis' else 'basis'].capitalize()}: {percent(other[0], 2)}." if other else ""
     price = judged.price.split(". ")[0].rstrip(".")
-    return f"{name} wins.", f"{loop.NAMES[judged.composer]}: at most {percent(mine, 2)} of on\u2011off control’s flow error on any part.{beside} {price}." if price else ""
+    return (
+        f"{name} wins.",
+        f"{loop.NAMES[judged.composer]}: at most {percent(mine, 2)} of on\u2011off control’s flow error on any part.{beside} {price}."
+        if price
+        else "",
+    )
 
 
 def _worst(groups: Sequence[Sequence[float]], limit: float) -> list[dict[str, Any]]:
@@ -221,7 +242,11 @@ def _worst(groups: Sequence[Sequence[float]], limit: float) -> list[dict[str, An
     values = [max(group) if group else math.inf for group in groups]
     least = min(values)
     return [
-        {"text": percent(value, 2) if math.isfinite(value) else "not measured", "best": value == least and math.isfinite(value), "bad": limit < value < math.inf}
+        {
+            "text": percent(value, 2) if math.isfinite(value) else "not measured",
+            "best": value == least and math.isfinite(value),
+            "bad": limit < value < math.inf,
+        }
         for value in values
     ]
 
@@ -247,7 +272,15 @@ def _learning_spark(curve: np.ndarray | Missing, css: str, *, named: bool) -> Ma
     bad = bool(curve[-1] > loop.LEARNED)
     alt = f"{'On-off control learns nothing' if css == 'bl' else f'The error ends at {percent(float(curve[-1]), 2)} of trial 0’s after {len(curve) - 1} trials'}, {'above' if bad else 'below'} the {loop.LEARNED:g} % asked for"
     return charts.spark(
-        np.arange(float(len(curve))), curve, charts.Axis(0.3, 200.0, (), True), css=css, limit=loop.LEARNED, alt=alt, named=named, bad=bad, limit_label=f"limit {loop.LEARNED:g}"
+        np.arange(float(len(curve))),
+        curve,
+        charts.Axis(0.3, 200.0, (), True),
+        css=css,
+        limit=loop.LEARNED,
+        alt=alt,
+        named=named,
+        bad=bad,
+        limit_label=f"limit {loop.LEARNED:g}",
     )
 
 
@@ -260,7 +293,11 @@ def _unbuilt(key: str, why: str) -> dict[str, Any]:
     """A loop without figures: the same frame, and the sentence in it."""
     heads = {
         "deposition": ("Deposition", "Plunger command to flow at the nozzle", ("library + priority", "basis functions", "on-off control")),
-        "setpoint": ("Setpoint", "Nozzle camera to flow and temperature setpoints", ("Bayes filter", "Q-learning agent", "sequential test")),
+        "setpoint": (
+            "Setpoint",
+            "Nozzle camera to flow and temperature setpoints",
+            ("Bayes filter", "Q-learning agent", "sequential test"),
+        ),
     }
     name, moved, methods = heads[key]
     order = ("model_based", "data_driven", "baseline")
@@ -274,7 +311,9 @@ def _unbuilt(key: str, why: str) -> dict[str, Any]:
         "win": ("Not measured.", why or "Its stages are not built yet: train_classifier, train_agent, evaluate_setpoint."),
         "caption": "Nothing is shown before it is measured.",
         "panels": [Markup('<div class="hole">{}not measured</div>').format(page.glyph(OPEN)) for _ in order],
-        "heads": [{"mark": role, "name": LABELS[CONTROLLERS[role]][0], "method": method} for role, method in zip(order, methods, strict=True)],
+        "heads": [
+            {"mark": role, "name": LABELS[CONTROLLERS[role]][0], "method": method} for role, method in zip(order, methods, strict=True)
+        ],
         "rows": [],
         "note": "No figure, so no claim.",
         "model": None,

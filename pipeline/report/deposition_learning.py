@@ -91,7 +91,11 @@ def errors(sources: Sources) -> Picture:
                 charts.dots(frame, mine["trial"][best : best + 1], true[best : best + 1], f"dot {LAWS[law][2]}", 3),
                 charts.label(frame, last, 130, f"material {material}", anchor="end"),
             ]
-            panels.append(charts.panel(frame, layers, alt=alt, css=LAWS[law][2], title="% of trial 0, log" if column == i == 0 else "", x_ticks=bottom))
+            panels.append(
+                charts.panel(
+                    frame, layers, alt=alt, css=LAWS[law][2], title="% of trial 0, log" if column == i == 0 else "", x_ticks=bottom
+                )
+            )
         return panels
 
     shown = _columns(laws, draw)
@@ -101,7 +105,14 @@ def errors(sources: Sources) -> Picture:
         if machine
         else "Line: r.m.s. error of the true flow; grey dots: of the measured one, which ends higher because noise that does not repeat counts in it, and cannot be learned away."
     )
-    return Picture("learning-error", title, f"{text}.", shown, f"{floor} In % of trial 0’s, log scale, against the trial; the lines at 20 and 10 are the guides. Filled dot: the best trial.", page.origin(sources.source("trials")))
+    return Picture(
+        "learning-error",
+        title,
+        f"{text}.",
+        shown,
+        f"{floor} In % of trial 0’s, log scale, against the trial; the lines at 20 and 10 are the guides. Filled dot: the best trial.",
+        page.origin(sources.source("trials")),
+    )
 
 
 # ---- commands
@@ -132,7 +143,9 @@ def commands(sources: Sources) -> Picture:
             if trial == last:
                 peaks.append(f"{material} {number(peak, 0)} times")
             bottom = i == len(materials) - 1
-            frame = charts.Frame(charts.linear(0, float(mine["time_s"][-1]), ticks=5), y, 368, 132 if bottom else 120, 30, 16 if bottom else 6)
+            frame = charts.Frame(
+                charts.linear(0, float(mine["time_s"][-1]), ticks=5), y, 368, 132 if bottom else 120, 30, 16 if bottom else 6
+            )
             layers = [
                 charts.line(frame, mine["time_s"], u, most=500),
                 charts.label(frame, float(mine["time_s"][-1]), 10, f"material {material}: peak {short(peak, 2)} ×", anchor="end"),
@@ -187,7 +200,14 @@ def corner(sources: Sources) -> Picture:
             near = (mine["time_s"] >= begin - 1.0) & (mine["time_s"] <= end + 1.5)
             t, flow, wanted = mine["time_s"][near] - begin, mine[kind][near], mine["wanted_mm3_per_s"][near]
             top, bottom = 1.45 * float(wanted.max()), i == len(materials) - 1
-            frame = charts.Frame(charts.linear(-1.0, end - begin + 1.5, ticks=4), charts.linear(0, top, ticks=3), 270, 128 if bottom else 116, 26, 16 if bottom else 6)
+            frame = charts.Frame(
+                charts.linear(-1.0, end - begin + 1.5, ticks=4),
+                charts.linear(0, top, ticks=3),
+                270,
+                128 if bottom else 116,
+                26,
+                16 if bottom else 6,
+            )
             error = 100 * float(np.sqrt(np.nanmean((flow - wanted) ** 2))) / float(wanted.max())
             low[f"{law}{after}"] = max(low.get(f"{law}{after}", 0.0), error)
             alt = f"{'After learning' if after else 'Before learning'}, {LAWS[law][0] if after else 'on-off control'}, material {material}: the flow misses the wanted one by {percent(error, 2)} of a full line, r.m.s."
@@ -200,7 +220,9 @@ def corner(sources: Sources) -> Picture:
         return panels
 
     shown = [Column(head, small, mark, draw(law, css, after, i)) for i, (head, small, mark, css, law, after) in enumerate(stories)]
-    after = [f"{LAWS[law][0].lower() if law == 'paper' else LAWS[law][0]} {percent(low[f'{law}True'], 2)}" for law in laws if f"{law}True" in low]
+    after = [
+        f"{LAWS[law][0].lower() if law == 'paper' else LAWS[law][0]} {percent(low[f'{law}True'], 2)}" for law in laws if f"{law}True" in low
+    ]
     before = low.get(f"{laws[-1]}False")
     return Picture(
         "corner",
@@ -235,7 +257,7 @@ def frames(sources: Sources) -> dict[str, Any]:
                 + (f"rejected: {one['reason']}" if one["reason"] else f"the bead’s edges found, {number(one['width_mm'], 3)} mm apart")
             ),
         }
-        for one in rows[:24]
+        for one in rows
     ]
     return {"missing": None, "shown": shown, "origin": page.origin(sources.source("frames"))}
 
@@ -257,14 +279,21 @@ def measured(sources: Sources) -> Picture:
             mine = _trial(table, material, "pixels", trial)
             here = (film["material"] == material) & (film["routine"] == 0) & (film["trial"] == trial)
             if len(mine["time_s"]) and here.any():
-                panels += _told(mine, 1.645 * float(film["deviation_mm3_per_s"][here][0]), f"Material {material}, trial {trial}", machine, titled=column == 0 and not panels)
+                panels += _told(
+                    mine,
+                    1.645 * float(film["deviation_mm3_per_s"][here][0]),
+                    f"Material {material}, trial {trial}",
+                    machine,
+                    titled=column == 0 and not panels,
+                )
         return panels
 
     shown = [Column(f"Material {material}", "first and last filmed trial", "", draw(material, i)) for i, material in enumerate(materials)]
     figures = [
         f"{name} {percent(float(whole), 2)}, around the corner {percent(float(near), 2)}"
         for name, one in (sources.metrics["train_ilc"] if isinstance(sources.metrics["train_ilc"], dict) else {}).items()
-        if not isinstance(whole := lookup(one, "pixels.flow_error_percent"), Missing) and not isinstance(near := lookup(one, "pixels.flow_error_corner_percent"), Missing)
+        if not isinstance(whole := lookup(one, "pixels.flow_error_percent"), Missing)
+        and not isinstance(near := lookup(one, "pixels.flow_error_corner_percent"), Missing)
     ]
     finding = (
         f"Over all trials the measured flow is off by, r.m.s. of a full line’s: {'; '.join(figures)}. At most 2.5{THIN}% and 6{THIN}% are asked for."
@@ -285,7 +314,9 @@ def measured(sources: Sources) -> Picture:
 def _told(mine: Table, wide: float, name: str, machine: bool, *, titled: bool) -> list[Markup]:
     """The measured flow of a trial, and, where it is known, its distance from the true one with the band of its uncertainty."""
     t, seen, true, steady = mine["time_s"], mine["measured_mm3_per_s"], mine["true_mm3_per_s"], float(mine["wanted_mm3_per_s"].max())
-    frame = charts.Frame(charts.linear(0, float(t[-1]), ticks=5), charts.linear(0, 1.4 * steady, ticks=3), 568, 112, 28, 6 if not machine else 16)
+    frame = charts.Frame(
+        charts.linear(0, float(t[-1]), ticks=5), charts.linear(0, 1.4 * steady, ticks=3), 568, 112, 28, 6 if not machine else 16
+    )
     blind = [(float(t[a]), float(t[min(b, len(t) - 1)])) for a, b in charts.stretches(np.isnan(seen))]
     alt = f"{name}: the flow as measured, between {number(float(np.nanmin(seen)), 1)} and {number(float(np.nanmax(seen)), 1)} mm³/s; standard deviation {short(wide / 1.645, 2)}"
     text = charts.label(frame, float(t[-1]), 1.4 * steady, name, anchor="end", dy=6)

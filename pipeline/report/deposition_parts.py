@@ -86,7 +86,9 @@ def _shares(error: np.ndarray) -> Markup:
     """The legend of a map: how much of the time is of each class."""
     found = np.bincount(_classes(error), minlength=5) / max(len(error), 1)
     items = [
-        Markup('<span><svg class="key" aria-hidden="true" viewBox="0 0 18 8"><path class="{}" d="M1 4H17"/></svg>{} {}</span>').format(css, word, percent(100 * float(share), 2))
+        Markup('<span><svg class="key" aria-hidden="true" viewBox="0 0 18 8"><path class="{}" d="M1 4H17"/></svg>{} {}</span>').format(
+            css, word, percent(100 * float(share), 2)
+        )
         for (word, css), share in zip(CLASSES, found, strict=True)
         if share > 0
     ]
@@ -113,14 +115,20 @@ def _drawn(mine: Table, error: np.ndarray, prints: np.ndarray, alt: str) -> Mark
         if kind[piece[0]] >= 0:
             # up to the next piece's first sample where that prints too, so that no gap is left
             end = piece[-1] + 1
-            joined = np.append(piece, end) if end < len(kind) and kind[end] >= 0 and abs(px[end] - px[end - 1]) + abs(py[end] - py[end - 1]) < 8 else piece
+            joined = (
+                np.append(piece, end)
+                if end < len(kind) and kind[end] >= 0 and abs(px[end] - px[end - 1]) + abs(py[end] - py[end - 1]) < 8
+                else piece
+            )
             paths.setdefault(int(kind[piece[0]]), []).append(_path(px[joined], py[joined]))
     layers = [Markup('<path class="{}" d="{}"/>').format(CLASSES[k][1], "".join(paths[k])) for k in (2, 1, 3, 0, 4) if k in paths]
     bar = _round(span / 4)
     ruler = Markup('<path class="ruler" d="M{} {}h{}"/><text x="{}" y="{}">{} mm</text>').format(
         f"{room:.0f}", f"{height - 5:.0f}", f"{scale * bar:.1f}", f"{room + scale * bar + 5:.1f}", f"{height - 1:.0f}", short(bar, 2)
     )
-    return Markup('<svg class="plot map" viewBox="0 0 {} {}" role="img" aria-label="{}">{}{}</svg>').format(f"{width:.0f}", f"{height:.0f}", alt, Markup("").join(layers), ruler)
+    return Markup('<svg class="plot map" viewBox="0 0 {} {}" role="img" aria-label="{}">{}{}</svg>').format(
+        f"{width:.0f}", f"{height:.0f}", alt, Markup("").join(layers), ruler
+    )
 
 
 def _thinned(error: np.ndarray, prints: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -160,7 +168,10 @@ def stretches(sources: Sources) -> Picture:
     chosen = {(part, material): str(composer) for part, material, composer, taken in rows if taken}
     found = [_stretch(table, part, material, chosen.get((part, material), "basis")) for part, material in _streams(table)[:STREAMS]]
     names = [name for name in ("priority", "basis", "ilc", "on_off") if any(np.isfinite(one.flows[name]).any() for one in found)]
-    shown = [Column(NAMES[name], PAPER[name], MARK[name], [_panel(one, name, first=name == names[0], top=k == 0) for k, one in enumerate(found)]) for name in names]
+    shown = [
+        Column(NAMES[name], PAPER[name], MARK[name], [_panel(one, name, first=name == names[0], top=k == 0) for k, one in enumerate(found)])
+        for name in names
+    ]
     worst = {name: max(one.off(name) for one in found) for name in names}
     return Picture(
         "stretches",
@@ -184,7 +195,11 @@ class Stretch(NamedTuple):
 
     def off(self, name: str) -> float:
         """r.m.s. error in % of the steady flow."""
-        return 100 * float(np.sqrt(np.nanmean((self.flows[name] - self.wanted) ** 2))) / self.steady if np.isfinite(self.flows[name]).any() else 0.0
+        return (
+            100 * float(np.sqrt(np.nanmean((self.flows[name] - self.wanted) ** 2))) / self.steady
+            if np.isfinite(self.flows[name]).any()
+            else 0.0
+        )
 
 
 def _stretch(table: Table, part: str, material: str, chosen: str) -> Stretch:
@@ -194,11 +209,15 @@ def _stretch(table: Table, part: str, material: str, chosen: str) -> Stretch:
     middle = float(t[np.argmax(np.abs(np.nan_to_num(flows[chosen]) - wanted))])
     begin = min(max(middle - STRETCH_S / 2, float(t[0])), max(float(t[-1]) - STRETCH_S, float(t[0])))
     near = (t >= begin) & (t <= begin + STRETCH_S)
-    return Stretch(f"{part}, {material}", chosen, t[near], wanted[near], {name: flow[near] for name, flow in flows.items()}, float(wanted.max()) or 1.0)
+    return Stretch(
+        f"{part}, {material}", chosen, t[near], wanted[near], {name: flow[near] for name, flow in flows.items()}, float(wanted.max()) or 1.0
+    )
 
 
 def _panel(one: Stretch, name: str, *, first: bool, top: bool) -> Markup:
-    frame = charts.Frame(charts.linear(float(one.t[0]), float(one.t[-1]), ticks=4), charts.linear(0, 1.45 * one.steady, ticks=3), 270, 112, 26)
+    frame = charts.Frame(
+        charts.linear(float(one.t[0]), float(one.t[-1]), ticks=4), charts.linear(0, 1.45 * one.steady, ticks=3), 270, 112, 26
+    )
     text = f"{shortened(one.name, 24)}: {percent(one.off(name), 2)} off{', chosen' if name == one.chosen else ''}"
     layers = [
         charts.line(frame, one.t, one.wanted, "ref"),
@@ -284,8 +303,8 @@ def refused(sources: Sources) -> dict[str, Any]:
     rows = []
     for part, report in found.items():
         why = report.get("refused", [])
-        rows += [(str(part), "whole", why)] if isinstance(why, str) else [(str(part), f"line {one['line']}", str(one["why"])) for one in why]
+        rows += (
+            [(str(part), "whole", why)] if isinstance(why, str) else [(str(part), f"line {one['line']}", str(one["why"])) for one in why]
+        )
     unknown = [f"{part}: {count(report['unknown_words'], 'word')}" for part, report in found.items() if report.get("unknown_words")]
     return {"missing": None, "rows": rows[:REFUSED], "more": max(len(rows) - REFUSED, 0), "unknown": ", ".join(unknown)}
-
-

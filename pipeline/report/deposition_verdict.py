@@ -152,7 +152,9 @@ def _flow(found: Sequence[Structure]) -> Rule:
     pairs = [worst(found, name) for name in (OURS, LIBRARY)]
     shown = [(None, OPEN) if pair is None else (pair[0], percent(pair[0], 2)) for pair in pairs]
     reason = (
-        "" if pairs[0] is None else f"{_where(pairs[0][1])} keeps {percent(pairs[0][0], 2)} of on\u2011off control’s flow error; {FLOW:g}{THIN}% are allowed."
+        ""
+        if pairs[0] is None
+        else f"{_where(pairs[0][1])} keeps {percent(pairs[0][0], 2)} of on\u2011off control’s flow error; {FLOW:g}{THIN}% are allowed."
     )
     remedy = "Run more trials, or train the speeds and pauses of that part (printer.routines)."
     return _rule("Flow error", f"≤ {FLOW:g}{THIN}%", "scoreboard", shown, FLOW, reason, remedy)
@@ -164,12 +166,22 @@ def _where(one: Structure) -> str:
 
 def _line(found: Sequence[Structure]) -> Rule:
     pairs = [
-        max(((one.scores[name].worst_line, one) for one in found if name in one.scores and one.scores[name].worst_line is not None), default=None, key=lambda p: p[0])
+        max(
+            ((one.scores[name].worst_line, one) for one in found if name in one.scores and one.scores[name].worst_line is not None),
+            default=None,
+            key=lambda p: p[0],
+        )
         for name in (OURS, LIBRARY)
     ]
     shown = [(None, OPEN) if pair is None else (pair[0], f"±{percent(pair[0], 2)}") for pair in pairs]
-    reason = "" if pairs[0] is None else f"A line of {_where(pairs[0][1])} is {percent(pairs[0][0], 2)} off its volume; ±{LINE:g}{THIN}% is allowed."
-    return _rule("Line volume", f"±{LINE:g}{THIN}%", "lines", shown, LINE, reason, "Print that line slower, or longer: the table of lines names it.")
+    reason = (
+        ""
+        if pairs[0] is None
+        else f"A line of {_where(pairs[0][1])} is {percent(pairs[0][0], 2)} off its volume; ±{LINE:g}{THIN}% is allowed."
+    )
+    return _rule(
+        "Line volume", f"±{LINE:g}{THIN}%", "lines", shown, LINE, reason, "Print that line slower, or longer: the table of lines names it."
+    )
 
 
 def _above(found: Sequence[Structure]) -> Rule:
@@ -179,50 +191,48 @@ def _above(found: Sequence[Structure]) -> Rule:
         most = max(above, key=lambda pair: pair[0], default=None)
         place = place or most
         shown.append((None, OPEN) if most is None else (most[0], f"{'+' if most[0] > 0 else '−'}{number(abs(most[0]), 1)} points"))
-    reason = "" if place is None else f"{_where(place[1])} lies {number(place[0], 1)} points above what learning it trial by trial reaches; {ABOVE:g} is allowed."
-    return _rule("Above learning it whole", f"≤ {ABOVE:g} point", "scoreboard", shown, ABOVE, reason, "Learn that part itself, where it is printed often.")
+    reason = (
+        ""
+        if place is None
+        else f"{_where(place[1])} lies {number(place[0], 1)} points above what learning it trial by trial reaches; {ABOVE:g} is allowed."
+    )
+    return _rule(
+        "Above learning it whole",
+        f"≤ {ABOVE:g} point",
+        "scoreboard",
+        shown,
+        ABOVE,
+        reason,
+        "Learn that part itself, where it is printed often.",
+    )
 
 
 def _learning(sources: Sources) -> Rule:
     shown = []
-    laws = [[name for name in ("pixels", "ours") if name in _laws(sources)][:1], ["paper"]]
-    for names in laws:
-        ratios = [100 * value for name in names for _, value in best(sources, name)]
-        shown.append((max(ratios), percent(max(ratios), 2)) if ratios else (None, OPEN))
-    reason = f"The error after learning is still {shown[0][1]} of trial 0’s; {LEARNED:g}{THIN}% are asked for." if shown[0][0] is not None else "No trial was learned from."
+    for laws in (("pixels", "ours"), ("paper",)):
+        ratios = next((found for law in laws if (found := _each(sources, f"{law}.best_ratio"))), None)
+        shown.append((None, OPEN) if ratios is None else (100 * max(ratios), percent(100 * max(ratios), 2)))
+    reason = f"The error after learning is still {shown[0][1]} of trial 0’s; {LEARNED:g}{THIN}% are asked for."
+    reason = "No trial was learned from." if shown[0][0] is None else reason
     return _rule("Learned to", f"≤ {LEARNED:g}{THIN}%", "learning", shown, LEARNED, reason, "Run more trials (train_ilc.trials).")
 
 
-def _laws(sources: Sources) -> set[str]:
+def _each(sources: Sources, key: str) -> list[float]:
+    """A figure of every material that has it."""
     metrics = sources.metrics["train_ilc"]
-    return set() if isinstance(metrics, Missing) else {law for found in metrics.values() if isinstance(found, Mapping) for law in found}
-
-
-def best(sources: Sources, law: str) -> list[tuple[str, float]]:
-    """(material, least error as share of trial 0's) of a law."""
-    metrics = sources.metrics["train_ilc"]
-    pairs = [] if isinstance(metrics, Missing) else [(name, lookup(found, f"{law}.best_ratio")) for name, found in metrics.items()]
-    return [(name, float(value)) for name, value in pairs if not isinstance(value, Missing)]
+    found = [] if isinstance(metrics, Missing) else [lookup(one, key) for one in metrics.values()]
+    return [float(value) for value in found if not isinstance(value, Missing)]
 
 
 def gamma(sources: Sources) -> dict[str, float] | None:
     """Of the paper's law, before anything ran: nominal, worst of the family, and the share of it above 1 in %, each the worst of all materials."""
-    metrics = sources.metrics["train_ilc"]
-    found = {}
-    for key in ("gamma", "gamma_worst", "gamma_above_1_percent"):
-        values = [] if isinstance(metrics, Missing) else [lookup(one, key) for one in metrics.values()]
-        values = [float(value) for value in values if not isinstance(value, Missing)]
-        if not values:
-            return None
-        found[key] = max(values)
-    return found
+    found = {key: _each(sources, key) for key in ("gamma", "gamma_worst", "gamma_above_1_percent")}
+    return {key: max(values) for key, values in found.items()} if all(found.values()) else None
 
 
 def _convergence(sources: Sources) -> Rule:
-    found = gamma(sources)
+    found, values = gamma(sources), _each(sources, "gamma_ours_worst")
     paper = (OPEN, OPEN) if found is None else _below_one(found["gamma_worst"])
-    metrics = sources.metrics["train_ilc"]
-    values = [] if isinstance(metrics, Missing) else [value for one in metrics.values() if not isinstance(value := lookup(one, "gamma_ours_worst"), Missing)]
     # ours is tested once its first trials have identified the machine, over the machines that these cannot tell apart
     ours = _below_one(max(values)) if values else ("not applicable", "rolls back")
     return Rule("Convergence test", "γ < 1", "beforehand", (ours[0], paper[0]), (ours[1], paper[1]), "", "")
@@ -236,14 +246,22 @@ def _limit(sources: Sources) -> Rule:
     found = sources.tables["conformance"]
     if isinstance(found, Missing):
         return Rule("Command limit", "0", "saturation", (OPEN, OPEN), (OPEN, OPEN), found.sentence(), "")
-    shares = [(float(one["share_percent"]), part, name, one) for part, report in found.items() for name, one in report.get("saturation", {}).items()]
+    shares = [
+        (float(one["share_percent"]), part, name, one)
+        for part, report in found.items()
+        for name, one in report.get("saturation", {}).items()
+    ]
     if not shares:
         return Rule("Command limit", "0", "saturation", (OPEN, OPEN), (OPEN, OPEN), "No part was composed.", "")
     share, part, name, one = max(shares, key=lambda s: (not s[3]["enough"], s[0]))
     limited = any(s[3].get("limit") is not None for s in shares)
     text = percent(share, 2) if not one["enough"] else f"0{THIN}%" if limited else "none set"
     ramp = lookup(found, f"{part}.ramp_that_would_do_s.{name}") if "." not in part else Missing("not measured", "")
-    remedy = "Print slower, or raise printer.limit_mm: no ramp would do." if isinstance(ramp, Missing) else f"Ramps of {ramp:.2f}{THIN}s would do (printer.ramp_s)."
+    remedy = (
+        "Print slower, or raise printer.limit_mm: no ramp would do."
+        if isinstance(ramp, Missing)
+        else f"Ramps of {ramp:.2f}{THIN}s would do (printer.ramp_s)."
+    )
     reason = f"The command for {part}, material {name}, is at its limit {percent(share, 2)} of the printing time, and no signal can make up for it."
     state = PASSED if one["enough"] else FAILED
     return Rule("Time at the command’s limit", f"0{THIN}%", "saturation", (state, state), (text, text), reason, remedy)
@@ -257,7 +275,9 @@ def _printed(sources: Sources) -> Rule:
     short = sum(report.get("shorter_than_lead", 0) for report in found.values())
     states = (FAILED if refused else PASSED, FAILED if refused or short else PASSED)
     texts = tuple("all" if not n else f"{n:,} not" for n in (len(refused), len(refused) + short))
-    reason = f"{count(len(refused), 'line was', 'lines were')} refused".capitalize() + (f", the first in {refused[0][0]}: {refused[0][1]}" if refused else "")
+    reason = f"{count(len(refused), 'line was', 'lines were')} refused".capitalize() + (
+        f", the first in {refused[0][0]}: {refused[0][1]}" if refused else ""
+    )
     return Rule("Every line printed", "all", "refused", states, texts, reason, "Mend these lines of the program, or print without them.")
 
 
@@ -273,7 +293,18 @@ def verdict(sources: Sources) -> Verdict:
     found, machine = structures(sources), real(sources)
     if isinstance(found, Missing):
         tested = rules(sources, [])
-        return Verdict(OPEN, "", "Do not print by this loop yet.", "Nothing was composed.", found.sentence(), "", _price(sources, []), tested, "", machine)
+        return Verdict(
+            OPEN,
+            "",
+            "Do not print by this loop yet.",
+            "Nothing was composed.",
+            found.sentence(),
+            "",
+            _price(sources, []),
+            tested,
+            "",
+            machine,
+        )
     use, tested = winner(found), rules(sources, found)
     # ours' column for the basis functions, the paper's for the library; the paper's law is not what the library was learned by
     column = 0 if use == OURS else 1
@@ -288,9 +319,24 @@ def verdict(sources: Sources) -> Verdict:
         lead = f"All {count(len(needed), 'rule')} passed."
     else:
         decision = f"{'Do not print these parts yet' if state == FAILED else 'Do not decide yet'}: {USE[use]} {'comes' if use == 'on_off' or use != OURS else 'come'} closest."
-        lead = f"First {'failed' if state == FAILED else 'open'} rule: {first.name[:1].lower()}{first.name[1:]}." if first else "Nothing beats on\u2011off control."
+        lead = (
+            f"First {'failed' if state == FAILED else 'open'} rule: {first.name[:1].lower()}{first.name[1:]}."
+            if first
+            else "Nothing beats on\u2011off control."
+        )
     reason = " ".join(part for part in (first.reason if first and column == 0 else "", told(found, use, machine)) if part)
-    return Verdict(state, use, decision, lead, reason, first.remedy if first else "", _price(sources, found), tested, first.name if first else "", machine)
+    return Verdict(
+        state,
+        use,
+        decision,
+        lead,
+        reason,
+        first.remedy if first else "",
+        _price(sources, found),
+        tested,
+        first.name if first else "",
+        machine,
+    )
 
 
 def told(found: Sequence[Structure], use: str, machine: bool) -> str:
@@ -331,7 +377,15 @@ def _price(sources: Sources, found: Sequence[Structure]) -> str:
         )
     conformance = sources.tables["conformance"]
     short = {} if isinstance(conformance, Missing) else {part: report.get("shorter_than_lead", 0) for part, report in conformance.items()}
-    parts += [f"{count(n, 'line', 'lines').capitalize()} of {part} {'is' if n == 1 else 'are'} shorter than the lead: the priority rule would not print {'it' if n == 1 else 'them'}." for part, n in short.items() if n][:2]
-    missed = [one for one in found if one.chosen and one.chosen != one.best() and one.scores[one.chosen].error > one.scores[one.best()].error + SAME]
-    parts += [f"The forecast chose wrongly for {_where(missed[0])[:-1]}: {_bare(missed[0].best())} is better." ] if missed else []
+    parts += [
+        f"{count(n, 'line', 'lines').capitalize()} of {part} {'is' if n == 1 else 'are'} shorter than the lead: the priority rule would not print {'it' if n == 1 else 'them'}."
+        for part, n in short.items()
+        if n
+    ][:2]
+    missed = [
+        one
+        for one in found
+        if one.chosen and one.chosen != one.best() and one.scores[one.chosen].error > one.scores[one.best()].error + SAME
+    ]
+    parts += [f"The forecast chose wrongly for {_where(missed[0])[:-1]}: {_bare(missed[0].best())} is better."] if missed else []
     return " ".join(parts)

@@ -69,6 +69,9 @@ def collect(declared: Declared, metrics: Mapping[str, str], folders: Mapping[str
     by_name = [
         {name: value for (_, name), value in part} for part in (list(found.items())[: len(metrics)], list(found.items())[len(metrics) :])
     ]
+    frames = by_name[1].get("frames", [])
+    for one in [] if isinstance(frames, Missing) else frames:
+        read[one["path"]] = Source("frame", one["path"], "train_ilc", "JPEG", artifacts.sha256(one["path"]))
     before = _read({}, accepted, "accepted", "accept", "accepted", artifacts.read_json) if artifacts.exists(accepted) else None
     return Sources(declared, *by_name, read, absent, before or None, digest({folder: artifacts.sha256(folder) for folder in code}))
 
@@ -110,7 +113,7 @@ def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], An
         ("lessons", "train_ilc", "lessons.parquet", *table(schemas.LESSONS)),
         ("filmed", "train_ilc", "filmed.parquet", *table(schemas.FILMED)),
         ("models", "train_ilc", "models.json", "models", artifacts.read_json),
-        ("frames", "train_ilc", "frames", "frames 1", _frames),
+        ("frames", "train_ilc", "frames/frames.json", "frames 1", _frames),
         ("library", "segment_library", "library.parquet", *table(schemas.LIBRARY)),
         ("learned", "segment_library", "learned.json", "learned", artifacts.read_json),
         ("signals", "compose_parts", "signals.parquet", *table(schemas.SIGNALS)),
@@ -121,18 +124,22 @@ def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], An
     ]
 
 
-def _frames(folder: str) -> list[dict[str, Any]]:
-    """The index of a folder of frames, each with its picture as a data URI. Raises ValueError where a picture is missing or no JPEG."""
-    found = artifacts.read_json(f"{folder}/frames.json")
+# frames that a page has room for
+FRAMES = 24
+
+
+def _frames(path: str) -> list[dict[str, Any]]:
+    """The first rows of an index of frames, each with its picture's path and the picture as a data URI. Raises ValueError where one is missing or no JPEG."""
+    found = artifacts.read_json(path)[:FRAMES]
     for one in found:
-        path = Path(folder) / Path(one["file"]).name
+        picture = Path(path).with_name(Path(one["file"]).name)
         try:
-            data = path.read_bytes()
+            data = picture.read_bytes()
         except OSError as error:
-            raise ValueError(f"{path} cannot be read ({error.strerror}); run ./run dvc repro train_ilc") from None
+            raise ValueError(f"{picture} cannot be read ({error.strerror}); run ./run dvc repro train_ilc") from None
         if not data.startswith(b"\xff\xd8"):
-            raise ValueError(f"{path} is no JPEG; run ./run dvc repro train_ilc")
-        one["uri"] = "data:image/jpeg;base64," + base64.b64encode(data).decode()
+            raise ValueError(f"{picture} is no JPEG; run ./run dvc repro train_ilc")
+        one |= {"path": picture.as_posix(), "uri": "data:image/jpeg;base64," + base64.b64encode(data).decode()}
     return found
 
 

@@ -74,22 +74,55 @@ FIXED = {
         "Spread",
         "Plants identified anew from records rebuilt with resampled errors: as different as the record allows, and one order higher.",
     ),
-    "on_off": ("On\u2011off control", "Wanted flow over the gain known beforehand: what a machine does that knows nothing of its own slowness. Its error is 100 %."),
+    "on_off": (
+        "On\u2011off control",
+        "Wanted flow over the gain known beforehand: what a machine does that knows nothing of its own slowness. Its error is 100 %.",
+    ),
     "basis": (
         "Basis functions",
         "Our composer: the command for any part is built from a few functions of the wanted flow, fitted to the trials through an identified chain. It needs no trained task.",
     ),
-    "library": ("Library", "The paper’s composer: signals learned once for Start, Stop, Corner and Steady\u2011State, laid one after another as the part program asks."),
-    "priority": ("Priority rule", "Where two signals of the library overlap, one is dropped: Stop before Start before Corner before Steady\u2011State before No\u2011Flow."),
+    "library": (
+        "Library",
+        "The paper’s composer: signals learned once for Start, Stop, Corner and Steady\u2011State, laid one after another as the part program asks.",
+    ),
+    "priority": (
+        "Priority rule",
+        "Where two signals of the library overlap, one is dropped: Stop before Start before Corner before Steady\u2011State before No\u2011Flow.",
+    ),
     "superposition": ("Superposition", "Where two signals overlap, both are added, as deviations from the steady command."),
-    "whole": ("Learned whole", "Trials of this very part by our law: the best that learning gives, and a yardstick for signals composed without it."),
-    "forecast": ("Forecast", "What the identified chain predicts before anything is printed. True figures come from a simulated machine that nothing was fitted to."),
-    "lead": ("Lead", "How long before its event a signal must begin: the material answers late. A line shorter than it leaves Stop no room."),
-    "trial": ("Trial", "One run of the training routine: off, on, a pause of the gantry that stands for a corner, on, off. Trial 0 is on\u2011off control."),
-    "through_pictures": ("Through pictures", "The flow is not told to the law but measured from camera frames of the bead, trial by trial, as on a machine."),
-    "gamma": ("γ", "By how much, at most, the error of one trial can be larger than that of the trial before, over all frequencies. Below 1 learning converges."),
-    "saturation": ("Saturation", "The command asks for more than the drive can give and is cut off. No law makes up for it; longer ramps do."),
-    "line_volume": ("Line volume", "Material between the middles of the gaps before and after a printed line, against bead area times length."),
+    "whole": (
+        "Learned whole",
+        "Trials of this very part by our law: the best that learning gives, and a yardstick for signals composed without it.",
+    ),
+    "forecast": (
+        "Forecast",
+        "What the identified chain predicts before anything is printed. True figures come from a simulated machine that nothing was fitted to.",
+    ),
+    "lead": (
+        "Lead",
+        "How long before its event a signal must begin: the material answers late. A line shorter than it leaves Stop no room.",
+    ),
+    "trial": (
+        "Trial",
+        "One run of the training routine: off, on, a pause of the gantry that stands for a corner, on, off. Trial 0 is on\u2011off control.",
+    ),
+    "through_pictures": (
+        "Through pictures",
+        "The flow is not told to the law but measured from camera frames of the bead, trial by trial, as on a machine.",
+    ),
+    "gamma": (
+        "γ",
+        "By how much, at most, the error of one trial can be larger than that of the trial before, over all frequencies. Below 1 learning converges.",
+    ),
+    "saturation": (
+        "Saturation",
+        "The command asks for more than the drive can give and is cut off. No law makes up for it; longer ramps do.",
+    ),
+    "line_volume": (
+        "Line volume",
+        "Material between the middles of the gaps before and after a printed line, against bead area times length.",
+    ),
     "study": ("The study", "The published work whose method this is; “as published” repeats its own way of counting, digit by digit."),
 }
 

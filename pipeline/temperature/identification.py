@@ -45,7 +45,7 @@ from pipeline.temperature.subspace import (
     varx,
 )
 
-__all__ = ["Candidate", "Identified", "Varx", "check_inputs", "identify", "moesp", "moesp_singular_values", "varx"]
+__all__ = ["Candidate", "Identified", "Varx", "check_inputs", "identify", "moesp", "moesp_singular_values", "refit", "varx"]
 
 EXACT_RANK = 1e-7  # singular values of a noise-free record below this share of the largest are rounding
 
@@ -161,16 +161,8 @@ def identify(
     `limits` (low, high) of the actuators clip u; `max_radius` bounds every pole. Works in closed loop, unless refined on simulation errors.
     Raises ValueError for a constant or collinear input, a constant output, a record too short for the order, and shapes that do not agree.
     """
-    u, y = [np.atleast_2d(np.asarray(a, float)) for a in u], [np.atleast_2d(np.asarray(b, float)) for b in y]
-    _check_shapes(u, y)
-    m, whole = u[0].shape[1], sum(map(len, u))
-    u, notes = within_limits(u, limits, names=names) if limits is not None else (u, [])
-    u, y = gapless(u, y)
-    cut = whole - sum(map(len, u))
-    _check_length(u, y, order, past)
-    check_inputs(u, offset=offset, names=names)
-    check_outputs(y)
-    notes += [f"{cut} samples with a masked input, or without any output, were cut out"] if cut else []
+    u, y, cut, notes = _prepared(u, y, order, past, offset, limits, names)
+    m = u[0].shape[1]
     pasts, exact = _windows(u, y, order, past, offset)
     direct = (feedthrough,)
     if feedthrough is None:
@@ -191,6 +183,38 @@ def identify(
         notes.append(f"direct feed-through {'kept' if structure.feedthrough else 'left out'} as the data prefer")
     found = _fit_all(u, y, structure, exact, order, kind, method, sample_time_s, table, max_radius)
     return found._replace(dropped_rows=found.dropped_rows + cut, notes=notes + _remarks(found, names))
+
+
+def refit(
+    u: Segments,
+    y: Segments,
+    found: Identified,
+    *,
+    method: Literal["pbsid", "moesp"] = "pbsid",
+    max_radius: float | None = None,
+    limits: tuple[Sequence[float], Sequence[float]] | None = None,
+    names: Sequence[str] = (),
+) -> Identified:
+    """What was chosen on a part of the record (window, feed-through, dead times, order, refinement) fitted to all of it, nothing chosen anew; as `identify` otherwise."""
+    u, y, cut, notes = _prepared(u, y, found.order, found.past, found.offset, limits, names)
+    structure = Structure(found.past, found.feedthrough, found.offset, found.delays)
+    exact = not found.order_table and windows(lagged(u, y, found.past, feedthrough=found.feedthrough, offset=found.offset))[1]
+    again = _fit_all(u, y, structure, exact, found.order, found.fit, method, found.plant.sample_time_s, found.order_table, max_radius)
+    return again._replace(dropped_rows=again.dropped_rows + cut, notes=notes + _remarks(again, names))
+
+
+def _prepared(u, y, order, past, offset, limits, names) -> tuple[list[np.ndarray], list[np.ndarray], int, list[str]]:
+    """The record as it can be identified, checked: clipped at the limits, cut at masked inputs; how many samples that cost, and what was done, a sentence each."""
+    u, y = [np.atleast_2d(np.asarray(a, float)) for a in u], [np.atleast_2d(np.asarray(b, float)) for b in y]
+    _check_shapes(u, y)
+    whole = sum(map(len, u))
+    u, notes = within_limits(u, limits, names=names) if limits is not None else (u, [])
+    u, y = gapless(u, y)
+    cut = whole - sum(map(len, u))
+    _check_length(u, y, order, past)
+    check_inputs(u, offset=offset, names=names)
+    check_outputs(y)
+    return u, y, cut, notes + ([f"{cut} samples with a masked input, or without any output, were cut out"] if cut else [])
 
 
 def _windows(u, y, order, past, offset) -> tuple[tuple[int, ...], bool]:
@@ -324,17 +348,18 @@ def _check_shapes(u: Segments, y: Segments) -> None:
 
 
 def _check_length(u: Segments, y: Segments, order: int | None, past: int | None) -> None:
-    """Four complete windows for each unknown of the smallest window that carries the order, and 20; a window is one unbroken stretch."""
+    """Six complete samples for each unknown of the smallest window that carries the order, and as many unbroken windows as there are unknowns."""
     if not u:
         raise ValueError("the record is empty: no sample has all inputs beside at least one output; check the mapping, and what was masked")
     p, q = y[0].shape[1], u[0].shape[1] + y[0].shape[1]
-    lags = past or max(2, -(-(order or 1) // p))
+    lags = max(2, -(-(order or 1) // p) + 1)
     lengths = np.array([len(w) for w in complete_runs(u, y)])
-    needed, samples = max(4 * lags * q + lags, 20), int(lengths.sum())
+    needed, samples = 6 * lags * q, int(lengths.sum())
     if samples < needed:
         raise ValueError(
             f"the record is too short for order {order or 1}: expected at least {needed} complete samples, found {samples}; record {needed - samples} samples more"
         )
+    lags = past or lags
     windows, unknowns = int(np.maximum(lengths - lags, 0).sum()), (lags + 1) * q + 1
     if windows < unknowns:
         raise ValueError(

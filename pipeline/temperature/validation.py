@@ -203,7 +203,7 @@ def _reidentified(u: Segments, y: Segments, identified, order: int) -> Plant:
     us, ys = shifted(u, y, identified.delays)
     data = lagged(us, ys, identified.past, feedthrough=identified.feedthrough, offset=identified.offset)
     start = stabilised(realise(data, subspace(data, identified.past).basis[:order], identified.plant.sample_time_s), LARGEST_RADIUS)
-    found = fit(identified.fit, start, us, ys, feedthrough=identified.feedthrough, offset=identified.offset, max_iterations=5)
+    found = fit(identified.fit, start, us, ys, feedthrough=identified.feedthrough, offset=identified.offset, max_iterations=5, gain=False)
     return with_delays(stabilised(found, LARGEST_RADIUS), identified.delays)
 
 

@@ -115,7 +115,14 @@ def metrics():
 
 def deposition_metrics():
     def law(ratio, **more):
-        return {"ratio_trial_2": ratio, "best_ratio": ratio, "best_trial": 2, "trials": 2, "peak_over_steady": 20.0, "saturated": 0.0} | more
+        return {
+            "ratio_trial_2": ratio,
+            "best_ratio": ratio,
+            "best_trial": 2,
+            "trials": 2,
+            "peak_over_steady": 20.0,
+            "saturated": 0.0,
+        } | more
 
     pixels = {"flow_error_percent": 2.0, "flow_error_corner_percent": 3.0, "rejected_percent": 1.0}
     before = {"gamma": 0.76, "gamma_worst": 1.2, "gamma_above_1_percent": 70.0, "gamma_ours": 0.1, "gamma_ours_worst": 0.3}
@@ -312,7 +319,16 @@ def deposition(scores=None):
     artifacts.write_table(folder / "lessons.parquet", schemas.LESSONS, _columns(schemas.LESSONS, rows))
     filmed = [("A", 0, j, 100, 1, "no bead 1", 0.01, 0.9, 0) for j in range(3)]
     artifacts.write_table(folder / "filmed.parquet", schemas.FILMED, _columns(schemas.FILMED, filmed))
-    chain = {"gain": 1.0, "time_constant_s": 2.7, "delay_s": 0.1, "lag_hz": None, "play": 0.01, "yield_": 0.1, "creep_share": 0.0, "creep_time_s": 20.0}
+    chain = {
+        "gain": 1.0,
+        "time_constant_s": 2.7,
+        "delay_s": 0.1,
+        "lag_hz": None,
+        "play": 0.01,
+        "yield_": 0.1,
+        "creep_share": 0.0,
+        "creep_time_s": 20.0,
+    }
     calibration = {"gain": 0.008, "offset": 0.0, "deviation": 0.0004, "residuals": [0.0]}
     artifacts.write_json(folder / "models.json", {"A": {"nominal": chain, "plant": chain, "calibration": calibration}})
     frame = {"material": "A", "trial": 0, "recording": HOSTILE, "topic": "/image", "time_s": 1.0, "deviation_px": 0.1, "blur_px": 1.0}
@@ -329,23 +345,49 @@ def deposition(scores=None):
     known = {"material": "A", "nozzle_mm": 0.8, "chain": {"extruder": chain, "held_out_percent": 0.6}}
     learned = {"sample_time_s": 0.02, "marks": {"Stop": [0.56, 0.58]}, "materials": [known], "checks": checks}
     artifacts.write_json("datasets/segment_library/learned.json", learned)
-    _composed(time, wanted, scores or {"on_off": (100.0, None, 60.0), "priority": (12.0, 11.0, 9.0), "superposition": (8.0, 7.0, 4.0), "basis": (2.0, 2.5, 1.0), "ilc": (1.5, None, 0.5)})
+    _composed(
+        time,
+        wanted,
+        scores
+        or {
+            "on_off": (100.0, None, 60.0),
+            "priority": (12.0, 11.0, 9.0),
+            "superposition": (8.0, 7.0, 4.0),
+            "basis": (2.0, 2.5, 1.0),
+            "ilc": (1.5, None, 0.5),
+        },
+    )
 
 
 def _composed(time, wanted, scores):
     folder = Path("datasets/compose_parts")
     absent = {"superposition": scores["priority"], "ilc": (np.nan,)}
     flows = {name: wanted * (1 - (absent | scores)[name][0] / 100) for name in ("on_off", "priority", "superposition", "basis", "ilc")}
-    rows = [("square", 0, "A", t, 8 * t, 0.0, r, r, r, *(flows[name][k] for name in flows)) for k, (t, r) in enumerate(zip(time, wanted, strict=True))]
+    rows = [
+        ("square", 0, "A", t, 8 * t, 0.0, r, r, r, *(flows[name][k] for name in flows))
+        for k, (t, r) in enumerate(zip(time, wanted, strict=True))
+    ]
     artifacts.write_table(folder / "signals.parquet", schemas.SIGNALS, _columns(schemas.SIGNALS, rows))
     rows = [("square", "A", name, name == "basis", error, predicted, line) for name, (error, predicted, line) in scores.items()]
     artifacts.write_table(folder / "scores.parquet", schemas.SCORES, _columns(schemas.SCORES, rows))
-    artifacts.write_table(folder / "tasks.parquet", schemas.TASKS, _columns(schemas.TASKS, [("square", "Start", 0, 3, 1.0, 1.0, 8.0, 0.0, 0.0)]))
+    artifacts.write_table(
+        folder / "tasks.parquet", schemas.TASKS, _columns(schemas.TASKS, [("square", "Start", 0, 3, 1.0, 1.0, 8.0, 0.0, 0.0)])
+    )
     lines = [("square", 3, 0, 1.0, 2.0, 16.0, 4.0, 3.8, 1.0, -5.0, False), ("square", 7, 0, 3.0, 0.2, 1.6, 0.4, 0.4, 0.1, 0.0, True)]
     artifacts.write_table(folder / "lines.parquet", schemas.LINES, _columns(schemas.LINES, lines))
     enough = {"ramp_s": 0.15, "limit": None, "peak_over_steady": 20.0, "share_percent": 0.0, "rms_percent_of_on_off": 0.1, "enough": True}
-    report = {"printed_lines": 2, "runs": 2, "duration_s": 4.0, "shorter_than_lead": 1, "composer": {"A": "basis"}, "refused": [], "unknown_words": 1}
-    artifacts.write_json(folder / "conformance.json", {"square": report | {"saturation": {"A": enough}, "ramp_that_would_do_s": {"A": 0.15}}})
+    report = {
+        "printed_lines": 2,
+        "runs": 2,
+        "duration_s": 4.0,
+        "shorter_than_lead": 1,
+        "composer": {"A": "basis"},
+        "refused": [],
+        "unknown_words": 1,
+    }
+    artifacts.write_json(
+        folder / "conformance.json", {"square": report | {"saturation": {"A": enough}, "ramp_that_would_do_s": {"A": 0.15}}}
+    )
 
 
 def _columns(schema, rows):

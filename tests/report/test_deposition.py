@@ -14,7 +14,10 @@ from tests.report.test_pages import Page, change, figures
 
 PAGE, FOLDER = Path("reports/deposition.html"), Path("datasets/compose_parts")
 ARTIFACTS = [
-    *(f"datasets/train_ilc/{name}" for name in ("trials.parquet", "lessons.parquet", "filmed.parquet", "models.json", "frames/frames.json")),
+    *(
+        f"datasets/train_ilc/{name}"
+        for name in ("trials.parquet", "lessons.parquet", "filmed.parquet", "models.json", "frames/frames.json")
+    ),
     *(f"datasets/segment_library/{name}" for name in ("library.parquet", "learned.json")),
     *(f"datasets/compose_parts/{name}" for name in ("signals.parquet", "scores.parquet", "lines.parquet", "conformance.json")),
 ]
@@ -42,7 +45,15 @@ def test_the_composer_with_the_least_worst_error_is_named_with_its_figure_yardst
 
 
 def test_where_the_simple_rule_is_as_good_it_wins(project):
-    made.deposition({"on_off": (100.0, None, 60.0), "priority": (2.4, 2.0, 1.0), "superposition": (2.4, 2.0, 1.0), "basis": (2.0, 2.5, 1.0), "ilc": (1.5, None, 0.5)})
+    made.deposition(
+        {
+            "on_off": (100.0, None, 60.0),
+            "priority": (2.4, 2.0, 1.0),
+            "superposition": (2.4, 2.0, 1.0),
+            "basis": (2.0, 2.5, 1.0),
+            "ilc": (1.5, None, 0.5),
+        }
+    )
     conformance(shorter_than_lead=0)
     # 2.4 % is within half a point of 2.0 %: the simpler one is taken
     assert "use the library by its priority rule. All five rules passed." in page()
@@ -59,7 +70,11 @@ def test_on_off_control_may_win_and_then_nothing_is_to_be_printed_by_this_loop(p
     [
         ((7.0, 2.5, 1.0), "flow error", "square, material A, keeps 7.0 % of on‑off control’s flow error; 6 % are allowed."),
         ((2.0, 2.5, 4.0), "line volume", "A line of square, material A, is 4.0 % off its volume; ±3 % is allowed."),
-        ((4.0, 2.5, 1.0), "above learning it whole", "square, material A, lies 2.5 points above what learning it trial by trial reaches; 1 is allowed."),
+        (
+            (4.0, 2.5, 1.0),
+            "above learning it whole",
+            "square, material A, lies 2.5 points above what learning it trial by trial reaches; 1 is allowed.",
+        ),
     ],
 )
 def test_the_first_failed_rule_is_said_in_words(project, basis, rule, sentence):
@@ -108,7 +123,7 @@ def test_what_is_missing_or_broken_is_said_in_its_place(project, path, how):
     # in its place and in the provenance
     text, name = page(), Path(path).name
     broken = "is not whole JSON" if name.endswith("json") else "is not a whole Parquet file"
-    sentence = f"{name} is missing" if "frames" in path else f"{name} of {path.split('/')[1]} is not there. Run ./run dvc repro {path.split('/')[1]}."
+    sentence = f"{name} of {path.split('/')[1]} is not there. Run ./run dvc repro {path.split('/')[1]}."
     assert text.count(broken if how == "broken" else sentence) >= 2
 
 
@@ -131,7 +146,10 @@ def test_a_frame_is_in_the_page_itself_with_its_recording_time_and_the_reason_of
 def test_page_one_has_the_card_with_the_winner_in_words_and_the_worst_loop_as_its_headline(project):
     main()
     first = Page(Path("reports/index.html"))
-    assert "Data‑driven wins. Basis functions: at most 2.0 % of on‑off control’s flow error on any part. The library by its priority rule: 12 %." in first.text
+    assert (
+        "Data‑driven wins. Basis functions: at most 2.0 % of on‑off control’s flow error on any part. The library by its priority rule: 12 %."
+        in first.text
+    )
     assert first.links.count("deposition.html") >= 3
     assert "Deploy the data‑driven temperature controller." in first.text
     made.deposition({"on_off": (100.0, None, 60.0), "priority": (12.0, 11.0, 9.0), "basis": (7.0, 2.5, 1.0), "ilc": (6.5, None, 0.5)})

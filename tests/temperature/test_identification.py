@@ -3,7 +3,7 @@ import re
 import numpy as np
 import pytest
 
-from pipeline.temperature.identification import identify, moesp, moesp_singular_values, varx
+from pipeline.temperature.identification import identify, moesp, moesp_singular_values, refit, varx
 from pipeline.temperature.order import dead_time, with_delays
 from pipeline.temperature.plant import baam, markov_parameters, plant, simulate
 from pipeline.temperature.probing import study_probe, study_signal
@@ -189,6 +189,20 @@ def test_a_dead_time_is_found_and_becomes_a_chain_of_states():
     np.testing.assert_allclose(markov_parameters(found.plant, 20), markov_parameters(true, 20), atol=5e-3)  # 0.01 of noise, 2,000 samples
 
 
+def test_a_refit_keeps_what_was_chosen_and_uses_the_whole_record():
+    rng = np.random.default_rng(2)
+    true = with_delays(plant([[0.8]], [[0.5]], [[1.0]]), (4,))
+    u = rng.integers(0, 2, (2000, 1)).astype(float)
+    y = simulate(true, u, np.zeros(5))[1] + 0.05 * rng.standard_normal((2000, 1))
+    chosen = identify([u[:1000]], [y[:1000]], sample_time_s=2.0, refinement="validated")
+    found = refit([u], [y], chosen)
+    assert (found.order, found.past, found.delays, found.fit) == (chosen.order, chosen.past, chosen.delays, chosen.fit)
+    assert found.plant.sample_time_s == 2.0
+    assert found.rows > chosen.rows
+    same = refit([u[:1000]], [y[:1000]], chosen).plant
+    np.testing.assert_array_equal(same.A, chosen.plant.A)
+
+
 def test_feed_through_is_left_to_the_data_where_asked():
     _, u, y = two_zones()
     assert not identify([u], [y], sample_time_s=1.0, feedthrough=None).feedthrough
@@ -254,8 +268,8 @@ def test_a_collinear_input_is_named_with_the_ones_that_it_follows():
 
 def test_a_record_that_is_too_short_says_how_many_samples_more():
     _, u, y = two_zones(300)
-    # order 6 of 2 outputs: 3 lags of 4 signals, four windows for each of 12 unknowns, and the 3 samples before the first
-    with pytest.raises(ValueError, match="expected at least 51 complete samples, found 40; record 11 samples more"):
+    # order 6 of 2 outputs: 4 lags of 4 signals, six samples for each of 16 unknowns
+    with pytest.raises(ValueError, match="expected at least 96 complete samples, found 40; record 56 samples more"):
         identify([u[:40]], [y[:40]], sample_time_s=1.0, order=6)
 
 
