@@ -140,6 +140,8 @@ def hold_out(name: str, u: np.ndarray, y: np.ndarray, cut: int, peers: dict[str,
             found, seconds = timed(function, u[:cut] - mean_u, y[:cut] - mean_y, ours.plant.n)
             with np.errstate(all="ignore"):
                 score = simulate_fit(found, [u[cut:] - mean_u], [y[cut:] - mean_y], means_removed=True)
+            if not np.isfinite(score).all():
+                raise ValueError("the simulation of the hold-out is not finite")
             row[peer] = {"error_percent": round(100 - float(score.mean()), 2), "s": round(seconds, 2)}
         except (ValueError, np.linalg.LinAlgError, TypeError, ZeroDivisionError, control.ControlArgument) as failure:
             row[peer] = {"failed": str(failure)[:120]}

@@ -181,7 +181,8 @@ def deposition(sources: Sources) -> dict[str, Any]:
         {
             "title": f"Flow error, {shortened(part, 30)}",
             "cells": _worst(
-                [[one.scores[name].error for one in found if one.part == part and name in one.scores] for name in names], loop.FLOW
+                [[one.scores[name].error for one in found if one.part == part and name in one.scores] for name in names],
+                sources.declared.rules.flow_error_percent,
             ),
         }
         for part in parts[:2]
@@ -189,7 +190,7 @@ def deposition(sources: Sources) -> dict[str, Any]:
     lines = [
         [one.scores[name].worst_line for one in found if name in one.scores and one.scores[name].worst_line is not None] for name in names
     ]
-    rows.append({"title": "Worst line’s volume", "cells": _worst(lines, loop.LINE)})
+    rows.append({"title": "Worst line’s volume", "cells": _worst(lines, sources.declared.rules.line_volume_percent)})
     role = ROLE.get(judged.composer)
     trials = [_learned(sources, law) for law in ("paper", "ours", "")]
     return {
@@ -202,7 +203,8 @@ def deposition(sources: Sources) -> dict[str, Any]:
         "win": _deposition_win(found, judged, role),
         "caption": "Error while learning, in % of on\u2011off control’s, log scale 0.3 to 200\u00a0%, the worse material: the paper’s law, ours, none. Grey: what is asked for.",
         "panels": [
-            _learning_spark(curve, css, named=i == 1) for i, (curve, css) in enumerate(zip(trials, ("mb", "dd", "bl"), strict=True))
+            _learning_spark(curve, css, sources.declared.rules.learned_percent, named=i == 1)
+            for i, (curve, css) in enumerate(zip(trials, ("mb", "dd", "bl"), strict=True))
         ],
         "heads": [
             {"mark": key, "name": LABELS[CONTROLLERS[key]][0], "method": method}
@@ -265,22 +267,22 @@ def _learned(sources: Sources, law: str) -> np.ndarray | Missing:
     return np.array([100 * float(table["ratio"][rows & (table["trial"] == j)].max()) for j in sorted(set(table["trial"][rows].tolist()))])
 
 
-def _learning_spark(curve: np.ndarray | Missing, css: str, *, named: bool) -> Markup:
+def _learning_spark(curve: np.ndarray | Missing, css: str, limit: float, *, named: bool) -> Markup:
     if isinstance(curve, Missing):
         return Markup('<div class="hole">{}</div>').format(page.missing(curve))
     curve = curve if len(curve) > 1 else np.repeat(curve, 2)
-    bad = bool(curve[-1] > loop.LEARNED)
-    alt = f"{'On-off control learns nothing' if css == 'bl' else f'The error ends at {percent(float(curve[-1]), 2)} of trial 0’s after {len(curve) - 1} trials'}, {'above' if bad else 'below'} the {loop.LEARNED:g} % asked for"
+    bad = bool(curve[-1] > limit)
+    alt = f"{'On-off control learns nothing' if css == 'bl' else f'The error ends at {percent(float(curve[-1]), 2)} of trial 0’s after {len(curve) - 1} trials'}, {'above' if bad else 'below'} the {limit:g} % asked for"
     return charts.spark(
         np.arange(float(len(curve))),
         curve,
         charts.Axis(0.3, 200.0, (), True),
         css=css,
-        limit=loop.LEARNED,
+        limit=limit,
         alt=alt,
         named=named,
         bad=bad,
-        limit_label=f"limit {loop.LEARNED:g}",
+        limit_label=f"limit {limit:g}",
     )
 
 

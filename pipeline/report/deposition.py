@@ -6,11 +6,11 @@ import numpy as np
 from markupsafe import Markup
 
 from pipeline.report import charts, deposition_learning, deposition_parts, page, words
-from pipeline.report.deposition_verdict import FLOW, LIBRARY, LINE, MARK, NAMES, OURS, PAPER, Structure, gamma, structures, verdict
+from pipeline.report.deposition_verdict import LIBRARY, MARK, NAMES, OURS, PAPER, Structure, gamma, structures, verdict
 from pipeline.report.digits import THIN, number, percent, short
 from pipeline.report.pictures import Column, Picture, hole
 from pipeline.report.sources import Sources, Table, digest, lookup
-from pipeline.report.verdict import Figure, Missing, Question
+from pipeline.report.verdict import Figure, Missing, Question, ReportRules
 
 WORDS = (
     "on_off",
@@ -57,7 +57,7 @@ def render(sources: Sources) -> str:
         real=judged.real,
         no_scores=found if isinstance(found, Missing) else None,
         answers=[_answer(one) for one in measured],
-        scoreboard=scoreboard(measured),
+        scoreboard=scoreboard(measured, sources.declared.rules),
         learning=deposition_learning.pictures(sources),
         frames=deposition_learning.frames(sources),
         measured=deposition_learning.measured(sources),
@@ -106,7 +106,7 @@ def _beforehand(sources: Sources) -> str:
 
 def _answer(one: Structure) -> dict[str, Any]:
     """Ours beside the library on one scale, the strip's limit in its middle; the worst line's volume of the composer that was chosen."""
-    question = Question(0, "", one.part, "%", FLOW, False, "")
+    question = Question(0, "", one.part, "%", one.asked.flow_error_percent, False, "")
     shown = [
         (NAMES[name], css, Figure(*3 * (one.scores[name].error,)) if name in one.scores else Missing("not measured", "no score"))
         for name, css in ((OURS, "dd"), (LIBRARY, "mb"), ("ilc", "acc"))
@@ -124,7 +124,7 @@ def _answer(one: Structure) -> dict[str, Any]:
                 "name": NAMES[name],
                 "value": percent(one.scores[name].error, 2) if name in one.scores else "not measured",
                 "band": _forecast(one.scores[name].predicted) if name in one.scores else "",
-                "bad": name in one.scores and one.scores[name].error > FLOW,
+                "bad": name in one.scores and one.scores[name].error > one.asked.flow_error_percent,
                 "best": name == best,
             }
             for css, name in (("dd", OURS), ("mb", LIBRARY))
@@ -132,7 +132,7 @@ def _answer(one: Structure) -> dict[str, Any]:
         "whole": percent(one.scores["ilc"].error, 2) if "ilc" in one.scores else "none",
         "strip": charts.strip(question, shown, (9, 25, 17)),
         "line": "no line" if line is None else percent(line, 2),
-        "line_bad": line is not None and line > LINE,
+        "line_bad": line is not None and line > one.asked.line_volume_percent,
         "chosen": NAMES.get(one.chosen, one.chosen),
     }
 
@@ -141,7 +141,7 @@ def _forecast(value: float | None) -> str:
     return "" if value is None else f"forecast {percent(value, 2)}"
 
 
-def scoreboard(found: list[Structure]) -> dict[str, Any]:
+def scoreboard(found: list[Structure], asked: ReportRules) -> dict[str, Any]:
     """Structures and materials down, composers across: true error, what was forecast, and the worst line's volume."""
     names = ("basis", "priority", "superposition", "on_off", "ilc")
     heads = [{"mark": MARK[name], "name": NAMES[name], "method": PAPER[name]} for name in names]
@@ -162,13 +162,13 @@ def scoreboard(found: list[Structure]) -> dict[str, Any]:
                     "band": _forecast(score.predicted),
                     "line": "no line long enough" if score.worst_line is None else f"worst line {percent(score.worst_line, 2)}",
                     "best": name == best,
-                    "bad": score.error > FLOW and name != "on_off",
-                    "line_bad": score.worst_line is not None and score.worst_line > LINE and name != "on_off",
+                    "bad": score.error > one.asked.flow_error_percent and name != "on_off",
+                    "line_bad": score.worst_line is not None and score.worst_line > one.asked.line_volume_percent and name != "on_off",
                     "chosen": name == one.chosen,
                 }
             )
         rows.append({"part": one.part, "material": one.material, "cells": cells})
-    return {"heads": heads, "rows": rows, "limit": f"{FLOW:g}{THIN}%", "line": f"±{LINE:g}{THIN}%"}
+    return {"heads": heads, "rows": rows, "limit": f"{asked.flow_error_percent:g}{THIN}%", "line": f"±{asked.line_volume_percent:g}{THIN}%"}
 
 
 def declared(sources: Sources) -> list[tuple[str, list[tuple[str, str]]]]:

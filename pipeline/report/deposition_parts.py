@@ -6,7 +6,7 @@ import numpy as np
 from markupsafe import Markup
 
 from pipeline.report import charts, page
-from pipeline.report.deposition_verdict import LINE, MARK, NAMES, PAPER, real
+from pipeline.report.deposition_verdict import MARK, NAMES, PAPER, real
 from pipeline.report.digits import MINUS, THIN, count, number, percent, short, shortened
 from pipeline.report.pictures import Column, Picture, hole
 from pipeline.report.sources import Sources, Table
@@ -236,7 +236,7 @@ def lines(sources: Sources) -> dict[str, Any]:
     table = sources.tables["lines"]
     if isinstance(table, Missing):
         return {"missing": table, "rows": [], "said": ""}
-    error = np.nan_to_num(table["error_percent"])
+    error, allowed = np.nan_to_num(table["error_percent"]), sources.declared.rules.line_volume_percent
     order = np.argsort(-np.abs(error), kind="stable")[:WORST]
     rows = [
         {
@@ -248,13 +248,13 @@ def lines(sources: Sources) -> dict[str, Any]:
             "predicted": number(float(table["predicted_mm3"][k]), 3),
             "on_off": _signed(100 * (float(table["on_off_mm3"][k]) / max(float(table["planned_mm3"][k]), 1e-12) - 1)),
             "error": _signed(float(error[k])),
-            "bad": abs(error[k]) > LINE,
+            "bad": abs(error[k]) > allowed,
             "short": bool(table["shorter_than_lead"][k]),
         }
         for k in order
     ]
-    beyond, whole, short_runs = int(np.sum(np.abs(error) > LINE)), len(error), int(np.sum(table["shorter_than_lead"]))
-    said = f"Of {count(whole, 'line')}, {'none is' if not beyond else count(beyond, 'is', 'are')} predicted more than {LINE:g}{THIN}% off {'its' if beyond <= 1 else 'their'} volume; {count(short_runs, 'belongs', 'belong') if short_runs else 'none belongs'} to runs shorter than the lead of Stop."
+    beyond, whole, short_runs = int(np.sum(np.abs(error) > allowed)), len(error), int(np.sum(table["shorter_than_lead"]))
+    said = f"Of {count(whole, 'line')}, {'none is' if not beyond else count(beyond, 'is', 'are')} predicted more than {allowed:g}{THIN}% off {'its' if beyond <= 1 else 'their'} volume; {count(short_runs, 'belongs', 'belong') if short_runs else 'none belongs'} to runs shorter than the lead of Stop."
     return {"missing": None, "rows": rows, "said": said}
 
 

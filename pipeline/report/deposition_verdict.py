@@ -6,10 +6,9 @@ from typing import Any, NamedTuple
 
 from pipeline.report.digits import THIN, count, number, percent
 from pipeline.report.sources import Sources, lookup
-from pipeline.report.verdict import FAILED, OPEN, PASSED, Missing
+from pipeline.report.verdict import FAILED, OPEN, PASSED, Missing, ReportRules
 
 # largest r.m.s. flow error in % of on-off control's; largest volume error of a line in %; points above learning the structure itself; best error of a law, in % of trial 0
-FLOW, LINE, ABOVE, LEARNED = 6.0, 3.0, 1.0, 20.0
 # errors closer than this, in points of on-off control's, are one: the simpler composer is taken
 SAME = 0.5
 OURS, LIBRARY = "basis", "priority"
@@ -54,6 +53,7 @@ class Structure(NamedTuple):
     material: str
     scores: Mapping[str, Score]
     chosen: str
+    asked: ReportRules
 
     def best(self) -> str:
         """The composer, on-off control too, with the least error; what learned the part itself is a yardstick."""
@@ -64,7 +64,9 @@ class Structure(NamedTuple):
         score = self.scores.get(self.chosen)
         if score is None:
             return OPEN
-        return FAILED if score.error > FLOW or (score.worst_line or 0.0) > LINE else PASSED
+        return (
+            FAILED if score.error > self.asked.flow_error_percent or (score.worst_line or 0.0) > self.asked.line_volume_percent else PASSED
+        )
 
 
 class Rule(NamedTuple):
@@ -102,7 +104,7 @@ def structures(sources: Sources) -> list[Structure] | Missing:
     found: dict[tuple[str, str], Structure] = {}
     names = ("part", "material", "composer", "chosen", "rms_percent_of_on_off", "predicted_percent", "worst_line_volume_percent")
     for part, material, composer, chosen, *figures in zip(*(table[name] for name in names), strict=True):
-        one = found.setdefault((part, material), Structure(str(part), str(material), {}, ""))
+        one = found.setdefault((part, material), Structure(str(part), str(material), {}, "", sources.declared.rules))
         error, predicted, line = (None if figure is None or math.isnan(figure) else float(figure) for figure in figures)
         if error is not None:
             found[part, material] = one._replace(
@@ -131,10 +133,11 @@ def winner(found: Sequence[Structure]) -> str:
 
 
 def rules(sources: Sources, found: Sequence[Structure]) -> tuple[Rule, ...]:
+    asked = sources.declared.rules
     return (
-        _flow(found),
-        _line(found),
-        _above(found),
+        _flow(found, asked.flow_error_percent),
+        _line(found, asked.line_volume_percent),
+        _above(found, asked.above_whole_points),
         _learning(sources),
         _convergence(sources),
         _limit(sources),
@@ -148,23 +151,23 @@ def _rule(name: str, limit: str, place: str, pairs: Sequence[tuple[float | None,
     return Rule(name, limit, place, states, tuple(text for _, text in pairs), reason, remedy)
 
 
-def _flow(found: Sequence[Structure]) -> Rule:
+def _flow(found: Sequence[Structure], bound: float) -> Rule:
     pairs = [worst(found, name) for name in (OURS, LIBRARY)]
     shown = [(None, OPEN) if pair is None else (pair[0], percent(pair[0], 2)) for pair in pairs]
     reason = (
         ""
         if pairs[0] is None
-        else f"{_where(pairs[0][1])} keeps {percent(pairs[0][0], 2)} of on\u2011off control’s flow error; {FLOW:g}{THIN}% are allowed."
+        else f"{_where(pairs[0][1])} keeps {percent(pairs[0][0], 2)} of on\u2011off control’s flow error; {bound:g}{THIN}% are allowed."
     )
     remedy = "Run more trials, or train the speeds and pauses of that part (printer.routines)."
-    return _rule("Flow error", f"≤ {FLOW:g}{THIN}%", "scoreboard", shown, FLOW, reason, remedy)
+    return _rule("Flow error", f"≤ {bound:g}{THIN}%", "scoreboard", shown, bound, reason, remedy)
 
 
 def _where(one: Structure) -> str:
     return f"{one.part}, material {one.material},"
 
 
-def _line(found: Sequence[Structure]) -> Rule:
+def _line(found: Sequence[Structure], bound: float) -> Rule:
     pairs = [
         max(
             ((one.scores[name].worst_line, one) for one in found if name in one.scores and one.scores[name].worst_line is not None),
@@ -177,14 +180,20 @@ def _line(found: Sequence[Structure]) -> Rule:
     reason = (
         ""
         if pairs[0] is None
-        else f"A line of {_where(pairs[0][1])} is {percent(pairs[0][0], 2)} off its volume; ±{LINE:g}{THIN}% is allowed."
+        else f"A line of {_where(pairs[0][1])} is {percent(pairs[0][0], 2)} off its volume; ±{bound:g}{THIN}% is allowed."
     )
     return _rule(
-        "Line volume", f"±{LINE:g}{THIN}%", "lines", shown, LINE, reason, "Print that line slower, or longer: the table of lines names it."
+        "Line volume",
+        f"±{bound:g}{THIN}%",
+        "lines",
+        shown,
+        bound,
+        reason,
+        "Print that line slower, or longer: the table of lines names it.",
     )
 
 
-def _above(found: Sequence[Structure]) -> Rule:
+def _above(found: Sequence[Structure], bound: float) -> Rule:
     shown, place = [], None
     for name in (OURS, LIBRARY):
         above = [(one.scores[name].error - one.scores["ilc"].error, one) for one in found if name in one.scores and "ilc" in one.scores]
@@ -194,27 +203,27 @@ def _above(found: Sequence[Structure]) -> Rule:
     reason = (
         ""
         if place is None
-        else f"{_where(place[1])} lies {number(place[0], 1)} points above what learning it trial by trial reaches; {ABOVE:g} is allowed."
+        else f"{_where(place[1])} lies {number(place[0], 1)} points above what learning it trial by trial reaches; {bound:g} is allowed."
     )
     return _rule(
         "Above learning it whole",
-        f"≤ {ABOVE:g} point",
+        f"≤ {bound:g} point",
         "scoreboard",
         shown,
-        ABOVE,
+        bound,
         reason,
         "Learn that part itself, where it is printed often.",
     )
 
 
 def _learning(sources: Sources) -> Rule:
-    shown = []
-    for laws in (("pixels", "ours"), ("paper",)):
+    shown, bound = [], sources.declared.rules.learned_percent
+    for laws in (("pixels", "ours"), ("paper_on_machine",)):
         ratios = next((found for law in laws if (found := _each(sources, f"{law}.best_ratio"))), None)
         shown.append((None, OPEN) if ratios is None else (100 * max(ratios), percent(100 * max(ratios), 2)))
-    reason = f"The error after learning is still {shown[0][1]} of trial 0’s; {LEARNED:g}{THIN}% are asked for."
+    reason = f"The error after learning is still {shown[0][1]} of trial 0’s; {bound:g}{THIN}% are asked for."
     reason = "No trial was learned from." if shown[0][0] is None else reason
-    return _rule("Learned to", f"≤ {LEARNED:g}{THIN}%", "learning", shown, LEARNED, reason, "Run more trials (train_ilc.trials).")
+    return _rule("Learned to", f"≤ {bound:g}{THIN}%", "learning", shown, bound, reason, "Run more trials (train_ilc.trials).")
 
 
 def _each(sources: Sources, key: str) -> list[float]:
@@ -346,7 +355,11 @@ def told(found: Sequence[Structure], use: str, machine: bool) -> str:
     whole = worst(found, "ilc")
     others += [f"learning each part from scratch {percent(whole[0], 2)}"] if whole else []
     lines = [one.scores[use].worst_line for one in found if use in one.scores and one.scores[use].worst_line is not None]
-    volume = f" Worst printed line: {percent(max(lines), 2)} off its volume, ±{LINE:g}{THIN}% allowed." if lines else ""
+    volume = (
+        f" Worst printed line: {percent(max(lines), 2)} off its volume, ±{place.asked.line_volume_percent:g}{THIN}% allowed."
+        if lines
+        else ""
+    )
     known = " These figures are forecasts of the identified machine: the true flow of a real one is not known." if machine else ""
     return (
         f"{_bare(use)[:1].upper()}{_bare(use)[1:]} {'leave' if use == OURS else 'leaves'} at most {percent(error, 2)} of on\u2011off control’s flow error "

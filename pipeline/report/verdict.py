@@ -24,6 +24,10 @@ class ReportRules(params.Section):
     disk_margin: float = Field(gt=0, le=2)
     delay_margin_s: float = Field(gt=0, le=1e6)
     worst_case_gap_percent: float = Field(gt=0, le=1e6)
+    flow_error_percent: float = Field(gt=0, le=1e6)
+    line_volume_percent: float = Field(gt=0, le=1e6)
+    above_whole_points: float = Field(ge=0, le=1e6)
+    learned_percent: float = Field(gt=0, le=1e6)
 
 
 class Figure(NamedTuple):

@@ -30,6 +30,10 @@ RULES = ReportRules(
     disk_margin=0.4,
     delay_margin_s=1.0,
     worst_case_gap_percent=50.0,
+    flow_error_percent=6.0,
+    line_volume_percent=3.0,
+    above_whole_points=1.0,
+    learned_percent=20.0,
 )
 ASKED = questions(RULES, band_degC=1.0)
 BY_KEY = {question.key: question for question in ASKED}
