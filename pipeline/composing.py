@@ -115,7 +115,13 @@ def restored(table: dict[str, np.ndarray], rest: dict[str, Any]) -> Learned:
 
 def read_learned(table: str, rest: str) -> Learned:
     """Library and chains of segment_library, from its two files."""
-    return restored(artifacts.read_table(table, schemas.LIBRARY), artifacts.read_json(rest))
+    columns, known = artifacts.read_table(table, schemas.LIBRARY), artifacts.read_json(rest)
+    try:
+        return restored(columns, known)
+    except (AttributeError, IndexError, KeyError, TypeError) as error:
+        raise ValueError(
+            f"{rest} is not what segment_library writes ({error}); make it again with ./run dvc repro segment_library"
+        ) from None
 
 
 # ---- one part
@@ -123,12 +129,20 @@ def read_learned(table: str, rest: str) -> Learned:
 
 def compose(path: Path, learned: Learned, printer: Printer, p: ComposeParts) -> Part:
     """A part program, composed. Raises ValueError naming the file, and the line where there is one."""
+    learned_s = learned.library.sample_time_s
+    if learned_s != printer.sample_time_s:
+        raise ValueError(
+            f"params.yaml: printer.sample_time_s is {printer.sample_time_s:g} but the library was learned at {learned_s:g} s; learn it again with ./run dvc repro"
+        )
     try:
         data = path.read_bytes()
     except OSError as error:
         raise ValueError(f"{path} cannot be read ({error.strerror}); name a part program (G-code)") from None
     with artifacts.about(path):
         program = gcode.parse(data)
+        if program.refusals and not np.any(program.moves.kind == gcode.Kind.EXTRUDE):
+            first = program.refusals[0]
+            raise ValueError(f"line {first.line}: {first.why}; it was left out, and nothing of the program that could be read prints")
         planned = motion.plan(
             program.moves, acceleration=printer.acceleration_mm_per_s2, junction_deviation_mm=printer.junction_deviation_mm,
             speed_limit=printer.speed_limit_mm_per_s, unset_feed=printer.speed_mm_per_s, tool_change_s=printer.tool_change_s,

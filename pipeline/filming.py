@@ -7,9 +7,10 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+import scipy.signal
 
 from pipeline import trials
-from pipeline.artifacts import beside
+from pipeline.artifacts import about, beside
 from pipeline.deposition import bead, flow, rendering
 from pipeline.deposition.extruder import Extruder, Routine, disturb
 from pipeline.deposition.extruder import flow as true_flow
@@ -44,8 +45,14 @@ def calibrate(scene: rendering.Camera, camera: Camera, rng: np.random.Generator)
     """Pixels to mm on pictures of the known widths of section `camera`."""
     known = np.repeat(camera.known_widths_mm, CALIBRATION_FRAMES)
     frames = [scene.frame(width / abs(camera.mm_per_px), stage_px=int(rng.integers(0, 10_000))) for width in known]
-    measured = [bead.measure(frame, columns=tuple(camera.columns), longest_blur_px=camera.longest_blur_px).width for frame in frames]
-    return bead.calibrate(np.array(measured), known)
+    seen = [bead.measure(frame, columns=tuple(camera.columns), longest_blur_px=camera.longest_blur_px) for frame in frames]
+    bad = [f"{width:g} mm: {one.reason}" for width, one in zip(known, seen, strict=True) if one.reason]
+    if bad:
+        reasons = ", ".join(f"{bad.count(what)} of {CALIBRATION_FRAMES} of {what}" for what in dict.fromkeys(bad))
+        raise ValueError(
+            f"camera: known widths should be seen in every picture but are not ({reasons}); fit camera.known_widths_mm to what is seen at {abs(camera.mm_per_px):g} mm per px, or raise camera.longest_blur_px"
+        )
+    return bead.calibrate(np.array([one.width for one in seen]), known)
 
 
 def film(
@@ -85,6 +92,12 @@ def watch(path: str | Path, routine: Routine, *, printer: Printer, camera: Camer
         raise ValueError(
             f"{path}: expected metadata with material, trial and calibration (record beadline.trial), found none; write it as the commands in datasets/train_ilc/next have it"
         )
+    if not known.px_per_mm > 0 or known.trial < 0:
+        raise ValueError(
+            f"{path}: expected a scale px_per_mm above 0 and a trial from 0 on, found {known.px_per_mm:g} and {known.trial}; mend the metadata record {trials.SCHEMA}"
+        )
+    late = _late(*recording.signals["position_mm"], routine)
+    recording = recording._replace(signals={name: (time_s - late, values) for name, (time_s, values) in recording.signals.items()})
     for name, (time_s, _) in recording.signals.items():
         if len(time_s) == 0 or time_s[0] > SLACK_S or time_s[-1] < routine.time_s[-1] - SLACK_S:
             span = f"{time_s[0]:.2f} to {time_s[-1]:.2f} s" if len(time_s) else "nothing"
@@ -92,16 +105,31 @@ def watch(path: str | Path, routine: Routine, *, printer: Printer, camera: Camer
                 f"{path}: expected {name} from 0 to {routine.time_s[-1]:.2f} s, as its routine has it, found {span}; record the whole trial, from its start"
             )
     signals = {name: np.interp(routine.time_s, *at) for name, at in recording.signals.items()}
+    for name in ("position_mm", "command_mm"):
+        if gaps := int(np.count_nonzero(~np.isfinite(signals[name]))):
+            raise ValueError(
+                f"{path}: expected {name} at every moment but {gaps} of {len(routine.time_s)} are missing; record the trial again"
+            )
+    asked, travelled = np.ptp(routine.position), np.ptp(signals["position_mm"])
+    if not 0.9 * asked < travelled < 1.1 * asked:
+        raise ValueError(
+            f"{path}: expected the gantry to travel {asked:.4g} mm, as its routine has it, found {travelled:.4g} mm; check topic and unit of its position, or record the trial again"
+        )
     rejected: dict[str, int] = {}
     times, columns, widths = [], None, []
     for time, found in _beads(recording, camera):
-        times.append(time)
+        times.append(time - late)
         columns = found.columns
         widths.append(np.where(found.widths == 0, 0.0, (found.widths - known.offset_px) / known.px_per_mm))
         if found.reason:
             rejected[found.reason] = rejected.get(found.reason, 0) + 1
     if not times:
         raise ValueError(f"{path}: expected frames but none could be read; record the trial again")
+    if not any(np.any(width > 0) for width in widths):
+        reasons = ", ".join(f"{reason} in {count}" for reason, count in sorted(rejected.items()))
+        raise ValueError(
+            f"{path}: none of {len(times)} frames shows a usable bead ({reasons}); check light, focus, calibration and camera.columns, or record the trial again"
+        )
     try:
         seen = flow.sections(
             np.interp(times, *recording.signals["position_mm"]), columns, np.array(widths), view=flow.View(known.mm_per_px, known.nozzle_column),
@@ -128,9 +156,25 @@ def _beads(recording: trials.Trial, camera: Camera) -> Iterator[tuple[float, bea
     frames = iter(recording.frames)
     while batch := list(itertools.islice(frames, TOGETHER)):
         times, pictures = zip(*batch, strict=True)
-        yield from zip(
-            times, bead.measure_all(pictures, columns=tuple(camera.columns), longest_blur_px=camera.longest_blur_px), strict=True
-        )
+        with about(recording.path):
+            found = bead.measure_all(pictures, columns=tuple(camera.columns), longest_blur_px=camera.longest_blur_px)
+        yield from zip(times, found, strict=True)
+
+
+def _late(time_s: np.ndarray, position: np.ndarray, routine: Routine) -> float:
+    """How much later than its routine a recording's clock runs, in s: where sum (|v| - v_routine)^2 of the gantry's speed is least; 0 for a record shorter than that.
+
+    A recorder begins before the routine does, and a clock of the calendar is counted from its whole second.
+    """
+    Ts = float(routine.time_s[1] - routine.time_s[0])
+    spare = round(SLACK_S / Ts)
+    grid = np.arange(time_s[0], time_s[-1] + Ts / 2, Ts) if np.isfinite(position).all() else np.zeros(0)
+    if len(grid) < max(len(routine.time_s) - spare, 2):
+        return 0.0
+    speed = np.pad(np.abs(np.gradient(np.interp(grid, time_s, position), Ts)), spare)
+    both = scipy.signal.correlate(speed, routine.speed, "valid", method="fft")
+    own = np.convolve(speed**2, np.ones(len(routine.speed)), "valid")
+    return float(time_s[0]) + (int(np.argmin(own - 2 * both)) - spare) * Ts
 
 
 def conditions(
@@ -190,7 +234,7 @@ def shown(path: Path, folder: Path, camera: Camera) -> list[dict[str, Any]]:
 def _places(recording: trials.Trial, beads: Sequence[tuple[float, bead.Bead]], camera: Camera) -> dict[int, str]:
     """Numbers of the frames to show, and what they show. After the pause of the gantry the corner takes a while to come to the middle of what is measured."""
     time_s, speed = recording.signals["speed_mm_per_s"]
-    full = np.nanmedian([found.width for _, found in beads if not found.reason] or [np.nan])
+    full = np.median([found.width for _, found in beads if not found.reason] or [0.0])
     good = [k for k, (_, found) in enumerate(beads) if not found.reason and found.width > 0.7 * full]
     rejected = {found.reason: k for k, (_, found) in reversed(list(enumerate(beads))) if found.reason}
     places = {k: "rejected" for k in rejected.values()}

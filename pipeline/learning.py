@@ -9,6 +9,7 @@ from pydantic import Field
 from tqdm import tqdm
 
 from pipeline import filming, trials
+from pipeline.artifacts import about
 from pipeline.deposition import bead, ilc, training
 from pipeline.deposition.extruder import Extruder, Routine, draw
 from pipeline.deposition.ilc import Trial
@@ -16,6 +17,9 @@ from pipeline.deposition.training import Lesson, Noise, Run, Settings, on_off, o
 from pipeline.filming import Watched
 from pipeline.params import Section
 from pipeline.printer import Camera, Material, Printer
+
+# an extruder is known to 30 %: what is off by this factor is a unit, a scale or a picture of another size, and the next command would be off as much
+WRONG_GAIN = 3.0
 
 
 class TrialNoise(Section):
@@ -286,6 +290,11 @@ def _resume(watched: Sequence[Watched], routine: Routine, nominal: Extruder, s: 
         return None, ilc.Step(u0, 0, False, False)
     law = ours(routine, s)
     step = ilc.next_step(done, routine.r, law, rise=s.rise)
+    found = law.model.extruder.gain / nominal.gain if law.model else 1.0
+    if not 1 / WRONG_GAIN < found < WRONG_GAIN:
+        raise ValueError(
+            f"the trials show {found:.3g} times the gain of printer.materials; check the units of the command, the calibration and the frames' size, or write the gain as it is"
+        )
     rows = ilc.table(done, routine.r, steady=float(u0.max()), limit=s.limit, rise=s.rise)
     return Run("pixels", routine, done, rows, law.model), step
 
@@ -303,7 +312,8 @@ def recordings(folder: Path, following: Path, work: Work) -> Part:
         models: dict[str, Any] = {"nominal": _plain(nominal)}
         for index, routine in enumerate(routines):
             watched = seen.get((material.name, index), [])
-            done, step = _resume(watched, routine, nominal, s)
+            with about(f"{folder}: material {material.name}, routine {index}"):
+                done, step = _resume(watched, routine, nominal, s)
             name = f"{material.name}_routine_{index}_trial_{len(watched):02d}"
             known = filming.conditions(
                 material,

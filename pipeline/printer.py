@@ -93,6 +93,18 @@ class Camera(Section):
     scene: Literal["nominal", "hard"]
     encoding: Literal["jpeg", "png", "raw"]
 
+    @pydantic.model_validator(mode="after")
+    def _looks(self):
+        if abs(self.mm_per_px) < 1e-6:
+            raise ValueError(
+                f"has mm_per_px {self.mm_per_px:g}; give the size of a pixel on the stage, negative where the line trails to higher columns"
+            )
+        if self.columns[1] <= self.columns[0]:
+            raise ValueError(
+                f"has columns {self.columns[0]} to {self.columns[1]}; give the first and, behind it, the last that is measured"
+            )
+        return self
+
     @property
     def view(self) -> View:
         return View(self.mm_per_px, self.nozzle_column)

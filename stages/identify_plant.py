@@ -32,15 +32,17 @@ def main() -> None:
         with artifacts.about("datasets/ingest/record.parquet"):
             identification.check_inputs(u, offset=p.offset, names=inputs)
             identification.check_outputs(y, names=outputs)
+        u, clipped = identification.within_limits(u, tuple(zip(*((i.low, i.high) for i in machine.inputs), strict=True)), names=inputs)
         cuts = [round(len(us) * (1 - p.holdout_share)) for us in u]
         first = [[signal[:cut] for signal, cut in zip(signals, cuts, strict=True)] for signals in (u, y)]
         last = [[signal[cut:] for signal, cut in zip(signals, cuts, strict=True)] for signals in (u, y)]
-        settings = {"sample_time_s": machine.sample_time_s, "offset": p.offset, "refinement": p.refinement, "max_order": p.max_order}
         with artifacts.about("datasets/ingest/record.parquet"):
-            chosen = identification.identify(*first, order=p.order or None, **settings)
+            chosen = identification.identify(
+                *first, sample_time_s=machine.sample_time_s, order=p.order or None, offset=p.offset, refinement=p.refinement, max_order=p.max_order, names=inputs
+            )
         judged = trust.holdout(chosen.plant, *last, p.ahead_steps, block=2 * chosen.past, rng=np.random.default_rng(p.seed))
         tests, excited = validation.residual_tests(chosen.plant, *last, lags=trust.residual_lags(last[0])), validation.excitation(first[0], chosen.past)
-        found = identification.identify(u, y, order=chosen.order, past=chosen.past, **settings)
+        found = identification.refit(u, y, chosen, names=inputs)
         if not (observed := plant.observability(found.plant)).passed:
             raise ValueError("datasets/ingest/record.parquet: " + observed.reason)
         family = validation.bootstrap_spread(u, y, found, count=p.spread_plants, order=found.order + 1, rng=np.random.default_rng(p.seed))
@@ -60,7 +62,7 @@ def main() -> None:
         metrics = {
             "order": found.order, "order_tolerance_percent": 100 * order.WORTH_A_STATE, "past": found.past, "fit": found.fit, "rows": found.rows, "dropped_rows": found.dropped_rows,
             "samples": sum(map(len, recorded[0])), "samples_cut": sum(map(len, recorded[0])) - sum(map(len, u)), "samples_holdout": sum(map(len, last[0])),
-            "delays": dict(zip(inputs, found.delays, strict=True)), "notes": list(dict.fromkeys([*chosen.notes, *found.notes])), "ahead_steps": p.ahead_steps,
+            "delays": dict(zip(inputs, found.delays, strict=True)), "notes": list(dict.fromkeys([*clipped, *chosen.notes, *found.notes])), "ahead_steps": p.ahead_steps,
             **trust.fit_figures(judged, outputs), **trust.outcome_figures(tests, excited, outputs, inputs),
             "controllable": plant.controllability(found.plant).passed, "largest_pole": np.abs(np.linalg.eigvals(found.plant.A)).max(),
             "advice": validation.advice(tests, excited, judged.fit[0], outputs=outputs, inputs=inputs),

@@ -164,6 +164,51 @@ def test_a_folder_of_trials_that_contradict_each_other_is_refused_by_file(projec
     assert "print_0_0.mcap" in refusal("train_ilc", capsys)
 
 
+def filmed(path: Path, plant, routine, u, *, late_s: float = 0.0, dark: bool = False, shown_mm: float = 1.0, command: float = 1.0) -> None:
+    """The first trial of a machine, by a recorder that began earlier, in the dark, or with its gantry or plunger in other units."""
+    printer, camera = params.load(Printer, "printer"), params.load(Camera, "camera")
+    calibration = Calibration(abs(camera.mm_per_px), 0.0, 0.0, np.zeros(0))
+    known = filming.conditions(printer.materials[0], routine, 0, "ours", printer=printer, camera=camera, calibration=calibration)
+    truth = flow(plant, u, sample_time_s=printer.sample_time_s)
+    pictures = filming.scene(camera, np.random.default_rng(0)).trial(
+        routine.time_s, truth, routine.position, view=camera.view, frame_rate_hz=camera.frames_per_s,
+        nozzle_mm=(printer.nozzle_mm / 2, printer.nozzle_outer_mm / 2), contact_angle_deg=camera.contact_angle_deg,
+    )  # fmt: skip
+    frames = ((time + late_s, 0 * frame if dark else frame) for time, frame in pictures)
+    trials.write_trial(
+        path, known, frames, time_s=routine.time_s + late_s, position_mm=shown_mm * routine.position, speed_mm_per_s=routine.speed, command_mm=command * u, encoding="jpeg"
+    )  # fmt: skip
+
+
+def test_a_trial_begins_where_its_gantry_does_whenever_its_recorder_began(project):
+    printer, camera = params.load(Printer, "printer"), params.load(Camera, "camera")
+    routine, plant = printer.trained()[0], draw(np.random.default_rng(3), gain=1.08, time_constant_s=0.8, steady_flow=printer.steady_flow)
+    u = routine.r / 1.08
+    seen = []
+    # a clock of the calendar is counted from its whole second: this one is 0.41 s late
+    for late_s in (0.0, 2.0, 1.7e9 + 0.41):
+        filmed(Path("trial.mcap"), plant, routine, u, late_s=late_s)
+        seen.append(filming.watch("trial.mcap", routine, printer=printer, camera=camera).flow.flow)
+    # the clock of a record holds nanoseconds; a tenth of a percent of the steady flow is far below what pictures tell
+    np.testing.assert_allclose(seen[1:], np.stack([seen[0]] * 2), atol=1e-3 * printer.steady_flow)
+
+
+def test_a_trial_in_the_dark_or_in_other_units_is_refused_by_file(project, capsys):
+    declare({"train_ilc.source": "recordings"})
+    stage("train_ilc")
+    printer = params.load(Printer, "printer")
+    routine, plant = printer.trained()[0], draw(np.random.default_rng(3), gain=1.08, time_constant_s=0.8, steady_flow=printer.steady_flow)
+    path = Path("datasets/raw/deposition/trial.mcap")
+    for changes, words in [
+        ({"dark": True}, ("trial.mcap", "none of", "no bead in")),
+        ({"shown_mm": 1e-3}, ("trial.mcap", "gantry", "unit")),
+        ({"command": 1e3}, ("material A, routine 0", "times the gain", "units")),
+    ]:
+        filmed(path, plant, routine, routine.r / 1.08, **changes)
+        said = refusal("train_ilc", capsys)
+        assert all(word in said for word in words), said
+
+
 def test_without_a_trial_the_first_commands_are_written_and_the_library_says_what_to_do(project, capsys):
     declare({"train_ilc.source": "recordings"})
     stage("train_ilc")
@@ -183,6 +228,22 @@ def test_a_part_that_cannot_be_composed_is_listed_and_the_others_go_on(project, 
     for name in ("dashes", "fig9"):
         Path(f"datasets/parts/{name}.gcode").unlink()
     assert "none of 2" in refusal("compose_parts", capsys)
+    Path("datasets/parts/other.gcode").write_text("G21\nG90\nM83\nG0 X0 Y0 F600\nG2 X10 Y0 I50 J0 E1 F480\n")
+    Path("datasets/parts/picture.gcode").unlink()
+    assert "line 5" in refusal("compose_parts", capsys), "nothing prints because the one line that would is left out"
+    rest = Path("datasets/segment_library/learned.json")
+    whole = rest.read_text()
+    rest.write_text("{}")
+    assert "learned.json is not what segment_library writes" in refusal("compose_parts", capsys)
+    rest.write_text(whole)
+    declare({"printer.sample_time_s": 0.05})
+    assert "sample_time_s is 0.05" in refusal("compose_parts", capsys)
+
+
+def test_a_pixel_without_a_size_is_refused_by_its_key(project, capsys):
+    for key, value in (("camera.mm_per_px", 0.0), ("camera.columns", [640, 120])):
+        declare({key: value}, ROOT / "params.yaml")
+        assert key.split(".")[1] in refusal("train_ilc", capsys)
 
 
 def test_what_was_learned_survives_being_stored(project):

@@ -6,7 +6,7 @@ The rules, each with its reason:
   largest order singular values, in units of the noise, above what coefficient errors alone reach: sqrt(2) (sqrt(rows) + sqrt(columns)) of the noise matrix
   dead time     none; the lags at which the largest model's impulse response stays under 5 % of its peak; those under a quarter that Wald's test finds silent too
   order         of all these, the fewest parameters whose error in simulation of left-out blocks (geometric mean) is within 2 % of the best
-  refinement    where `refinement` is "validated": prediction-error fits of the chosen model, where one takes more than 5 % off the error on the left-out blocks
+  refinement    where `refinement` is "validated": prediction-error fits of the chosen model, where one takes more than 5 % off the error on the left-out blocks; for simulation only where that beats prediction by a fifth
 """
 
 from collections.abc import Sequence
@@ -16,6 +16,7 @@ import numpy as np
 
 from pipeline.temperature.order import (
     WORTH_REFINING,
+    WORTH_THE_NOISE,
     Candidate,
     Structure,
     cross_validate,
@@ -257,7 +258,7 @@ def _choose(u, y, structures, order, max_order, validated, settings) -> tuple[Ca
         values = np.array([known.get(n, np.nan) for n in range(1, chosen.order + 1)])
         refined = cross_validate(u, y, [chosen.order], chosen.structure, ("prediction", "simulation"), singular_values=values, **settings)
         table += refined
-        best = min(refined, key=lambda row: row.error, default=chosen)
+        best = min(refined, key=lambda row: row.error * (1 - WORTH_THE_NOISE) ** (row.fit == "prediction"), default=chosen)
         chosen = best if best.error < (1 - WORTH_REFINING) * chosen.error else chosen
     return chosen, table
 

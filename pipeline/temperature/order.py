@@ -25,6 +25,9 @@ Fit = Literal["subspace", "prediction", "simulation"]
 NOISE_FREE = 1e-10  # share of the outputs' power that a noise-free record's one-step errors stay under
 WIDEST = 360  # columns of the lagged record: the cost of a fit grows with their square
 WORTH_REFINING = 0.05  # a refined fit must take this share off the error: its own cost of computing and of fitting noise
+WORTH_THE_NOISE = (
+    0.2  # a simulation fit must take this share off a prediction fit's error: it leaves no model of the noise, and a tracker needs one
+)
 WORTH_A_STATE = 0.02  # a state that takes less than this share off the error is not worth carrying in a controller
 SMALLEST = 1e-9  # share of an output's variation below which an error is rounding
 LARGEST_RADIUS = 1.0 - 1e-6  # of the plants of a spread, which are simulated for ever: no record shows a time constant of a million samples
