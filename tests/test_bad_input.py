@@ -249,12 +249,12 @@ def test_an_order_that_the_record_cannot_carry_is_refused_with_what_it_lacks(tre
 def test_an_unobservable_plant_is_refused_with_its_rank(tree, refused, monkeypatch):
     """No record shows a state that nothing measures; the stage must refuse whatever says that it found one."""
     hidden = plant([[0.95, 0.0], [0.0, 0.9]], [[0.02, 0.0], [0.0, 0.04]], [[1.0, 0.0], [2.0, 0.0]], d=[20.0, 20.0])
-    found = identification.identify
+    found = identification.refit
 
     def hiding(*signals, **settings):
         return found(*signals, **settings)._replace(plant=hidden)
 
-    monkeypatch.setattr(identification, "identify", hiding)
+    monkeypatch.setattr(identification, "refit", hiding)
     said = refused(tree, "identify_plant")
     assert re.search(
         r"datasets/ingest/record\.parquet: the plant is not observable: rank 1 of 2, .*; add a sensor, or lower the order", said
