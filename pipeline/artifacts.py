@@ -52,15 +52,15 @@ def write_table(path: str | Path, schema: Schema, columns: Mapping[str, np.ndarr
 
 def read_table(path: str | Path, schema: Schema) -> dict[str, np.ndarray]:
     """Columns by name: text as objects, missing floats as NaN, lists as objects. Raises ValueError where it is not `schema`."""
-    remedy = _remedy(path)
+    wanted = remedy(path)
     try:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             table = file.read()
     except FileNotFoundError:
-        raise ValueError(f"{path} is missing; {remedy}") from None
+        raise ValueError(f"{path} is missing; {wanted}") from None
     except (OSError, pa.ArrowException) as error:
-        raise ValueError(f"{path} is not a whole Parquet file ({_reason(error)}); {remedy}") from None
-    table_schema.check(path, schema, table, remedy)
+        raise ValueError(f"{path} is not a whole Parquet file ({_reason(error)}); {wanted}") from None
+    table_schema.check(path, schema, table, wanted)
     return {column.name: np.array(table[column.name].to_numpy(zero_copy_only=False)) for column in schema.columns}
 
 
@@ -114,9 +114,9 @@ def read_json(path: str | Path):
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise ValueError(f"{path} is missing; {_remedy(path)}") from None
+        raise ValueError(f"{path} is missing; {remedy(path)}") from None
     except ValueError as error:
-        raise ValueError(f"{path} is not whole JSON ({_reason(error)}); {_remedy(path)}") from None
+        raise ValueError(f"{path} is not whole JSON ({_reason(error)}); {remedy(path)}") from None
 
 
 def write_metrics(stage: str, data: Mapping) -> None:
@@ -344,7 +344,7 @@ def _mend(error: OSError, folder: Path) -> str:
     return f"look at {folder}"
 
 
-def _remedy(path: str | Path) -> str:
+def remedy(path: str | Path) -> str:
     """The command that makes the artifact again; the stage is in its path."""
     parts = Path(path).parts
     if parts[:2] == ("reports", "metrics"):
