@@ -16,7 +16,7 @@ def write_weights(path: str | Path, name: str, arrays: Mapping[str, np.ndarray],
     # the library writes metadata in the order of a hash that differs from process to process; one key holds all
     packed = {"beadline": "\n".join(f"{key}={metadata[key]}" for key in sorted(metadata))}
     with artifacts.beside(path) as temporary:
-        save_file({key: np.ascontiguousarray(array) for key, array in sorted(arrays.items())}, temporary, packed)
+        save_file({key: np.asarray(array, order="C") for key, array in sorted(arrays.items())}, temporary, packed)
 
 
 def read_weights(path: str | Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
