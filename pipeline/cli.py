@@ -48,6 +48,8 @@ def compose(arguments: argparse.Namespace) -> None:
     from pipeline import composing
     from pipeline.printer import Printer
 
+    if arguments.out.exists() and not arguments.out.is_dir():
+        raise ValueError(f"--out {arguments.out}: should be a folder but is a file; name a folder, which is made where it is missing")
     learned = composing.read_learned("datasets/segment_library/library.parquet", "datasets/segment_library/learned.json")
     part = composing.compose(arguments.part, learned, params.load(Printer, "printer"), params.load(composing.ComposeParts, "compose_parts"))
     arguments.out.mkdir(parents=True, exist_ok=True)
