@@ -16,6 +16,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from pathlib import Path
 
+import cv2
 import mcap.writer
 import numpy as np
 import pyarrow as pa
@@ -133,6 +134,15 @@ def write_text(path: str | Path, text: str) -> None:
     """UTF-8 with Unix line ends."""
     with beside(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
+
+
+def write_jpeg(path: str | Path, picture: np.ndarray) -> None:
+    """A picture (h, w, 3) uint8 in RGB, at the quality of a page."""
+    done, data = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 80])
+    if not done:
+        raise OSError(f"{path} cannot be written")
+    with beside(path) as temporary:
+        temporary.write_bytes(data.tobytes())
 
 
 def write_csv(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.signal
 
 from pipeline import trials
-from pipeline.artifacts import about, beside
+from pipeline.artifacts import about, write_jpeg
 from pipeline.deposition import bead, flow, rendering
 from pipeline.deposition.extruder import Extruder, Routine, disturb
 from pipeline.deposition.extruder import flow as true_flow
@@ -259,12 +259,7 @@ def _save(path: Path, picture: np.ndarray, found: bead.Bead) -> None:
     middle = float(np.nanmean(rows)) if np.isfinite(rows).any() and not found.reason else h / 2
     first = int(np.clip(middle - h / 4, 0, h - h // 2))
     cut = cv2.resize(picture[first : first + h // 2], None, fx=0.75, fy=0.75, interpolation=cv2.INTER_AREA)
-    with beside(path) as temporary:
-        # OpenCV tells the format by the suffix; only artifacts opens a file to write
-        written = temporary.with_suffix(".jpg")
-        if not cv2.imwrite(str(written), cv2.cvtColor(cut, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 80]):
-            raise OSError(f"{path} cannot be written")
-        written.replace(temporary)
+    write_jpeg(path, cut)
 
 
 # ---- as a table

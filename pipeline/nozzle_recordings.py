@@ -1,0 +1,231 @@
+"""Nozzle frames in MCAP, with the setpoints they were printed at: written as any ROS 2 or Foxglove viewer opens it, and read from that form or from a machine's own topics."""
+
+import contextlib
+import hashlib
+import heapq
+import itertools
+import operator
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+
+from pipeline import trials
+from pipeline.artifacts import beside, sha256
+from pipeline.nozzle_images import Seen, entry_of, look, remember, remembered, together
+from pipeline.nozzle_log import stretches
+from pipeline.reading import image_messages
+from pipeline.reading.formats import Columns, file_format
+from pipeline.reading.image_topics import Frames, Walk, columns, frame_times, image_topic
+from pipeline.reading.mcap_columns import Topic, resolve, topics
+from pipeline.reading.mcap_messages import UnreadableMessage
+from pipeline.reading.signals import Note, Source, nearest_names
+
+TOPIC = "/setpoint"
+# our signals and their units; where the mapping says nothing, the only field of that name
+UNITS = {
+    "flow_percent": "percent",
+    "temperature_degC": "degC",
+    "print_id": "1",
+    "tip_x_px": "px",
+    "tip_y_px": "px",
+    "travel_direction_deg": "deg",
+}
+NEEDED = ("flow_percent", "temperature_degC")
+# a temperature that changes more often than this, and than in one of so many frames, is no setpoint
+MEASURED = 20
+# frames in memory at a time
+TOGETHER = 64
+
+
+class Topics(NamedTuple):
+    """Where a recording has what we need: the image topic (empty: the only one), the clock (log_time, publish_time or a stamp's field), and the mapping
+    {our signal: (source, unit, scale, offset)}."""
+
+    image: str
+    time: str
+    mapping: Mapping[str, tuple[str, str, float, float]]
+
+    def sources(self) -> dict[str, Source]:
+        """{signal: source}. Raises ValueError for a signal that is none of ours, and for another unit."""
+        for name, (_, unit, _, _) in self.mapping.items():
+            if name not in UNITS:
+                raise ValueError(f"params.yaml: mapping.{name} is no signal of nozzle frames; {nearest_names(name, UNITS)}")
+            if unit != UNITS[name]:
+                raise ValueError(
+                    f"params.yaml: mapping.{name}.unit is {unit} but {name} is in {UNITS[name]}; convert with scale and offset, and write unit: {UNITS[name]}"
+                )
+        return {name: Source(name, *self.mapping.get(name, (name, unit, 1.0, 0.0))) for name, unit in UNITS.items()}
+
+
+class Film(NamedTuple):
+    """The n frames of a recording that can be decoded, at time_s (n,), as the front end sees them: flow in percent, temperature in degC and print that held at that time,
+    NaN and empty before the first; `stretch` numbers those of constant settings."""
+
+    time_s: np.ndarray
+    seen: Seen
+    flow: np.ndarray
+    temperature: np.ndarray
+    prints: list[str]
+    stretch: np.ndarray
+    notes: list[Note]
+
+
+# ---- writing
+
+
+def write_film(
+    path: str | Path, frames: Iterable[tuple[float, np.ndarray]], *, time_s: np.ndarray, signals: Mapping[str, np.ndarray], encoding: str
+) -> None:
+    """One recording of frames (time_s, (height, width) uint8 or uint16), taken one by one, and of signals {name: (T,)} at time_s (T,) on topic /setpoint.
+
+    signals has flow_percent and temperature_degC, and may have print_id, tip_x_px, tip_y_px and travel_direction_deg; `encoding` is "jpeg" (8 bits only), "png" or "raw".
+    Raises ValueError, nothing written, as trials.write_trial does.
+    """
+    unknown = sorted({*signals, *NEEDED} - ({*UNITS} & {*signals}))
+    if unknown:
+        raise ValueError(
+            f"{path}: expected the signals {', '.join(NEEDED)} and at most {', '.join([*UNITS][2:])} beside them, found {', '.join(signals)}; see to {unknown[0]}"
+        )
+    if encoding not in trials._ENCODERS:
+        raise ValueError(f"{path}: the encoding should be jpeg, png or raw but is {encoding!r}; name one of them")
+    tables = trials._tables(
+        path, time_s, [(Source(name, f"{TOPIC}:{name}", UNITS[name]), signals[name]) for name in UNITS if name in signals]
+    )
+    with beside(path) as temporary:
+        writer = Writer(str(temporary), compression=CompressionType.NONE)
+        writer.start(profile="ros2", library="beadline")
+        text = image_messages.HEADER + "".join(f"float64 {name}\n" for name in tables[TOPIC]) + image_messages.HEADER_TYPES
+        channels = {TOPIC: trials._channel(writer, TOPIC, "beadline_msgs/msg/Setpoint", text)}
+        if encoding == "raw":
+            camera = trials._channel(writer, trials.IMAGE_TOPIC, "sensor_msgs/msg/Image", image_messages.IMAGE)
+        else:
+            camera = trials._channel(
+                writer, f"{trials.IMAGE_TOPIC}/compressed", "sensor_msgs/msg/CompressedImage", image_messages.COMPRESSED_IMAGE
+            )
+        pictures = trials._frame_messages(path, camera, encoding, frames, trials._span(np.asarray(time_s, float)))
+        both = heapq.merge(trials._signal_messages(tables, channels, time_s), pictures, key=operator.itemgetter(0))
+        for sequence, (stamp, channel, message) in enumerate(both):
+            writer.add_message(channel, stamp, message, stamp, sequence)
+        writer.finish()
+
+
+# ---- reading
+
+
+def watch(path: Path, shown: Path, where: Topics, tip_px: tuple[float, float] | None, *, least_score: float, memo: Path) -> Film:
+    """The key areas of a recording, with the setpoints that held when each frame was taken, a few frames in memory at a time; `shown` is the path that is spoken of.
+
+    The tip is `tip_px` or, where that is None, the recording's; the print is the recording's print_id, or its file. Raises ValueError, one sentence, where the file cannot be
+    read, has no such topic, or has frames and setpoints that do not overlap in time; what is damaged is left out and noted.
+    """
+    try:
+        return _watch(path, shown, where, tip_px, least_score, memo)
+    except ValueError as error:
+        raise ValueError(str(error).replace(str(path), str(shown))) from None
+    except OSError as error:
+        # what cannot be written is said already
+        if not error.strerror:
+            raise
+        raise ValueError(f"{shown} cannot be read ({error.strerror}); check the disk, or copy the recording again") from None
+
+
+def open_film(path: Path, where: Topics) -> tuple[Frames, dict[str, tuple[np.ndarray, np.ndarray]], list[Note]]:
+    """Frames in the order of time, {signal: (time_s (n,), values (n,))} of those that the recording has, on one clock, and notes of what was damaged."""
+    clock = where.time or "log_time"
+    found = _topics(path)
+    camera = image_topic(path, found, where.image)
+    places = {}
+    for name, source in where.sources().items():
+        try:
+            places[name] = (source, *resolve(path, source.source, found))
+        except ValueError as error:
+            # what was mapped on purpose must be there
+            if name in NEEDED or name in where.mapping:
+                raise ValueError(f"{error}; map {name} to the topic that has it") from None
+    walk = Walk(path, camera, {topic for _, topic, _ in places.values()}, clock)
+    notes = walk.notes()
+    if not walk.picture_order():
+        raise ValueError(f"{path}: no picture of {camera.name} can be read ({trials._damage(path)}); copy the recording again")
+    groups: dict[str, Columns] = {}
+    for topic in dict.fromkeys(topic for _, topic, _ in places.values()):
+        fields = list(dict.fromkeys(field for _, at, field in places.values() if at == topic))
+        groups[topic], dropped = columns(walk, found[topic], fields, clock)
+        if dropped:
+            notes.append(Note("unreadable", "", dropped, f"{dropped} messages of {topic} are not what its schema says and were left out"))
+    start_ns = trials._start(path, [*groups.values(), frame_times(walk, camera)], notes)
+    signals = {
+        name: ((groups[topic].time - start_ns) / 1e9, trials._values(path, source, groups[topic].values[field], notes))
+        for name, (source, topic, field) in places.items()
+    }
+    return Frames(walk, camera, clock, start_ns=start_ns, unreadable_share=1.0), signals, notes
+
+
+def _topics(path: Path) -> dict[str, Topic]:
+    if file_format(path) != "mcap":
+        raise ValueError(f"{path} is a table but should be an MCAP recording with frames; name the recording")
+    return topics(path)
+
+
+def middle_frame(path: Path) -> np.ndarray:
+    """The frame (height, width) in the middle of a recording's only image topic. Raises ValueError."""
+    camera = image_topic(path, _topics(path), "")
+    walk = Walk(path, camera, set(), "log_time")
+    frames = Frames(walk, camera, "log_time", start_ns=0, unreadable_share=1.0)
+    for _, picture in itertools.islice(frames.pictures(), len(frames) // 2, None):
+        with contextlib.suppress(UnreadableMessage):
+            return image_messages.gray(picture)
+    raise ValueError(
+        f"{path}: expected a picture on {camera.name}, found none that can be decoded ({trials._damage(path)}); copy the recording again"
+    )
+
+
+def _watch(path: Path, shown: Path, where: Topics, tip_px: tuple[float, float] | None, least_score: float, memo: Path) -> Film:
+    frames, signals, notes = open_film(path, where)
+    trials._check_overlap(path, trials._span(frames.time_s), {name: (signals[name][0][0], np.inf) for name in NEEDED})
+    entry = entry_of(memo, sha256(path), where, tip_px, least_score)
+    # frames that cannot be decoded are met again, and counted
+    time_s, seen = frames.time_s, remembered(entry, len(frames))
+    if not seen:
+        time_s, seen = _looked(path, frames, signals, tip_px, least_score)
+        remember(entry, seen)
+    flow, temperature, number = (_held(signals, name, time_s) for name in ("flow_percent", "temperature_degC", "print_id"))
+    prints = [f"{value:g}" if np.isfinite(value) else "" for value in number] if "print_id" in signals else [shown.stem] * len(time_s)
+    settings, known = [flow, number], np.nan_to_num(temperature, nan=-1.0)
+    if np.count_nonzero(known[1:] != known[:-1]) <= max(MEASURED, len(time_s) / MEASURED):
+        settings.append(known)
+    else:
+        said = "its temperature changes all the time, so it is measured and ends no segment; map the setpoint where there is one"
+        notes.append(Note("temperature", "temperature_degC", 1, said))
+    notes = [note._replace(message=f"{shown}: {note.message}") for note in [*notes, *frames.notes()]]
+    return Film(time_s, seen, flow, temperature, prints, stretches(np.column_stack(settings)), notes)
+
+
+def _looked(
+    path: Path, frames: Frames, signals: Mapping, tip_px: tuple[float, float] | None, least_score: float
+) -> tuple[np.ndarray, Seen]:
+    """(time_s (n,), what the front end makes of the frames), of those that can be decoded."""
+    times, pieces, walking = [], [], iter(frames)
+    while batch := list(itertools.islice(walking, TOGETHER)):
+        time_s = np.array([time for time, _ in batch])
+        tips = np.column_stack([_held(signals, name, time_s) for name in ("tip_x_px", "tip_y_px")])
+        tips = tips if tip_px is None else np.broadcast_to(np.array(tip_px, float), tips.shape)
+        seen = look((frame for _, frame in batch), tips, _held(signals, "travel_direction_deg", time_s), least_score=least_score)
+        pieces.append(
+            seen._replace(digests=[hashlib.blake2b(np.ascontiguousarray(frame), digest_size=16).hexdigest() for _, frame in batch])
+        )
+        times.append(time_s)
+    if not times:
+        raise ValueError(f"{path}: expected frames, found none that can be decoded; record again")
+    return np.concatenate(times), together(pieces)
+
+
+def _held(signals: Mapping[str, tuple[np.ndarray, np.ndarray]], name: str, time_s: np.ndarray) -> np.ndarray:
+    """The signal's value at each time (n,): a setpoint holds until the next; NaN before the first, and where there is no such signal."""
+    if name not in signals:
+        return np.full(len(time_s), np.nan)
+    at, values = signals[name]
+    last = np.searchsorted(at, time_s, side="right") - 1
+    return np.where(last < 0, np.nan, values[np.maximum(last, 0)])
