@@ -5,10 +5,13 @@ import sys
 from pathlib import Path
 
 from pipeline import artifacts, params
+from pipeline.nightly import commands as nights
 
 
 def accept(_: argparse.Namespace) -> None:
     """Mark the figures of this run as good: later reports show their differences against them."""
+    from pipeline.report.sources import code_files
+
     metrics = {path.stem: artifacts.read_json(path) for path in sorted(Path("reports/metrics").glob("*.json")) if path.stem != "report"}
     if not metrics:
         raise ValueError("reports/metrics: expected the figures of a run, found none; run ./run dvc repro first")
@@ -18,22 +21,42 @@ def accept(_: argparse.Namespace) -> None:
         if path.is_file() and path.parts[1] not in {"memo"} and not path.parts[1].startswith(".")
     )
     hashes = {path.as_posix(): artifacts.sha256(path) for path in [*files, Path("pipeline"), Path("stages")]}
-    artifacts.write_json("reports/accepted.json", {"metrics": metrics, "params": params.read("params.yaml"), "hashes": hashes})
+    run = {"metrics": metrics, "params": params.read("params.yaml"), "hashes": hashes, "code": code_files(("pipeline", "stages"))}
+    artifacts.write_json("reports/accepted.json", run | {"figures": _figures()})
     print(f"reports/accepted.json: accepted {len(metrics)} stages' figures and {len(hashes)} artifacts; commit it to keep it")
 
 
+def _figures() -> dict:
+    """The figures with their bands as the pages show them; none where no page was made. Raises ValueError where the pages are of another run."""
+    if not artifacts.exists("reports/metrics/report.json"):
+        return {}
+    report = artifacts.read_metrics("report")
+    stale = [path for path, recorded in report["read"].items() if not artifacts.exists(path) or artifacts.sha256(path) != recorded]
+    if stale:
+        raise ValueError(f"reports: the pages are of another run than {stale[0]}; run ./run dvc repro, look at them, and accept then")
+    return report["figures"]
+
+
 def verify(_: argparse.Namespace) -> None:
-    """Hold what the pages say they were made from against the files as they are now; what no longer matches is named, with exit status 1."""
-    read = artifacts.read_json("reports/metrics/report.json")["read"]
-    wrong = []
-    for path, recorded in read.items():
-        if not Path(path).exists():
-            wrong.append(f"{path} is gone")
-        elif artifacts.sha256(path) != recorded:
-            wrong.append(f"{path} has changed since")
-    if wrong:
-        raise ValueError(f"reports: {len(wrong)} of {len(read)} sources no longer match the pages: {'; '.join(wrong)}; run ./run dvc repro")
-    print(f"reports: all {len(read)} sources are as the pages say")
+    """Hold what the pages say they were made from against dvc.lock and the files as they are now; what no longer matches is named, with exit status 1."""
+    from pipeline import provenance
+
+    print(provenance.told(provenance.checks()))
+
+
+def history(arguments: argparse.Namespace) -> None:
+    """Write reports/history.html: the figures of every run that git holds, as trends and as a table."""
+    from tqdm import tqdm
+
+    from pipeline import history as past
+    from pipeline.report import trend
+    from pipeline.report.verdict import ReportRules
+
+    found = list(tqdm(past.runs(arguments.most), desc="history", unit=" runs", file=sys.stderr))
+    pages = [(path.stem, path.name) for path in sorted(Path("reports").glob("*.html")) if path.stem != "history"]
+    rules, panel = params.load(ReportRules, "report"), params.load(params.Panel, "panel")
+    artifacts.write_text("reports/history.html", trend.render(found, rules, band_degC=panel.band_degC, pages=pages))
+    print(f"reports/history.html: {len(found)} runs, the last {found[-1].commit[:8] or 'not committed'}")
 
 
 def inspect(arguments: argparse.Namespace) -> None:
@@ -58,11 +81,28 @@ def compose(arguments: argparse.Namespace) -> None:
     print("written: " + ", ".join(str(file) for file in files))
 
 
+def calibrate_tip(arguments: argparse.Namespace) -> None:
+    """A picture of the nozzle's camera into a page on which a click gives the tip; with --tip, what the front end makes of it."""
+    from pipeline.tip_page import calibrate
+
+    sections = params.read()
+    try:
+        least_score = float(sections["train_classifier"]["least_score"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"params.yaml: train_classifier.least_score should be a number of gray levels ({error}); write one such as 10"
+        ) from None
+    print(calibrate(arguments.image, arguments.out or Path(f"{arguments.image.stem}.tip.html"), arguments.tip, least_score=least_score))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(prog="beadline", description="Extrusion-printer recordings into controllers that can be trusted.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     commands.add_parser("accept", help=accept.__doc__).set_defaults(run=accept)
     commands.add_parser("verify", help=verify.__doc__).set_defaults(run=verify)
+    command = commands.add_parser("history", help=history.__doc__)
+    command.add_argument("--most", type=int, default=500, help="revisions to read at most, the newest first (500)")
+    command.set_defaults(run=history)
     command = commands.add_parser("inspect", help=inspect.__doc__)
     command.add_argument("file", type=Path)
     command.set_defaults(run=inspect)
@@ -70,6 +110,12 @@ def main() -> None:
     command.add_argument("part", type=Path, help="the part program (G-code)")
     command.add_argument("--out", type=Path, default=Path("."), help="folder for signal, tasks and report")
     command.set_defaults(run=compose)
+    command = commands.add_parser("calibrate-tip", help=calibrate_tip.__doc__)
+    command.add_argument("image", type=Path, help="a frame of the nozzle's camera")
+    command.add_argument("--tip", default="", metavar="X,Y", help="the tip in pixels, from the left and from the top")
+    command.add_argument("--out", type=Path, metavar="FILE", help="the page; default IMAGE.tip.html here")
+    command.set_defaults(run=calibrate_tip)
+    nights.add(commands)
     arguments = parser.parse_args()
     try:
         arguments.run(arguments)

@@ -1,11 +1,13 @@
 """Artifacts -> pages: reads the metrics and tables of every stage and reports/accepted.json; writes reports/index.html, temperature.html,
-identification.html and deposition.html.
+identification.html, deposition.html and setpoint.html.
 
 What is missing is shown as missing; what was read is hashed, and the pages carry the hashes.
 """
 
+import hashlib
+
 from pipeline import artifacts, params
-from pipeline.report import deposition, identification, index, temperature
+from pipeline.report import deposition, identification, index, setpoint, temperature
 from pipeline.report.judgement import judgement, shown
 from pipeline.report.sources import Declared, collect, digest
 from pipeline.report.verdict import ReportRules
@@ -30,6 +32,9 @@ def main() -> None:
             "train_ilc": "reports/metrics/train_ilc.json",
             "segment_library": "reports/metrics/segment_library.json",
             "compose_parts": "reports/metrics/compose_parts.json",
+            "train_classifier": "reports/metrics/train_classifier.json",
+            "train_agent": "reports/metrics/train_agent.json",
+            "evaluate_setpoint": "reports/metrics/evaluate_setpoint.json",
         }
         folders = {
             "ingest": "datasets/ingest",
@@ -40,6 +45,9 @@ def main() -> None:
             "train_ilc": "datasets/train_ilc",
             "segment_library": "datasets/segment_library",
             "compose_parts": "datasets/compose_parts",
+            "train_classifier": "datasets/train_classifier",
+            "train_agent": "datasets/train_agent",
+            "evaluate_setpoint": "datasets/evaluate_setpoint",
         }
         sources = collect(declared, metrics, folders, "reports/accepted.json", ("pipeline", "stages"))
         judged = judgement(sources)
@@ -48,11 +56,13 @@ def main() -> None:
             "temperature": temperature.render(sources, judged),
             "identification": identification.render(sources),
             "deposition": deposition.render(sources),
+            "setpoint": setpoint.render(sources),
         }
         artifacts.write_text("reports/index.html", pages["index"])
         artifacts.write_text("reports/temperature.html", pages["temperature"])
         artifacts.write_text("reports/identification.html", pages["identification"])
         artifacts.write_text("reports/deposition.html", pages["deposition"])
+        artifacts.write_text("reports/setpoint.html", pages["setpoint"])
         artifacts.write_metrics(
             "report",
             {
@@ -60,6 +70,7 @@ def main() -> None:
                 "figures": shown(judged),
                 "bytes": {name: len(text.encode()) for name, text in pages.items()},
                 "pictures": {name: text.count('role="img"') for name, text in pages.items()},
+                "pages": {name: hashlib.sha256(text.encode()).hexdigest() for name, text in pages.items()},
                 "read": {path: source.sha256 for path, source in sources.read.items()},
                 "parameters": digest(declared.everything),
                 "code": sources.code,

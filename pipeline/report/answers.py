@@ -42,7 +42,7 @@ def _answer(sources: Sources, judged: Any, name: str, question: Question) -> Fig
     if isinstance(mine, Missing):
         return mine
     if question.key == "worst_case_gap_percent":
-        return worst_case(sources.tables["scorecard"], name, _noise(sources), mine.get("gap_percent"))
+        return worst_case(sources.tables["scorecard"], name, noise(sources), mine.get("gap_percent"))
     found = mine.get(question.key)
     if found is None:
         return Missing("not measured", f"{question.title} is not in the scorecard", "Run ./run dvc repro evaluate_temperature")
@@ -59,7 +59,7 @@ def _zone(sources: Sources, found: Mapping) -> str:
     return f"zone {zone + 1}" if isinstance(zone, int) else f"zone {zone}" if zone else ""
 
 
-def _noise(sources: Sources) -> float:
+def noise(sources: Sources) -> float:
     """The noise level that the figures were judged at, in °C."""
     found = lookup(sources.tables["summary"], "noise_degC")
     if not isinstance(found, Missing):
@@ -77,7 +77,7 @@ def _runs(sources: Sources, name: str, key: str) -> tuple[float, ...]:
     if isinstance(table, Missing) or key not in RUNS:
         return ()
     column, factor = RUNS[key]
-    values = factor * table[column][_mine(table, name, _noise(sources)) & (table["plant"] == 0)]
+    values = factor * table[column][_mine(table, name, noise(sources)) & (table["plant"] == 0)]
     return tuple(np.where(np.isnan(values), math.inf, values).tolist())
 
 
@@ -149,4 +149,4 @@ def featured(sources: Sources) -> str:
     offset = panel.judging.reference_offsets_degC[0]
     references = [o.reference + offset for o in sources.declared.machine.outputs]
     ends = f"{number(min(references), 0)}{DASH}{number(max(references), 0)}"
-    return f"nominal plant, held at {panel.judging.starts_degC[0]:g} °C, then sent to {ends} °C; sensor noise {_noise(sources):g} °C"
+    return f"nominal plant, held at {panel.judging.starts_degC[0]:g} °C, then sent to {ends} °C; sensor noise {noise(sources):g} °C"

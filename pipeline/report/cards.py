@@ -45,6 +45,7 @@ def temperature(sources: Sources, judged: Judgement) -> dict[str, Any]:
         "rows": rows,
         "note": _kernel_note(kernel, sources),
         "model": trust(sources),
+        "sources": sources.source("evaluate_temperature", "scorecard", "trajectories"),
         "missing": None,
     }
 
@@ -127,13 +128,14 @@ def _spark(sources: Sources, judged: Judgement, role: str, *, limit: float, name
     return charts.spark(
         time,
         values,
-        charts.Axis(_FLOOR, _CEILING, (), True),
+        charts.logarithmic(_FLOOR, _CEILING)._replace(low=_FLOOR, high=_CEILING),
         css=page.MARKS[role],
         limit=limit,
         alt=alt,
         named=named,
         bad=values[-1] > limit,
         limit_label=f"limit {limit:g}",
+        units=("s", "°C"),
     )
 
 
@@ -170,7 +172,7 @@ def deposition(sources: Sources) -> dict[str, Any]:
     """In this loop's terms: model-based is the paper's law and its library by priority, data-driven our law and the basis functions, baseline on-off control."""
     judged, found = loop.verdict(sources), loop.structures(sources)
     if isinstance(found, Missing):
-        return _unbuilt("deposition", found.sentence()) | {"link": "deposition.html"}
+        return unbuilt("deposition", found.sentence()) | {"link": "deposition.html"}
     parts = list(dict.fromkeys(one.part for one in found))
     # the parts on which the library fares worst say most
     parts.sort(
@@ -219,6 +221,7 @@ def deposition(sources: Sources) -> dict[str, Any]:
         if judged.real
         else "Judged by the true flow of simulated machines that nothing was fitted to.",
         "model": None,
+        "sources": sources.source("scores", "trials"),
         "missing": None,
     }
 
@@ -276,29 +279,25 @@ def _learning_spark(curve: np.ndarray | Missing, css: str, limit: float, *, name
     return charts.spark(
         np.arange(float(len(curve))),
         curve,
-        charts.Axis(0.3, 200.0, (), True),
+        charts.logarithmic(0.3, 200.0)._replace(low=0.3, high=200.0),
         css=css,
         limit=limit,
         alt=alt,
         named=named,
         bad=bad,
         limit_label=f"limit {limit:g}",
+        units=("trials", "%"),
     )
 
 
-def unbuilt() -> list[dict[str, Any]]:
-    """The loop that no stage measures yet."""
-    return [_unbuilt("setpoint", "")]
-
-
-def _unbuilt(key: str, why: str) -> dict[str, Any]:
+def unbuilt(key: str, why: str) -> dict[str, Any]:
     """A loop without figures: the same frame, and the sentence in it."""
     heads = {
         "deposition": ("Deposition", "Plunger command to flow at the nozzle", ("library + priority", "basis functions", "on-off control")),
         "setpoint": (
             "Setpoint",
             "Nozzle camera to flow and temperature setpoints",
-            ("Bayes filter", "Q-learning agent", "sequential test"),
+            ("Bayes filter", "Q-learning agent", "proportional"),
         ),
     }
     name, moved, methods = heads[key]
@@ -310,7 +309,7 @@ def _unbuilt(key: str, why: str) -> dict[str, Any]:
         "moves": moved,
         "state": "Not measured",
         "mark": None,
-        "win": ("Not measured.", why or "Its stages are not built yet: train_classifier, train_agent, evaluate_setpoint."),
+        "win": ("Not measured.", why),
         "caption": "Nothing is shown before it is measured.",
         "panels": [Markup('<div class="hole">{}not measured</div>').format(page.glyph(OPEN)) for _ in order],
         "heads": [
@@ -319,5 +318,6 @@ def _unbuilt(key: str, why: str) -> dict[str, Any]:
         "rows": [],
         "note": "No figure, so no claim.",
         "model": None,
+        "sources": [],
         "missing": True,
     }

@@ -154,8 +154,19 @@ class Frame(NamedTuple):
         return self.height - self.below - self.y.at(values) * (self.height - self.below - self.above)
 
 
-def panel(frame: Frame, layers: Sequence[Markup], *, alt: str, css: str = "mb", title: str = "", x_ticks: bool = True) -> Markup:
-    """The layers on their axes; `title` stands above the y axis and names quantity and unit, `alt` states the finding."""
+def panel(
+    frame: Frame,
+    layers: Sequence[Markup],
+    *,
+    alt: str,
+    css: str = "mb",
+    title: str = "",
+    x_ticks: bool = True,
+    units: tuple[str, str] = ("", ""),
+) -> Markup:
+    """The layers on their axes; `title` stands above the y axis and names quantity and unit, `alt` states the finding, `units` (across, up)
+    stand behind the values that the pointer reads off.
+    """
     axes = []
     for value, label in frame.y.ticks:
         y = float(frame.py(value))
@@ -175,9 +186,23 @@ def panel(frame: Frame, layers: Sequence[Markup], *, alt: str, css: str = "mb", 
         )
     axes.append(Markup('<line class="ax" x1="{}" x2="{}" y1="{}" y2="{}"/>').format(frame.left, frame.width - frame.right, base, base))
     head = Markup('<text class="yt" x="0" y="9">{}</text>').format(title) if title else ""
-    return Markup('<svg class="plot {}" viewBox="0 0 {} {}" role="img" aria-label="{}">{}{}{}</svg>').format(
-        css, frame.width, frame.height, alt, Markup("").join(axes), Markup("").join(layers), head
+    return Markup('<svg class="plot {}" viewBox="0 0 {} {}" role="img" aria-label="{}"{}>{}{}{}</svg>').format(
+        css, frame.width, frame.height, alt, readable(frame, units), Markup("").join(axes), Markup("").join(layers), head
     )
+
+
+def readable(frame: Frame, units: tuple[str, str] = ("", "")) -> Markup:
+    """What a script needs to tell the values below the pointer: room left, right, above, below, width and height in px, then the scales.
+    A scale without ticks is one of names, and is not told.
+    """
+    room = (frame.left, frame.right, frame.above, frame.below, frame.width, frame.height)
+    scales = Markup("").join(
+        Markup(' data-{}="{:.6g} {:.6g}{}"').format(name, axis.low, axis.high, " log" if axis.log else "")
+        for name, axis in (("x", frame.x), ("y", frame.y))
+        if axis.ticks
+    )
+    told = Markup(' data-u="{}|{}"').format(*units) if any(units) else ""
+    return Markup(' data-f="{}"{}{}').format(" ".join(map(str, room)), scales, told)
 
 
 # ---- layers
@@ -291,14 +316,24 @@ def label(frame: Frame, x: float, y: float, text: str, *, anchor: str = "start",
 
 
 def spark(
-    x: np.ndarray, y: np.ndarray, axis: Axis, *, css: str, limit: float, alt: str, named: bool, bad: bool, limit_label: str
+    x: np.ndarray,
+    y: np.ndarray,
+    axis: Axis,
+    *,
+    css: str,
+    limit: float,
+    alt: str,
+    named: bool,
+    bad: bool,
+    limit_label: str,
+    units: tuple[str, str] = ("", ""),
 ) -> Markup:
     """A panel of a loop's card: no ticks, the allowed region grey, the last point marked, vermillion where it lies outside."""
-    frame = Frame(Axis(float(x[0]), float(x[-1]), ()), axis, 104, 88, 1, 4, 4, 4)
+    frame = Frame(linear(float(x[0]), float(x[-1])), axis, 104, 88, 1, 4, 4, 4)
     end = Markup('<circle class="end{}" cx="{}" cy="{}" r="3"/>').format(
         " bad" if bad else "", _n(float(frame.px(x[-1]))), _n(float(frame.py(y[-1])))
     )
     layers = [tint(frame, axis.low, limit), line(frame, x, y), level(frame, limit, "lim", limit_label if named else ""), end]
-    return Markup('<svg class="spark {}" viewBox="0 0 104 88" role="img" aria-label="{}">{}</svg>').format(
-        css, alt, Markup("").join(layers)
+    return Markup('<svg class="spark {}" viewBox="0 0 104 88" role="img" aria-label="{}"{}>{}</svg>').format(
+        css, alt, readable(frame, units), Markup("").join(layers)
     )

@@ -1,12 +1,14 @@
 """The page of the deposition loop: whose signal prints the parts, what it leaves of on-off control's error, what that took, and the pictures behind it."""
 
+import itertools
 from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.report import charts, deposition_learning, deposition_parts, page, words
+from pipeline.report import charts, deposition_change, deposition_learning, deposition_parts, page, words
 from pipeline.report.deposition_verdict import LIBRARY, MARK, NAMES, OURS, PAPER, Structure, gamma, structures, verdict
+from pipeline.report.difference import Move
 from pipeline.report.digits import THIN, number, percent, short
 from pipeline.report.pictures import Column, Picture, hole
 from pipeline.report.sources import Sources, Table, digest, lookup
@@ -56,7 +58,7 @@ def render(sources: Sources) -> str:
         beforehand=_beforehand(sources),
         real=judged.real,
         no_scores=found if isinstance(found, Missing) else None,
-        answers=[_answer(one) for one in measured],
+        answers=[_answer(one) | since(move) for one, move in itertools.zip_longest(measured, deposition_change.moves(sources, measured))],
         scoreboard=scoreboard(measured, sources.declared.rules),
         learning=deposition_learning.pictures(sources),
         frames=deposition_learning.frames(sources),
@@ -137,6 +139,13 @@ def _answer(one: Structure) -> dict[str, Any]:
     }
 
 
+def since(move: Move | None) -> dict[str, Any]:
+    """How the figure of the composer in use moved since the accepted run."""
+    if move is None:
+        return {"change": "first run", "moved": False, "worse": False}
+    return {"change": move.text(), "moved": move.moved, "worse": move.word == "worse"}
+
+
 def _forecast(value: float | None) -> str:
     return "" if value is None else f"forecast {percent(value, 2)}"
 
@@ -173,12 +182,12 @@ def scoreboard(found: list[Structure], asked: ReportRules) -> dict[str, Any]:
 
 def declared(sources: Sources) -> list[tuple[str, list[tuple[str, str]]]]:
     """Sections of params.yaml that this loop reads, flattened, as text."""
-    return [(section, _flat(sources.declared.everything.get(section, {}))) for section in SECTIONS]
+    return [(section, flat(sources.declared.everything.get(section, {}))) for section in SECTIONS]
 
 
-def _flat(data: Any, name: str = "") -> list[tuple[str, str]]:
+def flat(data: Any, name: str = "") -> list[tuple[str, str]]:
     if isinstance(data, dict):
-        return [pair for key, value in data.items() for pair in _flat(value, f"{name}.{key}" if name else str(key))]
+        return [pair for key, value in data.items() for pair in flat(value, f"{name}.{key}" if name else str(key))]
     if isinstance(data, list) and any(isinstance(item, dict) for item in data):
         return [(f"{name}[{i}]", ", ".join(f"{key} {value}" for key, value in item.items())) for i, item in enumerate(data)]
     if isinstance(data, list):
@@ -251,7 +260,7 @@ def _panel(table: Table, rows: np.ndarray, task: str, material: str, Ts: float, 
         charts.label(frame, frame.x.high, frame.y.high, f"{task}: peak {short(most, 2)} ×, lead {number(lead, 2)} s", anchor="end", dy=8)
     )
     alt = f"{task} of material {material}: begins {number(lead, 2)} s ahead of its event and peaks at {short(most, 2)} times the steady command"
-    return charts.panel(frame, layers, alt=alt, css="mb wide", title="× steady" if titled else "")
+    return charts.panel(frame, layers, alt=alt, css="mb wide", title="× steady" if titled else "", units=("s", "×"))
 
 
 def assumptions(sources: Sources) -> dict[str, Any]:

@@ -93,7 +93,13 @@ def errors(sources: Sources) -> Picture:
             ]
             panels.append(
                 charts.panel(
-                    frame, layers, alt=alt, css=LAWS[law][2], title="% of trial 0, log" if column == i == 0 else "", x_ticks=bottom
+                    frame,
+                    layers,
+                    alt=alt,
+                    css=LAWS[law][2],
+                    title="% of trial 0, log" if column == i == 0 else "",
+                    x_ticks=bottom,
+                    units=("trials", "%"),
                 )
             )
         return panels
@@ -151,7 +157,11 @@ def commands(sources: Sources) -> Picture:
                 charts.label(frame, float(mine["time_s"][-1]), 10, f"material {material}: peak {short(peak, 2)} ×", anchor="end"),
             ]
             alt = f"Trial {trial}, material {material}: the command peaks at {short(peak, 2)} times the steady one"
-            panels.append(charts.panel(frame, layers, alt=alt, css="dd", title="× steady" if column == i == 0 else "", x_ticks=bottom))
+            panels.append(
+                charts.panel(
+                    frame, layers, alt=alt, css="dd", title="× steady" if column == i == 0 else "", x_ticks=bottom, units=("s", "×")
+                )
+            )
         return panels
 
     heads = {0: "on\u2011off control", 1: "after one update", last: "the last"}
@@ -216,7 +226,11 @@ def corner(sources: Sources) -> Picture:
                 charts.line(frame, t, flow),
                 charts.label(frame, frame.x.high, top, f"material {material}: {percent(error, 2)} off", anchor="end", dy=8),
             ]
-            panels.append(charts.panel(frame, layers, alt=alt, css=css, title="mm³/s" if column == i == 0 else "", x_ticks=bottom))
+            panels.append(
+                charts.panel(
+                    frame, layers, alt=alt, css=css, title="mm³/s" if column == i == 0 else "", x_ticks=bottom, units=("s", "mm³/s")
+                )
+            )
         return panels
 
     shown = [Column(head, small, mark, draw(law, css, after, i)) for i, (head, small, mark, css, law, after) in enumerate(stories)]
@@ -321,7 +335,7 @@ def _told(mine: Table, wide: float, name: str, machine: bool, *, titled: bool) -
     alt = f"{name}: the flow as measured, between {number(float(np.nanmin(seen)), 1)} and {number(float(np.nanmax(seen)), 1)} mm³/s; standard deviation {short(wide / 1.645, 2)}"
     text = charts.label(frame, float(t[-1]), 1.4 * steady, name, anchor="end", dy=6)
     layers = [*(charts.interval(frame, *stretch) for stretch in blind), charts.line(frame, t, seen, most=400), text]
-    panels = [charts.panel(frame, layers, alt=alt, css="dd wide", title="mm³/s" if titled else "", x_ticks=machine)]
+    panels = [charts.panel(frame, layers, alt=alt, css="dd wide", title="mm³/s" if titled else "", x_ticks=machine, units=("s", "mm³/s"))]
     if machine:
         return panels
     error, band = 100 * (seen - true) / steady, 100 * wide / steady
@@ -330,7 +344,7 @@ def _told(mine: Table, wide: float, name: str, machine: bool, *, titled: bool) -
     text = charts.label(frame, float(t[-1]), 12, f"measured less true: {percent(off, 2)}, r.m.s.", anchor="end", dy=6)
     layers = [charts.tint(frame, -band, band), charts.line(frame, t, error, "line thin", most=400), text]
     alt = f"{name}: measured less true is {percent(off, 2)} of a full line’s flow, r.m.s., of which its own uncertainty explains ±{percent(band, 2)}"
-    return [*panels, charts.panel(frame, layers, alt=alt, css="dd wide", title="%" if titled else "")]
+    return [*panels, charts.panel(frame, layers, alt=alt, css="dd wide", title="%" if titled else "", units=("s", "%"))]
 
 
 def camera(sources: Sources) -> dict[str, Any]:

@@ -74,7 +74,7 @@ def _map(sources: Sources, table: Table, part: str, i: int, *, last: bool) -> Pi
         if not last
         else "The nozzle’s path from above where it should print, in mm. Brown: too little, thin; teal: too much, thick; grey: right. "
         f"Light beyond ±{100 * RIGHT:g}{THIN}%, dark beyond ±{100 * FAR:g}{THIN}% of a full line’s flow; of a long part the worst of each stretch. {'Forecast.' if real(sources) else 'True flow of the simulated machine.'}",
-        page.origin(sources.source("signals") if last else []),
+        page.origin(sources.source("signals")),
     )
 
 
@@ -225,7 +225,7 @@ def _panel(one: Stretch, name: str, *, first: bool, top: bool) -> Markup:
         charts.label(frame, frame.x.high, frame.y.high, text, anchor="end", dy=6),
     ]
     alt = f"{NAMES[name]}, {one.name}: {percent(one.off(name), 2)} of a full line’s flow off the wanted one between {number(float(one.t[0]), 1)} and {number(float(one.t[-1]), 1)} s"
-    return charts.panel(frame, layers, alt=alt, css=CSS[name], title="mm³/s" if first and top else "")
+    return charts.panel(frame, layers, alt=alt, css=CSS[name], title="mm³/s" if first and top else "", units=("s", "mm³/s"))
 
 
 # ---- the lines

@@ -2,10 +2,11 @@
 
 import math
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from pipeline.report.answers import all_answers
-from pipeline.report.digits import MINUS, THIN, decimals, number
+from pipeline.report.digits import MINUS, THIN, count, decimals, number, short
 from pipeline.report.sources import Sources, digest
 from pipeline.report.verdict import Figure, Missing, Question
 
@@ -29,19 +30,22 @@ class Move(NamedTuple):
         if math.isinf(change) or math.isnan(change):
             return self.word
         places = min(decimals(f.low, f.high, value=f.value) for f in (self.before, self.now))
+        exact = all(f.low == f.high for f in (self.before, self.now))
+        size = short(abs(change), 3) if exact else number(abs(change), places)
         unit = {"%": "points", "×": "×"}.get(self.question.unit, self.question.unit)
         sign = "+" if change > 0 else MINUS
-        return f"{sign}{number(abs(change), places)}{THIN + unit if unit else ''} · {self.word}"
+        return f"{sign}{size}{THIN + unit if unit else ''} · {self.word}"
 
 
 class Difference(NamedTuple):
-    """`inputs`, `parameters` (name, before, now), `code` and `artifacts` (path, new | changed | gone) that changed; `same`: how many
-    artifacts did not.
+    """`inputs`, `parameters` (name, before, now), `code` with its `files`, and `artifacts` (path, new | changed | gone) that changed; `same`:
+    how many artifacts did not.
     """
 
     inputs: list[str]
     parameters: list[tuple[str, str, str]]
     code: str
+    files: list[tuple[str, str]]
     artifacts: list[tuple[str, str]]
     same: int
     accepted: str
@@ -57,7 +61,7 @@ def difference(sources: Sources) -> Difference | None:
     if before is None or isinstance(before, Missing):
         return None
     hashes = before.get("hashes") or {}
-    now = {path: source.sha256 for path, source in sources.read.items()}
+    now = {path: source.sha256 for path, source in sources.read.items() if path.startswith(("datasets/", "reports/metrics/"))}
     known = {
         path: value
         for path, value in hashes.items()
@@ -66,8 +70,10 @@ def difference(sources: Sources) -> Difference | None:
     recorded = {path.split("/", 1)[0] for path in known}
     now = {path: value for path, value in now.items() if path.split("/", 1)[0] in recorded}
     changes = [(path, "changed" if path in known else "new") for path in sorted(now) if known.get(path) != now[path]]
+    # what no page reads is not hashed again; that it is not there any more is seen
+    folders_read = {path.rsplit("/", 1)[0] for path in now}
     changes += [
-        (path, "gone") for path in sorted(known) if path not in now and path.rsplit("/", 1)[0] in {p.rsplit("/", 1)[0] for p in now}
+        (path, "gone") for path in sorted(known) if path not in now and path.rsplit("/", 1)[0] in folders_read and not Path(path).exists()
     ]
     inputs = [path for path, _ in changes if path.split("/")[1] == "raw" or path.split("/")[1:] == ["ingest", "record.parquet"]]
     # the accepted run may know the code by its folders, as it knows artifacts
@@ -77,14 +83,26 @@ def difference(sources: Sources) -> Difference | None:
         inputs,
         list(_parameters(before.get("params") or {}, sources.declared.everything)),
         "not recorded" if code is None else "unchanged" if code == sources.code else "changed",
+        _changed(before["code"], sources.files) if before.get("code") else [],
         [change for change in changes if change[0] not in inputs],
         sum(known.get(path) == now[path] for path in now),
         digest(before)[:8],
     )
 
 
+def _changed(before: Mapping[str, str], now: Mapping[str, str]) -> list[tuple[str, str]]:
+    """(path, new | changed | gone) of every file whose digest is another."""
+    words = {(True, True): "changed", (False, True): "new", (True, False): "gone"}
+    return [(path, words[path in before, path in now]) for path in sorted(before.keys() | now.keys()) if before.get(path) != now.get(path)]
+
+
 def _parameters(before: Mapping, now: Mapping) -> Iterator[tuple[str, str, str]]:
-    old, new = dict(_flat("", before)), dict(_flat("", now))
+    # a section that is new or gone is one change
+    for name in sorted(before.keys() ^ now.keys()):
+        values = count(len(list(_flat("", before.get(name, now.get(name))))), "value")
+        yield name, *(("no section", f"a section of {values}") if name in now else (f"a section of {values}", "no section"))
+    both = before.keys() & now.keys()
+    old, new = (dict(_flat("", {name: part[name] for name in both})) for part in (before, now))
     for name in sorted(old.keys() | new.keys()):
         if old.get(name) != new.get(name):
             yield name, _shown(old, name), _shown(new, name)
@@ -105,7 +123,7 @@ def _flat(prefix: str, data: Any) -> Iterator[tuple[str, Any]]:
 
 
 def accepted_answers(sources: Sources, asked: list[Question]) -> Mapping[str, Mapping[str, Figure | Missing]]:
-    """The figures of the accepted run; only metrics were kept of it, no tables."""
+    """The figures of an accepted run that kept none with their bands: from its metrics alone, no tables."""
     gone = Missing("not measured", "the accepted run keeps no table")
     metrics = {stage: sources.accepted.get("metrics", {}).get(stage, gone) for stage in sources.metrics}
     return all_answers(sources._replace(metrics=metrics, tables=dict.fromkeys(sources.tables, gone)), asked)
@@ -113,14 +131,25 @@ def accepted_answers(sources: Sources, asked: list[Question]) -> Mapping[str, Ma
 
 def moves(sources: Sources, asked: list[Question], answers: Mapping[str, Mapping[str, Figure | Missing]]) -> dict[str, list[Move]]:
     """{controller: every figure against the accepted run's}; unchanged is what the metrics alone say, moved what the bands say."""
-    before = accepted_answers(sources, asked)
-    plain = all_answers(sources._replace(tables=dict.fromkeys(sources.tables, Missing("not measured", ""))), asked)
+    if sources.accepted.get("figures"):
+        before, plain = _recorded(sources.accepted["figures"]), answers
+    else:
+        before = accepted_answers(sources, asked)
+        plain = all_answers(sources._replace(tables=dict.fromkeys(sources.tables, Missing("not measured", ""))), asked)
     return {
         name: [
             _move(question, before.get(name, {}).get(question.key), plain[name][question.key], answers[name][question.key])
             for question in asked
         ]
         for name in answers
+    }
+
+
+def _recorded(figures: Mapping[str, Any]) -> dict[str, dict[str, Figure | Missing]]:
+    """The figures as the accepted pages showed them; null is without end."""
+    return {
+        name: {key: Figure(*(math.inf if f[end] is None else f[end] for end in ("median", "low", "high"))) for key, f in found.items()}
+        for name, found in figures.items()
     }
 
 

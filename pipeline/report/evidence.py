@@ -326,7 +326,11 @@ def holdout(sources: Sources) -> Picture:
         small = "fit not measured" if fit is None else f"fit {number(fit, 1)}{THIN}%"
         alt = f"{output.name}: {small} in simulation on the hold-out"
         layers = [charts.line(frame, time, measured, "line seen"), charts.line(frame, time, simulated, "line thin")]
-        shown.append(Column(output.name, small, "", [charts.panel(frame, layers, alt=alt, css="mb", title="°C" if not shown else "")]))
+        shown.append(
+            Column(
+                output.name, small, "", [charts.panel(frame, layers, alt=alt, css="mb", title="°C" if not shown else "", units=("s", "°C"))]
+            )
+        )
     text = "The model runs from the inputs alone; a fit of 100 % would be perfect, 0 % no better than the mean."
     return Picture(
         "holdout",

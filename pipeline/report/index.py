@@ -3,8 +3,9 @@
 from collections.abc import Sequence
 from typing import Any
 
-from pipeline.report import cards, charts, deposition_verdict, page, words
+from pipeline.report import cards, charts, deposition_change, deposition_verdict, page, setpoint_card, setpoint_verdict, words, workflow
 from pipeline.report.answers import repetitions
+from pipeline.report.difference import Move
 from pipeline.report.digits import band, count, quantity
 from pipeline.report.judgement import NAMES, Judgement
 from pipeline.report.sources import Sources, digest
@@ -35,10 +36,12 @@ def render(sources: Sources, judged: Judgement) -> str:
         answers=_rows(judged),
         repetitions=repetitions(sources),
         seeds=len(sources.declared.panel.judging.seeds),
-        change=_change_sentence(judged, sources.accepted),
+        change=_change_sentence(judged, sources.accepted, _deposition_moves(sources)),
         hashes=hashes(sources),
-        cards=[cards.temperature(sources, judged), cards.deposition(sources), *cards.unbuilt()],
+        cards=[cards.temperature(sources, judged), cards.deposition(sources), setpoint_card.setpoint(sources)],
         difference=difference_parts(sources, judged),
+        workflow=workflow.figure(sources),
+        from_accepted=sources.source("accepted"),
         words=words.chosen(sources, words.INDEX),
         sources=list(sources.read.values()),
         absent=sources.absent,
@@ -59,26 +62,30 @@ WORSE = {"passed": 0, "open": 1, "failed": 2}
 
 
 def _headline(sources: Sources, judged: Judgement) -> dict[str, Any]:
-    """The verdict of the worst loop that was measured, the temperature loop's in case of a tie, and beside it what the other says."""
-    mine, other = verdict_parts(judged), deposition_verdict.verdict(sources)
-    state = "open" if other.state == OPEN else other.state
-    mine |= {"title": _title(judged.verdict), "also": "Deposition", "link": "deposition.html", "told": other.decision, "glyph": other.state}
-    if not other.composer or WORSE[state] <= WORSE[mine["state"]]:
-        return mine
-    rules = [{"rule": rule.name, "answers": "", "states": list(rule.states), "first": rule.name == other.first} for rule in other.rules]
+    """The verdict of the worst loop that was measured, the first of them in case of a tie, and beside it what the others say."""
+    mine, parts, seen = verdict_parts(judged), deposition_verdict.verdict(sources), setpoint_verdict.verdict(sources)
+    loops = [mine | {"title": _title(judged.verdict)}, *(_other(found, mine["changed"]) for found in (parts, seen))]
+    measured = [0, *([1] if parts.composer else []), *([2] if seen.default else [])]
+    worst = max(measured, key=lambda i: (WORSE[loops[i]["state"]], -i))
+    told = [
+        {"name": name, "link": f"{name.lower()}.html", "told": loop["decision"], "glyph": loop["state"]}
+        for name, loop in zip(("Temperature", "Deposition", "Setpoint"), loops, strict=True)
+    ]
+    return loops[worst] | {"others": [one for i, one in enumerate(told) if i != worst]}
+
+
+def _other(found: deposition_verdict.Verdict | setpoint_verdict.Verdict, changed: str) -> dict[str, Any]:
+    """The verdict of another loop in the temperature loop's place."""
+    rules = [{"rule": rule.name, "answers": "", "states": list(rule.states), "first": rule.name == found.first} for rule in found.rules]
     return {
-        "title": f"{other.decision.rstrip('.')}: {other.lead[:1].lower()}{other.lead[1:].rstrip('.')}",
-        "state": state,
-        "decision": other.decision,
-        "lead": other.lead,
-        "reason": other.reason,
-        "remedy": f"{other.remedy} The answers below are the temperature loop’s.".strip(),
+        "title": f"{found.decision.rstrip('.')}: {found.lead[:1].lower()}{found.lead[1:].rstrip('.')}",
+        "state": found.state if found.state in WORSE else "open",
+        "decision": found.decision,
+        "lead": found.lead,
+        "reason": found.reason,
+        "remedy": f"{found.remedy} The answers below are the temperature loop’s.".strip(),
         "rules": rules,
-        "changed": mine["changed"],
-        "also": "Temperature",
-        "link": "temperature.html",
-        "told": judged.verdict.decision,
-        "glyph": judged.verdict.state,
+        "changed": changed,
     }
 
 
@@ -121,6 +128,7 @@ def _row(question: Question, judged: Judgement) -> dict[str, Any]:
         "n": question.answer,
         "key": question.key,
         "title": question.title,
+        "word": words.explaining(question.key),
         "sub": _sub(question, pair),
         "cells": [_cell(question, role, figure, places) for role, figure in pair],
         "limit": f"{'≥' if question.at_least else '≤'} {quantity(question.limit, question.unit, places)}",
@@ -155,7 +163,7 @@ def _cell(question: Question, role: str, figure: Figure | Missing, places: int) 
     return cell
 
 
-def _change_sentence(judged: Judgement, accepted: dict | Missing | None) -> dict[str, str]:
+def _change_sentence(judged: Judgement, accepted: dict | Missing | None, parts: Sequence[Move]) -> dict[str, str]:
     """Answer 3."""
     if isinstance(accepted, Missing):
         return {"strong": "The accepted run cannot be read.", "text": accepted.sentence()}
@@ -166,10 +174,19 @@ def _change_sentence(judged: Judgement, accepted: dict | Missing | None) -> dict
         unchanged = judged.changed.empty and all(
             move.word in ("unchanged", "not measured", "failed") for move in judged.moved["data_driven"]
         )
-        return {"strong": "Nothing changed; no figure moved." if unchanged else "No figure moved beyond its noise.", "text": ""}
+        other = "" if unchanged and not any(move.moved for move in parts) else deposition_change.said(parts)
+        return {"strong": "Nothing changed; no figure moved." if unchanged else "No figure moved beyond its noise.", "text": other}
     groups = [(word, [BRIEF[move.question.key] for move in found if move.word == word]) for word in ("worse", "better")]
     said = "; ".join(f"{word}: {', '.join(names)}" for word, names in groups if names)
-    return {"strong": f"{len(found)} of {len(judged.asked)} figures moved beyond their noise.", "text": f"{said[:1].upper()}{said[1:]}."}
+    return {
+        "strong": f"{len(found)} of {len(judged.asked)} figures moved beyond their noise.",
+        "text": f"{said[:1].upper()}{said[1:]}. {deposition_change.said(parts) if any(m.moved for m in parts) else ''}".strip(),
+    }
+
+
+def _deposition_moves(sources: Sources) -> list[Move]:
+    found = deposition_verdict.structures(sources)
+    return [] if isinstance(found, Missing) else deposition_change.moves(sources, found)
 
 
 def hashes(sources: Sources) -> list[tuple[str, str]]:
@@ -190,8 +207,9 @@ def hashes(sources: Sources) -> list[tuple[str, str]]:
 
 
 def difference_parts(sources: Sources, judged: Judgement) -> dict[str, Any]:
-    """What changed, and the figures that moved, of both controllers."""
+    """What changed, and the figures that moved: of both controllers of the temperature loop, and of the composer in use of the deposition loop."""
     accepted, changed = sources.accepted, judged.changed
+    parts = _deposition_moves(sources)
     if isinstance(accepted, Missing) or changed is None:
         return {
             "accepted": "",
@@ -202,21 +220,21 @@ def difference_parts(sources: Sources, judged: Judgement) -> dict[str, Any]:
             "empty": False,
         }
     moved = []
-    for role in ("data_driven", "model_based"):
-        for move in judged.moved[role]:
+    for role, found in (*((role, judged.moved[role]) for role in ("data_driven", "model_based")), ("deposition", parts)):
+        for move in found:
             if move.moved:
                 places = row_places(move.question, [move.before, move.now])
                 limit = quantity(move.question.limit, move.question.unit, places)
                 moved.append(
                     {
                         "title": move.question.title,
-                        "role": role,
-                        "name": NAMES[role],
+                        "role": "data_driven" if role == "deposition" else role,
+                        "name": "composer in use" if role == "deposition" else NAMES[role],
                         "word": move.word,
                         "worse": move.word == "worse" and state(move.question, move.now) != PASSED,
                         "before": quantity(move.before.value, move.question.unit, places, beyond=move.question.beyond),
                         "now": quantity(move.now.value, move.question.unit, places, beyond=move.question.beyond),
-                        "svg": charts.before_and_now(move.question, page.MARKS[role], move.before, move.now, limit),
+                        "svg": charts.before_and_now(move.question, page.MARKS.get(role, "dd"), move.before, move.now, limit),
                     }
                 )
     rest: dict[str, list[str]] = {}
@@ -228,7 +246,7 @@ def difference_parts(sources: Sources, judged: Judgement) -> dict[str, Any]:
         "accepted": changed.accepted,
         "missing": None,
         "moved": moved,
-        "rest": [*still, "Not measured in either run: drift."],
+        "rest": [*still, "Not measured in either run: drift.", deposition_change.said(parts)],
         "changed": changed,
         "empty": changed.empty and not moved,
     }

@@ -77,12 +77,12 @@ def _response(table: Table, rows: np.ndarray, dynamics: Table, row: int, y: char
     gain, peak = (tuple(float(dynamics[f"{key}{side}"][row]) for side in ("", "_low", "_high")) for key in ("gain", "peak"))
     if not seen:
         alt = f"{output} after {name}: sign not known, {_span(peak)} °C per %"
-        return Cell(name, _span(gain), charts.panel(frame, layers, alt=alt, css=size.css), "sign not known")
+        return Cell(name, _span(gain), charts.panel(frame, layers, alt=alt, css=size.css, units=("s", "°C")), "sign not known")
     tau, delay = (f"{short(float(dynamics[key][row]), 2)}{THIN}s" for key in ("time_constant_s", "delay_s"))
     turns = gain[0] / peak[0] < 0.8
     figure = f"{number(peak[0], _places(peak))} ({_span(peak)})" + (f", then {number(gain[0], _places(gain))}" if turns else "")
     alt = f"{output} after {name}: {figure} °C per %; time constant {tau}, delay {delay}"
-    return Cell(name, figure, charts.panel(frame, layers, alt=alt, css=size.css), f"τ {tau}, delay {delay}")
+    return Cell(name, figure, charts.panel(frame, layers, alt=alt, css=size.css, units=("s", "°C")), f"τ {tau}, delay {delay}")
 
 
 def _places(values: tuple[float, float, float]) -> int:

@@ -118,9 +118,22 @@ def _stretch(sources: Sources, table: Table, name: str, small: str, points: int)
     )
     return [
         charts.panel(
-            above, drawn(above, [(measured, "line seen"), (simulated, "line thin")]), alt=alt, css="mb wide", title="°C", x_ticks=False
+            above,
+            drawn(above, [(measured, "line seen"), (simulated, "line thin")]),
+            alt=alt,
+            css="mb wide",
+            title="°C",
+            x_ticks=False,
+            units=("s", "°C"),
         ),
-        charts.panel(below, drawn(below, [(error[1], "line seen"), (error[0], "line thin")]), alt=said, css="mb wide", title="error, °C"),
+        charts.panel(
+            below,
+            drawn(below, [(error[1], "line seen"), (error[0], "line thin")]),
+            alt=said,
+            css="mb wide",
+            title="error, °C",
+            units=("s", "°C"),
+        ),
     ]
 
 
@@ -208,7 +221,7 @@ def _stems(table: Table, rows: np.ndarray, y: charts.Axis, size: Room, name: str
     ]
     worst = int(np.abs(np.nan_to_num(np.where(judged, value, 0.0))).argmax())
     alt = f"{name}: {int((outside & judged).sum())} of {int(judged.sum())} lags outside of ±{number(limit, 2)}, most {number(float(np.nan_to_num(value[worst])), 2)} at lag {int(lag[worst])}"
-    return charts.panel(frame, layers, alt=alt, css=size.css)
+    return charts.panel(frame, layers, alt=alt, css=size.css, units=("samples", ""))
 
 
 def matrix(sources: Sources, cell: Callable[[str, str], tuple[float, Callable[[], Cell]]]) -> tuple[list[tuple[str, list[Cell]]], str]:

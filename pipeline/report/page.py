@@ -1,6 +1,8 @@
 """The frame of every page: templates, one stylesheet, marks, and the small pieces that both pages use."""
 
+import base64
 import functools
+import hashlib
 
 import jinja2
 from markupsafe import Markup, escape
@@ -24,7 +26,18 @@ def environment() -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    found.globals |= {"glyph": glyph, "mark": mark, "bdi": bdi, "origin": origin, "missing": missing, "anchor": anchor}
+    found.globals |= {
+        "glyph": glyph,
+        "mark": mark,
+        "bdi": bdi,
+        "origin": origin,
+        "missing": missing,
+        "anchor": anchor,
+        "term": term, "hashed": hashed,
+        "word_id": word_id,
+    }
+    script = Markup(found.get_template("page.js").render().strip())
+    found.globals |= {"script": script, "script_hash": base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}
     found.filters |= {"shortened": digits.shortened, "count": digits.count}
     return found
 
@@ -64,6 +77,22 @@ def origin(sources: list[Source]) -> Markup:
         return Markup("")
     parts = [Markup('<a href="#{}"><code>{}</code></a>').format(anchor(s.path), s.path.split("/", 1)[1]) for s in sources]
     return Markup('<p class="src">From {}.</p>').format(Markup(", ").join(parts))
+
+
+def word_id(word: str) -> str:
+    return "word-" + "".join(letter if letter.isalnum() else "-" for letter in word.lower())
+
+
+def term(word: str, text: str = "") -> Markup:
+    """A word of the page's list, linked to its meaning there; where a script runs, the meaning stands beside it on hover and focus."""
+    return Markup('<a class="term" href="#{}">{}</a>').format(word_id(word), text or word) if word else escape(text)
+
+
+def hashed(short: str, sources: list[Source]) -> Markup:
+    """The first digits of a hash, linked to the artifact that has it, where it is one's."""
+    found = next((source for source in sources if source.sha256.startswith(short)), None)
+    code = Markup("<code>{}</code>").format(short)
+    return Markup('<a href="#{}">{}</a>').format(anchor(found.path), code) if found else code
 
 
 def anchor(path: str) -> str:

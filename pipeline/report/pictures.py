@@ -109,7 +109,7 @@ def trajectories(sources: Sources) -> Picture:
                 charts.line(frame, run.time[early], values),
                 charts.label(frame, SPAN_S, y.low, f"zone {i + 1}: {reference:g}", anchor="end", dy=-5),
             ]
-            panels.append(charts.panel(frame, layers, alt=alt, css=run.css, title="°C" if i == 0 else "", x_ticks=last))
+            panels.append(charts.panel(frame, layers, alt=alt, css=run.css, title="°C" if i == 0 else "", x_ticks=last, units=("s", "°C")))
         return panels
 
     return Picture(
@@ -163,7 +163,7 @@ def errors(sources: Sources) -> Picture:
             charts.level(frame, limit, "lim", f"limit {limit:g}" if column == 0 else ""),
             charts.line(frame, run.time, error),
         ]
-        return [charts.panel(frame, layers, alt=alt, css=run.css, title="°C, log" if column == 0 else "")]
+        return [charts.panel(frame, layers, alt=alt, css=run.css, title="°C, log" if column == 0 else "", units=("s", "°C"))]
 
     shown = columns(found, draw)
     text = (
@@ -176,7 +176,7 @@ def errors(sources: Sources) -> Picture:
         title,
         text,
         absent(sources, shown),
-        "Largest distance of a zone from its reference, in °C, log scale, against time in s. Grey: what the rule allows once settled.",
+        "Largest distance of a zone from its reference, in °C, log scale, against time in s, noise and ripple in it. Grey: what the rule allows of the settled error, which is of the mean over the last third.",
         page.origin(sources.source("trajectories")),
     )
 
@@ -204,7 +204,11 @@ def costs(sources: Sources) -> Picture:
         alt = f"{LABELS[run.name][0]}: cost {number(finals[run.name], 0)} after {number(float(run.time[-1]) + 1, 0)} s" + (
             f", {_signed(100 * above)} against the exact model" if exact else ""
         )
-        return [charts.panel(frame, [*other, mine, end], alt=alt, css=run.css, title="thousands" if column == 0 else "")]
+        return [
+            charts.panel(
+                frame, [*other, mine, end], alt=alt, css=run.css, title="thousands" if column == 0 else "", units=("s", "thousand")
+            )
+        ]
 
     shown = columns(found, draw)
     first = float(found[0].rows["cost"][0]) / finals[found[0].name]
@@ -258,7 +262,7 @@ def inputs(sources: Sources) -> Picture:
                 charts.line(frame, run.time[early], command[early], steps=True),
                 charts.label(frame, SPAN_S, signal.high, signal.name, anchor="end", dy=10),
             ]
-            panels.append(charts.panel(frame, layers, alt=alt, css=run.css, title="%" if i == 0 else "", x_ticks=last))
+            panels.append(charts.panel(frame, layers, alt=alt, css=run.css, title="%" if i == 0 else "", x_ticks=last, units=("s", "%")))
         return panels
 
     free = [

@@ -36,7 +36,7 @@ def excitation(sources: Sources) -> Picture:
             f"{name}: level {number(float(levels[:, i].min()), 2)} to {number(float(levels[:, i].max()), 2)} % "
             "in eight bands from 0 to π rad a step"
         )
-        shown.append(Column(name, "", "", [charts.panel(frame, [layer], alt=alt, title="%" if i == 0 else "")]))
+        shown.append(Column(name, "", "", [charts.panel(frame, [layer], alt=alt, title="%" if i == 0 else "", units=("of π", "%"))]))
     rank, full, order = (lookup(found, f"excitation_{key}") for key in ("rank", "full_rank", "order"))
     condition, limited = lookup(found, "excitation_condition"), lookup(found, "limited_share")
     text = f"Exciting of order {order}: rank {rank} of {full}" + (
@@ -126,11 +126,12 @@ def _signal(signal, time: np.ndarray, values: np.ndarray, masked: np.ndarray, qu
     short_ones = [i for i in mine if quality["end_s"][i] - quality["start_s"][i] < 0.5 * float(time[-1])]
     layers = [charts.interval(frame, float(quality["start_s"][i]), float(quality["end_s"][i])) for i in short_ones[:100]] + layers
     flags = ", ".join(sorted({str(quality["kind"][i]) for i in mine}))
-    alt = (
-        f"{signal.name}: {short(low)} to {short(high)} {'°C' if signal.unit == 'degC' else signal.unit}, "
-        f"{count(int(masked.sum()), 'sample')} masked"
-    ) + (f"; flagged {flags}" if flags else "")
-    return charts.panel(frame, layers, alt=alt, css="mb", title=signal.name + (f": {flags}" if flags else ""), x_ticks=last)
+    unit = {"degC": "°C"}.get(signal.unit, signal.unit)
+    alt = (f"{signal.name}: {short(low)} to {short(high)} {unit}, {count(int(masked.sum()), 'sample')} masked") + (
+        f"; flagged {flags}" if flags else ""
+    )
+    title = signal.name + (f": {flags}" if flags else "")
+    return charts.panel(frame, layers, alt=alt, css="mb", title=title, x_ticks=last, units=("s", unit))
 
 
 def findings(sources: Sources, most: int = 40) -> tuple[list[Mapping[str, str]], int, Missing | None]:

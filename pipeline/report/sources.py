@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline import artifacts, schemas
+from pipeline import artifacts, schemas, setpoint_schemas
 from pipeline.params import Panel, Plant, Tracking
 from pipeline.report.verdict import Missing, ReportRules
 
@@ -40,7 +40,8 @@ class Source(NamedTuple):
 
 class Sources(NamedTuple):
     """`metrics` by stage and `tables` by name, each with a Missing where it could not be read; `read`: what was;
-    `absent`: what was not, by path; `accepted`: the last accepted run, or None.
+    `absent`: what was not, by path; `accepted`: the last accepted run, or None; `files`: digest of each
+    file of code.
     """
 
     declared: Declared
@@ -50,6 +51,7 @@ class Sources(NamedTuple):
     absent: Mapping[str, Missing]
     accepted: dict | Missing | None
     code: str
+    files: Mapping[str, str]
 
     def source(self, *names: str) -> list[Source]:
         """Those of the files that could be read."""
@@ -69,11 +71,21 @@ def collect(declared: Declared, metrics: Mapping[str, str], folders: Mapping[str
     by_name = [
         {name: value for (_, name), value in part} for part in (list(found.items())[: len(metrics)], list(found.items())[len(metrics) :])
     ]
-    frames = by_name[1].get("frames", [])
-    for one in [] if isinstance(frames, Missing) else frames:
-        read[one["path"]] = Source("frame", one["path"], "train_ilc", "JPEG", artifacts.sha256(one["path"]))
-    before = _read({}, accepted, "accepted", "accept", "accepted", artifacts.read_json) if artifacts.exists(accepted) else None
-    return Sources(declared, *by_name, read, absent, before or None, digest({folder: artifacts.sha256(folder) for folder in code}))
+    for name, stage in (("frames", "train_ilc"), ("nozzle_frames", "train_classifier")):
+        frames = by_name[1].get(name, [])
+        for one in [] if isinstance(frames, Missing) else frames:
+            read[one["path"]] = Source("frame", one["path"], stage, "JPEG", artifacts.sha256(one["path"]))
+    before = _read(read, accepted, "accepted", "accept", "accepted", artifacts.read_json) if artifacts.exists(accepted) else None
+    folders_of_code = digest({folder: artifacts.sha256(folder) for folder in code})
+    return Sources(declared, *by_name, read, absent, before or None, folders_of_code, code_files(code))
+
+
+def code_files(folders: tuple[str, ...]) -> dict[str, str]:
+    """Digest of each file of code, so that a difference can name the ones that changed."""
+    files = [file for folder in folders for file in sorted(Path(folder).rglob("*")) if file.is_file()]
+    return {
+        file.as_posix(): artifacts.sha256(file) for file in files if not any(p.startswith(".") or p == "__pycache__" for p in file.parts)
+    }
 
 
 def digest(data: Any) -> str:
@@ -121,6 +133,16 @@ def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], An
         ("tasks", "compose_parts", "tasks.parquet", *table(schemas.TASKS)),
         ("lines", "compose_parts", "lines.parquet", *table(schemas.LINES)),
         ("conformance", "compose_parts", "conformance.json", "conformance", artifacts.read_json),
+        ("classified", "train_classifier", "classified.parquet", *table(setpoint_schemas.CLASSIFIED)),
+        ("reliability", "train_classifier", "reliability.parquet", *table(setpoint_schemas.RELIABILITY)),
+        ("course", "train_classifier", "course.parquet", *table(setpoint_schemas.COURSE)),
+        ("windows", "train_classifier", "windows.parquet", *table(setpoint_schemas.WINDOWS)),
+        ("nozzle_frames", "train_classifier", "frames/frames.json", "frames 1", _frames),
+        ("agents", "train_agent", "agents.parquet", *table(setpoint_schemas.LESSONS_OF_AGENTS)),
+        ("scoreboard", "evaluate_setpoint", "scoreboard.parquet", *table(setpoint_schemas.SCOREBOARD)),
+        ("paths", "evaluate_setpoint", "paths.parquet", *table(setpoint_schemas.PATHS)),
+        ("decisions", "evaluate_setpoint", "decisions.parquet", *table(setpoint_schemas.DECISIONS)),
+        ("choice", "evaluate_setpoint", "choice.json", "choice", artifacts.read_json),
     ]
 
 
@@ -130,15 +152,15 @@ FRAMES = 24
 
 def _frames(path: str) -> list[dict[str, Any]]:
     """The first rows of an index of frames, each with its picture's path and the picture as a data URI. Raises ValueError where one is missing or no JPEG."""
-    found = artifacts.read_json(path)[:FRAMES]
+    found, stage = artifacts.read_json(path)[:FRAMES], Path(path).parent.parent.name
     for one in found:
         picture = Path(path).with_name(Path(one["file"]).name)
         try:
             data = picture.read_bytes()
         except OSError as error:
-            raise ValueError(f"{picture} cannot be read ({error.strerror}); run ./run dvc repro train_ilc") from None
+            raise ValueError(f"{picture} cannot be read ({error.strerror}); run ./run dvc repro {stage}") from None
         if not data.startswith(b"\xff\xd8"):
-            raise ValueError(f"{picture} is no JPEG; run ./run dvc repro train_ilc")
+            raise ValueError(f"{picture} is no JPEG; run ./run dvc repro {stage}")
         one |= {"path": picture.as_posix(), "uri": "data:image/jpeg;base64," + base64.b64encode(data).decode()}
     return found
 

@@ -9,6 +9,7 @@ from pipeline.report.digits import MINUS, THIN, band, decimals, number, percent,
 from pipeline.report.pictures import ORDER
 from pipeline.report.sources import Sources, lookup
 from pipeline.report.verdict import FAILED, UNDECIDED, Figure, Missing, Question, state
+from pipeline.report.words import FIXED, explaining
 
 EXTRA = (
     ("tracking_degC", "Tracking error, r.m.s.", "°C"),
@@ -21,7 +22,7 @@ def yardstick(sources: Sources, asked: list[Question]) -> dict[str, Any]:
     """Rows are figures, columns controllers; the rule's limit beside them."""
     answers = all_answers(sources, asked)
     names = [name for name in ORDER if name in answers or name == "kernel"]
-    heads = [{"mark": name, "name": LABELS[name][0], "method": LABELS[name][1]} for name in names]
+    heads = [{"mark": name, "word": FIXED[name][0], "name": LABELS[name][0], "method": LABELS[name][1]} for name in names]
     rows = [_row(question, names, [answers.get(name, {}).get(question.key, _no_kernel(sources)) for name in names]) for question in asked]
     for key, title, unit in EXTRA:
         question = Question(0, key, title, unit, math.inf, False, "")
@@ -37,7 +38,7 @@ def yardstick(sources: Sources, asked: list[Question]) -> dict[str, Any]:
         }
         for s in stable
     ]
-    rows.append({"title": "Plants of the spread held stable", "limit": "", "cells": cells})
+    rows.append({"title": "Plants of the spread held stable", "word": "Plant spread", "limit": "", "cells": cells})
     return {"heads": heads, "rows": rows}
 
 
@@ -86,7 +87,7 @@ def _row(question: Question, names: list[str], figures: list[Figure | Missing]) 
             f"{quantity(question.limit, question.unit, min(limit_places, 1 if question.limit < 10 else 0))}"
         )
     )
-    return {"title": question.title, "limit": limit, "cells": cells}
+    return {"title": question.title, "word": explaining(question.key), "limit": limit, "cells": cells}
 
 
 # ---- as published

@@ -1,6 +1,6 @@
 """The page of the temperature loop: verdict, tables, findings, figures, what was declared, words, provenance."""
 
-from pipeline.report import evidence, findings, index, page, pictures, recording, tables, words
+from pipeline.report import evidence, findings, index, page, pictures, recording, tables, trades, words
 from pipeline.report.answers import featured, repetitions
 from pipeline.report.judgement import Judgement
 from pipeline.report.model import trust
@@ -16,6 +16,8 @@ WORDS = (
     "gap",
     "band",
     "settled",
+    "settling",
+    "overshoot",
     "at_limits",
     "margin_disk",
     "margin_delay",
@@ -23,6 +25,7 @@ WORDS = (
     "worst",
     "data",
     "step",
+    "hash",
 )
 
 
@@ -40,7 +43,14 @@ def render(sources: Sources, judged: Judgement) -> str:
         published=tables.published(sources),
         honest=tables.honest(sources),
         findings=findings.findings(sources),
-        at_work=[pictures.trajectories(sources), pictures.errors(sources), pictures.costs(sources), pictures.inputs(sources)],
+        at_work=[
+            pictures.trajectories(sources),
+            pictures.errors(sources),
+            pictures.costs(sources),
+            pictures.inputs(sources),
+            trades.tradeoff(sources),
+            trades.plants(sources),
+        ],
         learning=[evidence.noise(sources), evidence.orders(sources), evidence.holdout(sources), evidence.tuning(sources)],
         record=[recording.excitation(sources), recording.record(sources)],
         flaws=flaws,
@@ -56,6 +66,7 @@ def render(sources: Sources, judged: Judgement) -> str:
         hashes=index.hashes(sources),
         from_scorecard=sources.source("scorecard", "evaluate_temperature"),
         from_metrics=sources.source("evaluate_temperature"),
+        from_quality=sources.source("quality"),
         from_weights=sources.source("weights"),
         from_model=sources.source("identify_plant", "plant"),
     )

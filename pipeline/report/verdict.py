@@ -28,6 +28,12 @@ class ReportRules(params.Section):
     line_volume_percent: float = Field(gt=0, le=1e6)
     above_whole_points: float = Field(ge=0, le=1e6)
     learned_percent: float = Field(gt=0, le=1e6)
+    settled_percent: float = Field(gt=0, le=100)
+    stay_percent: float = Field(gt=0, le=100)
+    image_accuracy: float = Field(gt=0, le=1)
+    window_accuracy: float = Field(gt=0, le=1)
+    ece_image: float = Field(gt=0, le=1)
+    ece_window: float = Field(gt=0, le=1)
 
 
 class Figure(NamedTuple):

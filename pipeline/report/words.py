@@ -2,7 +2,35 @@
 
 from pipeline.report.sources import Sources
 
-INDEX = ("gap", "band", "passed", "settled", "margin_disk", "margin_delay", "spread", "worst", "data", "accepted")
+INDEX = (
+    "gap",
+    "band",
+    "passed",
+    "settled",
+    "settling",
+    "overshoot",
+    "at_limits",
+    "margin_disk",
+    "margin_delay",
+    "spread",
+    "worst",
+    "data",
+    "drift",
+    "accepted",
+    "hash",
+)
+# key of an answer -> the word that explains it
+ANSWERS = {
+    "gap_percent": "gap",
+    "settled_error_degC": "settled",
+    "settling_s": "settling",
+    "overshoot_degC": "overshoot",
+    "at_limits_percent": "at_limits",
+    "disk": "margin_disk",
+    "delay_s": "margin_delay",
+    "worst_case_gap_percent": "worst",
+    "data": "data",
+}
 
 
 FIXED = {
@@ -29,6 +57,16 @@ FIXED = {
         "Samples needed",
         "So many that a controller learned from them costs no more than learn_kernel.allowed_gap_percent above the best, "
         + "and no fewer than it has unknowns to learn.",
+    ),
+    "settling": ("Settling", "How long it takes until every zone has come within the band around its reference and stays there for good."),
+    "overshoot": ("Overshoot", "The furthest way that any zone goes past its reference."),
+    "drift": (
+        "Drift",
+        "How far the machine has moved away from the record that its controller was learned from. Only a machine in use can show it.",
+    ),
+    "hash": (
+        "Hash",
+        "The first digits of a fingerprint (SHA-256) of a file: equal hashes, equal bytes. ./run beadline verify holds all of them against the files.",
     ),
     "accepted": ("Accepted run", "The last run that a person marked as good with ./run beadline accept."),
     "at_limits": ("Time at limits", "Share of all commands beyond what the machine can give; they are clipped to it."),
@@ -123,6 +161,70 @@ FIXED = {
         "Line volume",
         "Material between the middles of the gaps before and after a printed line, against bead area times length.",
     ),
+    "window_of_frames": (
+        "Window",
+        "Twenty frames in a row, on which one decision rests. They are of one segment and repeat each other: their evidence is worth about two frames.",
+    ),
+    "settles": (
+        "Settle",
+        "Flow within 90–110 % and nozzle within 210 ± 5 °C from some decision up to the 90th, until the 100th. The true flow counts, which no controller is told.",
+    ),
+    "stays": ("Stay", "Settled, and never outside again until decision 200."),
+    "recovers": (
+        "Recover",
+        "Inside from some decision up to the 90th until the 120th, though at the 60th the nozzle clogged to 60 % of its flow.",
+    ),
+    "agent": (
+        "Agent",
+        "A network that learned in simulation what to change: rewards teach it, and nobody tells it a model of the machine (deep Q-learning).",
+    ),
+    "as_published": (
+        "As published",
+        "The paper’s own agent, network, four phases and settings, trained by its recipe. What the paper prints no value for is in params.yaml or in the notes.",
+    ),
+    "bayes": (
+        "Bayes filter",
+        "Keeps a list of how likely each flow is, corrects it with every window by how often such windows come at that flow, and moves towards 100 %.",
+    ),
+    "sequential": ("Sequential test", "Adds up the evidence of windows until it suffices for a move, then begins anew."),
+    "proportional": (
+        "Proportional",
+        "Moves the flow by the difference between the shares of over and under, as seen or smoothed over a few windows.",
+    ),
+    "recorded_windows": (
+        "Recorded windows",
+        "Windows that the trained classifier really named, drawn again by the flow of the moment: its errors sit at the class borders and persist.",
+    ),
+    "sticky": (
+        "Sticky",
+        "The conditions of a picture last for several decisions, so that an error comes again; fresh: each window is of another segment.",
+    ),
+    "accuracy": ("Accuracy", "Share of windows that the paper’s simulator names rightly; the rest gets one of the two other classes."),
+    "worst_case": (
+        "Worst case",
+        "The case in which the fewest runs of a controller settle and stay. The controller with the best worst case runs by default.",
+    ),
+    "interval": (
+        "Interval",
+        "Where the true share lies with 95 % confidence, for as many runs as were made (Wilson). A share that straddles its limit is undecided.",
+    ),
+    "key_area": ("Key area", "The 48 × 16 pixels beside the nozzle that hold the line just printed, cut out along it."),
+    "calibrated": (
+        "Calibrated",
+        "Of answers given with 80 % confidence, 80 % are right. The error is the mean distance between the two (expected calibration error).",
+    ),
+    "held_window": (
+        "Held",
+        "Nothing is sent: too few frames show a line, they are foreign, the tip moved, or two classes remain possible.",
+    ),
+    "foreign": (
+        "Foreign",
+        "A picture that lies further from all that was learned than 95 % of familiar ones (Mahalanobis distance of the features).",
+    ),
+    "reward": (
+        "Reward",
+        "1 at 100 % and 210 °C, falling along ellipses that lean: a hotter nozzle wants less flow. The semi-axes a, b say how soon.",
+    ),
     "study": ("The study", "The published work whose method this is; “as published” repeats its own way of counting, digit by digit."),
 }
 
@@ -142,7 +244,10 @@ def glossary(sources: Sources) -> dict[str, tuple[str, str]]:
     return FIXED | {
         "settled": (
             "Settled error",
-            f"Mean distance from the reference over the last third of {panel.steps} steps, for the zone where it is largest.",
+            (
+                f"How far the mean temperature of the last third of {panel.steps} steps lies from the reference, for the zone where it lies furthest; "
+                "noise about that mean does not count."
+            ),
         ),
         "spread": ("Plant spread", spread),
         "step": ("Step", f"One sample of the controller, {machine.sample_time_s:g} s here."),
@@ -152,3 +257,9 @@ def glossary(sources: Sources) -> dict[str, tuple[str, str]]:
 def chosen(sources: Sources, keys: tuple[str, ...]) -> list[tuple[str, str]]:
     found = glossary(sources)
     return [found[key] for key in keys]
+
+
+def explaining(key: str) -> str:
+    """The word that explains an answer; none where it explains itself."""
+    known = {"settled": "Settled error"}
+    return known.get(ANSWERS.get(key, ""), FIXED.get(ANSWERS.get(key, ""), ("",))[0])

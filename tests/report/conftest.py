@@ -1,5 +1,6 @@
-"""The small project as the working directory, and the browser."""
+"""The small project as the working directory, its pages built once, and the browser."""
 
+import contextlib
 import shutil
 
 import pytest
@@ -7,21 +8,64 @@ import pytest
 from tests.report import made
 
 
+def populate(folder):
+    """Every artifact and two files of code."""
+    for name in ("pipeline", "stages"):
+        (folder / name).mkdir()
+        (folder / name / "code.py").write_text("1\n")
+    made.write(folder)
+
+
 @pytest.fixture
 def project(tmp_path, monkeypatch):
     """The working directory with every artifact in it."""
     monkeypatch.chdir(tmp_path)
-    for folder in ("pipeline", "stages"):
-        (tmp_path / folder).mkdir()
-        (tmp_path / folder / "code.py").write_text("1\n")
-    made.write(tmp_path)
+    populate(tmp_path)
     return tmp_path
 
 
-@pytest.fixture
-def chromium():
-    """Path of the browser, or the reason why there is none."""
+@pytest.fixture(scope="session")
+def reports(tmp_path_factory):
+    """The folder of the small project's pages, which nobody changes."""
+    from stages.report import main
+
+    folder = tmp_path_factory.mktemp("built")
+    with contextlib.chdir(folder):
+        populate(folder)
+        main()
+    return folder / "reports"
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """Debian's Chromium, or the reason why there is none."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed; uv sync installs it")
     found = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if not found:
         pytest.skip("no Chromium on this machine; install it to see the pages in a browser")
-    return found
+    with playwright.sync_playwright() as driver:
+        started = driver.chromium.launch(executable_path=found, args=["--no-sandbox", "--disable-gpu"])
+        yield started
+        started.close()
+
+
+@pytest.fixture
+def open_page(browser, reports):
+    """open_page(name, width, theme, script): a page in a browser of its own; what it asked for, and what it said, in .asked and .said."""
+    contexts = []
+
+    def opened(name, *, width=1280, height=800, theme="light", script=True, folder=reports):
+        context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=theme, java_script_enabled=script)
+        contexts.append(context)
+        page = context.new_page()
+        page.asked, page.said = [], []
+        page.on("request", lambda request: page.asked.append(request.url))
+        page.on("console", lambda message: page.said.append(message.text))
+        page.on("pageerror", lambda error: page.said.append(str(error)))
+        page.on("dialog", lambda dialog: page.said.append(dialog.message))
+        page.goto(f"file://{folder}/{name}.html")
+        return page
+
+    yield opened
+    for context in contexts:
+        context.close()

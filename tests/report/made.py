@@ -6,6 +6,7 @@ import numpy as np
 import yaml
 
 from pipeline import artifacts, params, schemas
+from tests.report import made_setpoint
 
 ROOT = Path(__file__).resolve().parents[2]
 CONTROLLERS = ("model_based", "window", "kernel", "baseline", "exact_model")
@@ -295,6 +296,7 @@ def write(root, *, samples=400, recording="good.mcap", worst=None):
     artifacts.write_table(folder / "study.parquet", schemas.STUDY, study)
     artifacts.write_json(folder / "summary.json", {"noise_degC": 0.1, "scenarios": 6, "plants": 2})
     deposition()
+    made_setpoint.write()
 
 
 # ---- the deposition loop: one material, one part of one line, three trials of three laws

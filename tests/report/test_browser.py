@@ -1,94 +1,225 @@
-"""The pages in headless Chromium: what fits, what overflows, what is asked of the network, what the console says; skipped where there is
-no browser."""
+"""The pages in headless Chromium: what fits, what overflows, what is asked of the network, what the console says, what sorts, enlarges and
+explains itself, what prints; skipped where there is no browser."""
 
-import html
-import json
 import re
-import subprocess
-from pathlib import Path
 
 import pytest
 
-from stages.report import main
-
-OPTIONS = [
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--hide-scrollbars",
-    "--host-resolver-rules=MAP * ~NOTFOUND",
-    "--enable-logging=stderr",
-    "--v=0",
-]
-# a page in a frame of the parent's own origin, so that the parent may measure it at any width and in any theme
-FRAME = """<!doctype html><body style="margin:0"><iframe id="f" width="{width}" height="800" style="border:0" srcdoc="{page}"></iframe><pre id="out"></pre><script>
-const f = document.getElementById("f");
-f.onload = () => {{
-  const d = f.contentDocument, w = f.contentWindow, root = d.documentElement;
-  const last = [...d.querySelectorAll(".answers tbody tr")].at(-1);
-  const wide = [...d.body.querySelectorAll("*")].filter(e => !e.closest("svg, .scroll, .vh") && e.getBoundingClientRect().right > {width} + 1);
-  const hidden = [...d.querySelectorAll(".answers tbody tr")].filter(r => !r.getBoundingClientRect().height);
-  document.getElementById("out").textContent = JSON.stringify({{
-    scroll: root.scrollWidth, answers: last ? last.getBoundingClientRect().bottom : 0, wide: wide.map(e => e.outerHTML.slice(0, 120)), hidden: hidden.length,
-    paper: w.getComputedStyle(d.body).backgroundColor, requests: w.performance.getEntriesByType("resource").map(e => e.name),
-  }});
-}};
-</script></body>"""
+PAGES = ("index", "temperature", "identification", "deposition", "setpoint")
+# A4 landscape less its margins, in px
+SHEET = (1016, 703)
 
 
-def run(chromium, tmp_path, *arguments):
-    done = subprocess.run(
-        [chromium, *OPTIONS, f"--user-data-dir={tmp_path / 'profile'}", *arguments], capture_output=True, text=True, timeout=60, check=True
-    )
-    return done.stdout, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
-
-
-def measured(chromium, tmp_path, page, *, width, theme="light"):
-    """What Chromium says of a page at a width and in a theme, and the lines of its console."""
-    text = page.read_text(encoding="utf-8").replace('<html lang="en">', f'<html lang="en" data-theme="{theme}">')
-    frame = tmp_path / "frame.html"
-    frame.write_text(FRAME.format(width=width, page=html.escape(text, quote=True)), encoding="utf-8")
-    dom, console = run(chromium, tmp_path, "--window-size=1400,900", "--virtual-time-budget=5000", "--dump-dom", f"file://{frame}")
-    return json.loads(html.unescape(re.search(r'<pre id="out">(.*?)</pre>', dom, re.DOTALL)[1])), console
-
-
-@pytest.mark.parametrize("name", ["index.html", "temperature.html", "identification.html", "deposition.html"])
+@pytest.mark.parametrize("name", PAGES)
 @pytest.mark.parametrize(("width", "theme"), [(1280, "light"), (1024, "dark"), (390, "light")])
-def test_nothing_overflows_nothing_is_fetched_and_the_console_is_silent(project, chromium, tmp_path, name, width, theme):
-    main()
-    found, console = measured(chromium, tmp_path, Path("reports") / name, width=width, theme=theme)
-    assert found["scroll"] <= width and found["wide"] == []
-    assert found["requests"] == [] and console == []
-    assert found["paper"] == {"light": "rgb(255, 255, 255)", "dark": "rgb(18, 21, 25)"}[theme]
+def test_nothing_overflows_nothing_is_fetched_and_the_console_is_silent(open_page, name, width, theme):
+    page = open_page(name, width=width, theme=theme)
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    wide = """width => [...document.querySelectorAll("body *")].filter(e => !e.closest("svg, .scroll, .vh, dialog, .tip") &&
+        e.getBoundingClientRect().right > width + 1).map(e => e.outerHTML.slice(0, 120))"""
+    assert page.evaluate(wide, width) == []
+    # the page itself and the pictures inside it
+    assert [url for url in page.asked if not url.startswith("data:")] == [page.url] and page.said == []
+    paper = page.evaluate("getComputedStyle(document.body).backgroundColor")
+    assert paper == {"light": "rgb(255, 255, 255)", "dark": "rgb(18, 21, 25)"}[theme]
     # no row of the answers is lost at any width
-    assert found["hidden"] == 0
+    assert all(box["height"] > 0 for box in map(box_of, page.locator(".answers tbody tr").all()))
 
 
-def test_the_twelve_answers_end_within_the_first_screen(project, chromium, tmp_path):
-    main()
-    found, _ = measured(chromium, tmp_path, Path("reports/index.html"), width=1280)
-    assert 0 < found["answers"] <= 800
+def box_of(found):
+    return found.bounding_box()
 
 
-def test_a_page_prints_to_a4_landscape(project, chromium, tmp_path):
-    main()
-    for name in ("index", "temperature", "identification", "deposition"):
-        run(
-            chromium,
-            tmp_path,
-            "--no-pdf-header-footer",
-            f"--print-to-pdf={tmp_path / name}.pdf",
-            f"file://{Path('reports').resolve() / name}.html",
-        )
-        pdf = (tmp_path / f"{name}.pdf").read_bytes()
-        box = re.search(rb"/MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", pdf)
-        # 297 x 210 mm in points
-        assert abs(float(box[1]) - 842) < 2 and abs(float(box[2]) - 595) < 2
+ANSWERS = (
+    "Gap to the optimum",
+    "Change since accepted run",
+    "Worst settled zone error",
+    "Settling to within 1\u00a0°C",
+    "Overshoot",
+    "Time at limits",
+    "Margin: disk",
+    "Margin: delay",
+    "Worst case over plant spread",
+    "Data: samples, of those needed",
+    "Drift since commissioning",
+    "Provenance",
+)
+
+
+@pytest.mark.parametrize("script", [True, False])
+def test_the_first_screen_holds_the_verdict_and_the_twelve_answers_in_their_order(open_page, script):
+    page = open_page("index", script=script)
+    rows = page.locator(".answers tbody tr").all()
+    assert len(rows) == len(ANSWERS)
+    for row, title in zip(rows, ANSWERS, strict=True):
+        assert row.locator("th").inner_text().startswith(title)
+        assert row.locator("td").nth(1).inner_text().strip()
+    for found in (page.locator("h1"), page.locator(".rules"), page.locator(".why"), *rows):
+        box = box_of(found)
+        assert box["y"] >= 0 and box["y"] + box["height"] <= 800 and box["x"] + box["width"] <= 1280
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_a_page_says_the_same_without_a_script(open_page, name):
+    with_script, without = (open_page(name, script=script).locator("main") for script in (True, False))
+    # the only text that a script adds are the arrows of style sheets, which are no text
+    assert with_script.inner_text() == without.inner_text()
+
+
+def test_a_table_sorts_by_number_both_ways_and_back_and_what_has_no_value_stands_last(open_page):
+    page = open_page("identification")
+    place = page.locator("section", has=page.locator("#order")).last
+    head = place.locator("th", has_text="Error on left")
+    cells = place.locator("tbody tr > :nth-child(4)")
+    before = cells.all_inner_texts()
+    # 50 %, 10 % and an order that was not tried
+    assert [text.split("\u202f")[0] for text in before] == ["50.00", "10.00", "within noise"]
+    head.locator("button").click()
+    assert head.get_attribute("aria-sort") == "ascending"
+    assert [text[:2] for text in cells.all_inner_texts()] == ["10", "50", "wi"]
+    head.locator("button").press("Enter")
+    assert head.get_attribute("aria-sort") == "descending"
+    assert [text[:2] for text in cells.all_inner_texts()] == ["50", "10", "wi"]
+    head.locator("button").press("Enter")
+    assert head.get_attribute("aria-sort") is None and cells.all_inner_texts() == before
+
+
+def test_a_table_sorts_by_text_and_the_deposition_scores_by_their_error(open_page):
+    page = open_page("index")
+    paths = page.locator(".prov tbody td:first-child")
+    page.locator(".prov th button", has_text="Artifact").click()
+    assert paths.all_inner_texts() == sorted(paths.all_inner_texts(), key=str.lower)
+
+
+def pointed(page, section, picture, share):
+    """The tip with the pointer over a picture at a share of its width."""
+    svg = page.locator(f"section:has(> #{section}) svg.plot").nth(picture)
+    svg.scroll_into_view_if_needed()
+    box = box_of(svg)
+    page.mouse.move(box["x"] + share * box["width"], box["y"] + box["height"] / 2)
+    return page.locator(".tip").inner_text().replace(",", "")
+
+
+def test_the_pointer_tells_time_and_value_as_they_are_in_the_artifact(open_page):
+    page = open_page("temperature")
+    seconds, degrees = pointed(page, "errors", 0, 0.2).split("\n")
+    time, error = (float(text.split("\u202f")[0]) for text in (seconds, degrees))
+    # the trajectories of the small project: 80 / 2^t - 0.05, sampled once a second; straight between samples on the log scale, within the
+    # tenth of a pixel to which a picture is drawn, of 18 px a decade
+    low, high = (abs(80 * 0.5**t - 0.05) for t in (int(time) + 1, int(time)))
+    assert 1 < time < 12 and low * 0.95 <= error <= high * 1.05
+    assert seconds.endswith("s") and degrees.endswith("°C")
+
+
+@pytest.mark.parametrize(
+    ("name", "figure", "picture"), [("temperature", ".col figure", "svg.plot"), ("deposition", ".frames figure", "img")]
+)
+def test_a_picture_enlarges_zooms_and_closes(open_page, name, figure, picture):
+    page = open_page(name)
+    page.set_default_timeout(5000)
+    found = page.locator(figure).first
+    found.locator("button.zoom").focus()
+    page.keyboard.press("Enter")
+    dialog, shown = page.locator("dialog"), page.locator("dialog .stage svg")
+    assert dialog.is_visible() and box_of(shown)["width"] > 1.5 * box_of(found)["width"]
+    assert shown.get_attribute("aria-label") == (
+        found.locator(picture).get_attribute("aria-label") or found.locator(picture).get_attribute("alt")
+    )
+    whole = shown.get_attribute("viewBox")
+    box = box_of(shown)
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.wheel(0, -200)
+    page.wait_for_function("whole => document.querySelector('dialog .stage svg').getAttribute('viewBox') !== whole", arg=whole)
+    page.keyboard.press("0")
+    assert [float(part) for part in shown.get_attribute("viewBox").split()] == [float(part) for part in whole.split()]
+    page.keyboard.press("Escape")
+    assert not dialog.is_visible() and page.said == []
+
+
+def test_the_keys_read_values_off_an_enlarged_picture(open_page):
+    page = open_page("temperature")
+    page.locator("section:has(> #errors) button.zoom").first.click()
+    page.keyboard.press("ArrowLeft")
+    assert re.fullmatch(r"[\d.]+\u202fs\n[\d.]+\u202f°C", page.locator(".tip").inner_text())
+
+
+def test_a_word_explains_itself_to_pointer_and_keys_and_stands_in_the_list(open_page):
+    page = open_page("index")
+    word, tip = page.locator("#disk a.term"), page.locator(".tip")
+    word.hover()
+    assert "before it oscillates" in tip.inner_text()
+    page.keyboard.press("Escape")
+    assert not tip.is_visible()
+    page.mouse.move(5, 5)
+    page.locator("#overshoot_degC a.term").focus()
+    assert "past its reference" in tip.inner_text()
+    assert page.locator(word.get_attribute("href")).locator("dd").inner_text().endswith("from 2/3 to 3/2.")
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_a_page_prints_on_a4_landscape_and_no_figure_is_cut(open_page, name):
+    page = open_page(name, width=SHEET[0], theme="dark")
+    pdf = page.pdf(prefer_css_page_size=True)
+    boxes = re.findall(rb"/MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", pdf)
+    # 297 x 210 mm in points
+    assert boxes and all(abs(float(w) - 842) < 2 and abs(float(h) - 595) < 2 for w, h in boxes)
+    page.emulate_media(media="print")
+    assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+    cut = """([width, height]) => [...document.querySelectorAll("svg[role=img], img")].filter(e => {
+        const box = e.getBoundingClientRect(), kept = e.closest("figure, .card, tr, .mv");
+        return box.right > width + 1 || !kept || getComputedStyle(kept).breakInside !== "avoid" || kept.getBoundingClientRect().height > height;
+    }).map(e => e.outerHTML.slice(0, 120))"""
+    assert page.evaluate(cut, list(SHEET)) == []
+    # one sheet each: the first screen, the cards
+    if name == "index":
+        edges = [box_of(page.locator(place)) for place in (".answers", ".loops")]
+        assert edges[0]["y"] + edges[0]["height"] <= SHEET[1] and edges[1]["height"] <= SHEET[1]
+    assert not page.locator(".zoom:visible, .way:visible").count()
+
+
+@pytest.mark.parametrize("name", PAGES)
+@pytest.mark.parametrize(("theme", "width"), [("light", 1280), ("dark", 1280), pytest.param("light", 390, marks=pytest.mark.slow)])
+def test_axe_finds_nothing_serious(open_page, name, theme, width):
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe is not installed; uv sync installs it")
+    # a theme changes colours and nothing else
+    options = {"resultTypes": ["violations"]} | ({"runOnly": ["color-contrast"]} if theme == "dark" else {})
+    found = axe.Axe().run(open_page(name, theme=theme, width=width), options=options).response["violations"]
+    serious = [
+        (one["id"], node["html"][:160], node["failureSummary"])
+        for one in found
+        if one["impact"] in ("serious", "critical")
+        for node in one["nodes"]
+    ]
+    assert serious == []
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_every_picture_stands_where_a_link_leads_to_stage_artifact_schema_and_hash(open_page, name):
+    page = open_page(name)
+    lost = """() => [...document.querySelectorAll("main svg[role=img], main img")].filter(e => {
+        const links = [...(e.closest("article, section, .answers")?.querySelectorAll("a[href^='#from-']") ?? [])];
+        return !links.length || links.some(a => document.getElementById(a.hash.slice(1)).cells.length !== 4);
+    }).map(e => e.closest("section, .answers")?.id + " " + e.outerHTML.slice(0, 160))"""
+    assert page.evaluate(lost) == []
+    # a table of figures too; what params.yaml declares has no artifact, and a loop that is not measured no figure
+    unsaid = """() => [...document.querySelectorAll("main table.tab, main table.fig, main .answers table")].filter(e =>
+        !(e.closest("article, section, .answers").querySelector("a[href^='#from-']")) && e.closest("section").getAttribute("aria-labelledby") !== "declared"
+        && !e.querySelector(".hole")).map(e => e.outerHTML.slice(0, 160))"""
+    assert page.evaluate(unsaid) == []
+
+
+def test_text_from_the_data_runs_nothing_even_where_it_were_not_escaped(open_page, reports, tmp_path):
+    text = (reports / "index.html").read_text(encoding="utf-8")
+    hostile = (
+        '<script>window.hit = 1</script><img src="http://evil.example/x" onerror="window.hit = 2"><a href="javascript:window.hit=3">x</a>'
+    )
+    (tmp_path / "bad.html").write_text(text.replace("<main>", f"<main>{hostile}"), encoding="utf-8")
+    page = open_page("bad", folder=tmp_path)
+    assert page.evaluate("window.hit") is None
+    # the browser refuses before it asks
+    assert not any(url.startswith("http") and "evil" in url for url in page.asked) or all("Content Security Policy" in s for s in page.said)
+    page.locator("a", has_text="x").first.click()
+    assert page.evaluate("window.hit") is None
 
 
 def luminance(colour):

@@ -1,6 +1,8 @@
 """The stage on a small project: what the pages say, what they do with missing and hostile input, their size, and that equal inputs give
 equal bytes."""
 
+import base64
+import hashlib
 import json
 import re
 from html.parser import HTMLParser
@@ -10,13 +12,14 @@ import numpy as np
 import pytest
 
 from pipeline import artifacts
+from pipeline.report.page import environment
 from stages.report import main
 from tests.report import made
 
-INDEX, TEMPERATURE, IDENTIFICATION, DEPOSITION = (
-    Path(f"reports/{name}.html") for name in ("index", "temperature", "identification", "deposition")
+INDEX, TEMPERATURE, IDENTIFICATION, DEPOSITION, SETPOINT = (
+    Path(f"reports/{name}.html") for name in ("index", "temperature", "identification", "deposition", "setpoint")
 )
-PAGES = (INDEX, TEMPERATURE, IDENTIFICATION, DEPOSITION)
+PAGES = (INDEX, TEMPERATURE, IDENTIFICATION, DEPOSITION, SETPOINT)
 
 
 class Page(HTMLParser):
@@ -25,11 +28,11 @@ class Page(HTMLParser):
     def __init__(self, path):
         super().__init__()
         self.tags, self.ids, self.links, self.words = [], [], [], []
-        self.style = False
+        self.style = False  # or script
         self.feed(path.read_text(encoding="utf-8"))
 
     def handle_starttag(self, tag, attributes):
-        found, self.style = dict(attributes), tag == "style"
+        found, self.style = dict(attributes), tag in ("style", "script")
         self.tags.append((tag, found))
         self.ids += [found["id"]] if "id" in found else []
         self.links += [found[key] for key in ("href", "src", "xlink:href", "action", "data", "poster", "srcset") if found.get(key)]
@@ -166,7 +169,16 @@ def test_hostile_text_from_the_data_is_escaped_and_isolated(project):
     main()
     for path in PAGES:
         page = Page(path)
-        assert not any(tag in ("script", "iframe", "object", "embed") for tag, _ in page.tags)
+        assert not any(tag in ("iframe", "object", "embed") for tag, _ in page.tags)
+        # one script, ours, and no other may run
+        assert re.findall(r"<script[^>]*>(.*?)</script>", path.read_text(encoding="utf-8"), re.DOTALL) == [
+            str(environment().globals["script"])
+        ]
+        assert [tag for tag, _ in page.tags].count("script") == 1
+        allowed = base64.b64encode(hashlib.sha256(environment().globals["script"].encode()).digest()).decode()
+        assert f"default-src 'none'; style-src 'unsafe-inline'; img-src data:; script-src 'sha256-{allowed}';" in path.read_text(
+            encoding="utf-8"
+        )
         assert all(found["src"].startswith("data:image/jpeg;base64,") for tag, found in page.tags if tag == "img")
         assert not any(name.startswith("on") for _, attributes in page.tags for name in attributes)
     text = TEMPERATURE.read_text(encoding="utf-8")
@@ -210,6 +222,21 @@ def test_a_long_record_is_thinned_and_keeps_its_peak(project):
     # the limits of the pages: 1 MB and 1.5 MB
     assert size["index"] <= 1_000_000 and size["temperature"] <= 1_500_000
     assert "zone_1: 40.0 to 999" in TEMPERATURE.read_text()
+
+
+def test_a_hundred_recordings_with_their_findings_stay_within_the_sizes(project):
+    machine = made.declared(project)
+    columns = made.record(machine, 100_000, "x")
+    columns["recording"] = [f"a rather long name of a recording {i // 1000:03d}.mcap" for i in range(100_000)]
+    columns["segment"] = np.repeat(np.arange(100), 1000).astype(np.int32)
+    artifacts.write_table("datasets/ingest/record.parquet", made.schemas.record(machine.inputs, machine.outputs), columns)
+    rows = 100 * 20
+    flaws = {"recording": columns["recording"][::50][:rows], "signal": ["zone_1"] * rows, "kind": ["spike"] * rows, "count": [1] * rows}
+    flaws |= {"start_s": np.arange(rows) * 50.0, "end_s": np.arange(rows) * 50.0 + 5, "message": ["a spike that stands alone"] * rows}
+    artifacts.write_table("datasets/ingest/quality.parquet", made.schemas.QUALITY, flaws)
+    main()
+    size = figures()["bytes"]
+    assert size["index"] <= 1_000_000 and max(size.values()) <= 1_500_000
 
 
 def test_first_run_equal_runs_and_a_moved_figure(project):

@@ -34,6 +34,12 @@ RULES = ReportRules(
     line_volume_percent=3.0,
     above_whole_points=1.0,
     learned_percent=20.0,
+    settled_percent=97.0,
+    stay_percent=90.0,
+    image_accuracy=0.78,
+    window_accuracy=0.90,
+    ece_image=0.025,
+    ece_window=0.04,
 )
 ASKED = questions(RULES, band_degC=1.0)
 BY_KEY = {question.key: question for question in ASKED}

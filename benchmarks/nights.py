@@ -1,0 +1,325 @@
+"""Sixty nights of the nightly job on a made-up machine: recordings as CSV in the users' format, one a night, with seeds; then drift, bad nights and a planted challenger.
+
+`nice ./run python -m benchmarks.nights [null|drift|bad|planted ...]` plays the scenarios named (default: all), prints the figures beside the bars, and writes
+benchmarks/results/nights.json. Each night is `pipeline.nightly.night.nightly` itself in a git repository of its own; only `dvc repro` is replaced by a call of the same stages in one
+process, because starting five of them takes longer than their work. `--dvc` plays it with `dvc repro`.
+
+The machine: two heated zones (60 and 90 s, 1.6 and 1.2 °C per percent) that warm each other, 20 °C around them give or take 0.5 °C a night, 0.1 °C of sensor noise. The judge of all is
+the machine itself: what a promotion was worth is measured on it, not on the panel that the job judged by.
+"""
+
+import argparse
+import datetime
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import zlib
+from pathlib import Path
+
+import numpy as np
+import scipy.linalg
+import yaml
+
+from pipeline import artifacts
+from pipeline.nightly import champion, judge, night, processes
+from pipeline.temperature import judging, scorecard
+from pipeline.temperature.plant import Plant, hold_output, plant
+from pipeline.temperature.probing import prbs, probe
+
+reproduce = night._reproduce
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "benchmarks/results/nights.json"
+STAGES = ("generate_probing", "ingest", "identify_plant", "learn_kernel", "tune_weights")
+SAMPLES, KEPT, REFERENCE, NOISE_DEGC, AMBIENT_DEGC = 600, 4, np.array([120.0, 110.0]), 0.1, 20.0
+START = datetime.datetime(2030, 1, 1, 2, 0, tzinfo=datetime.UTC)
+TIME_CONSTANTS_S, GAINS = np.array([60.0, 90.0]), np.array([1.6, 1.2])
+
+
+def machine(*, gain: tuple[float, float] = (1.0, 1.0), slower: tuple[float, float] = (1.0, 1.0), ambient: float = AMBIENT_DEGC) -> Plant:
+    """Two zones: tau_i dy_i = K_i u_i + ambient + 0.1 (y_j - y_i) - (y_i - ambient), sampled each second; gains and time constants as shares of the nominal ones."""
+    tau, K = TIME_CONSTANTS_S * slower, GAINS * gain
+    F = np.array([[-1.1, 0.1], [0.1, -1.1]]) / tau[:, None]
+    G = np.column_stack([np.diag(K) / tau[:, None], ambient / tau])
+    whole = scipy.linalg.expm(np.block([[F, G], [np.zeros((3, 5))]]))
+    return plant(whole[:2, :2], whole[:2, 2:4], np.eye(2), b=whole[:2, 4])
+
+
+def recording(truth: Plant, seed: int, *, samples: int = SAMPLES) -> dict[str, np.ndarray]:
+    """A shift of the machine under its operator's loop, dithered: columns as a user's CSV has them."""
+    rng = np.random.default_rng(seed)
+    x0, u0 = hold_output(truth, REFERENCE)
+    signal = prbs(rng, samples, 2, amplitude=8.0, shortest=20)
+    noise = NOISE_DEGC * rng.standard_normal((samples, 2))
+    run = probe(
+        truth, signal, x0=x0, u_centre=u0, y_centre=REFERENCE, feedback=0.5 * np.eye(2), noise=noise, low=np.zeros(2), high=np.full(2, 100.0), rate=20.0
+    )
+    return {"time_s": np.arange(samples, dtype=float), "heater_1": run.u[:, 0], "heater_2": run.u[:, 1], "sensor_1": run.y[:, 0], "sensor_2": run.y[:, 1]}
+
+
+def a_night(seed: int, index: int, **changes) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng([seed, index])
+    return recording(machine(ambient=AMBIENT_DEGC + rng.uniform(-0.5, 0.5), **changes), int(rng.integers(2**31)))
+
+
+def write(path: Path, columns: dict[str, np.ndarray]) -> None:
+    artifacts.write_csv(path, {name: np.round(values, 4) for name, values in columns.items()})
+
+
+# ---- a project
+
+
+def project(folder: Path, seed: int, *, recordings: int = 4, with_dvc: bool = False) -> None:
+    """A repository with the temperature loop's stages, `recordings` nights recorded, three held out, and the first champion made; the working directory is in it afterwards."""
+    folder.mkdir(parents=True)
+    for name in ("pipeline", "stages"):
+        (folder / name).symlink_to(ROOT / name)
+    dvc_yaml = yaml.safe_load((ROOT / "dvc.yaml").read_text())
+    dvc_yaml["stages"] = {name: dvc_yaml["stages"][name] for name in STAGES}
+    (folder / "dvc.yaml").write_text(yaml.safe_dump(dvc_yaml))
+    (folder / "params.yaml").write_text(yaml.safe_dump(settings()))
+    (folder / ".gitignore").write_text("/pipeline\n/stages\n/reports/*.html\n/datasets/memo\n/datasets/[gilt]*\n/datasets/.*.[0-9]*\n*.tmp\n")
+    os.chdir(folder)
+    for command in ("git init -q -b main", f"{sys.executable} -m dvc init -q", "git config user.email n@example.com", "git config user.name N"):
+        subprocess.run(command.split(), check=True)
+    if not with_dvc:
+        (folder / "dvc.lock").write_text("schema: '2.0'\nstages: {}\n")
+    for k in range(recordings):
+        write(Path(f"datasets/raw/temperature/shift_{k:03d}.csv"), a_night(seed, k))
+    for k in range(3):
+        write(Path(f"datasets/holdout/temperature/holdout_{k}.csv"), a_night(seed + 1000, k))
+    subprocess.run(["git", "add", "-A"], check=True)
+    subprocess.run(["git", "commit", "-q", "-m", "project"], check=True)
+    night._reproduce = reproduce if with_dvc else _stages
+
+
+def settings() -> dict:
+    """The project's own params.yaml, for this machine and small; section nightly as the tests have it."""
+    from tests.toy_nights import SETTINGS
+
+    found = yaml.safe_load((ROOT / "params.yaml").read_text())
+    signal = {"unit": "percent", "low": 0, "high": 100}
+    found["plant"] = {
+        "sample_time_s": 1.0, "inputs": [{"name": f"heater_{k}", **signal} for k in (1, 2)],
+        "outputs": [{"name": f"sensor_{k}", "unit": "degC", "reference": float(REFERENCE[k - 1])} for k in (1, 2)],
+    }  # fmt: skip
+    found["generate_probing"] |= {"source": "recordings", "samples": 100}
+    found["panel"] |= {"steps": 150, "noise_degC": [0.1], "training": {"starts_degC": [60], "reference_offsets_degC": [0], "seeds": [101]}}
+    found["learn_kernel"] |= {"longest_window": 8}
+    found["identify_plant"] |= {"max_order": 3}
+    found["tune_weights"] |= {"initial": 4, "evaluations": 8, "practical_initial": 8, "practical_evaluations": 14}
+    found["nightly"] = SETTINGS | {
+        "loops": {
+            "temperature": {
+                "artifacts": ["datasets/identify_plant/plant.parquet", "datasets/learn_kernel/window.parquet", "datasets/tune_weights/weights.json"],
+                "judge": "temperature", "cases": "", "recordings": "datasets/raw/temperature",
+            }
+        },
+        "holdout": SETTINGS["holdout"] | {"starts_degC": [50, 90], "reference_offsets_degC": [0, -10], "seeds": [901, 902]},
+    }  # fmt: skip
+    found["nightly"]["holdout"]["steps"] = 150
+    return found
+
+
+def _stages(_, entry: dict) -> None:
+    """The stages in one forked process, in place of `dvc repro`."""
+    log = Path(".beadline/logs") / f"{entry['run']}.log"
+    log.parent.mkdir(parents=True, exist_ok=True)
+    child = os.fork()
+    if child == 0:
+        descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        os.dup2(descriptor, 1)
+        os.dup2(descriptor, 2)
+        status = 1
+        try:
+            import importlib
+
+            for name in STAGES:
+                importlib.import_module(f"stages.{name}").main()
+            status = 0
+        except SystemExit as end:
+            status = int(end.code or 0)
+        finally:
+            os._exit(status)
+    if os.waitpid(child, 0)[1]:
+        raise ValueError(f"dvc repro failed: {processes._sentence(log.read_text())}")
+
+
+def play(index: int, columns: dict[str, np.ndarray] | None) -> tuple[int, str, dict]:
+    """One night, and what it remembers of itself."""
+    if columns is not None:
+        # the last KEPT recordings are learned from; the older ones are the archive's
+        for old in sorted(Path("datasets/raw/temperature").glob("shift_*.csv"))[: -KEPT + 1]:
+            old.unlink()
+        write(Path(f"datasets/raw/temperature/shift_{index:03d}.csv"), columns)
+    status, said = night.nightly(START + datetime.timedelta(days=index))
+    return status, said, night.nights()[-1]
+
+
+def true_cost(folder: Path) -> float:
+    """What the controller below `folder` costs on the machine itself, over starts, references and seeds of its own."""
+    p = yaml.safe_load(Path("params.yaml").read_text())
+    made, _, weights = judge.controller(folder, p["nightly"]["holdout"]["controller"], p["tracking"]["gamma"])
+    limits = (np.zeros(2), np.full(2, 100.0))
+    plants = [machine(gain=(a, b)) for a, b in ((1, 1), (0.95, 1.05), (1.05, 0.95))]
+    scenarios = scorecard.panel(
+        plants, starts=[40.0, 70.0, 100.0], references=[REFERENCE + d for d in (0.0, -10.0, -20.0)], noise=[NOISE_DEGC], seeds=range(5), steps=150, hold=30, cells=False
+    )
+    law = made.design(weights["q"], weights["r"], p["tracking"]["integral"])
+    run = scorecard.simulate(
+        scenarios, law, scorecard.feed_forward(scenarios, law, judging.targets(made.model, scenarios.r, limits)), limits=limits,
+        integral_band=p["tracking"]["integral_limit_degC"],
+    )  # fmt: skip
+    allowance = scorecard.Allowance(*(p["tune_weights"][f"allow_{name}"] for name in scorecard.Allowance._fields[:-1]), 0.0)
+    figures = scorecard.figures(scenarios, run, limits=limits, band=p["panel"]["band_degC"], sample_time_s=1.0)
+    return scorecard.engineering_cost(figures, scenarios.plant, allowance, longest_s=150.0)
+
+
+# ---- scenarios
+
+
+def null(seed: int, count: int, folder: Path, with_dvc: bool) -> dict:
+    """`count` nights with no change of the machine."""
+    project(folder, seed, with_dvc=with_dvc)
+    promotions, alarms, worse, costs, seconds = [], [], 0, [], []
+    for k in range(4, 4 + count):
+        before = true_cost(champion.FOLDER / "temperature") if champion.read()["champions"] else None
+        began = time.monotonic()
+        status, said, entry = play(k, a_night(seed, k) if k > 4 else None)
+        seconds.append(time.monotonic() - began)
+        assert status in (night.OK, night.DRIFTED), said
+        alarms += [(entry["run"], one["cause"], one["sigmas"]) for one in entry["drift"]["alarms"]]
+        if entry.get("promoted"):
+            after = true_cost(champion.FOLDER / "temperature")
+            promotions.append((entry["run"], before, after))
+            worse += before is not None and after > before
+        costs.append(true_cost(champion.FOLDER / "temperature"))
+        print(f"  {said[:230]}", flush=True)
+    return {
+        "nights": count, "seed": seed, "false_alarms": len(alarms), "alarms": alarms, "promotions": len(promotions) - 1, "first_champion": promotions[0][0],
+        "promotions_on_the_machine": promotions[1:], "worse_promoted": worse, "seconds_a_night": float(np.median(seconds)),
+    }  # fmt: skip
+
+
+def drifted(seed: int, folder: Path, with_dvc: bool) -> dict:
+    """10 % of a gain or a time constant, up and down, each from a fresh clone of the same settled project: nights until the alarm, and the cause it names."""
+    project(folder / "base", seed, with_dvc=with_dvc)
+    status, said, _ = play(4, None)
+    assert status == night.OK, said
+    os.chdir("/")
+    night._reproduce = lambda *_: None  # drift is found before anything is learned, and the challenger is not asked for here
+    found = {}
+    for name, changes in {
+        "gain of heater_1 -10 %": {"gain": (0.9, 1.0)}, "gain of heater_1 +10 %": {"gain": (1.1, 1.0)}, "gain of heater_2 -10 %": {"gain": (1.0, 0.9)},
+        "gain of both -10 %": {"gain": (0.9, 0.9)}, "time constant of zone 1 +10 %": {"slower": (1.1, 1.0)}, "time constant of zone 2 -10 %": {"slower": (1.0, 0.9)},
+        "time constants of both +10 %": {"slower": (1.1, 1.1)},
+    }.items():  # fmt: skip
+        shutil.copytree(folder / "base", folder / "now", symlinks=True)
+        os.chdir(folder / "now")
+        nights, causes = 0, []
+        for k in (5, 6, 7):
+            nights += 1
+            causes = [one["cause"] for one in play(k, a_night(seed, k + 10 * zlib.crc32(name.encode()) % 1000, **changes))[2]["drift"]["alarms"]]
+            if causes:
+                break
+        found[name] = {"nights": nights if causes else None, "causes": causes}
+        print(f"  {name}: {found[name]}", flush=True)
+        os.chdir("/")
+        shutil.rmtree(folder / "now")
+    return found
+
+
+def bad(seed: int, folder: Path, with_dvc: bool) -> dict:
+    """Bad recordings, one a night, each followed by a good night."""
+    project(folder, seed, with_dvc=with_dvc)
+    status, said, _ = play(4, None)
+    assert status == night.OK, said
+    found = {}
+    good = a_night(seed, 5)
+    wrong = {
+        "empty file": None,
+        "half a header": {"time_s": np.zeros(0)},
+        "swapped sensors": good | {"sensor_1": good["sensor_2"], "sensor_2": good["sensor_1"]},
+        "swapped heaters": good | {"heater_1": good["heater_2"], "heater_2": good["heater_1"]},
+        "sensors in °F": good | {name: 1.8 * good[name] + 32 for name in ("sensor_1", "sensor_2")},
+        "one sensor in K": good | {"sensor_1": good["sensor_1"] + 273.15},
+        "heaters as shares": good | {name: good[name] / 100 for name in ("heater_1", "heater_2")},
+        "a sensor that is not there": {name: values for name, values in good.items() if name != "sensor_2"},
+        "not a number": good | {"sensor_1": np.full(SAMPLES, np.nan)},
+    }
+    for k, (name, columns) in enumerate(wrong.items()):
+        files, run = champion.md5s(champion.FOLDER / "temperature"), champion.read()["champions"]["temperature"]["run"]
+        path = Path(f"datasets/raw/temperature/bad_{k}.csv")
+        if columns is None:
+            path.write_bytes(b"")
+        else:
+            write(path, columns)
+        status, said, _ = play(10 + 2 * k, None)
+        same = champion.md5s(champion.FOLDER / "temperature") == files and champion.read()["champions"]["temperature"]["run"] == run
+        path.unlink(missing_ok=True)
+        after = play(11 + 2 * k, a_night(seed, 11 + 2 * k))
+        found[name] = {"status": status, "champion_untouched": same, "told": said, "next_night": after[0], "page_names_it": f"bad_{k}.csv" in Path("reports/nightly.html").read_text()}
+        print(f"  {name}: {status} untouched {same}, next {after[0]}: {said[:240]}", flush=True)
+    return found
+
+
+def planted(seed: int, folder: Path, with_dvc: bool) -> dict:
+    """The champion is made 10 % worse than what a night learns, by weights on its inputs: nights until the challenger is promoted."""
+    project(folder, seed, with_dvc=with_dvc)
+    play(4, None)
+    from pipeline import params
+    from pipeline.nightly.settings import Nightly
+
+    rule = params.load(Nightly, "nightly")
+    measured = judge.judge(rule.loops["temperature"], rule).measure
+    own = Path("champion/temperature/tune_weights/weights.json")
+    weights = artifacts.read_json(own)
+
+    def cost(share: float) -> float:
+        artifacts.write_json(own, weights | {"practical": weights["practical"] | {"r": [r * share for r in weights["practical"]["r"]]}})
+        return float(np.mean([value for _, value in measured(champion.FOLDER / "temperature").cases.values()]))
+
+    best, low, high = cost(1.0), 0.0, 6.0
+    for _ in range(14):
+        middle = (low + high) / 2
+        low, high = (middle, high) if cost(10**middle) < best / 0.9 else (low, middle)
+    made = cost(10**high)
+    entry = champion.read()["champions"]["temperature"]
+    processes.dvc("add", "--quiet", "champion/temperature")
+    state = champion.read()
+    state["champions"]["temperature"] = entry | {"files": champion.md5s(champion.FOLDER / "temperature"), "folder": champion._out("temperature")}
+    artifacts.write_json(champion.FILE, state)
+    processes.commit(champion.paths(), "a champion that is 10 % worse")
+    for k in (5, 6, 7):
+        _, said, entry = play(k, a_night(seed, k))
+        print(f"  {said[:300]}", flush=True)
+        if entry.get("promoted"):
+            return {"planted_percent": 100 * (1 - best / made), "nights": k - 4}
+    return {"planted_percent": 100 * (1 - best / made), "nights": None}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("scenarios", nargs="*", default=["null", "drift", "bad", "planted"])
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--nights", type=int, default=60)
+    parser.add_argument("--dvc", action="store_true")
+    parser.add_argument("--folder", type=Path)
+    a = parser.parse_args()
+    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    whole = a.folder or Path(tempfile.mkdtemp(prefix="nights-"))
+    for name in a.scenarios:
+        print(name, flush=True)
+        call = {"null": lambda f: null(a.seed, a.nights, f, a.dvc), "drift": lambda f: drifted(a.seed, f, a.dvc), "bad": lambda f: bad(a.seed, f, a.dvc), "planted": lambda f: planted(a.seed, f, a.dvc)}
+        results[f"{name}_seed_{a.seed}"] = call[name](whole / name)
+        os.chdir(ROOT)
+        artifacts.write_json(RESULTS, results)
+    shutil.rmtree(whole)
+    print(json.dumps(results, indent=1, ensure_ascii=False, default=str)[:6000])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,45 @@
+"""`./run beadline nightly | rollback`: exit status for a scheduler, one line for a person."""
+
+import argparse
+import sys
+
+
+def nightly(arguments: argparse.Namespace) -> None:
+    """The nightly job: new recordings, dvc repro, judge, promote or keep. Exit status 0: well; 1: failed; 3: drift alarm; 75: another night is at work."""
+    from pipeline.nightly import merging, night
+
+    if arguments.merge:
+        print(merging.merge(arguments.merge))
+    status, said = night.watchdog() if arguments.watch else night.nightly()
+    print(said, file=sys.stderr if status else sys.stdout)
+    sys.exit(status)
+
+
+def rollback(arguments: argparse.Namespace) -> None:
+    """Put an earlier champion back into production, bit by bit: that of RUN, or the one before the present one."""
+    from pipeline.nightly import night
+
+    print(night.rollback(arguments.of, arguments.loop))
+
+
+def sweep(arguments: argparse.Namespace) -> None:
+    """Experiments over a grid of parameters and seeds, with a table and a picture: sweep -S tune_weights.seed=1,2,3 --target tune_weights --metric tune_weights:practical.cost"""
+    from pipeline.nightly import sweeping
+
+    print(sweeping.sweep(arguments.set, arguments.target, arguments.metric))
+
+
+def add(commands) -> None:
+    command = commands.add_parser("nightly", help=nightly.__doc__)
+    command.add_argument("--watch", action="store_true", help="only look whether the last success is older than nightly.watch_h")
+    command.add_argument("--merge", metavar="BRANCH", default="", help="merge the nights of another branch first")
+    command.set_defaults(run=nightly)
+    command = commands.add_parser("rollback", help=rollback.__doc__)
+    command.add_argument("of", metavar="RUN", nargs="?", default="", help="such as night-0042; default: the champion before the present one")
+    command.add_argument("--loop", default="", help="only this loop")
+    command.set_defaults(run=rollback)
+    command = commands.add_parser("sweep", help=sweep.__doc__)
+    command.add_argument("-S", "--set", action="append", required=True, metavar="KEY=A,B,C", help="a key of params.yaml and its values")
+    command.add_argument("--target", required=True, metavar="STAGE", help="the stage up to which each experiment runs")
+    command.add_argument("--metric", required=True, metavar="STAGE:KEY", help="the figure that is told of each, below reports/metrics")
+    command.set_defaults(run=sweep)

@@ -1,0 +1,58 @@
+"""What a night depends on, as one digest, so that a night with nothing new ends in seconds; and which recordings are new."""
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+
+import yaml
+
+from pipeline import artifacts
+
+
+def sources() -> list[str]:
+    """Files and folders that dvc.yaml's stages read and none of them writes; params.yaml and dvc.yaml with them."""
+    stages = yaml.safe_load(Path("dvc.yaml").read_text(encoding="utf-8")).get("stages", {})
+    made = {name for stage in stages.values() for kind in ("outs", "metrics", "plots") for out in stage.get(kind, []) for name in _names(out)}
+    read = {dep for stage in stages.values() for dep in stage.get("deps", [])} | {"params.yaml", "dvc.yaml"}
+    return sorted(dep for dep in read if not any(f"{dep}/".startswith(f"{out}/") for out in made) and dep != "reports/accepted.json")
+
+
+def _names(out: str | Mapping) -> list[str]:
+    return [out] if isinstance(out, str) else list(out)
+
+
+class Hashes:
+    """SHA-256 by path, remembered with size and time of change, so that a gigabyte that did not change is not read every night."""
+
+    def __init__(self, remembered: Mapping[str, list]):
+        self.remembered = dict(remembered)
+        self.now: dict[str, list] = {}
+
+    def of(self, path: Path) -> str:
+        found = path.stat()
+        stamp = [found.st_size, found.st_mtime_ns, found.st_ino]
+        known = self.remembered.get(str(path))
+        self.now[str(path)] = known if known and known[:3] == stamp else [*stamp, artifacts.sha256(path)]
+        return self.now[str(path)][3]
+
+    def below(self, place: str) -> dict[str, str]:
+        """{path: digest} of a file, or of every file below a folder that a stage would read."""
+        path = Path(place)
+        files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
+        kept = [file for file in files if not any(part.startswith(".") or part == "__pycache__" for part in file.parts) and file.suffix != ".pyc"]
+        return {file.as_posix(): self.of(file) for file in kept}
+
+
+def digest(hashes: Hashes, places: list[str]) -> str:
+    """One digest over names and contents of all that lies at `places`."""
+    whole = hashlib.sha256()
+    for place in places:
+        for name, content in hashes.below(place).items():
+            whole.update(f"{name}\0{content}\n".encode())
+    return whole.hexdigest()
+
+
+def recordings(hashes: Hashes, folder: str) -> dict[str, str]:
+    """{path: digest} of the recordings below a loop's folder; notes and files of dvc are none."""
+    found = hashes.below(folder) if folder and Path(folder).is_dir() else {}
+    return {name: content for name, content in found.items() if not name.lower().endswith((".md", ".txt", ".yaml", ".dvc"))}

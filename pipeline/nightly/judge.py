@@ -1,0 +1,207 @@
+"""A controller's files -> evidence: the temperature loop on a frozen panel of plants that nothing was learned from; any loop from a file of costs by case."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import joblib
+import numpy as np
+
+from pipeline import artifacts, ingestion, params, schemas, setpoint_schemas
+from pipeline.nightly.decision import Evidence
+from pipeline.nightly.settings import HoldOut, Loop, Nightly, Rule
+
+MEMO = Path(".beadline/panel")
+
+
+class Judge(NamedTuple):
+    """`measure(folder)`: the evidence on a controller whose files lie below it (datasets, or champion/<loop>); `allowed(champion)`: how much worse each guard may be."""
+
+    measure: Callable[[Path], Evidence]
+    allowed: Callable[[Evidence], dict[str, float]]
+
+
+def judge(loop: Loop, settings: Nightly) -> Judge:
+    if loop.judge == "cases":
+        name = loop.cases.removeprefix("datasets/")
+        return Judge(lambda folder: _cases(folder / name)[0], lambda _: _cases(Path(loop.cases))[1])
+    percent = settings.rule.worst_case_percent / 100
+    if loop.judge in ("deposition", "setpoint"):
+        measure = {"deposition": _deposition, "setpoint": _setpoint}[loop.judge]
+        return Judge(measure, lambda champion: {name: percent * value for name, value in champion.guards.items()})
+    return Judge(_temperature(settings), lambda champion: _allowed(champion, settings.rule))
+
+
+def _cases(path: Path) -> tuple[Evidence, dict[str, float]]:
+    """{"panel": name, "cases": {case: {"block": name, "cost": number}}, "guards": {guard: {"value": number, "allowed": number}}}."""
+    found = artifacts.read_json(path)
+    try:
+        cases = {name: (str(case["block"]), float(case["cost"]) if case["cost"] is not None else np.inf) for name, case in found["cases"].items()}
+        guards = {name: float(guard["value"]) for name, guard in found["guards"].items()}
+        return Evidence(str(found["panel"]), cases, guards), {name: float(guard["allowed"]) for name, guard in found["guards"].items()}
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path}: expected panel, cases with block and cost, and guards with value and allowed, found no {error}; let its stage write them") from None
+
+
+def _deposition(folder: Path) -> Evidence:
+    """Of each part program and material, none of which was trained on: the error of the flow that the chosen composer leaves, as its stage scored it. Guard: the worst line."""
+    table = artifacts.read_table(folder / "compose_parts/scores.parquet", schemas.SCORES)
+    rows = [k for k, chosen in enumerate(table["chosen"]) if chosen]
+    cases = {f"{table['part'][k]}, {table['material'][k]}": (f"{table['part'][k]}, {table['material'][k]}", max(float(table["rms_percent_of_on_off"][k]), 1e-3)) for k in rows}
+    worst = np.nanmax([table["worst_line_volume_percent"][k] for k in rows], initial=0.0)
+    return Evidence(joblib.hash(sorted(cases)), cases, {"worst_line_volume_percent": float(worst)})
+
+
+def _setpoint(folder: Path) -> Evidence:
+    """Of each case of each simulator that counts: the share of runs that the chosen controller does not settle, plus one point. Guards: the worst case, and the slowest."""
+    table, chosen = artifacts.read_table(folder / "evaluate_setpoint/scoreboard.parquet", setpoint_schemas.SCOREBOARD), artifacts.read_json(folder / "evaluate_setpoint/choice.json")
+    rows = [k for k, name in enumerate(table["controller"]) if name == chosen["name"] and table["counts"][k]]
+    lost = {f"{table['simulator'][k]}: {table['case'][k]}": 101.0 - float(table["settled_percent"][k]) for k in rows}
+    slow = np.nanmax([table["p90_steps"][k] for k in rows], initial=0.0)
+    return Evidence(joblib.hash(sorted(lost)), {name: (name, cost) for name, cost in lost.items()}, {"worst_unsettled_percent": max(lost.values()), "slowest_p90_steps": float(slow)})
+
+
+# ---- the temperature loop
+
+
+def _allowed(champion: Evidence, rule: Rule) -> dict[str, float]:
+    return {
+        "worst_case": champion.guards["worst_case"] * rule.worst_case_percent / 100, "settled_error_degC": rule.settled_error_degC, "at_limits_percent": rule.at_limits_points,
+        "lost_disk_margin": rule.disk_margin, "holdout_error_degC": champion.guards.get("holdout_error_degC", 0.0) * rule.holdout_error_percent / 100,
+    }  # fmt: skip
+
+
+def _temperature(settings: Nightly) -> Callable[[Path], Evidence]:
+    """Closed loop on every plant of the frozen panel, from starts and to references of section `nightly.holdout`, with its seeds; prediction on the hold-out recordings."""
+    from pipeline.temperature import judging, plant, scorecard
+
+    h, machine, tracking, panel = settings.holdout, params.load(params.Plant, "plant"), params.load(params.Tracking, "tracking"), params.load(params.Panel, "panel")
+    weights = params.read()["tune_weights"]
+    allowance = scorecard.Allowance(*(float(weights[f"allow_{name}"]) for name in scorecard.Allowance._fields[:-1]), 0.0)
+    simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
+    records = [] if simulated else _holdout_records(h, machine)
+    if simulated:
+        plants = plant.spread(plant.baam()._replace(sample_time_s=machine.sample_time_s), input_gain=panel.input_gain, loss=panel.loss)
+        # between the declared plants: the panel that the stages judge on has the ends
+        plants = plant.spread(plants[0], input_gain=0.6 * panel.input_gain, loss=0.6 * panel.loss)
+    else:
+        plants = _panel_plants(records, machine)
+    reference = np.array([output.reference for output in machine.outputs])
+    scenarios = scorecard.panel(
+        plants, starts=h.starts_degC, references=[reference + offset for offset in h.reference_offsets_degC], noise=[h.noise_degC], seeds=h.seeds,
+        steps=h.steps, hold=panel.hold_steps, cells=simulated,
+    )  # fmt: skip
+    limits = tuple(np.array([(i.low, i.high) for i in machine.inputs]).T)
+    name = joblib.hash((h.model_dump(), [tuple(map(np.asarray, one)) for one in plants], machine.model_dump(), tracking.model_dump(), panel.model_dump(), tuple(allowance)))
+
+    def measured(folder: Path) -> Evidence:
+        made, predictor, weight = controller(folder, h.controller, tracking.gamma)
+        law = made.design(weight["q"], weight["r"], tracking.integral)
+        aims = judging.targets(made.model, scenarios.r, limits)
+        run = scorecard.simulate(scenarios, law, scorecard.feed_forward(scenarios, law, aims), limits=limits, integral_band=tracking.integral_limit_degC)
+        found = scorecard.figures(scenarios, run, limits=limits, band=panel.band_degC, sample_time_s=machine.sample_time_s)
+        margins = scorecard.margins(plants, law, grid=80)
+        return _temperature_evidence(name, scenarios, found, margins, allowance, machine.sample_time_s, _prediction_error(predictor, records))
+
+    return measured
+
+
+def _temperature_evidence(name: str, scenarios, found, margins, allowance, sample_time_s: float, holdout: float | None) -> Evidence:
+    from pipeline.temperature import scorecard
+
+    costs = []
+    for i in range(len(scenarios.plant)):
+        one = type(found)(*(figure[i : i + 1] for figure in found))
+        try:
+            costs.append(scorecard.engineering_cost(one, scenarios.plant[i : i + 1], allowance, longest_s=scenarios.steps * sample_time_s))
+        except ValueError:
+            costs.append(np.inf)
+    cases = {
+        f"plant {p}, {start:g} °C to {r:g} °C, seed {seed}": (f"plant {p}", float(cost))
+        for p, start, r, seed, cost in zip(scenarios.plant, scenarios.start, scenarios.r[:, 0], scenarios.seed, costs, strict=True)
+    }
+    by_plant = [np.mean(np.array(costs)[scenarios.plant == p]) for p in np.unique(scenarios.plant)]
+    guards = {
+        "worst_case": float(np.max(by_plant)), "settled_error_degC": float(found.settled_error_degC.max()), "at_limits_percent": float(found.at_limits_percent.max()),
+        "lost_disk_margin": 2.0 - min(margin.disk for margin in margins), "unstable_plants": float(sum(not margin.stable for margin in margins)),
+    }  # fmt: skip
+    return Evidence(name, cases, guards | ({"holdout_error_degC": holdout} if holdout is not None else {}))
+
+
+def controller(folder: Path, which: str, gamma: float):
+    """The controller whose files lie below `folder`, the model that it predicts with, and its weights."""
+    from pipeline.temperature import judging, plant, window
+
+    weights = {name: np.array(value) for name, value in artifacts.read_json(folder / "tune_weights/weights.json")["practical"].items()}
+    model = plant.restored(artifacts.read_arrays(folder / "identify_plant/plant.parquet", "plant", 1))[0]
+    if which == "model_based":
+        return judging.model_based(model, gamma, tau=float(weights["observer_tau"])), model, weights
+    long = window.restored(artifacts.read_arrays(folder / "learn_kernel/window.parquet", "window", 1))
+    return judging.window(long, gamma), window.predictor(long, model.sample_time_s), weights
+
+
+def _holdout_records(h: HoldOut, machine: params.Plant) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The hold-out recordings as gapless segments. Raises ValueError where there is none that can be read."""
+    if not Path(h.recordings).is_dir():
+        raise ValueError(f"{h.recordings}: expected recordings that nothing is trained on, found none; put one of the machine as commissioned there")
+    segments = record_segments(Path(h.recordings), machine)
+    return [pair for pairs in segments.values() for pair in pairs]
+
+
+def record_segments(folder: Path, machine: params.Plant, *, broken: dict[str, str] | None = None) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
+    """{recording: [(u, y), ...]} below a folder, read as the stage `ingest` reads, through its memo; reasons of those that cannot be read go to `broken`."""
+    declared: dict[str, Any] = params.read()["ingest"]
+    mapping = {name: (m["source"], m["unit"], float(m["scale"]), float(m["offset"])) for name, m in declared["mapping"].items()}
+    job = ingestion.Job(machine, mapping, declared["time"], float(declared["max_gap_s"]))
+    results = ingestion.process(folder, job, params.load(params.Execution, "execution"), memo=Path("datasets/memo/ingest"))
+    found = {}
+    for result in results:
+        if result.reason:
+            if broken is None:
+                raise ValueError(result.reason)
+            broken[result.name] = result.reason
+            continue
+        found[result.name] = _segments(result.record, machine)
+    return found
+
+
+def _segments(record: dict[str, np.ndarray], machine: params.Plant) -> list[tuple[np.ndarray, np.ndarray]]:
+    u, y = (
+        np.stack([np.where(record[f"{s.name}_masked"], np.nan, record[s.name]) for s in signals], axis=1).astype(float)
+        for signals in (machine.inputs, machine.outputs)
+    )
+    cuts = np.flatnonzero(np.diff(record["segment"])) + 1
+    pairs = []
+    for a, b in zip(np.split(u, cuts), np.split(y, cuts), strict=True):
+        # inputs without gaps: what lies between two is a segment of its own
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], np.isfinite(a).all(axis=1).astype(int), [0]])))
+        pairs += [(a[i:j], b[i:j]) for i, j in zip(edges[::2], edges[1::2], strict=True) if j - i >= 30]
+    return pairs
+
+
+def _panel_plants(records: list[tuple[np.ndarray, np.ndarray]], machine: params.Plant):
+    """The plants of the hold-out recordings: identified from them alone, and a bootstrap family around; kept, since neither recordings nor method change from night to night."""
+    from pipeline.temperature import identification, plant, validation
+
+    p = params.read()["identify_plant"]
+    key = joblib.hash((records, p["max_order"], p["offset"], p["spread_plants"], p["seed"]))
+    path = MEMO / f"{key}.parquet"
+    if path.exists():
+        return plant.restored(artifacts.read_arrays(path, "holdout_plants", 1))
+    u, y = [a for a, _ in records], [b for _, b in records]
+    names = [i.name for i in machine.inputs]
+    u, _ = identification.within_limits(u, tuple(zip(*((i.low, i.high) for i in machine.inputs), strict=True)), names=names)
+    found = identification.identify(u, y, sample_time_s=machine.sample_time_s, order=None, offset=p["offset"], refinement="none", max_order=p["max_order"], names=names)
+    family = validation.bootstrap_spread(u, y, found, count=p["spread_plants"], order=found.order, rng=np.random.default_rng(p["seed"]))
+    artifacts.write_arrays(path, "holdout_plants", 1, plant.stored([found.plant, *family]))
+    return plant.restored(artifacts.read_arrays(path, "holdout_plants", 1))
+
+
+def _prediction_error(model, records: list[tuple[np.ndarray, np.ndarray]]) -> float | None:
+    """Root mean square one-step error in °C on the hold-out recordings, None where there are none."""
+    if not records:
+        return None
+    from pipeline.temperature import validation
+
+    errors = np.vstack(validation.one_step_errors(model, [u for u, _ in records], [y for _, y in records]))
+    return float(np.sqrt(np.nanmean(errors**2)))

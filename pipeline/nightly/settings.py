@@ -1,0 +1,90 @@
+"""Section `nightly` of params.yaml: when to promote, what is drift, who is woken."""
+
+from typing import Annotated, Literal
+
+import pydantic
+from pydantic import Field
+
+from pipeline.params import Section
+
+Path = Annotated[str, Field(min_length=1, max_length=300)]
+
+
+class Loop(Section):
+    """One control loop: the files that are its controller, and where the judge finds its evidence: a panel of its own (temperature), what its stage scored on cases
+    that nothing was trained on (deposition, setpoint), or a file of costs by case."""
+
+    artifacts: list[Path] = Field(min_length=1, max_length=50)
+    judge: Literal["temperature", "deposition", "setpoint", "cases"]
+    cases: str = Field(max_length=300)
+    recordings: str = Field(max_length=300)
+
+    @pydantic.model_validator(mode="after")
+    def _cases_have_a_file(self):
+        if (self.judge == "cases") != bool(self.cases):
+            raise ValueError(f'has judge {self.judge} but cases "{self.cases}"; name the file of costs where judge is cases, and only there')
+        if self.cases and self.cases not in self.artifacts:
+            raise ValueError(f"has cases {self.cases} that are not among its artifacts; add them there, so that the champion keeps its own")
+        return self
+
+
+class Rule(Section):
+    """Better beyond noise, by a margin worth a change, and no guard worse by more than is allowed."""
+
+    level: float = Field(gt=0, le=0.2)
+    least_improvement_percent: float = Field(ge=0, le=100)
+    worst_case_percent: float = Field(ge=0, le=1000)
+    settled_error_degC: float = Field(ge=0, le=100)
+    at_limits_points: float = Field(ge=0, le=100)
+    disk_margin: float = Field(ge=0, le=2)
+    holdout_error_percent: float = Field(ge=0, le=1000)
+
+
+class HoldOut(Section):
+    """The temperature loop's hold-out: which controller, on which scenarios, with seeds that no stage uses; recordings of `recordings` make the plants."""
+
+    controller: Literal["window", "model_based"]
+    recordings: Path
+    starts_degC: list[Annotated[float, Field(ge=-273.15, le=1000)]] = Field(min_length=1, max_length=20)
+    reference_offsets_degC: list[Annotated[float, Field(ge=-500, le=500)]] = Field(min_length=1, max_length=20)
+    noise_degC: float = Field(ge=0, le=50)
+    seeds: list[Annotated[int, Field(ge=0, le=2**31)]] = Field(min_length=1, max_length=100)
+    steps: int = Field(ge=60, le=20000)
+
+
+class Drift(Section):
+    """Alarm where a figure leaves its band by `alarm_sigmas` at once, or by `watch_sigmas` two nights running; and never for less than what matters."""
+
+    alarm_sigmas: float = Field(gt=1, le=100)
+    watch_sigmas: float = Field(gt=1, le=100)
+    parameter_percent: float = Field(gt=0, le=1000)
+    offset_degC: float = Field(gt=0, le=1000)
+    noise_percent: float = Field(gt=0, le=1000)
+    effort_percent: float = Field(gt=0, le=100)
+    at_limits_points: float = Field(gt=0, le=100)
+    camera_px: float = Field(gt=0, le=1000)
+    contrast_percent: float = Field(gt=0, le=1000)
+    class_points: float = Field(gt=0, le=100)
+
+
+class Nightly(Section):
+    """Section `nightly`."""
+
+    promotion: Literal["at_once", "branch"]
+    branch: str = Field(min_length=1, max_length=100)
+    remote: str = Field(max_length=100)
+    longest_h: float = Field(gt=0, le=168)
+    least_free_mb: float = Field(ge=0, le=1e7)
+    watch_h: float = Field(gt=0, le=10000)
+    alarm: str = Field(max_length=1000)
+    webhook: str = Field(max_length=1000)
+    loops: dict[Annotated[str, Field(min_length=1, max_length=40)], Loop]
+    rule: Rule
+    holdout: HoldOut
+    drift: Drift
+
+    @pydantic.model_validator(mode="after")
+    def _loop(self):
+        if not self.loops:
+            raise ValueError("has no loops; name at least one, with its artifacts and judge")
+        return self

@@ -1,0 +1,135 @@
+"""Bayes filters for the flow: what the windows say on a grid of flows, under several hypotheses of how the camera errs, and the move with the least expected loss.
+
+The flow is known by its moves and by the windows it shows. The filter carries b(h, q), the belief that the flow is q and the camera errs in the manner h:
+
+    b(h, q) <- sum_h' T(h', h) [(1 - hazard) b(h', q - move) + hazard b(h') prior(q)]      the move; a clog or the like, with a small probability; another segment
+    b(h, q) <- b(h, q) P(window | h, q) / sum                                              the window
+    a = argmin_a sum b(q) loss(q + a) + move_cost |a|                                      loss(q) = |q - 100| + outside_cost where that is more than 10
+
+Manners of erring (`evidence`): anywhere with one probability, as in the paper's simulator; or as a trained classifier does by its recorded windows, seen through
+a segment that makes every bead look wider or narrower. Which it is, shows by itself.
+"""
+
+from functools import cache
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.special
+
+from pipeline.setpoint.baselines import temperature_move
+from pipeline.setpoint.recorded import WindowTable
+from pipeline.setpoint.reward import BEST_FLOW
+from pipeline.setpoint.simulator import CLASSES, FLOW_LIMITS, FLOW_MOVES, GOOD, UNDER, Action, Controller, Observation, flow_class
+
+SPACING = 2.5  # percent: half the smallest move
+GRID = np.arange(FLOW_LIMITS[0], FLOW_LIMITS[1] + SPACING / 2, SPACING)  # (N,)
+PRIOR = 1 / GRID / np.sum(1 / GRID)  # errors of extrusion are ratios: 50 % is as likely as 200 %
+LEVELS = 6  # of the shares within each class
+FAINTEST = 0.03  # shares below this are told apart no more
+CODES = CLASSES * LEVELS
+
+
+class Filter(NamedTuple):
+    """evidence (H, CODES, N) is P(code | h, q); transition (H, H) from row to column at each decision; hazard: probability a decision that the flow jumps;
+    move_cost in percent of flow error by percent of move, outside_cost in percent of flow error."""
+
+    evidence: jax.Array
+    transition: jax.Array
+    hazard: float
+    move_cost: float
+    outside_cost: float
+
+
+@cache  # one pair of functions, so that what was compiled for it is found again
+def bayes(hypotheses: int) -> Controller:
+    """The filter and its greedy move, for Filter parameters of so many hypotheses; memory is the belief (H, N)."""
+
+    def act(parameters: Filter, belief: jax.Array, observation: Observation, key: jax.Array) -> tuple[jax.Array, Action]:
+        belief = believed(parameters, belief, observation)
+        return belief, Action(jnp.argmin(expected_loss(parameters, belief)).astype(jnp.int32), temperature_move(observation))
+
+    return Controller(lambda: jnp.tile(jnp.asarray(PRIOR, jnp.float32) / hypotheses, (hypotheses, 1)), act)
+
+
+def believed(parameters: Filter, belief: jax.Array, observation: Observation) -> jax.Array:
+    """The belief (H, N) after the move that led to this window, and the window."""
+    moved = shifted(belief, observation.flow_move)
+    jumped = belief.sum(axis=1, keepdims=True) * jnp.asarray(PRIOR, jnp.float32)
+    predicted = parameters.transition.T @ ((1.0 - parameters.hazard) * moved + parameters.hazard * jumped)
+    posterior = predicted * parameters.evidence[:, code(observation.shares, observation.named)]
+    return posterior / posterior.sum()
+
+
+def expected_loss(parameters: Filter, belief: jax.Array) -> jax.Array:
+    """Of each of the five moves (5), in percent of flow error."""
+    moves = jnp.asarray(FLOW_MOVES)
+    miss = jnp.abs(GRID + moves[:, None] - BEST_FLOW)
+    return (miss + parameters.outside_cost * (miss > 10.0)) @ belief.sum(axis=0) + parameters.move_cost * jnp.abs(moves)
+
+
+def shifted(belief: jax.Array, move: jax.Array) -> jax.Array:
+    """The belief (H, N) moved by `move` percent, linear between grid points; what would leave the grid stays on its last point."""
+    whole = jnp.floor(move / SPACING)
+    fraction = move / SPACING - whole
+    source = jnp.arange(len(GRID)) - whole.astype(jnp.int32)
+
+    def at(index):
+        return jnp.where((index >= 0) & (index < len(GRID)), belief[:, jnp.clip(index, 0, len(GRID) - 1)], 0.0)
+
+    moved = (1.0 - fraction) * at(source) + fraction * at(source - 1)
+    last = jnp.arange(len(GRID)) == jnp.where(move > 0, len(GRID) - 1, 0)
+    return moved + last * (belief.sum(axis=1) - moved.sum(axis=1))[:, None]
+
+
+def code(shares: jax.Array, named: jax.Array) -> jax.Array:
+    """The window as one of CODES numbers: its class, and within it one of LEVELS of s = log (p_2 + f) / (p_0 + f), which says where in the class the flow is."""
+    s = jnp.log((shares[..., 2] + FAINTEST) / (shares[..., 0] + FAINTEST)) / np.log((1 + FAINTEST) / FAINTEST)
+    within = jnp.where(named == UNDER, s + 1.0, jnp.where(named == GOOD, (s + 0.8) / 1.6, s))
+    return (named * LEVELS + jnp.clip(jnp.floor(within * LEVELS), 0, LEVELS - 1)).astype(jnp.int32)
+
+
+def class_evidence(accuracy: float) -> np.ndarray:
+    """(1, CODES, N): the class is right with this probability and one of the others otherwise, wherever the flow is; the shares say nothing more."""
+    right = np.arange(CODES)[:, None] // LEVELS == np.asarray(flow_class(GRID))
+    return np.where(right, accuracy, (1.0 - accuracy) / (CLASSES - 1))[None] / LEVELS
+
+
+def recorded_evidence(table: WindowTable, *, look: float, looks: int, floor: float, smoothing: float) -> np.ndarray:
+    """(looks, CODES, N): frequencies of the codes by flow, in hypothesis j seen as if the flow were q exp(look z_j), z_j the middles of `looks` equal parts of N(0, 1).
+
+    look: relative width that a segment adds to its beads, one deviation; floor: share of windows that may show anything; smoothing over flow in percent, one
+    deviation, at least half a bin.
+    """
+    edges = np.asarray(table.flow_edges, float)
+    centre, width = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
+    counts = np.zeros((len(centre), CODES))
+    np.add.at(counts, (table.flow_bin, np.asarray(code(jnp.asarray(table.shares), jnp.asarray(table.named)))), 1.0)
+    counts *= (width / counts.sum(axis=1))[:, None]  # as if every percent of flow had been recorded alike
+    z = scipy.special.ndtri((np.arange(looks) + 0.5) / looks)
+    seen = GRID * np.exp(look * z)[:, None]
+    weight = np.exp(-0.5 * ((seen[..., None] - centre) / np.maximum(smoothing, width / 2)) ** 2)
+    shown = weight @ counts
+    return np.swapaxes((1.0 - floor) * shown / shown.sum(axis=2, keepdims=True) + floor / CODES, 1, 2)
+
+
+def robust_filter(table: WindowTable, *, accuracy: float, looks: int, look: float, floor: float, smoothing: float, segment: float, switch: float,
+                  hazard: float, move_cost: float, outside_cost: float) -> Filter:  # fmt: skip
+    """The filter for both simulators: hypothesis 0 errs anywhere (`accuracy`), 1 .. looks as recorded, each the look of a segment that lasts `segment` decisions.
+
+    switch: probability a decision of going over from erring anywhere to erring as recorded, or back.
+    """
+    evidence = np.concatenate(
+        [class_evidence(accuracy), recorded_evidence(table, look=look, looks=looks, floor=floor, smoothing=smoothing)]
+    )
+    transition = np.zeros((looks + 1, looks + 1))
+    transition[0, 0], transition[0, 1:] = 1.0 - switch, switch / looks
+    transition[1:, 0] = switch
+    transition[1:, 1:] = (1.0 - switch) * ((1.0 - 1.0 / segment) * np.eye(looks) + 1.0 / segment / looks)
+    return Filter(jnp.asarray(evidence, jnp.float32), jnp.asarray(transition, jnp.float32), hazard, move_cost, outside_cost)
+
+
+def class_filter(*, accuracy: float, hazard: float, move_cost: float, outside_cost: float) -> Filter:
+    """The filter of the paper's simulator: exact with hazard 0, and with a leak otherwise."""
+    return Filter(jnp.asarray(class_evidence(accuracy), jnp.float32), jnp.ones((1, 1)), hazard, move_cost, outside_cost)

@@ -1,0 +1,273 @@
+"""Our agent: deep Q-learning on a belief. The Bayes filter of bayes.py turns windows and moves into what is known of the flow, so that a small network meets a problem
+that is nearly Markov. It starts from the value that the belief would have were the flow seen from the next step on, and double Q-learning in disturbed episodes adds
+what that leaves out: hesitation while moves are cheap to regret, haste after a clog, and distrust of the filter where the machine is none of its hypotheses.
+
+Nothing tells the agent the classifier's accuracy, the actuator's gain or the setpoint: accuracies are hypotheses of the filter, and moves count with several gains.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.tree_util import Partial
+
+from pipeline.setpoint import bayes
+from pipeline.setpoint.agent import ACTIONS, TEMPERATURE_SCALE, Learner, Setting, Sight, World, double, greedy, phase
+from pipeline.setpoint.recorded import WindowTable, recorded_windows
+from pipeline.setpoint.reward import BEST_FLOW, BEST_TEMPERATURE, PHASES, reward
+from pipeline.setpoint.simulator import (
+    DELTA,
+    FLOW_LIMITS,
+    FLOW_MOVES,
+    GOOD,
+    LAMBDA,
+    STAND,
+    TEMPERATURE_LIMITS,
+    TEMPERATURE_MOVES,
+    Conditions,
+    Observation,
+    State,
+    Windows,
+    flow_class,
+    paper_windows,
+    rollout,
+)
+
+SINGLE = (60.0, 150.0)  # percent of flow between which the network sees every point of the grid; outside it sees groups of GROUP
+GROUP = 4
+VALIDATION = 1024  # episodes: the mean cost of a step to about 1 %
+AHEAD = 40  # steps after which a heater of (6) has 1e-4 of its way left
+
+
+class Belief(NamedTuple):
+    """filter: of bayes.py; gains (g,) and their weights (g,): true by commanded move, drawn anew at each move; values (5, N): of each flow action
+    were the flow seen, under the discount gamma."""
+
+    filter: bayes.Filter
+    gains: jax.Array
+    weights: jax.Array
+    values: jax.Array
+    gamma: float
+
+
+class Costs(NamedTuple):
+    """Of a step: |q - 100 %| / scale, `outside` where the class is not good, and `move` for every percent that the setpoint moved; in percent of flow where not bare."""
+
+    scale: float
+    outside: float
+    move: float
+
+
+def flow_reward(costs: Costs, flow: jax.Array, move: jax.Array) -> jax.Array:
+    """- |q - q*| / scale - outside [class not good] - move cost |a|: a median is sought where (14) seeks a mode, so far flows that are in doubt weigh as much as near ones."""
+    return -jnp.abs(flow - BEST_FLOW) / costs.scale - costs.outside * (flow_class(flow) != GOOD) - costs.move * jnp.abs(move)
+
+
+def rewards(costs: Costs, state: State) -> jax.Array:
+    """(2,) for the heads: the flow's and the temperature's. Neither moves the other, so neither is blamed for it."""
+    return jnp.stack([flow_reward(costs, state.flow, state.flow_move), temperature_reward(state.temperature)])
+
+
+def temperature_reward(temperature: jax.Array) -> jax.Array:
+    """The third ellipse (14) cut along q*."""
+    a, b = PHASES[-1]
+    return reward(BEST_FLOW, temperature, a=a, b=b)
+
+
+def seen_values(costs: Costs, gamma: float) -> np.ndarray:
+    """Q (5, N) were the flow seen: Q(a, q) = r(q + a, a) + gamma max_a' Q(a', q + a), by value iteration on the filter's grid."""
+    moves = np.array(FLOW_MOVES)[:, None]
+    after = np.clip(np.arange(len(bayes.GRID)) + (moves / bayes.SPACING).astype(int), 0, len(bayes.GRID) - 1)
+    r = np.asarray(flow_reward(costs, jnp.asarray(bayes.GRID)[after], jnp.asarray(moves)), float)
+    Q = np.zeros(after.shape)
+    while True:
+        better = r + gamma * Q.max(axis=0)[after]
+        if np.abs(better - Q).max() < 1e-6:
+            return better
+        Q = better
+
+
+def _pooling() -> np.ndarray:
+    """(N, pools) of zeros and ones: which points of the grid the network sees together."""
+    single = (bayes.GRID >= SINGLE[0]) & (bayes.GRID <= SINGLE[1])
+    first = np.r_[True, single[1:] | single[:-1] | (np.arange(1, len(single)) % GROUP == 0)]
+    return np.eye(first.sum())[np.cumsum(first) - 1]
+
+
+POOLING = _pooling()
+
+
+def updated(of: Belief, belief: jax.Array, observation: Observation) -> jax.Array:
+    """The belief (H, N) after the executed move, by each gain in its weight, and the window."""
+    moved = jax.vmap(bayes.shifted, (None, 0))(belief, of.gains * observation.flow_move)
+    return bayes.believed(
+        of.filter, jnp.tensordot(of.weights, moved, 1), observation._replace(flow_move=jnp.zeros_like(observation.flow_move))
+    )
+
+
+def slower(gamma: float) -> float:
+    """The temperature's discount a step, gamma^(1/lambda): from one of its actions to the next as much is lost as from one action of the flow to the next."""
+    return gamma ** (1 / LAMBDA)
+
+
+def standing_values(observation: Observation, gamma: float) -> jax.Array:
+    """(5,) of each temperature action were the target to stand thereafter: sum over k of gamma^(k-1) r(u_k), with u_k - target = (1 - 1/delta)^k (u_hat - target) by (6).
+
+    Where lambda's clock heeds no action, each is worth what standing is.
+    """
+    heeded = observation.step % LAMBDA == 0
+    target = jnp.clip(observation.target + jnp.where(heeded, jnp.asarray(TEMPERATURE_MOVES), 0.0), *TEMPERATURE_LIMITS)
+    k = jnp.arange(1, AHEAD + 1)[:, None]
+    u = target + (1 - 1 / DELTA) ** k * (observation.temperature - target)
+    return (gamma ** (k - 1) * temperature_reward(u)).sum(axis=0) + gamma**AHEAD / (1 - gamma) * temperature_reward(target)
+
+
+def belief_sight(of: Belief) -> Sight:
+    """x = [values of the flow's actions (5), pooled belief, hypotheses (H), values of the temperature's actions (5), u_hat, u_bar, clock, heeded]."""
+    hypotheses = of.filter.evidence.shape[0]
+    pooling, start = jnp.asarray(POOLING, jnp.float32), jnp.tile(jnp.asarray(bayes.PRIOR, jnp.float32) / hypotheses, (hypotheses, 1))
+
+    def see(network, belief, observation):
+        belief = updated(of, belief, observation)
+        flow, clock = belief.sum(axis=0), observation.step % LAMBDA
+        temperatures = (jnp.stack([observation.temperature, observation.target]) - BEST_TEMPERATURE) / TEMPERATURE_SCALE
+        rest = [standing_values(observation, slower(of.gamma)), temperatures, jnp.stack([clock / LAMBDA, clock == 0])]
+        return belief, jnp.concatenate([of.values @ flow, flow @ pooling, belief.sum(axis=1), *rest])
+
+    return Sight(lambda: start, see)
+
+
+class Correction(eqx.Module):
+    """What is added to the values of five actions: a common part and a part of each with mean zero (dueling: Wang and others 2016), both zero before training."""
+
+    hidden: tuple[eqx.nn.Linear, ...]
+    last: eqx.nn.Linear
+
+    def __init__(self, sizes: tuple[int, ...], key: jax.Array):
+        keys = jax.random.split(key, len(sizes))
+        self.hidden = tuple(eqx.nn.Linear(m, n, key=k) for m, n, k in zip(sizes[:-1], sizes[1:], keys[:-1], strict=True))
+        self.last = jax.tree.map(jnp.zeros_like, eqx.nn.Linear(sizes[-1], ACTIONS + 1, key=keys[-1]))
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        for layer in self.hidden:
+            x = jax.nn.relu(layer(x))
+        common, *_ = out = self.last(x)
+        return common + out[1:] - out[1:].mean()
+
+
+class BeliefNetwork(eqx.Module):
+    """Q (2, 5): of each head the values that it starts from and their correction; the temperature's sees temperatures and clock alone."""
+
+    flow: Correction
+    temperature: Correction
+
+    def __init__(self, hypotheses: int, key: jax.Array):
+        keys = jax.random.split(key, 2)
+        self.flow = Correction((ACTIONS + POOLING.shape[1] + hypotheses, 128, 64), keys[0])
+        self.temperature = Correction((ACTIONS + 4, 32), keys[1])
+
+    def __call__(self, x: jax.Array) -> jax.Array:
+        known, rest = x[: -ACTIONS - 4], x[-ACTIONS - 4 :]
+        value, worth = known[:ACTIONS], rest[:ACTIONS]
+        heeded = rest[-1] > 0
+        warmer = self.temperature(rest)
+        Q = value + self.flow(known.at[:ACTIONS].add(-value.max()))
+        return jnp.stack([Q, worth + jnp.where(heeded, warmer, warmer[STAND])])  # what is not heeded is standing
+
+
+# ---- training
+
+
+class Troubles(NamedTuple):
+    """What training episodes meet, each drawn uniformly: the share of episodes on recorded windows (the rest on the paper's) and how long a segment may last; from which
+    accuracy, gain and clog up to 1, clogs in a share of the episodes and at any step; drift a step up to +- this."""
+
+    recorded_share: float
+    longest_segment: float
+    accuracy: float
+    gain: float
+    clog: float
+    clog_share: float
+    drift: float
+
+
+def paper_or_recorded(table: WindowTable) -> Windows:
+    """The paper's windows where a segment lasts no time (persistence 0), recorded ones otherwise: one source for a world of both."""
+    paper, recorded = paper_windows(), recorded_windows(table)
+
+    def draw(arrays, conditions, flow, segment, u):
+        recorded_now = conditions.persistence > 0
+        both = recorded.draw(arrays, conditions, flow, segment, u), paper.draw((), conditions, flow, segment, u)
+        return tuple(jnp.where(recorded_now, *pair) for pair in zip(*both, strict=True))
+
+    return Windows(draw, recorded.table)
+
+
+def troubled(troubles: Troubles, length: int, key: jax.Array) -> Conditions:
+    """Conditions of one episode; starts are uniform in the logarithm of the flow, as errors of extrusion are ratios."""
+    u = jax.random.uniform(key, (10,))
+    low, high = np.log(FLOW_LIMITS)
+    return Conditions(
+        flow=jnp.exp(low + (high - low) * u[0]),
+        temperature=TEMPERATURE_LIMITS[0] + (TEMPERATURE_LIMITS[1] - TEMPERATURE_LIMITS[0]) * u[1],
+        accuracy=troubles.accuracy + (1 - troubles.accuracy) * u[2],
+        persistence=jnp.where(u[3] < troubles.recorded_share, troubles.longest_segment ** u[4], 0.0),
+        gain=troubles.gain + (1 - troubles.gain) * u[5],
+        clog=troubles.clog + (1 - troubles.clog) * u[6],
+        clog_step=jnp.where(u[7] < troubles.clog_share, jnp.floor(length * u[8]), -1.0),
+        drift=troubles.drift * (2 * u[9] - 1),
+        jump_rate=jnp.zeros(()),
+        jump_size=jnp.zeros(()),
+    )
+
+
+class Trained(NamedTuple):
+    """The network kept; judged: mean cost-less-reward a step of validation episodes before training and after each round, the best of which (`kept`) it is; rewards of
+    each training step."""
+
+    network: BeliefNetwork
+    judged: tuple[float, ...]
+    kept: int
+    rewards: jax.Array
+
+
+def train(
+    key: jax.Array, of: Belief, table: WindowTable, *, costs: Costs, troubles: Troubles, setting: Setting, rate: float, updates: int, rounds: int, explore: float,
+    least: float, on_step=None,
+) -> Trained:  # fmt: skip
+    """Double Q-learning in troubled episodes on the paper's windows and on recorded ones, Adam with a rate that falls by a cosine to zero over all rounds.
+
+    After each of the rounds the network is judged on VALIDATION episodes drawn as the training's are, and the best is kept: what it started from, if nothing was better.
+    on_step(round, network, judged) is called after each.
+    """
+    k_network, k_judge, key = jax.random.split(key, 3)
+    sight, world = belief_sight(of), World(paper_or_recorded(table), Partial(troubled, troubles, setting.episode), Partial(rewards, costs))
+    network, optimiser = (
+        BeliefNetwork(of.filter.evidence.shape[0], k_network),
+        optax.adam(optax.cosine_decay_schedule(rate, rounds * updates)),
+    )
+    learner = Learner(network, network, optimiser.init(network))
+    episodes, controller = jax.vmap(world.conditions)(jax.random.split(k_judge, VALIDATION)), greedy(sight)
+
+    def judge(network):
+        seen = rollout(controller, network, world.windows, episodes, k_judge, steps=setting.episode)
+        moves = jnp.asarray(FLOW_MOVES)[seen.action.flow]
+        return float(flow_reward(costs, seen.flow[:, 1:], moves).mean() + temperature_reward(seen.temperature[:, 1:]).mean())
+
+    setting = setting._replace(gamma=jnp.array([setting.gamma, slower(setting.gamma)]))
+    networks, judged, paid = [network], [judge(network)], []
+    for i in range(rounds):
+        learner, gained = phase(
+            learner, jax.random.fold_in(key, i), sight=sight, world=world, optimiser=optimiser, bootstrap=double, setting=setting, updates=updates,
+            epsilon=(explore, least),
+        )  # fmt: skip
+        networks.append(learner.network)
+        judged.append(judge(learner.network))
+        paid.append(gained)
+        if on_step is not None:
+            on_step(i + 1, learner.network, judged[-1])
+    kept = int(np.argmax(judged))
+    return Trained(networks[kept], tuple(judged), kept, jnp.concatenate(paid))

@@ -1,0 +1,228 @@
+"""From the frames of a window to a setpoint that may be sent: hold with a reason, limits, and the wait and window that measurements ask for."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.setpoint.calibration import hard_shares, window_probabilities
+
+CLASSES = ("under", "good", "over")
+REASONS = (
+    "acts",
+    "too few valid frames",
+    "out of distribution",
+    "tip moved",
+    "the classes cannot be told apart",
+    "the action is not a number",
+)
+ACTS, FEW, FOREIGN, TIP, AMBIGUOUS, NO_NUMBER = range(6)
+
+
+class Window(NamedTuple):
+    """What E windows of frames say. `reason` indexes REASONS: 0 acts, all else holds.
+
+    p (E, 3) soft shares, counts of which the paper makes its shares: shares (E, 3) and scaled (E, 3) of (4), label (E,) the class of p, members (E, 3) the conformal
+    set, score (E,) the median out-of-distribution score, valid (E,) and used (E,) the frames that were valid and the frames that count, reason (E,).
+    Where no frame counts, p and shares are 1/3 each and the score is NaN.
+    """
+
+    p: np.ndarray
+    shares: np.ndarray
+    scaled: np.ndarray
+    label: np.ndarray
+    members: np.ndarray
+    score: np.ndarray
+    valid: np.ndarray
+    used: np.ndarray
+    reason: np.ndarray
+
+
+def judge_window(
+    probabilities: np.ndarray,
+    valid: np.ndarray,
+    scores: np.ndarray,
+    tip_moved: np.ndarray,
+    *,
+    least_frames: int,
+    correlation: float,
+    foreign_above: float,
+    conformal_level: float,
+) -> Window:
+    """E windows of W frames each: class probabilities (E, W, 3), valid (E, W), out-of-distribution scores (E, W), tip moved (E,) -> what they say together.
+
+    A frame counts when its key area is valid, its probabilities are a distribution and its score is at most `foreign_above`. Of the m that count
+        p = softmax( sum_i log p_i / (1 + (m - 1) correlation) )        frames of one segment repeat each other (design effect; Kish 1965)
+        w_c = #{i: argmax p_i = c},  p = w / m,  p-hat = p / max p       Li and Pattinson 2025, eq. 1-4
+        members = {c: p_c >= conformal_level}                            split conformal set (Sadinle, Lei, Wasserman 2019)
+    Held: fewer than `least_frames` count (by what cost the most of them), the tip has moved, or the set is no single class.
+    """
+    P, valid, scores = np.asarray(probabilities, float), np.asarray(valid, bool), np.asarray(scores, float)
+    if P.ndim != 3 or P.shape[2] != 3 or valid.shape != P.shape[:2] or scores.shape != P.shape[:2] or np.shape(tip_moved) != P.shape[:1]:
+        raise ValueError(
+            "judge_window: expected probabilities (E, W, 3), valid and scores (E, W), tip_moved (E,), found "
+            f"{P.shape}, {valid.shape}, {scores.shape}, {np.shape(tip_moved)}; give one row a window"
+        )
+    if least_frames < 1:
+        raise ValueError(f"judge_window: expected least_frames of at least 1, found {least_frames}; an empty window says nothing")
+    P = np.where(np.isfinite(P) & (np.abs(P) <= 2), P, -1.0)
+    seen = valid & (P >= 0).all(axis=2) & (np.abs(P.sum(axis=2) - 1) < 1e-3)
+    known = seen & (scores <= foreign_above)
+    m = known.sum(axis=1)
+    logs = np.log(np.clip(P, 1e-6, 1.0))
+    p, shares = window_probabilities(logs, known, correlation), hard_shares(logs, known)
+    members = p >= conformal_level
+    few = np.where(seen.sum(axis=1) >= least_frames, FOREIGN, FEW)
+    reason = np.where(members.sum(axis=1) != 1, AMBIGUOUS, ACTS)
+    reason = np.where(tip_moved, TIP, np.where(m < least_frames, few, reason))
+    return Window(
+        p,
+        shares,
+        shares / shares.max(axis=1, keepdims=True),
+        p.argmax(axis=1),
+        members,
+        _median(scores, seen),
+        valid.sum(axis=1),
+        m,
+        reason,
+    )
+
+
+def _median(scores: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """The median (the upper one of two) of each row over what was seen, NaN where nothing was. A missing score is infinite: nothing vouches for that frame."""
+    ordered = np.sort(np.where(seen & ~np.isnan(scores), scores, np.inf), axis=1)
+    n = seen.sum(axis=1)
+    ordered = np.concatenate([ordered, np.full((len(n), 1), np.nan)], axis=1)
+    return ordered[np.arange(len(n)), np.where(n > 0, n // 2, -1)]
+
+
+class Limits(NamedTuple):
+    """Of (flow in percent, target temperature in °C), each (2,): the box, the largest change of one action and the travel allowed in any 60 s."""
+
+    low: np.ndarray
+    high: np.ndarray
+    per_action: np.ndarray
+    per_minute: np.ndarray
+
+
+class Setpoints(NamedTuple):
+    """Setpoints as sent, value (E, 2); the moves of the last minute, times (E, H) in s and moves (E, H, 2); `clipped` (E, 4) counts how often the size of one action,
+    the travel of a minute or the box cut a change, and how often it was no number."""
+
+    value: np.ndarray
+    times: np.ndarray
+    moves: np.ndarray
+    clipped: np.ndarray
+
+
+def setpoints(start: np.ndarray, limits: Limits) -> Setpoints:
+    """Setpoints at rest at start (E, 2). Raises ValueError where a start lies outside the box."""
+    start = np.asarray(start, float)
+    outside = ~((start >= limits.low) & (start <= limits.high)).all(axis=1)
+    if outside.any():
+        raise ValueError(
+            f"setpoints: expected a start within {np.asarray(limits.low)} to {np.asarray(limits.high)} (flow in percent, target in °C), "
+            f"found {start[outside][0]}; bring the machine there by hand first"
+        )
+    n = len(start)
+    return Setpoints(start, np.zeros((n, 0)), np.zeros((n, 0, 2)), np.zeros((n, 4), int))
+
+
+def moved(state: Setpoints, change: np.ndarray, time_s: np.ndarray, limits: Limits) -> Setpoints:
+    """The setpoints after the wanted change (E, 2) at time_s (E,), cut to the size of one action, to what is left of the last 60 s' travel, and to the box.
+
+    A change that is no number moves nothing. Every cut is counted.
+    """
+    number = np.isfinite(change).all(axis=1)
+    wanted = np.where(number[:, None], change, 0.0)
+    recent = np.asarray(time_s)[:, None] - state.times < 60.0
+    left = np.maximum(limits.per_minute - (np.abs(state.moves) * recent[:, :, None]).sum(axis=1), 0.0)
+    small = np.clip(wanted, -limits.per_action, limits.per_action)
+    slow = np.clip(small, -left, left)
+    value = np.clip(state.value + slow, limits.low, limits.high)
+    cuts = np.stack(
+        [(small != wanted).any(axis=1), (slow != small).any(axis=1), (value != state.value + slow).any(axis=1), ~number], axis=1
+    )
+    keep = recent.any(axis=0)
+    times = np.concatenate([state.times[:, keep], np.asarray(time_s, float)[:, None]], axis=1)
+    moves = np.concatenate([state.moves[:, keep], (value - state.value)[:, None]], axis=1)
+    return Setpoints(value, times, moves, state.clipped + cuts)
+
+
+class Waits(NamedTuple):
+    """Seconds to the next window after an action that moved the flow, that moved the temperature, that moved nothing."""
+
+    flow_s: float
+    temperature_s: float
+    idle_s: float
+
+
+def wait_after(change: np.ndarray, waits: Waits) -> np.ndarray:
+    """Seconds (E,) to wait after the changes (E, 2) that were really sent: the longest that any of them asks for."""
+    asked = np.where(change != 0, [waits.flow_s, waits.temperature_s], 0.0)
+    return np.maximum(asked.max(axis=1), waits.idle_s)
+
+
+def settling_s(y: np.ndarray, *, at: int, band: float, window: int, sample_time_s: float) -> float:
+    """Seconds from the step at sample `at` until the mean of every later window of y (T,) stays within `band` (units of y) of where the response ends.
+
+    It is the mean of a window that the classifier sees, so that noise counts as a window averages it. The end is the mean of the record's last quarter.
+    Raises ValueError where the record is too short for that: a window's mean still leaves the band in the last quarter.
+    """
+    y, tail = np.asarray(y, float), (len(y) - at) // 4
+    if not np.isfinite(y).all() or at < 0 or tail < window:
+        raise ValueError(
+            f"settling_s: expected at least {4 * window} finite samples after the step, found {int(np.isfinite(y[max(at, 0) :]).sum())}; record for longer"
+        )
+    end = y[-tail:].mean()
+    sums = np.concatenate([[0.0], np.cumsum(y[at:] - end)])
+    outside = np.flatnonzero(np.abs(sums[window:] - sums[:-window]) > band * window)
+    last = outside[-1] if len(outside) else -1
+    if last >= len(y) - at - tail:
+        raise ValueError(
+            f"settling_s: the response has not come to rest within {band:g} in {(len(y) - at) * sample_time_s:g} s; record for longer, or widen the band"
+        )
+    return float((last + 1) * sample_time_s)
+
+
+def autocorrelation(errors: np.ndarray, *, longest: int) -> np.ndarray:
+    """rho (longest,) of the classifier's errors (S, T), a row a segment in the order of its frames, about the mean of all rows; NaN is a frame that was rejected.
+
+    rho_k = mean of e_t e_{t+k} within rows / mean of e_t^2, rho_0 = 1: a segment that is wrong throughout keeps rho high at every lag.
+    """
+    e = np.asarray(errors, float)
+    if e.ndim != 2 or e.shape[1] < longest or np.nanstd(e) == 0 or np.isnan(e).all():
+        raise ValueError(
+            f"autocorrelation: expected errors (segments, frames) of {longest} frames or more that are not all alike, found {e.shape}; "
+            "take longer segments, and flows near the class borders"
+        )
+    seen = np.isfinite(e)
+    e = np.where(seen, e - e[seen].mean(), 0.0)
+    pairs = [(e[:, : e.shape[1] - k] * e[:, k:]).sum() / max((seen[:, : e.shape[1] - k] & seen[:, k:]).sum(), 1) for k in range(longest)]
+    return np.array(pairs) / pairs[0]
+
+
+def effective_frames(rho: np.ndarray) -> np.ndarray:
+    """Independent frames that windows of 1 ... K frames are worth: n_eff(n) = n / (1 + 2 sum_{k<n} (1 - k/n) rho_k), rho (K,) from lag 0 (Bayley, Hammersley 1946)."""
+    n = np.arange(1, len(rho) + 1)
+    tail = np.concatenate([[0.0], rho[1:]])
+    sums, weighted = np.cumsum(tail), np.cumsum(tail * np.arange(len(rho)))
+    return n / np.maximum(1.0 + 2.0 * (sums - weighted / n), 1.0 / n)
+
+
+def window_frames(rho: np.ndarray, *, wait_s: float, frame_rate_hz: float) -> int:
+    """The window that gathers the most evidence a second, argmax over n of n_eff(n) / (wait + n / rate): what a longer one adds no longer pays for its time."""
+    n = np.arange(1, len(rho) + 1)
+    return int(n[np.argmax(effective_frames(rho) / (wait_s + n / frame_rate_hz))])
+
+
+def why(time_s: float, window: Window, i: int, change: np.ndarray) -> str:
+    """One line of the strip "why it acted" for window i: time, what was seen, what was sent or why it was held."""
+    frames = f"{time_s:6.1f} s: {window.valid[i]} frames valid, {window.used[i]} count"
+    if window.reason[i] == ACTS:
+        moves = (
+            ", ".join(f"{name} {c:+g} {unit}" for name, c, unit in zip(("flow", "temperature"), change, ("%", "°C"), strict=True) if c)
+            or "no change"
+        )
+        return f"{frames}, {CLASSES[window.label[i]]} {window.p[i, window.label[i]]:.2f}; {moves}"
+    shares = " ".join(f"{name} {p:.2f}" for name, p in zip(CLASSES, window.p[i], strict=True))
+    return f"{frames}, {shares}, score {window.score[i]:.3g}; held: {REASONS[window.reason[i]]}"

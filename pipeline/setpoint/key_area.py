@@ -1,0 +1,322 @@
+"""Nozzle frame -> 48 x 16 key area along the freshly extruded line, or the reason why there is none: the paper's sweep, and a form that real frames do not fool.
+
+Angles are degrees as the picture is seen, 0 right, 90 down (towards the camera), 270 up (the nozzle). Key areas have rows across the line and columns along it, from
+the tip outward. The paper is Li and Pattinson 2025, section 2.2.1.
+"""
+
+import functools
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+# the paper's geometry in px: crop around the tip, rectangle along and across the line; key area (rows, columns)
+SIDE, LENGTH, HEIGHT, SHAPE = 350, 87, 20, (16, 48)
+SMALLEST = 64
+# ridges are sought in profiles across rays: radii every STRIDE px from START on (nearer, the rim of the nozzle is seen), offsets every STEP px up to REACH
+START, STRIDE, STEP, REACH = 12, 3, 2, 28
+# (half-width of the strip, distance of its flanks, both in steps; weight): the line of an ordinary bead, and a broad bead, which the shading of a part mimics better
+SCALES = ((1, 5, 1.0), (3, 8, 0.6))
+# the line may pass beside the calibrated tip by this many steps
+MISS = 4
+MISSES = STEP * np.arange(-MISS, MISS + 1)
+# the nozzle hides the rays within 60 degrees of 270; the search takes every COARSE of the others, then every degree
+COARSE = 4
+OPEN = np.arange(-30, 211, COARSE)
+# a direction from G-code is trusted to this many degrees: the line bends, and the camera's turn is known to a few
+LEEWAY_DEG = 6
+# what scores within this share of the best belongs to the same line
+NEARLY = 0.1
+
+
+class KeyArea(NamedTuple):
+    """The key area of one frame: image (16, 48) uint8, equalised; zeros where `reason` is not empty.
+
+    angle_deg is the line's direction from the tip, miss_px by how much it passes beside the tip (to the right of who looks along it), score its ridge in gray levels
+    of 8 bits, padded_share the share of the crop that lies outside the frame.
+    """
+
+    image: np.ndarray
+    angle_deg: float
+    miss_px: float
+    score: float
+    padded_share: float
+    reason: str
+
+
+class KeyAreas(NamedTuple):
+    """Those of n frames: images (n, 16, 48) uint8, angle_deg, miss_px, score, padded_share (n,), n reasons, valid (n,) bool."""
+
+    images: np.ndarray
+    angle_deg: np.ndarray
+    miss_px: np.ndarray
+    score: np.ndarray
+    padded_share: np.ndarray
+    reasons: tuple[str, ...]
+    valid: np.ndarray
+
+
+class Crop(NamedTuple):
+    """Gray crop (350, 350) uint8 with the tip at (175, 175); levels (256,) uint8 is its equalisation, padded_share the share of it that lies outside the frame."""
+
+    gray: np.ndarray
+    levels: np.ndarray
+    padded_share: float
+    inside: tuple[int, int, int, int]
+
+
+def crop(frame: np.ndarray, tip: tuple[float, float]) -> Crop:
+    """The square of 350 px around the tip (x, y) in gray; what lies outside the frame repeats its border and is left out of the equalisation.
+
+    frame is gray (h, w) or BGR(A) (h, w, 3 or 4) of uint8 or uint16 (of which the upper 8 bits are used). Raises ValueError for other frames and a tip outside.
+    """
+    _check(frame, tip)
+    h, w = frame.shape[:2]
+    x, y = (round(float(v)) - SIDE // 2 for v in tip)
+    left, right, top, bottom = max(x, 0), min(x + SIDE, w), max(y, 0), min(y + SIDE, h)
+    inside = _gray(frame[top:bottom, left:right])
+    levels = _equalisation(inside)
+    edges = (top - y, y + SIDE - bottom, left - x, x + SIDE - right)
+    gray = cv2.copyMakeBorder(inside, *edges, cv2.BORDER_REPLICATE) if any(edges) else inside
+    return Crop(gray, levels, 1 - inside.size / SIDE**2, (left - x, top - y, right - x, bottom - y))
+
+
+def sweep(crop: Crop) -> np.ndarray:
+    """(360,) mean equalised level of the 87 px from the tip outward at each whole degree; the paper takes the brightest as the fresh line."""
+    samples = crop.levels.take(crop.gray.ravel().take(_rays(), mode="clip"))
+    return samples.sum(axis=0, dtype=np.uint16) / LENGTH  # 87 x 255 fits in 16 bits
+
+
+def published(frame: np.ndarray, tip: tuple[float, float]) -> KeyArea:
+    """The key area as the paper takes it: along the brightest ray, never rejected; its score is the mean level of that ray."""
+    c = crop(frame, tip)
+    rays = sweep(c)
+    angle = int(rays.argmax())
+    return KeyArea(_rectangle(c, angle, 0.0), float(angle), 0.0, float(rays[angle]), c.padded_share, "")
+
+
+def find(frame: np.ndarray, tip: tuple[float, float], *, least_score: float, direction_deg: float | None = None) -> KeyArea:
+    """The key area along the strongest ridge: score = strip - brighter flank, rays on the nozzle left out; rejected below least_score gray levels.
+
+    With direction_deg, known from G-code, only rays within LEEWAY_DEG of it are looked at, those on the nozzle too. Raises ValueError as crop does.
+    """
+    c = crop(frame, tip)
+    angle, miss, score = _ridge(c.gray, direction_deg)
+    outside = _outside(c, angle, miss)
+    reason = ""
+    if score < least_score:
+        reason = f"no fresh line: the best ridge at {angle:.0f} degrees stands {score:.1f} gray levels above its brighter flank, below {least_score:g}"
+    elif outside > 0.5:
+        reason = f"cut by the frame: {outside:.0%} of the rectangle at {angle:.0f} degrees lie outside"
+    image = np.zeros(SHAPE, np.uint8) if reason else _rectangle(c, angle, miss)
+    return KeyArea(image, angle, miss, score, c.padded_share, reason)
+
+
+def find_all(
+    frames: Iterable[np.ndarray], tips: np.ndarray, *, least_score: float, directions_deg: np.ndarray | float | None = None
+) -> KeyAreas:
+    """Key areas of n frames, each with its tip (n, 2) or one for all (2,), and its direction (n,), or one for all, where known: NaN is not known."""
+    frames = list(frames)
+    tips = np.broadcast_to(np.asarray(tips, float), (len(frames), 2))
+    directions = np.broadcast_to(np.nan if directions_deg is None else directions_deg, len(frames))
+    found = [
+        find(frame, tip, least_score=least_score, direction_deg=None if np.isnan(direction) else float(direction))
+        for frame, tip, direction in zip(frames, tips, directions, strict=True)
+    ]
+    images = np.array([k.image for k in found], np.uint8).reshape(-1, *SHAPE)
+    columns = (np.array([getattr(k, name) for k in found]) for name in ("angle_deg", "miss_px", "score", "padded_share"))
+    reasons = tuple(k.reason for k in found)
+    return KeyAreas(images, *columns, reasons, np.array([not r for r in reasons], bool))
+
+
+class Drift(NamedTuple):
+    """Where the nozzle is seen: offset (x, y) in px from the calibrated tip, and how alike it looks there, a correlation of -1..1."""
+
+    offset_px: tuple[int, int]
+    correlation: float
+
+
+def nozzle_template(frame: np.ndarray, tip: tuple[float, float], *, size_px: int) -> np.ndarray:
+    """Gray patch (size, size) uint8 of the nozzle with the tip in the middle of its lower edge, cut from the frame on which the tip was calibrated.
+
+    Raises ValueError where the patch does not lie inside the frame.
+    """
+    _check(frame, tip)
+    left, top = _corner(tip, size_px)
+    if left < 0 or top < 0 or left + size_px > frame.shape[1]:
+        raise ValueError(
+            f"nozzle template: expected {size_px} px above and {size_px // 2} px beside the tip ({tip[0]:g}, {tip[1]:g}) inside the frame "
+            f"of {frame.shape[1]} x {frame.shape[0]} px; take a smaller template"
+        )
+    return _gray(frame[top : top + size_px, left : left + size_px]).copy()
+
+
+def drift(frame: np.ndarray, template: np.ndarray, tip: tuple[float, float], *, reach_px: int) -> Drift:
+    """Where within reach_px of the calibrated tip the nozzle is (normalised cross-correlation): an alarm that the camera moved, never a new calibration."""
+    _check(frame, tip)
+    size = len(template)
+    left, top = _corner(tip, size)
+    rows, columns = (np.clip([v - reach_px, v + size + reach_px], 0, end) for v, end in ((top, frame.shape[0]), (left, frame.shape[1])))
+    if min(rows[1] - rows[0], columns[1] - columns[0]) < size:
+        raise ValueError(
+            f"nozzle drift: expected room for the template of {size} px around the tip ({tip[0]:g}, {tip[1]:g}) but the frame is "
+            f"{frame.shape[1]} x {frame.shape[0]} px; calibrate on frames of this camera"
+        )
+    match = cv2.matchTemplate(_gray(frame[rows[0] : rows[1], columns[0] : columns[1]]), template, cv2.TM_CCOEFF_NORMED)
+    row, column = np.unravel_index(int(match.argmax()), match.shape)
+    return Drift((int(columns[0] + column - left), int(rows[0] + row - top)), float(match[row, column]))
+
+
+def drawn(frame: np.ndarray, tip: tuple[float, float], found: KeyArea) -> np.ndarray:
+    """The crop as (350, 350, 3) uint8 RGB with the tip and the rectangle, green where the key area was accepted, red with the reason where not, for a report."""
+    picture = cv2.cvtColor(crop(frame, tip).gray, cv2.COLOR_GRAY2RGB)
+    colour = (220, 40, 40) if found.reason else (40, 200, 80)
+    at = np.rint(corners(found.angle_deg, found.miss_px) + SIDE // 2).astype(np.int32)
+    cv2.polylines(picture, [at], True, colour, 1, cv2.LINE_AA)
+    cv2.drawMarker(picture, (SIDE // 2, SIDE // 2), colour, cv2.MARKER_CROSS, 9, 1)
+    words = found.reason.partition(":")[0] or "accepted"
+    cv2.putText(picture, f"{words}, {found.score:.1f} gray levels", (8, SIDE - 10), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
+    return picture
+
+
+def _corner(tip: tuple[float, float], size: int) -> tuple[int, int]:
+    """Left and top of the template whose lower edge has the tip in its middle."""
+    return round(float(tip[0])) - size // 2, round(float(tip[1])) - size + 1
+
+
+def _ridge(gray: np.ndarray, direction_deg: float | None) -> tuple[float, float, float]:
+    """(angle in degrees, miss in px, score) of the strongest ridge; without a direction every COARSE degrees, then every degree around the best of them."""
+    small = cv2.resize(gray, None, fx=1 / STEP, fy=1 / STEP, interpolation=cv2.INTER_AREA).ravel()
+    if direction_deg is None:
+        coarse = OPEN[_scores(small, _open_profiles()).max(axis=1).argmax()]
+        angles = np.arange(coarse - COARSE, coarse + COARSE + 1)
+    else:
+        angles = round(direction_deg) + np.arange(-LEEWAY_DEG, LEEWAY_DEG + 1)
+    score = _scores(small, _profiles()[:, angles % 360])
+    best, at = float(score.max()), int(score.argmax()) % score.shape[1]
+    # what is nearly as strong has a say, so that a broad line is taken in its middle; never another line beside it
+    beside = slice(max(at - 2, 0), at + 3)
+    weight = np.maximum(score[:, beside] - (best - NEARLY * abs(best) - 1e-6), 0)
+    weight /= weight.sum()
+    angle, miss = weight.sum(axis=1) @ angles, weight.sum(axis=0) @ MISSES[beside]
+    return float(angle) % 360, float(miss), best
+
+
+def _scores(small: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """(rays, misses) ridges of profiles at `places` (radii, rays, offsets): strip less its brighter flank, in the near or the far half of the ray, whichever is
+    less, as a line stands out all along; the most over the scales."""
+    radii, rays, offsets = places.shape
+    samples = small.take(places.reshape(radii, -1), mode="clip")
+    half = radii // 2
+    mean = np.empty((2, rays * offsets), np.float32)
+    for k, part in enumerate((samples[:half], samples[half:])):
+        np.divide(part.sum(axis=0, dtype=np.uint16), np.float32(len(part)), out=mean[k])
+    near, far = (mean.reshape(-1, offsets) @ _ridge_filters(offsets)).reshape(2, rays, -1)
+    weaker = np.minimum(near, far).reshape(rays, len(SCALES), 2, -1)
+    return np.minimum(weaker[:, :, 0], weaker[:, :, 1]).max(axis=1)
+
+
+@functools.cache
+def _ridge_filters(offsets: int) -> np.ndarray:
+    """(offsets, scales x 2 x misses): strip less left flank, and strip less right flank, for every miss, times the scale's weight."""
+    place = np.arange(offsets) - offsets // 2
+    columns = []
+    for half, away, weight in SCALES:
+        for side in (-away, away):
+            for miss in range(-MISS, MISS + 1):
+                strip, flank = np.abs(place - miss) <= half, np.abs(place - miss - side) <= 1
+                columns.append(weight * (strip / strip.sum() - flank / flank.sum()))
+    return np.array(columns, np.float32).T.copy()
+
+
+@functools.cache
+def _rays() -> np.ndarray:
+    """The gather table of the sweep: (87, 360) places in the crop, from the tip outward."""
+    angle, radius = np.deg2rad(np.arange(360)), np.arange(1, LENGTH + 1)[:, None]
+    column, row = (np.rint(SIDE // 2 + radius * v).astype(np.intp) for v in (np.cos(angle), np.sin(angle)))
+    return row * SIDE + column
+
+
+@functools.cache
+def _profiles() -> np.ndarray:
+    """The gather table of the ridges: (radii, 360, offsets), places in the crop reduced by STEP, at every radius along and offset across each ray."""
+    angle = np.deg2rad(np.arange(360))[:, None]
+    along, across = np.arange(START, LENGTH, STRIDE)[:, None, None], np.arange(-REACH, REACH + 1, STEP)
+    x, y = along * np.cos(angle) - across * np.sin(angle), along * np.sin(angle) + across * np.cos(angle)
+    column, row = (np.rint((SIDE // 2 + v + 0.5) / STEP - 0.5).astype(np.intp) for v in (x, y))
+    return row * (SIDE // STEP) + column
+
+
+@functools.cache
+def _open_profiles() -> np.ndarray:
+    """Those of OPEN at every second radius: enough for a first direction."""
+    return np.ascontiguousarray(_profiles()[::2, OPEN % 360])
+
+
+def _rectangle(c: Crop, angle_deg: float, miss_px: float) -> np.ndarray:
+    """(16, 48) equalised levels of the rectangle s, e -+ g h with g = (s_y - e_y, e_x - s_x) / |.| (1)-(3), 87 x 20 px resized."""
+    rows, columns = SHAPE
+    fine = 2 * columns  # 0.9 px along: one sample a column would skip pixels
+    a = np.deg2rad(angle_deg)
+    along, across = LENGTH / fine * np.array([np.cos(a), np.sin(a)]), HEIGHT / rows * np.array([-np.sin(a), np.cos(a)])
+    origin = SIDE // 2 + 0.5 * along + (miss_px / HEIGHT * rows - (rows - 1) / 2) * across
+    matrix = np.column_stack([along, across, origin])
+    patch = cv2.warpAffine(c.gray, matrix, (fine, rows), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE)
+    return cv2.LUT(cv2.resize(patch, (columns, rows), interpolation=cv2.INTER_AREA), c.levels)
+
+
+def corners(angle_deg: float, miss_px: float) -> np.ndarray:
+    """(4, 2) vertices v1 v2 v4 v3 of the rectangle (2)-(3) about the tip, in px, in drawing order."""
+    a = np.deg2rad(angle_deg)
+    ray, g = np.array([np.cos(a), np.sin(a)]), np.array([-np.sin(a), np.cos(a)])
+    low, high = (miss_px - HEIGHT / 2) * g, (miss_px + HEIGHT / 2) * g
+    return np.array([low, high, high + LENGTH * ray, low + LENGTH * ray])
+
+
+def _equalisation(gray: np.ndarray) -> np.ndarray:
+    """(256,) uint8: the table of cv2.equalizeHist for this picture."""
+    counts = cv2.calcHist([gray], [0], None, [256], [0, 256]).ravel()
+    first = int((counts > 0).argmax())
+    if counts[first] == gray.size:
+        return np.full(256, first, np.uint8)
+    total = np.cumsum(counts) - counts[first]
+    scale = np.float32(255.0 / (gray.size - counts[first]))
+    return np.clip(np.rint(total * scale), 0, 255).astype(np.uint8)
+
+
+def _gray(part: np.ndarray) -> np.ndarray:
+    if part.dtype == np.uint16:
+        part = (part >> 8).astype(np.uint8)
+    if part.ndim == 3:
+        return cv2.cvtColor(part, cv2.COLOR_BGR2GRAY if part.shape[2] == 3 else cv2.COLOR_BGRA2GRAY)
+    return np.ascontiguousarray(part)
+
+
+def _check(frame: np.ndarray, tip: tuple[float, float]) -> None:
+    if frame.dtype not in (np.uint8, np.uint16) or not (frame.ndim == 2 or (frame.ndim == 3 and frame.shape[2] in (3, 4))):
+        raise ValueError(
+            f"frame: expected gray (h, w) or BGR(A) (h, w, 3 or 4) of 8 or 16 bits but found {frame.shape} of {frame.dtype}; convert it"
+        )
+    h, w = frame.shape[:2]
+    if min(h, w) < SMALLEST:
+        raise ValueError(f"frame: expected at least {SMALLEST} x {SMALLEST} px but found {w} x {h}; use the camera's full frame")
+    x, y = tip
+    if not (0 <= x < w and 0 <= y < h):
+        raise ValueError(
+            f"nozzle tip: expected x, y inside the frame of {w} x {h} px but found ({x:g}, {y:g}); calibrate it by a click on a frame of this camera"
+        )
+
+
+def _outside(c: Crop, angle_deg: float, miss_px: float) -> float:
+    """Share of the rectangle that lies outside the frame, on a grid of 40 x 40 points."""
+    if not c.padded_share:
+        return 0.0
+    left, top, right, bottom = c.inside
+    vertices = corners(angle_deg, miss_px) + SIDE // 2
+    if (vertices >= (left, top)).all() and (vertices < (right, bottom)).all():
+        return 0.0
+    low, high, high_end, _ = vertices
+    share = (np.arange(40) + 0.5) / 40
+    x, y = (low + share[:, None, None] * (high - low) + share[:, None] * (high_end - high)).reshape(-1, 2).T
+    return 1.0 - float(np.mean((x >= left) & (x < right) & (y >= top) & (y < bottom)))

@@ -1,0 +1,301 @@
+"""The closed loop through pixels: setpoints -> heater and melt -> rendered frames -> key areas -> classifier -> window -> hold or controller -> setpoints."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import cv2
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pipeline.setpoint import deployment, key_area, nozzle_scene
+from pipeline.setpoint.deployment import ACTS, AMBIGUOUS, Limits, Waits, Window
+from pipeline.setpoint.simulator import FLOW_MOVES, LAMBDA, TEMPERATURE_MOVES, Controller, Observation
+
+TEMPLATE_PX, LIKENESS = 60, 0.6  # of the nozzle, for the alarm that the camera moved: what is less alike is not the nozzle elsewhere
+
+# ---- the machine
+
+
+class Machine(NamedTuple):
+    """Heater: first order, heater_s, after heater_delay_s. Melt: melt_s at 210 °C is how long it empties, longer by `softening` per °C below."""
+
+    heater_s: float
+    heater_delay_s: float
+    melt_s: float
+    softening_per_degC: float
+
+
+class Running(NamedTuple):
+    """State of E machines: temperature (E,) °C, stored (E,) the volume already in the melt, in percent of nominal flow times s, and the targets on their way to the
+    heater, oldest first (E, delay)."""
+
+    temperature: np.ndarray
+    stored: np.ndarray
+    coming: np.ndarray
+
+
+def at_rest(machine: Machine, flow: np.ndarray, temperature: np.ndarray, *, tick_s: float) -> Running:
+    """Machines that have long been fed flow (E,) in percent at temperature (E,) in °C."""
+    temperature = np.asarray(temperature, float)
+    delay = round(machine.heater_delay_s / tick_s)
+    return Running(temperature, flow * _melt_s(machine, temperature), np.repeat(temperature[:, None], delay + 1, axis=1))
+
+
+def tick(
+    machine: Machine, state: Running, feed: np.ndarray, target: np.ndarray, running: np.ndarray, *, tick_s: float
+) -> tuple[Running, np.ndarray]:
+    """The next state and the mean flow (E,) out of the nozzle over a tick, for those that run (E,) bool; the others stand still.
+
+    T' = (target(t - delay) - T) / heater_s;   V' = feed - V / tau(T),  flow = V / tau,  tau = melt_s exp(-softening (T - 210)): what is fed leaves, later, and a melt
+    that heats up lets go of what it holds. Both exact for inputs held over the tick.
+    """
+    tau = _melt_s(machine, state.temperature)
+    stored = feed * tau + (state.stored - feed * tau) * np.exp(-tick_s / tau)
+    flow = feed - (stored - state.stored) / tick_s
+    coming = np.concatenate([state.coming[:, 1:], target[:, None]], axis=1)
+    temperature = coming[:, 0] + (state.temperature - coming[:, 0]) * np.exp(-tick_s / machine.heater_s)
+    now = Running(temperature, stored, coming)
+    return Running(*(np.where(running.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(now, state, strict=True))), flow
+
+
+def _melt_s(machine: Machine, temperature: np.ndarray) -> np.ndarray:
+    return machine.melt_s * np.exp(-machine.softening_per_degC * (temperature - 210.0))
+
+
+def step_response(
+    machine: Machine, *, flow: tuple, temperature: tuple, before_s: float, after_s: float, tick_s: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Flow and temperature (T,) of a machine at rest whose flow and target step from the first to the second value: the record to measure the wait from."""
+    state, on = at_rest(machine, np.array([flow[0]]), np.array([temperature[0]]), tick_s=tick_s), np.array([True])
+    flows, temperatures = [], []
+    for k in range(round((before_s + after_s) / tick_s)):
+        late = int(k * tick_s >= before_s - tick_s / 2)
+        state, out = tick(machine, state, np.array([flow[late]]), np.array([temperature[late]]), on, tick_s=tick_s)
+        flows.append(out[0])
+        temperatures.append(state.temperature[0])
+    return np.array(flows), np.array(temperatures)
+
+
+# ---- what befalls it
+
+
+class Disturbances(NamedTuple):
+    """Of E episodes, counted in decisions: the feed is multiplied by clog (E,) from clog_at (E,) on; the camera moves by shift_px (E, 2) at shift_at (E,); for burst_for
+    (E,) decisions from burst_at (E,) the picture is blurred by blur_px (E,) and outshone by glare (E,) gray levels beside the nozzle."""
+
+    clog: np.ndarray
+    clog_at: np.ndarray
+    shift_px: np.ndarray
+    shift_at: np.ndarray
+    blur_px: np.ndarray
+    glare: np.ndarray
+    burst_at: np.ndarray
+    burst_for: np.ndarray
+
+
+def calm(episodes: int) -> Disturbances:
+    """Nothing befalls E episodes; `_replace` what is to."""
+    zero, never = np.zeros(episodes), np.full(episodes, np.iinfo(int).max)
+    return Disturbances(zero + 1, never, np.zeros((episodes, 2)), never, zero, zero, never, zero)
+
+
+def _filmed(frames: np.ndarray, d: Disturbances, i: int, decision: int, tip: np.ndarray) -> np.ndarray:
+    """The frames (n, h, w) of episode i as a disturbed camera gives them."""
+    burst = 0 <= decision - d.burst_at[i] < d.burst_for[i]
+    h, w = frames.shape[1:]
+    if burst and d.blur_px[i] > 0:
+        frames = np.stack([cv2.GaussianBlur(f, (0, 0), d.blur_px[i]) for f in frames])
+    if burst and d.glare[i] > 0:
+        y, x = np.mgrid[:h, :w]
+        spot = d.glare[i] * np.exp(-((x - tip[0] - 30) ** 2 + (y - tip[1] - 15) ** 2) / (2 * 40.0**2))
+        frames = np.clip(frames + spot, 0, 255).astype(np.uint8)
+    if decision >= d.shift_at[i]:
+        by = np.float32([[1, 0, d.shift_px[i, 0]], [0, 1, d.shift_px[i, 1]]])
+        frames = np.stack([cv2.warpAffine(f, by, (w, h), borderMode=cv2.BORDER_REPLICATE) for f in frames])
+    return frames
+
+
+# ---- the loop
+
+
+class Episodes(NamedTuple):
+    """E episodes of D decisions. Truth: flow and temperature (E, D + 1), means over the window that each decision was made on, and over one after the last.
+
+    Per decision (E, D): time_s at the window's end, setpoint and sent (E, D, 2) flow and target before, and the change that was sent, windows (each field (E, D, ...)),
+    segment number; clipped (E, 4) as in deployment.Setpoints; pictures (350, 350, 3) uint8 by (episode, decision), the key area drawn in.
+    """
+
+    flow: np.ndarray
+    temperature: np.ndarray
+    time_s: np.ndarray
+    setpoint: np.ndarray
+    sent: np.ndarray
+    windows: Window
+    segment: np.ndarray
+    clipped: np.ndarray
+    pictures: dict[tuple[int, int], np.ndarray]
+
+
+class Loop(NamedTuple):
+    """How the loop is deployed: frames a window at frame_rate_hz, waits, limits, the rule of the window judge(P, valid, scores, tip_moved) -> Window, the least ridge
+    score of a key area, how far the nozzle may be from where its tip was calibrated, and how long a segment's conditions last on average, in s."""
+
+    frames: int
+    frame_rate_hz: float
+    waits: Waits
+    limits: Limits
+    judge: Callable[..., Window]
+    least_score: float
+    tip_tolerance_px: float
+    segment_s: float
+
+
+def _told(reason: np.ndarray) -> np.ndarray:
+    """Whether the controller hears of a window: of those acted on, and of those that cannot tell the classes apart."""
+    return (reason == ACTS) | (reason == AMBIGUOUS)
+
+
+def _answer(
+    controller: Controller, parameters: Any, memory: Any, shown: Observation, keys: jax.Array, reason: np.ndarray
+) -> tuple[Any, np.ndarray]:
+    """Memory and the change (E, 2) wanted of flow and target; the target's only where lambda's clock allows it, none where the window is held."""
+    shown = Observation(*(jnp.asarray(a, jnp.int32 if a.dtype.kind == "i" else jnp.float32) for a in shown))
+    memory, q, u = _decided(controller, parameters, memory, shown, keys, jnp.asarray(_told(reason)))
+    wanted = np.stack([np.asarray(FLOW_MOVES)[q], np.where(shown.step % LAMBDA == 0, np.asarray(TEMPERATURE_MOVES)[u], 0.0)], axis=1)
+    return memory, np.where((reason == ACTS)[:, None], wanted, 0.0)
+
+
+@eqx.filter_jit
+def _decided(controller: Controller, parameters: Any, memory: Any, shown: Observation, keys: jax.Array, told: jax.Array):
+    """Memory, which stays where nothing was told, and action indices of every episode."""
+    after, action = jax.vmap(controller.act, (None, 0, 0, 0))(parameters, memory, shown, keys)
+    return jax.tree.map(lambda new, old: jnp.where(told.reshape(-1, *[1] * (new.ndim - 1)), new, old), after, memory), *action
+
+
+def run(
+    controller: Controller,
+    parameters: Any,
+    see: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]],
+    start: np.ndarray,
+    machine: Machine,
+    loop: Loop,
+    disturbances: Disturbances,
+    *,
+    decisions: int,
+    rng: np.random.Generator,
+    draw: frozenset[tuple[int, int]] = frozenset(),
+) -> Episodes:
+    """Episodes from the setpoints start (E, 2), at rest there; the first frame of each (episode, decision) in `draw` is kept as a picture.
+
+    see(images (n, 16, 48), temperature (n,)) -> class probabilities (n, 3), out-of-distribution scores (n,).
+
+    A window whose classes cannot be told apart is no reason to act, but it is evidence: the controller is shown it and remembers, and its answer is not sent. Of windows
+    held for another reason it hears nothing. Lambda's clock counts the windows that were acted on, so that a hold does not cost the temperature its action. Each episode
+    draws from its own generator: what it meets does not depend on the others.
+    """
+    E, tick_s = len(start), 1.0 / loop.frame_rate_hz
+    if len(disturbances.clog) != E:
+        raise ValueError(f"pixels.run: expected disturbances of {E} episodes, found {len(disturbances.clog)}; make them by calm({E})")
+    rngs = rng.spawn(E)
+    keys = jax.random.split(jax.random.key(int(rng.integers(2**31))), E)
+    setpoints = deployment.setpoints(start, loop.limits)
+    running = at_rest(machine, *setpoints.value.T, tick_s=tick_s)
+    memory = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (E, *jnp.shape(leaf))), controller.start())
+    time_s, ends, numbers = np.zeros(E), np.zeros(E), np.zeros(E, int)
+    segments: list = [None] * E
+    templates: list = [None] * E
+    pictures: dict[tuple[int, int], np.ndarray] = {}
+    acted, since, change = np.zeros(E, int), np.zeros(E), np.zeros((E, 2))
+    rows = []
+    for decision in range(decisions + 1):
+        feed = setpoints.value[:, 0] * np.where(decision >= disturbances.clog_at, disturbances.clog, 1.0)
+        ticks = np.rint(deployment.wait_after(change, loop.waits) / tick_s).astype(int) * (decision > 0)
+        running, _, _ = _advance(machine, running, feed, setpoints.value[:, 1], ticks, tick_s)
+        running, flow, temperature = _advance(machine, running, feed, setpoints.value[:, 1], np.full(E, loop.frames), tick_s)
+        time_s = time_s + (ticks + loop.frames) * tick_s
+        if decision == decisions:
+            break
+        for i in np.flatnonzero(time_s > ends):
+            segments[i] = _next_segment(segments[i], rngs[i])
+            ends[i] = time_s[i] + rngs[i].exponential(loop.segment_s)
+            numbers[i] += 1
+        seen = _seen(segments, templates, flow, temperature, loop, disturbances, decision, rngs, draw)
+        P, scores = see(seen.images.reshape(-1, *key_area.SHAPE), temperature.ravel())
+        window = loop.judge(P.reshape(E, -1, 3), seen.valid, scores.reshape(E, -1), seen.tip_moved)
+        pictures |= seen.pictures
+        step_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, decision)
+        shown = Observation(window.p, window.label, since, temperature.mean(axis=1), setpoints.value[:, 1], acted)
+        memory, wanted = _answer(controller, parameters, memory, shown, step_keys, window.reason)
+        before, setpoints = setpoints, deployment.moved(setpoints, wanted, time_s, loop.limits)
+        change = setpoints.value - before.value
+        rows.append((flow.mean(axis=1), temperature.mean(axis=1), time_s, before.value, change, window, numbers.copy()))
+        since, acted = np.where(_told(window.reason), 0.0, since) + change[:, 0], acted + (window.reason == ACTS)
+    flows, temperatures, times, values, changes, windows, segment = zip(*rows, strict=True)
+    return Episodes(
+        flow=np.stack([*flows, flow.mean(axis=1)], axis=1), temperature=np.stack([*temperatures, temperature.mean(axis=1)], axis=1),
+        time_s=np.stack(times, axis=1), setpoint=np.stack(values, axis=1), sent=np.stack(changes, axis=1),
+        windows=Window(*(np.stack(field, axis=1) for field in zip(*windows, strict=True))), segment=np.stack(segment, axis=1), clipped=setpoints.clipped, pictures=pictures,
+    )  # fmt: skip
+
+
+def _advance(machine: Machine, state: Running, feed: np.ndarray, target: np.ndarray, ticks: np.ndarray, tick_s: float):
+    """The state after ticks (E,), and the flow and temperature (E, most) of each tick."""
+    flows, temperatures = np.zeros((2, len(feed), ticks.max(initial=0)))
+    for k in range(ticks.max(initial=0)):
+        state, flows[:, k] = tick(machine, state, feed, target, k < ticks, tick_s=tick_s)
+        temperatures[:, k] = state.temperature
+    return state, flows, temperatures
+
+
+def _next_segment(segment, rng: np.random.Generator):
+    """New conditions on the same machine: nozzle, calibrated tip and the plate's brightness stay."""
+    new = nozzle_scene.draw_segment(rng)
+    if segment is None:
+        return new
+    brighter = float(segment.ground.mean()) - float(new.ground.mean())
+    ground = np.clip(new.ground + brighter, 0, 255).astype(np.uint8)
+    return new._replace(nozzle=segment.nozzle, mask=segment.mask, tip=segment.tip, ground=ground)
+
+
+class _Seen(NamedTuple):
+    """Key areas (E, W, 16, 48) uint8, whether they are valid (E, W), whether the nozzle is elsewhere than where it was calibrated (E,), and the pictures asked for."""
+
+    images: np.ndarray
+    valid: np.ndarray
+    tip_moved: np.ndarray
+    pictures: dict[tuple[int, int], np.ndarray]
+
+
+def _seen(
+    segments: list, templates: list, flow, temperature, loop: Loop, d: Disturbances, decision: int, rngs: list, draw: frozenset
+) -> _Seen:
+    """What the cameras show of flow and temperature (E, W); `templates` of the nozzles are cut from the first frames, where the tip was calibrated."""
+    images, valid, moved, pictures = [], [], [], {}
+    for i, segment in enumerate(segments):
+        made = nozzle_scene.render(segment, flow[i], temperature[i], rngs[i])
+        frames, tip = _filmed(made.frames, d, i, decision, segment.tip), segment.tip
+        found = key_area.find_all(frames, tip, least_score=loop.least_score, directions_deg=segment.direction_deg)
+        if templates[i] is None:
+            templates[i] = key_area.nozzle_template(made.frames[0], tip, size_px=TEMPLATE_PX)
+        nozzle = key_area.drift(frames[0], templates[i], tip, reach_px=TEMPLATE_PX // 2)
+        images.append(found.images)
+        valid.append(found.valid)
+        moved.append(np.hypot(*nozzle.offset_px) > loop.tip_tolerance_px and nozzle.correlation >= LIKENESS)
+        if (i, decision) in draw:
+            one = key_area.find(frames[0], tip, least_score=loop.least_score, direction_deg=segment.direction_deg)
+            pictures[i, decision] = key_area.drawn(frames[0], tip, one)
+    return _Seen(np.stack(images), np.stack(valid), np.array(moved), pictures)
+
+
+def settled_since(episodes: Episodes) -> np.ndarray:
+    """The decision (E,) from which each episode is inside 90-110 % and 210 +- 5 °C, by the true flow, to its end; D + 1 where it ends outside."""
+    inside = (np.abs(episodes.flow - 100.0) <= 10.0 + 1e-3) & (np.abs(episodes.temperature - 210.0) <= 5.0 + 1e-3)
+    out = ~inside[:, ::-1]
+    return np.where(out.any(axis=1), inside.shape[1] - out.argmax(axis=1), 0)
+
+
+def settled(episodes: Episodes, *, by: int) -> np.ndarray:
+    """Whether each episode (E,) is inside from some decision <= by to its end."""
+    return settled_since(episodes) <= by

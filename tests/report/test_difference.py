@@ -1,0 +1,96 @@
+"""This run against the accepted one: equal runs differ in nothing, one change is named where it is, and a figure moves where its bands part."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from pipeline import artifacts, cli
+from stages.report import main
+from tests.report import made
+from tests.report.test_pages import INDEX, Page, change
+
+DEPOSITION = Path("reports/deposition.html")
+SCORES = {
+    "on_off": (100.0, None, 60.0),
+    "priority": (12.0, 11.0, 9.0),
+    "superposition": (8.0, 7.0, 4.0),
+    "basis": (2.0, 2.5, 1.0),
+    "ilc": (1.5, None, 0.5),
+}
+
+
+def compose(error):
+    """The deposition loop's table and metrics with another error of the composer in use."""
+    made.deposition(SCORES | {"basis": (error, 2.5, 1.0)})
+    artifacts.write_metrics("compose_parts", {"square": {"A": {"chosen": "basis", "basis": {"rms_percent_of_on_off": error}}}})
+
+
+@pytest.fixture
+def accepted(project, monkeypatch):
+    compose(2.0)
+    main()
+    monkeypatch.setattr(sys, "argv", ["beadline", "accept"])
+    cli.main()
+    main()
+    return project
+
+
+def test_two_equal_runs_give_an_empty_difference(accepted):
+    text = Page(INDEX).text
+    assert "Nothing changed; no figure moved." in text
+    place = text[
+        text.index("What changed and what moved") if "What changed and what moved" in text else text.index("Difference against the last") :
+    ]
+    assert "Inputs unchanged Parameters unchanged Code unchanged Artifacts 0 changed" in place
+    assert "0 of 1 flow errors moved" in place and "unchanged" in Page(DEPOSITION).text
+
+
+def test_a_changed_parameter_code_file_and_artifact_are_each_named(accepted):
+    Path("params.yaml").write_text(Path("params.yaml").read_text().replace("gap_percent: 5.0", "gap_percent: 6.0", 1))
+    Path("stages/code.py").write_text("2\n")
+    artifacts.write_json("datasets/tune_weights/weights.json", {"practical": {"q": [1.0, 3.0], "r": [0.1, 0.2]}})
+    main()
+    text = Page(INDEX).text
+    assert "report.gap_percent 5.0 → 6.0" in text
+    assert "Code changed stages/code.py changed" in text
+    assert "1 changed, " in text and "datasets/tune_weights/weights.json changed" in text
+    assert "No figure moved beyond its noise." in text
+
+
+def test_a_figure_moves_where_its_band_leaves_the_accepted_one_and_only_there(accepted):
+    change(
+        "evaluate_temperature",
+        controllers__window__overshoot_degC=made.figure(0.85, 0.7, 1.0),
+        controllers__window__disk=made.figure(0.5, 0.45, 0.55),
+    )
+    main()
+    text = Page(INDEX).text
+    # accepted overshoot 0.3 to 0.9: the bands overlap; disk 0.6 to 0.7: they do not
+    assert "1 of 9 figures moved beyond their noise. Worse: disk margin." in text
+
+
+def test_the_worst_case_is_held_against_the_accepted_band_not_against_a_bare_number(accepted):
+    # the accepted page showed 10.001 to 10.003; half as much moves, and by how much is said
+    artifacts.write_table("datasets/evaluate_temperature/scorecard.parquet", made.schemas.SCORECARD, made.scorecard({"window": 5.0}))
+    main()
+    assert "better: worst case over plant spread" in Page(INDEX).text.replace("Better", "better")
+
+
+@pytest.mark.parametrize(
+    ("error", "said", "moved"), [(2.3, "within noise", 0), (3.5, "+1.50 points · worse", 1), (1.0, "−1.00 points · better", 1)]
+)
+def test_a_flow_error_moves_by_more_than_half_a_point_and_stands_on_both_pages(accepted, error, said, moved):
+    compose(error)
+    main()
+    assert said in Page(DEPOSITION).text
+    text = Page(INDEX).text
+    assert f"Deposition: {moved} of 1 flow errors moved." in text
+    assert ("Flow error, square, A" in text) == bool(moved)
+
+
+def test_a_run_whose_pages_are_older_than_its_figures_is_not_accepted(accepted, capsys):
+    change("evaluate_temperature", controllers__window__settling_s=made.figure(2.0, 1.0, 3.0))
+    with pytest.raises(SystemExit):
+        cli.main()
+    assert "the pages are of another run than reports/metrics/evaluate_temperature.json; run ./run dvc repro" in capsys.readouterr().err

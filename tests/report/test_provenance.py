@@ -1,0 +1,126 @@
+"""What the pages say they were made from: everything matches right after a run, and one changed byte anywhere is found and named."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from pipeline import artifacts, cli, provenance
+from stages.report import main
+
+
+def lock():
+    """dvc.lock of the small project as DVC would write it: folders of stages, and what the report stage wrote."""
+    outs = [Path("datasets") / name for name in ("compose_parts", "evaluate_temperature", "identify_plant", "ingest")]
+    outs += [Path("datasets") / name for name in ("learn_kernel", "segment_library", "train_ilc", "tune_weights")]
+    stages = {path.name: {"outs": [{"path": str(path), "md5": provenance.md5(path)}]} for path in outs}
+    written = [*Path("reports").glob("*.html"), *Path("reports/metrics").glob("*.json")]
+    stages["report"] = {"outs": [{"path": str(path), "md5": provenance.md5(path)} for path in sorted(written)]}
+    Path("dvc.lock").write_text(yaml.safe_dump({"schema": "2.0", "stages": stages}))
+
+
+@pytest.fixture
+def checked(project):
+    main()
+    lock()
+    return project
+
+
+def wrong():
+    return [sentence for check in provenance.checks() for sentence in check.wrong]
+
+
+def flip(path):
+    """One byte of the file, in its middle."""
+    data = bytearray(Path(path).read_bytes())
+    data[len(data) // 2] ^= 1
+    Path(path).write_bytes(data)
+
+
+def test_right_after_a_run_everything_matches_and_the_command_says_how_much(checked, monkeypatch, capsys):
+    assert wrong() == []
+    monkeypatch.setattr(sys, "argv", ["beadline", "verify"])
+    cli.main()
+    said = capsys.readouterr().out
+    read = artifacts.read_metrics("report")["read"]
+    assert f"{len(read)} sources of the pages: all match" in said and "references of figures and tables: all match" in said
+
+
+def test_one_changed_byte_of_any_source_is_found_and_named(checked):
+    read = artifacts.read_metrics("report")["read"]
+    assert len(read) > 40
+    for path in read:
+        whole = Path(path).read_bytes()
+        flip(path)
+        assert f"{path} has changed since" in wrong(), path
+        Path(path).write_bytes(whole)
+    assert wrong() == []
+
+
+@pytest.mark.parametrize(
+    ("path", "sentence"),
+    [
+        ("params.yaml", "params.yaml has changed since"),
+        ("pipeline/code.py", "the code (pipeline, stages) has changed since"),
+        ("reports/temperature.html", "reports/temperature.html has changed since"),
+    ],
+)
+def test_a_change_of_parameters_code_or_a_page_is_found(checked, path, sentence):
+    text = Path(path).read_text()
+    changed = {"params.yaml": text.replace("gap_percent: 5.0", "gap_percent: 6.0", 1), "pipeline/code.py": "2\n"}.get(path, text + "\n")
+    assert changed != text
+    Path(path).write_text(changed)
+    assert sentence in wrong()
+
+
+def test_a_figure_whose_source_is_not_in_the_provenance_or_has_another_hash_is_found(checked):
+    page = Path("reports/index.html")
+    metrics = artifacts.read_metrics("report")
+    text = page.read_text()
+    page.write_text(text.replace("</main>", '<p class="src"><a href="#from-nowhere">x</a></p></main>'))
+    assert "reports/index.html refers to from-nowhere, which is not among its sources" in wrong()
+    recorded = metrics["read"]["reports/metrics/ingest.json"]
+    page.write_text(text.replace(recorded, "0" * 64))
+    assert "reports/index.html gives another hash of reports/metrics/ingest.json than was read" in wrong()
+
+
+def test_what_dvc_recorded_otherwise_is_found_and_a_source_of_no_stage_too(checked):
+    Path("datasets/train_ilc/extra.txt").write_text("x")
+    assert wrong() == ["datasets/train_ilc is not what dvc.lock has of train_ilc"]
+    found = yaml.safe_load(Path("dvc.lock").read_text())
+    del found["stages"]["train_ilc"]
+    Path("dvc.lock").write_text(yaml.safe_dump(found))
+    assert "datasets/train_ilc/trials.parquet is in no entry of dvc.lock" in wrong()
+    Path("dvc.lock").unlink()
+    assert wrong() == ["dvc.lock is missing: nothing says which run the files are of"]
+
+
+def test_the_command_names_what_no_longer_matches_and_ends_with_one(checked, monkeypatch, capsys):
+    flip("datasets/ingest/quality.parquet")
+    monkeypatch.setattr(sys, "argv", ["beadline", "verify"])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == 1
+    said = capsys.readouterr().err
+    assert (
+        "datasets/ingest/quality.parquet has changed since; datasets/ingest is not what dvc.lock has of ingest; run ./run dvc repro" in said
+    )
+
+
+def test_the_metrics_of_an_older_version_are_refused_in_one_sentence(checked):
+    artifacts.write_json("reports/metrics/report.json", {"read": {}})
+    with pytest.raises(ValueError, match="it does not say what the pages were made from; run ./run dvc repro report"):
+        provenance.checks()
+
+
+def test_the_digest_of_a_folder_is_the_one_that_dvc_writes(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("b.txt", "a/c d.txt", "a/é.txt", "Z.txt"):
+        Path("folder", name).parent.mkdir(parents=True, exist_ok=True)
+        Path("folder", name).write_text(name)
+    for command in (["init", "--no-scm", "-q"], ["add", "-q", "folder"]):
+        subprocess.run([sys.executable, "-m", "dvc", *command], check=True, capture_output=True)
+    recorded = yaml.safe_load(Path("folder.dvc").read_text())["outs"][0]
+    assert provenance.md5(Path("folder")) == recorded["md5"]

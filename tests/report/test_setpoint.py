@@ -1,0 +1,208 @@
+"""The page of the setpoint loop on made-up artifacts: the verdict against figures made by hand, undecided shares, what is missing, hostile text, sizes."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from pipeline import artifacts, params, setpoint_schemas
+from pipeline.report import setpoint_agent, setpoint_verdict, setpoint_vision, setpoint_why
+from pipeline.report.verdict import Figure, Question
+from pipeline.setpoint.reward import reward
+from stages.report import main
+from tests.report import made_setpoint
+from tests.report.test_pages import Page, change, figures
+
+PAGE, INDEX = Path("reports/setpoint.html"), Path("reports/index.html")
+ARTIFACTS = [
+    *(f"datasets/train_classifier/{name}" for name in ("classified.parquet", "reliability.parquet", "course.parquet", "windows.parquet", "frames/frames.json")),
+    "datasets/train_agent/agents.parquet",
+    *(f"datasets/evaluate_setpoint/{name}" for name in ("scoreboard.parquet", "paths.parquet", "decisions.parquet", "choice.json")),
+]  # fmt: skip
+
+
+def page():
+    main()
+    return Page(PAGE).text
+
+
+def lost(**percent):
+    """The made-up controllers with other shares of lost runs: name with _ for a space -> (least, more a case)."""
+    return made_setpoint.LOST | {name.replace("_", " "): pair for name, pair in percent.items()}
+
+
+def test_the_default_is_named_with_its_worst_case_and_its_lead_over_the_next(project):
+    text = page()
+    # by hand: 100 - 1.5 (0.2 + 5 x 0.1) = 98.95, and 97.6 for the next
+    assert "Run the agent by default. All six rules passed." in text
+    assert "In its worst case (the paper’s simulator, accuracy 70 %, clog) 99.0 % of 2,100 runs settle and stay, 1.1 points more than of the next, the baseline “Bayes, robust”" in text  # fmt: skip
+    assert re.search(r"<title>(.*?) ·", PAGE.read_text())[1] == "Setpoint: Run the agent by default"
+
+
+def test_what_may_be_claimed_stands_in_the_verdict_and_on_page_one(project):
+    claim = "The classifier is trained and judged on rendered frames: eight real pictures allow no claim about real printers."
+    assert claim in page() and claim in Page(INDEX).text
+    sections = params.read("params.yaml")
+    sections["train_classifier"]["source"] = "recordings"
+    Path("params.yaml").write_text(yaml.safe_dump(sections))
+    assert claim not in page() and "recordings of datasets/raw/setpoint, split by print" in Page(PAGE).text
+
+
+def test_a_baseline_may_win_and_then_the_page_says_how_far_the_agent_came(project):
+    made_setpoint.scoreboard(lost(our_agent=(1.0, 2.0)))
+    made_setpoint.choice("Bayes, robust", margin=9.0)
+    text = page()
+    assert "Run the baseline “Bayes, robust” by default. All six rules passed." in text
+    # 100 - 1.5 (1 + 10) = 83.5, behind the sequential test's 88.6
+    assert "9.0 points more than of the next, the baseline “sequential test”" in text
+    assert "The agent did not earn it: 83.5 % (the paper’s simulator, accuracy 70 %, clog)." in text
+    assert "Model‑based wins." in Page(INDEX).text
+
+
+@pytest.mark.parametrize(
+    ("metric", "value", "rule", "sentence"),
+    [
+        ("ece_window", 0.05, "calibrated, a window", "Stated and true shares of right answers differ by 0.050 on average; 0.04 is allowed."),
+        ("intervals_percent__image", [70.0, 72.0], "right, an image", "The classifier names 79.7 % of frames of segments it never saw rightly; 78 % are asked for."),
+    ],
+)  # fmt: skip
+def test_the_first_failed_rule_is_said_in_words(project, metric, value, rule, sentence):
+    change("train_classifier", **{metric: value})
+    text = page()
+    assert f"Do not let it steer a printer yet: the agent comes closest. First failed rule: {rule}. {sentence}" in text
+    assert PAGE.read_text().count('<tr class="fail"><th scope="row"><a') == 1
+    # the worst loop has the headline of page one
+    assert re.search(r"<h1>(.*?)</h1>", INDEX.read_text())[1] == "Do not let it steer a printer yet: the agent comes closest."
+
+
+def test_a_share_that_straddles_its_limit_is_undecided_and_says_how_many_runs_would_tell(project):
+    made_setpoint.scoreboard(lost(our_agent=(0.5, 0.3)), runs=210)
+    text = page()
+    # 98.0 % of 210 runs: 95.1 to 99.2; 1.96^2 x 0.98 x 0.02 / 0.01^2 = 753, rounded up to two digits
+    assert "Do not decide yet: the agent comes closest. First open rule: settles, worst case." in text
+    assert (
+        "98.0 % of its runs settle; 97 % are asked for. Its interval, 95.1–99.2, straddles that; about 760 runs in all would decide."
+        in text
+    )
+    assert setpoint_verdict.undecided(Question(0, "", "", "%", 97.0, True, ""), Figure(97.0, 96.0, 98.0)).endswith(
+        "no number of runs would decide."
+    )
+
+
+@pytest.mark.parametrize("path", ARTIFACTS)
+@pytest.mark.parametrize("how", ["missing", "broken"])
+def test_what_is_missing_or_broken_is_said_in_its_place(project, path, how):
+    if how == "missing":
+        Path(path).unlink()
+    else:
+        Path(path).write_bytes(b"{")
+    # in its place and in the provenance
+    text, name = page(), Path(path).name
+    broken = "is not whole JSON" if name.endswith("json") else "is not a whole Parquet file"
+    sentence = f"{name} of {path.split('/')[1]} is not there. Run ./run dvc repro {path.split('/')[1]}."
+    assert text.count(broken if how == "broken" else sentence) >= 2
+
+
+def test_before_the_stages_ran_the_page_and_the_card_say_so(project):
+    for path in [*ARTIFACTS, *(f"reports/metrics/{stage}.json" for stage in made_setpoint.metrics())]:
+        Path(path).unlink()
+    text = page()
+    assert "Let nobody set flow and temperature by this loop yet. No controller was chosen." in text
+    assert "Run ./run dvc repro evaluate_setpoint." in text and "Run the agent" not in Page(INDEX).text
+    # what was not measured takes no headline from a loop that was
+    assert "Deploy the data‑driven temperature controller." in INDEX.read_text().split("</h1>")[0]
+
+
+def test_a_choice_of_somebody_who_was_not_judged_is_no_choice(project):
+    made_setpoint.choice("nobody")
+    assert "No controller was chosen. The choice names a controller that was not judged." in page()
+
+
+def test_names_and_reasons_from_the_data_are_escaped_and_isolated(project):
+    made_setpoint.decisions(why=f"held: {made_setpoint.HOSTILE}")
+    page()
+    text = PAGE.read_text()
+    assert "<script>alert" not in text and "<img src=http" not in text
+    assert text.count("&lt;script&gt;") >= 2
+
+
+def test_every_controller_stands_in_every_case_and_its_worst_case_is_bold(project):
+    page()
+    text = PAGE.read_text()
+    tables = re.findall(r'<table class="tab board">.*?</table>', text, re.DOTALL)
+    assert len(tables) == 3 and [table.count("<tr><th") for table in tables] == [8, 8, 4]
+    bold = [table.count('<td class="low"') for table in tables]
+    # clog at accuracy 0.7 and in sticky windows are alike here; the first one is taken
+    assert bold == [7, 0, 0]
+    assert "proportional" in tables[0] and "recover 24.0" in tables[0]
+
+
+def test_the_card_names_the_winner_in_words_and_shows_three_panels(project):
+    page()
+    first = Page(INDEX)
+    assert (
+        "Data‑driven wins. The agent: 99.0 % of runs settle and stay in its worst case (the paper’s simulator, accuracy 70 %, clog)"
+        in first.text
+    )
+    card = INDEX.read_text().split('id="c-setpoint"')[1].split("</article>")[0]
+    assert card.count('class="spark') == 3 and first.links.count("setpoint.html") >= 3
+
+
+def test_how_a_figure_moved_since_the_accepted_run_is_said(project):
+    accepted = {"metrics": {"evaluate_setpoint": artifacts.read_metrics("evaluate_setpoint")}, "params": {}, "hashes": {}}
+    cases = accepted["metrics"]["evaluate_setpoint"]["our agent"]["paper"]
+    cases["accuracy 0.7"]["settled"] = 97.0
+    artifacts.write_json("reports/accepted.json", accepted)
+    text = page()
+    # 99.5 % now, 99.1 to 99.7
+    assert "+2.5 points · better" in text and "new" in text
+
+
+# ---- the figures themselves
+
+
+def test_lines_of_equal_reward_have_that_reward():
+    for level in setpoint_agent.LEVELS:
+        q, u = setpoint_agent.equal_reward(level, a=20.0, b=10.0)
+        # float32 in the reward
+        np.testing.assert_allclose(reward(q, u, a=20.0, b=10.0), level, atol=1e-5)
+
+
+def test_windows_are_counted_right_by_the_class_of_their_flow():
+    p = np.array([[0.8, 0.2, 0.0], [0.5, 0.5, 0.0], [0.0, 0.1, 0.9], [0.0, 0.9, 0.1]])
+    mine = {
+        "flow_bin": np.array([0, 0, 1, 1]),
+        "flow_low_percent": np.array([80.0, 80.0, 110.0, 110.0]),
+        "flow_high_percent": np.array([90.0, 90.0, 120.0, 120.0]),
+        "named": np.array([0, 1, 2, 2]),
+    } | {f"p_{name}": p[:, k] for k, name in enumerate(("under", "good", "over"))}
+    flow, scaled, right = setpoint_vision._by_bin(mine)
+    np.testing.assert_allclose(flow, [85, 115])
+    np.testing.assert_allclose(right, [50, 100])
+    # divided by the largest of each window, then the mean
+    np.testing.assert_allclose(scaled[0], [1.0, (0.25 + 1) / 2, 0.0])
+
+
+def test_stretches_of_held_windows_end_where_the_reason_changes():
+    why = ["good 0.9; no change", "x held: tip moved", "y held: tip moved", "z held: out of distribution", "good 0.9; flow -5 %"]
+    mine = {"held": np.array([False, True, True, True, False]), "why": np.array(why)}
+    assert setpoint_why._alike(mine) == [(1, 3), (3, 4)]
+    assert setpoint_why.reason(why[1]) == "tip moved"
+
+
+def test_cases_are_said_in_words():
+    assert setpoint_verdict.case_text(("recorded", "recorded, sticky, clog"), whole=True) == "Recorded windows, sticky, clog"
+    assert setpoint_verdict.case_text(("paper", "accuracy 0.7, gain 0.6")) == "accuracy 70\u202f%, gain 0.6"
+
+
+def test_two_hundred_controllers_and_thousands_of_decisions_stay_within_the_size_of_a_page(project):
+    made_setpoint.decisions(steps=2000)
+    rows = 40_000
+    table = {"controller": ["our agent"] * rows, "simulator": ["paper"] * rows, "case": ["accuracy 0.7"] * rows, "start": np.repeat(np.arange(200), 200), "step": np.tile(np.arange(200), 200)}  # fmt: skip
+    walk = 100 + 20 * np.random.default_rng(0).standard_normal(rows)
+    artifacts.write_table("datasets/evaluate_setpoint/paths.parquet", setpoint_schemas.PATHS, table | {"flow_percent": walk, "temperature_degC": 210 + walk / 20})  # fmt: skip
+    main()
+    # the limit of a page: 1.5 MB
+    assert figures()["bytes"]["setpoint"] <= 1_500_000

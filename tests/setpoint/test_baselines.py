@@ -1,0 +1,200 @@
+"""Controllers without learning: moves by hand, the Bayes filter against brute force, and the trial's figures on the paper's simulator."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pipeline.setpoint import bayes, judging
+from pipeline.setpoint.baselines import Proportional, SequentialTest, nearest, proportional, sequential_test, temperature_move
+from pipeline.setpoint.recorded import recorded_windows, synthetic_table
+from pipeline.setpoint.simulator import FLOW_MOVES, TEMPERATURE_MOVES, Observation, paper_windows
+
+KEY = jax.random.key(0)
+PURE = {0: [0.76, 0.17, 0.07], 1: [0.15, 0.7, 0.15], 2: [0.07, 0.17, 0.76]}  # the mean window of each class
+ROBUST = {
+    "accuracy": 0.7, "looks": 5, "look": 0.055, "floor": 0.03, "smoothing": 4.0, "segment": 12.0, "switch": 3e-4, "hazard": 6e-4, "move_cost": 0.38, "outside_cost": 5.0,
+}  # fmt: skip
+EXACT = {"accuracy": 0.7, "hazard": 0.0, "move_cost": 0.0, "outside_cost": 0.0}
+
+
+def seen(named, *, shares=None, move=0.0, target=210.0, step=0):
+    return Observation(
+        jnp.array(shares or PURE[named]), jnp.array(named), jnp.array(move), jnp.array(target), jnp.array(target), jnp.array(step)
+    )
+
+
+def moves(controller, parameters, classes):
+    """The flow moves in percent that answer these classes, one after the other."""
+    act, memory, answers, move = jax.jit(controller.act), controller.start(), [], 0.0
+    for t, named in enumerate(classes):
+        memory, action = act(parameters, memory, seen(named, move=move, step=t), KEY)
+        move = FLOW_MOVES[int(action.flow)]
+        answers.append(move)
+    return answers
+
+
+@pytest.fixture(scope="module")
+def table():
+    return synthetic_table(np.random.default_rng(100), segments=30, windows=10)
+
+
+# ---- moves by hand
+
+
+def test_the_temperature_goes_to_210_by_the_largest_steps_and_rests_there():
+    answers = {
+        target: TEMPERATURE_MOVES[int(temperature_move(seen(1, target=target)))]
+        for target in (180.0, 190.0, 198.0, 204.0, 206.0, 210.0, 213.3, 215.0, 230.0)
+    }
+    assert answers == {180.0: 20, 190.0: 20, 198.0: 10, 204.0: 10, 206.0: 0, 210.0: 0, 213.3: 0, 215.0: 0, 230.0: -20}
+
+
+def test_of_two_moves_as_near_the_smaller_is_taken():
+    assert [FLOW_MOVES[int(nearest(FLOW_MOVES, wanted))] for wanted in (-30.0, -7.6, -7.5, -2.5, 2.4, 2.6, 7.5, 8.0)] == [
+        -10,
+        -10,
+        -5,
+        0,
+        0,
+        5,
+        5,
+        10,
+    ]
+
+
+def test_proportional_moves_by_its_gain_times_the_difference_and_filtered_it_waits():
+    assert moves(proportional(), Proportional(gain=10.0, time_constant=1.0), [0, 1, 2]) == [5, 0, -5]  # 6.9, 0, -6.9
+    # y = 0.69 (1 - 0.75^k) reaches 0.25 at k = 2 and 5 % follows; what is kept of it is 0.75 of y
+    assert moves(proportional(), Proportional(gain=10.0, time_constant=4.0), [0, 0, 0]) == [0, 5, 5]
+
+
+def test_the_sequential_test_moves_when_one_class_leads_good_by_its_threshold():
+    parameters = SequentialTest(accuracy=0.7, threshold=3.0, cap=4.7)  # log (0.7 / 0.15) = 1.54 a window: two to move, three to the cap
+    assert moves(sequential_test(), parameters, [0, 0, 0, 1, 1, 1]) == [0, 10, 10, 10, 0, 0]
+    assert moves(sequential_test(), parameters, [2, 1, 2, 2]) == [0, 0, 0, -10]
+    assert moves(sequential_test(), parameters, [1] * 50 + [0] * 5) == [0] * 54 + [
+        10
+    ]  # the cap lets under come back: three to be level, two to lead
+
+
+# ---- the Bayes filter
+
+
+def test_the_exact_filter_is_bayes_rule_over_every_start():
+    parameters, controller, believed = bayes.class_filter(**EXACT), bayes.bayes(1), jax.jit(bayes.believed)
+    rng, belief = np.random.default_rng(0), controller.start()
+    flow, prior = bayes.GRID.copy(), bayes.PRIOR.copy()
+    for t in range(12):
+        move = float(rng.choice(FLOW_MOVES)) if t else 0.0
+        named = int(rng.integers(3))
+        flow = np.clip(flow + move, 20, 310)
+        true = np.where(flow < 90, 0, np.where(flow > 110, 2, 1))
+        prior = prior * np.where(true == named, 0.7, 0.15)
+        belief = believed(parameters, belief, seen(named, move=move))
+    expected = np.zeros(len(bayes.GRID))
+    np.add.at(expected, np.rint((flow - 20) / bayes.SPACING).astype(int), prior / prior.sum())
+    np.testing.assert_allclose(belief[0], expected, atol=1e-6)  # float32
+
+
+def test_a_part_of_a_spacing_moves_the_mean_by_as_much_and_loses_nothing():
+    belief = jnp.zeros((2, len(bayes.GRID))).at[0, 40].set(0.3).at[1, 50].set(0.7)
+    for move in (-6.0, -0.5, 0.0, 1.2, 6.0):
+        moved = np.asarray(bayes.shifted(belief, jnp.float32(move)))
+        np.testing.assert_allclose(moved.sum(axis=1), [0.3, 0.7], rtol=1e-6)
+        np.testing.assert_allclose(moved @ bayes.GRID / moved.sum(axis=1), bayes.GRID[[40, 50]] + move, rtol=1e-6)
+    np.testing.assert_allclose(np.asarray(bayes.shifted(belief, jnp.float32(400.0)))[:, -1], [0.3, 0.7], rtol=1e-6)
+
+
+def test_the_move_is_the_one_with_the_least_expected_loss():
+    parameters = bayes.class_filter(accuracy=0.7, hazard=0.0, move_cost=0.4, outside_cost=5.0)
+    belief = np.zeros((1, len(bayes.GRID)))
+    belief[0, [28, 32]] = 0.75, 0.25  # 90 and 100 %
+    # |q + a - 100| + 5 outside + 0.4 |a|: at a = 0 7.5, at + 5 5 + 2, at + 10 2.5 + 4, at - 10 17.5 + 3.75 + 4, at - 5 12.5 + 3.75 + 2
+    np.testing.assert_allclose(bayes.expected_loss(parameters, jnp.asarray(belief, jnp.float32)), [25.25, 18.25, 7.5, 7.0, 6.5], rtol=1e-6)
+
+
+def test_evidence_sums_to_one_for_every_flow_and_transitions_for_every_hypothesis(table):
+    parameters = bayes.robust_filter(table, **ROBUST)
+    assert parameters.evidence.shape == (6, bayes.CODES, len(bayes.GRID))
+    np.testing.assert_allclose(parameters.evidence.sum(axis=1), 1.0, rtol=1e-5)  # float32
+    np.testing.assert_allclose(parameters.transition.sum(axis=1), 1.0, rtol=1e-6)
+    assert float(parameters.evidence.min()) > 0  # nothing is ever ruled out
+
+
+def test_codes_tell_the_classes_apart_and_rise_with_the_flow():
+    all_shares = [np.array(p) / sum(p) for p in itertools.product([0.0, 0.1, 0.5, 1.0], repeat=3) if sum(p) > 0]
+    for shares, named in itertools.product(all_shares, range(3)):
+        assert named * bayes.LEVELS <= int(bayes.code(jnp.asarray(shares), jnp.asarray(named))) < (named + 1) * bayes.LEVELS
+    leaning = [int(bayes.code(jnp.array([a, 0.8, 0.2 - a]), jnp.array(1))) for a in (0.2, 0.15, 0.1, 0.05, 0.0)]
+    assert leaning == sorted(leaning)
+    assert leaning[0] < leaning[-1]
+
+
+def test_a_thin_looking_segment_is_told_from_a_low_flow_by_its_end(table):
+    """Two hundred good windows, then ten that lean to under: a segment that looks thin explains them, and the flow stays; thirty that name under move it."""
+    controller, parameters = bayes.bayes(6), bayes.robust_filter(table, **ROBUST)
+    act, memory = jax.jit(controller.act), controller.start()
+    answers = []
+    for shares in [[0.02, 0.96, 0.02]] * 200 + [[0.1, 0.89, 0.01]] * 3 + [[0.9, 0.1, 0.0]] * 3:
+        memory, action = act(parameters, memory, seen(int(np.argmax(shares)), shares=shares, step=len(answers)), KEY)
+        answers.append(FLOW_MOVES[int(action.flow)])
+    assert not any(answers[20:203])
+    assert answers[-1] > 0
+
+
+# ---- figures
+
+
+def score(controller, parameters, windows, conditions, seed=0):
+    return judging.evaluate(
+        controller, jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), parameters), windows, conditions, jax.random.key(seed)
+    )
+
+
+def test_the_robust_filter_holds_its_bars_on_the_paper_s_windows_with_a_clog(table):
+    controller, parameters = bayes.bayes(6), bayes.robust_filter(table, **ROBUST)
+    windows, conditions = judging.cases(recorded_windows(table), runs=6, segment=10.0)["accuracy 0.7, clog"]
+    found = score(controller, parameters, windows, conditions)
+    # 98.5 and 96.9 on 2,100 runs; of 126 runs the deviation is 1.5 points
+    assert found.settled.percent >= 95
+    assert found.recovered.percent >= 94
+    assert found.stay.percent >= 90
+
+
+@pytest.mark.slow
+def test_the_trial_s_figures_come_out():
+    """Section 2 of the notes, 21 starts x 100 runs at accuracy 0.7: settled, stay, median; deviations of 2,100 runs are 1 point at most, the rest is how the trial's
+    controllers were set, which the notes do not say."""
+    paper, rough = paper_windows(), judging.starts(100, accuracy=0.7)
+    exact = score(bayes.bayes(1), bayes.class_filter(**EXACT), paper, rough)
+    assert exact.settled.percent >= 99.5
+    assert exact.stay.percent >= 99
+    assert exact.median_steps == pytest.approx(9, abs=1)
+    leaking = score(bayes.bayes(1), bayes.class_filter(**{**EXACT, "hazard": 0.02}), paper, rough)
+    assert leaking.settled.percent == pytest.approx(92, abs=4)
+    assert leaking.stay.percent == pytest.approx(50, abs=8)
+    assert leaking.median_steps == pytest.approx(21, abs=3)
+    plain = score(proportional(), Proportional(gain=20.0, time_constant=1.0), paper, rough)
+    assert plain.settled.percent == pytest.approx(17, abs=4)
+    assert plain.stay.percent == 0
+    test = score(sequential_test(), SequentialTest(accuracy=0.7, threshold=2.98, cap=4.62), paper, rough)
+    assert test.settled.percent >= 99
+    assert test.median_steps == pytest.approx(11, abs=1)
+    assert test.p90_steps == pytest.approx(30, abs=4)
+    one = jnp.ones_like(rough.flow)
+    clogged = score(bayes.bayes(1), bayes.class_filter(**EXACT), paper, rough._replace(clog=0.6 * one, clog_step=60 * one))
+    assert clogged.recovered.percent == pytest.approx(1.5, abs=1)
+
+
+@pytest.mark.slow
+def test_the_robust_filter_holds_every_bar_of_the_default(table):
+    controller, parameters = bayes.bayes(6), bayes.robust_filter(table, **ROBUST)
+    unseen = recorded_windows(synthetic_table(np.random.default_rng(11), segments=30, windows=10))
+    for number, (case, (windows, conditions)) in enumerate(judging.cases(unseen, runs=100, segment=10.0).items()):
+        found = score(controller, parameters, windows, conditions, seed=number)
+        assert found.settled.percent >= 97, case
+        assert found.stay.percent >= 90, case
+        assert found.flow_error <= {"recorded, fresh": 2.0, "recorded, sticky": 5.0}.get(case, np.inf), case
