@@ -55,9 +55,24 @@ def recording(truth: Plant, seed: int, *, samples: int = SAMPLES) -> dict[str, n
     signal = prbs(rng, samples, 2, amplitude=8.0, shortest=20)
     noise = NOISE_DEGC * rng.standard_normal((samples, 2))
     run = probe(
-        truth, signal, x0=x0, u_centre=u0, y_centre=REFERENCE, feedback=0.5 * np.eye(2), noise=noise, low=np.zeros(2), high=np.full(2, 100.0), rate=20.0
+        truth,
+        signal,
+        x0=x0,
+        u_centre=u0,
+        y_centre=REFERENCE,
+        feedback=0.5 * np.eye(2),
+        noise=noise,
+        low=np.zeros(2),
+        high=np.full(2, 100.0),
+        rate=20.0,
     )
-    return {"time_s": np.arange(samples, dtype=float), "heater_1": run.u[:, 0], "heater_2": run.u[:, 1], "sensor_1": run.y[:, 0], "sensor_2": run.y[:, 1]}
+    return {
+        "time_s": np.arange(samples, dtype=float),
+        "heater_1": run.u[:, 0],
+        "heater_2": run.u[:, 1],
+        "sensor_1": run.y[:, 0],
+        "sensor_2": run.y[:, 1],
+    }
 
 
 def a_night(seed: int, index: int, **changes) -> dict[str, np.ndarray]:
@@ -81,9 +96,16 @@ def project(folder: Path, seed: int, *, recordings: int = 4, with_dvc: bool = Fa
     dvc_yaml["stages"] = {name: dvc_yaml["stages"][name] for name in STAGES}
     (folder / "dvc.yaml").write_text(yaml.safe_dump(dvc_yaml))
     (folder / "params.yaml").write_text(yaml.safe_dump(settings()))
-    (folder / ".gitignore").write_text("/pipeline\n/stages\n/reports/*.html\n/datasets/memo\n/datasets/[gilt]*\n/datasets/.*.[0-9]*\n*.tmp\n")
+    (folder / ".gitignore").write_text(
+        "/pipeline\n/stages\n/reports/*.html\n/datasets/memo\n/datasets/[gilt]*\n/datasets/.*.[0-9]*\n*.tmp\n"
+    )
     os.chdir(folder)
-    for command in ("git init -q -b main", f"{sys.executable} -m dvc init -q", "git config user.email n@example.com", "git config user.name N"):
+    for command in (
+        "git init -q -b main",
+        f"{sys.executable} -m dvc init -q",
+        "git config user.email n@example.com",
+        "git config user.name N",
+    ):
         subprocess.run(command.split(), check=True)
     if not with_dvc:
         (folder / "dvc.lock").write_text("schema: '2.0'\nstages: {}\n")
@@ -166,7 +188,14 @@ def true_cost(folder: Path) -> float:
     limits = (np.zeros(2), np.full(2, 100.0))
     plants = [machine(gain=(a, b)) for a, b in ((1, 1), (0.95, 1.05), (1.05, 0.95))]
     scenarios = scorecard.panel(
-        plants, starts=[40.0, 70.0, 100.0], references=[REFERENCE + d for d in (0.0, -10.0, -20.0)], noise=[NOISE_DEGC], seeds=range(5), steps=150, hold=30, cells=False
+        plants,
+        starts=[40.0, 70.0, 100.0],
+        references=[REFERENCE + d for d in (0.0, -10.0, -20.0)],
+        noise=[NOISE_DEGC],
+        seeds=range(5),
+        steps=150,
+        hold=30,
+        cells=False,
     )
     law = made.design(weights["q"], weights["r"], p["tracking"]["integral"])
     run = scorecard.simulate(
@@ -222,7 +251,9 @@ def drifted(seed: int, folder: Path, with_dvc: bool) -> dict:
         nights, causes = 0, []
         for k in (5, 6, 7):
             nights += 1
-            causes = [one["cause"] for one in play(k, a_night(seed, k + 10 * zlib.crc32(name.encode()) % 1000, **changes))[2]["drift"]["alarms"]]
+            causes = [
+                one["cause"] for one in play(k, a_night(seed, k + 10 * zlib.crc32(name.encode()) % 1000, **changes))[2]["drift"]["alarms"]
+            ]
             if causes:
                 break
         found[name] = {"nights": nights if causes else None, "causes": causes}
@@ -261,7 +292,13 @@ def bad(seed: int, folder: Path, with_dvc: bool) -> dict:
         same = champion.md5s(champion.FOLDER / "temperature") == files and champion.read()["champions"]["temperature"]["run"] == run
         path.unlink(missing_ok=True)
         after = play(11 + 2 * k, a_night(seed, 11 + 2 * k))
-        found[name] = {"status": status, "champion_untouched": same, "told": said, "next_night": after[0], "page_names_it": f"bad_{k}.csv" in Path("reports/nightly.html").read_text()}
+        found[name] = {
+            "status": status,
+            "champion_untouched": same,
+            "told": said,
+            "next_night": after[0],
+            "page_names_it": f"bad_{k}.csv" in Path("reports/nightly.html").read_text(),
+        }
         print(f"  {name}: {status} untouched {same}, next {after[0]}: {said[:240]}", flush=True)
     return found
 
@@ -290,7 +327,10 @@ def planted(seed: int, folder: Path, with_dvc: bool) -> dict:
     entry = champion.read()["champions"]["temperature"]
     processes.dvc("add", "--quiet", "champion/temperature")
     state = champion.read()
-    state["champions"]["temperature"] = entry | {"files": champion.md5s(champion.FOLDER / "temperature"), "folder": champion._out("temperature")}
+    state["champions"]["temperature"] = entry | {
+        "files": champion.md5s(champion.FOLDER / "temperature"),
+        "folder": champion._out("temperature"),
+    }
     artifacts.write_json(champion.FILE, state)
     processes.commit(champion.paths(), "a champion that is 10 % worse")
     for k in (5, 6, 7):
@@ -313,7 +353,12 @@ def main() -> None:
     whole = a.folder or Path(tempfile.mkdtemp(prefix="nights-"))
     for name in a.scenarios:
         print(name, flush=True)
-        call = {"null": lambda f: null(a.seed, a.nights, f, a.dvc), "drift": lambda f: drifted(a.seed, f, a.dvc), "bad": lambda f: bad(a.seed, f, a.dvc), "planted": lambda f: planted(a.seed, f, a.dvc)}
+        call = {
+            "null": lambda f: null(a.seed, a.nights, f, a.dvc),
+            "drift": lambda f: drifted(a.seed, f, a.dvc),
+            "bad": lambda f: bad(a.seed, f, a.dvc),
+            "planted": lambda f: planted(a.seed, f, a.dvc),
+        }
         results[f"{name}_seed_{a.seed}"] = call[name](whole / name)
         os.chdir(ROOT)
         artifacts.write_json(RESULTS, results)

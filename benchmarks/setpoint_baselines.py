@@ -6,6 +6,7 @@ judged by the stage evaluate_setpoint.
 """
 
 import json
+import os
 import sys
 import time
 from pathlib import Path
@@ -109,10 +110,11 @@ def main(seeds: int, runs: int) -> None:
         "choices": [choice._asdict() for choice in choices],
         "simulator_steps_per_s": round(speed()),
         "action_ms": round(action_ms("Bayes, robust"), 4),
+        "load_average": os.getloadavg()[0],
         "specified": SPEC,
         "rows": [{"seed": seed, **row} for seed, of in scores.items() for row in judging.rows(of)],
     }
-    print({key: results[key] for key in ("simulator_steps_per_s", "action_ms")})
+    print({key: results[key] for key in ("simulator_steps_per_s", "action_ms", "load_average")})
     RESULTS.write_text(json.dumps(results, indent=1) + "\n")
 
 

@@ -139,7 +139,7 @@ def measured_waits(rng: np.random.Generator) -> tuple[Waits, dict]:
     flow = max(settled((100.0, 100.0 + d), (190.0, 190.0), 0, 1.0, 1.0, 20.0) for d in (10.0, -10.0) for _ in range(3))
     target = max(settled((100.0, 100.0), (210.0 - d, 210.0), 0, 1.0, 1.0, 80.0) for d in (20.0, -20.0) for _ in range(3))
     heater = max(settled((100.0, 100.0), (210.0 - d, 210.0), 1, 1.0, 0.2, 120.0) for d in (20.0, -20.0))
-    return Waits(flow, target, flow), {"flow_s": flow, "flow_after_target_s": target, "heater_s": heater}
+    return deployment.derived_waits(flow, target, transport_s=0.1), {"flow_s": flow, "flow_after_target_s": target, "heater_s": heater}
 
 
 def summary(e: Episodes) -> dict:

@@ -13,7 +13,7 @@ ALIKE = 0.5  # background and contrast that change by shares within this ratio o
 
 
 class Seen(NamedTuple):
-    """Of one night: mean (6,) of FIGURES over the frames with a bead, its standard deviation (6,) (a figure counts a frame as new only every fifth: beads are long), frames with one."""
+    """Of one night: median (6,) of FIGURES over the frames with a bead, its standard deviation (6,) (a figure counts a frame as new only every fifth: beads are long), frames with one."""
 
     mean: np.ndarray
     deviation: np.ndarray
@@ -26,8 +26,13 @@ def figures(frames: Sequence[np.ndarray]) -> Seen:
     """
     rows = np.array([found for frame in frames if (found := _frame(np.asarray(frame, float))) is not None])
     if len(rows) < 5:
-        raise ValueError(f"camera: expected a bead in at least 5 frames, found one in {len(rows)} of {len(frames)}; look at the picture: lens, light, ink")
-    return Seen(rows.mean(axis=0), rows.std(axis=0, ddof=1) * np.sqrt(5.0 / len(rows)), len(rows))
+        raise ValueError(
+            f"camera: expected a bead in at least 5 frames, found one in {len(rows)} of {len(frames)}; look at the picture: lens, light, ink"
+        )
+    # medians: a frame at the end of a line is no picture of it
+    middle = np.median(rows, axis=0)
+    deviation = 1.4826 * 1.2533 * np.median(np.abs(rows - middle), axis=0) * np.sqrt(5.0 / len(rows))
+    return Seen(middle, deviation, len(rows))
 
 
 def _frame(g: np.ndarray) -> np.ndarray | None:
@@ -38,10 +43,22 @@ def _frame(g: np.ndarray) -> np.ndarray | None:
     contrast = float(np.median(away[np.abs(away) >= 0.35 * np.abs(away).max()]))
     if abs(contrast) < SEEN:
         return None
-    halves = [_middle(np.median(part, axis=1) - background, contrast) for part in np.array_split(g, 2, axis=1)]
+    sides = [np.median(part, axis=1) - background for part in np.array_split(g, 2, axis=1)]
+    if min(np.abs(side).max() for side in sides) < 0.5 * np.abs(away).max():
+        return None  # the line ends within the picture
+    halves = [_middle(side, contrast) for side in sides]
     inside = away / contrast > 0.5
     # the two halves' middles are half a width apart: the tilt over the whole of it is twice their difference
-    return np.array([np.mean(halves), 2 * (halves[1] - halves[0]), background, contrast, np.abs(np.diff(profile)).max() / abs(contrast), float(inside.sum())])
+    return np.array(
+        [
+            np.mean(halves),
+            2 * (halves[1] - halves[0]),
+            background,
+            contrast,
+            np.abs(np.diff(profile)).max() / abs(contrast),
+            float(inside.sum()),
+        ]
+    )
 
 
 def _middle(away: np.ndarray, contrast: float) -> float:
@@ -58,7 +75,7 @@ class Change(NamedTuple):
 
 
 def changes(now: Seen, before: Sequence[Seen], *, moved_px: float, contrast_percent: float) -> tuple[Shift, list[Change]]:
-    """What the camera's figures say, the cause named: moved, other light, other ink, out of focus, another width. Changes that do not matter are left out, however sure."""
+    """What the camera's figures say, the cause named: moved, other light, other ink, out of focus; the bead's width is the process's own affair. Changes that do not matter are left out, however sure."""
     known = np.stack([one.mean for one in before])
     found = shift(now.mean, now.deviation, known, np.stack([one.deviation for one in before]))
     by = dict(zip(FIGURES, found.value - found.reference, strict=True))
@@ -71,18 +88,38 @@ def changes(now: Seen, before: Sequence[Seen], *, moved_px: float, contrast_perc
                    max(sure["row_px"], sure["tilt_px"], key=abs))
         )  # fmt: skip
     light, ink = abs(share["background"]) >= contrast_percent, abs(share["contrast"]) >= contrast_percent
-    together = min(abs(share["background"]), abs(share["contrast"])) >= ALIKE * max(abs(share["background"]), abs(share["contrast"])) and share["background"] * share["contrast"] > 0
+    together = (
+        min(abs(share["background"]), abs(share["contrast"])) >= ALIKE * max(abs(share["background"]), abs(share["contrast"]))
+        and share["background"] * share["contrast"] > 0
+    )
     if (light or ink) and together:
-        causes.append(Change("light", f"the light has changed: background {share['background']:+.0f} % and contrast {share['contrast']:+.0f} % together", sure["contrast"]))
+        causes.append(
+            Change(
+                "light",
+                f"the light has changed: background {share['background']:+.0f} % and contrast {share['contrast']:+.0f} % together",
+                sure["contrast"],
+            )
+        )
     elif ink:
-        causes.append(Change("ink", f"the ink looks different: contrast {share['contrast']:+.0f} %, background {share['background']:+.0f} %: another ink, or another surface under it", sure["contrast"]))
+        causes.append(
+            Change(
+                "ink",
+                f"the ink looks different: contrast {share['contrast']:+.0f} %, background {share['background']:+.0f} %: another ink, or another surface under it",
+                sure["contrast"],
+            )
+        )
     elif light:
-        causes.append(Change("background", f"the background has changed by {share['background']:+.0f} %: another surface, or stray light", sure["background"]))
+        causes.append(
+            Change(
+                "background",
+                f"the background has changed by {share['background']:+.0f} %: another surface, or stray light",
+                sure["background"],
+            )
+        )
     if abs(share["sharpness_per_px"]) >= 2 * contrast_percent and not causes:
-        causes.append(Change("focus", f"the edges are {share['sharpness_per_px']:+.0f} % as steep: the focus has changed", sure["sharpness_per_px"]))
-    if abs(share["width_px"]) >= contrast_percent and not causes:
-        words = f"the bead is {share['width_px']:+.0f} % wide for the same command: the ink's flow, the nozzle, or the camera's distance"
-        causes.append(Change("width", words, sure["width_px"]))
+        causes.append(
+            Change("focus", f"the edges are {share['sharpness_per_px']:+.0f} % as steep: the focus has changed", sure["sharpness_per_px"])
+        )
     return found, causes
 
 

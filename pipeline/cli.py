@@ -12,7 +12,7 @@ def accept(_: argparse.Namespace) -> None:
     """Mark the figures of this run as good: later reports show their differences against them."""
     from pipeline.report.sources import code_files
 
-    metrics = {path.stem: artifacts.read_json(path) for path in sorted(Path("reports/metrics").glob("*.json")) if path.stem != "report"}
+    metrics = {path.stem: artifacts.read_json(path) for path in sorted(Path("reports/metrics").glob("*.json")) if path.stem not in ("report", "nightly")}
     if not metrics:
         raise ValueError("reports/metrics: expected the figures of a run, found none; run ./run dvc repro first")
     files = sorted(

@@ -107,7 +107,9 @@ def estimate(plant: Plant, records: Segments, asked: Sequence[Cause], K: np.ndar
     p = plant.p
     parts = [(*_free(plant, K, u, y, asked), len(y)) for u, y in records if len(y) >= 4 * plant.n + 8]
     if sum(part[2] for part in parts) < 4 * BLOCKS:
-        raise ValueError(f"drift: expected records of at least {4 * BLOCKS} samples to hold against the champion, found {sum(part[2] for part in parts)}; record longer")
+        raise ValueError(
+            f"drift: expected records of at least {4 * BLOCKS} samples to hold against the champion, found {sum(part[2] for part in parts)}; record longer"
+        )
     e, psi = np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])  # (T, p), (T, p, causes)
     seen = np.isfinite(e)
     e, psi = np.where(seen, e, 0.0), np.where(seen[:, :, None], psi, 0.0)
@@ -231,7 +233,9 @@ class Mistake(NamedTuple):
     left: float
 
 
-def mistakes(plant: Plant, u: np.ndarray, y: np.ndarray, *, inputs: Sequence[str], outputs: Sequence[str], scale: np.ndarray, gross: float) -> list[Mistake]:
+def mistakes(
+    plant: Plant, u: np.ndarray, y: np.ndarray, *, inputs: Sequence[str], outputs: Sequence[str], scale: np.ndarray, gross: float
+) -> list[Mistake]:
     """Swapped sensors, swapped inputs and wrong units that explain the record better than taking it at its word, the best first; `scale` (p,) is the errors' usual size.
     The first of the list is the record as it is, with its mean squared error; alone where that is below `gross`, for then nothing is wrong.
 

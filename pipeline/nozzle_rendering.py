@@ -42,16 +42,15 @@ def rendered(seed: Sequence[int], frames: int, least_score: float) -> Seen:
 
 
 def swept(seed: Sequence[int], frames: int, least_score: float) -> Seen:
-    """One segment in each bin of the flow, at a temperature of its own."""
+    """One segment's conditions at a flow in each bin, all at one temperature."""
     rng = np.random.default_rng(seed)
+    segment, degrees = nozzle_scene.draw_segment(rng), rng.choice(nozzle_scene.TEMPERATURES)
     pieces = []
-    for b, (low, high) in enumerate(itertools.pairwise(FLOW_EDGES)):
-        flow, temperature = np.full(frames, rng.uniform(low, high)), np.full(frames, rng.choice(nozzle_scene.TEMPERATURES))
-        cut = nozzle_scene.key_areas(nozzle_scene.render(nozzle_scene.draw_segment(rng), flow, temperature, rng), least_score=least_score)
-        number = np.full(frames, b)
-        pieces.append(
-            Seen(cut.images, nozzle_scene.label(flow), flow, temperature, number, number, cut.valid, np.array(cut.reasons, object))
-        )
+    for low, high in itertools.pairwise(FLOW_EDGES):
+        flow, temperature = np.full(frames, rng.uniform(low, high)), np.full(frames, degrees)
+        cut = nozzle_scene.key_areas(nozzle_scene.render(segment, flow, temperature, rng), least_score=least_score)
+        number = np.zeros(frames, int)
+        pieces.append(Seen(cut.images, nozzle_scene.label(flow), flow, temperature, number, number, cut.valid, np.array(cut.reasons, object)))
     return Seen(*(np.concatenate(columns) for columns in zip(*pieces, strict=True)))
 
 

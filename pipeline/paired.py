@@ -28,7 +28,9 @@ def paired(champion: np.ndarray, challenger: np.ndarray, block: Sequence[str], *
     """Costs (cases,) above 0, less is better; an infinite cost of the challenger counts as a thousand times the champion's. Raises ValueError for costs that are none."""
     champion, challenger = np.asarray(champion, float), np.asarray(challenger, float)
     if len(champion) == 0 or not (np.isfinite(champion).all() and (champion > 0).all() and (challenger >= 0).all()):
-        raise ValueError("paired: expected costs above 0 of at least one case that both ran, found none, or one that is no cost; judge both on the same cases")
+        raise ValueError(
+            "paired: expected costs above 0 of at least one case that both ran, found none, or one that is no cost; judge both on the same cases"
+        )
     ratio = np.clip(challenger / champion, 1e-3, 1e3)
     names = np.asarray(block, object)
     d = np.array([-np.log(ratio[names == name]).mean() for name in dict.fromkeys(block)])

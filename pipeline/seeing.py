@@ -31,6 +31,13 @@ class Counts(Section):
     judged: int = Field(ge=1, le=10_000)
 
 
+class Recorded(Section):
+    """Segments whose windows at every flow are recorded for the simulator: those that controllers are trained and tuned on, and those that they are judged on."""
+
+    learn: int = Field(ge=1, le=1000)
+    judge: int = Field(ge=1, le=1000)
+
+
 class Recipe(Section):
     """How a network of one size is trained."""
 
@@ -63,7 +70,7 @@ class TrainClassifier(Section):
     coverage: float = Field(gt=0.5, lt=1)
     confidence: float = Field(gt=0.5, lt=1)
     false_alarms: float = Field(gt=0, lt=0.5)
-    recorded_segments: int = Field(ge=1, le=1000)
+    recorded: Recorded
 
 
 def parts(p: TrainClassifier, folder: str, execution: Execution) -> tuple[dict[str, Seen], dict[str, Any]]:
@@ -114,9 +121,10 @@ def to_record(p: TrainClassifier, found: dict[str, Seen], execution: Execution) 
     """Frames whose windows controllers are trained on ("learn") and judged on ("judge"): rendered over the whole range of flows, or what a folder has for calibration and judging."""
     if p.source == "recordings":
         return {"learn": found["calibration"], "judge": found["judged"]}
-    calls = [delayed(swept)((p.seed, len(PARTS) + k, i), p.window, p.least_score) for k in range(2) for i in range(p.recorded_segments)]
+    counts = p.recorded.model_dump()
+    calls = [delayed(swept)((p.seed, len(PARTS) + k, i), p.window, p.least_score) for k, part in enumerate(counts) for i in range(counts[part])]
     done = iter(tqdm(run_all(calls, execution), total=len(calls), desc="train_classifier: windows at every flow", mininterval=2))
-    return {part: joined([next(done) for _ in range(p.recorded_segments)]) for part in ("learn", "judge")}
+    return {part: joined([next(done) for _ in range(count)]) for part, count in counts.items()}
 
 
 def edges(flows: Sequence[np.ndarray]) -> np.ndarray:

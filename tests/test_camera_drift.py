@@ -10,10 +10,10 @@ LIMITS = {"moved_px": 2.0, "contrast_percent": 15.0}
 
 
 def night(seed: int, **changes) -> camera_drift.Seen:
-    """40 frames of a bead between 100 and 116 px wide, as the ink lies that night."""
+    """25 frames of a bead between 100 and 116 px wide, as the ink lies that night."""
     rng = np.random.default_rng(seed)
     camera = rendering.Camera(rendering.NOMINAL._replace(**changes), rng)
-    return camera_drift.figures([camera.frame(float(rng.uniform(100, 116)), stage_px=int(rng.integers(10_000))) for _ in range(40)])
+    return camera_drift.figures([camera.frame(float(rng.uniform(100, 116)), stage_px=int(rng.integers(10_000))) for _ in range(25)])
 
 
 @pytest.fixture(scope="module")
@@ -21,11 +21,11 @@ def good() -> list[camera_drift.Seen]:
     return [night(k) for k in range(4)]
 
 
-def test_pictures_of_the_same_scene_raise_nothing_in_ten_nights(good):
-    for k in range(10):
+def test_pictures_of_the_same_scene_raise_nothing_in_six_nights(good):
+    for k in range(6):
         found, causes = camera_drift.changes(night(20 + k), good, **LIMITS)
         assert causes == []
-        assert np.abs(found.sigmas).max() < 5  # 60 figures; the night's alarm needs the change to matter as well
+        assert np.abs(found.sigmas).max() < 5  # 36 figures; the night's alarm needs the change to matter as well
 
 
 @pytest.mark.parametrize(

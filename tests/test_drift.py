@@ -61,7 +61,9 @@ def test_the_change_of_a_gain_is_measured_to_a_percent():
 )
 def test_a_longer_time_constant_is_told_from_a_lower_gain(changes, cause):
     for seed in (2, 3):
-        (own, mine), (_, slow) = (shifts(two_zones(**changes), seed, K) for K in (drift.observer(MODEL, SAMPLES), drift.slow_observer(MODEL, SAMPLES)))
+        (own, mine), (_, slow) = (
+            shifts(two_zones(**changes), seed, K) for K in (drift.observer(MODEL, SAMPLES), drift.slow_observer(MODEL, SAMPLES))
+        )
         found = drift.named(np.abs(own.value - own.reference) > 0.04, mine, slow)
         assert [CAUSES[k] for k in found] == [cause]
         # of 10 %, to a fifth: rates fall to 1 / 1.1

@@ -75,7 +75,11 @@ def test_a_worse_challenger_changes_nothing_but_the_report(project):
     assert status == night.OK and "kept" in said and "no better" in said
     assert project.production() == before and project.champion()["run"] == "night-0001" and project.dirty() == []
     metrics = json.loads((project.folder / "reports/metrics/nightly.json").read_text())
-    assert metrics["decision"] == "kept" and metrics["champion"]["toy"]["run"] == "night-0001" and metrics["decisions"]["toy"]["paired"]["p"] == 1.0
+    assert (
+        metrics["decision"] == "kept"
+        and metrics["champion"]["toy"]["run"] == "night-0001"
+        and metrics["decisions"]["toy"]["paired"]["p"] == 1.0
+    )
 
 
 def test_a_night_with_bad_data_leaves_the_last_good_run_and_the_next_night_works(project):
@@ -152,7 +156,9 @@ def test_a_promotion_that_was_killed_before_its_commit_never_was(project):
     model = project.folder / "datasets/learn/model.json"
     model.write_text("10.0")
     described = {"run": "night-0002", "when": "2030-01-01T00:00:00+00:00", "why": "killed"}
-    state = champion.promoted(champion.read(), "toy", described | champion.install("toy", ["datasets/learn/model.json"], {}), event="promoted")
+    state = champion.promoted(
+        champion.read(), "toy", described | champion.install("toy", ["datasets/learn/model.json"], {}), event="promoted"
+    )
     (project.folder / "champion.json").write_text(json.dumps(state))
     guarding.RUNNING.touch()
     assert project.production() != before
@@ -281,17 +287,26 @@ def test_killed_at_twenty_random_moments_the_champion_is_whole_and_the_next_nigh
 @pytest.mark.slow
 def test_a_sweep_runs_every_point_beside_the_working_tree_and_tabulates_it(project):
     text = (project.folder / "learn.py").read_text()
-    (project.folder / "learn.py").write_text(text.replace("sum(values) / len(values)", "sum(values) / len(values) + __import__('yaml').safe_load(pathlib.Path('params.yaml').read_text())['shift']"))
+    (project.folder / "learn.py").write_text(
+        text.replace(
+            "sum(values) / len(values)",
+            "sum(values) / len(values) + __import__('yaml').safe_load(pathlib.Path('params.yaml').read_text())['shift']",
+        )
+    )
     parameters = json.loads((project.folder / "params.yaml").read_text()) | {"shift": 0}
     (project.folder / "params.yaml").write_text(json.dumps(parameters, indent=1))
-    (project.folder / "dvc.yaml").write_text((project.folder / "dvc.yaml").read_text().replace("deps: [learn.py,", "params: [shift]\n    deps: [learn.py,"))
+    (project.folder / "dvc.yaml").write_text(
+        (project.folder / "dvc.yaml").read_text().replace("deps: [learn.py,", "params: [shift]\n    deps: [learn.py,")
+    )
     project.run("git", "commit", "-qam", "a parameter")
     before = (project.folder / "datasets/learn/model.json").read_bytes()
     found = project.beadline("sweep", "-S", "shift=1,2", "--target", "learn", "--metric", "learn:mean")
     assert found.returncode == 0, found
     table = (project.folder / "reports/sweep.csv").read_text().splitlines()
     assert table == ["experiment,shift,learn:mean", "sweep-shift-1,1,12.0", "sweep-shift-2,2,13.0"]
-    assert (project.folder / "datasets/learn/model.json").read_bytes() == before and "lowest in experiment 1" in (project.folder / "reports/sweep.html").read_text()
+    assert (project.folder / "datasets/learn/model.json").read_bytes() == before and "lowest in experiment 1" in (
+        project.folder / "reports/sweep.html"
+    ).read_text()
     assert project.run("git", "diff", "--stat").stdout == ""
 
 

@@ -12,7 +12,9 @@ import pytest
 
 from tests.toy_nights import Project
 
-pytest.importorskip("moto", reason="moto[server] is not installed: ./run --with 'moto[server]' --with dvc-s3 pytest -m slow tests/test_nightly_s3.py")
+pytest.importorskip(
+    "moto", reason="moto[server] is not installed: ./run --with 'moto[server]' --with dvc-s3 pytest -m slow tests/test_nightly_s3.py"
+)
 pytest.importorskip("dvc_s3", reason="dvc-s3 is not installed")
 
 
@@ -41,7 +43,13 @@ def server(tmp_path):
 @pytest.mark.slow
 def test_a_night_pushes_to_s3_and_a_fresh_clone_has_the_champion_bit_by_bit(server, tmp_path):
     project = Project(tmp_path / "toy").make()
-    project.env |= {"AWS_ACCESS_KEY_ID": "test", "AWS_SECRET_ACCESS_KEY": "test", "AWS_DEFAULT_REGION": "us-east-1", "NO_PROXY": "127.0.0.1", "no_proxy": "127.0.0.1"}
+    project.env |= {
+        "AWS_ACCESS_KEY_ID": "test",
+        "AWS_SECRET_ACCESS_KEY": "test",
+        "AWS_DEFAULT_REGION": "us-east-1",
+        "NO_PROXY": "127.0.0.1",
+        "no_proxy": "127.0.0.1",
+    }
     dvc = (sys.executable, "-m", "dvc")
     project.run(*dvc, "remote", "add", "-q", "-d", "store", "s3://beadline/dvc")
     project.run(*dvc, "remote", "modify", "-q", "store", "endpointurl", server)

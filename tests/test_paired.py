@@ -8,7 +8,12 @@ from pipeline.nightly.settings import Rule
 from pipeline.paired import blocks_needed, paired
 
 RULE = Rule(
-    level=0.01, least_improvement_percent=5, worst_case_percent=5, settled_error_degC=0.05, at_limits_points=1, disk_margin=0.05, holdout_error_percent=5
+    level=0.01,
+    least_improvement_percent=5,
+    worst_case_percent=5,
+    settled_error_degC=0.05,
+    least_disk_margin=0.5,
+    holdout_error_percent=5,
 )
 
 
@@ -46,7 +51,9 @@ def test_costs_that_are_none_are_refused():
 
 
 def _evidence(cost: float, **guards: float) -> Evidence:
-    return Evidence("panel", {f"case {k}": (f"plant {k}", cost * (1 + k)) for k in range(8)}, {"worst_case": 10.0, "unstable_plants": 0.0} | guards)
+    return Evidence(
+        "panel", {f"case {k}": (f"plant {k}", cost * (1 + k)) for k in range(8)}, {"worst_case": 10.0, "unstable_plants": 0.0} | guards
+    )
 
 
 def _decide(champion, challenger, alarms=()):
@@ -73,7 +80,11 @@ def test_the_rule_promotes_what_is_better_and_nothing_else():
     ],
 )  # fmt: skip
 def test_a_better_mean_alone_does_not_promote(challenger, alarms, reason):
-    champion = _evidence(1.0) if challenger.cases["case 0"][0] != "plant" else _evidence(1.0)._replace(cases={f"case {k}": ("plant", 1.0) for k in range(8)})
+    champion = (
+        _evidence(1.0)
+        if challenger.cases["case 0"][0] != "plant"
+        else _evidence(1.0)._replace(cases={f"case {k}": ("plant", 1.0) for k in range(8)})
+    )
     found = _decide(champion, challenger, alarms)
     assert found.decision == KEPT and any(reason in sentence for sentence in found.reasons), found.reasons
 

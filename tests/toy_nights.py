@@ -8,7 +8,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 
-LEARN = '''
+LEARN = """
 import json, pathlib, sys, time
 values = []
 for path in sorted(pathlib.Path("datasets/raw/toy").rglob("*.csv")):
@@ -26,10 +26,10 @@ out.mkdir(parents=True, exist_ok=True)
 metrics = pathlib.Path("reports/metrics/learn.json")
 metrics.parent.mkdir(parents=True, exist_ok=True)
 metrics.write_text(json.dumps({"mean": sum(values) / len(values), "samples": len(values)}))
-'''
+"""
 
 # the true mean is 10; a case costs 1 and how far the model is from it
-EVALUATE = '''
+EVALUATE = """
 import json, pathlib
 model = json.loads(pathlib.Path("datasets/learn/model.json").read_text())
 cases = {f"case {k}": {"block": f"plant {k}", "cost": 1 + abs(model - 10) + 0.001 * k} for k in range(8)}
@@ -37,7 +37,7 @@ out = pathlib.Path("datasets/evaluate")
 out.mkdir(parents=True, exist_ok=True)
 guards = {"worst": {"value": abs(model - 10), "allowed": 0.1}, "unstable": {"value": 0, "allowed": 0}}
 (out / "cases.json").write_text(json.dumps({"panel": "toy 1", "cases": cases, "guards": guards}))
-'''
+"""
 
 DVC = """
 stages:
@@ -61,7 +61,7 @@ SETTINGS = {
         }
     },
     "rule": {
-        "level": 0.01, "least_improvement_percent": 5, "worst_case_percent": 5, "settled_error_degC": 0.05, "at_limits_points": 1, "disk_margin": 0.05,
+        "level": 0.01, "least_improvement_percent": 5, "worst_case_percent": 5, "settled_error_degC": 0.05,  "least_disk_margin": 0.5,
         "holdout_error_percent": 5,
     },
     "holdout": {
@@ -70,7 +70,7 @@ SETTINGS = {
     },
     "drift": {
         "alarm_sigmas": 5, "watch_sigmas": 3, "parameter_percent": 4, "offset_degC": 0.5, "noise_percent": 50, "effort_percent": 5, "at_limits_points": 10,
-        "camera_px": 2, "contrast_percent": 15, "class_points": 10,
+        "camera_px": 2, "contrast_percent": 15,
     },
 }  # fmt: skip
 
@@ -120,7 +120,12 @@ class Project:
 
     def start(self) -> subprocess.Popen:
         return subprocess.Popen(
-            [sys.executable, "-m", "pipeline.cli", "nightly"], cwd=self.folder, env=self.env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            [sys.executable, "-m", "pipeline.cli", "nightly"],
+            cwd=self.folder,
+            env=self.env,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
         )
 
     def night(self) -> subprocess.CompletedProcess:

@@ -100,7 +100,15 @@ def _out(loop: str) -> dict[str, Any]:
 def promoted(state: Mapping[str, Any], loop: str, entry: Mapping[str, Any], *, event: str) -> dict[str, Any]:
     """champion.json with `entry` in production, and one more line of its history."""
     before = state["champions"].get(loop, {}).get("run")
-    line = {"run": entry["run"], "loop": loop, "event": event, "when": entry["when"], "why": entry["why"], "before": before, "champion": dict(entry)}
+    line = {
+        "run": entry["run"],
+        "loop": loop,
+        "event": event,
+        "when": entry["when"],
+        "why": entry["why"],
+        "before": before,
+        "champion": dict(entry),
+    }
     if event == "rolled back":
         line["replaced"] = state["champions"][loop]["files"]
     return {**state, "champions": {**state["champions"], loop: dict(entry)}, "history": [*state["history"], line]}
@@ -129,7 +137,9 @@ def earlier(state: Mapping[str, Any], run: str, loop: str) -> dict[str, dict[str
         last = next(line["loop"] for line in reversed(history) if line["loop"] in found)
         return {last: found[last]}
     known = ", ".join(dict.fromkeys(f"{line['run']} ({line['loop']})" for line in state["history"])) or "none"
-    raise ValueError(f"{FILE}: expected {f'a champion of {run}' if run else 'an earlier champion'} to go back to, found none; known are: {known}")
+    raise ValueError(
+        f"{FILE}: expected {f'a champion of {run}' if run else 'an earlier champion'} to go back to, found none; known are: {known}"
+    )
 
 
 def put_back(loop: str, entry: Mapping[str, Any]) -> None:
@@ -141,7 +151,9 @@ def put_back(loop: str, entry: Mapping[str, Any]) -> None:
         _fetch(pointer)
         wrong = sorted(set(md5s(FOLDER / loop).items()) ^ set(entry["files"].items()))
         if wrong:
-            raise ValueError(f"{FOLDER / loop}: {wrong[0][0]} is not what it was in {entry['run']}; bring DVC's cache or remote back, and run it again")
+            raise ValueError(
+                f"{FOLDER / loop}: {wrong[0][0]} is not what it was in {entry['run']}; bring DVC's cache or remote back, and run it again"
+            )
     except ValueError:
         if present:
             artifacts.write_text(pointer, present.decode())

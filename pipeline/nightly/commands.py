@@ -35,7 +35,9 @@ def add(commands) -> None:
     command.add_argument("--merge", metavar="BRANCH", default="", help="merge the nights of another branch first")
     command.set_defaults(run=nightly)
     command = commands.add_parser("rollback", help=rollback.__doc__)
-    command.add_argument("of", metavar="RUN", nargs="?", default="", help="such as night-0042; default: the champion before the present one")
+    command.add_argument(
+        "of", metavar="RUN", nargs="?", default="", help="such as night-0042; default: the champion before the present one"
+    )
     command.add_argument("--loop", default="", help="only this loop")
     command.set_defaults(run=rollback)
     command = commands.add_parser("sweep", help=sweep.__doc__)

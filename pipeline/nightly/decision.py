@@ -29,18 +29,26 @@ class Decision(NamedTuple):
         return self.decision in (PROMOTED, FIRST)
 
 
-def decide(champion: Evidence | None, challenger: Evidence, rule: Rule, *, allowed: Mapping[str, float], alarms: list[str], seed: int) -> Decision:
+def decide(
+    champion: Evidence | None, challenger: Evidence, rule: Rule, *, allowed: Mapping[str, float], alarms: list[str], seed: int
+) -> Decision:
     """Promote where the paired test finds the challenger better by at least `rule.least_improvement_percent`, no guard is worse by more than `allowed`, and nothing has drifted."""
     infinite = [case for case, (_, cost) in challenger.cases.items() if not np.isfinite(cost)]
-    unfit = [f"{name} is {figure:g}; none is allowed" for name, figure in challenger.guards.items() if name.startswith("unstable") and figure > 0]
+    unfit = [
+        f"{name} is {figure:g}; none is allowed" for name, figure in challenger.guards.items() if name.startswith("unstable") and figure > 0
+    ]
     if champion is None:
         reasons = unfit + ([f"{len(infinite)} of {len(challenger.cases)} cases fail, such as {infinite[0]}"] if infinite else [])
         figures = {"guards": {name: {"challenger": figure} for name, figure in challenger.guards.items()}}
-        return Decision(KEPT, ["there is no champion, and the challenger is not fit to be one: " + "; ".join(reasons)], figures) if reasons else Decision(
-            FIRST, ["there was no champion to compare with"], figures
+        return (
+            Decision(KEPT, ["there is no champion, and the challenger is not fit to be one: " + "; ".join(reasons)], figures)
+            if reasons
+            else Decision(FIRST, ["there was no champion to compare with"], figures)
         )
     if champion.panel != challenger.panel:
-        return Decision(KEPT, [f"the two were judged on different cases ({champion.panel[:12]}, {challenger.panel[:12]}): they cannot be compared"], {})
+        return Decision(
+            KEPT, [f"the two were judged on different cases ({champion.panel[:12]}, {challenger.panel[:12]}): they cannot be compared"], {}
+        )
     shared = [case for case in champion.cases if case in challenger.cases]
     found = paired(
         np.array([champion.cases[case][1] for case in shared]), np.array([challenger.cases[case][1] for case in shared]),
@@ -65,7 +73,9 @@ def _against(found, rule: Rule) -> list[str]:
         return [f"{found.blocks} blocks cannot tell at level {rule.level:g}; at least {blocks_needed(rule.level)} are needed"]
     told = f"{found.improvement_percent:.1f} % ({found.low_percent:.1f} to {found.high_percent:.1f} %, p = {found.p:.2g})"
     if found.improvement_percent <= 0:
-        return [f"the challenger is no better: its cases cost {-found.improvement_percent:.1f} % more ({-found.high_percent:.1f} to {-found.low_percent:.1f} %)"]
+        return [
+            f"the challenger is no better: its cases cost {-found.improvement_percent:.1f} % more ({-found.high_percent:.1f} to {-found.low_percent:.1f} %)"
+        ]
     if found.improvement_percent < rule.least_improvement_percent:
         return [f"the challenger is better by {told}; at least {rule.least_improvement_percent:g} % is worth a change"]
     if found.p > rule.level:

@@ -32,7 +32,9 @@ def alone() -> Iterator[list[str]]:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             holder = os.pread(descriptor, 100, 0).decode(errors="replace").strip() or "unknown"
-            raise BusyError(f"another night is at work (process {holder}); this one changed nothing; run it again when that has ended") from None
+            raise BusyError(
+                f"another night is at work (process {holder}); this one changed nothing; run it again when that has ended"
+            ) from None
         os.ftruncate(descriptor, 0)
         os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
         left = _after_a_kill()
@@ -75,7 +77,9 @@ def ready(least_free_mb: float) -> None:
             raise ValueError(f"a {word} is under way in git; finish it (or give it up with git {word} --abort), and run it again")
     free = shutil.disk_usage(Path()).free / 1e6
     if free < least_free_mb:
-        raise ValueError(f"the disk has {free:.0f} MB left, but a night needs {least_free_mb:g} MB (nightly.least_free_mb); free some space, or run dvc gc --all-commits")
+        raise ValueError(
+            f"the disk has {free:.0f} MB left, but a night needs {least_free_mb:g} MB (nightly.least_free_mb); free some space, or run dvc gc --all-commits"
+        )
     if not RESERVE.exists() or RESERVE.stat().st_size < RESERVE_BYTES:
         artifacts.write_text(RESERVE, "0" * RESERVE_BYTES)
 

@@ -12,7 +12,9 @@ from pipeline import artifacts
 def sources() -> list[str]:
     """Files and folders that dvc.yaml's stages read and none of them writes; params.yaml and dvc.yaml with them."""
     stages = yaml.safe_load(Path("dvc.yaml").read_text(encoding="utf-8")).get("stages", {})
-    made = {name for stage in stages.values() for kind in ("outs", "metrics", "plots") for out in stage.get(kind, []) for name in _names(out)}
+    made = {
+        name for stage in stages.values() for kind in ("outs", "metrics", "plots") for out in stage.get(kind, []) for name in _names(out)
+    }
     read = {dep for stage in stages.values() for dep in stage.get("deps", [])} | {"params.yaml", "dvc.yaml"}
     return sorted(dep for dep in read if not any(f"{dep}/".startswith(f"{out}/") for out in made) and dep != "reports/accepted.json")
 
@@ -39,7 +41,11 @@ class Hashes:
         """{path: digest} of a file, or of every file below a folder that a stage would read."""
         path = Path(place)
         files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
-        kept = [file for file in files if not any(part.startswith(".") or part == "__pycache__" for part in file.parts) and file.suffix != ".pyc"]
+        kept = [
+            file
+            for file in files
+            if not any(part.startswith(".") or part == "__pycache__" for part in file.parts) and file.suffix != ".pyc"
+        ]
         return {file.as_posix(): self.of(file) for file in kept}
 
 

@@ -36,29 +36,46 @@ def _cases(path: Path) -> tuple[Evidence, dict[str, float]]:
     """{"panel": name, "cases": {case: {"block": name, "cost": number}}, "guards": {guard: {"value": number, "allowed": number}}}."""
     found = artifacts.read_json(path)
     try:
-        cases = {name: (str(case["block"]), float(case["cost"]) if case["cost"] is not None else np.inf) for name, case in found["cases"].items()}
+        cases = {
+            name: (str(case["block"]), float(case["cost"]) if case["cost"] is not None else np.inf) for name, case in found["cases"].items()
+        }
         guards = {name: float(guard["value"]) for name, guard in found["guards"].items()}
         return Evidence(str(found["panel"]), cases, guards), {name: float(guard["allowed"]) for name, guard in found["guards"].items()}
     except (KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path}: expected panel, cases with block and cost, and guards with value and allowed, found no {error}; let its stage write them") from None
+        raise ValueError(
+            f"{path}: expected panel, cases with block and cost, and guards with value and allowed, found no {error}; let its stage write them"
+        ) from None
 
 
 def _deposition(folder: Path) -> Evidence:
     """Of each part program and material, none of which was trained on: the error of the flow that the chosen composer leaves, as its stage scored it. Guard: the worst line."""
     table = artifacts.read_table(folder / "compose_parts/scores.parquet", schemas.SCORES)
     rows = [k for k, chosen in enumerate(table["chosen"]) if chosen]
-    cases = {f"{table['part'][k]}, {table['material'][k]}": (f"{table['part'][k]}, {table['material'][k]}", max(float(table["rms_percent_of_on_off"][k]), 1e-3)) for k in rows}
+    cases = {
+        f"{table['part'][k]}, {table['material'][k]}": (
+            f"{table['part'][k]}, {table['material'][k]}",
+            max(float(table["rms_percent_of_on_off"][k]), 1e-3),
+        )
+        for k in rows
+    }
     worst = np.nanmax([table["worst_line_volume_percent"][k] for k in rows], initial=0.0)
     return Evidence(joblib.hash(sorted(cases)), cases, {"worst_line_volume_percent": float(worst)})
 
 
 def _setpoint(folder: Path) -> Evidence:
     """Of each case of each simulator that counts: the share of runs that the chosen controller does not settle, plus one point. Guards: the worst case, and the slowest."""
-    table, chosen = artifacts.read_table(folder / "evaluate_setpoint/scoreboard.parquet", setpoint_schemas.SCOREBOARD), artifacts.read_json(folder / "evaluate_setpoint/choice.json")
+    table, chosen = (
+        artifacts.read_table(folder / "evaluate_setpoint/scoreboard.parquet", setpoint_schemas.SCOREBOARD),
+        artifacts.read_json(folder / "evaluate_setpoint/choice.json"),
+    )
     rows = [k for k, name in enumerate(table["controller"]) if name == chosen["name"] and table["counts"][k]]
     lost = {f"{table['simulator'][k]}: {table['case'][k]}": 101.0 - float(table["settled_percent"][k]) for k in rows}
     slow = np.nanmax([table["p90_steps"][k] for k in rows], initial=0.0)
-    return Evidence(joblib.hash(sorted(lost)), {name: (name, cost) for name, cost in lost.items()}, {"worst_unsettled_percent": max(lost.values()), "slowest_p90_steps": float(slow)})
+    return Evidence(
+        joblib.hash(sorted(lost)),
+        {name: (name, cost) for name, cost in lost.items()},
+        {"worst_unsettled_percent": max(lost.values()), "slowest_p90_steps": float(slow)},
+    )
 
 
 # ---- the temperature loop
@@ -66,8 +83,8 @@ def _setpoint(folder: Path) -> Evidence:
 
 def _allowed(champion: Evidence, rule: Rule) -> dict[str, float]:
     return {
-        "worst_case": champion.guards["worst_case"] * rule.worst_case_percent / 100, "settled_error_degC": rule.settled_error_degC, "at_limits_percent": rule.at_limits_points,
-        "lost_disk_margin": rule.disk_margin, "holdout_error_degC": champion.guards.get("holdout_error_degC", 0.0) * rule.holdout_error_percent / 100,
+        "worst_case": champion.guards["worst_case"] * rule.worst_case_percent / 100, "settled_error_degC": rule.settled_error_degC,
+        "holdout_error_degC": champion.guards.get("holdout_error_degC", 0.0) * rule.holdout_error_percent / 100,
     }  # fmt: skip
 
 
@@ -75,7 +92,12 @@ def _temperature(settings: Nightly) -> Callable[[Path], Evidence]:
     """Closed loop on every plant of the frozen panel, from starts and to references of section `nightly.holdout`, with its seeds; prediction on the hold-out recordings."""
     from pipeline.temperature import judging, plant, scorecard
 
-    h, machine, tracking, panel = settings.holdout, params.load(params.Plant, "plant"), params.load(params.Tracking, "tracking"), params.load(params.Panel, "panel")
+    h, machine, tracking, panel = (
+        settings.holdout,
+        params.load(params.Plant, "plant"),
+        params.load(params.Tracking, "tracking"),
+        params.load(params.Panel, "panel"),
+    )
     weights = params.read()["tune_weights"]
     allowance = scorecard.Allowance(*(float(weights[f"allow_{name}"]) for name in scorecard.Allowance._fields[:-1]), 0.0)
     simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
@@ -92,21 +114,43 @@ def _temperature(settings: Nightly) -> Callable[[Path], Evidence]:
         steps=h.steps, hold=panel.hold_steps, cells=simulated,
     )  # fmt: skip
     limits = tuple(np.array([(i.low, i.high) for i in machine.inputs]).T)
-    name = joblib.hash((h.model_dump(), [tuple(map(np.asarray, one)) for one in plants], machine.model_dump(), tracking.model_dump(), panel.model_dump(), tuple(allowance)))
+    name = joblib.hash(
+        (
+            h.model_dump(),
+            [tuple(map(np.asarray, one)) for one in plants],
+            machine.model_dump(),
+            tracking.model_dump(),
+            panel.model_dump(),
+            tuple(allowance),
+        )
+    )
 
     def measured(folder: Path) -> Evidence:
         made, predictor, weight = controller(folder, h.controller, tracking.gamma)
         law = made.design(weight["q"], weight["r"], tracking.integral)
         aims = judging.targets(made.model, scenarios.r, limits)
-        run = scorecard.simulate(scenarios, law, scorecard.feed_forward(scenarios, law, aims), limits=limits, integral_band=tracking.integral_limit_degC)
+        run = scorecard.simulate(
+            scenarios, law, scorecard.feed_forward(scenarios, law, aims), limits=limits, integral_band=tracking.integral_limit_degC
+        )
         found = scorecard.figures(scenarios, run, limits=limits, band=panel.band_degC, sample_time_s=machine.sample_time_s)
         margins = scorecard.margins(plants, law, grid=80)
-        return _temperature_evidence(name, scenarios, found, margins, allowance, machine.sample_time_s, _prediction_error(predictor, records))
+        return _temperature_evidence(
+            name,
+            scenarios,
+            found,
+            margins,
+            allowance,
+            machine.sample_time_s,
+            _prediction_error(predictor, records),
+            settings.rule.least_disk_margin,
+        )
 
     return measured
 
 
-def _temperature_evidence(name: str, scenarios, found, margins, allowance, sample_time_s: float, holdout: float | None) -> Evidence:
+def _temperature_evidence(
+    name: str, scenarios, found, margins, allowance, sample_time_s: float, holdout: float | None, least_margin: float
+) -> Evidence:
     from pipeline.temperature import scorecard
 
     costs = []
@@ -122,8 +166,8 @@ def _temperature_evidence(name: str, scenarios, found, margins, allowance, sampl
     }
     by_plant = [np.mean(np.array(costs)[scenarios.plant == p]) for p in np.unique(scenarios.plant)]
     guards = {
-        "worst_case": float(np.max(by_plant)), "settled_error_degC": float(found.settled_error_degC.max()), "at_limits_percent": float(found.at_limits_percent.max()),
-        "lost_disk_margin": 2.0 - min(margin.disk for margin in margins), "unstable_plants": float(sum(not margin.stable for margin in margins)),
+        "worst_case": float(np.max(by_plant)), "settled_error_degC": float(found.settled_error_degC.max()),
+        "margin_short_of_least": max(least_margin - min(margin.disk for margin in margins), 0.0), "unstable_plants": float(sum(not margin.stable for margin in margins)),
     }  # fmt: skip
     return Evidence(name, cases, guards | ({"holdout_error_degC": holdout} if holdout is not None else {}))
 
@@ -143,12 +187,16 @@ def controller(folder: Path, which: str, gamma: float):
 def _holdout_records(h: HoldOut, machine: params.Plant) -> list[tuple[np.ndarray, np.ndarray]]:
     """The hold-out recordings as gapless segments. Raises ValueError where there is none that can be read."""
     if not Path(h.recordings).is_dir():
-        raise ValueError(f"{h.recordings}: expected recordings that nothing is trained on, found none; put one of the machine as commissioned there")
+        raise ValueError(
+            f"{h.recordings}: expected recordings that nothing is trained on, found none; put one of the machine as commissioned there"
+        )
     segments = record_segments(Path(h.recordings), machine)
     return [pair for pairs in segments.values() for pair in pairs]
 
 
-def record_segments(folder: Path, machine: params.Plant, *, broken: dict[str, str] | None = None) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
+def record_segments(
+    folder: Path, machine: params.Plant, *, broken: dict[str, str] | None = None
+) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
     """{recording: [(u, y), ...]} below a folder, read as the stage `ingest` reads, through its memo; reasons of those that cannot be read go to `broken`."""
     declared: dict[str, Any] = params.read()["ingest"]
     mapping = {name: (m["source"], m["unit"], float(m["scale"]), float(m["offset"])) for name, m in declared["mapping"].items()}
@@ -191,7 +239,9 @@ def _panel_plants(records: list[tuple[np.ndarray, np.ndarray]], machine: params.
     u, y = [a for a, _ in records], [b for _, b in records]
     names = [i.name for i in machine.inputs]
     u, _ = identification.within_limits(u, tuple(zip(*((i.low, i.high) for i in machine.inputs), strict=True)), names=names)
-    found = identification.identify(u, y, sample_time_s=machine.sample_time_s, order=None, offset=p["offset"], refinement="none", max_order=p["max_order"], names=names)
+    found = identification.identify(
+        u, y, sample_time_s=machine.sample_time_s, order=None, offset=p["offset"], refinement="none", max_order=p["max_order"], names=names
+    )
     family = validation.bootstrap_spread(u, y, found, count=p["spread_plants"], order=found.order, rng=np.random.default_rng(p["seed"]))
     artifacts.write_arrays(path, "holdout_plants", 1, plant.stored([found.plant, *family]))
     return plant.restored(artifacts.read_arrays(path, "holdout_plants", 1))

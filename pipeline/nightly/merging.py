@@ -14,7 +14,9 @@ def merge(branch: str) -> str:
     """Merges `branch`; where both sides' nights wrote, ours stays and the history of both is kept. Raises ValueError where people's own files conflict, and gives the merge up."""
     with guarding.alone():
         if git("status", "--porcelain", "--untracked-files=no"):
-            raise ValueError("expected everything committed before a merge, found changes; commit or stash them (git status), and run it again")
+            raise ValueError(
+                "expected everything committed before a merge, found changes; commit or stash them (git status), and run it again"
+            )
         if not git("rev-parse", "--verify", "-q", branch, check=False):
             raise ValueError(f"{branch} is no branch of this repository; git branch -a lists them")
         mine, theirs = champion.read(), _of(branch)
@@ -26,11 +28,16 @@ def merge(branch: str) -> str:
         conflicts = git("diff", "--name-only", "--diff-filter=U").splitlines()
         if conflicts:
             git("merge", "--abort")
-            raise ValueError(f"{branch} and this branch both changed {', '.join(conflicts)}; merge them by hand (git merge {branch}), then run ./run beadline nightly")
+            raise ValueError(
+                f"{branch} and this branch both changed {', '.join(conflicts)}; merge them by hand (git merge {branch}), then run ./run beadline nightly"
+            )
         seen = {_key(line) for line in mine["history"]}
         both = [*mine["history"], *(line for line in theirs["history"] if _key(line) not in seen)]
         # a loop that has no champion here keeps theirs
-        artifacts.write_json(champion.FILE, {**mine, "champions": {**theirs["champions"], **mine["champions"]}, "history": sorted(both, key=lambda line: line["when"])})
+        artifacts.write_json(
+            champion.FILE,
+            {**mine, "champions": {**theirs["champions"], **mine["champions"]}, "history": sorted(both, key=lambda line: line["when"])},
+        )
         git("add", "--", str(champion.FILE))
         git("commit", "-q", "--no-edit", env=identity())
         dvc("checkout", "--quiet", "--force", *(path for path in champion.paths() if path.endswith(".dvc")))

@@ -34,7 +34,13 @@ def nightly(now: datetime.datetime | None = None) -> tuple[int, str]:
 
 def _night(settings: Nightly, now: datetime.datetime, left: list[str]) -> tuple[int, str]:
     remembered, clock = watch.last(), time.monotonic()
-    entry: dict[str, Any] = {"night": int(remembered["night"]) + 1, "run": f"night-{int(remembered['night']) + 1:04d}", "when": watch.stamp(now), "outcome": "", "notes": left}
+    entry: dict[str, Any] = {
+        "night": int(remembered["night"]) + 1,
+        "run": f"night-{int(remembered['night']) + 1:04d}",
+        "when": watch.stamp(now),
+        "outcome": "",
+        "notes": left,
+    }
     success = remembered.get("success")
     if success and now < datetime.datetime.fromisoformat(success):
         entry["notes"].append(f"the clock was set back: it is {entry['when']}, and the last success was at {success}")
@@ -109,7 +115,14 @@ def _judge(settings: Nightly, entry: dict[str, Any], state: dict[str, Any]) -> d
             promoted.append(name)
             known = screening.reference(loop, Path("datasets"))
             made = champion.install(name, loop.artifacts, {screening.REFERENCE: known} if known else {})
-            described = {"run": entry["run"], "when": entry["when"], "why": "; ".join(decision.reasons), **made, "metrics": figures, "lineage": lineage}
+            described = {
+                "run": entry["run"],
+                "when": entry["when"],
+                "why": "; ".join(decision.reasons),
+                **made,
+                "metrics": figures,
+                "lineage": lineage,
+            }
             state = champion.promoted(state, name, described, event=decision.decision)
     entry["decisions"] = decisions
     entry |= {
@@ -137,7 +150,11 @@ def _decide(settings: Nightly, name: str, state: dict[str, Any], entry: dict[str
     before = judged.measure(champion.FOLDER / name) if present else None
     alarms = [alarm["cause"] for alarm in entry["drift"].get("alarms", []) if alarm["loop"] == name]
     allowed = judged.allowed(before) if before else {}
-    figures = {"panel": challenger.panel, "mean_cost": float(np.mean([cost for _, cost in challenger.cases.values()])), "guards": challenger.guards}
+    figures = {
+        "panel": challenger.panel,
+        "mean_cost": float(np.mean([cost for _, cost in challenger.cases.values()])),
+        "guards": challenger.guards,
+    }
     return decide(before, challenger, settings.rule, allowed=allowed, alarms=alarms, seed=entry["night"]), figures
 
 
@@ -150,7 +167,8 @@ def _lineage(settings: Nightly) -> dict[str, Any]:
         "dvc_lock": artifacts.sha256("dvc.lock"),
         "params": artifacts.sha256("params.yaml"),
         "recordings": {
-            name: {path: artifacts.sha256(path) for path in sorted(inputs.recordings(inputs.Hashes({}), loop.recordings))} for name, loop in settings.loops.items()
+            name: {path: artifacts.sha256(path) for path in sorted(inputs.recordings(inputs.Hashes({}), loop.recordings))}
+            for name, loop in settings.loops.items()
         },
     }
 
@@ -160,10 +178,21 @@ def _keep(settings: Nightly, entry: dict[str, Any], state: dict[str, Any]) -> No
     on_branch = settings.branch if settings.promotion == "branch" and entry["promoted"] else ""
     if entry["promoted"]:
         artifacts.write_json(champion.FILE, state)
-    tracked = ["dvc.lock", "reports/metrics", "datasets/.gitignore", *(place for loop in settings.loops.values() if (place := loop.recordings)), settings.holdout.recordings]
-    tracked += [f"{place}.dvc" for loop in settings.loops.values() if (place := loop.recordings)] + (champion.paths() if entry["promoted"] else [])
+    tracked = [
+        "dvc.lock",
+        "reports/metrics",
+        "datasets/.gitignore",
+        *(place for loop in settings.loops.values() if (place := loop.recordings)),
+        settings.holdout.recordings,
+    ]
+    tracked += [f"{place}.dvc" for loop in settings.loops.values() if (place := loop.recordings)] + (
+        champion.paths() if entry["promoted"] else []
+    )
     told = f"promoted {', '.join(entry['promoted'])}" if entry["promoted"] else "kept the champions"
-    changed = bool(git("status", "--porcelain", "--", *(path for path in tracked if path != str(METRICS) and Path(path).exists()))) or entry["promoted"]
+    changed = (
+        bool(git("status", "--porcelain", "--", *(path for path in tracked if path != str(METRICS) and Path(path).exists())))
+        or entry["promoted"]
+    )
     if changed and (on_branch or settings.promotion == "at_once"):
         _metrics(entry, state)
         entry["commit"] = commit(tracked, f"nightly {entry['run']}: {told}\n\n" + "\n".join(entry["reasons"]), branch=on_branch)
@@ -184,7 +213,14 @@ def _metrics(entry: dict[str, Any], state: dict[str, Any]) -> None:
     kept = {key: entry.get(key) for key in ("night", "run", "when", "seconds", "notes", "new_recordings", "quarantined")}
     artifacts.write_json(
         METRICS,
-        {"decision": entry["outcome"], "reasons": entry.get("reasons", []), "decisions": entry.get("decisions", {}), "drift": entry.get("drift", {}), "champion": production} | kept,
+        {
+            "decision": entry["outcome"],
+            "reasons": entry.get("reasons", []),
+            "decisions": entry.get("decisions", {}),
+            "drift": entry.get("drift", {}),
+            "champion": production,
+        }
+        | kept,
     )
 
 
@@ -204,7 +240,9 @@ def _say(settings: Nightly, entry: dict[str, Any], remembered: dict[str, Any], h
     if status != OK:
         told = {"night": entry["run"], "when": entry["when"], "drift": entry.get("drift", {}), "log": f".beadline/logs/{entry['run']}.log"}
         kind = "failed" if status == FAILED else "drift"
-        troubles += watch.wake(kind, entry.get("reasons", []) if status == FAILED else alarms, told, command=settings.alarm, webhook=settings.webhook)
+        troubles += watch.wake(
+            kind, entry.get("reasons", []) if status == FAILED else alarms, told, command=settings.alarm, webhook=settings.webhook
+        )
     return status, _summary(entry, alarms, troubles)
 
 
@@ -272,11 +310,11 @@ def rollback(run: str, loop: str) -> str:
         when = watch.stamp(datetime.datetime.now(datetime.UTC))
         for name, entry in found.items():
             champion.put_back(name, entry)
-            state = champion.promoted(state, name, {**entry, "why": f"rolled back to {entry['run']} by hand", "since": when}, event="rolled back")
+            state = champion.promoted(
+                state, name, {**entry, "why": f"rolled back to {entry['run']} by hand", "since": when}, event="rolled back"
+            )
             state["history"][-1] |= {"when": when, "why": "by hand"}
         artifacts.write_json(champion.FILE, state)
         names = ", ".join(f"{name} is {entry['run']}" for name, entry in found.items())
         made = commit(champion.paths(), f"rollback: {names}")
         return f"rollback: {names} again, every file as it was; commit {made[:12]}"
-
-

@@ -15,7 +15,9 @@ FALLBACK = {"GIT_AUTHOR_NAME": "beadline nightly", "GIT_AUTHOR_EMAIL": "nightly@
 
 def git(*arguments: str, env: dict[str, str] | None = None, check: bool = True) -> str:
     """Standard output of `git ...`. Raises ValueError with git's last line where it fails and `check` is on."""
-    found = subprocess.run(["git", *arguments], check=False, capture_output=True, text=True, env=os.environ | (env or {}), stdin=subprocess.DEVNULL)
+    found = subprocess.run(
+        ["git", *arguments], check=False, capture_output=True, text=True, env=os.environ | (env or {}), stdin=subprocess.DEVNULL
+    )
     if check and found.returncode:
         raise ValueError(f"git {arguments[0]} failed: {_last(found.stderr) or f'exit status {found.returncode}'}")
     return found.stdout.strip() if found.returncode == 0 else ""

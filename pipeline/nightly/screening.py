@@ -7,18 +7,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline import artifacts, camera_drift, drift, params
-from pipeline.nightly import champion, judge
+from pipeline import artifacts, drift, params
+from pipeline.nightly import champion, judge, pictures
 from pipeline.nightly.settings import Drift, Loop, Nightly
 
 QUARANTINE = Path("datasets/quarantine")
 REFERENCE = "reference.json"  # in the champion's folder
-FRAMES = 40  # pictures of a recording that are looked at
 PIECES = 4  # into which a single record of the champion is cut, to stand for nights
 NIGHTS = 12  # of the champion's own recordings that a new one is held against
 GROSS = 3.0  # mean squared error, in the champion's own, from which a record is asked whether it is what it says
 UNDONE = 0.5  # share of that error which undoing a mistake must leave at most
-SETTLED = 2.0  # offsets of the champion's own nights, in units of drift.offset_degC, up to which they count as closed loop at the references
+SETTLED = (
+    2.0  # offsets of the champion's own nights, in units of drift.offset_degC, up to which they count as closed loop at the references
+)
 
 
 class Reference(NamedTuple):
@@ -31,14 +32,16 @@ class Reference(NamedTuple):
     loop: list[dict[str, list[float]]]
 
 
-def look(settings: Nightly, state: Mapping[str, Any], new: Mapping[str, Mapping[str, str]], memory: Mapping[str, Any], *, night: int) -> dict[str, Any]:
+def look(
+    settings: Nightly, state: Mapping[str, Any], new: Mapping[str, Mapping[str, str]], memory: Mapping[str, Any], *, night: int
+) -> dict[str, Any]:
     """{"alarms": [{loop, kind, cause, figures}], "watched": what would be one if it stayed, "figures": by recording, "quarantined": {path: reason}, "memory": for the next night}."""
     found: dict[str, Any] = {"alarms": [], "watched": [], "figures": {}, "quarantined": {}, "notes": []}
     for name, loop in settings.loops.items():
         if loop.judge == "temperature" and loop.recordings and _recorded():
             _temperature(settings, name, loop.recordings, name in state["champions"], list(new.get(name, {})), memory, found)
-        elif filmed := [path for path in new.get(name, {}) if path.lower().endswith(".mcap")]:
-            _camera(settings.drift, name, filmed, _read(champion.FOLDER / name), set(memory.get("pending", [])), found)
+        elif loop.judge == "deposition" and (filmed := [path for path in new.get(name, {}) if path.lower().endswith(".mcap")]):
+            pictures.look(settings.drift, name, filmed, _read(champion.FOLDER / name), set(memory.get("pending", [])), found)
     if not any(new.values()):
         found["memory"] = dict(memory)
         # nothing was recorded: what was found last still stands
@@ -48,7 +51,9 @@ def look(settings: Nightly, state: Mapping[str, Any], new: Mapping[str, Mapping[
     return found
 
 
-def _temperature(settings: Nightly, name: str, folder: str, has_champion: bool, new: Sequence[str], memory: Mapping[str, Any], found: dict[str, Any]) -> None:
+def _temperature(
+    settings: Nightly, name: str, folder: str, has_champion: bool, new: Sequence[str], memory: Mapping[str, Any], found: dict[str, Any]
+) -> None:
     machine, broken = params.load(params.Plant, "plant"), {}
     if not new or not Path(folder).is_dir():
         return
@@ -70,7 +75,12 @@ def _temperature(settings: Nightly, name: str, folder: str, has_champion: bool, 
         u, y = max(segments, key=lambda pair: len(pair[0]))
         suspects = drift.mistakes(reference.model, u, y, scale=scale, gross=GROSS, **names)
         if len(suspects) > 1 and suspects[1].left < UNDONE:
-            _aside(path, name, f"{path}: {suspects[1].words}: undone, the record fits the champion's model {1 / suspects[1].left:.0f} times better; mend it and put it back", found)
+            _aside(
+                path,
+                name,
+                f"{path}: {suspects[1].words}: undone, the record fits the champion's model {1 / suspects[1].left:.0f} times better; mend it and put it back",
+                found,
+            )
             continue
         try:
             _measure(settings.drift, name, path, segments, reference, machine, set(memory.get("pending", [])), found)
@@ -97,20 +107,26 @@ def reference(loop: Loop, folder: Path) -> dict[str, Any] | None:
     that are known to be good. None where the loop has no recordings, or too short ones."""
     if not loop.recordings or not Path(loop.recordings).is_dir():
         return None
-    if loop.judge != "temperature":
-        pictures = [seen for path in sorted(Path(loop.recordings).rglob("*.mcap"))[-NIGHTS:] if (seen := _seen(path))]
-        return {"schema": "reference", "version": 1, "camera": [[seen.mean.tolist(), seen.deviation.tolist(), seen.frames] for seen in pictures]} if pictures else None
-    if not _recorded():
+    if loop.judge == "deposition":
+        filmed = [seen for path in sorted(Path(loop.recordings).rglob("*.mcap"))[-NIGHTS:] if (seen := pictures.seen(path))]
+        camera = [[seen.mean.tolist(), seen.deviation.tolist(), seen.frames] for seen in filmed]
+        return {"schema": "reference", "version": 1, "camera": camera} if camera else None
+    if loop.judge != "temperature" or not _recorded():
         return None
     machine = params.load(params.Plant, "plant")
     records = judge.record_segments(Path(loop.recordings), machine, broken={})
     nights = [records[path] for path in sorted(records) if records[path]][-NIGHTS:]
     if len(nights) == 1:
-        nights = [[(part, other)] for u, y in nights[0] for part, other in zip(np.array_split(u, PIECES), np.array_split(y, PIECES), strict=True)]
+        nights = [
+            [(part, other)] for u, y in nights[0] for part, other in zip(np.array_split(u, PIECES), np.array_split(y, PIECES), strict=True)
+        ]
     _, model, _ = judge.controller(folder, "model_based", 0.99)
     asked, samples = drift.causes(model), int(np.median([sum(len(u) for u, _ in night) for night in nights]))
     try:
-        own, slow = ([drift.estimate(model, night, asked, K) for night in nights] for K in (drift.observer(model, samples), drift.slow_observer(model, samples)))
+        own, slow = (
+            [drift.estimate(model, night, asked, K) for night in nights]
+            for K in (drift.observer(model, samples), drift.slow_observer(model, samples))
+        )
     except ValueError:
         return None
     both = {"own": [list(map(np.ndarray.tolist, one)) for one in own], "slow": [list(map(np.ndarray.tolist, one)) for one in slow]}
@@ -149,11 +165,23 @@ def _closed_loop(segments: Sequence[tuple[np.ndarray, np.ndarray]], machine: par
 # ---- the new one against them
 
 
-def _measure(limits: Drift, loop: str, path: str, segments: Sequence, reference: Reference, machine: params.Plant, pending: set[str], found: dict[str, Any]) -> None:
+def _measure(
+    limits: Drift,
+    loop: str,
+    path: str,
+    segments: Sequence,
+    reference: Reference,
+    machine: params.Plant,
+    pending: set[str],
+    found: dict[str, Any],
+) -> None:
     inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
     samples = sum(len(u) for u, _ in segments)
     estimates = []
-    for known, K in ((reference.own, drift.observer(reference.model, samples)), (reference.slow, drift.slow_observer(reference.model, samples))):
+    for known, K in (
+        (reference.own, drift.observer(reference.model, samples)),
+        (reference.slow, drift.slow_observer(reference.model, samples)),
+    ):
         variance = np.exp(np.mean([one.log_variance for one in known], axis=0))
         one = drift.estimate(reference.model, segments, reference.asked, K, variance)
         estimates.append((one, _shift(one, known, "change", "deviation")))
@@ -172,7 +200,13 @@ def _measure(limits: Drift, loop: str, path: str, segments: Sequence, reference:
     for i, output in enumerate(outputs):
         grown, moved = 100 * np.expm1(0.5 * (noise.value - noise.reference)[i]), (mean.value - mean.reference)[i]
         if abs(grown) >= limits.noise_percent and not explained:
-            causes.append((f"noise of {output}", f"the noise of {output} has {'grown' if grown > 0 else 'fallen'} by {abs(grown):.0f} %", float(noise.sigmas[i])))
+            causes.append(
+                (
+                    f"noise of {output}",
+                    f"the noise of {output} has {'grown' if grown > 0 else 'fallen'} by {abs(grown):.0f} %",
+                    float(noise.sigmas[i]),
+                )
+            )
         if abs(moved) >= limits.noise_percent / 100 * spread[i] and not explained:
             words = f"{output} reads {moved:+.3g} °C a step from what the model expects of it: its offset, or the heat lost around it, has changed"
             causes.append((f"offset of {output}", words, float(mean.sigmas[i])))
@@ -180,28 +214,47 @@ def _measure(limits: Drift, loop: str, path: str, segments: Sequence, reference:
     figures["closed_loop"] = loop_figures
     causes += consequences if not explained else []
     found["figures"][path] = figures
-    _raise(limits, loop, path, causes, [words for _, words, _ in consequences] if explained else [], pending, found)
+    pictures.raised(limits, loop, path, causes, [words for _, words, _ in consequences] if explained else [], pending, found)
 
 
 def _shift(one: drift.Estimate, known: Sequence[drift.Estimate], value: str, deviation: str) -> drift.Shift:
-    return drift.shift(getattr(one, value), getattr(one, deviation), np.array([getattr(k, value) for k in known]), np.array([getattr(k, deviation) for k in known]))
+    return drift.shift(
+        getattr(one, value),
+        getattr(one, deviation),
+        np.array([getattr(k, value) for k in known]),
+        np.array([getattr(k, deviation) for k in known]),
+    )
 
 
 def _parameters(shifted: drift.Shift, asked: Sequence[drift.Cause], inputs: Sequence[str]) -> dict[str, dict[str, float]]:
     """{cause: change in percent, half of its 90 % band, sigmas}; time constants from rates."""
     change, band = _percent(shifted, asked), 100 * 1.645 * shifted.deviation
     return {
-        f"{cause.kind} from {inputs[cause.channel] if cause.channel >= 0 else 'all inputs'}": {"percent": float(p), "band_percent": float(b), "sigmas": float(s)}
+        f"{cause.kind} from {inputs[cause.channel] if cause.channel >= 0 else 'all inputs'}": {
+            "percent": float(p),
+            "band_percent": float(b),
+            "sigmas": float(s),
+        }
         for cause, p, b, s in zip(asked, change, band, shifted.sigmas, strict=True)
     }
 
 
 def _percent(shifted: drift.Shift, asked: Sequence[drift.Cause]) -> np.ndarray:
     change = shifted.value - shifted.reference
-    return 100 * np.array([1 / (1 + max(c, -0.9)) - 1 if cause.kind == "time constant" else c for c, cause in zip(change, asked, strict=True)])
+    return 100 * np.array(
+        [1 / (1 + max(c, -0.9)) - 1 if cause.kind == "time constant" else c for c, cause in zip(change, asked, strict=True)]
+    )
 
 
-def _plant(limits: Drift, shifted: drift.Shift, own: drift.Estimate, slower: drift.Shift, slow: drift.Estimate, asked: Sequence[drift.Cause], inputs: Sequence[str]) -> list:
+def _plant(
+    limits: Drift,
+    shifted: drift.Shift,
+    own: drift.Estimate,
+    slower: drift.Shift,
+    slow: drift.Estimate,
+    asked: Sequence[drift.Cause],
+    inputs: Sequence[str],
+) -> list:
     """The likeliest cause among those that moved by what matters: the input by the champion's own observer, gain or time constant by the slow one, both where neither can tell."""
     percent = _percent(shifted, asked)
     fits = (np.abs(percent) >= limits.parameter_percent) & (np.abs(shifted.sigmas) >= limits.watch_sigmas)
@@ -209,13 +262,24 @@ def _plant(limits: Drift, shifted: drift.Shift, own: drift.Estimate, slower: dri
     if not found:
         return []
     where = inputs[asked[found[0]].channel] if asked[found[0]].channel >= 0 else "every input"
-    said = {"gain": "the gain from {} has changed by {:+.1f} %", "time constant": "the time constants of what answers to {} have changed by {:+.1f} %"}
-    words = ", or ".join(said[asked[k].kind].format(where, percent[k]) for k in found) + (": this record cannot tell which" if len(found) == 2 else "")
+    said = {
+        "gain": "the gain from {} has changed by {:+.1f} %",
+        "time constant": "the time constants of what answers to {} have changed by {:+.1f} %",
+    }
+    words = ", or ".join(said[asked[k].kind].format(where, percent[k]) for k in found) + (
+        ": this record cannot tell which" if len(found) == 2 else ""
+    )
     sigmas = max((float(shifted.sigmas[k]) for k in range(len(asked)) if asked[k].channel == asked[found[0]].channel), key=abs)
     return [(f"plant at {where}", words, sigmas)]
 
 
-def _loop(limits: Drift, now: Mapping[str, list[float]], before: Sequence[Mapping[str, list[float]]], inputs: Sequence[str], outputs: Sequence[str]) -> tuple[dict, list]:
+def _loop(
+    limits: Drift,
+    now: Mapping[str, list[float]],
+    before: Sequence[Mapping[str, list[float]]],
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+) -> tuple[dict, list]:
     """Offset, effort and share at limits against the champion's own nights; not asked where those nights were not settled at the references."""
     known = {key: np.array([night[key] for night in before]) for key in now}
     if np.abs(known["offset_degC"].mean(axis=0)).max() > SETTLED * limits.offset_degC:
@@ -231,39 +295,3 @@ def _loop(limits: Drift, now: Mapping[str, list[float]], before: Sequence[Mappin
             if abs(moved[k]) >= least:
                 causes.append((f"{key} of {name}", f"closed loop: {name} {verb} {moved[k]:+.2g} {rest}", float(moved[k] / scatter[k])))
     return figures, causes
-
-
-# ---- pictures
-
-
-def _seen(path: Path) -> camera_drift.Seen | None:
-    """The camera's figures of FRAMES pictures over a trial; None where it has none that show a bead, which its stage will say."""
-    from pipeline import trials
-
-    try:
-        frames = trials.read_trial(path, unreadable_share=1.0).frames
-        every = max(len(frames.time_s) // FRAMES, 1)
-        return camera_drift.figures([picture for k, (_, picture) in enumerate(frames) if k % every == 0 and picture is not None])
-    except ValueError:
-        return None
-
-
-def _camera(limits: Drift, loop: str, paths: Sequence[str], kept: Mapping[str, Any], pending: set[str], found: dict[str, Any]) -> None:
-    before = [camera_drift.Seen(np.array(mean), np.array(deviation), frames) for mean, deviation, frames in kept.get("camera", [])]
-    for path in paths:
-        seen = _seen(Path(path))
-        if seen is None or not before:
-            found["notes"].append(f"{path}: {'no picture shows a bead' if before else 'the champion has no pictures of its own'}: the camera was not judged")
-            continue
-        _, causes = camera_drift.changes(seen, before, moved_px=limits.camera_px, contrast_percent=limits.contrast_percent)
-        _raise(limits, loop, path, [(cause.key, cause.words, cause.sigmas) for cause in causes], [], pending, found)
-
-
-def _raise(limits: Drift, loop: str, path: str, causes: Sequence[tuple[str, str, float]], consequences: Sequence[str], pending: set[str], found: dict[str, Any]) -> None:
-    """Alarms where a cause is sure at once, or has been watched the night before; watched where it is nearly sure."""
-    for key, words, sigmas in causes:
-        one = {"loop": loop, "key": f"{loop}: {key}", "recording": path, "cause": words, "sigmas": round(float(sigmas), 1), "consequences": list(consequences)}
-        if abs(sigmas) >= limits.alarm_sigmas or (abs(sigmas) >= limits.watch_sigmas and one["key"] in pending):
-            found["alarms"].append(one)
-        elif abs(sigmas) >= limits.watch_sigmas:
-            found["watched"].append(one)

@@ -22,7 +22,9 @@ class Loop(Section):
     @pydantic.model_validator(mode="after")
     def _cases_have_a_file(self):
         if (self.judge == "cases") != bool(self.cases):
-            raise ValueError(f'has judge {self.judge} but cases "{self.cases}"; name the file of costs where judge is cases, and only there')
+            raise ValueError(
+                f'has judge {self.judge} but cases "{self.cases}"; name the file of costs where judge is cases, and only there'
+            )
         if self.cases and self.cases not in self.artifacts:
             raise ValueError(f"has cases {self.cases} that are not among its artifacts; add them there, so that the champion keeps its own")
         return self
@@ -35,8 +37,7 @@ class Rule(Section):
     least_improvement_percent: float = Field(ge=0, le=100)
     worst_case_percent: float = Field(ge=0, le=1000)
     settled_error_degC: float = Field(ge=0, le=100)
-    at_limits_points: float = Field(ge=0, le=100)
-    disk_margin: float = Field(ge=0, le=2)
+    least_disk_margin: float = Field(ge=0, le=2)
     holdout_error_percent: float = Field(ge=0, le=1000)
 
 
@@ -64,7 +65,6 @@ class Drift(Section):
     at_limits_points: float = Field(gt=0, le=100)
     camera_px: float = Field(gt=0, le=1000)
     contrast_percent: float = Field(gt=0, le=1000)
-    class_points: float = Field(gt=0, le=100)
 
 
 class Nightly(Section):

@@ -4,7 +4,6 @@ import itertools
 import json
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,9 @@ def grid(settings: Sequence[str]) -> list[dict[str, str]]:
         for part in key.split("."):
             known = known.get(part) if isinstance(known, dict) else None
         if known is None or not values:
-            raise ValueError(f"sweep: expected KEY=VALUE,VALUE with a key of params.yaml, found {text}; write for example tune_weights.seed=1,2,3")
+            raise ValueError(
+                f"sweep: expected KEY=VALUE,VALUE with a key of params.yaml, found {text}; write for example tune_weights.seed=1,2,3"
+            )
         axes[key] = values.split(",")
     return [dict(zip(axes, chosen, strict=True)) for chosen in itertools.product(*axes.values())]
 
@@ -43,12 +44,16 @@ def sweep(settings: Sequence[str], target: str, metric: str) -> str:
         found: Any = json.loads(git("show", f"refs/exps/{head[:2]}/{head[2:]}/{name}:reports/metrics/{stage}.json"))
         for part in key.split("."):
             found = found.get(part) if isinstance(found, dict) else None
-        if not isinstance(found, int | float):
+        figure = found if isinstance(found, int | float) else None
+        if figure is None:
             raise ValueError(f"sweep: reports/metrics/{stage}.json has no number at {key}; look at the file for its keys")
-        rows.append({"experiment": name, **point, metric: float(found)})
+        rows.append({"experiment": name, **point, metric: float(figure)})
     lines = [",".join(rows[0])] + [",".join(str(value) for value in row.values()) for row in rows]
     artifacts.write_text("reports/sweep.csv", "\n".join(lines) + "\n")
-    artifacts.write_text("reports/sweep.html", page.render("sweep.html", here="sweep", title="Sweep", rows=rows, metric=metric, picture=_picture(rows, metric)))
+    artifacts.write_text(
+        "reports/sweep.html",
+        page.render("sweep.html", here="sweep", title="Sweep", rows=rows, metric=metric, picture=_picture(rows, metric)),
+    )
     width = [max(len(line.split(",")[k]) for line in lines) for k in range(len(rows[0]))]
     table = "\n".join("  ".join(cell.ljust(w) for cell, w in zip(line.split(","), width, strict=True)) for line in lines)
     return f"{table}\nreports/sweep.csv, reports/sweep.html; to take one: dvc exp apply NAME"
@@ -59,8 +64,13 @@ def _picture(rows: Sequence[dict[str, Any]], metric: str):
     values = np.array([row[metric] for row in rows])
     margin = 0.1 * (np.ptp(values) or max(abs(values[0]), 1.0))
     ticks = tuple((float(k), str(k)) for k in range(1, len(rows) + 1, max(1, math.ceil(len(rows) / 12))))
-    frame = charts.Frame(charts.Axis(0.5, len(rows) + 0.5, ticks), charts.linear(values.min() - margin, values.max() + margin), 760, 220, 60, 18, 20, 12)
+    frame = charts.Frame(
+        charts.Axis(0.5, len(rows) + 0.5, ticks), charts.linear(values.min() - margin, values.max() + margin), 760, 220, 60, 18, 20, 12
+    )
     best = int(values.argmin()) + 1
-    return charts.panel(frame, [charts.dots(frame, np.arange(1, len(rows) + 1), values, radius=4)], alt=f"{metric}: lowest in experiment {best}, {values.min():.4g}", title=metric)
-
-
+    return charts.panel(
+        frame,
+        [charts.dots(frame, np.arange(1, len(rows) + 1), values, radius=4)],
+        alt=f"{metric}: lowest in experiment {best}, {values.min():.4g}",
+        title=metric,
+    )

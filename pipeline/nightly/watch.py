@@ -55,7 +55,13 @@ def wake(kind: str, reasons: list[str], told: Mapping[str, Any], *, command: str
     if command:
         try:
             found = subprocess.run(
-                [*shlex.split(command), str(ALARM)], check=False, input=text, text=True, capture_output=True, timeout=60, env={**os.environ, "BEADLINE_ALARM": kind}
+                [*shlex.split(command), str(ALARM)],
+                check=False,
+                input=text,
+                text=True,
+                capture_output=True,
+                timeout=60,
+                env={**os.environ, "BEADLINE_ALARM": kind},
             )
             if found.returncode:
                 troubles.append(f"nightly.alarm: {command} ended with status {found.returncode}: {found.stderr.strip()[-200:]}")

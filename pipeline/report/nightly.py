@@ -14,8 +14,8 @@ from pipeline.report.verdict import FAILED, OPEN, PASSED
 SHOWN = 40  # nights in the table, the newest first
 REACH = 20.0  # percent: half the width of the picture of the plant's parameters
 GUARDS = {
-    "worst_case": "worst plant's cost", "settled_error_degC": "worst settled error, °C", "at_limits_percent": "commands beyond a limit, %",
-    "lost_disk_margin": "2 less the disk margin", "holdout_error_degC": "one-step error on hold-out recordings, °C", "unstable_plants": "plants on which it is unstable",
+    "worst_case": "worst plant's cost", "settled_error_degC": "worst settled error, °C",
+    "margin_short_of_least": "disk margin, short of the least", "holdout_error_degC": "one-step error on hold-out recordings, °C", "unstable_plants": "plants on which it is unstable",
 }  # fmt: skip
 
 
@@ -55,7 +55,11 @@ def _head(night: Mapping[str, Any]) -> tuple[str, str]:
 def _verdict(night: Mapping[str, Any], state: Mapping[str, Any]) -> dict[str, Any]:
     head, kind = _head(night)
     alarms = night.get("drift", {}).get("alarms", [])
-    reasons = [alarm["cause"] for alarm in alarms] if alarms and night["outcome"] != "failed" else [*night.get("reasons", []), *night.get("quarantined", {}).values()]
+    reasons = (
+        [alarm["cause"] for alarm in alarms]
+        if alarms and night["outcome"] != "failed"
+        else [*night.get("reasons", []), *night.get("quarantined", {}).values()]
+    )
     remedy = {
         "failed": f"Nothing of what is in production has changed. The log is .beadline/logs/{night['run']}.log; mend the cause, and the next night works.",
         "quarantined": "They lie in datasets/quarantine, unchanged, each with its reason beside it; mend them and put them back.",
@@ -63,12 +67,24 @@ def _verdict(night: Mapping[str, Any], state: Mapping[str, Any]) -> dict[str, An
     }.get(night["outcome"], "")
     if alarms and night["outcome"] != "failed":
         remedy = "No challenger is promoted while this lasts. Look at the machine; where the change is meant to stay, record it anew for datasets/holdout, and the next night judges both on it."
-    return {"state": "failed" if kind == FAILED else "passed", "decision": head, "lead": f"{night['run']}, {_when(night['when'])}:", "reason": "; ".join(reasons), "remedy": remedy}
+    return {
+        "state": "failed" if kind == FAILED else "passed",
+        "decision": head,
+        "lead": f"{night['run']}, {_when(night['when'])}:",
+        "reason": "; ".join(reasons),
+        "remedy": remedy,
+    }
 
 
 def _champions(state: Mapping[str, Any]) -> list[dict[str, str]]:
     return [
-        {"loop": name, "run": entry["run"], "since": _when(entry.get("since", entry["when"])), "hash": entry["folder"]["md5"][:12], "commit": entry["lineage"]["commit"][:12]}
+        {
+            "loop": name,
+            "run": entry["run"],
+            "since": _when(entry.get("since", entry["when"])),
+            "hash": entry["folder"]["md5"][:12],
+            "commit": entry["lineage"]["commit"][:12],
+        }
         for name, entry in state["champions"].items()
     ]
 
@@ -81,7 +97,15 @@ def _decisions(night: Mapping[str, Any]) -> list[dict[str, Any]]:
              "bad": figures.get("champion") is not None and figures["challenger"] > figures["champion"] + figures["allowed"] + 1e-9 * abs(figures["champion"])}
             for guard, figures in decision.get("guards", {}).items()
         ]  # fmt: skip
-        found.append({"loop": name, "decision": decision["decision"], "reasons": decision["reasons"], "paired": _paired(decision.get("paired")), "guards": guards})
+        found.append(
+            {
+                "loop": name,
+                "decision": decision["decision"],
+                "reasons": decision["reasons"],
+                "paired": _paired(decision.get("paired")),
+                "guards": guards,
+            }
+        )
     return found
 
 
@@ -136,7 +160,20 @@ def _interval(name: str, value: float, half: float, limit: float) -> Markup:
         '<svg viewBox="0 0 320 20" width="320" height="20" role="img" aria-label="{}: {} percent, band {} to {}, allowed {} either way">'
         '<rect class="beyond" x="{:.1f}" width="{:.1f}" y="0" height="20"/><line class="limit" x1="160" x2="160" y1="0" y2="20"/>'
         '<line class="mb{}" x1="{:.1f}" x2="{:.1f}" y1="10" y2="10"/><rect class="mb{}" x="{:.1f}" y="6.5" width="7" height="7"/></svg>'
-    ).format(name, number(value, 1), number(value - half, 1), number(value + half, 1), f"{limit:g}", at[3], at[4] - at[3], bad, at[0], at[2], bad, at[1] - 3.5)
+    ).format(
+        name,
+        number(value, 1),
+        number(value - half, 1),
+        number(value + half, 1),
+        f"{limit:g}",
+        at[3],
+        at[4] - at[3],
+        bad,
+        at[0],
+        at[2],
+        bad,
+        at[1] - 3.5,
+    )
 
 
 def _pictures(nights: Sequence[Mapping[str, Any]], settings: Nightly) -> list[dict[str, Any]]:
@@ -151,9 +188,19 @@ def _pictures(nights: Sequence[Mapping[str, Any]], settings: Nightly) -> list[di
         return []
     top = max(*y, settings.drift.alarm_sigmas) * 1.15
     frame = charts.Frame(charts.linear(x[0], x[-1], ticks=6), charts.linear(0, top), 760, 150, 36, 18, 20, 12)
-    layers = [charts.tint(frame, 0, settings.drift.alarm_sigmas), charts.line(frame, x, y), charts.dots(frame, x, y), charts.level(frame, settings.drift.alarm_sigmas, "lim", "alarm")]
+    layers = [
+        charts.tint(frame, 0, settings.drift.alarm_sigmas),
+        charts.line(frame, x, y),
+        charts.dots(frame, x, y),
+        charts.level(frame, settings.drift.alarm_sigmas, "lim", "alarm"),
+    ]
     alt = f"Largest change of a plant parameter over {len(x)} nights: {number(y[-1], 1)} sigmas last night, {number(max(y), 1)} at most; the alarm is at {settings.drift.alarm_sigmas:g}"
-    return [{"svg": charts.panel(frame, layers, alt=alt, title="Largest change of a plant parameter, sigmas"), "caption": f"{alt}. Across: nights."}]
+    return [
+        {
+            "svg": charts.panel(frame, layers, alt=alt, title="Largest change of a plant parameter, sigmas"),
+            "caption": f"{alt}. Across: nights.",
+        }
+    ]
 
 
 # ---- the nights

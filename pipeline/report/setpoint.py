@@ -4,8 +4,7 @@ from typing import Any
 
 from pipeline.report import charts, page, setpoint_agent, setpoint_vision, setpoint_why, words
 from pipeline.report.deposition import flat
-from pipeline.report.difference import Move
-from pipeline.report.digits import THIN, band, number, percent, quantity
+from pipeline.report.digits import MINUS, THIN, band, number, percent, quantity
 from pipeline.report.setpoint_verdict import (
     BASELINE,
     SIMULATORS,
@@ -161,11 +160,12 @@ def change(sources: Sources, found: Board, case: Case, cell: Cell | None) -> dic
     if before is None:
         return still | {"text": "new"}
     now = cell.settled
+    points = now.value - before
+    if now.low <= before <= now.high:
+        return still | {"text": "within noise" if points else "unchanged"}
     question = Question(0, "", "Settled", "%", sources.declared.rules.settled_percent, True, "")
-    moved = not now.low <= before <= now.high
-    word = ("better" if now.value > before else "worse") if moved else "unchanged" if before == now.value else "within noise"
-    move = Move(question, Figure(before, before, before), now, moved, word)
-    return {"text": move.text(), "moved": moved, "worse": word == "worse" and state(question, now) == FAILED}
+    text = f"{'+' if points > 0 else MINUS}{number(abs(points), 1)}{THIN}points · {'better' if points > 0 else 'worse'}"
+    return {"text": text, "moved": True, "worse": points < 0 and state(question, now) == FAILED}
 
 
 # ---- the scoreboard
@@ -219,7 +219,7 @@ def worsts(found: Board) -> list[dict[str, Any]]:
         if case is None:
             continue
         cell = found.cells[name, case]
-        others = [value for _, one in found.counting(name) if (value := lasting(one)) == value]
+        others = [share.value for _, one in found.counting(name) if isinstance(share := lasting(one), Figure)]
         flow, degrees, settled = cell.worst_start
         rows.append({
             "name": name, "mark": role(found, name), "default": name == found.default, "kind": {BASELINE: "no learning", "agent": "ours, learned"}.get(found.kinds[name], "as published"),

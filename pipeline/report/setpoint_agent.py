@@ -8,7 +8,7 @@ import numpy as np
 from markupsafe import Markup
 
 from pipeline.report import charts, page
-from pipeline.report.digits import THIN, number, percent, short
+from pipeline.report.digits import THIN, number, percent
 from pipeline.report.pictures import Column, Picture, hole
 from pipeline.report.setpoint_verdict import AGENT, BASELINE, PAPER, Board, Case, case_text, role
 from pipeline.report.sources import Sources, Table, lookup
@@ -19,6 +19,8 @@ from pipeline.setpoint.reward import BEST_FLOW, BEST_TEMPERATURE, PHASES, ROTATI
 # rewards whose lines are drawn, of the last phase
 LEVELS = (0.5, 0.0, -0.5, -0.8)
 FLOW, TEMPERATURE = charts.linear(0, 320, ticks=6), charts.linear(180, 240, ticks=6)
+# starts that a panel has room for
+MOST = 42
 CASES = (("recorded", "recorded, fresh"), ("paper", "accuracy 0.7"))
 # key of train_agent.json -> who, after what
 TAUGHT = {
@@ -83,7 +85,8 @@ def _kind(board: Board, name: str) -> str:
 
 
 def _by_start(table: Table, mine: np.ndarray, column: str) -> list[np.ndarray]:
-    return [table[column][mine & (table["start"] == k)] for k in np.unique(table["start"][mine])]
+    starts = np.unique(table["start"][mine])
+    return [table[column][mine & (table["start"] == k)] for k in starts[:: -(-len(starts) // MOST)]]
 
 
 def _inside(flow: list[np.ndarray], temperature: list[np.ndarray]) -> list[np.ndarray]:
@@ -154,60 +157,58 @@ def _steps(name: str, flow: list[np.ndarray], inside: list[np.ndarray], css: str
 
 
 def training(sources: Sources) -> Picture:
-    """Reward and settled runs while the agents learn, phase after phase (figure 6 of the paper)."""
+    """Mean reward while the agents learn, phase after phase (figure 6 of the paper)."""
     table, title = sources.tables["agents"], "The agents in training, phase after phase"
     if isinstance(table, Missing):
         return hole("agents", title, table)
     columns, said = [], []
     for agent in dict.fromkeys(map(str, table["agent"])):
         mine = {name: values[table["agent"] == agent] for name, values in table.items()}
-        ends = [_last(mine, "reward", k) for k in np.unique(mine["phase"])]
-        said.append(f"{_agent(agent)} ends its phases at a mean reward of {', '.join(number(end, 2) for end in ends)}")
-        told = [("reward", "reward")] + (
-            [("settled_percent", "% of quick runs that settle")] if np.isfinite(mine["settled_percent"]).any() else []
+        ends = [float(mine["reward"][mine["phase"] == k][-1]) for k in np.unique(mine["phase"])]
+        told = (
+            ", ".join(number(end, 2) for end in ends)
+            if len(ends) <= 6
+            else f"{number(ends[0], 2)}, the last of {len(ends)} at {number(ends[-1], 2)}"
         )
-        panels = [_course(mine, agent, column, name, last=(column, name) == told[-1]) for column, name in told]
+        word = "phase" if agent == "paper" else "round"
+        said.append(f"{_agent(agent)} ends its {f'{word}s' if len(ends) <= 6 else f'first {word}'} at a mean reward of {told}")
         columns.append(
-            Column(_agent(agent), "as published" if agent == "paper" else "ours", "kernel" if agent == "paper" else "data_driven", panels)
+            Column(
+                _agent(agent),
+                "as published" if agent == "paper" else "ours",
+                "kernel" if agent == "paper" else "data_driven",
+                [_course(mine, agent, word, told)],
+            )
         )
     return Picture(
         "agents",
         title,
-        f"{'; '.join(said)}.",
+        f"{'. '.join(said)}.",
         columns,
         f"Mean reward of a step, in the reward of its phase, against thousands of updates. As published: {', then '.join(f'a, b = {a:g}, {b:g}' for a, b in PHASES)}, then the last with classes that are wrong at times. "
-        "A phase that asks for more begins lower: rewards of two phases do not compare.",
+        "Ours learns in rounds, of which the one is kept that costs least on episodes it did not learn from; its reward is what a step costs, with a minus. Rewards of two phases, or of two agents, do not compare.",
         page.origin(sources.source("agents")),
     )
 
 
-def _last(mine: Table, column: str, phase: int) -> float:
-    """The last value that is known in a phase."""
-    values = mine[column][(mine["phase"] == phase) & np.isfinite(mine[column])]
-    return float(values[-1]) if len(values) else math.nan
-
-
-def _course(mine: Table, agent: str, column: str, name: str, *, last: bool) -> Markup:
-    updates, known = mine["update"] / 1000, np.isfinite(mine[column])
-    low = min(-0.2, 0.2 * math.floor(5 * float(np.nanmin(mine["reward"]))))
-    y = charts.linear(low, 1, ticks=4) if column == "reward" else charts.linear(0, 100, ticks=2)
-    frame = charts.Frame(
-        charts.linear(0, float(updates.max()) or 1.0, ticks=5), y, 568, 150 if column == "reward" else 104, 30, 16 if last else 6
-    )
+def _course(mine: Table, agent: str, word: str, told: str) -> Markup:
+    updates, reward, phases = mine["update"] / 1000, mine["reward"], np.unique(mine["phase"])
+    span = max(float(reward.max() - reward.min()), 0.2)
+    y = charts.linear(float(reward.min()) - 0.25 * span, float(reward.max()) + 0.1 * span, ticks=4)
+    frame = charts.Frame(charts.linear(0, float(updates.max()) or 1.0, ticks=5), y, 568, 180, 34)
     layers = []
-    for k in np.unique(mine["phase"]):
-        begin = float(updates[mine["phase"] == k].min())
+    for k in phases:
+        here = mine["phase"] == k
+        begin = 0.0 if k == phases[0] else float(updates[here].min())
         x = float(frame.px(begin))
-        if k > mine["phase"].min():
+        if k > phases[0]:
             layers.append(
                 Markup('<line class="lim" x1="{0:.1f}" x2="{0:.1f}" y1="{1}" y2="{2}"/>').format(x, frame.above, frame.height - frame.below)
             )
-        layers.append(charts.label(frame, begin, y.low, f"phase {k}", dx=3, dy=-4) if column == "reward" else Markup(""))
-        here = known & (mine["phase"] == k)
-        layers.append(charts.line(frame, updates[here], mine[column][here]))
-    ends = ", ".join(number(_last(mine, column, k), 2) for k in np.unique(mine["phase"]) if math.isfinite(_last(mine, column, k)))
-    alt = f"{_agent(agent)}: {name} at the end of each phase {ends}, after {number(float(mine['update'].max()), 0)} updates in all"
-    return charts.panel(frame, layers, alt=alt, css="dd wide", title=name, x_ticks=last, units=("thousand updates", ""))
+        layers.append(charts.label(frame, begin, y.low, f"{word} {k}" if len(phases) <= 6 or k == phases[0] else str(k), dx=3, dy=-4))
+        layers.append(charts.line(frame, updates[here], reward[here]))
+    alt = f"{_agent(agent)}: mean reward at the end of each {word} {told}, after {number(float(mine['update'].max()), 0)} updates in all"
+    return charts.panel(frame, layers, alt=alt, css="dd wide", title="mean reward", units=("thousand updates", ""))
 
 
 def _agent(name: str) -> str:
@@ -246,7 +247,7 @@ def by_accuracy(sources: Sources, board: Board | Missing) -> Picture:
             layers += [charts.line(frame, px, py, css), charts.dots(frame, px, py, f"dot whole {page.MARKS[role(board, name)]}", 2.4)]
         ends = [(curve[0][1], name) for name, curve in curves.items()]
         layers += _names(frame, ends) if limit else _names(frame, [(curve[-1][1], name) for name, curve in curves.items()], right=True)
-        told = ", ".join(f"{name} {short(value, 3)}{'' if not limit else THIN + '%'}" for value, name in ends)
+        told = ", ".join(f"{name} {number(value, 1) + THIN + '%' if limit else number(value, 0)}" for value, name in ends)
         said.append(f"{head}: {told}")
         alt = f"At {100 * cases[0][0]:g} % right, {head.lower()}: {told}"
         columns.append(
@@ -286,7 +287,9 @@ def _names(frame: charts.Frame, ends: list[tuple[float, str]], *, right: bool = 
         y = max(float(frame.py(value)) + 12, last + 11)
         y = min(y, frame.height - frame.below - 3)
         x, anchor = (frame.width - frame.right - 6, "end") if right else (frame.left + 6, "start")
-        made.append(Markup('<text x="{}" y="{:.1f}" text-anchor="{}">{} {}</text>').format(x, y, anchor, name, short(value, 3)))
+        made.append(
+            Markup('<text x="{}" y="{:.1f}" text-anchor="{}">{} {}</text>').format(x, y, anchor, name, number(value, 0 if right else 1))
+        )
         last = y
     return made
 
@@ -313,4 +316,16 @@ def phases(sources: Sources) -> dict[str, Any]:
                 "runs": "not said" if isinstance(runs, Missing) else f"{runs:,}",
             }
         )
-    return {"missing": None if rows else Missing("not measured", "train_agent.json holds no run"), "rows": rows}
+    gap = None if rows else Missing("not measured", "train_agent.json holds no run")
+    return {"missing": gap, "rows": rows, "kept": _kept(metrics)}
+
+
+def _kept(metrics: dict[str, Any]) -> str:
+    """What the rounds of our agent came to, on episodes that it did not learn from."""
+    judged, kept, rounds = (metrics.get(key) for key in ("validation", "kept_round", "rounds"))
+    if not judged or kept is None or not 0 <= kept < len(judged):
+        return ""
+    before, after = number(float(judged[0]), 3), number(float(judged[kept]), 3)
+    if kept == 0:
+        return f"No round of ours was better than what it began with: {before} a step on episodes it did not learn from, and that is kept."
+    return f"Of ours round {kept} of {rounds} is kept: {after} a step on episodes it did not learn from, {before} before any training."

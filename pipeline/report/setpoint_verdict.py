@@ -122,13 +122,13 @@ def _figure(value: float, low: float, high: float) -> Figure | Missing:
     return Figure(value, value if math.isnan(low) else low, value if math.isnan(high) else high)
 
 
-def lasting(cell: Cell) -> float:
+def lasting(cell: Cell) -> Figure | Missing:
     """The share by which a case is read: settled and staying, or settled where runs end before that can be told."""
-    return next((found.value for found in (cell.stay, cell.settled) if isinstance(found, Figure)), math.nan)
+    return cell.stay if isinstance(cell.stay, Figure) else cell.settled
 
 
 def _rank(board: Board, name: str) -> tuple[float, float]:
-    values = [value for _, cell in board.counting(name) if not math.isnan(value := lasting(cell))]
+    values = [found.value for _, cell in board.counting(name) if isinstance(found := lasting(cell), Figure)]
     return (min(values), float(np.mean(values))) if values else (-1.0, -1.0)
 
 
@@ -137,15 +137,11 @@ def worst(board: Board, name: str, what: str) -> tuple[Figure | Missing, Case | 
     found = [
         (figure, case)
         for case, cell in board.counting(name)
-        if isinstance(figure := _lasting(cell) if what == "lasting" else getattr(cell, what), Figure)
+        if isinstance(figure := lasting(cell) if what == "lasting" else getattr(cell, what), Figure)
     ]
     return (
         min(found, key=lambda pair: pair[0].value) if found else (Missing("not measured", f"no case of {name or 'any controller'}"), None)
     )
-
-
-def _lasting(cell: Cell) -> Figure | Missing:
-    return cell.stay if isinstance(cell.stay, Figure) else cell.settled
 
 
 def share_text(figure: Figure | Missing) -> str:

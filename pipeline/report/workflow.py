@@ -21,6 +21,9 @@ READS: dict[str, tuple[str, ...]] = {
     "train_ilc": (),
     "segment_library": ("train_ilc",),
     "compose_parts": ("segment_library", "train_ilc"),
+    "train_classifier": (),
+    "train_agent": ("train_classifier",),
+    "evaluate_setpoint": ("train_classifier", "train_agent"),
 }
 SAME, CHANGED, GONE, FIRST = "as accepted", "made anew", "not there", "first run"
 CSS = {SAME: "same", CHANGED: "anew", GONE: "lost", FIRST: "same"}

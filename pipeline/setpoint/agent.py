@@ -117,12 +117,14 @@ class Setting(NamedTuple):
 
 
 class Replay(NamedTuple):
-    """Ring of transitions: x and what followed (capacity, d), action and reward of both heads (capacity, 2)."""
+    """Ring of transitions: x and what followed (capacity, d), action and reward of both heads (capacity, 2), and whether lambda's clock heeds no temperature action next
+    (capacity,): then the temperature stands, and the target says so; a maximum there would make waiting free."""
 
     x: jax.Array
     after: jax.Array
     action: jax.Array
     reward: jax.Array
+    waits: jax.Array
 
 
 class World(NamedTuple):
@@ -167,19 +169,21 @@ def _stepped(world: World, sight: Sight, network, episodes, epsilon, key, length
     )
     memory, after = jax.vmap(Partial(sight.see, network))(memory, observation)
     rewards = jax.vmap(world.rewards)(state)
-    over = state.step >= length
+    over, waits = state.step >= length, state.step % LAMBDA != 0
 
     def renewed(going):
         again = _fresh(world, sight, network, jax.random.split(k_fresh, n))
         return jax.tree.map(lambda new, old: jnp.where(over.reshape(-1, *[1] * (old.ndim - 1)), new, old), again, going)
 
     episodes = jax.lax.cond(over.any(), renewed, lambda going: going, (conditions, state, memory, after))
-    return episodes, Replay(x, after, action.astype(jnp.int8), rewards)
+    return episodes, Replay(x, after, action.astype(jnp.int8), rewards, waits)
 
 
 def _updated(learner: Learner, rows: Replay, optimiser, bootstrap, gamma: float | jax.Array, tau: float) -> Learner:
     """One step on (12) for a batch, then (13)."""
-    y = rows.reward + gamma * jax.vmap(Partial(bootstrap, learner.network, learner.slow))(rows.after)
+    ahead = jax.vmap(Partial(bootstrap, learner.network, learner.slow))(rows.after)
+    standing = jax.vmap(learner.slow)(rows.after)[:, 1, STAND]
+    y = rows.reward + gamma * ahead.at[:, 1].set(jnp.where(rows.waits, standing, ahead[:, 1]))
     taken = jax.nn.one_hot(rows.action, ACTIONS)
 
     def loss(network):
@@ -206,7 +210,13 @@ def phase(
     conditions, state, memory, x = _fresh(world, sight, learner.network, jax.random.split(k_start, n))
     state = state._replace(step=LAMBDA * jax.random.randint(k_clock, (n,), 0, setting.episode // LAMBDA))
     rows = setting.capacity
-    replay = Replay(jnp.zeros((rows, x.shape[1])), jnp.zeros((rows, x.shape[1])), jnp.zeros((rows, 2), jnp.int8), jnp.zeros((rows, 2)))
+    replay = Replay(
+        jnp.zeros((rows, x.shape[1])),
+        jnp.zeros((rows, x.shape[1])),
+        jnp.zeros((rows, 2), jnp.int8),
+        jnp.zeros((rows, 2)),
+        jnp.zeros(rows, bool),
+    )
 
     def one(carry, i):
         learner, episodes, replay = carry

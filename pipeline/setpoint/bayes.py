@@ -123,11 +123,44 @@ def robust_filter(table: WindowTable, *, accuracy: float, looks: int, look: floa
     evidence = np.concatenate(
         [class_evidence(accuracy), recorded_evidence(table, look=look, looks=looks, floor=floor, smoothing=smoothing)]
     )
+    return Filter(
+        jnp.asarray(evidence, jnp.float32), jnp.asarray(_changes(looks, segment, switch), jnp.float32), hazard, move_cost, outside_cost
+    )
+
+
+def segment_filter(table: WindowTable, *, accuracy: float, floor: float, smoothing: float, segment: float, switch: float, hazard: float, move_cost: float,
+                   outside_cost: float) -> Filter:  # fmt: skip
+    """The filter whose hypotheses 1 .. are the recorded segments themselves: P(code | segment, q) from each one's own windows, smoothed over flow and over neighbouring codes;
+    hypothesis 0 errs anywhere (`accuracy`). For tables in which a segment is seen at many flows; other arguments as of `robust_filter`.
+    """
+    edges = np.asarray(table.flow_edges, float)
+    centre, width = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
+    codes = np.asarray(code(jnp.asarray(table.shares), jnp.asarray(table.named)))
+    near = np.exp(-0.5 * (np.arange(CODES)[:, None] - np.arange(CODES)) ** 2.0)
+    weight = np.exp(-0.5 * ((GRID[:, None] - centre) / np.maximum(smoothing, width / 2)) ** 2)
+    evidence = [class_evidence(accuracy)[0]]
+    for s in np.unique(table.segment):
+        counts = np.zeros((len(centre), CODES))
+        np.add.at(counts, (table.flow_bin[table.segment == s], codes[table.segment == s]), 1.0)
+        shown = weight @ (counts @ (near / near.sum(axis=1, keepdims=True)) * width[:, None])
+        evidence.append(((1 - floor) * shown / np.maximum(shown.sum(axis=1, keepdims=True), 1e-300) + floor / CODES).T)
+    looks = len(evidence) - 1
+    return Filter(
+        jnp.asarray(np.array(evidence), jnp.float32),
+        jnp.asarray(_changes(looks, segment, switch), jnp.float32),
+        hazard,
+        move_cost,
+        outside_cost,
+    )
+
+
+def _changes(looks: int, segment: float, switch: float) -> np.ndarray:
+    """(looks + 1, looks + 1): from erring anywhere (row 0) to erring as recorded or back with probability `switch`; looks last `segment` decisions."""
     transition = np.zeros((looks + 1, looks + 1))
     transition[0, 0], transition[0, 1:] = 1.0 - switch, switch / looks
     transition[1:, 0] = switch
     transition[1:, 1:] = (1.0 - switch) * ((1.0 - 1.0 / segment) * np.eye(looks) + 1.0 / segment / looks)
-    return Filter(jnp.asarray(evidence, jnp.float32), jnp.asarray(transition, jnp.float32), hazard, move_cost, outside_cost)
+    return transition
 
 
 def class_filter(*, accuracy: float, hazard: float, move_cost: float, outside_cost: float) -> Filter:

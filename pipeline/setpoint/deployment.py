@@ -162,6 +162,12 @@ def wait_after(change: np.ndarray, waits: Waits) -> np.ndarray:
     return np.maximum(asked.max(axis=1), waits.idle_s)
 
 
+def derived_waits(flow_settling_s: float, target_settling_s: float, *, transport_s: float) -> Waits:
+    """The waits from measured settling after a step of the flow and of the target; transport_s is how long the nozzle takes along the key area (0 where unknown): only
+    then does all of it show line that was laid after the change. After no move another look waits as after a move of the flow: at once it would show the same segment."""
+    return Waits(flow_settling_s + transport_s, target_settling_s + transport_s, flow_settling_s + transport_s)
+
+
 def settling_s(y: np.ndarray, *, at: int, band: float, window: int, sample_time_s: float) -> float:
     """Seconds from the step at sample `at` until the mean of every later window of y (T,) stays within `band` (units of y) of where the response ends.
 

@@ -17,6 +17,7 @@ from pipeline.setpoint.deployment import (
     Limits,
     Waits,
     autocorrelation,
+    derived_waits,
     effective_frames,
     judge_window,
     moved,
@@ -45,7 +46,7 @@ def one(p=UNDER, frames=20, valid=20, foreign=0, moved=False, **rules):
 anything = st.floats(allow_nan=True, allow_infinity=True, width=64)
 
 
-@settings(max_examples=200)
+@settings(max_examples=100)
 @given(st.data())
 def test_whatever_arrives_the_shares_are_a_distribution_and_an_action_rests_on_enough_proper_frames(data):
     E, W = data.draw(st.integers(1, 4)), data.draw(st.integers(0, 12))
@@ -123,7 +124,7 @@ def test_windows_of_the_wrong_shape_are_refused():
 # ---- limits
 
 
-@settings(max_examples=200)
+@settings(max_examples=100)
 @given(st.data())
 def test_no_sequence_of_actions_leaves_the_box_or_passes_the_slew_of_an_action_or_of_any_minute(data):
     n = data.draw(st.integers(1, 25))
@@ -172,6 +173,7 @@ def test_the_wait_is_the_longest_that_any_move_asks_for():
     change = np.array([[0.0, 0.0], [5.0, 0.0], [0.0, -10.0], [-5.0, 20.0]])
     np.testing.assert_array_equal(wait_after(change, Waits(3.0, 8.0, 0.5)), [0.5, 3.0, 8.0, 8.0])
     np.testing.assert_array_equal(wait_after(change, Waits(6.0, 6.0, 6.0)), 6.0)  # as published
+    assert derived_waits(3.0, 20.0, transport_s=0.5) == Waits(3.5, 20.5, 3.5)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
