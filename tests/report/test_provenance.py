@@ -15,6 +15,7 @@ def lock():
     """dvc.lock of the small project as DVC would write it: folders of stages, and what the report stage wrote."""
     outs = [Path("datasets") / name for name in ("compose_parts", "evaluate_temperature", "identify_plant", "ingest")]
     outs += [Path("datasets") / name for name in ("learn_kernel", "segment_library", "train_ilc", "tune_weights")]
+    outs += [Path("datasets") / name for name in ("train_classifier", "train_agent", "evaluate_setpoint")]
     stages = {path.name: {"outs": [{"path": str(path), "md5": provenance.md5(path)}]} for path in outs}
     written = [*Path("reports").glob("*.html"), *Path("reports/metrics").glob("*.json")]
     stages["report"] = {"outs": [{"path": str(path), "md5": provenance.md5(path)} for path in sorted(written)]}

@@ -71,16 +71,18 @@ def test_the_network_sees_30_classes_the_scaled_distribution_and_both_temperatur
 # ---- the learning rule
 
 
-def one_row(network, reward, after):
+def one_row(network, reward, after, waits=False):
     learner = Learner(network, jax.tree.map(lambda w: 2 * w, network), optax.sgd(0.0).init(network))
-    row = Replay(jnp.zeros((1, 35)), after[None], jnp.array([[4, STAND]], jnp.int8), jnp.array([reward]))
+    row = Replay(jnp.zeros((1, 35)), after[None], jnp.array([[4, STAND]], jnp.int8), jnp.array([reward]), jnp.array([waits]))
     return learner, row
 
 
-def test_each_head_learns_from_its_own_maximum_of_the_slow_copy_by_hand():
+@pytest.mark.parametrize("waits", [False, True])
+def test_each_head_learns_from_its_own_maximum_of_the_slow_copy_or_from_standing_where_nothing_is_heeded_next(waits):
     network, after = QNetwork(jax.random.key(1)), jax.random.normal(jax.random.key(2), (35,))
-    learner, row = one_row(network, [0.5, -0.5], after)
-    y = np.array([0.5, -0.5]) + 0.9 * np.asarray(learner.slow(after)).max(axis=1)
+    learner, row = one_row(network, [0.5, -0.5], after, waits)
+    ahead = np.asarray(learner.slow(after))
+    y = np.array([0.5, -0.5]) + 0.9 * np.array([ahead[0].max(), ahead[1, STAND] if waits else ahead[1].max()])
     Q = np.asarray(network(jnp.zeros(35)))
     error = np.array([Q[0, 4], Q[1, STAND]]) - y  # gradient of the mean of two squares is the error itself
     optimiser = optax.sgd(1.0)
@@ -106,6 +108,7 @@ def test_both_heads_are_paid_by_the_ellipse():
     np.testing.assert_allclose(ellipse(40.0, 20.0, state), [0.394, 0.394], atol=5e-4)  # the check value has three digits
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_others():
     train = lambda seed: train_published(jax.random.key(seed), setting=SMALL, rate=1e-4, updates=(20, 20), accuracy=0.7, **EXPLORE)
     one, again, other = train(0), train(0), train(1)
@@ -171,6 +174,7 @@ def test_untrained_it_settles_the_papers_simulator_from_every_start(known):
     assert score.median_steps <= 8
 
 
+@pytest.mark.slow
 def test_training_in_troubles_is_reproducible_and_keeps_the_start_where_it_is_no_better(known):
     table = synthetic_table(np.random.default_rng(1), segments=5, windows=4)
     troubles = belief_agent.Troubles(
