@@ -72,7 +72,13 @@ def riccati_pair() -> Callable[[], object]:
 
 
 # the case; how many processes; how often it is repeated in one, of which the median counts
-CASES = {"kernel_6": (kernel_6, REPEATS, 1), "naive_6": (naive_6, 1, 1), "kernel_2": (kernel_2, REPEATS, 5), "retune_2": (retune_2, REPEATS, 15), "riccati": (riccati_pair, REPEATS, 200)}
+CASES = {
+    "kernel_6": (kernel_6, REPEATS, 1),
+    "naive_6": (naive_6, 1, 1),
+    "kernel_2": (kernel_2, REPEATS, 5),
+    "retune_2": (retune_2, REPEATS, 15),
+    "riccati": (riccati_pair, REPEATS, 200),
+}
 
 
 def peak_MB() -> float:
@@ -93,14 +99,22 @@ def measure(name: str) -> dict[str, float]:
     iterations = getattr(found, "iterations", None)
     if name == "kernel_6" and iterations != ITERATIONS:
         raise ValueError(f"kernel_6 should make {ITERATIONS} iterations but made {iterations}")
-    return {"cpu_s": statistics.median(seconds[1:] or seconds), "above_imports_MB": peak_MB() - imports, "of_which_data_MB": tuples_made - imports}
+    return {
+        "cpu_s": statistics.median(seconds[1:] or seconds),
+        "above_imports_MB": peak_MB() - imports,
+        "of_which_data_MB": tuples_made - imports,
+    }
 
 
 def fresh(name: str) -> dict[str, float]:
     """`measure` in processes of their own, one BLAS thread each: the median of each figure."""
     environment = os.environ | {key: "1" for key in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
     runs = [
-        json.loads(subprocess.run([sys.executable, "-m", "benchmarks.temperature", name], env=environment, check=True, capture_output=True, text=True).stdout)
+        json.loads(
+            subprocess.run(
+                [sys.executable, "-m", "benchmarks.temperature", name], env=environment, check=True, capture_output=True, text=True
+            ).stdout
+        )
         for _ in range(CASES[name][1])
     ]
     return {key: statistics.median(run[key] for run in runs) for key in runs[0]}
@@ -109,7 +123,12 @@ def fresh(name: str) -> dict[str, float]:
 def bars(found: dict[str, dict[str, float]]) -> list[tuple[str, float, float, bool]]:
     """Figure, value, bar, and whether more is better."""
     return [
-        ("N = 6, 15,000 samples, 500 iterations: times faster than the naive form", found["naive_6"]["cpu_s"] / found["kernel_6"]["cpu_s"], 50.0, True),
+        (
+            "N = 6, 15,000 samples, 500 iterations: times faster than the naive form",
+            found["naive_6"]["cpu_s"] / found["kernel_6"]["cpu_s"],
+            50.0,
+            True,
+        ),
         ("N = 6, 15,000 samples: GB above the imports", found["kernel_6"]["above_imports_MB"] / 1024, 0.6, False),
         ("N = 2, 500 samples: s", found["kernel_2"]["cpu_s"], 0.05, False),
         ("new weights: ms", 1000 * found["retune_2"]["cpu_s"], 30.0, False),
@@ -135,7 +154,10 @@ def main() -> None:
         "command": "./run python -m benchmarks.temperature",
         "machine": {"cores": os.cpu_count(), "blas_threads": 1},
         "cases": {name: {key: float(f"{value:.3g}") for key, value in figures.items()} for name, figures in found.items()},
-        "figures": [{"figure": figure, "value": float(f"{value:.3g}"), "bar": bar, "better": "more" if more else "less"} for figure, value, bar, more in table],
+        "figures": [
+            {"figure": figure, "value": float(f"{value:.3g}"), "bar": bar, "better": "more" if more else "less"}
+            for figure, value, bar, more in table
+        ],
     }
     RESULTS.parent.mkdir(exist_ok=True)
     RESULTS.write_text(json.dumps(result, indent=2) + "\n")

@@ -268,7 +268,8 @@ def expected(root: Path, stage: str) -> dict[str, Any]:
     metrics = [f"reports/metrics/{stage}.json"] if any(function == "write_metrics" for *_, function in calls(tree)) else []
     entry = {
         "cmd": f"python -m stages.{stage}",
-        "deps": [dep for dep in (name, *sorted(code - {name}), *sorted(data_files(root, code))) if dep.split("/")[0] not in read] + sorted(read),
+        "deps": [dep for dep in (name, *sorted(code - {name}), *sorted(data_files(root, code))) if dep.split("/")[0] not in read]
+        + sorted(read),
         "params": sorted(keys),
         # DVC deletes outs before it runs a stage unless they persist, and the last good artifacts must outlive a stage that fails
         "outs": [{path: {"persist": True}} for path in sorted(written)],

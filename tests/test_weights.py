@@ -25,7 +25,10 @@ def test_equal_arrays_give_equal_bytes_in_whatever_order_they_come(tmp_path):
     "change, sentence",
     [
         (lambda path: path.unlink(), "weights.safetensors is missing; make it again with ./run dvc repro train_agent"),
-        (lambda path: path.write_bytes(path.read_bytes()[:-5]), "holds no whole weights .*; make it again with ./run dvc repro train_agent"),
+        (
+            lambda path: path.write_bytes(path.read_bytes()[:-5]),
+            "holds no whole weights .*; make it again with ./run dvc repro train_agent",
+        ),
         (lambda path: write_weights(path, "classifier 1", ARRAYS, {}), "should hold weights of agent 1 but has schema classifier 1; "),
     ],
 )

@@ -54,7 +54,9 @@ def test_the_baseline_settles_on_every_plant_of_the_spread():
     plants = spread(baam(), input_gain=0.15, loss=0.005)
     scenarios = panel(plants, starts=[20.0], references=[REFERENCE], noise=[0.0], seeds=[0], steps=600, hold=0, cells=True)
     law, target = pi_law(pairing(baam(), LOW, HIGH, horizon=600), inputs=7), feasible_target(baam(), REFERENCE, LOW, HIGH)
-    run = simulate(scenarios, law, feed_forward(scenarios, law, {REFERENCE.tobytes(): (target.u, target.y)}), limits=(LOW, HIGH), integral_band=1.0)
+    run = simulate(
+        scenarios, law, feed_forward(scenarios, law, {REFERENCE.tobytes(): (target.u, target.y)}), limits=(LOW, HIGH), integral_band=1.0
+    )
     found = figures(scenarios, run, limits=(LOW, HIGH), band=1.0, sample_time_s=1.0)
     assert found.settled_error_degC.max() < 1.0
     assert not np.isnan(found.settling_s).any()

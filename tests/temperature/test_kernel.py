@@ -30,7 +30,9 @@ from pipeline.temperature.tracking import gains
 from tests.temperature import naive
 
 I5, I7 = np.eye(5), np.eye(7)
-SMALL = plant([[0.8, 0.2, 0.0], [-0.1, 0.7, 0.3], [0.0, 0.1, 0.9]], [[0.5, -1.0], [1.0, 0.3], [0.2, 0.7]], [[1.0, 0.5, -0.3], [0.2, -1.0, 0.8]])
+SMALL = plant(
+    [[0.8, 0.2, 0.0], [-0.1, 0.7, 0.3], [0.0, 0.1, 0.9]], [[0.5, -1.0], [1.0, 0.3], [0.2, 0.7]], [[1.0, 0.5, -0.3], [0.2, -1.0, 0.8]]
+)
 OFFSET = SMALL._replace(b=np.array([0.3, -0.2, 0.5]), d=np.array([1.0, -2.0]))
 Q2, R2 = np.array([[2.0, 0.3], [0.3, 1.0]]), np.diag([0.5, 1.5])
 TURN = 0.9 * np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
@@ -90,7 +92,10 @@ def test_windows_hold_the_past_newest_first():
 
 
 def test_no_window_reaches_across_a_gap_or_holds_a_masked_sample():
-    u, y = [np.arange(10.0 * k, 10 * k + n)[:, None] for k, n in ((0, 8), (1, 2), (2, 5))], [np.arange(10.0 * k, 10 * k + n)[:, None] for k, n in ((0, 8), (1, 2), (2, 5))]
+    u, y = (
+        [np.arange(10.0 * k, 10 * k + n)[:, None] for k, n in ((0, 8), (1, 2), (2, 5))],
+        [np.arange(10.0 * k, 10 * k + n)[:, None] for k, n in ((0, 8), (1, 2), (2, 5))],
+    )
     y[0][4] = np.nan
     w, u_now, _ = windows(u, y, 2)
     # of rows 2..7 of the first segment, y at 4 is in the windows of 5 and 6 and is itself the output of 4; the second is too short; of the third rows 2..4 are complete
@@ -108,7 +113,9 @@ def test_segments_give_the_kernel_of_one_record():
 
 
 def test_records_shorter_than_the_window_are_refused():
-    with pytest.raises(ValueError, match="no segment is longer than the window of 3 samples; lower the window, or record a longer stretch without gaps"):
+    with pytest.raises(
+        ValueError, match="no segment is longer than the window of 3 samples; lower the window, or record a longer stretch without gaps"
+    ):
         windows([np.ones((3, 1))], [np.ones((3, 1))], 3)
 
 
@@ -159,7 +166,9 @@ def differences(data, iterations):
     W, _ = whitening(data.s, data.s_next, tolerance=1e-9)
     scale = np.block([[W, np.zeros((len(W), 7))], [np.zeros((7, W.shape[1])), np.diag(1 / np.sqrt((data.u**2).mean(axis=0)))]])
     ours = np.column_stack([found.K, found.k + found.K_r @ data.base])
-    return np.abs(scale.T @ found.H @ scale - H).max() / np.abs(H).max(), np.abs(ours - K @ data.features).max() / np.abs(K @ data.features).max()
+    return np.abs(scale.T @ found.H @ scale - H).max() / np.abs(H).max(), np.abs(ours - K @ data.features).max() / np.abs(
+        K @ data.features
+    ).max()
 
 
 def test_the_kernel_equals_the_naive_form_at_the_published_ridge(record):
@@ -190,7 +199,9 @@ def test_the_kernel_learned_without_noise_is_the_exact_one(record, N, samples):
 
 
 @pytest.mark.parametrize("F", [np.eye(2), TURN], ids=["constant reference", "turning and decaying reference"])
-@pytest.mark.parametrize(("machine", "offset"), [(SMALL, False), (SMALL, True), (OFFSET, True)], ids=["no offset", "offset 0 learned", "offset"])
+@pytest.mark.parametrize(
+    ("machine", "offset"), [(SMALL, False), (SMALL, True), (OFFSET, True)], ids=["no offset", "offset 0 learned", "offset"]
+)
 def test_the_learned_law_is_the_optimal_one_for_any_generator_and_offset(machine, offset, F):
     x, u, y = small_record(machine)
     found = value_iteration(regress(tuples([u], [y], 2, offset=offset)), Q2, R2, 0.9, F=F, tolerance=1e-12)
@@ -207,7 +218,9 @@ def test_policies_and_values_lead_to_one_kernel():
     by_value = value_iteration(data, Q2, R2, 0.9, tolerance=1e-13)
     by_policy = policy_iteration(data, Q2, R2, 0.9, np.zeros((2, len(data.W))))
     assert by_policy.iterations < 10 < by_value.iterations
-    np.testing.assert_allclose(by_policy.H, by_value.H, rtol=1e-8, atol=1e-8 * np.abs(by_value.H).max())  # H creeps at 0.9^k after the gain has settled
+    np.testing.assert_allclose(
+        by_policy.H, by_value.H, rtol=1e-8, atol=1e-8 * np.abs(by_value.H).max()
+    )  # H creeps at 0.9^k after the gain has settled
     np.testing.assert_allclose(by_policy.K, by_value.K, atol=1e-9)
     np.testing.assert_allclose(by_policy.k, by_value.k, atol=1e-9)
 
@@ -222,7 +235,9 @@ def test_the_kernel_solves_the_bellman_equation_on_every_sample():
     v, s_next = np.hstack([data.s @ W.T, data.u / np.sqrt((data.u**2).mean(axis=0))]), data.s_next @ W.T
     P = found.H[:7, :7] - found.H[:7, 7:] @ np.linalg.solve(found.H[7:, 7:], found.H[7:, :7])
     stage = ((data.e @ Q2) * data.e + (data.u @ R2) * data.u).sum(axis=1)
-    np.testing.assert_allclose(((v @ found.H) * v).sum(axis=1), stage + 0.9 * ((s_next @ P) * s_next).sum(axis=1), rtol=1e-8, atol=1e-8)  # rounding times condition
+    np.testing.assert_allclose(
+        ((v @ found.H) * v).sum(axis=1), stage + 0.9 * ((s_next @ P) * s_next).sum(axis=1), rtol=1e-8, atol=1e-8
+    )  # rounding times condition
 
 
 def test_exactly_so_many_iterations_are_made_as_asked_for():
@@ -256,7 +271,9 @@ def test_window_law_takes_over_with_the_history_of_the_hold():
 def test_the_state_is_reconstructed_from_the_window_to_rounding(N, record):
     u, _ = record
     x, y = simulate(baam(), u[:40], np.linspace(10, 60, 6))
-    np.testing.assert_allclose(windows([u[:40]], [y], N)[0] @ reconstruction(baam(), N).T, x[N:-1], atol=1e-9)  # rounding at 100 °C times the inverse of C
+    np.testing.assert_allclose(
+        windows([u[:40]], [y], N)[0] @ reconstruction(baam(), N).T, x[N:-1], atol=1e-9
+    )  # rounding at 100 °C times the inverse of C
 
 
 # ---- refusals
@@ -264,7 +281,10 @@ def test_the_state_is_reconstructed_from_the_window_to_rounding(N, record):
 
 def test_too_few_samples_are_refused_with_how_many_more(record):
     u, y = record
-    with pytest.raises(ValueError, match=re.escape("expected at least 378 samples for its 378 unknowns, found 300; record 78 more, or lower the window below 2")):
+    with pytest.raises(
+        ValueError,
+        match=re.escape("expected at least 378 samples for its 378 unknowns, found 300; record 78 more, or lower the window below 2"),
+    ):
         regress(tuples([u[:302]], [y[:302]], 2))
 
 
@@ -285,7 +305,10 @@ def test_an_input_that_only_feeds_back_is_refused_by_name():
         rows.append(u)
         measured.append(y)
         x = machine.A @ x + machine.B @ u
-    with pytest.raises(ValueError, match=r"input 2 of 2 follows from the past of inputs and outputs \(rank \d+ of \d+\), .* add probing that no feedback produces"):
+    with pytest.raises(
+        ValueError,
+        match=r"input 2 of 2 follows from the past of inputs and outputs \(rank \d+ of \d+\), .* add probing that no feedback produces",
+    ):
         regress(tuples([np.array(rows)], [np.array(measured)], 2))
 
 
@@ -294,7 +317,10 @@ def test_inputs_of_two_levels_at_one_frequency_do_not_determine_the_kernel():
     bits = np.random.default_rng(0).choice([-1.0, 1.0], (400, 1))
     machine = plant([[0.0]], [[1.0]], [[1.0]])
     y = simulate(machine, bits, np.ones(1))[1]
-    with pytest.raises(ValueError, match=r"does not determine the kernel: expected a Gram matrix of condition below 1e\+13 for \d+ unknowns, found .* probe with more levels"):
+    with pytest.raises(
+        ValueError,
+        match=r"does not determine the kernel: expected a Gram matrix of condition below 1e\+13 for \d+ unknowns, found .* probe with more levels",
+    ):
         regress(tuples([bits], [y], 1))
 
 
@@ -306,5 +332,8 @@ def test_a_kernel_without_a_minimum_in_u_is_refused(record):
 
 def test_value_iteration_that_does_not_settle_is_refused():
     _, u, y = small_record(SMALL)
-    with pytest.raises(ValueError, match=r"value iteration did not settle in 1 iterations \(last relative change of the gain .*\); record longer, or lower the window"):
+    with pytest.raises(
+        ValueError,
+        match=r"value iteration did not settle in 1 iterations \(last relative change of the gain .*\); record longer, or lower the window",
+    ):
         value_iteration(regress(tuples([u], [y], 2)), Q2, R2, 0.9, max_iterations=1)

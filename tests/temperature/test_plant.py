@@ -48,7 +48,9 @@ def test_markov_parameters_are_the_response_to_a_unit_pulse():
     for channel in range(machine.m):
         pulse = np.zeros((lags + 1, machine.m))
         pulse[0, channel] = 1.0
-        np.testing.assert_allclose(h[:, :, channel], simulate(machine, pulse, np.zeros(machine.n))[1][1:], atol=1e-14)  # rounding of numbers near 1
+        np.testing.assert_allclose(
+            h[:, :, channel], simulate(machine, pulse, np.zeros(machine.n))[1][1:], atol=1e-14
+        )  # rounding of numbers near 1
 
 
 def test_the_study_s_machine_shows_every_state_and_obeys_in_every_state():
@@ -80,7 +82,9 @@ def test_the_holding_input_of_an_output_rests_there_and_is_the_smallest(machine)
     y = np.linspace(40.0, 60.0, machine.p)
     x, u = hold_output(machine, y)
     np.testing.assert_allclose(machine.A @ x + machine.B @ u + machine.b, x, atol=1e-11)  # rounding at 60 °C
-    np.testing.assert_allclose(machine.C @ x + machine.D @ u + machine.d, y, atol=1e-8)  # rounding times the gain of 5e5 of the study's machine at rest
+    np.testing.assert_allclose(
+        machine.C @ x + machine.D @ u + machine.d, y, atol=1e-8
+    )  # rounding times the gain of 5e5 of the study's machine at rest
     # smallest: the map from u to y at rest is surjective here, and its pseudo-inverse gives the least norm
     rest = machine.C @ np.linalg.inv(np.eye(machine.n) - machine.A)
     expected = np.linalg.pinv(rest @ machine.B + machine.D) @ (y - machine.d - rest @ machine.b)

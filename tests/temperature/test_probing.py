@@ -20,7 +20,17 @@ def gentle(signal, *, rate=5.0, noise=0.1, seed=0, low=None, high=None):
     target, rng = feasible_target(baam(), REFERENCE, LOW, HIGH), np.random.default_rng(seed)
     limits = {"low": target.u - 5 if low is None else low, "high": target.u + 5 if high is None else high}
     disturbance = noise * rng.standard_normal((len(signal), 5))
-    return probe(baam(), signal, x0=target.x, u_centre=target.u, y_centre=target.y, feedback=0.2 * np.eye(7, 5), rate=rate, noise=disturbance, **limits), target
+    return probe(
+        baam(),
+        signal,
+        x0=target.x,
+        u_centre=target.u,
+        y_centre=target.y,
+        feedback=0.2 * np.eye(7, 5),
+        rate=rate,
+        noise=disturbance,
+        **limits,
+    ), target
 
 
 def test_a_multisine_stays_within_its_amplitude_and_reaches_it():
@@ -36,7 +46,9 @@ def test_the_inputs_of_a_multisine_share_no_line_and_have_none_below_the_lowest(
     assert on.sum(axis=1).max() == 1
     assert (2 * np.pi * np.flatnonzero(on.any(axis=1)) / samples).min() >= 0.5
     for channel in range(3):
-        np.testing.assert_allclose(power[on[:, channel], channel], power[on[:, channel], channel].mean(), rtol=1e-9)  # equal power; rounding
+        np.testing.assert_allclose(
+            power[on[:, channel], channel], power[on[:, channel], channel].mean(), rtol=1e-9
+        )  # equal power; rounding
 
 
 def test_a_prbs_has_two_levels_and_switches_no_faster_than_told():
@@ -142,5 +154,7 @@ def test_the_level_of_a_frequency_lands_in_its_band_with_its_r_m_s_value():
 
 
 def test_too_short_a_record_is_refused_with_how_many_more():
-    with pytest.raises(ValueError, match=re.escape("excitation of order 12 with 7 inputs expects at least 96 samples, found 90; record 6 more")):
+    with pytest.raises(
+        ValueError, match=re.escape("excitation of order 12 with 7 inputs expects at least 96 samples, found 90; record 6 more")
+    ):
         excitation(np.zeros((90, 7)), 12)

@@ -27,7 +27,11 @@ def learned(draws):
     return kernel_gains(draws[1], draws[2], [IDENTITY, TUNED_DATA])
 
 
-@pytest.mark.parametrize(("weights", "J100", "J1000", "error"), [(IDENTITY, 183_362.49, 183_436.2, 0.03763), (TUNED_MODEL, 76_060.36, 76_072.6, 0.02738)], ids=["identity", "tuned"])
+@pytest.mark.parametrize(
+    ("weights", "J100", "J1000", "error"),
+    [(IDENTITY, 183_362.49, 183_436.2, 0.03763), (TUNED_MODEL, 76_060.36, 76_072.6, 0.02738)],
+    ids=["identity", "tuned"],
+)
 def test_the_model_based_figures_come_out_as_printed(draws, weights, J100, J1000, error):
     found = model_based(weights, draws[0])
     assert found.J100 == pytest.approx(J100, abs=0.01)  # the bar
@@ -40,7 +44,9 @@ def test_the_data_driven_cost_comes_out_as_printed(learned):
 
 
 def test_the_tuned_data_driven_cost_is_the_one_of_the_notes(learned):
-    assert data_driven(TUNED_DATA[0], learned[1]).J100 == pytest.approx(204_666.9, abs=1.0)  # printed 204,635.7; both are shown, without a bar
+    assert data_driven(TUNED_DATA[0], learned[1]).J100 == pytest.approx(
+        204_666.9, abs=1.0
+    )  # printed 204,635.7; both are shown, without a bar
 
 
 def test_most_of_the_data_driven_cost_accrues_in_the_start_up_steps(learned):

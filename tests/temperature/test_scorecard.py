@@ -42,7 +42,18 @@ def static(gain: float) -> Law:
     """u = gain (r - y), without memory."""
     empty = np.zeros((0, 1))
     return Law(
-        np.zeros((0, 0)), empty, empty, empty, np.zeros(0), np.zeros((1, 0)), np.full((1, 1), gain), np.full((1, 1), -gain), np.zeros(1), empty, empty, np.zeros(0)
+        np.zeros((0, 0)),
+        empty,
+        empty,
+        empty,
+        np.zeros(0),
+        np.zeros((1, 0)),
+        np.full((1, 1), gain),
+        np.full((1, 1), -gain),
+        np.zeros(1),
+        empty,
+        empty,
+        np.zeros(0),
     )
 
 
@@ -60,7 +71,13 @@ def scenarios(plants=None, noise=(0.0,), seeds=(1,), steps=60, hold=5, starts=(2
 
 
 def test_a_panel_is_every_combination_and_noise_free_ones_once():
-    found = scenarios(spread(baam(), input_gain=0.15, loss=0.005), noise=(0.0, 0.1), seeds=(1, 2, 3), starts=(20.0, 70.0), references=[REFERENCE, REFERENCE - 15])
+    found = scenarios(
+        spread(baam(), input_gain=0.15, loss=0.005),
+        noise=(0.0, 0.1),
+        seeds=(1, 2, 3),
+        starts=(20.0, 70.0),
+        references=[REFERENCE, REFERENCE - 15],
+    )
     assert len(found.r) == 16 * 2 * 2 * (1 + 3)
     assert (found.noise == 0).sum() == 16 * 2 * 2
     np.testing.assert_array_equal(np.bincount(found.plant), np.full(16, 16))
@@ -105,7 +122,9 @@ def test_the_integrator_sees_errors_no_larger_than_its_band():
     found = panel([machine], starts=[0.0], references=[[10.0]], noise=[0.0], seeds=[0], steps=3, hold=0, cells=False)
     law = static(1.0)._replace(integral=0.5)
     # u = (r + xi) - y, y+ = u, xi+ = xi + 0.5 clip(r - y, 1): errors 10, 0, 9.5
-    np.testing.assert_allclose(simulate(found, law, np.zeros((1, 1)), limits=None, integral_band=1.0).u[:, 0, 0], [10.0, 0.5, 10.0 + 0.5 - 0.5], rtol=1e-12)
+    np.testing.assert_allclose(
+        simulate(found, law, np.zeros((1, 1)), limits=None, integral_band=1.0).u[:, 0, 0], [10.0, 0.5, 10.0 + 0.5 - 0.5], rtol=1e-12
+    )
 
 
 def test_the_memory_is_fed_with_what_was_applied():
@@ -149,14 +168,19 @@ def test_nothing_is_cheaper_than_the_optimum_and_the_observer_is_nearly_as_cheap
     found = scenarios(plants, steps=1500, starts=(20.0, 45.0))
     best = optimum(found, YARDSTICK)
     for law in (observer(), observer(q=0.5), observer(r=0.5)):
-        assert (regret(cost(found, simulate(found, law, feed_forward(found, law, None), limits=None), YARDSTICK), best) > -1e-12).all()  # 0.99^1500 of a cost
+        assert (
+            regret(cost(found, simulate(found, law, feed_forward(found, law, None), limits=None), YARDSTICK), best) > -1e-12
+        ).all()  # 0.99^1500 of a cost
     nominal = found.plant == 0
     mine = regret(cost(found, simulate(found, observer(), feed_forward(found, observer(), None), limits=None), YARDSTICK), best)
     assert mine[nominal].max() < 1e-5
     assert mine[~nominal].max() > 1e-3
 
 
-@pytest.mark.parametrize("other", [Yardstick(2 * np.ones(5), np.ones(7), GAMMA), Yardstick(np.ones(5), 2 * np.ones(7), GAMMA), Yardstick(np.ones(5), np.ones(7), 0.95)])
+@pytest.mark.parametrize(
+    "other",
+    [Yardstick(2 * np.ones(5), np.ones(7), GAMMA), Yardstick(np.ones(5), 2 * np.ones(7), GAMMA), Yardstick(np.ones(5), np.ones(7), 0.95)],
+)
 def test_costs_under_different_weights_are_refused(other):
     sentence = r"^costs under different weights cannot be compared: one was computed with q = .*, r = .*, gamma = .*, the other with q = .*; compute both under one yardstick"
     with pytest.raises(ValueError, match=sentence):
@@ -168,7 +192,9 @@ def test_costs_under_different_weights_are_refused(other):
 
 
 def test_an_engineer_s_figures_by_hand():
-    found = panel([plant([[0.5]], [[1.0]], [[1.0]])], starts=[20.0], references=[[100.0]], noise=[0.0], seeds=[0], steps=9, hold=0, cells=False)
+    found = panel(
+        [plant([[0.5]], [[1.0]], [[1.0]])], starts=[20.0], references=[[100.0]], noise=[0.0], seeds=[0], steps=9, hold=0, cells=False
+    )
     y = np.array([20.0, 60, 103, 100.5, 98, 100.5, 100.5, 99.8, 100.3])[:, None, None]
     command = np.array([120.0, 50, -10, 5, 5, 5, 5, 5, 5])[:, None, None]
     limits = (np.zeros(1), np.full(1, 100.0))
@@ -183,7 +209,9 @@ def test_an_engineer_s_figures_by_hand():
 
 
 def test_a_run_that_ends_outside_the_band_never_settled_and_cooling_overshoots_downwards():
-    found = panel([plant([[0.5]], [[1.0]], [[1.0]])], starts=[100.0], references=[[20.0]], noise=[0.0], seeds=[0], steps=4, hold=0, cells=False)
+    found = panel(
+        [plant([[0.5]], [[1.0]], [[1.0]])], starts=[100.0], references=[[20.0]], noise=[0.0], seeds=[0], steps=4, hold=0, cells=False
+    )
     run = Run(np.array([100.0, 50, 15, 30])[:, None, None], np.zeros((4, 1, 1)), np.zeros((4, 1, 1)))
     result = figures(found, run, limits=(np.zeros(1), np.ones(1)), band=1.0, sample_time_s=1.0)
     assert np.isnan(result.settling_s[0])
@@ -193,10 +221,22 @@ def test_a_run_that_ends_outside_the_band_never_settled_and_cooling_overshoots_d
 
 
 def test_the_engineering_cost_by_hand_and_its_refusal():
-    found = panel([plant([[0.5]], [[1.0]], [[1.0]])] * 2, starts=[20.0], references=[[100.0]], noise=[0.0], seeds=[0], steps=3, hold=0, cells=False)
-    base = figures(found, Run(np.full((3, 2, 1), 100.0), np.zeros((3, 2, 1)), np.zeros((3, 2, 1))), limits=(np.zeros(1), np.ones(1)), band=1.0, sample_time_s=1.0)
+    found = panel(
+        [plant([[0.5]], [[1.0]], [[1.0]])] * 2, starts=[20.0], references=[[100.0]], noise=[0.0], seeds=[0], steps=3, hold=0, cells=False
+    )
+    base = figures(
+        found,
+        Run(np.full((3, 2, 1), 100.0), np.zeros((3, 2, 1)), np.zeros((3, 2, 1))),
+        limits=(np.zeros(1), np.ones(1)),
+        band=1.0,
+        sample_time_s=1.0,
+    )
     values = base._replace(
-        settling_s=np.array([30.0, np.nan]), overshoot_degC=np.array([1.0, 0]), settled_error_degC=np.array([0.5, 1]), at_limits_percent=np.array([0.0, 20]), effort_percent=np.array([5.0, 10])
+        settling_s=np.array([30.0, np.nan]),
+        overshoot_degC=np.array([1.0, 0]),
+        settled_error_degC=np.array([0.5, 1]),
+        at_limits_percent=np.array([0.0, 20]),
+        effort_percent=np.array([5.0, 10]),
     )
     allowance = Allowance(15.0, 2.0, 0.5, 10.0, 10.0, worst_case=0.5)
     each = np.array([2 + 0.5 + 1 + 0 + 0.5, 4 + 0 + 2 + 2 + 1])
@@ -213,7 +253,9 @@ def delayed(machine: Plant, samples: int) -> Plant:
     for _ in range(samples):
         A = scipy.linalg.block_diag(machine.A, np.zeros((machine.p, machine.p)))
         A[machine.n :, : machine.n] = machine.C
-        machine = plant(A, np.vstack([machine.B, np.zeros((machine.p, machine.m))]), np.hstack([np.zeros((machine.p, machine.n)), np.eye(machine.p)]))
+        machine = plant(
+            A, np.vstack([machine.B, np.zeros((machine.p, machine.m))]), np.hstack([np.zeros((machine.p, machine.n)), np.eye(machine.p)])
+        )
     return machine
 
 
@@ -224,7 +266,9 @@ def first_unstable_delay(machine: Plant, law: Law, *, most: int) -> float:
 def test_the_disk_margin_of_the_textbook_loop():
     """L = 25 / (s^3 + 10 s^2 + 10 s + 10): alpha = 0.46 (Seiler, Packard, Gahinet 2020, section II), sampled so fast that its hold costs half a percent."""
     A, B, C, _, _ = scipy.signal.cont2discrete(scipy.signal.tf2ss([25.0], [1.0, 10.0, 10.0, 10.0]), 0.002)
-    assert margins([plant(A, B, C, sample_time_s=0.002)], static(1.0), grid=2000)[0].disk == pytest.approx(0.46, abs=0.005)  # printed digits
+    assert margins([plant(A, B, C, sample_time_s=0.002)], static(1.0), grid=2000)[0].disk == pytest.approx(
+        0.46, abs=0.005
+    )  # printed digits
 
 
 @pytest.mark.parametrize(("a", "b", "k"), [(0.9, 0.5, 0.6), (0.5, 1.0, 1.2), (1.0, 0.1, 3.0)])
@@ -235,7 +279,9 @@ def test_the_disk_margin_of_a_first_order_loop_in_closed_form(a, b, k):
 
 
 @pytest.mark.parametrize("integral", [0.0, 0.02])
-@pytest.mark.parametrize(("q", "r", "tau"), [(1.0, 1.0, 0.002), (0.1, 1.0, 0.002), (0.01, 1.0, 0.002), (1.0, 3.0, 2.0), (1.0, 10.0, 2.0), (3.0, 0.3, 0.002)])
+@pytest.mark.parametrize(
+    ("q", "r", "tau"), [(1.0, 1.0, 0.002), (0.1, 1.0, 0.002), (0.01, 1.0, 0.002), (1.0, 3.0, 2.0), (1.0, 10.0, 2.0), (3.0, 0.3, 0.002)]
+)
 def test_the_delay_margin_is_where_more_delay_destabilises(q, r, tau, integral):
     law = observer(q, r, tau, integral)
     margin, first = margins([baam()], law)[0].delay_s, first_unstable_delay(baam(), law, most=30)
@@ -303,8 +349,18 @@ def learned():
 def judged(learned):
     u, y, long = learned
     found = scenarios(spread(baam(), input_gain=0.15, loss=0.005)[:3], noise=(0.0, 0.1), seeds=(1, 2), steps=300, hold=8)
-    compared = judging.controllers(baam(), long, regress(tuples([u], [y], 2)), limits=LIMITS, gamma=GAMMA, tau=TAU, horizon=300, truth=baam(), exact_tau=TAU)
-    settings = {"yardstick": YARDSTICK, "q": np.ones(5), "r": np.ones(7), "limits": LIMITS, "band": 1.0, "integral": 0.02, "integral_limit": 1.0}
+    compared = judging.controllers(
+        baam(), long, regress(tuples([u], [y], 2)), limits=LIMITS, gamma=GAMMA, tau=TAU, horizon=300, truth=baam(), exact_tau=TAU
+    )
+    settings = {
+        "yardstick": YARDSTICK,
+        "q": np.ones(5),
+        "r": np.ones(7),
+        "limits": LIMITS,
+        "band": 1.0,
+        "integral": 0.02,
+        "integral_limit": 1.0,
+    }
     return found, [judging.judge(controller, found, **settings) for controller in compared]
 
 
@@ -372,7 +428,17 @@ def test_the_state_of_algorithm_2_is_chosen_from_the_record_and_refusals_are_kep
     assert [c.state for c in found] == ["window of 1", "window of 2", "window of 3", "predicted state"]
     gaps = {c.state: c.gap for c in found}
     assert min(gaps["window of 2"], gaps["predicted state"]) < min(0.01, gaps["window of 1"])
-    short = judging.kernel_candidates([u[:300]], [y[:300]], window_route.learn([u[:300]], [y[:300]], longest=4), YARDSTICK, largest=2, offset=False, start=20.0, reference=REFERENCE, steps=50)
+    short = judging.kernel_candidates(
+        [u[:300]],
+        [y[:300]],
+        window_route.learn([u[:300]], [y[:300]], longest=4),
+        YARDSTICK,
+        largest=2,
+        offset=False,
+        start=20.0,
+        reference=REFERENCE,
+        steps=50,
+    )
     refused = {c.state: c for c in short}["window of 2"]
     assert (refused.learned, refused.gap) == (None, float("inf"))
     assert re.search(r"expected at least 496 samples .* record 198 more", refused.refusal)

@@ -80,7 +80,13 @@ def test_noisy_data_sets_become_a_table_and_its_figures():
     table = study.rows(work, found)
     assert len(table["gap"]) == len(work) * len(study.ROUTES)
     figures = study.metrics({}, study.Exact(1, 2, 3, 4, 5), study.NoiseFree(6, 7, 8), table, failures=9, starts=10)
-    assert figures["window"]["noise_0_1"] == {"median_gap": 2.0, "worst_gap": 3.0, "median_error_degC": pytest.approx(0.1), "stable": 0, "of": 3}
+    assert figures["window"]["noise_0_1"] == {
+        "median_gap": 2.0,
+        "worst_gap": 3.0,
+        "median_error_degC": pytest.approx(0.1),
+        "stable": 0,
+        "of": 3,
+    }
     kernel = figures["kernel"]["noise_0_1"]
     assert (kernel["worst_gap"], kernel["median_gap"], kernel["stable"]) == (None, 4.0, 0)  # an unstable one is the worst, and no number
     assert (figures["kernel"]["gap"], figures["kernel"]["any_reference_gap"], figures["optimal"]["J1000"]) == (6, 8, 1)

@@ -26,7 +26,11 @@ from pipeline.temperature.tracking import (
 I5, I7 = np.eye(5), np.eye(7)
 LOW, HIGH = np.zeros(7), np.full(7, 100.0)
 SMALL = plant(
-    [[0.8, 0.2, 0.0], [-0.1, 0.7, 0.3], [0.0, 0.1, 0.9]], [[0.5, -1.0], [1.0, 0.3], [0.2, 0.7]], [[1.0, 0.5, -0.3], [0.2, -1.0, 0.8]], b=[0.3, -0.2, 0.5], d=[1.0, -2.0]
+    [[0.8, 0.2, 0.0], [-0.1, 0.7, 0.3], [0.0, 0.1, 0.9]],
+    [[0.5, -1.0], [1.0, 0.3], [0.2, 0.7]],
+    [[1.0, 0.5, -0.3], [0.2, -1.0, 0.8]],
+    b=[0.3, -0.2, 0.5],
+    d=[1.0, -2.0],
 )
 Q2, R2 = np.array([[2.0, 0.3], [0.3, 1.0]]), np.diag([0.5, 1.5])
 TURN = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
@@ -96,7 +100,9 @@ def best_inputs(machine, Q, R, gamma, F, x0, r0, steps):
     return np.linalg.lstsq(rows, right, rcond=None)[0].reshape(steps, m)
 
 
-@pytest.mark.parametrize("F", [np.eye(2), TURN, 0.9 * TURN, np.diag([0.5, 1.0])], ids=["constant", "turning", "turning and decaying", "one decaying"])
+@pytest.mark.parametrize(
+    "F", [np.eye(2), TURN, 0.9 * TURN, np.diag([0.5, 1.0])], ids=["constant", "turning", "turning and decaying", "one decaying"]
+)
 def test_gains_are_optimal_for_every_reference_generator_and_offset(F):
     found, x0, r0 = gains(SMALL, Q2, R2, 0.9, F), np.array([1.0, -2.0, 3.0]), np.array([20.0, -10.0])
     u = best_inputs(SMALL, Q2, R2, 0.9, F, x0, r0, 150)[0]
@@ -119,7 +125,9 @@ def test_weights_in_one_proportion_are_one_controller():
 
 
 def test_the_design_refuses_a_plant_that_jumps_with_its_input():
-    with pytest.raises(ValueError, match=r"expects outputs that do not jump with the input \(D = 0\) .* identify it with feedthrough: false"):
+    with pytest.raises(
+        ValueError, match=r"expects outputs that do not jump with the input \(D = 0\) .* identify it with feedthrough: false"
+    ):
         gains(baam()._replace(D=np.ones((5, 7))), I5, I7, GAMMA)
 
 
@@ -133,7 +141,9 @@ def test_policy_iteration_reaches_the_stabilising_gain_from_300_of_300():
     for seed in range(300):
         K0 = np.random.default_rng(seed).normal(0.0, 10.0, (7, 11))
         found = policy_iteration(machine, I5, I7, GAMMA, K0)
-        np.testing.assert_allclose(found.K, expected, atol=1e-11, err_msg=f"seed {seed}")  # its own tolerance of 1e-9, converging quadratically
+        np.testing.assert_allclose(
+            found.K, expected, atol=1e-11, err_msg=f"seed {seed}"
+        )  # its own tolerance of 1e-9, converging quadratically
         assert found.settled
 
 
@@ -151,7 +161,10 @@ def test_algorithm_1_says_when_its_iterations_ran_out():
 
 def test_policy_iteration_says_when_a_mode_obeys_no_input():
     stuck = plant(np.diag([1.1, 0.5]), [[0.0], [1.0]], np.eye(2))
-    with pytest.raises(ValueError, match=r"policy iteration did not settle in 200 policies \(discount 0\.\d+ of 0.99\); is every slow mode moved by an input\?"):
+    with pytest.raises(
+        ValueError,
+        match=r"policy iteration did not settle in 200 policies \(discount 0\.\d+ of 0.99\); is every slow mode moved by an input\?",
+    ):
         policy_iteration(stuck, np.eye(2), np.eye(1), 0.99, np.zeros((1, 4)))
 
 
@@ -184,7 +197,9 @@ def test_the_robust_observer_is_stable_and_the_same_in_any_coordinates(tau):
     other = machine._replace(A=V @ machine.A @ np.linalg.inv(V), B=V @ machine.B, C=machine.C @ np.linalg.inv(V))
     np.testing.assert_allclose(robust_observer_gain(other, tau), V @ L, atol=1e-6)  # rounding times the square of the condition of V, 1e3
     P = scipy.linalg.solve_discrete_are(machine.A.T, machine.C.T, machine.B @ machine.B.T, tau * I5)
-    np.testing.assert_allclose(L, machine.A @ P @ machine.C.T @ np.linalg.inv(machine.C @ P @ machine.C.T + tau * I5), atol=1e-8)  # scipy's rounding
+    np.testing.assert_allclose(
+        L, machine.A @ P @ machine.C.T @ np.linalg.inv(machine.C @ P @ machine.C.T + tau * I5), atol=1e-8
+    )  # scipy's rounding
 
 
 def test_a_feasible_reference_is_hit_exactly_with_every_input_off_its_limits():
@@ -215,7 +230,9 @@ def test_an_aimed_law_rests_at_its_target():
     target = feasible_target(machine, REFERENCE, LOW, HIGH)
     law = aimed(observer_law(machine, gains(machine, I5, I7, GAMMA), observer_gain(machine, TAU)), REFERENCE, target.u, target.y)
     z = np.linalg.solve(np.eye(6) - law.A, law.B_u @ target.u + law.B_y @ target.y + law.c)
-    np.testing.assert_allclose(z, target.x, atol=1e-4)  # the memory at rest is the state at rest: 1e-9 of the target's balance through the slowest observer pole
+    np.testing.assert_allclose(
+        z, target.x, atol=1e-4
+    )  # the memory at rest is the state at rest: 1e-9 of the target's balance through the slowest observer pole
     np.testing.assert_allclose(-law.K @ z - law.K_r @ REFERENCE - law.k, target.u, atol=1e-11)  # rounding at 180 °C
 
 

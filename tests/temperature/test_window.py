@@ -13,7 +13,11 @@ from pipeline.temperature.window import law, learn, predicted_tuples, predictor
 
 I5, I7 = np.eye(5), np.eye(7)
 SMALL = plant(
-    [[0.8, 0.2, 0.0], [-0.1, 0.7, 0.3], [0.0, 0.1, 0.9]], [[0.5, -1.0], [1.0, 0.3], [0.2, 0.7]], [[1.0, 0.5, -0.3], [0.2, -1.0, 0.8]], b=[0.3, -0.2, 0.5], d=[1.0, -2.0]
+    [[0.8, 0.2, 0.0], [-0.1, 0.7, 0.3], [0.0, 0.1, 0.9]],
+    [[0.5, -1.0], [1.0, 0.3], [0.2, 0.7]],
+    [[1.0, 0.5, -0.3], [0.2, -1.0, 0.8]],
+    b=[0.3, -0.2, 0.5],
+    d=[1.0, -2.0],
 )
 Q2, R2 = np.diag([2.0, 1.0]), np.diag([0.5, 1.5])
 
@@ -57,7 +61,9 @@ def test_a_spread_of_gains_adds_to_each_input_its_own_moments(record):
     own = np.zeros((found.N * 12,) * 2)
     own[: found.N * 7, : found.N * 7] = np.kron(np.ones((found.N, found.N)), np.eye(7))  # lags of one input with one another, no two inputs
     moments = w.T @ w
-    np.testing.assert_allclose(found.Theta.T, np.linalg.solve(moments + 0.04 * own * moments, w.T @ y_now), atol=1e-8)  # rounding times a condition of 1e5
+    np.testing.assert_allclose(
+        found.Theta.T, np.linalg.solve(moments + 0.04 * own * moments, w.T @ y_now), atol=1e-8
+    )  # rounding times a condition of 1e5
     assert np.abs(found.Theta - learn([u], [y], longest=3).Theta).max() > 1e-3
 
 
@@ -125,7 +131,9 @@ def test_the_predicted_state_is_a_map_of_the_window_and_a_constant(record):
 def test_a_window_that_predicts_nothing_is_refused():
     rng = np.random.default_rng(0)
     u, y = rng.normal(size=(400, 1)), rng.normal(size=(400, 1))
-    with pytest.raises(ValueError, match="the window predicts nothing beyond the noise of the sensors; probe with a larger amplitude, or record longer"):
+    with pytest.raises(
+        ValueError, match="the window predicts nothing beyond the noise of the sensors; probe with a larger amplitude, or record longer"
+    ):
         predicted_tuples(learn([u], [y], longest=2), [u], [y])
 
 
