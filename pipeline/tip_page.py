@@ -67,7 +67,7 @@ def _front_end(frame: np.ndarray, tip_px: tuple[float, float], found: key_area.K
     area = (
         found.image
         if not found.reason
-        else key_area.find(frame, tip_px, least_score=-np.inf, direction_deg=found.angle_deg, leeway_deg=0.0).image
+        else key_area.find(frame, tip_px, least_score=-np.inf, direction_deg=found.angle_deg).image
     )
     enlarged = cv2.resize(area, None, fx=AREA, fy=AREA, interpolation=cv2.INTER_NEAREST)
     figures = {

@@ -1,6 +1,7 @@
 """What every test may ask for: the repository's root, other people's data (or the reason why not), and slow tests only when they are asked for."""
 
 import os
+import shutil
 from pathlib import Path
 
 import hypothesis
@@ -17,6 +18,19 @@ hypothesis.settings.load_profile("repeatable")
 @pytest.fixture(scope="session")
 def root() -> Path:
     return ROOT
+
+
+@pytest.fixture(scope="session")
+def browser():
+    """Debian's Chromium, or the reason why there is none."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed; uv sync installs it")
+    found = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if not found:
+        pytest.skip("no Chromium on this machine; install it to see the pages in a browser")
+    with playwright.sync_playwright() as driver:
+        started = driver.chromium.launch(executable_path=found, args=["--no-sandbox", "--disable-gpu"])
+        yield started
+        started.close()
 
 
 @pytest.fixture(scope="session")

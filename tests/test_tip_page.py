@@ -1,7 +1,6 @@
 """`beadline calibrate-tip`: the page, what it says of a frame, and a click in a real browser."""
 
 import re
-import shutil
 import sys
 from pathlib import Path
 
@@ -130,22 +129,16 @@ def test_a_least_score_that_is_no_number_is_refused(calibrate, picture):
 
 
 @pytest.fixture
-def page(calibrate, picture):
-    """The page of the picture, open in Debian's Chromium, with what it asked for and said."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed; uv sync installs it")
-    found = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if not found:
-        pytest.skip("no Chromium on this machine; install it to see the page in a browser")
+def page(browser, calibrate, picture):
+    """The page of the picture, open in the browser, with what it asked for and said."""
     calibrate(picture[0])
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=found, args=["--no-sandbox", "--disable-gpu"])
-        shown = browser.new_page(viewport={"width": 1000, "height": 900})
-        shown.asked, shown.wrong = [], []
-        shown.on("request", lambda request: shown.asked.append(request.url))
-        shown.on("pageerror", lambda error: shown.wrong.append(str(error)))
-        shown.goto(Path("a<b>&.tip.html").absolute().as_uri())
-        yield shown
-        browser.close()
+    shown = browser.new_page(viewport={"width": 1000, "height": 900})
+    shown.asked, shown.wrong = [], []
+    shown.on("request", lambda request: shown.asked.append(request.url))
+    shown.on("pageerror", lambda error: shown.wrong.append(str(error)))
+    shown.goto(Path("a<b>&.tip.html").absolute().as_uri())
+    yield shown
+    shown.close()
 
 
 def test_a_click_shows_and_copies_the_pixel_under_it(page):

@@ -1,7 +1,6 @@
 """The small project as the working directory, its pages built once, and the browser."""
 
 import contextlib
-import shutil
 
 import pytest
 
@@ -34,19 +33,6 @@ def reports(tmp_path_factory):
         populate(folder)
         main()
     return folder / "reports"
-
-
-@pytest.fixture(scope="session")
-def browser():
-    """Debian's Chromium, or the reason why there is none."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed; uv sync installs it")
-    found = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if not found:
-        pytest.skip("no Chromium on this machine; install it to see the pages in a browser")
-    with playwright.sync_playwright() as driver:
-        started = driver.chromium.launch(executable_path=found, args=["--no-sandbox", "--disable-gpu"])
-        yield started
-        started.close()
 
 
 @pytest.fixture
