@@ -236,7 +236,7 @@ def test_zeros_after_a_power_failure_are_left_out_and_noted(tmp_path):
         ("\n\n# nothing\n", "the file has only blank or comment lines and no data"),
         ("", "is empty (0 bytes) but should be MCAP, Parquet or CSV; copy the recording again"),
         (bytes(3000), "begins with 512 zero bytes"),
-        (gzip.compress(b"t,u,y\n0,1,2\n"), "is gzip but should be MCAP, Parquet or CSV; unpack it with gunzip"),
+        (gzip.compress(b"t,u,y\n0,1,2\n", mtime=0), "is gzip but should be MCAP, Parquet or CSV; unpack it with gunzip"),
         (b"PK\x03\x04 and so on", "is zip or Excel"),
         (b"#ROSBAG V2.0\n", "is a ROS 1 bag but should be MCAP, Parquet or CSV; convert it with: mcap convert"),
         (b"t,u,y\n0,1,2\n" + bytes(500) + b"1,2,3\n", "are neither text nor Parquet nor MCAP"),

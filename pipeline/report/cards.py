@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.report import charts, page
-from pipeline.report import deposition_verdict as loop
+from pipeline.report import charts, deposition_rules, deposition_verdict, page
 from pipeline.report.answers import CONTROLLERS, LABELS, featured
 from pipeline.report.digits import decimals, number, percent, quantity, shortened
 from pipeline.report.judgement import NAMES, Judgement
@@ -170,7 +169,7 @@ def _kernel_note(gap: Figure | Missing | None, sources: Sources) -> str:
 
 def deposition(sources: Sources) -> dict[str, Any]:
     """In this loop's terms: model-based is the paper's law and its library by priority, data-driven our law and the basis functions, baseline on-off control."""
-    judged, found = loop.verdict(sources), loop.structures(sources)
+    judged, found = deposition_verdict.verdict(sources), deposition_rules.structures(sources)
     if isinstance(found, Missing):
         return unbuilt("deposition", found.sentence()) | {"link": "deposition.html"}
     parts = list(dict.fromkeys(one.part for one in found))
@@ -200,8 +199,8 @@ def deposition(sources: Sources) -> dict[str, Any]:
         "name": "Deposition",
         "link": "deposition.html",
         "moves": "Plunger command to flow at the nozzle",
-        "state": f"Run {ROLES[role]}" if judged.state == loop.PASSED else "Do not print yet",
-        "mark": role if judged.state == loop.PASSED else None,
+        "state": f"Run {ROLES[role]}" if judged.state == deposition_verdict.PASSED else "Do not print yet",
+        "mark": role if judged.state == deposition_verdict.PASSED else None,
         "win": _deposition_win(found, judged, role),
         "caption": "Error while learning, in % of on\u2011off control’s, log scale 0.3 to 200\u00a0%, the worse material: the paper’s law, ours, none. Grey: what is asked for.",
         "panels": [
@@ -226,17 +225,21 @@ def deposition(sources: Sources) -> dict[str, Any]:
     }
 
 
-def _deposition_win(found: Sequence[loop.Structure], judged: loop.Verdict, role: str | None) -> tuple[str, str]:
-    if judged.state != loop.PASSED or role is None:
+def _deposition_win(found: Sequence[deposition_rules.Structure], judged: deposition_verdict.Verdict, role: str | None) -> tuple[str, str]:
+    if judged.state != deposition_verdict.PASSED or role is None:
         return judged.lead or judged.decision, judged.reason
     name = "The baseline" if role == "baseline" else NAMES[role]
-    mine, _ = loop.worst(found, judged.composer) or (0.0, None)
-    other = loop.worst(found, "priority" if judged.composer == "basis" else "basis")
-    beside = f" {loop.USE['priority' if judged.composer == 'basis' else 'basis'].capitalize()}: {percent(other[0], 2)}." if other else ""
+    mine, _ = deposition_rules.worst(found, judged.composer) or (0.0, None)
+    other = deposition_rules.worst(found, "priority" if judged.composer == "basis" else "basis")
+    beside = (
+        f" {deposition_rules.USE['priority' if judged.composer == 'basis' else 'basis'].capitalize()}: {percent(other[0], 2)}."
+        if other
+        else ""
+    )
     price = judged.price.split(". ")[0].rstrip(".")
     return (
         f"{name} wins.",
-        f"{loop.NAMES[judged.composer]}: at most {percent(mine, 2)} of on\u2011off control’s flow error on any part.{beside} {price}."
+        f"{deposition_rules.NAMES[judged.composer]}: at most {percent(mine, 2)} of on\u2011off control’s flow error on any part.{beside} {price}."
         if price
         else "",
     )

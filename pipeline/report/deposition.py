@@ -7,7 +7,8 @@ import numpy as np
 from markupsafe import Markup
 
 from pipeline.report import charts, deposition_change, deposition_learning, deposition_parts, page, words
-from pipeline.report.deposition_verdict import LIBRARY, MARK, NAMES, OURS, PAPER, Structure, gamma, structures, verdict
+from pipeline.report.deposition_rules import HEADS, LIBRARY, MARK, NAMES, OURS, PAPER, Structure, gamma, structures
+from pipeline.report.deposition_verdict import verdict
 from pipeline.report.difference import Move
 from pipeline.report.digits import THIN, number, percent, short
 from pipeline.report.pictures import Column, Picture, hole
@@ -54,6 +55,7 @@ def render(sources: Sources) -> str:
         here="deposition",
         title=f"Deposition: {judged.decision.rstrip('.')}",
         verdict=judged,
+        heads_of_rules=HEADS,
         verdict_mark=MARK.get(judged.composer, "data_driven"),
         beforehand=_beforehand(sources),
         real=judged.real,

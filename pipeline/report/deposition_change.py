@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from pipeline.report.deposition_verdict import SAME, Structure
+from pipeline.report.deposition_rules import SAME, Structure
 from pipeline.report.difference import Move
 from pipeline.report.sources import Sources, lookup
 from pipeline.report.verdict import Figure, Missing, Question

@@ -7,7 +7,7 @@ import numpy as np
 from markupsafe import Markup
 
 from pipeline.report import charts, page
-from pipeline.report.deposition_verdict import real
+from pipeline.report.deposition_rules import real
 from pipeline.report.digits import THIN, count, number, percent, short
 from pipeline.report.pictures import Column, Picture, hole
 from pipeline.report.sources import Sources, Table, lookup

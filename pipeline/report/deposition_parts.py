@@ -6,7 +6,7 @@ import numpy as np
 from markupsafe import Markup
 
 from pipeline.report import charts, page
-from pipeline.report.deposition_verdict import MARK, NAMES, PAPER, real
+from pipeline.report.deposition_rules import MARK, NAMES, PAPER, real
 from pipeline.report.digits import MINUS, THIN, count, number, percent, short, shortened
 from pipeline.report.pictures import Column, Picture, hole
 from pipeline.report.sources import Sources, Table

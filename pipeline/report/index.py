@@ -1,9 +1,21 @@
 """Page one: the verdict, the twelve answers, a card a loop, the difference, words, provenance."""
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
-from pipeline.report import cards, charts, deposition_change, deposition_verdict, page, setpoint_card, setpoint_verdict, words, workflow
+from pipeline.report import (
+    cards,
+    charts,
+    deposition_change,
+    deposition_rules,
+    deposition_verdict,
+    page,
+    setpoint_card,
+    setpoint_verdict,
+    words,
+    workflow,
+)
 from pipeline.report.answers import repetitions
 from pipeline.report.difference import Move
 from pipeline.report.digits import band, count, quantity
@@ -64,7 +76,11 @@ WORSE = {"passed": 0, "open": 1, "failed": 2}
 def _headline(sources: Sources, judged: Judgement) -> dict[str, Any]:
     """The verdict of the worst loop that was measured, the first of them in case of a tie, and beside it what the others say."""
     mine, parts, seen = verdict_parts(judged), deposition_verdict.verdict(sources), setpoint_verdict.verdict(sources)
-    loops = [mine | {"title": _title(judged.verdict)}, *(_other(found, mine["changed"]) for found in (parts, seen))]
+    loops = [
+        mine | {"title": _title(judged.verdict)},
+        _other(parts, deposition_rules.HEADS, mine["changed"]),
+        _other(seen, setpoint_verdict.HEADS, mine["changed"]),
+    ]
     measured = [0, *([1] if parts.composer else []), *([2] if seen.default else [])]
     worst = max(measured, key=lambda i: (WORSE[loops[i]["state"]], -i))
     told = [
@@ -74,19 +90,25 @@ def _headline(sources: Sources, judged: Judgement) -> dict[str, Any]:
     return loops[worst] | {"others": [one for i, one in enumerate(told) if i != worst]}
 
 
-def _other(found: deposition_verdict.Verdict | setpoint_verdict.Verdict, changed: str) -> dict[str, Any]:
-    """The verdict of another loop in the temperature loop's place."""
+def _other(found: deposition_verdict.Verdict | setpoint_verdict.Verdict, heads: tuple[str, str, str], changed: str) -> dict[str, Any]:
+    """The verdict of another loop in the temperature loop's place, as short: what else it has to say stands on its own page."""
     rules = [{"rule": rule.name, "answers": "", "states": list(rule.states), "first": rule.name == found.first} for rule in found.rules]
     return {
         "title": f"{found.decision.rstrip('.')}: {found.lead[:1].lower()}{found.lead[1:].rstrip('.')}",
         "state": found.state if found.state in WORSE else "open",
         "decision": found.decision,
         "lead": found.lead,
-        "reason": found.reason,
-        "remedy": f"{found.remedy} The answers below are the temperature loop’s.".strip(),
+        "reason": _sentence(found.reason),
+        "remedy": _sentence(found.remedy),
         "rules": rules,
+        "heads": heads,
         "changed": changed,
     }
+
+
+def _sentence(text: str) -> str:
+    """The first sentence."""
+    return re.split(r"(?<=[.!?]) (?=[A-Z])", text, maxsplit=1)[0]
 
 
 def verdict_parts(judged: Judgement) -> dict[str, Any]:
@@ -185,7 +207,7 @@ def _change_sentence(judged: Judgement, accepted: dict | Missing | None, parts: 
 
 
 def _deposition_moves(sources: Sources) -> list[Move]:
-    found = deposition_verdict.structures(sources)
+    found = deposition_rules.structures(sources)
     return [] if isinstance(found, Missing) else deposition_change.moves(sources, found)
 
 

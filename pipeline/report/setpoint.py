@@ -7,6 +7,7 @@ from pipeline.report.deposition import flat
 from pipeline.report.digits import MINUS, THIN, band, number, percent, quantity
 from pipeline.report.setpoint_verdict import (
     BASELINE,
+    HEADS,
     SIMULATORS,
     Board,
     Case,
@@ -58,6 +59,7 @@ def render(sources: Sources) -> str:
         here="setpoint",
         title=f"Setpoint: {judged.decision.rstrip('.')}",
         verdict=judged,
+        heads_of_rules=HEADS,
         no_board=found if isinstance(found, Missing) else None,
         heads=heads(known),
         answers=answers(sources, known) if known else [],

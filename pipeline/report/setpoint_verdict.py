@@ -17,6 +17,8 @@ CLAIM = "The classifier is trained and judged on rendered frames: eight real pic
 CLAIM_RECORDED = (
     "The classifier is trained and judged on recordings of datasets/raw/setpoint, split by print; it is known on these printers only."
 )
+# what the two columns of its rules are, and the mark of the second
+HEADS = ("Learned", "Best baseline", "baseline")
 
 
 class Cell(NamedTuple):
