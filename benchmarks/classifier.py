@@ -15,7 +15,7 @@ import cv2
 import jax
 import numpy as np
 
-from pipeline.setpoint import calibration, nozzle_scene, yardsticks
+from pipeline.setpoint import calibration, eyes, nozzle_scene, yardsticks
 from pipeline.setpoint.classifier import Labelled, Rates, _step, adr, along_bead, predict, train, untrained
 from pipeline.setpoint.vision_transformer import PAPER, SMALL, Classifier, convolutional, vision_transformer
 
@@ -49,25 +49,13 @@ def trained(network: Classifier, data: dict, seed: int, **settings) -> Classifie
     return train(untrained(network, epochs=EPOCHS), learned, stopping, key=jax.random.key(seed), **TRAINING | settings).best
 
 
-def transposed(key_area: np.ndarray) -> np.ndarray:
-    return np.array([cv2.resize(np.ascontiguousarray(a.T), (48, 16), interpolation=cv2.INTER_AREA) for a in key_area])
-
-
-def blurred(key_area: np.ndarray, sigma_px: float) -> np.ndarray:
-    return np.array([cv2.GaussianBlur(a, (0, 0), sigma_px) for a in key_area])
-
-
 def foreign(network: Classifier, fitted: calibration.Calibration, test: calibration.Seen, data: Labelled) -> dict:
     """AUROC of blur and transposed crops by the distance, and by its yardsticks; with the share of foreign images that the threshold finds."""
     v = test.valid
     familiar = calibration.mahalanobis(fitted.familiar, test.features[v])
     confidence = np.exp(calibration.log_probabilities(test.logits[v], fitted.temperature)).max(axis=1)
     out = {}
-    for name, area in {
-        "blur_1.5": blurred(data.key_area[v], 1.5),
-        "blur": blurred(data.key_area[v], 2.5),
-        "transposed": transposed(data.key_area[v]),
-    }.items():
+    for name, area in eyes.foreign(data.key_area[v]).items():
         shown = predict(network, area, data.temperature_degC[v])
         score = calibration.mahalanobis(fitted.familiar, np.hstack([shown.features, calibration.appearance(area)]))
         p = np.exp(calibration.log_probabilities(shown.logits, fitted.temperature)).max(axis=1)

@@ -21,7 +21,7 @@ import numpy as np
 
 from pipeline.setpoint import calibration, deployment, judging, nozzle_scene, pixels
 from pipeline.setpoint.baselines import Proportional, proportional
-from pipeline.setpoint.bayes import CODES, GRID, Filter, bayes, code, robust_filter
+from pipeline.setpoint.bayes import bayes, robust_filter, segment_filter
 from pipeline.setpoint.classifier import Labelled, along_bead, predict, train, untrained
 from pipeline.setpoint.deployment import ACTS, Limits, Waits
 from pipeline.setpoint.pixels import Disturbances, Episodes, Loop, Machine, calm
@@ -36,7 +36,8 @@ SEGMENT_S, TIP_TOLERANCE_PX = 10.0, 4.0
 EDGES = np.r_[20, 30, 40, 50, 60, np.arange(70, 130.1, 2.5), 150, 180, 220, 260, 310]
 ROBUST = {"accuracy": 0.7, "looks": 5, "look": 0.055, "floor": 0.03, "smoothing": 4.0, "segment": 12.0, "switch": 3e-4, "hazard": 6e-4}
 ROBUST |= {"move_cost": 0.38, "outside_cost": 5.0}
-BY_SEGMENT = {"floor": 0.05, "smoothing": 4.0, "hazard": 1e-3, "move_cost": 0.4, "outside_cost": 10.0}
+BY_SEGMENT = {"accuracy": 0.7, "floor": 0.05, "smoothing": 4.0, "switch": 3e-4, "hazard": 1e-3, "move_cost": 0.4, "outside_cost": 10.0}
+SEGMENTS = 24  # whose windows are recorded
 
 
 class Sight(NamedTuple):
@@ -105,26 +106,6 @@ def recorded(eyes: Sight, frames: int, segments: int) -> WindowTable:
             rows.append((np.log(np.clip(p, 1e-6, 1.0)), found.valid & (score <= eyes.foreign_above), flow, s))
     log_p, valid, flow, segment = (np.array(column) for column in zip(*rows, strict=True))
     return calibration.recorded(log_p, valid, flow, segment, correlation=eyes.correlation, flow_edges=EDGES)
-
-
-def by_segment(
-    table: WindowTable, *, persistence: float, floor: float, smoothing: float, hazard: float, move_cost: float, outside_cost: float
-) -> Filter:
-    """The Bayes filter whose hypotheses are the recorded segments themselves: P(code | segment, flow) from each segment's own windows, smoothed over flow (percent, one
-    deviation) and over neighbouring codes; a segment lasts `persistence` decisions on average."""
-    codes, edges = np.asarray(code(jnp.asarray(table.shares), jnp.asarray(table.named))), np.asarray(table.flow_edges)
-    centre, width = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
-    near = np.exp(-0.5 * (np.arange(CODES)[:, None] - np.arange(CODES)) ** 2.0)
-    weight = np.exp(-0.5 * ((GRID[:, None] - centre) / np.maximum(smoothing, width / 2)) ** 2)
-    evidence = []
-    for s in np.unique(table.segment):
-        counts = np.zeros((len(centre), CODES))
-        np.add.at(counts, (table.flow_bin[table.segment == s], codes[table.segment == s]), 1.0)
-        shown = weight @ (counts @ (near / near.sum(axis=1, keepdims=True)) * width[:, None])
-        evidence.append(((1 - floor) * shown / shown.sum(axis=1, keepdims=True) + floor / CODES).T)
-    n = len(evidence)
-    transition = (1 - 1 / persistence) * np.eye(n) + 1 / persistence / n
-    return Filter(np.array(evidence), transition, hazard, move_cost, outside_cost)
 
 
 def measured_waits(rng: np.random.Generator) -> tuple[Waits, dict]:
@@ -199,7 +180,7 @@ def main(runs: int, weights: Path | None) -> None:
         "effective_frames": {str(frames): round(float(effective[frames - 1]), 2), "20": round(float(effective[19]), 2)}, "segment_s": SEGMENT_S, "cases": {},
     }  # fmt: skip
     print(json.dumps(report), flush=True)
-    table = recorded(eyes, frames, 24)
+    table = recorded(eyes, frames, SEGMENTS)
     judge = functools.partial(
         deployment.judge_window, least_frames=max(2, round(0.4 * frames)), correlation=eyes.correlation, foreign_above=eyes.foreign_above,
         conformal_level=eyes.level,
@@ -208,7 +189,8 @@ def main(runs: int, weights: Path | None) -> None:
     starts = np.array([[f, t] for f in judging.START_FLOWS for t in judging.START_TEMPERATURES])
 
     def ours(loop):
-        return bayes(24), by_segment(table, persistence=max(SEGMENT_S / (loop.waits.flow_s + frames / RATE_HZ), 1.2), **BY_SEGMENT)
+        decisions = max(SEGMENT_S / (loop.waits.flow_s + frames / RATE_HZ), 1.2)
+        return bayes(1 + SEGMENTS), segment_filter(table, segment=decisions, **BY_SEGMENT)
 
     def case(name, controller, loop, disturbances, decisions, judged):
         began, n = time.process_time(), len(disturbances.clog)

@@ -73,7 +73,7 @@ def _trained(
     key: jax.Array,
     checkpoints: Path,
 ) -> State:
-    what = (name, p.size, p.augmentation, p.seed, recipe.model_dump(), [a.tobytes() for data in (learned, held_out) for a in data], CODE())
+    what = (name, p.size, p.augmentation, p.seed, recipe.model_dump(), [a.tobytes() for data in (learned, held_out) for a in data], _code())
     path = checkpoints / f"{joblib.hash(what)}.safetensors"
     state = classifier.untrained(network, epochs=recipe.epochs)
     if artifacts.exists(path):
@@ -89,7 +89,7 @@ def _trained(
         return classifier.train(state, learned, held_out, key=key, augment=AUGMENTATIONS[p.augmentation], on_step=on_step, **settings)
 
 
-def CODE() -> list[str]:
+def _code() -> list[str]:
     """What decides where a training ends, beside its data and settings."""
     return [artifacts.sha256(Path(__file__).parent / "setpoint" / name) for name in ("classifier.py", "vision_transformer.py")]
 

@@ -92,7 +92,10 @@ def calibrate_tip(arguments: argparse.Namespace) -> None:
         raise ValueError(
             f"params.yaml: train_classifier.least_score should be a number of gray levels ({error}); write one such as 10"
         ) from None
-    print(calibrate(arguments.image, arguments.out or Path(f"{arguments.image.stem}.tip.html"), arguments.tip, least_score=least_score))
+    topics = sections["train_classifier"].get("topics")
+    topic = str(topics.get("image") or "") if isinstance(topics, dict) else ""
+    out = arguments.out or Path(f"{arguments.image.stem}.tip.html")
+    print(calibrate(arguments.image, out, arguments.tip, least_score=least_score, topic=topic))
 
 
 def main() -> None:

@@ -24,6 +24,8 @@ from pipeline.reading.mcap_messages import UnreadableMessage
 from pipeline.reading.signals import Note, Source, nearest_names
 
 TOPIC = "/setpoint"
+# the section of params.yaml with our signals' places in a recording
+PLACE = "params.yaml: train_classifier.topics"
 # our signals and their units; where the mapping says nothing, the only field of that name
 UNITS = {
     "flow_percent": "percent",
@@ -52,10 +54,10 @@ class Topics(NamedTuple):
         """{signal: source}. Raises ValueError for a signal that is none of ours, and for another unit."""
         for name, (_, unit, _, _) in self.mapping.items():
             if name not in UNITS:
-                raise ValueError(f"params.yaml: mapping.{name} is no signal of nozzle frames; {nearest_names(name, UNITS)}")
+                raise ValueError(f"{PLACE}.mapping.{name} is no signal of nozzle frames; {nearest_names(name, UNITS)}")
             if unit != UNITS[name]:
                 raise ValueError(
-                    f"params.yaml: mapping.{name}.unit is {unit} but {name} is in {UNITS[name]}; convert with scale and offset, and write unit: {UNITS[name]}"
+                    f"{PLACE}.mapping.{name}.unit is {unit} but {name} is in {UNITS[name]}; convert with scale and offset, and write unit: {UNITS[name]}"
                 )
         return {name: Source(name, *self.mapping.get(name, (name, unit, 1.0, 0.0))) for name, unit in UNITS.items()}
 
@@ -136,7 +138,7 @@ def open_film(path: Path, where: Topics) -> tuple[Frames, dict[str, tuple[np.nda
     """Frames in the order of time, {signal: (time_s (n,), values (n,))} of those that the recording has, on one clock, and notes of what was damaged."""
     clock = where.time or "log_time"
     found = _topics(path)
-    camera = image_topic(path, found, where.image)
+    camera = _camera(path, found, where.image)
     places = {}
     for name, source in where.sources().items():
         try:
@@ -144,7 +146,7 @@ def open_film(path: Path, where: Topics) -> tuple[Frames, dict[str, tuple[np.nda
         except ValueError as error:
             # what was mapped on purpose must be there
             if name in NEEDED or name in where.mapping:
-                raise ValueError(f"{error}; map {name} to the topic that has it") from None
+                raise ValueError(f"{error}; map it in {PLACE}.mapping.{name}") from None
     walk = Walk(path, camera, {topic for _, topic, _ in places.values()}, clock)
     notes = walk.notes()
     if not walk.picture_order():
@@ -169,9 +171,16 @@ def _topics(path: Path) -> dict[str, Topic]:
     return topics(path)
 
 
-def middle_frame(path: Path) -> np.ndarray:
-    """The frame (height, width) in the middle of a recording's only image topic. Raises ValueError."""
-    camera = image_topic(path, _topics(path), "")
+def _camera(path: Path, found: dict[str, Topic], name: str) -> Topic:
+    try:
+        return image_topic(path, found, name)
+    except ValueError as error:
+        raise ValueError(f"{error} ({PLACE}.image)") from None
+
+
+def middle_frame(path: Path, image: str) -> np.ndarray:
+    """The frame (height, width) in the middle of a recording's image topic `image`, or of its only one where that is empty. Raises ValueError."""
+    camera = _camera(path, _topics(path), image)
     walk = Walk(path, camera, set(), "log_time")
     frames = Frames(walk, camera, "log_time", start_ns=0, unreadable_share=1.0)
     for _, picture in itertools.islice(frames.pictures(), len(frames) // 2, None):

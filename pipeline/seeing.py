@@ -52,6 +52,26 @@ class Recipe(Section):
     patience: int = Field(ge=1, le=10_000)
 
 
+class Mapped(Section):
+    """Where a signal of a recording comes from: source times scale, plus offset."""
+
+    source: str = Field(min_length=1, max_length=300)
+    unit: str = Field(min_length=1, max_length=20)
+    scale: float = Field(ge=-1e9, le=1e9)
+    offset: float = Field(ge=-1e9, le=1e9)
+
+
+class RecordedTopics(Section):
+    """Topics of a user's MCAP recordings, as nozzle_recordings.Topics says."""
+
+    image: str = Field(max_length=300)
+    time: str = Field(max_length=300)
+    mapping: dict[str, Mapped]
+
+    def topics(self) -> Topics:
+        return Topics(self.image, self.time, {name: (m.source, m.unit, m.scale, m.offset) for name, m in self.mapping.items()})
+
+
 class TrainClassifier(Section):
     """Section `train_classifier`."""
 
@@ -64,6 +84,7 @@ class TrainClassifier(Section):
     window: int = Field(ge=1, le=1000)
     least_score: float = Field(ge=0, le=255)
     tip_px: tuple[Annotated[float, Field(ge=0, le=100_000)], Annotated[float, Field(ge=0, le=100_000)]] | None
+    topics: RecordedTopics
     small: Recipe
     paper: Recipe
     cnn: Recipe
@@ -78,7 +99,7 @@ def parts(p: TrainClassifier, folder: str, execution: Execution) -> tuple[dict[s
     if p.source == "recordings":
         folder = Path(folder)
         frames = nozzle_frames.read_folder(
-            folder, Reading(p.tip_px, p.least_score, Topics("", "", {})), execution, memo=Path("datasets/memo/train_classifier")
+            folder, Reading(p.tip_px, p.least_score, p.topics.topics()), execution, memo=Path("datasets/memo/train_classifier")
         )
         nozzle_frames.check(folder, frames)
         return _by_print(p, frames), nozzle_frames.figures(frames)
@@ -122,7 +143,9 @@ def to_record(p: TrainClassifier, found: dict[str, Seen], execution: Execution) 
     if p.source == "recordings":
         return {"learn": found["calibration"], "judge": found["judged"]}
     counts = p.recorded.model_dump()
-    calls = [delayed(swept)((p.seed, len(PARTS) + k, i), p.window, p.least_score) for k, part in enumerate(counts) for i in range(counts[part])]
+    calls = [
+        delayed(swept)((p.seed, len(PARTS) + k, i), p.window, p.least_score) for k, part in enumerate(counts) for i in range(counts[part])
+    ]
     done = iter(tqdm(run_all(calls, execution), total=len(calls), desc="train_classifier: windows at every flow", mininterval=2))
     return {part: joined([next(done) for _ in range(count)]) for part, count in counts.items()}
 

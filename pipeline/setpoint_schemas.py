@@ -62,7 +62,7 @@ WINDOWS = Schema(
     ),
 )
 
-LESSONS_OF_AGENTS = Schema(
+AGENT_COURSE = Schema(
     "agents",
     1,
     (

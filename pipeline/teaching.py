@@ -158,7 +158,7 @@ def _course(name: str, phase: int, before: int, rewards) -> list[tuple[str, int,
 
 
 def course_rows(taught: Taught) -> dict[str, list]:
-    """Columns of schema LESSONS_OF_AGENTS."""
+    """Columns of schema AGENT_COURSE."""
     return dict(zip(("agent", "phase", "update", "reward"), map(list, zip(*taught.course, strict=True)), strict=True))
 
 

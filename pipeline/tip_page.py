@@ -22,13 +22,13 @@ CROP, AREA = 2, 8
 RED, GREEN = (60, 60, 235), (90, 200, 60)
 
 
-def calibrate(image: Path, out: Path, tip: str, *, least_score: float) -> str:
-    """Writes the page of a picture, or of the middle frame of an MCAP recording, to `out`, and returns what is to be said of it; `tip` is "x,y" in px, or empty.
+def calibrate(image: Path, out: Path, tip: str, *, least_score: float, topic: str) -> str:
+    """Writes the page of a picture, or of the middle frame of `topic` of an MCAP recording, to `out`, and returns what is to be said of it; `tip` is "x,y" in px, or empty.
 
     Raises ValueError where the picture cannot be read, is too small, or has the tip outside.
     """
     tip_px = _pixel(tip) if tip else None
-    frame = middle_frame(image) if image.suffix.lower() == ".mcap" else read_image(image)
+    frame = middle_frame(image, topic) if image.suffix.lower() == ".mcap" else read_image(image)
     # a picture that is too small is refused with or without a tip
     with artifacts.about(image):
         found = key_area.find(frame, tip_px or (0.0, 0.0), least_score=least_score)

@@ -137,9 +137,10 @@ def test_a_measured_temperature_ends_no_segment_and_is_said_to_be_one(tmp_path):
 # ---- other machines' topics
 
 
-def foreign(path: Path, *, flow_share: bool = True) -> Path:
-    """Foxglove JSON pictures beside numbers in JSON, with other names and units, the setpoints at 2 Hz."""
+def foreign(path: Path, *, flow_share: bool = True, other: str = "") -> Path:
+    """Foxglove JSON pictures beside numbers in JSON, with other names and units, the setpoints at 2 Hz; `other` is the topic of a camera that looks elsewhere."""
     made = Written()
+    elsewhere = made.topic(other, "json", "foxglove.CompressedImage", "jsonschema", b"{}") if other else None
     camera = made.topic("/cam", "json", "foxglove.CompressedImage", "jsonschema", b"{}")
     printer = made.topic("/printer/state", "json")
     for k, (time, frame) in enumerate(pictures()):
@@ -148,6 +149,9 @@ def foreign(path: Path, *, flow_share: bool = True) -> Path:
             made.message(printer, 10 + time, {"extruder": {"rate": flow / 100 if flow_share else flow}, "hotend_target": 210.0})
         data = base64.b64encode(cv2.imencode(".png", frame)[1]).decode()
         made.message(camera, 10 + time, {"timestamp": {"sec": 10, "nsec": 0}, "frame_id": "", "format": "png", "data": data})
+        if other:
+            dark = base64.b64encode(cv2.imencode(".png", 0 * frame)[1]).decode()
+            made.message(elsewhere, 10 + time, {"timestamp": {"sec": 10, "nsec": 0}, "frame_id": "", "format": "png", "data": dark})
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(made.bytes())
     return path
@@ -165,6 +169,24 @@ def test_a_machine_s_own_topics_are_read_through_a_mapping(tmp_path):
     assert found.prints == ("night",)
 
 
+def test_of_two_cameras_the_one_that_is_named_is_read(tmp_path):
+    foreign(tmp_path / "one/night.mcap")
+    path = foreign(tmp_path / "two/night.mcap", other="/bed/camera")
+    there = ANY._replace(mapping=MAPPING)
+    one, two = (
+        read(tmp_path / name, tip=(175, 175), topics=topics) for name, topics in (("one", there), ("two", there._replace(image="/cam")))
+    )
+    np.testing.assert_array_equal(two.images, one.images)
+    assert two.valid.any()
+    said = refusal(tmp_path / "two", tip=(175, 175), topics=there)
+    assert (
+        "2 topics have images (/bed/camera, /cam); name the one of the nozzle's camera (params.yaml: train_classifier.topics.image)" in said
+    )
+    np.testing.assert_array_equal(middle_frame(path, "/cam"), scenes()[3].frames[0])
+    with pytest.raises(ValueError, match="2 topics have images"):
+        middle_frame(path, "")
+
+
 def test_signals_on_one_clock(tmp_path):
     frames, found, _ = open_film(foreign(tmp_path / "night.mcap"), ANY._replace(mapping=MAPPING))
     np.testing.assert_allclose(frames.time_s, 10 + TIME, atol=1e-9)  # nanoseconds
@@ -175,12 +197,15 @@ def test_signals_on_one_clock(tmp_path):
 @pytest.mark.parametrize(
     ("topics", "said"),
     [
-        (ANY, r"no message has a number 'flow_percent'.*map flow_percent to the topic"),
+        (ANY, r"no message has a number 'flow_percent'.*map it in params.yaml: train_classifier.topics.mapping.flow_percent"),
         (
             ANY._replace(mapping={"flow": ("a", "percent", 1.0, 0.0)}),
-            "mapping.flow is no signal of nozzle frames; the nearest names are flow_percent",
+            "params.yaml: train_classifier.topics.mapping.flow is no signal of nozzle frames; the nearest names are flow_percent",
         ),
-        (ANY._replace(mapping={"flow_percent": ("a", "1", 1.0, 0.0)}), "mapping.flow_percent.unit is 1 but flow_percent is in percent"),
+        (
+            ANY._replace(mapping={"flow_percent": ("a", "1", 1.0, 0.0)}),
+            "topics.mapping.flow_percent.unit is 1 but flow_percent is in percent",
+        ),
         (
             ANY._replace(mapping=MAPPING | {"print_id": ("/printer/state:job", "1", 1.0, 0.0)}),
             "no message has a number '/printer/state:job'",
@@ -269,8 +294,8 @@ def test_what_was_looked_at_before_is_not_looked_at_again(tmp_path, monkeypatch)
 
 
 def test_the_middle_frame_is_in_the_middle(tmp_path):
-    np.testing.assert_array_equal(middle_frame(film(tmp_path / "a.mcap")), scenes()[3].frames[0])
-    np.testing.assert_array_equal(middle_frame(foreign(tmp_path / "b.mcap")), scenes()[3].frames[0])
+    np.testing.assert_array_equal(middle_frame(film(tmp_path / "a.mcap"), ""), scenes()[3].frames[0])
+    np.testing.assert_array_equal(middle_frame(foreign(tmp_path / "b.mcap"), ""), scenes()[3].frames[0])
 
 
 def test_topics_have_defaults_of_the_same_names():

@@ -138,7 +138,7 @@ def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], An
         ("course", "train_classifier", "course.parquet", *table(setpoint_schemas.COURSE)),
         ("windows", "train_classifier", "windows.parquet", *table(setpoint_schemas.WINDOWS)),
         ("nozzle_frames", "train_classifier", "frames/frames.json", "frames 1", _frames),
-        ("agents", "train_agent", "agents.parquet", *table(setpoint_schemas.LESSONS_OF_AGENTS)),
+        ("agents", "train_agent", "agents.parquet", *table(setpoint_schemas.AGENT_COURSE)),
         ("scoreboard", "evaluate_setpoint", "scoreboard.parquet", *table(setpoint_schemas.SCOREBOARD)),
         ("paths", "evaluate_setpoint", "paths.parquet", *table(setpoint_schemas.PATHS)),
         ("decisions", "evaluate_setpoint", "decisions.parquet", *table(setpoint_schemas.DECISIONS)),

@@ -193,7 +193,7 @@ def agents():
     for agent, phases in (("paper", 4), ("ours", 2)):
         for phase in range(1, phases + 1):
             rows += [(agent, phase, 500 * (10 * (phase - 1) + k), 0.8 - 0.6 * math.exp(-k / 3) - 0.1 * phase) for k in range(1, 11)]  # fmt: skip
-    artifacts.write_table("datasets/train_agent/agents.parquet", setpoint_schemas.LESSONS_OF_AGENTS, columns(setpoint_schemas.LESSONS_OF_AGENTS, rows))  # fmt: skip
+    artifacts.write_table("datasets/train_agent/agents.parquet", setpoint_schemas.AGENT_COURSE, columns(setpoint_schemas.AGENT_COURSE, rows))  # fmt: skip
 
 
 def write():
