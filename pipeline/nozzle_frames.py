@@ -6,7 +6,7 @@ Nothing is dropped: every frame that is listed has its row, and one that cannot 
 import collections
 import os
 import posixpath
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,6 +29,8 @@ CLASSES = ("under (flow below 90 %)", "good (90 to 110 %)", "over (above 110 %)"
 TOGETHER = 256
 # lines that tell where a file's images are
 LOOKED_AT = 2000
+# endings of what is written about recordings, and the longest path that is shown
+TEXTS, LONGEST = {".md", ".txt", ".html", ".yaml", ".yml", ".dvc", ""}, 200
 REPEATED, COPY = "an earlier line lists the image", "the frame is a copy of another"
 NO_FLOW, NO_TEMPERATURE, NO_PRINT, NO_NAME = "no flow is known", "no temperature is known", "no print is named", "no image is named"
 REMEDIES = {
@@ -36,6 +38,10 @@ REMEDIES = {
     UNREADABLE: "copy the images again",
     NO_TIP: "find it with ./run beadline calibrate-tip IMAGE, and set tip_px in params.yaml",
     UNUSABLE: "find the tip of these pictures with ./run beadline calibrate-tip IMAGE, and set tip_px in params.yaml",
+    NO_FLOW: "fill it in, in percent of nominal, or remove those lines",
+    NO_TEMPERATURE: "fill it in, or remove those lines; without a column target_hotend the measured hotend is taken",
+    NO_PRINT: "fill in print_id, or remove that column where the file is one print",
+    NO_NAME: "fill in img_path, or remove those lines",
     REPEATED: "remove the lines that repeat others",
     COPY: "record again with a camera that runs, or remove the copies",
 }
@@ -92,6 +98,9 @@ def read_folder(folder: Path, how: Reading, execution: Execution, *, memo: Path)
     """
     there = _images(folder)
     files = {ending: sorted(folder / name for name in there if name.lower().endswith(ending)) for ending in (".csv", ".mcap")}
+    for path in (*files[".csv"], *files[".mcap"]):
+        if not path.is_file():
+            raise ValueError(f"{path} is a link to what is not there; copy the file itself, or remove the link")
     logs = [read_log(path) for path in files[".csv"]]
     recordings, copies = _different(files[".mcap"])
     if not (logs or recordings):
@@ -120,7 +129,9 @@ def read_folder(folder: Path, how: Reading, execution: Execution, *, memo: Path)
     for log, (_, note), why, size in zip(logs, found, reasons, sizes, strict=True):
         parts.append(_of_log(log, [next(results) for _ in range(size)], why, note))
     parts += [_of_film(path, film) for path, film in zip(recordings, results, strict=True)]
-    return _joined(folder, parts, copies)
+    read = {path.relative_to(folder).as_posix() for paths in files.values() for path in paths}
+    unread = there.difference(read, *(images for images, _ in found))
+    return _joined(folder, parts, copies + _unread(folder, unread))
 
 
 def check(folder: Path, frames: NozzleFrames) -> None:
@@ -164,11 +175,20 @@ def _different(paths: Sequence[Path]) -> tuple[list[Path], list[Note]]:
     ] if twice else []
 
 
+def _unread(folder: Path, names: Iterable[str]) -> list[Note]:
+    """A note of files that are no recording, that no CSV names, and that are no text about the others."""
+    names = [name for name in names if posixpath.splitext(name)[1].lower() not in TEXTS]
+    said = f"{folder}: {len(names)} files are named by no CSV and were not read, the first {min(names, default='')}; list them in a CSV, or move them out"
+    return [Note("unread", "", len(names), said)] if names else []
+
+
 def _images(folder: Path) -> set[str]:
-    """Paths of all files that are not hidden, from `folder` on, with forward slashes."""
-    found = set()
+    """Paths of all files that are not hidden, from `folder` on, with forward slashes; what links lead to once more is walked once."""
+    found, walked = set(), set()
     for here, folders, names in os.walk(folder, followlinks=True):
-        folders[:] = [name for name in folders if not name.startswith(".")]
+        # a link may lead back to where it lies
+        walked.add(os.path.realpath(here))
+        folders[:] = sorted(name for name in folders if not name.startswith(".") and os.path.realpath(f"{here}/{name}") not in walked)
         inside = Path(here).relative_to(folder).as_posix()
         found.update(name if inside == "." else f"{inside}/{name}" for name in names if not name.startswith("."))
     return found
@@ -259,7 +279,7 @@ def _of_log(log: Log, seen: Sequence[Seen], why: list[str], notes: list[Note]) -
                 f"{log.flow[i]:g} percent, which is class {label[i]}; flow_rate was taken",
             )
         )  # fmt: skip
-    places = [f"line {line}, {image or 'no image'}" for line, image in zip(log.line, log.image, strict=True)]
+    places = [f"line {line}, {' '.join(image.split())[-LONGEST:] or 'no image'}" for line, image in zip(log.line, log.image, strict=True)]
     return _Part(log.path, whole, log.flow, log.temperature, log.print_id, log.setting, places, notes)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.reading.csv_files import MISSING, _floats, _sound_rows
 from pipeline.reading.csv_layout import CsvLayout, csv_layout
 from pipeline.reading.formats import column_place
-from pipeline.reading.instants import instants
+from pipeline.reading.instants import instants, month_first
 from pipeline.reading.signals import Note, nearest_names
 
 ROWS_AT_ONCE = 10_000
@@ -28,6 +28,9 @@ OPTIONAL = {
 }
 # beside flow and target temperature, what is constant within a segment where the file has it
 SETTINGS = ("feed_rate", "z_offset")
+COLUMNS = {"img_path", "flow_rate", "target_hotend", "hotend", "nozzle_tip_y", LABELS, *OPTIONAL, *SETTINGS}
+# beside what others write where they have nothing: a time of pandas
+NOTHING = {*MISSING, "nat"}
 
 
 class Log(NamedTuple):
@@ -51,9 +54,11 @@ def read_log(path: Path) -> Log:
     """The frames that a CSV lists, those of a print one behind the other. Raises ValueError, one sentence with the line, for a needed column that is not there, text in
     place of a number, a flow or temperature that no printer has, a label that is no class, and time that runs backwards within a print."""
     layout = csv_layout(path)
-    notes = list(layout.notes)
+    layout = layout._replace(names=[_column(name) for name in layout.names])
+    said, notes = list(layout.notes), []
     columns = _columns(path, layout, notes)
-    texts, numbers, lines = _rows(path, layout, columns, notes)
+    texts, numbers, lines = _rows(path, layout, columns, said)
+    notes = [note._replace(message=f"{path}: {note.message}") for note in said] + notes
     count, missing = len(lines), np.full(len(lines), np.nan)
     _check_numbers(path, lines, numbers)
     temperature = numbers[columns[1]]
@@ -66,8 +71,8 @@ def read_log(path: Path) -> Log:
         # a line that is there twice is met again, and counted, where images are looked for
         first: dict[str, int] = {}
         stamps = [
-            stamp if first.setdefault(image, i) == i else ""
-            for i, (image, stamp) in enumerate(zip(texts["img_path"], texts["timestamp"], strict=True))
+            stamp if name and first.setdefault(image, i) == i else ""
+            for i, (image, stamp, name) in enumerate(zip(texts["img_path"], texts["timestamp"], prints, strict=True))
         ]
         _check_time(path, lines, stamps, which, prints)
     order = np.argsort(which, kind="stable")
@@ -84,6 +89,12 @@ def stretches(settings: np.ndarray) -> np.ndarray:
     settings = np.nan_to_num(settings, nan=np.inf)
     changes = (settings[1:] != settings[:-1]).any(axis=1)
     return np.concatenate([[0], np.cumsum(changes)]).astype(int)
+
+
+def _column(name: str) -> str:
+    """`Img Path` or `IMG-PATH` is img_path; a column that is none of ours keeps its name."""
+    plain = re.sub(r"[\s-]+", "_", name.strip()).casefold()
+    return plain if plain in COLUMNS else name
 
 
 def _columns(path: Path, layout: CsvLayout, notes: list[Note]) -> tuple[str, ...]:
@@ -124,7 +135,7 @@ def _rows(
         for name, place in places.items():
             fields = [row[place].strip() for _, row in block]
             if name in texts:
-                texts[name] += ["" if field.casefold() in MISSING else field for field in fields]
+                texts[name] += ["" if field.casefold() in NOTHING else field for field in fields]
             else:
                 parts[name].append(_floats(path, name, fields, layout.decimal, here, {}))
     return texts, {name: np.concatenate(found) for name, found in parts.items()}, np.array(lines)
@@ -137,7 +148,7 @@ def _check_numbers(path: Path, lines: np.ndarray, numbers: dict[str, np.ndarray]
     }  # fmt: skip
     for name, (low, high, unit) in bounds.items():
         values = numbers.get(name, np.zeros(0))
-        wrong = (values < low) | (values > high) | ((name == LABELS) & np.isfinite(values) & (values % 1 != 0))
+        wrong = (values < low) | (values > high) | ((name == LABELS) & (values != np.rint(values)) & np.isfinite(values))
         if wrong.any():
             i = int(np.flatnonzero(wrong)[0])
             more = f", the first of {wrong.sum()}" if wrong.sum() > 1 else ""
@@ -155,7 +166,11 @@ def _check_time(path: Path, lines: np.ndarray, stamps: Sequence[str], which: np.
     try:
         times = np.array(plain, float)
     except ValueError:
-        times = instants(path, "timestamp", plain, lines[present].tolist(), month_first=None).ns.astype(float) / 1e9
+        first = month_first({stamp.split()[0] for stamp in plain}, plain[0])
+        try:
+            times = instants(path, "timestamp", plain, lines[present].tolist(), month_first=first).ns.astype(float) / 1e9
+        except ValueError as error:
+            raise ValueError(str(error).replace("name another column", "remove that column")) from None
     which, lines, names = which[present], lines[present], list(itertools.compress(prints, present))
     order = np.argsort(which, kind="stable")
     back = np.flatnonzero((np.diff(times[order]) < 0) & (np.diff(which[order]) == 0))

@@ -48,7 +48,7 @@ def _spoil(content: bytes, kind: str) -> bytes:
     jpeg = cv2.imencode(".jpg", cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE))[1].tobytes()
     half = len(jpeg) // 2
     return {
-        "empty": b"", "text": b"no picture", "cut PNG": content[: len(content) // 2], "cut JPEG": jpeg[:half], "JPEG without its last byte": jpeg[:-1],
+        "empty": b"", "text": b"no picture", "page": b"<!DOCTYPE html><html><body>404 Not Found</body></html>", "cut PNG": content[: len(content) // 2], "cut JPEG": jpeg[:half], "JPEG without its last byte": jpeg[:-1],
         "JPEG of zeros": jpeg[:half] + bytes(half), "JPEG with a hole": jpeg[:half] + jpeg[half + 400 :],
         "floats": cv2.imencode(".tif", np.ones((80, 80), np.float32))[1].tobytes(), "no pixels": cv2.imencode(".png", np.zeros((1, 1), np.uint8))[1].tobytes(),
     }[kind]  # fmt: skip
@@ -57,7 +57,7 @@ def _spoil(content: bytes, kind: str) -> bytes:
 @pytest.mark.parametrize(
     ("kind", "said"),
     [
-        ("empty", "an empty file"), ("text", "10 bytes that are no whole picture"), ("cut PNG", "no whole picture"), ("cut JPEG", "without its end"),
+        ("empty", "an empty file"), ("text", "10 bytes that are no whole picture"), ("page", "no whole picture, beginning with 3c 21"), ("cut PNG", "no whole picture"), ("cut JPEG", "without its end"),
         ("JPEG without its last byte", "without its end"), ("JPEG of zeros", "without its end"), ("JPEG with a hole", "Corrupt JPEG data"), ("floats", "float32"),
         ("no pixels", "at least 64 x 64 px"),
     ],
@@ -122,6 +122,49 @@ def test_labels_that_contradict_the_flow_are_reported_and_the_flow_is_taken(copy
     )
 
 
+@pytest.mark.parametrize(
+    ("column", "said"),
+    [
+        ("flow_rate", "no flow is known, the first line 2, print0/image-0.png; fill it in, in percent of nominal"),
+        ("target_hotend", "no temperature is known, the first line 2, print0/image-0.png; fill it in"),
+        ("print_id", "no print is named, the first line 2, print0/image-0.png; fill in print_id, or remove that column"),
+        ("img_path", "no image is named, the first line 2, no image; fill in img_path"),
+        ("nozzle_tip_y", "no tip is known, the first line 2, print0/image-0.png; find it with ./run beadline calibrate-tip"),
+    ],
+)
+def test_an_empty_column_is_refused_with_what_to_do(copy, column, said):
+    table(copy / "log.csv", [dict(row, **{column: ""}) for row in rows()])
+    assert said in refusal(copy)
+
+
+def test_files_that_no_line_names_are_counted(copy):
+    table(copy / "log.csv", rows()[:12])
+    (copy / "settings.xlsx").write_bytes(b"PK")
+    (copy / "README.md").write_text("as they came")
+    found = read(copy)
+    assert len(found.valid) == 12
+    assert f"{copy}: 7 files are named by no CSV and were not read, the first print1/image-3.png; list them" in notes(found)
+
+
+@pytest.mark.parametrize("tip", ["NaN", "inf", "-1", "1e300"])
+def test_a_tip_that_is_no_place_in_the_picture_leaves_out_its_line(copy, tip):
+    lines = rows()
+    lines[4]["nozzle_tip_x"] = tip
+    table(copy / "log.csv", lines)
+    found = read(copy)
+    assert not found.valid[4]
+    assert "1 of 18 frames were left out: " in notes(found)
+    assert "calibrate-tip" in notes(found)
+    np.testing.assert_array_equal(np.delete(found.images, 4, 0), np.delete(expected(), 4, 0))
+
+
+def test_notes_of_a_table_name_their_file(copy):
+    (copy / "log.csv").write_bytes(
+        (copy / "log.csv").read_bytes().replace(b"bed", "Bett, nördlich".encode("cp1252").replace(b",", b" ")) + bytes(40)
+    )
+    assert f"{copy / 'log.csv'}: byte " in notes(read(copy))
+
+
 # ---- refused
 
 
@@ -141,6 +184,9 @@ def test_what_a_csv_is_refused_for(copy):
     assert "line 6: expected print0/image-3.png once, found it here with 100 percent and 230 degC in print '0' and in line 5" in of(
         img_path="print0/image-3.png", target_hotend="230"
     )
+    assert "line 6, time timestamp should be" in of(timestamp="1602163930")
+    assert "convert it, or remove that column" in of(timestamp="1602163930")
+    assert "line 6: a quotation mark is opened there and never closed; remove or close it" in of(img_path='"print0/image-4.png')
     for column, needed in (("flow_rate", "flow_rate"), ("img_path", "img_path")):
         table(copy / "log.csv", [{name: text for name, text in row.items() if name != column} for row in rows()])
         assert f"log.csv: expected a column {needed}, found none" in refusal(copy)
@@ -164,6 +210,11 @@ def test_a_folder_without_anything_to_read_is_refused(tmp_path):
     assert "expected a CSV with its images, or MCAP recordings, found neither" in refusal(tmp_path / "raw")
     (tmp_path / "raw/log.csv").write_text(",".join(rows()[0]) + "\n")
     assert "a header and no data" in refusal(tmp_path / "raw")
+
+
+def test_a_link_to_nowhere_is_refused_by_its_name(copy):
+    (copy / "night.mcap").symlink_to("gone.mcap")
+    assert "night.mcap is a link to what is not there; copy the file itself" in refusal(copy)
 
 
 def test_a_folder_without_one_usable_frame_is_refused_with_the_reason(copy):

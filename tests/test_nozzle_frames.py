@@ -92,11 +92,20 @@ def test_prints_that_take_turns_in_a_file_are_put_one_behind_the_other(copy):
         lambda path, lines: table(path / "log.csv", [dict(line, img_path=line["img_path"].replace("/", "\\")) for line in lines]),
         lambda path, lines: table(path / "log.csv", [dict(line, img_path="C:\\data\\caxton_dataset\\" + line["img_path"].replace("/", "\\")) for line in lines]),
         lambda path, lines: table(path / "log.csv", [dict(line, img_path="./" + line["img_path"]) for line in lines]),
+        lambda path, lines: table(path / "log.csv", [dict(line, img_path="/home/me/caxton/" + line["img_path"]) for line in lines]),
+        lambda path, lines: table(path / "log.csv", [{name.upper(): text for name, text in line.items()} for line in lines]),
+        lambda path, lines: table(path / "log.csv", [{f" {name.replace('_', ' ').title()}": text for name, text in line.items()} for line in lines]),
+        lambda path, lines: table(path / "log.csv", [{"": str(k), **dict(reversed(line.items())), "remark": "Zoë"} for k, line in enumerate(lines)]),
+        lambda path, lines: table(path / "log.csv", [dict(line, timestamp=str(1602163930 + k)) for k, line in enumerate(lines)]),
+        lambda path, lines: table(path / "log.csv", [dict(line, timestamp=f"2020-10-08T13:12:{k:02d}.123456+00:00") for k, line in enumerate(lines)]),
+        lambda path, lines: table(path / "log.csv", [dict(line, timestamp=f"10/08/2020 1:12:{k:02d} PM") for k, line in enumerate(lines)]),
+        lambda path, lines: table(path / "log.csv", [dict(line, timestamp="NaT") for line in lines]),
+        lambda path, lines: (table(path / "log.csv", lines), (path / "again").symlink_to(".")),
         lambda path, lines: table(path / "logs/log.csv", lines),
         lambda path, lines: _flat(path, lines),
         lambda path, lines: [table(path / f"print{k}/log.csv", [dict(r, img_path=r["img_path"].split("/")[1]) for r in lines[9 * k : 9 * k + 9]]) for k in (0, 1)],
     ],
-    ids=["mark and CRLF", "semicolons and decimal commas", "back-slashes", "another computer's folders", "a dot", "CSV in a folder of its own", "images in a folder of another name", "CSV beside its images"],
+    ids=["mark and CRLF", "semicolons and decimal commas", "back-slashes", "another computer's folders", "a dot", "an absolute path", "upper case", "names with blanks", "another order, an index and a remark", "seconds since 1970", "ISO with a zone", "an American clock", "no times", "a link that leads back", "CSV in a folder of its own", "images in a folder of another name", "CSV beside its images"],
 )  # fmt: skip
 def test_however_the_file_is_written_the_frames_are_the_same(copy, write):
     (copy / "log.csv").unlink()
@@ -120,7 +129,7 @@ def test_a_file_without_the_optional_columns_is_one_print_and_says_what_it_lacks
     assert len(set(found.segment)) == 6
 
 
-@pytest.mark.parametrize("kind", ["colour", "16 bit", "16 bit colour", "jpeg", "tiff", "bmp"])
+@pytest.mark.parametrize("kind", ["colour", "16 bit", "16 bit colour", "transparent", "jpeg", "tiff", "bmp"])
 def test_depth_colour_and_format_of_the_pictures_do_not_matter(made, copy, kind):
     ending = {"jpeg": ".jpg", "tiff": ".tif", "bmp": ".bmp"}.get(kind, ".png")
     lines = rows()[:9]
@@ -129,11 +138,24 @@ def test_depth_colour_and_format_of_the_pictures_do_not_matter(made, copy, kind)
         frame = frame.astype(np.uint16) << 8 if "16" in kind else frame
         frame = cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR) if "colour" in kind else frame
         line["img_path"] = line["img_path"].replace(".png", ending)
+        frame = np.dstack([frame] * 3 + [0 * frame]) if kind == "transparent" else frame
         cv2.imwrite(str(copy / line["img_path"]), frame, [cv2.IMWRITE_JPEG_QUALITY, 100])
     table(copy / "log.csv", lines)
     found = read(copy).images.astype(int)
     # colour is one level off in rounding, which equalisation may stretch; a JPEG of quality 100 is good to two
-    assert np.abs(found - expected()[:9]).mean() <= {"colour": 1, "16 bit colour": 1, "jpeg": 4}.get(kind, 0)
+    assert np.abs(found - expected()[:9]).mean() <= {"colour": 1, "16 bit colour": 1, "transparent": 1, "jpeg": 4}.get(kind, 0)
+
+
+def test_pictures_of_another_size_in_a_print_are_read_as_they_are(copy):
+    valid = int(np.flatnonzero(expected().any(axis=(1, 2)))[0])
+    path, lines = copy / rows()[valid]["img_path"], rows()
+    wide = cv2.copyMakeBorder(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), 30, 90, 200, 10, cv2.BORDER_REPLICATE)
+    cv2.imwrite(str(path), wide)
+    for name, shift in (("nozzle_tip_x", 200), ("nozzle_tip_y", 30)):
+        lines[valid][name] = f"{float(lines[valid][name]) + shift:.2f}"
+    table(copy / "log.csv", lines)
+    # what is seen around the tip is the same; equalisation counts a few more pixels of the border
+    assert np.abs(read(copy).images.astype(int) - expected()).mean() < 1
 
 
 def test_a_direction_column_is_obeyed(copy):

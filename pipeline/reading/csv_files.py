@@ -102,6 +102,8 @@ def _sound_rows(path: Path, layout: CsvLayout, clock: "_Clock | None", notes: li
             yield line, row
         elif [field.strip() for field in row[:width]] in (layout.names, layout.units):
             repeated.append(line)
+        elif breaks := sum(field.rstrip("\n").count("\n") for field in row):
+            raise ValueError(f"{path}: line {line - breaks}: a quotation mark is opened there and never closed; remove or close it")
         else:
             tail.append((line, row))
             if len(tail) > LONGEST_TAIL:
