@@ -78,12 +78,15 @@ class Block(eqx.Module):
         self.queries_keys_values, self.attended = Dense(d, 3 * d, rng), Dense(d, d, rng)
         self.expand, self.contract = Dense(d, size.feed_forward, rng), Dense(size.feed_forward, d, rng)
 
-    def __call__(self, x: Float[Array, "n tokens width"]) -> Float[Array, "n tokens width"]:
+    def __call__(self, x: Float[Array, "n tokens width"], wanted: int) -> Float[Array, "n wanted width"]:
+        """The first `wanted` tokens after the layer: of the last one the class token alone is read, and the others are not worked out."""
         n, tokens, d = x.shape
-        split = self.queries_keys_values(self.norm_1(x)).reshape(n, tokens, 3, self.heads, d // self.heads)
-        q, k, v = split[:, :, 0], split[:, :, 1], split[:, :, 2]
+        seen, W, b = self.norm_1(x), self.queries_keys_values.W, self.queries_keys_values.b
+        q = (seen[:, :wanted] @ W[:, :d] + b[:d]).reshape(n, wanted, self.heads, d // self.heads)
+        kv = (seen @ W[:, d:] + b[d:]).reshape(n, tokens, 2, self.heads, d // self.heads)
+        k, v = kv[:, :, 0], kv[:, :, 1]
         weight = jax.nn.softmax(jnp.einsum("nqhd,nkhd->nhqk", q, k) / np.sqrt(d / self.heads), axis=-1)
-        x = x + self.attended(jnp.einsum("nhqk,nkhd->nqhd", weight, v).reshape(n, tokens, d))
+        x = x[:, :wanted] + self.attended(jnp.einsum("nhqk,nkhd->nqhd", weight, v).reshape(n, wanted, d))
         return x + self.contract(jax.nn.gelu(self.expand(self.norm_2(x))))
 
 
@@ -114,9 +117,9 @@ class VisionTransformer(eqx.Module):
         tiles = x.reshape(n, ROWS // rows, rows, COLUMNS // columns, columns).swapaxes(2, 3).reshape(n, -1, rows * columns)
         tokens = self.patches(tiles)
         tokens = jnp.concatenate([jnp.broadcast_to(self.class_token, (n, 1, tokens.shape[-1])), tokens], axis=1) + self.positions
-        for block in self.blocks:
-            tokens = block(tokens)
-        return self.norm(tokens[:, 0])
+        for block in self.blocks[:-1]:
+            tokens = block(tokens, tokens.shape[1])
+        return self.norm(self.blocks[-1](tokens, 1)[:, 0])
 
 
 class ConvolutionalNetwork(eqx.Module):
