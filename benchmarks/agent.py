@@ -12,7 +12,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -59,8 +58,9 @@ def one_seed(p: teaching.TrainAgent, runs: int, segment: float) -> dict[str, Any
     return row
 
 
-def speeds(p: teaching.Paper) -> dict[str, float]:
-    """Updates of the whole loop, rollout steps a second with 1,024 environments, and milliseconds of one action, each the median of 3; compiling is not counted."""
+def speeds(p: teaching.Paper) -> dict[str, Any]:
+    """Updates of the whole loop, rollout steps with 1,024 environments, and milliseconds of one action; compiling is not counted. Beside them the matrix products that
+    an update cannot do without, alone: on a machine that others use too, the ratio is what can be compared."""
     network, optimiser, sight = agent.QNetwork(jax.random.key(0)), optax.adam(1e-4), agent.paper_sight()
     a, b = (jnp.asarray(x) for x in (40.0, 20.0))
     world = agent.World(
@@ -68,57 +68,79 @@ def speeds(p: teaching.Paper) -> dict[str, float]:
     )
     learner, controller = agent.Learner(network, network, optimiser.init(network)), agent.greedy(sight)
     conditions = jax.tree.map(lambda leaf: leaf[:1024], judging.starts(49, accuracy=1.0))
-
-    def train():
-        keywords = {"sight": sight, "world": world, "optimiser": optimiser, "bootstrap": agent.greatest, "setting": p.setting()}
-        return agent.phase(learner, jax.random.key(0), updates=UPDATES, epsilon=(1.0, 0.05), **keywords)
-
-    act = eqx.filter_jit(controller.act)
+    keywords = {"sight": sight, "world": world, "optimiser": optimiser, "bootstrap": agent.greatest, "setting": p.setting()}
+    act = jax.jit(lambda memory, seen: controller.act(network, memory, seen, None))
     seen = agent.begin(paper_windows(), jax.tree.map(lambda leaf: leaf[0], conditions), jax.random.key(0))[1]
+    products, flop = update_products(p.batch)
 
     def acting():
         memory = sight.start()
         for _ in range(UPDATES):
-            memory, action = act(network, memory, seen, jax.random.key(0))
+            memory, action = act(memory, seen)
         return action
 
-    updates = UPDATES / seconds(train)
-    steps = 1024 * 200 / seconds(lambda: rollout(controller, network, paper_windows(), conditions, jax.random.key(0), steps=200).flow)
+    work = {
+        "update": (lambda: agent.phase(learner, jax.random.key(0), updates=UPDATES, longest=UPDATES, epsilon=(1.0, 0.05), **keywords), UPDATES),
+        "products": (products, UPDATES),
+        "rollout_step": (lambda: rollout(controller, network, paper_windows(), conditions, jax.random.key(0), steps=200).flow, 1024 * 200),
+        "action": (acting, UPDATES),
+    }  # fmt: skip
+    taken = {name: seconds(f) / n for name, (f, n) in work.items()}
+    wall, cpu = ({name: both[i] for name, both in taken.items()} for i in (0, 1))
     return {
-        "updates_per_s": updates,
-        "environment_steps_per_s": updates * p.environments,
-        "rollout_steps_per_s": steps,
-        "action_ms": 1e3 * seconds(acting) / UPDATES,
-    }
+        "updates_per_s": 1 / wall["update"], "updates_per_cpu_s": 1 / cpu["update"], "environment_steps_per_s": p.environments / wall["update"],
+        "update_gflop": flop / 1e9, "products_alone_per_s": 1 / wall["products"], "products_alone_per_cpu_s": 1 / cpu["products"],
+        "update_by_products_wall": wall["update"] / wall["products"], "update_by_products_cpu": cpu["update"] / cpu["products"],
+        "rollout_steps_per_s": 1 / wall["rollout_step"], "rollout_steps_per_cpu_s": 1 / cpu["rollout_step"], "action_ms": 1e3 * wall["action"], "action_cpu_ms": 1e3 * cpu["action"],
+    }  # fmt: skip
 
 
-def seconds(work) -> float:
-    """Median of 3 after one to compile."""
+def update_products(batch: int):
+    """The products of one update with nothing between them, UPDATES times: two networks forward, one backward without the inputs' share -> (work, floating point operations
+    of one update)."""
+    sizes, rng = ((35, 288), (288, 128), (128, 10)), np.random.default_rng(0)
+    made = [[jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in ((batch, m), (m, n), (batch, n))] for m, n in sizes]
+
+    def one(c, _):
+        total = 0.0
+        for i, (x, W, y) in enumerate(made):
+            W = W + 1e-20 * c  # so that no step can be left out
+            total += (x @ W)[0, 0] + ((x + c) @ W)[0, 0] + (x.T @ (y + c))[0, 0] + (((y - c) @ W.T)[0, 0] if i else 0.0)
+        return 1e-20 * total, None
+
+    loop = jax.jit(lambda: jax.lax.scan(one, jnp.float32(0.0), None, length=UPDATES)[0])
+    return loop, 2 * batch * sum((4 if i else 3) * m * n for i, (m, n) in enumerate(sizes))
+
+
+def seconds(work) -> np.ndarray:
+    """(2,): median of 3 in wall and in CPU seconds, after one to compile."""
     taken = []
     for _ in range(4):
-        start = time.perf_counter()
+        start = np.array([time.perf_counter(), time.process_time()])
         jax.block_until_ready(work())
-        taken.append(time.perf_counter() - start)
-    return float(np.median(taken[1:]))
+        taken.append(np.array([time.perf_counter(), time.process_time()]) - start)
+    return np.median(taken[1:], axis=0)
 
 
-def peer(python: str | None, updates_per_s: float) -> dict[str, Any]:
+def peer(python: str | None, ours: dict[str, Any]) -> dict[str, Any]:
+    """stable-baselines3's updates a second and a CPU second, of its whole loop and of its updates alone, and how often ours fit into them."""
     if python is None or not Path(python).exists():
         return {"skipped": "no python of an environment with stable-baselines3 and a CPU build of torch was named"}
     done = subprocess.run([python, str(PEER), str(UPDATES)], capture_output=True, text=True, check=True)
-    found = {name: float(np.median(values)) for name, values in json.loads(done.stdout.splitlines()[-1]).items()}
+    found = {name: [float(x) for x in np.median(values, axis=0)] for name, values in json.loads(done.stdout.splitlines()[-1]).items()}
+    found = {f"{name}_per_{unit}": value for name, pair in found.items() for unit, value in zip(("s", "cpu_s"), pair, strict=True)}
     return found | {
-        "ratio_whole_loop": updates_per_s / found["whole_loop"],
-        "ratio_to_updates_alone": updates_per_s / found["updates_alone"],
-    }
+        f"ratio_{name}_{unit}": ours[f"updates_per_{unit}"] / found[f"{name}_per_{unit}"] for name in ("whole_loop", "updates_alone") for unit in ("s", "cpu_s")
+    }  # fmt: skip
 
 
 if __name__ == "__main__":
     seeds, runs, python = [*sys.argv[1:], *["5", "100", None][len(sys.argv) - 1 :]]
     p = params.load(teaching.TrainAgent, "train_agent")
     found: dict[str, Any] = {"speed": speeds(p.paper)}
-    found["peer"] = peer(python, found["speed"]["updates_per_s"])
+    found["peer"] = peer(python, found["speed"])
     print(json.dumps(found, indent=2))
+    RESULTS.write_text(json.dumps(found, indent=2, ensure_ascii=False) + "\n")
     for seed in range(int(seeds)):
         found[f"seed {seed}"] = one_seed(p.model_copy(update={"seed": seed}), int(runs), 10.0)
         print(seed, json.dumps(found[f"seed {seed}"], indent=2, ensure_ascii=False), flush=True)

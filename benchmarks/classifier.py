@@ -122,7 +122,8 @@ def worst(rows: list[dict]) -> dict:
 
 
 def speed(batch: int = 64, repeats: int = 4) -> dict:
-    """Images a second of the paper's size, forward and backward with its update, and milliseconds an image of the forward pass: wall and CPU."""
+    """Images a second of the paper's size, forward and backward with its update, and milliseconds an image of the forward pass: wall and CPU. Beside them what the matrix
+    products that it cannot do without would take at the rate of the widest of them alone: on a machine that others use too, that ratio is what can be compared."""
     rng = np.random.default_rng(0)
     network = vision_transformer(PAPER, rng)
     rows = [
@@ -143,12 +144,35 @@ def speed(batch: int = 64, repeats: int = 4) -> dict:
     step = timed(lambda: _step(along_bead, carry, drawn, rows, Rates(1e-4, 1, 100, 0.0, 0.0, 0.0)))
     forward = jax.jit(lambda x, u: network(x, u))
     look = timed(lambda: forward(rows[0], rows[1]))
+    x, W = (
+        jax.numpy.asarray(rng.normal(size=shape), jax.numpy.float32)
+        for shape in ((batch * 49, PAPER.width), (PAPER.width, PAPER.feed_forward))
+    )
+    both_ways = jax.jit(lambda x: (x @ W) @ W.T)
+    products = [
+        taken * batch / (4 * x.size * PAPER.feed_forward) for taken in timed(lambda: both_ways(x))
+    ]  # seconds a floating point operation
+    flop = forward_flop()
     return {
+        "forward_gflop": flop / 1e9,
+        "step_by_products_wall": step[0] / (3 * flop * products[0]),
+        "step_by_products_cpu": step[1] / (3 * flop * products[1]),
+        "forward_by_products_wall": look[0] / (flop * products[0]),
+        "forward_by_products_cpu": look[1] / (flop * products[1]),
+        "products_gflop_per_s_wall": 1e-9 / products[0],
+        "products_gflop_per_cpu_s": 1e-9 / products[1],
         "images_per_s_wall": 1 / step[0],
         "images_per_cpu_s": 1 / step[1],
         "ms_per_image_wall": 1e3 * look[0],
         "cpu_ms_per_image": 1e3 * look[1],
     }
+
+
+def forward_flop() -> float:
+    """Floating point operations of one image's products: of the last layer only keys and values are needed of every token."""
+    d, tokens = PAPER.width, 49
+    layer, last = 4 * d * d + 2 * d * PAPER.feed_forward, 2 * d * d
+    return 2.0 * (tokens * ((PAPER.layers - 1) * layer + last) + layer - last + 48 * 16 * d)
 
 
 def main(seeds: int, others: bool) -> None:

@@ -16,6 +16,7 @@ from jax.tree_util import Partial
 
 from pipeline.setpoint.reward import BEST_TEMPERATURE, PHASES, reward
 from pipeline.setpoint.simulator import (
+    CHANCES,
     FLOW_LIMITS,
     HISTORY,
     LAMBDA,
@@ -34,6 +35,7 @@ from pipeline.setpoint.simulator import (
     paper_windows,
     remembered,
     step,
+    stepped,
 )
 
 VISION = HISTORY + 3  # numbers of the state that come from the camera; the rest are temperatures
@@ -58,9 +60,10 @@ class QNetwork(eqx.Module):
 
     def __call__(self, state: jax.Array) -> jax.Array:
         """Q (2, 5) of the flow's and the temperature's actions at a state (35,) of (9), temperatures already scaled."""
-        seen = jax.nn.relu(self.vision(state[:VISION]))
-        hot = jax.nn.relu(self.temperature(state[VISION:]))
-        return self.heads(jax.nn.relu(self.joint(jnp.concatenate([seen, hot])))).reshape(2, ACTIONS)
+        # both first layers as one product, zeros where one does not see the other's numbers: for a batch that is dearer in sums and cheaper in moving them
+        both = jax.scipy.linalg.block_diag(self.vision.weight, self.temperature.weight)
+        seen = jax.nn.relu(both @ state + jnp.concatenate([self.vision.bias, self.temperature.bias]))
+        return self.heads(jax.nn.relu(self.joint(seen))).reshape(2, ACTIONS)
 
 
 class Sight(NamedTuple):
@@ -117,14 +120,24 @@ class Setting(NamedTuple):
 
 
 class Replay(NamedTuple):
-    """Ring of transitions: x and what followed (capacity, d), action and reward of both heads (capacity, 2), and whether lambda's clock heeds no temperature action next
-    (capacity,): then the temperature stands, and the target says so; a maximum there would make waiting free."""
+    """Transitions: x and what followed (n, d), action and reward of both heads (n, 2), and whether lambda's clock heeds no temperature action next (n,): then the
+    temperature stands, and the target says so; a maximum there would make waiting free. The ring keeps them as rows of 2 d + 5 numbers: one place to look up each."""
 
     x: jax.Array
     after: jax.Array
     action: jax.Array
     reward: jax.Array
     waits: jax.Array
+
+
+def _packed(rows: Replay) -> jax.Array:
+    return jnp.concatenate([rows.x, rows.after, rows.action, rows.reward, rows.waits[:, None]], axis=1)
+
+
+def _unpacked(table: jax.Array) -> Replay:
+    d = (table.shape[1] - 5) // 2
+    x, after, action, reward, waits = jnp.split(table, (d, 2 * d, 2 * d + 2, 2 * d + 4), axis=1)
+    return Replay(x, after, action.astype(jnp.int8), reward, waits[:, 0] > 0)
 
 
 class World(NamedTuple):
@@ -156,23 +169,20 @@ def _fresh(world: World, sight: Sight, network, keys):
     return jax.vmap(one)(keys)
 
 
-def _stepped(world: World, sight: Sight, network, episodes, epsilon, key, length: int):
-    """One step of all episodes under the epsilon-greedy policy -> (episodes, transitions as rows of the replay); episodes that are over start anew."""
+def _stepped(world: World, sight: Sight, network, episodes, epsilon, u: jax.Array, key, length: int):
+    """One step of all episodes under the epsilon-greedy policy, by u (n, 4 + CHANCES) uniform in [0, 1) -> (episodes, their transitions); those that are over start
+    anew, from the key."""
     conditions, state, memory, x = episodes
-    n = x.shape[0]
-    k_random, k_action, k_world, k_fresh = jax.random.split(key, 4)
-    best = jax.vmap(network)(x).argmax(axis=2)
-    action = jnp.where(jax.random.uniform(k_random, (n, 2)) < epsilon, jax.random.randint(k_action, (n, 2), 0, ACTIONS), best)
+    explores, at_random, befalls = u[:, :2] < epsilon, (ACTIONS * u[:, 2:4]).astype(jnp.int32), u[:, 4:]
+    action = jnp.where(explores, at_random, jax.vmap(network)(x).argmax(axis=2))
     action = action.at[:, 1].set(jnp.where(state.step % LAMBDA == 0, action[:, 1], STAND))  # what is not heeded is standing
-    state, observation = jax.vmap(Partial(step, world.windows))(
-        conditions, state, Action(action[:, 0], action[:, 1]), jax.random.split(k_world, n)
-    )
+    state, observation = jax.vmap(Partial(stepped, world.windows))(conditions, state, Action(action[:, 0], action[:, 1]), befalls)
     memory, after = jax.vmap(Partial(sight.see, network))(memory, observation)
     rewards = jax.vmap(world.rewards)(state)
     over, waits = state.step >= length, state.step % LAMBDA != 0
 
     def renewed(going):
-        again = _fresh(world, sight, network, jax.random.split(k_fresh, n))
+        again = _fresh(world, sight, network, jax.random.split(key, len(x)))
         return jax.tree.map(lambda new, old: jnp.where(over.reshape(-1, *[1] * (old.ndim - 1)), new, old), again, going)
 
     episodes = jax.lax.cond(over.any(), renewed, lambda going: going, (conditions, state, memory, after))
@@ -196,41 +206,52 @@ def _updated(learner: Learner, rows: Replay, optimiser, bootstrap, gamma: float 
     return Learner(network, slow, moments)
 
 
-@eqx.filter_jit
 def phase(
     learner: Learner, key: jax.Array, *, sight: Sight, world: World, optimiser: optax.GradientTransformation, bootstrap: Callable, setting: Setting,
-    updates: int, epsilon: tuple[float, float],
+    updates: int, longest: int, epsilon: tuple[float, float],
 ) -> tuple[Learner, jax.Array]:  # fmt: skip
     """A whole phase as one program -> the learner after it and the mean reward of each step (updates,); epsilon falls in a line over the first third.
 
     A step of all episodes, one batch from an empty replay, one update, `updates` times. Episodes start at different steps, so that they do not end together.
+    Phases with the same `longest`, the updates of the longest of them, are one program compiled once.
     """
+    learner, rewards = _phase(
+        learner, key, jnp.asarray(updates), jnp.asarray(epsilon), sight=sight, world=world, optimiser=optimiser, bootstrap=bootstrap, setting=setting, longest=longest
+    )  # fmt: skip
+    return learner, rewards[:updates]
+
+
+@eqx.filter_jit
+def _phase(learner, key, updates, epsilon, *, sight: Sight, world: World, optimiser, bootstrap, setting: Setting, longest: int):
     k_start, k_clock, key = jax.random.split(key, 3)
-    n = setting.environments
+    n, capacity = setting.environments, setting.capacity
     conditions, state, memory, x = _fresh(world, sight, learner.network, jax.random.split(k_start, n))
     state = state._replace(step=LAMBDA * jax.random.randint(k_clock, (n,), 0, setting.episode // LAMBDA))
-    rows = setting.capacity
-    replay = Replay(
-        jnp.zeros((rows, x.shape[1])),
-        jnp.zeros((rows, x.shape[1])),
-        jnp.zeros((rows, 2), jnp.int8),
-        jnp.zeros((rows, 2)),
-        jnp.zeros(rows, bool),
-    )
+    # a step draws some thousand numbers: by XLA's own generator (Philox), which costs a tenth of jax's default there
+    fast = jax.random.wrap_key_data(jnp.tile(jax.random.key_data(key), 2), impl="rbg")
 
-    def one(carry, i):
-        learner, episodes, replay = carry
-        k_step, k_batch = jax.random.split(jax.random.fold_in(key, i))
-        share = jnp.minimum(3.0 * i / updates, 1.0)
+    def one(i, carry):
+        learner, episodes, ring, paid = carry
+        k_step, k_batch = (jax.random.fold_in(fast, 2 * i + j) for j in (0, 1))
+        now = epsilon[0] + (epsilon[1] - epsilon[0]) * jnp.minimum(3.0 * i / updates, 1.0)
         episodes, new = _stepped(
-            world, sight, learner.network, episodes, epsilon[0] + (epsilon[1] - epsilon[0]) * share, k_step, setting.episode
+            world,
+            sight,
+            learner.network,
+            episodes,
+            now,
+            jax.random.uniform(k_step, (n, 4 + CHANCES)),
+            jax.random.fold_in(key, i),
+            setting.episode,
         )
-        replay = jax.tree.map(lambda ring, row: jax.lax.dynamic_update_slice_in_dim(ring, row, i * n % rows, 0), replay, new)
-        chosen = jax.random.randint(k_batch, (setting.batch,), 0, jnp.minimum((i + 1) * n, rows))
-        learner = _updated(learner, jax.tree.map(lambda ring: ring[chosen], replay), optimiser, bootstrap, setting.gamma, setting.tau)
-        return (learner, episodes, replay), new.reward.mean()
+        ring = jax.lax.dynamic_update_slice_in_dim(ring, _packed(new), i * n % capacity, 0)
+        filled = jnp.minimum((i + 1) * n, capacity).astype(jnp.uint32)
+        chosen = (jax.random.bits(k_batch, (setting.batch,)) % filled).astype(jnp.int32)
+        learner = _updated(learner, _unpacked(ring[chosen]), optimiser, bootstrap, setting.gamma, setting.tau)
+        return learner, episodes, ring, paid.at[i].set(new.reward.mean())
 
-    (learner, *_), rewards = jax.lax.scan(one, (learner, (conditions, state, memory, x), replay), jnp.arange(updates))
+    ring = jnp.zeros((capacity, 2 * x.shape[1] + 5))
+    learner, _, _, rewards = jax.lax.fori_loop(0, updates, one, (learner, (conditions, state, memory, x), ring, jnp.zeros(longest)))
     return learner, rewards
 
 
@@ -284,7 +305,7 @@ def train_published(
         world = World(windows, Partial(anywhere, jnp.asarray(right)), Partial(ellipse, jnp.asarray(a), jnp.asarray(b)))
         learner, rewards = phase(
             learner, jax.random.fold_in(key, i), sight=sight, world=world, optimiser=optimiser, bootstrap=greatest, setting=setting, updates=count,
-            epsilon=(explore if i == 0 else explore_again, least),
+            longest=max(updates), epsilon=(explore if i == 0 else explore_again, least),
         )  # fmt: skip
         networks.append(learner.network)
         all_rewards.append(rewards)

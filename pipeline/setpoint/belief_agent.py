@@ -262,7 +262,7 @@ def train(
     for i in range(rounds):
         learner, gained = phase(
             learner, jax.random.fold_in(key, i), sight=sight, world=world, optimiser=optimiser, bootstrap=double, setting=setting, updates=updates,
-            epsilon=(explore, least),
+            longest=updates, epsilon=(explore, least),
         )  # fmt: skip
         networks.append(learner.network)
         judged.append(judge(learner.network))

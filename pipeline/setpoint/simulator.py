@@ -147,7 +147,7 @@ def begin(windows: Windows, conditions: Conditions, key: jax.Array) -> tuple[Sta
 
 def step(windows: Windows, conditions: Conditions, state: State, action: Action, key: jax.Array) -> tuple[State, Observation]:
     """One decision of one episode: the action, the lags, whatever befalls the machine, and the next window. The reward is `reward(state.flow, state.temperature, ...)`."""
-    return _stepped(windows, conditions, state, action, jax.random.uniform(key, (CHANCES,)))
+    return stepped(windows, conditions, state, action, jax.random.uniform(key, (CHANCES,)))
 
 
 def _begun(windows: Windows, conditions: Conditions, u: jax.Array) -> tuple[State, Observation]:
@@ -157,7 +157,8 @@ def _begun(windows: Windows, conditions: Conditions, u: jax.Array) -> tuple[Stat
     return state, _observe(windows, conditions, state, u[:3])
 
 
-def _stepped(windows: Windows, conditions: Conditions, state: State, action: Action, u: jax.Array) -> tuple[State, Observation]:
+def stepped(windows: Windows, conditions: Conditions, state: State, action: Action, u: jax.Array) -> tuple[State, Observation]:
+    """`step` by numbers u (CHANCES,), uniform in [0, 1), that the caller has drawn for many at once."""
     flow_bar = jnp.clip(state.flow_bar + conditions.gain * jnp.asarray(FLOW_MOVES)[action.flow], *FLOW_LIMITS)
     asked = jnp.where(state.step % LAMBDA == 0, jnp.asarray(TEMPERATURE_MOVES)[action.temperature], 0.0)
     target = jnp.clip(state.target + asked, *TEMPERATURE_LIMITS)
@@ -216,7 +217,7 @@ def _rolled(controller: Controller, parameters: Any, windows: Windows, condition
         u, t = chance
         now = jax.vmap(jax.random.fold_in, (0, None))(keys, t)
         memory, action = jax.vmap(controller.act, (None, 0, 0, 0))(parameters, memory, observation, now)
-        after, seen = jax.vmap(_stepped, (None, 0, 0, 0, 0))(windows, conditions, state, action, u)
+        after, seen = jax.vmap(stepped, (None, 0, 0, 0, 0))(windows, conditions, state, action, u)
         return (after, seen, memory), (after.flow, after.temperature, after.target, observation.named, observation.shares, action)
 
     state, observation = jax.vmap(_begun, (None, 0, 0))(windows, conditions, u[0])

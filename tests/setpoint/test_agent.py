@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from jax.tree_util import Partial
 
 from pipeline.setpoint import bayes, belief_agent
 from pipeline.setpoint.agent import (
@@ -12,12 +13,17 @@ from pipeline.setpoint.agent import (
     QNetwork,
     Replay,
     Setting,
+    World,
+    _packed,
+    _unpacked,
     _updated,
+    anywhere,
     double,
     ellipse,
     greatest,
     greedy,
     paper_sight,
+    phase,
     train_published,
     weights,
     why,
@@ -68,6 +74,13 @@ def test_the_network_sees_30_classes_the_scaled_distribution_and_both_temperatur
     assert history[-1] == pytest.approx(2 / 3)
 
 
+def test_both_first_layers_as_one_product_are_the_two_layers():
+    network, x = QNetwork(jax.random.key(3)), jax.random.normal(jax.random.key(4), (35,))
+    seen, hot = jax.nn.relu(network.vision(x[:33])), jax.nn.relu(network.temperature(x[33:]))
+    Q = network.heads(jax.nn.relu(network.joint(jnp.concatenate([seen, hot]))))
+    np.testing.assert_allclose(network(x).ravel(), Q, atol=1e-6)  # float32 sums in another order
+
+
 # ---- the learning rule
 
 
@@ -115,6 +128,33 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_others():
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)
     assert np.abs(one.networks[-1].heads.bias - other.networks[-1].heads.bias).max() > 1e-3
+
+
+def test_transitions_survive_the_ring():
+    rng = np.random.default_rng(0)
+    rows = Replay(
+        *(jnp.asarray(rng.normal(size=(6, 35)), jnp.float32) for _ in range(2)),
+        jnp.asarray(rng.integers(0, 5, (6, 2)), jnp.int8),
+        jnp.asarray(rng.normal(size=(6, 2)), jnp.float32),
+        jnp.arange(6) % 2 == 0,
+    )
+    for before, after in zip(rows, _unpacked(_packed(rows)), strict=True):
+        assert before.dtype == after.dtype
+        np.testing.assert_array_equal(before, after)
+
+
+@pytest.mark.slow
+def test_a_phase_does_not_depend_on_how_long_the_longest_is():
+    network, optimiser = QNetwork(jax.random.key(0)), optax.adam(1e-3)
+    world = World(paper_windows(), Partial(anywhere, jnp.asarray(1.0)), Partial(ellipse, jnp.asarray(40.0), jnp.asarray(20.0)))
+    learner, keywords = Learner(network, network, optimiser.init(network)), {"sight": paper_sight(), "world": world, "optimiser": optimiser}
+    (one, paid), (other, paid_alike) = (
+        phase(learner, jax.random.key(1), bootstrap=greatest, setting=SMALL, updates=12, longest=longest, epsilon=(1.0, 0.1), **keywords)
+        for longest in (12, 30)
+    )
+    np.testing.assert_array_equal(paid, paid_alike)
+    np.testing.assert_array_equal(one.network.joint.weight, other.network.joint.weight)
+    assert np.abs(one.network.joint.weight - network.joint.weight).max() > 1e-4  # Adam moves each weight by some 1e-3 a step
 
 
 def test_learning_raises_the_reward_from_its_first_to_its_last_steps():
