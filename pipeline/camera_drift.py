@@ -1,4 +1,5 @@
-"""Has the camera moved, the light or the ink changed, the focus gone? Figures of a line's frames, held against those of nights that are known to be good; and the balance of classes."""
+"""Has the camera moved, the light or the ink changed, the focus gone? Figures of a line's frames, held against those of nights that are known to be good; and of a nozzle's
+camera the balance of classes."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -123,7 +124,47 @@ def changes(now: Seen, before: Sequence[Seen], *, moved_px: float, contrast_perc
     return found, causes
 
 
-def class_balance(now: np.ndarray, before: np.ndarray, *, together: int) -> Shift:
+# ---- the camera that looks at the nozzle: what of a print's frames is which class, and how the line stands out
+
+KINDS = ("are under-extruded", "are well extruded", "are over-extruded", "show no line that can be read")
+
+
+class Contrast(NamedTuple):
+    """Median contrast (1,) of the line in a print's frames, in gray levels, and its standard deviation (1,)."""
+
+    mean: np.ndarray
+    deviation: np.ndarray
+
+
+def line_contrast(scores: np.ndarray, *, together: float) -> Contrast:
+    """Of the frames' ridge scores; frames come in segments of `together` that look alike, and a segment counts once."""
+    middle = float(np.median(scores))
+    spread = 1.4826 * 1.2533 * float(np.median(np.abs(scores - middle)))
+    return Contrast(np.array([middle]), np.array([max(spread * np.sqrt(together / len(scores)), 1e-6)]))
+
+
+def contrast_changes(now: Contrast, before: Sequence[Contrast], *, percent: float) -> list[Change]:
+    """The line stands out less, or more, than in the prints before, by at least `percent`."""
+    found = shift(now.mean, now.deviation, np.stack([one.mean for one in before]), np.stack([one.deviation for one in before]))
+    by = 100 * float(found.value[0] / max(found.reference[0], 1e-9) - 1)
+    words = f"the line stands out by {found.value[0]:.0f} gray levels where {found.reference[0]:.0f} were usual ({by:+.0f} %): light, focus or material"
+    return [Change("contrast", words, float(found.sigmas[0]))] if abs(by) >= percent else []
+
+
+def balance_changes(now: np.ndarray, before: np.ndarray, *, together: float, points: float) -> list[Change]:
+    """Of counts (4,) of KINDS against those of the prints before (prints, 4): the kind that has moved most surely by at least `points`; frames without a line go before classes."""
+    found = class_balance(now, before, together=together)
+    by = found.value - found.reference
+    moved = [k for k in range(len(KINDS)) if abs(by[k]) >= points]
+    if not moved:
+        return []
+    k = 3 if 3 in moved else max(moved, key=lambda k: abs(found.sigmas[k]))
+    why = "the nozzle's tip in the picture, light or focus" if k == 3 else "flow, or the picture that its class is read from"
+    words = f"{found.value[k]:.0f} % of the frames {KINDS[k]} where {found.reference[k]:.0f} % were usual: {why}"
+    return [Change("balance", words, float(found.sigmas[k]))]
+
+
+def class_balance(now: np.ndarray, before: np.ndarray, *, together: float) -> Shift:
     """Shares of classes in counts now (classes,) against those of good nights (nights, classes), in points; frames come in runs of `together` that say the same."""
     shares, known = 100 * now / max(now.sum(), 1), 100 * before / np.maximum(before.sum(axis=1, keepdims=True), 1)
 

@@ -190,14 +190,16 @@ class Shift(NamedTuple):
 def shift(value: np.ndarray, deviation: np.ndarray, before: np.ndarray, before_deviation: np.ndarray) -> Shift:
     """value (k,) against those of the reference nights before (nights, k): their mean, and as noise both nights' own and what they scatter beyond it (DerSimonian and Laird 1986).
 
-    With few nights the scatter is hardly known: the ratio is brought to the sigmas that a normal variable would need to be as unlikely.
+    With few nights the scatter is hardly known: its degrees of freedom count as many as there are nights less one (Satterthwaite 1946), and the ratio is brought to the sigmas
+    that a normal variable would need to be as unlikely.
     """
     nights = len(before)
     inside = (before_deviation**2).mean(axis=0)
     between = np.maximum(before.var(axis=0, ddof=1) - inside, 0.0) if nights > 1 else np.zeros_like(inside)
-    spread = np.sqrt(deviation**2 + between + (inside + between) / nights)
-    t = (value - before.mean(axis=0)) / np.maximum(spread, 1e-12)
-    freedom = BLOCKS - 1 if nights < 3 else min(BLOCKS - 1, 4 * (nights - 1))
+    own, scatter = np.maximum(deviation**2 + inside / nights, 1e-24), between * (1 + 1 / nights)
+    spread = np.sqrt(own + scatter)
+    t = (value - before.mean(axis=0)) / spread
+    freedom = spread**4 / (own**2 / (BLOCKS - 1) + scatter**2 / max(nights - 1, 1))
     tail = np.maximum(scipy.stats.t.sf(np.abs(t), freedom), 1e-290)
     return Shift(value, before.mean(axis=0), spread, np.sign(t) * scipy.stats.norm.isf(tail))
 

@@ -240,6 +240,7 @@ def test_a_failed_night_wakes_somebody_and_an_alarm_that_fails_does_not_hide_it(
 def test_rollback_to_an_unknown_run_names_the_known_ones(project):
     with pytest.raises(ValueError, match=r"expected a champion of night-0099 to go back to, found none; known are: night-0001 \(toy\)"):
         night.rollback("night-0099", "")
+    assert not guarding.RUNNING.exists()  # refused, not killed: the next night has nothing to mend
 
 
 @pytest.mark.slow

@@ -12,9 +12,7 @@ import pytest
 
 from tests.toy_nights import Project
 
-pytest.importorskip(
-    "moto", reason="moto[server] is not installed: ./run --with 'moto[server]' --with dvc-s3 pytest -m slow tests/test_nightly_s3.py"
-)
+pytest.importorskip("moto", reason="moto is not installed: ./run --group s3 pytest -m slow tests/test_nightly_s3.py")
 pytest.importorskip("dvc_s3", reason="dvc-s3 is not installed")
 
 

@@ -70,7 +70,7 @@ SETTINGS = {
     },
     "drift": {
         "alarm_sigmas": 5, "watch_sigmas": 3, "parameter_percent": 4, "offset_degC": 0.5, "noise_percent": 50, "effort_percent": 5, "at_limits_points": 10,
-        "camera_px": 2, "contrast_percent": 15,
+        "camera_px": 2, "contrast_percent": 15, "balance_points": 20,
     },
 }  # fmt: skip
 

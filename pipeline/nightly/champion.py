@@ -56,7 +56,7 @@ def install(loop: str, files: Sequence[str], beside: Mapping[str, Any]) -> dict[
         artifacts.write_json(new / name, content)
     _swap(new, FOLDER / loop)
     dvc("add", "--quiet", str(FOLDER / loop))
-    return {"folder": _out(loop), "files": md5s(FOLDER / loop), "outs": locked(files)}
+    return {"folder": pointer(loop), "files": md5s(FOLDER / loop), "outs": locked(files)}
 
 
 def md5_of(files: Sequence[str]) -> dict[str, str]:
@@ -93,7 +93,8 @@ def _swap(new: Path, target: Path) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
-def _out(loop: str) -> dict[str, Any]:
+def pointer(loop: str) -> dict[str, Any]:
+    """What champion/<loop>.dvc says of the folder."""
     return yaml.safe_load((FOLDER / f"{loop}.dvc").read_text(encoding="utf-8"))["outs"][0]
 
 
@@ -144,11 +145,11 @@ def earlier(state: Mapping[str, Any], run: str, loop: str) -> dict[str, dict[str
 
 def put_back(loop: str, entry: Mapping[str, Any]) -> None:
     """champion/<loop> as `entry` has it: from DVC's cache, or pulled. Raises ValueError where a file is not what it was, and leaves the present champion then."""
-    pointer = FOLDER / f"{loop}.dvc"
-    present = pointer.read_bytes() if pointer.exists() else b""
-    artifacts.write_text(pointer, yaml.safe_dump({"outs": [dict(entry["folder"])]}, sort_keys=False))
+    path = FOLDER / f"{loop}.dvc"
+    present = path.read_bytes() if path.exists() else b""
+    artifacts.write_text(path, yaml.safe_dump({"outs": [dict(entry["folder"])]}, sort_keys=False))
     try:
-        _fetch(pointer)
+        _fetch(path)
         wrong = sorted(set(md5s(FOLDER / loop).items()) ^ set(entry["files"].items()))
         if wrong:
             raise ValueError(
@@ -156,16 +157,16 @@ def put_back(loop: str, entry: Mapping[str, Any]) -> None:
             )
     except ValueError:
         if present:
-            artifacts.write_text(pointer, present.decode())
-            _fetch(pointer)
+            artifacts.write_text(path, present.decode())
+            _fetch(path)
         raise
 
 
-def _fetch(pointer: Path) -> None:
+def _fetch(path: Path) -> None:
     try:
-        dvc("checkout", "--quiet", "--force", str(pointer))
+        dvc("checkout", "--quiet", "--force", str(path))
     except ValueError:
-        dvc("pull", "--quiet", "--force", str(pointer))
+        dvc("pull", "--quiet", "--force", str(path))
 
 
 def as_committed() -> list[str]:

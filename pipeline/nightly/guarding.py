@@ -40,7 +40,11 @@ def alone() -> Iterator[list[str]]:
         left = _after_a_kill()
         os.environ[TOKEN] = str(Path.cwd())
         RUNNING.touch()
-        yield left
+        try:
+            yield left
+        except ValueError:  # refused in a sentence, not killed
+            RUNNING.unlink(missing_ok=True)
+            raise
         RUNNING.unlink(missing_ok=True)
     finally:
         os.environ.pop(TOKEN, None)

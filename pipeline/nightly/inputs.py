@@ -1,12 +1,16 @@
-"""What a night depends on, as one digest, so that a night with nothing new ends in seconds; and which recordings are new."""
+"""What a night depends on, as one digest, so that a night with nothing new ends in seconds; which recordings are new, and where those go that cannot be learned from."""
 
 import hashlib
+import itertools
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
 import yaml
 
 from pipeline import artifacts
+
+QUARANTINE = Path("datasets/quarantine")
 
 
 def sources() -> list[str]:
@@ -62,3 +66,16 @@ def recordings(hashes: Hashes, folder: str) -> dict[str, str]:
     """{path: digest} of the recordings below a loop's folder; notes and files of dvc are none."""
     found = hashes.below(folder) if folder and Path(folder).is_dir() else {}
     return {name: content for name, content in found.items() if not name.lower().endswith((".md", ".txt", ".yaml", ".dvc"))}
+
+
+def aside(path: str, loop: str, reason: str) -> str:
+    """Moves the recording, unchanged, to datasets/quarantine, where no stage looks and git does not either, its reason beside it; nothing there is overwritten. The reason."""
+    name, folder = Path(path), QUARANTINE / loop
+    folder.mkdir(parents=True, exist_ok=True)
+    if not (QUARANTINE / ".gitignore").exists():
+        artifacts.write_text(QUARANTINE / ".gitignore", "*\n")
+    names = itertools.chain([name.name], (f"{name.stem}.{k}{name.suffix}" for k in itertools.count(2)))
+    target = next(folder / one for one in names if not (folder / one).exists())
+    shutil.move(path, target)
+    artifacts.write_text(f"{target}.reason.txt", reason + "\n")
+    return reason

@@ -1,4 +1,6 @@
-"""One night: recordings in, `dvc repro`, judge, promote or keep, say so. Exit status 0: all is well; 1: the night failed; 3: drift alarm; 75: another night is at work."""
+"""One night: recordings in, `dvc repro`, judge, promote or keep, say so.
+
+Exit status 0: promoted, kept, or nothing new; 1: the night failed; 3: drift alarm; 4: recordings were set aside; 75: another night is at work."""
 
 import datetime
 import time
@@ -15,7 +17,7 @@ from pipeline.nightly.settings import Nightly
 if TYPE_CHECKING:  # what judges takes seconds to import, and a night with nothing new is done without
     from pipeline.nightly.decision import Decision
 
-OK, FAILED, DRIFTED, BUSY = 0, 1, 3, 75
+OK, FAILED, DRIFTED, QUARANTINED, BUSY = 0, 1, 3, 4, 75
 NIGHTS = STATE / "nights.json"
 METRICS = Path("reports/metrics/nightly.json")
 LONGEST_HISTORY = 1000
@@ -227,7 +229,7 @@ def _metrics(entry: dict[str, Any], state: dict[str, Any]) -> None:
 def _say(settings: Nightly, entry: dict[str, Any], remembered: dict[str, Any], hashes: inputs.Hashes, known: str | None) -> tuple[int, str]:
     """State, page, alarm; the exit status and the summary. On a disk without room the summary still comes."""
     alarms = [alarm["cause"] for alarm in entry.get("drift", {}).get("alarms", [])]
-    status = FAILED if entry["outcome"] == "failed" or entry.get("unpushed") else DRIFTED if alarms else OK
+    status = _status(entry)
     troubles: list[str] = []
     try:
         _remember(settings, entry, remembered, hashes, known)
@@ -238,12 +240,30 @@ def _say(settings: Nightly, entry: dict[str, Any], remembered: dict[str, Any], h
     except OSError as error:
         troubles.append(str(error))
     if status != OK:
-        told = {"night": entry["run"], "when": entry["when"], "drift": entry.get("drift", {}), "log": f".beadline/logs/{entry['run']}.log"}
-        kind = "failed" if status == FAILED else "drift"
-        troubles += watch.wake(
-            kind, entry.get("reasons", []) if status == FAILED else alarms, told, command=settings.alarm, webhook=settings.webhook
-        )
+        told = {
+            "night": entry["run"],
+            "when": entry["when"],
+            "status": status,
+            "drift": entry.get("drift", {}),
+            "quarantined": entry.get("quarantined", {}),
+            "log": f".beadline/logs/{entry['run']}.log",
+        }
+        kind, reasons = {
+            FAILED: ("failed", entry.get("reasons", []) if entry["outcome"] == "failed" else entry["notes"]),
+            DRIFTED: ("drift", alarms),
+            QUARANTINED: ("quarantined", [*entry.get("quarantined", {}).values()]),
+        }[status]
+        troubles += watch.wake(kind, reasons, told, command=settings.alarm, webhook=settings.webhook)
     return status, _summary(entry, alarms, troubles)
+
+
+def _status(entry: dict[str, Any]) -> int:
+    """What a scheduler is told: the gravest of what the night met."""
+    if entry["outcome"] == "failed" or entry.get("unpushed"):
+        return FAILED
+    if entry.get("drift", {}).get("alarms"):
+        return DRIFTED
+    return QUARANTINED if entry.get("quarantined") else OK
 
 
 def _remember(settings: Nightly, entry: dict[str, Any], remembered: dict[str, Any], hashes: inputs.Hashes, known: str | None) -> None:

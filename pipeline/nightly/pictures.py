@@ -1,4 +1,4 @@
-"""The camera's part of a night: pictures of new recordings held against those that the champion was made of; and what of all that has changed is an alarm."""
+"""The cameras' part of a night: pictures of new recordings held against those that the champion was made of; and what of all that has changed is an alarm."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -6,40 +6,125 @@ from typing import Any
 
 import numpy as np
 
-from pipeline import camera_drift, trials
+from pipeline import camera_drift, params, trials
+from pipeline.nightly.inputs import aside
 from pipeline.nightly.settings import Drift
 
 FRAMES = 40  # pictures of a recording that are looked at
 
 
-def seen(path: Path) -> camera_drift.Seen | None:
-    """The camera's figures of FRAMES pictures over a trial; None where it has none that show a bead, which its stage will say."""
-    try:
-        frames = trials.read_trial(path, unreadable_share=1.0).frames
-        every = max(len(frames.time_s) // FRAMES, 1)
-        return camera_drift.figures([picture for k, (_, picture) in enumerate(frames) if k % every == 0 and picture is not None])
-    except ValueError:
-        return None
+# ---- deposition: the camera that rides with the nozzle
 
 
-def look(limits: Drift, loop: str, paths: Sequence[str], kept: Mapping[str, Any], pending: set[str], found: dict[str, Any]) -> None:
-    before = [camera_drift.Seen(np.array(mean), np.array(deviation), frames) for mean, deviation, frames in kept.get("camera", [])]
-    for path in paths:
-        now = seen(Path(path))
-        if now is None or not before:
-            found["notes"].append(
-                f"{path}: {'no picture shows a bead' if before else 'the champion has no pictures of its own'}: the camera was not judged"
-            )
+def of_trials(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[Any]]:
+    """[median, deviation, frames] of each of the last `most` trials below `folder` whose pictures show a bead; `only` those named."""
+    found = []
+    for path in [path for path in sorted(folder.rglob("*.mcap")) if not only or path.as_posix() in only][-most:]:
+        try:
+            seen = _seen(trials.read_trial(path, unreadable_share=1.0))
+        except ValueError:
             continue
-        _, causes = camera_drift.changes(now, before, moved_px=limits.camera_px, contrast_percent=limits.contrast_percent)
-        raised(limits, loop, path, [(cause.key, cause.words, cause.sigmas) for cause in causes], [], pending, found)
+        found.append([seen.mean.tolist(), seen.deviation.tolist(), seen.frames])
+    return found
+
+
+def _seen(trial: trials.Trial) -> camera_drift.Seen:
+    frames = trial.frames
+    every = max(len(frames.time_s) // FRAMES, 1)
+    return camera_drift.figures([picture for k, (_, picture) in enumerate(frames) if k % every == 0 and picture is not None])
+
+
+def trials_of(
+    limits: Drift, loop: str, folder: str, paths: Sequence[str], kept: Mapping[str, Any], pending: set[str], found: dict[str, Any]
+) -> None:
+    """Of new trials: those that cannot be read are set aside, the others' pictures held against the champion's."""
+    before = [camera_drift.Seen(np.array(mean), np.array(deviation), frames) for mean, deviation, frames in kept.get("camera", [])]
+    for path in (path for path in paths if path.lower().endswith(".mcap")):
+        try:
+            trial = trials.read_trial(path, unreadable_share=1.0)
+        except ValueError as error:
+            found["quarantined"][path] = aside(path, loop, str(error))
+            continue
+        if not before:
+            found["notes"].append(f"{path}: the champion has no pictures of its own: the camera was not judged")
+            continue
+        try:
+            _, causes = camera_drift.changes(_seen(trial), before, moved_px=limits.camera_px, contrast_percent=limits.contrast_percent)
+        except ValueError as error:
+            found["notes"].append(f"{path}: {error}")
+            continue
+        raised(limits, loop, path, causes, [], pending, found)
+
+
+# ---- setpoint: the camera that looks at the nozzle
+
+
+def of_prints(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[Any]]:
+    """[print, frames by class and without a line (4,), frames of a segment, median contrast of the line and its deviation] of the last `most` prints below `folder`;
+    `only` those named."""
+    from pipeline import nozzle_frames, seeing
+
+    p = params.load(seeing.TrainClassifier, "train_classifier")
+    if p.source != "recordings":
+        return []
+    how = nozzle_frames.Reading(p.tip_px, p.least_score, p.topics.topics())
+    frames = nozzle_frames.read_folder(folder, how, params.load(params.Execution, "execution"), memo=Path("datasets/memo/train_classifier"))
+    found = []
+    for number, name in [one for one in enumerate(frames.prints) if not only or one[1] in only][-most:]:
+        here = frames.print_number == number
+        good = here & frames.valid & (frames.label >= 0)
+        if good.any():
+            counts = [*np.bincount(frames.label[good], minlength=3).tolist(), int((here & ~frames.valid).sum())]
+            together = float(here.sum() / len(np.unique(frames.segment[here])))
+            seen = camera_drift.line_contrast(frames.score[good], together=together)
+            found.append([name, counts, together, seen.mean.tolist(), seen.deviation.tolist()])
+    return found
+
+
+def nozzle_of(
+    limits: Drift, loop: str, folder: str, paths: Sequence[str], kept: Mapping[str, Any], pending: set[str], found: dict[str, Any]
+) -> None:
+    """Of new prints: files that cannot be read are set aside; classes, frames without a line, and the line's contrast are held against the champion's prints."""
+    from pipeline import nozzle_log, nozzle_recordings, seeing
+
+    p = params.load(seeing.TrainClassifier, "train_classifier")
+    if p.source != "recordings":
+        return
+    for path in paths:
+        try:
+            if path.lower().endswith(".csv"):
+                nozzle_log.read_log(Path(path))
+            elif path.lower().endswith(".mcap"):
+                nozzle_recordings.open_film(Path(path), p.topics.topics())
+        except ValueError as error:
+            found["quarantined"][path] = aside(path, loop, str(error))
+    before = kept.get("camera", [])
+    if not before:
+        return
+    names = {one[0] for one in before}
+    try:
+        new = [one for one in of_prints(Path(folder), 10**6) if one[0] not in names]
+    except ValueError as error:  # what the stage will refuse as well, and say so
+        found["notes"].append(str(error))
+        return
+    known = np.array([one[1] for one in before])
+    for name, counts, together, mean, deviation in new:
+        causes = camera_drift.balance_changes(np.array(counts), known, together=together, points=limits.balance_points)
+        contrasts = [camera_drift.Contrast(np.array(one[3]), np.array(one[4])) for one in before]
+        causes += camera_drift.contrast_changes(
+            camera_drift.Contrast(np.array(mean), np.array(deviation)), contrasts, percent=limits.contrast_percent
+        )
+        raised(limits, loop, name, causes, [], pending, found)
+
+
+# ---- what is an alarm
 
 
 def raised(
     limits: Drift,
     loop: str,
     path: str,
-    causes: Sequence[tuple[str, str, float]],
+    causes: Sequence[camera_drift.Change],
     consequences: Sequence[str],
     pending: set[str],
     found: dict[str, Any],

@@ -1,6 +1,5 @@
 """New recordings before anything learns from them: what cannot be read or is not what it says goes to quarantine; what has changed since the champion was made is drift."""
 
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,9 +8,9 @@ import numpy as np
 
 from pipeline import artifacts, drift, params
 from pipeline.nightly import champion, judge, pictures
+from pipeline.nightly.inputs import aside
 from pipeline.nightly.settings import Drift, Loop, Nightly
 
-QUARANTINE = Path("datasets/quarantine")
 REFERENCE = "reference.json"  # in the champion's folder
 PIECES = 4  # into which a single record of the champion is cut, to stand for nights
 NIGHTS = 12  # of the champion's own recordings that a new one is held against
@@ -22,6 +21,9 @@ SETTLED = (
 )
 
 
+PARTS = 6  # of a record, whose scatter tells how well its closed-loop figures are known
+
+
 class Reference(NamedTuple):
     """What the champion's own recordings said: estimates under its own and the slow observer, one a night, their closed-loop figures, and the model."""
 
@@ -29,7 +31,7 @@ class Reference(NamedTuple):
     asked: list[drift.Cause]
     own: list[drift.Estimate]
     slow: list[drift.Estimate]
-    loop: list[dict[str, list[float]]]
+    loop: list[dict[str, list[list[float]]]]
 
 
 def look(
@@ -40,14 +42,22 @@ def look(
     for name, loop in settings.loops.items():
         if loop.judge == "temperature" and loop.recordings and _recorded():
             _temperature(settings, name, loop.recordings, name in state["champions"], list(new.get(name, {})), memory, found)
-        elif loop.judge == "deposition" and (filmed := [path for path in new.get(name, {}) if path.lower().endswith(".mcap")]):
-            pictures.look(settings.drift, name, filmed, _read(champion.FOLDER / name), set(memory.get("pending", [])), found)
+        elif loop.judge in ("deposition", "setpoint") and new.get(name):
+            cameras = pictures.trials_of if loop.judge == "deposition" else pictures.nozzle_of
+            pending = set(memory.get("pending", []))
+            cameras(settings.drift, name, loop.recordings, list(new[name]), _read(champion.FOLDER / name), pending, found)
     if not any(new.values()):
         found["memory"] = dict(memory)
         # nothing was recorded: what was found last still stands
         found["alarms"] = list(memory.get("alarms", []))
         return found
-    found["memory"] = {"pending": [one["key"] for one in [*found["watched"], *found["alarms"]]], "alarms": found["alarms"], "night": night}
+    # what each loop recorded since its alarm: a person may accept that as how things are
+    since = dict(memory.get("drifted", {}))
+    for name in (name for name, recorded in new.items() if recorded):
+        raised = [one["recording"] for one in found["alarms"] if one["loop"] == name]
+        since[name] = list(dict.fromkeys([*since.get(name, []), *raised])) if raised else []
+    pending = [one["key"] for one in [*found["watched"], *found["alarms"]]]
+    found["memory"] = {"pending": pending, "alarms": found["alarms"], "drifted": since, "night": night}
     return found
 
 
@@ -60,7 +70,7 @@ def _temperature(
     records = judge.record_segments(Path(folder), machine, broken=broken)
     for path, reason in broken.items():
         if f"{folder}/{path}" in new:
-            _aside(f"{folder}/{path}", name, reason, found)
+            found["quarantined"][f"{folder}/{path}"] = aside(f"{folder}/{path}", name, reason)
     good = [path for path in new if path not in found["quarantined"] and records.get(path.removeprefix(f"{folder}/"))]
     if not has_champion or not good:
         return
@@ -75,12 +85,8 @@ def _temperature(
         u, y = max(segments, key=lambda pair: len(pair[0]))
         suspects = drift.mistakes(reference.model, u, y, scale=scale, gross=GROSS, **names)
         if len(suspects) > 1 and suspects[1].left < UNDONE:
-            _aside(
-                path,
-                name,
-                f"{path}: {suspects[1].words}: undone, the record fits the champion's model {1 / suspects[1].left:.0f} times better; mend it and put it back",
-                found,
-            )
+            reason = f"{path}: {suspects[1].words}: undone, the record fits the champion's model {1 / suspects[1].left:.0f} times better; mend it and put it back"
+            found["quarantined"][path] = aside(path, name, reason)
             continue
         try:
             _measure(settings.drift, name, path, segments, reference, machine, set(memory.get("pending", [])), found)
@@ -88,34 +94,23 @@ def _temperature(
             found["notes"].append(f"{path}: {error}")
 
 
-def _aside(path: str, loop: str, reason: str, found: dict[str, Any]) -> None:
-    """The recording moves, unchanged, to datasets/quarantine, where no stage looks and git does not either."""
-    target = QUARANTINE / loop / Path(path).name
-    target.parent.mkdir(parents=True, exist_ok=True)
-    if not (QUARANTINE / ".gitignore").exists():
-        artifacts.write_text(QUARANTINE / ".gitignore", "*\n")
-    shutil.move(path, target)
-    artifacts.write_text(f"{target}.reason.txt", reason + "\n")
-    found["quarantined"][path] = reason
-
-
 # ---- the champion's own recordings
 
 
-def reference(loop: Loop, folder: Path) -> dict[str, Any] | None:
+def reference(loop: Loop, folder: Path, only: Sequence[str] = ()) -> dict[str, Any] | None:
     """What the recordings that a challenger was made of say of its own model, for champion/<loop>/reference.json: a night's figures mean something only beside those of nights
-    that are known to be good. None where the loop has no recordings, or too short ones."""
+    that are known to be good; `only` these recordings, or prints, where any are named. None where the loop has no recordings, or too short ones."""
     if not loop.recordings or not Path(loop.recordings).is_dir():
         return None
-    if loop.judge == "deposition":
-        filmed = [seen for path in sorted(Path(loop.recordings).rglob("*.mcap"))[-NIGHTS:] if (seen := pictures.seen(path))]
-        camera = [[seen.mean.tolist(), seen.deviation.tolist(), seen.frames] for seen in filmed]
-        return {"schema": "reference", "version": 1, "camera": camera} if camera else None
+    if loop.judge in ("deposition", "setpoint"):
+        known = {"deposition": pictures.of_trials, "setpoint": pictures.of_prints}[loop.judge](Path(loop.recordings), NIGHTS, only)
+        return {"schema": "reference", "version": 1, "camera": known} if known else None
     if loop.judge != "temperature" or not _recorded():
         return None
     machine = params.load(params.Plant, "plant")
     records = judge.record_segments(Path(loop.recordings), machine, broken={})
-    nights = [records[path] for path in sorted(records) if records[path]][-NIGHTS:]
+    named = [path.removeprefix(f"{loop.recordings}/") for path in only] or sorted(records)
+    nights = [records[path] for path in named if records.get(path)][-NIGHTS:]
     if len(nights) == 1:
         nights = [
             [(part, other)] for u, y in nights[0] for part, other in zip(np.array_split(u, PIECES), np.array_split(y, PIECES), strict=True)
@@ -150,16 +145,25 @@ def _recorded() -> bool:
     return params.value("generate_probing.source", one_of=("simulated", "recordings")) == "recordings"
 
 
-def _closed_loop(segments: Sequence[tuple[np.ndarray, np.ndarray]], machine: params.Plant) -> dict[str, list[float]]:
-    """Offset of each output from its reference over the last third in °C, root mean square of each input and its share of samples at a limit, both in percent."""
+def _closed_loop(segments: Sequence[tuple[np.ndarray, np.ndarray]], machine: params.Plant) -> dict[str, list[list[float]]]:
+    """Offset of each output from its reference after the first third in °C, root mean square of each input and its share of samples at a limit, both in percent: [figures, their
+    standard deviations], from PARTS of the record, which are longer than what a loop remembers."""
     u, y = (np.concatenate([pair[k] for pair in segments]) for k in (0, 1))
     reference, low, high = np.array([o.reference for o in machine.outputs]), *np.array([(i.low, i.high) for i in machine.inputs]).T
-    late = y[2 * len(y) // 3 :]
+    late, limited = (y - reference)[len(y) // 3 :], 100.0 * ((u <= low + 1e-9) | (u >= high - 1e-9))
+    effort = np.sqrt((u**2).mean(axis=0))
     return {
-        "offset_degC": np.where(np.isfinite(late).any(axis=0), np.nanmean(late, axis=0) - reference, 0.0).tolist(),
-        "effort_percent": np.sqrt((u**2).mean(axis=0)).tolist(),
-        "at_limits_percent": (100.0 * ((u <= low + 1e-9) | (u >= high - 1e-9)).mean(axis=0)).tolist(),
+        "offset_degC": _mean(late),
+        "effort_percent": [effort.tolist(), (np.array(_mean(u**2)[1]) / np.maximum(2 * effort, 1e-9)).tolist()],
+        "at_limits_percent": _mean(limited),
     }
+
+
+def _mean(values: np.ndarray) -> list[list[float]]:
+    """Mean (k,) of values (T, k) that are there, and its standard deviation from the means of PARTS."""
+    parts = np.ma.masked_invalid(values)
+    means = np.ma.stack([part.mean(axis=0) for part in np.array_split(parts, PARTS)])
+    return [parts.mean(axis=0).filled(0.0).tolist(), (means.std(axis=0, ddof=1) / np.sqrt(PARTS)).filled(0.0).tolist()]
 
 
 # ---- the new one against them
@@ -275,23 +279,25 @@ def _plant(
 
 def _loop(
     limits: Drift,
-    now: Mapping[str, list[float]],
-    before: Sequence[Mapping[str, list[float]]],
+    now: Mapping[str, list[list[float]]],
+    before: Sequence[Mapping[str, list[list[float]]]],
     inputs: Sequence[str],
     outputs: Sequence[str],
 ) -> tuple[dict, list]:
     """Offset, effort and share at limits against the champion's own nights; not asked where those nights were not settled at the references."""
-    known = {key: np.array([night[key] for night in before]) for key in now}
-    if np.abs(known["offset_degC"].mean(axis=0)).max() > SETTLED * limits.offset_degC:
+    known = {key: np.array([night[key] for night in before]) for key in now}  # (nights, 2, signals): figures and their deviations
+    offset, unsure = known["offset_degC"][:, 0].mean(axis=0), np.sqrt((known["offset_degC"][:, 1] ** 2).mean(axis=0) / len(before))
+    if (np.abs(offset) > SETTLED * limits.offset_degC + 2 * unsure).any():
         return {"not_applicable": "the champion's own recordings are not of a loop settled at the references"}, []
     figures, causes = {}, []
     words = {"offset_degC": ("settles", "°C from where it did", limits.offset_degC, outputs), "effort_percent": ("needs", "points of effort more than it did", limits.effort_percent, inputs),
              "at_limits_percent": ("is at a limit", "points more of the time than it was", limits.at_limits_points, inputs)}  # fmt: skip
     for key, (verb, rest, least, names) in words.items():
-        moved = np.array(now[key]) - known[key].mean(axis=0)
-        scatter = np.maximum(known[key].std(axis=0, ddof=1), least / 6) * np.sqrt(1 + 1 / len(before))
-        for k, name in enumerate(names):
-            figures[f"{name} {key}"] = {"moved": float(moved[k]), "sigmas": float(moved[k] / scatter[k])}
-            if abs(moved[k]) >= least:
-                causes.append((f"{key} of {name}", f"closed loop: {name} {verb} {moved[k]:+.2g} {rest}", float(moved[k] / scatter[k])))
+        # a figure counts as known to a sixth of what matters at best, so that nights that agree by chance make no alarm of a trifle
+        value, deviation = np.array(now[key][0]), np.maximum(now[key][1], least / 6)
+        moved = drift.shift(value, deviation, known[key][:, 0], np.maximum(known[key][:, 1], least / 6))
+        for name, by, sigmas in zip(names, moved.value - moved.reference, moved.sigmas, strict=True):
+            figures[f"{name} {key}"] = {"moved": float(by), "sigmas": float(sigmas)}
+            if abs(by) >= least:
+                causes.append((f"{key} of {name}", f"closed loop: {name} {verb} {by:+.2g} {rest}", float(sigmas)))
     return figures, causes

@@ -65,6 +65,7 @@ class Drift(Section):
     at_limits_points: float = Field(gt=0, le=100)
     camera_px: float = Field(gt=0, le=1000)
     contrast_percent: float = Field(gt=0, le=1000)
+    balance_points: float = Field(gt=0, le=100)
 
 
 class Nightly(Section):

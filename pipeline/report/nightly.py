@@ -16,7 +16,15 @@ REACH = 20.0  # percent: half the width of the picture of the plant's parameters
 GUARDS = {
     "worst_case": "worst plant's cost", "settled_error_degC": "worst settled error, °C",
     "margin_short_of_least": "disk margin, short of the least", "holdout_error_degC": "one-step error on hold-out recordings, °C", "unstable_plants": "plants on which it is unstable",
+    "worst_line_volume_percent": "worst line's volume, % off", "worst_unsettled_percent": "runs not settled in the worst case, %, plus one",
+    "slowest_p90_steps": "decisions until settled, slowest case",
 }  # fmt: skip
+
+LOOP = {
+    "offset_degC": "offset from its reference, °C",
+    "effort_percent": "effort, points",
+    "at_limits_percent": "share of time at a limit, points",
+}
 
 
 def render(nights: Sequence[Mapping[str, Any]], state: Mapping[str, Any], settings: Nightly) -> str:
@@ -47,9 +55,8 @@ def _head(night: Mapping[str, Any]) -> tuple[str, str]:
         return "The machine has drifted; the champions stay.", FAILED
     if night["outcome"] == "quarantined":
         return "Bad recordings are set aside; the champions stay.", FAILED
-    if night.get("promoted"):
-        return f"Promoted: {', '.join(night['promoted'])}.", PASSED
-    return "The champions stay.", PASSED
+    head = f"Promoted: {', '.join(night['promoted'])}." if night.get("promoted") else "The champions stay."
+    return (f"{head} Bad recordings are set aside.", FAILED) if night.get("quarantined") else (head, PASSED)
 
 
 def _verdict(night: Mapping[str, Any], state: Mapping[str, Any]) -> dict[str, Any]:
@@ -58,13 +65,16 @@ def _verdict(night: Mapping[str, Any], state: Mapping[str, Any]) -> dict[str, An
     reasons = (
         [alarm["cause"] for alarm in alarms]
         if alarms and night["outcome"] != "failed"
-        else [*night.get("reasons", []), *night.get("quarantined", {}).values()]
+        else [*_together(night), *night.get("quarantined", {}).values()]
     )
     remedy = {
         "failed": f"Nothing of what is in production has changed. The log is .beadline/logs/{night['run']}.log; mend the cause, and the next night works.",
-        "quarantined": "They lie in datasets/quarantine, unchanged, each with its reason beside it; mend them and put them back.",
         "promoted": "To go back: ./run beadline rollback.",
     }.get(night["outcome"], "")
+    if night.get("quarantined"):
+        remedy = (
+            f"{remedy} They lie in datasets/quarantine, unchanged, each with its reason beside it; mend them and put them back.".strip()
+        )
     if alarms and night["outcome"] != "failed":
         remedy = "No challenger is promoted while this lasts. Look at the machine; where the change is meant to stay, record it anew for datasets/holdout, and the next night judges both on it."
     return {
@@ -74,6 +84,14 @@ def _verdict(night: Mapping[str, Any], state: Mapping[str, Any]) -> dict[str, An
         "reason": "; ".join(reasons),
         "remedy": remedy,
     }
+
+
+def _together(night: Mapping[str, Any]) -> list[str]:
+    """The night's reasons, those that several loops share said once."""
+    loops: dict[str, list[str]] = {}
+    for name, decision in night.get("decisions", {}).items():
+        loops.setdefault("; ".join(decision["reasons"]), []).append(name)
+    return [f"{', '.join(names)}: {reason}" for reason, names in loops.items()] or list(night.get("reasons", []))
 
 
 def _champions(state: Mapping[str, Any]) -> list[dict[str, str]]:
@@ -104,6 +122,7 @@ def _decisions(night: Mapping[str, Any]) -> list[dict[str, Any]]:
                 "reasons": decision["reasons"],
                 "paired": _paired(decision.get("paired")),
                 "guards": guards,
+                "compared": any(guard["champion"] for guard in guards),
             }
         )
     return found
@@ -149,7 +168,13 @@ def _drift(night: Mapping[str, Any], settings: Nightly) -> dict[str, Any]:
     told = loop.get("not_applicable") or ""
     worst = sorted(((abs(one["sigmas"]), name, one) for name, one in loop.items() if isinstance(one, dict)), reverse=True)[:6]
     return {"recording": path, "run": night["run"], "rows": rows, "innovation": innovation, "limit": f"{limit:g}", "loop_told": told,
-            "loop": [{"name": name, "moved": number(one["moved"], 2), "sigmas": number(one["sigmas"], 1)} for _, name, one in worst]}  # fmt: skip
+            "loop": [{"name": _words(name), "moved": number(one["moved"], 2), "sigmas": number(one["sigmas"], 1)} for _, name, one in worst]}  # fmt: skip
+
+
+def _words(name: str) -> str:
+    """`heater_1 effort_percent` as a person says it."""
+    signal, _, key = name.rpartition(" ")
+    return f"{signal}: {LOOP.get(key, key)}"
 
 
 def _interval(name: str, value: float, half: float, limit: float) -> Markup:
@@ -176,6 +201,11 @@ def _interval(name: str, value: float, half: float, limit: float) -> Markup:
     )
 
 
+def _nights_axis(x: Sequence[int]) -> charts.Axis:
+    every = max(1, math.ceil((x[-1] - x[0]) / 8))
+    return charts.Axis(x[0], x[-1], tuple((float(k), str(k)) for k in range(x[0], x[-1] + 1, every)))
+
+
 def _pictures(nights: Sequence[Mapping[str, Any]], settings: Nightly) -> list[dict[str, Any]]:
     """The largest change of the plant's parameters, night by night, in sigmas, beside the alarm."""
     x, y = [], []
@@ -187,7 +217,7 @@ def _pictures(nights: Sequence[Mapping[str, Any]], settings: Nightly) -> list[di
     if len(x) < 2:
         return []
     top = max(*y, settings.drift.alarm_sigmas) * 1.15
-    frame = charts.Frame(charts.linear(x[0], x[-1], ticks=6), charts.linear(0, top), 760, 150, 36, 18, 20, 12)
+    frame = charts.Frame(_nights_axis(x), charts.linear(0, top), 760, 150, 36, 18, 20, 12)
     layers = [
         charts.tint(frame, 0, settings.drift.alarm_sigmas),
         charts.line(frame, x, y),
@@ -208,10 +238,16 @@ def _pictures(nights: Sequence[Mapping[str, Any]], settings: Nightly) -> list[di
 
 def _row(night: Mapping[str, Any]) -> dict[str, Any]:
     alarms = [alarm["cause"] for alarm in night.get("drift", {}).get("alarms", [])]
-    state = FAILED if night["outcome"] in ("failed", "quarantined") or alarms else OPEN if night["outcome"] == "nothing new" else PASSED
+    state = (
+        FAILED
+        if night["outcome"] == "failed" or night.get("quarantined") or alarms
+        else OPEN
+        if night["outcome"] == "nothing new"
+        else PASSED
+    )
     return {
         "run": night["run"], "when": _when(night["when"]), "state": state, "outcome": night["outcome"], "new": sum(map(len, night.get("new_recordings", {}).values())),
-        "reasons": "; ".join([*alarms, *night.get("reasons", []), *night.get("quarantined", {}).values()]), "seconds": number(night.get("seconds", 0), 0),
+        "reasons": "; ".join([*alarms, *_together(night), *night.get("quarantined", {}).values()]), "seconds": number(night.get("seconds", 0), 0),
     }  # fmt: skip
 
 
