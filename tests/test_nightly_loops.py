@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pipeline import artifacts, schemas, setpoint_schemas
-from pipeline.nightly import champion, inputs, night, watch
+from pipeline.nightly import accepting, champion, inputs, night, screening, watch
 from tests.toy_nights import Project
 
 LOOPS = {
@@ -111,3 +111,22 @@ def test_the_gravest_of_a_night_is_its_exit_status():
         for more in ({}, aside, aside | alarm, aside | alarm | {"outcome": "failed"}, {"unpushed": True})
     ]
     assert found == [0, 4, 3, 1, 1]
+
+
+def test_drift_that_is_meant_is_accepted_by_hand_and_the_champion_stays(project, monkeypatch):
+    project.set(loops={"deposition": {"judge": "deposition", "cases": "", "recordings": "", "artifacts": LOOPS["deposition"]}})
+    monkeypatch.setattr(night, "_reproduce", lambda *_: deposition(10.0, 2.0))
+    assert night.nightly()[0] == night.OK
+    with pytest.raises(ValueError, match="expected a loop with a champion and a drift alarm, found none; loops with an alarm: none"):
+        accepting.accept("deposition", "a new camera")
+    before = project.production_of("deposition")
+    memory = {"alarms": [{"loop": "deposition"}], "pending": ["deposition: camera"], "drifted": {"deposition": ["trial_8.mcap"]}}
+    artifacts.write_json(watch.LAST, watch.last() | {"drift": memory})
+    monkeypatch.setattr(screening, "reference", lambda loop, folder, only: {"schema": "reference", "version": 1, "camera": list(only)})
+    assert "is held against trial_8.mcap from now on" in accepting.accept("deposition", "a new camera")
+    after = project.production_of("deposition")
+    assert artifacts.read_json("champion/deposition/reference.json")["camera"] == ["trial_8.mcap"]
+    assert {name: after[name] for name in before} == before and watch.last()["drift"]["drifted"] == {"deposition": []}
+    line = champion.read()["history"][-1]
+    assert (line["event"], line["why"], line["run"]) == ("drift accepted", "a new camera", "night-0001")
+    assert not any(entry.endswith(("champion.json", ".dvc")) for entry in project.dirty())

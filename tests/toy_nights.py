@@ -140,7 +140,10 @@ class Project:
         return json.loads(found.stdout)["champions"]["toy"] if found.returncode == 0 else {}
 
     def production(self) -> dict[str, bytes]:
-        folder = self.folder / "champion/toy"
+        return self.production_of("toy")
+
+    def production_of(self, loop: str) -> dict[str, bytes]:
+        folder = self.folder / "champion" / loop
         return {path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
     def dirty(self) -> list[str]:
