@@ -138,8 +138,9 @@ if __name__ == "__main__":
     seeds, runs, python = [*sys.argv[1:], *["5", "100", None][len(sys.argv) - 1 :]]
     p = params.load(teaching.TrainAgent, "train_agent")
     found: dict[str, Any] = {"speed": speeds(p.paper)}
+    print(json.dumps(found, indent=2), flush=True)
     found["peer"] = peer(python, found["speed"])
-    print(json.dumps(found, indent=2))
+    print(json.dumps(found["peer"], indent=2), flush=True)
     RESULTS.write_text(json.dumps(found, indent=2, ensure_ascii=False) + "\n")
     for seed in range(int(seeds)):
         found[f"seed {seed}"] = one_seed(p.model_copy(update={"seed": seed}), int(runs), 10.0)
