@@ -66,11 +66,14 @@ def trajectories(inputs: Sequence[_Signal], outputs: Sequence[_Signal]) -> Schem
         Column("time_s", FLOAT, "s", "time since the controller took over"),
         Column("cost", FLOAT, NONE, "discounted cost so far, at the yardstick's weights", nullable=True),
     ]
+    for name, share in (("low", "5th"), ("median", "50th"), ("high", "95th")):
+        meaning = f"worst zone's distance from its reference, {share} percentile of all runs on the nominal plant"
+        columns.append(Column(f"error_{name}_degC", FLOAT, "degC", meaning, low=0, nullable=True))
     columns += [Column(signal.name, FLOAT, signal.unit, f"true output {signal.name}", nullable=True) for signal in outputs]
     for signal in inputs:
         columns.append(Column(f"{signal.name}_command", FLOAT, signal.unit, f"{signal.name} as the controller asked", nullable=True))
         columns.append(Column(f"{signal.name}_applied", FLOAT, signal.unit, f"{signal.name} as it was given", nullable=True))
-    return Schema("trajectories", 1, tuple(columns))
+    return Schema("trajectories", 2, tuple(columns))
 
 
 SCORECARD = Schema(
@@ -111,12 +114,15 @@ STUDY = Schema(
 
 TUNING = Schema(
     "tuning",
-    1,
+    2,
     (
         Column("mode", TEXT, NONE, "parity: the paper's (37); practical: the declared engineering cost"),
         Column("evaluation", COUNT, NONE, "counted from 1", low=1),
         Column("cost", FLOAT, NONE, "cost of this candidate; missing where it failed", nullable=True),
         Column("incumbent", FLOAT, NONE, "lowest cost so far; missing before the first success", nullable=True),
+        Column("tracking_degC", FLOAT, "degC", "r.m.s. tracking error of this candidate; missing where it failed", nullable=True),
+        Column("effort_percent", FLOAT, "percent", "r.m.s. effort of this candidate; missing where it failed", nullable=True),
+        Column("chosen", BOOL, NONE, "whether the search recommends this candidate"),
         Column("failure", TEXT, NONE, "why the candidate failed; empty where it did not"),
     ),
 )

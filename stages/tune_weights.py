@@ -10,7 +10,7 @@ from pydantic import Field
 from tqdm import tqdm
 
 from pipeline import artifacts, params, schemas
-from pipeline.temperature import judging, plant, scorecard, study, tuning
+from pipeline.temperature import engineering, judging, plant, scorecard, study, tuning
 
 
 class TuneWeights(params.Section):
@@ -58,8 +58,17 @@ def main() -> None:
             "integral": tracking.integral,
             "integral_limit": tracking.integral_limit_degC,
         }
-        practical_cost = judging.engineering_objective(model, scenarios, allowance=allowance, least_disk_margin=p.least_disk_margin, **settings)
-        parity = _search("parity", study.tuning_objective, p, p.initial, p.evaluations, [p.q_low] * 5 + [p.r_low] * 7, [p.q_high] * 5 + [p.r_high] * 7)
+        run, traded = engineering.deployed(model, scenarios, least_disk_margin=p.least_disk_margin, **settings), {}
+
+        def practical_cost(theta: np.ndarray) -> float:
+            found = run(theta)
+            cost = scorecard.engineering_cost(found, scenarios.plant, allowance, longest_s=scenarios.steps * model.sample_time_s)
+            traded[theta.tobytes()] = engineering.trade(found)
+            return cost
+
+        parity = _search(
+            "parity", study.tuning_objective, p, p.initial, p.evaluations, [p.q_low] * 5 + [p.r_low] * 7, [p.q_high] * 5 + [p.r_high] * 7
+        )
         practical = _search(
             "practical",
             practical_cost,
@@ -76,12 +85,22 @@ def main() -> None:
             out / "weights.json",
             {"practical": {"q": q, "r": r, "observer_tau": float(tau[0])}, "parity": {"q": parity.theta[:5], "r": parity.theta[5:]}},
         )
-        artifacts.write_table(out / "history.parquet", schemas.TUNING, judging.histories({"parity": parity, "practical": practical}))
+        searches = {"parity": parity, "practical": practical}
+        trades = {
+            "parity": [None if failed else engineering.Trade(*study.tuning_parts(theta)) for theta, failed in zip(parity.history.theta, parity.history.failed, strict=True)],
+            "practical": [traded.get(theta.tobytes()) for theta in practical.history.theta],
+        }  # fmt: skip
+        artifacts.write_table(out / "history.parquet", schemas.TUNING, engineering.histories(searches, trades))
+        default_cost = engineering.found_or_none(practical_cost, default)
         metrics = {
-            "parity": {"best_cost_perfect_state": parity.cost, "optimum": study.tuning_objective(np.ones(12)), "scaled_weights": study.scaled_weights()},
+            "parity": {
+                "best_cost_perfect_state": parity.cost, "optimum": study.tuning_objective(np.ones(12)), "scaled_weights": study.scaled_weights(),
+                "trade": {"optimum": engineering.Trade(*study.tuning_parts(np.ones(12)))},
+            },
             "practical": {
-                "cost": practical.cost, "cost_default": judging.cost_or_none(practical_cost, default), "regret_identity": judging.yardstick_regret(tuned, scenarios, yardstick, q, r),
+                "cost": practical.cost, "cost_default": default_cost, "regret_identity": engineering.yardstick_regret(tuned, scenarios, yardstick, q, r),
                 "failed": int(np.isnan(practical.history.cost).sum()), "q": q, "r": r, "observer_tau": float(tau[0]),
+                "trade": {"default": traded.get(default.tobytes()), "optimum": engineering.optimum_trade(scenarios, yardstick, limits=limits, band=declared.band_degC)},
             },
         }  # fmt: skip
         artifacts.write_metrics("tune_weights", metrics)

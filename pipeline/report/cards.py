@@ -288,7 +288,7 @@ def _learning_spark(curve: np.ndarray | Missing, css: str, limit: float, *, name
         alt=alt,
         named=named,
         bad=bad,
-        limit_label=f"limit {limit:g}",
+        limit_label=f"learned to {limit:g}",
         units=("trials", "%"),
     )
 

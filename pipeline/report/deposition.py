@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.report import charts, deposition_change, deposition_learning, deposition_parts, page, words
+from pipeline.report import charts, deposition_change, deposition_learning, deposition_parts, headline, page, words
 from pipeline.report.deposition_rules import HEADS, LIBRARY, MARK, NAMES, OURS, PAPER, Structure, gamma, structures
 from pipeline.report.deposition_verdict import verdict
 from pipeline.report.difference import Move
@@ -56,6 +56,7 @@ def render(sources: Sources) -> str:
         title=f"Deposition: {judged.decision.rstrip('.')}",
         verdict=judged,
         heads_of_rules=HEADS,
+        claim=headline.claim(sources, ("deposition",)),
         verdict_mark=MARK.get(judged.composer, "data_driven"),
         beforehand=_beforehand(sources),
         real=judged.real,

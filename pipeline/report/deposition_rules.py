@@ -11,6 +11,8 @@ from pipeline.report.verdict import FAILED, OPEN, PASSED, Missing, ReportRules
 # errors closer than this, in points of on-off control's, are one: the simpler composer is taken
 SAME = 0.5
 OURS, LIBRARY = "basis", "priority"
+# a rule that cannot be judged before somebody declares what it asks about
+UNJUDGED = "not applicable"
 # simplest first
 COMPOSERS = ("on_off", "priority", "superposition", "basis")
 NAMES = {
@@ -250,7 +252,7 @@ def _limit(sources: Sources) -> Rule:
         return Rule("Command limit", "0", "saturation", (OPEN, OPEN), (OPEN, OPEN), "No part was composed.", "")
     share, part, name, one = max(shares, key=lambda s: (not s[3]["enough"], s[0]))
     limited = any(s[3].get("limit") is not None for s in shares)
-    text = percent(share, 2) if not one["enough"] else f"0{THIN}%" if limited else "none set"
+    text = percent(share, 2) if not one["enough"] else f"0{THIN}%" if limited else "no limit set"
     ramp = lookup(found, f"{part}.ramp_that_would_do_s.{name}") if "." not in part else Missing("not measured", "")
     remedy = (
         "Print slower, or raise printer.limit_mm: no ramp would do."
@@ -258,7 +260,7 @@ def _limit(sources: Sources) -> Rule:
         else f"Ramps of {ramp:.2f}{THIN}s would do (printer.ramp_s)."
     )
     reason = f"The command for {part}, material {name}, is at its limit {percent(share, 2)} of the printing time, and no signal can make up for it."
-    state = PASSED if one["enough"] else FAILED
+    state = FAILED if not one["enough"] else PASSED if limited else UNJUDGED
     return Rule("Time at the command’s limit", f"0{THIN}%", "saturation", (state, state), (text, text), reason, remedy)
 
 

@@ -7,6 +7,7 @@ from pipeline.report.deposition_rules import (
     COMPOSERS,
     OURS,
     SAME,
+    UNJUDGED,
     USE,
     Rule,
     Structure,
@@ -58,15 +59,15 @@ def verdict(sources: Sources) -> Verdict:
     use, tested = winner(found), rules(sources, found)
     # ours' column for the basis functions, the paper's for the library; the paper's law is not what the library was learned by
     column = 0 if use == OURS else 1
-    needed = [rule for rule in tested if rule.name != "Convergence test"]
-    if use != OURS:
-        needed = [rule for rule in needed if rule.name != "Learned to"]
+    needed = [rule for rule in tested if use == OURS or rule.name not in ("Convergence test", "Learned to")]
+    unjudged = [rule for rule in needed if rule.states[column] == UNJUDGED]
+    needed = [rule for rule in needed if rule not in unjudged]
     states = [rule.states[column] for rule in needed]
     state = FAILED if FAILED in states or use == "on_off" else OPEN if OPEN in states and not machine else PASSED
     first = next((rule for wanted in (FAILED, OPEN) for rule in needed if rule.states[column] == wanted), None) if state != PASSED else None
     if state == PASSED:
         decision = f"{'By forecast, t' if machine else 'T'}his machine prints these parts: use {USE[use]}."
-        lead = f"All {count(len(needed), 'rule')} passed."
+        lead = f"All {count(len(needed), 'rule')} {'that can be judged ' if unjudged else ''}passed."
     else:
         decision = f"{'Do not print these parts yet' if state == FAILED else 'Do not decide yet'}: {USE[use]} {'comes' if use == 'on_off' or use != OURS else 'come'} closest."
         lead = (
@@ -81,12 +82,24 @@ def verdict(sources: Sources) -> Verdict:
         decision,
         lead,
         reason,
-        first.remedy if first else "",
+        " ".join(filter(None, [first.remedy if first else "", _unlimited(sources) if unjudged else ""])),
         _price(sources, found),
         tested,
         first.name if first else "",
         machine,
     )
+
+
+def _unlimited(sources: Sources) -> str:
+    """Before the command's limit is declared, how far the command goes is a condition of the verdict."""
+    metrics = sources.metrics["train_ilc"]
+    peaks = (
+        []
+        if isinstance(metrics, Missing)
+        else [one[law]["peak_over_steady"] for one in metrics.values() for law in ("ours", "pixels") if law in one]
+    )
+    peak = f": the command peaks at {number(max(peaks), 0)} times the steady one" if peaks else ""
+    return f"Not judged: time at the command’s limit. Declare the drive’s limit (printer.limit_mm){peak}."
 
 
 def told(found: Sequence[Structure], use: str, machine: bool) -> str:

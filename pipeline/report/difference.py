@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from pipeline.report.answers import all_answers
 from pipeline.report.digits import MINUS, THIN, count, decimals, number, short
-from pipeline.report.sources import Sources, digest
+from pipeline.report.sources import NIGHTLY, Sources, digest
 from pipeline.report.verdict import Figure, Missing, Question
 
 
@@ -61,11 +61,15 @@ def difference(sources: Sources) -> Difference | None:
     if before is None or isinstance(before, Missing):
         return None
     hashes = before.get("hashes") or {}
-    now = {path: source.sha256 for path, source in sources.read.items() if path.startswith(("datasets/", "reports/metrics/"))}
+    now = {
+        path: source.sha256
+        for path, source in sources.read.items()
+        if path.startswith(("datasets/", "reports/metrics/")) and path != NIGHTLY
+    }
     known = {
         path: value
         for path, value in hashes.items()
-        if path.startswith(("datasets/", "reports/metrics/")) and path.rsplit("/", 1)[-1] != "report.json"
+        if path.startswith(("datasets/", "reports/metrics/")) and path.rsplit("/", 1)[-1] not in ("report.json", "nightly.json")
     }
     recorded = {path.split("/", 1)[0] for path in known}
     now = {path: value for path, value in now.items() if path.split("/", 1)[0] in recorded}
@@ -109,7 +113,7 @@ def _parameters(before: Mapping, now: Mapping) -> Iterator[tuple[str, str, str]]
 
 
 def _shown(values: Mapping[str, Any], name: str) -> str:
-    return "none" if name not in values else "null" if values[name] is None else str(values[name])
+    return "none" if name not in values else "null" if values[name] is None else str(values[name]) or "empty"
 
 
 def _flat(prefix: str, data: Any) -> Iterator[tuple[str, Any]]:

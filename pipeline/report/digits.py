@@ -30,6 +30,11 @@ def number(value: float, places: int) -> str:
     return MINUS + text if value < 0 and float(text.replace(",", "")) != 0 else text
 
 
+def declared(value: float) -> int:
+    """Decimals of a number that somebody wrote down, such as a limit: as many as it has, at most nine."""
+    return next((places for places in range(9) if round(value, places) == value), 9)
+
+
 def quantity(value: float, unit: str, places: int, *, beyond: str = "never") -> str:
     """The number with its unit after a thin space; `beyond` in place of infinity."""
     if math.isinf(value):

@@ -1,6 +1,5 @@
 """Page one: the verdict, the twelve answers, a card a loop, the difference, words, provenance."""
 
-import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,16 +8,16 @@ from pipeline.report import (
     charts,
     deposition_change,
     deposition_rules,
-    deposition_verdict,
+    headline,
     page,
     setpoint_card,
-    setpoint_verdict,
+    setpoint_change,
     words,
     workflow,
 )
 from pipeline.report.answers import repetitions
-from pipeline.report.difference import Move
-from pipeline.report.digits import band, count, quantity
+from pipeline.report.difference import Difference, Move
+from pipeline.report.digits import band, count, decimals, declared, quantity
 from pipeline.report.judgement import NAMES, Judgement
 from pipeline.report.sources import Sources, digest
 from pipeline.report.verdict import (
@@ -28,10 +27,11 @@ from pipeline.report.verdict import (
     OPEN,
     PASSED,
     ROLES,
+    UNDECIDED,
     Figure,
     Missing,
     Question,
-    Verdict,
+    drift_state,
     outcomes,
     row_places,
     state,
@@ -40,15 +40,24 @@ from pipeline.report.verdict import (
 
 def render(sources: Sources, judged: Judgement) -> str:
     """The text of index.html."""
-    headline = _headline(sources, judged)
+    loops = headline.loops(sources, judged)
     return page.render(
         "index.html",
-        title=headline["title"],
-        verdict=headline,
+        title=headline.decision(loops).rstrip("."),
+        decision=headline.decision(loops),
+        state=headline.state(loops),
+        loops=[
+            loop._asdict() | {"reason": words.explained(sources, loop.reason), "remedy": words.explained(sources, loop.remedy)}
+            for loop in loops
+        ],
+        claim=f"{headline.claim(sources)} {_drifts(judged)}",
+        rules=verdict_parts(judged)["rules"],
         answers=_rows(judged),
         repetitions=repetitions(sources),
         seeds=len(sources.declared.panel.judging.seeds),
-        change=_change_sentence(judged, sources.accepted, _deposition_moves(sources)),
+        change=_change_sentence(judged, sources.accepted, _deposition_moves(sources), setpoint_change.said(sources)),
+        drift=judged.drifted,
+        drift_state=drift_state(judged.roles["data_driven"]),
         hashes=hashes(sources),
         cards=[cards.temperature(sources, judged), cards.deposition(sources), setpoint_card.setpoint(sources)],
         difference=difference_parts(sources, judged),
@@ -62,53 +71,14 @@ def render(sources: Sources, judged: Judgement) -> str:
     )
 
 
-def _title(verdict: Verdict) -> str:
-    return verdict.decision.rstrip(".") + (
-        f": first {'failed' if verdict.state == FAILED else 'open'} rule {verdict.rule}" if verdict.rule else ""
-    )
+def _drifts(judged: Judgement) -> str:
+    """Drift of the three loops in a sentence; only the temperature loop's is measured, by the nightly job."""
+    if drift_state(judged.roles["data_driven"]) in (OPEN, UNDECIDED):
+        return "Drift is not measured in any loop."
+    return f"Drift: temperature {judged.drifted.word[:1].lower()}{judged.drifted.word[1:].rstrip('.')}, not measured in the others."
 
 
 # ---- the verdict
-
-WORSE = {"passed": 0, "open": 1, "failed": 2}
-
-
-def _headline(sources: Sources, judged: Judgement) -> dict[str, Any]:
-    """The verdict of the worst loop that was measured, the first of them in case of a tie, and beside it what the others say."""
-    mine, parts, seen = verdict_parts(judged), deposition_verdict.verdict(sources), setpoint_verdict.verdict(sources)
-    loops = [
-        mine | {"title": _title(judged.verdict)},
-        _other(parts, deposition_rules.HEADS, mine["changed"]),
-        _other(seen, setpoint_verdict.HEADS, mine["changed"]),
-    ]
-    measured = [0, *([1] if parts.composer else []), *([2] if seen.default else [])]
-    worst = max(measured, key=lambda i: (WORSE[loops[i]["state"]], -i))
-    told = [
-        {"name": name, "link": f"{name.lower()}.html", "told": loop["decision"], "glyph": loop["state"]}
-        for name, loop in zip(("Temperature", "Deposition", "Setpoint"), loops, strict=True)
-    ]
-    return loops[worst] | {"others": [one for i, one in enumerate(told) if i != worst]}
-
-
-def _other(found: deposition_verdict.Verdict | setpoint_verdict.Verdict, heads: tuple[str, str, str], changed: str) -> dict[str, Any]:
-    """The verdict of another loop in the temperature loop's place, as short: what else it has to say stands on its own page."""
-    rules = [{"rule": rule.name, "answers": "", "states": list(rule.states), "first": rule.name == found.first} for rule in found.rules]
-    return {
-        "title": f"{found.decision.rstrip('.')}: {found.lead[:1].lower()}{found.lead[1:].rstrip('.')}",
-        "state": found.state if found.state in WORSE else "open",
-        "decision": found.decision,
-        "lead": found.lead,
-        "reason": _sentence(found.reason),
-        "remedy": _sentence(found.remedy),
-        "rules": rules,
-        "heads": heads,
-        "changed": changed,
-    }
-
-
-def _sentence(text: str) -> str:
-    """The first sentence."""
-    return re.split(r"(?<=[.!?]) (?=[A-Z])", text, maxsplit=1)[0]
 
 
 def verdict_parts(judged: Judgement) -> dict[str, Any]:
@@ -131,6 +101,7 @@ def verdict_parts(judged: Judgement) -> dict[str, Any]:
         "reason": judged.verdict.reason,
         "remedy": judged.verdict.remedy,
         "rules": table,
+        "claim": "",
         "changed": f"{count(len(changed), 'parameter').capitalize()} changed since the accepted run" if changed else "",
     }
 
@@ -153,7 +124,8 @@ def _row(question: Question, judged: Judgement) -> dict[str, Any]:
         "word": words.explaining(question.key),
         "sub": _sub(question, pair),
         "cells": [_cell(question, role, figure, places) for role, figure in pair],
-        "limit": f"{'≥' if question.at_least else '≤'} {quantity(question.limit, question.unit, places)}",
+        # as it was declared: "10.000 %" reads as ten thousand where a point parts thousands
+        "limit": f"{'≥' if question.at_least else '≤'} {quantity(question.limit, question.unit, declared(question.limit))}",
         "state": state(question, pair[0][1]),
         "strip": charts.strip(question, [(ROLES[role], page.MARKS[role], figure) for role, figure in pair]),
         "change": move.text() if move else "first run",
@@ -178,32 +150,55 @@ def _cell(question: Question, role: str, figure: Figure | Missing, places: int) 
     if isinstance(figure, Figure):
         cell["value"] = quantity(figure.value, question.unit, places, beyond=question.beyond)
         cell["band"] = (
-            figure.note.split(" samples")[0]
+            figure.note.split(" samples")[0].replace(" of ", " / ")
             if question.key == "data"
-            else band(figure.low, figure.high, places, beyond=question.beyond) or "all runs"
+            else band(figure.low, figure.high, places, beyond=question.beyond) or _finer(figure, question)
         )
     return cell
 
 
-def _change_sentence(judged: Judgement, accepted: dict | Missing | None, parts: Sequence[Move]) -> dict[str, str]:
-    """Answer 3."""
+def _finer(figure: Figure, question: Question) -> str:
+    """A band that the row's decimals do not show, with those that do; runs that are all alike are said to be."""
+    return band(figure.low, figure.high, decimals(figure.low, figure.high, value=figure.value), beyond=question.beyond) or "all alike"
+
+
+def _change_sentence(judged: Judgement, accepted: dict | Missing | None, parts: Sequence[Move], seen: tuple[int, int]) -> dict[str, str]:
+    """Answer 3: the figures of the temperature loop that moved, and how many of the other loops'."""
     if isinstance(accepted, Missing):
         return {"strong": "The accepted run cannot be read.", "text": accepted.sentence()}
     if judged.changed is None:
         return {"strong": "First run: nothing to compare with.", "text": "./run beadline accept marks this one as good."}
     found = [move for move in judged.moved["data_driven"] if move.moved]
+    others = sum(move.moved for move in parts), seen[0]
+    elsewhere = f"Deposition: {others[0]} of {len(parts)} moved. Setpoint: {others[1]} of {seen[1]}." if parts or seen[1] else ""
     if not found:
         unchanged = judged.changed.empty and all(
             move.word in ("unchanged", "not measured", "failed") for move in judged.moved["data_driven"]
         )
-        other = "" if unchanged and not any(move.moved for move in parts) else deposition_change.said(parts)
-        return {"strong": "Nothing changed; no figure moved." if unchanged else "No figure moved beyond its noise.", "text": other}
+        if unchanged and not any(others):
+            return {"strong": "Nothing changed; no figure moved.", "text": ""}
+        loop = "of this loop " if any(others) else ""
+        return {
+            "strong": f"No figure {loop}moved beyond its noise.",
+            "text": f"{_inputs(judged.changed)} {elsewhere if any(others) else ''}".strip(),
+        }
     groups = [(word, [BRIEF[move.question.key] for move in found if move.word == word]) for word in ("worse", "better")]
     said = "; ".join(f"{word}: {', '.join(names)}" for word, names in groups if names)
     return {
         "strong": f"{len(found)} of {len(judged.asked)} figures moved beyond their noise.",
-        "text": f"{said[:1].upper()}{said[1:]}. {deposition_change.said(parts) if any(m.moved for m in parts) else ''}".strip(),
+        "text": f"{said[:1].upper()}{said[1:]}. {_inputs(judged.changed)} {elsewhere if any(others) else ''}".strip(),
     }
+
+
+def _inputs(changed: Difference) -> str:
+    """ "Changed: code, 4 parameters." """
+    parts = [
+        count(len(changed.inputs), "recording") if changed.inputs else "",
+        count(len(changed.parameters), "parameter") if changed.parameters else "",
+        "code" if changed.code == "changed" else "",
+        count(len(changed.artifacts), "artifact") if changed.artifacts else "",
+    ]
+    return f"Changed: {', '.join(filter(None, parts))}." if any(parts) else "Nothing else changed."
 
 
 def _deposition_moves(sources: Sources) -> list[Move]:
@@ -268,7 +263,7 @@ def difference_parts(sources: Sources, judged: Judgement) -> dict[str, Any]:
         "accepted": changed.accepted,
         "missing": None,
         "moved": moved,
-        "rest": [*still, "Not measured in either run: drift.", deposition_change.said(parts)],
+        "rest": [*still, "Not measured in either run: drift." if sources.nightly is None else "", deposition_change.said(parts)],
         "changed": changed,
         "empty": changed.empty and not moved,
     }

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from pipeline.report.answers import CONTROLLERS, all_answers
 from pipeline.report.difference import Difference, Move, difference, moves
+from pipeline.report.drifted import Drift, drift
 from pipeline.report.sources import Sources
 from pipeline.report.verdict import Figure, Missing, Question, Verdict, decide, questions
 
@@ -21,16 +22,19 @@ class Judgement(NamedTuple):
     verdict: Verdict
     changed: Difference | None
     moved: Mapping[str, list[Move]]
+    drifted: Drift
 
 
 def judgement(sources: Sources) -> Judgement:
     asked = questions(sources.declared.rules, band_degC=sources.declared.panel.band_degC)
-    by_name = all_answers(sources, asked)
+    drifted = drift(sources)
+    # of the machine, and so of every controller that was learned from its record
+    by_name = {name: {**answers, "drift": drifted.found} for name, answers in all_answers(sources, asked).items()}
     roles = {role: by_name[name] for role, name in CONTROLLERS.items()}
     changed = difference(sources)
     found = moves(sources, asked, by_name) if changed else {}
     moved = {role: found[name] for role, name in CONTROLLERS.items()} if changed else {}
-    return Judgement(asked, by_name, roles, decide("temperature", asked, roles), changed, moved)
+    return Judgement(asked, by_name, roles, decide("temperature", asked, roles), changed, moved, drifted)
 
 
 def shown(judged: Judgement) -> dict[str, dict[str, dict[str, float | None]]]:
@@ -39,7 +43,7 @@ def shown(judged: Judgement) -> dict[str, dict[str, dict[str, float | None]]]:
         name: {
             key: {"median": _plain(f.value), "low": _plain(f.low), "high": _plain(f.high)}
             for key, f in answers.items()
-            if isinstance(f, Figure)
+            if isinstance(f, Figure) and key != "drift"
         }
         for name, answers in judged.by_name.items()
     }

@@ -7,6 +7,7 @@ import hashlib
 import jinja2
 from markupsafe import Markup, escape
 
+from pipeline import artifacts
 from pipeline.report import digits
 from pipeline.report.sources import Source
 from pipeline.report.verdict import FAILED, OPEN, PASSED, UNDECIDED
@@ -33,7 +34,8 @@ def environment() -> jinja2.Environment:
         "origin": origin,
         "missing": missing,
         "anchor": anchor,
-        "term": term, "hashed": hashed,
+        "term": term,
+        "hashed": hashed,
         "word_id": word_id,
     }
     script = Markup(found.get_template("page.js").render().strip())
@@ -42,9 +44,14 @@ def environment() -> jinja2.Environment:
     return found
 
 
+# pages that the command line writes, linked where they are
+BESIDE = (("nightly", "Nightly"), ("history", "History"))
+
+
 def render(template: str, **values) -> str:
     """A whole page."""
-    return environment().get_template(template).render(**values)
+    beside = [(name, title) for name, title in BESIDE if name == values["here"] or artifacts.exists(f"reports/{name}.html")]
+    return environment().get_template(template).render(beside=beside, **values)
 
 
 def glyph(state: str) -> Markup:

@@ -139,7 +139,7 @@ def _reach(found: list[Run], machine, offset: float) -> str:
 def errors(sources: Sources) -> Picture:
     """The worst zone's error over the whole run."""
     found = runs(sources, "deployed")
-    title = "The worst zone’s error, to the end of the run"
+    title = "The worst zone’s error at each moment, noise and ripple in it"
     if isinstance(found, Missing):
         return hole("errors", title, found)
     machine, offset, limit = (
@@ -160,6 +160,7 @@ def errors(sources: Sources) -> Picture:
         )
         layers = [
             charts.tint(frame, 0.01, limit),
+            _band(frame, run),
             charts.level(frame, limit, "lim", f"limit {limit:g}" if column == 0 else ""),
             charts.line(frame, run.time, error),
         ]
@@ -167,18 +168,27 @@ def errors(sources: Sources) -> Picture:
 
     shown = columns(found, draw)
     text = (
-        "Median over the last third: "
+        "At a moment of the last third, median, noise and ripple in it: "
         f"{', '.join(f'{name} {short(value, 2)}{THIN}°C' for name, value in last.items())}; the rule "
-        f"allows {limit:g}{THIN}°C of settled error."
+        f"allows {limit:g}{THIN}°C of settled error, which is of the mean over that third and so smaller."
     )
     return Picture(
         "errors",
         title,
         text,
         absent(sources, shown),
-        "Largest distance of a zone from its reference, in °C, log scale, against time in s, noise and ripple in it. Grey: what the rule allows of the settled error, which is of the mean over the last third.",
+        "Largest distance of a zone from its reference, in °C, log scale, against time in s, noise and ripple in it. Line: one run; band: 90 of 100 runs on the nominal plant, all starts, references and seeds. Grey: what the rule allows of the settled error, which is of the mean over the last third.",
         page.origin(sources.source("trajectories")),
     )
+
+
+def _band(frame: charts.Frame, run: Run) -> Markup:
+    """The range of 90 of 100 runs, decimated: the lowest low and the highest high of every few samples."""
+    low, high = run.rows["error_low_degC"], run.rows["error_high_degC"]
+    of = max(len(low) // 150, 1)
+    keep = len(low) // of * of
+    ends = [pick(values[:keep].reshape(-1, of), axis=1) for pick, values in ((np.nanmin, low), (np.nanmax, high))]
+    return charts.ribbon(frame, run.time[:keep:of], *ends, f"ribbon {run.css}") if np.isfinite(ends).all() else Markup("")
 
 
 def costs(sources: Sources) -> Picture:

@@ -2,25 +2,25 @@
 
 from typing import Any
 
-from pipeline.report import charts, page, setpoint_agent, setpoint_vision, setpoint_why, words
+from pipeline.report import charts, page, setpoint_agent, setpoint_change, setpoint_vision, setpoint_why, words
 from pipeline.report.deposition import flat
-from pipeline.report.digits import MINUS, THIN, band, number, percent, quantity
+from pipeline.report.digits import THIN, band, number, percent, quantity
 from pipeline.report.setpoint_verdict import (
     BASELINE,
     HEADS,
     SIMULATORS,
     Board,
-    Case,
     Cell,
     board,
     case_text,
     lasting,
     role,
     share_text,
+    told,
     verdict,
     worst,
 )
-from pipeline.report.sources import Sources, digest, lookup
+from pipeline.report.sources import Sources, digest
 from pipeline.report.verdict import FAILED, Figure, Missing, Question, state
 
 WORDS = (
@@ -59,7 +59,9 @@ def render(sources: Sources) -> str:
         here="setpoint",
         title=f"Setpoint: {judged.decision.rstrip('.')}",
         verdict=judged,
-        heads_of_rules=HEADS,
+        heads_of_rules=HEADS if known is None else (*HEADS[:2], role(known, known.best(BASELINE)) if known.best(BASELINE) else HEADS[2]),
+        second=known is not None and bool(known.default) and known.kinds[known.default] == BASELINE,
+        told=told(sources, known) if known and known.default else "",
         no_board=found if isinstance(found, Missing) else None,
         heads=heads(known),
         answers=answers(sources, known) if known else [],
@@ -95,11 +97,16 @@ def hashes(sources: Sources) -> list[tuple[str, str]]:
     return [(name, value[:8]) for name, value in [*found, ("parameters", digest(sources.declared.everything)), ("code", sources.code)]]
 
 
-def heads(found: Board | None) -> list[dict[str, str]]:
+def heads(found: Board | None) -> list[dict[str, Any]]:
     """The two controllers of the first screen: what learned, and the best baseline."""
     pair = ("", "") if found is None else (found.learned(), found.best(BASELINE))
     return [
-        {"name": name or "none", "mark": role(found, name) if name else fallback, "css": css}
+        {
+            "name": name or "none",
+            "default": bool(name) and found is not None and name == found.default,
+            "mark": role(found, name) if name else fallback,
+            "css": css,
+        }
         for name, fallback, css in zip(pair, ("data_driven", "baseline"), ("dd", "mb"), strict=True)
     ]
 
@@ -124,7 +131,7 @@ def answers(sources: Sources, found: Board) -> list[dict[str, Any]]:
             "state": next((one for one in states if one != "passed"), "passed"),
             "cells": [_answer(cell, lost, css) | {"name": name} for name, cell, css in zip(pair, cells, ("dd", "mb"), strict=True)],
             "strip": charts.strip(lost, shown), "stay": _stay(mine), "stay_bad": bool(mine) and state(gone, _lost(mine, "stay")) == FAILED,
-            "change": change(sources, found, case, mine),
+            "change": setpoint_change.change(sources, case, mine),
         })  # fmt: skip
     return rows
 
@@ -148,26 +155,6 @@ def _answer(cell: Cell | None, lost: Question, css: str) -> dict[str, Any]:
 
 def _stay(cell: Cell | None) -> str:
     return "not measured" if cell is None else share_text(cell.stay)
-
-
-def change(sources: Sources, found: Board, case: Case, cell: Cell | None) -> dict[str, Any]:
-    """How the settled runs of the default moved since the accepted run: beyond noise where the old figure lies outside the new interval."""
-    still = {"text": "first run", "moved": False, "worse": False}
-    if sources.accepted is None or isinstance(sources.accepted, Missing) or cell is None or isinstance(cell.settled, Missing):
-        return still
-    stage = lookup(sources.accepted, "metrics.evaluate_setpoint")
-    name = None if isinstance(stage, Missing) else stage.get("default")
-    of = {} if not name or not isinstance(stage.get(name), dict) else stage[name]
-    before = of.get(case[0], {}).get(case[1], {}).get("settled")
-    if before is None:
-        return still | {"text": "new"}
-    now = cell.settled
-    points = now.value - before
-    if now.low <= before <= now.high:
-        return still | {"text": "within noise" if points else "unchanged"}
-    question = Question(0, "", "Settled", "%", sources.declared.rules.settled_percent, True, "")
-    text = f"{'+' if points > 0 else MINUS}{number(abs(points), 1)}{THIN}points · {'better' if points > 0 else 'worse'}"
-    return {"text": text, "moved": True, "worse": points < 0 and state(question, now) == FAILED}
 
 
 # ---- the scoreboard

@@ -49,7 +49,7 @@ def setpoint(sources: Sources) -> dict[str, Any]:
         "moves": "Nozzle camera to flow and temperature setpoints",
         "state": f"Run {ROLES[role]}" if judged.state == PASSED else "Do not decide yet" if judged.state == OPEN else "Do not steer yet",
         "mark": role if judged.state == PASSED else None,
-        "win": (f"{'The baseline' if role == 'baseline' else ROLES[role].capitalize().replace('-', chr(0x2011))} wins." if judged.state == PASSED else judged.lead, _win(found, judged.default)),
+        "win": (f"{'The baseline' if role == 'baseline' else ROLES[role].capitalize().replace('-', chr(0x2011))} wins." if judged.state == PASSED else judged.lead, _win(found, judged.default) if judged.state == PASSED else judged.reason),
         "caption": f"Flow’s distance from 100\u00a0%, 90th percentile of 21 starts over 100 decisions, log scale {FLOOR:g} to {CEILING:g}\u00a0%: {case_text(case, whole=True)}. Grey: within {FLOW_BAND:g}\u00a0%.",
         "panels": [_spark(table, name, case, css, named=i == 0) for i, (name, css) in enumerate(zip((who[role] for role in ORDER), ("mb", "dd", "bl"), strict=True))],
         "heads": [{"mark": role, "name": LABELS[CONTROLLERS[role]][0], "method": who[role] or "none judged"} for role in ORDER],

@@ -197,7 +197,7 @@ def _control(board: Board | None, name: str, what: str, limit: float, does: str)
         tuple(state(question, figure) for figure, _ in found),
         tuple(share_text(figure) for figure, _ in found),
         reasons,
-        "Train longer (train_agent), or narrow what the machine may do to it.",
+        "A classifier whose errors persist for fewer decisions, or fewer starts and disturbances to stand (evaluate_setpoint).",
         False,
     )
 
@@ -234,7 +234,7 @@ def _seeing(sources: Sources, name: str, limit: float, key: str, others: Sequenc
         else f"The classifier names {share_text(mine)} of {of} rightly; {limit:g}{THIN}% are asked for.{undecided(question, mine)}"
     )
     shown = share_text(best) + (f" {BRIEF[who]}" if who else "")
-    return Rule(name, f"≥ {limit:g}{THIN}%", "vision", (state(question, mine), state(question, best)), (share_text(mine), shown), (reason, reason), "Train on more segments (train_classifier.segments).", True)  # fmt: skip
+    return Rule(name, f"≥ {limit:g}{THIN}%", "vision", (state(question, mine), state(question, best)), (share_text(mine), shown), (reason, reason), "More segments to train on (train_classifier.segments), or another view of the nozzle.", True)  # fmt: skip
 
 
 def accuracy(metrics: Mapping | Missing, name: str) -> Figure | Missing:
@@ -295,25 +295,43 @@ def verdict(sources: Sources) -> Verdict:
     decision = (
         f"Run {named(found, found.default)} by default."
         if passed
-        else f"{'Do not let it steer a printer yet' if failed else 'Do not decide yet'}: {named(found, found.default)} comes closest."
+        else f"{'Do not let the camera steer a printer yet' if failed else 'Do not decide yet'}."
     )
     lead = (
         f"All {count(len(tested), 'rule')} passed."
         if passed
         else f"First {'failed' if failed else 'open'} rule: {tested[first].name[:1].lower()}{tested[first].name[1:]}."
     )
-    reason = "" if passed else tested[first].reasons[column]
+    reason = "" if passed else _closest(named(found, found.default), tested[first], column)
     return Verdict(
         PASSED if passed else FAILED if failed else OPEN,
         found.default,
         decision,
         lead,
-        f"{reason} {told(sources, found)}".strip(),
-        "" if passed else tested[first].remedy,
+        told(sources, found) if passed else reason,
+        "" if passed else _conditions(tested, column, claim == CLAIM),
         claim,
         tested,
         "" if passed else tested[first].name,
         role(found, found.default),
+    )
+
+
+def _conditions(tested: Sequence[Rule], column: int, rendered: bool) -> str:
+    """What would have to come out before the loop may steer: every rule that does not pass with its figure, and what to try."""
+    short = [rule for rule in tested if rule.states[0 if rule.seeing else column] != PASSED]
+    asked = [f"{rule.name[:1].lower()}{rule.name[1:]} {rule.limit} (now {rule.figures[0 if rule.seeing else column]})" for rule in short]
+    real = " Recordings of the real printer: none are in (datasets/raw/setpoint)." if rendered else ""
+    return f"Before it may: {', '.join(asked)}.{real} To try: {' '.join(dict.fromkeys(rule.remedy for rule in short if rule.remedy))}"
+
+
+def _closest(name: str, rule: Rule, column: int) -> str:
+    """Who comes closest, and how far it is off; a rule of the classifier holds whoever controls."""
+    reason = rule.reasons[column]
+    return (
+        f"{reason} By runs that settle and stay {name} comes closest."
+        if rule.seeing
+        else f"Best, by runs that settle and stay, is {name}: {reason[:1].lower()}{reason[1:]}"
     )
 
 

@@ -41,7 +41,7 @@ class Source(NamedTuple):
 class Sources(NamedTuple):
     """`metrics` by stage and `tables` by name, each with a Missing where it could not be read; `read`: what was;
     `absent`: what was not, by path; `accepted`: the last accepted run, or None; `files`: digest of each
-    file of code.
+    file of code; `nightly`: what the last night measured, None before the first.
     """
 
     declared: Declared
@@ -52,10 +52,15 @@ class Sources(NamedTuple):
     accepted: dict | Missing | None
     code: str
     files: Mapping[str, str]
+    nightly: dict | Missing | None = None
 
     def source(self, *names: str) -> list[Source]:
         """Those of the files that could be read."""
         return [source for name in names for source in self.read.values() if source.name == name]
+
+
+# what the nightly job writes after the pages: no dependency of theirs (DVC would ask for it before the first night), they show the night before
+NIGHTLY = "reports/metrics/nightly.json"
 
 
 def collect(declared: Declared, metrics: Mapping[str, str], folders: Mapping[str, str], accepted: str, code: tuple[str, ...]) -> Sources:
@@ -76,8 +81,9 @@ def collect(declared: Declared, metrics: Mapping[str, str], folders: Mapping[str
         for one in [] if isinstance(frames, Missing) else frames:
             read[one["path"]] = Source("frame", one["path"], stage, "JPEG", artifacts.sha256(one["path"]))
     before = _read(read, accepted, "accepted", "accept", "accepted", artifacts.read_json) if artifacts.exists(accepted) else None
+    night = _read(read, NIGHTLY, "nightly", "nightly", "nightly", artifacts.read_json) if artifacts.exists(NIGHTLY) else None
     folders_of_code = digest({folder: artifacts.sha256(folder) for folder in code})
-    return Sources(declared, *by_name, read, absent, before or None, folders_of_code, code_files(code))
+    return Sources(declared, *by_name, read, absent, before or None, folders_of_code, code_files(code), night)
 
 
 def code_files(folders: tuple[str, ...]) -> dict[str, str]:

@@ -1,6 +1,6 @@
 """The page of the temperature loop: verdict, tables, findings, figures, what was declared, words, provenance."""
 
-from pipeline.report import evidence, findings, index, page, pictures, recording, tables, trades, words
+from pipeline.report import evidence, findings, headline, index, page, pairs, pictures, recording, tables, trades, words
 from pipeline.report.answers import featured, repetitions
 from pipeline.report.judgement import Judgement
 from pipeline.report.model import trust
@@ -36,10 +36,11 @@ def render(sources: Sources, judged: Judgement) -> str:
         "temperature.html",
         here="temperature",
         title=f"Temperature: {judged.verdict.decision.rstrip('.')}",
-        verdict=index.verdict_parts(judged),
+        verdict=index.verdict_parts(judged) | {"claim": headline.claim(sources, ("temperature",))},
         featured=featured(sources),
         repetitions=repetitions(sources),
         yardstick=tables.yardstick(sources, judged.asked),
+        pairs=pairs.compared(sources),
         published=tables.published(sources),
         honest=tables.honest(sources),
         findings=findings.findings(sources),
@@ -51,7 +52,13 @@ def render(sources: Sources, judged: Judgement) -> str:
             trades.tradeoff(sources),
             trades.plants(sources),
         ],
-        learning=[evidence.noise(sources), evidence.orders(sources), evidence.holdout(sources), evidence.tuning(sources)],
+        learning=[
+            evidence.noise(sources),
+            evidence.orders(sources),
+            evidence.holdout(sources),
+            evidence.tuning(sources),
+            trades.candidates(sources),
+        ],
         record=[recording.excitation(sources), recording.record(sources)],
         flaws=flaws,
         more=more,

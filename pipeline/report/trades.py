@@ -1,15 +1,16 @@
-"""The figures of the temperature page that show what a controller pays for what it gives: error against effort, and the gap plant by plant."""
+"""The figures of the temperature page that show what a controller pays for what it gives: error against effort, of controllers and of the tuning's candidates, and the gap
+plant by plant."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from markupsafe import Markup
 
 from pipeline.report import charts, page
 from pipeline.report.answers import LABELS, noise
-from pipeline.report.digits import THIN, number, percent, short
+from pipeline.report.digits import THIN, count, number, percent, short
 from pipeline.report.pictures import ORDER, Column, Picture, hole
-from pipeline.report.sources import Sources, Table
+from pipeline.report.sources import Sources, Table, lookup
 from pipeline.report.verdict import Missing
 
 
@@ -93,6 +94,122 @@ def _traded(name: str, clouds: dict[str, Cloud], points: dict, best: list[str], 
 def _beating(points: dict[str, tuple[float, float]], name: str) -> list[str]:
     a, b = points[name]
     return [other for other, (c, d) in points.items() if other != name and c <= a and d <= b]
+
+
+# ---- the candidates of the tuning
+
+MODES = {
+    "practical": ("The declared engineering cost", "mean over the training panel, as deployed"),
+    "parity": ("The study’s objective", "its own machine, state known, discounted"),
+}
+
+
+def candidates(sources: Sources) -> Picture:
+    """Error against effort of everything that the search tried, with the front, the chosen one, the default weights and the optimum."""
+    table, found, title = sources.tables["tuning"], sources.metrics["tune_weights"], "What the tuning’s candidates trade"
+    if isinstance(table, Missing):
+        return hole("candidates", title, table)
+    shown, said = [], []
+    for mode, (head, small) in MODES.items():
+        rows = (table["mode"] == mode) & np.isfinite(table["tracking_degC"]) & np.isfinite(table["effort_percent"])
+        if not rows.any():
+            gap = page.missing(Missing("not measured", f"no candidate of the {mode} search worked"))
+            shown.append(Column(head, small, "", [Markup('<div class="hole">{}</div>').format(gap)]))
+            continue
+        points = np.column_stack([table["effort_percent"][rows], table["tracking_degC"][rows]])
+        marks = _marks(points, table["chosen"][rows], lookup(found, f"{mode}.trade"))
+        edge = points[_best(points)]
+        shown.append(Column(head, small, "", [_searched(points, edge, marks, head)]))
+        if mode == "practical":
+            said = [_bought(marks), _beyond(marks, edge)]
+    return Picture(
+        "candidates",
+        title,
+        " ".join(filter(None, said)),
+        shown,
+        "R.m.s. tracking error in °C, up, against r.m.s. effort in per cent, across. Small: a candidate that worked; line: the front, candidates that no other beats in both; "
+        "filled square: chosen; ring: default weights; cross: the optimum, a Riccati law that is told the plant and its state, unclipped. The searches minimise a cost, not one of "
+        "these two alone, so that the chosen one need not lie on the front.",
+        page.origin(sources.source("tuning", "tune_weights")),
+    )
+
+
+def _marks(points: np.ndarray, chosen: np.ndarray, trade: Any) -> dict[str, tuple[float, float]]:
+    """(effort, error) of the chosen candidate, the default weights and the optimum, as far as they are known."""
+    known = {} if isinstance(trade, Missing) else {name: one for name, one in trade.items() if one}
+    found = {name: (one["effort_percent"], one["tracking_degC"]) for name, one in known.items()}
+    return ({"chosen": (float(points[chosen][0, 0]), float(points[chosen][0, 1]))} if chosen.any() else {}) | found
+
+
+def _best(points: np.ndarray) -> np.ndarray:
+    """Rows of the front, by effort: those that no other beats in one figure without losing in the other."""
+    order = np.lexsort((points[:, 1], points[:, 0]))
+    least = np.minimum.accumulate(np.append(np.inf, points[order, 1]))[:-1]
+    return order[points[order, 1] < least]
+
+
+def _place(name: str, marks: dict[str, tuple[float, float]]) -> str:
+    effort, error = marks[name]
+    return f"{short(error, 3)}{THIN}°C at {short(effort, 3)}{THIN}%"
+
+
+def _bought(marks: dict[str, tuple[float, float]]) -> str:
+    if not {"chosen", "default"} <= marks.keys():
+        return f"Chosen: {_place('chosen', marks)}." if "chosen" in marks else ""
+    words = ["less" if mine < theirs else "more" for mine, theirs in zip(marks["chosen"], marks["default"], strict=True)]
+    return f"The chosen weights have {words[1]} error for {words[0]} effort than the default ones: {_place('chosen', marks)} of effort against {_place('default', marks)}."
+
+
+def _beyond(marks: dict[str, tuple[float, float]], edge: np.ndarray) -> str:
+    """How far the chosen one lies above the front at its own effort."""
+    if "chosen" not in marks:
+        return ""
+    effort, error = marks["chosen"]
+    least = float(edge[edge[:, 0] <= effort * (1 + 1e-12), 1].min())
+    above = 100 * (error / least - 1)
+    return (
+        "It lies on the front."
+        if above < 0.05
+        else f"No candidate of its effort has less than {short(least, 3)}{THIN}°C: it lies {percent(above, 2)} above the front."
+    )
+
+
+def _searched(points: np.ndarray, edge: np.ndarray, marks: dict[str, tuple[float, float]], head: str) -> Markup:
+    every = np.array([*points, *marks.values()])
+    # far candidates would press the front against an axis: what lies beyond nine tenths of them is drawn at the edge
+    ends = [
+        (min(values.min(), named.min()), max(np.quantile(values, 0.9), named.max()))
+        for values, named in zip(points.T, np.array([*marks.values(), edge[0], edge[-1]]).T, strict=True)
+    ]
+    x, y = (_around(np.array(end)) for end in ends)
+    frame = charts.Frame(x, y, width=540, height=230, left=44, above=20, right=12)
+    inside = (points[:, 0] <= x.high) & (points[:, 1] <= y.high)
+    front_line = edge[(edge[:, 0] <= x.high) & (edge[:, 1] <= y.high)]
+    layers = [
+        charts.dots(frame, points[inside, 0], points[inside, 1], "try", 1.8),
+        charts.line(frame, front_line[:, 0], front_line[:, 1], "line", most=1000),
+    ]
+    if "default" in marks:
+        layers.append(charts.dots(frame, *marks["default"], "ring-end", 4.5))
+    if "optimum" in marks:
+        layers.append(charts.crosses(frame, [marks["optimum"][0]], [marks["optimum"][1]], size=4.5))
+    if "chosen" in marks:
+        a, b = float(frame.px(marks["chosen"][0])), float(frame.py(marks["chosen"][1]))
+        layers.append(Markup('<rect class="picked-mark" x="{:.1f}" y="{:.1f}" width="8" height="8"/>').format(a - 4, b - 4))
+    # apart even where all three lie on one another
+    corners = {"chosen": ("end", -8, -7), "default": ("start", 8, -7), "optimum": ("end", -8, 15)}
+    for name, place in marks.items():
+        anchor, dx, dy = corners[name]
+        layers.append(charts.label(frame, *place, name, anchor=anchor, dx=dx, dy=dy))
+    out = len(every) - len(marks) - int(inside.sum())
+    alt = f"{head}: {len(points)} candidates, {len(edge)} on the front; " + "; ".join(
+        f"{name} {_place(name, marks)} of effort" for name in marks
+    )
+    alt += f"; {count(out, 'candidate')} beyond the picture" if out else ""
+    return charts.panel(frame, layers, alt=alt, css="mb", title="°C", units=("%", "°C"))
+
+
+# ---- the plants
 
 
 def plants(sources: Sources) -> Picture:

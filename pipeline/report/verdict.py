@@ -145,7 +145,9 @@ class Outcome(NamedTuple):
 
 
 def outcome(rule: str, asked: Sequence[Question], answers: Answers) -> Outcome:
-    """Failed before open before passed; drift has no question before the nightly job measures it."""
+    """Failed before open before passed; drift is no question of a limit: the nightly job says whether there is any."""
+    if rule == "drift":
+        return Outcome(rule, drift_state(answers), None)
     mine = [question for question in asked if question.rule == rule]
     states = [state(question, answers[question.key]) for question in mine]
     for wanted in (FAILED, UNDECIDED, OPEN):
@@ -154,13 +156,18 @@ def outcome(rule: str, asked: Sequence[Question], answers: Answers) -> Outcome:
     return Outcome(rule, PASSED, None) if mine else Outcome(rule, OPEN, None)
 
 
+def drift_state(answers: Answers) -> str:
+    found = answers.get("drift")
+    return found.state if isinstance(found, Missing) else OPEN if found is None else PASSED
+
+
 def outcomes(asked: Sequence[Question], answers: Answers) -> list[Outcome]:
     return [outcome(rule, asked, answers) for rule in RULES]
 
 
 def passes(found: Sequence[Outcome]) -> bool:
-    """Every rule but drift, which only the machine itself can measure once the controller runs on it."""
-    return all(o.state == PASSED for o in found if o.rule != "drift")
+    """Every rule; drift may be open, for only the machine itself shows it, once the controller runs on it."""
+    return all(o.state == PASSED or (o.rule == "drift" and o.state in (OPEN, UNDECIDED)) for o in found)
 
 
 class Verdict(NamedTuple):
@@ -223,32 +230,52 @@ def _deploy(
 ) -> Verdict:
     decision = f"Deploy the {ROLES[best].replace('-', chr(0x2011))} {loop} controller."
     whole = all(o.state == PASSED for o in found[best])
-    lead = "All five rules passed;" if whole else "It passes every rule measured so far;"
+    lead = "All five rules passed." if whole else "It passes every rule measured so far."
     question, figure = min(
         ((q, answers[best][q.key]) for q in asked if q.rule != "data sufficiency"), key=lambda pair: -share(pair[0], _worst_end(*pair))
     )
     places = row_places(question, [answers[role][question.key] for role in ("data_driven", "model_based")])
-    closest = (
-        f"closest to its limit: {BRIEF[question.key]}, "
-        f"{quantity(figure.value, question.unit, places, beyond=question.beyond)} of "
-        f"{_rule_allows(question, places)}."
-    )
-    drift = "" if whole else "Drift is not measured: the nightly job measures it once the controller runs."
     other = "model_based" if best == "data_driven" else "data_driven"
-    told = _told_apart(asked, answers, best, other) if passes(found[other]) else ""
-    return Verdict(PASSED, decision, lead, closest, f"{told} {drift}".strip(), "", best)
+    theirs = answers[other][question.key]
+    beside = (
+        f" ({ROLES[other]}: {quantity(theirs.value, question.unit, places, beyond=question.beyond)})" if isinstance(theirs, Figure) else ""
+    )
+    closest = (
+        f"Closest to its limit: {BRIEF[question.key]}, "
+        f"{quantity(figure.value, question.unit, places, beyond=question.beyond)} of "
+        f"{_rule_allows(question, places)}{beside}."
+    )
+    drift = "" if whole else f"Drift is {drift_state(answers[best])}. {_watched(answers[best])}"
+    first = next((o for wanted in (FAILED, UNDECIDED, OPEN) for o in found[other] if o.state == wanted and o.rule != "drift"), None)
+    told = (
+        _told_apart(asked, answers, best, other)
+        if first is None
+        else f"{_name(other)} {'fails' if first.state == FAILED else 'is open'} on {first.rule}."
+    )
+    return Verdict(PASSED, decision, lead, told, f"{closest} {drift}".strip(), "", best)
+
+
+def _name(role: str) -> str:
+    return ROLES[role][:1].upper() + ROLES[role][1:]
+
+
+def _watched(answers: Answers) -> str:
+    found = answers.get("drift")
+    return found.sentence() if isinstance(found, Missing) else "The nightly job measures it and has not run."
 
 
 def _told_apart(asked: Sequence[Question], answers: Mapping[str, Answers], best: str, other: str) -> str:
     """Why the better of two that pass is the better one."""
     key = preferred(answers, best, other)[1]
     if not key:
-        return f"The {ROLES[other]} controller passes too and is as good within noise."
+        return f"{_name(other)} passes too and is as good within noise; the smaller median gap decides."
+    alike = [BRIEF[one] for one in PREFERENCE[: PREFERENCE.index(key)]]
+    noise = f"{' and '.join(alike)} {'is' if len(alike) == 1 else 'are'} within noise, so " if alike else ""
     question = next(q for q in asked if q.key == key)
     mine, theirs = answers[best][key], answers[other][key]
     places = min(decimals(figure.low, figure.high, value=figure.value) for figure in (mine, theirs))
     figures = [quantity(figure.value, question.unit, places) for figure in (theirs, mine)]
-    return f"The {ROLES[other]} controller passes too; its {BRIEF[key]} is {figures[0]} against {figures[1]}."
+    return f"{_name(other)} passes too; {noise}the {BRIEF[key]} decides: {figures[1]} against {figures[0]}."
 
 
 def _worst_end(question: Question, figure: Figure) -> float:
@@ -287,7 +314,8 @@ def _rule_allows(question: Question, places: int) -> str:
 def reason(question: Question | None, answers: Mapping[str, Answers]) -> str:
     """The data-driven controller's figure of a rule that failed or is open, and its limit, in one or two sentences."""
     if question is None:
-        return "The nightly job measures it and has not run."
+        found = answers["data_driven"].get("drift")
+        return found.sentence() if isinstance(found, Missing) else "The nightly job measures it and has not run."
     figure = answers["data_driven"][question.key]
     if isinstance(figure, Missing):
         return figure.sentence()

@@ -1,5 +1,8 @@
 """The words of the pages, each explained once, as a process engineer would."""
 
+from markupsafe import Markup, escape
+
+from pipeline.report import page
 from pipeline.report.sources import Sources
 
 INDEX = (
@@ -18,7 +21,24 @@ INDEX = (
     "drift",
     "accepted",
     "hash",
+    "basis",
+    "recorded_windows",
+    "sticky",
+    "weak_actuator",
+    "settles",
+    "stays",
 )
+# as a sentence has them -> key of the word that explains them
+INLINE = {
+    "basis functions": "basis",
+    "on\u2011off control": "on_off",
+    "disk margin": "margin_disk",
+    "recorded windows": "recorded_windows",
+    "sticky": "sticky",
+    "gain 0.6": "weak_actuator",
+    "settled error": "settled",
+    "worst case over plant spread": "worst",
+}
 # key of an answer -> the word that explains it
 ANSWERS = {
     "gap_percent": "gap",
@@ -36,7 +56,7 @@ ANSWERS = {
 FIXED = {
     "gap": (
         "Gap to the optimum",
-        "How much more a controller costs than the best possible one on the same plant, from the same start, judged by true temperatures.",
+        "By how many per cent a controller’s cost (squared errors and inputs, summed) lies above that of the best possible one on the same plant, from the same start, judged by true temperatures.",
     ),
     "band": (
         "Band",
@@ -195,9 +215,13 @@ FIXED = {
         "Recorded windows",
         "Windows that the trained classifier really named, drawn again by the flow of the moment: its errors sit at the class borders and persist.",
     ),
+    "weak_actuator": (
+        "Gain 0.6",
+        "The extruder moves only 0.6 of what it is told, as a worn or slipping drive does; the controller is not told.",
+    ),
     "sticky": (
         "Sticky",
-        "The conditions of a picture last for several decisions, so that an error comes again; fresh: each window is of another segment.",
+        "The conditions of a picture last for about ten decisions, so that an error comes again; fresh: each window is of another segment.",
     ),
     "accuracy": ("Accuracy", "Share of windows that the paper’s simulator names rightly; the rest gets one of the two other classes."),
     "worst_case": (
@@ -252,6 +276,17 @@ def glossary(sources: Sources) -> dict[str, tuple[str, str]]:
         "spread": ("Plant spread", spread),
         "step": ("Step", f"One sample of the controller, {machine.sample_time_s:g} s here."),
     }
+
+
+def explained(sources: Sources, text: str) -> Markup:
+    """A sentence whose words of the page's list lead there, each where it stands first."""
+    said = escape(text)
+    known, listed = glossary(sources), set(INDEX)
+    for phrase, key in INLINE.items():
+        if key in listed and key in known and phrase in said:
+            before, after = said.split(phrase, 1)
+            said = Markup("{}{}{}").format(Markup(before), page.term(known[key][0], phrase), Markup(after))
+    return said
 
 
 def chosen(sources: Sources, keys: tuple[str, ...]) -> list[tuple[str, str]]:

@@ -10,14 +10,12 @@ from pipeline.temperature.baseline import pairing, pi_law
 from pipeline.temperature.kernel import Kernel, Regression, regress, tuples, value_iteration, window_law
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.scorecard import (
-    Allowance,
     Figures,
     Margins,
     Panel,
     Run,
     Yardstick,
     cost,
-    engineering_cost,
     feed_forward,
     figures,
     margins,
@@ -27,7 +25,6 @@ from pipeline.temperature.scorecard import (
     simulate,
 )
 from pipeline.temperature.tracking import Law, feasible_target, gains, observer_gain, observer_law, robust_observer_gain
-from pipeline.temperature.tuning import Result
 
 Limits = tuple[np.ndarray, np.ndarray]
 Targets = dict[bytes, tuple[np.ndarray, np.ndarray]]
@@ -280,8 +277,8 @@ def featured(scenarios: Panel, noise: float) -> int:
 def trajectories(
     judged: Sequence[Judged], scenarios: Panel, inputs: Sequence[str], outputs: Sequence[str], *, noise: float, yardstick: Yardstick
 ) -> dict[str, list | np.ndarray]:
-    """The featured scenario under every controller, in both modes, as columns."""
-    i = featured(scenarios, noise)
+    """The featured scenario under every controller, in both modes, as columns; beside it the worst zone's error of all runs on the nominal plant, 5th, 50th and 95th percentile."""
+    i, alike = featured(scenarios, noise), (scenarios.plant == 0) & (scenarios.noise == noise)
     runs = [(j.name, mode, run) for j in judged for mode, run in (("unclipped", j.unclipped), ("deployed", j.deployed))]
     time_s = scenarios.plants[0].sample_time_s * np.arange(scenarios.steps)
     discount = yardstick.gamma ** np.arange(scenarios.steps)
@@ -292,59 +289,14 @@ def trajectories(
         "time_s": np.tile(time_s, len(runs)),
         "cost": np.concatenate([np.cumsum(stage) for stage in stages]),
     }
+    worst = [
+        np.quantile(np.abs(run.y[:, alike] - scenarios.r[alike]).max(axis=2), [0.05, 0.5, 0.95], axis=1, method="nearest")
+        for _, _, run in runs
+    ]
+    columns |= {f"error_{name}_degC": np.concatenate([found[k] for found in worst]) for k, name in enumerate(("low", "median", "high"))}
     for channel, name in enumerate(outputs):
         columns[name] = np.concatenate([run.y[:, i, channel] for _, _, run in runs])
     for channel, name in enumerate(inputs):
         columns[f"{name}_command"] = np.concatenate([run.command[:, i, channel] for _, _, run in runs])
         columns[f"{name}_applied"] = np.concatenate([run.u[:, i, channel] for _, _, run in runs])
     return columns
-
-
-def engineering_objective(
-    plant: Plant, scenarios: Panel, *, gamma: float, limits: Limits, band: float, integral: float, integral_limit: float, allowance: Allowance, least_disk_margin: float
-) -> Callable[[np.ndarray], float]:  # fmt: skip
-    """Practical tuning's cost of theta = [q; r; tau]: weights and observer of the model's controller, deployed on the training panel, counted by `allowance`.
-
-    A candidate whose disk margin on its own model is below `least_disk_margin` fails: figures in simulation are no reason to give robustness away.
-    """
-    aims, p, m = targets(plant, scenarios.r, limits), plant.p, plant.m
-
-    def objective(theta: np.ndarray) -> float:
-        law = model_based(plant, gamma, tau=theta[-1]).design(theta[:p], theta[p : p + m], integral)
-        disk = margins([plant], law, grid=80)[0].disk
-        if disk < least_disk_margin:
-            raise ValueError(f"the disk margin is {disk:.2f}, below the least of {least_disk_margin:.2f}")
-        run = simulate(scenarios, law, feed_forward(scenarios, law, aims), limits=limits, integral_band=integral_limit)
-        found = figures(scenarios, run, limits=limits, band=band, sample_time_s=plant.sample_time_s)
-        return engineering_cost(found, scenarios.plant, allowance, longest_s=scenarios.steps * plant.sample_time_s)
-
-    return objective
-
-
-def cost_or_none(objective: Callable[[np.ndarray], float], theta: np.ndarray) -> float | None:
-    """The cost of theta, None where it fails: default weights may fail on somebody else's plant, and the search is not lost for that."""
-    try:
-        return objective(theta)
-    except ValueError:
-        return None
-
-
-def yardstick_regret(controller: Controller, scenarios: Panel, yardstick: Yardstick, q: np.ndarray, r: np.ndarray) -> float:
-    """What weights q, r cost on the common yardstick: median regret, unclipped, on the quietest scenarios of the nominal plant."""
-    law = controller.design(q, r, 0.0)
-    found = regret(
-        cost(scenarios, simulate(scenarios, law, feed_forward(scenarios, law, None), limits=None), yardstick), optimum(scenarios, yardstick)
-    )
-    return float(np.median(found[(scenarios.plant == 0) & (scenarios.noise == scenarios.noise.min())]))
-
-
-def histories(results: dict[str, Result]) -> dict[str, list | np.ndarray]:
-    """The candidates of several searches as columns, one row a candidate."""
-    of = {mode: result.history for mode, result in results.items()}
-    return {
-        "mode": [mode for mode, history in of.items() for _ in history.cost],
-        "evaluation": [k + 1 for history in of.values() for k in range(len(history.cost))],
-        "cost": np.concatenate([history.cost for history in of.values()]),
-        "incumbent": np.concatenate([history.incumbent for history in of.values()]),
-        "failure": [reason for history in of.values() for reason in history.failed],
-    }

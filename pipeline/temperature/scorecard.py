@@ -150,8 +150,13 @@ def cost(panel: Panel, run: Run, yardstick: Yardstick) -> Cost:
 
 def optimum(panel: Panel, yardstick: Yardstick) -> Cost:
     """J* of every scenario: the Riccati law of its own plant, which knows the state, unclipped."""
+    return cost(panel, optimum_run(panel, yardstick), yardstick)
+
+
+def optimum_run(panel: Panel, yardstick: Yardstick) -> Run:
+    """The run behind J*."""
     best = [gains(plant, np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma) for plant in panel.plants]
-    return cost(panel, _state_feedback(panel, best), yardstick)
+    return _state_feedback(panel, best)
 
 
 def _state_feedback(panel: Panel, best: Sequence[Gains]) -> Run:

@@ -153,6 +153,19 @@ def tuning_objective(theta: np.ndarray) -> float:
     return fitness(plant, best.K_x, best.K_r, reference=REFERENCE, gamma=GAMMA, steps=100, x0=np.full(plant.n, 20.0))
 
 
+def tuning_parts(theta: np.ndarray) -> tuple[float, float]:
+    """What tuning_objective adds up, each in its own unit: discounted r.m.s. error e in °C and effort u in percent, F = sum_t gamma^t (5 e^2 + 7 u^2)."""
+    plant, discount = baam(), GAMMA ** np.arange(101)
+    best = gains(plant, np.diag(theta[:5]), np.diag(theta[5:]), GAMMA)
+    x, squares = np.full(plant.n, 20.0), np.empty((101, 2))
+    for t in range(101):
+        u = -best.K_x @ x - best.K_r @ REFERENCE - best.k
+        squares[t] = ((plant.C @ x + plant.D @ u + plant.d - REFERENCE) ** 2).mean(), (u**2).mean()
+        x = plant.A @ x + plant.B @ u + plant.b
+    error, effort = np.sqrt(discount @ squares / discount.sum())
+    return float(error), float(effort)
+
+
 class ScaledWeights(NamedTuple):
     """Q = R = 0.4 I beside Q = R = I: the change of the index when each is computed with its own weights, in percent, and the largest difference of the gains."""
 

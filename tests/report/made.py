@@ -11,6 +11,8 @@ from tests.report import made_setpoint
 ROOT = Path(__file__).resolve().parents[2]
 CONTROLLERS = ("model_based", "window", "kernel", "baseline", "exact_model")
 HOSTILE = '"><script>alert(1)</script><img src=http://evil.example/x onerror=alert(2)>\u202egpj.mcap'
+SCALED = {"change_percent": -60.0, "gain_difference": 1e-15}
+TRADES = {name: {"tracking_degC": e, "effort_percent": u} for name, e, u in (("default", 8.0, 11.0), ("optimum", 4.0, 30.0))}
 
 
 def figure(median, low, high, **more):
@@ -94,12 +96,8 @@ def metrics():
             "candidates": {},
         },
         "tune_weights": {
-            "parity": {
-                "best_cost_perfect_state": 101.0,
-                "optimum": 100.0,
-                "scaled_weights": {"change_percent": -60.0, "gain_difference": 1e-15},
-            },
-            "practical": {"cost": 2.0, "cost_default": 8.0, "regret_identity": 0.5, "failed": 1},
+            "parity": {"best_cost_perfect_state": 101.0, "optimum": 100.0, "scaled_weights": SCALED, "trade": TRADES},
+            "practical": {"cost": 2.0, "cost_default": 8.0, "regret_identity": 0.5, "failed": 1, "trade": TRADES},
         },
         "evaluate_temperature": {
             "as_published": both,
@@ -175,6 +173,8 @@ def trajectories(machine, steps=60):
         "time_s": np.tile(time, len(names)),
         "cost": np.tile(1000.0 * (1 - 0.5 ** (time + 1)), len(names)),
     }
+    for end, factor in (("low", 0.5), ("median", 1.0), ("high", 2.0)):
+        columns[f"error_{end}_degC"] = np.tile(factor * np.abs(80 * 0.5**time - 0.05), len(names))
     for output in machine.outputs:
         columns[output.name] = np.tile(output.reference - 80.0 * 0.5**time + 0.05, len(names))
     for signal in machine.inputs:
@@ -283,6 +283,9 @@ def write(root, *, samples=400, recording="good.mcap", worst=None):
         "evaluation": [1, 2, 3] * 2,
         "cost": [120.0, 101.0, 103.0, 9.0, np.nan, 2.0],
         "incumbent": [120.0, 101.0, 101.0, 9.0, 9.0, 2.0],
+        "tracking_degC": [8.0, 6.0, 6.5, 9.0, np.nan, 5.0],
+        "effort_percent": [20.0, 24.0, 26.0, 10.0, np.nan, 12.0],
+        "chosen": [False, True, False, False, False, True],
         "failure": ["", "", "", "", HOSTILE, ""],
     }
     artifacts.write_table(data / "tune_weights/history.parquet", schemas.TUNING, history)

@@ -3,10 +3,11 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import yaml
 
 from pipeline import artifacts
-from pipeline.report import trades, workflow
+from pipeline.report import pairs, trades, workflow
 from stages.report import main
 from tests.report import made
 from tests.report.test_pages import INDEX as PAGE_ONE
@@ -65,3 +66,80 @@ def test_a_stage_is_as_accepted_made_anew_or_not_there(project):
     text = PAGE_ONE.read_text()
     assert "New results begin at tune_weights." in text
     assert "Made anew: tune_weights; not there: segment_library; as accepted: " in text
+
+
+# ---- the candidates of the tuning
+
+
+def test_the_front_of_the_candidates_is_drawn_with_chosen_default_and_optimum_and_says_what_was_bought(project):
+    main()
+    text = Page(TEMPERATURE).text
+    # of the small project: practical candidates (10 %, 9 °C), (12 %, 5 °C; chosen) and one that failed; default (11 %, 8 °C)
+    assert (
+        "The chosen weights have less error for more effort than the default ones: 5.00 °C at 12.0 % of effort against 8.00 °C at 11.0 %. "
+        "It lies on the front."
+    ) in text
+    label = re.search(r'aria-label="(The declared engineering cost: 2 candidates[^"]*)"', TEMPERATURE.read_text())[1].replace("\u202f", " ")
+    assert label == (
+        "The declared engineering cost: 2 candidates, 2 on the front; chosen 5.00 °C at 12.0 % of effort; default 8.00 °C at 11.0 % of effort; "
+        "optimum 4.00 °C at 30.0 % of effort"
+    )
+
+
+def test_a_chosen_candidate_above_the_front_says_by_how_much():
+    # at effort 3 or less the least error is 2: 2.5 lies 25 % above
+    points = np.array([[1.0, 4.0], [2.0, 2.0], [3.0, 2.5], [4.0, 1.0], [4.0, 3.0]])
+    edge = points[trades._best(points)]
+    np.testing.assert_array_equal(edge, [[1.0, 4.0], [2.0, 2.0], [4.0, 1.0]])
+    assert (
+        trades._beyond({"chosen": (3.0, 2.5)}, edge).replace("\u202f", " ")
+        == "No candidate of its effort has less than 2.00 °C: it lies 25 % above the front."
+    )
+
+
+# ---- two controllers on the same cases
+
+
+def cases(factor, *, plants=6, seeds=3):
+    """A scorecard of two controllers on the same cases: the model-based one costs `factor` (plants,) times as much."""
+    rows = [(plant, seed) for plant in range(plants) for seed in range(seeds)]
+    plant, seed = (np.array(column) for column in zip(*rows, strict=True))
+    both = {
+        "plant": np.tile(plant, 2),
+        "seed": np.tile(seed, 2),
+        "start_degC": np.full(2 * len(rows), 20.0),
+        "reference_degC": np.full(2 * len(rows), 150.0),
+    }
+    ours = 1.0 + 0.01 * seed
+    return both | {
+        "controller": np.array(["window"] * len(rows) + ["model_based"] * len(rows)),
+        "noise_degC": np.full(2 * len(rows), 0.1),
+        "tracking_degC": np.concatenate([ours, ours * np.asarray(factor)[plant]]),
+    }
+
+
+def tracking(table, rows):
+    return table["tracking_degC"][rows]
+
+
+def test_the_paired_saving_is_that_of_the_costs_ratio_over_plants():
+    found = pairs._paired(cases(np.full(6, 2.0)), "model_based", "window", 0.1, tracking)
+    # half the cost in every case, and one sign pattern of 2^6 does as well
+    np.testing.assert_allclose([found.improvement_percent, found.p], [50.0, 1 / 64], rtol=1e-12)
+    assert (found.cases, found.blocks) == (18, 6)
+    row = pairs._row(found)
+    assert (row["saved"].replace("\u202f", " "), row["cases"], row["sure"]) == ("50 % less", "18 on six plants", True)
+
+
+def test_a_difference_that_changes_its_sign_from_plant_to_plant_is_chance():
+    found = pairs._paired(cases([2.0, 0.5, 2.0, 0.5, 2.0, 0.5]), "model_based", "window", 0.1, tracking)
+    assert abs(found.improvement_percent) < 1e-9 and not pairs._row(found)["sure"]
+    assert pairs._sentence("Error, as deployed", found).startswith("Error: no difference beyond chance")
+
+
+def test_other_cases_or_a_lost_run_are_no_pair():
+    table = cases(np.full(6, 2.0))
+    assert pairs._paired(table | {"seed": np.arange(36)}, "model_based", "window", 0.1, tracking) is None
+    lost = table["tracking_degC"].copy()
+    lost[0] = np.inf
+    assert pairs._paired(table | {"tracking_degC": lost}, "model_based", "window", 0.1, tracking) is None

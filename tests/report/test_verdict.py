@@ -105,9 +105,11 @@ def test_passed_says_so_with_what_is_closest_to_its_limit_and_never_counts_drift
     verdict = decide("temperature", ASKED, roles(model_based=answers(gap_percent=Figure(9.0, 8.0, 10.0))))
     assert verdict.state == PASSED
     assert verdict.decision == "Deploy the data\u2011driven temperature controller."
-    assert verdict.lead == "It passes every rule measured so far;"
-    assert verdict.reason == "closest to its limit: disk margin, 0.46 of at least 0.40."
-    assert verdict.remedy.startswith("Drift is not measured")
+    assert verdict.lead == "It passes every rule measured so far."
+    assert verdict.remedy.startswith(
+        "Closest to its limit: disk margin, 0.46 of at least 0.40 (model-based: 0.46). Drift is not measured. The nightly job measures it and has not run."
+    )
+    assert verdict.reason == "Model-based fails on gap."
 
 
 def test_open_says_what_is_missing_and_how_much_more_of_it():
@@ -144,7 +146,7 @@ def test_the_winner_has_the_smallest_settled_error_and_within_noise_the_smallest
 def test_where_the_better_controller_is_the_other_one_the_verdict_deploys_that():
     verdict = decide("temperature", ASKED, roles(model_based=answers(settled_error_degC=Figure(0.1, 0.09, 0.11))))
     assert verdict.decision == "Deploy the model\u2011based temperature controller."
-    assert verdict.remedy.startswith("The data-driven controller passes too; its settled error is 0.31\u202f°C against 0.10\u202f°C.")
+    assert verdict.reason == "Data-driven passes too; the settled error decides: 0.10\u202f°C against 0.31\u202f°C."
 
 
 def test_an_undecided_figure_says_how_many_more_runs_would_decide():

@@ -1,0 +1,76 @@
+"""Answer 11: what the nightly job measured last, or why nothing is known; and that its figures are no dependency of the pages."""
+
+import re
+from pathlib import Path
+
+from pipeline import artifacts, provenance
+from pipeline.report.verdict import Missing, Outcome, outcome
+from stages.report import main
+from tests.report.test_pages import INDEX, TEMPERATURE, Page, figures
+
+NIGHT = Path("reports/metrics/nightly.json")
+FIGURES = {
+    "datasets/raw/temperature/a.mcap": {
+        "parameters": {
+            "gain of heater_1": {"percent": 3.2, "band_percent": 4.1, "sigmas": 1.3},
+            "gain of heater_2": {"percent": -6.0, "band_percent": 20.0, "sigmas": -0.5},
+        }
+    }
+}
+
+
+def night(**drift):
+    artifacts.write_json(
+        NIGHT, {"run": "night-0003", "when": "2026-11-20T02:10:00+00:00", "drift": {"alarms": [], "watched": [], "figures": {}} | drift}
+    )
+    main()
+    text = Page(INDEX).text
+    return re.search(r"Drift since commissioning (.*?) 12 Provenance", text)[1]
+
+
+def test_before_the_first_night_drift_is_not_measured(project):
+    main()
+    assert "Not measured. The nightly job measures it and has not run." in Page(INDEX).text
+    assert "nightly.html" not in INDEX.read_text()
+
+
+def test_no_alarm_passes_the_rule_and_names_what_moved_most_against_its_noise(project):
+    assert night(figures=FIGURES) == "None found. Largest change of the machine: gain of heater_1, 3.2 % ± 4.1. night-0003, 2026-11-20"
+    assert figures()["verdict"]["lead"] == "All five rules passed."
+    assert 'href="nightly.html"' in INDEX.read_text()
+
+
+def test_an_alarm_fails_the_rule_for_every_controller_and_gives_the_cause(project):
+    found = night(figures=FIGURES, alarms=[{"cause": "the gain of heater_1 fell by 12 %", "loop": "temperature"}])
+    assert found.startswith("Drifted. The gain of heater_1 fell by 12 %.")
+    said = figures()["verdict"]
+    assert (said["state"], said["rule"], said["winner"]) == ("failed", "drift", None)
+    assert "First failed rule: drift. The machine has changed: the gain of heater_1 fell by 12 %." in Page(TEMPERATURE).text
+
+
+def test_what_is_watched_is_undecided_and_a_night_without_recordings_measures_nothing(project):
+    assert night(watched=[{"cause": "the noise of sensor_2 grew"}]).startswith("Perhaps. The noise of sensor_2 grew; an alarm where")
+    assert night().startswith("Not measured. The last night had no new recording")
+    assert figures()["verdict"]["lead"] == "It passes every rule measured so far."
+
+
+def test_a_broken_file_of_the_night_is_said_so(project):
+    NIGHT.write_text("{")
+    main()
+    assert "nightly.json is not whole JSON" in Page(INDEX).text
+
+
+def test_text_of_the_night_is_escaped(project):
+    night(alarms=[{"cause": "<script>alert(1)</script>"}])
+    assert "<script>alert" not in INDEX.read_text()
+
+
+def test_a_later_night_is_no_change_of_what_the_pages_were_made_from(project):
+    night(figures=FIGURES)
+    artifacts.write_json(NIGHT, {"run": "night-0004"})
+    assert not any("nightly.json" in sentence for check in provenance.checks() for sentence in check.wrong)
+
+
+def test_drift_is_judged_by_the_night_alone():
+    assert outcome("drift", [], {}) == Outcome("drift", "not measured", None)
+    assert outcome("drift", [], {"drift": Missing("failed", "")}) == Outcome("drift", "failed", None)

@@ -1,0 +1,116 @@
+"""Page one's first screen, 1280 x 800, in a browser: whatever state the loops are in and however long their sentences are, in both themes; and the pages with a
+hundred recordings."""
+
+import contextlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline import artifacts, schemas
+from pipeline.report import deposition, identification, setpoint, temperature
+from stages import report
+from tests.report import made, made_setpoint
+from tests.report.conftest import populate
+from tests.report.test_browser import ANSWERS
+from tests.report.test_pages import change
+
+LONG = "the recording of the third night stops in the middle of a line, and nobody knows why " * 6
+
+
+def fine():
+    pass
+
+
+def temperature_failed():
+    change("evaluate_temperature", controllers__window__settled_error_degC=made.figure(0.72, 0.61, 0.84, zone=1))
+
+
+def deposition_failed():
+    made.deposition({"on_off": (100.0, None, 60.0), "priority": (12.0, 11.0, 9.0), "basis": (7.0, 2.5, 1.0), "ilc": (6.5, None, 0.5)})
+
+
+def setpoint_failed():
+    change("train_classifier", ece_window=0.05)
+
+
+def all_failed():
+    temperature_failed()
+    deposition_failed()
+    setpoint_failed()
+
+
+def one_missing():
+    for path in Path("datasets/evaluate_setpoint").iterdir():
+        path.unlink()
+
+
+def nothing():
+    for path in [*Path("datasets").rglob("*.parquet"), *Path("datasets").rglob("*.json"), *Path("reports/metrics").glob("*.json")]:
+        path.unlink()
+
+
+def long_sentences():
+    all_failed()
+    made_setpoint.choice("x" * 300)
+    artifacts.write_json(
+        "reports/metrics/nightly.json", {"run": "night-0003", "when": "2026-11-20T02", "drift": {"alarms": [{"cause": LONG}]}}
+    )
+    Path("reports/metrics/evaluate_temperature.json").write_text("{")
+
+
+STATES = (fine, temperature_failed, deposition_failed, setpoint_failed, all_failed, one_missing, nothing, long_sentences)
+
+
+@pytest.fixture
+def page_one(tmp_path, monkeypatch):
+    """page_one(change): the folder of index.html of the small project after a change; the other pages are left out."""
+    for module in (deposition, identification, setpoint, temperature):
+        monkeypatch.setattr(module, "render", lambda *_: "")
+
+    def built(changed):
+        with contextlib.chdir(tmp_path):
+            populate(tmp_path)
+            changed()
+            report.main()
+        return tmp_path / "reports"
+
+    return built
+
+
+@pytest.mark.parametrize("changed", STATES)
+def test_the_twelve_answers_fit_the_first_screen_in_both_themes(page_one, open_page, changed):
+    folder = page_one(changed)
+    for theme in ("light", "dark"):
+        page = open_page("index", theme=theme, folder=folder)
+        rows = page.locator(".answers tbody tr").all()
+        assert len(rows) == len(ANSWERS)
+        found = [page.locator("h1"), page.locator(".rules"), *page.locator(".whole > div").all(), *rows]
+        for one in found:
+            box = one.bounding_box()
+            assert box["height"] > 0 and box["y"] >= 0 and box["y"] + box["height"] <= 800, (theme, one.inner_text()[:80], box)
+            assert box["x"] >= 0 and box["x"] + box["width"] <= 1280, (theme, one.inner_text()[:80], box)
+        assert page.evaluate("document.documentElement.scrollWidth") <= 1280
+
+
+def hundred(folder):
+    """A record of a hundred recordings of an hour each, with a finding in every one of them."""
+    machine = made.declared(folder)
+    parts = [made.record(machine, 3600, f"night_{k:03d}.mcap") for k in range(100)]
+    whole = {key: np.concatenate([np.asarray(part[key]) for part in parts]) for key in parts[0]}
+    whole["recording"], whole["segment"] = (
+        [name for part in parts for name in part["recording"]],
+        np.repeat(np.arange(100, dtype=np.int32), 3600),
+    )
+    artifacts.write_table("datasets/ingest/record.parquet", schemas.record(machine.inputs, machine.outputs), whole)
+    names = [f"night_{k:03d}.mcap" for k in range(100)]
+    flaws = {"recording": names, "signal": ["zone_1"] * 100, "kind": ["spike"] * 100, "start_s": [10.0] * 100, "end_s": [12.0] * 100, "count": [2] * 100, "message": ["2 samples stand out"] * 100}  # fmt: skip
+    artifacts.write_table("datasets/ingest/quality.parquet", schemas.QUALITY, flaws)
+
+
+def test_with_a_hundred_recordings_the_pages_stay_small(project):
+    hundred(project)
+    report.main()
+    sizes = {path.stem: path.stat().st_size for path in Path("reports").glob("*.html")}
+    # the bars of the pages
+    assert sizes.pop("index") <= 1_000_000 and max(sizes.values()) <= 1_500_000, sizes

@@ -1,0 +1,60 @@
+"""What the tuning's candidates trade: the parts of an objective add up to it, and a history keeps them beside their candidates."""
+
+import numpy as np
+import pytest
+
+from pipeline.temperature import engineering, plant, scorecard, study, tuning
+from pipeline.temperature.published import GAMMA
+
+
+@pytest.mark.parametrize("theta", [np.ones(12), np.linspace(0.05, 0.9, 12)])
+def test_error_and_effort_add_up_to_the_studys_objective(theta):
+    error, effort = study.tuning_parts(theta)
+    total = (GAMMA ** np.arange(101)).sum() * (5 * error**2 + 7 * effort**2)
+    # the same run, by steps instead of by products of matrices
+    np.testing.assert_allclose(total, study.tuning_objective(theta), rtol=1e-9)
+
+
+def small():
+    machine = plant.baam()
+    scenarios = scorecard.panel(
+        [machine], starts=[20.0], references=[np.full(5, 150.0)], noise=[0.0], seeds=[1], steps=60, hold=5, cells=True
+    )
+    settings = {"gamma": GAMMA, "limits": (np.zeros(7), np.full(7, 100.0)), "band": 1.0, "integral": 0.02, "integral_limit": 1.0}
+    return machine, scenarios, settings
+
+
+def test_a_candidates_trade_is_that_of_its_run_and_a_fragile_one_fails():
+    machine, scenarios, settings = small()
+    theta = np.append(np.ones(12), 1.0)
+    run = engineering.deployed(machine, scenarios, least_disk_margin=0.0, **settings)
+    found = engineering.trade(run(theta))
+    assert found == engineering.Trade(float(run(theta).tracking_degC.mean()), float(run(theta).effort_percent.mean()))
+    # weights that spare the heaters take less of them, and more error
+    spared = engineering.trade(run(np.concatenate([np.full(5, 0.01), np.full(7, 10.0), [1.0]])))
+    assert spared.effort_percent < found.effort_percent and spared.tracking_degC > found.tracking_degC
+    fragile = engineering.deployed(machine, scenarios, least_disk_margin=1.9, **settings)
+    with pytest.raises(ValueError, match="below the least of 1.90"):
+        fragile(theta)
+    assert engineering.found_or_none(fragile, theta) is None
+
+
+def test_the_optimum_is_the_run_whose_cost_no_controller_undercuts():
+    _, scenarios, settings = small()
+    yardstick = scorecard.Yardstick(np.ones(5), np.ones(7), GAMMA)
+    best = scorecard.cost(scenarios, scorecard.optimum_run(scenarios, yardstick), yardstick)
+    np.testing.assert_array_equal(best.J, scorecard.optimum(scenarios, yardstick).J)
+    found = engineering.optimum_trade(scenarios, yardstick, limits=settings["limits"], band=1.0)
+    assert found.tracking_degC > 0 and found.effort_percent > 0
+
+
+def test_a_history_has_each_candidates_trade_and_marks_the_chosen_one():
+    theta = np.array([[1.0], [2.0], [3.0]])
+    history = tuning.History(theta, np.array([5.0, np.nan, 4.0]), ("", "unstable", ""), np.array([5.0, 5.0, 4.0]))
+    columns = engineering.histories(
+        {"practical": tuning.Result(theta[2], 4.0, history)},
+        {"practical": [engineering.Trade(1.0, 2.0), None, engineering.Trade(3.0, 4.0)]},
+    )
+    assert columns["evaluation"] == [1, 2, 3] and columns["chosen"].tolist() == [False, False, True]
+    np.testing.assert_array_equal(columns["tracking_degC"], [1.0, np.nan, 3.0])
+    np.testing.assert_array_equal(columns["effort_percent"], [2.0, np.nan, 4.0])
