@@ -1,5 +1,6 @@
 """What train_classifier does with its four parts: networks trained with checkpoints, calibrated, judged beside their yardsticks; tables, metrics and a few frames of it."""
 
+import contextlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -33,6 +34,8 @@ from pipeline.setpoint.vision_transformer import (
 
 SIZES = {"small": SMALL, "paper": PAPER}
 AUGMENTATIONS = {"along_bead": classifier.along_bead, "adr": classifier.adr}
+# of the yardstick that is fitted beside the networks, yardsticks.fit_profile_machine
+FOLDS = 3
 MEMO = Path("datasets/memo/train_classifier")
 SCHEMA, CALIBRATION = "classifier 1", ("classifier_calibration", 1)
 
@@ -49,7 +52,11 @@ class Trained(NamedTuple):
 
 
 def trained(p: TrainClassifier, found: Mapping[str, Seen], checkpoints: Path = MEMO) -> Trained:
-    """The vision transformer of p.size and the small CNN, trained alike; a training that was killed goes on from its last epoch."""
+    """The vision transformer of p.size and the small CNN, trained alike; a training that was killed goes on from its last epoch.
+
+    Raises ValueError, nothing trained, where the other parts do not suffice for what is fitted and judged afterwards.
+    """
+    _check_parts(p, found)
     learned, held_out = Labelled(*found["learned"].labelled()), Labelled(*found["held_out"].labelled())
     key = jax.random.key(p.seed)
     untrained = {
@@ -76,7 +83,7 @@ def _trained(
     what = (name, p.size, p.augmentation, p.seed, recipe.model_dump(), [a.tobytes() for data in (learned, held_out) for a in data], _code())
     path = checkpoints / f"{joblib.hash(what)}.safetensors"
     state = classifier.untrained(network, epochs=recipe.epochs)
-    if artifacts.exists(path):
+    with contextlib.suppress(ValueError):  # there is none yet, or it is damaged: from the beginning
         state = from_named_arrays(state, weights.read_weights(path, SCHEMA)[0])
     with tqdm(total=recipe.epochs, initial=int(state.epoch), desc=f"train_classifier: {name}", unit="epoch", mininterval=2) as bar:
 
@@ -87,6 +94,34 @@ def _trained(
 
         settings = recipe.model_dump(exclude={"epochs"})
         return classifier.train(state, learned, held_out, key=key, augment=AUGMENTATIONS[p.augmentation], on_step=on_step, **settings)
+
+
+def _check_parts(p: TrainClassifier, found: Mapping[str, Seen]) -> None:
+    """Raises ValueError where a class is learned in too few stretches for the yardstick's folds, a part has no window, or too few segments have one for the sets that are
+    asked for (calibration.conformal_level)."""
+    learned = Labelled(*found["learned"].labelled())
+    for c, name in enumerate(classifier.CLASS_NAMES):
+        stretches = len(np.unique(learned.segment[learned.label == c]))
+        if stretches < FOLDS:
+            raise ValueError(
+                f"expected at least {FOLDS} stretches of constant settings of class {c}, {name}, to learn from, found {stretches}; record more prints, "
+                "or raise train_classifier.segments.learned"
+            )
+    for part in ("judged", "calibration"):
+        data = _all(p, found[part])
+        rows = calibration.windows(data.segment, data.label, length=p.window).rows
+        if not len(rows):
+            raise ValueError(
+                f"expected {p.window} frames in a row at one class in the frames for {part}, found none in {len(data.label)}; record longer stretches, "
+                "or lower train_classifier.window"
+            )
+    there, needed = len(np.unique(data.segment[rows[:, 0]])), int(np.ceil(np.log(1 - p.confidence) / np.log(p.coverage)))
+    if there < needed:
+        of = "prints" if p.source == "recordings" else "segments"
+        raise ValueError(
+            f"expected windows of at least log(1 - confidence) / log(coverage) = {needed} {of} to calibrate with, found {there}; add {of}, raise "
+            "train_classifier.segments.calibration, or lower train_classifier.coverage or confidence"
+        )
 
 
 def _code() -> list[str]:

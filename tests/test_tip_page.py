@@ -11,7 +11,7 @@ import pytest
 from pipeline import cli
 from pipeline.setpoint import key_area
 from tests.nozzle_folders import LEAST, expected, scenes
-from tests.test_nozzle_recordings import film
+from tests.test_nozzle_recordings import film, foreign
 
 
 def declare(least_score: float | str) -> None:
@@ -80,6 +80,13 @@ def test_the_middle_frame_of_a_recording_will_do(calibrate, tmp_path):
     status, said, _ = calibrate("night.mcap")
     assert status == 0
     assert "night.tip.html: open it in a browser" in said
+
+
+def test_of_two_cameras_the_one_of_the_parameters_is_shown(calibrate, tmp_path):
+    foreign(tmp_path / "night.mcap", other="/bed/camera")
+    assert "name the one of the nozzle's camera (params.yaml: train_classifier.topics.image)" in calibrate("night.mcap")[2]
+    Path("params.yaml").write_text(f"train_classifier: {{least_score: {LEAST}, topics: {{image: /cam}}}}\n")
+    assert calibrate("night.mcap")[0] == 0
 
 
 @pytest.mark.parametrize("kind", ["16 bit", "colour"])
