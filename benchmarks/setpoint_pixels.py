@@ -21,7 +21,7 @@ import numpy as np
 
 from pipeline.setpoint import calibration, deployment, judging, nozzle_scene, pixels
 from pipeline.setpoint.baselines import Proportional, proportional
-from pipeline.setpoint.bayes import bayes, robust_filter, segment_filter
+from pipeline.setpoint.bayes import bayes, robust_filter
 from pipeline.setpoint.classifier import Labelled, along_bead, predict, train, untrained
 from pipeline.setpoint.deployment import ACTS, Limits, Waits
 from pipeline.setpoint.pixels import Disturbances, Episodes, Loop, Machine, calm
@@ -34,9 +34,8 @@ MACHINE = Machine(heater_s=15.0, heater_delay_s=2.0, melt_s=1.2, softening_per_d
 LIMITS = Limits(np.array([20.0, 180.0]), np.array([310.0, 240.0]), np.array([10.0, 20.0]), np.array([180.0, 40.0]))
 SEGMENT_S, TIP_TOLERANCE_PX = 10.0, 4.0
 EDGES = np.r_[20, 30, 40, 50, 60, np.arange(70, 130.1, 2.5), 150, 180, 220, 260, 310]
-ROBUST = {"accuracy": 0.7, "looks": 5, "look": 0.055, "floor": 0.03, "smoothing": 4.0, "segment": 12.0, "switch": 3e-4, "hazard": 6e-4}
-ROBUST |= {"move_cost": 0.38, "outside_cost": 5.0}
-BY_SEGMENT = {"accuracy": 0.7, "floor": 0.05, "smoothing": 4.0, "switch": 3e-4, "hazard": 1e-3, "move_cost": 0.4, "outside_cost": 10.0}
+ROBUST = {"accuracies": [0.7, 0.97], "gains": [1.0, 0.65], "looks": 5, "look": 0.08, "floor": 0.03, "smoothing": 4.0, "switch": 3e-4, "hazard": 6e-4}
+ROBUST |= {"move_cost": 0.25, "outside_cost": 3.0}
 SEGMENTS = 24  # whose windows are recorded
 
 
@@ -190,7 +189,7 @@ def main(runs: int, weights: Path | None) -> None:
 
     def ours(loop):
         decisions = max(SEGMENT_S / (loop.waits.flow_s + frames / RATE_HZ), 1.2)
-        return bayes(1 + SEGMENTS), segment_filter(table, segment=decisions, **BY_SEGMENT)
+        return bayes(14), robust_filter(table, segment=decisions, **ROBUST)
 
     def case(name, controller, loop, disturbances, decisions, judged):
         began, n = time.process_time(), len(disturbances.clog)
@@ -205,12 +204,11 @@ def main(runs: int, weights: Path | None) -> None:
 
     derived, n, few = published._replace(waits=waits), 21 * runs, 21 * max(1, runs // 5)
     clog = calm(few)._replace(clog=np.full(few, 0.6), clog_at=np.full(few, 60))
-    case("Bayes by segment, wait 6 s", ours(published), published, calm(n), 100, summary)
-    case("Bayes by segment, derived wait", ours(derived), derived, calm(n), 100, summary)
+    case("Bayes, robust, wait 6 s", ours(published), published, calm(n), 100, summary)
+    case("Bayes, robust, derived wait", ours(derived), derived, calm(n), 100, summary)
     for name, disturbances in bursts(21).items():
         case(name, ours(published), published, disturbances, 20, held_after)
-    case("Bayes by segment, clog x 0.6 at 60 of 120", ours(published), published, clog, 120, summary)
-    case("Bayes, robust, wait 6 s", (bayes(6), robust_filter(table, **ROBUST)), published, calm(few), 100, summary)
+    case("Bayes, robust, clog x 0.6 at 60 of 120", ours(published), published, clog, 120, summary)
     case(
         "filtered proportional, wait 6 s", (proportional(), Proportional(gain=11.4, time_constant=11.2)), published, calm(few), 100, summary
     )

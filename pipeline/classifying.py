@@ -99,13 +99,14 @@ def _trained(
 def _check_parts(p: TrainClassifier, found: Mapping[str, Seen]) -> None:
     """Raises ValueError where a class is learned in too few stretches for the yardstick's folds, a part has no window, or too few segments have one for the sets that are
     asked for (calibration.conformal_level)."""
+    of = "prints" if p.source == "recordings" else "segments"
     learned = Labelled(*found["learned"].labelled())
     for c, name in enumerate(classifier.CLASS_NAMES):
         stretches = len(np.unique(learned.segment[learned.label == c]))
         if stretches < FOLDS:
             raise ValueError(
                 f"expected at least {FOLDS} stretches of constant settings of class {c}, {name}, to learn from, found {stretches}; record more prints, "
-                "or raise train_classifier.segments.learned"
+                f"or raise train_classifier.{of}.learned"
             )
     for part in ("judged", "calibration"):
         data = _all(p, found[part])
@@ -117,10 +118,9 @@ def _check_parts(p: TrainClassifier, found: Mapping[str, Seen]) -> None:
             )
     there, needed = len(np.unique(data.segment[rows[:, 0]])), int(np.ceil(np.log(1 - p.confidence) / np.log(p.coverage)))
     if there < needed:
-        of = "prints" if p.source == "recordings" else "segments"
         raise ValueError(
             f"expected windows of at least log(1 - confidence) / log(coverage) = {needed} {of} to calibrate with, found {there}; add {of}, raise "
-            "train_classifier.segments.calibration, or lower train_classifier.coverage or confidence"
+            f"train_classifier.{of}.calibration, or lower train_classifier.coverage or confidence"
         )
 
 

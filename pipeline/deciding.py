@@ -38,13 +38,6 @@ class ClassFilter(Section):
     outside_cost: float = Field(ge=0, le=1000)
 
 
-class SegmentFilter(ClassFilter):
-    floor: float = Field(gt=0, lt=1)
-    smoothing: float = Field(gt=0, le=100)
-    segment: float = Field(ge=1, le=10_000)
-    switch: float = Field(gt=0, lt=1)
-
-
 class Baselines(Section):
     """Settings of the controllers without learning, tuned on windows and seeds that nothing is judged on."""
 
@@ -54,7 +47,6 @@ class Baselines(Section):
     bayes_exact: ClassFilter
     bayes_leak: ClassFilter
     bayes_robust: RobustFilter
-    bayes_by_segment: SegmentFilter
 
 
 class Pixels(Section):
@@ -114,11 +106,8 @@ def seats(p: Baselines, agents: Agents, learned: WindowTable) -> dict[str, Seat]
         "sequential test": (baselines.sequential_test(), baselines.SequentialTest(**p.sequential_test.model_dump())),
         "Bayes, exact model": (bayes.bayes(1), bayes.class_filter(**p.bayes_exact.model_dump())),
         "Bayes with leak": (bayes.bayes(1), bayes.class_filter(**p.bayes_leak.model_dump())),
-        "Bayes, robust": (bayes.bayes(1 + p.bayes_robust.looks), bayes.robust_filter(learned, **p.bayes_robust.model_dump())),
+        "Bayes, robust": (bayes.bayes(p.bayes_robust.hypotheses()), bayes.robust_filter(learned, **p.bayes_robust.model_dump())),
     }
-    segments = len(np.unique(learned.segment))
-    if len(learned.named) >= 4 * segments:  # of a folder, a segment is seen at one flow only, which tells nothing of others
-        without["Bayes by segment"] = (bayes.bayes(1 + segments), bayes.segment_filter(learned, **p.bayes_by_segment.model_dump()))
     paper = agent.greedy(agent.paper_sight())
     found = {
         name: Seat("baseline", one, jax.tree.map(partial(jnp.asarray, dtype=jnp.float32), settings))

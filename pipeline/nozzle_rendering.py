@@ -9,7 +9,8 @@ import numpy as np
 from pipeline.setpoint import nozzle_scene
 
 # bins of the true flow in percent: fine where controllers must find 100 %, wide where any window says the same
-FLOW_EDGES = np.concatenate([np.arange(20, 70, 10.0), np.arange(70, 130, 2.5), np.arange(130, 311, 20.0)])
+FLOW_EDGES = np.concatenate([[20.0, 35, 50, 60, 70], np.arange(75, 125, 2.5), np.arange(125, 150, 5.0), np.arange(150, 311, 40.0)])
+FINE = (75.0, 125.0)  # in which a controller stays, and would see one window's chance again and again
 
 
 class Seen(NamedTuple):
@@ -41,15 +42,21 @@ def rendered(seed: Sequence[int], frames: int, least_score: float) -> Seen:
     )
 
 
-def swept(seed: Sequence[int], frames: int, least_score: float) -> Seen:
-    """One segment's conditions at a flow in each bin, all at one temperature."""
+def swept(seed: Sequence[int], windows: float, frames: int, least_score: float) -> Seen:
+    """One segment's conditions, all at one temperature, over all bins of the flow: windows of `frames` frames with a flow each.
+
+    windows: how many in each bin within FINE on average; elsewhere no more than one.
+    """
     rng = np.random.default_rng(seed)
     segment, degrees = nozzle_scene.draw_segment(rng), rng.choice(nozzle_scene.TEMPERATURES)
     pieces = []
     for low, high in itertools.pairwise(FLOW_EDGES):
-        flow, temperature = np.full(frames, rng.uniform(low, high)), np.full(frames, degrees)
+        count = int((windows if FINE[0] <= low < FINE[1] else min(windows, 1.0)) + rng.random())
+        if count == 0:
+            continue
+        flow, temperature = np.repeat(rng.uniform(low, high, count), frames), np.full(count * frames, degrees)
         cut = nozzle_scene.key_areas(nozzle_scene.render(segment, flow, temperature, rng), least_score=least_score)
-        number = np.zeros(frames, int)
+        number = np.zeros(len(flow), int)
         pieces.append(Seen(cut.images, nozzle_scene.label(flow), flow, temperature, number, number, cut.valid, np.array(cut.reasons, object)))
     return Seen(*(np.concatenate(columns) for columns in zip(*pieces, strict=True)))
 

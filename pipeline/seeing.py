@@ -10,7 +10,7 @@ from joblib import delayed
 from pydantic import Field
 from tqdm import tqdm
 
-from pipeline import nozzle_frames
+from pipeline import artifacts, nozzle_frames
 from pipeline.execution import run_all
 from pipeline.nozzle_frames import NozzleFrames, Reading
 from pipeline.nozzle_recordings import Topics
@@ -32,10 +32,13 @@ class Counts(Section):
 
 
 class Recorded(Section):
-    """Segments whose windows at every flow are recorded for the simulator: those that controllers are trained and tuned on, and those that they are judged on."""
+    """Segments whose windows over the whole range of flows are recorded for the simulator, and windows of each in a bin of the flow: those that controllers are trained
+    and tuned on (many segments, as what a segment adds stays with its windows), and those that they are judged on."""
 
     learn: int = Field(ge=1, le=1000)
     judge: int = Field(ge=1, le=1000)
+    learn_windows: float = Field(gt=0, le=100)
+    judge_windows: float = Field(gt=0, le=100)
 
 
 class Recipe(Section):
@@ -80,6 +83,7 @@ class TrainClassifier(Section):
     size: Literal["small", "paper"]
     augmentation: Literal["along_bead", "adr"]
     segments: Counts
+    prints: Counts
     frames: Counts
     window: int = Field(ge=1, le=1000)
     least_score: float = Field(ge=0, le=255)
@@ -102,7 +106,8 @@ def parts(p: TrainClassifier, folder: str, execution: Execution) -> tuple[dict[s
             folder, Reading(p.tip_px, p.least_score, p.topics.topics()), execution, memo=Path("datasets/memo/train_classifier")
         )
         nozzle_frames.check(folder, frames)
-        return _by_print(p, frames), nozzle_frames.figures(frames)
+        with artifacts.about(folder):
+            return _by_print(p, frames), nozzle_frames.figures(frames)
     counts = p.segments.model_dump()
     frames = p.frames.model_dump()
     calls = [delayed(rendered)((p.seed, k, i), frames[part], p.least_score) for k, part in enumerate(PARTS) for i in range(counts[part])]
@@ -122,13 +127,13 @@ def _kind(reason: str) -> str:
 
 
 def _by_print(p: TrainClassifier, frames: NozzleFrames) -> dict[str, Seen]:
-    """The frames of a folder, its prints dealt out to the parts in proportion to `segments`; frames without a known class or temperature are left out."""
+    """The frames of a folder, its prints dealt out to the parts in proportion to `prints`; frames without a known class or temperature are left out."""
     known = (frames.label >= 0) & np.isfinite(frames.temperature)
     seen = Seen(
         frames.images, frames.label, frames.flow, frames.temperature, frames.print_number, frames.segment, frames.valid, np.array(frames.reasons, object)
     ).take(known)  # fmt: skip
     valid = seen.take(seen.valid)
-    shares = tuple(float(n) for n in p.segments.model_dump().values())
+    shares = tuple(float(n) for n in p.prints.model_dump().values())
     chosen = split_by_segment(
         Labelled(valid.images, valid.temperature, valid.label, valid.print_number), shares=shares, rng=np.random.default_rng(p.seed)
     )
@@ -142,9 +147,11 @@ def to_record(p: TrainClassifier, found: dict[str, Seen], execution: Execution) 
     """Frames whose windows controllers are trained on ("learn") and judged on ("judge"): rendered over the whole range of flows, or what a folder has for calibration and judging."""
     if p.source == "recordings":
         return {"learn": found["calibration"], "judge": found["judged"]}
-    counts = p.recorded.model_dump()
+    counts, windows = {"learn": p.recorded.learn, "judge": p.recorded.judge}, (p.recorded.learn_windows, p.recorded.judge_windows)
     calls = [
-        delayed(swept)((p.seed, len(PARTS) + k, i), p.window, p.least_score) for k, part in enumerate(counts) for i in range(counts[part])
+        delayed(swept)((p.seed, len(PARTS) + k, i), windows[k], p.window, p.least_score)
+        for k, part in enumerate(counts)
+        for i in range(counts[part])
     ]
     done = iter(tqdm(run_all(calls, execution), total=len(calls), desc="train_classifier: windows at every flow", mininterval=2))
     return {part: joined([next(done) for _ in range(count)]) for part, count in counts.items()}

@@ -52,7 +52,8 @@ class Paper(Learning):
 class RobustFilter(Section):
     """Settings of bayes.robust_filter."""
 
-    accuracy: float = Field(gt=0.34, lt=1)
+    accuracies: list[Annotated[float, Field(gt=0.34, lt=1)]] = Field(min_length=1, max_length=20)
+    gains: list[Annotated[float, Field(gt=0, le=10)]] = Field(min_length=1, max_length=20)
     looks: int = Field(ge=1, le=51)
     look: float = Field(gt=0, le=1)
     floor: float = Field(gt=0, lt=1)
@@ -62,6 +63,9 @@ class RobustFilter(Section):
     hazard: float = Field(ge=0, lt=1)
     move_cost: float = Field(ge=0, le=10)
     outside_cost: float = Field(ge=0, le=1000)
+
+    def hypotheses(self) -> int:
+        return len(self.gains) * (len(self.accuracies) + self.looks)
 
 
 class Costs(Section):
@@ -85,11 +89,9 @@ class Troubles(Section):
 
 
 class Ours(Learning):
-    """Our agent: the filter whose belief it sees, the gains it reckons with, what a step costs, what it meets, and rounds of updates, the best of which is kept."""
+    """Our agent: the filter whose belief it sees, what a step costs, what it meets, and rounds of updates, the best of which is kept."""
 
     filter: RobustFilter
-    gains: list[Annotated[float, Field(gt=0, le=10)]] = Field(min_length=1, max_length=20)
-    gain_weights: list[Annotated[float, Field(gt=0, le=1)]] = Field(min_length=1, max_length=20)
     costs: Costs
     troubles: Troubles
     updates: int = Field(ge=1, le=10_000_000)
@@ -118,14 +120,9 @@ class Taught(NamedTuple):
 
 def belief(p: Ours, learned: WindowTable) -> Belief:
     """The filter on recorded windows, and the value of each move were the flow seen."""
-    if len(p.gains) != len(p.gain_weights):
-        raise ValueError(
-            f"params.yaml: train_agent.ours: {len(p.gains)} gains but {len(p.gain_weights)} gain_weights; give each gain a weight"
-        )
     found = bayes.robust_filter(learned, **p.filter.model_dump())
     values = belief_agent.seen_values(belief_agent.Costs(**p.costs.model_dump()), p.gamma)
-    shares = np.array(p.gain_weights) / np.sum(p.gain_weights)
-    return Belief(found, jnp.asarray(p.gains, jnp.float32), jnp.asarray(shares, jnp.float32), jnp.asarray(values, jnp.float32), p.gamma)
+    return Belief(found, jnp.asarray(values, jnp.float32), p.gamma)
 
 
 def taught(p: TrainAgent, learned: WindowTable) -> Taught:

@@ -1,15 +1,17 @@
 """Bayes filters for the flow: what the windows say on a grid of flows, under several hypotheses of how the camera errs, and the move with the least expected loss.
 
-The flow is known by its moves and by the windows it shows. The filter carries b(h, q), the belief that the flow is q and the camera errs in the manner h:
+The flow is known by its moves and by the windows it shows. The filter carries b(h, q), the belief that the flow is q, the camera errs in the manner of h, and the
+extruder follows its commands with the gain g_h:
 
-    b(h, q) <- sum_h' T(h', h) [(1 - hazard) b(h', q - move) + hazard b(h') prior(q)]      the move; a clog or the like, with a small probability; another segment
-    b(h, q) <- b(h, q) P(window | h, q) / sum                                              the window
-    a = argmin_a sum b(q) loss(q + a) + move_cost |a|                                      loss(q) = |q - 100| + outside_cost where that is more than 10
+    b(h, q) <- sum_h' T(h', h) [(1 - hazard) b(h', q - g_h' move) + hazard b(h') prior(q)]   the move; a clog or the like, with a small probability; another segment
+    b(h, q) <- b(h, q) P(window | h, q) / sum                                                the window
+    a = argmin_a sum b(h, q) loss(q + g_h a) + move_cost |a|                                 loss(q) = |q - 100| + outside_cost where that is more than 10
 
 Manners of erring (`evidence`): anywhere with one probability, as in the paper's simulator; or as a trained classifier does by its recorded windows, seen through
-a segment that makes every bead look wider or narrower. Which it is, shows by itself.
+a segment that makes every bead look wider or narrower. Which it is, and how the extruder follows, shows by itself.
 """
 
+from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
 
@@ -21,7 +23,19 @@ import scipy.special
 from pipeline.setpoint.baselines import temperature_move
 from pipeline.setpoint.recorded import WindowTable
 from pipeline.setpoint.reward import BEST_FLOW
-from pipeline.setpoint.simulator import CLASSES, FLOW_LIMITS, FLOW_MOVES, GOOD, UNDER, Action, Controller, Observation, flow_class
+from pipeline.setpoint.simulator import (
+    CLASSES,
+    FLOW_LIMITS,
+    FLOW_MOVES,
+    GOOD,
+    UNDER,
+    Action,
+    Controller,
+    Observation,
+    flow_class,
+    nominal,
+    paper_windows,
+)
 
 SPACING = 2.5  # percent: half the smallest move
 GRID = np.arange(FLOW_LIMITS[0], FLOW_LIMITS[1] + SPACING / 2, SPACING)  # (N,)
@@ -32,11 +46,12 @@ CODES = CLASSES * LEVELS
 
 
 class Filter(NamedTuple):
-    """evidence (H, CODES, N) is P(code | h, q); transition (H, H) from row to column at each decision; hazard: probability a decision that the flow jumps;
-    move_cost in percent of flow error by percent of move, outside_cost in percent of flow error."""
+    """evidence (H, CODES, N) is P(code | h, q); transition (H, H) from row to column at each decision; gains (H,), true by commanded move; hazard: probability a
+    decision that the flow jumps; move_cost in percent of flow error by percent of move, outside_cost in percent of flow error."""
 
     evidence: jax.Array
     transition: jax.Array
+    gains: jax.Array
     hazard: float
     move_cost: float
     outside_cost: float
@@ -55,7 +70,7 @@ def bayes(hypotheses: int) -> Controller:
 
 def believed(parameters: Filter, belief: jax.Array, observation: Observation) -> jax.Array:
     """The belief (H, N) after the move that led to this window, and the window."""
-    moved = shifted(belief, observation.flow_move)
+    moved = jax.vmap(shifted)(belief, parameters.gains * observation.flow_move)
     jumped = belief.sum(axis=1, keepdims=True) * jnp.asarray(PRIOR, jnp.float32)
     predicted = parameters.transition.T @ ((1.0 - parameters.hazard) * moved + parameters.hazard * jumped)
     posterior = predicted * parameters.evidence[:, code(observation.shares, observation.named)]
@@ -65,22 +80,23 @@ def believed(parameters: Filter, belief: jax.Array, observation: Observation) ->
 def expected_loss(parameters: Filter, belief: jax.Array) -> jax.Array:
     """Of each of the five moves (5), in percent of flow error."""
     moves = jnp.asarray(FLOW_MOVES)
-    miss = jnp.abs(GRID + moves[:, None] - BEST_FLOW)
-    return (miss + parameters.outside_cost * (miss > 10.0)) @ belief.sum(axis=0) + parameters.move_cost * jnp.abs(moves)
+    miss = jnp.abs(GRID + parameters.gains[:, None] * moves[:, None, None] - BEST_FLOW)  # (5, H, N)
+    # of a miss on the border itself, as little as rounding is not outside
+    return jnp.sum((miss + parameters.outside_cost * (miss > 10.0 + 1e-3)) * belief, axis=(1, 2)) + parameters.move_cost * jnp.abs(moves)
 
 
 def shifted(belief: jax.Array, move: jax.Array) -> jax.Array:
-    """The belief (H, N) moved by `move` percent, linear between grid points; what would leave the grid stays on its last point."""
+    """The belief (..., N) moved by `move` percent, linear between grid points; what would leave the grid stays on its last point."""
     whole = jnp.floor(move / SPACING)
     fraction = move / SPACING - whole
     source = jnp.arange(len(GRID)) - whole.astype(jnp.int32)
 
     def at(index):
-        return jnp.where((index >= 0) & (index < len(GRID)), belief[:, jnp.clip(index, 0, len(GRID) - 1)], 0.0)
+        return jnp.where((index >= 0) & (index < len(GRID)), belief[..., jnp.clip(index, 0, len(GRID) - 1)], 0.0)
 
     moved = (1.0 - fraction) * at(source) + fraction * at(source - 1)
     last = jnp.arange(len(GRID)) == jnp.where(move > 0, len(GRID) - 1, 0)
-    return moved + last * (belief.sum(axis=1) - moved.sum(axis=1))[:, None]
+    return moved + last * (belief.sum(axis=-1, keepdims=True) - moved.sum(axis=-1, keepdims=True))
 
 
 def code(shares: jax.Array, named: jax.Array) -> jax.Array:
@@ -91,9 +107,21 @@ def code(shares: jax.Array, named: jax.Array) -> jax.Array:
 
 
 def class_evidence(accuracy: float) -> np.ndarray:
-    """(1, CODES, N): the class is right with this probability and one of the others otherwise, wherever the flow is; the shares say nothing more."""
+    """(1, CODES, N): the class is right with this probability and one of the others otherwise, wherever the flow is; the shares are those of (7) for the class named,
+    which say nothing more of the flow."""
     right = np.arange(CODES)[:, None] // LEVELS == np.asarray(flow_class(GRID))
-    return np.where(right, accuracy, (1.0 - accuracy) / (CLASSES - 1))[None] / LEVELS
+    return (np.where(right, accuracy, (1.0 - accuracy) / (CLASSES - 1)) * _paper_levels()[:, None])[None]
+
+
+@cache
+def _paper_levels() -> np.ndarray:
+    """(CODES,) P(code | class named) under (7), by the midpoints of its two uniform numbers, with a floor of 1 % for every level."""
+    u = jnp.stack(jnp.meshgrid(*2 * [(jnp.arange(100) + 0.5) / 100], indexing="ij"), axis=-1).reshape(-1, 2)
+    found = np.zeros(CODES)
+    for flow in (50.0, 100.0, 150.0):
+        drawn = jax.vmap(lambda pair, flow=flow: paper_windows().draw((), nominal(flow, 210.0, accuracy=1.0), flow, 0.0, jnp.concatenate([jnp.zeros(1), pair])))(u)
+        found += np.bincount(np.asarray(code(*drawn)), minlength=CODES) / len(u)
+    return 0.99 * found + 0.01 / LEVELS
 
 
 def recorded_evidence(table: WindowTable, *, look: float, looks: int, floor: float, smoothing: float) -> np.ndarray:
@@ -114,55 +142,32 @@ def recorded_evidence(table: WindowTable, *, look: float, looks: int, floor: flo
     return np.swapaxes((1.0 - floor) * shown / shown.sum(axis=2, keepdims=True) + floor / CODES, 1, 2)
 
 
-def robust_filter(table: WindowTable, *, accuracy: float, looks: int, look: float, floor: float, smoothing: float, segment: float, switch: float,
-                  hazard: float, move_cost: float, outside_cost: float) -> Filter:  # fmt: skip
-    """The filter for both simulators: hypothesis 0 errs anywhere (`accuracy`), 1 .. looks as recorded, each the look of a segment that lasts `segment` decisions.
+def robust_filter(table: WindowTable, *, accuracies: Sequence[float], gains: Sequence[float], looks: int, look: float, floor: float, smoothing: float,
+                  segment: float, switch: float, hazard: float, move_cost: float, outside_cost: float) -> Filter:  # fmt: skip
+    """The filter for both simulators: for each of `gains` the manners of erring are anywhere with each of `accuracies`, then `looks` as recorded, each the look of a
+    segment that lasts `segment` decisions.
 
-    switch: probability a decision of going over from erring anywhere to erring as recorded, or back.
+    switch: probability a decision of going over from one way of erring (any of `accuracies`, or as recorded) to another.
     """
-    evidence = np.concatenate(
-        [class_evidence(accuracy), recorded_evidence(table, look=look, looks=looks, floor=floor, smoothing=smoothing)]
-    )
+    recorded = recorded_evidence(table, look=look, looks=looks, floor=floor, smoothing=smoothing)
+    evidence = np.concatenate([*(class_evidence(accuracy) for accuracy in accuracies), recorded])
+    transition = np.kron(np.eye(len(gains)), _changes(len(accuracies), looks, segment, switch))
     return Filter(
-        jnp.asarray(evidence, jnp.float32), jnp.asarray(_changes(looks, segment, switch), jnp.float32), hazard, move_cost, outside_cost
-    )
+        jnp.asarray(np.tile(evidence, (len(gains), 1, 1)), jnp.float32), jnp.asarray(transition, jnp.float32),
+        jnp.repeat(jnp.asarray(gains, jnp.float32), len(evidence)), hazard, move_cost, outside_cost,
+    )  # fmt: skip
 
 
-def segment_filter(table: WindowTable, *, accuracy: float, floor: float, smoothing: float, segment: float, switch: float, hazard: float, move_cost: float,
-                   outside_cost: float) -> Filter:  # fmt: skip
-    """The filter whose hypotheses 1 .. are the recorded segments themselves: P(code | segment, q) from each one's own windows, smoothed over flow and over neighbouring codes;
-    hypothesis 0 errs anywhere (`accuracy`). For tables in which a segment is seen at many flows; other arguments as of `robust_filter`.
-    """
-    edges = np.asarray(table.flow_edges, float)
-    centre, width = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
-    codes = np.asarray(code(jnp.asarray(table.shares), jnp.asarray(table.named)))
-    near = np.exp(-0.5 * (np.arange(CODES)[:, None] - np.arange(CODES)) ** 2.0)
-    weight = np.exp(-0.5 * ((GRID[:, None] - centre) / np.maximum(smoothing, width / 2)) ** 2)
-    evidence = [class_evidence(accuracy)[0]]
-    for s in np.unique(table.segment):
-        counts = np.zeros((len(centre), CODES))
-        np.add.at(counts, (table.flow_bin[table.segment == s], codes[table.segment == s]), 1.0)
-        shown = weight @ (counts @ (near / near.sum(axis=1, keepdims=True)) * width[:, None])
-        evidence.append(((1 - floor) * shown / np.maximum(shown.sum(axis=1, keepdims=True), 1e-300) + floor / CODES).T)
-    looks = len(evidence) - 1
-    return Filter(
-        jnp.asarray(np.array(evidence), jnp.float32),
-        jnp.asarray(_changes(looks, segment, switch), jnp.float32),
-        hazard,
-        move_cost,
-        outside_cost,
-    )
-
-
-def _changes(looks: int, segment: float, switch: float) -> np.ndarray:
-    """(looks + 1, looks + 1): from erring anywhere (row 0) to erring as recorded or back with probability `switch`; looks last `segment` decisions."""
-    transition = np.zeros((looks + 1, looks + 1))
-    transition[0, 0], transition[0, 1:] = 1.0 - switch, switch / looks
-    transition[1:, 0] = switch
-    transition[1:, 1:] = (1.0 - switch) * ((1.0 - 1.0 / segment) * np.eye(looks) + 1.0 / segment / looks)
+def _changes(anywhere: int, looks: int, segment: float, switch: float) -> np.ndarray:
+    """(anywhere + looks, anywhere + looks): ways of erring are left with probability `switch` for any of them alike; looks last `segment` decisions."""
+    ways = anywhere + 1
+    transition = np.full((anywhere + looks, anywhere + looks), switch / ways)
+    transition[:, anywhere:] /= looks
+    transition[:anywhere, :anywhere] += (1.0 - switch) * np.eye(anywhere)
+    transition[anywhere:, anywhere:] += (1.0 - switch) * ((1.0 - 1.0 / segment) * np.eye(looks) + 1.0 / segment / looks)
     return transition
 
 
 def class_filter(*, accuracy: float, hazard: float, move_cost: float, outside_cost: float) -> Filter:
     """The filter of the paper's simulator: exact with hazard 0, and with a leak otherwise."""
-    return Filter(jnp.asarray(class_evidence(accuracy), jnp.float32), jnp.ones((1, 1)), hazard, move_cost, outside_cost)
+    return Filter(jnp.asarray(class_evidence(accuracy), jnp.float32), jnp.ones((1, 1)), jnp.ones(1), hazard, move_cost, outside_cost)

@@ -2,7 +2,7 @@
 that is nearly Markov. It starts from the value that the belief would have were the flow seen from the next step on, and double Q-learning in disturbed episodes adds
 what that leaves out: hesitation while moves are cheap to regret, haste after a clog, and distrust of the filter where the machine is none of its hypotheses.
 
-Nothing tells the agent the classifier's accuracy, the actuator's gain or the setpoint: accuracies are hypotheses of the filter, and moves count with several gains.
+Nothing tells the agent the classifier's accuracy, the actuator's gain or the setpoint: accuracies and gains are hypotheses of the filter.
 """
 
 from typing import NamedTuple
@@ -43,12 +43,9 @@ AHEAD = 40  # steps after which a heater of (6) has 1e-4 of its way left
 
 
 class Belief(NamedTuple):
-    """filter: of bayes.py; gains (g,) and their weights (g,): true by commanded move, drawn anew at each move; values (5, N): of each flow action
-    were the flow seen, under the discount gamma."""
+    """filter: of bayes.py; values (5, N): of each flow action were the flow seen, under the discount gamma."""
 
     filter: bayes.Filter
-    gains: jax.Array
-    weights: jax.Array
     values: jax.Array
     gamma: float
 
@@ -100,14 +97,6 @@ def _pooling() -> np.ndarray:
 POOLING = _pooling()
 
 
-def updated(of: Belief, belief: jax.Array, observation: Observation) -> jax.Array:
-    """The belief (H, N) after the executed move, by each gain in its weight, and the window."""
-    moved = jax.vmap(bayes.shifted, (None, 0))(belief, of.gains * observation.flow_move)
-    return bayes.believed(
-        of.filter, jnp.tensordot(of.weights, moved, 1), observation._replace(flow_move=jnp.zeros_like(observation.flow_move))
-    )
-
-
 def slower(gamma: float) -> float:
     """The temperature's discount a step, gamma^(1/lambda): from one of its actions to the next as much is lost as from one action of the flow to the next."""
     return gamma ** (1 / LAMBDA)
@@ -131,7 +120,7 @@ def belief_sight(of: Belief) -> Sight:
     pooling, start = jnp.asarray(POOLING, jnp.float32), jnp.tile(jnp.asarray(bayes.PRIOR, jnp.float32) / hypotheses, (hypotheses, 1))
 
     def see(network, belief, observation):
-        belief = updated(of, belief, observation)
+        belief = bayes.believed(of.filter, belief, observation)
         flow, clock = belief.sum(axis=0), observation.step % LAMBDA
         temperatures = (jnp.stack([observation.temperature, observation.target]) - BEST_TEMPERATURE) / TEMPERATURE_SCALE
         rest = [standing_values(observation, slower(of.gamma)), temperatures, jnp.stack([clock / LAMBDA, clock == 0])]

@@ -36,7 +36,17 @@ from pipeline.setpoint.simulator import STAND, Observation, State, nominal, pape
 SMALL = Setting(gamma=0.99, tau=0.005, batch=64, capacity=512, environments=8, episode=100)
 EXPLORE = {"explore": 1.0, "explore_again": 0.3, "least": 0.05}
 COSTS = belief_agent.Costs(scale=10.0, outside=0.5, move=0.1)
-FILTER = {"accuracy": 0.7, "looks": 3, "look": 0.06, "floor": 0.04, "smoothing": 3.0, "segment": 14.0, "switch": 4e-4, "hazard": 5e-4}
+FILTER = {
+    "accuracies": [0.7],
+    "gains": [1.0, 0.7],
+    "looks": 3,
+    "look": 0.06,
+    "floor": 0.04,
+    "smoothing": 3.0,
+    "segment": 14.0,
+    "switch": 4e-4,
+    "hazard": 5e-4,
+}
 
 
 def observation(named=1, flow_move=0.0, temperature=210.0, target=210.0, step=0):
@@ -54,9 +64,7 @@ def observation(named=1, flow_move=0.0, temperature=210.0, target=210.0, step=0)
 def known():
     table = synthetic_table(np.random.default_rng(1), segments=20, windows=5)
     model = bayes.robust_filter(table, move_cost=0.0, outside_cost=0.0, **FILTER)
-    return belief_agent.Belief(
-        model, jnp.array([1.0, 0.7]), jnp.array([0.7, 0.3]), jnp.asarray(belief_agent.seen_values(COSTS, 0.8), jnp.float32), 0.8
-    )
+    return belief_agent.Belief(model, jnp.asarray(belief_agent.seen_values(COSTS, 0.8), jnp.float32), 0.8)
 
 
 # ---- the paper's network

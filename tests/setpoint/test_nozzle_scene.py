@@ -49,16 +49,17 @@ def test_the_bead_is_a_stadium_of_the_flow_with_the_stated_spread():
     assert 0.05 < np.corrcoef(both[:, 0], both[:, 1])[0, 1] < 0.55
 
 
-def test_a_drawn_bead_is_as_wide_as_its_truth_says():
+def test_a_drawn_bead_is_as_wide_as_its_truth_says(monkeypatch):
+    monkeypatch.setattr(nozzle_scene, "SHADING", (0.0, 0.0))
     rng = np.random.default_rng(8)
     for flow in (60.0, 100.0, 160.0):
-        segment = nozzle_scene.draw_segment(rng)._replace(noise=0.0, blur_px=0.3, contrast=100.0, shading=0.0, specular=0.0)
+        segment = nozzle_scene.draw_segment(rng)._replace(noise=0.0, blur_px=0.3, contrast=100.0, specular=0.0)
         segment = segment._replace(ground=np.full_like(segment.ground, 40), texture=np.zeros_like(segment.texture))
         made = nozzle_scene.render(segment, np.full(6, flow), 210.0, rng)
         far = segment.at[(segment.along > 40) & (segment.along < 120)]
-        # area of the bright band by its length; edges that wander by 12 percent over 25 px leave 3 percent in the mean of six
+        # area of the bright band by its length; edges that wander by 26 percent over 25 px leave 6 percent in the mean of six
         drawn = (made.frames.reshape(6, -1)[made.line][:, far] > 90).sum(axis=1) / 80
-        assert drawn.mean() == pytest.approx(made.width_px[made.line].mean(), rel=0.1)
+        assert drawn.mean() == pytest.approx(made.width_px[made.line].mean(), rel=0.15)
 
 
 def test_one_frame_in_sixteen_has_no_line_and_the_front_end_rejects_it():
