@@ -54,7 +54,7 @@ def test_the_first_screen_holds_the_verdict_and_the_twelve_answers_in_their_orde
     for row, title in zip(rows, ANSWERS, strict=True):
         assert row.locator("th").inner_text().startswith(title)
         assert row.locator("td").nth(1).inner_text().strip()
-    for found in (page.locator("h1"), page.locator(".rules"), page.locator(".why"), *rows):
+    for found in (page.locator("h1"), page.locator(".rules"), *page.locator(".why").all(), *rows):
         box = box_of(found)
         assert box["y"] >= 0 and box["y"] + box["height"] <= 800 and box["x"] + box["width"] <= 1280
 
