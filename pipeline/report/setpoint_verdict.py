@@ -319,10 +319,13 @@ def verdict(sources: Sources) -> Verdict:
 
 def _conditions(tested: Sequence[Rule], column: int, rendered: bool) -> str:
     """What would have to come out before the loop may steer: every rule that does not pass with its figure, and what to try."""
-    short = [rule for rule in tested if rule.states[0 if rule.seeing else column] != PASSED]
-    asked = [f"{rule.name[:1].lower()}{rule.name[1:]} {rule.limit} (now {rule.figures[0 if rule.seeing else column]})" for rule in short]
+    short = [(rule, 0 if rule.seeing else column) for rule in tested if rule.states[0 if rule.seeing else column] != PASSED]
+    asked = [
+        f"{rule.name[:1].lower()}{rule.name[1:]} {rule.limit} (now {rule.figures[k]}{', but its interval crosses the limit' if rule.states[k] == UNDECIDED else ''})"
+        for rule, k in short
+    ]
     real = " Recordings of the real printer: none are in (datasets/raw/setpoint)." if rendered else ""
-    return f"Before it may: {', '.join(asked)}.{real} To try: {' '.join(dict.fromkeys(rule.remedy for rule in short if rule.remedy))}"
+    return f"Before it may: {', '.join(asked)}.{real} To try: {' '.join(dict.fromkeys(rule.remedy for rule, _ in short if rule.remedy))}"
 
 
 def _closest(name: str, rule: Rule, column: int) -> str:
