@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from pipeline.nightly import champion, guarding, night, processes, watch
-from tests.toy_nights import Project
+from tests.toy_nights import Project, entered
 
 TOMORROW = datetime.timedelta(days=1)
 
@@ -31,12 +31,7 @@ def first(tmp_path_factory):
 @pytest.fixture
 def project(first, tmp_path, monkeypatch):
     """A copy of it, and this process in it, as the job is."""
-    shutil.copytree(first.folder, tmp_path / "toy", symlinks=True)
-    copy = Project(tmp_path / "toy")
-    monkeypatch.chdir(copy.folder)
-    for name in ("PATH", "PYTHONPATH", "DVC_NO_ANALYTICS", "GIT_CONFIG_GLOBAL", "GIT_CONFIG_SYSTEM"):
-        monkeypatch.setenv(name, copy.env[name])
-    return copy
+    return entered(first, tmp_path / "toy", monkeypatch)
 
 
 def test_a_night_without_new_data_is_done_in_seconds_and_commits_nothing(project):

@@ -1,6 +1,5 @@
 """Deposition and setpoint, from what their stages scored to what is in production: a better challenger goes in, a worse one or one with a worse guard does not."""
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +7,7 @@ import pytest
 
 from pipeline import artifacts, schemas, setpoint_schemas
 from pipeline.nightly import accepting, champion, inputs, night, screening, watch
-from tests.toy_nights import Project
+from tests.toy_nights import Project, entered
 
 LOOPS = {
     "deposition": ["datasets/compose_parts/scores.parquet"],
@@ -24,11 +23,7 @@ def empty(tmp_path_factory):
 @pytest.fixture
 def project(empty, tmp_path, monkeypatch):
     """A project with one loop, whose stages score what the test says in place of `dvc repro`."""
-    shutil.copytree(empty.folder, tmp_path / "toy", symlinks=True)
-    copy = Project(tmp_path / "toy")
-    monkeypatch.chdir(copy.folder)
-    for name in ("PATH", "PYTHONPATH", "DVC_NO_ANALYTICS", "GIT_CONFIG_GLOBAL", "GIT_CONFIG_SYSTEM"):
-        monkeypatch.setenv(name, copy.env[name])
+    copy = entered(empty, tmp_path / "toy", monkeypatch)
     Path("dvc.lock").write_text("schema: '2.0'\nstages: {}\n")
     return copy
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -148,3 +149,13 @@ class Project:
 
     def dirty(self) -> list[str]:
         return self.run("git", "status", "--porcelain").stdout.splitlines()
+
+
+def entered(project: Project, place: Path, monkeypatch) -> Project:
+    """A copy of a project at `place`, and this process in it, as the job is."""
+    shutil.copytree(project.folder, place, symlinks=True)
+    copy = Project(place)
+    monkeypatch.chdir(copy.folder)
+    for name in ("PATH", "PYTHONPATH", "DVC_NO_ANALYTICS", "GIT_CONFIG_GLOBAL", "GIT_CONFIG_SYSTEM"):
+        monkeypatch.setenv(name, copy.env[name])
+    return copy

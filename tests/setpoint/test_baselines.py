@@ -10,7 +10,7 @@ import pytest
 from pipeline.setpoint import bayes, judging
 from pipeline.setpoint.baselines import Proportional, SequentialTest, nearest, proportional, sequential_test, temperature_move
 from pipeline.setpoint.recorded import recorded_windows, synthetic_table
-from pipeline.setpoint.simulator import FLOW_MOVES, TEMPERATURE_MOVES, Observation, paper_windows
+from pipeline.setpoint.simulator import FLOW_MOVES, TEMPERATURE_MOVES, Observation, nominal, paper_windows
 
 KEY = jax.random.key(0)
 PURE = {0: [0.76, 0.17, 0.07], 1: [0.15, 0.7, 0.15], 2: [0.07, 0.17, 0.76]}  # the mean window of each class
@@ -143,6 +143,42 @@ def test_a_thin_looking_segment_is_told_from_a_low_flow_by_its_end(table):
         answers.append(FLOW_MOVES[int(action.flow)])
     assert not any(answers[20:203])
     assert answers[-1] > 0
+
+
+def test_a_weak_extruder_moves_its_own_hypothesis_by_less_and_asks_for_more(table):
+    blind = np.full((2, bayes.CODES, len(bayes.GRID)), 1 / bayes.CODES)
+    parameters = bayes.Filter(jnp.asarray(blind), jnp.eye(2), jnp.array([1.0, 0.5]), 0.0, 0.0, 0.0)
+    belief = jnp.zeros((2, len(bayes.GRID))).at[:, 16].set(0.5)  # 60 %, either way of following
+    after = np.asarray(bayes.believed(parameters, belief, seen(1, move=10.0)))
+    np.testing.assert_allclose(after @ bayes.GRID / after.sum(axis=1), [70.0, 65.0], rtol=1e-6)
+    # from 60 % a move of 10 leaves a miss of 30 where the extruder follows, of 35 where it follows by half
+    np.testing.assert_allclose(np.asarray(bayes.expected_loss(parameters, belief))[[2, 4]], [40.0, 32.5], rtol=1e-6)
+
+
+def test_an_extruder_that_follows_by_half_is_found_out(table):
+    """Moves of + 10 % from 60 %: the windows name good four moves later where the extruder follows, eight later where it follows by half."""
+    parameters = bayes.robust_filter(table, **{**ROBUST, "gains": [1.0, 0.5]})
+    belief, one = bayes.bayes(14).start(), jax.jit(bayes.believed)
+    for k in range(24):
+        named = 0 if k < 8 else 1 if k < 12 else 2
+        belief = one(parameters, belief, seen(named, move=10.0 if k else 0.0, step=k))
+    weak = float(belief[7:].sum())
+    belief = bayes.bayes(14).start()
+    for k in range(14):
+        named = 0 if k < 4 else 1 if k < 6 else 2
+        belief = one(parameters, belief, seen(named, move=10.0 if k else 0.0, step=k))
+    assert weak > 0.8 > 0.6 > float(belief[7:].sum())
+
+
+def test_the_paper_s_windows_show_the_codes_that_their_evidence_says():
+    u = jax.random.uniform(KEY, (20_000, 3))
+    for flow, named in ((50.0, 0), (100.0, 1), (200.0, 2)):
+        drawn = jax.vmap(lambda one, flow=flow: paper_windows().draw((), nominal(flow, 210.0, accuracy=1.0), flow, 0.0, one))(u)
+        codes = np.bincount(np.asarray(bayes.code(*drawn)), minlength=bayes.CODES) / len(u)
+        said = bayes.class_evidence(0.999)[0, :, int(np.argmin(np.abs(bayes.GRID - flow)))]
+        # 20,000 draws: a deviation of 0.0035 at most; the evidence's floor of 1 % moves a level by as much as 0.004
+        np.testing.assert_allclose(codes, said, atol=0.015)
+        assert codes[named * bayes.LEVELS : (named + 1) * bayes.LEVELS].sum() == pytest.approx(1.0)
 
 
 # ---- figures
