@@ -167,7 +167,8 @@ def test_an_extruder_that_follows_by_half_is_found_out(table):
     for k in range(14):
         named = 0 if k < 4 else 1 if k < 6 else 2
         belief = one(parameters, belief, seen(named, move=10.0 if k else 0.0, step=k))
-    assert weak > 0.8 > 0.6 > float(belief[7:].sum())
+    assert weak > 0.8
+    assert float(belief[7:].sum()) < 0.6
 
 
 def test_the_paper_s_windows_show_the_codes_that_their_evidence_says():
