@@ -130,6 +130,21 @@ def read_metrics(stage: str) -> dict:
     return read_json(REPORTS / "metrics" / f"{stage}.json")
 
 
+def write_course(folder: str | Path, columns: Mapping[str, Sequence], *, of: str, step: str, figures: Sequence[str]) -> None:
+    """The course of a training as DVCLive writes it, for `dvc plots` and whatever else reads its files: a TSV of `figures` by `step` for every name in column `of`.
+
+    No clock and no experiment is written; a figure that is missing at a step has no line there. Only inside a stage's folder, whose frame puts it in place.
+    """
+    from dvclive import Live  # slow to import, and only stages that train have a course
+
+    with Live(str(folder), save_dvc_exp=False, dvcyaml=None, report=None) as live:
+        for name, at, *values in zip(*(columns[key] for key in (of, step, *figures)), strict=True):
+            live.step = int(at)
+            for figure, value in zip(figures, values, strict=True):
+                if value is not None and np.isfinite(value):
+                    live.log_metric(f"{name.replace(' ', '_')}/{figure}", float(value))
+
+
 def write_text(path: str | Path, text: str) -> None:
     """UTF-8 with Unix line ends."""
     with beside(path) as temporary:

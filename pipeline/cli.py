@@ -1,6 +1,8 @@
 """`./run beadline COMMAND`: what is not a stage."""
 
 import argparse
+import datetime
+import subprocess
 import sys
 from pathlib import Path
 
@@ -21,9 +23,15 @@ def accept(_: argparse.Namespace) -> None:
         if path.is_file() and path.parts[1] not in {"memo"} and not path.parts[1].startswith(".")
     )
     hashes = {path.as_posix(): artifacts.sha256(path) for path in [*files, Path("pipeline"), Path("stages")]}
-    run = {"metrics": metrics, "params": params.read("params.yaml"), "hashes": hashes, "code": code_files(("pipeline", "stages"))}
+    run = {"accepted": _today(), "metrics": metrics, "params": params.read("params.yaml"), "hashes": hashes, "code": code_files(("pipeline", "stages"))}
     artifacts.write_json("reports/accepted.json", run | {"figures": _figures()})
     print(f"reports/accepted.json: accepted {len(metrics)} stages' figures and {len(hashes)} artifacts; commit it to keep it")
+
+
+def _today() -> dict[str, str]:
+    """The day, and the commit that is checked out; "none" where there is none."""
+    head = subprocess.run(["git", "rev-parse", "--short=8", "HEAD"], capture_output=True, text=True, check=False)
+    return {"on": datetime.datetime.now(datetime.UTC).date().isoformat(), "commit": head.stdout.strip() if head.returncode == 0 else "none"}
 
 
 def _figures() -> dict:

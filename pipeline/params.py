@@ -81,6 +81,15 @@ class Plant(Section):
         return self
 
 
+class Mapped(Section):
+    """Where a signal of a recording comes from: source times scale, plus offset."""
+
+    source: str = Field(min_length=1, max_length=300)
+    unit: str = Field(min_length=1, max_length=20)
+    scale: float = Field(ge=-1e9, le=1e9)
+    offset: float = Field(ge=-1e9, le=1e9)
+
+
 class Execution(Section):
     """Section `execution`: where joblib sends its work; one machine (loky) or a cluster (dask with the address of its scheduler)."""
 

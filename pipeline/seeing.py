@@ -15,7 +15,7 @@ from pipeline.execution import run_all
 from pipeline.nozzle_frames import NozzleFrames, Reading
 from pipeline.nozzle_recordings import Topics
 from pipeline.nozzle_rendering import FLOW_EDGES, Seen, joined, rendered, swept
-from pipeline.params import Execution, Section
+from pipeline.params import Execution, Mapped, Section
 from pipeline.setpoint.classifier import Labelled, split_by_segment
 from pipeline.setpoint.recorded import WindowTable
 
@@ -53,15 +53,6 @@ class Recipe(Section):
     smoothing: float = Field(ge=0, lt=1)
     averaging: float = Field(ge=0, lt=1)
     patience: int = Field(ge=1, le=10_000)
-
-
-class Mapped(Section):
-    """Where a signal of a recording comes from: source times scale, plus offset."""
-
-    source: str = Field(min_length=1, max_length=300)
-    unit: str = Field(min_length=1, max_length=20)
-    scale: float = Field(ge=-1e9, le=1e9)
-    offset: float = Field(ge=-1e9, le=1e9)
 
 
 class RecordedTopics(Section):

@@ -10,15 +10,8 @@ from pipeline import artifacts, params
 from pipeline.ingestion import Job, collect, process
 
 
-class Mapped(params.Section):
-    source: str = Field(min_length=1, max_length=300)
-    unit: str = Field(min_length=1, max_length=20)
-    scale: float = Field(ge=-1e9, le=1e9)
-    offset: float = Field(ge=-1e9, le=1e9)
-
-
 class Ingest(params.Section):
-    mapping: dict[str, Mapped]
+    mapping: dict[str, params.Mapped]
     time: str = Field(max_length=300)
     max_gap_s: float = Field(gt=0, le=86400)
     strict: bool

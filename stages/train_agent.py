@@ -11,7 +11,9 @@ def main() -> None:
         tables = seeing.window_tables(artifacts.read_table("datasets/train_classifier/windows.parquet", setpoint_schemas.WINDOWS))
         done = teaching.taught(p, tables["learn"])
         teaching.store(out / "weights.safetensors", done)
-        artifacts.write_table(out / "agents.parquet", setpoint_schemas.AGENT_COURSE, teaching.course_rows(done))
+        course = teaching.course_rows(done)
+        artifacts.write_table(out / "agents.parquet", setpoint_schemas.AGENT_COURSE, course)
+        artifacts.write_course(out / "live", course, of="agent", step="update", figures=("reward",))
         artifacts.write_metrics("train_agent", teaching.metrics(p, done, tables["judge"]))
 
 

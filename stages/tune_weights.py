@@ -90,7 +90,9 @@ def main() -> None:
             "parity": [None if failed else engineering.Trade(*study.tuning_parts(theta)) for theta, failed in zip(parity.history.theta, parity.history.failed, strict=True)],
             "practical": [traded.get(theta.tobytes()) for theta in practical.history.theta],
         }  # fmt: skip
-        artifacts.write_table(out / "history.parquet", schemas.TUNING, engineering.histories(searches, trades))
+        history = engineering.histories(searches, trades)
+        artifacts.write_table(out / "history.parquet", schemas.TUNING, history)
+        artifacts.write_course(out / "live", history, of="mode", step="evaluation", figures=("cost", "incumbent"))
         default_cost = engineering.found_or_none(practical_cost, default)
         metrics = {
             "parity": {

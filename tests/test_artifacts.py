@@ -269,6 +269,19 @@ def test_a_record_is_cut_at_gaps_and_recordings_and_masked_samples_are_missing()
     np.testing.assert_array_equal(y[2][:, 0], [20, 20, np.nan])
 
 
+def test_a_course_is_a_table_a_figure_without_what_is_missing(project):
+    course = {"agent": ["ours", "ours", "the paper"], "update": [10, 20, 10], "reward": [0.1, None, 1 / 3], "cost": [1.0, 2.0, float("nan")]}
+    for folder in ("a", "b"):
+        artifacts.write_course(folder, course, of="agent", step="update", figures=("reward", "cost"))
+    files = {path.relative_to("a/plots/metrics").as_posix(): path.read_text() for path in Path("a/plots").rglob("*.tsv")}
+    assert files == {
+        "ours/reward.tsv": "step\treward\n10\t0.1\n",
+        "ours/cost.tsv": "step\tcost\n10\t1.0\n20\t2.0\n",
+        "the_paper/reward.tsv": "step\treward\n10\t0.3333333333333333\n",
+    }
+    assert artifacts.sha256("a") == artifacts.sha256("b") and not (project / "dvc.yaml").exists()
+
+
 def test_csv_keeps_every_digit_under_a_line_of_names(project):
     artifacts.write_csv("next.csv", {"time_s": np.array([0, 1]), "heater_1": np.array([0.1, 1 / 3])})
     assert (project / "next.csv").read_text() == "time_s,heater_1\n0,0.1\n1,0.3333333333333333\n"

@@ -97,7 +97,7 @@ def claim(sources: Sources, names: Sequence[str] = NAMES) -> str:
     said = [f"{name} {RECORDED[name]}" for name in names if name not in made]
     if made:
         which = "" if len(names) == len(made) else f"{_listed(made, 'and')} "
-        said.append(f"{which}judged on simulated machines: nothing is claimed about a real printer".strip())
+        said.append(f"{which}judged on simulated machines only: nothing is claimed about a real printer".strip())
     text = "; ".join(said)
     return f"{text[:1].upper()}{text[1:]}."
 

@@ -40,12 +40,14 @@ from pipeline.report.verdict import (
 
 def render(sources: Sources, judged: Judgement) -> str:
     """The text of index.html."""
-    loops = headline.loops(sources, judged)
+    loops, accepted = headline.loops(sources, judged), _accepted(sources)
     return page.render(
         "index.html",
         title=headline.decision(loops).rstrip("."),
         decision=headline.decision(loops),
         state=headline.state(loops),
+        accepted_on=accepted.get("on", ""),
+        accepted_at=accepted.get("commit", ""),
         loops=[
             loop._asdict() | {"reason": words.explained(sources, loop.reason), "remedy": words.explained(sources, loop.remedy)}
             for loop in loops
@@ -69,6 +71,13 @@ def render(sources: Sources, judged: Judgement) -> str:
         code=sources.code,
         here="index",
     )
+
+
+def _accepted(sources: Sources) -> dict[str, str]:
+    """The day on which the run was accepted, and the commit that was checked out; older files do not say."""
+    found = sources.accepted if isinstance(sources.accepted, dict) else {}
+    said = found.get("accepted")
+    return {key: str(said[key])[:40] for key in ("on", "commit") if key in said} if isinstance(said, dict) else {}
 
 
 def _drifts(judged: Judgement) -> str:

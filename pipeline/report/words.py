@@ -3,9 +3,11 @@
 from markupsafe import Markup, escape
 
 from pipeline.report import page
+from pipeline.report.digits import THIN
 from pipeline.report.sources import Sources
 
 INDEX = (
+    "deploy",
     "gap",
     "band",
     "passed",
@@ -73,10 +75,9 @@ FIXED = {
     ),
     "margin_delay": ("Delay margin", "Extra delay of all sensors, in seconds, that the loop bears before it oscillates."),
     "worst": ("Worst case", "The largest gap over all plants of the spread, starts and references."),
-    "data": (
-        "Samples needed",
-        "So many that a controller learned from them costs no more than learn_kernel.allowed_gap_percent above the best, "
-        + "and no fewer than it has unknowns to learn.",
+    "deploy": (
+        "Deploy",
+        "Take it to the machine and commission it there, under watch: the rules of this page are passed. It does not say that it ran on a machine.",
     ),
     "settling": ("Settling", "How long it takes until every zone has come within the band around its reference and stays there for good."),
     "overshoot": ("Overshoot", "The furthest way that any zone goes past its reference."),
@@ -257,6 +258,8 @@ def glossary(sources: Sources) -> dict[str, tuple[str, str]]:
     """{key: (word, meaning)}; figures in a meaning are those of params.yaml."""
     panel, machine = sources.declared.panel, sources.declared.machine
     simulated = sources.declared.everything.get("generate_probing", {}).get("source") == "simulated"
+    allowed = sources.declared.everything.get("learn_kernel", {}).get("allowed_gap_percent")
+    enough = "little more than the best" if allowed is None else f"no more than {allowed:g}{THIN}% above the best (learn_kernel.allowed_gap_percent)"
     spread = (
         (
             f"Plants on which nothing was fitted: each column of B by 1 ± {100 * panel.input_gain:g} %, and A "
@@ -274,6 +277,10 @@ def glossary(sources: Sources) -> dict[str, tuple[str, str]]:
             ),
         ),
         "spread": ("Plant spread", spread),
+        "data": (
+            "Samples needed",
+            f"So many that a controller learned from them costs {enough}, and no fewer than it has unknowns to learn.",
+        ),
         "step": ("Step", f"One sample of the controller, {machine.sample_time_s:g} s here."),
     }
 
@@ -296,5 +303,5 @@ def chosen(sources: Sources, keys: tuple[str, ...]) -> list[tuple[str, str]]:
 
 def explaining(key: str) -> str:
     """The word that explains an answer; none where it explains itself."""
-    known = {"settled": "Settled error"}
+    known = {"settled": "Settled error", "data": "Samples needed"}
     return known.get(ANSWERS.get(key, ""), FIXED.get(ANSWERS.get(key, ""), ("",))[0])

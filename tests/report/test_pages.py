@@ -243,6 +243,7 @@ def test_first_run_equal_runs_and_a_moved_figure(project):
     main()
     assert "First run: nothing to compare with." in Page(INDEX).text
     accepted = {
+        "accepted": {"on": "2026-11-20", "commit": "0a1b2c3d"},
         "metrics": {path.stem: artifacts.read_json(path) for path in Path("reports/metrics").glob("*.json")},
         "params": made.params.read("params.yaml"),
         "hashes": {str(p): artifacts.sha256(p) for p in Path("datasets").rglob("*") if p.is_file()}
@@ -252,6 +253,7 @@ def test_first_run_equal_runs_and_a_moved_figure(project):
     main()
     page = Page(INDEX).text
     assert "Nothing changed; no figure moved." in page
+    assert "Since 2026-11-20" in page and "accepted on 2026-11-20 at commit 0a1b2c3d" in page
     assert "first run" not in page
 
     change("evaluate_temperature", controllers__window__settled_error_degC=made.figure(0.45, 0.41, 0.49, zone=0))
