@@ -64,14 +64,18 @@ def decide(
             if name in challenger.guards
         },
     }
-    better = f"{found.improvement_percent:.1f} % better ({found.low_percent:.1f} to {found.high_percent:.1f} %, p = {found.p:.2g}) on {found.cases} cases of {found.blocks} blocks"
+    better = f"{found.improvement_percent:.1f} % better ({found.low_percent:.1f} to {found.high_percent:.1f} %, {_chance(found)}) on {found.cases} cases of {found.blocks} blocks"
     return Decision(KEPT, against, figures) if against else Decision(PROMOTED, [better, "no guard is worse"], figures)
+
+
+def _chance(found) -> str:
+    return "p < 0.0001" if found.p < 1e-4 else f"p = {found.p:.2g}"
 
 
 def _against(found, rule: Rule) -> list[str]:
     if found.blocks < blocks_needed(rule.level):
         return [f"{found.blocks} blocks cannot tell at level {rule.level:g}; at least {blocks_needed(rule.level)} are needed"]
-    told = f"{found.improvement_percent:.1f} % ({found.low_percent:.1f} to {found.high_percent:.1f} %, p = {found.p:.2g})"
+    told = f"{found.improvement_percent:.1f} % ({found.low_percent:.1f} to {found.high_percent:.1f} %, {_chance(found)})"
     if found.improvement_percent <= 0:
         return [
             f"the challenger is no better: its cases cost {-found.improvement_percent:.1f} % more ({-found.high_percent:.1f} to {-found.low_percent:.1f} %)"

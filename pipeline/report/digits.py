@@ -2,6 +2,7 @@
 never comes."""
 
 import math
+import re
 
 MINUS, THIN, DASH = "\u2212", "\u202f", "\u2013"
 
@@ -28,6 +29,12 @@ def number(value: float, places: int) -> str:
     """1234.5 -> "1,234.5"; -0.04 at one place -> "0.0", not a minus nothing."""
     text = f"{abs(value):,.{places}f}"
     return MINUS + text if value < 0 and float(text.replace(",", "")) != 0 else text
+
+
+def typeset(text: str | float) -> str:
+    """A line of a log as a page sets it: "-15.1 %" with a true minus and a thin space; names such as night-0005 and dates stay."""
+    signed = re.sub(r"(?<![\w.\-])-(?=\d)", MINUS, str(text))
+    return re.sub(r"(?<=\d) (?=%|°C)", THIN, signed)
 
 
 def declared(value: float) -> int:

@@ -245,9 +245,10 @@ def _row(night: Mapping[str, Any]) -> dict[str, Any]:
         if night["outcome"] == "nothing new"
         else PASSED
     )
+    told = "; ".join([*_together(night), *night.get("quarantined", {}).values()])
     return {
         "run": night["run"], "when": _when(night["when"]), "state": state, "outcome": night["outcome"], "new": sum(map(len, night.get("new_recordings", {}).values())),
-        "reasons": "; ".join([*alarms, *_together(night), *night.get("quarantined", {}).values()]), "seconds": number(night.get("seconds", 0), 0),
+        "reasons": "; ".join([*(alarm for alarm in alarms if alarm not in told), told]), "seconds": number(night.get("seconds", 0), 0),
     }  # fmt: skip
 
 

@@ -40,7 +40,7 @@ def environment() -> jinja2.Environment:
     }
     script = Markup(found.get_template("page.js").render().strip())
     found.globals |= {"script": script, "script_hash": base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}
-    found.filters |= {"shortened": digits.shortened, "count": digits.count}
+    found.filters |= {"shortened": digits.shortened, "typeset": digits.typeset, "count": digits.count}
     return found
 
 

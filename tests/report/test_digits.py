@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from pipeline.report.digits import band, count, decimals, number, quantity, short, shortened
+from pipeline.report.digits import band, count, decimals, number, quantity, short, shortened, typeset
 
 
 @pytest.mark.parametrize(
@@ -50,3 +50,11 @@ def test_counts_and_long_names():
     assert (count(1, "run"), count(24, "run"), count(0, "candidate")) == ("one run", "24 runs", "no candidates")
     assert len(shortened("x" * 200)) == 60
     assert shortened("a" * 30 + "b" * 60).startswith("a" * 29 + "…")
+
+
+def test_a_line_of_a_log_is_set_as_a_page_has_it_and_names_stay():
+    text = "night-0005, 2030-01-09: gain -15.1 % (-16.0 to -0.2 %), offset -2.0 °C; shift_-1.csv, a-b"
+    thin = "\u202f"
+    assert typeset(text) == (
+        f"night-0005, 2030-01-09: gain −15.1{thin}% (−16.0 to −0.2{thin}%), offset −2.0{thin}°C; shift_-1.csv, a-b"
+    )
