@@ -187,11 +187,11 @@ class Shift(NamedTuple):
     sigmas: np.ndarray
 
 
-def shift(value: np.ndarray, deviation: np.ndarray, before: np.ndarray, before_deviation: np.ndarray) -> Shift:
+def shift(value: np.ndarray, deviation: np.ndarray, before: np.ndarray, before_deviation: np.ndarray, *, freedom: int = BLOCKS - 1) -> Shift:
     """value (k,) against those of the reference nights before (nights, k): their mean, and as noise both nights' own and what they scatter beyond it (DerSimonian and Laird 1986).
 
-    With few nights the scatter is hardly known: its degrees of freedom count as many as there are nights less one (Satterthwaite 1946), and the ratio is brought to the sigmas
-    that a normal variable would need to be as unlikely.
+    A night's own deviation has `freedom`, the scatter of a few nights less: both count with the degrees of freedom that they have (Satterthwaite 1946), and
+    the ratio is brought to the sigmas that a normal variable would need to be as unlikely.
     """
     nights = len(before)
     inside = (before_deviation**2).mean(axis=0)
@@ -199,8 +199,8 @@ def shift(value: np.ndarray, deviation: np.ndarray, before: np.ndarray, before_d
     own, scatter = np.maximum(deviation**2 + inside / nights, 1e-24), between * (1 + 1 / nights)
     spread = np.sqrt(own + scatter)
     t = (value - before.mean(axis=0)) / spread
-    freedom = spread**4 / (own**2 / (BLOCKS - 1) + scatter**2 / max(nights - 1, 1))
-    tail = np.maximum(scipy.stats.t.sf(np.abs(t), freedom), 1e-290)
+    known = spread**4 / (own**2 / freedom + scatter**2 / max(nights - 1, 1))
+    tail = np.maximum(scipy.stats.t.sf(np.abs(t), known), 1e-290)
     return Shift(value, before.mean(axis=0), spread, np.sign(t) * scipy.stats.norm.isf(tail))
 
 

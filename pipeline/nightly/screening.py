@@ -21,7 +21,7 @@ SETTLED = (
 )
 
 
-PARTS = 6  # of a record, whose scatter tells how well its closed-loop figures are known
+PARTS = 4  # of a record, whose scatter tells how well its closed-loop figures are known
 
 
 class Reference(NamedTuple):
@@ -294,8 +294,10 @@ def _loop(
              "at_limits_percent": ("is at a limit", "points more of the time than it was", limits.at_limits_points, inputs)}  # fmt: skip
     for key, (verb, rest, least, names) in words.items():
         # a figure counts as known to a sixth of what matters at best, so that nights that agree by chance make no alarm of a trifle
-        value, deviation = np.array(now[key][0]), np.maximum(now[key][1], least / 6)
-        moved = drift.shift(value, deviation, known[key][:, 0], np.maximum(known[key][:, 1], least / 6))
+        own = np.maximum([*known[key][:, 1], now[key][1]], least / 6)
+        # a few parts of one night say little of how well a mean is known: those of all nights say it together
+        pooled = np.sqrt((own**2).mean(axis=0))
+        moved = drift.shift(np.array(now[key][0]), pooled, known[key][:, 0], own[:-1], freedom=(PARTS - 1) * len(own))
         for name, by, sigmas in zip(names, moved.value - moved.reference, moved.sigmas, strict=True):
             figures[f"{name} {key}"] = {"moved": float(by), "sigmas": float(sigmas)}
             if abs(by) >= least:
