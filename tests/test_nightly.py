@@ -2,6 +2,7 @@
 
 import datetime
 import fcntl
+import itertools
 import json
 import os
 import shutil
@@ -87,6 +88,30 @@ def test_a_night_with_bad_data_leaves_the_last_good_run_and_the_next_night_works
     assert "bad.csv" in (project.folder / "reports/nightly.html").read_text()
     bad.unlink()
     project.record("second", [9.0, 9.0, 9.0])
+    assert night.nightly()[0] == night.OK and project.champion()["run"] == "night-0003"
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_what_changes_while_the_stages_run_is_learned_whole_or_not_at_all(project, monkeypatch, times):
+    project.record("second", [9.0])
+    lock, learn, late = (project.folder / "dvc.lock").read_bytes(), night._reproduce, iter(range(times))
+
+    def meanwhile(*given):
+        learn(*given)
+        for k in itertools.islice(late, 1):  # after stage learn has read, as a printer that goes on recording
+            project.record(f"late_{k}", [9.0])
+            project.set(watch_h=48 + k)
+
+    monkeypatch.setattr(night, "_reproduce", meanwhile)
+    status, said = night.nightly()
+    if times == 1:
+        assert status == night.OK and "promoted toy" in said
+        assert json.loads((project.folder / "datasets/learn/model.json").read_text()) == (33 + 18) / 5
+        assert night.nights()[-1]["notes"] == ["datasets/raw/toy/late_0.csv, params.yaml changed while the stages ran, which ran again"]
+        assert "nothing new" in night.nightly()[1]
+        return
+    assert status == night.FAILED and "datasets/raw/toy/late_1.csv changed again while the stages ran; start the night when" in said
+    assert (project.folder / "dvc.lock").read_bytes() == lock and project.champion()["run"] == "night-0001"
     assert night.nightly()[0] == night.OK and project.champion()["run"] == "night-0003"
 
 

@@ -53,12 +53,16 @@ class Hashes:
         return {file.as_posix(): self.of(file) for file in kept}
 
 
-def digest(hashes: Hashes, places: list[str]) -> str:
-    """One digest over names and contents of all that lies at `places`."""
+def contents(hashes: Hashes, places: list[str]) -> dict[str, str]:
+    """{path: digest} of all that lies at `places`."""
+    return {name: content for place in places for name, content in hashes.below(place).items()}
+
+
+def digest(found: Mapping[str, str]) -> str:
+    """One digest over names and contents."""
     whole = hashlib.sha256()
-    for place in places:
-        for name, content in hashes.below(place).items():
-            whole.update(f"{name}\0{content}\n".encode())
+    for name, content in found.items():
+        whole.update(f"{name}\0{content}\n".encode())
     return whole.hexdigest()
 
 

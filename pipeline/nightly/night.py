@@ -59,10 +59,10 @@ def _night(settings: Nightly, now: datetime.datetime, left: list[str]) -> tuple[
     return _say(settings, entry, remembered, hashes, known)
 
 
-def _work(settings: Nightly, entry: dict[str, Any], remembered: dict[str, Any], hashes: inputs.Hashes) -> str:
-    """The night itself; what it did goes to `entry`. The digest of what it was made from."""
+def _work(settings: Nightly, entry: dict[str, Any], remembered: dict[str, Any], hashes: inputs.Hashes, *, again: bool = True) -> str:
+    """The night itself; what it did goes to `entry`. The digest of what it was made from: where that changes while the stages run, they run once again."""
     places = [*inputs.sources(), settings.holdout.recordings]
-    seen = inputs.digest(hashes, places)
+    seen = inputs.digest(inputs.contents(hashes, places))
     if seen == remembered.get("inputs") and not remembered.get("unpushed"):
         entry |= {"outcome": "nothing new", "reasons": ["no recording, parameter or code has changed since the last night"]}
         return seen
@@ -72,18 +72,28 @@ def _work(settings: Nightly, entry: dict[str, Any], remembered: dict[str, Any], 
 
     state = champion.read()
     entry["drift"] = screening.look(settings, state, new, remembered.get("drift", {}), night=entry["night"])
-    entry["quarantined"] = entry["drift"].pop("quarantined")
-    seen = inputs.digest(hashes, places)
+    entry["quarantined"] = entry.get("quarantined", {}) | entry["drift"].pop("quarantined")
+    before = inputs.contents(hashes, places)
+    seen = inputs.digest(before)
     if seen == remembered.get("inputs") and not remembered.get("unpushed"):
         entry |= {"outcome": "quarantined", "reasons": ["all that was new is quarantined"]}
         return seen
     guarding.remember_before()
     try:
         _reproduce(settings, entry)
-        state = _judge(settings, entry, state)
+        # what came or changed meanwhile may be in some stages and not in others, and nobody has looked whether it is fit to learn from
+        after = inputs.contents(hashes, places)
+        moved = sorted({name for name, _ in before.items() ^ after.items()})
+        if moved and not again:
+            raise ValueError(f"{moved[0]} changed again while the stages ran; start the night when nothing is recorded or edited")
+        if not moved:
+            state = _judge(settings, entry, state)
     except (ValueError, OSError, np.linalg.LinAlgError):
         entry["notes"] += guarding.back_to_before() + champion.as_committed()
         raise
+    if moved:
+        entry["notes"] += [*guarding.back_to_before(), f"{', '.join(moved[:3])} changed while the stages ran, which ran again"]
+        return _work(settings, entry, remembered, hashes, again=False)
     _keep(settings, entry, state)
     return seen
 
