@@ -76,7 +76,10 @@ def _verdict(night: Mapping[str, Any], state: Mapping[str, Any]) -> dict[str, An
             f"{remedy} They lie in datasets/quarantine, unchanged, each with its reason beside it; mend them and put them back.".strip()
         )
     if alarms and night["outcome"] != "failed":
-        remedy = "No challenger is promoted while this lasts. Look at the machine; where the change is meant to stay, record it anew for datasets/holdout, and the next night judges both on it."
+        remedy = (
+            "No challenger of this loop is promoted while this lasts. Look at the machine; where the change is meant to stay: "
+            f'./run beadline nightly --accept-drift {alarms[0]["loop"]} "WHY".'
+        )
     return {
         "state": "failed" if kind == FAILED else "passed",
         "decision": head,

@@ -69,6 +69,7 @@ def test_an_alarm_night_says_cause_consequence_and_what_stays(open_page, alarm):
     assert page.locator("h1").inner_text().replace("\n", " ") == "The machine has drifted; the champions stay."
     text = page.locator("body").inner_text()
     assert "the gain from heater_1 has changed by −15.1\u202f%" in text and "as a consequence, closed loop: sensor_1 settles −1.4\u202f°C off" in text
+    assert './run beadline nightly --accept-drift temperature "WHY"' in text
     # the cause stands once in the night's row, and file names are text
     row = page.locator("#nights ~ div tbody tr").first.inner_text()
     assert row.count("has changed by") == 1 and "<b>8</b>" in text
