@@ -2,17 +2,20 @@
 
 from typing import Any
 
+import numpy as np
+
 from pipeline.report.digits import MINUS, THIN, number
 from pipeline.report.setpoint_verdict import Case, Cell, board
 from pipeline.report.sources import Sources, lookup
 from pipeline.report.verdict import FAILED, Missing, Question, state
+from pipeline.setpoint.judging import wilson
 
 # points closer than this are one: the accepted figures are kept rounded
 SAME = 0.05
 
 
 def change(sources: Sources, case: Case, cell: Cell | None) -> dict[str, Any]:
-    """How the settled runs of the default moved since the accepted run: beyond noise where the old figure lies outside the new interval."""
+    """How the settled runs of the default moved since the accepted run: beyond noise where their intervals, of as many runs as now, do not overlap."""
     still = {"text": "first run", "moved": False, "worse": False}
     if sources.accepted is None or isinstance(sources.accepted, Missing) or cell is None or isinstance(cell.settled, Missing):
         return still
@@ -26,7 +29,8 @@ def change(sources: Sources, case: Case, cell: Cell | None) -> dict[str, Any]:
     points = now.value - before
     if abs(points) < SAME:
         return still | {"text": "unchanged"}
-    if now.low <= before <= now.high:
+    then = wilson(np.arange(cell.runs) < round(before / 100 * cell.runs))
+    if now.low <= then.high and then.low <= now.high:
         return still | {"text": "within noise"}
     question = Question(0, "", "Settled", "%", sources.declared.rules.settled_percent, True, "")
     text = f"{'+' if points > 0 else MINUS}{number(abs(points), 1)}{THIN}points · {'better' if points > 0 else 'worse'}"
