@@ -19,6 +19,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pipeline import params
+from pipeline.deciding import EvaluateSetpoint
 from pipeline.setpoint import calibration, deployment, judging, nozzle_scene, pixels
 from pipeline.setpoint.baselines import Proportional, proportional
 from pipeline.setpoint.bayes import bayes, robust_filter
@@ -34,8 +36,7 @@ MACHINE = Machine(heater_s=15.0, heater_delay_s=2.0, melt_s=1.2, softening_per_d
 LIMITS = Limits(np.array([20.0, 180.0]), np.array([310.0, 240.0]), np.array([10.0, 20.0]), np.array([180.0, 40.0]))
 SEGMENT_S, TIP_TOLERANCE_PX = 10.0, 4.0
 EDGES = np.r_[20, 30, 40, 50, 60, np.arange(70, 130.1, 2.5), 150, 180, 220, 260, 310]
-ROBUST = {"accuracies": [0.7, 0.97], "gains": [1.0, 0.65], "looks": 5, "look": 0.08, "floor": 0.03, "smoothing": 4.0, "switch": 3e-4, "hazard": 6e-4}
-ROBUST |= {"move_cost": 0.25, "outside_cost": 3.0}
+ROBUST = params.load(EvaluateSetpoint, "evaluate_setpoint").baselines.bayes_robust
 SEGMENTS = 24  # whose windows are recorded
 
 
@@ -189,7 +190,7 @@ def main(runs: int, weights: Path | None) -> None:
 
     def ours(loop):
         decisions = max(SEGMENT_S / (loop.waits.flow_s + frames / RATE_HZ), 1.2)
-        return bayes(14), robust_filter(table, segment=decisions, **ROBUST)
+        return bayes(ROBUST.hypotheses()), robust_filter(table, **ROBUST.model_dump() | {"segment": decisions})
 
     def case(name, controller, loop, disturbances, decisions, judged):
         began, n = time.process_time(), len(disturbances.clog)
