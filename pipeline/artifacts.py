@@ -131,18 +131,17 @@ def read_metrics(stage: str) -> dict:
 
 
 def write_course(folder: str | Path, columns: Mapping[str, Sequence], *, of: str, step: str, figures: Sequence[str]) -> None:
-    """The course of a training as DVCLive writes it, for `dvc plots` and whatever else reads its files: a TSV of `figures` by `step` for every name in column `of`.
+    """The course of a training in DVCLive's files, for `dvc plots` and whatever else reads them: <folder>/plots/metrics/<name>/<figure>.tsv by `step`, for every name in column `of`.
 
-    No clock and no experiment is written; a figure that is missing at a step has no line there. Only inside a stage's folder, whose frame puts it in place.
+    A figure that is missing at a step has no line there. (The library itself takes hold of git, of dvc.yaml and, where a token is set, of the network.)
     """
-    from dvclive import Live  # slow to import, and only stages that train have a course
-
-    with Live(str(folder), save_dvc_exp=False, dvcyaml=None, report=None) as live:
-        for name, at, *values in zip(*(columns[key] for key in (of, step, *figures)), strict=True):
-            live.step = int(at)
-            for figure, value in zip(figures, values, strict=True):
-                if value is not None and np.isfinite(value):
-                    live.log_metric(f"{name.replace(' ', '_')}/{figure}", float(value))
+    lines: dict[tuple[str, str], list[str]] = {}
+    for name, at, *values in zip(*(columns[key] for key in (of, step, *figures)), strict=True):
+        for figure, value in zip(figures, values, strict=True):
+            if value is not None and np.isfinite(value):
+                lines.setdefault((name.replace(" ", "_"), figure), []).append(f"{int(at)}\t{float(value)!r}\n")
+    for (name, figure), rows in lines.items():
+        write_text(Path(folder) / "plots/metrics" / name / f"{figure}.tsv", f"step\t{figure}\n{''.join(rows)}")
 
 
 def write_text(path: str | Path, text: str) -> None:

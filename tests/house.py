@@ -291,7 +291,7 @@ def pipeline(root: Path) -> dict[str, Any]:
     }
     ordered = {stage: entries[stage] for stage in graphlib.TopologicalSorter(order).static_order()}
     courses = [stage for stage in ordered if any(function == "write_course" for *_, function in calls(parsed(root / f"stages/{stage}.py")))]
-    return {"stages": ordered} | ({"plots": [f"datasets/{stage}/live/plots/metrics" for stage in courses]} if courses else {})
+    return {"stages": ordered} | ({"plots": [{f"datasets/{stage}/live/plots/metrics": {"x": "step"}} for stage in courses]} if courses else {})
 
 
 def differences(found: dict[str, Any], wanted: dict[str, Any]) -> list[str]:

@@ -14,7 +14,7 @@ import time
 import numpy as np
 import pytest
 
-from pipeline.nightly import champion, guarding, night, processes, watch
+from pipeline.nightly import champion, guarding, night, processes, screening, watch
 from tests.toy_nights import Project, entered
 
 TOMORROW = datetime.timedelta(days=1)
@@ -91,8 +91,13 @@ def test_a_night_with_bad_data_leaves_the_last_good_run_and_the_next_night_works
     assert night.nightly()[0] == night.OK and project.champion()["run"] == "night-0003"
 
 
-@pytest.mark.parametrize("times", [1, 2])
-def test_what_changes_while_the_stages_run_is_learned_whole_or_not_at_all(project, monkeypatch, times):
+@pytest.mark.parametrize(("times", "kept_by"), [(1, "git"), (2, "git"), (1, "dvc")])
+def test_what_changes_while_the_stages_run_is_learned_whole_or_not_at_all(project, monkeypatch, times, kept_by):
+    if kept_by == "dvc":
+        project.run("git", "rm", "-rq", "--cached", "datasets/raw/toy")
+        project.run(sys.executable, "-m", "dvc", "add", "-q", "datasets/raw/toy")
+        project.run("git", "add", "datasets/raw")
+        project.run("git", "commit", "-q", "-m", "recordings are dvc's")
     project.record("second", [9.0])
     lock, learn, late = (project.folder / "dvc.lock").read_bytes(), night._reproduce, iter(range(times))
 
@@ -105,14 +110,52 @@ def test_what_changes_while_the_stages_run_is_learned_whole_or_not_at_all(projec
     monkeypatch.setattr(night, "_reproduce", meanwhile)
     status, said = night.nightly()
     if times == 1:
+        assert status == night.OK, said
         assert status == night.OK and "promoted toy" in said
         assert json.loads((project.folder / "datasets/learn/model.json").read_text()) == (33 + 18) / 5
-        assert night.nights()[-1]["notes"] == ["datasets/raw/toy/late_0.csv, params.yaml changed while the stages ran, which ran again"]
+        assert night.nights()[-1]["notes"] == ["datasets/raw/toy/late_0.csv, params.yaml changed while the stages ran: the night began once again"]
+        assert sorted(project.champion()["lineage"]["recordings"]["toy"]) == [f"datasets/raw/toy/{name}.csv" for name in ("first", "late_0", "second")]
         assert "nothing new" in night.nightly()[1]
         return
     assert status == night.FAILED and "datasets/raw/toy/late_1.csv changed again while the stages ran; start the night when" in said
     assert (project.folder / "dvc.lock").read_bytes() == lock and project.champion()["run"] == "night-0001"
     assert night.nightly()[0] == night.OK and project.champion()["run"] == "night-0003"
+
+
+def test_a_recording_that_comes_while_others_are_looked_at_or_judged_is_new_the_next_night_or_looked_at_tonight(project, monkeypatch):
+    project.record("second", [9.0])
+    look, judge = screening.look, night._judge
+
+    def looked(*given, **more):
+        monkeypatch.setattr(screening, "look", look)
+        project.record("while_looking", [9.2])
+        return look(*given, **more)
+
+    def judged(*given):
+        project.record("while_judging", [9.5])
+        return judge(*given)
+
+    monkeypatch.setattr(screening, "look", looked)
+    monkeypatch.setattr(night, "_judge", judged)
+    assert night.nightly()[0] == night.OK
+    tonight = night.nights()[-1]["new_recordings"]["toy"]
+    assert tonight == ["datasets/raw/toy/second.csv", "datasets/raw/toy/while_looking.csv"]
+    monkeypatch.setattr(night, "_judge", judge)
+    assert night.nightly()[0] == night.OK
+    assert night.nights()[-1]["new_recordings"] == {"toy": ["datasets/raw/toy/while_judging.csv"]}
+
+
+def test_code_that_changes_while_the_stages_run_ends_the_night(project, monkeypatch):
+    learn = night._reproduce
+
+    def meanwhile(*given):
+        learn(*given)
+        (project.folder / "learn.py").write_text((project.folder / "learn.py").read_text() + "# pulled meanwhile\n")
+
+    project.record("second", [9.0])
+    monkeypatch.setattr(night, "_reproduce", meanwhile)
+    status, said = night.nightly()
+    assert status == night.FAILED and "learn.py changed while the stages ran" in said and project.champion()["run"] == "night-0001"
 
 
 @pytest.mark.slow

@@ -7,6 +7,8 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+import yaml
+
 from pipeline import artifacts
 from pipeline.nightly import champion
 from pipeline.nightly.processes import STATE, TOKEN, dvc, end_orphans, fresh_index, git, stale_git_locks
@@ -109,7 +111,8 @@ def back_to_before() -> list[str]:
         Path("dvc.lock").unlink(missing_ok=True)
         return []
     try:
-        dvc("checkout", "--quiet", "--force")
+        # what the stages made, and no more: recordings that DVC keeps may hold what it has not seen yet
+        dvc("checkout", "--quiet", "--force", *yaml.safe_load(Path("dvc.lock").read_text(encoding="utf-8")).get("stages", {}))
     except ValueError as error:
         return [f"datasets could not be put back to the last good run ({error}); the next dvc repro makes them again"]
     return []

@@ -66,10 +66,10 @@ def digest(found: Mapping[str, str]) -> str:
     return whole.hexdigest()
 
 
-def recordings(hashes: Hashes, folder: str) -> dict[str, str]:
-    """{path: digest} of the recordings below a loop's folder; notes and files of dvc are none."""
-    found = hashes.below(folder) if folder and Path(folder).is_dir() else {}
-    return {name: content for name, content in found.items() if not name.lower().endswith((".md", ".txt", ".yaml", ".dvc"))}
+def recordings(found: Mapping[str, str], folder: str) -> dict[str, str]:
+    """{path: digest} of the recordings below a loop's folder, of all that was found; notes and files of dvc are none."""
+    notes = (".md", ".txt", ".yaml", ".dvc")
+    return {name: content for name, content in found.items() if folder and name.startswith(f"{folder}/") and not name.lower().endswith(notes)}
 
 
 def aside(path: str, loop: str, reason: str) -> str:

@@ -59,47 +59,48 @@ def _night(settings: Nightly, now: datetime.datetime, left: list[str]) -> tuple[
     return _say(settings, entry, remembered, hashes, known)
 
 
-def _work(settings: Nightly, entry: dict[str, Any], remembered: dict[str, Any], hashes: inputs.Hashes, *, again: bool = True) -> str:
-    """The night itself; what it did goes to `entry`. The digest of what it was made from: where that changes while the stages run, they run once again."""
-    places = [*inputs.sources(), settings.holdout.recordings]
-    seen = inputs.digest(inputs.contents(hashes, places))
-    if seen == remembered.get("inputs") and not remembered.get("unpushed"):
-        entry |= {"outcome": "nothing new", "reasons": ["no recording, parameter or code has changed since the last night"]}
-        return seen
-    new = {name: _new(hashes, loop.recordings, remembered.get("recordings", {}).get(name, {})) for name, loop in settings.loops.items()}
+def _work(settings: Nightly, entry: dict[str, Any], remembered: dict[str, Any], hashes: inputs.Hashes, *, again: bool = True) -> dict[str, str]:
+    """The night itself; what it did goes to `entry`. What it was made from, {path: digest}: where that changes from the first look on, the night begins once again."""
+    places = [*inputs.sources(), settings.holdout.recordings, *(loop.recordings for loop in settings.loops.values() if loop.recordings)]
+    before = inputs.contents(hashes, places)
+    if inputs.digest(before) == remembered.get("inputs") and not remembered.get("unpushed"):
+        nothing = "no recording, parameter or code has changed since the last night"
+        entry |= {"outcome": "quarantined" if entry.get("quarantined") else "nothing new", "reasons": [nothing]}
+        return before
+    new = {name: _new(before, loop.recordings, remembered.get("recordings", {}).get(name, {})) for name, loop in settings.loops.items()}
     entry["new_recordings"] = {name: sorted(found) for name, found in new.items() if found}
     from pipeline.nightly import screening
 
     state = champion.read()
     entry["drift"] = screening.look(settings, state, new, remembered.get("drift", {}), night=entry["night"])
     entry["quarantined"] = entry.get("quarantined", {}) | entry["drift"].pop("quarantined")
-    before = inputs.contents(hashes, places)
-    seen = inputs.digest(before)
-    if seen == remembered.get("inputs") and not remembered.get("unpushed"):
+    before = {name: content for name, content in before.items() if name not in entry["quarantined"]}
+    if inputs.digest(before) == remembered.get("inputs") and not remembered.get("unpushed"):
         entry |= {"outcome": "quarantined", "reasons": ["all that was new is quarantined"]}
-        return seen
+        return before
     guarding.remember_before()
     try:
         _reproduce(settings, entry)
         # what came or changed meanwhile may be in some stages and not in others, and nobody has looked whether it is fit to learn from
-        after = inputs.contents(hashes, places)
-        moved = sorted({name for name, _ in before.items() ^ after.items()})
-        if moved and not again:
-            raise ValueError(f"{moved[0]} changed again while the stages ran; start the night when nothing is recorded or edited")
+        moved = sorted({name for name, _ in before.items() ^ inputs.contents(hashes, places).items()})
+        if moved and (not again or any(name.endswith(".py") for name in moved)):
+            raise ValueError(f"{moved[0]} changed{'' if again else ' again'} while the stages ran; start the night when nothing is recorded or edited")
         if not moved:
-            state = _judge(settings, entry, state)
+            state = _judge(settings, entry, state, before)
     except (ValueError, OSError, np.linalg.LinAlgError):
         entry["notes"] += guarding.back_to_before() + champion.as_committed()
         raise
     if moved:
-        entry["notes"] += [*guarding.back_to_before(), f"{', '.join(moved[:3])} changed while the stages ran, which ran again"]
-        return _work(settings, entry, remembered, hashes, again=False)
+        entry["notes"] += [*guarding.back_to_before(), f"{', '.join(moved[:3])} changed while the stages ran: the night began once again"]
+        for key in ("drift", "new_recordings"):
+            entry.pop(key)
+        return _work(params.load(Nightly, "nightly"), entry, remembered, hashes, again=False)
     _keep(settings, entry, state)
-    return seen
+    return before
 
 
-def _new(hashes: inputs.Hashes, folder: str, known: dict[str, str]) -> dict[str, str]:
-    return {name: content for name, content in inputs.recordings(hashes, folder).items() if content not in known.values()}
+def _new(found: dict[str, str], folder: str, known: dict[str, str]) -> dict[str, str]:
+    return {name: content for name, content in inputs.recordings(found, folder).items() if content not in known.values()}
 
 
 def _reproduce(settings: Nightly, entry: dict[str, Any]) -> None:
@@ -113,13 +114,13 @@ def _reproduce(settings: Nightly, entry: dict[str, Any]) -> None:
         old.unlink()
 
 
-def _judge(settings: Nightly, entry: dict[str, Any], state: dict[str, Any]) -> dict[str, Any]:
+def _judge(settings: Nightly, entry: dict[str, Any], state: dict[str, Any], made_from: dict[str, str]) -> dict[str, Any]:
     """Each loop's challenger against its champion; champion.json with those that are promoted, whose files lie in champion/<loop> by then."""
     from pipeline.nightly import screening
 
     decisions: dict[str, Any] = {}
     promoted: list[str] = []
-    lineage = _lineage(settings)
+    lineage = _lineage(settings, made_from)
     for name, loop in settings.loops.items():
         decision, figures = _decide(settings, name, state, entry)
         decisions[name] = {"decision": decision.decision, "reasons": decision.reasons, **decision.figures}
@@ -170,7 +171,7 @@ def _decide(settings: Nightly, name: str, state: dict[str, Any], entry: dict[str
     return decide(before, challenger, settings.rule, allowed=allowed, alarms=alarms, seed=entry["night"]), figures
 
 
-def _lineage(settings: Nightly) -> dict[str, Any]:
+def _lineage(settings: Nightly, made_from: dict[str, str]) -> dict[str, Any]:
     """What the challengers were made from: the commit, what lay uncommitted on it, dvc.lock, parameters and recordings."""
     uncommitted = [line[3:] for line in git("status", "--porcelain", "--untracked-files=no").splitlines()]
     return {
@@ -178,10 +179,7 @@ def _lineage(settings: Nightly) -> dict[str, Any]:
         "uncommitted": [path for path in uncommitted if path != "dvc.lock" and not path.startswith(("reports/", "champion"))],
         "dvc_lock": artifacts.sha256("dvc.lock"),
         "params": artifacts.sha256("params.yaml"),
-        "recordings": {
-            name: {path: artifacts.sha256(path) for path in sorted(inputs.recordings(inputs.Hashes({}), loop.recordings))}
-            for name, loop in settings.loops.items()
-        },
+        "recordings": {name: inputs.recordings(made_from, loop.recordings) for name, loop in settings.loops.items()},
     }
 
 
@@ -190,16 +188,15 @@ def _keep(settings: Nightly, entry: dict[str, Any], state: dict[str, Any]) -> No
     on_branch = settings.branch if settings.promotion == "branch" and entry["promoted"] else ""
     if entry["promoted"]:
         artifacts.write_json(champion.FILE, state)
+    recordings = [*(loop.recordings for loop in settings.loops.values()), settings.holdout.recordings]
     tracked = [
         "dvc.lock",
         "reports/metrics",
         "datasets/.gitignore",
-        *(place for loop in settings.loops.values() if (place := loop.recordings)),
-        settings.holdout.recordings,
+        # of a folder that DVC keeps, git keeps the pointer alone
+        *(pointer if Path(pointer := f"{place}.dvc").exists() else place for place in recordings if place),
+        *(champion.paths() if entry["promoted"] else []),
     ]
-    tracked += [f"{place}.dvc" for loop in settings.loops.values() if (place := loop.recordings)] + (
-        champion.paths() if entry["promoted"] else []
-    )
     told = f"promoted {', '.join(entry['promoted'])}" if entry["promoted"] else "kept the champions"
     changed = (
         bool(git("status", "--porcelain", "--", *(path for path in tracked if path != str(METRICS) and Path(path).exists())))
@@ -236,7 +233,7 @@ def _metrics(entry: dict[str, Any], state: dict[str, Any]) -> None:
     )
 
 
-def _say(settings: Nightly, entry: dict[str, Any], remembered: dict[str, Any], hashes: inputs.Hashes, known: str | None) -> tuple[int, str]:
+def _say(settings: Nightly, entry: dict[str, Any], remembered: dict[str, Any], hashes: inputs.Hashes, known: dict[str, str] | None) -> tuple[int, str]:
     """State, page, alarm; the exit status and the summary. On a disk without room the summary still comes."""
     alarms = [alarm["cause"] for alarm in entry.get("drift", {}).get("alarms", [])]
     status = _status(entry)
@@ -276,22 +273,22 @@ def _status(entry: dict[str, Any]) -> int:
     return QUARANTINED if entry.get("quarantined") else OK
 
 
-def _remember(settings: Nightly, entry: dict[str, Any], remembered: dict[str, Any], hashes: inputs.Hashes, known: str | None) -> None:
+def _remember(settings: Nightly, entry: dict[str, Any], remembered: dict[str, Any], hashes: inputs.Hashes, known: dict[str, str] | None) -> None:
     good = entry["outcome"] != "failed"
     if good and entry["outcome"] != "nothing new" and not entry.get("commit"):
         _metrics(entry, champion.read())
-    recordings = {name: inputs.recordings(hashes, loop.recordings) for name, loop in settings.loops.items()}
-    drift = entry.get("drift", {}).pop("memory", remembered.get("drift", {}))
+    # a recording of a failed night is new again the next one, and must not count as two
+    memory = entry.get("drift", {}).pop("memory", remembered.get("drift", {}))
     artifacts.write_json(
         watch.LAST,
         {
             "night": entry["night"],
             # a clock that was set back must not make the last success look older than it is
             "success": max(entry["when"], remembered.get("success") or "") if good else remembered.get("success"),
-            "inputs": known if good else remembered.get("inputs"),
+            "inputs": inputs.digest(known or {}) if good else remembered.get("inputs"),
             "unpushed": bool(entry.get("unpushed")),
-            "recordings": recordings if good else remembered.get("recordings", {}),
-            "drift": drift,
+            "recordings": {name: inputs.recordings(known or {}, loop.recordings) for name, loop in settings.loops.items()} if good else remembered.get("recordings", {}),
+            "drift": memory if good else remembered.get("drift", {}),
             "hashes": hashes.now,
         },
     )

@@ -293,8 +293,8 @@ def _loop(
     for key, (verb, rest, least, names) in words.items():
         # a figure counts as known to a sixth of what matters at best, so that nights that agree by chance make no alarm of a trifle
         own = np.maximum([*known[key][:, 1], now[key][1]], least / 6)
-        # a few parts of one night say little of how well a mean is known: those of all nights say it together
-        pooled = np.sqrt((own**2).mean(axis=0))
+        # a few parts of one night say little of how well a mean is known: those of all nights say it together; a short or restless night is known less well
+        pooled = np.maximum(np.sqrt((own**2).mean(axis=0)), own[-1])
         moved = drift.shift(np.array(now[key][0]), pooled, known[key][:, 0], own[:-1], freedom=(PARTS - 1) * len(own))
         for name, by, sigmas in zip(names, moved.value - moved.reference, moved.sigmas, strict=True):
             figures[f"{name} {key}"] = {"moved": float(by), "sigmas": float(sigmas)}
