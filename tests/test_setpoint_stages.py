@@ -132,9 +132,10 @@ def check_classifier(source: str) -> dict:
         assert len(next(iter(artifacts.read_table(out / f"{name}.parquet", schema).values()))), name
     frames = artifacts.read_json(out / "frames/frames.json")
     expected = {f"{name}.parquet" for name in (*TABLES, "calibration")} | {"weights.safetensors", "frames/frames.json"}
-    assert {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()} == expected | {
-        f"frames/{row['file']}" for row in frames
-    }
+    expected |= {f"frames/{row['file']}" for row in frames}
+    courses = {f"{figure}.tsv" for figure in ("training_loss", "held_out_loss", "held_out_accuracy")}
+    expected |= {f"live/plots/metrics/{learner}/{name}" for learner in ("vision_transformer", "convolutional_network") for name in courses}
+    assert {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()} == expected
     figures = artifacts.read_metrics("train_classifier")
     for name in ("image_accuracy", "window_accuracy", "svc_image_accuracy", "ece_image", "ece_window"):
         assert 0 <= figures[name] <= 1

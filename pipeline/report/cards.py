@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.report import charts, deposition_rules, deposition_verdict, page, pairs
+from pipeline.report import charts, deposition_rules, deposition_verdict, page
 from pipeline.report.answers import CONTROLLERS, LABELS, featured
 from pipeline.report.digits import decimals, number, percent, quantity, shortened
 from pipeline.report.judgement import NAMES, Judgement
@@ -42,7 +42,7 @@ def temperature(sources: Sources, judged: Judgement) -> dict[str, Any]:
         "panels": [_spark(sources, judged, role, limit=rules.settled_error_degC, named=i == 0) for i, role in enumerate(order)],
         "heads": [{"mark": role, "name": LABELS[CONTROLLERS[role]][0], "method": LABELS[CONTROLLERS[role]][1]} for role in order],
         "rows": rows,
-        "note": f"{pairs.compared(sources)['finding']} {_kernel_note(kernel, sources)}".strip(),
+        "note": _kernel_note(kernel, sources),
         "model": trust(sources),
         "sources": sources.source("evaluate_temperature", "scorecard", "trajectories"),
         "missing": None,
