@@ -110,9 +110,12 @@ def back_to_before() -> list[str]:
     if not (BEFORE / "dvc.lock").exists():
         Path("dvc.lock").unlink(missing_ok=True)
         return []
+    stages = yaml.safe_load(Path("dvc.lock").read_text(encoding="utf-8")).get("stages", {})
+    if not stages:
+        return []
     try:
         # what the stages made, and no more: recordings that DVC keeps may hold what it has not seen yet
-        dvc("checkout", "--quiet", "--force", *yaml.safe_load(Path("dvc.lock").read_text(encoding="utf-8")).get("stages", {}))
+        dvc("checkout", "--quiet", "--force", *stages)
     except ValueError as error:
         return [f"datasets could not be put back to the last good run ({error}); the next dvc repro makes them again"]
     return []
