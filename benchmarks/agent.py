@@ -20,13 +20,14 @@ import optax
 from pipeline import params, teaching
 from pipeline.setpoint import agent, belief_agent, judging
 from pipeline.setpoint.recorded import recorded_windows, synthetic_table
+from pipeline.setpoint.score import Score
 from pipeline.setpoint.simulator import paper_windows, rollout
 
 RESULTS, PEER = Path(__file__).parent / "results" / "agent.json", Path(__file__).parent / "agent_peer.py"
 UPDATES = 500  # of each timing
 
 
-def figures(score: judging.Score) -> dict[str, float]:
+def figures(score: Score) -> dict[str, float]:
     shares = {name: round(getattr(score, name).percent, 2) for name in ("settled", "stay", "recovered")}
     return shares | {name: round(getattr(score, name), 2) for name in ("median_steps", "p90_steps", "overshoot_p95", "flow_error")}
 

@@ -28,15 +28,17 @@ from pipeline.setpoint.classifier import Labelled, along_bead, predict, train, u
 from pipeline.setpoint.deployment import ACTS, Limits, Waits
 from pipeline.setpoint.pixels import Disturbances, Episodes, Loop, Machine, calm
 from pipeline.setpoint.recorded import WindowTable
+from pipeline.setpoint.score import wilson
 from pipeline.setpoint.vision_transformer import SMALL, from_named_arrays, named_arrays, vision_transformer
 
 RESULTS = Path(__file__).parent / "results" / "setpoint_pixels.json"
 LEAST_SCORE, RATE_HZ, LONGEST = 10.0, 20.0, 20
 MACHINE = Machine(heater_s=15.0, heater_delay_s=2.0, melt_s=1.2, softening_per_degC=0.02)
 LIMITS = Limits(np.array([20.0, 180.0]), np.array([310.0, 240.0]), np.array([10.0, 20.0]), np.array([180.0, 40.0]))
-SEGMENT_S, TIP_TOLERANCE_PX = 10.0, 4.0
+SEGMENT_S = 10.0
 EDGES = np.r_[20, 30, 40, 50, 60, np.arange(70, 130.1, 2.5), 150, 180, 220, 260, 310]
-ROBUST = params.load(EvaluateSetpoint, "evaluate_setpoint").baselines.bayes_robust
+SECTION = params.load(EvaluateSetpoint, "evaluate_setpoint")
+ROBUST, TIP_TOLERANCE_PX = SECTION.baselines.bayes_robust, SECTION.pixels.tip_tolerance_px
 SEGMENTS = 24  # whose windows are recorded
 
 
@@ -128,7 +130,7 @@ def summary(e: Episodes) -> dict:
     decisions = e.time_s.shape[1]
     ok, since = pixels.settled(e, by=decisions - 10), pixels.settled_since(e)
     minutes = e.time_s[np.arange(len(ok)), np.minimum(since, decisions - 1)][ok] / 60
-    share = judging.wilson(ok)
+    share = wilson(ok)
     return {
         "episodes": len(ok), "settled": round(share.percent, 1), "interval": [round(share.low, 1), round(share.high, 1)],
         "decisions_median_p90": np.percentile(since[ok], [50, 90]).round(1).tolist() if ok.any() else None,

@@ -19,8 +19,8 @@ from pipeline.setpoint.calibration import Calibration
 from pipeline.setpoint.calibration import Seen as CalibrationSeen
 from pipeline.setpoint.classifier import Labelled, State
 from pipeline.setpoint.eyes import Beside, Eyes, Said
-from pipeline.setpoint.judging import wilson
 from pipeline.setpoint.recorded import WindowTable
+from pipeline.setpoint.score import wilson
 from pipeline.setpoint.vision_transformer import (
     PAPER,
     SMALL,

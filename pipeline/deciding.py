@@ -14,8 +14,9 @@ from pipeline.params import Section
 from pipeline.seeing import TrainClassifier
 from pipeline.setpoint import agent, baselines, bayes, belief_agent, deployment, eyes, judging, pixels
 from pipeline.setpoint.eyes import Eyes
-from pipeline.setpoint.judging import Choice, Score
+from pipeline.setpoint.judging import Choice
 from pipeline.setpoint.recorded import WindowTable, recorded_windows
+from pipeline.setpoint.score import Score, wilson
 from pipeline.setpoint.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS, Controller, rollout
 from pipeline.teaching import Agents, RobustFilter
 
@@ -250,7 +251,7 @@ def _pixel_row(name: str, kind: str, case: str, found: pixels.Episodes) -> dict[
     """A row of schema SCOREBOARD: settled is inside to the end from at least DWELL decisions before it."""
     since, runs, last = pixels.settled_since(found), len(found.flow), found.flow.shape[1] - 1
     done = since <= last - DWELL
-    share = judging.wilson(done)
+    share = wilson(done)
     past = np.sign(100.0 - found.flow[:, :1]) * (found.flow - 100.0)
     worst = int(since.argmax())
     nothing = dict.fromkeys((f"{key}_{end}percent" for key in ("stay", "recovered") for end in ("", "low_", "high_")), np.nan)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import scipy.stats
+import scipy.special
 
 EXACT = 14  # blocks up to which all 2^n signs are tried
 
@@ -41,7 +41,7 @@ def paired(champion: np.ndarray, challenger: np.ndarray, block: Sequence[str], *
     else:
         flipped = rng.choice([-1.0, 1.0], (draws, n)) @ d
         p = float((1 + (flipped >= d.sum() - 1e-12).sum()) / (1 + draws))
-    half = scipy.stats.t.ppf(0.95, n - 1) * d.std(ddof=1) / np.sqrt(n) if n > 1 else np.inf
+    half = scipy.special.stdtrit(n - 1, 0.95) * d.std(ddof=1) / np.sqrt(n) if n > 1 else np.inf
     low, middle, high = (100.0 * (1.0 - np.exp(-value)) for value in (mean - half, mean, mean + half))
     return Paired(float(middle), float(max(low, -1e6)), float(high), p, len(champion), n)
 

@@ -1,6 +1,8 @@
 """A section of params.yaml -> a frozen, bounded, typed object; each problem with it becomes one sentence that ends with the remedy."""
 
+import copy
 import difflib
+import functools
 import hashlib
 import json
 import re
@@ -206,6 +208,11 @@ _Loader.add_constructor("tag:yaml.org,2002:int", lambda loader, node: int(node.v
 _Loader.add_constructor("tag:yaml.org,2002:float", lambda loader, node: float(re.sub(r"\.(inf|nan)", r"\1", node.value.lower())))
 
 
+@functools.lru_cache(maxsize=4)
+def _parsed(text: str) -> Any:
+    return yaml.load(text, _Loader)
+
+
 def read(path: str | Path = FILE) -> dict:
     """Every section as the file has it, unchecked. Raises ValueError with file and line where it is no YAML or a key stands there twice."""
     try:
@@ -215,7 +222,7 @@ def read(path: str | Path = FILE) -> dict:
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: byte {error.start} is not UTF-8; save the file as UTF-8") from None
     try:
-        sections = yaml.load(text, _Loader)
+        sections = copy.deepcopy(_parsed(text))
     except yaml.MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 1
         remedy = "keep one of the two" if "twice" in (error.problem or "") else "mend the line: key: value, indented by spaces"

@@ -16,8 +16,8 @@ from pipeline.params import Section
 from pipeline.setpoint import agent, bayes, belief_agent, judging
 from pipeline.setpoint.agent import QNetwork
 from pipeline.setpoint.belief_agent import Belief, BeliefNetwork
-from pipeline.setpoint.judging import Score
 from pipeline.setpoint.recorded import WindowTable, recorded_windows
+from pipeline.setpoint.score import Score
 
 SCHEMA = "agents 1"
 # points of the course of training that a page has room for, of each phase

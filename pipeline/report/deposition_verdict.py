@@ -67,7 +67,8 @@ def verdict(sources: Sources) -> Verdict:
     first = next((rule for wanted in (FAILED, OPEN) for rule in needed if rule.states[column] == wanted), None) if state != PASSED else None
     if state == PASSED:
         decision = f"{'By forecast, t' if machine else 'T'}his machine prints these parts: use {USE[use]}."
-        lead = f"All {count(len(needed), 'rule')} {'that can be judged ' if unjudged else ''}passed."
+        peak = f", where the drive can give {number(peak, 0)} times the steady command" if unjudged and use == OURS and (peak := _peak(sources)) else ""
+        lead = f"All {count(len(needed), 'rule')} {'that can be judged ' if unjudged else ''}passed{peak}."
     else:
         decision = f"{'Do not print these parts yet' if state == FAILED else 'Do not decide yet'}: {USE[use]} {'comes' if use == 'on_off' or use != OURS else 'come'} closest."
         lead = (
@@ -92,14 +93,15 @@ def verdict(sources: Sources) -> Verdict:
 
 def _unlimited(sources: Sources) -> str:
     """Before the command's limit is declared, how far the command goes is a condition of the verdict."""
-    metrics = sources.metrics["train_ilc"]
-    peaks = (
-        []
-        if isinstance(metrics, Missing)
-        else [one[law]["peak_over_steady"] for one in metrics.values() for law in ("ours", "pixels") if law in one]
-    )
-    peak = f": the command peaks at {number(max(peaks), 0)} times the steady one" if peaks else ""
+    peak = f": the command peaks at {number(peak, 0)} times the steady one" if (peak := _peak(sources)) else ""
     return f"Not judged: time at the command’s limit. Declare the drive’s limit (printer.limit_mm){peak}."
+
+
+def _peak(sources: Sources) -> float:
+    """The largest command of our laws over the steady one; 0 where none was learned."""
+    metrics = sources.metrics["train_ilc"]
+    learned = [] if isinstance(metrics, Missing) else [one[law] for one in metrics.values() for law in ("ours", "pixels") if law in one]
+    return max((law["peak_over_steady"] for law in learned), default=0.0)
 
 
 def told(found: Sequence[Structure], use: str, machine: bool) -> str:

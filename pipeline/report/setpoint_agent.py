@@ -13,8 +13,8 @@ from pipeline.report.pictures import Column, Picture, hole
 from pipeline.report.setpoint_verdict import AGENT, BASELINE, PAPER, Board, Case, case_text, role
 from pipeline.report.sources import Sources, Table, lookup
 from pipeline.report.verdict import Figure, Missing
-from pipeline.setpoint.judging import FLOW_BAND, SETTLED_BY, TEMPERATURE_BAND
-from pipeline.setpoint.reward import BEST_FLOW, BEST_TEMPERATURE, PHASES, ROTATION
+from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE, PHASES, ROTATION
+from pipeline.setpoint.score import FLOW_BAND, SETTLED_BY, TEMPERATURE_BAND
 
 # rewards whose lines are drawn, of the last phase
 LEVELS = (0.5, 0.0, -0.5, -0.8)

@@ -15,8 +15,8 @@ from pipeline.report.setpoint_agent import CASES
 from pipeline.report.setpoint_verdict import BASELINE, OPEN, PASSED, Board, board, case_text, named, share_text, verdict, within, worst
 from pipeline.report.sources import Sources, Table
 from pipeline.report.verdict import ROLES, Figure, Missing
-from pipeline.setpoint.judging import FLOW_BAND
-from pipeline.setpoint.reward import BEST_FLOW
+from pipeline.setpoint.published import BEST_FLOW
+from pipeline.setpoint.score import FLOW_BAND
 
 FLOOR, CEILING = 1.0, 300.0
 ORDER = ("model_based", "data_driven", "baseline")

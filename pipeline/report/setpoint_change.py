@@ -8,7 +8,7 @@ from pipeline.report.digits import MINUS, THIN, number
 from pipeline.report.setpoint_verdict import Case, Cell, board
 from pipeline.report.sources import Sources, lookup
 from pipeline.report.verdict import FAILED, Missing, Question, state
-from pipeline.setpoint.judging import wilson
+from pipeline.setpoint.score import wilson
 
 # points closer than this are one: the accepted figures are kept rounded
 SAME = 0.05

@@ -12,7 +12,7 @@ from pipeline.report.pictures import Column, Picture, hole
 from pipeline.report.setpoint_verdict import NAMES, accuracy, share_text
 from pipeline.report.sources import Sources, Table, lookup
 from pipeline.report.verdict import Figure, Missing
-from pipeline.setpoint.simulator import ALPHA
+from pipeline.setpoint.published import ALPHA
 
 CLASSES = ("under", "good", "over")
 # borders of the classes in percent of nominal flow

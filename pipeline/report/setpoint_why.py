@@ -10,8 +10,8 @@ from pipeline.report import charts, page
 from pipeline.report.digits import THIN, count, number
 from pipeline.report.sources import Sources, Table
 from pipeline.report.verdict import Missing
-from pipeline.setpoint.judging import FLOW_BAND, TEMPERATURE_BAND
-from pipeline.setpoint.reward import BEST_FLOW, BEST_TEMPERATURE
+from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE
+from pipeline.setpoint.score import FLOW_BAND, TEMPERATURE_BAND
 
 EPISODES, WIDTH, LEFT = 2, 1112, 36
 # decisions that are told in words

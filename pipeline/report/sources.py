@@ -128,7 +128,7 @@ def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], An
         ("trajectories", "evaluate_temperature", "trajectories.parquet", *table(schemas.trajectories(machine.inputs, machine.outputs))),
         ("study", "evaluate_temperature", "study.parquet", *table(schemas.STUDY)),
         ("trials", "train_ilc", "trials.parquet", *table(schemas.TRIALS)),
-        ("lessons", "train_ilc", "lessons.parquet", *table(schemas.LESSONS)),
+        ("lessons", "train_ilc", "lessons.parquet", f"{schemas.LESSONS.name} {schemas.LESSONS.version}", _first_routine),
         ("filmed", "train_ilc", "filmed.parquet", *table(schemas.FILMED)),
         ("models", "train_ilc", "models.json", "models", artifacts.read_json),
         ("frames", "train_ilc", "frames/frames.json", "frames 1", _frames),
@@ -150,6 +150,13 @@ def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], An
         ("decisions", "evaluate_setpoint", "decisions.parquet", *table(setpoint_schemas.DECISIONS)),
         ("choice", "evaluate_setpoint", "choice.json", "choice", artifacts.read_json),
     ]
+
+
+def _first_routine(path: str) -> Table:
+    """The lessons of the reference routine, a third of all rows; the pages show no other."""
+    table = artifacts.read_table(path, schemas.LESSONS)
+    rows = table["routine"] == 0
+    return {name: values[rows] for name, values in table.items()}
 
 
 # frames that a page has room for

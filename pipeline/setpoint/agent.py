@@ -14,7 +14,8 @@ import numpy as np
 import optax
 from jax.tree_util import Partial
 
-from pipeline.setpoint.reward import BEST_TEMPERATURE, PHASES, reward
+from pipeline.setpoint.published import BEST_TEMPERATURE, PHASES
+from pipeline.setpoint.reward import reward
 from pipeline.setpoint.simulator import (
     CHANCES,
     FLOW_LIMITS,

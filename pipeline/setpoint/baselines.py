@@ -10,8 +10,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from pipeline.setpoint.reward import BEST_TEMPERATURE
-from pipeline.setpoint.simulator import CLASSES, FLOW_MOVES, GOOD, OVER, STAND, TEMPERATURE_MOVES, UNDER, Action, Controller, Observation
+from pipeline.setpoint.published import BEST_TEMPERATURE, FLOW_MOVES, TEMPERATURE_MOVES
+from pipeline.setpoint.simulator import CLASSES, GOOD, OVER, STAND, UNDER, Action, Controller, Observation
 
 
 def nearest(moves: tuple[float, ...], wanted: jax.Array) -> jax.Array:

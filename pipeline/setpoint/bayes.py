@@ -21,8 +21,8 @@ import numpy as np
 import scipy.special
 
 from pipeline.setpoint.baselines import temperature_move
+from pipeline.setpoint.published import BEST_FLOW
 from pipeline.setpoint.recorded import WindowTable
-from pipeline.setpoint.reward import BEST_FLOW
 from pipeline.setpoint.simulator import (
     CLASSES,
     FLOW_LIMITS,

@@ -16,8 +16,9 @@ from jax.tree_util import Partial
 
 from pipeline.setpoint import bayes
 from pipeline.setpoint.agent import ACTIONS, TEMPERATURE_SCALE, Learner, Setting, Sight, World, double, greedy, phase
+from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE, PHASES
 from pipeline.setpoint.recorded import WindowTable, recorded_windows
-from pipeline.setpoint.reward import BEST_FLOW, BEST_TEMPERATURE, PHASES, reward
+from pipeline.setpoint.reward import reward
 from pipeline.setpoint.simulator import (
     DELTA,
     FLOW_LIMITS,

@@ -4,42 +4,11 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-import scipy.special
 
-from pipeline.setpoint.reward import BEST_FLOW, BEST_TEMPERATURE
-from pipeline.setpoint.simulator import Conditions, Controller, Trajectory, Windows, nominal, paper_windows, rollout
+from pipeline.setpoint.score import CLOG_STEP, STEPS, Score, Share, judge
+from pipeline.setpoint.simulator import Conditions, Controller, Windows, nominal, paper_windows, rollout
 
 START_FLOWS, START_TEMPERATURES = (30.0, 60.0, 80.0, 120.0, 150.0, 200.0, 300.0), (190.0, 210.0, 230.0)  # section 3.4
-FLOW_BAND, TEMPERATURE_BAND = 10.0, 5.0  # about 100 % and 210 °C
-SETTLED_BY, DWELL_UNTIL, STEPS = 90, 100, 200  # inside from some step <= 90 until 100; never out from 100 to 200 is staying
-CLOG_STEP, RECOVERED_UNTIL = 60, 120
-
-
-class Share(NamedTuple):
-    """A share of runs in percent with its 95 % Wilson interval."""
-
-    percent: float
-    low: float
-    high: float
-
-
-class Score(NamedTuple):
-    """n runs. Shares of all runs: settled (inside 90-110 % and 210 +- 5 °C from some step <= 90 until 100), stay (settled, and never out from 100 to 200), recovered
-    (inside from some step <= 90 until 120: the one to read where something befalls the machine at step 60).
-
-    median_steps and p90_steps of the settled runs until they are inside for good (NaN where none settled); overshoot_p95 of the points of flow past 100 % on the far
-    side of the start, before step 60; flow_error the mean of |q - 100 %| over steps 100 to 200; worst_start names the start with the fewest settled, with its percent.
-    """
-
-    runs: int
-    settled: Share
-    stay: Share
-    recovered: Share
-    median_steps: float
-    p90_steps: float
-    overshoot_p95: float
-    flow_error: float
-    worst_start: tuple[float, float, float]
 
 
 class Choice(NamedTuple):
@@ -80,57 +49,10 @@ def cases(recorded: Windows, *, runs: int, segment: float) -> dict[str, tuple[Wi
     }
 
 
-def judge(trajectory: Trajectory) -> Score:
-    """The score of n trajectories of at least 200 decisions, by their true flow and temperature.
-
-    Raises ValueError for shorter ones.
-    """
-    flow, temperature = np.asarray(trajectory.flow, float), np.asarray(trajectory.temperature, float)
-    if flow.shape[1] <= STEPS:
-        raise ValueError(f"judge: expected trajectories of {STEPS} decisions, found {flow.shape[1] - 1}; roll out with steps={STEPS}")
-    # float32 sums of moves end a hair outside a border that they are on
-    inside = (np.abs(flow - BEST_FLOW) <= FLOW_BAND + 1e-3) & (np.abs(temperature - BEST_TEMPERATURE) <= TEMPERATURE_BAND + 1e-3)
-    entered = _inside_since(inside, DWELL_UNTIL)
-    settled, stay = entered <= SETTLED_BY, (entered <= SETTLED_BY) & inside[:, DWELL_UNTIL : STEPS + 1].all(axis=1)
-    recovered = _inside_since(inside, RECOVERED_UNTIL) <= SETTLED_BY
-    past = np.sign(BEST_FLOW - flow[:, :1]) * (flow[:, :CLOG_STEP] - BEST_FLOW)
-    median, p90 = np.percentile(entered[settled], [50, 90]) if settled.any() else (np.nan, np.nan)
-    return Score(
-        runs=len(flow),
-        settled=wilson(settled),
-        stay=wilson(stay),
-        recovered=wilson(recovered),
-        median_steps=float(median),
-        p90_steps=float(p90),
-        overshoot_p95=float(np.percentile(past.max(axis=1).clip(0), 95)),
-        flow_error=float(np.abs(flow[:, DWELL_UNTIL : STEPS + 1] - BEST_FLOW).mean()),
-        worst_start=_worst_start(flow[:, 0], temperature[:, 0], settled),
-    )
-
-
 def evaluate(controller: Controller, parameters, windows: Windows, conditions: Conditions, key: jax.Array) -> Score:
     """Roll out and judge."""
-    return judge(rollout(controller, parameters, windows, conditions, key, steps=STEPS))
-
-
-def _inside_since(inside: np.ndarray, until: int) -> np.ndarray:
-    """The first step (n,) from which each run is inside through step `until`; until + 1 where it is outside then."""
-    out = ~inside[:, until::-1]
-    return np.where(out.any(axis=1), until + 1 - out.argmax(axis=1), 0)
-
-
-def _worst_start(flow: np.ndarray, temperature: np.ndarray, settled: np.ndarray) -> tuple[float, float, float]:
-    pairs, which = np.unique(np.stack([flow, temperature], axis=1), axis=0, return_inverse=True)
-    percent = 100.0 * np.bincount(which.ravel(), weights=settled) / np.bincount(which.ravel())
-    worst = int(percent.argmin())
-    return float(pairs[worst, 0]), float(pairs[worst, 1]), float(percent[worst])
-
-
-def wilson(happened: np.ndarray) -> Share:
-    """The share of True (n,) in percent with the interval of Wilson 1927 at 95 %: (p + z^2 / 2n +- z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n)."""
-    n, p, z = len(happened), float(np.mean(happened)), float(scipy.special.ndtri(0.975))
-    centre, half = (p + z**2 / (2 * n)) / (1 + z**2 / n), z * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2)) / (1 + z**2 / n)
-    return Share(100.0 * p, float(100.0 * max(centre - half, 0.0)), float(100.0 * min(centre + half, 1.0)))
+    ran = rollout(controller, parameters, windows, conditions, key, steps=STEPS)
+    return judge(ran.flow, ran.temperature)
 
 
 def choose(scores: dict[str, dict[str, Score]]) -> Choice:

@@ -5,7 +5,7 @@ the tip outward. The paper is Li and Pattinson 2025, section 2.2.1.
 """
 
 import functools
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -26,6 +26,8 @@ COARSE = 4
 OPEN = np.arange(-30, 211, COARSE)
 # a direction from G-code is trusted to this many degrees: the line bends, and the camera's turn is known to a few
 LEEWAY_DEG = 6
+# a nozzle this close to where it was calibrated is at home
+HOME_PX = 2
 # what scores within this share of the best belongs to the same line
 NEARLY = 0.1
 
@@ -131,14 +133,16 @@ def find_all(
 
 
 class Drift(NamedTuple):
-    """Where the nozzle is seen: offset (x, y) in px from the calibrated tip, and how alike it looks there, a correlation of -1..1."""
+    """Where the nozzle is seen: offset (x, y) in px from the calibrated tip, how alike it looks there, a correlation of -1..1, and by how much more than at home."""
 
     offset_px: tuple[int, int]
     correlation: float
+    advantage: float
 
 
 def nozzle_template(frame: np.ndarray, tip: tuple[float, float], *, size_px: int) -> np.ndarray:
-    """Gray patch (size, size) uint8 of the nozzle with the tip in the middle of its lower edge, cut from the frame on which the tip was calibrated.
+    """Gray patch (3/4 size, size) uint8 of the nozzle above the calibrated tip, cut from the frame on which it was calibrated: a square with the tip in the middle of its
+    lower edge, less its lowest quarter, where beads are laid and look different on each segment.
 
     Raises ValueError where the patch does not lie inside the frame.
     """
@@ -149,23 +153,33 @@ def nozzle_template(frame: np.ndarray, tip: tuple[float, float], *, size_px: int
             f"nozzle template: expected {size_px} px above and {size_px // 2} px beside the tip ({tip[0]:g}, {tip[1]:g}) inside the frame "
             f"of {frame.shape[1]} x {frame.shape[0]} px; take a smaller template"
         )
-    return _gray(frame[top : top + size_px, left : left + size_px]).copy()
+    return _gray(frame[top : top + size_px - size_px // 4, left : left + size_px]).copy()
 
 
-def drift(frame: np.ndarray, template: np.ndarray, tip: tuple[float, float], *, reach_px: int) -> Drift:
-    """Where within reach_px of the calibrated tip the nozzle is (normalised cross-correlation): an alarm that the camera moved, never a new calibration."""
-    _check(frame, tip)
-    size = len(template)
+def drift(frames: Sequence[np.ndarray], template: np.ndarray, tip: tuple[float, float], *, reach_px: int) -> Drift:
+    """Where within reach_px of the calibrated tip the nozzle is, by the mean over the frames of the normalised cross-correlation: an alarm that the camera moved, never a
+    new calibration. At home is within HOME_PX of the calibrated tip.
+    """
+    for frame in frames:
+        _check(frame, tip)
+    frame, (tall, size) = frames[0], template.shape
     left, top = _corner(tip, size)
-    rows, columns = (np.clip([v - reach_px, v + size + reach_px], 0, end) for v, end in ((top, frame.shape[0]), (left, frame.shape[1])))
-    if min(rows[1] - rows[0], columns[1] - columns[0]) < size:
+    rows, columns = (
+        np.clip([v - reach_px, v + extent + reach_px], 0, end)
+        for v, extent, end in ((top, tall, frame.shape[0]), (left, size, frame.shape[1]))
+    )
+    if rows[1] - rows[0] < tall or columns[1] - columns[0] < size:
         raise ValueError(
             f"nozzle drift: expected room for the template of {size} px around the tip ({tip[0]:g}, {tip[1]:g}) but the frame is "
             f"{frame.shape[1]} x {frame.shape[0]} px; calibrate on frames of this camera"
         )
-    match = cv2.matchTemplate(_gray(frame[rows[0] : rows[1], columns[0] : columns[1]]), template, cv2.TM_CCOEFF_NORMED)
+    match = np.mean(
+        [cv2.matchTemplate(_gray(one[rows[0] : rows[1], columns[0] : columns[1]]), template, cv2.TM_CCOEFF_NORMED) for one in frames], axis=0
+    )
     row, column = np.unravel_index(int(match.argmax()), match.shape)
-    return Drift((int(columns[0] + column - left), int(rows[0] + row - top)), float(match[row, column]))
+    y, x = (max(int(v), 0) for v in (top - rows[0], left - columns[0]))
+    home = match[max(y - HOME_PX, 0) : y + HOME_PX + 1, max(x - HOME_PX, 0) : x + HOME_PX + 1].max()
+    return Drift((int(columns[0] + column - left), int(rows[0] + row - top)), float(match[row, column]), float(match[row, column] - home))
 
 
 def drawn(frame: np.ndarray, tip: tuple[float, float], found: KeyArea) -> np.ndarray:

@@ -11,9 +11,11 @@ import numpy as np
 
 from pipeline.setpoint import deployment, key_area, nozzle_scene
 from pipeline.setpoint.deployment import ACTS, AMBIGUOUS, Limits, Waits, Window
-from pipeline.setpoint.simulator import FLOW_MOVES, LAMBDA, TEMPERATURE_MOVES, Controller, Observation
+from pipeline.setpoint.published import FLOW_MOVES, LAMBDA, TEMPERATURE_MOVES
+from pipeline.setpoint.simulator import Controller, Observation
 
-TEMPLATE_PX, LIKENESS = 60, 0.6  # of the nozzle, for the alarm that the camera moved: what is less alike is not the nozzle elsewhere
+# of the nozzle, for the alarm that the camera moved: frames of a window that are looked at; what is less alike, or hardly more than at home, is not the nozzle elsewhere
+TEMPLATE_PX, REACH_PX, LOOKS, LIKENESS, ADVANTAGE = 80, 30, 5, 0.4, 0.1
 
 # ---- the machine
 
@@ -279,10 +281,10 @@ def _seen(
         found = key_area.find_all(frames, tip, least_score=loop.least_score, directions_deg=segment.direction_deg)
         if templates[i] is None:
             templates[i] = key_area.nozzle_template(made.frames[0], tip, size_px=TEMPLATE_PX)
-        nozzle = key_area.drift(frames[0], templates[i], tip, reach_px=TEMPLATE_PX // 2)
+        nozzle = key_area.drift(frames[:: max(1, len(frames) // LOOKS)], templates[i], tip, reach_px=REACH_PX)
         images.append(found.images)
         valid.append(found.valid)
-        moved.append(np.hypot(*nozzle.offset_px) > loop.tip_tolerance_px and nozzle.correlation >= LIKENESS)
+        moved.append(np.hypot(*nozzle.offset_px) > loop.tip_tolerance_px and nozzle.correlation >= LIKENESS and nozzle.advantage >= ADVANTAGE)
         if (i, decision) in draw:
             one = key_area.find(frames[0], tip, least_score=loop.least_score, direction_deg=segment.direction_deg)
             pictures[i, decision] = key_area.drawn(frames[0], tip, one)

@@ -3,9 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-BEST_FLOW, BEST_TEMPERATURE = 100.0, 210.0  # q* in percent of nominal, u* in °C: PLA, as printed
-ROTATION = jnp.pi * 70 / 180  # theta of table 2
-PHASES = ((40.0, 20.0), (40.0, 10.0), (20.0, 10.0))  # semi-axes (a, b) of the three phases of shaping; the fourth keeps the last
+from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE, ROTATION
 
 
 def reward(flow: jax.Array, temperature: jax.Array, *, a: float, b: float) -> jax.Array:

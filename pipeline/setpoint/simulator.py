@@ -15,13 +15,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-FLOW_MOVES, TEMPERATURE_MOVES = (-10.0, -5.0, 0.0, 5.0, 10.0), (-20.0, -10.0, 0.0, 10.0, 20.0)  # (5), percent and °C
+from pipeline.setpoint.published import ALPHA, DELTA, FLOW_MOVES, LAMBDA, SIGMA, TEMPERATURE_MOVES
+
 STAND = 2  # the index of no move
 FLOW_LIMITS, TEMPERATURE_LIMITS = (20.0, 310.0), (180.0, 240.0)
 BLOCKAGE_LIMITS = (1 / 3, 3.0)  # beyond, no setpoint within its limits would bring the flow to 100 %
-LAMBDA = 10  # flow actions to one temperature action (table 2)
-DELTA = 5.0  # of (6), in steps; the paper prints no value
-ALPHA, SIGMA = 1.5, 0.15  # of (7); the paper prints no values
 HISTORY, CLASSES = 30, 3  # eta and n_c of (8)
 UNDER, GOOD, OVER = 0, 1, 2
 CHANCES = 7  # uniform numbers that a decision takes: three for its window, four for what befalls the machine

@@ -9,8 +9,9 @@ import pytest
 
 from pipeline.setpoint import bayes, judging
 from pipeline.setpoint.baselines import Proportional, SequentialTest, nearest, proportional, sequential_test, temperature_move
+from pipeline.setpoint.published import FLOW_MOVES, TEMPERATURE_MOVES
 from pipeline.setpoint.recorded import recorded_windows, synthetic_table
-from pipeline.setpoint.simulator import FLOW_MOVES, TEMPERATURE_MOVES, Observation, nominal, paper_windows
+from pipeline.setpoint.simulator import Observation, nominal, paper_windows
 
 KEY = jax.random.key(0)
 PURE = {0: [0.76, 0.17, 0.07], 1: [0.15, 0.7, 0.15], 2: [0.07, 0.17, 0.76]}  # the mean window of each class

@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pipeline.setpoint.judging import START_FLOWS, START_TEMPERATURES, Score, Share, cases, choose, judge, rows, starts, wilson
+from pipeline.setpoint.judging import START_FLOWS, START_TEMPERATURES, cases, choose, rows, starts
 from pipeline.setpoint.recorded import recorded_windows, synthetic_table
-from pipeline.setpoint.simulator import Trajectory
+from pipeline.setpoint.score import Score, Share, judge, wilson
 
 
 def path(*pieces):
@@ -19,7 +19,7 @@ def path(*pieces):
 
 def run(*flows, temperature=210.0):
     flow = np.stack(flows)
-    return Trajectory(flow, np.broadcast_to(temperature, flow.shape), None, None, None, None)
+    return flow, np.broadcast_to(temperature, flow.shape)
 
 
 def test_settled_staying_and_recovered_are_what_the_notes_define():
@@ -32,7 +32,7 @@ def test_settled_staying_and_recovered_are_what_the_notes_define():
         path((0, 60), (7, 95), (110, 80), (121, 95)),  # out before 120: settled, not recovered
         path((0, 100), (60, 60), (75, 90)),  # a clog made good at step 75, on the border
     ]
-    score = judge(run(*flows))
+    score = judge(*run(*flows))
     assert score.settled.percent == pytest.approx(100 * 5 / 7)
     assert score.stay.percent == pytest.approx(100 * 3 / 7)
     assert score.recovered.percent == pytest.approx(100 * 4 / 7)
@@ -43,20 +43,20 @@ def test_settled_staying_and_recovered_are_what_the_notes_define():
 
 def test_a_temperature_out_of_its_band_is_not_settled():
     warm = np.where(np.arange(201) < 12, 215.1, 215.0)
-    assert judge(run(path((0, 100)), temperature=warm)).median_steps == 12
-    assert judge(run(path((0, 100)), temperature=215.1)).settled.percent == 0
-    assert np.isnan(judge(run(path((0, 100)), temperature=215.1)).median_steps)
+    assert judge(*run(path((0, 100)), temperature=warm)).median_steps == 12
+    assert judge(*run(path((0, 100)), temperature=215.1)).settled.percent == 0
+    assert np.isnan(judge(*run(path((0, 100)), temperature=215.1)).median_steps)
 
 
 def test_overshoot_counts_the_far_side_of_the_start_until_the_clog_only():
-    score = judge(run(path((0, 300), (20, 85), (30, 100), (60, 60), (75, 100))))
+    score = judge(*run(path((0, 300), (20, 85), (30, 100), (60, 60), (75, 100))))
     assert score.overshoot_p95 == 15
-    assert judge(run(path((0, 30), (20, 130), (30, 100)))).overshoot_p95 == 30
-    assert judge(run(path((0, 30), (20, 99)))).overshoot_p95 == 0
+    assert judge(*run(path((0, 30), (20, 130), (30, 100)))).overshoot_p95 == 30
+    assert judge(*run(path((0, 30), (20, 99)))).overshoot_p95 == 0
 
 
 def test_the_flow_error_is_the_mean_distance_over_the_second_hundred_steps():
-    score = judge(run(path((0, 60), (100, 95), (150, 105)), path((0, 60), (100, 98))))
+    score = judge(*run(path((0, 60), (100, 95), (150, 105)), path((0, 60), (100, 98))))
     assert score.flow_error == pytest.approx(3.5)
 
 
@@ -111,7 +111,7 @@ def test_controllers_judged_on_different_cases_are_not_compared():
 def test_short_trajectories_are_refused():
     short = np.full((1, 101), 100.0)
     with pytest.raises(ValueError, match=r"expected trajectories of 200 decisions, found 100; roll out with steps=200"):
-        judge(Trajectory(short, short, None, None, None, None))
+        judge(short, short)
 
 
 def test_a_row_is_flat_and_names_what_it_holds():
