@@ -38,7 +38,7 @@ USE = {
 # marks of the other pages: circle data-driven, square model-based, ring baseline; hollow: a second of its kind
 MARK = {"basis": "data_driven", "priority": "model_based", "superposition": "exact_model", "on_off": "baseline", "ilc": "kernel"}
 # what the two columns of its rules are, and the mark of the second
-HEADS = ("Ours", "The paper", "model_based")
+HEADS = ("Data\u2011driven", "The paper", "model_based")
 
 
 class Score(NamedTuple):

@@ -18,7 +18,7 @@ CLAIM_RECORDED = (
     "The classifier is trained and judged on recordings of datasets/raw/setpoint, split by print; it is known on these printers only."
 )
 # what the two columns of its rules are, and the mark of the second
-HEADS = ("Learned", "Best baseline", "baseline")
+HEADS = ("Data\u2011driven", "Best baseline", "baseline")
 
 
 class Cell(NamedTuple):

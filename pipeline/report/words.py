@@ -8,6 +8,7 @@ from pipeline.report.sources import Sources
 
 INDEX = (
     "deploy",
+    "columns",
     "gap",
     "band",
     "passed",
@@ -78,6 +79,11 @@ FIXED = {
     "deploy": (
         "Deploy",
         "Take it to the machine and commission it there, under watch: the rules of this page are passed. It does not say that it ran on a machine.",
+    ),
+    "columns": (
+        "Data\u2011driven, model\u2011based, baseline",
+        "One column each in every loop. Temperature: learned from the record alone; from the identified model; PI per zone. Deposition: basis functions of a chain identified "
+        "from trials; the paper’s law and its library; on\u2011off control. Setpoint: our agent; a Bayes filter, whose model is given; the best of the others.",
     ),
     "settling": ("Settling", "How long it takes until every zone has come within the band around its reference and stays there for good."),
     "overshoot": ("Overshoot", "The furthest way that any zone goes past its reference."),

@@ -36,7 +36,7 @@ def conformance(**values):
 
 def test_the_composer_with_the_least_worst_error_is_named_with_its_figure_yardsticks_and_price(project):
     text = page()
-    assert "This machine prints these parts: use the basis functions. All six rules that can be judged passed." in text
+    assert "This machine prints these parts: use the basis functions. All six rules that can be judged passed, where the drive can give 20 times the steady command." in text
     assert "Basis functions leave at most 2.0 % of on‑off control’s flow error (square, A); library by its priority rule 12 %" in text
     assert "learning each part from scratch 1.5 %. Worst printed line: 1.0 % off its volume, ±3 % allowed." in text
     assert "commands up to 20 times the steady one." in text
