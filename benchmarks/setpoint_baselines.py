@@ -32,6 +32,7 @@ ROBUST = {
     "smoothing": 4.0,
     "segment": 12.0,
     "switch": 3e-4,
+    "repeats": 0.3,
     "hazard": 6e-4,
     "move_cost": 0.38,
     "outside_cost": 5.0,

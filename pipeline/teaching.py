@@ -60,6 +60,7 @@ class RobustFilter(Section):
     smoothing: float = Field(gt=0, le=100)
     segment: float = Field(ge=1, le=10_000)
     switch: float = Field(gt=0, lt=1)
+    repeats: float = Field(ge=0, lt=1)
     hazard: float = Field(ge=0, lt=1)
     move_cost: float = Field(ge=0, le=10)
     outside_cost: float = Field(ge=0, le=1000)

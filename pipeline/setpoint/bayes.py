@@ -3,12 +3,14 @@
 The flow is known by its moves and by the windows it shows. The filter carries b(h, q), the belief that the flow is q, the camera errs in the manner of h, and the
 extruder follows its commands with the gain g_h:
 
-    b(h, q) <- sum_h' T(h', h) [(1 - hazard) b(h', q - g_h' move) + hazard b(h') prior(q)]   the move; a clog or the like, with a small probability; another segment
-    b(h, q) <- b(h, q) P(window | h, q) / sum                                                the window
+    b(h, q) <- sum_h' T(h', h) [(1 - hazard) b(h', q - g_h' move) + hazard b'(h') prior(q)]  the move; a clog or the like, with a small probability; another segment
+    b(h, q) <- b(h, q) P(window | h, q, window before) / sum                                 the window
     a = argmin_a sum b(h, q) loss(q + g_h a) + move_cost |a|                                 loss(q) = |q - 100| + outside_cost where that is more than 10
 
 Manners of erring (`evidence`): anywhere with one probability, as in the paper's simulator; or as a trained classifier does by its recorded windows, seen through
-a segment that makes every bead look wider or narrower. Which it is, and how the extruder follows, shows by itself.
+a segment that makes every bead look wider or narrower. Which it is, and how the extruder follows, shows by itself. b'(h) is b(h) with all gains alike: what clogs a
+nozzle changes how its flow follows, too. Windows of a segment are alike: where nothing moved, one shows with probability `repeats` what the one before did,
+whatever the flow, so that ten alike are not ten witnesses.
 """
 
 from collections.abc import Sequence
@@ -46,35 +48,52 @@ CODES = CLASSES * LEVELS
 
 
 class Filter(NamedTuple):
-    """evidence (H, CODES, N) is P(code | h, q); transition (H, H) from row to column at each decision; gains (H,), true by commanded move; hazard: probability a
-    decision that the flow jumps; move_cost in percent of flow error by percent of move, outside_cost in percent of flow error."""
+    """evidence (H, CODES, N) is P(code | h, q); transition and after_jump (H, H) from row to column at each decision and each jump of the flow; gains (H,), true by
+    commanded move; repeats (H,): probability that a window shows what the one before did where nothing moved; hazard: probability a decision that the flow jumps; move_cost in percent of
+    flow error by percent of move, outside_cost in percent of flow error."""
 
     evidence: jax.Array
     transition: jax.Array
+    after_jump: jax.Array
     gains: jax.Array
+    repeats: jax.Array
     hazard: float
     move_cost: float
     outside_cost: float
 
 
+class Known(NamedTuple):
+    """What the filter remembers: belief (H, N), sum 1, and the code of the last window, -1 before the first."""
+
+    belief: jax.Array
+    last: jax.Array
+
+
+def unknown(hypotheses: int) -> Known:
+    """Before the first window."""
+    return Known(jnp.tile(jnp.asarray(PRIOR, jnp.float32) / hypotheses, (hypotheses, 1)), jnp.int32(-1))
+
+
 @cache  # one pair of functions, so that what was compiled for it is found again
 def bayes(hypotheses: int) -> Controller:
-    """The filter and its greedy move, for Filter parameters of so many hypotheses; memory is the belief (H, N)."""
+    """The filter and its greedy move, for Filter parameters of so many hypotheses."""
 
-    def act(parameters: Filter, belief: jax.Array, observation: Observation, key: jax.Array) -> tuple[jax.Array, Action]:
-        belief = believed(parameters, belief, observation)
-        return belief, Action(jnp.argmin(expected_loss(parameters, belief)).astype(jnp.int32), temperature_move(observation))
+    def act(parameters: Filter, known: Known, observation: Observation, key: jax.Array) -> tuple[Known, Action]:
+        known = believed(parameters, known, observation)
+        return known, Action(jnp.argmin(expected_loss(parameters, known.belief)).astype(jnp.int32), temperature_move(observation))
 
-    return Controller(lambda: jnp.tile(jnp.asarray(PRIOR, jnp.float32) / hypotheses, (hypotheses, 1)), act)
+    return Controller(lambda: unknown(hypotheses), act)
 
 
-def believed(parameters: Filter, belief: jax.Array, observation: Observation) -> jax.Array:
-    """The belief (H, N) after the move that led to this window, and the window."""
-    moved = jax.vmap(shifted)(belief, parameters.gains * observation.flow_move)
-    jumped = belief.sum(axis=1, keepdims=True) * jnp.asarray(PRIOR, jnp.float32)
+def believed(parameters: Filter, known: Known, observation: Observation) -> Known:
+    """What is known after the move that led to this window, and the window."""
+    moved = jax.vmap(shifted)(known.belief, parameters.gains * observation.flow_move)
+    jumped = (parameters.after_jump.T @ known.belief.sum(axis=1))[:, None] * jnp.asarray(PRIOR, jnp.float32)
     predicted = parameters.transition.T @ ((1.0 - parameters.hazard) * moved + parameters.hazard * jumped)
-    posterior = predicted * parameters.evidence[:, code(observation.shares, observation.named)]
-    return posterior / posterior.sum()
+    shown = code(observation.shares, observation.named)
+    repeats = (parameters.repeats * ((known.last >= 0) & (observation.flow_move == 0)))[:, None]
+    posterior = predicted * (repeats * (shown == known.last) + (1.0 - repeats) * parameters.evidence[:, shown])
+    return Known(posterior / posterior.sum(), shown)
 
 
 def expected_loss(parameters: Filter, belief: jax.Array) -> jax.Array:
@@ -143,18 +162,20 @@ def recorded_evidence(table: WindowTable, *, look: float, looks: int, floor: flo
 
 
 def robust_filter(table: WindowTable, *, accuracies: Sequence[float], gains: Sequence[float], looks: int, look: float, floor: float, smoothing: float,
-                  segment: float, switch: float, hazard: float, move_cost: float, outside_cost: float) -> Filter:  # fmt: skip
+                  segment: float, switch: float, repeats: float, hazard: float, move_cost: float, outside_cost: float) -> Filter:  # fmt: skip
     """The filter for both simulators: for each of `gains` the manners of erring are anywhere with each of `accuracies`, then `looks` as recorded, each the look of a
     segment that lasts `segment` decisions.
 
-    switch: probability a decision of going over from one way of erring (any of `accuracies`, or as recorded) to another.
+    switch: probability a decision of going over from one way of erring (any of `accuracies`, or as recorded) to another; repeats: of the manners as recorded.
     """
     recorded = recorded_evidence(table, look=look, looks=looks, floor=floor, smoothing=smoothing)
     evidence = np.concatenate([*(class_evidence(accuracy) for accuracy in accuracies), recorded])
     transition = np.kron(np.eye(len(gains)), _changes(len(accuracies), looks, segment, switch))
+    after_jump = np.kron(np.full((len(gains), len(gains)), 1 / len(gains)), np.eye(len(evidence)))
+    repeating = np.tile(np.repeat([0.0, repeats], [len(accuracies), looks]), len(gains))
     return Filter(
-        jnp.asarray(np.tile(evidence, (len(gains), 1, 1)), jnp.float32), jnp.asarray(transition, jnp.float32),
-        jnp.repeat(jnp.asarray(gains, jnp.float32), len(evidence)), hazard, move_cost, outside_cost,
+        jnp.asarray(np.tile(evidence, (len(gains), 1, 1)), jnp.float32), jnp.asarray(transition, jnp.float32), jnp.asarray(after_jump, jnp.float32),
+        jnp.repeat(jnp.asarray(gains, jnp.float32), len(evidence)), jnp.asarray(repeating, jnp.float32), hazard, move_cost, outside_cost,
     )  # fmt: skip
 
 
@@ -170,4 +191,5 @@ def _changes(anywhere: int, looks: int, segment: float, switch: float) -> np.nda
 
 def class_filter(*, accuracy: float, hazard: float, move_cost: float, outside_cost: float) -> Filter:
     """The filter of the paper's simulator: exact with hazard 0, and with a leak otherwise."""
-    return Filter(jnp.asarray(class_evidence(accuracy), jnp.float32), jnp.ones((1, 1)), jnp.ones(1), hazard, move_cost, outside_cost)
+    evidence, one = jnp.asarray(class_evidence(accuracy), jnp.float32), jnp.ones((1, 1))
+    return Filter(evidence, one, one, jnp.ones(1), jnp.zeros(1), hazard, move_cost, outside_cost)

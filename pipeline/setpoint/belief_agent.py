@@ -118,16 +118,17 @@ def standing_values(observation: Observation, gamma: float) -> jax.Array:
 def belief_sight(of: Belief) -> Sight:
     """x = [values of the flow's actions (5), pooled belief, hypotheses (H), values of the temperature's actions (5), u_hat, u_bar, clock, heeded]."""
     hypotheses = of.filter.evidence.shape[0]
-    pooling, start = jnp.asarray(POOLING, jnp.float32), jnp.tile(jnp.asarray(bayes.PRIOR, jnp.float32) / hypotheses, (hypotheses, 1))
+    pooling = jnp.asarray(POOLING, jnp.float32)
 
-    def see(network, belief, observation):
-        belief = bayes.believed(of.filter, belief, observation)
+    def see(network, known, observation):
+        known = bayes.believed(of.filter, known, observation)
+        belief = known.belief
         flow, clock = belief.sum(axis=0), observation.step % LAMBDA
         temperatures = (jnp.stack([observation.temperature, observation.target]) - BEST_TEMPERATURE) / TEMPERATURE_SCALE
         rest = [standing_values(observation, slower(of.gamma)), temperatures, jnp.stack([clock / LAMBDA, clock == 0])]
-        return belief, jnp.concatenate([of.values @ flow, flow @ pooling, belief.sum(axis=1), *rest])
+        return known, jnp.concatenate([of.values @ flow, flow @ pooling, belief.sum(axis=1), *rest])
 
-    return Sight(lambda: start, see)
+    return Sight(lambda: bayes.unknown(hypotheses), see)
 
 
 class Correction(eqx.Module):

@@ -16,7 +16,7 @@ from pipeline.setpoint.simulator import Observation, nominal, paper_windows
 KEY = jax.random.key(0)
 PURE = {0: [0.76, 0.17, 0.07], 1: [0.15, 0.7, 0.15], 2: [0.07, 0.17, 0.76]}  # the mean window of each class
 ROBUST = {
-    "accuracies": [0.7, 0.97], "gains": [1.0, 0.65], "looks": 5, "look": 0.055, "floor": 0.03, "smoothing": 4.0, "segment": 12.0, "switch": 3e-4, "hazard": 6e-4, "move_cost": 0.38, "outside_cost": 5.0,
+    "accuracies": [0.7, 0.97], "gains": [1.0, 0.65], "looks": 5, "look": 0.055, "floor": 0.03, "smoothing": 4.0, "segment": 12.0, "switch": 3e-4, "repeats": 0.3, "hazard": 6e-4, "move_cost": 0.38, "outside_cost": 5.0,
 }  # fmt: skip
 EXACT = {"accuracy": 0.7, "hazard": 0.0, "move_cost": 0.0, "outside_cost": 0.0}
 
@@ -86,7 +86,7 @@ def test_the_sequential_test_moves_when_one_class_leads_good_by_its_threshold():
 
 def test_the_exact_filter_is_bayes_rule_over_every_start():
     parameters, controller, believed = bayes.class_filter(**EXACT), bayes.bayes(1), jax.jit(bayes.believed)
-    rng, belief = np.random.default_rng(0), controller.start()
+    rng, known = np.random.default_rng(0), controller.start()
     flow, prior = bayes.GRID.copy(), bayes.PRIOR.copy()
     for t in range(12):
         move = float(rng.choice(FLOW_MOVES)) if t else 0.0
@@ -94,10 +94,10 @@ def test_the_exact_filter_is_bayes_rule_over_every_start():
         flow = np.clip(flow + move, 20, 310)
         true = np.where(flow < 90, 0, np.where(flow > 110, 2, 1))
         prior = prior * np.where(true == named, 0.7, 0.15)
-        belief = believed(parameters, belief, seen(named, move=move))
+        known = believed(parameters, known, seen(named, move=move))
     expected = np.zeros(len(bayes.GRID))
     np.add.at(expected, np.rint((flow - 20) / bayes.SPACING).astype(int), prior / prior.sum())
-    np.testing.assert_allclose(belief[0], expected, atol=1e-6)  # float32
+    np.testing.assert_allclose(known.belief[0], expected, atol=1e-6)  # float32
 
 
 def test_a_part_of_a_spacing_moves_the_mean_by_as_much_and_loses_nothing():
@@ -122,6 +122,7 @@ def test_evidence_sums_to_one_for_every_flow_and_transitions_for_every_hypothesi
     assert parameters.evidence.shape == (14, bayes.CODES, len(bayes.GRID))
     np.testing.assert_allclose(parameters.evidence.sum(axis=1), 1.0, rtol=1e-5)  # float32
     np.testing.assert_allclose(parameters.transition.sum(axis=1), 1.0, rtol=1e-6)
+    np.testing.assert_allclose(parameters.after_jump.sum(axis=1), 1.0, rtol=1e-6)
     assert float(parameters.evidence.min()) > 0  # nothing is ever ruled out
 
 
@@ -135,11 +136,11 @@ def test_codes_tell_the_classes_apart_and_rise_with_the_flow():
 
 
 def test_a_thin_looking_segment_is_told_from_a_low_flow_by_its_end(table):
-    """Two hundred good windows, then ten that lean to under: a segment that looks thin explains them, and the flow stays; thirty that name under move it."""
+    """Two hundred good windows, then three that lean to under: a segment that looks thin explains them, and the flow stays; eight that name under move it."""
     controller, parameters = bayes.bayes(14), bayes.robust_filter(table, **ROBUST)
     act, memory = jax.jit(controller.act), controller.start()
     answers = []
-    for shares in [[0.02, 0.96, 0.02]] * 200 + [[0.1, 0.89, 0.01]] * 3 + [[0.9, 0.1, 0.0]] * 3:
+    for shares in [[0.02, 0.96, 0.02]] * 200 + [[0.1, 0.89, 0.01]] * 3 + [[0.9, 0.1, 0.0]] * 8:
         memory, action = act(parameters, memory, seen(int(np.argmax(shares)), shares=shares, step=len(answers)), KEY)
         answers.append(FLOW_MOVES[int(action.flow)])
     assert not any(answers[20:203])
@@ -148,9 +149,9 @@ def test_a_thin_looking_segment_is_told_from_a_low_flow_by_its_end(table):
 
 def test_a_weak_extruder_moves_its_own_hypothesis_by_less_and_asks_for_more(table):
     blind = np.full((2, bayes.CODES, len(bayes.GRID)), 1 / bayes.CODES)
-    parameters = bayes.Filter(jnp.asarray(blind), jnp.eye(2), jnp.array([1.0, 0.5]), 0.0, 0.0, 0.0)
+    parameters = bayes.Filter(jnp.asarray(blind), jnp.eye(2), jnp.eye(2), jnp.array([1.0, 0.5]), jnp.zeros(2), 0.0, 0.0, 0.0)
     belief = jnp.zeros((2, len(bayes.GRID))).at[:, 16].set(0.5)  # 60 %, either way of following
-    after = np.asarray(bayes.believed(parameters, belief, seen(1, move=10.0)))
+    after = np.asarray(bayes.believed(parameters, bayes.Known(belief, jnp.int32(-1)), seen(1, move=10.0)).belief)
     np.testing.assert_allclose(after @ bayes.GRID / after.sum(axis=1), [70.0, 65.0], rtol=1e-6)
     # from 60 % a move of 10 leaves a miss of 30 where the extruder follows, of 35 where it follows by half
     np.testing.assert_allclose(np.asarray(bayes.expected_loss(parameters, belief))[[2, 4]], [40.0, 32.5], rtol=1e-6)
@@ -159,17 +160,44 @@ def test_a_weak_extruder_moves_its_own_hypothesis_by_less_and_asks_for_more(tabl
 def test_an_extruder_that_follows_by_half_is_found_out(table):
     """Moves of + 10 % from 60 %: the windows name good four moves later where the extruder follows, eight later where it follows by half."""
     parameters = bayes.robust_filter(table, **{**ROBUST, "gains": [1.0, 0.5]})
-    belief, one = bayes.bayes(14).start(), jax.jit(bayes.believed)
+    known, one = bayes.bayes(14).start(), jax.jit(bayes.believed)
     for k in range(24):
         named = 0 if k < 8 else 1 if k < 12 else 2
-        belief = one(parameters, belief, seen(named, move=10.0 if k else 0.0, step=k))
-    weak = float(belief[7:].sum())
-    belief = bayes.bayes(14).start()
+        known = one(parameters, known, seen(named, move=10.0 if k else 0.0, step=k))
+    weak = float(known.belief[7:].sum())
+    known = bayes.bayes(14).start()
     for k in range(14):
         named = 0 if k < 4 else 1 if k < 6 else 2
-        belief = one(parameters, belief, seen(named, move=10.0 if k else 0.0, step=k))
+        known = one(parameters, known, seen(named, move=10.0 if k else 0.0, step=k))
     assert weak > 0.8
-    assert float(belief[7:].sum()) < 0.6
+    assert float(known.belief[7:].sum()) < 0.6
+
+
+def test_a_window_that_repeats_is_a_weaker_witness_by_the_rule_and_one_that_differs_a_full_one():
+    evidence = np.full((1, bayes.CODES, len(bayes.GRID)), 0.01)
+    parameters = bayes.Filter(jnp.asarray(evidence, jnp.float32).at[:, :, 32].set(0.2), jnp.ones((1, 1)), jnp.ones((1, 1)), jnp.ones(1), jnp.array([0.4]), 0.0, 0.0, 0.0)  # fmt: skip
+    start = bayes.Known(jnp.full((1, len(bayes.GRID)), 1 / len(bayes.GRID)), jnp.int32(-1))
+
+    def ratio(known):
+        return float(known.belief[0, 32] / known.belief[0, 10])
+
+    first = bayes.believed(parameters, start, seen(1))
+    assert ratio(first) == pytest.approx(20.0, rel=1e-5)  # 0.2 / 0.01: nothing came before it
+    same, other = (bayes.believed(parameters, first, seen(named)) for named in (1, 2))
+    assert ratio(same) / ratio(first) == pytest.approx((0.4 + 0.6 * 0.2) / (0.4 + 0.6 * 0.01), rel=1e-5)
+    assert ratio(other) / ratio(first) == pytest.approx(20.0, rel=1e-5)
+    moved = bayes.believed(parameters, first, seen(1, move=5.0))  # what stood at 95 % is at 100 now: a repeat after a move is a full witness
+    assert float(moved.belief[0, 32] / moved.belief[0, 10]) == pytest.approx(20.0, rel=1e-5)
+    assert int(first.last) == int(bayes.code(seen(1).shares, seen(1).named))
+
+
+def test_a_jump_of_the_flow_leaves_open_how_the_extruder_follows(table):
+    parameters = bayes.robust_filter(table, **{**ROBUST, "hazard": 1.0})
+    sure = bayes.Known(bayes.bayes(14).start().belief.at[7:].set(0.0), jnp.int32(-1))
+    blind = parameters._replace(evidence=jnp.ones_like(parameters.evidence))
+    shares = np.asarray(bayes.believed(blind, sure, seen(1)).belief.sum(axis=1)).reshape(2, 7)
+    np.testing.assert_allclose(shares.sum(axis=1), 0.5, rtol=1e-5)
+    np.testing.assert_allclose(shares[0], shares[1], rtol=1e-5)
 
 
 def test_the_paper_s_windows_show_the_codes_that_their_evidence_says():
