@@ -46,7 +46,10 @@ CONTROLLERS = {
     "Bayes, class, tuned": (bayes(1), class_filter(accuracy=0.7, hazard=6e-4, move_cost=0.3, outside_cost=8.0)),
     "Bayes, soft window": (
         bayes(1),
-        Filter(recorded_evidence(LEARNED, look=0.0, looks=1, floor=0.35, smoothing=4.0), np.ones((1, 1)), np.ones(1), 7.7e-4, 0.4, 6.4),
+        Filter(
+            evidence=recorded_evidence(LEARNED, look=0.0, looks=1, floor=0.35, smoothing=4.0), transition=np.ones((1, 1)), after_jump=np.ones((1, 1)),
+            gains=np.ones(1), repeats=np.zeros(1), hazard=7.7e-4, move_cost=0.4, outside_cost=6.4,
+        ),  # fmt: skip
     ),
     "Bayes, robust": (bayes(2 * (2 + ROBUST["looks"])), robust_filter(LEARNED, **ROBUST)),
 }

@@ -59,7 +59,7 @@ class Pixels(Section):
     frame_rate_hz: float = Field(gt=0, le=1000)
     wait_s: float = Field(ge=0, le=600)
     idle_wait_s: float = Field(ge=0, le=600)
-    tip_tolerance_px: float = Field(gt=0, le=1000)
+    tip_tolerance_px: float = Field(ge=8, le=pixels.REACH_PX)
     per_action: tuple[Annotated[float, Field(gt=0, le=1000)], Annotated[float, Field(gt=0, le=1000)]]
     per_minute: tuple[Annotated[float, Field(gt=0, le=10_000)], Annotated[float, Field(gt=0, le=10_000)]]
     segment_s: float = Field(gt=0, le=1e6)

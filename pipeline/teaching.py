@@ -19,7 +19,7 @@ from pipeline.setpoint.belief_agent import Belief, BeliefNetwork
 from pipeline.setpoint.recorded import WindowTable, recorded_windows
 from pipeline.setpoint.score import Score
 
-SCHEMA = "agents 1"
+SCHEMA = "agents 2"
 # points of the course of training that a page has room for, of each phase
 POINTS = 50
 

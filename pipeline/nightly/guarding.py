@@ -101,7 +101,7 @@ def remember_before() -> None:
 
 
 def back_to_before() -> list[str]:
-    """A failed night changes nothing but the report: dvc.lock, metrics and what lies in datasets are as before it."""
+    """A failed night changes nothing but the report: dvc.lock, metrics and what stages wrote to datasets are as before it."""
     for path in METRICS.glob("*.json"):
         if not (BEFORE / path).exists() and path.name != "nightly.json":
             path.unlink()
@@ -110,7 +110,7 @@ def back_to_before() -> list[str]:
     if not (BEFORE / "dvc.lock").exists():
         Path("dvc.lock").unlink(missing_ok=True)
         return []
-    stages = yaml.safe_load(Path("dvc.lock").read_text(encoding="utf-8")).get("stages", {})
+    stages = (yaml.safe_load(Path("dvc.lock").read_text(encoding="utf-8")) or {}).get("stages")
     if not stages:
         return []
     try:

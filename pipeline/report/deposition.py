@@ -16,7 +16,6 @@ from pipeline.report.sources import Sources, Table, digest, lookup
 from pipeline.report.verdict import Figure, Missing, Question, ReportRules
 
 WORDS = (
-    "columns",
     "on_off",
     "basis",
     "library",

@@ -134,7 +134,7 @@ def _price(sources: Sources, found: Sequence[Structure]) -> str:
         laws = [one[law] for one in metrics.values() for law in ("ours", "pixels") if law in one]
         routines = max((len(one.get("other_routines", [])) for one in metrics.values()), default=0)
         if laws:
-            trials, peak = max(law["trials"] for law in laws), max(law["peak_over_steady"] for law in laws)
+            trials, peak = max(law["trials"] for law in laws), _peak(sources)
             of = f"{count(routines, 'routine')} of {trials + 1} trials" if routines else f"{trials + 1} trials"
             parts.append(f"Price: {of} for each material, and commands up to {number(peak, 0)} times the steady one.")
     before = gamma(sources)

@@ -24,7 +24,6 @@ from pipeline.report.sources import Sources, digest
 from pipeline.report.verdict import FAILED, Figure, Missing, Question, state
 
 WORDS = (
-    "columns",
     "window_of_frames",
     "settles",
     "stays",

@@ -82,8 +82,8 @@ FIXED = {
     ),
     "columns": (
         "Data\u2011driven, model\u2011based, baseline",
-        "One column each in every loop. Temperature: learned from the record alone; from the identified model; PI per zone. Deposition: basis functions of a chain identified "
-        + "from trials; the paper’s law and its library; on\u2011off control. Setpoint: our agent; a Bayes filter, whose model is given; the best of the others.",
+        "On this page one column each in every loop. Temperature: learned from the record alone; from the identified model; PI per zone. Deposition: basis functions of a chain identified "
+        + "from trials; the paper’s law and its library; on\u2011off control. Setpoint: our agent; a Bayes filter, whose model is given; the best proportional rule.",
     ),
     "settling": ("Settling", "How long it takes until every zone has come within the band around its reference and stays there for good."),
     "overshoot": ("Overshoot", "The furthest way that any zone goes past its reference."),

@@ -14,13 +14,12 @@ import numpy as np
 import optax
 from jax.tree_util import Partial
 
-from pipeline.setpoint.published import BEST_TEMPERATURE, PHASES
+from pipeline.setpoint.published import BEST_TEMPERATURE, LAMBDA, PHASES
 from pipeline.setpoint.reward import reward
 from pipeline.setpoint.simulator import (
     CHANCES,
     FLOW_LIMITS,
     HISTORY,
-    LAMBDA,
     STAND,
     TEMPERATURE_LIMITS,
     Action,
@@ -319,7 +318,7 @@ def train_published(
 
 
 class Why(NamedTuple):
-    """One episode of T decisions: true flow and temperatures at each, what was seen, Q (T, 2, 5), actions (T, 2), and the memory after the window (ours: belief (T, H, N))."""
+    """One episode of T decisions: true flow and temperatures at each, what was seen, Q (T, 2, 5), actions (T, 2), and the memory after the window (ours: bayes.Known, belief (T, H, N))."""
 
     flow: jax.Array
     temperature: jax.Array

@@ -9,7 +9,7 @@ extruder follows its commands with the gain g_h:
 
 Manners of erring (`evidence`): anywhere with one probability, as in the paper's simulator; or as a trained classifier does by its recorded windows, seen through
 a segment that makes every bead look wider or narrower. Which it is, and how the extruder follows, shows by itself. b'(h) is b(h) with all gains alike: what clogs a
-nozzle changes how its flow follows, too. Windows of a segment are alike: where nothing moved, one shows with probability `repeats` what the one before did,
+nozzle changes how its flow follows, too. Windows of a segment are alike: where the flow setpoint stood, one shows with probability `repeats` what the one before did,
 whatever the flow, so that ten alike are not ten witnesses.
 """
 
@@ -23,12 +23,11 @@ import numpy as np
 import scipy.special
 
 from pipeline.setpoint.baselines import temperature_move
-from pipeline.setpoint.published import BEST_FLOW
+from pipeline.setpoint.published import BEST_FLOW, FLOW_MOVES
 from pipeline.setpoint.recorded import WindowTable
 from pipeline.setpoint.simulator import (
     CLASSES,
     FLOW_LIMITS,
-    FLOW_MOVES,
     GOOD,
     UNDER,
     Action,
@@ -49,8 +48,8 @@ CODES = CLASSES * LEVELS
 
 class Filter(NamedTuple):
     """evidence (H, CODES, N) is P(code | h, q); transition and after_jump (H, H) from row to column at each decision and each jump of the flow; gains (H,), true by
-    commanded move; repeats (H,): probability that a window shows what the one before did where nothing moved; hazard: probability a decision that the flow jumps; move_cost in percent of
-    flow error by percent of move, outside_cost in percent of flow error."""
+    commanded move; repeats (H,): probability that a window shows what the one before did where the flow setpoint stood; hazard: probability a decision that the flow
+    jumps; move_cost in percent of flow error by percent of move, outside_cost in percent of flow error."""
 
     evidence: jax.Array
     transition: jax.Array

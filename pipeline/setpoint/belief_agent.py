@@ -16,18 +16,14 @@ from jax.tree_util import Partial
 
 from pipeline.setpoint import bayes
 from pipeline.setpoint.agent import ACTIONS, TEMPERATURE_SCALE, Learner, Setting, Sight, World, double, greedy, phase
-from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE, PHASES
+from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE, DELTA, FLOW_MOVES, LAMBDA, PHASES, TEMPERATURE_MOVES
 from pipeline.setpoint.recorded import WindowTable, recorded_windows
 from pipeline.setpoint.reward import reward
 from pipeline.setpoint.simulator import (
-    DELTA,
     FLOW_LIMITS,
-    FLOW_MOVES,
     GOOD,
-    LAMBDA,
     STAND,
     TEMPERATURE_LIMITS,
-    TEMPERATURE_MOVES,
     Conditions,
     Observation,
     State,

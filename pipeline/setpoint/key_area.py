@@ -141,8 +141,8 @@ class Drift(NamedTuple):
 
 
 def nozzle_template(frame: np.ndarray, tip: tuple[float, float], *, size_px: int) -> np.ndarray:
-    """Gray patch (3/4 size, size) uint8 of the nozzle above the calibrated tip, cut from the frame on which it was calibrated: a square with the tip in the middle of its
-    lower edge, less its lowest quarter, where beads are laid and look different on each segment.
+    """Gray patch (7/8 size, size) uint8 of the nozzle above the calibrated tip, cut from the frame on which it was calibrated: a square with the tip in the middle of its
+    lower edge, less its lowest eighth, where beads are laid and look different on each segment.
 
     Raises ValueError where the patch does not lie inside the frame.
     """
@@ -153,13 +153,15 @@ def nozzle_template(frame: np.ndarray, tip: tuple[float, float], *, size_px: int
             f"nozzle template: expected {size_px} px above and {size_px // 2} px beside the tip ({tip[0]:g}, {tip[1]:g}) inside the frame "
             f"of {frame.shape[1]} x {frame.shape[0]} px; take a smaller template"
         )
-    return _gray(frame[top : top + size_px - size_px // 4, left : left + size_px]).copy()
+    return _gray(frame[top : top + size_px - size_px // 8, left : left + size_px]).copy()
 
 
 def drift(frames: Sequence[np.ndarray], template: np.ndarray, tip: tuple[float, float], *, reach_px: int) -> Drift:
     """Where within reach_px of the calibrated tip the nozzle is, by the mean over the frames of the normalised cross-correlation: an alarm that the camera moved, never a
     new calibration. At home is within HOME_PX of the calibrated tip.
     """
+    if not len(frames):
+        raise ValueError("nozzle drift: expected frames to look at, found none; give at least one")
     for frame in frames:
         _check(frame, tip)
     frame, (tall, size) = frames[0], template.shape
@@ -168,7 +170,7 @@ def drift(frames: Sequence[np.ndarray], template: np.ndarray, tip: tuple[float, 
         np.clip([v - reach_px, v + extent + reach_px], 0, end)
         for v, extent, end in ((top, tall, frame.shape[0]), (left, size, frame.shape[1]))
     )
-    if rows[1] - rows[0] < tall or columns[1] - columns[0] < size:
+    if left < 0 or top < 0 or left + size > frame.shape[1] or top + tall > frame.shape[0]:
         raise ValueError(
             f"nozzle drift: expected room for the template of {size} px around the tip ({tip[0]:g}, {tip[1]:g}) but the frame is "
             f"{frame.shape[1]} x {frame.shape[0]} px; calibrate on frames of this camera"
@@ -177,7 +179,7 @@ def drift(frames: Sequence[np.ndarray], template: np.ndarray, tip: tuple[float, 
         [cv2.matchTemplate(_gray(one[rows[0] : rows[1], columns[0] : columns[1]]), template, cv2.TM_CCOEFF_NORMED) for one in frames], axis=0
     )
     row, column = np.unravel_index(int(match.argmax()), match.shape)
-    y, x = (max(int(v), 0) for v in (top - rows[0], left - columns[0]))
+    y, x = int(top - rows[0]), int(left - columns[0])
     home = match[max(y - HOME_PX, 0) : y + HOME_PX + 1, max(x - HOME_PX, 0) : x + HOME_PX + 1].max()
     return Drift((int(columns[0] + column - left), int(rows[0] + row - top)), float(match[row, column]), float(match[row, column] - home))
 
