@@ -5,6 +5,8 @@ import base64
 import hashlib
 import json
 import re
+import subprocess
+import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -285,3 +287,10 @@ def test_a_signal_of_another_schema_is_shown_as_failed_not_read(project):
         "Failed. datasets/learn_kernel/window.parquet holds schema other version 1 but window version 1 is expected"
         in Page(TEMPERATURE).text
     )
+
+
+def test_a_page_needs_no_simulator_and_starts_fast():
+    heavy = ("jax", "equinox", "scipy.stats", "pipeline.setpoint.simulator", "pipeline.temperature.plant")
+    said = f"import sys, stages.report, pipeline.report.nightly, pipeline.report.trend; print([name for name in {heavy!r} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", said], capture_output=True, text=True, check=True, cwd=Path(__file__).resolve().parents[2])
+    assert done.stdout.strip() == "[]"
