@@ -15,7 +15,7 @@ from pipeline.setpoint.published import FLOW_MOVES, LAMBDA, TEMPERATURE_MOVES
 from pipeline.setpoint.simulator import Controller, Observation
 
 # of the nozzle, for the alarm that the camera moved: at least LOOKS frames of a window are looked at; what is less alike, or hardly more than at home, is not the nozzle elsewhere
-TEMPLATE_PX, REACH_PX, LOOKS, LIKENESS, ADVANTAGE = 80, 30, 5, 0.4, 0.1
+TEMPLATE_PX, REACH_PX, LOOKS, LIKENESS, ADVANTAGE = 80, 30, 5, 0.4, 0.12
 
 # ---- the machine
 
