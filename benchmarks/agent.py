@@ -1,6 +1,6 @@
 """The agents over training seeds, each judged on windows that nothing was fitted to, and the speed of training beside stable-baselines3's.
 
-`./run python -m benchmarks.agent 5 100` trains with seeds 0 .. 4 by the numbers of params.yaml, judges 21 starts x 100 runs in every case, prints every seed and the
+`./run python -m benchmarks.agent 5 100` trains with seeds 0 .. 4 by the numbers of params.expert.yaml, judges 21 starts x 100 runs in every case, prints every seed and the
 worst, and writes benchmarks/results/agent.json. A third argument is the python of an environment with stable-baselines3 and a CPU build of torch, which then trains
 a DQN of the same sizes in the same run. Recorded windows are synthetic ones: drawn with one generator to learn from, with another to judge on.
 """
@@ -17,11 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from pipeline import params, teaching
 from pipeline.setpoint import agent, belief_agent, judging
-from pipeline.setpoint.recorded import recorded_windows, synthetic_table
+from pipeline.setpoint.recorded import recorded_windows
 from pipeline.setpoint.score import Score
 from pipeline.setpoint.simulator import paper_windows, rollout
+from pipeline.setpoint.workflow import train_agent
+from pipeline.setpoint.workflow.settings import Paper, TrainAgent
+from pipeline.store import params
+from tests.setpoint.synthetic import synthetic_table
 
 RESULTS, PEER = Path(__file__).parent / "results" / "agent.json", Path(__file__).parent / "agent_peer.py"
 UPDATES = 500  # of each timing
@@ -32,22 +35,22 @@ def figures(score: Score) -> dict[str, float]:
     return shares | {name: round(getattr(score, name), 2) for name in ("median_steps", "p90_steps", "overshoot_p95", "flow_error")}
 
 
-def one_seed(p: teaching.TrainAgent, runs: int, segment: float) -> dict[str, Any]:
+def one_seed(p: TrainAgent, runs: int, segment: float) -> dict[str, Any]:
     """Figures of the paper's agent after phases 3 and 4 and of ours in every case, ours from 30 %, 190 °C too, and the seconds and CPU seconds of training both."""
     learn, judge = (synthetic_table(np.random.default_rng(seed), segments=40, windows=10) for seed in (1, 99))
     wall, cpu = time.perf_counter(), time.process_time()
-    done = teaching.taught(p, learn)
+    done = train_agent.taught(p, learn)
     row: dict[str, Any] = {
         "train_s": round(time.perf_counter() - wall, 1),
         "train_cpu_s": round(time.process_time() - cpu, 1),
         "kept_round": done.kept,
     }
-    paper, ours = agent.greedy(agent.paper_sight()), agent.greedy(belief_agent.belief_sight(done.belief))
-    before = belief_agent.BeliefNetwork(done.belief.filter.evidence.shape[0], jax.random.key(0))
+    paper, ours = agent.greedy(agent.paper_sight()), agent.greedy(belief_agent.belief_sight(done.agents.belief))
+    before = belief_agent.BeliefNetwork(done.agents.belief.filter.evidence.shape[0], jax.random.key(0))
     seats = {
-        "phases 1-3": (paper, done.paper[2]),
-        "four phases": (paper, done.paper[-1]),
-        "ours": (ours, done.ours),
+        "phases 1-3": (paper, done.agents.paper[2]),
+        "four phases": (paper, done.agents.paper[-1]),
+        "ours": (ours, done.agents.ours),
         "ours before training": (ours, before),
     }
     cases = judging.cases(recorded_windows(judge), runs=runs, segment=segment)
@@ -55,11 +58,11 @@ def one_seed(p: teaching.TrainAgent, runs: int, segment: float) -> dict[str, Any
         row[name] = {case: figures(judging.evaluate(controller, network, *of, jax.random.key(1000 + p.seed))) for case, of in cases.items()}
     windows, conditions = cases["accuracy 0.7"]
     coldest = jax.tree.map(lambda leaf: leaf[(conditions.flow == 30.0) & (conditions.temperature == 190.0)], conditions)
-    row["ours from 30 %, 190 °C"] = figures(judging.evaluate(ours, done.ours, windows, coldest, jax.random.key(2000 + p.seed)))
+    row["ours from 30 %, 190 °C"] = figures(judging.evaluate(ours, done.agents.ours, windows, coldest, jax.random.key(2000 + p.seed)))
     return row
 
 
-def speeds(p: teaching.Paper) -> dict[str, Any]:
+def speeds(p: Paper) -> dict[str, Any]:
     """Updates of the whole loop, rollout steps with 1,024 environments, and milliseconds of one action; compiling is not counted. Beside them the matrix products that
     an update cannot do without, alone: on a machine that others use too, the ratio is what can be compared."""
     network, optimiser, sight = agent.QNetwork(jax.random.key(0)), optax.adam(1e-4), agent.paper_sight()
@@ -69,7 +72,7 @@ def speeds(p: teaching.Paper) -> dict[str, Any]:
     )
     learner, controller = agent.Learner(network, network, optimiser.init(network)), agent.greedy(sight)
     conditions = jax.tree.map(lambda leaf: leaf[:1024], judging.starts(49, accuracy=1.0))
-    keywords = {"sight": sight, "world": world, "optimiser": optimiser, "bootstrap": agent.greatest, "setting": p.setting()}
+    keywords = {"sight": sight, "world": world, "optimiser": optimiser, "bootstrap": agent.greatest, "setting": train_agent.setting(p)}
     act = jax.jit(lambda memory, seen: controller.act(network, memory, seen, None))
     seen = agent.begin(paper_windows(), jax.tree.map(lambda leaf: leaf[0], conditions), jax.random.key(0))[1]
     products, flop = update_products(p.batch)
@@ -137,7 +140,7 @@ def peer(python: str | None, ours: dict[str, Any]) -> dict[str, Any]:
 
 if __name__ == "__main__":
     seeds, runs, python = [*sys.argv[1:], *["5", "100", None][len(sys.argv) - 1 :]]
-    p = params.load(teaching.TrainAgent, "train_agent")
+    p = params.load(TrainAgent, "train_agent")
     found: dict[str, Any] = {"speed": speeds(p.paper)}
     print(json.dumps(found, indent=2), flush=True)
     found["peer"] = peer(python, found["speed"])

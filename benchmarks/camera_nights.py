@@ -13,11 +13,12 @@ import cv2
 import numpy as np
 
 from benchmarks.nights import RESULTS
-from pipeline import artifacts, trials
 from pipeline.deposition import rendering
+from pipeline.deposition.workflow import trial_files
 from pipeline.nightly import pictures
 from pipeline.nightly.settings import Drift
-from tests.toy_nights import SETTINGS
+from pipeline.store import artifacts
+from tests.nightly.toy_nights import SETTINGS
 
 
 def filmed(path: Path, seed: int, **changes) -> None:
@@ -26,8 +27,8 @@ def filmed(path: Path, seed: int, **changes) -> None:
     camera, time_s = rendering.Camera(scene, rng), 0.02 * np.arange(76)
     frames = ((k / 30, camera.frame(float(rng.uniform(100, 116)), stage_px=int(rng.integers(10_000)))) for k in range(45))
     signals = {"position_mm": 8 * time_s, "speed_mm_per_s": np.full(76, 8.0), "command_mm": np.ones(76), "flow_mm3_per_s": np.ones(76)}
-    said = trials.Conditions("A", "0.8 mm", 0, "ours", 8.0, 0.6, 0.304, 125.0, 0.0, 90.0, -0.008, 30.0)
-    trials.write_trial(path, said, frames, encoding="jpeg", time_s=time_s, **signals)
+    said = trial_files.Conditions("A", "0.8 mm", 0, "ours", 8.0, 0.6, 0.304, 125.0, 0.0, 90.0, -0.008, 30.0)
+    trial_files.write_trial(path, said, frames, encoding="jpeg", time_s=time_s, **signals)
 
 
 def camera(seed: int, count: int, folder: Path) -> dict:

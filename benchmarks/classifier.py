@@ -10,6 +10,7 @@ import json
 import sys
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import jax
@@ -66,11 +67,35 @@ def foreign(network: Classifier, fitted: calibration.Calibration, test: calibrat
     return out
 
 
+class Judgement(NamedTuple):
+    """Images that are valid, and windows: share right, reliability; windows by the paper's hard counts beside them; the sets; and the share of images taken for foreign."""
+
+    image_accuracy: float
+    window_accuracy: float
+    image: calibration.Reliability
+    window: calibration.Reliability
+    hard_window: calibration.Reliability
+    sets: calibration.Sets
+    false_alarms: float
+
+
+def judge(fitted: calibration.Calibration, test: calibration.Seen, *, length: int, bins: int) -> Judgement:
+    """How a calibrated classifier does on segments that neither learning nor calibration saw."""
+    v, log_p = test.valid, calibration.log_probabilities(test.logits, fitted.temperature)
+    rows = calibration.windows(test.segment, test.label, length=length).rows
+    label, p = test.label[rows[:, 0]], calibration.window_probabilities(log_p[rows], v[rows], fitted.correlation)
+    image, window = calibration.reliability(np.exp(log_p[v]), test.label[v], bins=bins), calibration.reliability(p, label, bins=bins)
+    hard = calibration.reliability(calibration.hard_shares(log_p[rows], v[rows]), label, bins=bins)
+    right = [float(np.mean(a.argmax(axis=1) == b)) for a, b in ((log_p[v], test.label[v]), (p, label))]
+    foreign = calibration.mahalanobis(fitted.familiar, test.features[v]) > fitted.foreign_above
+    return Judgement(*right, image, window, hard, calibration.sets(p, label, fitted.level), float(foreign.mean()))
+
+
 def judged(network: Classifier, data: dict) -> dict:
     """Every figure of a trained network; `head_...` are those of the distance in the head's features alone."""
     looks = {name: calibration.seen(predict(network, d.key_area, d.temperature_degC), d, v) for name, (d, v) in data.items()}
     fitted = calibration.calibrate(looks["learned"], looks["unseen"], length=WINDOW, **SETS)
-    found = calibration.judge(fitted, looks["test"], length=WINDOW, bins=BINS)
+    found = judge(fitted, looks["test"], length=WINDOW, bins=BINS)
     return {
         "image_accuracy": found.image_accuracy, "window_accuracy": found.window_accuracy, "temperature": fitted.temperature, "divisor": 1 + (WINDOW - 1) * fitted.correlation,
         "ece_image": found.image.error, "ece_image_floor": found.image.floor, "ece_window": found.window.error, "ece_window_floor": found.window.floor,

@@ -8,18 +8,18 @@ plants and seeds as median and worst. The yardstick is learning the whole struct
 import json
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from pipeline import gcode
-from pipeline.deposition import basis, ilc
+from pipeline.deposition import basis, gcode, ilc
 from pipeline.deposition.composition import Composed, Learned, compose, learn, priority, superposition
 from pipeline.deposition.conformance import conform, line_volumes, saturation
 from pipeline.deposition.extruder import Extruder, disturb, draw, flow, routine
-from pipeline.deposition.library import Training
+from pipeline.deposition.library import CORNER, NO_FLOW, START, STEADY, STOP, Training
 from pipeline.deposition.motion import plan
-from pipeline.deposition.tasks import DWELL, forbidden
+from pipeline.deposition.tasks import DWELL
 
 RESULTS = Path(__file__).parent / "results" / "composition.json"
 PARTS = Path(__file__).parents[1] / "datasets" / "parts"
@@ -32,6 +32,28 @@ MACHINE = {"acceleration": 1000.0, "junction_deviation_mm": 0.05, "speed_limit":
 PART = {"nozzle_mm": NOZZLE, "bead_area_mm2": AREA, "ramp_s": RAMP, "corner_deg": 30.0, "longest_pause_s": 1.0}
 BARS = {"tic_tac_toe": (3.0, 5.0), "dashes": (6.0, 6.0), "pause_0.2": (4.0, 5.0), "speed_0.5x": (6.0, None), "speed_1.5x": (6.0, None)}
 FIG_9 = ["No-Flow", "Start", "Steady-State", "Corner", "Steady-State", "Corner", "Steady-State", "Stop", "No-Flow"]
+
+
+# fig. 8 within a material; Dwell stands for the switch of the system
+ALLOWED = {
+    NO_FLOW: (START, DWELL),
+    START: (STEADY, STOP),
+    STEADY: (CORNER, STOP),
+    CORNER: (STEADY, STOP),
+    STOP: (NO_FLOW, START, DWELL),
+    DWELL: (START,),
+}
+
+
+def forbidden(tasks: Sequence[str], tools: Sequence[int]) -> np.ndarray:
+    """The indices (F,) of tasks that may not follow the one before them (fig. 8): another tool comes only by Dwell, Steady-State never goes to No-Flow."""
+    tasks, tools = np.asarray(tasks), np.asarray(tools)
+    names = np.array(list(ALLOWED))
+    table = np.array([[after in ALLOWED[before] for after in names] for before in names])
+    order = np.argsort(names)
+    code = order[np.searchsorted(names, tasks, sorter=order)]
+    fine = table[code[:-1], code[1:]] & ((tools[1:] == tools[:-1]) | (tasks[:-1] == DWELL))
+    return np.flatnonzero(~fine) + 1
 
 
 def learned_trials(

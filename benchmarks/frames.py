@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from pipeline.deposition import ilc
-from pipeline.deposition.bead import area, calibrate, measure, measure_all, millimetres
+from pipeline.deposition.bead import Calibration, area, calibrate, measure, measure_all
 from pipeline.deposition.extruder import Extruder, disturb, draw, flow, routine
 from pipeline.deposition.flow import Flow, View, estimate, sections
 from pipeline.deposition.rendering import HARD, NOMINAL, Camera, Scene
@@ -41,6 +41,11 @@ OTHERS = {
     "blur_3_dim": NOMINAL._replace(blur_px=3.0, contrast=45.0),
     "hard_other_side": HARD._replace(specular_at=-0.6, tilt_deg=-2.0, offset_px=-40.0),
 }
+
+
+def millimetres(calibration: Calibration, widths_px: np.ndarray) -> np.ndarray:
+    """Widths in mm; 0 (bare substrate) stays 0 and NaN stays NaN."""
+    return np.where(widths_px == 0, 0.0, calibration.gain * widths_px + calibration.offset)
 
 
 def widths(scene: Scene, seed: int, frames: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

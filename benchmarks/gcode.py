@@ -14,9 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline import gcode
-from pipeline.deposition import motion
-from pipeline.gcode import Kind
+from pipeline.deposition import gcode, motion
+from pipeline.deposition.gcode import Kind
 
 RESULTS = Path(__file__).parent / "results" / "gcode.json"
 BARS = {"lines_per_s": 400_000, "refused_share": 1e-3, "extruded_error": 1e-3, "job_s": 0.7}
@@ -271,14 +270,12 @@ def job(lines: int) -> dict:
     program, parsing = best(lambda: gcode.parse(text))
     plan, planning = best(lambda: motion.plan(program.moves, **LIMITS))
     signal, sampling = best(lambda: motion.sampled(plan, program.moves, sample_time_s=0.02))
-    dips, finding = best(lambda: motion.dips(plan, program.moves))
-    parts = {"parse_s": parsing, "plan_s": planning, "sample_s": sampling, "dips_s": finding}
+    parts = {"parse_s": parsing, "plan_s": planning, "sample_s": sampling}
     return {
         "lines": program.lines,
         "moves": len(program.moves.line),
         "samples": len(signal.time_s),
         "hours": round(signal.time_s[-1] / 3600, 2),
-        "dips": len(dips.move),
         **{name: round(seconds, 3) for name, seconds in parts.items()},
         "job_s": round(sum(parts.values()), 3),
     }

@@ -17,14 +17,15 @@ import control
 import numpy as np
 
 from benchmarks.foreign_records import RECORDS
-from pipeline.temperature.identification import identify, moesp, moesp_singular_values
+from benchmarks.moesp import moesp, moesp_singular_values, varx
+from pipeline.temperature.identification import identify
 from pipeline.temperature.order import LARGEST_RADIUS, stabilised
 from pipeline.temperature.plant import Plant, baam, markov_parameters, simulate
 from pipeline.temperature.plant import plant as make_plant
 from pipeline.temperature.probing import study_probe, study_signal
 from pipeline.temperature.published import K_DATA
-from pipeline.temperature.subspace import lagged, realise, subspace, varx
-from pipeline.temperature.validation import predict_fit, simulate_fit
+from pipeline.temperature.subspace import Segments, lagged, realise, subspace
+from pipeline.temperature.validation import predicted_ahead, simulated
 
 SHARED = Path(os.environ.get("BEADLINE_SHARED", "../shared")) / "data"
 RESULTS = Path(__file__).parent / "results" / "identification.json"
@@ -37,6 +38,32 @@ PRINTED_POLES = np.sort_complex(np.array([0.961, 0.7455, 0.4758 + 0.200j, 0.4758
 ERR1 = {"dryer": (15, 4, 0.0150), "evaporator": (10, 4, 0.489), "glass_furnace": (10, 5, 0.496)}
 HOLD_OUT_BARS = {"dryer": 8.0, "evaporator": 38.0, "glass_furnace": 36.0}
 MARKOV_BARS = {0.1: 2e-3, 0.5: 1.5e-2}
+
+
+def nrmse(y: np.ndarray, predicted: np.ndarray, *, means_removed: bool = False) -> np.ndarray:
+    """Fit of each output in percent, 100 (1 - |y - ŷ| / |y - mean y|); NaN in y is left out. With `means_removed` the mean of the error is taken off first."""
+    seen = np.isfinite(y)
+    error = np.where(seen, y - predicted, np.nan)
+    error = error - np.nanmean(error, axis=0) if means_removed else error
+    spread = np.where(seen, y, np.nan) - np.nanmean(np.where(seen, y, np.nan), axis=0)
+    return 100.0 * (1.0 - np.sqrt(np.nansum(error**2, axis=0) / np.maximum(np.nansum(spread**2, axis=0), np.finfo(float).tiny)))
+
+
+def simulate_fit(plant: Plant, u: Segments, y: Segments, *, means_removed: bool = False) -> np.ndarray:
+    """NRMSE (p,) in percent of free simulation over the segments, the initial state of each fitted as in `simulated`."""
+    predicted = [simulated(plant, a, b, means_removed=means_removed) for a, b in zip(u, y, strict=True)]
+    return nrmse(np.vstack(y), np.vstack(predicted), means_removed=means_removed)
+
+
+def predict_fit(plant: Plant, u: Segments, y: Segments, steps: int) -> np.ndarray:
+    """NRMSE (p,) in percent `steps` samples ahead, over the samples after the start-up of `predicted_ahead`."""
+    skip = max(3 * plant.n, 30) + steps
+    if all(len(a) <= skip for a in u):
+        raise ValueError(
+            f"predict_fit: expected a segment longer than {skip} samples for {steps} steps ahead; hold out a longer part, or fewer steps"
+        )
+    pairs = [(b[skip:], predicted_ahead(plant, a, b, steps)[skip:]) for a, b in zip(u, y, strict=True) if len(a) > skip]
+    return nrmse(np.vstack([b for b, _ in pairs]), np.vstack([e for _, e in pairs]))
 
 
 def resampled(path: Path, sample_time_s: float, columns: tuple[list[int], list[int]]) -> tuple[np.ndarray, np.ndarray]:

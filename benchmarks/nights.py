@@ -24,8 +24,8 @@ import numpy as np
 import scipy.linalg
 import yaml
 
-from pipeline import artifacts
 from pipeline.nightly import champion, judge, night, processes
+from pipeline.store import artifacts, params
 from pipeline.temperature import judging, scorecard
 from pipeline.temperature.plant import Plant, hold_output, plant
 from pipeline.temperature.probing import prbs, probe
@@ -99,7 +99,10 @@ def project(folder: Path, seed: int, *, recordings: int = 4, with_dvc: bool = Fa
     dvc_yaml = yaml.safe_load((ROOT / "dvc.yaml").read_text())
     dvc_yaml["stages"] = {name: dvc_yaml["stages"][name] for name in STAGES}
     (folder / "dvc.yaml").write_text(yaml.safe_dump(dvc_yaml))
-    (folder / "params.yaml").write_text(yaml.safe_dump(settings()))
+    declared = settings()
+    for path, sections in params.files(ROOT / "params.yaml").items():
+        here = {section: {key: declared[section][key] for key in keys} for section, keys in sections.items()}
+        (folder / Path(path).name).write_text(yaml.safe_dump(here))
     (folder / ".gitignore").write_text(
         "/pipeline\n/stages\n/reports/*.html\n/datasets/memo\n/datasets/[gilt]*\n/datasets/.*.[0-9]*\n*.tmp\n"
     )
@@ -123,10 +126,10 @@ def project(folder: Path, seed: int, *, recordings: int = 4, with_dvc: bool = Fa
 
 
 def settings() -> dict:
-    """The project's own params.yaml, for this machine and small; section nightly as the tests have it."""
-    from tests.toy_nights import SETTINGS
+    """The project's own parameters, of both files, for this machine and small; section nightly as the tests have it."""
+    from tests.nightly.toy_nights import SETTINGS
 
-    found = yaml.safe_load((ROOT / "params.yaml").read_text())
+    found = params.read(ROOT / "params.yaml")
     signal = {"unit": "percent", "low": 0, "high": 100}
     found["plant"] = {
         "sample_time_s": 1.0, "inputs": [{"name": f"heater_{k}", **signal} for k in (1, 2)],
@@ -188,7 +191,7 @@ def play(index: int, columns: dict[str, np.ndarray] | None) -> tuple[int, str, d
 
 def true_cost(folder: Path) -> float:
     """What the controller below `folder` costs on the machine itself, over starts, references and seeds of its own."""
-    p = yaml.safe_load(Path("params.yaml").read_text())
+    p = params.read()
     made, _, weights = judge.controller(folder, p["nightly"]["holdout"]["controller"], p["tracking"]["gamma"])
     limits = (np.zeros(2), np.full(2, 100.0))
     plants = [machine(gain=(a, b)) for a, b in ((1, 1), (0.95, 1.05), (1.05, 0.95))]
@@ -314,7 +317,6 @@ def planted(seed: int, folder: Path, with_dvc: bool) -> dict:
     """The champion is made 10 % worse than what a night learns, by weights on its inputs: nights until the challenger is promoted."""
     project(folder, seed, with_dvc=with_dvc)
     play(4, None)
-    from pipeline import params
     from pipeline.nightly.settings import Nightly
 
     rule = params.load(Nightly, "nightly")

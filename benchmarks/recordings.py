@@ -75,7 +75,7 @@ def write(path: Path, kind: str, count: int) -> None:
 
 def ours(path: Path) -> int:
     """Reads three of the eight signals; returns how many samples came out."""
-    from pipeline.recordings import Source, read
+    from pipeline.reading.recordings import Source, read
 
     raw = read(path, [Source(name, name, "1") for name in (NAMES[0], NAMES[3], NAMES[7])])
     assert raw.signals[NAMES[7]][1][0] == next(rows(1))[7], "what is read is not what was written"

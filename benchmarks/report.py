@@ -13,9 +13,10 @@ import tempfile
 import time
 from pathlib import Path
 
-from pipeline import history, params
-from pipeline.report import trend
-from pipeline.report.verdict import ReportRules
+from pipeline.report.runs import history, trend
+from pipeline.report.shared.verdict import ReportRules
+from pipeline.store import params
+from pipeline.temperature.workflow.settings import Panel
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks/results/report.json"
@@ -25,7 +26,7 @@ BARS = {"pages_s": 5.0, "index_bytes": 1_000_000, "page_bytes": 1_500_000, "hist
 
 def shared(folder: Path) -> Path:
     """A folder that has the project's artifacts, parameters and code, and reports of its own."""
-    for name in ("datasets", "params.yaml", "pipeline", "stages"):
+    for name in ("datasets", "params.yaml", "params.expert.yaml", "pipeline", "stages"):
         (folder / name).symlink_to(ROOT / name)
     shutil.copytree(ROOT / "reports/metrics", folder / "reports/metrics")
     if (ROOT / "reports/accepted.json").exists():
@@ -48,7 +49,7 @@ def past() -> tuple[int, float]:
     """Runs that git holds, and the seconds from git to the text of the page."""
     started = time.perf_counter()
     found = list(history.runs(500))
-    trend.render(found, params.load(ReportRules, "report"), band_degC=params.load(params.Panel, "panel").band_degC, pages=[])
+    trend.render(found, params.load(ReportRules, "report"), band_degC=params.load(Panel, "panel").band_degC, pages=[])
     return len(found), time.perf_counter() - started
 
 

@@ -1,7 +1,7 @@
 """Setpoint controllers without learning on both simulators: 21 starts x 100 runs by five seeds in twelve cases, the bars beside them, and the speed of the simulator.
 
 `./run python -m benchmarks.setpoint_baselines [seeds] [runs]` prints the tables and writes benchmarks/results/setpoint_baselines.json. Settings were tuned on other seeds
-and on another table of windows than they are judged on. The recorded windows are synthetic here (recorded.synthetic_table): those of the trained classifier are
+and on another table of windows than they are judged on. The recorded windows are synthetic here (tests.setpoint.synthetic): those of the trained classifier are
 judged by the stage evaluate_setpoint.
 """
 
@@ -18,8 +18,11 @@ import numpy as np
 from pipeline.setpoint import judging
 from pipeline.setpoint.baselines import Proportional, SequentialTest, proportional, sequential_test
 from pipeline.setpoint.bayes import Filter, bayes, class_filter, recorded_evidence, robust_filter
-from pipeline.setpoint.recorded import recorded_windows, synthetic_table
+from pipeline.setpoint.recorded import recorded_windows
+from pipeline.setpoint.score import Score
 from pipeline.setpoint.simulator import begin, paper_windows, rollout
+from pipeline.statistics import Share
+from tests.setpoint.synthetic import synthetic_table
 
 RESULTS = Path(__file__).parent / "results" / "setpoint_baselines.json"
 LEARNED = synthetic_table(np.random.default_rng(100), segments=30, windows=10)  # the filters' evidence; other tables are judged on
@@ -47,9 +50,15 @@ CONTROLLERS = {
     "Bayes, soft window": (
         bayes(1),
         Filter(
-            evidence=recorded_evidence(LEARNED, look=0.0, looks=1, floor=0.35, smoothing=4.0), transition=np.ones((1, 1)), after_jump=np.ones((1, 1)),
-            gains=np.ones(1), repeats=np.zeros(1), hazard=7.7e-4, move_cost=0.4, outside_cost=6.4,
-        ),  # fmt: skip
+            evidence=recorded_evidence(LEARNED, look=0.0, looks=1, floor=0.35, smoothing=4.0),
+            transition=np.ones((1, 1)),
+            after_jump=np.ones((1, 1)),
+            gains=np.ones(1),
+            repeats=np.zeros(1),
+            hazard=7.7e-4,
+            move_cost=0.4,
+            outside_cost=6.4,
+        ),
     ),
     "Bayes, robust": (bayes(2 * (2 + ROBUST["looks"])), robust_filter(LEARNED, **ROBUST)),
 }
@@ -59,6 +68,27 @@ SPEC = {  # figures of an earlier trial implementation: (settled at accuracy 1, 
     "Bayes, exact model": (100, 100, 9, 22, 100, 1.5),
     "Bayes, 2 % leak": (100, 92, 21, 77, 50, 97),
 }
+
+
+def rows(scores: dict[str, dict[str, Score]]) -> list[dict[str, str | float | int]]:
+    """One flat row a controller and case: each field of the score, shares as percent, low and high."""
+    return [
+        {
+            "controller": name,
+            "case": case,
+            **{key: value for field, entry in zip(score._fields, score, strict=True) for key, value in _flat(field, entry)},
+        }
+        for name, of in scores.items()
+        for case, score in of.items()
+    ]
+
+
+def _flat(field: str, entry) -> list[tuple[str, float | int]]:
+    if isinstance(entry, Share):
+        return [(field, entry.percent), (f"{field}_low", entry.low), (f"{field}_high", entry.high)]
+    if isinstance(entry, tuple):
+        return [(f"{field}_{part}", value) for part, value in zip(("flow", "temperature", "settled"), entry, strict=True)]
+    return [(field, entry)]
 
 
 def arrays(parameters):
@@ -117,7 +147,7 @@ def main(seeds: int, runs: int) -> None:
         "action_ms": round(action_ms("Bayes, robust"), 4),
         "load_average": os.getloadavg()[0],
         "specified": SPEC,
-        "rows": [{"seed": seed, **row} for seed, of in scores.items() for row in judging.rows(of)],
+        "rows": [{"seed": seed, **row} for seed, of in scores.items() for row in rows(of)],
     }
     print({key: results[key] for key in ("simulator_steps_per_s", "action_ms", "load_average")})
     RESULTS.write_text(json.dumps(results, indent=1) + "\n")

@@ -19,8 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pipeline import params
-from pipeline.deciding import EvaluateSetpoint
+from benchmarks.waits import autocorrelation, derived_waits, effective_frames, settling_s, step_response, window_frames
 from pipeline.setpoint import calibration, deployment, judging, nozzle_scene, pixels
 from pipeline.setpoint.baselines import Proportional, proportional
 from pipeline.setpoint.bayes import bayes, robust_filter
@@ -28,8 +27,10 @@ from pipeline.setpoint.classifier import Labelled, along_bead, predict, train, u
 from pipeline.setpoint.deployment import ACTS, Limits, Waits
 from pipeline.setpoint.pixels import Disturbances, Episodes, Loop, Machine, calm
 from pipeline.setpoint.recorded import WindowTable
-from pipeline.setpoint.score import wilson
 from pipeline.setpoint.vision_transformer import SMALL, from_named_arrays, named_arrays, vision_transformer
+from pipeline.setpoint.workflow.settings import EvaluateSetpoint
+from pipeline.statistics import wilson
+from pipeline.store import params
 
 RESULTS = Path(__file__).parent / "results" / "setpoint_pixels.json"
 LEAST_SCORE, RATE_HZ, LONGEST = 10.0, 20.0, 20
@@ -92,7 +93,7 @@ def sight(weights: Path | None) -> Sight:
         return np.exp(calibration.log_probabilities(found.logits, T)), calibration.mahalanobis(familiar, found.features)
 
     right = float(np.mean((log_p.argmax(axis=1) == held.label)[valid]))
-    return Sight(see, correlation, level, foreign_above, deployment.autocorrelation(errors, longest=LONGEST), right)
+    return Sight(see, correlation, level, foreign_above, autocorrelation(errors, longest=LONGEST), right)
 
 
 def recorded(eyes: Sight, frames: int, segments: int) -> WindowTable:
@@ -116,19 +117,20 @@ def measured_waits(rng: np.random.Generator) -> tuple[Waits, dict]:
     tick, at, window = 1 / RATE_HZ, 40, 20
 
     def settled(flow, temperature, column, band, noise, after):
-        record = pixels.step_response(MACHINE, flow=flow, temperature=temperature, before_s=at * tick, after_s=after, tick_s=tick)[column]
-        return deployment.settling_s(record + rng.normal(0, noise, len(record)), at=at, band=band, window=window, sample_time_s=tick)
+        record = step_response(MACHINE, flow=flow, temperature=temperature, before_s=at * tick, after_s=after, tick_s=tick)[column]
+        return settling_s(record + rng.normal(0, noise, len(record)), at=at, band=band, window=window, sample_time_s=tick)
 
     flow = max(settled((100.0, 100.0 + d), (190.0, 190.0), 0, 1.0, 1.0, 20.0) for d in (10.0, -10.0) for _ in range(3))
     target = max(settled((100.0, 100.0), (210.0 - d, 210.0), 0, 1.0, 1.0, 80.0) for d in (20.0, -20.0) for _ in range(3))
     heater = max(settled((100.0, 100.0), (210.0 - d, 210.0), 1, 1.0, 0.2, 120.0) for d in (20.0, -20.0))
-    return deployment.derived_waits(flow, target, transport_s=0.1), {"flow_s": flow, "flow_after_target_s": target, "heater_s": heater}
+    return derived_waits(flow, target, transport_s=0.1), {"flow_s": flow, "flow_after_target_s": target, "heater_s": heater}
 
 
 def summary(e: Episodes) -> dict:
     """Settled ten decisions before the end, with its Wilson interval; decisions and minutes of the settled, flow error of the last 20 windows, reasons, cuts."""
     decisions = e.time_s.shape[1]
-    ok, since = pixels.settled(e, by=decisions - 10), pixels.settled_since(e)
+    since = pixels.settled_since(e)
+    ok = since <= decisions - 10
     minutes = e.time_s[np.arange(len(ok)), np.minimum(since, decisions - 1)][ok] / 60
     share = wilson(ok)
     return {
@@ -174,8 +176,8 @@ def main(runs: int, weights: Path | None) -> None:
     cv2.setNumThreads(1)
     eyes = sight(weights)
     waits, measured = measured_waits(np.random.default_rng(5))
-    frames = deployment.window_frames(eyes.rho, wait_s=waits.flow_s, frame_rate_hz=RATE_HZ)
-    effective = deployment.effective_frames(eyes.rho)
+    frames = window_frames(eyes.rho, wait_s=waits.flow_s, frame_rate_hz=RATE_HZ)
+    effective = effective_frames(eyes.rho)
     report = {
         "command": f"./run python -m benchmarks.setpoint_pixels {runs}", "machine": {"cores": os.cpu_count()}, "bar": "21 starts x 10: >= 95 % settled",
         "image_accuracy": round(eyes.image_accuracy, 3), "measured_waits_s": {k: round(v, 2) for k, v in measured.items()}, "window_frames": frames,

@@ -18,7 +18,8 @@ from mcap.reader import make_reader
 
 from pipeline.deposition.bead import area, measure_all
 from pipeline.deposition.rendering import NOMINAL, Camera
-from pipeline.trials import IMAGE_TOPIC, Conditions, read_trial, write_trial
+from pipeline.deposition.workflow.trial_files import Conditions, read_trial, write_trial
+from pipeline.store.mcap_frames import IMAGE_TOPIC
 
 FRAMES, ROUNDS = 450, 5
 # at least: of bare decoding for what is encoded, frames a second for what is not

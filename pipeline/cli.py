@@ -6,13 +6,14 @@ import subprocess
 import sys
 from pathlib import Path
 
-from pipeline import artifacts, params
 from pipeline.nightly import commands as nights
+from pipeline.store import artifacts, params
+from pipeline.temperature.workflow.settings import Panel
 
 
 def accept(_: argparse.Namespace) -> None:
     """Mark the figures of this run as good: later reports show their differences against them."""
-    from pipeline.report.sources import code_files
+    from pipeline.report.shared.sources import code_files, machine
 
     metrics = {path.stem: artifacts.read_json(path) for path in sorted(Path("reports/metrics").glob("*.json")) if path.stem not in ("report", "nightly")}
     if not metrics:
@@ -23,7 +24,14 @@ def accept(_: argparse.Namespace) -> None:
         if path.is_file() and path.parts[1] not in {"memo"} and not path.parts[1].startswith(".")
     )
     hashes = {path.as_posix(): artifacts.sha256(path) for path in [*files, Path("pipeline"), Path("stages")]}
-    run = {"accepted": _today(), "metrics": metrics, "params": params.read("params.yaml"), "hashes": hashes, "code": code_files(("pipeline", "stages"))}
+    run = {
+        "accepted": _today(),
+        "machine": machine("reports/machine.js"),
+        "metrics": metrics,
+        "params": params.read(),
+        "hashes": hashes,
+        "code": code_files(("pipeline", "stages")),
+    }
     artifacts.write_json("reports/accepted.json", run | {"figures": _figures()})
     print(f"reports/accepted.json: accepted {len(metrics)} stages' figures and {len(hashes)} artifacts; commit it to keep it")
 
@@ -47,7 +55,7 @@ def _figures() -> dict:
 
 def verify(_: argparse.Namespace) -> None:
     """Hold what the pages say they were made from against dvc.lock and the files as they are now; what no longer matches is named, with exit status 1."""
-    from pipeline import provenance
+    from pipeline.report.shared import provenance
 
     print(provenance.told(provenance.checks()))
 
@@ -56,49 +64,50 @@ def history(arguments: argparse.Namespace) -> None:
     """Write reports/history.html: the figures of every run that git holds, as trends and as a table."""
     from tqdm import tqdm
 
-    from pipeline import history as past
-    from pipeline.report import trend
-    from pipeline.report.verdict import ReportRules
+    from pipeline.report.runs import history as past
+    from pipeline.report.runs import trend
+    from pipeline.report.shared.verdict import ReportRules
 
     found = list(tqdm(past.runs(arguments.most), desc="history", unit=" runs", file=sys.stderr))
     pages = [(path.stem, path.name) for path in sorted(Path("reports").glob("*.html")) if path.stem != "history"]
-    rules, panel = params.load(ReportRules, "report"), params.load(params.Panel, "panel")
+    rules, panel = params.load(ReportRules, "report"), params.load(Panel, "panel")
     artifacts.write_text("reports/history.html", trend.render(found, rules, band_degC=panel.band_degC, pages=pages))
     print(f"reports/history.html: {len(found)} runs, the last {found[-1].commit[:8] or 'not committed'}")
 
 
 def inspect(arguments: argparse.Namespace) -> None:
     """What is in a recording: signals, rates, jitter, gaps, ranges, damage; and a mapping to paste into params.yaml."""
-    from pipeline.recordings import inspect as describe
+    from pipeline.reading.recordings import inspect as describe
 
     print(describe(arguments.file))
 
 
 def compose(arguments: argparse.Namespace) -> None:
     """A part program into plunger commands: signal and tasks as CSV, and whether it will print, line by line."""
-    from pipeline import composing
-    from pipeline.printer import Printer
+    from pipeline.deposition.workflow import compose_parts
+    from pipeline.deposition.workflow.segment_library import read_learned
+    from pipeline.deposition.workflow.settings import ComposeParts, Printer
 
     if arguments.out.exists() and not arguments.out.is_dir():
         raise ValueError(f"--out {arguments.out}: should be a folder but is a file; name a folder, which is made where it is missing")
-    learned = composing.read_learned("datasets/segment_library/library.parquet", "datasets/segment_library/learned.json")
-    part = composing.compose(arguments.part, learned, params.load(Printer, "printer"), params.load(composing.ComposeParts, "compose_parts"))
+    learned = read_learned("datasets/segment_library/library.parquet", "datasets/segment_library/learned.json")
+    part = compose_parts.compose(arguments.part, learned, params.load(Printer, "printer"), params.load(ComposeParts, "compose_parts"))
     arguments.out.mkdir(parents=True, exist_ok=True)
-    files = composing.write(part, arguments.out)
-    print(composing.told(part))
+    files = compose_parts.write(part, arguments.out)
+    print(compose_parts.told(part))
     print("written: " + ", ".join(str(file) for file in files))
 
 
 def calibrate_tip(arguments: argparse.Namespace) -> None:
     """A picture of the nozzle's camera into a page on which a click gives the tip; with --tip, what the front end makes of it."""
-    from pipeline.tip_page import calibrate
+    from pipeline.setpoint.workflow.calibrate_tip import calibrate
 
     sections = params.read()
     try:
         least_score = float(sections["train_classifier"]["least_score"])
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
-            f"params.yaml: train_classifier.least_score should be a number of gray levels ({error}); write one such as 10"
+            f"{params.home('train_classifier.least_score') or params.EXPERT}: train_classifier.least_score should be a number of gray levels ({error}); write one such as 10"
         ) from None
     topics = sections["train_classifier"].get("topics")
     topic = str(topics.get("image") or "") if isinstance(topics, dict) else ""

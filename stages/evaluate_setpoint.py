@@ -1,25 +1,30 @@
-"""Agents and classifier -> who sets flow and temperature: reads datasets/train_classifier and datasets/train_agent; writes datasets/evaluate_setpoint: scoreboard.parquet,
-paths.parquet of one run from each start, decisions.parquet of two episodes through pixels, and choice.json, the default with its worst case."""
+"""Agents and classifier -> who sets flow and temperature: reads datasets/train_classifier and datasets/train_agent; writes
+datasets/evaluate_setpoint: scoreboard.parquet, paths.parquet of one run from each start, decisions.parquet of two episodes through pixels,
+and choice.json, the default with its worst case."""
 
-from pipeline import artifacts, classifying, deciding, params, seeing, setpoint_schemas, teaching
-from pipeline.deciding import EvaluateSetpoint
-from pipeline.seeing import TrainClassifier
+from pipeline.setpoint.workflow import evaluate_setpoint
+from pipeline.setpoint.workflow.agent_files import restore_agents
+from pipeline.setpoint.workflow.classifier_files import restore_classifier
+from pipeline.setpoint.workflow.settings import EvaluateSetpoint, TrainClassifier
+from pipeline.setpoint.workflow.tables import DECISIONS, PATHS, SCOREBOARD, WINDOWS
+from pipeline.setpoint.workflow.windows import window_tables
+from pipeline.store import artifacts, params
 
 
 def main() -> None:
     with artifacts.stage("evaluate_setpoint") as out:
         p, view = params.load(EvaluateSetpoint, "evaluate_setpoint"), params.load(TrainClassifier, "train_classifier")
-        known = classifying.restore("datasets/train_classifier/weights.safetensors", "datasets/train_classifier/calibration.parquet")
-        tables = seeing.window_tables(artifacts.read_table("datasets/train_classifier/windows.parquet", setpoint_schemas.WINDOWS))
-        seats = deciding.seats(p.baselines, teaching.restore("datasets/train_agent/weights.safetensors"), tables["learn"])
-        scores = deciding.scores(seats, tables["judge"], p)
-        choice = deciding.chosen(scores)
-        pixels = deciding.pixel_runs(seats, choice, known, p, view)
-        artifacts.write_table(out / "scoreboard.parquet", setpoint_schemas.SCOREBOARD, deciding.scoreboard(seats, scores, pixels))
-        artifacts.write_table(out / "paths.parquet", setpoint_schemas.PATHS, deciding.paths(seats, tables["judge"], p, pixels))
-        artifacts.write_table(out / "decisions.parquet", setpoint_schemas.DECISIONS, deciding.decisions(choice.name, pixels))
+        known = restore_classifier("datasets/train_classifier/weights.safetensors", "datasets/train_classifier/calibration.parquet")
+        tables = window_tables(artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS))
+        seats = evaluate_setpoint.seats(p.baselines, restore_agents("datasets/train_agent/weights.safetensors"), tables["learn"])
+        scores = evaluate_setpoint.scores(seats, tables["judge"], p)
+        choice = evaluate_setpoint.chosen(scores)
+        pixels = evaluate_setpoint.pixel_runs(seats, choice, known, p, view)
+        artifacts.write_table(out / "scoreboard.parquet", SCOREBOARD, evaluate_setpoint.scoreboard(seats, scores, pixels))
+        artifacts.write_table(out / "paths.parquet", PATHS, evaluate_setpoint.paths(seats, tables["judge"], p, pixels))
+        artifacts.write_table(out / "decisions.parquet", DECISIONS, evaluate_setpoint.decisions(choice.name, pixels))
         artifacts.write_json(out / "choice.json", choice)
-        artifacts.write_metrics("evaluate_setpoint", deciding.metrics(seats, scores, choice, pixels))
+        artifacts.write_metrics("evaluate_setpoint", evaluate_setpoint.metrics(seats, scores, choice, pixels))
 
 
 if __name__ == "__main__":

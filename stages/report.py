@@ -7,20 +7,25 @@ What is missing is shown as missing; what was read is hashed, and the pages carr
 
 import hashlib
 
-from pipeline import artifacts, params
-from pipeline.report import deposition, identification, index, setpoint, temperature
-from pipeline.report.judgement import judgement, shown
-from pipeline.report.sources import Declared, collect, digest
-from pipeline.report.verdict import ReportRules
+from pipeline.report.deposition import page as deposition_page
+from pipeline.report.identification import page as identification_page
+from pipeline.report.index import page as index_page
+from pipeline.report.setpoint import page as setpoint_page
+from pipeline.report.shared.sources import Declared, collect, digest
+from pipeline.report.shared.verdict import ReportRules
+from pipeline.report.temperature import page as temperature_page
+from pipeline.report.temperature.judgement import judgement, shown
+from pipeline.store import artifacts, params
+from pipeline.temperature.workflow.settings import Panel, Plant, Tracking
 
 
 def main() -> None:
     with artifacts.stage("report"):
         declared = Declared(
             params.load(ReportRules, "report"),
-            params.load(params.Plant, "plant"),
-            params.load(params.Panel, "panel"),
-            params.load(params.Tracking, "tracking"),
+            params.load(Plant, "plant"),
+            params.load(Panel, "panel"),
+            params.load(Tracking, "tracking"),
             params.read(),
         )
         metrics = {
@@ -53,11 +58,11 @@ def main() -> None:
         sources = collect(declared, metrics, folders, "reports/accepted.json", ("pipeline", "stages"))
         judged = judgement(sources)
         pages = {
-            "index": index.render(sources, judged),
-            "temperature": temperature.render(sources, judged),
-            "identification": identification.render(sources),
-            "deposition": deposition.render(sources),
-            "setpoint": setpoint.render(sources),
+            "index": index_page.render(sources, judged),
+            "temperature": temperature_page.render(sources, judged),
+            "identification": identification_page.render(sources),
+            "deposition": deposition_page.render(sources),
+            "setpoint": setpoint_page.render(sources),
         }
         artifacts.write_text("reports/index.html", pages["index"])
         artifacts.write_text("reports/temperature.html", pages["temperature"])

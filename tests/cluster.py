@@ -10,7 +10,7 @@ from pathlib import Path
 
 FORKED = multiprocessing.get_context("forkserver")
 # pyarrow loads pandas with the first array that it makes
-FORKED.set_forkserver_preload(["distributed", "pandas", "pipeline.ingestion", "tests.cluster"])
+FORKED.set_forkserver_preload(["distributed", "pandas", "pipeline.temperature.workflow.ingest", "tests.cluster"])
 
 
 def free_port() -> int:

@@ -11,11 +11,9 @@ from typing import Annotated, Any, NamedTuple
 
 import yaml
 
-from pipeline import params
+from pipeline.store import params
 
 LOOPS = ("temperature", "deposition", "setpoint")
-# text or arrays in, arrays out: any loop may import them
-PURE = ("pipeline/gcode.py", "pipeline/first_order.py")
 NUMERICS = {"numpy", "scipy", "control", "sklearn", "cv2", "jax", "equinox", "optax", "jaxtyping"}
 LANGUAGE = {
     "__future__",
@@ -48,6 +46,11 @@ WRITES = {
     "dump",
 }
 EDGE_CALLS = {"artifacts", "params", "recordings"}
+# what takes a second to import, or needs a device
+HEAVY = {"jax", "equinox", "optax", "cv2", "sklearn", "control", "pandas", "pyarrow", "mcap", "joblib"}
+# all that may lie directly in pipeline/
+ROOMS = {*LOOPS, "store", "reading", "runtime", "report", "nightly"}
+LOOSE = {"__init__", "statistics", "cli"}
 GENERATORS = {"Generator", "default_rng", "SeedSequence", "BitGenerator", "PCG64"}
 
 
@@ -60,13 +63,13 @@ class File(NamedTuple):
 
     @property
     def room(self) -> str:
-        """temperature, deposition, setpoint, runtime, stages, pure; all else of pipeline/ is the edge."""
-        parts = self.name.split("/")
-        if self.name in PURE:
-            return "pure"
-        if parts[0] == "stages":
-            return "stages"
-        return parts[1] if len(parts) > 2 and parts[1] in (*LOOPS, "runtime") else "edge"
+        """stages, store, reading, report, nightly, runtime, statistics, cli; of a loop temperature its methods, temperature/workflow, and tables and settings apart."""
+        parts = self.name.removesuffix(".py").split("/")
+        if parts[0] != "pipeline" or len(parts) < 2:
+            return parts[0]
+        if parts[1] in LOOPS and parts[2:3] == ["workflow"]:
+            return f"{parts[1]}/{parts[3]}" if parts[3:] in (["tables"], ["settings"]) else f"{parts[1]}/workflow"
+        return "nightly/settings" if parts[1:] == ["nightly", "settings"] else parts[1]
 
 
 def parsed(path: Path) -> ast.Module:
@@ -113,51 +116,71 @@ def calls(tree: ast.AST) -> Iterator[tuple[ast.Call, str, str]]:
 # ---- who may know whom
 
 
+def may_know(room: str, target: str) -> bool:
+    """The five rules: whether a file of `room` may import a file of `target`."""
+    loop = room.split("/")[0]
+    if room == "statistics":
+        return False
+    if room in LOOPS:  # 1: methods know numerics, their own loop's methods and statistics
+        return target in (room, "statistics")
+    if loop in LOOPS:  # 2: a workflow knows its own loop and what every stage stands on
+        light = room.endswith(("/tables", "/settings"))
+        return target in ("store", "reading", "statistics", loop, f"{loop}/tables", f"{loop}/settings") or (target == f"{loop}/workflow" and not light)
+    if room == "report":  # 3: pages know what a table and a setting is, and nothing that computes
+        return target in ("store", "statistics", "report") or target.endswith(("/tables", "/settings"))
+    if room == "runtime":  # 4: beside a machine run the methods
+        return target in (*LOOPS, "store", "statistics", "runtime")
+    if room in ("store", "reading"):  # 5: below the loops
+        return target in ("store", "reading", "statistics")
+    return True  # nightly, cli and stages
+
+
 def forbidden_imports(root: Path) -> list[str]:
     found = []
     for file in files(root, "pipeline", "stages"):
+        numerics = file.room in LOOPS or file.room == "statistics"
         for line, name in imports(file.tree):
             target = project_file(root, name)
-            room = File(target, file.tree).room if target else ""
+            room = File(target, file.tree).room if target and target != "pipeline/__init__.py" else ""
+            why = ""
             if name.startswith("."):
                 why = "write the whole name"
             elif room == "stages" or name.split(".")[0] == "tests":
                 why = "nothing imports a stage or a test"
-            elif file.room in (*LOOPS, "pure") and target:
-                why = (
-                    ""
-                    if room in (file.room, "pure") or target == "pipeline/__init__.py"
-                    else f"{file.room} knows itself, gcode and first_order only"
-                )
-            elif file.room in (*LOOPS, "pure"):
-                why = (
-                    ""
-                    if name.split(".")[0] in NUMERICS | LANGUAGE
-                    else f"{file.room} knows arrays, nothing of files, clocks, processes or figures"
-                )
-            elif file.room == "runtime" and target:
-                why = "" if room in ("runtime", "temperature") else "runtime knows temperature only"
-            elif file.room == "stages":
-                why = "only artifacts opens artifacts" if name.split(".")[0] in FORMATS else ""
-            else:
-                why = ""
+            elif room and not may_know(file.room, room):
+                why = f"{file.room} must not know {room}"
+            elif numerics and not target and name.split(".")[0] not in NUMERICS | LANGUAGE:
+                why = f"{file.room} knows arrays, nothing of files, clocks, processes or figures"
+            elif file.room.endswith("/settings") and name.split(".")[0] in HEAVY:
+                why = "a settings class imports nothing heavy"
+            elif file.room == "stages" and name.split(".")[0] in FORMATS:
+                why = "only artifacts opens artifacts"
             if why:
                 found.append(f"{file.name}:{line} imports {name}: {why}")
     return found
+
+
+def misplaced(root: Path) -> list[str]:
+    """Files and folders of pipeline/ that are no room of the house."""
+    return [
+        f"pipeline/{path.name}: which room is it of?"
+        for path in sorted((root / "pipeline").iterdir())
+        if path.name != "__pycache__" and path.stem not in (ROOMS if path.is_dir() else LOOSE)
+    ]
 
 
 def forbidden_files(root: Path) -> list[str]:
     """Loops and stages read and write nothing by themselves; the edge writes through artifacts."""
     found = []
     for file in files(root, "pipeline", "stages"):
-        forbidden = WRITES if file.room in ("edge", "runtime") else WRITES | READS
+        forbidden = WRITES | READS if file.room in (*LOOPS, "statistics", "stages") else WRITES
         for call, receiver, function in calls(file.tree):
             modes = call.args[:1] if receiver else call.args[1:2]
             modes += [keyword.value for keyword in call.keywords if keyword.arg == "mode"]
             opened_to_write = function == "open" and any(
                 isinstance(mode, ast.Constant) and set(str(mode.value)) & set("wax+") for mode in modes
             )
-            if file.name != "pipeline/artifacts.py" and receiver not in EDGE_CALLS and (function in forbidden or opened_to_write):
+            if file.name != "pipeline/store/artifacts.py" and receiver not in EDGE_CALLS and (function in forbidden or opened_to_write):
                 found.append(f"{file.name}:{call.lineno} {ast.unparse(call.func)}: only artifacts opens artifacts")
     return found
 
@@ -238,6 +261,21 @@ def paths(stage: str, name: str, tree: ast.Module) -> tuple[set[str], set[str]]:
     return {path for path in read if not path.startswith(("datasets/memo", f"datasets/{stage}/"))}, written
 
 
+def tracked(root: Path, keys: set[str]) -> list[Any]:
+    """Keys as DVC lists them, each under the files in which it stands: those of params.yaml bare, those of params.expert.yaml below its name."""
+    owner, expert = root / params.FILE, root / params.EXPERT
+    found = params.files(owner) if owner.exists() else {}
+    standing = {name: sorted(key for key in keys if key in _flattened(sections)) for name, sections in found.items()}
+    methods = standing.get(str(expert), [])
+    # what stands nowhere is asked for where a person looks first
+    return sorted({*standing.get(str(owner), []), *(keys - {*methods})}) + ([{params.EXPERT: methods}] if methods else [])
+
+
+def _flattened(sections: dict[str, Any]) -> set[str]:
+    """Sections, and the keys of each as section.key."""
+    return {*sections, *(f"{section}.{key}" for section, keys in sections.items() if isinstance(keys, dict) for key in keys)}
+
+
 def expected(root: Path, stage: str) -> dict[str, Any]:
     """The entry of dvc.yaml: deps, params, outs and metrics are what stages/<stage>.py imports and opens, directly or through what it imports."""
     name = f"stages/{stage}.py"
@@ -249,9 +287,10 @@ def expected(root: Path, stage: str) -> dict[str, Any]:
     # paths stand in the stage's file, where one can grep for them: what it imports takes them as arguments
     found = paths(stage, name, tree)
     read, written = read | found[0], written | found[1]
-    # a stage that hashes whole folders of code, or reads params.yaml whole, depends on them whole
+    # a stage that hashes whole folders of code, or reads the parameters whole, depends on them whole
     read |= {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and node.value in ("pipeline", "stages")}
-    read |= {"params.yaml" for _, receiver, function in calls(tree) if (receiver, function) == ("params", "read")}
+    whole = any((receiver, function) == ("params", "read") for _, receiver, function in calls(tree))
+    read |= {params.FILE, params.EXPERT} if whole else set()
     frames = [
         item
         for node in ast.walk(tree)
@@ -270,7 +309,7 @@ def expected(root: Path, stage: str) -> dict[str, Any]:
         "cmd": f"python -m stages.{stage}",
         "deps": [dep for dep in (name, *sorted(code - {name}), *sorted(data_files(root, code))) if dep.split("/")[0] not in read]
         + sorted(read),
-        "params": sorted(keys),
+        "params": tracked(root, keys),
         # DVC deletes outs before it runs a stage unless they persist, and the last good artifacts must outlive a stage that fails
         "outs": [{path: {"persist": True}} for path in sorted(written)],
         "metrics": [{path: {"cache": False, "persist": True}} for path in metrics],

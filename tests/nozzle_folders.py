@@ -6,10 +6,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipeline import nozzle_frames
-from pipeline.nozzle_recordings import Topics
-from pipeline.params import Execution
 from pipeline.setpoint import key_area, nozzle_scene
+from pipeline.setpoint.workflow import frame_folder
+from pipeline.setpoint.workflow.frame_mcap import Topics
+from pipeline.store.params import Execution
 
 LEAST = 10.0
 ANY = Topics(image="", time="", mapping={})
@@ -60,9 +60,9 @@ def folder(path: Path, prints: int = 2) -> Path:
     return path
 
 
-def read(path: Path, *, tip=None, topics: Topics = ANY, jobs: int = 1, memo: Path | None = None) -> nozzle_frames.NozzleFrames:
-    how = nozzle_frames.Reading(tip_px=tip, least_score=LEAST, topics=topics)
-    return nozzle_frames.read_folder(path, how, Execution(backend="loky", jobs=jobs, scheduler=""), memo=memo or path.parent / "memo")
+def read(path: Path, *, tip=None, topics: Topics = ANY, jobs: int = 1, memo: Path | None = None) -> frame_folder.NozzleFrames:
+    how = frame_folder.Reading(tip_px=tip, least_score=LEAST, topics=topics)
+    return frame_folder.read_folder(path, how, Execution(backend="loky", jobs=jobs, scheduler=""), memo=memo or path.parent / "memo")
 
 
 def expected() -> np.ndarray:
@@ -71,5 +71,5 @@ def expected() -> np.ndarray:
     return np.array([one.image for one in found])
 
 
-def notes(found: nozzle_frames.NozzleFrames) -> str:
+def notes(found: frame_folder.NozzleFrames) -> str:
     return "\n".join(note.message for note in found.notes)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline import artifacts, params
+from pipeline.store import artifacts, params
 from pipeline.temperature import identification
 from pipeline.temperature.plant import plant, simulate
 
@@ -32,9 +32,9 @@ def record(tree: Path, columns: dict[str, np.ndarray]) -> None:
     artifacts.write_csv(tree / "datasets/raw/temperature/rig.csv", columns)
 
 
-def declare(tree: Path, changes: dict) -> None:
-    """{dotted key: value} into the tree's params.yaml."""
-    sections = params.read(tree / "params.yaml")
+def declare(tree: Path, changes: dict, of: Path | None = None) -> None:
+    """The parameters of a project (the tree itself) with {dotted key: value} changed, as the tree's params.yaml."""
+    sections = params.read((of or tree) / "params.yaml")
     for dotted, value in changes.items():
         *parents, key = dotted.split(".")
         inner = sections
@@ -69,7 +69,6 @@ def good(tree: Path) -> dict[str, bytes]:
 def ready(root, tmp_path_factory) -> Path:
     """A project whose record was ingested, identified and learned well."""
     tree = tmp_path_factory.mktemp("project")
-    shutil.copy(root / "params.yaml", tree)
     declare(
         tree,
         {
@@ -89,6 +88,7 @@ def ready(root, tmp_path_factory) -> Path:
             "learn_kernel.longest_window": 6,
             "panel.steps": 60,
         },
+        of=root,
     )
     record(tree, signals())
     with pytest.MonkeyPatch.context() as monkeypatch:

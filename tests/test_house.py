@@ -11,7 +11,7 @@ import pytest
 import yaml
 from pydantic import Field
 
-from pipeline import params
+from pipeline.store import params
 from tests.house import (
     differences,
     expected,
@@ -19,6 +19,7 @@ from tests.house import (
     forbidden_imports,
     forbidden_randomness,
     loads,
+    misplaced,
     pipeline,
     stages,
     unbounded,
@@ -31,7 +32,7 @@ ROOT = Path(__file__).resolve().parents[1]
 # ---- the house as it stands
 
 
-@pytest.mark.parametrize("rule", [forbidden_imports, forbidden_files, forbidden_randomness, unframed])
+@pytest.mark.parametrize("rule", [misplaced, forbidden_imports, forbidden_files, forbidden_randomness, unframed])
 def test_the_house_keeps_the_rule(rule):
     assert rule(ROOT) == []
 
@@ -60,11 +61,22 @@ def test_the_parameters_of_a_stage_are_bounded_and_others_are_refused_by_name(st
             params.load(kind, section, tmp_path / "params.yaml")
 
 
-def test_every_section_of_params_yaml_is_read_by_a_stage():
-    read = {key.split(".")[0] for stage in stages(ROOT) for key in expected(ROOT, stage).get("params", [])}
-    found = set(params.read(ROOT / "params.yaml")) if stages(ROOT) else set()
-    assert found - {"plant", "execution", "nightly"} <= read  # the job reads its own
-    assert read <= found
+def test_every_section_of_either_file_is_read_by_a_stage():
+    for file, found in params.files(ROOT / "params.yaml").items():
+        listed = [entry for stage in stages(ROOT) for entry in expected(ROOT, stage).get("params", [])]
+        if Path(file).name == params.EXPERT:
+            listed = [key for entry in listed if isinstance(entry, dict) for key in entry[params.EXPERT]]
+        read = {entry.split(".")[0] for entry in listed if isinstance(entry, str)}
+        assert found.keys() - {"plant", "execution", "nightly"} <= read  # the job reads its own
+        assert read <= found.keys()
+
+
+def test_the_owner_of_a_machine_has_few_numbers_to_set():
+    def leaves(found) -> int:
+        return sum(map(leaves, found.values())) if isinstance(found, dict) and found else 1
+
+    owner, expert = map(leaves, params.files(ROOT / "params.yaml").values())
+    assert owner <= 50 and expert > 5 * owner
 
 
 # ---- the rules see what they should see
@@ -79,42 +91,65 @@ def house(root: Path, **sources: str) -> Path:
     return root
 
 
-def test_a_loop_that_knows_another_loop_or_the_edge_or_a_clock_is_seen(tmp_path):
+def test_what_the_five_rules_forbid_is_seen(tmp_path):
     house(
         tmp_path,
-        pipeline__artifacts="import pyarrow",
-        pipeline__gcode="import re",
-        pipeline__temperature__plant="import numpy as np\nfrom pipeline import gcode\nfrom pipeline.temperature import plant",
-        pipeline__temperature__bad="import time\nfrom pipeline import artifacts\nfrom pipeline.deposition.ilc import law\nfrom . import plant",
+        pipeline__store__artifacts="import pyarrow\nfrom pipeline.reading import csv_layout",
+        pipeline__store__tables="from pipeline.temperature.workflow import tables",
+        pipeline__reading__csv_layout="from pipeline.temperature import plant",
+        pipeline__statistics="import numpy as np\nimport pathlib",
+        pipeline__temperature__plant="import numpy as np\nfrom pipeline import statistics\nfrom pipeline.temperature import plant",
+        pipeline__temperature__bad="import time\nfrom pipeline.store import artifacts\nfrom pipeline.deposition.ilc import law\nfrom . import plant\n"
+        "from pipeline.temperature.workflow import settings\nfrom pipeline.runtime import guard",
+        pipeline__temperature__workflow__settings="import jax\nfrom pipeline.store import artifacts",
+        pipeline__temperature__workflow__tables="from pipeline.temperature.workflow import ingest",
+        pipeline__temperature__workflow__ingest="import joblib\nfrom pipeline.temperature import plant\nfrom pipeline.reading import csv_layout\n"
+        "from pipeline.deposition import ilc\nfrom pipeline.report import page",
         pipeline__deposition__ilc="import scipy.linalg\nfrom stages import ingest",
-        pipeline__runtime__guard="import time\nfrom pipeline.temperature import plant\nfrom pipeline import artifacts",
-        stages__ingest="import json\nfrom pipeline import artifacts",
+        pipeline__runtime__guard="import time\nfrom pipeline.temperature import plant\nfrom pipeline.store import artifacts\nfrom pipeline.temperature.workflow import ingest",
+        pipeline__report__page="from pipeline.temperature.workflow import tables, settings\nfrom pipeline.temperature import plant\nfrom pipeline.nightly import night",
+        pipeline__nightly__night="from pipeline.temperature import plant\nfrom pipeline.report import page",
+        pipeline__cli="import argparse\nfrom pipeline.nightly import night",
+        pipeline__loose="",
+        stages__ingest="import json\nfrom pipeline.store import artifacts",
         stages__learn="from stages import ingest",
     )
     places = [sentence.split(": ")[0] for sentence in forbidden_imports(tmp_path)]
     assert places == [
         "pipeline/deposition/ilc.py:2 imports stages.ingest",
-        "pipeline/runtime/guard.py:3 imports pipeline.artifacts",
+        "pipeline/reading/csv_layout.py:1 imports pipeline.temperature.plant",
+        "pipeline/report/page.py:2 imports pipeline.temperature.plant",
+        "pipeline/report/page.py:3 imports pipeline.nightly.night",
+        "pipeline/runtime/guard.py:4 imports pipeline.temperature.workflow.ingest",
+        "pipeline/statistics.py:2 imports pathlib",
+        "pipeline/store/tables.py:1 imports pipeline.temperature.workflow.tables",
         "pipeline/temperature/bad.py:1 imports time",
-        "pipeline/temperature/bad.py:2 imports pipeline.artifacts",
+        "pipeline/temperature/bad.py:2 imports pipeline.store.artifacts",
         "pipeline/temperature/bad.py:3 imports pipeline.deposition.ilc.law",
         "pipeline/temperature/bad.py:4 imports .plant",
+        "pipeline/temperature/bad.py:5 imports pipeline.temperature.workflow.settings",
+        "pipeline/temperature/bad.py:6 imports pipeline.runtime.guard",
+        "pipeline/temperature/workflow/ingest.py:4 imports pipeline.deposition.ilc",
+        "pipeline/temperature/workflow/ingest.py:5 imports pipeline.report.page",
+        "pipeline/temperature/workflow/settings.py:1 imports jax",
+        "pipeline/temperature/workflow/tables.py:1 imports pipeline.temperature.workflow.ingest",
         "stages/ingest.py:1 imports json",
         "stages/learn.py:1 imports stages.ingest",
     ]
+    assert misplaced(tmp_path) == ["pipeline/loose.py: which room is it of?"]
 
 
 def test_a_file_opened_or_a_global_seed_outside_the_edge_is_seen(tmp_path):
     house(
         tmp_path,
-        pipeline__artifacts="open('a', 'w')",
-        pipeline__recordings="open('a', 'rb')\nopen('a', 'wb')\npath.open()\npath.write_text('')",
+        pipeline__store__artifacts="open('a', 'w')",
+        pipeline__reading__recordings="open('a', 'rb')\nopen('a', 'wb')\npath.open()\npath.write_text('')",
         pipeline__temperature__bad="open('a')\nnp.load('a')\npath.write_text('')\nnp.random.seed(0)\nnp.random.default_rng()\nnp.random.default_rng(1)",
         stages__ingest="artifacts.write_text('a', '')\nparams.load(A, 'a')\npath.read_text()",
     )
     assert [sentence.split(":")[0] + sentence.split(":")[1][:2] for sentence in forbidden_files(tmp_path)] == [
-        "pipeline/recordings.py2 ",
-        "pipeline/recordings.py4 ",
+        "pipeline/reading/recordings.py2 ",
+        "pipeline/reading/recordings.py4 ",
         "pipeline/temperature/bad.py1 ",
         "pipeline/temperature/bad.py2 ",
         "pipeline/temperature/bad.py3 ",
@@ -136,7 +171,7 @@ def test_input_read_outside_the_frame_of_a_stage_is_seen(tmp_path):
 
 
 STAGE = '''"""Reads datasets/raw/temperature; writes datasets/learn."""
-from pipeline import artifacts, params
+from pipeline.store import artifacts, params
 from pipeline.report import page
 params.load(Learn, "learn")
 params.value("probe.source", one_of=("a",))
@@ -153,13 +188,13 @@ with artifacts.stage("learn") as out:
 def toy(tmp_path):
     house(
         tmp_path,
-        pipeline__artifacts="import pyarrow",
-        pipeline__params="",
-        pipeline__report__page="import pipeline.schemas",
-        pipeline__schemas="import numpy",
+        pipeline__store__artifacts="import pyarrow",
+        pipeline__store__params="",
+        pipeline__report__page="import pipeline.store.tables",
+        pipeline__store__tables="import numpy",
         pipeline__unused="1",
         stages__learn=STAGE,
-        stages__ingest="from pipeline import artifacts\nwith artifacts.stage('ingest') as out:\n    artifacts.write_metrics('ingest', {})\n",
+        stages__ingest="from pipeline.store import artifacts\nwith artifacts.stage('ingest') as out:\n    artifacts.write_metrics('ingest', {})\n",
     )
     (tmp_path / "pipeline/report/templates").mkdir()
     (tmp_path / "pipeline/report/templates/page.html").write_text("")
@@ -173,9 +208,9 @@ def test_an_entry_of_dvc_yaml_is_derived_from_the_stage(toy):
         "cmd": "python -m stages.learn",
         "deps": [
             "stages/learn.py",
-            "pipeline/artifacts.py",
             "pipeline/report/page.py",
-            "pipeline/schemas.py",
+            "pipeline/store/artifacts.py",
+            "pipeline/store/tables.py",
             "pipeline/report/templates",
             "datasets/ingest/record.parquet",
             "reports/metrics/ingest.json",
@@ -187,18 +222,29 @@ def test_an_entry_of_dvc_yaml_is_derived_from_the_stage(toy):
     assert list(pipeline(toy)["stages"]) == ["ingest", "learn"]
 
 
+def test_a_stage_lists_each_parameter_under_the_files_in_which_it_stands(toy):
+    (toy / "params.yaml").write_text("learn: {seed: 1}\nprobe: {seed: 1}\n")
+    (toy / "params.expert.yaml").write_text("learn: {order: 2}\nprobe: {source: a}\n")
+    assert expected(toy, "learn")["params"] == ["learn", {"params.expert.yaml": ["learn", "probe.source"]}]
+    (toy / "params.expert.yaml").write_text("probe: {source: a}\n")
+    assert expected(toy, "learn")["params"] == ["learn", {"params.expert.yaml": ["probe.source"]}]
+    with (toy / "stages/learn.py").open("a") as file:
+        file.write("    params.read()\n")
+    assert {"params.yaml", "params.expert.yaml"} <= set(expected(toy, "learn")["deps"])
+
+
 def test_a_dvc_yaml_that_lacks_or_has_too_much_is_seen(toy):
     wanted = pipeline(toy)["stages"]
     found = yaml.safe_load(yaml.safe_dump(wanted))
     assert differences(found, wanted) == []
-    found["learn"]["deps"].remove("pipeline/schemas.py")
+    found["learn"]["deps"].remove("pipeline/store/tables.py")
     found["learn"]["outs"][0] = "datasets/learn"
     found["learn"]["always_changed"] = "yes"
     found["old"] = {}
     assert differences(found, wanted) == [
         "old: stage is not in stages/",
         "learn: always_changed has yes",
-        "learn: deps lacks pipeline/schemas.py",
+        "learn: deps lacks pipeline/store/tables.py",
         "learn: outs lacks {datasets/learn: {persist: true}}",
         "learn: outs has datasets/learn",
     ]

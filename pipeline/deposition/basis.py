@@ -6,7 +6,7 @@ import numpy as np
 import scipy.ndimage
 import scipy.signal
 
-from pipeline.deposition import norm_optimal
+from pipeline.deposition import reachable
 from pipeline.deposition.extruder import DAMPING, Extruder, lagged, ramp
 
 # the yield is loaded this long before the flow begins and kept through gaps of twice that: long against the lag, short against a pause between lines
@@ -97,5 +97,5 @@ def _nearest(extruder: Extruder, v: np.ndarray, r: np.ndarray, limit: float, sam
     """v (T,) within +-limit whose fast mode comes nearest to that of the unlimited v; below the yield, where no flow is wanted, it is free."""
     (g, _), (a, _) = _modes(extruder, sample_time_s)
     fast = scipy.signal.lfilter([g], [1.0, -a], v)
-    reached = norm_optimal.nearest(fast, np.append(r[1:], 0.0) <= 0, pole=a, bound=g * limit)
+    reached = reachable.nearest(fast, np.append(r[1:], 0.0) <= 0, pole=a, bound=g * limit)
     return np.clip((reached - a * np.append(0.0, reached[:-1])) / g, -limit, limit)

@@ -78,30 +78,6 @@ def calibrate(widths_px: np.ndarray, known_mm: np.ndarray) -> Calibration:
     return Calibration(float(gain), float(offset), float(np.sqrt(residuals @ residuals / (len(px) - 2))), residuals)
 
 
-def millimetres(calibration: Calibration, widths_px: np.ndarray) -> np.ndarray:
-    """Widths in mm; 0 (bare substrate) stays 0 and NaN stays NaN."""
-    return np.where(widths_px == 0, 0.0, calibration.gain * widths_px + calibration.offset)
-
-
-class Drift(NamedTuple):
-    """Mean of calibrated less known width in mm; `alarm` where it is further from 0 than the allowed number of its standard deviations."""
-
-    miss: float
-    deviation: float
-    alarm: bool
-
-
-def drift(calibration: Calibration, widths_px: np.ndarray, known_mm: np.ndarray, *, deviations: float) -> Drift:
-    """Whether frames of known widths, taken later, still agree with the calibration: the alarm goes where lens, focus, height or light have moved."""
-    miss = millimetres(calibration, np.asarray(widths_px, float)) - np.asarray(known_mm, float)
-    if not len(miss) or not np.isfinite(miss).all():
-        raise ValueError(
-            f"calibration: expected a width in every check frame but {np.count_nonzero(~np.isfinite(miss))} of {len(miss)} have none; look at their reasons"
-        )
-    deviation = calibration.deviation * math.sqrt(1 / len(miss) + 1 / len(calibration.residuals))
-    return Drift(float(miss.mean()), deviation, bool(abs(miss.mean()) > deviations * max(deviation, 1e-9)))
-
-
 def drawn(frame: np.ndarray, bead: Bead) -> np.ndarray:
     """The frame as (h, w, 3) uint8 RGB with the measured edges as green lines, for a report; blocks without a width stay bare, a rejected frame gets a red border."""
     scale = 1 if frame.dtype == np.uint8 else 1 / 257

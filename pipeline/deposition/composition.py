@@ -8,6 +8,7 @@ import numpy as np
 
 from pipeline.deposition import basis
 from pipeline.deposition.chain import Chain, averaged, forecast, identify, simulate
+from pipeline.deposition.gcode import Kind, Program
 from pipeline.deposition.library import (
     CORNER,
     START,
@@ -25,7 +26,6 @@ from pipeline.deposition.library import (
 )
 from pipeline.deposition.motion import Motion, rate, sampled
 from pipeline.deposition.tasks import Lines, Tasks, halting, printed_lines, refuse, sequence
-from pipeline.gcode import Kind, Program
 
 COMPOSERS = PRIORITY, SUPERPOSITION, BASIS = "priority", "superposition", "basis"
 # rest before the first line and after the last: longer than any lead

@@ -10,8 +10,8 @@ from pipeline.deposition import basis
 from pipeline.deposition.chain import forecast
 from pipeline.deposition.composition import BASIS, EXCERPT_S, MARGIN_S, Composed, Learned
 from pipeline.deposition.extruder import Extruder
+from pipeline.deposition.gcode import Refusal
 from pipeline.deposition.library import STOP, Library
-from pipeline.gcode import Refusal
 
 # flow this long before a line begins and after it ends is its own, unless a neighbour is nearer
 REACH_S = 1.0

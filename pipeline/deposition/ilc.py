@@ -11,7 +11,7 @@ import scipy.fft
 import scipy.ndimage
 import scipy.signal
 
-from pipeline.deposition import norm_optimal
+from pipeline.deposition import reachable
 from pipeline.deposition.extruder import Extruder, flow, frequency_response, pressed
 from pipeline.deposition.trial_model import TrialModel, identify
 
@@ -54,11 +54,6 @@ def zero_phase(x: np.ndarray, *, order: int, cutoff_hz: float, sample_time_s: fl
     return scipy.signal.sosfilt(sos, scipy.signal.sosfilt(sos, padded)[..., ::-1])[..., ::-1][..., pad : padded.shape[-1] - pad]
 
 
-def causal(x: np.ndarray, *, order: int, cutoff_hz: float, sample_time_s: float) -> np.ndarray:
-    """Q x (T,) run forward only: the other reading of the paper's Q, which delays the command and never gets below a third of the error."""
-    return scipy.signal.sosfilt(_butterworth(order, cutoff_hz, sample_time_s), x)
-
-
 def magnitude(frequency_hz: np.ndarray, *, order: int, cutoff_hz: float, sample_time_s: float) -> np.ndarray:
     """|Q(f)| (F,) of one run of the Butterworth filter; squared it is the response of `zero_phase`."""
     sos = _butterworth(order, cutoff_hz, sample_time_s)
@@ -92,7 +87,7 @@ def paper_law(
     limit: float,
     sample_time_s: float,
 ) -> Law:
-    """u_{j+1} = Q (u_j + L e_j) of the last trial (Hoelzle 2009, eq. 2); q is `zero_phase` or `causal`, the model the nominal (1).
+    """u_{j+1} = Q (u_j + L e_j) of the last trial (Hoelzle 2009, eq. 2); q is `zero_phase` or takes the same, the model the nominal (1).
 
     u_j is what the drive applied, so that nothing winds up at the limit; e_j = 0 where the flow was not observable.
     """
@@ -145,7 +140,7 @@ def disturbance(trials: Sequence[Trial], r: np.ndarray, model: TrialModel, *, fl
 
 
 def command(x: np.ndarray, r: np.ndarray, model: Extruder, *, limit: float, sample_time_s: float) -> np.ndarray:
-    """u (T,) in mm that presses x (T,) out of the model; where that takes more than `limit`, the u whose flow comes nearest (`norm_optimal.nearest`)."""
+    """u (T,) in mm that presses x (T,) out of the model; where that takes more than `limit`, the u whose flow comes nearest (`reachable.nearest`)."""
     u = inverse(x, model, sample_time_s=sample_time_s)
     if np.abs(u).max() <= limit:
         return u
@@ -154,7 +149,7 @@ def command(x: np.ndarray, r: np.ndarray, model: Extruder, *, limit: float, samp
     # u(t) shows in the flow one sample and the delay later
     later = t + sample_time_s + model.delay_s
     free = np.interp(later, t, r) <= 0
-    v = norm_optimal.nearest(np.interp(later, t, x), free, pole=a, bound=scale * limit)
+    v = reachable.nearest(np.interp(later, t, x), free, pole=a, bound=scale * limit)
     return np.clip(np.diff(v, prepend=0.0) / scale + np.concatenate([[0.0], v[:-1]]) / model.gain, -limit, limit)
 
 
@@ -184,20 +179,6 @@ class InverseLaw:
         d = disturbance(trials, self.r, self.model, floor=self.floor, sample_time_s=self.sample_time_s)
         x = zero_phase(wanted(self.r, extruder.yield_, sample_time_s=self.sample_time_s) - d, **self.q)
         return command(x, self.r, extruder, limit=self.limit, sample_time_s=self.sample_time_s)
-
-
-def norm_optimal_law(r: np.ndarray, model: Extruder, *, R_u: float, R_d: float, limit: float, sample_time_s: float) -> Law:
-    """u_{j+1} = u_j + argmin |e - G du|^2 + |u + du|_Ru^2 + |du|_Rd^2 of the last trial; R_u and R_d as shares of the squared steady gain of the model."""
-    ones = np.ones(len(r))
-    plan = norm_optimal.plan(
-        norm_optimal.transfer(model, sample_time_s=sample_time_s), W=ones, R_u=R_u * model.gain**2 * ones, R_d=R_d * model.gain**2 * ones
-    )
-
-    def law(trials: Sequence[Trial]) -> np.ndarray:
-        u, y, _ = trials[-1]
-        return np.clip(u + norm_optimal.step(plan, u, np.where(np.isfinite(y), r - y, 0.0)), -limit, limit)
-
-    return law
 
 
 # ---- before anything runs

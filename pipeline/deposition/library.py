@@ -1,4 +1,4 @@
-"""The basis-signal library: learned commands cut into tasks on the smoothed signal, matrix (3), the index, and the four assumptions in figures (Hoelzle 2009)."""
+"""The basis-signal library: learned commands cut into tasks on the smoothed signal, the nearest of them, and the four assumptions in figures (Hoelzle 2009)."""
 
 import math
 from collections.abc import Sequence
@@ -56,15 +56,6 @@ class Library(NamedTuple):
     columns: tuple[Basis, ...]
     sample_time_s: float
     marks: dict[str, tuple[float, float]]
-
-
-class Found(NamedTuple):
-    """The nearest column for what was asked, its signal scaled by `factor` = speed asked / speed trained, and the predicted error of the signal in percent:
-    0 for what was trained, NaN where the library holds nothing to judge it by."""
-
-    basis: Basis
-    factor: float
-    error_percent: float
 
 
 class Nearest(NamedTuple):
@@ -178,32 +169,6 @@ def build(trainings: Sequence[Training], *, sample_time_s: float) -> Library:
     return Library(columns, sample_time_s, marks)
 
 
-def matrix(library: Library) -> np.ndarray:
-    """(3): row 0 the leads, row 1 the lengths K_i, then the samples, zero beyond K_i; one column a basis signal."""
-    out = np.zeros((2 + max(len(basis.signal) for basis in library.columns), len(library.columns)))
-    for column, basis in zip(out.T, library.columns, strict=True):
-        column[0], column[1] = basis.lead, len(basis.signal)
-        column[2 : 2 + len(basis.signal)] = basis.signal
-    return out
-
-
-def index(library: Library) -> list[tuple[str, str, float, float, float]]:
-    """(task, material, nozzle_mm, speed, pause_s) of each column of (3)."""
-    return [basis[:5] for basis in library.columns]
-
-
-def from_matrix(values: np.ndarray, keys: Sequence[tuple], *, sample_time_s: float, marks: dict[str, tuple[float, float]]) -> Library:
-    """The library back from (3) and its index: exact. Raises ValueError where a length exceeds the rows, or columns and keys differ in number."""
-    lengths = values[1].astype(int)
-    if len(keys) != values.shape[1] or lengths.max(initial=0) > len(values) - 2:
-        raise ValueError(
-            f"library: expected {values.shape[1]} keys and lengths of at most {len(values) - 2} samples but found {len(keys)} keys and lengths up to "
-            f"{lengths.max(initial=0)}; the matrix and its index are not of the same library"
-        )
-    columns = tuple(Basis(*key, int(column[0]), column[2 : 2 + n].copy()) for key, column, n in zip(keys, values.T, lengths, strict=True))
-    return Library(columns, sample_time_s, marks)
-
-
 def _laid(basis: Basis, factor: float, level: float, lead: int, length: int) -> np.ndarray:
     """The signal as deviation from the command that is there without it, `lead` samples before its event to `length` after: the level before a Corner or a Stop,
     after a Start or a Corner."""
@@ -274,25 +239,6 @@ def nearest(library: Library, task: str, material: str, nozzle_mm: float, speed:
     return Nearest(
         columns, column, speed / np.array([basis.speed for basis in columns])[column], np.zeros(len(column)) if task == NO_FLOW else error
     )
-
-
-def lookup(
-    library: Library, task: str, material: str, nozzle_mm: float, *, speed: float, pause_s: float, largest_error_percent: float
-) -> Found:
-    """The column of a task, or the nearest with its predicted error from how unlike the trained ones are among themselves.
-
-    Raises ValueError for a material or nozzle that was not trained, and where the predicted error exceeds `largest_error_percent` (inf: anything goes)
-    or, with a finite bound, cannot be predicted.
-    """
-    columns, column, factor, error = nearest(library, task, material, nozzle_mm, np.array([speed]), np.array([pause_s]))
-    found = Found(columns[int(column[0])], float(factor[0]), float(error[0]))
-    if math.isfinite(largest_error_percent) and not found.error_percent <= largest_error_percent:
-        raise ValueError(
-            f"library: {task} of {material} at {speed:g} mm/s with a pause of {pause_s:g} s is not in it; the nearest has {found.basis.speed:g} mm/s and "
-            f"{found.basis.pause_s:g} s, predicted error {found.error_percent:.0f} % against {largest_error_percent:g} % allowed; train that speed and pause, "
-            "or raise largest_error_percent"
-        )
-    return found
 
 
 def check(trainings: Sequence[Training], library: Library) -> list[Check]:

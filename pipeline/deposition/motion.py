@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.gcode import Kind, Moves
+from pipeline.deposition.gcode import Kind, Moves
 
 MOST = 50_000_000  # samples of one signal, 11 days at 50 Hz: beyond it a feed or a dwell is a slip
 
@@ -38,23 +38,6 @@ class Signal(NamedTuple):
     e_rate: np.ndarray
     move: np.ndarray
     share: np.ndarray
-
-
-class Dips(NamedTuple):
-    """Where printing slows down and speeds up again: the move (D,) that begins at the slowest place, its time and speed, when slowing down began and speeding up ended,
-    and by what angle the path turns there."""
-
-    move: np.ndarray
-    time_s: np.ndarray
-    speed: np.ndarray
-    begin_s: np.ndarray
-    end_s: np.ndarray
-    turn: np.ndarray
-
-
-def junction_deviation(square_corner_velocity: float, acceleration: float) -> float:
-    """The junction deviation in mm at which a corner of 90 degrees is passed at the square-corner velocity: v^2 (sqrt 2 - 1) / a (Klipper's own conversion)."""
-    return square_corner_velocity**2 * (np.sqrt(2.0) - 1.0) / acceleration
 
 
 def plan(
@@ -187,20 +170,3 @@ def rate(signal: Signal, amount: np.ndarray, *, sample_time_s: float) -> np.ndar
     spent = np.append(0.0, np.cumsum(amount))
     total = spent[signal.move] + amount[signal.move] * signal.share
     return np.diff(total, append=spent[-1]) / sample_time_s
-
-
-def dips(motion: Motion, moves: Moves) -> Dips:
-    """Every local minimum of the speed inside printed moves: corners, and curves too tight for the feed."""
-    speeds = np.column_stack([motion.entry, motion.cruise, motion.cruise, motion.exit])
-    length = np.column_stack([motion.ramp_s[0], motion.duration_s - motion.ramp_s.sum(axis=0), motion.ramp_s[1]]).ravel()
-    slope = np.sign(np.diff(speeds, axis=1)).ravel()
-    end = np.cumsum(length)
-    ramps = np.flatnonzero((slope != 0) & (length > 0))
-    slope, begin, end = slope[ramps], end[ramps] - length[ramps], end[ramps]
-    same = (slope[1:] == slope[:-1]) & (begin[1:] - end[:-1] < 1e-9)
-    first = np.maximum.accumulate(np.where(np.append(True, ~same), np.arange(len(ramps)), 0))
-    last = np.minimum.accumulate(np.where(np.append(~same, True), np.arange(len(ramps)), len(ramps))[::-1])[::-1]
-    unprinted = np.append(0, np.cumsum(moves.kind != Kind.EXTRUDE))
-    down = np.flatnonzero((slope[:-1] < 0) & (slope[1:] > 0) & (unprinted[ramps[1:] // 3 + 1] == unprinted[ramps[:-1] // 3]))
-    move = ramps[down] // 3 + 1
-    return Dips(move, end[down], motion.exit[move - 1], begin[first[down]], end[last[down + 1]], motion.turn[move])

@@ -1,25 +1,16 @@
 """Moves and their motion -> the sequence of tasks, with look-ahead: runs, corners, gaps, changes of material; the rules of what may follow what (Hoelzle 2009, fig. 8)."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.deposition.gcode import Kind, Moves
 from pipeline.deposition.library import CORNER, NO_FLOW, START, STEADY, STOP
 from pipeline.deposition.motion import Motion
-from pipeline.gcode import Kind, Moves
 
 # between two materials the paper's Stop A, dwell, Start B: no task of either material
 DWELL = "Dwell"
-# fig. 8 within a material; Dwell stands for the switch of the system
-ALLOWED = {
-    NO_FLOW: (START, DWELL),
-    START: (STEADY, STOP),
-    STEADY: (CORNER, STOP),
-    CORNER: (STEADY, STOP),
-    STOP: (NO_FLOW, START, DWELL),
-    DWELL: (START,),
-}
 # words at which a machine waits for a person or ends: a run across one would stand still with the plunger pressing
 HALTS = ("M0", "M1", "M2", "M25", "M30", "M112", "M226", "M600", "M601", "PAUSE", "CANCEL_PRINT")
 TINY_S = 1e-6
@@ -113,17 +104,6 @@ def sequence(lines: Lines, *, end_s: float) -> Tasks:
         ahead = (NO_FLOW, lines.tool[0], lines.line[0], 0.0, lines.begin_s[0], lines.speed[0], 0.0)
         columns = [np.concatenate([[value], column]) for value, column in zip(ahead, columns, strict=True)]
     return Tasks(*columns)
-
-
-def forbidden(tasks: Sequence[str], tools: Sequence[int]) -> np.ndarray:
-    """The indices (F,) of tasks that may not follow the one before them (fig. 8): another tool comes only by Dwell, Steady-State never goes to No-Flow."""
-    tasks, tools = np.asarray(tasks), np.asarray(tools)
-    names = np.array(list(ALLOWED))
-    table = np.array([[after in ALLOWED[before] for after in names] for before in names])
-    order = np.argsort(names)
-    code = order[np.searchsorted(names, tasks, sorter=order)]
-    fine = table[code[:-1], code[1:]] & ((tools[1:] == tools[:-1]) | (tasks[:-1] == DWELL))
-    return np.flatnonzero(~fine) + 1
 
 
 def refuse(lines: Lines, moves: Moves, *, halts: Collection[int], switch_s: float) -> None:

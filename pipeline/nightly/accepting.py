@@ -2,10 +2,10 @@
 
 import datetime
 
-from pipeline import artifacts, params
 from pipeline.nightly import champion, guarding, screening, watch
 from pipeline.nightly.processes import commit, dvc
 from pipeline.nightly.settings import Nightly
+from pipeline.store import artifacts, params
 
 
 def accept(loop: str, why: str) -> str:

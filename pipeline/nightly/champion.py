@@ -8,8 +8,8 @@ from typing import Any
 
 import yaml
 
-from pipeline import artifacts
 from pipeline.nightly.processes import dvc, fresh_index, git
+from pipeline.store import artifacts
 
 FILE, FOLDER = Path("champion.json"), Path("champion")
 EMPTY: dict[str, Any] = {"schema": "champion", "version": 1, "champions": {}, "history": []}

@@ -47,7 +47,7 @@ def add(commands) -> None:
     command.add_argument("--loop", default="", help="only this loop")
     command.set_defaults(run=rollback)
     command = commands.add_parser("sweep", help=sweep.__doc__, description=sweep.__doc__)
-    command.add_argument("-S", "--set", action="append", required=True, metavar="KEY=A,B,C", help="a key of params.yaml and its values")
+    command.add_argument("-S", "--set", action="append", required=True, metavar="KEY=A,B,C", help="a key of params.yaml or params.expert.yaml and its values")
     command.add_argument("--target", required=True, metavar="STAGE", help="the stage up to which each experiment runs")
     command.add_argument("--metric", required=True, metavar="STAGE:KEY", help="the figure that is told of each, below reports/metrics")
     command.set_defaults(run=sweep)

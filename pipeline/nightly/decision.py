@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipeline.nightly.settings import Rule
-from pipeline.paired import blocks_needed, paired
+from pipeline.statistics import blocks_needed, paired
 
 PROMOTED, KEPT, FIRST = "promoted", "kept", "first champion"
 

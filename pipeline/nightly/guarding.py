@@ -9,9 +9,9 @@ from pathlib import Path
 
 import yaml
 
-from pipeline import artifacts
 from pipeline.nightly import champion
 from pipeline.nightly.processes import STATE, TOKEN, dvc, end_orphans, fresh_index, git, stale_git_locks
+from pipeline.store import artifacts
 
 LOCK, RUNNING, RESERVE, BEFORE = STATE / "lock", STATE / "running.json", STATE / "reserve", STATE / "before"
 RESERVE_BYTES = 1 << 20

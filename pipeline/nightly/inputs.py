@@ -8,18 +8,18 @@ from pathlib import Path
 
 import yaml
 
-from pipeline import artifacts
+from pipeline.store import artifacts, params
 
 QUARANTINE = Path("datasets/quarantine")
 
 
 def sources() -> list[str]:
-    """Files and folders that dvc.yaml's stages read and none of them writes; params.yaml and dvc.yaml with them."""
+    """Files and folders that dvc.yaml's stages read and none of them writes; the files of parameters and dvc.yaml with them."""
     stages = yaml.safe_load(Path("dvc.yaml").read_text(encoding="utf-8")).get("stages", {})
     made = {
         name for stage in stages.values() for kind in ("outs", "metrics", "plots") for out in stage.get(kind, []) for name in _names(out)
     }
-    read = {dep for stage in stages.values() for dep in stage.get("deps", [])} | {"params.yaml", "dvc.yaml"}
+    read = {dep for stage in stages.values() for dep in stage.get("deps", [])} | {params.FILE, params.EXPERT, "dvc.yaml"}
     return sorted(dep for dep in read if not any(f"{dep}/".startswith(f"{out}/") for out in made) and dep != "reports/accepted.json")
 
 

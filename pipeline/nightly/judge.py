@@ -7,9 +7,13 @@ from typing import Any, NamedTuple
 import joblib
 import numpy as np
 
-from pipeline import artifacts, ingestion, params, schemas, setpoint_schemas
+from pipeline.deposition.workflow.tables import SCORES
 from pipeline.nightly.decision import Evidence
 from pipeline.nightly.settings import HoldOut, Loop, Nightly, Rule
+from pipeline.setpoint.workflow import tables
+from pipeline.store import artifacts, params
+from pipeline.temperature.workflow import ingest
+from pipeline.temperature.workflow.settings import Panel, Plant, Tracking
 
 MEMO = Path(".beadline/panel")
 
@@ -49,7 +53,7 @@ def _cases(path: Path) -> tuple[Evidence, dict[str, float]]:
 
 def _deposition(folder: Path) -> Evidence:
     """Of each part program and material, none of which was trained on: the error of the flow that the chosen composer leaves, as its stage scored it. Guard: the worst line."""
-    table = artifacts.read_table(folder / "compose_parts/scores.parquet", schemas.SCORES)
+    table = artifacts.read_table(folder / "compose_parts/scores.parquet", SCORES)
     rows = [k for k, chosen in enumerate(table["chosen"]) if chosen]
     cases = {
         f"{table['part'][k]}, {table['material'][k]}": (
@@ -65,7 +69,7 @@ def _deposition(folder: Path) -> Evidence:
 def _setpoint(folder: Path) -> Evidence:
     """Of each case of each simulator that counts: the share of runs that the chosen controller does not settle, plus one point. Guards: the worst case, and the slowest."""
     table, chosen = (
-        artifacts.read_table(folder / "evaluate_setpoint/scoreboard.parquet", setpoint_schemas.SCOREBOARD),
+        artifacts.read_table(folder / "evaluate_setpoint/scoreboard.parquet", tables.SCOREBOARD),
         artifacts.read_json(folder / "evaluate_setpoint/choice.json"),
     )
     rows = [k for k, name in enumerate(table["controller"]) if name == chosen["name"] and table["counts"][k]]
@@ -94,9 +98,9 @@ def _temperature(settings: Nightly) -> Callable[[Path], Evidence]:
 
     h, machine, tracking, panel = (
         settings.holdout,
-        params.load(params.Plant, "plant"),
-        params.load(params.Tracking, "tracking"),
-        params.load(params.Panel, "panel"),
+        params.load(Plant, "plant"),
+        params.load(Tracking, "tracking"),
+        params.load(Panel, "panel"),
     )
     weights = params.read()["tune_weights"]
     allowance = scorecard.Allowance(*(float(weights[f"allow_{name}"]) for name in scorecard.Allowance._fields[:-1]), 0.0)
@@ -184,7 +188,7 @@ def controller(folder: Path, which: str, gamma: float):
     return judging.window(long, gamma), window.predictor(long, model.sample_time_s), weights
 
 
-def _holdout_records(h: HoldOut, machine: params.Plant) -> list[tuple[np.ndarray, np.ndarray]]:
+def _holdout_records(h: HoldOut, machine: Plant) -> list[tuple[np.ndarray, np.ndarray]]:
     """The hold-out recordings as gapless segments. Raises ValueError where there is none that can be read."""
     if not Path(h.recordings).is_dir():
         raise ValueError(
@@ -195,13 +199,13 @@ def _holdout_records(h: HoldOut, machine: params.Plant) -> list[tuple[np.ndarray
 
 
 def record_segments(
-    folder: Path, machine: params.Plant, *, broken: dict[str, str] | None = None
+    folder: Path, machine: Plant, *, broken: dict[str, str] | None = None
 ) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
     """{recording: [(u, y), ...]} below a folder, read as the stage `ingest` reads, through its memo; reasons of those that cannot be read go to `broken`."""
     declared: dict[str, Any] = params.read()["ingest"]
     mapping = {name: (m["source"], m["unit"], float(m["scale"]), float(m["offset"])) for name, m in declared["mapping"].items()}
-    job = ingestion.Job(machine, mapping, declared["time"], float(declared["max_gap_s"]))
-    results = ingestion.process(folder, job, params.load(params.Execution, "execution"), memo=Path("datasets/memo/ingest"))
+    job = ingest.Job(machine, mapping, declared["time"], float(declared["max_gap_s"]))
+    results = ingest.process(folder, job, params.load(params.Execution, "execution"), memo=Path("datasets/memo/ingest"))
     found = {}
     for result in results:
         if result.reason:
@@ -213,7 +217,7 @@ def record_segments(
     return found
 
 
-def _segments(record: dict[str, np.ndarray], machine: params.Plant) -> list[tuple[np.ndarray, np.ndarray]]:
+def _segments(record: dict[str, np.ndarray], machine: Plant) -> list[tuple[np.ndarray, np.ndarray]]:
     u, y = (
         np.stack([np.where(record[f"{s.name}_masked"], np.nan, record[s.name]) for s in signals], axis=1).astype(float)
         for signals in (machine.inputs, machine.outputs)
@@ -227,7 +231,7 @@ def _segments(record: dict[str, np.ndarray], machine: params.Plant) -> list[tupl
     return pairs
 
 
-def _panel_plants(records: list[tuple[np.ndarray, np.ndarray]], machine: params.Plant):
+def _panel_plants(records: list[tuple[np.ndarray, np.ndarray]], machine: Plant):
     """The plants of the hold-out recordings: identified from them alone, and a bootstrap family around; kept, since neither recordings nor method change from night to night."""
     from pipeline.temperature import identification, plant, validation
 

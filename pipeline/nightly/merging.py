@@ -2,9 +2,9 @@
 
 import json
 
-from pipeline import artifacts
 from pipeline.nightly import champion, guarding
 from pipeline.nightly.processes import dvc, git, identity
+from pipeline.store import artifacts
 
 # made by nights: of these, either side is right, and the next night makes them anew
 OURS = ("dvc.lock", "reports/metrics", "champion.json", "champion")

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipeline import artifacts, params
 from pipeline.nightly import champion, guarding, inputs, watch
 from pipeline.nightly.processes import STATE, commit, dvc, git
 from pipeline.nightly.settings import Nightly
+from pipeline.store import artifacts, params
 
 if TYPE_CHECKING:  # what judges takes seconds to import, and a night with nothing new is done without
     from pipeline.nightly.decision import Decision
@@ -24,7 +24,7 @@ LONGEST_HISTORY = 1000
 
 
 def nightly(now: datetime.datetime | None = None) -> tuple[int, str]:
-    """Exit status and the one-line summary of a night. Raises ValueError where params.yaml does not say what to do."""
+    """Exit status and the one-line summary of a night. Raises ValueError where the parameters do not say what to do."""
     settings = params.load(Nightly, "nightly")
     started = now or datetime.datetime.now(datetime.UTC)
     try:
@@ -178,7 +178,7 @@ def _lineage(settings: Nightly, made_from: dict[str, str]) -> dict[str, Any]:
         "commit": git("rev-parse", "HEAD"),
         "uncommitted": [path for path in uncommitted if path != "dvc.lock" and not path.startswith(("reports/", "champion"))],
         "dvc_lock": artifacts.sha256("dvc.lock"),
-        "params": artifacts.sha256("params.yaml"),
+        "params": {name: artifacts.sha256(name) for name in (params.FILE, params.EXPERT) if artifacts.exists(name)},
         "recordings": {name: inputs.recordings(made_from, loop.recordings) for name, loop in settings.loops.items()},
     }
 
@@ -241,7 +241,7 @@ def _say(settings: Nightly, entry: dict[str, Any], remembered: dict[str, Any], h
     try:
         _remember(settings, entry, remembered, hashes, known)
         if entry["outcome"] != "nothing new":
-            from pipeline.report import nightly as page
+            from pipeline.report.nightly import page
 
             artifacts.write_text("reports/nightly.html", page.render(nights(), champion.read(), settings))
     except OSError as error:

@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from pipeline import camera_drift, params, trials
+from pipeline.deposition.workflow import trial_files
+from pipeline.nightly import camera_drift
 from pipeline.nightly.inputs import aside
 from pipeline.nightly.settings import Drift
+from pipeline.store import params
 
 FRAMES = 40  # pictures of a recording that are looked at
 
@@ -21,14 +23,14 @@ def of_trials(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[An
     found = []
     for path in [path for path in sorted(folder.rglob("*.mcap")) if not only or path.as_posix() in only][-most:]:
         try:
-            seen = _seen(trials.read_trial(path, unreadable_share=1.0))
+            seen = _seen(trial_files.read_trial(path, unreadable_share=1.0))
         except ValueError:
             continue
         found.append([seen.mean.tolist(), seen.deviation.tolist(), seen.frames])
     return found
 
 
-def _seen(trial: trials.Trial) -> camera_drift.Seen:
+def _seen(trial: trial_files.Trial) -> camera_drift.Seen:
     frames = trial.frames
     every = max(len(frames.time_s) // FRAMES, 1)
     return camera_drift.figures([picture for k, (_, picture) in enumerate(frames) if k % every == 0 and picture is not None])
@@ -41,7 +43,7 @@ def trials_of(
     before = [camera_drift.Seen(np.array(mean), np.array(deviation), frames) for mean, deviation, frames in kept.get("camera", [])]
     for path in (path for path in paths if path.lower().endswith(".mcap")):
         try:
-            trial = trials.read_trial(path, unreadable_share=1.0)
+            trial = trial_files.read_trial(path, unreadable_share=1.0)
         except ValueError as error:
             found["quarantined"][path] = aside(path, loop, str(error))
             continue
@@ -62,13 +64,14 @@ def trials_of(
 def of_prints(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[Any]]:
     """[print, frames by class and without a line (4,), frames of a segment, median contrast of the line and its deviation] of the last `most` prints below `folder`;
     `only` those named."""
-    from pipeline import nozzle_frames, seeing
+    from pipeline.setpoint.workflow import frame_folder
+    from pipeline.setpoint.workflow.settings import TrainClassifier
 
-    p = params.load(seeing.TrainClassifier, "train_classifier")
+    p = params.load(TrainClassifier, "train_classifier")
     if p.source != "recordings":
         return []
-    how = nozzle_frames.Reading(p.tip_px, p.least_score, p.topics.topics())
-    frames = nozzle_frames.read_folder(folder, how, params.load(params.Execution, "execution"), memo=Path("datasets/memo/train_classifier"))
+    how = frame_folder.reading(p)
+    frames = frame_folder.read_folder(folder, how, params.load(params.Execution, "execution"), memo=Path("datasets/memo/train_classifier"))
     found = []
     for number, name in [one for one in enumerate(frames.prints) if not only or one[1] in only][-most:]:
         here = frames.print_number == number
@@ -85,17 +88,18 @@ def nozzle_of(
     limits: Drift, loop: str, folder: str, paths: Sequence[str], kept: Mapping[str, Any], pending: set[str], found: dict[str, Any]
 ) -> None:
     """Of new prints: files that cannot be read are set aside; classes, frames without a line, and the line's contrast are held against the champion's prints."""
-    from pipeline import nozzle_log, nozzle_recordings, seeing
+    from pipeline.setpoint.workflow import frame_csv, frame_folder, frame_mcap
+    from pipeline.setpoint.workflow.settings import TrainClassifier
 
-    p = params.load(seeing.TrainClassifier, "train_classifier")
+    p = params.load(TrainClassifier, "train_classifier")
     if p.source != "recordings":
         return
     for path in paths:
         try:
             if path.lower().endswith(".csv"):
-                nozzle_log.read_log(Path(path))
+                frame_csv.read_log(Path(path))
             elif path.lower().endswith(".mcap"):
-                nozzle_recordings.open_film(Path(path), p.topics.topics())
+                frame_mcap.open_film(Path(path), frame_folder.reading(p).topics)
         except ValueError as error:
             found["quarantined"][path] = aside(path, loop, str(error))
     before = kept.get("camera", [])

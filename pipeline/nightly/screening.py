@@ -6,10 +6,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline import artifacts, drift, params
-from pipeline.nightly import champion, judge, pictures
+from pipeline.nightly import champion, drift, judge, pictures
 from pipeline.nightly.inputs import aside
 from pipeline.nightly.settings import Drift, Loop, Nightly
+from pipeline.store import artifacts, params
+from pipeline.temperature.workflow.settings import Plant
 
 REFERENCE = "reference.json"  # in the champion's folder
 PIECES = 4  # into which a single record of the champion is cut, to stand for nights
@@ -62,7 +63,7 @@ def look(
 def _temperature(
     settings: Nightly, name: str, folder: str, has_champion: bool, new: Sequence[str], memory: Mapping[str, Any], found: dict[str, Any]
 ) -> None:
-    machine, broken = params.load(params.Plant, "plant"), {}
+    machine, broken = params.load(Plant, "plant"), {}
     if not new or not Path(folder).is_dir():
         return
     records = judge.record_segments(Path(folder), machine, broken=broken)
@@ -105,7 +106,7 @@ def reference(loop: Loop, folder: Path, only: Sequence[str] = ()) -> dict[str, A
         return {"schema": "reference", "version": 1, "camera": known} if known else None
     if loop.judge != "temperature" or not _recorded():
         return None
-    machine = params.load(params.Plant, "plant")
+    machine = params.load(Plant, "plant")
     records = judge.record_segments(Path(loop.recordings), machine, broken={})
     named = [path.removeprefix(f"{loop.recordings}/") for path in only] or sorted(records)
     nights = [records[path] for path in named if records.get(path)][-NIGHTS:]
@@ -143,7 +144,7 @@ def _recorded() -> bool:
     return params.value("generate_probing.source", one_of=("simulated", "recordings")) == "recordings"
 
 
-def _closed_loop(segments: Sequence[tuple[np.ndarray, np.ndarray]], machine: params.Plant) -> dict[str, list[list[float]]]:
+def _closed_loop(segments: Sequence[tuple[np.ndarray, np.ndarray]], machine: Plant) -> dict[str, list[list[float]]]:
     """Offset of each output from its reference after the first third in °C, root mean square of each input and its share of samples at a limit, both in percent: [figures, their
     standard deviations], from PARTS of the record, which are longer than what a loop remembers."""
     u, y = (np.concatenate([pair[k] for pair in segments]) for k in (0, 1))
@@ -173,7 +174,7 @@ def _measure(
     path: str,
     segments: Sequence,
     reference: Reference,
-    machine: params.Plant,
+    machine: Plant,
     pending: set[str],
     found: dict[str, Any],
 ) -> None:

@@ -1,11 +1,11 @@
-"""Section `nightly` of params.yaml: when to promote, what is drift, who is woken."""
+"""Section `nightly` of the parameters: when to promote, what is drift, who is woken."""
 
 from typing import Annotated, Literal
 
 import pydantic
 from pydantic import Field
 
-from pipeline.params import Section
+from pipeline.store.params import Section
 
 Path = Annotated[str, Field(min_length=1, max_length=300)]
 

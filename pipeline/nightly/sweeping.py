@@ -8,24 +8,23 @@ from typing import Any
 
 import numpy as np
 
-from pipeline import artifacts, params
 from pipeline.nightly.processes import STATE, dvc, git
-from pipeline.report import charts, page
+from pipeline.report.shared import charts, page
+from pipeline.store import artifacts, params
 
 
 def grid(settings: Sequence[str]) -> list[dict[str, str]]:
-    """Every combination of `key=a,b,c`. Raises ValueError where a key is not one of params.yaml's, or has no values."""
+    """Every combination of `key=a,b,c` or `file:key=a,b,c`. Raises ValueError where a key stands in no file of parameters or in another, or has no values."""
     axes = {}
     for text in settings:
         key, _, values = text.partition("=")
-        known: Any = params.read()
-        for part in key.split("."):
-            known = known.get(part) if isinstance(known, dict) else None
-        if known is None or not values:
+        said, _, dotted = key.rpartition(":")
+        home = params.home(dotted)
+        if not home or said not in ("", home) or not values:
             raise ValueError(
-                f"sweep: expected KEY=VALUE,VALUE with a key of params.yaml, found {text}; write for example tune_weights.seed=1,2,3"
+                f"sweep: expected KEY=VALUE,VALUE with a key of {' or '.join(params.files())}, found {text}; write for example tune_weights.seed=1,2,3"
             )
-        axes[key] = values.split(",")
+        axes[dotted] = values.split(",")
     return [dict(zip(axes, chosen, strict=True)) for chosen in itertools.product(*axes.values())]
 
 
@@ -38,7 +37,7 @@ def sweep(settings: Sequence[str], target: str, metric: str) -> str:
     head = git("rev-parse", "HEAD")
     for k, point in enumerate(points, 1):
         name = "sweep-" + "-".join(f"{part.rsplit('.', 1)[-1]}-{value}" for part, value in point.items()).replace(".", "_").lower()
-        chosen = [word for part, value in point.items() for word in ("--set-param", f"{part}={value}")]
+        chosen = [word for part, value in point.items() for word in ("--set-param", f"{params.home(part)}:{part}={value}")]
         print(f"sweep: {k} of {len(points)}: {', '.join(f'{part}={value}' for part, value in point.items())}", flush=True)
         dvc("exp", "run", "--temp", "--force", "--name", name, *chosen, target, log=STATE / "logs" / f"{name}.log")
         found: Any = json.loads(git("show", f"refs/exps/{head[:2]}/{head[2:]}/{name}:reports/metrics/{stage}.json"))

@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline import artifacts
 from pipeline.nightly.processes import STATE
+from pipeline.store import artifacts
 
 ALARM, LAST = STATE / "alarm.json", STATE / "last.json"
 

@@ -294,3 +294,7 @@ def every(time: str) -> float | None:
     except ValueError:
         return None
     return interval if interval is not None and 0 < interval < np.inf else None
+
+# a clock that begins later than three years is one of the calendar; it is counted from the record's first whole second, so that floats hold
+# nanoseconds
+CALENDAR_S = 1e8

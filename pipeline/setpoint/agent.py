@@ -34,7 +34,6 @@ from pipeline.setpoint.simulator import (
     paper_state,
     paper_windows,
     remembered,
-    step,
     stepped,
 )
 
@@ -320,36 +319,6 @@ def train_published(
         if on_step is not None:
             on_step(i + 1, learner.network, rewards)
     return Published(tuple(networks), tuple(all_rewards))
-
-
-# ---- why it acted
-
-
-class Why(NamedTuple):
-    """One episode of T decisions: true flow and temperatures at each, what was seen, Q (T, 2, 5), actions (T, 2), and the memory after the window (ours: bayes.Known, belief (T, H, N))."""
-
-    flow: jax.Array
-    temperature: jax.Array
-    observation: Observation
-    Q: jax.Array
-    action: jax.Array
-    memory: Any
-
-
-@eqx.filter_jit
-def why(sight: Sight, network: eqx.Module, windows: Windows, conditions: Conditions, key: jax.Array, *, steps: int) -> Why:
-    """An episode under the greedy policy with the reasons of each decision; scalar conditions."""
-
-    def one(carry, k):
-        state, observation, memory = carry
-        memory, x = sight.see(network, memory, observation)
-        Q = network(x)
-        action = Action(*Q.argmax(axis=1))
-        after, seen = step(windows, conditions, state, action, k)
-        return (after, seen, memory), Why(state.flow, state.temperature, observation, Q, jnp.stack(action), memory)
-
-    k_begin, key = jax.random.split(key)
-    return jax.lax.scan(one, (*begin(windows, conditions, k_begin), sight.start()), jax.random.split(key, steps))[1]
 
 
 # ---- weights by name

@@ -136,21 +136,6 @@ def reliability(p: np.ndarray, label: np.ndarray, *, bins: int) -> Reliability:
     return Reliability(*means, count, edges[:-1], float(error), float(floor))
 
 
-class Confusion(NamedTuple):
-    """counts (k, 3, 3) of true class x named class at each of the nozzle temperatures (k,) in °C."""
-
-    temperature_degC: np.ndarray
-    counts: np.ndarray
-
-
-def confusion_by_temperature(label: np.ndarray, named: np.ndarray, temperature_degC: np.ndarray) -> Confusion:
-    """As in Li and Pattinson 2025, figure 5c."""
-    values, place = np.unique(temperature_degC, return_inverse=True)
-    counts = np.zeros((len(values), CLASSES, CLASSES), int)
-    np.add.at(counts, (place, label, named), 1)
-    return Confusion(values, counts)
-
-
 # ---- sets that hold the true class
 
 
@@ -300,27 +285,3 @@ def _rows(frames: Seen, length: int) -> np.ndarray:
             f"expected a segment with {length} frames in a row of one class but found none among {len(frames.label)} frames; film longer ones, or take shorter windows"
         )
     return rows
-
-
-class Judgement(NamedTuple):
-    """Images that are valid, and windows: share right, reliability; windows by the paper's hard counts beside them; the sets; and the share of images taken for foreign."""
-
-    image_accuracy: float
-    window_accuracy: float
-    image: Reliability
-    window: Reliability
-    hard_window: Reliability
-    sets: Sets
-    false_alarms: float
-
-
-def judge(calibration: Calibration, test: Seen, *, length: int, bins: int) -> Judgement:
-    """How a calibrated classifier does on segments that neither learning nor calibration saw."""
-    v, log_p = test.valid, log_probabilities(test.logits, calibration.temperature)
-    rows = _rows(test, length)
-    label, p = test.label[rows[:, 0]], window_probabilities(log_p[rows], v[rows], calibration.correlation)
-    image, window = reliability(np.exp(log_p[v]), test.label[v], bins=bins), reliability(p, label, bins=bins)
-    hard = reliability(hard_shares(log_p[rows], v[rows]), label, bins=bins)
-    right = [float(np.mean(a.argmax(axis=1) == b)) for a, b in ((log_p[v], test.label[v]), (p, label))]
-    foreign = mahalanobis(calibration.familiar, test.features[v]) > calibration.foreign_above
-    return Judgement(*right, image, window, hard, sets(p, label, calibration.level), float(foreign.mean()))

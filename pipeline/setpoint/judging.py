@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from pipeline.setpoint.score import CLOG_STEP, STEPS, Score, Share, judge
+from pipeline.setpoint.score import CLOG_STEP, STEPS, Score, judge
 from pipeline.setpoint.simulator import Conditions, Controller, Windows, nominal, paper_windows, rollout
 
 START_FLOWS, START_TEMPERATURES = (30.0, 60.0, 80.0, 120.0, 150.0, 200.0, 300.0), (190.0, 210.0, 230.0)  # section 3.4
@@ -80,24 +80,3 @@ def choose(scores: dict[str, dict[str, Score]]) -> Choice:
         margin,
         f"{sentence}, {margin:.1f} points more than of {ranked[1]} in its worst ({next_case}, {next_worst:.1f} %).",
     )
-
-
-def rows(scores: dict[str, dict[str, Score]]) -> list[dict[str, str | float | int]]:
-    """One flat row a controller and case: each field of the score, shares as percent, low and high."""
-    return [
-        {
-            "controller": name,
-            "case": case,
-            **{key: value for field, entry in zip(score._fields, score, strict=True) for key, value in _flat(field, entry)},
-        }
-        for name, of in scores.items()
-        for case, score in of.items()
-    ]
-
-
-def _flat(field: str, entry) -> list[tuple[str, float | int]]:
-    if isinstance(entry, Share):
-        return [(field, entry.percent), (f"{field}_low", entry.low), (f"{field}_high", entry.high)]
-    if isinstance(entry, tuple):
-        return [(f"{field}_{part}", value) for part, value in zip(("flow", "temperature", "settled"), entry, strict=True)]
-    return [(field, entry)]

@@ -84,20 +84,6 @@ def crop(frame: np.ndarray, tip: tuple[float, float]) -> Crop:
     return Crop(gray, levels, 1 - inside.size / SIDE**2, (left - x, top - y, right - x, bottom - y))
 
 
-def sweep(crop: Crop) -> np.ndarray:
-    """(360,) mean equalised level of the 87 px from the tip outward at each whole degree; the paper takes the brightest as the fresh line."""
-    samples = crop.levels.take(crop.gray.ravel().take(_rays(), mode="clip"))
-    return samples.sum(axis=0, dtype=np.uint16) / LENGTH  # 87 x 255 fits in 16 bits
-
-
-def published(frame: np.ndarray, tip: tuple[float, float]) -> KeyArea:
-    """The key area as the paper takes it: along the brightest ray, never rejected; its score is the mean level of that ray."""
-    c = crop(frame, tip)
-    rays = sweep(c)
-    angle = int(rays.argmax())
-    return KeyArea(_rectangle(c, angle, 0.0), float(angle), 0.0, float(rays[angle]), c.padded_share, "")
-
-
 def find(frame: np.ndarray, tip: tuple[float, float], *, least_score: float, direction_deg: float | None = None) -> KeyArea:
     """The key area along the strongest ridge: score = strip - brighter flank, rays on the nozzle left out; rejected below least_score gray levels.
 
@@ -176,7 +162,8 @@ def drift(frames: Sequence[np.ndarray], template: np.ndarray, tip: tuple[float, 
             f"{frame.shape[1]} x {frame.shape[0]} px; calibrate on frames of this camera"
         )
     match = np.mean(
-        [cv2.matchTemplate(_gray(one[rows[0] : rows[1], columns[0] : columns[1]]), template, cv2.TM_CCOEFF_NORMED) for one in frames], axis=0
+        [cv2.matchTemplate(_gray(one[rows[0] : rows[1], columns[0] : columns[1]]), template, cv2.TM_CCOEFF_NORMED) for one in frames],
+        axis=0,
     )
     row, column = np.unravel_index(int(match.argmax()), match.shape)
     y, x = int(top - rows[0]), int(left - columns[0])
@@ -244,14 +231,6 @@ def _ridge_filters(offsets: int) -> np.ndarray:
                 strip, flank = np.abs(place - miss) <= half, np.abs(place - miss - side) <= 1
                 columns.append(weight * (strip / strip.sum() - flank / flank.sum()))
     return np.array(columns, np.float32).T.copy()
-
-
-@functools.cache
-def _rays() -> np.ndarray:
-    """The gather table of the sweep: (87, 360) places in the crop, from the tip outward."""
-    angle, radius = np.deg2rad(np.arange(360)), np.arange(1, LENGTH + 1)[:, None]
-    column, row = (np.rint(SIDE // 2 + radius * v).astype(np.intp) for v in (np.cos(angle), np.sin(angle)))
-    return row * SIDE + column
 
 
 @functools.cache

@@ -66,20 +66,6 @@ def _melt_s(machine: Machine, temperature: np.ndarray) -> np.ndarray:
     return machine.melt_s * np.exp(-machine.softening_per_degC * (temperature - 210.0))
 
 
-def step_response(
-    machine: Machine, *, flow: tuple, temperature: tuple, before_s: float, after_s: float, tick_s: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Flow and temperature (T,) of a machine at rest whose flow and target step from the first to the second value: the record to measure the wait from."""
-    state, on = at_rest(machine, np.array([flow[0]]), np.array([temperature[0]]), tick_s=tick_s), np.array([True])
-    flows, temperatures = [], []
-    for k in range(round((before_s + after_s) / tick_s)):
-        late = int(k * tick_s >= before_s - tick_s / 2)
-        state, out = tick(machine, state, np.array([flow[late]]), np.array([temperature[late]]), on, tick_s=tick_s)
-        flows.append(out[0])
-        temperatures.append(state.temperature[0])
-    return np.array(flows), np.array(temperatures)
-
-
 # ---- what befalls it
 
 
@@ -296,8 +282,3 @@ def settled_since(episodes: Episodes) -> np.ndarray:
     inside = (np.abs(episodes.flow - 100.0) <= 10.0 + 1e-3) & (np.abs(episodes.temperature - 210.0) <= 5.0 + 1e-3)
     out = ~inside[:, ::-1]
     return np.where(out.any(axis=1), inside.shape[1] - out.argmax(axis=1), 0)
-
-
-def settled(episodes: Episodes, *, by: int) -> np.ndarray:
-    """Whether each episode (E,) is inside from some decision <= by to its end."""
-    return settled_since(episodes) <= by

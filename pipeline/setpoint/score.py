@@ -3,21 +3,13 @@
 from typing import NamedTuple
 
 import numpy as np
-import scipy.special
 
 from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE
+from pipeline.statistics import Share, wilson
 
 FLOW_BAND, TEMPERATURE_BAND = 10.0, 5.0  # about 100 % and 210 °C
 SETTLED_BY, DWELL_UNTIL, STEPS = 90, 100, 200  # inside from some step <= 90 until 100; never out from 100 to 200 is staying
 CLOG_STEP, RECOVERED_UNTIL = 60, 120
-
-
-class Share(NamedTuple):
-    """A share of runs in percent with its 95 % Wilson interval."""
-
-    percent: float
-    low: float
-    high: float
 
 
 class Score(NamedTuple):
@@ -80,8 +72,3 @@ def _worst_start(flow: np.ndarray, temperature: np.ndarray, settled: np.ndarray)
     return float(pairs[worst, 0]), float(pairs[worst, 1]), float(percent[worst])
 
 
-def wilson(happened: np.ndarray) -> Share:
-    """The share of True (n,) in percent with the interval of Wilson 1927 at 95 %: (p + z^2 / 2n +- z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n)."""
-    n, p, z = len(happened), float(np.mean(happened)), float(scipy.special.ndtri(0.975))
-    centre, half = (p + z**2 / (2 * n)) / (1 + z**2 / n), z * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2)) / (1 + z**2 / n)
-    return Share(100.0 * p, float(100.0 * max(centre - half, 0.0)), float(100.0 * min(centre + half, 1.0)))

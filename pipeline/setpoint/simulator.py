@@ -143,11 +143,6 @@ def begin(windows: Windows, conditions: Conditions, key: jax.Array) -> tuple[Sta
     return _begun(windows, conditions, jax.random.uniform(key, (CHANCES,)))
 
 
-def step(windows: Windows, conditions: Conditions, state: State, action: Action, key: jax.Array) -> tuple[State, Observation]:
-    """One decision of one episode: the action, the lags, whatever befalls the machine, and the next window. The reward is `reward(state.flow, state.temperature, ...)`."""
-    return stepped(windows, conditions, state, action, jax.random.uniform(key, (CHANCES,)))
-
-
 def _begun(windows: Windows, conditions: Conditions, u: jax.Array) -> tuple[State, Observation]:
     flow, temperature = jnp.clip(conditions.flow, *FLOW_LIMITS), jnp.clip(conditions.temperature, *TEMPERATURE_LIMITS)
     zero = jnp.zeros_like(flow)
@@ -156,7 +151,10 @@ def _begun(windows: Windows, conditions: Conditions, u: jax.Array) -> tuple[Stat
 
 
 def stepped(windows: Windows, conditions: Conditions, state: State, action: Action, u: jax.Array) -> tuple[State, Observation]:
-    """`step` by numbers u (CHANCES,), uniform in [0, 1), that the caller has drawn for many at once."""
+    """One decision of one episode: the action, the lags, whatever befalls the machine, and the next window. The reward is `reward(state.flow, state.temperature, ...)`.
+
+    u (CHANCES,) are the chances, uniform in [0, 1), which the caller draws for many at once.
+    """
     flow_bar = jnp.clip(state.flow_bar + conditions.gain * jnp.asarray(FLOW_MOVES)[action.flow], *FLOW_LIMITS)
     asked = jnp.where(state.step % LAMBDA == 0, jnp.asarray(TEMPERATURE_MOVES)[action.temperature], 0.0)
     target = jnp.clip(state.target + asked, *TEMPERATURE_LIMITS)

@@ -32,21 +32,15 @@ from pipeline.temperature.order import (
     with_delays,
 )
 from pipeline.temperature.plant import Plant
-from pipeline.temperature.refinement import drives, estimate_state, kalman_gain, simulation_form
+from pipeline.temperature.refinement import drives, estimate_state, simulation_form
 from pipeline.temperature.subspace import (
     Segments,
-    Varx,
     complete_runs,
     gapless,
     lagged,
-    moesp,
-    moesp_singular_values,
     realise,
     subspace,
-    varx,
 )
-
-__all__ = ["Candidate", "Identified", "Varx", "check_inputs", "identify", "moesp", "moesp_singular_values", "refit", "varx"]
 
 EXACT_RANK = 1e-7  # singular values of a noise-free record below this share of the largest are rounding
 
@@ -145,7 +139,6 @@ def identify(
     sample_time_s: float,
     order: int | None = None,
     past: int | None = None,
-    method: Literal["pbsid", "moesp"] = "pbsid",
     feedthrough: bool | None = False,
     offset: bool = True,
     refinement: Literal["none", "prediction", "simulation", "validated"] = "none",
@@ -157,8 +150,8 @@ def identify(
 ) -> Identified:
     """The plant that a record shows, by the rules at the head of this module; u segments (T, m), y segments (T, p), NaN where a sample is masked.
 
-    `method` makes the start: PBSID, or past-output MOESP with the Kalman gain of its one-step errors; both give the innovation form. `refinement` "prediction" or
-    "simulation" moves it to the least errors of that kind; "validated" does so only where the left-out blocks prefer it. `feedthrough` None lets the data decide.
+    PBSID makes the start, in innovation form. `refinement` "prediction" or "simulation" moves it to the least errors of that kind; "validated" does
+    so only where the left-out blocks prefer it. `feedthrough` None lets the data decide.
     `limits` (low, high) of the actuators clip u; `max_radius` bounds every pole. Works in closed loop, unless refined on simulation errors.
     Raises ValueError for a constant or collinear input, a constant output, a record too short for the order, and shapes that do not agree.
     """
@@ -182,7 +175,7 @@ def identify(
         order, structure, kind = chosen.order, chosen.structure, chosen.fit if refinement == "validated" else kind
     if feedthrough is None:
         notes.append(f"direct feed-through {'kept' if structure.feedthrough else 'left out'} as the data prefer")
-    found = _fit_all(u, y, structure, exact, order, kind, method, sample_time_s, table, max_radius)
+    found = _fit_all(u, y, structure, exact, order, kind, sample_time_s, table, max_radius)
     return found._replace(dropped_rows=found.dropped_rows + cut, notes=notes + _remarks(found, names))
 
 
@@ -191,7 +184,6 @@ def refit(
     y: Segments,
     found: Identified,
     *,
-    method: Literal["pbsid", "moesp"] = "pbsid",
     max_radius: float | None = None,
     limits: tuple[Sequence[float], Sequence[float]] | None = None,
     names: Sequence[str] = (),
@@ -200,7 +192,7 @@ def refit(
     u, y, cut, notes = _prepared(u, y, found.order, found.past, found.offset, limits, names)
     structure = Structure(found.past, found.feedthrough, found.offset, found.delays)
     exact = not found.order_table and windows(lagged(u, y, found.past, feedthrough=found.feedthrough, offset=found.offset))[1]
-    again = _fit_all(u, y, structure, exact, found.order, found.fit, method, found.plant.sample_time_s, found.order_table, max_radius)
+    again = _fit_all(u, y, structure, exact, found.order, found.fit, found.plant.sample_time_s, found.order_table, max_radius)
     return again._replace(dropped_rows=again.dropped_rows + cut, notes=notes + _remarks(again, names))
 
 
@@ -263,7 +255,7 @@ def _choose(u, y, structures, order, max_order, validated, settings) -> tuple[Ca
     return chosen, table
 
 
-def _fit_all(u, y, structure, exact, order, kind, method, sample_time_s, table, max_radius) -> Identified:
+def _fit_all(u, y, structure, exact, order, kind, sample_time_s, table, max_radius) -> Identified:
     """One fit of the chosen model on all of the record."""
     past, rest = structure.past, {"feedthrough": structure.feedthrough, "offset": structure.offset}
     us, ys = shifted(u, y, structure.delays)
@@ -273,10 +265,7 @@ def _fit_all(u, y, structure, exact, order, kind, method, sample_time_s, table, 
         raise ValueError(
             f"order {order} needs a longer window: {past} past samples give at most {len(sub.singular_values)} states; raise past"
         )
-    if method == "moesp":
-        plant = kalman_gain(moesp(us, ys, block_rows(us, ys, past, order), order, sample_time_s=sample_time_s, **rest)[0], us, ys)
-    else:
-        plant = realise(data, sub.basis[:order], sample_time_s)
+    plant = realise(data, sub.basis[:order], sample_time_s)
     plant = with_delays(fit(kind, plant, us, ys, max_iterations=30, max_radius=max_radius, **rest), structure.delays)
     model = simulation_form(plant, [])
     return Identified(
@@ -296,13 +285,6 @@ def _fit_all(u, y, structure, exact, order, kind, method, sample_time_s, table, 
         dropped_rows=data.dropped_rows,
         notes=[],
     )
-
-
-def block_rows(u: Segments, y: Segments, past: int, order: int) -> int:
-    """Block rows s for past-output MOESP: the window, but at least what the order needs, (s - 1) p >= order, and else no more than give as many rows as columns."""
-    p, q, lengths = y[0].shape[1], u[0].shape[1] + y[0].shape[1], np.array([len(w) for w in complete_runs(u, y)])
-    least = -(-order // p) + 1
-    return max([s for s in range(least, past + 1) if np.maximum(lengths - 2 * s + 1, 0).sum() >= 2 * s * q + 1], default=least)
 
 
 def _remarks(found: Identified, names: Sequence[str]) -> list[str]:

@@ -114,7 +114,10 @@ class Regression(NamedTuple):
 
 
 _STORED = {
-    "G": ("1", "half-vector of the whitened state's second moment a step later, beyond skron(step), on that of v; empty where nothing is beyond"),
+    "G": (
+        "1",
+        "half-vector of the whitened state's second moment a step later, beyond skron(step), on that of v; empty where nothing is beyond",
+    ),
     "G_e": ("degC^2", "half-vector of e e' on that of v"),
     "G_u": ("percent^2", "half-vector of u u' on that of v"),
     "step": ("1", "whitened state a step later, on v"),

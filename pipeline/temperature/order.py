@@ -9,16 +9,7 @@ import scipy.stats
 
 from pipeline.temperature.plant import Plant, drawn_in, markov_parameters
 from pipeline.temperature.plant import plant as make_plant
-from pipeline.temperature.refinement import (
-    drives,
-    fit_inputs,
-    fitted_state,
-    free_response,
-    kalman_gain,
-    refine,
-    respond,
-    simulation_form,
-)
+from pipeline.temperature.refinement import drives, fit_inputs, fitted_state, free_response, kalman_gain, refine, respond, simulation_form
 from pipeline.temperature.subspace import Lagged, Segments, complete_runs, lagged, one_step, realise, subspace
 
 Fit = Literal["subspace", "prediction", "simulation"]

@@ -178,7 +178,7 @@ def regret(J: Cost, best: Cost) -> np.ndarray:
     if not (np.array_equal(a.q, b.q) and np.array_equal(a.r, b.r) and a.gamma == b.gamma):
         raise ValueError(
             f"costs under different weights cannot be compared: one was computed with q = {_short(a.q)}, r = {_short(a.r)}, gamma = {a.gamma:g}, the other with "
-            f"q = {_short(b.q)}, r = {_short(b.r)}, gamma = {b.gamma:g}; compute both under one yardstick (section tracking of params.yaml)"
+            f"q = {_short(b.q)}, r = {_short(b.r)}, gamma = {b.gamma:g}; compute both under one yardstick (section tracking of params.expert.yaml)"
         )
     return J.J / best.J - 1
 

@@ -51,15 +51,6 @@ class Excitation(NamedTuple):
     levels: np.ndarray
 
 
-def nrmse(y: np.ndarray, predicted: np.ndarray, *, means_removed: bool = False) -> np.ndarray:
-    """Fit of each output in percent, 100 (1 - |y - ŷ| / |y - mean y|); NaN in y is left out. With `means_removed` the mean of the error is taken off first."""
-    seen = np.isfinite(y)
-    error = np.where(seen, y - predicted, np.nan)
-    error = error - np.nanmean(error, axis=0) if means_removed else error
-    spread = np.where(seen, y, np.nan) - np.nanmean(np.where(seen, y, np.nan), axis=0)
-    return 100.0 * (1.0 - np.sqrt(np.nansum(error**2, axis=0) / np.maximum(np.nansum(spread**2, axis=0), np.finfo(float).tiny)))
-
-
 def simulated(plant: Plant, u: np.ndarray, y: np.ndarray, *, means_removed: bool = False) -> np.ndarray:
     """ŷ (T, p) of the plant under u (T, m) alone, from the initial state that fits all of y (T, p) best (the rule of SLICOT's IB01CD and of MATLAB's compare).
 
@@ -67,12 +58,6 @@ def simulated(plant: Plant, u: np.ndarray, y: np.ndarray, *, means_removed: bool
     """
     model, v = simulation_form(plant, []), drives("simulation", u, y)
     return respond(model, v, estimate_state(model, v, y, free_mean=means_removed))[1]
-
-
-def simulate_fit(plant: Plant, u: Segments, y: Segments, *, means_removed: bool = False) -> np.ndarray:
-    """NRMSE (p,) in percent of free simulation over the segments, the initial state of each fitted as in `simulated`."""
-    predicted = [simulated(plant, a, b, means_removed=means_removed) for a, b in zip(u, y, strict=True)]
-    return nrmse(np.vstack(y), np.vstack(predicted), means_removed=means_removed)
 
 
 def predicted_ahead(plant: Plant, u: np.ndarray, y: np.ndarray, steps: int, *, x0: np.ndarray | None = None) -> np.ndarray:
@@ -93,17 +78,6 @@ def predicted_ahead(plant: Plant, u: np.ndarray, y: np.ndarray, steps: int, *, x
     for ahead in range(1, min(steps, len(u))):  # row t then holds x(t | y up to t-1-ahead)
         x[ahead:] = x[ahead - 1 : -1] @ plant.A.T + u[ahead - 1 : -1] @ plant.B.T + plant.b
     return x @ plant.C.T + u @ plant.D.T + plant.d
-
-
-def predict_fit(plant: Plant, u: Segments, y: Segments, steps: int) -> np.ndarray:
-    """NRMSE (p,) in percent `steps` samples ahead, over the samples after the start-up of `predicted_ahead`."""
-    skip = max(3 * plant.n, 30) + steps
-    if all(len(a) <= skip for a in u):
-        raise ValueError(
-            f"predict_fit: expected a segment longer than {skip} samples for {steps} steps ahead; hold out a longer part, or fewer steps"
-        )
-    pairs = [(b[skip:], predicted_ahead(plant, a, b, steps)[skip:]) for a, b in zip(u, y, strict=True) if len(a) > skip]
-    return nrmse(np.vstack([b for b, _ in pairs]), np.vstack([e for _, e in pairs]))
 
 
 def one_step_errors(plant: Plant, u: Segments, y: Segments) -> list[np.ndarray]:

@@ -50,7 +50,11 @@ def learn(u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, longest: int, off
     )
     N = int(table[table[:, 2].argmin(), 0])
     k = offset + N * (m + p)
-    robust = np.linalg.qr(np.vstack([triangle[:, np.r_[:k, -p:0]], gain_spread * _own_moments(triangle[:, :k], offset, m, p)]), mode="r") if gain_spread else triangle
+    robust = (
+        np.linalg.qr(np.vstack([triangle[:, np.r_[:k, -p:0]], gain_spread * _own_moments(triangle[:, :k], offset, m, p)]), mode="r")
+        if gain_spread
+        else triangle
+    )
     solution = np.linalg.lstsq(robust[:k, :k], robust[:k, -p:], rcond=1e-12)[0]
     rest = triangle[:, -p:] - triangle[:, :k] @ solution
     Theta = np.empty((p, N * (m + p)))
@@ -127,9 +131,7 @@ def predicted_tuples(window: Window, u: Sequence[np.ndarray], y: Sequence[np.nda
     features = np.zeros((order + offset, w.shape[1] + 1))
     features[:order, :-1], features[:order, -1], features[order:, -1] = T, -T @ centre, 1.0
     base = y_now.mean(axis=0) * offset
-    return Tuples(
-        np.hstack([(w - centre) @ T.T, one]), u_now, y_now - base, np.hstack([x_next, one]), features, window.N, base
-    )
+    return Tuples(np.hstack([(w - centre) @ T.T, one]), u_now, y_now - base, np.hstack([x_next, one]), features, window.N, base)
 
 
 def stored(window: Window) -> dict[str, tuple[np.ndarray, str, str]]:

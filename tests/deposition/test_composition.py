@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline import gcode
-from pipeline.deposition import basis
+from pipeline.deposition import basis, gcode
 from pipeline.deposition.composition import BASIS, commands, compose, priority, superposition
 from pipeline.deposition.library import Basis, Library, learned
 from pipeline.deposition.motion import plan

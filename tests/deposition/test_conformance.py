@@ -6,7 +6,7 @@ import pytest
 from pipeline.deposition import basis
 from pipeline.deposition.conformance import conform, line_volumes, ramp_that_would_do, saturation, volume_between
 from pipeline.deposition.extruder import Extruder, flow
-from pipeline.gcode import Refusal
+from pipeline.deposition.gcode import Refusal
 from tests.deposition.test_composition import composed, of_part
 from tests.deposition.trained import AREA, NOMINAL, PLANT, RAMP, TS, known, protocol
 

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from benchmarks.ilc import causal_q
+from benchmarks.norm_optimal import norm_optimal_law
 from pipeline.deposition import ilc
 from pipeline.deposition.extruder import Extruder, disturb, draw, flow, frequency_response, pressed, routine
 from pipeline.deposition.trial_model import identify
@@ -62,7 +64,7 @@ def ratios(law, measure, nominal, trials, r=R, limit=np.inf, rise=0.1):
 
 def test_the_zero_phase_filter_keeps_a_symmetric_pulse_symmetric_and_the_causal_one_delays_it():
     pulse = np.exp(-(((np.arange(401) - 200) / 15.0) ** 2))
-    both, once = (q(pulse, order=4, cutoff_hz=3.0, sample_time_s=TS) for q in (ilc.zero_phase, ilc.causal))
+    both, once = (q(pulse, order=4, cutoff_hz=3.0, sample_time_s=TS) for q in (ilc.zero_phase, causal_q))
     np.testing.assert_allclose(both, both[::-1], atol=1e-9)  # what the filter still rings at the padding's end
     assert np.argmax(both) == 200 and np.argmax(once) > 203
 
@@ -146,7 +148,7 @@ def test_the_papers_law_survives_100_ms_and_diverges_at_150_ms_unless_rolled_bac
 @pytest.mark.parametrize("name", "AB")
 def test_a_causal_q_leaves_a_third_of_the_error(name):
     found = ratios(
-        paper(MATERIALS[name], ilc.causal), machine(MATERIALS[name], noise=dict.fromkeys(NOISE, 0.0)), MATERIALS[name], 40, rise=np.inf
+        paper(MATERIALS[name], causal_q), machine(MATERIALS[name], noise=dict.fromkeys(NOISE, 0.0)), MATERIALS[name], 40, rise=np.inf
     )
     assert found.min() > 35
 
@@ -234,7 +236,7 @@ def test_the_norm_optimal_law_learns_too():
     name, plant = next(family(15, 1))
     u0 = R / MATERIALS[name].gain
     model = identify([u0], [machine(plant)(u0).y], sample_time_s=TS).extruder
-    law = ilc.norm_optimal_law(R, model, R_u=1e-5, R_d=1e-3, limit=np.inf, sample_time_s=TS)
+    law = norm_optimal_law(R, model, R_u=1e-5, R_d=1e-3, limit=np.inf, sample_time_s=TS)
     found = ratios(law, machine(plant), MATERIALS[name], 15)
     assert found[2] < 20 and found[15] < 6
 

@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline import gcode
+from benchmarks.composition import ALLOWED, forbidden
+from pipeline.deposition import gcode
 from pipeline.deposition.motion import plan
-from pipeline.deposition.tasks import ALLOWED, DWELL, forbidden, halting, printed_lines, refuse, sequence
+from pipeline.deposition.tasks import DWELL, halting, printed_lines, refuse, sequence
 
 PARTS = Path(__file__).parents[2] / "datasets" / "parts"
 MACHINE = {"acceleration": 1000.0, "junction_deviation_mm": 0.05, "speed_limit": 100.0, "unset_feed": 8.0, "tool_change_s": 0.0}

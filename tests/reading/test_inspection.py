@@ -6,9 +6,9 @@ import pytest
 import yaml
 
 from pipeline import cli
-from pipeline.artifacts import write_recording
-from pipeline.params import Plant
-from pipeline.recordings import Source, inspect, read
+from pipeline.reading.recordings import Source, inspect, read
+from pipeline.store.artifacts import write_recording
+from pipeline.temperature.workflow.settings import Plant
 from tests.mcap_writing import NO, Written, chunks, flipped, json_recording
 
 

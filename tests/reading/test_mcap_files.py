@@ -6,7 +6,7 @@ import pytest
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-from pipeline.recordings import Raw, Source, read
+from pipeline.reading.recordings import Raw, Source, read
 from tests.mcap_writing import LZ4, NO, ZSTD, Written, chunks, flipped, json_recording
 
 SOURCES = [Source("heater_1", "heater_1", "percent"), Source("temperature_1", "temperature_1", "degC")]

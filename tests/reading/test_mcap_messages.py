@@ -7,8 +7,8 @@ import pytest
 import zstandard
 
 from pipeline.reading.mcap_messages import Channel, decoder, fields, plain
+from pipeline.reading.recordings import Source, read
 from pipeline.reading.ros_messages import UnreadableMessage
-from pipeline.recordings import Source, read
 from tests.mcap_writing import Written, cdr
 from tests.reading.test_protobuf_messages import DESCRIPTOR, MESSAGE
 

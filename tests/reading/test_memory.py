@@ -5,7 +5,7 @@ import tracemalloc
 
 import pytest
 
-from pipeline.recordings import Source, read
+from pipeline.reading.recordings import Source, read
 from tests.mcap_writing import Written
 
 SOURCES = [Source("u", "u", "percent"), Source("y", "y", "degC")]

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from pipeline.reading.mixing import alternate, mixed
-from pipeline.recordings import Raw, resample
+from pipeline.reading.recordings import Raw, resample
 
 
 def course(samples: int = 600, seed: int = 0, noise: float = 0.05) -> np.ndarray:

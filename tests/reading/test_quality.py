@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from pipeline.recordings import Flag, Source, Table, flag, read, resample
+from pipeline.reading.recordings import Flag, Source, Table, flag, read, resample
 
 LIMITS = {"u": (0.0, 100.0)}
 UNITS = {"u": "percent", "y": "degC", "z": "degC"}

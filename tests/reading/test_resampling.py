@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.recordings import Raw, Source, Table, read, resample
+from pipeline.reading.recordings import Raw, Source, Table, read, resample
 
 
 def recorded(**signals: tuple) -> Raw:

@@ -1,10 +1,15 @@
 """The small project as the working directory, its pages built once, and the browser."""
 
 import contextlib
+from pathlib import Path
 
 import pytest
 
 from tests.report import made
+
+MACHINE = """window.beadline = {"machine": {"cpu": "Some CPU @ 3.00GHz", "cores": 2, "pins": "avx2", "version": "0.1.0", \
+"commit": "abc12345", "changed": true, "locked": "1", "date": "2026-11-22T07:00:00Z"}};
+"""
 
 
 def populate(folder):
@@ -32,6 +37,7 @@ def reports(tmp_path_factory):
     with contextlib.chdir(folder):
         populate(folder)
         main()
+        Path("reports/machine.js").write_text(MACHINE)  # as ./run does
     return folder / "reports"
 
 

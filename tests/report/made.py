@@ -5,7 +5,10 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from pipeline import artifacts, params, schemas
+from pipeline.deposition.workflow.tables import FILMED, LESSONS, LIBRARY, LINES, SCORES, SIGNALS, TASKS, TRIALS
+from pipeline.store import artifacts, params
+from pipeline.temperature.workflow import tables
+from pipeline.temperature.workflow.settings import Plant
 from tests.report import made_setpoint
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -143,13 +146,13 @@ def declared(root):
         "judging": {"starts_degC": [20], "reference_offsets_degC": [0], "seeds": [1, 2, 3]},
     }
     (root / "params.yaml").write_text(yaml.safe_dump(sections))
-    return params.load(params.Plant, "plant", root / "params.yaml")
+    return params.load(Plant, "plant", root / "params.yaml")
 
 
 def scorecard(worst):
     """Two plants, three seeds; the second plant is the worst: `worst` by controller, in percent."""
     rows = [(name, plant, seed) for name in CONTROLLERS for plant in (0, 1) for seed in (1, 2, 3)]
-    columns = {column.name: [0.0] * len(rows) for column in schemas.SCORECARD.columns}
+    columns = {column.name: [0.0] * len(rows) for column in tables.SCORECARD.columns}
     names, plants, seeds = zip(*rows, strict=True)
     gap = [worst.get(name, 10.0) / 100 * (0.01 + 0.99 * plant + 0.0001 * seed) for name, plant, seed in rows]
     return columns | {
@@ -218,11 +221,11 @@ def model(machine):
     ]
     levels = [(name, np.pi * k / 8, np.pi * (k + 1) / 8, 0.5) for name in names[1] for k in range(8)]
     rows = {
-        "residuals": (schemas.RESIDUALS, residuals),
-        "steps": (schemas.STEPS, rise),
-        "dynamics": (schemas.DYNAMICS, dynamics),
-        "poles": (schemas.POLES, poles),
-        "levels": (schemas.LEVELS, levels),
+        "residuals": (tables.RESIDUALS, residuals),
+        "steps": (tables.STEPS, rise),
+        "dynamics": (tables.DYNAMICS, dynamics),
+        "poles": (tables.POLES, poles),
+        "levels": (tables.LEVELS, levels),
     }
     return {
         name: (schema, dict(zip((c.name for c in schema.columns), map(list, zip(*found, strict=True)), strict=True)))
@@ -237,7 +240,7 @@ def write(root, *, samples=400, recording="good.mcap", worst=None):
         artifacts.write_metrics(stage, figures)
     data = Path("datasets")
     artifacts.write_table(
-        data / "ingest/record.parquet", schemas.record(machine.inputs, machine.outputs), record(machine, samples, recording)
+        data / "ingest/record.parquet", tables.record(machine.inputs, machine.outputs), record(machine, samples, recording)
     )
     flaw = {
         "recording": [HOSTILE],
@@ -248,7 +251,7 @@ def write(root, *, samples=400, recording="good.mcap", worst=None):
         "count": [1],
         "message": [HOSTILE],
     }
-    artifacts.write_table(data / "ingest/quality.parquet", schemas.QUALITY, flaw)
+    artifacts.write_table(data / "ingest/quality.parquet", tables.QUALITY, flaw)
     plant = {"A": (np.diag([0.99, 0.9])[None], "1", "state matrix")}
     artifacts.write_arrays(data / "identify_plant/plant.parquet", "plant", 1, plant)
     order = {
@@ -259,11 +262,11 @@ def write(root, *, samples=400, recording="good.mcap", worst=None):
         "error": [0.5, 0.1, np.nan],
         "chosen": [False, True, False],
     }
-    artifacts.write_table(data / "identify_plant/order.parquet", schemas.ORDER, order)
+    artifacts.write_table(data / "identify_plant/order.parquet", tables.ORDER, order)
     seen = {"segment": np.repeat([0, 1], 25).astype(np.int32), "time_s": np.tile(np.arange(25.0), 2)}
     seen |= {f"{o.name}_{kind}": np.sin(np.arange(50.0)) for o in machine.outputs for kind in ("measured", "simulated", "ahead")}
     seen["zone_2_measured"][5:9] = np.nan
-    artifacts.write_table(data / "identify_plant/holdout.parquet", schemas.holdout(machine.outputs), seen)
+    artifacts.write_table(data / "identify_plant/holdout.parquet", tables.holdout(machine.outputs), seen)
     for name, (schema, columns) in model(machine).items():
         artifacts.write_table(data / f"identify_plant/{name}.parquet", schema, columns)
     table = np.array([[1, 8, -10.0], [2, 16, -30.0], [3, 24, -20.0]])
@@ -288,15 +291,15 @@ def write(root, *, samples=400, recording="good.mcap", worst=None):
         "chosen": [False, True, False, False, False, True],
         "failure": ["", "", "", "", HOSTILE, ""],
     }
-    artifacts.write_table(data / "tune_weights/history.parquet", schemas.TUNING, history)
+    artifacts.write_table(data / "tune_weights/history.parquet", tables.TUNING, history)
     artifacts.write_json(data / "tune_weights/weights.json", {"practical": {"q": [1.0, 2.0], "r": [0.1, 0.2]}})
     folder = data / "evaluate_temperature"
-    artifacts.write_table(folder / "scorecard.parquet", schemas.SCORECARD, scorecard(worst or {}))
-    artifacts.write_table(folder / "trajectories.parquet", schemas.trajectories(machine.inputs, machine.outputs), trajectories(machine))
+    artifacts.write_table(folder / "scorecard.parquet", tables.SCORECARD, scorecard(worst or {}))
+    artifacts.write_table(folder / "trajectories.parquet", tables.trajectories(machine.inputs, machine.outputs), trajectories(machine))
     routes = [(route, noise, i) for route in ("window", "kernel", "kernel_predicted_state") for noise in (0.1, 0.5) for i in range(4)]
     study = dict(zip(("route", "noise_degC", "data_set"), map(list, zip(*routes, strict=True)), strict=True))
     study |= {"gap": [1e-5 * (1 + i) for i in range(len(routes))], "error_degC": [0.01 * (1 + i) for i in range(len(routes))]}
-    artifacts.write_table(folder / "study.parquet", schemas.STUDY, study)
+    artifacts.write_table(folder / "study.parquet", tables.STUDY, study)
     artifacts.write_json(folder / "summary.json", {"noise_degC": 0.1, "scenarios": 6, "plants": 2})
     deposition()
     made_setpoint.write()
@@ -315,15 +318,15 @@ def deposition(scores=None):
     runs = [(law, j) for law in ("paper", "ours", "pixels") for j in range(3)]
     ratio = [1.0, 0.7, 0.4, 1.0, 0.1, 0.02, 1.0, 0.1, 0.03]
     rows = [("A", law, 0, 8.0, 0.4, j, r, r + 0.05, r, 1.0 + 9.5 * j, 0.0, False) for (law, j), r in zip(runs, ratio, strict=True)]
-    artifacts.write_table(folder / "trials.parquet", schemas.TRIALS, _columns(schemas.TRIALS, rows))
+    artifacts.write_table(folder / "trials.parquet", TRIALS, _columns(TRIALS, rows))
     rows = [
         ("A", law, 0, j, t, r, r * (1 + 10 * j * (t < 1.2)), r * (1 - found) if not 1.8 < t < 2.2 else np.nan, r * (1 - found))
         for (law, j), found in zip(runs, ratio, strict=True)
         for t, r in zip(time, wanted, strict=True)
     ]
-    artifacts.write_table(folder / "lessons.parquet", schemas.LESSONS, _columns(schemas.LESSONS, rows))
+    artifacts.write_table(folder / "lessons.parquet", LESSONS, _columns(LESSONS, rows))
     filmed = [("A", 0, j, 100, 1, "no bead 1", 0.01, 0.9, 0) for j in range(3)]
-    artifacts.write_table(folder / "filmed.parquet", schemas.FILMED, _columns(schemas.FILMED, filmed))
+    artifacts.write_table(folder / "filmed.parquet", FILMED, _columns(FILMED, filmed))
     chain = {
         "gain": 1.0,
         "time_constant_s": 2.7,
@@ -345,7 +348,7 @@ def deposition(scores=None):
         (folder / "frames" / name).write_bytes(b"\xff\xd8 a picture \xff\xd9")
     tasks = [("Start", 0.0, 40, 51), ("Corner", 0.4, 28, 54), ("Stop", 0.0, 28, 57), ("Steady-State", 0.0, 0, 1), ("No-Flow", 0.0, 0, 1)]
     rows = [(task, "A", 0.8, 8.0, pause, lead, n, [float(task != "No-Flow")] * n) for task, pause, lead, n in tasks]
-    artifacts.write_table("datasets/segment_library/library.parquet", schemas.LIBRARY, _columns(schemas.LIBRARY, rows))
+    artifacts.write_table("datasets/segment_library/library.parquet", LIBRARY, _columns(LIBRARY, rows))
     checks = [{"assumption": k, "claim": f"claim {k}: what", "material": "A", "nozzle_mm": 0.8, "percent": 10.0 * k} for k in range(1, 5)]
     known = {"material": "A", "nozzle_mm": 0.8, "chain": {"extruder": chain, "held_out_percent": 0.6}}
     learned = {"sample_time_s": 0.02, "marks": {"Stop": [0.56, 0.58]}, "materials": [known], "checks": checks}
@@ -372,14 +375,14 @@ def _composed(time, wanted, scores):
         ("square", 0, "A", t, 8 * t, 0.0, r, r, r, *(flows[name][k] for name in flows))
         for k, (t, r) in enumerate(zip(time, wanted, strict=True))
     ]
-    artifacts.write_table(folder / "signals.parquet", schemas.SIGNALS, _columns(schemas.SIGNALS, rows))
+    artifacts.write_table(folder / "signals.parquet", SIGNALS, _columns(SIGNALS, rows))
     rows = [("square", "A", name, name == "basis", error, predicted, line) for name, (error, predicted, line) in scores.items()]
-    artifacts.write_table(folder / "scores.parquet", schemas.SCORES, _columns(schemas.SCORES, rows))
+    artifacts.write_table(folder / "scores.parquet", SCORES, _columns(SCORES, rows))
     artifacts.write_table(
-        folder / "tasks.parquet", schemas.TASKS, _columns(schemas.TASKS, [("square", "Start", 0, 3, 1.0, 1.0, 8.0, 0.0, 0.0)])
+        folder / "tasks.parquet", TASKS, _columns(TASKS, [("square", "Start", 0, 3, 1.0, 1.0, 8.0, 0.0, 0.0)])
     )
     lines = [("square", 3, 0, 1.0, 2.0, 16.0, 4.0, 3.8, 1.0, -5.0, False), ("square", 7, 0, 3.0, 0.2, 1.6, 0.4, 0.4, 0.1, 0.0, True)]
-    artifacts.write_table(folder / "lines.parquet", schemas.LINES, _columns(schemas.LINES, lines))
+    artifacts.write_table(folder / "lines.parquet", LINES, _columns(LINES, lines))
     enough = {"ramp_s": 0.15, "limit": None, "peak_over_steady": 20.0, "share_percent": 0.0, "rms_percent_of_on_off": 0.1, "enough": True}
     report = {
         "printed_lines": 2,

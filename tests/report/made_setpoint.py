@@ -7,7 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from pipeline import artifacts, setpoint_schemas
+from pipeline.setpoint.workflow import tables
+from pipeline.store import artifacts
 
 HOSTILE = '"><script>alert(1)</script><img src=http://evil.example/x onerror=alert(2)>'
 KINDS = {
@@ -56,7 +57,7 @@ def scoreboard(lost=LOST, runs=RUNS):
                 rows.append((name, KINDS[name], simulator, case, True, runs, *wilson(settled, runs), *wilson(stay, runs), *recovered, 9.0 + hard, 22.0 + 4 * hard, 12.0, 0.8 + 0.2 * hard, 300.0, 230.0, settled))  # fmt: skip
         if name in (DEFAULT, "Bayes, robust", "the paper's agent"):
             rows.append((name, KINDS[name], "pixels", "as published", False, 21, *wilson(max(100 - 3 * least, 0.0), 21), *nothing, *nothing, 14.0, 30.0, 15.0, 2.0, 30.0, 190.0, 100.0))  # fmt: skip
-    artifacts.write_table("datasets/evaluate_setpoint/scoreboard.parquet", setpoint_schemas.SCOREBOARD, columns(setpoint_schemas.SCOREBOARD, rows))  # fmt: skip
+    artifacts.write_table("datasets/evaluate_setpoint/scoreboard.parquet", tables.SCOREBOARD, columns(tables.SCOREBOARD, rows))  # fmt: skip
 
 
 def choice(name=DEFAULT, **more):
@@ -92,7 +93,7 @@ def paths(steps=100):
             for k, start in enumerate(starts):
                 q, u = _walk(rng, *start, steps, error)
                 rows += [(name, simulator, case, k, step, a, b) for step, (a, b) in enumerate(zip(q, u, strict=True))]
-    artifacts.write_table("datasets/evaluate_setpoint/paths.parquet", setpoint_schemas.PATHS, columns(setpoint_schemas.PATHS, rows))
+    artifacts.write_table("datasets/evaluate_setpoint/paths.parquet", tables.PATHS, columns(tables.PATHS, rows))
 
 
 def decisions(steps=50, why=""):
@@ -111,8 +112,8 @@ def decisions(steps=50, why=""):
             text = f"{8.0 * k:6.1f} s: 20 frames valid, 20 count, " + (f"held: {reason}" if held else f"good {p[1]:.2f}; flow {move:+g} %")
             rows.append((episode, DEFAULT, k, 8.0 * k, max(true, 0.0), degrees, setpoint, target, *(p / p.sum()), 4 if held else 20, 9.0, move, warm, bool(held), why or text))  # fmt: skip
             setpoint, target, degrees = setpoint + move, target + warm, degrees + 0.6 * (target + warm - degrees)
-    table = columns(setpoint_schemas.DECISIONS, rows)
-    artifacts.write_table("datasets/evaluate_setpoint/decisions.parquet", setpoint_schemas.DECISIONS, table)
+    table = columns(tables.DECISIONS, rows)
+    artifacts.write_table("datasets/evaluate_setpoint/decisions.parquet", tables.DECISIONS, table)
 
 
 def classifier(seed=0):
@@ -125,13 +126,13 @@ def classifier(seed=0):
     p = 0.1 + 0.7 * np.eye(3)[seen]
     others = [np.searchsorted([90.0, 110.0], flow + rng.normal(0, 18, n), side="right") for _ in range(3)]
     table = {"segment": np.arange(n) // 20, "flow_percent": flow, "temperature_degC": heat, "label": label, "p_under": p[:, 0], "p_good": p[:, 1], "p_over": p[:, 2], "named": seen, "named_cnn": others[0], "named_svc": others[1], "named_width": others[2], "distance": rng.chisquare(8, n)}  # fmt: skip
-    artifacts.write_table(folder / "classified.parquet", setpoint_schemas.CLASSIFIED, table)
+    artifacts.write_table(folder / "classified.parquet", tables.CLASSIFIED, table)
     rows = []
     for of, method, off in (("image", "raw", 0.07), ("image", "calibrated", 0.01), ("window", "hard_counts", 0.1), ("window", "mean", 0.18), ("window", "log_sum", 0.02)):  # fmt: skip
         rows += [(of, method, k / 10, (k + 1) / 10, 20 * k if k > 3 else 0, k / 10 + 0.05 if k > 3 else math.nan, min(k / 10 + 0.05 - off, 1.0) if k > 3 else math.nan) for k in range(10)]  # fmt: skip
-    artifacts.write_table(folder / "reliability.parquet", setpoint_schemas.RELIABILITY, columns(setpoint_schemas.RELIABILITY, rows))
+    artifacts.write_table(folder / "reliability.parquet", tables.RELIABILITY, columns(tables.RELIABILITY, rows))
     rows = [(learner, k, 1.1 * math.exp(-k / 15) + 0.4, 1.1 * math.exp(-k / 12) + 0.5, 0.79 - 0.45 * math.exp(-k / 8)) for learner, last in (("vision transformer", 40), ("convolutional network", 20)) for k in range(1, last + 1)]  # fmt: skip
-    artifacts.write_table(folder / "course.parquet", setpoint_schemas.COURSE, columns(setpoint_schemas.COURSE, rows))
+    artifacts.write_table(folder / "course.parquet", tables.COURSE, columns(tables.COURSE, rows))
     edges = [20.0, 40.0, 60.0, 80.0, 90.0, 100.0, 110.0, 120.0, 150.0, 200.0, 310.0]
     rows = []
     for part in ("learn", "judge"):
@@ -141,7 +142,7 @@ def classifier(seed=0):
                 shares = np.exp([-((middle - c) ** 2) / 800 for c in (60.0, 100.0, 140.0)])
                 shares = np.array([1.0, 0, 0]) if middle < 60 else np.array([0, 0, 1.0]) if middle > 140 else shares / shares.sum()
                 rows.append((part, b, low, high, 10 * b + segment, *shares, int(shares.argmax())))
-    artifacts.write_table(folder / "windows.parquet", setpoint_schemas.WINDOWS, columns(setpoint_schemas.WINDOWS, rows))
+    artifacts.write_table(folder / "windows.parquet", tables.WINDOWS, columns(tables.WINDOWS, rows))
     frames()
 
 
@@ -193,7 +194,7 @@ def agents():
     for agent, phases in (("paper", 4), ("ours", 2)):
         for phase in range(1, phases + 1):
             rows += [(agent, phase, 500 * (10 * (phase - 1) + k), 0.8 - 0.6 * math.exp(-k / 3) - 0.1 * phase) for k in range(1, 11)]  # fmt: skip
-    artifacts.write_table("datasets/train_agent/agents.parquet", setpoint_schemas.AGENT_COURSE, columns(setpoint_schemas.AGENT_COURSE, rows))  # fmt: skip
+    artifacts.write_table("datasets/train_agent/agents.parquet", tables.AGENT_COURSE, columns(tables.AGENT_COURSE, rows))  # fmt: skip
 
 
 def write():

@@ -5,6 +5,8 @@ import re
 
 import pytest
 
+from tests.report.conftest import MACHINE
+
 PAGES = ("index", "temperature", "identification", "deposition", "setpoint")
 # A4 landscape less its margins, in px
 SHEET = (1016, 703)
@@ -12,14 +14,17 @@ SHEET = (1016, 703)
 
 @pytest.mark.parametrize("name", PAGES)
 @pytest.mark.parametrize(("width", "theme"), [(1280, "light"), (1024, "dark"), (390, "light")])
-def test_nothing_overflows_nothing_is_fetched_and_the_console_is_silent(open_page, name, width, theme):
+def test_nothing_overflows_nothing_is_fetched_but_the_machine_and_the_console_is_silent(open_page, name, width, theme):
     page = open_page(name, width=width, theme=theme)
     assert page.evaluate("document.documentElement.scrollWidth") <= width
     wide = """width => [...document.querySelectorAll("body *")].filter(e => !e.closest("svg, .scroll, .vh, dialog, .tip") &&
         e.getBoundingClientRect().right > width + 1).map(e => e.outerHTML.slice(0, 120))"""
     assert page.evaluate(wide, width) == []
-    # the page itself and the pictures inside it
-    assert [url for url in page.asked if not url.startswith("data:")] == [page.url] and page.said == []
+    # the page itself and the pictures inside it; beside it what it was made on
+    beside = page.url.replace(f"{name}.html", "machine.js")
+    assert [url for url in page.asked if not url.startswith("data:")] == [page.url, beside] and page.said == []
+    told = "Last run on Some CPU @ 3.00GHz, pins avx2, beadline 0.1.0, commit abc12345 with uncommitted changes, 22 Nov 2026"
+    assert page.locator("body > footer").inner_text() == told
     paper = page.evaluate("getComputedStyle(document.body).backgroundColor")
     assert paper == {"light": "rgb(255, 255, 255)", "dark": "rgb(18, 21, 25)"}[theme]
     # no row of the answers is lost at any width
@@ -211,9 +216,11 @@ def test_every_picture_stands_where_a_link_leads_to_stage_artifact_schema_and_ha
 def test_text_from_the_data_runs_nothing_even_where_it_were_not_escaped(open_page, reports, tmp_path):
     text = (reports / "index.html").read_text(encoding="utf-8")
     hostile = (
-        '<script>window.hit = 1</script><img src="http://evil.example/x" onerror="window.hit = 2"><a href="javascript:window.hit=3">x</a>'
+        '<script>window.hit = 1</script><script src="evil.js"></script><img src="http://evil.example/x" onerror="window.hit = 2"><a href="javascript:window.hit=3">x</a>'
     )
     (tmp_path / "bad.html").write_text(text.replace("<main>", f"<main>{hostile}"), encoding="utf-8")
+    (tmp_path / "machine.js").write_text(MACHINE)
+    (tmp_path / "evil.js").write_text("window.hit = 4")
     page = open_page("bad", folder=tmp_path)
     assert page.evaluate("window.hit") is None
     # the browser refuses before it asks

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline import artifacts, params, schemas
+from pipeline.deposition.workflow import tables
+from pipeline.deposition.workflow.tables import SIGNALS
+from pipeline.store import artifacts, params
 from stages.report import main
 from tests.report import made
 from tests.report.test_pages import Page, change, figures
@@ -104,7 +106,7 @@ def test_the_figures_of_a_real_machine_are_said_to_be_forecasts(project):
     Path("params.yaml").write_text(yaml.safe_dump(sections))
     made.deposition({"on_off": (100.0, None, 60.0), "priority": (12.0, 12.0, 9.0), "basis": (2.0, 2.0, 1.0)})
     for name, column in (("lessons", "true_mm3_per_s"), ("trials", "rms_true")):
-        schema, path = getattr(schemas, name.upper()), f"datasets/train_ilc/{name}.parquet"
+        schema, path = getattr(tables, name.upper()), f"datasets/train_ilc/{name}.parquet"
         table = artifacts.read_table(path, schema)
         artifacts.write_table(path, schema, table | {column: np.full(len(table[column]), np.nan)})
     text = page()
@@ -188,7 +190,7 @@ def test_a_long_job_stays_within_the_size_of_a_page(project):
         "part": ["big"] * n, "tool": np.zeros(n, int), "material": ["A"] * n, "time_s": np.arange(n) / 50, "x_mm": 50 * np.cos(angle) * (1 - angle / 800),
         "y_mm": 50 * np.sin(angle) * (1 - angle / 800), "wanted_mm3_per_s": np.full(n, 2.0), "command_mm": np.full(n, 2.0),
     } | {name: 2 + 0.2 * rng.standard_normal(n) for name in names}  # fmt: skip
-    artifacts.write_table(FOLDER / "signals.parquet", schemas.SIGNALS, columns)
+    artifacts.write_table(FOLDER / "signals.parquet", SIGNALS, columns)
     main()
     # the limit of a page: 1.5 MB
     assert figures()["bytes"]["deposition"] <= 1_500_000

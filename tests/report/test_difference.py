@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import artifacts, cli
+from pipeline import cli
+from pipeline.store import artifacts
 from stages.report import main
 from tests.report import made
 from tests.report.test_pages import INDEX, Page, change
@@ -72,7 +73,7 @@ def test_a_figure_moves_where_its_band_leaves_the_accepted_one_and_only_there(ac
 
 def test_the_worst_case_is_held_against_the_accepted_band_not_against_a_bare_number(accepted):
     # the accepted page showed 10.001 to 10.003; half as much moves, and by how much is said
-    artifacts.write_table("datasets/evaluate_temperature/scorecard.parquet", made.schemas.SCORECARD, made.scorecard({"window": 5.0}))
+    artifacts.write_table("datasets/evaluate_temperature/scorecard.parquet", made.tables.SCORECARD, made.scorecard({"window": 5.0}))
     main()
     assert "better: worst case over plant spread" in Page(INDEX).text.replace("Better", "better")
 

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from pipeline.report.digits import band, count, decimals, number, quantity, short, shortened, typeset
+from pipeline.report.shared.digits import band, count, decimals, number, quantity, short, shortened, typeset
 
 
 @pytest.mark.parametrize(

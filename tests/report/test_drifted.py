@@ -3,8 +3,9 @@
 import re
 from pathlib import Path
 
-from pipeline import artifacts, provenance
-from pipeline.report.verdict import Missing, Outcome, outcome
+from pipeline.report.shared import provenance
+from pipeline.report.shared.verdict import Missing, Outcome, outcome
+from pipeline.store import artifacts
 from stages.report import main
 from tests.report.test_pages import INDEX, TEMPERATURE, Page, figures
 

@@ -7,8 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline import artifacts, schemas
-from pipeline.report import deposition, identification, setpoint, temperature
+from pipeline.report.deposition import page as deposition_page
+from pipeline.report.identification import page as identification_page
+from pipeline.report.setpoint import page as setpoint_page
+from pipeline.report.temperature import page as temperature_page
+from pipeline.store import artifacts
+from pipeline.temperature.workflow import tables
 from stages import report
 from tests.report import made, made_setpoint
 from tests.report.conftest import populate
@@ -65,7 +69,7 @@ STATES = (fine, temperature_failed, deposition_failed, setpoint_failed, all_fail
 @pytest.fixture
 def page_one(tmp_path, monkeypatch):
     """page_one(change): the folder of index.html of the small project after a change; the other pages are left out."""
-    for module in (deposition, identification, setpoint, temperature):
+    for module in (deposition_page, identification_page, setpoint_page, temperature_page):
         monkeypatch.setattr(module, "render", lambda *_: "")
 
     def built(changed):
@@ -102,10 +106,10 @@ def hundred(folder):
         [name for part in parts for name in part["recording"]],
         np.repeat(np.arange(100, dtype=np.int32), 3600),
     )
-    artifacts.write_table("datasets/ingest/record.parquet", schemas.record(machine.inputs, machine.outputs), whole)
+    artifacts.write_table("datasets/ingest/record.parquet", tables.record(machine.inputs, machine.outputs), whole)
     names = [f"night_{k:03d}.mcap" for k in range(100)]
     flaws = {"recording": names, "signal": ["zone_1"] * 100, "kind": ["spike"] * 100, "start_s": [10.0] * 100, "end_s": [12.0] * 100, "count": [2] * 100, "message": ["2 samples stand out"] * 100}  # fmt: skip
-    artifacts.write_table("datasets/ingest/quality.parquet", schemas.QUALITY, flaws)
+    artifacts.write_table("datasets/ingest/quality.parquet", tables.QUALITY, flaws)
 
 
 def test_with_a_hundred_recordings_the_pages_stay_small(project):

@@ -1,6 +1,6 @@
 """Page one's sentence and its three rows: who may be deployed, in few words, however long the sentences of the stages are."""
 
-from pipeline.report.headline import LINE, LINES, Loop, _fitted, _lines, decision, state
+from pipeline.report.shared.headline import LINE, LINES, Loop, _fitted, _lines, decision, state
 
 
 def loop(name="temperature", state="passed", reason="It costs 1 % more.", remedy=""):

@@ -10,8 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline import artifacts, cli, history
+from pipeline import cli
+from pipeline.report.runs import history
+from pipeline.store import artifacts
 from tests.report import made
+from tests.report.conftest import MACHINE
 from tests.report.test_pages import Page
 
 PAGE = Path("reports/history.html")
@@ -133,6 +136,7 @@ def test_without_a_git_or_a_revision_it_says_so_and_writes_nothing(empty, monkey
 def test_in_a_browser_it_says_nothing_on_the_console_and_sorts_by_a_figure(empty, monkeypatch, open_page):
     commits([(f"run {k}", {"report.json": report(gap)}) for k, gap in enumerate((2.0, 0.5, 12.0))])
     command(monkeypatch)
+    Path("reports/machine.js").write_text(MACHINE)
     page = open_page("history", folder=empty / "reports")
     page.locator("th button", has_text="Gap").click()
     assert page.locator(".runs tbody td:nth-child(5)").all_inner_texts() == ["0.500", "2.00", "12.0"]

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline import artifacts, params, schemas
-from pipeline.report import charts
-from pipeline.report.identification import since
-from pipeline.report.verdict import Figure
+from pipeline.report.identification.page import since
+from pipeline.report.shared import charts
+from pipeline.report.shared.verdict import Figure
+from pipeline.store import artifacts, params
+from pipeline.temperature.workflow import tables
+from pipeline.temperature.workflow.settings import Plant
 from stages.report import main
 from tests.report import made
 from tests.report.test_pages import IDENTIFICATION, INDEX, TEMPERATURE, Page, change, figures
@@ -31,8 +33,8 @@ def rewrite(name, schema, **columns):
 
 def white():
     """The made model without its one flaw."""
-    table = artifacts.read_table(FOLDER / "residuals.parquet", schemas.RESIDUALS)
-    rewrite("residuals", schemas.RESIDUALS, passed=np.ones(len(table["passed"]), bool))
+    table = artifacts.read_table(FOLDER / "residuals.parquet", tables.RESIDUALS)
+    rewrite("residuals", tables.RESIDUALS, passed=np.ones(len(table["passed"]), bool))
 
 
 # ---- the verdict
@@ -100,13 +102,13 @@ def test_a_prediction_that_holding_the_last_value_beats_is_not_trusted_whatever_
 def test_each_rule_that_design_needs_takes_it_away_and_is_named(project, how, rule, said):
     white()
     if how == "input left":
-        table = artifacts.read_table(FOLDER / "residuals.parquet", schemas.RESIDUALS)
-        rewrite("residuals", schemas.RESIDUALS, passed=~((table["output"] == "zone_1") & (table["against"] == "heater_2")))
+        table = artifacts.read_table(FOLDER / "residuals.parquet", tables.RESIDUALS)
+        rewrite("residuals", tables.RESIDUALS, passed=~((table["output"] == "zone_1") & (table["against"] == "heater_2")))
     elif how == "poor input":
         change("identify_plant", excitation__rank=9, excitation__inputs__heater_1__rank=4)
     elif how == "blind input":
-        table = artifacts.read_table(FOLDER / "dynamics.parquet", schemas.DYNAMICS)
-        rewrite("dynamics", schemas.DYNAMICS, seen=table["input"] == "heater_1")
+        table = artifacts.read_table(FOLDER / "dynamics.parquet", tables.DYNAMICS)
+        rewrite("dynamics", tables.DYNAMICS, seen=table["input"] == "heater_1")
     else:
         change("identify_plant", largest_pole=1.001)
     text = page()
@@ -237,12 +239,12 @@ def test_a_machine_of_32_inputs_and_outputs_and_a_long_hold_out_stay_within_the_
     sections["plant"]["inputs"] = [{"name": f"heater_{i}", "unit": "percent", "low": 0, "high": 100} for i in range(32)]
     sections["plant"]["outputs"] = [{"name": f"zone_{i}", "unit": "degC", "reference": 100.0} for i in range(32)]
     Path("params.yaml").write_text(yaml.safe_dump(sections))
-    machine = params.load(params.Plant, "plant")
+    machine = params.load(Plant, "plant")
     rng, names = np.random.default_rng(0), [o.name for o in machine.outputs]
     samples = 100 * 300
     seen = {"segment": np.repeat(np.arange(100), 300).astype(np.int32), "time_s": np.tile(np.arange(300.0), 100)}
     seen |= {f"{name}_{kind}": rng.standard_normal(samples) for name in names for kind in ("measured", "simulated", "ahead")}
-    artifacts.write_table(FOLDER / "holdout.parquet", schemas.holdout(machine.outputs), seen)
+    artifacts.write_table(FOLDER / "holdout.parquet", tables.holdout(machine.outputs), seen)
     for name, (schema, columns) in made.model(machine).items():
         artifacts.write_table(FOLDER / f"{name}.parquet", schema, columns)
     change("identify_plant", fit_holdout=dict.fromkeys(names, 90.0), fit_holdout_band=None)

@@ -4,10 +4,11 @@ import copy
 
 import pytest
 
-from pipeline import params
 from pipeline.nightly.settings import Nightly
-from pipeline.report import nightly
+from pipeline.report.nightly import page as nightly_page
+from pipeline.store import params
 from tests.conftest import ROOT
+from tests.report.conftest import MACHINE
 
 FILE = "datasets/raw/temperature/shift_<b>8</b>.csv"
 CAUSE = "the gain from heater_1 has changed by -15.1 %"
@@ -50,7 +51,8 @@ STATE = {
 def alarm(tmp_path):
     """The folder with the page of an alarm night."""
     settings = params.load(Nightly, "nightly", ROOT / "params.yaml")
-    (tmp_path / "nightly.html").write_text(nightly.render([FIRST, copy.deepcopy(ALARM)], STATE, settings), encoding="utf-8")
+    (tmp_path / "nightly.html").write_text(nightly_page.render([FIRST, copy.deepcopy(ALARM)], STATE, settings), encoding="utf-8")
+    (tmp_path / "machine.js").write_text(MACHINE)
     return tmp_path
 
 
@@ -59,7 +61,8 @@ def test_an_alarm_night_fits_asks_for_nothing_and_is_open_to_all(open_page, alar
     axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe is not installed; uv sync installs it")
     page = open_page("nightly", folder=alarm, width=width, theme=theme)
     assert page.evaluate("document.documentElement.scrollWidth") <= width
-    assert [url for url in page.asked if not url.startswith("data:")] == [page.url] and page.said == []
+    beside = page.url.replace("nightly.html", "machine.js")
+    assert [url for url in page.asked if not url.startswith("data:")] == [page.url, beside] and page.said == []
     found = axe.Axe().run(page, options={"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa"]}).response["violations"]
     assert [(one["id"], [node["html"][:120] for node in one["nodes"]]) for one in found] == []
 

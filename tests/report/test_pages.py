@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline import artifacts
-from pipeline.report.page import environment
+from pipeline.report.shared.page import environment
+from pipeline.store import artifacts
 from stages.report import main
 from tests.report import made
 
@@ -178,7 +178,7 @@ def test_hostile_text_from_the_data_is_escaped_and_isolated(project):
         ]
         assert [tag for tag, _ in page.tags].count("script") == 1
         allowed = base64.b64encode(hashlib.sha256(environment().globals["script"].encode()).digest()).decode()
-        assert f"default-src 'none'; style-src 'unsafe-inline'; img-src data:; script-src 'sha256-{allowed}';" in path.read_text(
+        assert f"default-src 'none'; style-src 'unsafe-inline'; img-src data:; script-src 'sha256-{allowed}' 'strict-dynamic';" in path.read_text(
             encoding="utf-8"
         )
         assert all(found["src"].startswith("data:image/jpeg;base64,") for tag, found in page.tags if tag == "img")
@@ -218,7 +218,7 @@ def test_a_long_record_is_thinned_and_keeps_its_peak(project):
     machine = made.declared(project)
     columns = made.record(machine, 200_000, "long.mcap")
     columns["zone_1"][123_456] = 999.0
-    artifacts.write_table("datasets/ingest/record.parquet", made.schemas.record(machine.inputs, machine.outputs), columns)
+    artifacts.write_table("datasets/ingest/record.parquet", made.tables.record(machine.inputs, machine.outputs), columns)
     main()
     size = figures()["bytes"]
     # the limits of the pages: 1 MB and 1.5 MB
@@ -231,11 +231,11 @@ def test_a_hundred_recordings_with_their_findings_stay_within_the_sizes(project)
     columns = made.record(machine, 100_000, "x")
     columns["recording"] = [f"a rather long name of a recording {i // 1000:03d}.mcap" for i in range(100_000)]
     columns["segment"] = np.repeat(np.arange(100), 1000).astype(np.int32)
-    artifacts.write_table("datasets/ingest/record.parquet", made.schemas.record(machine.inputs, machine.outputs), columns)
+    artifacts.write_table("datasets/ingest/record.parquet", made.tables.record(machine.inputs, machine.outputs), columns)
     rows = 100 * 20
     flaws = {"recording": columns["recording"][::50][:rows], "signal": ["zone_1"] * rows, "kind": ["spike"] * rows, "count": [1] * rows}
     flaws |= {"start_s": np.arange(rows) * 50.0, "end_s": np.arange(rows) * 50.0 + 5, "message": ["a spike that stands alone"] * rows}
-    artifacts.write_table("datasets/ingest/quality.parquet", made.schemas.QUALITY, flaws)
+    artifacts.write_table("datasets/ingest/quality.parquet", made.tables.QUALITY, flaws)
     main()
     size = figures()["bytes"]
     assert size["index"] <= 1_000_000 and max(size.values()) <= 1_500_000
@@ -291,6 +291,6 @@ def test_a_signal_of_another_schema_is_shown_as_failed_not_read(project):
 
 def test_a_page_needs_no_simulator_and_starts_fast():
     heavy = ("jax", "equinox", "scipy.stats", "pipeline.setpoint.simulator", "pipeline.temperature.plant")
-    said = f"import sys, stages.report, pipeline.report.nightly, pipeline.report.trend; print([name for name in {heavy!r} if name in sys.modules])"
+    said = f"import sys, stages.report, pipeline.report.nightly.page, pipeline.report.runs.trend; print([name for name in {heavy!r} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", said], capture_output=True, text=True, check=True, cwd=Path(__file__).resolve().parents[2])
     assert done.stdout.strip() == "[]"

@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from pipeline import artifacts, cli, provenance
+from pipeline import cli
+from pipeline.report.shared import provenance
+from pipeline.store import artifacts
 from stages.report import main
 
 
@@ -64,13 +66,16 @@ def test_one_changed_byte_of_any_source_is_found_and_named(checked):
     ("path", "sentence"),
     [
         ("params.yaml", "params.yaml has changed since"),
+        ("params.expert.yaml", "params.yaml or params.expert.yaml has changed since"),
         ("pipeline/code.py", "the code (pipeline, stages) has changed since"),
         ("reports/temperature.html", "reports/temperature.html has changed since"),
     ],
 )
 def test_a_change_of_parameters_code_or_a_page_is_found(checked, path, sentence):
-    text = Path(path).read_text()
-    changed = {"params.yaml": text.replace("gap_percent: 5.0", "gap_percent: 6.0", 1), "pipeline/code.py": "2\n"}.get(path, text + "\n")
+    text = Path(path).read_text() if Path(path).exists() else ""
+    changed = {
+        "params.yaml": text.replace("gap_percent: 5.0", "gap_percent: 6.0", 1), "params.expert.yaml": "train_agent: {more: 1}\n", "pipeline/code.py": "2\n",
+    }.get(path, text + "\n")  # fmt: skip
     assert changed != text
     Path(path).write_text(changed)
     assert sentence in wrong()

@@ -7,10 +7,14 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline import artifacts, params, setpoint_schemas
-from pipeline.report import setpoint_agent, setpoint_verdict, setpoint_vision, setpoint_why
-from pipeline.report.verdict import Figure, Question
+from pipeline.report.setpoint import agent as setpoint_agent
+from pipeline.report.setpoint import verdict as setpoint_verdict
+from pipeline.report.setpoint import vision as setpoint_vision
+from pipeline.report.setpoint import why as setpoint_why
+from pipeline.report.shared.verdict import Figure, Question
 from pipeline.setpoint.reward import reward
+from pipeline.setpoint.workflow.tables import PATHS
+from pipeline.store import artifacts, params
 from stages.report import main
 from tests.report import made_setpoint
 from tests.report.test_pages import Page, change, figures
@@ -210,7 +214,7 @@ def test_two_hundred_starts_and_a_thousand_decisions_stay_within_the_size_of_a_p
     rows = 40_000
     table = {"controller": ["our agent"] * rows, "simulator": ["paper"] * rows, "case": ["accuracy 0.7"] * rows, "start": np.repeat(np.arange(200), 200), "step": np.tile(np.arange(200), 200)}  # fmt: skip
     walk = 100 + 20 * np.random.default_rng(0).standard_normal(rows)
-    artifacts.write_table("datasets/evaluate_setpoint/paths.parquet", setpoint_schemas.PATHS, table | {"flow_percent": walk, "temperature_degC": 210 + walk / 20})  # fmt: skip
+    artifacts.write_table("datasets/evaluate_setpoint/paths.parquet", PATHS, table | {"flow_percent": walk, "temperature_degC": 210 + walk / 20})  # fmt: skip
     main()
     # the limit of a page: 1.5 MB
     assert figures()["bytes"]["setpoint"] <= 1_500_000

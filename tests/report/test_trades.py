@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from pipeline import artifacts
-from pipeline.report import pairs, trades, workflow
+from pipeline.report.index import workflow
+from pipeline.report.temperature import pairs, trades
+from pipeline.store import artifacts
 from stages.report import main
 from tests.report import made
 from tests.report.test_pages import INDEX as PAGE_ONE
@@ -41,7 +42,7 @@ def test_the_drawn_stages_are_those_of_dvc_yaml_and_read_what_they_read_there(ro
         for stage, entry in stages.items()
         if stage != "report"
     }
-    assert {stage: set(found) for stage, found in workflow.READS.items()} == reads, "add the stage to READS in pipeline/report/workflow.py"
+    assert {stage: set(found) for stage, found in workflow.READS.items()} == reads, "add the stage to READS in pipeline/report/index/workflow.py"
 
 
 def test_no_two_stages_share_a_place_and_every_arrow_points_right():

@@ -4,8 +4,7 @@ import math
 
 import pytest
 
-from pipeline import params
-from pipeline.report.verdict import (
+from pipeline.report.shared.verdict import (
     FAILED,
     OPEN,
     PASSED,
@@ -20,6 +19,7 @@ from pipeline.report.verdict import (
     undecided,
     winner,
 )
+from pipeline.store import params
 
 RULES = ReportRules(
     gap_percent=5.0,

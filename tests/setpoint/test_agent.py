@@ -26,12 +26,11 @@ from pipeline.setpoint.agent import (
     phase,
     train_published,
     weights,
-    why,
     with_weights,
 )
 from pipeline.setpoint.judging import evaluate, starts
-from pipeline.setpoint.recorded import synthetic_table
-from pipeline.setpoint.simulator import STAND, Observation, State, nominal, paper_windows
+from pipeline.setpoint.simulator import STAND, Observation, State, paper_windows
+from tests.setpoint.synthetic import synthetic_table
 
 SMALL = Setting(gamma=0.99, tau=0.005, batch=64, capacity=512, environments=8, episode=100)
 EXPLORE = {"explore": 1.0, "explore_again": 0.3, "least": 0.05}
@@ -249,16 +248,7 @@ def test_training_in_troubles_is_reproducible_and_keeps_the_start_where_it_is_no
     assert one.judged[one.kept] == max(one.judged)
 
 
-# ---- why it acted, and weights
-
-
-def test_the_reasons_are_those_of_the_action_taken():
-    network = QNetwork(jax.random.key(0))
-    reasons = why(paper_sight(), network, paper_windows(), nominal(200.0, 190.0, accuracy=0.7), jax.random.key(0), steps=12)
-    np.testing.assert_array_equal(np.asarray(reasons.Q).argmax(axis=2), reasons.action)
-    assert reasons.flow[0] == 200.0
-    moves = np.array([-10.0, -5, 0, 5, 10])[np.asarray(reasons.action)[:-1, 0]]
-    np.testing.assert_allclose(reasons.observation.flow_move[1:], moves, atol=1e-4)  # no limit is met within 12 steps of 10 %
+# ---- weights
 
 
 def test_weights_return_to_the_network_they_came_from_and_no_other():

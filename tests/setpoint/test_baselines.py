@@ -10,8 +10,9 @@ import pytest
 from pipeline.setpoint import bayes, judging
 from pipeline.setpoint.baselines import Proportional, SequentialTest, nearest, proportional, sequential_test, temperature_move
 from pipeline.setpoint.published import FLOW_MOVES, TEMPERATURE_MOVES
-from pipeline.setpoint.recorded import recorded_windows, synthetic_table
+from pipeline.setpoint.recorded import recorded_windows
 from pipeline.setpoint.simulator import Observation, nominal, paper_windows
+from tests.setpoint.synthetic import synthetic_table
 
 KEY = jax.random.key(0)
 PURE = {0: [0.76, 0.17, 0.07], 1: [0.15, 0.7, 0.15], 2: [0.07, 0.17, 0.76]}  # the mean window of each class
@@ -186,7 +187,9 @@ def test_a_window_that_repeats_is_a_weaker_witness_by_the_rule_and_one_that_diff
     same, other = (bayes.believed(parameters, first, seen(named)) for named in (1, 2))
     assert ratio(same) / ratio(first) == pytest.approx((0.4 + 0.6 * 0.2) / (0.4 + 0.6 * 0.01), rel=1e-5)
     assert ratio(other) / ratio(first) == pytest.approx(20.0, rel=1e-5)
-    moved = bayes.believed(parameters, first, seen(1, move=5.0))  # what stood at 95 % is at 100 now: a repeat after a move is a full witness
+    moved = bayes.believed(
+        parameters, first, seen(1, move=5.0)
+    )  # what stood at 95 % is at 100 now: a repeat after a move is a full witness
     assert float(moved.belief[0, 32] / moved.belief[0, 10]) == pytest.approx(20.0, rel=1e-5)
     assert int(first.last) == int(bayes.code(seen(1).shares, seen(1).named))
 

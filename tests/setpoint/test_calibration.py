@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import scipy.special
 
+from benchmarks.classifier import judge
 from pipeline.setpoint.calibration import (
     Familiar,
     Seen,
@@ -14,14 +15,12 @@ from pipeline.setpoint.calibration import (
     auroc,
     calibrate,
     conformal_level,
-    confusion_by_temperature,
     energy,
     fit_correlation,
     fit_familiar,
     fit_temperature,
     foreign_above,
     hard_shares,
-    judge,
     log_probabilities,
     mahalanobis,
     recorded,
@@ -136,13 +135,6 @@ def test_a_calibrated_classifier_shows_its_floor_and_an_overconfident_one_more()
     drawn = [reliability(np.exp(log_probabilities(a, 1.0)), b, bins=15).error for a, b in (draw(5_000, seed=s) for s in range(20, 60))]
     assert np.mean(drawn) == pytest.approx(true.floor, rel=0.15)  # forty draws, and the normal law of a bin's hits
     assert sure.error > 5 * sure.floor
-
-
-def test_confusion_by_hand():
-    found = confusion_by_temperature([0, 0, 1, 2, 2], [0, 1, 1, 2, 0], [230.0, 230, 190, 190, 190])
-    np.testing.assert_array_equal(found.temperature_degC, [190, 230])
-    np.testing.assert_array_equal(found.counts[0], [[0, 0, 0], [0, 1, 0], [1, 0, 1]])
-    np.testing.assert_array_equal(found.counts[1], [[1, 1, 0], [0, 0, 0], [0, 0, 0]])
 
 
 # ---- conformal sets

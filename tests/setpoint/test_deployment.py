@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from benchmarks.waits import autocorrelation, derived_waits, effective_frames, settling_s, window_frames
 from pipeline.setpoint.deployment import (
     ACTS,
     AMBIGUOUS,
@@ -16,16 +17,11 @@ from pipeline.setpoint.deployment import (
     TIP,
     Limits,
     Waits,
-    autocorrelation,
-    derived_waits,
-    effective_frames,
     judge_window,
     moved,
     setpoints,
-    settling_s,
     wait_after,
     why,
-    window_frames,
 )
 
 RULES = {"least_frames": 8, "correlation": 0.45, "foreign_above": 5.0, "conformal_level": 0.2}

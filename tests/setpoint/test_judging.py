@@ -4,9 +4,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pipeline.setpoint.judging import START_FLOWS, START_TEMPERATURES, cases, choose, rows, starts
-from pipeline.setpoint.recorded import recorded_windows, synthetic_table
-from pipeline.setpoint.score import Score, Share, judge, wilson
+from pipeline.setpoint.judging import START_FLOWS, START_TEMPERATURES, cases, choose, starts
+from pipeline.setpoint.recorded import recorded_windows
+from pipeline.setpoint.score import Score, judge
+from pipeline.statistics import Share, wilson
+from tests.setpoint.synthetic import synthetic_table
 
 
 def path(*pieces):
@@ -112,12 +114,3 @@ def test_short_trajectories_are_refused():
     short = np.full((1, 101), 100.0)
     with pytest.raises(ValueError, match=r"expected trajectories of 200 decisions, found 100; roll out with steps=200"):
         judge(short, short)
-
-
-def test_a_row_is_flat_and_names_what_it_holds():
-    (row,) = rows({"a": {"x": scored(90.0)}})
-    assert row["controller"] == "a"
-    assert row["case"] == "x"
-    assert (row["stay"], row["stay_low"], row["stay_high"]) == (90.0, 89.0, 91.0)
-    assert (row["worst_start_flow"], row["worst_start_temperature"], row["worst_start_settled"]) == (30.0, 190.0, 95.0)
-    assert all(isinstance(value, (str, int, float)) for value in row.values())

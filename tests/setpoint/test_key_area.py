@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.key_area import published, sweep
 from pipeline.setpoint import key_area, nozzle_scene
 
 LEAST = 10.0
@@ -50,7 +51,7 @@ def test_the_gathered_sweep_is_the_naive_sweep():
     scenes = [nozzle_scene.render(nozzle_scene.draw_segment(rng), np.array([100.0]), 210.0, rng).frames[0] for _ in range(4)]
     for frame in [*scenes, line(123), line(301, width=3)]:
         cropped = key_area.crop(frame, (frame.shape[1] // 2, frame.shape[0] // 2))
-        expected, found = naive_sweep(cropped.gray), key_area.sweep(cropped)
+        expected, found = naive_sweep(cropped.gray), sweep(cropped)
         # rounding of places in single precision moves some samples of the 87 by one pixel
         assert np.abs(found - expected).mean() < 0.2
         assert apart(found.argmax(), expected.argmax()) <= 2  # the bar
@@ -68,7 +69,7 @@ def test_the_equalisation_is_that_of_opencv():
 def test_the_published_form_takes_a_bright_nozzle_for_the_line_and_the_robust_form_does_not():
     frame = line(120, width=8, level=120)
     cv2.fillPoly(frame, [np.array([[60, 0], [340, 0], [205, 195], [195, 195]])], 250)
-    assert apart(key_area.published(frame, (200, 200)).angle_deg, 270) < 45  # inside the cone
+    assert apart(published(frame, (200, 200)).angle_deg, 270) < 45  # inside the cone
     found = key_area.find(frame, (200, 200), least_score=LEAST)
     assert apart(found.angle_deg, 120) <= 2
     assert found.reason == ""

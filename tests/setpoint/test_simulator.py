@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pipeline.setpoint.recorded import WindowTable, recorded_windows, synthetic_table
+from pipeline.setpoint.recorded import WindowTable, recorded_windows
 from pipeline.setpoint.reward import reward
 from pipeline.setpoint.simulator import (
     FLOW_MOVES,
@@ -21,6 +21,7 @@ from pipeline.setpoint.simulator import (
     remembered,
     rollout,
 )
+from tests.setpoint.synthetic import synthetic_table
 
 STEPS, N = 30, 2000  # one shape, so that everything runs in one compiled program
 

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from benchmarks.identification import nrmse, predict_fit, simulate_fit
 from pipeline.temperature.plant import plant
 from pipeline.temperature.trust import (
     dynamics_rows,
@@ -20,7 +21,7 @@ from pipeline.temperature.trust import (
     steps,
     two_points,
 )
-from pipeline.temperature.validation import excitation, nrmse, predict_fit, residual_tests, simulate_fit, step_response
+from pipeline.temperature.validation import excitation, residual_tests, step_response
 from tests.temperature.test_validation import HEATER, innovations_record
 
 

@@ -1,17 +1,15 @@
 import numpy as np
 import pytest
 
+from benchmarks.identification import nrmse, predict_fit, simulate_fit
 from pipeline.temperature.identification import identify
 from pipeline.temperature.plant import plant, simulate
 from pipeline.temperature.validation import (
     advice,
     bootstrap_spread,
     excitation,
-    nrmse,
-    predict_fit,
     predicted_ahead,
     residual_tests,
-    simulate_fit,
     simulated,
     spread_bands,
     step_response,

@@ -1,6 +1,6 @@
 "use strict";
 /* What a page does beyond lying there: tables sort, pictures enlarge and tell their values, words explain themselves.
-   Nothing is fetched or stored, and nothing on the page needs it. */
+   Nothing is stored, nothing is fetched but machine.js, and nothing on the page needs it. */
 (() => {
   const page = document, make = (tag, set = {}, ...inside) => {
     const made = Object.assign(page.createElement(tag), set);
@@ -235,5 +235,26 @@
     found.after(button);
     found.addEventListener("click", () => enlarge(found));
   });
+
+  /* ---- what the run was made on: beside the pages, not in them, so that they are the same on every machine */
+
+  const told = () => {
+    const now = window.beadline?.machine;
+    if (!now) return;
+    const day = new Date(now.date).toLocaleDateString("en-GB", { day: "numeric", month: "short", year: "numeric", timeZone: "UTC" });
+    const commit = now.commit === "none" ? "no commit" : `commit ${now.commit}${now.changed ? " with uncommitted changes" : ""}`;
+    page.querySelector("main").after(make("footer", { className: "wrap made" }, `Last run on ${now.cpu}, pins ${now.pins}, beadline ${now.version}, ${commit}, ${day}`));
+    /* the page carries the accepted run's machine only where inputs, parameters and code are the same */
+    const place = page.querySelector("[data-machine]"), then = place && JSON.parse(place.dataset.machine);
+    if (!then || then.locked !== now.locked) return;
+    const cpu = then.cpu !== now.cpu, pins = then.pins !== now.pins;
+    if (!cpu && !pins) return;
+    const name = machine => [cpu && machine.cpu, pins && `pins ${machine.pins}`].filter(Boolean).join(", ");
+    const what = cpu && pins ? "CPU and pins differ" : cpu ? "the CPU differs" : "the pins differ";
+    place.append(make("strong", {}, `Nothing but ${what} from the accepted run: ${name(then)} then, ${name(now)} now.`));
+    place.hidden = false;
+    page.querySelectorAll("[data-alone]").forEach(text => { text.textContent = text.dataset.alone; });
+  };
+  page.head.append(make("script", { src: "machine.js", onload: told }));
   page.documentElement.classList.add("js");
 })();

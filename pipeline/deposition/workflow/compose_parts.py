@@ -1,0 +1,266 @@
+"""What compose_parts and `beadline compose` do: a part program read, planned and composed from the library,
+judged where the machine is known, and reported."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from tqdm import tqdm
+
+from pipeline.deposition import composition, conformance, evaluation, gcode, motion
+from pipeline.deposition.composition import Composed, Learned
+from pipeline.deposition.conformance import Conformance
+from pipeline.deposition.evaluation import Score
+from pipeline.deposition.workflow import laws
+from pipeline.deposition.workflow.segment_library import finite_or_none
+from pipeline.deposition.workflow.settings import ComposeParts, Printer, TrainIlc
+from pipeline.deposition.workflow.tables import LINES, SCORES, SIGNALS, TASKS
+from pipeline.store import artifacts
+
+
+class Part(NamedTuple):
+    """A part program read, planned, composed, and whether it will print."""
+
+    name: str
+    program: gcode.Program
+    planned: motion.Motion
+    composed: Composed
+    conformance: Conformance
+
+
+def compose_all(folder: Path, learned: Learned, printer: Printer, p: ComposeParts) -> tuple[list[Part], dict[str, str]]:
+    """Every part program in `folder`, and the reasons of those that cannot be composed; raises ValueError where none can."""
+    parts, refused = [], {}
+    for path in programs(folder):
+        try:
+            parts.append(compose(path, learned, printer, p))
+        except ValueError as error:
+            refused[path.stem] = str(error)
+    if not parts:
+        raise ValueError(f"{folder}: none of {len(refused)} part programs can be composed; the first: {next(iter(refused.values()))}")
+    return parts, refused
+
+
+def programs(folder: Path) -> list[Path]:
+    """The part programs in a folder, by name. Raises ValueError where there is none."""
+    found = sorted(path for path in folder.glob("*") if path.suffix.lower() in {".gcode", ".gco", ".g", ".nc"})
+    if not found:
+        raise ValueError(f"{folder}: expected part programs (*.gcode), found none; copy one there")
+    return found
+
+
+def judged(
+    parts: Sequence[Part], learned: Learned, models: dict[str, Any], printer: Printer, p: ComposeParts, taught: TrainIlc
+) -> list[tuple[Part, list[Score]]]:
+    """Every part with the scores of its composers, on the extruders of models.json and with the noise of train_ilc."""
+    settings = {
+        "nominals": laws.extruders(models, "nominal"), "plants": laws.extruders(models, "plant"), "noise": laws.noise(taught),
+        "s": laws.settings(taught, printer), "updates": p.whole_updates, "bead_area_mm2": printer.bead_area_mm2, "shortest_s": p.shortest_s,
+    }  # fmt: skip
+    rng = np.random.default_rng(p.seed)
+    return [
+        (part, evaluation.evaluate(learned, part.composed, rng=rng, **settings))
+        for part in tqdm(parts, desc="compose_parts: parts", mininterval=2)
+    ]
+
+
+# ---- one part
+
+
+def compose(path: Path, learned: Learned, printer: Printer, p: ComposeParts) -> Part:
+    """A part program, composed. Raises ValueError naming the file, and the line where there is one."""
+    learned_s = learned.library.sample_time_s
+    if learned_s != printer.sample_time_s:
+        raise ValueError(
+            f"params.yaml: printer.sample_time_s is {printer.sample_time_s:g} but the library was learned at {learned_s:g} s; "
+            "learn it again with ./run dvc repro"
+        )
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read ({error.strerror}); name a part program (G-code)") from None
+    with artifacts.about(path):
+        program = gcode.parse(data)
+        if program.refusals and not np.any(program.moves.kind == gcode.Kind.EXTRUDE):
+            first = program.refusals[0]
+            raise ValueError(f"line {first.line}: {first.why}; it was left out, and nothing of the program that could be read prints")
+        planned = motion.plan(
+            program.moves, acceleration=printer.acceleration_mm_per_s2, junction_deviation_mm=printer.junction_deviation_mm,
+            speed_limit=printer.speed_limit_mm_per_s, unset_feed=printer.speed_mm_per_s, tool_change_s=printer.tool_change_s,
+        )  # fmt: skip
+        settings = {"bead_area_mm2": printer.bead_area_mm2, "ramp_s": printer.ramp_s, "limit": printer.limit}
+        composed = composition.compose(
+            learned, program, planned, materials={m.tool: m.name for m in printer.materials}, nozzle_mm=printer.nozzle_mm,
+            corner_deg=p.corner_deg, longest_pause_s=p.longest_pause_s, **settings,
+        )  # fmt: skip
+        report = conformance.conform(
+            composed, learned, shortest_s=p.shortest_s, largest_error_percent=p.largest_error_percent, refusals=program.refusals, **settings
+        )
+    return Part(path.stem, program, planned, composed, report)
+
+
+def write(part: Part, folder: Path) -> list[Path]:
+    """The commands of all tools and the tasks as CSV, and the conformance report as JSON, beside one another in `folder`."""
+    composed = part.composed
+    signal = {"time_s": np.arange(len(composed.streams[0].u)) * composed.sample_time_s}
+    signal |= {f"T{stream.tool}_{stream.material}_mm": stream.u for stream in composed.streams}
+    files = [folder / f"{part.name}.{kind}" for kind in ("signal.csv", "tasks.csv", "conformance.json")]
+    artifacts.write_csv(files[0], signal)
+    artifacts.write_csv(files[1], task_rows(part))
+    lines = line_rows(part)
+    rows = [
+        {
+            name: finite_or_none(values[i].item() if hasattr(values[i], "item") else values[i])
+            for name, values in lines.items()
+            if name != "part"
+        }
+        for i in range(len(lines["line"]))
+    ]
+    artifacts.write_json(files[2], report(part) | {"lines": rows})
+    return files
+
+
+def told(part: Part) -> str:
+    """The conformance report in words."""
+    found, composed = part.conformance, part.composed
+    lines, text = found.lines, []
+    duration = len(composed.streams[0].u) * composed.sample_time_s
+    text.append(
+        f"{part.name}: {len(lines.line)} printed lines in {int(composed.lines.run[-1]) + 1} runs, {duration:.1f} s; "
+        f"the gantry sets out {composed.lead_in_s:.2f} s after the signal"
+    )
+    for stream in composed.streams:
+        predicted = {q.composer: q.rms_percent_of_on_off for q in composed.predictions if q.tool == stream.tool}
+        others = ", ".join(f"{name} {percent:.1f} %" for name, percent in sorted(predicted.items(), key=lambda item: item[1]))
+        text.append(f"T{stream.tool} {stream.material}: by {stream.composer}; predicted flow error, of on-off control's: {others}")
+        sat = found.saturation[stream.tool]
+        if not sat.enough:
+            ramp = found.ramp_that_would_do_s[stream.tool]
+            do = f"ramps of {ramp:.2f} s would do" if math.isfinite(ramp) else "no ramp would do: print slower, or raise printer.limit_mm"
+            text.append(
+                f"  the command reaches its limit {sat.share_percent:.1f} % of the printing time (peak "
+                f"{sat.peak_over_steady:.1f} x steady); {do}"
+            )
+    if found.judged:
+        worst = int(np.argmax(np.where(lines.duration_s >= 0, np.abs(lines.error_percent), 0)))
+        text.append(
+            f"volume of {found.judged} lines within {found.worst_line_volume_percent:.1f} % of the plan; "
+            f"of all lines the worst is line {lines.line[worst]}: {lines.error_percent[worst]:+.1f} % of "
+            f"{lines.planned_mm3[worst]:.3g} mm^3"
+        )
+    if np.any(lines.shorter_than_lead):
+        text.append(
+            f"{int(np.sum(lines.shorter_than_lead))} lines belong to runs shorter than the lead of Stop: "
+            "the priority rule would not print them"
+        )
+    text += [f"line {one.line}: {one.why}" for one in found.refused]
+    return "\n".join(text)
+
+
+# ---- as tables
+
+
+def signal_rows(part: Part, scores: Sequence[Score]) -> dict[str, np.ndarray]:
+    """One row a sample of every stream, the gantry beside it, and the flow of every composer."""
+    composed = part.composed
+    Ts, ahead = composed.sample_time_s, round(composed.lead_in_s / composed.sample_time_s)
+    position = motion.sampled(part.planned, part.program.moves, sample_time_s=Ts).position
+    n = len(composed.streams[0].r)
+    at = np.clip(np.arange(n) - ahead, 0, len(position) - 1)
+    parts = []
+    for i, stream in enumerate(composed.streams):
+        flows = {f"{score.composer}_mm3_per_s": score.y for score in scores if score.stream == i}
+        parts.append({
+            "part": np.full(n, part.name, object), "tool": np.full(n, stream.tool), "material": np.full(n, stream.material, object),
+            "time_s": np.arange(n) * Ts,
+            "x_mm": position[at, 0], "y_mm": position[at, 1], "wanted_mm3_per_s": stream.r, "command_mm": stream.u,
+            "predicted_mm3_per_s": stream.y,
+            **{column.name: flows.get(column.name, np.full(n, np.nan)) for column in SIGNALS.columns[9:]},
+        })  # fmt: skip
+    return {name: np.concatenate([one[name] for one in parts]) for name in parts[0]}
+
+
+def score_rows(part: Part, scores: Sequence[Score]) -> dict[str, list]:
+    materials = [part.composed.streams[score.stream].material for score in scores]
+    values = [(part.name, material, *score[1:6]) for material, score in zip(materials, scores, strict=True)]
+    return {column.name: list(column_values) for column, column_values in zip(SCORES.columns, zip(*values, strict=True), strict=True)}
+
+
+def task_rows(part: Part) -> dict[str, np.ndarray]:
+    tasks = part.composed.tasks
+    values = [np.full(len(tasks.task), part.name, object), tasks.task.astype(object), *tasks[1:], part.composed.error_percent]
+    return dict(zip([column.name for column in TASKS.columns], values, strict=True))
+
+
+def line_rows(part: Part) -> dict[str, np.ndarray]:
+    lines = part.conformance.lines
+    values = [np.full(len(lines.line), part.name, object), *lines]
+    return dict(zip([column.name for column in LINES.columns], values, strict=True))
+
+
+def rows(done: Sequence[tuple[Part, Sequence[Score]]]) -> dict[str, dict[str, np.ndarray]]:
+    """Columns of schemas SIGNALS, SCORES, TASKS and LINES of all parts."""
+    return {
+        "signals": stacked([signal_rows(*one) for one in done]), "scores": stacked([score_rows(*one) for one in done]),
+        "tasks": stacked([task_rows(part) for part, _ in done]), "lines": stacked([line_rows(part) for part, _ in done]),
+    }  # fmt: skip
+
+
+def stacked(tables: Sequence[dict[str, Any]]) -> dict[str, np.ndarray]:
+    """Tables of equal columns, one below the other."""
+    return {name: np.concatenate([np.asarray(table[name]) for table in tables]) for name in tables[0]}
+
+
+def reports(done: Sequence[tuple[Part, Sequence[Score]]], refused: dict[str, str]) -> dict[str, Any]:
+    """Conformance by part, and why others were refused."""
+    return {part.name: report(part) for part, _ in done} | {name: {"refused": why} for name, why in refused.items()}
+
+
+def report(part: Part) -> dict[str, Any]:
+    """What the conformance report says, as JSON."""
+    found, composed = part.conformance, part.composed
+    lines, refused = found.lines, [one._asdict() for one in found.refused]
+    return {
+        "lines_of_the_program": part.program.lines,
+        "printed_lines": len(lines.line),
+        "runs": int(composed.lines.run[-1]) + 1,
+        "duration_s": len(composed.streams[0].r) * composed.sample_time_s,
+        "worst_line_volume_percent": finite_or_none(found.worst_line_volume_percent),
+        "judged_lines": found.judged,
+        "shorter_than_lead": int(np.sum(lines.shorter_than_lead)),
+        "composer": {stream.material: stream.composer for stream in composed.streams},
+        "predicted_percent": {
+            p.material: {q.composer: finite_or_none(q.rms_percent_of_on_off) for q in composed.predictions if q.material == p.material}
+            for p in composed.predictions
+        },
+        "saturation": {
+            name: {key: finite_or_none(value) for key, value in one._asdict().items()} for name, one in _by_material(part, found.saturation)
+        },
+        "ramp_that_would_do_s": {name: finite_or_none(value) for name, value in _by_material(part, found.ramp_that_would_do_s)},
+        "refused": refused,
+        "unknown_words": len(part.program.other_line),
+    }
+
+
+def _by_material(part: Part, of_tool: dict[int, Any]) -> list[tuple[str, Any]]:
+    return [(stream.material, of_tool[stream.tool]) for stream in part.composed.streams]
+
+
+def figures(judged: Sequence[tuple[Part, Sequence[Score]]]) -> dict[str, Any]:
+    """By part, material and composer: the error of the true flow in % of on-off
+    control's, the worst line's volume, and which was chosen."""
+    found: dict[str, Any] = {}
+    for part, scores in judged:
+        for score in scores:
+            material = part.composed.streams[score.stream].material
+            one = found.setdefault(part.name, {}).setdefault(material, {})
+            one[score.composer] = {
+                "rms_percent_of_on_off": score.rms_percent_of_on_off,
+                "worst_line_volume_percent": finite_or_none(score.worst_line_volume_percent),
+                "predicted_percent": finite_or_none(score.predicted_percent),
+            }
+            if score.chosen:
+                one["chosen"] = score.composer
+    return found

@@ -1,0 +1,168 @@
+"""Sections `printer` and `camera` of the parameters: the deposition loop's machine, its materials, and what looks at the bead."""
+
+import math
+from typing import Annotated, Literal
+
+import pydantic
+from pydantic import Field
+
+from pipeline.deposition.extruder import Routine, routine
+from pipeline.store.params import Section
+
+
+class Material(Section):
+    """What is known of a material before anything is learned: K / (tau s + 1) from
+    plunger displacement to flow, on the printer's nozzle."""
+
+    name: str = Field(min_length=1, max_length=40, pattern=r"^[A-Za-z0-9_-]+$")
+    tool: int = Field(ge=0, le=99)
+    gain_mm3_per_s_per_mm: float = Field(gt=0, le=1e6)
+    time_constant_s: float = Field(gt=0, le=1000)
+
+
+class Training(Section):
+    """A training routine: off, on, a pause of the gantry, on, off."""
+
+    speed_mm_per_s: float = Field(gt=0, le=1000)
+    pause_s: float = Field(gt=0, le=60)
+    off_s: float = Field(gt=0, le=600)
+    on_s: float = Field(gt=0, le=600)
+    tail_s: float = Field(gt=0, le=600)
+
+
+class Printer(Section):
+    """Section `printer`: nozzle, bead, speed, limits of motion and of the plunger, and the materials with their tools."""
+
+    sample_time_s: float = Field(gt=0, le=1)
+    nozzle_mm: float = Field(gt=0, le=20)
+    nozzle_outer_mm: float = Field(gt=0, le=50)
+    bead_area_mm2: float = Field(gt=0, le=100)
+    speed_mm_per_s: float = Field(gt=0, le=1000)
+    ramp_s: float = Field(gt=0, le=60)
+    limit_mm: float | None = Field(gt=0, le=1e6)
+    acceleration_mm_per_s2: float = Field(gt=0, le=1e6)
+    junction_deviation_mm: float = Field(ge=0, le=10)
+    speed_limit_mm_per_s: float = Field(gt=0, le=10_000)
+    tool_change_s: float = Field(ge=0, le=3600)
+    materials: list[Material] = Field(min_length=1, max_length=20)
+    reference: Training
+    routines: list[Training] = Field(max_length=20)
+
+    @pydantic.model_validator(mode="after")
+    def _distinct(self):
+        for key in ("name", "tool"):
+            found = [getattr(material, key) for material in self.materials]
+            twice = sorted({value for value in found if found.count(value) > 1})
+            if twice:
+                raise ValueError(f"gives {key} {twice[0]} to more than one material; give every material a {key} of its own")
+        return self
+
+    @property
+    def limit(self) -> float:
+        """Largest command in mm; infinite where the drive has no limit that matters."""
+        return math.inf if self.limit_mm is None else self.limit_mm
+
+    @property
+    def steady_flow(self) -> float:
+        """Wanted flow of a line at full speed, mm^3/s."""
+        return self.bead_area_mm2 * self.speed_mm_per_s
+
+    def trained(self) -> list[Routine]:
+        """The training routines: the reference, on which laws are compared, and those of the library."""
+        return [
+            routine(
+                off_s=t.off_s, on_s=t.on_s, pause_s=t.pause_s, tail_s=t.tail_s, speed=t.speed_mm_per_s, bead_area_mm2=self.bead_area_mm2,
+                ramp_s=self.ramp_s, sample_time_s=self.sample_time_s,
+            )
+            for t in [self.reference, *self.routines]
+        ]  # fmt: skip
+
+
+class Camera(Section):
+    """Section `camera`: where it looks, how it was calibrated, and, for simulated trials, how hard the pictures are."""
+
+    frames_per_s: float = Field(gt=0, le=1000)
+    mm_per_px: float = Field(gt=-10, lt=10)
+    nozzle_column: float = Field(ge=-10_000, le=10_000)
+    columns: list[Annotated[int, Field(ge=0, le=10_000)]] = Field(min_length=2, max_length=2)
+    contact_angle_deg: float = Field(gt=0, lt=180)
+    known_widths_mm: list[Annotated[float, Field(gt=0, le=100)]] = Field(min_length=3, max_length=20)
+    width_deviation_mm: float = Field(ge=0, le=10)
+    longest_blur_px: float = Field(gt=0, le=50)
+    unreadable_share: float = Field(ge=0, le=1)
+    scene: Literal["nominal", "hard"]
+    encoding: Literal["jpeg", "png", "raw"]
+
+    @pydantic.model_validator(mode="after")
+    def _looks(self):
+        if abs(self.mm_per_px) < 1e-6:
+            raise ValueError(
+                f"has mm_per_px {self.mm_per_px:g}; give the size of a pixel on the stage, negative where the line trails to higher columns"
+            )
+        if self.columns[1] <= self.columns[0]:
+            raise ValueError(
+                f"has columns {self.columns[0]} to {self.columns[1]}; give the first and, behind it, the last that is measured"
+            )
+        return self
+
+
+# ---- a section a stage
+
+
+class TrialNoise(Section):
+    """What does not repeat from trial to trial: white noise and drift in percent of the
+    steady flow, the gain of a whole trial in percent."""
+
+    white_percent: float = Field(ge=0, le=100)
+    drift_percent: float = Field(ge=0, le=100)
+    gain_percent: float = Field(ge=0, le=100)
+
+
+class PaperLaw(Section):
+    """The paper's law."""
+
+    learning_gain: float = Field(gt=0, le=2)
+    fast_zero_s: float = Field(gt=0, le=10)
+    order: int = Field(ge=1, le=10)
+    cutoff_hz: float = Field(gt=0, le=1000)
+
+
+class OurLaw(Section):
+    """Ours, on a model that the first trials identify."""
+
+    identify_trials: int = Field(ge=1, le=100)
+    floor: float = Field(gt=0, le=1)
+    order: int = Field(ge=1, le=10)
+    cutoff_hz: float = Field(gt=0, le=1000)
+    rise: float = Field(gt=0, le=10)
+
+
+class TrainIlc(Section):
+    """Section `train_ilc`."""
+
+    source: Literal["simulated", "recordings"]
+    seed: int = Field(ge=0, le=2**31)
+    trials: int = Field(ge=1, le=1000)
+    pixel_trials: int = Field(ge=1, le=1000)
+    family_plants: int = Field(ge=1, le=100_000)
+    worst_ratio: float = Field(gt=0, le=1)
+    noise: TrialNoise
+    paper: PaperLaw
+    law: OurLaw
+
+
+class SegmentLibrary(Section):
+    """Section `segment_library`."""
+
+    law: Literal["ours", "pixels"]
+
+
+class ComposeParts(Section):
+    """Section `compose_parts`."""
+
+    seed: int = Field(ge=0, le=2**31)
+    corner_deg: float = Field(gt=0, le=180)
+    longest_pause_s: float = Field(ge=0, le=600)
+    shortest_s: float = Field(ge=0, le=600)
+    largest_error_percent: float = Field(gt=0, le=1000)
+    whole_updates: int = Field(ge=1, le=1000)

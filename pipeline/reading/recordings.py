@@ -1,0 +1,117 @@
+"""Recordings of other people's machines: MCAP, Parquet and CSV -> signals on their own clocks, with what was damaged, missing or left out
+counted.
+
+`read` is the door; `resample` and `flag` make a table of it, `inspect` says in words what is in a file.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.reading.csv_files import read_csv
+from pipeline.reading.formats import CALENDAR_S, Columns, check_clock, file_format
+from pipeline.reading.inspection import inspect
+from pipeline.reading.mcap_columns import mcap_columns
+from pipeline.reading.mcap_records import check_magic
+from pipeline.reading.parquet_files import read_parquet
+from pipeline.reading.quality import flag
+from pipeline.reading.resampling import resample
+from pipeline.reading.signals import Flag, Jitter, Note, Raw, Source, Table, nearest_names
+
+__all__ = ["Flag", "Jitter", "Note", "Raw", "Source", "Table", "flag", "inspect", "nearest_names", "read", "resample"]
+
+
+def read(path: str | Path, sources: Sequence[Source], *, time: str = "") -> Raw:
+    """The signals of a recording, each on its own clock, in our units.
+
+    `time` names the clock: in a table a column (by default one that is called like a time) or "every 0.5 s" where there is none; in MCAP
+    log_time (the default), publish_time, or a field of every topic such as header.stamp. A clock of the calendar is counted from the first
+    whole second of the record. Missing numbers are NaN, and counted in a note. Raises ValueError, one sentence with file, place, expected,
+    found and remedy, for a source that is not there, text in place of a number, a signal without any number, a time that is missing,
+    repeated or runs backwards, and a file that cannot be read.
+    """
+    path = Path(path)
+    _check_sources(path, sources)
+    kind = file_format(path)
+    names = list(dict.fromkeys(source.source for source in sources))
+    try:
+        if kind == "mcap":
+            with path.open("rb") as stream:
+                check_magic(path, stream.read(16))
+            columns, places, messages, notes = mcap_columns(path, names, time)
+        else:
+            table, notes = (read_csv if kind == "csv" else read_parquet)(path, names, time)
+            columns, places, messages = [table], {name: (table.name, name) for name in names}, {table.name: len(table.time)}
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read ({error.strerror or error}); check the disk, or copy the recording again") from None
+    clocks = _clocks(path, columns, notes)
+    signals = {}
+    for source in sources:
+        topic, field = places[source.source]
+        group = next(group for group in columns if group.name == topic)
+        signals[source.signal] = _signal(path, source, clocks[topic], group, group.values[field], notes)
+    return Raw(str(path), signals, messages, notes)
+
+
+def _check_sources(path: Path, sources: Sequence[Source]) -> None:
+    if not sources:
+        raise ValueError(
+            f"{path}: the mapping names no signal; map each input and output to a column or topic (beadline inspect proposes a mapping)"
+        )
+    signals = [source.signal for source in sources]
+    twice = sorted({signal for signal in signals if signals.count(signal) > 1})
+    if twice:
+        raise ValueError(f"{path}: the mapping gives {twice[0]} more than one source; give it one")
+    for source in sources:
+        if not (np.isfinite(source.scale) and np.isfinite(source.offset) and source.scale != 0):
+            raise ValueError(
+                f"{path}: the mapping of {source.signal} has scale {source.scale:g} and offset {source.offset:g}; both"
+                f" must be finite, scale not 0"
+            )
+
+
+def _clocks(path: Path, columns: Sequence[Columns], notes: list[Note]) -> dict[str, np.ndarray]:
+    """{topic: time_s (n,)}, all counted from one instant; each checked to run forward."""
+    for group in columns:
+        check_clock(path, group)
+    first = min(group.time[0] for group in columns)
+    on_calendar = columns[0].time.dtype == np.int64
+    unit = 10**9 if on_calendar else 1.0
+    start = first // unit * unit if first > CALENDAR_S * unit else 0
+    if start:
+        zero = np.datetime64(int(start // unit), "s")
+        zones = sorted({group.zone or "of no zone" for group in columns})
+        notes.append(Note("clock", "", 1, f"time is counted from {zero} ({', '.join(zones)}, as the recording's clock says)"))
+    return {group.name: (group.time - start if start else group.time) / unit for group in columns}
+
+
+def _signal(
+    path: Path, source: Source, time: np.ndarray, group: Columns, found: np.ndarray, notes: list[Note]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Time and values in our unit; a signal that is there in less than half of the rows, spread among them, keeps only those: it has its
+    own clock."""
+    present = np.isfinite(found)
+    if not present.any():
+        raise ValueError(
+            f"{path}: {source.source} should hold numbers for {source.signal} but all of its {len(found)} values are"
+            f" missing; map another source"
+        )
+    values = found if (source.scale, source.offset) == (1.0, 0.0) else found * source.scale + source.offset
+    if present.all():
+        return time, values
+    where = np.flatnonzero(present)
+    missing = len(found) - len(where)
+    if where.size < len(found) / 2 and where.size > 1 and np.median(np.diff(where)) > 1:
+        notes.append(
+            Note(
+                "sparse", source.signal, missing, f"{source.source} has a value in {where.size} of {len(found)} rows; those are its samples"
+            )
+        )
+        return time[where], values[where]
+    first = int(np.flatnonzero(~present)[0])
+    infinite = int(np.isinf(found).sum())
+    kinds = f" ({infinite} of them infinite)" if infinite else ""
+    message = f"{missing} of {len(found)} values of {source.source} are missing{kinds}, the first in {group.place(first)}; they are masked"
+    notes.append(Note("missing", source.signal, missing, message))
+    return time, np.where(present, values, np.nan)

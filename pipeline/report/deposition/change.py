@@ -1,0 +1,46 @@
+"""The scores of the deposition loop against the accepted run's: which moved by more than two composers may differ and still count as one."""
+
+from collections.abc import Sequence
+
+from pipeline.report.deposition.rules import SAME, Structure
+from pipeline.report.shared.difference import Move
+from pipeline.report.shared.sources import Sources, lookup
+from pipeline.report.shared.verdict import Figure, Missing, Question
+
+
+def moves(sources: Sources, found: Sequence[Structure]) -> list[Move]:
+    """Of every structure and material the flow error of the composer in use. These errors have no bands: one simulated print each, the same at
+    every run; so noise is what the choice between composers calls equal.
+    """
+    if sources.accepted is None or isinstance(sources.accepted, Missing):
+        return []
+    return [_move(sources, one) for one in found]
+
+
+def _move(sources: Sources, one: Structure) -> Move:
+    question = Question(0, "flow_error_percent", f"Flow error, {one.part}, {one.material}", "%", one.asked.flow_error_percent, False, "")
+    score, before = one.scores.get(one.chosen), _accepted(sources, one)
+    if score is None:
+        return Move(question, before, Missing("not measured", "no composer was chosen"), False, "not measured")
+    now = Figure(score.error, score.error, score.error)
+    if before is None:
+        return Move(question, None, now, False, "new")
+    if before.value == now.value:
+        return Move(question, before, now, False, "unchanged")
+    if abs(now.value - before.value) <= SAME:
+        return Move(question, before, now, False, "within noise")
+    return Move(question, before, now, True, "better" if now.value < before.value else "worse")
+
+
+def _accepted(sources: Sources, one: Structure) -> Figure | None:
+    """The error of the composer that was in use then, which may be another one."""
+    parts = lookup(sources.accepted, "metrics.compose_parts")
+    then = {} if isinstance(parts, Missing) else parts.get(one.part, {}).get(one.material, {})
+    score = then.get(then.get("chosen"))
+    return Figure(*3 * (float(score["rms_percent_of_on_off"]),)) if score else None
+
+
+def said(found: Sequence[Move]) -> str:
+    """ "Deposition: 1 of 4 flow errors moved." """
+    moved = sum(move.moved for move in found)
+    return f"Deposition: {moved} of {len(found)} flow errors moved." if found else ""

@@ -1,0 +1,281 @@
+"""Figures of the identification -> what the model may be used for: seven rules, three uses, the verdict in words. No page, no file."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pipeline.report.shared.digits import THIN, band, count, decimals, number, quantity, short
+from pipeline.report.shared.sources import Sources, lookup
+from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, UNDECIDED, Figure, Missing, Question, state
+
+# below this fit a model misses more than half of an output's movement: the size of its error is more than half of the movement's
+LEAST_FIT = 50.0
+
+
+WHITENESS = "Whiteness"
+
+
+class Rule(NamedTuple):
+    """One test of the model: where its picture is, how it ended, the weakest figure, that figure as a sentence, and what to do."""
+
+    name: str
+    place: str
+    state: str
+    figure: str
+    reason: str
+    remedy: str
+
+
+class Trust(NamedTuple):
+    """`state`: passed, failed, open; `uses`: state of each use by the words for it; decision, lead, reason and remedy as the verdict says them."""
+
+    state: str
+    decision: str
+    lead: str
+    reason: str
+    remedy: str
+    rules: tuple[Rule, ...]
+    uses: Mapping[str, str]
+
+
+class Fit(NamedTuple):
+    """One output on the hold-out: fits in percent, simulated and so many steps ahead, and what the last value gives when it is held."""
+
+    name: str
+    simulated: Figure | Missing
+    ahead: Figure | Missing
+    held: Figure | Missing
+
+
+def trust(sources: Sources) -> Trust:
+    """Which uses the model is good for. A use is passed where each rule that it needs is passed."""
+    found, ahead = fits(sources), ahead_words(sources)
+    rules = (
+        _simulation(found),
+        _ahead(found, ahead),
+        _inputs_left(sources),
+        _whiteness(sources),
+        _excitation(sources),
+        _effects(sources),
+        _stability(sources),
+    )
+    simulation, prediction, inputs_left, _, excitation, effects, stability = (rule.state for rule in rules)
+    uses = {
+        "to design controllers": _worst([prediction, inputs_left, excitation, effects, stability]),
+        f"to predict {ahead}": prediction,
+        "to simulate": _worst([simulation, stability]),
+    }
+    # a rule that some use needs comes before one that is only a reservation
+    needed = [rule for rule in rules if rule.name != WHITENESS]
+    first = next(
+        (rule for among in (needed, rules) for wanted in (FAILED, UNDECIDED, OPEN) for rule in among if rule.state == wanted), None
+    )
+    states = list(uses.values())
+    whole = PASSED if states == [PASSED] * 3 else FAILED if FAILED in states else OPEN
+    if first is None:
+        weakest = min((fit for fit in found), key=lambda fit: fit.simulated.value)
+        lead = f"All {count(len(rules), 'rule')} passed;"
+        reason = f"weakest in simulation: {weakest.name}, {percent_of(weakest.simulated)} of at least {LEAST_FIT:g}{THIN}%."
+        return Trust(
+            whole, _decision(uses), lead, reason, "Valid for the range of inputs and temperatures that the record covers.", rules, uses
+        )
+    word = {FAILED: "failed", UNDECIDED: "undecided", OPEN: "open"}[first.state]
+    lead = f"{'First' if whole != PASSED else 'One reservation, the first'} {word} rule: {first.name[:1].lower()}{first.name[1:]}."
+    return Trust(whole, _decision(uses), lead, first.reason, first.remedy, rules, uses)
+
+
+def _worst(states: Sequence[str]) -> str:
+    return next((wanted for wanted in (FAILED, OPEN, UNDECIDED) if wanted in states), PASSED)
+
+
+def _decision(uses: Mapping[str, str]) -> str:
+    good, bad = ([use for use, found in uses.items() if (found == PASSED) == wanted] for wanted in (True, False))
+    if not good:
+        return "Do not trust this model." if FAILED in uses.values() else "Do not trust this model yet."
+    groups = [(word, [use for use in bad if (uses[use] == FAILED) == failed]) for word, failed in (("not", True), ("not yet", False))]
+    return f"Trust this model {_listed(good)}{''.join(f', {word} {_listed(group)}' for word, group in groups if group)}."
+
+
+def _listed(items: Sequence[str]) -> str:
+    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"
+
+
+# ---- the figures
+
+
+def fits(sources: Sources) -> list[Fit]:
+    """Every output's fits on the hold-out."""
+    metrics = sources.metrics["identify_plant"]
+    return [
+        Fit(output.name, *(_fit(metrics, key, output.name) for key in ("fit_holdout", "fit_holdout_ahead", "fit_holdout_held")))
+        for output in sources.declared.machine.outputs
+    ]
+
+
+def _fit(metrics: Any, key: str, name: str) -> Figure | Missing:
+    value = lookup(metrics, f"{key}.{name}")
+    if isinstance(value, Missing):
+        if isinstance(metrics, Missing) or key == "fit_holdout":
+            return value
+        return Missing(
+            "not measured", "no stretch of the hold-out outlasts the start-up of the prediction", "Record longer, or lower ahead_steps"
+        )
+    ends = lookup(metrics, f"{key}_band.{name}")
+    return Figure(value, *([value, value] if isinstance(ends, Missing) else ends))
+
+
+def ahead_words(sources: Sources) -> str:
+    """ "60 s ahead"."""
+    steps = lookup(sources.metrics["identify_plant"], "ahead_steps")
+    return "ahead" if isinstance(steps, Missing) else f"{steps * sources.declared.machine.sample_time_s:g}{THIN}s\u00a0ahead"
+
+
+def percent_of(figure: Figure) -> str:
+    return quantity(figure.value, "%", min(decimals(figure.low, figure.high, value=figure.value), 1))
+
+
+def _with_band(figure: Figure) -> str:
+    places = min(decimals(figure.low, figure.high, value=figure.value), 1)
+    ends = band(figure.low, figure.high, places)
+    return f"{quantity(figure.value, '%', places)}" + (f" ({ends})" if ends else "")
+
+
+def _missing_rule(name: str, place: str, gap: Missing) -> Rule:
+    return Rule(
+        name, place, FAILED if gap.state == FAILED else OPEN, "", gap.reason.rstrip(".") + ".", gap.remedy and gap.remedy.rstrip(".") + "."
+    )
+
+
+# ---- the rules
+
+
+def _simulation(found: Sequence[Fit]) -> Rule:
+    name, place = "Simulation", "holdout"
+    gap = next((fit.simulated for fit in found if isinstance(fit.simulated, Missing)), None)
+    if gap:
+        return _missing_rule(name, place, gap)
+    asked = Question(0, "", "", "%", LEAST_FIT, True, "")
+    ended = _worst([state(asked, fit.simulated) for fit in found])
+    weakest = min((fit for fit in found if state(asked, fit.simulated) == ended), key=lambda fit: fit.simulated.value)
+    figure = weakest.simulated
+    reason = (
+        f"{weakest.name} is simulated with a fit of {_with_band(figure)}; the rule asks for {LEAST_FIT:g}{THIN}%, its mean alone gives 0."
+    )
+    remedy = "Look for an input or a disturbance that is not recorded; where outputs are measured, predict from them instead."
+    return Rule(
+        name, place, ended, f"{weakest.name} {percent_of(figure)}", reason, _longer(figure, LEAST_FIT) if ended == UNDECIDED else remedy
+    )
+
+
+def _longer(figure: Figure, limit: float) -> str:
+    """How long a hold-out would decide: a band shrinks with the root of the samples."""
+    reach = limit - figure.low if figure.value > limit else figure.high - limit
+    away = abs(figure.value - limit)
+    times = math.ceil(((reach + away) / away) ** 2) if away > 0 else math.inf
+    return f"A hold-out {count(times, 'time', 'times')} as long would decide." if times <= 12 else "Only a far longer record would decide."
+
+
+def _ahead(found: Sequence[Fit], words: str) -> Rule:
+    name, place = words[:1].upper() + words[1:], "holdout"
+    gap = next((part for fit in found for part in (fit.ahead, fit.held) if isinstance(part, Missing)), None)
+    if gap:
+        return _missing_rule(name, place, gap)
+    asked = [Question(0, "", "", "%", max(fit.held.value, LEAST_FIT), True, "") for fit in found]
+    states = [state(question, fit.ahead) for question, fit in zip(asked, found, strict=True)]
+    ended = _worst(states)
+    weakest, bar = min(
+        ((fit, question.limit) for fit, question, mine in zip(found, asked, states, strict=True) if mine == ended),
+        key=lambda pair: pair[0].ahead.value - pair[1],
+    )
+    figure, last = weakest.ahead, weakest.held
+    reason = f"{weakest.name} is predicted {words} with a fit of {_with_band(figure)}; holding its last value gives {percent_of(last)}, the rule asks for more, and for {LEAST_FIT:g}{THIN}%."
+    remedy = "Record longer, or ask for fewer steps ahead (identify_plant.ahead_steps)."
+    return Rule(name, place, ended, f"{weakest.name} {percent_of(figure)}", reason, _longer(figure, bar) if ended == UNDECIDED else remedy)
+
+
+def _inputs_left(sources: Sources) -> Rule:
+    name, place = "Inputs used up", "followed"
+    table = sources.tables["residuals"]
+    if isinstance(table, Missing):
+        return _missing_rule(name, place, table)
+    pairs = (table["against"] != table["output"]) & (table["lag"] >= 0)
+    worst, excess = _worst_lag(table, pairs & ~table["passed"])
+    remedy = "Raise the order, or check the dead time of that input."
+    if worst is None:
+        return Rule(name, place, PASSED, f"{count(len(set(table['against'][pairs])), 'input')}", "The errors follow no input.", "")
+    output, against, lag = table["output"][worst], table["against"][worst], int(table["lag"][worst])
+    reason = f"The errors of {output} still follow {against}: correlation {_signed(table['correlation'][worst])} at lag {lag}, {short(excess, 2)} times its 99{THIN}% band."
+    return Rule(name, place, FAILED, f"{output} after {against}", reason, remedy)
+
+
+def _whiteness(sources: Sources) -> Rule:
+    name, place = WHITENESS, "white"
+    table = sources.tables["residuals"]
+    if isinstance(table, Missing):
+        return _missing_rule(name, place, table)
+    mine = (table["against"] == table["output"]) & (table["lag"] > 0)
+    worst, excess = _worst_lag(table, mine & ~table["passed"])
+    if worst is None:
+        return Rule(name, place, PASSED, "noise only", "The errors are noise.", "")
+    output, lag = table["output"][worst], int(table["lag"][worst])
+    reason = f"The one-step errors of {output} are not noise: correlation {_signed(table['correlation'][worst])} at lag {lag}, {short(excess, 2)} times its 99{THIN}% band."
+    remedy = (
+        "The observer could predict better: lengthen the window, or model the disturbance. What the fits measure they measure all the same."
+    )
+    return Rule(name, place, FAILED, f"{output}, lag {lag}", reason, remedy)
+
+
+def _worst_lag(table: Mapping[str, np.ndarray], rows: np.ndarray) -> tuple[int | None, float]:
+    """The row whose correlation leaves its band furthest, and how many bands that is."""
+    if not rows.any():
+        return None, 0.0
+    excess = np.where(rows, np.nan_to_num(np.abs(table["correlation"]) / np.maximum(table["band"], 1e-300)), -1.0)
+    return int(excess.argmax()), float(excess.max())
+
+
+def _signed(value: float) -> str:
+    return ("+" if value > 0 else "") + number(float(value), 2)
+
+
+def _excitation(sources: Sources) -> Rule:
+    name, place = "Excitation", "excitation"
+    metrics = sources.metrics["identify_plant"]
+    rank, full = lookup(metrics, "excitation.rank"), lookup(metrics, "excitation.full")
+    gap = next((part for part in (rank, full) if isinstance(part, Missing)), None)
+    if gap:
+        return _missing_rule(name, place, gap)
+    figure, lags = f"rank {rank} of {full}", lookup(metrics, "excitation.lags")
+    reason = f"The inputs move in {rank} of {full} directions over the window."
+    if rank < full and not isinstance(lags, Missing):
+        weak = [key for key, part in metrics["excitation"]["inputs"].items() if part["rank"] < lags]
+        reason += f" Too poor on its own: {_listed(weak)}." if weak else " Each is rich enough alone, but they move alike."
+    return Rule(
+        name, place, PASSED if rank == full else FAILED, figure, reason, "Move each input with a sequence of its own, at more frequencies."
+    )
+
+
+def _effects(sources: Sources) -> Rule:
+    name, place = "Effects known", "steps"
+    table = sources.tables["dynamics"]
+    if isinstance(table, Missing):
+        return _missing_rule(name, place, table)
+    seen = f"{int(table['seen'].sum())} of {len(table['seen'])}"
+    blind = [i.name for i in sources.declared.machine.inputs if not table["seen"][table["input"] == i.name].any()]
+    if not blind:
+        return Rule(name, place, PASSED, seen, f"The sign of {seen} effects is known, and of each input at least one.", "")
+    reason = f"What {_listed(blind)} does is not known, not even in sign: the bands of the spread hold zero for every output."
+    return Rule(name, place, FAILED, f"{blind[0]}: sign unknown", reason, f"Move {_listed(blind)} more, or longer, and record again.")
+
+
+def _stability(sources: Sources) -> Rule:
+    name, place = "Stability", "poles"
+    radius = lookup(sources.metrics["identify_plant"], "largest_pole")
+    if isinstance(radius, Missing):
+        return _missing_rule(name, place, radius)
+    figure = f"largest pole {number(radius, 4)}"
+    if radius < 1:
+        return Rule(name, place, PASSED, figure, "Every pole lies inside the unit circle.", "")
+    reason = f"The largest pole, {number(radius, 4)}, is not inside the unit circle: simulated far ahead, the model runs away."
+    return Rule(name, place, FAILED, figure, reason, "Record longer, or set identify_plant.refinement to validated.")

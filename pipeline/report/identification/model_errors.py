@@ -1,0 +1,236 @@
+"""The figures of the identification page that show the model's errors: on the hold-out, with themselves, and with the inputs."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from markupsafe import Markup
+
+from pipeline.report.identification.model import Fit, percent_of
+from pipeline.report.shared import charts, page
+from pipeline.report.shared.digits import THIN, count, number, short
+from pipeline.report.shared.pictures import Column, Picture, hole
+from pipeline.report.shared.sources import Sources, Table
+from pipeline.report.shared.verdict import Missing
+
+MOST_INPUTS = 7  # panels in a row of a matrix; a machine with more shows the strongest
+
+
+class Cell(NamedTuple):
+    """A panel of a matrix: what it is, its figure above, its figures below."""
+
+    head: str
+    figure: str
+    panel: Markup
+    foot: str
+
+
+class Room(NamedTuple):
+    """How many panels stand beside one another, and what each of them has in px: four at least, so that few do not grow into posters."""
+
+    across: int
+    width: int
+    height: int
+    css: str
+
+    @property
+    def left(self) -> int:
+        return 34 if self.css == "mb wide" else 28
+
+
+def room(panels: int) -> Room:
+    across = min(max(panels, 4), MOST_INPUTS)
+    width, height = {4: (272, 120), 5: (213, 104), 6: (173, 92), 7: (152, 88)}[across]
+    return Room(across, width, height, "mb wide" if across < 6 else "mb")
+
+
+class Matrix(NamedTuple):
+    """Outputs x inputs, a row of panels for each output; in the place of what cannot be drawn, the reason."""
+
+    id: str
+    title: str
+    finding: str
+    rows: list[tuple[str, list[Cell]]]
+    caption: str
+    origin: Markup
+    across: int
+    missing: Missing | None = None
+
+
+def blank(id: str, title: str, missing: Missing) -> Matrix:
+    return Matrix(id, title, "", [], "", Markup(""), 0, missing)
+
+
+# ---- the hold-out
+
+
+def holdout(sources: Sources, found: Sequence[Fit], ahead: str) -> Picture:
+    """Every output of the hold-out: measured, simulated, and predicted so many steps ahead."""
+    table, title = sources.tables["holdout"], "Measured against simulated, on the part of the record that the model did not see"
+    if isinstance(table, Missing):
+        return hole("holdout", title, table)
+    shown, points = [], max(60, 240 * 10 // max(len(found), 10))
+    for fit in found:
+        parts = [("simulated", fit.simulated), (ahead, fit.ahead)]
+        small = ", ".join(f"{name} {part.state if isinstance(part, Missing) else percent_of(part)}" for name, part in parts)
+        shown.append(Column(fit.name, f"fit: {small}", "", _stretch(sources, table, fit.name, small, points)))
+    segments = len(np.unique(table["segment"]))
+    masked = sum(int((~np.isfinite(table[f"{fit.name}_measured"])).sum()) for fit in found)
+    text = (
+        f"{number(len(table['time_s']), 0)} samples in {count(segments, 'stretch', 'stretches')}, the last part of each; "
+        + (f"{count(masked, 'measured value is', 'measured values are')} masked and not scored." if masked else "none of them masked.")
+        + f" Simulated: the model runs from the inputs alone. {ahead[:1].upper()}{ahead[1:]}: it also knows the outputs until then."
+    )
+    caption = (
+        "Above, °C against time in s, stretches one after the other: grey measured, ink simulated. "
+        f"Below, measured less predicted: ink simulated, grey {ahead}. Vermillion: masked. Upright lines: where a stretch ends."
+    )
+    return Picture("holdout", title, text, shown, caption, page.origin(sources.source("holdout")))
+
+
+def _stretch(sources: Sources, table: Table, name: str, small: str, points: int) -> list[Markup]:
+    step = sources.declared.machine.sample_time_s
+    time = step * np.arange(len(table["segment"]))
+    measured, simulated, ahead = (table[f"{name}_{kind}"] for kind in ("measured", "simulated", "ahead"))
+    values = np.concatenate([measured, simulated])
+    values = values[np.isfinite(values)]
+    y = charts.linear(float(values.min()), float(values.max()), ticks=3) if len(values) else charts.linear(0, 1)
+    x = charts.linear(0, float(time[-1]) or 1.0, ticks=6)
+    above = charts.Frame(x, y, width=568, height=150, left=40, below=4)
+    error = [measured - simulated, measured - ahead]
+    reach = 1.05 * float(np.nanmax(np.abs(error[0]), initial=0.0)) or 1.0
+    below = charts.Frame(x, charts.balanced(reach), width=568, height=96, left=40)
+    ends = np.flatnonzero(np.diff(table["segment"])) + 1
+    masked = charts.stretches(~np.isfinite(measured))
+
+    def drawn(frame: charts.Frame, lines: Sequence[tuple[np.ndarray, str]]) -> list[Markup]:
+        marks = [charts.interval(frame, float(time[a]), float(time[b - 1]), "gone") for a, b in masked[:200]]
+        marks += [charts.interval(frame, float(time[at]), float(time[at]), "end") for at in ends[:100]]
+        # a line breaks where one stretch ends and another begins
+        return marks + [
+            charts.line(frame, np.insert(time, ends, time[ends]), np.insert(v, ends, np.nan), css, most=points) for v, css in lines
+        ]
+
+    alt = f"{name} on the hold-out: fit {small}; {count(int((~np.isfinite(measured)).sum()), 'sample')} masked"
+    size, late = (float(np.sqrt(np.nanmean(part**2))) if np.isfinite(part).any() else np.nan for part in error)
+    said = f"{name}: error of simulation {short(size, 2)} °C r.m.s., ahead " + (
+        f"{short(late, 2)} °C" if np.isfinite(late) else "not measured"
+    )
+    return [
+        charts.panel(
+            above,
+            drawn(above, [(measured, "line seen"), (simulated, "line thin")]),
+            alt=alt,
+            css="mb wide",
+            title="°C",
+            x_ticks=False,
+            units=("s", "°C"),
+        ),
+        charts.panel(
+            below,
+            drawn(below, [(error[1], "line seen"), (error[0], "line thin")]),
+            alt=said,
+            css="mb wide",
+            title="error, °C",
+            units=("s", "°C"),
+        ),
+    ]
+
+
+# ---- residuals
+
+
+def whiteness(sources: Sources) -> Picture:
+    """Autocorrelation of the one-step errors of each output, with its 99 % band."""
+    table, title = sources.tables["residuals"], "What the model leaves over: is it noise?"
+    if isinstance(table, Missing):
+        return hole("white", title, table)
+    names = [output.name for output in sources.declared.machine.outputs]
+    mine = {name: (table["output"] == name) & (table["against"] == name) & (table["lag"] > 0) for name in names}
+    y = _correlations(table, np.any(list(mine.values()), axis=0))
+    shown = []
+    for name in names:
+        passed = bool(table["passed"][mine[name]].all())
+        panel = _stems(table, mine[name], y, room(len(names)), f"{name}, errors with themselves")
+        shown.append(Column(name, "passed: noise" if passed else "failed: not noise", "", [panel]))
+    bad = [name for name in names if not table["passed"][mine[name]].all()]
+    text = (
+        "Yes: the one-step errors of every output are noise, by Ljung and Box’s test at 99 %."
+        if not bad
+        else f"Not for {', '.join(bad)}: the next error can be told in part from the ones before, so the observer could do better."
+    )
+    caption = f"Autocorrelation of the one-step errors on the hold-out against lag in samples. Grey: the 99{THIN}% band; one lag in a hundred may leave it by chance. Vermillion: lags outside where the test failed."
+    return Picture("white", title, text, shown, caption, page.origin(sources.source("residuals")))
+
+
+def cross(sources: Sources) -> Matrix:
+    """Correlation of each output's one-step errors with each input."""
+    table, title = sources.tables["residuals"], "Do the errors still follow an input?"
+    if isinstance(table, Missing):
+        return blank("followed", title, table)
+    other, size = table["against"] != table["output"], room(len(sources.declared.machine.inputs))
+    y = _correlations(table, other)
+    strength = np.nan_to_num(np.abs(table["correlation"]) / np.maximum(table["band"], 1e-300))
+
+    def cell(output: str, name: str) -> tuple[float, Callable[[], Cell]]:
+        mine = other & (table["output"] == output) & (table["against"] == name)
+        passed = bool(table["passed"][mine].all())
+
+        def draw() -> Cell:
+            return Cell(name, "" if passed else "failed", _stems(table, mine, y, size, f"{output} after {name}"), "")
+
+        return float(strength[mine & (table["lag"] >= 0)].max(initial=0)), draw
+
+    rows, more = matrix(sources, cell)
+    failed = sorted(
+        {
+            (str(o), str(a))
+            for o, a in zip(table["output"][other & ~table["passed"]], table["against"][other & ~table["passed"]], strict=True)
+        }
+    )
+    said = ", ".join(f"{output} after {name}" for output, name in failed[:6]) + (f" and {len(failed) - 6} more" if len(failed) > 6 else "")
+    text = f"Yes: {said}. There the model misses something that an input does." if failed else "No: what the inputs do, the model explains."
+    caption = (
+        f"Correlation of the one-step errors with the input, lag in samples; right of zero the input came first. Grey: the 99{THIN}% band of a single lag; "
+        f"the test widens it for the number of lags. Left of zero, pale: feedback from errors to inputs, no fault of the model.{more}"
+    )
+    return Matrix("followed", title, text, rows, caption, page.origin(sources.source("residuals")), size.across)
+
+
+def _correlations(table: Table, rows: np.ndarray) -> charts.Axis:
+    """One scale for all panels: the largest correlation, or three bands."""
+    largest = np.nan_to_num(np.abs(table["correlation"][rows])).max(initial=0.0)
+    reach = min(max(1.1 * float(largest), 2.0 * float(table["band"][rows].max(initial=0.0)), 1e-3), 1.0)
+    return charts.balanced(reach)
+
+
+def _stems(table: Table, rows: np.ndarray, y: charts.Axis, size: Room, name: str) -> Markup:
+    lag, value, limit = table["lag"][rows], table["correlation"][rows], float(table["band"][rows][0])
+    ends = dict.fromkeys((float(lag.min()), float(max(lag.min(), 0)), float(lag.max())))
+    frame = charts.Frame(
+        charts.Axis(float(lag.min()) - 1, float(lag.max()) + 1, tuple((k, number(k, 0)) for k in ends)), y,
+        width=size.width, height=size.height, left=size.left, above=6,
+    )  # fmt: skip
+    # a lag outside of the band is marked only where the test over all lags failed: one in a hundred leaves it by chance
+    outside, judged = np.abs(np.nan_to_num(value)) > limit, lag >= 0
+    marked = outside & ~table["passed"][rows]
+    layers = [charts.tint(frame, -limit, limit), charts.level(frame, 0.0, "tk")]
+    layers += [
+        charts.stems(frame, lag[part], value[part], css)
+        for part, css in ((judged & ~marked, "stem"), (judged & marked, "stem bad"), (~judged, "stem pale"))
+    ]
+    worst = int(np.abs(np.nan_to_num(np.where(judged, value, 0.0))).argmax())
+    alt = f"{name}: {int((outside & judged).sum())} of {int(judged.sum())} lags outside of ±{number(limit, 2)}, most {number(float(np.nan_to_num(value[worst])), 2)} at lag {int(lag[worst])}"
+    return charts.panel(frame, layers, alt=alt, css=size.css, units=("samples", ""))
+
+
+def matrix(sources: Sources, cell: Callable[[str, str], tuple[float, Callable[[], Cell]]]) -> tuple[list[tuple[str, list[Cell]]], str]:
+    """Rows of cells; where the machine has many inputs, of each output the strongest ones, in their order."""
+    machine = sources.declared.machine
+    rows = []
+    for output in machine.outputs:
+        cells = [cell(output.name, i.name) for i in machine.inputs]
+        kept = sorted(sorted(range(len(cells)), key=lambda k: -cells[k][0])[:MOST_INPUTS])
+        rows.append((output.name, [cells[k][1]() for k in kept]))
+    left = len(machine.inputs) - MOST_INPUTS
+    return rows, f" Of {len(machine.inputs)} inputs the {MOST_INPUTS} strongest of each output are shown." if left > 0 else ""

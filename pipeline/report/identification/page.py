@@ -1,0 +1,250 @@
+"""The page of the identification: what the model may be used for, every output's fits, what to do, the pictures behind it, and what the record lost on the way."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from pipeline.report.identification import model_dynamics, model_errors
+from pipeline.report.identification.model import LEAST_FIT, Fit, Trust, ahead_words, fits, trust
+from pipeline.report.index import page as index_page
+from pipeline.report.shared import charts, page, words
+from pipeline.report.shared.digits import MINUS, THIN, band, count, decimals, number, short
+from pipeline.report.shared.sources import Sources, lookup
+from pipeline.report.shared.verdict import FAILED, PASSED, UNDECIDED, Figure, Missing, Question, state
+
+WORDS = (
+    "trusted",
+    "fit",
+    "simulation",
+    "ahead",
+    "held",
+    "holdout",
+    "fit_band",
+    "whiteness",
+    "inputs_left",
+    "excitation",
+    "identified_spread",
+    "accepted",
+)
+
+
+def render(sources: Sources) -> str:
+    """The text of identification.html."""
+    found, judged, ahead = fits(sources), trust(sources), ahead_words(sources)
+    return page.render(
+        "identification.html",
+        here="identification",
+        title=f"Identification: {judged.decision.rstrip('.')}",
+        trust=judged,
+        ahead=ahead[:1].upper() + ahead[1:],
+        answers=[answer(sources, fit, ahead) for fit in found],
+        judged_on=_judged_on(sources),
+        advice=advice(sources, judged),
+        holdout=model_errors.holdout(sources, found, ahead),
+        white=model_errors.whiteness(sources),
+        cross=model_errors.cross(sources),
+        steps=model_dynamics.steps(sources),
+        order=model_dynamics.order(sources),
+        candidates=candidates(sources),
+        poles=model_dynamics.poles(sources),
+        pole_rows=model_dynamics.pole_table(sources),
+        excitation=model_dynamics.excitation(sources),
+        losses=losses(sources),
+        used=used(sources),
+        from_metrics=sources.source("identify_plant", "holdout", "residuals"),
+        from_record=sources.source("record", "quality", "ingest", "identify_plant"),
+        words=words.chosen(sources, WORDS),
+        sources=list(sources.read.values()),
+        absent=sources.absent,
+        hashes=index_page.hashes(sources),
+    )
+
+
+def _judged_on(sources: Sources) -> str:
+    metrics, share = sources.metrics["identify_plant"], sources.declared.everything.get("identify_plant", {}).get("holdout_share")
+    held, samples = lookup(metrics, "samples_holdout"), lookup(metrics, "samples")
+    if isinstance(held, Missing) or isinstance(samples, Missing) or share is None:
+        return ""
+    return (
+        f"Judged on the last {100 * share:g}{THIN}% of every stretch, {number(held, 0)} of {number(samples, 0)} samples, by the model of the rest. "
+        "The model that is handed on was then fitted to all of them, with the same choices."
+    )
+
+
+# ---- a row for each output
+
+
+def answer(sources: Sources, fit: Fit, ahead: str) -> dict[str, Any]:
+    """Fits with bands, the yardstick, the share that is missed as a strip, what the residuals say, and the change since the accepted run."""
+    question = Question(0, "", fit.name, "%", LEAST_FIT, True, "")
+    bar = fit.held if isinstance(fit.held, Missing) else Question(0, "", fit.name, "%", max(fit.held.value, LEAST_FIT), True, "")
+    states = [state(question, fit.simulated), fit.ahead.state if isinstance(bar, Missing) else state(bar, fit.ahead)]
+    shown = [
+        ("Simulation", "mb", _missed(fit.simulated)),
+        (ahead, "mb hollow", _missed(fit.ahead)),
+        ("Holding the last value", "acc", _missed(fit.held)),
+    ]
+    before = _accepted(sources, fit.name)
+    change, moved = since(before, fit.simulated)
+    return {
+        "name": fit.name,
+        "note": _residual_note(sources, fit.name),
+        "state": next(
+            (wanted for wanted in (FAILED, UNDECIDED) if wanted in states), PASSED if states == [PASSED, PASSED] else "not measured"
+        ),
+        "cells": [
+            {
+                "css": css,
+                "name": name,
+                "state": found.replace(" ", "-"),
+                "missing": part if isinstance(part, Missing) else None,
+                **_value(part),
+            }
+            for css, name, part, found in (
+                ("dd", "Simulation", fit.simulated, states[0]),
+                ("mb", ahead[:1].upper() + ahead[1:], fit.ahead, states[1]),
+            )
+        ],
+        "held": _value(fit.held)["value"],
+        "strip": charts.strip(Question(0, "", fit.name, "%", 100 - LEAST_FIT, False, ""), shown, (11, 23, 23)),
+        "change": change,
+        "moved": moved,
+    }
+
+
+def _value(figure: Figure | Missing) -> dict[str, str]:
+    if isinstance(figure, Missing):
+        return {"value": figure.state, "band": ""}
+    places = min(decimals(figure.low, figure.high, value=figure.value), 1)
+    return {"value": f"{number(figure.value, places)}{THIN}%", "band": band(figure.low, figure.high, places)}
+
+
+def _missed(figure: Figure | Missing) -> Figure | Missing:
+    """The share of the movement that the fit misses; none is 0, the mean misses 100 %."""
+    return figure if isinstance(figure, Missing) else Figure(100 - figure.value, 100 - figure.high, 100 - figure.low)
+
+
+def _residual_note(sources: Sources, name: str) -> str:
+    table = sources.tables["residuals"]
+    if isinstance(table, Missing):
+        return "residuals not measured"
+    failed = table["against"][(table["output"] == name) & ~table["passed"]]
+    left = sorted({str(a) for a in failed} - {name})
+    parts = ["errors not noise"] * (name in failed) + (
+        [f"{left[0]}{f' and {len(left) - 1} more' if left[1:] else ''} left in them"] if left else []
+    )
+    return "; ".join(parts) or "errors are noise"
+
+
+def _accepted(sources: Sources, name: str) -> Figure | None:
+    before = sources.accepted
+    if before is None or isinstance(before, Missing):
+        return None
+    value, ends = (lookup(before, f"metrics.identify_plant.{key}.{name}") for key in ("fit_holdout", "fit_holdout_band"))
+    return None if isinstance(value, Missing) else Figure(value, *([value, value] if isinstance(ends, Missing) else ends))
+
+
+def since(before: Figure | None, now: Figure | Missing) -> tuple[str, bool]:
+    """The change of a fit in points and whether it is beyond the bands of both runs."""
+    if isinstance(now, Missing):
+        return now.state, False
+    if before is None:
+        return "first run", False
+    if math.isclose(before.value, now.value, rel_tol=1e-6):
+        return f"unchanged, {_value(before)['value']}", False
+    if before.low <= now.high and now.low <= before.high:
+        return f"within noise of {_value(before)['value']}", False
+    change = now.value - before.value
+    return f"{'+' if change > 0 else MINUS}{number(abs(change), 1)} points · {'better' if change > 0 else 'worse'}", True
+
+
+# ---- what to do
+
+
+def advice(sources: Sources, judged: Trust) -> list[str]:
+    """The identification's own sentences, then the remedies of rules that they do not speak of."""
+    found = lookup(sources.metrics["identify_plant"], "advice")
+    said = [] if isinstance(found, Missing) else [_sentence(text) for text in found]
+    spoken = {"Inputs used up", "Whiteness", "Excitation"} if said else set()
+    spoken |= {"Simulation"} if any("hold-out fit" in text for text in said) else set()
+    said += [f"{rule.name}: {rule.remedy}" for rule in judged.rules if rule.state != PASSED and rule.remedy and rule.name not in spoken]
+    notes = lookup(sources.metrics["identify_plant"], "notes")
+    return said + ([] if isinstance(notes, Missing) else [f"Noted while fitting: {text}." for text in dict.fromkeys(notes)])
+
+
+def _sentence(text: str) -> str:
+    text = text.strip().rstrip(".").replace(" -", f" {MINUS}")
+    return f"{text[:1].upper()}{text[1:]}."
+
+
+# ---- tables
+
+
+def candidates(sources: Sources) -> list[dict[str, Any]]:
+    """The order table with its rule: what each order keeps, costs and leaves unexplained."""
+    table = sources.tables["order"]
+    if isinstance(table, Missing):
+        return []
+    tried = np.isfinite(table["error"])
+    chosen = int(table["order"][table["chosen"]][0]) if table["chosen"].any() else 0
+    last = max(chosen + 3, int(table["order"][tried].max()) if tried.any() else 0)
+    best = float(table["error"][tried].min()) if tried.any() else np.nan
+    rows = []
+    for k in np.flatnonzero(table["order"] <= last):
+        error, value, edge = (float(table[name][k]) for name in ("error", "singular_value", "noise_edge"))
+        above = 100 * (error / best - 1) if best > 0 else 0.0
+        rows.append(
+            {
+                "order": int(table["order"][k]),
+                "chosen": bool(table["chosen"][k]),
+                "value": short(value, 3),
+                "parameters": number(float(table["parameters"][k]), 0) if tried[k] else "",
+                "error": f"{number(100 * error, 2)}{THIN}%" if tried[k] else "not tried" if value > edge else "within noise",
+                "above": "" if not tried[k] else "the best" if above == 0 else f"{short(above, 2)}{THIN}%",
+            }
+        )
+    return rows
+
+
+def losses(sources: Sources) -> dict[str, Any]:
+    """For each signal: samples, how many are masked, and what was flagged."""
+    table = sources.tables["record"]
+    if isinstance(table, Missing):
+        return {"missing": table, "rows": []}
+    flags = lookup(sources.metrics["ingest"], "findings")
+    rows = []
+    for signal in [*sources.declared.machine.inputs, *sources.declared.machine.outputs]:
+        masked, total = int(table[f"{signal.name}_masked"].sum()), len(table["time_s"])
+        mine = {} if isinstance(flags, Missing) else flags.get(signal.name, {})
+        rows.append(
+            {
+                "name": signal.name,
+                "samples": number(total, 0),
+                "masked": f"{number(masked, 0)}{f' ({short(100 * masked / total, 2)}{THIN}%)' if masked else ''}",
+                "bad": masked > 0.1 * total,
+                "flags": ", ".join(f"{kind} {number(number_of, 0)}" for kind, number_of in mine.items())
+                or ("not measured" if isinstance(flags, Missing) else "none"),
+            }
+        )
+    return {"missing": None, "rows": rows}
+
+
+def used(sources: Sources) -> list[tuple[str, str]]:
+    """What became of the samples between the recordings and the fit."""
+    ingested, found = sources.metrics["ingest"], sources.metrics["identify_plant"]
+    items = (
+        (ingested, "recordings", "Recordings read"),
+        (ingested, "quarantined", "Recordings quarantined, not used"),
+        (ingested, "segments", "Stretches without a gap"),
+        (found, "samples", "Samples of the record"),
+        (found, "samples_cut", "Cut out: an input masked, or no output at all"),
+        (found, "samples_holdout", "Held out to judge"),
+        (found, "rows", "Rows of the regression"),
+        (found, "dropped_rows", "Rows left out: their window touches a masked sample"),
+        (found, "past", "Window, in samples"),
+    )
+    rows = [(title, value.state if isinstance(value := lookup(data, key), Missing) else number(value, 0)) for data, key, title in items]
+    delays = lookup(found, "delays")
+    late = [] if isinstance(delays, Missing) else [f"{name} {count(steps, 'sample')}" for name, steps in delays.items() if steps]
+    return [*rows, ("Dead time found", ", ".join(late) or ("not measured" if isinstance(delays, Missing) else "none beyond one sample"))]

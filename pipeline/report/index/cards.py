@@ -1,0 +1,328 @@
+"""A card a loop: the winner in words, three small multiples on one scale, three figures. A loop that is not measured keeps its frame."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from pipeline.report.deposition import rules as deposition_rules
+from pipeline.report.deposition import verdict as deposition_verdict
+from pipeline.report.identification.model import trust
+from pipeline.report.shared import charts, page
+from pipeline.report.shared.digits import decimals, number, percent, quantity, shortened
+from pipeline.report.shared.sources import Sources, Table
+from pipeline.report.shared.verdict import FAILED, OPEN, ROLES, UNDECIDED, Figure, Missing, Question, outcomes, row_places, state
+from pipeline.report.temperature.answers import CONTROLLERS, LABELS, featured
+from pipeline.report.temperature.judgement import NAMES, Judgement
+
+# composer of the deposition loop -> its place in the card
+ROLE = {"basis": "data_driven", "priority": "model_based", "superposition": "model_based", "on_off": "baseline"}
+
+
+def temperature(sources: Sources, judged: Judgement) -> dict[str, Any]:
+    order = ("model_based", "data_driven", "baseline")
+    answers, rules = judged.roles, sources.declared.rules
+    rows = []
+    for key in ("settled_error_degC", "gap_percent", "settling_s"):
+        question = next(q for q in judged.asked if q.key == key)
+        rows.append({"title": question.title, "cells": _card_cells(question, [answers[role][key] for role in order])})
+    kernel = judged.by_name.get("kernel", {}).get("gap_percent")
+    return {
+        "id": "temperature",
+        "name": "Temperature",
+        "link": "temperature.html",
+        "moves": "Heaters and motor to barrel temperatures",
+        "state": f"Run {ROLES[judged.verdict.winner]}" if judged.verdict.winner else "Run none of them",
+        "mark": judged.verdict.winner,
+        "win": _win(judged),
+        "caption": (
+            f"Worst zone’s true error over {_SPAN} s, log scale {_FLOOR:g} to {number(_CEILING, 0)}\u00a0°C: "
+            f"{featured(sources)}. Grey: what the rule allows once settled."
+        ),
+        "panels": [_spark(sources, judged, role, limit=rules.settled_error_degC, named=i == 0) for i, role in enumerate(order)],
+        "heads": [{"mark": role, "name": LABELS[CONTROLLERS[role]][0], "method": LABELS[CONTROLLERS[role]][1]} for role in order],
+        "rows": rows,
+        "note": _kernel_note(kernel, sources),
+        "model": trust(sources),
+        "sources": sources.source("evaluate_temperature", "scorecard", "trajectories"),
+        "missing": None,
+    }
+
+
+def _card_cells(question: Question, figures: Sequence[Figure | Missing]) -> list[dict[str, Any]]:
+    places = row_places(question, figures[:2])
+    values = [f.value if isinstance(f, Figure) else math.inf for f in figures]
+    best = min(values)
+    cells = []
+    for figure, value in zip(figures, values, strict=True):
+        if isinstance(figure, Missing):
+            cells.append({"text": figure.state, "best": False, "bad": False})
+            continue
+        mine = min(places, decimals(0, 0, value=value)) if math.isfinite(value) else places
+        text = quantity(value, question.unit, mine, beyond=question.beyond)
+        cells.append(
+            {
+                "text": text,
+                "best": text == quantity(best, question.unit, mine) and math.isfinite(best),
+                "bad": state(question, figure) == FAILED,
+            }
+        )
+    return cells
+
+
+def _win(judged: Judgement) -> tuple[str, str]:
+    """The winner in words, with its figure and its price."""
+    best = judged.verdict.winner
+    settled = next(q for q in judged.asked if q.key == "settled_error_degC")
+    if best is None:
+        return "No controller wins.", "Not one of them passes its rules."
+    mine = judged.roles[best]["settled_error_degC"]
+    places = row_places(settled, [mine])
+    holds = f"It holds every zone within {quantity(mine.high, '°C', places)} of its reference."
+    others = []
+    for role in ("data_driven", "model_based", "baseline"):
+        if role != best:
+            failed = [o for o in outcomes(judged.asked, judged.roles[role]) if o.state in (FAILED, UNDECIDED, OPEN) and o.rule != "drift"]
+            if failed and failed[0].question:
+                others.append(
+                    f"{NAMES[role]} {'fails' if failed[0].state == FAILED else 'is open'} on {_on(failed[0].question, judged.roles[role])}."
+                )
+            else:
+                others.append(f"{NAMES[role]} passes too.")
+    return f"{'The b' if best == 'baseline' else NAMES[best][:1]}{'aseline' if best == 'baseline' else NAMES[best][1:]} wins.", " ".join(
+        [holds, *others]
+    )
+
+
+def _on(question: Question, answers: Mapping[str, Figure | Missing]) -> str:
+    figure = answers[question.key]
+    name = {"worst_case_gap_percent": "its worst plant", "gap_percent": "the gap", "data": "data"}.get(
+        question.key, question.title[:1].lower() + question.title[1:]
+    )
+    if isinstance(figure, Missing):
+        return f"{name}, {figure.state}"
+    places = min(decimals(figure.low, figure.high, value=figure.value), 2)
+    return (
+        f"{name}: {quantity(figure.value, question.unit, places, beyond=question.beyond)} of "
+        f"{quantity(question.limit, question.unit, 0 if question.limit >= 10 else places)}"
+    )
+
+
+_SPAN, _FLOOR, _CEILING = 60, 0.01, 300.0
+
+
+def _spark(sources: Sources, judged: Judgement, role: str, *, limit: float, named: bool) -> Markup:
+    table = sources.tables["trajectories"]
+    figure = judged.roles[role]["settled_error_degC"]
+    error = _worst_error(sources, table, CONTROLLERS[role])
+    if isinstance(error, Missing):
+        return Markup('<div class="hole">{}</div>').format(page.missing(error))
+    time, values = error
+    said = "not judged" if isinstance(figure, Missing) else f"settled error {quantity(figure.value, '°C', 3)}"
+    alt = (
+        f"{ROLES[role].capitalize()}: worst zone {number(float(values[-1]), 2)} °C from its reference "
+        f"after {number(float(time[-1]), 0)} s, {'above' if values[-1] > limit else 'below'} the {limit:g} "
+        f"°C limit; {said}"
+    )
+    return charts.spark(
+        time,
+        values,
+        charts.logarithmic(_FLOOR, _CEILING)._replace(low=_FLOOR, high=_CEILING),
+        css=page.MARKS[role],
+        limit=limit,
+        alt=alt,
+        named=named,
+        bad=values[-1] > limit,
+        limit_label=f"limit {limit:g}",
+        units=("s", "°C"),
+    )
+
+
+def _worst_error(sources: Sources, table: Table | Missing, name: str) -> tuple[np.ndarray, np.ndarray] | Missing:
+    if isinstance(table, Missing):
+        return table
+    rows = (table["controller"] == name) & (table["mode"] == "deployed")
+    if not rows.any():
+        return Missing("not measured", f"no trajectory of {name}")
+    offset = sources.declared.panel.judging.reference_offsets_degC[0]
+    errors = np.stack([np.abs(table[o.name][rows] - o.reference - offset) for o in sources.declared.machine.outputs])
+    time = table["time_s"][rows]
+    return time[time <= _SPAN], errors.max(axis=0)[time <= _SPAN]
+
+
+def _kernel_note(gap: Figure | Missing | None, sources: Sources) -> str:
+    noise = (
+        "Simulated plants on which nothing was fitted."
+        if sources.declared.everything.get("generate_probing", {}).get("source") == "simulated"
+        else "Judged on plants of the identified spread."
+    )
+    if isinstance(gap, Figure):
+        return (
+            "Algorithm 2’s kernel, learned from the same record, costs "
+            f"{quantity(gap.value, '%', decimals(gap.low, gap.high, value=gap.value))} more than the optimum: "
+            f"see the temperature page. {noise}"
+        )
+    learned = sources.metrics["learn_kernel"]
+    refused = learned.get("refused") if isinstance(learned, dict) else None
+    return f"Algorithm 2’s kernel failed: {refused}" if refused else f"Algorithm 2’s kernel: not measured. {noise}"
+
+
+def deposition(sources: Sources) -> dict[str, Any]:
+    """In this loop's terms: model-based is the paper's law and its library by priority, data-driven our law and the basis functions, baseline on-off control."""
+    judged, found = deposition_verdict.verdict(sources), deposition_rules.structures(sources)
+    if isinstance(found, Missing):
+        return unbuilt("deposition", found.sentence()) | {"link": "deposition.html"}
+    parts = list(dict.fromkeys(one.part for one in found))
+    # the parts on which the library fares worst say most
+    parts.sort(
+        key=lambda part: -max((one.scores["priority"].error for one in found if one.part == part and "priority" in one.scores), default=0.0)
+    )
+    names = ("priority", "basis", "on_off")
+    rows = [
+        {
+            "title": f"Flow error, {shortened(part, 30)}",
+            "cells": _worst(
+                [[one.scores[name].error for one in found if one.part == part and name in one.scores] for name in names],
+                sources.declared.rules.flow_error_percent,
+            ),
+        }
+        for part in parts[:2]
+    ]
+    lines = [
+        [one.scores[name].worst_line for one in found if name in one.scores and one.scores[name].worst_line is not None] for name in names
+    ]
+    rows.append({"title": "Worst line’s volume", "cells": _worst(lines, sources.declared.rules.line_volume_percent)})
+    role = ROLE.get(judged.composer)
+    trials = [_learned(sources, law) for law in ("paper", "ours", "")]
+    return {
+        "id": "deposition",
+        "name": "Deposition",
+        "link": "deposition.html",
+        "moves": "Plunger command to flow at the nozzle",
+        "state": f"Run {ROLES[role]}" if judged.state == deposition_verdict.PASSED else "Do not print yet",
+        "mark": role if judged.state == deposition_verdict.PASSED else None,
+        "win": _deposition_win(found, judged, role),
+        "caption": "Error while learning, in % of on\u2011off control’s, log scale 0.3 to 200\u00a0%, the worse material: the paper’s law, ours, none. Grey: what is asked for.",
+        "panels": [
+            _learning_spark(curve, css, sources.declared.rules.learned_percent, named=i == 1)
+            for i, (curve, css) in enumerate(zip(trials, ("mb", "dd", "bl"), strict=True))
+        ],
+        "heads": [
+            {"mark": key, "name": LABELS[CONTROLLERS[key]][0], "method": method}
+            for key, method in (
+                ("model_based", "library + priority"),
+                ("data_driven", "basis functions"),
+                ("baseline", "on\u2011off control"),
+            )
+        ],
+        "rows": rows,
+        "note": "Forecasts of the identified machine: the true flow of a real one is not known."
+        if judged.real
+        else "Judged by the true flow of simulated machines that nothing was fitted to.",
+        "model": None,
+        "sources": sources.source("scores", "trials"),
+        "missing": None,
+    }
+
+
+def _deposition_win(found: Sequence[deposition_rules.Structure], judged: deposition_verdict.Verdict, role: str | None) -> tuple[str, str]:
+    if judged.state != deposition_verdict.PASSED or role is None:
+        return judged.lead or judged.decision, judged.reason
+    name = "The baseline" if role == "baseline" else NAMES[role]
+    mine, _ = deposition_rules.worst(found, judged.composer) or (0.0, None)
+    other = deposition_rules.worst(found, "priority" if judged.composer == "basis" else "basis")
+    beside = (
+        f" {deposition_rules.USE['priority' if judged.composer == 'basis' else 'basis'].capitalize()}: {percent(other[0], 2)}."
+        if other
+        else ""
+    )
+    price = judged.price.split(". ")[0].rstrip(".")
+    return (
+        f"{name} wins.",
+        f"{deposition_rules.NAMES[judged.composer]}: at most {percent(mine, 2)} of on\u2011off control’s flow error on any part.{beside} {price}."
+        if price
+        else "",
+    )
+
+
+def _worst(groups: Sequence[Sequence[float]], limit: float) -> list[dict[str, Any]]:
+    """A cell for each group: its largest value, the least of all bold."""
+    values = [max(group) if group else math.inf for group in groups]
+    least = min(values)
+    return [
+        {
+            "text": percent(value, 2) if math.isfinite(value) else "not measured",
+            "best": value == least and math.isfinite(value),
+            "bad": limit < value < math.inf,
+        }
+        for value in values
+    ]
+
+
+def _learned(sources: Sources, law: str) -> np.ndarray | Missing:
+    """The larger of the materials' errors after each trial of the reference routine, in % of trial 0's; on-off control learns nothing."""
+    table = sources.tables["trials"]
+    if isinstance(table, Missing):
+        return table
+    if not law:
+        return np.full(2, 100.0)
+    law = law if (table["law"] == law).any() else "pixels"
+    rows = (table["law"] == law) & (table["routine"] == 0)
+    if not rows.any():
+        return Missing("not measured", "this law was not run")
+    return np.array([100 * float(table["ratio"][rows & (table["trial"] == j)].max()) for j in sorted(set(table["trial"][rows].tolist()))])
+
+
+def _learning_spark(curve: np.ndarray | Missing, css: str, limit: float, *, named: bool) -> Markup:
+    if isinstance(curve, Missing):
+        return Markup('<div class="hole">{}</div>').format(page.missing(curve))
+    curve = curve if len(curve) > 1 else np.repeat(curve, 2)
+    bad = bool(curve[-1] > limit)
+    alt = f"{'On-off control learns nothing' if css == 'bl' else f'The error ends at {percent(float(curve[-1]), 2)} of trial 0’s after {len(curve) - 1} trials'}, {'above' if bad else 'below'} the {limit:g} % asked for"
+    return charts.spark(
+        np.arange(float(len(curve))),
+        curve,
+        charts.logarithmic(0.3, 200.0)._replace(low=0.3, high=200.0),
+        css=css,
+        limit=limit,
+        alt=alt,
+        named=named,
+        bad=bad,
+        limit_label=f"learned to {limit:g}",
+        units=("trials", "%"),
+    )
+
+
+def unbuilt(key: str, why: str) -> dict[str, Any]:
+    """A loop without figures: the same frame, and the sentence in it."""
+    heads = {
+        "deposition": ("Deposition", "Plunger command to flow at the nozzle", ("library + priority", "basis functions", "on-off control")),
+        "setpoint": (
+            "Setpoint",
+            "Nozzle camera to flow and temperature setpoints",
+            ("Bayes filter", "Q-learning agent", "proportional"),
+        ),
+    }
+    name, moved, methods = heads[key]
+    order = ("model_based", "data_driven", "baseline")
+    return {
+        "id": key,
+        "name": name,
+        "link": "",
+        "moves": moved,
+        "state": "Not measured",
+        "mark": None,
+        "win": ("Not measured.", why),
+        "caption": "Nothing is shown before it is measured.",
+        "panels": [Markup('<div class="hole">{}not measured</div>').format(page.glyph(OPEN)) for _ in order],
+        "heads": [
+            {"mark": role, "name": LABELS[CONTROLLERS[role]][0], "method": method} for role, method in zip(order, methods, strict=True)
+        ],
+        "rows": [],
+        "note": "No figure, so no claim.",
+        "model": None,
+        "sources": [],
+        "missing": True,
+    }

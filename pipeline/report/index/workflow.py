@@ -1,0 +1,127 @@
+"""The stages and what each reads of the others, drawn with what is the same as in the accepted run, and what was made anew."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from markupsafe import Markup
+
+from pipeline.report.shared import page
+from pipeline.report.shared.digits import count
+from pipeline.report.shared.sources import Sources
+from pipeline.report.shared.verdict import Missing
+
+# stage -> stages that it reads, in the order of their lanes; tests hold it against dvc.yaml
+READS: dict[str, tuple[str, ...]] = {
+    "generate_probing": (),
+    "ingest": ("generate_probing",),
+    "identify_plant": ("ingest",),
+    "tune_weights": ("identify_plant",),
+    "learn_kernel": ("ingest",),
+    "evaluate_temperature": ("identify_plant", "learn_kernel", "tune_weights"),
+    "train_ilc": (),
+    "segment_library": ("train_ilc",),
+    "compose_parts": ("segment_library", "train_ilc"),
+    "train_classifier": (),
+    "train_agent": ("train_classifier",),
+    "evaluate_setpoint": ("train_classifier", "train_agent"),
+}
+SAME, CHANGED, GONE, FIRST = "as accepted", "made anew", "not there", "first run"
+CSS = {SAME: "same", CHANGED: "anew", GONE: "lost", FIRST: "same"}
+WIDE, TALL, ACROSS, DOWN = 170, 40, 46, 18
+
+
+def figure(sources: Sources) -> dict[str, Any]:
+    """Finding, picture, and what both are from."""
+    states = {stage: state(sources, stage) for stage in READS}
+    groups = [(word, [stage for stage, found in states.items() if found == word]) for word in (CHANGED, GONE, SAME, FIRST)]
+    said = "; ".join(f"{word}: {', '.join(names)}" for word, names in groups if names)
+    alt = f"{len(states)} stages. {said[:1].upper()}{said[1:]}"
+    return {"finding": _finding(states), "picture": _drawn(states, alt), "origin": page.origin(sources.source("accepted", *READS))}
+
+
+def state(sources: Sources, stage: str) -> str:
+    """As accepted: figures and all artifacts that the pages read are the same to the byte, whether they were reused or made again."""
+    if isinstance(sources.metrics.get(stage), Missing) or any(path.startswith(f"datasets/{stage}/") for path in sources.absent):
+        return GONE
+    before = sources.accepted
+    if before is None or isinstance(before, Missing):
+        return FIRST
+    mine = {path: source.sha256 for path, source in sources.read.items() if path.startswith(f"datasets/{stage}/")}
+    hashes = before.get("hashes") or {}
+    equal = all(hashes.get(path) == value for path, value in mine.items())
+    return SAME if equal and (before.get("metrics") or {}).get(stage) == sources.metrics.get(stage) else CHANGED
+
+
+def _finding(states: Mapping[str, str]) -> str:
+    names = [stage for stage, found in states.items() if found == CHANGED]
+    same = sum(found == SAME for found in states.values())
+    if FIRST in states.values():
+        return "No run was accepted yet: nothing says what is new."
+    if not names:
+        return f"The results of {same} of {len(states)} stages are those of the accepted run, to the byte."
+    # what was made anew although nothing that it reads was: there the cause is in its own inputs, parameters or code
+    first = [stage for stage in names if not any(states[read] == CHANGED for read in READS[stage])]
+    return f"{count(same, 'stage').capitalize()} of {len(states)} gave what they gave in the accepted run, to the byte. New results begin at {', '.join(first)}."
+
+
+# ---- the drawing
+
+
+def reduced(reads: Mapping[str, tuple[str, ...]]) -> dict[str, list[str]]:
+    """The arrows that cannot be left out: none to what another of its sources reads already."""
+
+    def all_of(stage: str) -> set[str]:
+        return set(reads[stage]).union(*(all_of(read) for read in reads[stage]))
+
+    return {stage: [read for read in reads[stage] if not any(read in all_of(other) for other in reads[stage])] for stage in reads}
+
+
+def places(reads: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[int, int]]:
+    """(column, lane): one column right of the last stage that it reads; in the lane of the first, or in the next one that is free."""
+    found: dict[str, tuple[int, int]] = {}
+    for stage, sources in reads.items():
+        column = max((found[read][0] + 1 for read in sources), default=0)
+        lane = found[sources[0]][1] if sources else max((lane for _, lane in found.values()), default=-1) + 1
+        while (column, lane) in found.values():
+            lane += 1
+        found[stage] = column, lane
+    return found
+
+
+def _drawn(states: Mapping[str, str], alt: str) -> Markup:
+    at = places(READS)
+    width = (max(column for column, _ in at.values()) + 1) * (WIDE + ACROSS) - ACROSS + 4
+    height = (max(lane for _, lane in at.values()) + 1) * (TALL + DOWN) - DOWN + 4
+    left = {stage: 2 + column * (WIDE + ACROSS) for stage, (column, _) in at.items()}
+    top = {stage: 2 + lane * (TALL + DOWN) for stage, (_, lane) in at.items()}
+    arrows = [
+        # straight on in its own lane, then across to the other's
+        Markup('<path class="arrow" d="M{} {}H{}C{} {} {} {} {} {}"/>').format(
+            left[read] + WIDE, top[read] + TALL // 2, left[stage] - ACROSS,
+            left[stage] - ACROSS // 2, top[read] + TALL // 2, left[stage] - ACROSS // 2, top[stage] + TALL // 2,
+            left[stage], top[stage] + TALL // 2,
+        )
+        for stage, sources in reduced(READS).items()
+        for read in sources
+    ]  # fmt: skip
+    boxes = [
+        Markup(
+            '<g class="{}"><rect x="{}" y="{}" width="{}" height="{}" rx="2"/><text x="{}" y="{}">{}</text><text x="{}" y="{}">{}</text></g>'
+        ).format(
+            CSS[word],
+            left[stage],
+            top[stage],
+            WIDE,
+            TALL,
+            left[stage] + 10,
+            top[stage] + 17,
+            stage,
+            left[stage] + 10,
+            top[stage] + 32,
+            word,
+        )
+        for stage, word in states.items()
+    ]
+    return Markup('<svg class="plot dag" viewBox="0 0 {} {}" role="img" aria-label="{}">{}{}</svg>').format(
+        width, height, alt, Markup("").join(arrows), Markup("").join(boxes)
+    )

@@ -1,0 +1,330 @@
+"""How controllers of setpoints fare, drawn: ways from the 21 starts over the reward, their flow step by step, training of the agents, settled runs against the classifier's accuracy."""
+
+import math
+import re
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from pipeline.report.setpoint.verdict import AGENT, BASELINE, PAPER, Board, Case, case_text, role
+from pipeline.report.shared import charts, page
+from pipeline.report.shared.digits import THIN, number, percent
+from pipeline.report.shared.pictures import Column, Picture, hole
+from pipeline.report.shared.sources import Sources, Table, lookup
+from pipeline.report.shared.verdict import Figure, Missing
+from pipeline.setpoint.workflow.tables import BEST_FLOW, BEST_TEMPERATURE, FLOW_BAND, PHASES, ROTATION, SETTLED_BY, TEMPERATURE_BAND
+
+# rewards whose lines are drawn, of the last phase
+LEVELS = (0.5, 0.0, -0.5, -0.8)
+FLOW, TEMPERATURE = charts.linear(0, 320, ticks=6), charts.linear(180, 240, ticks=6)
+# starts that a panel has room for
+MOST = 42
+CASES = (("recorded", "recorded, fresh"), ("paper", "accuracy 0.7"))
+# key of train_agent.json -> who, after what
+TAUGHT = {
+    "phase3": ("The paper’s agent", "phases 1 to 3, judged with classes that are always right"),
+    "phase3_at_0.7": ("The paper’s agent", f"phases 1 to 3, judged with 70{THIN}% right"),
+    "phase4": ("The paper’s agent", f"all four phases, judged with 70{THIN}% right"),
+    "ours": ("Our agent", "as deployed, judged with classes that are always right"),
+    "ours_at_0.7": ("Our agent", f"as deployed, judged with 70{THIN}% right"),
+}
+
+
+# ---- from the 21 starts
+
+
+def shown(board: Board, table: Table, case: Case) -> list[str]:
+    """The default first, then the paper's agent, then the best of the other side, as far as their ways were kept."""
+    kept = {str(name) for name in table["controller"][(table["simulator"] == case[0]) & (table["case"] == case[1])]}
+    other = board.best(BASELINE) if board.default and board.kinds[board.default] != BASELINE else board.best(AGENT)
+    return [name for name in dict.fromkeys((board.default or board.names[0], board.best(PAPER), other)) if name in kept]
+
+
+def ways(sources: Sources, board: Board | Missing) -> list[Picture]:
+    """For each simulator whose ways were kept, everybody's ways over the reward and their flow step by step."""
+    table, title = sources.tables["paths"], "From 21 starts to the best setpoint"
+    for found in (board, table):
+        if isinstance(found, Missing):
+            return [hole("ways", title, found)]
+    there = list(dict.fromkeys(zip(map(str, table["simulator"]), map(str, table["case"]), strict=True)))
+    cases = [case for case in (*CASES, *(one for one in there if one[0] == "pixels")) if case in there][:3] or there[:1]
+    if not cases:
+        return [hole("ways", title, Missing("not measured", "no way was kept", "Run ./run dvc repro evaluate_setpoint"))]
+    return [_ways(sources, board, table, case, i) for i, case in enumerate(cases)]
+
+
+def _ways(sources: Sources, board: Board, table: Table, case: Case, i: int) -> Picture:
+    columns, said = [], []
+    for name in shown(board, table, case):
+        mine = (table["controller"] == name) & (table["simulator"] == case[0]) & (table["case"] == case[1])
+        flow, temperature = _by_start(table, mine, "flow_percent"), _by_start(table, mine, "temperature_degC")
+        inside = _inside(flow, temperature)
+        ends = sum(one[min(len(one) - 1, SETTLED_BY) :].all() for one in inside)
+        mark, css = role(board, name), page.MARKS[role(board, name)]
+        said.append(f"{name} {ends} of {len(flow)}")
+        first = not columns
+        panels = [_surface(name, flow, temperature, ends, css, first), _steps(name, flow, inside, css, first)]
+        columns.append(Column(name, "runs by default" if name == board.default else _kind(board, name), mark, panels))
+    where = case_text(case, whole=True)
+    return Picture(
+        f"ways-{i}",
+        f"{where}: from 21 starts to the best setpoint",
+        f"Inside by decision {SETTLED_BY} and to the end: {'; '.join(said)}.",
+        columns,
+        f"One run from each start. Above: temperature against true flow, over the paper’s reward with a, b = {PHASES[-1][0]:g}, {PHASES[-1][1]:g}; lines of equal reward "
+        f"{', '.join(number(level, 1) for level in LEVELS)} outwards. Ring: start; filled: end, vermillion outside. Grey: {BEST_FLOW - FLOW_BAND:g}–{BEST_FLOW + FLOW_BAND:g}{THIN}% and "
+        f"{BEST_TEMPERATURE:g}{THIN}±{THIN}{TEMPERATURE_BAND:g}{THIN}°C. Below: flow against decisions.",
+        page.origin(sources.source("paths")),
+    )
+
+
+def _kind(board: Board, name: str) -> str:
+    return {AGENT: "our agent", PAPER: "as published"}.get(board.kinds[name], "best baseline")
+
+
+def _by_start(table: Table, mine: np.ndarray, column: str) -> list[np.ndarray]:
+    starts = np.unique(table["start"][mine])
+    return [table[column][mine & (table["start"] == k)] for k in starts[:: -(-len(starts) // MOST)]]
+
+
+def _inside(flow: list[np.ndarray], temperature: list[np.ndarray]) -> list[np.ndarray]:
+    return [
+        (np.abs(q - BEST_FLOW) <= FLOW_BAND + 1e-3) & (np.abs(u - BEST_TEMPERATURE) <= TEMPERATURE_BAND + 1e-3)
+        for q, u in zip(flow, temperature, strict=True)
+    ]
+
+
+def equal_reward(level: float, *, a: float, b: float) -> tuple[np.ndarray, np.ndarray]:
+    """Flow and temperature where (14)-(16) give `level`: the ellipse with semi-axes (a, b) times 2 / (1 + level) - 1, turned by theta."""
+    t, scale = np.linspace(0, 2 * math.pi, 121), 2 / (1 + level) - 1
+    q_r, u_r = scale * a * np.cos(t), scale * b * np.sin(t)
+    cos, sin = math.cos(ROTATION), math.sin(ROTATION)
+    return BEST_FLOW + q_r * cos + u_r * sin, BEST_TEMPERATURE - q_r * sin + u_r * cos
+
+
+def _surface(name: str, flow: list[np.ndarray], temperature: list[np.ndarray], ends: int, css: str, titled: bool) -> Markup:
+    frame = charts.Frame(FLOW, TEMPERATURE, 368, 244, 30, above=22)
+    layers = [_rings(frame)]
+    box = [float(v) for v in (*frame.px([BEST_FLOW - FLOW_BAND, BEST_FLOW + FLOW_BAND]), *frame.py([BEST_TEMPERATURE + TEMPERATURE_BAND, BEST_TEMPERATURE - TEMPERATURE_BAND]))]  # fmt: skip
+    layers.append(
+        Markup('<rect class="flag" x="{:.1f}" width="{:.1f}" y="{:.1f}" height="{:.1f}"/>').format(
+            box[0], box[1] - box[0], box[2], box[3] - box[2]
+        )
+    )
+    for q, u in zip(flow, temperature, strict=True):
+        layers.append(charts.line(frame, q, u, "line way"))
+    layers += [charts.dots(frame, q[:1], u[:1], "begin", 2.4) for q, u in zip(flow, temperature, strict=True)]
+    last = [one[-1] for one in _inside(flow, temperature)]
+    layers += [charts.dots(frame, q[-1:], u[-1:], "dot whole" if ok else "dot off", 2.8) for q, u, ok in zip(flow, temperature, last, strict=True)]  # fmt: skip
+    alt = f"{name}: of {len(flow)} starts {ends} end inside 90–110 % and 205–215 °C and stay there"
+    return charts.panel(frame, layers, alt=alt, css=f"{css} surface", title="°C against % of flow" if titled else "", units=("%", "°C"))
+
+
+def _rings(frame: charts.Frame) -> Markup:
+    """The reward as nested grey areas, cut at the panel's edge."""
+    paths = []
+    for level in sorted(LEVELS):
+        q, u = equal_reward(level, a=PHASES[-1][0], b=PHASES[-1][1])
+        # unclipped, so that an ellipse that leaves the panel keeps its shape
+        px = frame.left + (q - frame.x.low) / (frame.x.high - frame.x.low) * (frame.width - frame.left - frame.right)
+        py = frame.height - frame.below - (u - frame.y.low) / (frame.y.high - frame.y.low) * (frame.height - frame.below - frame.above)
+        paths.append(
+            Markup('<path class="iso" d="M{}Z"/>').format("L".join(f"{x:.1f} {y:.1f}" for x, y in zip(px[:-1], py[:-1], strict=True)))
+        )
+    wide, high = frame.width - frame.left - frame.right, frame.height - frame.below - frame.above
+    return Markup('<svg x="{0}" y="{1}" width="{2}" height="{3}" viewBox="{0} {1} {2} {3}">{4}</svg>').format(
+        frame.left, frame.above, wide, high, Markup("").join(paths)
+    )
+
+
+def _steps(name: str, flow: list[np.ndarray], inside: list[np.ndarray], css: str, titled: bool) -> Markup:
+    last = max(len(q) for q in flow) - 1
+    frame = charts.Frame(charts.linear(0, max(last, 1), ticks=5), charts.linear(0, 320, ticks=4), 368, 132, 30)
+    since = [int(np.flatnonzero(~one)[-1]) + 1 if not one.all() else 0 for one in inside]
+    done = [k for k, one in zip(since, inside, strict=True) if one[-1]]
+    text = f"half of them inside after {int(np.median(done))} decisions" if done else "none inside at the end"
+    layers = [charts.tint(frame, BEST_FLOW - FLOW_BAND, BEST_FLOW + FLOW_BAND)]
+    layers += [charts.line(frame, np.arange(len(q)), q, "line way") for q in flow]
+    layers.append(charts.label(frame, last, 320, text, anchor="end", dy=8))
+    lowest, highest = (find(float(find(q[len(q) // 2 :])) for q in flow) for find in (min, max))
+    alt = f"{name}: {text}; in the second half flows lie between {number(lowest, 0)} and {number(highest, 0)} %"
+    return charts.panel(frame, layers, alt=alt, css=css, title="% of flow" if titled else "", units=("decisions", "%"))
+
+
+# ---- what the agents learned
+
+
+def training(sources: Sources) -> Picture:
+    """Mean reward while the agents learn, phase after phase (figure 6 of the paper)."""
+    table, title = sources.tables["agents"], "The agents in training, phase after phase"
+    if isinstance(table, Missing):
+        return hole("agents", title, table)
+    columns, said = [], []
+    for agent in dict.fromkeys(map(str, table["agent"])):
+        mine = {name: values[table["agent"] == agent] for name, values in table.items()}
+        ends = [float(mine["reward"][mine["phase"] == k][-1]) for k in np.unique(mine["phase"])]
+        told = (
+            ", ".join(number(end, 2) for end in ends)
+            if len(ends) <= 6
+            else f"{number(ends[0], 2)}, the last of {len(ends)} at {number(ends[-1], 2)}"
+        )
+        word = "phase" if agent == "paper" else "round"
+        said.append(f"{_agent(agent)} ends its {f'{word}s' if len(ends) <= 6 else f'first {word}'} at a mean reward of {told}")
+        columns.append(
+            Column(
+                _agent(agent),
+                "as published" if agent == "paper" else "ours",
+                "kernel" if agent == "paper" else "data_driven",
+                [_course(mine, agent, word, told)],
+            )
+        )
+    return Picture(
+        "agents",
+        title,
+        f"{'. '.join(said)}.",
+        columns,
+        f"Mean reward of a step, in the reward of its phase, against thousands of updates. As published: {', then '.join(f'a, b = {a:g}, {b:g}' for a, b in PHASES)}, then the last with classes that are wrong at times. "
+        "Ours learns in rounds, of which the one is kept that costs least on episodes it did not learn from; its reward is what a step costs, with a minus. Rewards of two phases, or of two agents, do not compare.",
+        page.origin(sources.source("agents")),
+    )
+
+
+def _course(mine: Table, agent: str, word: str, told: str) -> Markup:
+    updates, reward, phases = mine["update"] / 1000, mine["reward"], np.unique(mine["phase"])
+    span = max(float(reward.max() - reward.min()), 0.2)
+    y = charts.linear(float(reward.min()) - 0.25 * span, float(reward.max()) + 0.1 * span, ticks=4)
+    frame = charts.Frame(charts.linear(0, float(updates.max()) or 1.0, ticks=5), y, 568, 180, 34)
+    layers = []
+    for k in phases:
+        here = mine["phase"] == k
+        begin = 0.0 if k == phases[0] else float(updates[here].min())
+        x = float(frame.px(begin))
+        if k > phases[0]:
+            layers.append(
+                Markup('<line class="lim" x1="{0:.1f}" x2="{0:.1f}" y1="{1}" y2="{2}"/>').format(x, frame.above, frame.height - frame.below)
+            )
+        layers.append(charts.label(frame, begin, y.low, f"{word} {k}" if len(phases) <= 6 or k == phases[0] else str(k), dx=3, dy=-4))
+        layers.append(charts.line(frame, updates[here], reward[here]))
+    alt = f"{_agent(agent)}: mean reward at the end of each {word} {told}, after {number(float(mine['update'].max()), 0)} updates in all"
+    return charts.panel(frame, layers, alt=alt, css="dd wide", title="mean reward", units=("thousand updates", ""))
+
+
+def _agent(name: str) -> str:
+    return {"paper": "The paper’s agent", "ours": "Our agent"}.get(name, name)
+
+
+def by_accuracy(sources: Sources, board: Board | Missing) -> Picture:
+    """Settled runs against the share of windows that are named rightly, on the paper's simulator (figure 7, as figures)."""
+    title = "How much misnaming each bears"
+    if isinstance(board, Missing):
+        return hole("by-accuracy", title, board)
+    cases = sorted((float(found[1]), case) for case in board.cases if (found := re.fullmatch(r"accuracy (\d\.?\d*)", case[1])))
+    if len(cases) < 2:
+        return hole("by-accuracy", title, Missing("not measured", "fewer than two accuracies were judged"))
+    learned, paper, base = board.learned(), board.best(PAPER), board.best(BASELINE)
+    names = [name for name in dict.fromkeys((learned, paper, base)) if name]
+    x = charts.Axis(100 * cases[0][0], 100 * cases[-1][0], tuple((100 * a, f"{100 * a:g}") for a, _ in cases))
+    asked = sources.declared.rules
+    columns, said = [], []
+    for what, head, limit in (
+        ("settled", "Settle", asked.settled_percent),
+        ("stay", "Settle and stay", asked.stay_percent),
+        ("median", "Decisions until inside", None),
+    ):
+        curves = {name: _curve(board, name, cases, what) for name in names}
+        curves = {name: curve for name, curve in curves.items() if len(curve)}
+        top = 104.0 if limit else 1.1 * max((max(value for _, value in curve) for curve in curves.values()), default=1.0)
+        y = charts.Axis(0, 104, ((0.0, "0"), (50.0, "50"), (100.0, "100"))) if limit else charts.linear(0, top, ticks=4)
+        frame = charts.Frame(x, y, 368, 190, 30)
+        layers = [charts.tint(frame, limit, 100), charts.level(frame, limit, "lim", f"limit {limit:g}", above=False)] if limit else []
+        for name, curve in curves.items():
+            px, py = map(np.array, zip(*curve, strict=True))
+            css = {"data_driven": "line dd", "kernel": "line dd dash", "model_based": "line", "exact_model": "line dash"}.get(
+                role(board, name), "line bl"
+            )
+            layers += [charts.line(frame, px, py, css), charts.dots(frame, px, py, f"dot whole {page.MARKS[role(board, name)]}", 2.4)]
+        ends = [(curve[0][1], name) for name, curve in curves.items()]
+        layers += _names(frame, ends) if limit else _names(frame, [(curve[-1][1], name) for name, curve in curves.items()], right=True)
+        told = ", ".join(f"{name} {number(value, 1) + THIN + '%' if limit else number(value, 0)}" for value, name in ends)
+        said.append(f"{head}: {told}")
+        alt = f"At {100 * cases[0][0]:g} % right, {head.lower()}: {told}"
+        columns.append(
+            Column(
+                head,
+                "of runs, in per cent" if limit else "median of the runs that settle",
+                "",
+                [
+                    charts.panel(
+                        frame, layers, alt=alt, css="mb", title="%" if limit else "decisions", units=("% right", "%" if limit else "")
+                    )
+                ],
+            )
+        )
+    return Picture(
+        "by-accuracy",
+        title,
+        f"With {100 * cases[0][0]:g}{THIN}% of the windows named rightly. {'; '.join(said)}.",
+        columns,
+        "Share of runs on the paper’s simulator against the share of windows that are named rightly. Blue: our agent; blue, dashed: the paper’s; ink or grey: the best baseline. Grey area: what is asked for.",
+        page.origin(sources.source("scoreboard")),
+    )
+
+
+def _curve(board: Board, name: str, cases: list[tuple[float, Case]], what: str) -> list[tuple[float, float]]:
+    """(accuracy in percent, figure), where it is known."""
+    cells = [(100 * a, cell) for a, case in cases if (cell := board.cells.get((name, case)))]
+    if what == "median":
+        return [(a, cell.median) for a, cell in cells if not math.isnan(cell.median)]
+    return [(a, found.value) for a, cell in cells if isinstance(found := getattr(cell, what), Figure)]
+
+
+def _names(frame: charts.Frame, ends: list[tuple[float, str]], *, right: bool = False) -> list[Markup]:
+    """Names below the ends of lines, from the top down, 11 px apart at least."""
+    made, last = [], -100.0
+    for value, name in sorted(ends, reverse=True):
+        y = max(float(frame.py(value)) + 12, last + 11)
+        y = min(y, frame.height - frame.below - 3)
+        x, anchor = (frame.width - frame.right - 6, "end") if right else (frame.left + 6, "start")
+        made.append(
+            Markup('<text x="{}" y="{:.1f}" text-anchor="{}">{} {}</text>').format(x, y, anchor, name, number(value, 0 if right else 1))
+        )
+        last = y
+    return made
+
+
+def phases(sources: Sources) -> dict[str, Any]:
+    """What training came to: settled, staying and steps, by what was trained."""
+    metrics = sources.metrics["train_agent"]
+    if isinstance(metrics, Missing):
+        return {"missing": metrics, "rows": []}
+    rows = []
+    for name, (head, small) in TAUGHT.items():
+        found = metrics.get(name)
+        if not isinstance(found, dict):
+            continue
+        steps, runs, stay = (lookup(found, key) for key in ("median_steps", "runs", "stay"))
+        rows.append(
+            {
+                "name": head,
+                "small": small,
+                "mark": "data_driven" if name.startswith("ours") else "kernel",
+                "settled": percent(float(found["settled"]), 3),
+                "stay": "not measured" if isinstance(stay, Missing) else percent(float(stay), 3),
+                "steps": "none settled" if isinstance(steps, Missing) else number(float(steps), 0),
+                "runs": "not said" if isinstance(runs, Missing) else f"{runs:,}",
+            }
+        )
+    gap = None if rows else Missing("not measured", "train_agent.json holds no run")
+    return {"missing": gap, "rows": rows, "kept": _kept(metrics)}
+
+
+def _kept(metrics: dict[str, Any]) -> str:
+    """What the rounds of our agent came to, on episodes that it did not learn from."""
+    judged, kept, rounds = (metrics.get(key) for key in ("validation", "kept_round", "rounds"))
+    if not judged or kept is None or not 0 <= kept < len(judged):
+        return ""
+    before, after = number(float(judged[0]), 3), number(float(judged[kept]), 3)
+    if kept == 0:
+        return f"No round of ours was better than what it began with: {before} a step on episodes it did not learn from, and that is kept."
+    return f"Of ours round {kept} of {rounds} is kept: {after} a step on episodes it did not learn from, {before} before any training."

@@ -1,0 +1,101 @@
+"""The setpoint loop's card on page one: Bayes filter, agent and proportional control, the winner in words."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from pipeline.report.index.cards import unbuilt
+from pipeline.report.setpoint.agent import CASES
+from pipeline.report.setpoint.verdict import BASELINE, OPEN, PASSED, Board, board, case_text, named, share_text, verdict, within, worst
+from pipeline.report.shared import charts, page
+from pipeline.report.shared.digits import number
+from pipeline.report.shared.sources import Sources, Table
+from pipeline.report.shared.verdict import ROLES, Figure, Missing
+from pipeline.report.temperature.answers import CONTROLLERS, LABELS
+from pipeline.setpoint.workflow.tables import BEST_FLOW, FLOW_BAND
+
+FLOOR, CEILING = 1.0, 300.0
+ORDER = ("model_based", "data_driven", "baseline")
+
+
+def seats(found: Board) -> dict[str, str]:
+    """Who stands for each role: the best Bayes filter, the agent that competes, the best proportional control, or else the best of the other baselines."""
+
+    def first(fits: Callable[[str], bool]) -> str:
+        return next((name for name in found.names if found.kinds[name] == BASELINE and fits(name.lower())), "")
+
+    bayes = first(lambda name: "bayes" in name)
+    plain = first(lambda name: "proportional" in name) or first(lambda name: "bayes" not in name)
+    return {"model_based": bayes, "data_driven": found.learned(), "baseline": plain}
+
+
+def setpoint(sources: Sources) -> dict[str, Any]:
+    judged, found = verdict(sources), board(sources)
+    if isinstance(found, Missing) or not judged.default:
+        return unbuilt("setpoint", found.sentence() if isinstance(found, Missing) else judged.reason) | {"link": "setpoint.html"}
+    who = seats(found)
+    role = next((role for role, name in who.items() if name == judged.default), "baseline")
+    table = sources.tables["paths"]
+    case = CASES[1]
+    rules = sources.declared.rules
+    return {
+        "id": "setpoint",
+        "name": "Setpoint",
+        "link": "setpoint.html",
+        "moves": "Nozzle camera to flow and temperature setpoints",
+        "state": f"Run {ROLES[role]}" if judged.state == PASSED else "Do not decide yet" if judged.state == OPEN else "Do not steer yet",
+        "mark": role if judged.state == PASSED else None,
+        "win": (f"{'The baseline' if role == 'baseline' else ROLES[role].capitalize().replace('-', chr(0x2011))} wins." if judged.state == PASSED else judged.lead, _win(found, judged.default) if judged.state == PASSED else judged.reason),
+        "caption": f"Flow’s distance from 100\u00a0%, 90th percentile of 21 starts over 100 decisions, log scale {FLOOR:g} to {CEILING:g}\u00a0%: {case_text(case, whole=True)}. Grey: within {FLOW_BAND:g}\u00a0%.",
+        "panels": [_spark(table, name, case, css, named=i == 0) for i, (name, css) in enumerate(zip((who[role] for role in ORDER), ("mb", "dd", "bl"), strict=True))],
+        "heads": [{"mark": role, "name": LABELS[CONTROLLERS[role]][0], "method": who[role] or "none judged"} for role in ORDER],
+        "rows": [
+            {"title": "Settle, worst case", "cells": _cells([worst(found, who[role], "settled")[0] for role in ORDER], rules.settled_percent)},
+            {"title": "Settle and stay, worst case", "cells": _cells([worst(found, who[role], "stay")[0] for role in ORDER], rules.stay_percent)},
+            {"title": "Recover from a clog", "cells": _cells([worst(found, who[role], "recovered")[0] for role in ORDER], rules.settled_percent)},
+        ],
+        "note": judged.claim,
+        "model": None,
+        "sources": sources.source("scoreboard", "paths", "choice"),
+        "missing": None,
+    }  # fmt: skip
+
+
+def _win(found: Board, default: str) -> str:
+    """The default's worst case beside those of the others."""
+    mine, place = worst(found, default, "lasting")
+    if place is None:
+        return ""
+    name = named(found, default)
+    others = [f"{named(found, one)} {share_text(worst(found, one, 'lasting')[0])}" for one in found.names if one != default][:2]
+    beside = f"; next in their own worst cases: {', '.join(others)}" if others else ""
+    return f"{name[:1].upper()}{name[1:]}: {share_text(mine)} of runs settle and stay in its worst case ({within(place)}){beside}."
+
+
+def _cells(figures: Sequence[Figure | Missing], limit: float) -> list[dict[str, Any]]:
+    most = max((figure.value for figure in figures if isinstance(figure, Figure)), default=math.nan)
+    return [
+        {
+            "text": share_text(figure),
+            "best": isinstance(figure, Figure) and figure.value == most,
+            "bad": isinstance(figure, Figure) and figure.high < limit,
+        }
+        for figure in figures
+    ]
+
+
+def _spark(table: Table | Missing, name: str, case: tuple[str, str], css: str, *, named: bool) -> Markup:
+    gap = table if isinstance(table, Missing) else Missing("not measured", f"no way of {name or 'any controller'} was kept")
+    rows = None if isinstance(table, Missing) else (table["controller"] == name) & (table["simulator"] == case[0]) & (table["case"] == case[1])  # fmt: skip
+    if rows is None or not rows.any():
+        return Markup('<div class="hole">{}</div>').format(page.missing(gap))
+    steps = np.unique(table["step"][rows])
+    off = np.abs(table["flow_percent"][rows] - BEST_FLOW)
+    curve = np.array([float(np.percentile(off[table["step"][rows] == k], 90)) for k in steps])
+    bad = bool(curve[-1] > FLOW_BAND)
+    alt = f"{name}: nine of ten starts are within {number(float(curve[-1]), 1)} % of full flow after {int(steps[-1])} decisions, {'outside' if bad else 'inside'} the {FLOW_BAND:g} % asked for"
+    axis = charts.logarithmic(FLOOR, CEILING)._replace(low=FLOOR, high=CEILING)
+    return charts.spark(steps.astype(float), np.maximum(curve, FLOOR), axis, css=css, limit=FLOW_BAND, alt=alt, named=named, bad=bad, limit_label=f"limit {FLOW_BAND:g}", units=("decisions", "%"))  # fmt: skip

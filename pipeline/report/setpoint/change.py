@@ -1,0 +1,46 @@
+"""How the settled runs of the setpoint loop's default moved since the accepted run."""
+
+from typing import Any
+
+import numpy as np
+
+from pipeline.report.setpoint.verdict import Case, Cell, board
+from pipeline.report.shared.digits import MINUS, THIN, number
+from pipeline.report.shared.sources import Sources, lookup
+from pipeline.report.shared.verdict import FAILED, Missing, Question, state
+from pipeline.statistics import wilson
+
+# points closer than this are one: the accepted figures are kept rounded
+SAME = 0.05
+
+
+def change(sources: Sources, case: Case, cell: Cell | None) -> dict[str, Any]:
+    """How the settled runs of the default moved since the accepted run: beyond noise where their intervals, of as many runs as now, do not overlap."""
+    still = {"text": "first run", "moved": False, "worse": False}
+    if sources.accepted is None or isinstance(sources.accepted, Missing) or cell is None or isinstance(cell.settled, Missing):
+        return still
+    stage = lookup(sources.accepted, "metrics.evaluate_setpoint")
+    name = None if isinstance(stage, Missing) else stage.get("default")
+    of = {} if not name or not isinstance(stage.get(name), dict) else stage[name]
+    before = of.get(case[0], {}).get(case[1], {}).get("settled")
+    if before is None:
+        return still | {"text": "new"}
+    now = cell.settled
+    points = now.value - before
+    if abs(points) < SAME:
+        return still | {"text": "unchanged"}
+    then = wilson(np.arange(cell.runs) < round(before / 100 * cell.runs))
+    if now.low <= then.high and then.low <= now.high:
+        return still | {"text": "within noise"}
+    question = Question(0, "", "Settled", "%", sources.declared.rules.settled_percent, True, "")
+    text = f"{'+' if points > 0 else MINUS}{number(abs(points), 1)}{THIN}points · {'better' if points > 0 else 'worse'}"
+    return {"text": text, "moved": True, "worse": points < 0 and state(question, now) == FAILED}
+
+
+def said(sources: Sources) -> tuple[int, int]:
+    """How many cases of the default moved beyond noise, of how many that count."""
+    found = board(sources)
+    if isinstance(found, Missing) or not found.default:
+        return 0, 0
+    changes = [change(sources, case, cell) for case, cell in found.counting(found.default)]
+    return sum(one["moved"] for one in changes), len(changes)

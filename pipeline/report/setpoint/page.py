@@ -1,0 +1,222 @@
+"""The page of the setpoint loop: who sets flow and temperature by default, what each controller makes of each case, and what the camera's classifier is worth."""
+
+from typing import Any
+
+from pipeline.report.deposition.page import flat
+from pipeline.report.setpoint import agent as setpoint_agent
+from pipeline.report.setpoint import change as setpoint_change
+from pipeline.report.setpoint import vision as setpoint_vision
+from pipeline.report.setpoint import why as setpoint_why
+from pipeline.report.setpoint.verdict import (
+    BASELINE,
+    HEADS,
+    SIMULATORS,
+    Board,
+    Cell,
+    board,
+    case_text,
+    lasting,
+    role,
+    share_text,
+    told,
+    verdict,
+    worst,
+)
+from pipeline.report.shared import charts, page, words
+from pipeline.report.shared.digits import THIN, band, number, percent, quantity
+from pipeline.report.shared.sources import Sources, digest
+from pipeline.report.shared.verdict import FAILED, Figure, Missing, Question, state
+
+WORDS = (
+    "window_of_frames",
+    "settles",
+    "stays",
+    "recovers",
+    "agent",
+    "as_published",
+    "bayes",
+    "sequential",
+    "proportional",
+    "recorded_windows",
+    "sticky",
+    "accuracy",
+    "worst_case",
+    "interval",
+    "key_area",
+    "calibrated",
+    "held_window",
+    "foreign",
+    "reward",
+    "accepted",
+)
+SECTIONS = ("train_classifier", "train_agent", "evaluate_setpoint")
+MOST = 12
+LANES = {"data_driven": "dd", "kernel": "dd", "model_based": "mb", "exact_model": "mb", "baseline": "acc"}
+
+
+def render(sources: Sources) -> str:
+    """The text of setpoint.html."""
+    judged, found = verdict(sources), board(sources)
+    known = None if isinstance(found, Missing) else found
+    return page.render(
+        "setpoint.html",
+        here="setpoint",
+        title=f"Setpoint: {judged.decision.rstrip('.')}",
+        verdict=judged,
+        heads_of_rules=HEADS if known is None else (*HEADS[:2], role(known, known.best(BASELINE)) if known.best(BASELINE) else HEADS[2]),
+        second=known is not None and bool(known.default) and known.kinds[known.default] == BASELINE,
+        told=told(sources, known) if known and known.default else "",
+        no_board=found if isinstance(found, Missing) else None,
+        heads=heads(known),
+        answers=answers(sources, known) if known else [],
+        boards=boards(sources, known) if known else [],
+        worsts=worsts(known) if known else [],
+        ways=setpoint_agent.ways(sources, found),
+        strips=setpoint_why.strips(sources),
+        training=setpoint_agent.training(sources),
+        by_accuracy=setpoint_agent.by_accuracy(sources, found),
+        phases=setpoint_agent.phases(sources),
+        yardsticks=setpoint_vision.yardsticks(sources),
+        reliability=setpoint_vision.reliability(sources),
+        confusion=setpoint_vision.confusion(sources),
+        distributions=setpoint_vision.distributions(sources),
+        course=setpoint_vision.course(sources),
+        frames=setpoint_vision.frames(sources),
+        data=setpoint_vision.data(sources),
+        declared=[(section, flat(sources.declared.everything.get(section, {}))) for section in SECTIONS],
+        words=words.chosen(sources, WORDS),
+        sources=list(sources.read.values()),
+        absent=sources.absent,
+        hashes=hashes(sources),
+        from_board=sources.source("scoreboard", "choice"),
+        from_agents=sources.source("train_agent"),
+        from_classifier=sources.source("train_classifier", "classified"),
+    )
+
+
+def hashes(sources: Sources) -> list[tuple[str, str]]:
+    """Short digests by which two pages can be told to be of one run."""
+    tables = {source.name: source.sha256 for source in sources.read.values()}
+    found = [(name, tables.get(name, "missing")) for name in ("classified", "scoreboard", "choice")]
+    return [(name, value[:8]) for name, value in [*found, ("parameters", digest(sources.declared.everything)), ("code", sources.code)]]
+
+
+def heads(found: Board | None) -> list[dict[str, Any]]:
+    """The two controllers of the first screen: what learned, and the best baseline."""
+    pair = ("", "") if found is None else (found.learned(), found.best(BASELINE))
+    return [
+        {
+            "name": name or "none",
+            "default": bool(name) and found is not None and name == found.default,
+            "mark": role(found, name) if name else fallback,
+            "css": css,
+        }
+        for name, fallback, css in zip(pair, ("data_driven", "baseline"), ("dd", "mb"), strict=True)
+    ]
+
+
+# ---- the first screen: a row for each case that counts
+
+
+def answers(sources: Sources, found: Board) -> list[dict[str, Any]]:
+    """Runs that settle and stay of what learned and of the best baseline; the strip shows the runs that are lost, as a share of those that may be."""
+    pair = (found.learned(), found.best(BASELINE))
+    cases = [case for case in found.cases if any((cell := found.cells.get((name, case))) and cell.counts for name in pair)]
+    lost = Question(0, "", "Runs lost", "%", 100 - sources.declared.rules.settled_percent, False, "")
+    gone = Question(0, "", "Runs that leave", "%", 100 - sources.declared.rules.stay_percent, False, "")
+    rows = []
+    for case in cases[:MOST]:
+        cells = [found.cells.get((name, case)) for name in pair]
+        shown = [(name, LANES[role(found, name)], _lost(cell)) for name, cell in zip(pair, cells, strict=True) if name]
+        mine = found.cells.get((found.default or pair[0], case))
+        states = [state(lost, _lost(mine)), state(gone, _lost(mine, "stay"))] if mine else ["not measured"] * 2
+        rows.append({
+            "simulator": SIMULATORS.get(case[0], case[0]), "case": case_text(case),
+            "state": next((one for one in states if one != "passed"), "passed"),
+            "cells": [_answer(cell, lost, css) | {"name": name} for name, cell, css in zip(pair, cells, ("dd", "mb"), strict=True)],
+            "strip": charts.strip(lost, shown), "stay": _stay(mine), "stay_bad": bool(mine) and state(gone, _lost(mine, "stay")) == FAILED,
+            "change": setpoint_change.change(sources, case, mine),
+        })  # fmt: skip
+    return rows
+
+
+def _lost(cell: Cell | None, what: str = "settled") -> Figure | Missing:
+    share = Missing("not measured", "this case was not run") if cell is None else getattr(cell, what)
+    return share if isinstance(share, Missing) else Figure(*(max(100 - end, 0.0) for end in (share.value, share.high, share.low)))
+
+
+def _answer(cell: Cell | None, lost: Question, css: str) -> dict[str, Any]:
+    if cell is None or isinstance(cell.settled, Missing):
+        return {"css": css, "value": "not measured", "band": "", "bad": False, "steps": ""}
+    return {
+        "css": css,
+        "value": share_text(cell.settled),
+        "band": band(cell.settled.low, cell.settled.high, 1),
+        "bad": state(lost, _lost(cell)) == FAILED,
+        "steps": "" if cell.median != cell.median else f"{number(cell.median, 0)} steps",
+    }
+
+
+def _stay(cell: Cell | None) -> str:
+    return "not measured" if cell is None else share_text(cell.stay)
+
+
+# ---- the scoreboard
+
+
+def boards(sources: Sources, found: Board) -> list[dict[str, Any]]:
+    """A table for each simulator: controllers down, cases across; vermillion where the whole interval lies beyond a limit, bold in a controller's own worst case."""
+    asked = sources.declared.rules
+    limits = {"settled": asked.settled_percent, "stay": asked.stay_percent, "recovered": asked.settled_percent}
+    tables = []
+    for simulator in dict.fromkeys(case[0] for case in found.cases):
+        cases = [case for case in found.cases if case[0] == simulator]
+        rows = []
+        for name in found.names:
+            cells = [found.cells.get((name, case)) for case in cases]
+            if not any(cells):
+                continue
+            _, low = worst(found, name, "lasting")
+            rows.append({
+                "name": name, "mark": role(found, name), "default": name == found.default, "kind": found.kinds[name],
+                "cells": [_cell(cell, limits, bold=case == low) for case, cell in zip(cases, cells, strict=True)],
+            })  # fmt: skip
+        counts = any(cell.counts for (_, case), cell in found.cells.items() if case[0] == simulator)
+        runs = sorted({cell.runs for (_, case), cell in found.cells.items() if case[0] == simulator})
+        tables.append({"id": f"board-{simulator}", "name": SIMULATORS.get(simulator, simulator), "heads": [case_text(case) for case in cases], "rows": rows, "counts": counts, "runs": f"{runs[0]:,}" if len(runs) == 1 else f"{runs[0]:,} to {runs[-1]:,}"})  # fmt: skip
+    return tables
+
+
+def _cell(cell: Cell | None, limits: dict[str, float], *, bold: bool) -> dict[str, Any]:
+    if cell is None:
+        return {"lines": [], "bold": False}
+    lines = []
+    for what, word in (("settled", ""), ("stay", "stay "), ("recovered", "recover ")):
+        share = getattr(cell, what)
+        if isinstance(share, Figure):
+            failed = state(Question(0, "", "", "%", limits[what], True, ""), share) == FAILED
+            lines.append({"text": f"{word}{quantity(share.value, '%', 1)}", "band": band(share.low, share.high, 1), "bad": failed})
+    steps = "none settles" if cell.median != cell.median else f"{number(cell.median, 0)} steps, p90 {number(cell.p90, 0)}"
+    more = f"past it {number(cell.overshoot, 0)}{THIN}%" if cell.overshoot == cell.overshoot else ""
+    more += f", off {number(cell.flow_error, 1)}{THIN}%" if cell.flow_error == cell.flow_error else ""
+    flow, degrees, share = cell.worst_start
+    tip = f"{cell.runs:,} runs; fewest settle from {flow:g} % and {degrees:g} °C: {number(share, 0)} %"
+    return {"lines": lines, "steps": steps, "more": more.strip(", "), "tip": tip, "bold": bold}
+
+
+def worsts(found: Board) -> list[dict[str, Any]]:
+    """Everybody's worst case, the best first, with the start from which fewest settle there."""
+    rows = []
+    for name in found.names:
+        figure, case = worst(found, name, "lasting")
+        if case is None:
+            continue
+        cell = found.cells[name, case]
+        others = [share.value for _, one in found.counting(name) if isinstance(share := lasting(one), Figure)]
+        flow, degrees, settled = cell.worst_start
+        rows.append({
+            "name": name, "mark": role(found, name), "default": name == found.default, "kind": {BASELINE: "no learning", "agent": "ours, learned"}.get(found.kinds[name], "as published"),
+            "case": case_text(case, whole=True), "value": share_text(figure), "band": band(figure.low, figure.high, 1),
+            "mean": percent(sum(others) / len(others), 3), "start": f"{flow:g}{THIN}%, {degrees:g}{THIN}°C: {number(settled, 0)}{THIN}% settle",
+        })  # fmt: skip
+    return rows

@@ -1,0 +1,371 @@
+"""Scoreboard and classifier's figures -> who sets flow and temperature by default, by how much, and whether it may steer a printer, in words. No page, no file."""
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.report.shared.digits import THIN, band, count, number, quantity
+from pipeline.report.shared.sources import Sources, Table, lookup
+from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, UNDECIDED, Figure, Missing, Question, state
+
+AGENT, PAPER, BASELINE = "agent", "paper", "baseline"
+SIMULATORS = {"paper": "The paper’s simulator", "recorded": "Recorded windows", "pixels": "Through pictures"}
+CLAIM = "The classifier is trained and judged on rendered frames: eight real pictures allow no claim about real printers."
+CLAIM_RECORDED = (
+    "The classifier is trained and judged on recordings of datasets/raw/setpoint, split by print; it is known on these printers only."
+)
+# what the two columns of its rules are, and the mark of the second
+HEADS = ("Data\u2011driven", "Best baseline", "baseline")
+
+
+class Cell(NamedTuple):
+    """One controller in one case: shares of runs in percent with their 95 % intervals, or why one is missing; steps until inside for good; overshoot and flow error in percent."""
+
+    runs: int
+    counts: bool
+    settled: Figure | Missing
+    stay: Figure | Missing
+    recovered: Figure | Missing
+    median: float
+    p90: float
+    overshoot: float
+    flow_error: float
+    worst_start: tuple[float, float, float]
+
+
+Case = tuple[str, str]  # simulator, case
+
+
+class Board(NamedTuple):
+    """Who was judged, the best worst case first, with the kind of each; cases in the table's order; who runs by default ("" where nobody chose)."""
+
+    names: list[str]
+    kinds: Mapping[str, str]
+    cases: list[Case]
+    cells: Mapping[tuple[str, Case], Cell]
+    default: str
+
+    def counting(self, name: str) -> list[tuple[Case, Cell]]:
+        """The cases that count for the choice."""
+        return [(case, cell) for case in self.cases if (cell := self.cells.get((name, case))) and cell.counts]
+
+    def best(self, *kinds: str) -> str:
+        """Of these kinds, the one with the best worst case; "" where there is none."""
+        return next((name for name in self.names if self.kinds[name] in kinds), "")
+
+    def learned(self) -> str:
+        """The agent that competes: the default where it is one, else ours, else the paper's."""
+        return self.default if self.default and self.kinds[self.default] != BASELINE else self.best(AGENT) or self.best(PAPER)
+
+
+def role(board: Board, name: str) -> str:
+    """The mark of a controller: circle what learned (hollow: not the one that competes), square the Bayes filter, ring the others."""
+    if board.kinds[name] != BASELINE:
+        return "data_driven" if name == board.learned() else "kernel"
+    if "bayes" in name.lower():
+        first = next(other for other in board.names if board.kinds[other] == BASELINE and "bayes" in other.lower())
+        return "model_based" if name == first else "exact_model"
+    return "baseline"
+
+
+def case_text(case: Case, *, whole: bool = False) -> str:
+    """ "accuracy 0.7, clog" -> "accuracy 70 %, clog"; `whole`: after the simulator's name."""
+    simulator, name = case
+    name = re.sub(rf"^{re.escape(simulator)}[, ]*", "", name) or "as it is"
+    name = re.sub(r"accuracy (\d\.?\d*)", lambda found: f"accuracy {100 * float(found[1]):g}{THIN}%", name)
+    return f"{SIMULATORS.get(simulator, simulator)}, {name}" if whole else name
+
+
+def within(case: Case) -> str:
+    """The same in the middle of a sentence."""
+    text = case_text(case, whole=True)
+    return text[:1].lower() + text[1:]
+
+
+def board(sources: Sources) -> Board | Missing:
+    table, choice = sources.tables["scoreboard"], sources.tables["choice"]
+    if isinstance(table, Missing):
+        return table
+    if not len(table["controller"]):
+        return Missing("not measured", "the scoreboard is empty", "Run ./run dvc repro evaluate_setpoint")
+    keys = [
+        (str(name), (str(simulator), str(case)))
+        for name, simulator, case in zip(table["controller"], table["simulator"], table["case"], strict=True)
+    ]
+    cells = {key: _cell(table, i) for i, key in enumerate(keys)}
+    kinds = {name: str(kind) for (name, _), kind in zip(keys, table["kind"], strict=True)}
+    found = Board(list(kinds), kinds, list(dict.fromkeys(case for _, case in keys)), cells, "")
+    ranked = sorted(kinds, key=lambda name: _rank(found, name), reverse=True)
+    chosen = str(choice.get("name", "")) if isinstance(choice, Mapping) else ""
+    return found._replace(names=ranked, default=chosen if chosen in kinds else "")
+
+
+def _cell(table: Table, i: int) -> Cell:
+    figures = [
+        _figure(*(float(table[f"{name}{end}_percent"][i]) for end in ("", "_low", "_high"))) for name in ("settled", "stay", "recovered")
+    ]
+    numbers = ("median_steps", "p90_steps", "overshoot_p95_percent", "flow_error_percent")
+    start = ("worst_start_flow_percent", "worst_start_temperature_degC", "worst_start_settled_percent")
+    return Cell(
+        int(table["runs"][i]),
+        bool(table["counts"][i]),
+        *figures,
+        *(float(table[name][i]) for name in numbers),
+        tuple(float(table[name][i]) for name in start),
+    )
+
+
+def _figure(value: float, low: float, high: float) -> Figure | Missing:
+    if math.isnan(value):
+        return Missing("not applicable", "runs end before")
+    return Figure(value, value if math.isnan(low) else low, value if math.isnan(high) else high)
+
+
+def lasting(cell: Cell) -> Figure | Missing:
+    """The share by which a case is read: settled and staying, or settled where runs end before that can be told."""
+    return cell.stay if isinstance(cell.stay, Figure) else cell.settled
+
+
+def _rank(board: Board, name: str) -> tuple[float, float]:
+    values = [found.value for _, cell in board.counting(name) if isinstance(found := lasting(cell), Figure)]
+    return (min(values), float(np.mean(values))) if values else (-1.0, -1.0)
+
+
+def worst(board: Board, name: str, what: str) -> tuple[Figure | Missing, Case | None]:
+    """The smallest share `what` (settled, stay, lasting) of the cases that count, and where."""
+    found = [
+        (figure, case)
+        for case, cell in board.counting(name)
+        if isinstance(figure := lasting(cell) if what == "lasting" else getattr(cell, what), Figure)
+    ]
+    return (
+        min(found, key=lambda pair: pair[0].value) if found else (Missing("not measured", f"no case of {name or 'any controller'}"), None)
+    )
+
+
+def share_text(figure: Figure | Missing) -> str:
+    return figure.state if isinstance(figure, Missing) else quantity(figure.value, "%", 1)
+
+
+# ---- the rules
+
+
+class Rule(NamedTuple):
+    """One test: limit and place on the page; states and figures of what learned and of the best baseline; as a sentence, each, where it does not pass."""
+
+    name: str
+    limit: str
+    place: str
+    states: tuple[str, str]
+    figures: tuple[str, str]
+    reasons: tuple[str, str]
+    remedy: str
+    seeing: bool  # of the classifier, on which every controller rests
+
+
+def rules(sources: Sources, board: Board | None) -> tuple[Rule, ...]:
+    asked = sources.declared.rules
+    return (
+        _control(board, "Settles, worst case", "settled", asked.settled_percent, "settle"),
+        _control(board, "Stays, worst case", "stay", asked.stay_percent, "settle and stay"),
+        _seeing(sources, "Right, an image", 100 * asked.image_accuracy, "image_accuracy", ("svc", "cnn", "width"), "frames of segments it never saw"),
+        _seeing(sources, "Right, a window", 100 * asked.window_accuracy, "window_accuracy", ("svc",), "windows of segments it never saw"),
+        _calibrated(sources, "Calibrated, an image", asked.ece_image, ("ece_image", "ece_image_raw")),
+        _calibrated(sources, "Calibrated, a window", asked.ece_window, ("ece_window", "ece_window_counts")),
+    )  # fmt: skip
+
+
+def _control(board: Board | None, name: str, what: str, limit: float, does: str) -> Rule:
+    question = Question(0, what, name, "%", limit, True, "")
+    text = f"≥ {limit:g}{THIN}%"
+    if board is None:
+        return Rule(name, text, "scoreboard", (OPEN, OPEN), (OPEN, OPEN), ("Nothing was judged.",) * 2, "", False)
+    found = [worst(board, who, what) for who in (board.learned(), board.best(BASELINE))]
+    reasons = tuple(
+        figure.sentence()
+        if isinstance(figure, Missing)
+        else f"In its worst case ({within(case)}) {share_text(figure)} of its runs {does}; {limit:g}{THIN}% are asked for.{undecided(question, figure)}"
+        for figure, case in found
+    )
+    return Rule(
+        name,
+        text,
+        "scoreboard",
+        tuple(state(question, figure) for figure, _ in found),
+        tuple(share_text(figure) for figure, _ in found),
+        reasons,
+        "A classifier whose errors persist for fewer decisions, or fewer starts and disturbances to stand (evaluate_setpoint).",
+        False,
+    )
+
+
+def undecided(question: Question, figure: Figure) -> str:
+    """How many runs would tell, where the interval straddles the limit: z^2 p (1 - p) / (p - limit)^2 at 95 %."""
+    if state(question, figure) != UNDECIDED:
+        return ""
+    p, off = figure.value / 100, abs(figure.value - question.limit) / 100
+    needed = 1.96**2 * p * (1 - p) / off**2 if off else math.inf
+    more = f"about {_round(needed):,} runs in all would decide" if needed < 1e7 else "no number of runs would decide"
+    return f" Its interval, {band(figure.low, figure.high, 1)}, straddles that; {more}."
+
+
+def _round(value: float) -> int:
+    power = 10 ** max(math.floor(math.log10(max(value, 1))) - 1, 0)
+    return math.ceil(value / power) * power
+
+
+NAMES = {"svc": "support vector machine", "cnn": "convolutional network", "width": "width rule"}
+BRIEF = {"svc": "SVC", "cnn": "CNN", "width": "width"}
+
+
+def _seeing(sources: Sources, name: str, limit: float, key: str, others: Sequence[str], of: str) -> Rule:
+    metrics, question = sources.metrics["train_classifier"], Question(0, key, name, "%", limit, True, "")
+    mine = accuracy(metrics, key.removesuffix("_accuracy"))
+    beside = [
+        (found, other) for other in others if isinstance(found := accuracy(metrics, f"{other}_{key.removesuffix('_accuracy')}"), Figure)
+    ]
+    best, who = max(beside, key=lambda pair: pair[0].value, default=(Missing("not measured", "no yardstick"), ""))
+    reason = (
+        mine.sentence()
+        if isinstance(mine, Missing)
+        else f"The classifier names {share_text(mine)} of {of} rightly; {limit:g}{THIN}% are asked for.{undecided(question, mine)}"
+    )
+    shown = share_text(best) + (f" {BRIEF[who]}" if who else "")
+    return Rule(name, f"≥ {limit:g}{THIN}%", "vision", (state(question, mine), state(question, best)), (share_text(mine), shown), (reason, reason), "More segments to train on (train_classifier.segments), or another view of the nozzle.", True)  # fmt: skip
+
+
+def accuracy(metrics: Mapping | Missing, name: str) -> Figure | Missing:
+    """In percent, with the interval where the stage gives one."""
+    value = lookup(metrics, f"{name}_accuracy")
+    if isinstance(value, Missing):
+        return value
+    ends = lookup(metrics, f"intervals_percent.{name}")
+    return Figure(100 * value, *((100 * value,) * 2 if isinstance(ends, Missing) else map(float, ends)))
+
+
+def _calibrated(sources: Sources, name: str, limit: float, keys: tuple[str, str]) -> Rule:
+    found = [lookup(sources.metrics["train_classifier"], key) for key in keys]
+    states = tuple(OPEN if isinstance(value, Missing) else PASSED if value <= limit else FAILED for value in found)
+    shown = tuple(OPEN if isinstance(value, Missing) else number(value, 3) for value in found)
+    reason = (
+        f"Stated and true shares of right answers differ by {shown[0]} on average; {limit:g} is allowed."
+        if states[0] != OPEN
+        else "It was not measured."
+    )
+    return Rule(name, f"≤ {limit:g}", "reliability", states, shown, (reason, reason), "Calibrate on more segments (train_classifier.segments.calibration).", True)  # fmt: skip
+
+
+# ---- the verdict
+
+
+class Verdict(NamedTuple):
+    """`state`: passed, failed, open; the controller that runs by default; sentences as the page says them; `first` names the first rule that does not pass."""
+
+    state: str
+    default: str
+    decision: str
+    lead: str
+    reason: str
+    remedy: str
+    claim: str
+    rules: tuple[Rule, ...]
+    first: str
+    role: str
+
+
+def verdict(sources: Sources) -> Verdict:
+    found = board(sources)
+    claim = CLAIM_RECORDED if sources.declared.everything.get("train_classifier", {}).get("source") == "recordings" else CLAIM
+    if isinstance(found, Missing) or not found.default:
+        gap = found if isinstance(found, Missing) else sources.tables["choice"]
+        why = gap.sentence() if isinstance(gap, Missing) else "The choice names a controller that was not judged."
+        tested = rules(sources, None if isinstance(found, Missing) else found)
+        return Verdict(
+            OPEN, "", "Let nobody set flow and temperature by this loop yet.", "No controller was chosen.", why, "", claim, tested, "", ""
+        )
+    tested = rules(sources, found)
+    column = int(found.kinds[found.default] == BASELINE)
+    states = [rule.states[0 if rule.seeing else column] for rule in tested]
+    failed = FAILED in states
+    first = next((i for wanted in ((FAILED,) if failed else (UNDECIDED, OPEN)) for i, one in enumerate(states) if one == wanted), None)
+    passed = first is None
+    decision = (
+        f"Run {named(found, found.default)} by default."
+        if passed
+        else f"{'Do not let the camera steer a printer yet' if failed else 'Do not decide yet'}."
+    )
+    lead = (
+        f"All {count(len(tested), 'rule')} passed."
+        if passed
+        else f"First {'failed' if failed else 'open'} rule: {tested[first].name[:1].lower()}{tested[first].name[1:]}."
+    )
+    reason = "" if passed else _closest(named(found, found.default), tested[first], column)
+    return Verdict(
+        PASSED if passed else FAILED if failed else OPEN,
+        found.default,
+        decision,
+        lead,
+        told(sources, found) if passed else reason,
+        "" if passed else _conditions(tested, column, claim == CLAIM),
+        claim,
+        tested,
+        "" if passed else tested[first].name,
+        role(found, found.default),
+    )
+
+
+def _conditions(tested: Sequence[Rule], column: int, rendered: bool) -> str:
+    """What would have to come out before the loop may steer: every rule that does not pass with its figure, and what to try."""
+    short = [(rule, 0 if rule.seeing else column) for rule in tested if rule.states[0 if rule.seeing else column] != PASSED]
+    asked = [
+        f"{rule.name[:1].lower()}{rule.name[1:]} {rule.limit} (now {rule.figures[k]}{', but its interval crosses the limit' if rule.states[k] == UNDECIDED else ''})"
+        for rule, k in short
+    ]
+    real = " Recordings of the real printer: none are in (datasets/raw/setpoint)." if rendered else ""
+    return f"Before it may: {', '.join(asked)}.{real} To try: {' '.join(dict.fromkeys(rule.remedy for rule, _ in short if rule.remedy))}"
+
+
+def _closest(name: str, rule: Rule, column: int) -> str:
+    """Who comes closest, and how far it is off; a rule of the classifier holds whoever controls."""
+    reason = rule.reasons[column]
+    return (
+        f"{reason} By runs that settle and stay {name} comes closest."
+        if rule.seeing
+        else f"Best, by runs that settle and stay, is {name}: {reason[:1].lower()}{reason[1:]}"
+    )
+
+
+def named(board: Board, name: str) -> str:
+    """ "the agent “ours”", "the baseline “Bayes, robust”"."""
+    kind = {AGENT: "the agent", PAPER: "the paper’s agent"}.get(board.kinds[name], "the baseline")
+    return kind if name.lower() in ("agent", "our agent", "ours", "the paper's agent", "paper", "the paper’s agent") else f"{kind} “{name}”"
+
+
+def told(sources: Sources, board: Board) -> str:
+    """The default's worst case, by how much it beats the next, and, where the agent is neither, how far it came."""
+    mine, place = worst(board, board.default, "lasting")
+    if place is None:
+        return ""
+    runs = board.cells[board.default, place].runs
+    text = f"In its worst case ({within(place)}) {share_text(mine)} of {runs:,} runs settle and stay"
+    others = [name for name in board.names if name != board.default and worst(board, name, "lasting")[1]]
+    if not others:
+        return f"{text}. Nothing else was judged."
+    figure, where = worst(board, others[0], "lasting")
+    margin = lookup(sources.tables["choice"], "margin")
+    points = mine.value - figure.value if isinstance(margin, Missing) else float(margin)
+    noise = ", which is within the noise of these runs" if figure.high >= mine.low else ""
+    rival = f"the next, {named(board, others[0])}, in its own ({within(where)}: {share_text(figure)})"
+    text += f", {number(points, 1)} points more than of {rival}{noise}." if abs(points) >= 0.05 else f", as many as of {rival}."
+    learned = board.learned()
+    if not learned or learned in (board.default, others[0]):
+        return text
+    figure, where = worst(board, learned, "lasting")
+    return (
+        text
+        if where is None
+        else f"{text} {named(board, learned)[:1].upper()}{named(board, learned)[1:]} did not earn it: {share_text(figure)} ({within(where)})."
+    )

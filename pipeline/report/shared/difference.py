@@ -1,0 +1,174 @@
+"""This run against the last accepted one: what changed, and which figures moved beyond their noise."""
+
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pipeline.report.shared.digits import MINUS, THIN, count, decimals, number, short
+from pipeline.report.shared.sources import NIGHTLY, Sources, digest
+from pipeline.report.shared.verdict import Figure, Missing, Question
+from pipeline.report.temperature.answers import all_answers
+
+
+class Move(NamedTuple):
+    """A figure in both runs. `moved`: its bands no longer overlap; `word`: better, worse, within noise, unchanged, or why it cannot be
+    said.
+    """
+
+    question: Question
+    before: Figure | None
+    now: Figure | Missing
+    moved: bool
+    word: str
+
+    def text(self) -> str:
+        """ "+0.39 °C · worse"; a change of a percentage is in points."""
+        if not self.moved:
+            return self.word
+        change = self.now.value - self.before.value
+        if math.isinf(change) or math.isnan(change):
+            return self.word
+        places = min(decimals(f.low, f.high, value=f.value) for f in (self.before, self.now))
+        exact = all(f.low == f.high for f in (self.before, self.now))
+        size = short(abs(change), 3) if exact else number(abs(change), places)
+        unit = {"%": "points", "×": "×"}.get(self.question.unit, self.question.unit)
+        sign = "+" if change > 0 else MINUS
+        return f"{sign}{size}{THIN + unit if unit else ''} · {self.word}"
+
+
+class Difference(NamedTuple):
+    """`inputs`, `parameters` (name, before, now), `code` with its `files`, and `artifacts` (path, new | changed | gone) that changed;
+    `same`: how many artifacts did not; `machine`: the accepted run's, where nothing but the machine can differ from it, else {}.
+    """
+
+    inputs: list[str]
+    parameters: list[tuple[str, str, str]]
+    code: str
+    files: list[tuple[str, str]]
+    artifacts: list[tuple[str, str]]
+    same: int
+    accepted: str
+    machine: Mapping[str, Any]
+
+    @property
+    def empty(self) -> bool:
+        return not (self.inputs or self.parameters or self.artifacts or self.code == "changed")
+
+
+def difference(sources: Sources) -> Difference | None:
+    """None where no run was accepted yet."""
+    before = sources.accepted
+    if before is None or isinstance(before, Missing):
+        return None
+    hashes = before.get("hashes") or {}
+    now = {
+        path: source.sha256
+        for path, source in sources.read.items()
+        if path.startswith(("datasets/", "reports/metrics/")) and path != NIGHTLY
+    }
+    known = {
+        path: value
+        for path, value in hashes.items()
+        if path.startswith(("datasets/", "reports/metrics/")) and path.rsplit("/", 1)[-1] not in ("report.json", "nightly.json")
+    }
+    recorded = {path.split("/", 1)[0] for path in known}
+    now = {path: value for path, value in now.items() if path.split("/", 1)[0] in recorded}
+    changes = [(path, "changed" if path in known else "new") for path in sorted(now) if known.get(path) != now[path]]
+    # what no page reads is not hashed again; that it is not there any more is seen
+    folders_read = {path.rsplit("/", 1)[0] for path in now}
+    changes += [
+        (path, "gone") for path in sorted(known) if path not in now and path.rsplit("/", 1)[0] in folders_read and not Path(path).exists()
+    ]
+    inputs = [path for path, _ in changes if path.split("/")[1] == "raw" or path.split("/")[1:] == ["ingest", "record.parquet"]]
+    # the accepted run may know the code by its folders, as it knows artifacts
+    folders = {path: value for path, value in hashes.items() if path in ("pipeline", "stages")}
+    code = digest(folders) if folders else None
+    parameters = list(_parameters(before.get("params") or {}, sources.declared.everything))
+    alike = code == sources.code and not inputs and not parameters
+    machine = before.get("machine")
+    return Difference(
+        inputs,
+        parameters,
+        "not recorded" if code is None else "unchanged" if code == sources.code else "changed",
+        _changed(before["code"], sources.files) if before.get("code") else [],
+        [change for change in changes if change[0] not in inputs],
+        sum(known.get(path) == now[path] for path in now),
+        digest(before)[:8],
+        machine if alike and isinstance(machine, dict) else {},
+    )
+
+
+def _changed(before: Mapping[str, str], now: Mapping[str, str]) -> list[tuple[str, str]]:
+    """(path, new | changed | gone) of every file whose digest is another."""
+    words = {(True, True): "changed", (False, True): "new", (True, False): "gone"}
+    return [(path, words[path in before, path in now]) for path in sorted(before.keys() | now.keys()) if before.get(path) != now.get(path)]
+
+
+def _parameters(before: Mapping, now: Mapping) -> Iterator[tuple[str, str, str]]:
+    # a section that is new or gone is one change
+    for name in sorted(before.keys() ^ now.keys()):
+        values = count(len(list(_flat("", before.get(name, now.get(name))))), "value")
+        yield name, *(("no section", f"a section of {values}") if name in now else (f"a section of {values}", "no section"))
+    both = before.keys() & now.keys()
+    old, new = (dict(_flat("", {name: part[name] for name in both})) for part in (before, now))
+    for name in sorted(old.keys() | new.keys()):
+        if old.get(name) != new.get(name):
+            yield name, _shown(old, name), _shown(new, name)
+
+
+def _shown(values: Mapping[str, Any], name: str) -> str:
+    return "none" if name not in values else "null" if values[name] is None else str(values[name]) or "empty"
+
+
+def _flat(prefix: str, data: Any) -> Iterator[tuple[str, Any]]:
+    items = data.items() if isinstance(data, Mapping) and data else enumerate(data) if isinstance(data, list) and data else None
+    if items is None:
+        yield prefix, data
+        return
+    for key, value in items:
+        place = f"{prefix}[{key}]" if isinstance(data, list) else f"{prefix}.{key}" if prefix else str(key)
+        yield from _flat(place, value)
+
+
+def accepted_answers(sources: Sources, asked: list[Question]) -> Mapping[str, Mapping[str, Figure | Missing]]:
+    """The figures of an accepted run that kept none with their bands: from its metrics alone, no tables."""
+    gone = Missing("not measured", "the accepted run keeps no table")
+    metrics = {stage: sources.accepted.get("metrics", {}).get(stage, gone) for stage in sources.metrics}
+    return all_answers(sources._replace(metrics=metrics, tables=dict.fromkeys(sources.tables, gone)), asked)
+
+
+def moves(sources: Sources, asked: list[Question], answers: Mapping[str, Mapping[str, Figure | Missing]]) -> dict[str, list[Move]]:
+    """{controller: every figure against the accepted run's}; unchanged is what the metrics alone say, moved what the bands say."""
+    if sources.accepted.get("figures"):
+        before, plain = _recorded(sources.accepted["figures"]), answers
+    else:
+        before = accepted_answers(sources, asked)
+        plain = all_answers(sources._replace(tables=dict.fromkeys(sources.tables, Missing("not measured", ""))), asked)
+    return {
+        name: [
+            _move(question, before.get(name, {}).get(question.key), plain[name][question.key], answers[name][question.key])
+            for question in asked
+        ]
+        for name in answers
+    }
+
+
+def _recorded(figures: Mapping[str, Any]) -> dict[str, dict[str, Figure | Missing]]:
+    """The figures as the accepted pages showed them; null is without end."""
+    return {
+        name: {key: Figure(*(math.inf if f[end] is None else f[end] for end in ("median", "low", "high"))) for key, f in found.items()}
+        for name, found in figures.items()
+    }
+
+
+def _move(question: Question, before: Figure | Missing | None, plain: Figure | Missing, now: Figure | Missing) -> Move:
+    if isinstance(now, Missing):
+        return Move(question, None, now, False, now.state)
+    if before is None or isinstance(before, Missing):
+        return Move(question, None, now, False, "new")
+    if isinstance(plain, Figure) and before[:3] == plain[:3]:
+        return Move(question, before, now, False, "unchanged")
+    if now.low <= before.high and before.low <= now.high:
+        return Move(question, before, now, False, "within noise")
+    return Move(question, before, now, True, "better" if (now.value < before.value) != question.at_least else "worse")

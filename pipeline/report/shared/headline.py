@@ -1,0 +1,132 @@
+"""What page one says first: one sentence for the machine, and a row for each loop with its decision, the rule that decided it and what to do."""
+
+import math
+import re
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from pipeline.report.deposition import verdict as deposition_verdict
+from pipeline.report.setpoint import verdict as setpoint_verdict
+from pipeline.report.shared.sources import Sources
+from pipeline.report.shared.verdict import FAILED, PASSED
+from pipeline.report.temperature.judgement import Judgement
+
+NAMES = ("temperature", "deposition", "setpoint")
+MOVES = ("heaters to barrel", "plunger to flow", "camera to setpoints")
+ABSENT = "not measured"
+# what the first screen has room for beside the answers: lines in all, and letters in a line of the widest font
+LINES, LINE = 11, 72
+
+
+class Loop(NamedTuple):
+    """One loop: its state (passed, failed, open, not measured), and whole sentences; `lead` is bold and vermillion where it failed."""
+
+    name: str
+    moves: str
+    state: str
+    decision: str
+    lead: str
+    reason: str
+    remedy: str
+
+
+def loops(sources: Sources, judged: Judgement) -> list[Loop]:
+    """Temperature, deposition, setpoint, each as short as page one has room for; the loop's own page has the whole."""
+    mine, parts, seen = judged.verdict, deposition_verdict.verdict(sources), setpoint_verdict.verdict(sources)
+    states = (
+        {PASSED: "passed", FAILED: "failed"}.get(mine.state, "open"),
+        {PASSED: "passed", FAILED: "failed"}.get(parts.state, "open") if parts.composer else ABSENT,
+        {PASSED: "passed", FAILED: "failed"}.get(seen.state, "open") if seen.default else ABSENT,
+    )
+    said = (
+        (mine.decision, mine.lead, mine.reason, mine.remedy),
+        *((v.decision, v.lead, _first(v.reason), v.remedy) for v in (parts, seen)),
+    )
+    found = [Loop(name, moves, state, *one) for name, moves, state, one in zip(NAMES, MOVES, states, said, strict=True)]
+    return _fitted(found)
+
+
+def _first(text: str) -> str:
+    """The first sentence, up to its first semicolon where that is long."""
+    sentence = re.split(_SENTENCES, text, maxsplit=1)[0]
+    return sentence if len(sentence) <= 2 * LINE + 20 else re.split(r"; ", sentence, maxsplit=1)[0].rstrip(".") + "."
+
+
+_SENTENCES = r"(?<=[.!?]) (?=[A-Z])"
+
+
+def _fitted(found: Sequence[Loop]) -> list[Loop]:
+    """Where there is no room for all reasons, those that take more than a third of it are cut at their end; then remedies by whole sentences, those of a loop that did not
+    pass first.
+    """
+    kept = [loop._replace(remedy="") for loop in found]
+    if sum(map(_lines, kept)) > LINES:
+        kept = [loop._replace(reason=_cut(loop.reason, LINES // 3 * LINE - len(loop.decision) - len(loop.lead) - 2)) for loop in kept]
+    for i in sorted(range(len(found)), key=lambda i: found[i].state == "passed"):
+        for sentence in filter(None, re.split(_SENTENCES, found[i].remedy)):
+            longer = kept[i]._replace(remedy=f"{kept[i].remedy} {sentence}".strip())
+            if sum(_lines(loop) for loop in [*kept[:i], longer, *kept[i + 1 :]]) > LINES:
+                break
+            kept[i] = longer
+    return kept
+
+
+def _cut(text: str, room: int) -> str:
+    room = max(room, LINE)
+    return text if len(text) <= room else text[: room - 1].rstrip() + "…"
+
+
+def _lines(loop: Loop) -> int:
+    return math.ceil(len(f"{loop.decision} {loop.lead} {loop.reason} {loop.remedy}".rstrip()) / LINE)
+
+
+SOURCES = {"temperature": "generate_probing", "deposition": "train_ilc", "setpoint": "train_classifier"}
+RECORDED = {
+    "temperature": "judged on models of the recorded machine",
+    "deposition": "forecast by the model of the recorded machine",
+    "setpoint": "judged on recorded frames",
+}
+
+
+def simulated(sources: Sources, name: str) -> bool:
+    return sources.declared.everything.get(SOURCES[name], {}).get("source") != "recordings"
+
+
+def claim(sources: Sources, names: Sequence[str] = NAMES) -> str:
+    """What was judged on what, and so what may be claimed of a real printer."""
+    made = [name for name in names if simulated(sources, name)]
+    said = [f"{name} {RECORDED[name]}" for name in names if name not in made]
+    if made:
+        which = "" if len(names) == len(made) else f"{_listed(made, 'and')} "
+        said.append(f"{which}judged on simulated machines only: nothing is claimed about a real printer".strip())
+    text = "; ".join(said)
+    return f"{text[:1].upper()}{text[1:]}."
+
+
+def decision(found: Sequence[Loop]) -> str:
+    """ "Deploy temperature and deposition; do not deploy setpoint." """
+    groups = {state: [loop.name for loop in found if loop.state == state] for state in ("passed", "failed", "open", ABSENT)}
+    if len(groups["passed"]) == len(found):
+        return "Deploy all three loops."
+    said = [
+        f"deploy {_listed(groups['passed'], 'and')}" if groups["passed"] else "",
+        f"do not deploy {_listed(groups['failed'], 'or')}" if groups["failed"] else "",
+        f"{_listed(groups['open'], 'and')} {_is(groups['open'])} undecided" if groups["open"] else "",
+        f"{_listed(groups[ABSENT], 'and')} {_is(groups[ABSENT])} not measured" if groups[ABSENT] else "",
+    ]
+    text = "; ".join(filter(None, said))
+    return f"{text[:1].upper()}{text[1:]}."
+
+
+def _is(names: Sequence[str]) -> str:
+    return "is" if len(names) == 1 else "are"
+
+
+def _listed(names: Sequence[str], word: str) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} {word} {names[-1]}"
+
+
+def state(found: Sequence[Loop]) -> str:
+    """The worst of the loops that were measured: failed before open before passed."""
+    states = {loop.state for loop in found}
+    return next((one for one in ("failed", "open") if one in states), "passed" if "passed" in states else "open")

@@ -1,0 +1,121 @@
+"""What the pages say they were made from, held against the files as they are now and against dvc.lock."""
+
+import hashlib
+import json
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+
+from pipeline.report.shared.sources import NIGHTLY, digest
+from pipeline.store import artifacts, params
+
+# what .dvcignore leaves out of every folder
+IGNORED = {"__pycache__", ".venv", ".uv"}
+
+
+class Check(NamedTuple):
+    """What was held against what: how many things, and a sentence for each that does not match."""
+
+    what: str
+    count: int
+    wrong: list[str]
+
+
+def checks(report: str = "reports/metrics/report.json", lock: str = "dvc.lock") -> list[Check]:
+    """Sources, parameters and code, the pages and their references, and dvc.lock. Raises ValueError where the report's metrics are missing or
+    were written by an older version.
+    """
+    said = artifacts.read_json(report)
+    if not {"read", "pages", "parameters", "code"} <= said.keys():
+        raise ValueError(f"{report}: it does not say what the pages were made from; run ./run dvc repro report")
+    # the night that made these pages has written its own figures since
+    files = [sentence for path, recorded in said["read"].items() if path != NIGHTLY and (sentence := _held(path, recorded))]
+    written = {f"reports/{name}.html": recorded for name, recorded in said["pages"].items()}
+    pages = [sentence for path, recorded in written.items() if (sentence := _held(path, recorded))]
+    return [
+        Check("sources of the pages", len(said["read"]), files),
+        Check("digests of parameters and code", 2, list(_settings(said))),
+        Check("pages", len(written), pages),
+        _references(written, said["read"]),
+        _lock(Path(lock), said["read"]),
+    ]
+
+
+def _held(path: str, recorded: str) -> str:
+    if not Path(path).exists():
+        return f"{path} is gone"
+    return "" if artifacts.sha256(path) == recorded else f"{path} has changed since"
+
+
+def _settings(said: Mapping[str, Any]) -> Iterator[str]:
+    if digest(params.read()) != said["parameters"]:
+        yield f"{' or '.join(params.files())} has changed since"
+    if digest({folder: artifacts.sha256(folder) for folder in ("pipeline", "stages")}) != said["code"]:
+        yield "the code (pipeline, stages) has changed since"
+
+
+def _references(pages: Mapping[str, str], read: Mapping[str, str]) -> Check:
+    """Every "From ..." below a figure or a table leads to a row with artifact, stage, schema and hash, and the hash is the one that was read."""
+    row = re.compile(
+        r'<tr id="(from-[^"]+)"><td><code>([^<]+)</code></td><td>([^<]+)</td><td>([^<]+)</td><td><code>([0-9a-f]{64})</code></td></tr>'
+    )
+    count, wrong = 0, []
+    for path in pages:
+        text = Path(path).read_text(encoding="utf-8") if Path(path).exists() else ""
+        rows = {found[1]: found for found in row.finditer(text)}
+        linked = re.findall(r'href="#(from-[^"]+)"', text)
+        count += len(linked)
+        wrong += [f"{path} refers to {name}, which is not among its sources" for name in dict.fromkeys(linked) if name not in rows]
+        wrong += [f"{path} gives another hash of {found[2]} than was read" for found in rows.values() if read.get(found[2]) != found[5]]
+    return Check("references of figures and tables", count, wrong)
+
+
+# ---- dvc.lock
+
+
+def _lock(path: Path, read: Mapping[str, str]) -> Check:
+    """What every stage wrote, and what the report stage read, by the MD5 that DVC recorded; a source that no stage wrote is said so."""
+    if not path.exists():
+        return Check("entries of dvc.lock", 0, [f"{path} is missing: nothing says which run the files are of"])
+    stages = (yaml.safe_load(path.read_text(encoding="utf-8")) or {}).get("stages", {})
+    entries = [(entry, name) for name, stage in stages.items() for entry in stage.get("outs", [])]
+    entries += [
+        (entry, "report") for entry in stages.get("report", {}).get("deps", []) if entry["path"] not in {e["path"] for e, _ in entries}
+    ]
+    wrong = []
+    for entry, stage in entries:
+        place = Path(entry["path"])
+        if not place.exists():
+            wrong.append(f"{place} of {stage} is gone")
+        elif "md5" in entry and md5(place) != entry["md5"]:
+            wrong.append(f"{place} is not what dvc.lock has of {stage}")
+    known = [entry["path"] for entry, _ in entries]
+    wrong += [
+        f"{source} is in no entry of dvc.lock"
+        for source in read
+        if source != NIGHTLY and not any(f"{source}/".startswith(f"{k}/") for k in known)
+    ]
+    return Check("entries of dvc.lock", len(entries), wrong)
+
+
+def md5(path: Path) -> str:
+    """As DVC 3 has it: of a file its bytes', of a folder the MD5 of the JSON list of its files' MD5s and relative names, with .dir behind."""
+    if not path.is_dir():
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "md5").hexdigest()
+    files = [file for file in path.rglob("*") if file.is_file() and not IGNORED & set(file.parts) and file.suffix != ".pyc"]
+    listed = sorted(
+        ({"md5": md5(file), "relpath": file.relative_to(path).as_posix()} for file in files), key=lambda entry: entry["relpath"]
+    )
+    return hashlib.md5(json.dumps(listed, sort_keys=True).encode()).hexdigest() + ".dir"
+
+
+def told(found: list[Check]) -> str:
+    """One line for each check that held. Raises ValueError naming all that did not."""
+    wrong = [sentence for check in found for sentence in dict.fromkeys(check.wrong)]
+    if wrong:
+        raise ValueError(f"reports: {len(wrong)} of {sum(c.count for c in found)} no longer match: {'; '.join(wrong)}; run ./run dvc repro")
+    return "\n".join(f"{check.count:>5} {check.what}: all match" for check in found)

@@ -1,0 +1,216 @@
+"""What the pages are made of: every artifact that is there, read and hashed; in the place of one that is not, the reason."""
+
+import base64
+import hashlib
+import json
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pipeline.deposition.workflow.tables import FILMED, LESSONS, LIBRARY, LINES, SCORES, SIGNALS, TASKS, TRIALS
+from pipeline.report.shared.verdict import Missing, ReportRules
+from pipeline.setpoint.workflow.tables import AGENT_COURSE, CLASSIFIED, COURSE, DECISIONS, PATHS, RELIABILITY, SCOREBOARD, WINDOWS
+from pipeline.store import artifacts
+from pipeline.temperature.workflow import tables as schemas
+from pipeline.temperature.workflow.settings import Panel, Plant, Tracking
+
+Table = dict[str, np.ndarray]
+
+
+class Declared(NamedTuple):
+    """What the parameters say: the sections that figures are labelled with, and all of it as text for the difference."""
+
+    rules: ReportRules
+    machine: Plant
+    panel: Panel
+    tracking: Tracking
+    everything: dict[str, Any]
+
+
+class Source(NamedTuple):
+    """One file that the pages show: what it is called here (a table's name, or the stage of metrics), the stage that wrote it, name and
+    version of its schema, and the digest of its bytes.
+    """
+
+    name: str
+    path: str
+    stage: str
+    schema: str
+    sha256: str
+
+
+class Sources(NamedTuple):
+    """`metrics` by stage and `tables` by name, each with a Missing where it could not be read; `read`: what was;
+    `absent`: what was not, by path; `accepted`: the last accepted run, or None; `files`: digest of each
+    file of code; `nightly`: what the last night measured, None before the first.
+    """
+
+    declared: Declared
+    metrics: Mapping[str, dict | Missing]
+    tables: Mapping[str, Table | Missing]
+    read: Mapping[str, Source]
+    absent: Mapping[str, Missing]
+    accepted: dict | Missing | None
+    code: str
+    files: Mapping[str, str]
+    nightly: dict | Missing | None = None
+
+    def source(self, *names: str) -> list[Source]:
+        """Those of the files that could be read."""
+        return [source for name in names for source in self.read.values() if source.name == name]
+
+
+# what the nightly job writes after the pages: no dependency of theirs (DVC would ask for it before the first night), they show the night before
+NIGHTLY = "reports/metrics/nightly.json"
+
+
+def collect(declared: Declared, metrics: Mapping[str, str], folders: Mapping[str, str], accepted: str, code: tuple[str, ...]) -> Sources:
+    """Reads the metrics files and the folders of stages, {stage: path} each. What is missing or broken is no error here: its place on
+    the page says so.
+    """
+    read: dict[str, Source] = {}
+    wanted = [(path, stage, stage, "metrics", artifacts.read_json) for stage, path in metrics.items()]
+    tables = _tables(declared.machine)
+    wanted += [(f"{folders[stage]}/{file}", name, stage, kind, reader) for name, stage, file, kind, reader in tables]
+    found = {(path, name): _read(read, path, name, stage, kind, reader) for path, name, stage, kind, reader in wanted}
+    absent = {path: value for (path, _), value in found.items() if isinstance(value, Missing)}
+    by_name = [
+        {name: value for (_, name), value in part} for part in (list(found.items())[: len(metrics)], list(found.items())[len(metrics) :])
+    ]
+    for name, stage in (("frames", "train_ilc"), ("nozzle_frames", "train_classifier")):
+        frames = by_name[1].get(name, [])
+        for one in [] if isinstance(frames, Missing) else frames:
+            read[one["path"]] = Source("frame", one["path"], stage, "JPEG", artifacts.sha256(one["path"]))
+    before = _read(read, accepted, "accepted", "accept", "accepted", artifacts.read_json) if artifacts.exists(accepted) else None
+    night = _read(read, NIGHTLY, "nightly", "nightly", "nightly", artifacts.read_json) if artifacts.exists(NIGHTLY) else None
+    folders_of_code = digest({folder: artifacts.sha256(folder) for folder in code})
+    return Sources(declared, *by_name, read, absent, before or None, folders_of_code, code_files(code), night)
+
+
+def code_files(folders: tuple[str, ...]) -> dict[str, str]:
+    """Digest of each file of code, so that a difference can name the ones that changed."""
+    files = [file for folder in folders for file in sorted(Path(folder).rglob("*")) if file.is_file()]
+    return {
+        file.as_posix(): artifacts.sha256(file) for file in files if not any(p.startswith(".") or p == "__pycache__" for p in file.parts)
+    }
+
+
+def machine(path: str) -> dict[str, Any]:
+    """What `run` wrote beside the pages of the machine it ran on; {} where it did not. Raises ValueError where the file holds another line."""
+    if not artifacts.exists(path):
+        return {}
+    found = re.fullmatch(r"window\.beadline = (\{.*\});\s*", Path(path).read_text(encoding="utf-8", errors="replace"))
+    try:
+        return dict(json.loads(found[1])["machine"])
+    except (TypeError, ValueError, KeyError):
+        raise ValueError(f"{path}: expected the line that ./run writes, found another; run ./run dvc repro, which writes it anew") from None
+
+
+def digest(data: Any) -> str:
+    """SHA-256 of the canonical JSON of plain data."""
+    return hashlib.sha256(json.dumps(data, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], Any]]]:
+    """(name, stage, file, schema, reader) of every table that the pages show."""
+
+    def table(schema: schemas.Schema) -> tuple[str, Callable[[str], Table]]:
+        return f"{schema.name} {schema.version}", lambda path: artifacts.read_table(path, schema)
+
+    def arrays(name: str) -> tuple[str, Callable[[str], Table]]:
+        return f"{name} 1", lambda path: artifacts.read_arrays(path, name, 1)
+
+    return [
+        ("record", "ingest", "record.parquet", *table(schemas.record(machine.inputs, machine.outputs))),
+        ("quality", "ingest", "quality.parquet", *table(schemas.QUALITY)),
+        ("plant", "identify_plant", "plant.parquet", *arrays("plant")),
+        ("order", "identify_plant", "order.parquet", *table(schemas.ORDER)),
+        ("holdout", "identify_plant", "holdout.parquet", *table(schemas.holdout(machine.outputs))),
+        ("residuals", "identify_plant", "residuals.parquet", *table(schemas.RESIDUALS)),
+        ("steps", "identify_plant", "steps.parquet", *table(schemas.STEPS)),
+        ("dynamics", "identify_plant", "dynamics.parquet", *table(schemas.DYNAMICS)),
+        ("poles", "identify_plant", "poles.parquet", *table(schemas.POLES)),
+        ("levels", "identify_plant", "levels.parquet", *table(schemas.LEVELS)),
+        ("window", "learn_kernel", "window.parquet", *arrays("window")),
+        ("kernel", "learn_kernel", "kernel.parquet", *arrays("kernel")),
+        ("tuning", "tune_weights", "history.parquet", *table(schemas.TUNING)),
+        ("weights", "tune_weights", "weights.json", "weights", artifacts.read_json),
+        ("summary", "evaluate_temperature", "summary.json", "summary", artifacts.read_json),
+        ("scorecard", "evaluate_temperature", "scorecard.parquet", *table(schemas.SCORECARD)),
+        ("trajectories", "evaluate_temperature", "trajectories.parquet", *table(schemas.trajectories(machine.inputs, machine.outputs))),
+        ("study", "evaluate_temperature", "study.parquet", *table(schemas.STUDY)),
+        ("trials", "train_ilc", "trials.parquet", *table(TRIALS)),
+        ("lessons", "train_ilc", "lessons.parquet", f"{LESSONS.name} {LESSONS.version}", _first_routine),
+        ("filmed", "train_ilc", "filmed.parquet", *table(FILMED)),
+        ("models", "train_ilc", "models.json", "models", artifacts.read_json),
+        ("frames", "train_ilc", "frames/frames.json", "frames 1", _frames),
+        ("library", "segment_library", "library.parquet", *table(LIBRARY)),
+        ("learned", "segment_library", "learned.json", "learned", artifacts.read_json),
+        ("signals", "compose_parts", "signals.parquet", *table(SIGNALS)),
+        ("scores", "compose_parts", "scores.parquet", *table(SCORES)),
+        ("tasks", "compose_parts", "tasks.parquet", *table(TASKS)),
+        ("lines", "compose_parts", "lines.parquet", *table(LINES)),
+        ("conformance", "compose_parts", "conformance.json", "conformance", artifacts.read_json),
+        ("classified", "train_classifier", "classified.parquet", *table(CLASSIFIED)),
+        ("reliability", "train_classifier", "reliability.parquet", *table(RELIABILITY)),
+        ("course", "train_classifier", "course.parquet", *table(COURSE)),
+        ("windows", "train_classifier", "windows.parquet", *table(WINDOWS)),
+        ("nozzle_frames", "train_classifier", "frames/frames.json", "frames 1", _frames),
+        ("agents", "train_agent", "agents.parquet", *table(AGENT_COURSE)),
+        ("scoreboard", "evaluate_setpoint", "scoreboard.parquet", *table(SCOREBOARD)),
+        ("paths", "evaluate_setpoint", "paths.parquet", *table(PATHS)),
+        ("decisions", "evaluate_setpoint", "decisions.parquet", *table(DECISIONS)),
+        ("choice", "evaluate_setpoint", "choice.json", "choice", artifacts.read_json),
+    ]
+
+
+def _first_routine(path: str) -> Table:
+    """The lessons of the reference routine, a third of all rows; the pages show no other."""
+    table = artifacts.read_table(path, LESSONS)
+    rows = table["routine"] == 0
+    return {name: values[rows] for name, values in table.items()}
+
+
+# frames that a page has room for
+FRAMES = 24
+
+
+def _frames(path: str) -> list[dict[str, Any]]:
+    """The first rows of an index of frames, each with its picture's path and the picture as a data URI. Raises ValueError where one is missing or no JPEG."""
+    found, stage = artifacts.read_json(path)[:FRAMES], Path(path).parent.parent.name
+    for one in found:
+        picture = Path(path).with_name(Path(one["file"]).name)
+        try:
+            data = picture.read_bytes()
+        except OSError as error:
+            raise ValueError(f"{picture} cannot be read ({error.strerror}); run ./run dvc repro {stage}") from None
+        if not data.startswith(b"\xff\xd8"):
+            raise ValueError(f"{picture} is no JPEG; run ./run dvc repro {stage}")
+        one |= {"path": picture.as_posix(), "uri": "data:image/jpeg;base64," + base64.b64encode(data).decode()}
+    return found
+
+
+def _read(read: dict[str, Source], path: str, name: str, stage: str, schema: str, reader: Callable[[str], Any]) -> Any:
+    if not artifacts.exists(path):
+        return Missing("not measured", f"{Path(path).name} of {stage} is not there", f"Run ./run dvc repro {stage}")
+    try:
+        found = reader(path)
+    except ValueError as error:
+        return Missing("failed", str(error))
+    read[path] = Source(name, path, stage, schema, artifacts.sha256(path))
+    return found
+
+
+def lookup(data: Any, dotted: str, *, what: str = "") -> Any:
+    """data["a"]["b"] of "a.b", or the Missing that stands for it; null is missing too."""
+    found = data
+    for key in dotted.split("."):
+        if isinstance(found, Missing):
+            return found
+        found = found.get(key) if isinstance(found, Mapping) else None
+        if found is None:
+            return Missing("not measured", f"{what or dotted} is not among what the stage measured")
+    return found

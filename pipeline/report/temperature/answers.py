@@ -1,0 +1,152 @@
+"""Artifacts -> the answers of page one: median and 90 % band of each figure, for each controller."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from pipeline.report.shared.digits import DASH, number
+from pipeline.report.shared.sources import Sources, Table, lookup
+from pipeline.report.shared.verdict import Figure, Missing, Question
+
+# role on page one -> the controller's name in the artifacts; the window is the data-driven route: the record alone ranks it before the kernel
+CONTROLLERS = {"data_driven": "window", "model_based": "model_based", "baseline": "baseline"}
+LABELS = {
+    "model_based": ("Model-based", "model + Riccati"),
+    "window": ("Data-driven", "window + Riccati"),
+    "kernel": ("Kernel", "Algorithm 2"),
+    "baseline": ("Baseline", "PI per zone"),
+    "exact_model": ("Exact model", "told the truth"),
+}
+RUNS = {
+    "gap_percent": ("regret", 100.0),
+    "settled_error_degC": ("settled_error_degC", 1.0),
+    "settling_s": ("settling_s", 1.0),
+    "overshoot_degC": ("overshoot_degC", 1.0),
+    "at_limits_percent": ("at_limits_percent", 1.0),
+}
+
+
+def all_answers(sources: Sources, asked: list[Question]) -> dict[str, dict[str, Figure | Missing]]:
+    """{controller: {key: figure}} of every controller that was judged, and of the three roles whether they were or not."""
+    judged = lookup(sources.metrics["evaluate_temperature"], "controllers", what="the scorecard")
+    names = list(dict.fromkeys([*CONTROLLERS.values(), *([] if isinstance(judged, Missing) else judged)]))
+    return {name: {question.key: _answer(sources, judged, name, question) for question in asked} for name in names}
+
+
+def _answer(sources: Sources, judged: Any, name: str, question: Question) -> Figure | Missing:
+    if question.key == "data":
+        return _data(sources, name)
+    mine = lookup(judged, name, what=f"{LABELS.get(name, (name,))[0]}")
+    if isinstance(mine, Missing):
+        return mine
+    if question.key == "worst_case_gap_percent":
+        return worst_case(sources.tables["scorecard"], name, noise(sources), mine.get("gap_percent"))
+    found = mine.get(question.key)
+    if found is None:
+        return Missing("not measured", f"{question.title} is not in the scorecard", "Run ./run dvc repro evaluate_temperature")
+    note = _zone(sources, found) if question.key == "settled_error_degC" else ""
+    return Figure(*(_finite(found.get(end)) for end in ("median", "low", "high")), runs=_runs(sources, name, question.key), note=note)
+
+
+def _finite(value: float | None) -> float:
+    return math.inf if value is None else float(value)
+
+
+def _zone(sources: Sources, found: Mapping) -> str:
+    zone = found.get("zone")
+    return f"zone {zone + 1}" if isinstance(zone, int) else f"zone {zone}" if zone else ""
+
+
+def noise(sources: Sources) -> float:
+    """The noise level that the figures were judged at, in °C."""
+    found = lookup(sources.tables["summary"], "noise_degC")
+    if not isinstance(found, Missing):
+        return found
+    return sources.declared.everything.get("evaluate_temperature", {}).get("report_noise_degC", sources.declared.panel.noise_degC[0])
+
+
+def _mine(table: Table, name: str, noise: float) -> np.ndarray:
+    return (table["controller"] == name) & (table["noise_degC"] == noise)
+
+
+def _runs(sources: Sources, name: str, key: str) -> tuple[float, ...]:
+    """The repetitions on the nominal plant, a run that never settles as infinity."""
+    table = sources.tables["scorecard"]
+    if isinstance(table, Missing) or key not in RUNS:
+        return ()
+    column, factor = RUNS[key]
+    values = factor * table[column][_mine(table, name, noise(sources)) & (table["plant"] == 0)]
+    return tuple(np.where(np.isnan(values), math.inf, values).tolist())
+
+
+def worst_case(table: Table | Missing, name: str, noise: float, summary: Mapping | None) -> Figure | Missing:
+    """The largest gap over plants, starts and references, in percent; its band is over the seeds of the noise."""
+    if isinstance(table, Missing):
+        worst = (summary or {}).get("worst")
+        return table if worst is None else Figure(worst, worst, worst)
+    rows = _mine(table, name, noise)
+    if not rows.any():
+        return Missing("not measured", f"the scorecard has no run of {name} at {noise:g} °C of noise")
+    gap, seed, plant = (table[column][rows] for column in ("regret", "seed", "plant"))
+    gap = 100.0 * np.where(np.isnan(gap), math.inf, gap)
+    worst = np.array([gap[seed == s].max() for s in np.unique(seed)])
+    low, value, high = np.quantile(worst, [0.05, 0.5, 0.95], method="nearest")
+    return Figure(float(value), float(low), float(high), tuple(worst.tolist()), f"{len(np.unique(plant))} plants")
+
+
+def _data(sources: Sources, name: str) -> Figure | Missing:
+    """Samples of the record over the samples that a controller needs: for its noise, and for its unknowns."""
+    learned, machine = sources.metrics["learn_kernel"], sources.declared.machine
+    if name == "kernel":
+        needed, samples = lookup(learned, "samples_needed"), lookup(learned, "samples")
+        if isinstance(needed, Missing) and isinstance(learned, dict) and learned.get("refused"):
+            return Missing("failed", str(learned["refused"]))
+        return _of(samples, needed)
+    if name == "window":
+        samples, noise, past = (lookup(learned, key) for key in ("samples", "samples_needed_for_noise", "window"))
+        missing = next((part for part in (samples, noise, past) if isinstance(part, Missing)), None)
+        unknowns = 0 if missing else past * (len(machine.inputs) + len(machine.outputs)) + 1
+        return missing or _of(samples, max(noise, unknowns))
+    if name in ("model_based", "baseline"):
+        return _model_data(sources)
+    return Missing("not applicable", f"{LABELS.get(name, (name,))[0]} learns nothing from the record")
+
+
+def _model_data(sources: Sources) -> Figure | Missing:
+    """The model has fewer unknowns than the window, so that noise asks no more of it; its own first step, a long VARX, asks for its
+    unknowns.
+    """
+    found, machine = sources.metrics["identify_plant"], sources.declared.machine
+    samples, past = lookup(found, "rows"), lookup(found, "past")
+    needed = lookup(found, "samples_needed")
+    if isinstance(needed, Missing) and not isinstance(past, Missing):
+        noise = lookup(sources.metrics["learn_kernel"], "samples_needed_for_noise")
+        needed = noise if isinstance(noise, Missing) else max(noise, past * (len(machine.inputs) + len(machine.outputs)) + 1)
+    return _of(samples, needed)
+
+
+def _of(samples: Any, needed: Any) -> Figure | Missing:
+    missing = next((part for part in (samples, needed) if isinstance(part, Missing)), None)
+    if missing or not needed:
+        return missing or Missing("not measured", "the number of samples that are needed is not known")
+    ratio, more = samples / needed, max(needed - samples, 0)
+    note = f"{number(samples, 0)} of {number(needed, 0)}" + (f" samples; record {number(more, 0)} more." if more else "")
+    return Figure(ratio, ratio, ratio, note=note)
+
+
+def repetitions(sources: Sources) -> str:
+    """ "24 runs: 3 starts x 2 references x 4 seeds"."""
+    half = sources.declared.panel.judging
+    parts = len(half.starts_degC), len(half.reference_offsets_degC), len(half.seeds)
+    return f"{math.prod(parts)} runs: {parts[0]} starts × {parts[1]} references × {parts[2]} seeds"
+
+
+def featured(sources: Sources) -> str:
+    """The scenario of the pictures, in words."""
+    panel = sources.declared.panel
+    offset = panel.judging.reference_offsets_degC[0]
+    references = [o.reference + offset for o in sources.declared.machine.outputs]
+    ends = f"{number(min(references), 0)}{DASH}{number(max(references), 0)}"
+    return f"nominal plant, held at {panel.judging.starts_degC[0]:g} °C, then sent to {ends} °C; sensor noise {noise(sources):g} °C"

@@ -1,0 +1,57 @@
+"""Answer 11: whether the machine has drifted, as the nightly job measured it last; reports/metrics/nightly.json -> a figure, or why there is none."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from pipeline.report.shared.digits import number
+from pipeline.report.shared.sources import Sources
+from pipeline.report.shared.verdict import FAILED, OPEN, UNDECIDED, Figure, Missing
+
+NEVER = Missing(OPEN, "The nightly job measures it and has not run")
+AGAIN = "Look at the machine; where the change is meant to stay, record it anew and learn again"
+
+
+class Drift(NamedTuple):
+    """Answer 11 as it is read: what the rule is judged by, the word before the sentence, and which night it is from ("" before the first)."""
+
+    found: Figure | Missing
+    word: str
+    text: str
+    night: str
+
+
+def drift(sources: Sources) -> Drift:
+    """Alarm: failed. Watched: undecided. No alarm on a new recording: passed, with the parameter that moved most, in percent with its 90 % band."""
+    nightly = sources.nightly
+    if nightly is None:
+        return Drift(NEVER, "Not measured.", NEVER.sentence(), "")
+    if isinstance(nightly, Missing):
+        return Drift(nightly, f"{nightly.state.capitalize()}.", nightly.sentence(), "")
+    night, seen = f"{nightly.get('run', 'last night')}, {str(nightly.get('when', ''))[:10]}".strip(", "), nightly.get("drift") or {}
+    for key, state, word in (("alarms", FAILED, "Drifted."), ("watched", UNDECIDED, "Perhaps.")):
+        causes = "; ".join(str(one.get("cause", one)) for one in seen.get(key, []))
+        if causes:
+            text = causes if state == FAILED else f"{causes}; an alarm where the next night finds it again"
+            found = Missing(
+                state,
+                f"The machine has changed: {text}" if state == FAILED else f"{text[:1].upper()}{text[1:]}",
+                AGAIN if state == FAILED else "",
+            )
+            return Drift(found, word, f"{text[:1].upper()}{text[1:]}.", night)
+    most = _most(seen.get("figures") or {})
+    if most is None:
+        found = Missing(OPEN, "The last night had no new recording of the machine to measure it on")
+        return Drift(found, "Not measured.", found.sentence(), night)
+    name, percent, half = most
+    text = f"Largest change of the machine: {name}, {number(percent, 1)} % ± {number(half, 1)}."
+    return Drift(Figure(percent, percent - half, percent + half, note=text), "None found.", text, night)
+
+
+def _most(figures: Mapping[str, Any]) -> tuple[str, float, float] | None:
+    """The parameter of the plant that moved most of all recordings of the night, against its own noise: name, change and half of its 90 % band in percent."""
+    found = [
+        (abs(one["sigmas"]), name, float(one["percent"]), float(one["band_percent"]))
+        for recording in figures.values()
+        for name, one in (recording.get("parameters") or {}).items()
+    ]
+    return max(found)[1:] if found else None

@@ -1,0 +1,98 @@
+"""The findings of the temperature page in plain words, each with its figure."""
+
+from typing import Any
+
+from pipeline.report.shared.digits import THIN, number, percent, short
+from pipeline.report.shared.sources import Sources, lookup
+from pipeline.report.shared.verdict import Missing
+from pipeline.report.temperature.evidence import default_cost
+
+
+def findings(sources: Sources) -> list[tuple[str, str]]:
+    """What a reader should take away, each with its figure; a figure that was not measured is said to be so."""
+    evaluated, tuned = sources.metrics["evaluate_temperature"], sources.metrics["tune_weights"]
+    found = [_claim(sources), _scaled(tuned), _algorithm_1(evaluated), _start(evaluated), _regret(tuned)]
+    units = sources.declared.machine.sample_time_s
+    found.append(
+        (
+            "Units are our convention.",
+            (
+                f"The study names no unit of time and none of duty. Here a step is {units:g}{THIN}s and inputs are "
+                "in per cent; read seconds as steps."
+            ),
+        )
+    )
+    if sources.declared.everything.get("generate_probing", {}).get("source") == "simulated":
+        found.append(
+            (
+                "The probing is simulated, the judging is separate.",
+                (
+                    "The record comes from the study’s machine, simulated within limits; every controller is judged "
+                    "on plants that nothing was fitted to. Nothing here is a claim about a real printer."
+                ),
+            )
+        )
+    return [item for item in found if item]
+
+
+def _claim(sources: Sources) -> tuple[str, str] | None:
+    printed = lookup(sources.metrics["evaluate_temperature"], "printed")
+    if isinstance(printed, Missing):
+        return "“Better after tuning”.", f"Not measured. {printed.sentence()}"
+    model = 100 * (1 - printed["model_based_tuned"]["J100"] / printed["model_based"]["J100"])
+    data = 100 * (1 - printed["data_driven_tuned"]["J100"] / printed["data_driven"]["J100"])
+    return (
+        f"“{number(model, 1)} % and {number(data, 1)} % better after tuning” compares two currencies.",
+        (
+            "The cost before tuning is counted with Q = R = I, the cost after it with the tuned, smaller "
+            "weights. The objective that was tuned is the cost at Q = R = I, whose optimum is Q = R = I: no "
+            "weights can be better."
+        ),
+    )
+
+
+def _scaled(tuned: Any) -> tuple[str, str]:
+    change, apart = lookup(tuned, "parity.scaled_weights.change_percent"), lookup(tuned, "parity.scaled_weights.gain_difference")
+    if isinstance(change, Missing) or isinstance(apart, Missing):
+        return "The same controller, “improved”.", "Not measured: tune_weights did not try Q = R = 0.4 I."
+    return (
+        f"Q = R = 0.4 I “improves” the cost by {number(abs(change), 1)} % without changing the controller.",
+        f"Its gain differs from that of Q = R = I by {short(apart, 1)}, which is rounding; every temperature and every input is the same.",
+    )
+
+
+def _algorithm_1(evaluated: Any) -> tuple[str, str]:
+    failed, of = lookup(evaluated, "algorithm_1.failures"), lookup(evaluated, "algorithm_1.of")
+    if isinstance(failed, Missing) or isinstance(of, Missing):
+        return "Algorithm 1 from random starts.", "Not measured."
+    return (
+        f"Algorithm 1 as published misses the stabilising gain in {failed} of {of} random starts.",
+        (
+            "It has no guard against a start that does not stabilise. The controllers here take the Riccati "
+            "equation’s solution instead, which needs no start."
+        ),
+    )
+
+
+def _start(evaluated: Any) -> tuple[str, str]:
+    best, late = lookup(evaluated, "optimal.J1000"), lookup(evaluated, "observer.J1000_from_50_degC")
+    if isinstance(best, Missing) or isinstance(late, Missing):
+        return "Where the observer starts.", "Not measured."
+    return (
+        f"Starting the observer at 50 °C costs {percent(100 * (late / best - 1), 2)} for nothing.",
+        "Starting it from the first measurement costs next to nothing, and asks for nothing that is not known.",
+    )
+
+
+def _regret(tuned: Any) -> tuple[str, str]:
+    regret, cost, identity = lookup(tuned, "practical.regret_identity"), lookup(tuned, "practical.cost"), default_cost(tuned)
+    if any(isinstance(v, Missing) for v in (regret, cost, identity)):
+        return "What tuning buys.", "Not measured."
+    return (
+        f"Practical tuning lowers the engineering cost by {percent(100 * (1 - cost / identity), 2)}, and says what it pays.",
+        f"On the common yardstick the tuned weights cost {percent(100 * regret, 2)} more than the default ones: settling, overshoot and "
+        + (
+            "limits are bought with quadratic cost. Gaps on these pages are at the yardstick’s weights, "
+            "unclipped; everything else is as deployed."
+        ),
+    )

@@ -1,0 +1,53 @@
+"""What both pages say of the temperature loop: questions, answers, verdict, and how the figures moved."""
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from pipeline.report.shared.difference import Difference, Move, difference, moves
+from pipeline.report.shared.sources import Sources
+from pipeline.report.shared.verdict import Figure, Missing, Question, Verdict, decide, questions
+from pipeline.report.temperature.answers import CONTROLLERS, all_answers
+from pipeline.report.temperature.drifted import Drift, drift
+
+NAMES = {"data_driven": "Data\u2011driven", "model_based": "Model\u2011based", "baseline": "Baseline"}
+
+
+class Judgement(NamedTuple):
+    """What both pages say: questions, answers by controller and by role, the verdict, and the difference."""
+
+    asked: list[Question]
+    by_name: Mapping[str, Mapping[str, Figure | Missing]]
+    roles: Mapping[str, Mapping[str, Figure | Missing]]
+    verdict: Verdict
+    changed: Difference | None
+    moved: Mapping[str, list[Move]]
+    drifted: Drift
+
+
+def judgement(sources: Sources) -> Judgement:
+    asked = questions(sources.declared.rules, band_degC=sources.declared.panel.band_degC)
+    drifted = drift(sources)
+    # of the machine, and so of every controller that was learned from its record
+    by_name = {name: {**answers, "drift": drifted.found} for name, answers in all_answers(sources, asked).items()}
+    roles = {role: by_name[name] for role, name in CONTROLLERS.items()}
+    changed = difference(sources)
+    found = moves(sources, asked, by_name) if changed else {}
+    moved = {role: found[name] for role, name in CONTROLLERS.items()} if changed else {}
+    return Judgement(asked, by_name, roles, decide("temperature", asked, roles), changed, moved, drifted)
+
+
+def shown(judged: Judgement) -> dict[str, dict[str, dict[str, float | None]]]:
+    """The figures of the pages as numbers, for the metrics: later runs are held against them."""
+    return {
+        name: {
+            key: {"median": _plain(f.value), "low": _plain(f.low), "high": _plain(f.high)}
+            for key, f in answers.items()
+            if isinstance(f, Figure) and key != "drift"
+        }
+        for name, answers in judged.by_name.items()
+    }
+
+
+def _plain(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,81 @@
+"""The page of the temperature loop: verdict, tables, findings, figures, what was declared, words, provenance."""
+
+from pipeline.report.identification.model import trust
+from pipeline.report.index import page as index_page
+from pipeline.report.shared import headline, page, pictures, tables, words
+from pipeline.report.shared.sources import Sources
+from pipeline.report.temperature import evidence, findings, pairs, recording, trades
+from pipeline.report.temperature.answers import featured, repetitions
+from pipeline.report.temperature.judgement import Judgement
+
+WORDS = (
+    "model_based",
+    "window",
+    "kernel",
+    "baseline",
+    "exact_model",
+    "study",
+    "gap",
+    "band",
+    "settled",
+    "settling",
+    "overshoot",
+    "at_limits",
+    "margin_disk",
+    "margin_delay",
+    "spread",
+    "worst",
+    "data",
+    "step",
+    "hash",
+)
+
+
+def render(sources: Sources, judged: Judgement) -> str:
+    """The text of temperature.html."""
+    flaws, more, no_quality = recording.findings(sources)
+    return page.render(
+        "temperature.html",
+        here="temperature",
+        title=f"Temperature: {judged.verdict.decision.rstrip('.')}",
+        verdict=index_page.verdict_parts(judged) | {"claim": headline.claim(sources, ("temperature",))},
+        featured=featured(sources),
+        repetitions=repetitions(sources),
+        yardstick=tables.yardstick(sources, judged.asked),
+        pairs=pairs.compared(sources),
+        published=tables.published(sources),
+        honest=tables.honest(sources),
+        findings=findings.findings(sources),
+        at_work=[
+            pictures.trajectories(sources),
+            pictures.errors(sources),
+            pictures.costs(sources),
+            pictures.inputs(sources),
+            trades.tradeoff(sources),
+            trades.plants(sources),
+        ],
+        learning=[
+            evidence.noise(sources),
+            evidence.orders(sources),
+            evidence.holdout(sources),
+            evidence.tuning(sources),
+            trades.candidates(sources),
+        ],
+        record=[recording.excitation(sources), recording.record(sources)],
+        flaws=flaws,
+        more=more,
+        no_quality=no_quality,
+        panel=tables.panel(sources),
+        weights=tables.weights(sources),
+        identified=tables.identified(sources),
+        trusted=trust(sources),
+        words=words.chosen(sources, WORDS),
+        sources=list(sources.read.values()),
+        absent=sources.absent,
+        hashes=index_page.hashes(sources),
+        from_scorecard=sources.source("scorecard", "evaluate_temperature"),
+        from_metrics=sources.source("evaluate_temperature"),
+        from_quality=sources.source("quality"),
+        from_weights=sources.source("weights"),
+        from_model=sources.source("identify_plant", "plant"),
+    )

@@ -1,0 +1,168 @@
+"""The figures of the temperature page that show the data: what was excited, the record signal by signal, and what was found strange in
+it."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from pipeline.report.shared import charts, page
+from pipeline.report.shared.digits import THIN, count, number, short
+from pipeline.report.shared.pictures import Column, Picture, hole
+from pipeline.report.shared.sources import Sources, Table, lookup
+from pipeline.report.shared.verdict import Missing
+
+
+def excitation(sources: Sources) -> Picture:
+    """How strongly each input was moved, by frequency."""
+    found, title = sources.metrics["generate_probing"], "What the probing excites"
+    levels = lookup(found, "level_percent_per_band")
+    if isinstance(levels, Missing):
+        return hole("excitation", title, levels)
+    levels, machine = np.array(levels), sources.declared.machine
+    y = charts.linear(0, 1.1 * float(levels.max()), ticks=3)
+    names = (
+        [signal.name for signal in machine.inputs]
+        if levels.shape[1] == len(machine.inputs)
+        else [f"input {i + 1}" for i in range(levels.shape[1])]
+    )
+    shown = []
+    for i, name in enumerate(names):
+        edges = np.linspace(0, 1, len(levels) + 1)
+        frame = charts.Frame(charts.Axis(0, 1, ((0, "0"), (1, "π"))), y, width=150, height=96, left=24)
+        layer = charts.line(frame, edges, np.append(levels[:, i], levels[-1, i]), steps=True)
+        alt = (
+            f"{name}: level {number(float(levels[:, i].min()), 2)} to {number(float(levels[:, i].max()), 2)} % "
+            "in eight bands from 0 to π rad a step"
+        )
+        shown.append(Column(name, "", "", [charts.panel(frame, [layer], alt=alt, title="%" if i == 0 else "", units=("of π", "%"))]))
+    rank, full, order = (lookup(found, f"excitation_{key}") for key in ("rank", "full_rank", "order"))
+    condition, limited = lookup(found, "excitation_condition"), lookup(found, "limited_share")
+    text = f"Exciting of order {order}: rank {rank} of {full}" + (
+        "." if isinstance(condition, Missing) else f", condition {short(condition)}."
+    )
+    text += (
+        ""
+        if isinstance(limited, Missing)
+        else (
+            f" {number(100 * limited, 0)}{THIN}% of all commands met a limit of amplitude, rate or machine; "
+            "what was applied is what is recorded."
+        )
+    )
+    return Picture(
+        "excitation",
+        title,
+        text,
+        shown,
+        "R.m.s. level in per cent within equal bands of frequency, 0 to π rad a step.",
+        page.origin(sources.source("generate_probing")),
+    )
+
+
+def record(sources: Sources) -> Picture:
+    """Every signal of the record, what is masked and what was found strange."""
+    table, quality, title = sources.tables["record"], sources.tables["quality"], "The record, with what was flagged and masked"
+    if isinstance(table, Missing):
+        return hole("record", title, table)
+    machine, time = sources.declared.machine, _elapsed(table, sources.declared.machine.sample_time_s)
+    masked_total = 0
+    halves: list[list[Markup]] = [[], []]
+    for half, signals in enumerate((machine.inputs, machine.outputs)):
+        for i, signal in enumerate(signals):
+            values, masked = table[signal.name], table[f"{signal.name}_masked"]
+            masked_total += int(masked.sum())
+            halves[half].append(_signal(signal, time, values, masked, quality, last=i == len(signals) - 1))
+    recordings = count(len(np.unique(table["recording"])), "recording")
+    masks = f"{count(masked_total, 'value is', 'values are')} masked and not used" if masked_total else "nothing is masked"
+    text = f"{number(len(time), 0)} samples of {recordings}; {masks}. {_found(sources.metrics['ingest'])}"
+    heads = (("Inputs", f"{machine.inputs[0].unit}, as applied"), ("Outputs", "°C, as measured"))
+    shown = [Column(head, small, "", panels) for (head, small), panels in zip(heads, halves, strict=True)]
+    return Picture(
+        "record",
+        title,
+        text,
+        shown,
+        (
+            "Against time in s, recordings one after the other; at most 480 points a signal, highest and "
+            "lowest of each stretch kept. Grey: flagged; vermillion: masked."
+        ),
+        page.origin(sources.source("record", "quality")),
+    )
+
+
+def _found(metrics: Any) -> str:
+    quarantined = lookup(metrics, "quarantined")
+    if isinstance(quarantined, Missing):
+        return ""
+    return (
+        "No recording is quarantined."
+        if quarantined == 0
+        else f"{count(quarantined, 'recording is', 'recordings are').capitalize()} quarantined: see the findings."
+    )
+
+
+def _elapsed(table: Table, step: float) -> np.ndarray:
+    return step * np.arange(len(table["time_s"]))
+
+
+def _signal(signal, time: np.ndarray, values: np.ndarray, masked: np.ndarray, quality: Table | Missing, *, last: bool) -> Markup:
+    finite = values[np.isfinite(values)]
+    low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
+    frame = charts.Frame(
+        charts.linear(0, float(time[-1]) or 1.0),
+        charts.Axis(low, high, ((low, short(low, 3)), (high, short(high, 3)))) if high > low else charts.linear(low, high),
+        width=540,
+        height=80 if last else 66,
+        left=44,
+        below=16 if last else 4,
+        above=22,
+    )
+    layers = [charts.line(frame, time, np.where(masked, np.nan, values), "line thin")]
+    stretches = charts.stretches(masked)
+    layers += [charts.interval(frame, float(time[a]), float(time[b - 1]), "gone") for a, b in stretches[:200]]
+    mine = [] if isinstance(quality, Missing) else np.flatnonzero(quality["signal"] == signal.name)
+    # a flag that spans the record says where it is in words, not in grey over everything
+    short_ones = [i for i in mine if quality["end_s"][i] - quality["start_s"][i] < 0.5 * float(time[-1])]
+    layers = [charts.interval(frame, float(quality["start_s"][i]), float(quality["end_s"][i])) for i in short_ones[:100]] + layers
+    flags = ", ".join(sorted({str(quality["kind"][i]) for i in mine}))
+    unit = {"degC": "°C"}.get(signal.unit, signal.unit)
+    alt = (f"{signal.name}: {short(low)} to {short(high)} {unit}, {count(int(masked.sum()), 'sample')} masked") + (
+        f"; flagged {flags}" if flags else ""
+    )
+    title = signal.name + (f": {flags}" if flags else "")
+    return charts.panel(frame, layers, alt=alt, css="mb", title=title, x_ticks=last, units=("s", unit))
+
+
+def findings(sources: Sources, most: int = 40) -> tuple[list[Mapping[str, str]], int, Missing | None]:
+    """The quality findings as rows, quarantined recordings first, and how many more there are."""
+    table = sources.tables["quality"]
+    if isinstance(table, Missing):
+        return [], 0, table
+    order = sorted(
+        range(len(table["kind"])),
+        key=lambda i: (
+            table["kind"][i] != "quarantined",
+            str(table["recording"][i]),
+            str(table["signal"][i]),
+            str(table["kind"][i]),
+            float(np.nan_to_num(table["start_s"][i])),
+        ),
+    )
+    rows = [
+        {
+            "recording": str(table["recording"][i]),
+            "signal": str(table["signal"][i]) or "whole recording",
+            "kind": str(table["kind"][i]),
+            "place": "" if np.isnan(table["start_s"][i]) else f"{_seconds(table['start_s'][i])} to {_seconds(table['end_s'][i])}{THIN}s",
+            "count": number(float(table["count"][i]), 0),
+            "message": str(table["message"][i]),
+            "bad": table["kind"][i] == "quarantined",
+        }
+        for i in order[:most]
+    ]
+    return rows, max(len(order) - most, 0), None
+
+
+def _seconds(value: float) -> str:
+    return number(float(value), 0 if float(value).is_integer() or abs(value) >= 1000 else 2)

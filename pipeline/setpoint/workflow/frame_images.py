@@ -1,0 +1,202 @@
+"""Image files -> key areas, a batch at a time; what was cut before, from the same bytes by the same code, is taken from a memo."""
+
+import contextlib
+import itertools
+import os
+import tempfile
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import joblib
+import numpy as np
+import pyarrow as pa
+
+from pipeline.setpoint import key_area
+from pipeline.store import artifacts
+from pipeline.store.tables import FLOAT, NONE, TEXT, Column, Schema
+
+HERE = Path(__file__).parents[2]
+# the code that decides what an entry of the memo holds
+CODE = (
+    "setpoint/workflow/frame_images.py", "setpoint/workflow/frame_mcap.py", "setpoint/key_area.py", "store/mcap_frames.py",
+    "reading/image_messages.py", "reading/image_topics.py",
+)  # fmt: skip
+DIGEST_BYTES = 16
+# cameras of 10 and 12 bits may leave the upper ones of 16 empty; a picture as dark as that has fewer than 16 of 256 gray levels in any case
+FILLED_BITS = 12
+MISSING, UNREADABLE, NO_TIP, UNUSABLE = "the image is missing", "the image cannot be read", "no tip is known", "the frame cannot be used"
+# the error stream is the process's: threads of a cluster's worker take turns
+_LISTENING = threading.Lock()
+KEY_AREAS = Schema(
+    "key_areas",
+    1,
+    (
+        Column("image", pa.binary(key_area.SHAPE[0] * key_area.SHAPE[1]), NONE, "16 x 48 gray levels, row by row"),
+        Column("angle_deg", FLOAT, "deg", "direction of the line, 0 right, 90 down", nullable=True),
+        Column("score", FLOAT, NONE, "ridge in gray levels", nullable=True),
+        Column("padded_share", FLOAT, NONE, "share of the crop outside the frame", nullable=True),
+        Column("reason", TEXT, NONE, "why there is no key area; empty where there is one"),
+        Column("digest", TEXT, NONE, "of the frame: equal frames have equal ones"),
+    ),
+)
+
+
+class Seen(NamedTuple):
+    """What the front end made of n frames: images (n, 16, 48) uint8, zeros where rejected; angle_deg, score, padded_share (n,), NaN where
+    nothing was looked at; n reasons, empty where there is a key area; n digests of what the frame held."""
+
+    images: np.ndarray
+    angle_deg: np.ndarray
+    score: np.ndarray
+    padded_share: np.ndarray
+    reasons: list[str]
+    digests: list[str]
+
+
+def read_image(path: str | Path) -> np.ndarray:
+    """The picture (height, width) in gray, uint8 or uint16, as the camera wrote it: a rotation noted
+    beside the pixels is not applied. Raises ValueError."""
+    with _said() as said:
+        found = _opened(str(path), said)
+    reason = found.partition(": ")[2] if isinstance(found, str) else ""
+    if reason:
+        raise ValueError(f"{path}: expected a whole picture (JPEG, PNG, TIFF, BMP, WebP), found {reason}; check the name, or copy it again")
+    return found
+
+
+def decode(data: bytes) -> np.ndarray:
+    """The picture (height, width) in gray, uint8 or uint16, of an encoded file. Raises ValueError that says what was found instead."""
+    if not data:
+        raise ValueError("an empty file")
+    # a broken end is filled with gray: the end mark must follow the last scan
+    if data.startswith(b"\xff\xd8") and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
+        raise ValueError(f"a JPEG of {len(data)} bytes without its end")
+    try:
+        frame = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        frame = None
+    if frame is None:
+        raise ValueError(f"{len(data)} bytes that are no whole picture, beginning with {data[:8].hex(' ')}")
+    if frame.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"pixels of {frame.dtype} in place of 8 or 16 bits")
+    return frame
+
+
+def cut(paths: Sequence[str], tips: np.ndarray, directions_deg: np.ndarray, *, least_score: float, memo: Path) -> Seen:
+    """Key areas of image files with tips (n, 2) in px and travel directions (n,) in degrees, NaN where they
+    are not known; one file's pixels in memory at a time.
+
+    An empty path is a frame that is not to be looked at. An entry of the memo is named by the hash of all that decides what it holds.
+    """
+    digests = [_digest(path) for path in paths]
+    entry = entry_of(memo, digests, tips.tolist(), directions_deg.tolist(), least_score)
+    found = remembered(entry, len(paths))
+    if not found:
+        with _said() as said:
+            found = look((_opened(path, said) for path in paths), tips, directions_deg, least_score=least_score)
+        remember(entry, found)
+    return found._replace(digests=digests)
+
+
+def look(frames: Iterable[np.ndarray | str], tips: np.ndarray, directions_deg: np.ndarray, *, least_score: float) -> Seen:
+    """What the front end makes of n frames, or of a text that says why there is none; digests are left empty."""
+    found = []
+    for frame, tip, direction in zip(frames, tips, directions_deg, strict=True):
+        reason = frame if isinstance(frame, str) else _shallow(frame) or ("" if np.isfinite(tip).all() else NO_TIP)
+        seen = key_area.KeyArea(np.zeros(key_area.SHAPE, np.uint8), np.nan, np.nan, np.nan, np.nan, reason)
+        if not reason:
+            try:
+                known = float(direction) if np.isfinite(direction) else None
+                seen = key_area.find(frame, (float(tip[0]), float(tip[1])), least_score=least_score, direction_deg=known)
+            except ValueError as error:
+                seen = seen._replace(reason=f"{UNUSABLE}: {error}")
+        found.append(seen)
+    images = np.array([seen.image for seen in found], np.uint8).reshape(-1, *key_area.SHAPE)
+    figures = (np.array([getattr(seen, name) for seen in found], float) for name in ("angle_deg", "score", "padded_share"))
+    return Seen(images, *figures, [seen.reason for seen in found], [""] * len(found))
+
+
+def _shallow(frame: np.ndarray) -> str:
+    """Why a frame of 16 bits is not used of which a camera filled the lower ones alone: the front end would see black."""
+    if frame.dtype != np.uint16 or frame.max() >= 1 << FILLED_BITS:
+        return ""
+    return f"{UNUSABLE}: its 16 bits hold {frame.max()} at most, as of a camera of fewer bits; write its gray levels over all of 0 to 65535"
+
+
+def together(parts: Sequence[Seen]) -> Seen:
+    """The frames of all parts, one part behind the other."""
+    arrays = (np.concatenate([getattr(part, name) for part in parts]) for name in ("images", "angle_deg", "score", "padded_share"))
+    texts = (list(itertools.chain.from_iterable(getattr(part, name) for part in parts)) for name in ("reasons", "digests"))
+    return Seen(*arrays, *texts)
+
+
+def _opened(path: str, said: Callable[[], str]) -> np.ndarray | str:
+    """The frame, or the reason why there is none."""
+    try:
+        frame = decode(Path(path).read_bytes()) if path else MISSING
+    except OSError as error:
+        frame = f"{UNREADABLE}: {os.strerror(error.errno or 0).lower()}"
+    except ValueError as error:
+        frame = f"{UNREADABLE}: {error}"
+    complaint = said()
+    return f"{UNREADABLE}: {complaint}" if complaint and not isinstance(frame, str) else frame
+
+
+@contextlib.contextmanager
+def _said() -> Iterator[Callable[[], str]]:
+    """A function that gives what the JPEG decoder has complained of since it was last asked: it mends what is damaged,
+    and says so on the process's error stream alone."""
+    at = 0
+
+    def said() -> str:
+        nonlocal at
+        text = os.pread(heard.fileno(), 1 << 16, at)
+        at += len(text)
+        # padding between restart markers, as cameras write it, loses nothing
+        return next((line for line in text.decode(errors="replace").splitlines() if "JPEG" in line and "extraneous" not in line), "")
+
+    with _LISTENING, tempfile.TemporaryFile() as heard:
+        own = os.dup(2)
+        os.dup2(heard.fileno(), 2)
+        try:
+            yield said
+        finally:
+            os.dup2(own, 2)
+            os.close(own)
+
+
+def _digest(path: str) -> str:
+    """Of the file's bytes; empty where it cannot be opened."""
+    try:
+        return artifacts.sha256(path)[: 2 * DIGEST_BYTES] if path else ""
+    except OSError:
+        return ""
+
+
+# ---- memo
+
+
+def entry_of(memo: Path, *what: Any) -> Path:
+    """The file of an entry: named by the hash of what it is made of, and of the code that makes it."""
+    return memo / f"{joblib.hash((what, [artifacts.sha256(HERE / name) for name in CODE]))}.parquet"
+
+
+def remember(entry: Path, found: Seen) -> None:
+    columns = ([image.tobytes() for image in found.images], *found[1:])
+    artifacts.write_table(entry, KEY_AREAS, dict(zip([column.name for column in KEY_AREAS.columns], columns, strict=True)))
+
+
+def remembered(entry: Path, count: int) -> Seen | None:
+    """An entry of so many frames that is whole, which the checksums of its pages tell."""
+    try:
+        table = artifacts.read_table(entry, KEY_AREAS)
+    except ValueError:
+        return None
+    if len(table["image"]) != count:
+        return None
+    images = np.frombuffer(b"".join(table["image"]), np.uint8).reshape(-1, *key_area.SHAPE)
+    columns = (table[name].tolist() for name in ("reason", "digest"))
+    return Seen(images, table["angle_deg"], table["score"], table["padded_share"], *columns)

@@ -1,0 +1,216 @@
+"""Sections of the params files that the setpoint loop's stages read."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from pipeline.store.params import Mapped, Section
+
+# as far as pixels.py looks for the nozzle's tip, in px: a number of its own, since that module imports much
+REACH_PX = 30
+
+
+class Counts(Section):
+    """A number for each of the four parts."""
+
+    learned: int = Field(ge=1, le=10_000)
+    held_out: int = Field(ge=1, le=10_000)
+    calibration: int = Field(ge=1, le=10_000)
+    judged: int = Field(ge=1, le=10_000)
+
+
+class Recorded(Section):
+    """Segments whose windows over the whole range of flows are recorded for the simulator, and windows of each in a
+    bin of the flow: those that controllers are trained and tuned on (many segments, as what a segment adds stays with
+    its windows), and those that they are judged on."""
+
+    learn: int = Field(ge=1, le=1000)
+    judge: int = Field(ge=1, le=1000)
+    learn_windows: float = Field(gt=0, le=100)
+    judge_windows: float = Field(gt=0, le=100)
+
+
+class Recipe(Section):
+    """How a network of one size is trained."""
+
+    epochs: int = Field(ge=1, le=10_000)
+    cycle_epochs: int = Field(ge=1, le=10_000)
+    warmup_epochs: float = Field(ge=0, le=1000)
+    batch: int = Field(ge=1, le=100_000)
+    learning_rate: float = Field(gt=0, le=1)
+    weight_decay: float = Field(ge=0, le=1)
+    smoothing: float = Field(ge=0, lt=1)
+    averaging: float = Field(ge=0, lt=1)
+    patience: int = Field(ge=1, le=10_000)
+
+
+class RecordedTopics(Section):
+    """Topics of a user's MCAP recordings, as frame_mcap.Topics says."""
+
+    image: str = Field(max_length=300)
+    time: str = Field(max_length=300)
+    mapping: dict[str, Mapped]
+
+
+class TrainClassifier(Section):
+    """Section `train_classifier`."""
+
+    source: Literal["simulated", "recordings"]
+    seed: int = Field(ge=0, le=2**31)
+    size: Literal["small", "paper"]
+    augmentation: Literal["along_bead", "adr"]
+    segments: Counts
+    prints: Counts
+    frames: Counts
+    window: int = Field(ge=1, le=1000)
+    least_score: float = Field(ge=0, le=255)
+    tip_px: tuple[Annotated[float, Field(ge=0, le=100_000)], Annotated[float, Field(ge=0, le=100_000)]] | None
+    topics: RecordedTopics
+    small: Recipe
+    paper: Recipe
+    cnn: Recipe
+    coverage: float = Field(gt=0.5, lt=1)
+    confidence: float = Field(gt=0.5, lt=1)
+    false_alarms: float = Field(gt=0, lt=0.5)
+    recorded: Recorded
+
+
+class Learning(Section):
+    """Deep Q-learning: environments stepped together, batch, transitions remembered, steps of an episode, Adam's rate, discount, the slow
+    copy's step, and how much is explored."""
+
+    environments: int = Field(ge=1, le=100_000)
+    batch: int = Field(ge=1, le=100_000)
+    capacity: int = Field(ge=1000, le=10_000_000)
+    episode: int = Field(ge=10, le=10_000)
+    learning_rate: float = Field(gt=0, le=1)
+    gamma: float = Field(ge=0, lt=1)
+    tau: float = Field(gt=0, le=1)
+    explore: float = Field(ge=0, le=1)
+    least: float = Field(ge=0, le=1)
+
+
+class Paper(Learning):
+    """The published agent: updates of its phases, exploration again from the second on, accuracy of the last."""
+
+    updates: list[Annotated[int, Field(ge=1, le=10_000_000)]] = Field(min_length=3, max_length=4)
+    explore_again: float = Field(ge=0, le=1)
+    accuracy: float = Field(gt=0.34, le=1)
+
+
+class RobustFilter(Section):
+    """Settings of bayes.robust_filter."""
+
+    accuracies: list[Annotated[float, Field(gt=0.34, lt=1)]] = Field(min_length=1, max_length=20)
+    gains: list[Annotated[float, Field(gt=0, le=10)]] = Field(min_length=1, max_length=20)
+    looks: int = Field(ge=1, le=51)
+    look: float = Field(gt=0, le=1)
+    floor: float = Field(gt=0, lt=1)
+    smoothing: float = Field(gt=0, le=100)
+    segment: float = Field(ge=1, le=10_000)
+    switch: float = Field(gt=0, lt=1)
+    repeats: float = Field(ge=0, lt=1)
+    hazard: float = Field(ge=0, lt=1)
+    move_cost: float = Field(ge=0, le=10)
+    outside_cost: float = Field(ge=0, le=1000)
+
+    def hypotheses(self) -> int:
+        return len(self.gains) * (len(self.accuracies) + self.looks)
+
+
+class Costs(Section):
+    """Of a step, belief_agent.Costs."""
+
+    scale: float = Field(gt=0, le=1000)
+    outside: float = Field(ge=0, le=1000)
+    move: float = Field(ge=0, le=10)
+
+
+class Troubles(Section):
+    """What training episodes meet, belief_agent.Troubles."""
+
+    recorded_share: float = Field(ge=0, le=1)
+    longest_segment: float = Field(ge=1, le=10_000)
+    accuracy: float = Field(gt=0.34, le=1)
+    gain: float = Field(gt=0, le=1)
+    clog: float = Field(gt=0, le=1)
+    clog_share: float = Field(ge=0, le=1)
+    drift: float = Field(ge=0, le=0.1)
+
+
+class Ours(Learning):
+    """Our agent: the filter whose belief it sees, what a step costs, what it meets, and rounds of updates, the best of which is kept."""
+
+    filter: RobustFilter
+    costs: Costs
+    troubles: Troubles
+    updates: int = Field(ge=1, le=10_000_000)
+    rounds: int = Field(ge=1, le=1000)
+
+
+class TrainAgent(Section):
+    """Section `train_agent`."""
+
+    seed: int = Field(ge=0, le=2**31)
+    runs: int = Field(ge=1, le=10_000)
+    paper: Paper
+    ours: Ours
+
+
+class Proportional(Section):
+    gain: float = Field(gt=0, le=1000)
+    time_constant: float = Field(ge=1, le=1000)
+
+
+class SequentialTest(Section):
+    accuracy: float = Field(gt=0.34, lt=1)
+    threshold: float = Field(gt=0, le=100)
+    cap: float = Field(gt=0, le=100)
+
+
+class ClassFilter(Section):
+    accuracy: float = Field(gt=0.34, lt=1)
+    hazard: float = Field(ge=0, lt=1)
+    move_cost: float = Field(ge=0, le=10)
+    outside_cost: float = Field(ge=0, le=1000)
+
+
+class Baselines(Section):
+    """Settings of the controllers without learning, tuned on windows and seeds that nothing is judged on."""
+
+    proportional: Proportional
+    filtered_proportional: Proportional
+    sequential_test: SequentialTest
+    bayes_exact: ClassFilter
+    bayes_leak: ClassFilter
+    bayes_robust: RobustFilter
+
+
+class Pixels(Section):
+    """The closed loop through rendered frames."""
+
+    starts: int = Field(ge=1, le=21)
+    runs: int = Field(ge=1, le=1000)
+    decisions: int = Field(ge=20, le=1000)
+    frame_rate_hz: float = Field(gt=0, le=1000)
+    wait_s: float = Field(ge=0, le=600)
+    idle_wait_s: float = Field(ge=0, le=600)
+    tip_tolerance_px: float = Field(ge=8, le=REACH_PX)
+    per_action: tuple[Annotated[float, Field(gt=0, le=1000)], Annotated[float, Field(gt=0, le=1000)]]
+    per_minute: tuple[Annotated[float, Field(gt=0, le=10_000)], Annotated[float, Field(gt=0, le=10_000)]]
+    segment_s: float = Field(gt=0, le=1e6)
+    least_frames: int = Field(ge=1, le=1000)
+    heater_s: float = Field(gt=0, le=1000)
+    heater_delay_s: float = Field(ge=0, le=1000)
+    melt_s: float = Field(gt=0, le=1000)
+    softening_per_degC: float = Field(ge=0, le=1)
+
+
+class EvaluateSetpoint(Section):
+    """Section `evaluate_setpoint`."""
+
+    seed: int = Field(ge=0, le=2**31)
+    runs: int = Field(ge=1, le=10_000)
+    segment: float = Field(ge=1, le=10_000)
+    baselines: Baselines
+    pixels: Pixels

@@ -1,0 +1,53 @@
+"""The windows that controllers are trained and judged on, as columns of a table and back."""
+
+import collections
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.setpoint.recorded import WindowTable
+from pipeline.setpoint.workflow.tables import FLOW_EDGES
+
+
+def edges(flows: Sequence[np.ndarray]) -> np.ndarray:
+    """FLOW_EDGES, of which those are left out that would leave a bin without a window in any of several sets of flows (w,)."""
+    kept = [min(FLOW_EDGES[0], *(float(flow.min()) for flow in flows))]
+    for edge in FLOW_EDGES[1:-1]:
+        if all(((flow >= kept[-1]) & (flow < edge)).any() for flow in flows):
+            kept.append(edge)
+    while len(kept) > 1 and not all((flow >= kept[-1]).any() for flow in flows):
+        kept.pop()
+    return np.array([*kept, max(FLOW_EDGES[-1], *(float(flow.max()) for flow in flows))])
+
+
+def window_rows(tables: dict[str, WindowTable]) -> dict[str, np.ndarray]:
+    """The tables of "learn" and "judge" as columns of schema WINDOWS."""
+    columns = collections.defaultdict(list)
+    for part, table in tables.items():
+        columns["part"] += [part] * len(table.named)
+        columns["flow_bin"].append(table.flow_bin)
+        columns["flow_low_percent"].append(table.flow_edges[table.flow_bin])
+        columns["flow_high_percent"].append(table.flow_edges[table.flow_bin + 1])
+        columns["segment"].append(table.segment)
+        columns["named"].append(table.named)
+        for c, name in enumerate(("under", "good", "over")):
+            columns[f"p_{name}"].append(table.shares[:, c])
+    return {name: values if name == "part" else np.concatenate(values) for name, values in columns.items()}
+
+
+def window_tables(columns: dict[str, np.ndarray]) -> dict[str, WindowTable]:
+    """The reverse of `window_rows`."""
+    found = {}
+    for part in ("learn", "judge"):
+        rows = columns["part"] == part
+        bins, first = np.unique(columns["flow_bin"][rows], return_index=True)
+        low, high = (columns[f"flow_{end}_percent"][rows][first] for end in ("low", "high"))
+        shares = np.stack([columns[f"p_{name}"][rows] for name in ("under", "good", "over")], axis=1)
+        found[part] = WindowTable(
+            shares,
+            columns["named"][rows],
+            np.searchsorted(bins, columns["flow_bin"][rows]),
+            columns["segment"][rows],
+            np.append(low, high[-1]),
+        )
+    return found

@@ -1,0 +1,225 @@
+"""Rows of text and numbers out of a CSV file of somebody else's: what the readers of records and of lists of images share."""
+
+import csv
+import itertools
+import re
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from pipeline.reading.signals import Note
+
+COMMENT = ("#", "%", "//")
+LOOKED_AT = 1 << 16
+_NUMBER = {decimal: re.compile(rf"\s*[+-]?(\d+({mark}\d*)?|{mark}\d+)([eE][+-]?\d+)?\s*$") for decimal, mark in ((".", r"\."), (",", ","))}
+# a number with its unit, 21.5 °C: it shows where the table is, and is refused with its line when it is read
+_QUANTITY = re.compile(r"\s*[+-]?\d[\d.,]*\s*(%|°\s?[CFK]|[a-zA-Z]{1,3}(/[a-zA-Z]{1,3})?)$")
+# text has tabs, line ends and form feeds, and at times the end mark of an old system; other control characters are of binary files
+_CONTROL = bytes(set(range(32)) - set(b"\t\n\r\f\x1a"))
+
+
+class Clock(Protocol):
+    """The column of the time, as a reader with a clock knows it."""
+
+    name: str
+
+    def text(self, row: list[str]) -> str: ...
+
+    def is_time(self, row: list[str]) -> bool: ...
+
+
+class CsvLayout(NamedTuple):
+    """How a text file is laid out: `skip` lines before the data, in which names and units stand."""
+
+    encoding: str
+    delimiter: str
+    decimal: str
+    names: list[str]
+    units: list[str]
+    skip: int
+    notes: list[Note]
+
+
+class Opening(NamedTuple):
+    """The first lines of a text file as fields, a remark's marks taken off; `remark` says which lines are remarks."""
+
+    encoding: str
+    delimiter: str
+    decimal: str
+    rows: list[list[str]]
+    remark: list[bool]
+    notes: list[Note]
+
+
+def opening(path: Path) -> Opening:
+    """Encoding, delimiter, decimal mark and first lines of a text file. Raises ValueError where it is no text."""
+    with path.open("rb") as stream:
+        # zeros behind the text are what a file system leaves after a power failure
+        start = stream.read(LOOKED_AT).rstrip(b"\0")
+    encoding, notes = _encoding(path, start)
+    lines = start.decode(encoding, errors="replace").splitlines()[: 400 if len(start) < LOOKED_AT else -1]
+    remark = [line.lstrip().startswith(COMMENT) for line in lines]
+    delimiter, decimal = _delimiter([line for line, is_remark in zip(lines, remark, strict=True) if line.strip() and not is_remark])
+    rows = [_split(line.lstrip("#% ") if is_remark else line, delimiter) for line, is_remark in zip(lines, remark, strict=True)]
+    return Opening(encoding, delimiter, decimal, rows, remark, notes)
+
+
+def list_layout(path: Path, is_header: Callable[[list[str]], bool]) -> CsvLayout:
+    """The layout of a list whose columns are known by name: its header is the first line that `is_header`, or else the first line; rows follow.
+
+    Raises ValueError where no row follows.
+    """
+    start = opening(path)
+    written = [i for i, row in enumerate(start.rows) if any(row) and not start.remark[i]]
+    heads = [i for i, row in enumerate(start.rows) if is_header(row)] or written
+    if not heads or not any(i > heads[0] for i in written):
+        found = "a header" if heads else "only blank or comment lines"
+        raise ValueError(f"{path}: line 2 on should hold rows of numbers, but the file has {found} and no data; record it again or remove it")
+    names = [field.strip() for field in start.rows[heads[0]]]
+    return CsvLayout(start.encoding, start.delimiter, start.decimal, names, [""] * len(names), heads[0] + 1, start.notes)
+
+
+def is_number(field: str, decimal: str) -> bool:
+    """Whether a field is a number with that decimal mark, "." or ","."""
+    return bool(_NUMBER[decimal].match(field))
+
+
+def is_quantity(field: str, decimal: str) -> bool:
+    return is_number(field, decimal) or bool(_QUANTITY.match(field))
+
+
+def _encoding(path: Path, start: bytes) -> tuple[str, list[Note]]:
+    for mark, encoding in ((b"\xef\xbb\xbf", "utf-8-sig"), (b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16")):
+        if start.startswith(mark):
+            return encoding, []
+    if start[1::2].count(0) > len(start) // 4 and not start[0::2].count(0):
+        return "utf-16-le", [Note("encoding", "", 1, "the text is UTF-16 without a byte order mark")]
+    control = len(start) - len(start.translate(None, _CONTROL))
+    if control > len(start) // 100:
+        raise ValueError(
+            f"{path}: the bytes at offset 0 ({start[:8].hex(' ')}) are neither text nor Parquet nor MCAP; convert the"
+            f" recording to one of them"
+        )
+    try:
+        # a letter of several bytes may be cut at the end of the part that was read
+        start.decode("utf-8") if len(start) < LOOKED_AT else start[: start.rfind(b"\n") + 1].decode("utf-8")
+    except UnicodeDecodeError as error:
+        return "cp1252", [Note("encoding", "", 1, f"byte {error.start} is not UTF-8, so the text was read as Windows-1252")]
+    return "utf-8", []
+
+
+def _delimiter(lines: Sequence[str]) -> tuple[str, str]:
+    """The delimiter and decimal mark with which most fields are numbers, and then fewest are not; the blank is tried last."""
+    best, choice = (0.0, 0.0), (",", ".")
+    for delimiter, decimal in itertools.product((",", ";", "\t", "|", " "), (".", ",")):
+        fields = [field for line in lines[:50] for field in _split(line, delimiter)]
+        found = sum(is_quantity(field, decimal) for field in fields)
+        score = (found, found / max(len(fields), 1))
+        if score > best:
+            best, choice = score, (delimiter, decimal)
+    return choice
+
+
+def _split(line: str, delimiter: str) -> list[str]:
+    if delimiter == " ":
+        return line.split()
+    row = next(csv.reader([line], delimiter=delimiter), [])
+    return row[:-1] if len(row) > 1 and not row[-1].strip() and line.rstrip("\r\n ").endswith(delimiter) else row
+
+# what programs write where they have no number
+MISSING = {"", "nan", "na", "n/a", "#n/a", "null", "<null>", "none", "-", "--", "---", "?", "bad", "bad input", "no data", "nodata", "error",
+           "fault", "i/o timeout", "unavailable", "unknown", "-nan(ind)", "1.#qnan", "-1.#ind", "#value!", "#ref!", "#div/0!"}  # fmt: skip
+SWITCH = {"on": 1.0, "true": 1.0, "off": 0.0, "false": 0.0}
+# totals and remarks behind the data; more than that is no tail
+LONGEST_TAIL = 20
+
+
+def rows(path: Path, layout: CsvLayout) -> Iterator[tuple[int, list[str]]]:
+    """(line, fields) of the rows of data; blank lines and comments are passed over."""
+    with path.open(encoding=layout.encoding, newline="") as stream:
+        try:
+            if layout.delimiter == " ":
+                numbered = ((i, line.split()) for i, line in enumerate(stream, 1))
+            else:
+                reader = csv.reader(stream, delimiter=layout.delimiter)
+                numbered = ((reader.line_num, row) for row in reader)
+            for line, row in numbered:
+                start = row[0].lstrip() if row else ""
+                if line > layout.skip and not start.startswith(COMMENT) and (start or any(field.strip() for field in row)):
+                    yield line, row
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{path}: byte 0x{error.object[error.start]:02x} is not {layout.encoding}; save the file as UTF-8") from None
+        except csv.Error as error:
+            raise ValueError(f"{path}: a line cannot be split into columns ({error}); save the file again as plain CSV") from None
+
+
+def sound_rows(path: Path, layout: CsvLayout, clock: "Clock | None", notes: list[Note]) -> Iterator[tuple[int, list[str]]]:
+    """The rows with one field a column and a time.
+
+    A header that is repeated is passed over and counted; what stands behind the data (a row that breaks off as loggers leave it that lose
+    their power, totals, remarks) is left out and noted; the same amid the data is refused.
+    """
+    width, tail, repeated = len(layout.names), [], []
+    for line, row in rows(path, layout):
+        whole = len(row) == width or (len(row) > width and not any(field.strip() for field in row[width:]))
+        if whole and (clock is None or clock.is_time(row)):
+            if tail:
+                raise ValueError(f"{path}: {_unsound(*tail[0], layout, clock)}; mend or remove that line")
+            yield line, row
+        elif [field.strip() for field in row[:width]] in (layout.names, layout.units):
+            repeated.append(line)
+        elif breaks := sum(field.rstrip("\n").count("\n") for field in row):
+            raise ValueError(f"{path}: line {line - breaks}: a quotation mark is opened there and never closed; remove or close it")
+        else:
+            tail.append((line, row))
+            if len(tail) > LONGEST_TAIL:
+                raise ValueError(f"{path}: {_unsound(*tail[0], layout, clock)}; mend or remove that line")
+    if repeated:
+        notes.append(Note("header", "", len(repeated), f"the header is repeated {len(repeated)} times, first in line {repeated[0]}"))
+    if len(tail) == 1 and len(tail[0][1]) < width:
+        message = f"line {tail[0][0]}, the last, breaks off after {len(tail[0][1])} of {width} fields and was left out"
+        notes.append(Note("truncated", "", 1, message))
+    elif tail:
+        shown = layout.delimiter.join(tail[0][1])[:60]
+        message = f"{len(tail)} lines behind the data were left out, from line {tail[0][0]} on, which is {shown!r}"
+        notes.append(Note("trailing", "", len(tail), message))
+
+
+def _unsound(line: int, row: list[str], layout: CsvLayout, clock: "Clock | None") -> str:
+    if clock is None or len(row) != len(layout.names):
+        return f"line {line} has {len(row)} fields but the header has {len(layout.names)} columns"
+    found = clock.text(row).strip()
+    return f"line {line} should have a time in {clock.name} but has {repr(found[:40]) if found else 'none'}"
+
+
+def floats(path: Path, name: str, fields: list[str], decimal: str, lines: list[int], switches: dict[str, set[str]]) -> np.ndarray:
+    try:
+        if decimal == ".":
+            return np.array(list(map(float, fields)))
+        if not any("." in field for field in fields):
+            return np.array([float(field.replace(",", ".")) for field in fields])
+    except ValueError:
+        pass  # one by one, which names the line
+    return np.array([_float(path, name, field, decimal, line, switches) for field, line in zip(fields, lines, strict=True)])
+
+
+def _float(path: Path, name: str, field: str, decimal: str, line: int, switches: dict[str, set[str]]) -> float:
+    plain = field.strip()
+    if is_number(plain, decimal):
+        return float(plain.replace(",", "."))
+    word = plain.casefold()
+    if word in MISSING:
+        return np.nan
+    if word in SWITCH:
+        switches.setdefault(name, set()).add(plain)
+        return SWITCH[word]
+    if re.fullmatch(r"[+-]?(inf|infinity|nan)", word):
+        return float(word)
+    remedy = "mend that line, or leave the field empty"
+    if re.fullmatch(r"[+-]?[\d.,]+\s*[^\d\s.,]{1,6}", plain):
+        remedy = "write the numbers without their unit"
+    elif re.fullmatch(r"[+-]?[\d.,\s']+", plain):
+        remedy = f"write the numbers without marks between thousands, with {'a point' if decimal == '.' else 'a comma'} before the decimals"
+    raise ValueError(f"{path}: line {line}, column {name} should be a number but is {plain[:40]!r}; {remedy}")

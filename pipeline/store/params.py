@@ -1,0 +1,328 @@
+"""A section of params.yaml and params.expert.yaml -> a frozen, bounded, typed object; each problem with it becomes one sentence that ends with the remedy.
+
+params.yaml has what the owner of a machine decides, params.expert.yaml what a developer of a method sets. A section may stand in both, a key of it in one.
+Whoever names a params.yaml means both files: the other one is looked for beside it.
+"""
+
+import copy
+import difflib
+import functools
+import hashlib
+import json
+import re
+import types
+import typing
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
+
+import pydantic
+import yaml
+from pydantic import Field
+
+FILE, EXPERT = "params.yaml", "params.expert.yaml"
+
+
+class Section(pydantic.BaseModel):
+    """One section of the two files. Fields have bounds and no defaults: the files are the only home of a value.
+
+    Strict: "true" is no number and 3.5 no integer, but 3 is a float. A list of YAML fills lists and tuples; NaN and infinity are refused.
+    """
+
+    model_config = pydantic.ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+
+# ---- sections that belong to no loop
+
+
+class Mapped(Section):
+    """Where a signal of a recording comes from: source times scale, plus offset."""
+
+    source: str = Field(min_length=1, max_length=300)
+    unit: str = Field(min_length=1, max_length=20)
+    scale: float = Field(ge=-1e9, le=1e9)
+    offset: float = Field(ge=-1e9, le=1e9)
+
+
+class Execution(Section):
+    """Section `execution`: where joblib sends its work; one machine (loky) or a cluster (dask with the address of its scheduler)."""
+
+    backend: Literal["loky", "dask"]
+    jobs: int = Field(ge=1, le=64)
+    scheduler: str = Field(max_length=200)
+
+    @pydantic.model_validator(mode="after")
+    def _scheduler_for_dask_only(self):
+        if self.backend == "dask" and not self.scheduler:
+            raise ValueError('has backend dask but scheduler ""; write the address of the scheduler there, such as tcp://host:8786')
+        if self.backend != "dask" and self.scheduler:
+            raise ValueError(f'has scheduler "{self.scheduler}" but backend {self.backend}; set backend: dask, or scheduler: ""')
+        return self
+
+
+# ---- reading
+
+S = TypeVar("S", bound=Section)
+
+
+def load(model: type[S], section: str, path: str | Path = FILE) -> S:
+    """Section `section` of both files as a frozen `model`. Raises ValueError with a line for each key unknown, missing or out of bounds."""
+    sections = files(path)
+    values = _section(section, path)
+    try:
+        # through JSON, where strictness knows no difference between a list and a tuple
+        return model.model_validate_json(json.dumps(values))
+    except pydantic.ValidationError as error:
+        found = _sentences(model, section, error.errors())
+        raise ValueError("\n".join(f"{_files_of(sections, section, location)}: {sentence}" for location, sentence in found)) from None
+
+
+def value(dotted: str, path: str | Path = FILE, *, one_of: tuple) -> Any:
+    """One key of another stage's section, such as generate_probing.source; it must be one of `one_of`. Raises ValueError as `load` does."""
+    section, *keys = dotted.split(".")
+    found = _section(section, path)
+    place = _files_of(files(path), section, keys)
+    for key in keys:
+        if not isinstance(found, dict) or key not in found:
+            near = _nearest(key, found if isinstance(found, dict) else ())
+            raise ValueError(f"{place}: {dotted} is missing; {f'is {near} meant?' if near else f'add it (one of {_listed(one_of)})'}")
+        found = found[key]
+    if not any(type(found) is type(choice) and found == choice for choice in one_of):
+        raise ValueError(f"{place}: {dotted} is {_shown(found)} but must be one of {_listed(one_of)}{_did_you_mean(found, one_of)}")
+    return found
+
+
+def home(dotted: str, path: str | Path = FILE) -> str:
+    """The file in which a key such as train_agent.seed stands, "" where it stands in none."""
+    for name, found in files(path).items():
+        for key in dotted.split("."):
+            if not isinstance(found, dict) or key not in found:
+                break
+            found = found[key]
+        else:
+            return name
+    return ""
+
+
+def digest(model: Section) -> str:
+    """SHA-256 of the section's canonical JSON: equal parameters have equal digests, whatever their order and spelling in the file."""
+    canonical = json.dumps(model.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(canonical.encode()).hexdigest()
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML 1.2 as DVC reads it: 1e-6 is a number, `no` and `on` are words, 12:30 is no number; a key given twice is refused."""
+
+    yaml_implicit_resolvers: ClassVar[dict] = {}
+
+    def construct_mapping(self, node, deep=False):
+        seen = {}
+        for key_node, _ in node.value:
+            key = key_node.value
+            if key in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"{key} is given twice, first in line {seen[key]}", key_node.start_mark)
+            seen[key] = key_node.start_mark.line + 1
+        return super().construct_mapping(node, deep)
+
+
+for _tag, _pattern, _first in [
+    ("bool", r"true|True|TRUE|false|False|FALSE", "tTfF"),
+    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+    ("int", r"[-+]?[0-9]+", "-+0123456789"),
+    ("float", r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)", "-+.0123456789"),
+]:
+    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(rf"^(?:{_pattern})$"), list(_first))
+_Loader.add_constructor("tag:yaml.org,2002:int", lambda loader, node: int(node.value))
+_Loader.add_constructor("tag:yaml.org,2002:float", lambda loader, node: float(re.sub(r"\.(inf|nan)", r"\1", node.value.lower())))
+
+
+@functools.lru_cache(maxsize=8)
+def _parsed(text: str) -> Any:
+    return yaml.load(text, _Loader)
+
+
+def read(path: str | Path = FILE) -> dict:
+    """Every section with its keys of both files, unchecked. Raises ValueError as `files` does, and where a key of a section stands in both."""
+    (name, whole), *others = files(path).items()
+    for other, sections in others:
+        for section, keys in sections.items():
+            mine = whole.get(section, {})
+            for file, part in ((name, mine), (other, keys)):
+                if type(part) is not dict:
+                    raise ValueError(f"{file}: {section} {_NO_SECTION.format(_shown(part))}")
+            twice = [key for key in keys if key in mine]
+            if twice:
+                raise ValueError(f"{name} and {other}: {section}.{twice[0]} stands in both; take it out of one of the two")
+            whole[section] = mine | keys
+    return whole
+
+
+def files(path: str | Path = FILE) -> dict[str, dict]:
+    """The sections of params.yaml and, where it is there, of params.expert.yaml beside it, by the files' names, unchecked.
+
+    Raises ValueError with file and line where one is no YAML or has a key twice.
+    """
+    expert = Path(path).with_name(EXPERT)
+    return {str(name): _sections(name) for name in (path, *([expert] if expert.exists() else []))}
+
+
+def _sections(path: str | Path) -> dict:
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ValueError(f"{path} is missing; {_RESTORE.format(path)}") from None
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: byte {error.start} is not UTF-8; save the file as UTF-8") from None
+    try:
+        sections = copy.deepcopy(_parsed(text))
+    except yaml.MarkedYAMLError as error:
+        line = error.problem_mark.line + 1 if error.problem_mark else 1
+        remedy = "keep one of the two" if "twice" in (error.problem or "") else "mend the line: key: value, indented by spaces"
+        raise ValueError(f"{path}: line {line}: {error.problem}; {remedy}") from None
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path}: {' '.join(str(error).split())}; remove that character") from None
+    if type(sections) is not dict:
+        raise ValueError(
+            f"{path} must hold sections (name: and indented keys) but holds {_shown(sections)}; restore it with git checkout {path}"
+        )
+    return sections
+
+
+def _section(section: str, path: str | Path) -> dict:
+    sections = read(path)
+    if section not in sections:
+        near = _nearest(section, sections)
+        expert = Path(path).with_name(EXPERT)
+        if not near and not expert.exists():
+            raise ValueError(f"{path}: section {section} is missing, and so is {expert}; {_RESTORE.format(expert)}")
+        place = home(near, path) or _files_of(files(path), section)
+        raise ValueError(
+            f"{place}: section {section} is missing; {f'is {near} meant?' if near else f'add {section}: with its keys below it'}"
+        )
+    if type(sections[section]) is not dict:
+        raise ValueError(f"{home(section, path)}: {section} {_NO_SECTION.format(_shown(sections[section]))}")
+    return sections[section]
+
+
+def _files_of(sections: dict[str, dict], section: str, location: Sequence = ()) -> str:
+    """The file in which a key stands; of a key that is missing, and of the section as such, those in which the section does."""
+    having = [name for name, found in sections.items() if section in found] or list(sections)
+    exact = [name for name in having if location and location[0] in sections[name].get(section, {})]
+    return (" or " if location else " and ").join(exact or having)
+
+
+# ---- the sentences
+
+_RESTORE = "run from the root of the project, or restore it with git checkout {}"
+_NO_SECTION = "must be a section with keys below it but is {}; indent its keys by two spaces"
+_BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
+_COMPARISONS = {"greater_than_equal": "ge", "greater_than": "gt", "less_than_equal": "le", "less_than": "lt"}
+_TYPES = {
+    "int_type": "a whole number",
+    "int_from_float": "a whole number",
+    "float_type": "a number",
+    "finite_number": "a finite number",
+    "string_type": "a text",
+    "bool_type": "true or false",
+    "list_type": "a list",
+    "tuple_type": "a list",
+    "model_type": "a section with keys below it",
+    "model_attributes_type": "a section with keys below it",
+    "dict_type": "a section with keys below it",
+}
+
+
+def _sentences(model: type[Section], section: str, errors: list) -> Iterator[tuple[tuple, str]]:
+    """(location, sentence) of each problem; a key that is missing because it is misspelt is one problem, not two."""
+    misspelt = set()
+    for error in errors:
+        if error["type"] == "extra_forbidden":
+            parent = _at(model, error["loc"][:-1])
+            names = tuple(parent.model_fields) if isinstance(parent, type) and issubclass(parent, Section) else ()
+            near = _nearest(error["loc"][-1], names)
+            misspelt.add((*error["loc"][:-1], near))
+            remedy = f"did you mean {near}?" if near else f"remove it, or use {_listed(names)}"
+            yield error["loc"], f"{_place(section, error['loc'])} is unknown; {remedy}"
+    for error in errors:
+        if error["type"] == "missing" and error["loc"] not in misspelt:
+            yield error["loc"], f"{_place(section, error['loc'])} is missing; add it ({_expected(model, error['loc'])})"
+        elif error["type"] not in ("missing", "extra_forbidden"):
+            yield error["loc"], f"{_place(section, error['loc'])} {_complaint(error)}"
+
+
+def _complaint(error: dict) -> str:
+    kind, context, found = error["type"], error.get("ctx", {}), _shown(error["input"])
+    if kind in _COMPARISONS:
+        bound = _COMPARISONS[kind]
+        return f"is {found} but must be {_BOUNDS[bound]} {context[bound]:g}"
+    if kind in _TYPES:
+        return f"is {found} but must be {_TYPES[kind]}"
+    if kind == "literal_error":
+        return (
+            f"is {found} but must be one of {context['expected'].replace(chr(39), '')}{_did_you_mean(error['input'], context['expected'])}"
+        )
+    if kind in ("too_short", "string_too_short"):
+        return f"is {found} but needs at least {context.get('min_length')} {'entries' if kind == 'too_short' else 'characters'}"
+    if kind in ("too_long", "string_too_long"):
+        return f"is {found} but takes at most {context.get('max_length')} {'entries' if kind == 'too_long' else 'characters'}"
+    if kind == "value_error":
+        message = str(context["error"])
+        # what is wrong between the keys of a section is told without repeating the section
+        return message if isinstance(error["input"], dict) else f"is {found} {message}"
+    return f"is {found}: {error['msg'][0].lower()}{error['msg'][1:]}"
+
+
+def _place(section: str, location: tuple) -> str:
+    return section + "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in location)
+
+
+def _shown(found: Any) -> str:
+    text = json.dumps(found, ensure_ascii=False, default=str)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _nearest(name: Any, names) -> str:
+    return next(iter(difflib.get_close_matches(str(name), [str(other) for other in names], n=1, cutoff=0.6)), "")
+
+
+def _did_you_mean(found: Any, choices) -> str:
+    words = re.findall(r"'([^']*)'", choices) if isinstance(choices, str) else choices
+    near = _nearest(found, words)
+    return f"; did you mean {near}?" if near else ""
+
+
+def _listed(names) -> str:
+    return ", ".join(str(name) for name in names) or "nothing"
+
+
+def _at(model: Any, location: tuple) -> Any:
+    """The type that the schema has at a location: a Section, an element's type, or the field itself at the end."""
+    for key in location:
+        if isinstance(model, type) and issubclass(model, Section):
+            model = model.model_fields[key].annotation if key in model.model_fields else None
+        else:
+            arguments = [argument for argument in typing.get_args(model) if argument not in (Ellipsis, type(None))]
+            model = arguments[-1] if arguments else None
+        if typing.get_origin(model) in (typing.Union, types.UnionType):
+            model = next(argument for argument in typing.get_args(model) if argument is not type(None))
+        if typing.get_origin(model) is Annotated:
+            model = typing.get_args(model)[0]
+    return model
+
+
+def _expected(model: type[Section], location: tuple) -> str:
+    """What a missing key should be: "int, at least 1 and at most 20", "one of loky, dask", "section with name, unit"."""
+    kind = _at(model, location)
+    if typing.get_origin(kind) is Literal:
+        return "one of " + _listed(typing.get_args(kind))
+    if isinstance(kind, type) and issubclass(kind, Section):
+        return "section with " + _listed(kind.model_fields)
+    owner = _at(model, location[:-1])
+    bounds = [
+        f"{words} {getattr(limit, name):g}"
+        for limit in owner.model_fields[location[-1]].metadata
+        for name, words in _BOUNDS.items()
+        if hasattr(limit, name)
+    ]
+    name = (typing.get_origin(kind) or kind).__name__
+    return f"{name}, {' and '.join(bounds)}" if bounds else name

@@ -1,0 +1,185 @@
+"""Sections of the params files that the temperature loop's stages read: the machine, what
+controllers share, the panel, and a section a stage."""
+
+import re
+from typing import Annotated, Literal
+
+import pydantic
+from pydantic import AfterValidator, Field
+
+from pipeline.store.params import Mapped, Section
+
+_TABLE_COLUMNS = ("recording", "segment", "time_s")
+
+
+def _signal_name(name: str) -> str:
+    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name):
+        raise ValueError("but must consist of letters, digits and _ and not begin with a digit")
+    if name in _TABLE_COLUMNS or name.endswith("_masked"):
+        raise ValueError(f"but that is taken by the table of the record ({', '.join(_TABLE_COLUMNS)}, ..._masked); rename the signal")
+    return name
+
+
+class Signal(Section):
+    """A signal of the machine; figures label their axes with its name and unit."""
+
+    name: Annotated[str, AfterValidator(_signal_name)]
+    unit: str = Field(min_length=1, max_length=20)
+
+
+class Input(Signal):
+    """A heater or the motor; low and high are the limits of what the machine can give, in percent."""
+
+    low: float = Field(ge=-100, le=100)
+    high: float = Field(ge=-100, le=100)
+
+    @pydantic.model_validator(mode="after")
+    def _ordered(self):
+        if not self.low < self.high:
+            raise ValueError(f"has low {self.low:g} but high {self.high:g}; low must be less than high")
+        return self
+
+
+class Output(Signal):
+    """A barrel temperature and the reference that it should settle at, in °C."""
+
+    reference: float = Field(ge=-273.15, le=1000)
+
+
+class Plant(Section):
+    """Section `plant`: the machine's signals and its sample time."""
+
+    inputs: list[Input] = Field(min_length=1, max_length=32)
+    outputs: list[Output] = Field(min_length=1, max_length=32)
+    sample_time_s: float = Field(gt=0, le=3600)
+
+    @pydantic.model_validator(mode="after")
+    def _unique(self):
+        names = [signal.name for signal in [*self.inputs, *self.outputs]]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"names {', '.join(twice)} more than once; give every input and output a name of its own")
+        return self
+
+
+class Tracking(Section):
+    """Section `tracking`: what every controller and every comparison shares; Q = yardstick_q I and R =
+    yardstick_r I are the weights of the common yardstick."""
+
+    gamma: float = Field(gt=0, le=1)
+    yardstick_q: float = Field(gt=0, le=1e6)
+    yardstick_r: float = Field(gt=0, le=1e6)
+    integral: float = Field(ge=0, le=1)
+    integral_limit_degC: float = Field(gt=0, le=1000)
+    observer_tau: float = Field(gt=0, le=1000)
+
+
+class Half(Section):
+    """One half of the panel: temperatures that the plant is held at, references as offsets
+    from plant.outputs, and seeds of the sensor noise."""
+
+    starts_degC: list[Annotated[float, Field(ge=-273.15, le=1000)]] = Field(min_length=1, max_length=20)
+    reference_offsets_degC: list[Annotated[float, Field(ge=-500, le=500)]] = Field(min_length=1, max_length=20)
+    seeds: list[Annotated[int, Field(ge=0, le=2**31)]] = Field(min_length=1, max_length=100)
+
+
+class Panel(Section):
+    """Section `panel`: the scenarios on which controllers are compared; nothing is tuned on the judging half."""
+
+    noise_degC: list[Annotated[float, Field(ge=0, le=50)]] = Field(min_length=1, max_length=10)
+    input_gain: float = Field(gt=0, lt=1)
+    loss: float = Field(ge=0, lt=1)
+    steps: int = Field(ge=60, le=20000)
+    hold_steps: int = Field(ge=0, le=2000)
+    band_degC: float = Field(gt=0, le=100)
+    training: Half
+    judging: Half
+
+    @pydantic.model_validator(mode="after")
+    def _halves_differ(self):
+        same = sorted(set(self.training.seeds) & set(self.judging.seeds))
+        if same:
+            raise ValueError(f"uses seed {same[0]} in the training and in the judging half; give each half seeds of its own")
+        return self
+
+
+# ---- a section a stage
+
+
+class GenerateProbing(Section):
+    """Section `generate_probing`."""
+
+    source: Literal["simulated", "recordings"]
+    seed: int = Field(ge=0, le=2**31)
+    signal: Literal["multisine", "prbs"]
+    samples: int = Field(ge=50, le=1_000_000)
+    amplitude_percent: float = Field(gt=0, le=100)
+    rate_percent_per_step: float = Field(gt=0, le=200)
+    shortest_steps: int = Field(ge=1, le=10_000)
+    noise_degC: float = Field(ge=0, le=50)
+    feedback_percent_per_degC: float = Field(ge=0, le=100)
+    centre_percent: float | None = Field(ge=-100, le=100)
+
+
+class Ingest(Section):
+    """Section `ingest`."""
+
+    mapping: dict[str, Mapped]
+    time: str = Field(max_length=300)
+    max_gap_s: float = Field(gt=0, le=86400)
+    strict: bool
+
+
+class IdentifyPlant(Section):
+    """Section `identify_plant`."""
+
+    seed: int = Field(ge=0, le=2**31)
+    order: int = Field(ge=0, le=60)
+    max_order: int = Field(ge=1, le=60)
+    offset: bool
+    refinement: Literal["none", "prediction", "simulation", "validated"]
+    holdout_share: float = Field(gt=0, lt=0.9)
+    ahead_steps: int = Field(ge=1, le=10_000)
+    spread_plants: int = Field(ge=20, le=1000)
+
+
+class LearnKernel(Section):
+    """Section `learn_kernel`."""
+
+    longest_window: int = Field(ge=1, le=200)
+    largest_kernel_window: int = Field(ge=1, le=10)
+    offset: bool
+    gain_spread: float = Field(ge=0, le=1)
+    allowed_gap_percent: float = Field(gt=0, le=100)
+
+
+class TuneWeights(Section):
+    """Section `tune_weights`."""
+
+    seed: int = Field(ge=0, le=2**31)
+    initial: int = Field(ge=4, le=5000)
+    evaluations: int = Field(ge=8, le=5000)
+    practical_initial: int = Field(ge=4, le=5000)
+    practical_evaluations: int = Field(ge=8, le=5000)
+    acquisition: Literal["expected_improvement", "upper_confidence_bound"]
+    q_low: float = Field(gt=0, le=1e6)
+    q_high: float = Field(gt=0, le=1e6)
+    r_low: float = Field(gt=0, le=1e6)
+    r_high: float = Field(gt=0, le=1e6)
+    tau_low: float = Field(gt=0, le=1e6)
+    tau_high: float = Field(gt=0, le=1e6)
+    allow_settling_s: float = Field(gt=0, le=1e6)
+    allow_overshoot_degC: float = Field(gt=0, le=1000)
+    allow_settled_error_degC: float = Field(gt=0, le=1000)
+    allow_at_limits_percent: float = Field(gt=0, le=100)
+    allow_effort_percent: float = Field(gt=0, le=100)
+    worst_case: float = Field(ge=0, le=1000)
+    least_disk_margin: float = Field(ge=0, le=2)
+
+
+class EvaluateTemperature(Section):
+    """Section `evaluate_temperature`."""
+
+    seed: int = Field(ge=0, le=2**31)
+    data_sets: int = Field(ge=1, le=1000)
+    report_noise_degC: float = Field(ge=0, le=50)

@@ -1,0 +1,210 @@
+"""Every table that a stage writes: columns with type, unit, meaning and range, and a version.
+
+Other columns are another version: raise the number with them.
+"""
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from pipeline.store.tables import BOOL, COUNT, FLOAT, INDEX, NONE, TEXT, Column, Schema
+
+
+class _Signal(Protocol):
+    name: str
+    unit: str
+
+
+def record(inputs: Sequence[_Signal], outputs: Sequence[_Signal]) -> Schema:
+    """The table that ingest writes: one row a sample. A masked value stays as recorded; the flag beside it says not to use it."""
+    columns = [
+        Column("recording", TEXT, NONE, "file below datasets/raw that the sample is from"),
+        Column("segment", INDEX, NONE, "stretch of that recording without a gap, counted from 0", low=0),
+        Column("time_s", FLOAT, "s", "time since the recording began"),
+    ]
+    for role, signals in (("input", inputs), ("output", outputs)):
+        for signal in signals:
+            columns.append(Column(signal.name, FLOAT, signal.unit, f"{role} {signal.name}", nullable=True))
+            columns.append(Column(f"{signal.name}_masked", BOOL, NONE, f"{signal.name} is not to be used here: missing, or found faulty"))
+    return Schema("record", 1, tuple(columns))
+
+
+QUALITY = Schema(
+    "quality",
+    1,
+    (
+        Column("recording", TEXT, NONE, "file below datasets/raw"),
+        Column("signal", TEXT, NONE, "signal that the finding is about; empty where it is about the whole recording"),
+        Column("kind", TEXT, NONE, "what was found: gap, spike, frozen, saturated, ..."),
+        Column("start_s", FLOAT, "s", "where it begins", nullable=True),
+        Column("end_s", FLOAT, "s", "where it ends", nullable=True),
+        Column("count", COUNT, NONE, "samples concerned", low=0),
+        Column("message", TEXT, NONE, "the finding in one sentence"),
+    ),
+)
+
+
+def trajectories(inputs: Sequence[_Signal], outputs: Sequence[_Signal]) -> Schema:
+    """One featured scenario of the panel under every controller, unclipped at the yardstick's weights and as deployed: true outputs, commands, applied inputs."""
+    columns = [
+        Column("controller", TEXT, NONE, "which controller"),
+        Column("mode", TEXT, NONE, "unclipped, or deployed: clipped to the limits, aimed at a feasible target"),
+        Column("time_s", FLOAT, "s", "time since the controller took over"),
+        Column("cost", FLOAT, NONE, "discounted cost so far, at the yardstick's weights", nullable=True),
+    ]
+    for name, share in (("low", "5th"), ("median", "50th"), ("high", "95th")):
+        meaning = f"worst zone's distance from its reference, {share} percentile of all runs on the nominal plant"
+        columns.append(Column(f"error_{name}_degC", FLOAT, "degC", meaning, low=0, nullable=True))
+    columns += [Column(signal.name, FLOAT, signal.unit, f"true output {signal.name}", nullable=True) for signal in outputs]
+    for signal in inputs:
+        columns.append(Column(f"{signal.name}_command", FLOAT, signal.unit, f"{signal.name} as the controller asked", nullable=True))
+        columns.append(Column(f"{signal.name}_applied", FLOAT, signal.unit, f"{signal.name} as it was given", nullable=True))
+    return Schema("trajectories", 2, tuple(columns))
+
+
+SCORECARD = Schema(
+    "scorecard",
+    1,
+    (
+        Column("controller", TEXT, NONE, "which controller"),
+        Column("plant", INDEX, NONE, "plant of the spread, 0 the nominal one", low=0),
+        Column("start_degC", FLOAT, "degC", "temperature that the plant was held at"),
+        Column("reference_degC", FLOAT, "degC", "reference of the first output"),
+        Column("noise_degC", FLOAT, "degC", "standard deviation of the noise that the controller saw", low=0),
+        Column("seed", COUNT, NONE, "seed of that noise", low=0),
+        Column("regret", FLOAT, NONE, "J / J* - 1 at the yardstick's weights, unclipped", nullable=True),
+        Column("outside_percent", FLOAT, "percent", "unclipped commands outside the limits", 0, 100),
+        Column("tracking_degC", FLOAT, "degC", "root mean square error as deployed", low=0),
+        Column("effort_percent", FLOAT, "percent", "root mean square input as deployed", low=0),
+        Column("settled_error_degC", FLOAT, "degC", "mean error over the last third, worst zone", low=0),
+        Column("settled_zone", TEXT, NONE, "that zone"),
+        Column("settling_s", FLOAT, "s", "time until every zone stays within the band; missing where one never does", nullable=True),
+        Column("overshoot_degC", FLOAT, "degC", "largest way past a reference", low=0),
+        Column("at_limits_percent", FLOAT, "percent", "commands beyond the limits as deployed", 0, 100),
+        Column("input_low_percent", FLOAT, "percent", "lowest input given"),
+        Column("input_high_percent", FLOAT, "percent", "highest input given"),
+    ),
+)
+
+STUDY = Schema(
+    "study",
+    1,
+    (
+        Column("route", TEXT, NONE, "window, kernel or kernel_predicted_state"),
+        Column("noise_degC", FLOAT, "degC", "noise in the data and under the controller", low=0),
+        Column("data_set", COUNT, NONE, "which data set of 15,000 samples", low=0),
+        Column("gap", FLOAT, NONE, "J / J* - 1 over 1,000 steps", nullable=True),
+        Column("error_degC", FLOAT, "degC", "root mean square error over steps 500-1000", nullable=True),
+    ),
+)
+
+TUNING = Schema(
+    "tuning",
+    2,
+    (
+        Column("mode", TEXT, NONE, "parity: the paper's (37); practical: the declared engineering cost"),
+        Column("evaluation", COUNT, NONE, "counted from 1", low=1),
+        Column("cost", FLOAT, NONE, "cost of this candidate; missing where it failed", nullable=True),
+        Column("incumbent", FLOAT, NONE, "lowest cost so far; missing before the first success", nullable=True),
+        Column("tracking_degC", FLOAT, "degC", "r.m.s. tracking error of this candidate; missing where it failed", nullable=True),
+        Column("effort_percent", FLOAT, "percent", "r.m.s. effort of this candidate; missing where it failed", nullable=True),
+        Column("chosen", BOOL, NONE, "whether the search recommends this candidate"),
+        Column("failure", TEXT, NONE, "why the candidate failed; empty where it did not"),
+    ),
+)
+
+ORDER = Schema(
+    "order",
+    1,
+    (
+        Column("order", INDEX, NONE, "states of the candidate", low=1),
+        Column("singular_value", FLOAT, NONE, "that this order keeps last", low=0),
+        Column("noise_edge", FLOAT, NONE, "what noise alone puts into the singular values", low=0),
+        Column("parameters", COUNT, NONE, "free numbers of the candidate", low=0),
+        Column("error", FLOAT, NONE, "error on left-out blocks, as a share of the outputs' variation; missing where only the rank decided", nullable=True),
+        Column("chosen", BOOL, NONE, "the candidate that was taken"),
+    ),
+)
+
+
+def holdout(outputs: Sequence[_Signal]) -> Schema:
+    """The part of the record that judged the model: measured, simulated from its inputs alone, and predicted from outputs so many steps before."""
+    columns = [Column("segment", INDEX, NONE, "stretch of the record", low=0), Column("time_s", FLOAT, "s", "time since the hold-out began")]
+    for signal in outputs:
+        columns.append(Column(f"{signal.name}_measured", FLOAT, signal.unit, f"{signal.name} as recorded", nullable=True))
+        columns.append(Column(f"{signal.name}_simulated", FLOAT, signal.unit, f"{signal.name} by the model, from the inputs alone", nullable=True))
+        columns.append(Column(f"{signal.name}_ahead", FLOAT, signal.unit, f"{signal.name} by the model, identify_plant.ahead_steps before", nullable=True))
+    return Schema("holdout", 2, tuple(columns))
+
+
+RESIDUALS = Schema(
+    "residuals",
+    1,
+    (
+        Column("output", TEXT, NONE, "output whose one-step errors on the hold-out these are"),
+        Column("against", TEXT, NONE, "the same output, or the input that they are correlated with"),
+        Column("lag", INDEX, NONE, "samples by which the error comes later"),
+        Column("correlation", FLOAT, NONE, "both about zero mean and of unit power; missing where one of them never moves", nullable=True),
+        Column("band", FLOAT, NONE, "what 99 % of such correlations stay under where nothing is left over", low=0),
+        Column("passed", BOOL, NONE, "the test over all lags, at 99 %"),
+    ),
+)
+
+STEPS = Schema(
+    "steps",
+    1,
+    (
+        Column("output", TEXT, NONE, "output that answers"),
+        Column("input", TEXT, NONE, "input that steps by one percent"),
+        Column("time_s", FLOAT, "s", "time since the step", low=0),
+        Column("response", FLOAT, "degC per percent", "of the model, from rest"),
+        Column("low", FLOAT, "degC per percent", "lower end of the 90 % band over the plants of the spread"),
+        Column("high", FLOAT, "degC per percent", "upper end of that band"),
+    ),
+)
+
+DYNAMICS = Schema(
+    "dynamics",
+    1,
+    (
+        Column("output", TEXT, NONE, "output that answers"),
+        Column("input", TEXT, NONE, "input that steps"),
+        Column("seen", BOOL, NONE, "the band of the response's largest excursion does not hold zero"),
+        *(
+            Column(f"{name}{end}", FLOAT, unit, meaning + of, low, nullable=unit == "s")
+            for name, unit, meaning, low in (
+                ("gain", "degC per percent", "the step response at its end", None),
+                ("peak", "degC per percent", "its largest excursion", None),
+                ("time_constant_s", "s", "1.5 times the way from 28.3 to 63.2 % of the largest excursion", 0),
+                ("delay_s", "s", "what is left of the time to 63.2 % without one time constant", 0),
+            )
+            for end, of in (("", ""), ("_low", ", lower end of its 90 % band"), ("_high", ", upper end of its 90 % band"))
+        ),
+    ),
+)
+
+POLES = Schema(
+    "poles",
+    1,
+    (
+        Column("member", INDEX, NONE, "0 the model, from 1 the plants of the spread", low=0),
+        Column("pole", INDEX, NONE, "number of the model's pole that it belongs to, the largest 0; -1 for one that the model does not have", low=-1),
+        Column("real", FLOAT, NONE, "real part"),
+        Column("imag", FLOAT, NONE, "imaginary part"),
+    ),
+)
+
+LEVELS = Schema(
+    "levels",
+    1,
+    (
+        Column("input", TEXT, NONE, "input"),
+        Column("low_rad", FLOAT, "rad per sample", "lower edge of the band of frequencies", low=0),
+        Column("high_rad", FLOAT, "rad per sample", "upper edge of that band"),
+        Column("level", FLOAT, "percent", "root mean square of the input within the band", low=0),
+    ),
+)
+
+
+# ---- the deposition loop
+
+

@@ -1,0 +1,430 @@
+"""The nightly job's mechanics, on a toy project in a git repository of its own: what a scheduler meets."""
+
+import datetime
+import fcntl
+import itertools
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.nightly import champion, guarding, inputs, night, processes, screening, sweeping, watch
+from tests.nightly.toy_nights import Project, entered
+
+TOMORROW = datetime.timedelta(days=1)
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory):
+    """The project after its first night: mean 11, the champion of night-0001."""
+    project = Project(tmp_path_factory.mktemp("nights") / "toy").make()
+    found = project.night()
+    assert found.returncode == 0 and "promoted toy" in found.stdout, found
+    return project
+
+
+@pytest.fixture
+def project(first, tmp_path, monkeypatch):
+    """A copy of it, and this process in it, as the job is."""
+    return entered(first, tmp_path / "toy", monkeypatch)
+
+
+def test_a_night_without_new_data_is_done_in_seconds_and_commits_nothing(project):
+    head, began = project.head(), os.times()
+    found = project.night()
+    spent = os.times()
+    assert found.returncode == 0 and "nothing new" in found.stdout
+    assert project.head() == head and project.dirty() == []
+    # the bar is 15 s; counted in the processor's seconds, which do not depend on what else the machine does: half of it leaves room for the disk
+    assert spent.children_user + spent.children_system - began.children_user - began.children_system < 7
+
+
+def test_a_better_challenger_is_promoted_and_the_champion_before_it_comes_back_bit_by_bit(project):
+    before, name = project.production(), project.champion()["folder"]["md5"]
+    project.record("second", [9.0, 9.0, 9.0])  # the mean of all is 10, the truth
+    status, said = night.nightly()
+    assert status == night.OK and "promoted toy" in said
+    assert project.production() != before and project.champion()["run"] == "night-0002"
+    assert project.champion()["files"] == champion.md5s(project.folder / "champion/toy")
+    assert project.dirty() == []
+
+    began = time.monotonic()
+    assert "toy is night-0001 again" in night.rollback("", "")
+    assert time.monotonic() - began < 60
+    assert project.production() == before and project.champion()["folder"]["md5"] == name and project.dirty() == []
+    # and the night after does not promote again what somebody has just rolled back
+    (project.folder / "learn.py").write_text((project.folder / "learn.py").read_text() + "# other code, same model\n")
+    status, said = night.nightly()
+    assert status == night.OK and "was rolled back by hand" in said and project.champion()["run"] == "night-0001"
+
+
+@pytest.mark.slow
+def test_a_worse_challenger_changes_nothing_but_the_report(project):
+    before = project.production()
+    project.record("second", [30.0])
+    status, said = night.nightly()
+    assert status == night.OK and "kept" in said and "no better" in said
+    assert project.production() == before and project.champion()["run"] == "night-0001" and project.dirty() == []
+    metrics = json.loads((project.folder / "reports/metrics/nightly.json").read_text())
+    assert (
+        metrics["decision"] == "kept"
+        and metrics["champion"]["toy"]["run"] == "night-0001"
+        and metrics["decisions"]["toy"]["paired"]["p"] == 1.0
+    )
+
+
+def test_a_night_with_bad_data_leaves_the_last_good_run_and_the_next_night_works(project):
+    lock, learned = ((project.folder / name).read_bytes() for name in ("dvc.lock", "datasets/learn/model.json"))
+    bad = project.record("bad", ["x"])
+    status, said = night.nightly()
+    assert status == night.FAILED and "bad.csv: expected numbers, found none; mend the file" in said
+    assert (project.folder / "dvc.lock").read_bytes() == lock and (project.folder / "datasets/learn/model.json").read_bytes() == learned
+    assert "bad.csv" in (project.folder / "reports/nightly.html").read_text()
+    bad.unlink()
+    project.record("second", [9.0, 9.0, 9.0])
+    assert night.nightly()[0] == night.OK and project.champion()["run"] == "night-0003"
+
+
+@pytest.mark.parametrize(("times", "kept_by"), [(1, "git"), (2, "git"), (1, "dvc")])
+def test_what_changes_while_the_stages_run_is_learned_whole_or_not_at_all(project, monkeypatch, times, kept_by):
+    if kept_by == "dvc":
+        project.run("git", "rm", "-rq", "--cached", "datasets/raw/toy")
+        project.run(sys.executable, "-m", "dvc", "add", "-q", "datasets/raw/toy")
+        project.run("git", "add", "datasets/raw")
+        project.run("git", "commit", "-q", "-m", "recordings are dvc's")
+    project.record("second", [9.0])
+    lock, learn, late = (project.folder / "dvc.lock").read_bytes(), night._reproduce, iter(range(times))
+
+    def meanwhile(*given):
+        learn(*given)
+        for k in itertools.islice(late, 1):  # after stage learn has read, as a printer that goes on recording
+            project.record(f"late_{k}", [9.0])
+            project.set(watch_h=48 + k)
+
+    monkeypatch.setattr(night, "_reproduce", meanwhile)
+    status, said = night.nightly()
+    if times == 1:
+        assert status == night.OK, said
+        assert status == night.OK and "promoted toy" in said
+        assert json.loads((project.folder / "datasets/learn/model.json").read_text()) == (33 + 18) / 5
+        assert night.nights()[-1]["notes"] == [
+            "datasets/raw/toy/late_0.csv, params.yaml changed while the stages ran: the night began once again"
+        ]
+        assert sorted(project.champion()["lineage"]["recordings"]["toy"]) == [
+            f"datasets/raw/toy/{name}.csv" for name in ("first", "late_0", "second")
+        ]
+        assert "nothing new" in night.nightly()[1]
+        return
+    assert status == night.FAILED and "datasets/raw/toy/late_1.csv changed again while the stages ran; start the night when" in said
+    assert (project.folder / "dvc.lock").read_bytes() == lock and project.champion()["run"] == "night-0001"
+    assert night.nightly()[0] == night.OK and project.champion()["run"] == "night-0003"
+
+
+def test_a_recording_that_comes_while_others_are_looked_at_or_judged_is_new_the_next_night_or_looked_at_tonight(project, monkeypatch):
+    project.record("second", [9.0])
+    look, judge = screening.look, night._judge
+
+    def looked(*given, **more):
+        monkeypatch.setattr(screening, "look", look)
+        project.record("while_looking", [9.2])
+        return look(*given, **more)
+
+    def judged(*given):
+        project.record("while_judging", [9.5])
+        return judge(*given)
+
+    monkeypatch.setattr(screening, "look", looked)
+    monkeypatch.setattr(night, "_judge", judged)
+    assert night.nightly()[0] == night.OK
+    tonight = night.nights()[-1]["new_recordings"]["toy"]
+    assert tonight == ["datasets/raw/toy/second.csv", "datasets/raw/toy/while_looking.csv"]
+    monkeypatch.setattr(night, "_judge", judge)
+    assert night.nightly()[0] == night.OK
+    assert night.nights()[-1]["new_recordings"] == {"toy": ["datasets/raw/toy/while_judging.csv"]}
+
+
+@pytest.mark.parametrize("lock", [None, "schema: '2.0'\nstages: {}\n", ""])
+def test_going_back_leaves_recordings_that_dvc_has_not_seen_alone(project, lock):
+    project.run("git", "rm", "-rq", "--cached", "datasets/raw/toy")
+    project.run(sys.executable, "-m", "dvc", "add", "-q", "datasets/raw/toy")
+    if lock is not None:
+        (project.folder / "dvc.lock").write_text(lock)
+    guarding.remember_before()
+    late, model = project.record("late", [9.0]), project.folder / "datasets/learn/model.json"
+    model.write_text("0")
+    assert guarding.back_to_before() == [] and late.read_text() == "9.0"
+    assert model.read_text() == ("11.0" if lock is None else "0")
+
+
+def test_code_that_changes_while_the_stages_run_ends_the_night(project, monkeypatch):
+    learn = night._reproduce
+
+    def meanwhile(*given):
+        learn(*given)
+        (project.folder / "learn.py").write_text((project.folder / "learn.py").read_text() + "# pulled meanwhile\n")
+
+    project.record("second", [9.0])
+    monkeypatch.setattr(night, "_reproduce", meanwhile)
+    status, said = night.nightly()
+    assert status == night.FAILED and "learn.py changed while the stages ran" in said and project.champion()["run"] == "night-0001"
+
+
+@pytest.mark.slow
+def test_an_empty_folder_is_a_failed_night_with_its_cause(project):
+    shutil.rmtree(project.folder / "datasets/raw/toy")
+    (project.folder / "datasets/raw/toy").mkdir()
+    before = project.production()
+    status, said = night.nightly()
+    assert status == night.FAILED and "datasets/raw/toy" in said
+    assert project.production() == before and project.champion()["run"] == "night-0001"
+
+
+def test_a_second_night_at_the_same_time_is_refused_and_changes_nothing(project):
+    (project.folder / ".beadline").mkdir(exist_ok=True)
+    descriptor = os.open(project.folder / ".beadline/lock", os.O_RDWR | os.O_CREAT)
+    fcntl.flock(descriptor, fcntl.LOCK_EX)
+    project.record("second", [9.0, 9.0, 9.0])
+    assert night.nightly()[0] == night.BUSY
+    assert project.champion()["run"] == "night-0001"
+    os.close(descriptor)
+    assert night.nightly()[0] == night.OK
+
+
+@pytest.mark.slow
+def test_on_a_full_disk_the_champion_stays_and_the_cause_is_reported(project, monkeypatch):
+    project.record("second", [9.0, 9.0, 9.0])
+
+    copy = shutil.copyfile
+
+    def full(source, target):
+        if "champion" in str(target):
+            raise OSError(28, "No space left on device", str(target))
+        return copy(source, target)
+
+    before = project.production()
+    with monkeypatch.context() as broken:
+        broken.setattr(champion.shutil, "copyfile", full)
+        status, said = night.nightly()
+    assert status == night.FAILED and "No space left on device" in said
+    assert project.production() == before and project.champion()["run"] == "night-0001"
+    assert night.nightly()[0] == night.OK and project.champion()["run"] == "night-0003"
+
+
+def test_too_little_room_ends_the_night_before_it_begins(project):
+    project.set(least_free_mb=1e7)
+    status, said = night.nightly()
+    assert status == night.FAILED and "nightly.least_free_mb" in said and project.champion()["run"] == "night-0001"
+
+
+@pytest.mark.slow
+def test_a_clock_that_was_set_back_is_said_and_does_not_make_the_last_success_older(project):
+    success = watch.last()["success"]
+    project.record("second", [9.0, 9.0, 9.0])
+    status, said = night.nightly(datetime.datetime.fromisoformat(success) - 30 * TOMORROW)
+    assert status == night.OK and "the clock was set back" in said and project.champion()["run"] == "night-0002"
+    assert watch.last()["success"] == success
+
+
+def test_a_promotion_that_was_killed_before_its_commit_never_was(project):
+    """Between champion.json and the commit: everything new lies there, and HEAD knows none of it."""
+    before, head = project.production(), project.head()
+    model = project.folder / "datasets/learn/model.json"
+    model.write_text("10.0")
+    described = {"run": "night-0002", "when": "2030-01-01T00:00:00+00:00", "why": "killed"}
+    state = champion.promoted(
+        champion.read(), "toy", described | champion.install("toy", ["datasets/learn/model.json"], {}), event="promoted"
+    )
+    (project.folder / "champion.json").write_text(json.dumps(state))
+    guarding.RUNNING.touch()
+    assert project.production() != before
+    (project.folder / "datasets/learn/model.json").write_text("11.0")
+    status, said = night.nightly()
+    assert status == night.OK and "the night before was killed" in said
+    assert project.production() == before and project.champion()["run"] == "night-0001" and project.head() == head
+
+
+@pytest.mark.slow
+def test_gits_lock_left_by_a_killed_night_does_not_stop_the_next_one(project):
+    guarding.RUNNING.touch()
+    (project.folder / ".git/index.lock").touch()
+    (project.folder / ".git/refs/heads/main.lock").touch()
+    project.record("second", [9.0, 9.0, 9.0])
+    status, said = night.nightly()
+    assert status == night.OK and "was left by a killed git" in said and project.champion()["run"] == "night-0002"
+
+
+@pytest.mark.slow
+def test_a_commit_leaves_alone_what_the_user_has_staged(project):
+    (project.folder / "mine.txt").write_text("half done")
+    project.run("git", "add", "mine.txt")
+    project.record("second", [9.0, 9.0, 9.0])
+    assert night.nightly()[0] == night.OK
+    assert project.dirty() == ["A  mine.txt"]
+
+
+@pytest.mark.slow
+def test_a_promotion_on_a_branch_waits_for_a_person(project):
+    before = project.production()
+    project.set(promotion="branch")
+    project.record("second", [9.0, 9.0, 9.0])
+    status, said = night.nightly()
+    assert status == night.OK and "git merge nightly" in said
+    assert project.production() == before and project.champion()["run"] == "night-0001"
+    project.run("git", "add", "-A")
+    project.run("git", "stash", "-q")
+    project.run("git", "merge", "-q", "nightly")
+    project.run(sys.executable, "-m", "dvc", "checkout", "-q")
+    assert project.champion()["run"] == "night-0002" and project.production()["learn/model.json"] == b"10.0"
+
+
+@pytest.mark.slow
+def test_nights_of_two_branches_are_merged_by_one_command(project):
+    project.run("git", "checkout", "-q", "-b", "other")
+    project.record("other", [9.5, 9.5, 9.5])
+    assert night.nightly()[0] == night.OK and project.champion()["run"] == "night-0002"
+    project.run("git", "checkout", "-q", "main")
+    project.run(sys.executable, "-m", "dvc", "checkout", "-q")
+    project.record("mine", [9.4, 9.4, 9.4])
+    assert night.nightly()[0] == night.OK
+    assert project.run("git", "merge", "other", check=False).returncode != 0  # by itself git cannot
+    project.run("git", "merge", "--abort")
+    found = project.beadline("nightly", "--merge", "other")
+    assert found.returncode == 0, found
+    assert json.loads((project.folder / "datasets/learn/model.json").read_text()) == pytest.approx(np.mean([11, 9.5, 9.4]))
+    assert {line["run"] for line in champion.read()["history"]} >= {"night-0001", "night-0002"} and project.dirty() == []
+
+
+def test_the_watchdog_wakes_somebody_when_the_last_success_is_old(project):
+    project.set(watch_h=0.001, alarm=f"{sys.executable} -c \"import sys,shutil; shutil.copy(sys.argv[1], 'woken.json')\"")
+    time.sleep(4)
+    status, said = night.watchdog()
+    assert status == night.FAILED and "nightly.watch_h allows 0.001 h" in said
+    woken = json.loads((project.folder / "woken.json").read_text())
+    assert woken["kind"] == "watch" and "last success was" in woken["reasons"][0]
+
+
+@pytest.mark.slow
+def test_a_failed_night_wakes_somebody_and_an_alarm_that_fails_does_not_hide_it(project):
+    project.set(alarm="no-such-command", webhook="http://127.0.0.1:9/none")
+    project.record("bad", ["x"])
+    status, said = night.nightly()
+    assert status == night.FAILED and "bad.csv" in said and "nightly.alarm" in said and "nightly.webhook" in said
+    assert json.loads(watch.ALARM.read_text())["kind"] == "failed"
+
+
+def test_rollback_to_an_unknown_run_names_the_known_ones(project):
+    with pytest.raises(ValueError, match=r"expected a champion of night-0099 to go back to, found none; known are: night-0001 \(toy\)"):
+        night.rollback("night-0099", "")
+    assert not guarding.RUNNING.exists()  # refused, not killed: the next night has nothing to mend
+
+
+@pytest.mark.slow
+def test_artifacts_are_pushed_to_a_remote_and_a_fresh_clone_pulls_the_champion(project, tmp_path):
+    project.run(sys.executable, "-m", "dvc", "remote", "add", "-q", "store", str(tmp_path / "remote"))
+    project.run("git", "commit", "-qam", "a remote")
+    project.set(remote="store")
+    project.record("second", [9.0, 9.0, 9.0])
+    assert night.nightly()[0] == night.OK
+    project.run("git", "commit", "-qam", "parameters")
+    project.run("git", "clone", "-q", str(project.folder), str(tmp_path / "clone"))
+    clone = Project(tmp_path / "clone")
+    clone.run(sys.executable, "-m", "dvc", "pull", "-q", "-r", "store")
+    assert clone.production() == project.production()
+
+
+@pytest.mark.slow
+def test_killed_at_twenty_random_moments_the_champion_is_whole_and_the_next_night_works(project):
+    """SIGKILL at moments spread over a night that promotes, or would."""
+    rng = np.random.default_rng(7)
+    (project.folder / "slow.txt").write_text("0.5")
+    project.run("git", "add", "slow.txt")
+    project.run("git", "commit", "-qm", "a stage that takes a while")
+    began = time.monotonic()
+    project.record("warm", [11.0])
+    night.nightly()
+    whole_s = time.monotonic() - began
+    for k, share in enumerate(rng.uniform(0.02, 1.0, 20)):
+        before = project.champion()
+        project.record(f"kill {k}", [9.9 - 0.1 * k, 10.1 + 0.05 * k])
+        child = project.start()
+        time.sleep(share * whole_s)
+        child.send_signal(signal.SIGKILL)
+        child.communicate()
+        now = project.champion()
+        assert now["run"] == before["run"] or now["run"] > before["run"]
+        status, said = night.nightly()
+        assert status == night.OK, f"after a kill at {share:.2f} of a night: {said}"
+        present = project.champion()
+        assert champion.md5s(project.folder / "champion/toy") == present["files"] and project.dirty() == []
+        assert not processes.orphans()
+    subprocess.run(["git", "fsck", "--strict"], check=True, capture_output=True)
+
+
+@pytest.mark.slow
+def test_a_sweep_runs_every_point_beside_the_working_tree_and_tabulates_it(project):
+    text = (project.folder / "learn.py").read_text()
+    (project.folder / "learn.py").write_text(
+        text.replace(
+            "sum(values) / len(values)",
+            "sum(values) / len(values) + __import__('yaml').safe_load(pathlib.Path('params.yaml').read_text())['shift']",
+        )
+    )
+    parameters = json.loads((project.folder / "params.yaml").read_text()) | {"shift": 0}
+    (project.folder / "params.yaml").write_text(json.dumps(parameters, indent=1))
+    (project.folder / "dvc.yaml").write_text(
+        (project.folder / "dvc.yaml").read_text().replace("deps: [learn.py,", "params: [shift]\n    deps: [learn.py,")
+    )
+    project.run("git", "commit", "-qam", "a parameter")
+    before = (project.folder / "datasets/learn/model.json").read_bytes()
+    found = project.beadline("sweep", "-S", "shift=1,2", "--target", "learn", "--metric", "learn:mean")
+    assert found.returncode == 0, found
+    table = (project.folder / "reports/sweep.csv").read_text().splitlines()
+    assert table == ["experiment,shift,learn:mean", "sweep-shift-1,1,12.0", "sweep-shift-2,2,13.0"]
+    assert (project.folder / "datasets/learn/model.json").read_bytes() == before and "lowest in experiment 1" in (
+        project.folder / "reports/sweep.html"
+    ).read_text()
+    assert project.run("git", "diff", "--stat").stdout == ""
+
+
+def test_a_sweep_finds_the_file_of_each_key(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("params.yaml").write_text("learn: {window: null}")
+    Path("params.expert.yaml").write_text("learn: {seed: 1}")
+    asked = []
+    monkeypatch.setattr(sweeping, "dvc", lambda *words, log: asked.append(words[words.index("--set-param") : -1]))
+    monkeypatch.setattr(sweeping, "git", lambda *words: '{"cost": 1}')
+    said = sweeping.sweep(["params.expert.yaml:learn.seed=1,2", "learn.window=3"], "learn", "learn:cost")
+    assert asked == [
+        ("--set-param", f"params.expert.yaml:learn.seed={seed}", "--set-param", "params.yaml:learn.window=3") for seed in (1, 2)
+    ]
+    assert said.splitlines()[0].split() == ["experiment", "learn.seed", "learn.window", "learn:cost"]
+    with pytest.raises(ValueError, match=r"with a key of params.yaml or params.expert.yaml, found params.yaml:learn.seed=1; "):
+        sweeping.grid(["params.yaml:learn.seed=1"])
+
+
+@pytest.mark.parametrize("file", ["params.yaml", "params.expert.yaml"])
+def test_a_change_of_either_file_of_parameters_is_something_new(tmp_path, monkeypatch, file):
+    monkeypatch.chdir(tmp_path)
+    Path("dvc.yaml").write_text("stages: {}")
+    Path("params.yaml").write_text("learn: {window: 1}")
+    Path("params.expert.yaml").write_text("learn: {seed: 1}")
+
+    def depended_on() -> str:
+        return inputs.digest(inputs.contents(inputs.Hashes({}), inputs.sources()))
+
+    before = depended_on()
+    assert depended_on() == before
+    Path(file).write_text("learn: {other: 2}")
+    assert depended_on() != before
+
+
+def test_a_sweep_over_a_key_that_is_not_there_is_refused(project):
+    found = project.beadline("sweep", "-S", "colour=1,2", "--target", "learn", "--metric", "learn:mean")
+    assert found.returncode == 1 and "expected KEY=VALUE,VALUE with a key of params.yaml, found colour=1,2" in found.stderr

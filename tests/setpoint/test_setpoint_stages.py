@@ -1,0 +1,403 @@
+"""The setpoint stages as a user runs them: on rendered frames, and on a folder of a user's; what is killed goes on, and broken input leaves all as it was."""
+
+import contextlib
+import importlib
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from pipeline.setpoint import eyes
+from pipeline.setpoint.calibration import Calibration, Familiar
+from pipeline.setpoint.recorded import WindowTable
+from pipeline.setpoint.vision_transformer import SMALL as SMALL_SIZE
+from pipeline.setpoint.vision_transformer import named_arrays, vision_transformer
+from pipeline.setpoint.workflow import parts, train_agent, train_classifier
+from pipeline.setpoint.workflow.agent_files import Agents, restore_agents, store_agents
+from pipeline.setpoint.workflow.classifier_files import CLASSIFIER_SCHEMA, restore_classifier, store_classifier
+from pipeline.setpoint.workflow.settings import TrainAgent, TrainClassifier
+from pipeline.setpoint.workflow.tables import AGENT_COURSE, CLASSIFIED, COURSE, DECISIONS, PATHS, RELIABILITY, SCOREBOARD, WINDOWS
+from pipeline.setpoint.workflow.windows import edges, window_rows, window_tables
+from pipeline.store import artifacts, params
+from pipeline.store.artifacts import read_weights, write_weights
+from pipeline.store.params import Execution
+from tests.nozzle_folders import SHOTS, folder, rows, table
+from tests.setpoint.synthetic import synthetic_table
+
+ROOT = Path(__file__).parents[2]
+TABLES = {
+    "classified": CLASSIFIED, "reliability": RELIABILITY, "course": COURSE, "windows": WINDOWS,
+}  # fmt: skip
+RECIPE = {"epochs": 2, "cycle_epochs": 2, "warmup_epochs": 0, "batch": 16}
+# a few frames of everything, and as much promised as so few allow
+SMALL = {
+    "execution.jobs": 1,
+    "train_classifier.segments": {"learned": 3, "held_out": 1, "calibration": 2, "judged": 2},
+    "train_classifier.frames": {"learned": 1, "held_out": 2, "calibration": SHOTS, "judged": SHOTS},
+    "train_classifier.window": SHOTS,
+    "train_classifier.coverage": 0.6,
+    "train_classifier.confidence": 0.55,
+    "train_classifier.false_alarms": 0.1,
+    "train_classifier.recorded": {"learn": 1, "judge": 1, "learn_windows": 1.0, "judge_windows": 1.0},
+    **{f"train_classifier.{network}.{key}": value for network in ("small", "cnn") for key, value in RECIPE.items()},
+    "train_agent.runs": 1,
+    "train_agent.paper.updates": [20, 20, 20, 20],
+    "train_agent.ours.updates": 20,
+    "train_agent.ours.rounds": 2,
+    **{f"train_agent.{who}.{key}": value for who in ("paper", "ours") for key, value in {"environments": 4, "batch": 16, "capacity": 1000}.items()},
+    "evaluate_setpoint.runs": 1,
+    "evaluate_setpoint.pixels.starts": 1,
+    "evaluate_setpoint.pixels.decisions": 20,
+    "evaluate_setpoint.pixels.least_frames": 2,
+}  # fmt: skip
+
+
+def declare(changes: dict, source: Path = Path("params.yaml")) -> None:
+    sections = params.read(source)
+    for dotted, value in changes.items():
+        *parents, key = dotted.split(".")
+        place = sections
+        for parent in parents:
+            place = place[parent]
+        place[key] = value
+    Path("params.yaml").write_text(yaml.safe_dump(sections, sort_keys=False))
+
+
+def stage(name: str) -> None:
+    importlib.import_module(f"stages.{name}").main()
+
+
+def begun(place: Path, **changes) -> Path:
+    """A project with small parameters, in which one works from now on."""
+    place.mkdir(parents=True, exist_ok=True)
+    with contextlib.chdir(place):
+        declare(SMALL | {f"train_classifier.{key}": value for key, value in changes.items()}, ROOT / "params.yaml")
+    return place
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory) -> Path:
+    """A project in which the classifier was trained on rendered frames."""
+    place = begun(tmp_path_factory.mktemp("simulated"))
+    with contextlib.chdir(place):
+        stage("train_classifier")
+    return place
+
+
+@pytest.fixture
+def project(tmp_path, monkeypatch) -> Path:
+    monkeypatch.chdir(begun(tmp_path / "project"))
+    return tmp_path / "project"
+
+
+@pytest.fixture
+def stored(project) -> Path:
+    """A project with a classifier that has learned nothing, and made-up windows; to be spoiled."""
+    known = Calibration(1.0, 0.1, 0.2, Familiar(np.zeros((3, 4)), np.eye(4)), 9.0)
+    out = project / "datasets/train_classifier"
+    store_classifier(
+        out, params.load(TrainClassifier, "train_classifier"), eyes.Eyes(vision_transformer(SMALL_SIZE, np.random.default_rng(0)), known)
+    )
+    tables = {part: synthetic_table(np.random.default_rng(1), segments=1, windows=2) for part in ("learn", "judge")}
+    artifacts.write_table(out / "windows.parquet", WINDOWS, window_rows(tables))
+    return project
+
+
+def refusal(name: str, capsys) -> str:
+    """The one sentence with which a stage ends; but for what it remembers nothing was written."""
+
+    def there():
+        return {path: artifacts.sha256(path) for path in sorted(Path().rglob("*")) if path.is_file() and "memo" not in path.parts}
+
+    before = there()
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as ended:
+        stage(name)
+    said = [
+        line
+        for line in capsys.readouterr().err.splitlines()
+        if line.startswith(f"{name}: ") and "%|" not in line and "frames: " not in line
+    ]
+    assert ended.value.code == 1
+    assert len(said) == 1
+    assert "; " in said[0]
+    assert there() == before
+    return said[0]
+
+
+# ---- what comes out
+
+
+def check_classifier(source: str) -> dict:
+    """The artifacts of train_classifier in this folder, all and no other; returns its metrics."""
+    out = Path("datasets/train_classifier")
+    for name, schema in TABLES.items():
+        assert len(next(iter(artifacts.read_table(out / f"{name}.parquet", schema).values()))), name
+    frames = artifacts.read_json(out / "frames/frames.json")
+    expected = {f"{name}.parquet" for name in (*TABLES, "calibration")} | {"weights.safetensors", "frames/frames.json"}
+    expected |= {f"frames/{row['file']}" for row in frames}
+    courses = {f"{figure}.tsv" for figure in ("training_loss", "held_out_loss", "held_out_accuracy")}
+    expected |= {f"live/plots/metrics/{learner}/{name}" for learner in ("vision_transformer", "convolutional_network") for name in courses}
+    assert {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()} == expected
+    figures = artifacts.read_metrics("train_classifier")
+    for name in ("image_accuracy", "window_accuracy", "svc_image_accuracy", "ece_image", "ece_window"):
+        assert 0 <= figures[name] <= 1
+    assert figures["source"] == source
+    assert figures["epochs"] == {"vision transformer": 2, "convolutional network": 2}
+    return figures
+
+
+def test_on_rendered_frames_every_artifact_is_written_with_its_schema(simulated, monkeypatch):
+    monkeypatch.chdir(simulated)
+    figures = check_classifier("simulated")
+    assert figures["data"]["frames"] == 15 * (3 * 1 + 1 * 2 + 2 * SHOTS + 2 * SHOTS)
+    assert figures["data"]["valid"] + sum(figures["data"]["rejected"].values()) == figures["data"]["frames"]
+    course = artifacts.read_table("datasets/train_classifier/course.parquet", COURSE)
+    assert course["epoch"].tolist() == [1, 2] * 2
+
+
+def test_a_training_that_was_killed_goes_on_and_ends_at_the_very_same_weights(simulated, project, monkeypatch):
+    p, write, epochs = params.load(TrainClassifier, "train_classifier"), write_weights, []
+    found, _ = parts.parts(p, "datasets/raw/setpoint", params.load(Execution, "execution"))
+
+    def killing(path, name, arrays, about):
+        write(path, name, arrays, about)
+        epochs.append(int(about["epoch"]))
+        if len(epochs) == 1:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(train_classifier, "write_weights", killing)
+    with pytest.raises(KeyboardInterrupt):
+        train_classifier.trained(p, found)
+    once = train_classifier.trained(p, found)
+    assert epochs == [1, 2, 1, 2], "of the first network one epoch was left, of the second both"
+    # a damaged checkpoint is begun anew
+    for path in Path("datasets/memo/train_classifier").glob("*.safetensors"):
+        path.write_bytes(path.read_bytes()[:1000])
+    twice = train_classifier.trained(p, found)
+    assert epochs == [1, 2, 1, 2, 1, 2, 1, 2]
+    whole, _ = read_weights(simulated / "datasets/train_classifier/weights.safetensors", CLASSIFIER_SCHEMA)
+    for arrays in (named_arrays(once.network), named_arrays(twice.network)):
+        assert arrays.keys() == whole.keys()
+        for name, values in whole.items():
+            np.testing.assert_array_equal(arrays[name], values, err_msg=name)
+
+
+# ---- there and back
+
+
+def test_the_eyes_survive_being_stored(simulated, project):
+    names = [f"{simulated}/datasets/train_classifier/{name}" for name in ("weights.safetensors", "calibration.parquet")]
+    found = restore_classifier(*names)
+    store_classifier(Path("again"), params.load(TrainClassifier, "train_classifier"), found)
+    for name in names:
+        assert Path("again", Path(name).name).read_bytes() == Path(name).read_bytes()
+    images = np.random.default_rng(1).integers(0, 256, (5, 16, 48), np.uint8)
+    once, twice = (
+        eyes.see(one, images, np.full(5, 210.0))
+        for one in (found, restore_classifier("again/weights.safetensors", "again/calibration.parquet"))
+    )
+    for a, b in zip(once, twice, strict=True):
+        np.testing.assert_array_equal(a, b)
+    np.testing.assert_allclose(once[0].sum(axis=1), 1, atol=1e-12)  # double precision
+
+
+def test_window_tables_survive_being_written(simulated, tmp_path):
+    made = {part: synthetic_table(np.random.default_rng(k), segments=3, windows=2) for k, part in enumerate(("learn", "judge"))}
+    artifacts.write_table(tmp_path / "windows.parquet", WINDOWS, window_rows(made))
+    found = window_tables(artifacts.read_table(tmp_path / "windows.parquet", WINDOWS))
+    for part, one in made.items():
+        for name, a, b in zip(WindowTable._fields, one, found[part], strict=True):
+            np.testing.assert_array_equal(a, b, err_msg=name)
+    columns = artifacts.read_table(simulated / "datasets/train_classifier/windows.parquet", WINDOWS)
+    again = window_rows(window_tables(columns))
+    for name, values in columns.items():
+        np.testing.assert_array_equal(again[name], values, err_msg=name)
+
+
+def test_bins_of_the_flow_by_hand():
+    # no bin without a window in any set: [20, 30) .. [60, 70) are one, 100 and 105 are two, and what lies above the last stays with it
+    np.testing.assert_array_equal(edges([np.array([60.0, 100.0, 106.0]), np.array([25.0, 101.0, 140.0])]), [20.0, 70.0, 102.5, 310.0])
+    # one set has nothing above the other's: one bin
+    np.testing.assert_array_equal(edges([np.array([15.0]), np.array([320.0])]), [15.0, 320.0])
+
+
+def test_agents_survive_being_stored(project, tmp_path):
+    import jax
+
+    from pipeline.setpoint.agent import QNetwork
+    from pipeline.setpoint.belief_agent import BeliefNetwork
+
+    p = params.load(TrainAgent, "train_agent")
+    sees = train_agent.belief(p.ours, synthetic_table(np.random.default_rng(0), segments=3, windows=2))
+    keys = jax.random.split(jax.random.key(3), 5)
+    networks = tuple(QNetwork(key) for key in keys[:4])
+    ours = BeliefNetwork(sees.filter.evidence.shape[0], keys[4])
+    store_agents(tmp_path / "a.safetensors", Agents(networks, sees, ours))
+    found = restore_agents(str(tmp_path / "a.safetensors"))
+    for made, again in zip((*networks, sees, ours), (*found.paper, found.belief, found.ours), strict=True):
+        leaves = [jax.tree.leaves(one) for one in (made, again)]
+        assert len(leaves[0]) == len(leaves[1]) > 0
+        for a, b in zip(*leaves, strict=True):
+            np.testing.assert_array_equal(np.asarray(a, np.float32), np.asarray(b))
+
+
+# ---- weights and tables that are not what they should be
+
+
+def test_damaged_or_foreign_weights_are_refused_by_name(stored, capsys):
+    path = Path("datasets/train_classifier/weights.safetensors")
+    whole = path.read_bytes()
+    for spoilt in (b"", whole[:100], whole[: len(whole) // 2]):
+        path.write_bytes(spoilt)
+        said = refusal("evaluate_setpoint", capsys)
+        assert f"{path} holds no whole weights" in said
+        assert "make it again with ./run dvc repro train_classifier" in said
+    path.write_bytes(whole)
+    arrays, _ = read_weights(path, CLASSIFIER_SCHEMA)
+    write_weights(path, CLASSIFIER_SCHEMA, arrays, {"size": "paper"})
+    assert f"{path}: weights of another architecture: " in refusal("evaluate_setpoint", capsys)
+    write_weights(path, CLASSIFIER_SCHEMA, arrays, {"size": "huge"})
+    assert f"{path} should say its size, small or paper, but says huge" in refusal("evaluate_setpoint", capsys)
+    write_weights(path, "agents 1", arrays, {"size": "small"})
+    assert f"{path} should hold weights of classifier 1 but has schema agents 1" in refusal("evaluate_setpoint", capsys)
+    path.unlink()
+    assert f"{path} is missing" in refusal("evaluate_setpoint", capsys)
+
+
+def test_damaged_windows_are_refused_by_name(stored, capsys):
+    path = Path("datasets/train_classifier/windows.parquet")
+    path.write_bytes(path.read_bytes()[:500])
+    assert f"{path} is not a whole Parquet file" in refusal("train_agent", capsys)
+    path.unlink()
+    assert f"{path} is missing; make it again with ./run dvc repro train_classifier" in refusal("train_agent", capsys)
+
+
+# ---- a user's folder
+
+PRINTS = 12
+SHARES = {"learned": 4, "held_out": 2, "calibration": 3, "judged": 3}
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory) -> Path:
+    return folder(tmp_path_factory.mktemp("frames") / "setpoint", PRINTS)
+
+
+@pytest.fixture
+def users(frames, tmp_path, monkeypatch) -> Path:
+    """A project with a user's folder, whose images are elsewhere; returns the folder. What is cut in one test is known in the next."""
+    monkeypatch.chdir(begun(tmp_path / "project", source="recordings", prints=SHARES))
+    place, memo = Path("datasets/raw/setpoint"), frames.parent / "memo"
+    place.mkdir(parents=True)
+    memo.mkdir(exist_ok=True)
+    Path("datasets/memo").symlink_to(memo)
+    shutil.copy(frames / "log.csv", place)
+    for k in range(PRINTS):
+        (place / f"print{k}").symlink_to(frames / f"print{k}")
+    return place
+
+
+@pytest.mark.slow
+def test_on_a_user_s_folder_every_artifact_is_written_and_no_print_is_in_two_parts(users):
+    stage("train_classifier")
+    figures = check_classifier("recordings")
+    assert figures["data"]["frames"] == 3 * SHOTS * PRINTS
+    assert figures["data"]["prints"] == PRINTS
+    assert figures["data"]["valid"] + sum(figures["data"]["rejected"].values()) == figures["data"]["frames"]
+    first = artifacts.sha256("datasets/train_classifier"), artifacts.sha256("reports")
+    p = params.load(TrainClassifier, "train_classifier")
+    found, _ = parts.parts(p, "datasets/raw/setpoint", params.load(Execution, "execution"))
+    prints = [set(part.print_number.tolist()) for part in found.values()]
+    assert sum(map(len, prints)) == len(set.union(*prints)) == PRINTS
+    for path in Path("datasets/memo").rglob("*.safetensors"):
+        path.unlink()
+    stage("train_classifier")
+    assert (artifacts.sha256("datasets/train_classifier"), artifacts.sha256("reports")) == first
+
+
+def lines(count: int = PRINTS, **changes) -> list[dict[str, str]]:
+    return [dict(row, **changes) for row in rows(PRINTS)[: 3 * SHOTS * count]]
+
+
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        (lambda: lines(1), "no honest split: expected valid frames of at least 2 prints"),
+        (lambda: lines(print_id="a", timestamp=""), "no honest split: expected valid frames of at least 2 prints"),
+        (lambda: lines(2), "datasets/raw/setpoint: 2 segments do not let each of 4 parts hold every class"),
+        (lambda: lines(6), "expected at least 3 stretches of constant settings of class 0"),
+        (lambda: lines(flow_rate="100"), "expected valid frames of every class, found none of class 0"),
+        (lambda: [dict(row, flow_rate=str(float(row["flow_rate"]) / 100)) for row in lines()], "or write flow_rate in percent"),
+        (lambda: lines(flow_rate_class="3"), "log.csv: line 2: expected flow_rate_class within 0 and 2"),
+        (lambda: [dict(row, img_path=f"gone/{k}.png") for k, row in enumerate(lines())], "the image is missing, the first line 2, gone/0.png"),
+        (lambda: lines(nozzle_tip_x="400"), "inside the frame of 350 x 350 px but found (400, "),
+    ],
+    ids=["one print", "one name for all prints", "two prints", "few prints", "one class", "shares for percent", "a label outside", "missing images", "a tip outside"],
+)  # fmt: skip
+def test_a_folder_that_cannot_be_learned_from_is_refused_before_training(users, capsys, made, said):
+    table(users / "log.csv", made())
+    assert said in refusal("train_classifier", capsys)
+    assert not list(Path("datasets/memo").rglob("*.safetensors"))
+
+
+def test_frames_that_are_too_small_are_refused(users, capsys):
+    for row in lines():
+        small = cv2.imread(str(users / row["img_path"]), cv2.IMREAD_GRAYSCALE)[150:200, 150:200]
+        cv2.imwrite(str(users / row["img_path"].replace("/", "-")), small)
+    table(users / "log.csv", [dict(row, img_path=row["img_path"].replace("/", "-")) for row in lines()])
+    assert "expected at least 64 x 64 px but found 50 x 50" in refusal("train_classifier", capsys)
+
+
+def test_more_than_the_prints_can_promise_is_refused_with_what_would_do(users, capsys):
+    declare({"train_classifier.coverage": 0.95})
+    said = refusal("train_classifier", capsys)
+    assert "log(1 - confidence) / log(coverage) = 16 prints to calibrate with, found 3; add prints" in said
+    declare({"train_classifier.coverage": 0.6, "train_classifier.window": 20})
+    assert "expected 20 frames in a row at one class in the frames for judged, found none" in refusal("train_classifier", capsys)
+    assert not list(Path("datasets/memo").rglob("*.safetensors"))
+
+
+# ---- the whole loop
+
+
+def check_agents() -> None:
+    course = artifacts.read_table("datasets/train_agent/agents.parquet", AGENT_COURSE)
+    assert {"paper", "ours"} == set(course["agent"])
+    figures = artifacts.read_metrics("train_agent")
+    assert 0 <= figures["phase3"]["settled"] <= 100
+
+
+def check_judgement() -> None:
+    out = Path("datasets/evaluate_setpoint")
+    board = artifacts.read_table(out / "scoreboard.parquet", SCOREBOARD)
+    assert {"paper", "recorded", "pixels"} == set(board["simulator"])
+    for name, schema in (("paths", PATHS), ("decisions", DECISIONS)):
+        assert len(artifacts.read_table(out / f"{name}.parquet", schema)["step"])
+    figures = artifacts.read_metrics("evaluate_setpoint")
+    assert figures["default"] == json.loads((out / "choice.json").read_text())["name"]
+    assert figures["default"] in set(board["controller"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("source", ["simulated", "recordings"])
+def test_the_whole_loop_runs_and_repeats_to_the_byte(source, frames, tmp_path, monkeypatch):
+    changes = {"prints": SHARES} if source == "recordings" else {}
+    monkeypatch.chdir(begun(tmp_path / "project", source=source, **changes))
+    shutil.copytree(frames, "datasets/raw/setpoint")
+    found = []
+    for _ in range(2):
+        for name in ("train_classifier", "train_agent", "evaluate_setpoint"):
+            stage(name)
+        check_classifier(source)
+        check_agents()
+        check_judgement()
+        found.append(
+            [artifacts.sha256(f"datasets/{name}") for name in ("train_classifier", "train_agent", "evaluate_setpoint")]
+            + [artifacts.sha256("reports")]
+        )
+    assert found[0] == found[1]

@@ -1,0 +1,304 @@
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import joblib
+import numpy as np
+import pytest
+
+from pipeline.store import artifacts, params
+from pipeline.store.execution import run_all
+from pipeline.temperature import study
+from pipeline.temperature.workflow import ingest
+from pipeline.temperature.workflow.ingest import Job, collect, process
+from pipeline.temperature.workflow.settings import Plant
+from tests.cluster import Cluster
+
+MACHINE = Plant.model_validate(
+    {
+        "sample_time_s": 1.0,
+        "inputs": [{"name": "heater", "unit": "percent", "low": 0.0, "high": 100.0}],
+        "outputs": [{"name": "zone", "unit": "degC", "reference": 50.0}],
+    }
+)
+JOB = Job(MACHINE, {}, "", 5.0)
+INLINE = params.Execution(backend="loky", jobs=1, scheduler="")
+LOKY = params.Execution(backend="loky", jobs=2, scheduler="")
+NAMES = ("record.parquet", "quality.parquet", "metrics.json")
+
+
+def recording(path: Path, seed: int, samples: int = 120) -> Path:
+    """A heater that is switched now and then, and the zone that follows it, with noise."""
+    rng = np.random.default_rng(seed)
+    heater = np.repeat(rng.choice([20.0, 40.0], size=-(-samples // 15)), 15)[:samples]
+    zone = 20 + np.convolve(heater, 0.02 * 0.95 ** np.arange(samples))[:samples] + 0.05 * rng.standard_normal(samples)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    artifacts.write_csv(path, {"time_s": np.arange(samples, dtype=float), "heater": heater, "zone": zone})
+    return path
+
+
+def folder(root: Path, count: int) -> Path:
+    for k in range(count):
+        recording(root / "raw" / f"{k:03d}.csv", seed=k)
+    return root / "raw"
+
+
+def ingested(raw: Path, out: Path, execution=INLINE, job=JOB, memo: Path | None = None, strict: bool = False) -> dict:
+    """What the stage does with a folder; the tables land in `out` for a look at their bytes."""
+    record, quality, metrics = collect(process(raw, job, execution, memo=memo or out / "memo"), MACHINE, strict=strict)
+    artifacts.write_table(out / "record.parquet", record.schema, record.columns)
+    artifacts.write_table(out / "quality.parquet", quality.schema, quality.columns)
+    artifacts.write_json(out / "metrics.json", metrics)
+    return metrics
+
+
+def tables(out: Path) -> list[bytes]:
+    return [(out / name).read_bytes() for name in NAMES[:2]]
+
+
+def done(metrics: dict) -> tuple[int, int, int]:
+    return metrics["processed"], metrics["reused"], metrics["quarantined"]
+
+
+# ---- the memo
+
+
+def test_one_recording_more_among_a_hundred_costs_one(tmp_path):
+    raw = folder(tmp_path, 100)
+    assert done(ingested(raw, tmp_path / "a")) == (100, 0, 0)
+    recording(raw / "new.csv", seed=1000)
+    start = time.perf_counter()
+    assert done(ingested(raw, tmp_path / "b", memo=tmp_path / "a/memo")) == (1, 100, 0)
+    assert time.perf_counter() - start < 8  # the bar on top of the work, which is milliseconds here
+    ingested(raw, tmp_path / "fresh")
+    assert tables(tmp_path / "b") == tables(tmp_path / "fresh")
+
+
+def test_a_changed_recording_parameter_mapping_or_name_is_read_again_and_nothing_else(tmp_path):
+    raw, memo = folder(tmp_path, 3), tmp_path / "memo"
+    ingested(raw, tmp_path, memo=memo)
+    recording(raw / "001.csv", seed=99)
+    assert done(ingested(raw, tmp_path, memo=memo)) == (1, 2, 0)
+    (raw / "002.csv").rename(raw / "other.csv")
+    assert done(ingested(raw, tmp_path, memo=memo)) == (1, 2, 0)
+    assert done(ingested(raw, tmp_path, memo=memo, job=JOB._replace(max_gap_s=7.0))) == (3, 0, 0)
+    turned = JOB._replace(mapping={"zone": ("zone", "degC", 1.0, -0.5)})
+    assert done(ingested(raw, tmp_path, memo=memo, job=turned)) == (3, 0, 0)
+    assert done(ingested(raw, tmp_path, memo=memo)) == (0, 3, 0)
+
+
+def test_changed_code_reads_everything_again(tmp_path, monkeypatch):
+    raw = folder(tmp_path, 2)
+    ingested(raw, tmp_path)
+    code = tmp_path / "code"
+    code.mkdir()
+    (code / "recordings.py").write_text("another version")
+    monkeypatch.setattr(ingest, "CODE", code)
+    assert done(ingested(raw, tmp_path)) == (2, 0, 0)
+
+
+@pytest.mark.parametrize("part", ["record.parquet", "quality.parquet", "json"])
+@pytest.mark.parametrize("damage", ["cut", "flipped", "empty", "gone", "another's"])
+def test_a_damaged_entry_of_the_memo_is_read_again_and_never_trusted(tmp_path, part, damage):
+    raw, memo = folder(tmp_path, 2), tmp_path / "memo"
+    ingested(raw, tmp_path, memo=memo)
+    before = tables(tmp_path)
+    entry, other = sorted(memo.glob(f"*.{part}"))[:2]
+    content = entry.read_bytes()
+    middle = len(content) // 2
+    damaged = {
+        "cut": content[:middle],
+        "flipped": content[:middle] + bytes([content[middle] ^ 4]) + content[middle + 1 :],
+        "empty": b"",
+        "another's": other.read_bytes(),
+    }
+    entry.unlink()
+    if damage in damaged:
+        entry.write_bytes(damaged[damage])
+    # the findings of two such recordings are the same bytes where neither has any
+    same = damage in damaged and damaged[damage] == content
+    assert done(ingested(raw, tmp_path, memo=memo)) == ((0, 2, 0) if same else (1, 1, 0))
+    assert tables(tmp_path) == before
+    assert done(ingested(raw, tmp_path, memo=memo)) == (0, 2, 0)
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from pipeline.store import artifacts
+from tests.temperature.test_ingest import INLINE, JOB, process
+
+write_table, written = artifacts.write_table, []
+
+def killed_in_the_second_entry(path, schema, columns):
+    if len(written) == int(sys.argv[3]):
+        os.kill(os.getpid(), signal.SIGKILL)
+    written.append(path)
+    write_table(path, schema, columns)
+
+artifacts.write_table = killed_in_the_second_entry
+process(Path(sys.argv[1]), JOB, INLINE, memo=Path(sys.argv[2]))
+"""
+
+
+@pytest.mark.parametrize("tables_before", [2, 3])
+def test_a_killed_run_leaves_whole_entries_only_and_they_are_kept(tmp_path, root, tables_before):
+    raw, memo = folder(tmp_path, 3), tmp_path / "memo"
+    ended = subprocess.run([sys.executable, "-c", KILLED, raw, memo, str(tables_before)], cwd=root, check=False)
+    assert ended.returncode == -signal.SIGKILL
+    assert done(ingested(raw, tmp_path / "after", memo=memo)) == (2, 1, 0)
+    ingested(raw, tmp_path / "fresh")
+    assert tables(tmp_path / "after") == tables(tmp_path / "fresh")
+
+
+# ---- quarantine
+
+
+def broken(raw: Path) -> None:
+    (raw / "backwards.csv").write_text("time_s,heater,zone\n0,1,20\n2,1,20\n1,1,20\n")
+    (raw / "lacks.csv").write_text("time_s,heater\n0,1\n1,1\n")
+
+
+def test_broken_recordings_are_quarantined_with_their_reasons_and_the_others_go_on(tmp_path):
+    raw = folder(tmp_path, 3)
+    ingested(raw, tmp_path / "good")
+    broken(raw)
+    assert done(ingested(raw, tmp_path / "all")) == (3, 0, 2)
+    assert tables(tmp_path / "all")[0] == tables(tmp_path / "good")[0]
+    quality = artifacts.read_table(tmp_path / "all/quality.parquet", ingest.tables.QUALITY)
+    reasons = {
+        name: text
+        for name, kind, text in zip(quality["recording"], quality["kind"], quality["message"], strict=True)
+        if kind == "quarantined"
+    }
+    assert set(reasons) == {"backwards.csv", "lacks.csv"}
+    assert "before" in reasons["backwards.csv"]
+    assert "zone" in reasons["lacks.csv"]
+    # what was refused once is refused again, and is no reuse
+    assert done(ingested(raw, tmp_path / "all")) == (0, 3, 2)
+
+
+def test_strict_and_a_folder_of_broken_recordings_alone_end_with_the_first_reason(tmp_path):
+    raw = folder(tmp_path, 1)
+    broken(raw)
+    with pytest.raises(ValueError, match=r"backwards\.csv.*\(2 of 3 recordings are broken\)"):
+        ingested(raw, tmp_path, strict=True)
+    (raw / "000.csv").unlink()
+    with pytest.raises(ValueError, match=r"backwards\.csv.*\(2 of 2 recordings are broken\)"):
+        ingested(raw, tmp_path)
+    with pytest.raises(ValueError, match=r"expected at least one recording \(CSV, Parquet or MCAP\), found none"):
+        ingested(tmp_path / "nothing", tmp_path)
+
+
+def test_a_copy_of_a_recording_is_quarantined_for_it_would_count_twice(tmp_path):
+    raw = folder(tmp_path, 2)
+    ingested(raw, tmp_path / "before")
+    (raw / "copy.csv").write_bytes((raw / "001.csv").read_bytes())
+    assert done(ingested(raw, tmp_path / "after", memo=tmp_path / "before/memo")) == (0, 2, 1)
+    assert tables(tmp_path / "after")[0] == tables(tmp_path / "before")[0]
+    with pytest.raises(ValueError, match=r"copy\.csv is 001\.csv once more, byte for byte; remove one of the two"):
+        ingested(raw, tmp_path / "after", strict=True)
+
+
+def test_two_devices_in_one_recording_are_quarantined_with_the_place_and_in_a_part_of_it_masked(tmp_path):
+    def mixed(path: Path, start: int) -> None:
+        found = np.genfromtxt(recording(path, seed=1, samples=600), delimiter=",", names=True)
+        zone = np.where((np.arange(600) >= start) & (np.arange(600) % 2 == 0), found["zone"] + 9, found["zone"])
+        artifacts.write_csv(path, {"time_s": found["time_s"], "heater": found["heater"], "zone": zone})
+
+    raw = folder(tmp_path, 1)
+    mixed(raw / "all.csv", 0)
+    mixed(raw / "end.csv", 450)
+    assert done(ingested(raw, tmp_path)) == (2, 0, 1)
+    quality = artifacts.read_table(tmp_path / "quality.parquet", ingest.tables.QUALITY)
+    found = {(str(quality["recording"][i]), str(quality["kind"][i])): str(quality["message"][i]) for i in range(len(quality["kind"]))}
+    assert "from 0 to 599 s, masked: two devices seem to write under one name" in found["all.csv", "quarantined"]
+    assert "to 599 s, masked: two devices" in found["end.csv", "mixed"]
+    record = artifacts.read_table(tmp_path / "record.parquet", ingest.tables.record(MACHINE.inputs, MACHINE.outputs))
+    masked = record["zone_masked"][record["recording"] == "end.csv"]
+    assert masked[-150:].all()
+    assert not masked[:400].any()
+
+
+def test_a_mapping_that_names_no_signal_gives_the_nearest_names(tmp_path):
+    with pytest.raises(ValueError, match=r"ingest\.mapping\.zoone is no signal of the plant; the nearest names are zone"):
+        ingested(folder(tmp_path, 1), tmp_path, job=JOB._replace(mapping={"zoone": ("zone", "degC", 1.0, 0.0)}))
+
+
+# ---- more than one process
+
+
+def test_two_workers_of_this_machine_give_the_bytes_of_one(tmp_path):
+    raw = folder(tmp_path, 6)
+    broken(raw)
+    ingested(raw, tmp_path / "one", INLINE)
+    ingested(raw, tmp_path / "two", LOKY)
+    for name in NAMES:
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory):
+    made = Cluster(tmp_path_factory.mktemp("cluster"))
+    yield made
+    made.stop()
+
+
+def test_a_dask_cluster_of_two_workers_gives_the_bytes_of_one_machine(tmp_path, cluster, monkeypatch):
+    raw = folder(tmp_path, 6)
+    broken(raw)
+    monkeypatch.chdir(tmp_path)  # as the stage names them: relative paths
+    ingested(Path("raw"), Path("one"))
+    ingested(Path("raw"), Path("cluster"), params.Execution(backend="dask", jobs=2, scheduler=cluster.address))
+    for name in NAMES:
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "cluster" / name).read_bytes()
+
+
+def test_what_the_cluster_computes_for_a_stage_is_what_this_machine_computes(cluster):
+    """The judging of learners on noisy data sets, as evaluate_temperature spreads it."""
+    rng = np.random.default_rng(0)
+    sets_u, sets_y = study.data_sets(rng, 1500, 2)
+    calls = [joblib.delayed(study.under_noise)(sets_u[:, i], sets_y[:, i], noise=0.01, seed=i, longest=6) for i in range(2)]
+    here = list(run_all(calls, INLINE))
+    assert list(run_all(calls, params.Execution(backend="dask", jobs=2, scheduler=cluster.address))) == here
+    assert len(here) == 2
+
+
+KILLER = """
+import os, sys, time
+
+while not os.listdir(sys.argv[1]):
+    time.sleep(0.001)
+os.kill(int(sys.argv[2]), 9)
+print(sum(name.endswith(".json") for name in os.listdir(sys.argv[1])))
+"""
+
+
+def test_a_worker_killed_at_its_work_costs_nothing_but_time(tmp_path, cluster):
+    raw = tmp_path / "raw"
+    for k in range(6):
+        recording(raw / f"{k:02d}.csv", seed=k, samples=10_000)
+    ingested(raw, tmp_path / "one")
+    # the second worker is killed as soon as anything is in the memo, with most of the work before it
+    memo = tmp_path / "cluster/memo"
+    memo.mkdir(parents=True)
+    killer = subprocess.Popen([sys.executable, "-c", KILLER, memo, str(cluster.workers[1].pid)], stdout=subprocess.PIPE)
+    ingested(raw, tmp_path / "cluster", params.Execution(backend="dask", jobs=2, scheduler=cluster.address))
+    assert int(killer.communicate(timeout=60)[0]) < 6  # entries that were whole when it died: there was work left
+    cluster.workers[1].join(timeout=60)
+    assert cluster.workers[1].exitcode == -signal.SIGKILL
+    assert cluster.workers[0].is_alive()
+    for name in NAMES:
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "cluster" / name).read_bytes()
+    assert json.loads((tmp_path / "cluster/metrics.json").read_text())["processed"] == 6
+
+
+@pytest.mark.slow  # waits the 20 s that a scheduler is given
+def test_no_scheduler_at_the_address_is_one_sentence(tmp_path):
+    with pytest.raises(
+        ValueError, match=r"execution\.scheduler: expected a dask scheduler with a worker at tcp://127\.0\.0\.1:9, found none"
+    ):
+        ingested(folder(tmp_path, 2), tmp_path, params.Execution(backend="dask", jobs=2, scheduler="tcp://127.0.0.1:9"))
