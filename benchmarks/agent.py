@@ -1,8 +1,11 @@
-"""The agents over training seeds, each judged on windows that nothing was fitted to, and the speed of training beside stable-baselines3's.
+"""The agents over training seeds, each judged on windows that nothing was fitted to, and the speed of
+training beside stable-baselines3's.
 
-`./run python -m benchmarks.agent 5 100` trains with seeds 0 .. 4 by the numbers of params.expert.yaml, judges 21 starts x 100 runs in every case, prints every seed and the
-worst, and writes benchmarks/results/agent.json. A third argument is the python of an environment with stable-baselines3 and a CPU build of torch, which then trains
-a DQN of the same sizes in the same run. Recorded windows are synthetic ones: drawn with one generator to learn from, with another to judge on.
+`./run python -m benchmarks.agent 5 100` trains with seeds 0 .. 4 by the numbers of params.expert.yaml, judges
+21 starts x 100 runs in every case, prints every seed and the worst, and writes benchmarks/results/agent.json.
+A third argument is the python of an environment with stable-baselines3 and a CPU build of torch, which then
+trains a DQN of the same sizes in the same run. Recorded windows are synthetic ones: drawn with one generator
+to learn from, with another to judge on.
 """
 
 import json
@@ -32,11 +35,15 @@ UPDATES = 500  # of each timing
 
 def figures(score: Score) -> dict[str, float]:
     shares = {name: round(getattr(score, name).percent, 2) for name in ("settled", "stay", "recovered")}
-    return shares | {name: round(getattr(score, name), 2) for name in ("median_steps", "p90_steps", "overshoot_p95", "flow_error")}
+    return shares | {
+        name: round(getattr(score, name), 2)
+        for name in ("median_steps", "p90_steps", "overshoot_p95", "flow_error")
+    }
 
 
 def one_seed(p: TrainAgent, runs: int, segment: float) -> dict[str, Any]:
-    """Figures of the paper's agent after phases 3 and 4 and of ours in every case, ours from 30 %, 190 °C too, and the seconds and CPU seconds of training both."""
+    """Figures of the paper's agent after phases 3 and 4 and of ours in every case, ours from 30 %, 190 °C
+    too, and the seconds and CPU seconds of training both."""
     learn, judge = (synthetic_table(np.random.default_rng(seed), segments=40, windows=10) for seed in (1, 99))
     wall, cpu = time.perf_counter(), time.process_time()
     done = train_agent.taught(p, learn)
@@ -45,7 +52,10 @@ def one_seed(p: TrainAgent, runs: int, segment: float) -> dict[str, Any]:
         "train_cpu_s": round(time.process_time() - cpu, 1),
         "kept_round": done.kept,
     }
-    paper, ours = agent.greedy(agent.paper_sight()), agent.greedy(belief_agent.belief_sight(done.agents.belief))
+    paper, ours = (
+        agent.greedy(agent.paper_sight()),
+        agent.greedy(belief_agent.belief_sight(done.agents.belief)),
+    )
     before = belief_agent.BeliefNetwork(done.agents.belief.filter.evidence.shape[0], jax.random.key(0))
     seats = {
         "phases 1-3": (paper, done.agents.paper[2]),
@@ -55,24 +65,40 @@ def one_seed(p: TrainAgent, runs: int, segment: float) -> dict[str, Any]:
     }
     cases = judging.cases(recorded_windows(judge), runs=runs, segment=segment)
     for name, (controller, network) in seats.items():
-        row[name] = {case: figures(judging.evaluate(controller, network, *of, jax.random.key(1000 + p.seed))) for case, of in cases.items()}
+        row[name] = {
+            case: figures(judging.evaluate(controller, network, *of, jax.random.key(1000 + p.seed)))
+            for case, of in cases.items()
+        }
     windows, conditions = cases["accuracy 0.7"]
-    coldest = jax.tree.map(lambda leaf: leaf[(conditions.flow == 30.0) & (conditions.temperature == 190.0)], conditions)
-    row["ours from 30 %, 190 °C"] = figures(judging.evaluate(ours, done.agents.ours, windows, coldest, jax.random.key(2000 + p.seed)))
+    coldest = jax.tree.map(
+        lambda leaf: leaf[(conditions.flow == 30.0) & (conditions.temperature == 190.0)], conditions
+    )
+    row["ours from 30 %, 190 °C"] = figures(
+        judging.evaluate(ours, done.agents.ours, windows, coldest, jax.random.key(2000 + p.seed))
+    )
     return row
 
 
 def speeds(p: Paper) -> dict[str, Any]:
-    """Updates of the whole loop, rollout steps with 1,024 environments, and milliseconds of one action; compiling is not counted. Beside them the matrix products that
-    an update cannot do without, alone: on a machine that others use too, the ratio is what can be compared."""
+    """Updates of the whole loop, rollout steps with 1,024 environments, and milliseconds of one action;
+    compiling is not counted. Beside them the matrix products that an update cannot do without, alone: on a
+    machine that others use too, the ratio is what can be compared."""
     network, optimiser, sight = agent.QNetwork(jax.random.key(0)), optax.adam(1e-4), agent.paper_sight()
     a, b = (jnp.asarray(x) for x in (40.0, 20.0))
     world = agent.World(
-        paper_windows(), jax.tree_util.Partial(agent.anywhere, jnp.asarray(1.0)), jax.tree_util.Partial(agent.ellipse, a, b)
+        paper_windows(),
+        jax.tree_util.Partial(agent.anywhere, jnp.asarray(1.0)),
+        jax.tree_util.Partial(agent.ellipse, a, b),
     )
     learner, controller = agent.Learner(network, network, optimiser.init(network)), agent.greedy(sight)
     conditions = jax.tree.map(lambda leaf: leaf[:1024], judging.starts(49, accuracy=1.0))
-    keywords = {"sight": sight, "world": world, "optimiser": optimiser, "bootstrap": agent.greatest, "setting": train_agent.setting(p)}
+    keywords = {
+        "sight": sight,
+        "world": world,
+        "optimiser": optimiser,
+        "bootstrap": agent.greatest,
+        "setting": train_agent.setting(p),
+    }
     act = jax.jit(lambda memory, seen: controller.act(network, memory, seen, None))
     seen = agent.begin(paper_windows(), jax.tree.map(lambda leaf: leaf[0], conditions), jax.random.key(0))[1]
     products, flop = update_products(p.batch)
@@ -84,32 +110,46 @@ def speeds(p: Paper) -> dict[str, Any]:
         return action
 
     work = {
-        "update": (lambda: agent.phase(learner, jax.random.key(0), updates=UPDATES, longest=UPDATES, epsilon=(1.0, 0.05), **keywords), UPDATES),
+        "update": (lambda: agent.phase(learner, jax.random.key(0), updates=UPDATES, longest=UPDATES,
+        epsilon=(1.0, 0.05), **keywords), UPDATES),
         "products": (products, UPDATES),
-        "rollout_step": (lambda: rollout(controller, network, paper_windows(), conditions, jax.random.key(0), steps=200).flow, 1024 * 200),
+        "rollout_step": (lambda: rollout(controller, network, paper_windows(), conditions, jax.random.key(0),
+        steps=200).flow, 1024 * 200),
         "action": (acting, UPDATES),
     }  # fmt: skip
     taken = {name: seconds(f) / n for name, (f, n) in work.items()}
     wall, cpu = ({name: both[i] for name, both in taken.items()} for i in (0, 1))
     return {
-        "updates_per_s": 1 / wall["update"], "updates_per_cpu_s": 1 / cpu["update"], "environment_steps_per_s": p.environments / wall["update"],
-        "update_gflop": flop / 1e9, "products_alone_per_s": 1 / wall["products"], "products_alone_per_cpu_s": 1 / cpu["products"],
-        "update_by_products_wall": wall["update"] / wall["products"], "update_by_products_cpu": cpu["update"] / cpu["products"],
-        "rollout_steps_per_s": 1 / wall["rollout_step"], "rollout_steps_per_cpu_s": 1 / cpu["rollout_step"], "action_ms": 1e3 * wall["action"], "action_cpu_ms": 1e3 * cpu["action"],
+        "updates_per_s": 1 / wall["update"], "updates_per_cpu_s": 1 / cpu["update"],
+        "environment_steps_per_s": p.environments / wall["update"],
+        "update_gflop": flop / 1e9, "products_alone_per_s": 1 / wall["products"],
+        "products_alone_per_cpu_s": 1 / cpu["products"],
+        "update_by_products_wall": wall["update"] / wall["products"],
+        "update_by_products_cpu": cpu["update"] / cpu["products"],
+        "rollout_steps_per_s": 1 / wall["rollout_step"], "rollout_steps_per_cpu_s": 1 / cpu["rollout_step"],
+        "action_ms": 1e3 * wall["action"], "action_cpu_ms": 1e3 * cpu["action"],
     }  # fmt: skip
 
 
 def update_products(batch: int):
-    """The products of one update with nothing between them, UPDATES times: two networks forward, one backward without the inputs' share -> (work, floating point operations
-    of one update)."""
+    """The products of one update with nothing between them, UPDATES times: two networks forward, one backward
+    without the inputs' share -> (work, floating point operations of one update)."""
     sizes, rng = ((35, 288), (288, 128), (128, 10)), np.random.default_rng(0)
-    made = [[jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in ((batch, m), (m, n), (batch, n))] for m, n in sizes]
+    made = [
+        [jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in ((batch, m), (m, n), (batch, n))]
+        for m, n in sizes
+    ]
 
     def one(c, _):
         total = 0.0
         for i, (x, W, y) in enumerate(made):
             W = W + 1e-20 * c  # so that no step can be left out
-            total += (x @ W)[0, 0] + ((x + c) @ W)[0, 0] + (x.T @ (y + c))[0, 0] + (((y - c) @ W.T)[0, 0] if i else 0.0)
+            total += (
+                (x @ W)[0, 0]
+                + ((x + c) @ W)[0, 0]
+                + (x.T @ (y + c))[0, 0]
+                + (((y - c) @ W.T)[0, 0] if i else 0.0)
+            )
         return 1e-20 * total, None
 
     loop = jax.jit(lambda: jax.lax.scan(one, jnp.float32(0.0), None, length=UPDATES)[0])
@@ -127,12 +167,22 @@ def seconds(work) -> np.ndarray:
 
 
 def peer(python: str | None, ours: dict[str, Any]) -> dict[str, Any]:
-    """stable-baselines3's updates a second and a CPU second, of its whole loop and of its updates alone, and how often ours fit into them."""
+    """stable-baselines3's updates a second and a CPU second, of its whole loop and of its
+    updates alone, and how often ours fit into them."""
     if python is None or not Path(python).exists():
-        return {"skipped": "no python of an environment with stable-baselines3 and a CPU build of torch was named"}
+        return {
+            "skipped": "no python of an environment with stable-baselines3 and a CPU build of torch was named"
+        }
     done = subprocess.run([python, str(PEER), str(UPDATES)], capture_output=True, text=True, check=True)
-    found = {name: [float(x) for x in np.median(values, axis=0)] for name, values in json.loads(done.stdout.splitlines()[-1]).items()}
-    found = {f"{name}_per_{unit}": value for name, pair in found.items() for unit, value in zip(("s", "cpu_s"), pair, strict=True)}
+    found = {
+        name: [float(x) for x in np.median(values, axis=0)]
+        for name, values in json.loads(done.stdout.splitlines()[-1]).items()
+    }
+    found = {
+        f"{name}_per_{unit}": value
+        for name, pair in found.items()
+        for unit, value in zip(("s", "cpu_s"), pair, strict=True)
+    }
     return found | {
         f"ratio_{name}_{unit}": ours[f"updates_per_{unit}"] / found[f"{name}_per_{unit}"] for name in ("whole_loop", "updates_alone") for unit in ("s", "cpu_s")
     }  # fmt: skip

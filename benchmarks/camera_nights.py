@@ -1,6 +1,8 @@
-"""Nights of the camera that rides with the nozzle: a trial a night, recorded as MCAP, held against six trials of the champion; first nothing changes, then the camera, ink or light.
+"""Nights of the camera that rides with the nozzle: a trial a night, recorded as MCAP, held against six trials
+of the champion; first nothing changes, then the camera, ink or light.
 
-`nice ./run python -m benchmarks.camera_nights --seed 1` prints the figures and adds them to benchmarks/results/nights.json.
+`nice ./run python -m benchmarks.camera_nights --seed 1` prints the
+figures and adds them to benchmarks/results/nights.json.
 """
 
 import argparse
@@ -25,14 +27,23 @@ def filmed(path: Path, seed: int, **changes) -> None:
     """A trial of one and a half seconds under a camera whose scene is changed so."""
     rng, scene = np.random.default_rng(seed), rendering.NOMINAL._replace(**changes)
     camera, time_s = rendering.Camera(scene, rng), 0.02 * np.arange(76)
-    frames = ((k / 30, camera.frame(float(rng.uniform(100, 116)), stage_px=int(rng.integers(10_000)))) for k in range(45))
-    signals = {"position_mm": 8 * time_s, "speed_mm_per_s": np.full(76, 8.0), "command_mm": np.ones(76), "flow_mm3_per_s": np.ones(76)}
+    frames = (
+        (k / 30, camera.frame(float(rng.uniform(100, 116)), stage_px=int(rng.integers(10_000))))
+        for k in range(45)
+    )
+    signals = {
+        "position_mm": 8 * time_s,
+        "speed_mm_per_s": np.full(76, 8.0),
+        "command_mm": np.ones(76),
+        "flow_mm3_per_s": np.ones(76),
+    }
     said = trial_files.Conditions("A", "0.8 mm", 0, "ours", 8.0, 0.6, 0.304, 125.0, 0.0, 90.0, -0.008, 30.0)
     trial_files.write_trial(path, said, frames, encoding="jpeg", time_s=time_s, **signals)
 
 
 def camera(seed: int, count: int, folder: Path) -> dict:
-    """A trial a night before a camera that stays as it is, `count` nights, and before one that was moved, or sees other ink or light: held against six trials of the champion."""
+    """A trial a night before a camera that stays as it is, `count` nights, and before one that was moved, or
+    sees other ink or light: held against six trials of the champion."""
     limits, nominal = Drift(**SETTINGS["drift"]), rendering.NOMINAL
     for k in range(6):
         filmed(folder / f"champion/trial_{k}.mcap", 1000 * seed + k)
@@ -52,8 +63,12 @@ def camera(seed: int, count: int, folder: Path) -> dict:
         false += [one["cause"] for one in found["alarms"]]
     result = {"nights": count, "false_alarms": len(false), "alarms": false}
     for name, changes in {
-        "camera 4 px lower": {"offset_px": nominal.offset_px + 4}, "camera 4 px higher": {"offset_px": nominal.offset_px - 4}, "camera tilted by 0.5 degrees": {"tilt_deg": nominal.tilt_deg + 0.5},
-        "ink of 70 % contrast": {"contrast": 0.7 * nominal.contrast, "specular": 0.7 * nominal.specular}, "light 25 % brighter": {"background": 1.25 * nominal.background, "contrast": 1.25 * nominal.contrast, "specular": 1.25 * nominal.specular},
+        "camera 4 px lower": {"offset_px": nominal.offset_px + 4},
+        "camera 4 px higher": {"offset_px": nominal.offset_px - 4},
+        "camera tilted by 0.5 degrees": {"tilt_deg": nominal.tilt_deg + 0.5},
+        "ink of 70 % contrast": {"contrast": 0.7 * nominal.contrast, "specular": 0.7 * nominal.specular},
+        "light 25 % brighter": {"background": 1.25 * nominal.background, "contrast": 1.25 * nominal.contrast,
+        "specular": 1.25 * nominal.specular},
         "out of focus": {"blur_px": 4.0},
     }.items():  # fmt: skip
         nights, found, pending = 0, {"alarms": []}, set()
@@ -61,7 +76,10 @@ def camera(seed: int, count: int, folder: Path) -> dict:
             nights += 1
             found = look(f"{name} {nights}", pending, **changes)
             pending = {one["key"] for one in found["watched"]}
-        result[name] = {"nights": nights if found["alarms"] else None, "causes": [one["cause"] for one in found["alarms"]]}
+        result[name] = {
+            "nights": nights if found["alarms"] else None,
+            "causes": [one["cause"] for one in found["alarms"]],
+        }
         print(f"  {name}: {result[name]}", flush=True)
     return result
 

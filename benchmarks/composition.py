@@ -1,8 +1,11 @@
-"""Composition without learning again, on plants of the family: every error is of the true flow under commands made from measured, noisy trials of the training routine.
+"""Composition without learning again, on plants of the family: every error is of the true flow under commands
+made from measured, noisy trials of the training routine.
 
-`./run python -m benchmarks.composition` prints the tables with their bars and writes benchmarks/results/composition.json; `... composition 4 1` takes 4 plants a
-material and one seed. Training: two speeds, two pauses, 20 updates by our law. Errors are r.m.s. in % of on-off control r / K_nominal on the same structure, over
-plants and seeds as median and worst. The yardstick is learning the whole structure with the same law and as many trials. Times are CPU seconds.
+`./run python -m benchmarks.composition` prints the tables with their bars and writes
+benchmarks/results/composition.json; `... composition 4 1` takes 4 plants a material and one seed. Training:
+two speeds, two pauses, 20 updates by our law. Errors are r.m.s. in % of on-off control r / K_nominal on the
+same structure, over plants and seeds as median and worst. The yardstick is learning the whole structure with
+the same law and as many trials. Times are CPU seconds.
 """
 
 import json
@@ -28,10 +31,38 @@ MATERIALS = {"A": Extruder(1.08, 2.7), "B": Extruder(0.89, 4.5)}
 SPEEDS, PAUSES, UPDATES = (8.0, 5.0), (0.6, 0.3), 20
 NOISE = {"white": 0.03, "drift": 0.01, "gain": 0.01}
 LAW = {"identify_trials": 3, "floor": 0.1, "order": 4, "cutoff_hz": 5.0}
-MACHINE = {"acceleration": 1000.0, "junction_deviation_mm": 0.05, "speed_limit": 100.0, "unset_feed": 8.0, "tool_change_s": 2.0}
-PART = {"nozzle_mm": NOZZLE, "bead_area_mm2": AREA, "ramp_s": RAMP, "corner_deg": 30.0, "longest_pause_s": 1.0}
-BARS = {"tic_tac_toe": (3.0, 5.0), "dashes": (6.0, 6.0), "pause_0.2": (4.0, 5.0), "speed_0.5x": (6.0, None), "speed_1.5x": (6.0, None)}
-FIG_9 = ["No-Flow", "Start", "Steady-State", "Corner", "Steady-State", "Corner", "Steady-State", "Stop", "No-Flow"]
+MACHINE = {
+    "acceleration": 1000.0,
+    "junction_deviation_mm": 0.05,
+    "speed_limit": 100.0,
+    "unset_feed": 8.0,
+    "tool_change_s": 2.0,
+}
+PART = {
+    "nozzle_mm": NOZZLE,
+    "bead_area_mm2": AREA,
+    "ramp_s": RAMP,
+    "corner_deg": 30.0,
+    "longest_pause_s": 1.0,
+}
+BARS = {
+    "tic_tac_toe": (3.0, 5.0),
+    "dashes": (6.0, 6.0),
+    "pause_0.2": (4.0, 5.0),
+    "speed_0.5x": (6.0, None),
+    "speed_1.5x": (6.0, None),
+}
+FIG_9 = [
+    "No-Flow",
+    "Start",
+    "Steady-State",
+    "Corner",
+    "Steady-State",
+    "Corner",
+    "Steady-State",
+    "Stop",
+    "No-Flow",
+]
 
 
 # fig. 8 within a material; Dwell stands for the switch of the system
@@ -46,7 +77,8 @@ ALLOWED = {
 
 
 def forbidden(tasks: Sequence[str], tools: Sequence[int]) -> np.ndarray:
-    """The indices (F,) of tasks that may not follow the one before them (fig. 8): another tool comes only by Dwell, Steady-State never goes to No-Flow."""
+    """The indices (F,) of tasks that may not follow the one before them (fig. 8): another tool comes only by
+    Dwell, Steady-State never goes to No-Flow."""
     tasks, tools = np.asarray(tasks), np.asarray(tools)
     names = np.array(list(ALLOWED))
     table = np.array([[after in ALLOWED[before] for after in names] for before in names])
@@ -72,18 +104,41 @@ def train(plant: Extruder, name: str, rng: np.random.Generator) -> list[Training
     out = []
     for speed in SPEEDS:
         for pause in PAUSES:
-            lesson = routine(off_s=4, on_s=14, pause_s=pause, tail_s=8, speed=speed, bead_area_mm2=AREA, ramp_s=RAMP, sample_time_s=TS)
+            lesson = routine(
+                off_s=4,
+                on_s=14,
+                pause_s=pause,
+                tail_s=8,
+                speed=speed,
+                bead_area_mm2=AREA,
+                ramp_s=RAMP,
+                sample_time_s=TS,
+            )
             trials = learned_trials(plant, MATERIALS[name], lesson.r, rng)
-            out.append(Training(name, NOZZLE, lesson, np.array([t.u for t in trials]), np.array([t.y for t in trials])))
+            out.append(
+                Training(
+                    name, NOZZLE, lesson, np.array([t.u for t in trials]), np.array([t.y for t in trials])
+                )
+            )
     return out
 
 
 def protocol(speed: float, pause_s: float, ramp_s: float = RAMP) -> np.ndarray:
-    return routine(off_s=4, on_s=6, pause_s=pause_s, tail_s=8, speed=speed, bead_area_mm2=AREA, ramp_s=ramp_s, sample_time_s=TS).r
+    return routine(
+        off_s=4,
+        on_s=6,
+        pause_s=pause_s,
+        tail_s=8,
+        speed=speed,
+        bead_area_mm2=AREA,
+        ramp_s=ramp_s,
+        sample_time_s=TS,
+    ).r
 
 
 def program(name: str, tool: int) -> gcode.Program:
-    """A part with all its lines on one tool (None: as it is), so that each material prints the whole of it."""
+    """A part with all its lines on one tool (None: as it is), so that
+    each material prints the whole of it."""
     text = (PARTS / f"{name}.gcode").read_text()
     if tool is not None:
         text = text.replace("T1", f"T{tool}").replace("T0", f"T{tool}")
@@ -122,9 +177,17 @@ def one(plant: Extruder, name: str, rng: np.random.Generator) -> dict[str, float
         out[f"{structure}.over_ilc"] = out[f"{structure}.chosen"] - out[f"{structure}.ilc"]
         true = made._replace(streams=(stream._replace(y=flow(plant, stream.u, sample_time_s=TS)),))
         volumes = line_volumes(true, known.library, bead_area_mm2=AREA)
-        out[f"{structure}.line_volume"] = float(np.abs(volumes.error_percent[volumes.duration_s >= 0.4 - 1e-9]).max())
-    for label, r in {"pause_0.2": protocol(8.0, 0.2), "speed_0.5x": protocol(4.0, 0.6), "speed_1.5x": protocol(12.0, 0.6)}.items():
-        out[f"{label}.basis"] = percent(plant, nominal, basis.compose(known.materials[0].chain.extruder, r, sample_time_s=TS), r)
+        out[f"{structure}.line_volume"] = float(
+            np.abs(volumes.error_percent[volumes.duration_s >= 0.4 - 1e-9]).max()
+        )
+    for label, r in {
+        "pause_0.2": protocol(8.0, 0.2),
+        "speed_0.5x": protocol(4.0, 0.6),
+        "speed_1.5x": protocol(12.0, 0.6),
+    }.items():
+        out[f"{label}.basis"] = percent(
+            plant, nominal, basis.compose(known.materials[0].chain.extruder, r, sample_time_s=TS), r
+        )
     return out
 
 
@@ -136,12 +199,19 @@ def family(plants: int, seeds: int, creep_share: float) -> dict:
         for name, nominal in MATERIALS.items():
             for _ in range(plants):
                 plant = draw(
-                    rng, gain=nominal.gain, time_constant_s=nominal.time_constant_s, steady_flow=AREA * SPEEDS[0], creep_share=creep_share
+                    rng,
+                    gain=nominal.gain,
+                    time_constant_s=nominal.time_constant_s,
+                    steady_flow=AREA * SPEEDS[0],
+                    creep_share=creep_share,
                 )
                 for key, value in one(plant, name, rng).items():
                     table[name].setdefault(key, []).append(value)
     return {
-        name: {key: {"median": round(float(np.median(v)), 2), "worst": round(float(np.max(v)), 2)} for key, v in rows.items()}
+        name: {
+            key: {"median": round(float(np.median(v)), 2), "worst": round(float(np.max(v)), 2)}
+            for key, v in rows.items()
+        }
         for name, rows in table.items()
     }
 
@@ -152,31 +222,46 @@ def bars(result: dict) -> dict:
     for place, label in enumerate(("no_creep", "creep_12_percent")):
         rows = result[label].values()
         for structure, bar in BARS.items():
-            worst = max(row[f"{structure}.{'chosen' if f'{structure}.chosen' in row else 'basis'}"]["worst"] for row in rows)
+            worst = max(
+                row[f"{structure}.{'chosen' if f'{structure}.chosen' in row else 'basis'}"]["worst"]
+                for row in rows
+            )
             out[f"{label}.{structure}"] = {"worst": worst, "bar": bar[place]}
         for structure in ("tic_tac_toe", "dashes"):
-            out[f"{label}.{structure}.over_ilc"] = {"worst": max(row[f"{structure}.over_ilc"]["worst"] for row in rows), "bar": 1.0}
+            out[f"{label}.{structure}.over_ilc"] = {
+                "worst": max(row[f"{structure}.over_ilc"]["worst"] for row in rows),
+                "bar": 1.0,
+            }
         out[f"{label}.line_volume"] = {
-            "worst": max(row[f"{s}.line_volume"]["worst"] for row in rows for s in ("fig9", "tic_tac_toe", "dashes")),
+            "worst": max(
+                row[f"{s}.line_volume"]["worst"] for row in rows for s in ("fig9", "tic_tac_toe", "dashes")
+            ),
             "bar": 3.0,
         }
     return out
 
 
 def saturations(plants: int) -> dict:
-    """Forecast by the chain of the training against the true plant: the same command, and our law learning under the same limit. Points of percent of on-off."""
+    """Forecast by the chain of the training against the true plant: the same command, and our law learning
+    under the same limit. Points of percent of on-off."""
     rng, rows = np.random.default_rng(7), []
     for name, nominal in MATERIALS.items():
         for _ in range(plants):
-            plant = draw(rng, gain=nominal.gain, time_constant_s=nominal.time_constant_s, steady_flow=AREA * SPEEDS[0])
+            plant = draw(
+                rng, gain=nominal.gain, time_constant_s=nominal.time_constant_s, steady_flow=AREA * SPEEDS[0]
+            )
             extruder = learn(train(plant, name, rng), sample_time_s=TS).materials[0].chain.extruder
             for ramp_s in (0.15, 0.3, 0.5, 1.0, 2.0):
                 on = protocol(8.0, 0.6, 1e-9)
                 r = basis.boxed(on, ramp_s, TS)
                 for times in (3.0, 5.0, 10.0, 20.0):
                     limit = times * r.max() / nominal.gain
-                    found = saturation(extruder, on, on_off_gain=nominal.gain, ramp_s=ramp_s, limit=limit, sample_time_s=TS)
-                    on_off = np.linalg.norm(flow(plant, np.clip(r / nominal.gain, -limit, limit), sample_time_s=TS) - r)
+                    found = saturation(
+                        extruder, on, on_off_gain=nominal.gain, ramp_s=ramp_s, limit=limit, sample_time_s=TS
+                    )
+                    on_off = np.linalg.norm(
+                        flow(plant, np.clip(r / nominal.gain, -limit, limit), sample_time_s=TS) - r
+                    )
                     u = basis.compose(extruder, r, sample_time_s=TS, limit=limit)
                     forecast = found.rms_percent_of_on_off
                     same = 100 * np.linalg.norm(flow(plant, u, sample_time_s=TS, limit=limit) - r) / on_off
@@ -192,7 +277,8 @@ def saturations(plants: int) -> dict:
 
 
 def sequences(programs: int) -> dict:
-    """Random programs: no forbidden transition; those that would need Steady-State -> No-Flow are refused by line number."""
+    """Random programs: no forbidden transition; those that would need
+    Steady-State -> No-Flow are refused by line number."""
     from tests.deposition.test_tasks import random_tasks
 
     rng, found, refused = np.random.default_rng(0), 0, 0
@@ -212,7 +298,9 @@ def job(lines: int) -> str:
         travel = k % 9 == 0
         dx, dy = rng.uniform(-12, 12, 2) if travel else rng.uniform(-3, 3, 2)
         x, y = x + dx, y + dy
-        text.append(f"G0 X{x:.3f} Y{y:.3f} F3000" if travel else f"G1 X{x:.3f} Y{y:.3f} E{np.hypot(dx, dy):.4f} F480")
+        text.append(
+            f"G0 X{x:.3f} Y{y:.3f} F3000" if travel else f"G1 X{x:.3f} Y{y:.3f} E{np.hypot(dx, dy):.4f} F480"
+        )
     return "\n".join(text)
 
 
@@ -227,7 +315,15 @@ def speed(known: Learned) -> dict:
         marks.append(time.process_time())
         made = compose(known, read, motion, materials={0: "A", 1: "B"}, limit=np.inf, **PART)
         marks.append(time.process_time())
-        conform(made, known, bead_area_mm2=AREA, ramp_s=RAMP, limit=np.inf, shortest_s=0.4, largest_error_percent=20.0)
+        conform(
+            made,
+            known,
+            bead_area_mm2=AREA,
+            ramp_s=RAMP,
+            limit=np.inf,
+            shortest_s=0.4,
+            largest_error_percent=20.0,
+        )
         marks.append(time.process_time())
         times.append(np.diff(marks))
     best = np.min(times, axis=0)
@@ -243,11 +339,16 @@ def main() -> None:
     plants, seeds = (int(a) for a in sys.argv[1:3]) if len(sys.argv) > 2 else (14, 2)
     result = {"plants": plants, "seeds": seeds}
     rng = np.random.default_rng(1)
-    known = learn([t for name, e in MATERIALS.items() for t in train(e._replace(delay_s=0.1, lag_hz=4.0), name, rng)], sample_time_s=TS)
+    known = learn(
+        [t for name, e in MATERIALS.items() for t in train(e._replace(delay_s=0.1, lag_hz=4.0), name, rng)],
+        sample_time_s=TS,
+    )
     result["speed"] = speed(known)
     tasks = part(known, "fig9", "A").tasks
     read = program("tic_tac_toe", None)
-    crosses = compose(known, read, plan(read.moves, **MACHINE), materials={0: "A", 1: "B"}, limit=np.inf, **PART)
+    crosses = compose(
+        known, read, plan(read.moves, **MACHINE), materials={0: "A", 1: "B"}, limit=np.inf, **PART
+    )
     result["sequences"] = {
         "fig9_exact": tasks.task.tolist() == FIG_9,
         "tic_tac_toe_runs": int(crosses.lines.run[-1]) + 1,
@@ -258,7 +359,11 @@ def main() -> None:
     result["creep_12_percent"] = family(plants, seeds, 0.12)
     result["saturation"] = saturations(max(1, plants // 4))
     result["bars"] = bars(result)
-    print(json.dumps({**result, "saturation": {k: v for k, v in result["saturation"].items() if k != "rows"}}, indent=2))
+    print(
+        json.dumps(
+            {**result, "saturation": {k: v for k, v in result["saturation"].items() if k != "rows"}}, indent=2
+        )
+    )
     RESULTS.parent.mkdir(exist_ok=True)
     RESULTS.write_text(json.dumps(result, indent=2) + "\n")
 

@@ -1,6 +1,8 @@
-"""Records that no linear model of finite order made: simulated machines with nonlinear losses, dead times, diffusion, quantised sensors, feedback, poor excitation.
+"""Records that no linear model of finite order made: simulated machines with nonlinear losses, dead times,
+diffusion, quantised sensors, feedback, poor excitation.
 
-Each function takes a generator and gives u (T, m) as a logger would have it and y (T, p); the identification benchmark holds its rules against them.
+Each function takes a generator and gives u (T, m) as a logger would have it and y (T, p); the identification
+benchmark holds its rules against them.
 """
 
 from collections.abc import Callable
@@ -29,7 +31,8 @@ def quantised(y: np.ndarray, step: float) -> np.ndarray:
 
 
 def hot_end(rng):
-    """A printer's hot end, 0.5 s: PID on a thermistor of 0.1 °C, set-points every minute, radiation, a fan, flow as the second input."""
+    """A printer's hot end, 0.5 s: PID on a thermistor of 0.1 °C, set-points every
+    minute, radiation, a fan, flow as the second input."""
     T, y, u = 1700, np.empty((1700, 1)), np.empty((1700, 2))
     target, flow = levels(rng, T, 1, 120, 181, 230)[:, 0], levels(rng, T, 1, 60, 0, 12)[:, 0]
     block, tip, wire, integral, measured, last = 200.0, 198.0, np.full(4, 60.0), 60.0, 198.0, 198.0
@@ -39,7 +42,9 @@ def hot_end(rng):
         integral, last = integral + 0.15 * (target[t] - measured) * (0 <= raw <= 100), measured
         u[t], y[t] = [np.clip(raw, 0, 100), flow[t]], measured
         wire = np.r_[u[t, 0], wire[:-1]]
-        loss = 0.0025 * (block - 25) + 1.2e-11 * ((block + 273) ** 4 - 298**4) + 0.0003 * flow[t] * (block - 25)
+        loss = (
+            0.0025 * (block - 25) + 1.2e-11 * ((block + 273) ** 4 - 298**4) + 0.0003 * flow[t] * (block - 25)
+        )
         block += 0.5 * (0.022 * wire[-1] - loss) + 0.02 * rng.standard_normal()
         tip += 0.5 * 0.25 * (block - tip)
     return u, y
@@ -59,7 +64,8 @@ def power_station(rng):
 
 
 def flexible(rng, T, modes, periodic=0, pole=0.0, noise=0.02, direct=0.0):
-    """Lightly damped modes (frequency in rad/sample, damping ratio, gain) under a coloured or periodic input."""
+    """Lightly damped modes (frequency in rad/sample, damping ratio,
+    gain) under a coloured or periodic input."""
     u = coloured(rng, periodic or T, 1, pole)
     u = np.tile(u, (T // len(u) + 1, 1))[:T]
     y = direct * u[:, 0]
@@ -72,7 +78,14 @@ def flexible(rng, T, modes, periodic=0, pole=0.0, noise=0.02, direct=0.0):
 
 def robot_arm(rng):
     """Torque to acceleration of a flexible arm: periodic input, three modes, direct feed-through."""
-    return flexible(rng, 1024, [(0.25, 0.02, 0.3), (0.6, 0.03, -0.2), (1.3, 0.03, 0.15)], periodic=256, noise=0.05, direct=0.3)
+    return flexible(
+        rng,
+        1024,
+        [(0.25, 0.02, 0.3), (0.6, 0.03, -0.2), (1.3, 0.03, 0.15)],
+        periodic=256,
+        noise=0.05,
+        direct=0.3,
+    )
 
 
 def flutter(rng):
@@ -81,7 +94,8 @@ def flutter(rng):
 
 
 def disc_player_arm(rng):
-    """Two inputs, two outputs in closed loop, lightly damped modes on a double integrator's skirt, 2,048 samples."""
+    """Two inputs, two outputs in closed loop, lightly damped modes on
+    a double integrator's skirt, 2,048 samples."""
     T = 2048
     modes = [np.exp(w * (-z + 1j)) for w, z in ((0.08, 0.3), (0.45, 0.02), (0.9, 0.015), (1.6, 0.02))]
     A = np.zeros((8, 8))
@@ -99,12 +113,15 @@ def disc_player_arm(rng):
 
 
 def ball_and_beam(rng):
-    """A double integrator with a rolling nonlinearity, held by hand: 1,000 samples of the beam's angle and the ball's place."""
+    """A double integrator with a rolling nonlinearity, held by hand: 1,000
+    samples of the beam's angle and the ball's place."""
     T, x, v, wanted = 1000, 0.0, 0.0, levels(rng, 1000, 1, 60, -0.3, 0.3)[:, 0]
     u, y, angle = np.empty((T, 1)), np.empty((T, 1)), 0.0
     for t in range(T):
         y[t] = quantised(x + 0.002 * rng.standard_normal(), 0.001)
-        angle += 0.5 * (np.clip(1.2 * (wanted[t] - x) - 1.6 * v, -0.3, 0.3) - angle) + 0.01 * rng.standard_normal()
+        angle += (
+            0.5 * (np.clip(1.2 * (wanted[t] - x) - 1.6 * v, -0.3, 0.3) - angle) + 0.01 * rng.standard_normal()
+        )
         u[t] = angle
         v += 0.1 * (7.0 * np.sin(angle) - 0.15 * v) * 0.7
         x = np.clip(x + 0.1 * v, -0.6, 0.6)
@@ -112,7 +129,8 @@ def ball_and_beam(rng):
 
 
 def heat_exchanger(rng):
-    """Liquid flow to outlet temperature: gain that falls with flow, 12 samples of dead time, 4,000 samples."""
+    """Liquid flow to outlet temperature: gain that falls with flow, 12
+    samples of dead time, 4,000 samples."""
     T, x, y = 4000, np.array([97.0, 97.0]), np.empty((4000, 1))
     u = levels(rng, T, 1, 25, 0.1, 0.7)
     drift = 0.02 * np.cumsum(rng.standard_normal(T))
@@ -128,7 +146,10 @@ def wall(rng):
     """A wall of twenty layers between two temperatures, heat flow as output, 1,680 samples, slow weather."""
     T, n = 1680, 20
     weather = np.column_stack(
-        [10 + 8 * np.sin(np.arange(T) / 40) + 3 * coloured(rng, T, 1, 0.98)[:, 0], 20 + levels(rng, T, 1, 60, -2, 2)[:, 0]]
+        [
+            10 + 8 * np.sin(np.arange(T) / 40) + 3 * coloured(rng, T, 1, 0.98)[:, 0],
+            20 + levels(rng, T, 1, 60, -2, 2)[:, 0],
+        ]
     )
     x, y = np.linspace(10, 20, n), np.empty((T, 1))
     for t in range(T):
@@ -140,7 +161,11 @@ def wall(rng):
 
 def titration(rng):
     """pH of a stirred tank, acid and base flow in, strongly nonlinear at its neck, 2,001 samples."""
-    T, u, y = 2001, np.column_stack([levels(rng, 2001, 1, 60, 16.0, 18.0), levels(rng, 2001, 1, 15, 15.0, 17.0)]), np.empty((2001, 1))
+    T, u, y = (
+        2001,
+        np.column_stack([levels(rng, 2001, 1, 60, 16.0, 18.0), levels(rng, 2001, 1, 15, 15.0, 17.0)]),
+        np.empty((2001, 1)),
+    )
     x = 0.0
     for t in range(T):
         x += 0.03 * ((u[t, 1] - u[t, 0]) - x)
@@ -149,7 +174,8 @@ def titration(rng):
 
 
 def steam_generator(rng):
-    """Four inputs, four outputs, 9,600 samples: a drum whose level integrates and swells, its level held by a PI loop, dead times."""
+    """Four inputs, four outputs, 9,600 samples: a drum whose level integrates and
+    swells, its level held by a PI loop, dead times."""
     T = 9600
     u, y = np.empty((T, 4)), np.empty((T, 4))
     asked = np.column_stack([levels(rng, T, 3, 80, -1, 1) + 0.1 * coloured(rng, T, 3, 0.9)])
@@ -177,12 +203,16 @@ def relay_bed(rng):
         y[t] = quantised(x[1] + 0.05 * rng.standard_normal(), 0.06)
         on = y[t, 0] < target[t] - 0.4 if not on else y[t, 0] < target[t] + 0.4
         u[t] = 100.0 * on
-        x = x + [0.02 * u[t, 0] - 0.008 * (x[0] - 22) - 0.02 * (x[0] - x[1]), 0.03 * (x[0] - x[1]) - 0.004 * (x[1] - 22)]
+        x = x + [
+            0.02 * u[t, 0] - 0.008 * (x[0] - 22) - 0.02 * (x[0] - x[1]),
+            0.03 * (x[0] - x[1]) - 0.004 * (x[1] - 22),
+        ]
     return u, y
 
 
 def two_heaters(rng):
-    """Another two-heater board, 600 samples of steps: radiation, draughts, ambient drift, sensors of 0.3 °C, heaters that clip what is asked beyond 0-100."""
+    """Another two-heater board, 600 samples of steps: radiation, draughts, ambient drift, sensors of 0.3 °C,
+    heaters that clip what is asked beyond 0-100."""
     T, H, S, y = 600, np.array([22.0, 22.0]), np.array([22.0, 22.0]), np.empty((600, 2))
     u = np.round(levels(rng, T, 2, 50, -25, 125))
     ambient = 22 + 0.03 * np.cumsum(rng.standard_normal(T))
@@ -202,12 +232,19 @@ def ganged_zones(rng):
     u = np.column_stack([u, quantised(0.8 * u[:, 0] + 5, 0.1)])
     for t in range(T):
         y[t] = x + 0.1 * rng.standard_normal(3)
-        x = x + 0.03 * u[t] * [1, 0.8, 1.2] - 0.012 * (x - 20) + 0.01 * (np.roll(x, 1) - x) + 0.01 * (np.roll(x, -1) - x)
+        x = (
+            x
+            + 0.03 * u[t] * [1, 0.8, 1.2]
+            - 0.012 * (x - 20)
+            + 0.01 * (np.roll(x, 1) - x)
+            + 0.01 * (np.roll(x, -1) - x)
+        )
     return u, y
 
 
 def unstable_reactor(rng):
-    """An exothermic reactor about its unstable point, held by a PI loop with dead time; set-points move, 2,000 samples."""
+    """An exothermic reactor about its unstable point, held by a PI loop
+    with dead time; set-points move, 2,000 samples."""
     T, x, y, u, integral = 2000, 0.0, np.empty((2000, 1)), np.empty((2000, 1)), 0.0
     target = levels(rng, T, 1, 40, -1, 1)[:, 0]
     for t in range(T):
@@ -220,7 +257,8 @@ def unstable_reactor(rng):
 
 
 def barrel(rng):
-    """Five zones, five heaters under PI loops, set-points moved one after another, saturation, screw heat that nobody records."""
+    """Five zones, five heaters under PI loops, set-points moved one after
+    another, saturation, screw heat that nobody records."""
     T, x, y, u, integral = 3000, np.full(5, 150.0), np.empty((3000, 5)), np.empty((3000, 5)), np.full(5, 35.0)
     target, screw = levels(rng, T, 5, 400, 140, 190), 0.3 * levels(rng, T, 1, 500, 0, 1)[:, 0]
     metal = x.copy()
@@ -250,7 +288,8 @@ def staircase(rng):
 RECORDS: dict[str, Callable[[np.random.Generator], tuple[np.ndarray, np.ndarray]]] = {
     f.__name__: f
     for f in (
-        hot_end, power_station, robot_arm, flutter, disc_player_arm, ball_and_beam, heat_exchanger, wall, titration,
+        hot_end, power_station, robot_arm, flutter, disc_player_arm, ball_and_beam, heat_exchanger, wall,
+        titration,
         steam_generator, relay_bed, two_heaters, ganged_zones, unstable_reactor, barrel, staircase,
     )
 }  # fmt: skip

@@ -1,8 +1,11 @@
-"""From frames to flow: bead width, empty frames, Q(t), learning through pixels, and the time a frame takes, each beside its bar.
+"""From frames to flow: bead width, empty frames, Q(t), learning through
+pixels, and the time a frame takes, each beside its bar.
 
-`./run python -m benchmarks.frames` prints the tables and writes benchmarks/results/frames.json; `./run python -m benchmarks.frames width empty` runs only the parts
-named (width, empty, flow, pixels, speed) and leaves the others as they were. Figures are the worst over seeds that nothing was tuned on; the scenes nominal and hard,
-and some like the others, were looked at while the edge finder was made. Times are CPU milliseconds of one core, the quickest of several rounds.
+`./run python -m benchmarks.frames` prints the tables and writes benchmarks/results/frames.json; `./run python
+-m benchmarks.frames width empty` runs only the parts named (width, empty, flow, pixels, speed) and leaves the
+others as they were. Figures are the worst over seeds that nothing was tuned on; the scenes nominal and hard,
+and some like the others, were looked at while the edge finder was made. Times are CPU milliseconds of one
+core, the quickest of several rounds.
 """
 
 import itertools
@@ -27,7 +30,9 @@ TS, SPEED, ANGLE_DEG, PX_PER_MM = 0.02, 8.0, 90.0, 125.0
 AREA = float(area(0.88, ANGLE_DEG))
 NOMINAL_FLOW = AREA * SPEED
 VIEW, NOZZLE_MM, COLUMNS, LONGEST_BLUR_PX = View(1 / PX_PER_MM, 648.0), (0.25, 0.32), (0, 600), 6.0
-R = routine(off_s=4, on_s=6, pause_s=0.6, tail_s=8, speed=SPEED, bead_area_mm2=AREA, ramp_s=0.15, sample_time_s=TS)
+R = routine(
+    off_s=4, on_s=6, pause_s=0.6, tail_s=8, speed=SPEED, bead_area_mm2=AREA, ramp_s=0.15, sample_time_s=TS
+)
 CORNER = (R.time_s > R.pause_s[0] - 0.5) & (R.time_s < R.pause_s[1] + 0.5)
 MATERIALS = {"A": Extruder(1.08, 2.7), "B": Extruder(0.89, 4.5)}
 NOISE = {"white": 0.03, "drift": 0.01, "gain": 0.01}
@@ -49,13 +54,18 @@ def millimetres(calibration: Calibration, widths_px: np.ndarray) -> np.ndarray:
 
 
 def widths(scene: Scene, seed: int, frames: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Per width: mean error (px), deviation (px), and mean error after a calibration on the first, third and fifth, other frames than those judged."""
+    """Per width: mean error (px), deviation (px), and mean error after a calibration on the first, third and
+    fifth, other frames than those judged."""
     rng = np.random.default_rng(seed)
     camera = Camera(scene, rng)
 
     def measured(width):
         return [
-            measure(camera.frame(width, stage_px=int(rng.integers(0, 10**6))), columns=COLUMNS, longest_blur_px=LONGEST_BLUR_PX).width
+            measure(
+                camera.frame(width, stage_px=int(rng.integers(0, 10**6))),
+                columns=COLUMNS,
+                longest_blur_px=LONGEST_BLUR_PX,
+            ).width
             for _ in range(frames)
         ]
 
@@ -67,7 +77,9 @@ def widths(scene: Scene, seed: int, frames: int) -> tuple[np.ndarray, np.ndarray
 
 
 def width_figures(seeds: int = 6, frames: int = 40) -> dict[str, Any]:
-    out: dict[str, Any] = {"bars": "deviation <= 0.12 px nominal, 0.3 hard; bias <= 0.2 px; widths 60 to 160 px"}
+    out: dict[str, Any] = {
+        "bars": "deviation <= 0.12 px nominal, 0.3 hard; bias <= 0.2 px; widths 60 to 160 px"
+    }
     scenes = {name: (scene, range(100, 100 + seeds)) for name, (scene, _) in LEVELS.items()} | {
         name: (scene, range(200, 202)) for name, scene in OTHERS.items()
     }
@@ -80,7 +92,8 @@ def width_figures(seeds: int = 6, frames: int = 40) -> dict[str, Any]:
             "worst_bias_px": np.abs(bias).max(),
         }
         out[name] = {
-            key: round(float(value), 3) for key, value in (figures | {"worst_bias_calibrated_px": np.abs(calibrated).max()}).items()
+            key: round(float(value), 3)
+            for key, value in (figures | {"worst_bias_calibrated_px": np.abs(calibrated).max()}).items()
         }
         print(name, out[name], flush=True)
     return out
@@ -94,27 +107,43 @@ def empty_figures(frames: int = 500) -> dict[str, Any]:
         for _ in range(25):
             camera = Camera(scene, rng)
             found += [
-                measure(camera.empty(stage_px=int(rng.integers(0, 10**6))), columns=COLUMNS, longest_blur_px=LONGEST_BLUR_PX)
+                measure(
+                    camera.empty(stage_px=int(rng.integers(0, 10**6))),
+                    columns=COLUMNS,
+                    longest_blur_px=LONGEST_BLUR_PX,
+                )
                 for _ in range(frames // 25)
             ]
         out[name] = {
             "frames": len(found),
             "beads": sum(not bead.reason for bead in found),
             "frames_with_any_width": sum(bool(np.nansum(bead.widths)) for bead in found),
-            "blocks_unread_percent": round(100 * float(np.mean([np.isnan(bead.widths) for bead in found])), 3),
+            "blocks_unread_percent": round(
+                100 * float(np.mean([np.isnan(bead.widths) for bead in found])), 3
+            ),
         }
     return out
 
 
 def seen(camera: Camera, Q: np.ndarray, calibration) -> Flow:
-    frames = camera.trial(R.time_s, Q, R.position, view=VIEW, frame_rate_hz=30.0, nozzle_mm=NOZZLE_MM, contact_angle_deg=ANGLE_DEG)
+    frames = camera.trial(
+        R.time_s,
+        Q,
+        R.position,
+        view=VIEW,
+        frame_rate_hz=30.0,
+        nozzle_mm=NOZZLE_MM,
+        contact_angle_deg=ANGLE_DEG,
+    )
     times, beads = [], []
     while some := list(itertools.islice(frames, 16)):
         times += [t for t, _ in some]
         beads += measure_all([frame for _, frame in some], columns=COLUMNS, longest_blur_px=LONGEST_BLUR_PX)
     x = np.interp(times, R.time_s, R.position)
     mm = millimetres(calibration, np.array([bead.widths for bead in beads]))
-    places = sections(x, beads[0].columns, mm, view=VIEW, nozzle_radius_mm=NOZZLE_MM[0], contact_angle_deg=ANGLE_DEG)
+    places = sections(
+        x, beads[0].columns, mm, view=VIEW, nozzle_radius_mm=NOZZLE_MM[0], contact_angle_deg=ANGLE_DEG
+    )
     return estimate(
         R.time_s,
         R.position,
@@ -130,7 +159,12 @@ def gauged(camera: Camera, rng: np.random.Generator, each: int = 5):
     """A calibration on four known widths, as a user would make it."""
     known = np.repeat([0.55, 0.75, 0.95, 1.2], each)
     frames = [camera.frame(w * PX_PER_MM, stage_px=int(rng.integers(0, 10**6))) for w in known]
-    return calibrate(np.array([measure(frame, columns=COLUMNS, longest_blur_px=LONGEST_BLUR_PX).width for frame in frames]), known)
+    return calibrate(
+        np.array(
+            [measure(frame, columns=COLUMNS, longest_blur_px=LONGEST_BLUR_PX).width for frame in frames]
+        ),
+        known,
+    )
 
 
 def errors(found: Flow, Q: np.ndarray) -> dict[str, float]:
@@ -144,18 +178,28 @@ def errors(found: Flow, Q: np.ndarray) -> dict[str, float]:
         "mean_steady_percent": float(abs(e[steady].mean())),
         "lag_ms": float(abs(1e3 * slope @ (found.flow - Q) / (slope @ slope))),
         "pause_volume_percent_of_0.6_s": float(100 * abs(pause.volume - laid) / (0.6 * NOMINAL_FLOW)),
-        "errors_over_deviation": float(np.sqrt(np.mean(np.square((found.flow - Q)[found.observable] / found.deviation[found.observable])))),
+        "errors_over_deviation": float(
+            np.sqrt(
+                np.mean(np.square((found.flow - Q)[found.observable] / found.deviation[found.observable]))
+            )
+        ),
     }
 
 
 def plants(seed: int) -> list[tuple[str, Extruder]]:
     rng = np.random.default_rng(seed)
-    return [(name, draw(rng, gain=m.gain, time_constant_s=m.time_constant_s, steady_flow=NOMINAL_FLOW)) for name, m in MATERIALS.items()]
+    return [
+        (name, draw(rng, gain=m.gain, time_constant_s=m.time_constant_s, steady_flow=NOMINAL_FLOW))
+        for name, m in MATERIALS.items()
+    ]
 
 
 def flow_figures(seeds: int = 3) -> dict[str, Any]:
-    """Q(t) of three kinds of trial on drawn plants: the first (on-off), one half way to the wanted flow, one that prints as wanted."""
-    out: dict[str, Any] = {"bars": "rms <= 2.5 % of nominal, <= 6 % within 0.5 s of the pause; lag below 33 ms"}
+    """Q(t) of three kinds of trial on drawn plants: the first (on-off), one half
+    way to the wanted flow, one that prints as wanted."""
+    out: dict[str, Any] = {
+        "bars": "rms <= 2.5 % of nominal, <= 6 % within 0.5 s of the pause; lag below 33 ms"
+    }
     for level, (scene, _) in LEVELS.items():
         rows: dict[str, list[dict[str, float]]] = {}
         for seed in range(400, 400 + seeds):
@@ -166,13 +210,17 @@ def flow_figures(seeds: int = 3) -> dict[str, Any]:
                 first = flow(plant, R.r / MATERIALS[name].gain, sample_time_s=TS)
                 for kind, Q in {"on_off": first, "half_way": (first + R.r) / 2, "as_wanted": R.r}.items():
                     rows.setdefault(kind, []).append(errors(seen(camera, Q, calibration), Q))
-        out[level] = {kind: {f"worst_{key}": round(max(row[key] for row in found), 2) for key in found[0]} for kind, found in rows.items()}
+        out[level] = {
+            kind: {f"worst_{key}": round(max(row[key] for row in found), 2) for key in found[0]}
+            for kind, found in rows.items()
+        }
         print(level, out[level], flush=True)
     return out
 
 
 def learned(name: str, plant: Extruder, scene: Scene, seed: int, trials: int) -> list[float]:
-    """True error of each trial in percent of trial 0: trial -> frames -> widths -> Q(t) -> law, a fresh part of the stage each time.
+    """True error of each trial in percent of trial 0: trial -> frames -> widths
+    -> Q(t) -> law, a fresh part of the stage each time.
 
     What is laid is the true flow with the trial noise of the plant family; the figure is the true flow's."""
     rng = np.random.default_rng(seed)
@@ -196,10 +244,15 @@ def pixel_figures(trials: int = 15) -> dict[str, Any]:
     out: dict[str, Any] = {"bars": "percent of trial 0: <= 20 at trial 2, <= 10 at 4, <= 5 at 15"}
     for level, seeds in {"nominal": range(500, 503), "hard": range(510, 511)}.items():
         runs = []
-        for seed, (name, plant) in itertools.chain.from_iterable([(seed, pair) for pair in plants(seed)] for seed in seeds):
+        for seed, (name, plant) in itertools.chain.from_iterable(
+            [(seed, pair) for pair in plants(seed)] for seed in seeds
+        ):
             runs.append(learned(name, plant, LEVELS[level][0], seed, trials))
             print(level, name, seed, runs[-1], flush=True)
-        out[level] = {"runs": len(runs), **{f"worst_at_{j}": max(run[j] for run in runs) for j in (1, 2, 4, 6, trials)}}
+        out[level] = {
+            "runs": len(runs),
+            **{f"worst_at_{j}": max(run[j] for run in runs) for j in (1, 2, 4, 6, trials)},
+        }
     return out
 
 
@@ -228,16 +281,30 @@ def speed_figures() -> dict[str, Any]:
         "render_ms": quickest_ms(lambda: camera.frame(110.0, stage_px=0)),
         "measure_ms": quickest_ms(lambda: measure(frame, columns=COLUMNS, longest_blur_px=LONGEST_BLUR_PX)),
         "measure_all_ms_a_frame": (
-            ms := round(quickest_ms(lambda: measure_all(many, columns=COLUMNS, longest_blur_px=LONGEST_BLUR_PX), each=3) / 16, 3)
+            ms := round(
+                quickest_ms(
+                    lambda: measure_all(many, columns=COLUMNS, longest_blur_px=LONGEST_BLUR_PX), each=3
+                )
+                / 16,
+                3,
+            )
         ),
-        "measure_empty_ms": quickest_ms(lambda: measure(bare, columns=COLUMNS, longest_blur_px=LONGEST_BLUR_PX)),
+        "measure_empty_ms": quickest_ms(
+            lambda: measure(bare, columns=COLUMNS, longest_blur_px=LONGEST_BLUR_PX)
+        ),
         "raw_frames_per_s": round(1e3 / ms),
         "jpeg_decode_ms": quickest_ms(lambda: cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE)),
         "trial_of_738_frames_s": round(whole, 2),
     }
 
 
-PARTS = {"width": width_figures, "empty": empty_figures, "flow": flow_figures, "pixels": pixel_figures, "speed": speed_figures}
+PARTS = {
+    "width": width_figures,
+    "empty": empty_figures,
+    "flow": flow_figures,
+    "pixels": pixel_figures,
+    "speed": speed_figures,
+}
 
 
 def main() -> None:

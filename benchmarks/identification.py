@@ -1,8 +1,10 @@
-"""Identification held against published figures, against peers on the same hold-outs, and against simple competitors on records that no linear model made.
+"""Identification held against published figures, against peers on the same hold-outs, and against simple
+competitors on records that no linear model made.
 
-`./run python -m benchmarks.identification` prints the tables with their bars and writes benchmarks/results/identification.json; with `foreign` behind it, only the
-last table, into identification_foreign.json. The peers are nfoursid, sippy_unipi and
-python-control; one that is not installed is left out with a line. Data sets come from BEADLINE_SHARED, by default ../shared. Times are CPU seconds.
+`./run python -m benchmarks.identification` prints the tables with their bars and writes
+benchmarks/results/identification.json; with `foreign` behind it, only the last table, into
+identification_foreign.json. The peers are nfoursid, sippy_unipi and python-control; one that is not installed
+is left out with a line. Data sets come from BEADLINE_SHARED, by default ../shared. Times are CPU seconds.
 """
 
 import importlib.util
@@ -41,49 +43,70 @@ MARKOV_BARS = {0.1: 2e-3, 0.5: 1.5e-2}
 
 
 def nrmse(y: np.ndarray, predicted: np.ndarray, *, means_removed: bool = False) -> np.ndarray:
-    """Fit of each output in percent, 100 (1 - |y - ŷ| / |y - mean y|); NaN in y is left out. With `means_removed` the mean of the error is taken off first."""
+    """Fit of each output in percent, 100 (1 - |y - ŷ| / |y - mean y|); NaN in y is left out. With
+    `means_removed` the mean of the error is taken off first."""
     seen = np.isfinite(y)
     error = np.where(seen, y - predicted, np.nan)
     error = error - np.nanmean(error, axis=0) if means_removed else error
     spread = np.where(seen, y, np.nan) - np.nanmean(np.where(seen, y, np.nan), axis=0)
-    return 100.0 * (1.0 - np.sqrt(np.nansum(error**2, axis=0) / np.maximum(np.nansum(spread**2, axis=0), np.finfo(float).tiny)))
+    return 100.0 * (
+        1.0
+        - np.sqrt(
+            np.nansum(error**2, axis=0) / np.maximum(np.nansum(spread**2, axis=0), np.finfo(float).tiny)
+        )
+    )
 
 
 def simulate_fit(plant: Plant, u: Segments, y: Segments, *, means_removed: bool = False) -> np.ndarray:
-    """NRMSE (p,) in percent of free simulation over the segments, the initial state of each fitted as in `simulated`."""
+    """NRMSE (p,) in percent of free simulation over the segments, the
+    initial state of each fitted as in `simulated`."""
     predicted = [simulated(plant, a, b, means_removed=means_removed) for a, b in zip(u, y, strict=True)]
     return nrmse(np.vstack(y), np.vstack(predicted), means_removed=means_removed)
 
 
 def predict_fit(plant: Plant, u: Segments, y: Segments, steps: int) -> np.ndarray:
-    """NRMSE (p,) in percent `steps` samples ahead, over the samples after the start-up of `predicted_ahead`."""
+    """NRMSE (p,) in percent `steps` samples ahead, over the samples
+    after the start-up of `predicted_ahead`."""
     skip = max(3 * plant.n, 30) + steps
     if all(len(a) <= skip for a in u):
         raise ValueError(
-            f"predict_fit: expected a segment longer than {skip} samples for {steps} steps ahead; hold out a longer part, or fewer steps"
+            f"predict_fit: expected a segment longer than {skip} samples for {steps} steps ahead; "
+            "hold out a longer part, or fewer steps"
         )
-    pairs = [(b[skip:], predicted_ahead(plant, a, b, steps)[skip:]) for a, b in zip(u, y, strict=True) if len(a) > skip]
+    pairs = [
+        (b[skip:], predicted_ahead(plant, a, b, steps)[skip:])
+        for a, b in zip(u, y, strict=True)
+        if len(a) > skip
+    ]
     return nrmse(np.vstack([b for b, _ in pairs]), np.vstack([e for _, e in pairs]))
 
 
-def resampled(path: Path, sample_time_s: float, columns: tuple[list[int], list[int]]) -> tuple[np.ndarray, np.ndarray]:
+def resampled(
+    path: Path, sample_time_s: float, columns: tuple[list[int], list[int]]
+) -> tuple[np.ndarray, np.ndarray]:
     """Inputs held and outputs interpolated on a clock of `sample_time_s`: the makers' stamps are jittered."""
     record = np.genfromtxt(path, delimiter=",", skip_header=1)
     t = np.arange(0.0, record[-1, 0], sample_time_s)
     held = np.maximum(np.searchsorted(record[:, 0], t, side="right") - 1, 0)
-    return record[held][:, columns[0]], np.column_stack([np.interp(t, record[:, 0], record[:, k]) for k in columns[1]])
+    return record[held][:, columns[0]], np.column_stack(
+        [np.interp(t, record[:, 0], record[:, k]) for k in columns[1]]
+    )
 
 
 def probed(seed: int, noise: float, samples: int = 15_000) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     signal = study_signal(rng, samples, 7, amplitudes=AMPLITUDES, bandwidth=1.65, variance=1.5)
-    found = study_probe(baam(), signal, K_DATA, x0=np.full(6, 50.0), noise=noise * rng.standard_normal((samples, 5)))
+    found = study_probe(
+        baam(), signal, K_DATA, x0=np.full(6, 50.0), noise=noise * rng.standard_normal((samples, 5))
+    )
     return found.u, found.y
 
 
 def records() -> dict[str, tuple[np.ndarray, np.ndarray, int]]:
     """u, y and the first sample of the hold-out of each set."""
-    dryer, evaporator, glass = (np.loadtxt(SHARED / "daisy_a" / f"{name}.dat") for name in ("dryer", "evaporator", "glassfurnace"))
+    dryer, evaporator, glass = (
+        np.loadtxt(SHARED / "daisy_a" / f"{name}.dat") for name in ("dryer", "evaporator", "glassfurnace")
+    )
     prbs = np.genfromtxt(SHARED / "tclab_mlid_prbs" / "prbs.csv", delimiter=",", skip_header=1)
     balance = resampled(SHARED / "tclab_apmonitor" / "energy_balance_mimo.csv", 1.0, ([1, 2], [3, 4]))
     return {
@@ -124,7 +147,9 @@ def control_plant(u: np.ndarray, y: np.ndarray, order: int) -> Plant:
     """Markov parameters by python-control's least squares, realised by its eigensystem algorithm."""
     lags = max(20, 6 * order)
     H = control.markov(y.T, u.T, m=lags)
-    model, _ = control.eigensys_realization(np.asarray(H).reshape(y.shape[1], u.shape[1], -1), order, m=lags // 2, n=lags // 2 - 1)
+    model, _ = control.eigensys_realization(
+        np.asarray(H).reshape(y.shape[1], u.shape[1], -1), order, m=lags // 2, n=lags // 2 - 1
+    )
     return make_plant(model.A, model.B, model.C, model.D)
 
 
@@ -146,12 +171,19 @@ def installed_peers() -> dict[str, Callable]:
 
 
 def hold_out(name: str, u: np.ndarray, y: np.ndarray, cut: int, peers: dict[str, Callable]) -> dict:
-    """Mean NRMSE over the outputs, means of the hold-out removed to score, for ours and each peer at our number of states, delays included; the peers get data without their means."""
+    """Mean NRMSE over the outputs, means of the hold-out removed to score, for ours and each peer at our
+    number of states, delays included; the peers get data without their means."""
     settings = {"sample_time_s": 1.0, "feedthrough": None}
     ours, seconds = timed(identify, [u[:cut]], [y[:cut]], **settings, refinement="validated")
     rough, rough_seconds = timed(identify, [u[:cut]], [y[:cut]], **settings)
     test = ([u[cut:]], [y[cut:]])
-    row = {"order": ours.order, "past": ours.past, "delays": list(ours.delays), "fit": ours.fit, "ours_s": round(seconds, 2)}
+    row = {
+        "order": ours.order,
+        "past": ours.past,
+        "delays": list(ours.delays),
+        "fit": ours.fit,
+        "ours_s": round(seconds, 2),
+    }
     row["ours_percent"] = simulate_fit(ours.plant, *test, means_removed=True).round(2).tolist()
     row["ours_raw_percent"] = simulate_fit(ours.plant, *test).round(2).tolist()
     row["error_percent"] = round(100 - float(np.mean(row["ours_percent"])), 2)
@@ -170,7 +202,13 @@ def hold_out(name: str, u: np.ndarray, y: np.ndarray, cut: int, peers: dict[str,
             if not np.isfinite(score).all():
                 raise ValueError("the simulation of the hold-out is not finite")
             row[peer] = {"error_percent": round(100 - float(score.mean()), 2), "s": round(seconds, 2)}
-        except (ValueError, np.linalg.LinAlgError, TypeError, ZeroDivisionError, control.ControlArgument) as failure:
+        except (
+            ValueError,
+            np.linalg.LinAlgError,
+            TypeError,
+            ZeroDivisionError,
+            control.ControlArgument,
+        ) as failure:
             row[peer] = {"failed": str(failure)[:120]}
     return row
 
@@ -179,7 +217,9 @@ def parity(sets) -> dict:
     u, y, _ = sets["dryer"]
     poles = np.sort_complex(np.linalg.eigvals(moesp([u], [y], 15, 4)[0].A))
     out = {
-        "singular_values_relative": float(np.abs(moesp_singular_values([u], [y], 15)[:6] / PRINTED_SINGULAR_VALUES - 1).max()),
+        "singular_values_relative": float(
+            np.abs(moesp_singular_values([u], [y], 15)[:6] / PRINTED_SINGULAR_VALUES - 1).max()
+        ),
         "pole_error": float(np.abs(poles - PRINTED_POLES).max()),
     }
     for name, (block_rows, order, published) in ERR1.items():
@@ -219,7 +259,9 @@ def study_plant(sets: int = 20) -> dict:
         "best_s": round(min(s for _, s in runs), 3),
     }
     u, y = probed(0, 0.1)
-    out["fixed_order_s"] = round(min(timed(identify, [u], [y], sample_time_s=1.0, order=6, past=24)[1] for _ in range(3)), 3)
+    out["fixed_order_s"] = round(
+        min(timed(identify, [u], [y], sample_time_s=1.0, order=6, past=24)[1] for _ in range(3)), 3
+    )
     return out
 
 
@@ -261,7 +303,8 @@ def arx_lags(u: np.ndarray, y: np.ndarray, price: Callable[[int], float]) -> int
 
 
 def subspace_plants(u: np.ndarray, y: np.ndarray) -> Iterator[tuple[str, Plant]]:
-    """Every plain subspace model of order 1 to 12: windows 5 to 40 and past-output MOESP of 10 and 15 block rows, poles drawn into the unit circle."""
+    """Every plain subspace model of order 1 to 12: windows 5 to 40 and past-output MOESP of 10 and 15 block
+    rows, poles drawn into the unit circle."""
     for past in (5, 10, 20, 40):
         for feedthrough in (False, True):
             try:
@@ -280,14 +323,18 @@ def subspace_plants(u: np.ndarray, y: np.ndarray) -> Iterator[tuple[str, Plant]]
 
 
 def foreign(name: str, seed: int) -> dict:
-    """Ours by its own rule, ARX by Akaike's and Schwarz's criteria, and the subspace models that are best on the hold-out itself, which nobody could choose."""
+    """Ours by its own rule, ARX by Akaike's and Schwarz's criteria, and the subspace models that are best on
+    the hold-out itself, which nobody could choose."""
     u, y = RECORDS[name](np.random.default_rng(seed))
     cut = int(0.7 * len(u))
     train, test = (u[:cut], y[:cut]), (u[cut:], y[cut:])
-    ours, seconds = timed(identify, *([a] for a in train), sample_time_s=1.0, feedthrough=None, refinement="validated")
+    ours, seconds = timed(
+        identify, *([a] for a in train), sample_time_s=1.0, feedthrough=None, refinement="validated"
+    )
     row = {
         "samples": len(u), "inputs": u.shape[1], "outputs": y.shape[1],
-        "order": ours.order, "past": ours.past, "delays": list(ours.delays), "feedthrough": ours.feedthrough, "fit": ours.fit, "s": round(seconds, 1),
+        "order": ours.order, "past": ours.past, "delays": list(ours.delays), "feedthrough": ours.feedthrough,
+        "fit": ours.fit, "s": round(seconds, 1),
         "ours": score(ours.plant, *test),
         "arx_akaike": score(arx_plant(*train, arx_lags(*train, lambda rows: 2.0)), *test),
         "arx_schwarz": score(arx_plant(*train, arx_lags(*train, np.log)), *test),
@@ -305,7 +352,11 @@ def main() -> None:
         for name, row in result.items():
             print(
                 f"{name:20s}",
-                *(f"{key} {row[key]}" for key in ("ours", "arx_akaike", "arx_schwarz", "best_n4sid", "best_moesp") if key in row),
+                *(
+                    f"{key} {row[key]}"
+                    for key in ("ours", "arx_akaike", "arx_schwarz", "best_n4sid", "best_moesp")
+                    if key in row
+                ),
             )
         return
     peers, sets = installed_peers(), records()

@@ -1,8 +1,11 @@
-"""The front end and the scenes: frames a second from a decoded frame to its key area, the verdicts on real frames, and how hard the scenes are for the yardsticks.
+"""The front end and the scenes: frames a second from a decoded frame to its key area, the verdicts on real
+frames, and how hard the scenes are for the yardsticks.
 
-`./run python -m benchmarks.key_area` prints the tables with their bars and writes benchmarks/results/key_area.json; `... key_area speed real` runs only the parts named
-(speed, real, difficulty) and leaves the others as they were. Rates are frames a CPU second of one core, the quickest of several rounds. The real frames are the eight of
-caxton_samples and those of fast_caxton_frames in BEADLINE_SHARED (default ../shared); eight pictures allow no claim about real printers.
+`./run python -m benchmarks.key_area` prints the tables with their bars and writes
+benchmarks/results/key_area.json; `... key_area speed real` runs only the parts named (speed, real,
+difficulty) and leaves the others as they were. Rates are frames a CPU second of one core, the quickest of
+several rounds. The real frames are the eight of caxton_samples and those of fast_caxton_frames in
+BEADLINE_SHARED (default ../shared); eight pictures allow no claim about real printers.
 """
 
 import functools
@@ -33,22 +36,28 @@ WANTED = {"0021": False, "0022": False, "1111": False, "1221": False, "2120": Fa
 def gathered() -> np.ndarray:
     """The gather table of the sweep: (87, 360) places in the crop, from the tip outward."""
     angle, radius = np.deg2rad(np.arange(360)), np.arange(1, key_area.LENGTH + 1)[:, None]
-    column, row = (np.rint(key_area.SIDE // 2 + radius * v).astype(np.intp) for v in (np.cos(angle), np.sin(angle)))
+    column, row = (
+        np.rint(key_area.SIDE // 2 + radius * v).astype(np.intp) for v in (np.cos(angle), np.sin(angle))
+    )
     return row * key_area.SIDE + column
 
 
 def sweep(crop: key_area.Crop) -> np.ndarray:
-    """(360,) mean equalised level of the 87 px from the tip outward at each whole degree; the paper takes the brightest as the fresh line."""
+    """(360,) mean equalised level of the 87 px from the tip outward at each whole degree;
+    the paper takes the brightest as the fresh line."""
     samples = crop.levels.take(crop.gray.ravel().take(gathered(), mode="clip"))
     return samples.sum(axis=0, dtype=np.uint16) / key_area.LENGTH  # 87 x 255 fits in 16 bits
 
 
 def published(frame: np.ndarray, tip: tuple[float, float]) -> key_area.KeyArea:
-    """The key area as the paper takes it: along the brightest ray, never rejected; its score is the mean level of that ray."""
+    """The key area as the paper takes it: along the brightest ray, never
+    rejected; its score is the mean level of that ray."""
     c = key_area.crop(frame, tip)
     rays = sweep(c)
     angle = int(rays.argmax())
-    return key_area.KeyArea(key_area._rectangle(c, angle, 0.0), float(angle), 0.0, float(rays[angle]), c.padded_share, "")
+    return key_area.KeyArea(
+        key_area._rectangle(c, angle, 0.0), float(angle), 0.0, float(rays[angle]), c.padded_share, ""
+    )
 
 
 def rate(call: Callable[[], object], *, rounds: int = 15, calls: int = 100) -> float:
@@ -75,7 +84,9 @@ def speed() -> dict:
     table: dict[str, float] = {}
     for name, (frame, tip) in cases.items():
         table[f"{name}_sweep"] = rate(lambda f=frame, t=tip: key_area.find(f, t, least_score=LEAST))
-        table[f"{name}_direction_known"] = rate(lambda f=frame, t=tip: key_area.find(f, t, least_score=LEAST, direction_deg=90.0))
+        table[f"{name}_direction_known"] = rate(
+            lambda f=frame, t=tip: key_area.find(f, t, least_score=LEAST, direction_deg=90.0)
+        )
         table[f"{name}_published"] = rate(lambda f=frame, t=tip: published(f, t))
     crop = key_area.crop(small, (175, 175))
     table["published_sweep_alone"] = rate(lambda: sweep(crop))
@@ -91,7 +102,11 @@ def real() -> dict:
     for name, (x, y) in TIPS.items():
         frame = cv2.imread(str(DATA / f"caxton_samples/full/sample{name}.jpg"))
         at = key_area.find(frame, (x, y), least_score=LEAST)
-        near = [not key_area.find(frame, (x + i, y + j), least_score=LEAST).reason for i in range(-10, 11, 5) for j in range(-10, 11, 5)]
+        near = [
+            not key_area.find(frame, (x + i, y + j), least_score=LEAST).reason
+            for i in range(-10, 11, 5)
+            for j in range(-10, 11, 5)
+        ]
         out[name] = {
             "angle_deg": round(at.angle_deg, 1),
             "score": round(at.score, 1),
@@ -103,15 +118,24 @@ def real() -> dict:
     while (read := video.read())[0]:
         frames.append(read[1])
     found = key_area.find_all(frames, (301, 190), least_score=LEAST)
-    out["nozzle_video"] = {"frames": len(frames), "accepted": int(found.valid.sum()), "least_score": round(float(found.score.min()), 1)}
+    out["nozzle_video"] = {
+        "frames": len(frames),
+        "accepted": int(found.valid.sum()),
+        "least_score": round(float(found.score.min()), 1),
+    }
     stills = [cv2.imread(str(path)) for path in sorted((DATA / "fast_caxton_frames/imgs").glob("*.jpg"))]
     found = key_area.find_all(stills, (134, 120), least_score=LEAST)
-    out["stills"] = {"frames": len(stills), "accepted": int(found.valid.sum()), "least_score": round(float(found.score.min()), 1)}
+    out["stills"] = {
+        "frames": len(stills),
+        "accepted": int(found.valid.sum()),
+        "least_score": round(float(found.score.min()), 1),
+    }
     return out
 
 
 def difficulty() -> dict:
-    """Accuracy on segments never seen, three seeds: 60 segments x 5 images for each combination to train, 14 x 20 to test."""
+    """Accuracy on segments never seen, three seeds: 60 segments x 5 images
+    for each combination to train, 14 x 20 to test."""
     rows = []
     for seed in range(3):
         rng = np.random.default_rng(seed)
@@ -120,11 +144,15 @@ def difficulty() -> dict:
         v, w = seen.valid, test.valid
         rule = yardsticks.fit_width_rule(seen.images[v], seen.label[v])
         begin = time.process_time()
-        fitted = yardsticks.fit_profile_machine(seen.images[v], seen.temperature[v], seen.label[v], seen.segment[v])
+        fitted = yardsticks.fit_profile_machine(
+            seen.images[v], seen.temperature[v], seen.label[v], seen.segment[v]
+        )
         took = time.process_time() - begin
         p = yardsticks.profile_probabilities(fitted, test.images[w], test.temperature[w])
         label, segment = test.label[w], test.segment[w]
-        window = [np.log(p[segment == s]).sum(axis=0).argmax() == label[segment == s][0] for s in np.unique(segment)]
+        window = [
+            np.log(p[segment == s]).sum(axis=0).argmax() == label[segment == s][0] for s in np.unique(segment)
+        ]
         rows.append(
             {
                 "valid": round(float(w.mean()), 3),
@@ -134,7 +162,10 @@ def difficulty() -> dict:
                 "fit_s": round(took, 1),
             }
         )
-    return {"seeds": rows, "notes": {"width_rule": 0.638, "profile_machine": 0.747, "profile_machine_window": 0.860}}
+    return {
+        "seeds": rows,
+        "notes": {"width_rule": 0.638, "profile_machine": 0.747, "profile_machine_window": 0.860},
+    }
 
 
 def main() -> None:

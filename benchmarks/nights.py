@@ -1,11 +1,15 @@
-"""Sixty nights of the nightly job on a made-up machine: recordings as CSV in the users' format, one a night, with seeds; then drift, bad nights and a planted challenger.
+"""Sixty nights of the nightly job on a made-up machine: recordings as CSV in the users' format, one a night,
+with seeds; then drift, bad nights and a planted challenger.
 
-`nice ./run python -m benchmarks.nights [null|alarms|drift|bad|planted ...]` plays the scenarios named (default: all), prints the figures beside the bars, and writes
-benchmarks/results/nights.json. Each night is `pipeline.nightly.night.nightly` itself in a git repository of its own; only `dvc repro` is replaced by a call of the same stages in one
-process, because starting five of them takes longer than their work. `--dvc` plays it with `dvc repro`.
+`nice ./run python -m benchmarks.nights [null|alarms|drift|bad|planted ...]` plays the scenarios
+named (default: all), prints the figures beside the bars, and writes benchmarks/results/nights.json.
+Each night is `pipeline.nightly.night.nightly` itself in a git repository of its own; only `dvc
+repro` is replaced by a call of the same stages in one process, because starting five of them takes
+longer than their work. `--dvc` plays it with `dvc repro`.
 
-The machine: two heated zones (60 and 90 s, 1.6 and 1.2 °C per percent) that warm each other, 20 °C around them give or take 0.5 °C a night, 0.1 °C of sensor noise. The judge of all is
-the machine itself: what a promotion was worth is measured on it, not on the panel that the job judged by.
+The machine: two heated zones (60 and 90 s, 1.6 and 1.2 °C per percent) that warm each other, 20 °C around
+them give or take 0.5 °C a night, 0.1 °C of sensor noise. The judge of all is the machine itself: what a
+promotion was worth is measured on it, not on the panel that the job judged by.
 """
 
 import argparse
@@ -39,8 +43,14 @@ START = datetime.datetime(2030, 1, 1, 2, 0, tzinfo=datetime.UTC)
 TIME_CONSTANTS_S, GAINS = np.array([60.0, 90.0]), np.array([1.6, 1.2])
 
 
-def machine(*, gain: tuple[float, float] = (1.0, 1.0), slower: tuple[float, float] = (1.0, 1.0), ambient: float = AMBIENT_DEGC) -> Plant:
-    """Two zones: tau_i dy_i = K_i u_i + ambient + 0.1 (y_j - y_i) - (y_i - ambient), sampled each second; gains and time constants as shares of the nominal ones."""
+def machine(
+    *,
+    gain: tuple[float, float] = (1.0, 1.0),
+    slower: tuple[float, float] = (1.0, 1.0),
+    ambient: float = AMBIENT_DEGC,
+) -> Plant:
+    """Two zones: tau_i dy_i = K_i u_i + ambient + 0.1 (y_j - y_i) - (y_i - ambient), sampled each second;
+    gains and time constants as shares of the nominal ones."""
     tau, K = TIME_CONSTANTS_S * slower, GAINS * gain
     F = np.array([[-1.1, 0.1], [0.1, -1.1]]) / tau[:, None]
     G = np.column_stack([np.diag(K) / tau[:, None], ambient / tau])
@@ -49,9 +59,15 @@ def machine(*, gain: tuple[float, float] = (1.0, 1.0), slower: tuple[float, floa
 
 
 def recording(
-    truth: Plant, seed: int, *, samples: int = SAMPLES, aim_degC: tuple[float, float] = (0.0, 0.0), dither: float = 8.0
+    truth: Plant,
+    seed: int,
+    *,
+    samples: int = SAMPLES,
+    aim_degC: tuple[float, float] = (0.0, 0.0),
+    dither: float = 8.0,
 ) -> dict[str, np.ndarray]:
-    """A shift of the machine under its operator's loop, dithered, which aims so far beside the references: columns as a user's CSV has them."""
+    """A shift of the machine under its operator's loop, dithered, which aims so far beside the references:
+    columns as a user's CSV has them."""
     rng = np.random.default_rng(seed)
     x0, u0 = hold_output(truth, REFERENCE)
     signal = prbs(rng, samples, 2, amplitude=dither, shortest=20)
@@ -77,7 +93,9 @@ def recording(
     }
 
 
-def a_night(seed: int, index: int, *, loop: dict | None = None, colder_degC: float = 0.0, **changes) -> dict[str, np.ndarray]:
+def a_night(
+    seed: int, index: int, *, loop: dict | None = None, colder_degC: float = 0.0, **changes
+) -> dict[str, np.ndarray]:
     """The recording of one night: `loop` are settings of `recording`, `changes` those of the machine."""
     rng = np.random.default_rng([seed, index])
     truth = machine(ambient=AMBIENT_DEGC - colder_degC + rng.uniform(-0.5, 0.5), **changes)
@@ -92,7 +110,8 @@ def write(path: Path, columns: dict[str, np.ndarray]) -> None:
 
 
 def project(folder: Path, seed: int, *, recordings: int = 4, with_dvc: bool = False) -> None:
-    """A repository with the temperature loop's stages, `recordings` nights recorded, three held out, and the first champion made; the working directory is in it afterwards."""
+    """A repository with the temperature loop's stages, `recordings` nights recorded, three held out, and the
+    first champion made; the working directory is in it afterwards."""
     folder.mkdir(parents=True)
     for name in ("pipeline", "stages"):
         (folder / name).symlink_to(ROOT / name)
@@ -126,29 +145,44 @@ def project(folder: Path, seed: int, *, recordings: int = 4, with_dvc: bool = Fa
 
 
 def settings() -> dict:
-    """The project's own parameters, of both files, for this machine and small; section nightly as the tests have it."""
+    """The project's own parameters, of both files, for this machine
+    and small; section nightly as the tests have it."""
     from tests.nightly.toy_nights import SETTINGS
 
     found = params.read(ROOT / "params.yaml")
     signal = {"unit": "percent", "low": 0, "high": 100}
     found["plant"] = {
         "sample_time_s": 1.0, "inputs": [{"name": f"heater_{k}", **signal} for k in (1, 2)],
-        "outputs": [{"name": f"sensor_{k}", "unit": "degC", "reference": float(REFERENCE[k - 1])} for k in (1, 2)],
+        "outputs": [{"name": f"sensor_{k}", "unit": "degC", "reference": float(REFERENCE[k - 1])} for k in (1,
+        2)],
     }  # fmt: skip
-    found["execution"] |= {"jobs": 1}  # a night's recordings are few: workers would take longer to start than to work
+    found["execution"] |= {
+        "jobs": 1
+    }  # a night's recordings are few: workers would take longer to start than to work
     found["generate_probing"] |= {"source": "recordings", "samples": 100}
-    found["panel"] |= {"steps": 150, "noise_degC": [0.1], "training": {"starts_degC": [60], "reference_offsets_degC": [0], "seeds": [101]}}
+    found["panel"] |= {
+        "steps": 150,
+        "noise_degC": [0.1],
+        "training": {"starts_degC": [60], "reference_offsets_degC": [0], "seeds": [101]},
+    }
     found["learn_kernel"] |= {"longest_window": 8}
     found["identify_plant"] |= {"max_order": 3}
-    found["tune_weights"] |= {"initial": 4, "evaluations": 8, "practical_initial": 8, "practical_evaluations": 14}
+    found["tune_weights"] |= {
+        "initial": 4,
+        "evaluations": 8,
+        "practical_initial": 8,
+        "practical_evaluations": 14,
+    }
     found["nightly"] = SETTINGS | {
         "loops": {
             "temperature": {
-                "artifacts": ["datasets/identify_plant/plant.parquet", "datasets/learn_kernel/window.parquet", "datasets/tune_weights/weights.json"],
+                "artifacts": ["datasets/identify_plant/plant.parquet", "datasets/learn_kernel/window.parquet",
+                "datasets/tune_weights/weights.json"],
                 "judge": "temperature", "cases": "", "recordings": "datasets/raw/temperature",
             }
         },
-        "holdout": SETTINGS["holdout"] | {"starts_degC": [50, 90], "reference_offsets_degC": [0, -10], "seeds": [901, 902]},
+        "holdout": SETTINGS["holdout"] | {"starts_degC": [50, 90], "reference_offsets_degC": [0, -10],
+        "seeds": [901, 902]},
     }  # fmt: skip
     found["nightly"]["holdout"]["steps"] = 150
     return found
@@ -190,7 +224,8 @@ def play(index: int, columns: dict[str, np.ndarray] | None) -> tuple[int, str, d
 
 
 def true_cost(folder: Path) -> float:
-    """What the controller below `folder` costs on the machine itself, over starts, references and seeds of its own."""
+    """What the controller below `folder` costs on the machine itself,
+    over starts, references and seeds of its own."""
     p = params.read()
     made, _, weights = judge.controller(folder, p["nightly"]["holdout"]["controller"], p["tracking"]["gamma"])
     limits = (np.zeros(2), np.full(2, 100.0))
@@ -207,11 +242,16 @@ def true_cost(folder: Path) -> float:
     )
     law = made.design(weights["q"], weights["r"], p["tracking"]["integral"])
     run = scorecard.simulate(
-        scenarios, law, scorecard.feed_forward(scenarios, law, judging.targets(made.model, scenarios.r, limits)), limits=limits,
+        scenarios, law, scorecard.feed_forward(scenarios, law, judging.targets(made.model, scenarios.r,
+        limits)), limits=limits,
         integral_band=p["tracking"]["integral_limit_degC"],
     )  # fmt: skip
-    allowance = scorecard.Allowance(*(p["tune_weights"][f"allow_{name}"] for name in scorecard.Allowance._fields[:-1]), 0.0)
-    figures = scorecard.figures(scenarios, run, limits=limits, band=p["panel"]["band_degC"], sample_time_s=1.0)
+    allowance = scorecard.Allowance(
+        *(p["tune_weights"][f"allow_{name}"] for name in scorecard.Allowance._fields[:-1]), 0.0
+    )
+    figures = scorecard.figures(
+        scenarios, run, limits=limits, band=p["panel"]["band_degC"], sample_time_s=1.0
+    )
     return scorecard.engineering_cost(figures, scenarios.plant, allowance, longest_s=150.0)
 
 
@@ -219,7 +259,8 @@ def true_cost(folder: Path) -> float:
 
 
 def null(seed: int, count: int, folder: Path, with_dvc: bool, *, learn: bool = True) -> dict:
-    """`count` nights with no change of the machine; without learning after the first one, they say how many alarms are false, in a tenth of the time."""
+    """`count` nights with no change of the machine; without learning after the first one, they say how many
+    alarms are false, in a tenth of the time."""
     project(folder, seed, with_dvc=with_dvc)
     promotions, alarms, worse, costs, seconds = [], [], 0, [], []
     for k in range(4, 4 + count):
@@ -238,23 +279,32 @@ def null(seed: int, count: int, folder: Path, with_dvc: bool, *, learn: bool = T
         costs.append(true_cost(champion.FOLDER / "temperature"))
         print(f"  {said[:230]}", flush=True)
     return {
-        "nights": count, "seed": seed, "false_alarms": len(alarms), "alarms": alarms, "promotions": len(promotions) - 1, "first_champion": promotions[0][0],
-        "promotions_on_the_machine": promotions[1:], "worse_promoted": worse, "seconds_a_night": float(np.median(seconds)),
+        "nights": count, "seed": seed, "false_alarms": len(alarms), "alarms": alarms,
+        "promotions": len(promotions) - 1, "first_champion": promotions[0][0],
+        "promotions_on_the_machine": promotions[1:], "worse_promoted": worse,
+        "seconds_a_night": float(np.median(seconds)),
     }  # fmt: skip
 
 
 def drifted(seed: int, folder: Path, with_dvc: bool) -> dict:
-    """10 % of a gain or a time constant, up and down, each from a fresh clone of the same settled project: nights until the alarm, and the cause it names."""
+    """10 % of a gain or a time constant, up and down, each from a fresh clone of the same settled project:
+    nights until the alarm, and the cause it names."""
     project(folder / "base", seed, with_dvc=with_dvc)
     status, said, _ = play(4, None)
     assert status == night.OK, said
     os.chdir("/")
-    night._reproduce = lambda *_: None  # drift is found before anything is learned, and the challenger is not asked for here
+    night._reproduce = lambda *_: (
+        None
+    )  # drift is found before anything is learned, and the challenger is not asked for here
     found = {}
     for name, changes in {
-        "gain of heater_1 -10 %": {"gain": (0.9, 1.0)}, "gain of heater_1 +10 %": {"gain": (1.1, 1.0)}, "gain of heater_2 -10 %": {"gain": (1.0, 0.9)},
-        "gain of both -10 %": {"gain": (0.9, 0.9)}, "time constant of zone 1 +10 %": {"slower": (1.1, 1.0)}, "time constant of zone 2 -10 %": {"slower": (1.0, 0.9)},
-        "time constants of both +10 %": {"slower": (1.1, 1.1)}, "15 °C colder around it": {"colder_degC": 15.0}, "heaters at their limits": {"loop": {"dither": 30.0}},
+        "gain of heater_1 -10 %": {"gain": (0.9, 1.0)}, "gain of heater_1 +10 %": {"gain": (1.1, 1.0)},
+        "gain of heater_2 -10 %": {"gain": (1.0, 0.9)},
+        "gain of both -10 %": {"gain": (0.9, 0.9)}, "time constant of zone 1 +10 %": {"slower": (1.1, 1.0)},
+        "time constant of zone 2 -10 %": {"slower": (1.0, 0.9)},
+        "time constants of both +10 %": {"slower": (1.1, 1.1)},
+        "15 °C colder around it": {"colder_degC": 15.0},
+        "heaters at their limits": {"loop": {"dither": 30.0}},
     }.items():  # fmt: skip
         shutil.copytree(folder / "base", folder / "now", symlinks=True)
         os.chdir(folder / "now")
@@ -262,7 +312,10 @@ def drifted(seed: int, folder: Path, with_dvc: bool) -> dict:
         for k in (5, 6, 7):
             nights += 1
             causes = [
-                one["cause"] for one in play(k, a_night(seed, k + 10 * zlib.crc32(name.encode()) % 1000, **changes))[2]["drift"]["alarms"]
+                one["cause"]
+                for one in play(k, a_night(seed, k + 10 * zlib.crc32(name.encode()) % 1000, **changes))[2][
+                    "drift"
+                ]["alarms"]
             ]
             if causes:
                 break
@@ -292,14 +345,20 @@ def bad(seed: int, folder: Path, with_dvc: bool) -> dict:
         "not a number": good | {"sensor_1": np.full(SAMPLES, np.nan)},
     }
     for k, (name, columns) in enumerate(wrong.items()):
-        files, run = champion.md5s(champion.FOLDER / "temperature"), champion.read()["champions"]["temperature"]["run"]
+        files, run = (
+            champion.md5s(champion.FOLDER / "temperature"),
+            champion.read()["champions"]["temperature"]["run"],
+        )
         path = Path(f"datasets/raw/temperature/bad_{k}.csv")
         if columns is None:
             path.write_bytes(b"")
         else:
             write(path, columns)
         status, said, _ = play(10 + 2 * k, None)
-        same = champion.md5s(champion.FOLDER / "temperature") == files and champion.read()["champions"]["temperature"]["run"] == run
+        same = (
+            champion.md5s(champion.FOLDER / "temperature") == files
+            and champion.read()["champions"]["temperature"]["run"] == run
+        )
         path.unlink(missing_ok=True)
         after = play(11 + 2 * k, a_night(seed, 11 + 2 * k))
         found[name] = {
@@ -314,7 +373,8 @@ def bad(seed: int, folder: Path, with_dvc: bool) -> dict:
 
 
 def planted(seed: int, folder: Path, with_dvc: bool) -> dict:
-    """The champion is made 10 % worse than what a night learns, by weights on its inputs: nights until the challenger is promoted."""
+    """The champion is made 10 % worse than what a night learns, by weights on its
+    inputs: nights until the challenger is promoted."""
     project(folder, seed, with_dvc=with_dvc)
     play(4, None)
     from pipeline.nightly.settings import Nightly
@@ -325,8 +385,14 @@ def planted(seed: int, folder: Path, with_dvc: bool) -> dict:
     weights = artifacts.read_json(own)
 
     def cost(share: float) -> float:
-        artifacts.write_json(own, weights | {"practical": weights["practical"] | {"r": [r * share for r in weights["practical"]["r"]]}})
-        return float(np.mean([value for _, value in measured(champion.FOLDER / "temperature").cases.values()]))
+        artifacts.write_json(
+            own,
+            weights
+            | {"practical": weights["practical"] | {"r": [r * share for r in weights["practical"]["r"]]}},
+        )
+        return float(
+            np.mean([value for _, value in measured(champion.FOLDER / "temperature").cases.values()])
+        )
 
     best, low, high = cost(1.0), 0.0, 6.0
     for _ in range(14):

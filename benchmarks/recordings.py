@@ -1,6 +1,8 @@
-"""Rows or messages per second and peak memory of reading recordings of three lengths, CRCs checked, on one core.
+"""Rows or messages per second and peak memory of reading recordings of
+three lengths, CRCs checked, on one core.
 
-`./run python -m benchmarks.recordings` prints the figures beside the bars and writes benchmarks/results/recordings.json.
+`./run python -m benchmarks.recordings` prints the figures beside the bars and writes
+benchmarks/results/recordings.json.
 """
 
 import json
@@ -46,14 +48,22 @@ def write(path: Path, kind: str, count: int) -> None:
     if kind == "csv":
         with path.open("w") as stream:
             stream.write(",".join(["t_s", *NAMES]) + "\n")
-            stream.writelines(f"{k / 100}," + ",".join(map(repr, row)) + "\n" for k, row in enumerate(rows(count)))
+            stream.writelines(
+                f"{k / 100}," + ",".join(map(repr, row)) + "\n" for k, row in enumerate(rows(count))
+            )
         return
     if kind == "parquet":
         columns = np.array(list(rows(count))).T
-        pq.write_table(pa.table({"t_s": np.arange(count) / 100, **dict(zip(NAMES, columns, strict=True))}), path, row_group_size=count)
+        pq.write_table(
+            pa.table({"t_s": np.arange(count) / 100, **dict(zip(NAMES, columns, strict=True))}),
+            path,
+            row_group_size=count,
+        )
         return
     numbers = "".join(f"float64 {name}\n" for name in NAMES)
-    schema = {"json": b"", "cdr": numbers.encode(), "cdr_header": (HEADER + numbers + HEADER_TYPES).encode()}[kind]
+    schema = {"json": b"", "cdr": numbers.encode(), "cdr_header": (HEADER + numbers + HEADER_TYPES).encode()}[
+        kind
+    ]
     fixed, headed = struct.Struct(f"<4x{len(NAMES)}d"), struct.Struct(f"<4xiII12s{len(NAMES)}d")
 
     def message(k: int, row: list[float]) -> bytes:
@@ -61,7 +71,10 @@ def write(path: Path, kind: str, count: int) -> None:
             return json.dumps(dict(zip(NAMES, row, strict=True))).encode()
         if kind == "cdr":
             return b"\x00\x01\x00\x00" + fixed.pack(*row)[4:]
-        return b"\x00\x01\x00\x00" + headed.pack(k // 100, k % 100 * 10_000_000, 12, b"base_barrel\x00", *row)[4:]
+        return (
+            b"\x00\x01\x00\x00"
+            + headed.pack(k // 100, k % 100 * 10_000_000, 12, b"base_barrel\x00", *row)[4:]
+        )
 
     with path.open("wb") as stream:
         writer = Writer(stream)
@@ -98,14 +111,22 @@ def measure(reader: Callable[[Path], int], path: Path, kind: str) -> dict[str, f
     start = time.process_time()
     count = reader(path)
     seconds = time.process_time() - start
-    return {"rows": count, "rows_per_s": count / seconds, "peak_MB": peak_MB(), "above_warm_MB": peak_MB() - before}
+    return {
+        "rows": count,
+        "rows_per_s": count / seconds,
+        "peak_MB": peak_MB(),
+        "above_warm_MB": peak_MB() - before,
+    }
 
 
 def peak_MB(*, again: bool = False) -> float:
-    """The largest memory that this process has had, `again` from now on; what its parent had is not in it, as in getrusage it is."""
+    """The largest memory that this process has had, `again` from now on; what its
+    parent had is not in it, as in getrusage it is."""
     if again:
         Path("/proc/self/clear_refs").write_text("5")
-    found = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM"))
+    found = next(
+        line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM")
+    )
     return int(found.split()[1]) / 1024
 
 
@@ -113,7 +134,9 @@ def apart(reader: str, path: Path, kind: str) -> dict[str, float]:
     """`measure` in a process of its own, so that its peak is its own."""
     call = f"b.measure(b.{reader}, Path({str(path)!r}), {kind!r})"
     code = f"import json; from pathlib import Path; from benchmarks import recordings as b; print(json.dumps({call}))"
-    return json.loads(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout)
+    return json.loads(
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    )
 
 
 def main() -> None:
@@ -128,12 +151,15 @@ def main() -> None:
                 found["kept_MB"] = count * 4 * 8 / 2**20
                 bar = f" (bar {BARS[kind]:,})" if kind in BARS else ""
                 print(
-                    f"{kind:>11} {count:>9,} rows: {found['rows_per_s']:>9,.0f} per second{bar}, peak {found['peak_MB']:.0f} MB,"
+                    f"{kind:>11} {count:>9,} rows: {found['rows_per_s']:>9,.0f} per second{bar}, "
+                    f"peak {found['peak_MB']:.0f} MB,"
                     f" {found['above_warm_MB']:.1f} MB above warm, of which kept {found['kept_MB']:.1f} MB"
                 )
                 if kind in BARS and count == LENGTHS[1]:
                     undecoded = results[f"{kind}_mcap_package_undecoded"] = apart("package", path, kind)
-                    print(f"{'':>11} the mcap package, undecoded: {undecoded['rows_per_s']:>9,.0f} per second")
+                    print(
+                        f"{'':>11} the mcap package, undecoded: {undecoded['rows_per_s']:>9,.0f} per second"
+                    )
                 path.unlink()
     RESULTS.parent.mkdir(parents=True, exist_ok=True)
     RESULTS.write_text(json.dumps(results, indent=2) + "\n")

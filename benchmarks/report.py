@@ -1,7 +1,9 @@
 """Time, memory and size of the pages from the artifacts that are there, and of the history from git.
 
-`./run python -m benchmarks.report` prints the figures beside the bars and writes benchmarks/results/report.json. The stage runs as a process of its own, start and imports
-included, in a folder that shares the artifacts: nothing in reports/ is touched. Seconds are the best of three rounds, CPU and wall.
+`./run python -m benchmarks.report` prints the figures beside the bars and writes
+benchmarks/results/report.json. The stage runs as a process of its own, start and
+imports included, in a folder that shares the artifacts: nothing in reports/ is touched.
+Seconds are the best of three rounds, CPU and wall.
 """
 
 import json
@@ -49,7 +51,9 @@ def past() -> tuple[int, float]:
     """Runs that git holds, and the seconds from git to the text of the page."""
     started = time.perf_counter()
     found = list(history.runs(500))
-    trend.render(found, params.load(ReportRules, "report"), band_degC=params.load(Panel, "panel").band_degC, pages=[])
+    trend.render(
+        found, params.load(ReportRules, "report"), band_degC=params.load(Panel, "panel").band_degC, pages=[]
+    )
     return len(found), time.perf_counter() - started
 
 
@@ -61,7 +65,12 @@ def main() -> None:
     wall, cpu, memory = (min(values) for values in zip(*rounds, strict=True))
     runs, seconds = past()
     found = {
-        "pages": {"wall_s": round(wall, 2), "cpu_s": round(cpu, 2), "peak_MB": round(memory), "bar_s": BARS["pages_s"]},
+        "pages": {
+            "wall_s": round(wall, 2),
+            "cpu_s": round(cpu, 2),
+            "peak_MB": round(memory),
+            "bar_s": BARS["pages_s"],
+        },
         "bytes": sizes | {"bar_index": BARS["index_bytes"], "bar_page": BARS["page_bytes"]},
         "history": {"runs": runs, "wall_s": round(seconds, 3), "bar_s": BARS["history_s"]},
     }

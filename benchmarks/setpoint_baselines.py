@@ -1,8 +1,10 @@
-"""Setpoint controllers without learning on both simulators: 21 starts x 100 runs by five seeds in twelve cases, the bars beside them, and the speed of the simulator.
+"""Setpoint controllers without learning on both simulators: 21 starts x 100 runs by five seeds in twelve
+cases, the bars beside them, and the speed of the simulator.
 
-`./run python -m benchmarks.setpoint_baselines [seeds] [runs]` prints the tables and writes benchmarks/results/setpoint_baselines.json. Settings were tuned on other seeds
-and on another table of windows than they are judged on. The recorded windows are synthetic here (tests.setpoint.synthetic): those of the trained classifier are
-judged by the stage evaluate_setpoint.
+`./run python -m benchmarks.setpoint_baselines [seeds] [runs]` prints the tables and writes
+benchmarks/results/setpoint_baselines.json. Settings were tuned on other seeds and on another table of windows
+than they are judged on. The recorded windows are synthetic here (tests.setpoint.synthetic): those of the
+trained classifier are judged by the stage evaluate_setpoint.
 """
 
 import json
@@ -25,7 +27,9 @@ from pipeline.statistics import Share
 from tests.setpoint.synthetic import synthetic_table
 
 RESULTS = Path(__file__).parent / "results" / "setpoint_baselines.json"
-LEARNED = synthetic_table(np.random.default_rng(100), segments=30, windows=10)  # the filters' evidence; other tables are judged on
+LEARNED = synthetic_table(
+    np.random.default_rng(100), segments=30, windows=10
+)  # the filters' evidence; other tables are judged on
 ROBUST = {
     "accuracies": [0.7, 0.97],
     "gains": [1.0, 0.65],
@@ -46,7 +50,10 @@ CONTROLLERS = {
     "sequential test": (sequential_test(), SequentialTest(accuracy=0.746, threshold=2.86, cap=5.28)),
     "Bayes, exact model": (bayes(1), class_filter(accuracy=0.7, hazard=0.0, move_cost=0.0, outside_cost=0.0)),
     "Bayes, 2 % leak": (bayes(1), class_filter(accuracy=0.7, hazard=0.02, move_cost=0.0, outside_cost=0.0)),
-    "Bayes, class, tuned": (bayes(1), class_filter(accuracy=0.7, hazard=6e-4, move_cost=0.3, outside_cost=8.0)),
+    "Bayes, class, tuned": (
+        bayes(1),
+        class_filter(accuracy=0.7, hazard=6e-4, move_cost=0.3, outside_cost=8.0),
+    ),
     "Bayes, soft window": (
         bayes(1),
         Filter(
@@ -76,7 +83,11 @@ def rows(scores: dict[str, dict[str, Score]]) -> list[dict[str, str | float | in
         {
             "controller": name,
             "case": case,
-            **{key: value for field, entry in zip(score._fields, score, strict=True) for key, value in _flat(field, entry)},
+            **{
+                key: value
+                for field, entry in zip(score._fields, score, strict=True)
+                for key, value in _flat(field, entry)
+            },
         }
         for name, of in scores.items()
         for case, score in of.items()
@@ -87,7 +98,10 @@ def _flat(field: str, entry) -> list[tuple[str, float | int]]:
     if isinstance(entry, Share):
         return [(field, entry.percent), (f"{field}_low", entry.low), (f"{field}_high", entry.high)]
     if isinstance(entry, tuple):
-        return [(f"{field}_{part}", value) for part, value in zip(("flow", "temperature", "settled"), entry, strict=True)]
+        return [
+            (f"{field}_{part}", value)
+            for part, value in zip(("flow", "temperature", "settled"), entry, strict=True)
+        ]
     return [(field, entry)]
 
 
@@ -96,13 +110,16 @@ def arrays(parameters):
 
 
 def speed() -> float:
-    """Decisions a second of the paper's simulator under the proportional controller, 1,024 episodes together, best of 5."""
+    """Decisions a second of the paper's simulator under the proportional
+    controller, 1,024 episodes together, best of 5."""
     controller, parameters = CONTROLLERS["proportional"]
     conditions = jax.tree.map(lambda leaf: leaf[:1024], judging.starts(50, accuracy=0.7))
     walls = []
     for seed in range(6):
         began = time.perf_counter()
-        rollout(controller, arrays(parameters), paper_windows(), conditions, jax.random.key(seed), steps=1000).flow.block_until_ready()
+        rollout(
+            controller, arrays(parameters), paper_windows(), conditions, jax.random.key(seed), steps=1000
+        ).flow.block_until_ready()
         walls.append(time.perf_counter() - began)
     return 1024 * 1000 / min(walls[1:])
 
@@ -110,8 +127,17 @@ def speed() -> float:
 def action_ms(name: str) -> float:
     """One decision of one episode, compiled, in ms."""
     controller, parameters = CONTROLLERS[name]
-    _, observation = begin(paper_windows(), jax.tree.map(lambda leaf: leaf[0], judging.starts(1, accuracy=0.7)), jax.random.key(0))
-    act, parameters, memory, key = jax.jit(controller.act), arrays(parameters), controller.start(), jax.random.key(0)
+    _, observation = begin(
+        paper_windows(),
+        jax.tree.map(lambda leaf: leaf[0], judging.starts(1, accuracy=0.7)),
+        jax.random.key(0),
+    )
+    act, parameters, memory, key = (
+        jax.jit(controller.act),
+        arrays(parameters),
+        controller.start(),
+        jax.random.key(0),
+    )
     walls = []
     for _ in range(300):
         began = time.perf_counter()
@@ -126,15 +152,24 @@ def main(seeds: int, runs: int) -> None:
     for name, (controller, parameters) in CONTROLLERS.items():
         for seed in range(seeds):
             table = recorded_windows(synthetic_table(np.random.default_rng(seed), segments=30, windows=10))
-            for number, (case, (windows, conditions)) in enumerate(judging.cases(table, runs=runs, segment=10.0).items()):
+            for number, (case, (windows, conditions)) in enumerate(
+                judging.cases(table, runs=runs, segment=10.0).items()
+            ):
                 key = jax.random.fold_in(jax.random.key(seed), number)
-                scores[seed][name][case] = judging.evaluate(controller, arrays(parameters), windows, conditions, key)
-        print(f"\n{name}\n{'worst of ' + str(seeds) + ' seeds':28} settled  stay  recovered  median  p90  overshoot  error")
+                scores[seed][name][case] = judging.evaluate(
+                    controller, arrays(parameters), windows, conditions, key
+                )
+        print(
+            f"\n{name}\n{'worst of ' + str(seeds) + ' seeds':28} settled  stay  recovered  median  "
+            "p90  overshoot  error"
+        )
         for case in scores[0][name]:
             of = [scores[seed][name][case] for seed in range(seeds)]
             print(
-                f"{case:28} {min(s.settled.percent for s in of):6.1f} {min(s.stay.percent for s in of):6.1f} {min(s.recovered.percent for s in of):8.1f} "
-                f"{max(s.median_steps for s in of):8.0f} {max(s.p90_steps for s in of):5.0f} {max(s.overshoot_p95 for s in of):8.0f} {max(s.flow_error for s in of):8.1f}",
+                f"{case:28} {min(s.settled.percent for s in of):6.1f} {min(s.stay.percent for s in of):6.1f} "
+                f"{min(s.recovered.percent for s in of):8.1f} "
+                f"{max(s.median_steps for s in of):8.0f} {max(s.p90_steps for s in of):5.0f} "
+                f"{max(s.overshoot_p95 for s in of):8.0f} {max(s.flow_error for s in of):8.1f}",
                 flush=True,
             )
     choices = [judging.choose(of) for of in scores.values()]

@@ -1,8 +1,10 @@
-"""Our kernel beside the published form of Algorithm 2, vectorised: CPU seconds on one core and peak memory above the imports, in one run.
+"""Our kernel beside the published form of Algorithm 2, vectorised: CPU seconds on one
+core and peak memory above the imports, in one run.
 
-`./run python -m benchmarks.temperature` prints the figures beside the bars and writes benchmarks/results/temperature.json. Each figure is the median of several
-fresh processes; the naive form, a minute and more, has one. Both forms get the same tuples (N = 6, 15,000 samples, the study's reference, mu = 1e-4) and make
-500 iterations.
+`./run python -m benchmarks.temperature` prints the figures beside the bars and writes
+benchmarks/results/temperature.json. Each figure is the median of several fresh processes; the
+naive form, a minute and more, has one. Both forms get the same tuples (N = 6, 15,000 samples, the
+study's reference, mu = 1e-4) and make 500 iterations.
 """
 
 import json
@@ -17,7 +19,14 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.temperature.kernel import Tuples, quadratic_gram, regress, tuples, tuples_with_reference, value_iteration
+from pipeline.temperature.kernel import (
+    Tuples,
+    quadratic_gram,
+    regress,
+    tuples,
+    tuples_with_reference,
+    value_iteration,
+)
 from pipeline.temperature.plant import baam
 from pipeline.temperature.published import GAMMA, REFERENCE
 from pipeline.temperature.study import data_sets
@@ -45,12 +54,16 @@ def kernel_6() -> Callable[[], object]:
     data = explicit()
     # every row in the Gram matrix: none is dropped or thinned out on the way into it
     assert len(data.s) == SAMPLES - 6
-    return lambda: value_iteration(regress(data, mu=1e-4), I5, I7, GAMMA, tolerance=0.0, max_iterations=ITERATIONS)
+    return lambda: value_iteration(
+        regress(data, mu=1e-4), I5, I7, GAMMA, tolerance=0.0, max_iterations=ITERATIONS
+    )
 
 
 def naive_6() -> Callable[[], object]:
     data = explicit()
-    return lambda: naive.value_iteration(data.s, data.u, data.e, data.s_next, I5, I7, GAMMA, mu=1e-4, iterations=ITERATIONS)
+    return lambda: naive.value_iteration(
+        data.s, data.u, data.e, data.s_next, I5, I7, GAMMA, mu=1e-4, iterations=ITERATIONS
+    )
 
 
 def kernel_2() -> Callable[[], object]:
@@ -86,7 +99,8 @@ def peak_MB() -> float:
 
 
 def measure(name: str) -> dict[str, float]:
-    """In this process: CPU seconds (median over `repeats`, the first left out where there are several), and peak memory above the imports and above the tuples."""
+    """In this process: CPU seconds (median over `repeats`, the first left out where there are several), and
+    peak memory above the imports and above the tuples."""
     case, _, repeats = CASES[name]
     quadratic_gram(np.ones((2, 4)))
     imports = peak_MB()
@@ -108,11 +122,17 @@ def measure(name: str) -> dict[str, float]:
 
 def fresh(name: str) -> dict[str, float]:
     """`measure` in processes of their own, one BLAS thread each: the median of each figure."""
-    environment = os.environ | {key: "1" for key in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")}
+    environment = os.environ | dict.fromkeys(
+        ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1"
+    )
     runs = [
         json.loads(
             subprocess.run(
-                [sys.executable, "-m", "benchmarks.temperature", name], env=environment, check=True, capture_output=True, text=True
+                [sys.executable, "-m", "benchmarks.temperature", name],
+                env=environment,
+                check=True,
+                capture_output=True,
+                text=True,
             ).stdout
         )
         for _ in range(CASES[name][1])
@@ -129,7 +149,12 @@ def bars(found: dict[str, dict[str, float]]) -> list[tuple[str, float, float, bo
             50.0,
             True,
         ),
-        ("N = 6, 15,000 samples: GB above the imports", found["kernel_6"]["above_imports_MB"] / 1024, 0.6, False),
+        (
+            "N = 6, 15,000 samples: GB above the imports",
+            found["kernel_6"]["above_imports_MB"] / 1024,
+            0.6,
+            False,
+        ),
         ("N = 2, 500 samples: s", found["kernel_2"]["cpu_s"], 0.05, False),
         ("new weights: ms", 1000 * found["retune_2"]["cpu_s"], 30.0, False),
         ("Riccati gains of a pair (Q, R): ms", 1000 * found["riccati"]["cpu_s"], 1.0, False),
@@ -145,17 +170,31 @@ def main() -> None:
         print(f"{name} ...", file=sys.stderr, flush=True)
         found[name] = fresh(name)
     for name, figures in found.items():
-        print(f"{name:10} {figures['cpu_s']:10.4f} CPU s {figures['above_imports_MB']:8.0f} MB above the imports")
+        print(
+            f"{name:10} {figures['cpu_s']:10.4f} CPU s {figures['above_imports_MB']:8.0f} "
+            "MB above the imports"
+        )
     table = bars(found)
     for figure, value, bar, more in table:
         held = value >= bar if more else value <= bar
-        print(f"{figure}: {value:.3g}, bar {'at least' if more else 'at most'} {bar:g}: {'held' if held else 'MISSED'}")
+        print(
+            f"{figure}: {value:.3g}, bar {'at least' if more else 'at most'} {bar:g}: "
+            f"{'held' if held else 'MISSED'}"
+        )
     result = {
         "command": "./run python -m benchmarks.temperature",
         "machine": {"cores": os.cpu_count(), "blas_threads": 1},
-        "cases": {name: {key: float(f"{value:.3g}") for key, value in figures.items()} for name, figures in found.items()},
+        "cases": {
+            name: {key: float(f"{value:.3g}") for key, value in figures.items()}
+            for name, figures in found.items()
+        },
         "figures": [
-            {"figure": figure, "value": float(f"{value:.3g}"), "bar": bar, "better": "more" if more else "less"}
+            {
+                "figure": figure,
+                "value": float(f"{value:.3g}"),
+                "bar": bar,
+                "better": "more" if more else "less",
+            }
             for figure, value, bar, more in table
         ],
     }

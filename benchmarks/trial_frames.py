@@ -1,7 +1,9 @@
-"""Frames per second on one core from an MCAP trial to the bead's section, beside bare cv2 decoding of the same bytes and the mcap package's reader; and of writing.
+"""Frames per second on one core from an MCAP trial to the bead's section, beside bare cv2 decoding of the
+same bytes and the mcap package's reader; and of writing.
 
-`./run python -m benchmarks.trial_frames` prints the figures beside the bars and writes benchmarks/results/trial_frames.json. Frames are rendered, 640 x 480 mono8, at 30 a
-second for 15 s. Times are CPU seconds, the best of five rounds in which the ways take turns.
+`./run python -m benchmarks.trial_frames` prints the figures beside the bars and writes
+benchmarks/results/trial_frames.json. Frames are rendered, 640 x 480 mono8, at 30 a second for 15 s. Times are
+CPU seconds, the best of five rounds in which the ways take turns.
 """
 
 import itertools
@@ -37,13 +39,21 @@ def rendered(count: int) -> list[np.ndarray]:
 def write(path: Path, frames: list[np.ndarray], encoding: str) -> None:
     t = np.arange(FRAMES // 30 * 50) / 50
     stream: Iterator = ((k / 30, frames[k % len(frames)]) for k in range(FRAMES))
-    signals = {"position_mm": 8 * t, "speed_mm_per_s": np.full(t.size, 8.0), "command_mm": np.sin(t), "flow_mm3_per_s": np.cos(t)}
+    signals = {
+        "position_mm": 8 * t,
+        "speed_mm_per_s": np.full(t.size, 8.0),
+        "command_mm": np.sin(t),
+        "flow_mm3_per_s": np.cos(t),
+    }
     write_trial(path, CONDITIONS, stream, time_s=t, encoding=encoding, **signals)
 
 
 def encoded(path: Path) -> list[np.ndarray]:
     """The bytes of every picture, in memory: what bare decoding begins with."""
-    return [np.frombuffer(bytes(picture.data), np.uint8) for _, picture in read_trial(path, unreadable_share=0.0).frames.pictures()]
+    return [
+        np.frombuffer(bytes(picture.data), np.uint8)
+        for _, picture in read_trial(path, unreadable_share=0.0).frames.pictures()
+    ]
 
 
 def bare(pictures: list[np.ndarray]) -> int:
@@ -67,13 +77,25 @@ def package(path: Path) -> int:
     """The mcap package's reader with its CRCs on, messages cut open by hand, decoded: no signals."""
     count = 0
     with path.open("rb") as stream:
-        for _, channel, message in make_reader(stream, validate_crcs=True).iter_messages(log_time_order=False):
+        for _, channel, message in make_reader(stream, validate_crcs=True).iter_messages(
+            log_time_order=False
+        ):
             if channel.topic == IMAGE_TOPIC:
-                count += np.frombuffer(message.data, np.uint8, 480 * 640, len(message.data) - 480 * 640).reshape(480, 640).shape[0] == 480
+                count += (
+                    np.frombuffer(message.data, np.uint8, 480 * 640, len(message.data) - 480 * 640)
+                    .reshape(480, 640)
+                    .shape[0]
+                    == 480
+                )
             elif channel.topic.startswith(IMAGE_TOPIC):
                 start = 28 + struct.unpack_from("<I", message.data, 24)[0]
                 start += -start % 4 + 4
-                count += cv2.imdecode(np.frombuffer(message.data, np.uint8, offset=start), cv2.IMREAD_GRAYSCALE).shape[0] == 480
+                count += (
+                    cv2.imdecode(
+                        np.frombuffer(message.data, np.uint8, offset=start), cv2.IMREAD_GRAYSCALE
+                    ).shape[0]
+                    == 480
+                )
     return count
 
 
@@ -97,16 +119,33 @@ def main() -> None:
             path = Path(folder) / f"{encoding}.mcap"
             start = time.process_time()
             write(path, frames, encoding)
-            found = {"written_per_s": round(FRAMES / (time.process_time() - start), 1), "MB": round(path.stat().st_size / 1e6, 1)}
-            ways = {"decoded": lambda p=path: decoded(p), "measured": lambda p=path: measured(p), "mcap_package": lambda p=path: package(p)}
+            found = {
+                "written_per_s": round(FRAMES / (time.process_time() - start), 1),
+                "MB": round(path.stat().st_size / 1e6, 1),
+            }
+            ways = {
+                "decoded": lambda p=path: decoded(p),
+                "measured": lambda p=path: measured(p),
+                "mcap_package": lambda p=path: package(p),
+            }
             if encoding != "raw":
                 pictures = encoded(path)
                 ways["bare"] = lambda p=pictures: bare(p)
             found |= rates(ways)
-            share = found["measured_per_s"] / found["bare_per_s"] if encoding != "raw" else found["measured_per_s"]
-            found |= {"measured_of_bare" if encoding != "raw" else "raw_measured_per_s": round(share, 3), "bar": bar}
+            share = (
+                found["measured_per_s"] / found["bare_per_s"]
+                if encoding != "raw"
+                else found["measured_per_s"]
+            )
+            found |= {
+                "measured_of_bare" if encoding != "raw" else "raw_measured_per_s": round(share, 3),
+                "bar": bar,
+            }
             results[encoding] = found
-            print(f"{encoding:>5}: {share:.3g} (bar {bar:g}); " + ", ".join(f"{name} {value:g}" for name, value in found.items()))
+            print(
+                f"{encoding:>5}: {share:.3g} (bar {bar:g}); "
+                + ", ".join(f"{name} {value:g}" for name, value in found.items())
+            )
     RESULTS.parent.mkdir(parents=True, exist_ok=True)
     RESULTS.write_text(json.dumps(results, indent=2) + "\n")
 

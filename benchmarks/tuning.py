@@ -1,9 +1,11 @@
-"""Costs that 150 evaluations reach: our two searches beside random search, Optuna's TPE and CMA-ES, all on log-weights, over seeds.
+"""Costs that 150 evaluations reach: our two searches beside random search,
+Optuna's TPE and CMA-ES, all on log-weights, over seeds.
 
-`./run --group peers python -m benchmarks.tuning [seeds]` prints the excess over the optimum and writes benchmarks/results/tuning.json;
-a peer that is not installed is left out, and said so. (37) is the paper's fitness; the others have their optimum elsewhere: the index at
-the paper's tuned weights, a rotated bowl of 20 weights with its optimum on bounds, a curved valley of 8, and a bowl of 12 whose optimum
-lies beside a wall behind which more than half of the domain fails.
+`./run --group peers python -m benchmarks.tuning [seeds]` prints the excess over the optimum and writes
+benchmarks/results/tuning.json; a peer that is not installed is left out, and said so. (37) is the paper's
+fitness; the others have their optimum elsewhere: the index at the paper's tuned weights, a rotated bowl of 20
+weights with its optimum on bounds, a curved valley of 8, and a bowl of 12 whose optimum lies beside a wall
+behind which more than half of the domain fails.
 """
 
 import importlib.util
@@ -27,7 +29,20 @@ RESULTS = Path(__file__).parent / "results" / "tuning.json"
 INITIAL, EVALUATIONS = 50, 150
 BARS = {"median": 151_840, "worst": 151_880, "wall_s": 10}
 TUNED = np.array(  # seed 1, (46)-(47)
-    [0.9434381, 0.7622189, 0.5422118, 0.4198321, 0.05144575, 0.2997687, 0.2696552, 0.2805254, 0.09184189, 0.05358372, 0.2685642, 0.3179601]
+    [
+        0.9434381,
+        0.7622189,
+        0.5422118,
+        0.4198321,
+        0.05144575,
+        0.2997687,
+        0.2696552,
+        0.2805254,
+        0.09184189,
+        0.05358372,
+        0.2685642,
+        0.3179601,
+    ]
 )
 
 
@@ -43,7 +58,8 @@ def unit(theta: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
 
 
 def tracking_index(weights: np.ndarray) -> Problem:
-    """The index (3) with fixed weights (12,), l = 100, from 20 °C, of the controller that a candidate designs; (37) where they are 1."""
+    """The index (3) with fixed weights (12,), l = 100, from 20 °C, of the controller
+    that a candidate designs; (37) where they are 1."""
     machine, reference = baam(), np.array([150.0, 160.0, 170.0, 175.0, 180.0])
     scale_y, scale_u = np.sqrt(weights[:5]), np.sqrt(weights[5:])
     # the same loop in units of sqrt(q) y and sqrt(r) u, so that (37) is the index with these weights
@@ -52,16 +68,23 @@ def tracking_index(weights: np.ndarray) -> Problem:
     def cost(theta: np.ndarray) -> float:
         found = gains(machine, np.diag(theta[:5]), np.diag(theta[5:]), 0.99)
         K_x, K_r = scale_u[:, None] * found.K_x, scale_u[:, None] * found.K_r / scale_y
-        return tuning.fitness(scaled, K_x, K_r, reference=scale_y * reference, gamma=0.99, steps=100, x0=np.full(6, 20.0))
+        return tuning.fitness(
+            scaled, K_x, K_r, reference=scale_y * reference, gamma=0.99, steps=100, x0=np.full(6, 20.0)
+        )
 
     return Problem(cost, np.full(12, 0.01), np.repeat([1.0, 0.4], [5, 7]), cost(weights))
 
 
 def bowl(d: int, seed: int, *, at_bounds: int = 0, wall: bool = False) -> Problem:
-    """A rotated quadratic in log-weights, condition 100; its optimum on `at_bounds` lower bounds; with a wall 5 % of the domain away."""
+    """A rotated quadratic in log-weights, condition 100; its optimum on `at_bounds`
+    lower bounds; with a wall 5 % of the domain away."""
     rng = np.random.default_rng(seed)
     lower, upper, axes = np.full(d, 1e-3), np.full(d, 10.0), np.linalg.qr(rng.standard_normal((d, d)))[0]
-    H, optimum, normal = axes @ np.diag(np.geomspace(1, 100, d)) @ axes.T, rng.uniform(0.1, 0.9, d), rng.standard_normal(d)
+    H, optimum, normal = (
+        axes @ np.diag(np.geomspace(1, 100, d)) @ axes.T,
+        rng.uniform(0.1, 0.9, d),
+        rng.standard_normal(d),
+    )
     optimum[:at_bounds] = 0.0
     normal *= np.sign((optimum - 0.5) @ normal) / np.linalg.norm(normal)
 
@@ -159,7 +182,12 @@ def timed(search: Callable[[Problem, int], float], problem: Problem, seeds: int)
         began = time.perf_counter()
         costs.append(search(problem, seed))
         walls.append(time.perf_counter() - began)
-    found = {"optimum": problem.optimum, "median": statistics.median(costs), "worst": max(costs), "costs": costs}
+    found = {
+        "optimum": problem.optimum,
+        "median": statistics.median(costs),
+        "worst": max(costs),
+        "costs": costs,
+    }
     return found | {"wall_s": statistics.median(walls)}
 
 
@@ -176,7 +204,10 @@ def main() -> None:
         for label, problem in PROBLEMS.items():
             found = results[name][label] = timed(search, problem, seeds)
             excess = found["median"] - problem.optimum, found["worst"] - problem.optimum
-            print(f"{name:>20} {label:>20}: above the optimum {excess[0]:10.4g} median {excess[1]:10.4g} worst, {found['wall_s']:5.1f} s")
+            print(
+                f"{name:>20} {label:>20}: above the optimum {excess[0]:10.4g} median {excess[1]:10.4g} "
+                f"worst, {found['wall_s']:5.1f} s"
+            )
     best = results["expected improvement"]["(37)"]
     print(*(f"(37) {key}: {best[key]:,.1f}, bar {bar:,}" for key, bar in BARS.items()), sep="\n")
     RESULTS.parent.mkdir(parents=True, exist_ok=True)

@@ -15,9 +15,15 @@ def accept(_: argparse.Namespace) -> None:
     """Mark the figures of this run as good: later reports show their differences against them."""
     from pipeline.report.shared.sources import code_files, machine
 
-    metrics = {path.stem: artifacts.read_json(path) for path in sorted(Path("reports/metrics").glob("*.json")) if path.stem not in ("report", "nightly")}
+    metrics = {
+        path.stem: artifacts.read_json(path)
+        for path in sorted(Path("reports/metrics").glob("*.json"))
+        if path.stem not in ("report", "nightly")
+    }
     if not metrics:
-        raise ValueError("reports/metrics: expected the figures of a run, found none; run ./run dvc repro first")
+        raise ValueError(
+            "reports/metrics: expected the figures of a run, found none; run ./run dvc repro first"
+        )
     files = sorted(
         path
         for path in Path("datasets").rglob("*")
@@ -33,28 +39,45 @@ def accept(_: argparse.Namespace) -> None:
         "code": code_files(("pipeline", "stages")),
     }
     artifacts.write_json("reports/accepted.json", run | {"figures": _figures()})
-    print(f"reports/accepted.json: accepted {len(metrics)} stages' figures and {len(hashes)} artifacts; commit it to keep it")
+    print(
+        f"reports/accepted.json: accepted {len(metrics)} stages' figures and {len(hashes)} artifacts; "
+        "commit it to keep it"
+    )
 
 
 def _today() -> dict[str, str]:
     """The day, and the commit that is checked out; "none" where there is none."""
-    head = subprocess.run(["git", "rev-parse", "--short=8", "HEAD"], capture_output=True, text=True, check=False)
-    return {"on": datetime.datetime.now(datetime.UTC).date().isoformat(), "commit": head.stdout.strip() if head.returncode == 0 else "none"}
+    head = subprocess.run(
+        ["git", "rev-parse", "--short=8", "HEAD"], capture_output=True, text=True, check=False
+    )
+    return {
+        "on": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "commit": head.stdout.strip() if head.returncode == 0 else "none",
+    }
 
 
 def _figures() -> dict:
-    """The figures with their bands as the pages show them; none where no page was made. Raises ValueError where the pages are of another run."""
+    """The figures with their bands as the pages show them; none where no page was made. Raises ValueError
+    where the pages are of another run."""
     if not artifacts.exists("reports/metrics/report.json"):
         return {}
     report = artifacts.read_metrics("report")
-    stale = [path for path, recorded in report["read"].items() if not artifacts.exists(path) or artifacts.sha256(path) != recorded]
+    stale = [
+        path
+        for path, recorded in report["read"].items()
+        if not artifacts.exists(path) or artifacts.sha256(path) != recorded
+    ]
     if stale:
-        raise ValueError(f"reports: the pages are of another run than {stale[0]}; run ./run dvc repro, look at them, and accept then")
+        raise ValueError(
+            f"reports: the pages are of another run than {stale[0]}; run ./run dvc repro, "
+            "look at them, and accept then"
+        )
     return report["figures"]
 
 
 def verify(_: argparse.Namespace) -> None:
-    """Hold what the pages say they were made from against dvc.lock and the files as they are now; what no longer matches is named, with exit status 1."""
+    """Hold what the pages say they were made from against dvc.lock and the files as they are now; what no
+    longer matches is named, with exit status 1."""
     from pipeline.report.shared import provenance
 
     print(provenance.told(provenance.checks()))
@@ -69,29 +92,42 @@ def history(arguments: argparse.Namespace) -> None:
     from pipeline.report.shared.verdict import ReportRules
 
     found = list(tqdm(past.runs(arguments.most), desc="history", unit=" runs", file=sys.stderr))
-    pages = [(path.stem, path.name) for path in sorted(Path("reports").glob("*.html")) if path.stem != "history"]
+    pages = [
+        (path.stem, path.name) for path in sorted(Path("reports").glob("*.html")) if path.stem != "history"
+    ]
     rules, panel = params.load(ReportRules, "report"), params.load(Panel, "panel")
-    artifacts.write_text("reports/history.html", trend.render(found, rules, band_degC=panel.band_degC, pages=pages))
+    artifacts.write_text(
+        "reports/history.html", trend.render(found, rules, band_degC=panel.band_degC, pages=pages)
+    )
     print(f"reports/history.html: {len(found)} runs, the last {found[-1].commit[:8] or 'not committed'}")
 
 
 def inspect(arguments: argparse.Namespace) -> None:
-    """What is in a recording: signals, rates, jitter, gaps, ranges, damage; and a mapping to paste into params.yaml."""
+    """What is in a recording: signals, rates, jitter, gaps, ranges,
+    damage; and a mapping to paste into params.yaml."""
     from pipeline.reading.recordings import inspect as describe
 
     print(describe(arguments.file))
 
 
 def compose(arguments: argparse.Namespace) -> None:
-    """A part program into plunger commands: signal and tasks as CSV, and whether it will print, line by line."""
+    """A part program into plunger commands: signal and tasks as CSV,
+    and whether it will print, line by line."""
     from pipeline.deposition.workflow import compose_parts
     from pipeline.deposition.workflow.segment_library import read_learned
     from pipeline.deposition.workflow.settings import ComposeParts, Printer
 
     if arguments.out.exists() and not arguments.out.is_dir():
-        raise ValueError(f"--out {arguments.out}: should be a folder but is a file; name a folder, which is made where it is missing")
-    learned = read_learned("datasets/segment_library/library.parquet", "datasets/segment_library/learned.json")
-    part = compose_parts.compose(arguments.part, learned, params.load(Printer, "printer"), params.load(ComposeParts, "compose_parts"))
+        raise ValueError(
+            f"--out {arguments.out}: should be a folder but is a file; name a folder, "
+            "which is made where it is missing"
+        )
+    learned = read_learned(
+        "datasets/segment_library/library.parquet", "datasets/segment_library/learned.json"
+    )
+    part = compose_parts.compose(
+        arguments.part, learned, params.load(Printer, "printer"), params.load(ComposeParts, "compose_parts")
+    )
     arguments.out.mkdir(parents=True, exist_ok=True)
     files = compose_parts.write(part, arguments.out)
     print(compose_parts.told(part))
@@ -99,7 +135,8 @@ def compose(arguments: argparse.Namespace) -> None:
 
 
 def calibrate_tip(arguments: argparse.Namespace) -> None:
-    """A picture of the nozzle's camera into a page on which a click gives the tip; with --tip, what the front end makes of it."""
+    """A picture of the nozzle's camera into a page on which a click gives the
+    tip; with --tip, what the front end makes of it."""
     from pipeline.setpoint.workflow.calibrate_tip import calibrate
 
     sections = params.read()
@@ -107,7 +144,8 @@ def calibrate_tip(arguments: argparse.Namespace) -> None:
         least_score = float(sections["train_classifier"]["least_score"])
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(
-            f"{params.home('train_classifier.least_score') or params.EXPERT}: train_classifier.least_score should be a number of gray levels ({error}); write one such as 10"
+            f"{params.home('train_classifier.least_score') or params.EXPERT}: "
+            f"train_classifier.least_score should be a number of gray levels ({error}); write one such as 10"
         ) from None
     topics = sections["train_classifier"].get("topics")
     topic = str(topics.get("image") or "") if isinstance(topics, dict) else ""
@@ -116,12 +154,16 @@ def calibrate_tip(arguments: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="beadline", description="Extrusion-printer recordings into controllers that can be trusted.")
+    parser = argparse.ArgumentParser(
+        prog="beadline", description="Extrusion-printer recordings into controllers that can be trusted."
+    )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     commands.add_parser("accept", help=accept.__doc__).set_defaults(run=accept)
     commands.add_parser("verify", help=verify.__doc__).set_defaults(run=verify)
     command = commands.add_parser("history", help=history.__doc__)
-    command.add_argument("--most", type=int, default=500, help="revisions to read at most, the newest first (500)")
+    command.add_argument(
+        "--most", type=int, default=500, help="revisions to read at most, the newest first (500)"
+    )
     command.set_defaults(run=history)
     command = commands.add_parser("inspect", help=inspect.__doc__)
     command.add_argument("file", type=Path)
@@ -132,7 +174,9 @@ def main() -> None:
     command.set_defaults(run=compose)
     command = commands.add_parser("calibrate-tip", help=calibrate_tip.__doc__)
     command.add_argument("image", type=Path, help="a frame of the nozzle's camera")
-    command.add_argument("--tip", default="", metavar="X,Y", help="the tip in pixels, from the left and from the top")
+    command.add_argument(
+        "--tip", default="", metavar="X,Y", help="the tip in pixels, from the left and from the top"
+    )
     command.add_argument("--out", type=Path, metavar="FILE", help="the page; default IMAGE.tip.html here")
     command.set_defaults(run=calibrate_tip)
     nights.add(commands)

@@ -1,7 +1,9 @@
-"""Is the challenger better than the champion beyond noise? Both ran the same cases; cases that share a plant, a part or a recording are one block, and blocks are what repeats.
+"""Is the challenger better than the champion beyond noise? Both ran the same cases; cases that share a plant,
+a part or a recording are one block, and blocks are what repeats.
 
-d_b = mean over the cases of block b of log(champion's cost / challenger's cost). Under "no difference" every d_b is as likely with either sign: the sign-flip test (Fisher 1935),
-exact for up to 14 blocks and by draws beyond.
+d_b = mean over the cases of block b of log(champion's cost / challenger's cost). Under
+"no difference" every d_b is as likely with either sign: the sign-flip test (Fisher
+1935), exact for up to 14 blocks and by draws beyond.
 """
 
 from collections.abc import Sequence
@@ -14,7 +16,8 @@ EXACT = 14  # blocks up to which all 2^n signs are tried
 
 
 class Paired(NamedTuple):
-    """improvement of the mean cost in percent with the ends of its 90 % interval (Student's t over blocks), and the one-sided probability that chance alone does as well."""
+    """improvement of the mean cost in percent with the ends of its 90 % interval (Student's t over blocks),
+    and the one-sided probability that chance alone does as well."""
 
     improvement_percent: float
     low_percent: float
@@ -24,12 +27,23 @@ class Paired(NamedTuple):
     blocks: int
 
 
-def paired(champion: np.ndarray, challenger: np.ndarray, block: Sequence[str], *, rng: np.random.Generator, draws: int = 20_000) -> Paired:
-    """Costs (cases,) above 0, less is better; an infinite cost of the challenger counts as a thousand times the champion's. Raises ValueError for costs that are none."""
+def paired(
+    champion: np.ndarray,
+    challenger: np.ndarray,
+    block: Sequence[str],
+    *,
+    rng: np.random.Generator,
+    draws: int = 20_000,
+) -> Paired:
+    """Costs (cases,) above 0, less is better; an infinite cost of the challenger counts as a thousand times
+    the champion's. Raises ValueError for costs that are none."""
     champion, challenger = np.asarray(champion, float), np.asarray(challenger, float)
-    if len(champion) == 0 or not (np.isfinite(champion).all() and (champion > 0).all() and (challenger >= 0).all()):
+    if len(champion) == 0 or not (
+        np.isfinite(champion).all() and (champion > 0).all() and (challenger >= 0).all()
+    ):
         raise ValueError(
-            "paired: expected costs above 0 of at least one case that both ran, found none, or one that is no cost; judge both on the same cases"
+            "paired: expected costs above 0 of at least one case that both ran, found none, "
+            "or one that is no cost; judge both on the same cases"
         )
     ratio = np.clip(challenger / champion, 1e-3, 1e3)
     names = np.asarray(block, object)
@@ -51,7 +65,6 @@ def blocks_needed(level: float) -> int:
     return int(np.ceil(np.log2(1 / level)))
 
 
-
 class Share(NamedTuple):
     """A share of runs in percent with its 95 % Wilson interval."""
 
@@ -61,7 +74,11 @@ class Share(NamedTuple):
 
 
 def wilson(happened: np.ndarray) -> Share:
-    """The share of True (n,) in percent with the interval of Wilson 1927 at 95 %: (p + z^2 / 2n +- z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n)."""
+    """The share of True (n,) in percent with the interval of Wilson 1927 at 95 %: (p + z^2 / 2n +- z sqrt(p
+    (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n)."""
     n, p, z = len(happened), float(np.mean(happened)), float(scipy.special.ndtri(0.975))
-    centre, half = (p + z**2 / (2 * n)) / (1 + z**2 / n), z * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2)) / (1 + z**2 / n)
+    centre, half = (
+        (p + z**2 / (2 * n)) / (1 + z**2 / n),
+        z * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2)) / (1 + z**2 / n),
+    )
     return Share(100.0 * p, float(100.0 * max(centre - half, 0.0)), float(100.0 * min(centre + half, 1.0)))

@@ -13,8 +13,14 @@ from pipeline.store import artifacts, params
 
 def main() -> None:
     with artifacts.stage("compose_parts") as out:
-        p, printer, taught = params.load(ComposeParts, "compose_parts"), params.load(Printer, "printer"), params.load(TrainIlc, "train_ilc")
-        learned = read_learned("datasets/segment_library/library.parquet", "datasets/segment_library/learned.json")
+        p, printer, taught = (
+            params.load(ComposeParts, "compose_parts"),
+            params.load(Printer, "printer"),
+            params.load(TrainIlc, "train_ilc"),
+        )
+        learned = read_learned(
+            "datasets/segment_library/library.parquet", "datasets/segment_library/learned.json"
+        )
         models = artifacts.read_json("datasets/train_ilc/models.json")
         parts, refused = compose_parts.compose_all(Path("datasets/parts"), learned, printer, p)
         done = compose_parts.judged(parts, learned, models, printer, p, taught)

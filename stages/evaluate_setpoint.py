@@ -1,5 +1,6 @@
-"""Agents and classifier -> who sets flow and temperature: reads datasets/train_classifier and datasets/train_agent; writes
-datasets/evaluate_setpoint: scoreboard.parquet, paths.parquet of one run from each start, decisions.parquet of two episodes through pixels,
+"""Agents and classifier -> who sets flow and temperature: reads datasets/train_classifier
+and datasets/train_agent; writes datasets/evaluate_setpoint: scoreboard.parquet,
+paths.parquet of one run from each start, decisions.parquet of two episodes through pixels,
 and choice.json, the default with its worst case."""
 
 from pipeline.setpoint.workflow import evaluate_setpoint
@@ -13,16 +14,29 @@ from pipeline.store import artifacts, params
 
 def main() -> None:
     with artifacts.stage("evaluate_setpoint") as out:
-        p, view = params.load(EvaluateSetpoint, "evaluate_setpoint"), params.load(TrainClassifier, "train_classifier")
-        known = restore_classifier("datasets/train_classifier/weights.safetensors", "datasets/train_classifier/calibration.parquet")
+        p, view = (
+            params.load(EvaluateSetpoint, "evaluate_setpoint"),
+            params.load(TrainClassifier, "train_classifier"),
+        )
+        known = restore_classifier(
+            "datasets/train_classifier/weights.safetensors", "datasets/train_classifier/calibration.parquet"
+        )
         tables = window_tables(artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS))
-        seats = evaluate_setpoint.seats(p.baselines, restore_agents("datasets/train_agent/weights.safetensors"), tables["learn"])
+        seats = evaluate_setpoint.seats(
+            p.baselines, restore_agents("datasets/train_agent/weights.safetensors"), tables["learn"]
+        )
         scores = evaluate_setpoint.scores(seats, tables["judge"], p)
         choice = evaluate_setpoint.chosen(scores)
         pixels = evaluate_setpoint.pixel_runs(seats, choice, known, p, view)
-        artifacts.write_table(out / "scoreboard.parquet", SCOREBOARD, evaluate_setpoint.scoreboard(seats, scores, pixels))
-        artifacts.write_table(out / "paths.parquet", PATHS, evaluate_setpoint.paths(seats, tables["judge"], p, pixels))
-        artifacts.write_table(out / "decisions.parquet", DECISIONS, evaluate_setpoint.decisions(choice.name, pixels))
+        artifacts.write_table(
+            out / "scoreboard.parquet", SCOREBOARD, evaluate_setpoint.scoreboard(seats, scores, pixels)
+        )
+        artifacts.write_table(
+            out / "paths.parquet", PATHS, evaluate_setpoint.paths(seats, tables["judge"], p, pixels)
+        )
+        artifacts.write_table(
+            out / "decisions.parquet", DECISIONS, evaluate_setpoint.decisions(choice.name, pixels)
+        )
         artifacts.write_json(out / "choice.json", choice)
         artifacts.write_metrics("evaluate_setpoint", evaluate_setpoint.metrics(seats, scores, choice, pixels))
 

@@ -1,5 +1,6 @@
-"""Judge every temperature controller on one panel: reads what the temperature stages wrote and datasets/published; writes
-datasets/evaluate_temperature: scorecard.parquet, trajectories.parquet, study.parquet and summary.json."""
+"""Judge every temperature controller on one panel: reads what the temperature stages wrote and
+datasets/published; writes datasets/evaluate_temperature: scorecard.parquet,
+trajectories.parquet, study.parquet and summary.json."""
 
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow import evaluate_temperature, tables
@@ -14,7 +15,8 @@ def main() -> None:
         simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
         evaluate_temperature.check(p, panel)
         known = evaluate_temperature.read_learned(
-            "datasets/identify_plant/plant.parquet", "datasets/learn_kernel/window.parquet", "datasets/learn_kernel/kernel.parquet",
+            "datasets/identify_plant/plant.parquet", "datasets/learn_kernel/window.parquet",
+            "datasets/learn_kernel/kernel.parquet",
             "datasets/tune_weights/weights.json", "datasets/identify_plant/spread.parquet",
         )  # fmt: skip
         judged = evaluate_temperature.judged(p, machine, tracking, panel, known, simulated=simulated)
@@ -24,7 +26,9 @@ def main() -> None:
         artifacts.write_table(out / "study.parquet", tables.STUDY, studied.rows)
         artifacts.write_json(out / "summary.json", judged.summary)
         controllers = judged.summary["controllers"]
-        artifacts.write_metrics("evaluate_temperature", studied.figures | {"controllers": controllers, "refused": judged.refused})
+        artifacts.write_metrics(
+            "evaluate_temperature", studied.figures | {"controllers": controllers, "refused": judged.refused}
+        )
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
-"""Probe the machine: writes datasets/generate_probing/probing.mcap (simulated), in the very format that a user's recordings come in, or
-next_experiment.csv (recordings), what to play on the machine next."""
+"""Probe the machine: writes datasets/generate_probing/probing.mcap (simulated), in the very format that a
+user's recordings come in, or next_experiment.csv (recordings), what to play on the machine next."""
 
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow import generate_probing

@@ -1,5 +1,6 @@
-"""Record -> plant and its spread: reads datasets/ingest/record.parquet; writes datasets/identify_plant: plant, spread, order, and what the
-page of the identification shows: holdout, residuals, steps, dynamics, poles, levels."""
+"""Record -> plant and its spread: reads datasets/ingest/record.parquet; writes
+datasets/identify_plant: plant, spread, order, and what the page of the identification shows:
+holdout, residuals, steps, dynamics, poles, levels."""
 
 from pipeline.store import artifacts, params
 from pipeline.temperature import plant

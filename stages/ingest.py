@@ -1,6 +1,7 @@
-"""Recordings -> one table: reads datasets/generate_probing (simulated) or every file below datasets/raw/temperature (recordings); writes
-datasets/ingest/record.parquet and quality.parquet. A recording that was processed before, with the same parameters and code, is taken from
-a memo; a broken one is quarantined with its reason."""
+"""Recordings -> one table: reads datasets/generate_probing (simulated) or every file below
+datasets/raw/temperature (recordings); writes datasets/ingest/record.parquet and
+quality.parquet. A recording that was processed before, with the same parameters and code, is
+taken from a memo; a broken one is quarantined with its reason."""
 
 import sys
 from pathlib import Path
@@ -12,10 +13,18 @@ from pipeline.temperature.workflow.settings import Ingest, Plant
 
 def main() -> None:
     with artifacts.stage("ingest") as out:
-        p, machine, execution = params.load(Ingest, "ingest"), params.load(Plant, "plant"), params.load(params.Execution, "execution")
+        p, machine, execution = (
+            params.load(Ingest, "ingest"),
+            params.load(Plant, "plant"),
+            params.load(params.Execution, "execution"),
+        )
         source = params.value("generate_probing.source", one_of=("simulated", "recordings"))
-        folder = Path({"simulated": "datasets/generate_probing", "recordings": "datasets/raw/temperature"}[source])
-        results = ingest.process(folder, ingest.job_of(p, machine, source), execution, memo=Path("datasets/memo/ingest"))
+        folder = Path(
+            {"simulated": "datasets/generate_probing", "recordings": "datasets/raw/temperature"}[source]
+        )
+        results = ingest.process(
+            folder, ingest.job_of(p, machine, source), execution, memo=Path("datasets/memo/ingest")
+        )
         record, quality, metrics = ingest.collect(results, machine, strict=p.strict or "--strict" in sys.argv)
         artifacts.write_table(out / "record.parquet", record.schema, record.columns)
         artifacts.write_table(out / "quality.parquet", quality.schema, quality.columns)

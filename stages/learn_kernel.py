@@ -1,5 +1,6 @@
-"""Learn controllers from the record alone: reads datasets/ingest/record.parquet; writes datasets/learn_kernel/window.parquet and, where the
-record determines it, kernel.parquet: what the data say whatever the weights, so that new weights need no pass over the data."""
+"""Learn controllers from the record alone: reads datasets/ingest/record.parquet; writes
+datasets/learn_kernel/window.parquet and, where the record determines it, kernel.parquet: what the data say
+whatever the weights, so that new weights need no pass over the data."""
 
 from pipeline.store import artifacts, params
 from pipeline.temperature import window

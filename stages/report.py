@@ -1,8 +1,9 @@
-"""Artifacts -> pages: reads the metrics and tables of every stage and reports/accepted.json; writes reports/index.html, temperature.html,
-identification.html, deposition.html and setpoint.html.
+"""Artifacts -> pages: reads the metrics and tables of every stage and reports/accepted.json; writes
+reports/index.html, temperature.html, identification.html, deposition.html and setpoint.html.
 
-What is missing is shown as missing; what was read is hashed, and the pages carry the hashes. The drift on page one is that of the last night before
-(reports/metrics/nightly.json), which the nightly job writes after the pages and which is therefore no dependency of theirs.
+What is missing is shown as missing; what was read is hashed, and the pages carry the hashes. The drift on
+page one is that of the last night before (reports/metrics/nightly.json), which the nightly job writes after
+the pages and which is therefore no dependency of theirs.
 """
 
 import hashlib

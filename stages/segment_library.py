@@ -1,6 +1,6 @@
 """Learned commands -> library: reads datasets/train_ilc/lessons.parquet; writes datasets/segment_library:
-library.parquet, the columns of the paper's matrix (3), and learned.json, the identified chain of each material, the
-demarcation and the paper's four assumptions in figures."""
+library.parquet, the columns of the paper's matrix (3), and learned.json, the identified chain of each
+material, the demarcation and the paper's four assumptions in figures."""
 
 from pipeline.deposition.workflow import segment_library
 from pipeline.deposition.workflow.settings import Printer, SegmentLibrary

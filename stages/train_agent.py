@@ -1,5 +1,6 @@
-"""Recorded windows -> agents: reads datasets/train_classifier/windows.parquet; writes datasets/train_agent: weights.safetensors of the
-paper's agent after each phase and of ours with the filter whose belief it sees, and agents.parquet, the course of training."""
+"""Recorded windows -> agents: reads datasets/train_classifier/windows.parquet; writes datasets/train_agent:
+weights.safetensors of the paper's agent after each phase and of ours with the filter whose belief it sees,
+and agents.parquet, the course of training."""
 
 from pipeline.setpoint.workflow import train_agent
 from pipeline.setpoint.workflow.agent_files import store_agents

@@ -1,6 +1,7 @@
-"""Trials -> learned commands: reads datasets/raw/deposition where the source is recordings; writes datasets/train_ilc: trials.parquet,
-lessons.parquet, filmed.parquet, models.json, recordings of the first and the last trial, frames of these with the measured edges, and, for
-a real machine, the command of the next one in next/."""
+"""Trials -> learned commands: reads datasets/raw/deposition where the source is recordings;
+writes datasets/train_ilc: trials.parquet, lessons.parquet, filmed.parquet, models.json,
+recordings of the first and the last trial, frames of these with the measured edges, and, for a
+real machine, the command of the next one in next/."""
 
 from pipeline.deposition import training
 from pipeline.deposition.workflow import train_ilc, trial_video
@@ -11,14 +12,20 @@ from pipeline.store import artifacts, params
 
 def main() -> None:
     with artifacts.stage("train_ilc") as out:
-        p, printer, camera = params.load(TrainIlc, "train_ilc"), params.load(Printer, "printer"), params.load(Camera, "camera")
+        p, printer, camera = (
+            params.load(TrainIlc, "train_ilc"),
+            params.load(Printer, "printer"),
+            params.load(Camera, "camera"),
+        )
         execution, recorded = params.load(params.Execution, "execution"), "datasets/raw/deposition"
         found = train_ilc.trained(p, printer, camera, execution, recorded=recorded, out=out)
         artifacts.write_table(out / "trials.parquet", TRIALS, training.rows(found.runs))
         artifacts.write_table(out / "lessons.parquet", LESSONS, training.lessons(found.runs))
         artifacts.write_table(out / "filmed.parquet", FILMED, trial_video.rows(found.watched))
         artifacts.write_json(out / "models.json", found.models)
-        artifacts.write_json(out / "frames/frames.json", train_ilc.shown(p, camera, execution, recorded=recorded, out=out))
+        artifacts.write_json(
+            out / "frames/frames.json", train_ilc.shown(p, camera, execution, recorded=recorded, out=out)
+        )
         artifacts.write_metrics("train_ilc", found.metrics)
 
 

@@ -1,5 +1,5 @@
-"""Tune Q and R by Bayesian optimisation: reads datasets/identify_plant/plant.parquet; writes datasets/tune_weights/weights.json and
-history.parquet. No data stage is touched by new weights."""
+"""Tune Q and R by Bayesian optimisation: reads datasets/identify_plant/plant.parquet; writes
+datasets/tune_weights/weights.json and history.parquet. No data stage is touched by new weights."""
 
 from pipeline.store import artifacts, params
 from pipeline.temperature import plant
@@ -15,7 +15,9 @@ def main() -> None:
         found = tune_weights.tuned(p, machine, tracking, panel, model)
         artifacts.write_json(out / "weights.json", found.weights)
         artifacts.write_table(out / "history.parquet", tables.TUNING, found.history)
-        artifacts.write_course(out / "live", found.history, of="mode", step="evaluation", figures=("cost", "incumbent"))
+        artifacts.write_course(
+            out / "live", found.history, of="mode", step="evaluation", figures=("cost", "incumbent")
+        )
         artifacts.write_metrics("tune_weights", found.metrics)
 
 

@@ -1,5 +1,5 @@
-"""A dask scheduler and two workers on loopback, each a process of its own; what they import is paid once, in the process that they are forked
-from."""
+"""A dask scheduler and two workers on loopback, each a process of its own; what they import is paid once, in
+the process that they are forked from."""
 
 import asyncio
 import multiprocessing
@@ -10,7 +10,9 @@ from pathlib import Path
 
 FORKED = multiprocessing.get_context("forkserver")
 # pyarrow loads pandas with the first array that it makes
-FORKED.set_forkserver_preload(["distributed", "pandas", "pipeline.temperature.workflow.ingest", "tests.cluster"])
+FORKED.set_forkserver_preload(
+    ["distributed", "pandas", "pipeline.temperature.workflow.ingest", "tests.cluster"]
+)
 
 
 def free_port() -> int:
@@ -29,7 +31,11 @@ def serve(scheduler: str, port: int, scratch: Path) -> None:
 
         here = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
         # no nanny: a killed worker stays dead
-        node = Worker(scheduler, nthreads=1, local_directory=str(scratch), **here) if scheduler else Scheduler(port=port, **here)
+        node = (
+            Worker(scheduler, nthreads=1, local_directory=str(scratch), **here)
+            if scheduler
+            else Scheduler(port=port, **here)
+        )
         async with node:
             (scratch / f"{os.getpid()}.ready").touch()
             await node.finished()

@@ -1,4 +1,5 @@
-"""What every test may ask for: the repository's root, other people's data (or the reason why not), and slow tests only when they are asked for."""
+"""What every test may ask for: the repository's root, other people's data (or the reason why not), and slow
+tests only when they are asked for."""
 
 import os
 import shutil
@@ -23,7 +24,9 @@ def root() -> Path:
 @pytest.fixture(scope="session")
 def browser():
     """Debian's Chromium, or the reason why there is none."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed; uv sync installs it")
+    playwright = pytest.importorskip(
+        "playwright.sync_api", reason="playwright is not installed; uv sync installs it"
+    )
     found = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
     if not found:
         pytest.skip("no Chromium on this machine; install it to see the pages in a browser")
@@ -35,11 +38,14 @@ def browser():
 
 @pytest.fixture(scope="session")
 def shared():
-    """shared("data/tclab_mlid_prbs/prbs.csv"): the path of other people's data; the test is skipped where it is absent."""
+    """shared("data/tclab_mlid_prbs/prbs.csv"): the path of other
+    people's data; the test is skipped where it is absent."""
 
     def path(name: str) -> Path:
         if not (SHARED / name).exists():
-            pytest.skip(f"{name} is not in BEADLINE_SHARED ({os.environ.get('BEADLINE_SHARED', '../shared')})")
+            pytest.skip(
+                f"{name} is not in BEADLINE_SHARED ({os.environ.get('BEADLINE_SHARED', '../shared')})"
+            )
         return SHARED / name
 
     return path

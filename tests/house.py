@@ -1,4 +1,5 @@
-"""The house, read off the syntax tree: who imports whom, who opens files, and the dvc.yaml that the stages ask for."""
+"""The house, read off the syntax tree: who imports whom, who opens
+files, and the dvc.yaml that the stages ask for."""
 
 import ast
 import functools
@@ -31,7 +32,19 @@ LANGUAGE = {
 }
 LANGUAGE |= {"operator", "re", "string", "types", "typing", "warnings"}
 FORMATS = {"csv", "h5py", "json", "mcap", "orjson", "pandas", "pickle", "pyarrow", "yaml"}
-READS = {"read_text", "read_bytes", "load", "loadtxt", "genfromtxt", "fromfile", "memmap", "read_csv", "read_parquet", "read_table", "open"}
+READS = {
+    "read_text",
+    "read_bytes",
+    "load",
+    "loadtxt",
+    "genfromtxt",
+    "fromfile",
+    "memmap",
+    "read_csv",
+    "read_parquet",
+    "read_table",
+    "open",
+}
 WRITES = {
     "write_text",
     "write_bytes",
@@ -63,12 +76,17 @@ class File(NamedTuple):
 
     @property
     def room(self) -> str:
-        """stages, store, reading, report, nightly, runtime, statistics, cli; of a loop temperature its methods, temperature/workflow, and tables and settings apart."""
+        """stages, store, reading, report, nightly, runtime, statistics, cli; of a loop temperature its
+        methods, temperature/workflow, and tables and settings apart."""
         parts = self.name.removesuffix(".py").split("/")
         if parts[0] != "pipeline" or len(parts) < 2:
             return parts[0]
         if parts[1] in LOOPS and parts[2:3] == ["workflow"]:
-            return f"{parts[1]}/{parts[3]}" if parts[3:] in (["tables"], ["settings"]) else f"{parts[1]}/workflow"
+            return (
+                f"{parts[1]}/{parts[3]}"
+                if parts[3:] in (["tables"], ["settings"])
+                else f"{parts[1]}/workflow"
+            )
         return "nightly/settings" if parts[1:] == ["nightly", "settings"] else parts[1]
 
 
@@ -87,12 +105,16 @@ def files(root: Path, *folders: str) -> Iterator[File]:
 
 
 def imports(tree: ast.AST) -> Iterator[tuple[int, str]]:
-    """(line, dotted name) of what is imported, `from a import b` as a.b; a relative import begins with a dot."""
+    """(line, dotted name) of what is imported, `from a import b` as
+    a.b; a relative import begins with a dot."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from ((node.lineno, alias.name) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            yield from ((node.lineno, "." * node.level + f"{node.module or ''}.{alias.name}".strip(".")) for alias in node.names)
+            yield from (
+                (node.lineno, "." * node.level + f"{node.module or ''}.{alias.name}".strip("."))
+                for alias in node.names
+            )
 
 
 def project_file(root: Path, name: str) -> str | None:
@@ -106,7 +128,8 @@ def project_file(root: Path, name: str) -> str | None:
 
 
 def calls(tree: ast.AST) -> Iterator[tuple[ast.Call, str, str]]:
-    """(call, receiver, function): artifacts.write_text(...) is ("artifacts", "write_text"), open(...) ("", "open")."""
+    """(call, receiver, function): artifacts.write_text(...) is
+    ("artifacts", "write_text"), open(...) ("", "open")."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Call):
             *receiver, function = ast.unparse(node.func).rsplit(".", 1)
@@ -125,7 +148,9 @@ def may_know(room: str, target: str) -> bool:
         return target in (room, "statistics")
     if loop in LOOPS:  # 2: a workflow knows its own loop and what every stage stands on
         light = room.endswith(("/tables", "/settings"))
-        return target in ("store", "reading", "statistics", loop, f"{loop}/tables", f"{loop}/settings") or (target == f"{loop}/workflow" and not light)
+        return target in ("store", "reading", "statistics", loop, f"{loop}/tables", f"{loop}/settings") or (
+            target == f"{loop}/workflow" and not light
+        )
     if room == "report":  # 3: pages know what a table and a setting is, and nothing that computes
         return target in ("store", "statistics", "report") or target.endswith(("/tables", "/settings"))
     if room == "runtime":  # 4: beside a machine run the methods
@@ -180,8 +205,14 @@ def forbidden_files(root: Path) -> list[str]:
             opened_to_write = function == "open" and any(
                 isinstance(mode, ast.Constant) and set(str(mode.value)) & set("wax+") for mode in modes
             )
-            if file.name != "pipeline/store/artifacts.py" and receiver not in EDGE_CALLS and (function in forbidden or opened_to_write):
-                found.append(f"{file.name}:{call.lineno} {ast.unparse(call.func)}: only artifacts opens artifacts")
+            if (
+                file.name != "pipeline/store/artifacts.py"
+                and receiver not in EDGE_CALLS
+                and (function in forbidden or opened_to_write)
+            ):
+                found.append(
+                    f"{file.name}:{call.lineno} {ast.unparse(call.func)}: only artifacts opens artifacts"
+                )
     return found
 
 
@@ -189,21 +220,32 @@ def forbidden_randomness(root: Path) -> list[str]:
     found = []
     for file in files(root, "pipeline", "stages"):
         for call, receiver, function in calls(file.tree):
-            if receiver in ("np.random", "numpy.random") and (function not in GENERATORS or (function == "default_rng" and not call.args)):
-                found.append(f"{file.name}:{call.lineno} {ast.unparse(call)}: the stage makes a seeded generator and hands it on")
+            if receiver in ("np.random", "numpy.random") and (
+                function not in GENERATORS or (function == "default_rng" and not call.args)
+            ):
+                found.append(
+                    f"{file.name}:{call.lineno} {ast.unparse(call)}: "
+                    "the stage makes a seeded generator and hands it on"
+                )
     return found
 
 
 def unframed(root: Path) -> list[str]:
-    """What a stage reads outside `with artifacts.stage(...)`: there bad input would end in a traceback, not in one sentence."""
+    """What a stage reads outside `with artifacts.stage(...)`: there bad
+    input would end in a traceback, not in one sentence."""
     found = []
     for file in files(root, "stages"):
         mains = [node for node in file.tree.body if isinstance(node, ast.FunctionDef) and node.name == "main"]
         for statement in [statement for main in mains for statement in main.body]:
-            framed = isinstance(statement, ast.With) and ast.unparse(statement.items[0]).startswith("artifacts.stage(")
+            framed = isinstance(statement, ast.With) and ast.unparse(statement.items[0]).startswith(
+                "artifacts.stage("
+            )
             for call, receiver, _ in calls(statement):
                 if not framed and receiver in EDGE_CALLS:
-                    found.append(f"{file.name}:{call.lineno} {ast.unparse(call)}: move it into `with artifacts.stage(...)`")
+                    found.append(
+                        f"{file.name}:{call.lineno} {ast.unparse(call)}: "
+                        "move it into `with artifacts.stage(...)`"
+                    )
     return found
 
 
@@ -211,13 +253,16 @@ def unframed(root: Path) -> list[str]:
 
 
 def modules(root: Path, name: str) -> set[str]:
-    """The file itself and every file of the project that it imports, and that those import; empty __init__.py left out."""
+    """The file itself and every file of the project that it imports,
+    and that those import; empty __init__.py left out."""
     reached, todo = set(), [name]
     while todo:
         here = todo.pop()
         if here not in reached and (root / here).stat().st_size:
             reached.add(here)
-            todo += [target for _, module in imports(parsed(root / here)) if (target := project_file(root, module))]
+            todo += [
+                target for _, module in imports(parsed(root / here)) if (target := project_file(root, module))
+            ]
     return reached
 
 
@@ -226,7 +271,11 @@ def data_files(root: Path, modules: set[str]) -> set[str]:
     found = set()
     for folder in {(root / name).parent for name in modules}:
         for path in folder.iterdir():
-            inside = [file for file in (path, *path.rglob("*")) if file.is_file() and "__pycache__" not in file.parts]
+            inside = [
+                file
+                for file in (path, *path.rglob("*"))
+                if file.is_file() and "__pycache__" not in file.parts
+            ]
             if inside and not path.name.startswith(".") and all(file.suffix != ".py" for file in inside):
                 found.add(path.relative_to(root).as_posix())
     return found
@@ -234,12 +283,15 @@ def data_files(root: Path, modules: set[str]) -> set[str]:
 
 def literal(file: str, call: ast.Call, position: int) -> str:
     argument = call.args[position] if len(call.args) > position else None
-    assert isinstance(argument, ast.Constant), f"{file}:{call.lineno} {ast.unparse(call)}: write the name out, so that one can grep for it"
+    assert isinstance(argument, ast.Constant), (
+        f"{file}:{call.lineno} {ast.unparse(call)}: write the name out, so that one can grep for it"
+    )
     return argument.value
 
 
 def loads(name: str, tree: ast.AST) -> Iterator[tuple[str, str]]:
-    """(model, key): the sections that params.load reads whole, and with model "" the keys that params.value reads."""
+    """(model, key): the sections that params.load reads whole, and
+    with model "" the keys that params.value reads."""
     for call, receiver, function in calls(tree):
         if receiver == "params" and function == "load":
             yield ast.unparse(call.args[0]), literal(name, call, 1)
@@ -250,34 +302,51 @@ def loads(name: str, tree: ast.AST) -> Iterator[tuple[str, str]]:
 def paths(stage: str, name: str, tree: ast.Module) -> tuple[set[str], set[str]]:
     """Literal paths in datasets/ and reports/ that are read, and those that are written."""
     written, read = set(), set()
-    targets = {id(call.args[0]) for call, _, function in calls(tree) if function.startswith("write_") and call.args}
+    targets = {
+        id(call.args[0]) for call, _, function in calls(tree) if function.startswith("write_") and call.args
+    }
     for node in ast.walk(tree):
         if isinstance(node, ast.JoinedStr) and re.match(r"f['\"](datasets|reports)/", ast.unparse(node)):
-            raise AssertionError(f"{name}:{node.lineno} {ast.unparse(node)}: write the path out, so that one can grep for it")
+            raise AssertionError(
+                f"{name}:{node.lineno} {ast.unparse(node)}: write the path out, so that one can grep for it"
+            )
         if isinstance(node, ast.Constant) and re.fullmatch(r"(datasets|reports)/[\w./-]+", str(node.value)):
             (written if id(node) in targets else read).add(node.value.rstrip("/"))
-    read |= {f"reports/metrics/{literal(name, call, 0)}.json" for call, _, function in calls(tree) if function == "read_metrics"}
+    read |= {
+        f"reports/metrics/{literal(name, call, 0)}.json"
+        for call, _, function in calls(tree)
+        if function == "read_metrics"
+    }
     # a memo is no artifact: whatever is in it, the results are the same
     return {path for path in read if not path.startswith(("datasets/memo", f"datasets/{stage}/"))}, written
 
 
 def tracked(root: Path, keys: set[str]) -> list[Any]:
-    """Keys as DVC lists them, each under the files in which it stands: those of params.yaml bare, those of params.expert.yaml below its name."""
+    """Keys as DVC lists them, each under the files in which it stands: those of params.yaml bare, those of
+    params.expert.yaml below its name."""
     owner, expert = root / params.FILE, root / params.EXPERT
     found = params.files(owner) if owner.exists() else {}
-    standing = {name: sorted(key for key in keys if key in _flattened(sections)) for name, sections in found.items()}
+    standing = {
+        name: sorted(key for key in keys if key in _flattened(sections)) for name, sections in found.items()
+    }
     methods = standing.get(str(expert), [])
     # what stands nowhere is asked for where a person looks first
-    return sorted({*standing.get(str(owner), []), *(keys - {*methods})}) + ([{params.EXPERT: methods}] if methods else [])
+    return sorted({*standing.get(str(owner), []), *(keys - {*methods})}) + (
+        [{params.EXPERT: methods}] if methods else []
+    )
 
 
 def _flattened(sections: dict[str, Any]) -> set[str]:
     """Sections, and the keys of each as section.key."""
-    return {*sections, *(f"{section}.{key}" for section, keys in sections.items() if isinstance(keys, dict) for key in keys)}
+    return {
+        *sections,
+        *(f"{section}.{key}" for section, keys in sections.items() if isinstance(keys, dict) for key in keys),
+    }
 
 
 def expected(root: Path, stage: str) -> dict[str, Any]:
-    """The entry of dvc.yaml: deps, params, outs and metrics are what stages/<stage>.py imports and opens, directly or through what it imports."""
+    """The entry of dvc.yaml: deps, params, outs and metrics are what stages/<stage>.py imports and opens,
+    directly or through what it imports."""
     name = f"stages/{stage}.py"
     code = modules(root, name)
     read, written, keys = set(), set(), set()
@@ -288,7 +357,11 @@ def expected(root: Path, stage: str) -> dict[str, Any]:
     found = paths(stage, name, tree)
     read, written = read | found[0], written | found[1]
     # a stage that hashes whole folders of code, or reads the parameters whole, depends on them whole
-    read |= {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and node.value in ("pipeline", "stages")}
+    read |= {
+        node.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and node.value in ("pipeline", "stages")
+    }
     whole = any((receiver, function) == ("params", "read") for _, receiver, function in calls(tree))
     read |= {params.FILE, params.EXPERT} if whole else set()
     frames = [
@@ -304,13 +377,22 @@ def expected(root: Path, stage: str) -> dict[str, Any]:
         assert function not in ("stage", "write_metrics") or literal(name, call, 0) == stage, (
             f"{name}:{call.lineno} the stage's name is {stage}"
         )
-    metrics = [f"reports/metrics/{stage}.json"] if any(function == "write_metrics" for *_, function in calls(tree)) else []
+    metrics = (
+        [f"reports/metrics/{stage}.json"]
+        if any(function == "write_metrics" for *_, function in calls(tree))
+        else []
+    )
     entry = {
         "cmd": f"python -m stages.{stage}",
-        "deps": [dep for dep in (name, *sorted(code - {name}), *sorted(data_files(root, code))) if dep.split("/")[0] not in read]
+        "deps": [
+            dep
+            for dep in (name, *sorted(code - {name}), *sorted(data_files(root, code)))
+            if dep.split("/")[0] not in read
+        ]
         + sorted(read),
         "params": tracked(root, keys),
-        # DVC deletes outs before it runs a stage unless they persist, and the last good artifacts must outlive a stage that fails
+        # DVC deletes outs before it runs a stage unless they persist, and the
+        # last good artifacts must outlive a stage that fails
         "outs": [{path: {"persist": True}} for path in sorted(written)],
         "metrics": [{path: {"cache": False, "persist": True}} for path in metrics],
     }
@@ -324,28 +406,48 @@ def stages(root: Path) -> list[str]:
 def pipeline(root: Path) -> dict[str, Any]:
     """All stages, each after those whose results it reads."""
     entries = {stage: expected(root, stage) for stage in stages(root)}
-    made = {path: stage for stage, entry in entries.items() for kind in ("outs", "metrics") for out in entry.get(kind, []) for path in out}
+    made = {
+        path: stage
+        for stage, entry in entries.items()
+        for kind in ("outs", "metrics")
+        for out in entry.get(kind, [])
+        for path in out
+    }
     order = {
-        stage: [made[out] for out in made for dep in entry["deps"] if f"{dep}/".startswith(f"{out}/")] for stage, entry in entries.items()
+        stage: [made[out] for out in made for dep in entry["deps"] if f"{dep}/".startswith(f"{out}/")]
+        for stage, entry in entries.items()
     }
     ordered = {stage: entries[stage] for stage in graphlib.TopologicalSorter(order).static_order()}
-    courses = [stage for stage in ordered if any(function == "write_course" for *_, function in calls(parsed(root / f"stages/{stage}.py")))]
-    return {"stages": ordered} | ({"plots": [{f"datasets/{stage}/live/plots/metrics": {"x": "step"}} for stage in courses]} if courses else {})
+    courses = [
+        stage
+        for stage in ordered
+        if any(function == "write_course" for *_, function in calls(parsed(root / f"stages/{stage}.py")))
+    ]
+    return {"stages": ordered} | (
+        {"plots": [{f"datasets/{stage}/live/plots/metrics": {"x": "step"}} for stage in courses]}
+        if courses
+        else {}
+    )
 
 
 def differences(found: dict[str, Any], wanted: dict[str, Any]) -> list[str]:
-    """Sentences, empty where dvc.yaml is what the stages ask for; the order of entries and `desc` are free."""
+    """Sentences, empty where dvc.yaml is what the stages ask for; the
+    order of entries and `desc` are free."""
 
     def flat(entry, kind):
         value = entry.get(kind, [])
         return (
             {value}
             if isinstance(value, str)
-            else {yaml.safe_dump(item, default_flow_style=True, width=999).replace("\n...", "").strip() for item in value}
+            else {
+                yaml.safe_dump(item, default_flow_style=True, width=999).replace("\n...", "").strip()
+                for item in value
+            }
         )
 
     sentences = [
-        f"{stage}: stage is {'missing' if stage in wanted else 'not in stages/'}" for stage in sorted(found.keys() ^ wanted.keys())
+        f"{stage}: stage is {'missing' if stage in wanted else 'not in stages/'}"
+        for stage in sorted(found.keys() ^ wanted.keys())
     ]
     for stage in found.keys() & wanted.keys():
         for kind in sorted((found[stage].keys() | wanted[stage].keys()) - {"desc"}):
@@ -368,9 +470,18 @@ def unbounded(kind: Any, place: str, limits: tuple = ()) -> list[str]:
     if isinstance(kind, type) and issubclass(kind, params.Section):
         fields = kind.model_fields.items()
         defaults = [f"{place}.{name} has a default" for name, field in fields if not field.is_required()]
-        return defaults + [item for name, field in fields for item in unbounded(field.annotation, f"{place}.{name}", tuple(field.metadata))]
+        return defaults + [
+            item
+            for name, field in fields
+            for item in unbounded(field.annotation, f"{place}.{name}", tuple(field.metadata))
+        ]
     if kind in (int, float):
-        has = {name for limit in limits for name in ("ge", "gt", "le", "lt") if getattr(limit, name, None) is not None}
+        has = {
+            name
+            for limit in limits
+            for name in ("ge", "gt", "le", "lt")
+            if getattr(limit, name, None) is not None
+        }
         sides = ["no lower bound"] * (not has & {"ge", "gt"}) + ["no upper bound"] * (not has & {"le", "lt"})
         return [f"{place} has {side}" for side in sides]
     union = typing.get_origin(kind) in (typing.Union, typing.get_origin(int | None))

@@ -19,14 +19,24 @@ class Written:
         self.writer.start("", "test")
 
     def topic(
-        self, name: str, encoding: str, schema_name: str = "", schema_encoding: str = "", schema: bytes = b"", **metadata: str
+        self,
+        name: str,
+        encoding: str,
+        schema_name: str = "",
+        schema_encoding: str = "",
+        schema: bytes = b"",
+        **metadata: str,
     ) -> int:
         number = self.writer.register_schema(schema_name, schema_encoding, schema) if schema_name else 0
         return self.writer.register_channel(name, encoding, number, metadata)
 
-    def message(self, channel: int, time_s: float, data: bytes | dict, published_s: float | None = None) -> None:
+    def message(
+        self, channel: int, time_s: float, data: bytes | dict, published_s: float | None = None
+    ) -> None:
         data = json.dumps(data).encode() if isinstance(data, dict) else data
-        self.writer.add_message(channel, round(time_s * 1e9), data, round((time_s if published_s is None else published_s) * 1e9))
+        self.writer.add_message(
+            channel, round(time_s * 1e9), data, round((time_s if published_s is None else published_s) * 1e9)
+        )
 
     def bytes(self) -> bytes:
         self.writer.finish()
@@ -61,7 +71,8 @@ def flipped(content: bytes, place: int, bit: int) -> bytes:
 
 
 def cdr(*parts: tuple[str, Sequence]) -> bytes:
-    """Little-endian CDR of (format, values) parts, each number aligned to its size: written as the standard says, by hand."""
+    """Little-endian CDR of (format, values) parts, each number aligned to
+    its size: written as the standard says, by hand."""
     body = b""
     for code, values in parts:
         for value in values if code != "s" else [values]:

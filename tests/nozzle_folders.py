@@ -1,4 +1,5 @@
-"""Folders of nozzle frames for tests, as users have them: pictures of the synthetic scene, and the CSV beside them."""
+"""Folders of nozzle frames for tests, as users have them: pictures of
+the synthetic scene, and the CSV beside them."""
 
 import functools
 from pathlib import Path
@@ -21,7 +22,9 @@ def scenes(prints: int = 2) -> tuple[nozzle_scene.Frames, ...]:
     """Three segments, one of each class, for each print."""
     rng = np.random.default_rng(5)
     return tuple(
-        nozzle_scene.render(nozzle_scene.draw_segment(rng), np.full(SHOTS, flow), 210.0, rng) for _ in range(prints) for flow in FLOWS
+        nozzle_scene.render(nozzle_scene.draw_segment(rng), np.full(SHOTS, flow), 210.0, rng)
+        for _ in range(prints)
+        for flow in FLOWS
     )
 
 
@@ -32,21 +35,28 @@ def rows(prints: int = 2) -> list[dict[str, str]]:
         for shot in range(SHOTS):
             number = k % 3 * SHOTS + shot
             found.append({
-                "img_path": f"print{k // 3}/image-{number}.png", "timestamp": f"2020-10-08T13:12:{number:02d}-{5 * number:02d}",
-                "flow_rate": f"{scene.flow[0]:g}", "feed_rate": "100", "z_offset": "0.0", "target_hotend": "210.0", "hotend": f"{209 + number / 10:g}", "bed": "60.0",
-                "nozzle_tip_x": f"{scene.tip[0]:.2f}", "nozzle_tip_y": f"{scene.tip[1]:.2f}", "print_id": str(k // 3), "img_num": str(number),
+                "img_path": f"print{k // 3}/image-{number}.png",
+                "timestamp": f"2020-10-08T13:12:{number:02d}-{5 * number:02d}",
+                "flow_rate": f"{scene.flow[0]:g}", "feed_rate": "100", "z_offset": "0.0",
+                "target_hotend": "210.0", "hotend": f"{209 + number / 10:g}", "bed": "60.0",
+                "nozzle_tip_x": f"{scene.tip[0]:.2f}", "nozzle_tip_y": f"{scene.tip[1]:.2f}",
+                "print_id": str(k // 3), "img_num": str(number),
             })  # fmt: skip
     return found
 
 
 def images(folder: Path, prints: int = 2) -> None:
-    for row, frame in zip(rows(prints), (frame for scene in scenes(prints) for frame in scene.frames), strict=True):
+    for row, frame in zip(
+        rows(prints), (frame for scene in scenes(prints) for frame in scene.frames), strict=True
+    ):
         path = folder / row["img_path"]
         path.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(path), frame)
 
 
-def table(path: Path, lines: list[dict[str, str]], *, separator: str = ",", end: str = "\n", mark: str = "") -> Path:
+def table(
+    path: Path, lines: list[dict[str, str]], *, separator: str = ",", end: str = "\n", mark: str = ""
+) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     text = end.join([separator.join(lines[0]), *(separator.join(line.values()) for line in lines)])
     path.write_bytes((mark + text + end).encode())
@@ -60,14 +70,23 @@ def folder(path: Path, prints: int = 2) -> Path:
     return path
 
 
-def read(path: Path, *, tip=None, topics: Topics = ANY, jobs: int = 1, memo: Path | None = None) -> frame_folder.NozzleFrames:
+def read(
+    path: Path, *, tip=None, topics: Topics = ANY, jobs: int = 1, memo: Path | None = None
+) -> frame_folder.NozzleFrames:
     how = frame_folder.Reading(tip_px=tip, least_score=LEAST, topics=topics)
-    return frame_folder.read_folder(path, how, Execution(backend="loky", jobs=jobs, scheduler=""), memo=memo or path.parent / "memo")
+    return frame_folder.read_folder(
+        path, how, Execution(backend="loky", jobs=jobs, scheduler=""), memo=memo or path.parent / "memo"
+    )
 
 
 def expected() -> np.ndarray:
-    """The key areas of all frames, cut without any file between; two decimals of the tip are what the CSV holds."""
-    found = [key_area.find(frame, tuple(np.round(scene.tip, 2)), least_score=LEAST) for scene in scenes() for frame in scene.frames]
+    """The key areas of all frames, cut without any file between; two
+    decimals of the tip are what the CSV holds."""
+    found = [
+        key_area.find(frame, tuple(np.round(scene.tip, 2)), least_score=LEAST)
+        for scene in scenes()
+        for frame in scene.frames
+    ]
     return np.array([one.image for one in found])
 
 

@@ -1,4 +1,5 @@
-"""What bad input gets: exit status 1 and one sentence with file, place, expected, found and remedy; the last good artifacts stay as they were."""
+"""What bad input gets: exit status 1 and one sentence with file, place, expected, found and remedy; the last
+good artifacts stay as they were."""
 
 import os
 import re
@@ -25,7 +26,13 @@ def signals(samples: int = SAMPLES, *, seed: int = 1) -> dict[str, np.ndarray]:
     u = np.repeat(rng.choice([30.0, 50.0], size=(-(-samples // 5), 2)), 5, axis=0)[:samples]
     machine = plant([[0.95, 0.02], [0.01, 0.9]], [[0.02, 0.0], [0.0, 0.04]], np.eye(2), d=[20.0, 20.0])
     y = simulate(machine, u, np.array([16.0, 16.0]))[1] + 0.02 * rng.standard_normal((samples, 2))
-    return {"t_s": np.arange(samples, dtype=float), "Q1": u[:, 0], "Q2": u[:, 1], "T1": y[:, 0], "T2": y[:, 1]}
+    return {
+        "t_s": np.arange(samples, dtype=float),
+        "Q1": u[:, 0],
+        "Q2": u[:, 1],
+        "T1": y[:, 0],
+        "T2": y[:, 1],
+    }
 
 
 def record(tree: Path, columns: dict[str, np.ndarray]) -> None:
@@ -33,7 +40,8 @@ def record(tree: Path, columns: dict[str, np.ndarray]) -> None:
 
 
 def declare(tree: Path, changes: dict, of: Path | None = None) -> None:
-    """The parameters of a project (the tree itself) with {dotted key: value} changed, as the tree's params.yaml."""
+    """The parameters of a project (the tree itself) with {dotted key:
+    value} changed, as the tree's params.yaml."""
     sections = params.read((of or tree) / "params.yaml")
     for dotted, value in changes.items():
         *parents, key = dotted.split(".")
@@ -61,7 +69,9 @@ def good(tree: Path) -> dict[str, bytes]:
     return {
         path.relative_to(tree).as_posix(): path.read_bytes()
         for path in tree.rglob("*")
-        if path.is_file() and not path.is_relative_to(tree / "datasets/raw") and not path.is_relative_to(tree / "datasets/memo")
+        if path.is_file()
+        and not path.is_relative_to(tree / "datasets/raw")
+        and not path.is_relative_to(tree / "datasets/memo")
     }
 
 
@@ -72,7 +82,9 @@ def ready(root, tmp_path_factory) -> Path:
     declare(
         tree,
         {
-            "plant.inputs": [{"name": f"heater_{i}", "unit": "percent", "low": 0, "high": 100} for i in (1, 2)],
+            "plant.inputs": [
+                {"name": f"heater_{i}", "unit": "percent", "low": 0, "high": 100} for i in (1, 2)
+            ],
             "plant.outputs": [{"name": f"zone_{i}", "unit": "degC", "reference": 35} for i in (1, 2)],
             "generate_probing.source": "recordings",
             "ingest.mapping": {
@@ -105,7 +117,8 @@ def tree(ready, tmp_path) -> Path:
 @pytest.fixture
 def refused(monkeypatch, capfd):
     def refused(tree: Path, stage: str) -> str:
-        """The sentence with which the stage ends, once it is seen to be one, and to have left everything as it was."""
+        """The sentence with which the stage ends, once it is seen to
+        be one, and to have left everything as it was."""
         before = good(tree)
         capfd.readouterr()
         assert run(tree, stage, monkeypatch) == 1
@@ -134,12 +147,32 @@ def changed(**columns: tuple[int | slice, float]) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize(
     ("stage", "key", "value", "said"),
     [
-        ("ingest", "ingest.colour", 1, "params.yaml: ingest.colour is unknown; remove it, or use mapping, time, max_gap_s, strict"),
-        ("ingest", "ingest.max_gaps", 5.0, "params.yaml: ingest.max_gaps is unknown; did you mean max_gap_s?"),
+        (
+            "ingest",
+            "ingest.colour",
+            1,
+            "params.yaml: ingest.colour is unknown; remove it, or use mapping, time, max_gap_s, strict",
+        ),
+        (
+            "ingest",
+            "ingest.max_gaps",
+            5.0,
+            "params.yaml: ingest.max_gaps is unknown; did you mean max_gap_s?",
+        ),
         ("ingest", "ingest.max_gap_s", -1.0, "params.yaml: ingest.max_gap_s is -1.0 but must be more than 0"),
-        ("identify_plant", "identify_plant.order", 61, "params.yaml: identify_plant.order is 61 but must be at most 60"),
+        (
+            "identify_plant",
+            "identify_plant.order",
+            61,
+            "params.yaml: identify_plant.order is 61 but must be at most 60",
+        ),
         ("learn_kernel", "tracking.gamma", 1.5, "params.yaml: tracking.gamma is 1.5 but must be at most 1"),
-        ("identify_plant", "plant.sample_time_s", "one", 'params.yaml: plant.sample_time_s is "one" but must be a number'),
+        (
+            "identify_plant",
+            "plant.sample_time_s",
+            "one",
+            'params.yaml: plant.sample_time_s is "one" but must be a number',
+        ),
         ("ingest", "generate_probing.source", "recording", "did you mean recordings?"),
     ],
 )
@@ -151,13 +184,22 @@ def test_a_parameter_that_cannot_be_is_refused_by_name(tree, refused, stage, key
 @pytest.mark.parametrize(
     ("key", "value", "said"),
     [
-        ("heater_1.source", "Q3", "datasets/raw/temperature/rig.csv: there is no column 'Q3'; the nearest names are Q2, Q1"),
+        (
+            "heater_1.source",
+            "Q3",
+            "datasets/raw/temperature/rig.csv: there is no column 'Q3'; the nearest names are Q2, Q1",
+        ),
         (
             "zone_1.unit",
             "degF",
-            "params.yaml: ingest.mapping.zone_1.unit is degF but the plant's zone_1 is in degC; convert with scale and offset, and write unit: degC",
+            "params.yaml: ingest.mapping.zone_1.unit is degF but the plant's zone_1 is in degC; "
+            "convert with scale and offset, and write unit: degC",
         ),
-        ("zone_1.scale", 0.0, "rig.csv: the mapping of zone_1 has scale 0 and offset 0; both must be finite, scale not 0"),
+        (
+            "zone_1.scale",
+            0.0,
+            "rig.csv: the mapping of zone_1 has scale 0 and offset 0; both must be finite, scale not 0",
+        ),
     ],
 )
 def test_a_mapping_to_a_missing_column_or_in_a_wrong_unit_is_refused(tree, refused, key, value, said):
@@ -166,9 +208,12 @@ def test_a_mapping_to_a_missing_column_or_in_a_wrong_unit_is_refused(tree, refus
 
 
 def test_a_mapping_that_names_no_signal_is_refused_with_the_nearest_names(tree, refused):
-    declare(tree, {"ingest.mapping.heater_11": {"source": "Q1", "unit": "percent", "scale": 1.0, "offset": 0.0}})
-    assert "params.yaml: ingest.mapping.heater_11 is no signal of the plant; the nearest names are heater_1, heater_2" in refused(
-        tree, "ingest"
+    declare(
+        tree, {"ingest.mapping.heater_11": {"source": "Q1", "unit": "percent", "scale": 1.0, "offset": 0.0}}
+    )
+    assert (
+        "params.yaml: ingest.mapping.heater_11 is no signal of the plant; "
+        "the nearest names are heater_1, heater_2" in refused(tree, "ingest")
     )
 
 
@@ -181,18 +226,23 @@ def test_a_mapping_that_names_no_signal_is_refused_with_the_nearest_names(tree, 
         (
             changed(t_s=(300, 20.0)),
             (
-                "line 302 is at 20 s, which is before the sample ahead of it at 299 s, but time should only run forward; "
+                "line 302 is at 20 s, which is before the sample ahead of it at 299 s, "
+                "but time should only run forward; "
                 "split the recording where its clock was set back"
             ),
         ),
         (
             changed(t_s=(300, 299.0)),
             (
-                "line 302 has the same time as the sample before it, 299 s, but time should only run forward; "
+                "line 302 has the same time as the sample before it, 299 s, "
+                "but time should only run forward; "
                 "name a finer clock, or give each device or tag that writes here a column of its own"
             ),
         ),
-        (changed(T1=(slice(None), np.nan)), "T1 should hold numbers for zone_1 but all of its 600 values are missing; map another source"),
+        (
+            changed(T1=(slice(None), np.nan)),
+            "T1 should hold numbers for zone_1 but all of its 600 values are missing; map another source",
+        ),
         (signals(1), "output zone_1 should have at least two samples but has 1; record longer"),
     ],
     ids=["backwards", "two at one time", "NaN only", "one sample"],
@@ -204,7 +254,10 @@ def test_a_recording_that_is_no_record_is_refused_with_its_place(tree, refused, 
 
 def test_no_recording_at_all_is_refused_with_the_folder(tree, refused):
     (tree / "datasets/raw/temperature/rig.csv").unlink()
-    assert "datasets/raw/temperature: expected at least one recording (CSV, Parquet or MCAP), found none" in refused(tree, "ingest")
+    assert (
+        "datasets/raw/temperature: expected at least one recording (CSV, Parquet or MCAP), found none"
+        in refused(tree, "ingest")
+    )
 
 
 def test_strict_makes_one_broken_recording_among_good_ones_fatal(tree, refused):
@@ -223,14 +276,20 @@ def test_strict_makes_one_broken_recording_among_good_ones_fatal(tree, refused):
     [
         (
             changed(Q1=(slice(None), 30.0)),
-            r"input (u1|heater_1) is constant, so its column of B is not identified; excite it, or leave it out",
+            r"input (u1|heater_1) is constant, so its column of B is not identified; "
+            r"excite it, or leave it out",
         ),
         (
             signals() | {"Q2": signals()["Q1"]},
-            r"input (u2|heater_2) is a linear combination of (u1|heater_1), so its column of B is not identified; move it independently",
+            r"input (u2|heater_2) is a linear combination of (u1|heater_1), "
+            r"so its column of B is not identified; move it independently",
         ),
         # 28 of the 40 samples identify, the others judge
-        (signals(40), r"the record is too short for order 1: expected at least 48 complete samples, found 28; record 20 samples more"),
+        (
+            signals(40),
+            r"the record is too short for order 1: expected at least 48 complete samples, found 28; "
+            r"record 20 samples more",
+        ),
     ],
     ids=["a constant input", "a collinear input", "too few samples"],
 )
@@ -243,12 +302,18 @@ def test_a_record_that_does_not_determine_the_plant_is_refused(tree, refused, mo
 def test_an_order_that_the_record_cannot_carry_is_refused_with_what_it_lacks(tree, refused):
     declare(tree, {"identify_plant.order": 40})
     said = refused(tree, "identify_plant")
-    assert "the record is too short for order 40: expected at least 504 complete samples, found 420; record 84 samples more" in said
+    assert (
+        "the record is too short for order 40: expected at least 504 complete samples, found 420; "
+        "record 84 samples more" in said
+    )
 
 
 def test_an_unobservable_plant_is_refused_with_its_rank(tree, refused, monkeypatch):
-    """No record shows a state that nothing measures; the stage must refuse whatever says that it found one."""
-    hidden = plant([[0.95, 0.0], [0.0, 0.9]], [[0.02, 0.0], [0.0, 0.04]], [[1.0, 0.0], [2.0, 0.0]], d=[20.0, 20.0])
+    """No record shows a state that nothing measures; the stage must
+    refuse whatever says that it found one."""
+    hidden = plant(
+        [[0.95, 0.0], [0.0, 0.9]], [[0.02, 0.0], [0.0, 0.04]], [[1.0, 0.0], [2.0, 0.0]], d=[20.0, 20.0]
+    )
     found = identification.refit
 
     def hiding(*signals, **settings):
@@ -257,7 +322,9 @@ def test_an_unobservable_plant_is_refused_with_its_rank(tree, refused, monkeypat
     monkeypatch.setattr(identification, "refit", hiding)
     said = refused(tree, "identify_plant")
     assert re.search(
-        r"datasets/ingest/record\.parquet: the plant is not observable: rank 1 of 2, .*; add a sensor, or lower the order", said
+        r"datasets/ingest/record\.parquet: the plant is not observable: rank 1 of 2, .*; add a "
+        r"sensor, or lower the order",
+        said,
     )
 
 
@@ -265,7 +332,9 @@ def test_an_unobservable_plant_is_refused_with_its_rank(tree, refused, monkeypat
 
 
 @pytest.mark.parametrize("damage", ["missing", "cut"])
-def test_an_artifact_that_is_missing_or_damaged_is_refused_with_the_command_that_makes_it(tree, refused, damage):
+def test_an_artifact_that_is_missing_or_damaged_is_refused_with_the_command_that_makes_it(
+    tree, refused, damage
+):
     path = tree / "datasets/ingest/record.parquet"
     content = path.read_bytes()
     path.unlink()
@@ -284,8 +353,17 @@ def test_the_command_ends_with_status_1_and_one_sentence_without_a_traceback(tre
     before = good(tree)
     environment = os.environ | {"PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1"}
     ended = subprocess.run(
-        [sys.executable, "-m", "stages.ingest"], cwd=tree, env=environment, capture_output=True, text=True, timeout=120, check=False
+        [sys.executable, "-m", "stages.ingest"],
+        cwd=tree,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
     )
     assert ended.returncode == 1
-    assert re.fullmatch(r"ingest: datasets/raw/temperature/rig\.csv: line 302 is at 20 s, .*; split the recording .*\n", ended.stderr)
+    assert re.fullmatch(
+        r"ingest: datasets/raw/temperature/rig\.csv: line 302 is at 20 s, .*; split the recording .*\n",
+        ended.stderr,
+    )
     assert good(tree) == before

@@ -1,4 +1,5 @@
-"""Who may know whom, and dvc.yaml: both read off the syntax tree. `./run python -m tests.test_house` prints the dvc.yaml that the stages ask for."""
+"""Who may know whom, and dvc.yaml: both read off the syntax tree. `./run python -m tests.test_house` prints
+the dvc.yaml that the stages ask for."""
 
 import ast
 import importlib
@@ -32,7 +33,9 @@ ROOT = Path(__file__).resolve().parents[1]
 # ---- the house as it stands
 
 
-@pytest.mark.parametrize("rule", [misplaced, forbidden_imports, forbidden_files, forbidden_randomness, unframed])
+@pytest.mark.parametrize(
+    "rule", [misplaced, forbidden_imports, forbidden_files, forbidden_randomness, unframed]
+)
 def test_the_house_keeps_the_rule(rule):
     assert rule(ROOT) == []
 
@@ -41,7 +44,9 @@ def test_dvc_yaml_is_what_the_stages_import_and_open():
     path = ROOT / "dvc.yaml"
     found, wanted = yaml.safe_load(path.read_text(encoding="utf-8")), pipeline(ROOT)
     assert found["plots"] == wanted["plots"]
-    assert differences(found["stages"], wanted["stages"]) == [], "paste the output of ./run python -m tests.test_house into dvc.yaml"
+    assert differences(found["stages"], wanted["stages"]) == [], (
+        "paste the output of ./run python -m tests.test_house into dvc.yaml"
+    )
 
 
 @pytest.mark.parametrize("stage", stages(ROOT))
@@ -147,7 +152,9 @@ def test_a_file_opened_or_a_global_seed_outside_the_edge_is_seen(tmp_path):
         pipeline__temperature__bad="open('a')\nnp.load('a')\npath.write_text('')\nnp.random.seed(0)\nnp.random.default_rng()\nnp.random.default_rng(1)",
         stages__ingest="artifacts.write_text('a', '')\nparams.load(A, 'a')\npath.read_text()",
     )
-    assert [sentence.split(":")[0] + sentence.split(":")[1][:2] for sentence in forbidden_files(tmp_path)] == [
+    assert [
+        sentence.split(":")[0] + sentence.split(":")[1][:2] for sentence in forbidden_files(tmp_path)
+    ] == [
         "pipeline/reading/recordings.py2 ",
         "pipeline/reading/recordings.py4 ",
         "pipeline/temperature/bad.py1 ",
@@ -167,7 +174,9 @@ def test_input_read_outside_the_frame_of_a_stage_is_seen(tmp_path):
         stages__good="def main():\n    with artifacts.stage('good') as out:\n        params.load(Good, 'good')",
         stages__bad="def main():\n    p = params.load(Bad, 'bad')\n    with artifacts.stage('bad') as out:\n        artifacts.read_json('a')",
     )
-    assert unframed(tmp_path) == ["stages/bad.py:2 params.load(Bad, 'bad'): move it into `with artifacts.stage(...)`"]
+    assert unframed(tmp_path) == [
+        "stages/bad.py:2 params.load(Bad, 'bad'): move it into `with artifacts.stage(...)`"
+    ]
 
 
 STAGE = '''"""Reads datasets/raw/temperature; writes datasets/learn."""
@@ -251,7 +260,12 @@ def test_a_dvc_yaml_that_lacks_or_has_too_much_is_seen(toy):
 
 
 @pytest.mark.parametrize(
-    "line", ["params.load(Learn, name)", "artifacts.read_metrics(name)", "artifacts.read_json(f'datasets/{name}/a.json')"]
+    "line",
+    [
+        "params.load(Learn, name)",
+        "artifacts.read_metrics(name)",
+        "artifacts.read_json(f'datasets/{name}/a.json')",
+    ],
 )
 def test_a_path_or_section_that_cannot_be_read_off_is_refused(toy, line):
     (toy / "stages/learn.py").write_text(STAGE + f"    {line}\n")

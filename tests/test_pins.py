@@ -1,4 +1,5 @@
-"""Same inputs, same bytes: what ./run pins wins over what is set outside, and over how many cores there are."""
+"""Same inputs, same bytes: what ./run pins wins over what is set
+outside, and over how many cores there are."""
 
 import json
 import os
@@ -13,7 +14,13 @@ import yaml
 
 from pipeline.store import artifacts, params
 
-THREADS = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1", "NPROC": "2"}
+THREADS = {
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    "OPENCV_FOR_THREADS_NUM": "1",
+    "NPROC": "2",
+}
 KERNELS = {
     "OPENBLAS_CORETYPE": "Haswell",
     "NPY_DISABLE_CPU_FEATURES": "X86_V4 AVX512_ICL AVX512_SPR",
@@ -24,7 +31,8 @@ KERNELS = {
     "OPENCV_IPP": "avx2",
 }
 OUTSIDE = {
-    "OPENBLAS_CORETYPE": "SkylakeX", "NPY_DISABLE_CPU_FEATURES": "", "XLA_FLAGS": "", "OPENCV_CPU_DISABLE": "AVX2",
+    "OPENBLAS_CORETYPE": "SkylakeX", "NPY_DISABLE_CPU_FEATURES": "", "XLA_FLAGS": "",
+    "OPENCV_CPU_DISABLE": "AVX2",
     "OPENBLAS_NUM_THREADS": "2", "OMP_NUM_THREADS": "2", "NPROC": "1",
 }  # fmt: skip
 STAGES = ("generate_probing", "ingest", "identify_plant")
@@ -52,12 +60,23 @@ def project(root, tmp_path):
     return tree
 
 
-def run(root: Path, tree: Path, *command: str, ahead: tuple[str, ...] = (), **outside: str) -> subprocess.CompletedProcess:
+def run(
+    root: Path, tree: Path, *command: str, ahead: tuple[str, ...] = (), **outside: str
+) -> subprocess.CompletedProcess:
     """`./run COMMAND` in the tree, with these variables set before; uv takes the environment as it is."""
     environment = os.environ | {
-        "PATH": f"{os.environ['PATH']}:{root}/.uv/bin", "UV_PROJECT_ENVIRONMENT": sys.prefix, "UV_NO_SYNC": "1", "PYTHONDONTWRITEBYTECODE": "1",
+        "PATH": f"{os.environ['PATH']}:{root}/.uv/bin", "UV_PROJECT_ENVIRONMENT": sys.prefix,
+        "UV_NO_SYNC": "1", "PYTHONDONTWRITEBYTECODE": "1",
     } | outside  # fmt: skip
-    return subprocess.run([*ahead, "./run", *command], cwd=tree, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    return subprocess.run(
+        [*ahead, "./run", *command],
+        cwd=tree,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
 
 
 def test_what_is_set_outside_and_a_single_core_change_no_byte(root, project):
@@ -67,8 +86,19 @@ def test_what_is_set_outside_and_a_single_core_change_no_byte(root, project):
         for stage in STAGES:
             ended = run(root, project, "python", "-m", f"stages.{stage}", ahead=ahead, **outside)
             assert ended.returncode == 0, ended.stderr
-        written = [path for folder in ("datasets", "reports/metrics") for path in sorted((project / folder).rglob("*")) if path.is_file()]
-        left.append({path.relative_to(project).as_posix(): artifacts.sha256(path) for path in written if "memo" not in path.parts})
+        written = [
+            path
+            for folder in ("datasets", "reports/metrics")
+            for path in sorted((project / folder).rglob("*"))
+            if path.is_file()
+        ]
+        left.append(
+            {
+                path.relative_to(project).as_posix(): artifacts.sha256(path)
+                for path in written
+                if "memo" not in path.parts
+            }
+        )
         # nothing is remembered: the second run computes all of it again
         for folder in ("datasets", "reports"):
             shutil.rmtree(project / folder)
@@ -95,4 +125,8 @@ def test_the_pins_are_those_of_the_cpu_whatever_is_set_outside(root, project, fl
     assert {name: found.get(name) for name in THREADS} == THREADS
     assert {name: found[name] for name in {*KERNELS, "OPENCV_CPU_DISABLE"} if name in found} == kernels
     lacking = not kernels and platform.machine() == "x86_64"
-    assert ended.stderr == ("run: this CPU lacks AVX2 or FMA; last digits may differ from those of other machines\n" if lacking else "")
+    assert ended.stderr == (
+        "run: this CPU lacks AVX2 or FMA; last digits may differ from those of other machines\n"
+        if lacking
+        else ""
+    )

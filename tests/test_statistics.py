@@ -18,17 +18,25 @@ RULE = Rule(
 
 
 def test_chance_alone_promotes_as_seldom_as_the_level_says():
-    """Two equal controllers, 16 plants of 4 noisy cases: p is uniform, so that it falls below 0.05 in 5 % of 400 panels, give or take 1.1 (one sigma)."""
+    """Two equal controllers, 16 plants of 4 noisy cases: p is uniform, so that it falls below 0.05 in 5 % of
+    400 panels, give or take 1.1 (one sigma)."""
     rng = np.random.default_rng(1)
     block = [f"plant {k}" for k in np.repeat(np.arange(16), 4)]
-    p = [paired(*np.exp(0.1 * rng.standard_normal((2, 64))), block, rng=rng, draws=2000).p for _ in range(400)]
+    p = [
+        paired(*np.exp(0.1 * rng.standard_normal((2, 64))), block, rng=rng, draws=2000).p for _ in range(400)
+    ]
     assert 0.02 < np.mean(np.array(p) < 0.05) < 0.09
 
 
 def test_ten_percent_better_is_found_among_ten_percent_of_noise():
     rng = np.random.default_rng(2)
     champion = np.exp(0.1 * rng.standard_normal(64)) * np.repeat(rng.uniform(1, 5, 16), 4)
-    found = paired(champion, 0.9 * champion * np.exp(0.02 * rng.standard_normal(64)), [str(k // 4) for k in range(64)], rng=rng)
+    found = paired(
+        champion,
+        0.9 * champion * np.exp(0.02 * rng.standard_normal(64)),
+        [str(k // 4) for k in range(64)],
+        rng=rng,
+    )
     assert found.p < 0.001 and found.low_percent < 10 < found.high_percent
 
 
@@ -52,7 +60,9 @@ def test_costs_that_are_none_are_refused():
 
 def _evidence(cost: float, **guards: float) -> Evidence:
     return Evidence(
-        "panel", {f"case {k}": (f"plant {k}", cost * (1 + k)) for k in range(8)}, {"worst_case": 10.0, "unstable_plants": 0.0} | guards
+        "panel",
+        {f"case {k}": (f"plant {k}", cost * (1 + k)) for k in range(8)},
+        {"worst_case": 10.0, "unstable_plants": 0.0} | guards,
     )
 
 
@@ -71,11 +81,14 @@ def test_the_rule_promotes_what_is_better_and_nothing_else():
     ("challenger", "alarms", "reason"),
     [
         (_evidence(0.97), (), "at least 5 % is worth a change"),
-        (_evidence(0.9, worst_case=10.6), (), "guard worst_case is 10.6 against 10; at most 0.5 more is allowed"),
+        (_evidence(0.9, worst_case=10.6), (),
+        "guard worst_case is 10.6 against 10; at most 0.5 more is allowed"),
         (_evidence(0.9, unstable_plants=1.0), (), "unstable_plants is 1; none is allowed"),
         (_evidence(0.9)._replace(panel="another"), (), "judged on different cases"),
-        (_evidence(0.9), ("the gain from heater_1 has changed",), "drift: the gain from heater_1 has changed"),
-        (_evidence(0.9)._replace(cases={f"case {k}": ("plant", 0.9) for k in range(8)}), (), "blocks cannot tell at level 0.01; at least 7 are needed"),
+        (_evidence(0.9), ("the gain from heater_1 has changed",),
+        "drift: the gain from heater_1 has changed"),
+        (_evidence(0.9)._replace(cases={f"case {k}": ("plant", 0.9) for k in range(8)}), (),
+        "blocks cannot tell at level 0.01; at least 7 are needed"),
         (_evidence(0.9)._replace(guards={}), (), "guard worst_case is inf"),
     ],
 )  # fmt: skip

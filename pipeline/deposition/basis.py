@@ -1,4 +1,5 @@
-"""The basis-function composer: a command for any wanted flow as a weighted sum of functions of it, the weights and the advance read off the identified chain."""
+"""The basis-function composer: a command for any wanted flow as a weighted sum of functions of it, the
+weights and the advance read off the identified chain."""
 
 import math
 
@@ -9,18 +10,22 @@ import scipy.signal
 from pipeline.deposition import reachable
 from pipeline.deposition.extruder import DAMPING, Extruder, lagged, ramp
 
-# the yield is loaded this long before the flow begins and kept through gaps of twice that: long against the lag, short against a pause between lines
+# the yield is loaded this long before the flow begins and kept through gaps of twice that: long against the
+# lag, short against a pause between lines
 LOAD_S = 0.25
-# dither: slow enough to pass a lag of a few Hz, fast enough that a time constant of seconds leaves some 0.1 % of the steady flow of it
+# dither: slow enough to pass a lag of a few Hz, fast enough that a time constant of
+# seconds leaves some 0.1 % of the steady flow of it
 DITHER_HZ = 2.5
 # and it fades over some cycles: a play left off its middle by a stop would offset the next start
 DITHER_S = 1.0
-# inverse of delay and lag: what lies beyond these seconds is nothing, and where the lag leaves less than FLOOR of the power it is not undone
+# inverse of delay and lag: what lies beyond these seconds is nothing, and where the lag leaves less than
+# FLOOR of the power it is not undone
 SPAN_S, FLOOR = 2.0, 1e-3
 
 
 def boxed(x: np.ndarray, ramp_s: float, sample_time_s: float) -> np.ndarray:
-    """x (T,), held from each sample to the next, after two moving averages of ramp_s, centred, at the samples: a step becomes extruder.ramp.
+    """x (T,), held from each sample to the next, after two moving averages of ramp_s, centred, at the
+    samples: a step becomes extruder.ramp.
 
     Beyond its ends x counts as 0; the sum is kept.
     """
@@ -30,16 +35,20 @@ def boxed(x: np.ndarray, ramp_s: float, sample_time_s: float) -> np.ndarray:
 
 
 def loaded(r: np.ndarray, margin_s: float, sample_time_s: float) -> np.ndarray:
-    """An on-indicator (T,): 1 while r > 0 and through gaps up to 2 margin_s, rising before and falling after within 2 margin_s."""
+    """An on-indicator (T,): 1 while r > 0 and through gaps up to 2 margin_s,
+    rising before and falling after within 2 margin_s."""
     n = max(1, round(margin_s / sample_time_s))
-    near = scipy.ndimage.maximum_filter1d((r > 1e-9 * r.max(initial=0.0)).astype(float), 2 * n + 1, mode="constant")
+    near = scipy.ndimage.maximum_filter1d(
+        (r > 1e-9 * r.max(initial=0.0)).astype(float), 2 * n + 1, mode="constant"
+    )
     for origin in (0, (n + 1) % 2 * -1):  # two boxes of an even length lie half a sample to either side
         near = scipy.ndimage.uniform_filter1d(near, n, mode="constant", origin=origin)
     return np.clip(near, 0.0, 1.0)
 
 
 def advance(extruder: Extruder, sample_time_s: float) -> np.ndarray:
-    """Centred impulse response of conj(H) / (|H|^2 + FLOOR), scaled to gain 1, with H of delay and lag: what comes late is sent ahead."""
+    """Centred impulse response of conj(H) / (|H|^2 + FLOOR), scaled to gain 1, with H
+    of delay and lag: what comes late is sent ahead."""
     half = round(SPAN_S / sample_time_s)
     impulse = np.zeros(4 * half)
     impulse[0] = 1.0
@@ -49,7 +58,8 @@ def advance(extruder: Extruder, sample_time_s: float) -> np.ndarray:
 
 
 def shift(extruder: Extruder, sample_time_s: float) -> np.ndarray:
-    """Centred impulse response that sends a signal ahead by the delay and the mean delay of the lag, and never beyond its limits."""
+    """Centred impulse response that sends a signal ahead by the delay and the
+    mean delay of the lag, and never beyond its limits."""
     half = round(SPAN_S / sample_time_s)
     late = min((extruder.delay_s + DAMPING / (math.pi * extruder.lag_hz)) / sample_time_s, half - 1.0)
     h = np.zeros(2 * half + 1)
@@ -58,16 +68,23 @@ def shift(extruder: Extruder, sample_time_s: float) -> np.ndarray:
     return h
 
 
-def compose(extruder: Extruder, r: np.ndarray, *, sample_time_s: float, limit: float = math.inf) -> np.ndarray:
-    """The command u (T,) in mm for the wanted flow r (T,) in mm^3/s, as functions of r and of the on-indicator p, with x = r + yield p:
+def compose(
+    extruder: Extruder, r: np.ndarray, *, sample_time_s: float, limit: float = math.inf
+) -> np.ndarray:
+    """The command u (T,) in mm for the wanted flow r (T,) in mm^3/s, as functions of r and of the
+    on-indicator p, with x = r + yield p:
 
-    u(t) = advance * [ rate x'(t) + level x(t) + slow <x>(t) + play q(t) sin(2 pi f t) ],   <x> = x / (sigma s + 1)
+    u(t) = advance * [ rate x'(t) + level x(t) + slow <x>(t) + play
+    q(t) sin(2 pi f t) ], <x> = x / (sigma s + 1)
 
-    The weights invert the chain: with c the creeping share, sigma = (1 - c) T + c tau, rate = tau T / (sigma K), level = (tau + T - tau T / sigma) / (sigma K)
-    and level + slow = 1 / K; without creep rate = tau / K, level = 1 / K, slow = 0. Computed in its exact discrete form. The dither is as wide as the play:
-    it walks through the play wherever that stands, so that its mean position is the command's (Zames and Shneydor 1976); q lets it die out after a stop.
+    The weights invert the chain: with c the creeping share, sigma = (1 - c) T + c tau, rate = tau T / (sigma
+    K), level = (tau + T - tau T / sigma) / (sigma K) and level + slow = 1 / K; without creep rate = tau / K,
+    level = 1 / K, slow = 0. Computed in its exact discrete form. The dither is as wide as the play: it walks
+    through the play wherever that stands, so that its mean position is the command's (Zames and Shneydor
+    1976); q lets it die out after a stop.
 
-    Where |u| would exceed `limit`, the command whose flow comes nearest: it sets out early and catches up late.
+    Where |u| would exceed `limit`, the command whose flow comes
+    nearest: it sets out early and catches up late.
     """
     if not np.any(r > 0):
         return np.zeros(len(r))
@@ -76,12 +93,17 @@ def compose(extruder: Extruder, r: np.ndarray, *, sample_time_s: float, limit: f
     if np.abs(scipy.signal.oaconvolve(v, ahead, "same")).max() > limit:
         v, ahead = _nearest(extruder, v, r, limit, sample_time_s), shift(extruder, sample_time_s)
     if extruder.play > 0:
-        v += extruder.play * loaded(r, DITHER_S, sample_time_s) * np.sin(2 * np.pi * DITHER_HZ * sample_time_s * np.arange(len(r)))
+        v += (
+            extruder.play
+            * loaded(r, DITHER_S, sample_time_s)
+            * np.sin(2 * np.pi * DITHER_HZ * sample_time_s * np.arange(len(r)))
+        )
     return np.clip(scipy.signal.oaconvolve(v, ahead, "same"), -limit, limit)
 
 
 def _modes(extruder: Extruder, sample_time_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Gain and pole of the fast and of the creeping mode: each is m(t+1) = pole m(t) + gain v(t), and x their sum."""
+    """Gain and pole of the fast and of the creeping mode: each is
+    m(t+1) = pole m(t) + gain v(t), and x their sum."""
     poles = np.exp(-sample_time_s / np.array([extruder.time_constant_s, extruder.creep_time_s]))
     return extruder.gain * np.array([1 - extruder.creep_share, extruder.creep_share]) * (1 - poles), poles
 
@@ -93,8 +115,11 @@ def _inverse(extruder: Extruder, x: np.ndarray, sample_time_s: float) -> np.ndar
     return np.append(v[1:], x[-1] / extruder.gain)
 
 
-def _nearest(extruder: Extruder, v: np.ndarray, r: np.ndarray, limit: float, sample_time_s: float) -> np.ndarray:
-    """v (T,) within +-limit whose fast mode comes nearest to that of the unlimited v; below the yield, where no flow is wanted, it is free."""
+def _nearest(
+    extruder: Extruder, v: np.ndarray, r: np.ndarray, limit: float, sample_time_s: float
+) -> np.ndarray:
+    """v (T,) within +-limit whose fast mode comes nearest to that of the unlimited v; below
+    the yield, where no flow is wanted, it is free."""
     (g, _), (a, _) = _modes(extruder, sample_time_s)
     fast = scipy.signal.lfilter([g], [1.0, -a], v)
     reached = reachable.nearest(fast, np.append(r[1:], 0.0) <= 0, pole=a, bound=g * limit)

@@ -1,4 +1,5 @@
-"""Camera frame -> sub-pixel bead width along the line, or the reason why there is none; pixels -> millimetres on known widths; width -> cross-section."""
+"""Camera frame -> sub-pixel bead width along the line, or the reason why there is none; pixels -> millimetres
+on known widths; width -> cross-section."""
 
 import math
 from collections.abc import Sequence
@@ -12,11 +13,14 @@ from pipeline.deposition.edges import BLOCK, FEWEST_BLOCKS
 
 
 class Bead(NamedTuple):
-    """The bead in one frame. columns (n,) are the centres of blocks of 8 columns; widths (n,), top (n,) and bottom (n,) in px across the line, pixel centres at whole rows.
+    """The bead in one frame. columns (n,) are the centres of blocks of 8 columns; widths (n,), top (n,) and
+    bottom (n,) in px across the line, pixel centres at whole rows.
 
-    widths is 0 where the block shows background only and NaN where it cannot be read. `width` is the line fitted robustly through the widths, at the middle of the
-    blocks that it uses, and `deviation` its standard deviation; both NaN where `reason` is not empty: "no bead", "saturated", "cut by the frame", "blurred".
-    `angle_deg` is the line's direction against the rows, `blur_px` the standard deviation of the edge, `contrast` bead less background in levels.
+    widths is 0 where the block shows background only and NaN where it cannot be read. `width` is the line
+    fitted robustly through the widths, at the middle of the blocks that it uses, and `deviation` its standard
+    deviation; both NaN where `reason` is not empty: "no bead", "saturated", "cut by the frame", "blurred".
+    `angle_deg` is the line's direction against the rows, `blur_px` the standard deviation of the edge,
+    `contrast` bead less background in levels.
     """
 
     columns: np.ndarray
@@ -32,20 +36,23 @@ class Bead(NamedTuple):
 
 
 def area(width: np.ndarray | float, contact_angle_deg: float) -> np.ndarray | float:
-    """Cross-section A = c w^2 in mm^2 of a bead w mm wide: the circular segment that meets the substrate at theta, c = (theta - sin theta cos theta) / (4 sin^2 theta).
+    """Cross-section A = c w^2 in mm^2 of a bead w mm wide: the circular segment that meets the substrate at
+    theta, c = (theta - sin theta cos theta) / (4 sin^2 theta).
 
     At 90 degrees c = pi/8. Raises ValueError where theta is not between 0 and 180 degrees.
     """
     if not 0 < contact_angle_deg < 180:
         raise ValueError(
-            f"bead: expected a contact angle between 0 and 180 degrees but found {contact_angle_deg:g}; measure it on a cut bead"
+            f"bead: expected a contact angle between 0 and 180 degrees but found {contact_angle_deg:g}; "
+            "measure it on a cut bead"
         )
     theta = math.radians(contact_angle_deg)
     return (theta - math.sin(theta) * math.cos(theta)) / (4 * math.sin(theta) ** 2) * width**2
 
 
 class Calibration(NamedTuple):
-    """Width in mm = gain px + offset. deviation is the r.m.s. of the residuals (mm, two parameters taken off), residuals (n,) known less fitted in mm."""
+    """Width in mm = gain px + offset. deviation is the r.m.s. of the residuals (mm, two parameters taken
+    off), residuals (n,) known less fitted in mm."""
 
     gain: float
     offset: float
@@ -54,32 +61,40 @@ class Calibration(NamedTuple):
 
 
 def calibrate(widths_px: np.ndarray, known_mm: np.ndarray) -> Calibration:
-    """Gain (mm/px) and offset (mm) by least squares from measured widths (n,) in px of beads or gauges of known widths (n,) in mm.
+    """Gain (mm/px) and offset (mm) by least squares from measured widths (n,)
+    in px of beads or gauges of known widths (n,) in mm.
 
-    Raises ValueError for fewer than three different widths, a measurement that failed, or widths that do not grow with the known ones.
+    Raises ValueError for fewer than three different widths, a measurement that
+    failed, or widths that do not grow with the known ones.
     """
     px, mm = np.asarray(widths_px, float), np.asarray(known_mm, float)
     if px.shape != mm.shape or px.ndim != 1 or len(np.unique(mm)) < 3:
         raise ValueError(
-            f"calibration: expected at least three different known widths, one measurement each or more, but found {px.shape} measured for "
+            "calibration: expected at least three different known widths, one measurement each or more, "
+            f"but found {px.shape} measured for "
             f"{len(np.unique(mm))} different; add frames of other widths"
         )
     if not np.isfinite(px).all():
         raise ValueError(
-            f"calibration: expected a width in every frame but {np.count_nonzero(~np.isfinite(px))} of {len(px)} have none; look at their reasons"
+            f"calibration: expected a width in every frame but {np.count_nonzero(~np.isfinite(px))} of "
+            f"{len(px)} have none; look at their reasons"
         )
     J = np.column_stack([px, np.ones(len(px))])
     gain, offset = np.linalg.lstsq(J, mm, rcond=None)[0]
     residuals = mm - gain * px - offset
     if gain <= 0:
         raise ValueError(
-            f"calibration: expected widths in px that grow with the known widths but found a gain of {gain:.3g} mm/px; check which frame shows which width"
+            "calibration: expected widths in px that grow with the known widths but found a gain of "
+            f"{gain:.3g} mm/px; check which frame shows which width"
         )
-    return Calibration(float(gain), float(offset), float(np.sqrt(residuals @ residuals / (len(px) - 2))), residuals)
+    return Calibration(
+        float(gain), float(offset), float(np.sqrt(residuals @ residuals / (len(px) - 2))), residuals
+    )
 
 
 def drawn(frame: np.ndarray, bead: Bead) -> np.ndarray:
-    """The frame as (h, w, 3) uint8 RGB with the measured edges as green lines, for a report; blocks without a width stay bare, a rejected frame gets a red border."""
+    """The frame as (h, w, 3) uint8 RGB with the measured edges as green lines, for a report; blocks without a
+    width stay bare, a rejected frame gets a red border."""
     scale = 1 if frame.dtype == np.uint8 else 1 / 257
     picture = cv2.cvtColor((gray(frame) * scale).astype(np.uint8), cv2.COLOR_GRAY2RGB)
     if bead.reason:
@@ -92,10 +107,13 @@ def drawn(frame: np.ndarray, bead: Bead) -> np.ndarray:
 
 
 def gray(frame: np.ndarray) -> np.ndarray:
-    """frame as (h, w) uint8 or uint16: gray as it is, colour (h, w, 3 or 4) in OpenCV's order BGR(A) by 0.114 B + 0.587 G + 0.299 R. Raises ValueError for all else."""
+    """frame as (h, w) uint8 or uint16: gray as it is, colour (h, w, 3 or 4) in OpenCV's order BGR(A) by 0.114
+    B + 0.587 G + 0.299 R. Raises ValueError for all else."""
     kind = "frame: expected (height, width) or (height, width, 3 or 4) of uint8 or uint16"
     if frame.dtype not in (np.uint8, np.uint16) or frame.ndim not in (2, 3):
-        raise ValueError(f"{kind} but found {frame.shape} of {frame.dtype}; convert it without scaling it per frame")
+        raise ValueError(
+            f"{kind} but found {frame.shape} of {frame.dtype}; convert it without scaling it per frame"
+        )
     if frame.ndim == 3 and frame.shape[2] in (3, 4):
         return cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY if frame.shape[2] == 3 else cv2.COLOR_BGRA2GRAY)
     if frame.ndim == 3 and frame.shape[2] != 1:
@@ -104,21 +122,28 @@ def gray(frame: np.ndarray) -> np.ndarray:
 
 
 def measure(frame: np.ndarray, *, columns: tuple[int, int], longest_blur_px: float) -> Bead:
-    """The bead's width in every block of 8 columns of frame[:, first:last] (`columns`: the part that the nozzle does not hide), the line along the image's x.
+    """The bead's width in every block of 8 columns of frame[:, first:last] (`columns`: the part that the
+    nozzle does not hide), the line along the image's x.
 
-    Profile of each block less the background between its ends; outermost significant run; half level of the plateau beside the edge, clipped at the bead's
-    median so that the specular line cannot lift it, and extrapolated to the edge against shading. Bright and dark beads alike. A frame without a usable bead
-    comes back with its reason; one that is no image, or too small, raises ValueError.
+    Profile of each block less the background between its ends; outermost significant run; half level of the
+    plateau beside the edge, clipped at the bead's median so that the specular line cannot lift it, and
+    extrapolated to the edge against shading. Bright and dark beads alike. A frame without a usable bead comes
+    back with its reason; one that is no image, or too small, raises ValueError.
     """
     return measure_all([frame], columns=columns, longest_blur_px=longest_blur_px)[0]
 
 
-def measure_all(frames: Sequence[np.ndarray], *, columns: tuple[int, int], longest_blur_px: float) -> list[Bead]:
-    """`measure` of each frame, all of one size and kind: the same numbers, each in a third of the time where sixteen come together."""
+def measure_all(
+    frames: Sequence[np.ndarray], *, columns: tuple[int, int], longest_blur_px: float
+) -> list[Bead]:
+    """`measure` of each frame, all of one size and kind: the same numbers, each in
+    a third of the time where sixteen come together."""
     frames = [gray(frame) for frame in frames]
     kinds = {(frame.shape, frame.dtype.name) for frame in frames}
     if len(kinds) > 1:
-        raise ValueError(f"frames: expected frames of one size and kind but found {sorted(kinds)}; measure them in groups")
+        raise ValueError(
+            f"frames: expected frames of one size and kind but found {sorted(kinds)}; measure them in groups"
+        )
     if not frames:
         return []
     g = edges.profiles(frames, columns)
@@ -132,20 +157,43 @@ def measure_all(frames: Sequence[np.ndarray], *, columns: tuple[int, int], longe
     cut, few = run.cut.sum(axis=1) > n / 2, good.sum(axis=1) < FEWEST_BLOCKS
     out = []
     for i in range(len(frames)):
-        reasons = {"cut by the frame": cut[i], "saturated": run.saturated[i], "no bead": few[i], "blurred": blur[i] > longest_blur_px}
+        reasons = {
+            "cut by the frame": cut[i],
+            "saturated": run.saturated[i],
+            "no bead": few[i],
+            "blurred": blur[i] > longest_blur_px,
+        }
         reason = next((name for name, holds in reasons.items() if holds), "")
         if reason:
             # in a frame without a bead what is bare substrate stays 0, in a spoilt one nothing is known
             nothing = np.full(n, math.nan)
             known = widths[i] if reason == "no bead" else nothing
-            out.append(Bead(where, known, nothing, nothing, *[math.nan] * 3, float(blur[i]), math.nan, reason))
+            out.append(
+                Bead(where, known, nothing, nothing, *[math.nan] * 3, float(blur[i]), math.nan, reason)
+            )
         else:
-            out.append(_bead(where, widths[i], good[i], top[i], bottom[i], float(blur[i]), float(run.sign[i] * run.plateau[i])))
+            out.append(
+                _bead(
+                    where,
+                    widths[i],
+                    good[i],
+                    top[i],
+                    bottom[i],
+                    float(blur[i]),
+                    float(run.sign[i] * run.plateau[i]),
+                )
+            )
     return out
 
 
 def _bead(
-    where: np.ndarray, widths: np.ndarray, good: np.ndarray, top: np.ndarray, bottom: np.ndarray, blur: float, contrast: float
+    where: np.ndarray,
+    widths: np.ndarray,
+    good: np.ndarray,
+    top: np.ndarray,
+    bottom: np.ndarray,
+    blur: float,
+    contrast: float,
 ) -> Bead:
     """The line through the edges: vertical distances are turned to widths across it."""
     x, lower, upper = where[good], top[good], bottom[good]
@@ -153,11 +201,14 @@ def _bead(
     slope = float(x @ (lower + upper) / (2 * x @ x))
     widths[good] = found = (upper - lower) / math.hypot(1.0, slope)
     top[~good] = bottom[~good] = math.nan
-    return Bead(where, widths, top, bottom, *_line(x, found), math.degrees(math.atan(slope)), blur, contrast, "")
+    return Bead(
+        where, widths, top, bottom, *_line(x, found), math.degrees(math.atan(slope)), blur, contrast, ""
+    )
 
 
 def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Value at x = 0 of the line through y and its standard deviation; points beyond three robust deviations of the first fit are left out of the second."""
+    """Value at x = 0 of the line through y and its standard deviation; points beyond three robust deviations
+    of the first fit are left out of the second."""
     a, b = x, y
     for _ in range(2):
         middle, mean = a.sum() / len(a), b.sum() / len(b)

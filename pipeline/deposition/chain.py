@@ -1,4 +1,5 @@
-"""The whole chain of the extruder identified from every learning trial: delay, lag, play, time constant, yield, creep; and its error on routines left out."""
+"""The whole chain of the extruder identified from every learning trial: delay, lag, play, time constant,
+yield, creep; and its error on routines left out."""
 
 import math
 from collections.abc import Sequence
@@ -11,13 +12,15 @@ import scipy.signal
 from pipeline.deposition.extruder import Extruder, lagged
 from pipeline.deposition.library import Training
 
-# the order of the unknowns: ln K, ln tau, delay, ln lag, play, yield, creep share, ln creep time; play and yield in shares of the steady command and flow
+# the order of the unknowns: ln K, ln tau, delay, ln lag, play, yield, creep share, ln creep time; play and
+# yield in shares of the steady command and flow
 LOW = np.array([math.log(1e-3), math.log(0.05), 0.0, math.log(1.0), 0.0, 0.0, 0.0, math.log(5.0)])
 HIGH = np.array([math.log(1e3), math.log(100.0), 1.0, math.log(20.0), 0.3, 0.5, 0.5, math.log(200.0)])
 # steps of the central part of the Jacobian, small against what a trial can tell and large against rounding
 STEP = np.array([1e-3, 1e-3, 1e-3, 1e-2, 1e-3, 1e-3, 2e-3, 1e-2])
 AVERAGE_S = 0.2
-# a measured flow wanders from trial to trial: changes slower than this are trusted less than white noise would be
+# a measured flow wanders from trial to trial: changes slower than this
+# are trusted less than white noise would be
 DRIFT_S = 4.0
 LINEAR, CREEP = np.arange(6), np.arange(8)
 
@@ -25,9 +28,9 @@ LINEAR, CREEP = np.arange(6), np.arange(8)
 class Chain(NamedTuple):
     """The identified extruder, and how far to trust it.
 
-    `residual_percent` is the r.m.s. of measured minus simulated flow over all trials, `held_out_percent` the r.m.s. error on learned trials of routines that the
-    fit did not see, both in % of the steady flow; the latter of means over AVERAGE_S. `creeps`: the slow mode lowered it.
-    `trials` were used, in `rows` means.
+    `residual_percent` is the r.m.s. of measured minus simulated flow over all trials, `held_out_percent` the
+    r.m.s. error on learned trials of routines that the fit did not see, both in % of the steady flow; the
+    latter of means over AVERAGE_S. `creeps`: the slow mode lowered it. `trials` were used, in `rows` means.
     """
 
     extruder: Extruder
@@ -39,7 +42,8 @@ class Chain(NamedTuple):
 
 
 class Records(NamedTuple):
-    """Rows (N, T) of commands u and measured flows y of `routine` (N,), weight (N, T) = root of the trials behind a row, 0 where y is unknown or beyond the end."""
+    """Rows (N, T) of commands u and measured flows y of `routine` (N,), weight (N, T) = root of the trials
+    behind a row, 0 where y is unknown or beyond the end."""
 
     u: np.ndarray
     y: np.ndarray
@@ -48,7 +52,8 @@ class Records(NamedTuple):
 
 
 def records(trainings: Sequence[Training], *, early: int = 3) -> Records:
-    """All trials as rows: the first `early` of each routine alone, for there u still changes, the mean of the later ones, whose commands hardly differ."""
+    """All trials as rows: the first `early` of each routine alone, for there u still changes, the mean of the
+    later ones, whose commands hardly differ."""
     rows = []
     for index, training in enumerate(trainings):
         u, y = np.asarray(training.u, float), np.asarray(training.y, float)
@@ -64,9 +69,11 @@ def records(trainings: Sequence[Training], *, early: int = 3) -> Records:
 
 
 def backlash(x: np.ndarray, play: np.ndarray) -> np.ndarray:
-    """Play of full width `play` (...,) along the last axis of x (..., T), y(t) = min(max(y(t-1), x(t) - play/2), x(t) + play/2) from y(-1) = 0.
+    """Play of full width `play` (...,) along the last axis of x (..., T), y(t) = min(max(y(t-1), x(t) -
+    play/2), x(t) + play/2) from y(-1) = 0.
 
-    Each step clips y to [x - play/2, x + play/2], and clips compose to clips: blocks of the time axis are walked side by side, then joined.
+    Each step clips y to [x - play/2, x + play/2], and clips compose to clips: blocks of
+    the time axis are walked side by side, then joined.
     """
     rows, length = math.prod(x.shape[:-1]), x.shape[-1]
     block = max(1, math.isqrt(length // 4) if rows < 64 else length)
@@ -95,10 +102,18 @@ def first_order(x: np.ndarray, time_constant_s: float, sample_time_s: float) -> 
 
 
 def simulate(extruders: Sequence[Extruder], u: np.ndarray, *, sample_time_s: float) -> np.ndarray:
-    """Flow (P, N, T) of each of P extruders under the rows u (N, T), each from rest: extruder.flow for many at once."""
-    quiet = math.ceil(2.0 / sample_time_s)  # the slowest lag and the longest delay have died out before the next row
+    """Flow (P, N, T) of each of P extruders under the rows u (N, T),
+    each from rest: extruder.flow for many at once."""
+    quiet = math.ceil(
+        2.0 / sample_time_s
+    )  # the slowest lag and the longest delay have died out before the next row
     flat = np.pad(u, ((0, 0), (0, quiet))).ravel()
-    x = np.stack([lagged(flat, e.delay_s, e.lag_hz, sample_time_s).reshape(len(u), -1)[:, : u.shape[1]] for e in extruders])
+    x = np.stack(
+        [
+            lagged(flat, e.delay_s, e.lag_hz, sample_time_s).reshape(len(u), -1)[:, : u.shape[1]]
+            for e in extruders
+        ]
+    )
     x = backlash(x, np.array([e.play for e in extruders])[:, None])
     flows = []
     for v, e in zip(x, extruders, strict=True):
@@ -117,24 +132,43 @@ def forecast(extruder: Extruder, u: np.ndarray, *, sample_time_s: float) -> np.n
 def _extruder(z: np.ndarray, steady_flow: float) -> Extruder:
     gain = math.exp(z[0])
     play, yield_ = z[4] * steady_flow / gain, z[5] * steady_flow
-    return Extruder(gain, math.exp(z[1]), float(z[2]), math.exp(z[3]), float(play), float(yield_), float(z[6]), math.exp(z[7]))
+    return Extruder(
+        gain,
+        math.exp(z[1]),
+        float(z[2]),
+        math.exp(z[3]),
+        float(play),
+        float(yield_),
+        float(z[6]),
+        math.exp(z[7]),
+    )
 
 
 def innovations(error: np.ndarray, weight: np.ndarray, sample_time_s: float) -> np.ndarray:
-    """Weighted errors (P, N, T) without what white noise upon a random walk lets one foresee: (1 - q^-1) / (1 - theta q^-1), theta = exp(-Ts / DRIFT_S).
+    """Weighted errors (P, N, T) without what white noise upon a random walk lets one foresee: (1 - q^-1) / (1
+    - theta q^-1), theta = exp(-Ts / DRIFT_S).
 
-    That is the whitening filter of such a measurement (Muth 1960). Where nothing was seen (weight (N, T) 0) the last error seen stays.
+    That is the whitening filter of such a measurement (Muth 1960). Where nothing
+    was seen (weight (N, T) 0) the last error seen stays.
     """
     seen = np.maximum.accumulate(np.where(weight > 0, np.arange(weight.shape[1]), 0), axis=1)
     held = np.take_along_axis(error * weight, np.broadcast_to(seen, error.shape), axis=-1)
-    return scipy.signal.lfilter([1.0, -1.0], [1.0, -math.exp(-sample_time_s / DRIFT_S)], held)[..., weight > 0]
+    return scipy.signal.lfilter([1.0, -1.0], [1.0, -math.exp(-sample_time_s / DRIFT_S)], held)[
+        ..., weight > 0
+    ]
 
 
 def fit(
-    rows: Records, z: np.ndarray, free: np.ndarray, steady_flow: float, sample_time_s: float, *, evaluations: int
+    rows: Records,
+    z: np.ndarray,
+    free: np.ndarray,
+    steady_flow: float,
+    sample_time_s: float,
+    *,
+    evaluations: int,
 ) -> tuple[np.ndarray, float]:
-    """The unknowns z with those in `free` moved to the least sum of squared innovations of simulated - measured flow (output error, Gauss-Newton within bounds);
-    and that sum."""
+    """The unknowns z with those in `free` moved to the least sum of squared innovations of simulated -
+    measured flow (output error, Gauss-Newton within bounds); and that sum."""
 
     def moved(part):
         full = z.copy()
@@ -145,7 +179,9 @@ def fit(
         return innovations(difference, rows.weight, sample_time_s) / steady_flow
 
     def errors(part):
-        return weighted(simulate([_extruder(moved(part), steady_flow)], rows.u, sample_time_s=sample_time_s)[0] - rows.y)
+        return weighted(
+            simulate([_extruder(moved(part), steady_flow)], rows.u, sample_time_s=sample_time_s)[0] - rows.y
+        )
 
     def jacobian(part):
         at = moved(part)
@@ -156,7 +192,14 @@ def fit(
 
     start = np.clip(z[free], LOW[free], HIGH[free])
     found = scipy.optimize.least_squares(
-        errors, start, jacobian, bounds=(LOW[free], HIGH[free]), x_scale=100 * STEP[free], ftol=1e-6, xtol=1e-6, max_nfev=evaluations
+        errors,
+        start,
+        jacobian,
+        bounds=(LOW[free], HIGH[free]),
+        x_scale=100 * STEP[free],
+        ftol=1e-6,
+        xtol=1e-6,
+        max_nfev=evaluations,
     )
     return moved(found.x), 2 * float(found.cost)
 
@@ -166,7 +209,8 @@ def _start(rows: Records, steady_flow: float, sample_time_s: float) -> np.ndarra
     displaced = np.sum(rows.u * (rows.weight > 0))
     if displaced <= 0:
         raise ValueError(
-            "identify: expected commands that press but found a sum of u <= 0; check the sign of the command (mm, positive pushes material out)"
+            "identify: expected commands that press but found a sum of u <= 0; "
+            "check the sign of the command (mm, positive pushes material out)"
         )
     gain = max(float(np.sum(rows.y * (rows.weight > 0))), 1e-3 * steady_flow) / displaced
     grid = [
@@ -178,7 +222,14 @@ def _start(rows: Records, steady_flow: float, sample_time_s: float) -> np.ndarra
     return grid[int(np.argmin([np.sum(((f - rows.y) * rows.weight) ** 2) for f in flows]))]
 
 
-def _held_out(rows: Records, folds: np.ndarray, z: np.ndarray, free: np.ndarray, steady_flow: float, sample_time_s: float) -> float:
+def _held_out(
+    rows: Records,
+    folds: np.ndarray,
+    z: np.ndarray,
+    free: np.ndarray,
+    steady_flow: float,
+    sample_time_s: float,
+) -> float:
     """R.m.s. error on the last row of each fold by a fit to the other folds, in shares of the steady flow."""
     squares = []
     for fold in np.unique(folds):
@@ -192,27 +243,39 @@ def _held_out(rows: Records, folds: np.ndarray, z: np.ndarray, free: np.ndarray,
 
 
 def averaged(error: np.ndarray, seen: np.ndarray, sample_time_s: float) -> float:
-    """R.m.s. of the means of an error over AVERAGE_S, where it was seen: what is left of white noise is a fraction, what is left of an error of flow all of it."""
+    """R.m.s. of the means of an error over AVERAGE_S, where it was seen: what is left of white noise is a
+    fraction, what is left of an error of flow all of it."""
     box = np.ones(round(AVERAGE_S / sample_time_s))
     count = np.convolve(seen, box, "same")
-    return float(np.sqrt(np.mean((np.convolve(np.where(seen, error, 0.0), box, "same")[count > 0] / count[count > 0]) ** 2)))
+    return float(
+        np.sqrt(
+            np.mean((np.convolve(np.where(seen, error, 0.0), box, "same")[count > 0] / count[count > 0]) ** 2)
+        )
+    )
 
 
 def identify(trainings: Sequence[Training], *, sample_time_s: float) -> Chain:
-    """The chain of one material and nozzle from all its trials: with the slow mode only where that predicts routines left out better.
+    """The chain of one material and nozzle from all its trials: with the slow mode
+    only where that predicts routines left out better.
 
-    One routine alone cannot be left out: then its rows are. Two speeds part gain from yield, which one speed cannot (they are collinear on one plateau).
-    Raises ValueError without trials, or where the commands do not press.
+    One routine alone cannot be left out: then its rows are. Two speeds part gain from
+    yield, which one speed cannot (they are collinear on one plateau). Raises ValueError
+    without trials, or where the commands do not press.
     """
     if not trainings or any(len(training.u) < 2 for training in trainings):
         raise ValueError(
-            f"identify: expected routines of at least two trials each but found {[len(t.u) for t in trainings]}; run more trials"
+            "identify: expected routines of at least two trials each but found "
+            f"{[len(t.u) for t in trainings]}; run more trials"
         )
     steady_flow = max(float(np.max(training.r)) for training in trainings)
     rows = records(trainings)
     folds = rows.routine if len(trainings) > 1 else np.arange(len(rows.routine))
-    z, cost = fit(rows, _start(rows, steady_flow, sample_time_s), LINEAR, steady_flow, sample_time_s, evaluations=40)
-    slow, slow_cost = fit(rows, np.where(np.arange(8) == 6, 0.05, z), CREEP, steady_flow, sample_time_s, evaluations=40)
+    z, cost = fit(
+        rows, _start(rows, steady_flow, sample_time_s), LINEAR, steady_flow, sample_time_s, evaluations=40
+    )
+    slow, slow_cost = fit(
+        rows, np.where(np.arange(8) == 6, 0.05, z), CREEP, steady_flow, sample_time_s, evaluations=40
+    )
     error, creeps = _held_out(rows, folds, z, LINEAR, steady_flow, sample_time_s), False
     # less than this is noise that a slow mode happens to fit
     if slow_cost < 0.996 * cost:
@@ -221,4 +284,11 @@ def identify(trainings: Sequence[Training], *, sample_time_s: float) -> Chain:
     best, error = (slow, slow_error) if creeps else (z, error)
     left = simulate([_extruder(best, steady_flow)], rows.u, sample_time_s=sample_time_s)[0] - rows.y
     residual = math.sqrt(np.sum((left * rows.weight) ** 2) / np.sum(rows.weight**2)) / steady_flow
-    return Chain(_extruder(best, steady_flow), 100 * residual, 100 * error, creeps, sum(len(t.u) for t in trainings), len(rows.routine))
+    return Chain(
+        _extruder(best, steady_flow),
+        100 * residual,
+        100 * error,
+        creeps,
+        sum(len(t.u) for t in trainings),
+        len(rows.routine),
+    )

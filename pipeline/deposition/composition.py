@@ -1,4 +1,5 @@
-"""Part program -> plunger command without learning again: the paper's priority rule, superposition, and basis functions; the one that predicts best is taken."""
+"""Part program -> plunger command without learning again: the paper's priority rule, superposition, and basis
+functions; the one that predicts best is taken."""
 
 import math
 from collections.abc import Sequence
@@ -35,8 +36,9 @@ EXCERPT_S = 600.0
 
 
 class Material(NamedTuple):
-    """What was learned of one material and nozzle: its chain, the gain (mm^3/s per mm) by which on-off control set out in the first trial, and the error of the learned
-    trials themselves in % of the steady flow (means over 0.2 s)."""
+    """What was learned of one material and nozzle: its chain, the gain (mm^3/s per mm) by
+    which on-off control set out in the first trial, and the error of the learned trials
+    themselves in % of the steady flow (means over 0.2 s)."""
 
     material: str
     nozzle_mm: float
@@ -54,8 +56,9 @@ class Learned(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """Predicted r.m.s. error of one composer on one tool's share of a part: the chain's forecast together with the composer's own error on trials it did not see, in % of
-    the forecast of on-off control; `chosen` is the least."""
+    """Predicted r.m.s. error of one composer on one tool's share of a part: the chain's
+    forecast together with the composer's own error on trials it did not see, in % of the
+    forecast of on-off control; `chosen` is the least."""
 
     tool: int
     material: str
@@ -65,8 +68,9 @@ class Prediction(NamedTuple):
 
 
 class Stream(NamedTuple):
-    """One tool's share of a part, all (T,): wanted flow r (mm^3/s), the same before its steps were shaped, command u (mm), predicted flow y and that of on-off control;
-    the composer that u is from, and the share of the time that u is at the limit."""
+    """One tool's share of a part, all (T,): wanted flow r (mm^3/s), the same before its steps were shaped,
+    command u (mm), predicted flow y and that of on-off control; the composer that u is from, and the share of
+    the time that u is at the limit."""
 
     tool: int
     material: str
@@ -81,8 +85,9 @@ class Stream(NamedTuple):
 
 
 class Composed(NamedTuple):
-    """A part: its streams on one clock (sample k at k Ts; the gantry sets out lead_in_s later, which the times of lines and tasks contain), and how each composer
-    would do. error_percent (N,) is the predicted error of the library's signal for each task, 0 for what was trained."""
+    """A part: its streams on one clock (sample k at k Ts; the gantry sets out lead_in_s later, which the
+    times of lines and tasks contain), and how each composer would do. error_percent (N,) is the predicted
+    error of the library's signal for each task, 0 for what was trained."""
 
     streams: tuple[Stream, ...]
     tasks: Tasks
@@ -105,8 +110,21 @@ def learn(trainings: Sequence[Training], *, sample_time_s: float) -> Learned:
         for t in mine:
             y = learned(t)[1]
             left.append(averaged(np.nan_to_num(y - t.r), np.isfinite(y), sample_time_s) / t.r.max())
-        gain = float(np.median(np.concatenate([t.r[t.r >= t.r.max() / 2] / np.maximum(t.u[0][t.r >= t.r.max() / 2], 1e-9) for t in mine])))
-        materials.append(Material(*key, identify(mine, sample_time_s=sample_time_s), gain, 100 * math.sqrt(np.mean(np.square(left)))))
+        gain = float(
+            np.median(
+                np.concatenate(
+                    [t.r[t.r >= t.r.max() / 2] / np.maximum(t.u[0][t.r >= t.r.max() / 2], 1e-9) for t in mine]
+                )
+            )
+        )
+        materials.append(
+            Material(
+                *key,
+                identify(mine, sample_time_s=sample_time_s),
+                gain,
+                100 * math.sqrt(np.mean(np.square(left))),
+            )
+        )
     return Learned(library, tuple(materials), check(trainings, library))
 
 
@@ -114,29 +132,46 @@ def _of(tasks: Tasks, tool: int, name: str) -> np.ndarray:
     return np.flatnonzero((tasks.task == name) & (tasks.tool == tool))
 
 
-def _steady(library: Library, material: str, nozzle_mm: float, lines: Lines, tool: int, samples: int) -> np.ndarray:
-    """Steady-State (T,) from each printed line's begin to the next one's in its run, at the level of its speed."""
+def _steady(
+    library: Library, material: str, nozzle_mm: float, lines: Lines, tool: int, samples: int
+) -> np.ndarray:
+    """Steady-State (T,) from each printed line's begin to the next
+    one's in its run, at the level of its speed."""
     mine = np.flatnonzero(lines.tool == tool)
-    columns, column, factor, _ = nearest(library, STEADY, material, nozzle_mm, lines.speed[mine], np.zeros(len(mine)))
+    columns, column, factor, _ = nearest(
+        library, STEADY, material, nozzle_mm, lines.speed[mine], np.zeros(len(mine))
+    )
     level = np.array([still.signal[0] for still in columns])[column] * factor
     until = np.where(lines.last[mine], lines.end_s[mine], np.append(lines.begin_s[1:], lines.end_s[-1])[mine])
     at = np.round(np.concatenate([lines.begin_s[mine], until]) / library.sample_time_s).astype(int)
-    step = np.bincount(np.minimum(at, samples), weights=np.concatenate([level, -level]), minlength=samples + 1)
+    step = np.bincount(
+        np.minimum(at, samples), weights=np.concatenate([level, -level]), minlength=samples + 1
+    )
     return np.cumsum(step)[:samples]
 
 
 def _placed(library: Library, name: str, material: str, nozzle_mm: float, tasks: Tasks, tool: int):
-    """For each column of a finite task: (signal, samples (E, K) that it takes at its E events, factors (E, 1))."""
+    """For each column of a finite task: (signal, samples (E, K) that
+    it takes at its E events, factors (E, 1))."""
     mine = _of(tasks, tool, name)
-    columns, column, factor, _ = nearest(library, name, material, nozzle_mm, tasks.speed[mine], tasks.pause_s[mine])
+    columns, column, factor, _ = nearest(
+        library, name, material, nozzle_mm, tasks.speed[mine], tasks.pause_s[mine]
+    )
     event = np.round(tasks.begin_s[mine] / library.sample_time_s).astype(int)
     for k in np.unique(column):
         chosen, taken = columns[k], column == k
-        yield chosen, (event[taken] - chosen.lead)[:, None] + np.arange(len(chosen.signal)), factor[taken][:, None]
+        yield (
+            chosen,
+            (event[taken] - chosen.lead)[:, None] + np.arange(len(chosen.signal)),
+            factor[taken][:, None],
+        )
 
 
-def priority(library: Library, material: str, nozzle_mm: float, tasks: Tasks, lines: Lines, tool: int, *, samples: int) -> np.ndarray:
-    """u (T,) by the paper's hierarchy (fig. 7): at each sample the highest of Stop, Start, Corner, Steady-State, No-Flow that is active; each sent ahead by its lead."""
+def priority(
+    library: Library, material: str, nozzle_mm: float, tasks: Tasks, lines: Lines, tool: int, *, samples: int
+) -> np.ndarray:
+    """u (T,) by the paper's hierarchy (fig. 7): at each sample the highest of Stop, Start, Corner,
+    Steady-State, No-Flow that is active; each sent ahead by its lead."""
     u = np.append(_steady(library, material, nozzle_mm, lines, tool, samples), 0.0)
     for name in (CORNER, START, STOP):
         for chosen, at, factor in _placed(library, name, material, nozzle_mm, tasks, tool):
@@ -144,8 +179,11 @@ def priority(library: Library, material: str, nozzle_mm: float, tasks: Tasks, li
     return u[:samples]
 
 
-def superposition(library: Library, material: str, nozzle_mm: float, tasks: Tasks, lines: Lines, tool: int, *, samples: int) -> np.ndarray:
-    """u (T,) as the steady level with every task's deviation from it added, so that tasks which overlap both count (the extruder is nearly linear)."""
+def superposition(
+    library: Library, material: str, nozzle_mm: float, tasks: Tasks, lines: Lines, tool: int, *, samples: int
+) -> np.ndarray:
+    """u (T,) as the steady level with every task's deviation from it added, so that tasks which overlap both
+    count (the extruder is nearly linear)."""
     u = _steady(library, material, nozzle_mm, lines, tool, samples)
     levels = {still.speed: float(still.signal[0]) for still in of_task(library, STEADY, material, nozzle_mm)}
     for name in (CORNER, START, STOP):
@@ -161,22 +199,43 @@ def _rms(a: np.ndarray) -> float:
 
 
 def _command(
-    composer: str, learned: Learned, known: Material, r: np.ndarray, tasks: Tasks, lines: Lines, tool: int, limit: float
+    composer: str,
+    learned: Learned,
+    known: Material,
+    r: np.ndarray,
+    tasks: Tasks,
+    lines: Lines,
+    tool: int,
+    limit: float,
 ) -> np.ndarray:
     if composer == BASIS:
-        return basis.compose(known.chain.extruder, r, sample_time_s=learned.library.sample_time_s, limit=limit)
+        return basis.compose(
+            known.chain.extruder, r, sample_time_s=learned.library.sample_time_s, limit=limit
+        )
     by = priority if composer == PRIORITY else superposition
-    return np.clip(by(learned.library, known.material, known.nozzle_mm, tasks, lines, tool, samples=len(r)), -limit, limit)
+    return np.clip(
+        by(learned.library, known.material, known.nozzle_mm, tasks, lines, tool, samples=len(r)),
+        -limit,
+        limit,
+    )
 
 
 def commands(learned: Learned, composed: Composed, stream: Stream, *, limit: float) -> dict[str, np.ndarray]:
     """The command (T,) of every composer for one stream of a part, to set beside the chosen one."""
-    known = next(k for k in learned.materials if (k.material, k.nozzle_mm) == (stream.material, stream.nozzle_mm))
-    return {name: _command(name, learned, known, stream.r, composed.tasks, composed.lines, stream.tool, limit) for name in COMPOSERS}
+    known = next(
+        k for k in learned.materials if (k.material, k.nozzle_mm) == (stream.material, stream.nozzle_mm)
+    )
+    return {
+        name: _command(name, learned, known, stream.r, composed.tasks, composed.lines, stream.tool, limit)
+        for name in COMPOSERS
+    }
 
 
-def _judge(learned: Learned, known: Material, r: np.ndarray, tasks: Tasks, lines: Lines, tool: int, limit: float) -> dict[str, float]:
-    """Predicted error of each composer in % of on-off control's, over the first EXCERPT_S from where this tool begins to print."""
+def _judge(
+    learned: Learned, known: Material, r: np.ndarray, tasks: Tasks, lines: Lines, tool: int, limit: float
+) -> dict[str, float]:
+    """Predicted error of each composer in % of on-off control's, over the first
+    EXCERPT_S from where this tool begins to print."""
     Ts, extruder = learned.library.sample_time_s, known.chain.extruder
     begin = max(0, int(np.argmax(r > 0)) - round(MARGIN_S / Ts))
     upto = min(len(r), begin + round(EXCERPT_S / Ts))
@@ -188,10 +247,17 @@ def _judge(learned: Learned, known: Material, r: np.ndarray, tasks: Tasks, lines
     row = Lines(*(np.asarray(column)[near] for column in lines))
     row = row._replace(begin_s=row.begin_s - begin * Ts, end_s=row.end_s - begin * Ts)
     wanted = r[begin:upto]
-    on_off = _rms(forecast(extruder, np.clip(wanted / known.on_off_gain, -limit, limit), sample_time_s=Ts) - wanted)
+    on_off = _rms(
+        forecast(extruder, np.clip(wanted / known.on_off_gain, -limit, limit), sample_time_s=Ts) - wanted
+    )
     percent = {}
     for name in COMPOSERS:
-        error = _rms(forecast(extruder, _command(name, learned, known, wanted, few, row, tool, limit), sample_time_s=Ts) - wanted)
+        error = _rms(
+            forecast(
+                extruder, _command(name, learned, known, wanted, few, row, tool, limit), sample_time_s=Ts
+            )
+            - wanted
+        )
         own = known.chain.held_out_percent if name == BASIS else known.learned_percent
         percent[name] = 100 * math.hypot(error, own / 100 * r.max()) / max(on_off, 1e-12)
     return percent
@@ -212,13 +278,19 @@ def compose(
 ) -> Composed:
     """Commands for all tools of a part, each by the composer that is predicted to do best for its material.
 
-    `materials` names the material of each tool; the wanted flow is r = bead area x printing speed, its steps shaped by two boxes of ramp_s. |u| <= limit (mm).
-    Raises ValueError for a tool without a material, a material or nozzle that was not learned, where nothing is printed, and, with its line number, where the
+    `materials` names the material of each tool; the wanted flow is r = bead area x printing speed, its steps
+    shaped by two boxes of ramp_s. |u| <= limit (mm). Raises ValueError for a tool without a material, a
+    material or nozzle that was not learned, where nothing is printed, and, with its line number, where the
     program would go from Steady-State to No-Flow without a Stop.
     """
     Ts, marks, moves = learned.library.sample_time_s, learned.library.marks, program.moves
     lines = printed_lines(moves, motion, corner_deg=corner_deg, longest_pause_s=longest_pause_s)
-    refuse(lines, moves, halts=halting(program.other_line, program.other_word), switch_s=marks[STOP][1] + marks[START][0])
+    refuse(
+        lines,
+        moves,
+        halts=halting(program.other_line, program.other_word),
+        switch_s=marks[STOP][1] + marks[START][0],
+    )
     signal = sampled(motion, moves, sample_time_s=Ts)
     ahead = math.ceil(max(0.0, MARGIN_S - lines.begin_s[0]) / Ts)
     behind = math.ceil(MARGIN_S / Ts)
@@ -234,26 +306,34 @@ def compose(
         r[r < 1e-9 * r.max()] = 0.0  # rounding of the sums behind the rate
         judged = _judge(learned, known, r, tasks, lines, tool, limit)
         best = min(judged, key=judged.__getitem__)
-        predictions += [Prediction(tool, known.material, name, percent, name == best) for name, percent in judged.items()]
+        predictions += [
+            Prediction(tool, known.material, name, percent, name == best) for name, percent in judged.items()
+        ]
         streams.append(_stream(learned, known, r, unshaped, tasks, lines, tool, limit, best))
         for name in (START, STOP, CORNER, STEADY):
             at = _of(tasks, tool, name)
-            error[at] = nearest(learned.library, name, known.material, nozzle_mm, tasks.speed[at], tasks.pause_s[at]).error_percent
+            error[at] = nearest(
+                learned.library, name, known.material, nozzle_mm, tasks.speed[at], tasks.pause_s[at]
+            ).error_percent
     return Composed(tuple(streams), tasks, lines, error, predictions, ahead * Ts, Ts)
 
 
-def _known(learned: Learned, materials: dict[int, str], tool: int, nozzle_mm: float, lines: Lines) -> Material:
+def _known(
+    learned: Learned, materials: dict[int, str], tool: int, nozzle_mm: float, lines: Lines
+) -> Material:
     first = lines.line[lines.tool == tool][0]
     if tool not in materials:
         raise ValueError(
-            f"line {first}: T{tool} prints but has no material; expected one of tools {sorted(materials)}, or name its material"
+            f"line {first}: T{tool} prints but has no material; expected one of tools {sorted(materials)}, "
+            "or name its material"
         )
     for known in learned.materials:
         if (known.material, known.nozzle_mm) == (materials[tool], nozzle_mm):
             return known
     held = ", ".join(f"{known.material} with {known.nozzle_mm:g} mm" for known in learned.materials)
     raise ValueError(
-        f"line {first}: T{tool} prints {materials[tool]} with a nozzle of {nozzle_mm:g} mm, but what was learned is {held}; train it first"
+        f"line {first}: T{tool} prints {materials[tool]} with a nozzle of {nozzle_mm:g} mm, "
+        f"but what was learned is {held}; train it first"
     )
 
 
@@ -271,4 +351,15 @@ def _stream(
     u = _command(composer, learned, known, r, tasks, lines, tool, limit)
     rows = np.stack([u, np.clip(r / known.on_off_gain, -limit, limit)])
     y, on_off = simulate([known.chain.extruder], rows, sample_time_s=learned.library.sample_time_s)[0]
-    return Stream(tool, known.material, known.nozzle_mm, composer, r, unshaped, u, y, on_off, float(np.mean(np.abs(u) >= limit)))
+    return Stream(
+        tool,
+        known.material,
+        known.nozzle_mm,
+        composer,
+        r,
+        unshaped,
+        u,
+        y,
+        on_off,
+        float(np.mean(np.abs(u) >= limit)),
+    )

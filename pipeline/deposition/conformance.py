@@ -1,4 +1,5 @@
-"""Will this part print? Predicted volume of every printed line, runs shorter than the Stop lead, what the drive's limit costs, and what was refused, by line number."""
+"""Will this part print? Predicted volume of every printed line, runs shorter than the Stop lead, what the
+drive's limit costs, and what was refused, by line number."""
 
 import math
 from collections.abc import Sequence
@@ -20,8 +21,9 @@ LONGEST_RAMP_S = 10.0
 
 
 class LineVolumes(NamedTuple):
-    """Every printed line, all (L,): number in the program, tool, begin and duration in s, length in mm, planned volume (bead area x length), predicted volume and
-    that of on-off control in mm^3, error in % of the plan, and whether its whole run is shorter than the Stop lead."""
+    """Every printed line, all (L,): number in the program, tool, begin and duration in s, length in mm,
+    planned volume (bead area x length), predicted volume and that of on-off control in mm^3, error in % of
+    the plan, and whether its whole run is shorter than the Stop lead."""
 
     line: np.ndarray
     tool: np.ndarray
@@ -36,8 +38,9 @@ class LineVolumes(NamedTuple):
 
 
 class Saturation(NamedTuple):
-    """What a limit does to one flow with one ramp: peak of the unlimited command over the steady one, share of the printing time at the limit, and r.m.s. error of the
-    best command within it in % of that of on-off control r / on_off_gain; `enough` is whether the limit is never reached."""
+    """What a limit does to one flow with one ramp: peak of the unlimited command over the steady one, share
+    of the printing time at the limit, and r.m.s. error of the best command within it in % of that of on-off
+    control r / on_off_gain; `enough` is whether the limit is never reached."""
 
     ramp_s: float
     limit: float
@@ -55,8 +58,9 @@ class Refused(NamedTuple):
 
 
 class Conformance(NamedTuple):
-    """The report on a part: its lines, the worst error in % among the `judged` lines of at least shortest_s, for each tool the saturation with the ramp as it
-    is and the ramp in s that would do (its own where none is needed, inf where none does), and what was refused."""
+    """The report on a part: its lines, the worst error in % among the `judged` lines of at least shortest_s,
+    for each tool the saturation with the ramp as it is and the ramp in s that would do (its own where none is
+    needed, inf where none does), and what was refused."""
 
     lines: LineVolumes
     worst_line_volume_percent: float
@@ -77,28 +81,38 @@ def conform(
     largest_error_percent: float,
     refusals: Sequence[Refusal] = (),
 ) -> Conformance:
-    """Whether the part will print: line volumes, saturation, refusals of the program's reader, and tasks whose signal the library only guesses (predicted error
-    above largest_error_percent, or unknown), where the library's signals are used."""
+    """Whether the part will print: line volumes, saturation, refusals of the program's reader, and
+    tasks whose signal the library only guesses (predicted error above largest_error_percent, or
+    unknown), where the library's signals are used."""
     lines = line_volumes(composed, learned.library, bead_area_mm2=bead_area_mm2)
     judged = lines.duration_s >= shortest_s - 1e-9
     Ts = composed.sample_time_s
     saturations, ramps = {}, {}
     for stream in composed.streams:
-        known = next(known for known in learned.materials if (known.material, known.nozzle_mm) == (stream.material, stream.nozzle_mm))
+        known = next(
+            known
+            for known in learned.materials
+            if (known.material, known.nozzle_mm) == (stream.material, stream.nozzle_mm)
+        )
         first = int(np.argmax(stream.unshaped > 0))
         some = stream.unshaped[max(0, first - round(MARGIN_S / Ts)) : first + round(EXCERPT_S / Ts)]
         settings = {"ramp_s": ramp_s, "limit": limit, "sample_time_s": Ts}
-        saturations[stream.tool] = saturation(known.chain.extruder, some, on_off_gain=known.on_off_gain, **settings)
+        saturations[stream.tool] = saturation(
+            known.chain.extruder, some, on_off_gain=known.on_off_gain, **settings
+        )
         ramps[stream.tool] = ramp_that_would_do(known.chain.extruder, some, **settings)
     refused = [Refused(refusal.line, refusal.why) for refusal in refusals]
-    by_library = np.isin(composed.tasks.tool, [stream.tool for stream in composed.streams if stream.composer != BASIS])
+    by_library = np.isin(
+        composed.tasks.tool, [stream.tool for stream in composed.streams if stream.composer != BASIS]
+    )
     for k in np.flatnonzero(by_library & ~(composed.error_percent <= largest_error_percent)):
         speed, pause = composed.tasks.speed[k], composed.tasks.pause_s[k]
         asked = f"{composed.tasks.task[k]} at {speed:g} mm/s with a pause of {pause:.2f} s"
         refused.append(
             Refused(
                 int(composed.tasks.line[k]),
-                f"the library lacks {asked}; the nearest signal has a predicted error of {composed.error_percent[k]:.0f} %",
+                f"the library lacks {asked}; the nearest signal has a predicted error of "
+                f"{composed.error_percent[k]:.0f} %",
             )
         )
     worst = float(np.abs(lines.error_percent[judged]).max()) if judged.any() else math.nan
@@ -106,7 +120,8 @@ def conform(
 
 
 def line_volumes(composed: Composed, library: Library, *, bead_area_mm2: float) -> LineVolumes:
-    """A row for each printed line, in their order: the flow between the middles of the gaps to its neighbours of the same tool, at most REACH_S from its ends."""
+    """A row for each printed line, in their order: the flow between the middles of the gaps to its neighbours
+    of the same tool, at most REACH_S from its ends."""
     lines, Ts = composed.lines, composed.sample_time_s
     begin = np.bincount(lines.run, weights=np.where(lines.first, lines.begin_s, 0.0))
     run_s = np.bincount(lines.run, weights=np.where(lines.last, lines.end_s, 0.0)) - begin
@@ -115,27 +130,49 @@ def line_volumes(composed: Composed, library: Library, *, bead_area_mm2: float) 
         mine = np.flatnonzero(lines.tool == stream.tool)
         a, b = lines.begin_s[mine], lines.end_s[mine]
         middle = (b[:-1] + a[1:]) / 2
-        start, stop = np.maximum(a - REACH_S, np.append(-np.inf, middle)), np.minimum(b + REACH_S, np.append(middle, np.inf))
+        start, stop = (
+            np.maximum(a - REACH_S, np.append(-np.inf, middle)),
+            np.minimum(b + REACH_S, np.append(middle, np.inf)),
+        )
         predicted[mine] = volume_between(stream.y, start, stop, sample_time_s=Ts)
         on_off[mine] = volume_between(stream.on_off, start, stop, sample_time_s=Ts)
     planned = bead_area_mm2 * lines.length
     error, short = 100 * (predicted / planned - 1), run_s[lines.run] < library.marks[STOP][0]
     return LineVolumes(
-        lines.line, lines.tool, lines.begin_s, lines.end_s - lines.begin_s, lines.length, planned, predicted, on_off, error, short
+        lines.line,
+        lines.tool,
+        lines.begin_s,
+        lines.end_s - lines.begin_s,
+        lines.length,
+        planned,
+        predicted,
+        on_off,
+        error,
+        short,
     )
 
 
-def volume_between(flow: np.ndarray, start: np.ndarray, stop: np.ndarray, *, sample_time_s: float) -> np.ndarray:
-    """Volume (L,) in mm^3 that a flow (T,), linear between its samples, presses out from start (L,) to stop (L,), in s; none before the first and after the last."""
+def volume_between(
+    flow: np.ndarray, start: np.ndarray, stop: np.ndarray, *, sample_time_s: float
+) -> np.ndarray:
+    """Volume (L,) in mm^3 that a flow (T,), linear between its samples, presses out from start (L,) to stop
+    (L,), in s; none before the first and after the last."""
     t = np.arange(len(flow)) * sample_time_s
     total = np.append(0.0, np.cumsum((flow[1:] + flow[:-1]) / 2)) * sample_time_s
     return np.interp(stop, t, total) - np.interp(start, t, total)
 
 
 def saturation(
-    extruder: Extruder, unshaped: np.ndarray, *, on_off_gain: float, ramp_s: float, limit: float, sample_time_s: float
+    extruder: Extruder,
+    unshaped: np.ndarray,
+    *,
+    on_off_gain: float,
+    ramp_s: float,
+    limit: float,
+    sample_time_s: float,
 ) -> Saturation:
-    """What |u| <= limit (mm) does to the wanted flow (T,) with its steps shaped by two boxes of ramp_s: forecast by the chain."""
+    """What |u| <= limit (mm) does to the wanted flow (T,) with its steps
+    shaped by two boxes of ramp_s: forecast by the chain."""
     r = basis.boxed(unshaped, ramp_s, sample_time_s)
     free = basis.compose(extruder, r, sample_time_s=sample_time_s)
     u = basis.compose(extruder, r, sample_time_s=sample_time_s, limit=limit)
@@ -147,8 +184,11 @@ def saturation(
     return Saturation(ramp_s, limit, peak / steady, 100 * float(share), 100 * ratio, peak <= limit)
 
 
-def ramp_that_would_do(extruder: Extruder, unshaped: np.ndarray, *, ramp_s: float, limit: float, sample_time_s: float) -> float:
-    """The shortest ramp in s, ramp_s or longer, whose command stays within the limit (mm); inf where none up to LONGEST_RAMP_S does.
+def ramp_that_would_do(
+    extruder: Extruder, unshaped: np.ndarray, *, ramp_s: float, limit: float, sample_time_s: float
+) -> float:
+    """The shortest ramp in s, ramp_s or longer, whose command stays within the
+    limit (mm); inf where none up to LONGEST_RAMP_S does.
 
     The peak falls with the ramp, about as (1 + tau / ramp) x steady: bisected to 1 %.
     """

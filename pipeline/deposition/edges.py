@@ -1,7 +1,9 @@
-"""Both edges of a bead that lies along the rows of a frame, to a fraction of a pixel: outermost significant run, then the half level of the plateau beside each edge.
+"""Both edges of a bead that lies along the rows of a frame, to a fraction of a pixel: outermost significant
+run, then the half level of the plateau beside each edge.
 
-A specular line on the bead has a stronger gradient than its edges, glare moves the background, shading bends the plateau, and texture lies beside it: so nothing
-here looks for the strongest gradient. All functions take k frames at once: k small calls cost more than one large one.
+A specular line on the bead has a stronger gradient than its edges, glare moves the background, shading bends
+the plateau, and texture lies beside it: so nothing here looks for the strongest gradient. All functions take
+k frames at once: k small calls cost more than one large one.
 """
 
 import functools
@@ -12,14 +14,25 @@ import cv2
 import numpy as np
 import scipy.special
 
-# columns averaged into one profile (64 um at 125 px/mm, an eighth of a nozzle) and rows averaged to find the run
+# columns averaged into one profile (64 um at 125 px/mm, an eighth of a
+# nozzle) and rows averaged to find the run
 BLOCK, COARSE = 8, 4
-# rows outward and inward of an edge in its window; levels of the background, beside the edge and deeper inside are read where a blurred edge has come to rest
+# rows outward and inward of an edge in its window; levels of the background, beside the edge and deeper
+# inside are read where a blurred edge has come to rest
 OUT, IN = 12, 20
 OUTSIDE, NEAR, FAR = np.arange(-OUT, -5), np.arange(5, 9), np.arange(12, 21)
-NEAR_ROW, FAR_ROW, NEAR_VARIANCE, FAR_VARIANCE = float(NEAR.mean()), float(FAR.mean()), float(NEAR.var()), float(FAR.var())
+NEAR_ROW, FAR_ROW, NEAR_VARIANCE, FAR_VARIANCE = (
+    float(NEAR.mean()),
+    float(FAR.mean()),
+    float(NEAR.var()),
+    float(FAR.var()),
+)
 LEVELS = np.zeros((OUT + 1 + IN, 3), np.float32)
-LEVELS[OUT + OUTSIDE, 0], LEVELS[OUT + NEAR, 1], LEVELS[OUT + FAR, 2] = 1 / len(OUTSIDE), 1 / len(NEAR), 1 / len(FAR)
+LEVELS[OUT + OUTSIDE, 0], LEVELS[OUT + NEAR, 1], LEVELS[OUT + FAR, 2] = (
+    1 / len(OUTSIDE),
+    1 / len(NEAR),
+    1 / len(FAR),
+)
 # an edge is sought outward from here: past it a dark bead's specular line may dip
 INSIDE = OUT + 5
 # the top edge lies towards lower rows of its bead, the bottom edge towards higher ones
@@ -31,7 +44,8 @@ THREE, THREE_VARIANCE = np.full((1, 3), 1 / 3, np.float32), 2 / 3
 UNEVEN = 0.12
 # edge, blur and shading settle within so many rounds, two where the edge is sharp
 ROUNDS = 12
-# a coarse row is bead where it stands so many standard deviations of the background above it, one in 10^9 rows of noise, and this share of the steps
+# a coarse row is bead where it stands so many standard deviations of the background above it, one in 10^9
+# rows of noise, and this share of the steps
 SIGNIFICANT, STEEP = 6.0, 0.2
 # a plateau above all levels: no bead
 NONE = 1e9
@@ -40,13 +54,15 @@ FEWEST_BLOCKS, FEWEST_ROWS, FEWEST_LINES = 4, 2, 48
 
 
 def profiles(frames: list[np.ndarray], columns: tuple[int, int]) -> np.ndarray:
-    """(frames, blocks, rows) sums of 8 columns each. The transposed copy makes every later pass run along memory."""
+    """(frames, blocks, rows) sums of 8 columns each. The transposed
+    copy makes every later pass run along memory."""
     first, last = columns
     h, w = frames[0].shape
     n = (last - first) // BLOCK
     if not 0 <= first < last <= w or n < FEWEST_BLOCKS or h < FEWEST_LINES:
         raise ValueError(
-            f"frame: expected at least {FEWEST_LINES} rows, and {FEWEST_BLOCKS * BLOCK} columns between {first} and {last}, "
+            f"frame: expected at least {FEWEST_LINES} rows, and {FEWEST_BLOCKS * BLOCK} columns between "
+            f"{first} and {last}, "
             f"but found {h} rows of {w}; check the camera's region of interest"
         )
     g = np.empty((len(frames), n, h), np.uint16 if frames[0].dtype == np.uint8 else np.uint32)
@@ -57,8 +73,9 @@ def profiles(frames: list[np.ndarray], columns: tuple[int, int]) -> np.ndarray:
 
 
 class Run(NamedTuple):
-    """Of k frames: rows (2, k, n) of the coarse edges; blocks (k, n) bool with a solid run, with an unclear one, with one that the frame cuts; plateau (k,) in levels
-    above background, NONE without a bead; sign (k,), saturated (k,)."""
+    """Of k frames: rows (2, k, n) of the coarse edges; blocks (k, n) bool with a solid run,
+    with an unclear one, with one that the frame cuts; plateau (k,) in levels above background,
+    NONE without a bead; sign (k,), saturated (k,)."""
 
     rows: np.ndarray
     seen: np.ndarray
@@ -72,13 +89,16 @@ class Run(NamedTuple):
 def coarse(g: np.ndarray, level: float) -> Run:
     """The outermost run above half the plateau in each block, on rows averaged by four.
 
-    Background is the straight line between the means of the first and the last sixteenth of the rows; its noise counts as at least half a gray level. What is
-    significant has steps over 16 rows; glare swells without any. The plateau is the median of all that reaches STEEP of those steps.
+    Background is the straight line between the means of the first and the last sixteenth of the rows; its
+    noise counts as at least half a gray level. What is significant has steps over 16 rows; glare swells
+    without any. The plateau is the median of all that reaches STEEP of those steps.
     """
     k, n, h = g.shape[0], g.shape[1], g.shape[2] // COARSE
     m, ends, line = _background(h)
     g = g[:, :, : h * COARSE]
-    c = (g[..., ::4] + g[..., 1::4] + g[..., 2::4] + g[..., 3::4]).astype(np.float32) * np.float32(1 / (BLOCK * COARSE))
+    c = (g[..., ::4] + g[..., 1::4] + g[..., 2::4] + g[..., 3::4]).astype(np.float32) * np.float32(
+        1 / (BLOCK * COARSE)
+    )
     margins = c @ ends
     d = c - margins @ line
     step, plateau, sign = np.empty(k), np.empty(k), np.empty(k)
@@ -101,11 +121,14 @@ def coarse(g: np.ndarray, level: float) -> Run:
     lopsided = np.abs(margins[..., 0] - margins[..., 1]) > step[:, None] / 2
     cut = some & ((at[0] < m) | (at[1] >= h - m) | ~solid & lopsided)
     white = np.add.reduce((c > 0.98 * 255 * level).reshape(k, -1), axis=1, dtype=np.int32)
-    return Run(edges, some & solid & ~cut, some & ~solid & ~cut, cut, plateau, sign, white > 0.3 * rows.sum(axis=1))
+    return Run(
+        edges, some & solid & ~cut, some & ~solid & ~cut, cut, plateau, sign, white > 0.3 * rows.sum(axis=1)
+    )
 
 
 def _plateau(d: np.ndarray, m: int, level: float) -> tuple[float, float, float]:
-    """Of one frame: median of the significant steps, median of what reaches STEEP of them, sign of the bead; NONE and 1 where nothing is significant."""
+    """Of one frame: median of the significant steps, median of what reaches STEEP of them, sign of the bead;
+    NONE and 1 where nothing is significant."""
     noise = max(math.hypot(cv2.norm(d[:, :m]), cv2.norm(d[:, -m:])) / math.sqrt(2 * m * len(d)), level / 2)
     steps = d[:, 4:] - d[:, :-4]
     steps = np.maximum(steps.max(axis=1), -steps.min(axis=1))
@@ -124,7 +147,8 @@ def _plateau(d: np.ndarray, m: int, level: float) -> tuple[float, float, float]:
 
 @functools.cache
 def _background(h: int) -> tuple[int, np.ndarray, np.ndarray]:
-    """Rows in a sixteenth; (h, 2) that takes the mean of the first and of the last; (2, h) that draws the straight line between them."""
+    """Rows in a sixteenth; (h, 2) that takes the mean of the first and of the last;
+    (2, h) that draws the straight line between them."""
     m = max(h // 16, 2)
     ends = np.zeros((h, 2), np.float32)
     ends[:m, 0] = ends[-m:, 1] = 1 / m
@@ -133,10 +157,12 @@ def _background(h: int) -> tuple[int, np.ndarray, np.ndarray]:
 
 
 def fine(g: np.ndarray, run: Run) -> tuple[np.ndarray, np.ndarray]:
-    """(2, k, n) sub-pixel rows of the top and the bottom edge, and each frame's blur (k,): standard deviation of its edge in px, NaN without a bead.
+    """(2, k, n) sub-pixel rows of the top and the bottom edge, and each frame's blur (k,): standard deviation
+    of its edge in px, NaN without a bead.
 
-    The half level lies between the local background and the plateau beside the edge, which is extrapolated to the edge against shading. Shading is the same at
-    both edges; where one is brighter than the other, the specular line lies beside it, and the other edge gives the plateau of both.
+    The half level lies between the local background and the plateau beside the edge, which is extrapolated to
+    the edge against shading. Shading is the same at both edges; where one is brighter than the other, the
+    specular line lies beside it, and the other edge gives the plateau of both.
     """
     k, n, h = g.shape
     # a speck beside the bead moves one block's coarse edge, not its neighbours'
@@ -158,19 +184,25 @@ def fine(g: np.ndarray, run: Run) -> tuple[np.ndarray, np.ndarray]:
     top, bottom = mean(far - outside)
     darker = np.where(run.sign * (bottom - top) < 0, 1, 0)
     clean = np.where(np.abs(top - bottom) > UNEVEN * run.plateau, darker, [[0], [1]]), np.arange(k)
-    rise, width = np.where(flat, mean((far - near)[clean]).mean(axis=0), 0.0), np.maximum(mean(rows[1] - rows[0]), OUT + IN)
+    rise, width = (
+        np.where(flat, mean((far - near)[clean]).mean(axis=0), 0.0),
+        np.maximum(mean(rows[1] - rows[0]), OUT + IN),
+    )
     fall, _ = _shading(rise, width, 0.0)
     along = _along(np.concatenate([outside, near]), used)
     outside, plateau = along[:2], run.plateau[:, None]
     level = np.minimum(np.maximum((along[2:] - outside)[clean] - fall[:, None], 0.3 * plateau), plateau)
     level = np.where(whole, level, plateau)
     into, step = _crossing(E, (outside + level / 2).astype(np.float32))
-    shift, blur = _settled(mean(level).mean(axis=0), mean(step).mean(axis=0), mean(into), clean, rise, width, fall, run.plateau)
+    shift, blur = _settled(
+        mean(level).mean(axis=0), mean(step).mean(axis=0), mean(into), clean, rise, width, fall, run.plateau
+    )
     return rows - OUTWARD * (into + shift[:, None]), np.where(used.any(axis=1), blur, math.nan)
 
 
 def _crossing(E: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (2, k, n) inward from the middle of each window to its half level, sought from the inside outward, and the rise of the row in which it lies."""
+    """Rows (2, k, n) inward from the middle of each window to its half level, sought from the inside outward,
+    and the rise of the row in which it lies."""
     shape, rows = E.shape, E.shape[-1]
     E = cv2.filter2D(E.reshape(-1, rows), -1, THREE, borderType=cv2.BORDER_REPLICATE)
     half = half.ravel()
@@ -183,10 +215,12 @@ def _crossing(E: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _settled(read, steep, inward, clean, rise, width, fall, plateau) -> tuple[np.ndarray, np.ndarray]:
-    """Shift (k,) of all edges inward, and blur (k,), that agree with each other; all arguments (k,), inward (2, k).
+    """Shift (k,) of all edges inward, and blur (k,), that agree with
+    each other; all arguments (k,), inward (2, k).
 
-    A blurred edge has not come to rest where its levels were read: what is missing there looks like shading and hides the blur. And the edge lies `at` from the
-    window's middle, so that the plateau was extrapolated too far or not far enough.
+    A blurred edge has not come to rest where its levels were read: what is missing there looks
+    like shading and hides the blur. And the edge lies `at` from the window's middle, so that the
+    plateau was extrapolated too far or not far enough.
     """
     at, across = inward[clean].mean(axis=0), width - inward.sum(axis=0)
     p0, steep = np.maximum(read, 1e-6), np.maximum(steep, 1e-6)
@@ -198,7 +232,8 @@ def _settled(read, steep, inward, clean, rise, width, fall, plateau) -> tuple[np
         previous, p0 = p0, np.maximum(read + missing + spilt + fall - nearer, 0.5 * np.maximum(read, 1e-6))
         if np.all(np.abs(p0 - previous) < 1e-3 * p0):
             break
-    # blur carries the shading's slope over the edge: (p0 + q x) Phi(x / s) + q s phi(x / s) = p0 / 2 at x = -q s^2 / p0
+    # blur carries the shading's slope over the edge: (p0 + q x) Phi(x
+    # / s) + q s phi(x / s) = p0 / 2 at x = -q s^2 / p0
     shift = (missing - spilt + fall - nearer) / (2 * steep) + q * variance / p0
     # an edge so soft that no level came to rest passes for shading: then the whole plateau tells
     apparent = plateau / (math.sqrt(2 * math.pi) * steep)
@@ -206,14 +241,17 @@ def _settled(read, steep, inward, clean, rise, width, fall, plateau) -> tuple[np
 
 
 def _tail(rows: np.ndarray, at: np.ndarray, blur: np.ndarray) -> np.ndarray:
-    """Mean (k,) of Phi((at - row) / blur) over the rows: what a blurred step at `at` still lacks inside of it; for rows outside give all with the other sign."""
+    """Mean (k,) of Phi((at - row) / blur) over the rows: what a blurred step at `at` still lacks inside of
+    it; for rows outside give all with the other sign."""
     return scipy.special.ndtr((at[:, None] - rows) / blur[:, None]).mean(axis=1)
 
 
 def _shading(rise: np.ndarray, width: np.ndarray, into: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-    """How far the level falls from the near rows to the edge, and its slope there, where it rises by `rise` from the near to the far rows; the edge is `into` from the window's middle.
+    """How far the level falls from the near rows to the edge, and its slope there, where it rises by `rise`
+    from the near to the far rows; the edge is `into` from the window's middle.
 
-    The level across the bead is taken as a - b u, u = (1 - 2 x / w)^2, x from the edge: the first term of every shading that is the same on both sides.
+    The level across the bead is taken as a - b u, u = (1 - 2 x / w)^2, x from the edge: the first term of
+    every shading that is the same on both sides.
     """
     near = (1 - 2 * (NEAR_ROW - into) / width) ** 2 + 4 * NEAR_VARIANCE / width**2
     far = (1 - 2 * (FAR_ROW - into) / width) ** 2 + 4 * FAR_VARIANCE / width**2

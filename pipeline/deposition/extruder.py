@@ -1,4 +1,5 @@
-"""The extruder: plunger command -> flow. The nominal first-order model (Hoelzle 2009, eq. 1), the harder chain that trials run on, its draws, and the training routine."""
+"""The extruder: plunger command -> flow. The nominal first-order model (Hoelzle 2009, eq. 1), the harder
+chain that trials run on, its draws, and the training routine."""
 
 import math
 from typing import NamedTuple
@@ -18,10 +19,12 @@ PLAY, YIELD = (0.01, 0.04), (0.02, 0.10)
 class Extruder(NamedTuple):
     """Plunger command u (mm) -> flow y (mm^3/s), in this order:
 
-    saturation |u| <= limit; transport delay; lag w^2 / (s^2 + 2 zeta w s + w^2); play (backlash of full width `play`, mm of command);
-    K ((1 - c) / (tau s + 1) + c / (T s + 1)), c the share of the gain that creeps with T; yield dead band y = max(x - yield, 0), mm^3/s.
+    saturation |u| <= limit; transport delay; lag w^2 / (s^2 + 2 zeta w s + w^2); play (backlash of full width
+    `play`, mm of command); K ((1 - c) / (tau s + 1) + c / (T s + 1)), c the share of the gain that creeps
+    with T; yield dead band y = max(x - yield, 0), mm^3/s.
 
-    `gain` K in mm^3/s per mm. The defaults are the nominal model (1): no delay, no lag, no play, no yield, no creep.
+    `gain` K in mm^3/s per mm. The defaults are the nominal model (1):
+    no delay, no lag, no play, no yield, no creep.
     """
 
     gain: float
@@ -37,9 +40,10 @@ class Extruder(NamedTuple):
 class Routine(NamedTuple):
     """The training routine (Hoelzle 2009, section III): all arrays (T,), one sample each `sample_time_s`.
 
-    r is the wanted flow in mm^3/s, speed the gantry's in mm/s, position in mm along the line from where the trial begins. The gantry runs at the printing
-    speed before the start and after the stop too, so that ooze there lies on the line and is seen; it halts in the pause. printing is True where r > 0.
-    The ramps are centred on the events start_s, pause_s = (begin, end) and stop_s.
+    r is the wanted flow in mm^3/s, speed the gantry's in mm/s, position in mm along the line from where the
+    trial begins. The gantry runs at the printing speed before the start and after the stop too, so that ooze
+    there lies on the line and is seen; it halts in the pause. printing is True where r > 0. The ramps are
+    centred on the events start_s, pause_s = (begin, end) and stop_s.
     """
 
     time_s: np.ndarray
@@ -53,7 +57,8 @@ class Routine(NamedTuple):
 
 
 def ramp(t: np.ndarray, width_s: float) -> np.ndarray:
-    """The unit step at t = 0 after two moving averages of `width_s`: 0 before -width, 1 after width, slope 1 / width at 0."""
+    """The unit step at t = 0 after two moving averages of `width_s`: 0
+    before -width, 1 after width, slope 1 / width at 0."""
     s = np.clip(np.asarray(t, float) / width_s, -1.0, 1.0)
     return np.where(s < 0, (1 + s) ** 2 / 2, 1 - (1 - s) ** 2 / 2)
 
@@ -69,14 +74,18 @@ def routine(
     ramp_s: float,
     sample_time_s: float,
 ) -> Routine:
-    """Off, on, pause, on, off: r = bead area x speed while printing. `speed` in mm/s; two boxes of `ramp_s` shape every change of speed.
+    """Off, on, pause, on, off: r = bead area x speed while printing. `speed` in mm/s;
+    two boxes of `ramp_s` shape every change of speed.
 
-    Raises ValueError where a ramp does not fit before the start or after the stop; ramps longer than the pause leave a dip of it.
+    Raises ValueError where a ramp does not fit before the start or after the
+    stop; ramps longer than the pause leave a dip of it.
     """
     shortest = min(off_s, tail_s)
     if not 0 < ramp_s <= shortest:
         raise ValueError(
-            f"routine: expected a ramp above 0 s and at most {shortest:g} s, the shorter of the phases before the start and after the stop, but found {ramp_s:g} s; shorten the ramp or lengthen them"
+            f"routine: expected a ramp above 0 s and at most {shortest:g} s, "
+            f"the shorter of the phases before the start and after the stop, but found {ramp_s:g} s; "
+            "shorten the ramp or lengthen them"
         )
     events = np.cumsum([off_s, on_s, pause_s, on_s])
     t = np.arange(round((events[-1] + tail_s) / sample_time_s)) * sample_time_s
@@ -86,11 +95,14 @@ def routine(
     r = bead_area_mm2 * speed * np.where(share > 1e-12, share, 0.0)
     v = speed * np.where(moving > 1e-12, moving, 0.0)
     position = np.concatenate([[0.0], np.cumsum((v[1:] + v[:-1]) / 2 * sample_time_s)])
-    return Routine(t, r, v, position, r > 0, float(events[0]), (float(events[1]), float(events[2])), float(events[3]))
+    return Routine(
+        t, r, v, position, r > 0, float(events[0]), (float(events[1]), float(events[2])), float(events[3])
+    )
 
 
 def _lag_ramp(t: np.ndarray, lag_hz: float) -> np.ndarray:
-    """Response of the second-order lag to the unit ramp at times t (s), 0 before 0; this is the integral of its step response."""
+    """Response of the second-order lag to the unit ramp at times t (s), 0
+    before 0; this is the integral of its step response."""
     t = np.maximum(t, 0.0)
     if math.isinf(lag_hz):
         return t
@@ -101,9 +113,11 @@ def _lag_ramp(t: np.ndarray, lag_hz: float) -> np.ndarray:
 
 
 def lag_filter(delay_s: float, lag_hz: float, sample_time_s: float) -> tuple[int, np.ndarray, np.ndarray]:
-    """(whole samples of delay, numerator, denominator) of the delay and the lag, from an input held between samples to the output's mean over the sample.
+    """(whole samples of delay, numerator, denominator) of the delay and the lag, from an input held between
+    samples to the output's mean over the sample.
 
-    The pulse response is the second difference of the ramp response at n Ts - delay; its denominator is known, so a few numerators hold all of it.
+    The pulse response is the second difference of the ramp response at n Ts - delay; its denominator is
+    known, so a few numerators hold all of it.
     """
     whole, fraction = divmod(delay_s / sample_time_s, 1.0)
     means = np.diff(_lag_ramp((np.arange(5) - fraction) * sample_time_s, lag_hz)) / sample_time_s
@@ -112,11 +126,16 @@ def lag_filter(delay_s: float, lag_hz: float, sample_time_s: float) -> tuple[int
         w = 2 * math.pi * lag_hz * sample_time_s
         decay = math.exp(-DAMPING * w)
         denominator = np.array([1.0, -2 * decay * math.cos(w * math.sqrt(1 - DAMPING**2)), decay**2])
-    return int(whole), np.convolve(np.diff(means, prepend=0.0), denominator)[: len(denominator) + 1], denominator
+    return (
+        int(whole),
+        np.convolve(np.diff(means, prepend=0.0), denominator)[: len(denominator) + 1],
+        denominator,
+    )
 
 
 def lagged(u: np.ndarray, delay_s: float, lag_hz: float, sample_time_s: float) -> np.ndarray:
-    """u (..., T) held between samples, after the delay and the second-order lag, as its mean from each sample to the next: exact for any delay."""
+    """u (..., T) held between samples, after the delay and the second-order lag, as its mean from each sample
+    to the next: exact for any delay."""
     whole, numerator, denominator = lag_filter(delay_s, lag_hz, sample_time_s)
     late = np.zeros(u.shape)
     late[..., whole:] = u[..., : max(u.shape[-1] - whole, 0)]
@@ -124,7 +143,8 @@ def lagged(u: np.ndarray, delay_s: float, lag_hz: float, sample_time_s: float) -
 
 
 def backlash(x: np.ndarray, play: float) -> np.ndarray:
-    """Play of full width `play` on x (T,): the output stays until x leaves it by half the play, y(t) = min(max(y(t-1), x(t) - play/2), x(t) + play/2), y(-1) = 0."""
+    """Play of full width `play` on x (T,): the output stays until x leaves it by half the play, y(t) =
+    min(max(y(t-1), x(t) - play/2), x(t) + play/2), y(-1) = 0."""
     half, y, out = play / 2, 0.0, []
     for value in x.tolist():
         if y < value - half:
@@ -141,10 +161,14 @@ def _modes(extruder: Extruder) -> list[tuple[float, float]]:
     return [(1 - c, extruder.time_constant_s)] + ([(c, extruder.creep_time_s)] if c > 0 else [])
 
 
-def pressed(extruder: Extruder, u: np.ndarray, *, sample_time_s: float, limit: float = math.inf) -> np.ndarray:
-    """x (..., T) in mm^3/s from rest: the flow that the command u (..., T) in mm would press out if the ink had no yield; below the yield nothing comes.
+def pressed(
+    extruder: Extruder, u: np.ndarray, *, sample_time_s: float, limit: float = math.inf
+) -> np.ndarray:
+    """x (..., T) in mm^3/s from rest: the flow that the command u (..., T) in mm would press out if the ink
+    had no yield; below the yield nothing comes.
 
-    u is held between samples and cut at +-limit, as the drive would. Each block takes the one before it as held at its mean over the sample.
+    u is held between samples and cut at +-limit, as the drive would. Each block takes the
+    one before it as held at its mean over the sample.
     """
     v = lagged(np.clip(u, -limit, limit), extruder.delay_s, extruder.lag_hz, sample_time_s)
     if extruder.play > 0:
@@ -157,12 +181,14 @@ def pressed(extruder: Extruder, u: np.ndarray, *, sample_time_s: float, limit: f
 
 
 def flow(extruder: Extruder, u: np.ndarray, *, sample_time_s: float, limit: float = math.inf) -> np.ndarray:
-    """True flow y = max(x - yield, 0) (T,) in mm^3/s under the command u (T,) in mm from rest, cut at +-limit; x as in `pressed`."""
+    """True flow y = max(x - yield, 0) (T,) in mm^3/s under the command u (T,) in
+    mm from rest, cut at +-limit; x as in `pressed`."""
     return np.maximum(pressed(extruder, u, sample_time_s=sample_time_s, limit=limit) - extruder.yield_, 0.0)
 
 
 def frequency_response(extruder: Extruder, frequency_hz: np.ndarray, *, sample_time_s: float) -> np.ndarray:
-    """P(e^(j 2 pi f Ts)) (F,) from samples of u to samples of x: delay, lag and first order, exactly as `pressed` runs them; play and yield left out."""
+    """P(e^(j 2 pi f Ts)) (F,) from samples of u to samples of x: delay, lag and first order, exactly as
+    `pressed` runs them; play and yield left out."""
     z = np.exp(-2j * np.pi * np.asarray(frequency_hz, float) * sample_time_s)
     whole, numerator, denominator = lag_filter(extruder.delay_s, extruder.lag_hz, sample_time_s)
     P = z**whole * np.polyval(numerator[::-1], z) / np.polyval(denominator[::-1], z)
@@ -170,10 +196,14 @@ def frequency_response(extruder: Extruder, frequency_hz: np.ndarray, *, sample_t
     return P * extruder.gain * sum(share * (1 - a) * z / (1 - a * z) for share, a in slow)
 
 
-def disturb(flow: np.ndarray, rng: np.random.Generator, *, steady_flow: float, white: float, drift: float, gain: float) -> np.ndarray:
-    """Measured flow (T,): what does not repeat from trial to trial laid over the true flow, as shares of `steady_flow` (mm^3/s).
+def disturb(
+    flow: np.ndarray, rng: np.random.Generator, *, steady_flow: float, white: float, drift: float, gain: float
+) -> np.ndarray:
+    """Measured flow (T,): what does not repeat from trial to trial laid over
+    the true flow, as shares of `steady_flow` (mm^3/s).
 
-    (1 + gain w) y + steady_flow (drift walk + white v): w drawn once a trial, v at each sample, and a random walk whose r.m.s. over the trial is `drift`.
+    (1 + gain w) y + steady_flow (drift walk + white v): w drawn once a trial, v at each sample, and a random
+    walk whose r.m.s. over the trial is `drift`.
     """
     steps = len(flow)
     walk = np.cumsum(rng.standard_normal(steps)) * math.sqrt(2 / steps)
@@ -181,8 +211,16 @@ def disturb(flow: np.ndarray, rng: np.random.Generator, *, steady_flow: float, w
     return (1 + gain * rng.standard_normal()) * flow + steady_flow * noise
 
 
-def draw(rng: np.random.Generator, *, gain: float, time_constant_s: float, steady_flow: float, creep_share: float = 0.0) -> Extruder:
-    """An extruder of the family around nominal gain (mm^3/s per mm) and time constant: each off by 10-30 %, either way, and everything that (1) leaves out."""
+def draw(
+    rng: np.random.Generator,
+    *,
+    gain: float,
+    time_constant_s: float,
+    steady_flow: float,
+    creep_share: float = 0.0,
+) -> Extruder:
+    """An extruder of the family around nominal gain (mm^3/s per mm) and time constant: each off by 10-30 %,
+    either way, and everything that (1) leaves out."""
     off = [1 + rng.choice([-1, 1]) * rng.uniform(*MISMATCH) for _ in range(2)]
     K = float(gain * off[0])
     return Extruder(

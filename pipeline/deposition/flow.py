@@ -1,7 +1,9 @@
-"""Widths of many frames -> cross-section along the line -> flow Q(t) by regularised inversion, with its uncertainty and what the frames cannot tell.
+"""Widths of many frames -> cross-section along the line -> flow Q(t) by regularised inversion, with its
+uncertainty and what the frames cannot tell.
 
-Width belongs to a place, not to a moment: the nozzle at x(t) lays Q(t) dt over its footprint f, so that A(s) = integral of Q(t) f(s - x(t)) dt, and each place is seen in
-many frames. Q comes back from A by least squares against a smoothness prior whose strength the data choose.
+Width belongs to a place, not to a moment: the nozzle at x(t) lays Q(t) dt over its footprint f, so that A(s)
+= integral of Q(t) f(s - x(t)) dt, and each place is seen in many frames. Q comes back from A by least squares
+against a smoothness prior whose strength the data choose.
 """
 
 from typing import NamedTuple
@@ -18,7 +20,8 @@ from pipeline.deposition.edges import BLOCK
 INSTANTS = 8
 # a bead lower than this is not seen, px: its section is the least that a place without a bead may hide
 BLIND_PX = 8.0
-# below this share of the highest speed the flow at a moment is not observable, only the volume of the whole pause
+# below this share of the highest speed the flow at a moment is not
+# observable, only the volume of the whole pause
 SLOW = 0.05
 # readings of one place this many deviations from their median are specks, not scatter
 GATE = 5.0
@@ -33,7 +36,8 @@ RIDGE = 1e-6
 
 
 class View(NamedTuple):
-    """Where the camera looks: a column shows the stage at s = x + (column - nozzle_column) mm_per_px, x the gantry's position.
+    """Where the camera looks: a column shows the stage at s = x + (column -
+    nozzle_column) mm_per_px, x the gantry's position.
 
     mm_per_px is negative where the line trails towards higher columns."""
 
@@ -42,8 +46,9 @@ class View(NamedTuple):
 
 
 class Sections(NamedTuple):
-    """Cross-section along the stage: centres s (n,) in mm of places 8 px long, area (n,) in mm^2 and its standard deviation as the frames scatter, and the
-    number of frames (n,) that saw each; `dropped` of all readings were outliers."""
+    """Cross-section along the stage: centres s (n,) in mm of places 8 px long, area (n,) in
+    mm^2 and its standard deviation as the frames scatter, and the number of frames (n,) that
+    saw each; `dropped` of all readings were outliers."""
 
     s: np.ndarray
     area: np.ndarray
@@ -54,7 +59,8 @@ class Sections(NamedTuple):
 
 
 class Pause(NamedTuple):
-    """A stretch in which the gantry stood: begin and end in s; the volume laid there in mm^3 and its standard deviation."""
+    """A stretch in which the gantry stood: begin and end in s; the
+    volume laid there in mm^3 and its standard deviation."""
 
     begin_s: float
     end_s: float
@@ -63,12 +69,15 @@ class Pause(NamedTuple):
 
 
 class Flow(NamedTuple):
-    """Q (T,) in mm^3/s at the gantry's samples and its standard deviation, given the smoothness that the data chose.
+    """Q (T,) in mm^3/s at the gantry's samples and its standard
+    deviation, given the smoothness that the data chose.
 
-    observable (T,) is False where the gantry stood or the camera never saw what was laid: there only the volume of the whole pause is measured, and Q is its
-    likeliest spread over time. per_travel (T,) is Q / v in mm^3/mm, NaN where v is below 5 % of its maximum. `amplitudes` (k,) belong to the shapes, `strength` is
-    the weight of smoothness, `noise` the scatter of A(s) about the fit in multiples of what the frames' scatter lets expect (more where the bead itself is rough),
-    `outliers` the places that were given less than half their weight.
+    observable (T,) is False where the gantry stood or the camera never saw what was laid: there only
+    the volume of the whole pause is measured, and Q is its likeliest spread over time. per_travel (T,)
+    is Q / v in mm^3/mm, NaN where v is below 5 % of its maximum. `amplitudes` (k,) belong to the
+    shapes, `strength` is the weight of smoothness, `noise` the scatter of A(s) about the fit in
+    multiples of what the frames' scatter lets expect (more where the bead itself is rough), `outliers`
+    the places that were given less than half their weight.
     """
 
     flow: np.ndarray
@@ -83,7 +92,8 @@ class Flow(NamedTuple):
 
 
 def deposit_share(distance: np.ndarray, radius: float) -> np.ndarray:
-    """Share of what leaves a round nozzle that falls behind `distance` ahead of its middle: 1/2 + (z sqrt(1 - z^2) + arcsin z) / pi, z = distance / radius in -1..1.
+    """Share of what leaves a round nozzle that falls behind `distance` ahead of its middle: 1/2 + (z sqrt(1 -
+    z^2) + arcsin z) / pi, z = distance / radius in -1..1.
 
     Its derivative is the footprint f: the chord of the nozzle at that distance, over its area.
     """
@@ -92,29 +102,44 @@ def deposit_share(distance: np.ndarray, radius: float) -> np.ndarray:
 
 
 def sections(
-    position: np.ndarray, columns: np.ndarray, widths: np.ndarray, *, view: View, nozzle_radius_mm: float, contact_angle_deg: float
+    position: np.ndarray,
+    columns: np.ndarray,
+    widths: np.ndarray,
+    *,
+    view: View,
+    nozzle_radius_mm: float,
+    contact_angle_deg: float,
 ) -> Sections:
-    """A(s) from widths (F, m) in mm at the `columns` (m,) of F frames taken with the gantry at `position` (F,); NaN is unread, 0 is bare substrate.
+    """A(s) from widths (F, m) in mm at the `columns` (m,) of F frames taken with the gantry at `position`
+    (F,); NaN is unread, 0 is bare substrate.
 
-    Readings are gathered by place. Those closer to the nozzle than its radius, where the bead still grows, are left out; so are those beyond five robust
-    deviations from the median of their place. Raises ValueError where nothing is left, or where the gantry does not move away from what the camera sees.
+    Readings are gathered by place. Those closer to the nozzle than its radius, where the bead still grows,
+    are left out; so are those beyond five robust deviations from the median of their place. Raises ValueError
+    where nothing is left, or where the gantry does not move away from what the camera sees.
     """
-    position, columns, widths = np.asarray(position, float), np.asarray(columns, float), np.asarray(widths, float)
+    position, columns, widths = (
+        np.asarray(position, float),
+        np.asarray(columns, float),
+        np.asarray(widths, float),
+    )
     if widths.shape != (len(position), len(columns)):
         raise ValueError(
-            f"sections: expected widths of {len(position)} frames x {len(columns)} columns but found {widths.shape}; give one row a frame"
+            f"sections: expected widths of {len(position)} frames x {len(columns)} columns but found "
+            f"{widths.shape}; give one row a frame"
         )
     behind = (columns - view.nozzle_column) * view.mm_per_px
     used = np.isfinite(widths) & (np.abs(behind) >= nozzle_radius_mm) & np.isfinite(position)[:, None]
     if not used.any():
         raise ValueError(
-            f"sections: none of {widths.size} readings is usable; look at why the frames were rejected, and at the nozzle's column in the view"
+            f"sections: none of {widths.size} readings is usable; look at why the frames were rejected, "
+            "and at the nozzle's column in the view"
         )
     travel = -np.sign(np.median(behind)) * position[np.isfinite(position)]
     retreat = float(np.max(np.maximum.accumulate(travel) - travel))
     if retreat > nozzle_radius_mm:
         raise ValueError(
-            f"sections: the gantry goes back by {retreat:.3g} mm, towards where the camera looks, so a place is seen before it is printed; "
+            f"sections: the gantry goes back by {retreat:.3g} mm, towards where the camera looks, "
+            "so a place is seen before it is printed; "
             "cut the record to one pass along the line, or turn the sign of the view's mm per px"
         )
     s, w = (position[:, None] + behind)[used], widths[used]
@@ -127,12 +152,18 @@ def sections(
     of = np.repeat(np.arange(len(first)), count)
     median = w[first + (count - 1) // 2]
     miss = np.abs(w - median[of])
-    # one scatter for all places, a dozen readings each do not tell it; beside it the width may change along a place
-    scatter = max(1.4826 * float(np.median(miss[w > 0])) if (w > 0).any() else 0.0, 0.02 * abs(view.mm_per_px))
+    # one scatter for all places, a dozen readings each do not tell it;
+    # beside it the width may change along a place
+    scatter = max(
+        1.4826 * float(np.median(miss[w > 0])) if (w > 0).any() else 0.0, 0.02 * abs(view.mm_per_px)
+    )
     keep = miss <= (GATE * scatter + np.abs(np.gradient(np.pad(median, 1, "edge"))[1:-1]))[of]
     kept = np.bincount(of, keep)
     A, where = np.bincount(of, area(w, contact_angle_deg) * keep) / kept, np.bincount(of, s * keep) / kept
-    slope, blind = np.sqrt(4 * area(1.0, contact_angle_deg) * A), area(BLIND_PX * abs(view.mm_per_px), contact_angle_deg)
+    slope, blind = (
+        np.sqrt(4 * area(1.0, contact_angle_deg) * A),
+        area(BLIND_PX * abs(view.mm_per_px), contact_angle_deg),
+    )
     # a place averages over its length: where A bends within it, the mean is not the value in the middle
     bend = np.convolve(np.pad(A, 1, "edge"), [1.0, -2.0, 1.0], "valid") / 12
     deviation = np.sqrt(slope**2 * scatter**2 / kept + blind**2 / 12 + bend**2)
@@ -151,53 +182,93 @@ def estimate(
 ) -> Flow:
     """Q(t) = z + shapes' a at the samples time_s (T,), evenly spaced, of the gantry's position (T,), from
 
-        min |W (A - K Q)|^2 + strength |D2 z|^2,   K[i, k] = mean over place i of integral of hat_k(t) f(s - x(t)) dt,
+    min |W (A - K Q)|^2 + strength |D2 z|^2, K[i, k] = mean over place
+    i of integral of hat_k(t) f(s - x(t)) dt,
 
-    D2 the second difference: z is an integrated random walk, and the shapes (k, T) are where the flow may turn sharply, each by an amplitude that the data choose
-    (the wanted flow r as one row; a model's answer to the command; none, as zeros (0, T)). The strength maximises the likelihood of A with all Q integrated out
-    (generalised maximum likelihood, Wahba 1985). W carries the deviations of A, scaled to its scatter about the fit, and Huber's weights.
-    `width_deviation_mm` is what a calibration leaves: it moves all widths alike, so that Q is uncertain by Q 2 dw / w on top.
-    Raises ValueError where the record is too short, unevenly sampled, or where no place is reached by the nozzle.
+    D2 the second difference: z is an integrated random walk, and the shapes (k, T) are where the flow may
+    turn sharply, each by an amplitude that the data choose (the wanted flow r as one row; a model's answer to
+    the command; none, as zeros (0, T)). The strength maximises the likelihood of A with all Q integrated out
+    (generalised maximum likelihood, Wahba 1985). W carries the deviations of A, scaled to its scatter about
+    the fit, and Huber's weights. `width_deviation_mm` is what a calibration leaves: it moves all widths
+    alike, so that Q is uncertain by Q 2 dw / w on top. Raises ValueError where the record is too short,
+    unevenly sampled, or where no place is reached by the nozzle.
     """
-    time_s, position, shapes = np.asarray(time_s, float), np.asarray(position, float), np.asarray(shapes, float)
+    time_s, position, shapes = (
+        np.asarray(time_s, float),
+        np.asarray(position, float),
+        np.asarray(shapes, float),
+    )
     _check(time_s, position, shapes)
     steps, dt = len(time_s), float(np.mean(np.diff(time_s)))
     K = _laid(position, dt, seen, nozzle_radius_mm)
     reached = np.asarray(K.sum(axis=1)).ravel() > 0
     if not reached.any():
         raise ValueError(
-            "estimate: the nozzle reached no place of A(s) in this record; do frames and gantry overlap in time, and has the view the right direction?"
+            "estimate: the nozzle reached no place of A(s) in this record; "
+            "do frames and gantry overlap in time, and has the view the right direction?"
         )
     K, A, expected = K[reached], seen.area[reached], seen.deviation[reached]
     bead = A > 0
     noise = _roughness(A, expected, bead)
-    P, tall, robust, deviation = _penalty(steps), shapes.T, np.ones(len(A)), np.where(bead, noise * expected, expected)
+    P, tall, robust, deviation = (
+        _penalty(steps),
+        shapes.T,
+        np.ones(len(A)),
+        np.where(bead, noise * expected, expected),
+    )
     for _ in range(ROUNDS):
         weight = np.sqrt(robust) / deviation
         H = scipy.sparse.diags(weight) @ K
-        data = _Data(_banded((H.T @ H).tocoo(), steps), P, H.T @ (H @ tall), tall, H.T @ (weight * A), float(np.sum((weight * A) ** 2)))
-        best = scipy.optimize.minimize_scalar(_unlikely, args=(data,), bounds=STRENGTHS, method="bounded", options={"xatol": 0.1})
+        data = _Data(
+            _banded((H.T @ H).tocoo(), steps),
+            P,
+            H.T @ (H @ tall),
+            tall,
+            H.T @ (weight * A),
+            float(np.sum((weight * A) ** 2)),
+        )
+        best = scipy.optimize.minimize_scalar(
+            _unlikely, args=(data,), bounds=STRENGTHS, method="bounded", options={"xatol": 0.1}
+        )
         fit = _solve(best.x, data)
         Q = fit.z + tall @ fit.a
         robust = np.minimum(1.0, HUBER * deviation / np.maximum(np.abs(A - K @ Q), 1e-12))
     U = tall - scipy.linalg.cho_solve_banded((fit.factor, True), data.C)
     spread = U @ np.linalg.inv(np.linalg.cholesky(fit.S)).T
     deviation = np.sqrt(_inverse_diagonal(_sum(data.M, P, np.exp(best.x))) + np.sum(spread**2, axis=1))
-    share = 2 * width_deviation_mm / np.sqrt(np.median(A[bead]) / area(1.0, contact_angle_deg)) if bead.any() else 0.0
+    share = (
+        2 * width_deviation_mm / np.sqrt(np.median(A[bead]) / area(1.0, contact_angle_deg))
+        if bead.any()
+        else 0.0
+    )
     deviation = np.hypot(deviation, share * Q)
     speed = np.abs(np.gradient(position, dt))
     moving = speed > SLOW * speed.max()
     lit = np.asarray(K.sum(axis=0)).ravel() * seen.length > 0.4 * dt
     per_travel = np.where(moving, Q / np.where(moving, speed, 1.0), np.nan)
     pauses = tuple(_pause(a, b, time_s, Q, fit.factor, spread) for a, b in _runs(~moving))
-    return Flow(Q, deviation, moving & lit, per_travel, pauses, fit.a, float(np.exp(best.x)), noise, int(np.sum(robust < 0.5)))
+    return Flow(
+        Q,
+        deviation,
+        moving & lit,
+        per_travel,
+        pauses,
+        fit.a,
+        float(np.exp(best.x)),
+        noise,
+        int(np.sum(robust < 0.5)),
+    )
 
 
 def _roughness(A: np.ndarray, expected: np.ndarray, bead: np.ndarray) -> float:
-    """Scatter of A along the stage over what the frames' scatter lets expect, at least 1: robust deviation of the second differences of means over three places,
-    which flow hardly moves. What lies on the stage errs alike in every frame, so only this shows it; neighbours share readings, hence the means."""
+    """Scatter of A along the stage over what the frames' scatter lets expect, at least 1: robust deviation of
+    the second differences of means over three places, which flow hardly moves. What lies on the stage errs
+    alike in every frame, so only this shows it; neighbours share readings, hence the means."""
     n = len(A) // 3
-    mean, variance = A[: 3 * n].reshape(n, 3).mean(axis=1), np.square(expected[: 3 * n]).reshape(n, 3).sum(axis=1) / 9
+    mean, variance = (
+        A[: 3 * n].reshape(n, 3).mean(axis=1),
+        np.square(expected[: 3 * n]).reshape(n, 3).sum(axis=1) / 9,
+    )
     whole = bead[: 3 * n].reshape(n, 3).all(axis=1)
     inside = whole[:-2] & whole[1:-1] & whole[2:]
     if not inside.any():
@@ -207,24 +278,33 @@ def _roughness(A: np.ndarray, expected: np.ndarray, bead: np.ndarray) -> float:
 
 
 def _check(time_s: np.ndarray, position: np.ndarray, shapes: np.ndarray) -> None:
-    if len(time_s) < 10 or position.shape != time_s.shape or shapes.ndim != 2 or shapes.shape[1] != len(time_s):
+    if (
+        len(time_s) < 10
+        or position.shape != time_s.shape
+        or shapes.ndim != 2
+        or shapes.shape[1] != len(time_s)
+    ):
         raise ValueError(
-            f"estimate: expected time and position (T,) and shapes (k, T) with T at least 10, but found {time_s.shape}, {position.shape} and {shapes.shape}; "
+            "estimate: expected time and position (T,) and shapes (k, T) with T at least 10, "
+            f"but found {time_s.shape}, {position.shape} and {shapes.shape}; "
             "resample them on one clock"
         )
     gaps = np.diff(time_s)
     if gaps.min() <= 0 or np.ptp(gaps) > 0.01 * gaps.mean():
         raise ValueError(
-            f"estimate: expected evenly spaced samples but found steps of {gaps.min():.4g} to {gaps.max():.4g} s; resample the gantry's record"
+            f"estimate: expected evenly spaced samples but found steps of {gaps.min():.4g} to "
+            f"{gaps.max():.4g} s; resample the gantry's record"
         )
     if not np.isfinite(position).all() or not np.isfinite(shapes).all():
         raise ValueError(
-            "estimate: expected finite positions and shapes but found gaps; cut the record there, or fill the gantry's position first"
+            "estimate: expected finite positions and shapes but found gaps; cut the record there, "
+            "or fill the gantry's position first"
         )
 
 
 def _laid(position: np.ndarray, dt: float, seen: Sections, radius: float) -> scipy.sparse.csr_matrix:
-    """K (n, T) in s/mm: section at place i from unit flow at sample k; positions straight between samples, flow too."""
+    """K (n, T) in s/mm: section at place i from unit flow at sample k;
+    positions straight between samples, flow too."""
     share = (np.arange(INSTANTS) + 0.5) / INSTANTS
     x = (position[:-1, None] + np.diff(position)[:, None] * share).ravel()
     begin = np.searchsorted(seen.s, x - radius - seen.length / 2)
@@ -232,7 +312,11 @@ def _laid(position: np.ndarray, dt: float, seen: Sections, radius: float) -> sci
     place = begin[:, None] + np.arange(many)
     s = seen.s[np.minimum(place, len(seen.s) - 1)] - x[:, None]
     half = seen.length / 2
-    f = (deposit_share(s + half, radius) - deposit_share(s - half, radius)) * (place < len(seen.s)) / seen.length
+    f = (
+        (deposit_share(s + half, radius) - deposit_share(s - half, radius))
+        * (place < len(seen.s))
+        / seen.length
+    )
     f *= dt / INSTANTS
     late = np.tile(share, len(position) - 1)[:, None]
     sample = np.repeat(np.arange(len(position) - 1), INSTANTS)[:, None]
@@ -264,7 +348,8 @@ def _sum(M: np.ndarray, P: np.ndarray, strength: float) -> np.ndarray:
 
 
 class _Data(NamedTuple):
-    """Normal equations: M = H'H banded, P = D2'D2 banded, shapes (T, k) and C = H'H shapes, right side H'y, energy y'y."""
+    """Normal equations: M = H'H banded, P = D2'D2 banded, shapes (T, k)
+    and C = H'H shapes, right side H'y, energy y'y."""
 
     M: np.ndarray
     P: np.ndarray
@@ -275,7 +360,8 @@ class _Data(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """Cholesky factor of M + strength P, Schur complement S (k, k) of the amplitudes, z (T,), a (k,), and -2 log likelihood up to a constant."""
+    """Cholesky factor of M + strength P, Schur complement S (k, k) of the amplitudes, z (T,), a (k,), and -2
+    log likelihood up to a constant."""
 
     factor: np.ndarray
     S: np.ndarray
@@ -285,7 +371,8 @@ class _Fit(NamedTuple):
 
 
 def _solve(log_strength: float, data: _Data) -> _Fit:
-    """Minimum over z and a by elimination of z; -2 log likelihood = minimum + log det (M + strength P) + log det S - (T - 2) log strength."""
+    """Minimum over z and a by elimination of z; -2 log likelihood = minimum + log det (M +
+    strength P) + log det S - (T - 2) log strength."""
     M, P, C, shapes, right, energy = data
     factor = scipy.linalg.cholesky_banded(_sum(M, P, np.exp(log_strength)), lower=True)
     solved = scipy.linalg.cho_solve_banded((factor, True), np.column_stack([right, C]))
@@ -293,7 +380,9 @@ def _solve(log_strength: float, data: _Data) -> _Fit:
     a = np.linalg.solve(S, shapes.T @ right - C.T @ solved[:, 0])
     z = solved[:, 0] - solved[:, 1:] @ a
     minimum = energy - right @ z - a @ (shapes.T @ right)
-    unlikely = minimum + 2 * np.log(factor[0]).sum() + np.linalg.slogdet(S)[1] - (M.shape[1] - 2) * log_strength
+    unlikely = (
+        minimum + 2 * np.log(factor[0]).sum() + np.linalg.slogdet(S)[1] - (M.shape[1] - 2) * log_strength
+    )
     return _Fit(factor, S, z, a, float(unlikely))
 
 
@@ -302,7 +391,8 @@ def _unlikely(log_strength: float, data: _Data) -> float:
 
 
 def _inverse_diagonal(band: np.ndarray) -> np.ndarray:
-    """Diagonal of the inverse of a symmetric banded matrix: blocks as wide as the band make it block tridiagonal; Schur complements down, inverses up (Takahashi 1973)."""
+    """Diagonal of the inverse of a symmetric banded matrix: blocks as wide as the band make it block
+    tridiagonal; Schur complements down, inverses up (Takahashi 1973)."""
     b, steps = len(band) - 1, band.shape[1]
     blocks = -(-steps // b)
     full = np.zeros((b + 1, blocks * b + b))
@@ -335,7 +425,8 @@ def _runs(flags: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _pause(a: int, b: int, time_s, Q, factor, spread) -> Pause:
-    """Volume w'Q of the samples a to b - 1, each dt long, and its standard deviation: both parts of the covariance, of z and of the amplitudes."""
+    """Volume w'Q of the samples a to b - 1, each dt long, and its standard deviation: both parts of the
+    covariance, of z and of the amplitudes."""
     w = np.zeros(len(Q))
     w[a:b] = time_s[1] - time_s[0]
     variance = w @ scipy.linalg.cho_solve_banded((factor, True), w) + np.sum((w @ spread) ** 2)

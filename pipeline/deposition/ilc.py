@@ -1,5 +1,6 @@
-"""Iterative learning control of the flow: the paper's law (Hoelzle 2009, eq. 2), the inverse of the identified model averaged over trials, the convergence
-test before anything runs, what the limits of the drive allow, and the learning loop with roll-back."""
+"""Iterative learning control of the flow: the paper's law (Hoelzle 2009, eq. 2), the inverse of the
+identified model averaged over trials, the convergence test before anything runs, what the limits of the drive
+allow, and the learning loop with roll-back."""
 
 import functools
 import math
@@ -15,7 +16,8 @@ from pipeline.deposition import reachable
 from pipeline.deposition.extruder import Extruder, flow, frequency_response, pressed
 from pipeline.deposition.trial_model import TrialModel, identify
 
-# of the steady gain squared: only keeps the inverse finite where half a sample of delay makes a zero, far above any Q
+# of the steady gain squared: only keeps the inverse finite where half
+# a sample of delay makes a zero, far above any Q
 EPSILON = 1e-9
 # the ink is brought to its yield over this time before flow is wanted, and let down over it afterwards
 YIELD_LEAD_S = 0.4
@@ -24,7 +26,8 @@ OOZE_S = 0.5
 
 
 class Trial(NamedTuple):
-    """Command u (T,) in mm as the drive applied it, measured flow y (T,) in mm^3/s with NaN where it was not observable, true flow where simulated."""
+    """Command u (T,) in mm as the drive applied it, measured flow y (T,) in mm^3/s with NaN where it was not
+    observable, true flow where simulated."""
 
     u: np.ndarray
     y: np.ndarray
@@ -41,17 +44,21 @@ Law = Callable[[Sequence[Trial]], np.ndarray]
 def _butterworth(order: int, cutoff_hz: float, sample_time_s: float) -> np.ndarray:
     if not 0 < cutoff_hz < 0.5 / sample_time_s:
         raise ValueError(
-            f"Q filter: expected a cut-off between 0 and half the sampling rate, {0.5 / sample_time_s:g} Hz, but found {cutoff_hz:g} Hz; lower the cut-off or sample faster"
+            f"Q filter: expected a cut-off between 0 and half the sampling rate, {0.5 / sample_time_s:g} Hz, "
+            f"but found {cutoff_hz:g} Hz; lower the cut-off or sample faster"
         )
     return scipy.signal.butter(order, cutoff_hz, fs=1 / sample_time_s, output="sos")
 
 
 def zero_phase(x: np.ndarray, *, order: int, cutoff_hz: float, sample_time_s: float) -> np.ndarray:
-    """Q x (..., T): Butterworth low-pass of `order` run forward and backward, |Q|^2 without phase; x is zero before and after, as no-flow is."""
+    """Q x (..., T): Butterworth low-pass of `order` run forward and backward, |Q|^2 without phase; x is zero
+    before and after, as no-flow is."""
     sos, pad = _butterworth(order, cutoff_hz, sample_time_s), round(order / cutoff_hz / sample_time_s)
     padded = np.zeros((*x.shape[:-1], x.shape[-1] + 2 * pad))
     padded[..., pad : padded.shape[-1] - pad] = x
-    return scipy.signal.sosfilt(sos, scipy.signal.sosfilt(sos, padded)[..., ::-1])[..., ::-1][..., pad : padded.shape[-1] - pad]
+    return scipy.signal.sosfilt(sos, scipy.signal.sosfilt(sos, padded)[..., ::-1])[..., ::-1][
+        ..., pad : padded.shape[-1] - pad
+    ]
 
 
 def magnitude(frequency_hz: np.ndarray, *, order: int, cutoff_hz: float, sample_time_s: float) -> np.ndarray:
@@ -63,16 +70,28 @@ def magnitude(frequency_hz: np.ndarray, *, order: int, cutoff_hz: float, sample_
 # ---- L
 
 
-def _slow_inverse(model: Extruder, learning_gain: float, fast_zero_s: float, sample_time_s: float) -> tuple[np.ndarray, np.ndarray]:
+def _slow_inverse(
+    model: Extruder, learning_gain: float, fast_zero_s: float, sample_time_s: float
+) -> tuple[np.ndarray, np.ndarray]:
     scale = learning_gain / model.gain
-    return scipy.signal.bilinear([scale * model.time_constant_s, scale], [fast_zero_s, 1.0], 1 / sample_time_s)
+    return scipy.signal.bilinear(
+        [scale * model.time_constant_s, scale], [fast_zero_s, 1.0], 1 / sample_time_s
+    )
 
 
 def paper_filter(
-    frequency_hz: np.ndarray, model: Extruder, *, learning_gain: float, fast_zero_s: float, sample_time_s: float
+    frequency_hz: np.ndarray,
+    model: Extruder,
+    *,
+    learning_gain: float,
+    fast_zero_s: float,
+    sample_time_s: float,
 ) -> np.ndarray:
-    """L(f) = k_p / P̂ (F,), P̂ = K (fast_zero s + 1) / (tau s + 1): the fast zero makes the inverse proper (Hoelzle 2009, eq. 2); bilinear."""
-    return scipy.signal.freqz(*_slow_inverse(model, learning_gain, fast_zero_s, sample_time_s), frequency_hz, fs=1 / sample_time_s)[1]
+    """L(f) = k_p / P̂ (F,), P̂ = K (fast_zero s + 1) / (tau s + 1): the fast zero makes the inverse proper
+    (Hoelzle 2009, eq. 2); bilinear."""
+    return scipy.signal.freqz(
+        *_slow_inverse(model, learning_gain, fast_zero_s, sample_time_s), frequency_hz, fs=1 / sample_time_s
+    )[1]
 
 
 def paper_law(
@@ -87,16 +106,27 @@ def paper_law(
     limit: float,
     sample_time_s: float,
 ) -> Law:
-    """u_{j+1} = Q (u_j + L e_j) of the last trial (Hoelzle 2009, eq. 2); q is `zero_phase` or takes the same, the model the nominal (1).
+    """u_{j+1} = Q (u_j + L e_j) of the last trial (Hoelzle 2009, eq. 2); q is
+    `zero_phase` or takes the same, the model the nominal (1).
 
-    u_j is what the drive applied, so that nothing winds up at the limit; e_j = 0 where the flow was not observable.
+    u_j is what the drive applied, so that nothing winds up at the
+    limit; e_j = 0 where the flow was not observable.
     """
     b, a = _slow_inverse(model, learning_gain, fast_zero_s, sample_time_s)
 
     def law(trials: Sequence[Trial]) -> np.ndarray:
         u, y, _ = trials[-1]
         e = np.where(np.isfinite(y), r - y, 0.0)
-        return np.clip(q(u + scipy.signal.lfilter(b, a, e), order=order, cutoff_hz=cutoff_hz, sample_time_s=sample_time_s), -limit, limit)
+        return np.clip(
+            q(
+                u + scipy.signal.lfilter(b, a, e),
+                order=order,
+                cutoff_hz=cutoff_hz,
+                sample_time_s=sample_time_s,
+            ),
+            -limit,
+            limit,
+        )
 
     return law
 
@@ -108,24 +138,32 @@ def inverse_filter(frequency_hz: np.ndarray, model: Extruder, *, sample_time_s: 
 
 
 def inverse(x: np.ndarray, model: Extruder, *, sample_time_s: float) -> np.ndarray:
-    """L x (T,) by FFT, with zeros for as long as the model's delay and a second more, so that nothing comes round."""
+    """L x (T,) by FFT, with zeros for as long as the model's delay and
+    a second more, so that nothing comes round."""
     n = scipy.fft.next_fast_len(len(x) + round((model.delay_s + 1.0) / sample_time_s), real=True)
     f = np.fft.rfftfreq(n, sample_time_s)
-    return np.fft.irfft(np.fft.rfft(x, n) * inverse_filter(f, model, sample_time_s=sample_time_s), n)[: len(x)]
+    return np.fft.irfft(np.fft.rfft(x, n) * inverse_filter(f, model, sample_time_s=sample_time_s), n)[
+        : len(x)
+    ]
 
 
 def wanted(r: np.ndarray, yield_: float, *, sample_time_s: float) -> np.ndarray:
-    """x (T,) in mm^3/s that gives the flow r: r + yield while ink is wanted, brought up to the yield just before and let down just after; r, yield in mm^3/s."""
+    """x (T,) in mm^3/s that gives the flow r: r + yield while ink is wanted, brought up to the yield just
+    before and let down just after; r, yield in mm^3/s."""
     half = round(YIELD_LEAD_S / sample_time_s)
     near = np.convolve(r > 0, np.ones(2 * half + 1), "full")[half : half + len(r)] / (half + 1)
     return r + yield_ * np.where(r > 0, 1.0, np.minimum(near, 1.0))
 
 
-def disturbance(trials: Sequence[Trial], r: np.ndarray, model: TrialModel, *, floor: float, sample_time_s: float) -> np.ndarray:
-    """d (T,) in mm^3/s, what repeats beyond the model: x = G u + d, y = max(x - yield, 0); a Kalman filter over trials with the weight k_j = max(1/j, floor).
+def disturbance(
+    trials: Sequence[Trial], r: np.ndarray, model: TrialModel, *, floor: float, sample_time_s: float
+) -> np.ndarray:
+    """d (T,) in mm^3/s, what repeats beyond the model: x = G u + d, y = max(x - yield, 0); a Kalman filter
+    over trials with the weight k_j = max(1/j, floor).
 
-    d <- d + k_j (y + yield - (G u_j + d)), the first two trials in full: the command moves far after trial 0. Nothing is learned where the flow was not
-    observable, nor where none is wanted, predicted or seen: below the yield y says nothing of x, and noise would be summed up trial after trial.
+    d <- d + k_j (y + yield - (G u_j + d)), the first two trials in full: the command moves far after trial 0.
+    Nothing is learned where the flow was not observable, nor where none is wanted, predicted or seen: below
+    the yield y says nothing of x, and noise would be summed up trial after trial.
     """
     extruder, d = model.extruder, np.zeros(len(r))
     y = np.array([trial.y for trial in trials])
@@ -139,8 +177,11 @@ def disturbance(trials: Sequence[Trial], r: np.ndarray, model: TrialModel, *, fl
     return d
 
 
-def command(x: np.ndarray, r: np.ndarray, model: Extruder, *, limit: float, sample_time_s: float) -> np.ndarray:
-    """u (T,) in mm that presses x (T,) out of the model; where that takes more than `limit`, the u whose flow comes nearest (`reachable.nearest`)."""
+def command(
+    x: np.ndarray, r: np.ndarray, model: Extruder, *, limit: float, sample_time_s: float
+) -> np.ndarray:
+    """u (T,) in mm that presses x (T,) out of the model; where that takes more than `limit`, the u whose flow
+    comes nearest (`reachable.nearest`)."""
     u = inverse(x, model, sample_time_s=sample_time_s)
     if np.abs(u).max() <= limit:
         return u
@@ -150,31 +191,57 @@ def command(x: np.ndarray, r: np.ndarray, model: Extruder, *, limit: float, samp
     later = t + sample_time_s + model.delay_s
     free = np.interp(later, t, r) <= 0
     v = reachable.nearest(np.interp(later, t, x), free, pole=a, bound=scale * limit)
-    return np.clip(np.diff(v, prepend=0.0) / scale + np.concatenate([[0.0], v[:-1]]) / model.gain, -limit, limit)
+    return np.clip(
+        np.diff(v, prepend=0.0) / scale + np.concatenate([[0.0], v[:-1]]) / model.gain, -limit, limit
+    )
 
 
 class InverseLaw:
-    """Our law, u_{j+1} = Q sum_i w_i (u_i + L e_i) over all trials i <= j, L the inverse of the model identified from the first ones; it remembers that model.
+    """Our law, u_{j+1} = Q sum_i w_i (u_i + L e_i) over all trials i <= j, L the inverse of the model
+    identified from the first ones; it remembers that model.
 
-    Written with the average d of what the model misses: u_{j+1} = Q L (r + yield - d), the same thing, and for one trial Q (u + L e). The weights w_i average
-    what does not repeat; Q stays outside, so that it erodes nothing as they fall, and |1 - k + k Q (1 - L P)| < 1 wherever |Q (1 - L P)| < 1, for any k.
+    Written with the average d of what the model misses: u_{j+1} = Q L (r + yield - d), the same thing, and
+    for one trial Q (u + L e). The weights w_i average what does not repeat; Q stays outside, so that it
+    erodes nothing as they fall, and |1 - k + k Q (1 - L P)| < 1 wherever |Q (1 - L P)| < 1, for any k.
 
-    `identify_trials` trials are identified together: beyond the on-off trial 0 the first learned commands show the extruder as it will be driven. `floor` is
-    the least weight of a new trial; `order` and `cutoff_hz` are those of Q.
+    `identify_trials` trials are identified together: beyond the on-off trial 0 the first
+    learned commands show the extruder as it will be driven. `floor` is the least weight of a
+    new trial; `order` and `cutoff_hz` are those of Q.
     """
 
     def __init__(
-        self, r: np.ndarray, *, identify_trials: int, floor: float, order: int, cutoff_hz: float, limit: float, sample_time_s: float
+        self,
+        r: np.ndarray,
+        *,
+        identify_trials: int,
+        floor: float,
+        order: int,
+        cutoff_hz: float,
+        limit: float,
+        sample_time_s: float,
     ):
-        self.r, self.identify_trials, self.floor, self.limit, self.sample_time_s = r, identify_trials, floor, limit, sample_time_s
+        self.r, self.identify_trials, self.floor, self.limit, self.sample_time_s = (
+            r,
+            identify_trials,
+            floor,
+            limit,
+            sample_time_s,
+        )
         self.q = {"order": order, "cutoff_hz": cutoff_hz, "sample_time_s": sample_time_s}
         self._first: list[Trial] = []
         self.model: TrialModel | None = None
 
     def __call__(self, trials: Sequence[Trial]) -> np.ndarray:
         first = list(trials[: self.identify_trials])
-        if self.model is None or len(first) != len(self._first) or any(a is not b for a, b in zip(first, self._first, strict=True)):
-            self._first, self.model = first, identify([t.u for t in first], [t.y for t in first], sample_time_s=self.sample_time_s)
+        if (
+            self.model is None
+            or len(first) != len(self._first)
+            or any(a is not b for a, b in zip(first, self._first, strict=True))
+        ):
+            self._first, self.model = (
+                first,
+                identify([t.u for t in first], [t.y for t in first], sample_time_s=self.sample_time_s),
+            )
         extruder = self.model.extruder
         d = disturbance(trials, self.r, self.model, floor=self.floor, sample_time_s=self.sample_time_s)
         x = zero_phase(wanted(self.r, extruder.yield_, sample_time_s=self.sample_time_s) - d, **self.q)
@@ -185,15 +252,18 @@ class InverseLaw:
 
 
 def gamma(Q: np.ndarray, L: np.ndarray, P: np.ndarray) -> np.ndarray:
-    """max over frequency of |Q (1 - L P)|: below 1 the error shrinks monotonically, above 1 it grows in the end (Bristow, Tharayil and Alleyne 2006).
+    """max over frequency of |Q (1 - L P)|: below 1 the error shrinks monotonically, above 1 it grows in the
+    end (Bristow, Tharayil and Alleyne 2006).
 
-    Q (F,) is |Q|^2 where Q runs both ways; L (F,); P (F,) or (plants, F), with all the delay there is: the result is one number a plant.
+    Q (F,) is |Q|^2 where Q runs both ways; L (F,); P (F,) or (plants, F), with all
+    the delay there is: the result is one number a plant.
     """
     return np.max(np.abs(Q * (1 - L * P)), axis=-1)
 
 
 class Authority(NamedTuple):
-    """What a limit on the command leaves: peak and steady command (mm) that r needs, the least error as a share of trial 0's, and the ramp that would do."""
+    """What a limit on the command leaves: peak and steady command (mm) that r needs, the least error as a
+    share of trial 0's, and the ramp that would do."""
 
     peak: float
     steady: float
@@ -202,22 +272,42 @@ class Authority(NamedTuple):
 
 
 def authority(
-    r: np.ndarray, u0: np.ndarray, model: Extruder, *, order: int, cutoff_hz: float, limit: float, sample_time_s: float
+    r: np.ndarray,
+    u0: np.ndarray,
+    model: Extruder,
+    *,
+    order: int,
+    cutoff_hz: float,
+    limit: float,
+    sample_time_s: float,
 ) -> Authority:
-    """Authority of the drive over the model for r (T,): the least error is that of the nearest flow within the limit, as a share of what u0 (T,) leaves.
+    """Authority of the drive over the model for r (T,): the least error is that of the nearest flow within
+    the limit, as a share of what u0 (T,) leaves.
 
-    ramp_s solves (1 + tau / t_ramp) steady = limit; it is infinite where the limit does not even hold the steady flow.
+    ramp_s solves (1 + tau / t_ramp) steady = limit; it is infinite
+    where the limit does not even hold the steady flow.
     """
-    x = zero_phase(wanted(r, model.yield_, sample_time_s=sample_time_s), order=order, cutoff_hz=cutoff_hz, sample_time_s=sample_time_s)
-    peak, steady = np.abs(inverse(x, model, sample_time_s=sample_time_s)).max(), (r.max() + model.yield_) / model.gain
-    best = flow(model, command(x, r, model, limit=limit, sample_time_s=sample_time_s), sample_time_s=sample_time_s)
+    x = zero_phase(
+        wanted(r, model.yield_, sample_time_s=sample_time_s),
+        order=order,
+        cutoff_hz=cutoff_hz,
+        sample_time_s=sample_time_s,
+    )
+    peak, steady = (
+        np.abs(inverse(x, model, sample_time_s=sample_time_s)).max(),
+        (r.max() + model.yield_) / model.gain,
+    )
+    best = flow(
+        model, command(x, r, model, limit=limit, sample_time_s=sample_time_s), sample_time_s=sample_time_s
+    )
     first = flow(model, u0, sample_time_s=sample_time_s, limit=limit)
     ramp_s = model.time_constant_s / (limit / steady - 1) if limit > steady else math.inf
     return Authority(float(peak), float(steady), rms(r - best) / rms(r - first), ramp_s)
 
 
 def check_authority(found: Authority, *, limit: float, worst_ratio: float) -> None:
-    """Raises ValueError where no law can come below `worst_ratio` of trial 0's error: the sentence names the ramp that would do."""
+    """Raises ValueError where no law can come below `worst_ratio` of trial 0's
+    error: the sentence names the ramp that would do."""
     if found.ratio <= worst_ratio:
         return
     needs = f"these ramps need a peak command of {found.peak / found.steady:.1f} x steady and the limit is {limit / found.steady:.1f} x"
@@ -226,14 +316,17 @@ def check_authority(found: Authority, *, limit: float, worst_ratio: float) -> No
         if math.isfinite(found.ramp_s)
         else "no ramp would do: print slower, or raise the limit above the steady command"
     )
-    raise ValueError(f"authority: {needs}, so no law comes below {found.ratio:.0%} of the error of trial 0; {do}")
+    raise ValueError(
+        f"authority: {needs}, so no law comes below {found.ratio:.0%} of the error of trial 0; {do}"
+    )
 
 
 # ---- the learning loop
 
 
 class Step(NamedTuple):
-    """The next command u (T,) in mm; best is the trial with the least measured error; stopped: u is that trial's command, and learning is over."""
+    """The next command u (T,) in mm; best is the trial with the least measured error; stopped: u is that
+    trial's command, and learning is over."""
 
     u: np.ndarray
     best: int
@@ -248,7 +341,8 @@ def rms(e: np.ndarray) -> float:
 
 
 class Judged(NamedTuple):
-    """The trials to learn from, the one with the least error, whether each has risen, and whether two have without a better one between: learning is over."""
+    """The trials to learn from, the one with the least error, whether each has risen, and whether two have
+    without a better one between: learning is over."""
 
     keep: list[int]
     best: int
@@ -257,7 +351,8 @@ class Judged(NamedTuple):
 
 
 def judge(errors: Sequence[float], *, rise: float) -> Judged:
-    """Which trials to learn from: one whose error exceeds the best so far by more than `rise` of trial 0's has risen, and all since the best are left."""
+    """Which trials to learn from: one whose error exceeds the best so far by more than `rise` of trial 0's
+    has risen, and all since the best are left."""
     keep, best, rises, risen = [0], 0, 0, [False]
     for j in range(1, len(errors)):
         risen.append(errors[j] > errors[best] + rise * errors[0])
@@ -273,15 +368,17 @@ def judge(errors: Sequence[float], *, rise: float) -> Judged:
 
 
 def next_step(trials: Sequence[Trial], r: np.ndarray, law: Law, *, rise: float) -> Step:
-    """What follows from the trials so far; nothing else is remembered, so that a folder of recordings can be continued.
+    """What follows from the trials so far; nothing else is remembered,
+    so that a folder of recordings can be continued.
 
-    After a trial that has risen (`judge`) the next command goes back to the best trial and takes half the law's step from there; after the second,
-    with no better trial between, learning stops at the best.
+    After a trial that has risen (`judge`) the next command goes back to the best trial and takes half the
+    law's step from there; after the second, with no better trial between, learning stops at the best.
     """
     for j, (u, y, _) in enumerate(trials):
         if u.shape != r.shape or y.shape != r.shape or not np.isfinite(y).any():
             raise ValueError(
-                f"trial {j}: expected command and flow of {len(r)} samples, as the reference has, some of it observable, but found {u.shape} and {y.shape} "
+                f"trial {j}: expected command and flow of {len(r)} samples, as the reference has, "
+                f"some of it observable, but found {u.shape} and {y.shape} "
                 f"with {np.isfinite(y).sum()} observable; leave the trial out or record it again"
             )
     keep, best, risen, stopped = judge([rms(r - trial.y) for trial in trials], rise=rise)
@@ -301,7 +398,8 @@ def learn(
     rise: float,
     on_step: Callable[[Trial], None] = lambda trial: None,
 ) -> list[Trial]:
-    """Trial 0 with u0 and at most `trials` updates; ends early where the loop stops. `measure` runs one command on a plant."""
+    """Trial 0 with u0 and at most `trials` updates; ends early where the
+    loop stops. `measure` runs one command on a plant."""
     done = [measure(u0)]
     on_step(done[0])
     while len(done) <= trials:
@@ -314,7 +412,8 @@ def learn(
 
 
 class Row(NamedTuple):
-    """One trial: errors in mm^3/s (true is NaN where nothing was simulated), ratio to trial 0 of the true error where known, else of the measured one."""
+    """One trial: errors in mm^3/s (true is NaN where nothing was simulated), ratio to trial 0 of the true
+    error where known, else of the measured one."""
 
     trial: int
     rms_true: float
@@ -326,7 +425,8 @@ class Row(NamedTuple):
 
 
 def table(trials: Sequence[Trial], r: np.ndarray, *, steady: float, limit: float, rise: float) -> list[Row]:
-    """A row a trial; `steady` is the steady command in mm, saturated the share of time at the limit, rolled_back whether the trial was left for a better one."""
+    """A row a trial; `steady` is the steady command in mm, saturated the share of time at the limit,
+    rolled_back whether the trial was left for a better one."""
     measured = [rms(r - trial.y) for trial in trials]
     true = [np.nan if trial.truth is None else rms(r - trial.truth) for trial in trials]
     risen = judge(measured, rise=rise).risen
@@ -334,6 +434,14 @@ def table(trials: Sequence[Trial], r: np.ndarray, *, steady: float, limit: float
     for j, (u, _, truth) in enumerate(trials):
         ratio = measured[j] / measured[0] if truth is None else true[j] / true[0]
         rows.append(
-            Row(j, true[j], measured[j], ratio, float(np.abs(u).max() / steady), float(np.mean(np.abs(u) >= 0.999 * limit)), risen[j])
+            Row(
+                j,
+                true[j],
+                measured[j],
+                ratio,
+                float(np.abs(u).max() / steady),
+                float(np.mean(np.abs(u) >= 0.999 * limit)),
+                risen[j],
+            )
         )
     return rows

@@ -1,4 +1,5 @@
-"""The basis-signal library: learned commands cut into tasks on the smoothed signal, the nearest of them, and the four assumptions in figures (Hoelzle 2009)."""
+"""The basis-signal library: learned commands cut into tasks on the smoothed signal, the nearest of them, and
+the four assumptions in figures (Hoelzle 2009)."""
 
 import math
 from collections.abc import Sequence
@@ -17,7 +18,8 @@ HOLD_S = 0.1
 
 
 class Training(NamedTuple):
-    """All trials of one routine on one material and nozzle: commands u (J, T) in mm and measured flows y (J, T) in mm^3/s, NaN where not observable."""
+    """All trials of one routine on one material and nozzle: commands u (J, T) in mm and measured flows y (J,
+    T) in mm^3/s, NaN where not observable."""
 
     material: str
     nozzle_mm: float
@@ -39,7 +41,8 @@ class Training(NamedTuple):
 
 
 class Basis(NamedTuple):
-    """One column of (3): `signal` (K,) in mm begins `lead` samples ahead of its event. speed in mm/s; pause_s is 0 but for a Corner."""
+    """One column of (3): `signal` (K,) in mm begins `lead` samples ahead of its
+    event. speed in mm/s; pause_s is 0 but for a Corner."""
 
     task: str
     material: str
@@ -51,7 +54,8 @@ class Basis(NamedTuple):
 
 
 class Library(NamedTuple):
-    """`columns` are the basis signals in the order of (3), `sample_time_s` their clock, `marks` the demarcation of each task in s before and after its event."""
+    """`columns` are the basis signals in the order of (3), `sample_time_s` their clock, `marks` the
+    demarcation of each task in s before and after its event."""
 
     columns: tuple[Basis, ...]
     sample_time_s: float
@@ -59,7 +63,8 @@ class Library(NamedTuple):
 
 
 class Nearest(NamedTuple):
-    """For M tasks: `columns` of the task, which of them is nearest (M,), the factor on its signal (M,), its predicted error in percent (M,)."""
+    """For M tasks: `columns` of the task, which of them is nearest (M,), the factor on its signal (M,), its
+    predicted error in percent (M,)."""
 
     columns: list[Basis]
     column: np.ndarray
@@ -78,7 +83,8 @@ class Check(NamedTuple):
 
 
 def learned(training: Training) -> tuple[np.ndarray, np.ndarray]:
-    """Command and measured flow (T,) that learning ended with: means over the trials whose measured error is within a tenth of the lowest."""
+    """Command and measured flow (T,) that learning ended with: means over the trials whose
+    measured error is within a tenth of the lowest."""
     error = np.sqrt(np.nanmean((training.y - training.r) ** 2, axis=1))
     best = error <= 1.1 * error.min()
     seen = np.isfinite(training.y[best])
@@ -93,29 +99,39 @@ def smoothed(u: np.ndarray, sample_time_s: float) -> np.ndarray:
 
 def _events(training: Training) -> dict[str, tuple[float, float]]:
     routine = training.routine
-    return {START: (routine.start_s, routine.start_s), CORNER: routine.pause_s, STOP: (routine.stop_s, routine.stop_s)}
+    return {
+        START: (routine.start_s, routine.start_s),
+        CORNER: routine.pause_s,
+        STOP: (routine.stop_s, routine.stop_s),
+    }
 
 
 def plateaus(training: Training, sample_time_s: float) -> tuple[slice, slice]:
     """The middle halves of the two plateaus."""
     routine = training.routine
     ends = ((routine.start_s, routine.pause_s[0]), (routine.pause_s[1], routine.stop_s))
-    return tuple(slice(round((0.75 * a + 0.25 * b) / sample_time_s), round((0.25 * a + 0.75 * b) / sample_time_s)) for a, b in ends)
+    return tuple(
+        slice(round((0.75 * a + 0.25 * b) / sample_time_s), round((0.25 * a + 0.75 * b) / sample_time_s))
+        for a, b in ends
+    )
 
 
 def _walk(active: np.ndarray, hold: int) -> int:
-    """Samples from the event until `active` stays False for `hold` samples; active (T,) begins at the event and ends in the middle of the next plateau."""
+    """Samples from the event until `active` stays False for `hold` samples; active (T,) begins at the event
+    and ends in the middle of the next plateau."""
     quiet = np.convolve(~active, np.ones(hold))[hold - 1 : len(active)] == hold
     return int(np.argmax(quiet)) if quiet.any() else len(active)
 
 
 def demarcate(trainings: Sequence[Training], *, sample_time_s: float) -> dict[str, tuple[float, float]]:
-    """Seconds by which each finite task's signal begins before its event and ends after it, the same for all materials, speeds and pauses: the widest found.
+    """Seconds by which each finite task's signal begins before its event and ends after it, the same for all
+    materials, speeds and pauses: the widest found.
 
-    A task lasts while the smoothed command is off the level of the plateau beside it by more than max(2 % of its peak, 3 sigma of the plateau). Raises ValueError
-    where the plateaus are none: 3 sigma above 30 % of the peak, or a task that lasts to the middle of its plateau.
+    A task lasts while the smoothed command is off the level of the plateau beside it by more than max(2 % of
+    its peak, 3 sigma of the plateau). Raises ValueError where the plateaus are none: 3 sigma above 30 % of
+    the peak, or a task that lasts to the middle of its plateau.
     """
-    marks = {task: (0.0, 0.0) for task in (START, CORNER, STOP)}
+    marks = dict.fromkeys((START, CORNER, STOP), (0.0, 0.0))
     hold = max(1, round(HOLD_S / sample_time_s))
     for training in trainings:
         u = smoothed(learned(training)[0], sample_time_s)
@@ -131,17 +147,24 @@ def demarcate(trainings: Sequence[Training], *, sample_time_s: float) -> dict[st
             sides = (u[middles[k] : begin + 1][::-1] - levels[k], u[end : middles[k + 1]] - levels[k + 1])
             spans = [_walk(np.abs(side) > threshold, hold) for side in sides]
             settled &= all(span < len(side) for span, side in zip(spans, sides, strict=True))
-            marks[task] = tuple(max(mark, span * sample_time_s) for mark, span in zip(marks[task], spans, strict=True))
+            marks[task] = tuple(
+                max(mark, span * sample_time_s) for mark, span in zip(marks[task], spans, strict=True)
+            )
         if 3 * sigma > 0.3 * peak or not settled:
             raise ValueError(
-                f"segment: the command of {training.material} at {training.speed:g} mm/s with a pause of {training.pause_s:g} s does not settle on its plateaus "
-                f"(3 sigma is {3 * sigma:.3g} mm, its peak {peak:.3g} mm); lengthen the plateaus to 3 time constants, or learn on"
+                f"segment: the command of {training.material} at {training.speed:g} mm/s with a pause of "
+                f"{training.pause_s:g} s does not settle on its plateaus "
+                f"(3 sigma is {3 * sigma:.3g} mm, its peak {peak:.3g} mm); "
+                "lengthen the plateaus to 3 time constants, or learn on"
             )
     return marks
 
 
-def segment(training: Training, marks: dict[str, tuple[float, float]], *, sample_time_s: float) -> list[Basis]:
-    """The five basis signals of one routine, cut from its learned command at the marks; Steady-State is the mean of the plateaus, No-Flow zero."""
+def segment(
+    training: Training, marks: dict[str, tuple[float, float]], *, sample_time_s: float
+) -> list[Basis]:
+    """The five basis signals of one routine, cut from its learned command at the marks; Steady-State is the
+    mean of the plateaus, No-Flow zero."""
     u = learned(training)[0]
     columns = []
     for task, event in _events(training).items():
@@ -152,12 +175,14 @@ def segment(training: Training, marks: dict[str, tuple[float, float]], *, sample
     flat = np.concatenate([u[part] for part in plateaus(training, sample_time_s)])
     columns += [(STEADY, 0.0, 0, np.array([flat.mean()])), (NO_FLOW, 0.0, 0, np.zeros(1))]
     return [
-        Basis(task, training.material, training.nozzle_mm, training.speed, pause, lead, signal) for task, pause, lead, signal in columns
+        Basis(task, training.material, training.nozzle_mm, training.speed, pause, lead, signal)
+        for task, pause, lead, signal in columns
     ]
 
 
 def build(trainings: Sequence[Training], *, sample_time_s: float) -> Library:
-    """The library of all routines; a task that several routines taught (Start at one speed with two pauses) is their mean: one task, one signal (assumption 3)."""
+    """The library of all routines; a task that several routines taught (Start at one speed with two pauses)
+    is their mean: one task, one signal (assumption 3)."""
     if not trainings:
         raise ValueError("library: expected at least one learned routine but found none; run train_ilc first")
     marks = demarcate(trainings, sample_time_s=sample_time_s)
@@ -165,35 +190,43 @@ def build(trainings: Sequence[Training], *, sample_time_s: float) -> Library:
     for training in trainings:
         for basis in segment(training, marks, sample_time_s=sample_time_s):
             taught.setdefault((*basis[1:4], TASKS.index(basis.task), basis.pause_s), []).append(basis)
-    columns = tuple(same[0]._replace(signal=np.mean([basis.signal for basis in same], axis=0)) for _, same in sorted(taught.items()))
+    columns = tuple(
+        same[0]._replace(signal=np.mean([basis.signal for basis in same], axis=0))
+        for _, same in sorted(taught.items())
+    )
     return Library(columns, sample_time_s, marks)
 
 
 def _laid(basis: Basis, factor: float, level: float, lead: int, length: int) -> np.ndarray:
-    """The signal as deviation from the command that is there without it, `lead` samples before its event to `length` after: the level before a Corner or a Stop,
-    after a Start or a Corner."""
+    """The signal as deviation from the command that is there without it, `lead` samples before its event to
+    `length` after: the level before a Corner or a Stop, after a Start or a Corner."""
     out, at = np.zeros(lead + length), lead - basis.lead
     out[at : at + len(basis.signal)] = factor * (basis.signal - background(basis, level))
     return out
 
 
 def background(basis: Basis, level: float) -> np.ndarray:
-    """The command (K,) that is there without the task: Steady-State at `level` after a Start, before a Stop, and on both sides of a Corner."""
+    """The command (K,) that is there without the task: Steady-State at `level` after a
+    Start, before a Stop, and on both sides of a Corner."""
     after = np.arange(len(basis.signal)) >= basis.lead
     return level * np.select([basis.task == START, basis.task == STOP], [after, ~after], 1.0)
 
 
 def _unlike(a: Basis, b: Basis, per_speed: float) -> float:
-    """How unlike a, scaled to b's speed, is to b: r.m.s. of the difference over the larger of the two, both as deviations from the steady command."""
+    """How unlike a, scaled to b's speed, is to b: r.m.s. of the difference over the larger of the two, both
+    as deviations from the steady command."""
     if a.task in (STEADY, NO_FLOW):
-        return abs(float(a.signal[0]) * b.speed / a.speed - float(b.signal[0])) / max(per_speed * b.speed, 1e-12)
+        return abs(float(a.signal[0]) * b.speed / a.speed - float(b.signal[0])) / max(
+            per_speed * b.speed, 1e-12
+        )
     lead, length = max(a.lead, b.lead), max(len(a.signal) - a.lead, len(b.signal) - b.lead)
     one, other = (_laid(c, b.speed / c.speed, per_speed * c.speed, lead, length) for c in (a, b))
     return float(np.linalg.norm(one - other) / max(np.linalg.norm(one), np.linalg.norm(other), 1e-12))
 
 
 def _slopes(columns: Sequence[Basis], per_speed: float) -> tuple[float, float]:
-    """Largest unlikeness per unit of |ln speed| and per second of pause among the columns of one task; NaN where one speed or one pause is all there is."""
+    """Largest unlikeness per unit of |ln speed| and per second of pause among the columns of one task; NaN
+    where one speed or one pause is all there is."""
     by_speed, by_pause = [math.nan], [math.nan]
     for a in columns:
         for b in columns:
@@ -205,62 +238,98 @@ def _slopes(columns: Sequence[Basis], per_speed: float) -> tuple[float, float]:
 
 
 def of_task(library: Library, task: str, material: str, nozzle_mm: float) -> list[Basis]:
-    """The columns of one task; a Corner of no pause is no event and need not be trained: it is the Steady-State.
+    """The columns of one task; a Corner of no pause is no event and
+    need not be trained: it is the Steady-State.
 
     Raises ValueError for a material or nozzle that was not trained.
     """
     held = sorted({basis.material for basis in library.columns})
     if material not in held:
-        raise ValueError(f"library: expected a material out of {', '.join(held)} but found {material}; train {material} first")
+        raise ValueError(
+            f"library: expected a material out of {', '.join(held)} but found {material}; "
+            f"train {material} first"
+        )
     nozzles = sorted({basis.nozzle_mm for basis in library.columns if basis.material == material})
     if nozzle_mm not in nozzles:
         sizes = ", ".join(f"{nozzle:g}" for nozzle in nozzles)
         raise ValueError(
-            f"library: {material} was trained with nozzles of {sizes} mm but is asked for with {nozzle_mm:g} mm; train that nozzle first"
+            f"library: {material} was trained with nozzles of {sizes} mm but is asked for with {nozzle_mm:g} "
+            "mm; train that nozzle first"
         )
     mine = [basis for basis in library.columns if (basis.material, basis.nozzle_mm) == (material, nozzle_mm)]
     still = [basis._replace(task=CORNER) for basis in mine if basis.task == STEADY] if task == CORNER else []
     return still + [basis for basis in mine if basis.task == task]
 
 
-def nearest(library: Library, task: str, material: str, nozzle_mm: float, speed: np.ndarray, pause_s: np.ndarray) -> Nearest:
-    """The nearest column for each of M tasks of `speed` (M,) in mm/s and `pause_s` (M,): in pause first, for that is what scaling cannot make up for."""
+def nearest(
+    library: Library, task: str, material: str, nozzle_mm: float, speed: np.ndarray, pause_s: np.ndarray
+) -> Nearest:
+    """The nearest column for each of M tasks of `speed` (M,) in mm/s and `pause_s` (M,): in pause first, for
+    that is what scaling cannot make up for."""
     columns = of_task(library, task, material, nozzle_mm)
     still = of_task(library, STEADY, material, nozzle_mm)
     per_speed = float(np.mean([basis.signal[0] / basis.speed for basis in still]))
     pause_s = np.where(task == CORNER, pause_s, 0.0)
-    off_speed = np.abs(np.log(np.maximum(speed, 1e-9)[:, None] / np.array([basis.speed for basis in columns])))
+    off_speed = np.abs(
+        np.log(np.maximum(speed, 1e-9)[:, None] / np.array([basis.speed for basis in columns]))
+    )
     off_pause = np.abs(pause_s[:, None] - np.array([basis.pause_s for basis in columns]))
     column = np.argmin(np.round(off_pause, 6) * 1e3 + off_speed, axis=1)
     rows = np.arange(len(column))
     error = np.zeros(len(column))
-    for slope, off in zip(_slopes(columns, per_speed), (off_speed[rows, column], off_pause[rows, column]), strict=True):
+    for slope, off in zip(
+        _slopes(columns, per_speed), (off_speed[rows, column], off_pause[rows, column]), strict=True
+    ):
         error += np.where(off < 1e-6, 0.0, 100 * slope * off)
     return Nearest(
-        columns, column, speed / np.array([basis.speed for basis in columns])[column], np.zeros(len(column)) if task == NO_FLOW else error
+        columns,
+        column,
+        speed / np.array([basis.speed for basis in columns])[column],
+        np.zeros(len(column)) if task == NO_FLOW else error,
     )
 
 
 def check(trainings: Sequence[Training], library: Library) -> list[Check]:
-    """Assumptions 1-4 as figures for each material and nozzle, in percent: none is assumed, all are reported."""
+    """Assumptions 1-4 as figures for each material and nozzle, in
+    percent: none is assumed, all are reported."""
     out, Ts = [], library.sample_time_s
     for key in sorted({(t.material, t.nozzle_mm) for t in trainings}):
         mine = [t for t in trainings if (t.material, t.nozzle_mm) == key]
         columns = [b for b in library.columns if (b.material, b.nozzle_mm) == key]
         per_speed = float(np.mean([b.signal[0] / b.speed for b in columns if b.task == STEADY]))
-        cut = [[b for t in mine for b in segment(t, library.marks, sample_time_s=Ts) if b.task == task] for task in TASKS]
+        cut = [
+            [b for t in mine for b in segment(t, library.marks, sample_time_s=Ts) if b.task == task]
+            for task in TASKS
+        ]
         pairs = [(a, b) for same in cut for a in same for b in same if a is not b and a.speed == b.speed]
         scatter = [np.sqrt(np.nanmean((t.y[-1] - t.y[-2]) ** 2) / 2) / t.r.max() for t in mine]
-        drift = [np.ptp([learned(t)[0][part].mean() for part in plateaus(t, Ts)]) / (per_speed * t.speed) for t in mine]
+        drift = [
+            np.ptp([learned(t)[0][part].mean() for part in plateaus(t, Ts)]) / (per_speed * t.speed)
+            for t in mine
+        ]
         alike = [_unlike(a, b, per_speed) for a, b in pairs if a.task not in (NO_FLOW, CORNER)]
         corners = [_unlike(a, b, per_speed) for a, b in pairs if a.task == CORNER and a.pause_s != b.pause_s]
-        edges = [(b.signal - background(b, per_speed * b.speed))[[0, -1]] / (per_speed * b.speed) for b in columns if len(b.signal) > 1]
+        edges = [
+            (b.signal - background(b, per_speed * b.speed))[[0, -1]] / (per_speed * b.speed)
+            for b in columns
+            if len(b.signal) > 1
+        ]
         for assumption, claim, values in (
             (1, "repetition: scatter of the measured flow between the last two trials", scatter),
             (2, "time invariance: change of the steady command from the first plateau to the second", drift),
-            (3, "one signal a task: difference of Start, Stop and Steady-State between routines of one speed", alike),
+            (
+                3,
+                "one signal a task: difference of Start, Stop and Steady-State between routines of one speed",
+                alike,
+            ),
             (3, "one signal a task: difference of Corner between pauses", corners),
-            (4, "continuity: largest jump of the command at a transition, in % of the steady command", np.abs(edges)),
+            (
+                4,
+                "continuity: largest jump of the command at a transition, in % of the steady command",
+                np.abs(edges),
+            ),
         ):
-            out.append(Check(assumption, claim, *key, 100 * float(np.max(values)) if len(values) else math.nan))
+            out.append(
+                Check(assumption, claim, *key, 100 * float(np.max(values)) if len(values) else math.nan)
+            )
     return out

@@ -1,4 +1,5 @@
-"""Moves -> the gantry's travel in time: trapezoids of speed with look-ahead, corners by junction deviation, arcs by their true length, as firmware plans them."""
+"""Moves -> the gantry's travel in time: trapezoids of speed with look-ahead, corners by junction deviation,
+arcs by their true length, as firmware plans them."""
 
 from typing import NamedTuple
 
@@ -10,11 +11,14 @@ MOST = 50_000_000  # samples of one signal, 11 days at 50 Hz: beyond it a feed o
 
 
 class Motion(NamedTuple):
-    """The plan of N moves: each speeds up from `entry` to `cruise` in ramp_s[0], cruises, and slows down to `exit` in ramp_s[1].
+    """The plan of N moves: each speeds up from `entry` to `cruise` in
+    ramp_s[0], cruises, and slows down to `exit` in ramp_s[1].
 
-    begin_s, duration_s (N,): when a move begins and how long it takes. entry, cruise, exit (N,): mm/s along the path, of filament where E moves alone.
-    ramp_s (2, N): seconds of speeding up and of slowing down. acceleration (N,): mm/s^2. travel (N,): mm along the path, of filament where E moves alone.
-    turn (N,): angle in rad by which the path turns where the move begins (0 straight on, pi back), NaN where it or the move before stands still.
+    begin_s, duration_s (N,): when a move begins and how long it takes. entry, cruise, exit (N,): mm/s
+    along the path, of filament where E moves alone. ramp_s (2, N): seconds of speeding up and of
+    slowing down. acceleration (N,): mm/s^2. travel (N,): mm along the path, of filament where E moves
+    alone. turn (N,): angle in rad by which the path turns where the move begins (0 straight on, pi
+    back), NaN where it or the move before stands still.
     """
 
     begin_s: np.ndarray
@@ -29,8 +33,9 @@ class Motion(NamedTuple):
 
 
 class Signal(NamedTuple):
-    """The plan at t = 0, Ts, 2 Ts, ... to its end: position (T, 3) in mm, speed (T,) in mm/s (0 where E moves alone), the move (T,) and the share (T,) of its way that
-    is done; e_rate (T,) in mm/s, the mean from each instant to the next, so that its sum times Ts is all of E."""
+    """The plan at t = 0, Ts, 2 Ts, ... to its end: position (T, 3) in mm, speed (T,) in mm/s (0 where E moves
+    alone), the move (T,) and the share (T,) of its way that is done; e_rate (T,) in mm/s, the mean from each
+    instant to the next, so that its sum times Ts is all of E."""
 
     time_s: np.ndarray
     position: np.ndarray
@@ -41,15 +46,23 @@ class Signal(NamedTuple):
 
 
 def plan(
-    moves: Moves, *, acceleration: float, junction_deviation_mm: float, speed_limit: float, unset_feed: float, tool_change_s: float
+    moves: Moves,
+    *,
+    acceleration: float,
+    junction_deviation_mm: float,
+    speed_limit: float,
+    unset_feed: float,
+    tool_change_s: float,
 ) -> Motion:
-    """The fastest motion within the limits: each move's feed, speed_limit in mm/s, acceleration in mm/s^2 (the program's own where that is lower), and at corners
+    """The fastest motion within the limits: each move's feed, speed_limit in mm/s, acceleration in mm/s^2
+    (the program's own where that is lower), and at corners
 
     v^2 <= a delta s / (1 - s),   v^2 <= a l s / (2 c),   s = sin(theta / 2), c = cos(theta / 2)
 
-    with theta the angle between the legs (pi straight on), delta the junction deviation (Jeon, "Improving grbl: cornering algorithm", 2011) and l the shorter leg
-    (Klipper's bound for curves in short legs). Arcs keep v^2 <= a r. Dwells, tool changes (tool_change_s) and E alone begin and end at rest; unset_feed (mm/s) is
-    for moves before the first F. Raises ValueError for limits that are not positive.
+    with theta the angle between the legs (pi straight on), delta the junction deviation (Jeon, "Improving
+    grbl: cornering algorithm", 2011) and l the shorter leg (Klipper's bound for curves in short legs). Arcs
+    keep v^2 <= a r. Dwells, tool changes (tool_change_s) and E alone begin and end at rest; unset_feed (mm/s)
+    is for moves before the first F. Raises ValueError for limits that are not positive.
     """
     limits = {"acceleration": acceleration, "speed_limit": speed_limit, "unset_feed": unset_feed}
     for name, limit in limits.items():
@@ -62,13 +75,17 @@ def plan(
     feed = np.minimum(np.where(np.isfinite(moves.feed), moves.feed, unset_feed), speed_limit)
     top = np.minimum(feed**2, a * np.nan_to_num(_radius(moves), nan=np.inf))
     turn = _turns(moves, runs)
-    cap = np.minimum(_corner(turn, moves.length, a, junction_deviation_mm), np.minimum(top, np.append(0.0, top[:-1])))
+    cap = np.minimum(
+        _corner(turn, moves.length, a, junction_deviation_mm), np.minimum(top, np.append(0.0, top[:-1]))
+    )
     entry, leave = _look_ahead(np.where(np.isfinite(turn), cap, 0.0), 2 * a * travel)
     cruise = np.maximum(np.minimum(top, (entry + leave) / 2 + a * travel), np.maximum(entry, leave))
     entry, leave, cruise = np.sqrt(entry), np.sqrt(leave), np.sqrt(cruise)
     ramp = np.stack([cruise - entry, cruise - leave]) / a
     flat = travel - (ramp[0] * (entry + cruise) + ramp[1] * (leave + cruise)) / 2
-    moving = np.where(travel > 0, ramp.sum(axis=0) + np.maximum(flat, 0.0) / np.where(travel > 0, cruise, 1.0), 0.0)
+    moving = np.where(
+        travel > 0, ramp.sum(axis=0) + np.maximum(flat, 0.0) / np.where(travel > 0, cruise, 1.0), 0.0
+    )
     ramp = np.where(travel > 0, ramp, 0.0)
     duration = moving + moves.dwell_s + np.where(moves.kind == Kind.TOOL, tool_change_s, 0.0)
     begin = np.append(0.0, np.cumsum(duration))[:-1]
@@ -77,11 +94,15 @@ def plan(
 
 def _radius(moves: Moves) -> np.ndarray:
     """Mean radius (N,) of the arcs, NaN for lines."""
-    return (np.linalg.norm(moves.start[:, :2] - moves.centre, axis=1) + np.linalg.norm(moves.end[:, :2] - moves.centre, axis=1)) / 2
+    return (
+        np.linalg.norm(moves.start[:, :2] - moves.centre, axis=1)
+        + np.linalg.norm(moves.end[:, :2] - moves.centre, axis=1)
+    ) / 2
 
 
 def _turns(moves: Moves, runs: np.ndarray) -> np.ndarray:
-    """Angle (N,) between the direction in which the move before ends and the one in which this one begins, NaN where either stands still."""
+    """Angle (N,) between the direction in which the move before ends and the one in which
+    this one begins, NaN where either stands still."""
     step = moves.end - moves.start
     turn = np.full(len(step), np.nan)
     pair = np.flatnonzero(runs[1:] & runs[:-1])
@@ -96,7 +117,9 @@ def _turns(moves: Moves, runs: np.ndarray) -> np.ndarray:
 
     before, after = direction(pair, moves.end), direction(pair + 1, moves.start)
     # 2 atan2(|a - b|, |a + b|) is exact near 0 and pi, where arccos loses half the digits (Kahan)
-    turn[pair + 1] = 2 * np.arctan2(np.linalg.norm(after - before, axis=1), np.linalg.norm(after + before, axis=1))
+    turn[pair + 1] = 2 * np.arctan2(
+        np.linalg.norm(after - before, axis=1), np.linalg.norm(after + before, axis=1)
+    )
     return turn
 
 
@@ -106,12 +129,15 @@ def _corner(turn: np.ndarray, length: np.ndarray, a: np.ndarray, deviation: floa
     lower = np.minimum(a, np.append(a[:1], a[:-1]))
     leg = np.minimum(length, np.append(length[:1], length[:-1]))
     with np.errstate(divide="ignore", invalid="ignore"):
-        bounds = np.stack([deviation * s / (2 * np.sin(turn / 4) ** 2), leg * s / (2 * c)])  # 1 - s without cancellation
+        bounds = np.stack(
+            [deviation * s / (2 * np.sin(turn / 4) ** 2), leg * s / (2 * c)]
+        )  # 1 - s without cancellation
     return lower * np.where(c > 1e-9, bounds, np.inf).min(axis=0)
 
 
 def _look_ahead(cap: np.ndarray, gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """v^2 (N,) where each move begins and ends: min over all places k of cap_k + |sum of the gains 2 a l from here to there|, rest after the last.
+    """v^2 (N,) where each move begins and ends: min over all places k of cap_k + |sum of the gains 2 a l from
+    here to there|, rest after the last.
 
     That is the backward pass and the forward pass of a planner in closed form, a running minimum each.
     """
@@ -123,12 +149,14 @@ def _look_ahead(cap: np.ndarray, gain: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def sampled(motion: Motion, moves: Moves, *, sample_time_s: float) -> Signal:
-    """The plan at t = 0, Ts, 2 Ts, ..., the last at most one Ts before its end. Raises ValueError where that is more than MOST samples."""
+    """The plan at t = 0, Ts, 2 Ts, ..., the last at most one Ts before its end. Raises
+    ValueError where that is more than MOST samples."""
     end = motion.begin_s + motion.duration_s
     if len(end) and end[-1] > MOST * sample_time_s:
         slow = motion.duration_s.argmax()
         raise ValueError(
-            f"motion: expected at most {MOST * sample_time_s / 3600:.0f} h, found {end[-1] / 3600:.3g} h, of which line {moves.line[slow]} takes "
+            f"motion: expected at most {MOST * sample_time_s / 3600:.0f} h, found {end[-1] / 3600:.3g} h, "
+            f"of which line {moves.line[slow]} takes "
             f"{motion.duration_s[slow]:.3g} s; check its F or its dwell"
         )
     count = int(np.ceil(end[-1] / sample_time_s)) if len(end) else 0
@@ -137,7 +165,12 @@ def sampled(motion: Motion, moves: Moves, *, sample_time_s: float) -> Signal:
     time_s = np.arange(count) * sample_time_s
     since = time_s - motion.begin_s[move]
     left = motion.duration_s[move] - since
-    up, down, cruise, a = motion.ramp_s[0, move], motion.ramp_s[1, move], motion.cruise[move], motion.acceleration[move]
+    up, down, cruise, a = (
+        motion.ramp_s[0, move],
+        motion.ramp_s[1, move],
+        motion.cruise[move],
+        motion.acceleration[move],
+    )
     early, late = np.maximum(up - since, 0.0), np.maximum(down - left, 0.0)
     speed = np.clip(cruise - a * (early + late), 0.0, None)
     # what the ramps take off cruise t, counted from the nearer end, so that rounding never leaves the move
@@ -163,7 +196,8 @@ def _on_arc(moves: Moves, move: np.ndarray, share: np.ndarray) -> np.ndarray:
 
 
 def rate(signal: Signal, amount: np.ndarray, *, sample_time_s: float) -> np.ndarray:
-    """Mean rate (T,) from each instant to the next of an amount (N,) that each move spends evenly along its way (E, volume, printed length); sums exactly.
+    """Mean rate (T,) from each instant to the next of an amount (N,) that each move spends evenly along its
+    way (E, volume, printed length); sums exactly.
 
     An amount of a move without travel is spent at its end.
     """

@@ -5,10 +5,12 @@ import scipy.linalg
 
 
 def nearest(target: np.ndarray, free: np.ndarray, *, pole: float, bound: float) -> np.ndarray:
-    """x (N,) from rest that is nearest to `target` (N,) among all with |x(t) - pole x(t-1)| <= bound: all that a first-order extruder can press.
+    """x (N,) from rest that is nearest to `target` (N,) among all with |x(t) - pole x(t-1)| <= bound: all
+    that a first-order extruder can press.
 
-    Where `free` (N,) is True only what lies above the target costs (no-flow: below the yield all is well). Newton's method on a log barrier (Boyd and
-    Vandenberghe 2004, ch. 11); the Hessian is tridiagonal, so a step is O(N). x and bound in mm^3/s, bound = K (1 - pole) limit.
+    Where `free` (N,) is True only what lies above the target costs (no-flow: below the yield all is well).
+    Newton's method on a log barrier (Boyd and Vandenberghe 2004, ch. 11); the Hessian is tridiagonal, so a
+    step is O(N). x and bound in mm^3/s, bound = K (1 - pole) limit.
     """
     N, a, c = len(target), pole, bound
     s, x, band = target / c, np.zeros(N), np.zeros((2, N))

@@ -1,4 +1,5 @@
-"""Synthetic frames of a trial: flow and gantry position -> deposited cross-section -> what a camera beside the nozzle sees, with everything that misleads an edge detector."""
+"""Synthetic frames of a trial: flow and gantry position -> deposited cross-section -> what a camera beside
+the nozzle sees, with everything that misleads an edge detector."""
 
 import math
 from collections.abc import Iterator
@@ -17,12 +18,15 @@ INSTANTS = 20
 
 
 class Scene(NamedTuple):
-    """What the camera sees. Levels are gray levels of 0..255, px are pixels, shares are of the bead's half-width; `contrast` below 0 is a dark bead.
+    """What the camera sees. Levels are gray levels of 0..255, px are pixels, shares are of the bead's
+    half-width; `contrast` below 0 is a dark bead.
 
-    Shading: the bead's level falls as 1 - shading rho^2, rho = 2 y / w across the bead. The specular line lies at `specular_at` = rho, `specular_px` wide (one
-    standard deviation), `specular` levels above the bead. `blur_px` is the standard deviation of the point spread. Glare is a bump of `glare` levels. The texture
-    (standard deviation, grain in px) lies on the stage, moves with it and is covered by the bead; noise is new in every frame. The bead's edges wander by
-    `roughness_px` about their truth, and stay so. `tilt_deg` turns the line, `offset_px` moves it off the middle.
+    Shading: the bead's level falls as 1 - shading rho^2, rho = 2 y / w across the bead. The specular line
+    lies at `specular_at` = rho, `specular_px` wide (one standard deviation), `specular` levels above the
+    bead. `blur_px` is the standard deviation of the point spread. Glare is a bump of `glare` levels. The
+    texture (standard deviation, grain in px) lies on the stage, moves with it and is covered by the bead;
+    noise is new in every frame. The bead's edges wander by `roughness_px` about their truth, and stay so.
+    `tilt_deg` turns the line, `offset_px` moves it off the middle.
     """
 
     height: int
@@ -49,23 +53,41 @@ HARD = Scene(480, 640, 70.0, 50.0, 0.35, 120.0, 0.55, 2.2, 2.8, 25.0, 5.0, 3.0, 
 
 
 class Camera:
-    """Renders frames of one scene; it remembers its tables and its banks of noise and texture. A frame takes about 0.3 ms."""
+    """Renders frames of one scene; it remembers its tables and its banks
+    of noise and texture. A frame takes about 0.3 ms."""
 
     def __init__(self, scene: Scene, rng: np.random.Generator):
         self.scene, self.rng = scene, rng
         h, w = scene.height, scene.width
-        self.spare = int(abs(scene.offset_px) + w / 2 * abs(math.tan(math.radians(scene.tilt_deg))) + 4 * scene.roughness_px) + 4
+        self.spare = (
+            int(
+                abs(scene.offset_px)
+                + w / 2 * abs(math.tan(math.radians(scene.tilt_deg)))
+                + 4 * scene.roughness_px
+            )
+            + 4
+        )
         tables = _tables(scene, h + 2 * self.spare)
-        self.bead, self.bare = (np.lib.stride_tricks.sliding_window_view(table, h, axis=2) for table in tables)
+        self.bead, self.bare = (
+            np.lib.stride_tricks.sliding_window_view(table, h, axis=2) for table in tables
+        )
         self.light = _light(scene, rng)
         self.noise = _bank(rng, 4 * h * w, scene.noise)
         self.texture = _texture(rng, 4 * w, h, scene)
         # wander of the middle and of the width, along the stage
-        self.wander = scene.roughness_px * np.stack([_grained(rng, 4 * w, 40.0), math.sqrt(2.0) * _grained(rng, 4 * w, 4.0)])
-        self.line = h / 2 - 0.5 + scene.offset_px + math.tan(math.radians(scene.tilt_deg)) * (np.arange(w) - (w - 1) / 2)
+        self.wander = scene.roughness_px * np.stack(
+            [_grained(rng, 4 * w, 40.0), math.sqrt(2.0) * _grained(rng, 4 * w, 4.0)]
+        )
+        self.line = (
+            h / 2
+            - 0.5
+            + scene.offset_px
+            + math.tan(math.radians(scene.tilt_deg)) * (np.arange(w) - (w - 1) / 2)
+        )
 
     def frame(self, width_px: np.ndarray | float, *, stage_px: int) -> np.ndarray:
-        """(h, w) uint8 with a bead width_px (w,) wide, 0 where there is none; the stage has moved by stage_px columns, and what lies on it with it.
+        """(h, w) uint8 with a bead width_px (w,) wide, 0 where there is none; the stage has moved by stage_px
+        columns, and what lies on it with it.
 
         Wider beads than the frame is high are drawn as wide as the frame.
         """
@@ -74,7 +96,9 @@ class Camera:
         first = stage_px % (3 * w)
         middle, rough = self.wander[:, first : first + w]
         across = np.broadcast_to(width_px, w)
-        across = np.where(across > 0, np.maximum(across + rough, 0.0), 0.0) / math.cos(math.radians(scene.tilt_deg))
+        across = np.where(across > 0, np.maximum(across + rough, 0.0), 0.0) / math.cos(
+            math.radians(scene.tilt_deg)
+        )
         dither = rng.random((2, w))
         k = np.minimum((across / WIDTH_STEP + dither[0]).astype(int), len(self.bead) - 1)
         start = ((self.spare + (h - 1) / 2 - self.line - middle) * SHIFTS + dither[1]).astype(int)
@@ -102,9 +126,11 @@ class Camera:
         nozzle_mm: tuple[float, float],
         contact_angle_deg: float,
     ) -> Iterator[tuple[float, np.ndarray]]:
-        """(time, frame) of a trial, one by one: flow (T,) mm^3/s and position (T,) mm, both straight between samples; nozzle_mm are its inner and outer radius.
+        """(time, frame) of a trial, one by one: flow (T,) mm^3/s and position (T,) mm, both straight between
+        samples; nozzle_mm are its inner and outer radius.
 
-        The bead under the nozzle grows while the frames run: each instant adds Q dt times the footprint to the section A(s), and the width is sqrt(A / c).
+        The bead under the nozzle grows while the frames run: each instant adds Q dt times the footprint to
+        the section A(s), and the width is sqrt(A / c).
         """
         c = area(1.0, contact_angle_deg)
         px = abs(view.mm_per_px)
@@ -142,7 +168,9 @@ def _instants(begin, end, time_s, flow, position) -> tuple[np.ndarray, np.ndarra
     return np.interp(at, time_s, flow) * dt, np.interp(at, time_s, position)
 
 
-def _lay(A: np.ndarray, origin: float, px: float, volumes: np.ndarray, places: np.ndarray, inner: float) -> None:
+def _lay(
+    A: np.ndarray, origin: float, px: float, volumes: np.ndarray, places: np.ndarray, inner: float
+) -> None:
     """A += sum of volumes times the footprint at their places, as means over the cells of the stage."""
     first = int((places.min() - inner - origin) / px)
     last = int((places.max() + inner - origin) / px) + 2
@@ -151,9 +179,11 @@ def _lay(A: np.ndarray, origin: float, px: float, volumes: np.ndarray, places: n
 
 
 def _tables(scene: Scene, rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Two tables (widths, shifts, rows) int16 for widths of 0 to the frame's height: the bead's profile less background, and 64 times the share of substrate still seen.
+    """Two tables (widths, shifts, rows) int16 for widths of 0 to the frame's height: the bead's profile less
+    background, and 64 times the share of substrate still seen.
 
-    The bead's middle is at row (rows - 1) / 2 + shift / SHIFTS. Drawn on SHIFTS samples a row, blurred, then averaged over each pixel.
+    The bead's middle is at row (rows - 1) / 2 + shift / SHIFTS. Drawn on SHIFTS
+    samples a row, blurred, then averaged over each pixel.
     """
     widths = np.arange(0.0, scene.height, WIDTH_STEP, dtype=np.float32)
     fine = SHIFTS * (rows + 1)
@@ -164,7 +194,11 @@ def _tables(scene: Scene, rows: int) -> tuple[np.ndarray, np.ndarray]:
         covered = np.clip((w / 2 - np.abs(y)) * SHIFTS + 0.5, 0.0, 1.0)
         rho = 2 * y / max(w, 1e-3)
         body = scene.contrast * (1 - scene.shading * np.minimum(rho * rho, 1.0))
-        line = scene.specular * min(1.0, w / 40.0) * np.exp(-0.5 * ((y - scene.specular_at * w / 2) / scene.specular_px) ** 2)
+        line = (
+            scene.specular
+            * min(1.0, w / 40.0)
+            * np.exp(-0.5 * ((y - scene.specular_at * w / 2) / scene.specular_px) ** 2)
+        )
         sharp = np.stack([(body + line) * covered, 64 * (1 - covered)])
         soft = cv2.GaussianBlur(sharp, (size, 1), scene.blur_px * SHIFTS, borderType=cv2.BORDER_REPLICATE)
         total = np.cumsum(np.pad(soft, ((0, 0), (1, 0))), axis=1, dtype=float) / SHIFTS
@@ -178,7 +212,9 @@ def _light(scene: Scene, rng: np.random.Generator) -> np.ndarray:
     h, w = scene.height, scene.width
     x, y = np.ogrid[:w, :h]
     at_x, at_y, spread = rng.uniform(0, w), rng.uniform(0, h), 0.3 * w
-    return np.rint(scene.background + scene.glare * np.exp(-((x - at_x) ** 2 + (y - at_y) ** 2) / (2 * spread**2))).astype(np.int16)
+    return np.rint(
+        scene.background + scene.glare * np.exp(-((x - at_x) ** 2 + (y - at_y) ** 2) / (2 * spread**2))
+    ).astype(np.int16)
 
 
 def _bank(rng: np.random.Generator, size: int, deviation: float) -> np.ndarray:

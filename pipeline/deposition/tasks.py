@@ -1,4 +1,5 @@
-"""Moves and their motion -> the sequence of tasks, with look-ahead: runs, corners, gaps, changes of material; the rules of what may follow what (Hoelzle 2009, fig. 8)."""
+"""Moves and their motion -> the sequence of tasks, with look-ahead: runs, corners, gaps, changes of material;
+the rules of what may follow what (Hoelzle 2009, fig. 8)."""
 
 from collections.abc import Collection
 from typing import NamedTuple
@@ -11,16 +12,18 @@ from pipeline.deposition.motion import Motion
 
 # between two materials the paper's Stop A, dwell, Start B: no task of either material
 DWELL = "Dwell"
-# words at which a machine waits for a person or ends: a run across one would stand still with the plunger pressing
+# words at which a machine waits for a person or ends: a run across one
+# would stand still with the plunger pressing
 HALTS = ("M0", "M1", "M2", "M25", "M30", "M112", "M226", "M600", "M601", "PAUSE", "CANCEL_PRINT")
 TINY_S = 1e-6
 
 
 class Lines(NamedTuple):
-    """Every printed line (L,): its number in the program, its move, its tool, the run that it belongs to, begin and end in s, length in mm, cruising speed in mm/s.
+    """Every printed line (L,): its number in the program, its move, its tool, the run that it belongs to,
+    begin and end in s, length in mm, cruising speed in mm/s.
 
-    first and last tell whether it begins or ends its run; pause_s is the time lost at the junction after it (halts in place and slowing down), and corner whether
-    that is a Corner.
+    first and last tell whether it begins or ends its run; pause_s is the time lost at the junction after it
+    (halts in place and slowing down), and corner whether that is a Corner.
     """
 
     line: np.ndarray
@@ -38,7 +41,8 @@ class Lines(NamedTuple):
 
 
 class Tasks(NamedTuple):
-    """The sequence (N,): name of the task, tool, number of the line that calls for it, its event and its end in s, speed in mm/s, pause in s (of a Corner)."""
+    """The sequence (N,): name of the task, tool, number of the line that calls for it, its event and its end
+    in s, speed in mm/s, pause in s (of a Corner)."""
 
     task: np.ndarray
     tool: np.ndarray
@@ -50,14 +54,17 @@ class Tasks(NamedTuple):
 
 
 def printed_lines(moves: Moves, motion: Motion, *, corner_deg: float, longest_pause_s: float) -> Lines:
-    """The printed lines, joined to runs where nothing but a halt in place of at most `longest_pause_s` lies between two of one tool.
+    """The printed lines, joined to runs where nothing but a halt in place of at
+    most `longest_pause_s` lies between two of one tool.
 
-    A junction is a Corner where the path turns by `corner_deg` or more, or halts. Raises ValueError where nothing is printed.
+    A junction is a Corner where the path turns by `corner_deg` or more, or
+    halts. Raises ValueError where nothing is printed.
     """
     at = np.flatnonzero((moves.kind == Kind.EXTRUDE) & (moves.length > 0))
     if not len(at):
         raise ValueError(
-            f"tasks: expected lines that print but found none among {len(moves.line)} moves; is extrusion driven by another axis or a switch?"
+            f"tasks: expected lines that print but found none among {len(moves.line)} moves; "
+            "is extrusion driven by another axis or a switch?"
         )
     begin, end = motion.begin_s[at], motion.begin_s[at] + motion.duration_s[at]
     way = np.concatenate([[0.0], np.cumsum(moves.length)])
@@ -65,7 +72,10 @@ def printed_lines(moves: Moves, motion: Motion, *, corner_deg: float, longest_pa
     between = way[at[1:]] - way[at[:-1] + 1]
     halt = np.maximum(begin[1:] - end[:-1], 0.0)
     joined = (
-        (between < 1e-9) & (moves.tool[at[1:]] == moves.tool[at[:-1]]) & (changes[at[1:]] == changes[at[:-1]]) & (halt <= longest_pause_s)
+        (between < 1e-9)
+        & (moves.tool[at[1:]] == moves.tool[at[:-1]])
+        & (changes[at[1:]] == changes[at[:-1]])
+        & (halt <= longest_pause_s)
     )
     joined = np.concatenate([[False], joined, [False]])
     speed = np.maximum(motion.cruise[at], 1e-9)
@@ -74,13 +84,28 @@ def printed_lines(moves: Moves, motion: Motion, *, corner_deg: float, longest_pa
     turned = np.append(np.nan_to_num(motion.turn[at[1:]]) >= np.radians(corner_deg) - 1e-9, False)
     corner = joined[1:] & (turned | (np.append(halt, 0.0) > TINY_S))
     first, last = ~joined[:-1], ~joined[1:]
-    return Lines(moves.line[at], at, moves.tool[at], np.cumsum(first) - 1, begin, end, moves.length[at], speed, first, last, lost, corner)
+    return Lines(
+        moves.line[at],
+        at,
+        moves.tool[at],
+        np.cumsum(first) - 1,
+        begin,
+        end,
+        moves.length[at],
+        speed,
+        first,
+        last,
+        lost,
+        corner,
+    )
 
 
 def sequence(lines: Lines, *, end_s: float) -> Tasks:
-    """The tasks in their order: No-Flow, then for each run Start, Steady-State, (Corner, Steady-State)..., Stop, and No-Flow or, to another tool, Dwell.
+    """The tasks in their order: No-Flow, then for each run Start, Steady-State, (Corner, Steady-State)...,
+    Stop, and No-Flow or, to another tool, Dwell.
 
-    A task's event is where the gantry begins it: the signals are sent ahead of it by their leads, which is what looking ahead is for.
+    A task's event is where the gantry begins it: the signals are sent ahead of it
+    by their leads, which is what looking ahead is for.
     """
     n = len(lines.line)
     switched = np.append(lines.tool[1:] != lines.tool[:-1], False)
@@ -99,7 +124,15 @@ def sequence(lines: Lines, *, end_s: float) -> Tasks:
     task = np.concatenate([np.broadcast_to(np.asarray(name), n)[mask] for mask, _, name, _ in parts])[by]
     begin = np.concatenate([times[mask] for mask, _, _, times in parts])[by]
     pause = np.where(task == CORNER, lines.pause_s[which], 0.0)
-    columns = [task, lines.tool[which], lines.line[which], begin, np.append(begin[1:], max(end_s, begin[-1])), lines.speed[which], pause]
+    columns = [
+        task,
+        lines.tool[which],
+        lines.line[which],
+        begin,
+        np.append(begin[1:], max(end_s, begin[-1])),
+        lines.speed[which],
+        pause,
+    ]
     if lines.begin_s[0] > TINY_S:
         ahead = (NO_FLOW, lines.tool[0], lines.line[0], 0.0, lines.begin_s[0], lines.speed[0], 0.0)
         columns = [np.concatenate([[value], column]) for value, column in zip(ahead, columns, strict=True)]
@@ -107,20 +140,26 @@ def sequence(lines: Lines, *, end_s: float) -> Tasks:
 
 
 def refuse(lines: Lines, moves: Moves, *, halts: Collection[int], switch_s: float) -> None:
-    """Raises ValueError, with the line number, where a program would have to go from Steady-State to No-Flow without a Stop:
+    """Raises ValueError, with the line number, where a program would have
+    to go from Steady-State to No-Flow without a Stop:
 
-    a change of material with less than `switch_s` between the last line of the one and the first of the other (the rest of Stop A and the lead of Start B), and a halt
-    (line numbers `halts`, see `halting`) in the middle of a run.
+    a change of material with less than `switch_s` between the last line of the one and the
+    first of the other (the rest of Stop A and the lead of Start B), and a halt (line
+    numbers `halts`, see `halting`) in the middle of a run.
     """
-    after = np.flatnonzero((lines.tool[1:] != lines.tool[:-1]) & (lines.begin_s[1:] - lines.end_s[:-1] < switch_s - TINY_S))
+    after = np.flatnonzero(
+        (lines.tool[1:] != lines.tool[:-1]) & (lines.begin_s[1:] - lines.end_s[:-1] < switch_s - TINY_S)
+    )
     if len(after):
         k = int(after[0])
         span = slice(lines.move[k] + 1, lines.move[k + 1] + 1)
         # the T word; where the tool changed without one, the line that prints with it
         change = np.append(moves.line[span][moves.kind[span] == Kind.TOOL], moves.line[span][-1])[0]
         raise ValueError(
-            f"line {change}: T{lines.tool[k + 1]} comes {lines.begin_s[k + 1] - lines.end_s[k]:.2f} s after line {lines.line[k]} still printed with T{lines.tool[k]}, so "
-            f"Steady-State would go to No-Flow without a Stop; expected {switch_s:.2f} s between them: write G4 P{1000 * switch_s:.0f} at the change"
+            f"line {change}: T{lines.tool[k + 1]} comes {lines.begin_s[k + 1] - lines.end_s[k]:.2f} s after "
+            f"line {lines.line[k]} still printed with T{lines.tool[k]}, so "
+            f"Steady-State would go to No-Flow without a Stop; expected {switch_s:.2f} s between them: "
+            f"write G4 P{1000 * switch_s:.0f} at the change"
         )
     halts = np.sort(np.asarray(list(halts), int))
     inside = np.searchsorted(lines.line, halts, side="right") - 1
@@ -128,11 +167,19 @@ def refuse(lines: Lines, moves: Moves, *, halts: Collection[int], switch_s: floa
     crossed[crossed] = ~lines.last[inside[crossed]]
     if crossed.any():
         raise ValueError(
-            f"line {halts[crossed][0]}: the machine halts here while line {lines.line[inside[crossed][0]]} still prints, so Steady-State would go to No-Flow without a "
+            f"line {halts[crossed][0]}: the machine halts here while line {lines.line[inside[crossed][0]]} "
+            "still prints, so Steady-State would go to No-Flow without a "
             "Stop; end the line with a travel before the halt"
         )
 
 
 def halting(other_line: np.ndarray, other_word: np.ndarray) -> np.ndarray:
     """The line numbers (H,) of words at which the machine waits for a person."""
-    return np.array([line for line, word in zip(other_line, other_word, strict=True) if str(word).split(" ")[0].upper() in HALTS], int)
+    return np.array(
+        [
+            line
+            for line, word in zip(other_line, other_word, strict=True)
+            if str(word).split(" ")[0].upper() in HALTS
+        ],
+        int,
+    )

@@ -1,4 +1,5 @@
-"""What one measured trial tells of the extruder: gain, time constant, total delay and yield by least squares, each with its uncertainty; up and down apart."""
+"""What one measured trial tells of the extruder: gain, time constant, total delay and yield by least squares,
+each with its uncertainty; up and down apart."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -17,10 +18,11 @@ LEAST_FIT_PERCENT = 20.0
 
 
 class TrialModel(NamedTuple):
-    """y = max(K / (tau s + 1) e^(-delay s) u - yield, 0), the delay holding all that is late (transport and lag).
+    """y = max(K / (tau s + 1) e^(-delay s) u - yield, 0), the delay
+    holding all that is late (transport and lag).
 
-    `extruder` holds K (mm^3/s per mm), tau, delay (s) and yield (mm^3/s). noise is the r.m.s. of what the model leaves, mm^3/s; fit_percent the NRMSE
-    100 (1 - |y - ŷ| / |y - mean y|).
+    `extruder` holds K (mm^3/s per mm), tau, delay (s) and yield (mm^3/s). noise is the r.m.s. of what the
+    model leaves, mm^3/s; fit_percent the NRMSE 100 (1 - |y - ŷ| / |y - mean y|).
     """
 
     extruder: Extruder
@@ -28,11 +30,14 @@ class TrialModel(NamedTuple):
     fit_percent: float
 
 
-def identify(u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, sample_time_s: float, yield_: float | None = None) -> TrialModel:
-    """The model that simulates the trials best from rest: min over (K, tau, delay, yield) of the sum of (max(x - yield, 0) - y)^2.
+def identify(
+    u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, sample_time_s: float, yield_: float | None = None
+) -> TrialModel:
+    """The model that simulates the trials best from rest: min over (K, tau,
+    delay, yield) of the sum of (max(x - yield, 0) - y)^2.
 
-    u (T,) in mm and measured flow y (T,) in mm^3/s of each trial; NaN in y is a sample that was not observable. `yield_` in
-    mm^3/s where it is known and not sought. Raises ValueError where a command holds
+    u (T,) in mm and measured flow y (T,) in mm^3/s of each trial; NaN in y is a sample that was not
+    observable. `yield_` in mm^3/s where it is known and not sought. Raises ValueError where a command holds
     NaN or never moves, or the flow never leaves its noise.
     """
     u, y = [np.asarray(a, float) for a in u], [np.asarray(b, float) for b in y]
@@ -42,7 +47,9 @@ def identify(u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, sample_time_s:
 
     def predicted(gain, tau, delay, yield_):
         model = Extruder(gain, tau, delay)
-        x = np.concatenate([pressed(model, a, sample_time_s=sample_time_s)[s] for a, s in zip(u, seen, strict=True)])
+        x = np.concatenate(
+            [pressed(model, a, sample_time_s=sample_time_s)[s] for a, s in zip(u, seen, strict=True)]
+        )
         return np.maximum(x - yield_, 0.0)
 
     starts = []
@@ -54,20 +61,27 @@ def identify(u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, sample_time_s:
     _, gain, tau, delay = min(starts)
     if gain <= 0:
         raise ValueError(
-            f"identify: expected a flow that rises with the command but found a best gain of {gain:.3g} mm^3/s per mm; check the command's sign and its clock against the frames'"
+            f"identify: expected a flow that rises with the command but found a best gain of {gain:.3g} "
+            "mm^3/s per mm; check the command's sign and its clock against the frames'"
         )
     # the yield is a share of the flow that was seen; the command's peaks say nothing of it
     span = float(np.quantile(measured, 0.95))
 
     def four(theta):
-        return float(np.exp(theta[0])), float(np.exp(theta[1])), float(theta[2]), float(theta[3] * span) if yield_ is None else yield_
+        return (
+            float(np.exp(theta[0])),
+            float(np.exp(theta[1])),
+            float(theta[2]),
+            float(theta[3] * span) if yield_ is None else yield_,
+        )
 
     n = 4 if yield_ is None else 3
     low = [np.log(gain) - 3, np.log(tau) - 3, 0.0, 0.0][:n]
     high = [np.log(gain) + 3, np.log(tau) + 3, LONGEST_DELAY_S, 1.0][:n]
     start = [np.log(gain), np.log(tau), max(delay, sample_time_s), 0.02][:n]
     fit = scipy.optimize.least_squares(
-        lambda theta: predicted(*four(theta)) - measured, start, bounds=(low, high), x_scale=[0.1, 0.1, 0.02, 0.02][:n], diff_step=1e-4, xtol=1e-7, ftol=1e-9
+        lambda theta: predicted(*four(theta)) - measured, start, bounds=(low, high),
+        x_scale=[0.1, 0.1, 0.02, 0.02][:n], diff_step=1e-4, xtol=1e-7, ftol=1e-9
     )  # fmt: skip
     K, tau, delay, found = four(fit.x)
     extruder = Extruder(K, tau, delay, yield_=found)
@@ -75,22 +89,38 @@ def identify(u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, sample_time_s:
     fit_percent = float(100 * (1 - np.linalg.norm(fit.fun) / spread))
     if fit_percent < LEAST_FIT_PERCENT:
         raise ValueError(
-            f"identify: expected a flow that follows the command but the best model fits {fit_percent:.0f} %; check that command and frames are of the same trial and clock"
+            f"identify: expected a flow that follows the command but the best model fits {fit_percent:.0f} "
+            "%; check that command and frames are of the same trial and clock"
         )
     return TrialModel(extruder, float(np.sqrt(np.mean(fit.fun**2))), fit_percent)
 
 
 def deviations(
-    model: TrialModel, u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, drift: float, trial_gain: float, sample_time_s: float
+    model: TrialModel,
+    u: Sequence[np.ndarray],
+    y: Sequence[np.ndarray],
+    *,
+    drift: float,
+    trial_gain: float,
+    sample_time_s: float,
 ) -> tuple[float, float, float, float]:
-    """One standard deviation of K (mm^3/s per mm), tau (s), delay (s) and yield (mm^3/s) of `identify` on the trials u, y.
+    """One standard deviation of K (mm^3/s per mm), tau (s), delay (s)
+    and yield (mm^3/s) of `identify` on the trials u, y.
 
-    The estimate moves by J^+ w, J the change of the predicted flow with the four; w is white noise of the model's own r.m.s., a random walk whose r.m.s.
-    over a trial is `drift` of the highest flow, and a share `trial_gain` of the flow itself: the last two are not to be seen in one trial's residual.
+    The estimate moves by J^+ w, J the change of the predicted flow with the four; w is white noise of the
+    model's own r.m.s., a random walk whose r.m.s. over a trial is `drift` of the highest flow, and a share
+    `trial_gain` of the flow itself: the last two are not to be seen in one trial's residual.
     """
     e = model.extruder
     theta = np.array([e.gain, e.time_constant_s, e.delay_s, e.yield_])
-    steps = np.array([1e-4 * e.gain, 1e-4 * e.time_constant_s, 1e-2 * sample_time_s, 1e-4 * e.gain * max(np.abs(a).max() for a in u)])
+    steps = np.array(
+        [
+            1e-4 * e.gain,
+            1e-4 * e.time_constant_s,
+            1e-2 * sample_time_s,
+            1e-4 * e.gain * max(np.abs(a).max() for a in u),
+        ]
+    )
 
     def predicted(theta, a):
         K, tau, delay, yield_ = theta
@@ -112,12 +142,21 @@ def deviations(
 
 
 def directions(
-    u: np.ndarray, y: np.ndarray, *, start_s: float, stop_s: float, window_s: float, yield_: float, sample_time_s: float
+    u: np.ndarray,
+    y: np.ndarray,
+    *,
+    start_s: float,
+    stop_s: float,
+    window_s: float,
+    yield_: float,
+    sample_time_s: float,
 ) -> tuple[TrialModel, TrialModel]:
-    """The models of the upward and of the downward step alone (Hoelzle 2009, table I is downward): only the flow within `window_s` of start or stop counts.
+    """The models of the upward and of the downward step alone (Hoelzle 2009, table I is downward): only the
+    flow within `window_s` of start or stop counts.
 
-    The yield (mm^3/s) is that of the whole trial: in one step it cannot be told from delay. Where the two differ by more than their deviations, the
-    extruder fills and relaxes at different speeds, and one first-order model is a compromise.
+    The yield (mm^3/s) is that of the whole trial: in one step it cannot be told from delay. Where
+    the two differ by more than their deviations, the extruder fills and relaxes at different
+    speeds, and one first-order model is a compromise.
     """
     t = np.arange(len(y)) * sample_time_s
     near = [np.where((t >= at - window_s / 10) & (t < at + window_s), y, np.nan) for at in (start_s, stop_s)]
@@ -128,16 +167,21 @@ def directions(
 def _check(u: list[np.ndarray], y: list[np.ndarray]) -> None:
     if not u or len(u) != len(y) or any(a.shape != b.shape or a.ndim != 1 for a, b in zip(u, y, strict=True)):
         raise ValueError(
-            f"identify: expected one command and one flow of equal length a trial but found shapes {[a.shape for a in u]} and {[b.shape for b in y]}"
+            "identify: expected one command and one flow of equal length a trial but found shapes "
+            f"{[a.shape for a in u]} and {[b.shape for b in y]}"
         )
     for j, (a, b) in enumerate(zip(u, y, strict=True)):
         if not np.isfinite(a).all():
-            raise ValueError(f"identify: expected a command without gaps but trial {j} holds NaN; record the trial again")
+            raise ValueError(
+                f"identify: expected a command without gaps but trial {j} holds NaN; record the trial again"
+            )
         if np.isfinite(b).sum() < 50:
             raise ValueError(
-                f"identify: expected at least 50 observable samples of flow but trial {j} has {np.isfinite(b).sum()}; check the frames of that trial"
+                f"identify: expected at least 50 observable samples of flow but trial {j} has "
+                f"{np.isfinite(b).sum()}; check the frames of that trial"
             )
     if all(np.ptp(a) == 0 for a in u):
         raise ValueError(
-            "identify: the command never moves, so neither gain nor delay is identified; record a trial with a start and a stop"
+            "identify: the command never moves, so neither gain nor delay is identified; "
+            "record a trial with a start and a stop"
         )

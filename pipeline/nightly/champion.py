@@ -1,4 +1,5 @@
-"""Who is in production: `champion.json` and `champion/<loop>.dvc`; promoted, checked, put back to an earlier one bit by bit."""
+"""Who is in production: `champion.json` and `champion/<loop>.dvc`; promoted,
+checked, put back to an earlier one bit by bit."""
 
 import hashlib
 import shutil
@@ -34,7 +35,12 @@ def _md5(path: Path) -> str:
 def locked(paths: Sequence[str]) -> dict[str, str]:
     """{out: hash} as dvc.lock has them, of the outs that hold these files."""
     lock = yaml.safe_load(Path("dvc.lock").read_text(encoding="utf-8"))
-    outs = {out["path"]: out["md5"] for stage in lock.get("stages", {}).values() for out in stage.get("outs", []) if "md5" in out}
+    outs = {
+        out["path"]: out["md5"]
+        for stage in lock.get("stages", {}).values()
+        for out in stage.get("outs", [])
+        if "md5" in out
+    }
     return {out: outs[out] for out in sorted(outs) if any(f"{path}/".startswith(f"{out}/") for path in paths)}
 
 
@@ -42,7 +48,8 @@ def locked(paths: Sequence[str]) -> dict[str, str]:
 
 
 def install(loop: str, files: Sequence[str], beside: Mapping[str, Any]) -> dict[str, Any]:
-    """Copies the files into champion/<loop>, with what is to lie beside them as JSON by name, and hands the folder to DVC; what `put_back` needs to have it again.
+    """Copies the files into champion/<loop>, with what is to lie beside them as JSON by name, and hands the
+    folder to DVC; what `put_back` needs to have it again.
 
     A file is copied beside and renamed whole; until the commit, HEAD still has the champion before it.
     """
@@ -70,7 +77,8 @@ def same(known: Mapping[str, str], files: Sequence[str]) -> bool:
 
 
 def rolled_back(state: Mapping[str, Any], loop: str, files: Sequence[str]) -> str:
-    """The run whose champion these very files are, where somebody has rolled it back since; empty otherwise."""
+    """The run whose champion these very files are, where somebody has
+    rolled it back since; empty otherwise."""
     found = ""
     for line in (line for line in state["history"] if line["loop"] == loop):
         if line["event"] == "rolled back" and same(line["replaced"], files):
@@ -112,7 +120,11 @@ def promoted(state: Mapping[str, Any], loop: str, entry: Mapping[str, Any], *, e
     }
     if event == "rolled back":
         line["replaced"] = state["champions"][loop]["files"]
-    return {**state, "champions": {**state["champions"], loop: dict(entry)}, "history": [*state["history"], line]}
+    return {
+        **state,
+        "champions": {**state["champions"], loop: dict(entry)},
+        "history": [*state["history"], line],
+    }
 
 
 # ---- the way back
@@ -124,7 +136,8 @@ def paths() -> list[str]:
 
 
 def earlier(state: Mapping[str, Any], run: str, loop: str) -> dict[str, dict[str, Any]]:
-    """{loop: entry} to go back to: those that were in production in `run`, or, where `run` is empty, before the present ones. Raises ValueError where there is none."""
+    """{loop: entry} to go back to: those that were in production in `run`, or, where `run` is empty, before
+    the present ones. Raises ValueError where there is none."""
     history = [line for line in state["history"] if not loop or line["loop"] == loop]
     found: dict[str, dict[str, Any]] = {}
     for line in history:
@@ -139,12 +152,14 @@ def earlier(state: Mapping[str, Any], run: str, loop: str) -> dict[str, dict[str
         return {last: found[last]}
     known = ", ".join(dict.fromkeys(f"{line['run']} ({line['loop']})" for line in state["history"])) or "none"
     raise ValueError(
-        f"{FILE}: expected {f'a champion of {run}' if run else 'an earlier champion'} to go back to, found none; known are: {known}"
+        f"{FILE}: expected {f'a champion of {run}' if run else 'an earlier champion'} to go back to, "
+        f"found none; known are: {known}"
     )
 
 
 def put_back(loop: str, entry: Mapping[str, Any]) -> None:
-    """champion/<loop> as `entry` has it: from DVC's cache, or pulled. Raises ValueError where a file is not what it was, and leaves the present champion then."""
+    """champion/<loop> as `entry` has it: from DVC's cache, or pulled. Raises ValueError where a file is not
+    what it was, and leaves the present champion then."""
     path = FOLDER / f"{loop}.dvc"
     present = path.read_bytes() if path.exists() else b""
     artifacts.write_text(path, yaml.safe_dump({"outs": [dict(entry["folder"])]}, sort_keys=False))
@@ -153,7 +168,8 @@ def put_back(loop: str, entry: Mapping[str, Any]) -> None:
         wrong = sorted(set(md5s(FOLDER / loop).items()) ^ set(entry["files"].items()))
         if wrong:
             raise ValueError(
-                f"{FOLDER / loop}: {wrong[0][0]} is not what it was in {entry['run']}; bring DVC's cache or remote back, and run it again"
+                f"{FOLDER / loop}: {wrong[0][0]} is not what it was in {entry['run']}; "
+                "bring DVC's cache or remote back, and run it again"
             )
     except ValueError:
         if present:
@@ -170,7 +186,8 @@ def _fetch(path: Path) -> None:
 
 
 def as_committed() -> list[str]:
-    """Puts champion.json, champion/*.dvc and the folders back to what HEAD says, which is what a killed promotion never was; what it mended, as sentences."""
+    """Puts champion.json, champion/*.dvc and the folders back to what HEAD says, which is what a killed
+    promotion never was; what it mended, as sentences."""
     mended = []
     head = set(git("ls-tree", "-r", "--name-only", "HEAD", "--", str(FILE), str(FOLDER)).splitlines())
     for path in {*head, *paths()}:

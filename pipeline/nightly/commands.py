@@ -5,7 +5,9 @@ import sys
 
 
 def nightly(arguments: argparse.Namespace) -> None:
-    """The nightly job: new recordings, dvc repro, judge, promote or keep. Exit status 0: promoted, kept, or nothing new; 1: failed, nothing in production has changed; 3: drift alarm; 4: done, but recordings were set aside; 75: refused, another night is at work."""
+    """The nightly job: new recordings, dvc repro, judge, promote or keep. Exit status 0: promoted, kept, or
+    nothing new; 1: failed, nothing in production has changed; 3: drift alarm; 4: done, but recordings were
+    set aside; 75: refused, another night is at work."""
     from pipeline.nightly import accepting, merging, night
 
     if arguments.accept_drift:
@@ -19,14 +21,16 @@ def nightly(arguments: argparse.Namespace) -> None:
 
 
 def rollback(arguments: argparse.Namespace) -> None:
-    """Put an earlier champion back into production, bit by bit: that of RUN, or the one before the present one."""
+    """Put an earlier champion back into production, bit by bit: that
+    of RUN, or the one before the present one."""
     from pipeline.nightly import night
 
     print(night.rollback(arguments.of, arguments.loop))
 
 
 def sweep(arguments: argparse.Namespace) -> None:
-    """Experiments over a grid of parameters and seeds, with a table and a picture: sweep -S tune_weights.seed=1,2,3 --target tune_weights --metric tune_weights:practical.cost"""
+    """Experiments over a grid of parameters and seeds, with a table and a picture: sweep -S
+    tune_weights.seed=1,2,3 --target tune_weights --metric tune_weights:practical.cost"""
     from pipeline.nightly import sweeping
 
     print(sweeping.sweep(arguments.set, arguments.target, arguments.metric))
@@ -34,20 +38,47 @@ def sweep(arguments: argparse.Namespace) -> None:
 
 def add(commands) -> None:
     command = commands.add_parser("nightly", help=nightly.__doc__, description=nightly.__doc__)
-    command.add_argument("--watch", action="store_true", help="only look whether the last success is older than nightly.watch_h")
-    command.add_argument("--merge", metavar="BRANCH", default="", help="merge the nights of another branch first")
     command.add_argument(
-        "--accept-drift", nargs=2, metavar=("LOOP", "WHY"), help="take what the alarm of LOOP saw for how things are from now on"
+        "--watch",
+        action="store_true",
+        help="only look whether the last success is older than nightly.watch_h",
+    )
+    command.add_argument(
+        "--merge", metavar="BRANCH", default="", help="merge the nights of another branch first"
+    )
+    command.add_argument(
+        "--accept-drift",
+        nargs=2,
+        metavar=("LOOP", "WHY"),
+        help="take what the alarm of LOOP saw for how things are from now on",
     )
     command.set_defaults(run=nightly)
     command = commands.add_parser("rollback", help=rollback.__doc__, description=rollback.__doc__)
     command.add_argument(
-        "of", metavar="RUN", nargs="?", default="", help="such as night-0042; default: the champion before the present one"
+        "of",
+        metavar="RUN",
+        nargs="?",
+        default="",
+        help="such as night-0042; default: the champion before the present one",
     )
     command.add_argument("--loop", default="", help="only this loop")
     command.set_defaults(run=rollback)
     command = commands.add_parser("sweep", help=sweep.__doc__, description=sweep.__doc__)
-    command.add_argument("-S", "--set", action="append", required=True, metavar="KEY=A,B,C", help="a key of params.yaml or params.expert.yaml and its values")
-    command.add_argument("--target", required=True, metavar="STAGE", help="the stage up to which each experiment runs")
-    command.add_argument("--metric", required=True, metavar="STAGE:KEY", help="the figure that is told of each, below reports/metrics")
+    command.add_argument(
+        "-S",
+        "--set",
+        action="append",
+        required=True,
+        metavar="KEY=A,B,C",
+        help="a key of params.yaml or params.expert.yaml and its values",
+    )
+    command.add_argument(
+        "--target", required=True, metavar="STAGE", help="the stage up to which each experiment runs"
+    )
+    command.add_argument(
+        "--metric",
+        required=True,
+        metavar="STAGE:KEY",
+        help="the figure that is told of each, below reports/metrics",
+    )
     command.set_defaults(run=sweep)

@@ -12,7 +12,8 @@ PROMOTED, KEPT, FIRST = "promoted", "kept", "first champion"
 
 
 class Evidence(NamedTuple):
-    """What the judge measured of one controller: {case: (block, cost)}, {guard: figure, less is better}, and the name of the panel, which two must share to be compared."""
+    """What the judge measured of one controller: {case: (block, cost)}, {guard: figure, less is better}, and
+    the name of the panel, which two must share to be compared."""
 
     panel: str
     cases: dict[str, tuple[str, float]]
@@ -30,28 +31,51 @@ class Decision(NamedTuple):
 
 
 def decide(
-    champion: Evidence | None, challenger: Evidence, rule: Rule, *, allowed: Mapping[str, float], alarms: list[str], seed: int
+    champion: Evidence | None,
+    challenger: Evidence,
+    rule: Rule,
+    *,
+    allowed: Mapping[str, float],
+    alarms: list[str],
+    seed: int,
 ) -> Decision:
-    """Promote where the paired test finds the challenger better by at least `rule.least_improvement_percent`, no guard is worse by more than `allowed`, and nothing has drifted."""
+    """Promote where the paired test finds the challenger better by at least `rule.least_improvement_percent`,
+    no guard is worse by more than `allowed`, and nothing has drifted."""
     infinite = [case for case, (_, cost) in challenger.cases.items() if not np.isfinite(cost)]
     unfit = [
-        f"{name} is {figure:g}; none is allowed" for name, figure in challenger.guards.items() if name.startswith("unstable") and figure > 0
+        f"{name} is {figure:g}; none is allowed"
+        for name, figure in challenger.guards.items()
+        if name.startswith("unstable") and figure > 0
     ]
     if champion is None:
-        reasons = unfit + ([f"{len(infinite)} of {len(challenger.cases)} cases fail, such as {infinite[0]}"] if infinite else [])
+        reasons = unfit + (
+            [f"{len(infinite)} of {len(challenger.cases)} cases fail, such as {infinite[0]}"]
+            if infinite
+            else []
+        )
         figures = {"guards": {name: {"challenger": figure} for name, figure in challenger.guards.items()}}
         return (
-            Decision(KEPT, ["there is no champion, and the challenger is not fit to be one: " + "; ".join(reasons)], figures)
+            Decision(
+                KEPT,
+                ["there is no champion, and the challenger is not fit to be one: " + "; ".join(reasons)],
+                figures,
+            )
             if reasons
             else Decision(FIRST, ["there was no champion to compare with"], figures)
         )
     if champion.panel != challenger.panel:
         return Decision(
-            KEPT, [f"the two were judged on different cases ({champion.panel[:12]}, {challenger.panel[:12]}): they cannot be compared"], {}
+            KEPT,
+            [
+                f"the two were judged on different cases ({champion.panel[:12]}, {challenger.panel[:12]}): "
+                "they cannot be compared"
+            ],
+            {},
         )
     shared = [case for case in champion.cases if case in challenger.cases]
     found = paired(
-        np.array([champion.cases[case][1] for case in shared]), np.array([challenger.cases[case][1] for case in shared]),
+        np.array([champion.cases[case][1] for case in shared]),
+        np.array([challenger.cases[case][1] for case in shared]),
         [champion.cases[case][0] for case in shared], rng=np.random.default_rng(seed),
     )  # fmt: skip
     against = _against(found, rule) + _guards(champion, challenger, allowed) + unfit
@@ -59,13 +83,21 @@ def decide(
     figures = {
         "paired": found._asdict(),
         "guards": {
-            name: {"champion": champion.guards[name], "challenger": challenger.guards[name], "allowed": allowed.get(name, 0.0)}
+            name: {
+                "champion": champion.guards[name],
+                "challenger": challenger.guards[name],
+                "allowed": allowed.get(name, 0.0),
+            }
             for name in champion.guards
             if name in challenger.guards
         },
     }
     better = f"{found.improvement_percent:.1f} % better ({found.low_percent:.1f} to {found.high_percent:.1f} %, {_chance(found)}) on {found.cases} cases of {found.blocks} blocks"
-    return Decision(KEPT, against, figures) if against else Decision(PROMOTED, [better, "no guard is worse"], figures)
+    return (
+        Decision(KEPT, against, figures)
+        if against
+        else Decision(PROMOTED, [better, "no guard is worse"], figures)
+    )
 
 
 def _chance(found) -> str:
@@ -74,14 +106,21 @@ def _chance(found) -> str:
 
 def _against(found, rule: Rule) -> list[str]:
     if found.blocks < blocks_needed(rule.level):
-        return [f"{found.blocks} blocks cannot tell at level {rule.level:g}; at least {blocks_needed(rule.level)} are needed"]
+        return [
+            f"{found.blocks} blocks cannot tell at level {rule.level:g}; "
+            f"at least {blocks_needed(rule.level)} are needed"
+        ]
     told = f"{found.improvement_percent:.1f} % ({found.low_percent:.1f} to {found.high_percent:.1f} %, {_chance(found)})"
     if found.improvement_percent <= 0:
         return [
-            f"the challenger is no better: its cases cost {-found.improvement_percent:.1f} % more ({-found.high_percent:.1f} to {-found.low_percent:.1f} %)"
+            f"the challenger is no better: its cases cost {-found.improvement_percent:.1f} % more "
+            f"({-found.high_percent:.1f} to {-found.low_percent:.1f} %)"
         ]
     if found.improvement_percent < rule.least_improvement_percent:
-        return [f"the challenger is better by {told}; at least {rule.least_improvement_percent:g} % is worth a change"]
+        return [
+            f"the challenger is better by {told}; at least {rule.least_improvement_percent:g} "
+            "% is worth a change"
+        ]
     if found.p > rule.level:
         return [f"the challenger is better by {told}, within noise at level {rule.level:g}"]
     return []
@@ -93,5 +132,8 @@ def _guards(champion: Evidence, challenger: Evidence, allowed: Mapping[str, floa
         now = challenger.guards.get(name, np.inf)
         # figures that differ by rounding are equal
         if not now <= before + allowed.get(name, 0.0) + 1e-9 * abs(before):
-            sentences.append(f"guard {name} is {now:.4g} against {before:.4g}; at most {allowed.get(name, 0.0):.3g} more is allowed")
+            sentences.append(
+                f"guard {name} is {now:.4g} against {before:.4g}; "
+                f"at most {allowed.get(name, 0.0):.3g} more is allowed"
+            )
     return sentences

@@ -1,4 +1,5 @@
-"""What a night depends on, as one digest, so that a night with nothing new ends in seconds; which recordings are new, and where those go that cannot be learned from."""
+"""What a night depends on, as one digest, so that a night with nothing new ends in seconds; which recordings
+are new, and where those go that cannot be learned from."""
 
 import hashlib
 import itertools
@@ -14,13 +15,26 @@ QUARANTINE = Path("datasets/quarantine")
 
 
 def sources() -> list[str]:
-    """Files and folders that dvc.yaml's stages read and none of them writes; the files of parameters and dvc.yaml with them."""
+    """Files and folders that dvc.yaml's stages read and none of them writes;
+    the files of parameters and dvc.yaml with them."""
     stages = yaml.safe_load(Path("dvc.yaml").read_text(encoding="utf-8")).get("stages", {})
     made = {
-        name for stage in stages.values() for kind in ("outs", "metrics", "plots") for out in stage.get(kind, []) for name in _names(out)
+        name
+        for stage in stages.values()
+        for kind in ("outs", "metrics", "plots")
+        for out in stage.get(kind, [])
+        for name in _names(out)
     }
-    read = {dep for stage in stages.values() for dep in stage.get("deps", [])} | {params.FILE, params.EXPERT, "dvc.yaml"}
-    return sorted(dep for dep in read if not any(f"{dep}/".startswith(f"{out}/") for out in made) and dep != "reports/accepted.json")
+    read = {dep for stage in stages.values() for dep in stage.get("deps", [])} | {
+        params.FILE,
+        params.EXPERT,
+        "dvc.yaml",
+    }
+    return sorted(
+        dep
+        for dep in read
+        if not any(f"{dep}/".startswith(f"{out}/") for out in made) and dep != "reports/accepted.json"
+    )
 
 
 def _names(out: str | Mapping) -> list[str]:
@@ -28,7 +42,8 @@ def _names(out: str | Mapping) -> list[str]:
 
 
 class Hashes:
-    """SHA-256 by path, remembered with size and time of change, so that a gigabyte that did not change is not read every night."""
+    """SHA-256 by path, remembered with size and time of change, so that a
+    gigabyte that did not change is not read every night."""
 
     def __init__(self, remembered: Mapping[str, list]):
         self.remembered = dict(remembered)
@@ -48,7 +63,8 @@ class Hashes:
         kept = [
             file
             for file in files
-            if not any(part.startswith(".") or part == "__pycache__" for part in file.parts) and file.suffix != ".pyc"
+            if not any(part.startswith(".") or part == "__pycache__" for part in file.parts)
+            and file.suffix != ".pyc"
         ]
         return {file.as_posix(): self.of(file) for file in kept}
 
@@ -67,13 +83,19 @@ def digest(found: Mapping[str, str]) -> str:
 
 
 def recordings(found: Mapping[str, str], folder: str) -> dict[str, str]:
-    """{path: digest} of the recordings below a loop's folder, of all that was found; notes and files of dvc are none."""
+    """{path: digest} of the recordings below a loop's folder, of all
+    that was found; notes and files of dvc are none."""
     notes = (".md", ".txt", ".yaml", ".dvc")
-    return {name: content for name, content in found.items() if folder and name.startswith(f"{folder}/") and not name.lower().endswith(notes)}
+    return {
+        name: content
+        for name, content in found.items()
+        if folder and name.startswith(f"{folder}/") and not name.lower().endswith(notes)
+    }
 
 
 def aside(path: str, loop: str, reason: str) -> str:
-    """Moves the recording, unchanged, to datasets/quarantine, where no stage looks and git does not either, its reason beside it; nothing there is overwritten. The reason."""
+    """Moves the recording, unchanged, to datasets/quarantine, where no stage looks and git does not either,
+    its reason beside it; nothing there is overwritten. The reason."""
     name, folder = Path(path), QUARANTINE / loop
     folder.mkdir(parents=True, exist_ok=True)
     if not (QUARANTINE / ".gitignore").exists():

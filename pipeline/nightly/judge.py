@@ -1,4 +1,5 @@
-"""A controller's files -> evidence: the temperature loop on a frozen panel of plants that nothing was learned from; any loop from a file of costs by case."""
+"""A controller's files -> evidence: the temperature loop on a frozen panel of plants that nothing was learned
+from; any loop from a file of costs by case."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +20,8 @@ MEMO = Path(".beadline/panel")
 
 
 class Judge(NamedTuple):
-    """`measure(folder)`: the evidence on a controller whose files lie below it (datasets, or champion/<loop>); `allowed(champion)`: how much worse each guard may be."""
+    """`measure(folder)`: the evidence on a controller whose files lie below it (datasets, or
+    champion/<loop>); `allowed(champion)`: how much worse each guard may be."""
 
     measure: Callable[[Path], Evidence]
     allowed: Callable[[Evidence], dict[str, float]]
@@ -32,27 +34,35 @@ def judge(loop: Loop, settings: Nightly) -> Judge:
     percent = settings.rule.worst_case_percent / 100
     if loop.judge in ("deposition", "setpoint"):
         measure = {"deposition": _deposition, "setpoint": _setpoint}[loop.judge]
-        return Judge(measure, lambda champion: {name: percent * value for name, value in champion.guards.items()})
+        return Judge(
+            measure, lambda champion: {name: percent * value for name, value in champion.guards.items()}
+        )
     return Judge(_temperature(settings), lambda champion: _allowed(champion, settings.rule))
 
 
 def _cases(path: Path) -> tuple[Evidence, dict[str, float]]:
-    """{"panel": name, "cases": {case: {"block": name, "cost": number}}, "guards": {guard: {"value": number, "allowed": number}}}."""
+    """{"panel": name, "cases": {case: {"block": name, "cost": number}}, "guards":
+    {guard: {"value": number, "allowed": number}}}."""
     found = artifacts.read_json(path)
     try:
         cases = {
-            name: (str(case["block"]), float(case["cost"]) if case["cost"] is not None else np.inf) for name, case in found["cases"].items()
+            name: (str(case["block"]), float(case["cost"]) if case["cost"] is not None else np.inf)
+            for name, case in found["cases"].items()
         }
         guards = {name: float(guard["value"]) for name, guard in found["guards"].items()}
-        return Evidence(str(found["panel"]), cases, guards), {name: float(guard["allowed"]) for name, guard in found["guards"].items()}
+        return Evidence(str(found["panel"]), cases, guards), {
+            name: float(guard["allowed"]) for name, guard in found["guards"].items()
+        }
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError(
-            f"{path}: expected panel, cases with block and cost, and guards with value and allowed, found no {error}; let its stage write them"
+            f"{path}: expected panel, cases with block and cost, and guards with value and allowed, "
+            f"found no {error}; let its stage write them"
         ) from None
 
 
 def _deposition(folder: Path) -> Evidence:
-    """Of each part program and material, none of which was trained on: the error of the flow that the chosen composer leaves, as its stage scored it. Guard: the worst line."""
+    """Of each part program and material, none of which was trained on: the error of the flow that the chosen
+    composer leaves, as its stage scored it. Guard: the worst line."""
     table = artifacts.read_table(folder / "compose_parts/scores.parquet", SCORES)
     rows = [k for k, chosen in enumerate(table["chosen"]) if chosen]
     cases = {
@@ -67,13 +77,17 @@ def _deposition(folder: Path) -> Evidence:
 
 
 def _setpoint(folder: Path) -> Evidence:
-    """Of each case of each simulator that counts: the share of runs that the chosen controller does not settle, plus one point. Guards: the worst case, and the slowest."""
+    """Of each case of each simulator that counts: the share of runs that the chosen controller does not
+    settle, plus one point. Guards: the worst case, and the slowest."""
     table, chosen = (
         artifacts.read_table(folder / "evaluate_setpoint/scoreboard.parquet", tables.SCOREBOARD),
         artifacts.read_json(folder / "evaluate_setpoint/choice.json"),
     )
     rows = [k for k, name in enumerate(table["controller"]) if name == chosen["name"] and table["counts"][k]]
-    lost = {f"{table['simulator'][k]}: {table['case'][k]}": 101.0 - float(table["settled_percent"][k]) for k in rows}
+    lost = {
+        f"{table['simulator'][k]}: {table['case'][k]}": 101.0 - float(table["settled_percent"][k])
+        for k in rows
+    }
     slow = np.nanmax([table["p90_steps"][k] for k in rows], initial=0.0)
     return Evidence(
         joblib.hash(sorted(lost)),
@@ -87,13 +101,16 @@ def _setpoint(folder: Path) -> Evidence:
 
 def _allowed(champion: Evidence, rule: Rule) -> dict[str, float]:
     return {
-        "worst_case": champion.guards["worst_case"] * rule.worst_case_percent / 100, "settled_error_degC": rule.settled_error_degC,
-        "holdout_error_degC": champion.guards.get("holdout_error_degC", 0.0) * rule.holdout_error_percent / 100,
+        "worst_case": champion.guards["worst_case"] * rule.worst_case_percent / 100,
+        "settled_error_degC": rule.settled_error_degC,
+        "holdout_error_degC": champion.guards.get("holdout_error_degC",
+        0.0) * rule.holdout_error_percent / 100,
     }  # fmt: skip
 
 
 def _temperature(settings: Nightly) -> Callable[[Path], Evidence]:
-    """Closed loop on every plant of the frozen panel, from starts and to references of section `nightly.holdout`, with its seeds; prediction on the hold-out recordings."""
+    """Closed loop on every plant of the frozen panel, from starts and to references of section
+    `nightly.holdout`, with its seeds; prediction on the hold-out recordings."""
     from pipeline.temperature import judging, plant, scorecard
 
     h, machine, tracking, panel = (
@@ -103,18 +120,25 @@ def _temperature(settings: Nightly) -> Callable[[Path], Evidence]:
         params.load(Panel, "panel"),
     )
     weights = params.read()["tune_weights"]
-    allowance = scorecard.Allowance(*(float(weights[f"allow_{name}"]) for name in scorecard.Allowance._fields[:-1]), 0.0)
+    allowance = scorecard.Allowance(
+        *(float(weights[f"allow_{name}"]) for name in scorecard.Allowance._fields[:-1]), 0.0
+    )
     simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
     records = [] if simulated else _holdout_records(h, machine)
     if simulated:
-        plants = plant.spread(plant.baam()._replace(sample_time_s=machine.sample_time_s), input_gain=panel.input_gain, loss=panel.loss)
+        plants = plant.spread(
+            plant.baam()._replace(sample_time_s=machine.sample_time_s),
+            input_gain=panel.input_gain,
+            loss=panel.loss,
+        )
         # between the declared plants: the panel that the stages judge on has the ends
         plants = plant.spread(plants[0], input_gain=0.6 * panel.input_gain, loss=0.6 * panel.loss)
     else:
         plants = _panel_plants(records, machine)
     reference = np.array([output.reference for output in machine.outputs])
     scenarios = scorecard.panel(
-        plants, starts=h.starts_degC, references=[reference + offset for offset in h.reference_offsets_degC], noise=[h.noise_degC], seeds=h.seeds,
+        plants, starts=h.starts_degC, references=[reference + offset for offset in h.reference_offsets_degC],
+        noise=[h.noise_degC], seeds=h.seeds,
         steps=h.steps, hold=panel.hold_steps, cells=simulated,
     )  # fmt: skip
     limits = tuple(np.array([(i.low, i.high) for i in machine.inputs]).T)
@@ -134,9 +158,15 @@ def _temperature(settings: Nightly) -> Callable[[Path], Evidence]:
         law = made.design(weight["q"], weight["r"], tracking.integral)
         aims = judging.targets(made.model, scenarios.r, limits)
         run = scorecard.simulate(
-            scenarios, law, scorecard.feed_forward(scenarios, law, aims), limits=limits, integral_band=tracking.integral_limit_degC
+            scenarios,
+            law,
+            scorecard.feed_forward(scenarios, law, aims),
+            limits=limits,
+            integral_band=tracking.integral_limit_degC,
         )
-        found = scorecard.figures(scenarios, run, limits=limits, band=panel.band_degC, sample_time_s=machine.sample_time_s)
+        found = scorecard.figures(
+            scenarios, run, limits=limits, band=panel.band_degC, sample_time_s=machine.sample_time_s
+        )
         margins = scorecard.margins(plants, law, grid=80)
         return _temperature_evidence(
             name,
@@ -153,7 +183,14 @@ def _temperature(settings: Nightly) -> Callable[[Path], Evidence]:
 
 
 def _temperature_evidence(
-    name: str, scenarios, found, margins, allowance, sample_time_s: float, holdout: float | None, least_margin: float
+    name: str,
+    scenarios,
+    found,
+    margins,
+    allowance,
+    sample_time_s: float,
+    holdout: float | None,
+    least_margin: float,
 ) -> Evidence:
     from pipeline.temperature import scorecard
 
@@ -161,17 +198,24 @@ def _temperature_evidence(
     for i in range(len(scenarios.plant)):
         one = type(found)(*(figure[i : i + 1] for figure in found))
         try:
-            costs.append(scorecard.engineering_cost(one, scenarios.plant[i : i + 1], allowance, longest_s=scenarios.steps * sample_time_s))
+            costs.append(
+                scorecard.engineering_cost(
+                    one, scenarios.plant[i : i + 1], allowance, longest_s=scenarios.steps * sample_time_s
+                )
+            )
         except ValueError:
             costs.append(np.inf)
     cases = {
         f"plant {p}, {start:g} °C to {r:g} °C, seed {seed}": (f"plant {p}", float(cost))
-        for p, start, r, seed, cost in zip(scenarios.plant, scenarios.start, scenarios.r[:, 0], scenarios.seed, costs, strict=True)
+        for p, start, r, seed, cost in zip(
+            scenarios.plant, scenarios.start, scenarios.r[:, 0], scenarios.seed, costs, strict=True
+        )
     }
     by_plant = [np.mean(np.array(costs)[scenarios.plant == p]) for p in np.unique(scenarios.plant)]
     guards = {
         "worst_case": float(np.max(by_plant)), "settled_error_degC": float(found.settled_error_degC.max()),
-        "margin_short_of_least": max(least_margin - min(margin.disk for margin in margins), 0.0), "unstable_plants": float(sum(not margin.stable for margin in margins)),
+        "margin_short_of_least": max(least_margin - min(margin.disk for margin in margins), 0.0),
+        "unstable_plants": float(sum(not margin.stable for margin in margins)),
     }  # fmt: skip
     return Evidence(name, cases, guards | ({"holdout_error_degC": holdout} if holdout is not None else {}))
 
@@ -180,7 +224,10 @@ def controller(folder: Path, which: str, gamma: float):
     """The controller whose files lie below `folder`, the model that it predicts with, and its weights."""
     from pipeline.temperature import judging, plant, window
 
-    weights = {name: np.array(value) for name, value in artifacts.read_json(folder / "tune_weights/weights.json")["practical"].items()}
+    weights = {
+        name: np.array(value)
+        for name, value in artifacts.read_json(folder / "tune_weights/weights.json")["practical"].items()
+    }
     model = plant.restored(artifacts.read_arrays(folder / "identify_plant/plant.parquet", "plant", 1))[0]
     if which == "model_based":
         return judging.model_based(model, gamma, tau=float(weights["observer_tau"])), model, weights
@@ -192,7 +239,8 @@ def _holdout_records(h: HoldOut, machine: Plant) -> list[tuple[np.ndarray, np.nd
     """The hold-out recordings as gapless segments. Raises ValueError where there is none that can be read."""
     if not Path(h.recordings).is_dir():
         raise ValueError(
-            f"{h.recordings}: expected recordings that nothing is trained on, found none; put one of the machine as commissioned there"
+            f"{h.recordings}: expected recordings that nothing is trained on, found none; "
+            "put one of the machine as commissioned there"
         )
     segments = record_segments(Path(h.recordings), machine)
     return [pair for pairs in segments.values() for pair in pairs]
@@ -201,11 +249,17 @@ def _holdout_records(h: HoldOut, machine: Plant) -> list[tuple[np.ndarray, np.nd
 def record_segments(
     folder: Path, machine: Plant, *, broken: dict[str, str] | None = None
 ) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
-    """{recording: [(u, y), ...]} below a folder, read as the stage `ingest` reads, through its memo; reasons of those that cannot be read go to `broken`."""
+    """{recording: [(u, y), ...]} below a folder, read as the stage `ingest` reads, through its memo; reasons
+    of those that cannot be read go to `broken`."""
     declared: dict[str, Any] = params.read()["ingest"]
-    mapping = {name: (m["source"], m["unit"], float(m["scale"]), float(m["offset"])) for name, m in declared["mapping"].items()}
+    mapping = {
+        name: (m["source"], m["unit"], float(m["scale"]), float(m["offset"]))
+        for name, m in declared["mapping"].items()
+    }
     job = ingest.Job(machine, mapping, declared["time"], float(declared["max_gap_s"]))
-    results = ingest.process(folder, job, params.load(params.Execution, "execution"), memo=Path("datasets/memo/ingest"))
+    results = ingest.process(
+        folder, job, params.load(params.Execution, "execution"), memo=Path("datasets/memo/ingest")
+    )
     found = {}
     for result in results:
         if result.reason:
@@ -219,7 +273,9 @@ def record_segments(
 
 def _segments(record: dict[str, np.ndarray], machine: Plant) -> list[tuple[np.ndarray, np.ndarray]]:
     u, y = (
-        np.stack([np.where(record[f"{s.name}_masked"], np.nan, record[s.name]) for s in signals], axis=1).astype(float)
+        np.stack(
+            [np.where(record[f"{s.name}_masked"], np.nan, record[s.name]) for s in signals], axis=1
+        ).astype(float)
         for signals in (machine.inputs, machine.outputs)
     )
     cuts = np.flatnonzero(np.diff(record["segment"])) + 1
@@ -232,7 +288,8 @@ def _segments(record: dict[str, np.ndarray], machine: Plant) -> list[tuple[np.nd
 
 
 def _panel_plants(records: list[tuple[np.ndarray, np.ndarray]], machine: Plant):
-    """The plants of the hold-out recordings: identified from them alone, and a bootstrap family around; kept, since neither recordings nor method change from night to night."""
+    """The plants of the hold-out recordings: identified from them alone, and a bootstrap family around; kept,
+    since neither recordings nor method change from night to night."""
     from pipeline.temperature import identification, plant, validation
 
     p = params.read()["identify_plant"]
@@ -242,11 +299,22 @@ def _panel_plants(records: list[tuple[np.ndarray, np.ndarray]], machine: Plant):
         return plant.restored(artifacts.read_arrays(path, "holdout_plants", 1))
     u, y = [a for a, _ in records], [b for _, b in records]
     names = [i.name for i in machine.inputs]
-    u, _ = identification.within_limits(u, tuple(zip(*((i.low, i.high) for i in machine.inputs), strict=True)), names=names)
-    found = identification.identify(
-        u, y, sample_time_s=machine.sample_time_s, order=None, offset=p["offset"], refinement="none", max_order=p["max_order"], names=names
+    u, _ = identification.within_limits(
+        u, tuple(zip(*((i.low, i.high) for i in machine.inputs), strict=True)), names=names
     )
-    family = validation.bootstrap_spread(u, y, found, count=p["spread_plants"], order=found.order, rng=np.random.default_rng(p["seed"]))
+    found = identification.identify(
+        u,
+        y,
+        sample_time_s=machine.sample_time_s,
+        order=None,
+        offset=p["offset"],
+        refinement="none",
+        max_order=p["max_order"],
+        names=names,
+    )
+    family = validation.bootstrap_spread(
+        u, y, found, count=p["spread_plants"], order=found.order, rng=np.random.default_rng(p["seed"])
+    )
     artifacts.write_arrays(path, "holdout_plants", 1, plant.stored([found.plant, *family]))
     return plant.restored(artifacts.read_arrays(path, "holdout_plants", 1))
 

@@ -1,4 +1,5 @@
-"""Two branches whose nights went on apart become one: recordings of both, champions and locks of ours; the night that follows judges what both together teach."""
+"""Two branches whose nights went on apart become one: recordings of both, champions and locks of ours; the
+night that follows judges what both together teach."""
 
 import json
 
@@ -11,11 +12,13 @@ OURS = ("dvc.lock", "reports/metrics", "champion.json", "champion")
 
 
 def merge(branch: str) -> str:
-    """Merges `branch`; where both sides' nights wrote, ours stays and the history of both is kept. Raises ValueError where people's own files conflict, and gives the merge up."""
+    """Merges `branch`; where both sides' nights wrote, ours stays and the history of both is kept. Raises
+    ValueError where people's own files conflict, and gives the merge up."""
     with guarding.alone():
         if git("status", "--porcelain", "--untracked-files=no"):
             raise ValueError(
-                "expected everything committed before a merge, found changes; commit or stash them (git status), and run it again"
+                "expected everything committed before a merge, found changes; "
+                "commit or stash them (git status), and run it again"
             )
         if not git("rev-parse", "--verify", "-q", branch, check=False):
             raise ValueError(f"{branch} is no branch of this repository; git branch -a lists them")
@@ -29,14 +32,19 @@ def merge(branch: str) -> str:
         if conflicts:
             git("merge", "--abort")
             raise ValueError(
-                f"{branch} and this branch both changed {', '.join(conflicts)}; merge them by hand (git merge {branch}), then run ./run beadline nightly"
+                f"{branch} and this branch both changed {', '.join(conflicts)}; "
+                f"merge them by hand (git merge {branch}), then run ./run beadline nightly"
             )
         seen = {_key(line) for line in mine["history"]}
         both = [*mine["history"], *(line for line in theirs["history"] if _key(line) not in seen)]
         # a loop that has no champion here keeps theirs
         artifacts.write_json(
             champion.FILE,
-            {**mine, "champions": {**theirs["champions"], **mine["champions"]}, "history": sorted(both, key=lambda line: line["when"])},
+            {
+                **mine,
+                "champions": {**theirs["champions"], **mine["champions"]},
+                "history": sorted(both, key=lambda line: line["when"]),
+            },
         )
         git("add", "--", str(champion.FILE))
         git("commit", "-q", "--no-edit", env=identity())

@@ -1,6 +1,7 @@
 """One night: recordings in, `dvc repro`, judge, promote or keep, say so.
 
-Exit status 0: promoted, kept, or nothing new; 1: the night failed; 3: drift alarm; 4: recordings were set aside; 75: another night is at work."""
+Exit status 0: promoted, kept, or nothing new; 1: the night failed; 3: drift alarm; 4: recordings were set
+aside; 75: another night is at work."""
 
 import datetime
 import time
@@ -24,7 +25,8 @@ LONGEST_HISTORY = 1000
 
 
 def nightly(now: datetime.datetime | None = None) -> tuple[int, str]:
-    """Exit status and the one-line summary of a night. Raises ValueError where the parameters do not say what to do."""
+    """Exit status and the one-line summary of a night. Raises
+    ValueError where the parameters do not say what to do."""
     settings = params.load(Nightly, "nightly")
     started = now or datetime.datetime.now(datetime.UTC)
     try:
@@ -45,7 +47,9 @@ def _night(settings: Nightly, now: datetime.datetime, left: list[str]) -> tuple[
     }
     success = remembered.get("success")
     if success and now < datetime.datetime.fromisoformat(success):
-        entry["notes"].append(f"the clock was set back: it is {entry['when']}, and the last success was at {success}")
+        entry["notes"].append(
+            f"the clock was set back: it is {entry['when']}, and the last success was at {success}"
+        )
     overdue = watch.overdue(now, settings.watch_h) if success else ""
     hashes, known = inputs.Hashes(remembered.get("hashes", {})), None
     try:
@@ -59,15 +63,33 @@ def _night(settings: Nightly, now: datetime.datetime, left: list[str]) -> tuple[
     return _say(settings, entry, remembered, hashes, known)
 
 
-def _work(settings: Nightly, entry: dict[str, Any], remembered: dict[str, Any], hashes: inputs.Hashes, *, again: bool = True) -> dict[str, str]:
-    """The night itself; what it did goes to `entry`. What it was made from, {path: digest}: where that changes from the first look on, the night begins once again."""
-    places = [*inputs.sources(), settings.holdout.recordings, *(loop.recordings for loop in settings.loops.values() if loop.recordings)]
+def _work(
+    settings: Nightly,
+    entry: dict[str, Any],
+    remembered: dict[str, Any],
+    hashes: inputs.Hashes,
+    *,
+    again: bool = True,
+) -> dict[str, str]:
+    """The night itself; what it did goes to `entry`. What it was made from, {path: digest}: where that
+    changes from the first look on, the night begins once again."""
+    places = [
+        *inputs.sources(),
+        settings.holdout.recordings,
+        *(loop.recordings for loop in settings.loops.values() if loop.recordings),
+    ]
     before = inputs.contents(hashes, places)
     if inputs.digest(before) == remembered.get("inputs") and not remembered.get("unpushed"):
         nothing = "no recording, parameter or code has changed since the last night"
-        entry |= {"outcome": "quarantined" if entry.get("quarantined") else "nothing new", "reasons": [nothing]}
+        entry |= {
+            "outcome": "quarantined" if entry.get("quarantined") else "nothing new",
+            "reasons": [nothing],
+        }
         return before
-    new = {name: _new(before, loop.recordings, remembered.get("recordings", {}).get(name, {})) for name, loop in settings.loops.items()}
+    new = {
+        name: _new(before, loop.recordings, remembered.get("recordings", {}).get(name, {}))
+        for name, loop in settings.loops.items()
+    }
     entry["new_recordings"] = {name: sorted(found) for name, found in new.items() if found}
     from pipeline.nightly import screening
 
@@ -81,17 +103,24 @@ def _work(settings: Nightly, entry: dict[str, Any], remembered: dict[str, Any], 
     guarding.remember_before()
     try:
         _reproduce(settings, entry)
-        # what came or changed meanwhile may be in some stages and not in others, and nobody has looked whether it is fit to learn from
+        # what came or changed meanwhile may be in some stages and not in others, and
+        # nobody has looked whether it is fit to learn from
         moved = sorted({name for name, _ in before.items() ^ inputs.contents(hashes, places).items()})
         if moved and (not again or any(name.endswith(".py") for name in moved)):
-            raise ValueError(f"{moved[0]} changed{'' if again else ' again'} while the stages ran; start the night when nothing is recorded or edited")
+            raise ValueError(
+                f"{moved[0]} changed{'' if again else ' again'} while the stages ran; "
+                "start the night when nothing is recorded or edited"
+            )
         if not moved:
             state = _judge(settings, entry, state, before)
     except (ValueError, OSError, np.linalg.LinAlgError):
         entry["notes"] += guarding.back_to_before() + champion.as_committed()
         raise
     if moved:
-        entry["notes"] += [*guarding.back_to_before(), f"{', '.join(moved[:3])} changed while the stages ran: the night began once again"]
+        entry["notes"] += [
+            *guarding.back_to_before(),
+            f"{', '.join(moved[:3])} changed while the stages ran: the night began once again",
+        ]
         for key in ("drift", "new_recordings"):
             entry.pop(key)
         return _work(params.load(Nightly, "nightly"), entry, remembered, hashes, again=False)
@@ -100,7 +129,11 @@ def _work(settings: Nightly, entry: dict[str, Any], remembered: dict[str, Any], 
 
 
 def _new(found: dict[str, str], folder: str, known: dict[str, str]) -> dict[str, str]:
-    return {name: content for name, content in inputs.recordings(found, folder).items() if content not in known.values()}
+    return {
+        name: content
+        for name, content in inputs.recordings(found, folder).items()
+        if content not in known.values()
+    }
 
 
 def _reproduce(settings: Nightly, entry: dict[str, Any]) -> None:
@@ -114,8 +147,11 @@ def _reproduce(settings: Nightly, entry: dict[str, Any]) -> None:
         old.unlink()
 
 
-def _judge(settings: Nightly, entry: dict[str, Any], state: dict[str, Any], made_from: dict[str, str]) -> dict[str, Any]:
-    """Each loop's challenger against its champion; champion.json with those that are promoted, whose files lie in champion/<loop> by then."""
+def _judge(
+    settings: Nightly, entry: dict[str, Any], state: dict[str, Any], made_from: dict[str, str]
+) -> dict[str, Any]:
+    """Each loop's challenger against its champion; champion.json with those that are
+    promoted, whose files lie in champion/<loop> by then."""
     from pipeline.nightly import screening
 
     decisions: dict[str, Any] = {}
@@ -146,7 +182,9 @@ def _judge(settings: Nightly, entry: dict[str, Any], state: dict[str, Any], made
     return state
 
 
-def _decide(settings: Nightly, name: str, state: dict[str, Any], entry: dict[str, Any]) -> tuple["Decision", dict[str, Any]]:
+def _decide(
+    settings: Nightly, name: str, state: dict[str, Any], entry: dict[str, Any]
+) -> tuple["Decision", dict[str, Any]]:
     from pipeline.nightly import judge
     from pipeline.nightly.decision import KEPT, Decision, decide
 
@@ -168,18 +206,29 @@ def _decide(settings: Nightly, name: str, state: dict[str, Any], entry: dict[str
         "mean_cost": float(np.mean([cost for _, cost in challenger.cases.values()])),
         "guards": challenger.guards,
     }
-    return decide(before, challenger, settings.rule, allowed=allowed, alarms=alarms, seed=entry["night"]), figures
+    return decide(
+        before, challenger, settings.rule, allowed=allowed, alarms=alarms, seed=entry["night"]
+    ), figures
 
 
 def _lineage(settings: Nightly, made_from: dict[str, str]) -> dict[str, Any]:
-    """What the challengers were made from: the commit, what lay uncommitted on it, dvc.lock, parameters and recordings."""
+    """What the challengers were made from: the commit, what lay
+    uncommitted on it, dvc.lock, parameters and recordings."""
     uncommitted = [line[3:] for line in git("status", "--porcelain", "--untracked-files=no").splitlines()]
     return {
         "commit": git("rev-parse", "HEAD"),
-        "uncommitted": [path for path in uncommitted if path != "dvc.lock" and not path.startswith(("reports/", "champion"))],
+        "uncommitted": [
+            path
+            for path in uncommitted
+            if path != "dvc.lock" and not path.startswith(("reports/", "champion"))
+        ],
         "dvc_lock": artifacts.sha256("dvc.lock"),
-        "params": {name: artifacts.sha256(name) for name in (params.FILE, params.EXPERT) if artifacts.exists(name)},
-        "recordings": {name: inputs.recordings(made_from, loop.recordings) for name, loop in settings.loops.items()},
+        "params": {
+            name: artifacts.sha256(name) for name in (params.FILE, params.EXPERT) if artifacts.exists(name)
+        },
+        "recordings": {
+            name: inputs.recordings(made_from, loop.recordings) for name, loop in settings.loops.items()
+        },
     }
 
 
@@ -199,18 +248,29 @@ def _keep(settings: Nightly, entry: dict[str, Any], state: dict[str, Any]) -> No
     ]
     told = f"promoted {', '.join(entry['promoted'])}" if entry["promoted"] else "kept the champions"
     changed = (
-        bool(git("status", "--porcelain", "--", *(path for path in tracked if path != str(METRICS) and Path(path).exists())))
+        bool(
+            git(
+                "status",
+                "--porcelain",
+                "--",
+                *(path for path in tracked if path != str(METRICS) and Path(path).exists()),
+            )
+        )
         or entry["promoted"]
     )
     if changed and (on_branch or settings.promotion == "at_once"):
         _metrics(entry, state)
-        entry["commit"] = commit(tracked, f"nightly {entry['run']}: {told}\n\n" + "\n".join(entry["reasons"]), branch=on_branch)
+        entry["commit"] = commit(
+            tracked, f"nightly {entry['run']}: {told}\n\n" + "\n".join(entry["reasons"]), branch=on_branch
+        )
     if settings.remote:
         try:
             dvc("push", "--quiet", "--remote", settings.remote)
         except ValueError as error:
             entry["unpushed"] = True
-            entry["notes"].append(f"the artifacts are not on remote {settings.remote}: {error}; the next night tries again")
+            entry["notes"].append(
+                f"the artifacts are not on remote {settings.remote}: {error}; the next night tries again"
+            )
     if on_branch:
         entry["notes"].append(f"the promotion waits on branch {on_branch}: git merge {on_branch}")
         champion.as_committed()
@@ -218,8 +278,14 @@ def _keep(settings: Nightly, entry: dict[str, Any], state: dict[str, Any]) -> No
 
 def _metrics(entry: dict[str, Any], state: dict[str, Any]) -> None:
     """reports/metrics/nightly.json."""
-    production = {name: {key: found[key] for key in ("run", "when", "why")} for name, found in state["champions"].items()}
-    kept = {key: entry.get(key) for key in ("night", "run", "when", "seconds", "notes", "new_recordings", "quarantined")}
+    production = {
+        name: {key: found[key] for key in ("run", "when", "why")}
+        for name, found in state["champions"].items()
+    }
+    kept = {
+        key: entry.get(key)
+        for key in ("night", "run", "when", "seconds", "notes", "new_recordings", "quarantined")
+    }
     artifacts.write_json(
         METRICS,
         {
@@ -233,7 +299,13 @@ def _metrics(entry: dict[str, Any], state: dict[str, Any]) -> None:
     )
 
 
-def _say(settings: Nightly, entry: dict[str, Any], remembered: dict[str, Any], hashes: inputs.Hashes, known: dict[str, str] | None) -> tuple[int, str]:
+def _say(
+    settings: Nightly,
+    entry: dict[str, Any],
+    remembered: dict[str, Any],
+    hashes: inputs.Hashes,
+    known: dict[str, str] | None,
+) -> tuple[int, str]:
     """State, page, alarm; the exit status and the summary. On a disk without room the summary still comes."""
     alarms = [alarm["cause"] for alarm in entry.get("drift", {}).get("alarms", [])]
     status = _status(entry)
@@ -273,7 +345,13 @@ def _status(entry: dict[str, Any]) -> int:
     return QUARANTINED if entry.get("quarantined") else OK
 
 
-def _remember(settings: Nightly, entry: dict[str, Any], remembered: dict[str, Any], hashes: inputs.Hashes, known: dict[str, str] | None) -> None:
+def _remember(
+    settings: Nightly,
+    entry: dict[str, Any],
+    remembered: dict[str, Any],
+    hashes: inputs.Hashes,
+    known: dict[str, str] | None,
+) -> None:
     good = entry["outcome"] != "failed"
     if good and entry["outcome"] != "nothing new" and not entry.get("commit"):
         _metrics(entry, champion.read())
@@ -284,10 +362,16 @@ def _remember(settings: Nightly, entry: dict[str, Any], remembered: dict[str, An
         {
             "night": entry["night"],
             # a clock that was set back must not make the last success look older than it is
-            "success": max(entry["when"], remembered.get("success") or "") if good else remembered.get("success"),
+            "success": max(entry["when"], remembered.get("success") or "")
+            if good
+            else remembered.get("success"),
             "inputs": inputs.digest(known or {}) if good else remembered.get("inputs"),
             "unpushed": bool(entry.get("unpushed")),
-            "recordings": {name: inputs.recordings(known or {}, loop.recordings) for name, loop in settings.loops.items()} if good else remembered.get("recordings", {}),
+            "recordings": {
+                name: inputs.recordings(known or {}, loop.recordings) for name, loop in settings.loops.items()
+            }
+            if good
+            else remembered.get("recordings", {}),
             "drift": memory if good else remembered.get("drift", {}),
             "hashes": hashes.now,
         },
@@ -315,13 +399,16 @@ def _summary(entry: dict[str, Any], alarms: list[str], troubles: list[str]) -> s
 
 
 def watchdog() -> tuple[int, str]:
-    """Whether somebody should look, because no night has succeeded for too long; the alarm goes out with it. Takes no lock: a night that hangs is seen too."""
+    """Whether somebody should look, because no night has succeeded for too long; the alarm goes out with it.
+    Takes no lock: a night that hangs is seen too."""
     settings, now = params.load(Nightly, "nightly"), datetime.datetime.now(datetime.UTC)
     late = watch.overdue(now, settings.watch_h)
     if not late:
         return OK, f"nightly: watch: the last success was at {watch.last()['success']}"
     STATE.mkdir(exist_ok=True)
-    troubles = watch.wake("watch", [late], {"when": watch.stamp(now)}, command=settings.alarm, webhook=settings.webhook)
+    troubles = watch.wake(
+        "watch", [late], {"when": watch.stamp(now)}, command=settings.alarm, webhook=settings.webhook
+    )
     return FAILED, " | ".join([f"nightly: watch: {late}", *troubles])
 
 
@@ -338,7 +425,10 @@ def rollback(run: str, loop: str) -> str:
         for name, entry in found.items():
             champion.put_back(name, entry)
             state = champion.promoted(
-                state, name, {**entry, "why": f"rolled back to {entry['run']} by hand", "since": when}, event="rolled back"
+                state,
+                name,
+                {**entry, "why": f"rolled back to {entry['run']} by hand", "since": when},
+                event="rolled back",
             )
             state["history"][-1] |= {"when": when, "why": "by hand"}
         artifacts.write_json(champion.FILE, state)

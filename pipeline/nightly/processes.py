@@ -1,4 +1,5 @@
-"""git and dvc as they are, run as children of the night; a commit that never touches what the user has staged."""
+"""git and dvc as they are, run as children of the night; a commit that
+never touches what the user has staged."""
 
 import os
 import shlex
@@ -14,29 +15,46 @@ FALLBACK = {"GIT_AUTHOR_NAME": "beadline nightly", "GIT_AUTHOR_EMAIL": "nightly@
 
 
 def git(*arguments: str, env: dict[str, str] | None = None, check: bool = True) -> str:
-    """Standard output of `git ...`. Raises ValueError with git's last line where it fails and `check` is on."""
+    """Standard output of `git ...`. Raises ValueError with git's last
+    line where it fails and `check` is on."""
     found = subprocess.run(
-        ["git", *arguments], check=False, capture_output=True, text=True, env=os.environ | (env or {}), stdin=subprocess.DEVNULL
+        ["git", *arguments],
+        check=False,
+        capture_output=True,
+        text=True,
+        env=os.environ | (env or {}),
+        stdin=subprocess.DEVNULL,
     )
     if check and found.returncode:
-        raise ValueError(f"git {arguments[0]} failed: {_last(found.stderr) or f'exit status {found.returncode}'}")
+        raise ValueError(
+            f"git {arguments[0]} failed: {_last(found.stderr) or f'exit status {found.returncode}'}"
+        )
     return found.stdout.strip() if found.returncode == 0 else ""
 
 
 def dvc(*arguments: str, log: Path | None = None, limit_s: float = 3600) -> str:
-    """What `dvc ...` printed. Raises ValueError with its own sentence where it fails or takes longer than `limit_s`; its whole process group ends with it."""
+    """What `dvc ...` printed. Raises ValueError with its own sentence where it fails or takes longer than
+    `limit_s`; its whole process group ends with it."""
     command = [sys.executable, "-m", "dvc", *arguments]
     target = log or STATE / "dvc.log"
     target.parent.mkdir(parents=True, exist_ok=True)
     descriptor = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     try:
-        child = subprocess.Popen(command, stdout=descriptor, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, start_new_session=True)
+        child = subprocess.Popen(
+            command,
+            stdout=descriptor,
+            stderr=subprocess.STDOUT,
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,
+        )
     finally:
         os.close(descriptor)
     try:
         status = child.wait(limit_s)
     except subprocess.TimeoutExpired:
-        raise ValueError(f"dvc {shlex.join(arguments)} was ended after {limit_s / 3600:.2g} h (nightly.longest_h)") from None
+        raise ValueError(
+            f"dvc {shlex.join(arguments)} was ended after {limit_s / 3600:.2g} h (nightly.longest_h)"
+        ) from None
     finally:
         if child.poll() is None:
             os.killpg(child.pid, signal.SIGKILL)
@@ -48,7 +66,8 @@ def dvc(*arguments: str, log: Path | None = None, limit_s: float = 3600) -> str:
 
 
 def _sentence(text: str) -> str:
-    """Of what dvc and its stages printed: the stage's own sentence where it has one, dvc's last error otherwise."""
+    """Of what dvc and its stages printed: the stage's own sentence
+    where it has one, dvc's last error otherwise."""
     lines = [line.strip() for line in text.replace("\r", "\n").splitlines() if line.strip()]
     stages = [line.split("'")[1] for line in lines if line.startswith("Running stage '")]
     said = [line for line in lines if stages and line.startswith(f"{stages[-1]}: ") and "|" not in line]
@@ -73,9 +92,11 @@ def identity() -> dict[str, str]:
 
 
 def commit(paths: Sequence[str], message: str, *, branch: str = "") -> str:
-    """A commit of these paths as they are on disk, on top of HEAD; moves HEAD, or `branch` where it is named. Its hash, empty where nothing differs.
+    """A commit of these paths as they are on disk, on top of HEAD; moves HEAD, or `branch` where it is named.
+    Its hash, empty where nothing differs.
 
-    Built beside the user's index, so that what is staged stays staged; the last step is one reference that moves whole or not at all.
+    Built beside the user's index, so that what is staged stays staged; the last
+    step is one reference that moves whole or not at all.
     """
     base = git("rev-parse", "HEAD")
     index = Path(git("rev-parse", "--git-dir")) / f"beadline-index.{os.getpid()}"
@@ -83,7 +104,11 @@ def commit(paths: Sequence[str], message: str, *, branch: str = "") -> str:
     try:
         git("read-tree", base, env=env)
         known = set(git("ls-files", "--", *paths).splitlines())
-        there = [path for path in paths if Path(path).exists() or any(name == path or name.startswith(f"{path}/") for name in known)]
+        there = [
+            path
+            for path in paths
+            if Path(path).exists() or any(name == path or name.startswith(f"{path}/") for name in known)
+        ]
         if there:
             git("add", "-A", "--", *there, env=env)
         tree = git("write-tree", env=env)
@@ -101,7 +126,8 @@ def commit(paths: Sequence[str], message: str, *, branch: str = "") -> str:
 
 
 def fresh_index(paths: Sequence[str]) -> None:
-    """The user's index as HEAD has these paths: after a commit beside it, and after a night that was killed between the two."""
+    """The user's index as HEAD has these paths: after a commit beside it,
+    and after a night that was killed between the two."""
     git("reset", "-q", "HEAD", "--", *paths, check=False)
 
 
@@ -113,7 +139,10 @@ def orphans() -> list[int]:
     mine, found = os.getpid(), []
     for entry in Path("/proc").glob("[0-9]*"):
         try:
-            if int(entry.name) != mine and f"{TOKEN}={Path.cwd()}\0".encode() in (entry / "environ").read_bytes():
+            if (
+                int(entry.name) != mine
+                and f"{TOKEN}={Path.cwd()}\0".encode() in (entry / "environ").read_bytes()
+            ):
                 found.append(int(entry.name))
         except OSError:
             continue
@@ -121,7 +150,8 @@ def orphans() -> list[int]:
 
 
 def end_orphans() -> int:
-    """Ends what a killed night left running, for it would write beside this one; call with the lock held. How many there were."""
+    """Ends what a killed night left running, for it would write beside this
+    one; call with the lock held. How many there were."""
     found = [pid for pid in orphans() if pid != os.getppid()]
     for pid in found:
         try:
@@ -132,11 +162,16 @@ def end_orphans() -> int:
 
 
 def stale_git_locks() -> list[Path]:
-    """Lock files of git where no git is at work in this repository: a killed one's, which git itself never removes."""
+    """Lock files of git where no git is at work in this repository: a
+    killed one's, which git itself never removes."""
     if not Path("/proc/self").exists() or any(_works_here(entry) for entry in Path("/proc").glob("[0-9]*")):
         return []
     folder = Path(git("rev-parse", "--git-dir"))
-    return [path for pattern in ("*.lock", "refs/heads/**/*.lock", "beadline-index.*") for path in folder.glob(pattern)]
+    return [
+        path
+        for pattern in ("*.lock", "refs/heads/**/*.lock", "beadline-index.*")
+        for path in folder.glob(pattern)
+    ]
 
 
 def _works_here(entry: Path) -> bool:

@@ -11,8 +11,9 @@ Path = Annotated[str, Field(min_length=1, max_length=300)]
 
 
 class Loop(Section):
-    """One control loop: the files that are its controller, and where the judge finds its evidence: a panel of its own (temperature), what its stage scored on cases
-    that nothing was trained on (deposition, setpoint), or a file of costs by case."""
+    """One control loop: the files that are its controller, and where the judge finds its evidence: a
+    panel of its own (temperature), what its stage scored on cases that nothing was trained on
+    (deposition, setpoint), or a file of costs by case."""
 
     artifacts: list[Path] = Field(min_length=1, max_length=50)
     judge: Literal["temperature", "deposition", "setpoint", "cases"]
@@ -23,10 +24,14 @@ class Loop(Section):
     def _cases_have_a_file(self):
         if (self.judge == "cases") != bool(self.cases):
             raise ValueError(
-                f'has judge {self.judge} but cases "{self.cases}"; name the file of costs where judge is cases, and only there'
+                f'has judge {self.judge} but cases "{self.cases}"; '
+                "name the file of costs where judge is cases, and only there"
             )
         if self.cases and self.cases not in self.artifacts:
-            raise ValueError(f"has cases {self.cases} that are not among its artifacts; add them there, so that the champion keeps its own")
+            raise ValueError(
+                f"has cases {self.cases} that are not among its artifacts; add them there, "
+                "so that the champion keeps its own"
+            )
         return self
 
 
@@ -42,19 +47,23 @@ class Rule(Section):
 
 
 class HoldOut(Section):
-    """The temperature loop's hold-out: which controller, on which scenarios, with seeds that no stage uses; recordings of `recordings` make the plants."""
+    """The temperature loop's hold-out: which controller, on which scenarios, with seeds that no stage uses;
+    recordings of `recordings` make the plants."""
 
     controller: Literal["window", "model_based"]
     recordings: Path
     starts_degC: list[Annotated[float, Field(ge=-273.15, le=1000)]] = Field(min_length=1, max_length=20)
-    reference_offsets_degC: list[Annotated[float, Field(ge=-500, le=500)]] = Field(min_length=1, max_length=20)
+    reference_offsets_degC: list[Annotated[float, Field(ge=-500, le=500)]] = Field(
+        min_length=1, max_length=20
+    )
     noise_degC: float = Field(ge=0, le=50)
     seeds: list[Annotated[int, Field(ge=0, le=2**31)]] = Field(min_length=1, max_length=100)
     steps: int = Field(ge=60, le=20000)
 
 
 class Drift(Section):
-    """Alarm where a figure leaves its band by `alarm_sigmas` at once, or by `watch_sigmas` two nights running; and never for less than what matters."""
+    """Alarm where a figure leaves its band by `alarm_sigmas` at once, or by `watch_sigmas` two nights
+    running; and never for less than what matters."""
 
     alarm_sigmas: float = Field(gt=1, le=100)
     watch_sigmas: float = Field(gt=1, le=100)

@@ -1,4 +1,5 @@
-"""`./run beadline sweep`: DVC experiments over a grid of parameters and seeds, one after the other beside the working tree, with a table and a picture."""
+"""`./run beadline sweep`: DVC experiments over a grid of parameters and seeds, one after the other beside the
+working tree, with a table and a picture."""
 
 import itertools
 import json
@@ -14,7 +15,8 @@ from pipeline.store import artifacts, params
 
 
 def grid(settings: Sequence[str]) -> list[dict[str, str]]:
-    """Every combination of `key=a,b,c` or `file:key=a,b,c`. Raises ValueError where a key stands in no file of parameters or in another, or has no values."""
+    """Every combination of `key=a,b,c` or `file:key=a,b,c`. Raises ValueError where a key stands in no file
+    of parameters or in another, or has no values."""
     axes = {}
     for text in settings:
         key, _, values = text.partition("=")
@@ -22,39 +24,79 @@ def grid(settings: Sequence[str]) -> list[dict[str, str]]:
         home = params.home(dotted)
         if not home or said not in ("", home) or not values:
             raise ValueError(
-                f"sweep: expected KEY=VALUE,VALUE with a key of {' or '.join(params.files())}, found {text}; write for example tune_weights.seed=1,2,3"
+                f"sweep: expected KEY=VALUE,VALUE with a key of {' or '.join(params.files())}, found {text}; "
+                "write for example tune_weights.seed=1,2,3"
             )
         axes[dotted] = values.split(",")
     return [dict(zip(axes, chosen, strict=True)) for chosen in itertools.product(*axes.values())]
 
 
 def sweep(settings: Sequence[str], target: str, metric: str) -> str:
-    """Runs each experiment up to stage `target`, and tells `metric` (STAGE:dotted.key of reports/metrics) of each; reports/sweep.csv and reports/sweep.html hold them all."""
+    """Runs each experiment up to stage `target`, and tells `metric` (STAGE:dotted.key of reports/metrics) of
+    each; reports/sweep.csv and reports/sweep.html hold them all."""
     stage, _, key = metric.partition(":")
     if not key:
-        raise ValueError(f"sweep: expected a metric as STAGE:dotted.key, such as tune_weights:practical.cost, found {metric}")
+        raise ValueError(
+            "sweep: expected a metric as STAGE:dotted.key, such as "
+            f"tune_weights:practical.cost, found {metric}"
+        )
     points, rows = grid(settings), []
     head = git("rev-parse", "HEAD")
     for k, point in enumerate(points, 1):
-        name = "sweep-" + "-".join(f"{part.rsplit('.', 1)[-1]}-{value}" for part, value in point.items()).replace(".", "_").lower()
-        chosen = [word for part, value in point.items() for word in ("--set-param", f"{params.home(part)}:{part}={value}")]
-        print(f"sweep: {k} of {len(points)}: {', '.join(f'{part}={value}' for part, value in point.items())}", flush=True)
-        dvc("exp", "run", "--temp", "--force", "--name", name, *chosen, target, log=STATE / "logs" / f"{name}.log")
-        found: Any = json.loads(git("show", f"refs/exps/{head[:2]}/{head[2:]}/{name}:reports/metrics/{stage}.json"))
+        name = (
+            "sweep-"
+            + "-".join(f"{part.rsplit('.', 1)[-1]}-{value}" for part, value in point.items())
+            .replace(".", "_")
+            .lower()
+        )
+        chosen = [
+            word
+            for part, value in point.items()
+            for word in ("--set-param", f"{params.home(part)}:{part}={value}")
+        ]
+        print(
+            f"sweep: {k} of {len(points)}: {', '.join(f'{part}={value}' for part, value in point.items())}",
+            flush=True,
+        )
+        dvc(
+            "exp",
+            "run",
+            "--temp",
+            "--force",
+            "--name",
+            name,
+            *chosen,
+            target,
+            log=STATE / "logs" / f"{name}.log",
+        )
+        found: Any = json.loads(
+            git("show", f"refs/exps/{head[:2]}/{head[2:]}/{name}:reports/metrics/{stage}.json")
+        )
         for part in key.split("."):
             found = found.get(part) if isinstance(found, dict) else None
         figure = found if isinstance(found, int | float) else None
         if figure is None:
-            raise ValueError(f"sweep: reports/metrics/{stage}.json has no number at {key}; look at the file for its keys")
+            raise ValueError(
+                f"sweep: reports/metrics/{stage}.json has no number at {key}; look at the file for its keys"
+            )
         rows.append({"experiment": name, **point, metric: float(figure)})
     lines = [",".join(rows[0])] + [",".join(str(value) for value in row.values()) for row in rows]
     artifacts.write_text("reports/sweep.csv", "\n".join(lines) + "\n")
     artifacts.write_text(
         "reports/sweep.html",
-        page.render("sweep.html", here="sweep", title="Sweep", rows=rows, metric=metric, picture=_picture(rows, metric)),
+        page.render(
+            "sweep.html",
+            here="sweep",
+            title="Sweep",
+            rows=rows,
+            metric=metric,
+            picture=_picture(rows, metric),
+        ),
     )
     width = [max(len(line.split(",")[k]) for line in lines) for k in range(len(rows[0]))]
-    table = "\n".join("  ".join(cell.ljust(w) for cell, w in zip(line.split(","), width, strict=True)) for line in lines)
+    table = "\n".join(
+        "  ".join(cell.ljust(w) for cell, w in zip(line.split(","), width, strict=True)) for line in lines
+    )
     return f"{table}\nreports/sweep.csv, reports/sweep.html; to take one: dvc exp apply NAME"
 
 
@@ -64,7 +106,14 @@ def _picture(rows: Sequence[dict[str, Any]], metric: str):
     margin = 0.1 * (np.ptp(values) or max(abs(values[0]), 1.0))
     ticks = tuple((float(k), str(k)) for k in range(1, len(rows) + 1, max(1, math.ceil(len(rows) / 12))))
     frame = charts.Frame(
-        charts.Axis(0.5, len(rows) + 0.5, ticks), charts.linear(values.min() - margin, values.max() + margin), 760, 220, 60, 18, 20, 12
+        charts.Axis(0.5, len(rows) + 0.5, ticks),
+        charts.linear(values.min() - margin, values.max() + margin),
+        760,
+        220,
+        60,
+        18,
+        20,
+        12,
     )
     best = int(values.argmin()) + 1
     return charts.panel(

@@ -1,4 +1,5 @@
-"""Who is woken, and when nobody ran: the alarm's JSON file, its command and webhook, and the age of the last success."""
+"""Who is woken, and when nobody ran: the alarm's JSON file, its
+command and webhook, and the age of the last success."""
 
 import datetime
 import json
@@ -26,12 +27,17 @@ def last() -> dict[str, Any]:
     for path in (LAST, Path("reports/metrics/nightly.json")):
         if path.exists():
             found = artifacts.read_json(path)
-            return found if path == LAST else {"night": found["night"], "success": found["when"], "watch_since": found["when"]}
+            return (
+                found
+                if path == LAST
+                else {"night": found["night"], "success": found["when"], "watch_since": found["when"]}
+            )
     return {"night": 0, "success": None}
 
 
 def overdue(now: datetime.datetime, watch_h: float) -> str:
-    """Why somebody should look: the last success is older than `watch_h` hours, or lies in the future; empty where all is well."""
+    """Why somebody should look: the last success is older than `watch_h` hours,
+    or lies in the future; empty where all is well."""
     success = last().get("success")
     if success is None:
         return "no night has ever succeeded; run ./run beadline nightly, and look at its schedule"
@@ -44,7 +50,8 @@ def overdue(now: datetime.datetime, watch_h: float) -> str:
 
 
 def wake(kind: str, reasons: list[str], told: Mapping[str, Any], *, command: str, webhook: str) -> list[str]:
-    """Writes the alarm, runs `command FILE`, posts the file to `webhook`; what went wrong on the way, as sentences, for an alarm that fails must not hide the night."""
+    """Writes the alarm, runs `command FILE`, posts the file to `webhook`; what went wrong on the way, as
+    sentences, for an alarm that fails must not hide the night."""
     alarm = {"schema": "alarm", "version": 1, "kind": kind, "reasons": reasons, **told}
     troubles = []
     text = json.dumps(alarm, indent=2, ensure_ascii=False, default=str)
@@ -64,7 +71,10 @@ def wake(kind: str, reasons: list[str], told: Mapping[str, Any], *, command: str
                 env={**os.environ, "BEADLINE_ALARM": kind},
             )
             if found.returncode:
-                troubles.append(f"nightly.alarm: {command} ended with status {found.returncode}: {found.stderr.strip()[-200:]}")
+                troubles.append(
+                    f"nightly.alarm: {command} ended with status {found.returncode}: "
+                    f"{found.stderr.strip()[-200:]}"
+                )
         except (OSError, ValueError, subprocess.TimeoutExpired) as error:
             troubles.append(f"nightly.alarm: {error}")
     if webhook:

@@ -1,4 +1,5 @@
-"""CSV and its relatives from other people's programs: rows of numbers out of text, and every refusal names the line."""
+"""CSV and its relatives from other people's programs: rows of numbers
+out of text, and every refusal names the line."""
 
 import itertools
 import re
@@ -8,10 +9,29 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.reading.csv_layout import csv_layout
-from pipeline.reading.formats import Column, Columns, Growing, column_place, date_column, every, forward, seconds, time_column
+from pipeline.reading.formats import (
+    Column,
+    Columns,
+    Growing,
+    column_place,
+    date_column,
+    every,
+    forward,
+    seconds,
+    time_column,
+)
 from pipeline.reading.instants import instants, is_compact, month_first, over_midnight
 from pipeline.reading.signals import Note
-from pipeline.store.csv_rows import LONGEST_TAIL, MISSING, SWITCH, CsvLayout, floats, is_number, rows, sound_rows
+from pipeline.store.csv_rows import (
+    LONGEST_TAIL,
+    MISSING,
+    SWITCH,
+    CsvLayout,
+    floats,
+    is_number,
+    rows,
+    sound_rows,
+)
 
 FIELDS_AT_ONCE = 20_000
 
@@ -22,11 +42,21 @@ def csv_columns(path: Path) -> list[Column]:
     shown = list(itertools.islice(rows(path, layout), 200))
     columns = []
     for i, (name, unit) in enumerate(zip(layout.names, layout.units, strict=True)):
-        fields = [row[i].strip() for _, row in shown if i < len(row) and row[i].strip().casefold() not in MISSING]
-        words = [field for field in fields if not (is_number(field, layout.decimal) or field.casefold() in {"inf", "-inf", *SWITCH})]
+        fields = [
+            row[i].strip() for _, row in shown if i < len(row) and row[i].strip().casefold() not in MISSING
+        ]
+        words = [
+            field
+            for field in fields
+            if not (is_number(field, layout.decimal) or field.casefold() in {"inf", "-inf", *SWITCH})
+        ]
         # totals may stand behind a short table
         numeric = fields and len(words) <= min(LONGEST_TAIL, len(fields) // 10)
-        columns.append(Column(name, "number" if numeric else f"text such as {words[0][:20]!r}" if words else "empty", unit))
+        columns.append(
+            Column(
+                name, "number" if numeric else f"text such as {words[0][:20]!r}" if words else "empty", unit
+            )
+        )
     return columns
 
 
@@ -47,12 +77,24 @@ def read_csv(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns, lis
         numbers = [line for line, _ in block]
         fields = [[row[place] for _, row in block] for place in places]
         lines.append(np.array(numbers))
-        columns.append(*(floats(path, name, found, layout.decimal, numbers, switches) for name, found in zip(wanted, fields, strict=True)))
+        columns.append(
+            *(
+                floats(path, name, found, layout.decimal, numbers, switches)
+                for name, found in zip(wanted, fields, strict=True)
+            )
+        )
         if clocks:
             clocks.append([row for _, row in block], numbers)
     line = lines.finished()[0]
     for name, words in switches.items():
-        notes.append(Note("words", "", 1, f"{name} is written as {' and '.join(sorted(words))}, which were read as 1 and 0"))
+        notes.append(
+            Note(
+                "words",
+                "",
+                1,
+                f"{name} is written as {' and '.join(sorted(words))}, which were read as 1 and 0",
+            )
+        )
     times, zone = clocks.finished(notes) if clocks else (np.arange(len(line)) * interval, "")
     values = dict(zip(wanted, columns.finished(), strict=True))
     found, turned = forward(Columns("rows", times, values, lambda i: f"line {line[i]}", zone))
@@ -66,12 +108,19 @@ def read_csv(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns, lis
 
 
 class _Clock:
-    """The column of the time, a part of the file at a time: numbers, or text that names instants, with the date in another column or
-    without."""
+    """The column of the time, a part of the file at a time: numbers, or text that names instants, with the
+    date in another column or without."""
 
     def __init__(self, path: Path, layout: CsvLayout, name: str):
-        self.path, self.layout, self.name, self.place = path, layout, name, column_place(path, layout.names, name)
-        first = next((row for _, row in rows(path, layout) if len(row) > self.place and row[self.place].strip()), None)
+        self.path, self.layout, self.name, self.place = (
+            path,
+            layout,
+            name,
+            column_place(path, layout.names, name),
+        )
+        first = next(
+            (row for _, row in rows(path, layout) if len(row) > self.place and row[self.place].strip()), None
+        )
         sample = first[self.place].strip() if first else "0"
         self.numeric = is_number(sample, layout.decimal) and not is_compact(sample)
         date = None if self.numeric else date_column(layout.names, name)
@@ -79,7 +128,11 @@ class _Clock:
         self.date = column_place(path, layout.names, date) if date and re.match(r"\d+:", sample) else None
         dates, sample = set(), self.text(first) if first else ""
         if not self.numeric and re.match(r"\s*\d{1,2}[/-]\d{1,2}[/-]\d", sample):
-            dates = {self.text(row).split()[0] for _, row in rows(path, layout) if len(row) > self.place and self.text(row).strip()}
+            dates = {
+                self.text(row).split()[0]
+                for _, row in rows(path, layout)
+                if len(row) > self.place and self.text(row).strip()
+            }
         self.month_first = month_first(dates, sample)
         self.times, self.zoned, self.dated = Growing([float if self.numeric else np.int64]), True, True
 
@@ -87,9 +140,14 @@ class _Clock:
         return row[self.place] if self.date is None else f"{row[self.date]} {row[self.place]}"
 
     def is_time(self, row: list[str]) -> bool:
-        """Whether there is something like a time, not a word or nothing; what it is exactly is looked at later."""
+        """Whether there is something like a time, not a word or
+        nothing; what it is exactly is looked at later."""
         field = row[self.place].strip()
-        return field[:1].isdigit() or (self.numeric and is_number(field, self.layout.decimal)) or (not self.numeric and ":" in field)
+        return (
+            field[:1].isdigit()
+            or (self.numeric and is_number(field, self.layout.decimal))
+            or (not self.numeric and ":" in field)
+        )
 
     def append(self, rows: list[list[str]], lines: list[int]) -> None:
         fields = [self.text(row) for row in rows]
@@ -112,11 +170,14 @@ class _Clock:
             times, midnights = over_midnight(times)
             if midnights:
                 notes.append(
-                    Note("clock", "", midnights, f"the time of day runs over midnight {midnights} times: a day was added each time")
+                    Note(
+                        "clock",
+                        "",
+                        midnights,
+                        f"the time of day runs over midnight {midnights} times: a day was added each time",
+                    )
                 )
         return times, "UTC" if self.zoned else ""
 
 
 # ---- numbers
-
-

@@ -1,4 +1,5 @@
-"""How a text file of numbers is laid out: encoding, delimiter, decimal mark, where its names and units stand and where its data begin."""
+"""How a text file of numbers is laid out: encoding, delimiter, decimal mark, where its
+names and units stand and where its data begin."""
 
 import collections
 from collections.abc import Sequence
@@ -10,34 +11,66 @@ from pipeline.store.csv_rows import CsvLayout, is_quantity, opening
 
 
 def csv_layout(path: Path) -> CsvLayout:
-    """Encoding, delimiter, decimal mark and header of a text file. Raises ValueError where it has no rows of numbers."""
+    """Encoding, delimiter, decimal mark and header of a text file.
+    Raises ValueError where it has no rows of numbers."""
     encoding, delimiter, decimal, rows, comment, notes = opening(path)
-    numbers = [0 if remark else sum(is_quantity(field, decimal) for field in row) for row, remark in zip(rows, comment, strict=True)]
+    numbers = [
+        0 if remark else sum(is_quantity(field, decimal) for field in row)
+        for row, remark in zip(rows, comment, strict=True)
+    ]
     first, width = _first_row(path, rows, numbers, comment, delimiter)
-    heads = [i for i in range(first) if len(rows[i]) >= width and any(rows[i]) and (not numbers[i] or _names_time(rows[i]))]
+    heads = [
+        i
+        for i in range(first)
+        if len(rows[i]) >= width and any(rows[i]) and (not numbers[i] or _names_time(rows[i]))
+    ]
     if not heads:
-        notes.append(Note("header", "", 1, f"line {first + 1} is data already: the {width} columns were named column_1 to column_{width}"))
-        return CsvLayout(encoding, delimiter, decimal, [f"column_{i + 1}" for i in range(width)], [""] * width, first, notes)
+        notes.append(
+            Note(
+                "header",
+                "",
+                1,
+                f"line {first + 1} is data already: the {width} columns were named "
+                f"column_1 to column_{width}",
+            )
+        )
+        return CsvLayout(
+            encoding,
+            delimiter,
+            decimal,
+            [f"column_{i + 1}" for i in range(width)],
+            [""] * width,
+            first,
+            notes,
+        )
     names, units = [field.strip() for field in rows[heads[-1]]], [""] * width
     if len(heads) > 1 and heads[-2] == heads[-1] - 1 and heads[-1] == first - 1:
-        names, units = [field.strip() for field in rows[heads[-2]]], [field.strip(" ()[]") for field in rows[heads[-1]]]
-    return CsvLayout(encoding, delimiter, decimal, names, units + [""] * (len(names) - len(units)), first, notes)
+        names, units = (
+            [field.strip() for field in rows[heads[-2]]],
+            [field.strip(" ()[]") for field in rows[heads[-1]]],
+        )
+    return CsvLayout(
+        encoding, delimiter, decimal, names, units + [""] * (len(names) - len(units)), first, notes
+    )
 
 
 def _names_time(row: Sequence[str]) -> bool:
     return len(row) > 1 and any(is_time_name(field) for field in row)
 
 
-def _first_row(path: Path, rows: Sequence[list[str]], numbers: Sequence[int], comment: Sequence[bool], delimiter: str) -> tuple[int, int]:
-    """(index, width) of the first row of the table: behind the first line that names a time, where there is one, of the width that most
-    rows with numbers have."""
+def _first_row(
+    path: Path, rows: Sequence[list[str]], numbers: Sequence[int], comment: Sequence[bool], delimiter: str
+) -> tuple[int, int]:
+    """(index, width) of the first row of the table: behind the first line that names a time, where there is
+    one, of the width that most rows with numbers have."""
     header = next((i for i, row in enumerate(rows) if _names_time(row) and any(numbers[i + 1 :])), -1)
     data = [i for i in range(header + 1, len(rows)) if numbers[i]]
     if not data:
         text = sum(bool(row) and not remark for row, remark in zip(rows, comment, strict=True))
         found = f"{text} lines of text" if text > 1 else "a header" if text else "only blank or comment lines"
         raise ValueError(
-            f"{path}: line 2 on should hold rows of numbers, but the file has {found} and no data; record it again or remove it"
+            f"{path}: line 2 on should hold rows of numbers, but the file has {found} and no data; "
+            "record it again or remove it"
         )
     widths = collections.Counter(len(rows[i]) for i in data)
     width = max(widths, key=lambda count: (widths[count], count))
@@ -47,7 +80,8 @@ def _first_row(path: Path, rows: Sequence[list[str]], numbers: Sequence[int], co
     words = delimiter == " " and sum(numbers[i] for i in table) < width * len(table) / 2
     if len(table) < len(written) / 2 or words or (len(table) == 1 and header < 0):
         raise ValueError(
-            f"{path} is text but no table: {len(table)} of its first {len(written)} lines have {width} fields with numbers among them;"
+            f"{path} is text but no table: {len(table)} of its first {len(written)} lines have {width} "
+            "fields with numbers among them;"
             " name a recording, or save it as CSV with one row a sample"
         )
     return table[0], width

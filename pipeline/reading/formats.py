@@ -1,4 +1,5 @@
-"""What a recording is written in, and what all formats have in common: columns on a clock, and how a column shows that it is the time."""
+"""What a recording is written in, and what all formats have in common: columns on a
+clock, and how a column shows that it is the time."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -9,8 +10,14 @@ import numpy as np
 
 from pipeline.reading.signals import Note, nearest_names
 
-# a number beyond that is no time in seconds but an epoch in ms, us, ns, or 100 ns as Windows counts from 1601 (1e11 s is the year 5138)
-_EPOCHS = ((5e17, 1e9, 0, "ns"), (1e17, 1e7, 11_644_473_600, "100 ns since 1601"), (1e14, 1e6, 0, "us"), (1e11, 1e3, 0, "ms"))
+# a number beyond that is no time in seconds but an epoch in ms, us, ns, or 100 ns as
+# Windows counts from 1601 (1e11 s is the year 5138)
+_EPOCHS = (
+    (5e17, 1e9, 0, "ns"),
+    (1e17, 1e7, 11_644_473_600, "100 ns since 1601"),
+    (1e14, 1e6, 0, "us"),
+    (1e11, 1e3, 0, "ms"),
+)
 # days since 1899-12-30 and since the year 0, from 1954 to 2119, and 1970-01-01 in them
 _SERIAL_DAYS = ((20_000, 80_000, 25_569, "spreadsheets"), (713_000, 774_000, 719_529, "MATLAB"))
 # a clock that runs on for no more than so many samples before it falls back is not one clock
@@ -45,7 +52,8 @@ _TIME_NAMES = (
 )
 DATE_NAMES = ("date", "datum")
 _PER_SECOND = {"s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e3, "msec": 1e3, "us": 1e6, "µs": 1e6,
-               "usec": 1e6, "ns": 1e9, "nsec": 1e9, "min": 1 / 60, "mins": 1 / 60, "minutes": 1 / 60, "h": 1 / 3600, "hours": 1 / 3600,
+               "usec": 1e6, "ns": 1e9, "nsec": 1e9, "min": 1 / 60, "mins": 1 / 60, "minutes": 1 / 60,
+               "h": 1 / 3600, "hours": 1 / 3600,
                "d": 1 / 86400, "days": 1 / 86400}  # fmt: skip
 
 _PARQUET = b"PAR1"
@@ -77,8 +85,8 @@ _STRANGERS = {
 
 
 class Columns(NamedTuple):
-    """Columns on one clock: time_s (n,) or, where it is on a calendar, time_ns (n,); `place(i)` says where sample i stands in the file;
-    `zone` is that of the calendar, empty where the file does not say it."""
+    """Columns on one clock: time_s (n,) or, where it is on a calendar, time_ns (n,); `place(i)` says where
+    sample i stands in the file; `zone` is that of the calendar, empty where the file does not say it."""
 
     name: str
     time: np.ndarray
@@ -96,7 +104,8 @@ class Column(NamedTuple):
 
 
 class Growing:
-    """Columns (n,) that grow in place as parts of a file come in: parts that are joined at the end would need twice the memory."""
+    """Columns (n,) that grow in place as parts of a file come in: parts that
+    are joined at the end would need twice the memory."""
 
     def __init__(self, kinds: Sequence[type], expected: int = 0):
         self.count = 0
@@ -123,7 +132,8 @@ class Growing:
 
 
 def file_format(path: Path) -> str:
-    """ "mcap", "parquet" or "csv", by the file's first bytes, whatever its name ends in. Raises ValueError for what is none of them."""
+    """ "mcap", "parquet" or "csv", by the file's first bytes, whatever its name ends
+    in. Raises ValueError for what is none of them."""
     if path.is_dir():
         raise ValueError(f"{path} is a folder but should be one recording; name a file in it")
     try:
@@ -134,7 +144,9 @@ def file_format(path: Path) -> str:
     except OSError as error:
         raise ValueError(f"{path} cannot be opened ({error.strerror}); make it readable") from None
     if not start:
-        raise ValueError(f"{path} is empty (0 bytes) but should be MCAP, Parquet or CSV; copy the recording again")
+        raise ValueError(
+            f"{path} is empty (0 bytes) but should be MCAP, Parquet or CSV; copy the recording again"
+        )
     if b"MCAP0" in start[:8]:
         return "mcap"
     if start.startswith(_PARQUET):
@@ -143,10 +155,14 @@ def file_format(path: Path) -> str:
         if start.startswith(magic):
             raise ValueError(f"{path} is {name} but should be MCAP, Parquet or CSV; {remedy}")
     if not start.strip(b"\0"):
-        raise ValueError(f"{path} begins with {len(start)} zero bytes but should be MCAP, Parquet or CSV; copy the recording again")
+        raise ValueError(
+            f"{path} begins with {len(start)} zero bytes but should be MCAP, Parquet or CSV; "
+            "copy the recording again"
+        )
     if path.suffix in (".mcap", ".parquet"):
         raise ValueError(
-            f"{path}: the bytes at offset 0 are {start[:8].hex(' ')}, which begin no {path.suffix[1:]} file; copy the"
+            f"{path}: the bytes at offset 0 are {start[:8].hex(' ')}, "
+            f"which begin no {path.suffix[1:]} file; copy the"
             f" recording again as binary"
         )
     return "csv"
@@ -165,16 +181,21 @@ def time_column(path: Path, names: Sequence[str], time: str) -> str:
     if not ranked:
         shown = ", ".join(names[:12])
         raise ValueError(
-            f"{path}: no column is called like a time (t_s, time, timestamp, ...) among {shown}; name it, or write time: every 1.0 s"
+            f"{path}: no column is called like a time (t_s, time, timestamp, ...) among {shown}; name it, "
+            "or write time: every 1.0 s"
         )
     return min(ranked)[1]
 
 
 def column_place(path: Path, names: Sequence[str], name: str) -> int:
     if name not in names:
-        raise ValueError(f"{path}: there is no column {name!r}; {nearest_names(name, [known for known in names if known])}")
+        raise ValueError(
+            f"{path}: there is no column {name!r}; {nearest_names(name, [known for known in names if known])}"
+        )
     if names.count(name) > 1:
-        raise ValueError(f"{path}: {names.count(name)} columns are called {name!r}; give each a name of its own")
+        raise ValueError(
+            f"{path}: {names.count(name)} columns are called {name!r}; give each a name of its own"
+        )
     return names.index(name)
 
 
@@ -190,7 +211,8 @@ def _time_rank(name: str) -> tuple[bool, int] | None:
 
 
 def _time_unit(name: str) -> tuple[str, str]:
-    """("time", "ms") of "Time [ms]", "time_ms" and the like; a time zone at the end is no part of the name."""
+    """("time", "ms") of "Time [ms]", "time_ms" and the like; a time
+    zone at the end is no part of the name."""
     plain = re.sub(r"[\s_.]*[(\[/_\s]\s*(utc|gmt|local)\s*[)\]]?$", "", name.strip().casefold())
     found = re.match(r"^(.*?)[\s_.]*[(\[/_\s]\s*(\w+)\s*[)\]]?$", plain)
     if found and found[2] in _PER_SECOND:
@@ -208,8 +230,8 @@ def date_column(names: Sequence[str], clock: str) -> str | None:
 
 
 def seconds(name: str, numbers: np.ndarray) -> tuple[np.ndarray, str]:
-    """Time in seconds from numbers in the unit of the column's name; without one, in seconds or in what the size of an epoch or of a
-    spreadsheet's days tells (then said)."""
+    """Time in seconds from numbers in the unit of the column's name; without one, in seconds or in what the
+    size of an epoch or of a spreadsheet's days tells (then said)."""
     unit = _time_unit(name)[1]
     if unit:
         return numbers / _PER_SECOND[unit], ""
@@ -217,18 +239,28 @@ def seconds(name: str, numbers: np.ndarray) -> tuple[np.ndarray, str]:
     low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
     for limit, per_second, epoch, unit in _EPOCHS:
         if high > limit:
-            return numbers / per_second - epoch, f"column {name} holds numbers up to {high:.3g} and was taken as an epoch in {unit}"
+            return (
+                numbers / per_second - epoch,
+                f"column {name} holds numbers up to {high:.3g} and was taken as an epoch in {unit}",
+            )
     for first, last, epoch, program in _SERIAL_DAYS:
-        if first <= low and high <= last and len(known) > 1 and _in_days(float(np.median(np.abs(np.diff(known))))):
-            said = f"column {name} holds {low:.8g} to {high:.8g} and was taken as days, as {program} count them"
+        if (
+            first <= low
+            and high <= last
+            and len(known) > 1
+            and _in_days(float(np.median(np.abs(np.diff(known)))))
+        ):
+            said = (
+                f"column {name} holds {low:.8g} to {high:.8g} and was taken as days, as {program} count them"
+            )
             # to the microsecond: what is left of a double there
             return np.round((numbers - epoch) * 86400, 6), said
     return numbers, ""
 
 
 def _in_days(interval: float) -> bool:
-    """Whether an interval is one of days: up to a second, or whole seconds up to a minute. Taken as seconds it would be 80 kHz, or a rate that no
-    machine of ours has: 1 kHz would be 86.4 s."""
+    """Whether an interval is one of days: up to a second, or whole seconds up to a minute. Taken as seconds
+    it would be 80 kHz, or a rate that no machine of ours has: 1 kHz would be 86.4 s."""
     in_seconds = interval * 86400
     return 0 < in_seconds < 1.05 or (in_seconds < 61 and abs(in_seconds - round(in_seconds)) < 0.02)
 
@@ -243,7 +275,14 @@ def forward(columns: Columns) -> tuple[Columns, list[Note]]:
         return columns, []
     values = {name: found[::-1] for name, found in columns.values.items()}
     turned = columns._replace(time=columns.time[::-1], values=values, place=lambda i: columns.place(last - i))
-    return turned, [Note("clock", "", last + 1, "the newest sample stands first: the rows were read from the last to the first")]
+    return turned, [
+        Note(
+            "clock",
+            "",
+            last + 1,
+            "the newest sample stands first: the rows were read from the last to the first",
+        )
+    ]
 
 
 def check_clock(path: Path, group: Columns) -> None:
@@ -252,7 +291,10 @@ def check_clock(path: Path, group: Columns) -> None:
     if np.issubdtype(time.dtype, np.floating) and not np.isfinite(time).all():
         i = int(np.flatnonzero(~np.isfinite(time))[0])
         missing = int((~np.isfinite(time)).sum())
-        raise ValueError(f"{path}: {group.place(i)} should have a time but has none, the first of {missing}; fill it in or remove the row")
+        raise ValueError(
+            f"{path}: {group.place(i)} should have a time but has none, the first of {missing}; "
+            "fill it in or remove the row"
+        )
     if (time[1:] > time[:-1]).all():
         return
     steps = np.diff(time)
@@ -268,7 +310,10 @@ def check_clock(path: Path, group: Columns) -> None:
         else f"is at {now:.9g} s{since}, which is before the sample ahead of it at {before:.9g} s"
     )
     times = f", the first of {count}" if count > 1 else ""
-    raise ValueError(f"{path}: {group.place(i + 1)} {said}{times}, but time should only run forward; {_remedy(group, steps / unit, back)}")
+    raise ValueError(
+        f"{path}: {group.place(i + 1)} {said}{times}, but time should only run forward; "
+        f"{_remedy(group, steps / unit, back)}"
+    )
 
 
 def _remedy(group: Columns, steps_s: np.ndarray, back: np.ndarray) -> str:
@@ -295,6 +340,8 @@ def every(time: str) -> float | None:
         return None
     return interval if interval is not None and 0 < interval < np.inf else None
 
-# a clock that begins later than three years is one of the calendar; it is counted from the record's first whole second, so that floats hold
+
+# a clock that begins later than three years is one of the calendar; it is counted from the record's first
+# whole second, so that floats hold
 # nanoseconds
 CALENDAR_S = 1e8

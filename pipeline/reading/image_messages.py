@@ -1,8 +1,11 @@
-"""Pictures out of the messages of an image topic, whatever they are written in, and gray frames out of pictures.
+"""Pictures out of the messages of an image topic, whatever they are
+written in, and gray frames out of pictures.
 
-Read are sensor_msgs Image and CompressedImage in ROS 2 CDR and ROS 1, Foxglove's RawImage and CompressedImage in protobuf, JSON (base64), CDR and ROS 1; their layouts are
-fixed (ros2/common_interfaces, foxglove/foxglove-sdk), so that those of ROS need no schema text. A picture shares the memory of its message, and a mono8 frame that of its
-picture. Gray is luma, 0.299 R + 0.587 G + 0.114 B (ITU-R BT.601), which is also what JPEG holds; 16 bits stay 16 bits.
+Read are sensor_msgs Image and CompressedImage in ROS 2 CDR and ROS 1, Foxglove's RawImage and CompressedImage
+in protobuf, JSON (base64), CDR and ROS 1; their layouts are fixed (ros2/common_interfaces,
+foxglove/foxglove-sdk), so that those of ROS need no schema text. A picture shares the memory of its message,
+and a mono8 frame that of its picture. Gray is luma, 0.299 R + 0.587 G + 0.114 B (ITU-R BT.601), which is also
+what JPEG holds; 16 bits stay 16 bits.
 """
 
 import base64
@@ -29,7 +32,8 @@ _ROS = {
 }
 _FOXGLOVE = ("foxglove/RawImage", "foxglove/CompressedImage")
 READABLE = "sensor_msgs Image and CompressedImage (ROS 2, ROS 1), foxglove RawImage and CompressedImage (protobuf, JSON, ROS)"
-# CDR representation -> byte order; no field is longer than four bytes, so that the two alignments there are agree
+# CDR representation -> byte order; no field is longer than four bytes,
+# so that the two alignments there are agree
 _ORDERS = {b"\x00\x00": ">", b"\x00\x01": "<", b"\x00\x06": ">", b"\x00\x07": "<"}
 
 _MONO = {"mono8", "8uc1"}
@@ -43,11 +47,14 @@ _COLOUR = {
 }  # fmt: skip
 # of two bytes a pixel, the one with the luma
 _LUMA = {"yuv422": 1, "uyvy": 1, "yuv422_yuy2": 0, "yuyv": 0}
-ENCODINGS = "mono8, mono16, rgb8, bgr8, rgba8, bgra8, 8UC1, 8UC3, 8UC4, 16UC1, bayer_*8, yuv422 and yuv422_yuy2"
+ENCODINGS = (
+    "mono8, mono16, rgb8, bgr8, rgba8, bgra8, 8UC1, 8UC3, 8UC4, 16UC1, bayer_*8, yuv422 and yuv422_yuy2"
+)
 
 
 class Picture(NamedTuple):
-    """A message's picture: `encoding` and the layout of its rows, or, where height is 0, the format ("jpeg", "png") of a compressed one."""
+    """A message's picture: `encoding` and the layout of its rows, or, where height is 0,
+    the format ("jpeg", "png") of a compressed one."""
 
     stamp_ns: int
     encoding: str
@@ -64,16 +71,22 @@ Read = Callable[[bytes | memoryview], Picture]
 def is_image(channel: Channel) -> bool:
     """Whether the channel's messages are pictures that `reader` reads."""
     kind = _kind(channel)
-    return (channel.encoding in ("cdr", "ros1") and kind in _ROS) or (channel.encoding in ("protobuf", "json") and kind in _FOXGLOVE)
+    return (channel.encoding in ("cdr", "ros1") and kind in _ROS) or (
+        channel.encoding in ("protobuf", "json") and kind in _FOXGLOVE
+    )
 
 
 def reader(channel: Channel) -> Read:
     """A function from one message of the channel to its Picture, nothing of it copied or decoded.
 
-    It raises UnreadableMessage for a message that is not what its type says. Raises ValueError for a channel that is none of images.
+    It raises UnreadableMessage for a message that is not what its type says.
+    Raises ValueError for a channel that is none of images.
     """
     if not is_image(channel):
-        raise ValueError(f"messages of type {channel.schema_name!r} in {channel.encoding!r} are no images that are read; {READABLE} are")
+        raise ValueError(
+            f"messages of type {channel.schema_name!r} in {channel.encoding!r} are no images that are "
+            f"read; {READABLE} are"
+        )
     if channel.encoding == "json":
         parse = _json
     elif channel.encoding == "protobuf":
@@ -170,14 +183,23 @@ def _picture(found: dict, stamp_ns: int) -> Picture:
         raise UnreadableMessage("a number where its type says bytes")
     if "width" not in found or not found.get("encoding", ""):
         return Picture(stamp_ns, found.get("format", ""), 0, 0, 0, False, data)
-    return Picture(stamp_ns, found["encoding"], found["height"], found["width"], found["step"], bool(found.get("is_bigendian", 0)), data)
+    return Picture(
+        stamp_ns,
+        found["encoding"],
+        found["height"],
+        found["width"],
+        found["step"],
+        bool(found.get("is_bigendian", 0)),
+        data,
+    )
 
 
 # ---- pictures -> frames
 
 
 def gray(picture: Picture) -> np.ndarray:
-    """The gray frame (height, width), uint8 or uint16; of mono8 a view of the message. Raises UnreadableMessage."""
+    """The gray frame (height, width), uint8 or uint16; of mono8 a view
+    of the message. Raises UnreadableMessage."""
     if not picture.height:
         return _decoded(picture)
     encoding = picture.encoding.casefold()
@@ -209,11 +231,15 @@ def _rows(picture: Picture, size: int) -> np.ndarray:
 def _decoded(picture: Picture) -> np.ndarray:
     # without ANYDEPTH 16 bits would be cut down to 8
     try:
-        frame = cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+        frame = cv2.imdecode(
+            np.frombuffer(picture.data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+        )
     except cv2.error:
         frame = None
     if frame is None:
-        raise UnreadableMessage(f"its {len(picture.data)} bytes of format {picture.encoding!r} are no whole picture")
+        raise UnreadableMessage(
+            f"its {len(picture.data)} bytes of format {picture.encoding!r} are no whole picture"
+        )
     return frame
 
 
@@ -242,14 +268,23 @@ def header(stamp_ns: int, frame_id: str) -> bytes:
 def image(head: bytes, frame: np.ndarray) -> bytes:
     """sensor_msgs/msg/Image of a frame (height, width), uint8 (mono8) or uint16 (mono16)."""
     height, width = frame.shape
-    body = _padded(head) + struct.pack("<II", height, width) + _text("mono8" if frame.itemsize == 1 else "mono16") + b"\0"
+    body = (
+        _padded(head)
+        + struct.pack("<II", height, width)
+        + _text("mono8" if frame.itemsize == 1 else "mono16")
+        + b"\0"
+    )
     data = np.ascontiguousarray(frame, "<u2" if frame.itemsize == 2 else np.uint8)
-    return b"".join([_padded(body), struct.pack("<II", width * frame.itemsize, data.nbytes), memoryview(data).cast("B")])
+    return b"".join(
+        [_padded(body), struct.pack("<II", width * frame.itemsize, data.nbytes), memoryview(data).cast("B")]
+    )
 
 
 def compressed_image(head: bytes, format: str, data: np.ndarray) -> bytes:
     """sensor_msgs/msg/CompressedImage of encoded bytes (n,)."""
-    return b"".join([_padded(_padded(head) + _text(format)), struct.pack("<I", data.size), memoryview(data).cast("B")])
+    return b"".join(
+        [_padded(_padded(head) + _text(format)), struct.pack("<I", data.size), memoryview(data).cast("B")]
+    )
 
 
 def _text(text: str) -> bytes:

@@ -1,5 +1,6 @@
-"""The frames of one image topic of an MCAP file and the numbers of the topics beside it: one walk checks all of the file, keeps the numbers and remembers where pictures are;
-frames are decoded when they are asked for."""
+"""The frames of one image topic of an MCAP file and the numbers of the topics beside
+it: one walk checks all of the file, keeps the numbers and remembers where pictures
+are; frames are decoded when they are asked for."""
 
 import struct
 from collections.abc import Iterator, Sequence
@@ -13,7 +14,16 @@ from pipeline.reading.image_messages import READABLE, Picture, gray, is_image, r
 from pipeline.reading.mcap_columns import Topic
 from pipeline.reading.mcap_files import McapFile, Messages
 from pipeline.reading.mcap_messages import Decode, UnreadableMessage, decoder, decompress, plain
-from pipeline.reading.mcap_records import CHUNK, CHUNK_HEAD, MESSAGE, MESSAGE_HEAD, RECORD_HEAD, pairs, prefixed, string
+from pipeline.reading.mcap_records import (
+    CHUNK,
+    CHUNK_HEAD,
+    MESSAGE,
+    MESSAGE_HEAD,
+    RECORD_HEAD,
+    pairs,
+    prefixed,
+    string,
+)
 from pipeline.reading.signals import Note, nearest_names
 
 METADATA = 0x0C
@@ -22,8 +32,9 @@ STAMPS = (("sec", "nanosec"), ("sec", "nsec"), ("secs", "nsecs"), ("seconds", "n
 
 
 class Walk(McapFile):
-    """All of a file, walked once: metadata records, the messages of the topics `wanted`, and the pictures of `image`: their times in ns on the clock `time`, and
-    the offsets of the whole chunks and single messages that hold them, by channel."""
+    """All of a file, walked once: metadata records, the messages of the topics `wanted`, and the
+    pictures of `image`: their times in ns on the clock `time`, and the offsets of the whole chunks
+    and single messages that hold them, by channel."""
 
     def __init__(self, path: Path, image: Topic, wanted: set[str], time: str):
         super().__init__(path)
@@ -33,7 +44,9 @@ class Walk(McapFile):
         self.picture_ns: dict[int, list[int]] = {}
         self.readers = {channel.id: reader(channel) for channel in image.channels}
         self._at = (0, 0)
-        for batch in self.batches(lambda channel: channel.topic in wanted or (channel.id in self.readers and time != "log_time")):
+        for batch in self.batches(
+            lambda channel: channel.topic in wanted or (channel.id in self.readers and time != "log_time")
+        ):
             for number, messages in batch.items():
                 if number in self.readers:
                     self._remember(number, messages, time)
@@ -70,7 +83,10 @@ class Walk(McapFile):
 
     def picture_order(self) -> list[int]:
         """The channels that have pictures, the earliest first."""
-        return sorted((number for number, times in self.picture_ns.items() if times), key=lambda number: self.picture_ns[number][0])
+        return sorted(
+            (number for number, times in self.picture_ns.items() if times),
+            key=lambda number: self.picture_ns[number][0],
+        )
 
 
 def _metadata(record: bytes) -> tuple[str, dict[str, str]]:
@@ -86,9 +102,11 @@ def _metadata(record: bytes) -> tuple[str, dict[str, str]]:
 
 
 def columns(walk: Walk, topic: Topic, names: Sequence[str], time: str) -> tuple[Columns, int]:
-    """The numbers `names` of a topic that the walk has kept, its channels one behind the other, and how many messages were not what the schema says.
+    """The numbers `names` of a topic that the walk has kept, its channels one behind the other, and how many
+    messages were not what the schema says.
 
-    Raises ValueError for a clock that the topic does not have, for text in place of a number, and where nothing can be read.
+    Raises ValueError for a clock that the topic does not have, for text
+    in place of a number, and where nothing can be read.
     """
     clock = _clock(walk.path, topic, time)
     pieces, dropped = [], 0
@@ -100,7 +118,9 @@ def columns(walk: Walk, topic: Topic, names: Sequence[str], time: str) -> tuple[
             decode = decoder(channel, [*names, *clock])
             rows, sound = _rows(decode, messages.data, len(names) + len(clock))
         except ValueError as error:
-            raise ValueError(f"{walk.path}: topic {topic.name} cannot be read because {error}; map another topic") from None
+            raise ValueError(
+                f"{walk.path}: topic {topic.name} cannot be read because {error}; map another topic"
+            ) from None
         dropped += len(messages.data) - len(sound)
         if len(clock) == 1:
             times = np.rint(1e9 * rows[:, -1]).astype(np.int64)
@@ -108,11 +128,16 @@ def columns(walk: Walk, topic: Topic, names: Sequence[str], time: str) -> tuple[
             # both parts are whole numbers below 2^53, so that the nanoseconds are exact
             times = rows[:, -2].astype(np.int64) * 10**9 + rows[:, -1].astype(np.int64)
         else:
-            times = np.array(messages.publish_time if time == "publish_time" else messages.log_time, np.uint64).astype(np.int64)[sound]
+            times = np.array(
+                messages.publish_time if time == "publish_time" else messages.log_time, np.uint64
+            ).astype(np.int64)[sound]
         if len(times):
             pieces.append((times, rows))
     if not pieces:
-        raise ValueError(f"{walk.path}: no message of {topic.name} is whole and what its schema says; copy the recording again")
+        raise ValueError(
+            f"{walk.path}: no message of {topic.name} is whole and what its schema says; "
+            "copy the recording again"
+        )
     pieces.sort(key=lambda piece: piece[0][0])
     values = np.concatenate([rows for _, rows in pieces])
     place = f"of {topic.name}"
@@ -133,7 +158,10 @@ def _clock(path: Path, topic: Topic, time: str) -> list[str]:
     for parts in STAMPS:
         if all(f"{time}.{part}" in topic.fields for part in parts):
             return [f"{time}.{part}" for part in parts]
-    raise ValueError(f"{path}: topic {topic.name} has no time {time!r}; {nearest_names(time, ['log_time', 'publish_time', *topic.fields])}")
+    raise ValueError(
+        f"{path}: topic {topic.name} has no time {time!r}; "
+        f"{nearest_names(time, ['log_time', 'publish_time', *topic.fields])}"
+    )
 
 
 def _rows(decode: Decode, data: Sequence[bytes], width: int) -> tuple[np.ndarray, list[int]]:
@@ -157,14 +185,21 @@ def _rows(decode: Decode, data: Sequence[bytes], width: int) -> tuple[np.ndarray
 def frame_times(walk: Walk, topic: Topic) -> Columns:
     """The pictures' times in ns, those of channels that took over from one another one behind the other."""
     times = [time for number in walk.picture_order() for time in walk.picture_ns[number]]
-    return Columns(topic.name, np.array(times, np.uint64).astype(np.int64), {}, lambda i: f"frame {i + 1} of {topic.name}")
+    return Columns(
+        topic.name,
+        np.array(times, np.uint64).astype(np.int64),
+        {},
+        lambda i: f"frame {i + 1} of {topic.name}",
+    )
 
 
 class Frames:
-    """(time_s, frame) of each picture in the order of time, frame (height, width) uint8 or uint16; as often as wanted, in the memory of a chunk.
+    """(time_s, frame) of each picture in the order of time, frame (height, width) uint8 or uint16; as often
+    as wanted, in the memory of a chunk.
 
-    time_s (n,) is known beforehand. A picture that cannot be decoded is left out: `unreadable` counts those of the last walk, `notes` says so. Raises ValueError where
-    they are more than `unreadable_share` of all, and where the size changes.
+    time_s (n,) is known beforehand. A picture that cannot be decoded is left out: `unreadable` counts
+    those of the last walk, `notes` says so. Raises ValueError where they are more than
+    `unreadable_share` of all, and where the size changes.
     """
 
     def __init__(self, walk: Walk, topic: Topic, time: str, *, start_ns: int, unreadable_share: float):
@@ -190,7 +225,8 @@ class Frames:
             kind = kind or found
             if found != kind:
                 raise ValueError(
-                    f"{self.path}: the frame of {self.topic} at {time:.3f} s is {found[0]} x {found[1]} px of {found[2]} bits but the first is {kind[0]} x"
+                    f"{self.path}: the frame of {self.topic} at {time:.3f} s is {found[0]} x {found[1]} px "
+                    f"of {found[2]} bits but the first is {kind[0]} x"
                     f" {kind[1]} px of {kind[2]}; record a trial at one size"
                 )
             yield time, frame
@@ -207,7 +243,9 @@ class Frames:
                         except UnreadableMessage as error:
                             self._leave_out((log_time - self._start_ns) / 1e9, error)
                             continue
-                        time = {"log_time": log_time, "publish_time": publish_time}.get(self._time, picture.stamp_ns)
+                        time = {"log_time": log_time, "publish_time": publish_time}.get(
+                            self._time, picture.stamp_ns
+                        )
                         yield (time - self._start_ns) / 1e9, picture
 
     def notes(self) -> list[Note]:
@@ -228,12 +266,14 @@ class Frames:
         self._first = self._first or f"cannot be decoded, the first at {time:.3f} s: {error}"
         if self.unreadable > self._share * self.count:
             raise ValueError(
-                f"{self.path}: {self.unreadable} of {self.count} frames of {self.topic} {self._first}; that is more than {100 * self._share:g} percent, so"
+                f"{self.path}: {self.unreadable} of {self.count} frames of {self.topic} {self._first}; "
+                f"that is more than {100 * self._share:g} percent, so"
                 f" record the trial again"
             )
 
     def _messages(self, stream: BinaryIO, number: int, offset: int) -> list[tuple[int, int, memoryview]]:
-        """(log_time, publish_time, message) of the channel in the chunk or message at `offset`, whose CRC the first walk has checked."""
+        """(log_time, publish_time, message) of the channel in the chunk or message at
+        `offset`, whose CRC the first walk has checked."""
         try:
             stream.seek(offset)
             head = stream.read(9)
@@ -242,7 +282,8 @@ class Frames:
             return list(_split(content, number))
         except (struct.error, IndexError, UnicodeDecodeError, UnreadableMessage):
             raise ValueError(
-                f"{self.path}: the record at byte {offset} is not what it was a moment ago; leave the file alone while it is read"
+                f"{self.path}: the record at byte {offset} is not what it was a moment ago; "
+                "leave the file alone while it is read"
             ) from None
 
 
@@ -250,7 +291,11 @@ def _contents(record: bytes) -> memoryview:
     size, _, length = CHUNK_HEAD.unpack_from(record)[2:]
     start = CHUNK_HEAD.size + length
     method = record[CHUNK_HEAD.size : start].decode()
-    return memoryview(decompress(method, record[start + 8 :], size)) if method else memoryview(record)[start + 8 :]
+    return (
+        memoryview(decompress(method, record[start + 8 :], size))
+        if method
+        else memoryview(record)[start + 8 :]
+    )
 
 
 def _split(content: memoryview, number: int) -> Iterator[tuple[int, int, memoryview]]:
@@ -265,17 +310,22 @@ def _split(content: memoryview, number: int) -> Iterator[tuple[int, int, memoryv
 
 
 def image_topic(path: Path, found: dict[str, Topic], name: str) -> Topic:
-    """The topic `name`, or, where that is empty, the only one with images. Raises ValueError saying which topics there are."""
+    """The topic `name`, or, where that is empty, the only one with images.
+    Raises ValueError saying which topics there are."""
     images = [topic for topic in found.values() if topic.channels and all(map(is_image, topic.channels))]
     chosen = [topic for topic in images if not name or topic.name == name]
     if len(chosen) == 1:
         return chosen[0]
     if chosen:
         raise ValueError(
-            f"{path}: {len(chosen)} topics have images ({', '.join(topic.name for topic in chosen)}); name the one of the nozzle's camera"
+            f"{path}: {len(chosen)} topics have images ({', '.join(topic.name for topic in chosen)}); "
+            "name the one of the nozzle's camera"
         )
     there = ", ".join(
-        f"{topic.name} ({topic.channels[0].schema_name or 'no type'} in {topic.channels[0].encoding})" for topic in found.values()
+        f"{topic.name} ({topic.channels[0].schema_name or 'no type'} in {topic.channels[0].encoding})"
+        for topic in found.values()
     )
     what = f"topic {name} with images" if name else "image topic"
-    raise ValueError(f"{path}: there is no {what}; it has {there or 'no topic at all'}; images are read as {READABLE}")
+    raise ValueError(
+        f"{path}: there is no {what}; it has {there or 'no topic at all'}; images are read as {READABLE}"
+    )

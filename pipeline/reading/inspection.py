@@ -1,5 +1,5 @@
-"""What is in a recording, in words: format, clocks with rate, jitter and gaps, signals with their ranges, damage; and a mapping to paste
-into params.yaml."""
+"""What is in a recording, in words: format, clocks with rate, jitter and gaps, signals with their ranges,
+damage; and a mapping to paste into params.yaml."""
 
 import json
 import re
@@ -20,9 +20,7 @@ from pipeline.reading.signals import Note, intervals
 MOST_FIELDS = 64
 _NO_TIME = "no column is called like a time; write its name, or time: every 1.0 s with the sample time, beside the mapping"
 _SET_POINT = r"set.?point|target|reference|\bsp\b|_sp$|^sp_"
-_TEMPERATURE = (
-    r"temp|celsius|deg_?c|°c|hot.?end|nozzle|barrel|zone|\bbed\b|^bed|thermo|tool_?\d|chamber|^t_?\d+|^t[_\[(]|_[ckf]$|[\[(][ckf°]"
-)
+_TEMPERATURE = r"temp|celsius|deg_?c|°c|hot.?end|nozzle|barrel|zone|\bbed\b|^bed|thermo|tool_?\d|chamber|^t_?\d+|^t[_\[(]|_[ckf]$|[\[(][ckf°]"
 # a temperature whatever else the name says, such as heater_bed.temperature
 _SURELY_TEMPERATURE = r"temperature|celsius|deg_?c|°c|(?<!set)[\s._](temp|actual)$"
 _INPUT = r"heat|duty|pwm|power|percent|pct|%|^q_?\d|^u_?\d*$|motor|screw|rpm|fan|voltage|current"
@@ -47,7 +45,8 @@ class _Signal(NamedTuple):
 
 
 def inspect(path: str | Path) -> str:
-    """A description of the recording to read, and at its end YAML to paste under `ingest.mapping` and `plant`.
+    """A description of the recording to read, and at its end YAML to
+    paste under `ingest.mapping` and `plant`.
 
     Raises ValueError where nothing can be read.
     """
@@ -63,10 +62,18 @@ def inspect(path: str | Path) -> str:
         for name, values in group.values.items():
             lines.append(f"  {name:<32} {_range(values)}")
             signals.append(_Signal(prefix + name, units.get(name, ""), values))
-    lines += ["", "Findings:" if notes else "Findings: none", *(f"  {note.kind}: {note.message}" for note in notes)]
+    lines += [
+        "",
+        "Findings:" if notes else "Findings: none",
+        *(f"  {note.kind}: {note.message}" for note in notes),
+    ]
     proposal = _proposal(signals, groups)
     if any(note.message == _NO_TIME for note in notes):
-        proposal.insert(2, "  time: every 1.0 s    # write the sample time here, for the file does not say it; or the name of a column")
+        proposal.insert(
+            2,
+            "  time: every 1.0 s    # write the sample time here, for the file does not say it; "
+            "or the name of a column",
+        )
     return "\n".join([f"{path}: {kind}, {path.stat().st_size} bytes", *lines, "", *proposal]) + "\n"
 
 
@@ -80,19 +87,33 @@ def _table(path: Path, kind: str) -> tuple[list[str], list[tuple[Columns, str]],
     if kind == "csv":
         layout = csv_layout(path)
         lines.append(
-            f"{layout.encoding}, delimiter {layout.delimiter!r}, decimal mark {layout.decimal!r}, data from line {layout.skip + 1}"
+            f"{layout.encoding}, delimiter {layout.delimiter!r}, decimal mark {layout.decimal!r}, "
+            f"data from line {layout.skip + 1}"
         )
-    others = [f"{column.name or '(no name)'} ({column.type})" for column in columns if column.name not in numeric]
-    lines += [f"{len(columns)} columns, {len(numeric)} of them numbers"] + ([f"not numbers: {', '.join(others[:20])}"] if others else [])
+    others = [
+        f"{column.name or '(no name)'} ({column.type})" for column in columns if column.name not in numeric
+    ]
+    lines += [f"{len(columns)} columns, {len(numeric)} of them numbers"] + (
+        [f"not numbers: {', '.join(others[:20])}"] if others else []
+    )
     names = [column.name for column in columns]
-    twice = [f"{name} ({names.count(name)} times)" for name in dict.fromkeys(names) if name and names.count(name) > 1]
-    lines += [f"the same name twice, so that none of them can be mapped; give each its own: {', '.join(twice)}"] if twice else []
+    twice = [
+        f"{name} ({names.count(name)} times)"
+        for name in dict.fromkeys(names)
+        if name and names.count(name) > 1
+    ]
+    lines += (
+        [f"the same name twice, so that none of them can be mapped; give each its own: {', '.join(twice)}"]
+        if twice
+        else []
+    )
     wanted = [name for name in numeric if names.count(name) == 1]
     signals = [name for name in wanted if not is_time_name(name)]
     if not signals:
         found = f" ({', '.join(others[:6] + twice)})" if others or twice else ""
         raise ValueError(
-            f"{path}: none of its {len(columns)} columns holds numbers beside the time{found}; write numbers without"
+            f"{path}: none of its {len(columns)} columns holds numbers beside the time{found}; "
+            "write numbers without"
             " units, with one decimal mark, and a name for each column"
         )
     reader: Callable = read_csv if kind == "csv" else read_parquet
@@ -111,24 +132,43 @@ def _mcap(path: Path) -> tuple[list[str], list[tuple[Columns, str]], dict[str, s
     lines, groups, units, notes = [f"{len(found)} topics"], [], {}, []
     bare = [field for topic in found.values() for field in topic.fields]
     for topic in found.values():
-        schemas = sorted({f"{channel.encoding}, {channel.schema_name or 'no schema'}" for channel in topic.channels})
+        schemas = sorted(
+            {f"{channel.encoding}, {channel.schema_name or 'no schema'}" for channel in topic.channels}
+        )
         said = (
-            f"cannot be read: {topic.unreadable}" if topic.unreadable else f"{len(topic.fields)} numbers" if topic.fields else "no numbers"
+            f"cannot be read: {topic.unreadable}"
+            if topic.unreadable
+            else f"{len(topic.fields)} numbers"
+            if topic.fields
+            else "no numbers"
         )
         lines.append(f"  {topic.name}: {topic.count} messages, {'; '.join(schemas)}, {said}")
         if topic.fields and topic.count:
             group, more = _topic(path, topic)
             notes += [note for note in more if note not in notes]
             if group is not None:
-                groups.append((group, "" if all(bare.count(field) == 1 for field in topic.fields) else f"{topic.name}:"))
+                groups.append(
+                    (group, "" if all(bare.count(field) == 1 for field in topic.fields) else f"{topic.name}:")
+                )
                 for channel in topic.channels:
-                    units |= {key[: -len(".unit")]: unit for key, unit in channel.metadata.items() if key.endswith(".unit")}
+                    units |= {
+                        key[: -len(".unit")]: unit
+                        for key, unit in channel.metadata.items()
+                        if key.endswith(".unit")
+                    }
     return lines, groups, units, notes
 
 
 def _topic(path: Path, topic: Topic) -> tuple[Columns | None, list[Note]]:
     shown = topic.fields[:MOST_FIELDS]
-    notes = [Note("fields", "", len(topic.fields), f"{topic.name} has {len(topic.fields)} numbers; the first {MOST_FIELDS} are shown")]
+    notes = [
+        Note(
+            "fields",
+            "",
+            len(topic.fields),
+            f"{topic.name} has {len(topic.fields)} numbers; the first {MOST_FIELDS} are shown",
+        )
+    ]
     try:
         columns, places, _, more = mcap_columns(path, [f"{topic.name}:{field}" for field in shown], "")
     except ValueError as error:
@@ -185,29 +225,51 @@ def _proposal(signals: Sequence[_Signal], groups: Sequence[tuple[Columns, str]])
     taken = [signal._replace(role=_role(signal)) for signal in signals]
     how = "names and ranges"
     if not any(signal.role in ("input", "output") for signal in taken):
-        taken, how = [signal._replace(role=_behaviour(signal)) for signal in signals], "the values alone: look at each line"
+        taken, how = (
+            [signal._replace(role=_behaviour(signal)) for signal in signals],
+            "the values alone: look at each line",
+        )
     mapping, inputs, outputs, names = [], [], [], set()
     for signal in taken:
         if signal.role not in ("input", "output"):
             continue
         name = _name(signal, names)
         unit, scale, offset = _conversion(signal)
-        mapping.append(f"    {name}: {{source: {_yaml(signal.source)}, unit: {unit}, scale: {scale!r}, offset: {offset!r}}}")
+        mapping.append(
+            f"    {name}: {{source: {_yaml(signal.source)}, unit: {unit}, scale: {scale!r}, "
+            f"offset: {offset!r}}}"
+        )
         ours = signal.values[np.isfinite(signal.values)] * scale + offset
         if signal.role == "input":
             high = 100 if ours.max() <= 100 else int(np.ceil(ours.max()))
-            inputs.append(f"    - {{name: {name}, unit: {unit}, low: {min(0, int(np.floor(ours.min())))}, high: {high}}}")
+            inputs.append(
+                f"    - {{name: {name}, unit: {unit}, low: {min(0, int(np.floor(ours.min())))}, "
+                f"high: {high}}}"
+            )
         else:
-            outputs.append(f"    - {{name: {name}, unit: {unit}, reference: {float(np.round(np.median(ours))) + 0.0!r}}}")
+            outputs.append(
+                f"    - {{name: {name}, unit: {unit}, reference: {float(np.round(np.median(ours))) + 0.0!r}}}"
+            )
     if not mapping:
         return ["# no column looks like an input or an output of the machine; write the mapping by hand"]
     left = [signal.source for signal in taken if signal.role == "set-point"]
     lines = [f"# a proposal from {how}", "ingest:", "  mapping:", *mapping]
     lines += [f"# set-points, which a plant's model has no use for: {', '.join(left)}"] if left else []
     lines += (
-        ["# nothing looks like a heater or a motor: map the inputs by hand, a plant cannot be identified without"] if not inputs else []
+        [
+            "# nothing looks like a heater or a motor: map the inputs by hand, "
+            "a plant cannot be identified without"
+        ]
+        if not inputs
+        else []
     )
-    lines += ["plant:", "  inputs:" if inputs else "  inputs: []", *inputs, "  outputs:" if outputs else "  outputs: []", *outputs]
+    lines += [
+        "plant:",
+        "  inputs:" if inputs else "  inputs: []",
+        *inputs,
+        "  outputs:" if outputs else "  outputs: []",
+        *outputs,
+    ]
     return [*lines, f"  sample_time_s: {_sample_time(groups)!r}"]
 
 
@@ -223,7 +285,9 @@ def _role(signal: _Signal) -> str:
     if re.search(_SET_POINT, name):
         return "set-point"
     power = re.search(r"duty|pwm|power|pct|%", name)
-    warm = not power and (re.search(_SURELY_TEMPERATURE, name) or (re.search(_TEMPERATURE, name) and "heater" not in name))
+    warm = not power and (
+        re.search(_SURELY_TEMPERATURE, name) or (re.search(_TEMPERATURE, name) and "heater" not in name)
+    )
     if warm or unit in ("degc", "°c", "k", "°f", "degf"):
         return "output"
     return "input" if unit in ("%", "percent") or re.search(_INPUT, name) else ""
@@ -232,9 +296,19 @@ def _role(signal: _Signal) -> str:
 def _behaviour(signal: _Signal) -> str:
     """Commands rest and jump between few levels; measurements do neither. A counter is none of both."""
     known = signal.values[np.isfinite(signal.values)]
-    if len(known) < 2 or np.ptp(known) == 0 or np.ptp(np.diff(known)) == 0 or re.search(_STAMP, _bare(signal.source)):
+    if (
+        len(known) < 2
+        or np.ptp(known) == 0
+        or np.ptp(np.diff(known)) == 0
+        or re.search(_STAMP, _bare(signal.source))
+    ):
         return ""
-    return "input" if len(np.unique(np.round(known, 1))) <= max(10, len(known) // 100) and not quantisation_step(known) < 0.1 else "output"
+    return (
+        "input"
+        if len(np.unique(np.round(known, 1))) <= max(10, len(known) // 100)
+        and not quantisation_step(known) < 0.1
+        else "output"
+    )
 
 
 def _name(signal: _Signal, names: set[str]) -> str:
@@ -258,7 +332,10 @@ def _conversion(signal: _Signal) -> tuple[str, float, float]:
     bare, unit = _bare(signal.source), signal.unit.casefold()
     known = signal.values[np.isfinite(signal.values)]
     low, high = known.min(), known.max()
-    found = next((ours for pattern, ours in _UNITS if re.search(pattern, bare) or re.search(rf"^{pattern}$", unit)), None)
+    found = next(
+        (ours for pattern, ours in _UNITS if re.search(pattern, bare) or re.search(rf"^{pattern}$", unit)),
+        None,
+    )
     if found is None and unit in ("k", "f"):
         found = ("degC", 1.0, -273.15) if unit == "k" else ("degC", 0.555556, -17.7778)
     if signal.role == "input" and (found is None or found[0] == "percent"):
@@ -274,7 +351,11 @@ def _conversion(signal: _Signal) -> tuple[str, float, float]:
 
 def _yaml(source: str) -> str:
     """A YAML scalar: as it is where it cannot be taken for anything else."""
-    return source if re.fullmatch(r"[A-Za-z_]\w*|/[\w/.:]*\w", source) and ": " not in source else json.dumps(source, ensure_ascii=False)
+    return (
+        source
+        if re.fullmatch(r"[A-Za-z_]\w*|/[\w/.:]*\w", source) and ": " not in source
+        else json.dumps(source, ensure_ascii=False)
+    )
 
 
 def _sample_time(groups: Sequence[tuple[Columns, str]]) -> float:

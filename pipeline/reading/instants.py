@@ -1,4 +1,5 @@
-"""Times that are written as text: ISO 8601, the dates of other countries, times of day; each becomes nanoseconds on one calendar."""
+"""Times that are written as text: ISO 8601, the dates of other countries, times
+of day; each becomes nanoseconds on one calendar."""
 
 import calendar
 import datetime
@@ -15,7 +16,9 @@ _EPOCH = datetime.date(1970, 1, 1).toordinal()
 _MONTHS = {name: i for i, name in enumerate(calendar.month_abbr)}
 _DATE = r"(?P<date>\d{4}(?P<m>[-/.])\d{1,2}(?P=m)\d{1,2}|\d{8}|\d{1,2}(?P<k>[./-])(?:\d{1,2}|[A-Za-z]{3})(?P=k)(?:\d{4}|\d{2}))"
 _TIME = r"(?P<hours>\d+):(?P<minutes>\d\d)(?::(?P<seconds>\d\d)(?:[.,:](?P<fraction>\d+))?)?\s*(?P<half>[AaPp]\.?[Mm]\.?)?"
-_TEXT = re.compile(rf"\s*(?:{_DATE}(?:[T,\s]+|$))?(?:{_TIME})?\s*(?P<zone>Z|z|UTC|GMT|[+-]\d\d(?::?\d\d)?)?\s*$")
+_TEXT = re.compile(
+    rf"\s*(?:{_DATE}(?:[T,\s]+|$))?(?:{_TIME})?\s*(?P<zone>Z|z|UTC|GMT|[+-]\d\d(?::?\d\d)?)?\s*$"
+)
 _PARTS = ("date", "hours", "minutes", "seconds", "fraction", "half", "zone")
 # 20251121130000 and 20251121130000250, as controllers stamp
 _COMPACT = re.compile(r"\s*((?:19|20)\d\d(?:0[1-9]|1[0-2])[0-3]\d)([0-2]\d)([0-5]\d)([0-5]\d)(\d{3})?\s*$")
@@ -23,7 +26,8 @@ EXPECTED = "seconds or ISO 8601 such as 2025-11-21T13:00:00.5"
 
 
 class Instants(NamedTuple):
-    """ns (n,) since 1970, or since midnight where the text has no date; `zoned` where every time names its zone."""
+    """ns (n,) since 1970, or since midnight where the text has no
+    date; `zoned` where every time names its zone."""
 
     ns: np.ndarray
     zoned: bool
@@ -35,7 +39,9 @@ def is_compact(text: str) -> bool:
     return bool(_COMPACT.match(text))
 
 
-def instants(path: Path, name: str, fields: Sequence[str], lines: Sequence[int], *, month_first: bool | None) -> Instants:
+def instants(
+    path: Path, name: str, fields: Sequence[str], lines: Sequence[int], *, month_first: bool | None
+) -> Instants:
     """The instants that `fields` name. `month_first` says how 05/03/2025 is meant; None refuses it.
 
     Raises ValueError with the line for what is no time.
@@ -48,7 +54,8 @@ def instants(path: Path, name: str, fields: Sequence[str], lines: Sequence[int],
         except ValueError as error:
             why = f" ({error}?)" if str(error).startswith(("day", "hours")) else ""
             raise ValueError(
-                f"{path}: line {line}, time {name} should be {EXPECTED} but is {field.strip()[:40]!r}{why}; convert it, or name another column"
+                f"{path}: line {line}, time {name} should be {EXPECTED} but is {field.strip()[:40]!r}{why}; "
+                "convert it, or name another column"
             ) from None
         zoned = zoned and has_zone
     return Instants(found, zoned, dated)
@@ -73,7 +80,11 @@ def _instant(field: str, month_first: bool | None) -> tuple[int, bool, bool]:
     if half:
         hours = hours % 12 + 12 * (half[0] in "Pp")
     ns = ((hours * 60 + minutes) * 60 + seconds) * 10**9 + int(f"{fraction or 0:0<9}"[:9])
-    return ns + (_day(date, month_first) * DAY_NS if date else 0) - _offset_ns(zone or ""), bool(zone), bool(date)
+    return (
+        ns + (_day(date, month_first) * DAY_NS if date else 0) - _offset_ns(zone or ""),
+        bool(zone),
+        bool(date),
+    )
 
 
 def _iso(field: str) -> tuple[int, bool, bool]:
@@ -112,9 +123,13 @@ def _day_and_month(first: int, second: int, mark: str, month_first: bool | None)
 
 
 def month_first(dates: Iterable[str], sample: str) -> bool | None:
-    """How dates such as 05/03/2025 are meant: by one that can be only one of both, or by the am and pm of `sample`; a single day is the same
-    either way. None where that is not known."""
-    pairs = {(int(found[1]), int(found[2])) for date in dates if (found := re.match(r"\s*(\d{1,2})[/-](\d{1,2})[/-]\d", date))}
+    """How dates such as 05/03/2025 are meant: by one that can be only one of both, or by the am and pm of
+    `sample`; a single day is the same either way. None where that is not known."""
+    pairs = {
+        (int(found[1]), int(found[2]))
+        for date in dates
+        if (found := re.match(r"\s*(\d{1,2})[/-](\d{1,2})[/-]\d", date))
+    }
     if any(first > 12 for first, _ in pairs):
         return False
     american = re.search(r"\d\s*[AaPp]\.?[Mm]", sample)
@@ -132,6 +147,7 @@ def _offset_ns(zone: str) -> int:
 
 
 def over_midnight(ns: np.ndarray) -> tuple[np.ndarray, int]:
-    """Times of day made to run on over midnight, and how often they do: a day is added where they fall by more than half of one."""
+    """Times of day made to run on over midnight, and how often they do: a day is
+    added where they fall by more than half of one."""
     midnights = np.cumsum(np.r_[0, np.diff(ns) < -DAY_NS // 2])
     return ns + midnights * DAY_NS, int(midnights[-1])

@@ -1,4 +1,5 @@
-"""Columns out of an MCAP file: which topics have which numbers, and those that are wanted, a chunk at a time."""
+"""Columns out of an MCAP file: which topics have which numbers, and
+those that are wanted, a chunk at a time."""
 
 import itertools
 import re
@@ -10,7 +11,15 @@ import numpy as np
 
 from pipeline.reading.formats import Columns, Growing
 from pipeline.reading.mcap_files import McapFile, Messages
-from pipeline.reading.mcap_messages import Channel, Decode, UnreadableMessage, compressed, decoder, fields, plain
+from pipeline.reading.mcap_messages import (
+    Channel,
+    Decode,
+    UnreadableMessage,
+    compressed,
+    decoder,
+    fields,
+    plain,
+)
 from pipeline.reading.signals import Note, nearest_names
 
 SAMPLES = 20
@@ -23,7 +32,8 @@ _STAMPS = (("sec", "nanosec"), ("sec", "nsec"), ("secs", "nsecs"), ("seconds", "
 
 
 class Topic(NamedTuple):
-    """A topic with its channels, the numbers in its messages, or why they cannot be read, and how many messages were seen."""
+    """A topic with its channels, the numbers in its messages, or why they
+    cannot be read, and how many messages were seen."""
 
     name: str
     channels: list[Channel]
@@ -58,7 +68,13 @@ def topics(path: Path, samples: int | None = SAMPLES) -> dict[str, Topic]:
             looked_at[number] = looked_at.get(number, 0) + len(data)
             if number in file.channels and data:
                 _look(file.channels[number], data, names, unreadable)
-        if samples and file.promised and all(looked_at.get(number, 0) >= min(samples, count) for number, count in file.promised.items()):
+        if (
+            samples
+            and file.promised
+            and all(
+                looked_at.get(number, 0) >= min(samples, count) for number, count in file.promised.items()
+            )
+        ):
             break
     counts = file.counts if samples is None or file.promised is None else file.promised
     found: dict[str, Topic] = {}
@@ -68,11 +84,15 @@ def topics(path: Path, samples: int | None = SAMPLES) -> dict[str, Topic]:
         before = found.get(channel.topic, Topic(channel.topic, [], [], "", 0))
         together = list(dict.fromkeys([*before.fields, *names.get(number, ())]))
         why = unreadable.get(number, before.unreadable)
-        found[channel.topic] = Topic(channel.topic, [*before.channels, channel], together, why, before.count + counts.get(number, 0))
+        found[channel.topic] = Topic(
+            channel.topic, [*before.channels, channel], together, why, before.count + counts.get(number, 0)
+        )
     return found
 
 
-def _look(channel: Channel, data: Sequence[bytes], names: dict[int, dict[str, None]], unreadable: dict[int, str]) -> None:
+def _look(
+    channel: Channel, data: Sequence[bytes], names: dict[int, dict[str, None]], unreadable: dict[int, str]
+) -> None:
     """Adds the numbers that are in `data` to the names of the channel, or why they cannot be read."""
     try:
         names.setdefault(channel.id, {}).update(dict.fromkeys(fields(channel, data)))
@@ -81,7 +101,8 @@ def _look(channel: Channel, data: Sequence[bytes], names: dict[int, dict[str, No
 
 
 def resolve(path: Path, source: str, found: dict[str, Topic]) -> tuple[str, str]:
-    """(topic, field) of "/topic:field", or of a field's bare name that only one topic has. Raises ValueError with the nearest names."""
+    """(topic, field) of "/topic:field", or of a field's bare name that only one
+    topic has. Raises ValueError with the nearest names."""
     for topic in found.values():
         if source.startswith(f"{topic.name}:"):
             field = source[len(topic.name) + 1 :]
@@ -94,7 +115,8 @@ def resolve(path: Path, source: str, found: dict[str, Topic]) -> tuple[str, str]
         return having[0], source
     if having:
         raise ValueError(
-            f"{path}: {len(having)} topics have a field {source!r} ({', '.join(having)}); write which, as in {having[0]}:{source}"
+            f"{path}: {len(having)} topics have a field {source!r} ({', '.join(having)}); write which, "
+            f"as in {having[0]}:{source}"
         )
     names = [f"{topic.name}:{field}" for topic in found.values() for field in topic.fields]
     raise ValueError(f"{path}: no message has a number {source!r}; {nearest_names(source, names)}")
@@ -111,10 +133,11 @@ def _element(field: str, known: Sequence[str]) -> bool:
 def mcap_columns(
     path: Path, sources: Sequence[str], time: str
 ) -> tuple[list[Columns], dict[str, tuple[str, str]], dict[str, int], list[Note]]:
-    """The columns of each topic that `sources` need, {source: (topic, field)}, messages of each topic, and notes.
+    """The columns of each topic that `sources` need, {source: (topic,
+    field)}, messages of each topic, and notes.
 
-    The clock is log_time, or publish_time, or a field of each topic such as header.stamp. Raises ValueError for what is not there and for
-    what has no whole chunk.
+    The clock is log_time, or publish_time, or a field of each topic such as header.stamp. Raises ValueError
+    for what is not there and for what has no whole chunk.
     """
     places, found = _places(path, sources)
     wanted = {}
@@ -134,7 +157,10 @@ def mcap_columns(
             need = wanted[channel.topic]
             if number not in decoders:
                 decoders[number] = _decoder(path, channel, [*need.fields, *need.clock])
-                parts[number] = Growing([np.int64, *[float] * len(need.fields)], min((file.promised or {}).get(number, 0), MOST_EXPECTED))
+                parts[number] = Growing(
+                    [np.int64, *[float] * len(need.fields)],
+                    min((file.promised or {}).get(number, 0), MOST_EXPECTED),
+                )
             times, values, dropped = _numbers(path, channel, decoders[number], messages, need, time)
             bad[channel.topic] = bad.get(channel.topic, 0) + dropped
             parts[number].append(times, *values.T)
@@ -147,13 +173,22 @@ def mcap_columns(
     notes = file.notes()
     for topic, count in bad.items():
         if count:
-            notes.append(Note("unreadable", "", count, f"{count} messages of {topic} are not what its schema says and were left out"))
+            notes.append(
+                Note(
+                    "unreadable",
+                    "",
+                    count,
+                    f"{count} messages of {topic} are not what its schema says and were left out",
+                )
+            )
     for topic, count in backwards.items():
         if count > OUT_OF_ORDER * counts[topic]:
-            message = (
-                f"the publish times of {topic} run back {count} times in {counts[topic]} messages: two devices with clocks of their own"
+            message = f"the publish times of {topic} run back {count} times in {counts[topic]} messages: two devices with clocks of their own"
+            notes.append(
+                Note(
+                    "mixed", "", count, f"{message} seem to publish it; record each under a topic of its own"
+                )
             )
-            notes.append(Note("mixed", "", count, f"{message} seem to publish it; record each under a topic of its own"))
     columns = [_join(path, need, file, parts, notes, bad) for need in wanted.values()]
     return columns, places, counts, notes
 
@@ -168,7 +203,10 @@ def _places(path: Path, sources: Sequence[str]) -> tuple[dict[str, tuple[str, st
             pass
         notes = [note.message for note in file.notes() if note.kind in ("damage", "truncated")]
         why = "; ".join([*reasons, *notes][:3]) or "its messages hold text or nothing"
-        raise ValueError(f"{path}: no topic with numbers could be read ({why}); record numeric topics, or copy the recording again")
+        raise ValueError(
+            f"{path}: no topic with numbers could be read ({why}); record numeric topics, "
+            "or copy the recording again"
+        )
     try:
         return {source: resolve(path, source, found) for source in sources}, found
     except ValueError:
@@ -187,15 +225,24 @@ def _clock(path: Path, topic: Topic, time: str) -> list[str]:
         names = [f"{time}.{part}" for part in parts]
         if all(name in topic.fields for name in names):
             return names
-    known = [name.rpartition(".")[0] for name in topic.fields if name.endswith(tuple(f".{part}" for part, _ in _STAMPS))]
-    raise ValueError(f"{path}: topic {topic.name} has no time {time!r}; {nearest_names(time, ['log_time', 'publish_time', *known])}")
+    known = [
+        name.rpartition(".")[0]
+        for name in topic.fields
+        if name.endswith(tuple(f".{part}" for part, _ in _STAMPS))
+    ]
+    raise ValueError(
+        f"{path}: topic {topic.name} has no time {time!r}; "
+        f"{nearest_names(time, ['log_time', 'publish_time', *known])}"
+    )
 
 
 def _decoder(path: Path, channel: Channel, names: Sequence[str]) -> Decode:
     try:
         return decoder(channel, names)
     except ValueError as error:
-        raise ValueError(f"{path}: topic {channel.topic} cannot be read because {error}; map another topic") from None
+        raise ValueError(
+            f"{path}: topic {channel.topic} cannot be read because {error}; map another topic"
+        ) from None
 
 
 def _numbers(
@@ -220,7 +267,9 @@ def _numbers(
             else stamp[:, 0].astype(np.int64) * 10**9 + stamp[:, 1].astype(np.int64)
         )
     else:
-        times = np.array(messages.publish_time if time == "publish_time" else messages.log_time, np.uint64).astype(np.int64)
+        times = np.array(
+            messages.publish_time if time == "publish_time" else messages.log_time, np.uint64
+        ).astype(np.int64)
         times = times if kept is None else times[kept]
     return times, values[:, : len(need.fields)], 0 if kept is None else len(messages.data) - len(kept)
 
@@ -236,23 +285,37 @@ def _one_by_one(decode: Decode, data: Sequence[bytes], width: int) -> tuple[np.n
     return np.concatenate(rows), kept
 
 
-def _join(path: Path, need: _Wanted, file: McapFile, parts: dict[int, Growing], notes: list[Note], bad: dict[str, int]) -> Columns:
-    """The topic's channels one behind the other; two that run at the same time are two devices under one name."""
+def _join(
+    path: Path,
+    need: _Wanted,
+    file: McapFile,
+    parts: dict[int, Growing],
+    notes: list[Note],
+    bad: dict[str, int],
+) -> Columns:
+    """The topic's channels one behind the other; two that run at the
+    same time are two devices under one name."""
     pieces = []
     for number in [number for number in parts if file.channels[number].topic == need.topic]:
         time, *values = parts.pop(number).finished()
         pieces.append((number, time, values))
     pieces = sorted((piece for piece in pieces if len(piece[1])), key=lambda piece: piece[1].min())
     if not pieces:
-        why = f"all of its {bad[need.topic]} messages are not what its schema says" if bad.get(need.topic) else "it has no whole message"
+        why = (
+            f"all of its {bad[need.topic]} messages are not what its schema says"
+            if bad.get(need.topic)
+            else "it has no whole message"
+        )
         said = "; ".join(note.message for note in notes[:2])
         raise ValueError(
-            f"{path}: nothing of topic {need.topic} could be read because {why}{f' ({said})' if said else ''}; copy the recording again"
+            f"{path}: nothing of topic {need.topic} could be read because "
+            f"{why}{f' ({said})' if said else ''}; copy the recording again"
         )
     for before, after in itertools.pairwise(pieces):
         if after[1].min() <= before[1].max():
             raise ValueError(
-                f"{path}: topic {need.topic} comes from channels {before[0]} and {after[0]} at the same time, as if two"
+                f"{path}: topic {need.topic} comes from channels {before[0]} and {after[0]} at the "
+                "same time, as if two"
                 f" devices had one name; record each"
                 " under a topic of its own"
             )
@@ -262,7 +325,8 @@ def _join(path: Path, need: _Wanted, file: McapFile, parts: dict[int, Growing], 
                 "channels",
                 "",
                 len(pieces),
-                f"topic {need.topic} was recorded by {len(pieces)} channels one after the other, which were joined",
+                f"topic {need.topic} was recorded by {len(pieces)} channels one after the "
+                "other, which were joined",
             )
         )
         time = np.concatenate([piece[1] for piece in pieces])

@@ -1,8 +1,8 @@
-"""Walks an MCAP file: chunks and their CRCs; what is whole comes out a chunk at a time, what is damaged is left out, counted and named by
-its offset.
+"""Walks an MCAP file: chunks and their CRCs; what is whole comes out a chunk at a time, what is damaged is
+left out, counted and named by its offset.
 
-The mcap package's reader takes 7 us a message and stops at the first damage; here it is 3 us, and the next chunk is
-looked for.
+The mcap package's reader takes 7 us a message and stops at the first damage;
+here it is 3 us, and the next chunk is looked for.
 """
 
 import struct
@@ -41,7 +41,8 @@ GROUP_BYTES = 1 << 20
 
 
 class Messages(NamedTuple):
-    """Messages of one channel in the order of the file: times in ns, and the bytes of each (none where the channel is not wanted)."""
+    """Messages of one channel in the order of the file: times in ns, and the bytes
+    of each (none where the channel is not wanted)."""
 
     log_time: list[int]
     publish_time: list[int]
@@ -55,7 +56,8 @@ class _Damage(NamedTuple):
 
 
 class McapFile:
-    """Walks a file once; remembers schemas, channels, counts and damage on the way. Raises ValueError where the file is no MCAP."""
+    """Walks a file once; remembers schemas, channels, counts and damage on the
+    way. Raises ValueError where the file is no MCAP."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -93,7 +95,11 @@ class McapFile:
         summary = stream.read(end - start)
         found = zlib.crc32(summary + tail[: FOOTER_RECORD.size - 4])
         if crc and found != crc:
-            self._remark("damage", 1, f"the summary at byte {start} has CRC 0x{found:08x} instead of 0x{crc:08x} and was not used")
+            self._remark(
+                "damage",
+                1,
+                f"the summary at byte {start} has CRC 0x{found:08x} instead of 0x{crc:08x} and was not used",
+            )
             return
         try:
             for opcode, record in records(summary):
@@ -121,12 +127,15 @@ class McapFile:
             topic, pos = string(record, 4)
             encoding, pos = string(record, pos)
             metadata, _ = prefixed(record, pos)
-            self.channels[number] = Channel(number, topic, encoding, pairs(metadata), *self.schemas.get(schema, ("", "", b"")))
+            self.channels[number] = Channel(
+                number, topic, encoding, pairs(metadata), *self.schemas.get(schema, ("", "", b""))
+            )
 
     # ---- the data
 
     def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[dict[int, Messages]]:
-        """{channel: Messages} of each chunk, or of a megabyte of messages outside chunks; only wanted channels come with data."""
+        """{channel: Messages} of each chunk, or of a megabyte of messages
+        outside chunks; only wanted channels come with data."""
         with self.path.open("rb", buffering=1 << 16) as stream:
             stream.seek(8)
             crc, group, grouped = zlib.crc32(MAGIC), {}, 0
@@ -188,7 +197,8 @@ class McapFile:
         return ""
 
     def _unsound_body(self, opcode: int, record: bytes) -> str:
-        """Whether the lengths inside agree with the record's own; where they do not, the next record is not where it seems."""
+        """Whether the lengths inside agree with the record's own; where
+        they do not, the next record is not where it seems."""
         try:
             if opcode == CHUNK:
                 start = CHUNK_HEAD.size + CHUNK_HEAD.unpack_from(record)[4]
@@ -207,13 +217,23 @@ class McapFile:
     def _cut_off(self, offset: int, reason: str) -> None:
         left = self.size - offset
         if self.has_footer:
-            self._remark("damage", 1, f"from byte {offset} on, where {reason}, the last {left} bytes hold no whole chunk and were left out")
+            self._remark(
+                "damage",
+                1,
+                f"from byte {offset} on, where {reason}, the last {left} bytes hold no whole "
+                "chunk and were left out",
+            )
         else:
             self._remark(
-                "truncated", 1, f"the file breaks off: from byte {offset} on, its last {left} bytes hold no whole chunk and were left out"
+                "truncated",
+                1,
+                f"the file breaks off: from byte {offset} on, its last {left} bytes hold no whole "
+                "chunk and were left out",
             )
 
-    def _chunk(self, offset: int, record: bytes, wanted: Callable[[Channel], bool]) -> dict[int, Messages] | None:
+    def _chunk(
+        self, offset: int, record: bytes, wanted: Callable[[Channel], bool]
+    ) -> dict[int, Messages] | None:
         first, last, size, crc, length = CHUNK_HEAD.unpack_from(record)
         start = CHUNK_HEAD.size + length
         try:
@@ -236,17 +256,29 @@ class McapFile:
         self._losing = None
         self.chunks += 1
         self.unchecked += not crc
-        times = [time for messages in batch.values() for time in (min(messages.log_time), max(messages.log_time))]
+        times = [
+            time for messages in batch.values() for time in (min(messages.log_time), max(messages.log_time))
+        ]
         if times and (min(times), max(times)) != (first, last):
-            message = (
-                f"the chunk at byte {offset} says {first} to {last} ns but has messages from {min(times)} to {max(times)} ns; its contents"
+            message = f"the chunk at byte {offset} says {first} to {last} ns but has messages from {min(times)} to {max(times)} ns; its contents"
+            self._remark(
+                "damage", 1, f"{message} {'agree with their CRC and' if crc else 'have no CRC and'} were kept"
             )
-            self._remark("damage", 1, f"{message} {'agree with their CRC and' if crc else 'have no CRC and'} were kept")
         return batch
 
-    def _split(self, data: bytes, begin: int, wanted: Callable[[Channel], bool], batch: dict[int, Messages]) -> None:
-        """Sorts the records in data[begin:] by channel into `batch`; raises UnreadableMessage where one runs over the end."""
-        pos, end, unpack, current, messages, kept = begin, len(data), MESSAGE_HEAD.unpack_from, -1, None, False
+    def _split(
+        self, data: bytes, begin: int, wanted: Callable[[Channel], bool], batch: dict[int, Messages]
+    ) -> None:
+        """Sorts the records in data[begin:] by channel into `batch`;
+        raises UnreadableMessage where one runs over the end."""
+        pos, end, unpack, current, messages, kept = (
+            begin,
+            len(data),
+            MESSAGE_HEAD.unpack_from,
+            -1,
+            None,
+            False,
+        )
         while pos < end:
             if data[pos] != MESSAGE:
                 opcode, length = RECORD_HEAD.unpack_from(data, pos)
@@ -264,7 +296,9 @@ class McapFile:
                     messages.publish_time.append(publish_time)
                     messages.data.append(data[pos + 31 : following])
             if following > end or (data[pos] == MESSAGE and length < 22):
-                raise UnreadableMessage(f"a record at byte {pos - begin} of its contents has length {length} and does not fit")
+                raise UnreadableMessage(
+                    f"a record at byte {pos - begin} of its contents has length {length} and does not fit"
+                )
             pos = following
 
     def _counted(self, batch: dict[int, Messages]) -> dict[int, Messages]:
@@ -279,12 +313,16 @@ class McapFile:
             return
         if self.unchunked or self.unchecked:
             raise ValueError(
-                f"{self.path}: the data section's CRC should be 0x{expected:08x} but is 0x{found:08x}, and its messages"
+                f"{self.path}: the data section's CRC should be 0x{expected:08x} but is "
+                f"0x{found:08x}, and its messages"
                 f" have no CRC of their own that would"
                 " tell which are damaged; copy the recording again from the machine"
             )
         self._remark(
-            "damage", 1, f"the data section's CRC is 0x{found:08x} instead of 0x{expected:08x}; all chunks are whole, so it is beside them"
+            "damage",
+            1,
+            f"the data section's CRC is 0x{found:08x} instead of 0x{expected:08x}; all chunks are whole, "
+            "so it is beside them",
         )
 
     # ---- what to say
@@ -295,13 +333,22 @@ class McapFile:
         for damage in self.damage:
             lost = f"{damage.lost[0]} messages" if damage.lost[0] else "messages, how many is not known,"
             notes.append(
-                Note("damage", "", 1, f"the chunk or record at byte {damage.offset} was left out with its {lost} because {damage.reason}")
+                Note(
+                    "damage",
+                    "",
+                    1,
+                    f"the chunk or record at byte {damage.offset} was left out with its {lost} "
+                    f"because {damage.reason}",
+                )
             )
         notes += self.remarks
         if self.undeclared:
             notes.append(
                 Note(
-                    "damage", "", self.undeclared, f"{self.undeclared} messages are of channels that are declared nowhere and were left out"
+                    "damage",
+                    "",
+                    self.undeclared,
+                    f"{self.undeclared} messages are of channels that are declared nowhere and were left out",
                 )
             )
         total, lost = sum(self.counts.values()), sum(damage.lost[0] for damage in self.damage)
@@ -309,14 +356,26 @@ class McapFile:
         if promised != total + lost:
             message = f"the summary counts {promised} messages but {total} were found"
             notes.append(
-                Note("damage", "", abs(promised - total - lost), f"{message}{f' and {lost} are lost with damaged chunks' if lost else ''}")
+                Note(
+                    "damage",
+                    "",
+                    abs(promised - total - lost),
+                    f"{message}{f' and {lost} are lost with damaged chunks' if lost else ''}",
+                )
             )
         if not self.has_footer:
             message = f"the file has no footer: it was cut off or never closed; {self.chunks} whole chunks"
             notes.append(Note("truncated", "", total, f"{message} and {total} messages were recovered"))
         if (self.unchecked or self.unchunked) and not self.verified:
-            what = f"{self.unchecked} chunks" if self.unchecked else f"{self.unchunked} messages outside chunks"
+            what = (
+                f"{self.unchecked} chunks" if self.unchecked else f"{self.unchunked} messages outside chunks"
+            )
             notes.append(
-                Note("unchecked", "", self.unchecked or self.unchunked, f"{what} have no CRC, so damage in them would not be seen")
+                Note(
+                    "unchecked",
+                    "",
+                    self.unchecked or self.unchunked,
+                    f"{what} have no CRC, so damage in them would not be seen",
+                )
             )
         return notes

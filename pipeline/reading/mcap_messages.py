@@ -1,5 +1,5 @@
-"""Numbers out of the messages of an MCAP channel, whatever they are written in: ROS 2 CDR, ROS 1, protobuf, JSON; a message may be
-compressed by itself."""
+"""Numbers out of the messages of an MCAP channel, whatever they are written in: ROS 2 CDR, ROS 1, protobuf,
+JSON; a message may be compressed by itself."""
 
 import json
 import operator
@@ -49,7 +49,9 @@ def fields(channel: Channel, samples: Sequence[bytes]) -> list[str]:
         return list(names)
     first = samples[0] if samples else None
     if kind == "protobuf":
-        return protobuf_messages.fields(protobuf_messages.message_types(channel.schema), channel.schema_name, first)
+        return protobuf_messages.fields(
+            protobuf_messages.message_types(channel.schema), channel.schema_name, first
+        )
     version = 2 if kind == "cdr" else 1
     return ros_messages.fields(_layout(channel, version), first, version=version)
 
@@ -57,13 +59,16 @@ def fields(channel: Channel, samples: Sequence[bytes]) -> list[str]:
 def decoder(channel: Channel, names: Sequence[str]) -> Decode:
     """A function from n messages to their numbers (n, len(names)), NaN where a message has none.
 
-    It raises UnreadableMessage for a message that is not what the channel says, and ValueError for text where a number is wanted.
+    It raises UnreadableMessage for a message that is not what the channel
+    says, and ValueError for text where a number is wanted.
     """
     kind = _kind(channel)
     if kind == "json":
         return _json_decoder(names)
     if kind == "protobuf":
-        return protobuf_messages.decoder(protobuf_messages.message_types(channel.schema), channel.schema_name, names)
+        return protobuf_messages.decoder(
+            protobuf_messages.message_types(channel.schema), channel.schema_name, names
+        )
     version = 2 if kind == "cdr" else 1
     return ros_messages.decoder(_layout(channel, version), names, version=version)
 
@@ -102,7 +107,8 @@ def plain(message: bytes) -> bytes:
 
 
 def decompress(method: str, data: bytes, size: int | None) -> bytes:
-    """The bytes of a zstd or lz4 frame, `size` of them if that is known. Raises UnreadableMessage where they are damaged.
+    """The bytes of a zstd or lz4 frame, `size` of them if that is
+    known. Raises UnreadableMessage where they are damaged.
 
     What the frame itself says of its size is compared first: after one flipped bit it may ask for terabytes.
     """
@@ -125,7 +131,8 @@ def decompress(method: str, data: bytes, size: int | None) -> bytes:
             raise UnreadableMessage(f"the compression {method!r} is not known; zstd and lz4 are")
     except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError, OverflowError) as error:
         raise UnreadableMessage(
-            f"{method} data that cannot be unpacked ({str(error).splitlines()[0] if str(error) else 'too large'})"
+            f"{method} data that cannot be unpacked "
+            f"({str(error).splitlines()[0] if str(error) else 'too large'})"
         ) from None
     if size is not None and len(found) != size:
         raise UnreadableMessage(f"{method} data that unpack to {len(found)} bytes, not {size}")
@@ -134,7 +141,9 @@ def decompress(method: str, data: bytes, size: int | None) -> bytes:
 
 def _check_size(said: int | None, size: int | None) -> None:
     if said is not None and (said > LARGEST_MESSAGE if size is None else said != size):
-        raise UnreadableMessage(f"data that say they unpack to {said} bytes{'' if size is None else f', not {size}'}")
+        raise UnreadableMessage(
+            f"data that say they unpack to {said} bytes{'' if size is None else f', not {size}'}"
+        )
 
 
 # ---- JSON
@@ -168,7 +177,9 @@ def _promised(schema, prefix: str, depth: int) -> list[str]:
     names = []
     for name, inner in properties.items():
         kind = inner.get("type") if isinstance(inner, dict) else None
-        if kind in ("number", "integer", "boolean") or (isinstance(kind, list) and {"number", "integer"} & set(map(str, kind))):
+        if kind in ("number", "integer", "boolean") or (
+            isinstance(kind, list) and {"number", "integer"} & set(map(str, kind))
+        ):
             names.append(prefix + name)
         elif kind == "object":
             names += _promised(inner, f"{prefix}{name}.", depth + 1)
@@ -197,13 +208,19 @@ def _json_decoder(names: Sequence[str]) -> Decode:
     def decode(messages: list[bytes]) -> np.ndarray:
         documents = [_document(message) for message in messages]
         try:
-            numbers = np.array([at_top(document) for document in documents]).reshape(len(messages), len(names))
+            numbers = np.array([at_top(document) for document in documents]).reshape(
+                len(messages), len(names)
+            )
         except (KeyError, TypeError, IndexError, ValueError):
             numbers = None
         # other kinds are text, null, or a mixture; they are looked at one by one
         if numbers is None or numbers.dtype.kind not in "fiub":
             numbers = np.array(
-                [[_value(document, name, path) for name, path in zip(names, steps, strict=True)] for document in documents], float
+                [
+                    [_value(document, name, path) for name, path in zip(names, steps, strict=True)]
+                    for document in documents
+                ],
+                float,
             )
         return numbers.astype(float, copy=False)
 
@@ -224,7 +241,9 @@ def _value(document, name: str, steps: tuple) -> float:
             return float(value)
         except OverflowError:
             return np.inf
-    raise ValueError(f"{name} should be a number but is {json.dumps(value)[:60]}; map another field, or write numbers")
+    raise ValueError(
+        f"{name} should be a number but is {json.dumps(value)[:60]}; map another field, or write numbers"
+    )
 
 
 def _by_prefix(document, name: str):

@@ -10,16 +10,29 @@ from typing import BinaryIO
 from pipeline.reading.mcap_messages import UnreadableMessage
 
 MAGIC = b"\x89MCAP0\r\n"
-HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, STATISTICS, DATA_END = 1, 2, 3, 4, 5, 6, 7, 0x0B, 0x0F
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, STATISTICS, DATA_END = (
+    1,
+    2,
+    3,
+    4,
+    5,
+    6,
+    7,
+    0x0B,
+    0x0F,
+)
 RECORD_HEAD = struct.Struct("<BQ")
 MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 CHUNK_HEAD = struct.Struct("<QQQII")
 FOOTER_RECORD = struct.Struct("<BQQQI")
-_CHUNK_START = re.compile(rb"\x06(.{8}).{28}(\x00\x00\x00\x00|\x03\x00\x00\x00lz4|\x04\x00\x00\x00zstd)(.{8})", re.DOTALL)
+_CHUNK_START = re.compile(
+    rb"\x06(.{8}).{28}(\x00\x00\x00\x00|\x03\x00\x00\x00lz4|\x04\x00\x00\x00zstd)(.{8})", re.DOTALL
+)
 
 
 def check_magic(path: Path, start: bytes) -> None:
-    """Raises ValueError where the first 8 bytes are not MCAP's, saying so where text-mode copying converted them."""
+    """Raises ValueError where the first 8 bytes are not MCAP's, saying
+    so where text-mode copying converted them."""
     if start[:8] == MAGIC:
         return
     converted = {
@@ -31,12 +44,14 @@ def check_magic(path: Path, start: bytes) -> None:
     for damaged, how in converted.items():
         if start.startswith(damaged):
             raise ValueError(
-                f"{path}: the bytes at offset 0 should be {MAGIC.hex(' ')} but are {start[:8].hex(' ')}: line ends were"
+                f"{path}: the bytes at offset 0 should be {MAGIC.hex(' ')} but are "
+                f"{start[:8].hex(' ')}: line ends were"
                 f" converted ({how}), which destroys the"
                 " whole file; copy it again as binary (*.mcap binary in .gitattributes)"
             )
     raise ValueError(
-        f"{path}: the bytes at offset 0 should be MCAP's {MAGIC.hex(' ')} but are {start[:8].hex(' ')}; copy the recording again as binary"
+        f"{path}: the bytes at offset 0 should be MCAP's {MAGIC.hex(' ')} but are {start[:8].hex(' ')}; "
+        "copy the recording again as binary"
     )
 
 
@@ -48,7 +63,11 @@ def next_chunk(stream: BinaryIO, offset: int) -> int | None:
     with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content:
         pos = offset
         while found := _CHUNK_START.search(content, pos):
-            length, method, held = struct.unpack("<Q", found[1])[0], len(found[2]), struct.unpack("<Q", found[3])[0]
+            length, method, held = (
+                struct.unpack("<Q", found[1])[0],
+                len(found[2]),
+                struct.unpack("<Q", found[3])[0],
+            )
             if length == 28 + method + 8 + held and found.start() + 9 + length <= size:
                 return found.start()
             pos = found.start() + 1
@@ -56,7 +75,8 @@ def next_chunk(stream: BinaryIO, offset: int) -> int | None:
 
 
 def records(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """(opcode, body) of records one behind the other. Raises UnreadableMessage where one runs over the end."""
+    """(opcode, body) of records one behind the other. Raises
+    UnreadableMessage where one runs over the end."""
     pos = 0
     while pos < len(data):
         opcode, length = RECORD_HEAD.unpack_from(data, pos)

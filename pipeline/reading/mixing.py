@@ -1,41 +1,55 @@
-"""Two devices that write under one name: samples that jump to and fro between two courses, and intervals that alternate."""
+"""Two devices that write under one name: samples that jump to and fro
+between two courses, and intervals that alternate."""
 
 import numpy as np
 
-# windows of so many samples, half overlapping: the short ones for devices that write in turn, the long ones for those that write in batches
+# windows of so many samples, half overlapping: the short ones for devices that write in
+# turn, the long ones for those that write in batches
 WINDOWS = (32, 128)
 LEAST_SHARE, LEAST_CROSSINGS, LEAST_WINDOWS = 1 / 8, 4, 3
-# between the two courses nothing lies: a gap three times any other, and three steps of a coarse sensor, of which none is coarser than 2
+# between the two courses nothing lies: a gap three times any other, and three steps of
+# a coarse sensor, of which none is coarser than 2
 GAP, COARSEST_STEP = 3.0, 2.0
 WINDOWS_AT_ONCE = 1000
 
 
 def mixed(values: np.ndarray) -> list[tuple[int, int, float]]:
-    """(first, last, distance) of the stretches of values (n,) in which the samples belong to two courses at once, `distance` apart.
+    """(first, last, distance) of the stretches of values (n,) in which the
+    samples belong to two courses at once, `distance` apart.
 
-    In each window the best parabola is taken off and the rest sorted: it falls into two groups with a gap between, and the samples change
-    group again and again, as a step (once) or a spike (twice) does not.
+    In each window the best parabola is taken off and the rest sorted: it falls into two groups with a gap
+    between, and the samples change group again and again, as a step (once) or a spike (twice) does not.
     """
     known = np.flatnonzero(np.isfinite(values))
     y = values[known]
-    # over one sample and over more: of two devices that write in turn every change from sample to sample is a jump
+    # over one sample and over more: of two devices that write in turn
+    # every change from sample to sample is a jump
     step = min(COARSEST_STEP, *(_least_change(y, lag) for lag in (1, 2, 3)))
     suspect, distance = np.zeros(len(y), bool), np.zeros(len(y), np.float32)
     for size in WINDOWS:
         if len(y) < size:
             continue
         starts = np.unique(np.r_[np.arange(0, len(y) - size, size // 2), len(y) - size])
-        gap = np.concatenate([_gaps(y, part, size, step) for part in np.array_split(starts, -(-len(starts) // WINDOWS_AT_ONCE))])
+        gap = np.concatenate(
+            [
+                _gaps(y, part, size, step)
+                for part in np.array_split(starts, -(-len(starts) // WINDOWS_AT_ONCE))
+            ]
+        )
         hit = _in_a_row(gap > 0, min(LEAST_WINDOWS, len(gap)))
         for start, width in zip(starts[hit], gap[hit], strict=True):
             suspect[start : start + size] = True
             distance[start : start + size] = width
     edges = np.flatnonzero(np.diff(np.r_[False, suspect, False].astype(np.int8)))
-    return [(int(known[a]), int(known[b - 1]), float(np.median(distance[a:b]))) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return [
+        (int(known[a]), int(known[b - 1]), float(np.median(distance[a:b])))
+        for a, b in zip(edges[::2], edges[1::2], strict=True)
+    ]
 
 
 def _least_change(y: np.ndarray, lag: int) -> float:
-    """The hundredth part of the changes is no larger: one step of a coarse sensor, next to nothing of a fine one."""
+    """The hundredth part of the changes is no larger: one step of a
+    coarse sensor, next to nothing of a fine one."""
     changes = np.abs(y[lag:] - y[:-lag])
     changes = changes[changes > 0]
     return float(np.percentile(changes, 1)) if len(changes) else np.inf
@@ -53,7 +67,9 @@ def _gaps(y: np.ndarray, starts: np.ndarray, size: int, step: float) -> np.ndarr
     gap, middle = between[rows, at], (ordered[rows, at] + ordered[rows, at + 1]) / 2
     between[rows, at] = 0
     crossings = np.count_nonzero(np.diff(rest > middle[:, None], axis=1), axis=1)
-    return np.where((gap > GAP * between.max(1)) & (gap > GAP * step) & (crossings >= LEAST_CROSSINGS), gap, 0.0)
+    return np.where(
+        (gap > GAP * between.max(1)) & (gap > GAP * step) & (crossings >= LEAST_CROSSINGS), gap, 0.0
+    )
 
 
 def _in_a_row(hit: np.ndarray, least: int) -> np.ndarray:

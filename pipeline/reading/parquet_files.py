@@ -7,7 +7,17 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline.reading.formats import Column, Columns, Growing, column_place, every, forward, is_time_name, seconds, time_column
+from pipeline.reading.formats import (
+    Column,
+    Columns,
+    Growing,
+    column_place,
+    every,
+    forward,
+    is_time_name,
+    seconds,
+    time_column,
+)
 from pipeline.reading.signals import Note
 
 ROWS_AT_ONCE = 50_000
@@ -20,7 +30,8 @@ def _parquet(path: Path) -> pq.ParquetFile:
         return pq.ParquetFile(path, page_checksum_verification=True, pre_buffer=False, buffer_size=1 << 16)
     except (OSError, pa.ArrowException) as error:
         raise ValueError(
-            f"{path} is not a whole Parquet file ({_first_line(error)}); its index is at its end, so copy the recording again"
+            f"{path} is not a whole Parquet file ({_first_line(error)}); its index is at its end, "
+            "so copy the recording again"
         ) from None
 
 
@@ -35,14 +46,25 @@ def _flat(table: pa.Table) -> pa.Table:
 
 
 def _is_numeric(kind: pa.DataType) -> bool:
-    return pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind) or pa.types.is_decimal(kind)
+    return (
+        pa.types.is_integer(kind)
+        or pa.types.is_floating(kind)
+        or pa.types.is_boolean(kind)
+        or pa.types.is_decimal(kind)
+    )
 
 
 def parquet_columns(path: Path) -> list[Column]:
     """The columns of a Parquet file; of a structure its parts as "a.b"."""
     columns = []
     for name, field in _leaves(_parquet(path).schema_arrow, ""):
-        kind = "number" if _is_numeric(field.type) else "time" if pa.types.is_timestamp(field.type) else str(field.type)
+        kind = (
+            "number"
+            if _is_numeric(field.type)
+            else "time"
+            if pa.types.is_timestamp(field.type)
+            else str(field.type)
+        )
         columns.append(Column(name, kind, (field.metadata or {}).get(b"unit", b"").decode(errors="replace")))
     return columns
 
@@ -56,46 +78,62 @@ def _leaves(fields: pa.Schema | pa.StructType, prefix: str) -> Iterator[tuple[st
 
 
 def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns, list[Note]]:
-    """The wanted columns, NaN where a value is null. Raises ValueError for a missing column, one that is no number, or a damaged file."""
+    """The wanted columns, NaN where a value is null. Raises ValueError for a missing
+    column, one that is no number, or a damaged file."""
     file, columns = _parquet(path), parquet_columns(path)
     names = [column.name for column in columns]
     interval = every(time)
     clock = ""
     if not interval:
         stamps = [column.name for column in columns if column.type == "time"]
-        clock = stamps[0] if not time and stamps and all(not is_time_name(name) for name in names) else time_column(path, names, time)
+        clock = (
+            stamps[0]
+            if not time and stamps and all(not is_time_name(name) for name in names)
+            else time_column(path, names, time)
+        )
     for name in wanted:
         column = columns[column_place(path, names, name)]
         if column.type != "number":
             raise ValueError(
-                f"{path}: column {name} should hold numbers but is of type {column.type}; write numbers, or map another column"
+                f"{path}: column {name} should hold numbers but is of type {column.type}; write numbers, "
+                "or map another column"
             )
     read = list(dict.fromkeys([*wanted, *([clock] if clock else [])]))
     kinds = {column.name: np.int64 if column.type == "time" else float for column in columns}
     parts = Growing([kinds[name] for name in read], min(file.metadata.num_rows, MOST_EXPECTED))
     try:
         for batch in file.iter_batches(
-            ROWS_AT_ONCE, columns=sorted({name.split(".")[0] if "." in name else name for name in read} | set(read))
+            ROWS_AT_ONCE,
+            columns=sorted({name.split(".")[0] if "." in name else name for name in read} | set(read)),
         ):
             table = _flat(pa.Table.from_batches([batch]))
             parts.append(*(_array(path, name, table[name], clock) for name in read))
     except (OSError, pa.ArrowException) as error:
         raise ValueError(
-            f"{path}: a column cannot be read ({_first_line(error)}); the file is damaged, so copy the recording again"
+            f"{path}: a column cannot be read ({_first_line(error)}); the file is damaged, "
+            "so copy the recording again"
         ) from None
     if not parts.count:
         raise ValueError(f"{path}: the table should have rows but has none; record it again or remove it")
     values = dict(zip(read, parts.finished(), strict=True))
     notes: list[Note] = []
-    zoned = clock and kinds[clock] is np.int64 and next(field.type.tz for name, field in _leaves(file.schema_arrow, "") if name == clock)
+    zoned = (
+        clock
+        and kinds[clock] is np.int64
+        and next(field.type.tz for name, field in _leaves(file.schema_arrow, "") if name == clock)
+    )
     zone = "UTC" if zoned or not clock or kinds[clock] is float else ""
     if interval:
         clock_values, said = np.arange(parts.count) * interval, ""
     else:
-        clock_values, said = (values[clock], "") if kinds[clock] is np.int64 else seconds(clock, values[clock])
+        clock_values, said = (
+            (values[clock], "") if kinds[clock] is np.int64 else seconds(clock, values[clock])
+        )
     if said:
         notes.append(Note("clock", "", 1, said))
-    found, turned = forward(Columns("rows", clock_values, {name: values[name] for name in wanted}, lambda i: f"row {i}", zone))
+    found, turned = forward(
+        Columns("rows", clock_values, {name: values[name] for name in wanted}, lambda i: f"row {i}", zone)
+    )
     return found, notes + turned
 
 
@@ -107,19 +145,23 @@ def _array(path: Path, name: str, column: pa.ChunkedArray, clock: str) -> np.nda
         return _numbers(instants, np.int64)
     if name == clock and not _is_numeric(column.type):
         raise ValueError(
-            f"{path}: time {name} should be seconds or a timestamp but is of type {column.type}; convert it, or name another column"
+            f"{path}: time {name} should be seconds or a timestamp but is of type {column.type}; convert it, "
+            "or name another column"
         )
     return _numbers(column.cast(pa.float64(), safe=False), np.float64)
 
 
 def _numbers(column: pa.ChunkedArray, kind: type) -> np.ndarray:
-    """The values of a column, NaN for null; to_numpy and fill_null would do it too, but load pandas, which takes longer."""
+    """The values of a column, NaN for null; to_numpy and fill_null would
+    do it too, but load pandas, which takes longer."""
     parts = [np.empty(0, kind)]
     for chunk in column.chunks:
         valid, content = chunk.buffers()
         part = np.frombuffer(content, kind)[chunk.offset : chunk.offset + len(chunk)]
         if chunk.null_count:
-            bits = np.unpackbits(np.frombuffer(valid, np.uint8), bitorder="little")[chunk.offset : chunk.offset + len(chunk)]
+            bits = np.unpackbits(np.frombuffer(valid, np.uint8), bitorder="little")[
+                chunk.offset : chunk.offset + len(chunk)
+            ]
             part = np.where(bits.astype(bool), part, np.nan)
         parts.append(part)
     return np.concatenate(parts)

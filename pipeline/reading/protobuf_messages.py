@@ -1,7 +1,8 @@
-"""Numbers out of protobuf messages: the FileDescriptorSet of the schema says where the fields are, and the wire is walked for those that
-are wanted.
+"""Numbers out of protobuf messages: the FileDescriptorSet of the schema says where the fields are, and the
+wire is walked for those that are wanted.
 
-Wire format: protobuf.dev/programming-guides/encoding; numbers of the descriptor's fields: google/protobuf/descriptor.proto.
+Wire format: protobuf.dev/programming-guides/encoding; numbers of the
+descriptor's fields: google/protobuf/descriptor.proto.
 """
 
 import re
@@ -16,8 +17,10 @@ from pipeline.reading.ros_messages import LONGEST_LISTED, UnreadableMessage
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
 # FieldDescriptorProto.Type -> wire type and struct format, or how a varint is read
 _NUMBERS = {
-    1: (FIXED64, "<d"), 2: (FIXED32, "<f"), 3: (VARINT, "signed"), 4: (VARINT, "unsigned"), 5: (VARINT, "signed"), 6: (FIXED64, "<Q"),
-    7: (FIXED32, "<I"), 8: (VARINT, "unsigned"), 13: (VARINT, "unsigned"), 14: (VARINT, "signed"), 15: (FIXED32, "<i"), 16: (FIXED64, "<q"),
+    1: (FIXED64, "<d"), 2: (FIXED32, "<f"), 3: (VARINT, "signed"), 4: (VARINT, "unsigned"),
+    5: (VARINT, "signed"), 6: (FIXED64, "<Q"),
+    7: (FIXED32, "<I"), 8: (VARINT, "unsigned"), 13: (VARINT, "unsigned"), 14: (VARINT, "signed"),
+    15: (FIXED32, "<i"), 16: (FIXED64, "<q"),
     17: (VARINT, "zigzag"), 18: (VARINT, "zigzag"),
 }  # fmt: skip
 _MESSAGE = 11
@@ -25,8 +28,8 @@ _DEEPEST = 6
 
 
 class Field(NamedTuple):
-    """A field of a message type. Without `presence` (proto3's plain numbers) a field that is not on the wire is 0; with it, it has no
-    value."""
+    """A field of a message type. Without `presence` (proto3's plain numbers) a field that is
+    not on the wire is 0; with it, it has no value."""
 
     name: str
     type: int
@@ -36,7 +39,8 @@ class Field(NamedTuple):
 
 
 class _Node(NamedTuple):
-    """What is wanted of one field: places of its numbers and plans of its messages by index; `length` is the place of the count."""
+    """What is wanted of one field: places of its numbers and plans of its
+    messages by index; `length` is the place of the count."""
 
     field: Field
     places: dict[int, int]
@@ -45,7 +49,8 @@ class _Node(NamedTuple):
 
 
 def message_types(descriptor_set: bytes) -> dict[str, dict[int, Field]]:
-    """{full name of the message: {field number: Field}} of a serialised FileDescriptorSet. Raises ValueError where it is none."""
+    """{full name of the message: {field number: Field}} of a serialised
+    FileDescriptorSet. Raises ValueError where it is none."""
     types: dict[str, dict[int, Field]] = {}
     try:
         for file in _parts(descriptor_set).get(1, []):
@@ -65,7 +70,9 @@ def _add_type(message: bytes, scope: str, proto3: bool, types: dict[str, dict[in
         inner = _parts(field)
         kind, repeated = inner.get(5, [0])[0], inner.get(4, [1])[0] == 3
         presence = not proto3 or 9 in inner or 17 in inner  # oneof_index, proto3_optional
-        types[name][inner[3][0]] = Field(_text(inner, 1), kind, _text(inner, 6).lstrip("."), repeated, presence)
+        types[name][inner[3][0]] = Field(
+            _text(inner, 1), kind, _text(inner, 6).lstrip("."), repeated, presence
+        )
     for nested in parts.get(3, []):
         _add_type(nested, name, proto3, types)
 
@@ -98,7 +105,8 @@ def _varint(data: bytes, pos: int) -> tuple[int, int]:
 
 
 def _wire(data: bytes):
-    """(field number, wire type, value) in the order of the wire; the value is an int for a varint, else the bytes."""
+    """(field number, wire type, value) in the order of the wire; the
+    value is an int for a varint, else the bytes."""
     pos, end = 0, len(data)
     while pos < end:
         key, pos = _varint(data, pos)
@@ -155,17 +163,25 @@ def fields(types: dict[str, dict[int, Field]], name: str, sample: bytes | None) 
         except UnreadableMessage:
             return names
         for (path, inner), length in zip(repeated, lengths, strict=True):
-            names += [f"{path}[{i}]{part}" for i in range(min(int(np.nan_to_num(length)), LONGEST_LISTED)) for part in inner]
+            names += [
+                f"{path}[{i}]{part}"
+                for i in range(min(int(np.nan_to_num(length)), LONGEST_LISTED))
+                for part in inner
+            ]
     return names
 
 
 def _known(types: dict, name: str) -> str:
     if name not in types:
-        raise ValueError(f"the schema does not define its own message {name}; it defines {', '.join(sorted(types)[:5])}")
+        raise ValueError(
+            f"the schema does not define its own message {name}; it defines {', '.join(sorted(types)[:5])}"
+        )
     return name
 
 
-def _plain_fields(types: dict, name: str, prefix: str, depth: int) -> tuple[list[str], list[tuple[str, list[str]]]]:
+def _plain_fields(
+    types: dict, name: str, prefix: str, depth: int
+) -> tuple[list[str], list[tuple[str, list[str]]]]:
     names, repeated = [], []
     for field in types.get(name, {}).values() if depth < _DEEPEST else []:
         path = f"{prefix}{field.name}"
@@ -187,7 +203,9 @@ def _plain_fields(types: dict, name: str, prefix: str, depth: int) -> tuple[list
 # ---- decoding
 
 
-def decoder(types: dict[str, dict[int, Field]], name: str, names: Sequence[str]) -> Callable[[list[bytes]], np.ndarray]:
+def decoder(
+    types: dict[str, dict[int, Field]], name: str, names: Sequence[str]
+) -> Callable[[list[bytes]], np.ndarray]:
     """A function from n messages to their numbers (n, len(names)), NaN where a field with presence is absent.
 
     It raises UnreadableMessage.
@@ -234,7 +252,8 @@ def _plan(types: dict, name: str, wanted: dict[str, int]) -> dict[int, _Node]:
 
 
 def _walk(data: bytes, plan: dict[int, _Node], row: list[float]) -> None:
-    """Fills the places of `row` that the message `data` has values for; the last value of a single field counts, as the format says."""
+    """Fills the places of `row` that the message `data` has values for; the last
+    value of a single field counts, as the format says."""
     for node in plan.values():
         if not node.field.presence and not node.field.repeated:
             for place in node.places.values():

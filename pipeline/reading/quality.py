@@ -1,5 +1,5 @@
-"""What is doubtful in a table: spikes, frozen sensors, rails, constants, quantisation, units; said with place and count, and masked where
-wrong."""
+"""What is doubtful in a table: spikes, frozen sensors, rails, constants, quantisation, units; said with place
+and count, and masked where wrong."""
 
 from collections.abc import Callable, Mapping
 
@@ -10,13 +10,16 @@ from pipeline.reading.signals import Flag, Table
 from pipeline.reading.stuck import frozen, rails
 
 SPIKE_WINDOW = 7
-# a spike is beyond eight robust standard deviations of the residual of the local median, and beyond three times what its neighbours do
+# a spike is beyond eight robust standard deviations of the residual of the local
+# median, and beyond three times what its neighbours do
 # among themselves
 SPIKE_SIGMAS, SPIKE_OVER_NEIGHBOURS = 8.0, 3.0
 SPIKE_LONGEST = 2
-# an input with no more levels than that between its limits follows a plan, and is not held back by the lower one
+# an input with no more levels than that between its limits follows a
+# plan, and is not held back by the lower one
 PLANNED_LEVELS = 20
-# an extruder's barrel, nozzle and bed: beyond it a number in °C is doubtful; rooms in °C, K and °F for a machine at rest
+# an extruder's barrel, nozzle and bed: beyond it a number in °C is
+# doubtful; rooms in °C, K and °F for a machine at rest
 HOTTEST_DEGC = 450.0
 ROOM_KELVIN, ROOM_FAHRENHEIT = (283.0, 313.0), (55.0, 100.0)
 _CELSIUS = {"degc", "°c", "c", "celsius"}
@@ -24,10 +27,12 @@ _PERCENT = {"percent", "%", "pct"}
 
 
 def flag(table: Table, *, units: Mapping[str, str], limits: Mapping[str, tuple[float, float]]) -> Table:
-    """The table with what is doubtful flagged and, where it is no measurement, masked; values stay as they are.
+    """The table with what is doubtful flagged and, where it is no
+    measurement, masked; values stay as they are.
 
-    `limits` are {input: (low, high)} in its unit: its signals are the inputs, all others outputs. Masked: spike, frozen. Reported only:
-    quantised, saturated, outside (an input beyond its limits), constant, unit (looks like kelvin, fahrenheit, a duty of 0-1).
+    `limits` are {input: (low, high)} in its unit: its signals are the inputs, all others outputs. Masked:
+    spike, frozen. Reported only: quantised, saturated, outside (an input beyond its limits), constant, unit
+    (looks like kelvin, fahrenheit, a duty of 0-1).
     """
     outputs = [name for name in table.values if name not in limits]
     flags, masked = list(table.flags), {name: mask.copy() for name, mask in table.masked.items()}
@@ -52,7 +57,9 @@ def _usable(table: Table, name: str) -> np.ndarray:
 
 
 def _flag(table: Table, name: str, kind: str, where: np.ndarray, message: str) -> Flag:
-    return Flag(name, kind, float(table.time_s[where[0]]), float(table.time_s[where[-1]]), len(where), message)
+    return Flag(
+        name, kind, float(table.time_s[where[0]]), float(table.time_s[where[-1]]), len(where), message
+    )
 
 
 def _groups(where: np.ndarray, segment: np.ndarray) -> list[np.ndarray]:
@@ -78,14 +85,20 @@ def _in_segments(table: Table, name: str, of: Callable[[np.ndarray], np.ndarray]
 
 
 def _spikes(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
-    """Isolated samples that leave the local median and come back (Hampel 1974, with guards for quantised and for smooth signals)."""
+    """Isolated samples that leave the local median and come back (Hampel 1974,
+    with guards for quantised and for smooth signals)."""
     residual = _in_segments(table, name, lambda y: y - median_filter(y, SPIKE_WINDOW, mode="nearest"))
     usable = ~table.masked[name]
     size = np.abs(residual)
     if usable.sum() < 3 * SPIKE_WINDOW:
         return []
-    # the median alone is 0 for a quantised signal, so the 90th percentile and the step of the values count too
-    sigma = max(1.4826 * np.median(size[usable]), np.percentile(size[usable], 90) / 1.645, quantisation_step(table.values[name][usable]))
+    # the median alone is 0 for a quantised signal, so the 90th
+    # percentile and the step of the values count too
+    sigma = max(
+        1.4826 * np.median(size[usable]),
+        np.percentile(size[usable], 90) / 1.645,
+        quantisation_step(table.values[name][usable]),
+    )
     found = []
     for group in _groups(np.flatnonzero(usable & (size > SPIKE_SIGMAS * sigma)), table.segment):
         # beside a spike the median of a smooth signal is off by what it does in a sample
@@ -112,8 +125,9 @@ def _stands_alone(table: Table, name: str, group: np.ndarray, size: float) -> bo
 def quantisation_step(values: np.ndarray) -> float:
     """The step of a quantised signal; 0 where the levels have no common step.
 
-    The median distance d of neighbouring levels is the step if nine tenths of the distances are whole multiples of it (to a tenth: rounded
-    print-outs of 0.0322 differ by 0.032 or 0.033) and if values come back to their levels, at least three times each.
+    The median distance d of neighbouring levels is the step if nine tenths of the distances are whole
+    multiples of it (to a tenth: rounded print-outs of 0.0322 differ by 0.032 or 0.033) and if values come
+    back to their levels, at least three times each.
     """
     levels = np.unique(values)
     if len(levels) < 2 or len(levels) > len(values) / 3:
@@ -149,7 +163,8 @@ def _at_limits(table: Table, name: str, low: float, high: float) -> list[Flag]:
         where = np.flatnonzero(at & usable)
         if len(where) and np.ptp(values[usable]) > 0 and not (planned and limit == low):
             message = (
-                f"{name} is at its limit {limit:g} in {len(where)} of {usable.sum()} samples: there it follows"
+                f"{name} is at its limit {limit:g} in {len(where)} of {usable.sum()} "
+                "samples: there it follows"
                 f" the limit, not the controller"
             )
             flags.append(_flag(table, name, "saturated", where, message))
@@ -176,7 +191,9 @@ def _quantised(table: Table, name: str) -> list[Flag]:
 # ---- units
 
 
-def _unit_flags(table: Table, units: Mapping[str, str], limits: Mapping[str, tuple[float, float]]) -> list[Flag]:
+def _unit_flags(
+    table: Table, units: Mapping[str, str], limits: Mapping[str, tuple[float, float]]
+) -> list[Flag]:
     resting = _at_rest(table, units, limits)
     flags = []
     for name in table.values:
@@ -196,11 +213,15 @@ def _unit_flags(table: Table, units: Mapping[str, str], limits: Mapping[str, tup
 
 
 def _at_rest(table: Table, units: Mapping[str, str], limits: Mapping[str, tuple[float, float]]) -> bool:
-    """Whether the recording begins on a machine at the room's temperature: every input at 0 or its lowest, or several temperatures that
-    are alike."""
+    """Whether the recording begins on a machine at the room's temperature: every input at 0 or its lowest, or
+    several temperatures that are alike."""
     first = {name: float(_usable(table, name)[0]) for name in table.values if len(_usable(table, name))}
     idle = bool(limits) and all(first.get(name, np.nan) in (0.0, low) for name, (low, _) in limits.items())
-    starts = [value for name, value in first.items() if name not in limits and units.get(name, "").casefold() in _CELSIUS]
+    starts = [
+        value
+        for name, value in first.items()
+        if name not in limits and units.get(name, "").casefold() in _CELSIUS
+    ]
     return idle or (len(starts) > 1 and np.ptp(starts) <= 3.0)
 
 
@@ -211,9 +232,7 @@ def _doubtful_celsius(name: str, values: np.ndarray, resting: bool) -> str:
     if middle > HOTTEST_DEGC or (resting and ROOM_KELVIN[0] <= first <= ROOM_KELVIN[1]):
         return f"{name} begins at {first:g} and is {middle:g} in the middle: it looks like kelvin; set offset: -273.15 if it is"
     if resting and ROOM_FAHRENHEIT[0] <= first <= ROOM_FAHRENHEIT[1]:
-        return (
-            f"{name} begins at {first:g} on a machine at rest: it looks like fahrenheit; set scale: 0.555556 and offset: -17.7778 if it is"
-        )
+        return f"{name} begins at {first:g} on a machine at rest: it looks like fahrenheit; set scale: 0.555556 and offset: -17.7778 if it is"
     if resting and values.max() <= 1.0 and values.min() >= 0.0:
         return f"{name} lies within 0 to 1: it looks like a share or a voltage; set the sensor's scale and offset if it is"
     return ""

@@ -1,5 +1,5 @@
-"""Recordings of other people's machines: MCAP, Parquet and CSV -> signals on their own clocks, with what was damaged, missing or left out
-counted.
+"""Recordings of other people's machines: MCAP, Parquet and CSV -> signals on their own clocks, with what was
+damaged, missing or left out counted.
 
 `read` is the door; `resample` and `flag` make a table of it, `inspect` says in words what is in a file.
 """
@@ -19,17 +19,30 @@ from pipeline.reading.quality import flag
 from pipeline.reading.resampling import resample
 from pipeline.reading.signals import Flag, Jitter, Note, Raw, Source, Table, nearest_names
 
-__all__ = ["Flag", "Jitter", "Note", "Raw", "Source", "Table", "flag", "inspect", "nearest_names", "read", "resample"]
+__all__ = [
+    "Flag",
+    "Jitter",
+    "Note",
+    "Raw",
+    "Source",
+    "Table",
+    "flag",
+    "inspect",
+    "nearest_names",
+    "read",
+    "resample",
+]
 
 
 def read(path: str | Path, sources: Sequence[Source], *, time: str = "") -> Raw:
     """The signals of a recording, each on its own clock, in our units.
 
-    `time` names the clock: in a table a column (by default one that is called like a time) or "every 0.5 s" where there is none; in MCAP
-    log_time (the default), publish_time, or a field of every topic such as header.stamp. A clock of the calendar is counted from the first
-    whole second of the record. Missing numbers are NaN, and counted in a note. Raises ValueError, one sentence with file, place, expected,
-    found and remedy, for a source that is not there, text in place of a number, a signal without any number, a time that is missing,
-    repeated or runs backwards, and a file that cannot be read.
+    `time` names the clock: in a table a column (by default one that is called like a time) or "every 0.5 s"
+    where there is none; in MCAP log_time (the default), publish_time, or a field of every topic such as
+    header.stamp. A clock of the calendar is counted from the first whole second of the record. Missing
+    numbers are NaN, and counted in a note. Raises ValueError, one sentence with file, place, expected, found
+    and remedy, for a source that is not there, text in place of a number, a signal without any number, a time
+    that is missing, repeated or runs backwards, and a file that cannot be read.
     """
     path = Path(path)
     _check_sources(path, sources)
@@ -42,9 +55,15 @@ def read(path: str | Path, sources: Sequence[Source], *, time: str = "") -> Raw:
             columns, places, messages, notes = mcap_columns(path, names, time)
         else:
             table, notes = (read_csv if kind == "csv" else read_parquet)(path, names, time)
-            columns, places, messages = [table], {name: (table.name, name) for name in names}, {table.name: len(table.time)}
+            columns, places, messages = (
+                [table],
+                {name: (table.name, name) for name in names},
+                {table.name: len(table.time)},
+            )
     except OSError as error:
-        raise ValueError(f"{path} cannot be read ({error.strerror or error}); check the disk, or copy the recording again") from None
+        raise ValueError(
+            f"{path} cannot be read ({error.strerror or error}); check the disk, or copy the recording again"
+        ) from None
     clocks = _clocks(path, columns, notes)
     signals = {}
     for source in sources:
@@ -57,7 +76,8 @@ def read(path: str | Path, sources: Sequence[Source], *, time: str = "") -> Raw:
 def _check_sources(path: Path, sources: Sequence[Source]) -> None:
     if not sources:
         raise ValueError(
-            f"{path}: the mapping names no signal; map each input and output to a column or topic (beadline inspect proposes a mapping)"
+            f"{path}: the mapping names no signal; map each input and output to a column or topic (beadline "
+            "inspect proposes a mapping)"
         )
     signals = [source.signal for source in sources]
     twice = sorted({signal for signal in signals if signals.count(signal) > 1})
@@ -66,7 +86,8 @@ def _check_sources(path: Path, sources: Sequence[Source]) -> None:
     for source in sources:
         if not (np.isfinite(source.scale) and np.isfinite(source.offset) and source.scale != 0):
             raise ValueError(
-                f"{path}: the mapping of {source.signal} has scale {source.scale:g} and offset {source.offset:g}; both"
+                f"{path}: the mapping of {source.signal} has scale {source.scale:g} and offset "
+                f"{source.offset:g}; both"
                 f" must be finite, scale not 0"
             )
 
@@ -82,19 +103,27 @@ def _clocks(path: Path, columns: Sequence[Columns], notes: list[Note]) -> dict[s
     if start:
         zero = np.datetime64(int(start // unit), "s")
         zones = sorted({group.zone or "of no zone" for group in columns})
-        notes.append(Note("clock", "", 1, f"time is counted from {zero} ({', '.join(zones)}, as the recording's clock says)"))
+        notes.append(
+            Note(
+                "clock",
+                "",
+                1,
+                f"time is counted from {zero} ({', '.join(zones)}, as the recording's clock says)",
+            )
+        )
     return {group.name: (group.time - start if start else group.time) / unit for group in columns}
 
 
 def _signal(
     path: Path, source: Source, time: np.ndarray, group: Columns, found: np.ndarray, notes: list[Note]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Time and values in our unit; a signal that is there in less than half of the rows, spread among them, keeps only those: it has its
-    own clock."""
+    """Time and values in our unit; a signal that is there in less than half of the rows, spread among them,
+    keeps only those: it has its own clock."""
     present = np.isfinite(found)
     if not present.any():
         raise ValueError(
-            f"{path}: {source.source} should hold numbers for {source.signal} but all of its {len(found)} values are"
+            f"{path}: {source.source} should hold numbers for {source.signal} but all of its "
+            f"{len(found)} values are"
             f" missing; map another source"
         )
     values = found if (source.scale, source.offset) == (1.0, 0.0) else found * source.scale + source.offset
@@ -105,7 +134,10 @@ def _signal(
     if where.size < len(found) / 2 and where.size > 1 and np.median(np.diff(where)) > 1:
         notes.append(
             Note(
-                "sparse", source.signal, missing, f"{source.source} has a value in {where.size} of {len(found)} rows; those are its samples"
+                "sparse",
+                source.signal,
+                missing,
+                f"{source.source} has a value in {where.size} of {len(found)} rows; those are its samples",
             )
         )
         return time[where], values[where]

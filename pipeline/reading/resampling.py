@@ -1,5 +1,5 @@
-"""Signals on their own clocks -> one table on one sample time: inputs are held, outputs interpolated between near neighbours, gaps make
-segments."""
+"""Signals on their own clocks -> one table on one sample time: inputs are held, outputs interpolated between
+near neighbours, gaps make segments."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,97 +9,138 @@ import numpy as np
 from pipeline.reading.mixing import alternate, mixed
 from pipeline.reading.signals import Flag, Raw, Table, intervals
 
-# a sample within that share of the sample time from the grid is on it: what a temperature does in a hundredth of a sample is far below any
+# a sample within that share of the sample time from the grid is on it: what a temperature
+# does in a hundredth of a sample is far below any
 # sensor's step
 ON_GRID = 0.01
 GAP_INTERVALS = 3.0
-# commands are sent periodically if nearly all of their intervals are alike; else they are events, and a long silence is no gap
+# commands are sent periodically if nearly all of their intervals are alike;
+# else they are events, and a long silence is no gap
 PERIODIC_SHARE = 0.95
 JITTER_SHARE, JITTER_OFTEN = 0.1, 0.01
 
 
 class _Clock(NamedTuple):
-    """One clock and who is on it; a gap is an interval beyond `gap_limit_s` (infinite for commands that come as events)."""
+    """One clock and who is on it; a gap is an interval beyond
+    `gap_limit_s` (infinite for commands that come as events)."""
 
     time_s: np.ndarray
     signals: list[str]
     gap_limit_s: float
 
 
-def resample(raw: Raw, *, sample_time_s: float, inputs: Sequence[str], outputs: Sequence[str], max_gap_s: float | None = None) -> Table:
+def resample(
+    raw: Raw,
+    *,
+    sample_time_s: float,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    max_gap_s: float | None = None,
+) -> Table:
     """The table of a recording on the grid t_k = t_0 + k T of each segment.
 
-    Inputs: u_k is the last command at or before t_k. Outputs: y_k is the sample at t_k where there is one (within T / 100: the record's own
-    numbers, unaltered), else the straight line between its neighbours. An interval longer than `max_gap_s` (default: three sample times or
-    three median intervals, whichever is longer) on any clock is a gap: nothing is interpolated or held across it, and a new segment begins
-    behind it. Segments span what all clocks have in common. A value whose neighbours are missing is NaN and masked. Flags say what was
-    done: gap, jitter, filled, step_inside, step_lost, missing, mixed, trimmed, short, rate. Raises ValueError where a signal is not in the recording,
-    clocks have no time in common, or no segment has two samples.
+    Inputs: u_k is the last command at or before t_k. Outputs: y_k is the sample at t_k where there is
+    one (within T / 100: the record's own numbers, unaltered), else the straight line between its
+    neighbours. An interval longer than `max_gap_s` (default: three sample times or three median
+    intervals, whichever is longer) on any clock is a gap: nothing is interpolated or held across it, and
+    a new segment begins behind it. Segments span what all clocks have in common. A value whose
+    neighbours are missing is NaN and masked. Flags say what was done: gap, jitter, filled, step_inside,
+    step_lost, missing, mixed, trimmed, short, rate. Raises ValueError where a signal is not in the
+    recording, clocks have no time in common, or no segment has two samples.
     """
     _check(raw, sample_time_s, inputs, outputs, max_gap_s)
     clocks = _clocks(raw, sample_time_s, inputs, outputs, max_gap_s)
     pieces = _pieces(raw, clocks, sample_time_s)
-    grids = [start + sample_time_s * np.arange(int(np.floor((end - start) / sample_time_s + ON_GRID)) + 1) for start, end in pieces]
+    grids = [
+        start + sample_time_s * np.arange(int(np.floor((end - start) / sample_time_s + ON_GRID)) + 1)
+        for start, end in pieces
+    ]
     whole = [grid for grid in grids if len(grid) > 1]
     if not whole:
         raise ValueError(
-            f"{raw.path}: the recording should have two samples {sample_time_s:g} s apart without a gap but its longest stretch is"
-            f" {max(end - start for start, end in pieces):g} s; record longer, or set a smaller sample time or a larger gap limit"
+            f"{raw.path}: the recording should have two samples {sample_time_s:g} s apart without a gap but "
+            "its longest stretch is"
+            f" {max(end - start for start, end in pieces):g} s; record longer, "
+            "or set a smaller sample time or a larger gap limit"
         )
     time = np.concatenate(whole)
     segment = np.repeat(np.arange(len(whole), dtype=np.int32), [len(grid) for grid in whole])
     values = {name: _held(*raw.signals[name], time, sample_time_s) for name in inputs}
-    values |= {name: np.concatenate([_interpolated(*raw.signals[name], grid, sample_time_s) for grid in whole]) for name in outputs}
+    values |= {
+        name: np.concatenate([_interpolated(*raw.signals[name], grid, sample_time_s) for grid in whole])
+        for name in outputs
+    }
     masked = {name: ~np.isfinite(found) for name, found in values.items()}
     flags = _gap_flags(clocks) + _jitter_flags(clocks) + _trim_flags(raw, clocks, pieces, grids)
     for name in outputs:
-        flags += _filled_flags(name, raw.signals[name][0], time, sample_time_s) + _rate_flags(name, raw.signals[name][0], sample_time_s)
+        flags += _filled_flags(name, raw.signals[name][0], time, sample_time_s) + _rate_flags(
+            name, raw.signals[name][0], sample_time_s
+        )
     for name in inputs:
         flags += _step_flags(name, *raw.signals[name], time, segment, sample_time_s)
     for name in [*inputs, *outputs]:
         flags += _missing_flags(name, masked[name], time)
     for name in outputs:
         flags += _mixed_flags(name, *raw.signals[name], time, masked[name])
-    jitter = {name: intervals(clock.time_s, clock.gap_limit_s) for clock in clocks for name in clock.signals if len(clock.time_s) > 1}
+    jitter = {
+        name: intervals(clock.time_s, clock.gap_limit_s)
+        for clock in clocks
+        for name in clock.signals
+        if len(clock.time_s) > 1
+    }
     return Table(raw.path, segment, time, values, masked, flags, jitter)
 
 
-def _check(raw: Raw, sample_time_s: float, inputs: Sequence[str], outputs: Sequence[str], max_gap_s: float | None) -> None:
+def _check(
+    raw: Raw, sample_time_s: float, inputs: Sequence[str], outputs: Sequence[str], max_gap_s: float | None
+) -> None:
     for name in [*inputs, *outputs]:
         if name not in raw.signals:
             raise ValueError(
-                f"{raw.path}: signal {name} is wanted but the mapping gives {', '.join(raw.signals)}; map it to a column or topic"
+                f"{raw.path}: signal {name} is wanted but the mapping gives {', '.join(raw.signals)}; "
+                "map it to a column or topic"
             )
     if not outputs:
         raise ValueError(f"{raw.path}: no output is wanted; name at least one measured signal")
     if not 0 < sample_time_s < np.inf:
         raise ValueError(
-            f"{raw.path}: the sample time should be more than 0 s but is {sample_time_s:g}; set it to about the recording's interval"
+            f"{raw.path}: the sample time should be more than 0 s but is {sample_time_s:g}; "
+            "set it to about the recording's interval"
         )
     if max_gap_s is not None and not max_gap_s >= sample_time_s:
-        raise ValueError(f"{raw.path}: the gap limit {max_gap_s:g} s should be at least the sample time {sample_time_s:g} s; raise it")
+        raise ValueError(
+            f"{raw.path}: the gap limit {max_gap_s:g} s should be at least the sample time "
+            f"{sample_time_s:g} s; raise it"
+        )
     for name in outputs:
         if len(raw.signals[name][0]) < 2:
             raise ValueError(
-                f"{raw.path}: output {name} should have at least two samples but has {len(raw.signals[name][0])}; record longer"
+                f"{raw.path}: output {name} should have at least two samples but has "
+                f"{len(raw.signals[name][0])}; record longer"
             )
 
 
 # ---- clocks, gaps and the time in common
 
 
-def _clocks(raw: Raw, sample_time_s: float, inputs: Sequence[str], outputs: Sequence[str], max_gap_s: float | None) -> list[_Clock]:
+def _clocks(
+    raw: Raw, sample_time_s: float, inputs: Sequence[str], outputs: Sequence[str], max_gap_s: float | None
+) -> list[_Clock]:
     clocks: list[_Clock] = []
     for name in [*outputs, *inputs]:
         time = raw.signals[name][0]
-        same = next((clock for clock in clocks if clock.time_s is time or np.array_equal(clock.time_s, time)), None)
+        same = next(
+            (clock for clock in clocks if clock.time_s is time or np.array_equal(clock.time_s, time)), None
+        )
         if same:
             same.signals.append(name)
             continue
         median = np.median(np.diff(time)) if len(time) > 1 else np.inf
         limit = max_gap_s if max_gap_s is not None else GAP_INTERVALS * max(sample_time_s, median)
         # outputs come first, so a new clock among the inputs is theirs alone
-        events = name in inputs and not (np.mean(np.diff(time) < 2 * median) >= PERIODIC_SHARE if len(time) > 2 else False)
+        events = name in inputs and not (
+            np.mean(np.diff(time) < 2 * median) >= PERIODIC_SHARE if len(time) > 2 else False
+        )
         clocks.append(_Clock(time, [name], np.inf if events else limit))
     return clocks
 
@@ -109,19 +150,30 @@ def _pieces(raw: Raw, clocks: Sequence[_Clock], sample_time_s: float) -> list[tu
     pieces = [(-np.inf, np.inf)]
     for clock in clocks:
         cuts = np.flatnonzero(np.diff(clock.time_s) > clock.gap_limit_s)
-        starts, ends = clock.time_s[np.r_[0, cuts + 1]], clock.time_s[np.r_[cuts, len(clock.time_s) - 1]].astype(float)
+        starts, ends = (
+            clock.time_s[np.r_[0, cuts + 1]],
+            clock.time_s[np.r_[cuts, len(clock.time_s) - 1]].astype(float),
+        )
         if np.isinf(clock.gap_limit_s):
             ends[-1] = np.inf  # the last event holds on
-        pieces = _common(pieces, list(zip(starts.tolist(), ends.tolist(), strict=True)), sample_time_s * ON_GRID)
+        pieces = _common(
+            pieces, list(zip(starts.tolist(), ends.tolist(), strict=True)), sample_time_s * ON_GRID
+        )
     if not pieces:
-        spans = "; ".join(f"{', '.join(clock.signals[:3])} from {clock.time_s[0]:g} to {clock.time_s[-1]:g} s" for clock in clocks)
+        spans = "; ".join(
+            f"{', '.join(clock.signals[:3])} from {clock.time_s[0]:g} to {clock.time_s[-1]:g} s"
+            for clock in clocks
+        )
         raise ValueError(
-            f"{raw.path}: the signals have no time in common ({spans}); map signals that were recorded together, or name their clock"
+            f"{raw.path}: the signals have no time in common ({spans}); "
+            "map signals that were recorded together, or name their clock"
         )
     return pieces
 
 
-def _common(left: Sequence[tuple[float, float]], right: Sequence[tuple[float, float]], tolerance: float) -> list[tuple[float, float]]:
+def _common(
+    left: Sequence[tuple[float, float]], right: Sequence[tuple[float, float]], tolerance: float
+) -> list[tuple[float, float]]:
     """Intersections of two sorted lists of intervals."""
     found, i, j = [], 0, 0
     while i < len(left) and j < len(right):
@@ -139,7 +191,8 @@ def _common(left: Sequence[tuple[float, float]], right: Sequence[tuple[float, fl
 
 
 def _held(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, sample_time_s: float) -> np.ndarray:
-    """u(t_k): the last command at or before t_k. Pieces begin at or behind the first command, so there is one."""
+    """u(t_k): the last command at or before t_k. Pieces begin at or
+    behind the first command, so there is one."""
     return values[np.maximum(np.searchsorted(time_s, grid + ON_GRID * sample_time_s, side="right") - 1, 0)]
 
 
@@ -149,7 +202,9 @@ def _nearest(time_s: np.ndarray, grid: np.ndarray) -> np.ndarray:
     return np.where(grid - time_s[after - 1] <= time_s[after] - grid, after - 1, after)
 
 
-def _interpolated(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, sample_time_s: float) -> np.ndarray:
+def _interpolated(
+    time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, sample_time_s: float
+) -> np.ndarray:
     """y(t_k): the sample on t_k itself, else the line between its neighbours; a NaN neighbour gives NaN."""
     after = np.clip(np.searchsorted(time_s, grid), 1, len(time_s) - 1)
     share = (grid - time_s[after - 1]) / (time_s[after] - time_s[after - 1])
@@ -162,7 +217,11 @@ def _interpolated(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, samp
 
 
 def _flag(signal: str, kind: str, where_s: np.ndarray, message: str) -> list[Flag]:
-    return [Flag(signal, kind, float(where_s[0]), float(where_s[-1]), len(where_s), message)] if len(where_s) else []
+    return (
+        [Flag(signal, kind, float(where_s[0]), float(where_s[-1]), len(where_s), message)]
+        if len(where_s)
+        else []
+    )
 
 
 def _gap_flags(clocks: Sequence[_Clock]) -> list[Flag]:
@@ -173,7 +232,8 @@ def _gap_flags(clocks: Sequence[_Clock]) -> list[Flag]:
             start, end = float(clock.time_s[i]), float(clock.time_s[i + 1])
             summer = " (an hour and an interval: a clock without a zone does so where summer time begins)"
             message = (
-                f"no sample of {', '.join(clock.signals)} for {end - start:g} s (limit {clock.gap_limit_s:g} s)"
+                f"no sample of {', '.join(clock.signals)} for {end - start:g} s (limit "
+                f"{clock.gap_limit_s:g} s)"
                 f"{summer if abs(end - start - 3600) <= 2 * median else ''}: a new segment begins behind it"
             )
             flags.append(Flag("", "gap", start, end, 1, message))
@@ -181,7 +241,8 @@ def _gap_flags(clocks: Sequence[_Clock]) -> list[Flag]:
 
 
 def _jitter_flags(clocks: Sequence[_Clock]) -> list[Flag]:
-    """Clocks of which one interval in a hundred is off by a tenth, or any by a half; commands that come as events have no interval."""
+    """Clocks of which one interval in a hundred is off by a tenth, or any by a
+    half; commands that come as events have no interval."""
     flags = []
     for clock in clocks:
         if not np.isfinite(clock.gap_limit_s) or len(clock.time_s) < 3:
@@ -191,35 +252,53 @@ def _jitter_flags(clocks: Sequence[_Clock]) -> list[Flag]:
         off = kept[np.abs(steps[kept] - jitter.interval_s) > JITTER_SHARE * jitter.interval_s]
         if len(off) < JITTER_OFTEN * len(kept) and jitter.max_s <= 0.5 * jitter.interval_s:
             continue
-        said = ", by turns longer and shorter: two devices may write under one name" if alternate(steps[kept]) else ""
+        said = (
+            ", by turns longer and shorter: two devices may write under one name"
+            if alternate(steps[kept])
+            else ""
+        )
         message = (
-            f"the intervals of {', '.join(clock.signals)} differ from {jitter.interval_s:.4g} s by {jitter.std_s:.2g} s (standard) and"
+            f"the intervals of {', '.join(clock.signals)} differ from {jitter.interval_s:.4g} s by "
+            f"{jitter.std_s:.2g} s (standard) and"
             f" {jitter.max_s:.2g} s (largest), {len(off)} of {len(kept)} by more than a tenth{said}"
         )
-        flags.append(Flag("", "jitter", float(clock.time_s[off[0]]), float(clock.time_s[off[-1] + 1]), len(off), message))
+        flags.append(
+            Flag(
+                "", "jitter", float(clock.time_s[off[0]]), float(clock.time_s[off[-1] + 1]), len(off), message
+            )
+        )
     return flags
 
 
-def _mixed_flags(name: str, time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, masked: np.ndarray) -> list[Flag]:
-    """Stretches in which two devices write under one name, found in the record's own samples; they are masked, for nobody knows which of the
-    two a sample of the table is."""
+def _mixed_flags(
+    name: str, time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, masked: np.ndarray
+) -> list[Flag]:
+    """Stretches in which two devices write under one name, found in the record's own samples; they are
+    masked, for nobody knows which of the two a sample of the table is."""
     flags = []
     for first, last, distance in mixed(values):
         start, end = float(time_s[first]), float(time_s[last])
         masked[(grid >= start) & (grid <= end)] = True
         message = (
-            f"{name} jumps to and fro between two courses {distance:.3g} apart from {start:g} to {end:g} s, masked: two devices seem to write"
+            f"{name} jumps to and fro between two courses {distance:.3g} apart from {start:g} to {end:g} s, "
+            "masked: two devices seem to write"
             f" under one name; record each under a name of its own"
         )
         flags.append(Flag(name, "mixed", start, end, last - first + 1, message))
     return flags
 
 
-def _trim_flags(raw: Raw, clocks: Sequence[_Clock], pieces: Sequence[tuple[float, float]], grids: Sequence[np.ndarray]) -> list[Flag]:
+def _trim_flags(
+    raw: Raw, clocks: Sequence[_Clock], pieces: Sequence[tuple[float, float]], grids: Sequence[np.ndarray]
+) -> list[Flag]:
     flags = []
     if len(clocks) > 1:
         start, end = pieces[0][0], pieces[-1][1]
-        cut = sum(int(((clock.time_s < start) | (clock.time_s > end)).sum()) for clock in clocks if np.isfinite(clock.gap_limit_s))
+        cut = sum(
+            int(((clock.time_s < start) | (clock.time_s > end)).sum())
+            for clock in clocks
+            if np.isfinite(clock.gap_limit_s)
+        )
         message = f"{len(clocks)} clocks were aligned over their common time {start:g} to {end:g} s; {cut} samples lie outside"
         flags.append(Flag("", "trimmed", start, end, cut, message))
     for grid in grids:
@@ -248,13 +327,15 @@ def _rate_flags(name: str, time_s: np.ndarray, sample_time_s: float) -> list[Fla
     span = time_s[[0, -1]]
     if interval < sample_time_s / 2:
         message = (
-            f"{name} is sampled every {interval:g} s, the table every {sample_time_s:g} s: only the samples at"
+            f"{name} is sampled every {interval:g} s, the table every {sample_time_s:g} s: "
+            "only the samples at"
             f" its times are used, without averaging"
         )
         return [Flag(name, "rate", float(span[0]), float(span[1]), len(time_s), message)]
     if interval > 1.5 * sample_time_s:
         message = (
-            f"{name} is sampled every {interval:g} s but the table every {sample_time_s:g} s: what lies between"
+            f"{name} is sampled every {interval:g} s but the table every {sample_time_s:g} "
+            "s: what lies between"
             f" is interpolated, no measurement"
         )
         return [Flag(name, "rate", float(span[0]), float(span[1]), len(time_s), message)]
@@ -262,9 +343,15 @@ def _rate_flags(name: str, time_s: np.ndarray, sample_time_s: float) -> list[Fla
 
 
 def _step_flags(
-    name: str, time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, segment: np.ndarray, sample_time_s: float
+    name: str,
+    time_s: np.ndarray,
+    values: np.ndarray,
+    grid: np.ndarray,
+    segment: np.ndarray,
+    sample_time_s: float,
 ) -> list[Flag]:
-    """Commands that change between two samples act from the next sample on; those that another overtakes before it are lost."""
+    """Commands that change between two samples act from the next sample on;
+    those that another overtakes before it are lost."""
     changes = np.flatnonzero(values[1:] != values[:-1]) + 1
     when = time_s[changes]
     following = np.searchsorted(grid, when - ON_GRID * sample_time_s)
@@ -286,4 +373,9 @@ def _step_flags(
 
 
 def _missing_flags(name: str, masked: np.ndarray, grid: np.ndarray) -> list[Flag]:
-    return _flag(name, "missing", grid[masked], f"{masked.sum()} samples of {name} have no measured value and are masked")
+    return _flag(
+        name,
+        "missing",
+        grid[masked],
+        f"{masked.sum()} samples of {name} have no measured value and are masked",
+    )

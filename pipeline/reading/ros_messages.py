@@ -1,8 +1,9 @@
-"""Numbers out of ROS messages: the message definition becomes a short program of struct formats, made once, run for each message.
+"""Numbers out of ROS messages: the message definition becomes a short program
+of struct formats, made once, run for each message.
 
-Layouts: CDR as ROS 2 writes it (OMG DDSI-RTPS 10.2, "classic CDR", and XCDR2 for final types), aligned to the size of each number behind a
-header of four bytes; ROS 1 has no header and no alignment. Sequences and text begin with their length (uint32); text is skipped, wide text
-ends what can be read.
+Layouts: CDR as ROS 2 writes it (OMG DDSI-RTPS 10.2, "classic CDR", and XCDR2 for final types), aligned to the
+size of each number behind a header of four bytes; ROS 1 has no header and no alignment. Sequences and text
+begin with their length (uint32); text is skipped, wide text ends what can be read.
 """
 
 import re
@@ -13,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 ROS2_NUMBERS = {
-    "bool": "?", "byte": "B", "char": "B", "octet": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i",
+    "bool": "?", "byte": "B", "char": "B", "octet": "B", "int8": "b", "uint8": "B", "int16": "h",
+    "uint16": "H", "int32": "i",
     "uint32": "I", "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
 }  # fmt: skip
 ROS1_NUMBERS = {**ROS2_NUMBERS, "byte": "b"}
@@ -28,8 +30,14 @@ KNOWN = {
 LARGEST_LAYOUT = 20_000
 LONGEST_LISTED = 64
 _FIELD = re.compile(r"^([A-Za-z]\w*(?:/\w+)*)(?:<=\d+)?\s*(\[(?:<=)?(\d*)\])?\s+([A-Za-z]\w*)\s*(=?)")
-# representation -> byte order, largest alignment; the lists of parameters (0x0002, 0x0003 and others) are not written by ROS
-_REPRESENTATIONS = {b"\x00\x00": (">", 8), b"\x00\x01": ("<", 8), b"\x00\x06": (">", 4), b"\x00\x07": ("<", 4)}
+# representation -> byte order, largest alignment; the lists of parameters
+# (0x0002, 0x0003 and others) are not written by ROS
+_REPRESENTATIONS = {
+    b"\x00\x00": (">", 8),
+    b"\x00\x01": ("<", 8),
+    b"\x00\x06": (">", 4),
+    b"\x00\x07": ("<", 4),
+}
 _LENGTH = {order: struct.Struct(order + "I") for order in "<>"}
 
 
@@ -38,8 +46,8 @@ class UnreadableMessage(ValueError):
 
 
 class Item(NamedTuple):
-    """A stretch of the layout: `count` numbers of one `format`, text, or a sequence of `items` (an empty sequence of numbers has one item
-    of count 1)."""
+    """A stretch of the layout: `count` numbers of one `format`, text, or a sequence of `items` (an empty
+    sequence of numbers has one item of count 1)."""
 
     kind: str
     path: str
@@ -142,7 +150,11 @@ def fields(items: Sequence[Item], sample: bytes | None, *, version: int) -> list
     sequences = []
     for item in _readable(items):
         if item.kind == "numbers" and not item.path.endswith("._"):
-            names += [f"{item.path}[{i}]" for i in range(min(item.count, LONGEST_LISTED))] if item.array else [item.path]
+            names += (
+                [f"{item.path}[{i}]" for i in range(min(item.count, LONGEST_LISTED))]
+                if item.array
+                else [item.path]
+            )
         elif item.kind == "sequence" and all(part.kind == "numbers" for part in item.items):
             sequences.append(item)
     if sample is not None and sequences:
@@ -152,14 +164,18 @@ def fields(items: Sequence[Item], sample: bytes | None, *, version: int) -> list
             return names
         for item, length in zip(sequences, lengths, strict=True):
             for i in range(min(int(length), LONGEST_LISTED)):
-                names += [f"{item.path}[{i}]{part.path[len(item.path) :]}" for part in item.items if not part.array]
+                names += [
+                    f"{item.path}[{i}]{part.path[len(item.path) :]}" for part in item.items if not part.array
+                ]
     return names
 
 
 def _readable(items: Sequence[Item]) -> list[Item]:
     """The items up to the first wide text: writers do not agree on how long its characters are."""
     for i, item in enumerate(items):
-        if item.kind == "wstring" or (item.kind == "sequence" and len(_readable(item.items)) < len(item.items)):
+        if item.kind == "wstring" or (
+            item.kind == "sequence" and len(_readable(item.items)) < len(item.items)
+        ):
             return list(items[:i])
     return list(items)
 
@@ -168,10 +184,13 @@ def _readable(items: Sequence[Item]) -> list[Item]:
 
 
 class _Run:
-    """Numbers of fixed size in a row; `layouts[phase]` unpacks the wanted ones when the run begins at that phase of the alignment."""
+    """Numbers of fixed size in a row; `layouts[phase]` unpacks the wanted ones
+    when the run begins at that phase of the alignment."""
 
     def __init__(self, items: Sequence[Item], wanted: set[str], order: str, alignment: int):
-        self.layouts = [struct.Struct(order + _run_format(items, wanted, phase, alignment)) for phase in range(8)]
+        self.layouts = [
+            struct.Struct(order + _run_format(items, wanted, phase, alignment)) for phase in range(8)
+        ]
         self.names = [name for item in items for name in _names(item) if name in wanted]
 
     def read(self, data: bytes, pos: int, values: list[float]) -> int:
@@ -211,19 +230,28 @@ class _Text:
 
 
 class _Sequence:
-    """A length and so many elements; those asked for by index are read (NaN where there are fewer), the others skipped.
+    """A length and so many elements; those asked for by index are read
+    (NaN where there are fewer), the others skipped.
 
     "[#]" is the length itself.
     """
 
     def __init__(self, item: Item, wanted: set[str], order: str, alignment: int):
         self.unpack, self.alignment = _LENGTH[order].unpack_from, min(4, alignment)
-        indices = {int(found[1]) for name in wanted if (found := re.match(re.escape(item.path) + r"\[(\d+)\]", name))}
+        indices = {
+            int(found[1]) for name in wanted if (found := re.match(re.escape(item.path) + r"\[(\d+)\]", name))
+        }
         self.skip = _program(item.items, set(), order, alignment)
         self.elements = {i: _program(_at(item, i), wanted, order, alignment) for i in sorted(indices)}
         self.length = f"{item.path}[#]" in wanted
-        self.names = [f"{item.path}[#]"] * self.length + [name for steps in self.elements.values() for step in steps for name in step.names]
-        only = item.items[0] if len(item.items) == 1 and item.items[0].kind == "numbers" and not item.items[0].array else None
+        self.names = [f"{item.path}[#]"] * self.length + [
+            name for steps in self.elements.values() for step in steps for name in step.names
+        ]
+        only = (
+            item.items[0]
+            if len(item.items) == 1 and item.items[0].kind == "numbers" and not item.items[0].array
+            else None
+        )
         self.size = struct.calcsize("=" + only.format) if only else 0
         self.element_alignment = min(self.size, alignment) if only else 1
         self.number = struct.Struct(order + only.format).unpack_from if only else None
@@ -257,7 +285,12 @@ class _Sequence:
 def _at(item: Item, i: int) -> list[Item]:
     """The elements of a sequence with the paths that they have at index i."""
     start = len(item.path)
-    return [part._replace(path=f"{item.path}[{i}]{part.path[start:]}", items=tuple(_at_prefix(part, item.path, i))) for part in item.items]
+    return [
+        part._replace(
+            path=f"{item.path}[{i}]{part.path[start:]}", items=tuple(_at_prefix(part, item.path, i))
+        )
+        for part in item.items
+    ]
 
 
 def _at_prefix(part: Item, prefix: str, i: int) -> list[Item]:
@@ -275,12 +308,19 @@ def _program(items: Sequence[Item], wanted: set[str], order: str, alignment: int
             steps.append(_Run(run, wanted, order, alignment))
             run = []
         if item is not None:
-            steps.append(_Text(order, alignment) if item.kind == "string" else _Sequence(item, wanted, order, alignment))
+            steps.append(
+                _Text(order, alignment)
+                if item.kind == "string"
+                else _Sequence(item, wanted, order, alignment)
+            )
     return steps
 
 
-def decoder(items: Sequence[Item], names: Sequence[str], *, version: int) -> Callable[[list[bytes]], np.ndarray]:
-    """A function from n messages to their numbers (n, len(names)). It raises UnreadableMessage where one is not what the layout says."""
+def decoder(
+    items: Sequence[Item], names: Sequence[str], *, version: int
+) -> Callable[[list[bytes]], np.ndarray]:
+    """A function from n messages to their numbers (n, len(names)). It raises
+    UnreadableMessage where one is not what the layout says."""
     readable = _readable(items)
     exact = len(readable) == len(items)
     if version == 1:
@@ -296,7 +336,9 @@ def decoder(items: Sequence[Item], names: Sequence[str], *, version: int) -> Cal
             return np.concatenate([decode([message]) for message in messages])
         code = codes.pop()
         if code not in programs:
-            raise UnreadableMessage(f"CDR representation 0x{code.hex()} is not read; 0x0000, 0x0001, 0x0006 and 0x0007 are")
+            raise UnreadableMessage(
+                f"CDR representation 0x{code.hex()} is not read; 0x0000, 0x0001, 0x0006 and 0x0007 are"
+            )
         # alignment counts from behind the header of four bytes
         return _decode([message[4:] for message in messages], programs[code], exact, 7)[:, order]
 
@@ -317,7 +359,11 @@ def _decode(messages: list[bytes], steps: list, exact: bool, padding: int) -> np
     try:
         if len(steps) == 1 and isinstance(steps[0], _Run):
             layout = steps[0].layouts[0]
-            unpack, shortest, longest = layout.unpack_from, layout.size, layout.size + padding if exact else np.inf
+            unpack, shortest, longest = (
+                layout.unpack_from,
+                layout.size,
+                layout.size + padding if exact else np.inf,
+            )
             rows = [unpack(data) for data in messages if shortest <= len(data) <= longest]
             if len(rows) < len(messages):
                 wrong = next(len(data) for data in messages if not shortest <= len(data) <= longest)

@@ -1,5 +1,5 @@
-"""What passes between a recording and the learners: a mapping's source, raw signals on their own clocks, a table on one clock, and
-findings with place and count."""
+"""What passes between a recording and the learners: a mapping's source, raw signals on their own clocks, a
+table on one clock, and findings with place and count."""
 
 import difflib
 from collections.abc import Iterable
@@ -11,7 +11,8 @@ import numpy as np
 class Source(NamedTuple):
     """Our `signal` is `scale` value + `offset`, in `unit`, of what the recording calls `source`.
 
-    A source is a column, or "/topic:field.sub[2]" in MCAP; a bare name there is the field of that name in the only topic that has it.
+    A source is a column, or "/topic:field.sub[2]" in MCAP; a bare name there is
+    the field of that name in the only topic that has it.
     """
 
     signal: str
@@ -22,7 +23,8 @@ class Source(NamedTuple):
 
 
 class Note(NamedTuple):
-    """What reading met: `count` messages, chunks, values or lines; `signal` is empty where it is about the whole recording."""
+    """What reading met: `count` messages, chunks, values or lines; `signal`
+    is empty where it is about the whole recording."""
 
     kind: str
     signal: str
@@ -31,7 +33,8 @@ class Note(NamedTuple):
 
 
 class Raw(NamedTuple):
-    """A recording as it was made: {signal: (time_s (n,), values (n,))} with a clock each; NaN where no value was written.
+    """A recording as it was made: {signal: (time_s (n,), values (n,))}
+    with a clock each; NaN where no value was written.
 
     `messages` counts each topic's, or rows.
     """
@@ -43,7 +46,8 @@ class Raw(NamedTuple):
 
 
 class Flag(NamedTuple):
-    """A finding: what (`kind`), where (start_s to end_s), how many samples, and one sentence; `signal` is empty for the whole recording."""
+    """A finding: what (`kind`), where (start_s to end_s), how many samples, and one
+    sentence; `signal` is empty for the whole recording."""
 
     signal: str
     kind: str
@@ -54,7 +58,8 @@ class Flag(NamedTuple):
 
 
 class Jitter(NamedTuple):
-    """Intervals of one clock, those across gaps left out: their median, and the deviation from it (standard and largest)."""
+    """Intervals of one clock, those across gaps left out: their median,
+    and the deviation from it (standard and largest)."""
 
     interval_s: float
     std_s: float
@@ -64,8 +69,8 @@ class Jitter(NamedTuple):
 class Table(NamedTuple):
     """A recording on one sample time: T samples in segments without a gap.
 
-    `values` are as measured, never altered; `masked` says which are not to be used. `jitter` is that of each signal's own clock before
-    resampling.
+    `values` are as measured, never altered; `masked` says which are not to be used. `jitter` is that of each
+    signal's own clock before resampling.
     """
 
     recording: str
@@ -83,7 +88,11 @@ def nearest_names(name: str, names: Iterable[str]) -> str:
     if not names:
         return "it has none that can be read as a number"
     # "/topic:field" is found by its field alone too
-    known = [(part, full) for full in names for part in sorted({full.casefold(), full.casefold().rpartition(":")[2]})]
+    known = [
+        (part, full)
+        for full in names
+        for part in sorted({full.casefold(), full.casefold().rpartition(":")[2]})
+    ]
     close = difflib.get_close_matches(name.casefold(), sorted({part for part, _ in known}), n=3, cutoff=0.5)
     close += [name.casefold().rpartition(":")[2]]
     close = list(dict.fromkeys(full for wanted in close for part, full in known if part == wanted))

@@ -1,5 +1,6 @@
-"""Signals that stand still where they should not: frozen sensors, and converters on their rail. A process comes to rest by and by, and a
-coarse sensor shows that in longer and longer stretches; only what stops at once was stopped by the sensor."""
+"""Signals that stand still where they should not: frozen sensors, and converters on their rail. A
+process comes to rest by and by, and a coarse sensor shows that in longer and longer stretches;
+only what stops at once was stopped by the sensor."""
 
 import numpy as np
 
@@ -11,8 +12,9 @@ BESIDE = 24
 
 
 def frozen(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
-    """Stretches of one value, far longer than is usual for the signal, at whose ends noise ends at once, or a movement does and is then seen
-    to have gone on: by a jump at the end of the stretch, or by what moves beside it."""
+    """Stretches of one value, far longer than is usual for the signal, at whose ends
+    noise ends at once, or a movement does and is then seen to have gone on: by a jump at
+    the end of the stretch, or by what moves beside it."""
     values = np.where(table.masked[name], np.nan, table.values[name])
     first, last = runs(values, table.segment)
     length = last - first + 1
@@ -25,13 +27,29 @@ def frozen(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
         step = _step(values)
         entry, end = _alive(before, step), _alive(-after[::-1], step)
         moving = [other for other in table.values if other != name and _moves(table, other, a, b)]
-        released = len(after) > 0 and abs(after[0]) > 3 * max(np.abs(before[1:]).max(initial=0.0), np.abs(after[1:]).max(initial=0.0))
+        released = len(after) > 0 and abs(after[0]) > 3 * max(
+            np.abs(before[1:]).max(initial=0.0), np.abs(after[1:]).max(initial=0.0)
+        )
         noise_stopped = {entry, end} <= {"noise", "edge"} and "noise" in (entry, end)
         if noise_stopped or (entry == "movement" and (released or moving)):
             where = np.arange(a + 1, b + 1)
             beside = f" while {', '.join(moving[:3])} move" if moving else ""
-            message = f"{name} stays at {values[a]:g} for {b - a + 1} samples{beside}: a frozen sensor, masked"
-            found.append((Flag(name, "frozen", float(table.time_s[a + 1]), float(table.time_s[b]), len(where), message), where))
+            message = (
+                f"{name} stays at {values[a]:g} for {b - a + 1} samples{beside}: a frozen sensor, masked"
+            )
+            found.append(
+                (
+                    Flag(
+                        name,
+                        "frozen",
+                        float(table.time_s[a + 1]),
+                        float(table.time_s[b]),
+                        len(where),
+                        message,
+                    ),
+                    where,
+                )
+            )
     return found
 
 
@@ -47,19 +65,35 @@ def rails(table: Table, name: str) -> list[Flag]:
     flags = []
     for rail, side in ((known.max(), "largest"), (known.min(), "smallest")):
         there = (values[first] == rail) & (length > limit)
-        long = [(int(a), int(b)) for a, b in zip(first[there], last[there], strict=True) if _at_rail(values, table.segment, a)]
-        if any(_alive(_before(values, table.segment, a), _step(values)) in ("noise", "movement") for a, _ in long):
+        long = [
+            (int(a), int(b))
+            for a, b in zip(first[there], last[there], strict=True)
+            if _at_rail(values, table.segment, a)
+        ]
+        if any(
+            _alive(_before(values, table.segment, a), _step(values)) in ("noise", "movement") for a, _ in long
+        ):
             count = sum(b - a + 1 for a, b in long)
             message = (
                 f"{name} stays at {rail:g}, its {side} value, for {count} samples in {len(long)} stretches:"
                 f" the sensor or its converter is saturated"
             )
-            flags.append(Flag(name, "saturated", float(table.time_s[long[0][0]]), float(table.time_s[long[-1][1]]), count, message))
+            flags.append(
+                Flag(
+                    name,
+                    "saturated",
+                    float(table.time_s[long[0][0]]),
+                    float(table.time_s[long[-1][1]]),
+                    count,
+                    message,
+                )
+            )
     return flags
 
 
 def runs(values: np.ndarray, segment: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """First and last index (m,) of stretches of equal values within segments; NaN end a stretch and are none."""
+    """First and last index (m,) of stretches of equal values within
+    segments; NaN end a stretch and are none."""
     same = (values[1:] == values[:-1]) & (segment[1:] == segment[:-1])
     first = np.flatnonzero(np.r_[True, ~same])
     last = np.r_[first[1:], len(values)] - 1
@@ -68,7 +102,8 @@ def runs(values: np.ndarray, segment: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _usual(lengths: np.ndarray) -> float:
-    """The length that nine tenths of the samples are within: a coarse or slow signal rests long, if not often."""
+    """The length that nine tenths of the samples are within: a coarse
+    or slow signal rests long, if not often."""
     ordered = np.sort(lengths)
     held = np.cumsum(ordered)
     return float(ordered[np.searchsorted(held, 0.9 * held[-1])]) if len(ordered) else np.inf
@@ -94,8 +129,9 @@ def _step(values: np.ndarray) -> float:
 
 
 def _alive(changes: np.ndarray, step: float) -> str:
-    """What a signal does before it stops: "noise" of more than its step, "movement" one way that does not slow down, "" for neither (it rests,
-    or comes to rest), and "edge" where the record has too little of it to tell."""
+    """What a signal does before it stops: "noise" of more than its step, "movement"
+    one way that does not slow down, "" for neither (it rests, or comes to rest), and
+    "edge" where the record has too little of it to tell."""
     changes = changes[np.isfinite(changes)]
     if len(changes) < BESIDE // 2:
         return "edge"
@@ -107,7 +143,14 @@ def _alive(changes: np.ndarray, step: float) -> str:
         return "noise"
     third = len(changes) // 3
     early, late = changes[:third].sum(), changes[-third:].sum()
-    return "movement" if turns <= 1 and early * late > 0 and abs(late) >= 0.5 * abs(early) and len(moved) >= 0.75 * len(changes) else ""
+    return (
+        "movement"
+        if turns <= 1
+        and early * late > 0
+        and abs(late) >= 0.5 * abs(early)
+        and len(moved) >= 0.75 * len(changes)
+        else ""
+    )
 
 
 def _moves(table: Table, name: str, first: int, last: int) -> bool:
@@ -119,7 +162,7 @@ def _moves(table: Table, name: str, first: int, last: int) -> bool:
 
 
 def _at_rail(values: np.ndarray, segment: np.ndarray, first: int) -> bool:
-    """Whether a stretch lies on the largest or smallest value of all, and the signal came there from elsewhere: a machine at rest begins
-    at its smallest."""
+    """Whether a stretch lies on the largest or smallest value of all, and the signal came there from
+    elsewhere: a machine at rest begins at its smallest."""
     begins = first == 0 or segment[first] != segment[first - 1]
     return not begins and bool(values[first] in (np.nanmax(values), np.nanmin(values)))

@@ -1,7 +1,9 @@
-"""Deep Q-learning of setpoints as published (Li and Pattinson 2025, eqs. 10-13, tables 1 and 2): network, replay, one phase as one program, and the four phases.
+"""Deep Q-learning of setpoints as published (Li and Pattinson 2025, eqs. 10-13, tables 1 and 2): network,
+replay, one phase as one program, and the four phases.
 
-What the network sees is a `Sight`, so that the paper's 35 numbers and ours (belief_agent.py) train by the same lines. Two heads, one for the flow and one for the
-temperature, each with one maximum and a one-step target of its own; step 100 ends an episode without ending the task, so its target still looks ahead.
+What the network sees is a `Sight`, so that the paper's 35 numbers and ours (belief_agent.py) train by the
+same lines. Two heads, one for the flow and one for the temperature, each with one maximum and a one-step
+target of its own; step 100 ends an episode without ending the task, so its target still looks ahead.
 """
 
 from collections.abc import Callable
@@ -44,7 +46,8 @@ TEMPERATURE_SCALE = 30.0  # °C, half the range of the targets: degrees as they 
 
 
 class QNetwork(eqx.Module):
-    """The paper's network, 47,082 parameters: camera 33 -> 256 and temperatures 2 -> 32, together 288 -> 128 -> 5 + 5, rectified linear."""
+    """The paper's network, 47,082 parameters: camera 33 -> 256 and temperatures 2 -> 32,
+    together 288 -> 128 -> 5 + 5, rectified linear."""
 
     vision: eqx.nn.Linear
     temperature: eqx.nn.Linear
@@ -59,15 +62,18 @@ class QNetwork(eqx.Module):
         self.heads = eqx.nn.Linear(128, 2 * ACTIONS, key=keys[3])
 
     def __call__(self, state: jax.Array) -> jax.Array:
-        """Q (2, 5) of the flow's and the temperature's actions at a state (35,) of (9), temperatures already scaled."""
-        # both first layers as one product, zeros where one does not see the other's numbers: for a batch that is dearer in sums and cheaper in moving them
+        """Q (2, 5) of the flow's and the temperature's actions at a
+        state (35,) of (9), temperatures already scaled."""
+        # both first layers as one product, zeros where one does not see the other's numbers: for a batch that
+        # is dearer in sums and cheaper in moving them
         both = jax.scipy.linalg.block_diag(self.vision.weight, self.temperature.weight)
         seen = jax.nn.relu(both @ state + jnp.concatenate([self.vision.bias, self.temperature.bias]))
         return self.heads(jax.nn.relu(self.joint(seen))).reshape(2, ACTIONS)
 
 
 class Sight(NamedTuple):
-    """What a network sees: start() -> memory;  see(parameters, memory, observation) -> (memory, x (d,)). Pure, for one episode."""
+    """What a network sees: start() -> memory; see(parameters, memory,
+    observation) -> (memory, x (d,)). Pure, for one episode."""
 
     start: Callable[[], Any]
     see: Callable[[Any, Any, Observation], tuple[Any, jax.Array]]
@@ -78,13 +84,16 @@ def paper_sight() -> Sight:
 
     def see(network, history, observation):
         state = paper_state(history, observation)
-        return remembered(history, observation.named), state.at[VISION:].add(-BEST_TEMPERATURE).at[VISION:].divide(TEMPERATURE_SCALE)
+        return remembered(history, observation.named), state.at[VISION:].add(-BEST_TEMPERATURE).at[
+            VISION:
+        ].divide(TEMPERATURE_SCALE)
 
     return Sight(first_history, see)
 
 
 def greedy(sight: Sight) -> Controller:
-    """The controller that takes the best action of each head; its parameters are the network. The simulator heeds the temperature's every 10th step."""
+    """The controller that takes the best action of each head; its parameters are the network. The simulator
+    heeds the temperature's every 10th step."""
 
     def act(network, memory, observation, key):
         memory, x = sight.see(network, memory, observation)
@@ -98,7 +107,8 @@ def greedy(sight: Sight) -> Controller:
 
 
 class Learner(NamedTuple):
-    """Network, its slow copy (13), and the optimiser's state: all that goes from one phase to the next. The replay does not: its rewards are of the old phase."""
+    """Network, its slow copy (13), and the optimiser's state: all that goes from one phase to the next. The
+    replay does not: its rewards are of the old phase."""
 
     network: eqx.Module
     slow: eqx.Module
@@ -106,7 +116,8 @@ class Learner(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """Numbers of table 2 and those it leaves open: `updates` of a phase, each after one step of `environments` episodes at once.
+    """Numbers of table 2 and those it leaves open: `updates` of a phase, each
+    after one step of `environments` episodes at once.
 
     gamma of both heads, or (2,) of each.
     """
@@ -120,8 +131,10 @@ class Setting(NamedTuple):
 
 
 class Replay(NamedTuple):
-    """Transitions: x and what followed (n, d), action and reward of both heads (n, 2), and whether lambda's clock heeds no temperature action next (n,): then the
-    temperature stands, and the target says so; a maximum there would make waiting free. The ring keeps them as rows of 2 d + 5 numbers: one place to look up each."""
+    """Transitions: x and what followed (n, d), action and reward of both heads (n, 2), and
+    whether lambda's clock heeds no temperature action next (n,): then the temperature stands,
+    and the target says so; a maximum there would make waiting free. The ring keeps them as
+    rows of 2 d + 5 numbers: one place to look up each."""
 
     x: jax.Array
     after: jax.Array
@@ -141,7 +154,8 @@ def _unpacked(table: jax.Array) -> Replay:
 
 
 class World(NamedTuple):
-    """Where experience comes from: windows, conditions(key) of a new episode, and rewards(state) -> (2,) of both heads."""
+    """Where experience comes from: windows, conditions(key) of a new
+    episode, and rewards(state) -> (2,) of both heads."""
 
     windows: Windows
     conditions: Callable[[jax.Array], Conditions]
@@ -154,7 +168,8 @@ def greatest(network, slow, after: jax.Array) -> jax.Array:
 
 
 def double(network, slow, after: jax.Array) -> jax.Array:
-    """Q(s', argmax_a Q(s', a); slow): the network chooses, the slow copy values (van Hasselt, Guez and Silver 2016)."""
+    """Q(s', argmax_a Q(s', a); slow): the network chooses, the slow
+    copy values (van Hasselt, Guez and Silver 2016)."""
     return jnp.take_along_axis(slow(after), network(after).argmax(axis=1)[:, None], axis=1)[:, 0]
 
 
@@ -170,26 +185,34 @@ def _fresh(world: World, sight: Sight, network, keys):
 
 
 def _stepped(world: World, sight: Sight, network, episodes, epsilon, u: jax.Array, key, length: int):
-    """One step of all episodes under the epsilon-greedy policy, by u (n, 4 + CHANCES) uniform in [0, 1) -> (episodes, their transitions); those that are over start
-    anew, from the key."""
+    """One step of all episodes under the epsilon-greedy policy, by u (n, 4 + CHANCES) uniform in [0, 1) ->
+    (episodes, their transitions); those that are over start anew, from the key."""
     conditions, state, memory, x = episodes
     explores, at_random, befalls = u[:, :2] < epsilon, (ACTIONS * u[:, 2:4]).astype(jnp.int32), u[:, 4:]
     action = jnp.where(explores, at_random, jax.vmap(network)(x).argmax(axis=2))
-    action = action.at[:, 1].set(jnp.where(state.step % LAMBDA == 0, action[:, 1], STAND))  # what is not heeded is standing
-    state, observation = jax.vmap(Partial(stepped, world.windows))(conditions, state, Action(action[:, 0], action[:, 1]), befalls)
+    action = action.at[:, 1].set(
+        jnp.where(state.step % LAMBDA == 0, action[:, 1], STAND)
+    )  # what is not heeded is standing
+    state, observation = jax.vmap(Partial(stepped, world.windows))(
+        conditions, state, Action(action[:, 0], action[:, 1]), befalls
+    )
     memory, after = jax.vmap(Partial(sight.see, network))(memory, observation)
     rewards = jax.vmap(world.rewards)(state)
     over, waits = state.step >= length, state.step % LAMBDA != 0
 
     def renewed(going):
         again = _fresh(world, sight, network, jax.random.split(key, len(x)))
-        return jax.tree.map(lambda new, old: jnp.where(over.reshape(-1, *[1] * (old.ndim - 1)), new, old), again, going)
+        return jax.tree.map(
+            lambda new, old: jnp.where(over.reshape(-1, *[1] * (old.ndim - 1)), new, old), again, going
+        )
 
     episodes = jax.lax.cond(over.any(), renewed, lambda going: going, (conditions, state, memory, after))
     return episodes, Replay(x, after, action.astype(jnp.int8), rewards, waits)
 
 
-def _updated(learner: Learner, rows: Replay, optimiser, bootstrap, gamma: float | jax.Array, tau: float) -> Learner:
+def _updated(
+    learner: Learner, rows: Replay, optimiser, bootstrap, gamma: float | jax.Array, tau: float
+) -> Learner:
     """One step on (12) for a batch, then (13)."""
     ahead = jax.vmap(Partial(bootstrap, learner.network, learner.slow))(rows.after)
     standing = jax.vmap(learner.slow)(rows.after)[:, 1, STAND]
@@ -207,34 +230,54 @@ def _updated(learner: Learner, rows: Replay, optimiser, bootstrap, gamma: float 
 
 
 def _mean_gradient(loss: Callable, network, *batch: jax.Array):
-    """Gradient of the mean of `loss` over the rows of `batch`, as the mean over slices of at most SHORT rows: sums of the same order on every CPU."""
-    parts = next(n for n in range(1, len(batch[0]) + 1) if len(batch[0]) % n == 0 and len(batch[0]) <= n * SHORT)
+    """Gradient of the mean of `loss` over the rows of `batch`, as the mean over slices of at most SHORT rows:
+    sums of the same order on every CPU."""
+    parts = next(
+        n for n in range(1, len(batch[0]) + 1) if len(batch[0]) % n == 0 and len(batch[0]) <= n * SHORT
+    )
     slices = zip(*(jnp.split(a, parts) for a in batch), strict=True)
     return jax.tree.map(lambda *g: sum(g) / parts, *(jax.grad(loss)(network, *rows) for rows in slices))
 
 
 def phase(
-    learner: Learner, key: jax.Array, *, sight: Sight, world: World, optimiser: optax.GradientTransformation, bootstrap: Callable, setting: Setting,
+    learner: Learner, key: jax.Array, *, sight: Sight, world: World, optimiser: optax.GradientTransformation,
+    bootstrap: Callable, setting: Setting,
     updates: int, longest: int, epsilon: tuple[float, float],
 ) -> tuple[Learner, jax.Array]:  # fmt: skip
-    """A whole phase as one program -> the learner after it and the mean reward of each step (updates,); epsilon falls in a line over the first third.
+    """A whole phase as one program -> the learner after it and the mean reward of each step (updates,);
+    epsilon falls in a line over the first third.
 
-    A step of all episodes, one batch from an empty replay, one update, `updates` times. Episodes start at different steps, so that they do not end together.
-    Phases with the same `longest`, the updates of the longest of them, are one program compiled once.
+    A step of all episodes, one batch from an empty replay, one update, `updates` times. Episodes start at
+    different steps, so that they do not end together. Phases with the same `longest`, the updates of the
+    longest of them, are one program compiled once.
     """
     learner, rewards = _phase(
-        learner, key, jnp.asarray(updates), jnp.asarray(epsilon), sight=sight, world=world, optimiser=optimiser, bootstrap=bootstrap, setting=setting, longest=longest
+        learner, key, jnp.asarray(updates), jnp.asarray(epsilon), sight=sight, world=world,
+        optimiser=optimiser, bootstrap=bootstrap, setting=setting, longest=longest
     )  # fmt: skip
     return learner, rewards[:updates]
 
 
 @eqx.filter_jit
-def _phase(learner, key, updates, epsilon, *, sight: Sight, world: World, optimiser, bootstrap, setting: Setting, longest: int):
+def _phase(
+    learner,
+    key,
+    updates,
+    epsilon,
+    *,
+    sight: Sight,
+    world: World,
+    optimiser,
+    bootstrap,
+    setting: Setting,
+    longest: int,
+):
     k_start, k_clock, key = jax.random.split(key, 3)
     n, capacity = setting.environments, setting.capacity
     conditions, state, memory, x = _fresh(world, sight, learner.network, jax.random.split(k_start, n))
     state = state._replace(step=LAMBDA * jax.random.randint(k_clock, (n,), 0, setting.episode // LAMBDA))
-    # a step draws some thousand numbers: by XLA's own generator (Philox), which costs a tenth of jax's default there
+    # a step draws some thousand numbers: by XLA's own generator
+    # (Philox), which costs a tenth of jax's default there
     fast = jax.random.wrap_key_data(jnp.tile(jax.random.key_data(key), 2), impl="rbg")
 
     def one(i, carry):
@@ -258,7 +301,9 @@ def _phase(learner, key, updates, epsilon, *, sight: Sight, world: World, optimi
         return learner, episodes, ring, paid.at[i].set(new.reward.mean())
 
     ring = jnp.zeros((capacity, 2 * x.shape[1] + 5))
-    learner, _, _, rewards = jax.lax.fori_loop(0, updates, one, (learner, (conditions, state, memory, x), ring, jnp.zeros(longest)))
+    learner, _, _, rewards = jax.lax.fori_loop(
+        0, updates, one, (learner, (conditions, state, memory, x), ring, jnp.zeros(longest))
+    )
     return learner, rewards
 
 
@@ -297,9 +342,11 @@ def train_published(
     least: float,
     on_step=None,
 ) -> Published:
-    """The four phases: reward shapes (40, 20), (40, 10), (20, 10) on windows that are always right, then the last shape with `accuracy`; Adam at one rate throughout.
+    """The four phases: reward shapes (40, 20), (40, 10), (20, 10) on windows that are always right, then the
+    last shape with `accuracy`; Adam at one rate throughout.
 
-    epsilon falls from `explore` in phase 1, from `explore_again` in the later ones, to `least`; `updates` of each phase, as many phases as there are numbers.
+    epsilon falls from `explore` in phase 1, from `explore_again` in the later ones, to
+    `least`; `updates` of each phase, as many phases as there are numbers.
     on_step(phase, network, rewards) is called after each phase.
     """
     k_network, key = jax.random.split(key)
@@ -309,9 +356,12 @@ def train_published(
     for i, count in enumerate(updates):
         a, b = PHASES[min(i, len(PHASES) - 1)]
         right = 1.0 if i < len(PHASES) else accuracy
-        world = World(windows, Partial(anywhere, jnp.asarray(right)), Partial(ellipse, jnp.asarray(a), jnp.asarray(b)))
+        world = World(
+            windows, Partial(anywhere, jnp.asarray(right)), Partial(ellipse, jnp.asarray(a), jnp.asarray(b))
+        )
         learner, rewards = phase(
-            learner, jax.random.fold_in(key, i), sight=sight, world=world, optimiser=optimiser, bootstrap=greatest, setting=setting, updates=count,
+            learner, jax.random.fold_in(key, i), sight=sight, world=world, optimiser=optimiser,
+            bootstrap=greatest, setting=setting, updates=count,
             longest=max(updates), epsilon=(explore if i == 0 else explore_again, least),
         )  # fmt: skip
         networks.append(learner.network)
@@ -338,11 +388,15 @@ def with_weights(network: eqx.Module, arrays: dict[str, np.ndarray]) -> eqx.Modu
     Raises ValueError where names or shapes are those of another architecture.
     """
     own = weights(network)
-    wrong = sorted(own.keys() ^ arrays.keys()) or [name for name in own if own[name].shape != np.shape(arrays[name])]
+    wrong = sorted(own.keys() ^ arrays.keys()) or [
+        name for name in own if own[name].shape != np.shape(arrays[name])
+    ]
     if wrong:
         found = f"shape {np.shape(arrays[wrong[0]])}" if wrong[0] in arrays else "none"
         raise ValueError(
-            f"weights of another architecture: {wrong[0]!r} is {f'of shape {own[wrong[0]].shape}' if wrong[0] in own else 'unknown'} in this network and {found} in "
+            f"weights of another architecture: {wrong[0]!r} is "
+            f"{f'of shape {own[wrong[0]].shape}' if wrong[0] in own else 'unknown'} in this "
+            f"network and {found} in "
             "the file; train again, or load them into the network that they were trained in"
         )
     return jax.tree.unflatten(jax.tree.structure(network), [jnp.asarray(arrays[name]) for name in own])

@@ -1,16 +1,20 @@
-"""Bayes filters for the flow: what the windows say on a grid of flows, under several hypotheses of how the camera errs, and the move with the least expected loss.
+"""Bayes filters for the flow: what the windows say on a grid of flows, under several hypotheses of how the
+camera errs, and the move with the least expected loss.
 
-The flow is known by its moves and by the windows it shows. The filter carries b(h, q), the belief that the flow is q, the camera errs in the manner of h, and the
-extruder follows its commands with the gain g_h:
+The flow is known by its moves and by the windows it shows. The filter carries b(h, q), the belief that the
+flow is q, the camera errs in the manner of h, and the extruder follows its commands with the gain g_h:
 
-    b(h, q) <- sum_h' T(h', h) [(1 - hazard) b(h', q - g_h' move) + hazard b'(h') prior(q)]  the move; a clog or the like, with a small probability; another segment
-    b(h, q) <- b(h, q) P(window | h, q, window before) / sum                                 the window
-    a = argmin_a sum b(h, q) loss(q + g_h a) + move_cost |a|                                 loss(q) = |q - 100| + outside_cost where that is more than 10
+b(h, q) <- sum_h' T(h', h) [(1 - hazard) b(h', q - g_h' move) + hazard b'(h') prior(q)] the move; a
+clog or the like, with a small probability; another segment b(h, q) <- b(h, q) P(window | h, q,
+window before) / sum the window a = argmin_a sum b(h, q) loss(q + g_h a) + move_cost |a| loss(q) =
+|q - 100| + outside_cost where that is more than 10
 
-Manners of erring (`evidence`): anywhere with one probability, as in the paper's simulator; or as a trained classifier does by its recorded windows, seen through
-a segment that makes every bead look wider or narrower. Which it is, and how the extruder follows, shows by itself. b'(h) is b(h) with all gains alike: what clogs a
-nozzle changes how its flow follows, too. Windows of a segment are alike: where the flow setpoint stood, one shows with probability `repeats` what the one before did,
-whatever the flow, so that ten alike are not ten witnesses.
+Manners of erring (`evidence`): anywhere with one probability, as in the paper's simulator; or as a
+trained classifier does by its recorded windows, seen through a segment that makes every bead look
+wider or narrower. Which it is, and how the extruder follows, shows by itself. b'(h) is b(h) with all
+gains alike: what clogs a nozzle changes how its flow follows, too. Windows of a segment are alike:
+where the flow setpoint stood, one shows with probability `repeats` what the one before did, whatever
+the flow, so that ten alike are not ten witnesses.
 """
 
 from collections.abc import Sequence
@@ -47,9 +51,11 @@ CODES = CLASSES * LEVELS
 
 
 class Filter(NamedTuple):
-    """evidence (H, CODES, N) is P(code | h, q); transition and after_jump (H, H) from row to column at each decision and each jump of the flow; gains (H,), true by
-    commanded move; repeats (H,): probability that a window shows what the one before did where the flow setpoint stood; hazard: probability a decision that the flow
-    jumps; move_cost in percent of flow error by percent of move, outside_cost in percent of flow error."""
+    """evidence (H, CODES, N) is P(code | h, q); transition and after_jump (H, H) from row to
+    column at each decision and each jump of the flow; gains (H,), true by commanded move; repeats
+    (H,): probability that a window shows what the one before did where the flow setpoint stood;
+    hazard: probability a decision that the flow jumps; move_cost in percent of flow error by
+    percent of move, outside_cost in percent of flow error."""
 
     evidence: jax.Array
     transition: jax.Array
@@ -62,7 +68,8 @@ class Filter(NamedTuple):
 
 
 class Known(NamedTuple):
-    """What the filter remembers: belief (H, N), sum 1, and the code of the last window, -1 before the first."""
+    """What the filter remembers: belief (H, N), sum 1, and the code of
+    the last window, -1 before the first."""
 
     belief: jax.Array
     last: jax.Array
@@ -77,9 +84,14 @@ def unknown(hypotheses: int) -> Known:
 def bayes(hypotheses: int) -> Controller:
     """The filter and its greedy move, for Filter parameters of so many hypotheses."""
 
-    def act(parameters: Filter, known: Known, observation: Observation, key: jax.Array) -> tuple[Known, Action]:
+    def act(
+        parameters: Filter, known: Known, observation: Observation, key: jax.Array
+    ) -> tuple[Known, Action]:
         known = believed(parameters, known, observation)
-        return known, Action(jnp.argmin(expected_loss(parameters, known.belief)).astype(jnp.int32), temperature_move(observation))
+        return known, Action(
+            jnp.argmin(expected_loss(parameters, known.belief)).astype(jnp.int32),
+            temperature_move(observation),
+        )
 
     return Controller(lambda: unknown(hypotheses), act)
 
@@ -91,7 +103,9 @@ def believed(parameters: Filter, known: Known, observation: Observation) -> Know
     predicted = parameters.transition.T @ ((1.0 - parameters.hazard) * moved + parameters.hazard * jumped)
     shown = code(observation.shares, observation.named)
     repeats = (parameters.repeats * ((known.last >= 0) & (observation.flow_move == 0)))[:, None]
-    posterior = predicted * (repeats * (shown == known.last) + (1.0 - repeats) * parameters.evidence[:, shown])
+    posterior = predicted * (
+        repeats * (shown == known.last) + (1.0 - repeats) * parameters.evidence[:, shown]
+    )
     return Known(posterior / posterior.sum(), shown)
 
 
@@ -100,17 +114,22 @@ def expected_loss(parameters: Filter, belief: jax.Array) -> jax.Array:
     moves = jnp.asarray(FLOW_MOVES)
     miss = jnp.abs(GRID + parameters.gains[:, None] * moves[:, None, None] - BEST_FLOW)  # (5, H, N)
     # of a miss on the border itself, as little as rounding is not outside
-    return jnp.sum((miss + parameters.outside_cost * (miss > 10.0 + 1e-3)) * belief, axis=(1, 2)) + parameters.move_cost * jnp.abs(moves)
+    return jnp.sum(
+        (miss + parameters.outside_cost * (miss > 10.0 + 1e-3)) * belief, axis=(1, 2)
+    ) + parameters.move_cost * jnp.abs(moves)
 
 
 def shifted(belief: jax.Array, move: jax.Array) -> jax.Array:
-    """The belief (..., N) moved by `move` percent, linear between grid points; what would leave the grid stays on its last point."""
+    """The belief (..., N) moved by `move` percent, linear between grid points;
+    what would leave the grid stays on its last point."""
     whole = jnp.floor(move / SPACING)
     fraction = move / SPACING - whole
     source = jnp.arange(len(GRID)) - whole.astype(jnp.int32)
 
     def at(index):
-        return jnp.where((index >= 0) & (index < len(GRID)), belief[..., jnp.clip(index, 0, len(GRID) - 1)], 0.0)
+        return jnp.where(
+            (index >= 0) & (index < len(GRID)), belief[..., jnp.clip(index, 0, len(GRID) - 1)], 0.0
+        )
 
     moved = (1.0 - fraction) * at(source) + fraction * at(source - 1)
     last = jnp.arange(len(GRID)) == jnp.where(move > 0, len(GRID) - 1, 0)
@@ -118,40 +137,51 @@ def shifted(belief: jax.Array, move: jax.Array) -> jax.Array:
 
 
 def code(shares: jax.Array, named: jax.Array) -> jax.Array:
-    """The window as one of CODES numbers: its class, and within it one of LEVELS of s = log (p_2 + f) / (p_0 + f), which says where in the class the flow is."""
+    """The window as one of CODES numbers: its class, and within it one of LEVELS of s = log (p_2 + f) / (p_0
+    + f), which says where in the class the flow is."""
     s = jnp.log((shares[..., 2] + FAINTEST) / (shares[..., 0] + FAINTEST)) / np.log((1 + FAINTEST) / FAINTEST)
     within = jnp.where(named == UNDER, s + 1.0, jnp.where(named == GOOD, (s + 0.8) / 1.6, s))
     return (named * LEVELS + jnp.clip(jnp.floor(within * LEVELS), 0, LEVELS - 1)).astype(jnp.int32)
 
 
 def class_evidence(accuracy: float) -> np.ndarray:
-    """(1, CODES, N): the class is right with this probability and one of the others otherwise, wherever the flow is; the shares are those of (7) for the class named,
-    which say nothing more of the flow."""
+    """(1, CODES, N): the class is right with this probability and one of the others otherwise, wherever the
+    flow is; the shares are those of (7) for the class named, which say nothing more of the flow."""
     right = np.arange(CODES)[:, None] // LEVELS == np.asarray(flow_class(GRID))
     return (np.where(right, accuracy, (1.0 - accuracy) / (CLASSES - 1)) * _paper_levels()[:, None])[None]
 
 
 @cache
 def _paper_levels() -> np.ndarray:
-    """(CODES,) P(code | class named) under (7), by the midpoints of its two uniform numbers, with a floor of 1 % for every level."""
+    """(CODES,) P(code | class named) under (7), by the midpoints of its two
+    uniform numbers, with a floor of 1 % for every level."""
     u = jnp.stack(jnp.meshgrid(*2 * [(jnp.arange(100) + 0.5) / 100], indexing="ij"), axis=-1).reshape(-1, 2)
     found = np.zeros(CODES)
     for flow in (50.0, 100.0, 150.0):
-        drawn = jax.vmap(lambda pair, flow=flow: paper_windows().draw((), nominal(flow, 210.0, accuracy=1.0), flow, 0.0, jnp.concatenate([jnp.zeros(1), pair])))(u)
+        drawn = jax.vmap(
+            lambda pair, flow=flow: paper_windows().draw(
+                (), nominal(flow, 210.0, accuracy=1.0), flow, 0.0, jnp.concatenate([jnp.zeros(1), pair])
+            )
+        )(u)
         found += np.bincount(np.asarray(code(*drawn)), minlength=CODES) / len(u)
     return 0.99 * found + 0.01 / LEVELS
 
 
-def recorded_evidence(table: WindowTable, *, look: float, looks: int, floor: float, smoothing: float) -> np.ndarray:
-    """(looks, CODES, N): frequencies of the codes by flow, in hypothesis j seen as if the flow were q exp(look z_j), z_j the middles of `looks` equal parts of N(0, 1).
+def recorded_evidence(
+    table: WindowTable, *, look: float, looks: int, floor: float, smoothing: float
+) -> np.ndarray:
+    """(looks, CODES, N): frequencies of the codes by flow, in hypothesis j seen as if the flow were q
+    exp(look z_j), z_j the middles of `looks` equal parts of N(0, 1).
 
-    look: relative width that a segment adds to its beads, one deviation; floor: share of windows that may show anything; smoothing over flow in percent, one
-    deviation, at least half a bin.
+    look: relative width that a segment adds to its beads, one deviation; floor: share of windows that may
+    show anything; smoothing over flow in percent, one deviation, at least half a bin.
     """
     edges = np.asarray(table.flow_edges, float)
     centre, width = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
     counts = np.zeros((len(centre), CODES))
-    np.add.at(counts, (table.flow_bin, np.asarray(code(jnp.asarray(table.shares), jnp.asarray(table.named)))), 1.0)
+    np.add.at(
+        counts, (table.flow_bin, np.asarray(code(jnp.asarray(table.shares), jnp.asarray(table.named)))), 1.0
+    )
     counts *= (width / counts.sum(axis=1))[:, None]  # as if every percent of flow had been recorded alike
     z = scipy.special.ndtri((np.arange(looks) + 0.5) / looks)
     seen = GRID * np.exp(look * z)[:, None]
@@ -161,11 +191,13 @@ def recorded_evidence(table: WindowTable, *, look: float, looks: int, floor: flo
 
 
 def robust_filter(table: WindowTable, *, accuracies: Sequence[float], gains: Sequence[float], looks: int, look: float, floor: float, smoothing: float,
-                  segment: float, switch: float, repeats: float, hazard: float, move_cost: float, outside_cost: float) -> Filter:  # fmt: skip
-    """The filter for both simulators: for each of `gains` the manners of erring are anywhere with each of `accuracies`, then `looks` as recorded, each the look of a
-    segment that lasts `segment` decisions.
+                  segment: float, switch: float, repeats: float, hazard: float, move_cost: float,
+                  outside_cost: float) -> Filter:  # fmt: skip
+    """The filter for both simulators: for each of `gains` the manners of erring are anywhere with each of
+    `accuracies`, then `looks` as recorded, each the look of a segment that lasts `segment` decisions.
 
-    switch: probability a decision of going over from one way of erring (any of `accuracies`, or as recorded) to another; repeats: of the manners as recorded.
+    switch: probability a decision of going over from one way of erring (any of `accuracies`, or as recorded)
+    to another; repeats: of the manners as recorded.
     """
     recorded = recorded_evidence(table, look=look, looks=looks, floor=floor, smoothing=smoothing)
     evidence = np.concatenate([*(class_evidence(accuracy) for accuracy in accuracies), recorded])
@@ -173,18 +205,23 @@ def robust_filter(table: WindowTable, *, accuracies: Sequence[float], gains: Seq
     after_jump = np.kron(np.full((len(gains), len(gains)), 1 / len(gains)), np.eye(len(evidence)))
     repeating = np.tile(np.repeat([0.0, repeats], [len(accuracies), looks]), len(gains))
     return Filter(
-        jnp.asarray(np.tile(evidence, (len(gains), 1, 1)), jnp.float32), jnp.asarray(transition, jnp.float32), jnp.asarray(after_jump, jnp.float32),
-        jnp.repeat(jnp.asarray(gains, jnp.float32), len(evidence)), jnp.asarray(repeating, jnp.float32), hazard, move_cost, outside_cost,
+        jnp.asarray(np.tile(evidence, (len(gains), 1, 1)), jnp.float32), jnp.asarray(transition, jnp.float32),
+        jnp.asarray(after_jump, jnp.float32),
+        jnp.repeat(jnp.asarray(gains, jnp.float32), len(evidence)), jnp.asarray(repeating, jnp.float32),
+        hazard, move_cost, outside_cost,
     )  # fmt: skip
 
 
 def _changes(anywhere: int, looks: int, segment: float, switch: float) -> np.ndarray:
-    """(anywhere + looks, anywhere + looks): ways of erring are left with probability `switch` for any of them alike; looks last `segment` decisions."""
+    """(anywhere + looks, anywhere + looks): ways of erring are left with probability `switch` for any of them
+    alike; looks last `segment` decisions."""
     ways = anywhere + 1
     transition = np.full((anywhere + looks, anywhere + looks), switch / ways)
     transition[:, anywhere:] /= looks
     transition[:anywhere, :anywhere] += (1.0 - switch) * np.eye(anywhere)
-    transition[anywhere:, anywhere:] += (1.0 - switch) * ((1.0 - 1.0 / segment) * np.eye(looks) + 1.0 / segment / looks)
+    transition[anywhere:, anywhere:] += (1.0 - switch) * (
+        (1.0 - 1.0 / segment) * np.eye(looks) + 1.0 / segment / looks
+    )
     return transition
 
 

@@ -1,8 +1,11 @@
-"""Our agent: deep Q-learning on a belief. The Bayes filter of bayes.py turns windows and moves into what is known of the flow, so that a small network meets a problem
-that is nearly Markov. It starts from the value that the belief would have were the flow seen from the next step on, and double Q-learning in disturbed episodes adds
-what that leaves out: hesitation while moves are cheap to regret, haste after a clog, and distrust of the filter where the machine is none of its hypotheses.
+"""Our agent: deep Q-learning on a belief. The Bayes filter of bayes.py turns windows and moves into what is
+known of the flow, so that a small network meets a problem that is nearly Markov. It starts from the value
+that the belief would have were the flow seen from the next step on, and double Q-learning in disturbed
+episodes adds what that leaves out: hesitation while moves are cheap to regret, haste after a clog, and
+distrust of the filter where the machine is none of its hypotheses.
 
-Nothing tells the agent the classifier's accuracy, the actuator's gain or the setpoint: accuracies and gains are hypotheses of the filter.
+Nothing tells the agent the classifier's accuracy, the actuator's gain or the setpoint:
+accuracies and gains are hypotheses of the filter.
 """
 
 from typing import NamedTuple
@@ -15,8 +18,26 @@ import optax
 from jax.tree_util import Partial
 
 from pipeline.setpoint import bayes
-from pipeline.setpoint.agent import ACTIONS, TEMPERATURE_SCALE, Learner, Setting, Sight, World, double, greedy, phase
-from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE, DELTA, FLOW_MOVES, LAMBDA, PHASES, TEMPERATURE_MOVES
+from pipeline.setpoint.agent import (
+    ACTIONS,
+    TEMPERATURE_SCALE,
+    Learner,
+    Setting,
+    Sight,
+    World,
+    double,
+    greedy,
+    phase,
+)
+from pipeline.setpoint.published import (
+    BEST_FLOW,
+    BEST_TEMPERATURE,
+    DELTA,
+    FLOW_MOVES,
+    LAMBDA,
+    PHASES,
+    TEMPERATURE_MOVES,
+)
 from pipeline.setpoint.recorded import WindowTable, recorded_windows
 from pipeline.setpoint.reward import reward
 from pipeline.setpoint.simulator import (
@@ -33,14 +54,18 @@ from pipeline.setpoint.simulator import (
     rollout,
 )
 
-SINGLE = (60.0, 150.0)  # percent of flow between which the network sees every point of the grid; outside it sees groups of GROUP
+SINGLE = (
+    60.0,
+    150.0,
+)  # percent of flow between which the network sees every point of the grid; outside it sees groups of GROUP
 GROUP = 4
 VALIDATION = 1024  # episodes: the mean cost of a step to about 1 %
 AHEAD = 40  # steps after which a heater of (6) has 1e-4 of its way left
 
 
 class Belief(NamedTuple):
-    """filter: of bayes.py; values (5, N): of each flow action were the flow seen, under the discount gamma."""
+    """filter: of bayes.py; values (5, N): of each flow action were the
+    flow seen, under the discount gamma."""
 
     filter: bayes.Filter
     values: jax.Array
@@ -48,7 +73,8 @@ class Belief(NamedTuple):
 
 
 class Costs(NamedTuple):
-    """Of a step: |q - 100 %| / scale, `outside` where the class is not good, and `move` for every percent that the setpoint moved; in percent of flow where not bare."""
+    """Of a step: |q - 100 %| / scale, `outside` where the class is not good, and `move` for every percent
+    that the setpoint moved; in percent of flow where not bare."""
 
     scale: float
     outside: float
@@ -56,12 +82,18 @@ class Costs(NamedTuple):
 
 
 def flow_reward(costs: Costs, flow: jax.Array, move: jax.Array) -> jax.Array:
-    """- |q - q*| / scale - outside [class not good] - move cost |a|: a median is sought where (14) seeks a mode, so far flows that are in doubt weigh as much as near ones."""
-    return -jnp.abs(flow - BEST_FLOW) / costs.scale - costs.outside * (flow_class(flow) != GOOD) - costs.move * jnp.abs(move)
+    """- |q - q*| / scale - outside [class not good] - move cost |a|: a median is sought where (14) seeks a
+    mode, so far flows that are in doubt weigh as much as near ones."""
+    return (
+        -jnp.abs(flow - BEST_FLOW) / costs.scale
+        - costs.outside * (flow_class(flow) != GOOD)
+        - costs.move * jnp.abs(move)
+    )
 
 
 def rewards(costs: Costs, state: State) -> jax.Array:
-    """(2,) for the heads: the flow's and the temperature's. Neither moves the other, so neither is blamed for it."""
+    """(2,) for the heads: the flow's and the temperature's. Neither
+    moves the other, so neither is blamed for it."""
     return jnp.stack([flow_reward(costs, state.flow, state.flow_move), temperature_reward(state.temperature)])
 
 
@@ -72,7 +104,8 @@ def temperature_reward(temperature: jax.Array) -> jax.Array:
 
 
 def seen_values(costs: Costs, gamma: float) -> np.ndarray:
-    """Q (5, N) were the flow seen: Q(a, q) = r(q + a, a) + gamma max_a' Q(a', q + a), by value iteration on the filter's grid."""
+    """Q (5, N) were the flow seen: Q(a, q) = r(q + a, a) + gamma max_a' Q(a',
+    q + a), by value iteration on the filter's grid."""
     moves = np.array(FLOW_MOVES)[:, None]
     after = np.clip(np.arange(len(bayes.GRID)) + (moves / bayes.SPACING).astype(int), 0, len(bayes.GRID) - 1)
     r = np.asarray(flow_reward(costs, jnp.asarray(bayes.GRID)[after], jnp.asarray(moves)), float)
@@ -95,24 +128,31 @@ POOLING = _pooling()
 
 
 def slower(gamma: float) -> float:
-    """The temperature's discount a step, gamma^(1/lambda): from one of its actions to the next as much is lost as from one action of the flow to the next."""
+    """The temperature's discount a step, gamma^(1/lambda): from one of its actions to the next as much is
+    lost as from one action of the flow to the next."""
     return gamma ** (1 / LAMBDA)
 
 
 def standing_values(observation: Observation, gamma: float) -> jax.Array:
-    """(5,) of each temperature action were the target to stand thereafter: sum over k of gamma^(k-1) r(u_k), with u_k - target = (1 - 1/delta)^k (u_hat - target) by (6).
+    """(5,) of each temperature action were the target to stand thereafter: sum over k of gamma^(k-1) r(u_k),
+    with u_k - target = (1 - 1/delta)^k (u_hat - target) by (6).
 
     Where lambda's clock heeds no action, each is worth what standing is.
     """
     heeded = observation.step % LAMBDA == 0
-    target = jnp.clip(observation.target + jnp.where(heeded, jnp.asarray(TEMPERATURE_MOVES), 0.0), *TEMPERATURE_LIMITS)
+    target = jnp.clip(
+        observation.target + jnp.where(heeded, jnp.asarray(TEMPERATURE_MOVES), 0.0), *TEMPERATURE_LIMITS
+    )
     k = jnp.arange(1, AHEAD + 1)[:, None]
     u = target + (1 - 1 / DELTA) ** k * (observation.temperature - target)
-    return (gamma ** (k - 1) * temperature_reward(u)).sum(axis=0) + gamma**AHEAD / (1 - gamma) * temperature_reward(target)
+    return (gamma ** (k - 1) * temperature_reward(u)).sum(axis=0) + gamma**AHEAD / (
+        1 - gamma
+    ) * temperature_reward(target)
 
 
 def belief_sight(of: Belief) -> Sight:
-    """x = [values of the flow's actions (5), pooled belief, hypotheses (H), values of the temperature's actions (5), u_hat, u_bar, clock, heeded]."""
+    """x = [values of the flow's actions (5), pooled belief, hypotheses (H), values of the temperature's
+    actions (5), u_hat, u_bar, clock, heeded]."""
     hypotheses = of.filter.evidence.shape[0]
     pooling = jnp.asarray(POOLING, jnp.float32)
 
@@ -120,22 +160,31 @@ def belief_sight(of: Belief) -> Sight:
         known = bayes.believed(of.filter, known, observation)
         belief = known.belief
         flow, clock = belief.sum(axis=0), observation.step % LAMBDA
-        temperatures = (jnp.stack([observation.temperature, observation.target]) - BEST_TEMPERATURE) / TEMPERATURE_SCALE
-        rest = [standing_values(observation, slower(of.gamma)), temperatures, jnp.stack([clock / LAMBDA, clock == 0])]
+        temperatures = (
+            jnp.stack([observation.temperature, observation.target]) - BEST_TEMPERATURE
+        ) / TEMPERATURE_SCALE
+        rest = [
+            standing_values(observation, slower(of.gamma)),
+            temperatures,
+            jnp.stack([clock / LAMBDA, clock == 0]),
+        ]
         return known, jnp.concatenate([of.values @ flow, flow @ pooling, belief.sum(axis=1), *rest])
 
     return Sight(lambda: bayes.unknown(hypotheses), see)
 
 
 class Correction(eqx.Module):
-    """What is added to the values of five actions: a common part and a part of each with mean zero (dueling: Wang and others 2016), both zero before training."""
+    """What is added to the values of five actions: a common part and a part of each with mean zero (dueling:
+    Wang and others 2016), both zero before training."""
 
     hidden: tuple[eqx.nn.Linear, ...]
     last: eqx.nn.Linear
 
     def __init__(self, sizes: tuple[int, ...], key: jax.Array):
         keys = jax.random.split(key, len(sizes))
-        self.hidden = tuple(eqx.nn.Linear(m, n, key=k) for m, n, k in zip(sizes[:-1], sizes[1:], keys[:-1], strict=True))
+        self.hidden = tuple(
+            eqx.nn.Linear(m, n, key=k) for m, n, k in zip(sizes[:-1], sizes[1:], keys[:-1], strict=True)
+        )
         self.last = jax.tree.map(jnp.zeros_like, eqx.nn.Linear(sizes[-1], ACTIONS + 1, key=keys[-1]))
 
     def __call__(self, x: jax.Array) -> jax.Array:
@@ -146,7 +195,8 @@ class Correction(eqx.Module):
 
 
 class BeliefNetwork(eqx.Module):
-    """Q (2, 5): of each head the values that it starts from and their correction; the temperature's sees temperatures and clock alone."""
+    """Q (2, 5): of each head the values that it starts from and their correction; the
+    temperature's sees temperatures and clock alone."""
 
     flow: Correction
     temperature: Correction
@@ -162,15 +212,18 @@ class BeliefNetwork(eqx.Module):
         heeded = rest[-1] > 0
         warmer = self.temperature(rest)
         Q = value + self.flow(known.at[:ACTIONS].add(-value.max()))
-        return jnp.stack([Q, worth + jnp.where(heeded, warmer, warmer[STAND])])  # what is not heeded is standing
+        return jnp.stack(
+            [Q, worth + jnp.where(heeded, warmer, warmer[STAND])]
+        )  # what is not heeded is standing
 
 
 # ---- training
 
 
 class Troubles(NamedTuple):
-    """What training episodes meet, each drawn uniformly: the share of episodes on recorded windows (the rest on the paper's) and how long a segment may last; from which
-    accuracy, gain and clog up to 1, clogs in a share of the episodes and at any step; drift a step up to +- this."""
+    """What training episodes meet, each drawn uniformly: the share of episodes on recorded windows (the rest
+    on the paper's) and how long a segment may last; from which accuracy, gain and clog up to 1, clogs in a
+    share of the episodes and at any step; drift a step up to +- this."""
 
     recorded_share: float
     longest_segment: float
@@ -182,19 +235,24 @@ class Troubles(NamedTuple):
 
 
 def paper_or_recorded(table: WindowTable) -> Windows:
-    """The paper's windows where a segment lasts no time (persistence 0), recorded ones otherwise: one source for a world of both."""
+    """The paper's windows where a segment lasts no time (persistence 0), recorded
+    ones otherwise: one source for a world of both."""
     paper, recorded = paper_windows(), recorded_windows(table)
 
     def draw(arrays, conditions, flow, segment, u):
         recorded_now = conditions.persistence > 0
-        both = recorded.draw(arrays, conditions, flow, segment, u), paper.draw((), conditions, flow, segment, u)
+        both = (
+            recorded.draw(arrays, conditions, flow, segment, u),
+            paper.draw((), conditions, flow, segment, u),
+        )
         return tuple(jnp.where(recorded_now, *pair) for pair in zip(*both, strict=True))
 
     return Windows(draw, recorded.table)
 
 
 def troubled(troubles: Troubles, length: int, key: jax.Array) -> Conditions:
-    """Conditions of one episode; starts are uniform in the logarithm of the flow, as errors of extrusion are ratios."""
+    """Conditions of one episode; starts are uniform in the logarithm
+    of the flow, as errors of extrusion are ratios."""
     u = jax.random.uniform(key, (10,))
     low, high = np.log(FLOW_LIMITS)
     return Conditions(
@@ -212,8 +270,8 @@ def troubled(troubles: Troubles, length: int, key: jax.Array) -> Conditions:
 
 
 class Trained(NamedTuple):
-    """The network kept; judged: mean cost-less-reward a step of validation episodes before training and after each round, the best of which (`kept`) it is; rewards of
-    each training step."""
+    """The network kept; judged: mean cost-less-reward a step of validation episodes before training and after
+    each round, the best of which (`kept`) it is; rewards of each training step."""
 
     network: BeliefNetwork
     judged: tuple[float, ...]
@@ -222,16 +280,24 @@ class Trained(NamedTuple):
 
 
 def train(
-    key: jax.Array, of: Belief, table: WindowTable, *, costs: Costs, troubles: Troubles, setting: Setting, rate: float, updates: int, rounds: int, explore: float,
+    key: jax.Array, of: Belief, table: WindowTable, *, costs: Costs, troubles: Troubles, setting: Setting,
+    rate: float, updates: int, rounds: int, explore: float,
     least: float, on_step=None,
 ) -> Trained:  # fmt: skip
-    """Double Q-learning in troubled episodes on the paper's windows and on recorded ones, Adam with a rate that falls by a cosine to zero over all rounds.
+    """Double Q-learning in troubled episodes on the paper's windows and on recorded ones, Adam with a rate
+    that falls by a cosine to zero over all rounds.
 
-    After each of the rounds the network is judged on VALIDATION episodes drawn as the training's are, and the best is kept: what it started from, if nothing was better.
+    After each of the rounds the network is judged on VALIDATION episodes drawn as the
+    training's are, and the best is kept: what it started from, if nothing was better.
     on_step(round, network, judged) is called after each.
     """
     k_network, k_judge, key = jax.random.split(key, 3)
-    sight, world = belief_sight(of), World(paper_or_recorded(table), Partial(troubled, troubles, setting.episode), Partial(rewards, costs))
+    sight, world = (
+        belief_sight(of),
+        World(
+            paper_or_recorded(table), Partial(troubled, troubles, setting.episode), Partial(rewards, costs)
+        ),
+    )
     network, optimiser = (
         BeliefNetwork(of.filter.evidence.shape[0], k_network),
         optax.adam(optax.cosine_decay_schedule(rate, rounds * updates)),
@@ -242,13 +308,17 @@ def train(
     def judge(network):
         seen = rollout(controller, network, world.windows, episodes, k_judge, steps=setting.episode)
         moves = jnp.asarray(FLOW_MOVES)[seen.action.flow]
-        return float(flow_reward(costs, seen.flow[:, 1:], moves).mean() + temperature_reward(seen.temperature[:, 1:]).mean())
+        return float(
+            flow_reward(costs, seen.flow[:, 1:], moves).mean()
+            + temperature_reward(seen.temperature[:, 1:]).mean()
+        )
 
     setting = setting._replace(gamma=jnp.array([setting.gamma, slower(setting.gamma)]))
     networks, judged, paid = [network], [judge(network)], []
     for i in range(rounds):
         learner, gained = phase(
-            learner, jax.random.fold_in(key, i), sight=sight, world=world, optimiser=optimiser, bootstrap=double, setting=setting, updates=updates,
+            learner, jax.random.fold_in(key, i), sight=sight, world=world, optimiser=optimiser,
+            bootstrap=double, setting=setting, updates=updates,
             longest=updates, epsilon=(explore, least),
         )  # fmt: skip
         networks.append(learner.network)

@@ -1,4 +1,5 @@
-"""What a classifier's probabilities are worth: temperature for one image, a fitted log-sum for a window, conformal sets by segment, distance from what was learned.
+"""What a classifier's probabilities are worth: temperature for one image, a fitted log-sum for a window,
+conformal sets by segment, distance from what was learned.
 
 All of it is fitted on segments that the classifier never saw, and judged on yet others.
 """
@@ -31,7 +32,9 @@ def fit_temperature(logits: np.ndarray, label: np.ndarray) -> float:
     """The T that makes the labels (n,) most likely, between 1/20 and 20."""
     label = np.asarray(label)
     found = scipy.optimize.minimize_scalar(
-        lambda log_t: -log_probabilities(logits, np.exp(log_t))[np.arange(len(label)), label].mean(), bounds=(-3.0, 3.0), method="bounded"
+        lambda log_t: -log_probabilities(logits, np.exp(log_t))[np.arange(len(label)), label].mean(),
+        bounds=(-3.0, 3.0),
+        method="bounded",
     )
     return float(np.exp(found.x))
 
@@ -47,18 +50,27 @@ class WindowRows(NamedTuple):
 
 
 def windows(segment: np.ndarray, label: np.ndarray, *, length: int) -> WindowRows:
-    """Every `length` frames of one segment and one class in the order in which they come, none used twice; a change of class starts anew."""
+    """Every `length` frames of one segment and one class in the order in which they come,
+    none used twice; a change of class starts anew."""
     segment, label = np.asarray(segment), np.asarray(label)
     order = np.argsort(segment, kind="stable")
-    change = (np.diff(segment[order]) != 0) | (np.diff(label[order]) != 0) if len(order) else np.zeros(0, bool)
-    rows = [run[i : i + length] for run in np.split(order, np.flatnonzero(change) + 1) for i in range(0, len(run) - length + 1, length)]
+    change = (
+        (np.diff(segment[order]) != 0) | (np.diff(label[order]) != 0) if len(order) else np.zeros(0, bool)
+    )
+    rows = [
+        run[i : i + length]
+        for run in np.split(order, np.flatnonzero(change) + 1)
+        for i in range(0, len(run) - length + 1, length)
+    ]
     return WindowRows(np.array(rows, int).reshape(-1, length), len(order) - length * len(rows))
 
 
 def window_probabilities(log_p: np.ndarray, valid: np.ndarray, correlation: float) -> np.ndarray:
-    """p (w, 3) = softmax( sum_i log p_i / (1 + (m - 1) correlation) ) over the m valid of a window's frames; log_p (w, length, 3), valid (w, length).
+    """p (w, 3) = softmax( sum_i log p_i / (1 + (m - 1) correlation) ) over the m valid of a window's frames;
+    log_p (w, length, 3), valid (w, length).
 
-    Frames of one segment repeat each other: the divisor is Kish's design effect (1965), 1 for independent frames and m where each says the same. No valid frame: 1/3 each.
+    Frames of one segment repeat each other: the divisor is Kish's design effect (1965), 1 for independent
+    frames and m where each says the same. No valid frame: 1/3 each.
     """
     m = valid.sum(axis=1)
     total = np.where(valid[:, :, None], log_p, 0.0).sum(axis=1)
@@ -66,7 +78,8 @@ def window_probabilities(log_p: np.ndarray, valid: np.ndarray, correlation: floa
 
 
 def fit_correlation(log_p: np.ndarray, valid: np.ndarray, label: np.ndarray) -> float:
-    """The correlation in 0 .. 3 that makes the labels (w,) of the windows most likely (above 1: images are surer than they should be)."""
+    """The correlation in 0 .. 3 that makes the labels (w,) of the windows most likely
+    (above 1: images are surer than they should be)."""
     label = np.asarray(label)
 
     def loss(correlation):
@@ -77,7 +90,8 @@ def fit_correlation(log_p: np.ndarray, valid: np.ndarray, label: np.ndarray) -> 
 
 
 def hard_shares(log_p: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """p_c = w_c / w, the shares of the valid frames' most likely classes (w, 3) (Li and Pattinson 2025, eq. 4; scaled: p / max p). No valid frame: 1/3 each."""
+    """p_c = w_c / w, the shares of the valid frames' most likely classes (w, 3) (Li and Pattinson 2025, eq.
+    4; scaled: p / max p). No valid frame: 1/3 each."""
     named = np.where(valid, log_p.argmax(axis=2), -1)
     counts = (named[:, :, None] == np.arange(CLASSES)).sum(axis=1)
     m = valid.sum(axis=1)[:, None]
@@ -85,9 +99,16 @@ def hard_shares(log_p: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 
 def recorded(
-    log_p: np.ndarray, valid: np.ndarray, flow: np.ndarray, segment: np.ndarray, *, correlation: float, flow_edges: np.ndarray
+    log_p: np.ndarray,
+    valid: np.ndarray,
+    flow: np.ndarray,
+    segment: np.ndarray,
+    *,
+    correlation: float,
+    flow_edges: np.ndarray,
 ) -> WindowTable:
-    """Windows (w, length, 3) of segments printed at flow (w,) percent as the simulator draws them again; windows without a valid frame are left out.
+    """Windows (w, length, 3) of segments printed at flow (w,) percent as the simulator draws them again;
+    windows without a valid frame are left out.
 
     flow_edges (bins + 1,) in percent; raises ValueError where a flow lies outside them.
     """
@@ -95,7 +116,8 @@ def recorded(
     outside = ~((flow >= flow_edges[0]) & (flow <= flow_edges[-1]))
     if outside.any():
         raise ValueError(
-            f"flows are expected within {flow_edges[0]:g} .. {flow_edges[-1]:g} % but {outside.sum()} are not, the first {flow[outside][0]:g}; widen the bins"
+            f"flows are expected within {flow_edges[0]:g} .. {flow_edges[-1]:g} % but {outside.sum()} are "
+            f"not, the first {flow[outside][0]:g}; widen the bins"
         )
     seen = valid.any(axis=1)
     p = window_probabilities(log_p[seen], valid[seen], correlation)
@@ -107,8 +129,9 @@ def recorded(
 
 
 class Reliability(NamedTuple):
-    """By bin of the highest probability: mean confidence, share right (NaN where empty), count, lower edges; `error` is the expected calibration error, and `floor` what a perfectly
-    calibrated classifier with these probabilities would show on as many."""
+    """By bin of the highest probability: mean confidence, share right (NaN where empty), count, lower edges;
+    `error` is the expected calibration error, and `floor` what a perfectly calibrated classifier with these
+    probabilities would show on as many."""
 
     confidence: np.ndarray
     accuracy: np.ndarray
@@ -119,9 +142,11 @@ class Reliability(NamedTuple):
 
 
 def reliability(p: np.ndarray, label: np.ndarray, *, bins: int) -> Reliability:
-    """ECE = sum_b n_b / n |accuracy_b - confidence_b| over `bins` bins of equal width between 1/3 and 1, where the highest of three probabilities lies (Guo et al. 2017).
+    """ECE = sum_b n_b / n |accuracy_b - confidence_b| over `bins` bins of equal width between 1/3 and 1,
+    where the highest of three probabilities lies (Guo et al. 2017).
 
-    p (n, 3). Were p true, a bin's hits would scatter by sqrt(sum c (1 - c)): the floor is the mean of that, sqrt(2 / pi) of it, over all bins.
+    p (n, 3). Were p true, a bin's hits would scatter by sqrt(sum c (1 - c)): the floor is
+    the mean of that, sqrt(2 / pi) of it, over all bins.
     """
     p, label = np.asarray(p, float), np.asarray(label)
     edges = np.linspace(1 / CLASSES, 1.0, bins + 1)
@@ -130,7 +155,9 @@ def reliability(p: np.ndarray, label: np.ndarray, *, bins: int) -> Reliability:
     count = np.bincount(place, minlength=bins)
 
     error = np.abs(np.bincount(place, right - confidence, bins)).sum() / max(len(label), 1)
-    floor = np.sqrt(2 / np.pi * np.bincount(place, confidence * (1 - confidence), bins)).sum() / max(len(label), 1)
+    floor = np.sqrt(2 / np.pi * np.bincount(place, confidence * (1 - confidence), bins)).sum() / max(
+        len(label), 1
+    )
     with np.errstate(invalid="ignore"):
         means = [np.bincount(place, values, bins) / count for values in (confidence, right)]
     return Reliability(*means, count, edges[:-1], float(error), float(floor))
@@ -139,12 +166,16 @@ def reliability(p: np.ndarray, label: np.ndarray, *, bins: int) -> Reliability:
 # ---- sets that hold the true class
 
 
-def conformal_level(p: np.ndarray, label: np.ndarray, segment: np.ndarray, *, coverage: float, confidence: float) -> float:
-    """The level of the sets {c: p_c >= level}: they hold the true class of a new segment's window with probability `coverage` (Sadinle, Lei and Wasserman 2019).
+def conformal_level(
+    p: np.ndarray, label: np.ndarray, segment: np.ndarray, *, coverage: float, confidence: float
+) -> float:
+    """The level of the sets {c: p_c >= level}: they hold the true class of a new segment's window with
+    probability `coverage` (Sadinle, Lei and Wasserman 2019).
 
-    Calibrated by segment: each counts once, however many windows (w,) it has, for its windows err together. The coverage that n segments promise varies with their draw; with the
-    k-th smallest p_label of n, the share missed is Beta(k, n + 1 - k) (Vovk 2012), and k is the largest for which it is at most 1 - coverage with probability `confidence`.
-    Raises ValueError where even k = 1 does not promise that.
+    Calibrated by segment: each counts once, however many windows (w,) it has, for its windows err together.
+    The coverage that n segments promise varies with their draw; with the k-th smallest p_label of n, the
+    share missed is Beta(k, n + 1 - k) (Vovk 2012), and k is the largest for which it is at most 1 - coverage
+    with probability `confidence`. Raises ValueError where even k = 1 does not promise that.
     """
     _, place, windows_of = np.unique(segment, return_inverse=True, return_counts=True)
     n = len(windows_of)
@@ -154,7 +185,8 @@ def conformal_level(p: np.ndarray, label: np.ndarray, segment: np.ndarray, *, co
     if k == 0:
         needed = int(np.ceil(np.log(1 - confidence) / np.log(coverage)))
         raise ValueError(
-            f"sets that cover {coverage:.0%} with confidence {confidence:.0%} need at least {needed} calibration segments but found {n}; film more, or ask for less"
+            f"sets that cover {coverage:.0%} with confidence {confidence:.0%} need at least {needed} "
+            f"calibration segments but found {n}; film more, or ask for less"
         )
     true = p[np.arange(len(label)), label]
     order = np.argsort(true, kind="stable")
@@ -163,7 +195,8 @@ def conformal_level(p: np.ndarray, label: np.ndarray, segment: np.ndarray, *, co
 
 
 class Sets(NamedTuple):
-    """Share of sets {c: p_c >= level} that hold the true class, and share that does not name one class alone: there the controller holds."""
+    """Share of sets {c: p_c >= level} that hold the true class, and share that does not
+    name one class alone: there the controller holds."""
 
     coverage: float
     held: float
@@ -178,14 +211,16 @@ def sets(p: np.ndarray, label: np.ndarray, level: float) -> Sets:
 
 
 class Familiar(NamedTuple):
-    """Means of the three classes' features (3, f) and the whitening L^-1 (f, f) of their common covariance L L'."""
+    """Means of the three classes' features (3, f) and the whitening
+    L^-1 (f, f) of their common covariance L L'."""
 
     means: np.ndarray
     whitening: np.ndarray
 
 
 def fit_familiar(features: np.ndarray, label: np.ndarray) -> Familiar:
-    """Gaussians of one covariance round each class's features (n, f) (Lee, Lee, Lee and Shin 2018), the covariance shrunk (Ledoit and Wolf 2004)."""
+    """Gaussians of one covariance round each class's features (n, f) (Lee, Lee, Lee and Shin 2018), the
+    covariance shrunk (Ledoit and Wolf 2004)."""
     features, label = np.asarray(features, float), np.asarray(label)
     means = np.array([features[label == c].mean(axis=0) for c in range(CLASSES)])
     covariance = sklearn.covariance.LedoitWolf(assume_centered=True).fit(features - means[label]).covariance_
@@ -201,22 +236,28 @@ BAND_ROWS, BAND_COLUMNS = (
 
 
 def appearance(key_area: np.ndarray) -> np.ndarray:
-    """log energy of key areas (n, 16, 48) in octaves of spatial frequency, across and along the bead (n, 34), each area scaled to mean 0 and deviation 1.
+    """log energy of key areas (n, 16, 48) in octaves of spatial frequency, across and along the bead (n, 34),
+    each area scaled to mean 0 and deviation 1.
 
-    A network trained for width is made blind to much else: its features hardly move under blur or a wrong angle, which empty and fill these bands.
+    A network trained for width is made blind to much else: its features hardly move under blur or a wrong
+    angle, which empty and fill these bands.
     """
     x = np.asarray(key_area, np.float32)
     x = x - x.mean(axis=(1, 2), keepdims=True)
     x /= np.sqrt((x**2).mean(axis=(1, 2), keepdims=True)) + 1
     energy = scipy.fft.dctn(x, axes=(1, 2), norm="ortho") ** 2
     bands = np.add.reduceat(np.add.reduceat(energy, BAND_ROWS, axis=1), BAND_COLUMNS, axis=2)
-    return np.log(bands + 0.01).reshape(len(x), -1)[:, 1:].astype(float)  # 0.01 of 768: rounding to gray levels; the mean is left out
+    return (
+        np.log(bands + 0.01).reshape(len(x), -1)[:, 1:].astype(float)
+    )  # 0.01 of 768: rounding to gray levels; the mean is left out
 
 
 def mahalanobis(familiar: Familiar, features: np.ndarray) -> np.ndarray:
     """min_c (f - mu_c)' Sigma^-1 (f - mu_c) (n,): how foreign each image is."""
     white = np.asarray(features, float) @ familiar.whitening.T
-    return np.min([((white - mean) ** 2).sum(axis=1) for mean in familiar.means @ familiar.whitening.T], axis=0)
+    return np.min(
+        [((white - mean) ** 2).sum(axis=1) for mean in familiar.means @ familiar.whitening.T], axis=0
+    )
 
 
 def energy(logits: np.ndarray) -> np.ndarray:
@@ -231,7 +272,8 @@ def foreign_above(scores: np.ndarray, *, false_alarms: float) -> float:
 
 
 def auroc(familiar: np.ndarray, foreign: np.ndarray) -> float:
-    """The probability that a foreign score exceeds a familiar one, ties for a half (Mann and Whitney 1947)."""
+    """The probability that a foreign score exceeds a familiar one,
+    ties for a half (Mann and Whitney 1947)."""
     return float(scipy.stats.mannwhitneyu(foreign, familiar).statistic / (len(familiar) * len(foreign)))
 
 
@@ -239,7 +281,8 @@ def auroc(familiar: np.ndarray, foreign: np.ndarray) -> float:
 
 
 class Seen(NamedTuple):
-    """What was seen of n frames: logits (n, 3), features with appearance (n, f), label, segment and valid (n,)."""
+    """What was seen of n frames: logits (n, 3), features with
+    appearance (n, f), label, segment and valid (n,)."""
 
     logits: np.ndarray
     features: np.ndarray
@@ -249,14 +292,20 @@ class Seen(NamedTuple):
 
 
 def seen(prediction: Prediction, data: Labelled, valid: np.ndarray) -> Seen:
-    """The head's features with the appearance of the key areas beside them; frames that the front end rejected are not valid."""
+    """The head's features with the appearance of the key areas beside them;
+    frames that the front end rejected are not valid."""
     return Seen(
-        prediction.logits, np.hstack([prediction.features, appearance(data.key_area)]), data.label, data.segment, np.asarray(valid, bool)
+        prediction.logits,
+        np.hstack([prediction.features, appearance(data.key_area)]),
+        data.label,
+        data.segment,
+        np.asarray(valid, bool),
     )
 
 
 class Calibration(NamedTuple):
-    """What turns logits into decisions: temperature of images, correlation of a window's frames, level of its conformal set, and the distance that is foreign."""
+    """What turns logits into decisions: temperature of images, correlation of a window's frames, level of its
+    conformal set, and the distance that is foreign."""
 
     temperature: float
     correlation: float
@@ -265,23 +314,37 @@ class Calibration(NamedTuple):
     foreign_above: float
 
 
-def calibrate(learned: Seen, unseen: Seen, *, length: int, coverage: float, confidence: float, false_alarms: float) -> Calibration:
-    """Everything fitted on segments `unseen` in training, but for the familiar features, which are those `learned`; windows have `length` frames."""
+def calibrate(
+    learned: Seen, unseen: Seen, *, length: int, coverage: float, confidence: float, false_alarms: float
+) -> Calibration:
+    """Everything fitted on segments `unseen` in training, but for the familiar features, which are those
+    `learned`; windows have `length` frames."""
     v = unseen.valid
     T = fit_temperature(unseen.logits[v], unseen.label[v])
     rows = _rows(unseen, length)
-    log_p, label, segment = log_probabilities(unseen.logits, T)[rows], unseen.label[rows[:, 0]], unseen.segment[rows[:, 0]]
+    log_p, label, segment = (
+        log_probabilities(unseen.logits, T)[rows],
+        unseen.label[rows[:, 0]],
+        unseen.segment[rows[:, 0]],
+    )
     correlation = fit_correlation(log_p, v[rows], label)
     p = window_probabilities(log_p, v[rows], correlation)
     level = conformal_level(p, label, segment, coverage=coverage, confidence=confidence)
     familiar = fit_familiar(learned.features[learned.valid], learned.label[learned.valid])
-    return Calibration(T, correlation, level, familiar, foreign_above(mahalanobis(familiar, unseen.features[v]), false_alarms=false_alarms))
+    return Calibration(
+        T,
+        correlation,
+        level,
+        familiar,
+        foreign_above(mahalanobis(familiar, unseen.features[v]), false_alarms=false_alarms),
+    )
 
 
 def _rows(frames: Seen, length: int) -> np.ndarray:
     rows = windows(frames.segment, frames.label, length=length).rows
     if not len(rows):
         raise ValueError(
-            f"expected a segment with {length} frames in a row of one class but found none among {len(frames.label)} frames; film longer ones, or take shorter windows"
+            f"expected a segment with {length} frames in a row of one class but found none among "
+            f"{len(frames.label)} frames; film longer ones, or take shorter windows"
         )
     return rows

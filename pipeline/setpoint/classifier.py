@@ -1,4 +1,5 @@
-"""Key areas -> flow class: split by segment, augmentation, training with checkpoints (Li and Pattinson 2025, sections 2.2 and 3.2), prediction."""
+"""Key areas -> flow class: split by segment, augmentation, training with checkpoints (Li and Pattinson 2025,
+sections 2.2 and 3.2), prediction."""
 
 import functools
 from collections.abc import Callable
@@ -16,7 +17,8 @@ CLASS_NAMES = ("under (flow < 90 %)", "good (90 to 110 %)", "over (flow > 110 %)
 
 
 class Labelled(NamedTuple):
-    """Key areas (n, 16, 48) uint8 with nozzle temperature in °C (n,), class 0, 1, 2 (n,) and the segment or print that each was filmed in (n,)."""
+    """Key areas (n, 16, 48) uint8 with nozzle temperature in °C (n,), class 0, 1, 2 (n,) and the segment or
+    print that each was filmed in (n,)."""
 
     key_area: np.ndarray
     temperature_degC: np.ndarray
@@ -28,42 +30,55 @@ class Labelled(NamedTuple):
 
 
 def checked(data: Labelled) -> Labelled:
-    """`data` as arrays; raises ValueError where shapes, depth, labels or temperatures are none that a classifier can learn from, or a class is empty."""
+    """`data` as arrays; raises ValueError where shapes, depth, labels or temperatures are none that a
+    classifier can learn from, or a class is empty."""
     data = Labelled(*(np.asarray(a) for a in data))
     n = len(data.label)
     if data.key_area.shape != (n, ROWS, COLUMNS) or data.key_area.dtype != np.uint8:
         raise ValueError(
-            f"key areas are expected as uint8 ({n}, {ROWS}, {COLUMNS}) but found {data.key_area.dtype} {data.key_area.shape}; cut them with key_area"
+            f"key areas are expected as uint8 ({n}, {ROWS}, {COLUMNS}) but found {data.key_area.dtype} "
+            f"{data.key_area.shape}; cut them with key_area"
         )
     for name in ("temperature_degC", "segment"):
         if getattr(data, name).shape != (n,):
-            raise ValueError(f"{name} is expected once a key area, ({n},), but found {getattr(data, name).shape}")
+            raise ValueError(
+                f"{name} is expected once a key area, ({n},), but found {getattr(data, name).shape}"
+            )
     if not np.isfinite(data.temperature_degC).all():
         raise ValueError(
-            f"{np.sum(~np.isfinite(data.temperature_degC))} of {n} temperatures are no numbers; drop those frames or fill in the measured temperature"
+            f"{np.sum(~np.isfinite(data.temperature_degC))} of {n} temperatures are no numbers; "
+            "drop those frames or fill in the measured temperature"
         )
     outside = ~np.isin(data.label, range(CLASSES))
     if outside.any():
         raise ValueError(
-            f"labels are expected to be 0, 1 or 2 but {outside.sum()} of {n} are not, the first {data.label[outside][0]}; label by flow_rate"
+            f"labels are expected to be 0, 1 or 2 but {outside.sum()} of {n} are not, "
+            f"the first {data.label[outside][0]}; label by flow_rate"
         )
     for c in range(CLASSES):
         if not np.any(data.label == c):
-            raise ValueError(f"class {c}, {CLASS_NAMES[c]}, has no key area among {n}; add prints at such flow rates")
+            raise ValueError(
+                f"class {c}, {CLASS_NAMES[c]}, has no key area among {n}; add prints at such flow rates"
+            )
     return data
 
 
-def split_by_segment(data: Labelled, *, shares: tuple[float, ...], rng: np.random.Generator) -> list[np.ndarray]:
-    """Rows of each part, no segment in two of them, every class near its share: segments come in random order, each to the part that lacks its classes most.
+def split_by_segment(
+    data: Labelled, *, shares: tuple[float, ...], rng: np.random.Generator
+) -> list[np.ndarray]:
+    """Rows of each part, no segment in two of them, every class near its share: segments come in random
+    order, each to the part that lacks its classes most.
 
-    Images of one segment look alike: a split by image would test what was learned by heart. A print with several classes in it counts for each (the idea is that of
-    iterative stratification; Sechidis, Tsoumakas and Vlahavas 2011). Raises ValueError where the segments do not suffice.
+    Images of one segment look alike: a split by image would test what was learned by heart. A print with
+    several classes in it counts for each (the idea is that of iterative stratification; Sechidis, Tsoumakas
+    and Vlahavas 2011). Raises ValueError where the segments do not suffice.
     """
     data = checked(data)
     names, index = np.unique(data.segment, return_inverse=True)
     if len(names) < 2:
         raise ValueError(
-            f"all {len(index)} key areas come from one print, which allows no honest split; film at least {len(shares)} prints with every class in them"
+            f"all {len(index)} key areas come from one print, which allows no honest split; "
+            f"film at least {len(shares)} prints with every class in them"
         )
     counts = np.zeros((len(names), CLASSES))
     np.add.at(counts, (index, data.label), 1)
@@ -77,16 +92,19 @@ def split_by_segment(data: Labelled, *, shares: tuple[float, ...], rng: np.rando
         for c in range(CLASSES):
             if not np.any(data.label[chosen] == c):
                 raise ValueError(
-                    f"{len(names)} segments do not let each of {len(shares)} parts hold every class: part {i + 1} has none of class {c}, {CLASS_NAMES[c]}; film more prints"
+                    f"{len(names)} segments do not let each of {len(shares)} parts hold every class: "
+                    f"part {i + 1} has none of class {c}, {CLASS_NAMES[c]}; film more prints"
                 )
     return rows
 
 
-# ---- augmentation: functions (key, x (n, 16, 48)) -> x of the same shape, each operation with probability 1/2
+# ---- augmentation: functions (key, x (n, 16, 48)) -> x of the same
+# shape, each operation with probability 1/2
 
 
 def _resample(x: Array, start: Array, keep: Array) -> Array:
-    """The last axis (of k) read at start + keep k by linear interpolation; start in px and keep of 1 are (n,)."""
+    """The last axis (of k) read at start + keep k by linear
+    interpolation; start in px and keep of 1 are (n,)."""
     k = jnp.arange(x.shape[-1])
     at = start[:, None] + keep[:, None] * (k + 0.5) - 0.5
     return jnp.einsum("nrk,nkj->nrj", x, jax.nn.relu(1 - jnp.abs(at[:, None, :] - k[:, None])))
@@ -95,7 +113,9 @@ def _resample(x: Array, start: Array, keep: Array) -> Array:
 def _crop(key: Array, x: Array) -> Array:
     """10 to 30 % of the last axis cut off at random ends, the rest stretched to the old length."""
     do, share, where = jax.random.split(key, 3)
-    cut = jax.random.bernoulli(do, 0.5, (len(x),)) * jax.random.uniform(share, (len(x),), minval=0.1, maxval=0.3)
+    cut = jax.random.bernoulli(do, 0.5, (len(x),)) * jax.random.uniform(
+        share, (len(x),), minval=0.1, maxval=0.3
+    )
     return _resample(x, cut * x.shape[-1] * jax.random.uniform(where, (len(x),)), 1 - cut)
 
 
@@ -106,20 +126,24 @@ def _flip(key: Array, x: Array, axis: int) -> Array:
 def _light(key: Array, x: Array) -> Array:
     """Brightness and contrast +-10 %."""
     do, size = jax.random.split(key)
-    change = jax.random.bernoulli(do, 0.5, (2, len(x), 1, 1)) * jax.random.uniform(size, (2, len(x), 1, 1), minval=-0.1, maxval=0.1)
+    change = jax.random.bernoulli(do, 0.5, (2, len(x), 1, 1)) * jax.random.uniform(
+        size, (2, len(x), 1, 1), minval=-0.1, maxval=0.1
+    )
     mean = x.mean(axis=(1, 2), keepdims=True)
     return jnp.clip((x - mean) * (1 + change[0]) + mean * (1 + change[1]), 0, 255)
 
 
 def adr(key: Array, x: Float[Array, "n 16 48"]) -> Float[Array, "n 16 48"]:
-    """As published: crop 10-30 % of both sides, flip, brightness and contrast (Li and Pattinson 2025, section 2.2.1). The crop widens the bead, which is what is labelled."""
+    """As published: crop 10-30 % of both sides, flip, brightness and contrast (Li and Pattinson 2025, section
+    2.2.1). The crop widens the bead, which is what is labelled."""
     across, along, flip, light = jax.random.split(key, 4)
     x = _crop(across, x.swapaxes(1, 2)).swapaxes(1, 2)
     return _light(light, _flip(flip, _crop(along, x), 2))
 
 
 def along_bead(key: Array, x: Float[Array, "n 16 48"]) -> Float[Array, "n 16 48"]:
-    """The form that keeps the width: the crop is along the bead only, and either side of the bead may come first."""
+    """The form that keeps the width: the crop is along the bead only,
+    and either side of the bead may come first."""
     along, flip, mirror, light = jax.random.split(key, 4)
     return _light(light, _flip(mirror, _flip(flip, _crop(along, x), 2), 1))
 
@@ -132,8 +156,9 @@ ADAM = optax.scale_by_adam()  # Kingma and Ba 2015, its own beta 0.9 and 0.999
 
 
 class State(NamedTuple):
-    """All that training needs to go on: epochs done, network, the running average of its weights, Adam's moments, the best average so far and its epoch, and the course:
-    history (epochs, 3) holds training loss, held-out loss and held-out accuracy of each epoch done, NaN after."""
+    """All that training needs to go on: epochs done, network, the running average of its weights, Adam's
+    moments, the best average so far and its epoch, and the course: history (epochs, 3) holds training loss,
+    held-out loss and held-out accuracy of each epoch done, NaN after."""
 
     epoch: Array
     network: Classifier
@@ -145,12 +170,22 @@ class State(NamedTuple):
 
 
 def untrained(network: Classifier, *, epochs: int) -> State:
-    """The state before the first of at most `epochs` epochs; a checkpoint is put into one by from_named_arrays."""
-    return State(jnp.array(0), network, network, ADAM.init(network), network, jnp.array(0), jnp.full((epochs, 3), jnp.nan))
+    """The state before the first of at most `epochs` epochs; a
+    checkpoint is put into one by from_named_arrays."""
+    return State(
+        jnp.array(0),
+        network,
+        network,
+        ADAM.init(network),
+        network,
+        jnp.array(0),
+        jnp.full((epochs, 3), jnp.nan),
+    )
 
 
 class Rates(NamedTuple):
-    """Highest learning rate, steps of its linear rise and of half its cosine; weight decay, label smoothing, decay a step of the weights' running average."""
+    """Highest learning rate, steps of its linear rise and of half its cosine; weight decay, label smoothing,
+    decay a step of the weights' running average."""
 
     highest: float
     rise: float
@@ -161,8 +196,14 @@ class Rates(NamedTuple):
 
 
 def cosine(step: Array, rates: Rates) -> Array:
-    """Cosine annealing highest (1 + cos(pi t / cycle)) / 2 (Loshchilov and Hutter 2017; the paper's cycle is 100 epochs from 1e-4), after a linear rise."""
-    return rates.highest * jnp.minimum(1.0, (step + 1) / jnp.maximum(rates.rise, 1)) * (1 + jnp.cos(jnp.pi * step / rates.cycle)) / 2
+    """Cosine annealing highest (1 + cos(pi t / cycle)) / 2 (Loshchilov and Hutter 2017; the paper's cycle is
+    100 epochs from 1e-4), after a linear rise."""
+    return (
+        rates.highest
+        * jnp.minimum(1.0, (step + 1) / jnp.maximum(rates.rise, 1))
+        * (1 + jnp.cos(jnp.pi * step / rates.cycle))
+        / 2
+    )
 
 
 def cross_entropy(logits: Float[Array, "n 3"], label: Array, smoothing: float) -> Array:
@@ -188,44 +229,63 @@ def train(
     augment: Callable[[Array, Array], Array],
     on_step: Callable[[State], None] = lambda state: None,
 ) -> State:
-    """Trains by AdamW on `learned` until the loss on `held_out` has not improved for `patience` epochs; `best` of the state returned is the classifier.
+    """Trains by AdamW on `learned` until the loss on `held_out` has not improved for `patience` epochs;
+    `best` of the state returned is the classifier.
 
-    `averaging` is the decay a step of the running average of the weights, which is what is judged and kept (0: the weights themselves). After each epoch on_step gets the state:
-    what a checkpoint holds. All randomness is that of (key, epoch), so that training from any of these states ends at the very same weights.
+    `averaging` is the decay a step of the running average of the weights, which is what is
+    judged and kept (0: the weights themselves). After each epoch on_step gets the state:
+    what a checkpoint holds. All randomness is that of (key, epoch), so that training from
+    any of these states ends at the very same weights.
     """
     learned, held_out = checked(learned), checked(held_out)
     shared = np.intersect1d(learned.segment, held_out.segment)
     if len(shared):
-        raise ValueError(f"{len(shared)} segments are both learned and held out, the first {shared[0]}; split with split_by_segment")
+        raise ValueError(
+            f"{len(shared)} segments are both learned and held out, the first {shared[0]}; "
+            "split with split_by_segment"
+        )
     batch, epochs = min(batch, len(learned.label)), len(state.history)
     steps = len(learned.label) // batch
-    rates = Rates(learning_rate, warmup_epochs * steps, cycle_epochs * steps, weight_decay, smoothing, averaging)
+    rates = Rates(
+        learning_rate, warmup_epochs * steps, cycle_epochs * steps, weight_decay, smoothing, averaging
+    )
     rows, judged = [[jnp.asarray(a) for a in data[:3]] for data in (learned, held_out)]
     run = _steps_on_cpu if jax.default_backend() == "cpu" else _steps
     while int(state.epoch) < epochs and int(state.epoch) - int(state.best_epoch) <= patience:
         order, drawn = jax.random.split(jax.random.fold_in(key, state.epoch))
         chosen = jax.random.permutation(order, len(learned.label))[: steps * batch].reshape(steps, batch)
         (network, average, moments), loss = run(
-            augment, (state.network, state.average, state.moments), (jax.random.split(drawn, steps), chosen), rows, rates
+            augment,
+            (state.network, state.average, state.moments),
+            (jax.random.split(drawn, steps), chosen),
+            rows,
+            rates,
         )
         state = state._replace(network=network, average=average, moments=moments)
-        logits = [_logits(average, *(a[i : i + AT_ONCE] for a in judged[:2])) for i in range(0, len(judged[2]), AT_ONCE)]
+        logits = [
+            _logits(average, *(a[i : i + AT_ONCE] for a in judged[:2]))
+            for i in range(0, len(judged[2]), AT_ONCE)
+        ]
         state = _judged(state, loss, jnp.concatenate(logits), judged[2])
         on_step(state)
     if int(state.best_epoch) == 0:
         raise ValueError(
-            f"no epoch of {int(state.epoch)} had a held-out loss that is a number; lower the learning rate of {learning_rate:g}"
+            f"no epoch of {int(state.epoch)} had a held-out loss that is a number; "
+            f"lower the learning rate of {learning_rate:g}"
         )
     return state
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _step(augment, carry, drawn: tuple[Array, Array], rows: list[Array], rates: Rates):
-    """One batch, drawn as (key, rows): AdamW (Loshchilov and Hutter 2019), theta <- theta - rate (Adam's direction + decay theta), and the running average of theta."""
+    """One batch, drawn as (key, rows): AdamW (Loshchilov and Hutter 2019), theta <- theta - rate (Adam's
+    direction + decay theta), and the running average of theta."""
     (network, average, moments), (key, chosen) = carry, drawn
     key_area, temperature, label = [a[chosen] for a in rows]
     seen = augment(key, key_area.astype(jnp.float32))
-    loss, gradient = jax.value_and_grad(lambda net: cross_entropy(net(seen, temperature), label, rates.smoothing))(network)
+    loss, gradient = jax.value_and_grad(
+        lambda net: cross_entropy(net(seen, temperature), label, rates.smoothing)
+    )(network)
     t = moments.count
     direction, moments = ADAM.update(gradient, moments)
     rate = cosine(t, rates)
@@ -256,13 +316,21 @@ def _logits(network: Classifier, key_area: Array, temperature_degC: Array) -> Ar
 
 @jax.jit
 def _judged(state: State, loss: Array, logits: Array, label: Array) -> State:
-    """The state with its average judged by its logits for the held-out segments, and kept where its loss is the lowest yet."""
-    row = jnp.stack([loss.mean(), cross_entropy(logits, label, 0.0), jnp.mean(jnp.argmax(logits, axis=1) == label)])
-    better = row[1] < jnp.min(jnp.nan_to_num(state.history[:, 1], nan=jnp.inf))  # never where the loss is no number
+    """The state with its average judged by its logits for the held-out
+    segments, and kept where its loss is the lowest yet."""
+    row = jnp.stack(
+        [loss.mean(), cross_entropy(logits, label, 0.0), jnp.mean(jnp.argmax(logits, axis=1) == label)]
+    )
+    better = row[1] < jnp.min(
+        jnp.nan_to_num(state.history[:, 1], nan=jnp.inf)
+    )  # never where the loss is no number
     best = jax.tree.map(lambda new, old: jnp.where(better, new, old), state.average, state.best)
     history = state.history.at[state.epoch].set(row)
     return state._replace(
-        epoch=state.epoch + 1, best=best, best_epoch=jnp.where(better, state.epoch + 1, state.best_epoch), history=history
+        epoch=state.epoch + 1,
+        best=best,
+        best_epoch=jnp.where(better, state.epoch + 1, state.best_epoch),
+        history=history,
     )
 
 
@@ -283,12 +351,18 @@ def _predict(network: Classifier, key_area: Array, temperature_degC: Array) -> t
     return network.head.classes(features), features
 
 
-def predict(network: Classifier, key_area: np.ndarray, temperature_degC: np.ndarray, *, batch: int = AT_ONCE) -> Prediction:
-    """Logits and features of key areas (n, 16, 48) at temperatures (n,), the mean over each area's four mirror images: a bead has no left, right, head or tail.
+def predict(
+    network: Classifier, key_area: np.ndarray, temperature_degC: np.ndarray, *, batch: int = AT_ONCE
+) -> Prediction:
+    """Logits and features of key areas (n, 16, 48) at temperatures (n,), the mean over each area's four
+    mirror images: a bead has no left, right, head or tail.
 
     It takes batches, the last one padded, so that one program serves any n.
     """
-    key_area, temperature_degC = np.asarray(key_area), np.broadcast_to(np.asarray(temperature_degC, np.float32), len(key_area))
+    key_area, temperature_degC = (
+        np.asarray(key_area),
+        np.broadcast_to(np.asarray(temperature_degC, np.float32), len(key_area)),
+    )
     parts = []
     for i in range(0, len(key_area), batch):
         k = min(batch, len(key_area) - i)
@@ -296,5 +370,7 @@ def predict(network: Classifier, key_area: np.ndarray, temperature_degC: np.ndar
         x[:k], u[:k] = key_area[i : i + k], temperature_degC[i : i + k]
         parts.append([np.asarray(a)[:k] for a in _predict(network, x, u)])
     if not parts:
-        return Prediction(np.zeros((0, CLASSES), np.float32), np.zeros((0, network.head.classes.W.shape[0]), np.float32))
+        return Prediction(
+            np.zeros((0, CLASSES), np.float32), np.zeros((0, network.head.classes.W.shape[0]), np.float32)
+        )
     return Prediction(*(np.concatenate(p) for p in zip(*parts, strict=True)))

@@ -21,9 +21,10 @@ ACTS, FEW, FOREIGN, TIP, AMBIGUOUS, NO_NUMBER = range(6)
 class Window(NamedTuple):
     """What E windows of frames say. `reason` indexes REASONS: 0 acts, all else holds.
 
-    p (E, 3) soft shares, counts of which the paper makes its shares: shares (E, 3) and scaled (E, 3) of (4), label (E,) the class of p, members (E, 3) the conformal
-    set, score (E,) the median out-of-distribution score, valid (E,) and used (E,) the frames that were valid and the frames that count, reason (E,).
-    Where no frame counts, p and shares are 1/3 each and the score is NaN.
+    p (E, 3) soft shares, counts of which the paper makes its shares: shares (E, 3) and scaled (E, 3) of (4),
+    label (E,) the class of p, members (E, 3) the conformal set, score (E,) the median out-of-distribution
+    score, valid (E,) and used (E,) the frames that were valid and the frames that count, reason (E,). Where
+    no frame counts, p and shares are 1/3 each and the score is NaN.
     """
 
     p: np.ndarray
@@ -48,22 +49,33 @@ def judge_window(
     foreign_above: float,
     conformal_level: float,
 ) -> Window:
-    """E windows of W frames each: class probabilities (E, W, 3), valid (E, W), out-of-distribution scores (E, W), tip moved (E,) -> what they say together.
+    """E windows of W frames each: class probabilities (E, W, 3), valid (E, W), out-of-distribution scores (E,
+    W), tip moved (E,) -> what they say together.
 
-    A frame counts when its key area is valid, its probabilities are a distribution and its score is at most `foreign_above`. Of the m that count
-        p = softmax( sum_i log p_i / (1 + (m - 1) correlation) )        frames of one segment repeat each other (design effect; Kish 1965)
-        w_c = #{i: argmax p_i = c},  p = w / m,  p-hat = p / max p       Li and Pattinson 2025, eq. 1-4
-        members = {c: p_c >= conformal_level}                            split conformal set (Sadinle, Lei, Wasserman 2019)
-    Held: fewer than `least_frames` count (by what cost the most of them), the tip has moved, or the set is no single class.
+    A frame counts when its key area is valid, its probabilities are a distribution and its score is at most
+    `foreign_above`. Of the m that count p = softmax( sum_i log p_i / (1 + (m - 1) correlation) ) frames of
+    one segment repeat each other (design effect; Kish 1965) w_c = #{i: argmax p_i = c}, p = w / m, p-hat = p
+    / max p Li and Pattinson 2025, eq. 1-4 members = {c: p_c >= conformal_level} split conformal set (Sadinle,
+    Lei, Wasserman 2019) Held: fewer than `least_frames` count (by what cost the most of them), the tip has
+    moved, or the set is no single class.
     """
     P, valid, scores = np.asarray(probabilities, float), np.asarray(valid, bool), np.asarray(scores, float)
-    if P.ndim != 3 or P.shape[2] != 3 or valid.shape != P.shape[:2] or scores.shape != P.shape[:2] or np.shape(tip_moved) != P.shape[:1]:
+    if (
+        P.ndim != 3
+        or P.shape[2] != 3
+        or valid.shape != P.shape[:2]
+        or scores.shape != P.shape[:2]
+        or np.shape(tip_moved) != P.shape[:1]
+    ):
         raise ValueError(
             "judge_window: expected probabilities (E, W, 3), valid and scores (E, W), tip_moved (E,), found "
             f"{P.shape}, {valid.shape}, {scores.shape}, {np.shape(tip_moved)}; give one row a window"
         )
     if least_frames < 1:
-        raise ValueError(f"judge_window: expected least_frames of at least 1, found {least_frames}; an empty window says nothing")
+        raise ValueError(
+            f"judge_window: expected least_frames of at least 1, found {least_frames}; "
+            "an empty window says nothing"
+        )
     P = np.where(np.isfinite(P) & (np.abs(P) <= 2), P, -1.0)
     seen = valid & (P >= 0).all(axis=2) & (np.abs(P.sum(axis=2) - 1) < 1e-3)
     known = seen & (scores <= foreign_above)
@@ -88,7 +100,8 @@ def judge_window(
 
 
 def _median(scores: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """The median (the upper one of two) of each row over what was seen, NaN where nothing was. A missing score is infinite: nothing vouches for that frame."""
+    """The median (the upper one of two) of each row over what was seen, NaN where nothing was. A missing
+    score is infinite: nothing vouches for that frame."""
     ordered = np.sort(np.where(seen & ~np.isnan(scores), scores, np.inf), axis=1)
     n = seen.sum(axis=1)
     ordered = np.concatenate([ordered, np.full((len(n), 1), np.nan)], axis=1)
@@ -96,7 +109,8 @@ def _median(scores: np.ndarray, seen: np.ndarray) -> np.ndarray:
 
 
 class Limits(NamedTuple):
-    """Of (flow in percent, target temperature in °C), each (2,): the box, the largest change of one action and the travel allowed in any 60 s."""
+    """Of (flow in percent, target temperature in °C), each (2,): the box, the largest change of one action
+    and the travel allowed in any 60 s."""
 
     low: np.ndarray
     high: np.ndarray
@@ -105,8 +119,9 @@ class Limits(NamedTuple):
 
 
 class Setpoints(NamedTuple):
-    """Setpoints as sent, value (E, 2); the moves of the last minute, times (E, H) in s and moves (E, H, 2); `clipped` (E, 4) counts how often the size of one action,
-    the travel of a minute or the box cut a change, and how often it was no number."""
+    """Setpoints as sent, value (E, 2); the moves of the last minute, times (E, H) in s and moves (E,
+    H, 2); `clipped` (E, 4) counts how often the size of one action, the travel of a minute or the
+    box cut a change, and how often it was no number."""
 
     value: np.ndarray
     times: np.ndarray
@@ -120,7 +135,8 @@ def setpoints(start: np.ndarray, limits: Limits) -> Setpoints:
     outside = ~((start >= limits.low) & (start <= limits.high)).all(axis=1)
     if outside.any():
         raise ValueError(
-            f"setpoints: expected a start within {np.asarray(limits.low)} to {np.asarray(limits.high)} (flow in percent, target in °C), "
+            f"setpoints: expected a start within {np.asarray(limits.low)} to {np.asarray(limits.high)} (flow "
+            "in percent, target in °C), "
             f"found {start[outside][0]}; bring the machine there by hand first"
         )
     n = len(start)
@@ -128,7 +144,8 @@ def setpoints(start: np.ndarray, limits: Limits) -> Setpoints:
 
 
 def moved(state: Setpoints, change: np.ndarray, time_s: np.ndarray, limits: Limits) -> Setpoints:
-    """The setpoints after the wanted change (E, 2) at time_s (E,), cut to the size of one action, to what is left of the last 60 s' travel, and to the box.
+    """The setpoints after the wanted change (E, 2) at time_s (E,), cut to the size of one action, to what is
+    left of the last 60 s' travel, and to the box.
 
     A change that is no number moves nothing. Every cut is counted.
     """
@@ -140,7 +157,13 @@ def moved(state: Setpoints, change: np.ndarray, time_s: np.ndarray, limits: Limi
     slow = np.clip(small, -left, left)
     value = np.clip(state.value + slow, limits.low, limits.high)
     cuts = np.stack(
-        [(small != wanted).any(axis=1), (slow != small).any(axis=1), (value != state.value + slow).any(axis=1), ~number], axis=1
+        [
+            (small != wanted).any(axis=1),
+            (slow != small).any(axis=1),
+            (value != state.value + slow).any(axis=1),
+            ~number,
+        ],
+        axis=1,
     )
     keep = recent.any(axis=0)
     times = np.concatenate([state.times[:, keep], np.asarray(time_s, float)[:, None]], axis=1)
@@ -149,7 +172,8 @@ def moved(state: Setpoints, change: np.ndarray, time_s: np.ndarray, limits: Limi
 
 
 class Waits(NamedTuple):
-    """Seconds to the next window after an action that moved the flow, that moved the temperature, that moved nothing."""
+    """Seconds to the next window after an action that moved the flow,
+    that moved the temperature, that moved nothing."""
 
     flow_s: float
     temperature_s: float
@@ -157,17 +181,23 @@ class Waits(NamedTuple):
 
 
 def wait_after(change: np.ndarray, waits: Waits) -> np.ndarray:
-    """Seconds (E,) to wait after the changes (E, 2) that were really sent: the longest that any of them asks for."""
+    """Seconds (E,) to wait after the changes (E, 2) that were really
+    sent: the longest that any of them asks for."""
     asked = np.where(change != 0, [waits.flow_s, waits.temperature_s], 0.0)
     return np.maximum(asked.max(axis=1), waits.idle_s)
 
 
 def why(time_s: float, window: Window, i: int, change: np.ndarray) -> str:
-    """One line of the strip "why it acted" for window i: time, what was seen, what was sent or why it was held."""
+    """One line of the strip "why it acted" for window i: time, what
+    was seen, what was sent or why it was held."""
     frames = f"{time_s:6.1f} s: {window.valid[i]} frames valid, {window.used[i]} count"
     if window.reason[i] == ACTS:
         moves = (
-            ", ".join(f"{name} {c:+g} {unit}" for name, c, unit in zip(("flow", "temperature"), change, ("%", "°C"), strict=True) if c)
+            ", ".join(
+                f"{name} {c:+g} {unit}"
+                for name, c, unit in zip(("flow", "temperature"), change, ("%", "°C"), strict=True)
+                if c
+            )
             or "no change"
         )
         return f"{frames}, {CLASSES[window.label[i]]} {window.p[i, window.label[i]]:.2f}; {moves}"

@@ -1,4 +1,5 @@
-"""A classifier with its calibration: what it says of key areas and of windows, and how well it knows what it does not know."""
+"""A classifier with its calibration: what it says of key areas and of
+windows, and how well it knows what it does not know."""
 
 from typing import Any, NamedTuple
 
@@ -20,7 +21,8 @@ class Eyes(NamedTuple):
 
 
 def see(eyes: Eyes, images: np.ndarray, temperature_degC: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Class probabilities (n, 3) of key areas (n, 16, 48) at temperatures (n,), and how foreign each is (n,): squared Mahalanobis distance of features and appearance."""
+    """Class probabilities (n, 3) of key areas (n, 16, 48) at temperatures (n,), and how foreign each is (n,):
+    squared Mahalanobis distance of features and appearance."""
     found = predict(eyes.network, images, temperature_degC)
     p = np.exp(calibration.log_probabilities(found.logits, eyes.known.temperature))
     features = np.hstack([found.features, calibration.appearance(images)])
@@ -33,7 +35,8 @@ def look(network: Classifier, data: Labelled, valid: np.ndarray) -> Seen:
 
 
 class Said(NamedTuple):
-    """Of w windows: p (w, 3) by summed logarithms, by hard counts and by the mean probability; true class (w,), flow-constant segment (w,), rows (w, length), any valid (w,)."""
+    """Of w windows: p (w, 3) by summed logarithms, by hard counts and by the mean probability; true class
+    (w,), flow-constant segment (w,), rows (w, length), any valid (w,)."""
 
     p: np.ndarray
     hard: np.ndarray
@@ -44,13 +47,15 @@ class Said(NamedTuple):
 
 
 def windows_said(known: Calibration, frames: Seen, *, length: int) -> Said:
-    """What is said of the windows of `length` frames of one segment and class; those without a valid frame say 1/3 each."""
+    """What is said of the windows of `length` frames of one segment and
+    class; those without a valid frame say 1/3 each."""
     rows = calibration.windows(frames.segment, frames.label, length=length).rows
     log_p, valid = calibration.log_probabilities(frames.logits, known.temperature)[rows], frames.valid[rows]
     total = np.where(valid[:, :, None], np.exp(log_p), 0).sum(axis=1)
     m = valid.sum(axis=1)[:, None]
     return Said(
-        calibration.window_probabilities(log_p, valid, known.correlation), calibration.hard_shares(log_p, valid),
+        calibration.window_probabilities(log_p, valid, known.correlation),
+        calibration.hard_shares(log_p, valid),
         np.where(m > 0, total / np.maximum(m, 1), 1 / 3), frames.label[rows[:, 0]], rows, valid.any(axis=1),
     )  # fmt: skip
 
@@ -63,41 +68,57 @@ def reliabilities(known: Calibration, frames: Seen, *, length: int) -> dict[tupl
         "calibrated": np.exp(calibration.log_probabilities(frames.logits[v], known.temperature)),
     }
     windows = {"hard_counts": says.hard, "mean": says.mean, "log_sum": says.p}
-    found = {("image", name): calibration.reliability(p, frames.label[v], bins=BINS) for name, p in images.items()}
+    found = {
+        ("image", name): calibration.reliability(p, frames.label[v], bins=BINS) for name, p in images.items()
+    }
     return found | {
-        ("window", name): calibration.reliability(p[says.seen], says.label[says.seen], bins=BINS) for name, p in windows.items()
+        ("window", name): calibration.reliability(p[says.seen], says.label[says.seen], bins=BINS)
+        for name, p in windows.items()
     }
 
 
 def foreign(key_area: np.ndarray) -> dict[str, np.ndarray]:
-    """Key areas (n, 16, 48) as no bead looks: a lens out of focus, little and much, and a rectangle that lies across the line."""
+    """Key areas (n, 16, 48) as no bead looks: a lens out of focus, little and
+    much, and a rectangle that lies across the line."""
     blurred = {
-        name: np.stack([cv2.GaussianBlur(a, (0, 0), sigma) for a in key_area]) for name, sigma in (("slight_blur", 1.5), ("blur", 2.5))
+        name: np.stack([cv2.GaussianBlur(a, (0, 0), sigma) for a in key_area])
+        for name, sigma in (("slight_blur", 1.5), ("blur", 2.5))
     }
     return blurred | {
-        "transposed": np.stack([cv2.resize(np.ascontiguousarray(a.T), a.shape[::-1], interpolation=cv2.INTER_AREA) for a in key_area])
+        "transposed": np.stack(
+            [
+                cv2.resize(np.ascontiguousarray(a.T), a.shape[::-1], interpolation=cv2.INTER_AREA)
+                for a in key_area
+            ]
+        )
     }
 
 
 def knows_not(eyes: Eyes, frames: Seen, data: Labelled) -> dict[str, Any]:
-    """By kind of foreign picture the AUROC of the distance, beside those of the energy and of 1 - max p, and the share found; and the share of familiar ones called foreign."""
+    """By kind of foreign picture the AUROC of the distance, beside those of the energy and of 1 - max p, and
+    the share found; and the share of familiar ones called foreign."""
     v, known = frames.valid, eyes.known
     familiar = calibration.mahalanobis(known.familiar, frames.features[v])
     plain = -scipy.special.softmax(frames.logits[v], axis=1).max(axis=1)
     figures: dict[str, Any] = {"false_alarms": float(np.mean(familiar > known.foreign_above))}
     for name, images in foreign(data.key_area[v]).items():
         shown = predict(eyes.network, images, data.temperature_degC[v])
-        scores = calibration.mahalanobis(known.familiar, np.hstack([shown.features, calibration.appearance(images)]))
+        scores = calibration.mahalanobis(
+            known.familiar, np.hstack([shown.features, calibration.appearance(images)])
+        )
         figures[name] = {
-            "auroc": calibration.auroc(familiar, scores), "found": float(np.mean(scores > known.foreign_above)),
-            "energy_auroc": calibration.auroc(calibration.energy(frames.logits[v]), calibration.energy(shown.logits)),
+            "auroc": calibration.auroc(familiar, scores),
+            "found": float(np.mean(scores > known.foreign_above)),
+            "energy_auroc": calibration.auroc(calibration.energy(frames.logits[v]),
+            calibration.energy(shown.logits)),
             "max_p_auroc": calibration.auroc(plain, -scipy.special.softmax(shown.logits, axis=1).max(axis=1)),
         }  # fmt: skip
     return figures
 
 
 class Beside(NamedTuple):
-    """The yardsticks' classes of n frames (n,): support vector machine on the profile, width; and the share of windows that the machine's counts name rightly."""
+    """The yardsticks' classes of n frames (n,): support vector machine on the profile, width; and the share
+    of windows that the machine's counts name rightly."""
 
     svc: np.ndarray
     width: np.ndarray
@@ -105,9 +126,16 @@ class Beside(NamedTuple):
 
 
 def beside(learned: Labelled, data: Labelled, says: Said, valid: np.ndarray) -> Beside:
-    """Both yardsticks, fitted on the valid frames that the network learned, on the frames `data` and their windows."""
-    machine = yardsticks.fit_profile_machine(learned.key_area, learned.temperature_degC, learned.label, learned.segment)
+    """Both yardsticks, fitted on the valid frames that the network
+    learned, on the frames `data` and their windows."""
+    machine = yardsticks.fit_profile_machine(
+        learned.key_area, learned.temperature_degC, learned.label, learned.segment
+    )
     rule = yardsticks.fit_width_rule(learned.key_area, learned.label)
     p = yardsticks.profile_probabilities(machine, data.key_area, data.temperature_degC)
     counts = calibration.hard_shares(np.log(p + 1e-12)[says.rows], valid[says.rows]).argmax(axis=1)
-    return Beside(p.argmax(axis=1), yardsticks.width_class(rule, data.key_area), float(np.mean((counts == says.label)[says.seen])))
+    return Beside(
+        p.argmax(axis=1),
+        yardsticks.width_class(rule, data.key_area),
+        float(np.mean((counts == says.label)[says.seen])),
+    )

@@ -1,7 +1,9 @@
-"""Nozzle frame -> 48 x 16 key area along the freshly extruded line, or the reason why there is none: the paper's sweep, and a form that real frames do not fool.
+"""Nozzle frame -> 48 x 16 key area along the freshly extruded line, or the reason why there is none: the
+paper's sweep, and a form that real frames do not fool.
 
-Angles are degrees as the picture is seen, 0 right, 90 down (towards the camera), 270 up (the nozzle). Key areas have rows across the line and columns along it, from
-the tip outward. The paper is Li and Pattinson 2025, section 2.2.1.
+Angles are degrees as the picture is seen, 0 right, 90 down (towards the camera), 270 up
+(the nozzle). Key areas have rows across the line and columns along it, from the tip
+outward. The paper is Li and Pattinson 2025, section 2.2.1.
 """
 
 import functools
@@ -11,20 +13,25 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-# the paper's geometry in px: crop around the tip, rectangle along and across the line; key area (rows, columns)
+# the paper's geometry in px: crop around the tip, rectangle along and
+# across the line; key area (rows, columns)
 SIDE, LENGTH, HEIGHT, SHAPE = 350, 87, 20, (16, 48)
 SMALLEST = 64
-# ridges are sought in profiles across rays: radii every STRIDE px from START on (nearer, the rim of the nozzle is seen), offsets every STEP px up to REACH
+# ridges are sought in profiles across rays: radii every STRIDE px from START on (nearer, the rim of the
+# nozzle is seen), offsets every STEP px up to REACH
 START, STRIDE, STEP, REACH = 12, 3, 2, 28
-# (half-width of the strip, distance of its flanks, both in steps; weight): the line of an ordinary bead, and a broad bead, which the shading of a part mimics better
+# (half-width of the strip, distance of its flanks, both in steps; weight): the line of an ordinary bead, and
+# a broad bead, which the shading of a part mimics better
 SCALES = ((1, 5, 1.0), (3, 8, 0.6))
 # the line may pass beside the calibrated tip by this many steps
 MISS = 4
 MISSES = STEP * np.arange(-MISS, MISS + 1)
-# the nozzle hides the rays within 60 degrees of 270; the search takes every COARSE of the others, then every degree
+# the nozzle hides the rays within 60 degrees of 270; the search takes
+# every COARSE of the others, then every degree
 COARSE = 4
 OPEN = np.arange(-30, 211, COARSE)
-# a direction from G-code is trusted to this many degrees: the line bends, and the camera's turn is known to a few
+# a direction from G-code is trusted to this many degrees: the line
+# bends, and the camera's turn is known to a few
 LEEWAY_DEG = 6
 # a nozzle this close to where it was calibrated is at home
 HOME_PX = 2
@@ -35,8 +42,9 @@ NEARLY = 0.1
 class KeyArea(NamedTuple):
     """The key area of one frame: image (16, 48) uint8, equalised; zeros where `reason` is not empty.
 
-    angle_deg is the line's direction from the tip, miss_px by how much it passes beside the tip (to the right of who looks along it), score its ridge in gray levels
-    of 8 bits, padded_share the share of the crop that lies outside the frame.
+    angle_deg is the line's direction from the tip, miss_px by how much it passes beside the tip
+    (to the right of who looks along it), score its ridge in gray levels of 8 bits, padded_share
+    the share of the crop that lies outside the frame.
     """
 
     image: np.ndarray
@@ -48,7 +56,8 @@ class KeyArea(NamedTuple):
 
 
 class KeyAreas(NamedTuple):
-    """Those of n frames: images (n, 16, 48) uint8, angle_deg, miss_px, score, padded_share (n,), n reasons, valid (n,) bool."""
+    """Those of n frames: images (n, 16, 48) uint8, angle_deg, miss_px,
+    score, padded_share (n,), n reasons, valid (n,) bool."""
 
     images: np.ndarray
     angle_deg: np.ndarray
@@ -60,7 +69,8 @@ class KeyAreas(NamedTuple):
 
 
 class Crop(NamedTuple):
-    """Gray crop (350, 350) uint8 with the tip at (175, 175); levels (256,) uint8 is its equalisation, padded_share the share of it that lies outside the frame."""
+    """Gray crop (350, 350) uint8 with the tip at (175, 175); levels (256,) uint8 is its equalisation,
+    padded_share the share of it that lies outside the frame."""
 
     gray: np.ndarray
     levels: np.ndarray
@@ -69,9 +79,11 @@ class Crop(NamedTuple):
 
 
 def crop(frame: np.ndarray, tip: tuple[float, float]) -> Crop:
-    """The square of 350 px around the tip (x, y) in gray; what lies outside the frame repeats its border and is left out of the equalisation.
+    """The square of 350 px around the tip (x, y) in gray; what lies outside the frame
+    repeats its border and is left out of the equalisation.
 
-    frame is gray (h, w) or BGR(A) (h, w, 3 or 4) of uint8 or uint16 (of which the upper 8 bits are used). Raises ValueError for other frames and a tip outside.
+    frame is gray (h, w) or BGR(A) (h, w, 3 or 4) of uint8 or uint16 (of which the upper 8 bits are used).
+    Raises ValueError for other frames and a tip outside.
     """
     _check(frame, tip)
     h, w = frame.shape[:2]
@@ -84,10 +96,14 @@ def crop(frame: np.ndarray, tip: tuple[float, float]) -> Crop:
     return Crop(gray, levels, 1 - inside.size / SIDE**2, (left - x, top - y, right - x, bottom - y))
 
 
-def find(frame: np.ndarray, tip: tuple[float, float], *, least_score: float, direction_deg: float | None = None) -> KeyArea:
-    """The key area along the strongest ridge: score = strip - brighter flank, rays on the nozzle left out; rejected below least_score gray levels.
+def find(
+    frame: np.ndarray, tip: tuple[float, float], *, least_score: float, direction_deg: float | None = None
+) -> KeyArea:
+    """The key area along the strongest ridge: score = strip - brighter flank, rays on the nozzle left out;
+    rejected below least_score gray levels.
 
-    With direction_deg, known from G-code, only rays within LEEWAY_DEG of it are looked at, those on the nozzle too. Raises ValueError as crop does.
+    With direction_deg, known from G-code, only rays within LEEWAY_DEG of it are looked at, those on the
+    nozzle too. Raises ValueError as crop does.
     """
     c = crop(frame, tip)
     angle, miss, score = _ridge(c.gray, direction_deg)
@@ -102,24 +118,38 @@ def find(frame: np.ndarray, tip: tuple[float, float], *, least_score: float, dir
 
 
 def find_all(
-    frames: Iterable[np.ndarray], tips: np.ndarray, *, least_score: float, directions_deg: np.ndarray | float | None = None
+    frames: Iterable[np.ndarray],
+    tips: np.ndarray,
+    *,
+    least_score: float,
+    directions_deg: np.ndarray | float | None = None,
 ) -> KeyAreas:
-    """Key areas of n frames, each with its tip (n, 2) or one for all (2,), and its direction (n,), or one for all, where known: NaN is not known."""
+    """Key areas of n frames, each with its tip (n, 2) or one for all (2,), and its direction (n,), or one for
+    all, where known: NaN is not known."""
     frames = list(frames)
     tips = np.broadcast_to(np.asarray(tips, float), (len(frames), 2))
     directions = np.broadcast_to(np.nan if directions_deg is None else directions_deg, len(frames))
     found = [
-        find(frame, tip, least_score=least_score, direction_deg=None if np.isnan(direction) else float(direction))
+        find(
+            frame,
+            tip,
+            least_score=least_score,
+            direction_deg=None if np.isnan(direction) else float(direction),
+        )
         for frame, tip, direction in zip(frames, tips, directions, strict=True)
     ]
     images = np.array([k.image for k in found], np.uint8).reshape(-1, *SHAPE)
-    columns = (np.array([getattr(k, name) for k in found]) for name in ("angle_deg", "miss_px", "score", "padded_share"))
+    columns = (
+        np.array([getattr(k, name) for k in found])
+        for name in ("angle_deg", "miss_px", "score", "padded_share")
+    )
     reasons = tuple(k.reason for k in found)
     return KeyAreas(images, *columns, reasons, np.array([not r for r in reasons], bool))
 
 
 class Drift(NamedTuple):
-    """Where the nozzle is seen: offset (x, y) in px from the calibrated tip, how alike it looks there, a correlation of -1..1, and by how much more than at home."""
+    """Where the nozzle is seen: offset (x, y) in px from the calibrated tip, how alike it looks there, a
+    correlation of -1..1, and by how much more than at home."""
 
     offset_px: tuple[int, int]
     correlation: float
@@ -127,8 +157,9 @@ class Drift(NamedTuple):
 
 
 def nozzle_template(frame: np.ndarray, tip: tuple[float, float], *, size_px: int) -> np.ndarray:
-    """Gray patch (7/8 size, size) uint8 of the nozzle above the calibrated tip, cut from the frame on which it was calibrated: a square with the tip in the middle of its
-    lower edge, less its lowest eighth, where beads are laid and look different on each segment.
+    """Gray patch (7/8 size, size) uint8 of the nozzle above the calibrated tip, cut from the frame on which
+    it was calibrated: a square with the tip in the middle of its lower edge, less its lowest eighth, where
+    beads are laid and look different on each segment.
 
     Raises ValueError where the patch does not lie inside the frame.
     """
@@ -136,15 +167,19 @@ def nozzle_template(frame: np.ndarray, tip: tuple[float, float], *, size_px: int
     left, top = _corner(tip, size_px)
     if left < 0 or top < 0 or left + size_px > frame.shape[1]:
         raise ValueError(
-            f"nozzle template: expected {size_px} px above and {size_px // 2} px beside the tip ({tip[0]:g}, {tip[1]:g}) inside the frame "
+            f"nozzle template: expected {size_px} px above and {size_px // 2} px beside the tip ({tip[0]:g}, "
+            f"{tip[1]:g}) inside the frame "
             f"of {frame.shape[1]} x {frame.shape[0]} px; take a smaller template"
         )
     return _gray(frame[top : top + size_px - size_px // 8, left : left + size_px]).copy()
 
 
-def drift(frames: Sequence[np.ndarray], template: np.ndarray, tip: tuple[float, float], *, reach_px: int) -> Drift:
-    """Where within reach_px of the calibrated tip the nozzle is, by the mean over the frames of the normalised cross-correlation: an alarm that the camera moved, never a
-    new calibration. At home is within HOME_PX of the calibrated tip.
+def drift(
+    frames: Sequence[np.ndarray], template: np.ndarray, tip: tuple[float, float], *, reach_px: int
+) -> Drift:
+    """Where within reach_px of the calibrated tip the nozzle is, by the mean over the frames
+    of the normalised cross-correlation: an alarm that the camera moved, never a new
+    calibration. At home is within HOME_PX of the calibrated tip.
     """
     if not len(frames):
         raise ValueError("nozzle drift: expected frames to look at, found none; give at least one")
@@ -158,28 +193,48 @@ def drift(frames: Sequence[np.ndarray], template: np.ndarray, tip: tuple[float, 
     )
     if left < 0 or top < 0 or left + size > frame.shape[1] or top + tall > frame.shape[0]:
         raise ValueError(
-            f"nozzle drift: expected room for the template of {size} px around the tip ({tip[0]:g}, {tip[1]:g}) but the frame is "
+            f"nozzle drift: expected room for the template of {size} px around the tip ({tip[0]:g}, "
+            f"{tip[1]:g}) but the frame is "
             f"{frame.shape[1]} x {frame.shape[0]} px; calibrate on frames of this camera"
         )
     match = np.mean(
-        [cv2.matchTemplate(_gray(one[rows[0] : rows[1], columns[0] : columns[1]]), template, cv2.TM_CCOEFF_NORMED) for one in frames],
+        [
+            cv2.matchTemplate(
+                _gray(one[rows[0] : rows[1], columns[0] : columns[1]]), template, cv2.TM_CCOEFF_NORMED
+            )
+            for one in frames
+        ],
         axis=0,
     )
     row, column = np.unravel_index(int(match.argmax()), match.shape)
     y, x = int(top - rows[0]), int(left - columns[0])
     home = match[max(y - HOME_PX, 0) : y + HOME_PX + 1, max(x - HOME_PX, 0) : x + HOME_PX + 1].max()
-    return Drift((int(columns[0] + column - left), int(rows[0] + row - top)), float(match[row, column]), float(match[row, column] - home))
+    return Drift(
+        (int(columns[0] + column - left), int(rows[0] + row - top)),
+        float(match[row, column]),
+        float(match[row, column] - home),
+    )
 
 
 def drawn(frame: np.ndarray, tip: tuple[float, float], found: KeyArea) -> np.ndarray:
-    """The crop as (350, 350, 3) uint8 RGB with the tip and the rectangle, green where the key area was accepted, red with the reason where not, for a report."""
+    """The crop as (350, 350, 3) uint8 RGB with the tip and the rectangle, green where the key area was
+    accepted, red with the reason where not, for a report."""
     picture = cv2.cvtColor(crop(frame, tip).gray, cv2.COLOR_GRAY2RGB)
     colour = (220, 40, 40) if found.reason else (40, 200, 80)
     at = np.rint(corners(found.angle_deg, found.miss_px) + SIDE // 2).astype(np.int32)
     cv2.polylines(picture, [at], True, colour, 1, cv2.LINE_AA)
     cv2.drawMarker(picture, (SIDE // 2, SIDE // 2), colour, cv2.MARKER_CROSS, 9, 1)
     words = found.reason.partition(":")[0] or "accepted"
-    cv2.putText(picture, f"{words}, {found.score:.1f} gray levels", (8, SIDE - 10), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
+    cv2.putText(
+        picture,
+        f"{words}, {found.score:.1f} gray levels",
+        (8, SIDE - 10),
+        cv2.FONT_HERSHEY_SIMPLEX,
+        0.45,
+        colour,
+        1,
+        cv2.LINE_AA,
+    )
     return picture
 
 
@@ -189,7 +244,8 @@ def _corner(tip: tuple[float, float], size: int) -> tuple[int, int]:
 
 
 def _ridge(gray: np.ndarray, direction_deg: float | None) -> tuple[float, float, float]:
-    """(angle in degrees, miss in px, score) of the strongest ridge; without a direction every COARSE degrees, then every degree around the best of them."""
+    """(angle in degrees, miss in px, score) of the strongest ridge; without a direction every COARSE degrees,
+    then every degree around the best of them."""
     small = cv2.resize(gray, None, fx=1 / STEP, fy=1 / STEP, interpolation=cv2.INTER_AREA).ravel()
     if direction_deg is None:
         coarse = OPEN[_scores(small, _open_profiles()).max(axis=1).argmax()]
@@ -198,7 +254,8 @@ def _ridge(gray: np.ndarray, direction_deg: float | None) -> tuple[float, float,
         angles = round(direction_deg) + np.arange(-LEEWAY_DEG, LEEWAY_DEG + 1)
     score = _scores(small, _profiles()[:, angles % 360])
     best, at = float(score.max()), int(score.argmax()) % score.shape[1]
-    # what is nearly as strong has a say, so that a broad line is taken in its middle; never another line beside it
+    # what is nearly as strong has a say, so that a broad line is taken
+    # in its middle; never another line beside it
     beside = slice(max(at - 2, 0), at + 3)
     weight = np.maximum(score[:, beside] - (best - NEARLY * abs(best) - 1e-6), 0)
     weight /= weight.sum()
@@ -207,8 +264,9 @@ def _ridge(gray: np.ndarray, direction_deg: float | None) -> tuple[float, float,
 
 
 def _scores(small: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """(rays, misses) ridges of profiles at `places` (radii, rays, offsets): strip less its brighter flank, in the near or the far half of the ray, whichever is
-    less, as a line stands out all along; the most over the scales."""
+    """(rays, misses) ridges of profiles at `places` (radii, rays, offsets): strip less its
+    brighter flank, in the near or the far half of the ray, whichever is less, as a line
+    stands out all along; the most over the scales."""
     radii, rays, offsets = places.shape
     samples = small.take(places.reshape(radii, -1), mode="clip")
     half = radii // 2
@@ -222,7 +280,8 @@ def _scores(small: np.ndarray, places: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def _ridge_filters(offsets: int) -> np.ndarray:
-    """(offsets, scales x 2 x misses): strip less left flank, and strip less right flank, for every miss, times the scale's weight."""
+    """(offsets, scales x 2 x misses): strip less left flank, and strip less right
+    flank, for every miss, times the scale's weight."""
     place = np.arange(offsets) - offsets // 2
     columns = []
     for half, away, weight in SCALES:
@@ -235,7 +294,8 @@ def _ridge_filters(offsets: int) -> np.ndarray:
 
 @functools.cache
 def _profiles() -> np.ndarray:
-    """The gather table of the ridges: (radii, 360, offsets), places in the crop reduced by STEP, at every radius along and offset across each ray."""
+    """The gather table of the ridges: (radii, 360, offsets), places in the crop reduced by STEP, at every
+    radius along and offset across each ray."""
     angle = np.deg2rad(np.arange(360))[:, None]
     along, across = np.arange(START, LENGTH, STRIDE)[:, None, None], np.arange(-REACH, REACH + 1, STEP)
     x, y = along * np.cos(angle) - across * np.sin(angle), along * np.sin(angle) + across * np.cos(angle)
@@ -250,14 +310,24 @@ def _open_profiles() -> np.ndarray:
 
 
 def _rectangle(c: Crop, angle_deg: float, miss_px: float) -> np.ndarray:
-    """(16, 48) equalised levels of the rectangle s, e -+ g h with g = (s_y - e_y, e_x - s_x) / |.| (1)-(3), 87 x 20 px resized."""
+    """(16, 48) equalised levels of the rectangle s, e -+ g h with g = (s_y -
+    e_y, e_x - s_x) / |.| (1)-(3), 87 x 20 px resized."""
     rows, columns = SHAPE
     fine = 2 * columns  # 0.9 px along: one sample a column would skip pixels
     a = np.deg2rad(angle_deg)
-    along, across = LENGTH / fine * np.array([np.cos(a), np.sin(a)]), HEIGHT / rows * np.array([-np.sin(a), np.cos(a)])
+    along, across = (
+        LENGTH / fine * np.array([np.cos(a), np.sin(a)]),
+        HEIGHT / rows * np.array([-np.sin(a), np.cos(a)]),
+    )
     origin = SIDE // 2 + 0.5 * along + (miss_px / HEIGHT * rows - (rows - 1) / 2) * across
     matrix = np.column_stack([along, across, origin])
-    patch = cv2.warpAffine(c.gray, matrix, (fine, rows), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE)
+    patch = cv2.warpAffine(
+        c.gray,
+        matrix,
+        (fine, rows),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
     return cv2.LUT(cv2.resize(patch, (columns, rows), interpolation=cv2.INTER_AREA), c.levels)
 
 
@@ -289,17 +359,24 @@ def _gray(part: np.ndarray) -> np.ndarray:
 
 
 def _check(frame: np.ndarray, tip: tuple[float, float]) -> None:
-    if frame.dtype not in (np.uint8, np.uint16) or not (frame.ndim == 2 or (frame.ndim == 3 and frame.shape[2] in (3, 4))):
+    if frame.dtype not in (np.uint8, np.uint16) or not (
+        frame.ndim == 2 or (frame.ndim == 3 and frame.shape[2] in (3, 4))
+    ):
         raise ValueError(
-            f"frame: expected gray (h, w) or BGR(A) (h, w, 3 or 4) of 8 or 16 bits but found {frame.shape} of {frame.dtype}; convert it"
+            f"frame: expected gray (h, w) or BGR(A) (h, w, 3 or 4) of 8 or 16 bits but found {frame.shape} "
+            f"of {frame.dtype}; convert it"
         )
     h, w = frame.shape[:2]
     if min(h, w) < SMALLEST:
-        raise ValueError(f"frame: expected at least {SMALLEST} x {SMALLEST} px but found {w} x {h}; use the camera's full frame")
+        raise ValueError(
+            f"frame: expected at least {SMALLEST} x {SMALLEST} px but found {w} x {h}; "
+            "use the camera's full frame"
+        )
     x, y = tip
     if not (0 <= x < w and 0 <= y < h):
         raise ValueError(
-            f"nozzle tip: expected x, y inside the frame of {w} x {h} px but found ({x:g}, {y:g}); calibrate it by a click on a frame of this camera"
+            f"nozzle tip: expected x, y inside the frame of {w} x {h} px but found ({x:g}, {y:g}); "
+            "calibrate it by a click on a frame of this camera"
         )
 
 

@@ -1,9 +1,11 @@
-"""Synthetic nozzle frames with labels: flow -> width of the fresh bead -> what an endoscope beside the nozzle sees, under conditions that stay for a whole segment.
+"""Synthetic nozzle frames with labels: flow -> width of the fresh bead -> what an endoscope beside the nozzle
+sees, under conditions that stay for a whole segment.
 
-The numbers below are the difficulty of the scenes. They are set so that the profile support vector machine (yardsticks.py) names 0.73-0.76 of single images on held-out
-segments; a test holds them there. They were set anew after networks had been seen: less that stays through a segment but the width itself, more that changes from image
-to image, as what stays moves a classifier's borders for a whole segment, which no window averages out. Change a number, and every figure of the classifier and of the
-closed loop is another.
+The numbers below are the difficulty of the scenes. They are set so that the profile support vector machine
+(yardsticks.py) names 0.73-0.76 of single images on held-out segments; a test holds them there. They were set
+anew after networks had been seen: less that stays through a segment but the width itself, more that changes
+from image to image, as what stays moves a classifier's borders for a whole segment, which no window averages
+out. Change a number, and every figure of the classifier and of the closed loop is another.
 """
 
 import functools
@@ -14,12 +16,15 @@ import numpy as np
 
 from pipeline.setpoint.key_area import SIDE, KeyAreas, find_all
 
-# classes 0 below 90, 1 from 90 to 110, 2 above 110 percent of the nominal flow (paper, section 2.2); the flows that a printer is set to
+# classes 0 below 90, 1 from 90 to 110, 2 above 110 percent of the nominal flow (paper,
+# section 2.2); the flows that a printer is set to
 BORDERS, FLOWS = (90.0, 110.0), (20.0, 310.0)
 TEMPERATURES = (190.0, 200.0, 210.0, 220.0, 230.0)
-# a bead of nominal flow in px; a stadium of height h has the section (w - h) h + pi h^2 / 4, so that w = w_100 (q + FLAT (1 - q)) with FLAT = (1 - pi/4) h / w_100
+# a bead of nominal flow in px; a stadium of height h has the section (w - h) h + pi h^2 / 4, so that w =
+# w_100 (q + FLAT (1 - q)) with FLAT = (1 - pi/4) h / w_100
 WIDTH_PX, FLAT = 8.0, 0.1
-# deviations of the width: one draw a segment, one an image (at 210 degC; hotter material spreads by SPREAD_PER_DEGC more)
+# deviations of the width: one draw a segment, one an image (at 210 degC;
+# hotter material spreads by SPREAD_PER_DEGC more)
 SEGMENT_SPREAD, IMAGE_SPREAD, SPREAD_PER_DEGC = 0.05, 0.08, 0.005
 # share of frames without a line
 EMPTY = 0.06
@@ -29,7 +34,8 @@ BLUR_PX, NOISE, TEXTURE, GRAIN_PX = (1.0, 1.3), (2.0, 8.0), (4.0, 6.0), (1.2, 3.
 SPECULAR, SPECULAR_PX = (20.0, 60.0), 1.2
 DIRECTION_DEG, HALF_CONE_DEG = (-25.0, 205.0), (38.0, 50.0)
 OLDER_SHARE, OLDER_PITCH, OLDER_LEVEL = 0.5, (11.5, 15.0), (0.15, 0.35)
-# deviations: curvature of the line in 1/px, of the calibrated tip in px, and from image to image of direction, place, light and focus
+# deviations: curvature of the line in 1/px, of the calibrated tip in px, and from image to image of
+# direction, place, light and focus
 CURVATURE, TIP_PX, TURN_DEG, PLACE_PX, FLICKER, FOCUS = 1 / 900, 1.5, 2.5, 1.0, 0.1, 0.4
 ROUGHNESS, ROUGH_GRAIN_PX = 0.26, 10.0
 # and of each image, uniform: fall of the level to the bead's edge, place of the specular line in half widths
@@ -39,10 +45,12 @@ TRAVEL, REACH_PX = 60, 22.0
 
 
 class Segment(NamedTuple):
-    """Conditions of one printed segment. direction_deg is the way the line leaves the tip (0 right, 90 down), tip the calibrated tip (x, y).
+    """Conditions of one printed segment. direction_deg is the way the line leaves the tip
+    (0 right, 90 down), tip the calibrated tip (x, y).
 
-    ground (350, 350) uint8 is the lit plate with older beads, texture int16 what moves over it, nozzle and its mask (350, 350) uint8. at (k,) are the pixels near the
-    line in the flattened frame, along and across (k,) their places in px; the others are gray levels and px.
+    ground (350, 350) uint8 is the lit plate with older beads, texture int16 what moves over it, nozzle and
+    its mask (350, 350) uint8. at (k,) are the pixels near the line in the flattened frame, along and across
+    (k,) their places in px; the others are gray levels and px.
     """
 
     direction_deg: float
@@ -62,8 +70,8 @@ class Segment(NamedTuple):
 
 
 class Frames(NamedTuple):
-    """frames (n, 350, 350) uint8 and their truth: flow (n,) in percent, temperature (n,) in degC, width_px (n,) of the bead as drawn, line (n,) whether there is one;
-    direction_deg and tip of their segment."""
+    """frames (n, 350, 350) uint8 and their truth: flow (n,) in percent, temperature (n,) in degC, width_px
+    (n,) of the bead as drawn, line (n,) whether there is one; direction_deg and tip of their segment."""
 
     frames: np.ndarray
     flow: np.ndarray
@@ -75,8 +83,9 @@ class Frames(NamedTuple):
 
 
 class DataSet(NamedTuple):
-    """Key areas of many segments: images (n, 16, 48) uint8, label (n,) 0 1 2, flow (n,) in percent, temperature (n,) in degC, segment (n,) 0 1 2 ...,
-    valid (n,) bool (images are zeros elsewhere), n reasons."""
+    """Key areas of many segments: images (n, 16, 48) uint8, label (n,) 0 1 2,
+    flow (n,) in percent, temperature (n,) in degC, segment (n,) 0 1 2 ..., valid
+    (n,) bool (images are zeros elsewhere), n reasons."""
 
     images: np.ndarray
     label: np.ndarray
@@ -88,7 +97,8 @@ class DataSet(NamedTuple):
 
 
 def label(flow: np.ndarray) -> np.ndarray:
-    """Class of a flow in percent: 0 below 90, 1 from 90 to 110, 2 above; a flow that is not known (NaN) has none, and is for the caller to leave out."""
+    """Class of a flow in percent: 0 below 90, 1 from 90 to 110, 2 above; a flow that is not known (NaN) has
+    none, and is for the caller to leave out."""
     flow = np.asarray(flow)
     return (flow >= BORDERS[0]).astype(np.int64) + (flow > BORDERS[1])
 
@@ -100,7 +110,11 @@ def draw_segment(rng: np.random.Generator) -> Segment:
     x, y = _grid()
     cos, sin = np.cos(np.deg2rad(direction)), np.sin(np.deg2rad(direction))
     along = x * np.float32(cos) + y * np.float32(sin)
-    across = y * np.float32(cos) - x * np.float32(sin) - np.float32(CURVATURE * rng.standard_normal() / 2) * along**2
+    across = (
+        y * np.float32(cos)
+        - x * np.float32(sin)
+        - np.float32(CURVATURE * rng.standard_normal() / 2) * along**2
+    )
     contrast = rng.uniform(*CONTRAST)
     ground = rng.uniform(*PLATE) + _slope(rng, x, y)
     if rng.random() < OLDER_SHARE:
@@ -108,15 +122,21 @@ def draw_segment(rng: np.random.Generator) -> Segment:
     nozzle, mask = _nozzle(rng, x, y)
     at = np.flatnonzero((np.abs(across) < REACH_PX) & (along > 0) & (mask == 0))
     return Segment(
-        direction_deg=direction % 360, tip=(middle + miss[0], middle + miss[1]), width_factor=1 + SEGMENT_SPREAD * rng.standard_normal(),
-        ground=np.clip(ground, 0, 255).astype(np.uint8), texture=_texture(rng), nozzle=nozzle, mask=mask, at=at,
-        along=along.ravel()[at], across=across.ravel()[at], contrast=contrast, specular=rng.uniform(*SPECULAR), blur_px=rng.uniform(*BLUR_PX), noise=rng.uniform(*NOISE),
+        direction_deg=direction % 360, tip=(middle + miss[0], middle + miss[1]),
+        width_factor=1 + SEGMENT_SPREAD * rng.standard_normal(),
+        ground=np.clip(ground, 0, 255).astype(np.uint8), texture=_texture(rng), nozzle=nozzle, mask=mask,
+        at=at,
+        along=along.ravel()[at], across=across.ravel()[at], contrast=contrast,
+        specular=rng.uniform(*SPECULAR), blur_px=rng.uniform(*BLUR_PX), noise=rng.uniform(*NOISE),
     )  # fmt: skip
 
 
 def render(segment: Segment, flow: np.ndarray, temperature: np.ndarray, rng: np.random.Generator) -> Frames:
-    """n frames of one segment, each with its own flow (n,) in percent and temperature (n,) in degC (scalars for all frames alike: give at least one array)."""
-    flow, temperature = np.broadcast_arrays(np.atleast_1d(np.asarray(flow, float)), np.asarray(temperature, float))
+    """n frames of one segment, each with its own flow (n,) in percent and temperature (n,) in degC (scalars
+    for all frames alike: give at least one array)."""
+    flow, temperature = np.broadcast_arrays(
+        np.atleast_1d(np.asarray(flow, float)), np.asarray(temperature, float)
+    )
     n = len(flow)
     hot = temperature - 210.0
     spread = IMAGE_SPREAD * (1 + SPREAD_PER_DEGC * hot) * rng.standard_normal(n)
@@ -125,7 +145,9 @@ def render(segment: Segment, flow: np.ndarray, temperature: np.ndarray, rng: np.
     line = rng.random(n) >= EMPTY
     gloss, focus = np.exp(0.01 * hot), np.exp(FOCUS * np.clip(rng.standard_normal(n), -2.5, 2.5))
     spare = 64 * SIDE
-    noise = np.rint(segment.noise * rng.standard_normal(SIDE * SIDE + spare, dtype=np.float32)).astype(np.int16)
+    noise = np.rint(segment.noise * rng.standard_normal(SIDE * SIDE + spare, dtype=np.float32)).astype(
+        np.int16
+    )
     frames = np.empty((n, SIDE, SIDE), np.uint8)
     for k in range(n):
         picture = _moved(segment, rng)
@@ -135,7 +157,15 @@ def render(segment: Segment, flow: np.ndarray, temperature: np.ndarray, rng: np.
         soft = cv2.GaussianBlur(picture, (0, 0), segment.blur_px * focus[k])
         first = int(rng.integers(0, spare))
         frames[k] = cv2.add(soft, noise[first : first + SIDE * SIDE].reshape(SIDE, SIDE), dtype=cv2.CV_8U)
-    return Frames(frames, flow.copy(), temperature.copy(), np.where(line, width, 0.0), line, segment.direction_deg, segment.tip)
+    return Frames(
+        frames,
+        flow.copy(),
+        temperature.copy(),
+        np.where(line, width, 0.0),
+        line,
+        segment.direction_deg,
+        segment.tip,
+    )
 
 
 def key_areas(frames: Frames, *, least_score: float) -> KeyAreas:
@@ -150,9 +180,11 @@ def draw_flow(rng: np.random.Generator, kind: int, n: int) -> np.ndarray:
 
 
 def data_set(rng: np.random.Generator, *, segments: int, frames: int, least_score: float) -> DataSet:
-    """Key areas of `segments` segments for each of the 15 combinations of class and temperature, `frames` images each; flow and temperature stay within a segment.
+    """Key areas of `segments` segments for each of the 15 combinations of class and temperature, `frames`
+    images each; flow and temperature stay within a segment.
 
-    Images of one segment share its conditions: a classifier learns more from many short segments than from few long ones.
+    Images of one segment share its conditions: a classifier learns
+    more from many short segments than from few long ones.
     """
     rows: list[tuple] = []
     for combination in range(15 * segments):
@@ -162,8 +194,10 @@ def data_set(rng: np.random.Generator, *, segments: int, frames: int, least_scor
         rows.append((made, key_areas(made, least_score=least_score)))
     flow = np.concatenate([m.flow for m, _ in rows])
     return DataSet(
-        np.concatenate([k.images for _, k in rows]), label(flow), flow, np.concatenate([m.temperature for m, _ in rows]),
-        np.repeat(np.arange(len(rows)), frames), np.concatenate([k.valid for _, k in rows]), sum((k.reasons for _, k in rows), ()),
+        np.concatenate([k.images for _, k in rows]), label(flow), flow,
+        np.concatenate([m.temperature for m, _ in rows]),
+        np.repeat(np.arange(len(rows)), frames), np.concatenate([k.valid for _, k in rows]),
+        sum((k.reasons for _, k in rows), ()),
     )  # fmt: skip
 
 
@@ -182,7 +216,8 @@ def _older(rng: np.random.Generator, across: np.ndarray) -> np.ndarray:
 
 
 def _nozzle(rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A cone above the tip with a flat end, dark steel to bright brass, lit from one side; and where it is."""
+    """A cone above the tip with a flat end, dark steel to bright
+    brass, lit from one side; and where it is."""
     slope, flat = np.float32(np.tan(np.deg2rad(rng.uniform(*HALF_CONE_DEG)))), np.float32(rng.uniform(6, 12))
     inside = (y < 0) & (np.abs(x) < flat - slope * y)
     level, side, band = rng.uniform(25, 75), rng.uniform(-0.4, 0.4), rng.uniform(-60, 60)
@@ -194,7 +229,9 @@ def _nozzle(rng: np.random.Generator, x: np.ndarray, y: np.ndarray) -> tuple[np.
 def _texture(rng: np.random.Generator) -> np.ndarray:
     """int16 canvas of plate texture, wider than the frame by TRAVEL on every side; drawn at half its size."""
     side = SIDE // 2 + TRAVEL
-    t = cv2.GaussianBlur(rng.standard_normal((side, side), dtype=np.float32), (0, 0), rng.uniform(*GRAIN_PX) / 2)
+    t = cv2.GaussianBlur(
+        rng.standard_normal((side, side), dtype=np.float32), (0, 0), rng.uniform(*GRAIN_PX) / 2
+    )
     t *= np.float32(rng.uniform(*TEXTURE) / t.std())
     return np.rint(cv2.resize(t, (2 * side, 2 * side))).astype(np.int16)
 
@@ -214,7 +251,8 @@ def _moved(segment: Segment, rng: np.random.Generator) -> np.ndarray:
 
 
 def _lay(picture: np.ndarray, segment: Segment, width: float, gloss: float, rng: np.random.Generator) -> None:
-    """Draws the fresh bead: level falls as 1 - shading rho^2 with rho = 2 t / w across it, a specular line at specular_at, rough edges."""
+    """Draws the fresh bead: level falls as 1 - shading rho^2 with rho = 2 t / w across
+    it, a specular line at specular_at, rough edges."""
     turn, place, light = (
         np.tan(np.deg2rad(TURN_DEG)) * rng.standard_normal(),
         PLACE_PX * rng.standard_normal(),

@@ -1,4 +1,5 @@
-"""The closed loop through pixels: setpoints -> heater and melt -> rendered frames -> key areas -> classifier -> window -> hold or controller -> setpoints."""
+"""The closed loop through pixels: setpoints -> heater and melt -> rendered frames -> key areas -> classifier
+-> window -> hold or controller -> setpoints."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -14,14 +15,16 @@ from pipeline.setpoint.deployment import ACTS, AMBIGUOUS, Limits, Waits, Window
 from pipeline.setpoint.published import FLOW_MOVES, LAMBDA, TEMPERATURE_MOVES
 from pipeline.setpoint.simulator import Controller, Observation
 
-# of the nozzle, for the alarm that the camera moved: at least LOOKS frames of a window are looked at; what is less alike, or hardly more than at home, is not the nozzle elsewhere
+# of the nozzle, for the alarm that the camera moved: at least LOOKS frames of a window are looked at; what is
+# less alike, or hardly more than at home, is not the nozzle elsewhere
 TEMPLATE_PX, REACH_PX, LOOKS, LIKENESS, ADVANTAGE = 80, 30, 5, 0.4, 0.12
 
 # ---- the machine
 
 
 class Machine(NamedTuple):
-    """Heater: first order, heater_s, after heater_delay_s. Melt: melt_s at 210 °C is how long it empties, longer by `softening` per °C below."""
+    """Heater: first order, heater_s, after heater_delay_s. Melt: melt_s at 210 °C is how long it empties,
+    longer by `softening` per °C below."""
 
     heater_s: float
     heater_delay_s: float
@@ -30,8 +33,8 @@ class Machine(NamedTuple):
 
 
 class Running(NamedTuple):
-    """State of E machines: temperature (E,) °C, stored (E,) the volume already in the melt, in percent of nominal flow times s, and the targets on their way to the
-    heater, oldest first (E, delay)."""
+    """State of E machines: temperature (E,) °C, stored (E,) the volume already in the melt, in percent of
+    nominal flow times s, and the targets on their way to the heater, oldest first (E, delay)."""
 
     temperature: np.ndarray
     stored: np.ndarray
@@ -42,16 +45,26 @@ def at_rest(machine: Machine, flow: np.ndarray, temperature: np.ndarray, *, tick
     """Machines that have long been fed flow (E,) in percent at temperature (E,) in °C."""
     temperature = np.asarray(temperature, float)
     delay = round(machine.heater_delay_s / tick_s)
-    return Running(temperature, flow * _melt_s(machine, temperature), np.repeat(temperature[:, None], delay + 1, axis=1))
+    return Running(
+        temperature, flow * _melt_s(machine, temperature), np.repeat(temperature[:, None], delay + 1, axis=1)
+    )
 
 
 def tick(
-    machine: Machine, state: Running, feed: np.ndarray, target: np.ndarray, running: np.ndarray, *, tick_s: float
+    machine: Machine,
+    state: Running,
+    feed: np.ndarray,
+    target: np.ndarray,
+    running: np.ndarray,
+    *,
+    tick_s: float,
 ) -> tuple[Running, np.ndarray]:
-    """The next state and the mean flow (E,) out of the nozzle over a tick, for those that run (E,) bool; the others stand still.
+    """The next state and the mean flow (E,) out of the nozzle over a tick,
+    for those that run (E,) bool; the others stand still.
 
-    T' = (target(t - delay) - T) / heater_s;   V' = feed - V / tau(T),  flow = V / tau,  tau = melt_s exp(-softening (T - 210)): what is fed leaves, later, and a melt
-    that heats up lets go of what it holds. Both exact for inputs held over the tick.
+    T' = (target(t - delay) - T) / heater_s; V' = feed - V / tau(T), flow = V / tau, tau = melt_s
+    exp(-softening (T - 210)): what is fed leaves, later, and a melt that heats up lets go of what it holds.
+    Both exact for inputs held over the tick.
     """
     tau = _melt_s(machine, state.temperature)
     stored = feed * tau + (state.stored - feed * tau) * np.exp(-tick_s / tau)
@@ -59,7 +72,9 @@ def tick(
     coming = np.concatenate([state.coming[:, 1:], target[:, None]], axis=1)
     temperature = coming[:, 0] + (state.temperature - coming[:, 0]) * np.exp(-tick_s / machine.heater_s)
     now = Running(temperature, stored, coming)
-    return Running(*(np.where(running.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(now, state, strict=True))), flow
+    return Running(
+        *(np.where(running.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(now, state, strict=True))
+    ), flow
 
 
 def _melt_s(machine: Machine, temperature: np.ndarray) -> np.ndarray:
@@ -70,8 +85,9 @@ def _melt_s(machine: Machine, temperature: np.ndarray) -> np.ndarray:
 
 
 class Disturbances(NamedTuple):
-    """Of E episodes, counted in decisions: the feed is multiplied by clog (E,) from clog_at (E,) on; the camera moves by shift_px (E, 2) at shift_at (E,); for burst_for
-    (E,) decisions from burst_at (E,) the picture is blurred by blur_px (E,) and outshone by glare (E,) gray levels beside the nozzle."""
+    """Of E episodes, counted in decisions: the feed is multiplied by clog (E,) from clog_at (E,) on; the
+    camera moves by shift_px (E, 2) at shift_at (E,); for burst_for (E,) decisions from burst_at (E,) the
+    picture is blurred by blur_px (E,) and outshone by glare (E,) gray levels beside the nozzle."""
 
     clog: np.ndarray
     clog_at: np.ndarray
@@ -109,10 +125,12 @@ def _filmed(frames: np.ndarray, d: Disturbances, i: int, decision: int, tip: np.
 
 
 class Episodes(NamedTuple):
-    """E episodes of D decisions. Truth: flow and temperature (E, D + 1), means over the window that each decision was made on, and over one after the last.
+    """E episodes of D decisions. Truth: flow and temperature (E, D + 1), means over the window that each
+    decision was made on, and over one after the last.
 
-    Per decision (E, D): time_s at the window's end, setpoint and sent (E, D, 2) flow and target before, and the change that was sent, windows (each field (E, D, ...)),
-    segment number; clipped (E, 4) as in deployment.Setpoints; pictures (350, 350, 3) uint8 by (episode, decision), the key area drawn in.
+    Per decision (E, D): time_s at the window's end, setpoint and sent (E, D, 2) flow and target before, and
+    the change that was sent, windows (each field (E, D, ...)), segment number; clipped (E, 4) as in
+    deployment.Setpoints; pictures (350, 350, 3) uint8 by (episode, decision), the key area drawn in.
     """
 
     flow: np.ndarray
@@ -127,8 +145,9 @@ class Episodes(NamedTuple):
 
 
 class Loop(NamedTuple):
-    """How the loop is deployed: frames a window at frame_rate_hz, waits, limits, the rule of the window judge(P, valid, scores, tip_moved) -> Window, the least ridge
-    score of a key area, how far the nozzle may be from where its tip was calibrated, and how long a segment's conditions last on average, in s."""
+    """How the loop is deployed: frames a window at frame_rate_hz, waits, limits, the rule of the window
+    judge(P, valid, scores, tip_moved) -> Window, the least ridge score of a key area, how far the nozzle may
+    be from where its tip was calibrated, and how long a segment's conditions last on average, in s."""
 
     frames: int
     frame_rate_hz: float
@@ -141,25 +160,42 @@ class Loop(NamedTuple):
 
 
 def _told(reason: np.ndarray) -> np.ndarray:
-    """Whether the controller hears of a window: of those acted on, and of those that cannot tell the classes apart."""
+    """Whether the controller hears of a window: of those acted on, and
+    of those that cannot tell the classes apart."""
     return (reason == ACTS) | (reason == AMBIGUOUS)
 
 
 def _answer(
-    controller: Controller, parameters: Any, memory: Any, shown: Observation, keys: jax.Array, reason: np.ndarray
+    controller: Controller,
+    parameters: Any,
+    memory: Any,
+    shown: Observation,
+    keys: jax.Array,
+    reason: np.ndarray,
 ) -> tuple[Any, np.ndarray]:
-    """Memory and the change (E, 2) wanted of flow and target; the target's only where lambda's clock allows it, none where the window is held."""
+    """Memory and the change (E, 2) wanted of flow and target; the target's only where lambda's clock allows
+    it, none where the window is held."""
     shown = Observation(*(jnp.asarray(a, jnp.int32 if a.dtype.kind == "i" else jnp.float32) for a in shown))
     memory, q, u = _decided(controller, parameters, memory, shown, keys, jnp.asarray(_told(reason)))
-    wanted = np.stack([np.asarray(FLOW_MOVES)[q], np.where(shown.step % LAMBDA == 0, np.asarray(TEMPERATURE_MOVES)[u], 0.0)], axis=1)
+    wanted = np.stack(
+        [
+            np.asarray(FLOW_MOVES)[q],
+            np.where(shown.step % LAMBDA == 0, np.asarray(TEMPERATURE_MOVES)[u], 0.0),
+        ],
+        axis=1,
+    )
     return memory, np.where((reason == ACTS)[:, None], wanted, 0.0)
 
 
 @eqx.filter_jit
-def _decided(controller: Controller, parameters: Any, memory: Any, shown: Observation, keys: jax.Array, told: jax.Array):
+def _decided(
+    controller: Controller, parameters: Any, memory: Any, shown: Observation, keys: jax.Array, told: jax.Array
+):
     """Memory, which stays where nothing was told, and action indices of every episode."""
     after, action = jax.vmap(controller.act, (None, 0, 0, 0))(parameters, memory, shown, keys)
-    return jax.tree.map(lambda new, old: jnp.where(told.reshape(-1, *[1] * (new.ndim - 1)), new, old), after, memory), *action
+    return jax.tree.map(
+        lambda new, old: jnp.where(told.reshape(-1, *[1] * (new.ndim - 1)), new, old), after, memory
+    ), *action
 
 
 def run(
@@ -175,17 +211,22 @@ def run(
     rng: np.random.Generator,
     draw: frozenset[tuple[int, int]] = frozenset(),
 ) -> Episodes:
-    """Episodes from the setpoints start (E, 2), at rest there; the first frame of each (episode, decision) in `draw` is kept as a picture.
+    """Episodes from the setpoints start (E, 2), at rest there; the first frame of each
+    (episode, decision) in `draw` is kept as a picture.
 
     see(images (n, 16, 48), temperature (n,)) -> class probabilities (n, 3), out-of-distribution scores (n,).
 
-    A window whose classes cannot be told apart is no reason to act, but it is evidence: the controller is shown it and remembers, and its answer is not sent. Of windows
-    held for another reason it hears nothing. Lambda's clock counts the windows that were acted on, so that a hold does not cost the temperature its action. Each episode
-    draws from its own generator: what it meets does not depend on the others.
+    A window whose classes cannot be told apart is no reason to act, but it is evidence: the controller is
+    shown it and remembers, and its answer is not sent. Of windows held for another reason it hears nothing.
+    Lambda's clock counts the windows that were acted on, so that a hold does not cost the temperature its
+    action. Each episode draws from its own generator: what it meets does not depend on the others.
     """
     E, tick_s = len(start), 1.0 / loop.frame_rate_hz
     if len(disturbances.clog) != E:
-        raise ValueError(f"pixels.run: expected disturbances of {E} episodes, found {len(disturbances.clog)}; make them by calm({E})")
+        raise ValueError(
+            f"pixels.run: expected disturbances of {E} episodes, found {len(disturbances.clog)}; "
+            f"make them by calm({E})"
+        )
     rngs = rng.spawn(E)
     keys = jax.random.split(jax.random.key(int(rng.integers(2**31))), E)
     setpoints = deployment.setpoints(start, loop.limits)
@@ -201,7 +242,9 @@ def run(
         feed = setpoints.value[:, 0] * np.where(decision >= disturbances.clog_at, disturbances.clog, 1.0)
         ticks = np.rint(deployment.wait_after(change, loop.waits) / tick_s).astype(int) * (decision > 0)
         running, _, _ = _advance(machine, running, feed, setpoints.value[:, 1], ticks, tick_s)
-        running, flow, temperature = _advance(machine, running, feed, setpoints.value[:, 1], np.full(E, loop.frames), tick_s)
+        running, flow, temperature = _advance(
+            machine, running, feed, setpoints.value[:, 1], np.full(E, loop.frames), tick_s
+        )
         time_s = time_s + (ticks + loop.frames) * tick_s
         if decision == decisions:
             break
@@ -214,21 +257,40 @@ def run(
         window = loop.judge(P.reshape(E, -1, 3), seen.valid, scores.reshape(E, -1), seen.tip_moved)
         pictures |= seen.pictures
         step_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, decision)
-        shown = Observation(window.p, window.label, since, temperature.mean(axis=1), setpoints.value[:, 1], acted)
+        shown = Observation(
+            window.p, window.label, since, temperature.mean(axis=1), setpoints.value[:, 1], acted
+        )
         memory, wanted = _answer(controller, parameters, memory, shown, step_keys, window.reason)
         before, setpoints = setpoints, deployment.moved(setpoints, wanted, time_s, loop.limits)
         change = setpoints.value - before.value
-        rows.append((flow.mean(axis=1), temperature.mean(axis=1), time_s, before.value, change, window, numbers.copy()))
-        since, acted = np.where(_told(window.reason), 0.0, since) + change[:, 0], acted + (window.reason == ACTS)
+        rows.append(
+            (
+                flow.mean(axis=1),
+                temperature.mean(axis=1),
+                time_s,
+                before.value,
+                change,
+                window,
+                numbers.copy(),
+            )
+        )
+        since, acted = (
+            np.where(_told(window.reason), 0.0, since) + change[:, 0],
+            acted + (window.reason == ACTS),
+        )
     flows, temperatures, times, values, changes, windows, segment = zip(*rows, strict=True)
     return Episodes(
-        flow=np.stack([*flows, flow.mean(axis=1)], axis=1), temperature=np.stack([*temperatures, temperature.mean(axis=1)], axis=1),
+        flow=np.stack([*flows, flow.mean(axis=1)], axis=1),
+        temperature=np.stack([*temperatures, temperature.mean(axis=1)], axis=1),
         time_s=np.stack(times, axis=1), setpoint=np.stack(values, axis=1), sent=np.stack(changes, axis=1),
-        windows=Window(*(np.stack(field, axis=1) for field in zip(*windows, strict=True))), segment=np.stack(segment, axis=1), clipped=setpoints.clipped, pictures=pictures,
+        windows=Window(*(np.stack(field, axis=1) for field in zip(*windows, strict=True))),
+        segment=np.stack(segment, axis=1), clipped=setpoints.clipped, pictures=pictures,
     )  # fmt: skip
 
 
-def _advance(machine: Machine, state: Running, feed: np.ndarray, target: np.ndarray, ticks: np.ndarray, tick_s: float):
+def _advance(
+    machine: Machine, state: Running, feed: np.ndarray, target: np.ndarray, ticks: np.ndarray, tick_s: float
+):
     """The state after ticks (E,), and the flow and temperature (E, most) of each tick."""
     flows, temperatures = np.zeros((2, len(feed), ticks.max(initial=0)))
     for k in range(ticks.max(initial=0)):
@@ -248,7 +310,8 @@ def _next_segment(segment, rng: np.random.Generator):
 
 
 class _Seen(NamedTuple):
-    """Key areas (E, W, 16, 48) uint8, whether they are valid (E, W), whether the nozzle is elsewhere than where it was calibrated (E,), and the pictures asked for."""
+    """Key areas (E, W, 16, 48) uint8, whether they are valid (E, W), whether the nozzle is elsewhere than
+    where it was calibrated (E,), and the pictures asked for."""
 
     images: np.ndarray
     valid: np.ndarray
@@ -257,28 +320,48 @@ class _Seen(NamedTuple):
 
 
 def _seen(
-    segments: list, templates: list, flow, temperature, loop: Loop, d: Disturbances, decision: int, rngs: list, draw: frozenset
+    segments: list,
+    templates: list,
+    flow,
+    temperature,
+    loop: Loop,
+    d: Disturbances,
+    decision: int,
+    rngs: list,
+    draw: frozenset,
 ) -> _Seen:
-    """What the cameras show of flow and temperature (E, W); `templates` of the nozzles are cut from the first frames, where the tip was calibrated."""
+    """What the cameras show of flow and temperature (E, W); `templates` of the nozzles are cut from the first
+    frames, where the tip was calibrated."""
     images, valid, moved, pictures = [], [], [], {}
     for i, segment in enumerate(segments):
         made = nozzle_scene.render(segment, flow[i], temperature[i], rngs[i])
         frames, tip = _filmed(made.frames, d, i, decision, segment.tip), segment.tip
-        found = key_area.find_all(frames, tip, least_score=loop.least_score, directions_deg=segment.direction_deg)
+        found = key_area.find_all(
+            frames, tip, least_score=loop.least_score, directions_deg=segment.direction_deg
+        )
         if templates[i] is None:
             templates[i] = key_area.nozzle_template(made.frames[0], tip, size_px=TEMPLATE_PX)
         nozzle = key_area.drift(frames[:: max(1, len(frames) // LOOKS)], templates[i], tip, reach_px=REACH_PX)
         images.append(found.images)
         valid.append(found.valid)
-        moved.append(np.hypot(*nozzle.offset_px) > loop.tip_tolerance_px and nozzle.correlation >= LIKENESS and nozzle.advantage >= ADVANTAGE)
+        moved.append(
+            np.hypot(*nozzle.offset_px) > loop.tip_tolerance_px
+            and nozzle.correlation >= LIKENESS
+            and nozzle.advantage >= ADVANTAGE
+        )
         if (i, decision) in draw:
-            one = key_area.find(frames[0], tip, least_score=loop.least_score, direction_deg=segment.direction_deg)
+            one = key_area.find(
+                frames[0], tip, least_score=loop.least_score, direction_deg=segment.direction_deg
+            )
             pictures[i, decision] = key_area.drawn(frames[0], tip, one)
     return _Seen(np.stack(images), np.stack(valid), np.array(moved), pictures)
 
 
 def settled_since(episodes: Episodes) -> np.ndarray:
-    """The decision (E,) from which each episode is inside 90-110 % and 210 +- 5 °C, by the true flow, to its end; D + 1 where it ends outside."""
-    inside = (np.abs(episodes.flow - 100.0) <= 10.0 + 1e-3) & (np.abs(episodes.temperature - 210.0) <= 5.0 + 1e-3)
+    """The decision (E,) from which each episode is inside 90-110 % and 210 +- 5 °C, by the true flow, to its
+    end; D + 1 where it ends outside."""
+    inside = (np.abs(episodes.flow - 100.0) <= 10.0 + 1e-3) & (
+        np.abs(episodes.temperature - 210.0) <= 5.0 + 1e-3
+    )
     out = ~inside[:, ::-1]
     return np.where(out.any(axis=1), inside.shape[1] - out.argmax(axis=1), 0)

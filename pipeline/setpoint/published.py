@@ -1,12 +1,20 @@
-"""The values of Li and Pattinson 2025: the goal, the shaping of its reward, the moves and the simulator. Plain numbers, so that a page can name them without a simulator."""
+"""The values of Li and Pattinson 2025: the goal, the shaping of its reward, the moves and the simulator.
+Plain numbers, so that a page can name them without a simulator."""
 
 import math
 
 BEST_FLOW, BEST_TEMPERATURE = 100.0, 210.0  # q* in percent of nominal, u* in °C: PLA, as printed
 ROTATION = math.pi * 70 / 180  # theta of table 2
-PHASES = ((40.0, 20.0), (40.0, 10.0), (20.0, 10.0))  # semi-axes (a, b) of the three phases of shaping; the fourth keeps the last
+PHASES = (
+    (40.0, 20.0),
+    (40.0, 10.0),
+    (20.0, 10.0),
+)  # semi-axes (a, b) of the three phases of shaping; the fourth keeps the last
 
-FLOW_MOVES, TEMPERATURE_MOVES = (-10.0, -5.0, 0.0, 5.0, 10.0), (-20.0, -10.0, 0.0, 10.0, 20.0)  # (5), percent and °C
+FLOW_MOVES, TEMPERATURE_MOVES = (
+    (-10.0, -5.0, 0.0, 5.0, 10.0),
+    (-20.0, -10.0, 0.0, 10.0, 20.0),
+)  # (5), percent and °C
 LAMBDA = 10  # flow actions to one temperature action (table 2)
 DELTA = 5.0  # of (6), in steps; the paper prints no value
 ALPHA, SIGMA = 1.5, 0.15  # of (7); the paper prints no values

@@ -1,7 +1,10 @@
-"""Windows recorded from a trained classifier as a source for the simulator: whole windows are drawn again, so errors sit, stick and mislead as the classifier's do.
+"""Windows recorded from a trained classifier as a source for the simulator: whole windows are drawn again, so
+errors sit, stick and mislead as the classifier's do.
 
-Given a true flow, a segment of its flow bin is taken, and of that segment any window. Conditions persist: within a bin the segments are ranked by how much they look
-over-extruded (mean p_2 - p_0), and an episode keeps its rank for a while, also when the flow moves to another bin, so that what looks thin here looks thin there.
+Given a true flow, a segment of its flow bin is taken, and of that segment any window.
+Conditions persist: within a bin the segments are ranked by how much they look over-extruded
+(mean p_2 - p_0), and an episode keeps its rank for a while, also when the flow moves to another
+bin, so that what looks thin here looks thin there.
 """
 
 from typing import NamedTuple
@@ -14,10 +17,12 @@ from pipeline.setpoint.simulator import Conditions, Windows
 
 
 class WindowTable(NamedTuple):
-    """n windows of a classifier: shares p (n, 3) of under, good, over, sum 1; named class (n,) 0, 1, 2; flow_bin (n,) 0 .. bins - 1; segment (n,) any integers.
+    """n windows of a classifier: shares p (n, 3) of under, good, over, sum 1; named class (n,) 0, 1, 2;
+    flow_bin (n,) 0 .. bins - 1; segment (n,) any integers.
 
-    flow_edges (bins + 1,) in percent, rising; flows outside take the outermost bin. Every bin needs a window; a segment may occur in one bin or in many.
-    Bins of 2.5 % from 70 to 130 % and wider ones beyond let a controller find 100 % within the good class.
+    flow_edges (bins + 1,) in percent, rising; flows outside take the outermost bin. Every bin needs a window;
+    a segment may occur in one bin or in many. Bins of 2.5 % from 70 to 130 % and wider ones beyond let a
+    controller find 100 % within the good class.
     """
 
     shares: np.ndarray
@@ -28,7 +33,8 @@ class WindowTable(NamedTuple):
 
 
 class _Ranked(NamedTuple):
-    """Windows sorted by bin, then by the rank of their segment: segments of bin b are first_segment[b] + 0 .. segments[b] - 1, their windows likewise."""
+    """Windows sorted by bin, then by the rank of their segment: segments of bin b are first_segment[b] + 0 ..
+    segments[b] - 1, their windows likewise."""
 
     shares: jax.Array
     named: jax.Array
@@ -73,14 +79,23 @@ def _recorded_draw(ranked: _Ranked, conditions: Conditions, flow, segment, u) ->
 
 def _check(table: WindowTable) -> None:
     shares, n, bins = np.asarray(table.shares), len(table.shares), len(table.flow_edges) - 1
-    if shares.shape != (n, 3) or not all(len(column) == n for column in (table.named, table.flow_bin, table.segment)):
+    if shares.shape != (n, 3) or not all(
+        len(column) == n for column in (table.named, table.flow_bin, table.segment)
+    ):
         raise ValueError(
-            f"recorded windows: expected shares (n, 3) and as many classes, flow bins and segments, found {shares.shape}, "
+            "recorded windows: expected shares (n, 3) and as many classes, flow bins and segments, "
+            f"found {shares.shape}, "
             f"{len(table.named)}, {len(table.flow_bin)}, {len(table.segment)}; record them in one go"
         )
-    if n == 0 or not np.isfinite(shares).all() or (shares < 0).any() or np.abs(shares.sum(axis=1) - 1).max() > 1e-3:
+    if (
+        n == 0
+        or not np.isfinite(shares).all()
+        or (shares < 0).any()
+        or np.abs(shares.sum(axis=1) - 1).max() > 1e-3
+    ):
         raise ValueError(
-            "recorded windows: expected shares from 0 to 1 with sum 1, found others; normalise each window's shares over its classes"
+            "recorded windows: expected shares from 0 to 1 with sum 1, found others; "
+            "normalise each window's shares over its classes"
         )
     if (np.diff(table.flow_edges) <= 0).any():
         raise ValueError("recorded windows: expected rising flow edges, found some that fall; sort the bins")
@@ -88,9 +103,11 @@ def _check(table: WindowTable) -> None:
     if len(empty):
         low, high = table.flow_edges[empty[0]], table.flow_edges[empty[0] + 1]
         raise ValueError(
-            f"recorded windows: no window for flows from {low:g} to {high:g} % ({len(empty)} empty bins); record them, or widen the bins"
+            f"recorded windows: no window for flows from {low:g} to {high:g} % ({len(empty)} empty bins); "
+            "record them, or widen the bins"
         )
     if np.min(table.flow_bin) < 0 or np.max(table.flow_bin) >= bins:
         raise ValueError(
-            f"recorded windows: expected flow bins 0 to {bins - 1}, found {np.min(table.flow_bin)} to {np.max(table.flow_bin)}"
+            f"recorded windows: expected flow bins 0 to {bins - 1}, "
+            f"found {np.min(table.flow_bin)} to {np.max(table.flow_bin)}"
         )

@@ -7,7 +7,8 @@ from pipeline.setpoint.published import BEST_FLOW, BEST_TEMPERATURE, ROTATION
 
 
 def reward(flow: jax.Array, temperature: jax.Array, *, a: float, b: float) -> jax.Array:
-    """r = 2 / (1 + sqrt(q_r^2 / a^2 + u_r^2 / b^2)) - 1 in (-1, 1], 1 at (q*, u*) = (100 %, 210 °C); flow in percent, temperature in °C, any one shape.
+    """r = 2 / (1 + sqrt(q_r^2 / a^2 + u_r^2 / b^2)) - 1 in (-1, 1], 1 at (q*, u*) = (100 %, 210 °C); flow in
+    percent, temperature in °C, any one shape.
 
     q_r = (q - q*) cos theta - (u - u*) sin theta,   u_r = (q - q*) sin theta + (u - u*) cos theta
     """

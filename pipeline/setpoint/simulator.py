@@ -1,11 +1,15 @@
-"""The printer as a controller of setpoints meets it: the paper's simulator (Li and Pattinson 2025, eqs. 5-9), disturbances in mid-episode, and rollouts.
+"""The printer as a controller of setpoints meets it: the paper's simulator (Li and Pattinson 2025, eqs. 5-9),
+disturbances in mid-episode, and rollouts.
 
-One decision is one window of frames. At step t the controller sees an `Observation` and answers with an `Action`; then
+One decision is one window of frames. At step t the controller sees an
+`Observation` and answers with an `Action`; then
 
-    q_bar <- clip(q_bar + gain a_q, 20, 310),   q = blockage q_bar,   u_bar <- clip(u_bar + a_u, 180, 240) where t mod lambda = 0,   u_hat += (u_bar - u_hat) / delta
+q_bar <- clip(q_bar + gain a_q, 20, 310), q = blockage q_bar, u_bar <- clip(u_bar + a_u, 180, 240) where t mod
+lambda = 0, u_hat += (u_bar - u_hat) / delta
 
-The commanded flow acts at once, and the class depends on the true flow q alone. What a window shows for a flow comes from a `Windows`: `paper_windows()` here, or
-windows recorded from a trained classifier (`recorded.recorded_windows`). Flow is in percent of nominal, temperature in °C.
+The commanded flow acts at once, and the class depends on the true flow q alone. What a window shows for a
+flow comes from a `Windows`: `paper_windows()` here, or windows recorded from a trained classifier
+(`recorded.recorded_windows`). Flow is in percent of nominal, temperature in °C.
 """
 
 from collections.abc import Callable
@@ -26,10 +30,12 @@ CHANCES = 7  # uniform numbers that a decision takes: three for its window, four
 
 
 class Observation(NamedTuple):
-    """What the machine shows at a decision. The true flow is not among it, nor a setpoint that would give it away: only moves of the flow setpoint mean something.
+    """What the machine shows at a decision. The true flow is not among it, nor a setpoint that would give it
+    away: only moves of the flow setpoint mean something.
 
-    shares (3,) of under, good, over in the window, sum 1; named is the window's class 0, 1, 2; flow_move (percent) is how far the flow setpoint moved since the
-    controller's last observation, as executed after limits (0 after a hold); temperature u_hat and target u_bar in °C; step t counts decisions, held ones too.
+    shares (3,) of under, good, over in the window, sum 1; named is the window's class 0, 1, 2; flow_move
+    (percent) is how far the flow setpoint moved since the controller's last observation, as executed after
+    limits (0 after a hold); temperature u_hat and target u_bar in °C; step t counts decisions, held ones too.
     """
 
     shares: jax.Array
@@ -41,14 +47,16 @@ class Observation(NamedTuple):
 
 
 class Action(NamedTuple):
-    """Indices 0..4 into FLOW_MOVES and TEMPERATURE_MOVES; the temperature's counts only where step mod LAMBDA = 0."""
+    """Indices 0..4 into FLOW_MOVES and TEMPERATURE_MOVES; the
+    temperature's counts only where step mod LAMBDA = 0."""
 
     flow: jax.Array
     temperature: jax.Array
 
 
 class Controller(NamedTuple):
-    """start() -> memory;  act(parameters, memory, observation, key) -> (memory, action). Both pure, for one episode: vmap over episodes, scan over steps."""
+    """start() -> memory; act(parameters, memory, observation, key) -> (memory, action). Both pure, for one
+    episode: vmap over episodes, scan over steps."""
 
     start: Callable[[], Any]
     act: Callable[[Any, Any, Observation, jax.Array], tuple[Any, Action]]
@@ -57,8 +65,9 @@ class Controller(NamedTuple):
 class Conditions(NamedTuple):
     """One episode's start and machine: scalars, or arrays (n,) with one entry an episode.
 
-    flow (percent) and temperature (°C) at the start; accuracy rho of the paper's windows; persistence: decisions that a recorded segment lasts on average, 1 is fresh;
-    gain: true move by commanded move; clog: factor on the flow from clog_step on, 1 is none; drift: relative change of the flow at each step;
+    flow (percent) and temperature (°C) at the start; accuracy rho of the paper's windows; persistence:
+    decisions that a recorded segment lasts on average, 1 is fresh; gain: true move by commanded move; clog:
+    factor on the flow from clog_step on, 1 is none; drift: relative change of the flow at each step;
     jump_rate: probability a step that the flow is multiplied by exp(jump_size N(0, 1)).
     """
 
@@ -75,7 +84,8 @@ class Conditions(NamedTuple):
 
 
 class State(NamedTuple):
-    """flow_bar: q_bar that the moves reach, before blockage; flow: the true q; segment in [0, 1): the recorded conditions that persist, as a rank among segments."""
+    """flow_bar: q_bar that the moves reach, before blockage; flow: the true q; segment in [0, 1): the
+    recorded conditions that persist, as a rank among segments."""
 
     flow_bar: jax.Array
     blockage: jax.Array
@@ -88,14 +98,16 @@ class State(NamedTuple):
 
 
 class Windows(NamedTuple):
-    """draw(table, conditions, flow, segment, u) -> shares (3,), named: a window at the true flow, from uniform numbers u (3,) and the arrays of `table`."""
+    """draw(table, conditions, flow, segment, u) -> shares (3,), named: a window at the true flow, from
+    uniform numbers u (3,) and the arrays of `table`."""
 
     draw: Callable[[Any, Conditions, jax.Array, jax.Array, jax.Array], tuple[jax.Array, jax.Array]]
     table: Any = ()
 
 
 class Trajectory(NamedTuple):
-    """n episodes of T decisions: true flow, temperature and target (n, T + 1) with the start first; named (n, T), shares (n, T, 3) and action (n, T) of each decision."""
+    """n episodes of T decisions: true flow, temperature and target (n, T + 1) with the start first; named (n,
+    T), shares (n, T, 3) and action (n, T) of each decision."""
 
     flow: jax.Array
     temperature: jax.Array
@@ -111,14 +123,18 @@ def flow_class(flow: jax.Array) -> jax.Array:
 
 
 def nominal(flow, temperature, *, accuracy: float) -> Conditions:
-    """Conditions of a machine that does as it is told, from starts flow (n,) and temperature (n,); `_replace` what an episode is to meet."""
+    """Conditions of a machine that does as it is told, from starts flow (n,) and
+    temperature (n,); `_replace` what an episode is to meet."""
     flow = jnp.asarray(flow, float)
     one, zero = jnp.ones_like(flow), jnp.zeros_like(flow)
-    return Conditions(flow, jnp.asarray(temperature, float) * one, accuracy * one, one, one, one, zero, zero, zero, zero)
+    return Conditions(
+        flow, jnp.asarray(temperature, float) * one, accuracy * one, one, one, one, zero, zero, zero, zero
+    )
 
 
 def paper_windows() -> Windows:
-    """(7): the class is right with probability rho, else one of the others; p_i = clip(exp(-alpha |i - x0|) + N(0, sigma^2), 0, 1) for i != x0, 1 at x0; over their sum."""
+    """(7): the class is right with probability rho, else one of the others; p_i = clip(exp(-alpha |i - x0|) +
+    N(0, sigma^2), 0, 1) for i != x0, 1 at x0; over their sum."""
     return Windows(_paper_draw)
 
 
@@ -128,7 +144,9 @@ def _paper_draw(table, conditions: Conditions, flow, segment, u) -> tuple[jax.Ar
     x0 = jnp.where(wrong, (flow_class(flow) + shift) % CLASSES, flow_class(flow))
     distance = jnp.abs(jnp.arange(CLASSES) - x0)
     z = _normal(u[1:])
-    noise = SIGMA * jnp.stack([z[0], jnp.where(x0 == 0, z[0], z[1]), z[1]])  # two numbers serve, as x0 itself takes none
+    noise = SIGMA * jnp.stack(
+        [z[0], jnp.where(x0 == 0, z[0], z[1]), z[1]]
+    )  # two numbers serve, as x0 itself takes none
     p = jnp.where(distance == 0, 1.0, jnp.clip(jnp.exp(-ALPHA * distance) + noise, 0.0, 1.0))
     return p / p.sum(), x0
 
@@ -144,14 +162,22 @@ def begin(windows: Windows, conditions: Conditions, key: jax.Array) -> tuple[Sta
 
 
 def _begun(windows: Windows, conditions: Conditions, u: jax.Array) -> tuple[State, Observation]:
-    flow, temperature = jnp.clip(conditions.flow, *FLOW_LIMITS), jnp.clip(conditions.temperature, *TEMPERATURE_LIMITS)
+    flow, temperature = (
+        jnp.clip(conditions.flow, *FLOW_LIMITS),
+        jnp.clip(conditions.temperature, *TEMPERATURE_LIMITS),
+    )
     zero = jnp.zeros_like(flow)
-    state = State(flow, zero + 1.0, flow, zero, temperature, temperature, u[6], jnp.zeros_like(flow, jnp.int32))
+    state = State(
+        flow, zero + 1.0, flow, zero, temperature, temperature, u[6], jnp.zeros_like(flow, jnp.int32)
+    )
     return state, _observe(windows, conditions, state, u[:3])
 
 
-def stepped(windows: Windows, conditions: Conditions, state: State, action: Action, u: jax.Array) -> tuple[State, Observation]:
-    """One decision of one episode: the action, the lags, whatever befalls the machine, and the next window. The reward is `reward(state.flow, state.temperature, ...)`.
+def stepped(
+    windows: Windows, conditions: Conditions, state: State, action: Action, u: jax.Array
+) -> tuple[State, Observation]:
+    """One decision of one episode: the action, the lags, whatever befalls the machine, and the next window.
+    The reward is `reward(state.flow, state.temperature, ...)`.
 
     u (CHANCES,) are the chances, uniform in [0, 1), which the caller draws for many at once.
     """
@@ -160,7 +186,12 @@ def stepped(windows: Windows, conditions: Conditions, state: State, action: Acti
     target = jnp.clip(state.target + asked, *TEMPERATURE_LIMITS)
     t = state.step + 1
     jump = jnp.where(u[3] < conditions.jump_rate, conditions.jump_size * _normal(u[4]), 0.0)
-    blockage = state.blockage * jnp.where(t == conditions.clog_step, conditions.clog, 1.0) * (1.0 + conditions.drift) * jnp.exp(jump)
+    blockage = (
+        state.blockage
+        * jnp.where(t == conditions.clog_step, conditions.clog, 1.0)
+        * (1.0 + conditions.drift)
+        * jnp.exp(jump)
+    )
     blockage = jnp.clip(blockage, *BLOCKAGE_LIMITS)
     state = State(
         flow_bar=flow_bar,
@@ -191,36 +222,73 @@ def remembered(history: jax.Array, named: jax.Array) -> jax.Array:
 
 
 def paper_state(history: jax.Array, observation: Observation) -> jax.Array:
-    """The state (35,) of (9): 30 former classes by n_c, oldest first, p_hat with its largest at 1, u_hat, u_bar (°C)."""
+    """The state (35,) of (9): 30 former classes by n_c, oldest first,
+    p_hat with its largest at 1, u_hat, u_bar (°C)."""
     p_hat = observation.shares / observation.shares.max()
     return jnp.concatenate([history, p_hat, jnp.stack([observation.temperature, observation.target])])
 
 
-def rollout(controller: Controller, parameters: Any, windows: Windows, conditions: Conditions, key: jax.Array, *, steps: int) -> Trajectory:
-    """Every episode of `conditions` (n,) for `steps` decisions: one compiled program, the same key the same bytes."""
+def rollout(
+    controller: Controller,
+    parameters: Any,
+    windows: Windows,
+    conditions: Conditions,
+    key: jax.Array,
+    *,
+    steps: int,
+) -> Trajectory:
+    """Every episode of `conditions` (n,) for `steps` decisions: one
+    compiled program, the same key the same bytes."""
     n = conditions.flow.shape[0]
     own, world = jax.random.split(key)  # the controller's chance is not the world's
     # chance is drawn outside of the program, as its generator takes longer to compile than the rest
     return _rolled(
-        controller, parameters, windows, conditions, jax.random.split(own, n), jax.random.uniform(world, (steps + 1, n, CHANCES))
+        controller,
+        parameters,
+        windows,
+        conditions,
+        jax.random.split(own, n),
+        jax.random.uniform(world, (steps + 1, n, CHANCES)),
     )
 
 
 @eqx.filter_jit
-def _rolled(controller: Controller, parameters: Any, windows: Windows, conditions: Conditions, keys: jax.Array, u: jax.Array) -> Trajectory:
+def _rolled(
+    controller: Controller,
+    parameters: Any,
+    windows: Windows,
+    conditions: Conditions,
+    keys: jax.Array,
+    u: jax.Array,
+) -> Trajectory:
     def decide(carry, chance):
         state, observation, memory = carry
         u, t = chance
         now = jax.vmap(jax.random.fold_in, (0, None))(keys, t)
         memory, action = jax.vmap(controller.act, (None, 0, 0, 0))(parameters, memory, observation, now)
         after, seen = jax.vmap(stepped, (None, 0, 0, 0, 0))(windows, conditions, state, action, u)
-        return (after, seen, memory), (after.flow, after.temperature, after.target, observation.named, observation.shares, action)
+        return (after, seen, memory), (
+            after.flow,
+            after.temperature,
+            after.target,
+            observation.named,
+            observation.shares,
+            action,
+        )
 
     state, observation = jax.vmap(_begun, (None, 0, 0))(windows, conditions, u[0])
-    memory = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(keys), *jnp.shape(leaf))), controller.start())
-    _, (flow, temperature, target, *per_decision) = jax.lax.scan(decide, (state, observation, memory), (u[1:], jnp.arange(len(u) - 1)))
+    memory = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(leaf, (len(keys), *jnp.shape(leaf))), controller.start()
+    )
+    _, (flow, temperature, target, *per_decision) = jax.lax.scan(
+        decide, (state, observation, memory), (u[1:], jnp.arange(len(u) - 1))
+    )
     flow, temperature, target = (
         jnp.concatenate([first[None], then])
-        for first, then in zip((state.flow, state.temperature, state.target), (flow, temperature, target), strict=True)
+        for first, then in zip(
+            (state.flow, state.temperature, state.target), (flow, temperature, target), strict=True
+        )
     )
-    return Trajectory(*jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), (flow, temperature, target, *per_decision)))
+    return Trajectory(
+        *jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), (flow, temperature, target, *per_decision))
+    )

@@ -1,6 +1,8 @@
-"""The networks that look at key areas: the paper's vision transformer and head (Li and Pattinson 2025, figure 5a), a small one, and a small CNN as yardstick.
+"""The networks that look at key areas: the paper's vision transformer and head (Li and Pattinson 2025, figure
+5a), a small one, and a small CNN as yardstick.
 
-Written on whole batches: every layer is one matrix product over (images x tokens). Weights are float32 and leave as named arrays.
+Written on whole batches: every layer is one matrix product over (images x
+tokens). Weights are float32 and leave as named arrays.
 """
 
 from typing import NamedTuple
@@ -13,11 +15,15 @@ from jaxtyping import Array, Float
 
 ROWS, COLUMNS = 16, 48  # of a key area: rows across the bead, columns along it from the tip outward
 CLASSES = 3  # flow below 90 %, 90 to 110 %, above
-CENTRE_DEGC, SPREAD_DEGC = 210.0, 20.0  # a nozzle temperature enters as (T - 210) / 20: the paper's five lie in -1 .. 1
+CENTRE_DEGC, SPREAD_DEGC = (
+    210.0,
+    20.0,
+)  # a nozzle temperature enters as (T - 210) / 20: the paper's five lie in -1 .. 1
 
 
 class Size(NamedTuple):
-    """Patch (rows, columns) in px, token width, layers, heads, feed-forward width; `image_features` and `temperature_features` are what the head concatenates."""
+    """Patch (rows, columns) in px, token width, layers, heads, feed-forward width; `image_features` and
+    `temperature_features` are what the head concatenates."""
 
     patch: tuple[int, int]
     width: int
@@ -29,7 +35,9 @@ class Size(NamedTuple):
 
 
 PAPER = Size((4, 4), 256, 3, 8, 2048, 128, 16)  # 3,962,880 + 33,363 parameters
-SMALL = Size((16, 4), 64, 2, 4, 128, 64, 16)  # 72,128 + 4,435: each token is the whole profile of 4 px of the line, and a fifth of the work
+SMALL = Size(
+    (16, 4), 64, 2, 4, 128, 64, 16
+)  # 72,128 + 4,435: each token is the whole profile of 4 px of the line, and a fifth of the work
 
 
 class Dense(eqx.Module):
@@ -58,7 +66,9 @@ class Norm(eqx.Module):
 
     def __call__(self, x: Float[Array, "*n width"]) -> Float[Array, "*n width"]:
         centred = x - x.mean(-1, keepdims=True)
-        return centred * jax.lax.rsqrt(jnp.mean(centred**2, -1, keepdims=True) + 1e-5) * self.scale + self.shift
+        return (
+            centred * jax.lax.rsqrt(jnp.mean(centred**2, -1, keepdims=True) + 1e-5) * self.scale + self.shift
+        )
 
 
 class Block(eqx.Module):
@@ -79,7 +89,8 @@ class Block(eqx.Module):
         self.expand, self.contract = Dense(d, size.feed_forward, rng), Dense(size.feed_forward, d, rng)
 
     def __call__(self, x: Float[Array, "n tokens width"], wanted: int) -> Float[Array, "n wanted width"]:
-        """The first `wanted` tokens after the layer: of the last one the class token alone is read, and the others are not worked out."""
+        """The first `wanted` tokens after the layer: of the last one the class token
+        alone is read, and the others are not worked out."""
         n, tokens, d = x.shape
         seen, W, b = self.norm_1(x), self.queries_keys_values.W, self.queries_keys_values.b
         q = (seen[:, :wanted] @ W[:, :d] + b[:d]).reshape(n, wanted, self.heads, d // self.heads)
@@ -103,7 +114,8 @@ class VisionTransformer(eqx.Module):
     def __init__(self, size: Size, rng: np.random.Generator):
         if ROWS % size.patch[0] or COLUMNS % size.patch[1]:
             raise ValueError(
-                f"a patch of {size.patch[0]} x {size.patch[1]} px does not tile the key area of {ROWS} x {COLUMNS}; choose divisors of both"
+                f"a patch of {size.patch[0]} x {size.patch[1]} px does not tile the key area of {ROWS} x "
+                f"{COLUMNS}; choose divisors of both"
             )
         pixels = size.patch[0] * size.patch[1]
         self.patches = Dense(pixels, size.width, rng)
@@ -114,36 +126,52 @@ class VisionTransformer(eqx.Module):
 
     def __call__(self, x: Float[Array, "n 16 48"]) -> Float[Array, "n width"]:
         (rows, columns), n = self.patch, len(x)
-        tiles = x.reshape(n, ROWS // rows, rows, COLUMNS // columns, columns).swapaxes(2, 3).reshape(n, -1, rows * columns)
+        tiles = (
+            x.reshape(n, ROWS // rows, rows, COLUMNS // columns, columns)
+            .swapaxes(2, 3)
+            .reshape(n, -1, rows * columns)
+        )
         tokens = self.patches(tiles)
-        tokens = jnp.concatenate([jnp.broadcast_to(self.class_token, (n, 1, tokens.shape[-1])), tokens], axis=1) + self.positions
+        tokens = (
+            jnp.concatenate([jnp.broadcast_to(self.class_token, (n, 1, tokens.shape[-1])), tokens], axis=1)
+            + self.positions
+        )
         for block in self.blocks[:-1]:
             tokens = block(tokens, tokens.shape[1])
         return self.norm(self.blocks[-1](tokens, 1)[:, 0])
 
 
 class ConvolutionalNetwork(eqx.Module):
-    """Three 3 x 3 convolutions with pooling, then the mean over the area: 50 k parameters with the head; the yardstick."""
+    """Three 3 x 3 convolutions with pooling, then the mean over the
+    area: 50 k parameters with the head; the yardstick."""
 
     kernels: list[Float[Array, "3 3 inputs outputs"]]
     biases: list[Float[Array, " outputs"]]
 
     def __init__(self, rng: np.random.Generator):
         pairs = ((1, 24), (24, 48), (48, 84))
-        self.kernels = [_float32(rng.standard_normal((3, 3, a, b)) * np.sqrt(2 / (9 * a))) for a, b in pairs]  # He et al. 2015
+        self.kernels = [
+            _float32(rng.standard_normal((3, 3, a, b)) * np.sqrt(2 / (9 * a))) for a, b in pairs
+        ]  # He et al. 2015
         self.biases = [_float32(np.zeros(b)) for _, b in pairs]
 
     def __call__(self, x: Float[Array, "n 16 48"]) -> Float[Array, "n width"]:
         x = x[..., None]
         for i, (kernel, bias) in enumerate(zip(self.kernels, self.biases, strict=True)):
-            x = jax.nn.relu(jax.lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")) + bias)
+            x = jax.nn.relu(
+                jax.lax.conv_general_dilated(
+                    x, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
+                )
+                + bias
+            )
             if i < len(self.kernels) - 1:
                 x = x.reshape(len(x), x.shape[1] // 2, 2, x.shape[2] // 2, 2, x.shape[3]).max(axis=(2, 4))
         return x.mean(axis=(1, 2))
 
 
 class Head(eqx.Module):
-    """relu of the image's and of the temperature's layer, concatenated, then one layer to the classes: 33,363 parameters at the paper's size."""
+    """relu of the image's and of the temperature's layer, concatenated, then one layer to the
+    classes: 33,363 parameters at the paper's size."""
 
     image: Dense
     temperature: Dense
@@ -161,12 +189,17 @@ class Classifier(eqx.Module):
     head: Head
 
     def features(self, key_area: Array, temperature_degC: Array) -> Float[Array, "n features"]:
-        """What the last layer sees: image features, then temperature features. Each key area is scaled to mean 0 and deviation 1, so that lighting does not matter."""
+        """What the last layer sees: image features, then temperature features. Each key area is scaled to
+        mean 0 and deviation 1, so that lighting does not matter."""
         x = key_area.astype(jnp.float32)
         x = x - x.mean(axis=(1, 2), keepdims=True)
-        x = x / (jnp.sqrt(jnp.mean(x**2, axis=(1, 2), keepdims=True)) + 1.0)  # + 1 gray level: a flat area stays flat
+        x = x / (
+            jnp.sqrt(jnp.mean(x**2, axis=(1, 2), keepdims=True)) + 1.0
+        )  # + 1 gray level: a flat area stays flat
         u = (temperature_degC.astype(jnp.float32)[:, None] - CENTRE_DEGC) / SPREAD_DEGC
-        return jnp.concatenate([jax.nn.relu(self.head.image(self.body(x))), jax.nn.relu(self.head.temperature(u))], axis=-1)
+        return jnp.concatenate(
+            [jax.nn.relu(self.head.image(self.body(x))), jax.nn.relu(self.head.temperature(u))], axis=-1
+        )
 
     def __call__(self, key_area: Array, temperature_degC: Array) -> Float[Array, "n 3"]:
         return self.head.classes(self.features(key_area, temperature_degC))
@@ -174,7 +207,9 @@ class Classifier(eqx.Module):
 
 def vision_transformer(size: Size, rng: np.random.Generator) -> Classifier:
     """A classifier with random weights: PAPER, SMALL, or a size of one's own."""
-    return Classifier(VisionTransformer(size, rng), Head(size.width, size.image_features, size.temperature_features, rng))
+    return Classifier(
+        VisionTransformer(size, rng), Head(size.width, size.image_features, size.temperature_features, rng)
+    )
 
 
 def convolutional(rng: np.random.Generator) -> Classifier:
@@ -188,23 +223,29 @@ def parameters(tree) -> int:
 
 
 def named_arrays(tree) -> dict[str, np.ndarray]:
-    """Every array of a network or of a training state by its path, e.g. "body.blocks.0.expand.W"; numbers as arrays of shape ()."""
+    """Every array of a network or of a training state by its path, e.g.
+    "body.blocks.0.expand.W"; numbers as arrays of shape ()."""
     paths = jax.tree_util.tree_flatten_with_path(eqx.filter(tree, eqx.is_array_like))[0]
     return {_name(path): np.asarray(leaf) for path, leaf in paths}
 
 
 def from_named_arrays(like, arrays: dict[str, np.ndarray]):
-    """`like` with its arrays replaced by those of the same names; raises ValueError where names or shapes are those of another architecture."""
+    """`like` with its arrays replaced by those of the same names; raises ValueError where
+    names or shapes are those of another architecture."""
     paths, structure = jax.tree_util.tree_flatten_with_path(like)
     names = {_name(path): np.shape(leaf) for path, leaf in paths if eqx.is_array_like(leaf)}
     for name in sorted(names.keys() | arrays.keys()):
         expected, found = names.get(name), np.shape(arrays[name]) if name in arrays else None
         if expected != found:
             raise ValueError(
-                f"weights of another architecture: {name} is expected {_shape(expected)} but found {_shape(found)}; "
+                f"weights of another architecture: {name} is expected {_shape(expected)} but "
+                f"found {_shape(found)}; "
                 "load them into the size that they were trained with, or train again"
             )
-    leaves = [jnp.asarray(arrays[_name(path)], jnp.asarray(leaf).dtype) if eqx.is_array_like(leaf) else leaf for path, leaf in paths]
+    leaves = [
+        jnp.asarray(arrays[_name(path)], jnp.asarray(leaf).dtype) if eqx.is_array_like(leaf) else leaf
+        for path, leaf in paths
+    ]
     return jax.tree_util.tree_unflatten(structure, leaves)
 
 

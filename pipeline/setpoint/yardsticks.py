@@ -1,4 +1,5 @@
-"""What a network must beat: the bead's width by Otsu's threshold with two limits, and the bead's profile in a support vector machine."""
+"""What a network must beat: the bead's width by Otsu's threshold with two limits, and
+the bead's profile in a support vector machine."""
 
 from typing import NamedTuple
 
@@ -19,23 +20,32 @@ class WidthRule(NamedTuple):
 
 
 class ProfileMachine(NamedTuple):
-    """A support vector machine on profiles, and the logistic map from its three decision values to probabilities."""
+    """A support vector machine on profiles, and the logistic map from
+    its three decision values to probabilities."""
 
     machine: Pipeline
     probability: LogisticRegression
 
 
 def widths(images: np.ndarray) -> np.ndarray:
-    """(n,) width of the bead in each key area (n, 16, 48): mean over its columns of the rows above Otsu's threshold, in rows."""
-    return np.array([np.mean(image >= cv2.threshold(image, 0, 255, cv2.THRESH_OTSU)[0]) * image.shape[0] for image in images])
+    """(n,) width of the bead in each key area (n, 16, 48): mean over its
+    columns of the rows above Otsu's threshold, in rows."""
+    return np.array(
+        [
+            np.mean(image >= cv2.threshold(image, 0, 255, cv2.THRESH_OTSU)[0]) * image.shape[0]
+            for image in images
+        ]
+    )
 
 
 def fit_width_rule(images: np.ndarray, label: np.ndarray) -> WidthRule:
-    """The two limits with the most right answers on key areas (n, 16, 48) with labels (n,) 0 1 2; exact, over every pair of widths that occur."""
+    """The two limits with the most right answers on key areas (n, 16, 48) with labels (n,) 0 1 2; exact, over
+    every pair of widths that occur."""
     width = widths(images)
     order = np.argsort(width, kind="stable")
     w, y = width[order], np.asarray(label)[order]
-    # right answers if the first i are class 0, the first j classes 0 and 1: gains of moving a limit past one more image
+    # right answers if the first i are class 0, the first j classes 0
+    # and 1: gains of moving a limit past one more image
     first = np.concatenate([[0], np.cumsum((y == 0).astype(int) - (y == 1))])
     second = np.concatenate([[0], np.cumsum((y == 1).astype(int) - (y == 2))])
     edges = np.concatenate([[-np.inf], (w[1:] + w[:-1]) / 2, [np.inf]])
@@ -61,10 +71,13 @@ def profiles(images: np.ndarray, temperature: np.ndarray) -> np.ndarray:
 def fit_profile_machine(
     images: np.ndarray, temperature: np.ndarray, label: np.ndarray, segment: np.ndarray, *, folds: int = 3
 ) -> ProfileMachine:
-    """The machine (Gaussian kernel, C = 1) on all images, its probabilities from decision values of folds whose segments it had not seen."""
+    """The machine (Gaussian kernel, C = 1) on all images, its probabilities from decision
+    values of folds whose segments it had not seen."""
     x = profiles(images, temperature)
     machine = make_pipeline(StandardScaler(), SVC(decision_function_shape="ovr"))
-    unseen = cross_val_predict(machine, x, label, groups=segment, cv=StratifiedGroupKFold(folds), method="decision_function")
+    unseen = cross_val_predict(
+        machine, x, label, groups=segment, cv=StratifiedGroupKFold(folds), method="decision_function"
+    )
     return ProfileMachine(machine.fit(x, label), LogisticRegression(max_iter=1000).fit(unseen, label))
 
 

@@ -1,4 +1,5 @@
-"""Rows of text and numbers out of a CSV file of somebody else's: what the readers of records and of lists of images share."""
+"""Rows of text and numbers out of a CSV file of somebody else's: what the
+readers of records and of lists of images share."""
 
 import csv
 import itertools
@@ -13,10 +14,14 @@ from pipeline.reading.signals import Note
 
 COMMENT = ("#", "%", "//")
 LOOKED_AT = 1 << 16
-_NUMBER = {decimal: re.compile(rf"\s*[+-]?(\d+({mark}\d*)?|{mark}\d+)([eE][+-]?\d+)?\s*$") for decimal, mark in ((".", r"\."), (",", ","))}
+_NUMBER = {
+    decimal: re.compile(rf"\s*[+-]?(\d+({mark}\d*)?|{mark}\d+)([eE][+-]?\d+)?\s*$")
+    for decimal, mark in ((".", r"\."), (",", ","))
+}
 # a number with its unit, 21.5 °C: it shows where the table is, and is refused with its line when it is read
 _QUANTITY = re.compile(r"\s*[+-]?\d[\d.,]*\s*(%|°\s?[CFK]|[a-zA-Z]{1,3}(/[a-zA-Z]{1,3})?)$")
-# text has tabs, line ends and form feeds, and at times the end mark of an old system; other control characters are of binary files
+# text has tabs, line ends and form feeds, and at times the end mark of an old
+# system; other control characters are of binary files
 _CONTROL = bytes(set(range(32)) - set(b"\t\n\r\f\x1a"))
 
 
@@ -43,7 +48,8 @@ class CsvLayout(NamedTuple):
 
 
 class Opening(NamedTuple):
-    """The first lines of a text file as fields, a remark's marks taken off; `remark` says which lines are remarks."""
+    """The first lines of a text file as fields, a remark's marks taken
+    off; `remark` says which lines are remarks."""
 
     encoding: str
     delimiter: str
@@ -54,20 +60,27 @@ class Opening(NamedTuple):
 
 
 def opening(path: Path) -> Opening:
-    """Encoding, delimiter, decimal mark and first lines of a text file. Raises ValueError where it is no text."""
+    """Encoding, delimiter, decimal mark and first lines of a text
+    file. Raises ValueError where it is no text."""
     with path.open("rb") as stream:
         # zeros behind the text are what a file system leaves after a power failure
         start = stream.read(LOOKED_AT).rstrip(b"\0")
     encoding, notes = _encoding(path, start)
     lines = start.decode(encoding, errors="replace").splitlines()[: 400 if len(start) < LOOKED_AT else -1]
     remark = [line.lstrip().startswith(COMMENT) for line in lines]
-    delimiter, decimal = _delimiter([line for line, is_remark in zip(lines, remark, strict=True) if line.strip() and not is_remark])
-    rows = [_split(line.lstrip("#% ") if is_remark else line, delimiter) for line, is_remark in zip(lines, remark, strict=True)]
+    delimiter, decimal = _delimiter(
+        [line for line, is_remark in zip(lines, remark, strict=True) if line.strip() and not is_remark]
+    )
+    rows = [
+        _split(line.lstrip("#% ") if is_remark else line, delimiter)
+        for line, is_remark in zip(lines, remark, strict=True)
+    ]
     return Opening(encoding, delimiter, decimal, rows, remark, notes)
 
 
 def list_layout(path: Path, is_header: Callable[[list[str]], bool]) -> CsvLayout:
-    """The layout of a list whose columns are known by name: its header is the first line that `is_header`, or else the first line; rows follow.
+    """The layout of a list whose columns are known by name: its header is the first line
+    that `is_header`, or else the first line; rows follow.
 
     Raises ValueError where no row follows.
     """
@@ -76,9 +89,14 @@ def list_layout(path: Path, is_header: Callable[[list[str]], bool]) -> CsvLayout
     heads = [i for i, row in enumerate(start.rows) if is_header(row)] or written
     if not heads or not any(i > heads[0] for i in written):
         found = "a header" if heads else "only blank or comment lines"
-        raise ValueError(f"{path}: line 2 on should hold rows of numbers, but the file has {found} and no data; record it again or remove it")
+        raise ValueError(
+            f"{path}: line 2 on should hold rows of numbers, but the file has {found} and no data; "
+            "record it again or remove it"
+        )
     names = [field.strip() for field in start.rows[heads[0]]]
-    return CsvLayout(start.encoding, start.delimiter, start.decimal, names, [""] * len(names), heads[0] + 1, start.notes)
+    return CsvLayout(
+        start.encoding, start.delimiter, start.decimal, names, [""] * len(names), heads[0] + 1, start.notes
+    )
 
 
 def is_number(field: str, decimal: str) -> bool:
@@ -99,19 +117,23 @@ def _encoding(path: Path, start: bytes) -> tuple[str, list[Note]]:
     control = len(start) - len(start.translate(None, _CONTROL))
     if control > len(start) // 100:
         raise ValueError(
-            f"{path}: the bytes at offset 0 ({start[:8].hex(' ')}) are neither text nor Parquet nor MCAP; convert the"
+            f"{path}: the bytes at offset 0 ({start[:8].hex(' ')}) are neither text nor Parquet "
+            "nor MCAP; convert the"
             f" recording to one of them"
         )
     try:
         # a letter of several bytes may be cut at the end of the part that was read
         start.decode("utf-8") if len(start) < LOOKED_AT else start[: start.rfind(b"\n") + 1].decode("utf-8")
     except UnicodeDecodeError as error:
-        return "cp1252", [Note("encoding", "", 1, f"byte {error.start} is not UTF-8, so the text was read as Windows-1252")]
+        return "cp1252", [
+            Note("encoding", "", 1, f"byte {error.start} is not UTF-8, so the text was read as Windows-1252")
+        ]
     return "utf-8", []
 
 
 def _delimiter(lines: Sequence[str]) -> tuple[str, str]:
-    """The delimiter and decimal mark with which most fields are numbers, and then fewest are not; the blank is tried last."""
+    """The delimiter and decimal mark with which most fields are numbers,
+    and then fewest are not; the blank is tried last."""
     best, choice = (0.0, 0.0), (",", ".")
     for delimiter, decimal in itertools.product((",", ";", "\t", "|", " "), (".", ",")):
         fields = [field for line in lines[:50] for field in _split(line, delimiter)]
@@ -126,11 +148,15 @@ def _split(line: str, delimiter: str) -> list[str]:
     if delimiter == " ":
         return line.split()
     row = next(csv.reader([line], delimiter=delimiter), [])
-    return row[:-1] if len(row) > 1 and not row[-1].strip() and line.rstrip("\r\n ").endswith(delimiter) else row
+    return (
+        row[:-1] if len(row) > 1 and not row[-1].strip() and line.rstrip("\r\n ").endswith(delimiter) else row
+    )
+
 
 # what programs write where they have no number
 MISSING = {"", "nan", "na", "n/a", "#n/a", "null", "<null>", "none", "-", "--", "---", "?", "bad", "bad input", "no data", "nodata", "error",
-           "fault", "i/o timeout", "unavailable", "unknown", "-nan(ind)", "1.#qnan", "-1.#ind", "#value!", "#ref!", "#div/0!"}  # fmt: skip
+           "fault", "i/o timeout", "unavailable", "unknown", "-nan(ind)", "1.#qnan", "-1.#ind", "#value!",
+           "#ref!", "#div/0!"}  # fmt: skip
 SWITCH = {"on": 1.0, "true": 1.0, "off": 0.0, "false": 0.0}
 # totals and remarks behind the data; more than that is no tail
 LONGEST_TAIL = 20
@@ -147,19 +173,31 @@ def rows(path: Path, layout: CsvLayout) -> Iterator[tuple[int, list[str]]]:
                 numbered = ((reader.line_num, row) for row in reader)
             for line, row in numbered:
                 start = row[0].lstrip() if row else ""
-                if line > layout.skip and not start.startswith(COMMENT) and (start or any(field.strip() for field in row)):
+                if (
+                    line > layout.skip
+                    and not start.startswith(COMMENT)
+                    and (start or any(field.strip() for field in row))
+                ):
                     yield line, row
         except UnicodeDecodeError as error:
-            raise ValueError(f"{path}: byte 0x{error.object[error.start]:02x} is not {layout.encoding}; save the file as UTF-8") from None
+            raise ValueError(
+                f"{path}: byte 0x{error.object[error.start]:02x} is not {layout.encoding}; "
+                "save the file as UTF-8"
+            ) from None
         except csv.Error as error:
-            raise ValueError(f"{path}: a line cannot be split into columns ({error}); save the file again as plain CSV") from None
+            raise ValueError(
+                f"{path}: a line cannot be split into columns ({error}); save the file again as plain CSV"
+            ) from None
 
 
-def sound_rows(path: Path, layout: CsvLayout, clock: "Clock | None", notes: list[Note]) -> Iterator[tuple[int, list[str]]]:
+def sound_rows(
+    path: Path, layout: CsvLayout, clock: "Clock | None", notes: list[Note]
+) -> Iterator[tuple[int, list[str]]]:
     """The rows with one field a column and a time.
 
-    A header that is repeated is passed over and counted; what stands behind the data (a row that breaks off as loggers leave it that lose
-    their power, totals, remarks) is left out and noted; the same amid the data is refused.
+    A header that is repeated is passed over and counted; what stands behind the data (a
+    row that breaks off as loggers leave it that lose their power, totals, remarks) is
+    left out and noted; the same amid the data is refused.
     """
     width, tail, repeated = len(layout.names), [], []
     for line, row in rows(path, layout):
@@ -171,19 +209,31 @@ def sound_rows(path: Path, layout: CsvLayout, clock: "Clock | None", notes: list
         elif [field.strip() for field in row[:width]] in (layout.names, layout.units):
             repeated.append(line)
         elif breaks := sum(field.rstrip("\n").count("\n") for field in row):
-            raise ValueError(f"{path}: line {line - breaks}: a quotation mark is opened there and never closed; remove or close it")
+            raise ValueError(
+                f"{path}: line {line - breaks}: a quotation mark is opened there and never closed; "
+                "remove or close it"
+            )
         else:
             tail.append((line, row))
             if len(tail) > LONGEST_TAIL:
                 raise ValueError(f"{path}: {_unsound(*tail[0], layout, clock)}; mend or remove that line")
     if repeated:
-        notes.append(Note("header", "", len(repeated), f"the header is repeated {len(repeated)} times, first in line {repeated[0]}"))
+        notes.append(
+            Note(
+                "header",
+                "",
+                len(repeated),
+                f"the header is repeated {len(repeated)} times, first in line {repeated[0]}",
+            )
+        )
     if len(tail) == 1 and len(tail[0][1]) < width:
         message = f"line {tail[0][0]}, the last, breaks off after {len(tail[0][1])} of {width} fields and was left out"
         notes.append(Note("truncated", "", 1, message))
     elif tail:
         shown = layout.delimiter.join(tail[0][1])[:60]
-        message = f"{len(tail)} lines behind the data were left out, from line {tail[0][0]} on, which is {shown!r}"
+        message = (
+            f"{len(tail)} lines behind the data were left out, from line {tail[0][0]} on, which is {shown!r}"
+        )
         notes.append(Note("trailing", "", len(tail), message))
 
 
@@ -194,7 +244,9 @@ def _unsound(line: int, row: list[str], layout: CsvLayout, clock: "Clock | None"
     return f"line {line} should have a time in {clock.name} but has {repr(found[:40]) if found else 'none'}"
 
 
-def floats(path: Path, name: str, fields: list[str], decimal: str, lines: list[int], switches: dict[str, set[str]]) -> np.ndarray:
+def floats(
+    path: Path, name: str, fields: list[str], decimal: str, lines: list[int], switches: dict[str, set[str]]
+) -> np.ndarray:
     try:
         if decimal == ".":
             return np.array(list(map(float, fields)))
@@ -202,10 +254,17 @@ def floats(path: Path, name: str, fields: list[str], decimal: str, lines: list[i
             return np.array([float(field.replace(",", ".")) for field in fields])
     except ValueError:
         pass  # one by one, which names the line
-    return np.array([_float(path, name, field, decimal, line, switches) for field, line in zip(fields, lines, strict=True)])
+    return np.array(
+        [
+            _float(path, name, field, decimal, line, switches)
+            for field, line in zip(fields, lines, strict=True)
+        ]
+    )
 
 
-def _float(path: Path, name: str, field: str, decimal: str, line: int, switches: dict[str, set[str]]) -> float:
+def _float(
+    path: Path, name: str, field: str, decimal: str, line: int, switches: dict[str, set[str]]
+) -> float:
     plain = field.strip()
     if is_number(plain, decimal):
         return float(plain.replace(",", "."))

@@ -1,6 +1,7 @@
 """Frames and numeric topics of one MCAP recording: what both camera loops write and read.
 
-Written as any ROS 2 or Foxglove viewer opens it: CDR with the ros2msg texts embedded, in the order of time, chunks with CRCs. Equal input gives equal bytes.
+Written as any ROS 2 or Foxglove viewer opens it: CDR with the ros2msg texts embedded, in the order of time,
+chunks with CRCs. Equal input gives equal bytes.
 """
 
 import heapq
@@ -24,7 +25,8 @@ from pipeline.store.artifacts import beside
 
 FRAME_ID = "nozzle"
 IMAGE_TOPIC = "/nozzle/image"
-# encoding -> ending and settings of cv2.imencode. A camera's frame is noise to a compressor: with one filter and runs only, a PNG of level 1
+# encoding -> ending and settings of cv2.imencode. A camera's frame is noise to a
+# compressor: with one filter and runs only, a PNG of level 1
 # is smaller than with a filter chosen for each row, is written in half the time and read in two thirds of it
 _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE,
         cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP]  # fmt: skip
@@ -32,7 +34,8 @@ ENCODERS = {"jpeg": (".jpg", [cv2.IMWRITE_JPEG_QUALITY, 95]), "png": (".png", _P
 
 
 class Recording(NamedTuple):
-    """Frames in the order of time, signals {name: (time_s (n,), values (n,))} on the same clock, metadata {record: {key: value}}, and notes of what was damaged."""
+    """Frames in the order of time, signals {name: (time_s (n,), values (n,))} on the same clock, metadata
+    {record: {key: value}}, and notes of what was damaged."""
 
     frames: Frames
     signals: dict[str, tuple[np.ndarray, np.ndarray]]
@@ -40,18 +43,30 @@ class Recording(NamedTuple):
     notes: list[Note]
 
 
-def tables_of(path: str | Path, time_s: np.ndarray, signals: Sequence[tuple[Source, np.ndarray]]) -> dict[str, dict[str, np.ndarray]]:
+def tables_of(
+    path: str | Path, time_s: np.ndarray, signals: Sequence[tuple[Source, np.ndarray]]
+) -> dict[str, dict[str, np.ndarray]]:
     """{topic: {field: values}}, checked."""
     time = np.asarray(time_s, float)
     tables: dict[str, dict[str, np.ndarray]] = {}
-    for name, values in [("time_s", time), *((source.signal, np.asarray(values, float)) for source, values in signals)]:
+    for name, values in [
+        ("time_s", time),
+        *((source.signal, np.asarray(values, float)) for source, values in signals),
+    ]:
         if values.shape != time.shape or time.ndim != 1 or not time.size:
-            raise ValueError(f"{path}: {name} should have one value for each of {time.size} times but has shape {values.shape}")
+            raise ValueError(
+                f"{path}: {name} should have one value for each of {time.size} times but has "
+                f"shape {values.shape}"
+            )
         if not np.isfinite(values).all():
-            raise ValueError(f"{path}: {name} is not finite at sample {np.flatnonzero(~np.isfinite(values))[0]}; leave that sample out")
+            raise ValueError(
+                f"{path}: {name} is not finite at sample {np.flatnonzero(~np.isfinite(values))[0]}; "
+                "leave that sample out"
+            )
     if time[0] < 0 or (np.diff(np.rint(time * 1e9)) <= 0).any():
         raise ValueError(
-            f"{path}: time_s should run forward from 0 or later, in steps of a nanosecond or more, but does not; sort or shift it"
+            f"{path}: time_s should run forward from 0 or later, in steps of a nanosecond or more, "
+            "but does not; sort or shift it"
         )
     for source, values in signals:
         topic, _, field = source.source.partition(":")
@@ -67,31 +82,48 @@ def write_frames(
     pictures: tuple[str, Iterable[tuple[float, np.ndarray]]] | None,
     metadata: tuple[str, Mapping[str, str]] | None = None,
 ) -> None:
-    """One recording of the tables {topic: {field: (T,)}} of `tables_of`, whose messages are named `types`, and of pictures (encoding, frames (time_s, (height, width))).
+    """One recording of the tables {topic: {field: (T,)}} of `tables_of`, whose messages are named `types`,
+    and of pictures (encoding, frames (time_s, (height, width))).
 
-    Frames are taken one by one: memory is that of a chunk. Raises ValueError, nothing written, for an unknown encoding and for frames that `_frame_messages` refuses.
+    Frames are taken one by one: memory is that of a chunk. Raises ValueError, nothing written, for an unknown
+    encoding and for frames that `_frame_messages` refuses.
     """
     if pictures and pictures[0] not in ENCODERS:
-        raise ValueError(f"{path}: the encoding should be jpeg, png or raw but is {pictures[0]!r}; name one of them")
+        raise ValueError(
+            f"{path}: the encoding should be jpeg, png or raw but is {pictures[0]!r}; name one of them"
+        )
     with beside(path) as temporary:
-        # by its name: only artifacts opens a file to write. Chunks, summary and metadata have a CRC each; one over all of it would be summed twice
+        # by its name: only artifacts opens a file to write. Chunks, summary and metadata have a CRC each; one
+        # over all of it would be summed twice
         writer = Writer(str(temporary), compression=CompressionType.NONE)
         writer.start(profile="ros2", library="beadline")
         if metadata:
             writer.add_metadata(*metadata)
         channels = {}
         for topic, fields in tables.items():
-            text = image_messages.HEADER + "".join(f"float64 {field}\n" for field in fields) + image_messages.HEADER_TYPES
+            text = (
+                image_messages.HEADER
+                + "".join(f"float64 {field}\n" for field in fields)
+                + image_messages.HEADER_TYPES
+            )
             channels[topic] = _channel(writer, topic, types[topic], text)
         streams = [_signal_messages(tables, channels, time_s)]
         if pictures:
             encoding, frames = pictures
-            name, text, topic = "CompressedImage", image_messages.COMPRESSED_IMAGE, f"{IMAGE_TOPIC}/compressed"
+            name, text, topic = (
+                "CompressedImage",
+                image_messages.COMPRESSED_IMAGE,
+                f"{IMAGE_TOPIC}/compressed",
+            )
             if encoding == "raw":
                 name, text, topic = "Image", image_messages.IMAGE, IMAGE_TOPIC
             channel = _channel(writer, topic, f"sensor_msgs/msg/{name}", text)
-            streams.append(_frame_messages(path, channel, encoding, frames, span_of(np.asarray(time_s, float))))
-        for sequence, (stamp, channel, message) in enumerate(heapq.merge(*streams, key=operator.itemgetter(0))):
+            streams.append(
+                _frame_messages(path, channel, encoding, frames, span_of(np.asarray(time_s, float)))
+            )
+        for sequence, (stamp, channel, message) in enumerate(
+            heapq.merge(*streams, key=operator.itemgetter(0))
+        ):
             writer.add_message(channel, stamp, message, stamp, sequence)
         writer.finish()
 
@@ -100,7 +132,9 @@ def _channel(writer: Writer, topic: str, name: str, text: str) -> int:
     return writer.register_channel(topic, "cdr", writer.register_schema(name, "ros2msg", text.encode()))
 
 
-def _signal_messages(tables: dict, channels: dict[str, int], time_s: np.ndarray) -> Iterator[tuple[int, int, bytes]]:
+def _signal_messages(
+    tables: dict, channels: dict[str, int], time_s: np.ndarray
+) -> Iterator[tuple[int, int, bytes]]:
     stamps = np.rint(np.asarray(time_s, float) * 1e9).astype(np.int64).tolist()
     # behind the header of a message and the CDR header of four bytes numbers stand at multiples of 8
     pad = bytes(-(len(image_messages.header(0, FRAME_ID)) - 4) % 8)
@@ -111,25 +145,41 @@ def _signal_messages(tables: dict, channels: dict[str, int], time_s: np.ndarray)
             yield stamp, channels[topic], head + values[k].tobytes()
 
 
-def _frame_messages(path, channel: int, encoding: str, frames: Iterable, span: tuple[float, float]) -> Iterator[tuple[int, int, bytes]]:
-    """CDR messages of the frames, each checked; at the end, whether they have anything to do with the signals' time."""
+def _frame_messages(
+    path, channel: int, encoding: str, frames: Iterable, span: tuple[float, float]
+) -> Iterator[tuple[int, int, bytes]]:
+    """CDR messages of the frames, each checked; at the end, whether
+    they have anything to do with the signals' time."""
     ending, settings = ENCODERS[encoding]
     kind, before, first = None, -1, math.nan
     for k, (time, frame) in enumerate(frames):
         stamp = round(time * 1e9) if math.isfinite(time) else -1
         if stamp <= before:
             raise ValueError(
-                f"{path}: frame {k} is at {time:g} s but frames should run forward from 0 s or later; sort them or shift the time"
+                f"{path}: frame {k} is at {time:g} s but frames should run forward from 0 s or later; "
+                "sort them or shift the time"
             )
-        if frame.ndim != 2 or frame.dtype not in (np.uint8, np.uint16) or (encoding == "jpeg" and frame.dtype != np.uint8):
+        if (
+            frame.ndim != 2
+            or frame.dtype not in (np.uint8, np.uint16)
+            or (encoding == "jpeg" and frame.dtype != np.uint8)
+        ):
             wanted = "uint8" if encoding == "jpeg" else "uint8 or uint16"
-            raise ValueError(f"{path}: frame {k} should be (height, width) of {wanted} but is {frame.shape} of {frame.dtype}; make it gray")
+            raise ValueError(
+                f"{path}: frame {k} should be (height, width) of {wanted} but is {frame.shape} of "
+                f"{frame.dtype}; make it gray"
+            )
         kind = kind or (frame.shape, frame.dtype)
         if (frame.shape, frame.dtype) != kind:
-            raise ValueError(f"{path}: frame {k} is {frame.shape} of {frame.dtype} but the first is {kind[0]} of {kind[1]}; write one size")
+            raise ValueError(
+                f"{path}: frame {k} is {frame.shape} of {frame.dtype} but the first is {kind[0]} of "
+                f"{kind[1]}; write one size"
+            )
         head = image_messages.header(stamp, FRAME_ID)
         if ending:
-            message = image_messages.compressed_image(head, encoding, cv2.imencode(ending, frame, settings)[1])
+            message = image_messages.compressed_image(
+                head, encoding, cv2.imencode(ending, frame, settings)[1]
+            )
         else:
             message = image_messages.image(head, frame)
         before, first = stamp, time if k == 0 else first
@@ -140,36 +190,63 @@ def _frame_messages(path, channel: int, encoding: str, frames: Iterable, span: t
 
 
 def read_frames(
-    path: Path, camera: Topic, places: Mapping[str, tuple[Source, str, str]], found: Mapping[str, Topic], *, clock: str, unreadable_share: float
+    path: Path,
+    camera: Topic,
+    places: Mapping[str, tuple[Source, str, str]],
+    found: Mapping[str, Topic],
+    *,
+    clock: str,
+    unreadable_share: float,
 ) -> Recording:
-    """Frames of `camera` and the signals of places {signal: (source, topic, field)}. Raises ValueError where no picture can be read, or a clock runs backwards."""
+    """Frames of `camera` and the signals of places {signal: (source, topic, field)}. Raises ValueError where
+    no picture can be read, or a clock runs backwards."""
     topics = list(dict.fromkeys(topic for _, topic, _ in places.values()))
     walk = Walk(path, camera, set(topics), clock)
     notes = walk.notes()
     if not walk.picture_order():
-        raise ValueError(f"{path}: no picture of {camera.name} can be read ({damage(path)}); copy the recording again")
+        raise ValueError(
+            f"{path}: no picture of {camera.name} can be read ({damage(path)}); copy the recording again"
+        )
     groups: dict[str, Columns] = {}
     for topic in topics:
         fields = list(dict.fromkeys(field for _, at, field in places.values() if at == topic))
         groups[topic], dropped = columns(walk, found[topic], fields, clock)
         if dropped:
-            notes.append(Note("unreadable", "", dropped, f"{dropped} messages of {topic} are not what its schema says and were left out"))
+            notes.append(
+                Note(
+                    "unreadable",
+                    "",
+                    dropped,
+                    f"{dropped} messages of {topic} are not what its schema says and were left out",
+                )
+            )
     start_ns = _start(path, [*groups.values(), frame_times(walk, camera)], notes)
     signals = {
-        name: ((groups[topic].time - start_ns) / 1e9, _values(path, source, groups[topic].values[field], notes))
+        name: (
+            (groups[topic].time - start_ns) / 1e9,
+            _values(path, source, groups[topic].values[field], notes),
+        )
         for name, (source, topic, field) in places.items()
     }
-    return Recording(Frames(walk, camera, clock, start_ns=start_ns, unreadable_share=unreadable_share), signals, walk.metadata, notes)
+    return Recording(
+        Frames(walk, camera, clock, start_ns=start_ns, unreadable_share=unreadable_share),
+        signals,
+        walk.metadata,
+        notes,
+    )
 
 
 # ---- what both check
 
 
-def check_overlap(path: str | Path, frames: tuple[float, float], others: dict[str, tuple[float, float]]) -> None:
+def check_overlap(
+    path: str | Path, frames: tuple[float, float], others: dict[str, tuple[float, float]]
+) -> None:
     for name, (first, last) in others.items():
         if frames[1] < first or last < frames[0]:
             raise ValueError(
-                f"{path}: the frames run from {frames[0]:.3f} to {frames[1]:.3f} s but {name} from {first:.3f} to {last:.3f} s, so they do not overlap in"
+                f"{path}: the frames run from {frames[0]:.3f} to {frames[1]:.3f} s but {name} from "
+                f"{first:.3f} to {last:.3f} s, so they do not overlap in"
                 f" time; record both on one clock"
             )
 
@@ -183,15 +260,24 @@ def _values(path: Path, source: Source, found: np.ndarray, notes: list[Note]) ->
     missing = int(np.count_nonzero(~np.isfinite(found)))
     if missing == len(found):
         raise ValueError(
-            f"{path}: {source.source} should hold numbers for {source.signal} but all of its {missing} values are missing; map another"
+            f"{path}: {source.source} should hold numbers for {source.signal} but all of its {missing} "
+            "values are missing; map another"
         )
     if missing:
-        notes.append(Note("missing", source.signal, missing, f"{missing} of {len(found)} values of {source.source} are missing"))
+        notes.append(
+            Note(
+                "missing",
+                source.signal,
+                missing,
+                f"{missing} of {len(found)} values of {source.source} are missing",
+            )
+        )
     return np.where(np.isfinite(found), found * source.scale + source.offset, np.nan)
 
 
 def _start(path: Path, groups: Sequence[Columns], notes: list[Note]) -> int:
-    """The instant in ns from which time is counted, every clock checked to run forward: 0, or the first whole second of a calendar."""
+    """The instant in ns from which time is counted, every clock checked to run
+    forward: 0, or the first whole second of a calendar."""
     for group in groups:
         check_clock(path, group)
     first = min(int(group.time[0]) for group in groups)

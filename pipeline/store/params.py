@@ -1,7 +1,9 @@
-"""A section of params.yaml and params.expert.yaml -> a frozen, bounded, typed object; each problem with it becomes one sentence that ends with the remedy.
+"""A section of params.yaml and params.expert.yaml -> a frozen, bounded, typed object; each problem with it
+becomes one sentence that ends with the remedy.
 
-params.yaml has what the owner of a machine decides, params.expert.yaml what a developer of a method sets. A section may stand in both, a key of it in one.
-Whoever names a params.yaml means both files: the other one is looked for beside it.
+params.yaml has what the owner of a machine decides, params.expert.yaml what a developer of a
+method sets. A section may stand in both, a key of it in one. Whoever names a params.yaml means
+both files: the other one is looked for beside it.
 """
 
 import copy
@@ -24,9 +26,11 @@ FILE, EXPERT = "params.yaml", "params.expert.yaml"
 
 
 class Section(pydantic.BaseModel):
-    """One section of the two files. Fields have bounds and no defaults: the files are the only home of a value.
+    """One section of the two files. Fields have bounds and no
+    defaults: the files are the only home of a value.
 
-    Strict: "true" is no number and 3.5 no integer, but 3 is a float. A list of YAML fills lists and tuples; NaN and infinity are refused.
+    Strict: "true" is no number and 3.5 no integer, but 3 is a float. A list of YAML
+    fills lists and tuples; NaN and infinity are refused.
     """
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
@@ -45,7 +49,8 @@ class Mapped(Section):
 
 
 class Execution(Section):
-    """Section `execution`: where joblib sends its work; one machine (loky) or a cluster (dask with the address of its scheduler)."""
+    """Section `execution`: where joblib sends its work; one machine (loky) or a
+    cluster (dask with the address of its scheduler)."""
 
     backend: Literal["loky", "dask"]
     jobs: int = Field(ge=1, le=64)
@@ -54,9 +59,15 @@ class Execution(Section):
     @pydantic.model_validator(mode="after")
     def _scheduler_for_dask_only(self):
         if self.backend == "dask" and not self.scheduler:
-            raise ValueError('has backend dask but scheduler ""; write the address of the scheduler there, such as tcp://host:8786')
+            raise ValueError(
+                'has backend dask but scheduler ""; write the address of the scheduler there, '
+                "such as tcp://host:8786"
+            )
         if self.backend != "dask" and self.scheduler:
-            raise ValueError(f'has scheduler "{self.scheduler}" but backend {self.backend}; set backend: dask, or scheduler: ""')
+            raise ValueError(
+                f'has scheduler "{self.scheduler}" but backend {self.backend}; set backend: '
+                'dask, or scheduler: ""'
+            )
         return self
 
 
@@ -66,7 +77,8 @@ S = TypeVar("S", bound=Section)
 
 
 def load(model: type[S], section: str, path: str | Path = FILE) -> S:
-    """Section `section` of both files as a frozen `model`. Raises ValueError with a line for each key unknown, missing or out of bounds."""
+    """Section `section` of both files as a frozen `model`. Raises ValueError with a line for each key
+    unknown, missing or out of bounds."""
     sections = files(path)
     values = _section(section, path)
     try:
@@ -74,21 +86,30 @@ def load(model: type[S], section: str, path: str | Path = FILE) -> S:
         return model.model_validate_json(json.dumps(values))
     except pydantic.ValidationError as error:
         found = _sentences(model, section, error.errors())
-        raise ValueError("\n".join(f"{_files_of(sections, section, location)}: {sentence}" for location, sentence in found)) from None
+        raise ValueError(
+            "\n".join(f"{_files_of(sections, section, location)}: {sentence}" for location, sentence in found)
+        ) from None
 
 
 def value(dotted: str, path: str | Path = FILE, *, one_of: tuple) -> Any:
-    """One key of another stage's section, such as generate_probing.source; it must be one of `one_of`. Raises ValueError as `load` does."""
+    """One key of another stage's section, such as generate_probing.source; it must be
+    one of `one_of`. Raises ValueError as `load` does."""
     section, *keys = dotted.split(".")
     found = _section(section, path)
     place = _files_of(files(path), section, keys)
     for key in keys:
         if not isinstance(found, dict) or key not in found:
             near = _nearest(key, found if isinstance(found, dict) else ())
-            raise ValueError(f"{place}: {dotted} is missing; {f'is {near} meant?' if near else f'add it (one of {_listed(one_of)})'}")
+            raise ValueError(
+                f"{place}: {dotted} is missing; "
+                f"{f'is {near} meant?' if near else f'add it (one of {_listed(one_of)})'}"
+            )
         found = found[key]
     if not any(type(found) is type(choice) and found == choice for choice in one_of):
-        raise ValueError(f"{place}: {dotted} is {_shown(found)} but must be one of {_listed(one_of)}{_did_you_mean(found, one_of)}")
+        raise ValueError(
+            f"{place}: {dotted} is {_shown(found)} but must be one of "
+            f"{_listed(one_of)}{_did_you_mean(found, one_of)}"
+        )
     return found
 
 
@@ -105,13 +126,15 @@ def home(dotted: str, path: str | Path = FILE) -> str:
 
 
 def digest(model: Section) -> str:
-    """SHA-256 of the section's canonical JSON: equal parameters have equal digests, whatever their order and spelling in the file."""
+    """SHA-256 of the section's canonical JSON: equal parameters have equal
+    digests, whatever their order and spelling in the file."""
     canonical = json.dumps(model.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML 1.2 as DVC reads it: 1e-6 is a number, `no` and `on` are words, 12:30 is no number; a key given twice is refused."""
+    """YAML 1.2 as DVC reads it: 1e-6 is a number, `no` and `on` are words,
+    12:30 is no number; a key given twice is refused."""
 
     yaml_implicit_resolvers: ClassVar[dict] = {}
 
@@ -120,7 +143,9 @@ class _Loader(yaml.SafeLoader):
         for key_node, _ in node.value:
             key = key_node.value
             if key in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"{key} is given twice, first in line {seen[key]}", key_node.start_mark)
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"{key} is given twice, first in line {seen[key]}", key_node.start_mark
+                )
             seen[key] = key_node.start_mark.line + 1
         return super().construct_mapping(node, deep)
 
@@ -129,11 +154,17 @@ for _tag, _pattern, _first in [
     ("bool", r"true|True|TRUE|false|False|FALSE", "tTfF"),
     ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
     ("int", r"[-+]?[0-9]+", "-+0123456789"),
-    ("float", r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)", "-+.0123456789"),
+    (
+        "float",
+        r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+        "-+.0123456789",
+    ),
 ]:
     _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(rf"^(?:{_pattern})$"), list(_first))
 _Loader.add_constructor("tag:yaml.org,2002:int", lambda loader, node: int(node.value))
-_Loader.add_constructor("tag:yaml.org,2002:float", lambda loader, node: float(re.sub(r"\.(inf|nan)", r"\1", node.value.lower())))
+_Loader.add_constructor(
+    "tag:yaml.org,2002:float", lambda loader, node: float(re.sub(r"\.(inf|nan)", r"\1", node.value.lower()))
+)
 
 
 @functools.lru_cache(maxsize=8)
@@ -142,7 +173,8 @@ def _parsed(text: str) -> Any:
 
 
 def read(path: str | Path = FILE) -> dict:
-    """Every section with its keys of both files, unchecked. Raises ValueError as `files` does, and where a key of a section stands in both."""
+    """Every section with its keys of both files, unchecked. Raises ValueError as `files` does, and where a
+    key of a section stands in both."""
     (name, whole), *others = files(path).items()
     for other, sections in others:
         for section, keys in sections.items():
@@ -152,13 +184,16 @@ def read(path: str | Path = FILE) -> dict:
                     raise ValueError(f"{file}: {section} {_NO_SECTION.format(_shown(part))}")
             twice = [key for key in keys if key in mine]
             if twice:
-                raise ValueError(f"{name} and {other}: {section}.{twice[0]} stands in both; take it out of one of the two")
+                raise ValueError(
+                    f"{name} and {other}: {section}.{twice[0]} stands in both; take it out of one of the two"
+                )
             whole[section] = mine | keys
     return whole
 
 
 def files(path: str | Path = FILE) -> dict[str, dict]:
-    """The sections of params.yaml and, where it is there, of params.expert.yaml beside it, by the files' names, unchecked.
+    """The sections of params.yaml and, where it is there, of
+    params.expert.yaml beside it, by the files' names, unchecked.
 
     Raises ValueError with file and line where one is no YAML or has a key twice.
     """
@@ -177,13 +212,18 @@ def _sections(path: str | Path) -> dict:
         sections = copy.deepcopy(_parsed(text))
     except yaml.MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 1
-        remedy = "keep one of the two" if "twice" in (error.problem or "") else "mend the line: key: value, indented by spaces"
+        remedy = (
+            "keep one of the two"
+            if "twice" in (error.problem or "")
+            else "mend the line: key: value, indented by spaces"
+        )
         raise ValueError(f"{path}: line {line}: {error.problem}; {remedy}") from None
     except yaml.YAMLError as error:
         raise ValueError(f"{path}: {' '.join(str(error).split())}; remove that character") from None
     if type(sections) is not dict:
         raise ValueError(
-            f"{path} must hold sections (name: and indented keys) but holds {_shown(sections)}; restore it with git checkout {path}"
+            f"{path} must hold sections (name: and indented keys) but holds {_shown(sections)}; "
+            f"restore it with git checkout {path}"
         )
     return sections
 
@@ -194,10 +234,13 @@ def _section(section: str, path: str | Path) -> dict:
         near = _nearest(section, sections)
         expert = Path(path).with_name(EXPERT)
         if not near and not expert.exists():
-            raise ValueError(f"{path}: section {section} is missing, and so is {expert}; {_RESTORE.format(expert)}")
+            raise ValueError(
+                f"{path}: section {section} is missing, and so is {expert}; {_RESTORE.format(expert)}"
+            )
         place = home(near, path) or _files_of(files(path), section)
         raise ValueError(
-            f"{place}: section {section} is missing; {f'is {near} meant?' if near else f'add {section}: with its keys below it'}"
+            f"{place}: section {section} is missing; "
+            f"{f'is {near} meant?' if near else f'add {section}: with its keys below it'}"
         )
     if type(sections[section]) is not dict:
         raise ValueError(f"{home(section, path)}: {section} {_NO_SECTION.format(_shown(sections[section]))}")
@@ -205,7 +248,8 @@ def _section(section: str, path: str | Path) -> dict:
 
 
 def _files_of(sections: dict[str, dict], section: str, location: Sequence = ()) -> str:
-    """The file in which a key stands; of a key that is missing, and of the section as such, those in which the section does."""
+    """The file in which a key stands; of a key that is missing, and of the
+    section as such, those in which the section does."""
     having = [name for name, found in sections.items() if section in found] or list(sections)
     exact = [name for name in having if location and location[0] in sections[name].get(section, {})]
     return (" or " if location else " and ").join(exact or having)
@@ -233,19 +277,25 @@ _TYPES = {
 
 
 def _sentences(model: type[Section], section: str, errors: list) -> Iterator[tuple[tuple, str]]:
-    """(location, sentence) of each problem; a key that is missing because it is misspelt is one problem, not two."""
+    """(location, sentence) of each problem; a key that is missing
+    because it is misspelt is one problem, not two."""
     misspelt = set()
     for error in errors:
         if error["type"] == "extra_forbidden":
             parent = _at(model, error["loc"][:-1])
-            names = tuple(parent.model_fields) if isinstance(parent, type) and issubclass(parent, Section) else ()
+            names = (
+                tuple(parent.model_fields) if isinstance(parent, type) and issubclass(parent, Section) else ()
+            )
             near = _nearest(error["loc"][-1], names)
             misspelt.add((*error["loc"][:-1], near))
             remedy = f"did you mean {near}?" if near else f"remove it, or use {_listed(names)}"
             yield error["loc"], f"{_place(section, error['loc'])} is unknown; {remedy}"
     for error in errors:
         if error["type"] == "missing" and error["loc"] not in misspelt:
-            yield error["loc"], f"{_place(section, error['loc'])} is missing; add it ({_expected(model, error['loc'])})"
+            yield (
+                error["loc"],
+                f"{_place(section, error['loc'])} is missing; add it ({_expected(model, error['loc'])})",
+            )
         elif error["type"] not in ("missing", "extra_forbidden"):
             yield error["loc"], f"{_place(section, error['loc'])} {_complaint(error)}"
 
@@ -258,9 +308,7 @@ def _complaint(error: dict) -> str:
     if kind in _TYPES:
         return f"is {found} but must be {_TYPES[kind]}"
     if kind == "literal_error":
-        return (
-            f"is {found} but must be one of {context['expected'].replace(chr(39), '')}{_did_you_mean(error['input'], context['expected'])}"
-        )
+        return f"is {found} but must be one of {context['expected'].replace(chr(39), '')}{_did_you_mean(error['input'], context['expected'])}"
     if kind in ("too_short", "string_too_short"):
         return f"is {found} but needs at least {context.get('min_length')} {'entries' if kind == 'too_short' else 'characters'}"
     if kind in ("too_long", "string_too_long"):
@@ -282,7 +330,9 @@ def _shown(found: Any) -> str:
 
 
 def _nearest(name: Any, names) -> str:
-    return next(iter(difflib.get_close_matches(str(name), [str(other) for other in names], n=1, cutoff=0.6)), "")
+    return next(
+        iter(difflib.get_close_matches(str(name), [str(other) for other in names], n=1, cutoff=0.6)), ""
+    )
 
 
 def _did_you_mean(found: Any, choices) -> str:
@@ -296,12 +346,15 @@ def _listed(names) -> str:
 
 
 def _at(model: Any, location: tuple) -> Any:
-    """The type that the schema has at a location: a Section, an element's type, or the field itself at the end."""
+    """The type that the schema has at a location: a Section, an
+    element's type, or the field itself at the end."""
     for key in location:
         if isinstance(model, type) and issubclass(model, Section):
             model = model.model_fields[key].annotation if key in model.model_fields else None
         else:
-            arguments = [argument for argument in typing.get_args(model) if argument not in (Ellipsis, type(None))]
+            arguments = [
+                argument for argument in typing.get_args(model) if argument not in (Ellipsis, type(None))
+            ]
             model = arguments[-1] if arguments else None
         if typing.get_origin(model) in (typing.Union, types.UnionType):
             model = next(argument for argument in typing.get_args(model) if argument is not type(None))
@@ -311,7 +364,8 @@ def _at(model: Any, location: tuple) -> Any:
 
 
 def _expected(model: type[Section], location: tuple) -> str:
-    """What a missing key should be: "int, at least 1 and at most 20", "one of loky, dask", "section with name, unit"."""
+    """What a missing key should be: "int, at least 1 and at most 20",
+    "one of loky, dask", "section with name, unit"."""
     kind = _at(model, location)
     if typing.get_origin(kind) is Literal:
         return "one of " + _listed(typing.get_args(kind))

@@ -1,4 +1,5 @@
-"""Practical tuning of the model-based controller: the declared engineering cost of its weights, and what each candidate trades, error for effort."""
+"""Practical tuning of the model-based controller: the declared engineering cost of its weights, and what each
+candidate trades, error for effort."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
@@ -24,18 +25,22 @@ from pipeline.temperature.tuning import Result
 
 
 class Trade(NamedTuple):
-    """What a candidate gives and takes: r.m.s. tracking error in °C and r.m.s. effort in percent, each the mean over the scenarios."""
+    """What a candidate gives and takes: r.m.s. tracking error in °C and r.m.s.
+    effort in percent, each the mean over the scenarios."""
 
     tracking_degC: float
     effort_percent: float
 
 
 def deployed(
-    plant: Plant, scenarios: Panel, *, gamma: float, limits: Limits, band: float, integral: float, integral_limit: float, least_disk_margin: float
+    plant: Plant, scenarios: Panel, *, gamma: float, limits: Limits, band: float, integral: float,
+    integral_limit: float, least_disk_margin: float
 ) -> Callable[[np.ndarray], Figures]:  # fmt: skip
-    """The figures of theta = [q; r; tau]: weights and observer of the model's controller, as deployed on the training panel.
+    """The figures of theta = [q; r; tau]: weights and observer of the
+    model's controller, as deployed on the training panel.
 
-    A candidate whose disk margin on its own model is below `least_disk_margin` fails (ValueError): figures in simulation are no reason to give robustness away.
+    A candidate whose disk margin on its own model is below `least_disk_margin` fails (ValueError): figures in
+    simulation are no reason to give robustness away.
     """
     aims, p, m = targets(plant, scenarios.r, limits), plant.p, plant.m
 
@@ -44,7 +49,9 @@ def deployed(
         disk = margins([plant], law, grid=80)[0].disk
         if disk < least_disk_margin:
             raise ValueError(f"the disk margin is {disk:.2f}, below the least of {least_disk_margin:.2f}")
-        found = simulate(scenarios, law, feed_forward(scenarios, law, aims), limits=limits, integral_band=integral_limit)
+        found = simulate(
+            scenarios, law, feed_forward(scenarios, law, aims), limits=limits, integral_band=integral_limit
+        )
         return figures(scenarios, found, limits=limits, band=band, sample_time_s=plant.sample_time_s)
 
     return run
@@ -55,33 +62,50 @@ def trade(found: Figures) -> Trade:
 
 
 def optimum_trade(scenarios: Panel, yardstick: Yardstick, *, limits: Limits, band: float) -> Trade:
-    """Of the Riccati law of each scenario's own plant, told the state and left unclipped: what no controller undercuts on the yardstick."""
+    """Of the Riccati law of each scenario's own plant, told the state and left
+    unclipped: what no controller undercuts on the yardstick."""
     return trade(
-        figures(scenarios, optimum_run(scenarios, yardstick), limits=limits, band=band, sample_time_s=scenarios.plants[0].sample_time_s)
+        figures(
+            scenarios,
+            optimum_run(scenarios, yardstick),
+            limits=limits,
+            band=band,
+            sample_time_s=scenarios.plants[0].sample_time_s,
+        )
     )
 
 
 def found_or_none(asked: Callable[[np.ndarray], object], theta: np.ndarray):
-    """What theta gives, None where it fails: default weights may fail on somebody else's plant, and the search is not lost for that."""
+    """What theta gives, None where it fails: default weights may fail on somebody
+    else's plant, and the search is not lost for that."""
     try:
         return asked(theta)
     except ValueError:
         return None
 
 
-def yardstick_regret(controller: Controller, scenarios: Panel, yardstick: Yardstick, q: np.ndarray, r: np.ndarray) -> float:
-    """What weights q, r cost on the common yardstick: median regret, unclipped, on the quietest scenarios of the nominal plant."""
+def yardstick_regret(
+    controller: Controller, scenarios: Panel, yardstick: Yardstick, q: np.ndarray, r: np.ndarray
+) -> float:
+    """What weights q, r cost on the common yardstick: median regret, unclipped,
+    on the quietest scenarios of the nominal plant."""
     law = controller.design(q, r, 0.0)
     found = regret(
-        cost(scenarios, simulate(scenarios, law, feed_forward(scenarios, law, None), limits=None), yardstick), optimum(scenarios, yardstick)
+        cost(scenarios, simulate(scenarios, law, feed_forward(scenarios, law, None), limits=None), yardstick),
+        optimum(scenarios, yardstick),
     )
     return float(np.median(found[(scenarios.plant == 0) & (scenarios.noise == scenarios.noise.min())]))
 
 
-def histories(results: Mapping[str, Result], trades: Mapping[str, Sequence[Trade | None]]) -> dict[str, list | np.ndarray]:
-    """The candidates of several searches as columns, one row a candidate; `trades` as many a search, None for a candidate that failed."""
+def histories(
+    results: Mapping[str, Result], trades: Mapping[str, Sequence[Trade | None]]
+) -> dict[str, list | np.ndarray]:
+    """The candidates of several searches as columns, one row a candidate; `trades` as
+    many a search, None for a candidate that failed."""
     of = {mode: result.history for mode, result in results.items()}
-    traded = np.array([[np.nan] * 2 if one is None else one for mode in of for one in trades[mode]], float).reshape(-1, 2)
+    traded = np.array(
+        [[np.nan] * 2 if one is None else one for mode in of for one in trades[mode]], float
+    ).reshape(-1, 2)
     return {
         "mode": [mode for mode, history in of.items() for _ in history.cost],
         "evaluation": [k + 1 for history in of.values() for k in range(len(history.cost))],
@@ -89,6 +113,8 @@ def histories(results: Mapping[str, Result], trades: Mapping[str, Sequence[Trade
         "incumbent": np.concatenate([history.incumbent for history in of.values()]),
         "tracking_degC": traded[:, 0],
         "effort_percent": traded[:, 1],
-        "chosen": np.concatenate([(result.history.theta == result.theta).all(axis=1) for result in results.values()]),
+        "chosen": np.concatenate(
+            [(result.history.theta == result.theta).all(axis=1) for result in results.values()]
+        ),
         "failure": [reason for history in of.values() for reason in history.failed],
     }

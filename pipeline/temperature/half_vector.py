@@ -1,4 +1,5 @@
-"""Half-vectors of symmetric matrices: the coordinates in which a quadratic function of a sample is linear, with half the columns of the Kronecker product."""
+"""Half-vectors of symmetric matrices: the coordinates in which a quadratic function of a sample is linear,
+with half the columns of the Kronecker product."""
 
 import numpy as np
 import scipy.linalg.blas
@@ -7,7 +8,8 @@ ROOT2 = np.sqrt(2.0)
 
 
 def svec(S: np.ndarray) -> np.ndarray:
-    """Half-vector of a symmetric S (d, d): upper triangle by rows, sqrt 2 off the diagonal, so that svec(S) . svec(T) = trace(S T)."""
+    """Half-vector of a symmetric S (d, d): upper triangle by rows, sqrt 2 off the
+    diagonal, so that svec(S) . svec(T) = trace(S T)."""
     i, j = np.triu_indices(len(S))
     return S[i, j] * np.where(i == j, 1.0, ROOT2)
 
@@ -30,7 +32,8 @@ def skron(X: np.ndarray) -> np.ndarray:
 
 
 def quadratic_gram(Z: np.ndarray, *, block: int = 1024) -> np.ndarray:
-    """Sum over samples of svec(z z') svec(z z')' for Z (d, samples), accumulated in blocks: memory does not grow with the number of samples."""
+    """Sum over samples of svec(z z') svec(z z')' for Z (d, samples), accumulated in blocks: memory does not
+    grow with the number of samples."""
     d, samples = Z.shape
     i, j = np.triu_indices(d)
     gram, features = np.zeros((len(i), len(i)), order="F"), np.empty((len(i), block))

@@ -1,12 +1,16 @@
-"""From a record to a plant: window, dead time, feed-through, order and refinement chosen on the identification data by stated rules, then one fit on all of it.
+"""From a record to a plant: window, dead time, feed-through, order and refinement chosen on the
+identification data by stated rules, then one fit on all of it.
 
 The rules, each with its reason:
-  window        twice the lags of Akaike's criterion (corrected for few samples) over VARX models: long enough to whiten; and Schwarz's lags, for records that say little
-  feed-through  with and without u(t), where `feedthrough` is None and Schwarz's criterion of the one-step predictor prefers it
-  largest order singular values, in units of the noise, above what coefficient errors alone reach: sqrt(2) (sqrt(rows) + sqrt(columns)) of the noise matrix
-  dead time     none; the lags at which the largest model's impulse response stays under 5 % of its peak; those under a quarter that Wald's test finds silent too
-  order         of all these, the fewest parameters whose error in simulation of left-out blocks (geometric mean) is within 2 % of the best
-  refinement    where `refinement` is "validated": prediction-error fits of the chosen model, where one takes more than 5 % off the error on the left-out blocks; for simulation only where that beats prediction by a fifth
+window twice the lags of Akaike's criterion (corrected for few samples) over VARX models: long enough to
+whiten; and Schwarz's lags, for records that say little feed-through with and without u(t), where
+`feedthrough` is None and Schwarz's criterion of the one-step predictor prefers it largest order singular
+values, in units of the noise, above what coefficient errors alone reach: sqrt(2) (sqrt(rows) + sqrt(columns))
+of the noise matrix dead time none; the lags at which the largest model's impulse response stays under 5 % of
+its peak; those under a quarter that Wald's test finds silent too order of all these, the fewest parameters
+whose error in simulation of left-out blocks (geometric mean) is within 2 % of the best refinement where
+`refinement` is "validated": prediction-error fits of the chosen model, where one takes more than 5 % off the
+error on the left-out blocks; for simulation only where that beats prediction by a fifth
 """
 
 from collections.abc import Sequence
@@ -33,22 +37,17 @@ from pipeline.temperature.order import (
 )
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.refinement import drives, estimate_state, simulation_form
-from pipeline.temperature.subspace import (
-    Segments,
-    complete_runs,
-    gapless,
-    lagged,
-    realise,
-    subspace,
-)
+from pipeline.temperature.subspace import Segments, complete_runs, gapless, lagged, realise, subspace
 
 EXACT_RANK = 1e-7  # singular values of a noise-free record below this share of the largest are rounding
 
 
 class Identified(NamedTuple):
-    """An identified plant and how it was chosen. order: states without those of the delays; past: window; order_table: candidates with their errors.
+    """An identified plant and how it was chosen. order: states without those of the delays; past: window;
+    order_table: candidates with their errors.
 
-    delays are the dead times in the plant, in samples for each input; silent marks inputs that no output answers. x0 has the initial state of each segment, or of
+    delays are the dead times in the plant, in samples for each input; silent marks
+    inputs that no output answers. x0 has the initial state of each segment, or of
     each piece where masked inputs cut one (`gapless`).
     """
 
@@ -81,23 +80,29 @@ def check_outputs(y: Segments, *, names: Sequence[str] = ()) -> None:
         if seen.size == 0 or np.ptp(seen) <= 1e-12 * np.abs(seen).max():
             shown = f"{seen[0]:g} in every sample" if seen.size else "missing in every sample"
             raise ValueError(
-                f"output {name_of(names, 'y', j)} is constant ({shown}), so no model of it is possible; check the sensor, or leave it out of plant.outputs"
+                f"output {name_of(names, 'y', j)} is constant ({shown}), so no model of it is possible; "
+                "check the sensor, or leave it out of plant.outputs"
             )
 
 
 def check_inputs(u: Segments, *, offset: bool = True, names: Sequence[str] = ()) -> None:
-    """Raises ValueError where an input is constant or a linear combination of the others: its column of B is then not identified."""
+    """Raises ValueError where an input is constant or a linear combination of the
+    others: its column of B is then not identified."""
     rows = np.vstack(u)
     rows = rows[np.isfinite(rows).all(axis=1)]
     if not len(rows):
-        raise ValueError("no sample has all inputs, so no plant can be run over the record; check plant.inputs and the mapping")
+        raise ValueError(
+            "no sample has all inputs, so no plant can be run over the record; "
+            "check plant.inputs and the mapping"
+        )
     largest = np.abs(rows).max(axis=0)
     rows = rows - rows.mean(axis=0) if offset else rows
     size = np.sqrt(np.mean(rows**2, axis=0))
     for j in range(rows.shape[1]):
         if size[j] <= max(1e-9 * largest[j], np.finfo(float).tiny):
             raise ValueError(
-                f"input {name_of(names, 'u', j)} is constant, so its column of B is not identified; excite it, or leave it out of the inputs"
+                f"input {name_of(names, 'u', j)} is constant, so its column of B is not identified; "
+                "excite it, or leave it out of the inputs"
             )
     scaled = rows / size
     for j in range(1, rows.shape[1]):
@@ -105,29 +110,34 @@ def check_inputs(u: Segments, *, offset: bool = True, names: Sequence[str] = ())
         if np.linalg.norm(scaled[:, j] - scaled[:, :j] @ weights) < 1e-6 * np.linalg.norm(scaled[:, j]):
             others = ", ".join(name_of(names, "u", k) for k in range(j) if abs(weights[k]) > 1e-6)
             raise ValueError(
-                f"input {name_of(names, 'u', j)} is a linear combination of {others}, so its column of B is not identified; move it independently, or leave it out"
+                f"input {name_of(names, 'u', j)} is a linear combination of {others}, "
+                "so its column of B is not identified; move it independently, or leave it out"
             )
 
 
 def within_limits(
     u: Segments, limits: tuple[Sequence[float], Sequence[float]], *, names: Sequence[str] = ()
 ) -> tuple[list[np.ndarray], list[str]]:
-    """The inputs that the actuators could follow, min(max(u, low), high), and a sentence for each input that was asked beyond its limits.
+    """The inputs that the actuators could follow, min(max(u, low), high), and a
+    sentence for each input that was asked beyond its limits.
 
-    Clipping at a known limit loses nothing; masking the same samples would cut the record wherever the actuator stands at its stop.
+    Clipping at a known limit loses nothing; masking the same samples would cut
+    the record wherever the actuator stands at its stop.
     """
     low, high = (np.asarray(side, float) for side in limits)
     m, said = u[0].shape[1], []
     if low.shape != (m,) or high.shape != (m,) or not (low < high).all():
         raise ValueError(
-            f"limits: expected {m} low and {m} high limits with low < high but found {low.tolist()} and {high.tolist()}; give one pair for each input"
+            f"limits: expected {m} low and {m} high limits with low < high but found {low.tolist()} and "
+            f"{high.tolist()}; give one pair for each input"
         )
     rows = np.vstack(u)
     for j in range(m):
         beyond = int(((rows[:, j] < low[j]) | (rows[:, j] > high[j])).sum())
         if beyond:
             said.append(
-                f"{name_of(names, 'u', j)} was asked beyond {low[j]:g}..{high[j]:g} in {beyond} of {len(rows)} samples: the limit is taken as its input there"
+                f"{name_of(names, 'u', j)} was asked beyond {low[j]:g}..{high[j]:g} in {beyond} of "
+                f"{len(rows)} samples: the limit is taken as its input there"
             )
     return [np.clip(a, low, high) for a in u], said
 
@@ -148,12 +158,14 @@ def identify(
     limits: tuple[Sequence[float], Sequence[float]] | None = None,
     names: Sequence[str] = (),
 ) -> Identified:
-    """The plant that a record shows, by the rules at the head of this module; u segments (T, m), y segments (T, p), NaN where a sample is masked.
+    """The plant that a record shows, by the rules at the head of this module; u segments (T, m), y segments
+    (T, p), NaN where a sample is masked.
 
-    PBSID makes the start, in innovation form. `refinement` "prediction" or "simulation" moves it to the least errors of that kind; "validated" does
-    so only where the left-out blocks prefer it. `feedthrough` None lets the data decide.
-    `limits` (low, high) of the actuators clip u; `max_radius` bounds every pole. Works in closed loop, unless refined on simulation errors.
-    Raises ValueError for a constant or collinear input, a constant output, a record too short for the order, and shapes that do not agree.
+    PBSID makes the start, in innovation form. `refinement` "prediction" or "simulation" moves it to the least
+    errors of that kind; "validated" does so only where the left-out blocks prefer it. `feedthrough` None lets
+    the data decide. `limits` (low, high) of the actuators clip u; `max_radius` bounds every pole. Works in
+    closed loop, unless refined on simulation errors. Raises ValueError for a constant or collinear input, a
+    constant output, a record too short for the order, and shapes that do not agree.
     """
     u, y, cut, notes = _prepared(u, y, order, past, offset, limits, names)
     m = u[0].shape[1]
@@ -161,20 +173,43 @@ def identify(
     direct = (feedthrough,)
     if feedthrough is None:
         direct = (False, True) if feedthrough_shows(u, y, pasts[0], offset) else (False,)
-    structure, kind, table = Structure(pasts[0], direct[-1], offset, (0,) * m), refinement.replace("none", "subspace"), []
+    structure, kind, table = (
+        Structure(pasts[0], direct[-1], offset, (0,) * m),
+        refinement.replace("none", "subspace"),
+        [],
+    )
     if exact:
         sub = subspace(lagged(u, y, pasts[0], feedthrough=direct[-1], offset=offset, exact=True), pasts[0])
         rank = max(int((sub.singular_values > EXACT_RANK * sub.singular_values[0]).sum()), 1)
-        exact = rank <= max_order  # else no rank but a nonlinearity without noise, and the order is a choice as with noise
+        exact = (
+            rank <= max_order
+        )  # else no rank but a nonlinearity without noise, and the order is a choice as with noise
     if exact:
-        notes.append(f"the record is noise-free: {pasts[0]} past samples predict it to rounding, and the order is a rank")
+        notes.append(
+            f"the record is noise-free: {pasts[0]} past samples predict it to rounding, "
+            "and the order is a rank"
+        )
         order, kind = order or rank, kind.replace("validated", "subspace")
     elif order is None or refinement == "validated":
         structures = [structure._replace(past=n, feedthrough=d) for n in pasts for d in direct]
-        chosen, table = _choose(u, y, structures, order, max_order, refinement == "validated", {"blocks": blocks, "max_radius": max_radius})
-        order, structure, kind = chosen.order, chosen.structure, chosen.fit if refinement == "validated" else kind
+        chosen, table = _choose(
+            u,
+            y,
+            structures,
+            order,
+            max_order,
+            refinement == "validated",
+            {"blocks": blocks, "max_radius": max_radius},
+        )
+        order, structure, kind = (
+            chosen.order,
+            chosen.structure,
+            chosen.fit if refinement == "validated" else kind,
+        )
     if feedthrough is None:
-        notes.append(f"direct feed-through {'kept' if structure.feedthrough else 'left out'} as the data prefer")
+        notes.append(
+            f"direct feed-through {'kept' if structure.feedthrough else 'left out'} as the data prefer"
+        )
     found = _fit_all(u, y, structure, exact, order, kind, sample_time_s, table, max_radius)
     return found._replace(dropped_rows=found.dropped_rows + cut, notes=notes + _remarks(found, names))
 
@@ -188,16 +223,33 @@ def refit(
     limits: tuple[Sequence[float], Sequence[float]] | None = None,
     names: Sequence[str] = (),
 ) -> Identified:
-    """What was chosen on a part of the record (window, feed-through, dead times, order, refinement) fitted to all of it, nothing chosen anew; as `identify` otherwise."""
+    """What was chosen on a part of the record (window, feed-through, dead times, order, refinement) fitted to
+    all of it, nothing chosen anew; as `identify` otherwise."""
     u, y, cut, notes = _prepared(u, y, found.order, found.past, found.offset, limits, names)
     structure = Structure(found.past, found.feedthrough, found.offset, found.delays)
-    exact = not found.order_table and windows(lagged(u, y, found.past, feedthrough=found.feedthrough, offset=found.offset))[1]
-    again = _fit_all(u, y, structure, exact, found.order, found.fit, found.plant.sample_time_s, found.order_table, max_radius)
+    exact = (
+        not found.order_table
+        and windows(lagged(u, y, found.past, feedthrough=found.feedthrough, offset=found.offset))[1]
+    )
+    again = _fit_all(
+        u,
+        y,
+        structure,
+        exact,
+        found.order,
+        found.fit,
+        found.plant.sample_time_s,
+        found.order_table,
+        max_radius,
+    )
     return again._replace(dropped_rows=again.dropped_rows + cut, notes=notes + _remarks(again, names))
 
 
-def _prepared(u, y, order, past, offset, limits, names) -> tuple[list[np.ndarray], list[np.ndarray], int, list[str]]:
-    """The record as it can be identified, checked: clipped at the limits, cut at masked inputs; how many samples that cost, and what was done, a sentence each."""
+def _prepared(
+    u, y, order, past, offset, limits, names
+) -> tuple[list[np.ndarray], list[np.ndarray], int, list[str]]:
+    """The record as it can be identified, checked: clipped at the limits, cut at masked inputs; how many
+    samples that cost, and what was done, a sentence each."""
     u, y = [np.atleast_2d(np.asarray(a, float)) for a in u], [np.atleast_2d(np.asarray(b, float)) for b in y]
     _check_shapes(u, y)
     whole = sum(map(len, u))
@@ -207,7 +259,12 @@ def _prepared(u, y, order, past, offset, limits, names) -> tuple[list[np.ndarray
     _check_length(u, y, order, past)
     check_inputs(u, offset=offset, names=names)
     check_outputs(y)
-    return u, y, cut, notes + ([f"{cut} samples with a masked input, or without any output, were cut out"] if cut else [])
+    return (
+        u,
+        y,
+        cut,
+        notes + ([f"{cut} samples with a masked input, or without any output, were cut out"] if cut else []),
+    )
 
 
 def _windows(u, y, order, past, offset) -> tuple[tuple[int, ...], bool]:
@@ -215,7 +272,9 @@ def _windows(u, y, order, past, offset) -> tuple[tuple[int, ...], bool]:
     if past:
         return (past,), False
     longest = longest_window(u, y)
-    pasts, exact = windows(lagged(u, y, min(longest, 6), offset=offset))  # a few lags tell whether the record is noise-free
+    pasts, exact = windows(
+        lagged(u, y, min(longest, 6), offset=offset)
+    )  # a few lags tell whether the record is noise-free
     if not exact:
         pasts, exact = windows(lagged(u, y, longest, offset=offset))
     least = -(-(order or 1) // y[0].shape[1])
@@ -223,34 +282,61 @@ def _windows(u, y, order, past, offset) -> tuple[tuple[int, ...], bool]:
 
 
 def _choose(u, y, structures, order, max_order, validated, settings) -> tuple[Candidate, list[Candidate]]:
-    """The candidate that the rules take, and the table: structures and orders of the subspace fit, then the refined fits of the winner."""
+    """The candidate that the rules take, and the table: structures and orders of the
+    subspace fit, then the refined fits of the winner."""
     table = []
     for structure in structures:
         data = lagged(u, y, structure.past, feedthrough=structure.feedthrough, offset=structure.offset)
         sub = subspace(data, structure.past)
         orders, delays, furthest = [order], {structure.delays}, max(data.past // 2, 1)
         if order is None:
-            largest = max(1, min(int((sub.singular_values > noise_edge(data, structure.past)).sum()), max_order, len(sub.singular_values)))
+            largest = max(
+                1,
+                min(
+                    int((sub.singular_values > noise_edge(data, structure.past)).sum()),
+                    max_order,
+                    len(sub.singular_values),
+                ),
+            )
             orders = range(1, largest + 1)
             model = realise(data, sub.basis[:largest], 1.0)
             quiet = np.minimum(tested_dead_times(data, furthest)[0], dead_time(model, furthest, 0.25))
             delays |= {dead_time(model, furthest), tuple(quiet.tolist())}
         for d in sorted(delays):
             table += cross_validate(
-                u, y, orders, structure._replace(delays=d), ("subspace",), singular_values=sub.singular_values, **settings
+                u,
+                y,
+                orders,
+                structure._replace(delays=d),
+                ("subspace",),
+                singular_values=sub.singular_values,
+                **settings,
             )
     if not table:
         raise ValueError(
-            f"the record is too short to choose a model by leaving out one of {settings['blocks']} blocks: {sum(map(len, u))} samples do not carry a window of"
+            f"the record is too short to choose a model by leaving out one of {settings['blocks']} blocks: "
+            f"{sum(map(len, u))} samples do not carry a window of"
             f" {structures[-1].past} without one; record longer, or give order and past"
         )
     chosen = simplest(table)
     if validated:
         known = {row.order: row.singular_value for row in table if row.structure == chosen.structure}
         values = np.array([known.get(n, np.nan) for n in range(1, chosen.order + 1)])
-        refined = cross_validate(u, y, [chosen.order], chosen.structure, ("prediction", "simulation"), singular_values=values, **settings)
+        refined = cross_validate(
+            u,
+            y,
+            [chosen.order],
+            chosen.structure,
+            ("prediction", "simulation"),
+            singular_values=values,
+            **settings,
+        )
         table += refined
-        best = min(refined, key=lambda row: row.error * (1 - WORTH_THE_NOISE) ** (row.fit == "prediction"), default=chosen)
+        best = min(
+            refined,
+            key=lambda row: row.error * (1 - WORTH_THE_NOISE) ** (row.fit == "prediction"),
+            default=chosen,
+        )
         chosen = best if best.error < (1 - WORTH_REFINING) * chosen.error else chosen
     return chosen, table
 
@@ -263,10 +349,13 @@ def _fit_all(u, y, structure, exact, order, kind, sample_time_s, table, max_radi
     sub = subspace(data, past)
     if order > len(sub.singular_values):
         raise ValueError(
-            f"order {order} needs a longer window: {past} past samples give at most {len(sub.singular_values)} states; raise past"
+            f"order {order} needs a longer window: {past} past samples give at most "
+            f"{len(sub.singular_values)} states; raise past"
         )
     plant = realise(data, sub.basis[:order], sample_time_s)
-    plant = with_delays(fit(kind, plant, us, ys, max_iterations=30, max_radius=max_radius, **rest), structure.delays)
+    plant = with_delays(
+        fit(kind, plant, us, ys, max_iterations=30, max_radius=max_radius, **rest), structure.delays
+    )
     model = simulation_form(plant, [])
     return Identified(
         plant=plant,
@@ -304,18 +393,24 @@ def _remarks(found: Identified, names: Sequence[str]) -> list[str]:
     ]
     determined = int((found.singular_values > found.noise_edge).sum())
     if found.order > max(determined, 1) and not found.order_table:
-        said.append(f"order {found.order} was asked but the record determines {determined} states above its noise; the others fit noise")
+        said.append(
+            f"order {found.order} was asked but the record determines {determined} states above its noise; "
+            "the others fit noise"
+        )
     radius = float(np.abs(np.linalg.eigvals(found.plant.A)).max())
     if radius > 1:
         said.append(
-            f"the largest pole is at {radius:.5f}, outside the unit circle; refine with a limit, or record longer, before simulating far ahead"
+            f"the largest pole is at {radius:.5f}, outside the unit circle; refine with a limit, "
+            "or record longer, before simulating far ahead"
         )
     return said
 
 
 def _check_shapes(u: Segments, y: Segments) -> None:
     if not u or len(u) != len(y):
-        raise ValueError(f"identify: expected as many segments of u as of y, at least one, but found {len(u)} and {len(y)}")
+        raise ValueError(
+            f"identify: expected as many segments of u as of y, at least one, but found {len(u)} and {len(y)}"
+        )
     for k, (a, b) in enumerate(zip(u, y, strict=True)):
         if (
             a.ndim != 2
@@ -326,33 +421,41 @@ def _check_shapes(u: Segments, y: Segments) -> None:
             or 0 in (a.shape[1], b.shape[1])
         ):
             raise ValueError(
-                f"identify: segment {k} has u of shape {a.shape} and y of shape {b.shape}; expected (T, {u[0].shape[1]}) and (T, {y[0].shape[1]}), one column at least"
+                f"identify: segment {k} has u of shape {a.shape} and y of shape {b.shape}; "
+                f"expected (T, {u[0].shape[1]}) and (T, {y[0].shape[1]}), one column at least"
             )
 
 
 def _check_length(u: Segments, y: Segments, order: int | None, past: int | None) -> None:
-    """Six complete samples for each unknown of the smallest window that carries the order, and as many unbroken windows as there are unknowns."""
+    """Six complete samples for each unknown of the smallest window that carries the order, and as many
+    unbroken windows as there are unknowns."""
     if not u:
-        raise ValueError("the record is empty: no sample has all inputs beside at least one output; check the mapping, and what was masked")
+        raise ValueError(
+            "the record is empty: no sample has all inputs beside at least one output; check the mapping, "
+            "and what was masked"
+        )
     p, q = y[0].shape[1], u[0].shape[1] + y[0].shape[1]
     lags = max(2, -(-(order or 1) // p) + 1)
     lengths = np.array([len(w) for w in complete_runs(u, y)])
     needed, samples = 6 * lags * q, int(lengths.sum())
     if samples < needed:
         raise ValueError(
-            f"the record is too short for order {order or 1}: expected at least {needed} complete samples, found {samples}; record {needed - samples} samples more"
+            f"the record is too short for order {order or 1}: expected at least {needed} complete samples, "
+            f"found {samples}; record {needed - samples} samples more"
         )
     lags = past or lags
     windows, unknowns = int(np.maximum(lengths - lags, 0).sum()), (lags + 1) * q + 1
     if windows < unknowns:
         raise ValueError(
-            f"the segments are too short for a window of {lags} samples: the longest complete stretch has {lengths.max()}, and {windows} windows do not determine"
+            f"the segments are too short for a window of {lags} samples: "
+            f"the longest complete stretch has {lengths.max()}, and {windows} windows do not determine"
             f" {unknowns} unknowns; record longer without gaps"
         )
 
 
 def rows(found: Identified) -> dict[str, list]:
-    """The table by which the order was chosen, as columns: every candidate, or the singular values alone where they decided."""
+    """The table by which the order was chosen, as columns: every candidate,
+    or the singular values alone where they decided."""
     structure = Structure(found.past, found.feedthrough, found.offset, found.delays)
     shown_rows = [row for row in found.order_table if row.structure == structure]
     tried = {row.order: row for row in shown_rows if row.fit == found.fit or row.order != found.order}

@@ -1,4 +1,5 @@
-"""Every controller of the temperature loop on one panel: built from what the stages learned, judged on plants that nothing was learned from."""
+"""Every controller of the temperature loop on one panel: built from what the stages learned,
+judged on plants that nothing was learned from."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -24,16 +25,25 @@ from pipeline.temperature.scorecard import (
     regret,
     simulate,
 )
-from pipeline.temperature.tracking import Law, feasible_target, gains, observer_gain, observer_law, robust_observer_gain
+from pipeline.temperature.tracking import (
+    Law,
+    feasible_target,
+    gains,
+    observer_gain,
+    observer_law,
+    robust_observer_gain,
+)
 
 Limits = tuple[np.ndarray, np.ndarray]
 Targets = dict[bytes, tuple[np.ndarray, np.ndarray]]
 
 
 class Controller(NamedTuple):
-    """One way to control: `design(q, r, integral)` gives its law for weights diag(q), diag(r); `model` is what its feasible targets are computed on.
+    """One way to control: `design(q, r, integral)` gives its law for weights diag(q), diag(r); `model` is
+    what its feasible targets are computed on.
 
-    `own_feed_forward`: unclipped, the law's own feed-forward is part of its optimum; a rule that has none aims at the target there too.
+    `own_feed_forward`: unclipped, the law's own feed-forward is part of its optimum;
+    a rule that has none aims at the target there too.
     """
 
     name: str
@@ -43,8 +53,9 @@ class Controller(NamedTuple):
 
 
 class Judged(NamedTuple):
-    """Of one controller: regret (scenarios,) unclipped under the yardstick, share of its unclipped commands outside the limits in percent, figures and margins as
-    deployed (clipped, aimed at feasible targets, integrator on), margins one a plant; and both runs."""
+    """Of one controller: regret (scenarios,) unclipped under the yardstick, share of its unclipped commands
+    outside the limits in percent, figures and margins as deployed (clipped, aimed at feasible targets,
+    integrator on), margins one a plant; and both runs."""
 
     name: str
     regret: np.ndarray
@@ -57,7 +68,8 @@ class Judged(NamedTuple):
 
 
 def model_based(plant: Plant, gamma: float, *, tau: float) -> Controller:
-    """Riccati gains of an identified model, and an observer that stands its errors (tracking.robust_observer_gain)."""
+    """Riccati gains of an identified model, and an observer that stands its errors
+    (tracking.robust_observer_gain)."""
     return _observed("model_based", plant, gamma, robust_observer_gain(plant, tau))
 
 
@@ -99,9 +111,11 @@ def baseline(plant: Plant, limits: Limits, *, horizon: int) -> Controller:
 
 
 def controllers(
-    model: Plant, long: window_route.Window, learned: Regression | None, *, limits: Limits, gamma: float, tau: float, exact_tau: float, horizon: int, truth: Plant | None
+    model: Plant, long: window_route.Window, learned: Regression | None, *, limits: Limits, gamma: float,
+    tau: float, exact_tau: float, horizon: int, truth: Plant | None
 ) -> list[Controller]:  # fmt: skip
-    """All that the scorecard compares; the kernel where it could be learned, and where the true plant is known a controller that was told its model, as a yardstick."""
+    """All that the scorecard compares; the kernel where it could be learned, and where the true plant is
+    known a controller that was told its model, as a yardstick."""
     found = [model_based(model, gamma, tau=tau), window(long, gamma)]
     if learned is not None:
         found.append(kernel(learned, gamma, found[1].model))
@@ -109,8 +123,11 @@ def controllers(
     return [*found, exact_model(truth, gamma, tau=exact_tau)] if truth is not None else found
 
 
-def refusals(compared: Sequence[Controller], designs: Sequence[tuple[np.ndarray, np.ndarray]]) -> dict[str, str]:
-    """The controllers that have no law for one of these (q, r), each with the reason: a kernel can be learned, and still have no minimum at other weights."""
+def refusals(
+    compared: Sequence[Controller], designs: Sequence[tuple[np.ndarray, np.ndarray]]
+) -> dict[str, str]:
+    """The controllers that have no law for one of these (q, r), each with the reason: a kernel can be
+    learned, and still have no minimum at other weights."""
     found = {}
     for controller in compared:
         for q, r in designs:
@@ -122,7 +139,8 @@ def refusals(compared: Sequence[Controller], designs: Sequence[tuple[np.ndarray,
 
 
 def targets(model: Plant, references: np.ndarray, limits: Limits) -> Targets:
-    """The feasible steady (u, y) of every reference (scenarios, p) on the panel, by the controller's own model."""
+    """The feasible steady (u, y) of every reference (scenarios, p) on
+    the panel, by the controller's own model."""
     found = {}
     for r in np.unique(references, axis=0):
         aim = feasible_target(model, r, *limits)
@@ -131,39 +149,63 @@ def targets(model: Plant, references: np.ndarray, limits: Limits) -> Targets:
 
 
 def judge(
-    controller: Controller, scenarios: Panel, *, yardstick: Yardstick, q: np.ndarray, r: np.ndarray, limits: Limits, band: float, integral: float, integral_limit: float
+    controller: Controller, scenarios: Panel, *, yardstick: Yardstick, q: np.ndarray, r: np.ndarray,
+    limits: Limits, band: float, integral: float, integral_limit: float
 ) -> Judged:  # fmt: skip
-    """Run one controller on the panel twice: designed for the yardstick's weights and unclipped; designed for (q, r), clipped, as it would be deployed."""
+    """Run one controller on the panel twice: designed for the yardstick's weights and unclipped; designed for
+    (q, r), clipped, as it would be deployed."""
     plain = controller.design(yardstick.q, yardstick.r, 0.0)
     aims = targets(controller.model, scenarios.r, limits)
-    unclipped = simulate(scenarios, plain, feed_forward(scenarios, plain, None if controller.own_feed_forward else aims), limits=None)
+    unclipped = simulate(
+        scenarios,
+        plain,
+        feed_forward(scenarios, plain, None if controller.own_feed_forward else aims),
+        limits=None,
+    )
     outside = (unclipped.command < limits[0]) | (unclipped.command > limits[1])
     law = controller.design(q, r, integral)
-    deployed = simulate(scenarios, law, feed_forward(scenarios, law, aims), limits=limits, integral_band=integral_limit)
+    deployed = simulate(
+        scenarios, law, feed_forward(scenarios, law, aims), limits=limits, integral_band=integral_limit
+    )
     sample_time_s = scenarios.plants[0].sample_time_s
     return Judged(
-        controller.name, regret(cost(scenarios, unclipped, yardstick), optimum(scenarios, yardstick)), 100.0 * outside.mean(axis=(0, 2)),
-        figures(scenarios, deployed, limits=limits, band=band, sample_time_s=sample_time_s), margins(scenarios.plants, law), unclipped, deployed, law,
+        controller.name, regret(cost(scenarios, unclipped, yardstick), optimum(scenarios, yardstick)),
+        100.0 * outside.mean(axis=(0, 2)),
+        figures(scenarios, deployed, limits=limits, band=band, sample_time_s=sample_time_s),
+        margins(scenarios.plants, law), unclipped, deployed, law,
     )  # fmt: skip
 
 
 def summary(judged: Judged, scenarios: Panel, *, noise: float) -> dict[str, dict[str, float | str | None]]:
-    """Median and 90 % band over starts, references and seeds on the nominal plant at one noise level, and the worst over every plant of the panel."""
+    """Median and 90 % band over starts, references and seeds on the nominal plant at one noise level, and the
+    worst over every plant of the panel."""
     nominal, level = scenarios.plant == 0, scenarios.noise == noise
     columns = {
         "gap_percent": 100.0 * judged.regret,
         **{
             name: getattr(judged.figures, name)
-            for name in ("settled_error_degC", "settling_s", "overshoot_degC", "at_limits_percent", "tracking_degC", "effort_percent")
+            for name in (
+                "settled_error_degC",
+                "settling_s",
+                "overshoot_degC",
+                "at_limits_percent",
+                "tracking_degC",
+                "effort_percent",
+            )
         },
         "outside_limits_percent": judged.outside_percent,
     }
     result: dict[str, dict] = {}
     for name, values in columns.items():
         # a run that never settles is infinitely late: it sorts last, and shows as null
-        typical, worst = (np.where(np.isnan(values[rows]), np.inf, values[rows]) for rows in (nominal & level, level))
+        typical, worst = (
+            np.where(np.isnan(values[rows]), np.inf, values[rows]) for rows in (nominal & level, level)
+        )
         low, median, high = np.quantile(typical, [0.05, 0.5, 0.95], method="nearest")
-        result[name] = {key: _number(value) for key, value in (("median", median), ("low", low), ("high", high), ("worst", worst.max()))}
+        result[name] = {
+            key: _number(value)
+            for key, value in (("median", median), ("low", low), ("high", high), ("worst", worst.max()))
+        }
     for name in ("disk", "delay_s"):
         values = np.array([getattr(margin, name) for margin in judged.margins])
         result[name] = {
@@ -174,7 +216,10 @@ def summary(judged: Judged, scenarios: Panel, *, noise: float) -> dict[str, dict
         }
     worst = np.where(nominal & level, judged.figures.settled_error_degC, -1.0).argmax()
     result["settled_error_degC"]["zone"] = int(judged.figures.settled_zone[worst])
-    result["stable_plants"] = {"count": sum(margin.stable for margin in judged.margins), "of": len(judged.margins)}
+    result["stable_plants"] = {
+        "count": sum(margin.stable for margin in judged.margins),
+        "of": len(judged.margins),
+    }
     return result
 
 
@@ -183,8 +228,9 @@ def _number(value: float) -> float | None:
 
 
 class Sufficiency(NamedTuple):
-    """`half_gap`: what a controller learned from half of the record costs more than one from all of it, on the model from all of it; `needed`: the samples at which
-    a controller from all of them would cost `allowed` more than the best, since the excess falls as one over the samples."""
+    """`half_gap`: what a controller learned from half of the record costs more than one from all of it, on
+    the model from all of it; `needed`: the samples at which a controller from all of them would cost
+    `allowed` more than the best, since the excess falls as one over the samples."""
 
     half_gap: float
     samples: int
@@ -192,30 +238,63 @@ class Sufficiency(NamedTuple):
 
 
 def sufficiency(
-    u: Sequence[np.ndarray], y: Sequence[np.ndarray], learned: window_route.Window, yardstick: Yardstick, *, start: float, reference: np.ndarray, allowed: float, offset: bool,
+    u: Sequence[np.ndarray], y: Sequence[np.ndarray], learned: window_route.Window, yardstick: Yardstick, *,
+    start: float, reference: np.ndarray, allowed: float, offset: bool,
     gain_spread: float, steps: int,
 ) -> Sufficiency:  # fmt: skip
-    """Whether the record is long enough for its noise, asked of the record alone: learn from each half of it, judge by the model of the whole."""
+    """Whether the record is long enough for its noise, asked of the record alone: learn from each half of it,
+    judge by the model of the whole."""
     model = window_route.predictor(learned)
-    scenarios = panel([model], starts=[start], references=[reference], noise=[0.0], seeds=[0], steps=steps, hold=0, cells=False)
+    scenarios = panel(
+        [model],
+        starts=[start],
+        references=[reference],
+        noise=[0.0],
+        seeds=[0],
+        steps=steps,
+        hold=0,
+        cells=False,
+    )
     best = optimum(scenarios, yardstick)
     gaps = []
     for part in (0, 1):
         halves = [
-            (us[part * len(us) // 2 : (part + 1) * len(us) // 2], ys[part * len(ys) // 2 : (part + 1) * len(ys) // 2])
+            (
+                us[part * len(us) // 2 : (part + 1) * len(us) // 2],
+                ys[part * len(ys) // 2 : (part + 1) * len(ys) // 2],
+            )
             for us, ys in zip(u, y, strict=True)
         ]
-        half = window_route.learn([h[0] for h in halves], [h[1] for h in halves], longest=learned.N, offset=offset, gain_spread=gain_spread)
+        half = window_route.learn(
+            [h[0] for h in halves],
+            [h[1] for h in halves],
+            longest=learned.N,
+            offset=offset,
+            gain_spread=gain_spread,
+        )
         law = window_route.law(half, np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma)
-        gaps.append(regret(cost(scenarios, simulate(scenarios, law, feed_forward(scenarios, law, None), limits=None), yardstick), best)[0])
+        gaps.append(
+            regret(
+                cost(
+                    scenarios,
+                    simulate(scenarios, law, feed_forward(scenarios, law, None), limits=None),
+                    yardstick,
+                ),
+                best,
+            )[0]
+        )
     half_gap = float(np.mean(gaps))
-    # never fewer than twice the numbers of one output's predictor: below that the half-record test itself means nothing
-    needed = max(np.ceil(learned.samples * min(half_gap / 2 / allowed, 1e3)), 2 * (learned.Theta.shape[1] + offset))
+    # never fewer than twice the numbers of one output's predictor:
+    # below that the half-record test itself means nothing
+    needed = max(
+        np.ceil(learned.samples * min(half_gap / 2 / allowed, 1e3)), 2 * (learned.Theta.shape[1] + offset)
+    )
     return Sufficiency(half_gap, learned.samples, int(needed))
 
 
 class Candidate(NamedTuple):
-    """One state that Algorithm 2 was tried on: what it found, the gap of its gain on the window's model (inf where it was refused), and the sentence of a refusal."""
+    """One state that Algorithm 2 was tried on: what it found, the gap of its gain on the window's model (inf
+    where it was refused), and the sentence of a refusal."""
 
     state: str
     learned: Regression | None
@@ -224,14 +303,26 @@ class Candidate(NamedTuple):
 
 
 def kernel_candidates(
-    u: Sequence[np.ndarray], y: Sequence[np.ndarray], long: window_route.Window, yardstick: Yardstick, *, largest: int, offset: bool, start: float, reference: np.ndarray, steps: int
+    u: Sequence[np.ndarray], y: Sequence[np.ndarray], long: window_route.Window, yardstick: Yardstick, *,
+    largest: int, offset: bool, start: float, reference: np.ndarray, steps: int
 ) -> list[Candidate]:  # fmt: skip
-    """Algorithm 2 on windows of 1 to `largest` samples and on the predicted state, each checked on the model of the long window: all from the one record.
+    """Algorithm 2 on windows of 1 to `largest` samples and on the predicted state, each checked on the model
+    of the long window: all from the one record.
 
-    The shortest window that holds the plant's state is exact without noise; with noise longer ones are biased, and the predicted state is not.
+    The shortest window that holds the plant's state is exact without noise; with noise longer ones are
+    biased, and the predicted state is not.
     """
     model = window_route.predictor(long)
-    scenarios = panel([model], starts=[start], references=[reference], noise=[0.0], seeds=[0], steps=steps, hold=0, cells=False)
+    scenarios = panel(
+        [model],
+        starts=[start],
+        references=[reference],
+        noise=[0.0],
+        seeds=[0],
+        steps=steps,
+        hold=0,
+        cells=False,
+    )
     best = optimum(scenarios, yardstick)
     tried = [(f"window of {N}", lambda N=N: tuples(u, y, N, offset=offset)) for N in range(1, largest + 1)]
     tried.append(("predicted state", lambda: window_route.predicted_tuples(long, u, y, offset=offset)))
@@ -275,14 +366,28 @@ def featured(scenarios: Panel, noise: float) -> int:
 
 
 def trajectories(
-    judged: Sequence[Judged], scenarios: Panel, inputs: Sequence[str], outputs: Sequence[str], *, noise: float, yardstick: Yardstick
+    judged: Sequence[Judged],
+    scenarios: Panel,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    *,
+    noise: float,
+    yardstick: Yardstick,
 ) -> dict[str, list | np.ndarray]:
-    """The featured scenario under every controller, in both modes, as columns; beside it the worst zone's error of all runs on the nominal plant, 5th, 50th and 95th percentile."""
+    """The featured scenario under every controller, in both modes, as columns; beside it the worst zone's
+    error of all runs on the nominal plant, 5th, 50th and 95th percentile."""
     i, alike = featured(scenarios, noise), (scenarios.plant == 0) & (scenarios.noise == noise)
-    runs = [(j.name, mode, run) for j in judged for mode, run in (("unclipped", j.unclipped), ("deployed", j.deployed))]
+    runs = [
+        (j.name, mode, run)
+        for j in judged
+        for mode, run in (("unclipped", j.unclipped), ("deployed", j.deployed))
+    ]
     time_s = scenarios.plants[0].sample_time_s * np.arange(scenarios.steps)
     discount = yardstick.gamma ** np.arange(scenarios.steps)
-    stages = [discount * ((run.y[:, i] - scenarios.r[i]) ** 2 @ yardstick.q + run.u[:, i] ** 2 @ yardstick.r) for _, _, run in runs]
+    stages = [
+        discount * ((run.y[:, i] - scenarios.r[i]) ** 2 @ yardstick.q + run.u[:, i] ** 2 @ yardstick.r)
+        for _, _, run in runs
+    ]
     columns: dict[str, list | np.ndarray] = {
         "controller": [name for name, _, _ in runs for _ in time_s],
         "mode": [mode for _, mode, _ in runs for _ in time_s],
@@ -290,10 +395,18 @@ def trajectories(
         "cost": np.concatenate([np.cumsum(stage) for stage in stages]),
     }
     worst = [
-        np.quantile(np.abs(run.y[:, alike] - scenarios.r[alike]).max(axis=2), [0.05, 0.5, 0.95], axis=1, method="nearest")
+        np.quantile(
+            np.abs(run.y[:, alike] - scenarios.r[alike]).max(axis=2),
+            [0.05, 0.5, 0.95],
+            axis=1,
+            method="nearest",
+        )
         for _, _, run in runs
     ]
-    columns |= {f"error_{name}_degC": np.concatenate([found[k] for found in worst]) for k, name in enumerate(("low", "median", "high"))}
+    columns |= {
+        f"error_{name}_degC": np.concatenate([found[k] for found in worst])
+        for k, name in enumerate(("low", "median", "high"))
+    }
     for channel, name in enumerate(outputs):
         columns[name] = np.concatenate([run.y[:, i, channel] for _, _, run in runs])
     for channel, name in enumerate(inputs):

@@ -1,5 +1,5 @@
-"""Which window, feed-through, dead time, order and fit: criteria propose, then every candidate is identified without one block of the record and simulated on it
-(cross-validation), and the simplest good one wins."""
+"""Which window, feed-through, dead time, order and fit: criteria propose, then every candidate is identified
+without one block of the record and simulated on it (cross-validation), and the simplest good one wins."""
 
 from typing import Literal, NamedTuple
 
@@ -9,23 +9,37 @@ import scipy.stats
 
 from pipeline.temperature.plant import Plant, drawn_in, markov_parameters
 from pipeline.temperature.plant import plant as make_plant
-from pipeline.temperature.refinement import drives, fit_inputs, fitted_state, free_response, kalman_gain, refine, respond, simulation_form
+from pipeline.temperature.refinement import (
+    drives,
+    fit_inputs,
+    fitted_state,
+    free_response,
+    kalman_gain,
+    refine,
+    respond,
+    simulation_form,
+)
 from pipeline.temperature.subspace import Lagged, Segments, complete_runs, lagged, one_step, realise, subspace
 
 Fit = Literal["subspace", "prediction", "simulation"]
 NOISE_FREE = 1e-10  # share of the outputs' power that a noise-free record's one-step errors stay under
 WIDEST = 360  # columns of the lagged record: the cost of a fit grows with their square
-WORTH_REFINING = 0.05  # a refined fit must take this share off the error: its own cost of computing and of fitting noise
-WORTH_THE_NOISE = (
-    0.2  # a simulation fit must take this share off a prediction fit's error: it leaves no model of the noise, and a tracker needs one
+WORTH_REFINING = (
+    0.05  # a refined fit must take this share off the error: its own cost of computing and of fitting noise
 )
-WORTH_A_STATE = 0.02  # a state that takes less than this share off the error is not worth carrying in a controller
+WORTH_THE_NOISE = 0.2  # a simulation fit must take this share off a prediction fit's error: it leaves no model of the noise, and a tracker needs one
+WORTH_A_STATE = (
+    0.02  # a state that takes less than this share off the error is not worth carrying in a controller
+)
 SMALLEST = 1e-9  # share of an output's variation below which an error is rounding
-LARGEST_RADIUS = 1.0 - 1e-6  # of the plants of a spread, which are simulated for ever: no record shows a time constant of a million samples
+LARGEST_RADIUS = (
+    1.0 - 1e-6
+)  # of the plants of a spread, which are simulated for ever: no record shows a time constant of a million samples
 
 
 class Structure(NamedTuple):
-    """What is fixed before an order is: window (samples), direct feed-through, offset, and the dead time of each input (samples)."""
+    """What is fixed before an order is: window (samples), direct feed-through,
+    offset, and the dead time of each input (samples)."""
 
     past: int
     feedthrough: bool
@@ -34,7 +48,8 @@ class Structure(NamedTuple):
 
 
 class Candidate(NamedTuple):
-    """One row of the order table: the model's class, and its error on each left-out block (share of each output's variation about the block mean, 1 = no better)."""
+    """One row of the order table: the model's class, and its error on each left-out block (share of each
+    output's variation about the block mean, 1 = no better)."""
 
     order: int
     structure: Structure
@@ -49,21 +64,27 @@ class Candidate(NamedTuple):
 
     @property
     def error(self) -> float:
-        """Geometric mean over the blocks: a block that a disturbance spoils for every candidate then weighs no more than the others."""
+        """Geometric mean over the blocks: a block that a disturbance spoils for
+        every candidate then weighs no more than the others."""
         return float(np.exp(np.mean(np.log(self.errors))))
 
 
 def longest_window(u: Segments, y: Segments) -> int:
-    """Most lags that leave four complete windows for each unknown of a VARX model, within the width that is paid for; 1 where the record is shorter than that."""
+    """Most lags that leave four complete windows for each unknown of a VARX model, within the width that is
+    paid for; 1 where the record is shorter than that."""
     q, lengths = u[0].shape[1] + y[0].shape[1], np.array([len(w) for w in complete_runs(u, y)])
-    supported = [past for past in range(2, WIDEST // q + 1) if np.maximum(lengths - past, 0).sum() >= 4 * q * past]
+    supported = [
+        past for past in range(2, WIDEST // q + 1) if np.maximum(lengths - past, 0).sum() >= 4 * q * past
+    ]
     return max(supported, default=1)
 
 
 def windows(data: Lagged) -> tuple[tuple[int, ...], bool]:
-    """Windows worth trying: twice the lags with the least corrected Akaike criterion (Bauer 2005: a subspace method's window must outgrow it), and Schwarz's lags.
+    """Windows worth trying: twice the lags with the least corrected Akaike criterion (Bauer 2005: a subspace
+    method's window must outgrow it), and Schwarz's lags.
 
-    True beside the shortest window that predicts to rounding, where there is one: the record is noise-free. The errors of every lag stand in the one factor.
+    True beside the shortest window that predicts to rounding, where there is one: the record is noise-free.
+    The errors of every lag stand in the one factor.
     """
     p, whole, akaike, schwarz = data.p, np.sum(data.R[:, data.now_y] ** 2), (np.inf, 1), (np.inf, 1)
     for past in range(1, data.past + 1):
@@ -76,16 +97,21 @@ def windows(data: Lagged) -> tuple[tuple[int, ...], bool]:
         schwarz = min(schwarz, (misfit + count * np.log(data.rows), past))
         if numbers > count + 1:
             akaike = min(akaike, (misfit + 2 * count * numbers / (numbers - count - 1), past))
-    return tuple(sorted({max(schwarz[1], min(2, data.past)), min(2 * akaike[1], data.past)}, reverse=True)), False
+    return tuple(
+        sorted({max(schwarz[1], min(2, data.past)), min(2 * akaike[1], data.past)}, reverse=True)
+    ), False
 
 
 def feedthrough_shows(u: Segments, y: Segments, past: int, offset: bool) -> bool:
-    """Whether Schwarz's criterion of the one-step predictor falls when u(t) is added to it. So it does too where a controller answers y(t) at once: the blocks decide."""
+    """Whether Schwarz's criterion of the one-step predictor falls when u(t) is added to it. So it does too
+    where a controller answers y(t) at once: the blocks decide."""
     criterion = []
     for feedthrough in (False, True):
         data = lagged(u, y, past, feedthrough=feedthrough, offset=offset)
         coefficients, errors = one_step(data, past)
-        criterion.append(data.rows * log_det(errors.T @ errors / data.rows) + np.log(data.rows) * coefficients.size)
+        criterion.append(
+            data.rows * log_det(errors.T @ errors / data.rows) + np.log(data.rows) * coefficients.size
+        )
     return bool(criterion[1] < criterion[0])
 
 
@@ -95,22 +121,27 @@ def log_det(S: np.ndarray) -> float:
 
 
 def dead_time(plant: Plant, longest: int, share: float = 0.05) -> tuple[int, ...]:
-    """Samples, for each input, beyond the one that every strictly proper plant has, before any output answers with `share` of its peak impulse response."""
+    """Samples, for each input, beyond the one that every strictly proper plant has, before any output answers
+    with `share` of its peak impulse response."""
     h = np.abs(markov_parameters(plant, 10 * longest))
     started = (h >= share * h.max(axis=0)).any(axis=1)
     return tuple(min(int(np.argmax(started[:, j])), longest) for j in range(plant.m))
 
 
 def tested_dead_times(data: Lagged, longest: int) -> tuple[tuple[int, ...], tuple[bool, ...]]:
-    """For each input, the lags 1..k that together do not differ from zero in the one-step predictor, and whether no lag at all does (Wald's test at 99.9 %).
+    """For each input, the lags 1..k that together do not differ from zero in the one-step predictor, and
+    whether no lag at all does (Wald's test at 99.9 %).
 
-    A delay at an input is a delay in its predictor too: B_1 ... B_delay of the VARX model are zero, in closed loop as well.
+    A delay at an input is a delay in its predictor too: B_1 ... B_delay
+    of the VARX model are zero, in closed loop as well.
     """
     m, p, first = data.m, data.p, data.m if data.feedthrough else 0
     coefficients, errors = one_step(data, data.past)
     k = len(coefficients)
     S = errors.T @ errors / max(data.rows - k, 1)
-    G = scipy.linalg.solve_triangular(data.R[:k, :k] + 1e-12 * np.diag(np.abs(np.diag(data.R))[:k]), np.eye(k))
+    G = scipy.linalg.solve_triangular(
+        data.R[:k, :k] + 1e-12 * np.diag(np.abs(np.diag(data.R))[:k]), np.eye(k)
+    )
     whiten = np.linalg.pinv(np.linalg.cholesky(S + np.eye(p) * (1e-12 * np.trace(S) + np.finfo(float).tiny)))
     late, silent = [], []
     for j in range(m):
@@ -131,9 +162,11 @@ def tested_dead_times(data: Lagged, longest: int) -> tuple[tuple[int, ...], tupl
 
 
 def noise_edge(data: Lagged, past: int) -> float:
-    """sqrt(2) (sqrt(past p) + sqrt(past (m+p))): above what the coefficients' error alone puts into the singular values.
+    """sqrt(2) (sqrt(past p) + sqrt(past (m+p))): above what the
+    coefficients' error alone puts into the singular values.
 
-    A matrix of independent unit noise of that shape stays under the bracket; here each error stands in up to `past` rows, which adds some tenth (measured).
+    A matrix of independent unit noise of that shape stays under the bracket; here each error stands in up to
+    `past` rows, which adds some tenth (measured).
     """
     return float(np.sqrt(2) * (np.sqrt(past * data.p) + np.sqrt(past * (data.m + data.p))))
 
@@ -141,15 +174,23 @@ def noise_edge(data: Lagged, past: int) -> float:
 def shifted(u: Segments, y: Segments, delays: tuple[int, ...]) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """u_j(t - delay_j) beside y(t), the first max(delays) samples of each segment left out."""
     most = max(delays)
-    return [np.column_stack([a[most - d : len(a) - d, j] for j, d in enumerate(delays)]) for a in u], [b[most:] for b in y]
+    return [np.column_stack([a[most - d : len(a) - d, j] for j, d in enumerate(delays)]) for a in u], [
+        b[most:] for b in y
+    ]
 
 
 def with_delays(plant: Plant, delays: tuple[int, ...]) -> Plant:
-    """The plant behind a chain of delays: u_j(t-1) ... u_j(t-delay_j) become states, and B_j acts through the last of them."""
+    """The plant behind a chain of delays: u_j(t-1) ... u_j(t-delay_j)
+    become states, and B_j acts through the last of them."""
     if not any(delays):
         return plant
     n, size = plant.n, plant.n + sum(delays)
-    A, B, C, D = np.zeros((size, size)), np.zeros((size, plant.m)), np.zeros((plant.p, size)), np.zeros_like(plant.D)
+    A, B, C, D = (
+        np.zeros((size, size)),
+        np.zeros((size, plant.m)),
+        np.zeros((plant.p, size)),
+        np.zeros_like(plant.D),
+    )
     A[:n, :n], C[:, :n], at = plant.A, plant.C, n
     for j, delay in enumerate(delays):
         if delay == 0:
@@ -160,7 +201,16 @@ def with_delays(plant: Plant, delays: tuple[int, ...]) -> Plant:
         A[:n, at + delay - 1], C[:, at + delay - 1] = plant.B[:, j], plant.D[:, j]
         at += delay
     rest = np.zeros(size - n)
-    return make_plant(A, B, C, D, np.r_[plant.b, rest], plant.d, np.vstack([plant.K, np.zeros((size - n, plant.p))]), plant.sample_time_s)
+    return make_plant(
+        A,
+        B,
+        C,
+        D,
+        np.r_[plant.b, rest],
+        plant.d,
+        np.vstack([plant.K, np.zeros((size - n, plant.p))]),
+        plant.sample_time_s,
+    )
 
 
 def stabilised(plant: Plant, radius: float) -> Plant:
@@ -169,29 +219,42 @@ def stabilised(plant: Plant, radius: float) -> Plant:
 
 
 def simulation_errors(plant: Plant, u: Segments, y: Segments) -> np.ndarray:
-    """For each segment and output, the size of the simulation error as a share of the output's variation, at most 1; shape (segments, p).
+    """For each segment and output, the size of the simulation error as a share of the
+    output's variation, at most 1; shape (segments, p).
 
-    Half of the error as it is and half of the error about its mean: the ambient, which no order can foretell, is charged by half. The initial state is fitted to the
-    segment. A plant whose simulation overflows counts as no better than the mean.
+    Half of the error as it is and half of the error about its mean: the ambient, which no order can
+    foretell, is charged by half. The initial state is fitted to the segment. A plant whose
+    simulation overflows counts as no better than the mean.
     """
     model, shares = simulation_form(plant, []), []
     for a, b in zip(u, y, strict=True):
         with np.errstate(over="ignore", invalid="ignore"):
-            error, gamma = b - respond(model, drives("simulation", a, b), np.zeros(plant.n))[1], free_response(model, len(b))
-        if not (np.isfinite(error) | np.isnan(b)).all() or not np.isfinite(gamma).all() or np.abs(gamma).max() > 1e100:
+            error, gamma = (
+                b - respond(model, drives("simulation", a, b), np.zeros(plant.n))[1],
+                free_response(model, len(b)),
+            )
+        if (
+            not (np.isfinite(error) | np.isnan(b)).all()
+            or not np.isfinite(gamma).all()
+            or np.abs(gamma).max() > 1e100
+        ):
             shares.append(np.ones(plant.p))
             continue
         spread = np.maximum(np.nanstd(b, axis=0), np.finfo(float).tiny)
-        whole = np.sqrt(np.nanmean((error - gamma @ fitted_state(gamma, error, free_mean=False)) ** 2, axis=0))
+        whole = np.sqrt(
+            np.nanmean((error - gamma @ fitted_state(gamma, error, free_mean=False)) ** 2, axis=0)
+        )
         about_mean = np.nanstd(error - gamma @ fitted_state(gamma, error, free_mean=True)[: plant.n], axis=0)
         shares.append((np.minimum(whole / spread, 1.0) + np.minimum(about_mean / spread, 1.0)) / 2)
     return np.nan_to_num(np.array(shares), nan=1.0)
 
 
 def folds(u: Segments, y: Segments, count: int) -> list[tuple[list, list, list, list]]:
-    """(u, y, u left out, y left out) with one of `count` blocks of each segment left out in turn; what remains on either side are segments of their own.
+    """(u, y, u left out, y left out) with one of `count` blocks of each segment left out in turn; what
+    remains on either side are segments of their own.
 
-    Of several segments, those too short to be cut into blocks of 10 samples are left out whole, every count-th of them in turn.
+    Of several segments, those too short to be cut into blocks of 10 samples
+    are left out whole, every count-th of them in turn.
     """
     out = []
     for k in range(count):
@@ -210,7 +273,8 @@ def folds(u: Segments, y: Segments, count: int) -> list[tuple[list, list, list, 
 
 
 def largest_radius(u: Segments) -> float:
-    """e^(3/T): a mode that refinement leaves in the plant may grow 20-fold over the longest segment of T samples, no more; so slow an instability is real or harmless."""
+    """e^(3/T): a mode that refinement leaves in the plant may grow 20-fold over the longest segment of T
+    samples, no more; so slow an instability is real or harmless."""
     return float(np.exp(3.0 / max(map(len, u))))
 
 
@@ -226,9 +290,11 @@ def fit(
     max_radius: float | None = None,
     gain: bool = True,
 ) -> Plant:
-    """The plant that the named fit makes of the subspace start: the start itself, refined on one-step errors, or refined on simulation errors.
+    """The plant that the named fit makes of the subspace start: the start itself, refined
+    on one-step errors, or refined on simulation errors.
 
-    Every pole stays within `max_radius` where given, and a refined plant's within `largest_radius`. `gain` False leaves a plant refined on simulation errors without K.
+    Every pole stays within `max_radius` where given, and a refined plant's within `largest_radius`. `gain`
+    False leaves a plant refined on simulation errors without K.
     """
     radius = max_radius or largest_radius(u)
     if kind == "subspace":
@@ -239,16 +305,39 @@ def fit(
     if kind == "simulation":
         linear = fit_inputs(start.A, start.C, u, y, feedthrough=feedthrough, offset=offset)
         m = start.m
-        start = make_plant(linear.F, linear.G[:, :m], linear.C, linear.H[:, :m], linear.G[:, m], linear.H[:, m], None, start.sample_time_s)
-    settings = {"feedthrough": feedthrough, "offset": offset, "max_radius": radius * (1 + 1e-12), "max_iterations": max_iterations}
+        start = make_plant(
+            linear.F,
+            linear.G[:, :m],
+            linear.C,
+            linear.H[:, :m],
+            linear.G[:, m],
+            linear.H[:, m],
+            None,
+            start.sample_time_s,
+        )
+    settings = {
+        "feedthrough": feedthrough,
+        "offset": offset,
+        "max_radius": radius * (1 + 1e-12),
+        "max_iterations": max_iterations,
+    }
     found = refine(start, u, y, criterion=kind, **settings).plant
     return kalman_gain(found, u, y) if gain and kind == "simulation" else found
 
 
 def cross_validate(
-    u, y, orders, structure: Structure, kinds: tuple[Fit, ...], *, blocks: int, singular_values, max_radius: float | None = None
+    u,
+    y,
+    orders,
+    structure: Structure,
+    kinds: tuple[Fit, ...],
+    *,
+    blocks: int,
+    singular_values,
+    max_radius: float | None = None,
 ) -> list[Candidate]:
-    """The order table's rows for one structure: each order and fit, identified without a block and simulated on it, for each of `blocks` blocks.
+    """The order table's rows for one structure: each order and fit, identified without a block and simulated
+    on it, for each of `blocks` blocks.
 
     A structure whose window does not fit into what remains of the record has no rows.
     """
@@ -263,8 +352,12 @@ def cross_validate(
         for order in orders:
             start = realise(data, basis[:order], 1.0)
             for kind in kinds:
-                plant = fit(kind, start, train_u, train_y, **rest, max_iterations=8, max_radius=max_radius, gain=False)
-                errors.setdefault((order, kind), []).append(max(float(simulation_errors(plant, test_u, test_y).mean()), SMALLEST))
+                plant = fit(
+                    kind, start, train_u, train_y, **rest, max_iterations=8, max_radius=max_radius, gain=False
+                )
+                errors.setdefault((order, kind), []).append(
+                    max(float(simulation_errors(plant, test_u, test_y).mean()), SMALLEST)
+                )
     m, p = u[0].shape[1], y[0].shape[1]
     more = (
         p * m * structure.feedthrough + p * structure.offset + (m + p) * sum(map(bool, structure.delays))
@@ -278,8 +371,12 @@ def cross_validate(
 def simplest(table: list[Candidate]) -> Candidate:
     """The row with the fewest parameters whose error is within 2 % of the best row's.
 
-    Not within one standard error: five blocks of which one holds a disturbance have so wide a one that models much too small pass, and these cost more on new
-    data than models somewhat too large (measured on the records of benchmarks/foreign_records.py).
+    Not within one standard error: five blocks of which one holds a disturbance have so wide a one that models
+    much too small pass, and these cost more on new data than models somewhat too large (measured on the
+    records of benchmarks/foreign_records.py).
     """
     best = min(row.error for row in table)
-    return min((row for row in table if row.error <= (1 + WORTH_A_STATE) * best), key=lambda row: (row.parameters, row.error))
+    return min(
+        (row for row in table if row.error <= (1 + WORTH_A_STATE) * best),
+        key=lambda row: (row.parameters, row.error),
+    )

@@ -1,4 +1,5 @@
-"""The plant of loop 1: a state-space model of heaters and motor -> barrel temperatures, the constants of the BAAM study, simulation and plant spread."""
+"""The plant of loop 1: a state-space model of heaters and motor -> barrel temperatures, the constants of the
+BAAM study, simulation and plant spread."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -8,9 +9,11 @@ import scipy.linalg
 
 
 class Plant(NamedTuple):
-    """x(t+1) = A x + B u + b + K e,  y = C x + D u + d + e   (seed 1, (1), with an offset and the innovation form of an identified model).
+    """x(t+1) = A x + B u + b + K e, y = C x + D u + d + e (seed 1, (1), with an
+    offset and the innovation form of an identified model).
 
-    A (n, n), B (n, m), C (p, n), D (p, m), b (n,), d (p,), K (n, p) the Kalman gain; one step is `sample_time_s` seconds, u in percent of duty, y in °C.
+    A (n, n), B (n, m), C (p, n), D (p, m), b (n,), d (p,), K (n, p) the Kalman gain; one step is
+    `sample_time_s` seconds, u in percent of duty, y in °C.
     """
 
     A: np.ndarray
@@ -36,27 +39,40 @@ class Plant(NamedTuple):
 
 
 def plant(A, B, C, D=None, b=None, d=None, K=None, sample_time_s: float = 1.0) -> Plant:
-    """A Plant with the shapes checked; what is left out is zero. Raises ValueError naming the matrix, the shape expected and the shape found."""
+    """A Plant with the shapes checked; what is left out is zero. Raises ValueError naming the matrix, the
+    shape expected and the shape found."""
     A, B, C = (np.atleast_2d(np.asarray(M, float)) for M in (A, B, C))
     n, m, p = A.shape[0], B.shape[1], C.shape[0]
     expected = {"A": (n, n), "B": (n, m), "C": (p, n), "D": (p, m), "b": (n,), "d": (p,), "K": (n, p)}
     given = {"A": A, "B": B, "C": C, "D": D, "b": b, "d": d, "K": K}
-    arrays = {name: np.zeros(shape) if given[name] is None else np.asarray(given[name], float) for name, shape in expected.items()}
+    arrays = {
+        name: np.zeros(shape) if given[name] is None else np.asarray(given[name], float)
+        for name, shape in expected.items()
+    }
     for name, shape in expected.items():
         if arrays[name].shape != shape:
             raise ValueError(
-                f"plant: {name} should have shape {shape} but has {arrays[name].shape}; A is {A.shape}, B {B.shape}, C {C.shape}"
+                f"plant: {name} should have shape {shape} but has {arrays[name].shape}; A is {A.shape}, "
+                f"B {B.shape}, C {C.shape}"
             )
         if not np.isfinite(arrays[name]).all():
-            raise ValueError(f"plant: {name} holds a number that is not finite; identify the plant again on a clean record")
+            raise ValueError(
+                f"plant: {name} holds a number that is not finite; identify the plant again on a clean record"
+            )
     return Plant(**arrays, sample_time_s=float(sample_time_s))
 
 
 def baam() -> Plant:
-    """The big-area extruder of seed 1, (44) and (45): six heated cells and a motor -> five sensors; by convention one step is 1 s and u is in percent."""
+    """The big-area extruder of seed 1, (44) and (45): six heated cells and a motor -> five sensors; by
+    convention one step is 1 s and u is in percent."""
     A = np.diag([0.992, 0.9919, 1.0009, 0.9979, 0.9972, 0.9953])
     A[0, 1], A[1, 0], A[1, 2], A[2, 1], A[2, 3], A[3, 2] = 0.0018, 0.0023, 0.0043, -0.0042, 0.0024, 0.0013
-    B = np.column_stack([np.diag([1.0033, 1.0460, 1.0326, 0.4798, 0.8882, 1.1699]), [-0.2175, -0.0788, -0.0020, -0.0669, 0.1273, -0.1792]])
+    B = np.column_stack(
+        [
+            np.diag([1.0033, 1.0460, 1.0326, 0.4798, 0.8882, 1.1699]),
+            [-0.2175, -0.0788, -0.0020, -0.0669, 0.1273, -0.1792],
+        ]
+    )
     C = np.array(
         [
             [0.992, 0.00018, 0.0, 0.0, -0.0001, 0.0],
@@ -96,7 +112,9 @@ def drawn_in(A: np.ndarray, radius: float) -> np.ndarray:
         return A
     drawn = eigenvalues * np.where(size > radius, radius * (1 - 1e-9) / np.maximum(size, 1e-300), 1.0)
     found = np.real((T * drawn) @ np.linalg.inv(T))
-    return found * min(1.0, radius * (1 - 1e-9) / np.abs(np.linalg.eigvals(found)).max())  # a defective A has no modal basis to draw in
+    return found * min(
+        1.0, radius * (1 - 1e-9) / np.abs(np.linalg.eigvals(found)).max()
+    )  # a defective A has no modal basis to draw in
 
 
 def observability_matrix(A: np.ndarray, C: np.ndarray, blocks: int) -> np.ndarray:
@@ -128,24 +146,33 @@ def _rank_test(matrix: np.ndarray, n: int, name: str, remedy: str) -> RankTest:
 def observability(plant: Plant) -> RankTest:
     """Rank test of (7) with its singular values; fails with a reason where some state never shows in y."""
     return _rank_test(
-        observability_matrix(plant.A, plant.C, plant.n), plant.n, "observable", "add a sensor, or lower the order of the model"
+        observability_matrix(plant.A, plant.C, plant.n),
+        plant.n,
+        "observable",
+        "add a sensor, or lower the order of the model",
     )
 
 
 def controllability(plant: Plant) -> RankTest:
-    """Rank test of [B AB ... A^(n-1)B] (10) with its singular values; fails with a reason where some state obeys no input."""
+    """Rank test of [B AB ... A^(n-1)B] (10) with its singular values;
+    fails with a reason where some state obeys no input."""
     return _rank_test(
-        observability_matrix(plant.A.T, plant.B.T, plant.n), plant.n, "controllable", "add an input, or lower the order of the model"
+        observability_matrix(plant.A.T, plant.B.T, plant.n),
+        plant.n,
+        "controllable",
+        "add an input, or lower the order of the model",
     )
 
 
 def hold_state(plant: Plant, x: np.ndarray) -> np.ndarray:
-    """The steady input u (m,) of least norm that holds the plant at state x (n,): (I - A) x = B u + b; the nearest one where none is exact."""
+    """The steady input u (m,) of least norm that holds the plant at state x (n,): (I - A) x = B u + b; the
+    nearest one where none is exact."""
     return np.linalg.lstsq(plant.B, (np.eye(plant.n) - plant.A) @ x - plant.b, rcond=None)[0]
 
 
 def hold_output(plant: Plant, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Steady state x (n,) and input u (m,) of least norm in u with C x + d as near as possible to y (p,), and x = A x + B u + b exactly."""
+    """Steady state x (n,) and input u (m,) of least norm in u with C x + d as near as
+    possible to y (p,), and x = A x + B u + b exactly."""
     n = plant.n
     balance = np.hstack([np.eye(n) - plant.A, -plant.B])
     free = scipy.linalg.null_space(balance)
@@ -160,8 +187,11 @@ def hold_output(plant: Plant, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return point[:n], point[n:]
 
 
-def spread(nominal: Plant, *, input_gain: float, loss: float, scale: Sequence[float] = (-1.0, 1.0)) -> list[Plant]:
-    """The declared family around a plant: the plant itself, each column of B by 1 +- input_gain, and A - loss I, in that order."""
+def spread(
+    nominal: Plant, *, input_gain: float, loss: float, scale: Sequence[float] = (-1.0, 1.0)
+) -> list[Plant]:
+    """The declared family around a plant: the plant itself, each column of B by
+    1 +- input_gain, and A - loss I, in that order."""
     family = [nominal]
     for column in range(nominal.m):
         for sign in scale:
@@ -172,13 +202,19 @@ def spread(nominal: Plant, *, input_gain: float, loss: float, scale: Sequence[fl
 
 
 def stored(plants: Sequence[Plant]) -> dict[str, tuple[np.ndarray, str, str]]:
-    """Plants of one order as named arrays with unit and meaning, stacked along the first axis, for an artifact; `restored` reads them back."""
+    """Plants of one order as named arrays with unit and meaning, stacked along the first axis, for an
+    artifact; `restored` reads them back."""
     meaning = {
-        "A": ("1", "state matrix"), "B": ("per percent", "input matrix"), "C": ("degC", "output matrix"), "D": ("degC per percent", "feed-through"),
-        "b": ("1", "offset of the state"), "d": ("degC", "offset of the output"), "K": ("per degC", "Kalman gain"),
+        "A": ("1", "state matrix"), "B": ("per percent", "input matrix"), "C": ("degC", "output matrix"),
+        "D": ("degC per percent", "feed-through"),
+        "b": ("1", "offset of the state"), "d": ("degC", "offset of the output"),
+        "K": ("per degC", "Kalman gain"),
         "sample_time_s": ("s", "one step"),
     }  # fmt: skip
-    return {name: (np.stack([np.asarray(getattr(plant, name), float) for plant in plants]), *meaning[name]) for name in Plant._fields}
+    return {
+        name: (np.stack([np.asarray(getattr(plant, name), float) for plant in plants]), *meaning[name])
+        for name in Plant._fields
+    }
 
 
 def restored(arrays: dict[str, np.ndarray]) -> list[Plant]:

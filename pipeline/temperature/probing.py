@@ -1,4 +1,5 @@
-"""Probing signals: the study's (48)-(52), and practical ones within amplitude and rate limits; what they excite, said before anything is learned from them."""
+"""Probing signals: the study's (48)-(52), and practical ones within amplitude and rate limits; what they
+excite, said before anything is learned from them."""
 
 from typing import NamedTuple
 
@@ -8,22 +9,36 @@ from pipeline.temperature.plant import Plant
 
 
 def study_signal(
-    rng: np.random.Generator, samples: int, inputs: int, *, amplitudes: np.ndarray, bandwidth: float, variance: float, redrawn: bool = True
+    rng: np.random.Generator,
+    samples: int,
+    inputs: int,
+    *,
+    amplitudes: np.ndarray,
+    bandwidth: float,
+    variance: float,
+    redrawn: bool = True,
 ) -> np.ndarray:
-    """omega_pr (samples, inputs) of (51), (52): a sinusoid at the bandwidth, one for each further amplitude at a random frequency below it, and Gaussian noise.
+    """omega_pr (samples, inputs) of (51), (52): a sinusoid at the bandwidth, one for each further amplitude
+    at a random frequency below it, and Gaussian noise.
 
-    `redrawn` draws the frequencies anew every step, as the study's script does (nearly white); without it they are fixed, as the text reads. bandwidth in rad a step.
+    `redrawn` draws the frequencies anew every step, as the study's script does (nearly white); without it
+    they are fixed, as the text reads. bandwidth in rad a step.
     """
     t = np.arange(samples)[:, None]
-    signal = np.sqrt(variance) * rng.standard_normal((samples, inputs)) + amplitudes[0] * np.sin(bandwidth * t)
+    signal = np.sqrt(variance) * rng.standard_normal((samples, inputs)) + amplitudes[0] * np.sin(
+        bandwidth * t
+    )
     for amplitude in amplitudes[1:]:
         omega = rng.uniform(0.0, bandwidth, (samples if redrawn else 1, inputs))
         signal += amplitude * np.sin(omega * t)
     return signal
 
 
-def multisine(rng: np.random.Generator, samples: int, inputs: int, *, amplitude: float, lowest: float = 0.0) -> np.ndarray:
-    """(samples, inputs) within +-amplitude: equal power at every frequency of the record from `lowest` (rad a step) up, random phases, other lines for each input."""
+def multisine(
+    rng: np.random.Generator, samples: int, inputs: int, *, amplitude: float, lowest: float = 0.0
+) -> np.ndarray:
+    """(samples, inputs) within +-amplitude: equal power at every frequency of the record from `lowest` (rad a
+    step) up, random phases, other lines for each input."""
     lines = np.arange(1, (samples + 1) // 2)
     lines = lines[2 * np.pi * lines / samples >= lowest]
     spectrum = np.zeros((samples // 2 + 1, inputs), complex)
@@ -34,14 +49,18 @@ def multisine(rng: np.random.Generator, samples: int, inputs: int, *, amplitude:
     return amplitude * signal / np.abs(signal).max(axis=0)
 
 
-def prbs(rng: np.random.Generator, samples: int, inputs: int, *, amplitude: float, shortest: int) -> np.ndarray:
-    """(samples, inputs) of +-amplitude: a random binary sequence that may switch every `shortest` samples, each input at its own draws."""
+def prbs(
+    rng: np.random.Generator, samples: int, inputs: int, *, amplitude: float, shortest: int
+) -> np.ndarray:
+    """(samples, inputs) of +-amplitude: a random binary sequence that may switch every
+    `shortest` samples, each input at its own draws."""
     bits = rng.integers(0, 2, (-(-samples // shortest), inputs))
     return amplitude * (2.0 * np.repeat(bits, shortest, axis=0)[:samples] - 1.0)
 
 
 class Probe(NamedTuple):
-    """u (samples, m) as applied, y (samples, p) as measured, and the share of (sample, input) at a limit of amplitude, rate or machine."""
+    """u (samples, m) as applied, y (samples, p) as measured, and the share of (sample,
+    input) at a limit of amplitude, rate or machine."""
 
     u: np.ndarray
     y: np.ndarray
@@ -49,12 +68,15 @@ class Probe(NamedTuple):
 
 
 def probe(
-    plant: Plant, signal: np.ndarray, *, x0: np.ndarray, u_centre: np.ndarray, y_centre: np.ndarray, feedback: np.ndarray, low: np.ndarray, high: np.ndarray, rate: float,
+    plant: Plant, signal: np.ndarray, *, x0: np.ndarray, u_centre: np.ndarray, y_centre: np.ndarray,
+    feedback: np.ndarray, low: np.ndarray, high: np.ndarray, rate: float,
     noise: np.ndarray,
 ) -> Probe:  # fmt: skip
-    """u = u_centre + feedback (y_centre - y measured) + signal, within [low, high] and `rate` percent a step: outputs stay near y_centre, from measurements only.
+    """u = u_centre + feedback (y_centre - y measured) + signal, within [low, high] and `rate` percent a step:
+    outputs stay near y_centre, from measurements only.
 
-    feedback (m, p) in percent per °C; noise (samples, p) in °C. What is applied is what is recorded, so that limits bias nothing.
+    feedback (m, p) in percent per °C; noise (samples, p) in °C. What is
+    applied is what is recorded, so that limits bias nothing.
     """
     x, last = x0, u_centre
     u, y, limited = np.empty_like(signal), np.empty((len(signal), plant.p)), 0
@@ -67,9 +89,12 @@ def probe(
     return Probe(u, y, limited / signal.size)
 
 
-def study_probe(plant: Plant, signal: np.ndarray, K_data: np.ndarray, *, x0: np.ndarray, noise: np.ndarray) -> Probe:
-    """u = -K_data x + omega_pr (50), which reads the true state and knows no limits: for parity and benchmarks only. signal and noise may carry a batch axis:
-    signal (samples, batch, m), noise (samples, batch, p) give u and y of the same shapes."""
+def study_probe(
+    plant: Plant, signal: np.ndarray, K_data: np.ndarray, *, x0: np.ndarray, noise: np.ndarray
+) -> Probe:
+    """u = -K_data x + omega_pr (50), which reads the true state and knows no limits: for parity and
+    benchmarks only. signal and noise may carry a batch axis: signal (samples, batch, m), noise (samples,
+    batch, p) give u and y of the same shapes."""
     closed = (plant.A - plant.B @ K_data).T
     x = np.empty((len(signal), *signal.shape[1:-1], plant.n))
     x[0] = x0
@@ -80,7 +105,8 @@ def study_probe(plant: Plant, signal: np.ndarray, K_data: np.ndarray, *, x0: np.
 
 
 class Excitation(NamedTuple):
-    """Of u over windows of `order` samples: rank and condition of its second moment; r.m.s. level (bands, m) in percent within equal bands from 0 to pi rad a step."""
+    """Of u over windows of `order` samples: rank and condition of its second moment; r.m.s. level (bands, m)
+    in percent within equal bands from 0 to pi rad a step."""
 
     order: int
     rank: int
@@ -90,11 +116,13 @@ class Excitation(NamedTuple):
 
 
 def excitation(u: np.ndarray, order: int, *, bands: int = 8) -> Excitation:
-    """Persistency of excitation of u (samples, m): of the order `order` where the rank is m x order. Raises ValueError where the record is shorter than that asks."""
+    """Persistency of excitation of u (samples, m): of the order `order` where the rank is m x order. Raises
+    ValueError where the record is shorter than that asks."""
     samples, m = u.shape
     if samples < (m + 1) * order:
         raise ValueError(
-            f"excitation of order {order} with {m} inputs expects at least {(m + 1) * order} samples, found {samples}; record {(m + 1) * order - samples} more"
+            f"excitation of order {order} with {m} inputs expects at least {(m + 1) * order} samples, "
+            f"found {samples}; record {(m + 1) * order - samples} more"
         )
     centred = u - u.mean(axis=0)
     hankel = np.hstack([centred[lag : samples - order + 1 + lag] for lag in range(order)])
@@ -102,4 +130,6 @@ def excitation(u: np.ndarray, order: int, *, bands: int = 8) -> Excitation:
     rank = int((sv > 1e-9 * sv[0]).sum()) if sv[0] > 0 else 0
     power = np.abs(np.fft.rfft(centred, axis=0)[1:]) ** 2 * 2 / samples**2
     level = np.sqrt(np.stack([part.sum(axis=0) for part in np.array_split(power, bands)]))
-    return Excitation(order, rank, m * order, float(sv[0] / sv[-1]) ** 2 if rank == m * order else float("inf"), level)
+    return Excitation(
+        order, rank, m * order, float(sv[0] / sv[-1]) ** 2 if rank == m * order else float("inf"), level
+    )

@@ -1,8 +1,10 @@
-"""The figures of seed 1 as it counts them, for parity: its constants, its draws, its conventions. The honest yardstick is scorecard.py.
+"""The figures of seed 1 as it counts them, for parity: its constants, its draws, its
+conventions. The honest yardstick is scorecard.py.
 
-Every convention here was found by reproducing a printed figure; none is recommended. What differs from (3): the model-based cost is taken on the observer's
-state and counts the first stage twice; the data-driven cost leaves u'Ru undiscounted, discounts e'Qe one step late, takes y(0) for 50 °C at every sensor, and
-begins with seven steps under u = -K_data x that drive the barrel to 0 °C, where 80 % of it accrues.
+Every convention here was found by reproducing a printed figure; none is recommended. What differs from (3):
+the model-based cost is taken on the observer's state and counts the first stage twice; the data-driven cost
+leaves u'Ru undiscounted, discounts e'Qe one step late, takes y(0) for 50 °C at every sensor, and begins with
+seven steps under u = -K_data x that drive the barrel to 0 °C, where 80 % of it accrues.
 """
 
 from typing import NamedTuple
@@ -55,7 +57,8 @@ class Figures(NamedTuple):
 
 
 def model_based(weights: tuple[np.ndarray, np.ndarray], K0: np.ndarray) -> Figures:
-    """Section 6.1: Algorithm 1 from the draw K0 (7, 11), observer (6), (8) from 50 °C, plant from 20 °C. J sums stages 0, 0, 1, ..., 98 of the observer's state."""
+    """Section 6.1: Algorithm 1 from the draw K0 (7, 11), observer (6), (8) from 50 °C, plant from 20 °C. J
+    sums stages 0, 0, 1, ..., 98 of the observer's state."""
     plant, (q, r) = baam(), weights
     K = algorithm_1(plant, np.diag(q), np.diag(r), GAMMA, K0, tolerance=0.1).K
     L = observer_gain(plant, TAU)
@@ -71,8 +74,12 @@ def model_based(weights: tuple[np.ndarray, np.ndarray], K0: np.ndarray) -> Figur
     return Figures(counted[:100].sum(), counted.sum(), np.linalg.norm(REFERENCE - y[99]))
 
 
-def kernel_gains(u: np.ndarray, y: np.ndarray, weights: list[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarray]:
-    """Algorithm 2 with the study's settings on its log u (15000, 7), y (15000, 5): N = 6, mu = 1e-4, data / 1000; stopped on the gain, which the script's stop at 1e-3 on H leaves the same in the digits printed. K (7, 73) on [w; constant], the constant for the study's reference."""
+def kernel_gains(
+    u: np.ndarray, y: np.ndarray, weights: list[tuple[np.ndarray, np.ndarray]]
+) -> list[np.ndarray]:
+    """Algorithm 2 with the study's settings on its log u (15000, 7), y (15000, 5): N = 6, mu = 1e-4, data /
+    1000; stopped on the gain, which the script's stop at 1e-3 on H leaves the same in the digits printed. K
+    (7, 73) on [w; constant], the constant for the study's reference."""
     N, scale = 6, 1000.0
     r = REFERENCE / scale
     # the last row has no successor in the script
@@ -82,7 +89,8 @@ def kernel_gains(u: np.ndarray, y: np.ndarray, weights: list[tuple[np.ndarray, n
 
 
 def data_driven(q: np.ndarray, K: np.ndarray) -> Figures:
-    """Section 6.3 on the study's own start-up, K (7, 73) on [w; constant] in data / 1000. J weighs u with R = I whatever R the gain was learned with."""
+    """Section 6.3 on the study's own start-up, K (7, 73) on [w; constant] in data / 1000. J weighs u with R =
+    I whatever R the gain was learned with."""
     plant, N, scale = baam(), 6, 1000.0
     x, u, y = np.full(plant.n, 50.0), np.empty((1001, plant.m)), np.empty((1001, plant.p))
     for t in range(1001):
@@ -111,10 +119,13 @@ def figures(K0: np.ndarray, u: np.ndarray, y: np.ndarray) -> dict[str, Figures]:
 
 
 def algorithm_1_failures(seeds: int) -> int:
-    """How many of `seeds` random K0 ~ N(0, 10) (seeds 0, 1, ...) the published Algorithm 1 does not take to a stabilising gain within 50 policies."""
+    """How many of `seeds` random K0 ~ N(0, 10) (seeds 0, 1, ...) the published Algorithm 1 does not take to a
+    stabilising gain within 50 policies."""
     plant, count = baam(), 0
     for seed in range(seeds):
         K0 = np.random.default_rng(seed).normal(0.0, 10.0, (plant.m, plant.n + plant.p))
-        result = algorithm_1(plant, np.eye(plant.p), np.eye(plant.m), GAMMA, K0, tolerance=0.1, max_iterations=50)
+        result = algorithm_1(
+            plant, np.eye(plant.p), np.eye(plant.m), GAMMA, K0, tolerance=0.1, max_iterations=50
+        )
         count += not (result.settled and stabilises(plant, result.K[:, : plant.n]))
     return count

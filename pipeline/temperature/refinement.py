@@ -1,9 +1,11 @@
-"""Prediction-error refinement of an identified plant: Gauss-Newton on one-step or simulation errors over whole records (Ljung, System Identification, ch. 7 and 10).
+"""Prediction-error refinement of an identified plant: Gauss-Newton on one-step or simulation errors over
+whole records (Ljung, System Identification, ch. 7 and 10).
 
 Both criteria are one output-error problem  x(t+1) = F x + G v,  ŷ = C x + H v:
   prediction  v = [u; 1; y],  F = A - K C,  G = [B - K D, b - K d, K],  H = [D, d, 0]
   simulation  v = [u; 1],     F = A,        G = [B, b],                 H = [D, d]
-so one routine serves both. It needs no filter per parameter: in block-modal coordinates every sensitivity is a first-order filter of one signal.
+so one routine serves both. It needs no filter per parameter: in block-modal coordinates every sensitivity is
+a first-order filter of one signal.
 """
 
 from collections.abc import Sequence
@@ -17,7 +19,8 @@ from pipeline.temperature.plant import Plant
 
 
 class Predictor(NamedTuple):
-    """x(t+1) = F x + G v,  ŷ = C x + H v, with one initial state a segment: F (n, n), G (n, r), C (p, n), H (p, r), x0 list of (n,)."""
+    """x(t+1) = F x + G v, ŷ = C x + H v, with one initial state a segment: F (n,
+    n), G (n, r), C (p, n), H (p, r), x0 list of (n,)."""
 
     F: np.ndarray
     G: np.ndarray
@@ -27,7 +30,8 @@ class Predictor(NamedTuple):
 
 
 class Refined(NamedTuple):
-    """A refined plant, the initial state of each segment, and the sum of squared weighted errors before the first and after each step."""
+    """A refined plant, the initial state of each segment, and the sum of squared
+    weighted errors before the first and after each step."""
 
     plant: Plant
     x0: list[np.ndarray]
@@ -35,7 +39,8 @@ class Refined(NamedTuple):
 
 
 def linear_recurrence(F: np.ndarray, g: np.ndarray, x0: np.ndarray) -> np.ndarray:
-    """x (T+1, n) of x(t+1) = F x(t) + g(t) from x0, by doubling: pass k adds F^(2^k) times what lies 2^k samples back (Hillis and Steele 1986)."""
+    """x (T+1, n) of x(t+1) = F x(t) + g(t) from x0, by doubling: pass k adds F^(2^k) times what lies 2^k
+    samples back (Hillis and Steele 1986)."""
     x, power, lag = np.vstack([x0[None], g]), F, 1
     while lag < len(x) and np.abs(power).max() > 1e-20:
         x[lag:] += x[:-lag] @ power.T
@@ -50,33 +55,44 @@ def respond(model: Predictor, v: np.ndarray, x0: np.ndarray) -> tuple[np.ndarray
 
 
 def free_response(model: Predictor, T: int) -> np.ndarray:
-    """[C; CF; ...; CF^(T-1)] (T, p, n), the outputs' response to each state at the start; doubles with each pass."""
+    """[C; CF; ...; CF^(T-1)] (T, p, n), the outputs' response to each
+    state at the start; doubles with each pass."""
     gamma, power = model.C[None], model.F
-    with np.errstate(over="ignore", invalid="ignore"):  # an unstable model may overflow far ahead; `fitted_state` leaves those rows out
+    with np.errstate(
+        over="ignore", invalid="ignore"
+    ):  # an unstable model may overflow far ahead; `fitted_state` leaves those rows out
         while len(gamma) < T:
             gamma, power = np.concatenate([gamma, gamma @ power]), power @ power
     return gamma[:T]
 
 
 def estimate_state(model: Predictor, v: np.ndarray, y: np.ndarray, *, free_mean: bool = False) -> np.ndarray:
-    """x(0) (n,) that fits y (T, p) best in least squares under v; NaN in y is left out. A direction of x(0) that y does not show stays zero.
+    """x(0) (n,) that fits y (T, p) best in least squares under v; NaN in y is left out. A
+    direction of x(0) that y does not show stays zero.
 
-    With `free_mean` a constant for each output is fitted along and dropped, for scores that remove the mean of the error.
+    With `free_mean` a constant for each output is fitted along and
+    dropped, for scores that remove the mean of the error.
     """
     n = len(model.F)
-    return fitted_state(free_response(model, len(v)), y - respond(model, v, np.zeros(n))[1], free_mean=free_mean)[:n]
+    return fitted_state(
+        free_response(model, len(v)), y - respond(model, v, np.zeros(n))[1], free_mean=free_mean
+    )[:n]
 
 
 def fitted_state(gamma: np.ndarray, error: np.ndarray, *, free_mean: bool) -> np.ndarray:
-    """x(0), and with `free_mean` a constant for each output after it, that leave the least of error (T, p); what is not finite is left out."""
+    """x(0), and with `free_mean` a constant for each output after it, that leave the least
+    of error (T, p); what is not finite is left out."""
     T, p, _ = gamma.shape
-    regressors = gamma if not free_mean else np.concatenate([gamma, np.broadcast_to(np.eye(p), (T, p, p))], axis=2)
+    regressors = (
+        gamma if not free_mean else np.concatenate([gamma, np.broadcast_to(np.eye(p), (T, p, p))], axis=2)
+    )
     seen = np.isfinite(error) & (np.abs(gamma).max(axis=2, initial=0.0) < 1e100)
     return np.linalg.lstsq(regressors[seen], error[seen], rcond=1e-10)[0]
 
 
 def _block_modal(model: Predictor) -> tuple[Predictor, list[tuple[int, complex]], np.ndarray]:
-    """The predictor with F block diagonal (1 x 1 real, 2 x 2 [[a, b], [-b, a]] for a + ib), (first row, eigenvalue) of each block, and the basis."""
+    """The predictor with F block diagonal (1 x 1 real, 2 x 2 [[a, b], [-b, a]] for a + ib), (first row,
+    eigenvalue) of each block, and the basis."""
     eigenvalues, vectors = np.linalg.eig(model.F)
     columns, blocks = [], []
     for eigenvalue, vector in zip(eigenvalues, vectors.T, strict=True):
@@ -86,13 +102,21 @@ def _block_modal(model: Predictor) -> tuple[Predictor, list[tuple[int, complex]]
         columns += [vector.real, vector.imag] if eigenvalue.imag > 0 else [vector.real]
     T = np.array(columns).T
     inverse = np.linalg.inv(T)
-    return Predictor(inverse @ model.F @ T, inverse @ model.G, model.C @ T, model.H, [inverse @ x for x in model.x0]), blocks, T
+    return (
+        Predictor(
+            inverse @ model.F @ T, inverse @ model.G, model.C @ T, model.H, [inverse @ x for x in model.x0]
+        ),
+        blocks,
+        T,
+    )
 
 
 def _filtered(blocks: list[tuple[int, complex]], s: np.ndarray, numerator: list[float]) -> np.ndarray:
-    """f (T, n, k): signal s_j (T, k) through the first-order filter of each mode, real and imaginary part of a pair in its two rows; numerator [0, 1] for an input, [1] for x0.
+    """f (T, n, k): signal s_j (T, k) through the first-order filter of each mode, real and imaginary part of
+    a pair in its two rows; numerator [0, 1] for an input, [1] for x0.
 
-    The response of ŷ_o to s_j entering at state i is a mixture of f by C alone (`_mixed`), so one set of filtered signals serves every output.
+    The response of ŷ_o to s_j entering at state i is a mixture of f by C alone (`_mixed`), so one set of
+    filtered signals serves every output.
     """
     f = np.empty((len(s), sum(1 + (eigenvalue.imag > 0) for _, eigenvalue in blocks), s.shape[1]))
     for k, eigenvalue in blocks:
@@ -105,7 +129,8 @@ def _filtered(blocks: list[tuple[int, complex]], s: np.ndarray, numerator: list[
 
 
 def _mixing(c: np.ndarray, blocks: list[tuple[int, complex]]) -> np.ndarray:
-    """M (n, n) with sensitivity = M f for the output whose row of C is c: [c_k] for a real mode, [[c_k, -c_k+1], [c_k+1, c_k]] for a pair."""
+    """M (n, n) with sensitivity = M f for the output whose row of C is c: [c_k] for a real mode, [[c_k,
+    -c_k+1], [c_k+1, c_k]] for a pair."""
     M = np.zeros((len(c), len(c)))
     for k, eigenvalue in blocks:
         M[k, k] = c[k]
@@ -119,17 +144,24 @@ def _mixed(c: np.ndarray, blocks: list[tuple[int, complex]], f: np.ndarray) -> n
     return np.einsum("il,tlj->tij", _mixing(c, blocks), f, optimize=True).reshape(len(f), -1)
 
 
-def _normal_equations(model: Predictor, blocks, free: np.ndarray, v_all, y_all) -> tuple[np.ndarray, np.ndarray]:
-    """J'J and J'e over every segment; parameters: [F G] row by row, then C and the free columns of H for each output, then x0 of each segment.
+def _normal_equations(
+    model: Predictor, blocks, free: np.ndarray, v_all, y_all
+) -> tuple[np.ndarray, np.ndarray]:
+    """J'J and J'e over every segment; parameters: [F G] row by row, then C and the free
+    columns of H for each output, then x0 of each segment.
 
-    With J_o = Z M_o the products over the samples, Z'Z and Z'e, are the same for every output that is measured at the same samples: taken once.
+    With J_o = Z M_o the products over the samples, Z'Z and Z'e, are the same for every output that is
+    measured at the same samples: taken once.
     """
     n, r = model.G.shape
     p, h = len(model.C), len(free)
     state, output = n * (n + r), n + h
     size = state + p * output + n * len(v_all)
     JJ, Je = np.zeros((size, size)), np.zeros(size)
-    mixing = [scipy.linalg.block_diag(np.kron(M, np.eye(n + r)), np.eye(output), M) for M in (_mixing(c, blocks) for c in model.C)]
+    mixing = [
+        scipy.linalg.block_diag(np.kron(M, np.eye(n + r)), np.eye(output), M)
+        for M in (_mixing(c, blocks) for c in model.C)
+    ]
     for segment, (v, y) in enumerate(zip(v_all, y_all, strict=True)):
         x, predicted = respond(model, v, model.x0[segment])
         pulse = np.zeros((len(v), 1))
@@ -164,23 +196,38 @@ def _stepped(model: Predictor, step: np.ndarray, free: np.ndarray) -> Predictor:
     H = model.H.copy()
     H[:, free] += CH[:, n:]
     x0 = step[state + CH.size :].reshape(-1, n)
-    return Predictor(model.F + FG[:, :n], model.G + FG[:, n:], model.C + CH[:, :n], H, [a + b for a, b in zip(model.x0, x0, strict=True)])
+    return Predictor(
+        model.F + FG[:, :n],
+        model.G + FG[:, n:],
+        model.C + CH[:, :n],
+        H,
+        [a + b for a, b in zip(model.x0, x0, strict=True)],
+    )
 
 
 def _cost(model: Predictor, v_all, y_all) -> float:
-    with np.errstate(over="ignore", invalid="ignore"):  # a trial step may explode; its cost is then infinite and the step refused
-        cost = sum(np.nansum((y - respond(model, v, x0)[1]) ** 2) for v, y, x0 in zip(v_all, y_all, model.x0, strict=True))
-        finite = all(np.isfinite(respond(model, v[-1:], x0)[1]).all() for v, x0 in zip(v_all, model.x0, strict=True))
+    with np.errstate(
+        over="ignore", invalid="ignore"
+    ):  # a trial step may explode; its cost is then infinite and the step refused
+        cost = sum(
+            np.nansum((y - respond(model, v, x0)[1]) ** 2)
+            for v, y, x0 in zip(v_all, y_all, model.x0, strict=True)
+        )
+        finite = all(
+            np.isfinite(respond(model, v[-1:], x0)[1]).all() for v, x0 in zip(v_all, model.x0, strict=True)
+        )
     return float(cost) if finite and np.isfinite(cost) else np.inf
 
 
 def gauss_newton(
     model: Predictor, v_all, y_all, *, free: np.ndarray, admissible, max_iterations: int, tolerance: float
 ) -> tuple[Predictor, list[float]]:
-    """Levenberg-Marquardt on sum |y - ŷ|² over F, G, C, the columns `free` of H and every x0; NaN in y is left out.
+    """Levenberg-Marquardt on sum |y - ŷ|² over F, G, C, the columns
+    `free` of H and every x0; NaN in y is left out.
 
-    The parameters are redundant (any change of state basis); the damping picks the step of least norm among equals. `admissible(F, G, C)` refuses steps,
-    which is how stability is kept by construction. Stops when a step gains less than `tolerance` of the cost; a start whose errors are not finite is returned as it is.
+    The parameters are redundant (any change of state basis); the damping picks the step of least norm among
+    equals. `admissible(F, G, C)` refuses steps, which is how stability is kept by construction. Stops when a
+    step gains less than `tolerance` of the cost; a start whose errors are not finite is returned as it is.
     """
     costs, damping = [_cost(model, v_all, y_all)], 1e-4
     for _ in range(max_iterations if np.isfinite(costs[0]) else 0):
@@ -192,7 +239,11 @@ def gauss_newton(
         while damping < 1e8:
             step = np.linalg.solve(JJ + damping * np.eye(len(JJ)), Je / scale) / scale
             trial = _stepped(model, step, free)
-            cost = _cost(trial, v_all, y_all) if np.isfinite(step).all() and admissible(trial.F, trial.G, trial.C) else np.inf
+            cost = (
+                _cost(trial, v_all, y_all)
+                if np.isfinite(step).all() and admissible(trial.F, trial.G, trial.C)
+                else np.inf
+            )
             if cost < costs[-1]:
                 break
             damping *= 10
@@ -206,12 +257,16 @@ def gauss_newton(
 
 
 def fit_inputs(A, C, u, y, *, feedthrough: bool, offset: bool) -> Predictor:
-    """B, b, D, d and every x0 that simulate y best for given A (n, n), C (p, n): a linear least-squares problem (Verhaegen 1994; SLICOT IB01CD).
+    """B, b, D, d and every x0 that simulate y best for given A (n, n), C (p, n): a linear least-squares
+    problem (Verhaegen 1994; SLICOT IB01CD).
 
-    Returns the simulator in its block-modal basis, v = [u; 1]. b is left at zero, and d too, where `offset` is False.
+    Returns the simulator in its block-modal basis, v = [u; 1]. b is
+    left at zero, and d too, where `offset` is False.
     """
     n, m, p, segments = len(A), u[0].shape[1], len(C), len(u)
-    model, blocks, _ = _block_modal(Predictor(A, np.zeros((n, m + 1)), C, np.zeros((p, m + 1)), [np.zeros(n)] * segments))
+    model, blocks, _ = _block_modal(
+        Predictor(A, np.zeros((n, m + 1)), C, np.zeros((p, m + 1)), [np.zeros(n)] * segments)
+    )
     inputs = np.arange(m + 1) if offset else np.arange(m)
     direct = np.r_[np.arange(m) if feedthrough else [], m if offset else []].astype(int)
     size = n * len(inputs) + p * len(direct)
@@ -240,7 +295,8 @@ def fit_inputs(A, C, u, y, *, feedthrough: bool, offset: bool) -> Predictor:
 
 
 def prediction_form(plant: Plant, x0: Sequence[np.ndarray]) -> Predictor:
-    """The one-step predictor of a plant: v = [u; 1; y], F = A - K C, G = [B - K D, b - K d, K], H = [D, d, 0]."""
+    """The one-step predictor of a plant: v = [u; 1; y], F = A - K C, G
+    = [B - K D, b - K d, K], H = [D, d, 0]."""
     A, B, C, D, b, d, K, _ = plant
     G = np.hstack([B - K @ D, (b - K @ d)[:, None], K])
     return Predictor(A - K @ C, G, C, np.hstack([D, d[:, None], np.zeros((plant.p, plant.p))]), list(x0))
@@ -248,7 +304,13 @@ def prediction_form(plant: Plant, x0: Sequence[np.ndarray]) -> Predictor:
 
 def simulation_form(plant: Plant, x0: Sequence[np.ndarray]) -> Predictor:
     """The simulator of a plant: v = [u; 1], F = A, G = [B, b], H = [D, d]."""
-    return Predictor(plant.A, np.hstack([plant.B, plant.b[:, None]]), plant.C, np.hstack([plant.D, plant.d[:, None]]), list(x0))
+    return Predictor(
+        plant.A,
+        np.hstack([plant.B, plant.b[:, None]]),
+        plant.C,
+        np.hstack([plant.D, plant.d[:, None]]),
+        list(x0),
+    )
 
 
 def drives(criterion: str, u: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -258,7 +320,8 @@ def drives(criterion: str, u: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def filled(plant: Plant, u: np.ndarray, y: np.ndarray, x0: np.ndarray) -> np.ndarray:
-    """y (T, p) with each masked entry replaced by its one-step prediction, which is what a Kalman filter without that measurement does."""
+    """y (T, p) with each masked entry replaced by its one-step prediction, which is
+    what a Kalman filter without that measurement does."""
     if np.isfinite(y).all():
         return y
     y, x = y.copy(), x0
@@ -281,21 +344,34 @@ def refine(
     max_iterations: int = 20,
     tolerance: float = 1e-5,
 ) -> Refined:
-    """The plant moved to the least sum of weighted squared errors, one step ahead or in free simulation, over every segment u (T, m), y (T, p).
+    """The plant moved to the least sum of weighted squared errors, one step ahead or in free
+    simulation, over every segment u (T, m), y (T, p).
 
-    Errors are weighted by the covariance of the starting model's (the full one for predictions, its diagonal for simulation). The predictor stays stable, and
-    so does A within `max_radius` where given (it must hold at the start). With `simulation` K is left zero: `kalman_gain` fits it. NaN in y is a masked sample; in u it is refused.
-    Raises ValueError where u holds NaN, or the start violates `max_radius`.
+    Errors are weighted by the covariance of the starting model's (the full one for predictions, its diagonal
+    for simulation). The predictor stays stable, and so does A within `max_radius` where given (it must hold
+    at the start). With `simulation` K is left zero: `kalman_gain` fits it. NaN in y is a masked sample; in u
+    it is refused. Raises ValueError where u holds NaN, or the start violates `max_radius`.
     """
     if any(not np.isfinite(a).all() for a in u):
-        raise ValueError("refine: expected inputs without gaps but found NaN in u; split the record into segments at the gaps")
+        raise ValueError(
+            "refine: expected inputs without gaps but found NaN in u; "
+            "split the record into segments at the gaps"
+        )
     if max_radius is not None and np.abs(np.linalg.eigvals(plant.A)).max() > max_radius:
         raise ValueError(
-            f"refine: the start has a pole at {np.abs(np.linalg.eigvals(plant.A)).max():.6f}, outside max_radius {max_radius}; start from a stabilised plant"
+            f"refine: the start has a pole at {np.abs(np.linalg.eigvals(plant.A)).max():.6f}, "
+            f"outside max_radius {max_radius}; start from a stabilised plant"
         )
     m, p, ahead = plant.m, plant.p, criterion == "prediction"
     start = prediction_form(plant, []) if ahead else simulation_form(plant, [])
-    y_full = y if not ahead else [filled(plant, a, b, _first_state(plant, start, criterion, a, b)) for a, b in zip(u, y, strict=True)]
+    y_full = (
+        y
+        if not ahead
+        else [
+            filled(plant, a, b, _first_state(plant, start, criterion, a, b))
+            for a, b in zip(u, y, strict=True)
+        ]
+    )
     v = [drives(criterion, a, b) for a, b in zip(u, y_full, strict=True)]
     x0 = [estimate_state(start, a, b) for a, b in zip(v, y, strict=True)]
     errors = np.vstack([b - respond(start, a, x)[1] for a, b, x in zip(v, y, x0, strict=True)])
@@ -310,18 +386,32 @@ def refine(
     def admissible(F, G, C):
         if ahead and np.abs(np.linalg.eigvals(F)).max() >= 1:
             return False
-        return max_radius is None or np.abs(np.linalg.eigvals(F + G[:, m + 1 :] @ C if ahead else F)).max() <= max_radius
+        return (
+            max_radius is None
+            or np.abs(np.linalg.eigvals(F + G[:, m + 1 :] @ C if ahead else F)).max() <= max_radius
+        )
 
-    best, costs = gauss_newton(start, v, y_weighted, free=free, admissible=admissible, max_iterations=max_iterations, tolerance=tolerance)
+    best, costs = gauss_newton(
+        start,
+        v,
+        y_weighted,
+        free=free,
+        admissible=admissible,
+        max_iterations=max_iterations,
+        tolerance=tolerance,
+    )
     C, H = unweight @ best.C, unweight @ best.H
     K = best.G[:, m + 1 :] @ weight if ahead else np.zeros((plant.n, p))
     D, d = H[:, :m], H[:, m]
-    found = Plant(best.F + K @ C, best.G[:, :m] + K @ D, C, D, best.G[:, m] + K @ d, d, K, plant.sample_time_s)
+    found = Plant(
+        best.F + K @ C, best.G[:, :m] + K @ D, C, D, best.G[:, m] + K @ d, d, K, plant.sample_time_s
+    )
     return Refined(found, best.x0, costs)
 
 
 def stabilising_gain(plant: Plant) -> np.ndarray:
-    """K (n, p) with A - K C stable: zero where A is, else the Kalman gain for process noise that enters as the inputs do (or into every state, where there are none)."""
+    """K (n, p) with A - K C stable: zero where A is, else the Kalman gain for process noise that enters as
+    the inputs do (or into every state, where there are none)."""
     if np.abs(np.linalg.eigvals(plant.A)).max() < 1:
         return np.zeros((plant.n, plant.p))
     A, C = plant.A, plant.C
@@ -332,10 +422,14 @@ def stabilising_gain(plant: Plant) -> np.ndarray:
     return A @ P @ C.T @ np.linalg.inv(C @ P @ C.T + R)
 
 
-def kalman_gain(plant: Plant, u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, max_iterations: int = 20) -> Plant:
-    """The plant with the gain K that makes the one-step errors least, all else kept; Gauss-Newton from a gain that stabilises, where dŷ/dK_ij answers e_j entering at state i.
+def kalman_gain(
+    plant: Plant, u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, max_iterations: int = 20
+) -> Plant:
+    """The plant with the gain K that makes the one-step errors least, all else kept; Gauss-Newton from a gain
+    that stabilises, where dŷ/dK_ij answers e_j entering at state i.
 
-    Errors are weighted by their variance at the start. A plant with an unstable mode that no output shows has no such gain, and is returned as it is.
+    Errors are weighted by their variance at the start. A plant with an unstable mode that no output shows has
+    no such gain, and is returned as it is.
     """
     try:
         K = stabilising_gain(plant)
@@ -355,7 +449,9 @@ def kalman_gain(plant: Plant, u: Sequence[np.ndarray], y: Sequence[np.ndarray], 
     for _ in range(max_iterations):
         modal, blocks, basis = _block_modal(model._replace(x0=[]))
         f = [_filtered(blocks, a, [0.0, 1.0]) for a in e]
-        J = np.vstack([np.stack([_mixed(c, blocks, a) for c in modal.C], axis=1).reshape(-1, n * p) for a in f])
+        J = np.vstack(
+            [np.stack([_mixed(c, blocks, a) for c in modal.C], axis=1).reshape(-1, n * p) for a in f]
+        )
         w = np.tile(weight, len(J) // p)
         JJ, Je = (J * w[:, None]).T @ (J * w[:, None]), (J * w[:, None]).T @ (np.vstack(e).ravel() * w)
         scale = np.sqrt(np.maximum(np.diag(JJ), np.finfo(float).tiny))
@@ -383,7 +479,8 @@ def _first_state(plant, start, criterion, u, y):
 
 
 def _weights(errors: np.ndarray, *, diagonal: bool) -> tuple[np.ndarray, np.ndarray]:
-    """W and its inverse with W'W = S^-1, S (p, p) the covariance of the errors; noise-free channels are floored at rounding."""
+    """W and its inverse with W'W = S^-1, S (p, p) the covariance of the
+    errors; noise-free channels are floored at rounding."""
     rows = errors[np.isfinite(errors).all(1)]
     S = rows.T @ rows / max(len(rows), 1)
     S = np.diag(np.diag(S)) if diagonal else S

@@ -1,7 +1,8 @@
-"""One panel, one yardstick, every controller: the same plants, starts, references and noise; costs only under the same weights, judged by true outputs.
+"""One panel, one yardstick, every controller: the same plants, starts, references and noise; costs only under
+the same weights, judged by true outputs.
 
-Two runs of every scenario: unclipped, where the discrete Riccati equation gives the optimum (regret J / J* - 1), and with inputs clipped to the machine's limits,
-where an engineer's figures are read off.
+Two runs of every scenario: unclipped, where the discrete Riccati equation gives the optimum (regret J / J* -
+1), and with inputs clipped to the machine's limits, where an engineer's figures are read off.
 """
 
 from collections.abc import Sequence
@@ -16,9 +17,11 @@ from pipeline.temperature.tracking import Gains, Law, aimed, gains
 
 
 class Panel(NamedTuple):
-    """Scenarios, one a row: plant[i] of `plants` (all of one order), held at x0 by u0, reference r, sensor noise of `noise` °C drawn from `seed`.
+    """Scenarios, one a row: plant[i] of `plants` (all of one order), held at x0 by u0, reference r, sensor
+    noise of `noise` °C drawn from `seed`.
 
-    The controller watches the hold for `hold` steps before it takes over, so that its memory holds what a machine would have put there, then runs for `steps`.
+    The controller watches the hold for `hold` steps before it takes over, so that its memory holds what a
+    machine would have put there, then runs for `steps`.
     """
 
     plants: list[Plant]
@@ -49,7 +52,8 @@ class Cost(NamedTuple):
 
 
 class Run(NamedTuple):
-    """True outputs y, commanded and applied inputs (steps, scenarios, p or m), and the sensors' errors that the controller saw."""
+    """True outputs y, commanded and applied inputs (steps, scenarios, p or m),
+    and the sensors' errors that the controller saw."""
 
     y: np.ndarray
     command: np.ndarray
@@ -57,7 +61,8 @@ class Run(NamedTuple):
 
 
 class Figures(NamedTuple):
-    """An engineer's figures of each scenario (scenarios,): °C, seconds, percent; NaN in settling_s where the outputs never stay within the band."""
+    """An engineer's figures of each scenario (scenarios,): °C, seconds, percent; NaN in settling_s where the
+    outputs never stay within the band."""
 
     tracking_degC: np.ndarray
     effort_percent: np.ndarray
@@ -71,12 +76,14 @@ class Figures(NamedTuple):
 
 
 def panel(
-    plants: Sequence[Plant], *, starts: Sequence[float], references: Sequence[Sequence[float]], noise: Sequence[float], seeds: Sequence[int], steps: int,
+    plants: Sequence[Plant], *, starts: Sequence[float], references: Sequence[Sequence[float]],
+    noise: Sequence[float], seeds: Sequence[int], steps: int,
     hold: int, cells: bool,
 ) -> Panel:  # fmt: skip
     """Every plant x start x reference x noise level, once without noise and once a seed with it.
 
-    A start is a temperature in °C at which the plant is held by its steady input: of every cell where the states are `cells`, of every sensor otherwise.
+    A start is a temperature in °C at which the plant is held by its steady input: of every cell where the
+    states are `cells`, of every sensor otherwise.
     """
     rows = []
     for index, plant in enumerate(plants):
@@ -85,26 +92,54 @@ def panel(
             u0 = hold_state(plant, x0) if u0 is None else u0
             for reference in references:
                 for level in noise:
-                    rows += [(index, x0, u0, reference, level, seed, start) for seed in (seeds if level > 0 else seeds[:1])]
+                    rows += [
+                        (index, x0, u0, reference, level, seed, start)
+                        for seed in (seeds if level > 0 else seeds[:1])
+                    ]
     index, x0, u0, r, level, seed, start = (np.array(column) for column in zip(*rows, strict=True))
-    return Panel(list(plants), index, x0, u0, np.asarray(r, float), level.astype(float), seed, start.astype(float), steps, hold)
+    return Panel(
+        list(plants),
+        index,
+        x0,
+        u0,
+        np.asarray(r, float),
+        level.astype(float),
+        seed,
+        start.astype(float),
+        steps,
+        hold,
+    )
 
 
 def disturbances(panel: Panel) -> np.ndarray:
-    """Sensor noise (hold + steps, scenarios, p): each scenario draws from its own seed, so that every controller sees the same."""
+    """Sensor noise (hold + steps, scenarios, p): each scenario draws from its
+    own seed, so that every controller sees the same."""
     unit = {
         int(seed): np.random.default_rng(seed).standard_normal((panel.hold + panel.steps, panel.r.shape[1]))
         for seed in np.unique(panel.seed)
     }
-    return np.stack([level * unit[int(seed)] for level, seed in zip(panel.noise, panel.seed, strict=True)], axis=1)
+    return np.stack(
+        [level * unit[int(seed)] for level, seed in zip(panel.noise, panel.seed, strict=True)], axis=1
+    )
 
 
-def simulate(panel: Panel, law: Law, k: np.ndarray, *, limits: tuple[np.ndarray, np.ndarray] | None, integral_band: float = np.inf) -> Run:
-    """Every scenario at once under one law with feed-forward k (scenarios, m); limits (low, high) in percent clip what is applied and what enters the memory.
+def simulate(
+    panel: Panel,
+    law: Law,
+    k: np.ndarray,
+    *,
+    limits: tuple[np.ndarray, np.ndarray] | None,
+    integral_band: float = np.inf,
+) -> Run:
+    """Every scenario at once under one law with feed-forward k (scenarios, m); limits (low, high) in percent
+    clip what is applied and what enters the memory.
 
-    The outer integrator xi sees errors no larger than `integral_band` °C, so that the way up winds nothing up.
+    The outer integrator xi sees errors no larger than `integral_band`
+    °C, so that the way up winds nothing up.
     """
-    A, B, C, b, d = (np.stack([getattr(panel.plants[i], name) for i in panel.plant]) for name in ("A", "B", "C", "b", "d"))
+    A, B, C, b, d = (
+        np.stack([getattr(panel.plants[i], name) for i in panel.plant]) for name in ("A", "B", "C", "b", "d")
+    )
     steps, (scenarios, p) = panel.steps, panel.r.shape
     y, command = np.empty((steps, scenarios, p)), np.empty((steps, scenarios, law.K.shape[0]))
     applied, noise = np.empty_like(command), disturbances(panel)
@@ -133,8 +168,11 @@ def simulate(panel: Panel, law: Law, k: np.ndarray, *, limits: tuple[np.ndarray,
     return Run(y, command, applied)
 
 
-def feed_forward(panel: Panel, law: Law, targets: dict[bytes, tuple[np.ndarray, np.ndarray]] | None) -> np.ndarray:
-    """k (scenarios, m): the law's own, or, with the steady (u, y) of each reference in `targets`, the one that rests there (tracking.feasible_target)."""
+def feed_forward(
+    panel: Panel, law: Law, targets: dict[bytes, tuple[np.ndarray, np.ndarray]] | None
+) -> np.ndarray:
+    """k (scenarios, m): the law's own, or, with the steady (u, y) of each reference in `targets`, the one
+    that rests there (tracking.feasible_target)."""
     if targets is None:
         return np.tile(law.k, (len(panel.r), 1))
     rest = {key: aimed(law, np.frombuffer(key), *target).k for key, target in targets.items()}
@@ -155,13 +193,17 @@ def optimum(panel: Panel, yardstick: Yardstick) -> Cost:
 
 def optimum_run(panel: Panel, yardstick: Yardstick) -> Run:
     """The run behind J*."""
-    best = [gains(plant, np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma) for plant in panel.plants]
+    best = [
+        gains(plant, np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma) for plant in panel.plants
+    ]
     return _state_feedback(panel, best)
 
 
 def _state_feedback(panel: Panel, best: Sequence[Gains]) -> Run:
     plants = [panel.plants[i] for i in panel.plant]
-    A, B, C, b, d = (np.stack([getattr(plant, name) for plant in plants]) for name in ("A", "B", "C", "b", "d"))
+    A, B, C, b, d = (
+        np.stack([getattr(plant, name) for plant in plants]) for name in ("A", "B", "C", "b", "d")
+    )
     K_x = np.stack([best[i].K_x for i in panel.plant])
     feed = np.stack([best[i].K_r @ r + best[i].k for i, r in zip(panel.plant, panel.r, strict=True)])
     x, y, u = panel.x0.copy(), np.empty((panel.steps, *panel.r.shape)), np.empty((panel.steps, *feed.shape))
@@ -173,12 +215,15 @@ def _state_feedback(panel: Panel, best: Sequence[Gains]) -> Run:
 
 
 def regret(J: Cost, best: Cost) -> np.ndarray:
-    """J / J* - 1 (scenarios,). Raises ValueError where the two were computed under different weights: such costs say nothing about each other."""
+    """J / J* - 1 (scenarios,). Raises ValueError where the two were computed under different weights: such
+    costs say nothing about each other."""
     a, b = J.yardstick, best.yardstick
     if not (np.array_equal(a.q, b.q) and np.array_equal(a.r, b.r) and a.gamma == b.gamma):
         raise ValueError(
-            f"costs under different weights cannot be compared: one was computed with q = {_short(a.q)}, r = {_short(a.r)}, gamma = {a.gamma:g}, the other with "
-            f"q = {_short(b.q)}, r = {_short(b.r)}, gamma = {b.gamma:g}; compute both under one yardstick (section tracking of params.expert.yaml)"
+            f"costs under different weights cannot be compared: one was computed with q = {_short(a.q)}, "
+            f"r = {_short(a.r)}, gamma = {a.gamma:g}, the other with "
+            f"q = {_short(b.q)}, r = {_short(b.r)}, gamma = {b.gamma:g}; "
+            "compute both under one yardstick (section tracking of params.expert.yaml)"
         )
     return J.J / best.J - 1
 
@@ -187,9 +232,12 @@ def _short(values: np.ndarray) -> str:
     return np.array2string(np.asarray(values), precision=3, threshold=4, edgeitems=2)
 
 
-def figures(panel: Panel, run: Run, *, limits: tuple[np.ndarray, np.ndarray], band: float, sample_time_s: float) -> Figures:
-    """What an engineer reads off a run. Settled: the mean error over the last third, of the worst zone. Settling: the first time after which every zone stays
-    within `band` °C of its reference. Overshoot: past the reference, in the direction of the step. At limits: share of (input, step) with a command outside."""
+def figures(
+    panel: Panel, run: Run, *, limits: tuple[np.ndarray, np.ndarray], band: float, sample_time_s: float
+) -> Figures:
+    """What an engineer reads off a run. Settled: the mean error over the last third, of the worst zone.
+    Settling: the first time after which every zone stays within `band` °C of its reference. Overshoot: past
+    the reference, in the direction of the step. At limits: share of (input, step) with a command outside."""
     error = run.y - panel.r
     late = error[2 * len(error) // 3 :].mean(axis=0)
     outside = (np.abs(error) > band).any(axis=2)
@@ -212,7 +260,8 @@ def figures(panel: Panel, run: Run, *, limits: tuple[np.ndarray, np.ndarray], ba
 
 
 class Allowance(NamedTuple):
-    """What the engineering cost counts as one: seconds of settling, °C of overshoot and of settled error, percent of commands outside the limits and of effort."""
+    """What the engineering cost counts as one: seconds of settling, °C of overshoot and of settled error,
+    percent of commands outside the limits and of effort."""
 
     settling_s: float
     overshoot_degC: float
@@ -223,9 +272,11 @@ class Allowance(NamedTuple):
 
 
 def engineering_cost(found: Figures, plant: np.ndarray, allowance: Allowance, *, longest_s: float) -> float:
-    """The declared cost of practical tuning: mean over scenarios of figure / allowance, summed, plus `worst_case` times that of the worst plant.
+    """The declared cost of practical tuning: mean over scenarios of figure / allowance, summed, plus
+    `worst_case` times that of the worst plant.
 
-    A run that never settles counts as one that settles at the end of the panel. Raises ValueError where a run leaves every scale: the candidate has failed.
+    A run that never settles counts as one that settles at the end of the panel. Raises ValueError where a run
+    leaves every scale: the candidate has failed.
     """
     settling = np.where(np.isnan(found.settling_s), longest_s, found.settling_s)
     parts = [
@@ -246,9 +297,10 @@ def engineering_cost(found: Figures, plant: np.ndarray, allowance: Allowance, *,
 
 
 class Margins(NamedTuple):
-    """`disk`: the smaller of the disk margins at the plant's inputs and at its outputs, every channel changing by itself at the same time (a lower bound, by scaling);
-    `delay_s`: extra delay in all sensors
-    at once; `stable`: every eigenvalue of the closed loop inside the unit circle, the largest of size `radius`."""
+    """`disk`: the smaller of the disk margins at the plant's inputs and at its outputs,
+    every channel changing by itself at the same time (a lower bound, by scaling);
+    `delay_s`: extra delay in all sensors at once; `stable`: every eigenvalue of the closed
+    loop inside the unit circle, the largest of size `radius`."""
 
     disk: float
     delay_s: float
@@ -257,22 +309,30 @@ class Margins(NamedTuple):
 
 
 def margins(plants: Sequence[Plant], law: Law, *, grid: int = 240) -> list[Margins]:
-    """Of each plant: disk margin 1 / max |S - I/2| (Seiler, Packard, Gahinet 2020, skew 0) and delay margin min (pi + arg lambda(L)) / omega over |lambda(L)| = 1."""
-    omega = np.concatenate([np.geomspace(1e-4, 0.3, grid // 2, endpoint=False), np.linspace(0.3, np.pi, grid - grid // 2)])
+    """Of each plant: disk margin 1 / max |S - I/2| (Seiler, Packard, Gahinet 2020, skew 0) and delay margin
+    min (pi + arg lambda(L)) / omega over |lambda(L)| = 1."""
+    omega = np.concatenate(
+        [np.geomspace(1e-4, 0.3, grid // 2, endpoint=False), np.linspace(0.3, np.pi, grid - grid // 2)]
+    )
     z = np.exp(1j * omega)
     K = law_response(law, z)
     return [_margins(plant, law, omega, z, K) for plant in plants]
 
 
 def _structured(M: np.ndarray, *, sweeps: int = 12) -> np.ndarray:
-    """Upper bound of the structured singular value of M (grid, k, k) for independent channels: |D M D^-1| with D by Osborne's balancing, never above |M|."""
+    """Upper bound of the structured singular value of M (grid, k, k) for independent channels: |D M D^-1|
+    with D by Osborne's balancing, never above |M|."""
     k = M.shape[1]
     off, d = np.abs(M) ** 2 * (1 - np.eye(k)), np.ones(M.shape[:2])
     for _ in range(sweeps):
         for i in range(k):
             row = (off[:, i] / d**2).sum(axis=1)
             column = (off[:, :, i] * d**2).sum(axis=1)
-            d[:, i] = np.where((row > 0) & (column > 0), (np.maximum(column, 1e-300) / np.maximum(row, 1e-300)) ** 0.25, d[:, i])
+            d[:, i] = np.where(
+                (row > 0) & (column > 0),
+                (np.maximum(column, 1e-300) / np.maximum(row, 1e-300)) ** 0.25,
+                d[:, i],
+            )
     scaled = d[:, :, None] * M / d[:, None, :]
     return np.minimum(np.linalg.norm(scaled, ord=2, axis=(1, 2)), np.linalg.norm(M, ord=2, axis=(1, 2)))
 
@@ -281,10 +341,19 @@ def _margins(plant: Plant, law: Law, omega: np.ndarray, z: np.ndarray, K: np.nda
     radius = np.abs(np.linalg.eigvals(closed_loop(plant, law))).max()
     if radius >= 1:
         return Margins(0.0, 0.0, False, float(radius))
-    G = plant.C @ np.linalg.solve(z[:, None, None] * np.eye(plant.n) - plant.A, np.broadcast_to(plant.B, (len(z), plant.n, plant.m)))
+    G = plant.C @ np.linalg.solve(
+        z[:, None, None] * np.eye(plant.n) - plant.A, np.broadcast_to(plant.B, (len(z), plant.n, plant.m))
+    )
     loops = (G @ K, K @ G)
-    disk = min(1 / _structured(np.linalg.inv(np.eye(L.shape[1]) + L) - np.eye(L.shape[1]) / 2).max() for L in loops)
-    return Margins(float(disk), _delay_margin(omega, np.linalg.eigvals(loops[0])) * plant.sample_time_s, True, float(radius))
+    disk = min(
+        1 / _structured(np.linalg.inv(np.eye(L.shape[1]) + L) - np.eye(L.shape[1]) / 2).max() for L in loops
+    )
+    return Margins(
+        float(disk),
+        _delay_margin(omega, np.linalg.eigvals(loops[0])) * plant.sample_time_s,
+        True,
+        float(radius),
+    )
 
 
 def closed_loop(plant: Plant, law: Law) -> np.ndarray:
@@ -302,7 +371,8 @@ def closed_loop(plant: Plant, law: Law) -> np.ndarray:
 
 
 def law_response(law: Law, z: np.ndarray) -> np.ndarray:
-    """Frequency response K (grid, m, p) of the law, u = -K(z) y, its memory fed with its own command; by one Schur form, triangular at every frequency."""
+    """Frequency response K (grid, m, p) of the law, u = -K(z) y, its memory fed with its own command; by one
+    Schur form, triangular at every frequency."""
     T, V = scipy.linalg.schur(law.A - law.B_u @ law.K, output="complex")
     from_y, from_xi = V.conj().T @ (law.B_y - law.B_u @ law.D), V.conj().T @ law.B_u @ law.K_r
     K, identity = law.K @ V, np.eye(len(T))
@@ -310,17 +380,23 @@ def law_response(law: Law, z: np.ndarray) -> np.ndarray:
     for i, point in enumerate(z):
         xi = -law.integral / (point - 1) if law.integral else 0.0
         response[i] = (
-            K @ scipy.linalg.solve_triangular(point * identity - T, from_y - xi * from_xi, check_finite=False) + law.D + xi * law.K_r
+            K @ scipy.linalg.solve_triangular(point * identity - T, from_y - xi * from_xi, check_finite=False)
+            + law.D
+            + xi * law.K_r
         )
     return response
 
 
 def _delay_margin(omega: np.ndarray, loci: np.ndarray) -> float:
-    """Smallest delay in samples that takes an eigenvalue of the loop to -1: both sides of each unit crossing are tried, the smaller counts."""
+    """Smallest delay in samples that takes an eigenvalue of the loop to -1: both sides of
+    each unit crossing are tried, the smaller counts."""
     size = np.abs(loci)
     crossing = (size[:-1] - 1) * (size[1:] - 1) < 0
-    lag = np.minimum((np.angle(loci[:-1]) + np.pi) / omega[:-1, None], (np.angle(loci[1:]) + np.pi) / omega[1:, None])
-    # a delay of whole samples turns the locus at pi by pi a sample: where it is larger than one there, it meets -1 without crossing the circle
+    lag = np.minimum(
+        (np.angle(loci[:-1]) + np.pi) / omega[:-1, None], (np.angle(loci[1:]) + np.pi) / omega[1:, None]
+    )
+    # a delay of whole samples turns the locus at pi by pi a sample: where it is larger than one there, it
+    # meets -1 without crossing the circle
     last = (np.angle(loci[-1]) + np.pi) / omega[-1]
     lags = np.concatenate([lag[crossing], last[size[-1] > 1]])
     return float(lags.min()) if lags.size else float("inf")

@@ -1,4 +1,5 @@
-"""What the learners reach on the study's machine, where the optimum is known: without noise, and on many noisy data sets; the yardstick beside the paper's figures."""
+"""What the learners reach on the study's machine, where the optimum is known: without noise, and on many
+noisy data sets; the yardstick beside the paper's figures."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,7 +11,16 @@ from pipeline.temperature.kernel import Kernel, exact_gains, regress, tuples, va
 from pipeline.temperature.plant import baam
 from pipeline.temperature.probing import study_probe, study_signal
 from pipeline.temperature.published import GAMMA, K_DATA, PRINTED, REFERENCE, TAU, Figures
-from pipeline.temperature.scorecard import Panel, Yardstick, cost, feed_forward, optimum, panel, regret, simulate
+from pipeline.temperature.scorecard import (
+    Panel,
+    Yardstick,
+    cost,
+    feed_forward,
+    optimum,
+    panel,
+    regret,
+    simulate,
+)
 from pipeline.temperature.tracking import Law, gains, observer_gain, observer_law
 from pipeline.temperature.tuning import fitness
 
@@ -18,9 +28,21 @@ YARDSTICK = Yardstick(np.ones(5), np.ones(7), GAMMA)
 AMPLITUDES, BANDWIDTH, VARIANCE = np.arange(100.0, 0.0, -10.0), 1.65, 1.5
 
 
-def study_panel(references: np.ndarray, *, noise: float = 0.0, seeds: tuple[int, ...] = (0,), hold: int = 0) -> Panel:
-    """The study's machine, held at 20 °C in every cell by its steady input, for each reference (k, 5); 1,000 steps."""
-    return panel([baam()], starts=[20.0], references=references, noise=[noise], seeds=seeds, steps=1000, hold=hold, cells=True)
+def study_panel(
+    references: np.ndarray, *, noise: float = 0.0, seeds: tuple[int, ...] = (0,), hold: int = 0
+) -> Panel:
+    """The study's machine, held at 20 °C in every cell by its steady
+    input, for each reference (k, 5); 1,000 steps."""
+    return panel(
+        [baam()],
+        starts=[20.0],
+        references=references,
+        noise=[noise],
+        seeds=seeds,
+        steps=1000,
+        hold=hold,
+        cells=True,
+    )
 
 
 def gap(law: Law, scenarios: Panel) -> np.ndarray:
@@ -30,8 +52,11 @@ def gap(law: Law, scenarios: Panel) -> np.ndarray:
 
 
 def data_sets(rng: np.random.Generator, samples: int, sets: int) -> tuple[np.ndarray, np.ndarray]:
-    """`sets` runs of the study's probing (50) from 50 °C, noise-free: u (samples, sets, 7), y (samples, sets, 5)."""
-    signal = study_signal(rng, samples, 7 * sets, amplitudes=AMPLITUDES, bandwidth=BANDWIDTH, variance=VARIANCE).reshape(samples, sets, 7)
+    """`sets` runs of the study's probing (50) from 50 °C, noise-free:
+    u (samples, sets, 7), y (samples, sets, 5)."""
+    signal = study_signal(
+        rng, samples, 7 * sets, amplitudes=AMPLITUDES, bandwidth=BANDWIDTH, variance=VARIANCE
+    ).reshape(samples, sets, 7)
     found = study_probe(baam(), signal, K_DATA, x0=np.full(6, 50.0), noise=np.zeros((samples, sets, 5)))
     return found.u, found.y
 
@@ -46,7 +71,8 @@ def law_of(kernel: Kernel, N: int) -> Law:
 
 
 class Exact(NamedTuple):
-    """J over 1,000 (100) steps from 20 °C, Q = R = I: the optimum that knows the state, and the observer that does not; and two prices of the start."""
+    """J over 1,000 (100) steps from 20 °C, Q = R = I: the optimum that knows the state, and the observer that
+    does not; and two prices of the start."""
 
     optimal_J1000: float
     optimal_J100: float
@@ -56,7 +82,8 @@ class Exact(NamedTuple):
 
 
 def exact() -> Exact:
-    """The model-based figures of the common yardstick, and what a wrong start costs: the paper's 50 °C estimate, and a window filled with u = 0 and y(0)."""
+    """The model-based figures of the common yardstick, and what a wrong start costs: the paper's 50 °C
+    estimate, and a window filled with u = 0 and y(0)."""
     plant, scenarios = baam(), study_panel(REFERENCE[None])
     best = gains(plant, np.eye(5), np.eye(7), GAMMA)
     short = scenarios._replace(steps=100)
@@ -66,16 +93,24 @@ def exact() -> Exact:
     history = window_law(K, K_r, best.k, 2)
     empty = history._replace(start_u=np.zeros_like(history.start_u))
     J = [
-        float(cost(scenarios, simulate(scenarios, run, feed_forward(scenarios, run, None), limits=None), YARDSTICK).J[0])
+        float(
+            cost(
+                scenarios,
+                simulate(scenarios, run, feed_forward(scenarios, run, None), limits=None),
+                YARDSTICK,
+            ).J[0]
+        )
         for run in (law, from_50)
     ]
     return Exact(
-        float(optimum(scenarios, YARDSTICK).J[0]), float(optimum(short, YARDSTICK).J[0]), *J, float(gap(empty, scenarios)[0])
+        float(optimum(scenarios, YARDSTICK).J[0]), float(optimum(short, YARDSTICK).J[0]), *J,
+        float(gap(empty, scenarios)[0])
     )  # fmt: skip
 
 
 class NoiseFree(NamedTuple):
-    """Gaps of Algorithm 2 on noise-free data: window of 2 on 500 and of 6 on 1,610 samples for the study's reference; one set of 540 for random references."""
+    """Gaps of Algorithm 2 on noise-free data: window of 2 on 500 and of 6 on 1,610 samples for the study's
+    reference; one set of 540 for random references."""
 
     gap: float
     gap_window_6: float
@@ -83,7 +118,8 @@ class NoiseFree(NamedTuple):
 
 
 def noise_free(u: np.ndarray, y: np.ndarray, rng: np.random.Generator, *, references: int = 20) -> NoiseFree:
-    """From the study's own record u (T, 7), y (T, 5) without its first row; the worst of `references` drawn from 100 to 220 °C."""
+    """From the study's own record u (T, 7), y (T, 5) without its first row; the
+    worst of `references` drawn from 100 to 220 °C."""
     one, many = study_panel(REFERENCE[None]), study_panel(rng.uniform(100.0, 220.0, (references, 5)))
     figures = []
     for N, samples, scenarios in ((2, 500, one), (6, 1610, one), (2, 540, many)):
@@ -96,65 +132,113 @@ NOISE = (0.1, 0.5)
 ROUTES = ("window", "kernel", "kernel_predicted_state")
 
 
-def under_noise(u: np.ndarray, y: np.ndarray, *, noise: float, seed: int, longest: int = 24) -> dict[str, tuple[float, float]]:
-    """(gap, r.m.s. error in °C over steps 500-1000) of each route on one data set with `noise` °C on y; the controller sees the same noise while it is judged."""
+def under_noise(
+    u: np.ndarray, y: np.ndarray, *, noise: float, seed: int, longest: int = 24
+) -> dict[str, tuple[float, float]]:
+    """(gap, r.m.s. error in °C over steps 500-1000) of each route on one data set with `noise` °C on y; the
+    controller sees the same noise while it is judged."""
     y = y + noise * np.random.default_rng(seed).standard_normal(y.shape)
-    scenarios, identity = study_panel(REFERENCE[None], noise=noise, seeds=(seed,), hold=longest), (np.eye(5), np.eye(7))
+    scenarios, identity = (
+        study_panel(REFERENCE[None], noise=noise, seeds=(seed,), hold=longest),
+        (np.eye(5), np.eye(7)),
+    )
     long = window_route.learn([u], [y], longest=longest)
     predicted = value_iteration(regress(window_route.predicted_tuples(long, [u], [y])), *identity, GAMMA)
-    laws = (window_route.law(long, *identity, GAMMA), law_of(kernel_of(u, y, 2), 2), law_of(predicted, long.N))
+    laws = (
+        window_route.law(long, *identity, GAMMA),
+        law_of(kernel_of(u, y, 2), 2),
+        law_of(predicted, long.N),
+    )
     result = {}
     for name, law in zip(ROUTES, laws, strict=True):
         run = simulate(scenarios, law, feed_forward(scenarios, law, None), limits=None)
         late = (run.y - scenarios.r)[500:]
-        result[name] = (float(regret(cost(scenarios, run, YARDSTICK), optimum(scenarios, YARDSTICK))[0]), float(np.sqrt((late**2).mean())))
+        result[name] = (
+            float(regret(cost(scenarios, run, YARDSTICK), optimum(scenarios, YARDSTICK))[0]),
+            float(np.sqrt((late**2).mean())),
+        )
     return result
 
 
-def rows(work: Sequence[tuple[float, int]], found: Sequence[dict[str, tuple[float, float]]]) -> dict[str, list]:
+def rows(
+    work: Sequence[tuple[float, int]], found: Sequence[dict[str, tuple[float, float]]]
+) -> dict[str, list]:
     """`under_noise` of each (noise, data set) as columns, one row a route."""
-    table = [(route, noise, index, *result[route]) for (noise, index), result in zip(work, found, strict=True) for route in ROUTES]
+    table = [
+        (route, noise, index, *result[route])
+        for (noise, index), result in zip(work, found, strict=True)
+        for route in ROUTES
+    ]
     route, noise, index, gaps, errors = (list(column) for column in zip(*table, strict=True))
     finite = [[value if np.isfinite(value) else np.nan for value in column] for column in (gaps, errors)]
     return {"route": route, "noise_degC": noise, "data_set": index, "gap": finite[0], "error_degC": finite[1]}
 
 
 def metrics(
-    as_published: dict[str, Figures], exact: Exact, noise_free: NoiseFree, table: dict[str, list], *, failures: int, starts: int
+    as_published: dict[str, Figures],
+    exact: Exact,
+    noise_free: NoiseFree,
+    table: dict[str, list],
+    *,
+    failures: int,
+    starts: int,
 ) -> dict:
-    """The figures by which the learners are known: as published, on the common yardstick without noise, and over the noisy data sets."""
+    """The figures by which the learners are known: as published, on the common
+    yardstick without noise, and over the noisy data sets."""
     result = {
         "as_published": {name: found._asdict() for name, found in as_published.items()},
         "printed": PRINTED,
         "algorithm_1": {"failures": failures, "of": starts},
         "optimal": {"J1000": exact.optimal_J1000, "J100": exact.optimal_J100},
-        "observer": {"J1000": exact.observer_J1000, "J1000_from_50_degC": exact.observer_published_start_J1000},
+        "observer": {
+            "J1000": exact.observer_J1000,
+            "J1000_from_50_degC": exact.observer_published_start_J1000,
+        },
         "takeover": {"zero_history_gap": exact.zero_history_gap},
-        "kernel": {"gap": noise_free.gap, "gap_window_6": noise_free.gap_window_6, "any_reference_gap": noise_free.any_reference_gap},
+        "kernel": {
+            "gap": noise_free.gap,
+            "gap_window_6": noise_free.gap_window_6,
+            "any_reference_gap": noise_free.any_reference_gap,
+        },
         "window": {},
         "kernel_predicted_state": {},
     }
     for route in ROUTES:
         for noise in NOISE:
-            mine = [i for i, (r, n) in enumerate(zip(table["route"], table["noise_degC"], strict=True)) if (r, n) == (route, noise)]
-            gaps, errors = (np.nan_to_num([table[name][i] for i in mine], nan=np.inf) for name in ("gap", "error_degC"))
+            mine = [
+                i
+                for i, (r, n) in enumerate(zip(table["route"], table["noise_degC"], strict=True))
+                if (r, n) == (route, noise)
+            ]
+            gaps, errors = (
+                np.nan_to_num([table[name][i] for i in mine], nan=np.inf) for name in ("gap", "error_degC")
+            )
             stable = int((gaps < 1).sum())
-            figures = {"median_gap": np.median(gaps), "worst_gap": gaps.max(), "median_error_degC": np.median(errors)}
+            figures = {
+                "median_gap": np.median(gaps),
+                "worst_gap": gaps.max(),
+                "median_error_degC": np.median(errors),
+            }
             result[route][f"noise_{noise:g}".replace(".", "_")] = {
-                **{name: float(value) if np.isfinite(value) else None for name, value in figures.items()}, "stable": stable, "of": len(mine),
+                **{name: float(value) if np.isfinite(value) else None for name, value in figures.items()},
+                "stable": stable, "of": len(mine),
             }  # fmt: skip
     return result
 
 
 def tuning_objective(theta: np.ndarray) -> float:
-    """(37) of theta = [q (5,); r (7,)] on the study's machine: l = 100, from 20 °C, the state known, the gain from the discounted Riccati equation."""
+    """(37) of theta = [q (5,); r (7,)] on the study's machine: l = 100, from 20 °C, the state known, the gain
+    from the discounted Riccati equation."""
     plant = baam()
     best = gains(plant, np.diag(theta[:5]), np.diag(theta[5:]), GAMMA)
-    return fitness(plant, best.K_x, best.K_r, reference=REFERENCE, gamma=GAMMA, steps=100, x0=np.full(plant.n, 20.0))
+    return fitness(
+        plant, best.K_x, best.K_r, reference=REFERENCE, gamma=GAMMA, steps=100, x0=np.full(plant.n, 20.0)
+    )
 
 
 def tuning_parts(theta: np.ndarray) -> tuple[float, float]:
-    """What tuning_objective adds up, each in its own unit: discounted r.m.s. error e in °C and effort u in percent, F = sum_t gamma^t (5 e^2 + 7 u^2)."""
+    """What tuning_objective adds up, each in its own unit: discounted r.m.s. error e in °C and effort u in
+    percent, F = sum_t gamma^t (5 e^2 + 7 u^2)."""
     plant, discount = baam(), GAMMA ** np.arange(101)
     best = gains(plant, np.diag(theta[:5]), np.diag(theta[5:]), GAMMA)
     x, squares = np.full(plant.n, 20.0), np.empty((101, 2))
@@ -167,17 +251,22 @@ def tuning_parts(theta: np.ndarray) -> tuple[float, float]:
 
 
 class ScaledWeights(NamedTuple):
-    """Q = R = 0.4 I beside Q = R = I: the change of the index when each is computed with its own weights, in percent, and the largest difference of the gains."""
+    """Q = R = 0.4 I beside Q = R = I: the change of the index when each is computed with its own weights, in
+    percent, and the largest difference of the gains."""
 
     change_percent: float
     gain_difference: float
 
 
 def scaled_weights(scale: float = 0.4) -> ScaledWeights:
-    """Why indices with different weights say nothing: scaling all weights changes the printed index by as much, and the controller not at all."""
+    """Why indices with different weights say nothing: scaling all weights changes the printed index by as
+    much, and the controller not at all."""
     plant, scenarios = baam(), study_panel(REFERENCE[None])
     one, other = (gains(plant, factor * np.eye(5), factor * np.eye(7), GAMMA) for factor in (1.0, scale))
     law = observer_law(plant, other, observer_gain(plant, TAU))
     run = simulate(scenarios, law, feed_forward(scenarios, law, None), limits=None)
-    J = [cost(scenarios, run, Yardstick(np.full(5, factor), np.full(7, factor), GAMMA)).J[0] for factor in (1.0, scale)]
+    J = [
+        cost(scenarios, run, Yardstick(np.full(5, factor), np.full(7, factor), GAMMA)).J[0]
+        for factor in (1.0, scale)
+    ]
     return ScaledWeights(float(100 * (J[1] / J[0] - 1)), float(np.abs(one.K_x - other.K_x).max()))

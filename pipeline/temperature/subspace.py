@@ -1,7 +1,8 @@
 """Subspace identification: PBSID with a Kalman gain (Chiuso 2007), over several segments.
 
-Records come as segments u (T, m), y (T, p); a NaN is a masked sample, and every row whose window touches one is dropped and counted. Everything that PBSID needs
-is in one triangular factor of the lagged record, so neither the order nor the horizon costs another pass over the samples.
+Records come as segments u (T, m), y (T, p); a NaN is a masked sample, and every row whose window touches one
+is dropped and counted. Everything that PBSID needs is in one triangular factor of the lagged record, so
+neither the order nor the horizon costs another pass over the samples.
 """
 
 from collections.abc import Sequence
@@ -19,9 +20,11 @@ Segments = Sequence[np.ndarray]
 
 
 class Lagged(NamedTuple):
-    """Triangular factor of the lagged record, columns [u(t) if feed-through, w(t-1), ..., w(t-past), u(t) if not, y(t)], w = [u; y] shifted and scaled.
+    """Triangular factor of the lagged record, columns [u(t) if feed-through, w(t-1), ..., w(t-past), u(t) if
+    not, y(t)], w = [u; y] shifted and scaled.
 
-    R'R is the second moment of those columns about their mean (with an offset) or about zero (without); means (past+1, m+p) holds the mean of w(t-lag) over the rows.
+    R'R is the second moment of those columns about their mean (with an offset) or about zero (without); means
+    (past+1, m+p) holds the mean of w(t-lag) over the rows.
     """
 
     R: np.ndarray
@@ -61,7 +64,8 @@ def complete_runs(u: Segments, y: Segments) -> list[np.ndarray]:
 
 
 def gapless(u: Segments, y: Segments) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """The segments cut where an input is masked: no plant can be run over an unknown input. Pieces of one sample, or without a single y, are dropped."""
+    """The segments cut where an input is masked: no plant can be run over an unknown input. Pieces of one
+    sample, or without a single y, are dropped."""
     us, ys = [], []
     for a, b in zip(u, y, strict=True):
         edges = np.flatnonzero(np.diff(np.r_[0, np.isfinite(a).all(axis=1), 0]))
@@ -75,7 +79,8 @@ def gapless(u: Segments, y: Segments) -> tuple[list[np.ndarray], list[np.ndarray
 def lagged_moments(w: np.ndarray, past: int) -> np.ndarray:
     """Sum over t = past..L-1 of z z', z = [w(t); w(t-1); ...; w(t-past)], for w (L, q).
 
-    Only the first block row is a product over the samples; the rest follows from the shift S(i+1, j+1) = S(i, j) + w(past-1-i) w(past-1-j)' - w(L-1-i) w(L-1-j)'.
+    Only the first block row is a product over the samples; the rest follows from the shift S(i+1, j+1) = S(i,
+    j) + w(past-1-i) w(past-1-j)' - w(L-1-i) w(L-1-j)'.
     """
     L, q = w.shape
     S = np.empty((past + 1, q, past + 1, q))
@@ -84,7 +89,9 @@ def lagged_moments(w: np.ndarray, past: int) -> np.ndarray:
         S[j, :, 0] = S[0, :, j].T
     for i in range(past):
         for j in range(i, past):
-            S[i + 1, :, j + 1] = S[i, :, j] + np.outer(w[past - 1 - i], w[past - 1 - j]) - np.outer(w[L - 1 - i], w[L - 1 - j])
+            S[i + 1, :, j + 1] = (
+                S[i, :, j] + np.outer(w[past - 1 - i], w[past - 1 - j]) - np.outer(w[L - 1 - i], w[L - 1 - j])
+            )
             S[j + 1, :, i + 1] = S[i + 1, :, j + 1].T
     return S.reshape((past + 1) * q, -1)
 
@@ -96,24 +103,37 @@ def _columns(m: int, p: int, past: int, feedthrough: bool) -> np.ndarray:
     return np.concatenate([now_u, lags, now_y] if feedthrough else [lags, now_u, now_y])
 
 
-def lagged(u: Segments, y: Segments, past: int, *, feedthrough: bool = False, offset: bool = True, exact: bool = False) -> Lagged:
-    """The triangular factor of a record. An offset is estimated with every regression (Frisch-Waugh: the moments are taken about the mean of the same rows).
+def lagged(
+    u: Segments,
+    y: Segments,
+    past: int,
+    *,
+    feedthrough: bool = False,
+    offset: bool = True,
+    exact: bool = False,
+) -> Lagged:
+    """The triangular factor of a record. An offset is estimated with every regression (Frisch-Waugh: the
+    moments are taken about the mean of the same rows).
 
-    `exact` takes the QR of the rows themselves, for records whose noise is below the root of rounding; otherwise Cholesky of the moments.
-    Raises ValueError where no window of past + 1 complete samples is left, or fewer than there are unknowns.
+    `exact` takes the QR of the rows themselves, for records whose noise is below the root of
+    rounding; otherwise Cholesky of the moments. Raises ValueError where no window of past + 1
+    complete samples is left, or fewer than there are unknowns.
     """
     m, p = u[0].shape[1], y[0].shape[1]
     runs = [w for w in complete_runs(u, y) if len(w) > past]
     rows, unknowns = sum(len(w) - past for w in runs), past * (m + p) + m * feedthrough + offset
     if rows < unknowns + m + p:
         raise ValueError(
-            f"the record is too short for a window of {past} samples: expected at least {unknowns + m + p} complete windows, found {rows};"
+            f"the record is too short for a window of {past} samples: "
+            f"expected at least {unknowns + m + p} complete windows, found {rows};"
             f" record {unknowns + m + p - rows} samples more, or shorten the window"
         )
     shift = sum(w.sum(axis=0) for w in runs) / sum(len(w) for w in runs) if offset else np.zeros(m + p)
     runs = [w - shift for w in runs]
     sums = sum(np.array([w[past - lag : len(w) - lag].sum(axis=0) for lag in range(past + 1)]) for w in runs)
-    R = (_exact_factor if exact else _moment_factor)(runs, past, _columns(m, p, past, feedthrough), sums.ravel() / rows * offset, rows)
+    R = (_exact_factor if exact else _moment_factor)(
+        runs, past, _columns(m, p, past, feedthrough), sums.ravel() / rows * offset, rows
+    )
     possible = sum(max(len(a) - past, 0) for a in u)
     return Lagged(R, m, p, past, feedthrough, (shift + sums / rows) * offset, rows, possible - rows, exact)
 
@@ -125,7 +145,10 @@ def _moment_factor(runs, past, columns, mean, rows) -> np.ndarray:
     try:
         return np.linalg.cholesky(S / np.outer(scale, scale) + ROUNDING * np.eye(len(S))).T * scale
     except np.linalg.LinAlgError:  # a channel whose movement is lost in the rounding of its mean: the rows themselves, with the same ridge
-        return np.linalg.qr(np.vstack([_exact_factor(runs, past, columns, mean, rows), np.sqrt(ROUNDING) * np.diag(scale)]), mode="r")
+        return np.linalg.qr(
+            np.vstack([_exact_factor(runs, past, columns, mean, rows), np.sqrt(ROUNDING) * np.diag(scale)]),
+            mode="r",
+        )
 
 
 def _exact_factor(runs, past, columns, mean, rows) -> np.ndarray:
@@ -134,7 +157,8 @@ def _exact_factor(runs, past, columns, mean, rows) -> np.ndarray:
 
 
 def one_step(data: Lagged, past: int) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients (features, p) of the one-step predictor with the first `past` lags (and u(t) with feed-through), and its errors as rows of the factor."""
+    """Coefficients (features, p) of the one-step predictor with the first `past` lags (and u(t) with
+    feed-through), and its errors as rows of the factor."""
     features = np.concatenate([data.now_u if data.feedthrough else [], data.lags(1, past)]).astype(int)
     k = len(features)  # the features lead the columns, so the factor is already theirs
     if data.exact:
@@ -145,41 +169,51 @@ def one_step(data: Lagged, past: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Subspace(NamedTuple):
-    """What the singular value decomposition of the extended predictor leaves: states = basis[:n] z for order n, and all singular values in units of noise."""
+    """What the singular value decomposition of the extended predictor leaves: states = basis[:n] z for order
+    n, and all singular values in units of noise."""
 
     basis: np.ndarray
     singular_values: np.ndarray
 
 
 def subspace(data: Lagged, future: int) -> Subspace:
-    """PBSID-opt (Chiuso 2007): the predictor's coefficients shifted into Gamma_f K, weighted by the noise, times the past, and its singular values.
+    """PBSID-opt (Chiuso 2007): the predictor's coefficients shifted into Gamma_f K, weighted by the noise,
+    times the past, and its singular values.
 
-    Row block i holds the coefficients of lags i+1, i+2, ... : the effect that the past still has i steps ahead. The coefficients' error adds to the singular values
-    about as much as a (future p) x (past (m+p)) matrix of unit noise does, at most sqrt(future p) + sqrt(past (m+p)).
+    Row block i holds the coefficients of lags i+1, i+2, ... : the effect that the past still has i steps
+    ahead. The coefficients' error adds to the singular values about as much as a (future p) x (past (m+p))
+    matrix of unit noise does, at most sqrt(future p) + sqrt(past (m+p)).
     """
     q, p, past = data.m + data.p, data.p, data.past
     coefficients, errors = one_step(data, past)
     first = data.m if data.feedthrough else 0
     S = errors.T @ errors / data.rows
-    whiten = np.linalg.inv(np.linalg.cholesky(S + ROUNDING * np.diag(np.diag(S)) + np.eye(p) * np.finfo(float).tiny))
+    whiten = np.linalg.inv(
+        np.linalg.cholesky(S + ROUNDING * np.diag(np.diag(S)) + np.eye(p) * np.finfo(float).tiny)
+    )
     phi = whiten @ coefficients[first:].T
     extended = np.zeros((future, p, past * q))
     for i in range(future):
         extended[i, :, : (past - i) * q] = phi[:, i * q :]
     extended = extended.reshape(future * p, past * q)
     U, singular_values, _ = np.linalg.svd(extended @ data.R[:, data.lags(1, past)].T, full_matrices=False)
-    return Subspace((U.T @ extended) / np.sqrt(np.maximum(singular_values, np.finfo(float).tiny))[:, None], singular_values)
+    return Subspace(
+        (U.T @ extended) / np.sqrt(np.maximum(singular_values, np.finfo(float).tiny))[:, None],
+        singular_values,
+    )
 
 
 def _least_squares(regressors: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Theta with target = regressors Theta'; columns are scaled first, so that the rank test does not depend on units."""
+    """Theta with target = regressors Theta'; columns are scaled first,
+    so that the rank test does not depend on units."""
     scale = np.linalg.norm(regressors, axis=0)
     scale[scale == 0] = 1.0
     return (np.linalg.lstsq(regressors / scale, target, rcond=RANK)[0] / scale[:, None]).T
 
 
 def realise(data: Lagged, basis: np.ndarray, sample_time_s: float) -> Plant:
-    """The plant whose states are basis (n, past (m+p)) times the past: C, D from y, then A, B, K from the states one step later, all by least squares."""
+    """The plant whose states are basis (n, past (m+p)) times the past: C, D from y, then A, B, K from the
+    states one step later, all by least squares."""
     n, m = len(basis), data.m
     x, x_next = data.R[:, data.lags(1, data.past)] @ basis.T, data.R[:, data.lags(0, data.past - 1)] @ basis.T
     u, y = data.R[:, data.now_u], data.R[:, data.now_y]

@@ -1,4 +1,5 @@
-"""Linear-quadratic tracking of a known model: Riccati gains, observer, Algorithm 1 of seed 1, and the feasible target within the limits of the inputs."""
+"""Linear-quadratic tracking of a known model: Riccati gains, observer, Algorithm 1 of seed 1, and the
+feasible target within the limits of the inputs."""
 
 from typing import NamedTuple
 
@@ -11,7 +12,8 @@ from pipeline.temperature.plant import Plant
 
 
 class Gains(NamedTuple):
-    """u = -K_x x - K_r r - k minimises (3); P (n, n) is the quadratic part of the value. K_x (m, n), K_r (m, p), k (m,)."""
+    """u = -K_x x - K_r r - k minimises (3); P (n, n) is the quadratic
+    part of the value. K_x (m, n), K_r (m, p), k (m,)."""
 
     K_x: np.ndarray
     K_r: np.ndarray
@@ -20,12 +22,15 @@ class Gains(NamedTuple):
 
 
 class Law(NamedTuple):
-    """A controller as it runs: memory z, measured y, reference r, and the input that was really applied (clipped or not).
+    """A controller as it runs: memory z, measured y, reference r, and
+    the input that was really applied (clipped or not).
 
-    u = -K z - D y - K_r (r + xi) - k,   z(t+1) = A z + B_u u_applied + B_y y + B_r r + c,   xi(t+1) = xi + integral (r - y)
+    u = -K z - D y - K_r (r + xi) - k, z(t+1) = A z + B_u u_applied +
+    B_y y + B_r r + c, xi(t+1) = xi + integral (r - y)
 
-    Shapes with q memories: A (q, q), B_u (q, m), B_y (q, p), B_r (q, p), c (q,), K (m, q), D (m, p), K_r (m, p), k (m,).
-    It takes over from a plant that was held by u0 at y0 with z = start_u u0 + start_y y0 + start and xi = 0.
+    Shapes with q memories: A (q, q), B_u (q, m), B_y (q, p), B_r (q, p), c (q,), K (m,
+    q), D (m, p), K_r (m, p), k (m,). It takes over from a plant that was held by u0 at y0
+    with z = start_u u0 + start_y y0 + start and xi = 0.
     """
 
     A: np.ndarray
@@ -43,10 +48,20 @@ class Law(NamedTuple):
     integral: float = 0.0
 
 
-def riccati(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray, *, tolerance: float = 1e-14, max_doublings: int = 60) -> np.ndarray:
-    """P = Q + A'PA - A'PB (R + B'PB)^-1 B'PA by structure-preserving doubling (Chu, Fan, Lin, Wang 2004): each step doubles the horizon.
+def riccati(
+    A: np.ndarray,
+    B: np.ndarray,
+    Q: np.ndarray,
+    R: np.ndarray,
+    *,
+    tolerance: float = 1e-14,
+    max_doublings: int = 60,
+) -> np.ndarray:
+    """P = Q + A'PA - A'PB (R + B'PB)^-1 B'PA by structure-preserving doubling (Chu,
+    Fan, Lin, Wang 2004): each step doubles the horizon.
 
-    A (n, n), B (n, m), Q (n, n) and R (m, m) symmetric, R > 0. Raises ValueError where the recursion does not settle: (A, B) is not stabilisable.
+    A (n, n), B (n, m), Q (n, n) and R (m, m) symmetric, R > 0. Raises ValueError where the recursion does not
+    settle: (A, B) is not stabilisable.
     """
     G = B @ np.linalg.solve(R, B.T)
     P, identity = Q, np.eye(len(A))
@@ -61,15 +76,18 @@ def riccati(A: np.ndarray, B: np.ndarray, Q: np.ndarray, R: np.ndarray, *, toler
         if np.abs(step).max() <= tolerance * np.abs(P).max():
             return P
     raise ValueError(
-        "the Riccati equation has no stabilising solution: expected every mode slower than the discount to obey an input, found one that does not; "
+        "the Riccati equation has no stabilising solution: expected every mode slower than the discount to "
+        "obey an input, found one that does not; "
         "check the columns of B, or add the input that moves it"
     )
 
 
 def gains(plant: Plant, Q: np.ndarray, R: np.ndarray, gamma: float, F: np.ndarray | None = None) -> Gains:
-    """The optimal u = -K_x x - K_r r - k for (3) with r(t+1) = F r(t) (default: constant): discrete Riccati equation on sqrt(gamma) (A, B).
+    """The optimal u = -K_x x - K_r r - k for (3) with r(t+1) = F r(t) (default:
+    constant): discrete Riccati equation on sqrt(gamma) (A, B).
 
-    With w = [r; 1], x+ = A x + B u + E w and y - r = C x + G w:  K_w = S^-1 gamma B'(P E + P_xw F_w),  P_xw = C'QG + gamma (A - B K_x)'(P E + P_xw F_w).
+    With w = [r; 1], x+ = A x + B u + E w and y - r = C x + G w: K_w = S^-1 gamma B'(P E + P_xw F_w), P_xw =
+    C'QG + gamma (A - B K_x)'(P E + P_xw F_w).
     """
     _strictly_proper(plant)
     p, F = plant.p, np.eye(plant.p) if F is None else F
@@ -85,7 +103,8 @@ def gains(plant: Plant, Q: np.ndarray, R: np.ndarray, gamma: float, F: np.ndarra
 
 
 def stein(A: np.ndarray, F: np.ndarray, C: np.ndarray) -> np.ndarray:
-    """X with X = A X F + C; one linear solve where F is the identity (a constant reference), by Kronecker products otherwise."""
+    """X with X = A X F + C; one linear solve where F is the identity (a
+    constant reference), by Kronecker products otherwise."""
     if np.array_equal(F, np.eye(len(F))):
         return np.linalg.solve(np.eye(len(A)) - A, C)
     x = np.linalg.solve(np.eye(C.size) - np.kron(F.T, A), C.ravel(order="F"))
@@ -100,7 +119,8 @@ def augmented(plant: Plant, Q: np.ndarray, F: np.ndarray) -> tuple[np.ndarray, n
 
 
 class Iterated(NamedTuple):
-    """K (m, n+p) of u = -K [x; r] (15), and how many policies were evaluated; `settled` is False where the limit of iterations ended it."""
+    """K (m, n+p) of u = -K [x; r] (15), and how many policies were evaluated; `settled`
+    is False where the limit of iterations ended it."""
 
     K: np.ndarray
     iterations: int
@@ -108,9 +128,11 @@ class Iterated(NamedTuple):
 
 
 def algorithm_1(plant: Plant, Q, R, gamma, K0, *, tolerance: float, max_iterations: int = 100) -> Iterated:
-    """Algorithm 1 as the study's script runs it: its Lyapunov equation carries gamma in place of sqrt(gamma), and it stops on the one-norm of K's change.
+    """Algorithm 1 as the study's script runs it: its Lyapunov equation carries gamma in place of sqrt(gamma),
+    and it stops on the one-norm of K's change.
 
-    From a K0 under which the cost is infinite, the P of (ii) is no cost, and the iteration can settle on a gain that does not stabilise: nothing here notices.
+    From a K0 under which the cost is infinite, the P of (ii) is no cost, and the iteration can settle on a
+    gain that does not stabilise: nothing here notices.
     """
     T, B_1, Q_1 = augmented(plant, Q, np.eye(plant.p))
     K = K0
@@ -122,11 +144,15 @@ def algorithm_1(plant: Plant, Q, R, gamma, K0, *, tolerance: float, max_iteratio
     return Iterated(K, max_iterations, False)
 
 
-def policy_iteration(plant: Plant, Q, R, gamma, K0, *, tolerance: float = 1e-9, max_iterations: int = 200) -> Iterated:
-    """Algorithm 1 made safe: a policy is evaluated only under a discount for which its cost is finite, and the discount rises to gamma as the policy improves.
+def policy_iteration(
+    plant: Plant, Q, R, gamma, K0, *, tolerance: float = 1e-9, max_iterations: int = 200
+) -> Iterated:
+    """Algorithm 1 made safe: a policy is evaluated only under a discount for which its cost is finite, and
+    the discount rises to gamma as the policy improves.
 
-    With rho the spectral radius of A - B K_x, the cost of K is finite for every discount below 1 / rho^2, so that P of (ii) is a cost, and the improvement
-    (iii) improves. Raises ValueError where no policy reaches gamma.
+    With rho the spectral radius of A - B K_x, the cost of K is finite for every
+    discount below 1 / rho^2, so that P of (ii) is a cost, and the improvement (iii)
+    improves. Raises ValueError where no policy reaches gamma.
     """
     T, B_1, Q_1 = augmented(plant, Q, np.eye(plant.p))
     K = K0
@@ -138,7 +164,8 @@ def policy_iteration(plant: Plant, Q, R, gamma, K0, *, tolerance: float = 1e-9, 
         if discount == gamma and np.linalg.norm(K - previous, 1) < tolerance:
             return Iterated(K, j, True)
     raise ValueError(
-        f"policy iteration did not settle in {max_iterations} policies (discount {discount:.3g} of {gamma:g}); is every slow mode moved by an input?"
+        f"policy iteration did not settle in {max_iterations} policies (discount {discount:.3g} of "
+        f"{gamma:g}); is every slow mode moved by an input?"
     )
 
 
@@ -153,29 +180,34 @@ def observer_gain(plant: Plant, tau: float) -> np.ndarray:
 
 
 def robust_observer_gain(plant: Plant, tau: float) -> np.ndarray:
-    """L = A P C'(C P C' + tau I)^-1 with P of the dual Riccati equation for process noise B B': stable for every tau > 0, and the same in any coordinates.
+    """L = A P C'(C P C' + tau I)^-1 with P of the dual Riccati equation for process noise B B': stable for
+    every tau > 0, and the same in any coordinates.
 
-    The Kalman gain of a record trusts its model wherever it goes. What a model gets wrong on another day acts like its inputs (their gain, heat lost), so that it is
-    those directions that the observer follows; tau in °C^2 per percent^2 says how much noisier than that the sensors are.
+    The Kalman gain of a record trusts its model wherever it goes. What a model gets wrong on another day acts
+    like its inputs (their gain, heat lost), so that it is those directions that the observer follows; tau in
+    °C^2 per percent^2 says how much noisier than that the sensors are.
     """
     P = riccati(plant.A.T, plant.C.T, plant.B @ plant.B.T, tau * np.eye(plant.p))
     return plant.A @ P @ plant.C.T @ np.linalg.inv(plant.C @ P @ plant.C.T + tau * np.eye(plant.p))
 
 
 def observer_law(plant: Plant, gains: Gains, L: np.ndarray, *, integral: float = 0.0) -> Law:
-    """Observer (6) and gains as one law: z = x-hat, started from the first measurement at pinv(C) (y(0) - d), which costs nothing and saves 4.8 % of J."""
+    """Observer (6) and gains as one law: z = x-hat, started from the first measurement at pinv(C) (y(0) - d),
+    which costs nothing and saves 4.8 % of J."""
     n, m, p = plant.n, plant.m, plant.p
     _strictly_proper(plant)
     C_inverse = np.linalg.pinv(plant.C)
     return Law(
-        A=plant.A - L @ plant.C, B_u=plant.B, B_y=L, B_r=np.zeros((n, p)), c=plant.b - L @ plant.d, K=gains.K_x, D=np.zeros((m, p)),
-        K_r=gains.K_r, k=gains.k, start_u=np.zeros((n, m)), start_y=C_inverse, start=-C_inverse @ plant.d, integral=integral,
+        A=plant.A - L @ plant.C, B_u=plant.B, B_y=L, B_r=np.zeros((n, p)), c=plant.b - L @ plant.d,
+        K=gains.K_x, D=np.zeros((m, p)),
+        K_r=gains.K_r, k=gains.k, start_u=np.zeros((n, m)), start_y=C_inverse, start=-C_inverse @ plant.d,
+        integral=integral,
     )  # fmt: skip
 
 
 class Target(NamedTuple):
-    """A steady state x (n,), u (m,) inside the limits with y (p,) as near the reference as the limits allow; `miss` (p,) is y - r in °C, `slack` the distance of u
-    from the nearest limit in percent."""
+    """A steady state x (n,), u (m,) inside the limits with y (p,) as near the reference as the limits allow;
+    `miss` (p,) is y - r in °C, `slack` the distance of u from the nearest limit in percent."""
 
     x: np.ndarray
     u: np.ndarray
@@ -184,11 +216,14 @@ class Target(NamedTuple):
     slack: float
 
 
-def feasible_target(plant: Plant, r: np.ndarray, low: np.ndarray, high: np.ndarray, *, tolerance: float = 1e-3) -> Target:
-    """min |C x + d - r|^2 over x = A x + B u + b, low <= u <= high, and among its solutions one that keeps all inputs as far from their limits as it can.
+def feasible_target(
+    plant: Plant, r: np.ndarray, low: np.ndarray, high: np.ndarray, *, tolerance: float = 1e-3
+) -> Target:
+    """min |C x + d - r|^2 over x = A x + B u + b, low <= u <= high, and among its solutions one that keeps
+    all inputs as far from their limits as it can.
 
-    The unlimited optimum asks heaters for negative heat; aimed at this target instead, the same gains settle on the reference (temperature notes, 6). The slack
-    costs at most `tolerance` °C of reach.
+    The unlimited optimum asks heaters for negative heat; aimed at this target instead, the same gains settle
+    on the reference (temperature notes, 6). The slack costs at most `tolerance` °C of reach.
     """
     nearest = _steady(plant, r, low, high, 0.0)
     reach, slack, step = np.linalg.norm(nearest.miss) + tolerance, 0.0, (high - low).min() / 4
@@ -202,7 +237,8 @@ def feasible_target(plant: Plant, r: np.ndarray, low: np.ndarray, high: np.ndarr
 
 
 def _steady(plant: Plant, r: np.ndarray, low: np.ndarray, high: np.ndarray, slack: float) -> Target:
-    """Bounded least squares over u, the state eliminated: x = (I - A)^-1 (B u + b); a plant that only integrates is taken to leak 1e-9 a step."""
+    """Bounded least squares over u, the state eliminated: x = (I - A)^-1 (B u + b); a plant that only
+    integrates is taken to leak 1e-9 a step."""
     m, light = plant.m, 1e-6
     balance = np.eye(plant.n) - plant.A
     if np.linalg.cond(balance) > 1e13:
@@ -218,7 +254,8 @@ def _steady(plant: Plant, r: np.ndarray, low: np.ndarray, high: np.ndarray, slac
 
 
 def aimed(law: Law, r: np.ndarray, u: np.ndarray, y: np.ndarray) -> Law:
-    """The law with its feed-forward replaced so that it rests at input u and output y while the reference is r: u - K (z - z_rest) - K_r xi."""
+    """The law with its feed-forward replaced so that it rests at input u and output y while
+    the reference is r: u - K (z - z_rest) - K_r xi."""
     z = np.linalg.solve(np.eye(len(law.A)) - law.A, law.B_u @ u + law.B_y @ y + law.B_r @ r + law.c)
     return law._replace(k=-u - law.K @ z - law.D @ y - law.K_r @ r)
 
@@ -226,5 +263,6 @@ def aimed(law: Law, r: np.ndarray, u: np.ndarray, y: np.ndarray) -> Law:
 def _strictly_proper(plant: Plant) -> None:
     if np.any(plant.D):
         raise ValueError(
-            "the design expects outputs that do not jump with the input (D = 0) but the model has feed-through; identify it with feedthrough: false"
+            "the design expects outputs that do not jump with the input (D = 0) but the model has "
+            "feed-through; identify it with feedthrough: false"
         )

@@ -1,4 +1,5 @@
-"""How far an identified plant can be trusted, as figures with bands and as columns: fits beside what they must beat, step responses, poles, excitation."""
+"""How far an identified plant can be trusted, as figures with bands and as columns: fits beside what they
+must beat, step responses, poles, excitation."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -8,7 +9,14 @@ import scipy.optimize
 
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.subspace import Segments
-from pipeline.temperature.validation import Excitation, Residuals, predicted_ahead, simulated, spread_bands, step_response
+from pipeline.temperature.validation import (
+    Excitation,
+    Residuals,
+    predicted_ahead,
+    simulated,
+    spread_bands,
+    step_response,
+)
 
 LEVEL = 0.9  # of every band here
 ENDS = ((1 - LEVEL) / 2, (1 + LEVEL) / 2)
@@ -17,8 +25,9 @@ ENDS = ((1 - LEVEL) / 2, (1 + LEVEL) / 2)
 class Holdout(NamedTuple):
     """What held-out segments say of a plant, fits in percent.
 
-    simulated, ahead: predictions (T, p) of each segment, the second NaN over its start-up; fit, ahead_fit (3, p): value and the ends of its 90 % band;
-    held_fit (p,): the last value seen so many steps before, held, over the rows of ahead_fit. NaN where no segment outlasts the start-up.
+    simulated, ahead: predictions (T, p) of each segment, the second NaN over its start-up; fit, ahead_fit (3,
+    p): value and the ends of its 90 % band; held_fit (p,): the last value seen so many steps before, held,
+    over the rows of ahead_fit. NaN where no segment outlasts the start-up.
     """
 
     simulated: list[np.ndarray]
@@ -29,10 +38,12 @@ class Holdout(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """Responses to unit steps, beside their bands over a family of plants: response, low, high (K, p, m) at samples (K,).
+    """Responses to unit steps, beside their bands over a family of
+    plants: response, low, high (K, p, m) at samples (K,).
 
-    gain, peak, time_constant, delay (3, p, m): value and the ends of its band. gain is the last value, peak the largest excursion; times are in samples, NaN
-    where `seen` (p, m) is False: the band of the peak holds zero, so that not even the sign of the effect is known.
+    gain, peak, time_constant, delay (3, p, m): value and the ends of its band. gain is the last value, peak
+    the largest excursion; times are in samples, NaN where `seen` (p, m) is False: the band of the peak holds
+    zero, so that not even the sign of the effect is known.
     """
 
     samples: np.ndarray
@@ -47,30 +58,43 @@ class Steps(NamedTuple):
 
 
 def held(y: np.ndarray, steps: int) -> np.ndarray:
-    """The last value of y (T, p) seen at or before t - steps, NaN before there is one: what a prediction `steps` ahead must beat."""
+    """The last value of y (T, p) seen at or before t - steps, NaN before there is
+    one: what a prediction `steps` ahead must beat."""
     last = np.maximum.accumulate(np.where(np.isfinite(y), np.arange(len(y))[:, None], -1), axis=0)
     late = np.vstack([np.full((steps, y.shape[1]), -1), last])[: len(y)]
     return np.where(late >= 0, np.take_along_axis(y, np.maximum(late, 0), axis=0), np.nan)
 
 
-def fit_with_band(y: Segments, predicted: Segments, *, block: int, rng: np.random.Generator, draws: int = 400) -> np.ndarray:
-    """NRMSE (3, p) in percent over the samples where both are seen: value, and the ends of its 90 % band by resampling blocks of samples (Kuensch 1989).
+def fit_with_band(
+    y: Segments, predicted: Segments, *, block: int, rng: np.random.Generator, draws: int = 400
+) -> np.ndarray:
+    """NRMSE (3, p) in percent over the samples where both are seen: value, and the ends of its 90 % band by
+    resampling blocks of samples (Kuensch 1989).
 
-    Blocks of `block` samples keep the colour of the errors; they are shortened where fewer than ten fit, and joined where more than 200 do.
+    Blocks of `block` samples keep the colour of the errors; they are shortened where
+    fewer than ten fit, and joined where more than 200 do.
     """
     y, predicted = np.vstack(y), np.vstack(predicted)
     seen = np.isfinite(y) & np.isfinite(predicted)
     mean = np.where(seen, y, 0.0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
     size = max(min(block, len(y) // 10), len(y) // 200, 1)
-    parts = [np.add.reduceat(np.where(seen, part, 0.0) ** 2, np.arange(0, len(y), size), axis=0) for part in (y - predicted, y - mean)]
+    parts = [
+        np.add.reduceat(np.where(seen, part, 0.0) ** 2, np.arange(0, len(y), size), axis=0)
+        for part in (y - predicted, y - mean)
+    ]
     drawn = rng.integers(0, len(parts[0]), (draws, len(parts[0])))
     error, spread = (np.vstack([part.sum(axis=0), part[drawn].sum(axis=1)]) for part in parts)
-    fit = np.where(seen.any(axis=0), 100.0 * (1.0 - np.sqrt(error / np.maximum(spread, np.finfo(float).tiny))), np.nan)
+    fit = np.where(
+        seen.any(axis=0), 100.0 * (1.0 - np.sqrt(error / np.maximum(spread, np.finfo(float).tiny))), np.nan
+    )
     return np.vstack([fit[0], np.quantile(fit[1:], ENDS, axis=0)])
 
 
-def holdout(plant: Plant, u: Segments, y: Segments, steps: int, *, block: int, rng: np.random.Generator) -> Holdout:
-    """Simulation and prediction `steps` ahead of held-out segments, beside holding the last value; `block` as in `fit_with_band`."""
+def holdout(
+    plant: Plant, u: Segments, y: Segments, steps: int, *, block: int, rng: np.random.Generator
+) -> Holdout:
+    """Simulation and prediction `steps` ahead of held-out segments, beside
+    holding the last value; `block` as in `fit_with_band`."""
     simulations = [simulated(plant, a, b) for a, b in zip(u, y, strict=True)]
     skip, ahead = max(3 * plant.n, 30) + steps, []  # the start-up of `predict_fit`
     for a, b in zip(u, y, strict=True):
@@ -88,9 +112,11 @@ def residual_lags(u: Segments) -> int:
 
 
 def horizon(plant: Plant, longest: int) -> int:
-    """Samples until every step response stays within 5 % of its output's largest one, and a third more; at most `longest`.
+    """Samples until every step response stays within 5 % of its
+    output's largest one, and a third more; at most `longest`.
 
-    Of a plant with a pole outside the unit circle, three of its time constants: later there is nothing else to see.
+    Of a plant with a pole outside the unit circle, three of its time
+    constants: later there is nothing else to see.
     """
     radius = np.abs(np.linalg.eigvals(plant.A)).max()
     longest = min(longest, int(np.ceil(3 / np.log(radius)))) if radius > 1 + 1e-9 else longest
@@ -100,15 +126,18 @@ def horizon(plant: Plant, longest: int) -> int:
 
 
 def two_points(responses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Time constant 1.5 (t63 - t28) and delay t63 - tau (p, m), in samples, of responses (T, p, m) (Smith 1972); t28 and t63 are when 28.3 and 63.2 % of the
-    largest excursion are first reached, between samples by a straight line.
+    """Time constant 1.5 (t63 - t28) and delay t63 - tau (p, m), in samples, of responses (T,
+    p, m) (Smith 1972); t28 and t63 are when 28.3 and 63.2 % of the largest excursion are
+    first reached, between samples by a straight line.
     """
     peak = np.take_along_axis(responses, np.abs(responses).argmax(axis=0)[None], axis=0)[0]
     share = responses / np.where(peak == 0, 1.0, peak)
 
     def reached(level):
         after = np.argmax(share >= level, axis=0)
-        here, before = (np.take_along_axis(share, np.maximum(k, 0)[None], axis=0)[0] for k in (after, after - 1))
+        here, before = (
+            np.take_along_axis(share, np.maximum(k, 0)[None], axis=0)[0] for k in (after, after - 1)
+        )
         rise = np.where(after > 0, here - before, 1.0)
         return np.where(after > 0, after - (here - level) / np.where(rise > 0, rise, 1.0), 0.0)
 
@@ -118,13 +147,19 @@ def two_points(responses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def steps(nominal: Plant, family: Sequence[Plant], longest: int, *, points: int = 120) -> Steps:
-    """Step responses of a plant over its `horizon`, at most `points` + 1 of each, with gain, peak, time constant and delay, beside the family's."""
+    """Step responses of a plant over its `horizon`, at most `points` + 1 of each, with gain, peak, time
+    constant and delay, beside the family's."""
     samples = horizon(nominal, longest)
     bands = spread_bands(nominal, family, samples + 1, level=LEVEL)
     at = np.abs(bands.nominal).argmax(axis=0)[None]
-    gain, peak = np.stack([part[-1] for part in bands[:3]]), np.concatenate([np.take_along_axis(part, at, axis=0) for part in bands[:3]])
+    gain, peak = (
+        np.stack([part[-1] for part in bands[:3]]),
+        np.concatenate([np.take_along_axis(part, at, axis=0) for part in bands[:3]]),
+    )
     seen = peak[1] * peak[2] > 0
-    shapes = np.stack([two_points(step_response(plant, samples + 1)) for plant in (nominal, *family)])  # (1 + family, 2, p, m)
+    shapes = np.stack(
+        [two_points(step_response(plant, samples + 1)) for plant in (nominal, *family)]
+    )  # (1 + family, 2, p, m)
     times = np.where(seen, np.concatenate([shapes[:1], np.quantile(shapes[1:], ENDS, axis=0)]), np.nan)
     grid = np.arange(0, samples + 1, -(-samples // points))
     response, low, high = (part[grid] for part in bands[:3])
@@ -132,19 +167,25 @@ def steps(nominal: Plant, family: Sequence[Plant], longest: int, *, points: int 
 
 
 def input_levels(u: Segments, *, bands: int = 8) -> np.ndarray:
-    """R.m.s. level (bands, m) of each input within equal bands from 0 to pi rad a sample, over the segments of at least four samples a band."""
+    """R.m.s. level (bands, m) of each input within equal bands from 0 to pi rad a sample, over the segments
+    of at least four samples a band."""
     power, samples = np.zeros((bands, u[0].shape[1])), 0
     for a in u:
         if len(a) >= 4 * bands:
             lines = 2.0 * np.abs(np.fft.rfft(a, axis=0)[1:]) ** 2 / len(a)
-            power, samples = power + np.stack([part.sum(axis=0) for part in np.array_split(lines, bands)]), samples + len(a)
+            power, samples = (
+                power + np.stack([part.sum(axis=0) for part in np.array_split(lines, bands)]),
+                samples + len(a),
+            )
     return np.sqrt(power / max(samples, 1))
 
 
 # ---- as columns
 
 
-def holdout_rows(measured: Segments, found: Holdout, outputs: Sequence[str], sample_time_s: float) -> dict[str, np.ndarray]:
+def holdout_rows(
+    measured: Segments, found: Holdout, outputs: Sequence[str], sample_time_s: float
+) -> dict[str, np.ndarray]:
     """Measured, simulated and predicted outputs of the held-out segments."""
     columns = {
         "segment": np.repeat(np.arange(len(measured), dtype=np.int32), [len(y) for y in measured]),
@@ -157,17 +198,31 @@ def holdout_rows(measured: Segments, found: Holdout, outputs: Sequence[str], sam
 
 
 def residual_rows(tests: Residuals, outputs: Sequence[str], inputs: Sequence[str]) -> dict[str, list]:
-    """Every correlation with its 99 % band: of each output's residuals with themselves, then with each input."""
+    """Every correlation with its 99 % band: of each output's residuals
+    with themselves, then with each input."""
     lags, found = tests.autocorrelation.shape[1] - 1, []
     for o, output in enumerate(outputs):
-        found += [(output, output, k, c, tests.band, tests.whiteness_passed[o]) for k, c in enumerate(tests.autocorrelation[o])]
+        found += [
+            (output, output, k, c, tests.band, tests.whiteness_passed[o])
+            for k, c in enumerate(tests.autocorrelation[o])
+        ]
         for j, name in enumerate(inputs):
             mine = zip(range(-lags, lags + 1), tests.cross_correlation[o, j], strict=True)
-            found += [(output, name, k, c, tests.cross_band[o, j], tests.independence_passed[o, j]) for k, c in mine]
-    return dict(zip(("output", "against", "lag", "correlation", "band", "passed"), map(list, zip(*found, strict=True)), strict=True))
+            found += [
+                (output, name, k, c, tests.cross_band[o, j], tests.independence_passed[o, j]) for k, c in mine
+            ]
+    return dict(
+        zip(
+            ("output", "against", "lag", "correlation", "band", "passed"),
+            map(list, zip(*found, strict=True)),
+            strict=True,
+        )
+    )
 
 
-def step_rows(found: Steps, outputs: Sequence[str], inputs: Sequence[str], sample_time_s: float) -> dict[str, np.ndarray | list]:
+def step_rows(
+    found: Steps, outputs: Sequence[str], inputs: Sequence[str], sample_time_s: float
+) -> dict[str, np.ndarray | list]:
     """The responses of `steps`, input by input within output by output."""
     pairs, count = [(o, j) for o in range(len(outputs)) for j in range(len(inputs))], len(found.samples)
     columns = {
@@ -175,12 +230,21 @@ def step_rows(found: Steps, outputs: Sequence[str], inputs: Sequence[str], sampl
         "input": [inputs[j] for _, j in pairs for _ in range(count)],
         "time_s": np.tile(sample_time_s * found.samples, len(pairs)),
     }
-    return columns | {name: np.concatenate([getattr(found, name)[:, o, j] for o, j in pairs]) for name in ("response", "low", "high")}
+    return columns | {
+        name: np.concatenate([getattr(found, name)[:, o, j] for o, j in pairs])
+        for name in ("response", "low", "high")
+    }
 
 
-def dynamics_rows(found: Steps, outputs: Sequence[str], inputs: Sequence[str], sample_time_s: float) -> dict[str, np.ndarray | list]:
+def dynamics_rows(
+    found: Steps, outputs: Sequence[str], inputs: Sequence[str], sample_time_s: float
+) -> dict[str, np.ndarray | list]:
     """Gain, peak, time constant and delay of `steps`, in the same order."""
-    columns = {"output": [name for name in outputs for _ in inputs], "input": [*inputs] * len(outputs), "seen": found.seen.ravel().tolist()}
+    columns = {
+        "output": [name for name in outputs for _ in inputs],
+        "input": [*inputs] * len(outputs),
+        "seen": found.seen.ravel().tolist(),
+    }
     for name, part in (
         ("gain", found.gain),
         ("peak", found.peak),
@@ -192,7 +256,8 @@ def dynamics_rows(found: Steps, outputs: Sequence[str], inputs: Sequence[str], s
 
 
 def pole_rows(nominal: Plant, family: Sequence[Plant]) -> dict[str, np.ndarray]:
-    """Poles of the plant (member 0), largest first, and of a family; `pole` is the number of the plant's pole that each belongs to, -1 for one too many.
+    """Poles of the plant (member 0), largest first, and of a family; `pole` is the number of the plant's pole
+    that each belongs to, -1 for one too many.
 
     Poles belong together where the sum of their distances is least (Kuhn 1955).
     """
@@ -206,7 +271,12 @@ def pole_rows(nominal: Plant, family: Sequence[Plant]) -> dict[str, np.ndarray]:
         number[of_theirs] = of_mine
         found += [(i, int(k), pole.real, pole.imag) for k, pole in zip(number, poles, strict=True)]
     member, pole, real, imag = zip(*found, strict=True)
-    return {"member": np.array(member, np.int32), "pole": np.array(pole, np.int32), "real": np.array(real), "imag": np.array(imag)}
+    return {
+        "member": np.array(member, np.int32),
+        "pole": np.array(pole, np.int32),
+        "real": np.array(real),
+        "imag": np.array(imag),
+    }
 
 
 def level_rows(levels: np.ndarray, inputs: Sequence[str]) -> dict[str, np.ndarray | list]:
@@ -224,15 +294,20 @@ def level_rows(levels: np.ndarray, inputs: Sequence[str]) -> dict[str, np.ndarra
 
 
 def fit_figures(found: Holdout, outputs: Sequence[str]) -> dict[str, dict | None]:
-    """Fits on the hold-out by output, with their bands and what they must beat; those ahead are None where no segment was long enough."""
+    """Fits on the hold-out by output, with their bands and what they must beat; those
+    ahead are None where no segment was long enough."""
     named = {"fit_holdout": found.fit, "fit_holdout_ahead": found.ahead_fit}
     figures = {key: dict(zip(outputs, part[0].tolist(), strict=True)) for key, part in named.items()}
-    figures |= {f"{key}_band": dict(zip(outputs, part[1:].T.tolist(), strict=True)) for key, part in named.items()}
+    figures |= {
+        f"{key}_band": dict(zip(outputs, part[1:].T.tolist(), strict=True)) for key, part in named.items()
+    }
     figures["fit_holdout_held"] = dict(zip(outputs, found.held_fit.tolist(), strict=True))
     return {key: part if np.isfinite(list(part.values())).all() else None for key, part in figures.items()}
 
 
-def outcome_figures(tests: Residuals, excited: Excitation, outputs: Sequence[str], inputs: Sequence[str]) -> dict[str, dict]:
+def outcome_figures(
+    tests: Residuals, excited: Excitation, outputs: Sequence[str], inputs: Sequence[str]
+) -> dict[str, dict]:
     """Which tests passed, and how far the inputs excite."""
     lags = excited.full // len(inputs)
     alone = {
@@ -242,7 +317,8 @@ def outcome_figures(tests: Residuals, excited: Excitation, outputs: Sequence[str
     return {
         "whiteness_passed": dict(zip(outputs, tests.whiteness_passed.tolist(), strict=True)),
         "independence_passed": {
-            name: dict(zip(inputs, row, strict=True)) for name, row in zip(outputs, tests.independence_passed.tolist(), strict=True)
+            name: dict(zip(inputs, row, strict=True))
+            for name, row in zip(outputs, tests.independence_passed.tolist(), strict=True)
         },
         "excitation": {
             "rank": excited.rank,

@@ -1,4 +1,5 @@
-"""How far an identified plant can be trusted: fits on held-out records, residual tests, excitation, uncertainty by bootstrap, and a sentence of advice for each."""
+"""How far an identified plant can be trusted: fits on held-out records, residual tests, excitation,
+uncertainty by bootstrap, and a sentence of advice for each."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -8,14 +9,23 @@ import scipy.stats
 
 from pipeline.temperature.order import LARGEST_RADIUS, fit, shifted, stabilised, with_delays
 from pipeline.temperature.plant import Plant, markov_parameters
-from pipeline.temperature.refinement import drives, estimate_state, filled, linear_recurrence, prediction_form, respond, simulation_form
+from pipeline.temperature.refinement import (
+    drives,
+    estimate_state,
+    filled,
+    linear_recurrence,
+    prediction_form,
+    respond,
+    simulation_form,
+)
 from pipeline.temperature.subspace import Segments, lagged, realise, subspace
 
 QUANTILE_99 = 2.5758  # of the standard normal, two-sided
 
 
 class Spread(NamedTuple):
-    """Step responses (steps, p, m) of the nominal plant and their bands over a family, at `level`; poles of every member, a list of (n,) arrays."""
+    """Step responses (steps, p, m) of the nominal plant and their bands over a family, at `level`; poles of
+    every member, a list of (n,) arrays."""
 
     nominal: np.ndarray
     low: np.ndarray
@@ -25,9 +35,11 @@ class Spread(NamedTuple):
 
 
 class Residuals(NamedTuple):
-    """Residual tests at 99 %: autocorrelation (p, lags+1), cross-correlation with each input (p, m, 2 lags+1) at lags -lags..lags (positive: input first).
+    """Residual tests at 99 %: autocorrelation (p, lags+1), cross-correlation with each input (p, m, 2 lags+1)
+    at lags -lags..lags (positive: input first).
 
-    band and cross_band are what an ideal residual stays under; whiteness is Ljung and Box's statistic for each output and whiteness_limit its 99 % point.
+    band and cross_band are what an ideal residual stays under; whiteness is Ljung and Box's statistic for
+    each output and whiteness_limit its 99 % point.
     """
 
     autocorrelation: np.ndarray
@@ -41,7 +53,8 @@ class Residuals(NamedTuple):
 
 
 class Excitation(NamedTuple):
-    """Rank and condition of the covariance of `past` lags of all inputs (each scaled to unit power), and of each input alone; full is the rank wanted."""
+    """Rank and condition of the covariance of `past` lags of all inputs (each scaled to unit power), and of
+    each input alone; full is the rank wanted."""
 
     rank: int
     full: int
@@ -52,26 +65,38 @@ class Excitation(NamedTuple):
 
 
 def simulated(plant: Plant, u: np.ndarray, y: np.ndarray, *, means_removed: bool = False) -> np.ndarray:
-    """ŷ (T, p) of the plant under u (T, m) alone, from the initial state that fits all of y (T, p) best (the rule of SLICOT's IB01CD and of MATLAB's compare).
+    """ŷ (T, p) of the plant under u (T, m) alone, from the initial state that fits all of y (T, p) best (the
+    rule of SLICOT's IB01CD and of MATLAB's compare).
 
-    With `means_removed` the initial state is fitted to the error without its mean, for a score that removes it.
+    With `means_removed` the initial state is fitted to the error
+    without its mean, for a score that removes it.
     """
     model, v = simulation_form(plant, []), drives("simulation", u, y)
     return respond(model, v, estimate_state(model, v, y, free_mean=means_removed))[1]
 
 
-def predicted_ahead(plant: Plant, u: np.ndarray, y: np.ndarray, steps: int, *, x0: np.ndarray | None = None) -> np.ndarray:
-    """ŷ(t | outputs up to t - steps) (T, p), inputs known throughout; the first `steps` - 1 rows start from x0.
+def predicted_ahead(
+    plant: Plant, u: np.ndarray, y: np.ndarray, steps: int, *, x0: np.ndarray | None = None
+) -> np.ndarray:
+    """ŷ(t | outputs up to t - steps) (T, p), inputs known throughout;
+    the first `steps` - 1 rows start from x0.
 
-    The state, disturbances in it included, comes from the Kalman predictor on past outputs only. x0 defaults to the state that fits the first
-    max(3 n, 30) one-step predictions; callers leave these rows out of a score. NaN in y passes as a missing measurement.
+    The state, disturbances in it included, comes from the Kalman predictor on past outputs only. x0 defaults
+    to the state that fits the first max(3 n, 30) one-step predictions; callers leave these rows out of a
+    score. NaN in y passes as a missing measurement.
     """
     if steps < 1:
-        raise ValueError(f"predicted_ahead: expected steps of at least 1 but found {steps}; one step ahead is steps=1")
+        raise ValueError(
+            f"predicted_ahead: expected steps of at least 1 but found {steps}; one step ahead is steps=1"
+        )
     model = prediction_form(plant, [])
     if x0 is None:
         first = min(max(3 * plant.n, 30), len(u))
-        start = drives("prediction", u[:first], np.where(np.isfinite(y[:first]), y[:first], np.nanmean(y[:first], axis=0)))
+        start = drives(
+            "prediction",
+            u[:first],
+            np.where(np.isfinite(y[:first]), y[:first], np.nanmean(y[:first], axis=0)),
+        )
         x0 = estimate_state(model, start, y[:first])
     known = filled(plant, u, y, x0)
     x = linear_recurrence(model.F, drives("prediction", u, known) @ model.G.T, x0)[:-1]  # x(t | y up to t-1)
@@ -81,7 +106,8 @@ def predicted_ahead(plant: Plant, u: np.ndarray, y: np.ndarray, steps: int, *, x
 
 
 def one_step_errors(plant: Plant, u: Segments, y: Segments) -> list[np.ndarray]:
-    """e(t) = y(t) - ŷ(t | t-1) (T, p) of each segment, the initial state fitted to the segment; NaN where y is masked."""
+    """e(t) = y(t) - ŷ(t | t-1) (T, p) of each segment, the initial
+    state fitted to the segment; NaN where y is masked."""
     model, out = prediction_form(plant, []), []
     for a, b in zip(u, y, strict=True):
         v = drives("prediction", a, filled(plant, a, b, np.zeros(plant.n)))
@@ -96,14 +122,17 @@ def _correlation(a: np.ndarray, b: np.ndarray, lag: int) -> float:
 
 
 def residual_tests(plant: Plant, u: Segments, y: Segments, *, lags: int = 25) -> Residuals:
-    """Whiteness of the one-step errors and their independence of past inputs (Ljung 1999, section 16.6), both at 99 %.
+    """Whiteness of the one-step errors and their independence of past
+    inputs (Ljung 1999, section 16.6), both at 99 %.
 
-    Whiteness is Ljung and Box's test. Independence fails where a correlation at a lag from 0 on leaves the band widened for the number of lags (Bonferroni);
-    correlation at negative lags only says that the record was taken in closed loop. Raises ValueError where the record has fewer than 4 lags of samples.
+    Whiteness is Ljung and Box's test. Independence fails where a correlation at a lag from 0 on leaves the
+    band widened for the number of lags (Bonferroni); correlation at negative lags only says that the record
+    was taken in closed loop. Raises ValueError where the record has fewer than 4 lags of samples.
     """
     if sum(len(a) for a in u) < 4 * lags:
         raise ValueError(
-            f"residual_tests: {sum(len(a) for a in u)} samples do not carry {lags} lags; expected at least {4 * lags}, so record longer or ask for fewer lags"
+            f"residual_tests: {sum(len(a) for a in u)} samples do not carry {lags} lags; "
+            f"expected at least {4 * lags}, so record longer or ask for fewer lags"
         )
     e, m, p = np.vstack(one_step_errors(plant, u, y)), plant.m, plant.p
     w = np.vstack(u)
@@ -111,7 +140,12 @@ def residual_tests(plant: Plant, u: Segments, y: Segments, *, lags: int = 25) ->
     w = (w - np.nanmean(w, axis=0)) / np.maximum(np.nanstd(w, axis=0), np.finfo(float).tiny)
     N = int(np.isfinite(e).all(axis=1).sum())
     auto = np.array([[_correlation(e[:, o], e[:, o], k) for k in range(lags + 1)] for o in range(p)])
-    cross = np.array([[[_correlation(e[:, o], w[:, j], k) for k in range(-lags, lags + 1)] for j in range(m)] for o in range(p)])
+    cross = np.array(
+        [
+            [[_correlation(e[:, o], w[:, j], k) for k in range(-lags, lags + 1)] for j in range(m)]
+            for o in range(p)
+        ]
+    )
     input_auto = np.array([[_correlation(w[:, j], w[:, j], k) for k in range(lags + 1)] for j in range(m)])
     power = 1.0 + 2.0 * np.einsum("ok,jk->oj", auto[:, 1:], input_auto[:, 1:])
     cross_band = QUANTILE_99 * np.sqrt(np.maximum(power, 1.0) / N)
@@ -119,28 +153,43 @@ def residual_tests(plant: Plant, u: Segments, y: Segments, *, lags: int = 25) ->
     limit = float(scipy.stats.chi2.ppf(0.99, lags))
     widened = scipy.stats.norm.ppf(1 - 0.005 / (lags + 1)) / QUANTILE_99
     independent = np.abs(cross[:, :, lags:]).max(axis=2) <= widened * cross_band
-    return Residuals(auto, cross, QUANTILE_99 / np.sqrt(N), cross_band, whiteness, limit, whiteness <= limit, independent)
+    return Residuals(
+        auto, cross, QUANTILE_99 / np.sqrt(N), cross_band, whiteness, limit, whiteness <= limit, independent
+    )
 
 
 def excitation(u: Segments, past: int) -> Excitation:
-    """Rank and condition of the lagged inputs, and of each alone, about their mean; levels (m,) is the standard deviation of each input."""
+    """Rank and condition of the lagged inputs, and of each alone, about their mean; levels (m,) is the
+    standard deviation of each input."""
     complete = [a for a in u if np.isfinite(a).all() and len(a) > past]
     if not complete:
         raise ValueError(
-            f"excitation: no segment holds {past + 1} complete samples of the inputs; record longer, or look at a shorter window"
+            f"excitation: no segment holds {past + 1} complete samples of the inputs; record longer, "
+            "or look at a shorter window"
         )
-    stacked = np.vstack([np.stack([a[past - k : len(a) - k] for k in range(past)], axis=2) for a in complete])  # (N, m, past)
+    stacked = np.vstack(
+        [np.stack([a[past - k : len(a) - k] for k in range(past)], axis=2) for a in complete]
+    )  # (N, m, past)
     stacked = stacked - stacked.mean(axis=0)
     levels = stacked[:, :, 0].std(axis=0)
     stacked = stacked / np.maximum(levels, np.finfo(float).tiny)[:, None]
 
     def rank_and_condition(columns):
         values = np.linalg.eigvalsh(columns.T @ columns / len(columns))
-        return int((values > 1e-9 * values[-1]).sum()), float(values[-1] / values[0]) if values[0] > 0 else np.inf
+        return int((values > 1e-9 * values[-1]).sum()), float(values[-1] / values[0]) if values[
+            0
+        ] > 0 else np.inf
 
     rank, condition = rank_and_condition(stacked.reshape(len(stacked), -1))
     alone = [rank_and_condition(stacked[:, j]) for j in range(stacked.shape[1])]
-    return Excitation(rank, stacked.shape[1] * past, condition, np.array([r for r, _ in alone]), np.array([c for _, c in alone]), levels)
+    return Excitation(
+        rank,
+        stacked.shape[1] * past,
+        condition,
+        np.array([r for r, _ in alone]),
+        np.array([c for _, c in alone]),
+        levels,
+    )
 
 
 def _block_resampled(errors: np.ndarray, block: int, length: int, rng: np.random.Generator) -> np.ndarray:
@@ -149,20 +198,35 @@ def _block_resampled(errors: np.ndarray, block: int, length: int, rng: np.random
 
 
 def bootstrap_spread(
-    u: Segments, y: Segments, identified, *, count: int = 20, order: int | None = None, rng: np.random.Generator
+    u: Segments,
+    y: Segments,
+    identified,
+    *,
+    count: int = 20,
+    order: int | None = None,
+    rng: np.random.Generator,
 ) -> list[Plant]:
-    """`count` plants re-identified on records rebuilt from block-resampled one-step errors (Kuensch 1989), each with finite poles inside the unit circle.
+    """`count` plants re-identified on records rebuilt from block-resampled one-step errors (Kuensch 1989),
+    each with finite poles inside the unit circle.
 
-    The record is rebuilt by x(t+1) = A x + B u + b + K e*, y* = C x + D u + d + e* under the recorded inputs; blocks are two windows long, so that colour that
-    the model missed is kept. `order` (without delays) may differ from the identified one, to give plants that no controller was designed on.
+    The record is rebuilt by x(t+1) = A x + B u + b + K e*, y* = C x + D u + d + e* under the recorded inputs;
+    blocks are two windows long, so that colour that the model missed is kept. `order` (without delays) may
+    differ from the identified one, to give plants that no controller was designed on.
     """
-    plant, past, block_errors = stabilised(identified.plant, LARGEST_RADIUS), identified.past, one_step_errors(identified.plant, u, y)
+    plant, past, block_errors = (
+        stabilised(identified.plant, LARGEST_RADIUS),
+        identified.past,
+        one_step_errors(identified.plant, u, y),
+    )
     errors = np.vstack(block_errors)
     errors = errors[np.isfinite(errors).all(axis=1)]
     errors = errors - errors.mean(axis=0)
     block, family = min(2 * past, len(errors) // 4), []
     if any(not np.isfinite(a).all() for a in u):
-        raise ValueError("bootstrap_spread: expected inputs without gaps but found NaN in u; split the record into segments at the gaps")
+        raise ValueError(
+            "bootstrap_spread: expected inputs without gaps but found NaN in u; "
+            "split the record into segments at the gaps"
+        )
     for _ in range(count):
         rebuilt = []
         for a, x0 in zip(u, identified.x0, strict=True):
@@ -176,50 +240,87 @@ def bootstrap_spread(
 def _reidentified(u: Segments, y: Segments, identified, order: int) -> Plant:
     us, ys = shifted(u, y, identified.delays)
     data = lagged(us, ys, identified.past, feedthrough=identified.feedthrough, offset=identified.offset)
-    start = stabilised(realise(data, subspace(data, identified.past).basis[:order], identified.plant.sample_time_s), LARGEST_RADIUS)
-    found = fit(identified.fit, start, us, ys, feedthrough=identified.feedthrough, offset=identified.offset, max_iterations=5, gain=False)
+    start = stabilised(
+        realise(data, subspace(data, identified.past).basis[:order], identified.plant.sample_time_s),
+        LARGEST_RADIUS,
+    )
+    found = fit(
+        identified.fit,
+        start,
+        us,
+        ys,
+        feedthrough=identified.feedthrough,
+        offset=identified.offset,
+        max_iterations=5,
+        gain=False,
+    )
     return with_delays(stabilised(found, LARGEST_RADIUS), identified.delays)
 
 
 def step_response(plant: Plant, steps: int) -> np.ndarray:
-    """Response (steps, p, m) of each output to a unit step of each input from rest, without offsets: D, then D + C B + C A B + ..."""
-    return plant.D + np.concatenate([np.zeros((1, plant.p, plant.m)), np.cumsum(markov_parameters(plant, steps - 1), axis=0)])
+    """Response (steps, p, m) of each output to a unit step of each input from
+    rest, without offsets: D, then D + C B + C A B + ..."""
+    return plant.D + np.concatenate(
+        [np.zeros((1, plant.p, plant.m)), np.cumsum(markov_parameters(plant, steps - 1), axis=0)]
+    )
 
 
 def spread_bands(nominal: Plant, family: Sequence[Plant], steps: int, *, level: float = 0.99) -> Spread:
-    """Bands of the step responses and the poles over a family of plants; with few members the band is their range."""
+    """Bands of the step responses and the poles over a family of
+    plants; with few members the band is their range."""
     responses = np.stack([step_response(plant, steps) for plant in family])
     low, high = np.quantile(responses, [(1 - level) / 2, (1 + level) / 2], axis=0)
-    return Spread(step_response(nominal, steps), low, high, [np.linalg.eigvals(plant.A) for plant in family], level)
+    return Spread(
+        step_response(nominal, steps), low, high, [np.linalg.eigvals(plant.A) for plant in family], level
+    )
 
 
-def advice(tests: Residuals, excited: Excitation, fit_percent: np.ndarray, *, outputs: Sequence[str], inputs: Sequence[str]) -> list[str]:
-    """A sentence for each test that failed: what was seen, where, and what to do about it. Empty where everything passed."""
+def advice(
+    tests: Residuals,
+    excited: Excitation,
+    fit_percent: np.ndarray,
+    *,
+    outputs: Sequence[str],
+    inputs: Sequence[str],
+) -> list[str]:
+    """A sentence for each test that failed: what was seen, where, and
+    what to do about it. Empty where everything passed."""
     sentences, lags = [], tests.autocorrelation.shape[1] - 1
     for o, output in enumerate(outputs):
         if not tests.whiteness_passed[o]:
             lag = int(np.abs(tests.autocorrelation[o, 1:]).argmax()) + 1
-            remedy = "lengthen the window, or model the disturbance" if lag <= 3 else "look for a periodic disturbance, or raise the order"
+            remedy = (
+                "lengthen the window, or model the disturbance"
+                if lag <= 3
+                else "look for a periodic disturbance, or raise the order"
+            )
             sentences.append(
-                f"the residuals of {output} are not white (correlation {tests.autocorrelation[o, lag]:+.2f} at lag {lag}): {remedy}"
+                f"the residuals of {output} are not white (correlation {tests.autocorrelation[o, lag]:+.2f} "
+                f"at lag {lag}): {remedy}"
             )
         for j, name in enumerate(inputs):
             if not tests.independence_passed[o, j]:
                 lag = int(np.abs(tests.cross_correlation[o, j, lags:]).argmax())
                 sentences.append(
-                    f"the residuals of {output} correlate with {name} at lag {lag}: raise the order, or check the dead time of {name}"
+                    f"the residuals of {output} correlate with {name} at lag {lag}: raise the order, "
+                    f"or check the dead time of {name}"
                 )
         if fit_percent[o] < 50:
             sentences.append(
-                f"the hold-out fit of {output} is {fit_percent[o]:.0f} %: the model misses more than half of its movement; look for an input or disturbance that is not recorded"
+                f"the hold-out fit of {output} is {fit_percent[o]:.0f} %: "
+                "the model misses more than half of its movement; "
+                "look for an input or disturbance that is not recorded"
             )
     for j, name in enumerate(inputs):
         if excited.per_input_rank[j] * excited.per_input_rank.size < excited.full:
             sentences.append(
-                f"{name} excites {excited.per_input_rank[j]} of {excited.full // excited.per_input_rank.size} lags: move it at more frequencies, or at shorter holds"
+                f"{name} excites {excited.per_input_rank[j]} of "
+                f"{excited.full // excited.per_input_rank.size} lags: move it at more frequencies, "
+                "or at shorter holds"
             )
     if excited.rank < excited.per_input_rank.sum():
         sentences.append(
-            f"the inputs together excite {excited.rank} of {excited.full} directions: they move alike; move one at a time, or with different sequences"
+            f"the inputs together excite {excited.rank} of {excited.full} directions: they move alike; "
+            "move one at a time, or with different sequences"
         )
     return sentences

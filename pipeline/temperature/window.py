@@ -1,7 +1,9 @@
-"""The indirect data-driven route: a long VARX window learned from the record is the state of a predictor, and the Riccati equation does the rest.
+"""The indirect data-driven route: a long VARX window learned from the record is the state of a predictor, and
+the Riccati equation does the rest.
 
-y(t) = Theta [u(t-1); ...; u(t-N); y(t-1); ...; y(t-N)] + theta_0 + e(t). Nothing is assumed about the order of the plant; noise costs little, because the
-long window averages it as a Kalman filter would (Chiuso 2007 on VARX and subspace methods).
+y(t) = Theta [u(t-1); ...; u(t-N); y(t-1); ...; y(t-N)] + theta_0 + e(t). Nothing is assumed
+about the order of the plant; noise costs little, because the long window averages it as a Kalman
+filter would (Chiuso 2007 on VARX and subspace methods).
 """
 
 from collections.abc import Sequence
@@ -17,7 +19,8 @@ from pipeline.temperature.tracking import Law, gains
 
 
 class Window(NamedTuple):
-    """Theta (p, N (m+p)), theta_0 (p,), the innovation's covariance (p, p), and the table by which N was chosen: (past, parameters, criterion) rows."""
+    """Theta (p, N (m+p)), theta_0 (p,), the innovation's covariance (p, p), and the table by which N was
+    chosen: (past, parameters, criterion) rows."""
 
     Theta: np.ndarray
     theta_0: np.ndarray
@@ -27,31 +30,54 @@ class Window(NamedTuple):
     table: np.ndarray
 
 
-def learn(u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, longest: int, offset: bool = False, gain_spread: float = 0.0) -> Window:
-    """Least-squares VARX on segments u (T, m), y (T, p), its window N <= `longest` chosen by Akaike's criterion on the samples that the longest one leaves.
+def learn(
+    u: Sequence[np.ndarray],
+    y: Sequence[np.ndarray],
+    *,
+    longest: int,
+    offset: bool = False,
+    gain_spread: float = 0.0,
+) -> Window:
+    """Least-squares VARX on segments u (T, m), y (T, p), its window N <= `longest` chosen by Akaike's
+    criterion on the samples that the longest one leaves.
 
-    One QR factorisation serves every N, because the columns are ordered lag by lag. With `gain_spread` sigma the predictor is the best on average over plants whose
-    columns of B differ by a random 1 + sigma: of such a plant, (u / (1 + sigma), y) is a record too, so that the expected moments are those of the record plus
-    sigma^2 times each input's own. It then leans on measured y where a long memory of u would carry a wrong gain along. Raises ValueError where the record is shorter than the shortest window needs.
+    One QR factorisation serves every N, because the columns are ordered lag by lag. With `gain_spread` sigma
+    the predictor is the best on average over plants whose columns of B differ by a random 1 + sigma: of such
+    a plant, (u / (1 + sigma), y) is a record too, so that the expected moments are those of the record plus
+    sigma^2 times each input's own. It then leans on measured y where a long memory of u would carry a wrong
+    gain along. Raises ValueError where the record is shorter than the shortest window needs.
     """
     w, _, y_now = windows(u, y, longest)
     m, p = u[0].shape[1], y[0].shape[1]
     samples = len(w)
     if samples <= 2 * (m + p + offset):
         raise ValueError(
-            f"the window cannot be learned: expected more than {2 * (m + p + offset)} complete windows of {longest} samples, found {samples}; record longer"
+            f"the window cannot be learned: expected more than {2 * (m + p + offset)} complete windows of "
+            f"{longest} samples, found {samples}; record longer"
         )
-    lags = [np.r_[lag * m : (lag + 1) * m, longest * m + lag * p : longest * m + (lag + 1) * p] for lag in range(longest)]
+    lags = [
+        np.r_[lag * m : (lag + 1) * m, longest * m + lag * p : longest * m + (lag + 1) * p]
+        for lag in range(longest)
+    ]
     order = np.concatenate(lags)
     columns = np.hstack([np.ones((samples, int(offset))), w[:, order], y_now])
     triangle = _triangle(columns)
     table = np.array(
-        [_criterion(triangle, offset, N, m, p, samples) for N in range(1, longest + 1) if 2 * (offset + N * (m + p)) < samples]
+        [
+            _criterion(triangle, offset, N, m, p, samples)
+            for N in range(1, longest + 1)
+            if 2 * (offset + N * (m + p)) < samples
+        ]
     )
     N = int(table[table[:, 2].argmin(), 0])
     k = offset + N * (m + p)
     robust = (
-        np.linalg.qr(np.vstack([triangle[:, np.r_[:k, -p:0]], gain_spread * _own_moments(triangle[:, :k], offset, m, p)]), mode="r")
+        np.linalg.qr(
+            np.vstack(
+                [triangle[:, np.r_[:k, -p:0]], gain_spread * _own_moments(triangle[:, :k], offset, m, p)]
+            ),
+            mode="r",
+        )
         if gain_spread
         else triangle
     )
@@ -61,19 +87,25 @@ def learn(u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, longest: int, off
     by_lag = solution[offset:].reshape(N, m + p, p)
     Theta[:, : N * m] = by_lag[:, :m].transpose(2, 0, 1).reshape(p, N * m)
     Theta[:, N * m :] = by_lag[:, m:].transpose(2, 0, 1).reshape(p, N * p)
-    return Window(Theta, solution[0] if offset else np.zeros(p), rest.T @ rest / (samples - k), N, samples, table)
+    return Window(
+        Theta, solution[0] if offset else np.zeros(p), rest.T @ rest / (samples - k), N, samples, table
+    )
 
 
 def _triangle(columns: np.ndarray) -> np.ndarray:
-    """R of the QR factorisation: by Cholesky from the moments where those keep enough digits (a noisy record), by Householder reflections otherwise."""
+    """R of the QR factorisation: by Cholesky from the moments where those keep enough digits (a noisy
+    record), by Householder reflections otherwise."""
     size = np.sqrt(np.einsum("ij,ij->j", columns, columns))
     size[size == 0] = 1.0
-    factor, failed = scipy.linalg.lapack.dpotrf((columns.T @ columns) / size / size[:, None], lower=0, clean=1)
+    factor, failed = scipy.linalg.lapack.dpotrf(
+        (columns.T @ columns) / size / size[:, None], lower=0, clean=1
+    )
     return factor * size if not failed and np.diag(factor).min() > 1e-4 else np.linalg.qr(columns, mode="r")
 
 
 def _own_moments(triangle: np.ndarray, offset: bool, m: int, p: int) -> np.ndarray:
-    """Rows whose squares sum to each input's own second moment over its lags, inputs apart from one another; the outputs' columns stay 0."""
+    """Rows whose squares sum to each input's own second moment over its lags, inputs
+    apart from one another; the outputs' columns stay 0."""
     k, rows = triangle.shape[1], []
     for channel in range(m):
         lags = np.arange(offset + channel, k, m + p)
@@ -83,8 +115,11 @@ def _own_moments(triangle: np.ndarray, offset: bool, m: int, p: int) -> np.ndarr
     return np.vstack(rows)
 
 
-def _criterion(triangle: np.ndarray, offset: bool, N: int, m: int, p: int, samples: int) -> tuple[int, int, float]:
-    """Akaike's criterion of the window N, its residual read off the triangle; a residual below rounding counts as rounding, so that the shortest exact N wins."""
+def _criterion(
+    triangle: np.ndarray, offset: bool, N: int, m: int, p: int, samples: int
+) -> tuple[int, int, float]:
+    """Akaike's criterion of the window N, its residual read off the triangle; a residual below rounding
+    counts as rounding, so that the shortest exact N wins."""
     k = offset + N * (m + p)
     rest, whole = triangle[k:, -p:], triangle[:, -p:]
     floor = 1e-20 * np.trace(whole.T @ whole) / samples
@@ -97,22 +132,39 @@ def predictor(window: Window, sample_time_s: float = 1.0) -> Plant:
     p = len(window.Theta)
     A, B_u, B_y = window_shift(window.Theta.shape[1] // window.N - p, p, window.N)
     return make_plant(
-        A + B_y @ window.Theta, B_u, window.Theta, b=B_y @ window.theta_0, d=window.theta_0, K=B_y, sample_time_s=sample_time_s
+        A + B_y @ window.Theta,
+        B_u,
+        window.Theta,
+        b=B_y @ window.theta_0,
+        d=window.theta_0,
+        K=B_y,
+        sample_time_s=sample_time_s,
     )
 
 
 def law(window: Window, Q: np.ndarray, R: np.ndarray, gamma: float, *, integral: float = 0.0) -> Law:
-    """Optimal tracking (3) of the predictor: u = -K w - K_r r - k on the window of past inputs and outputs."""
+    """Optimal tracking (3) of the predictor: u = -K w - K_r r - k on
+    the window of past inputs and outputs."""
     K_x, K_r, k, _ = gains(predictor(window), Q, R, gamma)
     return window_law(K_x, K_r, k, window.N, integral=integral)
 
 
-def predicted_tuples(window: Window, u: Sequence[np.ndarray], y: Sequence[np.ndarray], *, horizon: int = 2, offset: bool = False) -> Tuples:
-    """Tuples for Algorithm 2 whose state is not the noisy window but the directions of it that predict the next `horizon` outputs.
+def predicted_tuples(
+    window: Window,
+    u: Sequence[np.ndarray],
+    y: Sequence[np.ndarray],
+    *,
+    horizon: int = 2,
+    offset: bool = False,
+) -> Tuples:
+    """Tuples for Algorithm 2 whose state is not the noisy window but the
+    directions of it that predict the next `horizon` outputs.
 
-    x-hat = features [w; 1], from the singular vectors of (observability matrix of the predictor) x (root of the window's second moment), as in subspace
-    identification. x-hat is uncorrelated with the noise still to come, so that the least squares of Algorithm 2 lose the bias that noise in the regressors causes.
-    Kept are directions that move the outputs by more than twice the innovation: the value of a weaker one cannot be told from noise, and is not worth more.
+    x-hat = features [w; 1], from the singular vectors of (observability matrix of the predictor) x (root of
+    the window's second moment), as in subspace identification. x-hat is uncorrelated with the noise still to
+    come, so that the least squares of Algorithm 2 lose the bias that noise in the regressors causes. Kept are
+    directions that move the outputs by more than twice the innovation: the value of a weaker one cannot be
+    told from noise, and is not worth more.
     """
     w, u_now, y_now = windows(u, y, window.N)
     model = predictor(window)
@@ -123,7 +175,10 @@ def predicted_tuples(window: Window, u: Sequence[np.ndarray], y: Sequence[np.nda
     noise = np.sqrt(np.diag(window.covariance).max())
     order = int((sv > np.maximum(2 * noise, 1e-7 * sv[0])).sum())
     if order == 0:
-        raise ValueError("the window predicts nothing beyond the noise of the sensors; probe with a larger amplitude, or record longer")
+        raise ValueError(
+            "the window predicts nothing beyond the noise of the sensors; "
+            "probe with a larger amplitude, or record longer"
+        )
     T = left[:, :order].T @ free / sv[:order, None]
     A, B_u, B_y = window_shift(u_now.shape[1], y_now.shape[1], window.N)
     x_next = w @ (T @ A).T + u_now @ (T @ B_u).T + y_now @ (T @ B_y).T - T @ centre
@@ -131,13 +186,25 @@ def predicted_tuples(window: Window, u: Sequence[np.ndarray], y: Sequence[np.nda
     features = np.zeros((order + offset, w.shape[1] + 1))
     features[:order, :-1], features[:order, -1], features[order:, -1] = T, -T @ centre, 1.0
     base = y_now.mean(axis=0) * offset
-    return Tuples(np.hstack([(w - centre) @ T.T, one]), u_now, y_now - base, np.hstack([x_next, one]), features, window.N, base)
+    return Tuples(
+        np.hstack([(w - centre) @ T.T, one]),
+        u_now,
+        y_now - base,
+        np.hstack([x_next, one]),
+        features,
+        window.N,
+        base,
+    )
 
 
 def stored(window: Window) -> dict[str, tuple[np.ndarray, str, str]]:
     """The window as named arrays with unit and meaning, for an artifact; `restored` reads them back."""
     return {
-        "Theta": (window.Theta, "degC per percent | degC per degC", "one-step predictor on [u(t-1); ...; u(t-N); y(t-1); ...; y(t-N)]"),
+        "Theta": (
+            window.Theta,
+            "degC per percent | degC per degC",
+            "one-step predictor on [u(t-1); ...; u(t-N); y(t-1); ...; y(t-N)]",
+        ),
         "theta_0": (window.theta_0, "degC", "its constant"),
         "covariance": (window.covariance, "degC^2", "covariance of the innovation"),
         "N": (np.array(window.N), "steps", "length of the window"),

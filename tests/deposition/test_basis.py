@@ -1,4 +1,5 @@
-"""The basis-function composer: the inverse of the chain that it is made from, whatever is wanted; the weights of its docstring; limits."""
+"""The basis-function composer: the inverse of the chain that it is made from, whatever
+is wanted; the weights of its docstring; limits."""
 
 import numpy as np
 import pytest
@@ -18,7 +19,13 @@ def dashes(on_s=0.4, off_s=0.4, count=12, amount=STEADY):
 @pytest.mark.parametrize("creep_share", [0.0, 0.12])
 @pytest.mark.parametrize("seed", range(8))
 def test_on_the_chain_that_it_knows_the_flow_is_the_wanted_flow(seed, creep_share):
-    plant = draw(np.random.default_rng(seed), gain=1.08, time_constant_s=2.7, steady_flow=STEADY, creep_share=creep_share)
+    plant = draw(
+        np.random.default_rng(seed),
+        gain=1.08,
+        time_constant_s=2.7,
+        steady_flow=STEADY,
+        creep_share=creep_share,
+    )
     for r in (protocol().r, protocol(12.0, 0.2).r, dashes()):
         u = basis.compose(plant, r, sample_time_s=TS)
         # what is left: the dither that the time constant lets through, and what the lag swallowed for good
@@ -76,7 +83,10 @@ def test_what_is_sent_ahead_arrives_in_time():
 def test_a_command_within_its_limit_comes_nearest_and_beats_cutting():
     plant, r = Extruder(0.9, 4.5, delay_s=0.1, lag_hz=4.0, play=0.05, yield_=0.1), protocol().r
     limit = 5 * STEADY / plant.gain
-    within, cut = basis.compose(plant, r, sample_time_s=TS, limit=limit), np.clip(basis.compose(plant, r, sample_time_s=TS), -limit, limit)
+    within, cut = (
+        basis.compose(plant, r, sample_time_s=TS, limit=limit),
+        np.clip(basis.compose(plant, r, sample_time_s=TS), -limit, limit),
+    )
     assert np.abs(within).max() <= limit
     assert percent_of_on_off(plant, within, r) < 0.5 * percent_of_on_off(plant, cut, r)
     free = basis.compose(plant, r, sample_time_s=TS)
@@ -86,4 +96,6 @@ def test_a_command_within_its_limit_comes_nearest_and_beats_cutting():
 
 
 def test_no_flow_wanted_is_no_command():
-    assert not np.any(basis.compose(Extruder(1.0, 1.0, play=0.1, yield_=0.1), np.zeros(100), sample_time_s=TS))
+    assert not np.any(
+        basis.compose(Extruder(1.0, 1.0, play=0.1, yield_=0.1), np.zeros(100), sample_time_s=TS)
+    )

@@ -1,4 +1,5 @@
-"""Frame -> width: exact on drawn edges, robust on rendered frames, refusals with their reason; calibration, cross-section."""
+"""Frame -> width: exact on drawn edges, robust on rendered frames,
+refusals with their reason; calibration, cross-section."""
 
 import math
 
@@ -13,7 +14,15 @@ VIEW = {"columns": (0, 600), "longest_blur_px": 6.0}
 WIDTHS = (60.0, 85.0, 110.0, 135.0, 160.0)
 
 
-def strip(width: float, *, h: int = 480, w: int = 640, middle: float = 239.5, background: float = 60.0, level: float = 150.0) -> np.ndarray:
+def strip(
+    width: float,
+    *,
+    h: int = 480,
+    w: int = 640,
+    middle: float = 239.5,
+    background: float = 60.0,
+    level: float = 150.0,
+) -> np.ndarray:
     """A flat bead with edges sharp to the pixel they cross: its width is exact by the area that it covers."""
     rows = np.arange(h)[:, None]
     covered = np.clip(width / 2 - np.abs(rows - middle) + 0.5, 0, 1)
@@ -24,7 +33,10 @@ def figures(scene, *, seed: int, frames: int = 20) -> tuple[np.ndarray, np.ndarr
     """Mean error and standard deviation in px at each of WIDTHS; every frame on another part of the stage."""
     rng = np.random.default_rng(seed)
     camera = Camera(scene, rng)
-    found = [[measure(camera.frame(w, stage_px=int(rng.integers(0, 10**6))), **VIEW).width for _ in range(frames)] for w in WIDTHS]
+    found = [
+        [measure(camera.frame(w, stage_px=int(rng.integers(0, 10**6))), **VIEW).width for _ in range(frames)]
+        for w in WIDTHS
+    ]
     return np.mean(found, axis=1) - WIDTHS, np.std(found, axis=1)
 
 
@@ -164,10 +176,22 @@ def test_other_sizes_are_measured(h, w):
 @pytest.mark.parametrize(
     ("frame", "columns", "message"),
     [
-        (np.zeros((480, 640)), (0, 600), r"expected \(height, width\) .* of uint8 or uint16 but found \(480, 640\) of float64"),
+        (
+            np.zeros((480, 640)),
+            (0, 600),
+            r"expected \(height, width\) .* of uint8 or uint16 but found \(480, 640\) of float64",
+        ),
         (np.zeros((480, 640, 2), np.uint8), (0, 600), r"found \(480, 640, 2\) of uint8; convert it to gray"),
-        (np.zeros((40, 640), np.uint8), (0, 600), r"at least 48 rows, and 32 columns between 0 and 600, but found 40 rows of 640"),
-        (np.zeros((480, 500), np.uint8), (0, 600), r"between 0 and 600, but found 480 rows of 500; check the camera's region"),
+        (
+            np.zeros((40, 640), np.uint8),
+            (0, 600),
+            r"at least 48 rows, and 32 columns between 0 and 600, but found 40 rows of 640",
+        ),
+        (
+            np.zeros((480, 500), np.uint8),
+            (0, 600),
+            r"between 0 and 600, but found 480 rows of 500; check the camera's region",
+        ),
     ],
 )
 def test_what_is_no_frame_is_refused(frame, columns, message):
@@ -176,14 +200,19 @@ def test_what_is_no_frame_is_refused(frame, columns, message):
 
 
 def test_colour_becomes_gray_by_the_usual_weights():
-    assert gray(np.full((60, 60, 3), (10, 20, 30), np.uint8))[0, 0] == round(0.114 * 10 + 0.587 * 20 + 0.299 * 30)
+    assert gray(np.full((60, 60, 3), (10, 20, 30), np.uint8))[0, 0] == round(
+        0.114 * 10 + 0.587 * 20 + 0.299 * 30
+    )
 
 
 @pytest.mark.parametrize("level", [NOMINAL, HARD])
 def test_many_frames_at_once_give_the_same_numbers_as_each_alone(level):
     camera = Camera(level, np.random.default_rng(112))
     widths = [110.0, 0.0, 25.0, np.where(np.arange(640) < 300, 0.0, 200.0), 70.0]
-    frames = [camera.frame(w, stage_px=97 * i) for i, w in enumerate(widths)] + [strip(110.0, level=255.0), strip(150.0, middle=60.0)]
+    frames = [camera.frame(w, stage_px=97 * i) for i, w in enumerate(widths)] + [
+        strip(110.0, level=255.0),
+        strip(150.0, middle=60.0),
+    ]
     together = measure_all(frames, **VIEW)
     assert [bead.reason for bead in together] == ["", "no bead", "", "", "", "saturated", "cut by the frame"]
     for bead, frame in zip(together, frames, strict=True):
@@ -195,7 +224,9 @@ def test_many_frames_at_once_give_the_same_numbers_as_each_alone(level):
 
 
 def test_frames_of_two_sizes_are_not_measured_together():
-    with pytest.raises(ValueError, match=r"frames of one size and kind but found .*\(240, 320\).*\(480, 640\)"):
+    with pytest.raises(
+        ValueError, match=r"frames of one size and kind but found .*\(240, 320\).*\(480, 640\)"
+    ):
         measure_all([strip(110.0), strip(110.0, h=240, w=320)], columns=(0, 320), longest_blur_px=6.0)
 
 
@@ -207,7 +238,8 @@ def test_gain_and_offset_come_back_and_the_residuals_are_what_is_left():
     found = calibrate(px, 0.008 * px + 0.01)
     assert (found.gain, found.offset) == pytest.approx((0.008, 0.01), abs=1e-12)  # rounding
     assert found.deviation < 1e-12
-    # by hand: misses 1, -2, 1 are orthogonal to a line through three even places, so they stay: sqrt(6 / (3 - 2))
+    # by hand: misses 1, -2, 1 are orthogonal to a line through three
+    # even places, so they stay: sqrt(6 / (3 - 2))
     bent = calibrate(np.array([1.0, 2.0, 3.0]), np.array([2.0, 0.0, 4.0]))
     np.testing.assert_allclose(bent.residuals, [1.0, -2.0, 1.0], atol=1e-12)
     assert bent.deviation == pytest.approx(math.sqrt(6.0))
@@ -216,9 +248,17 @@ def test_gain_and_offset_come_back_and_the_residuals_are_what_is_left():
 @pytest.mark.parametrize(
     ("px", "mm", "message"),
     [
-        ([60.0, 60.0, 90.0], [0.5, 0.5, 0.7], r"at least three different known widths, .* found \(3,\) measured for 2 different"),
+        (
+            [60.0, 60.0, 90.0],
+            [0.5, 0.5, 0.7],
+            r"at least three different known widths, .* found \(3,\) measured for 2 different",
+        ),
         ([60.0, np.nan, 90.0], [0.5, 0.6, 0.7], r"expected a width in every frame but 1 of 3 have none"),
-        ([90.0, 75.0, 60.0], [0.5, 0.6, 0.7], r"grow with the known widths but found a gain of -0.00667 mm/px"),
+        (
+            [90.0, 75.0, 60.0],
+            [0.5, 0.6, 0.7],
+            r"grow with the known widths but found a gain of -0.00667 mm/px",
+        ),
     ],
 )
 def test_a_calibration_that_determines_nothing_is_refused(px, mm, message):

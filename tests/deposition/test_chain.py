@@ -1,4 +1,5 @@
-"""The identified chain: simulation of many at once against one at a time, backlash by blocks against the walk, parameters found, creep where there is creep."""
+"""The identified chain: simulation of many at once against one at a time, backlash by blocks against the
+walk, parameters found, creep where there is creep."""
 
 import numpy as np
 import pytest
@@ -24,35 +25,43 @@ def test_backlash_by_blocks_is_the_walk(length):
 def test_many_extruders_at_once_flow_as_each_alone():
     rng = np.random.default_rng(0)
     u = np.cumsum(rng.standard_normal((2, 600)), axis=1) * 0.3
-    family = [extruder.draw(rng, gain=1.08, time_constant_s=2.7, steady_flow=2.4, creep_share=c) for c in (0.0, 0.12, 0.0)] + [
-        Extruder(1.0, 2.0)
-    ]
+    family = [
+        extruder.draw(rng, gain=1.08, time_constant_s=2.7, steady_flow=2.4, creep_share=c)
+        for c in (0.0, 0.12, 0.0)
+    ] + [Extruder(1.0, 2.0)]
     found = simulate(family, u, sample_time_s=TS)
     for one, rows in zip(family, found, strict=True):
         for command, y in zip(u, rows, strict=True):
             np.testing.assert_allclose(
                 y, extruder.flow(one, command, sample_time_s=TS), atol=1e-9
             )  # rounding, and what a lag keeps for 2 s
-    np.testing.assert_array_equal(forecast(family[0], u[0], sample_time_s=TS), simulate(family[:1], u[:1], sample_time_s=TS)[0, 0])
+    np.testing.assert_array_equal(
+        forecast(family[0], u[0], sample_time_s=TS), simulate(family[:1], u[:1], sample_time_s=TS)[0, 0]
+    )
 
 
 def test_the_chain_of_the_plant_is_found_from_noisy_trials():
     found = known(PLANT).materials[0].chain
     assert not found.creeps and found.trials == sum(len(t.u) for t in trainings(PLANT))
     e = found.extruder
-    # 52 trials with 1 % gain noise each leave some 0.2 %; delay and lag trade against each other, their sum does not
+    # 52 trials with 1 % gain noise each leave some 0.2 %; delay and
+    # lag trade against each other, their sum does not
     assert e.gain == pytest.approx(PLANT.gain, rel=0.01)
     assert e.time_constant_s == pytest.approx(PLANT.time_constant_s, rel=0.01)
     assert e.yield_ == pytest.approx(PLANT.yield_, abs=0.015 * 2.43)
     late = [x.delay_s + extruder.DAMPING / (np.pi * x.lag_hz) for x in (e, PLANT)]
     assert late[0] == pytest.approx(late[1], abs=0.005)  # a quarter of a sample
-    assert found.residual_percent < 3.5 and 0 < found.held_out_percent < 0.8  # the noise of a trial is 3 % white; 12 of them averaged
+    assert (
+        found.residual_percent < 3.5 and 0 < found.held_out_percent < 0.8
+    )  # the noise of a trial is 3 % white; 12 of them averaged
 
 
 def test_creep_is_found_where_there_is_creep():
     found = known(CREEPING).materials[0].chain
     assert found.creeps
-    assert found.extruder.creep_share == pytest.approx(0.12, abs=0.03)  # share and time trade against each other within 30 s of trial
+    assert found.extruder.creep_share == pytest.approx(
+        0.12, abs=0.03
+    )  # share and time trade against each other within 30 s of trial
 
 
 def test_samples_that_were_not_observed_do_not_matter():
@@ -61,13 +70,20 @@ def test_samples_that_were_not_observed_do_not_matter():
         y = t.y.copy()
         y[:, 300:340] = np.nan
         holed.append(t._replace(y=y))
-    found, whole = identify(holed, sample_time_s=TS).extruder, identify(trainings(PLANT)[:2], sample_time_s=TS).extruder
-    assert found.gain == pytest.approx(whole.gain, rel=0.01) and found.time_constant_s == pytest.approx(whole.time_constant_s, rel=0.01)
+    found, whole = (
+        identify(holed, sample_time_s=TS).extruder,
+        identify(trainings(PLANT)[:2], sample_time_s=TS).extruder,
+    )
+    assert found.gain == pytest.approx(whole.gain, rel=0.01) and found.time_constant_s == pytest.approx(
+        whole.time_constant_s, rel=0.01
+    )
 
 
 def test_trials_that_tell_nothing_are_refused():
     t = trainings(PLANT)[0]
     with pytest.raises(ValueError, match="identify: expected routines of at least two trials each but found"):
         identify([t._replace(u=t.u[:1], y=t.y[:1])], sample_time_s=TS)
-    with pytest.raises(ValueError, match="identify: expected commands that press but found a sum of u <= 0; check the sign"):
+    with pytest.raises(
+        ValueError, match="identify: expected commands that press but found a sum of u <= 0; check the sign"
+    ):
         identify([t._replace(u=-t.u)], sample_time_s=TS)

@@ -1,4 +1,5 @@
-"""Composition: the three composers on structures that nobody trained on, judged by the true flow; the choice between them; materials, and what is refused."""
+"""Composition: the three composers on structures that nobody trained on, judged by the true flow; the choice
+between them; materials, and what is refused."""
 
 import re
 from pathlib import Path
@@ -10,16 +11,46 @@ from pipeline.deposition import basis, gcode
 from pipeline.deposition.composition import BASIS, commands, compose, priority, superposition
 from pipeline.deposition.library import Basis, Library, learned
 from pipeline.deposition.motion import plan
-from tests.deposition.trained import AREA, CREEPING, NOZZLE, PLANT, RAMP, TS, known, percent_of_on_off, protocol, trainings
+from tests.deposition.trained import (
+    AREA,
+    CREEPING,
+    NOZZLE,
+    PLANT,
+    RAMP,
+    TS,
+    known,
+    percent_of_on_off,
+    protocol,
+    trainings,
+)
 
 PARTS = Path(__file__).parents[2] / "datasets" / "parts"
-MACHINE = {"acceleration": 1000.0, "junction_deviation_mm": 0.05, "speed_limit": 100.0, "unset_feed": 8.0, "tool_change_s": 2.0}
-PART = {"nozzle_mm": NOZZLE, "bead_area_mm2": AREA, "ramp_s": RAMP, "corner_deg": 30.0, "longest_pause_s": 1.0, "limit": np.inf}
+MACHINE = {
+    "acceleration": 1000.0,
+    "junction_deviation_mm": 0.05,
+    "speed_limit": 100.0,
+    "unset_feed": 8.0,
+    "tool_change_s": 2.0,
+}
+PART = {
+    "nozzle_mm": NOZZLE,
+    "bead_area_mm2": AREA,
+    "ramp_s": RAMP,
+    "corner_deg": 30.0,
+    "longest_pause_s": 1.0,
+    "limit": np.inf,
+}
 
 
 def composed(text, plant=PLANT, materials=None, **changes):
     program = gcode.parse(text)
-    return compose(known(plant), program, plan(program.moves, **MACHINE), materials=materials or {0: "A", 1: "B"}, **{**PART, **changes})
+    return compose(
+        known(plant),
+        program,
+        plan(program.moves, **MACHINE),
+        materials=materials or {0: "A", 1: "B"},
+        **{**PART, **changes},
+    )
 
 
 def of_part(name, plant=PLANT, **changes):
@@ -33,9 +64,15 @@ def of_part(name, plant=PLANT, **changes):
 def test_parts_pauses_and_speeds_that_were_not_trained_stay_within_the_bars(plant, bars):
     for name, bar in (("tic_tac_toe", bars[0]), ("dashes", bars[1])):
         for stream in of_part(name, plant).streams:
-            assert percent_of_on_off(plant, stream.u, stream.r) < bar / 2  # half of the bar: one plant stands for a family
+            assert (
+                percent_of_on_off(plant, stream.u, stream.r) < bar / 2
+            )  # half of the bar: one plant stands for a family
     chain = known(plant).materials[0].chain.extruder
-    for r, bar in ((protocol(8.0, 0.2).r, bars[2]), (protocol(4.0, 0.6).r, bars[3]), (protocol(12.0, 0.6).r, bars[3])):
+    for r, bar in (
+        (protocol(8.0, 0.2).r, bars[2]),
+        (protocol(4.0, 0.6).r, bars[3]),
+        (protocol(12.0, 0.6).r, bars[3]),
+    ):
         assert percent_of_on_off(plant, basis.compose(chain, r, sample_time_s=TS), r) < bar / 2
 
 
@@ -48,7 +85,9 @@ def test_the_prediction_of_each_composer_is_near_its_true_error():
             for prediction in made.predictions:
                 if prediction.material == stream.material:
                     error = percent_of_on_off(PLANT, true[prediction.composer], stream.r)
-                    assert prediction.rms_percent_of_on_off == pytest.approx(error, rel=0.15, abs=1.5)  # predicted from trials alone
+                    assert prediction.rms_percent_of_on_off == pytest.approx(
+                        error, rel=0.15, abs=1.5
+                    )  # predicted from trials alone
             chosen = [p for p in made.predictions if p.chosen and p.material == stream.material]
             assert len(chosen) == 1 and stream.composer == chosen[0].composer == BASIS
 
@@ -69,28 +108,43 @@ def test_short_lines_need_superposition_and_long_ones_do_not():
 
 
 def test_the_library_composed_for_its_own_routine_is_what_was_learned():
-    """A line as long as the routine's, with its pause: the composed command is the learned one, but for the flattened plateaus."""
+    """A line as long as the routine's, with its pause: the composed command is
+    the learned one, but for the flattened plateaus."""
     lesson = protocol(8.0, 0.6, on_s=11)
-    made = composed(f"G21\nG90\nM83\nT0\nG0 X0 Y0 F480\nG1 X{8 * 11} E1 F480\nG4 P600\nG1 X{2 * 8 * 11} E1\nG0 X200\nG4 P5000")
+    made = composed(
+        f"G21\nG90\nM83\nT0\nG0 X0 Y0 F480\nG1 X{8 * 11} E1 F480\nG4 P600\nG1 X{2 * 8 * 11} "
+        "E1\nG0 X200\nG4 P5000"
+    )
     tasks, lines = made.tasks, made.lines
     u = priority(known(PLANT).library, "A", NOZZLE, tasks, lines, 0, samples=len(made.streams[0].r))
     taught = learned(trainings(PLANT)[0])[0]
     begin = round(lines.begin_s[0] / TS)
     start = round(lesson.start_s / TS)
     ours, theirs = u[begin - 20 : begin + 500], taught[start - 20 : start + 500]
-    assert np.linalg.norm(ours - theirs) < 0.2 * np.linalg.norm(theirs)  # Start is the mean over two pauses, and each plateau its mean
+    assert np.linalg.norm(ours - theirs) < 0.2 * np.linalg.norm(
+        theirs
+    )  # Start is the mean over two pauses, and each plateau its mean
 
 
 def test_where_tasks_overlap_the_higher_one_rules_and_superposition_adds_them():
-    """A line of 0.5 s between Start (3, from 0.2 s before to 0.4 s after) and Stop (-5, from 0.3 s before to 0.2 s after), Steady-State 1 at 8 mm/s."""
-    columns = [Basis("Stop", "A", NOZZLE, 8.0, 0.0, 15, np.full(25, -5.0)), Basis("Start", "A", NOZZLE, 8.0, 0.0, 10, np.full(30, 3.0))]
-    columns += [Basis("Steady-State", "A", NOZZLE, 8.0, 0.0, 0, np.ones(1)), Basis("No-Flow", "A", NOZZLE, 8.0, 0.0, 0, np.zeros(1))]
+    """A line of 0.5 s between Start (3, from 0.2 s before to 0.4 s after) and Stop (-5, from 0.3 s before to
+    0.2 s after), Steady-State 1 at 8 mm/s."""
+    columns = [
+        Basis("Stop", "A", NOZZLE, 8.0, 0.0, 15, np.full(25, -5.0)),
+        Basis("Start", "A", NOZZLE, 8.0, 0.0, 10, np.full(30, 3.0)),
+    ]
+    columns += [
+        Basis("Steady-State", "A", NOZZLE, 8.0, 0.0, 0, np.ones(1)),
+        Basis("No-Flow", "A", NOZZLE, 8.0, 0.0, 0, np.zeros(1)),
+    ]
     made = composed("G21\nG90\nM83\nT0\nG0 X40 Y0 F480\nG1 X44 E1\nG0 X84\nG4 P3000")
     k = round(made.lines.begin_s[0] / TS)
     where = (Library(tuple(columns), TS, {}), "A", NOZZLE, made.tasks, made.lines, 0)
     by_rank, added = (by(*where, samples=len(made.streams[0].r)) for by in (priority, superposition))
     assert round((made.lines.end_s[0] - made.lines.begin_s[0]) / TS) == 25
-    expected = np.repeat([0.0, 3.0, -5.0, 0.0], [5, 20, 25, 5])  # before; Start until Stop takes over; Stop; after
+    expected = np.repeat(
+        [0.0, 3.0, -5.0, 0.0], [5, 20, 25, 5]
+    )  # before; Start until Stop takes over; Stop; after
     np.testing.assert_array_equal(by_rank[k - 15 : k + 40], expected)
     # from 0.2 s to 0.4 s both: 3 + (-5 - 1); then Stop alone
     expected = np.repeat([0.0, 3.0, -3.0, -5.0, 0.0], [5, 20, 10, 15, 5])
@@ -130,11 +184,17 @@ def test_the_same_inputs_give_the_same_bytes():
 
 def test_a_tool_without_a_material_and_a_material_that_was_not_learned_are_refused_with_the_line():
     text = (PARTS / "tic_tac_toe.gcode").read_text()
-    with pytest.raises(ValueError, match=r"line \d+: T1 prints but has no material; expected one of tools \[0\], or name its material"):
+    with pytest.raises(
+        ValueError,
+        match=r"line \d+: T1 prints but has no material; expected one of tools \[0\], or name its material",
+    ):
         composed(text, materials={0: "A"})
     with pytest.raises(
         ValueError,
-        match=re.escape("T1 prints C with a nozzle of 0.6 mm, but what was learned is A with 0.6 mm, B with 0.6 mm; train it first"),
+        match=re.escape(
+            "T1 prints C with a nozzle of 0.6 mm, but what was learned is A with 0.6 mm, "
+            "B with 0.6 mm; train it first"
+        ),
     ):
         composed(text, materials={0: "A", 1: "C"})
     with pytest.raises(ValueError, match="T0 prints A with a nozzle of 0.4 mm"):
@@ -145,6 +205,7 @@ def test_a_program_that_would_jump_from_steady_state_to_no_flow_is_refused_with_
     program = gcode.parse("G21\nG90\nM83\nT0\nG0 X10 F480\nG1 X20 E1\nT1\nG1 X30 E1\nG0 X0")
     motion = plan(program.moves, **{**MACHINE, "tool_change_s": 0.0})
     with pytest.raises(
-        ValueError, match="line 7: T1 comes 0.00 s after line 6 still printed with T0, so Steady-State would go to No-Flow without a Stop"
+        ValueError,
+        match="line 7: T1 comes 0.00 s after line 6 still printed with T0, so Steady-State would go to No-Flow without a Stop",
     ):
         compose(known(PLANT), program, motion, materials={0: "A", 1: "B"}, **PART)

@@ -1,26 +1,43 @@
-"""The report on a part: line volumes against the true flow, the forecast of saturation against the plant, the ramp that would do, and what was refused."""
+"""The report on a part: line volumes against the true flow, the forecast of saturation against the plant, the
+ramp that would do, and what was refused."""
 
 import numpy as np
 import pytest
 
 from pipeline.deposition import basis
-from pipeline.deposition.conformance import conform, line_volumes, ramp_that_would_do, saturation, volume_between
+from pipeline.deposition.conformance import (
+    conform,
+    line_volumes,
+    ramp_that_would_do,
+    saturation,
+    volume_between,
+)
 from pipeline.deposition.extruder import Extruder, flow
 from pipeline.deposition.gcode import Refusal
 from tests.deposition.test_composition import composed, of_part
 from tests.deposition.trained import AREA, NOMINAL, PLANT, RAMP, TS, known, protocol
 
-REPORT = {"bead_area_mm2": AREA, "ramp_s": RAMP, "limit": np.inf, "shortest_s": 0.4, "largest_error_percent": 20.0}
+REPORT = {
+    "bead_area_mm2": AREA,
+    "ramp_s": RAMP,
+    "limit": np.inf,
+    "shortest_s": 0.4,
+    "largest_error_percent": 20.0,
+}
 
 
 @pytest.mark.parametrize("name", ["fig9", "tic_tac_toe", "dashes"])
 def test_every_printed_line_of_0_4_s_has_its_volume_in_truth_within_3_percent(name):
     made = of_part(name)
-    true = made._replace(streams=tuple(s._replace(y=flow(PLANT, s.u, sample_time_s=TS)) for s in made.streams))
+    true = made._replace(
+        streams=tuple(s._replace(y=flow(PLANT, s.u, sample_time_s=TS)) for s in made.streams)
+    )
     volumes = line_volumes(true, known(PLANT).library, bead_area_mm2=AREA)
     report = conform(made, known(PLANT), **REPORT)
     assert np.abs(volumes.error_percent).max() < 3.0  # the bar
-    np.testing.assert_allclose(report.lines.predicted_mm3, volumes.predicted_mm3, rtol=0.02)  # predicted from trials alone
+    np.testing.assert_allclose(
+        report.lines.predicted_mm3, volumes.predicted_mm3, rtol=0.02
+    )  # predicted from trials alone
     assert report.judged == len(made.lines.line) and report.worst_line_volume_percent < 3.0
 
 
@@ -28,20 +45,26 @@ def test_the_lines_of_a_run_share_its_volume_out_without_rest():
     made = composed("G21\nG90\nM83\nT0\nG0 X10 F480\nG1 X20 E1\nG1 Y7 E1\nG1 X35 E1\nG0 X0\nG4 P3000")
     volumes = line_volumes(made, known(PLANT).library, bead_area_mm2=AREA)
     assert volumes.line.tolist() == [6, 7, 8]
-    assert volumes.predicted_mm3.sum() == pytest.approx(made.streams[0].y.sum() * TS, rel=1e-3)  # but for what oozes a second later
+    assert volumes.predicted_mm3.sum() == pytest.approx(
+        made.streams[0].y.sum() * TS, rel=1e-3
+    )  # but for what oozes a second later
     np.testing.assert_allclose(volumes.planned_mm3, AREA * np.array([10, 7, 15]), rtol=1e-9)
 
 
 def test_volume_between_by_hand():
     flow_ = np.array([0.0, 1.0, 1.0, 0.0])  # a trapezoid of 2 samples' area
     np.testing.assert_allclose(
-        volume_between(flow_, np.array([-1.0, 0.5]), np.array([9.0, 1.5]), sample_time_s=1.0), [2.0, 0.25 + 0.5], atol=0.13
+        volume_between(flow_, np.array([-1.0, 0.5]), np.array([9.0, 1.5]), sample_time_s=1.0),
+        [2.0, 0.25 + 0.5],
+        atol=0.13,
     )
     assert volume_between(flow_, np.array([1.0]), np.array([2.0]), sample_time_s=1.0) == pytest.approx([1.0])
 
 
 def test_a_run_shorter_than_the_stop_lead_is_listed_and_a_long_one_is_not():
-    made = composed("G21\nG90\nM83\nT0\nG0 X10 F480\nG1 X12 E1\nG0 X20\nG1 X40 E1\nG0 X0\nG4 P3000")  # 0.25 s and 2.5 s
+    made = composed(
+        "G21\nG90\nM83\nT0\nG0 X10 F480\nG1 X12 E1\nG0 X20\nG1 X40 E1\nG0 X0\nG4 P3000"
+    )  # 0.25 s and 2.5 s
     report = conform(made, known(PLANT), **REPORT)
     assert report.lines.line.tolist() == [6, 8] and report.lines.shorter_than_lead.tolist() == [True, False]
     assert report.judged == 1
@@ -67,7 +90,8 @@ def test_the_peak_is_about_1_plus_tau_over_ramp():
     plant, on = Extruder(1.0, 3.0), protocol(ramp_s=1e-9).r
     for ramp_s in (0.3, 0.6, 1.2):
         found = saturation(plant, on, on_off_gain=1.0, ramp_s=ramp_s, limit=np.inf, sample_time_s=TS)
-        # the slope is steepest in the middle, where half of the flow is there: 1/2 + tau / ramp; dt of 0.02 s blunts it
+        # the slope is steepest in the middle, where half of the flow
+        # is there: 1/2 + tau / ramp; dt of 0.02 s blunts it
         assert found.peak_over_steady == pytest.approx(0.5 + 3.0 / ramp_s, rel=0.05)
 
 
@@ -75,11 +99,15 @@ def test_the_ramp_that_would_do_does_and_a_shorter_one_does_not():
     chain, on = known(PLANT).materials[0].chain.extruder, protocol(ramp_s=1e-9).r
     limit = 8 * on.max() / chain.gain
     ramp_s = ramp_that_would_do(chain, on, ramp_s=RAMP, limit=limit, sample_time_s=TS)
-    peaks = [np.abs(basis.compose(chain, basis.boxed(on, x, TS), sample_time_s=TS)).max() for x in (ramp_s, 0.97 * ramp_s)]
+    peaks = [
+        np.abs(basis.compose(chain, basis.boxed(on, x, TS), sample_time_s=TS)).max()
+        for x in (ramp_s, 0.97 * ramp_s)
+    ]
     assert peaks[0] <= limit < peaks[1]
     assert ramp_that_would_do(chain, on, ramp_s=RAMP, limit=1e3, sample_time_s=TS) == RAMP  # none is needed
     assert (
-        ramp_that_would_do(chain, on, ramp_s=RAMP, limit=0.5 * on.max() / chain.gain, sample_time_s=TS) == np.inf
+        ramp_that_would_do(chain, on, ramp_s=RAMP, limit=0.5 * on.max() / chain.gain, sample_time_s=TS)
+        == np.inf
     )  # not even the steady flow
 
 

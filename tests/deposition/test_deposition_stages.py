@@ -1,4 +1,5 @@
-"""The deposition stages as a user runs them: simulated from end to end, and a real machine whose trials lie in a folder; broken input leaves all as it was."""
+"""The deposition stages as a user runs them: simulated from end to end, and a real machine whose trials lie
+in a folder; broken input leaves all as it was."""
 
 import importlib
 import json
@@ -22,7 +23,10 @@ ROOT = Path(__file__).parents[2]
 SHORT = {"off_s": 1.0, "on_s": 2.5, "tail_s": 2.0}
 SMALL = {
     "printer.reference": {"speed_mm_per_s": 8.0, "pause_s": 0.6, **SHORT},
-    "printer.routines": [{"speed_mm_per_s": 8.0, "pause_s": 0.6, **SHORT}, {"speed_mm_per_s": 5.0, "pause_s": 0.4, **SHORT}],
+    "printer.routines": [
+        {"speed_mm_per_s": 8.0, "pause_s": 0.6, **SHORT},
+        {"speed_mm_per_s": 5.0, "pause_s": 0.4, **SHORT},
+    ],
     "printer.materials": [{"name": "A", "tool": 0, "gain_mm3_per_s_per_mm": 1.08, "time_constant_s": 0.8}],
     "train_ilc.trials": 6,
     "train_ilc.pixel_trials": 2,
@@ -74,7 +78,9 @@ def test_the_simulated_loop_learns_composes_and_repeats_to_the_byte(project, cap
     taught = json.loads(Path("reports/metrics/train_ilc.json").read_text())["A"]
     # the bars of the learning loop at trial 2, on a machine that is not the nominal model
     assert taught["ours"]["ratio_trial_2"] <= 0.20 and taught["pixels"]["ratio_trial_2"] <= 0.20
-    assert taught["gamma"] == pytest.approx(0.7555, abs=0.01), "gamma of the paper's law hardly depends on K and tau"
+    assert taught["gamma"] == pytest.approx(0.7555, abs=0.01), (
+        "gamma of the paper's law hardly depends on K and tau"
+    )
     found = json.loads(Path("reports/metrics/compose_parts.json").read_text())
     for part in ("dashes", "fig9"):
         one = found[part]["A"]
@@ -82,7 +88,17 @@ def test_the_simulated_loop_learns_composes_and_repeats_to_the_byte(project, cap
         assert one[one["chosen"]]["rms_percent_of_on_off"] <= 10.0
     tasks = artifacts.read_table("datasets/compose_parts/tasks.parquet", TASKS)
     mine = tasks["task"][tasks["part"] == "fig9"].tolist()
-    assert mine == ["No-Flow", "Start", "Steady-State", "Corner", "Steady-State", "Corner", "Steady-State", "Stop", "No-Flow"]
+    assert mine == [
+        "No-Flow",
+        "Start",
+        "Steady-State",
+        "Corner",
+        "Steady-State",
+        "Corner",
+        "Steady-State",
+        "Stop",
+        "No-Flow",
+    ]
     kept = sorted(path.name for path in Path("datasets/train_ilc/recordings").iterdir())
     assert kept == ["A_00.mcap", "A_02.mcap"], "recordings of the first and of the last trial"
     before = artifacts.sha256("datasets"), artifacts.sha256("reports")
@@ -92,10 +108,13 @@ def test_the_simulated_loop_learns_composes_and_repeats_to_the_byte(project, cap
 
 
 def machine(asked: int, index: int = 0, **changes) -> Path:
-    """A machine of the family prints the command that the stage asked for, and what its camera saw is put into the folder; returns the recording."""
+    """A machine of the family prints the command that the stage asked for, and what its camera saw is put
+    into the folder; returns the recording."""
     printer, camera = params.load(Printer, "printer"), params.load(Camera, "camera")
     routine, material = printer.trained()[index], printer.materials[0]
-    command = np.loadtxt(f"datasets/train_ilc/next/A_routine_{index}_trial_{asked:02d}.csv", delimiter=",", skiprows=1)[:, 1]
+    command = np.loadtxt(
+        f"datasets/train_ilc/next/A_routine_{index}_trial_{asked:02d}.csv", delimiter=",", skiprows=1
+    )[:, 1]
     plant = draw(np.random.default_rng(3), gain=1.08, time_constant_s=0.8, steady_flow=printer.steady_flow)
     scene = trial_video.scene(camera, np.random.default_rng(asked))
     known = trial_video.conditions(
@@ -138,10 +157,15 @@ def test_trial_after_trial_the_loop_closes_through_the_folder(project, capsys):
     assert min(errors[2:]) <= 0.20 * errors[0]
     stage("train_ilc")
     metrics = json.loads(Path("reports/metrics/train_ilc.json").read_text())["A"]
-    assert metrics["routine_0"]["next"] == "A_routine_0_trial_04" and metrics["routine_1"]["next"] == "A_routine_1_trial_00"
+    assert (
+        metrics["routine_0"]["next"] == "A_routine_0_trial_04"
+        and metrics["routine_1"]["next"] == "A_routine_1_trial_00"
+    )
     stage("segment_library")
     stage("compose_parts")
-    assert json.loads(Path("reports/metrics/compose_parts.json").read_text())["fig9"]["A"]["chosen"] == "basis"
+    assert (
+        json.loads(Path("reports/metrics/compose_parts.json").read_text())["fig9"]["A"]["chosen"] == "basis"
+    )
 
 
 def test_a_folder_of_trials_that_contradict_each_other_is_refused_by_file(project, capsys):
@@ -166,32 +190,52 @@ def test_a_folder_of_trials_that_contradict_each_other_is_refused_by_file(projec
     assert "print_0_0.mcap" in refusal("train_ilc", capsys)
 
 
-def filmed(path: Path, plant, routine, u, *, late_s: float = 0.0, dark: bool = False, shown_mm: float = 1.0, command: float = 1.0) -> None:
-    """The first trial of a machine, by a recorder that began earlier, in the dark, or with its gantry or plunger in other units."""
+def filmed(
+    path: Path,
+    plant,
+    routine,
+    u,
+    *,
+    late_s: float = 0.0,
+    dark: bool = False,
+    shown_mm: float = 1.0,
+    command: float = 1.0,
+) -> None:
+    """The first trial of a machine, by a recorder that began earlier, in the
+    dark, or with its gantry or plunger in other units."""
     printer, camera = params.load(Printer, "printer"), params.load(Camera, "camera")
     calibration = Calibration(abs(camera.mm_per_px), 0.0, 0.0, np.zeros(0))
-    known = trial_video.conditions(printer.materials[0], routine, 0, "ours", printer=printer, camera=camera, calibration=calibration)
+    known = trial_video.conditions(
+        printer.materials[0], routine, 0, "ours", printer=printer, camera=camera, calibration=calibration
+    )
     truth = flow(plant, u, sample_time_s=printer.sample_time_s)
     pictures = trial_video.scene(camera, np.random.default_rng(0)).trial(
-        routine.time_s, truth, routine.position, view=trial_video.view(camera), frame_rate_hz=camera.frames_per_s,
-        nozzle_mm=(printer.nozzle_mm / 2, printer.nozzle_outer_mm / 2), contact_angle_deg=camera.contact_angle_deg,
+        routine.time_s, truth, routine.position, view=trial_video.view(camera),
+        frame_rate_hz=camera.frames_per_s,
+        nozzle_mm=(printer.nozzle_mm / 2, printer.nozzle_outer_mm / 2),
+        contact_angle_deg=camera.contact_angle_deg,
     )  # fmt: skip
     frames = ((time + late_s, 0 * frame if dark else frame) for time, frame in pictures)
     trial_files.write_trial(
-        path, known, frames, time_s=routine.time_s + late_s, position_mm=shown_mm * routine.position, speed_mm_per_s=routine.speed, command_mm=command * u, encoding="jpeg"
+        path, known, frames, time_s=routine.time_s + late_s, position_mm=shown_mm * routine.position,
+        speed_mm_per_s=routine.speed, command_mm=command * u, encoding="jpeg"
     )  # fmt: skip
 
 
 def test_a_trial_begins_where_its_gantry_does_whenever_its_recorder_began(project):
     printer, camera = params.load(Printer, "printer"), params.load(Camera, "camera")
-    routine, plant = printer.trained()[0], draw(np.random.default_rng(3), gain=1.08, time_constant_s=0.8, steady_flow=printer.steady_flow)
+    routine, plant = (
+        printer.trained()[0],
+        draw(np.random.default_rng(3), gain=1.08, time_constant_s=0.8, steady_flow=printer.steady_flow),
+    )
     u = routine.r / 1.08
     seen = []
     # a clock of the calendar is counted from its whole second: this one is 0.41 s late
     for late_s in (0.0, 2.0, 1.7e9 + 0.41):
         filmed(Path("trial.mcap"), plant, routine, u, late_s=late_s)
         seen.append(trial_video.watch("trial.mcap", routine, printer=printer, camera=camera).flow.flow)
-    # the clock of a record holds nanoseconds; a tenth of a percent of the steady flow is far below what pictures tell
+    # the clock of a record holds nanoseconds; a tenth of a percent of
+    # the steady flow is far below what pictures tell
     np.testing.assert_allclose(seen[1:], np.stack([seen[0]] * 2), atol=1e-3 * printer.steady_flow)
 
 
@@ -199,7 +243,10 @@ def test_a_trial_in_the_dark_or_in_other_units_is_refused_by_file(project, capsy
     declare({"train_ilc.source": "recordings"})
     stage("train_ilc")
     printer = params.load(Printer, "printer")
-    routine, plant = printer.trained()[0], draw(np.random.default_rng(3), gain=1.08, time_constant_s=0.8, steady_flow=printer.steady_flow)
+    routine, plant = (
+        printer.trained()[0],
+        draw(np.random.default_rng(3), gain=1.08, time_constant_s=0.8, steady_flow=printer.steady_flow),
+    )
     path = Path("datasets/raw/deposition/trial.mcap")
     for changes, words in [
         ({"dark": True}, ("trial.mcap", "none of", "no bead in")),
@@ -222,7 +269,9 @@ def test_without_a_trial_the_first_commands_are_written_and_the_library_says_wha
 def test_a_part_that_cannot_be_composed_is_listed_and_the_others_go_on(project, capsys):
     stage("train_ilc")
     stage("segment_library")
-    Path("datasets/parts/other.gcode").write_text("G21\nG90\nM83\nT7\nG0 X0 Y0 F600\nG1 X40 E40 F480\nG0 X60\n")
+    Path("datasets/parts/other.gcode").write_text(
+        "G21\nG90\nM83\nT7\nG0 X0 Y0 F600\nG1 X40 E40 F480\nG0 X60\n"
+    )
     Path("datasets/parts/picture.gcode").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(range(256)) * 8)
     stage("compose_parts")
     refused = json.loads(Path("reports/metrics/compose_parts.json").read_text())["refused"]
@@ -232,7 +281,9 @@ def test_a_part_that_cannot_be_composed_is_listed_and_the_others_go_on(project, 
     assert "none of 2" in refusal("compose_parts", capsys)
     Path("datasets/parts/other.gcode").write_text("G21\nG90\nM83\nG0 X0 Y0 F600\nG2 X10 Y0 I50 J0 E1 F480\n")
     Path("datasets/parts/picture.gcode").unlink()
-    assert "line 5" in refusal("compose_parts", capsys), "nothing prints because the one line that would is left out"
+    assert "line 5" in refusal("compose_parts", capsys), (
+        "nothing prints because the one line that would is left out"
+    )
     rest = Path("datasets/segment_library/learned.json")
     whole = rest.read_text()
     rest.write_text("{}")
@@ -253,9 +304,13 @@ def test_what_was_learned_survives_being_stored(project):
     stage("segment_library")
     from pipeline.deposition.workflow.segment_library import read_learned, restored, stored
 
-    learned = read_learned("datasets/segment_library/library.parquet", "datasets/segment_library/learned.json")
+    learned = read_learned(
+        "datasets/segment_library/library.parquet", "datasets/segment_library/learned.json"
+    )
     table, rest = stored(learned)
-    again = restored({name: np.array(values, object) for name, values in table.items()}, json.loads(json.dumps(rest)))
+    again = restored(
+        {name: np.array(values, object) for name, values in table.items()}, json.loads(json.dumps(rest))
+    )
     assert again.materials == learned.materials and again.library.marks == learned.library.marks
     for a, b in zip(again.library.columns, learned.library.columns, strict=True):
         np.testing.assert_array_equal(a.signal, b.signal)
@@ -265,7 +320,9 @@ def test_what_was_learned_survives_being_stored(project):
 def test_learning_is_what_its_parts_are():
     """Figures of one material come from two processes: put together nothing is lost."""
     a = train_ilc.Part({("A", 0): [1]}, {}, {"A": {"x": 1}}, {"A": {"gamma": 1}})
-    b = train_ilc.Part({("A", 0): [2], ("B", 0): [3]}, {("A", 0): [4]}, {"A": {"y": 2}}, {"A": {"pixels": 2}, "B": {}})
+    b = train_ilc.Part(
+        {("A", 0): [2], ("B", 0): [3]}, {("A", 0): [4]}, {"A": {"y": 2}}, {"A": {"pixels": 2}, "B": {}}
+    )
     whole = train_ilc.joined([a, b])
     assert whole.runs == {("A", 0): [1, 2], ("B", 0): [3]} and whole.models == {"A": {"x": 1, "y": 2}}
     assert whole.metrics == {"A": {"gamma": 1, "pixels": 2}, "B": {}}

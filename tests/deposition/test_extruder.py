@@ -1,11 +1,23 @@
-"""The plant family: each block of the chain against its closed form, the draws within their ranges, the noise at its shares, the routine by its protocol."""
+"""The plant family: each block of the chain against its closed form, the draws within their ranges, the noise
+at its shares, the routine by its protocol."""
 
 import math
 
 import numpy as np
 import pytest
 
-from pipeline.deposition.extruder import Extruder, backlash, disturb, draw, flow, frequency_response, lagged, pressed, ramp, routine
+from pipeline.deposition.extruder import (
+    Extruder,
+    backlash,
+    disturb,
+    draw,
+    flow,
+    frequency_response,
+    lagged,
+    pressed,
+    ramp,
+    routine,
+)
 
 TS = 0.02
 A = Extruder(1.08, 2.7)
@@ -31,7 +43,9 @@ def reference(**changes):
 
 def test_the_nominal_step_response_is_first_order_at_every_sample():
     y = flow(A, np.full(500, 2.0), sample_time_s=TS)
-    np.testing.assert_allclose(y, 2.0 * 1.08 * (1 - np.exp(-np.arange(500) * TS / 2.7)), atol=1e-12)  # rounding
+    np.testing.assert_allclose(
+        y, 2.0 * 1.08 * (1 - np.exp(-np.arange(500) * TS / 2.7)), atol=1e-12
+    )  # rounding
 
 
 def test_delay_and_lag_between_samples_equal_a_simulation_two_hundred_times_finer():
@@ -46,17 +60,27 @@ def test_a_delay_of_two_and_a_half_samples_halves_each_sample():
 
 
 @pytest.mark.parametrize(
-    "extruder", [A, Extruder(0.5, 8.0, 0.113), Extruder(2.0, 1.0, 0.05, 3.0), Extruder(0.9, 4.5, 0.1, 6.0, creep_share=0.12)]
+    "extruder",
+    [
+        A,
+        Extruder(0.5, 8.0, 0.113),
+        Extruder(2.0, 1.0, 0.05, 3.0),
+        Extruder(0.9, 4.5, 0.1, 6.0, creep_share=0.12),
+    ],
 )
 def test_the_frequency_response_is_the_transform_of_the_pulse_response(extruder):
     pulse = pressed(extruder, np.eye(1, 16384)[0], sample_time_s=TS)
     f = np.fft.rfftfreq(16384, TS)
     # the creep's tail after 327 s is e^-16
-    np.testing.assert_allclose(frequency_response(extruder, f, sample_time_s=TS), np.fft.rfft(pulse), atol=1e-6 * extruder.gain)
+    np.testing.assert_allclose(
+        frequency_response(extruder, f, sample_time_s=TS), np.fft.rfft(pulse), atol=1e-6 * extruder.gain
+    )
 
 
 def test_a_play_of_two_by_hand():
-    np.testing.assert_array_equal(backlash(np.array([0.5, 2.0, 3.0, 2.5, 1.5, 0.0, -3.0]), 2.0), [0, 1, 2, 2, 2, 1, -2])
+    np.testing.assert_array_equal(
+        backlash(np.array([0.5, 2.0, 3.0, 2.5, 1.5, 0.0, -3.0]), 2.0), [0, 1, 2, 2, 2, 1, -2]
+    )
 
 
 def test_the_output_of_a_play_stays_within_half_of_it():
@@ -69,23 +93,31 @@ def test_the_output_of_a_play_stays_within_half_of_it():
 def test_below_the_yield_nothing_flows_and_above_it_the_yield_is_missing():
     plant = A._replace(yield_=0.2)
     assert flow(plant, np.full(3000, 0.18), sample_time_s=TS).max() == 0.0  # 1.08 x 0.18 < 0.2
-    assert flow(plant, np.full(3000, 1.0), sample_time_s=TS)[-1] == pytest.approx(0.88, abs=1e-6)  # e^-22 of the step is left
+    assert flow(plant, np.full(3000, 1.0), sample_time_s=TS)[-1] == pytest.approx(
+        0.88, abs=1e-6
+    )  # e^-22 of the step is left
 
 
 def test_the_drive_cuts_the_command_at_its_limit():
     u = np.linspace(-9, 9, 500)
-    np.testing.assert_array_equal(flow(A, u, sample_time_s=TS, limit=3.0), flow(A, np.clip(u, -3, 3), sample_time_s=TS))
+    np.testing.assert_array_equal(
+        flow(A, u, sample_time_s=TS, limit=3.0), flow(A, np.clip(u, -3, 3), sample_time_s=TS)
+    )
 
 
 def test_creep_holds_back_its_share_of_the_gain_and_gives_it_late():
     y = flow(A._replace(creep_share=0.12), np.ones(10000), sample_time_s=TS)
-    assert y[1000] == pytest.approx(1.08 * (1 - 0.88 * np.exp(-20 / 2.7) - 0.12 * np.exp(-1)), abs=1e-9)  # 20 s: closed form
+    assert y[1000] == pytest.approx(
+        1.08 * (1 - 0.88 * np.exp(-20 / 2.7) - 0.12 * np.exp(-1)), abs=1e-9
+    )  # 20 s: closed form
     assert y[-1] == pytest.approx(1.08, rel=1e-4)  # e^-10 of 12 % is left
 
 
 def test_the_chain_is_nearly_the_same_at_another_sample_time():
     plant = Extruder(1.2, 3.0, 0.113, 4.0, 0.05, 0.1)
-    coarse, fine = (flow(plant, reference(sample_time_s=ts).r / 1.08, sample_time_s=ts) for ts in (TS, TS / 10))
+    coarse, fine = (
+        flow(plant, reference(sample_time_s=ts).r / 1.08, sample_time_s=ts) for ts in (TS, TS / 10)
+    )
     # the command is held for 20 ms instead of 2 ms: 9 ms later on a slope of 2.4 mm^3/s in 3 s
     np.testing.assert_allclose(coarse, fine[::10], atol=0.012)
 
@@ -93,7 +125,9 @@ def test_the_chain_is_nearly_the_same_at_another_sample_time():
 def test_several_commands_at_once_press_what_each_presses_alone():
     u = np.random.default_rng(2).standard_normal((3, 200))
     plant = Extruder(1.2, 3.0, 0.113, 4.0, 0.05)
-    np.testing.assert_array_equal(pressed(plant, u, sample_time_s=TS), [pressed(plant, row, sample_time_s=TS) for row in u])
+    np.testing.assert_array_equal(
+        pressed(plant, u, sample_time_s=TS), [pressed(plant, row, sample_time_s=TS) for row in u]
+    )
 
 
 # ---- draws and noise
@@ -111,14 +145,19 @@ def test_draws_cover_their_ranges_and_keep_to_them():
         ([p.play * p.gain / STEADY for p in plants], 0.01, 0.04),
         ([p.yield_ / STEADY for p in plants], 0.02, 0.10),
     ):
-        assert low <= min(values) < low + 0.05 * (high - low) and high - 0.05 * (high - low) < max(values) <= high
+        assert (
+            low <= min(values) < low + 0.05 * (high - low)
+            and high - 0.05 * (high - low) < max(values) <= high
+        )
 
 
 def test_the_same_seed_draws_the_same_plant_and_the_same_noise():
     def both(seed):
         rng = np.random.default_rng(seed)
         plant = draw(rng, gain=1.08, time_constant_s=2.7, steady_flow=STEADY)
-        return plant, disturb(np.ones(50), rng, steady_flow=STEADY, white=0.03, drift=0.01, gain=0.01).tobytes()
+        return plant, disturb(
+            np.ones(50), rng, steady_flow=STEADY, white=0.03, drift=0.01, gain=0.01
+        ).tobytes()
 
     assert both(7) == both(7) and both(7) != both(8)
 
@@ -158,9 +197,13 @@ def test_a_ramp_is_a_step_after_two_moving_averages():
     box = np.ones(1501) / 1501
     step = np.convolve(np.convolve(t >= 0, box, "same"), box, "same")
     inside = np.abs(t) < 0.2
-    np.testing.assert_allclose(ramp(t, 0.15)[inside], step[inside], atol=2e-3)  # the boxes are whole samples wide
+    np.testing.assert_allclose(
+        ramp(t, 0.15)[inside], step[inside], atol=2e-3
+    )  # the boxes are whole samples wide
 
 
 def test_a_ramp_longer_than_the_phase_before_the_start_is_refused():
-    with pytest.raises(ValueError, match=r"expected a ramp above 0 s and at most 4 s.*but found 5 s; shorten the ramp"):
+    with pytest.raises(
+        ValueError, match=r"expected a ramp above 0 s and at most 4 s.*but found 5 s; shorten the ramp"
+    ):
         reference(ramp_s=5.0)

@@ -1,4 +1,5 @@
-"""Widths of many frames -> A(s) -> Q(t): exact without noise, within the bars through rendered pixels, honest about pauses, refusals."""
+"""Widths of many frames -> A(s) -> Q(t): exact without noise, within the bars through
+rendered pixels, honest about pauses, refusals."""
 
 import itertools
 
@@ -40,22 +41,45 @@ def exact_sections(time_s, Q, position) -> Sections:
     t = np.linspace(time_s[0], time_s[-1], 40 * (len(time_s) - 1) + 1)
     x, volume = np.interp(t, time_s, position), np.interp(t, time_s, Q) * (t[1] - t[0])
     faces = position[0] - 0.5 + LENGTH * np.arange(int((np.ptp(position) + 1.0) / LENGTH))
-    A = np.array([volume @ (deposit_share(b - x, RADIUS) - deposit_share(a - x, RADIUS)) for a, b in itertools.pairwise(faces)]) / LENGTH
+    A = (
+        np.array(
+            [
+                volume @ (deposit_share(b - x, RADIUS) - deposit_share(a - x, RADIUS))
+                for a, b in itertools.pairwise(faces)
+            ]
+        )
+        / LENGTH
+    )
     return Sections((faces[:-1] + faces[1:]) / 2, A, np.full(len(A), 1e-4), np.full(len(A), 17), LENGTH, 0)
 
 
 def inverted(r, seen, shapes=None):
     shapes = r.r[None] if shapes is None else shapes
-    return estimate(r.time_s, r.position, seen, nozzle_radius_mm=RADIUS, shapes=shapes, contact_angle_deg=90.0, width_deviation_mm=0.0)
+    return estimate(
+        r.time_s,
+        r.position,
+        seen,
+        nozzle_radius_mm=RADIUS,
+        shapes=shapes,
+        contact_angle_deg=90.0,
+        width_deviation_mm=0.0,
+    )
 
 
 def seen_through(camera, r, Q, *, view=VIEW, position=None):
     position = r.position if position is None else position
-    frames = camera.trial(r.time_s, Q, position, view=view, frame_rate_hz=30.0, nozzle_mm=(RADIUS, 0.32), contact_angle_deg=90.0)
+    frames = camera.trial(
+        r.time_s, Q, position, view=view, frame_rate_hz=30.0, nozzle_mm=(RADIUS, 0.32), contact_angle_deg=90.0
+    )
     columns = (0, 600) if view.mm_per_px > 0 else (40, 640)
     found = [(t, measure(frame, columns=columns, longest_blur_px=6.0)) for t, frame in frames]
-    x, widths = np.interp([t for t, _ in found], r.time_s, position), np.array([bead.widths for _, bead in found])
-    return sections(x, found[0][1].columns, widths / 125, view=view, nozzle_radius_mm=RADIUS, contact_angle_deg=90.0)
+    x, widths = (
+        np.interp([t for t, _ in found], r.time_s, position),
+        np.array([bead.widths for _, bead in found]),
+    )
+    return sections(
+        x, found[0][1].columns, widths / 125, view=view, nozzle_radius_mm=RADIUS, contact_angle_deg=90.0
+    )
 
 
 def percent(found, Q, within=slice(None)):
@@ -71,7 +95,9 @@ def on_off(r, seed=3):
 
 
 def test_the_footprint_is_the_chord_of_the_nozzle():
-    assert deposit_share(np.array([-9.0, -0.25, 0.0, 0.25, 9.0]), 0.25) == pytest.approx([0.0, 0.0, 0.5, 1.0, 1.0])
+    assert deposit_share(np.array([-9.0, -0.25, 0.0, 0.25, 9.0]), 0.25) == pytest.approx(
+        [0.0, 0.0, 0.5, 1.0, 1.0]
+    )
     z = np.linspace(-0.25, 0.25, 2001)
     chord = 2 * np.sqrt(0.25**2 - z**2) / (np.pi * 0.25**2)
     np.testing.assert_allclose(
@@ -101,7 +127,9 @@ def test_the_volume_of_a_pause_is_known_within_its_deviation_though_its_flow_is_
 
 
 def test_the_deviation_is_larger_where_the_gantry_stands():
-    found = inverted(SHORT, exact_sections(SHORT.time_s, on_off(SHORT), SHORT.position), np.zeros((0, len(SHORT.time_s))))
+    found = inverted(
+        SHORT, exact_sections(SHORT.time_s, on_off(SHORT), SHORT.position), np.zeros((0, len(SHORT.time_s)))
+    )
     steady = (SHORT.time_s > 2.2) & (SHORT.time_s < 3.0)
     assert found.deviation[~found.observable].max() > 3 * found.deviation[steady].mean()
 
@@ -111,13 +139,16 @@ def test_the_deviation_is_that_of_the_errors_under_white_noise():
     clean, errors, deviations = inverted(SHORT, exact), [], []
     for _ in range(8):
         noisy = exact._replace(
-            area=exact.area + np.where(exact.area > 0, 2e-3, 0) * rng.standard_normal(len(exact.s)), deviation=np.full(len(exact.s), 2e-3)
+            area=exact.area + np.where(exact.area > 0, 2e-3, 0) * rng.standard_normal(len(exact.s)),
+            deviation=np.full(len(exact.s), 2e-3),
         )
         found = inverted(SHORT, noisy)
         steady = (SHORT.time_s > 2.2) & (SHORT.time_s < 3.0)
         errors.append((found.flow - clean.flow)[steady])
         deviations.append(found.deviation[steady])
-    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(np.mean(deviations), rel=0.5)  # some 20 independent errors
+    assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(
+        np.mean(deviations), rel=0.5
+    )  # some 20 independent errors
 
 
 def test_a_shift_of_the_calibration_is_in_the_deviation():
@@ -132,7 +163,9 @@ def test_a_shift_of_the_calibration_is_in_the_deviation():
         width_deviation_mm=0.0088,
     )
     steady = (SHORT.time_s > 2.2) & (SHORT.time_s < 3.0)
-    np.testing.assert_allclose(found.deviation[steady] / found.flow[steady], 0.02, rtol=0.05)  # 2 x 1 % of 0.88 mm
+    np.testing.assert_allclose(
+        found.deviation[steady] / found.flow[steady], 0.02, rtol=0.05
+    )  # 2 x 1 % of 0.88 mm
 
 
 def test_a_speck_on_the_line_does_not_become_flow():
@@ -161,10 +194,21 @@ def test_readings_of_one_place_are_averaged_and_specks_dropped():
 def test_columns_under_the_nozzle_and_unread_blocks_are_left_out():
     columns = np.array([560.0, 640.0])
     widths = np.array([[0.88, 0.2], [np.nan, 0.2]])
-    found = sections(np.array([0.0, 0.5]), columns, widths, view=VIEW, nozzle_radius_mm=RADIUS, contact_angle_deg=90.0)
+    found = sections(
+        np.array([0.0, 0.5]), columns, widths, view=VIEW, nozzle_radius_mm=RADIUS, contact_angle_deg=90.0
+    )
     np.testing.assert_allclose(found.s, [-88 / 125])
-    with pytest.raises(ValueError, match=r"none of 4 readings is usable; look at why the frames were rejected"):
-        sections(np.array([0.0, 0.5]), columns, np.full((2, 2), np.nan), view=VIEW, nozzle_radius_mm=RADIUS, contact_angle_deg=90.0)
+    with pytest.raises(
+        ValueError, match=r"none of 4 readings is usable; look at why the frames were rejected"
+    ):
+        sections(
+            np.array([0.0, 0.5]),
+            columns,
+            np.full((2, 2), np.nan),
+            view=VIEW,
+            nozzle_radius_mm=RADIUS,
+            contact_angle_deg=90.0,
+        )
 
 
 def test_a_gantry_that_comes_back_is_refused():
@@ -172,7 +216,8 @@ def test_a_gantry_that_comes_back_is_refused():
     there_and_back = np.concatenate([np.arange(20.0), np.arange(20.0)[::-1]])
     for position, view in ((there_and_back, VIEW), (np.arange(40.0), View(-1 / 125, 648.0))):
         with pytest.raises(
-            ValueError, match=r"the gantry goes back by (19|39) mm, .* cut the record to one pass along the line, or turn the sign"
+            ValueError,
+            match=r"the gantry goes back by (19|39) mm, .* cut the record to one pass along the line, or turn the sign",
         ):
             sections(position, columns, widths, view=view, nozzle_radius_mm=RADIUS, contact_angle_deg=90.0)
 
@@ -223,19 +268,61 @@ def test_a_line_printed_the_other_way_is_read_by_a_mirrored_view():
 @pytest.mark.parametrize(
     ("time_s", "position", "shapes", "message"),
     [
-        (np.arange(5) * 0.02, np.arange(5.0), np.zeros((0, 5)), r"with T at least 10, but found \(5,\), \(5,\) and \(0, 5\)"),
-        (np.arange(20) * 0.02, np.arange(20.0), np.zeros(20), r"shapes \(k, T\) .* but found \(20,\), \(20,\) and \(20,\)"),
-        (np.arange(20) ** 2 * 0.02, np.arange(20.0), np.zeros((0, 20)), r"evenly spaced samples but found steps of 0.02 to 0.74 s"),
-        (np.arange(20) * 0.02, np.full(20, np.nan), np.zeros((0, 20)), r"finite positions and shapes but found gaps"),
-        (np.arange(20) * 0.02, 1e3 + np.arange(20.0), np.zeros((0, 20)), r"the nozzle reached no place of A\(s\) in this record"),
+        (
+            np.arange(5) * 0.02,
+            np.arange(5.0),
+            np.zeros((0, 5)),
+            r"with T at least 10, but found \(5,\), \(5,\) and \(0, 5\)",
+        ),
+        (
+            np.arange(20) * 0.02,
+            np.arange(20.0),
+            np.zeros(20),
+            r"shapes \(k, T\) .* but found \(20,\), \(20,\) and \(20,\)",
+        ),
+        (
+            np.arange(20) ** 2 * 0.02,
+            np.arange(20.0),
+            np.zeros((0, 20)),
+            r"evenly spaced samples but found steps of 0.02 to 0.74 s",
+        ),
+        (
+            np.arange(20) * 0.02,
+            np.full(20, np.nan),
+            np.zeros((0, 20)),
+            r"finite positions and shapes but found gaps",
+        ),
+        (
+            np.arange(20) * 0.02,
+            1e3 + np.arange(20.0),
+            np.zeros((0, 20)),
+            r"the nozzle reached no place of A\(s\) in this record",
+        ),
     ],
 )
 def test_a_record_that_cannot_be_inverted_is_refused(time_s, position, shapes, message):
     seen = Sections(np.arange(10) * LENGTH, np.full(10, AREA), np.full(10, 1e-3), np.full(10, 17), LENGTH, 0)
     with pytest.raises(ValueError, match=message):
-        estimate(time_s, position, seen, nozzle_radius_mm=RADIUS, shapes=shapes, contact_angle_deg=90.0, width_deviation_mm=0.0)
+        estimate(
+            time_s,
+            position,
+            seen,
+            nozzle_radius_mm=RADIUS,
+            shapes=shapes,
+            contact_angle_deg=90.0,
+            width_deviation_mm=0.0,
+        )
 
 
 def test_widths_of_another_shape_are_refused():
-    with pytest.raises(ValueError, match=r"expected widths of 3 frames x 2 columns but found \(2, 2\); give one row a frame"):
-        sections(np.zeros(3), np.zeros(2), np.zeros((2, 2)), view=VIEW, nozzle_radius_mm=RADIUS, contact_angle_deg=90.0)
+    with pytest.raises(
+        ValueError, match=r"expected widths of 3 frames x 2 columns but found \(2, 2\); give one row a frame"
+    ):
+        sections(
+            np.zeros(3),
+            np.zeros(2),
+            np.zeros((2, 2)),
+            view=VIEW,
+            nozzle_radius_mm=RADIUS,
+            contact_angle_deg=90.0,
+        )

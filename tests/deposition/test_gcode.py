@@ -1,4 +1,5 @@
-"""G-code as it is found: columns against a machine that reads one line at a time, each dialect's traps by hand, and what is refused."""
+"""G-code as it is found: columns against a machine that reads one line at a time,
+each dialect's traps by hand, and what is refused."""
 
 import re
 from pathlib import Path
@@ -26,10 +27,17 @@ def kinds(text):
 
 
 class Machine:
-    """The plain reading of a program without traps of text: one command a line, state kept from line to line."""
+    """The plain reading of a program without traps of text: one
+    command a line, state kept from line to line."""
 
     def __init__(self):
-        self.named, self.shift, self.feed, self.tool, self.rows = dict.fromkeys("XYZ", 0.0), dict.fromkeys("XYZ", 0.0), np.nan, 0, []
+        self.named, self.shift, self.feed, self.tool, self.rows = (
+            dict.fromkeys("XYZ", 0.0),
+            dict.fromkeys("XYZ", 0.0),
+            np.nan,
+            0,
+            [],
+        )
         self.e, self.relative, self.e_relative, self.unit, self.last = {}, False, False, 1.0, "G1"
 
     def at(self):
@@ -97,9 +105,13 @@ NUMBER |= st.sampled_from([".5", "-.5", "+.125", "1.123456789012", "123456789.5"
 AXES = st.dictionaries(st.sampled_from("XYZEF"), NUMBER, min_size=1, max_size=5)
 COMMANDS = st.one_of(
     st.tuples(st.sampled_from(["G0", "G1", "G00", "G01", "G1", "G1", ""]), AXES),
-    st.tuples(st.sampled_from(["G90", "G91", "M82", "M83", "G20", "G21", "T0", "T1", "T2", "G4"]), st.just({})),
+    st.tuples(
+        st.sampled_from(["G90", "G91", "M82", "M83", "G20", "G21", "T0", "T1", "T2", "G4"]), st.just({})
+    ),
     st.tuples(st.just("G92"), st.dictionaries(st.sampled_from("XYZE"), NUMBER, max_size=2)),
-    st.tuples(st.just("G28"), st.dictionaries(st.sampled_from("XYZ"), st.sampled_from(["", "0"]), max_size=2)),
+    st.tuples(
+        st.just("G28"), st.dictionaries(st.sampled_from("XYZ"), st.sampled_from(["", "0"]), max_size=2)
+    ),
 )
 
 
@@ -119,8 +131,16 @@ def programs(draw):
         if line[0] in "Nn" and draw(st.booleans()):
             line += f"*{np.bitwise_xor.reduce(np.frombuffer(re.sub(r'[(].*?one[)]', ' ', line).encode(), np.uint8))}"
         line += draw(st.sampled_from(["", "", " ", ";", " ; X5 (Y7", "; done é", " (speed)"]))
-        lines.append(line + draw(st.sampled_from(["", "", "", "\n", "\n;G1 X1", "\nM117 G1 X9 Y9", "\nM104 S200"])))
-        meant.append((1 + sum(text.count("\n") + 1 for text in lines[:-1]), command, {k: float(v or 0) for k, v in words.items()}))
+        lines.append(
+            line + draw(st.sampled_from(["", "", "", "\n", "\n;G1 X1", "\nM117 G1 X9 Y9", "\nM104 S200"]))
+        )
+        meant.append(
+            (
+                1 + sum(text.count("\n") + 1 for text in lines[:-1]),
+                command,
+                {k: float(v or 0) for k, v in words.items()},
+            )
+        )
     return draw(st.sampled_from(["\n", "\r\n"])).join(lines), meant
 
 
@@ -142,7 +162,9 @@ def test_columns_agree_with_a_machine_that_reads_one_line_at_a_time(program):
     np.testing.assert_array_equal(m.line, [row[0] for row in machine.rows])
     got = np.column_stack([m.start, m.end, m.e, m.feed, m.tool])
     # G92 and relative moves are summed in another order: rounding of coordinates up to 1e9
-    np.testing.assert_allclose(got, np.array([row[1:] for row in machine.rows]).reshape(-1, 9), rtol=1e-12, atol=1e-6)
+    np.testing.assert_allclose(
+        got, np.array([row[1:] for row in machine.rows]).reshape(-1, 9), rtol=1e-12, atol=1e-6
+    )
     # one chain: nothing jumps, whatever is renamed
     np.testing.assert_allclose(m.start[1:], m.end[:-1], atol=1e-6)
 
@@ -198,7 +220,8 @@ def test_free_text_is_never_a_move():
     found = parse(text)
     assert found.moves.line.tolist() == [10] and found.refusals == []
     assert list(zip(found.other_line.tolist(), found.other_word.tolist(), strict=True)) == [
-        (1, "M117"), (2, "M117"), (3, "M118"), (4, "M486"), (5, "M23"), (6, "M98"), (7, "M28"), (8, "M1002"), (11, "@info"), (12, "%"),
+        (1, "M117"), (2, "M117"), (3, "M118"), (4, "M486"), (5, "M23"), (6, "M98"), (7, "M28"), (8, "M1002"),
+        (11, "@info"), (12, "%"),
     ]  # fmt: skip
 
 
@@ -211,7 +234,10 @@ def test_macros_and_template_rests_are_kept_with_their_lines():
 
 
 def test_accelerations_of_both_firmwares_are_kept_with_the_moves():
-    m = moves("G1 X1\nM204 P800 T1500\nG1 X2\nSET_VELOCITY_LIMIT ACCEL=3000 ACCEL_TO_DECEL=1500\nG1 X3\nM204 S500\nG1 X4\n")
+    m = moves(
+        "G1 X1\nM204 P800 T1500\nG1 X2\nSET_VELOCITY_LIMIT ACCEL=3000 ACCEL_TO_DECEL=1500\nG1 "
+        "X3\nM204 S500\nG1 X4\n"
+    )
     np.testing.assert_array_equal(m.acceleration, [np.nan, 800, 3000, 500])
 
 
@@ -324,7 +350,12 @@ def test_words_that_change_the_tool(text, tools):
         ("M106 S255", "M107", "M106"),
         ("M106", "M106 S0", "M106"),
     ]
-    + [("M126", "M127", "M126"), ("M101", "M103", "M101"), ("M64 P0", "M65 P0", "M64"), ("M10", "M11", "M10")],
+    + [
+        ("M126", "M127", "M126"),
+        ("M101", "M103", "M101"),
+        ("M64 P0", "M65 P0", "M64"),
+        ("M10", "M11", "M10"),
+    ],
 )
 def test_paste_printers_that_switch_extrusion(on, off, name):
     found = parse(f"G0 X1\n{on}\nG1 X4 Y4\nG2 X4 Y4 I1\n{off}\nG0 X0\n")
@@ -370,7 +401,9 @@ def test_arcs_have_their_true_centre_sweep_and_length(arc, centre, angle, length
     found = parse(f"G0 X10\n{arc}\n")
     assert found.refusals == []
     np.testing.assert_allclose(found.moves.centre[1], centre, atol=1e-9)  # rounding
-    assert found.moves.angle[1] == pytest.approx(angle, rel=1e-3 if "9.99" in arc else 1e-12)  # the rounded radius moves the centre
+    assert found.moves.angle[1] == pytest.approx(
+        angle, rel=1e-3 if "9.99" in arc else 1e-12
+    )  # the rounded radius moves the centre
     assert found.moves.length[1] == pytest.approx(length, rel=1e-3 if "9.99" in arc else 1e-12)
 
 
@@ -380,7 +413,8 @@ def test_both_forms_of_an_arc_are_the_same_arc(radius, heading, sweep, code):
     way = 1 if code == 3 else -1
     a, b = (radius * np.array([np.cos(h), np.sin(h)]) for h in (heading, heading + way * sweep))
     by_centre, by_radius = (
-        moves(f"G0 X{a[0]:.9f} Y{a[1]:.9f}\nG{code} X{b[0]:.9f} Y{b[1]:.9f} {c}") for c in (f"I{-a[0]:.9f} J{-a[1]:.9f}", f"R{radius:.9f}")
+        moves(f"G0 X{a[0]:.9f} Y{a[1]:.9f}\nG{code} X{b[0]:.9f} Y{b[1]:.9f} {c}")
+        for c in (f"I{-a[0]:.9f} J{-a[1]:.9f}", f"R{radius:.9f}")
     )
     # nine decimals of the text; near a half circle the centre of the R form turns by the root of that
     assert by_centre.angle[1] == pytest.approx(way * sweep, abs=1e-6)
@@ -438,14 +472,22 @@ def test_what_is_no_program_is_refused_in_one_sentence(data, why):
 
 @settings(max_examples=120, deadline=None)
 @given(
-    st.lists(st.text(st.sampled_from("GMTXYZEFIJRNS0123456789.-+;()*@ {}\t\r\x00\xff_e\n"), max_size=12), min_size=1, max_size=30),
+    st.lists(
+        st.text(st.sampled_from("GMTXYZEFIJRNS0123456789.-+;()*@ {}\t\r\x00\xff_e\n"), max_size=12),
+        min_size=1,
+        max_size=30,
+    ),
     st.randoms(use_true_random=False),
 )
 def test_damaged_text_never_raises_and_never_jumps(damage, random):
     lines = ["G1 X1 Y2 E3", "G28", "T1", "G92 E0", "G2 X5 Y5 I2 J2"] * 3 + damage
     random.shuffle(lines)
     found = parse("G1 X0\n" * 200 + "\n".join(lines))
-    assert np.isfinite(found.moves.end).all() and np.isfinite(found.moves.length).all() and np.isfinite(found.moves.e).all()
+    assert (
+        np.isfinite(found.moves.end).all()
+        and np.isfinite(found.moves.length).all()
+        and np.isfinite(found.moves.e).all()
+    )
     assert (np.diff(found.moves.line) >= 0).all() and (found.moves.length >= 0).all()
 
 
@@ -541,7 +583,11 @@ VALVE = "G21\nG90\nM751 P1\nG92 X0 Y0 Z0\nG0 X10 F900\nM760\nG1 X20\nG4 P50\nG1 
     ("text", "names", "extruded"),
     [
         (CURA, "HOME RETRACT TRAVEL UNRETRACT EXTRUDE EXTRUDE RETRACT RETRACT WIPE TRAVEL", 4.0),
-        (PRUSA, "HOME TRAVEL EXTRUDE RETRACT TRAVEL TRAVEL TRAVEL UNRETRACT EXTRUDE EXTRUDE WIPE RETRACT", 10.0),
+        (
+            PRUSA,
+            "HOME TRAVEL EXTRUDE RETRACT TRAVEL TRAVEL TRAVEL UNRETRACT EXTRUDE EXTRUDE WIPE RETRACT",
+            10.0,
+        ),
         (BAMBU, "TRAVEL TRAVEL TRAVEL PRIME EXTRUDE EXTRUDE RETRACT", 1.2),
         (SIMPLIFY, "HOME TRAVEL TRAVEL PRIME EXTRUDE TOOL EXTRUDE", 3.0),
         (VALVE, "TRAVEL EXTRUDE DWELL EXTRUDE TRAVEL", 20.0),

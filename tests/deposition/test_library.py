@@ -1,29 +1,25 @@
-"""The basis-signal library: segments cut where a hand-made command changes, the nearest of what is lacking, and refusals."""
+"""The basis-signal library: segments cut where a hand-made command
+changes, the nearest of what is lacking, and refusals."""
 
 import numpy as np
 import pytest
 
 from pipeline.deposition.basis import compose
-from pipeline.deposition.library import (
-    Training,
-    build,
-    check,
-    demarcate,
-    learned,
-    nearest,
-    segment,
-)
+from pipeline.deposition.library import Training, build, check, demarcate, learned, nearest, segment
 from tests.deposition.trained import AREA, NOZZLE, PLANT, TS, protocol, trainings
 
 
 def lookup(library, task, material, nozzle_mm, *, speed, pause_s):
     """The nearest column for one task, the factor on its signal and its predicted error in percent."""
-    columns, column, factor, error = nearest(library, task, material, nozzle_mm, np.array([speed]), np.array([pause_s]))
+    columns, column, factor, error = nearest(
+        library, task, material, nozzle_mm, np.array([speed]), np.array([pause_s])
+    )
     return columns[column[0]], factor[0], error[0]
 
 
 def handmade(material="A", speed=8.0, pause_s=0.6, level=2.0, noise=0.0):
-    """A command as learning would end with, its edges known: Start from 0.4 s before to 0.2 s after, Corner 0.3 s before to 0.2 s after, Stop 0.4 s and 0.3 s."""
+    """A command as learning would end with, its edges known: Start from 0.4 s before to 0.2 s after, Corner
+    0.3 s before to 0.2 s after, Stop 0.4 s and 0.3 s."""
     lesson = protocol(speed, pause_s)
     t, u = lesson.time_s, np.zeros(len(lesson.time_s))
     a, (b, c), d = lesson.start_s, lesson.pause_s, lesson.stop_s
@@ -51,7 +47,10 @@ def test_the_marks_enclose_every_task_of_a_handmade_command():
 
 
 def test_noise_on_the_command_hardly_moves_the_marks():
-    quiet, loud = demarcate([handmade()], sample_time_s=TS), demarcate([handmade(noise=0.2)], sample_time_s=TS)
+    quiet, loud = (
+        demarcate([handmade()], sample_time_s=TS),
+        demarcate([handmade(noise=0.2)], sample_time_s=TS),
+    )
     for task in quiet:
         np.testing.assert_allclose(
             loud[task], quiet[task], atol=0.1
@@ -61,11 +60,18 @@ def test_noise_on_the_command_hardly_moves_the_marks():
 def test_a_vibration_that_the_filter_takes_out_does_not_move_the_marks():
     training = handmade()
     t = training.routine.time_s
-    # a tenth of the peak at 12 Hz, for a second up to the Start: on the command as it is, the Start would begin with it
+    # a tenth of the peak at 12 Hz, for a second up to the Start: on
+    # the command as it is, the Start would begin with it
     shaken = training._replace(
-        u=training.u + 10 * np.sin(2 * np.pi * 12 * t) * ((t > training.routine.start_s - 1.6) & (t < training.routine.start_s - 0.4))
+        u=training.u
+        + 10
+        * np.sin(2 * np.pi * 12 * t)
+        * ((t > training.routine.start_s - 1.6) & (t < training.routine.start_s - 0.4))
     )
-    assert demarcate([shaken], sample_time_s=TS)["Start"][0] < demarcate([training], sample_time_s=TS)["Start"][0] + 0.1
+    assert (
+        demarcate([shaken], sample_time_s=TS)["Start"][0]
+        < demarcate([training], sample_time_s=TS)["Start"][0] + 0.1
+    )
 
 
 def test_all_materials_are_cut_at_the_same_points():
@@ -84,7 +90,9 @@ def test_the_segments_put_together_again_are_the_command():
     for task, event in (("Corner", lesson.pause_s[0]), ("Start", lesson.start_s), ("Stop", lesson.stop_s)):
         at = round(event / TS) - cut[task].lead
         u[at : at + len(cut[task].signal)] = cut[task].signal
-    np.testing.assert_allclose(u, learned(training)[0], atol=1e-12)  # the handmade plateaus are flat: rounding of their mean
+    np.testing.assert_allclose(
+        u, learned(training)[0], atol=1e-12
+    )  # the handmade plateaus are flat: rounding of their mean
     assert cut["No-Flow"].signal.tolist() == [0.0]
 
 
@@ -94,13 +102,20 @@ def test_a_command_that_does_not_settle_is_refused():
         lesson = protocol(on_s=on_s)
         u = compose(PLANT, lesson.r, sample_time_s=TS)
         with pytest.raises(ValueError, match=expected):
-            demarcate([Training("A", NOZZLE, lesson, np.tile(u, (3, 1)), np.tile(lesson.r, (3, 1)))], sample_time_s=TS)
+            demarcate(
+                [Training("A", NOZZLE, lesson, np.tile(u, (3, 1)), np.tile(lesson.r, (3, 1)))],
+                sample_time_s=TS,
+            )
 
 
 def test_the_learned_command_is_the_mean_of_the_best_trials():
     training = handmade()
     y = np.stack([training.r * 0.5, training.r * 1.001, training.r])
-    u, mean = learned(training._replace(u=np.stack([training.u[0] * k for k in (9, 1, 3)]), y=y + 0.1 * np.array([0, 0, 0])[:, None]))
+    u, mean = learned(
+        training._replace(
+            u=np.stack([training.u[0] * k for k in (9, 1, 3)]), y=y + 0.1 * np.array([0, 0, 0])[:, None]
+        )
+    )
     np.testing.assert_allclose(u, 3 * training.u[0])  # only the last: a tenth above no error is no error
     np.testing.assert_allclose(mean, training.r)
 
@@ -140,9 +155,14 @@ def test_one_speed_cannot_predict_another():
 
 def test_a_material_or_nozzle_that_was_not_trained_is_refused():
     library = build([handmade("A"), handmade("B")], sample_time_s=TS)
-    with pytest.raises(ValueError, match="library: expected a material out of A, B but found C; train C first"):
+    with pytest.raises(
+        ValueError, match="library: expected a material out of A, B but found C; train C first"
+    ):
         lookup(library, "Start", "C", NOZZLE, speed=8.0, pause_s=0.0)
-    with pytest.raises(ValueError, match="A was trained with nozzles of 0.6 mm but is asked for with 0.4 mm; train that nozzle first"):
+    with pytest.raises(
+        ValueError,
+        match="A was trained with nozzles of 0.6 mm but is asked for with 0.4 mm; train that nozzle first",
+    ):
         lookup(library, "Start", "A", 0.4, speed=8.0, pause_s=0.0)
     with pytest.raises(ValueError, match="library: expected at least one learned routine but found none"):
         build([], sample_time_s=TS)
@@ -155,17 +175,24 @@ def test_the_assumptions_are_figures_that_see_what_breaks_them():
     trained = [handmade(speed=s, pause_s=p) for s in (8.0, 5.0) for p in (0.6, 0.3)]
     figures = [c.percent for c in check(trained, build(trained, sample_time_s=TS))]
     assert (
-        figures[0] == pytest.approx(0, abs=1e-9) and figures[1] == pytest.approx(0, abs=1e-9) and figures[2] == pytest.approx(0, abs=1e-9)
+        figures[0] == pytest.approx(0, abs=1e-9)
+        and figures[1] == pytest.approx(0, abs=1e-9)
+        and figures[2] == pytest.approx(0, abs=1e-9)
     )
     assert figures[3] > 10  # a Corner of 0.3 s is not that of 0.6 s
     # the first plateau 2 % higher; every second trial 1 % more flow; a Start that jumps
 
-    risen = [x._replace(u=x.u * np.where(x.routine.time_s < x.routine.pause_s[0] - 0.5, 1.02, 1.0)) for x in trained]
+    risen = [
+        x._replace(u=x.u * np.where(x.routine.time_s < x.routine.pause_s[0] - 0.5, 1.02, 1.0))
+        for x in trained
+    ]
     assert check(risen, build(risen, sample_time_s=TS))[1].percent == pytest.approx(2, abs=0.1)
     scattered = [x._replace(y=x.y * np.array([1, 1, 1.01])[:, None]) for x in trained]
     # 1 % over the share of the time that prints, the difference of two trials over root 2
     share = np.sqrt(np.mean((trained[0].r / trained[0].r.max()) ** 2))
-    assert check(scattered, build(scattered, sample_time_s=TS))[0].percent == pytest.approx(share / np.sqrt(2), rel=0.1)
+    assert check(scattered, build(scattered, sample_time_s=TS))[0].percent == pytest.approx(
+        share / np.sqrt(2), rel=0.1
+    )
 
 
 def test_the_bead_area_times_the_speed_is_the_wanted_flow():

@@ -1,4 +1,5 @@
-"""The gantry's travel in time: limits kept, way conserved, the closed-form look-ahead against passes move by move, corners and arcs by hand."""
+"""The gantry's travel in time: limits kept, way conserved, the closed-form look-ahead
+against passes move by move, corners and arcs by hand."""
 
 import numpy as np
 import pytest
@@ -8,7 +9,13 @@ from hypothesis import strategies as st
 from pipeline.deposition import motion
 from pipeline.deposition.gcode import Kind, parse
 
-LIMITS = {"acceleration": 500.0, "junction_deviation_mm": 0.02, "speed_limit": 60.0, "unset_feed": 25.0, "tool_change_s": 1.5}
+LIMITS = {
+    "acceleration": 500.0,
+    "junction_deviation_mm": 0.02,
+    "speed_limit": 60.0,
+    "unset_feed": 25.0,
+    "tool_change_s": 1.5,
+}
 A = LIMITS["acceleration"]
 
 
@@ -19,12 +26,21 @@ def planned(text, **changes):
 
 @st.composite
 def programs(draw):
-    """Lines, arcs, retracts, dwells and tool changes with lengths from a hundredth to a hundred mm and feeds from 1 to 100 mm/s."""
+    """Lines, arcs, retracts, dwells and tool changes with lengths from a
+    hundredth to a hundred mm and feeds from 1 to 100 mm/s."""
     step = st.sampled_from([0.01, -0.02, 0.3, 1.0, -5.0, 40.0, -100.0])
-    line = st.builds("G1 X{} Y{} E{} F{}".format, step, step, st.sampled_from([0, 0.5]), st.sampled_from([60, 480, 6000]))
-    arc = st.builds("G{} X{} Y0 I{} J0.1".format, st.sampled_from([2, 3]), st.sampled_from([0, 2]), st.just(1))
-    other = st.sampled_from(["G1 E-2 F1800", "G1 E2", "G4 P300", "T1", "T0", "G0 Z0.3 F600", "M204 S100", "G3 I0.5 Z0.4"])
-    return "M83\nG91\nG1 X1 F900\n" + "\n".join(draw(st.lists(st.one_of(line, line, arc, other), max_size=25)))
+    line = st.builds(
+        "G1 X{} Y{} E{} F{}".format, step, step, st.sampled_from([0, 0.5]), st.sampled_from([60, 480, 6000])
+    )
+    arc = st.builds(
+        "G{} X{} Y0 I{} J0.1".format, st.sampled_from([2, 3]), st.sampled_from([0, 2]), st.just(1)
+    )
+    other = st.sampled_from(
+        ["G1 E-2 F1800", "G1 E2", "G4 P300", "T1", "T0", "G0 Z0.3 F600", "M204 S100", "G3 I0.5 Z0.4"]
+    )
+    return "M83\nG91\nG1 X1 F900\n" + "\n".join(
+        draw(st.lists(st.one_of(line, line, arc, other), max_size=25))
+    )
 
 
 @settings(max_examples=80, deadline=None)
@@ -40,7 +56,9 @@ def test_no_limit_is_broken_and_no_way_is_lost(program):
     flat = plan.duration_s - plan.ramp_s.sum(axis=0)
     way = (plan.ramp_s * (v[[0, 2]] + v[1]) / 2).sum(axis=0) + v[1] * flat
     np.testing.assert_allclose(way[runs], moves.length[runs], rtol=1e-9)  # rounding of the sums of 2 a l
-    np.testing.assert_allclose((v[1] - v[[0, 2]])[:, runs], (plan.acceleration * plan.ramp_s)[:, runs], atol=1e-9)
+    np.testing.assert_allclose(
+        (v[1] - v[[0, 2]])[:, runs], (plan.acceleration * plan.ramp_s)[:, runs], atol=1e-9
+    )
     assert (plan.acceleration <= A).all() and (flat >= -1e-12).all() and (plan.ramp_s >= 0).all()
     assert plan.duration_s[runs].sum() >= (moves.length / feed)[runs].sum() * (1 - 1e-12)
 
@@ -53,10 +71,14 @@ def test_samples_follow_the_plan(program):
     signal = motion.sampled(plan, moves, sample_time_s=Ts)
     end = plan.begin_s[-1] + plan.duration_s[-1]
     assert 0 < end - signal.time_s[-1] <= Ts * (1 + 1e-9)
-    for amount, found in ((moves.e, signal.e_rate), (moves.length, motion.rate(signal, moves.length, sample_time_s=Ts))):
+    for amount, found in (
+        (moves.e, signal.e_rate),
+        (moves.length, motion.rate(signal, moves.length, sample_time_s=Ts)),
+    ):
         assert found.sum() * Ts == pytest.approx(amount.sum(), rel=1e-12, abs=1e-12)
     mean = motion.rate(signal, moves.length, sample_time_s=Ts)
-    # the mean speed over a sample lies within a Ts / 2 of the trapezoid's at both ends, and more only where a ramp turns inside
+    # the mean speed over a sample lies within a Ts / 2 of the trapezoid's at
+    # both ends, and more only where a ramp turns inside
     np.testing.assert_allclose(mean[:-1], (signal.speed[1:] + signal.speed[:-1]) / 2, atol=A * Ts / 2)
     assert np.abs(np.diff(signal.speed)).max(initial=0) <= A * Ts * (1 + 1e-9)
     # a chord is never longer than its path
@@ -75,8 +97,13 @@ def naive_look_ahead(cap, gain):
 @pytest.mark.parametrize("seed", range(5))
 def test_the_closed_form_of_the_look_ahead_is_a_backward_and_a_forward_pass(seed):
     rng = np.random.default_rng(seed)
-    cap, gain = rng.choice([0.0, 25.0, 900.0, 3600.0], 500), rng.exponential(200.0, 500) * rng.choice([0.01, 1], 500)
-    np.testing.assert_allclose(motion._look_ahead(cap, gain), naive_look_ahead(cap, gain), atol=1e-9)  # sums of 1e5
+    cap, gain = (
+        rng.choice([0.0, 25.0, 900.0, 3600.0], 500),
+        rng.exponential(200.0, 500) * rng.choice([0.01, 1], 500),
+    )
+    np.testing.assert_allclose(
+        motion._look_ahead(cap, gain), naive_look_ahead(cap, gain), atol=1e-9
+    )  # sums of 1e5
 
 
 def test_a_single_line_is_a_trapezoid():
@@ -94,7 +121,9 @@ def test_a_line_too_short_for_its_feed_is_a_triangle():
 
 @pytest.mark.parametrize(("corner", "speed"), [("X20 Y0", 20.0), ("X10 Y10", 5.0), ("X0 Y0", 0.0)])
 def test_corners_straight_on_square_and_back(corner, speed):
-    deviation = 5.0**2 * (np.sqrt(2.0) - 1.0) / A  # at which a square corner is passed at 5 mm/s, by Klipper's conversion
+    deviation = (
+        5.0**2 * (np.sqrt(2.0) - 1.0) / A
+    )  # at which a square corner is passed at 5 mm/s, by Klipper's conversion
     _, plan = planned(f"G1 X10 F1200\nG1 {corner}", junction_deviation_mm=deviation)
     assert plan.entry[1] == pytest.approx(speed, abs=1e-6)
 
@@ -123,7 +152,9 @@ def test_a_circle_in_short_legs_is_no_faster_than_the_circle():
     h = np.linspace(0, 4 * np.pi, 400)
     legs = "\n".join(f"G1 X{2 * np.cos(k):.6f} Y{2 * np.sin(k):.6f}" for k in h)
     _, plan = planned(f"G1 X2 F6000\n{legs}", junction_deviation_mm=0.5)
-    assert plan.cruise[100:300].max() == pytest.approx(np.sqrt(A * 2), rel=0.02)  # legs of 0.063 mm: junction and half a leg of speeding up
+    assert plan.cruise[100:300].max() == pytest.approx(
+        np.sqrt(A * 2), rel=0.02
+    )  # legs of 0.063 mm: junction and half a leg of speeding up
 
 
 def test_dwells_tool_changes_and_retracts_stand_still():
@@ -155,5 +186,7 @@ def test_limits_must_be_positive(name):
 
 def test_a_feed_that_is_a_slip_is_named_with_its_line():
     moves, plan = planned("G1 X1 F600\nG1 X50 F.001\n")
-    with pytest.raises(ValueError, match="expected at most 278 h, found .* h, of which line 2 takes .* s; check its F"):
+    with pytest.raises(
+        ValueError, match="expected at most 278 h, found .* h, of which line 2 takes .* s; check its F"
+    ):
         motion.sampled(plan, moves, sample_time_s=0.02)

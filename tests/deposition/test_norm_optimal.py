@@ -7,7 +7,12 @@ from benchmarks.norm_optimal import Transfer, plan, step, transfer
 from pipeline.deposition.extruder import Extruder, pressed
 
 TS = 0.02
-PLANTS = [Extruder(1.08, 2.7), Extruder(1.08, 2.7, 0.1), Extruder(0.89, 4.5, 0.113), Extruder(2.0, 1.0, 0.05, 3.0)]
+PLANTS = [
+    Extruder(1.08, 2.7),
+    Extruder(1.08, 2.7, 0.1),
+    Extruder(0.89, 4.5, 0.113),
+    Extruder(2.0, 1.0, 0.05, 3.0),
+]
 
 
 def lifted(extruder, N):
@@ -36,7 +41,9 @@ def test_the_banded_step_equals_the_dense_lifted_form(extruder):
     G = lifted(extruder, 400)
     dense = np.linalg.solve(G.T @ (W[:, None] * G) + np.diag(R_u + R_d), G.T @ (W * e) - R_u * u)
     found = step(plan(transfer(extruder, sample_time_s=TS), W=W, R_u=R_u, R_d=R_d), u, e)
-    np.testing.assert_allclose(found, dense, atol=1e-9 * np.abs(dense).max())  # rounding times a condition of about 1e5; the bar is 1e-6
+    np.testing.assert_allclose(
+        found, dense, atol=1e-9 * np.abs(dense).max()
+    )  # rounding times a condition of about 1e5; the bar is 1e-6
 
 
 def test_no_other_step_costs_less():
@@ -58,12 +65,19 @@ def test_one_sample_by_hand():
 
 
 def test_memory_grows_with_the_length_and_not_with_its_square():
-    found = plan(transfer(PLANTS[1], sample_time_s=TS), W=np.ones(100_000), R_u=np.full(100_000, 1e-4), R_d=np.full(100_000, 1e-4))
+    found = plan(
+        transfer(PLANTS[1], sample_time_s=TS),
+        W=np.ones(100_000),
+        R_u=np.full(100_000, 1e-4),
+        R_d=np.full(100_000, 1e-4),
+    )
     assert found.factor.shape == (2, 100_000)
 
 
 def test_weights_that_leave_the_step_undetermined_are_refused():
-    with pytest.raises(ValueError, match=r"expected W >= 0 and R_u \+ R_d > 0 but found least values 1 and 0; raise R_d"):
+    with pytest.raises(
+        ValueError, match=r"expected W >= 0 and R_u \+ R_d > 0 but found least values 1 and 0; raise R_d"
+    ):
         plan(transfer(PLANTS[1], sample_time_s=TS), W=np.ones(50), R_u=np.zeros(50), R_d=np.zeros(50))
     with pytest.raises(ValueError, match=r"expected weights of one length but found W \(50,\) and R \(49,\)"):
         plan(transfer(PLANTS[1], sample_time_s=TS), W=np.ones(50), R_u=np.zeros(49), R_d=np.ones(49))

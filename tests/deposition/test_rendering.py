@@ -1,4 +1,5 @@
-"""Rendered frames: the bead that they show is the bead that was asked for, volume is conserved, and the same seed gives the same bytes."""
+"""Rendered frames: the bead that they show is the bead that was asked for, volume is
+conserved, and the same seed gives the same bytes."""
 
 import numpy as np
 import pytest
@@ -7,7 +8,16 @@ from pipeline.deposition.bead import area
 from pipeline.deposition.flow import View
 from pipeline.deposition.rendering import HARD, NOMINAL, Camera
 
-CLEAN = NOMINAL._replace(shading=0.0, specular=0.0, glare=0.0, texture=0.0, noise=0.0, roughness_px=0.0, tilt_deg=0.0, offset_px=0.0)
+CLEAN = NOMINAL._replace(
+    shading=0.0,
+    specular=0.0,
+    glare=0.0,
+    texture=0.0,
+    noise=0.0,
+    roughness_px=0.0,
+    tilt_deg=0.0,
+    offset_px=0.0,
+)
 VIEW = View(mm_per_px=1 / 125, nozzle_column=648.0)
 NOZZLE = (0.25, 0.32)
 TIME = np.arange(0.0, 2.0, 0.02)
@@ -15,7 +25,11 @@ TIME = np.arange(0.0, 2.0, 0.02)
 
 def trial(scene, flow, position, *, seed=0, view=VIEW):
     camera = Camera(scene, np.random.default_rng(seed))
-    return list(camera.trial(TIME, flow, position, view=view, frame_rate_hz=30.0, nozzle_mm=NOZZLE, contact_angle_deg=90.0))
+    return list(
+        camera.trial(
+            TIME, flow, position, view=view, frame_rate_hz=30.0, nozzle_mm=NOZZLE, contact_angle_deg=90.0
+        )
+    )
 
 
 def summed_width(frame: np.ndarray) -> np.ndarray:
@@ -27,7 +41,9 @@ def summed_width(frame: np.ndarray) -> np.ndarray:
 def test_the_bead_is_as_wide_as_asked_for_on_average_over_the_columns(width):
     camera = Camera(CLEAN, np.random.default_rng(1))
     found = np.mean([summed_width(camera.frame(width, stage_px=0)) for _ in range(5)])
-    assert found == pytest.approx(width, abs=0.03)  # dither of a quarter of a pixel over 3,200 columns, levels in whole numbers
+    assert found == pytest.approx(
+        width, abs=0.03
+    )  # dither of a quarter of a pixel over 3,200 columns, levels in whole numbers
 
 
 def test_a_tilted_bead_is_as_wide_across_its_line():
@@ -41,7 +57,9 @@ def test_the_volume_on_the_stage_is_the_volume_that_flowed():
     frame = trial(CLEAN, flow, 2.0 * TIME)[-1][1]
     widths = summed_width(frame[:, :600]) / 125
     volume = area(np.maximum(widths, 0), 90.0).sum() / 125
-    assert volume == pytest.approx(np.trapezoid(flow, TIME), rel=0.01)  # widths dithered by a quarter of a pixel
+    assert volume == pytest.approx(
+        np.trapezoid(flow, TIME), rel=0.01
+    )  # widths dithered by a quarter of a pixel
 
 
 def test_a_pause_lays_its_volume_over_one_footprint():
@@ -67,7 +85,9 @@ def test_a_mirrored_view_shows_the_mirrored_trial():
     flow, position = np.full(len(TIME), 2.4), 4.0 * TIME
     right = trial(CLEAN, flow, position)[40][1]
     left = trial(CLEAN, flow, position, view=View(-1 / 125, 639.0 - 648.0))[40][1]
-    np.testing.assert_allclose(summed_width(right[:, 20:600]), summed_width(left)[::-1][20:600], atol=0.6)  # two dithers
+    np.testing.assert_allclose(
+        summed_width(right[:, 20:600]), summed_width(left)[::-1][20:600], atol=0.6
+    )  # two dithers
 
 
 def test_frames_are_bytes_of_the_size_and_rate_asked_for_and_the_nozzle_hides_one_side():
@@ -88,7 +108,17 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_others():
 def test_one_camera_lays_every_trial_on_a_fresh_part_of_the_stage():
     camera = Camera(NOMINAL._replace(noise=0.0), np.random.default_rng(7))
     first, second = (
-        next(camera.trial(TIME, 0 * TIME, 0 * TIME, view=VIEW, frame_rate_hz=30.0, nozzle_mm=NOZZLE, contact_angle_deg=90.0))[1]
+        next(
+            camera.trial(
+                TIME,
+                0 * TIME,
+                0 * TIME,
+                view=VIEW,
+                frame_rate_hz=30.0,
+                nozzle_mm=NOZZLE,
+                contact_angle_deg=90.0,
+            )
+        )[1]
         for _ in range(2)
     )
     assert not np.array_equal(first, second)

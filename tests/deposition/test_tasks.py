@@ -1,4 +1,5 @@
-"""Moves -> tasks: the paper's two parts exactly, runs and corners, the rules of fig. 8 on random programs, and what is refused with its line number."""
+"""Moves -> tasks: the paper's two parts exactly, runs and corners, the rules of fig. 8 on random programs,
+and what is refused with its line number."""
 
 from pathlib import Path
 
@@ -11,7 +12,13 @@ from pipeline.deposition.motion import plan
 from pipeline.deposition.tasks import DWELL, halting, printed_lines, refuse, sequence
 
 PARTS = Path(__file__).parents[2] / "datasets" / "parts"
-MACHINE = {"acceleration": 1000.0, "junction_deviation_mm": 0.05, "speed_limit": 100.0, "unset_feed": 8.0, "tool_change_s": 0.0}
+MACHINE = {
+    "acceleration": 1000.0,
+    "junction_deviation_mm": 0.05,
+    "speed_limit": 100.0,
+    "unset_feed": 8.0,
+    "tool_change_s": 0.0,
+}
 RULES = {"corner_deg": 30.0, "longest_pause_s": 1.0}
 SWITCH_S = 1.0
 
@@ -29,7 +36,8 @@ def tasks_of(text, *, switch_s=SWITCH_S):
 
 
 def random_program(rng):
-    """Lines, travels, turns, halts and changes of tool in any order; tool changes sometimes leave no time to stop."""
+    """Lines, travels, turns, halts and changes of tool in any order;
+    tool changes sometimes leave no time to stop."""
     text, x = ["G21", "G90", "M83", "T0"], np.zeros(2)
     for _ in range(rng.integers(3, 15)):
         x = x + rng.uniform(-8, 8, 2)
@@ -77,7 +85,13 @@ def test_every_run_starts_and_stops_once():
         lines = read(text)[2]
         tasks = sequence(lines, end_s=1e4)
         runs = lines.run[-1] + 1
-        assert np.sum(tasks.task == "Start") == np.sum(tasks.task == "Stop") == runs == lines.first.sum() == lines.last.sum()
+        assert (
+            np.sum(tasks.task == "Start")
+            == np.sum(tasks.task == "Stop")
+            == runs
+            == lines.first.sum()
+            == lines.last.sum()
+        )
         assert np.sum(tasks.task == "Corner") == lines.corner.sum()
 
 
@@ -120,7 +134,9 @@ def test_tic_tac_toe_is_eight_runs_with_one_change_of_material_between_a_stop_an
 def test_dashes_are_twelve_runs_of_0_4_s():
     lines = read((PARTS / "dashes.gcode").read_text())[2]
     assert len(lines.line) == lines.run[-1] + 1 == 12
-    np.testing.assert_allclose(lines.end_s - lines.begin_s, 0.4, atol=0.01)  # 3.2 mm at 8 mm/s; the first also speeds up
+    np.testing.assert_allclose(
+        lines.end_s - lines.begin_s, 0.4, atol=0.01
+    )  # 3.2 mm at 8 mm/s; the first also speeds up
 
 
 # ---- runs and corners by hand
@@ -136,8 +152,18 @@ def test_a_turn_is_a_corner_from_the_angle_on():
 
 def test_a_halt_in_place_is_a_corner_with_its_pause_and_a_long_one_ends_the_run():
     short, long = (tasks_of(HEAD + f"G1 X20 Y0 E1\nG4 P{ms}\nG1 X30 Y0 E1\nG0 X0 Y0") for ms in (300, 1500))
-    assert short.task.tolist() == ["No-Flow", "Start", "Steady-State", "Corner", "Steady-State", "Stop", "No-Flow"]
-    assert short.pause_s[3] == pytest.approx(0.3 + 2 * 8 / 1000 / 2)  # the dwell, and half of each ramp from and to 8 mm/s at 1000 mm/s^2
+    assert short.task.tolist() == [
+        "No-Flow",
+        "Start",
+        "Steady-State",
+        "Corner",
+        "Steady-State",
+        "Stop",
+        "No-Flow",
+    ]
+    assert short.pause_s[3] == pytest.approx(
+        0.3 + 2 * 8 / 1000 / 2
+    )  # the dwell, and half of each ramp from and to 8 mm/s at 1000 mm/s^2
     assert np.sum(long.task == "Start") == 2
 
 
@@ -155,14 +181,17 @@ def test_a_change_of_material_without_time_to_stop_is_refused_with_its_line():
     expected = r"line 7: T1 comes 0\.00 s after line 6 still printed with T0, so Steady-State would go to No-Flow without a Stop; .* write G4 P1000 at the change"
     with pytest.raises(ValueError, match=expected):
         tasks_of(text)
-    with pytest.raises(ValueError, match=r"line 8: T1 comes 0\.\d+ s after line 6"):  # a travel between does not hide the change
+    with pytest.raises(
+        ValueError, match=r"line 8: T1 comes 0\.\d+ s after line 6"
+    ):  # a travel between does not hide the change
         tasks_of(text.replace("T1\n", "G0 X22\nT1\n"))
     assert DWELL in tasks_of(text.replace("T1\n", "T1\nG4 P1000\n")).task  # and what it says will do does
 
 
 def test_a_halt_of_the_machine_in_the_middle_of_a_run_is_refused_with_its_line():
     with pytest.raises(
-        ValueError, match=r"line 7: the machine halts here while line 6 still prints, .* end the line with a travel before the halt"
+        ValueError,
+        match=r"line 7: the machine halts here while line 6 still prints, .* end the line with a travel before the halt",
     ):
         tasks_of(HEAD + "G1 X20 Y0 E1\nM600\nG1 X30 Y0 E1\nG0 X0 Y0")
     tasks_of(HEAD + "G1 X20 Y0 E1\nG0 X25 Y0\nM600\nG1 X30 Y0 E1\nG0 X0 Y0")

@@ -69,7 +69,9 @@ def pictures(count: int = 60, **kind):
 
 
 def written(path: Path, encoding: str = "raw", frames=None, **changes) -> Path:
-    write_trial(path, CONDITIONS, pictures() if frames is None else frames, encoding=encoding, **(SIGNALS | changes))
+    write_trial(
+        path, CONDITIONS, pictures() if frames is None else frames, encoding=encoding, **(SIGNALS | changes)
+    )
     return path
 
 
@@ -87,7 +89,9 @@ def refusal(path: Path, **settings) -> str:
 # ---- round trips
 
 
-@pytest.mark.parametrize(("encoding", "dtype"), [("raw", np.uint8), ("raw", np.uint16), ("png", np.uint8), ("png", np.uint16)])
+@pytest.mark.parametrize(
+    ("encoding", "dtype"), [("raw", np.uint8), ("raw", np.uint16), ("png", np.uint8), ("png", np.uint16)]
+)
 def test_pixels_times_signals_and_conditions_come_back_as_they_were(tmp_path, encoding, dtype):
     trial = opened(written(tmp_path / "trial.mcap", encoding, pictures(dtype=dtype)))
     assert trial.conditions == CONDITIONS
@@ -108,7 +112,8 @@ def test_pixels_times_signals_and_conditions_come_back_as_they_were(tmp_path, en
 def test_jpeg_is_off_by_a_few_levels_at_most(tmp_path):
     trial = opened(written(tmp_path / "trial.mcap", "jpeg"))
     off = np.array([frame.astype(int) - picture(k) for k, (_, frame) in enumerate(trial.frames)])
-    # quality 95 divides the coefficients of a block by 1 to 12: half of that, times what 64 of them add up to at worst in practice
+    # quality 95 divides the coefficients of a block by 1 to 12: half of that,
+    # times what 64 of them add up to at worst in practice
     assert abs(off).max() <= 6
     assert off.std() < 1
     # no bias: the width of a bead hangs on half levels
@@ -136,7 +141,11 @@ def test_any_clock_of_our_recordings_is_the_same_clock(tmp_path):
     for clock in ("log_time", "publish_time", "header.stamp"):
         trial = opened(path, time=clock)
         np.testing.assert_allclose(trial.signals["command_mm"][0], TIME, atol=1e-9)
-        assert [time for time, _ in trial.frames] == trial.frames.time_s.tolist() == opened(path).frames.time_s.tolist()
+        assert (
+            [time for time, _ in trial.frames]
+            == trial.frames.time_s.tolist()
+            == opened(path).frames.time_s.tolist()
+        )
 
 
 def test_memory_is_that_of_a_few_chunks_however_long_the_trial(tmp_path):
@@ -149,7 +158,8 @@ def test_memory_is_that_of_a_few_chunks_however_long_the_trial(tmp_path):
     reading = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert path.stat().st_size > 46e6
-    # a chunk holds 1 MB and a frame; the writer has four copies of it at a time, the reader the twenty messages of each channel that tell what is in it
+    # a chunk holds 1 MB and a frame; the writer has four copies of it at a time, the reader the twenty
+    # messages of each channel that tell what is in it
     assert writing < 10e6
     assert reading < 12e6
 
@@ -166,16 +176,37 @@ def test_the_mcap_package_finds_standard_images_and_schemas_that_say_all(tmp_pat
         (metadata,) = reader.iter_metadata()
         messages = list(reader.iter_messages())
     assert metadata.name == "beadline.trial"
-    assert {"material": "A", "trial": "3", "schema_version": "1", "px_per_mm": "125.1"}.items() <= metadata.metadata.items()
+    assert {
+        "material": "A",
+        "trial": "3",
+        "schema_version": "1",
+        "px_per_mm": "125.1",
+    }.items() <= metadata.metadata.items()
     assert len(messages) == 360
-    assert sorted(message.log_time for _, _, message in messages) == [message.log_time for _, _, message in messages]
+    assert sorted(message.log_time for _, _, message in messages) == [
+        message.log_time for _, _, message in messages
+    ]
     assert {channel.message_encoding for _, channel, _ in messages} == {"cdr"}
     assert {schema.encoding for schema, _, _ in messages} == {"ros2msg"}
-    assert all(b"MSG: std_msgs/Header" in schema.data and b"MSG: builtin_interfaces/Time" in schema.data for schema, _, _ in messages)
-    images = [(schema.name, message.data) for schema, _, message in messages if schema.name.startswith("sensor_msgs/msg/")]
+    assert all(
+        b"MSG: std_msgs/Header" in schema.data and b"MSG: builtin_interfaces/Time" in schema.data
+        for schema, _, _ in messages
+    )
+    images = [
+        (schema.name, message.data)
+        for schema, _, message in messages
+        if schema.name.startswith("sensor_msgs/msg/")
+    ]
     frame, stamp = picture(1), [("i", [0]), ("I", [33333333]), ("s", "nozzle")]
     if encoding == "raw":
-        expected = cdr(*stamp, ("I", [48, 64]), ("s", "mono8"), ("B", [0]), ("I", [64, 48 * 64]), ("B", frame.ravel().tolist()))
+        expected = cdr(
+            *stamp,
+            ("I", [48, 64]),
+            ("s", "mono8"),
+            ("B", [0]),
+            ("I", [64, 48 * 64]),
+            ("B", frame.ravel().tolist()),
+        )
     else:
         ending, settings = ENCODERS[encoding]
         data = cv2.imencode(ending, frame, settings)[1].tolist()
@@ -194,7 +225,9 @@ def test_the_reader_of_numeric_recordings_reads_the_signals_by_their_schemas(tmp
 
 
 def test_the_next_command_is_written_as_csv_and_mcap_alike(tmp_path):
-    write_command(tmp_path / "trial_0.4", CONDITIONS._replace(trial=4), time_s=TIME, command_mm=SIGNALS["command_mm"])
+    write_command(
+        tmp_path / "trial_0.4", CONDITIONS._replace(trial=4), time_s=TIME, command_mm=SIGNALS["command_mm"]
+    )
     assert sorted(path.name for path in tmp_path.iterdir()) == ["trial_0.4.csv", "trial_0.4.mcap"]
     table = pandas.read_csv(tmp_path / "trial_0.4.csv")
     assert list(table) == ["time_s", "displacement_mm"]
@@ -215,22 +248,33 @@ MAPPED = [
 ]
 
 
-def machine_recording(images: list[tuple[str, str, bytes]], *, start_s: float = 1.7e9, published_s: float = 0.0, compression=ZSTD) -> bytes:
-    """JSON stage at 50 Hz and pump at 10 Hz from `start_s` on; images (encoding, type, message) at 10 Hz on /camera."""
+def machine_recording(
+    images: list[tuple[str, str, bytes]],
+    *,
+    start_s: float = 1.7e9,
+    published_s: float = 0.0,
+    compression=ZSTD,
+) -> bytes:
+    """JSON stage at 50 Hz and pump at 10 Hz from `start_s` on; images
+    (encoding, type, message) at 10 Hz on /camera."""
     made = Written(compression)
     stage, pump = made.topic("/stage", "json"), made.topic("/pump/command", "json")
     cameras = {}
     for encoding, kind, _ in images:
         cameras.setdefault((encoding, kind), None)
     for encoding, kind in cameras:
-        cameras[encoding, kind] = made.topic("/camera", encoding, kind, "ros2msg" if encoding == "cdr" else "", b"uint8 unused")
+        cameras[encoding, kind] = made.topic(
+            "/camera", encoding, kind, "ros2msg" if encoding == "cdr" else "", b"uint8 unused"
+        )
     for k in range(100):
         made.message(stage, start_s + k / 50, {"x_m": 0.008 * k / 50, "v": 8.0})
         if k % 5 == 0:
             made.message(pump, start_s + k / 50, {"target": k / 50})
             if k // 5 < len(images):
                 encoding, kind, message = images[k // 5]
-                made.message(cameras[encoding, kind], start_s + k / 50 + 0.001, message, start_s + k / 50 + published_s)
+                made.message(
+                    cameras[encoding, kind], start_s + k / 50 + 0.001, message, start_s + k / 50 + published_s
+                )
     return made.bytes()
 
 
@@ -239,7 +283,9 @@ def image_at(stamp_ns: int, frame: np.ndarray) -> tuple[str, str, bytes]:
 
 
 def ros1_at(frame: np.ndarray) -> tuple[str, str, bytes]:
-    head = struct.pack("<IIII3s", 0, 0, 0, 3, b"cam") + struct.pack("<III5sBI", *frame.shape, 5, b"mono8", 0, frame.shape[1])
+    head = struct.pack("<IIII3s", 0, 0, 0, 3, b"cam") + struct.pack(
+        "<III5sBI", *frame.shape, 5, b"mono8", 0, frame.shape[1]
+    )
     return "ros1", "sensor_msgs/Image", head + struct.pack("<I", frame.size) + frame.tobytes()
 
 
@@ -249,12 +295,17 @@ def test_a_machines_own_topics_units_and_calendar_are_read_by_the_mapping(tmp_pa
     path = tmp_path / "machine.mcap"
     frames = [picture(k) for k in range(20)]
     path.write_bytes(
-        machine_recording([image_at(0, frame) if form == "cdr" else ros1_at(frame) for frame in frames], compression=compression)
+        machine_recording(
+            [image_at(0, frame) if form == "cdr" else ros1_at(frame) for frame in frames],
+            compression=compression,
+        )
     )
     trial = opened(path, sources=MAPPED)
     assert trial.conditions is None
     np.testing.assert_allclose(trial.signals["position_mm"][1], 8 * TIME, rtol=1e-12)
-    np.testing.assert_allclose(trial.signals["command_mm"][0], np.arange(20) / 10, atol=1e-6)  # a double of 1.7e9 s has steps of 0.24 us
+    np.testing.assert_allclose(
+        trial.signals["command_mm"][0], np.arange(20) / 10, atol=1e-6
+    )  # a double of 1.7e9 s has steps of 0.24 us
     np.testing.assert_allclose(trial.frames.time_s, np.arange(20) / 10 + 0.001, atol=1e-6)
     assert [note.kind for note in trial.notes] == ["clock", "outside", "conditions"]
     for (_, found), frame in zip(trial.frames, frames, strict=True):
@@ -271,7 +322,11 @@ def test_a_machines_clock_may_be_the_time_of_publishing(tmp_path):
 
 def test_a_topic_whose_recorder_was_restarted_gives_the_frames_of_both_channels(tmp_path):
     path = tmp_path / "machine.mcap"
-    path.write_bytes(machine_recording([image_at(0, picture(k)) for k in range(12)] + [ros1_at(picture(k)) for k in range(12, 20)]))
+    path.write_bytes(
+        machine_recording(
+            [image_at(0, picture(k)) for k in range(12)] + [ros1_at(picture(k)) for k in range(12, 20)]
+        )
+    )
     frames = list(opened(path, sources=MAPPED).frames)
     assert len(frames) == 20
     np.testing.assert_array_equal([frame for _, frame in frames], [picture(k) for k in range(20)])
@@ -288,7 +343,10 @@ def test_frames_and_command_without_a_common_time_are_refused_with_both_ranges(t
         written(tmp_path / "trial.mcap", frames=((time + 5, frame) for time, frame in pictures()))
     assert list(tmp_path.iterdir()) == []
     made = Written()
-    stage, camera = made.topic("/gantry", "json"), made.topic("/camera", "cdr", "sensor_msgs/msg/Image", "ros2msg", b"uint8 unused")
+    stage, camera = (
+        made.topic("/gantry", "json"),
+        made.topic("/camera", "cdr", "sensor_msgs/msg/Image", "ros2msg", b"uint8 unused"),
+    )
     plunger = made.topic("/plunger", "json")
     for k in range(10):
         made.message(stage, k / 10, {"position_mm": k, "speed_mm_per_s": 8})
@@ -296,7 +354,10 @@ def test_frames_and_command_without_a_common_time_are_refused_with_both_ranges(t
         made.message(camera, k / 10, image_at(0, picture(k))[2])
     path = tmp_path / "machine.mcap"
     path.write_bytes(made.bytes())
-    assert "the frames run from 0.000 to 0.900 s but command_mm from 20.000 to 20.900 s, so they do not overlap in time" in refusal(path)
+    assert (
+        "the frames run from 0.000 to 0.900 s but command_mm from 20.000 to 20.900 s, "
+        "so they do not overlap in time" in refusal(path)
+    )
 
 
 def test_frames_outside_the_command_are_counted(tmp_path):
@@ -308,8 +369,9 @@ def test_frames_outside_the_command_are_counted(tmp_path):
 def test_a_recording_without_images_or_command_is_refused_with_what_it_has(tmp_path):
     path = tmp_path / "trial.mcap"
     write_command(tmp_path / "trial", CONDITIONS, time_s=TIME, command_mm=TIME)
-    assert "there is no image topic; it has /plunger (beadline_msgs/msg/Plunger in cdr); images are read as sensor_msgs Image" in refusal(
-        path
+    assert (
+        "there is no image topic; it has /plunger (beadline_msgs/msg/Plunger in cdr); "
+        "images are read as sensor_msgs Image" in refusal(path)
     )
     made = Written()
     camera = made.topic("/camera", "cdr", "sensor_msgs/msg/Image", "ros2msg", b"uint8 unused")
@@ -321,17 +383,26 @@ def test_a_recording_without_images_or_command_is_refused_with_what_it_has(tmp_p
     written(path)
     sources = [POSITION, SPEED, COMMAND._replace(source="/plunger:displacement"), FLOW]
     found = refusal(path, sources=sources)
-    assert "no message has a number '/plunger:displacement'; the nearest names are /plunger:displacement_mm" in found
+    assert (
+        "no message has a number '/plunger:displacement'; the nearest names are /plunger:displacement_mm"
+        in found
+    )
     assert "map command_mm to" in found
     assert "the mapping should give command_mm one source" in refusal(path, sources=[POSITION, SPEED])
-    assert "there is no topic /camera with images; it has /gantry (beadline_msgs/msg/Gantry in cdr)" in refusal(path, image="/camera")
+    assert (
+        "there is no topic /camera with images; it has /gantry (beadline_msgs/msg/Gantry in cdr)"
+        in refusal(path, image="/camera")
+    )
 
 
 def test_of_two_cameras_one_must_be_named(tmp_path):
     path = tmp_path / "trial.mcap"
     made = Written()
     stage, plunger = made.topic("/gantry", "json"), made.topic("/plunger", "json")
-    cameras = [made.topic(name, "cdr", "sensor_msgs/msg/Image", "ros2msg", b"uint8 unused") for name in ("/left", "/right")]
+    cameras = [
+        made.topic(name, "cdr", "sensor_msgs/msg/Image", "ros2msg", b"uint8 unused")
+        for name in ("/left", "/right")
+    ]
     for k in range(10):
         made.message(stage, k / 10, {"position_mm": k, "speed_mm_per_s": 8})
         made.message(plunger, k / 10, {"displacement_mm": k})
@@ -339,17 +410,29 @@ def test_of_two_cameras_one_must_be_named(tmp_path):
             made.message(camera, k / 10, image_at(0, picture(k + 20 * i))[2])
     path.write_bytes(made.bytes())
     assert "2 topics have images (/left, /right); name the one of the nozzle's camera" in refusal(path)
-    np.testing.assert_array_equal([frame for _, frame in opened(path, image="/right").frames], [picture(k + 20) for k in range(10)])
+    np.testing.assert_array_equal(
+        [frame for _, frame in opened(path, image="/right").frames], [picture(k + 20) for k in range(10)]
+    )
 
 
 def test_frames_of_changing_size_are_refused_in_writing_and_in_reading(tmp_path):
-    with pytest.raises(ValueError, match=r"frame 1 is \(24, 64\) of uint8 but the first is \(48, 64\) of uint8; write one size"):
+    with pytest.raises(
+        ValueError,
+        match=r"frame 1 is \(24, 64\) of uint8 but the first is \(48, 64\) of uint8; write one size",
+    ):
         written(tmp_path / "trial.mcap", frames=iter([(0.0, picture(0)), (0.1, picture(1, height=24))]))
     assert list(tmp_path.iterdir()) == []
     path = tmp_path / "machine.mcap"
-    path.write_bytes(machine_recording([image_at(0, picture(k, height=24 if k == 12 else 48)) for k in range(20)], start_s=0.0))
+    path.write_bytes(
+        machine_recording(
+            [image_at(0, picture(k, height=24 if k == 12 else 48)) for k in range(20)], start_s=0.0
+        )
+    )
     found = refusal(path, sources=MAPPED)
-    assert "the frame of /camera at 1.201 s is 64 x 24 px of 8 bits but the first is 64 x 48 px of 8; record a trial at one size" in found
+    assert (
+        "the frame of /camera at 1.201 s is 64 x 24 px of 8 bits but the first is 64 x 48 px of 8; "
+        "record a trial at one size" in found
+    )
 
 
 @pytest.mark.parametrize("clock", ["log_time", "publish_time"])
@@ -366,16 +449,24 @@ def test_frames_that_cannot_be_decoded_are_left_out_and_counted_until_they_are_t
     assert trial.frames.unreadable == 2
     (note,) = trial.frames.notes()
     assert note.message.startswith("2 of 20 frames of /camera cannot be decoded, the first at 0.30")
-    assert "2 of 20 frames of /camera cannot be decoded, the first at 0.30" in refusal(path, sources=MAPPED, unreadable_share=0.09)
+    assert "2 of 20 frames of /camera cannot be decoded, the first at 0.30" in refusal(
+        path, sources=MAPPED, unreadable_share=0.09
+    )
     assert list(opened(path, sources=MAPPED, time=clock).frames)[-1][0] == trial.frames.time_s[-1]
 
 
 def test_a_jpeg_that_is_cut_off_is_no_frame(tmp_path):
     data = cv2.imencode(".jpg", picture(0))[1]
-    whole, cut = (image_messages.compressed_image(image_messages.header(0, "cam"), "jpeg", part) for part in (data, data[:-200]))
+    whole, cut = (
+        image_messages.compressed_image(image_messages.header(0, "cam"), "jpeg", part)
+        for part in (data, data[:-200])
+    )
     path = tmp_path / "machine.mcap"
     path.write_bytes(
-        machine_recording([("cdr", "sensor_msgs/msg/CompressedImage", cut if k == 5 else whole) for k in range(20)], start_s=0.0)
+        machine_recording(
+            [("cdr", "sensor_msgs/msg/CompressedImage", cut if k == 5 else whole) for k in range(20)],
+            start_s=0.0,
+        )
     )
     trial = opened(path, sources=MAPPED)
     assert sum(1 for _ in trial.frames) == 19
@@ -385,15 +476,20 @@ def test_a_jpeg_that_is_cut_off_is_no_frame(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"command_mm": np.where(TIME == TIME[7], np.nan, 0.0)}, "command_mm is not finite at sample 7; leave that sample out"),
-        ({"command_mm": TIME[:-1]}, r"command_mm should have one value for each of 100 times but has shape \(99,\)"),
+        ({"command_mm": np.where(TIME == TIME[7], np.nan, 0.0)},
+        "command_mm is not finite at sample 7; leave that sample out"),
+        ({"command_mm": TIME[:-1]},
+        r"command_mm should have one value for each of 100 times but has shape \(99,\)"),
         ({"time_s": TIME[::-1]}, "time_s should run forward from 0 or later"),
         ({"time_s": TIME - 1}, "time_s should run forward from 0 or later"),
         ({"frames": iter([])}, "a trial should have frames but there is none; give at least one"),
-        ({"frames": iter([(1.0, picture(0)), (1.0, picture(1))])}, "frame 1 is at 1 s but frames should run forward"),
+        ({"frames": iter([(1.0, picture(0)), (1.0, picture(1))])},
+        "frame 1 is at 1 s but frames should run forward"),
         ({"frames": iter([(np.nan, picture(0))])}, "frame 0 is at nan s but frames should run forward"),
-        ({"frames": iter([(0.0, np.zeros((4, 4, 3), np.uint8))])}, r"frame 0 should be \(height, width\) of uint8 or uint16 but is \(4, 4, 3\) of uint8; make it gray"),
-        ({"frames": pictures(dtype=np.uint16), "encoding": "jpeg"}, r"frame 0 should be \(height, width\) of uint8 but is \(48, 64\) of uint16"),
+        ({"frames": iter([(0.0, np.zeros((4, 4, 3), np.uint8))])},
+        r"frame 0 should be \(height, width\) of uint8 or uint16 but is \(4, 4, 3\) of uint8; make it gray"),
+        ({"frames": pictures(dtype=np.uint16), "encoding": "jpeg"},
+        r"frame 0 should be \(height, width\) of uint8 but is \(48, 64\) of uint16"),
         ({"encoding": "gif"}, "the encoding should be jpeg, png or raw but is 'gif'; name one of them"),
     ],
 )  # fmt: skip
@@ -402,7 +498,9 @@ def test_what_is_not_a_trial_is_not_written_and_the_last_good_one_stays(tmp_path
     path.write_bytes(b"the last good one")
     with pytest.raises(ValueError, match=f"trial.mcap: {said}"):
         written(path, **changes)
-    assert [(file.name, file.read_bytes()) for file in tmp_path.iterdir()] == [("trial.mcap", b"the last good one")]
+    assert [(file.name, file.read_bytes()) for file in tmp_path.iterdir()] == [
+        ("trial.mcap", b"the last good one")
+    ]
 
 
 def test_a_generator_that_fails_leaves_nothing_behind(tmp_path):
@@ -437,7 +535,11 @@ def test_a_file_that_is_no_recording_is_refused_in_one_sentence(tmp_path):
 @pytest.fixture(scope="module")
 def large(tmp_path_factory) -> bytes:
     """Five chunks with frames of 480 x 640."""
-    return written(tmp_path_factory.mktemp("large") / "trial.mcap", "raw", ((k / 7, picture(k, 480, 640)) for k in range(14))).read_bytes()
+    return written(
+        tmp_path_factory.mktemp("large") / "trial.mcap",
+        "raw",
+        ((k / 7, picture(k, 480, 640)) for k in range(14)),
+    ).read_bytes()
 
 
 def intact(trial: Trial) -> int:
@@ -475,20 +577,33 @@ def test_bit_flips_in_the_conditions_are_detected(tmp_path, large):
             assert "\n" not in str(error)
         else:
             # a flip in the name of the CRC itself leaves the conditions as they were, and they are read
-            assert trial.conditions == CONDITIONS if trial.conditions else any(note.kind == "conditions" for note in trial.notes)
+            assert (
+                trial.conditions == CONDITIONS
+                if trial.conditions
+                else any(note.kind == "conditions" for note in trial.notes)
+            )
 
 
 def test_every_complete_chunk_of_a_truncated_trial_is_recovered_and_counted(tmp_path, large):
     parts, path = chunks(large), tmp_path / "trial.mcap"
     # the mcap package counts the frames in each chunk of the whole file; channel 4 is that of the images
-    records = [record for record in StreamReader(io.BytesIO(large), emit_chunks=True).records if isinstance(record, Chunk)]
-    held = [sum(isinstance(record, Message) and record.channel_id == 4 for record in breakup_chunk(chunk)) for chunk in records]
+    records = [
+        record
+        for record in StreamReader(io.BytesIO(large), emit_chunks=True).records
+        if isinstance(record, Chunk)
+    ]
+    held = [
+        sum(isinstance(record, Message) and record.channel_id == 4 for record in breakup_chunk(chunk))
+        for chunk in records
+    ]
     assert sum(held) == 14
     for end in np.random.default_rng(2).integers(parts[0][2], parts[-1][2], 8):
         complete = sum(part[2] <= end for part in parts)
         path.write_bytes(large[:end])
         trial = opened(path)
-        assert any(f"{complete} whole chunks and" in note.message for note in trial.notes if note.kind == "truncated")
+        assert any(
+            f"{complete} whole chunks and" in note.message for note in trial.notes if note.kind == "truncated"
+        )
         assert trial.conditions == CONDITIONS
         assert len(trial.frames) == sum(held[:complete]) == intact(trial)
     path.write_bytes(large[: parts[0][2] - 1])
@@ -500,10 +615,17 @@ def test_a_chunk_of_frames_alone_that_is_lost_leaves_the_signals_whole(tmp_path)
     stream = io.BytesIO()
     writer = Writer(stream, compression=CompressionType.NONE, chunk_size=1)
     writer.start("", "test")
-    stage, plunger = writer.register_channel("/gantry", "json", 0), writer.register_channel("/plunger", "json", 0)
-    camera = writer.register_channel("/camera", "cdr", writer.register_schema("sensor_msgs/msg/Image", "ros2msg", b""))
+    stage, plunger = (
+        writer.register_channel("/gantry", "json", 0),
+        writer.register_channel("/plunger", "json", 0),
+    )
+    camera = writer.register_channel(
+        "/camera", "cdr", writer.register_schema("sensor_msgs/msg/Image", "ros2msg", b"")
+    )
     for k in range(10):
-        writer.add_message(stage, k * 10**8, json.dumps({"position_mm": k, "speed_mm_per_s": 8}).encode(), k * 10**8)
+        writer.add_message(
+            stage, k * 10**8, json.dumps({"position_mm": k, "speed_mm_per_s": 8}).encode(), k * 10**8
+        )
         writer.add_message(plunger, k * 10**8, json.dumps({"displacement_mm": k}).encode(), k * 10**8)
     for k in range(10):
         writer.add_message(camera, k * 10**8, image_at(0, picture(k))[2], k * 10**8)
@@ -529,4 +651,6 @@ def test_conditions_of_another_version_or_with_a_gap_are_refused(tmp_path):
         with pytest.raises(ValueError, match=said):
             trial_files._conditions(tmp_path, pairs | change, [])
     with pytest.raises(ValueError, match="the trial's conditions lack pause_s"):
-        trial_files._conditions(tmp_path, {name: value for name, value in pairs.items() if name != "pause_s"}, [])
+        trial_files._conditions(
+            tmp_path, {name: value for name, value in pairs.items() if name != "pause_s"}, []
+        )

@@ -1,4 +1,5 @@
-"""One measured trial tells gain, time constant, total delay and yield: exactly without noise, within its own deviations with it; up and down apart."""
+"""One measured trial tells gain, time constant, total delay and yield: exactly without noise, within its own
+deviations with it; up and down apart."""
 
 import numpy as np
 import pytest
@@ -7,7 +8,9 @@ from pipeline.deposition.extruder import Extruder, disturb, draw, flow, lagged, 
 from pipeline.deposition.trial_model import deviations, directions, identify
 
 TS = 0.02
-R = routine(off_s=4, on_s=6, pause_s=0.6, tail_s=8, speed=8.0, bead_area_mm2=0.304, ramp_s=0.15, sample_time_s=TS).r
+R = routine(
+    off_s=4, on_s=6, pause_s=0.6, tail_s=8, speed=8.0, bead_area_mm2=0.304, ramp_s=0.15, sample_time_s=TS
+).r
 STEADY, U = R.max(), R / 1.08
 TRUE = Extruder(1.3, 2.1, 0.133, yield_=0.15)
 NOISE = {"white": 0.03, "drift": 0.01, "gain": 0.01}
@@ -18,7 +21,8 @@ def parameters(extruder):
 
 
 def total(plant):
-    """The parameters that a model without lag should find: below its corner a lag of damping 0.7 delays by 1.4 / w."""
+    """The parameters that a model without lag should find: below its
+    corner a lag of damping 0.7 delays by 1.4 / w."""
     return parameters(plant._replace(delay_s=plant.delay_s + 1.4 / (2 * np.pi * plant.lag_hz)))
 
 
@@ -32,11 +36,15 @@ def asymmetric(u, slower):
 
 def test_without_noise_the_four_parameters_are_found():
     found = identify([U], [flow(TRUE, U, sample_time_s=TS)], sample_time_s=TS)
-    np.testing.assert_allclose(parameters(found.extruder), parameters(TRUE), rtol=1e-4)  # the solver stops at 1e-7 of the cost
+    np.testing.assert_allclose(
+        parameters(found.extruder), parameters(TRUE), rtol=1e-4
+    )  # the solver stops at 1e-7 of the cost
     assert found.fit_percent > 99.9
 
 
-@pytest.mark.parametrize("gain, time_constant_s, delay_s", [(0.5, 1.0, 0.0), (2.0, 8.0, 0.3), (0.7, 15.0, 0.6)])
+@pytest.mark.parametrize(
+    "gain, time_constant_s, delay_s", [(0.5, 1.0, 0.0), (2.0, 8.0, 0.3), (0.7, 15.0, 0.6)]
+)
 def test_no_guess_is_needed_for_any_material(gain, time_constant_s, delay_s):
     true = Extruder(gain, time_constant_s, delay_s, yield_=0.1)
     u = R / gain
@@ -53,11 +61,15 @@ def test_on_plants_of_the_family_the_errors_are_as_large_as_their_deviations():
         plant = draw(rng, gain=1.08, time_constant_s=2.7, steady_flow=STEADY)
         y = disturb(flow(plant, U, sample_time_s=TS), rng, steady_flow=STEADY, **NOISE)
         model = identify([U], [y], sample_time_s=TS)
-        assert model.noise / STEADY == pytest.approx(0.031, abs=0.004)  # white noise, and what of the drift no parameter takes
+        assert model.noise / STEADY == pytest.approx(
+            0.031, abs=0.004
+        )  # white noise, and what of the drift no parameter takes
         sigma = deviations(model, [U], [y], drift=0.01, trial_gain=0.01, sample_time_s=TS)
         z.append((parameters(model.extruder) - total(plant)) / sigma)
     # 16 draws know a deviation to 18 %; the play, which the model lacks, adds to each
-    assert np.all(np.sqrt(np.mean(np.square(z), axis=0)) < 1.8) and np.all(np.sqrt(np.mean(np.square(z), axis=0)) > 0.5)
+    assert np.all(np.sqrt(np.mean(np.square(z), axis=0)) < 1.8) and np.all(
+        np.sqrt(np.mean(np.square(z), axis=0)) > 0.5
+    )
 
 
 def test_a_second_trial_halves_the_variance():
@@ -66,7 +78,9 @@ def test_a_second_trial_halves_the_variance():
     settings = {"drift": 0.01, "trial_gain": 0.01, "sample_time_s": TS}
     model = identify([U], y[:1], sample_time_s=TS)
     one, two = deviations(model, [U], y[:1], **settings), deviations(model, [U, U], y, **settings)
-    np.testing.assert_allclose(np.square(two) / np.square(one), 0.5, rtol=0.01)  # the same model: only the count changes
+    np.testing.assert_allclose(
+        np.square(two) / np.square(one), 0.5, rtol=0.01
+    )  # the same model: only the count changes
 
 
 def test_samples_that_were_not_observable_are_left_out():
@@ -78,25 +92,42 @@ def test_samples_that_were_not_observable_are_left_out():
 
 def test_a_spiky_learned_command_does_not_hide_the_yield():
     u = U + 20 * np.diff(U, prepend=0.0) / TS * 0.1
-    found = identify([U, u], [flow(TRUE, U, sample_time_s=TS), flow(TRUE, u, sample_time_s=TS)], sample_time_s=TS)
+    found = identify(
+        [U, u], [flow(TRUE, U, sample_time_s=TS), flow(TRUE, u, sample_time_s=TS)], sample_time_s=TS
+    )
     np.testing.assert_allclose(parameters(found.extruder), parameters(TRUE), rtol=1e-4)  # the solver's stop
 
 
 def test_an_extruder_that_relaxes_slowly_shows_in_the_downward_step():
     settings = {"start_s": 4.0, "stop_s": 16.6, "window_s": 6.0, "yield_": 0.0, "sample_time_s": TS}
     up, down = directions(U, asymmetric(U, 1.5), **settings)
-    assert up.extruder.time_constant_s == pytest.approx(2.0, rel=0.05)  # the pause's dip lies outside the window, the lag inside
-    assert down.extruder.time_constant_s == pytest.approx(3.0, rel=0.15)  # the level it falls from came up at 2 s
+    assert up.extruder.time_constant_s == pytest.approx(
+        2.0, rel=0.05
+    )  # the pause's dip lies outside the window, the lag inside
+    assert down.extruder.time_constant_s == pytest.approx(
+        3.0, rel=0.15
+    )  # the level it falls from came up at 2 s
     up, down = directions(U, asymmetric(U, 1.0), **settings)
-    assert up.extruder.time_constant_s == pytest.approx(down.extruder.time_constant_s, rel=0.02)  # the lag taken as delay
+    assert up.extruder.time_constant_s == pytest.approx(
+        down.extruder.time_constant_s, rel=0.02
+    )  # the lag taken as delay
 
 
 @pytest.mark.parametrize(
     "u, y, sentence",
     [
-        ([U], [R[:-1]], r"expected one command and one flow of equal length a trial but found shapes \[\(1230,\)\] and \[\(1229,\)\]"),
+        (
+            [U],
+            [R[:-1]],
+            r"expected one command and one flow of equal length a trial but found shapes "
+            r"\[\(1230,\)\] and \[\(1229,\)\]",
+        ),
         ([np.where(R > 2, np.nan, U)], [R], r"expected a command without gaps but trial 0 holds NaN"),
-        ([U, U], [R, np.full(1230, np.nan)], r"expected at least 50 observable samples of flow but trial 1 has 0"),
+        (
+            [U, U],
+            [R, np.full(1230, np.nan)],
+            r"expected at least 50 observable samples of flow but trial 1 has 0",
+        ),
         ([np.ones(1230)], [R], r"the command never moves"),
         ([U], [-R], r"expected a flow that rises with the command but found a best gain of -"),
         (

@@ -1,4 +1,5 @@
-"""One plant of the family, trained by our law on two speeds and two pauses, for the tests of what is made of learned trials."""
+"""One plant of the family, trained by our law on two speeds and two pauses,
+for the tests of what is made of learned trials."""
 
 import functools
 
@@ -17,7 +18,16 @@ SPEEDS, PAUSES = (8.0, 5.0), (0.6, 0.3)
 
 
 def protocol(speed=8.0, pause_s=0.6, ramp_s=RAMP, on_s=6):
-    return routine(off_s=4, on_s=on_s, pause_s=pause_s, tail_s=8, speed=speed, bead_area_mm2=AREA, ramp_s=ramp_s, sample_time_s=TS)
+    return routine(
+        off_s=4,
+        on_s=on_s,
+        pause_s=pause_s,
+        tail_s=8,
+        speed=speed,
+        bead_area_mm2=AREA,
+        ramp_s=ramp_s,
+        sample_time_s=TS,
+    )
 
 
 @functools.cache
@@ -27,14 +37,22 @@ def trainings(plant: Extruder, material: str = "A", updates: int = 12) -> tuple[
         for pause in PAUSES:
             lesson = protocol(speed, pause, on_s=11)
             steady_flow = float(lesson.r.max())
-            law = ilc.InverseLaw(lesson.r, identify_trials=3, floor=0.1, order=4, cutoff_hz=5.0, limit=np.inf, sample_time_s=TS)
+            law = ilc.InverseLaw(
+                lesson.r, identify_trials=3, floor=0.1, order=4, cutoff_hz=5.0, limit=np.inf, sample_time_s=TS
+            )
 
             def measure(u, steady_flow=steady_flow):
                 y = flow(plant, u, sample_time_s=TS)
-                return ilc.Trial(u, disturb(y, rng, steady_flow=steady_flow, white=0.03, drift=0.01, gain=0.01), y)
+                return ilc.Trial(
+                    u, disturb(y, rng, steady_flow=steady_flow, white=0.03, drift=0.01, gain=0.01), y
+                )
 
             trials = ilc.learn(law, measure, lesson.r / NOMINAL.gain, lesson.r, trials=updates, rise=0.1)
-            out.append(Training(material, NOZZLE, lesson, np.array([t.u for t in trials]), np.array([t.y for t in trials])))
+            out.append(
+                Training(
+                    material, NOZZLE, lesson, np.array([t.u for t in trials]), np.array([t.y for t in trials])
+                )
+            )
     return tuple(out)
 
 
@@ -44,7 +62,8 @@ def known(plant: Extruder) -> Learned:
     made = learn(trainings(plant), sample_time_s=TS)
     columns = made.library.columns + tuple(basis._replace(material="B") for basis in made.library.columns)
     return made._replace(
-        library=made.library._replace(columns=columns), materials=(*made.materials, made.materials[0]._replace(material="B"))
+        library=made.library._replace(columns=columns),
+        materials=(*made.materials, made.materials[0]._replace(material="B")),
     )
 
 

@@ -35,7 +35,12 @@ def shifts(truth: Plant, seed: int, K: np.ndarray) -> tuple[drift.Shift, np.ndar
     before = [drift.estimate(MODEL, [record(two_zones(), 900 + k)], CAUSES, K) for k in range(4)]
     variance = np.exp(np.mean([one.log_variance for one in before], axis=0))
     now = drift.estimate(MODEL, [record(truth, seed)], CAUSES, K, variance)
-    found = drift.shift(now.change, now.deviation, np.array([one.change for one in before]), np.array([one.deviation for one in before]))
+    found = drift.shift(
+        now.change,
+        now.deviation,
+        np.array([one.change for one in before]),
+        np.array([one.deviation for one in before]),
+    )
     return found, drift.explained(found, now)
 
 
@@ -46,7 +51,10 @@ def test_the_change_of_a_gain_is_measured_to_a_percent():
         found, explained = shifts(two_zones(gain=tuple(gain)), 1, drift.observer(MODEL, SAMPLES))
         assert CAUSES[int(explained.argmax())] == drift.Cause("gain", channel)
         # three of its own deviations, which are below a percent here
-        assert abs(found.value[channel] - found.reference[channel] - (share - 1)) < 3 * found.deviation[channel] + 0.002
+        assert (
+            abs(found.value[channel] - found.reference[channel] - (share - 1))
+            < 3 * found.deviation[channel] + 0.002
+        )
         assert abs(found.sigmas[channel]) > 6
 
 
@@ -62,7 +70,8 @@ def test_the_change_of_a_gain_is_measured_to_a_percent():
 def test_a_longer_time_constant_is_told_from_a_lower_gain(changes, cause):
     for seed in (2, 3):
         (own, mine), (_, slow) = (
-            shifts(two_zones(**changes), seed, K) for K in (drift.observer(MODEL, SAMPLES), drift.slow_observer(MODEL, SAMPLES))
+            shifts(two_zones(**changes), seed, K)
+            for K in (drift.observer(MODEL, SAMPLES), drift.slow_observer(MODEL, SAMPLES))
         )
         found = drift.named(np.abs(own.value - own.reference) > 0.04, mine, slow)
         assert [CAUSES[k] for k in found] == [cause]
@@ -90,7 +99,9 @@ def test_a_first_order_lag_quickened_by_hand():
     # exp(-1 / 50) at twice the rate is exp(-2 / 50); B keeps the gain of 3
     lag = plant([[np.exp(-1 / 50)]], [[3 * (1 - np.exp(-1 / 50))]], [[1.0]])
     found = drift.faster(lag, 1.0)
-    assert found.A[0, 0] == pytest.approx(np.exp(-2 / 50)) and found.B[0, 0] == pytest.approx(3 * (1 - np.exp(-2 / 50)))
+    assert found.A[0, 0] == pytest.approx(np.exp(-2 / 50)) and found.B[0, 0] == pytest.approx(
+        3 * (1 - np.exp(-2 / 50))
+    )
 
 
 @pytest.mark.parametrize(
@@ -105,14 +116,18 @@ def test_a_first_order_lag_quickened_by_hand():
 )
 def test_a_mistake_in_a_record_is_named(spoil, words):
     u, y = spoil(*record(two_zones(), 5))
-    found = drift.mistakes(MODEL, u, y, inputs=["one", "two"], outputs=["left", "right"], scale=np.full(2, NOISE), gross=3.0)
+    found = drift.mistakes(
+        MODEL, u, y, inputs=["one", "two"], outputs=["left", "right"], scale=np.full(2, NOISE), gross=3.0
+    )
     assert found[1].words == words and found[1].left < 0.5
 
 
 @pytest.mark.parametrize("truth", [two_zones(), two_zones(gain=(0.85, 1.0)), two_zones(slower=(1.2, 1.2))])
 def test_a_drifted_plant_is_no_mistake_of_the_record(truth):
     u, y = record(truth, 6)
-    found = drift.mistakes(MODEL, u, y, inputs=["one", "two"], outputs=["left", "right"], scale=np.full(2, NOISE), gross=3.0)
+    found = drift.mistakes(
+        MODEL, u, y, inputs=["one", "two"], outputs=["left", "right"], scale=np.full(2, NOISE), gross=3.0
+    )
     assert len(found) == 1 or found[1].left > 0.5
 
 
@@ -127,5 +142,8 @@ def test_gaps_in_the_outputs_are_passed_over():
 
 def test_a_record_too_short_to_judge_is_refused():
     u, y = record(two_zones(), 8, samples=60)
-    with pytest.raises(ValueError, match="expected records of at least 96 samples to hold against the champion, found 60; record longer"):
+    with pytest.raises(
+        ValueError,
+        match="expected records of at least 96 samples to hold against the champion, found 60; record longer",
+    ):
         drift.estimate(MODEL, [(u, y)], CAUSES, drift.observer(MODEL, 60))

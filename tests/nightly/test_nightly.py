@@ -42,7 +42,8 @@ def test_a_night_without_new_data_is_done_in_seconds_and_commits_nothing(project
     spent = os.times()
     assert found.returncode == 0 and "nothing new" in found.stdout
     assert project.head() == head and project.dirty() == []
-    # the bar is 15 s; counted in the processor's seconds, which do not depend on what else the machine does: half of it leaves room for the disk
+    # the bar is 15 s; counted in the processor's seconds, which do not depend on what else the machine does:
+    # half of it leaves room for the disk
     assert spent.children_user + spent.children_system - began.children_user - began.children_system < 7
 
 
@@ -58,11 +59,19 @@ def test_a_better_challenger_is_promoted_and_the_champion_before_it_comes_back_b
     began = time.monotonic()
     assert "toy is night-0001 again" in night.rollback("", "")
     assert time.monotonic() - began < 60
-    assert project.production() == before and project.champion()["folder"]["md5"] == name and project.dirty() == []
+    assert (
+        project.production() == before
+        and project.champion()["folder"]["md5"] == name
+        and project.dirty() == []
+    )
     # and the night after does not promote again what somebody has just rolled back
-    (project.folder / "learn.py").write_text((project.folder / "learn.py").read_text() + "# other code, same model\n")
+    (project.folder / "learn.py").write_text(
+        (project.folder / "learn.py").read_text() + "# other code, same model\n"
+    )
     status, said = night.nightly()
-    assert status == night.OK and "was rolled back by hand" in said and project.champion()["run"] == "night-0001"
+    assert (
+        status == night.OK and "was rolled back by hand" in said and project.champion()["run"] == "night-0001"
+    )
 
 
 @pytest.mark.slow
@@ -71,7 +80,9 @@ def test_a_worse_challenger_changes_nothing_but_the_report(project):
     project.record("second", [30.0])
     status, said = night.nightly()
     assert status == night.OK and "kept" in said and "no better" in said
-    assert project.production() == before and project.champion()["run"] == "night-0001" and project.dirty() == []
+    assert (
+        project.production() == before and project.champion()["run"] == "night-0001" and project.dirty() == []
+    )
     metrics = json.loads((project.folder / "reports/metrics/nightly.json").read_text())
     assert (
         metrics["decision"] == "kept"
@@ -81,11 +92,15 @@ def test_a_worse_challenger_changes_nothing_but_the_report(project):
 
 
 def test_a_night_with_bad_data_leaves_the_last_good_run_and_the_next_night_works(project):
-    lock, learned = ((project.folder / name).read_bytes() for name in ("dvc.lock", "datasets/learn/model.json"))
+    lock, learned = (
+        (project.folder / name).read_bytes() for name in ("dvc.lock", "datasets/learn/model.json")
+    )
     bad = project.record("bad", ["x"])
     status, said = night.nightly()
     assert status == night.FAILED and "bad.csv: expected numbers, found none; mend the file" in said
-    assert (project.folder / "dvc.lock").read_bytes() == lock and (project.folder / "datasets/learn/model.json").read_bytes() == learned
+    assert (project.folder / "dvc.lock").read_bytes() == lock and (
+        project.folder / "datasets/learn/model.json"
+    ).read_bytes() == learned
     assert "bad.csv" in (project.folder / "reports/nightly.html").read_text()
     bad.unlink()
     project.record("second", [9.0, 9.0, 9.0])
@@ -93,7 +108,9 @@ def test_a_night_with_bad_data_leaves_the_last_good_run_and_the_next_night_works
 
 
 @pytest.mark.parametrize(("times", "kept_by"), [(1, "git"), (2, "git"), (1, "dvc")])
-def test_what_changes_while_the_stages_run_is_learned_whole_or_not_at_all(project, monkeypatch, times, kept_by):
+def test_what_changes_while_the_stages_run_is_learned_whole_or_not_at_all(
+    project, monkeypatch, times, kept_by
+):
     if kept_by == "dvc":
         project.run("git", "rm", "-rq", "--cached", "datasets/raw/toy")
         project.run(sys.executable, "-m", "dvc", "add", "-q", "datasets/raw/toy")
@@ -115,19 +132,25 @@ def test_what_changes_while_the_stages_run_is_learned_whole_or_not_at_all(projec
         assert status == night.OK and "promoted toy" in said
         assert json.loads((project.folder / "datasets/learn/model.json").read_text()) == (33 + 18) / 5
         assert night.nights()[-1]["notes"] == [
-            "datasets/raw/toy/late_0.csv, params.yaml changed while the stages ran: the night began once again"
+            "datasets/raw/toy/late_0.csv, params.yaml changed while the stages ran: "
+            "the night began once again"
         ]
         assert sorted(project.champion()["lineage"]["recordings"]["toy"]) == [
             f"datasets/raw/toy/{name}.csv" for name in ("first", "late_0", "second")
         ]
         assert "nothing new" in night.nightly()[1]
         return
-    assert status == night.FAILED and "datasets/raw/toy/late_1.csv changed again while the stages ran; start the night when" in said
+    assert (
+        status == night.FAILED
+        and "datasets/raw/toy/late_1.csv changed again while the stages ran; start the night when" in said
+    )
     assert (project.folder / "dvc.lock").read_bytes() == lock and project.champion()["run"] == "night-0001"
     assert night.nightly()[0] == night.OK and project.champion()["run"] == "night-0003"
 
 
-def test_a_recording_that_comes_while_others_are_looked_at_or_judged_is_new_the_next_night_or_looked_at_tonight(project, monkeypatch):
+def test_a_recording_that_comes_while_others_are_looked_at_or_judged_is_new_the_next_night_or_looked_at_tonight(
+    project, monkeypatch
+):
     project.record("second", [9.0])
     look, judge = screening.look, night._judge
 
@@ -168,12 +191,18 @@ def test_code_that_changes_while_the_stages_run_ends_the_night(project, monkeypa
 
     def meanwhile(*given):
         learn(*given)
-        (project.folder / "learn.py").write_text((project.folder / "learn.py").read_text() + "# pulled meanwhile\n")
+        (project.folder / "learn.py").write_text(
+            (project.folder / "learn.py").read_text() + "# pulled meanwhile\n"
+        )
 
     project.record("second", [9.0])
     monkeypatch.setattr(night, "_reproduce", meanwhile)
     status, said = night.nightly()
-    assert status == night.FAILED and "learn.py changed while the stages ran" in said and project.champion()["run"] == "night-0001"
+    assert (
+        status == night.FAILED
+        and "learn.py changed while the stages ran" in said
+        and project.champion()["run"] == "night-0001"
+    )
 
 
 @pytest.mark.slow
@@ -220,7 +249,11 @@ def test_on_a_full_disk_the_champion_stays_and_the_cause_is_reported(project, mo
 def test_too_little_room_ends_the_night_before_it_begins(project):
     project.set(least_free_mb=1e7)
     status, said = night.nightly()
-    assert status == night.FAILED and "nightly.least_free_mb" in said and project.champion()["run"] == "night-0001"
+    assert (
+        status == night.FAILED
+        and "nightly.least_free_mb" in said
+        and project.champion()["run"] == "night-0001"
+    )
 
 
 @pytest.mark.slow
@@ -228,7 +261,9 @@ def test_a_clock_that_was_set_back_is_said_and_does_not_make_the_last_success_ol
     success = watch.last()["success"]
     project.record("second", [9.0, 9.0, 9.0])
     status, said = night.nightly(datetime.datetime.fromisoformat(success) - 30 * TOMORROW)
-    assert status == night.OK and "the clock was set back" in said and project.champion()["run"] == "night-0002"
+    assert (
+        status == night.OK and "the clock was set back" in said and project.champion()["run"] == "night-0002"
+    )
     assert watch.last()["success"] == success
 
 
@@ -239,7 +274,10 @@ def test_a_promotion_that_was_killed_before_its_commit_never_was(project):
     model.write_text("10.0")
     described = {"run": "night-0002", "when": "2030-01-01T00:00:00+00:00", "why": "killed"}
     state = champion.promoted(
-        champion.read(), "toy", described | champion.install("toy", ["datasets/learn/model.json"], {}), event="promoted"
+        champion.read(),
+        "toy",
+        described | champion.install("toy", ["datasets/learn/model.json"], {}),
+        event="promoted",
     )
     (project.folder / "champion.json").write_text(json.dumps(state))
     guarding.RUNNING.touch()
@@ -247,7 +285,11 @@ def test_a_promotion_that_was_killed_before_its_commit_never_was(project):
     (project.folder / "datasets/learn/model.json").write_text("11.0")
     status, said = night.nightly()
     assert status == night.OK and "the night before was killed" in said
-    assert project.production() == before and project.champion()["run"] == "night-0001" and project.head() == head
+    assert (
+        project.production() == before
+        and project.champion()["run"] == "night-0001"
+        and project.head() == head
+    )
 
 
 @pytest.mark.slow
@@ -257,7 +299,11 @@ def test_gits_lock_left_by_a_killed_night_does_not_stop_the_next_one(project):
     (project.folder / ".git/refs/heads/main.lock").touch()
     project.record("second", [9.0, 9.0, 9.0])
     status, said = night.nightly()
-    assert status == night.OK and "was left by a killed git" in said and project.champion()["run"] == "night-0002"
+    assert (
+        status == night.OK
+        and "was left by a killed git" in said
+        and project.champion()["run"] == "night-0002"
+    )
 
 
 @pytest.mark.slow
@@ -297,12 +343,20 @@ def test_nights_of_two_branches_are_merged_by_one_command(project):
     project.run("git", "merge", "--abort")
     found = project.beadline("nightly", "--merge", "other")
     assert found.returncode == 0, found
-    assert json.loads((project.folder / "datasets/learn/model.json").read_text()) == pytest.approx(np.mean([11, 9.5, 9.4]))
-    assert {line["run"] for line in champion.read()["history"]} >= {"night-0001", "night-0002"} and project.dirty() == []
+    assert json.loads((project.folder / "datasets/learn/model.json").read_text()) == pytest.approx(
+        np.mean([11, 9.5, 9.4])
+    )
+    assert {line["run"] for line in champion.read()["history"]} >= {
+        "night-0001",
+        "night-0002",
+    } and project.dirty() == []
 
 
 def test_the_watchdog_wakes_somebody_when_the_last_success_is_old(project):
-    project.set(watch_h=0.001, alarm=f"{sys.executable} -c \"import sys,shutil; shutil.copy(sys.argv[1], 'woken.json')\"")
+    project.set(
+        watch_h=0.001,
+        alarm=f"{sys.executable} -c \"import sys,shutil; shutil.copy(sys.argv[1], 'woken.json')\"",
+    )
     time.sleep(4)
     status, said = night.watchdog()
     assert status == night.FAILED and "nightly.watch_h allows 0.001 h" in said
@@ -315,12 +369,17 @@ def test_a_failed_night_wakes_somebody_and_an_alarm_that_fails_does_not_hide_it(
     project.set(alarm="no-such-command", webhook="http://127.0.0.1:9/none")
     project.record("bad", ["x"])
     status, said = night.nightly()
-    assert status == night.FAILED and "bad.csv" in said and "nightly.alarm" in said and "nightly.webhook" in said
+    assert (
+        status == night.FAILED and "bad.csv" in said and "nightly.alarm" in said and "nightly.webhook" in said
+    )
     assert json.loads(watch.ALARM.read_text())["kind"] == "failed"
 
 
 def test_rollback_to_an_unknown_run_names_the_known_ones(project):
-    with pytest.raises(ValueError, match=r"expected a champion of night-0099 to go back to, found none; known are: night-0001 \(toy\)"):
+    with pytest.raises(
+        ValueError,
+        match=r"expected a champion of night-0099 to go back to, found none; known are: night-0001 \(toy\)",
+    ):
         night.rollback("night-0099", "")
     assert not guarding.RUNNING.exists()  # refused, not killed: the next night has nothing to mend
 
@@ -373,13 +432,16 @@ def test_a_sweep_runs_every_point_beside_the_working_tree_and_tabulates_it(proje
     (project.folder / "learn.py").write_text(
         text.replace(
             "sum(values) / len(values)",
-            "sum(values) / len(values) + __import__('yaml').safe_load(pathlib.Path('params.yaml').read_text())['shift']",
+            "sum(values) / len(values) + "
+            "__import__('yaml').safe_load(pathlib.Path('params.yaml').read_text())['shift']",
         )
     )
     parameters = json.loads((project.folder / "params.yaml").read_text()) | {"shift": 0}
     (project.folder / "params.yaml").write_text(json.dumps(parameters, indent=1))
     (project.folder / "dvc.yaml").write_text(
-        (project.folder / "dvc.yaml").read_text().replace("deps: [learn.py,", "params: [shift]\n    deps: [learn.py,")
+        (project.folder / "dvc.yaml")
+        .read_text()
+        .replace("deps: [learn.py,", "params: [shift]\n    deps: [learn.py,")
     )
     project.run("git", "commit", "-qam", "a parameter")
     before = (project.folder / "datasets/learn/model.json").read_bytes()
@@ -387,7 +449,9 @@ def test_a_sweep_runs_every_point_beside_the_working_tree_and_tabulates_it(proje
     assert found.returncode == 0, found
     table = (project.folder / "reports/sweep.csv").read_text().splitlines()
     assert table == ["experiment,shift,learn:mean", "sweep-shift-1,1,12.0", "sweep-shift-2,2,13.0"]
-    assert (project.folder / "datasets/learn/model.json").read_bytes() == before and "lowest in experiment 1" in (
+    assert (
+        project.folder / "datasets/learn/model.json"
+    ).read_bytes() == before and "lowest in experiment 1" in (
         project.folder / "reports/sweep.html"
     ).read_text()
     assert project.run("git", "diff", "--stat").stdout == ""
@@ -398,14 +462,19 @@ def test_a_sweep_finds_the_file_of_each_key(tmp_path, monkeypatch):
     Path("params.yaml").write_text("learn: {window: null}")
     Path("params.expert.yaml").write_text("learn: {seed: 1}")
     asked = []
-    monkeypatch.setattr(sweeping, "dvc", lambda *words, log: asked.append(words[words.index("--set-param") : -1]))
+    monkeypatch.setattr(
+        sweeping, "dvc", lambda *words, log: asked.append(words[words.index("--set-param") : -1])
+    )
     monkeypatch.setattr(sweeping, "git", lambda *words: '{"cost": 1}')
     said = sweeping.sweep(["params.expert.yaml:learn.seed=1,2", "learn.window=3"], "learn", "learn:cost")
     assert asked == [
-        ("--set-param", f"params.expert.yaml:learn.seed={seed}", "--set-param", "params.yaml:learn.window=3") for seed in (1, 2)
+        ("--set-param", f"params.expert.yaml:learn.seed={seed}", "--set-param", "params.yaml:learn.window=3")
+        for seed in (1, 2)
     ]
     assert said.splitlines()[0].split() == ["experiment", "learn.seed", "learn.window", "learn:cost"]
-    with pytest.raises(ValueError, match=r"with a key of params.yaml or params.expert.yaml, found params.yaml:learn.seed=1; "):
+    with pytest.raises(
+        ValueError, match=r"with a key of params.yaml or params.expert.yaml, found params.yaml:learn.seed=1; "
+    ):
         sweeping.grid(["params.yaml:learn.seed=1"])
 
 
@@ -427,4 +496,7 @@ def test_a_change_of_either_file_of_parameters_is_something_new(tmp_path, monkey
 
 def test_a_sweep_over_a_key_that_is_not_there_is_refused(project):
     found = project.beadline("sweep", "-S", "colour=1,2", "--target", "learn", "--metric", "learn:mean")
-    assert found.returncode == 1 and "expected KEY=VALUE,VALUE with a key of params.yaml, found colour=1,2" in found.stderr
+    assert (
+        found.returncode == 1
+        and "expected KEY=VALUE,VALUE with a key of params.yaml, found colour=1,2" in found.stderr
+    )

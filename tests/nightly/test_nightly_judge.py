@@ -18,15 +18,20 @@ from tests.nightly.toy_nights import SETTINGS
 
 TEMPERATURE = {
     "judge": "temperature", "cases": "", "recordings": "datasets/raw/temperature",
-    "artifacts": ["datasets/identify_plant/plant.parquet", "datasets/learn_kernel/window.parquet", "datasets/tune_weights/weights.json"],
+    "artifacts": ["datasets/identify_plant/plant.parquet", "datasets/learn_kernel/window.parquet",
+    "datasets/tune_weights/weights.json"],
 }  # fmt: skip
 
 
 @pytest.fixture
 def project(tmp_path, root, monkeypatch):
-    """params.yaml with a small panel, and controllers of the study's machine below `datasets` (weights 1 and 1) and `champion/temperature` (inputs cost a thousand times as much: it creeps)."""
+    """params.yaml with a small panel, and controllers of the study's machine below `datasets` (weights 1 and
+    1) and `champion/temperature` (inputs cost a thousand times as much: it creeps)."""
     declared = params.read(root / "params.yaml")
-    declared["nightly"] = SETTINGS | {"loops": {"temperature": TEMPERATURE}, "holdout": SETTINGS["holdout"] | {"steps": 120}}
+    declared["nightly"] = SETTINGS | {
+        "loops": {"temperature": TEMPERATURE},
+        "holdout": SETTINGS["holdout"] | {"steps": 120},
+    }
     (tmp_path / "params.yaml").write_text(yaml.safe_dump(declared))
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(1)
@@ -36,14 +41,23 @@ def project(tmp_path, root, monkeypatch):
     for folder, r in (("datasets", 1.0), ("champion/temperature", 1000.0)):
         artifacts.write_arrays(f"{folder}/identify_plant/plant.parquet", "plant", 1, plant.stored([baam()]))
         artifacts.write_arrays(f"{folder}/learn_kernel/window.parquet", "window", 1, window.stored(long))
-        artifacts.write_json(f"{folder}/tune_weights/weights.json", {"practical": {"q": [1.0] * 5, "r": [r] * 7, "observer_tau": 1.0}})
+        artifacts.write_json(
+            f"{folder}/tune_weights/weights.json",
+            {"practical": {"q": [1.0] * 5, "r": [r] * 7, "observer_tau": 1.0}},
+        )
     return params.load(Nightly, "nightly")
 
 
 def test_both_are_judged_on_the_same_cases_and_the_same_noise_every_time(project):
     judged = judge.judge(project.loops["temperature"], project)
-    challenger, champion, again = (judged.measure(Path(folder)) for folder in ("datasets", "champion/temperature", "datasets"))
-    assert challenger == again and challenger.panel == champion.panel and list(challenger.cases) == list(champion.cases)
+    challenger, champion, again = (
+        judged.measure(Path(folder)) for folder in ("datasets", "champion/temperature", "datasets")
+    )
+    assert (
+        challenger == again
+        and challenger.panel == champion.panel
+        and list(challenger.cases) == list(champion.cases)
+    )
     # nominal, 7 inputs up and down, and more heat loss
     assert len({block for block, _ in challenger.cases.values()}) == 16
     # the one that creeps costs more in every block, and the rule says so both ways round
@@ -54,7 +68,10 @@ def test_both_are_judged_on_the_same_cases_and_the_same_noise_every_time(project
 
 def test_another_panel_has_another_name(project):
     other = project.model_copy(update={"holdout": project.holdout.model_copy(update={"seeds": [902]})})
-    first, second = (judge.judge(settings.loops["temperature"], settings).measure(Path("datasets")) for settings in (project, other))
+    first, second = (
+        judge.judge(settings.loops["temperature"], settings).measure(Path("datasets"))
+        for settings in (project, other)
+    )
     assert first.panel != second.panel
 
 
@@ -62,18 +79,29 @@ def test_a_controller_that_destabilises_a_plant_says_so(project):
     learned = window.restored(artifacts.read_arrays("datasets/learn_kernel/window.parquet", "window", 1))
     Theta = learned.Theta.copy()
     Theta[:, : 7 * learned.N] *= -1  # every heater taken for a cooler
-    artifacts.write_arrays("datasets/learn_kernel/window.parquet", "window", 1, window.stored(learned._replace(Theta=Theta)))
-    assert judge.judge(project.loops["temperature"], project).measure(Path("datasets")).guards["unstable_plants"] > 0
+    artifacts.write_arrays(
+        "datasets/learn_kernel/window.parquet", "window", 1, window.stored(learned._replace(Theta=Theta))
+    )
+    assert (
+        judge.judge(project.loops["temperature"], project).measure(Path("datasets")).guards["unstable_plants"]
+        > 0
+    )
 
 
 def test_a_part_s_chosen_composer_is_its_case(project):
     columns = {
-        "part": ["a", "a", "b"], "material": ["A", "A", "A"], "composer": ["basis", "on_off", "basis"], "chosen": [True, False, True],
-        "rms_percent_of_on_off": [1.0, 100.0, 2.0], "predicted_percent": [1.0, np.nan, 2.0], "worst_line_volume_percent": [0.5, 90.0, np.nan],
+        "part": ["a", "a", "b"], "material": ["A", "A", "A"], "composer": ["basis", "on_off", "basis"],
+        "chosen": [True, False, True],
+        "rms_percent_of_on_off": [1.0, 100.0, 2.0], "predicted_percent": [1.0, np.nan, 2.0],
+        "worst_line_volume_percent": [0.5, 90.0, np.nan],
     }  # fmt: skip
     artifacts.write_table("datasets/compose_parts/scores.parquet", SCORES, columns)
-    found = judge.judge(Loop(artifacts=["x"], judge="deposition", cases="", recordings=""), project).measure(Path("datasets"))
-    assert found.cases == {"a, A": ("a, A", 1.0), "b, A": ("b, A", 2.0)} and found.guards == {"worst_line_volume_percent": 0.5}
+    found = judge.judge(Loop(artifacts=["x"], judge="deposition", cases="", recordings=""), project).measure(
+        Path("datasets")
+    )
+    assert found.cases == {"a, A": ("a, A", 1.0), "b, A": ("b, A", 2.0)} and found.guards == {
+        "worst_line_volume_percent": 0.5
+    }
 
 
 def test_a_setpoint_case_costs_the_runs_that_do_not_settle(project):
@@ -84,22 +112,37 @@ def test_a_setpoint_case_costs_the_runs_that_do_not_settle(project):
         ("pid", "paper", "calm", True, 50.0, 9.0),
     ]
     named = {
-        "controller": [r[0] for r in rows], "simulator": [r[1] for r in rows], "case": [r[2] for r in rows], "counts": [r[3] for r in rows],
+        "controller": [r[0] for r in rows], "simulator": [r[1] for r in rows], "case": [r[2] for r in rows],
+        "counts": [r[3] for r in rows],
         "settled_percent": [r[4] for r in rows], "p90_steps": [r[5] for r in rows],
     }  # fmt: skip
     filler = {
-        column.name: ["agent"] * 4 if str(column.type) == "string" else np.ones(4, int) if "int" in str(column.type) else np.ones(4)
+        column.name: ["agent"] * 4
+        if str(column.type) == "string"
+        else np.ones(4, int)
+        if "int" in str(column.type)
+        else np.ones(4)
         for column in tables.SCOREBOARD.columns
     }
     artifacts.write_table("datasets/evaluate_setpoint/scoreboard.parquet", tables.SCOREBOARD, filler | named)
     artifacts.write_json("datasets/evaluate_setpoint/choice.json", {"name": "ours"})
-    found = judge.judge(Loop(artifacts=["x"], judge="setpoint", cases="", recordings=""), project).measure(Path("datasets"))
-    assert {name: cost for name, (_, cost) in found.cases.items()} == {"paper: calm": 2.0, "recorded: clog": 6.0}
+    found = judge.judge(Loop(artifacts=["x"], judge="setpoint", cases="", recordings=""), project).measure(
+        Path("datasets")
+    )
+    assert {name: cost for name, (_, cost) in found.cases.items()} == {
+        "paper: calm": 2.0,
+        "recorded: clog": 6.0,
+    }
     assert found.guards == {"worst_unsettled_percent": 6.0, "slowest_p90_steps": 30.0}
 
 
 def test_a_file_of_cases_that_lacks_its_costs_is_refused(project):
-    artifacts.write_json("datasets/cases.json", {"panel": "a", "cases": {"one": {"block": "b"}}, "guards": {}})
+    artifacts.write_json(
+        "datasets/cases.json", {"panel": "a", "cases": {"one": {"block": "b"}}, "guards": {}}
+    )
     loop = Loop(artifacts=["datasets/cases.json"], judge="cases", cases="datasets/cases.json", recordings="")
-    with pytest.raises(ValueError, match="expected panel, cases with block and cost, and guards with value and allowed, found no 'cost'"):
+    with pytest.raises(
+        ValueError,
+        match="expected panel, cases with block and cost, and guards with value and allowed, found no 'cost'",
+    ):
         judge.judge(loop, project).measure(Path("datasets"))

@@ -1,4 +1,5 @@
-"""Deposition and setpoint, from what their stages scored to what is in production: a better challenger goes in, a worse one or one with a worse guard does not."""
+"""Deposition and setpoint, from what their stages scored to what is in production: a better challenger goes
+in, a worse one or one with a worse guard does not."""
 
 from pathlib import Path
 
@@ -31,22 +32,30 @@ def project(empty, tmp_path, monkeypatch):
 
 
 def deposition(cost: float, guard: float) -> None:
-    """Eight parts whose composed flow leaves `cost` percent of on-off control's error, the worst line's volume wrong by `guard` percent; the yardstick beside each is not judged."""
+    """Eight parts whose composed flow leaves `cost` percent of on-off control's error, the worst line's
+    volume wrong by `guard` percent; the yardstick beside each is not judged."""
     names = [f"part {k}" for k in range(8)]
     columns = {
-        "part": 2 * names, "material": ["A"] * 16, "composer": ["basis"] * 8 + ["on_off"] * 8, "chosen": [True] * 8 + [False] * 8,
-        "rms_percent_of_on_off": [cost + 0.1 * k for k in range(8)] + [100.0] * 8, "predicted_percent": [cost] * 8 + [np.nan] * 8,
+        "part": 2 * names, "material": ["A"] * 16, "composer": ["basis"] * 8 + ["on_off"] * 8,
+        "chosen": [True] * 8 + [False] * 8,
+        "rms_percent_of_on_off": [cost + 0.1 * k for k in range(8)] + [100.0] * 8,
+        "predicted_percent": [cost] * 8 + [np.nan] * 8,
         "worst_line_volume_percent": [guard] * 8 + [50.0] * 8,
     }  # fmt: skip
     artifacts.write_table("datasets/compose_parts/scores.parquet", SCORES, columns)
 
 
 def setpoint(cost: float, guard: float) -> None:
-    """Eight cases in which the chosen controller does not settle `cost` percent of its runs, the slowest in `guard` steps; a case that does not count, and another controller."""
+    """Eight cases in which the chosen controller does not settle `cost` percent of its runs, the slowest in
+    `guard` steps; a case that does not count, and another controller."""
     rows = [("ours", f"case {k}", True, 100 - cost - 0.1 * k) for k in range(8)]
     rows += [("ours", "beyond the box", False, 0.0), ("pid", "case 0", True, 0.0)]
     filler = {
-        c.name: ["agent"] * 10 if str(c.type) == "string" else np.ones(10, int) if "int" in str(c.type) else np.ones(10)
+        c.name: ["agent"] * 10
+        if str(c.type) == "string"
+        else np.ones(10, int)
+        if "int" in str(c.type)
+        else np.ones(10)
         for c in tables.SCOREBOARD.columns
     }
     named = {"controller": [r[0] for r in rows], "simulator": ["paper"] * 10, "case": [r[1] for r in rows], "counts": [r[2] for r in rows],
@@ -56,7 +65,9 @@ def setpoint(cost: float, guard: float) -> None:
 
 
 @pytest.mark.parametrize(("loop", "score"), [("deposition", deposition), ("setpoint", setpoint)])
-def test_a_better_challenger_is_promoted_and_a_worse_one_or_one_with_a_worse_guard_is_not(project, monkeypatch, loop, score):
+def test_a_better_challenger_is_promoted_and_a_worse_one_or_one_with_a_worse_guard_is_not(
+    project, monkeypatch, loop, score
+):
     project.set(loops={loop: {"judge": loop, "cases": "", "recordings": "", "artifacts": LOOPS[loop]}})
     # cost, guard, and what the night must say of it
     nights = [
@@ -73,7 +84,9 @@ def test_a_better_challenger_is_promoted_and_a_worse_one_or_one_with_a_worse_gua
         Path("learn.py").write_text(f"# night {k}\n")  # something is new
         status, said = night.nightly()
         entry = night.nights()[-1]["decisions"][loop]
-        assert status == night.OK and entry["decision"] == decision and reason in " ".join(entry["reasons"]), (said, entry)
+        assert (
+            status == night.OK and entry["decision"] == decision and reason in " ".join(entry["reasons"])
+        ), (said, entry)
         assert champion.read()["champions"][loop]["run"] == ("night-0005" if k >= 4 else "night-0001")
     # production holds what was promoted, not what was scored last
     present = champion.read()["champions"][loop]["metrics"]["mean_cost"]
@@ -83,7 +96,12 @@ def test_a_better_challenger_is_promoted_and_a_worse_one_or_one_with_a_worse_gua
 def test_a_recording_that_cannot_be_read_is_set_aside_and_the_scheduler_is_told(project, monkeypatch):
     project.set(
         loops={
-            "deposition": {"judge": "deposition", "cases": "", "recordings": "datasets/raw/deposition", "artifacts": LOOPS["deposition"]}
+            "deposition": {
+                "judge": "deposition",
+                "cases": "",
+                "recordings": "datasets/raw/deposition",
+                "artifacts": LOOPS["deposition"],
+            }
         }
     )
     monkeypatch.setattr(night, "_reproduce", lambda *_: deposition(10.0, 2.0))
@@ -94,7 +112,9 @@ def test_a_recording_that_cannot_be_read_is_set_aside_and_the_scheduler_is_told(
     Path("learn.py").write_text("# something else is new\n")
     status, said = night.nightly()
     assert status == night.QUARANTINED == 4 and "trial_7.mcap" in said
-    assert not broken.exists() and (inputs.QUARANTINE / "deposition/trial_7.mcap").read_bytes().endswith(b"half a file")
+    assert not broken.exists() and (inputs.QUARANTINE / "deposition/trial_7.mcap").read_bytes().endswith(
+        b"half a file"
+    )
     assert champion.read()["champions"]["deposition"]["run"] == "night-0001"
     told = artifacts.read_json(watch.ALARM)
     assert told["kind"] == "quarantined" and "trial_7.mcap" in told["reasons"][0]
@@ -111,19 +131,41 @@ def test_the_gravest_of_a_night_is_its_exit_status():
 
 
 def test_drift_that_is_meant_is_accepted_by_hand_and_the_champion_stays(project, monkeypatch):
-    project.set(loops={"deposition": {"judge": "deposition", "cases": "", "recordings": "", "artifacts": LOOPS["deposition"]}})
+    project.set(
+        loops={
+            "deposition": {
+                "judge": "deposition",
+                "cases": "",
+                "recordings": "",
+                "artifacts": LOOPS["deposition"],
+            }
+        }
+    )
     monkeypatch.setattr(night, "_reproduce", lambda *_: deposition(10.0, 2.0))
     assert night.nightly()[0] == night.OK
-    with pytest.raises(ValueError, match="expected a loop with a champion and a drift alarm, found none; loops with an alarm: none"):
+    with pytest.raises(
+        ValueError,
+        match="expected a loop with a champion and a drift alarm, found none; loops with an alarm: none",
+    ):
         accepting.accept("deposition", "a new camera")
     before = project.production_of("deposition")
-    memory = {"alarms": [{"loop": "deposition"}], "pending": ["deposition: camera"], "drifted": {"deposition": ["trial_8.mcap"]}}
+    memory = {
+        "alarms": [{"loop": "deposition"}],
+        "pending": ["deposition: camera"],
+        "drifted": {"deposition": ["trial_8.mcap"]},
+    }
     artifacts.write_json(watch.LAST, watch.last() | {"drift": memory})
-    monkeypatch.setattr(screening, "reference", lambda loop, folder, only: {"schema": "reference", "version": 1, "camera": list(only)})
+    monkeypatch.setattr(
+        screening,
+        "reference",
+        lambda loop, folder, only: {"schema": "reference", "version": 1, "camera": list(only)},
+    )
     assert "is held against trial_8.mcap from now on" in accepting.accept("deposition", "a new camera")
     after = project.production_of("deposition")
     assert artifacts.read_json("champion/deposition/reference.json")["camera"] == ["trial_8.mcap"]
-    assert {name: after[name] for name in before} == before and watch.last()["drift"]["drifted"] == {"deposition": []}
+    assert {name: after[name] for name in before} == before and watch.last()["drift"]["drifted"] == {
+        "deposition": []
+    }
     line = champion.read()["history"][-1]
     assert (line["event"], line["why"], line["run"]) == ("drift accepted", "a new camera", "night-0001")
     assert not any(entry.endswith(("champion.json", ".dvc")) for entry in project.dirty())

@@ -1,4 +1,5 @@
-"""The remote as it is in the field: an S3-compatible server, here moto's on loopback, that knows nothing of this project."""
+"""The remote as it is in the field: an S3-compatible server, here moto's
+on loopback, that knows nothing of this project."""
 
 import os
 import socket
@@ -12,7 +13,9 @@ import pytest
 
 from tests.nightly.toy_nights import Project
 
-pytest.importorskip("moto", reason="moto is not installed: ./run --group s3 pytest -m slow tests/nightly/test_nightly_s3.py")
+pytest.importorskip(
+    "moto", reason="moto is not installed: ./run --group s3 pytest -m slow tests/nightly/test_nightly_s3.py"
+)
 pytest.importorskip("dvc_s3", reason="dvc-s3 is not installed")
 
 
@@ -24,11 +27,15 @@ def server(tmp_path):
         port = free.getsockname()[1]
     address = f"http://127.0.0.1:{port}"
     with (tmp_path / "moto.log").open("w") as log:
-        process = subprocess.Popen([sys.executable, "-m", "moto.server", "-p", str(port)], stdout=log, stderr=log)
+        process = subprocess.Popen(
+            [sys.executable, "-m", "moto.server", "-p", str(port)], stdout=log, stderr=log
+        )
     try:
         for _ in range(120):
             try:
-                urllib.request.urlopen(urllib.request.Request(f"{address}/beadline", method="PUT"), timeout=5).close()
+                urllib.request.urlopen(
+                    urllib.request.Request(f"{address}/beadline", method="PUT"), timeout=5
+                ).close()
                 break
             except (urllib.error.URLError, ConnectionError):
                 time.sleep(0.5)

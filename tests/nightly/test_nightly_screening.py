@@ -1,4 +1,5 @@
-"""New recordings of the temperature loop before anything learns from them: set aside, or measured against the champion's own nights."""
+"""New recordings of the temperature loop before anything learns from them: set
+aside, or measured against the champion's own nights."""
 
 from pathlib import Path
 
@@ -18,20 +19,30 @@ CALM = {"dither": 1.0}
 
 
 def commissioned(folder, loop):
-    """Four good shifts of a machine of two zones, the model identified from them, and what they say of it: the champion's folder."""
+    """Four good shifts of a machine of two zones, the model identified from them,
+    and what they say of it: the champion's folder."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         Path("params.yaml").write_text(yaml.safe_dump(nights.settings()))
         shifts = [nights.a_night(1, k, loop=loop) for k in range(4)]
         for k, columns in enumerate(shifts):
             nights.write(RAW / f"shift_{k}.csv", columns)
-        u, y = ([np.column_stack([one[f"{kind}_1"], one[f"{kind}_2"]]) for one in shifts] for kind in ("heater", "sensor"))
-        model = identification.identify(u, y, sample_time_s=1.0, max_order=3, names=["heater_1", "heater_2"]).plant
+        u, y = (
+            [np.column_stack([one[f"{kind}_1"], one[f"{kind}_2"]]) for one in shifts]
+            for kind in ("heater", "sensor")
+        )
+        model = identification.identify(
+            u, y, sample_time_s=1.0, max_order=3, names=["heater_1", "heater_2"]
+        ).plant
         champion = Path("champion/temperature")
         artifacts.write_arrays(champion / "identify_plant/plant.parquet", "plant", 1, plant.stored([model]))
-        artifacts.write_json(champion / "tune_weights/weights.json", {"practical": {"q": [1.0, 1.0], "r": [1.0, 1.0], "observer_tau": 1.0}})
         artifacts.write_json(
-            champion / screening.REFERENCE, screening.reference(params.load(Nightly, "nightly").loops["temperature"], champion)
+            champion / "tune_weights/weights.json",
+            {"practical": {"q": [1.0, 1.0], "r": [1.0, 1.0], "observer_tau": 1.0}},
+        )
+        artifacts.write_json(
+            champion / screening.REFERENCE,
+            screening.reference(params.load(Nightly, "nightly").loops["temperature"], champion),
         )
     return folder
 
@@ -54,7 +65,9 @@ def screened(columns, memory=None):
     """The screening of one new shift."""
     nights.write(NEW, columns)
     try:
-        return screening.look(params.load(Nightly, "nightly"), STATE, {"temperature": {str(NEW): "new"}}, memory or {}, night=9)
+        return screening.look(
+            params.load(Nightly, "nightly"), STATE, {"temperature": {str(NEW): "new"}}, memory or {}, night=9
+        )
     finally:
         NEW.unlink(missing_ok=True)
 
@@ -92,12 +105,20 @@ def test_ten_percent_of_drift_is_named_within_two_nights(look, changes, words):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"loop": CALM | {"aim_degC": (3.0, 0.0)}}, "closed loop: sensor_1 settles +1."),  # its loop's gain is 0.8: 0.8 / 1.8 of 3 °C
-        ({"loop": CALM, "colder_degC": 15.0}, "closed loop: heater_1 needs +9."),  # 15 °C at 1.6 °C a percent are 9.4 points
+        (
+            {"loop": CALM | {"aim_degC": (3.0, 0.0)}},
+            "closed loop: sensor_1 settles +1.",
+        ),  # its loop's gain is 0.8: 0.8 / 1.8 of 3 °C
+        (
+            {"loop": CALM, "colder_degC": 15.0},
+            "closed loop: heater_1 needs +9.",
+        ),  # 15 °C at 1.6 °C a percent are 9.4 points
         ({"loop": {"dither": 30.0}}, "closed loop: heater_2 is at a limit +"),  # from 75 percent on, up by 30
     ],
 )
-def test_a_loop_that_settles_elsewhere_works_harder_or_saturates_is_found_within_two_nights(calm, monkeypatch, changes, words):
+def test_a_loop_that_settles_elsewhere_works_harder_or_saturates_is_found_within_two_nights(
+    calm, monkeypatch, changes, words
+):
     monkeypatch.chdir(calm)
     memory = {}
     for k in (250, 251):
@@ -105,7 +126,10 @@ def test_a_loop_that_settles_elsewhere_works_harder_or_saturates_is_found_within
         memory = found["memory"]
         if any(alarm["cause"].startswith(words) for alarm in found["alarms"]):
             break
-    assert any(alarm["cause"].startswith(words) for alarm in found["alarms"]), (found["alarms"], found["watched"])
+    assert any(alarm["cause"].startswith(words) for alarm in found["alarms"]), (
+        found["alarms"],
+        found["watched"],
+    )
     # the plant has not changed
     assert not any("gain" in alarm["cause"] or "time constant" in alarm["cause"] for alarm in found["alarms"])
 
@@ -114,7 +138,9 @@ def test_good_shifts_of_production_raise_nothing(calm, monkeypatch):
     monkeypatch.chdir(calm)
     for k in range(5):
         found = screened(nights.a_night(1, 400 + k, loop=CALM))
-        assert found["alarms"] == [] and "sensor_1 offset_degC" in found["figures"][str(NEW)]["closed_loop"], found
+        assert (
+            found["alarms"] == [] and "sensor_1 offset_degC" in found["figures"][str(NEW)]["closed_loop"]
+        ), found
 
 
 def test_swapped_sensors_are_set_aside_with_the_reason_beside_them(look):
@@ -134,7 +160,9 @@ def test_swapped_sensors_are_set_aside_with_the_reason_beside_them(look):
 
 def test_a_night_without_recordings_keeps_the_alarm_of_the_one_before(look):
     alarm = {"loop": "temperature", "cause": "the gain from heater_1 has changed by -10 %"}
-    found = screening.look(params.load(Nightly, "nightly"), STATE, {"temperature": {}}, {"alarms": [alarm]}, night=9)
+    found = screening.look(
+        params.load(Nightly, "nightly"), STATE, {"temperature": {}}, {"alarms": [alarm]}, night=9
+    )
     assert found["alarms"] == [alarm]
 
 
@@ -147,7 +175,9 @@ def test_what_drifted_is_remembered_until_a_good_night_and_can_be_what_later_nig
     before = artifacts.read_json(folder / screening.REFERENCE)
     try:
         nights.write(RAW / "drifted.csv", nights.a_night(1, 200, gain=(0.9, 1.0)))
-        artifacts.write_json(folder / screening.REFERENCE, screening.reference(loop, folder, only=[str(RAW / "drifted.csv")]))
+        artifacts.write_json(
+            folder / screening.REFERENCE, screening.reference(loop, folder, only=[str(RAW / "drifted.csv")])
+        )
         assert look(nights.a_night(1, 201, gain=(0.9, 1.0)))["alarms"] == []
         assert "gain from heater_1 has changed by +1" in look(nights.a_night(1, 101))["alarms"][0]["cause"]
     finally:

@@ -1,4 +1,5 @@
-"""A project of two fast stages in a repository of its own, on which the nightly job's mechanics are played: learn the mean of all recordings, and judge it on eight cases."""
+"""A project of two fast stages in a repository of its own, on which the nightly job's mechanics are played:
+learn the mean of all recordings, and judge it on eight cases."""
 
 import json
 import os
@@ -54,23 +55,28 @@ stages:
 """
 
 SETTINGS = {
-    "promotion": "at_once", "branch": "nightly", "remote": "", "longest_h": 0.1, "least_free_mb": 1, "watch_h": 36, "alarm": "", "webhook": "",
+    "promotion": "at_once", "branch": "nightly", "remote": "", "longest_h": 0.1, "least_free_mb": 1,
+    "watch_h": 36, "alarm": "", "webhook": "",
     "loops": {
         "toy": {
-            "artifacts": ["datasets/learn/model.json", "datasets/learn/weights.bin", "datasets/evaluate/cases.json"], "judge": "cases",
+            "artifacts": ["datasets/learn/model.json", "datasets/learn/weights.bin",
+            "datasets/evaluate/cases.json"], "judge": "cases",
             "cases": "datasets/evaluate/cases.json", "recordings": "datasets/raw/toy",
         }
     },
     "rule": {
-        "level": 0.01, "least_improvement_percent": 5, "worst_case_percent": 5, "settled_error_degC": 0.05,  "least_disk_margin": 0.5,
+        "level": 0.01, "least_improvement_percent": 5, "worst_case_percent": 5, "settled_error_degC": 0.05,
+        "least_disk_margin": 0.5,
         "holdout_error_percent": 5,
     },
     "holdout": {
-        "controller": "window", "recordings": "datasets/holdout/temperature", "starts_degC": [20], "reference_offsets_degC": [0], "noise_degC": 0.1, "seeds": [901],
+        "controller": "window", "recordings": "datasets/holdout/temperature", "starts_degC": [20],
+        "reference_offsets_degC": [0], "noise_degC": 0.1, "seeds": [901],
         "steps": 300,
     },
     "drift": {
-        "alarm_sigmas": 5, "watch_sigmas": 3, "parameter_percent": 4, "offset_degC": 0.5, "noise_percent": 50, "effort_percent": 5, "at_limits_points": 10,
+        "alarm_sigmas": 5, "watch_sigmas": 3, "parameter_percent": 4, "offset_degC": 0.5, "noise_percent": 50,
+        "effort_percent": 5, "at_limits_points": 10,
         "camera_px": 2, "contrast_percent": 15, "balance_points": 20,
     },
 }  # fmt: skip
@@ -83,7 +89,8 @@ class Project:
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
         self.env = {key: value for key, value in os.environ.items() if not key.startswith(("GIT_", "DVC_", "BEADLINE_"))} | {
-            "PYTHONPATH": str(ROOT), "DVC_NO_ANALYTICS": "1", "GIT_CONFIG_GLOBAL": "/dev/null", "GIT_CONFIG_SYSTEM": "/dev/null",
+            "PYTHONPATH": str(ROOT), "DVC_NO_ANALYTICS": "1", "GIT_CONFIG_GLOBAL": "/dev/null",
+            "GIT_CONFIG_SYSTEM": "/dev/null",
             "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
         }  # fmt: skip
 
@@ -93,7 +100,12 @@ class Project:
         self.run("git", "config", "user.name", "Somebody")
         self.run(sys.executable, "-m", "dvc", "init", "-q")
         self.run(sys.executable, "-m", "dvc", "config", "core.analytics", "false")
-        for name, text in {"learn.py": LEARN, "evaluate.py": EVALUATE, "dvc.yaml": DVC, ".gitignore": "/reports/*.html\n"}.items():
+        for name, text in {
+            "learn.py": LEARN,
+            "evaluate.py": EVALUATE,
+            "dvc.yaml": DVC,
+            ".gitignore": "/reports/*.html\n",
+        }.items():
             (self.folder / name).write_text(text)
         self.set()
         self.record("first", [11.0, 11.0, 11.0])
@@ -112,7 +124,9 @@ class Project:
         return path
 
     def run(self, *command: str, check: bool = True) -> subprocess.CompletedProcess:
-        found = subprocess.run(command, check=False, cwd=self.folder, env=self.env, capture_output=True, text=True)
+        found = subprocess.run(
+            command, check=False, cwd=self.folder, env=self.env, capture_output=True, text=True
+        )
         assert not check or found.returncode == 0, f"{command}: {found.stdout}{found.stderr}"
         return found
 
@@ -145,7 +159,11 @@ class Project:
 
     def production_of(self, loop: str) -> dict[str, bytes]:
         folder = self.folder / "champion" / loop
-        return {path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+        return {
+            path.relative_to(folder).as_posix(): path.read_bytes()
+            for path in sorted(folder.rglob("*"))
+            if path.is_file()
+        }
 
     def dirty(self) -> list[str]:
         return self.run("git", "status", "--porcelain").stdout.splitlines()

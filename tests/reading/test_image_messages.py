@@ -14,7 +14,8 @@ from pipeline.reading.mcap_messages import Channel
 from pipeline.reading.ros_messages import UnreadableMessage
 from tests.mcap_writing import cdr
 
-# A picture of 2 rows, [1 2 3] and [4 5 6], each with a byte of padding, taken at 7.000000500 s by "cam"; and PNGDATA as format "png" of the same camera.
+# A picture of 2 rows, [1 2 3] and [4 5 6], each with a byte of padding, taken at 7.000000500 s by "cam"; and
+# PNGDATA as format "png" of the same camera.
 # rosbags 0.11: serialize_ros1 (counter 9), serialize_cdr in both byte orders
 ROS1 = "0900000007000000f40100000300000063616d0200000003000000050000006d6f6e6f380004000000080000000102030004050600"
 ROS1_COMPRESSED = "0900000007000000f40100000300000063616d03000000706e6707000000504e4744415441"
@@ -40,20 +41,43 @@ COMPRESSED_IMAGE_FILE = (
 )
 STAMP = {"sec": 7, "nsec": 500}
 ROWS = base64.b64encode(bytes([1, 2, 3, 0, 4, 5, 6, 0])).decode()
-JSON = json.dumps({"timestamp": STAMP, "frame_id": "cam", "width": 3, "height": 2, "encoding": "mono8", "step": 4, "data": ROWS}).encode()
+JSON = json.dumps(
+    {
+        "timestamp": STAMP,
+        "frame_id": "cam",
+        "width": 3,
+        "height": 2,
+        "encoding": "mono8",
+        "step": 4,
+        "data": ROWS,
+    }
+).encode()
 JSON_COMPRESSED = json.dumps(
     {"timestamp": STAMP, "frame_id": "cam", "format": "png", "data": base64.b64encode(b"PNGDATA").decode()}
 ).encode()
 # builtin_interfaces/Time, frame, then as foxglove_msgs has its fields
-FOXGLOVE_CDR = cdr(("i", [7]), ("I", [500]), ("s", "cam"), ("I", [3, 2]), ("s", "mono8"), ("I", [4, 8]), ("B", [1, 2, 3, 0, 4, 5, 6, 0]))
-FOXGLOVE_CDR_COMPRESSED = cdr(("i", [7]), ("I", [500]), ("s", "cam"), ("I", [7]), ("B", b"PNGDATA"), ("s", "png"))
+FOXGLOVE_CDR = cdr(
+    ("i", [7]),
+    ("I", [500]),
+    ("s", "cam"),
+    ("I", [3, 2]),
+    ("s", "mono8"),
+    ("I", [4, 8]),
+    ("B", [1, 2, 3, 0, 4, 5, 6, 0]),
+)
+FOXGLOVE_CDR_COMPRESSED = cdr(
+    ("i", [7]), ("I", [500]), ("s", "cam"), ("I", [7]), ("B", b"PNGDATA"), ("s", "png")
+)
 
 
 def channel(encoding: str, name: str, schema: bytes = b"") -> Channel:
     return Channel(1, "/camera", encoding, {}, name, "", schema)
 
 
-DESCRIPTORS = [base64.b64decode(TIMESTAMP_FILE) + base64.b64decode(file) for file in (RAW_IMAGE_FILE, COMPRESSED_IMAGE_FILE)]
+DESCRIPTORS = [
+    base64.b64decode(TIMESTAMP_FILE) + base64.b64decode(file)
+    for file in (RAW_IMAGE_FILE, COMPRESSED_IMAGE_FILE)
+]
 RAW = {
     "ros1": (channel("ros1", "sensor_msgs/Image"), bytes.fromhex(ROS1)),
     "cdr": (channel("cdr", "sensor_msgs/msg/Image"), bytes.fromhex(CDR)),
@@ -67,12 +91,23 @@ COMPRESSED = {
     "ros1": (channel("ros1", "sensor_msgs/CompressedImage"), bytes.fromhex(ROS1_COMPRESSED)),
     "cdr": (channel("cdr", "sensor_msgs/msg/CompressedImage"), bytes.fromhex(CDR_COMPRESSED)),
     "cdr foxglove": (channel("cdr", "foxglove_msgs/msg/CompressedImage"), FOXGLOVE_CDR_COMPRESSED),
-    "protobuf": (channel("protobuf", "foxglove.CompressedImage", DESCRIPTORS[1]), bytes.fromhex(PROTOBUF_COMPRESSED)),
+    "protobuf": (
+        channel("protobuf", "foxglove.CompressedImage", DESCRIPTORS[1]),
+        bytes.fromhex(PROTOBUF_COMPRESSED),
+    ),
     "json": (channel("json", "foxglove.CompressedImage"), JSON_COMPRESSED),
 }
 
 
-def rows(encoding: str, height: int, width: int, data: np.ndarray | bytes, *, step: int = 0, big_endian: bool = False) -> Picture:
+def rows(
+    encoding: str,
+    height: int,
+    width: int,
+    data: np.ndarray | bytes,
+    *,
+    step: int = 0,
+    big_endian: bool = False,
+) -> Picture:
     return Picture(0, encoding, height, width, step, big_endian, memoryview(bytes(data)))
 
 
@@ -140,7 +175,9 @@ def test_what_we_write_is_what_another_encoder_writes():
     wanted = bytes.fromhex(CDR)
     # the other message has rows of four bytes
     assert image(header_of(7_000_000_500, "cam"), frame)[:-14] == wanted[:-16]
-    assert image(header_of(7_000_000_500, "cam"), frame)[-14:] == struct.pack("<II", 3, 6) + bytes([1, 2, 3, 4, 5, 6])
+    assert image(header_of(7_000_000_500, "cam"), frame)[-14:] == struct.pack("<II", 3, 6) + bytes(
+        [1, 2, 3, 4, 5, 6]
+    )
 
 
 def test_a_topic_of_text_is_no_image_topic_and_is_refused_by_its_type():
@@ -148,7 +185,8 @@ def test_a_topic_of_text_is_no_image_topic_and_is_refused_by_its_type():
     assert not is_image(text)
     assert not is_image(channel("protobuf", "sensor_msgs/msg/Image"))
     with pytest.raises(
-        ValueError, match=r"type 'std_msgs/msg/String' in 'cdr' are no images that are read; sensor_msgs Image and CompressedImage"
+        ValueError,
+        match=r"type 'std_msgs/msg/String' in 'cdr' are no images that are read; sensor_msgs Image and CompressedImage",
     ):
         reader(text)
 
@@ -157,7 +195,14 @@ def test_a_topic_of_text_is_no_image_topic_and_is_refused_by_its_type():
 
 
 @pytest.mark.parametrize(
-    ("encoding", "order"), [("rgb8", [0, 1, 2]), ("bgr8", [2, 1, 0]), ("8UC3", [2, 1, 0]), ("rgba8", [0, 1, 2, 3]), ("bgra8", [2, 1, 0, 3])]
+    ("encoding", "order"),
+    [
+        ("rgb8", [0, 1, 2]),
+        ("bgr8", [2, 1, 0]),
+        ("8UC3", [2, 1, 0]),
+        ("rgba8", [0, 1, 2, 3]),
+        ("bgra8", [2, 1, 0, 3]),
+    ],
 )
 def test_gray_of_a_colour_image_is_its_luma(encoding, order):
     rgba = np.random.default_rng(0).integers(0, 256, (4, 5, 4), dtype=np.uint8)
@@ -172,7 +217,9 @@ def test_gray_of_a_colour_image_is_its_luma(encoding, order):
 @pytest.mark.parametrize("big_endian", [False, True])
 def test_sixteen_bits_stay_sixteen_bits_in_either_byte_order(big_endian):
     values = np.array([[1, 256, 65535], [515, 0, 40000]], np.uint16)
-    frame = gray(rows("mono16", 2, 3, values.astype(">u2" if big_endian else "<u2").tobytes(), big_endian=big_endian))
+    frame = gray(
+        rows("mono16", 2, 3, values.astype(">u2" if big_endian else "<u2").tobytes(), big_endian=big_endian)
+    )
     assert frame.dtype == np.uint16
     np.testing.assert_array_equal(frame, values)
     np.testing.assert_array_equal(gray(encoded(cv2.imencode(".png", values)[1])), values)
@@ -187,7 +234,8 @@ def test_gray_of_yuv_is_its_luma_byte():
 def test_an_even_gray_surface_behind_a_bayer_filter_is_even_gray():
     for name in ("rggb", "bggr", "gbrg", "grbg"):
         assert np.unique(gray(rows(f"bayer_{name}8", 6, 8, np.full(48, 77, np.uint8)))).tolist() == [77]
-    # a red surface: only the red sites see light, and its gray is 0.299 of it; of the wrong pattern it would be blue's 0.114
+    # a red surface: only the red sites see light, and its gray is 0.299 of
+    # it; of the wrong pattern it would be blue's 0.114
     red = np.zeros((6, 8), np.uint8)
     red[::2, ::2] = 200
     np.testing.assert_allclose(gray(rows("bayer_rggb8", 6, 8, red))[2:-2, 2:-2], 0.299 * 200, atol=1)
@@ -208,7 +256,10 @@ def test_a_compressed_picture_is_decoded_whole_or_not_at_all(ending):
     ("picture", "said"),
     [
         (rows("mono8", 2, 3, bytes(5)), "3 x 2 px mono8 in rows of 3 bytes do not go with 5 bytes of data"),
-        (rows("rgb8", 2, 3, bytes(18), step=8), "3 x 2 px rgb8 in rows of 8 bytes do not go with 18 bytes of data"),
+        (
+            rows("rgb8", 2, 3, bytes(18), step=8),
+            "3 x 2 px rgb8 in rows of 8 bytes do not go with 18 bytes of data",
+        ),
         (rows("mono8", -2, 3, bytes(6)), "3 x -2 px"),
         (rows("mono8", 2, 0, bytes(6)), "0 x 2 px"),
         (rows("32FC1", 1, 1, bytes(4)), "the encoding '32FC1' is not read; mono8, mono16"),
@@ -223,7 +274,13 @@ def test_a_picture_that_does_not_agree_with_itself_is_refused(picture, said):
 def test_the_frames_of_a_viewers_own_test_recording_are_read(shared):
     with shared("data/mcap_ros2/custom-camera-model.mcap").open("rb") as stream:
         found = [
-            gray(reader(Channel(of.id, of.topic, of.message_encoding, {}, schema.name, schema.encoding, schema.data))(message.data))
+            gray(
+                reader(
+                    Channel(
+                        of.id, of.topic, of.message_encoding, {}, schema.name, schema.encoding, schema.data
+                    )
+                )(message.data)
+            )
             for schema, of, message in make_reader(stream).iter_messages(topics=["/image/compressed"])
         ]
     assert len(found) == 10

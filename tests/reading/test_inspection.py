@@ -31,7 +31,10 @@ def test_the_proposal_is_yaml_that_maps_the_recording(tmp_path):
         "temperature_2": {"source": "T2_F", "unit": "degC", "scale": 0.555556, "offset": -17.7778},
     }
     Plant.model_validate_json(json.dumps(found["plant"]))
-    sources = [Source(name, one["source"], one["unit"], one["scale"], one["offset"]) for name, one in found["ingest"]["mapping"].items()]
+    sources = [
+        Source(name, one["source"], one["unit"], one["scale"], one["offset"])
+        for name, one in found["ingest"]["mapping"].items()
+    ]
     raw = read(path, sources)
     assert raw.signals["temperature_1"][1][0] == pytest.approx(16.85)
     # 70 °F; the factor has six digits
@@ -42,7 +45,10 @@ def test_the_proposal_is_yaml_that_maps_the_recording(tmp_path):
 def test_rates_jitter_gaps_and_ranges_are_those_of_the_file(tmp_path):
     path = tmp_path / "rig.csv"
     time = [0, 0.5, 1.0, 1.6, 2.0, 9.0, 9.5, 10.0]
-    path.write_text("t_s,heater_1,T1_C,note\n" + "".join(f"{t},{k % 3},{20 + k if k != 4 else ''},ok\n" for k, t in enumerate(time)))
+    path.write_text(
+        "t_s,heater_1,T1_C,note\n"
+        + "".join(f"{t},{k % 3},{20 + k if k != 4 else ''},ok\n" for k, t in enumerate(time))
+    )
     text = inspect(path)
     assert "rows: 8 samples in 10 s, every 0.5 s (2 per second)" in text
     assert "0.1 s (largest); 1 gaps beyond 1.5 s, the longest 7 s at 2 s" in text
@@ -92,7 +98,9 @@ def test_damage_and_a_clock_that_runs_backwards_are_told_and_not_refused(tmp_pat
 def test_a_table_without_names_is_guessed_from_its_values_and_says_so(tmp_path):
     rng = np.random.default_rng(0)
     path = tmp_path / "rig.dat"
-    np.savetxt(path, np.column_stack([np.repeat(rng.choice([3.4, 6.4], 100), 10), np.cumsum(rng.normal(size=1000))]))
+    np.savetxt(
+        path, np.column_stack([np.repeat(rng.choice([3.4, 6.4], 100), 10), np.cumsum(rng.normal(size=1000))])
+    )
     text = inspect(path)
     assert "# a proposal from the values alone" in text
     assert [one["source"] for one in proposal(text)["ingest"]["mapping"].values()] == ["column_1", "column_2"]
@@ -102,7 +110,11 @@ def test_a_table_without_names_is_guessed_from_its_values_and_says_so(tmp_path):
 
 def test_our_own_recordings_are_proposed_under_their_own_names(tmp_path):
     time = np.arange(100.0)
-    signals = {"heater_1": (time % 7, "percent", ""), "motor": (time % 5, "percent", ""), "sensor_1": (150 + time / 10, "degC", "")}
+    signals = {
+        "heater_1": (time % 7, "percent", ""),
+        "motor": (time % 5, "percent", ""),
+        "sensor_1": (150 + time / 10, "degC", ""),
+    }
     write_recording(tmp_path / "ours.mcap", time, signals)
     found = proposal(inspect(tmp_path / "ours.mcap"))
     assert {name: one["source"] for name, one in found["ingest"]["mapping"].items()} == {
@@ -118,10 +130,17 @@ def test_the_same_file_gives_the_same_words(shared):
     text = inspect(path)
     assert text == inspect(path)
     assert "rows: 5100 samples in 5099 s, every 1 s" in text
-    assert [one["source"] for one in proposal(text)["ingest"]["mapping"].values()] == ["Q1_pct", "Q2_pct", "T1_C", "T2_C"]
+    assert [one["source"] for one in proposal(text)["ingest"]["mapping"].values()] == [
+        "Q1_pct",
+        "Q2_pct",
+        "T1_C",
+        "T2_C",
+    ]
 
 
-@pytest.mark.parametrize("name", ["cdr_test_0", "custom-camera-model", "talker", "topics_and_services", "wbag_0"])
+@pytest.mark.parametrize(
+    "name", ["cdr_test_0", "custom-camera-model", "talker", "topics_and_services", "wbag_0"]
+)
 def test_mcap_files_of_others_are_inspected(shared, name):
     text = inspect(shared(f"data/mcap_ros2/{name}.mcap"))
     assert "topics" in text
@@ -133,14 +152,25 @@ def test_mcap_files_of_others_are_inspected(shared, name):
     [
         (b"", "is empty (0 bytes)"),
         (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", "is a PNG picture but should be MCAP, Parquet or CSV"),
-        (bytes(np.random.default_rng(0).integers(1, 256, 4000, np.uint8)), "are neither text nor Parquet nor MCAP"),
+        (
+            bytes(np.random.default_rng(0).integers(1, 256, 4000, np.uint8)),
+            "are neither text nor Parquet nor MCAP",
+        ),
         (b"name,owner\nrig,bob\nrig,eve\n", "has 3 lines of text and no data"),
-        (b"import numpy as np\n\ndef f(x, y):\n    return 1 + x, 2\n\n\nclass A:\n    a: int = 3\n", "is text but no table"),
-        (b"t,Q1,T1\n0,20 %,21 C\n1,20 %,21 C\n", "none of its 3 columns holds numbers beside the time (Q1 (text such as '20 %')"),
+        (
+            b"import numpy as np\n\ndef f(x, y):\n    return 1 + x, 2\n\n\nclass A:\n    a: int = 3\n",
+            "is text but no table",
+        ),
+        (
+            b"t,Q1,T1\n0,20 %,21 C\n1,20 %,21 C\n",
+            "none of its 3 columns holds numbers beside the time (Q1 (text such as '20 %')",
+        ),
     ],
     ids=["empty", "picture", "bytes", "text", "program", "units"],
 )
-def test_what_is_no_recording_is_refused_in_one_sentence_of_the_command(tmp_path, monkeypatch, capsys, content, said):
+def test_what_is_no_recording_is_refused_in_one_sentence_of_the_command(
+    tmp_path, monkeypatch, capsys, content, said
+):
     path = tmp_path / "rig.csv"
     path.write_bytes(content)
     monkeypatch.setattr(sys, "argv", ["beadline", "inspect", str(path)])
@@ -158,14 +188,22 @@ def test_a_table_without_a_time_is_told_what_to_write_and_the_proposal_has_it(tm
     path = tmp_path / "rig.csv"
     path.write_text("Q1,T1\n" + "".join(f"{k % 30},{20 + k / 7}\n" for k in range(100)))
     text = inspect(path)
-    assert "no column is called like a time; write its name, or time: every 1.0 s with the sample time" in text
+    assert (
+        "no column is called like a time; write its name, or time: every 1.0 s with the sample time" in text
+    )
     assert proposal(text)["ingest"]["time"] == "every 1.0 s"
 
 
 def test_columns_of_one_name_are_named_and_those_of_other_programs_are_recognised(tmp_path):
     path = tmp_path / "rig.csv"
     names = "timestamp,tool0 actual,tool0 target,heater_bed.temperature,extruder.power,x,x"
-    path.write_text(names + "\n" + "".join(f"2025-11-21 13:00:{k:02d},{20 + k / 7},60,{30 + k / 9},0.{k % 9},{k},{k}\n" for k in range(60)))
+    path.write_text(
+        names
+        + "\n"
+        + "".join(
+            f"2025-11-21 13:00:{k:02d},{20 + k / 7},60,{30 + k / 9},0.{k % 9},{k},{k}\n" for k in range(60)
+        )
+    )
     text = inspect(path)
     assert "the same name twice, so that none of them can be mapped; give each its own: x (2 times)" in text
     assert {name: one["source"] for name, one in proposal(text)["ingest"]["mapping"].items()} == {

@@ -78,7 +78,9 @@ def test_day_and_month_are_told_by_a_date_that_can_be_only_one_of_both():
     ],
 )
 def test_what_is_no_time_is_refused_with_its_line(text, said):
-    with pytest.raises(ValueError, match=r"^rig\.csv: line 3, time time should be seconds or ISO 8601") as refusal:
+    with pytest.raises(
+        ValueError, match=r"^rig\.csv: line 3, time time should be seconds or ISO 8601"
+    ) as refusal:
         read("2025-11-21T12:00:00", text)
     assert said in str(refusal.value)
     assert str(refusal.value).endswith("; convert it, or name another column")

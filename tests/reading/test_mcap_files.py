@@ -53,9 +53,12 @@ def test_150_of_150_bit_flips_inside_chunks_are_detected_and_the_other_chunks_ke
         detected += "damage" in kinds(raw)
         assert right(raw)
         lost = SAMPLES - len(raw.signals["heater_1"][0])
-        # one chunk of 4000 bytes holds some 50 messages; a flip in bits that a decompressor passes over costs none
+        # one chunk of 4000 bytes holds some 50 messages; a flip in
+        # bits that a decompressor passes over costs none
         assert lost < 100
-        assert not lost or any(f"at byte {offset} was left out with its {lost} messages" in note.message for note in raw.notes)
+        assert not lost or any(
+            f"at byte {offset} was left out with its {lost} messages" in note.message for note in raw.notes
+        )
     assert detected == 150
 
 
@@ -76,7 +79,9 @@ def test_every_complete_chunk_of_a_truncated_file_is_recovered_and_counted(tmp_p
     parts = chunks(content)
     # the mcap package counts what each chunk of the whole file holds
     held = [
-        len(breakup_chunk(record)) for record in StreamReader(io.BytesIO(content), emit_chunks=True).records if isinstance(record, Chunk)
+        len(breakup_chunk(record))
+        for record in StreamReader(io.BytesIO(content), emit_chunks=True).records
+        if isinstance(record, Chunk)
     ]
     held[0] -= 1  # the channel's own record
     assert sum(held) == SAMPLES
@@ -85,7 +90,10 @@ def test_every_complete_chunk_of_a_truncated_file_is_recovered_and_counted(tmp_p
         raw = opened(tmp_path, content[:end])
         count = sum(held[:complete])
         assert raw.messages == {"/machine": count}
-        assert any(note.message.endswith(f"{complete} whole chunks and {count} messages were recovered") for note in raw.notes)
+        assert any(
+            note.message.endswith(f"{complete} whole chunks and {count} messages were recovered")
+            for note in raw.notes
+        )
         assert right(raw)
         np.testing.assert_array_equal(raw.signals["heater_1"][0], np.arange(count))
 
@@ -133,29 +141,38 @@ def test_channels_of_a_lost_first_chunk_come_from_the_summary(tmp_path):
 def test_damage_in_messages_outside_chunks_is_refused_because_it_cannot_be_placed(tmp_path):
     content = json_recording(SAMPLES, use_chunking=False, enable_data_crcs=True)
     place = content.index(b'"heater_1": 700.0') + 13
-    with pytest.raises(ValueError, match=r"the data section's CRC should be 0x\w+ but is 0x\w+, and its messages have no CRC of their own"):
+    with pytest.raises(
+        ValueError,
+        match=r"the data section's CRC should be 0x\w+ but is 0x\w+, and its messages have no CRC of their own",
+    ):
         opened(tmp_path, flipped(content, place, 0))
 
 
 def test_messages_without_any_crc_are_read_and_said_to_be_unchecked(tmp_path):
     raw = opened(tmp_path, json_recording(SAMPLES, use_chunking=False))
-    assert [note.message for note in raw.notes] == [f"{SAMPLES} messages outside chunks have no CRC, so damage in them would not be seen"]
+    assert [note.message for note in raw.notes] == [
+        f"{SAMPLES} messages outside chunks have no CRC, so damage in them would not be seen"
+    ]
     raw = opened(tmp_path, json_recording(SAMPLES, enable_crcs=False))
     assert [note.kind for note in raw.notes] == ["unchecked"]
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "how"), [(b"\r\n", b"\n", "CR LF to LF"), (b"\n", b"\r\n", "LF to CR LF"), (b"\r\n", b"\r", "CR LF to CR")]
+    ("old", "new", "how"),
+    [(b"\r\n", b"\n", "CR LF to LF"), (b"\n", b"\r\n", "LF to CR LF"), (b"\r\n", b"\r", "CR LF to CR")],
 )
 def test_converted_line_ends_are_named_as_such(tmp_path, old, new, how):
     with pytest.raises(
-        ValueError, match=rf"offset 0 should be 89 4d 43 41 50 30 0d 0a .* line ends were converted \({how}\).*\.gitattributes"
+        ValueError,
+        match=rf"offset 0 should be 89 4d 43 41 50 30 0d 0a .* line ends were converted \({how}\).*\.gitattributes",
     ):
         opened(tmp_path, json_recording(SAMPLES).replace(old, new))
 
 
 def test_an_unknown_compression_is_named(tmp_path):
-    content = json_recording(SAMPLES, ZSTD).replace(struct.pack("<I", 4) + b"zstd", struct.pack("<I", 4) + b"brot")
+    content = json_recording(SAMPLES, ZSTD).replace(
+        struct.pack("<I", 4) + b"zstd", struct.pack("<I", 4) + b"brot"
+    )
     with pytest.raises(ValueError, match="compression 'brot' is not known; zstd and lz4 are"):
         opened(tmp_path, content)
 
@@ -173,7 +190,10 @@ def test_two_channels_of_one_topic_are_joined_one_after_the_other_and_refused_at
     raw = opened(tmp_path, recorded(20))
     assert len(raw.signals["heater_1"][0]) == 20
     assert kinds(raw) == {"channels"}
-    with pytest.raises(ValueError, match="topic /machine comes from channels 1 and 2 at the same time, as if two devices had one name"):
+    with pytest.raises(
+        ValueError,
+        match="topic /machine comes from channels 1 and 2 at the same time, as if two devices had one name",
+    ):
         opened(tmp_path, recorded(5))
 
 
@@ -182,11 +202,19 @@ def test_two_publishers_whose_clocks_differ_are_told_and_a_late_message_is_not(t
         made = Written()
         channel = made.topic("/machine", "json")
         for k in range(200):
-            made.message(channel, k, {"heater_1": k, "temperature_1": 20 + k / 8}, published_s=k + 50 - behind_s * (k in late))
+            made.message(
+                channel,
+                k,
+                {"heater_1": k, "temperature_1": 20 + k / 8},
+                published_s=k + 50 - behind_s * (k in late),
+            )
         return made.bytes()
 
     assert kinds(opened(tmp_path, recorded([20, 90], 3.5))) == set()
     raw = opened(tmp_path, recorded(list(range(0, 200, 2)), 3.5))
     (note,) = [note for note in raw.notes if note.kind == "mixed"]
     assert note.count == 99
-    assert "two devices with clocks of their own seem to publish it; record each under a topic of its own" in note.message
+    assert (
+        "two devices with clocks of their own seem to publish it; record each under a topic of its own"
+        in note.message
+    )

@@ -16,7 +16,9 @@ JSON = Channel(1, "/machine", "json", {}, "", "", b"")
 
 
 def numbers(message: dict | bytes, *names: str) -> list[float]:
-    return decoder(JSON, names)([message if isinstance(message, bytes) else json.dumps(message).encode()])[0].tolist()
+    return decoder(JSON, names)([message if isinstance(message, bytes) else json.dumps(message).encode()])[
+        0
+    ].tolist()
 
 
 # ---- JSON
@@ -30,7 +32,10 @@ def test_json_numbers_are_found_by_path_also_where_keys_hold_dots():
 
 
 def test_json_null_and_absent_keys_are_missing_and_nan_is_read():
-    np.testing.assert_array_equal(numbers(b'{"a": null, "b": NaN, "c": -Infinity}', "a", "b", "c", "d"), [np.nan, np.nan, -np.inf, np.nan])
+    np.testing.assert_array_equal(
+        numbers(b'{"a": null, "b": NaN, "c": -Infinity}', "a", "b", "c", "d"),
+        [np.nan, np.nan, -np.inf, np.nan],
+    )
 
 
 def test_json_text_is_refused_even_where_it_looks_like_a_number():
@@ -41,7 +46,8 @@ def test_json_text_is_refused_even_where_it_looks_like_a_number():
 
 
 def test_fast_and_slow_path_agree():
-    """A batch of plain messages goes through one array; one null among them sends the batch through the other path."""
+    """A batch of plain messages goes through one array; one null among
+    them sends the batch through the other path."""
     batch = [json.dumps({"a": k / 7, "b": -k}).encode() for k in range(50)]
     fast = decoder(JSON, ["b", "a"])(batch)
     slow = decoder(JSON, ["b", "a"])([*batch, b'{"a": null, "b": 0}'])[:-1]
@@ -56,14 +62,23 @@ def test_what_is_no_json_is_unreadable():
 
 def test_a_json_schema_names_fields_before_any_message():
     schema = {
-        "properties": {"a": {"type": "number"}, "n": {"type": "string"}, "b": {"type": "object", "properties": {"c": {"type": "integer"}}}}
+        "properties": {
+            "a": {"type": "number"},
+            "n": {"type": "string"},
+            "b": {"type": "object", "properties": {"c": {"type": "integer"}}},
+        }
     }
-    assert fields(JSON._replace(schema_encoding="jsonschema", schema=json.dumps(schema).encode()), []) == ["a", "b.c"]
+    assert fields(JSON._replace(schema_encoding="jsonschema", schema=json.dumps(schema).encode()), []) == [
+        "a",
+        "b.c",
+    ]
 
 
 def test_other_encodings_are_refused_with_those_that_are_read():
     for encoding, schema in (("cdr", "ros2idl"), ("flatbuffer", "flatbuffer"), ("cbor", ""), ("cdr", "")):
-        with pytest.raises(ValueError, match="is not read; cdr with ros2msg, ros1 with ros1msg, protobuf, and json are"):
+        with pytest.raises(
+            ValueError, match="is not read; cdr with ros2msg, ros1 with ros1msg, protobuf, and json are"
+        ):
             fields(Channel(1, "/t", encoding, {}, "s", schema, b""), [])
 
 
@@ -73,7 +88,12 @@ def test_other_encodings_are_refused_with_those_that_are_read():
 def test_a_message_compressed_by_itself_is_unpacked_whether_or_not_it_says_its_size():
     message = cdr(("d", [1.5] * 40))
     stream = zstandard.ZstdCompressor(write_content_size=False).compressobj()
-    for packed in (zstandard.compress(message), stream.compress(message) + stream.flush(), lz4.frame.compress(message), message):
+    for packed in (
+        zstandard.compress(message),
+        stream.compress(message) + stream.flush(),
+        lz4.frame.compress(message),
+        message,
+    ):
         assert plain(packed) == message
 
 
@@ -135,7 +155,9 @@ def test_the_clock_may_be_log_time_publish_time_or_a_stamp(tmp_path):
     path.write_bytes(made.bytes())
     for time, late in (("", 0.2), ("log_time", 0.2), ("publish_time", 0.1), ("stamp", 0.25)):
         np.testing.assert_allclose(
-            read(path, [Source("zone", "degC", "degC")], time=time).signals["zone"][0], np.arange(5) + late, atol=1e-9
+            read(path, [Source("zone", "degC", "degC")], time=time).signals["zone"][0],
+            np.arange(5) + late,
+            atol=1e-9,
         )
     with pytest.raises(ValueError, match="topic /zone has no time 'stmp'; the nearest names are stamp"):
         read(path, [Source("zone", "degC", "degC")], time="stmp")
@@ -162,9 +184,13 @@ def test_a_bare_name_must_be_in_one_topic_only_and_a_wrong_one_gets_the_nearest(
     path = tmp_path / "two.mcap"
     path.write_bytes(made.bytes())
     assert read(path, [Source("u", "back_duty", "1")]).signals["u"][1].tolist() == [0, 1, 2]
-    with pytest.raises(ValueError, match=r"2 topics have a field 'degC' \(/front, /back\); write which, as in /front:degC"):
+    with pytest.raises(
+        ValueError, match=r"2 topics have a field 'degC' \(/front, /back\); write which, as in /front:degC"
+    ):
         read(path, [Source("y", "degC", "degC")])
-    with pytest.raises(ValueError, match="no message has a number 'back_dutty'; the nearest names are /back:back_duty"):
+    with pytest.raises(
+        ValueError, match="no message has a number 'back_dutty'; the nearest names are /back:back_duty"
+    ):
         read(path, [Source("y", "back_dutty", "degC")])
 
 

@@ -1,4 +1,5 @@
-"""What a recording costs in memory grows by the numbers that are kept, and by nothing else: no text, no messages, no copy of the file."""
+"""What a recording costs in memory grows by the numbers that are kept, and by nothing
+else: no text, no messages, no copy of the file."""
 
 import struct
 import tracemalloc
@@ -9,13 +10,16 @@ from pipeline.reading.recordings import Source, read
 from tests.mcap_writing import Written
 
 SOURCES = [Source("u", "u", "percent"), Source("y", "y", "degC")]
-# time, two signals and the line of each row are 28 bytes; a clock is checked and counted from its start with a few copies more
+# time, two signals and the line of each row are 28 bytes; a clock is checked
+# and counted from its start with a few copies more
 BYTES_A_SAMPLE = 64
 SHORT, LONG = 12_000, 30_000
 
 
 def csv(samples: int) -> bytes:
-    return b"t,u,y,note\n" + b"".join(b"%d,%d.25,%d.5,a remark that nobody reads\n" % (k, k % 50, k % 70) for k in range(samples))
+    return b"t,u,y,note\n" + b"".join(
+        b"%d,%d.25,%d.5,a remark that nobody reads\n" % (k, k % 50, k % 70) for k in range(samples)
+    )
 
 
 def mcap(encoding: str, samples: int, *, late: bool = False) -> bytes:
@@ -26,14 +30,24 @@ def mcap(encoding: str, samples: int, *, late: bool = False) -> bytes:
         u, y = k % 50 + 0.25, k % 70 + 0.5
         known = {"u": u, "note": "a remark that nobody reads"}
         made.message(
-            channel, k, struct.pack("<4sdd", b"\0\1\0\0", u, y) if encoding == "cdr" else known | ({} if late and k < 500 else {"y": y})
+            channel,
+            k,
+            struct.pack("<4sdd", b"\0\1\0\0", u, y)
+            if encoding == "cdr"
+            else known | ({} if late and k < 500 else {"y": y}),
         )
     return made.bytes()
 
 
 @pytest.mark.parametrize(
     "written",
-    [csv, lambda n: mcap("json", n), lambda n: mcap("cdr", n), lambda n: mcap("json", n)[:-300], lambda n: mcap("json", n, late=True)],
+    [
+        csv,
+        lambda n: mcap("json", n),
+        lambda n: mcap("cdr", n),
+        lambda n: mcap("json", n)[:-300],
+        lambda n: mcap("json", n, late=True),
+    ],
     ids=["CSV", "JSON", "CDR", "cut off", "a key that comes late"],
 )
 def test_a_longer_recording_costs_its_numbers_and_nothing_else(tmp_path, written):

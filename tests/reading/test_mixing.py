@@ -23,7 +23,9 @@ WAYS = {
     "at random": lambda n: np.random.default_rng(1).random(n) < 0.4,
     "one in five": lambda n: np.random.default_rng(2).random(n) < 0.2,
     "in batches of twenty": lambda n: np.arange(n) // 20 % 2 == 1,
-    "at rates that beat": lambda n: np.argsort(np.argsort(np.r_[np.arange(0, n, 1.7), np.arange(0, n, 2.43)][:n])) % 3 == 0,
+    "at rates that beat": lambda n: (
+        np.argsort(np.argsort(np.r_[np.arange(0, n, 1.7), np.arange(0, n, 2.43)][:n])) % 3 == 0
+    ),
 }
 
 
@@ -75,7 +77,12 @@ def test_what_is_mixed_is_masked_with_its_place_though_the_table_would_show_one_
     time = np.arange(600) / 2
     y = course() + 8 * in_turn(600)
     u = (time // 50 % 2) * 40
-    table = resample(Raw("rig.csv", {"u": (time, u), "y": (time, y)}, {}, []), sample_time_s=1.0, inputs=["u"], outputs=["y"])
+    table = resample(
+        Raw("rig.csv", {"u": (time, u), "y": (time, y)}, {}, []),
+        sample_time_s=1.0,
+        inputs=["u"],
+        outputs=["y"],
+    )
     (found,) = [one for one in table.flags if one.kind == "mixed"]
     assert (found.signal, found.start_s, found.end_s, found.count) == ("y", 0.0, 299.5, 600)
     assert table.masked["y"].all()

@@ -6,7 +6,8 @@ from pipeline.reading.ros_messages import UnreadableMessage
 
 # protoc --descriptor_set_out of: syntax = "proto3"; package machine;
 # message Zone { float celsius = 1; sint32 trim = 2; optional double limit = 3; }
-# message State { int64 stamp_ns = 1; double duty = 2; repeated Zone zones = 3; repeated int32 counts = 4; Zone nozzle = 5; fixed32 steps =
+# message State { int64 stamp_ns = 1; double duty = 2; repeated Zone zones = 3; repeated
+# int32 counts = 4; Zone nozzle = 5; fixed32 steps =
 # 6; string name = 7; }
 DESCRIPTOR = bytes.fromhex(
     "0abc020a07732e70726f746f12076d616368696e6522590a045a6f6e6512180a0763656c7369757318012001280252076365"
@@ -19,7 +20,8 @@ DESCRIPTOR = bytes.fromhex(
     "6e652e5a6f6e6552066e6f7a7a6c6512140a"
     "0573746570731806200128075205737465707312120a046e616d6518072001280952046e616d65620670726f746f33"
 )
-# google.protobuf 7.36: State(stamp_ns=-5, duty=37.5, counts=[3, -1, 70000], steps=4000000000, name="extruder",
+# google.protobuf 7.36: State(stamp_ns=-5, duty=37.5, counts=[3, -1,
+# 70000], steps=4000000000, name="extruder",
 #   zones=[Zone(celsius=180.5, trim=-3, limit=0.0), Zone(trim=2)], nozzle=Zone())
 MESSAGE = bytes.fromhex(
     "08fbffffffffffffffff01110000000000c042401a100d0080344310051900000000000000001a021004220e03ffffffffffffffffff01f0a2042a003500286bee3a08"
@@ -33,13 +35,32 @@ def numbers(message: bytes, *names: str) -> np.ndarray:
 
 
 def test_numbers_of_every_kind_are_what_protobuf_wrote():
-    found = numbers(MESSAGE, "steps", "duty", "stamp_ns", "zones[0].celsius", "zones[0].trim", "zones[1].trim", "counts[1]", "counts[2]")
+    found = numbers(
+        MESSAGE,
+        "steps",
+        "duty",
+        "stamp_ns",
+        "zones[0].celsius",
+        "zones[0].trim",
+        "zones[1].trim",
+        "counts[1]",
+        "counts[2]",
+    )
     assert found.tolist() == [4e9, 37.5, -5, 180.5, -3, 2, -1, 70000]
 
 
 def test_what_is_not_on_the_wire_is_zero_only_where_proto3_says_so():
-    """A plain number that is 0 is not written; an optional one, an element or a message that is absent has no value."""
-    found = numbers(MESSAGE, "zones[1].celsius", "nozzle.celsius", "zones[0].limit", "zones[1].limit", "zones[2].celsius", "counts[3]")
+    """A plain number that is 0 is not written; an optional one, an
+    element or a message that is absent has no value."""
+    found = numbers(
+        MESSAGE,
+        "zones[1].celsius",
+        "nozzle.celsius",
+        "zones[0].limit",
+        "zones[1].limit",
+        "zones[2].celsius",
+        "counts[3]",
+    )
     np.testing.assert_array_equal(found, [0, 0, 0, np.nan, np.nan, np.nan])
     np.testing.assert_array_equal(numbers(b"", "duty", "nozzle.celsius"), [0, np.nan])
 
@@ -64,7 +85,10 @@ def test_a_message_cut_anywhere_is_unreadable_or_shorter_but_never_a_crash():
 def test_a_schema_or_field_that_is_not_there_is_named():
     with pytest.raises(ValueError, match="no FileDescriptorSet"):
         message_types(b"\xff\xff\xff")
-    with pytest.raises(ValueError, match="does not define its own message machine.Stat; it defines machine.State, machine.Zone"):
+    with pytest.raises(
+        ValueError,
+        match="does not define its own message machine.Stat; it defines machine.State, machine.Zone",
+    ):
         decoder(TYPES, "machine.Stat", ["duty"])
     for field in ("name", "zones", "zones[0]", "duty[0]", "zones[0].speed", "nozzle"):
         with pytest.raises(ValueError, match="no numeric field"):

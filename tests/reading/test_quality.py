@@ -8,7 +8,8 @@ UNITS = {"u": "percent", "y": "degC", "z": "degC"}
 
 
 def rig(samples: int = 2000, seed: int = 0, step: float = 0.03) -> dict[str, np.ndarray]:
-    """Duty in levels held 100 s, two slow temperatures after it with noise, as a converter with steps of 0.03 °C shows them."""
+    """Duty in levels held 100 s, two slow temperatures after it with noise,
+    as a converter with steps of 0.03 °C shows them."""
     rng = np.random.default_rng(seed)
     u = np.repeat(rng.choice([20.0, 30, 40], samples // 100), 100)
     y, z = np.full(samples, 40.0), np.full(samples, 35.0)
@@ -19,11 +20,15 @@ def rig(samples: int = 2000, seed: int = 0, step: float = 0.03) -> dict[str, np.
     return {"u": u, "y": noisy[0], "z": noisy[1]}
 
 
-def flagged(values: dict[str, np.ndarray], limits=LIMITS, units=UNITS, segment: np.ndarray | None = None) -> Table:
+def flagged(
+    values: dict[str, np.ndarray], limits=LIMITS, units=UNITS, segment: np.ndarray | None = None
+) -> Table:
     count = len(next(iter(values.values())))
     segment = np.zeros(count, np.int32) if segment is None else segment
     masked = {name: ~np.isfinite(found) for name, found in values.items()}
-    return flag(Table("rig.csv", segment, np.arange(float(count)), values, masked, [], {}), units=units, limits=limits)
+    return flag(
+        Table("rig.csv", segment, np.arange(float(count)), values, masked, [], {}), units=units, limits=limits
+    )
 
 
 def of(table: Table, *kinds: str) -> list[Flag]:
@@ -56,7 +61,12 @@ def test_isolated_spikes_are_found_where_they_are_and_masked(size, length):
         values["y"][place : place + length] += size
         table = flagged(values)
         (spike,) = of(table, "spike")
-        assert (spike.signal, spike.start_s, spike.end_s, spike.count) == ("y", place, place + length - 1, length)
+        assert (spike.signal, spike.start_s, spike.end_s, spike.count) == (
+            "y",
+            place,
+            place + length - 1,
+            length,
+        )
         assert np.flatnonzero(table.masked["y"]).tolist() == list(range(place, place + length))
         assert not table.masked["z"].any()
 
@@ -95,13 +105,19 @@ def test_a_frozen_sensor_is_masked_from_its_second_sample_on():
 def test_a_coarse_slow_or_resting_signal_is_not_frozen():
     values = rig(step=1.0)
     assert of(flagged(values), "frozen") == []
-    values = {"u": np.full(500, 30.0), "y": np.r_[np.linspace(20, 40, 100), np.full(400, 40.0)], "z": np.full(500, 25.0)}
+    values = {
+        "u": np.full(500, 30.0),
+        "y": np.r_[np.linspace(20, 40, 100), np.full(400, 40.0)],
+        "z": np.full(500, 25.0),
+    }
     assert of(flagged(values), "frozen") == []
 
 
-def approach(samples: int = 3000, *, time_constant: float = 120.0, step: float = 0.0) -> dict[str, np.ndarray]:
-    """A heater that is switched now and then for long, and a temperature that comes to rest each time, without noise, as a sensor of that step
-    shows it."""
+def approach(
+    samples: int = 3000, *, time_constant: float = 120.0, step: float = 0.0
+) -> dict[str, np.ndarray]:
+    """A heater that is switched now and then for long, and a temperature that comes to rest each time,
+    without noise, as a sensor of that step shows it."""
     u = np.zeros(samples)
     u[20:1200], u[1200:2000], u[2000:] = 40.0, 70.0, 30.0
     y = np.full(samples, 21.5)
@@ -182,9 +198,15 @@ def test_constant_signals_are_named():
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda v: v | {"y": v["y"] - 20 + 273.15, "z": v["z"] - 15 + 273.15}, "looks like kelvin; set offset: -273.15"),
+        (
+            lambda v: v | {"y": v["y"] - 20 + 273.15, "z": v["z"] - 15 + 273.15},
+            "looks like kelvin; set offset: -273.15",
+        ),
         (lambda v: v | {"y": v["y"] + 480}, "looks like kelvin"),
-        (lambda v: v | {"y": (v["y"] - 20) * 1.8 + 32, "z": (v["z"] - 15) * 1.8 + 32}, "looks like fahrenheit; set scale: 0.555556"),
+        (
+            lambda v: v | {"y": (v["y"] - 20) * 1.8 + 32, "z": (v["z"] - 15) * 1.8 + 32},
+            "looks like fahrenheit; set scale: 0.555556",
+        ),
         (lambda v: v | {"u": v["u"] / 100}, "looks like a duty of 0 to 1; set scale: 100"),
         (lambda v: v | {"u": np.round(v["u"] * 2.55 * 2)}, "a converter's 0 to 255; set scale: 0.392157"),
         (lambda v: v | {"y": v["y"] - 400}, "which no temperature does"),
@@ -218,14 +240,23 @@ def test_a_signal_without_any_value_gets_no_finding():
 
 def test_the_spike_of_the_two_heater_kit_and_nothing_else_is_masked(shared):
     columns = {"heater_1": "Q1_pct", "heater_2": "Q2_pct", "temperature_1": "T1_C", "temperature_2": "T2_C"}
-    raw = read(shared("data/tclab_mlid_prbs/prbs.csv"), [Source(name, column, "") for name, column in columns.items()])
+    raw = read(
+        shared("data/tclab_mlid_prbs/prbs.csv"),
+        [Source(name, column, "") for name, column in columns.items()],
+    )
     inputs, outputs = ["heater_1", "heater_2"], ["temperature_1", "temperature_2"]
     table = resample(raw, sample_time_s=1.0, inputs=inputs, outputs=outputs)
     table = flag(
-        table, units={**dict.fromkeys(inputs, "percent"), **dict.fromkeys(outputs, "degC")}, limits=dict.fromkeys(inputs, (0.0, 100.0))
+        table,
+        units={**dict.fromkeys(inputs, "percent"), **dict.fromkeys(outputs, "degC")},
+        limits=dict.fromkeys(inputs, (0.0, 100.0)),
     )
     found = {(one.signal, one.kind, one.start_s, one.count) for one in table.flags}
-    assert found == {("temperature_1", "spike", 1789, 1), ("temperature_1", "quantised", 0, 5099), ("temperature_2", "quantised", 0, 5100)}
+    assert found == {
+        ("temperature_1", "spike", 1789, 1),
+        ("temperature_1", "quantised", 0, 5099),
+        ("temperature_2", "quantised", 0, 5100),
+    }
     assert np.flatnonzero(table.masked["temperature_1"]).tolist() == [1789]
     assert table.values["temperature_1"][1789] == 40.718
     assert not table.masked["temperature_2"].any()

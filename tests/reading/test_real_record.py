@@ -1,4 +1,5 @@
-"""The whole path on other people's data: the two-heater kit's record dropped in, mapped, and every stage run as a command, in a project of its own."""
+"""The whole path on other people's data: the two-heater kit's record dropped in, mapped, and every stage run
+as a command, in a project of its own."""
 
 import os
 import re
@@ -19,14 +20,25 @@ from pipeline.temperature.workflow.settings import Plant
 
 RECORD = "data/tclab_mlid_prbs/prbs.csv"
 SPIKE_S, SPIKE_DEGC = 1789, 40.718
-STAGES = ("generate_probing", "ingest", "identify_plant", "learn_kernel", "tune_weights", "evaluate_temperature", "report")
+STAGES = (
+    "generate_probing",
+    "ingest",
+    "identify_plant",
+    "learn_kernel",
+    "tune_weights",
+    "evaluate_temperature",
+    "report",
+)
 
 # what a user of the kit changes in params.yaml
 KIT = {
     "plant": {
         "sample_time_s": 1.0,
         "inputs": [{"name": f"heater_{i}", "unit": "percent", "low": 0, "high": 100} for i in (1, 2)],
-        "outputs": [{"name": "T1", "unit": "degC", "reference": 50}, {"name": "T2", "unit": "degC", "reference": 45}],
+        "outputs": [
+            {"name": "T1", "unit": "degC", "reference": 50},
+            {"name": "T2", "unit": "degC", "reference": 45},
+        ],
     },
     "generate_probing.source": "recordings",
     "ingest.mapping": {
@@ -52,7 +64,8 @@ SMALL = {
 
 
 def project(root: Path, tree: Path, changes: dict) -> Path:
-    """A project with this code, the study's draws, and params.yaml with {dotted key: value} changed; no recording yet."""
+    """A project with this code, the study's draws, and params.yaml
+    with {dotted key: value} changed; no recording yet."""
     (tree / "datasets/raw/temperature").mkdir(parents=True)
     (tree / "reports").mkdir()
     for name in ("pipeline", "stages", "datasets/published"):
@@ -71,10 +84,16 @@ def project(root: Path, tree: Path, changes: dict) -> Path:
 
 
 def run(tree: Path, *stages: str) -> Path:
-    environment = os.environ | {"PYTHONDONTWRITEBYTECODE": "1", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    environment = os.environ | {
+        "PYTHONDONTWRITEBYTECODE": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+        "OMP_NUM_THREADS": "1",
+    }
     for stage in stages:
         command = [sys.executable, "-m", f"stages.{stage}"]
-        ended = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, timeout=300, check=False)
+        ended = subprocess.run(
+            command, cwd=tree, env=environment, capture_output=True, text=True, timeout=300, check=False
+        )
         assert ended.returncode == 0, ended.stderr
     return tree
 
@@ -84,7 +103,9 @@ def machine(tree: Path) -> Plant:
 
 
 def record(tree: Path) -> dict[str, np.ndarray]:
-    return artifacts.read_table(tree / "datasets/ingest/record.parquet", tables.record(machine(tree).inputs, machine(tree).outputs))
+    return artifacts.read_table(
+        tree / "datasets/ingest/record.parquet", tables.record(machine(tree).inputs, machine(tree).outputs)
+    )
 
 
 def metrics(tree: Path, stage: str) -> dict:
@@ -106,7 +127,13 @@ def kit(root, shared, tmp_path_factory) -> Path:
 def test_the_spike_of_the_sensor_is_found_masked_and_kept_as_it_was_recorded(kit):
     quality = artifacts.read_table(kit / "datasets/ingest/quality.parquet", tables.QUALITY)
     spikes = [
-        (quality["recording"][i], quality["signal"][i], quality["start_s"][i], quality["end_s"][i], quality["count"][i])
+        (
+            quality["recording"][i],
+            quality["signal"][i],
+            quality["start_s"][i],
+            quality["end_s"][i],
+            quality["count"][i],
+        )
         for i in np.flatnonzero(quality["kind"] == "spike")
     ]
     assert spikes == [("prbs.csv", "T1", SPIKE_S, SPIKE_S, 1)]
@@ -115,7 +142,12 @@ def test_the_spike_of_the_sensor_is_found_masked_and_kept_as_it_was_recorded(kit
     assert found["T1"][SPIKE_S] == SPIKE_DEGC
     assert not any(found[f"{name}_masked"].any() for name in ("heater_1", "heater_2", "T2"))
     ingested = metrics(kit, "ingest")
-    assert (ingested["recordings"], ingested["quarantined"], ingested["samples"], ingested["segments"]) == (1, 0, 5100, 1)
+    assert (ingested["recordings"], ingested["quarantined"], ingested["samples"], ingested["segments"]) == (
+        1,
+        0,
+        5100,
+        1,
+    )
     assert ingested["findings"]["T1"]["spike"] == 1
 
 
@@ -129,7 +161,9 @@ def test_the_same_record_in_another_format_is_the_same_record(kit, root, shared,
     else:
         units = {"Q1_pct": "percent", "Q2_pct": "percent", "T1_C": "degC", "T2_C": "degC"}
         artifacts.write_recording(
-            path, table["t_s"].to_numpy(), {name: (table[name].to_numpy(), unit, name) for name, unit in units.items()}
+            path,
+            table["t_s"].to_numpy(),
+            {name: (table[name].to_numpy(), unit, name) for name, unit in units.items()},
         )
     found, expected = record(run(tree, "ingest")), record(kit)
     assert set(found["recording"]) == {f"kit.{form}"}
@@ -150,14 +184,21 @@ def test_the_next_experiment_is_written_within_the_limits(kit):
 
 def test_the_plant_is_judged_on_the_part_of_the_record_that_it_has_not_seen(kit):
     found = metrics(kit, "identify_plant")
-    # a plain subspace fit reaches 58 and 60 % here; the drift of the room limits what inputs alone can explain
+    # a plain subspace fit reaches 58 and 60 % here; the drift of the
+    # room limits what inputs alone can explain
     assert min(found["fit_holdout"][name] for name in ("T1", "T2")) >= 62
     assert found["ahead_steps"] == 60
     assert min(found["fit_holdout_ahead"][name] for name in ("T1", "T2")) >= 75
-    holdout = artifacts.read_table(kit / "datasets/identify_plant/holdout.parquet", tables.holdout(machine(kit).outputs))
+    holdout = artifacts.read_table(
+        kit / "datasets/identify_plant/holdout.parquet", tables.holdout(machine(kit).outputs)
+    )
     assert len(holdout["time_s"]) == round(0.3 * 5100)
-    nominal = plant.restored(artifacts.read_arrays(kit / "datasets/identify_plant/plant.parquet", "plant", 1))[0]
-    spread = plant.restored(artifacts.read_arrays(kit / "datasets/identify_plant/spread.parquet", "spread", 1))
+    nominal = plant.restored(
+        artifacts.read_arrays(kit / "datasets/identify_plant/plant.parquet", "plant", 1)
+    )[0]
+    spread = plant.restored(
+        artifacts.read_arrays(kit / "datasets/identify_plant/spread.parquet", "spread", 1)
+    )
     assert len(spread) == 20
     assert {member.n for member in spread} == {nominal.n + 1}
     # heat warms: each zone by its own heater most
@@ -168,7 +209,8 @@ def test_the_plant_is_judged_on_the_part_of_the_record_that_it_has_not_seen(kit)
 
 
 def test_the_kernel_is_learned_or_refused_with_its_reason(kit):
-    """The kit steps both heaters at once and one of the products u1(t-1) u2(t), u2(t-1) u1(t) never appears without the other."""
+    """The kit steps both heaters at once and one of the products u1(t-1)
+    u2(t), u2(t-1) u1(t) never appears without the other."""
     found, kernel = metrics(kit, "learn_kernel"), kit / "datasets/learn_kernel/kernel.parquet"
     assert (found["refused"] is None) == kernel.exists()
     if found["refused"]:
@@ -184,7 +226,9 @@ def test_every_controller_is_judged_on_the_spread_and_the_model_based_and_the_wi
         judged = controllers[name]
         assert judged["stable_plants"] == {"count": 20, "of": 20}
         assert judged["gap_percent"]["median"] < 5  # the verdict's own rule (report.gap_percent)
-        assert judged["settled_error_degC"]["median"] < 2  # twice panel.band_degC: 12 candidates are no tuning yet
+        assert (
+            judged["settled_error_degC"]["median"] < 2
+        )  # twice panel.band_degC: 12 candidates are no tuning yet
         assert judged["disk"]["worst"] > 0
     # the simple rule must at least push the right way: against the nominal model's early answer it did not
     assert controllers["baseline"]["disk"]["median"] > 0
@@ -212,13 +256,23 @@ def test_the_pages_show_the_spike_the_signals_and_nothing_from_the_network(kit):
 @pytest.mark.slow
 def test_a_folder_with_a_gap_a_missing_input_and_a_broken_file_goes_all_the_way(root, shared, tmp_path):
     header, *lines = shared(RECORD).read_text().splitlines()
-    tree = project(root, tmp_path / "tree", KIT | {"identify_plant.refinement": "validated", "evaluate_temperature.data_sets": 1})
+    tree = project(
+        root,
+        tmp_path / "tree",
+        KIT | {"identify_plant.refinement": "validated", "evaluate_temperature.data_sets": 1},
+    )
     raw = tree / "datasets/raw/temperature"
     missing = lines[2500].split(",")
     missing[1] = ""
     for name, part in {
         "first.csv": lines[:2000],
-        "second.csv": [*lines[2000:2500], ",".join(missing), *lines[2501:3400], *lines[3460:3500], *lines[3520:]],
+        "second.csv": [
+            *lines[2000:2500],
+            ",".join(missing),
+            *lines[2501:3400],
+            *lines[3460:3500],
+            *lines[3520:],
+        ],
         "broken.csv": [*lines[:10], *lines[:10]],
     }.items():
         (raw / name).write_text("\n".join([header, *part]) + "\n")
@@ -227,8 +281,11 @@ def test_a_folder_with_a_gap_a_missing_input_and_a_broken_file_goes_all_the_way(
     assert (ingested["recordings"], ingested["quarantined"], ingested["segments"]) == (3, 1, 4)
     assert "broken.csv" in (tree / "reports/temperature.html").read_text(encoding="utf-8")
     found = metrics(tree, "identify_plant")
-    assert min(found["fit_holdout"].values()) > 50  # less record than the whole, in pieces; half of the movement is a model still
+    assert (
+        min(found["fit_holdout"].values()) > 50
+    )  # less record than the whole, in pieces; half of the movement is a model still
     judged = metrics(tree, "evaluate_temperature")["controllers"]["model_based"]
     assert judged["disk"]["median"] > 0
-    # it holds on its own kind of plant and on nine of ten of a bootstrap family's members, whose tails no controller was promised to hold
+    # it holds on its own kind of plant and on nine of ten of a bootstrap family's
+    # members, whose tails no controller was promised to hold
     assert judged["stable_plants"]["count"] >= 18

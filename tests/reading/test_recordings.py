@@ -46,7 +46,11 @@ def test_one_record_reads_alike_from_csv_parquet_and_mcap(tmp_path):
 
 
 def test_scale_and_offset_turn_kelvin_and_duty_into_our_units(tmp_path):
-    raw = opened(tmp_path, "t,u,y\n0,0.5,293.15\n1,1,300\n", [Source("u", "u", "percent", 100.0), Source("y", "y", "degC", 1.0, -273.15)])
+    raw = opened(
+        tmp_path,
+        "t,u,y\n0,0.5,293.15\n1,1,300\n",
+        [Source("u", "u", "percent", 100.0), Source("y", "y", "degC", 1.0, -273.15)],
+    )
     np.testing.assert_allclose(raw.signals["u"][1], [50, 100], rtol=1e-15)
     np.testing.assert_allclose(raw.signals["y"][1], [20, 26.85], rtol=1e-14)
 
@@ -88,7 +92,12 @@ def test_csv_of_many_programs_is_the_same_record(tmp_path, content):
     raw = opened(tmp_path, content)
     # a minute's sixtieth is rounded; ten digits of a spreadsheet's day are 9 us
     time = raw.signals["u"][0]
-    np.testing.assert_allclose(time - np.floor(time[0]), np.array([0, 1]) + time[0] % 1, rtol=1e-15, atol=9e-6 if "Date," in content else 0)
+    np.testing.assert_allclose(
+        time - np.floor(time[0]),
+        np.array([0, 1]) + time[0] % 1,
+        rtol=1e-15,
+        atol=9e-6 if "Date," in content else 0,
+    )
     assert raw.signals["u"][1].tolist() == [1.5, 2.5]
     assert raw.signals["y"][1].tolist() == [2, 3]
 
@@ -102,7 +111,11 @@ def test_csv_in_other_encodings_keeps_its_names(tmp_path, encoding):
 
 def test_a_table_without_header_or_time_is_read_by_column_and_interval(tmp_path):
     raw = opened(
-        tmp_path, "  1.0e+00\t  4.5\t\n  2.0e+00\t  5.5\t\n", [Source("y", "column_2", "1")], name="dryer.dat", time="every 0.08 s"
+        tmp_path,
+        "  1.0e+00\t  4.5\t\n  2.0e+00\t  5.5\t\n",
+        [Source("y", "column_2", "1")],
+        name="dryer.dat",
+        time="every 0.08 s",
     )
     np.testing.assert_allclose(raw.signals["y"][0], [0, 0.08], rtol=0)
     assert raw.signals["y"][1].tolist() == [4.5, 5.5]
@@ -113,7 +126,9 @@ def test_missing_values_are_nan_and_counted_with_the_first_place(tmp_path):
     raw = opened(tmp_path, "t,u,y\n0,1,2\n1,,3\n2,NaN,4\n3,n/a,5\n4,inf,6\n5,2,7\n6,3,8\n7,4,8\n8,5,8\n")
     np.testing.assert_array_equal(raw.signals["u"][1], [1, np.nan, np.nan, np.nan, np.nan, 2, 3, 4, 5])
     message = "4 of 9 values of u are missing (1 of them infinite), the first in line 3; they are masked"
-    assert [(note.kind, note.signal, note.count, note.message) for note in raw.notes] == [("missing", "u", 4, message)]
+    assert [(note.kind, note.signal, note.count, note.message) for note in raw.notes] == [
+        ("missing", "u", 4, message)
+    ]
 
 
 def test_a_column_that_is_filled_now_and_then_has_its_own_clock(tmp_path):
@@ -127,7 +142,9 @@ def test_what_is_passed_over_or_taken_for_granted_is_noted_with_its_place(tmp_pa
     def notes(content: str) -> list[tuple[str, int, str]]:
         return [(note.kind, note.count, note.message) for note in opened(tmp_path, content).notes]
 
-    assert notes("t,u,y\n0,1,2\nt,u,y\n1,2,3\n") == [("header", 1, "the header is repeated 1 times, first in line 3")]
+    assert notes("t,u,y\n0,1,2\nt,u,y\n1,2,3\n") == [
+        ("header", 1, "the header is repeated 1 times, first in line 3")
+    ]
     tail = "2 lines behind the data were left out, from line 4 on, which is 'Total,,'"
     assert notes("t,u,y\n0,1,2\n1,2,3\nTotal,,\nMax,2,3\n") == [("trailing", 2, tail)]
     midnight = "the time of day runs over midnight 1 times: a day was added each time"
@@ -138,7 +155,9 @@ def test_what_is_passed_over_or_taken_for_granted_is_noted_with_its_place(tmp_pa
     assert notes("t,u,y\n0,OFF,2\n1,ON,3\n") == [switch]
     serial = "column Date holds 45982.542 to 45982.542 and was taken as days, as spreadsheets count them"
     assert notes("Date,u,y\n45982.541666667,1,2\n45982.541678241,2,3\n")[0] == ("clock", 1, serial)
-    assert notes("time,u,y\n2025-11-21T13:00:00,1,2\n")[0][2].endswith("13:00:00 (of no zone, as the recording's clock says)")
+    assert notes("time,u,y\n2025-11-21T13:00:00,1,2\n")[0][2].endswith(
+        "13:00:00 (of no zone, as the recording's clock says)"
+    )
 
 
 def test_an_epoch_of_another_program_counts_to_its_own_year(tmp_path):
@@ -174,7 +193,9 @@ def test_words_of_a_historian_for_no_value_are_missing_and_counted(tmp_path):
 def test_a_last_line_that_breaks_off_is_left_out_and_noted(tmp_path):
     raw = opened(tmp_path, "t,u,y\n0,1,2\n1,2,3\n2,3")
     assert raw.signals["u"][1].tolist() == [1, 2]
-    assert [note.message for note in raw.notes] == ["line 4, the last, breaks off after 2 of 3 fields and was left out"]
+    assert [note.message for note in raw.notes] == [
+        "line 4, the last, breaks off after 2 of 3 fields and was left out"
+    ]
 
 
 def test_zeros_after_a_power_failure_are_left_out_and_noted(tmp_path):
@@ -191,54 +212,94 @@ def test_zeros_after_a_power_failure_are_left_out_and_noted(tmp_path):
     [
         (
             "t,u,y\n0,1,2\n2,1,2\n1,1,2\n",
-            "line 4 is at 1 s, which is before the sample ahead of it at 2 s, but time should only run forward; split",
+            "line 4 is at 1 s, which is before the sample ahead of it at 2 s, "
+            "but time should only run forward; split",
         ),
-        ("t,u,y\n0,1,2\n1,1,2\n1,1,2\n2,1,2\n2,1,2\n", "line 4 has the same time as the sample before it, 1 s, the first of 2, but time"),
-        ("t,u,y\n0,1,2\n,1,2\n2,1,2\n", "line 3 should have a time in t but has none; mend or remove that line"),
-        ("t,u,y\n0,1,2\nTotal,1,2\n2,1,2\n", "line 3 should have a time in t but has 'Total'; mend or remove that line"),
-        ("t,u,y\n0,1,2\n1,warm,2\n", "line 3, column u should be a number but is 'warm'; mend that line, or leave the field empty"),
-        ("t,u,y\n0,1,2\n1,1\n2,1,2\n", "line 3 has 2 fields but the header has 3 columns; mend or remove that line"),
-        ("t,u,y\n0,1,2\n1,1,2\nt,u,y\n0,1,2\n", "line 5 is at 0 s, which is before the sample ahead of it at 1 s"),
-        ("t,u,y\n0,1,2\n1,20 %,2\n", "line 3, column u should be a number but is '20 %'; write the numbers without their unit"),
+        (
+            "t,u,y\n0,1,2\n1,1,2\n1,1,2\n2,1,2\n2,1,2\n",
+            "line 4 has the same time as the sample before it, 1 s, the first of 2, but time",
+        ),
+        (
+            "t,u,y\n0,1,2\n,1,2\n2,1,2\n",
+            "line 3 should have a time in t but has none; mend or remove that line",
+        ),
+        (
+            "t,u,y\n0,1,2\nTotal,1,2\n2,1,2\n",
+            "line 3 should have a time in t but has 'Total'; mend or remove that line",
+        ),
+        (
+            "t,u,y\n0,1,2\n1,warm,2\n",
+            "line 3, column u should be a number but is 'warm'; mend that line, or leave the field empty",
+        ),
+        (
+            "t,u,y\n0,1,2\n1,1\n2,1,2\n",
+            "line 3 has 2 fields but the header has 3 columns; mend or remove that line",
+        ),
+        (
+            "t,u,y\n0,1,2\n1,1,2\nt,u,y\n0,1,2\n",
+            "line 5 is at 0 s, which is before the sample ahead of it at 1 s",
+        ),
+        (
+            "t,u,y\n0,1,2\n1,20 %,2\n",
+            "line 3, column u should be a number but is '20 %'; write the numbers without their unit",
+        ),
         (
             "t;u;y\n0;1,5;2\n1;1.234,5;2\n",
-            "line 3, column u should be a number but is '1.234,5'; write the numbers without marks between thousands",
+            "line 3, column u should be a number but is '1.234,5'; "
+            "write the numbers without marks between thousands",
         ),
         (
             "t;u;y\n0;1,5;2\n1;1.234;2\n2;2,5;2\n",
-            "line 3, column u should be a number but is '1.234'; write the numbers without marks between thousands",
+            "line 3, column u should be a number but is '1.234'; write the numbers without "
+            "marks between thousands",
         ),
         (
             "t,u,y\n" + "".join(f"{k + 100 * (k % 2)},1,2\n" for k in range(40)),
-            "the first of 19, but time should only run forward; two devices with clocks of their own seem to write under one name",
+            "the first of 19, but time should only run forward; two devices with clocks of their own seem to "
+            "write under one name",
         ),
         (
-            "time,u,y\n" + "".join(f"2025-10-26 02:{minute}:{k:02d},1,2\n" for minute in ("59", "00") for k in range(60)),
+            "time,u,y\n"
+            + "".join(f"2025-10-26 02:{minute}:{k:02d},1,2\n" for minute in ("59", "00") for k in range(60)),
             "an hour is what the end of summer time takes away: write the times with their zone or in UTC",
         ),
-        ("t,u,y\n0,,2\n1,,2\n", "u should hold numbers for u but all of its 2 values are missing; map another source"),
+        (
+            "t,u,y\n0,,2\n1,,2\n",
+            "u should hold numbers for u but all of its 2 values are missing; map another source",
+        ),
         ("t,u,z\n0,1,2\n", "there is no column 'y'; it has t, u, z"),
         ("t,u,yy\n0,1,2\n", "there is no column 'y'; the nearest names are yy"),
         ("t,u,y,y\n0,1,2,3\n", "2 columns are called 'y'; give each a name of its own"),
         (
             "a,u,y\n0,1,2\n1,1,2\n",
-            "no column is called like a time (t_s, time, timestamp, ...) among a, u, y; name it, or write time: every 1.0 s",
+            "no column is called like a time (t_s, time, timestamp, ...) among a, u, y; name it, "
+            "or write time: every 1.0 s",
         ),
         (
             "time,u,y\n05/03/2025 13:00,1,2\n06/03/2025 13:00,1,2\n",
-            "line 2, time time should be seconds or ISO 8601 such as 2025-11-21T13:00:00.5 but is '05/03/2025 13:00' (day and month, or month and day?)",
+            "line 2, time time should be seconds or ISO 8601 such as 2025-11-21T13:00:00.5 but is "
+            "'05/03/2025 13:00' (day and month, or month and day?)",
         ),
         ("t,u,y\n", "the file has a header and no data"),
         ("name,owner\n" + "rig,bob\n" * 20, "the file has 21 lines of text and no data"),
         ("a word, and 3 more.\nThen nothing\n7 dwarfs,\n\nthe end of 1 tale\n" * 9, "is text but no table"),
         ('{"t": 0, "u": 1}\n', "is JSON but should be MCAP, Parquet or CSV"),
-        (b"\x89PNG\r\n\x1a\n" + bytes(100), "is a PNG picture but should be MCAP, Parquet or CSV; name the recording"),
+        (
+            b"\x89PNG\r\n\x1a\n" + bytes(100),
+            "is a PNG picture but should be MCAP, Parquet or CSV; name the recording",
+        ),
         ("\n\n# nothing\n", "the file has only blank or comment lines and no data"),
         ("", "is empty (0 bytes) but should be MCAP, Parquet or CSV; copy the recording again"),
         (bytes(3000), "begins with 512 zero bytes"),
-        (gzip.compress(b"t,u,y\n0,1,2\n", mtime=0), "is gzip but should be MCAP, Parquet or CSV; unpack it with gunzip"),
+        (
+            gzip.compress(b"t,u,y\n0,1,2\n", mtime=0),
+            "is gzip but should be MCAP, Parquet or CSV; unpack it with gunzip",
+        ),
         (b"PK\x03\x04 and so on", "is zip or Excel"),
-        (b"#ROSBAG V2.0\n", "is a ROS 1 bag but should be MCAP, Parquet or CSV; convert it with: mcap convert"),
+        (
+            b"#ROSBAG V2.0\n",
+            "is a ROS 1 bag but should be MCAP, Parquet or CSV; convert it with: mcap convert",
+        ),
         (b"t,u,y\n0,1,2\n" + bytes(500) + b"1,2,3\n", "are neither text nor Parquet nor MCAP"),
         (np.random.default_rng(0).bytes(5000), "recording.csv"),
     ],
@@ -254,7 +315,9 @@ def test_one_row_is_a_record_of_one_sample(tmp_path):
 def test_what_a_file_holds_counts_and_not_what_its_name_ends_in(tmp_path):
     pq.write_table(pa.table({"t": [0.0, 1.0], "u": [1, 2], "y": [3.0, None]}), tmp_path / "wrong.csv")
     np.testing.assert_array_equal(read(tmp_path / "wrong.csv", SOURCES).signals["y"][1], [3, np.nan])
-    assert "begin no mcap file; copy the recording again as binary" in refusal(tmp_path, "t,u,y\n0,1,2\n", name="text.mcap")
+    assert "begin no mcap file; copy the recording again as binary" in refusal(
+        tmp_path, "t,u,y\n0,1,2\n", name="text.mcap"
+    )
 
 
 def test_a_folder_and_a_missing_file_are_refused(tmp_path):
@@ -279,7 +342,9 @@ def test_mappings_that_make_no_sense_are_refused(tmp_path):
 def test_parquet_with_structures_time_stamps_nulls_and_decimals_is_read(tmp_path):
     start = datetime.datetime(2025, 1, 1, tzinfo=datetime.UTC)
     columns = {
-        "when": pa.array([start + datetime.timedelta(seconds=k) for k in range(3)], pa.timestamp("us", "UTC")),
+        "when": pa.array(
+            [start + datetime.timedelta(seconds=k) for k in range(3)], pa.timestamp("us", "UTC")
+        ),
         "zone": pa.array([{"y": 1.5, "name": "a"}, None, {"y": 2.5, "name": "b"}]),
         "u.dotted": pa.array([1, 2, 3]),
     }
@@ -321,12 +386,17 @@ def test_a_clock_of_the_calendar_counts_from_the_first_second_to_the_nanosecond(
     raw = opened(tmp_path, made.bytes(), name="epoch.mcap")
     assert raw.signals["u"][0].tolist() == [k + 0.250000001 for k in range(5)]
     assert raw.signals["y"][0].tolist() == [k + 0.5 for k in range(5)]
-    assert [note.message for note in raw.notes] == ["time is counted from 2025-11-21T13:00:00 (UTC, as the recording's clock says)"]
+    assert [note.message for note in raw.notes] == [
+        "time is counted from 2025-11-21T13:00:00 (UTC, as the recording's clock says)"
+    ]
 
 
 @pytest.mark.parametrize(
     ("step", "said"),
-    [(-1.0, "is at 3 s, which is before the sample ahead of it at 4 s"), (0.0, "has the same time as the sample before it, 4 s")],
+    [
+        (-1.0, "is at 3 s, which is before the sample ahead of it at 4 s"),
+        (0.0, "has the same time as the sample before it, 4 s"),
+    ],
 )
 def test_mcap_whose_clock_does_not_run_forward_is_refused_with_the_message(tmp_path, step, said):
     made = Written()
@@ -360,7 +430,9 @@ def test_recordings_of_others_are_read_by_topic_and_field(shared):
     assert raw.signals["line"][1].tolist() == [38] * 10
     # the talker publishes twice a second
     np.testing.assert_allclose(np.diff(raw.signals["line"][0]), 0.5, atol=0.01)
-    raw = read(shared("data/mcap_ros2/custom-camera-model.mcap"), [Source("focal", "/camera_calibration:K[0]", "px")])
+    raw = read(
+        shared("data/mcap_ros2/custom-camera-model.mcap"), [Source("focal", "/camera_calibration:K[0]", "px")]
+    )
     assert raw.signals["focal"][1].tolist() == [800] * 10
     with pytest.raises(ValueError, match="no topic with numbers could be read"):
         read(shared("data/mcap_ros2/wbag_0.mcap"), [Source("y", "data", "1")])

@@ -7,13 +7,25 @@ from pipeline.reading.recordings import Raw, Source, Table, read, resample
 
 
 def recorded(**signals: tuple) -> Raw:
-    return Raw("rig.csv", {name: (np.asarray(time, float), np.asarray(values, float)) for name, (time, values) in signals.items()}, {}, [])
+    return Raw(
+        "rig.csv",
+        {
+            name: (np.asarray(time, float), np.asarray(values, float))
+            for name, (time, values) in signals.items()
+        },
+        {},
+        [],
+    )
 
 
 def table(raw: Raw, sample_time_s: float = 1.0, **options) -> Table:
     inputs = [name for name in raw.signals if name.startswith("u")]
     return resample(
-        raw, sample_time_s=sample_time_s, inputs=inputs, outputs=[name for name in raw.signals if name.startswith("y")], **options
+        raw,
+        sample_time_s=sample_time_s,
+        inputs=inputs,
+        outputs=[name for name in raw.signals if name.startswith("y")],
+        **options,
     )
 
 
@@ -42,7 +54,11 @@ def test_outputs_follow_the_line_between_neighbours_and_inputs_hold():
     np.testing.assert_allclose(found.values["y"], [0, 10, 20, 30], rtol=1e-14)
     assert found.values["u"].tolist() == [1, 1, 2, 2]
     flags = {flag.kind: flag for flag in found.flags}
-    assert (flags["step_inside"].signal, flags["step_inside"].start_s, flags["step_inside"].count) == ("u", 1.4, 1)
+    assert (flags["step_inside"].signal, flags["step_inside"].start_s, flags["step_inside"].count) == (
+        "u",
+        1.4,
+        1,
+    )
     assert "0.6 s later on average" in flags["step_inside"].message
     assert flags["filled"].count == 2
 
@@ -58,7 +74,9 @@ def test_every_value_lies_between_its_neighbours_and_every_command_was_given(see
     before = np.searchsorted(time, found.time_s + 0.01 * sample_time_s, side="right") - 1
     after = np.minimum(np.searchsorted(time, found.time_s - 0.01 * sample_time_s), 59)
     low, high = np.minimum(y[before], y[after]), np.maximum(y[before], y[after])
-    assert ((found.values["y"] >= low - 1e-12) & (found.values["y"] <= high + 1e-12)).all()  # the line rounds at 1e-16
+    assert (
+        (found.values["y"] >= low - 1e-12) & (found.values["y"] <= high + 1e-12)
+    ).all()  # the line rounds at 1e-16
     np.testing.assert_array_equal(found.values["u"], raw.signals["u"][1][before])
 
 
@@ -103,7 +121,9 @@ def test_clocks_are_aligned_over_their_common_time():
     np.testing.assert_allclose(found.values["y"], 2 * found.time_s, rtol=1e-12)
     np.testing.assert_array_equal(found.values["u"], np.floor(found.time_s))
     assert {"trimmed", "rate"} <= set(kinds(found))
-    assert "2 clocks were aligned over their common time 3.05 to 39.95 s" in " ".join(flag.message for flag in found.flags)
+    assert "2 clocks were aligned over their common time 3.05 to 39.95 s" in " ".join(
+        flag.message for flag in found.flags
+    )
 
 
 def test_commands_that_come_as_events_are_held_however_long():
@@ -127,7 +147,8 @@ def test_jitter_is_that_of_the_recording_s_clock_without_its_gaps():
     time = np.arange(2000.0) + rng.uniform(-0.1, 0.1, 2000)
     time[1000:] += 500
     jitter = table(recorded(y=(time, time))).jitter["y"]
-    # the difference of two uniform deviations of +-0.1 has standard deviation 0.2 / sqrt(6); 5 % for 2000 draws
+    # the difference of two uniform deviations of +-0.1 has standard
+    # deviation 0.2 / sqrt(6); 5 % for 2000 draws
     assert jitter.std_s == pytest.approx(0.2 / np.sqrt(6), rel=0.05)
     assert 0.15 < jitter.max_s < 0.21
     assert jitter.interval_s == pytest.approx(1.0, abs=0.01)
@@ -136,7 +157,11 @@ def test_jitter_is_that_of_the_recording_s_clock_without_its_gaps():
 @pytest.mark.parametrize(
     ("signals", "options", "said"),
     [
-        ({"y": ([0, 1], [1, 2]), "u": ([5, 6], [1, 2])}, {}, "the signals have no time in common (y from 0 to 1 s; u from 5 to 6 s)"),
+        (
+            {"y": ([0, 1], [1, 2]), "u": ([5, 6], [1, 2])},
+            {},
+            "the signals have no time in common (y from 0 to 1 s; u from 5 to 6 s)",
+        ),
         (
             {"y": ([0.0, 10, 20], [1, 2, 3])},
             {"max_gap_s": 5.0},
@@ -144,8 +169,16 @@ def test_jitter_is_that_of_the_recording_s_clock_without_its_gaps():
         ),
         ({"y": ([0.0], [1])}, {}, "output y should have at least two samples but has 1; record longer"),
         ({"u": ([0.0, 1], [1, 2])}, {}, "no output is wanted"),
-        ({"y": ([0.0, 1], [1, 2])}, {"max_gap_s": 0.5}, "the gap limit 0.5 s should be at least the sample time 1 s; raise it"),
-        ({"y": ([0.0, 1], [1, 2])}, {"sample_time_s": 0.0}, "the sample time should be more than 0 s but is 0"),
+        (
+            {"y": ([0.0, 1], [1, 2])},
+            {"max_gap_s": 0.5},
+            "the gap limit 0.5 s should be at least the sample time 1 s; raise it",
+        ),
+        (
+            {"y": ([0.0, 1], [1, 2])},
+            {"sample_time_s": 0.0},
+            "the sample time should be more than 0 s but is 0",
+        ),
     ],
 )
 def test_what_cannot_be_resampled_is_refused(signals, options, said):
@@ -164,7 +197,9 @@ def test_a_printer_s_log_with_holes_becomes_segments(shared):
 
 def flags_of(time: np.ndarray, *kinds: str) -> list:
     signals = {"u": (time, np.zeros(len(time))), "y": (time, np.sqrt(np.arange(len(time))))}
-    table = resample(Raw("rig.csv", signals, {}, []), sample_time_s=1.0, inputs=["u"], outputs=["y"], max_gap_s=5.0)
+    table = resample(
+        Raw("rig.csv", signals, {}, []), sample_time_s=1.0, inputs=["u"], outputs=["y"], max_gap_s=5.0
+    )
     return [one for one in table.flags if one.kind in kinds]
 
 

@@ -18,7 +18,9 @@ TEMPERATURE = (
 
 
 def numbers(definition: str, message: bytes, names: list[str], version: int = 2) -> list[float]:
-    return decoder(layout(definition, "machine/msg/State", version=version), names, version=version)([message])[0].tolist()
+    return decoder(layout(definition, "machine/msg/State", version=version), names, version=version)(
+        [message]
+    )[0].tolist()
 
 
 def test_fields_of_a_message_are_its_numbers_without_text_and_constants():
@@ -33,12 +35,25 @@ def test_fields_of_a_message_are_its_numbers_without_text_and_constants():
 @pytest.mark.parametrize("frame", ["", "a", "ab", "abcdefg", "barrel_zone_4"])
 def test_numbers_behind_text_of_any_length_are_found_at_their_alignment(frame):
     message = cdr(("i", [7]), ("I", [500]), ("s", frame), ("d", [181.25, 0.5]))
-    assert numbers(TEMPERATURE, message, ["temperature", "header.stamp.nanosec", "variance"]) == [181.25, 500.0, 0.5]
+    assert numbers(TEMPERATURE, message, ["temperature", "header.stamp.nanosec", "variance"]) == [
+        181.25,
+        500.0,
+        0.5,
+    ]
 
 
 def test_numbers_of_every_size_are_aligned_to_their_size():
     definition = "bool a\nint16 b\nuint8 c\nfloat64 d\nint8 e\nfloat32 f\nuint8 g\nuint64 h\n"
-    message = cdr(("?", [True]), ("h", [-2]), ("B", [3]), ("d", [4.5]), ("b", [-5]), ("f", [6.5]), ("B", [7]), ("Q", [8]))
+    message = cdr(
+        ("?", [True]),
+        ("h", [-2]),
+        ("B", [3]),
+        ("d", [4.5]),
+        ("b", [-5]),
+        ("f", [6.5]),
+        ("B", [7]),
+        ("Q", [8]),
+    )
     assert numbers(definition, message, list("abcdefgh")) == [1, -2, 3, 4.5, -5, 6.5, 7, 8]
 
 
@@ -51,7 +66,9 @@ def test_big_endian_and_xcdr2_are_read_by_their_header():
 
 def test_elements_of_lists_are_read_by_index_and_missing_ones_are_nan():
     definition = "float64[] position\nstring[] names\nint16[3] fixed\nuint8 last\n"
-    message = cdr(("I", [2]), ("d", [1.5, 2.5]), ("I", [2]), ("s", "one"), ("s", "three"), ("h", [4, 5, 6]), ("B", [9]))
+    message = cdr(
+        ("I", [2]), ("d", [1.5, 2.5]), ("I", [2]), ("s", "one"), ("s", "three"), ("h", [4, 5, 6]), ("B", [9])
+    )
     names = ["last", "position[1]", "position[0]", "position[2]", "fixed[2]"]
     np.testing.assert_array_equal(numbers(definition, message, names), [9, 2.5, 1.5, np.nan, 6])
     assert fields(layout(definition, "m", version=2), message, version=2) == [
@@ -70,7 +87,11 @@ def test_an_empty_list_of_wide_numbers_takes_no_alignment():
 
 
 def test_lists_of_messages_are_read_by_index():
-    definition = "machine/Zone[] zones\nint32 after\n" + SEPARATOR + "MSG: machine/Zone\nstring name\nfloat64 degC\nfloat32[2] limits\n"
+    definition = (
+        "machine/Zone[] zones\nint32 after\n"
+        + SEPARATOR
+        + "MSG: machine/Zone\nstring name\nfloat64 degC\nfloat32[2] limits\n"
+    )
     zone = [("s", "feed"), ("d", [180.5]), ("f", [1, 2]), ("s", "nozzle"), ("d", [200.25]), ("f", [3, 4])]
     message = cdr(("I", [2]), *zone, ("i", [42]))
     names = ["zones[1].degC", "after", "zones[1].limits[0]", "zones[5].degC"]
@@ -79,7 +100,9 @@ def test_lists_of_messages_are_read_by_index():
 
 def test_ros1_has_no_alignment_and_its_own_time():
     definition = (
-        "Header header\nuint8 a\nfloat64 b\nduration d\n" + SEPARATOR + "MSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
+        "Header header\nuint8 a\nfloat64 b\nduration d\n"
+        + SEPARATOR
+        + "MSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
     )
     message = struct.pack("<IIII4sBdii", 5, 11, 22, 4, b"base", 3, 1.25, -1, 7)
     names = ["header.stamp.secs", "header.stamp.nsecs", "a", "b", "d.secs", "d.nsecs"]
@@ -103,7 +126,10 @@ def test_messages_that_do_not_fit_their_schema_are_unreadable():
         ("Zone zone\n", "uses Zone but does not define it"),
         ("float64\n", "the line 'float64', which is no field"),
         ("machine/Loop loop\n" + SEPARATOR + "MSG: machine/Loop\nmachine/Loop loop\n", "contains itself"),
-        ("machine/Big[9000] big\n" + SEPARATOR + "MSG: machine/Big\nfloat64 a\nfloat64 b\nfloat64 c\n", "more than 20000 parts"),
+        (
+            "machine/Big[9000] big\n" + SEPARATOR + "MSG: machine/Big\nfloat64 a\nfloat64 b\nfloat64 c\n",
+            "more than 20000 parts",
+        ),
     ],
 )
 def test_a_schema_that_cannot_be_read_says_why(definition, said):
@@ -126,6 +152,11 @@ def test_messages_recorded_by_ros_2_are_read_to_their_last_field(shared):
     arrays = [(schema, data) for schema, data in found if schema.name == "test_msgs/msg/Arrays"]
     for schema, data in arrays:
         definition = schema.data.decode()
-        names = ["int32_values_default[1]", "uint64_values_default[2]", "defaults_values[2].float64_value", "alignment_check"]
+        names = [
+            "int32_values_default[1]",
+            "uint64_values_default[2]",
+            "defaults_values[2].float64_value",
+            "alignment_check",
+        ]
         # defaults of rosbag2's test_msgs/Arrays, as its message definition prints them
         assert numbers(definition, data, names) == [2**31 - 1, 2.0**64, 1.125, 0]

@@ -43,11 +43,14 @@ def reports(tmp_path_factory):
 
 @pytest.fixture
 def open_page(browser, reports):
-    """open_page(name, width, theme, script): a page in a browser of its own; what it asked for, and what it said, in .asked and .said."""
+    """open_page(name, width, theme, script): a page in a browser of its own; what it
+    asked for, and what it said, in .asked and .said."""
     contexts = []
 
     def opened(name, *, width=1280, height=800, theme="light", script=True, folder=reports):
-        context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=theme, java_script_enabled=script)
+        context = browser.new_context(
+            viewport={"width": width, "height": height}, color_scheme=theme, java_script_enabled=script
+        )
         contexts.append(context)
         page = context.new_page()
         page.asked, page.said = [], []

@@ -1,11 +1,21 @@
-"""A small project with every artifact that the pages show, made by hand: two inputs, two zones, five controllers."""
+"""A small project with every artifact that the pages show, made by
+hand: two inputs, two zones, five controllers."""
 
 from pathlib import Path
 
 import numpy as np
 import yaml
 
-from pipeline.deposition.workflow.tables import FILMED, LESSONS, LIBRARY, LINES, SCORES, SIGNALS, TASKS, TRIALS
+from pipeline.deposition.workflow.tables import (
+    FILMED,
+    LESSONS,
+    LIBRARY,
+    LINES,
+    SCORES,
+    SIGNALS,
+    TASKS,
+    TRIALS,
+)
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow import tables
 from pipeline.temperature.workflow.settings import Plant
@@ -15,7 +25,10 @@ ROOT = Path(__file__).resolve().parents[2]
 CONTROLLERS = ("model_based", "window", "kernel", "baseline", "exact_model")
 HOSTILE = '"><script>alert(1)</script><img src=http://evil.example/x onerror=alert(2)>\u202egpj.mcap'
 SCALED = {"change_percent": -60.0, "gain_difference": 1e-15}
-TRADES = {name: {"tracking_degC": e, "effort_percent": u} for name, e, u in (("default", 8.0, 11.0), ("optimum", 4.0, 30.0))}
+TRADES = {
+    name: {"tracking_degC": e, "effort_percent": u}
+    for name, e, u in (("default", 8.0, 11.0), ("optimum", 4.0, 30.0))
+}
 
 
 def figure(median, low, high, **more):
@@ -55,7 +68,15 @@ def metrics():
             "limited_share": 0.1,
             "level_percent_per_band": [[0.3, 0.4]] * 8,
         },
-        "ingest": {"recordings": 2, "processed": 2, "reused": 0, "quarantined": 1, "samples": 400, "segments": 1, "findings": {}},
+        "ingest": {
+            "recordings": 2,
+            "processed": 2,
+            "reused": 0,
+            "quarantined": 1,
+            "samples": 400,
+            "segments": 1,
+            "findings": {},
+        },
         "identify_plant": {
             "order": 2,
             "past": 5,
@@ -83,7 +104,10 @@ def metrics():
                 "inputs": {f"heater_{i}": {"rank": 5, "level": 2.0} for i in (1, 2)},
             },
             "largest_pole": 0.99,
-            "advice": ["the residuals of zone_2 are not white (correlation +0.42 at lag 1): lengthen the window, or model the disturbance"],
+            "advice": [
+                "the residuals of zone_2 are not white (correlation +0.42 at lag 1): lengthen the window, "
+                "or model the disturbance"
+            ],
         },
         "learn_kernel": {
             "window": 4,
@@ -99,8 +123,19 @@ def metrics():
             "candidates": {},
         },
         "tune_weights": {
-            "parity": {"best_cost_perfect_state": 101.0, "optimum": 100.0, "scaled_weights": SCALED, "trade": TRADES},
-            "practical": {"cost": 2.0, "cost_default": 8.0, "regret_identity": 0.5, "failed": 1, "trade": TRADES},
+            "parity": {
+                "best_cost_perfect_state": 101.0,
+                "optimum": 100.0,
+                "scaled_weights": SCALED,
+                "trade": TRADES,
+            },
+            "practical": {
+                "cost": 2.0,
+                "cost_default": 8.0,
+                "regret_identity": 0.5,
+                "failed": 1,
+                "trade": TRADES,
+            },
         },
         "evaluate_temperature": {
             "as_published": both,
@@ -127,9 +162,24 @@ def deposition_metrics():
         } | more
 
     pixels = {"flow_error_percent": 2.0, "flow_error_corner_percent": 3.0, "rejected_percent": 1.0}
-    before = {"gamma": 0.76, "gamma_worst": 1.2, "gamma_above_1_percent": 70.0, "gamma_ours": 0.1, "gamma_ours_worst": 0.3}
-    trained = before | {"paper": law(0.4), "ours": law(0.02), "pixels": law(0.03, **pixels), "other_routines": [law(0.02)]}
-    return {"train_ilc": {"A": trained}, "segment_library": {"columns": 5}, "compose_parts": {"square": {"A": {"chosen": "basis"}}}}
+    before = {
+        "gamma": 0.76,
+        "gamma_worst": 1.2,
+        "gamma_above_1_percent": 70.0,
+        "gamma_ours": 0.1,
+        "gamma_ours_worst": 0.3,
+    }
+    trained = before | {
+        "paper": law(0.4),
+        "ours": law(0.02),
+        "pixels": law(0.03, **pixels),
+        "other_routines": [law(0.02)],
+    }
+    return {
+        "train_ilc": {"A": trained},
+        "segment_library": {"columns": 5},
+        "compose_parts": {"square": {"A": {"chosen": "basis"}}},
+    }
 
 
 def declared(root):
@@ -199,15 +249,23 @@ def record(machine, samples, recording):
 
 
 def model(machine):
-    """What the page of the identification shows: zone_2's errors are not noise, and heater_2 does nothing that is known to zone_1."""
+    """What the page of the identification shows: zone_2's errors are not noise,
+    and heater_2 does nothing that is known to zone_1."""
     names = [s.name for s in machine.outputs], [s.name for s in machine.inputs]
     residuals = []
     for output in names[0]:
-        residuals += [(output, output, k, 0.5 ** (4 * k) if output == "zone_1" else 0.42**k, 0.1, output == "zone_1") for k in range(6)]
+        residuals += [
+            (output, output, k, 0.5 ** (4 * k) if output == "zone_1" else 0.42**k, 0.1, output == "zone_1")
+            for k in range(6)
+        ]
         residuals += [(output, name, k, 0.02 * k / 5, 0.1, True) for name in names[1] for k in range(-5, 6)]
     pairs = [(output, name) for output in names[0] for name in names[1]]
     time = np.arange(0.0, 50.0, 10.0)
-    rise = [(o, i, t, 2 * (1 - np.exp(-t / 10)), 1.5 * (1 - np.exp(-t / 10)), 2.5 * (1 - np.exp(-t / 10))) for o, i in pairs for t in time]
+    rise = [
+        (o, i, t, 2 * (1 - np.exp(-t / 10)), 1.5 * (1 - np.exp(-t / 10)), 2.5 * (1 - np.exp(-t / 10)))
+        for o, i in pairs
+        for t in time
+    ]
     dynamics = []
     for output, name in pairs:
         seen = (output, name) != ("zone_1", "heater_2")
@@ -228,7 +286,10 @@ def model(machine):
         "levels": (tables.LEVELS, levels),
     }
     return {
-        name: (schema, dict(zip((c.name for c in schema.columns), map(list, zip(*found, strict=True)), strict=True)))
+        name: (
+            schema,
+            dict(zip((c.name for c in schema.columns), map(list, zip(*found, strict=True)), strict=True)),
+        )
         for name, (schema, found) in rows.items()
     }
 
@@ -240,7 +301,9 @@ def write(root, *, samples=400, recording="good.mcap", worst=None):
         artifacts.write_metrics(stage, figures)
     data = Path("datasets")
     artifacts.write_table(
-        data / "ingest/record.parquet", tables.record(machine.inputs, machine.outputs), record(machine, samples, recording)
+        data / "ingest/record.parquet",
+        tables.record(machine.inputs, machine.outputs),
+        record(machine, samples, recording),
     )
     flaw = {
         "recording": [HOSTILE],
@@ -264,13 +327,19 @@ def write(root, *, samples=400, recording="good.mcap", worst=None):
     }
     artifacts.write_table(data / "identify_plant/order.parquet", tables.ORDER, order)
     seen = {"segment": np.repeat([0, 1], 25).astype(np.int32), "time_s": np.tile(np.arange(25.0), 2)}
-    seen |= {f"{o.name}_{kind}": np.sin(np.arange(50.0)) for o in machine.outputs for kind in ("measured", "simulated", "ahead")}
+    seen |= {
+        f"{o.name}_{kind}": np.sin(np.arange(50.0))
+        for o in machine.outputs
+        for kind in ("measured", "simulated", "ahead")
+    }
     seen["zone_2_measured"][5:9] = np.nan
     artifacts.write_table(data / "identify_plant/holdout.parquet", tables.holdout(machine.outputs), seen)
     for name, (schema, columns) in model(machine).items():
         artifacts.write_table(data / f"identify_plant/{name}.parquet", schema, columns)
     table = np.array([[1, 8, -10.0], [2, 16, -30.0], [3, 24, -20.0]])
-    artifacts.write_arrays(data / "learn_kernel/window.parquet", "window", 1, {"table": (table, "1", "criterion")})
+    artifacts.write_arrays(
+        data / "learn_kernel/window.parquet", "window", 1, {"table": (table, "1", "criterion")}
+    )
     artifacts.write_arrays(
         data / "learn_kernel/kernel.parquet",
         "kernel",
@@ -292,13 +361,27 @@ def write(root, *, samples=400, recording="good.mcap", worst=None):
         "failure": ["", "", "", "", HOSTILE, ""],
     }
     artifacts.write_table(data / "tune_weights/history.parquet", tables.TUNING, history)
-    artifacts.write_json(data / "tune_weights/weights.json", {"practical": {"q": [1.0, 2.0], "r": [0.1, 0.2]}})
+    artifacts.write_json(
+        data / "tune_weights/weights.json", {"practical": {"q": [1.0, 2.0], "r": [0.1, 0.2]}}
+    )
     folder = data / "evaluate_temperature"
     artifacts.write_table(folder / "scorecard.parquet", tables.SCORECARD, scorecard(worst or {}))
-    artifacts.write_table(folder / "trajectories.parquet", tables.trajectories(machine.inputs, machine.outputs), trajectories(machine))
-    routes = [(route, noise, i) for route in ("window", "kernel", "kernel_predicted_state") for noise in (0.1, 0.5) for i in range(4)]
+    artifacts.write_table(
+        folder / "trajectories.parquet",
+        tables.trajectories(machine.inputs, machine.outputs),
+        trajectories(machine),
+    )
+    routes = [
+        (route, noise, i)
+        for route in ("window", "kernel", "kernel_predicted_state")
+        for noise in (0.1, 0.5)
+        for i in range(4)
+    ]
     study = dict(zip(("route", "noise_degC", "data_set"), map(list, zip(*routes, strict=True)), strict=True))
-    study |= {"gap": [1e-5 * (1 + i) for i in range(len(routes))], "error_degC": [0.01 * (1 + i) for i in range(len(routes))]}
+    study |= {
+        "gap": [1e-5 * (1 + i) for i in range(len(routes))],
+        "error_degC": [0.01 * (1 + i) for i in range(len(routes))],
+    }
     artifacts.write_table(folder / "study.parquet", tables.STUDY, study)
     artifacts.write_json(folder / "summary.json", {"noise_degC": 0.1, "scenarios": 6, "plants": 2})
     deposition()
@@ -317,10 +400,23 @@ def deposition(scores=None):
     folder = Path("datasets/train_ilc")
     runs = [(law, j) for law in ("paper", "ours", "pixels") for j in range(3)]
     ratio = [1.0, 0.7, 0.4, 1.0, 0.1, 0.02, 1.0, 0.1, 0.03]
-    rows = [("A", law, 0, 8.0, 0.4, j, r, r + 0.05, r, 1.0 + 9.5 * j, 0.0, False) for (law, j), r in zip(runs, ratio, strict=True)]
+    rows = [
+        ("A", law, 0, 8.0, 0.4, j, r, r + 0.05, r, 1.0 + 9.5 * j, 0.0, False)
+        for (law, j), r in zip(runs, ratio, strict=True)
+    ]
     artifacts.write_table(folder / "trials.parquet", TRIALS, _columns(TRIALS, rows))
     rows = [
-        ("A", law, 0, j, t, r, r * (1 + 10 * j * (t < 1.2)), r * (1 - found) if not 1.8 < t < 2.2 else np.nan, r * (1 - found))
+        (
+            "A",
+            law,
+            0,
+            j,
+            t,
+            r,
+            r * (1 + 10 * j * (t < 1.2)),
+            r * (1 - found) if not 1.8 < t < 2.2 else np.nan,
+            r * (1 - found),
+        )
         for (law, j), found in zip(runs, ratio, strict=True)
         for t, r in zip(time, wanted, strict=True)
     ]
@@ -338,18 +434,41 @@ def deposition(scores=None):
         "creep_time_s": 20.0,
     }
     calibration = {"gain": 0.008, "offset": 0.0, "deviation": 0.0004, "residuals": [0.0]}
-    artifacts.write_json(folder / "models.json", {"A": {"nominal": chain, "plant": chain, "calibration": calibration}})
-    frame = {"material": "A", "trial": 0, "recording": HOSTILE, "topic": "/image", "time_s": 1.0, "deviation_px": 0.1, "blur_px": 1.0}
+    artifacts.write_json(
+        folder / "models.json", {"A": {"nominal": chain, "plant": chain, "calibration": calibration}}
+    )
+    frame = {
+        "material": "A",
+        "trial": 0,
+        "recording": HOSTILE,
+        "topic": "/image",
+        "time_s": 1.0,
+        "deviation_px": 0.1,
+        "blur_px": 1.0,
+    }
     frames = [("a.jpg", "start", "", 0.9), ("b.jpg", "rejected", "no bead", None)]
     artifacts.write_json(
-        folder / "frames/frames.json", [frame | {"file": f, "place": p, "reason": why, "width_mm": w} for f, p, why, w in frames]
+        folder / "frames/frames.json",
+        [frame | {"file": f, "place": p, "reason": why, "width_mm": w} for f, p, why, w in frames],
     )
     for name, *_ in frames:
         (folder / "frames" / name).write_bytes(b"\xff\xd8 a picture \xff\xd9")
-    tasks = [("Start", 0.0, 40, 51), ("Corner", 0.4, 28, 54), ("Stop", 0.0, 28, 57), ("Steady-State", 0.0, 0, 1), ("No-Flow", 0.0, 0, 1)]
-    rows = [(task, "A", 0.8, 8.0, pause, lead, n, [float(task != "No-Flow")] * n) for task, pause, lead, n in tasks]
+    tasks = [
+        ("Start", 0.0, 40, 51),
+        ("Corner", 0.4, 28, 54),
+        ("Stop", 0.0, 28, 57),
+        ("Steady-State", 0.0, 0, 1),
+        ("No-Flow", 0.0, 0, 1),
+    ]
+    rows = [
+        (task, "A", 0.8, 8.0, pause, lead, n, [float(task != "No-Flow")] * n)
+        for task, pause, lead, n in tasks
+    ]
     artifacts.write_table("datasets/segment_library/library.parquet", LIBRARY, _columns(LIBRARY, rows))
-    checks = [{"assumption": k, "claim": f"claim {k}: what", "material": "A", "nozzle_mm": 0.8, "percent": 10.0 * k} for k in range(1, 5)]
+    checks = [
+        {"assumption": k, "claim": f"claim {k}: what", "material": "A", "nozzle_mm": 0.8, "percent": 10.0 * k}
+        for k in range(1, 5)
+    ]
     known = {"material": "A", "nozzle_mm": 0.8, "chain": {"extruder": chain, "held_out_percent": 0.6}}
     learned = {"sample_time_s": 0.02, "marks": {"Stop": [0.56, 0.58]}, "materials": [known], "checks": checks}
     artifacts.write_json("datasets/segment_library/learned.json", learned)
@@ -370,20 +489,36 @@ def deposition(scores=None):
 def _composed(time, wanted, scores):
     folder = Path("datasets/compose_parts")
     absent = {"superposition": scores["priority"], "ilc": (np.nan,)}
-    flows = {name: wanted * (1 - (absent | scores)[name][0] / 100) for name in ("on_off", "priority", "superposition", "basis", "ilc")}
+    flows = {
+        name: wanted * (1 - (absent | scores)[name][0] / 100)
+        for name in ("on_off", "priority", "superposition", "basis", "ilc")
+    }
     rows = [
         ("square", 0, "A", t, 8 * t, 0.0, r, r, r, *(flows[name][k] for name in flows))
         for k, (t, r) in enumerate(zip(time, wanted, strict=True))
     ]
     artifacts.write_table(folder / "signals.parquet", SIGNALS, _columns(SIGNALS, rows))
-    rows = [("square", "A", name, name == "basis", error, predicted, line) for name, (error, predicted, line) in scores.items()]
+    rows = [
+        ("square", "A", name, name == "basis", error, predicted, line)
+        for name, (error, predicted, line) in scores.items()
+    ]
     artifacts.write_table(folder / "scores.parquet", SCORES, _columns(SCORES, rows))
     artifacts.write_table(
         folder / "tasks.parquet", TASKS, _columns(TASKS, [("square", "Start", 0, 3, 1.0, 1.0, 8.0, 0.0, 0.0)])
     )
-    lines = [("square", 3, 0, 1.0, 2.0, 16.0, 4.0, 3.8, 1.0, -5.0, False), ("square", 7, 0, 3.0, 0.2, 1.6, 0.4, 0.4, 0.1, 0.0, True)]
+    lines = [
+        ("square", 3, 0, 1.0, 2.0, 16.0, 4.0, 3.8, 1.0, -5.0, False),
+        ("square", 7, 0, 3.0, 0.2, 1.6, 0.4, 0.4, 0.1, 0.0, True),
+    ]
     artifacts.write_table(folder / "lines.parquet", LINES, _columns(LINES, lines))
-    enough = {"ramp_s": 0.15, "limit": None, "peak_over_steady": 20.0, "share_percent": 0.0, "rms_percent_of_on_off": 0.1, "enough": True}
+    enough = {
+        "ramp_s": 0.15,
+        "limit": None,
+        "peak_over_steady": 20.0,
+        "share_percent": 0.0,
+        "rms_percent_of_on_off": 0.1,
+        "enough": True,
+    }
     report = {
         "printed_lines": 2,
         "runs": 2,
@@ -394,9 +529,12 @@ def _composed(time, wanted, scores):
         "unknown_words": 1,
     }
     artifacts.write_json(
-        folder / "conformance.json", {"square": report | {"saturation": {"A": enough}, "ramp_that_would_do_s": {"A": 0.15}}}
+        folder / "conformance.json",
+        {"square": report | {"saturation": {"A": enough}, "ramp_that_would_do_s": {"A": 0.15}}},
     )
 
 
 def _columns(schema, rows):
-    return dict(zip((column.name for column in schema.columns), map(list, zip(*rows, strict=True)), strict=True))
+    return dict(
+        zip((column.name for column in schema.columns), map(list, zip(*rows, strict=True)), strict=True)
+    )

@@ -1,4 +1,5 @@
-"""Every artifact of the setpoint loop, made up: seven controllers, the cases of both simulators and of the pictures, and a classifier. No figure here was measured."""
+"""Every artifact of the setpoint loop, made up: seven controllers, the cases of both simulators and of the
+pictures, and a classifier. No figure here was measured."""
 
 import itertools
 import math
@@ -20,8 +21,14 @@ KINDS = {
     "our agent": "agent",
     "the paper's agent": "paper",
 }
-PAPER_CASES = (*(f"accuracy {a:g}" for a in (1.0, 0.9, 0.8, 0.7)), "accuracy 0.7, gain 0.6", "accuracy 0.7, clog")
-RECORDED_CASES = tuple(f"recorded, {wear}{more}" for wear in ("fresh", "sticky") for more in ("", ", gain 0.6", ", clog"))
+PAPER_CASES = (
+    *(f"accuracy {a:g}" for a in (1.0, 0.9, 0.8, 0.7)),
+    "accuracy 0.7, gain 0.6",
+    "accuracy 0.7, clog",
+)
+RECORDED_CASES = tuple(
+    f"recorded, {wear}{more}" for wear in ("fresh", "sticky") for more in ("", ", gain 0.6", ", clog")
+)
 # runs that are lost in per cent, and how much more of them in a harder case
 LOST = {
     "our agent": (0.2, 0.1),
@@ -37,22 +44,31 @@ RUNS = 2100
 
 
 def columns(schema, rows):
-    return dict(zip((column.name for column in schema.columns), map(list, zip(*rows, strict=True)), strict=True))
+    return dict(
+        zip((column.name for column in schema.columns), map(list, zip(*rows, strict=True)), strict=True)
+    )
 
 
 def wilson(percent, runs):
     p, z = percent / 100, 1.96
-    centre, half = (p + z * z / 2 / runs) / (1 + z * z / runs), z * math.sqrt(p * (1 - p) / runs + z * z / 4 / runs**2) / (1 + z * z / runs)
+    centre, half = (
+        (p + z * z / 2 / runs) / (1 + z * z / runs),
+        z * math.sqrt(p * (1 - p) / runs + z * z / 4 / runs**2) / (1 + z * z / runs),
+    )
     return percent, 100 * max(centre - half, 0.0), 100 * min(centre + half, 1.0)
 
 
 def scoreboard(lost=LOST, runs=RUNS):
-    """`lost` {controller: (percent of runs lost, more of them for each step of difficulty)}; three cases of the pictures, of which no run is long enough to stay."""
+    """`lost` {controller: (percent of runs lost, more of them for each step of difficulty)}; three cases of
+    the pictures, of which no run is long enough to stay."""
     rows, nothing = [], (math.nan,) * 3
     for name, (least, more) in lost.items():
         for simulator, cases in (("paper", PAPER_CASES), ("recorded", RECORDED_CASES)):
             for hard, case in enumerate(cases):
-                settled, stay = max(100 - least - more * hard, 0.0), max(100 - 1.5 * least - 1.5 * more * hard, 0.0)
+                settled, stay = (
+                    max(100 - least - more * hard, 0.0),
+                    max(100 - 1.5 * least - 1.5 * more * hard, 0.0),
+                )
                 recovered = wilson(max(settled - 1, 0.0), runs) if case.endswith("clog") else nothing
                 rows.append((name, KINDS[name], simulator, case, True, runs, *wilson(settled, runs), *wilson(stay, runs), *recovered, 9.0 + hard, 22.0 + 4 * hard, 12.0, 0.8 + 0.2 * hard, 300.0, 230.0, settled))  # fmt: skip
         if name in (DEFAULT, "Bayes, robust", "the paper's agent"):
@@ -92,8 +108,13 @@ def paths(steps=100):
         for simulator, case in (("paper", "accuracy 0.7"), ("recorded", "recorded, fresh")):
             for k, start in enumerate(starts):
                 q, u = _walk(rng, *start, steps, error)
-                rows += [(name, simulator, case, k, step, a, b) for step, (a, b) in enumerate(zip(q, u, strict=True))]
-    artifacts.write_table("datasets/evaluate_setpoint/paths.parquet", tables.PATHS, columns(tables.PATHS, rows))
+                rows += [
+                    (name, simulator, case, k, step, a, b)
+                    for step, (a, b) in enumerate(zip(q, u, strict=True))
+                ]
+    artifacts.write_table(
+        "datasets/evaluate_setpoint/paths.parquet", tables.PATHS, columns(tables.PATHS, rows)
+    )
 
 
 def decisions(steps=50, why=""):
@@ -106,12 +127,24 @@ def decisions(steps=50, why=""):
             over, under = 1 / (1 + math.exp(-(true - 110) / 4)), 1 / (1 + math.exp((true - 90) / 4))
             p = np.clip([under, max(1 - under - over, 0.0), over], 0, 1)
             held = (flow > 100 and 37 <= k < 42) or rng.random() < 0.06
-            reason = "out of distribution" if flow > 100 and 37 <= k < 42 else "the classes cannot be told apart"
-            move = 0.0 if held or abs(true - 100) < 4 else float(np.clip(np.round((100 - true) / 5) * 5, -10, 10))
+            reason = (
+                "out of distribution" if flow > 100 and 37 <= k < 42 else "the classes cannot be told apart"
+            )
+            move = (
+                0.0
+                if held or abs(true - 100) < 4
+                else float(np.clip(np.round((100 - true) / 5) * 5, -10, 10))
+            )
             warm = 10.0 if k in (0, 10) and flow < 100 else 0.0
-            text = f"{8.0 * k:6.1f} s: 20 frames valid, 20 count, " + (f"held: {reason}" if held else f"good {p[1]:.2f}; flow {move:+g} %")
+            text = f"{8.0 * k:6.1f} s: 20 frames valid, 20 count, " + (
+                f"held: {reason}" if held else f"good {p[1]:.2f}; flow {move:+g} %"
+            )
             rows.append((episode, DEFAULT, k, 8.0 * k, max(true, 0.0), degrees, setpoint, target, *(p / p.sum()), 4 if held else 20, 9.0, move, warm, bool(held), why or text))  # fmt: skip
-            setpoint, target, degrees = setpoint + move, target + warm, degrees + 0.6 * (target + warm - degrees)
+            setpoint, target, degrees = (
+                setpoint + move,
+                target + warm,
+                degrees + 0.6 * (target + warm - degrees),
+            )
     table = columns(tables.DECISIONS, rows)
     artifacts.write_table("datasets/evaluate_setpoint/decisions.parquet", tables.DECISIONS, table)
 
@@ -130,7 +163,9 @@ def classifier(seed=0):
     rows = []
     for of, method, off in (("image", "raw", 0.07), ("image", "calibrated", 0.01), ("window", "hard_counts", 0.1), ("window", "mean", 0.18), ("window", "log_sum", 0.02)):  # fmt: skip
         rows += [(of, method, k / 10, (k + 1) / 10, 20 * k if k > 3 else 0, k / 10 + 0.05 if k > 3 else math.nan, min(k / 10 + 0.05 - off, 1.0) if k > 3 else math.nan) for k in range(10)]  # fmt: skip
-    artifacts.write_table(folder / "reliability.parquet", tables.RELIABILITY, columns(tables.RELIABILITY, rows))
+    artifacts.write_table(
+        folder / "reliability.parquet", tables.RELIABILITY, columns(tables.RELIABILITY, rows)
+    )
     rows = [(learner, k, 1.1 * math.exp(-k / 15) + 0.4, 1.1 * math.exp(-k / 12) + 0.5, 0.79 - 0.45 * math.exp(-k / 8)) for learner, last in (("vision transformer", 40), ("convolutional network", 20)) for k in range(1, last + 1)]  # fmt: skip
     artifacts.write_table(folder / "course.parquet", tables.COURSE, columns(tables.COURSE, rows))
     edges = [20.0, 40.0, 60.0, 80.0, 90.0, 100.0, 110.0, 120.0, 150.0, 200.0, 310.0]
@@ -140,7 +175,13 @@ def classifier(seed=0):
             for segment in range(4):
                 middle = (low + high) / 2 + rng.normal(0, 5)
                 shares = np.exp([-((middle - c) ** 2) / 800 for c in (60.0, 100.0, 140.0)])
-                shares = np.array([1.0, 0, 0]) if middle < 60 else np.array([0, 0, 1.0]) if middle > 140 else shares / shares.sum()
+                shares = (
+                    np.array([1.0, 0, 0])
+                    if middle < 60
+                    else np.array([0, 0, 1.0])
+                    if middle > 140
+                    else shares / shares.sum()
+                )
                 rows.append((part, b, low, high, 10 * b + segment, *shares, int(shares.argmax())))
     artifacts.write_table(folder / "windows.parquet", tables.WINDOWS, columns(tables.WINDOWS, rows))
     frames()
@@ -165,12 +206,17 @@ def frames():
 def metrics():
     out = {kind: {"auroc": 0.95 - 0.01 * i, "found": 0.7, "energy_auroc": 0.8, "max_p_auroc": 0.72} for i, kind in enumerate(("blur", "transposed"))}  # fmt: skip
     seen = {
-        "image_accuracy": 0.797, "window_accuracy": 0.931, "svc_image_accuracy": 0.747, "svc_window_accuracy": 0.86, "cnn_image_accuracy": 0.789, "width_image_accuracy": 0.638,
-        "intervals_percent": {"image": [78.9, 80.5], "window": [90.2, 95.1], "svc_image": [73.9, 75.5], "cnn_image": [78.1, 79.7], "width_image": [62.9, 64.7]},
+        "image_accuracy": 0.797, "window_accuracy": 0.931, "svc_image_accuracy": 0.747,
+        "svc_window_accuracy": 0.86, "cnn_image_accuracy": 0.789, "width_image_accuracy": 0.638,
+        "intervals_percent": {"image": [78.9, 80.5], "window": [90.2, 95.1], "svc_image": [73.9, 75.5],
+        "cnn_image": [78.1, 79.7], "width_image": [62.9, 64.7]},
         "ece_image": 0.018, "ece_image_raw": 0.07, "ece_window": 0.029, "ece_window_counts": 0.099,
-        "conformal": {"asked": 0.9, "coverage": 0.91, "held": 0.22, "windows": 300}, "out_of_distribution": out | {"false_alarms": 0.05},
-        "size": "small", "source": "simulated", "parameters": 75_843, "best_epoch": {"vision transformer": 38, "convolutional network": 19},
-        "data": {"frames": 13_800, "valid": 12_950, "rejected": {"no line stands out": 800, "the line passes the border": 50}, "segments": 690},
+        "conformal": {"asked": 0.9, "coverage": 0.91, "held": 0.22, "windows": 300},
+        "out_of_distribution": out | {"false_alarms": 0.05},
+        "size": "small", "source": "simulated", "parameters": 75_843,
+        "best_epoch": {"vision transformer": 38, "convolutional network": 19},
+        "data": {"frames": 13_800, "valid": 12_950,
+        "rejected": {"no line stands out": 800, "the line passes the border": 50}, "segments": 690},
     }  # fmt: skip
     taught = {
         "phase3": {"settled": 100.0, "stay": 100.0, "median_steps": 7.0, "runs": 2100},

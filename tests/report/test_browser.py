@@ -1,5 +1,5 @@
-"""The pages in headless Chromium: what fits, what overflows, what is asked of the network, what the console says, what sorts, enlarges and
-explains itself, what prints; skipped where there is no browser."""
+"""The pages in headless Chromium: what fits, what overflows, what is asked of the network, what the console
+says, what sorts, enlarges and explains itself, what prints; skipped where there is no browser."""
 
 import re
 
@@ -14,7 +14,9 @@ SHEET = (1016, 703)
 
 @pytest.mark.parametrize("name", PAGES)
 @pytest.mark.parametrize(("width", "theme"), [(1280, "light"), (1024, "dark"), (390, "light")])
-def test_nothing_overflows_nothing_is_fetched_but_the_machine_and_the_console_is_silent(open_page, name, width, theme):
+def test_nothing_overflows_nothing_is_fetched_but_the_machine_and_the_console_is_silent(
+    open_page, name, width, theme
+):
     page = open_page(name, width=width, theme=theme)
     assert page.evaluate("document.documentElement.scrollWidth") <= width
     wide = """width => [...document.querySelectorAll("body *")].filter(e => !e.closest("svg, .scroll, .vh, dialog, .tip") &&
@@ -22,7 +24,10 @@ def test_nothing_overflows_nothing_is_fetched_but_the_machine_and_the_console_is
     assert page.evaluate(wide, width) == []
     # the page itself and the pictures inside it; beside it what it was made on
     beside = page.url.replace(f"{name}.html", "machine.js")
-    assert [url for url in page.asked if not url.startswith("data:")] == [page.url, beside] and page.said == []
+    assert [url for url in page.asked if not url.startswith("data:")] == [
+        page.url,
+        beside,
+    ] and page.said == []
     told = "Last run on Some CPU @ 3.00GHz, pins avx2, beadline 0.1.0, commit abc12345 with uncommitted changes, 22 Nov 2026"
     assert page.locator("body > footer").inner_text() == told
     paper = page.evaluate("getComputedStyle(document.body).backgroundColor")
@@ -109,7 +114,8 @@ def test_the_pointer_tells_time_and_value_as_they_are_in_the_artifact(open_page)
     page = open_page("temperature")
     seconds, degrees = pointed(page, "errors", 0, 0.2).split("\n")
     time, error = (float(text.split("\u202f")[0]) for text in (seconds, degrees))
-    # the trajectories of the small project: 80 / 2^t - 0.05, sampled once a second; straight between samples on the log scale, within the
+    # the trajectories of the small project: 80 / 2^t - 0.05, sampled once a second;
+    # straight between samples on the log scale, within the
     # tenth of a pixel to which a picture is drawn, of 18 px a decade
     low, high = (abs(80 * 0.5**t - 0.05) for t in (int(time) + 1, int(time)))
     assert 1 < time < 12 and low * 0.95 <= error <= high * 1.05
@@ -117,7 +123,8 @@ def test_the_pointer_tells_time_and_value_as_they_are_in_the_artifact(open_page)
 
 
 @pytest.mark.parametrize(
-    ("name", "figure", "picture"), [("temperature", ".col figure", "svg.plot"), ("deposition", ".frames figure", "img")]
+    ("name", "figure", "picture"),
+    [("temperature", ".col figure", "svg.plot"), ("deposition", ".frames figure", "img")],
 )
 def test_a_picture_enlarges_zooms_and_closes(open_page, name, figure, picture):
     page = open_page(name)
@@ -134,9 +141,13 @@ def test_a_picture_enlarges_zooms_and_closes(open_page, name, figure, picture):
     box = box_of(shown)
     page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     page.mouse.wheel(0, -200)
-    page.wait_for_function("whole => document.querySelector('dialog .stage svg').getAttribute('viewBox') !== whole", arg=whole)
+    page.wait_for_function(
+        "whole => document.querySelector('dialog .stage svg').getAttribute('viewBox') !== whole", arg=whole
+    )
     page.keyboard.press("0")
-    assert [float(part) for part in shown.get_attribute("viewBox").split()] == [float(part) for part in whole.split()]
+    assert [float(part) for part in shown.get_attribute("viewBox").split()] == [
+        float(part) for part in whole.split()
+    ]
     page.keyboard.press("Escape")
     assert not dialog.is_visible() and page.said == []
 
@@ -183,9 +194,13 @@ def test_a_page_prints_on_a4_landscape_and_no_figure_is_cut(open_page, name):
 
 
 @pytest.mark.parametrize("name", PAGES)
-@pytest.mark.parametrize(("theme", "width"), [("light", 1280), ("dark", 1280), pytest.param("light", 390, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("theme", "width"), [("light", 1280), ("dark", 1280), pytest.param("light", 390, marks=pytest.mark.slow)]
+)
 def test_axe_finds_nothing_serious(open_page, name, theme, width):
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe is not installed; uv sync installs it")
+    axe = pytest.importorskip(
+        "axe_playwright_python.sync_playwright", reason="axe is not installed; uv sync installs it"
+    )
     # a theme changes colours and nothing else
     options = {"resultTypes": ["violations"]} | ({"runOnly": ["color-contrast"]} if theme == "dark" else {})
     found = axe.Axe().run(open_page(name, theme=theme, width=width), options=options).response["violations"]
@@ -206,7 +221,8 @@ def test_every_picture_stands_where_a_link_leads_to_stage_artifact_schema_and_ha
         return !links.length || links.some(a => document.getElementById(a.hash.slice(1)).cells.length !== 4);
     }).map(e => e.closest("section, .answers")?.id + " " + e.outerHTML.slice(0, 160))"""
     assert page.evaluate(lost) == []
-    # a table of figures too; what params.yaml declares has no artifact, and a loop that is not measured no figure
+    # a table of figures too; what params.yaml declares has no
+    # artifact, and a loop that is not measured no figure
     unsaid = """() => [...document.querySelectorAll("main table.tab, main table.fig, main .answers table")].filter(e =>
         !(e.closest("article, section, .answers").querySelector("a[href^='#from-']")) && e.closest("section").getAttribute("aria-labelledby") !== "declared"
         && !e.querySelector(".hole")).map(e => e.outerHTML.slice(0, 160))"""
@@ -215,16 +231,16 @@ def test_every_picture_stands_where_a_link_leads_to_stage_artifact_schema_and_ha
 
 def test_text_from_the_data_runs_nothing_even_where_it_were_not_escaped(open_page, reports, tmp_path):
     text = (reports / "index.html").read_text(encoding="utf-8")
-    hostile = (
-        '<script>window.hit = 1</script><script src="evil.js"></script><img src="http://evil.example/x" onerror="window.hit = 2"><a href="javascript:window.hit=3">x</a>'
-    )
+    hostile = '<script>window.hit = 1</script><script src="evil.js"></script><img src="http://evil.example/x" onerror="window.hit = 2"><a href="javascript:window.hit=3">x</a>'
     (tmp_path / "bad.html").write_text(text.replace("<main>", f"<main>{hostile}"), encoding="utf-8")
     (tmp_path / "machine.js").write_text(MACHINE)
     (tmp_path / "evil.js").write_text("window.hit = 4")
     page = open_page("bad", folder=tmp_path)
     assert page.evaluate("window.hit") is None
     # the browser refuses before it asks
-    assert not any(url.startswith("http") and "evil" in url for url in page.asked) or all("Content Security Policy" in s for s in page.said)
+    assert not any(url.startswith("http") and "evil" in url for url in page.asked) or all(
+        "Content Security Policy" in s for s in page.said
+    )
     page.locator("a", has_text="x").first.click()
     assert page.evaluate("window.hit") is None
 
@@ -240,7 +256,8 @@ def test_every_text_colour_reaches_four_and_a_half_to_one_on_every_ground(root, 
     style = (root / "pipeline/report/templates/style.css").read_text(encoding="utf-8")
     block = re.findall(r"--paper:#.*?\}", style, re.DOTALL)[theme]
     colours = {
-        key: "#" + "".join(c * (2 if len(value) == 3 else 1) for c in value) for key, value in re.findall(r"--(\w+):#([0-9a-f]+)", block)
+        key: "#" + "".join(c * (2 if len(value) == 3 else 1) for c in value)
+        for key, value in re.findall(r"--(\w+):#([0-9a-f]+)", block)
     }
     for ground in ("paper", "surface", "band", "calm"):
         for ink in ("ink", "muted", "blue", "red"):

@@ -1,4 +1,5 @@
-"""The page of the deposition loop on a small project: the verdict against figures made by hand, what is missing, hostile text, a real machine, sizes."""
+"""The page of the deposition loop on a small project: the verdict against figures made by hand, what is
+missing, hostile text, a real machine, sizes."""
 
 import re
 from pathlib import Path
@@ -18,10 +19,19 @@ PAGE, FOLDER = Path("reports/deposition.html"), Path("datasets/compose_parts")
 ARTIFACTS = [
     *(
         f"datasets/train_ilc/{name}"
-        for name in ("trials.parquet", "lessons.parquet", "filmed.parquet", "models.json", "frames/frames.json")
+        for name in (
+            "trials.parquet",
+            "lessons.parquet",
+            "filmed.parquet",
+            "models.json",
+            "frames/frames.json",
+        )
     ),
     *(f"datasets/segment_library/{name}" for name in ("library.parquet", "learned.json")),
-    *(f"datasets/compose_parts/{name}" for name in ("signals.parquet", "scores.parquet", "lines.parquet", "conformance.json")),
+    *(
+        f"datasets/compose_parts/{name}"
+        for name in ("signals.parquet", "scores.parquet", "lines.parquet", "conformance.json")
+    ),
 ]
 
 
@@ -38,12 +48,27 @@ def conformance(**values):
 
 def test_the_composer_with_the_least_worst_error_is_named_with_its_figure_yardsticks_and_price(project):
     text = page()
-    assert "This machine prints these parts: use the basis functions. All six rules that can be judged passed, where the drive can give 20 times the steady command." in text
-    assert "Basis functions leave at most 2.0 % of on‑off control’s flow error (square, A); library by its priority rule 12 %" in text
-    assert "learning each part from scratch 1.5 %. Worst printed line: 1.0 % off its volume, ±3 % allowed." in text
+    assert (
+        "This machine prints these parts: use the basis functions. All six rules that can be judged passed, "
+        "where the drive can give 20 times the steady command." in text
+    )
+    assert (
+        "Basis functions leave at most 2.0 % of on‑off control’s flow error (square, A); "
+        "library by its priority rule 12 %" in text
+    )
+    assert (
+        "learning each part from scratch 1.5 %. Worst printed line: 1.0 % off its volume, ±3 % allowed."
+        in text
+    )
     assert "commands up to 20 times the steady one." in text
-    assert "γ of the paper’s law was 0.76 on the nominal plant and 1.20 on the worst of its family, above 1 on 70 %: do not run it" in text
-    assert re.search(r"<title>(.*?) ·", PAGE.read_text())[1] == "Deposition: This machine prints these parts: use the basis functions"
+    assert (
+        "γ of the paper’s law was 0.76 on the nominal plant and 1.20 on the worst of its family, "
+        "above 1 on 70 %: do not run it" in text
+    )
+    assert (
+        re.search(r"<title>(.*?) ·", PAGE.read_text())[1]
+        == "Deposition: This machine prints these parts: use the basis functions"
+    )
 
 
 def test_where_the_simple_rule_is_as_good_it_wins(project):
@@ -62,7 +87,9 @@ def test_where_the_simple_rule_is_as_good_it_wins(project):
 
 
 def test_on_off_control_may_win_and_then_nothing_is_to_be_printed_by_this_loop(project):
-    made.deposition({"on_off": (100.0, None, 60.0), "priority": (120.0, 80.0, 90.0), "basis": (130.0, 60.0, 90.0)})
+    made.deposition(
+        {"on_off": (100.0, None, 60.0), "priority": (120.0, 80.0, 90.0), "basis": (130.0, 60.0, 90.0)}
+    )
     text = page()
     assert "Do not print these parts yet" in text and "on‑off control comes closest" in text
 
@@ -70,27 +97,56 @@ def test_on_off_control_may_win_and_then_nothing_is_to_be_printed_by_this_loop(p
 @pytest.mark.parametrize(
     ("basis", "rule", "sentence"),
     [
-        ((7.0, 2.5, 1.0), "flow error", "square, material A, keeps 7.0 % of on‑off control’s flow error; 6 % are allowed."),
-        ((2.0, 2.5, 4.0), "line volume", "A line of square, material A, is 4.0 % off its volume; ±3 % is allowed."),
+        (
+            (7.0, 2.5, 1.0),
+            "flow error",
+            "square, material A, keeps 7.0 % of on‑off control’s flow error; 6 % are allowed.",
+        ),
+        (
+            (2.0, 2.5, 4.0),
+            "line volume",
+            "A line of square, material A, is 4.0 % off its volume; ±3 % is allowed.",
+        ),
         (
             (4.0, 2.5, 1.0),
             "above learning it whole",
-            "square, material A, lies 2.5 points above what learning it trial by trial reaches; 1 is allowed.",
+            "square, material A, lies 2.5 points above what learning it trial by trial "
+            "reaches; 1 is allowed.",
         ),
     ],
 )
 def test_the_first_failed_rule_is_said_in_words(project, basis, rule, sentence):
-    made.deposition({"on_off": (100.0, None, 60.0), "priority": (12.0, 11.0, 9.0), "basis": basis, "ilc": (1.5, None, 0.5)})
+    made.deposition(
+        {
+            "on_off": (100.0, None, 60.0),
+            "priority": (12.0, 11.0, 9.0),
+            "basis": basis,
+            "ilc": (1.5, None, 0.5),
+        }
+    )
     text = page()
-    assert f"Do not print these parts yet: the basis functions come closest. First failed rule: {rule}. {sentence}" in text
+    assert (
+        "Do not print these parts yet: the basis functions come closest. First failed rule: "
+        f"{rule}. {sentence}" in text
+    )
     assert PAGE.read_text().count('<tr class="fail"><th scope="row"><a') == 1
 
 
 def test_a_command_at_its_limit_fails_with_the_ramp_that_would_do(project):
-    enough = {"ramp_s": 0.15, "limit": 5.0, "peak_over_steady": 20.0, "share_percent": 12.0, "rms_percent_of_on_off": 40.0, "enough": False}
+    enough = {
+        "ramp_s": 0.15,
+        "limit": 5.0,
+        "peak_over_steady": 20.0,
+        "share_percent": 12.0,
+        "rms_percent_of_on_off": 40.0,
+        "enough": False,
+    }
     conformance(saturation={"A": enough}, ramp_that_would_do_s={"A": 1.25})
     text = page()
-    assert "First failed rule: time at the command’s limit." in text and "Ramps of 1.25 s would do (printer.ramp_s)." in text
+    assert (
+        "First failed rule: time at the command’s limit." in text
+        and "Ramps of 1.25 s would do (printer.ramp_s)." in text
+    )
 
 
 def test_refused_lines_are_shown_with_their_number_and_fail(project):
@@ -133,7 +189,10 @@ def test_before_the_stages_ran_the_page_and_the_card_say_so(project):
     for path in [*ARTIFACTS, *(f"reports/metrics/{stage}.json" for stage in made.deposition_metrics())]:
         Path(path).unlink()
     text = page()
-    assert "Do not print by this loop yet. Nothing was composed." in text and "Run ./run dvc repro compose_parts." in text
+    assert (
+        "Do not print by this loop yet. Nothing was composed." in text
+        and "Run ./run dvc repro compose_parts." in text
+    )
     assert "This machine" not in Page(Path("reports/index.html")).text
 
 
@@ -149,21 +208,40 @@ def test_page_one_has_the_card_with_the_winner_in_words_and_the_worst_loop_as_it
     main()
     first = Page(Path("reports/index.html"))
     assert (
-        "Data‑driven wins. Basis functions: at most 2.0 % of on‑off control’s flow error on any part. The library by its priority rule: 12 %."
-        in first.text
+        "Data‑driven wins. Basis functions: at most 2.0 % of on‑off control’s flow error on any part. "
+        "The library by its priority rule: 12 %." in first.text
     )
     assert first.links.count("deposition.html") >= 3
     assert "Deploy the data‑driven temperature controller." in first.text
-    made.deposition({"on_off": (100.0, None, 60.0), "priority": (12.0, 11.0, 9.0), "basis": (7.0, 2.5, 1.0), "ilc": (6.5, None, 0.5)})
+    made.deposition(
+        {
+            "on_off": (100.0, None, 60.0),
+            "priority": (12.0, 11.0, 9.0),
+            "basis": (7.0, 2.5, 1.0),
+            "ilc": (6.5, None, 0.5),
+        }
+    )
     main()
     text = Path("reports/index.html").read_text()
-    assert re.search(r"<h1.*?>(.*?)</h1>", text)[1] == "Deploy temperature and setpoint; do not deploy deposition."
+    assert (
+        re.search(r"<h1.*?>(.*?)</h1>", text)[1]
+        == "Deploy temperature and setpoint; do not deploy deposition."
+    )
     assert "Do not print these parts yet: the basis functions come closest." in text
 
 
 def test_two_loops_that_fail_are_both_named_in_the_headline(project):
-    change("evaluate_temperature", controllers__window__settled_error_degC=made.figure(0.72, 0.61, 0.84, zone=1))
-    made.deposition({"on_off": (100.0, None, 60.0), "priority": (12.0, 11.0, 9.0), "basis": (7.0, 2.5, 1.0), "ilc": (6.5, None, 0.5)})
+    change(
+        "evaluate_temperature", controllers__window__settled_error_degC=made.figure(0.72, 0.61, 0.84, zone=1)
+    )
+    made.deposition(
+        {
+            "on_off": (100.0, None, 60.0),
+            "priority": (12.0, 11.0, 9.0),
+            "basis": (7.0, 2.5, 1.0),
+            "ilc": (6.5, None, 0.5),
+        }
+    )
     main()
     head, rest = Path("reports/index.html").read_text().split("</h1>")
     assert (
@@ -176,8 +254,12 @@ def test_every_picture_says_what_it_shows_and_every_link_leads_somewhere(project
     main()
     found = Page(PAGE)
     pictures = [tags for tag, tags in found.tags if tag == "img" or tags.get("role") == "img"]
-    assert len(pictures) > 20 and all((tags.get("alt") or tags.get("aria-label", "")).strip() for tags in pictures)
-    assert {link[1:] for link in found.links if link.startswith("#") and link[1:] not in ("tick", "cross", "open")} <= set(found.ids)
+    assert len(pictures) > 20 and all(
+        (tags.get("alt") or tags.get("aria-label", "")).strip() for tags in pictures
+    )
+    assert {
+        link[1:] for link in found.links if link.startswith("#") and link[1:] not in ("tick", "cross", "open")
+    } <= set(found.ids)
     assert len(found.ids) == len(set(found.ids))
     assert not [link for link in found.links if link.startswith(("http", "//"))]
 
@@ -187,8 +269,10 @@ def test_a_long_job_stays_within_the_size_of_a_page(project):
     angle = np.arange(n) / 500
     names = [f"{k}_mm3_per_s" for k in ("predicted", "on_off", "priority", "superposition", "basis", "ilc")]
     columns = {
-        "part": ["big"] * n, "tool": np.zeros(n, int), "material": ["A"] * n, "time_s": np.arange(n) / 50, "x_mm": 50 * np.cos(angle) * (1 - angle / 800),
-        "y_mm": 50 * np.sin(angle) * (1 - angle / 800), "wanted_mm3_per_s": np.full(n, 2.0), "command_mm": np.full(n, 2.0),
+        "part": ["big"] * n, "tool": np.zeros(n, int), "material": ["A"] * n, "time_s": np.arange(n) / 50,
+        "x_mm": 50 * np.cos(angle) * (1 - angle / 800),
+        "y_mm": 50 * np.sin(angle) * (1 - angle / 800), "wanted_mm3_per_s": np.full(n, 2.0),
+        "command_mm": np.full(n, 2.0),
     } | {name: 2 + 0.2 * rng.standard_normal(n) for name in names}  # fmt: skip
     artifacts.write_table(FOLDER / "signals.parquet", SIGNALS, columns)
     main()

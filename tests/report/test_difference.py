@@ -1,4 +1,5 @@
-"""This run against the accepted one: equal runs differ in nothing, one change is named where it is, and a figure moves where its bands part."""
+"""This run against the accepted one: equal runs differ in nothing, one change is named where it is, and a
+figure moves where its bands part."""
 
 import sys
 from pathlib import Path
@@ -24,7 +25,9 @@ SCORES = {
 def compose(error):
     """The deposition loop's table and metrics with another error of the composer in use."""
     made.deposition(SCORES | {"basis": (error, 2.5, 1.0)})
-    artifacts.write_metrics("compose_parts", {"square": {"A": {"chosen": "basis", "basis": {"rms_percent_of_on_off": error}}}})
+    artifacts.write_metrics(
+        "compose_parts", {"square": {"A": {"chosen": "basis", "basis": {"rms_percent_of_on_off": error}}}}
+    )
 
 
 @pytest.fixture
@@ -41,16 +44,22 @@ def test_two_equal_runs_give_an_empty_difference(accepted):
     text = Page(INDEX).text
     assert "Nothing changed; no figure moved." in text
     place = text[
-        text.index("What changed and what moved") if "What changed and what moved" in text else text.index("Difference against the last") :
+        text.index("What changed and what moved")
+        if "What changed and what moved" in text
+        else text.index("Difference against the last") :
     ]
     assert "Inputs unchanged Parameters unchanged Code unchanged Artifacts 0 changed" in place
     assert "0 of 1 flow errors moved" in place and "unchanged" in Page(DEPOSITION).text
 
 
 def test_a_changed_parameter_code_file_and_artifact_are_each_named(accepted):
-    Path("params.yaml").write_text(Path("params.yaml").read_text().replace("gap_percent: 5.0", "gap_percent: 6.0", 1))
+    Path("params.yaml").write_text(
+        Path("params.yaml").read_text().replace("gap_percent: 5.0", "gap_percent: 6.0", 1)
+    )
     Path("stages/code.py").write_text("2\n")
-    artifacts.write_json("datasets/tune_weights/weights.json", {"practical": {"q": [1.0, 3.0], "r": [0.1, 0.2]}})
+    artifacts.write_json(
+        "datasets/tune_weights/weights.json", {"practical": {"q": [1.0, 3.0], "r": [0.1, 0.2]}}
+    )
     main()
     text = Page(INDEX).text
     assert "report.gap_percent 5.0 → 6.0" in text
@@ -73,13 +82,18 @@ def test_a_figure_moves_where_its_band_leaves_the_accepted_one_and_only_there(ac
 
 def test_the_worst_case_is_held_against_the_accepted_band_not_against_a_bare_number(accepted):
     # the accepted page showed 10.001 to 10.003; half as much moves, and by how much is said
-    artifacts.write_table("datasets/evaluate_temperature/scorecard.parquet", made.tables.SCORECARD, made.scorecard({"window": 5.0}))
+    artifacts.write_table(
+        "datasets/evaluate_temperature/scorecard.parquet",
+        made.tables.SCORECARD,
+        made.scorecard({"window": 5.0}),
+    )
     main()
     assert "better: worst case over plant spread" in Page(INDEX).text.replace("Better", "better")
 
 
 @pytest.mark.parametrize(
-    ("error", "said", "moved"), [(2.3, "within noise", 0), (3.5, "+1.50 points · worse", 1), (1.0, "−1.00 points · better", 1)]
+    ("error", "said", "moved"),
+    [(2.3, "within noise", 0), (3.5, "+1.50 points · worse", 1), (1.0, "−1.00 points · better", 1)],
 )
 def test_a_flow_error_moves_by_more_than_half_a_point_and_stands_on_both_pages(accepted, error, said, moved):
     compose(error)
@@ -94,4 +108,7 @@ def test_a_run_whose_pages_are_older_than_its_figures_is_not_accepted(accepted, 
     change("evaluate_temperature", controllers__window__settling_s=made.figure(2.0, 1.0, 3.0))
     with pytest.raises(SystemExit):
         cli.main()
-    assert "the pages are of another run than reports/metrics/evaluate_temperature.json; run ./run dvc repro" in capsys.readouterr().err
+    assert (
+        "the pages are of another run than reports/metrics/evaluate_temperature.json; run ./run dvc repro"
+        in capsys.readouterr().err
+    )

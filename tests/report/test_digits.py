@@ -43,11 +43,21 @@ def test_a_band_has_an_en_dash_and_to_where_an_end_is_negative_or_in_words():
 
 
 def test_numbers_without_a_band_keep_three_digits_from_tiny_to_large():
-    assert [short(v) for v in (0.00123, 45.67, 183362.49, 3.1e-8, 0.0)] == ["0.00123", "45.7", "183,362", "3.10 × 10⁻⁸", "0"]
+    assert [short(v) for v in (0.00123, 45.67, 183362.49, 3.1e-8, 0.0)] == [
+        "0.00123",
+        "45.7",
+        "183,362",
+        "3.10 × 10⁻⁸",
+        "0",
+    ]
 
 
 def test_counts_and_long_names():
-    assert (count(1, "run"), count(24, "run"), count(0, "candidate")) == ("one run", "24 runs", "no candidates")
+    assert (count(1, "run"), count(24, "run"), count(0, "candidate")) == (
+        "one run",
+        "24 runs",
+        "no candidates",
+    )
     assert len(shortened("x" * 200)) == 60
     assert shortened("a" * 30 + "b" * 60).startswith("a" * 29 + "…")
 
@@ -56,5 +66,6 @@ def test_a_line_of_a_log_is_set_as_a_page_has_it_and_names_stay():
     text = "night-0005, 2030-01-09: gain -15.1 % (-16.0 to -0.2 %), offset -2.0 °C; shift_-1.csv, a-b"
     thin = "\u202f"
     assert typeset(text) == (
-        f"night-0005, 2030-01-09: gain −15.1{thin}% (−16.0 to −0.2{thin}%), offset −2.0{thin}°C; shift_-1.csv, a-b"
+        f"night-0005, 2030-01-09: gain −15.1{thin}% (−16.0 to −0.2{thin}%), "
+        f"offset −2.0{thin}°C; shift_-1.csv, a-b"
     )

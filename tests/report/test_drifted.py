@@ -1,4 +1,5 @@
-"""Answer 11: what the nightly job measured last, or why nothing is known; and that its figures are no dependency of the pages."""
+"""Answer 11: what the nightly job measured last, or why nothing is known; and
+that its figures are no dependency of the pages."""
 
 import re
 from pathlib import Path
@@ -22,7 +23,12 @@ FIGURES = {
 
 def night(**drift):
     artifacts.write_json(
-        NIGHT, {"run": "night-0003", "when": "2026-11-20T02:10:00+00:00", "drift": {"alarms": [], "watched": [], "figures": {}} | drift}
+        NIGHT,
+        {
+            "run": "night-0003",
+            "when": "2026-11-20T02:10:00+00:00",
+            "drift": {"alarms": [], "watched": [], "figures": {}} | drift,
+        },
     )
     main()
     text = Page(INDEX).text
@@ -36,21 +42,31 @@ def test_before_the_first_night_drift_is_not_measured(project):
 
 
 def test_no_alarm_passes_the_rule_and_names_what_moved_most_against_its_noise(project):
-    assert night(figures=FIGURES) == "None found. Largest change of the machine: gain of heater_1, 3.2 % ± 4.1. night-0003, 2026-11-20"
+    assert (
+        night(figures=FIGURES)
+        == "None found. Largest change of the machine: gain of heater_1, 3.2 % ± 4.1. night-0003, 2026-11-20"
+    )
     assert figures()["verdict"]["lead"] == "All five rules passed."
     assert 'href="nightly.html"' in INDEX.read_text()
 
 
 def test_an_alarm_fails_the_rule_for_every_controller_and_gives_the_cause(project):
-    found = night(figures=FIGURES, alarms=[{"cause": "the gain of heater_1 fell by 12 %", "loop": "temperature"}])
+    found = night(
+        figures=FIGURES, alarms=[{"cause": "the gain of heater_1 fell by 12 %", "loop": "temperature"}]
+    )
     assert found.startswith("Drifted. The gain of heater_1 fell by 12 %.")
     said = figures()["verdict"]
     assert (said["state"], said["rule"], said["winner"]) == ("failed", "drift", None)
-    assert "First failed rule: drift. The machine has changed: the gain of heater_1 fell by 12 %." in Page(TEMPERATURE).text
+    assert (
+        "First failed rule: drift. The machine has changed: the gain of heater_1 fell by 12 %."
+        in Page(TEMPERATURE).text
+    )
 
 
 def test_what_is_watched_is_undecided_and_a_night_without_recordings_measures_nothing(project):
-    assert night(watched=[{"cause": "the noise of sensor_2 grew"}]).startswith("Perhaps. The noise of sensor_2 grew; an alarm where")
+    assert night(watched=[{"cause": "the noise of sensor_2 grew"}]).startswith(
+        "Perhaps. The noise of sensor_2 grew; an alarm where"
+    )
     assert night().startswith("Not measured. The last night had no new recording")
     assert figures()["verdict"]["lead"] == "It passes every rule measured so far."
 

@@ -1,5 +1,5 @@
-"""Page one's first screen, 1280 x 800, in a browser: whatever state the loops are in and however long their sentences are, in both themes; and the pages with a
-hundred recordings."""
+"""Page one's first screen, 1280 x 800, in a browser: whatever state the loops are in and however long their
+sentences are, in both themes; and the pages with a hundred recordings."""
 
 import contextlib
 from pathlib import Path
@@ -27,11 +27,20 @@ def fine():
 
 
 def temperature_failed():
-    change("evaluate_temperature", controllers__window__settled_error_degC=made.figure(0.72, 0.61, 0.84, zone=1))
+    change(
+        "evaluate_temperature", controllers__window__settled_error_degC=made.figure(0.72, 0.61, 0.84, zone=1)
+    )
 
 
 def deposition_failed():
-    made.deposition({"on_off": (100.0, None, 60.0), "priority": (12.0, 11.0, 9.0), "basis": (7.0, 2.5, 1.0), "ilc": (6.5, None, 0.5)})
+    made.deposition(
+        {
+            "on_off": (100.0, None, 60.0),
+            "priority": (12.0, 11.0, 9.0),
+            "basis": (7.0, 2.5, 1.0),
+            "ilc": (6.5, None, 0.5),
+        }
+    )
 
 
 def setpoint_failed():
@@ -50,7 +59,11 @@ def one_missing():
 
 
 def nothing():
-    for path in [*Path("datasets").rglob("*.parquet"), *Path("datasets").rglob("*.json"), *Path("reports/metrics").glob("*.json")]:
+    for path in [
+        *Path("datasets").rglob("*.parquet"),
+        *Path("datasets").rglob("*.json"),
+        *Path("reports/metrics").glob("*.json"),
+    ]:
         path.unlink()
 
 
@@ -58,17 +71,28 @@ def long_sentences():
     all_failed()
     made_setpoint.choice("x" * 300)
     artifacts.write_json(
-        "reports/metrics/nightly.json", {"run": "night-0003", "when": "2026-11-20T02", "drift": {"alarms": [{"cause": LONG}]}}
+        "reports/metrics/nightly.json",
+        {"run": "night-0003", "when": "2026-11-20T02", "drift": {"alarms": [{"cause": LONG}]}},
     )
     Path("reports/metrics/evaluate_temperature.json").write_text("{")
 
 
-STATES = (fine, temperature_failed, deposition_failed, setpoint_failed, all_failed, one_missing, nothing, long_sentences)
+STATES = (
+    fine,
+    temperature_failed,
+    deposition_failed,
+    setpoint_failed,
+    all_failed,
+    one_missing,
+    nothing,
+    long_sentences,
+)
 
 
 @pytest.fixture
 def page_one(tmp_path, monkeypatch):
-    """page_one(change): the folder of index.html of the small project after a change; the other pages are left out."""
+    """page_one(change): the folder of index.html of the small project
+    after a change; the other pages are left out."""
     for module in (deposition_page, identification_page, setpoint_page, temperature_page):
         monkeypatch.setattr(module, "render", lambda *_: "")
 
@@ -92,7 +116,11 @@ def test_the_twelve_answers_fit_the_first_screen_in_both_themes(page_one, open_p
         found = [page.locator("h1"), page.locator(".rules"), *page.locator(".whole > div").all(), *rows]
         for one in found:
             box = one.bounding_box()
-            assert box["height"] > 0 and box["y"] >= 0 and box["y"] + box["height"] <= 800, (theme, one.inner_text()[:80], box)
+            assert box["height"] > 0 and box["y"] >= 0 and box["y"] + box["height"] <= 800, (
+                theme,
+                one.inner_text()[:80],
+                box,
+            )
             assert box["x"] >= 0 and box["x"] + box["width"] <= 1280, (theme, one.inner_text()[:80], box)
         assert page.evaluate("document.documentElement.scrollWidth") <= 1280
 
@@ -106,7 +134,9 @@ def hundred(folder):
         [name for part in parts for name in part["recording"]],
         np.repeat(np.arange(100, dtype=np.int32), 3600),
     )
-    artifacts.write_table("datasets/ingest/record.parquet", tables.record(machine.inputs, machine.outputs), whole)
+    artifacts.write_table(
+        "datasets/ingest/record.parquet", tables.record(machine.inputs, machine.outputs), whole
+    )
     names = [f"night_{k:03d}.mcap" for k in range(100)]
     flaws = {"recording": names, "signal": ["zone_1"] * 100, "kind": ["spike"] * 100, "start_s": [10.0] * 100, "end_s": [12.0] * 100, "count": [2] * 100, "message": ["2 samples stand out"] * 100}  # fmt: skip
     artifacts.write_table("datasets/ingest/quality.parquet", tables.QUALITY, flaws)

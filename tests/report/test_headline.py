@@ -1,4 +1,5 @@
-"""Page one's sentence and its three rows: who may be deployed, in few words, however long the sentences of the stages are."""
+"""Page one's sentence and its three rows: who may be deployed, in few
+words, however long the sentences of the stages are."""
 
 from pipeline.report.shared.headline import LINE, LINES, Loop, _fitted, _lines, decision, state
 
@@ -8,17 +9,28 @@ def loop(name="temperature", state="passed", reason="It costs 1 % more.", remedy
 
 
 def three(*states):
-    return [loop(name, one) for name, one in zip(("temperature", "deposition", "setpoint"), states, strict=True)]
+    return [
+        loop(name, one) for name, one in zip(("temperature", "deposition", "setpoint"), states, strict=True)
+    ]
 
 
 def test_the_sentence_names_every_loop_once_by_what_may_be_done_with_it():
     assert decision(three("passed", "passed", "passed")) == "Deploy all three loops."
-    assert decision(three("passed", "passed", "failed")) == "Deploy temperature and deposition; do not deploy setpoint."
     assert (
-        decision(three("failed", "open", "not measured")) == "Do not deploy temperature; deposition is undecided; setpoint is not measured."
+        decision(three("passed", "passed", "failed"))
+        == "Deploy temperature and deposition; do not deploy setpoint."
     )
-    assert decision(three("failed", "failed", "failed")) == "Do not deploy temperature, deposition or setpoint."
-    assert decision(three("open", "not measured", "not measured")) == "Temperature is undecided; deposition and setpoint are not measured."
+    assert (
+        decision(three("failed", "open", "not measured"))
+        == "Do not deploy temperature; deposition is undecided; setpoint is not measured."
+    )
+    assert (
+        decision(three("failed", "failed", "failed")) == "Do not deploy temperature, deposition or setpoint."
+    )
+    assert (
+        decision(three("open", "not measured", "not measured"))
+        == "Temperature is undecided; deposition and setpoint are not measured."
+    )
 
 
 def test_the_page_takes_the_colour_of_the_worst_loop_that_was_measured():
@@ -37,8 +49,14 @@ def test_sentences_of_any_length_fit_the_first_screen_and_what_is_cut_says_so():
 
 def test_remedies_come_whole_and_those_of_a_loop_that_did_not_pass_come_first():
     # each remedy is two lines long: beside three rows of one line there is room for all but one
-    remedy = "Record the machine again, longer than before, with every input moving at once" + ", again" * 8 + "."
+    remedy = (
+        "Record the machine again, longer than before, with every input moving at once" + ", again" * 8 + "."
+    )
     assert LINE < len(remedy) <= 2 * LINE
-    found = _fitted([loop(remedy=remedy), loop(remedy=f"{remedy} {remedy}"), loop(state="failed", remedy=remedy)])
-    assert found[2].remedy == remedy and all(one.remedy in ("", remedy, f"{remedy} {remedy}") for one in found)
+    found = _fitted(
+        [loop(remedy=remedy), loop(remedy=f"{remedy} {remedy}"), loop(state="failed", remedy=remedy)]
+    )
+    assert found[2].remedy == remedy and all(
+        one.remedy in ("", remedy, f"{remedy} {remedy}") for one in found
+    )
     assert sum(map(_lines, found)) <= LINES

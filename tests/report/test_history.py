@@ -1,4 +1,5 @@
-"""The history from a git of many runs: every figure of every revision, old formats, hostile subjects, time, and what it says where there is none."""
+"""The history from a git of many runs: every figure of every revision, old formats, hostile subjects, time,
+and what it says where there is none."""
 
 import json
 import re
@@ -22,23 +23,30 @@ PAGE = Path("reports/history.html")
 
 def report(gap):
     figures = {
-        name: {"gap_percent": {"median": k * gap, "low": 0.9 * k * gap, "high": 1.1 * k * gap}, "settling_s": made.figure(6.0, 5.0, None)}
+        name: {
+            "gap_percent": {"median": k * gap, "low": 0.9 * k * gap, "high": 1.1 * k * gap},
+            "settling_s": made.figure(6.0, 5.0, None),
+        }
         for k, name in enumerate(("window", "model_based", "baseline"), 1)
     }
     return {"verdict": {"decision": f"Deploy, gap {gap:g}."}, "figures": figures}
 
 
 def commits(runs):
-    """A git whose revisions are (subject, {file of reports/metrics: JSON or text}), oldest first, by one fast-import."""
+    """A git whose revisions are (subject, {file of reports/metrics:
+    JSON or text}), oldest first, by one fast-import."""
     stream = []
     for k, (subject, files) in enumerate(runs):
         message = subject.encode()
         stream.append(
-            b"commit refs/heads/main\ncommitter A <a@b> %d +0000\ndata %d\n%s\n" % (1_700_000_000 + 86400 * k, len(message), message)
+            b"commit refs/heads/main\ncommitter A <a@b> %d +0000\ndata %d\n%s\n"
+            % (1_700_000_000 + 86400 * k, len(message), message)
         )
         for name, data in files.items():
             text = data.encode() if isinstance(data, str) else json.dumps(data).encode()
-            stream.append(b"M 100644 inline reports/metrics/%s\ndata %d\n%s\n" % (name.encode(), len(text), text))
+            stream.append(
+                b"M 100644 inline reports/metrics/%s\ndata %d\n%s\n" % (name.encode(), len(text), text)
+            )
     subprocess.run(["git", "init", "-q", "-b", "main"], check=True)
     subprocess.run(["git", "fast-import", "--quiet"], input=b"".join(stream), check=True)
     subprocess.run(["git", "checkout", "-q", "-f", "main"], check=True)
@@ -56,17 +64,26 @@ def empty(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_two_hundred_revisions_are_drawn_within_ten_seconds_with_their_own_figures(empty, monkeypatch, capsys):
+def test_two_hundred_revisions_are_drawn_within_ten_seconds_with_their_own_figures(
+    empty, monkeypatch, capsys
+):
     commits([(f"run {k}", {"report.json": report(1 + k / 100)}) for k in range(200)])
     started = time.perf_counter()
     command(monkeypatch)
     # the issue's bar; a quiet machine takes under one
     assert time.perf_counter() - started < 10
     found = list(history.runs(500))
-    np.testing.assert_allclose([run.figures["window"]["gap_percent"].value for run in found], [1 + k / 100 for k in range(200)], rtol=1e-15)
+    np.testing.assert_allclose(
+        [run.figures["window"]["gap_percent"].value for run in found],
+        [1 + k / 100 for k in range(200)],
+        rtol=1e-15,
+    )
     assert [run.subject for run in found] == [f"run {k}" for k in range(200)]
     text = PAGE.read_text()
-    assert text.count('<svg class="plot') == 12 and len(re.findall(r"<tr><th scope=\"row\"><code>[0-9a-f]{8}</code>", text)) == 200
+    assert (
+        text.count('<svg class="plot') == 12
+        and len(re.findall(r"<tr><th scope=\"row\"><code>[0-9a-f]{8}</code>", text)) == 200
+    )
     assert "data-driven from 1 % to 2.99 %" in text.replace("\u202f", " ")
     assert len(text) <= 1_500_000
     assert "200" in capsys.readouterr().err
@@ -84,16 +101,43 @@ def test_figures_that_are_not_committed_come_last_and_equal_ones_do_not_come_twi
     assert [run.subject for run in history.runs(9)] == ["one", "two", "not committed"]
 
 
-def test_a_revision_before_the_pages_kept_figures_is_read_from_its_scorecard_and_a_broken_one_leaves_a_gap(empty, monkeypatch):
+def test_a_revision_before_the_pages_kept_figures_is_read_from_its_scorecard_and_a_broken_one_leaves_a_gap(
+    empty, monkeypatch
+):
     scorecard = {"controllers": {"window": made.controller(0.5)}}
-    parts = {"square": {"A": {"basis": {"rms_percent_of_on_off": 2.5, "worst_line_volume_percent": None}, "chosen": "basis"}}}
+    parts = {
+        "square": {
+            "A": {
+                "basis": {"rms_percent_of_on_off": 2.5, "worst_line_volume_percent": None},
+                "chosen": "basis",
+            }
+        }
+    }
     laws = {"A": {"pixels": {"best_ratio": 0.03}}, "B": {"ours": {"best_ratio": 0.05}}}
-    old = {"evaluate_temperature.json": scorecard, "report.json": "{}", "compose_parts.json": parts, "train_ilc.json": laws}
-    commits([("old", old), ("broken", {"report.json": "{", "evaluate_temperature.json": "[]"}), ("new", {"report.json": report(1.0)})])
+    old = {
+        "evaluate_temperature.json": scorecard,
+        "report.json": "{}",
+        "compose_parts.json": parts,
+        "train_ilc.json": laws,
+    }
+    commits(
+        [
+            ("old", old),
+            ("broken", {"report.json": "{", "evaluate_temperature.json": "[]"}),
+            ("new", {"report.json": report(1.0)}),
+        ]
+    )
     first, broken, new = history.runs(9)
-    # by hand: the figures of made.controller, the largest gap of the spread, the worse material after learning
-    assert first.figures["window"]["gap_percent"] == (0.5, 0.4, 0.65) and first.figures["window"]["worst_case_gap_percent"] == (0.65,) * 3
-    assert {key: f.value for key, f in first.figures["deposition"].items()} == {"flow_error_percent": 2.5, "learned_percent": 5.0}
+    # by hand: the figures of made.controller, the largest gap of the
+    # spread, the worse material after learning
+    assert (
+        first.figures["window"]["gap_percent"] == (0.5, 0.4, 0.65)
+        and first.figures["window"]["worst_case_gap_percent"] == (0.65,) * 3
+    )
+    assert {key: f.value for key, f in first.figures["deposition"].items()} == {
+        "flow_error_percent": 2.5,
+        "learned_percent": 5.0,
+    }
     assert broken.figures.keys() == {"deposition"}
     assert new.figures["window"]["settling_s"].high == np.inf
     command(monkeypatch)
@@ -104,7 +148,9 @@ def test_a_hostile_subject_does_nothing(empty, monkeypatch):
     commits([(made.HOSTILE, {"report.json": report(1.0) | {"verdict": {"decision": made.HOSTILE}}})])
     command(monkeypatch)
     page = Page(PAGE)
-    assert [tag for tag, _ in page.tags].count("script") == 1 and not any(tag == "img" for tag, _ in page.tags)
+    assert [tag for tag, _ in page.tags].count("script") == 1 and not any(
+        tag == "img" for tag, _ in page.tags
+    )
     assert not any(name.startswith("on") for _, attributes in page.tags for name in attributes)
 
 
@@ -122,7 +168,9 @@ def test_pages_that_lie_beside_it_are_linked_and_others_are_not(empty, monkeypat
         (True, "git has no revision of it; commit the figures of a run first"),
     ],
 )
-def test_without_a_git_or_a_revision_it_says_so_and_writes_nothing(empty, monkeypatch, capsys, made_git, sentence):
+def test_without_a_git_or_a_revision_it_says_so_and_writes_nothing(
+    empty, monkeypatch, capsys, made_git, sentence
+):
     if made_git:
         commits([("other", {})])
         Path("a").write_text("a")

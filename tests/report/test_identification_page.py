@@ -1,4 +1,5 @@
-"""The identification's page on the small project: what it says the model may be used for, in each case, and what it shows behind it."""
+"""The identification's page on the small project: what it says the model may be used
+for, in each case, and what it shows behind it."""
 
 import re
 from pathlib import Path
@@ -52,7 +53,8 @@ def test_errors_that_are_not_noise_are_a_reservation_and_take_no_use_away(projec
     text = page()
     assert "Trust this model to design controllers, to predict 10 s ahead and to simulate." in text
     assert (
-        "One reservation, the first failed rule: whiteness. The one-step errors of zone_2 are not noise: correlation +0.42 at lag 1" in text
+        "One reservation, the first failed rule: whiteness. The one-step errors of zone_2 are not noise: "
+        "correlation +0.42 at lag 1" in text
     )
     assert "zone_2 errors not noise" in text and "zone_1 errors are noise" in text
 
@@ -62,20 +64,27 @@ def test_a_failed_simulation_takes_only_simulation_away_and_marks_the_page_and_t
     change("identify_plant", fit_holdout__zone_2=42.0, fit_holdout_band__zone_2=[38.0, 47.0])
     text = page()
     assert "Trust this model to design controllers and to predict 10 s ahead, not to simulate." in text
-    assert "First failed rule: simulation. zone_2 is simulated with a fit of 42 % (38–47); the rule asks for 50 %" in text
+    assert (
+        "First failed rule: simulation. zone_2 is simulated with a fit of 42 % (38–47); "
+        "the rule asks for 50 %" in text
+    )
     html = IDENTIFICATION.read_text()
     assert 'class="verdict failed"' in html
     # its row among the outputs, and the rule's
     assert len(re.findall(r'<tr[^>]* class="fail"', html)) == 2
 
 
-def test_a_band_that_straddles_the_limit_is_undecided_and_says_how_much_longer_a_hold_out_would_decide(project):
+def test_a_band_that_straddles_the_limit_is_undecided_and_says_how_much_longer_a_hold_out_would_decide(
+    project,
+):
     white()
     change("identify_plant", fit_holdout__zone_2=60.0, fit_holdout_band__zone_2=[45.0, 68.0])
     text = page()
     assert "not yet to simulate." in text
     # the band reaches 15 points below 60, the limit lies 10 below: (15 / 10)^2 = 2.25 times as long
-    assert "First undecided rule: simulation." in text and "A hold-out three times as long would decide." in text
+    assert (
+        "First undecided rule: simulation." in text and "A hold-out three times as long would decide." in text
+    )
 
 
 def test_a_prediction_that_holding_the_last_value_beats_is_not_trusted_whatever_its_fit(project):
@@ -83,7 +92,9 @@ def test_a_prediction_that_holding_the_last_value_beats_is_not_trusted_whatever_
     change("identify_plant", fit_holdout_held__zone_1=97.0)
     text = page()
     assert "Trust this model to simulate, not to design controllers and to predict 10 s ahead." in text
-    assert "zone_1 is predicted 10 s ahead with a fit of 95 % (94–96); holding its last value gives 97 %" in text
+    assert (
+        "zone_1 is predicted 10 s ahead with a fit of 95 % (94–96); holding its last value gives 97 %" in text
+    )
 
 
 @pytest.mark.parametrize(
@@ -92,9 +103,14 @@ def test_a_prediction_that_holding_the_last_value_beats_is_not_trusted_whatever_
         (
             "input left",
             "inputs used up",
-            "The errors of zone_1 still follow heater_2: correlation +0.02 at lag 5, 0.20 times its 99 % band.",
+            "The errors of zone_1 still follow heater_2: correlation +0.02 at lag 5, "
+            "0.20 times its 99 % band.",
         ),
-        ("poor input", "excitation", "The inputs move in 9 of 10 directions over the window. Too poor on its own: heater_1."),
+        (
+            "poor input",
+            "excitation",
+            "The inputs move in 9 of 10 directions over the window. Too poor on its own: heater_1.",
+        ),
         ("blind input", "effects known", "What heater_2 does is not known, not even in sign"),
         ("unstable", "stability", "The largest pole, 1.0010, is not inside the unit circle"),
     ],
@@ -103,7 +119,11 @@ def test_each_rule_that_design_needs_takes_it_away_and_is_named(project, how, ru
     white()
     if how == "input left":
         table = artifacts.read_table(FOLDER / "residuals.parquet", tables.RESIDUALS)
-        rewrite("residuals", tables.RESIDUALS, passed=~((table["output"] == "zone_1") & (table["against"] == "heater_2")))
+        rewrite(
+            "residuals",
+            tables.RESIDUALS,
+            passed=~((table["output"] == "zone_1") & (table["against"] == "heater_2")),
+        )
     elif how == "poor input":
         change("identify_plant", excitation__rank=9, excitation__inputs__heater_1__rank=4)
     elif how == "blind input":
@@ -117,7 +137,11 @@ def test_each_rule_that_design_needs_takes_it_away_and_is_named(project, how, ru
 
 
 def test_a_model_that_fails_everywhere_is_marked_on_every_page(project):
-    change("identify_plant", fit_holdout={"zone_1": 10.0, "zone_2": 5.0}, fit_holdout_ahead={"zone_1": 1.0, "zone_2": 2.0})
+    change(
+        "identify_plant",
+        fit_holdout={"zone_1": 10.0, "zone_2": 5.0},
+        fit_holdout_ahead={"zone_1": 1.0, "zone_2": 2.0},
+    )
     change("identify_plant", fit_holdout_band=None, fit_holdout_ahead_band=None)
     assert "Do not trust this model." in page()
     for path in (INDEX, TEMPERATURE):
@@ -129,8 +153,8 @@ def test_a_hold_out_too_short_to_predict_over_leaves_that_open_and_keeps_the_res
     text = page()
     assert "Trust this model to simulate, not yet to design controllers and to predict 10 s ahead." in text
     assert (
-        "First open rule: 10 s ahead. no stretch of the hold-out outlasts the start-up of the prediction. Record longer, or lower ahead_steps."
-        in text
+        "First open rule: 10 s ahead. no stretch of the hold-out outlasts the start-up of the prediction. "
+        "Record longer, or lower ahead_steps." in text
     )
 
 
@@ -151,11 +175,18 @@ def test_nothing_identified_reads_as_open_never_as_passed(project):
 def test_every_output_stands_beside_what_it_must_beat_and_the_accepted_run(project):
     artifacts.write_json(
         "reports/accepted.json",
-        {"metrics": {"identify_plant": {"fit_holdout": {"zone_1": 90.0, "zone_2": 70.0}}}, "hashes": {}, "params": {}},
+        {
+            "metrics": {"identify_plant": {"fit_holdout": {"zone_1": 90.0, "zone_2": 70.0}}},
+            "hashes": {},
+            "params": {},
+        },
     )
     text = page()
     # 95 and 91 % ahead against 20 and -10 % of holding the last value
-    assert re.search(r"zone_1 .*?90\.0 % 88–91 .*?95 % 94–96 Held 20\.0 % unchanged, 90\.0 %".replace("\\.0", r"(?:\.0)?"), text)
+    assert re.search(
+        r"zone_1 .*?90\.0 % 88–91 .*?95 % 94–96 Held 20\.0 % unchanged, 90\.0 %".replace("\\.0", r"(?:\.0)?"),
+        text,
+    )
     assert "+10.0 points · better" in text
 
 
@@ -169,8 +200,13 @@ def test_a_change_within_both_bands_is_noise():
 
 def test_masked_samples_and_the_end_of_a_stretch_are_seen_in_the_hold_out(project):
     text = page()
-    assert "50 samples in two stretches, the last part of each; four measured values are masked and not scored." in text
-    panel = re.search(r'<svg[^>]*aria-label="zone_2 on the hold-out[^>]*>.*?</svg>', IDENTIFICATION.read_text(), re.DOTALL)[0]
+    assert (
+        "50 samples in two stretches, the last part of each; four measured values are masked and not scored."
+        in text
+    )
+    panel = re.search(
+        r'<svg[^>]*aria-label="zone_2 on the hold-out[^>]*>.*?</svg>', IDENTIFICATION.read_text(), re.DOTALL
+    )[0]
     assert panel.count('class="gone"') == 1 and panel.count('class="end"') == 1
     seen = re.search(r'<path class="line seen" d="([^"]*)"', panel)[1]
     # before the mask, after it, and the second stretch
@@ -180,16 +216,23 @@ def test_masked_samples_and_the_end_of_a_stretch_are_seen_in_the_hold_out(projec
 def test_an_effect_whose_sign_is_not_known_has_no_time_constant(project):
     text = page()
     assert re.search(
-        r"zone_1 heater_1 2\.0 \(1\.5–2\.5\)[^z]*? τ 10 s, delay 1\.0 s heater_2 −1\.0 to 2\.5[^z]*? sign not known zone_2", text
+        r"zone_1 heater_1 2\.0 \(1\.5–2\.5\)[^z]*? τ 10 s, delay 1\.0 s heater_2 −1\.0 to 2\.5[^z]*? "
+        r"sign not known zone_2",
+        text,
     )
 
 
 def test_lags_outside_of_the_band_are_marked_only_where_the_test_failed(project):
     main()
-    panels = re.findall(r'aria-label="(zone_\d), errors with themselves.*?</svg>', IDENTIFICATION.read_text(), re.DOTALL)
+    panels = re.findall(
+        r'aria-label="(zone_\d), errors with themselves.*?</svg>', IDENTIFICATION.read_text(), re.DOTALL
+    )
     assert panels == ["zone_1", "zone_2"]
     html = IDENTIFICATION.read_text()
-    first, second = (re.search(rf'aria-label="{name}, errors with themselves.*?</svg>', html, re.DOTALL)[0] for name in panels)
+    first, second = (
+        re.search(rf'aria-label="{name}, errors with themselves.*?</svg>', html, re.DOTALL)[0]
+        for name in panels
+    )
     assert "stem bad" not in first and "stem bad" in second
 
 
@@ -205,7 +248,9 @@ def test_advice_and_the_remedies_that_it_does_not_speak_of_stand_under_what_to_d
     text = page()
     todo = text[text.index("What to do The") :][:600]
     assert "The residuals of zone_2 are not white (correlation +0.42 at lag 1): lengthen the window" in todo
-    assert "Stability: Record longer" in todo and "Noted while fitting: 12 rows touch a masked sample." in todo
+    assert (
+        "Stability: Record longer" in todo and "Noted while fitting: 12 rows touch a masked sample." in todo
+    )
 
 
 def test_what_was_masked_is_counted_by_signal(project):
@@ -236,14 +281,25 @@ def test_a_table_that_is_missing_or_broken_is_said_so_in_its_place(project, name
 
 def test_a_machine_of_32_inputs_and_outputs_and_a_long_hold_out_stay_within_the_size_of_a_page(project):
     sections = params.read("params.yaml")
-    sections["plant"]["inputs"] = [{"name": f"heater_{i}", "unit": "percent", "low": 0, "high": 100} for i in range(32)]
-    sections["plant"]["outputs"] = [{"name": f"zone_{i}", "unit": "degC", "reference": 100.0} for i in range(32)]
+    sections["plant"]["inputs"] = [
+        {"name": f"heater_{i}", "unit": "percent", "low": 0, "high": 100} for i in range(32)
+    ]
+    sections["plant"]["outputs"] = [
+        {"name": f"zone_{i}", "unit": "degC", "reference": 100.0} for i in range(32)
+    ]
     Path("params.yaml").write_text(yaml.safe_dump(sections))
     machine = params.load(Plant, "plant")
     rng, names = np.random.default_rng(0), [o.name for o in machine.outputs]
     samples = 100 * 300
-    seen = {"segment": np.repeat(np.arange(100), 300).astype(np.int32), "time_s": np.tile(np.arange(300.0), 100)}
-    seen |= {f"{name}_{kind}": rng.standard_normal(samples) for name in names for kind in ("measured", "simulated", "ahead")}
+    seen = {
+        "segment": np.repeat(np.arange(100), 300).astype(np.int32),
+        "time_s": np.tile(np.arange(300.0), 100),
+    }
+    seen |= {
+        f"{name}_{kind}": rng.standard_normal(samples)
+        for name in names
+        for kind in ("measured", "simulated", "ahead")
+    }
     artifacts.write_table(FOLDER / "holdout.parquet", tables.holdout(machine.outputs), seen)
     for name, (schema, columns) in made.model(machine).items():
         artifacts.write_table(FOLDER / f"{name}.parquet", schema, columns)
@@ -269,4 +325,10 @@ def test_a_balanced_axis_has_zero_and_a_round_number_on_either_side():
 
 
 def test_ticks_of_a_quarter_of_a_thousand_have_no_decimals():
-    assert [label for _, label in charts.linear(0, 1000, ticks=4).ticks] == ["0", "250", "500", "750", "1,000"]
+    assert [label for _, label in charts.linear(0, 1000, ticks=4).ticks] == [
+        "0",
+        "250",
+        "500",
+        "750",
+        "1,000",
+    ]

@@ -1,4 +1,5 @@
-"""What the pages were made on: `run` writes it beside them, accept keeps it, and a page says "another CPU" where nothing else differs."""
+"""What the pages were made on: `run` writes it beside them, accept keeps it, and a
+page says "another CPU" where nothing else differs."""
 
 import json
 import re
@@ -37,7 +38,8 @@ def write(facts):
 
 @pytest.fixture
 def house(tmp_path, root):
-    """house(*command, cpuinfo): ./run of a copy in which uv only says what it was asked; the facts that were written, or None."""
+    """house(*command, cpuinfo): ./run of a copy in which uv only says what it
+    was asked; the facts that were written, or None."""
     for name in ("run", "pyproject.toml", "uv.lock", ".python-version"):
         shutil.copy(root / name, tmp_path)
     uv = tmp_path / "bin/uv"
@@ -53,8 +55,12 @@ def house(tmp_path, root):
         path = tmp_path / JS
         if path.is_file():
             path.unlink()
-        done = subprocess.run(["sh", tmp_path / "run", *command], capture_output=True, text=True, env=env, check=False)
-        assert done.returncode == 0 and done.stdout == f"run --frozen --project {tmp_path} {' '.join(command)}\n"
+        done = subprocess.run(
+            ["sh", tmp_path / "run", *command], capture_output=True, text=True, env=env, check=False
+        )
+        assert (
+            done.returncode == 0 and done.stdout == f"run --frozen --project {tmp_path} {' '.join(command)}\n"
+        )
         assert not list(tmp_path.rglob("*.tmp"))
         return machine(path) or None
 
@@ -62,28 +68,51 @@ def house(tmp_path, root):
 
 
 def git(folder, *arguments):
-    subprocess.run(["git", "-c", "user.name=a", "-c", "user.email=a@b", *arguments], cwd=folder, check=True, capture_output=True)
+    subprocess.run(
+        ["git", "-c", "user.name=a", "-c", "user.email=a@b", *arguments],
+        cwd=folder,
+        check=True,
+        capture_output=True,
+    )
 
 
 @pytest.mark.parametrize(
-    "command", ["dvc repro", "dvc repro report", "dvc exp run -S a.b=1", "beadline nightly", "beadline sweep", "--extra gpu dvc repro"]
+    "command",
+    [
+        "dvc repro",
+        "dvc repro report",
+        "dvc exp run -S a.b=1",
+        "beadline nightly",
+        "beadline sweep",
+        "--extra gpu dvc repro",
+    ],
 )
 def test_a_command_that_makes_pages_says_on_what(house, tmp_path, command):
     found = house(*command.split())
     assert list(found) == list(HERE)
-    assert found["pins"] in ("avx2", "none") and found["cores"] >= 1 and found["cpu"] and found["commit"] == "none" and not found["changed"]
+    assert (
+        found["pins"] in ("avx2", "none")
+        and found["cores"] >= 1
+        and found["cpu"]
+        and found["commit"] == "none"
+        and not found["changed"]
+    )
     assert found["version"] in (tmp_path / "pyproject.toml").read_text()
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ", found["date"])
 
 
-@pytest.mark.parametrize("command", ["dvc exp show", "dvc status", "beadline accept", "beadline nightly --watch", "pytest"])
+@pytest.mark.parametrize(
+    "command", ["dvc exp show", "dvc status", "beadline accept", "beadline nightly --watch", "pytest"]
+)
 def test_no_other_command_does(house, command):
     assert house(*command.split()) is None
 
 
 def test_another_environment_is_told_from_another_cpu(house, tmp_path):
     before = house("dvc", "repro")["locked"]
-    assert house("dvc", "repro", "-f")["locked"] == before != house("--extra", "gpu", "dvc", "repro")["locked"]
+    assert (
+        house("dvc", "repro", "-f")["locked"] == before != house("--extra", "gpu", "dvc", "repro")["locked"]
+    )
     (tmp_path / "uv.lock").write_text("other\n")
     assert house("dvc", "repro")["locked"] != before
 
@@ -139,14 +168,25 @@ def test_accept_keeps_the_machine_and_none_where_none_is_said(project, monkeypat
     assert accept(monkeypatch)["machine"] == THERE
 
 
-@pytest.mark.parametrize("text", ["", "window.beadline = {};\n", "window.beadline = {]};", 'window.beadline = {"machine": 3};', "alert(1)"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "window.beadline = {};\n",
+        "window.beadline = {]};",
+        'window.beadline = {"machine": 3};',
+        "alert(1)",
+    ],
+)
 def test_accept_refuses_what_is_no_such_file_in_one_sentence(project, monkeypatch, capsys, text):
     main()
     JS.write_text(text)
     with pytest.raises(SystemExit):
         accept(monkeypatch)
     said = capsys.readouterr().err
-    assert said.startswith("beadline: reports/machine.js: expected") and said.endswith("run ./run dvc repro, which writes it anew\n")
+    assert said.startswith("beadline: reports/machine.js: expected") and said.endswith(
+        "run ./run dvc repro, which writes it anew\n"
+    )
 
 
 # ---- the pages
@@ -176,22 +216,31 @@ ALONE = "Nothing but the CPU differs from the accepted run: There 3000 then, Her
 
 def test_a_page_says_that_nothing_but_the_cpu_differs(open_page, accepted):
     section, third = first_page(open_page, accepted)
-    assert ALONE in section and "What moved with the machine alone" in section and "beyond its noise" not in section
+    assert (
+        ALONE in section
+        and "What moved with the machine alone" in section
+        and "beyond its noise" not in section
+    )
     assert "1 of 9 figures moved with the machine alone." in third and "noise" not in third
 
 
 def test_pins_alone_and_both_are_said_too(open_page, accepted):
     write(THERE | {"pins": "none"})
-    assert "Nothing but the pins differ from the accepted run: pins avx2 then, pins none now." in first_page(open_page, accepted)[0]
+    assert (
+        "Nothing but the pins differ from the accepted run: pins avx2 then, pins none now."
+        in first_page(open_page, accepted)[0]
+    )
     write(HERE | {"pins": "none"})
     assert (
-        "Nothing but CPU and pins differ from the accepted run: There 3000, pins avx2 then, Here 9000, pins none now."
-        in first_page(open_page, accepted)[0]
+        "Nothing but CPU and pins differ from the accepted run: There 3000, pins avx2 then, "
+        "Here 9000, pins none now." in first_page(open_page, accepted)[0]
     )
 
 
 def parameter():
-    Path("params.yaml").write_text(Path("params.yaml").read_text().replace("gap_percent: 5.0", "gap_percent: 6.0", 1))
+    Path("params.yaml").write_text(
+        Path("params.yaml").read_text().replace("gap_percent: 5.0", "gap_percent: 6.0", 1)
+    )
 
 
 def code():
@@ -201,7 +250,9 @@ def code():
 def record():
     path = "datasets/ingest/record.parquet"
     accepted = artifacts.read_json("reports/accepted.json")
-    artifacts.write_json("reports/accepted.json", accepted | {"hashes": accepted["hashes"] | {path: "0" * 64}})
+    artifacts.write_json(
+        "reports/accepted.json", accepted | {"hashes": accepted["hashes"] | {path: "0" * 64}}
+    )
 
 
 def old_form():
@@ -211,7 +262,9 @@ def old_form():
 
 
 def broken_form():
-    artifacts.write_json("reports/accepted.json", artifacts.read_json("reports/accepted.json") | {"machine": ["</script>"]})
+    artifacts.write_json(
+        "reports/accepted.json", artifacts.read_json("reports/accepted.json") | {"machine": ["</script>"]}
+    )
 
 
 def as_before(open_page, folder):
@@ -227,7 +280,9 @@ def test_a_page_is_as_before_where_anything_else_differs(open_page, accepted, di
     as_before(open_page, accepted)
 
 
-def test_a_page_is_as_before_on_the_same_machine_with_other_packages_and_where_none_is_said(open_page, accepted):
+def test_a_page_is_as_before_on_the_same_machine_with_other_packages_and_where_none_is_said(
+    open_page, accepted
+):
     for text in (THERE, HERE | {"locked": "2"}):
         write(text)
         as_before(open_page, accepted)
@@ -252,15 +307,21 @@ def test_hostile_facts_of_the_accepted_run_stay_text(open_page, accepted):
     main()
     page = open_page("index", folder=accepted / "reports")
     page.wait_for_load_state()
-    assert f"the accepted run: {hostile} then, Here 9000 now." in page.locator("section:has(> #d)").inner_text()
+    assert (
+        f"the accepted run: {hostile} then, Here 9000 now." in page.locator("section:has(> #d)").inner_text()
+    )
     assert page.evaluate("window.hit") is None and page.said == []
 
 
-def test_without_the_file_a_page_says_the_same_and_the_browser_alone_remarks_on_it(open_page, reports, tmp_path):
+def test_without_the_file_a_page_says_the_same_and_the_browser_alone_remarks_on_it(
+    open_page, reports, tmp_path
+):
     shutil.copy(reports / "index.html", tmp_path)
     alone, beside = open_page("index", folder=tmp_path), open_page("index")
     for page in (alone, beside):
         page.wait_for_load_state()
     assert alone.locator("main").inner_text() == beside.locator("main").inner_text()
-    assert alone.locator(".made").count() == 0 and alone.said == ["Failed to load resource: net::ERR_FILE_NOT_FOUND"]
+    assert alone.locator(".made").count() == 0 and alone.said == [
+        "Failed to load resource: net::ERR_FILE_NOT_FOUND"
+    ]
     assert beside.locator(".made").inner_text().startswith("Last run on ")

@@ -1,4 +1,5 @@
-"""The nightly page in a browser: an alarm night as it is shown, wide and narrow, light and dark; hostile names do nothing."""
+"""The nightly page in a browser: an alarm night as it is shown, wide and
+narrow, light and dark; hostile names do nothing."""
 
 import copy
 
@@ -13,36 +14,61 @@ from tests.report.conftest import MACHINE
 FILE = "datasets/raw/temperature/shift_<b>8</b>.csv"
 CAUSE = "the gain from heater_1 has changed by -15.1 %"
 DRIFT = {
-    "parameters": {f"{what} from {who}": {"percent": -15.1, "band_percent": 0.7, "sigmas": -9.4} for what in ("gain", "time constant") for who in ("heater_1", "all inputs")},
-    "innovation": {f"sensor_{k}": {"noise_percent": 76.8, "noise_sigmas": 7.2, "mean_degC": -2.0, "mean_sigmas": -6.2} for k in (1, 2)},
-    "closed_loop": {"sensor_1 offset_degC": {"moved": -1.4, "sigmas": -1.1}, "heater_1 effort_percent": {"moved": 9.4, "sigmas": 5.1}},
+    "parameters": {f"{what} from {who}": {"percent": -15.1, "band_percent": 0.7,
+    "sigmas": -9.4} for what in ("gain", "time constant") for who in ("heater_1", "all inputs")},
+    "innovation": {f"sensor_{k}": {"noise_percent": 76.8, "noise_sigmas": 7.2, "mean_degC": -2.0,
+    "mean_sigmas": -6.2} for k in (1, 2)},
+    "closed_loop": {"sensor_1 offset_degC": {"moved": -1.4, "sigmas": -1.1},
+    "heater_1 effort_percent": {"moved": 9.4, "sigmas": 5.1}},
     "notes": [],
 }  # fmt: skip
 JUDGED = {
     "decision": "kept",
-    "reasons": ["the challenger is better by 0.1 % (-0.1 to 0.2 %, p = 0.03); at least 5 % is worth a change", f"drift: {CAUSE}; what the panel stands for has changed"],
-    "paired": {"improvement_percent": 0.1, "low_percent": -0.1, "high_percent": 0.2, "p": 0.03, "cases": 168, "blocks": 21},
-    "guards": {"worst_case": {"champion": 17.6, "challenger": 18.9, "allowed": 0.9}, "unstable_plants": {"champion": 0.0, "challenger": 0.0, "allowed": 0.0}},
+    "reasons": ["the challenger is better by 0.1 % (-0.1 to 0.2 %, p = 0.03); at least 5 % is worth a change",
+    f"drift: {CAUSE}; what the panel stands for has changed"],
+    "paired": {"improvement_percent": 0.1, "low_percent": -0.1, "high_percent": 0.2, "p": 0.03, "cases": 168,
+    "blocks": 21},
+    "guards": {"worst_case": {"champion": 17.6, "challenger": 18.9, "allowed": 0.9},
+    "unstable_plants": {"champion": 0.0, "challenger": 0.0, "allowed": 0.0}},
 }  # fmt: skip
 ALARM = {
-    "night": 2, "run": "night-0002", "when": "2030-01-09T02:00:00+00:00", "outcome": "kept", "notes": ["the clock was set back by 3 h"], "seconds": 8.0,
-    "new_recordings": {"temperature": [FILE]}, "quarantined": {FILE: f"{FILE}: 3 columns, 5 expected <script>alert(1)</script>"}, "decisions": {"temperature": JUDGED},
+    "night": 2, "run": "night-0002", "when": "2030-01-09T02:00:00+00:00", "outcome": "kept",
+    "notes": ["the clock was set back by 3 h"], "seconds": 8.0,
+    "new_recordings": {"temperature": [FILE]},
+    "quarantined": {FILE: f"{FILE}: 3 columns, 5 expected <script>alert(1)</script>"},
+    "decisions": {"temperature": JUDGED},
     "promoted": [], "reasons": [],
     "drift": {
-        "alarms": [{"loop": "temperature", "key": "k", "recording": FILE, "cause": CAUSE, "sigmas": -9.4, "consequences": ["closed loop: sensor_1 settles -1.4 °C off"]}],
+        "alarms": [{"loop": "temperature", "key": "k", "recording": FILE, "cause": CAUSE, "sigmas": -9.4,
+        "consequences": ["closed loop: sensor_1 settles -1.4 °C off"]}],
         "watched": [], "figures": {FILE: DRIFT},
     },
 }  # fmt: skip
 FIRST = ALARM | {
-    "night": 1, "run": "night-0001", "when": "2030-01-08T02:00:00+00:00", "outcome": "promoted", "promoted": ["temperature"], "quarantined": {}, "notes": [],
-    "decisions": {"temperature": {"decision": "first champion", "reasons": ["there was no champion to compare with"], "guards": {}}},
+    "night": 1, "run": "night-0001", "when": "2030-01-08T02:00:00+00:00", "outcome": "promoted",
+    "promoted": ["temperature"], "quarantined": {}, "notes": [],
+    "decisions": {"temperature": {"decision": "first champion",
+    "reasons": ["there was no champion to compare with"], "guards": {}}},
     "drift": {"alarms": [], "watched": [], "figures": {}},
 }  # fmt: skip
-ENTRY = {"run": "night-0001", "when": FIRST["when"], "folder": {"md5": "0123456789abcdef"}, "lineage": {"commit": "fedcba9876543210"}}
+ENTRY = {
+    "run": "night-0001",
+    "when": FIRST["when"],
+    "folder": {"md5": "0123456789abcdef"},
+    "lineage": {"commit": "fedcba9876543210"},
+}
 STATE = {
     "champions": {"temperature": ENTRY},
     "history": [
-        {"when": FIRST["when"], "loop": "temperature", "run": "night-0001", "event": "promoted", "before": "", "why": "first", "champion": ENTRY}
+        {
+            "when": FIRST["when"],
+            "loop": "temperature",
+            "run": "night-0001",
+            "event": "promoted",
+            "before": "",
+            "why": "first",
+            "champion": ENTRY,
+        }
     ],
 }
 
@@ -51,27 +77,43 @@ STATE = {
 def alarm(tmp_path):
     """The folder with the page of an alarm night."""
     settings = params.load(Nightly, "nightly", ROOT / "params.yaml")
-    (tmp_path / "nightly.html").write_text(nightly_page.render([FIRST, copy.deepcopy(ALARM)], STATE, settings), encoding="utf-8")
+    (tmp_path / "nightly.html").write_text(
+        nightly_page.render([FIRST, copy.deepcopy(ALARM)], STATE, settings), encoding="utf-8"
+    )
     (tmp_path / "machine.js").write_text(MACHINE)
     return tmp_path
 
 
 @pytest.mark.parametrize(("width", "theme"), [(1280, "light"), (390, "dark")])
 def test_an_alarm_night_fits_asks_for_nothing_and_is_open_to_all(open_page, alarm, width, theme):
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe is not installed; uv sync installs it")
+    axe = pytest.importorskip(
+        "axe_playwright_python.sync_playwright", reason="axe is not installed; uv sync installs it"
+    )
     page = open_page("nightly", folder=alarm, width=width, theme=theme)
     assert page.evaluate("document.documentElement.scrollWidth") <= width
     beside = page.url.replace("nightly.html", "machine.js")
-    assert [url for url in page.asked if not url.startswith("data:")] == [page.url, beside] and page.said == []
-    found = axe.Axe().run(page, options={"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa"]}).response["violations"]
+    assert [url for url in page.asked if not url.startswith("data:")] == [
+        page.url,
+        beside,
+    ] and page.said == []
+    found = (
+        axe.Axe()
+        .run(page, options={"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa"]})
+        .response["violations"]
+    )
     assert [(one["id"], [node["html"][:120] for node in one["nodes"]]) for one in found] == []
 
 
 def test_an_alarm_night_says_cause_consequence_and_what_stays(open_page, alarm):
     page = open_page("nightly", folder=alarm)
-    assert page.locator("h1").inner_text().replace("\n", " ") == "The machine has drifted; the champions stay."
+    assert (
+        page.locator("h1").inner_text().replace("\n", " ") == "The machine has drifted; the champions stay."
+    )
     text = page.locator("body").inner_text()
-    assert "the gain from heater_1 has changed by −15.1\u202f%" in text and "as a consequence, closed loop: sensor_1 settles −1.4\u202f°C off" in text
+    assert (
+        "the gain from heater_1 has changed by −15.1\u202f%" in text
+        and "as a consequence, closed loop: sensor_1 settles −1.4\u202f°C off" in text
+    )
     assert './run beadline nightly --accept-drift temperature "WHY"' in text
     # the cause stands once in the night's row, and file names are text
     row = page.locator("#nights ~ div tbody tr").first.inner_text()

@@ -1,5 +1,5 @@
-"""The stage on a small project: what the pages say, what they do with missing and hostile input, their size, and that equal inputs give
-equal bytes."""
+"""The stage on a small project: what the pages say, what they do with missing and hostile input, their size,
+and that equal inputs give equal bytes."""
 
 import base64
 import hashlib
@@ -19,13 +19,15 @@ from stages.report import main
 from tests.report import made
 
 INDEX, TEMPERATURE, IDENTIFICATION, DEPOSITION, SETPOINT = (
-    Path(f"reports/{name}.html") for name in ("index", "temperature", "identification", "deposition", "setpoint")
+    Path(f"reports/{name}.html")
+    for name in ("index", "temperature", "identification", "deposition", "setpoint")
 )
 PAGES = (INDEX, TEMPERATURE, IDENTIFICATION, DEPOSITION, SETPOINT)
 
 
 class Page(HTMLParser):
-    """Tags with attributes, ids, text, and the addresses that a page points to; every white space in the text is a plain one."""
+    """Tags with attributes, ids, text, and the addresses that a page points
+    to; every white space in the text is a plain one."""
 
     def __init__(self, path):
         super().__init__()
@@ -37,7 +39,11 @@ class Page(HTMLParser):
         found, self.style = dict(attributes), tag in ("style", "script")
         self.tags.append((tag, found))
         self.ids += [found["id"]] if "id" in found else []
-        self.links += [found[key] for key in ("href", "src", "xlink:href", "action", "data", "poster", "srcset") if found.get(key)]
+        self.links += [
+            found[key]
+            for key in ("href", "src", "xlink:href", "action", "data", "poster", "srcset")
+            if found.get(key)
+        ]
 
     def handle_data(self, data):
         self.words += [] if self.style else [data]
@@ -80,11 +86,16 @@ def test_page_one_holds_the_twelve_answers_in_order_and_its_title_is_the_verdict
 
 
 def test_a_failed_rule_fails_the_verdict_and_its_row_only(project):
-    change("evaluate_temperature", controllers__window__settled_error_degC=made.figure(0.72, 0.61, 0.84, zone=1))
+    change(
+        "evaluate_temperature", controllers__window__settled_error_degC=made.figure(0.72, 0.61, 0.84, zone=1)
+    )
     main()
     page = Page(INDEX).text
     assert "Do not deploy the data‑driven temperature controller." in page
-    assert "First failed rule: settled error. Zone 2 settles 0.72 °C from its reference; the rule allows 0.50 °C." in page
+    assert (
+        "First failed rule: settled error. Zone 2 settles 0.72 °C from its reference; "
+        "the rule allows 0.50 °C." in page
+    )
     assert INDEX.read_text().count('class="fail ') == 1
     assert figures()["verdict"]["winner"] == "model_based"
 
@@ -94,7 +105,9 @@ def test_the_worst_case_is_the_largest_gap_over_plants_with_its_band_over_seeds(
     main()
     found = figures()["figures"]["window"]["worst_case_gap_percent"]
     # by hand: 110 (0.01 + 0.99 + 0.0001 seed), seeds 1, 2, 3
-    np.testing.assert_allclose([found["low"], found["median"], found["high"]], [110.011, 110.022, 110.033], rtol=1e-12)
+    np.testing.assert_allclose(
+        [found["low"], found["median"], found["high"]], [110.011, 110.022, 110.033], rtol=1e-12
+    )
     assert figures()["verdict"]["rule"] == "limits"
 
 
@@ -135,11 +148,17 @@ def test_an_artifact_that_is_missing_or_broken_is_said_so_in_its_place(project, 
     assert f"<tr><td><code>{path}</code></td>" in text
     assert f"<tr><td><code>{path}</code></td>" not in whole
     assert path not in figures()["read"]
-    assert len(re.findall("not measured|failed", text.lower())) > len(re.findall("not measured|failed", whole.lower()))
+    assert len(re.findall("not measured|failed", text.lower())) > len(
+        re.findall("not measured|failed", whole.lower())
+    )
 
 
 def test_with_nothing_at_all_the_pages_are_there_and_every_place_says_not_measured(project):
-    for path in [*Path("datasets").rglob("*.parquet"), *Path("datasets").rglob("*.json"), *Path("reports/metrics").glob("*.json")]:
+    for path in [
+        *Path("datasets").rglob("*.parquet"),
+        *Path("datasets").rglob("*.json"),
+        *Path("reports/metrics").glob("*.json"),
+    ]:
         path.unlink()
     main()
     page = Page(INDEX).text
@@ -149,7 +168,9 @@ def test_with_nothing_at_all_the_pages_are_there_and_every_place_says_not_measur
 
 
 def test_a_kernel_that_was_refused_is_shown_as_failed_with_its_sentence(project):
-    change("learn_kernel", refused="the record does not determine the kernel; record longer", samples_needed=None)
+    change(
+        "learn_kernel", refused="the record does not determine the kernel; record longer", samples_needed=None
+    )
     Path("datasets/learn_kernel/kernel.parquet").unlink()
     for stage in ("evaluate_temperature",):
         found = artifacts.read_metrics(stage)
@@ -161,7 +182,10 @@ def test_a_kernel_that_was_refused_is_shown_as_failed_with_its_sentence(project)
 
 
 def test_never_settling_is_said_in_words(project):
-    change("evaluate_temperature", controllers__window__settling_s={"median": None, "low": 12.0, "high": None, "worst": None})
+    change(
+        "evaluate_temperature",
+        controllers__window__settling_s={"median": None, "low": 12.0, "high": None, "worst": None},
+    )
     main()
     text = INDEX.read_text()
     assert '<span class="v">never</span><span class="b">12 to never</span>' in text
@@ -178,10 +202,13 @@ def test_hostile_text_from_the_data_is_escaped_and_isolated(project):
         ]
         assert [tag for tag, _ in page.tags].count("script") == 1
         allowed = base64.b64encode(hashlib.sha256(environment().globals["script"].encode()).digest()).decode()
-        assert f"default-src 'none'; style-src 'unsafe-inline'; img-src data:; script-src 'sha256-{allowed}' 'strict-dynamic';" in path.read_text(
-            encoding="utf-8"
+        assert (
+            "default-src 'none'; style-src 'unsafe-inline'; img-src data:; "
+            f"script-src 'sha256-{allowed}' 'strict-dynamic';" in path.read_text(encoding="utf-8")
         )
-        assert all(found["src"].startswith("data:image/jpeg;base64,") for tag, found in page.tags if tag == "img")
+        assert all(
+            found["src"].startswith("data:image/jpeg;base64,") for tag, found in page.tags if tag == "img"
+        )
         assert not any(name.startswith("on") for _, attributes in page.tags for name in attributes)
     text = TEMPERATURE.read_text(encoding="utf-8")
     assert "&lt;script&gt;" in text
@@ -210,7 +237,9 @@ def test_every_picture_states_something_and_no_figure_is_nan(project):
     for path in PAGES:
         for tag, attributes in Page(path).tags:
             if tag == "svg" and attributes.get("role") == "img":
-                assert re.search(r"\d|not measured|failed", attributes["aria-label"]), attributes["aria-label"]
+                assert re.search(r"\d|not measured|failed", attributes["aria-label"]), attributes[
+                    "aria-label"
+                ]
         assert not re.search(r"\bnan\b|\binf\b|None", path.read_text().split("</style>")[1])
 
 
@@ -218,7 +247,9 @@ def test_a_long_record_is_thinned_and_keeps_its_peak(project):
     machine = made.declared(project)
     columns = made.record(machine, 200_000, "long.mcap")
     columns["zone_1"][123_456] = 999.0
-    artifacts.write_table("datasets/ingest/record.parquet", made.tables.record(machine.inputs, machine.outputs), columns)
+    artifacts.write_table(
+        "datasets/ingest/record.parquet", made.tables.record(machine.inputs, machine.outputs), columns
+    )
     main()
     size = figures()["bytes"]
     # the limits of the pages: 1 MB and 1.5 MB
@@ -231,10 +262,21 @@ def test_a_hundred_recordings_with_their_findings_stay_within_the_sizes(project)
     columns = made.record(machine, 100_000, "x")
     columns["recording"] = [f"a rather long name of a recording {i // 1000:03d}.mcap" for i in range(100_000)]
     columns["segment"] = np.repeat(np.arange(100), 1000).astype(np.int32)
-    artifacts.write_table("datasets/ingest/record.parquet", made.tables.record(machine.inputs, machine.outputs), columns)
+    artifacts.write_table(
+        "datasets/ingest/record.parquet", made.tables.record(machine.inputs, machine.outputs), columns
+    )
     rows = 100 * 20
-    flaws = {"recording": columns["recording"][::50][:rows], "signal": ["zone_1"] * rows, "kind": ["spike"] * rows, "count": [1] * rows}
-    flaws |= {"start_s": np.arange(rows) * 50.0, "end_s": np.arange(rows) * 50.0 + 5, "message": ["a spike that stands alone"] * rows}
+    flaws = {
+        "recording": columns["recording"][::50][:rows],
+        "signal": ["zone_1"] * rows,
+        "kind": ["spike"] * rows,
+        "count": [1] * rows,
+    }
+    flaws |= {
+        "start_s": np.arange(rows) * 50.0,
+        "end_s": np.arange(rows) * 50.0 + 5,
+        "message": ["a spike that stands alone"] * rows,
+    }
     artifacts.write_table("datasets/ingest/quality.parquet", made.tables.QUALITY, flaws)
     main()
     size = figures()["bytes"]
@@ -258,10 +300,14 @@ def test_first_run_equal_runs_and_a_moved_figure(project):
     assert "Since 2026-11-20" in page and "accepted on 2026-11-20 at commit 0a1b2c3d" in page
     assert "first run" not in page
 
-    change("evaluate_temperature", controllers__window__settled_error_degC=made.figure(0.45, 0.41, 0.49, zone=0))
+    change(
+        "evaluate_temperature", controllers__window__settled_error_degC=made.figure(0.45, 0.41, 0.49, zone=0)
+    )
     change("evaluate_temperature", controllers__window__settling_s=made.figure(2.0, 1.0, 3.0))
     change("evaluate_temperature", controllers__window__overshoot_degC=made.figure(0.6, 0.4, 1.0))
-    Path("params.yaml").write_text(Path("params.yaml").read_text().replace("gap_percent: 5.0", "gap_percent: 6.0", 1))
+    Path("params.yaml").write_text(
+        Path("params.yaml").read_text().replace("gap_percent: 5.0", "gap_percent: 6.0", 1)
+    )
     Path("pipeline/code.py").write_text("2\n")
     main()
     page = Page(INDEX).text
@@ -281,16 +327,24 @@ def test_a_broken_accepted_run_is_said_so(project):
 
 
 def test_a_signal_of_another_schema_is_shown_as_failed_not_read(project):
-    artifacts.write_arrays("datasets/learn_kernel/window.parquet", "other", 1, {"table": (np.eye(3), "1", "criterion")})
+    artifacts.write_arrays(
+        "datasets/learn_kernel/window.parquet", "other", 1, {"table": (np.eye(3), "1", "criterion")}
+    )
     main()
     assert (
-        "Failed. datasets/learn_kernel/window.parquet holds schema other version 1 but window version 1 is expected"
-        in Page(TEMPERATURE).text
+        "Failed. datasets/learn_kernel/window.parquet holds schema other version 1 but window "
+        "version 1 is expected" in Page(TEMPERATURE).text
     )
 
 
 def test_a_page_needs_no_simulator_and_starts_fast():
     heavy = ("jax", "equinox", "scipy.stats", "pipeline.setpoint.simulator", "pipeline.temperature.plant")
     said = f"import sys, stages.report, pipeline.report.nightly.page, pipeline.report.runs.trend; print([name for name in {heavy!r} if name in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", said], capture_output=True, text=True, check=True, cwd=Path(__file__).resolve().parents[2])
+    done = subprocess.run(
+        [sys.executable, "-c", said],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=Path(__file__).resolve().parents[2],
+    )
     assert done.stdout.strip() == "[]"

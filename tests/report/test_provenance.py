@@ -1,4 +1,5 @@
-"""What the pages say they were made from: everything matches right after a run, and one changed byte anywhere is found and named."""
+"""What the pages say they were made from: everything matches right after a run,
+and one changed byte anywhere is found and named."""
 
 import subprocess
 import sys
@@ -14,13 +15,21 @@ from stages.report import main
 
 
 def lock():
-    """dvc.lock of the small project as DVC would write it: folders of stages, and what the report stage wrote."""
-    outs = [Path("datasets") / name for name in ("compose_parts", "evaluate_temperature", "identify_plant", "ingest")]
-    outs += [Path("datasets") / name for name in ("learn_kernel", "segment_library", "train_ilc", "tune_weights")]
+    """dvc.lock of the small project as DVC would write it: folders of
+    stages, and what the report stage wrote."""
+    outs = [
+        Path("datasets") / name
+        for name in ("compose_parts", "evaluate_temperature", "identify_plant", "ingest")
+    ]
+    outs += [
+        Path("datasets") / name for name in ("learn_kernel", "segment_library", "train_ilc", "tune_weights")
+    ]
     outs += [Path("datasets") / name for name in ("train_classifier", "train_agent", "evaluate_setpoint")]
     stages = {path.name: {"outs": [{"path": str(path), "md5": provenance.md5(path)}]} for path in outs}
     written = [*Path("reports").glob("*.html"), *Path("reports/metrics").glob("*.json")]
-    stages["report"] = {"outs": [{"path": str(path), "md5": provenance.md5(path)} for path in sorted(written)]}
+    stages["report"] = {
+        "outs": [{"path": str(path), "md5": provenance.md5(path)} for path in sorted(written)]
+    }
     Path("dvc.lock").write_text(yaml.safe_dump({"schema": "2.0", "stages": stages}))
 
 
@@ -48,7 +57,10 @@ def test_right_after_a_run_everything_matches_and_the_command_says_how_much(chec
     cli.main()
     said = capsys.readouterr().out
     read = artifacts.read_metrics("report")["read"]
-    assert f"{len(read)} sources of the pages: all match" in said and "references of figures and tables: all match" in said
+    assert (
+        f"{len(read)} sources of the pages: all match" in said
+        and "references of figures and tables: all match" in said
+    )
 
 
 def test_one_changed_byte_of_any_source_is_found_and_named(checked):
@@ -74,7 +86,8 @@ def test_one_changed_byte_of_any_source_is_found_and_named(checked):
 def test_a_change_of_parameters_code_or_a_page_is_found(checked, path, sentence):
     text = Path(path).read_text() if Path(path).exists() else ""
     changed = {
-        "params.yaml": text.replace("gap_percent: 5.0", "gap_percent: 6.0", 1), "params.expert.yaml": "train_agent: {more: 1}\n", "pipeline/code.py": "2\n",
+        "params.yaml": text.replace("gap_percent: 5.0", "gap_percent: 6.0", 1),
+        "params.expert.yaml": "train_agent: {more: 1}\n", "pipeline/code.py": "2\n",
     }.get(path, text + "\n")  # fmt: skip
     assert changed != text
     Path(path).write_text(changed)
@@ -111,13 +124,16 @@ def test_the_command_names_what_no_longer_matches_and_ends_with_one(checked, mon
     assert ended.value.code == 1
     said = capsys.readouterr().err
     assert (
-        "datasets/ingest/quality.parquet has changed since; datasets/ingest is not what dvc.lock has of ingest; run ./run dvc repro" in said
+        "datasets/ingest/quality.parquet has changed since; datasets/ingest is not what dvc.lock has of "
+        "ingest; run ./run dvc repro" in said
     )
 
 
 def test_the_metrics_of_an_older_version_are_refused_in_one_sentence(checked):
     artifacts.write_json("reports/metrics/report.json", {"read": {}})
-    with pytest.raises(ValueError, match="it does not say what the pages were made from; run ./run dvc repro report"):
+    with pytest.raises(
+        ValueError, match="it does not say what the pages were made from; run ./run dvc repro report"
+    ):
         provenance.checks()
 
 

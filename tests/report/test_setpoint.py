@@ -1,4 +1,5 @@
-"""The page of the setpoint loop on made-up artifacts: the verdict against figures made by hand, undecided shares, what is missing, hostile text, sizes."""
+"""The page of the setpoint loop on made-up artifacts: the verdict against figures made by hand, undecided
+shares, what is missing, hostile text, sizes."""
 
 import re
 from pathlib import Path
@@ -21,9 +22,11 @@ from tests.report.test_pages import Page, change, figures
 
 PAGE, INDEX = Path("reports/setpoint.html"), Path("reports/index.html")
 ARTIFACTS = [
-    *(f"datasets/train_classifier/{name}" for name in ("classified.parquet", "reliability.parquet", "course.parquet", "windows.parquet", "frames/frames.json")),
+    *(f"datasets/train_classifier/{name}" for name in ("classified.parquet", "reliability.parquet",
+    "course.parquet", "windows.parquet", "frames/frames.json")),
     "datasets/train_agent/agents.parquet",
-    *(f"datasets/evaluate_setpoint/{name}" for name in ("scoreboard.parquet", "paths.parquet", "decisions.parquet", "choice.json")),
+    *(f"datasets/evaluate_setpoint/{name}" for name in ("scoreboard.parquet", "paths.parquet",
+    "decisions.parquet", "choice.json")),
 ]  # fmt: skip
 
 
@@ -33,7 +36,8 @@ def page():
 
 
 def lost(**percent):
-    """The made-up controllers with other shares of lost runs: name with _ for a space -> (least, more a case)."""
+    """The made-up controllers with other shares of lost runs: name
+    with _ for a space -> (least, more a case)."""
     return made_setpoint.LOST | {name.replace("_", " "): pair for name, pair in percent.items()}
 
 
@@ -68,20 +72,25 @@ def test_a_baseline_may_win_and_then_the_page_says_how_far_the_agent_came(projec
 @pytest.mark.parametrize(
     ("metric", "value", "rule", "sentence"),
     [
-        ("ece_window", 0.05, "calibrated, a window", "Stated and true shares of right answers differ by 0.050 on average; 0.04 is allowed."),
-        ("intervals_percent__image", [70.0, 72.0], "right, an image", "The classifier names 79.7 % of frames of segments it never saw rightly; 78 % are asked for."),
+        ("ece_window", 0.05, "calibrated, a window",
+        "Stated and true shares of right answers differ by 0.050 on average; 0.04 is allowed."),
+        ("intervals_percent__image", [70.0, 72.0], "right, an image",
+        "The classifier names 79.7 % of frames of segments it never saw rightly; 78 % are asked for."),
     ],
 )  # fmt: skip
 def test_the_first_failed_rule_is_said_in_words(project, metric, value, rule, sentence):
     change("train_classifier", **{metric: value})
     text = page()
     assert (
-        f"Do not let the camera steer a printer yet. First failed rule: {rule}. {sentence} By runs that settle and stay the agent comes closest."
-        in text
+        f"Do not let the camera steer a printer yet. First failed rule: {rule}. "
+        f"{sentence} By runs that settle and stay the agent comes closest." in text
     )
     assert PAGE.read_text().count('<tr class="fail"><th scope="row"><a') == 1
     # page one says which loops may be deployed, and of this one why not
-    assert re.search(r"<h1.*?>(.*?)</h1>", INDEX.read_text())[1] == "Deploy temperature and deposition; do not deploy setpoint."
+    assert (
+        re.search(r"<h1.*?>(.*?)</h1>", INDEX.read_text())[1]
+        == "Deploy temperature and deposition; do not deploy setpoint."
+    )
     assert f"First failed rule: {rule}. {sentence}" in Page(INDEX).text
 
 
@@ -90,29 +99,38 @@ def test_a_share_that_straddles_its_limit_is_undecided_and_says_how_many_runs_wo
     text = page()
     # 98.0 % of 210 runs: 95.1 to 99.2; 1.96^2 x 0.98 x 0.02 / 0.01^2 = 753, rounded up to two digits
     assert (
-        "Do not decide yet. First open rule: settles, worst case. Best, by runs that settle and stay, is the agent: in its worst case"
-        in text
+        "Do not decide yet. First open rule: settles, worst case. Best, by runs that settle and stay, "
+        "is the agent: in its worst case" in text
     )
     assert (
-        "98.0 % of its runs settle; 97 % are asked for. Its interval, 95.1–99.2, straddles that; about 760 runs in all would decide."
-        in text
+        "98.0 % of its runs settle; 97 % are asked for. Its interval, 95.1–99.2, straddles that; "
+        "about 760 runs in all would decide." in text
     )
-    assert setpoint_verdict.undecided(Question(0, "", "", "%", 97.0, True, ""), Figure(97.0, 96.0, 98.0)).endswith(
-        "no number of runs would decide."
-    )
+    assert setpoint_verdict.undecided(
+        Question(0, "", "", "%", 97.0, True, ""), Figure(97.0, 96.0, 98.0)
+    ).endswith("no number of runs would decide.")
 
 
 @pytest.mark.parametrize("how", ["missing", "broken"])
-@pytest.mark.parametrize("paths", [ARTIFACTS[:-3], ARTIFACTS[-3:-1], ARTIFACTS[-1:]], ids=["most", "paths and decisions", "choice"])
+@pytest.mark.parametrize(
+    "paths", [ARTIFACTS[:-3], ARTIFACTS[-3:-1], ARTIFACTS[-1:]], ids=["most", "paths and decisions", "choice"]
+)
 def test_what_is_missing_or_broken_is_said_in_its_place(project, paths, how):
     for path in paths:
         Path(path).unlink() if how == "missing" else Path(path).write_bytes(b"{")
     text = page()
     for path in paths:
         stage, name = path.split("/")[1], Path(path).name
-        broken = f"{path} is not whole JSON" if name.endswith("json") else f"{path} is not a whole Parquet file"
+        broken = (
+            f"{path} is not whole JSON" if name.endswith("json") else f"{path} is not a whole Parquet file"
+        )
         # in its place and in the provenance
-        assert text.count(broken if how == "broken" else f"{name} of {stage} is not there. Run ./run dvc repro {stage}.") >= 2, path
+        assert (
+            text.count(
+                broken if how == "broken" else f"{name} of {stage} is not there. Run ./run dvc repro {stage}."
+            )
+            >= 2
+        ), path
 
 
 def test_before_the_stages_ran_the_page_and_the_card_say_so(project):
@@ -122,7 +140,9 @@ def test_before_the_stages_ran_the_page_and_the_card_say_so(project):
     assert "Let nobody set flow and temperature by this loop yet. No controller was chosen." in text
     assert "Run ./run dvc repro evaluate_setpoint." in text and "Run the agent" not in Page(INDEX).text
     # what was not measured takes no headline from a loop that was
-    assert "Deploy temperature and deposition; setpoint is not measured." in INDEX.read_text().split("</h1>")[0]
+    assert (
+        "Deploy temperature and deposition; setpoint is not measured." in INDEX.read_text().split("</h1>")[0]
+    )
 
 
 def test_a_choice_of_somebody_who_was_not_judged_is_no_choice(project):
@@ -153,18 +173,24 @@ def test_the_card_names_the_winner_in_words_and_shows_three_panels(project):
     page()
     first = Page(INDEX)
     assert (
-        "Data‑driven wins. The agent: 99.0 % of runs settle and stay in its worst case (the paper’s simulator, accuracy 70 %, clog)"
-        in first.text
+        "Data‑driven wins. The agent: 99.0 % of runs settle and stay in its worst case (the paper’s "
+        "simulator, accuracy 70 %, clog)" in first.text
     )
     card = INDEX.read_text().split('id="c-setpoint"')[1].split("</article>")[0]
     assert card.count('class="spark') == 3 and first.links.count("setpoint.html") >= 3
 
 
 def test_how_a_figure_moved_since_the_accepted_run_is_said(project):
-    accepted = {"metrics": {"evaluate_setpoint": artifacts.read_metrics("evaluate_setpoint")}, "params": {}, "hashes": {}}
+    accepted = {
+        "metrics": {"evaluate_setpoint": artifacts.read_metrics("evaluate_setpoint")},
+        "params": {},
+        "hashes": {},
+    }
     cases = accepted["metrics"]["evaluate_setpoint"]["our agent"]["paper"]
     cases["accuracy 0.7"]["settled"] = 97.0
-    cases["accuracy 0.9"] = {"settled": 99.3}  # outside the interval of today, 99.36 to 99.86, which overlaps that of then
+    cases["accuracy 0.9"] = {
+        "settled": 99.3
+    }  # outside the interval of today, 99.36 to 99.86, which overlaps that of then
     artifacts.write_json("reports/accepted.json", accepted)
     text = page()
     # 99.5 % now, 99.1 to 99.7
@@ -198,14 +224,23 @@ def test_windows_are_counted_right_by_the_class_of_their_flow():
 
 
 def test_stretches_of_held_windows_end_where_the_reason_changes():
-    why = ["good 0.9; no change", "x held: tip moved", "y held: tip moved", "z held: out of distribution", "good 0.9; flow -5 %"]
+    why = [
+        "good 0.9; no change",
+        "x held: tip moved",
+        "y held: tip moved",
+        "z held: out of distribution",
+        "good 0.9; flow -5 %",
+    ]
     mine = {"held": np.array([False, True, True, True, False]), "why": np.array(why)}
     assert setpoint_why._alike(mine) == [(1, 3), (3, 4)]
     assert setpoint_why.reason(why[1]) == "tip moved"
 
 
 def test_cases_are_said_in_words():
-    assert setpoint_verdict.case_text(("recorded", "recorded, sticky, clog"), whole=True) == "Recorded windows, sticky, clog"
+    assert (
+        setpoint_verdict.case_text(("recorded", "recorded, sticky, clog"), whole=True)
+        == "Recorded windows, sticky, clog"
+    )
     assert setpoint_verdict.case_text(("paper", "accuracy 0.7, gain 0.6")) == "accuracy 70\u202f%, gain 0.6"
 
 

@@ -1,4 +1,5 @@
-"""What a controller trades, plant by plant, and which stages were made anew: against figures made by hand and dvc.yaml."""
+"""What a controller trades, plant by plant, and which stages were made
+anew: against figures made by hand and dvc.yaml."""
 
 import re
 from pathlib import Path
@@ -16,7 +17,13 @@ from tests.report.test_pages import TEMPERATURE, Page
 
 
 def test_the_front_holds_whom_no_other_beats_in_both():
-    points = {"cheap": (1.0, 5.0), "good": (3.0, 1.0), "between": (2.0, 2.0), "beaten": (2.5, 2.5), "worst": (3.0, 5.0)}
+    points = {
+        "cheap": (1.0, 5.0),
+        "good": (3.0, 1.0),
+        "between": (2.0, 2.0),
+        "beaten": (2.5, 2.5),
+        "worst": (3.0, 5.0),
+    }
     assert trades.front(points) == ["cheap", "between", "good"]
     # two that are equal do not beat one another
     assert trades.front({"a": (1.0, 1.0), "b": (1.0, 1.0)}) == ["a", "b"]
@@ -35,14 +42,22 @@ def test_the_hardest_plant_is_the_last_one_with_its_largest_gap(project):
 def test_the_drawn_stages_are_those_of_dvc_yaml_and_read_what_they_read_there(root):
     stages = yaml.safe_load((root / "dvc.yaml").read_text())["stages"]
     written = {
-        path: stage for stage, entry in stages.items() for kind in ("outs", "metrics") for out in entry.get(kind, []) for path in out
+        path: stage
+        for stage, entry in stages.items()
+        for kind in ("outs", "metrics")
+        for out in entry.get(kind, [])
+        for path in out
     }
     reads = {
-        stage: {written[path] for dep in entry["deps"] for path in written if f"{dep}/".startswith(f"{path}/")}
+        stage: {
+            written[path] for dep in entry["deps"] for path in written if f"{dep}/".startswith(f"{path}/")
+        }
         for stage, entry in stages.items()
         if stage != "report"
     }
-    assert {stage: set(found) for stage, found in workflow.READS.items()} == reads, "add the stage to READS in pipeline/report/index/workflow.py"
+    assert {stage: set(found) for stage, found in workflow.READS.items()} == reads, (
+        "add the stage to READS in pipeline/report/index/workflow.py"
+    )
 
 
 def test_no_two_stages_share_a_place_and_every_arrow_points_right():
@@ -56,12 +71,20 @@ def test_no_two_stages_share_a_place_and_every_arrow_points_right():
 def test_a_stage_is_as_accepted_made_anew_or_not_there(project):
     main()
     assert "No run was accepted yet: nothing says what is new." in Page(PAGE_ONE).text
-    metrics = {path.stem: artifacts.read_json(path) for path in Path("reports/metrics").glob("*.json") if path.stem != "report"}
-    hashes = {path.as_posix(): artifacts.sha256(path) for path in Path("datasets").rglob("*") if path.is_file()}
+    metrics = {
+        path.stem: artifacts.read_json(path)
+        for path in Path("reports/metrics").glob("*.json")
+        if path.stem != "report"
+    }
+    hashes = {
+        path.as_posix(): artifacts.sha256(path) for path in Path("datasets").rglob("*") if path.is_file()
+    }
     artifacts.write_json("reports/accepted.json", {"metrics": metrics, "params": {}, "hashes": hashes})
     main()
     assert "The results of 12 of 12 stages are those of the accepted run, to the byte." in Page(PAGE_ONE).text
-    artifacts.write_json("datasets/tune_weights/weights.json", {"practical": {"q": [1.0, 3.0], "r": [0.1, 0.2]}})
+    artifacts.write_json(
+        "datasets/tune_weights/weights.json", {"practical": {"q": [1.0, 3.0], "r": [0.1, 0.2]}}
+    )
     Path("datasets/segment_library/library.parquet").unlink()
     main()
     text = PAGE_ONE.read_text()
@@ -72,17 +95,24 @@ def test_a_stage_is_as_accepted_made_anew_or_not_there(project):
 # ---- the candidates of the tuning
 
 
-def test_the_front_of_the_candidates_is_drawn_with_chosen_default_and_optimum_and_says_what_was_bought(project):
+def test_the_front_of_the_candidates_is_drawn_with_chosen_default_and_optimum_and_says_what_was_bought(
+    project,
+):
     main()
     text = Page(TEMPERATURE).text
-    # of the small project: practical candidates (10 %, 9 °C), (12 %, 5 °C; chosen) and one that failed; default (11 %, 8 °C)
+    # of the small project: practical candidates (10 %, 9 °C), (12 %, 5 °C;
+    # chosen) and one that failed; default (11 %, 8 °C)
     assert (
-        "The chosen weights have less error for more effort than the default ones: 5.00 °C at 12.0 % of effort against 8.00 °C at 11.0 %. "
+        "The chosen weights have less error for more effort than the default ones: "
+        "5.00 °C at 12.0 % of effort against 8.00 °C at 11.0 %. "
         "It lies on the front."
     ) in text
-    label = re.search(r'aria-label="(The declared engineering cost: 2 candidates[^"]*)"', TEMPERATURE.read_text())[1].replace("\u202f", " ")
+    label = re.search(
+        r'aria-label="(The declared engineering cost: 2 candidates[^"]*)"', TEMPERATURE.read_text()
+    )[1].replace("\u202f", " ")
     assert label == (
-        "The declared engineering cost: 2 candidates, 2 on the front; chosen 5.00 °C at 12.0 % of effort; default 8.00 °C at 11.0 % of effort; "
+        "The declared engineering cost: 2 candidates, 2 on the front; chosen 5.00 °C at 12.0 % of effort; "
+        "default 8.00 °C at 11.0 % of effort; "
         "optimum 4.00 °C at 30.0 % of effort"
     )
 
@@ -102,7 +132,8 @@ def test_a_chosen_candidate_above_the_front_says_by_how_much():
 
 
 def cases(factor, *, plants=6, seeds=3):
-    """A scorecard of two controllers on the same cases: the model-based one costs `factor` (plants,) times as much."""
+    """A scorecard of two controllers on the same cases: the
+    model-based one costs `factor` (plants,) times as much."""
     rows = [(plant, seed) for plant in range(plants) for seed in range(seeds)]
     plant, seed = (np.array(column) for column in zip(*rows, strict=True))
     both = {
@@ -129,7 +160,11 @@ def test_the_paired_saving_is_that_of_the_costs_ratio_over_plants():
     np.testing.assert_allclose([found.improvement_percent, found.p], [50.0, 1 / 64], rtol=1e-12)
     assert (found.cases, found.blocks) == (18, 6)
     row = pairs._row(found)
-    assert (row["saved"].replace("\u202f", " "), row["cases"], row["sure"]) == ("50 % less", "18 on six plants", True)
+    assert (row["saved"].replace("\u202f", " "), row["cases"], row["sure"]) == (
+        "50 % less",
+        "18 on six plants",
+        True,
+    )
 
 
 def test_a_difference_that_changes_its_sign_from_plant_to_plant_is_chance():

@@ -62,7 +62,11 @@ def answers(**changed):
 
 
 def roles(data_driven=None, model_based=None, baseline=None):
-    return {"data_driven": data_driven or answers(), "model_based": model_based or answers(), "baseline": baseline or answers()}
+    return {
+        "data_driven": data_driven or answers(),
+        "model_based": model_based or answers(),
+        "baseline": baseline or answers(),
+    }
 
 
 @pytest.mark.parametrize(
@@ -92,7 +96,10 @@ def test_share_of_the_allowance_is_inverted_where_more_is_better():
 
 
 def test_failed_names_the_first_failed_rule_its_figure_and_what_to_run_instead():
-    worse = answers(settled_error_degC=Figure(0.72, 0.61, 0.84, note="zone 4"), worst_case_gap_percent=Figure(90.0, 80.0, 99.0))
+    worse = answers(
+        settled_error_degC=Figure(0.72, 0.61, 0.84, note="zone 4"),
+        worst_case_gap_percent=Figure(90.0, 80.0, 99.0),
+    )
     verdict = decide("temperature", ASKED, roles(data_driven=worse))
     assert verdict.state == FAILED
     assert verdict.decision == "Do not deploy the data\u2011driven temperature controller."
@@ -107,7 +114,8 @@ def test_passed_says_so_with_what_is_closest_to_its_limit_and_never_counts_drift
     assert verdict.decision == "Deploy the data\u2011driven temperature controller."
     assert verdict.lead == "It passes every rule measured so far."
     assert verdict.remedy.startswith(
-        "Closest to its limit: disk margin, 0.46 of at least 0.40 (model-based: 0.46). Drift is not measured. The nightly job measures it and has not run."
+        "Closest to its limit: disk margin, 0.46 of at least 0.40 (model-based: 0.46). "
+        "Drift is not measured. The nightly job measures it and has not run."
     )
     assert verdict.reason == "Model-based fails on gap."
 
@@ -118,7 +126,11 @@ def test_open_says_what_is_missing_and_how_much_more_of_it():
     assert (undecided_data.state, undecided_data.lead) == (FAILED, "First failed rule: data sufficiency.")
     assert undecided_data.reason == "700 of 1,610 samples; record 910 more."
     unmeasured = decide(
-        "temperature", ASKED, roles(data_driven=answers(gap_percent=Missing("not measured", "The scorecard is not there", "Run it")))
+        "temperature",
+        ASKED,
+        roles(
+            data_driven=answers(gap_percent=Missing("not measured", "The scorecard is not there", "Run it"))
+        ),
     )
     assert (unmeasured.state, unmeasured.decision) == (OPEN, "Do not decide yet.")
     assert unmeasured.reason == "The scorecard is not there. Run it."
@@ -129,7 +141,10 @@ def test_where_no_controller_passes_it_says_so_and_names_the_first_rule_of_each(
     bad = answers(gap_percent=Figure(9.0, 8.0, 10.0))
     verdict = decide("temperature", ASKED, roles(bad, bad, answers(disk=Figure(0.1, 0.1, 0.1))))
     assert verdict.winner is None
-    assert "No controller passes: the model-based one fails on gap, the baseline one fails on limits." in verdict.remedy
+    assert (
+        "No controller passes: the model-based one fails on gap, the baseline one fails on limits."
+        in verdict.remedy
+    )
 
 
 def test_the_winner_has_the_smallest_settled_error_and_within_noise_the_smallest_gap():
@@ -138,15 +153,26 @@ def test_the_winner_has_the_smallest_settled_error_and_within_noise_the_smallest
     noisier_gap = answers(gap_percent=Figure(0.4, 0.3, 0.5), worst_case_gap_percent=Figure(26.0, 25.0, 27.0))
     assert winner(ASKED, roles(model_based=noisier_gap, baseline=noisier_gap)) == "data_driven"
     assert (
-        winner(ASKED, roles(data_driven=answers(gap_percent=Figure(9.0, 8.0, 10.0)), model_based=answers(disk=Figure(0.1, 0.1, 0.1))))
+        winner(
+            ASKED,
+            roles(
+                data_driven=answers(gap_percent=Figure(9.0, 8.0, 10.0)),
+                model_based=answers(disk=Figure(0.1, 0.1, 0.1)),
+            ),
+        )
         == "baseline"
     )
 
 
 def test_where_the_better_controller_is_the_other_one_the_verdict_deploys_that():
-    verdict = decide("temperature", ASKED, roles(model_based=answers(settled_error_degC=Figure(0.1, 0.09, 0.11))))
+    verdict = decide(
+        "temperature", ASKED, roles(model_based=answers(settled_error_degC=Figure(0.1, 0.09, 0.11)))
+    )
     assert verdict.decision == "Deploy the model\u2011based temperature controller."
-    assert verdict.reason == "Data-driven passes too; the settled error decides: 0.10\u202f°C against 0.31\u202f°C."
+    assert (
+        verdict.reason
+        == "Data-driven passes too; the settled error decides: 0.10\u202f°C against 0.31\u202f°C."
+    )
 
 
 def test_an_undecided_figure_says_how_many_more_runs_would_decide():

@@ -6,18 +6,25 @@ from pipeline.setpoint.recorded import WindowTable
 
 
 def synthetic_table(rng: np.random.Generator, *, segments: int, windows: int) -> WindowTable:
-    """A stand-in until a classifier has recorded its own: `segments` segments of `windows` windows in every flow bin, with the errors that a real classifier makes.
+    """A stand-in until a classifier has recorded its own: `segments` segments of `windows` windows in every
+    flow bin, with the errors that a real classifier makes.
 
-    A segment shows the flow as if its beads were wider or narrower by 5 %, a window by another 3 %, and the classes' borders are seen to within 4 %; the border to
-    good lies near 83.5 % as it shows, so that from 80 to 90 % of flow some 38 % of the windows are right; errors stay within a segment and never swap under and over.
+    A segment shows the flow as if its beads were wider or narrower by 5 %, a window by another
+    3 %, and the classes' borders are seen to within 4 %; the border to good lies near 83.5 %
+    as it shows, so that from 80 to 90 % of flow some 38 % of the windows are right; errors
+    stay within a segment and never swap under and over.
     """
     edges = np.concatenate([np.arange(20, 70, 10.0), np.arange(70, 130, 2.5), np.arange(130, 311, 10.0)])
     flow_bin, segment = (a.ravel() for a in np.indices((len(edges) - 1, segments * windows)))
     segment = segment // windows
     flow = rng.uniform(edges[:-1], edges[1:], (segments * windows, len(edges) - 1)).T.ravel()
-    width = rng.normal(0.0, 0.05, (len(edges) - 1, segments))[flow_bin, segment] + rng.normal(0.0, 0.03, len(flow))
+    width = rng.normal(0.0, 0.05, (len(edges) - 1, segments))[flow_bin, segment] + rng.normal(
+        0.0, 0.03, len(flow)
+    )
     shown = flow * np.exp(width)
-    logits = np.stack([-(shown - 83.5) / 4, np.zeros(len(flow)), (shown - 114.5) / 4], axis=1) + rng.normal(0.0, 0.5, (len(flow), 3))
+    logits = np.stack([-(shown - 83.5) / 4, np.zeros(len(flow)), (shown - 114.5) / 4], axis=1) + rng.normal(
+        0.0, 0.5, (len(flow), 3)
+    )
     shares = np.exp(np.clip(logits - logits.max(axis=1, keepdims=True), -8, 0))
     shares /= shares.sum(axis=1, keepdims=True)
     return WindowTable(shares, shares.argmax(axis=1), flow_bin, segment, edges)

@@ -94,12 +94,20 @@ def test_both_first_layers_as_one_product_are_the_two_layers():
 
 def one_row(network, reward, after, waits=False):
     learner = Learner(network, jax.tree.map(lambda w: 2 * w, network), optax.sgd(0.0).init(network))
-    row = Replay(jnp.zeros((1, 35)), after[None], jnp.array([[4, STAND]], jnp.int8), jnp.array([reward]), jnp.array([waits]))
+    row = Replay(
+        jnp.zeros((1, 35)),
+        after[None],
+        jnp.array([[4, STAND]], jnp.int8),
+        jnp.array([reward]),
+        jnp.array([waits]),
+    )
     return learner, row
 
 
 @pytest.mark.parametrize("waits", [False, True])
-def test_each_head_learns_from_its_own_maximum_of_the_slow_copy_or_from_standing_where_nothing_is_heeded_next(waits):
+def test_each_head_learns_from_its_own_maximum_of_the_slow_copy_or_from_standing_where_nothing_is_heeded_next(
+    waits,
+):
     network, after = QNetwork(jax.random.key(1)), jax.random.normal(jax.random.key(2), (35,))
     learner, row = one_row(network, [0.5, -0.5], after, waits)
     ahead = np.asarray(learner.slow(after))
@@ -126,12 +134,16 @@ def test_double_learning_values_the_networks_choice_by_the_slow_copy():
 def test_both_heads_are_paid_by_the_ellipse():
     zero = jnp.zeros(())
     state = State(zero, zero, jnp.asarray(110.0), zero, jnp.asarray(205.0), zero, zero, zero)
-    np.testing.assert_allclose(ellipse(40.0, 20.0, state), [0.394, 0.394], atol=5e-4)  # the check value has three digits
+    np.testing.assert_allclose(
+        ellipse(40.0, 20.0, state), [0.394, 0.394], atol=5e-4
+    )  # the check value has three digits
 
 
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_others():
-    train = lambda seed: train_published(jax.random.key(seed), setting=SMALL, rate=1e-4, updates=(20, 20), accuracy=0.7, **EXPLORE)
+    train = lambda seed: train_published(
+        jax.random.key(seed), setting=SMALL, rate=1e-4, updates=(20, 20), accuracy=0.7, **EXPLORE
+    )
     one, again, other = train(0), train(0), train(1)
     for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -154,20 +166,40 @@ def test_transitions_survive_the_ring():
 @pytest.mark.slow
 def test_a_phase_does_not_depend_on_how_long_the_longest_is():
     network, optimiser = QNetwork(jax.random.key(0)), optax.adam(1e-3)
-    world = World(paper_windows(), Partial(anywhere, jnp.asarray(1.0)), Partial(ellipse, jnp.asarray(40.0), jnp.asarray(20.0)))
-    learner, keywords = Learner(network, network, optimiser.init(network)), {"sight": paper_sight(), "world": world, "optimiser": optimiser}
+    world = World(
+        paper_windows(),
+        Partial(anywhere, jnp.asarray(1.0)),
+        Partial(ellipse, jnp.asarray(40.0), jnp.asarray(20.0)),
+    )
+    learner, keywords = (
+        Learner(network, network, optimiser.init(network)),
+        {"sight": paper_sight(), "world": world, "optimiser": optimiser},
+    )
     (one, paid), (other, paid_alike) = (
-        phase(learner, jax.random.key(1), bootstrap=greatest, setting=SMALL, updates=12, longest=longest, epsilon=(1.0, 0.1), **keywords)
+        phase(
+            learner,
+            jax.random.key(1),
+            bootstrap=greatest,
+            setting=SMALL,
+            updates=12,
+            longest=longest,
+            epsilon=(1.0, 0.1),
+            **keywords,
+        )
         for longest in (12, 30)
     )
     np.testing.assert_array_equal(paid, paid_alike)
     np.testing.assert_array_equal(one.network.joint.weight, other.network.joint.weight)
-    assert np.abs(one.network.joint.weight - network.joint.weight).max() > 1e-4  # Adam moves each weight by some 1e-3 a step
+    assert (
+        np.abs(one.network.joint.weight - network.joint.weight).max() > 1e-4
+    )  # Adam moves each weight by some 1e-3 a step
 
 
 def test_learning_raises_the_reward_from_its_first_to_its_last_steps():
     setting = SMALL._replace(batch=256, capacity=2**15, environments=32)
-    rewards = train_published(jax.random.key(0), setting=setting, rate=1e-3, updates=(600,), accuracy=1.0, **EXPLORE).rewards[0]
+    rewards = train_published(
+        jax.random.key(0), setting=setting, rate=1e-3, updates=(600,), accuracy=1.0, **EXPLORE
+    ).rewards[0]
     # at random the flow wanders over 20-310 %, where the mean reward is about -0.55
     assert rewards[-100:].mean() > rewards[:100].mean() + 0.2
 
@@ -191,7 +223,9 @@ def test_the_value_of_a_seen_flow_moves_it_by_the_shortest_way_and_holds_it_at_1
 def test_the_value_solves_its_own_equation():
     Q, at = belief_agent.seen_values(COSTS, 0.8), {q: i for i, q in enumerate(bayes.GRID)}
     cost = -abs(85.0 - 100) / 10 - 0.5 - 0.1 * 5  # from 80 by +5: under 90 still
-    assert Q[3, at[80.0]] == pytest.approx(cost + 0.8 * Q[:, at[85.0]].max(), abs=1e-5)  # where the iteration ends
+    assert Q[3, at[80.0]] == pytest.approx(
+        cost + 0.8 * Q[:, at[85.0]].max(), abs=1e-5
+    )  # where the iteration ends
 
 
 def test_the_temperature_goes_home_in_one_move_where_one_move_reaches(known):
@@ -226,7 +260,13 @@ def test_untrained_it_settles_the_papers_simulator_from_every_start(known):
 def test_training_in_troubles_is_reproducible_and_keeps_the_start_where_it_is_no_better(known):
     table = synthetic_table(np.random.default_rng(1), segments=5, windows=4)
     troubles = belief_agent.Troubles(
-        recorded_share=0.5, longest_segment=30.0, accuracy=0.6, gain=0.5, clog=0.5, clog_share=0.5, drift=0.001
+        recorded_share=0.5,
+        longest_segment=30.0,
+        accuracy=0.6,
+        gain=0.5,
+        clog=0.5,
+        clog_share=0.5,
+        drift=0.001,
     )
     train = lambda: belief_agent.train(
         jax.random.key(0),
@@ -262,5 +302,7 @@ def test_weights_return_to_the_network_they_came_from_and_no_other():
         match=r"weights of another architecture: 'heads.weight' .* found|weights of another architecture: 'heads.weight' is of shape",
     ):
         with_weights(network, {**arrays, "heads.weight": np.zeros((3, 3))})
-    with pytest.raises(ValueError, match="weights of another architecture: 'extra' is unknown in this network"):
+    with pytest.raises(
+        ValueError, match="weights of another architecture: 'extra' is unknown in this network"
+    ):
         with_weights(network, {**arrays, "extra": np.zeros(1)})

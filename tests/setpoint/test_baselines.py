@@ -1,4 +1,5 @@
-"""Controllers without learning: moves by hand, the Bayes filter against brute force, and the trial's figures on the paper's simulator."""
+"""Controllers without learning: moves by hand, the Bayes filter against brute force,
+and the trial's figures on the paper's simulator."""
 
 import itertools
 
@@ -8,7 +9,14 @@ import numpy as np
 import pytest
 
 from pipeline.setpoint import bayes, judging
-from pipeline.setpoint.baselines import Proportional, SequentialTest, nearest, proportional, sequential_test, temperature_move
+from pipeline.setpoint.baselines import (
+    Proportional,
+    SequentialTest,
+    nearest,
+    proportional,
+    sequential_test,
+    temperature_move,
+)
 from pipeline.setpoint.published import FLOW_MOVES, TEMPERATURE_MOVES
 from pipeline.setpoint.recorded import recorded_windows
 from pipeline.setpoint.simulator import Observation, nominal, paper_windows
@@ -17,14 +25,21 @@ from tests.setpoint.synthetic import synthetic_table
 KEY = jax.random.key(0)
 PURE = {0: [0.76, 0.17, 0.07], 1: [0.15, 0.7, 0.15], 2: [0.07, 0.17, 0.76]}  # the mean window of each class
 ROBUST = {
-    "accuracies": [0.7, 0.97], "gains": [1.0, 0.65], "looks": 5, "look": 0.055, "floor": 0.03, "smoothing": 4.0, "segment": 12.0, "switch": 3e-4, "repeats": 0.3, "hazard": 6e-4, "move_cost": 0.38, "outside_cost": 5.0,
+    "accuracies": [0.7, 0.97], "gains": [1.0, 0.65], "looks": 5, "look": 0.055, "floor": 0.03,
+    "smoothing": 4.0, "segment": 12.0, "switch": 3e-4, "repeats": 0.3, "hazard": 6e-4, "move_cost": 0.38,
+    "outside_cost": 5.0,
 }  # fmt: skip
 EXACT = {"accuracy": 0.7, "hazard": 0.0, "move_cost": 0.0, "outside_cost": 0.0}
 
 
 def seen(named, *, shares=None, move=0.0, target=210.0, step=0):
     return Observation(
-        jnp.array(shares or PURE[named]), jnp.array(named), jnp.array(move), jnp.array(target), jnp.array(target), jnp.array(step)
+        jnp.array(shares or PURE[named]),
+        jnp.array(named),
+        jnp.array(move),
+        jnp.array(target),
+        jnp.array(target),
+        jnp.array(step),
     )
 
 
@@ -51,30 +66,40 @@ def test_the_temperature_goes_to_210_by_the_largest_steps_and_rests_there():
         target: TEMPERATURE_MOVES[int(temperature_move(seen(1, target=target)))]
         for target in (180.0, 190.0, 198.0, 204.0, 206.0, 210.0, 213.3, 215.0, 230.0)
     }
-    assert answers == {180.0: 20, 190.0: 20, 198.0: 10, 204.0: 10, 206.0: 0, 210.0: 0, 213.3: 0, 215.0: 0, 230.0: -20}
+    assert answers == {
+        180.0: 20,
+        190.0: 20,
+        198.0: 10,
+        204.0: 10,
+        206.0: 0,
+        210.0: 0,
+        213.3: 0,
+        215.0: 0,
+        230.0: -20,
+    }
 
 
 def test_of_two_moves_as_near_the_smaller_is_taken():
-    assert [FLOW_MOVES[int(nearest(FLOW_MOVES, wanted))] for wanted in (-30.0, -7.6, -7.5, -2.5, 2.4, 2.6, 7.5, 8.0)] == [
-        -10,
-        -10,
-        -5,
-        0,
-        0,
-        5,
-        5,
-        10,
-    ]
+    assert [
+        FLOW_MOVES[int(nearest(FLOW_MOVES, wanted))]
+        for wanted in (-30.0, -7.6, -7.5, -2.5, 2.4, 2.6, 7.5, 8.0)
+    ] == [-10, -10, -5, 0, 0, 5, 5, 10]
 
 
 def test_proportional_moves_by_its_gain_times_the_difference_and_filtered_it_waits():
-    assert moves(proportional(), Proportional(gain=10.0, time_constant=1.0), [0, 1, 2]) == [5, 0, -5]  # 6.9, 0, -6.9
+    assert moves(proportional(), Proportional(gain=10.0, time_constant=1.0), [0, 1, 2]) == [
+        5,
+        0,
+        -5,
+    ]  # 6.9, 0, -6.9
     # y = 0.69 (1 - 0.75^k) reaches 0.25 at k = 2 and 5 % follows; what is kept of it is 0.75 of y
     assert moves(proportional(), Proportional(gain=10.0, time_constant=4.0), [0, 0, 0]) == [0, 5, 5]
 
 
 def test_the_sequential_test_moves_when_one_class_leads_good_by_its_threshold():
-    parameters = SequentialTest(accuracy=0.7, threshold=3.0, cap=4.7)  # log (0.7 / 0.15) = 1.54 a window: two to move, three to the cap
+    parameters = SequentialTest(
+        accuracy=0.7, threshold=3.0, cap=4.7
+    )  # log (0.7 / 0.15) = 1.54 a window: two to move, three to the cap
     assert moves(sequential_test(), parameters, [0, 0, 0, 1, 1, 1]) == [0, 10, 10, 10, 0, 0]
     assert moves(sequential_test(), parameters, [2, 1, 2, 2]) == [0, 0, 0, -10]
     assert moves(sequential_test(), parameters, [1] * 50 + [0] * 5) == [0] * 54 + [
@@ -106,16 +131,25 @@ def test_a_part_of_a_spacing_moves_the_mean_by_as_much_and_loses_nothing():
     for move in (-6.0, -0.5, 0.0, 1.2, 6.0):
         moved = np.asarray(bayes.shifted(belief, jnp.float32(move)))
         np.testing.assert_allclose(moved.sum(axis=1), [0.3, 0.7], rtol=1e-6)
-        np.testing.assert_allclose(moved @ bayes.GRID / moved.sum(axis=1), bayes.GRID[[40, 50]] + move, rtol=1e-6)
-    np.testing.assert_allclose(np.asarray(bayes.shifted(belief, jnp.float32(400.0)))[:, -1], [0.3, 0.7], rtol=1e-6)
+        np.testing.assert_allclose(
+            moved @ bayes.GRID / moved.sum(axis=1), bayes.GRID[[40, 50]] + move, rtol=1e-6
+        )
+    np.testing.assert_allclose(
+        np.asarray(bayes.shifted(belief, jnp.float32(400.0)))[:, -1], [0.3, 0.7], rtol=1e-6
+    )
 
 
 def test_the_move_is_the_one_with_the_least_expected_loss():
     parameters = bayes.class_filter(accuracy=0.7, hazard=0.0, move_cost=0.4, outside_cost=5.0)
     belief = np.zeros((1, len(bayes.GRID)))
     belief[0, [28, 32]] = 0.75, 0.25  # 90 and 100 %
-    # |q + a - 100| + 5 outside + 0.4 |a|: at a = 0 7.5, at + 5 5 + 2, at + 10 2.5 + 4, at - 10 17.5 + 3.75 + 4, at - 5 12.5 + 3.75 + 2
-    np.testing.assert_allclose(bayes.expected_loss(parameters, jnp.asarray(belief, jnp.float32)), [25.25, 18.25, 7.5, 7.0, 6.5], rtol=1e-6)
+    # |q + a - 100| + 5 outside + 0.4 |a|: at a = 0 7.5, at + 5 5 + 2, at + 10 2.5 +
+    # 4, at - 10 17.5 + 3.75 + 4, at - 5 12.5 + 3.75 + 2
+    np.testing.assert_allclose(
+        bayes.expected_loss(parameters, jnp.asarray(belief, jnp.float32)),
+        [25.25, 18.25, 7.5, 7.0, 6.5],
+        rtol=1e-6,
+    )
 
 
 def test_evidence_sums_to_one_for_every_flow_and_transitions_for_every_hypothesis(table):
@@ -128,21 +162,32 @@ def test_evidence_sums_to_one_for_every_flow_and_transitions_for_every_hypothesi
 
 
 def test_codes_tell_the_classes_apart_and_rise_with_the_flow():
-    all_shares = [np.array(p) / sum(p) for p in itertools.product([0.0, 0.1, 0.5, 1.0], repeat=3) if sum(p) > 0]
+    all_shares = [
+        np.array(p) / sum(p) for p in itertools.product([0.0, 0.1, 0.5, 1.0], repeat=3) if sum(p) > 0
+    ]
     for shares, named in itertools.product(all_shares, range(3)):
-        assert named * bayes.LEVELS <= int(bayes.code(jnp.asarray(shares), jnp.asarray(named))) < (named + 1) * bayes.LEVELS
-    leaning = [int(bayes.code(jnp.array([a, 0.8, 0.2 - a]), jnp.array(1))) for a in (0.2, 0.15, 0.1, 0.05, 0.0)]
+        assert (
+            named * bayes.LEVELS
+            <= int(bayes.code(jnp.asarray(shares), jnp.asarray(named)))
+            < (named + 1) * bayes.LEVELS
+        )
+    leaning = [
+        int(bayes.code(jnp.array([a, 0.8, 0.2 - a]), jnp.array(1))) for a in (0.2, 0.15, 0.1, 0.05, 0.0)
+    ]
     assert leaning == sorted(leaning)
     assert leaning[0] < leaning[-1]
 
 
 def test_a_thin_looking_segment_is_told_from_a_low_flow_by_its_end(table):
-    """Two hundred good windows, then three that lean to under: a segment that looks thin explains them, and the flow stays; eight that name under move it."""
+    """Two hundred good windows, then three that lean to under: a segment that looks thin explains them, and
+    the flow stays; eight that name under move it."""
     controller, parameters = bayes.bayes(14), bayes.robust_filter(table, **ROBUST)
     act, memory = jax.jit(controller.act), controller.start()
     answers = []
     for shares in [[0.02, 0.96, 0.02]] * 200 + [[0.1, 0.89, 0.01]] * 3 + [[0.9, 0.1, 0.0]] * 8:
-        memory, action = act(parameters, memory, seen(int(np.argmax(shares)), shares=shares, step=len(answers)), KEY)
+        memory, action = act(
+            parameters, memory, seen(int(np.argmax(shares)), shares=shares, step=len(answers)), KEY
+        )
         answers.append(FLOW_MOVES[int(action.flow)])
     assert not any(answers[20:203])
     assert answers[-1] > 0
@@ -150,16 +195,23 @@ def test_a_thin_looking_segment_is_told_from_a_low_flow_by_its_end(table):
 
 def test_a_weak_extruder_moves_its_own_hypothesis_by_less_and_asks_for_more(table):
     blind = np.full((2, bayes.CODES, len(bayes.GRID)), 1 / bayes.CODES)
-    parameters = bayes.Filter(jnp.asarray(blind), jnp.eye(2), jnp.eye(2), jnp.array([1.0, 0.5]), jnp.zeros(2), 0.0, 0.0, 0.0)
+    parameters = bayes.Filter(
+        jnp.asarray(blind), jnp.eye(2), jnp.eye(2), jnp.array([1.0, 0.5]), jnp.zeros(2), 0.0, 0.0, 0.0
+    )
     belief = jnp.zeros((2, len(bayes.GRID))).at[:, 16].set(0.5)  # 60 %, either way of following
-    after = np.asarray(bayes.believed(parameters, bayes.Known(belief, jnp.int32(-1)), seen(1, move=10.0)).belief)
+    after = np.asarray(
+        bayes.believed(parameters, bayes.Known(belief, jnp.int32(-1)), seen(1, move=10.0)).belief
+    )
     np.testing.assert_allclose(after @ bayes.GRID / after.sum(axis=1), [70.0, 65.0], rtol=1e-6)
     # from 60 % a move of 10 leaves a miss of 30 where the extruder follows, of 35 where it follows by half
-    np.testing.assert_allclose(np.asarray(bayes.expected_loss(parameters, belief))[[2, 4]], [40.0, 32.5], rtol=1e-6)
+    np.testing.assert_allclose(
+        np.asarray(bayes.expected_loss(parameters, belief))[[2, 4]], [40.0, 32.5], rtol=1e-6
+    )
 
 
 def test_an_extruder_that_follows_by_half_is_found_out(table):
-    """Moves of + 10 % from 60 %: the windows name good four moves later where the extruder follows, eight later where it follows by half."""
+    """Moves of + 10 % from 60 %: the windows name good four moves later where the
+    extruder follows, eight later where it follows by half."""
     parameters = bayes.robust_filter(table, **{**ROBUST, "gains": [1.0, 0.5]})
     known, one = bayes.bayes(14).start(), jax.jit(bayes.believed)
     for k in range(24):
@@ -206,10 +258,15 @@ def test_a_jump_of_the_flow_leaves_open_how_the_extruder_follows(table):
 def test_the_paper_s_windows_show_the_codes_that_their_evidence_says():
     u = jax.random.uniform(KEY, (20_000, 3))
     for flow, named in ((50.0, 0), (100.0, 1), (200.0, 2)):
-        drawn = jax.vmap(lambda one, flow=flow: paper_windows().draw((), nominal(flow, 210.0, accuracy=1.0), flow, 0.0, one))(u)
+        drawn = jax.vmap(
+            lambda one, flow=flow: paper_windows().draw(
+                (), nominal(flow, 210.0, accuracy=1.0), flow, 0.0, one
+            )
+        )(u)
         codes = np.bincount(np.asarray(bayes.code(*drawn)), minlength=bayes.CODES) / len(u)
         said = bayes.class_evidence(0.999)[0, :, int(np.argmin(np.abs(bayes.GRID - flow)))]
-        # 20,000 draws: a deviation of 0.0035 at most; the evidence's floor of 1 % moves a level by as much as 0.004
+        # 20,000 draws: a deviation of 0.0035 at most; the evidence's
+        # floor of 1 % moves a level by as much as 0.004
         np.testing.assert_allclose(codes, said, atol=0.015)
         assert codes[named * bayes.LEVELS : (named + 1) * bayes.LEVELS].sum() == pytest.approx(1.0)
 
@@ -219,7 +276,11 @@ def test_the_paper_s_windows_show_the_codes_that_their_evidence_says():
 
 def score(controller, parameters, windows, conditions, seed=0):
     return judging.evaluate(
-        controller, jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), parameters), windows, conditions, jax.random.key(seed)
+        controller,
+        jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), parameters),
+        windows,
+        conditions,
+        jax.random.key(seed),
     )
 
 
@@ -235,7 +296,8 @@ def test_the_robust_filter_holds_its_bars_on_the_paper_s_windows_with_a_clog(tab
 
 @pytest.mark.slow
 def test_the_trial_s_figures_come_out():
-    """Section 2 of the notes, 21 starts x 100 runs at accuracy 0.7: settled, stay, median; deviations of 2,100 runs are 1 point at most, the rest is how the trial's
+    """Section 2 of the notes, 21 starts x 100 runs at accuracy 0.7: settled, stay,
+    median; deviations of 2,100 runs are 1 point at most, the rest is how the trial's
     controllers were set, which the notes do not say."""
     paper, rough = paper_windows(), judging.starts(100, accuracy=0.7)
     exact = score(bayes.bayes(1), bayes.class_filter(**EXACT), paper, rough)
@@ -254,7 +316,9 @@ def test_the_trial_s_figures_come_out():
     assert test.median_steps == pytest.approx(11, abs=1)
     assert test.p90_steps == pytest.approx(30, abs=4)
     one = jnp.ones_like(rough.flow)
-    clogged = score(bayes.bayes(1), bayes.class_filter(**EXACT), paper, rough._replace(clog=0.6 * one, clog_step=60 * one))
+    clogged = score(
+        bayes.bayes(1), bayes.class_filter(**EXACT), paper, rough._replace(clog=0.6 * one, clog_step=60 * one)
+    )
     assert clogged.recovered.percent == pytest.approx(1.5, abs=1)
 
 
@@ -262,7 +326,9 @@ def test_the_trial_s_figures_come_out():
 def test_the_robust_filter_holds_every_bar_of_the_default(table):
     controller, parameters = bayes.bayes(14), bayes.robust_filter(table, **ROBUST)
     unseen = recorded_windows(synthetic_table(np.random.default_rng(11), segments=30, windows=10))
-    for number, (case, (windows, conditions)) in enumerate(judging.cases(unseen, runs=100, segment=10.0).items()):
+    for number, (case, (windows, conditions)) in enumerate(
+        judging.cases(unseen, runs=100, segment=10.0).items()
+    ):
         found = score(controller, parameters, windows, conditions, seed=number)
         assert found.settled.percent >= 97, case
         assert found.stay.percent >= 90, case

@@ -52,8 +52,8 @@ def test_the_command_says_what_the_front_end_sees(calibrate, picture):
     status, said, wrong = calibrate(name, "--tip", f"{tip[0]:g},{tip[1]:g}")
     assert (status, wrong) == (0, "")
     assert (
-        f"{name}: accepted; line at {found.angle_deg:.0f} degrees (0 right, 90 down), score {found.score:.1f} of at least 10 gray levels"
-        in said
+        f"{name}: accepted; line at {found.angle_deg:.0f} degrees (0 right, 90 down), "
+        f"score {found.score:.1f} of at least 10 gray levels" in said
     )
     assert f"train_classifier:\n  tip_px: [{tip[0]:g}, {tip[1]:g}]\n" in said
     page = Path("a<b>&.tip.html").read_text()
@@ -84,14 +84,21 @@ def test_the_middle_frame_of_a_recording_will_do(calibrate, tmp_path):
 
 def test_of_two_cameras_the_one_of_the_parameters_is_shown(calibrate, tmp_path):
     foreign(tmp_path / "night.mcap", other="/bed/camera")
-    assert "name the one of the nozzle's camera (params.yaml: train_classifier.topics.image)" in calibrate("night.mcap")[2]
+    assert (
+        "name the one of the nozzle's camera (params.yaml: train_classifier.topics.image)"
+        in calibrate("night.mcap")[2]
+    )
     Path("params.yaml").write_text(f"train_classifier: {{least_score: {LEAST}, topics: {{image: /cam}}}}\n")
     assert calibrate("night.mcap")[0] == 0
 
 
 @pytest.mark.parametrize("kind", ["16 bit", "colour"])
 def test_deep_and_coloured_pictures_will_do(calibrate, picture, kind):
-    frame = picture[1].astype(np.uint16) << 8 if kind == "16 bit" else cv2.cvtColor(picture[1], cv2.COLOR_GRAY2BGR)
+    frame = (
+        picture[1].astype(np.uint16) << 8
+        if kind == "16 bit"
+        else cv2.cvtColor(picture[1], cv2.COLOR_GRAY2BGR)
+    )
     cv2.imwrite("b.png", frame)
     assert "accepted" in calibrate("b.png", "--tip", "{:g},{:g}".format(*picture[2]))[1]
 
@@ -99,14 +106,19 @@ def test_deep_and_coloured_pictures_will_do(calibrate, picture, kind):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["gone.png"], "gone.png: expected a whole picture (JPEG, PNG, TIFF, BMP, WebP), found no such file or directory"),
-        (["."], "is a directory"), (["text.png"], "found 6 bytes that are no whole picture"), (["cut.jpg"], "without its end"),
+        (["gone.png"],
+        "gone.png: expected a whole picture (JPEG, PNG, TIFF, BMP, WebP), found no such file or directory"),
+        (["."], "is a directory"), (["text.png"], "found 6 bytes that are no whole picture"),
+        (["cut.jpg"], "without its end"),
         (["small.png"], "small.png: frame: expected at least 64 x 64 px but found 40 x 50"),
         (["talk.mcap"], "talk.mcap"), (["gone.mcap"], "gone.mcap is missing"),
-        (["a<b>&.png", "--tip", "400,10"], "expected x, y inside the frame of 350 x 350 px but found (400, 10)"),
-        (["a<b>&.png", "--tip=-1,10"], "found (-1, 10)"), (["a<b>&.png", "--tip", "nan,10"], "found (nan, 10)"),
+        (["a<b>&.png", "--tip", "400,10"],
+        "expected x, y inside the frame of 350 x 350 px but found (400, 10)"),
+        (["a<b>&.png", "--tip=-1,10"], "found (-1, 10)"),
+        (["a<b>&.png", "--tip", "nan,10"], "found (nan, 10)"),
         (["a<b>&.png", "--tip", "40"], "--tip: expected two numbers of pixels such as 571,511, found '40'"),
-        (["a<b>&.png", "--tip", "a,b"], "found 'a,b'"), (["a<b>&.png", "--out", "text.png/page.html"], "text.png"),
+        (["a<b>&.png", "--tip", "a,b"], "found 'a,b'"),
+        (["a<b>&.png", "--out", "text.png/page.html"], "text.png"),
     ],
 )  # fmt: skip
 def test_bad_input_is_one_sentence(calibrate, picture, arguments, said):
@@ -127,8 +139,8 @@ def test_bad_input_is_one_sentence(calibrate, picture, arguments, said):
 def test_a_least_score_that_is_no_number_is_refused(calibrate, picture):
     declare("high")
     assert (
-        "params.yaml: train_classifier.least_score should be a number of gray levels (could not convert string to float: 'high'); write one"
-        in calibrate(picture[0])[2]
+        "params.yaml: train_classifier.least_score should be a number of gray levels (could not convert "
+        "string to float: 'high'); write one" in calibrate(picture[0])[2]
     )
 
 

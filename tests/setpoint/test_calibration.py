@@ -1,4 +1,5 @@
-"""Calibration: each fit finds what the data were drawn with, conformal sets cover as often as they promise, and the foreign is told from the familiar."""
+"""Calibration: each fit finds what the data were drawn with, conformal sets cover as often as they promise,
+and the foreign is told from the familiar."""
 
 import re
 
@@ -45,7 +46,9 @@ def draw(n: int, *, seed: int, sure: float = 2.0) -> tuple[np.ndarray, np.ndarra
 @pytest.mark.parametrize("T", [0.5, 1.0, 1.68, 4.0])
 def test_the_temperature_that_spoilt_the_logits_is_found(T):
     logits, label = draw(20_000, seed=0)
-    assert fit_temperature(T * logits, label) == pytest.approx(T, rel=0.04)  # three deviations at 20,000 labels
+    assert fit_temperature(T * logits, label) == pytest.approx(
+        T, rel=0.04
+    )  # three deviations at 20,000 labels
 
 
 def test_a_temperature_changes_how_sure_but_not_what():
@@ -71,7 +74,9 @@ def test_windows_are_frames_of_one_segment_and_class_in_their_order():
 def test_independent_frames_multiply_and_equal_frames_count_once():
     log_p = np.log([[[0.5, 0.3, 0.2], [0.6, 0.3, 0.1], [0.2, 0.2, 0.6]]])
     valid = np.array([[True, True, False]])
-    np.testing.assert_allclose(window_probabilities(log_p, valid, 0.0), [[30 / 41, 9 / 41, 2 / 41]])  # 0.30, 0.09, 0.02
+    np.testing.assert_allclose(
+        window_probabilities(log_p, valid, 0.0), [[30 / 41, 9 / 41, 2 / 41]]
+    )  # 0.30, 0.09, 0.02
     twice = log_p[:, [0, 0]]
     np.testing.assert_allclose(window_probabilities(twice, np.ones((1, 2), bool), 1.0), [[0.5, 0.3, 0.2]])
 
@@ -80,7 +85,9 @@ def test_frames_that_are_not_valid_do_not_count_whatever_they_hold_and_without_a
     log_p = np.full((2, 3, 3), np.nan)
     log_p[0, 0] = np.log([0.7, 0.2, 0.1])
     valid = np.array([[True, False, False], [False, False, False]])
-    np.testing.assert_allclose(window_probabilities(log_p, valid, 0.4), [[0.7, 0.2, 0.1], [1 / 3, 1 / 3, 1 / 3]])
+    np.testing.assert_allclose(
+        window_probabilities(log_p, valid, 0.4), [[0.7, 0.2, 0.1], [1 / 3, 1 / 3, 1 / 3]]
+    )
     np.testing.assert_allclose(hard_shares(log_p, valid), [[1, 0, 0], [1 / 3, 1 / 3, 1 / 3]])
 
 
@@ -106,13 +113,25 @@ def test_hard_shares_by_hand():
 def test_recorded_windows_fall_into_the_bins_of_their_flow():
     log_p = np.log(np.tile([0.7, 0.2, 0.1], (4, 2, 1)))
     valid = np.array([[True, True], [True, True], [False, False], [True, False]])
-    table = recorded(log_p, valid, [20.0, 89.9, 95.0, 310.0], [5, 6, 7, 8], correlation=1.0, flow_edges=np.array([20.0, 90, 110, 310]))
+    table = recorded(
+        log_p,
+        valid,
+        [20.0, 89.9, 95.0, 310.0],
+        [5, 6, 7, 8],
+        correlation=1.0,
+        flow_edges=np.array([20.0, 90, 110, 310]),
+    )
     np.testing.assert_array_equal(table.flow_bin, [0, 0, 2])
     np.testing.assert_array_equal(table.segment, [5, 6, 8])
     np.testing.assert_allclose(table.shares, np.tile([0.7, 0.2, 0.1], (3, 1)))
     np.testing.assert_array_equal(table.named, [0, 0, 0])
-    with pytest.raises(ValueError, match=re.escape("flows are expected within 20 .. 310 % but 1 are not, the first 400; widen the bins")):
-        recorded(log_p[:1], valid[:1], [400.0], [5], correlation=1.0, flow_edges=np.array([20.0, 90, 110, 310]))
+    with pytest.raises(
+        ValueError,
+        match=re.escape("flows are expected within 20 .. 310 % but 1 are not, the first 400; widen the bins"),
+    ):
+        recorded(
+            log_p[:1], valid[:1], [400.0], [5], correlation=1.0, flow_edges=np.array([20.0, 90, 110, 310])
+        )
 
 
 # ---- reliability
@@ -132,8 +151,13 @@ def test_a_calibrated_classifier_shows_its_floor_and_an_overconfident_one_more()
     logits, label = draw(5_000, seed=3)
     true, sure = (reliability(np.exp(log_probabilities(logits, T)), label, bins=15) for T in (1.0, 0.4))
     assert true.error < 2 * true.floor < 0.04
-    drawn = [reliability(np.exp(log_probabilities(a, 1.0)), b, bins=15).error for a, b in (draw(5_000, seed=s) for s in range(20, 60))]
-    assert np.mean(drawn) == pytest.approx(true.floor, rel=0.15)  # forty draws, and the normal law of a bin's hits
+    drawn = [
+        reliability(np.exp(log_probabilities(a, 1.0)), b, bins=15).error
+        for a, b in (draw(5_000, seed=s) for s in range(20, 60))
+    ]
+    assert np.mean(drawn) == pytest.approx(
+        true.floor, rel=0.15
+    )  # forty draws, and the normal law of a bin's hits
     assert sure.error > 5 * sure.floor
 
 
@@ -145,15 +169,21 @@ def test_sets_cover_as_often_as_they_promise_with_the_confidence_that_they_promi
     covered = []
     for seed in range(300):
         logits, label = draw(150, seed=seed)
-        level = conformal_level(scipy.special.softmax(logits, axis=1), label, np.arange(150), coverage=0.9, confidence=confidence)
+        level = conformal_level(
+            scipy.special.softmax(logits, axis=1), label, np.arange(150), coverage=0.9, confidence=confidence
+        )
         true = scipy.special.softmax(logits, axis=1)
-        covered.append(np.sum(np.where(true >= level, true, 0), axis=1).mean())  # its expectation over labels on the same logits
+        covered.append(
+            np.sum(np.where(true >= level, true, 0), axis=1).mean()
+        )  # its expectation over labels on the same logits
     logits, label = draw(20_000, seed=1000)
     p = scipy.special.softmax(logits, axis=1)
     promised = []
     for seed in range(300):
         few, y = draw(150, seed=2000 + seed)
-        level = conformal_level(scipy.special.softmax(few, axis=1), y, np.arange(150), coverage=0.9, confidence=confidence)
+        level = conformal_level(
+            scipy.special.softmax(few, axis=1), y, np.arange(150), coverage=0.9, confidence=confidence
+        )
         promised.append(sets(p, label, level).coverage >= 0.9)
     assert np.mean(promised) > confidence - 0.09  # three deviations of 300 draws
     assert np.mean(covered) < 0.96  # and not by covering everything
@@ -173,7 +203,9 @@ def test_the_level_by_hand():
     # ten segments, 50 % with confidence 1/2: the median miss of the k-th smallest is at most 1/2 up to k = 5
     p1 = np.linspace(0.05, 0.95, 10)
     p = np.stack([p1, 1 - p1, np.zeros(10)], axis=1)
-    assert conformal_level(p, np.zeros(10, int), np.arange(10), coverage=0.5, confidence=0.5) == pytest.approx(p1[4])
+    assert conformal_level(
+        p, np.zeros(10, int), np.arange(10), coverage=0.5, confidence=0.5
+    ) == pytest.approx(p1[4])
     found = sets(np.array([[0.5, 0.4, 0.1], [0.8, 0.1, 0.1], [0.2, 0.2, 0.6]]), np.array([1, 0, 1]), 0.3)
     assert (found.coverage, found.held) == (pytest.approx(2 / 3), pytest.approx(1 / 3))
 
@@ -182,8 +214,15 @@ def test_too_few_segments_promise_nothing():
     logits, label = draw(200, seed=0)
     expected = "sets that cover 95% with confidence 80% need at least 32 calibration segments but found 20; film more, or ask for less"
     with pytest.raises(ValueError, match=expected):
-        conformal_level(scipy.special.softmax(logits, axis=1), label, np.arange(200) % 20, coverage=0.95, confidence=0.8)
-    assert conformal_level(scipy.special.softmax(logits, axis=1), label, np.arange(200) % 32, coverage=0.95, confidence=0.8) > 0
+        conformal_level(
+            scipy.special.softmax(logits, axis=1), label, np.arange(200) % 20, coverage=0.95, confidence=0.8
+        )
+    assert (
+        conformal_level(
+            scipy.special.softmax(logits, axis=1), label, np.arange(200) % 32, coverage=0.95, confidence=0.8
+        )
+        > 0
+    )
 
 
 # ---- the foreign
@@ -191,7 +230,9 @@ def test_too_few_segments_promise_nothing():
 
 def test_mahalanobis_by_hand():
     familiar = Familiar(np.array([[0.0, 0.0], [4.0, 0.0], [0.0, 4.0]]), np.diag([1.0, 0.5]))
-    np.testing.assert_allclose(mahalanobis(familiar, np.array([[1.0, 2.0], [4.0, 2.0], [4.0, 4.0]])), [2.0, 1.0, 4.0])
+    np.testing.assert_allclose(
+        mahalanobis(familiar, np.array([[1.0, 2.0], [4.0, 2.0], [4.0, 4.0]])), [2.0, 1.0, 4.0]
+    )
 
 
 def test_features_of_many_images_have_their_covariance_and_a_dead_feature_does_no_harm():
@@ -199,9 +240,13 @@ def test_features_of_many_images_have_their_covariance_and_a_dead_feature_does_n
     label, mix = rng.integers(0, 3, 30_000), rng.normal(size=(6, 6))
     features = 50 * label[:, None] + rng.normal(size=(30_000, 6)) @ mix
     score = mahalanobis(fit_familiar(features, label), features)
-    assert score.mean() == pytest.approx(6, rel=0.02)  # chi squared with 6 degrees: three deviations, and the shrinkage
+    assert score.mean() == pytest.approx(
+        6, rel=0.02
+    )  # chi squared with 6 degrees: three deviations, and the shrinkage
     dead = np.column_stack([features, np.zeros(30_000)])
-    np.testing.assert_allclose(mahalanobis(fit_familiar(dead, label), dead), score, rtol=0.01)  # seven features shrink a little more
+    np.testing.assert_allclose(
+        mahalanobis(fit_familiar(dead, label), dead), score, rtol=0.01
+    )  # seven features shrink a little more
 
 
 def test_the_threshold_is_exceeded_by_no_more_than_its_share():
@@ -213,7 +258,9 @@ def test_the_threshold_is_exceeded_by_no_more_than_its_share():
 
 def test_the_share_of_pairs_in_order_by_hand():
     assert auroc(np.array([1.0, 2.0]), np.array([2.0, 3.0])) == pytest.approx((1 + 0.5 + 1 + 1) / 4)
-    assert auroc(energy(np.array([[9.0, 0, 0]])), energy(np.array([[1.0, 0, 0]]))) == 1.0  # large logits are familiar
+    assert (
+        auroc(energy(np.array([[9.0, 0, 0]])), energy(np.array([[1.0, 0, 0]]))) == 1.0
+    )  # large logits are familiar
 
 
 def test_blur_and_a_turned_key_area_look_unlike_beads_and_light_does_not_matter():
@@ -227,39 +274,56 @@ def test_blur_and_a_turned_key_area_look_unlike_beads_and_light_does_not_matter(
     turned = np.array([cv2.resize(np.ascontiguousarray(a.T), (48, 16)) for a in area[600:]])
     for foreign in (blurred, turned):
         assert auroc(own, mahalanobis(familiar, appearance(foreign))) > 0.99
-    np.testing.assert_allclose(appearance(0.5 * area[:9] + 50), appearance(area[:9]), atol=0.1)  # one gray level is added to the deviation
+    np.testing.assert_allclose(
+        appearance(0.5 * area[:9] + 50), appearance(area[:9]), atol=0.1
+    )  # one gray level is added to the deviation
 
 
 # ---- all of it together
 
 
 def frames(segments: int, *, seed: int) -> Seen:
-    """Segments of 20 frames: a frame shows its flow with an error of its own and one of its segment, as if both were its own, and 1.7 times as sure as that allows."""
+    """Segments of 20 frames: a frame shows its flow with an error of its own and one of its segment, as if
+    both were its own, and 1.7 times as sure as that allows."""
     rng = np.random.default_rng(seed)
     label = rng.integers(0, 3, segments)
     shown = (label + 0.4 * rng.normal(size=segments))[:, None] + 0.5 * rng.normal(size=(segments, 20))
     logits = -1.7 * (shown[:, :, None] - np.arange(3)) ** 2 / (2 * (0.4**2 + 0.5**2))
     features = shown[:, :, None] + 0.1 * rng.normal(size=(segments, 20, 4))
     valid = rng.random((segments, 20)) > 0.06
-    return Seen(logits.reshape(-1, 3), features.reshape(-1, 4), np.repeat(label, 20), np.repeat(np.arange(segments), 20), valid.ravel())
+    return Seen(
+        logits.reshape(-1, 3),
+        features.reshape(-1, 4),
+        np.repeat(label, 20),
+        np.repeat(np.arange(segments), 20),
+        valid.ravel(),
+    )
 
 
 def test_frames_that_share_an_error_are_calibrated_alone_and_in_windows_on_segments_never_seen():
-    fitted = calibrate(frames(200, seed=0), frames(600, seed=1), length=20, coverage=0.95, confidence=0.8, false_alarms=0.05)
+    fitted = calibrate(
+        frames(200, seed=0), frames(600, seed=1), length=20, coverage=0.95, confidence=0.8, false_alarms=0.05
+    )
     assert fitted.temperature == pytest.approx(1.7, rel=0.1)  # 600 segments
-    # with the segment's error of variance 0.16 and the frame's of 0.25, 20 frames know the class to 0.16 + 0.25 / 20; one to 0.41, so that they carry the evidence of 2.4
+    # with the segment's error of variance 0.16 and the frame's of 0.25, 20 frames know the class to 0.16 +
+    # 0.25 / 20; one to 0.41, so that they carry the evidence of 2.4
     assert 20 / (1 + 19 * fitted.correlation) == pytest.approx(0.41 / 0.1725, rel=0.2)
     found = judge(fitted, frames(2_000, seed=2), length=20, bins=10)
     assert found.image.error < 0.02  # 40,000 images of 2,000 segments
     assert found.window.error < 0.03  # floor 0.01
     assert found.hard_window.error > 2 * found.window.error
     assert found.window_accuracy > found.image_accuracy + 0.05
-    assert 0.93 < found.sets.coverage < 0.98  # 0.95, with the deviation of 600 calibration segments, 0.009, on its safe side
+    assert (
+        0.93 < found.sets.coverage < 0.98
+    )  # 0.95, with the deviation of 600 calibration segments, 0.009, on its safe side
     assert found.false_alarms == pytest.approx(0.05, abs=0.01)
 
 
 def test_segments_shorter_than_a_window_are_refused():
     with pytest.raises(
-        ValueError, match="expected a segment with 21 frames in a row of one class but found none among 200 frames; film longer ones"
+        ValueError,
+        match="expected a segment with 21 frames in a row of one class but found none among 200 frames; film longer ones",
     ):
-        calibrate(frames(10, seed=0), frames(10, seed=1), length=21, coverage=0.9, confidence=0.5, false_alarms=0.05)
+        calibrate(
+            frames(10, seed=0), frames(10, seed=1), length=21, coverage=0.9, confidence=0.5, false_alarms=0.05
+        )

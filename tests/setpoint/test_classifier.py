@@ -1,4 +1,5 @@
-"""The classifier: the paper's sizes, layers against plain loops, augmentation that keeps the width, honest splits, training that resumes to the same bytes."""
+"""The classifier: the paper's sizes, layers against plain loops, augmentation that keeps the width, honest
+splits, training that resumes to the same bytes."""
 
 import functools
 import re
@@ -55,7 +56,8 @@ def stripes(segments: int, frames: int, *, seed: int) -> Labelled:
 
 
 SETTINGS = {
-    "key": KEY, "cycle_epochs": 4, "warmup_epochs": 1, "batch": 16, "learning_rate": 3e-3, "weight_decay": 0.01, "smoothing": 0.0, "averaging": 0.9,
+    "key": KEY, "cycle_epochs": 4, "warmup_epochs": 1, "batch": 16, "learning_rate": 3e-3,
+    "weight_decay": 0.01, "smoothing": 0.0, "averaging": 0.9,
     "patience": 10, "augment": along_bead,
 }  # fmt: skip
 
@@ -98,7 +100,9 @@ def test_a_block_is_attention_then_feed_forward_as_loops_write_them():
     def norm(row, name):
         return (row - row.mean()) / np.sqrt(row.var() + 1e-5) * w[f"{name}.scale"] + w[f"{name}.shift"]
 
-    qkv = np.array([norm(row, "norm_1") @ w["queries_keys_values.W"] + w["queries_keys_values.b"] for row in x])
+    qkv = np.array(
+        [norm(row, "norm_1") @ w["queries_keys_values.W"] + w["queries_keys_values.b"] for row in x]
+    )
     seen = np.zeros((5, 6))
     for h in range(2):
         q, k, v = (qkv[:, 6 * i + 3 * h : 6 * i + 3 * h + 3] for i in range(3))
@@ -110,7 +114,9 @@ def test_a_block_is_attention_then_feed_forward_as_loops_write_them():
     gelu = wide / 2 * (1 + np.tanh(np.sqrt(2 / np.pi) * (wide + 0.044715 * wide**3)))
     for wanted in (5, 1):
         np.testing.assert_allclose(
-            block(jnp.asarray(x[None], jnp.float32), wanted)[0], (y + gelu @ w["contract.W"] + w["contract.b"])[:wanted], atol=2e-5
+            block(jnp.asarray(x[None], jnp.float32), wanted)[0],
+            (y + gelu @ w["contract.W"] + w["contract.b"])[:wanted],
+            atol=2e-5,
         )  # float32
 
 
@@ -131,15 +137,25 @@ def test_neither_lighting_nor_the_other_images_of_a_batch_change_the_logits(netw
     u = np.array([190.0, 200, 210, 220, 230])
     look = jax.jit(lambda x, u: network(x.astype(jnp.float32), u))
     logits = look(x, u)
-    np.testing.assert_allclose(look(np.tile(x[2], (5, 1, 1)), np.full(5, 210.0))[0], logits[2], atol=1e-5)  # float32
-    np.testing.assert_allclose(look(0.5 * x + 60, u), logits, atol=0.05)  # one gray level is added to the deviation of 46
+    np.testing.assert_allclose(
+        look(np.tile(x[2], (5, 1, 1)), np.full(5, 210.0))[0], logits[2], atol=1e-5
+    )  # float32
+    np.testing.assert_allclose(
+        look(0.5 * x + 60, u), logits, atol=0.05
+    )  # one gray level is added to the deviation of 46
     assert np.abs(look(x, u[::-1].copy()) - logits).max() > 1e-3
 
 
 def test_predictions_are_the_mean_of_four_mirror_images_however_images_fall_into_batches():
     network, data = drawn(TINY), stripes(3, 7, seed=0)
     look = jax.jit(lambda x, u: network(x, u))
-    whole = sum(look(x, data.temperature_degC) for x in (data.key_area[:, ::a, ::b] for a in (1, -1) for b in (1, -1))) / 4
+    whole = (
+        sum(
+            look(x, data.temperature_degC)
+            for x in (data.key_area[:, ::a, ::b] for a in (1, -1) for b in (1, -1))
+        )
+        / 4
+    )
     for batch in (4, 64):
         found = predict(network, data.key_area, data.temperature_degC, batch=batch)
         np.testing.assert_allclose(found.logits, whole, atol=1e-5)  # float32 products of other shapes
@@ -159,17 +175,18 @@ def test_weights_survive_as_named_arrays():
 
 def test_weights_of_another_architecture_are_refused_by_the_first_array_that_differs():
     arrays = named_arrays(drawn(TINY))
-    expected = (
-        "weights of another architecture: body.blocks.0.attended.W is expected of shape (12, 12) but found of shape (8, 8); load them into"
-    )
+    expected = "weights of another architecture: body.blocks.0.attended.W is expected of shape (12, 12) but found of shape (8, 8); load them into"
     with pytest.raises(ValueError, match=re.escape(expected)):
         from_named_arrays(drawn(TINY._replace(width=12)), arrays)
-    with pytest.raises(ValueError, match=r"body.blocks.1.attended.W is expected of shape \(8, 8\) but found absent"):
+    with pytest.raises(
+        ValueError, match=r"body.blocks.1.attended.W is expected of shape \(8, 8\) but found absent"
+    ):
         from_named_arrays(drawn(TINY._replace(layers=2)), arrays)
     with pytest.raises(ValueError, match=r"body.class_token is expected absent but found of shape \(8,\)"):
         from_named_arrays(
             convolutional(np.random.default_rng(0)),
-            {k: v for k, v in arrays.items() if "blocks" not in k} | named_arrays(convolutional(np.random.default_rng(0))),
+            {k: v for k, v in arrays.items() if "blocks" not in k}
+            | named_arrays(convolutional(np.random.default_rng(0))),
         )
 
 
@@ -203,10 +220,14 @@ def test_prints_that_hold_several_classes_are_split_too():
 
 def test_one_print_or_too_few_allow_no_split():
     data = stripes(6, 4, seed=0)
-    with pytest.raises(ValueError, match=r"all 24 key areas come from one print, which allows no honest split; film at least 2 prints"):
+    with pytest.raises(
+        ValueError,
+        match=r"all 24 key areas come from one print, which allows no honest split; film at least 2 prints",
+    ):
         split_by_segment(data._replace(segment=np.zeros(24)), shares=(0.5, 0.5), rng=np.random.default_rng(0))
     with pytest.raises(
-        ValueError, match=r"6 segments do not let each of 3 parts hold every class: part \d has none of class \d, .* film more prints"
+        ValueError,
+        match=r"6 segments do not let each of 3 parts hold every class: part \d has none of class \d, .* film more prints",
     ):
         split_by_segment(data, shares=(0.4, 0.3, 0.3), rng=np.random.default_rng(0))
 
@@ -214,19 +235,30 @@ def test_one_print_or_too_few_allow_no_split():
 def test_data_that_no_classifier_can_learn_from_is_refused_in_a_sentence():
     data = stripes(6, 4, seed=0)
     cases = {
-        "class 2, over (flow > 110 %), has no key area among 16; add prints": data.take(np.flatnonzero(data.label < 2)),
+        "class 2, over (flow > 110 %), has no key area among 16; add prints": data.take(
+            np.flatnonzero(data.label < 2)
+        ),
         "labels are expected to be 0, 1 or 2 but 1 of 24 are not, the first 7": data._replace(
             label=np.where(np.arange(24) == 5, 7, data.label)
         ),
-        "key areas are expected as uint8 (24, 16, 48) but found uint8 (24, 48, 16)": data._replace(key_area=data.key_area.swapaxes(1, 2)),
-        "key areas are expected as uint8 (24, 16, 48) but found float64 (24, 16, 48)": data._replace(key_area=data.key_area / 255),
-        "1 of 24 temperatures are no numbers": data._replace(temperature_degC=np.where(np.arange(24) == 5, np.nan, 210.0)),
+        "key areas are expected as uint8 (24, 16, 48) but found uint8 (24, 48, 16)": data._replace(
+            key_area=data.key_area.swapaxes(1, 2)
+        ),
+        "key areas are expected as uint8 (24, 16, 48) but found float64 (24, 16, 48)": data._replace(
+            key_area=data.key_area / 255
+        ),
+        "1 of 24 temperatures are no numbers": data._replace(
+            temperature_degC=np.where(np.arange(24) == 5, np.nan, 210.0)
+        ),
         "segment is expected once a key area, (24,), but found (3,)": data._replace(segment=np.arange(3)),
     }
     for sentence, bad in cases.items():
         with pytest.raises(ValueError, match=re.escape(sentence)):
             checked(bad)
-    with pytest.raises(ValueError, match=r"6 segments are both learned and held out, the first 0; split with split_by_segment"):
+    with pytest.raises(
+        ValueError,
+        match=r"6 segments are both learned and held out, the first 0; split with split_by_segment",
+    ):
         train(untrained(drawn(TINY), epochs=1), data, data, **SETTINGS)
 
 
@@ -238,9 +270,12 @@ def test_cropping_along_the_bead_keeps_its_profile_and_the_published_crop_does_n
     x = jnp.asarray(np.tile(profile[:, None], (200, 1, 48)).reshape(200, 16, 48), jnp.float32)
 
     def likeness(augment):
-        """Largest correlation of each image's profile with the profile or its mirror: 1 under any change of brightness and contrast."""
+        """Largest correlation of each image's profile with the profile or its
+        mirror: 1 under any change of brightness and contrast."""
         seen = np.asarray(jax.jit(augment)(KEY, x), float).mean(axis=2)
-        return np.array([max(np.corrcoef(row, way)[0, 1] for way in (profile, profile[::-1])) for row in seen])
+        return np.array(
+            [max(np.corrcoef(row, way)[0, 1] for way in (profile, profile[::-1])) for row in seen]
+        )
 
     assert likeness(along_bead).min() > 1 - 1e-9  # float32
     assert np.mean(likeness(adr) < 0.95) > 0.3  # half are cropped across
@@ -249,7 +284,9 @@ def test_cropping_along_the_bead_keeps_its_profile_and_the_published_crop_does_n
 def test_a_stretched_line_by_hand():
     x = jnp.arange(8.0).reshape(1, 1, 8)
     np.testing.assert_allclose(classifier._resample(x, jnp.zeros(1), jnp.ones(1)), x, atol=1e-6)
-    half = classifier._resample(x, jnp.full(1, 2.0), jnp.full(1, 0.5))  # pixels 2 .. 6 over eight places: 2 - 1/4, 2 + 1/4 ...
+    half = classifier._resample(
+        x, jnp.full(1, 2.0), jnp.full(1, 0.5)
+    )  # pixels 2 .. 6 over eight places: 2 - 1/4, 2 + 1/4 ...
     np.testing.assert_allclose(half[0, 0], 1.75 + 0.5 * np.arange(8), atol=1e-6)
 
 
@@ -274,7 +311,9 @@ def test_the_learning_rate_falls_as_a_cosine_after_its_rise():
 
 def test_the_loss_by_hand():
     logits = jnp.log(jnp.array([[0.7, 0.2, 0.1], [0.1, 0.3, 0.6]]))
-    assert cross_entropy(logits, jnp.array([0, 1]), 0.0) == pytest.approx(-(np.log(0.7) + np.log(0.3)) / 2, rel=1e-6)
+    assert cross_entropy(logits, jnp.array([0, 1]), 0.0) == pytest.approx(
+        -(np.log(0.7) + np.log(0.3)) / 2, rel=1e-6
+    )
     smooth = [0.8 * np.log(0.7) + 0.1 * np.log(0.02), 0.1 * np.log(0.06) + 0.8 * np.log(0.3)]
     assert cross_entropy(logits, jnp.array([0, 1]), 0.3) == pytest.approx(-np.mean(smooth), rel=1e-6)
 
@@ -284,7 +323,8 @@ def test_a_tiny_network_learns_widths_that_anyone_can_see():
     state = train(untrained(drawn(TINY), epochs=30), *parts(), **settings)
     test = stripes(30, 10, seed=5)
     assert (
-        np.mean(predict(state.best, test.key_area, test.temperature_degC).logits.argmax(axis=1) == test.label) > 0.95
+        np.mean(predict(state.best, test.key_area, test.temperature_degC).logits.argmax(axis=1) == test.label)
+        > 0.95
     )  # chance is a third
     history = np.asarray(state.history)
     assert history[int(state.best_epoch) - 1, 1] == np.nanmin(history[:, 1])
@@ -313,13 +353,20 @@ def test_an_epoch_as_one_program_is_an_epoch_step_by_step():
         Rates(1e-3, 1, 10, 0.01, 0.1, 0.9),
     )
     batches = jax.random.split(KEY, 5), jnp.arange(80).reshape(5, 16)
-    whole, step_by_step = (form(along_bead, start, batches, rows, rates) for form in (classifier._steps, classifier._steps_on_cpu))
-    jax.tree.map(lambda p, q: np.testing.assert_allclose(p, q, atol=2e-5), whole, step_by_step)  # float32 through five steps of Adam
+    whole, step_by_step = (
+        form(along_bead, start, batches, rows, rates)
+        for form in (classifier._steps, classifier._steps_on_cpu)
+    )
+    jax.tree.map(
+        lambda p, q: np.testing.assert_allclose(p, q, atol=2e-5), whole, step_by_step
+    )  # float32 through five steps of Adam
 
 
 def test_training_ends_when_the_held_out_loss_has_not_improved_for_patience_epochs_and_keeps_the_best():
     learned, held_out = parts()
-    shuffled = held_out._replace(label=np.random.default_rng(0).permutation(held_out.label))  # whatever is learned makes these worse
+    shuffled = held_out._replace(
+        label=np.random.default_rng(0).permutation(held_out.label)
+    )  # whatever is learned makes these worse
     states = []
     state = train(
         untrained(drawn(TINY), epochs=40),
@@ -334,7 +381,10 @@ def test_training_ends_when_the_held_out_loss_has_not_improved_for_patience_epoc
 
 
 def test_training_that_diverges_says_so():
-    with pytest.raises(ValueError, match=r"no epoch of 4 had a held-out loss that is a number; lower the learning rate of 1e\+30"):
+    with pytest.raises(
+        ValueError,
+        match=r"no epoch of 4 had a held-out loss that is a number; lower the learning rate of 1e\+30",
+    ):
         train(untrained(drawn(TINY), epochs=4), *parts(), **SETTINGS | {"learning_rate": 1e30})
 
 

@@ -1,4 +1,5 @@
-"""From frames to a setpoint: what holds and why, limits that no action passes, and the wait and window that measurements ask for."""
+"""From frames to a setpoint: what holds and why, limits that no action passes,
+and the wait and window that measurements ask for."""
 
 import numpy as np
 import pytest
@@ -25,12 +26,15 @@ from pipeline.setpoint.deployment import (
 )
 
 RULES = {"least_frames": 8, "correlation": 0.45, "foreign_above": 5.0, "conformal_level": 0.2}
-LIMITS = Limits(np.array([20.0, 180.0]), np.array([310.0, 240.0]), np.array([10.0, 20.0]), np.array([60.0, 30.0]))
+LIMITS = Limits(
+    np.array([20.0, 180.0]), np.array([310.0, 240.0]), np.array([10.0, 20.0]), np.array([60.0, 30.0])
+)
 UNDER = np.array([0.9, 0.08, 0.02])
 
 
 def one(p=UNDER, frames=20, valid=20, foreign=0, moved=False, **rules):
-    """One window of equal frames, the first `valid` of them valid, the first `foreign` of them with a score beyond the limit."""
+    """One window of equal frames, the first `valid` of them valid, the first
+    `foreign` of them with a score beyond the limit."""
     P, ok, score = np.tile(p, (1, frames, 1)), np.zeros((1, frames), bool), np.ones((1, frames))
     ok[:, :valid], score[:, :foreign] = True, 9.0
     return judge_window(P, ok, score, np.array([moved]), **{**RULES, **rules})
@@ -46,10 +50,15 @@ anything = st.floats(allow_nan=True, allow_infinity=True, width=64)
 @given(st.data())
 def test_whatever_arrives_the_shares_are_a_distribution_and_an_action_rests_on_enough_proper_frames(data):
     E, W = data.draw(st.integers(1, 4)), data.draw(st.integers(0, 12))
-    P = data.draw(arrays.arrays(float, (E, W, 3), elements=st.one_of(anything, st.sampled_from([0.0, 1.0, 1 / 3]))))
+    P = data.draw(
+        arrays.arrays(float, (E, W, 3), elements=st.one_of(anything, st.sampled_from([0.0, 1.0, 1 / 3])))
+    )
     proper = data.draw(arrays.arrays(bool, (E, W)))
     P[proper] = UNDER
-    valid, score = data.draw(arrays.arrays(bool, (E, W))), data.draw(arrays.arrays(float, (E, W), elements=anything))
+    valid, score = (
+        data.draw(arrays.arrays(bool, (E, W))),
+        data.draw(arrays.arrays(float, (E, W), elements=anything)),
+    )
     tip = data.draw(arrays.arrays(bool, E))
     got = judge_window(P, valid, score, tip, **RULES)
     for p in (got.p, got.shares):
@@ -70,7 +79,9 @@ def test_a_window_of_one_frame_many_times_over_says_less_than_as_many_independen
 def test_twenty_frames_by_hand():
     P = np.tile(UNDER, (1, 20, 1))
     P[0, 15:] = [0.1, 0.8, 0.1]
-    got = judge_window(P, np.ones((1, 20), bool), np.ones((1, 20)), np.array([False]), **{**RULES, "correlation": 1 / 19})
+    got = judge_window(
+        P, np.ones((1, 20), bool), np.ones((1, 20)), np.array([False]), **{**RULES, "correlation": 1 / 19}
+    )
     logs = (15 * np.log(UNDER) + 5 * np.log([0.1, 0.8, 0.1])) / 2  # 1 + 19/19
     np.testing.assert_allclose(got.p[0], np.exp(logs) / np.exp(logs).sum(), rtol=1e-12)
     np.testing.assert_allclose(got.shares[0], [0.75, 0.25, 0.0])
@@ -93,7 +104,19 @@ def test_twenty_frames_by_hand():
         ({"p": np.array([0.5, 0.49, 0.01])}, AMBIGUOUS),
         ({"p": np.full(3, 1 / 3), "conformal_level": 0.5}, AMBIGUOUS),
     ],
-    ids=["sound", "just enough", "one too few", "empty", "NaN", "no distribution", "some odd", "odd", "tip", "two classes", "no class"],
+    ids=[
+        "sound",
+        "just enough",
+        "one too few",
+        "empty",
+        "NaN",
+        "no distribution",
+        "some odd",
+        "odd",
+        "tip",
+        "two classes",
+        "no class",
+    ],
 )
 def test_a_window_is_held_for_its_own_reason(window, reason):
     assert one(**window).reason[0] == reason, REASONS[reason]
@@ -101,7 +124,11 @@ def test_a_window_is_held_for_its_own_reason(window, reason):
 
 def test_windows_do_not_see_each_other():
     rng = np.random.default_rng(0)
-    P, valid, score = rng.dirichlet(np.ones(3), (6, 20)), rng.random((6, 20)) < 0.6, rng.exponential(3.0, (6, 20))
+    P, valid, score = (
+        rng.dirichlet(np.ones(3), (6, 20)),
+        rng.random((6, 20)) < 0.6,
+        rng.exponential(3.0, (6, 20)),
+    )
     tip = rng.random(6) < 0.3
     together = judge_window(P, valid, score, tip, **RULES)
     for i in range(6):
@@ -111,7 +138,10 @@ def test_windows_do_not_see_each_other():
 
 
 def test_windows_of_the_wrong_shape_are_refused():
-    with pytest.raises(ValueError, match=r"expected probabilities \(E, W, 3\), .* found \(20, 3\), \(20,\), .*; give one row a window"):
+    with pytest.raises(
+        ValueError,
+        match=r"expected probabilities \(E, W, 3\), .* found \(20, 3\), \(20,\), .*; give one row a window",
+    ):
         judge_window(np.ones((20, 3)) / 3, np.ones(20, bool), np.ones(20), np.array([False]), **RULES)
     with pytest.raises(ValueError, match="least_frames of at least 1, found 0; an empty window says nothing"):
         one(least_frames=0)
@@ -125,39 +155,57 @@ def test_windows_of_the_wrong_shape_are_refused():
 def test_no_sequence_of_actions_leaves_the_box_or_passes_the_slew_of_an_action_or_of_any_minute(data):
     n = data.draw(st.integers(1, 25))
     start = np.array([[data.draw(st.floats(20, 310)), data.draw(st.floats(180, 240))]])
-    changes = data.draw(arrays.arrays(float, (n, 1, 2), elements=st.one_of(anything, st.sampled_from([-10.0, 10.0, 20.0, -300.0]))))
+    changes = data.draw(
+        arrays.arrays(
+            float, (n, 1, 2), elements=st.one_of(anything, st.sampled_from([-10.0, 10.0, 20.0, -300.0]))
+        )
+    )
     times = np.cumsum(data.draw(arrays.arrays(float, n, elements=st.floats(0, 40))))
     state, sent = setpoints(start, LIMITS), []
     for change, time in zip(changes, times, strict=True):
         after = moved(state, change, np.array([time]), LIMITS)
         sent.append((after.value - state.value)[0])
         assert ((after.value >= LIMITS.low) & (after.value <= LIMITS.high)).all()
-        asked_and_sent = np.array_equal(after.value - state.value, change) or np.allclose(after.value - state.value, change, atol=1e-9)
+        asked_and_sent = np.array_equal(after.value - state.value, change) or np.allclose(
+            after.value - state.value, change, atol=1e-9
+        )
         assert asked_and_sent or (after.clipped > state.clipped).any()  # what was cut is counted
         state = after
     sent = np.abs(sent)
     assert (sent <= LIMITS.per_action + 1e-9).all()  # rounding of value - value
     for i in range(n):
-        assert (sent[(times > times[i] - 60) & (times <= times[i])][: n - i].sum(axis=0) <= LIMITS.per_minute + 1e-9).all()
+        assert (
+            sent[(times > times[i] - 60) & (times <= times[i])][: n - i].sum(axis=0)
+            <= LIMITS.per_minute + 1e-9
+        ).all()
 
 
 def test_limits_by_hand():
     state = setpoints(np.array([[300.0, 210.0], [100.0, 210.0]]), LIMITS)
     for i in range(7):
-        state = moved(state, np.array([[25.0, 0.0], [-10.0, np.nan if i == 0 else 0.0]]), np.array([7.0 * i, 7.0 * i]), LIMITS)
+        state = moved(
+            state,
+            np.array([[25.0, 0.0], [-10.0, np.nan if i == 0 else 0.0]]),
+            np.array([7.0 * i, 7.0 * i]),
+            LIMITS,
+        )
     np.testing.assert_array_equal(state.value, [[310.0, 210.0], [40.0, 210.0]])
-    # first: each of 7 is cut to one action, 6 meet the box. second: the first is no number, six of -10 use the 60 of a minute up, none is cut
+    # first: each of 7 is cut to one action, 6 meet the box. second: the first is no number, six of -10 use
+    # the 60 of a minute up, none is cut
     np.testing.assert_array_equal(state.clipped, [[7, 0, 6, 0], [0, 0, 0, 1]])
     state = moved(state, np.array([[0.0, 0.0], [-10.0, 0.0]]), np.array([49.0, 49.0]), LIMITS)
     np.testing.assert_array_equal(state.clipped[1], [0, 1, 0, 1])
-    state = moved(state, np.array([[0.0, 0.0], [-10.0, 0.0]]), np.array([67.0, 67.0]), LIMITS)  # the move at 7 s is a minute old
+    state = moved(
+        state, np.array([[0.0, 0.0], [-10.0, 0.0]]), np.array([67.0, 67.0]), LIMITS
+    )  # the move at 7 s is a minute old
     np.testing.assert_array_equal(state.value[1], [30.0, 210.0])
     assert len(REASONS) == NO_NUMBER + 1
 
 
 def test_a_start_outside_the_box_is_refused():
     with pytest.raises(
-        ValueError, match=r"expected a start within \[ 20. 180.\] to \[310. 240.\] .* found \[330. 210.\]; bring the machine there by hand"
+        ValueError,
+        match=r"expected a start within \[ 20. 180.\] to \[310. 240.\] .* found \[330. 210.\]; bring the machine there by hand",
     ):
         setpoints(np.array([[100.0, 210.0], [330.0, 210.0]]), LIMITS)
 
@@ -186,13 +234,20 @@ def test_a_first_order_response_settles_when_its_exponential_says(sign):
 def test_noise_lengthens_the_wait_by_little_and_a_record_that_still_moves_is_refused():
     t, rng = np.arange(-2, 20, 0.05), np.random.default_rng(1)
     clean = 10 * (1 - np.exp(-np.maximum(t, 0) / 1.5))
-    waits = [settling_s(clean + rng.normal(0, 1.0, len(t)), at=40, band=1.0, window=20, sample_time_s=0.05) for _ in range(50)]
+    waits = [
+        settling_s(clean + rng.normal(0, 1.0, len(t)), at=40, band=1.0, window=20, sample_time_s=0.05)
+        for _ in range(50)
+    ]
     clean_wait = settling_s(clean, at=40, band=1.0, window=20, sample_time_s=0.05)
     # a mean of 20 has 0.22 of noise: 1.0 is passed for some half a time constant longer or shorter
     assert abs(np.median(waits) - clean_wait) < 0.75
-    with pytest.raises(ValueError, match=r"not come to rest within 0.1 in 20 s; record for longer, or widen the band"):
+    with pytest.raises(
+        ValueError, match=r"not come to rest within 0.1 in 20 s; record for longer, or widen the band"
+    ):
         settling_s(t, at=40, band=0.1, window=20, sample_time_s=0.05)
-    with pytest.raises(ValueError, match="at least 80 finite samples after the step, found 60; record for longer"):
+    with pytest.raises(
+        ValueError, match="at least 80 finite samples after the step, found 60; record for longer"
+    ):
         settling_s(clean[:100], at=40, band=1.0, window=20, sample_time_s=0.05)
 
 
@@ -220,10 +275,15 @@ def test_autocorrelation_reads_past_rejected_frames():
     e = (rng.random((3000, 1)) < 0.5) * 0.6 + (rng.random((3000, 40)) < 0.2)
     rho = autocorrelation(e, longest=20)
     e[rng.random(e.shape) < 0.2] = np.nan
-    np.testing.assert_allclose(autocorrelation(e, longest=20), rho, atol=0.02)  # a fifth fewer of 60,000 pairs
-    assert rho[1:] == pytest.approx(0.36 / 4 / (0.36 / 4 + 0.16), abs=0.03)  # between / (between + within) variance; 3,000 segments
+    np.testing.assert_allclose(
+        autocorrelation(e, longest=20), rho, atol=0.02
+    )  # a fifth fewer of 60,000 pairs
+    assert rho[1:] == pytest.approx(
+        0.36 / 4 / (0.36 / 4 + 0.16), abs=0.03
+    )  # between / (between + within) variance; 3,000 segments
     with pytest.raises(
-        ValueError, match="expected errors .* that are not all alike, found .*; take longer segments, and flows near the class borders"
+        ValueError,
+        match="expected errors .* that are not all alike, found .*; take longer segments, and flows near the class borders",
     ):
         autocorrelation(np.zeros((5, 40)), longest=20)
 
@@ -232,7 +292,9 @@ def test_the_window_grows_with_the_wait_and_shrinks_with_correlation():
     def best(rho, wait):
         return window_frames(np.r_[1.0, np.full(99, rho)], wait_s=wait, frame_rate_hz=20)
 
-    assert best(0.45, 6.0) == 12  # maximum of n / ((1 + 0.45 (n - 1)) (6 + n/20)) is at n^2 = 120 * 0.55 / 0.45: 12.1
+    assert (
+        best(0.45, 6.0) == 12
+    )  # maximum of n / ((1 + 0.45 (n - 1)) (6 + n/20)) is at n^2 = 120 * 0.55 / 0.45: 12.1
     assert best(0.45, 2.0) < best(0.45, 6.0) < best(0.1, 6.0)
     assert best(0.0, 6.0) == 100
 
@@ -241,6 +303,9 @@ def test_the_window_grows_with_the_wait_and_shrinks_with_correlation():
 
 
 def test_the_strip_says_what_was_seen_and_why_it_was_held():
-    assert why(12.5, one(correlation=1.0), 0, np.array([10.0, 0.0])) == "  12.5 s: 20 frames valid, 20 count, under 0.90; flow +10 %"
+    assert (
+        why(12.5, one(correlation=1.0), 0, np.array([10.0, 0.0]))
+        == "  12.5 s: 20 frames valid, 20 count, under 0.90; flow +10 %"
+    )
     assert why(0.0, one(), 0, np.zeros(2)).endswith("no change")
     assert why(3.0, one(valid=3), 0, np.zeros(2)).endswith("score 1; held: too few valid frames")

@@ -1,4 +1,5 @@
-"""Nozzle frames in MCAP: our own form there and back, other machines' topics, and what is damaged or missing."""
+"""Nozzle frames in MCAP: our own form there and back, other machines'
+topics, and what is damaged or missing."""
 
 import base64
 from pathlib import Path
@@ -22,13 +23,16 @@ TIME = np.arange(COUNT) / RATE
 
 
 def pictures():
-    return ((k / RATE, frame) for k, frame in enumerate(frame for scene in scenes() for frame in scene.frames))
+    return (
+        (k / RATE, frame) for k, frame in enumerate(frame for scene in scenes() for frame in scene.frames)
+    )
 
 
 def signals(**changes) -> dict[str, np.ndarray]:
     tips = np.repeat([np.round(scene.tip, 2) for scene in scenes()], SHOTS, axis=0)
     found = {
-        "flow_percent": np.tile(np.repeat(FLOWS, SHOTS), 2), "temperature_degC": np.full(COUNT, 210.0), "print_id": np.repeat([4.0, 7.0], COUNT // 2),
+        "flow_percent": np.tile(np.repeat(FLOWS, SHOTS), 2), "temperature_degC": np.full(COUNT, 210.0),
+        "print_id": np.repeat([4.0, 7.0], COUNT // 2),
         "tip_x_px": tips[:, 0], "tip_y_px": tips[:, 1],
     }  # fmt: skip
     return {name: values for name, values in (found | changes).items() if values is not None}
@@ -37,8 +41,18 @@ def signals(**changes) -> dict[str, np.ndarray]:
 def film(path: Path, *, frames=None, encoding: str = "png", time_s=TIME, **changes) -> Path:
     """A recording of our own form: `frames` (time_s, (height, width)), and the signals on topic /setpoint."""
     found = signals(**changes)
-    tables = tables_of(path, time_s, [(Source(name, f"/setpoint:{name}", UNITS[name]), found[name]) for name in UNITS if name in found])
-    write_frames(path, tables, {"/setpoint": "beadline_msgs/msg/Setpoint"}, time_s, (encoding, pictures() if frames is None else frames))
+    tables = tables_of(
+        path,
+        time_s,
+        [(Source(name, f"/setpoint:{name}", UNITS[name]), found[name]) for name in UNITS if name in found],
+    )
+    write_frames(
+        path,
+        tables,
+        {"/setpoint": "beadline_msgs/msg/Setpoint"},
+        time_s,
+        (encoding, pictures() if frames is None else frames),
+    )
     return path
 
 
@@ -77,7 +91,9 @@ def test_beside_one_another_a_frame_counts_once(tmp_path):
     film(tmp_path / "raw/a.mcap")
     (tmp_path / "raw/b.mcap").write_bytes((tmp_path / "raw/a.mcap").read_bytes())
     found = read(tmp_path / "raw")
-    assert "b.mcap is another recording once more, byte for byte" in "\n".join(note.message for note in found.notes)
+    assert "b.mcap is another recording once more, byte for byte" in "\n".join(
+        note.message for note in found.notes
+    )
     assert figures(found)["frames"] == 2 * COUNT
 
 
@@ -118,7 +134,8 @@ def test_what_cannot_be_written_is_refused_and_leaves_nothing(tmp_path, changes,
 
 def test_a_setpoint_holds_until_the_next_and_nothing_is_known_before_the_first(tmp_path):
     film(tmp_path / "raw/a.mcap", frames=((k / 10, frame) for k, (_, frame) in enumerate(pictures())), time_s=np.array([0.35, 0.8]),
-         flow_percent=np.array([80.0, 120.0]), temperature_degC=np.full(2, 200.0), print_id=None, tip_x_px=None, tip_y_px=None)  # fmt: skip
+         flow_percent=np.array([80.0, 120.0]), temperature_degC=np.full(2, 200.0), print_id=None,
+         tip_x_px=None, tip_y_px=None)  # fmt: skip
     found = read(tmp_path / "raw", tip=(175, 175))
     # frames at 0, 0.1, ... 1.7 s
     assert found.reasons[:4] == ["no flow is known"] * 4
@@ -141,7 +158,8 @@ def test_a_measured_temperature_ends_no_segment_and_is_said_to_be_one(tmp_path):
 
 
 def foreign(path: Path, *, flow_share: bool = True, other: str = "") -> Path:
-    """Foxglove JSON pictures beside numbers in JSON, with other names and units, the setpoints at 2 Hz; `other` is the topic of a camera that looks elsewhere."""
+    """Foxglove JSON pictures beside numbers in JSON, with other names and units, the setpoints at 2 Hz;
+    `other` is the topic of a camera that looks elsewhere."""
     made = Written()
     elsewhere = made.topic(other, "json", "foxglove.CompressedImage", "jsonschema", b"{}") if other else None
     camera = made.topic("/cam", "json", "foxglove.CompressedImage", "jsonschema", b"{}")
@@ -149,26 +167,45 @@ def foreign(path: Path, *, flow_share: bool = True, other: str = "") -> Path:
     for k, (time, frame) in enumerate(pictures()):
         if k % SHOTS == 0:
             flow = FLOWS[k // SHOTS % 3]
-            made.message(printer, 10 + time, {"extruder": {"rate": flow / 100 if flow_share else flow}, "hotend_target": 210.0})
+            made.message(
+                printer,
+                10 + time,
+                {"extruder": {"rate": flow / 100 if flow_share else flow}, "hotend_target": 210.0},
+            )
         data = base64.b64encode(cv2.imencode(".png", frame)[1]).decode()
-        made.message(camera, 10 + time, {"timestamp": {"sec": 10, "nsec": 0}, "frame_id": "", "format": "png", "data": data})
+        made.message(
+            camera,
+            10 + time,
+            {"timestamp": {"sec": 10, "nsec": 0}, "frame_id": "", "format": "png", "data": data},
+        )
         if other:
             dark = base64.b64encode(cv2.imencode(".png", 0 * frame)[1]).decode()
-            made.message(elsewhere, 10 + time, {"timestamp": {"sec": 10, "nsec": 0}, "frame_id": "", "format": "png", "data": dark})
+            made.message(
+                elsewhere,
+                10 + time,
+                {"timestamp": {"sec": 10, "nsec": 0}, "frame_id": "", "format": "png", "data": dark},
+            )
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(made.bytes())
     return path
 
 
-MAPPING = {"flow_percent": ("/printer/state:extruder.rate", "percent", 100.0, 0.0), "temperature_degC": ("hotend_target", "degC", 1.0, 0.0)}
+MAPPING = {
+    "flow_percent": ("/printer/state:extruder.rate", "percent", 100.0, 0.0),
+    "temperature_degC": ("hotend_target", "degC", 1.0, 0.0),
+}
 
 
 def test_a_machine_s_own_topics_are_read_through_a_mapping(tmp_path):
     foreign(tmp_path / "raw/night.mcap")
     found = read(tmp_path / "raw", tip=(175, 175), topics=ANY._replace(mapping=MAPPING))
-    np.testing.assert_allclose(found.flow, np.tile(np.repeat(FLOWS, SHOTS), 2), rtol=1e-12)  # 100 times a hundredth
+    np.testing.assert_allclose(
+        found.flow, np.tile(np.repeat(FLOWS, SHOTS), 2), rtol=1e-12
+    )  # 100 times a hundredth
     frames = [frame for scene in scenes() for frame in scene.frames]
-    np.testing.assert_array_equal(found.images, [key_area.find(frame, (175, 175), least_score=LEAST).image for frame in frames])
+    np.testing.assert_array_equal(
+        found.images, [key_area.find(frame, (175, 175), least_score=LEAST).image for frame in frames]
+    )
     assert found.prints == ("night",)
 
 
@@ -177,13 +214,15 @@ def test_of_two_cameras_the_one_that_is_named_is_read(tmp_path):
     path = foreign(tmp_path / "two/night.mcap", other="/bed/camera")
     there = ANY._replace(mapping=MAPPING)
     one, two = (
-        read(tmp_path / name, tip=(175, 175), topics=topics) for name, topics in (("one", there), ("two", there._replace(image="/cam")))
+        read(tmp_path / name, tip=(175, 175), topics=topics)
+        for name, topics in (("one", there), ("two", there._replace(image="/cam")))
     )
     np.testing.assert_array_equal(two.images, one.images)
     assert two.valid.any()
     said = refusal(tmp_path / "two", tip=(175, 175), topics=there)
     assert (
-        "2 topics have images (/bed/camera, /cam); name the one of the nozzle's camera (params.yaml: train_classifier.topics.image)" in said
+        "2 topics have images (/bed/camera, /cam); name the one of the nozzle's camera (params.yaml: "
+        "train_classifier.topics.image)" in said
     )
     np.testing.assert_array_equal(middle_frame(path, "/cam"), scenes()[3].frames[0])
     with pytest.raises(ValueError, match="2 topics have images"):
@@ -200,10 +239,15 @@ def test_signals_on_one_clock(tmp_path):
 @pytest.mark.parametrize(
     ("topics", "said"),
     [
-        (ANY, r"no message has a number 'flow_percent'.*map it in params.yaml: train_classifier.topics.mapping.flow_percent"),
+        (
+            ANY,
+            r"no message has a number 'flow_percent'.*map it in params.yaml: "
+            r"train_classifier.topics.mapping.flow_percent",
+        ),
         (
             ANY._replace(mapping={"flow": ("a", "percent", 1.0, 0.0)}),
-            "params.yaml: train_classifier.topics.mapping.flow is no signal of nozzle frames; the nearest names are flow_percent",
+            "params.yaml: train_classifier.topics.mapping.flow is no signal of nozzle frames; "
+            "the nearest names are flow_percent",
         ),
         (
             ANY._replace(mapping={"flow_percent": ("a", "1", 1.0, 0.0)}),
@@ -245,7 +289,14 @@ def test_pictures_that_cannot_be_decoded_are_counted_and_the_others_go_on(tmp_pa
             made.message(printer, time, {"flow_percent": 100.0, "temperature_degC": 200.0})
             data = b"none" if k < count else cv2.imencode(".png", frame)[1].tobytes()
             made.message(
-                camera, time, {"timestamp": {"sec": 0, "nsec": 0}, "frame_id": "", "format": "png", "data": base64.b64encode(data).decode()}
+                camera,
+                time,
+                {
+                    "timestamp": {"sec": 0, "nsec": 0},
+                    "frame_id": "",
+                    "format": "png",
+                    "data": base64.b64encode(data).decode(),
+                },
             )
         path = tmp_path / f"raw{count}/a.mcap"
         path.parent.mkdir()
@@ -254,15 +305,17 @@ def test_pictures_that_cannot_be_decoded_are_counted_and_the_others_go_on(tmp_pa
 
     found = read(with_bad(4), tip=(175, 175))
     assert len(found.valid) == COUNT - 4
-    assert f"4 of {COUNT} frames of /cam cannot be decoded, the first at 0.000 s" in "\n".join(note.message for note in found.notes)
+    assert f"4 of {COUNT} frames of /cam cannot be decoded, the first at 0.000 s" in "\n".join(
+        note.message for note in found.notes
+    )
     assert "found none that can be decoded; record again" in refusal(with_bad(COUNT), tip=(175, 175))
 
 
 def test_frames_without_a_usable_tip_are_refused_with_the_command(tmp_path):
     film(tmp_path / "raw/a.mcap", tip_x_px=None, tip_y_px=None)
     assert (
-        f"a.mcap: {COUNT} of {COUNT} frames were left out: no tip is known, the first 0.000 s; find it with ./run beadline calibrate-tip"
-        in refusal(tmp_path / "raw")
+        f"a.mcap: {COUNT} of {COUNT} frames were left out: no tip is known, the first 0.000 s; "
+        "find it with ./run beadline calibrate-tip" in refusal(tmp_path / "raw")
     )
     assert "(400, 10)" in refusal(tmp_path / "raw", tip=(400, 10))
 
@@ -302,4 +355,6 @@ def test_the_middle_frame_is_in_the_middle(tmp_path):
 
 
 def test_topics_have_defaults_of_the_same_names():
-    assert {name: source.source for name, source in Topics("", "", {}).sources().items()}["flow_percent"] == "flow_percent"
+    assert {name: source.source for name, source in Topics("", "", {}).sources().items()}[
+        "flow_percent"
+    ] == "flow_percent"

@@ -71,13 +71,23 @@ def test_wilson_s_interval_by_hand():
 
 
 def test_every_start_comes_as_often_in_every_case():
-    all_cases = cases(recorded_windows(synthetic_table(np.random.default_rng(0), segments=1, windows=1)), runs=3, segment=10.0)
+    all_cases = cases(
+        recorded_windows(synthetic_table(np.random.default_rng(0), segments=1, windows=1)),
+        runs=3,
+        segment=10.0,
+    )
     assert len(all_cases) == 12
     for _, conditions in all_cases.values():
-        pairs, counts = np.unique(np.stack([conditions.flow, conditions.temperature]), axis=1, return_counts=True)
+        pairs, counts = np.unique(
+            np.stack([conditions.flow, conditions.temperature]), axis=1, return_counts=True
+        )
         assert set(map(tuple, pairs.T)) == {(q, u) for q in START_FLOWS for u in START_TEMPERATURES}
         assert set(counts) == {3}
-    clogged = [name for name, (_, c) in all_cases.items() if (c.clog == jnp.float32(0.6)).all() and (c.clog_step == 60).all()]
+    clogged = [
+        name
+        for name, (_, c) in all_cases.items()
+        if (c.clog == jnp.float32(0.6)).all() and (c.clog_step == 60).all()
+    ]
     weak = [name for name, (_, c) in all_cases.items() if (c.gain == jnp.float32(0.6)).all()]
     assert clogged == [name for name in all_cases if name.endswith("clog")]
     assert weak == [name for name in all_cases if name.endswith("gain 0.6")]
@@ -86,31 +96,47 @@ def test_every_start_comes_as_often_in_every_case():
 
 def scored(stay):
     share = Share(stay, stay - 1, stay + 1)
-    return Score(100, Share(100, 99, 100), share, Share(100, 99, 100), 7.0, 19.0, 10.0, 1.5, (30.0, 190.0, 95.0))
+    return Score(
+        100, Share(100, 99, 100), share, Share(100, 99, 100), 7.0, 19.0, 10.0, 1.5, (30.0, 190.0, 95.0)
+    )
 
 
 def test_the_default_is_the_best_in_its_worst_case_and_the_margin_is_said():
-    scores = {"fast": {"calm": scored(100.0), "clog": scored(60.0)}, "robust": {"calm": scored(97.0), "clog": scored(96.5)}}
+    scores = {
+        "fast": {"calm": scored(100.0), "clog": scored(60.0)},
+        "robust": {"calm": scored(97.0), "clog": scored(96.5)},
+    }
     choice = choose(scores)
     assert (choice.name, choice.worst, choice.case, choice.margin) == ("robust", 96.5, "clog", 36.5)
     assert choice.sentence == (
-        "robust is the default: in its worst case (clog) 96.5 % of the runs settle and stay, 36.5 points more than of fast in its worst (clog, 60.0 %)."
+        "robust is the default: in its worst case (clog) 96.5 % of the runs settle and stay, "
+        "36.5 points more than of fast in its worst (clog, 60.0 %)."
     )
-    assert choose({"only": scores["fast"]}).sentence.endswith("60.0 % of the runs settle and stay; nothing else was judged.")
+    assert choose({"only": scores["fast"]}).sentence.endswith(
+        "60.0 % of the runs settle and stay; nothing else was judged."
+    )
 
 
 def test_of_two_with_one_worst_case_the_better_mean_wins():
-    assert choose({"a": {"x": scored(90.0), "y": scored(95.0)}, "b": {"x": scored(99.0), "y": scored(90.0)}}).name == "b"
+    assert (
+        choose(
+            {"a": {"x": scored(90.0), "y": scored(95.0)}, "b": {"x": scored(99.0), "y": scored(90.0)}}
+        ).name
+        == "b"
+    )
 
 
 def test_controllers_judged_on_different_cases_are_not_compared():
     with pytest.raises(
-        ValueError, match=r"expected every controller judged on the same cases, found \[\['x'\], \['y'\]\]; judge all on all"
+        ValueError,
+        match=r"expected every controller judged on the same cases, found \[\['x'\], \['y'\]\]; judge all on all",
     ):
         choose({"a": {"x": scored(90.0)}, "b": {"y": scored(90.0)}})
 
 
 def test_short_trajectories_are_refused():
     short = np.full((1, 101), 100.0)
-    with pytest.raises(ValueError, match=r"expected trajectories of 200 decisions, found 100; roll out with steps=200"):
+    with pytest.raises(
+        ValueError, match=r"expected trajectories of 200 decisions, found 100; roll out with steps=200"
+    ):
         judge(short, short)

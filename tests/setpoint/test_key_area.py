@@ -19,7 +19,8 @@ WITHOUT_LINE = ("0021", "0022", "1111", "1221", "2120")
 
 
 def line(angle_deg, *, width=8, level=140, ground=60, tip=(200, 200), side=400, miss=0.0):
-    """A frame with one bright line from the tip, and beside it by `miss` px to the right of who looks along it."""
+    """A frame with one bright line from the tip, and beside it by
+    `miss` px to the right of who looks along it."""
     frame = np.full((side, side), ground, np.uint8)
     y, x = np.mgrid[:side, :side].astype(float)
     a = np.deg2rad(angle_deg)
@@ -30,7 +31,8 @@ def line(angle_deg, *, width=8, level=140, ground=60, tip=(200, 200), side=400, 
 
 
 def naive_sweep(gray):
-    """The paper's sweep word by word: equalise, turn a segment of 87 px about the middle, mean of its levels."""
+    """The paper's sweep word by word: equalise, turn a segment of 87
+    px about the middle, mean of its levels."""
     equal, middle, means = cv2.equalizeHist(gray), key_area.SIDE // 2, []
     for degree in range(360):
         a = np.deg2rad(degree)
@@ -48,7 +50,10 @@ def apart(a, b):
 
 def test_the_gathered_sweep_is_the_naive_sweep():
     rng = np.random.default_rng(0)
-    scenes = [nozzle_scene.render(nozzle_scene.draw_segment(rng), np.array([100.0]), 210.0, rng).frames[0] for _ in range(4)]
+    scenes = [
+        nozzle_scene.render(nozzle_scene.draw_segment(rng), np.array([100.0]), 210.0, rng).frames[0]
+        for _ in range(4)
+    ]
     for frame in [*scenes, line(123), line(301, width=3)]:
         cropped = key_area.crop(frame, (frame.shape[1] // 2, frame.shape[0] // 2))
         expected, found = naive_sweep(cropped.gray), sweep(cropped)
@@ -82,7 +87,9 @@ def test_the_published_form_takes_a_bright_nozzle_for_the_line_and_the_robust_fo
 def test_a_line_is_found_within_two_degrees_wherever_it_leaves(angle):
     found = key_area.find(line(angle), (200, 200), least_score=LEAST)
     assert apart(found.angle_deg, angle) <= 2
-    assert abs(found.miss_px) <= 4  # 2 degrees over the middle of 87 px are 1.5 px; places are taken every 2 px
+    assert (
+        abs(found.miss_px) <= 4
+    )  # 2 degrees over the middle of 87 px are 1.5 px; places are taken every 2 px
     assert found.reason == ""
 
 
@@ -99,12 +106,16 @@ def test_the_score_is_the_contrast_of_a_line_wider_than_the_strip():
     # strip of three samples 2 px apart inside a line of 11 px, flanks 10 px away outside it: 140 - 60 by hand
     found = key_area.find(line(90, width=11), (200, 200), least_score=LEAST)
     assert found.score == pytest.approx(80, abs=0.5)
-    assert key_area.find(line(90, width=11, level=69), (200, 200), least_score=LEAST).score == pytest.approx(9, abs=0.5)
+    assert key_area.find(line(90, width=11, level=69), (200, 200), least_score=LEAST).score == pytest.approx(
+        9, abs=0.5
+    )
 
 
 def test_rows_lie_across_the_line_and_columns_run_outward_from_the_tip():
     frame = line(0, width=10)  # 10 px of 20 are 8 rows of 16
-    frame[:, 250:] = np.where(frame[:, 250:] == 140, 255, frame[:, 250:])  # brighter from 50 px on: column 27.6 of 48
+    frame[:, 250:] = np.where(
+        frame[:, 250:] == 140, 255, frame[:, 250:]
+    )  # brighter from 50 px on: column 27.6 of 48
     frame[206:209, 200:] = 0  # below the line, which is to the right of who looks along it
     found = key_area.find(frame, (200, 200), least_score=LEAST)
     assert found.image.shape == (16, 48)
@@ -117,7 +128,9 @@ def test_rows_lie_across_the_line_and_columns_run_outward_from_the_tip():
 
 def test_a_mirrored_frame_gives_the_mirrored_key_area():
     frame = cv2.GaussianBlur(line(130), (0, 0), 1.5)
-    found, mirrored = (key_area.find(f, t, least_score=LEAST) for f, t in ((frame, (200, 200)), (frame[:, ::-1], (199, 200))))
+    found, mirrored = (
+        key_area.find(f, t, least_score=LEAST) for f, t in ((frame, (200, 200)), (frame[:, ::-1], (199, 200)))
+    )
     assert apart(180 - found.angle_deg, mirrored.angle_deg) <= 1
     # the crop's middle lies between pixels, so that the mirror moves it by one
     assert np.corrcoef(found.image[::-1].ravel(), mirrored.image.ravel())[0, 1] > 0.95
@@ -141,7 +154,9 @@ def test_a_broad_bead_is_a_line_too():
     [
         np.full((400, 400), 90, np.uint8),
         np.clip(np.random.default_rng(2).normal(90, 15, (400, 400)), 0, 255).astype(np.uint8),
-        np.where(np.mgrid[:400, :400][1] > 210, 200, 60).astype(np.uint8),  # the edge of a part: one flank is as bright
+        np.where(np.mgrid[:400, :400][1] > 210, 200, 60).astype(
+            np.uint8
+        ),  # the edge of a part: one flank is as bright
         (np.mgrid[:400, :400][0] / 2).astype(np.uint8),
         line(90, level=66),
     ],
@@ -167,7 +182,8 @@ def test_a_spot_is_no_line():
 def test_gray_colour_and_sixteen_bits_are_the_same_frame():
     gray = line(100)
     kinds = [
-        gray, np.dstack([gray] * 3), np.dstack([gray] * 3 + [np.full_like(gray, 255)]), gray.astype(np.uint16) * 257,
+        gray, np.dstack([gray] * 3), np.dstack([gray] * 3 + [np.full_like(gray, 255)]),
+        gray.astype(np.uint16) * 257,
         np.dstack([gray] * 3).astype(np.uint16) * 256, np.asfortranarray(gray),
     ]  # fmt: skip
     first, *others = (key_area.find(frame, (200.0, 200.0), least_score=LEAST) for frame in kinds)
@@ -199,7 +215,11 @@ def test_a_rectangle_outside_the_frame_is_rejected():
         (np.zeros((63, 200), np.uint8), (5, 5), "expected at least 64 x 64 px but found 200 x 63"),
         (np.zeros((100, 100), np.float32), (5, 5), r"8 or 16 bits but found \(100, 100\) of float32"),
         (np.zeros((100, 100, 2), np.uint8), (5, 5), r"but found \(100, 100, 2\) of uint8"),
-        (np.zeros((100, 100), np.uint8), (100, 5), r"inside the frame of 100 x 100 px but found \(100, 5\); calibrate it by a click"),
+        (
+            np.zeros((100, 100), np.uint8),
+            (100, 5),
+            r"inside the frame of 100 x 100 px but found \(100, 5\); calibrate it by a click",
+        ),
         (np.zeros((100, 100), np.uint8), (-1, 5), r"found \(-1, 5\)"),
         (np.zeros((100, 100), np.uint8), (np.nan, 5), r"found \(nan, 5\)"),
     ],
@@ -211,11 +231,19 @@ def test_what_is_no_frame_or_no_tip_is_refused_in_one_sentence(frame, tip, words
 
 def test_many_frames_at_once_are_each_frame_alone():
     frames = [line(a) for a in (40, 90, 150)] + [np.full((400, 400), 90, np.uint8)]
-    many = key_area.find_all(frames, (200, 200), least_score=LEAST, directions_deg=np.array([40, 90, 150, 90]))
+    many = key_area.find_all(
+        frames, (200, 200), least_score=LEAST, directions_deg=np.array([40, 90, 150, 90])
+    )
     for k, (frame, direction) in enumerate(zip(frames, (40, 90, 150, 90), strict=True)):
         one = key_area.find(frame, (200, 200), least_score=LEAST, direction_deg=direction)
         np.testing.assert_array_equal(many.images[k], one.image)
-        assert (many.angle_deg[k], many.miss_px[k], many.score[k], many.padded_share[k], many.reasons[k]) == one[1:]
+        assert (
+            many.angle_deg[k],
+            many.miss_px[k],
+            many.score[k],
+            many.padded_share[k],
+            many.reasons[k],
+        ) == one[1:]
     assert many.valid.tolist() == [True, True, True, False]
     unknown = key_area.find_all(frames[:1], (200, 200), least_score=LEAST, directions_deg=np.nan)
     assert unknown.angle_deg[0] == key_area.find(frames[0], (200, 200), least_score=LEAST).angle_deg
@@ -231,25 +259,34 @@ def test_a_moved_nozzle_is_noticed_and_a_new_bead_is_not():
     first, second = nozzle_scene.render(segment, np.array([60.0, 150.0]), 210.0, rng).frames
     template = key_area.nozzle_template(first, (175, 175), size_px=81)
     still = key_area.drift([second], template, (175, 175), reach_px=20)
-    assert np.abs(still.offset_px).max() <= 5 and still.advantage < 0.02  # the plate beside the nozzle changes
+    assert (
+        np.abs(still.offset_px).max() <= 5 and still.advantage < 0.02
+    )  # the plate beside the nozzle changes
     moved = key_area.drift([np.roll(second, (-6, 9), axis=(0, 1))], template, (175, 175), reach_px=20)
     assert moved.offset_px == (still.offset_px[0] + 9, still.offset_px[1] - 6)
     assert min(still.correlation, moved.correlation) > 0.6 and moved.advantage > 0.1
-    away = key_area.drift([rng.integers(0, 255, (350, 350)).astype(np.uint8)], template, (175, 175), reach_px=20)
+    away = key_area.drift(
+        [rng.integers(0, 255, (350, 350)).astype(np.uint8)], template, (175, 175), reach_px=20
+    )
     assert away.correlation < 0.3
 
 
 def test_the_alarm_finds_moves_along_either_axis_on_later_segments_and_is_quiet_without_one():
-    """Sixteen machines, each on a new segment: per direction the share that is found 14 px away and clearly better than at home."""
-    rng, found = np.random.default_rng(5), {by: 0 for by in ((0, 0), (14, 0), (-14, 0), (0, 14), (0, -14))}
+    """Sixteen machines, each on a new segment: per direction the share that is
+    found 14 px away and clearly better than at home."""
+    rng, found = np.random.default_rng(5), dict.fromkeys(((0, 0), (14, 0), (-14, 0), (0, 14), (0, -14)), 0)
     for _ in range(16):
         first = nozzle_scene.draw_segment(rng)
-        template = key_area.nozzle_template(nozzle_scene.render(first, np.array([100.0]), 210.0, rng).frames[0], first.tip, size_px=80)
+        template = key_area.nozzle_template(
+            nozzle_scene.render(first, np.array([100.0]), 210.0, rng).frames[0], first.tip, size_px=80
+        )
         later = nozzle_scene.draw_segment(rng)._replace(nozzle=first.nozzle, mask=first.mask, tip=first.tip)
         frames = nozzle_scene.render(later, np.full(5, 100.0), 210.0, rng).frames
         for dx, dy in found:
             seen = key_area.drift(np.roll(frames, (dy, dx), axis=(1, 2)), template, first.tip, reach_px=30)
-            found[dx, dy] += np.hypot(*seen.offset_px) > 8 and seen.correlation >= 0.4 and seen.advantage >= 0.12
+            found[dx, dy] += (
+                np.hypot(*seen.offset_px) > 8 and seen.correlation >= 0.4 and seen.advantage >= 0.12
+            )
     assert found.pop((0, 0)) <= 1
     assert min(found.values()) >= 6  # down the nozzle looks most like itself
     assert sum(found.values()) >= 44  # of 64
@@ -263,7 +300,9 @@ def test_a_template_that_does_not_fit_is_refused():
     with pytest.raises(ValueError, match="expected room for the template of 81 px"):
         key_area.drift([frame[:70, :70]], template, (35, 35), reach_px=5)
     with pytest.raises(ValueError, match="expected room for the template of 81 px"):
-        key_area.drift([frame[:, :230]], template, (200, 200), reach_px=30)  # room for it, but not where it was calibrated
+        key_area.drift(
+            [frame[:, :230]], template, (200, 200), reach_px=30
+        )  # room for it, but not where it was calibrated
     with pytest.raises(ValueError, match="expected frames to look at, found none"):
         key_area.drift([], template, (200, 200), reach_px=30)
 
@@ -283,7 +322,9 @@ def test_the_picture_shows_the_rectangle_green_or_red():
 @pytest.mark.parametrize(("kind", "tips"), [("full", TIPS), ("cropped", dict.fromkeys(TIPS, (160, 160)))])
 def test_real_frames_without_a_fresh_line_are_rejected_and_the_one_with_it_is_accepted(shared, kind, tips):
     found = {
-        name: key_area.find(cv2.imread(str(shared(f"data/caxton_samples/{kind}/sample{name}.jpg"))), tip, least_score=LEAST)
+        name: key_area.find(
+            cv2.imread(str(shared(f"data/caxton_samples/{kind}/sample{name}.jpg"))), tip, least_score=LEAST
+        )
         for name, tip in tips.items()
     }
     for name in WITHOUT_LINE:
@@ -291,7 +332,9 @@ def test_real_frames_without_a_fresh_line_are_rejected_and_the_one_with_it_is_ac
         assert found[name].score < 8, name  # two gray levels of room
     assert found["1011"].reason == ""
     assert found["1011"].score > 25
-    assert apart(found["1011"].angle_deg, 148) <= 8  # the bead bends: 144 by its brightest ray, 147-154 by its edges
+    assert (
+        apart(found["1011"].angle_deg, 148) <= 8
+    )  # the bead bends: 144 by its brightest ray, 147-154 by its edges
 
 
 def test_a_tip_ten_pixels_off_changes_no_verdict_that_is_clear(shared):
@@ -309,7 +352,9 @@ def test_every_real_frame_that_shows_a_bead_is_accepted(shared):
         frames.append(read[1])
     assert len(frames) == 100
     assert key_area.find_all(frames, (301, 190), least_score=LEAST).valid.all()
-    assert key_area.find_all(frames, (299, 187), least_score=LEAST).valid.sum() >= 95  # a click some pixels off
+    assert (
+        key_area.find_all(frames, (299, 187), least_score=LEAST).valid.sum() >= 95
+    )  # a click some pixels off
     stills = [cv2.imread(str(p)) for p in sorted(shared("data/fast_caxton_frames/imgs").glob("*.jpg"))]
     found = key_area.find_all(stills, (134, 120), least_score=LEAST)
     assert found.valid.all()

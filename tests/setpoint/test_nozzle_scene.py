@@ -10,11 +10,22 @@ LEAST = 10.0
 
 
 def frames_of(rng, segments, flow, temperature=210.0):
-    return [nozzle_scene.render(nozzle_scene.draw_segment(rng), np.asarray(flow, float), temperature, rng) for _ in range(segments)]
+    return [
+        nozzle_scene.render(nozzle_scene.draw_segment(rng), np.asarray(flow, float), temperature, rng)
+        for _ in range(segments)
+    ]
 
 
 def test_the_classes_are_those_of_the_paper_at_their_borders():
-    assert nozzle_scene.label(np.array([20.0, 89.999, 90.0, 100.0, 110.0, 110.001, 310.0])).tolist() == [0, 0, 1, 1, 1, 2, 2]
+    assert nozzle_scene.label(np.array([20.0, 89.999, 90.0, 100.0, 110.0, 110.001, 310.0])).tolist() == [
+        0,
+        0,
+        1,
+        1,
+        1,
+        2,
+        2,
+    ]
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_others():
@@ -37,7 +48,8 @@ def test_the_bead_is_a_stadium_of_the_flow_with_the_stated_spread():
     rng = np.random.default_rng(7)
     made = frames_of(rng, 120, [100.0, 100.0, 300.0])
     factors = np.array([[m.width_px[k] if m.line[k] else np.nan for k in range(3)] for m in made])
-    # w = 8 px at 100 percent and 8 (3 - 0.1 x 2) = 22.4 px at 300 by hand; 9.4 percent over 120 draws is 0.9 percent
+    # w = 8 px at 100 percent and 8 (3 - 0.1 x 2) = 22.4 px at 300 by
+    # hand; 9.4 percent over 120 draws is 0.9 percent
     assert np.nanmean(factors[:, :2]) == pytest.approx(8.0, rel=0.03)
     assert np.nanmean(factors[:, 2]) == pytest.approx(22.4, rel=0.03)
     # two images of one segment differ by 8 percent each; 120 pairs know it to 7 percent of itself
@@ -53,11 +65,16 @@ def test_a_drawn_bead_is_as_wide_as_its_truth_says(monkeypatch):
     monkeypatch.setattr(nozzle_scene, "SHADING", (0.0, 0.0))
     rng = np.random.default_rng(8)
     for flow in (60.0, 100.0, 160.0):
-        segment = nozzle_scene.draw_segment(rng)._replace(noise=0.0, blur_px=0.3, contrast=100.0, specular=0.0)
-        segment = segment._replace(ground=np.full_like(segment.ground, 40), texture=np.zeros_like(segment.texture))
+        segment = nozzle_scene.draw_segment(rng)._replace(
+            noise=0.0, blur_px=0.3, contrast=100.0, specular=0.0
+        )
+        segment = segment._replace(
+            ground=np.full_like(segment.ground, 40), texture=np.zeros_like(segment.texture)
+        )
         made = nozzle_scene.render(segment, np.full(6, flow), 210.0, rng)
         far = segment.at[(segment.along > 40) & (segment.along < 120)]
-        # area of the bright band by its length; edges that wander by 26 percent over 25 px leave 6 percent in the mean of six
+        # area of the bright band by its length; edges that wander by 26
+        # percent over 25 px leave 6 percent in the mean of six
         drawn = (made.frames.reshape(6, -1)[made.line][:, far] > 90).sum(axis=1) / 80
         assert drawn.mean() == pytest.approx(made.width_px[made.line].mean(), rel=0.15)
 
@@ -75,8 +92,13 @@ def test_one_frame_in_sixteen_has_no_line_and_the_front_end_rejects_it():
 def test_the_line_leaves_the_tip_in_the_direction_that_the_segment_states():
     rng = np.random.default_rng(10)
     made = frames_of(rng, 40, [110.0])
-    errors = [abs((find(m.frames[0], m.tip, least_score=LEAST).angle_deg - m.direction_deg + 180) % 360 - 180) for m in made if m.line[0]]
-    # without G-code: the sweep finds it but for the few whose older bead is stronger; curvature turns it by up to 5 degrees
+    errors = [
+        abs((find(m.frames[0], m.tip, least_score=LEAST).angle_deg - m.direction_deg + 180) % 360 - 180)
+        for m in made
+        if m.line[0]
+    ]
+    # without G-code: the sweep finds it but for the few whose older bead
+    # is stronger; curvature turns it by up to 5 degrees
     assert np.mean(np.array(errors) < 8) > 0.85
 
 
@@ -93,7 +115,11 @@ def test_heat_changes_the_look_a_little():
     bright = []
     for temperature in (190.0, 230.0):
         made = nozzle_scene.render(segment, np.full(20, 150.0), temperature, np.random.default_rng(1))
-        bright.append(np.mean([f.ravel()[segment.at[np.abs(segment.across) < 5]].mean() for f in made.frames[made.line]]))
+        bright.append(
+            np.mean(
+                [f.ravel()[segment.at[np.abs(segment.across) < 5]].mean() for f in made.frames[made.line]]
+            )
+        )
     assert 0.5 < bright[1] - bright[0] < 15  # gray levels of gloss
 
 
@@ -114,10 +140,16 @@ def test_a_data_set_holds_the_fifteen_combinations_in_equal_parts():
 
 def image_accuracy(seed, *, train, test):
     rng = np.random.default_rng(seed)
-    seen, held_out = (nozzle_scene.data_set(rng, segments=s, frames=5, least_score=LEAST) for s in (train, test))
+    seen, held_out = (
+        nozzle_scene.data_set(rng, segments=s, frames=5, least_score=LEAST) for s in (train, test)
+    )
     v, w = seen.valid, held_out.valid
-    fitted = yardsticks.fit_profile_machine(seen.images[v], seen.temperature[v], seen.label[v], seen.segment[v])
-    answers = yardsticks.profile_probabilities(fitted, held_out.images[w], held_out.temperature[w]).argmax(axis=1)
+    fitted = yardsticks.fit_profile_machine(
+        seen.images[v], seen.temperature[v], seen.label[v], seen.segment[v]
+    )
+    answers = yardsticks.profile_probabilities(fitted, held_out.images[w], held_out.temperature[w]).argmax(
+        axis=1
+    )
     return np.mean(answers == held_out.label[w])
 
 

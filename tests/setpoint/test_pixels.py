@@ -1,4 +1,5 @@
-"""The closed loop through pixels: the machine keeps its volume, a held window moves nothing, and what befalls the camera or the nozzle is survived."""
+"""The closed loop through pixels: the machine keeps its volume, a held window moves nothing, and what befalls
+the camera or the nozzle is survived."""
 
 import functools
 
@@ -15,8 +16,12 @@ from pipeline.setpoint.simulator import Action, Controller
 from pipeline.setpoint.workflow import settings
 
 MACHINE = Machine(heater_s=15.0, heater_delay_s=2.0, melt_s=1.2, softening_per_degC=0.02)
-LIMITS = Limits(np.array([20.0, 180.0]), np.array([310.0, 240.0]), np.array([10.0, 20.0]), np.array([120.0, 40.0]))
-JUDGE = functools.partial(deployment.judge_window, least_frames=4, correlation=0.45, foreign_above=5.0, conformal_level=0.15)
+LIMITS = Limits(
+    np.array([20.0, 180.0]), np.array([310.0, 240.0]), np.array([10.0, 20.0]), np.array([120.0, 40.0])
+)
+JUDGE = functools.partial(
+    deployment.judge_window, least_frames=4, correlation=0.45, foreign_above=5.0, conformal_level=0.15
+)
 LOOP = Loop(
     frames=8,
     frame_rate_hz=20.0,
@@ -35,7 +40,10 @@ TICK = 0.05
 
 def test_what_is_fed_leaves_or_is_stored():
     rng = np.random.default_rng(0)
-    state, on = at_rest(MACHINE, np.array([100.0, 30.0]), np.array([210.0, 190.0]), tick_s=TICK), np.array([True, True])
+    state, on = (
+        at_rest(MACHINE, np.array([100.0, 30.0]), np.array([210.0, 190.0]), tick_s=TICK),
+        np.array([True, True]),
+    )
     first, fed, left = state.stored, 0.0, 0.0
     for _ in range(400):
         feed = rng.uniform(20, 310, 2)
@@ -47,26 +55,42 @@ def test_what_is_fed_leaves_or_is_stored():
 
 def test_at_rest_the_flow_is_the_feed_at_any_temperature():
     state = at_rest(MACHINE, np.array([100.0, 30.0, 300.0]), np.array([210.0, 190.0, 230.0]), tick_s=TICK)
-    after, flow = tick(MACHINE, state, np.array([100.0, 30.0, 300.0]), state.temperature, np.ones(3, bool), tick_s=TICK)
+    after, flow = tick(
+        MACHINE, state, np.array([100.0, 30.0, 300.0]), state.temperature, np.ones(3, bool), tick_s=TICK
+    )
     np.testing.assert_allclose(flow, [100.0, 30.0, 300.0], rtol=1e-12)
     np.testing.assert_allclose(after.temperature, [210.0, 190.0, 230.0], rtol=1e-12)
 
 
 def test_a_step_of_the_flow_follows_its_exponential_and_a_machine_that_does_not_run_stands_still():
-    flow, _ = step_response(MACHINE, flow=(100.0, 110.0), temperature=(210.0, 210.0), before_s=1.0, after_s=6.0, tick_s=TICK)
+    flow, _ = step_response(
+        MACHINE, flow=(100.0, 110.0), temperature=(210.0, 210.0), before_s=1.0, after_s=6.0, tick_s=TICK
+    )
     ends = np.arange(1, 121) * TICK
-    mean = 10 * (1 - 1.2 / TICK * (np.exp(TICK / 1.2) - 1) * np.exp(-ends / 1.2))  # the mean over a tick of 1 - exp(-t / tau)
+    mean = 10 * (
+        1 - 1.2 / TICK * (np.exp(TICK / 1.2) - 1) * np.exp(-ends / 1.2)
+    )  # the mean over a tick of 1 - exp(-t / tau)
     np.testing.assert_allclose(flow[20:], 100 + mean, rtol=1e-9)
     state = at_rest(MACHINE, np.array([100.0]), np.array([210.0]), tick_s=TICK)
-    for a, b in zip(tick(MACHINE, state, np.array([50.0]), np.array([230.0]), np.array([False]), tick_s=TICK)[0], state, strict=True):
+    for a, b in zip(
+        tick(MACHINE, state, np.array([50.0]), np.array([230.0]), np.array([False]), tick_s=TICK)[0],
+        state,
+        strict=True,
+    ):
         np.testing.assert_array_equal(a, b)
 
 
 def test_a_hotter_melt_lets_go_of_what_it_holds_and_then_flows_as_it_is_fed():
-    flow, temperature = step_response(MACHINE, flow=(100.0, 100.0), temperature=(210.0, 230.0), before_s=1.0, after_s=120.0, tick_s=TICK)
+    flow, temperature = step_response(
+        MACHINE, flow=(100.0, 100.0), temperature=(210.0, 230.0), before_s=1.0, after_s=120.0, tick_s=TICK
+    )
     assert temperature[20 + 39] == 210.0  # two seconds of delay
-    assert temperature[20 + 40 + 300] == pytest.approx(210 + 20 * (1 - np.exp(-1)), abs=0.1)  # a time constant later; one tick is 0.03
-    assert 102.5 < flow.max() < 103.5  # tau softening dT/dt = 1.2 * 0.02 * 20 / 15 = 3.2 % at once, less for the time it takes to build up
+    assert temperature[20 + 40 + 300] == pytest.approx(
+        210 + 20 * (1 - np.exp(-1)), abs=0.1
+    )  # a time constant later; one tick is 0.03
+    assert (
+        102.5 < flow.max() < 103.5
+    )  # tau softening dT/dt = 1.2 * 0.02 * 20 / 15 = 3.2 % at once, less for the time it takes to build up
     assert flow[-1] == pytest.approx(100.0, abs=0.01)  # 118 s are 8 time constants
 
 
@@ -74,7 +98,8 @@ def test_a_hotter_melt_lets_go_of_what_it_holds_and_then_flows_as_it_is_fed():
 
 
 def _see(images, temperature):
-    """Class probabilities from a width in percent that stands in a key area's first two bytes; a key area without a width is foreign."""
+    """Class probabilities from a width in percent that stands in a key area's first
+    two bytes; a key area without a width is foreign."""
     width = images[:, 0, 0] + 256.0 * images[:, 0, 1]
     under, over = norm.cdf((90 - width) / 8), norm.sf((110 - width) / 8)
     return np.stack([under, np.clip(1 - under - over, 0, 1), over], axis=1), np.where(width > 0, 0.0, 9.0)
@@ -82,7 +107,8 @@ def _see(images, temperature):
 
 @pytest.fixture
 def numbers(monkeypatch):
-    """A scene and front end of one number: the bead's width in percent, 5 % off for a segment, 8 % an image; blurred, it is 0."""
+    """A scene and front end of one number: the bead's width in percent, 5 %
+    off for a segment, 8 % an image; blurred, it is 0."""
 
     def seen(segments, templates, flow, temperature, loop, disturbances, decision, rngs, draw):
         images = np.zeros((*flow.shape, 16, 48), np.uint8)
@@ -90,7 +116,9 @@ def numbers(monkeypatch):
             burst = 0 <= decision - disturbances.burst_at[i] < disturbances.burst_for[i]
             width = flow[i] * (1 + segments[i]) * (1 + 0.08 * rng.normal(size=loop.frames)) * (not burst)
             images[i, :, 0, 0], images[i, :, 0, 1] = width % 256, width // 256
-        return pixels._Seen(images, np.stack([rng.random(loop.frames) > 0.06 for rng in rngs]), np.zeros(len(rngs), bool), {})
+        return pixels._Seen(
+            images, np.stack([rng.random(loop.frames) > 0.06 for rng in rngs]), np.zeros(len(rngs), bool), {}
+        )
 
     monkeypatch.setattr(pixels, "_next_segment", lambda segment, rng: 0.05 * rng.normal())
     monkeypatch.setattr(pixels, "_seen", seen)
@@ -105,23 +133,46 @@ def _filtered(parameters, memory, observation, key):
 
 
 FILTERED = Controller(lambda: jnp.zeros(()), _filtered)
-BANG = Controller(lambda: jnp.zeros(()), lambda parameters, memory, observation, key: (memory + 1, Action(jnp.int32(4), jnp.int32(4))))
-STARTS = np.array([[f, t] for f in (30.0, 60.0, 80.0, 120.0, 150.0, 200.0, 300.0) for t in (190.0, 210.0, 230.0)])
+BANG = Controller(
+    lambda: jnp.zeros(()),
+    lambda parameters, memory, observation, key: (memory + 1, Action(jnp.int32(4), jnp.int32(4))),
+)
+STARTS = np.array(
+    [[f, t] for f in (30.0, 60.0, 80.0, 120.0, 150.0, 200.0, 300.0) for t in (190.0, 210.0, 230.0)]
+)
 
 
 def test_all_starts_settle(numbers):
-    got = run(FILTERED, None, _see, STARTS, MACHINE, LOOP, calm(21), decisions=60, rng=np.random.default_rng(0))
+    got = run(
+        FILTERED, None, _see, STARTS, MACHINE, LOOP, calm(21), decisions=60, rng=np.random.default_rng(0)
+    )
     assert (pixels.settled_since(got) <= 50).mean() >= 0.95
     assert got.flow.shape == (21, 61)
 
 
 def test_each_episode_is_its_own_and_the_same_again(numbers):
-    got = run(FILTERED, None, _see, STARTS, MACHINE, LOOP, calm(21), decisions=8, rng=np.random.default_rng(0))
-    few = run(FILTERED, None, _see, STARTS[:3], MACHINE, LOOP, calm(3), decisions=8, rng=np.random.default_rng(0))
+    got = run(
+        FILTERED, None, _see, STARTS, MACHINE, LOOP, calm(21), decisions=8, rng=np.random.default_rng(0)
+    )
+    few = run(
+        FILTERED, None, _see, STARTS[:3], MACHINE, LOOP, calm(3), decisions=8, rng=np.random.default_rng(0)
+    )
     np.testing.assert_array_equal(few.flow, got.flow[:3])
     np.testing.assert_array_equal(few.windows.p, got.windows.p[:3])
-    with pytest.raises(ValueError, match=r"expected disturbances of 3 episodes, found 21; make them by calm\(3\)"):
-        run(FILTERED, None, _see, STARTS[:3], MACHINE, LOOP, calm(21), decisions=8, rng=np.random.default_rng(0))
+    with pytest.raises(
+        ValueError, match=r"expected disturbances of 3 episodes, found 21; make them by calm\(3\)"
+    ):
+        run(
+            FILTERED,
+            None,
+            _see,
+            STARTS[:3],
+            MACHINE,
+            LOOP,
+            calm(21),
+            decisions=8,
+            rng=np.random.default_rng(0),
+        )
 
 
 def test_a_held_window_moves_nothing_and_the_controller_does_not_hear_of_it(numbers):
@@ -136,14 +187,34 @@ def test_a_held_window_moves_nothing_and_the_controller_does_not_hear_of_it(numb
 
 def test_the_temperature_waits_for_lambda_s_clock_which_a_hold_does_not_advance(numbers):
     d = calm(1)._replace(burst_at=np.array([0]), burst_for=np.array([4]))
-    got = run(BANG, None, _see, np.array([[180.0, 190.0]]), MACHINE, LOOP, d, decisions=16, rng=np.random.default_rng(2))
+    got = run(
+        BANG,
+        None,
+        _see,
+        np.array([[180.0, 190.0]]),
+        MACHINE,
+        LOOP,
+        d,
+        decisions=16,
+        rng=np.random.default_rng(2),
+    )
     np.testing.assert_array_equal(
         np.flatnonzero(got.sent[0, :, 1]), [4, 14]
     )  # 180 % and more is never ambiguous: ten shown windows lie between
 
 
 def test_a_controller_that_pushes_on_stays_within_box_and_slew_and_its_cuts_are_counted(numbers):
-    got = run(BANG, None, _see, np.array([[250.0, 230.0]]), MACHINE, LOOP, calm(1), decisions=20, rng=np.random.default_rng(3))
+    got = run(
+        BANG,
+        None,
+        _see,
+        np.array([[250.0, 230.0]]),
+        MACHINE,
+        LOOP,
+        calm(1),
+        decisions=20,
+        rng=np.random.default_rng(3),
+    )
     assert got.setpoint[0].max(axis=0).tolist() == [310.0, 240.0]
     assert got.clipped[0, 2] > 0
 
@@ -159,7 +230,17 @@ def test_a_clog_in_mid_episode_is_recovered_from(numbers):
 
 def test_time_counts_waits_and_windows(numbers):
     loop = LOOP._replace(waits=Waits(2.0, 9.0, 0.0))
-    got = run(BANG, None, _see, np.array([[30.0, 190.0]]), MACHINE, loop, calm(1), decisions=12, rng=np.random.default_rng(5))
+    got = run(
+        BANG,
+        None,
+        _see,
+        np.array([[30.0, 190.0]]),
+        MACHINE,
+        loop,
+        calm(1),
+        decisions=12,
+        rng=np.random.default_rng(5),
+    )
     # the first sends a temperature: 9 s; then flow alone: 2 s; each window takes 0.4 s
     np.testing.assert_allclose(np.diff(got.time_s[0])[:3], [9.4, 2.4, 2.4])
 
@@ -191,18 +272,28 @@ def test_frames_are_rendered_seen_and_acted_on_and_pictures_are_kept():
         draw=frozenset({(0, 1), (5, 2)}),
     )
     assert (got.sent[:, :, 0] <= 0).all()
-    assert (got.windows.reason == ACTS).mean() >= 0.8  # 6 % of frames show no line: 4 % of windows keep less than two of four
+    assert (
+        got.windows.reason == ACTS
+    ).mean() >= 0.8  # 6 % of frames show no line: 4 % of windows keep less than two of four
     assert (got.setpoint + got.sent)[:, -1, 0].mean() <= 185.0  # -5, -10, -10 % where none is held
     assert sorted(got.pictures) == [(0, 1), (5, 2)]
-    assert all(picture.shape == (350, 350, 3) and picture.dtype == np.uint8 for picture in got.pictures.values())
+    assert all(
+        picture.shape == (350, 350, 3) and picture.dtype == np.uint8 for picture in got.pictures.values()
+    )
 
 
 def test_a_camera_that_moved_is_held_for_that_and_one_that_shook_a_little_is_not():
-    far, little = (calm(6)._replace(shift_px=np.tile(by, (6, 1)), shift_at=np.full(6, 1)) for by in ([12.0, 8.0], [2.0, -1.0]))
-    moved, shaken = (
-        run(FILTERED, None, _over, SIX, MACHINE, CALM_LIGHT, d, decisions=4, rng=np.random.default_rng(1)) for d in (far, little)
+    far, little = (
+        calm(6)._replace(shift_px=np.tile(by, (6, 1)), shift_at=np.full(6, 1))
+        for by in ([12.0, 8.0], [2.0, -1.0])
     )
-    assert (moved.windows.reason[:, 1:] == deployment.TIP).mean() >= 0.8  # a dark nozzle before a dark plate may not be found again
+    moved, shaken = (
+        run(FILTERED, None, _over, SIX, MACHINE, CALM_LIGHT, d, decisions=4, rng=np.random.default_rng(1))
+        for d in (far, little)
+    )
+    assert (
+        moved.windows.reason[:, 1:] == deployment.TIP
+    ).mean() >= 0.8  # a dark nozzle before a dark plate may not be found again
     assert (moved.sent[moved.windows.reason == deployment.TIP] == 0).all()
     assert (shaken.windows.reason == deployment.TIP).sum() <= 1  # of 24: nor where it is, once in a while
 
@@ -216,10 +307,14 @@ def test_a_picture_without_any_detail_is_held():
 
 
 def test_the_derived_wait_is_what_the_machine_s_exponential_asks_for():
-    flow, _ = step_response(MACHINE, flow=(100.0, 110.0), temperature=(190.0, 190.0), before_s=1.0, after_s=15.0, tick_s=TICK)
+    flow, _ = step_response(
+        MACHINE, flow=(100.0, 110.0), temperature=(190.0, 190.0), before_s=1.0, after_s=15.0, tick_s=TICK
+    )
     tau = 1.2 * np.exp(0.4)  # 20 °C below 210 at 2 % each
     expected = tau * np.log(10.0 * tau * (1 - np.exp(-1 / tau)))  # the mean of a second falls to 1 % of 10
-    assert settling_s(flow, at=20, band=1.0, window=20, sample_time_s=TICK) == pytest.approx(expected, abs=0.1)  # two ticks
+    assert settling_s(flow, at=20, band=1.0, window=20, sample_time_s=TICK) == pytest.approx(
+        expected, abs=0.1
+    )  # two ticks
 
 
 def test_the_tolerance_of_the_tip_goes_as_far_as_it_is_looked_for():

@@ -1,4 +1,5 @@
-"""The setpoint stages as a user runs them: on rendered frames, and on a folder of a user's; what is killed goes on, and broken input leaves all as it was."""
+"""The setpoint stages as a user runs them: on rendered frames, and on a folder of a user's; what is killed
+goes on, and broken input leaves all as it was."""
 
 import contextlib
 import importlib
@@ -18,9 +19,22 @@ from pipeline.setpoint.vision_transformer import SMALL as SMALL_SIZE
 from pipeline.setpoint.vision_transformer import named_arrays, vision_transformer
 from pipeline.setpoint.workflow import parts, train_agent, train_classifier
 from pipeline.setpoint.workflow.agent_files import Agents, restore_agents, store_agents
-from pipeline.setpoint.workflow.classifier_files import CLASSIFIER_SCHEMA, restore_classifier, store_classifier
+from pipeline.setpoint.workflow.classifier_files import (
+    CLASSIFIER_SCHEMA,
+    restore_classifier,
+    store_classifier,
+)
 from pipeline.setpoint.workflow.settings import TrainAgent, TrainClassifier
-from pipeline.setpoint.workflow.tables import AGENT_COURSE, CLASSIFIED, COURSE, DECISIONS, PATHS, RELIABILITY, SCOREBOARD, WINDOWS
+from pipeline.setpoint.workflow.tables import (
+    AGENT_COURSE,
+    CLASSIFIED,
+    COURSE,
+    DECISIONS,
+    PATHS,
+    RELIABILITY,
+    SCOREBOARD,
+    WINDOWS,
+)
 from pipeline.setpoint.workflow.windows import edges, window_rows, window_tables
 from pipeline.store import artifacts, params
 from pipeline.store.artifacts import read_weights, write_weights
@@ -43,12 +57,14 @@ SMALL = {
     "train_classifier.confidence": 0.55,
     "train_classifier.false_alarms": 0.1,
     "train_classifier.recorded": {"learn": 1, "judge": 1, "learn_windows": 1.0, "judge_windows": 1.0},
-    **{f"train_classifier.{network}.{key}": value for network in ("small", "cnn") for key, value in RECIPE.items()},
+    **{f"train_classifier.{network}.{key}": value for network in ("small", "cnn") for key,
+    value in RECIPE.items()},
     "train_agent.runs": 1,
     "train_agent.paper.updates": [20, 20, 20, 20],
     "train_agent.ours.updates": 20,
     "train_agent.ours.rounds": 2,
-    **{f"train_agent.{who}.{key}": value for who in ("paper", "ours") for key, value in {"environments": 4, "batch": 16, "capacity": 1000}.items()},
+    **{f"train_agent.{who}.{key}": value for who in ("paper", "ours") for key,
+    value in {"environments": 4, "batch": 16, "capacity": 1000}.items()},
     "evaluate_setpoint.runs": 1,
     "evaluate_setpoint.pixels.starts": 1,
     "evaluate_setpoint.pixels.decisions": 20,
@@ -75,7 +91,9 @@ def begun(place: Path, **changes) -> Path:
     """A project with small parameters, in which one works from now on."""
     place.mkdir(parents=True, exist_ok=True)
     with contextlib.chdir(place):
-        declare(SMALL | {f"train_classifier.{key}": value for key, value in changes.items()}, ROOT / "params.yaml")
+        declare(
+            SMALL | {f"train_classifier.{key}": value for key, value in changes.items()}, ROOT / "params.yaml"
+        )
     return place
 
 
@@ -100,9 +118,13 @@ def stored(project) -> Path:
     known = Calibration(1.0, 0.1, 0.2, Familiar(np.zeros((3, 4)), np.eye(4)), 9.0)
     out = project / "datasets/train_classifier"
     store_classifier(
-        out, params.load(TrainClassifier, "train_classifier"), eyes.Eyes(vision_transformer(SMALL_SIZE, np.random.default_rng(0)), known)
+        out,
+        params.load(TrainClassifier, "train_classifier"),
+        eyes.Eyes(vision_transformer(SMALL_SIZE, np.random.default_rng(0)), known),
     )
-    tables = {part: synthetic_table(np.random.default_rng(1), segments=1, windows=2) for part in ("learn", "judge")}
+    tables = {
+        part: synthetic_table(np.random.default_rng(1), segments=1, windows=2) for part in ("learn", "judge")
+    }
     artifacts.write_table(out / "windows.parquet", WINDOWS, window_rows(tables))
     return project
 
@@ -111,7 +133,11 @@ def refusal(name: str, capsys) -> str:
     """The one sentence with which a stage ends; but for what it remembers nothing was written."""
 
     def there():
-        return {path: artifacts.sha256(path) for path in sorted(Path().rglob("*")) if path.is_file() and "memo" not in path.parts}
+        return {
+            path: artifacts.sha256(path)
+            for path in sorted(Path().rglob("*"))
+            if path.is_file() and "memo" not in path.parts
+        }
 
     before = there()
     capsys.readouterr()
@@ -138,10 +164,17 @@ def check_classifier(source: str) -> dict:
     for name, schema in TABLES.items():
         assert len(next(iter(artifacts.read_table(out / f"{name}.parquet", schema).values()))), name
     frames = artifacts.read_json(out / "frames/frames.json")
-    expected = {f"{name}.parquet" for name in (*TABLES, "calibration")} | {"weights.safetensors", "frames/frames.json"}
+    expected = {f"{name}.parquet" for name in (*TABLES, "calibration")} | {
+        "weights.safetensors",
+        "frames/frames.json",
+    }
     expected |= {f"frames/{row['file']}" for row in frames}
     courses = {f"{figure}.tsv" for figure in ("training_loss", "held_out_loss", "held_out_accuracy")}
-    expected |= {f"live/plots/metrics/{learner}/{name}" for learner in ("vision_transformer", "convolutional_network") for name in courses}
+    expected |= {
+        f"live/plots/metrics/{learner}/{name}"
+        for learner in ("vision_transformer", "convolutional_network")
+        for name in courses
+    }
     assert {path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file()} == expected
     figures = artifacts.read_metrics("train_classifier")
     for name in ("image_accuracy", "window_accuracy", "svc_image_accuracy", "ece_image", "ece_window"):
@@ -160,7 +193,9 @@ def test_on_rendered_frames_every_artifact_is_written_with_its_schema(simulated,
     assert course["epoch"].tolist() == [1, 2] * 2
 
 
-def test_a_training_that_was_killed_goes_on_and_ends_at_the_very_same_weights(simulated, project, monkeypatch):
+def test_a_training_that_was_killed_goes_on_and_ends_at_the_very_same_weights(
+    simulated, project, monkeypatch
+):
     p, write, epochs = params.load(TrainClassifier, "train_classifier"), write_weights, []
     found, _ = parts.parts(p, "datasets/raw/setpoint", params.load(Execution, "execution"))
 
@@ -191,7 +226,10 @@ def test_a_training_that_was_killed_goes_on_and_ends_at_the_very_same_weights(si
 
 
 def test_the_eyes_survive_being_stored(simulated, project):
-    names = [f"{simulated}/datasets/train_classifier/{name}" for name in ("weights.safetensors", "calibration.parquet")]
+    names = [
+        f"{simulated}/datasets/train_classifier/{name}"
+        for name in ("weights.safetensors", "calibration.parquet")
+    ]
     found = restore_classifier(*names)
     store_classifier(Path("again"), params.load(TrainClassifier, "train_classifier"), found)
     for name in names:
@@ -207,7 +245,10 @@ def test_the_eyes_survive_being_stored(simulated, project):
 
 
 def test_window_tables_survive_being_written(simulated, tmp_path):
-    made = {part: synthetic_table(np.random.default_rng(k), segments=3, windows=2) for k, part in enumerate(("learn", "judge"))}
+    made = {
+        part: synthetic_table(np.random.default_rng(k), segments=3, windows=2)
+        for k, part in enumerate(("learn", "judge"))
+    }
     artifacts.write_table(tmp_path / "windows.parquet", WINDOWS, window_rows(made))
     found = window_tables(artifacts.read_table(tmp_path / "windows.parquet", WINDOWS))
     for part, one in made.items():
@@ -220,8 +261,11 @@ def test_window_tables_survive_being_written(simulated, tmp_path):
 
 
 def test_bins_of_the_flow_by_hand():
-    # no bin without a window in any set: [20, 30) .. [60, 70) are one, 100 and 105 are two, and what lies above the last stays with it
-    np.testing.assert_array_equal(edges([np.array([60.0, 100.0, 106.0]), np.array([25.0, 101.0, 140.0])]), [20.0, 70.0, 102.5, 310.0])
+    # no bin without a window in any set: [20, 30) .. [60, 70) are one, 100 and 105
+    # are two, and what lies above the last stays with it
+    np.testing.assert_array_equal(
+        edges([np.array([60.0, 100.0, 106.0]), np.array([25.0, 101.0, 140.0])]), [20.0, 70.0, 102.5, 310.0]
+    )
     # one set has nothing above the other's: one bin
     np.testing.assert_array_equal(edges([np.array([15.0]), np.array([320.0])]), [15.0, 320.0])
 
@@ -262,9 +306,13 @@ def test_damaged_or_foreign_weights_are_refused_by_name(stored, capsys):
     write_weights(path, CLASSIFIER_SCHEMA, arrays, {"size": "paper"})
     assert f"{path}: weights of another architecture: " in refusal("evaluate_setpoint", capsys)
     write_weights(path, CLASSIFIER_SCHEMA, arrays, {"size": "huge"})
-    assert f"{path} should say its size, small or paper, but says huge" in refusal("evaluate_setpoint", capsys)
+    assert f"{path} should say its size, small or paper, but says huge" in refusal(
+        "evaluate_setpoint", capsys
+    )
     write_weights(path, "agents 1", arrays, {"size": "small"})
-    assert f"{path} should hold weights of classifier 1 but has schema agents 1" in refusal("evaluate_setpoint", capsys)
+    assert f"{path} should hold weights of classifier 1 but has schema agents 1" in refusal(
+        "evaluate_setpoint", capsys
+    )
     path.unlink()
     assert f"{path} is missing" in refusal("evaluate_setpoint", capsys)
 
@@ -274,7 +322,9 @@ def test_damaged_windows_are_refused_by_name(stored, capsys):
     path.write_bytes(path.read_bytes()[:500])
     assert f"{path} is not a whole Parquet file" in refusal("train_agent", capsys)
     path.unlink()
-    assert f"{path} is missing; make it again with ./run dvc repro train_classifier" in refusal("train_agent", capsys)
+    assert f"{path} is missing; make it again with ./run dvc repro train_classifier" in refusal(
+        "train_agent", capsys
+    )
 
 
 # ---- a user's folder
@@ -290,7 +340,8 @@ def frames(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def users(frames, tmp_path, monkeypatch) -> Path:
-    """A project with a user's folder, whose images are elsewhere; returns the folder. What is cut in one test is known in the next."""
+    """A project with a user's folder, whose images are elsewhere; returns the
+    folder. What is cut in one test is known in the next."""
     monkeypatch.chdir(begun(tmp_path / "project", source="recordings", prints=SHARES))
     place, memo = Path("datasets/raw/setpoint"), frames.parent / "memo"
     place.mkdir(parents=True)
@@ -328,16 +379,20 @@ def lines(count: int = PRINTS, **changes) -> list[dict[str, str]]:
     ("made", "said"),
     [
         (lambda: lines(1), "no honest split: expected valid frames of at least 2 prints"),
-        (lambda: lines(print_id="a", timestamp=""), "no honest split: expected valid frames of at least 2 prints"),
+        (lambda: lines(print_id="a", timestamp=""),
+        "no honest split: expected valid frames of at least 2 prints"),
         (lambda: lines(2), "datasets/raw/setpoint: 2 segments do not let each of 4 parts hold every class"),
         (lambda: lines(6), "expected at least 3 stretches of constant settings of class 0"),
         (lambda: lines(flow_rate="100"), "expected valid frames of every class, found none of class 0"),
-        (lambda: [dict(row, flow_rate=str(float(row["flow_rate"]) / 100)) for row in lines()], "or write flow_rate in percent"),
+        (lambda: [dict(row, flow_rate=str(float(row["flow_rate"]) / 100)) for row in lines()],
+        "or write flow_rate in percent"),
         (lambda: lines(flow_rate_class="3"), "log.csv: line 2: expected flow_rate_class within 0 and 2"),
-        (lambda: [dict(row, img_path=f"gone/{k}.png") for k, row in enumerate(lines())], "the image is missing, the first line 2, gone/0.png"),
+        (lambda: [dict(row, img_path=f"gone/{k}.png") for k, row in enumerate(lines())],
+        "the image is missing, the first line 2, gone/0.png"),
         (lambda: lines(nozzle_tip_x="400"), "inside the frame of 350 x 350 px but found (400, "),
     ],
-    ids=["one print", "one name for all prints", "two prints", "few prints", "one class", "shares for percent", "a label outside", "missing images", "a tip outside"],
+    ids=["one print", "one name for all prints", "two prints", "few prints", "one class",
+    "shares for percent", "a label outside", "missing images", "a tip outside"],
 )  # fmt: skip
 def test_a_folder_that_cannot_be_learned_from_is_refused_before_training(users, capsys, made, said):
     table(users / "log.csv", made())
@@ -358,7 +413,9 @@ def test_more_than_the_prints_can_promise_is_refused_with_what_would_do(users, c
     said = refusal("train_classifier", capsys)
     assert "log(1 - confidence) / log(coverage) = 16 prints to calibrate with, found 3; add prints" in said
     declare({"train_classifier.coverage": 0.6, "train_classifier.window": 20})
-    assert "expected 20 frames in a row at one class in the frames for judged, found none" in refusal("train_classifier", capsys)
+    assert "expected 20 frames in a row at one class in the frames for judged, found none" in refusal(
+        "train_classifier", capsys
+    )
     assert not list(Path("datasets/memo").rglob("*.safetensors"))
 
 
@@ -397,7 +454,10 @@ def test_the_whole_loop_runs_and_repeats_to_the_byte(source, frames, tmp_path, m
         check_agents()
         check_judgement()
         found.append(
-            [artifacts.sha256(f"datasets/{name}") for name in ("train_classifier", "train_agent", "evaluate_setpoint")]
+            [
+                artifacts.sha256(f"datasets/{name}")
+                for name in ("train_classifier", "train_agent", "evaluate_setpoint")
+            ]
             + [artifacts.sha256("reports")]
         )
     assert found[0] == found[1]

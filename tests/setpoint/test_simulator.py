@@ -1,4 +1,5 @@
-"""The paper's simulator and reward against their printed values and by hand, disturbances in mid-episode, and windows drawn again from a record."""
+"""The paper's simulator and reward against their printed values and by hand, disturbances in mid-episode, and
+windows drawn again from a record."""
 
 import jax
 import jax.numpy as jnp
@@ -47,7 +48,15 @@ def machine(flow, temperature, *, accuracy=1.0, **changes):
 def played(moves, conditions, windows=None, seed=0):
     """The trajectory of moves (T, 2), indices, as numpy arrays."""
     return jax.tree.map(
-        np.asarray, rollout(SCRIPTED, jnp.asarray(moves), windows or paper_windows(), conditions, jax.random.key(seed), steps=len(moves))
+        np.asarray,
+        rollout(
+            SCRIPTED,
+            jnp.asarray(moves),
+            windows or paper_windows(),
+            conditions,
+            jax.random.key(seed),
+            steps=len(moves),
+        ),
     )
 
 
@@ -60,7 +69,12 @@ def standing():
 
 @pytest.mark.parametrize(
     ("flow", "temperature", "a", "b", "printed"),
-    [(110, 205, 40, 20, 0.394), (110, 215, 40, 20, 0.285), (105, 210, 20, 10, 0.3536), (200, 210, 20, 10, -0.8104)],
+    [
+        (110, 205, 40, 20, 0.394),
+        (110, 215, 40, 20, 0.285),
+        (105, 210, 20, 10, 0.3536),
+        (200, 210, 20, 10, -0.8104),
+    ],
 )
 def test_the_reward_has_its_check_values(flow, temperature, a, b, printed):
     assert float(reward(flow, temperature, a=a, b=b)) == pytest.approx(
@@ -105,13 +119,17 @@ def test_the_flow_moves_at_once_and_setpoints_stay_in_their_limits():
 
 
 def test_classes_include_both_borders_of_the_good_band():
-    np.testing.assert_array_equal(flow_class(jnp.array([20.0, 89.9, 90.0, 100.0, 110.0, 110.1])), [0, 0, 1, 1, 1, 2])
+    np.testing.assert_array_equal(
+        flow_class(jnp.array([20.0, 89.9, 90.0, 100.0, 110.0, 110.1])), [0, 0, 1, 1, 1, 2]
+    )
 
 
 def test_windows_are_right_as_often_as_their_accuracy_and_wrong_ones_share_alike():
     run = played(standing(), machine(60.0, 210.0, accuracy=0.7))
     share = np.bincount(run.named.ravel(), minlength=3) / run.named.size
-    np.testing.assert_allclose(share, [0.7, 0.15, 0.15], atol=4 * np.sqrt(0.21 / run.named.size))  # four deviations of 60,000 draws
+    np.testing.assert_allclose(
+        share, [0.7, 0.15, 0.15], atol=4 * np.sqrt(0.21 / run.named.size)
+    )  # four deviations of 60,000 draws
 
 
 def test_shares_are_clipped_noisy_decays_from_the_class():
@@ -133,8 +151,17 @@ def test_the_paper_s_state_is_thirty_classes_three_shares_and_two_temperatures()
     history = first_history()
     for named in (2, 0):
         history = remembered(history, jnp.array(named))
-    seen = Observation(jnp.array([0.5, 0.3, 0.2]), jnp.array(0), jnp.array(0.0), jnp.array(205.0), jnp.array(210.0), jnp.array(2))
-    np.testing.assert_allclose(paper_state(history, seen), [1 / 3] * 28 + [2 / 3, 0, 1, 0.6, 0.4, 205, 210], rtol=1e-6)  # float32
+    seen = Observation(
+        jnp.array([0.5, 0.3, 0.2]),
+        jnp.array(0),
+        jnp.array(0.0),
+        jnp.array(205.0),
+        jnp.array(210.0),
+        jnp.array(2),
+    )
+    np.testing.assert_allclose(
+        paper_state(history, seen), [1 / 3] * 28 + [2 / 3, 0, 1, 0.6, 0.4, 205, 210], rtol=1e-6
+    )  # float32
 
 
 def test_the_same_key_gives_the_same_bytes_and_another_key_others():
@@ -163,7 +190,9 @@ def test_drift_compounds_and_jumps_come_at_their_rate():
     np.testing.assert_allclose(drifting.flow[0], 100 * 0.995 ** np.arange(STEPS + 1), rtol=1e-5)
     jumping = played(standing(), machine(100.0, 210.0, jump_rate=0.02, jump_size=0.1))
     jumps = np.diff(np.log(jumping.flow), axis=1)
-    assert (np.abs(jumps) > 1e-6).mean() == pytest.approx(0.02, abs=4 * np.sqrt(0.02 / 60_000))  # four deviations
+    assert (np.abs(jumps) > 1e-6).mean() == pytest.approx(
+        0.02, abs=4 * np.sqrt(0.02 / 60_000)
+    )  # four deviations
     assert jumps[np.abs(jumps) > 1e-6].std() == pytest.approx(0.1, rel=0.1)  # four deviations of 1,200 jumps
 
 
@@ -208,9 +237,13 @@ def test_the_synthetic_table_errs_as_real_classifiers_do():
     assert np.abs(table.named - true).max() == 1  # under and over are never swapped
     border = (low >= 80) & (high <= 90)
     by_segment = [
-        right[border & (table.segment == s) & (table.flow_bin == b)].mean() for s in range(60) for b in np.unique(table.flow_bin[border])
+        right[border & (table.segment == s) & (table.flow_bin == b)].mean()
+        for s in range(60)
+        for b in np.unique(table.flow_bin[border])
     ]
-    assert np.std(by_segment) > 2 * np.sqrt(0.25 / 20)  # errors persist: independent ones would scatter the means of 20 by half of that
+    assert np.std(by_segment) > 2 * np.sqrt(
+        0.25 / 20
+    )  # errors persist: independent ones would scatter the means of 20 by half of that
 
 
 def spoilt(**fields):
@@ -222,16 +255,24 @@ def spoilt(**fields):
     [
         (
             spoilt(named=np.zeros(3, int)),
-            r"expected shares \(n, 3\) and as many classes, flow bins and segments, found \(188, 3\), 3, 188, 188; record them in one go",
+            r"expected shares \(n, 3\) and as many classes, flow bins and segments, found \(188, 3\), 3, "
+            r"188, 188; record them in one go",
         ),
         (
             spoilt(shares=np.full((188, 3), 0.5)),
-            r"expected shares from 0 to 1 with sum 1, found others; normalise each window's shares over its classes",
+            r"expected shares from 0 to 1 with sum 1, found others; "
+            r"normalise each window's shares over its classes",
         ),
         (spoilt(shares=np.full((188, 3), np.nan)), r"expected shares from 0 to 1 with sum 1"),
-        (spoilt(flow_bin=np.zeros(188, int)), r"no window for flows from 30 to 40 % \(46 empty bins\); record them, or widen the bins"),
+        (
+            spoilt(flow_bin=np.zeros(188, int)),
+            r"no window for flows from 30 to 40 % \(46 empty bins\); record them, or widen the bins",
+        ),
         (spoilt(flow_bin=np.arange(188)), r"expected flow bins 0 to 46, found 0 to 187"),
-        (spoilt(flow_edges=np.linspace(310, 20, 48)), r"expected rising flow edges, found some that fall; sort the bins"),
+        (
+            spoilt(flow_edges=np.linspace(310, 20, 48)),
+            r"expected rising flow edges, found some that fall; sort the bins",
+        ),
     ],
 )
 def test_a_table_that_cannot_be_drawn_from_is_refused(table, message):

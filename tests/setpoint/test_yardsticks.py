@@ -65,7 +65,9 @@ def test_probabilities_are_as_sure_as_they_are_right_on_segments_not_seen():
     def draw(segments):
         label = np.repeat(np.arange(segments) % 3, 8)
         shade = np.repeat(30 * rng.standard_normal(segments), 8)  # of the whole segment
-        rows = np.clip(np.round(8 + 1.2 * (label - 1) + 1.5 * rng.standard_normal(len(label))), 1, 15).astype(int)
+        rows = np.clip(np.round(8 + 1.2 * (label - 1) + 1.5 * rng.standard_normal(len(label))), 1, 15).astype(
+            int
+        )
         images = np.clip(bars(rows, rng).astype(float) + shade[:, None, None], 0, 255).astype(np.uint8)
         return images, np.full(len(label), 210.0), label, np.repeat(np.arange(segments), 8)
 

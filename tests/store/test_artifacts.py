@@ -1,4 +1,5 @@
-"""Artifacts: equal inputs give equal bytes, what is damaged is refused, and whatever goes wrong the last good ones stay."""
+"""Artifacts: equal inputs give equal bytes, what is damaged is refused,
+and whatever goes wrong the last good ones stay."""
 
 import errno
 import json
@@ -20,13 +21,18 @@ from pipeline.store import artifacts, tables
 from pipeline.temperature.workflow.settings import Input, Output
 from pipeline.temperature.workflow.tables import record
 
-RECORD = record([Input(name="heater_1", unit="percent", low=0, high=100)], [Output(name="zone_1", unit="°C", reference=200)])
+RECORD = record(
+    [Input(name="heater_1", unit="percent", low=0, high=100)],
+    [Output(name="zone_1", unit="°C", reference=200)],
+)
 SCORES = tables.Schema(
     "scores",
     1,
     (
         tables.Column("controller", tables.TEXT, "1", "who"),
-        tables.Column("share", tables.FLOAT, "percent", "of the time at a limit", low=0, high=100, nullable=True),
+        tables.Column(
+            "share", tables.FLOAT, "percent", "of the time at a limit", low=0, high=100, nullable=True
+        ),
         tables.Column("steps", tables.COUNT, "1", "how many", low=1),
     ),
 )
@@ -57,7 +63,9 @@ def scores(**changed):
 
 def everything(folder):
     """Relative name -> bytes of all files."""
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()
+    }
 
 
 # ---- tables
@@ -68,7 +76,15 @@ def test_a_table_comes_back_as_it_was_written():
     table = artifacts.read_table("datasets/ingest/record.parquet", RECORD)
     for name, values in columns().items():
         np.testing.assert_array_equal(table[name], values)
-    kinds = {"recording": "O", "segment": "i", "time_s": "f", "heater_1": "f", "heater_1_masked": "b", "zone_1": "f", "zone_1_masked": "b"}
+    kinds = {
+        "recording": "O",
+        "segment": "i",
+        "time_s": "f",
+        "heater_1": "f",
+        "heater_1_masked": "b",
+        "zone_1": "f",
+        "zone_1_masked": "b",
+    }
     assert {name: values.dtype.kind for name, values in table.items()} == kinds
     assert list(table) == [column.name for column in RECORD.columns]
 
@@ -95,15 +111,24 @@ def test_equal_tables_are_equal_bytes_whatever_container_they_came_in():
             {"share": np.array([3.0, 101.0])},
             "column share is 101 percent in row 1 but must be at most 100 percent; the file was not written",
         ),
-        ({"share": np.array([-np.inf, 1.0])}, "column share is -inf percent in row 0 but must be at least 0 percent"),
+        (
+            {"share": np.array([-np.inf, 1.0])},
+            "column share is -inf percent in row 0 but must be at least 0 percent",
+        ),
         ({"steps": [5, 0]}, "column steps is 0 in row 1 but must be at least 1"),
         ({"steps": np.array([5.5, 6])}, "column steps does not fit int64 (Float value 5.5"),
         ({"steps": np.array([5, np.nan])}, "column steps has no value (NaN) in row 1, the first of 1"),
         ({"controller": ["a", None]}, "column controller has no value (NaN) in row 1"),
         ({"share": ["x", "y"]}, "column share does not fit double"),
         ({"share": np.zeros((2, 2))}, "column share does not fit double"),
-        ({"share": [1.0]}, "columns should have one length but have {'controller': 2, 'share': 1, 'steps': 2}"),
-        ({"extra": [1, 2]}, "table scores version 1 has extra too many; give exactly the columns of the schema"),
+        (
+            {"share": [1.0]},
+            "columns should have one length but have {'controller': 2, 'share': 1, 'steps': 2}",
+        ),
+        (
+            {"extra": [1, 2]},
+            "table scores version 1 has extra too many; give exactly the columns of the schema",
+        ),
     ],
 )
 def test_a_table_that_breaks_its_schema_is_not_written(project, changed, sentence):
@@ -125,8 +150,14 @@ def with_column(number, **changed):
 @pytest.mark.parametrize(
     ("found", "sentence"),
     [
-        (table(SCORES._replace(version=2)), " holds schema scores version 2 but scores version 1 is expected"),
-        (table(SCORES._replace(name="tuning")), " holds schema tuning version 1 but scores version 1 is expected"),
+        (
+            table(SCORES._replace(version=2)),
+            " holds schema scores version 2 but scores version 1 is expected",
+        ),
+        (
+            table(SCORES._replace(name="tuning")),
+            " holds schema tuning version 1 but scores version 1 is expected",
+        ),
         (pa.table({"a": [1]}), " holds no schema but scores version 1 is expected"),
         (table().drop_columns("share"), ": table scores version 1 lacks share"),
         (table(with_column(1, unit="1")), ": column share is in 1 but should be in percent"),
@@ -139,12 +170,18 @@ def test_a_table_of_another_schema_is_refused_with_the_command_that_makes_it_aga
     path = "datasets/evaluate_temperature/scores.parquet"
     (project / path).parent.mkdir(parents=True)
     pq.write_table(found, path)
-    with pytest.raises(ValueError, match=f"^{re.escape(path + sentence)}; make it again with ./run dvc repro evaluate_temperature$"):
+    with pytest.raises(
+        ValueError,
+        match=f"^{re.escape(path + sentence)}; make it again with ./run dvc repro evaluate_temperature$",
+    ):
         artifacts.read_table(path, SCORES)
 
 
 def test_a_missing_table_is_one_sentence():
-    with pytest.raises(ValueError, match=r"^datasets/ingest/record.parquet is missing; make it again with ./run dvc repro ingest$"):
+    with pytest.raises(
+        ValueError,
+        match=r"^datasets/ingest/record.parquet is missing; make it again with ./run dvc repro ingest$",
+    ):
         artifacts.read_table("datasets/ingest/record.parquet", RECORD)
 
 
@@ -153,12 +190,16 @@ def test_a_truncated_table_is_refused(project, kept):
     artifacts.write_table("datasets/ingest/record.parquet", RECORD, columns())
     whole = (project / "datasets/ingest/record.parquet").read_bytes()
     (project / "datasets/ingest/record.parquet").write_bytes(whole[:kept])
-    with pytest.raises(ValueError, match=r"record.parquet is not a whole Parquet file .*; make it again with ./run dvc repro ingest$"):
+    with pytest.raises(
+        ValueError,
+        match=r"record.parquet is not a whole Parquet file .*; make it again with ./run dvc repro ingest$",
+    ):
         artifacts.read_table("datasets/ingest/record.parquet", RECORD)
 
 
 def test_a_flipped_bit_never_changes_a_value(project):
-    """Pages carry checksums; a flip in a name, unit or statistic is refused or read past, but the values are those that were written."""
+    """Pages carry checksums; a flip in a name, unit or statistic is refused or read
+    past, but the values are those that were written."""
     artifacts.write_table("record.parquet", RECORD, columns())
     whole = (project / "record.parquet").read_bytes()
     good, refused = artifacts.read_table("record.parquet", RECORD), 0
@@ -197,13 +238,18 @@ def test_arrays_of_any_shape_come_back():
 
 def test_arrays_that_are_not_finite_real_numbers_are_refused():
     with pytest.raises(
-        ValueError, match=r"model.parquet: array poles is complex128 but should be real numbers; write real and imaginary part"
+        ValueError,
+        match=r"model.parquet: array poles is complex128 but should be real numbers; write real and imaginary part",
     ):
         artifacts.write_arrays("model.parquet", "model", 1, {"poles": (np.array([1j]), "1", "")})
-    with pytest.raises(ValueError, match=r"array A holds an infinite number; write NaN where there is no value"):
+    with pytest.raises(
+        ValueError, match=r"array A holds an infinite number; write NaN where there is no value"
+    ):
         artifacts.write_arrays("model.parquet", "model", 1, {"A": (np.array([np.inf]), "1", "")})
     artifacts.write_arrays("model.parquet", "model", 1, {"A": (np.eye(2), "1", "")})
-    with pytest.raises(ValueError, match=r"model.parquet holds schema model version 1 but model version 2 is expected"):
+    with pytest.raises(
+        ValueError, match=r"model.parquet holds schema model version 1 but model version 2 is expected"
+    ):
         artifacts.read_arrays("model.parquet", "model", 2)
 
 
@@ -216,9 +262,17 @@ class Score(NamedTuple):
 
 
 def test_json_keeps_order_and_every_digit():
-    data = {"b": np.float64(0.1) + 0.2, "a": [np.int32(3), np.array([[1.5]]), (1, None)], "é": Score(1e-9, np.bool_(True))}
+    data = {
+        "b": np.float64(0.1) + 0.2,
+        "a": [np.int32(3), np.array([[1.5]]), (1, None)],
+        "é": Score(1e-9, np.bool_(True)),
+    }
     artifacts.write_json("a.json", data)
-    assert artifacts.read_json("a.json") == {"b": 0.30000000000000004, "a": [3, [[1.5]], [1, None]], "é": {"gap": 1e-9, "stable": True}}
+    assert artifacts.read_json("a.json") == {
+        "b": 0.30000000000000004,
+        "a": [3, [[1.5]], [1, None]],
+        "é": {"gap": 1e-9, "stable": True},
+    }
     text = Path("a.json").read_text(encoding="utf-8")
     assert text.startswith('{\n  "b": 0.30000000000000004,\n  "a": [')
     assert text.endswith("}\n")
@@ -230,7 +284,8 @@ def test_json_keeps_order_and_every_digit():
     [
         (
             {"kernel": {"gap": [0.0, np.nan]}},
-            "kernel.gap[1] is nan but must be finite; write null where there is no figure, and say why beside it",
+            "kernel.gap[1] is nan but must be finite; write null where there is no figure, "
+            "and say why beside it",
         ),
         ({"kernel": np.array([np.inf])}, "kernel[0] is inf but must be finite"),
         ({"kernel": {1: 2}}, "key 1 of kernel should be text but is int"),
@@ -249,10 +304,13 @@ def test_broken_json_is_refused_with_its_place(project):
     whole = (project / "reports/metrics/ingest.json").read_text()
     (project / "reports/metrics/ingest.json").write_text(whole[:-4])
     with pytest.raises(
-        ValueError, match=r"reports/metrics/ingest.json is not whole JSON \(.*line 2.*\); make it again with ./run dvc repro ingest"
+        ValueError,
+        match=r"reports/metrics/ingest.json is not whole JSON \(.*line 2.*\); make it again with ./run dvc repro ingest",
     ):
         artifacts.read_metrics("ingest")
-    with pytest.raises(ValueError, match=r"reports/metrics/report.json is missing; make it again with ./run dvc repro report"):
+    with pytest.raises(
+        ValueError, match=r"reports/metrics/report.json is missing; make it again with ./run dvc repro report"
+    ):
         artifacts.read_metrics("report")
 
 
@@ -268,7 +326,10 @@ def test_a_course_is_a_table_a_figure_without_what_is_missing(project):
     }
     for folder in ("a", "b"):
         artifacts.write_course(folder, course, of="agent", step="update", figures=("reward", "cost"))
-    files = {path.relative_to("a/plots/metrics").as_posix(): path.read_text() for path in Path("a/plots").rglob("*.tsv")}
+    files = {
+        path.relative_to("a/plots/metrics").as_posix(): path.read_text()
+        for path in Path("a/plots").rglob("*.tsv")
+    }
     assert files == {
         "ours/reward.tsv": "step\treward\n10\t0.1\n",
         "ours/cost.tsv": "step\tcost\n10\t1.0\n20\t2.0\n",
@@ -325,7 +386,9 @@ def test_equal_recordings_are_equal_bytes():
 )
 def test_a_recording_of_bad_numbers_is_not_written(project, time, values, sentence):
     with pytest.raises(ValueError, match=f"machine.mcap: {sentence}"):
-        artifacts.write_recording("machine.mcap", np.array(time, float), {"heater_1": (np.array(values), "percent", "")})
+        artifacts.write_recording(
+            "machine.mcap", np.array(time, float), {"heater_1": (np.array(values), "percent", "")}
+        )
     assert not everything(project)
 
 
@@ -341,7 +404,9 @@ def test_the_digest_of_a_folder_is_of_names_and_contents_without_dot_files(proje
     assert artifacts.sha256("a") == digest
     (project / "a/two.txt").rename(project / "a/three.txt")
     assert artifacts.sha256("a") != digest
-    assert artifacts.sha256("a/b/one.txt") == "6b86b273ff34fce19d6b804eff5a3f5747ada4eaa22f1d49c01e52ddb7875b4b"
+    assert (
+        artifacts.sha256("a/b/one.txt") == "6b86b273ff34fce19d6b804eff5a3f5747ada4eaa22f1d49c01e52ddb7875b4b"
+    )
 
 
 # ---- all or nothing
@@ -418,7 +483,11 @@ def test_a_writer_that_fails_half_way_leaves_the_last_good_file_alone(project, m
         raise error
 
     monkeypatch.setattr(pq, "write_table", half)
-    sentence = r"scores.parquet cannot be written \(No space left on device\); free some space" if isinstance(error, OSError) else None
+    sentence = (
+        r"scores.parquet cannot be written \(No space left on device\); free some space"
+        if isinstance(error, OSError)
+        else None
+    )
     with pytest.raises(type(error), match=sentence):
         artifacts.write_table("scores.parquet", SCORES, scores(steps=[7, 8]))
     assert everything(project) == before
@@ -426,7 +495,14 @@ def test_a_writer_that_fails_half_way_leaves_the_last_good_file_alone(project, m
 
 def run(root, script) -> subprocess.CompletedProcess:
     environment = os.environ | {"PYTHONPATH": str(root)}
-    return subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, timeout=60, check=False)
+    return subprocess.run(
+        [sys.executable, "-c", script],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
 
 
 FULL_DISK = """
@@ -441,9 +517,14 @@ with artifacts.stage("learn_kernel") as out:
 @pytest.mark.parametrize(
     ("write", "name"),
     [
-        ("artifacts.write_arrays(out / 'a.parquet', 'a', 1, {'a': (np.random.default_rng(0).normal(size=9999), '1', '')})", "a.parquet"),
         (
-            "artifacts.write_recording(out / 'a.mcap', np.arange(9999.), {'a': (np.random.default_rng(0).normal(size=9999), '1', '')})",
+            "artifacts.write_arrays(out / 'a.parquet', 'a', 1, {'a': "
+            "(np.random.default_rng(0).normal(size=9999), '1', '')})",
+            "a.parquet",
+        ),
+        (
+            "artifacts.write_recording(out / 'a.mcap', np.arange(9999.), {'a': "
+            "(np.random.default_rng(0).normal(size=9999), '1', '')})",
             "a.mcap",
         ),
         ("artifacts.write_text(out / 'a.txt', 'a' * 9999)", "a.txt"),
@@ -453,7 +534,9 @@ def test_a_write_that_the_system_cuts_off_is_one_line(root, project, last_good, 
     """The limit of a file's size is the one full disk that a test can have without being root."""
     end = run(root, FULL_DISK.format(write=write))
     assert end.returncode == 1
-    assert re.fullmatch(rf"learn_kernel: datasets/learn_kernel/{name} cannot be written \(File too large\); .+\n", end.stderr)
+    assert re.fullmatch(
+        rf"learn_kernel: datasets/learn_kernel/{name} cannot be written \(File too large\); .+\n", end.stderr
+    )
     assert everything(project) == last_good
 
 
@@ -472,7 +555,10 @@ def test_a_read_only_folder_is_one_line(root, project, last_good):
     (project / "datasets").chmod(0o555)
     end = run(root, READ_ONLY)
     (project / "datasets").chmod(0o755)
-    assert (end.returncode, end.stderr) == (1, "learn_kernel: datasets/learn_kernel: Permission denied; make datasets writable\n")
+    assert (end.returncode, end.stderr) == (
+        1,
+        "learn_kernel: datasets/learn_kernel: Permission denied; make datasets writable\n",
+    )
     assert everything(project) == last_good
 
 

@@ -1,4 +1,5 @@
-"""params.yaml and params.expert.yaml are the only home of a value, and whatever is wrong with them is said in one sentence."""
+"""params.yaml and params.expert.yaml are the only home of a value, and
+whatever is wrong with them is said in one sentence."""
 
 import re
 from typing import Annotated, Literal
@@ -60,7 +61,15 @@ def test_a_good_section_becomes_a_frozen_typed_object(load):
 def test_numbers_are_read_as_dvc_reads_them(load):
     """YAML 1.1, PyYAML's own, takes 1e-3 for a text, `no` for false and 1:30 for 90; DVC reads YAML 1.2."""
     assert load(GOOD).gamma == 0.001
-    assert params.read() == {"learn_kernel": {"horizon": 6, "gamma": 0.001, "method": "window", "levels": [0, 0.5], "progress": True}}
+    assert params.read() == {
+        "learn_kernel": {
+            "horizon": 6,
+            "gamma": 0.001,
+            "method": "window",
+            "levels": [0, 0.5],
+            "progress": True,
+        }
+    }
     with pytest.raises(ValueError, match='progress is "no" but must be true or false'):
         load(GOOD.replace("true", "no"))
     with pytest.raises(ValueError, match='horizon is "1:30" but must be a whole number'):
@@ -71,7 +80,11 @@ def test_numbers_are_read_as_dvc_reads_them(load):
     ("old", "new", "sentence"),
     [
         ("horizon: 6", "horizn: 6", "learn_kernel.horizn is unknown; did you mean horizon?"),
-        ("horizon: 6", "horizon: 6\n  zzz: 1", "learn_kernel.zzz is unknown; remove it, or use horizon, gamma, method, levels, progress"),
+        (
+            "horizon: 6",
+            "horizon: 6\n  zzz: 1",
+            "learn_kernel.zzz is unknown; remove it, or use horizon, gamma, method, levels, progress",
+        ),
         ("  horizon: 6\n", "", "learn_kernel.horizon is missing; add it (int, at least 1 and at most 20)"),
         ("  gamma: 1e-3\n", "", "learn_kernel.gamma is missing; add it (float, more than 0 and less than 1)"),
         ("  method: window\n", "", "learn_kernel.method is missing; add it (one of direct, window)"),
@@ -83,16 +96,29 @@ def test_numbers_are_read_as_dvc_reads_them(load):
         ("gamma: 1e-3", "gamma:", "learn_kernel.gamma is null but must be a number"),
         ("gamma: 1e-3", "gamma: .nan", "learn_kernel.gamma is NaN but must be a finite number"),
         ("gamma: 1e-3", "gamma: -.inf", "learn_kernel.gamma is -Infinity but must be a finite number"),
-        ("method: window", "method: windw", 'learn_kernel.method is "windw" but must be one of direct or window; did you mean window?'),
+        (
+            "method: window",
+            "method: windw",
+            'learn_kernel.method is "windw" but must be one of direct or window; did you mean window?',
+        ),
         ("[0, 0.5]", "[0, 7]", "learn_kernel.levels[1] is 7 but must be at most 5"),
         ("[0, 0.5]", "0.5", "learn_kernel.levels is 0.5 but must be a list"),
         ("[0, 0.5]", "[]", "learn_kernel.levels is [] but needs at least 1 entries"),
-        ("progress: true", "progress: true\n  gamma: 0.5", "line 8: gamma is given twice, first in line 4; keep one of the two"),
-        ("progress: true", "progress: true\nlearn_kernel: 3", "line 8: learn_kernel is given twice, first in line 2; keep one of the two"),
+        (
+            "progress: true",
+            "progress: true\n  gamma: 0.5",
+            "line 8: gamma is given twice, first in line 4; keep one of the two",
+        ),
+        (
+            "progress: true",
+            "progress: true\nlearn_kernel: 3",
+            "line 8: learn_kernel is given twice, first in line 2; keep one of the two",
+        ),
         (
             "  horizon: 6",
             "\thorizon: 6",
-            "line 3: found character '\\t' that cannot start any token; mend the line: key: value, indented by spaces",
+            "line 3: found character '\\t' that cannot start any token; mend the line: key: "
+            "value, indented by spaces",
         ),
         ("learn_kernel:", "lern_kernel:", "section learn_kernel is missing; is lern_kernel meant?"),
     ],
@@ -105,7 +131,8 @@ def test_each_mistake_is_one_sentence_with_place_expectation_and_remedy(load, ol
 
 def test_two_mistakes_are_two_lines(load):
     with pytest.raises(
-        ValueError, match="horizon is 0 but must be at least 1\nparams.yaml: learn_kernel.gamma is 1 but must be less than 1$"
+        ValueError,
+        match="horizon is 0 but must be at least 1\nparams.yaml: learn_kernel.gamma is 1 but must be less than 1$",
     ):
         load(GOOD.replace("horizon: 6", "horizon: 0").replace("1e-3", "1"))
 
@@ -135,7 +162,10 @@ def test_a_missing_file_and_one_that_is_not_text_are_refused(load, tmp_path):
 def test_one_key_of_another_section_is_bounded_too(load):
     load(GOOD)
     assert params.value("learn_kernel.method", one_of=("direct", "window")) == "window"
-    with pytest.raises(ValueError, match='learn_kernel.method is "window" but must be one of windows, direct; did you mean windows'):
+    with pytest.raises(
+        ValueError,
+        match='learn_kernel.method is "window" but must be one of windows, direct; did you mean windows',
+    ):
         params.value("learn_kernel.method", one_of=("windows", "direct"))
     with pytest.raises(ValueError, match=r"learn_kernel.progress is true but must be one of 0, 1"):
         params.value("learn_kernel.progress", one_of=(0, 1))
@@ -153,10 +183,27 @@ def test_the_digest_is_of_the_values_not_of_their_spelling(load):
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
-        ("zone_1", "heater_1", "plant names heater_1 more than once; give every input and output a name of its own"),
-        ("heater_1", "1_heater", 'plant.inputs[0].name is "1_heater" but must consist of letters, digits and _ and not begin with a digit'),
-        ("zone_1", "time_s", 'plant.outputs[0].name is "time_s" but that is taken by the table of the record'),
-        ("zone_1", "heater_1_masked", 'plant.outputs[0].name is "heater_1_masked" but that is taken by the table of the record'),
+        (
+            "zone_1",
+            "heater_1",
+            "plant names heater_1 more than once; give every input and output a name of its own",
+        ),
+        (
+            "heater_1",
+            "1_heater",
+            'plant.inputs[0].name is "1_heater" but must consist of letters, '
+            "digits and _ and not begin with a digit",
+        ),
+        (
+            "zone_1",
+            "time_s",
+            'plant.outputs[0].name is "time_s" but that is taken by the table of the record',
+        ),
+        (
+            "zone_1",
+            "heater_1_masked",
+            'plant.outputs[0].name is "heater_1_masked" but that is taken by the table of the record',
+        ),
         ("high: 100", "high: 0", "plant.inputs[0] has low 0 but high 0; low must be less than high"),
         ("high: 100", "hi: 100", "plant.inputs[0].hi is unknown; did you mean high?"),
         ("{name: zone_1, unit: °C, reference: 200}", "", "plant.outputs is [] but needs at least 1 entries"),
@@ -174,7 +221,10 @@ def test_the_plant_has_distinct_named_signals_within_limits(load, old, new, sent
     [
         ("{backend: ray, jobs: 2, scheduler: ''}", 'backend is "ray" but must be one of loky or dask'),
         ("{backend: loky, jobs: 0, scheduler: ''}", "jobs is 0 but must be at least 1"),
-        ("{backend: dask, jobs: 2, scheduler: ''}", 'has backend dask but scheduler ""; write the address of the scheduler there'),
+        (
+            "{backend: dask, jobs: 2, scheduler: ''}",
+            'has backend dask but scheduler ""; write the address of the scheduler there',
+        ),
         (
             "{backend: loky, jobs: 2, scheduler: 'tcp://a:1'}",
             'has scheduler "tcp://a:1" but backend loky; set backend: dask, or scheduler: ""',
@@ -182,7 +232,10 @@ def test_the_plant_has_distinct_named_signals_within_limits(load, old, new, sent
     ],
 )
 def test_a_cluster_needs_a_scheduler_and_one_machine_has_none(load, text, sentence):
-    assert load("execution: {backend: dask, jobs: 2, scheduler: 'tcp://a:1'}", Execution, "execution").backend == "dask"
+    assert (
+        load("execution: {backend: dask, jobs: 2, scheduler: 'tcp://a:1'}", Execution, "execution").backend
+        == "dask"
+    )
     with pytest.raises(ValueError, match=re.escape(sentence)):
         load(f"execution: {text}", Execution, "execution")
 
@@ -205,9 +258,18 @@ def test_a_section_may_stand_in_both_files_and_is_one(load, tmp_path):
     assert load(OWNER, expert=EXPERT) == load(GOOD)
     load(OWNER, expert=EXPERT)
     assert params.load(LearnKernel, "learn_kernel", tmp_path / "params.yaml").horizon == 6
-    assert params.read()["learn_kernel"] == {"method": "window", "progress": True, "horizon": 6, "gamma": 0.001, "levels": [0, 0.5]}
+    assert params.read()["learn_kernel"] == {
+        "method": "window",
+        "progress": True,
+        "horizon": 6,
+        "gamma": 0.001,
+        "levels": [0, 0.5],
+    }
     assert list(params.read()) == ["probe", "learn_kernel", "tracking"]
-    assert params.value("learn_kernel.horizon", one_of=(6,)) == 6 and params.value("probe.source", one_of=("recordings",)) == "recordings"
+    assert (
+        params.value("learn_kernel.horizon", one_of=(6,)) == 6
+        and params.value("probe.source", one_of=("recordings",)) == "recordings"
+    )
     assert params.home("learn_kernel.method") == params.home("probe") == "params.yaml"
     assert params.home("learn_kernel.levels") == params.home("tracking.gamma") == "params.expert.yaml"
     assert params.home("learn_kernel.colour") == params.home("learn_kernel.levels.0") == params.home("") == ""
@@ -228,34 +290,50 @@ def test_a_key_that_stands_in_both_files_is_refused(load, twice):
             ("", ""),
             "params.yaml: learn_kernel.metod is unknown; did you mean method?",
         ),
-        (("", ""), ("gamma: 1e-3", "gama: 1e-3"), "params.expert.yaml: learn_kernel.gama is unknown; did you mean gamma?"),
+        (
+            ("", ""),
+            ("gamma: 1e-3", "gama: 1e-3"),
+            "params.expert.yaml: learn_kernel.gama is unknown; did you mean gamma?",
+        ),
         (("", ""), ("1e-3", "2"), "params.expert.yaml: learn_kernel.gamma is 2 but must be less than 1"),
-        (("", ""), ("[0, 0.5]", "[0, 7]"), "params.expert.yaml: learn_kernel.levels[1] is 7 but must be at most 5"),
+        (
+            ("", ""),
+            ("[0, 0.5]", "[0, 7]"),
+            "params.expert.yaml: learn_kernel.levels[1] is 7 but must be at most 5",
+        ),
         (
             ("", ""),
             ("horizon: 6, ", ""),
-            "params.yaml or params.expert.yaml: learn_kernel.horizon is missing; add it (int, at least 1 and at most 20)",
+            "params.yaml or params.expert.yaml: learn_kernel.horizon is missing; "
+            "add it (int, at least 1 and at most 20)",
         ),
         (
             ("", ""),
             ("tracking:", "  tracking:"),
-            "params.expert.yaml: line 3: expected <block end>, but found '<block mapping start>'; mend the line: key: value, indented by spaces",
+            "params.expert.yaml: line 3: expected <block end>, but found '<block mapping start>'; "
+            "mend the line: key: value, indented by spaces",
         ),
         (
             ("", ""),
             ("learn_kernel: {horizon: 6, gamma: 1e-3, levels: [0, 0.5]}", "learn_kernel:"),
-            "params.expert.yaml: learn_kernel must be a section with keys below it but is null; indent its keys by two spaces",
+            "params.expert.yaml: learn_kernel must be a section with keys below it but is null; "
+            "indent its keys by two spaces",
         ),
     ],
 )
 def test_a_mistake_is_said_with_the_file_in_which_it_stands(load, owner, expert, sentence):
     assert owner[0] in OWNER and expert[0] in EXPERT
     with pytest.raises(ValueError, match=f"^{re.escape(sentence)}$"):
-        load(OWNER.replace(*owner) if owner[0] else OWNER, expert=EXPERT.replace(*expert) if expert[0] else EXPERT)
+        load(
+            OWNER.replace(*owner) if owner[0] else OWNER,
+            expert=EXPERT.replace(*expert) if expert[0] else EXPERT,
+        )
 
 
 def test_what_is_wrong_between_keys_of_both_files_names_both(load):
-    with pytest.raises(ValueError, match=r'^params.yaml and params.expert.yaml: execution has backend dask but scheduler ""'):
+    with pytest.raises(
+        ValueError, match=r'^params.yaml and params.expert.yaml: execution has backend dask but scheduler ""'
+    ):
         load("execution: {jobs: 2}", Execution, "execution", "execution: {backend: dask, scheduler: ''}")
 
 
@@ -263,12 +341,17 @@ def test_a_key_or_a_section_that_is_missing_says_where_it_is_looked_for(load):
     load(OWNER, expert=EXPERT)
     with pytest.raises(ValueError, match=r"^params.expert.yaml: tracking.gama is missing; is gamma meant\?$"):
         params.value("tracking.gama", one_of=(1,))
-    with pytest.raises(ValueError, match=r"^params.yaml: probe.source is \"recordings\" but must be one of simulated$"):
+    with pytest.raises(
+        ValueError, match=r"^params.yaml: probe.source is \"recordings\" but must be one of simulated$"
+    ):
         params.value("probe.source", one_of=("simulated",))
-    with pytest.raises(ValueError, match=r"^params.expert.yaml: section trackin is missing; is tracking meant\?$"):
+    with pytest.raises(
+        ValueError, match=r"^params.expert.yaml: section trackin is missing; is tracking meant\?$"
+    ):
         params.load(LearnKernel, "trackin")
     with pytest.raises(
-        ValueError, match=r"^params.yaml and params.expert.yaml: section colours is missing; add colours: with its keys below it$"
+        ValueError,
+        match=r"^params.yaml and params.expert.yaml: section colours is missing; add colours: with its keys below it$",
     ):
         params.load(LearnKernel, "colours")
     with pytest.raises(

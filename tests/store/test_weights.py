@@ -3,7 +3,11 @@ import pytest
 
 from pipeline.store.artifacts import read_weights, write_weights
 
-ARRAYS = {"head.bias": np.arange(3, dtype=np.float32), "adam.count": np.array(7), "key": np.array([1, 2**32 - 1], np.uint32)}
+ARRAYS = {
+    "head.bias": np.arange(3, dtype=np.float32),
+    "adam.count": np.array(7),
+    "key": np.array([1, 2**32 - 1], np.uint32),
+}
 
 
 def test_arrays_come_back_bit_for_bit_with_what_was_said_of_them(tmp_path):
@@ -24,12 +28,18 @@ def test_equal_arrays_give_equal_bytes_in_whatever_order_they_come(tmp_path):
 @pytest.mark.parametrize(
     "change, sentence",
     [
-        (lambda path: path.unlink(), "weights.safetensors is missing; make it again with ./run dvc repro train_agent"),
+        (
+            lambda path: path.unlink(),
+            "weights.safetensors is missing; make it again with ./run dvc repro train_agent",
+        ),
         (
             lambda path: path.write_bytes(path.read_bytes()[:-5]),
             "holds no whole weights .*; make it again with ./run dvc repro train_agent",
         ),
-        (lambda path: write_weights(path, "classifier 1", ARRAYS, {}), "should hold weights of agent 1 but has schema classifier 1; "),
+        (
+            lambda path: write_weights(path, "classifier 1", ARRAYS, {}),
+            "should hold weights of agent 1 but has schema classifier 1; ",
+        ),
     ],
 )
 def test_what_is_not_whole_or_of_another_learner_is_one_sentence(tmp_path, monkeypatch, change, sentence):

@@ -1,12 +1,16 @@
-"""Algorithm 2 in its published form, vectorised: Kronecker products z (x) z with every entry twice, and every iteration through all samples. Nothing is whitened,
-nothing is projected; it shares no line with pipeline/temperature/kernel.py, which is held against it."""
+"""Algorithm 2 in its published form, vectorised: Kronecker products z (x) z with every entry twice, and every
+iteration through all samples. Nothing is whitened, nothing is projected; it shares no line with
+pipeline/temperature/kernel.py, which is held against it."""
 
 import numpy as np
 import scipy.linalg
 
 
-def value_iteration(s, u, e, s_next, Q, R, gamma: float, *, mu: float, iterations: int) -> tuple[np.ndarray, np.ndarray]:
-    """H (k+m, k+m) and K (m, k) of u = -K s after H <- argmin sum (e'Qe + u'Ru + gamma z+'H z+ - z'H z)^2 + mu |H|^2 (34)-(36), from H = the fit of the stage cost.
+def value_iteration(
+    s, u, e, s_next, Q, R, gamma: float, *, mu: float, iterations: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """H (k+m, k+m) and K (m, k) of u = -K s after H <- argmin sum (e'Qe + u'Ru + gamma z+'H z+ - z'H z)^2 +
+    mu |H|^2 (34)-(36), from H = the fit of the stage cost.
 
     s (samples, k), u (samples, m), e (samples, p), s_next (samples, k); z = [s; u], z+ = [s_next; -K s_next].
     """

@@ -1,4 +1,5 @@
-"""What the tuning's candidates trade: the parts of an objective add up to it, and a history keeps them beside their candidates."""
+"""What the tuning's candidates trade: the parts of an objective add up to it,
+and a history keeps them beside their candidates."""
 
 import numpy as np
 import pytest
@@ -18,9 +19,22 @@ def test_error_and_effort_add_up_to_the_studys_objective(theta):
 def small():
     machine = plant.baam()
     scenarios = scorecard.panel(
-        [machine], starts=[20.0], references=[np.full(5, 150.0)], noise=[0.0], seeds=[1], steps=60, hold=5, cells=True
+        [machine],
+        starts=[20.0],
+        references=[np.full(5, 150.0)],
+        noise=[0.0],
+        seeds=[1],
+        steps=60,
+        hold=5,
+        cells=True,
     )
-    settings = {"gamma": GAMMA, "limits": (np.zeros(7), np.full(7, 100.0)), "band": 1.0, "integral": 0.02, "integral_limit": 1.0}
+    settings = {
+        "gamma": GAMMA,
+        "limits": (np.zeros(7), np.full(7, 100.0)),
+        "band": 1.0,
+        "integral": 0.02,
+        "integral_limit": 1.0,
+    }
     return machine, scenarios, settings
 
 
@@ -29,7 +43,9 @@ def test_a_candidates_trade_is_that_of_its_run_and_a_fragile_one_fails():
     theta = np.append(np.ones(12), 1.0)
     run = engineering.deployed(machine, scenarios, least_disk_margin=0.0, **settings)
     found = engineering.trade(run(theta))
-    assert found == engineering.Trade(float(run(theta).tracking_degC.mean()), float(run(theta).effort_percent.mean()))
+    assert found == engineering.Trade(
+        float(run(theta).tracking_degC.mean()), float(run(theta).effort_percent.mean())
+    )
     # weights that spare the heaters take less of them, and more error
     spared = engineering.trade(run(np.concatenate([np.full(5, 0.01), np.full(7, 10.0), [1.0]])))
     assert spared.effort_percent < found.effort_percent and spared.tracking_degC > found.tracking_degC
@@ -50,7 +66,9 @@ def test_the_optimum_is_the_run_whose_cost_no_controller_undercuts():
 
 def test_a_history_has_each_candidates_trade_and_marks_the_chosen_one():
     theta = np.array([[1.0], [2.0], [3.0]])
-    history = tuning.History(theta, np.array([5.0, np.nan, 4.0]), ("", "unstable", ""), np.array([5.0, 5.0, 4.0]))
+    history = tuning.History(
+        theta, np.array([5.0, np.nan, 4.0]), ("", "unstable", ""), np.array([5.0, 5.0, 4.0])
+    )
     columns = engineering.histories(
         {"practical": tuning.Result(theta[2], 4.0, history)},
         {"practical": [engineering.Trade(1.0, 2.0), None, engineering.Trade(3.0, 4.0)]},

@@ -8,7 +8,9 @@ def test_response_to_a_step_is_the_textbook_one_also_for_a_fraction_of_a_sample_
     u = np.r_[0.0, np.ones(40)]
     y = response(u, time_constant_s=5.0, delay_s=2.3, sample_time_s=1.0)
     t = np.arange(41.0) - 1.0 - 2.3
-    np.testing.assert_allclose(y, np.where(t > 0, 1 - np.exp(-t / 5.0), 0.0), atol=1e-12)  # exact discretisation: rounding only
+    np.testing.assert_allclose(
+        y, np.where(t > 0, 1 - np.exp(-t / 5.0), 0.0), atol=1e-12
+    )  # exact discretisation: rounding only
 
 
 def test_a_noise_free_record_gives_its_own_constants_back():
@@ -16,14 +18,19 @@ def test_a_noise_free_record_gives_its_own_constants_back():
     y = 7.0 + 1.5 * (response(u, 8.0, 3.4, 0.5))
     model = fit_record([u], [y], sample_time_s=0.5)
     # limited by the finite differences of the search, not by the data
-    np.testing.assert_allclose([model.gain, model.time_constant_s, model.delay_s, model.offset], [1.5, 8.0, 3.4, 7.0], rtol=1e-4)
+    np.testing.assert_allclose(
+        [model.gain, model.time_constant_s, model.delay_s, model.offset], [1.5, 8.0, 3.4, 7.0], rtol=1e-4
+    )
 
 
 def test_true_constants_lie_within_four_deviations_under_noise():
     u = np.tile(np.repeat([0.0, 10.0], 80), 4)
     y = 20.0 + 0.8 * response(u, 12.0, 4.0, 1.0) + 0.3 * np.random.default_rng(5).standard_normal(len(u))
     model = fit_record([u], [y], sample_time_s=1.0)
-    z = np.abs(np.subtract([0.8, 12.0, 4.0], [model.gain, model.time_constant_s, model.delay_s])) / model.deviations
+    z = (
+        np.abs(np.subtract([0.8, 12.0, 4.0], [model.gain, model.time_constant_s, model.delay_s]))
+        / model.deviations
+    )
     assert (z < 4).all()  # four deviations: one in 5,000 by chance
 
 
@@ -38,7 +45,10 @@ def test_masked_samples_do_not_move_the_fit():
 
 def test_two_segments_share_one_model_and_have_their_own_start():
     u = [np.repeat([0.0, 1.0], 50), np.repeat([1.0, 0.0], 50)]
-    y = [2.0 * response(u[0], 6.0, 1.0, 1.0), 2.0 + 2.0 * response(u[1], 6.0, 1.0, 1.0) + 3.0 * np.exp(-np.arange(100) / 6.0)]
+    y = [
+        2.0 * response(u[0], 6.0, 1.0, 1.0),
+        2.0 + 2.0 * response(u[1], 6.0, 1.0, 1.0) + 3.0 * np.exp(-np.arange(100) / 6.0),
+    ]
     model = fit_record(u, y, sample_time_s=1.0)
     np.testing.assert_allclose([model.gain, model.time_constant_s, model.delay_s], [2.0, 6.0, 1.0], rtol=1e-4)
 
@@ -49,7 +59,9 @@ def test_up_and_downward_steps_are_told_apart():
     y = np.r_[up, up[-1] + response(np.repeat([1.0, 0.0], 100), 15.0, 2.0, 1.0)[100:]]
     first, second = fit_steps(u, y, sample_time_s=1.0)
     assert (first.step, second.step) == (1.0, -1.0)
-    np.testing.assert_allclose([first.model.time_constant_s, second.model.time_constant_s], [5.0, 15.0], rtol=1e-3)
+    np.testing.assert_allclose(
+        [first.model.time_constant_s, second.model.time_constant_s], [5.0, 15.0], rtol=1e-3
+    )
 
 
 def test_a_step_counts_only_as_long_as_the_other_inputs_stand_still():
@@ -57,17 +69,25 @@ def test_a_step_counts_only_as_long_as_the_other_inputs_stand_still():
     y = response(u, 5.0, 2.0, 1.0) + 3.0 * response(other, 5.0, 2.0, 1.0)
     (step,) = fit_steps(u, y, sample_time_s=1.0, others=other[:, None])
     np.testing.assert_allclose([step.model.gain, step.model.time_constant_s], [1.0, 5.0], rtol=1e-3)
-    assert abs(fit_steps(u, y, sample_time_s=1.0)[0].model.gain - 1.0) > 1.0  # blind to the other input, its effect is taken for u's
+    assert (
+        abs(fit_steps(u, y, sample_time_s=1.0)[0].model.gain - 1.0) > 1.0
+    )  # blind to the other input, its effect is taken for u's
 
 
 def test_each_step_of_the_two_heater_kit_says_what_its_hold_can_say(shared):
-    record = np.genfromtxt(shared("data/tclab_apmonitor/energy_balance_mimo.csv"), delimiter=",", skip_header=1)
+    record = np.genfromtxt(
+        shared("data/tclab_apmonitor/energy_balance_mimo.csv"), delimiter=",", skip_header=1
+    )
     u, y = record[:, 1:3], record[:, 3:5]
     steps = fit_steps(u[:, 1], y[:, 1], sample_time_s=1.0, others=u[:, :1])
     assert [step.step for step in steps] == [50.0, 30.0, -70.0]
     assert all(step.model.fit_percent > 88 for step in steps)
-    gains, deviations = ([value(step.model) for step in steps] for value in (lambda model: model.gain, lambda model: model.deviations[0]))
-    # holds of 100 s against time constants of 150 to 350 s: the gains agree, 0.23 to 0.29 °C per percent, within three of their wide deviations
+    gains, deviations = (
+        [value(step.model) for step in steps]
+        for value in (lambda model: model.gain, lambda model: model.deviations[0])
+    )
+    # holds of 100 s against time constants of 150 to 350 s: the gains agree, 0.23 to 0.29 °C per percent,
+    # within three of their wide deviations
     assert all(abs(gain - 0.27) < 3 * deviation for gain, deviation in zip(gains, deviations, strict=True))
 
 

@@ -9,7 +9,13 @@ from pipeline.temperature.order import dead_time, with_delays
 from pipeline.temperature.plant import baam, markov_parameters, plant, simulate
 from pipeline.temperature.probing import study_probe, study_signal
 from pipeline.temperature.published import K_DATA
-from pipeline.temperature.refinement import estimate_state, kalman_gain, linear_recurrence, refine, simulation_form
+from pipeline.temperature.refinement import (
+    estimate_state,
+    kalman_gain,
+    linear_recurrence,
+    refine,
+    simulation_form,
+)
 from pipeline.temperature.subspace import lagged
 from pipeline.temperature.validation import simulated
 
@@ -25,7 +31,8 @@ def markov_error_of(found, true):
 
 
 def two_zones(T=3000, noise=0.05, seed=0, offset=20.0):
-    """A stable 2-input 2-output plant of order 3 under random two-level inputs, its output in °C about `offset`."""
+    """A stable 2-input 2-output plant of order 3 under random
+    two-level inputs, its output in °C about `offset`."""
     rng = np.random.default_rng(seed)
     true = plant(
         [[0.95, 0.03, 0.0], [0.02, 0.9, 0.05], [0.0, 0.0, 0.7]],
@@ -40,10 +47,13 @@ def two_zones(T=3000, noise=0.05, seed=0, offset=20.0):
 
 
 def probed(seed, noise, T=15000):
-    """A record of the study's plant under its own probing, frequencies drawn anew at every step as the authors' script does."""
+    """A record of the study's plant under its own probing, frequencies drawn
+    anew at every step as the authors' script does."""
     rng = np.random.default_rng(seed)
     signal = study_signal(rng, T, 7, amplitudes=np.arange(100.0, 0.0, -10.0), bandwidth=1.65, variance=1.5)
-    found = study_probe(baam(), signal, K_DATA, x0=np.full(6, 50.0), noise=noise * rng.standard_normal((T, 5)))
+    found = study_probe(
+        baam(), signal, K_DATA, x0=np.full(6, 50.0), noise=noise * rng.standard_normal((T, 5))
+    )
     return found.u, found.y
 
 
@@ -56,17 +66,25 @@ def hair_dryer(shared):
 def printed(path, label, rows):
     lines = path.read_text().splitlines()
     at = next(i for i, line in enumerate(lines) if label in line) + 1
-    return np.array([float(number) for line in lines[at : at + rows] for number in re.findall(r"-?\d+\.\d+", line)])
+    return np.array(
+        [float(number) for line in lines[at : at + rows] for number in re.findall(r"-?\d+\.\d+", line)]
+    )
 
 
 def test_moesp_singular_values_are_those_that_slicot_prints(hair_dryer, shared):
     expected = printed(shared("data/slicot_reference/IB01AD.res"), "singular values", 2)
     # the bar; the print has four decimals, 5e-5 of the smallest value shown is 1e-3 of it
-    np.testing.assert_allclose(moesp_singular_values([hair_dryer[0]], [hair_dryer[1]], 15)[:8], expected[:8], rtol=1e-3)
+    np.testing.assert_allclose(
+        moesp_singular_values([hair_dryer[0]], [hair_dryer[1]], 15)[:8], expected[:8], rtol=1e-3
+    )
 
 
 def test_moesp_poles_are_those_of_slicots_printed_matrix(hair_dryer, shared):
-    expected = np.sort_complex(np.linalg.eigvals(printed(shared("data/slicot_reference/IB01BD.res"), "state matrix A", 4).reshape(4, 4)))
+    expected = np.sort_complex(
+        np.linalg.eigvals(
+            printed(shared("data/slicot_reference/IB01BD.res"), "state matrix A", 4).reshape(4, 4)
+        )
+    )
     found = np.sort_complex(np.linalg.eigvals(moesp([hair_dryer[0]], [hair_dryer[1]], 15, 4)[0].A))
     np.testing.assert_allclose(found, expected, atol=2e-3)  # A is printed to four decimals
 
@@ -79,7 +97,9 @@ def test_moesp_poles_are_those_of_slicots_printed_matrix(hair_dryer, shared):
         ("glassfurnace", slice(1, 4), slice(4, 10), 10, 5, 0.496),
     ],
 )
-def test_moesp_simulates_the_benchmark_sets_as_well_as_slicot(shared, name, inputs, outputs, block_rows, order, published):
+def test_moesp_simulates_the_benchmark_sets_as_well_as_slicot(
+    shared, name, inputs, outputs, block_rows, order, published
+):
     record = np.loadtxt(shared(f"data/daisy_a/{name}.dat"))
     u, y = record[:, inputs], record[:, outputs]
     found, x0 = moesp([u], [y], block_rows, order)
@@ -90,7 +110,11 @@ def test_moesp_simulates_the_benchmark_sets_as_well_as_slicot(shared, name, inpu
 def test_a_noise_free_record_gives_the_plant_back_to_rounding(shared):
     from pyarrow import parquet
 
-    record = parquet.read_table(shared("data/paper_reference/probing_log_seed1.parquet")).to_pandas().to_numpy()[1:]
+    record = (
+        parquet.read_table(shared("data/paper_reference/probing_log_seed1.parquet"))
+        .to_pandas()
+        .to_numpy()[1:]
+    )
     found = identify([record[:, :7]], [record[:, 7:]], sample_time_s=1.0)
     assert found.order == 6
     assert markov_error(found.plant, baam()) <= 1e-10  # the bar; measured 1e-12
@@ -142,7 +166,10 @@ def test_varx_coefficients_are_those_of_plain_least_squares_over_two_segments_wi
 
 def test_fast_moments_and_the_rows_themselves_give_the_same_factor():
     _, u, y = two_zones(500)
-    fast, exact = lagged([u[:200], u[200:]], [y[:200], y[200:]], 5), lagged([u[:200], u[200:]], [y[:200], y[200:]], 5, exact=True)
+    fast, exact = (
+        lagged([u[:200], u[200:]], [y[:200], y[200:]], 5),
+        lagged([u[:200], u[200:]], [y[:200], y[200:]], 5, exact=True),
+    )
     S = exact.R.T @ exact.R
     np.testing.assert_allclose(fast.R.T @ fast.R, S, atol=1e-10 * np.abs(S).max())  # rounding of 500 rows
 
@@ -154,13 +181,17 @@ def test_the_offset_of_the_room_is_found_and_moves_with_it():
     np.testing.assert_allclose(
         markov_parameters(cold.plant, 50), markov_parameters(warm.plant, 50), atol=1e-7
     )  # rounding of 300 °C squared
-    np.testing.assert_allclose(simulated(warm.plant, u, y + 300.0) - simulated(cold.plant, u, y), 300.0, atol=1e-4)
+    np.testing.assert_allclose(
+        simulated(warm.plant, u, y + 300.0) - simulated(cold.plant, u, y), 300.0, atol=1e-4
+    )
 
 
 def test_results_do_not_depend_on_the_units_of_the_input():
     _, u, y = two_zones()
     percent, duty = identify([u], [y], sample_time_s=1.0), identify([u / 100], [y], sample_time_s=1.0)
-    np.testing.assert_allclose(markov_parameters(duty.plant, 30), 100 * markov_parameters(percent.plant, 30), rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(
+        markov_parameters(duty.plant, 30), 100 * markov_parameters(percent.plant, 30), rtol=1e-5, atol=1e-7
+    )
 
 
 def test_closed_loop_data_are_identified_without_the_bias_of_feedback():
@@ -174,7 +205,9 @@ def test_closed_loop_data_are_identified_without_the_bias_of_feedback():
         x = 0.9 * x + 0.1 * u[t, 0] + 0.4 * e
     found = identify([u], [y], sample_time_s=1.0, order=1).plant
     h = markov_parameters(found, 5)[:, 0, 0]
-    np.testing.assert_allclose(h, 0.1 * 0.9 ** np.arange(5), rtol=0.05)  # 20,000 samples: 1 % of deviation, the feedback's bias is 30 %
+    np.testing.assert_allclose(
+        h, 0.1 * 0.9 ** np.arange(5), rtol=0.05
+    )  # 20,000 samples: 1 % of deviation, the feedback's bias is 30 %
     np.testing.assert_allclose(found.C @ found.K, true.K, atol=0.05)
 
 
@@ -187,7 +220,9 @@ def test_a_dead_time_is_found_and_becomes_a_chain_of_states():
     found = identify([u], [y], sample_time_s=1.0)
     assert (found.order, found.delays) == (1, (4,))
     assert "dead time of u1: 4 samples beyond the one of sampling" in found.notes
-    np.testing.assert_allclose(markov_parameters(found.plant, 20), markov_parameters(true, 20), atol=5e-3)  # 0.01 of noise, 2,000 samples
+    np.testing.assert_allclose(
+        markov_parameters(found.plant, 20), markov_parameters(true, 20), atol=5e-3
+    )  # 0.01 of noise, 2,000 samples
 
 
 def test_a_refit_keeps_what_was_chosen_and_uses_the_whole_record():
@@ -197,7 +232,12 @@ def test_a_refit_keeps_what_was_chosen_and_uses_the_whole_record():
     y = simulate(true, u, np.zeros(5))[1] + 0.05 * rng.standard_normal((2000, 1))
     chosen = identify([u[:1000]], [y[:1000]], sample_time_s=2.0, refinement="validated")
     found = refit([u], [y], chosen)
-    assert (found.order, found.past, found.delays, found.fit) == (chosen.order, chosen.past, chosen.delays, chosen.fit)
+    assert (found.order, found.past, found.delays, found.fit) == (
+        chosen.order,
+        chosen.past,
+        chosen.delays,
+        chosen.fit,
+    )
     assert found.plant.sample_time_s == 2.0
     assert found.rows > chosen.rows
     same = refit([u[:1000]], [y[:1000]], chosen).plant
@@ -225,7 +265,9 @@ def test_the_initial_state_is_found_around_masked_samples():
     y[::7] = np.nan
     model = simulation_form(true, [])
     found = estimate_state(model, np.hstack([u, np.ones((200, 1))]), y)
-    np.testing.assert_allclose(found, [1.0, -2.0, 3.0], atol=1e-8)  # rounding through an observability matrix of condition 1e3
+    np.testing.assert_allclose(
+        found, [1.0, -2.0, 3.0], atol=1e-8
+    )  # rounding through an observability matrix of condition 1e3
 
 
 def test_a_refined_plant_stays_within_the_radius_that_was_asked_for():
@@ -240,7 +282,8 @@ def test_masked_samples_are_counted_and_do_not_bend_the_plant():
     whole = identify([u], [y], sample_time_s=1.0, order=3)
     y[699:703], u[2000] = np.nan, np.nan
     found = identify([u], [y], sample_time_s=1.0, order=3)
-    # 0.05 of noise over 3,000 samples moves the plant by some tenths of a per cent; the spike, left in, by several times that
+    # 0.05 of noise over 3,000 samples moves the plant by some tenths of a
+    # per cent; the spike, left in, by several times that
     assert markov_error_of(found.plant, true) < 0.01 < markov_error_of(whole.plant, true)
     assert found.dropped_rows == 4 + found.past + 1
     assert len(found.x0) == 2
@@ -263,14 +306,18 @@ def test_a_constant_input_is_named():
 
 def test_a_collinear_input_is_named_with_the_ones_that_it_follows():
     _, u, y = two_zones(300)
-    with pytest.raises(ValueError, match="input u3 is a linear combination of u1, so its column of B is not identified"):
+    with pytest.raises(
+        ValueError, match="input u3 is a linear combination of u1, so its column of B is not identified"
+    ):
         identify([np.column_stack([u, 2 * u[:, 0] + 5])], [y], sample_time_s=1.0)
 
 
 def test_a_record_that_is_too_short_says_how_many_samples_more():
     _, u, y = two_zones(300)
     # order 6 of 2 outputs: 4 lags of 4 signals, six samples for each of 16 unknowns
-    with pytest.raises(ValueError, match="expected at least 96 complete samples, found 40; record 56 samples more"):
+    with pytest.raises(
+        ValueError, match="expected at least 96 complete samples, found 40; record 56 samples more"
+    ):
         identify([u[:40]], [y[:40]], sample_time_s=1.0, order=6)
 
 
@@ -292,13 +339,17 @@ def test_an_output_that_never_moves_is_named():
 
 def test_a_record_without_one_complete_sample_is_called_empty():
     _, u, y = two_zones(300)
-    with pytest.raises(ValueError, match="the record is empty: no sample has all inputs beside at least one output"):
+    with pytest.raises(
+        ValueError, match="the record is empty: no sample has all inputs beside at least one output"
+    ):
         identify([u], [np.full_like(y, np.nan)], sample_time_s=1.0)
 
 
 def test_segments_shorter_than_the_window_say_what_is_missing():
     _, u, y = two_zones(600)
-    with pytest.raises(ValueError, match="too short for a window of 12 samples: the longest complete stretch has 10"):
+    with pytest.raises(
+        ValueError, match="too short for a window of 12 samples: the longest complete stretch has 10"
+    ):
         cut = np.arange(0, 600, 10)
         identify([u[i : i + 10] for i in cut], [y[i : i + 10] for i in cut], sample_time_s=1.0, past=12)
 
@@ -306,14 +357,18 @@ def test_segments_shorter_than_the_window_say_what_is_missing():
 def test_an_order_beyond_what_the_record_determines_is_said_so():
     _, u, y = two_zones(1000, noise=2.0)
     assert any(
-        note.startswith("order 12 was asked but the record determines") for note in identify([u], [y], sample_time_s=1.0, order=12).notes
+        note.startswith("order 12 was asked but the record determines")
+        for note in identify([u], [y], sample_time_s=1.0, order=12).notes
     )
 
 
 def test_an_input_that_no_output_answers_is_named():
     _, u, y = two_zones(1500)
     found = identify(
-        [np.column_stack([u, np.random.default_rng(9).standard_normal(1500)])], [y], sample_time_s=1.0, names=["h1", "h2", "fan"]
+        [np.column_stack([u, np.random.default_rng(9).standard_normal(1500)])],
+        [y],
+        sample_time_s=1.0,
+        names=["h1", "h2", "fan"],
     )
     assert found.silent == (False, False, True)
     assert "no output answers fan (99.9 %): leave it out, or excite it more" in found.notes
@@ -321,10 +376,13 @@ def test_an_input_that_no_output_answers_is_named():
 
 def test_an_actuator_asked_beyond_its_limit_is_taken_at_its_limit():
     true, u, _ = two_zones(2000)
-    y = simulate(true, np.clip(u, 0.0, 10.0), np.zeros(3))[1] + 0.05 * np.random.default_rng(3).standard_normal((2000, 2))
+    y = simulate(true, np.clip(u, 0.0, 10.0), np.zeros(3))[1] + 0.05 * np.random.default_rng(
+        3
+    ).standard_normal((2000, 2))
     bent = identify([u], [y], sample_time_s=1.0, order=3)
     found = identify([u], [y], sample_time_s=1.0, order=3, limits=([0.0, 0.0], [10.0, 10.0]))
-    # u is either 0 or 10 with deviation 1, so half of that is clipped away: part of what the unclipped input says is not so
+    # u is either 0 or 10 with deviation 1, so half of that is clipped
+    # away: part of what the unclipped input says is not so
     assert markov_error_of(found.plant, true) < 0.01 < markov_error_of(bent.plant, true)
     assert found.notes[0].startswith("u1 was asked beyond 0..10 in ")
 
@@ -358,9 +416,11 @@ def test_the_gain_fitted_to_a_moesp_plant_is_slicots_kalman_gain(hair_dryer, sha
     )
     found = kalman_gain(moesp([hair_dryer[0]], [hair_dryer[1]], 15, 4)[0], [hair_dryer[0]], [hair_dryer[1]])
     expected, response = (
-        [(P @ np.linalg.matrix_power(M, k) @ G)[0, 0] for k in range(4)] for P, M, G in ((C, A, K), (found.C, found.A, found.K))
+        [(P @ np.linalg.matrix_power(M, k) @ G)[0, 0] for k in range(4)]
+        for P, M, G in ((C, A, K), (found.C, found.A, found.K))
     )
-    # SLICOT solves a Riccati equation on estimated covariances, ours minimises the one-step errors: two estimates of one gain, 1000 samples
+    # SLICOT solves a Riccati equation on estimated covariances, ours minimises the one-step errors: two
+    # estimates of one gain, 1000 samples
     np.testing.assert_allclose(response, expected, rtol=0.04)
     assert np.abs(np.linalg.eigvals(found.A - found.K @ found.C)).max() < 1
 
@@ -376,7 +436,9 @@ def test_a_plant_comes_in_innovation_form():
     found = identify([u], [y], sample_time_s=1.0, order=2, past=15).plant
     response = [(found.C @ np.linalg.matrix_power(found.A, k) @ found.K)[0, 0] for k in range(4)]
     # 6,000 samples: a hundredth or two on each
-    np.testing.assert_allclose(response, [(true.C @ np.linalg.matrix_power(true.A, k) @ true.K)[0, 0] for k in range(4)], atol=0.06)
+    np.testing.assert_allclose(
+        response, [(true.C @ np.linalg.matrix_power(true.A, k) @ true.K)[0, 0] for k in range(4)], atol=0.06
+    )
 
 
 def test_an_unstable_plant_has_a_gain_that_predicts_it():
@@ -394,7 +456,8 @@ def test_an_unstable_plant_has_a_gain_that_predicts_it():
 def test_a_refined_plant_may_keep_a_pole_that_grows_no_more_than_the_record_can_show():
     u, y = probed(3, 0.1, T=6000)
     found = identify([u], [y], sample_time_s=1.0, order=6, past=24, refinement="simulation")
-    # the study's plant has its largest pole at 1.0000029; drawn inside the circle it costs the refinement its convergence (2.4e-3)
+    # the study's plant has its largest pole at 1.0000029; drawn inside the circle
+    # it costs the refinement its convergence (2.4e-3)
     assert markov_error(found.plant, baam()) < 5e-4
     assert np.abs(np.linalg.eigvals(found.plant.A)).max() < 1.0005
 
@@ -407,13 +470,16 @@ def test_every_pole_stays_within_the_radius_asked():
 
 
 def damaged(rng):
-    """A record of random shape, scale and damage: masked samples, constant and doubled columns, short segments."""
+    """A record of random shape, scale and damage: masked samples,
+    constant and doubled columns, short segments."""
     m, p = (int(n) for n in rng.integers(1, 5, 2))
     A, B, C = np.diag(rng.uniform(-0.5, 1.01, 3)), rng.standard_normal((3, m)), rng.standard_normal((p, 3))
     us, ys = [], []
     for T in rng.choice([2, 8, 60, 150, 300], int(rng.integers(1, 4))):
         u = rng.integers(0, 2, (T // 5 + 1, m)).repeat(5, axis=0)[:T].astype(float)
-        y = simulate(plant(A, B, C), u, np.zeros(3))[1] + rng.choice([0.0, 1e-6, 0.1]) * rng.standard_normal((T, p))
+        y = simulate(plant(A, B, C), u, np.zeros(3))[1] + rng.choice([0.0, 1e-6, 0.1]) * rng.standard_normal(
+            (T, p)
+        )
         us.append(u * 10.0 ** rng.integers(-9, 10, m))
         ys.append(y * 10.0 ** rng.integers(-9, 10, p))
     kind = rng.integers(6)
@@ -437,7 +503,9 @@ def test_any_damaged_record_gives_a_finite_plant_or_one_sentence(seeds):
         rng = np.random.default_rng(seed)
         us, ys = damaged(rng)
         try:
-            found = identify(us, ys, sample_time_s=1.0, feedthrough=None, refinement=str(rng.choice(["none", "validated"])))
+            found = identify(
+                us, ys, sample_time_s=1.0, feedthrough=None, refinement=str(rng.choice(["none", "validated"]))
+            )
             assert all(np.isfinite(M).all() for M in found.plant[:7])
         except np.linalg.LinAlgError:
             raise

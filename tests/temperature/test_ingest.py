@@ -34,7 +34,11 @@ def recording(path: Path, seed: int, samples: int = 120) -> Path:
     """A heater that is switched now and then, and the zone that follows it, with noise."""
     rng = np.random.default_rng(seed)
     heater = np.repeat(rng.choice([20.0, 40.0], size=-(-samples // 15)), 15)[:samples]
-    zone = 20 + np.convolve(heater, 0.02 * 0.95 ** np.arange(samples))[:samples] + 0.05 * rng.standard_normal(samples)
+    zone = (
+        20
+        + np.convolve(heater, 0.02 * 0.95 ** np.arange(samples))[:samples]
+        + 0.05 * rng.standard_normal(samples)
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
     artifacts.write_csv(path, {"time_s": np.arange(samples, dtype=float), "heater": heater, "zone": zone})
     return path
@@ -46,9 +50,13 @@ def folder(root: Path, count: int) -> Path:
     return root / "raw"
 
 
-def ingested(raw: Path, out: Path, execution=INLINE, job=JOB, memo: Path | None = None, strict: bool = False) -> dict:
+def ingested(
+    raw: Path, out: Path, execution=INLINE, job=JOB, memo: Path | None = None, strict: bool = False
+) -> dict:
     """What the stage does with a folder; the tables land in `out` for a look at their bytes."""
-    record, quality, metrics = collect(process(raw, job, execution, memo=memo or out / "memo"), MACHINE, strict=strict)
+    record, quality, metrics = collect(
+        process(raw, job, execution, memo=memo or out / "memo"), MACHINE, strict=strict
+    )
     artifacts.write_table(out / "record.parquet", record.schema, record.columns)
     artifacts.write_table(out / "quality.parquet", quality.schema, quality.columns)
     artifacts.write_json(out / "metrics.json", metrics)
@@ -147,7 +155,9 @@ process(Path(sys.argv[1]), JOB, INLINE, memo=Path(sys.argv[2]))
 @pytest.mark.parametrize("tables_before", [2, 3])
 def test_a_killed_run_leaves_whole_entries_only_and_they_are_kept(tmp_path, root, tables_before):
     raw, memo = folder(tmp_path, 3), tmp_path / "memo"
-    ended = subprocess.run([sys.executable, "-c", KILLED, raw, memo, str(tables_before)], cwd=root, check=False)
+    ended = subprocess.run(
+        [sys.executable, "-c", KILLED, raw, memo, str(tables_before)], cwd=root, check=False
+    )
     assert ended.returncode == -signal.SIGKILL
     assert done(ingested(raw, tmp_path / "after", memo=memo)) == (2, 1, 0)
     ingested(raw, tmp_path / "fresh")
@@ -189,7 +199,9 @@ def test_strict_and_a_folder_of_broken_recordings_alone_end_with_the_first_reaso
     (raw / "000.csv").unlink()
     with pytest.raises(ValueError, match=r"backwards\.csv.*\(2 of 2 recordings are broken\)"):
         ingested(raw, tmp_path)
-    with pytest.raises(ValueError, match=r"expected at least one recording \(CSV, Parquet or MCAP\), found none"):
+    with pytest.raises(
+        ValueError, match=r"expected at least one recording \(CSV, Parquet or MCAP\), found none"
+    ):
         ingested(tmp_path / "nothing", tmp_path)
 
 
@@ -199,14 +211,18 @@ def test_a_copy_of_a_recording_is_quarantined_for_it_would_count_twice(tmp_path)
     (raw / "copy.csv").write_bytes((raw / "001.csv").read_bytes())
     assert done(ingested(raw, tmp_path / "after", memo=tmp_path / "before/memo")) == (0, 2, 1)
     assert tables(tmp_path / "after")[0] == tables(tmp_path / "before")[0]
-    with pytest.raises(ValueError, match=r"copy\.csv is 001\.csv once more, byte for byte; remove one of the two"):
+    with pytest.raises(
+        ValueError, match=r"copy\.csv is 001\.csv once more, byte for byte; remove one of the two"
+    ):
         ingested(raw, tmp_path / "after", strict=True)
 
 
 def test_two_devices_in_one_recording_are_quarantined_with_the_place_and_in_a_part_of_it_masked(tmp_path):
     def mixed(path: Path, start: int) -> None:
         found = np.genfromtxt(recording(path, seed=1, samples=600), delimiter=",", names=True)
-        zone = np.where((np.arange(600) >= start) & (np.arange(600) % 2 == 0), found["zone"] + 9, found["zone"])
+        zone = np.where(
+            (np.arange(600) >= start) & (np.arange(600) % 2 == 0), found["zone"] + 9, found["zone"]
+        )
         artifacts.write_csv(path, {"time_s": found["time_s"], "heater": found["heater"], "zone": zone})
 
     raw = folder(tmp_path, 1)
@@ -214,18 +230,29 @@ def test_two_devices_in_one_recording_are_quarantined_with_the_place_and_in_a_pa
     mixed(raw / "end.csv", 450)
     assert done(ingested(raw, tmp_path)) == (2, 0, 1)
     quality = artifacts.read_table(tmp_path / "quality.parquet", ingest.tables.QUALITY)
-    found = {(str(quality["recording"][i]), str(quality["kind"][i])): str(quality["message"][i]) for i in range(len(quality["kind"]))}
-    assert "from 0 to 599 s, masked: two devices seem to write under one name" in found["all.csv", "quarantined"]
+    found = {
+        (str(quality["recording"][i]), str(quality["kind"][i])): str(quality["message"][i])
+        for i in range(len(quality["kind"]))
+    }
+    assert (
+        "from 0 to 599 s, masked: two devices seem to write under one name" in found["all.csv", "quarantined"]
+    )
     assert "to 599 s, masked: two devices" in found["end.csv", "mixed"]
-    record = artifacts.read_table(tmp_path / "record.parquet", ingest.tables.record(MACHINE.inputs, MACHINE.outputs))
+    record = artifacts.read_table(
+        tmp_path / "record.parquet", ingest.tables.record(MACHINE.inputs, MACHINE.outputs)
+    )
     masked = record["zone_masked"][record["recording"] == "end.csv"]
     assert masked[-150:].all()
     assert not masked[:400].any()
 
 
 def test_a_mapping_that_names_no_signal_gives_the_nearest_names(tmp_path):
-    with pytest.raises(ValueError, match=r"ingest\.mapping\.zoone is no signal of the plant; the nearest names are zone"):
-        ingested(folder(tmp_path, 1), tmp_path, job=JOB._replace(mapping={"zoone": ("zone", "degC", 1.0, 0.0)}))
+    with pytest.raises(
+        ValueError, match=r"ingest\.mapping\.zoone is no signal of the plant; the nearest names are zone"
+    ):
+        ingested(
+            folder(tmp_path, 1), tmp_path, job=JOB._replace(mapping={"zoone": ("zone", "degC", 1.0, 0.0)})
+        )
 
 
 # ---- more than one process
@@ -252,7 +279,9 @@ def test_a_dask_cluster_of_two_workers_gives_the_bytes_of_one_machine(tmp_path, 
     broken(raw)
     monkeypatch.chdir(tmp_path)  # as the stage names them: relative paths
     ingested(Path("raw"), Path("one"))
-    ingested(Path("raw"), Path("cluster"), params.Execution(backend="dask", jobs=2, scheduler=cluster.address))
+    ingested(
+        Path("raw"), Path("cluster"), params.Execution(backend="dask", jobs=2, scheduler=cluster.address)
+    )
     for name in NAMES:
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "cluster" / name).read_bytes()
 
@@ -261,7 +290,10 @@ def test_what_the_cluster_computes_for_a_stage_is_what_this_machine_computes(clu
     """The judging of learners on noisy data sets, as evaluate_temperature spreads it."""
     rng = np.random.default_rng(0)
     sets_u, sets_y = study.data_sets(rng, 1500, 2)
-    calls = [joblib.delayed(study.under_noise)(sets_u[:, i], sets_y[:, i], noise=0.01, seed=i, longest=6) for i in range(2)]
+    calls = [
+        joblib.delayed(study.under_noise)(sets_u[:, i], sets_y[:, i], noise=0.01, seed=i, longest=6)
+        for i in range(2)
+    ]
     here = list(run_all(calls, INLINE))
     assert list(run_all(calls, params.Execution(backend="dask", jobs=2, scheduler=cluster.address))) == here
     assert len(here) == 2
@@ -285,9 +317,13 @@ def test_a_worker_killed_at_its_work_costs_nothing_but_time(tmp_path, cluster):
     # the second worker is killed as soon as anything is in the memo, with most of the work before it
     memo = tmp_path / "cluster/memo"
     memo.mkdir(parents=True)
-    killer = subprocess.Popen([sys.executable, "-c", KILLER, memo, str(cluster.workers[1].pid)], stdout=subprocess.PIPE)
+    killer = subprocess.Popen(
+        [sys.executable, "-c", KILLER, memo, str(cluster.workers[1].pid)], stdout=subprocess.PIPE
+    )
     ingested(raw, tmp_path / "cluster", params.Execution(backend="dask", jobs=2, scheduler=cluster.address))
-    assert int(killer.communicate(timeout=60)[0]) < 6  # entries that were whole when it died: there was work left
+    assert (
+        int(killer.communicate(timeout=60)[0]) < 6
+    )  # entries that were whole when it died: there was work left
     cluster.workers[1].join(timeout=60)
     assert cluster.workers[1].exitcode == -signal.SIGKILL
     assert cluster.workers[0].is_alive()
@@ -299,6 +335,11 @@ def test_a_worker_killed_at_its_work_costs_nothing_but_time(tmp_path, cluster):
 @pytest.mark.slow  # waits the 20 s that a scheduler is given
 def test_no_scheduler_at_the_address_is_one_sentence(tmp_path):
     with pytest.raises(
-        ValueError, match=r"execution\.scheduler: expected a dask scheduler with a worker at tcp://127\.0\.0\.1:9, found none"
+        ValueError,
+        match=r"execution\.scheduler: expected a dask scheduler with a worker at tcp://127\.0\.0\.1:9, found none",
     ):
-        ingested(folder(tmp_path, 2), tmp_path, params.Execution(backend="dask", jobs=2, scheduler="tcp://127.0.0.1:9"))
+        ingested(
+            folder(tmp_path, 2),
+            tmp_path,
+            params.Execution(backend="dask", jobs=2, scheduler="tcp://127.0.0.1:9"),
+        )

@@ -1,4 +1,5 @@
-"""Algorithm 2: equal to the naive form, equal to the exact kernel on noise-free data, for any reference and offset; and what it refuses to learn from."""
+"""Algorithm 2: equal to the naive form, equal to the exact kernel on noise-free data, for any reference and
+offset; and what it refuses to learn from."""
 
 import re
 
@@ -31,7 +32,9 @@ from tests.temperature import naive
 
 I5, I7 = np.eye(5), np.eye(7)
 SMALL = plant(
-    [[0.8, 0.2, 0.0], [-0.1, 0.7, 0.3], [0.0, 0.1, 0.9]], [[0.5, -1.0], [1.0, 0.3], [0.2, 0.7]], [[1.0, 0.5, -0.3], [0.2, -1.0, 0.8]]
+    [[0.8, 0.2, 0.0], [-0.1, 0.7, 0.3], [0.0, 0.1, 0.9]],
+    [[0.5, -1.0], [1.0, 0.3], [0.2, 0.7]],
+    [[1.0, 0.5, -0.3], [0.2, -1.0, 0.8]],
 )
 OFFSET = SMALL._replace(b=np.array([0.3, -0.2, 0.5]), d=np.array([1.0, -2.0]))
 Q2, R2 = np.array([[2.0, 0.3], [0.3, 1.0]]), np.diag([0.5, 1.5])
@@ -63,7 +66,9 @@ def test_half_vectors_keep_the_inner_product_and_come_back():
 
 
 def test_a_half_vector_by_hand():
-    np.testing.assert_allclose(svec(np.array([[1.0, 2.0], [2.0, 3.0]])), [1.0, 2 * np.sqrt(2), 3.0], rtol=1e-15)
+    np.testing.assert_allclose(
+        svec(np.array([[1.0, 2.0], [2.0, 3.0]])), [1.0, 2 * np.sqrt(2), 3.0], rtol=1e-15
+    )
 
 
 @pytest.mark.parametrize(("a", "d"), [(3, 4), (5, 2), (1, 3), (4, 4)])
@@ -71,14 +76,18 @@ def test_skron_carries_a_congruence(a, d):
     rng = np.random.default_rng(a)
     X, S = rng.normal(size=(a, d)), rng.normal(size=(d, d))
     S = S + S.T
-    np.testing.assert_allclose(skron(X) @ svec(S), svec(X @ S @ X.T), atol=1e-13)  # rounding of numbers near 10
+    np.testing.assert_allclose(
+        skron(X) @ svec(S), svec(X @ S @ X.T), atol=1e-13
+    )  # rounding of numbers near 10
 
 
 def test_the_gram_matrix_in_blocks_is_that_of_all_samples():
     Z = np.random.default_rng(0).normal(size=(4, 37))
     features = np.stack([svec(np.outer(z, z)) for z in Z.T])
     for block in (5, 37, 1024):
-        np.testing.assert_allclose(quadratic_gram(Z, block=block), features.T @ features, rtol=1e-12)  # rounding of 37 terms
+        np.testing.assert_allclose(
+            quadratic_gram(Z, block=block), features.T @ features, rtol=1e-12
+        )  # rounding of 37 terms
 
 
 # ---- windows
@@ -98,7 +107,8 @@ def test_no_window_reaches_across_a_gap_or_holds_a_masked_sample():
     )
     y[0][4] = np.nan
     w, u_now, _ = windows(u, y, 2)
-    # of rows 2..7 of the first segment, y at 4 is in the windows of 5 and 6 and is itself the output of 4; the second is too short; of the third rows 2..4 are complete
+    # of rows 2..7 of the first segment, y at 4 is in the windows of 5 and 6 and is itself the output of 4;
+    # the second is too short; of the third rows 2..4 are complete
     np.testing.assert_array_equal(u_now[:, 0], [2, 3, 7, 22, 23, 24])
     np.testing.assert_array_equal(w[:, 0], u_now[:, 0] - 1)
     assert np.isfinite(w).all()
@@ -114,7 +124,8 @@ def test_segments_give_the_kernel_of_one_record():
 
 def test_records_shorter_than_the_window_are_refused():
     with pytest.raises(
-        ValueError, match="no segment is longer than the window of 3 samples; lower the window, or record a longer stretch without gaps"
+        ValueError,
+        match="no segment is longer than the window of 3 samples; lower the window, or record a longer stretch without gaps",
     ):
         windows([np.ones((3, 1))], [np.ones((3, 1))], 3)
 
@@ -136,13 +147,19 @@ def test_whitening_keeps_the_range_and_makes_the_second_moment_the_identity():
     W, sv = whitening(s, s_next, tolerance=1e-9)
     assert (W.shape, len(sv)) == ((3, 8), 8)
     v = np.vstack([s, s_next]) @ W.T
-    np.testing.assert_allclose(v.T @ v / 400, np.eye(3), atol=1e-9)  # rounding times the spread of scales, 1e7
+    np.testing.assert_allclose(
+        v.T @ v / 400, np.eye(3), atol=1e-9
+    )  # rounding times the spread of scales, 1e7
     np.testing.assert_allclose(v @ np.linalg.pinv(W).T, np.vstack([s, s_next]), rtol=1e-6)
 
 
 def test_the_study_s_window_of_six_has_rank_56_of_79(record):
     data = regress(tuples([record[0]], [record[1]], 6))
-    assert (data.rank, data.unknowns, data.samples_needed) == (55, 1540, 1540)  # [past u; past y; u]: 7 x 6 + 6 states + 7, no reference
+    assert (data.rank, data.unknowns, data.samples_needed) == (
+        55,
+        1540,
+        1540,
+    )  # [past u; past y; u]: 7 x 6 + 6 states + 7, no reference
     assert data.entries == 79 * 80 // 2
     assert data.condition < 1e6  # 6.6e13 without whitening
     reference = tuples_with_reference([record[0]], [record[1]], 6, REFERENCE, I5)
@@ -159,21 +176,31 @@ def explicit(record, N, samples):
 
 
 def differences(data, iterations):
-    """Relative difference of H and of the gain between ours and the naive form, both from the fit of the stage cost, after the same number of iterations."""
-    H, K = naive.value_iteration(data.s, data.u, data.e, data.s_next, I5, I7, GAMMA, mu=1e-4, iterations=iterations)
+    """Relative difference of H and of the gain between ours and the naive form, both from the fit of the
+    stage cost, after the same number of iterations."""
+    H, K = naive.value_iteration(
+        data.s, data.u, data.e, data.s_next, I5, I7, GAMMA, mu=1e-4, iterations=iterations
+    )
     found = value_iteration(regress(data, mu=1e-4), I5, I7, GAMMA, tolerance=0.0, max_iterations=iterations)
     assert found.iterations == iterations
     W, _ = whitening(data.s, data.s_next, tolerance=1e-9)
-    scale = np.block([[W, np.zeros((len(W), 7))], [np.zeros((7, W.shape[1])), np.diag(1 / np.sqrt((data.u**2).mean(axis=0)))]])
+    scale = np.block(
+        [
+            [W, np.zeros((len(W), 7))],
+            [np.zeros((7, W.shape[1])), np.diag(1 / np.sqrt((data.u**2).mean(axis=0)))],
+        ]
+    )
     ours = np.column_stack([found.K, found.k + found.K_r @ data.base])
-    return np.abs(scale.T @ found.H @ scale - H).max() / np.abs(H).max(), np.abs(ours - K @ data.features).max() / np.abs(
-        K @ data.features
-    ).max()
+    return np.abs(scale.T @ found.H @ scale - H).max() / np.abs(H).max(), np.abs(
+        ours - K @ data.features
+    ).max() / np.abs(K @ data.features).max()
 
 
 def test_the_kernel_equals_the_naive_form_at_the_published_ridge(record):
     in_kernel, in_gain = differences(explicit(record, 2, 600), 20)
-    assert in_kernel <= 1e-7  # the naive Gram matrix has a condition near 1e9 at this ridge: seven digits of sixteen remain
+    assert (
+        in_kernel <= 1e-7
+    )  # the naive Gram matrix has a condition near 1e9 at this ridge: seven digits of sixteen remain
     assert in_gain <= 1e-7
 
 
@@ -192,7 +219,8 @@ def test_the_kernel_learned_without_noise_is_the_exact_one(record, N, samples):
     best = gains(baam(), I5, I7, GAMMA)
     K, K_r = exact_gains(baam(), best, N)
     w = windows([u], [y], N)[0]
-    # gains on redundant windows differ where no window of the plant lies; on every window of the record the input is the same to 1e-6 of its 100 percent
+    # gains on redundant windows differ where no window of the plant lies; on every window of the record the
+    # input is the same to 1e-6 of its 100 percent
     np.testing.assert_allclose(w @ found.K.T, w @ K.T, atol=1e-4)
     np.testing.assert_allclose(found.K_r, K_r, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(found.k, 0.0, atol=1e-6)
@@ -200,14 +228,17 @@ def test_the_kernel_learned_without_noise_is_the_exact_one(record, N, samples):
 
 @pytest.mark.parametrize("F", [np.eye(2), TURN], ids=["constant reference", "turning and decaying reference"])
 @pytest.mark.parametrize(
-    ("machine", "offset"), [(SMALL, False), (SMALL, True), (OFFSET, True)], ids=["no offset", "offset 0 learned", "offset"]
+    ("machine", "offset"),
+    [(SMALL, False), (SMALL, True), (OFFSET, True)],
+    ids=["no offset", "offset 0 learned", "offset"],
 )
 def test_the_learned_law_is_the_optimal_one_for_any_generator_and_offset(machine, offset, F):
     x, u, y = small_record(machine)
     found = value_iteration(regress(tuples([u], [y], 2, offset=offset)), Q2, R2, 0.9, F=F, tolerance=1e-12)
     best = gains(machine, Q2, R2, 0.9, F)
     w = windows([u], [y], 2)[0]
-    # 1e-12 on the gain at stop leaves 1e-11 of a contraction 0.9; whitening multiplies rounding by its condition of 1e3
+    # 1e-12 on the gain at stop leaves 1e-11 of a contraction 0.9;
+    # whitening multiplies rounding by its condition of 1e3
     np.testing.assert_allclose(w @ found.K.T + found.k, x[2:-1] @ best.K_x.T + best.k, atol=1e-8)
     np.testing.assert_allclose(found.K_r, best.K_r, atol=1e-8)
 
@@ -229,20 +260,32 @@ def test_the_kernel_solves_the_bellman_equation_on_every_sample():
     """v'H v = e'Qe + u'Ru + gamma s+'P s+ with P the Schur complement of H: no noise, so sample by sample."""
     _, u, y = small_record(SMALL)
     data = tuples([u], [y], 2)
-    found = policy_iteration(regress(data), Q2, R2, 0.9, np.zeros((2, 7)), tolerance=1e-12) if len(regress(data).W) == 7 else None
+    found = (
+        policy_iteration(regress(data), Q2, R2, 0.9, np.zeros((2, 7)), tolerance=1e-12)
+        if len(regress(data).W) == 7
+        else None
+    )
     assert found is not None, "the window of two holds 2 x 2 inputs and 3 states"
     W, _ = whitening(data.s, data.s_next, tolerance=1e-9)
     v, s_next = np.hstack([data.s @ W.T, data.u / np.sqrt((data.u**2).mean(axis=0))]), data.s_next @ W.T
     P = found.H[:7, :7] - found.H[:7, 7:] @ np.linalg.solve(found.H[7:, 7:], found.H[7:, :7])
     stage = ((data.e @ Q2) * data.e + (data.u @ R2) * data.u).sum(axis=1)
     np.testing.assert_allclose(
-        ((v @ found.H) * v).sum(axis=1), stage + 0.9 * ((s_next @ P) * s_next).sum(axis=1), rtol=1e-8, atol=1e-8
+        ((v @ found.H) * v).sum(axis=1),
+        stage + 0.9 * ((s_next @ P) * s_next).sum(axis=1),
+        rtol=1e-8,
+        atol=1e-8,
     )  # rounding times condition
 
 
 def test_exactly_so_many_iterations_are_made_as_asked_for():
     _, u, y = small_record(SMALL)
-    assert value_iteration(regress(tuples([u], [y], 2)), Q2, R2, 0.9, tolerance=0.0, max_iterations=77).iterations == 77
+    assert (
+        value_iteration(
+            regress(tuples([u], [y], 2)), Q2, R2, 0.9, tolerance=0.0, max_iterations=77
+        ).iterations
+        == 77
+    )
 
 
 def test_a_stored_regression_comes_back_as_it_was():
@@ -264,7 +307,9 @@ def test_window_law_takes_over_with_the_history_of_the_hold():
     u, y = np.array([3.0, -1.0]), np.array([50.0])
     start = law.start_u @ u + law.start_y @ y + law.start
     np.testing.assert_array_equal(start, [3, -1, 3, -1, 3, -1, 3, -1, 50, 50, 50, 50])
-    np.testing.assert_array_equal(law.A @ start + law.B_u @ u + law.B_y @ y, start)  # a hold goes on as a hold
+    np.testing.assert_array_equal(
+        law.A @ start + law.B_u @ u + law.B_y @ y, start
+    )  # a hold goes on as a hold
 
 
 @pytest.mark.parametrize("N", [2, 3, 6])
@@ -283,7 +328,10 @@ def test_too_few_samples_are_refused_with_how_many_more(record):
     u, y = record
     with pytest.raises(
         ValueError,
-        match=re.escape("expected at least 378 samples for its 378 unknowns, found 300; record 78 more, or lower the window below 2"),
+        match=re.escape(
+            "expected at least 378 samples for its 378 unknowns, found 300; record 78 more, "
+            "or lower the window below 2"
+        ),
     ):
         regress(tuples([u[:302]], [y[:302]], 2))
 
@@ -291,7 +339,9 @@ def test_too_few_samples_are_refused_with_how_many_more(record):
 def test_a_constant_input_is_refused_by_name(record):
     u, y = record[0].copy(), record[1]
     u[:, 3] = 12.0
-    with pytest.raises(ValueError, match="input 4 of 7 is constant in the record; move every input while recording"):
+    with pytest.raises(
+        ValueError, match="input 4 of 7 is constant in the record; move every input while recording"
+    ):
         regress(tuples([u], [y], 2))
 
 
@@ -313,7 +363,8 @@ def test_an_input_that_only_feeds_back_is_refused_by_name():
 
 
 def test_inputs_of_two_levels_at_one_frequency_do_not_determine_the_kernel():
-    """Bits are their own squares: u^2 is constant, so its entry of H cannot be told from a constant; the Gram matrix is singular though v has full rank."""
+    """Bits are their own squares: u^2 is constant, so its entry of H cannot be told from a constant; the Gram
+    matrix is singular though v has full rank."""
     bits = np.random.default_rng(0).choice([-1.0, 1.0], (400, 1))
     machine = plant([[0.0]], [[1.0]], [[1.0]])
     y = simulate(machine, bits, np.ones(1))[1]
@@ -326,7 +377,10 @@ def test_inputs_of_two_levels_at_one_frequency_do_not_determine_the_kernel():
 
 def test_a_kernel_without_a_minimum_in_u_is_refused(record):
     data = regress(tuples([record[0][:502]], [record[1][:502]], 2))
-    with pytest.raises(ValueError, match=r"no minimum in u \(H_uu is not positive definite\): .* lower the window or record longer"):
+    with pytest.raises(
+        ValueError,
+        match=r"no minimum in u \(H_uu is not positive definite\): .* lower the window or record longer",
+    ):
         value_iteration(data, I5, -1e6 * I7, GAMMA)
 
 

@@ -20,7 +20,9 @@ from pipeline.temperature.plant import (
 )
 
 # a plant with everything in it: offsets, feed-through, two inputs for one output
-SMALL = plant([[0.5, 0.1], [0.0, 0.8]], [[1.0, 0.0], [0.5, 2.0]], [[1.0, 3.0]], D=[[0.25, 0.0]], b=[1.0, -1.0], d=[10.0])
+SMALL = plant(
+    [[0.5, 0.1], [0.0, 0.8]], [[1.0, 0.0], [0.5, 2.0]], [[1.0, 3.0]], D=[[0.25, 0.0]], b=[1.0, -1.0], d=[10.0]
+)
 
 
 def test_the_study_s_machine_is_the_one_of_its_tables(shared):
@@ -31,7 +33,9 @@ def test_the_study_s_machine_is_the_one_of_its_tables(shared):
 
 def test_the_study_s_machine_nearly_integrates():
     slowest = np.abs(np.linalg.eigvals(baam().A)).max()
-    assert slowest == pytest.approx(1.00000285, abs=1e-8)  # printed digits of the temperature notes' "open-loop pole at 1 + its band"
+    assert slowest == pytest.approx(
+        1.00000285, abs=1e-8
+    )  # printed digits of the temperature notes' "open-loop pole at 1 + its band"
 
 
 def test_two_steps_by_hand():
@@ -62,7 +66,10 @@ def test_the_study_s_machine_shows_every_state_and_obeys_in_every_state():
 def test_a_state_that_never_shows_fails_with_a_reason():
     hidden = observability(SMALL._replace(C=np.array([[0.0, 1.0]])))
     assert (hidden.passed, hidden.rank) == (False, 1)
-    assert re.match(r"the plant is not observable: rank 1 of 2, smallest singular values \[.*\]; add a sensor, or lower", hidden.reason)
+    assert re.match(
+        r"the plant is not observable: rank 1 of 2, smallest singular values \[.*\]; add a sensor, or lower",
+        hidden.reason,
+    )
     deaf = controllability(SMALL._replace(B=np.array([[1.0, 0.0], [0.0, 0.0]])))
     assert (deaf.passed, deaf.rank) == (False, 1)
     assert "not controllable: rank 1 of 2" in deaf.reason
@@ -74,10 +81,14 @@ def test_the_holding_input_holds_every_cell():
     u = hold_state(machine, x)
     states, _ = simulate(machine, np.tile(u, (1000, 1)), x)
     np.testing.assert_allclose(states, 20.0, atol=1e-9)  # 1,000 steps of rounding at 20 °C
-    assert np.linalg.norm(u) <= np.linalg.norm(hold_state(machine._replace(B=machine.B * [1, 1, 1, 1, 1, 1, 0]), x))
+    assert np.linalg.norm(u) <= np.linalg.norm(
+        hold_state(machine._replace(B=machine.B * [1, 1, 1, 1, 1, 1, 0]), x)
+    )
 
 
-@pytest.mark.parametrize("machine", [baam(), SMALL, baam()._replace(b=np.linspace(-1, 1, 6), d=np.linspace(5, -5, 5))])
+@pytest.mark.parametrize(
+    "machine", [baam(), SMALL, baam()._replace(b=np.linspace(-1, 1, 6), d=np.linspace(5, -5, 5))]
+)
 def test_the_holding_input_of_an_output_rests_there_and_is_the_smallest(machine):
     y = np.linspace(40.0, 60.0, machine.p)
     x, u = hold_output(machine, y)
@@ -88,7 +99,9 @@ def test_the_holding_input_of_an_output_rests_there_and_is_the_smallest(machine)
     # smallest: the map from u to y at rest is surjective here, and its pseudo-inverse gives the least norm
     rest = machine.C @ np.linalg.inv(np.eye(machine.n) - machine.A)
     expected = np.linalg.pinv(rest @ machine.B + machine.D) @ (y - machine.d - rest @ machine.b)
-    np.testing.assert_allclose(u, expected, atol=1e-6)  # both lose the digits of that gain, far below a percent of duty
+    np.testing.assert_allclose(
+        u, expected, atol=1e-6
+    )  # both lose the digits of that gain, far below a percent of duty
 
 
 def test_an_integrator_holds_its_output_too():
@@ -109,13 +122,21 @@ def test_stored_plants_come_back_as_they_were():
     family = [SMALL._replace(K=np.array([[0.1], [0.2]]), sample_time_s=2.0), SMALL]
     arrays = plants.stored(family)
     assert all(unit and meaning for _, unit, meaning in arrays.values())
-    for before, after in zip(family, plants.restored({name: values for name, (values, _, _) in arrays.items()}), strict=True):
+    for before, after in zip(
+        family, plants.restored({name: values for name, (values, _, _) in arrays.items()}), strict=True
+    ):
         for one, other in zip(before, after, strict=True):
             np.testing.assert_array_equal(one, other)
 
 
 def test_a_matrix_of_the_wrong_shape_is_named():
-    with pytest.raises(ValueError, match=re.escape("plant: b should have shape (2,) but has (3,); A is (2, 2), B (2, 2), C (1, 2)")):
+    with pytest.raises(
+        ValueError,
+        match=re.escape("plant: b should have shape (2,) but has (3,); A is (2, 2), B (2, 2), C (1, 2)"),
+    ):
         plant(SMALL.A, SMALL.B, SMALL.C, b=np.zeros(3))
-    with pytest.raises(ValueError, match="plant: C holds a number that is not finite; identify the plant again on a clean record"):
+    with pytest.raises(
+        ValueError,
+        match="plant: C holds a number that is not finite; identify the plant again on a clean record",
+    ):
         plant(SMALL.A, SMALL.B, [[np.nan, 1.0]])

@@ -7,7 +7,15 @@ import pyarrow.parquet as pq
 import pytest
 
 from pipeline.temperature import published
-from pipeline.temperature.published import IDENTITY, TUNED_DATA, TUNED_MODEL, algorithm_1_failures, data_driven, kernel_gains, model_based
+from pipeline.temperature.published import (
+    IDENTITY,
+    TUNED_DATA,
+    TUNED_MODEL,
+    algorithm_1_failures,
+    data_driven,
+    kernel_gains,
+    model_based,
+)
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +26,10 @@ def draws(root):
         rows = list(csv.reader(stream))
     K0 = np.array([row for row in rows if row and row[0].lstrip("-")[:1].isdigit()], float)
     table = pq.read_table(folder / "probing_log_seed1.parquet")
-    u, y = (np.column_stack([table[f"{name}{i}"].to_numpy() for i in range(1, count + 1)]) for name, count in (("u", 7), ("y", 5)))
+    u, y = (
+        np.column_stack([table[f"{name}{i}"].to_numpy() for i in range(1, count + 1)])
+        for name, count in (("u", 7), ("y", 5))
+    )
     return K0[:, -11:], u, y
 
 
@@ -59,7 +70,9 @@ def test_most_of_the_data_driven_cost_accrues_in_the_start_up_steps(learned):
 
 def test_algorithm_1_misses_the_stabilising_gain_in_a_third_of_300_starts():
     failures = algorithm_1_failures(300)
-    assert 80 <= failures <= 120  # about 100 of 300; the count turns on how a failure is told, not on rounding
+    assert (
+        80 <= failures <= 120
+    )  # about 100 of 300; the count turns on how a failure is told, not on rounding
 
 
 def test_the_four_columns_are_the_study_s(draws, learned, monkeypatch):

@@ -7,7 +7,10 @@ from pipeline.temperature.workflow import tables
 from pipeline.temperature.workflow.record import read_record
 from pipeline.temperature.workflow.settings import Input, Output
 
-HEATER, ZONE = Input(name="heater_1", unit="percent", low=0, high=100), Output(name="zone_1", unit="degC", reference=200)
+HEATER, ZONE = (
+    Input(name="heater_1", unit="percent", low=0, high=100),
+    Output(name="zone_1", unit="degC", reference=200),
+)
 
 
 def test_a_record_is_cut_at_gaps_and_recordings_and_masked_samples_are_missing(tmp_path):

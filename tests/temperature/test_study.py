@@ -9,7 +9,8 @@ from pipeline.temperature.published import REFERENCE
 
 @pytest.fixture(scope="module")
 def record():
-    """A record of the study's probing, noise-free, whose first row the learners leave out as they do the published one's."""
+    """A record of the study's probing, noise-free, whose first row the
+    learners leave out as they do the published one's."""
     u, y = study.data_sets(np.random.default_rng(3), 1650, 1)
     return u[1:, 0], y[1:, 0]
 
@@ -75,11 +76,15 @@ def test_the_index_of_the_tuner_is_the_known_optimum_at_equal_weights_and_more_e
 
 def test_noisy_data_sets_become_a_table_and_its_figures():
     work = [(noise, i) for noise in study.NOISE for i in range(3)]
-    found = [{route: (10.0 * noise + i + k, 0.1 * i) for k, route in enumerate(study.ROUTES)} for noise, i in work]
+    found = [
+        {route: (10.0 * noise + i + k, 0.1 * i) for k, route in enumerate(study.ROUTES)} for noise, i in work
+    ]
     found[0]["kernel"] = (float("inf"), float("nan"))
     table = study.rows(work, found)
     assert len(table["gap"]) == len(work) * len(study.ROUTES)
-    figures = study.metrics({}, study.Exact(1, 2, 3, 4, 5), study.NoiseFree(6, 7, 8), table, failures=9, starts=10)
+    figures = study.metrics(
+        {}, study.Exact(1, 2, 3, 4, 5), study.NoiseFree(6, 7, 8), table, failures=9, starts=10
+    )
     assert figures["window"]["noise_0_1"] == {
         "median_gap": 2.0,
         "worst_gap": 3.0,
@@ -88,8 +93,16 @@ def test_noisy_data_sets_become_a_table_and_its_figures():
         "of": 3,
     }
     kernel = figures["kernel"]["noise_0_1"]
-    assert (kernel["worst_gap"], kernel["median_gap"], kernel["stable"]) == (None, 4.0, 0)  # an unstable one is the worst, and no number
-    assert (figures["kernel"]["gap"], figures["kernel"]["any_reference_gap"], figures["optimal"]["J1000"]) == (6, 8, 1)
+    assert (kernel["worst_gap"], kernel["median_gap"], kernel["stable"]) == (
+        None,
+        4.0,
+        0,
+    )  # an unstable one is the worst, and no number
+    assert (
+        figures["kernel"]["gap"],
+        figures["kernel"]["any_reference_gap"],
+        figures["optimal"]["J1000"],
+    ) == (6, 8, 1)
     assert figures["algorithm_1"] == {"failures": 9, "of": 10}
 
 

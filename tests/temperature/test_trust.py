@@ -59,13 +59,17 @@ def test_fits_are_those_of_validation_and_lie_in_their_bands():
     # the start-up of predict_fit: 30 samples and the steps, in each segment
     assert np.flatnonzero(np.isfinite(found.ahead[0][:, 0]))[0] == 37
     last = [np.where(np.isfinite(found.ahead[k]), held(ys[k], 7), np.nan) for k in range(2)]
-    np.testing.assert_allclose(found.held_fit, nrmse(np.vstack([b[37:] for b in ys]), np.vstack([b[37:] for b in last])), rtol=1e-12)
+    np.testing.assert_allclose(
+        found.held_fit, nrmse(np.vstack([b[37:] for b in ys]), np.vstack([b[37:] for b in last])), rtol=1e-12
+    )
 
 
 def test_the_band_of_a_fit_holds_the_fit_of_another_hold_out_of_that_length_nine_times_in_ten():
     rng, inside = np.random.default_rng(1), 0
     long = rng.standard_normal((200_000, 1))
-    truth = fit_with_band([long], [long + 0.3 * rng.standard_normal(long.shape)], block=10, rng=rng, draws=2)[0, 0]
+    truth = fit_with_band([long], [long + 0.3 * rng.standard_normal(long.shape)], block=10, rng=rng, draws=2)[
+        0, 0
+    ]
     for _ in range(100):
         y = rng.standard_normal((400, 1))
         _, low, high = fit_with_band([y], [y + 0.3 * rng.standard_normal(y.shape)], block=10, rng=rng)[:, 0]
@@ -79,7 +83,11 @@ def test_a_hold_out_without_a_segment_long_enough_has_no_fit_ahead_and_is_writte
     found = holdout(HEATER, [u], [y], 60, block=20, rng=np.random.default_rng(0))
     figures = fit_figures(found, ["T1"])
     assert figures["fit_holdout"]["T1"] == found.fit[0, 0]
-    assert figures["fit_holdout_ahead"] is None and figures["fit_holdout_ahead_band"] is None and figures["fit_holdout_held"] is None
+    assert (
+        figures["fit_holdout_ahead"] is None
+        and figures["fit_holdout_ahead_band"] is None
+        and figures["fit_holdout_held"] is None
+    )
 
 
 def test_as_many_lags_as_the_hold_out_carries():
@@ -122,7 +130,9 @@ def test_steps_hold_the_truth_and_say_where_the_sign_is_not_known():
     assert found.seen.tolist() == [[True, False]]
     # 1 / (1 - 0.95) = 20, less what is left after 1.33 settling times
     np.testing.assert_allclose(found.gain[0, 0, 0], 20.0, rtol=0.03)
-    assert (found.low[1:, 0, 0] < found.response[1:, 0, 0]).all() and (found.response[1:, 0, 0] < found.high[1:, 0, 0]).all()
+    assert (found.low[1:, 0, 0] < found.response[1:, 0, 0]).all() and (
+        found.response[1:, 0, 0] < found.high[1:, 0, 0]
+    ).all()
     # -1 / ln 0.95 = 19.5
     np.testing.assert_allclose(found.time_constant[0, 0, 0], 19.5, rtol=0.05)
     assert np.isnan(found.time_constant[:, 0, 1]).all() and np.isnan(found.delay[:, 0, 1]).all()
@@ -144,7 +154,11 @@ def test_poles_of_the_spread_are_assigned_to_the_nearest_of_the_model_and_the_re
     )
     rows = pole_rows(nominal, [member])
     assert rows["real"][:2].tolist() == [0.9, 0.5] and rows["member"].tolist() == [0, 0, 1, 1, 1]
-    assert {round(x, 2): int(k) for x, k in zip(rows["real"][2:], rows["pole"][2:], strict=True)} == {0.1: -1, 0.52: 1, 0.88: 0}
+    assert {round(x, 2): int(k) for x, k in zip(rows["real"][2:], rows["pole"][2:], strict=True)} == {
+        0.1: -1,
+        0.52: 1,
+        0.88: 0,
+    }
 
 
 def test_the_level_of_a_sine_lies_in_its_band_and_all_bands_together_have_its_power():
@@ -181,4 +195,9 @@ def test_tables_name_each_pair_and_keep_their_values():
 def test_a_condition_beyond_all_numbers_is_written_as_none():
     u, y = innovations_record(HEATER, 200, 0.1, 5)
     excited = excitation([u], 3)._replace(condition=np.inf)
-    assert outcome_figures(residual_tests(HEATER, [u], [y], lags=3), excited, ["T1"], ["a", "b"])["excitation"]["condition"] is None
+    assert (
+        outcome_figures(residual_tests(HEATER, [u], [y], lags=3), excited, ["T1"], ["a", "b"])["excitation"][
+            "condition"
+        ]
+        is None
+    )

@@ -1,4 +1,5 @@
-"""Bayesian optimisation of weights: the fitness (37), searches with known optimum, failures as failures, going on after stops."""
+"""Bayesian optimisation of weights: the fitness (37), searches with known
+optimum, failures as failures, going on after stops."""
 
 import numpy as np
 import pytest
@@ -34,7 +35,9 @@ def index(found, q, r, steps=100):
 
 def fitness_of_baam(theta):
     found = designed(theta)
-    return tuning.fitness(BAAM, found.K_x, found.K_r, reference=REFERENCE, gamma=GAMMA, steps=100, x0=np.full(6, 20.0))
+    return tuning.fitness(
+        BAAM, found.K_x, found.K_r, reference=REFERENCE, gamma=GAMMA, steps=100, x0=np.full(6, 20.0)
+    )
 
 
 def bowl(optimum, lower, upper, curvature):
@@ -53,26 +56,45 @@ def bowl(optimum, lower, upper, curvature):
 @pytest.mark.parametrize("steps", [0, 1, 7, 8, 100])
 def test_fitness_is_the_sum_of_37_term_by_term(steps):
     found = designed(np.linspace(0.05, 0.4, 12))
-    value = tuning.fitness(BAAM, found.K_x, found.K_r, reference=REFERENCE, gamma=GAMMA, steps=steps, x0=np.full(6, 20.0))
+    value = tuning.fitness(
+        BAAM, found.K_x, found.K_r, reference=REFERENCE, gamma=GAMMA, steps=steps, x0=np.full(6, 20.0)
+    )
     # two orders of the same sum of at most 101 positive terms: rounding only
     assert value == pytest.approx(index(found, np.ones(5), np.ones(7), steps), rel=1e-12)
 
 
 def test_fitness_counts_the_offsets_of_a_plant_worked_by_hand():
-    # x+ = u / 2 + 1, y = x + 2, u = -3 - 1 r with r = 1: u = -4, x = 4, -1, -1; y - r = 5, 0, 0; F = 25 + 16 + (0 + 16) / 2 + (0 + 16) / 4
+    # x+ = u / 2 + 1, y = x + 2, u = -3 - 1 r with r = 1: u = -4, x = 4, -1, -1; y - r =
+    # 5, 0, 0; F = 25 + 16 + (0 + 16) / 2 + (0 + 16) / 4
     shifted = plant([[0.0]], [[0.5]], [[1.0]], b=[1.0], d=[2.0])
     found = tuning.fitness(
-        shifted, np.zeros((1, 1)), np.ones((1, 1)), reference=np.ones(1), gamma=0.5, steps=2, x0=np.array([4.0]), k=np.array([3.0])
+        shifted,
+        np.zeros((1, 1)),
+        np.ones((1, 1)),
+        reference=np.ones(1),
+        gamma=0.5,
+        steps=2,
+        x0=np.array([4.0]),
+        k=np.array([3.0]),
     )
     assert found == pytest.approx(53.0, rel=1e-14)  # rounding of a few sums
 
 
 def test_an_unstable_loop_has_no_fitness():
     with pytest.raises(
-        ValueError, match=r"fitness: the closed loop is unstable, spectral radius 1\.5, expected below 1; choose other weights"
+        ValueError,
+        match=r"fitness: the closed loop is unstable, spectral radius 1\.5, expected below 1; choose other weights",
     ):
         K_x, K_r = np.zeros((1, 1)), np.zeros((1, 1))
-        tuning.fitness(plant([[1.5]], [[1.0]], [[1.0]]), K_x, K_r, reference=np.ones(1), gamma=0.99, steps=100, x0=np.zeros(1))
+        tuning.fitness(
+            plant([[1.5]], [[1.0]], [[1.0]]),
+            K_x,
+            K_r,
+            reference=np.ones(1),
+            gamma=0.99,
+            steps=100,
+            x0=np.zeros(1),
+        )
 
 
 def test_the_fitness_is_the_index_at_equal_weights_so_their_controller_is_its_optimum():
@@ -85,10 +107,14 @@ def test_the_fitness_is_the_index_at_equal_weights_so_their_controller_is_its_op
 
 def test_weights_of_04_improve_the_index_by_60_percent_at_an_identical_gain():
     one, less = designed(np.ones(12)), designed(np.full(12, 0.4))
-    np.testing.assert_allclose(less.K_x, one.K_x, rtol=0, atol=1e-12)  # gains of order 1, one Riccati solve of rounding apart
+    np.testing.assert_allclose(
+        less.K_x, one.K_x, rtol=0, atol=1e-12
+    )  # gains of order 1, one Riccati solve of rounding apart
     np.testing.assert_allclose(less.K_r, one.K_r, rtol=0, atol=1e-12)
     before, after = index(one, np.ones(5), np.ones(7)), index(less, np.full(5, 0.4), np.full(7, 0.4))
-    assert after / before - 1 == pytest.approx(-0.6, abs=1e-12)  # "60.0 % better", for the same temperatures and inputs
+    assert after / before - 1 == pytest.approx(
+        -0.6, abs=1e-12
+    )  # "60.0 % better", for the same temperatures and inputs
     assert fitness_of_baam(np.full(12, 0.4)) == pytest.approx(
         fitness_of_baam(np.ones(12)), rel=1e-12
     )  # and not better at all on one yardstick
@@ -97,15 +123,21 @@ def test_weights_of_04_improve_the_index_by_60_percent_at_an_identical_gain():
 @pytest.mark.parametrize(("route", "worse"), [("model-based", 0.0496), ("data-driven", 0.3984)])
 def test_the_published_tuning_is_worse_than_the_weights_it_started_from(route, worse):
     theta = np.array(PUBLISHED[route].split(), float)
-    assert fitness_of_baam(theta) / fitness_of_baam(np.ones(12)) - 1 == pytest.approx(worse, abs=5e-5)  # the printed digits
+    assert fitness_of_baam(theta) / fitness_of_baam(np.ones(12)) - 1 == pytest.approx(
+        worse, abs=5e-5
+    )  # the printed digits
 
 
 # ---- the search
 
 
 def test_the_search_finds_the_optimum_of_37():
-    found = tuning.minimise(fitness_of_baam, LOWER, UPPER, rng=np.random.default_rng(2), initial=50, evaluations=150)
-    assert found.cost <= 151_880  # the worst that is allowed of any seed; benchmarks/tuning.py has the distribution
+    found = tuning.minimise(
+        fitness_of_baam, LOWER, UPPER, rng=np.random.default_rng(2), initial=50, evaluations=150
+    )
+    assert (
+        found.cost <= 151_880
+    )  # the worst that is allowed of any seed; benchmarks/tuning.py has the distribution
     assert found.cost == fitness_of_baam(found.theta) == found.history.cost.min()
 
 
@@ -118,13 +150,21 @@ def test_the_search_finds_an_optimum_off_centre_in_any_dimension(d, evaluations)
     cost = bowl(optimum, lower, upper, np.geomspace(1.0, 10.0, d))
     drawn = [cost(lower * (upper / lower) ** rng.random(d)) for _ in range(evaluations)]
     found = tuning.minimise(cost, lower, upper, rng=rng, initial=evaluations // 3, evaluations=evaluations)
-    # drawing at random leaves most of the excess; the model of a quadratic should take away all but a hundredth of what is left
+    # drawing at random leaves most of the excess; the model of a quadratic
+    # should take away all but a hundredth of what is left
     assert found.cost - 3.0 < 0.01 * (min(drawn) - 3.0)
 
 
 def test_the_search_stays_within_the_bounds_and_reaches_an_optimum_on_them():
     lower, upper = np.full(3, 0.1), np.full(3, 2.0)
-    found = tuning.minimise(lambda theta: float(np.log(theta).sum()), lower, upper, rng=np.random.default_rng(0), initial=8, evaluations=30)
+    found = tuning.minimise(
+        lambda theta: float(np.log(theta).sum()),
+        lower,
+        upper,
+        rng=np.random.default_rng(0),
+        initial=8,
+        evaluations=30,
+    )
     assert (found.history.theta >= lower).all() and (found.history.theta <= upper).all()
     np.testing.assert_allclose(found.theta, lower, rtol=1e-6)  # the corner, but for exp and log
 
@@ -138,7 +178,8 @@ def test_the_published_search_beats_its_own_design_and_recommends_a_candidate_it
 
 
 def test_the_posterior_of_the_published_search_is_41_by_hand():
-    # values 1 at two points a distance 1 apart, k = exp(-1) between them: half way, where k' = exp(-1/4), mu = 2 k' / (1 + k)
+    # values 1 at two points a distance 1 apart, k = exp(-1) between them:
+    # half way, where k' = exp(-1/4), mu = 2 k' / (1 + k)
     search = tuning._Search(np.full(1, 0.5), np.full(1, 3.0), "upper_confidence_bound", 2.0)
     gp = tuning._surrogate(np.array([[1.0], [2.0]]), np.ones(2), search.kernel())
     mean, std = tuning._posterior(gp, np.array([[1.0], [1.5]]))
@@ -163,7 +204,12 @@ def test_the_slope_of_the_acquisition_is_that_of_its_value(name):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tuning.scipy.optimize, "minimize", watched)
-        tuning._least(tuning._terms(search, points, costs, search.kernel()), rng.random((20, 3)), np.zeros(3), np.ones(3))
+        tuning._least(
+            tuning._terms(search, points, costs, search.kernel()),
+            rng.random((20, 3)),
+            np.zeros(3),
+            np.ones(3),
+        )
     for x in rng.random((5, 3)):
         numeric = approx_fprime(x, lambda z: seen["objective"](z)[0], 1e-7)
         # forward differences of 1e-7: half of the digits
@@ -173,31 +219,44 @@ def test_the_slope_of_the_acquisition_is_that_of_its_value(name):
 def test_the_logarithm_of_the_improvement_is_smooth_from_end_to_end():
     z = np.array([-1e6, -1e4, -50.0, -1.0, 0.0, 3.0, 50.0])
     log_h, ratio = tuning._log_improvement(z)
-    assert log_h[[4, 6]] == pytest.approx([-0.5 * np.log(2 * np.pi), np.log(50.0)], rel=1e-12)  # h(0) = phi(0), h(z) = z far above
+    assert log_h[[4, 6]] == pytest.approx(
+        [-0.5 * np.log(2 * np.pi), np.log(50.0)], rel=1e-12
+    )  # h(0) = phi(0), h(z) = z far above
     assert log_h[2] == pytest.approx(
         -1250 - 0.5 * np.log(2 * np.pi) - 2 * np.log(50.0), abs=2e-3
     )  # phi / z^2 (1 - 3 / z^2): 3 / 2500 is left out
     step = 1e-6 * np.maximum(1, abs(z))
     slope = (tuning._log_improvement(z + step)[0] - tuning._log_improvement(z - step)[0]) / (2 * step)
-    np.testing.assert_allclose(ratio, slope, rtol=1e-3)  # a central difference, over the seams at -1 and -1e4 too
+    np.testing.assert_allclose(
+        ratio, slope, rtol=1e-3
+    )  # a central difference, over the seams at -1 and -1e4 too
 
 
 # ---- failures
 
 
 def walled(theta):
-    """A bowl whose optimum lies 2 % of the domain from a wall behind which every second part of the domain has no cost."""
+    """A bowl whose optimum lies 2 % of the domain from a wall behind
+    which every second part of the domain has no cost."""
     if theta[0] < 0.05:
         raise ValueError("the loop is unstable")
     if theta[1] > 1.5:
         return np.inf
-    return bowl(np.array([0.06, 1.2, 0.1]), np.full(3, 1e-3), np.full(3, 10.0), np.array([3.0, 1.0, 10.0]))(theta)
+    return bowl(np.array([0.06, 1.2, 0.1]), np.full(3, 1e-3), np.full(3, 10.0), np.array([3.0, 1.0, 10.0]))(
+        theta
+    )
 
 
 def test_failures_are_recorded_with_their_reason_and_never_as_numbers():
     seen = []
     found = tuning.minimise(
-        walled, np.full(3, 1e-3), np.full(3, 10.0), rng=np.random.default_rng(4), initial=16, evaluations=60, on_step=seen.append
+        walled,
+        np.full(3, 1e-3),
+        np.full(3, 10.0),
+        rng=np.random.default_rng(4),
+        initial=16,
+        evaluations=60,
+        on_step=seen.append,
     )
     theta, cost, failed, incumbent = found.history
     unstable, infinite = theta[:, 0] < 0.05, (theta[:, 0] >= 0.05) & (theta[:, 1] > 1.5)
@@ -212,7 +271,9 @@ def test_failures_are_recorded_with_their_reason_and_never_as_numbers():
     assert [len(history.cost) for history in seen] == list(range(1, 61))
 
 
-@pytest.mark.parametrize(("acquisition", "heaviest"), [("expected_improvement", 0.03), ("upper_confidence_bound", 0.25)])
+@pytest.mark.parametrize(
+    ("acquisition", "heaviest"), [("expected_improvement", 0.03), ("upper_confidence_bound", 0.25)]
+)
 def test_a_search_whose_whole_design_failed_still_finds_the_part_that_works(acquisition, heaviest):
     def corner(theta):
         if theta.max() > heaviest:  # 6 % of the domain works, as each search measures it
@@ -220,7 +281,9 @@ def test_a_search_whose_whole_design_failed_still_finds_the_part_that_works(acqu
         return float(theta.sum())
 
     lower, upper = np.full(2, 0.01), np.full(2, 1.0)
-    found = tuning.minimise(corner, lower, upper, rng=np.random.default_rng(7), initial=2, evaluations=40, acquisition=acquisition)
+    found = tuning.minimise(
+        corner, lower, upper, rng=np.random.default_rng(7), initial=2, evaluations=40, acquisition=acquisition
+    )
     assert np.isnan(found.history.incumbent[1])
     assert found.cost == pytest.approx(0.02, abs=1e-3)  # the lower corner
 
@@ -230,14 +293,17 @@ def test_where_every_candidate_fails_the_last_reason_is_told():
         raise ValueError("no actuator obeys")
 
     with pytest.raises(
-        ValueError, match=r"all 6 candidates failed, the last because: no actuator obeys; widen the bounds or correct the cost"
+        ValueError,
+        match=r"all 6 candidates failed, the last because: no actuator obeys; widen the bounds or correct the cost",
     ):
         tuning.minimise(cost, [0.1, 0.1], [1.0, 1.0], rng=np.random.default_rng(0), initial=4, evaluations=6)
 
 
 def test_a_mistake_in_the_cost_is_no_failure_of_the_candidate():
     with pytest.raises(TypeError):
-        tuning.minimise(lambda theta: theta + "°C", [0.1], [1.0], rng=np.random.default_rng(0), initial=1, evaluations=2)
+        tuning.minimise(
+            lambda theta: theta + "°C", [0.1], [1.0], rng=np.random.default_rng(0), initial=1, evaluations=2
+        )
 
 
 # ---- the same again, and going on
@@ -248,7 +314,9 @@ def test_a_stopped_search_goes_on_as_if_it_had_not_been(acquisition):
     settings = {"initial": 8, "evaluations": 30, "acquisition": acquisition}
     bounds = np.full(3, 1e-3), np.full(3, 10.0)
     histories = []
-    whole = tuning.minimise(walled, *bounds, rng=np.random.default_rng(5), on_step=histories.append, **settings)
+    whole = tuning.minimise(
+        walled, *bounds, rng=np.random.default_rng(5), on_step=histories.append, **settings
+    )
     for stopped in (histories[4], histories[20], histories[29]):
         again = tuning.minimise(walled, *bounds, rng=np.random.default_rng(5), start=stopped, **settings)
         assert again.history.theta.tobytes() == whole.history.theta.tobytes()
@@ -257,20 +325,33 @@ def test_a_stopped_search_goes_on_as_if_it_had_not_been(acquisition):
 
 
 def test_other_seeds_give_other_candidates():
-    runs = [tuning.minimise(np.sum, [0.1, 0.1], [1.0, 1.0], rng=np.random.default_rng(seed), initial=4, evaluations=5) for seed in (0, 1)]
+    runs = [
+        tuning.minimise(
+            np.sum, [0.1, 0.1], [1.0, 1.0], rng=np.random.default_rng(seed), initial=4, evaluations=5
+        )
+        for seed in (0, 1)
+    ]
     assert not np.array_equal(runs[0].history.theta, runs[1].history.theta)
 
 
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
-        ({"lower": [0.0, 0.1]}, r"expected bounds 0 < lower < upper of one length, found lower \[0\.  0\.1\] and upper \[1\. 1\.\]"),
+        (
+            {"lower": [0.0, 0.1]},
+            r"expected bounds 0 < lower < upper of one length, found lower \[0\.  0\.1\] "
+            r"and upper \[1\. 1\.\]",
+        ),
         ({"upper": [1.0]}, r"expected bounds 0 < lower < upper of one length"),
         ({"initial": 9}, r"expected 1 <= initial <= evaluations, found 9 of 8; change one of them"),
-        ({"acquisition": "guess"}, r"acquisition 'guess' is unknown, expected expected_improvement or upper_confidence_bound"),
+        (
+            {"acquisition": "guess"},
+            r"acquisition 'guess' is unknown, expected expected_improvement or upper_confidence_bound",
+        ),
         (
             {"start": tuning.History(np.ones((2, 3)), np.ones(2), ("", ""), np.ones(2))},
-            r"the history to go on from has theta \(2, 3\), 2 costs and 2 reasons, expected at most 8 candidates of 2 weights within",
+            r"the history to go on from has theta \(2, 3\), 2 costs and 2 reasons, expected at most 8 "
+            r"candidates of 2 weights within",
         ),
         (
             {"start": tuning.History(np.full((1, 2), 3.0), np.ones(1), ("",), np.ones(1))},
@@ -279,6 +360,12 @@ def test_other_seeds_give_other_candidates():
     ],
 )
 def test_a_search_that_cannot_be_made_is_refused_in_one_sentence(change, sentence):
-    settings = {"lower": [0.1, 0.1], "upper": [1.0, 1.0], "initial": 4, "evaluations": 8, "acquisition": "expected_improvement"} | change
+    settings = {
+        "lower": [0.1, 0.1],
+        "upper": [1.0, 1.0],
+        "initial": 4,
+        "evaluations": 8,
+        "acquisition": "expected_improvement",
+    } | change
     with pytest.raises(ValueError, match=sentence):
         tuning.minimise(np.sum, rng=np.random.default_rng(0), **settings)

@@ -27,13 +27,17 @@ def innovations_record(true, T, noise, seed):
     return u, y
 
 
-HEATER = plant([[0.9, 0.1], [0.0, 0.6]], [[0.0, 0.2], [0.5, 0.0]], [[1.0, 0.0]], b=[0.5, 0.0], d=[20.0], K=[[0.3], [0.0]])
+HEATER = plant(
+    [[0.9, 0.1], [0.0, 0.6]], [[0.0, 0.2], [0.5, 0.0]], [[1.0, 0.0]], b=[0.5, 0.0], d=[20.0], K=[[0.3], [0.0]]
+)
 
 
 def test_nrmse_by_hand():
     y = np.array([[0.0], [1.0], [2.0], [np.nan]])
     # |y - mean| = sqrt 2; errors 0, 0, 1 and one masked
-    np.testing.assert_allclose(nrmse(y, np.array([[0.0], [1.0], [1.0], [9.0]])), 100 * (1 - 1 / np.sqrt(2)), rtol=1e-12)
+    np.testing.assert_allclose(
+        nrmse(y, np.array([[0.0], [1.0], [1.0], [9.0]])), 100 * (1 - 1 / np.sqrt(2)), rtol=1e-12
+    )
 
 
 def test_a_constant_error_costs_nothing_where_means_are_removed():
@@ -44,7 +48,9 @@ def test_a_constant_error_costs_nothing_where_means_are_removed():
 def test_the_true_plant_simulates_its_own_noise_free_record_in_full_from_any_start():
     u = np.random.default_rng(0).standard_normal((300, 2))
     y = simulate(HEATER, u, np.array([3.0, -4.0]))[1]
-    np.testing.assert_allclose(simulate_fit(HEATER, [u], [y]), 100.0, atol=1e-6)  # x0 by least squares: rounding
+    np.testing.assert_allclose(
+        simulate_fit(HEATER, [u], [y]), 100.0, atol=1e-6
+    )  # x0 by least squares: rounding
 
 
 def test_prediction_ahead_is_the_kalman_recursion_written_out():
@@ -71,7 +77,10 @@ def test_a_drift_that_simulation_misses_is_followed_ahead():
     u, y = innovations_record(HEATER, 2000, 0.02, 2)
     y = y + np.cumsum(0.02 * np.random.default_rng(3).standard_normal((2000, 1)), axis=0)
     found = identify([u[:1400]], [y[:1400]], sample_time_s=1.0, refinement="prediction")
-    assert predict_fit(found.plant, [u[1400:]], [y[1400:]], 5)[0] > simulate_fit(found.plant, [u[1400:]], [y[1400:]])[0]
+    assert (
+        predict_fit(found.plant, [u[1400:]], [y[1400:]], 5)[0]
+        > simulate_fit(found.plant, [u[1400:]], [y[1400:]])[0]
+    )
 
 
 def test_residuals_of_the_true_plant_pass_and_those_of_a_lower_order_do_not():
@@ -86,21 +95,42 @@ def test_advice_names_the_output_the_input_and_the_lag():
     u, y = innovations_record(HEATER, 4000, 0.1, 4)
     y[3:] += u[:-3, :1] * 0.5
     sentences = advice(
-        residual_tests(HEATER, [u], [y]), excitation([u], 5), np.array([80.0]), outputs=["T2"], inputs=["heater_1", "heater_2"]
+        residual_tests(HEATER, [u], [y]),
+        excitation([u], 5),
+        np.array([80.0]),
+        outputs=["T2"],
+        inputs=["heater_1", "heater_2"],
     )
-    assert any(s.startswith("the residuals of T2 correlate with heater_1 at lag 3: raise the order") for s in sentences)
+    assert any(
+        s.startswith("the residuals of T2 correlate with heater_1 at lag 3: raise the order")
+        for s in sentences
+    )
     assert not any("heater_2" in s for s in sentences)
 
 
 def test_no_advice_where_everything_passed():
     u, y = innovations_record(HEATER, 4000, 0.1, 4)
-    assert advice(residual_tests(HEATER, [u], [y]), excitation([u], 5), np.array([80.0]), outputs=["T1"], inputs=["a", "b"]) == []
+    assert (
+        advice(
+            residual_tests(HEATER, [u], [y]),
+            excitation([u], 5),
+            np.array([80.0]),
+            outputs=["T1"],
+            inputs=["a", "b"],
+        )
+        == []
+    )
 
 
 def test_excitation_counts_what_a_sine_cannot_excite():
     t = np.arange(500.0)
-    excited = excitation([np.column_stack([np.sin(0.3 * t), np.random.default_rng(0).standard_normal(500)])], 6)
-    assert excited.per_input_rank.tolist() == [2, 6]  # a sine spans two directions, whatever the number of lags
+    excited = excitation(
+        [np.column_stack([np.sin(0.3 * t), np.random.default_rng(0).standard_normal(500)])], 6
+    )
+    assert excited.per_input_rank.tolist() == [
+        2,
+        6,
+    ]  # a sine spans two directions, whatever the number of lags
     assert (excited.rank, excited.full) == (8, 12)
 
 
@@ -120,7 +150,9 @@ def test_bootstrap_gives_finite_stable_plants_whose_step_responses_hold_the_trut
 def test_bootstrap_is_repeatable_and_may_take_another_order():
     u, y = innovations_record(HEATER, 800, 0.1, 6)
     found = identify([u], [y], sample_time_s=1.0, order=2)
-    first, second = (bootstrap_spread([u], [y], found, count=2, order=3, rng=np.random.default_rng(1)) for _ in range(2))
+    first, second = (
+        bootstrap_spread([u], [y], found, count=2, order=3, rng=np.random.default_rng(1)) for _ in range(2)
+    )
     assert first[0].n == 3
     np.testing.assert_array_equal(first[1].A, second[1].A)
 
@@ -147,7 +179,9 @@ def test_too_few_samples_for_the_lags_are_refused():
     ],
 )
 @pytest.mark.slow
-def test_benchmark_sets_are_simulated_on_the_hold_out_as_well_as_published(shared, name, inputs, outputs, cut, bar):
+def test_benchmark_sets_are_simulated_on_the_hold_out_as_well_as_published(
+    shared, name, inputs, outputs, cut, bar
+):
     record = np.loadtxt(shared(f"data/daisy_a/{name}.dat"))
     u, y = record[:, inputs], record[:, outputs]
     found = identify([u[:cut]], [y[:cut]], sample_time_s=1.0, feedthrough=None, refinement="validated")
@@ -158,5 +192,7 @@ def test_two_heater_kit_is_simulated_and_predicted_on_the_last_third(shared):
     record = np.genfromtxt(shared("data/tclab_mlid_prbs/prbs.csv"), delimiter=",", skip_header=1)
     u, y, cut = record[:, 1:3], record[:, 3:5], int(0.7 * len(record))
     found = identify([u[:cut]], [y[:cut]], sample_time_s=1.0)
-    assert (simulate_fit(found.plant, [u[cut:]], [y[cut:]]) >= 62).all()  # plain MOESP of order 3 reaches 58 and 60 %
+    assert (
+        simulate_fit(found.plant, [u[cut:]], [y[cut:]]) >= 62
+    ).all()  # plain MOESP of order 3 reaches 58 and 60 %
     assert (predict_fit(found.plant, [u[cut:]], [y[cut:]], 60) >= 75).all()

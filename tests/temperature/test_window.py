@@ -1,4 +1,5 @@
-"""The indirect route: the window that it chooses, the predictor that it learns, the law that follows, and the state that it hands to Algorithm 2."""
+"""The indirect route: the window that it chooses, the predictor that it learns, the law that follows, and the
+state that it hands to Algorithm 2."""
 
 import numpy as np
 import pytest
@@ -46,10 +47,14 @@ def test_under_noise_the_window_is_longer(record):
 def test_one_factorisation_gives_the_least_squares_fit_of_its_window(record):
     u, y = record[0][:900], noisy(record[1], 0.5)[:900]
     found = learn([u], [y], longest=8, offset=True)
-    w, _, y_now = windows([u[8 - found.N :]], [y[8 - found.N :]], found.N)  # the samples that the longest window leaves
+    w, _, y_now = windows(
+        [u[8 - found.N :]], [y[8 - found.N :]], found.N
+    )  # the samples that the longest window leaves
     columns = np.hstack([w, np.ones((len(w), 1))])
     expected = np.linalg.lstsq(columns, y_now, rcond=None)[0]
-    np.testing.assert_allclose(np.vstack([found.Theta.T, found.theta_0]), expected, atol=1e-7)  # two roads through a condition of 1e4
+    np.testing.assert_allclose(
+        np.vstack([found.Theta.T, found.theta_0]), expected, atol=1e-7
+    )  # two roads through a condition of 1e4
     rest = y_now - columns @ expected
     np.testing.assert_allclose(found.covariance, rest.T @ rest / (len(w) - columns.shape[1]), rtol=1e-8)
 
@@ -59,7 +64,9 @@ def test_a_spread_of_gains_adds_to_each_input_its_own_moments(record):
     found = learn([u], [y], longest=3, gain_spread=0.2)
     w, _, y_now = windows([u[3 - found.N :]], [y[3 - found.N :]], found.N)
     own = np.zeros((found.N * 12,) * 2)
-    own[: found.N * 7, : found.N * 7] = np.kron(np.ones((found.N, found.N)), np.eye(7))  # lags of one input with one another, no two inputs
+    own[: found.N * 7, : found.N * 7] = np.kron(
+        np.ones((found.N, found.N)), np.eye(7)
+    )  # lags of one input with one another, no two inputs
     moments = w.T @ w
     np.testing.assert_allclose(
         found.Theta.T, np.linalg.solve(moments + 0.04 * own * moments, w.T @ y_now), atol=1e-8
@@ -74,7 +81,9 @@ def test_the_table_holds_akaike_s_criterion(record):
         w, _, y_now = windows([u[4 - int(N) :]], [y[4 - int(N) :]], int(N))
         rest = y_now - w @ np.linalg.lstsq(w, y_now, rcond=None)[0]
         assert parameters == 5 * 12 * N
-        assert criterion == pytest.approx(len(w) * np.linalg.slogdet(rest.T @ rest / len(w))[1] + 2 * parameters, rel=1e-9)  # rounding
+        assert criterion == pytest.approx(
+            len(w) * np.linalg.slogdet(rest.T @ rest / len(w))[1] + 2 * parameters, rel=1e-9
+        )  # rounding
 
 
 def test_segments_and_masked_samples_leave_the_predictor_exact():
@@ -84,7 +93,9 @@ def test_segments_and_masked_samples_leave_the_predictor_exact():
     found = learn([u[:120], u[120:]], [y[:120], y[120:]], longest=3, offset=True)
     assert found.samples == 300 - 2 * 3 - 4
     w, _, y_now = windows([u[120:]], [y[120:]], found.N)
-    np.testing.assert_allclose(w @ found.Theta.T + found.theta_0, y_now, atol=1e-10)  # rounding of numbers near 10
+    np.testing.assert_allclose(
+        w @ found.Theta.T + found.theta_0, y_now, atol=1e-10
+    )  # rounding of numbers near 10
 
 
 def test_the_predictor_is_the_plant_from_its_window_on():
@@ -93,7 +104,9 @@ def test_the_predictor_is_the_plant_from_its_window_on():
     found = learn([u[:200]], [y[:200]], longest=4, offset=True)
     w = windows([u], [y], found.N)[0][200 - found.N]
     model = predictor(found, sample_time_s=2.0)
-    np.testing.assert_allclose(simulate(model, u[200:], w)[1], y[200:], atol=1e-9)  # rounding fed back for 100 steps
+    np.testing.assert_allclose(
+        simulate(model, u[200:], w)[1], y[200:], atol=1e-9
+    )  # rounding fed back for 100 steps
     assert model.sample_time_s == 2.0
 
 
@@ -104,13 +117,16 @@ def test_the_law_of_the_window_is_the_optimal_one_on_a_plant_with_offset():
     best = gains(SMALL, Q2, R2, 0.9)
     N = found.K.shape[1] // 4
     w = windows([u], [y], N)[0]
-    np.testing.assert_allclose(w @ found.K.T + found.k, x[N:-1] @ best.K_x.T + best.k, atol=1e-9)  # rounding of a least-squares fit
+    np.testing.assert_allclose(
+        w @ found.K.T + found.k, x[N:-1] @ best.K_x.T + best.k, atol=1e-9
+    )  # rounding of a least-squares fit
     np.testing.assert_allclose(found.K_r, best.K_r, atol=1e-9)
 
 
 @pytest.mark.parametrize(("noise", "orders"), [(0.0, {6}), (0.1, {5, 6}), (0.5, {5, 6})])
 def test_the_predicted_state_has_the_order_of_the_plant_and_no_direction_of_noise(record, noise, orders):
-    """The null direction of C moves the outputs by little: under noise it may be left out, but of 40 or more directions of the window no other comes in."""
+    """The null direction of C moves the outputs by little: under noise it may be left out, but of 40 or more
+    directions of the window no other comes in."""
     y = noisy(record[1], noise)
     long = learn([record[0]], [y], longest=8)
     assert predicted_tuples(long, [record[0]], [y]).s.shape[1] in orders
@@ -132,13 +148,16 @@ def test_a_window_that_predicts_nothing_is_refused():
     rng = np.random.default_rng(0)
     u, y = rng.normal(size=(400, 1)), rng.normal(size=(400, 1))
     with pytest.raises(
-        ValueError, match="the window predicts nothing beyond the noise of the sensors; probe with a larger amplitude, or record longer"
+        ValueError,
+        match="the window predicts nothing beyond the noise of the sensors; probe with a larger amplitude, or record longer",
     ):
         predicted_tuples(learn([u], [y], longest=2), [u], [y])
 
 
 def test_a_record_shorter_than_the_shortest_window_needs_is_refused(record):
-    with pytest.raises(ValueError, match="expected more than 24 complete windows of 6 samples, found 20; record longer"):
+    with pytest.raises(
+        ValueError, match="expected more than 24 complete windows of 6 samples, found 20; record longer"
+    ):
         learn([record[0][:26]], [record[1][:26]], longest=6)
 
 

@@ -30,8 +30,11 @@ class Part(NamedTuple):
     conformance: Conformance
 
 
-def compose_all(folder: Path, learned: Learned, printer: Printer, p: ComposeParts) -> tuple[list[Part], dict[str, str]]:
-    """Every part program in `folder`, and the reasons of those that cannot be composed; raises ValueError where none can."""
+def compose_all(
+    folder: Path, learned: Learned, printer: Printer, p: ComposeParts
+) -> tuple[list[Part], dict[str, str]]:
+    """Every part program in `folder`, and the reasons of those that
+    cannot be composed; raises ValueError where none can."""
     parts, refused = [], {}
     for path in programs(folder):
         try:
@@ -39,25 +42,38 @@ def compose_all(folder: Path, learned: Learned, printer: Printer, p: ComposePart
         except ValueError as error:
             refused[path.stem] = str(error)
     if not parts:
-        raise ValueError(f"{folder}: none of {len(refused)} part programs can be composed; the first: {next(iter(refused.values()))}")
+        raise ValueError(
+            f"{folder}: none of {len(refused)} part programs can be composed; the first: "
+            f"{next(iter(refused.values()))}"
+        )
     return parts, refused
 
 
 def programs(folder: Path) -> list[Path]:
     """The part programs in a folder, by name. Raises ValueError where there is none."""
-    found = sorted(path for path in folder.glob("*") if path.suffix.lower() in {".gcode", ".gco", ".g", ".nc"})
+    found = sorted(
+        path for path in folder.glob("*") if path.suffix.lower() in {".gcode", ".gco", ".g", ".nc"}
+    )
     if not found:
         raise ValueError(f"{folder}: expected part programs (*.gcode), found none; copy one there")
     return found
 
 
 def judged(
-    parts: Sequence[Part], learned: Learned, models: dict[str, Any], printer: Printer, p: ComposeParts, taught: TrainIlc
+    parts: Sequence[Part],
+    learned: Learned,
+    models: dict[str, Any],
+    printer: Printer,
+    p: ComposeParts,
+    taught: TrainIlc,
 ) -> list[tuple[Part, list[Score]]]:
-    """Every part with the scores of its composers, on the extruders of models.json and with the noise of train_ilc."""
+    """Every part with the scores of its composers, on the extruders of
+    models.json and with the noise of train_ilc."""
     settings = {
-        "nominals": laws.extruders(models, "nominal"), "plants": laws.extruders(models, "plant"), "noise": laws.noise(taught),
-        "s": laws.settings(taught, printer), "updates": p.whole_updates, "bead_area_mm2": printer.bead_area_mm2, "shortest_s": p.shortest_s,
+        "nominals": laws.extruders(models, "nominal"), "plants": laws.extruders(models, "plant"),
+        "noise": laws.noise(taught),
+        "s": laws.settings(taught, printer), "updates": p.whole_updates,
+        "bead_area_mm2": printer.bead_area_mm2, "shortest_s": p.shortest_s,
     }  # fmt: skip
     rng = np.random.default_rng(p.seed)
     return [
@@ -74,7 +90,8 @@ def compose(path: Path, learned: Learned, printer: Printer, p: ComposeParts) -> 
     learned_s = learned.library.sample_time_s
     if learned_s != printer.sample_time_s:
         raise ValueError(
-            f"params.yaml: printer.sample_time_s is {printer.sample_time_s:g} but the library was learned at {learned_s:g} s; "
+            f"params.yaml: printer.sample_time_s is {printer.sample_time_s:g} but the library was learned "
+            f"at {learned_s:g} s; "
             "learn it again with ./run dvc repro"
         )
     try:
@@ -85,24 +102,36 @@ def compose(path: Path, learned: Learned, printer: Printer, p: ComposeParts) -> 
         program = gcode.parse(data)
         if program.refusals and not np.any(program.moves.kind == gcode.Kind.EXTRUDE):
             first = program.refusals[0]
-            raise ValueError(f"line {first.line}: {first.why}; it was left out, and nothing of the program that could be read prints")
+            raise ValueError(
+                f"line {first.line}: {first.why}; it was left out, "
+                "and nothing of the program that could be read prints"
+            )
         planned = motion.plan(
-            program.moves, acceleration=printer.acceleration_mm_per_s2, junction_deviation_mm=printer.junction_deviation_mm,
-            speed_limit=printer.speed_limit_mm_per_s, unset_feed=printer.speed_mm_per_s, tool_change_s=printer.tool_change_s,
+            program.moves, acceleration=printer.acceleration_mm_per_s2,
+            junction_deviation_mm=printer.junction_deviation_mm,
+            speed_limit=printer.speed_limit_mm_per_s, unset_feed=printer.speed_mm_per_s,
+            tool_change_s=printer.tool_change_s,
         )  # fmt: skip
         settings = {"bead_area_mm2": printer.bead_area_mm2, "ramp_s": printer.ramp_s, "limit": printer.limit}
         composed = composition.compose(
-            learned, program, planned, materials={m.tool: m.name for m in printer.materials}, nozzle_mm=printer.nozzle_mm,
+            learned, program, planned, materials={m.tool: m.name for m in printer.materials},
+            nozzle_mm=printer.nozzle_mm,
             corner_deg=p.corner_deg, longest_pause_s=p.longest_pause_s, **settings,
         )  # fmt: skip
         report = conformance.conform(
-            composed, learned, shortest_s=p.shortest_s, largest_error_percent=p.largest_error_percent, refusals=program.refusals, **settings
+            composed,
+            learned,
+            shortest_s=p.shortest_s,
+            largest_error_percent=p.largest_error_percent,
+            refusals=program.refusals,
+            **settings,
         )
     return Part(path.stem, program, planned, composed, report)
 
 
 def write(part: Part, folder: Path) -> list[Path]:
-    """The commands of all tools and the tasks as CSV, and the conformance report as JSON, beside one another in `folder`."""
+    """The commands of all tools and the tasks as CSV, and the conformance
+    report as JSON, beside one another in `folder`."""
     composed = part.composed
     signal = {"time_s": np.arange(len(composed.streams[0].u)) * composed.sample_time_s}
     signal |= {f"T{stream.tool}_{stream.material}_mm": stream.u for stream in composed.streams}
@@ -128,17 +157,29 @@ def told(part: Part) -> str:
     lines, text = found.lines, []
     duration = len(composed.streams[0].u) * composed.sample_time_s
     text.append(
-        f"{part.name}: {len(lines.line)} printed lines in {int(composed.lines.run[-1]) + 1} runs, {duration:.1f} s; "
+        f"{part.name}: {len(lines.line)} printed lines in {int(composed.lines.run[-1]) + 1} runs, "
+        f"{duration:.1f} s; "
         f"the gantry sets out {composed.lead_in_s:.2f} s after the signal"
     )
     for stream in composed.streams:
-        predicted = {q.composer: q.rms_percent_of_on_off for q in composed.predictions if q.tool == stream.tool}
-        others = ", ".join(f"{name} {percent:.1f} %" for name, percent in sorted(predicted.items(), key=lambda item: item[1]))
-        text.append(f"T{stream.tool} {stream.material}: by {stream.composer}; predicted flow error, of on-off control's: {others}")
+        predicted = {
+            q.composer: q.rms_percent_of_on_off for q in composed.predictions if q.tool == stream.tool
+        }
+        others = ", ".join(
+            f"{name} {percent:.1f} %" for name, percent in sorted(predicted.items(), key=lambda item: item[1])
+        )
+        text.append(
+            f"T{stream.tool} {stream.material}: by {stream.composer}; predicted flow error, "
+            f"of on-off control's: {others}"
+        )
         sat = found.saturation[stream.tool]
         if not sat.enough:
             ramp = found.ramp_that_would_do_s[stream.tool]
-            do = f"ramps of {ramp:.2f} s would do" if math.isfinite(ramp) else "no ramp would do: print slower, or raise printer.limit_mm"
+            do = (
+                f"ramps of {ramp:.2f} s would do"
+                if math.isfinite(ramp)
+                else "no ramp would do: print slower, or raise printer.limit_mm"
+            )
             text.append(
                 f"  the command reaches its limit {sat.share_percent:.1f} % of the printing time (peak "
                 f"{sat.peak_over_steady:.1f} x steady); {do}"
@@ -173,9 +214,11 @@ def signal_rows(part: Part, scores: Sequence[Score]) -> dict[str, np.ndarray]:
     for i, stream in enumerate(composed.streams):
         flows = {f"{score.composer}_mm3_per_s": score.y for score in scores if score.stream == i}
         parts.append({
-            "part": np.full(n, part.name, object), "tool": np.full(n, stream.tool), "material": np.full(n, stream.material, object),
+            "part": np.full(n, part.name, object), "tool": np.full(n, stream.tool),
+            "material": np.full(n, stream.material, object),
             "time_s": np.arange(n) * Ts,
-            "x_mm": position[at, 0], "y_mm": position[at, 1], "wanted_mm3_per_s": stream.r, "command_mm": stream.u,
+            "x_mm": position[at, 0], "y_mm": position[at, 1], "wanted_mm3_per_s": stream.r,
+            "command_mm": stream.u,
             "predicted_mm3_per_s": stream.y,
             **{column.name: flows.get(column.name, np.full(n, np.nan)) for column in SIGNALS.columns[9:]},
         })  # fmt: skip
@@ -185,12 +228,20 @@ def signal_rows(part: Part, scores: Sequence[Score]) -> dict[str, np.ndarray]:
 def score_rows(part: Part, scores: Sequence[Score]) -> dict[str, list]:
     materials = [part.composed.streams[score.stream].material for score in scores]
     values = [(part.name, material, *score[1:6]) for material, score in zip(materials, scores, strict=True)]
-    return {column.name: list(column_values) for column, column_values in zip(SCORES.columns, zip(*values, strict=True), strict=True)}
+    return {
+        column.name: list(column_values)
+        for column, column_values in zip(SCORES.columns, zip(*values, strict=True), strict=True)
+    }
 
 
 def task_rows(part: Part) -> dict[str, np.ndarray]:
     tasks = part.composed.tasks
-    values = [np.full(len(tasks.task), part.name, object), tasks.task.astype(object), *tasks[1:], part.composed.error_percent]
+    values = [
+        np.full(len(tasks.task), part.name, object),
+        tasks.task.astype(object),
+        *tasks[1:],
+        part.composed.error_percent,
+    ]
     return dict(zip([column.name for column in TASKS.columns], values, strict=True))
 
 
@@ -203,8 +254,10 @@ def line_rows(part: Part) -> dict[str, np.ndarray]:
 def rows(done: Sequence[tuple[Part, Sequence[Score]]]) -> dict[str, dict[str, np.ndarray]]:
     """Columns of schemas SIGNALS, SCORES, TASKS and LINES of all parts."""
     return {
-        "signals": stacked([signal_rows(*one) for one in done]), "scores": stacked([score_rows(*one) for one in done]),
-        "tasks": stacked([task_rows(part) for part, _ in done]), "lines": stacked([line_rows(part) for part, _ in done]),
+        "signals": stacked([signal_rows(*one) for one in done]),
+        "scores": stacked([score_rows(*one) for one in done]),
+        "tasks": stacked([task_rows(part) for part, _ in done]),
+        "lines": stacked([line_rows(part) for part, _ in done]),
     }  # fmt: skip
 
 
@@ -215,7 +268,9 @@ def stacked(tables: Sequence[dict[str, Any]]) -> dict[str, np.ndarray]:
 
 def reports(done: Sequence[tuple[Part, Sequence[Score]]], refused: dict[str, str]) -> dict[str, Any]:
     """Conformance by part, and why others were refused."""
-    return {part.name: report(part) for part, _ in done} | {name: {"refused": why} for name, why in refused.items()}
+    return {part.name: report(part) for part, _ in done} | {
+        name: {"refused": why} for name, why in refused.items()
+    }
 
 
 def report(part: Part) -> dict[str, Any]:
@@ -232,13 +287,20 @@ def report(part: Part) -> dict[str, Any]:
         "shorter_than_lead": int(np.sum(lines.shorter_than_lead)),
         "composer": {stream.material: stream.composer for stream in composed.streams},
         "predicted_percent": {
-            p.material: {q.composer: finite_or_none(q.rms_percent_of_on_off) for q in composed.predictions if q.material == p.material}
+            p.material: {
+                q.composer: finite_or_none(q.rms_percent_of_on_off)
+                for q in composed.predictions
+                if q.material == p.material
+            }
             for p in composed.predictions
         },
         "saturation": {
-            name: {key: finite_or_none(value) for key, value in one._asdict().items()} for name, one in _by_material(part, found.saturation)
+            name: {key: finite_or_none(value) for key, value in one._asdict().items()}
+            for name, one in _by_material(part, found.saturation)
         },
-        "ramp_that_would_do_s": {name: finite_or_none(value) for name, value in _by_material(part, found.ramp_that_would_do_s)},
+        "ramp_that_would_do_s": {
+            name: finite_or_none(value) for name, value in _by_material(part, found.ramp_that_would_do_s)
+        },
         "refused": refused,
         "unknown_words": len(part.program.other_line),
     }

@@ -14,7 +14,8 @@ def settings(p: TrainIlc, printer: Printer) -> Settings:
     """Of the paper's law and of ours, on this printer."""
     paper, law = p.paper, p.law
     return Settings(
-        printer.sample_time_s, printer.limit, paper.learning_gain, paper.fast_zero_s, paper.order, paper.cutoff_hz,
+        printer.sample_time_s, printer.limit, paper.learning_gain, paper.fast_zero_s, paper.order,
+        paper.cutoff_hz,
         law.identify_trials, law.floor, law.order, law.cutoff_hz, law.rise,
     )  # fmt: skip
 
@@ -30,7 +31,8 @@ def plain(extruder: Extruder) -> dict[str, float | None]:
 
 
 def extruders(models: dict[str, dict[str, Any]], which: str) -> dict[str, Extruder]:
-    """The nominal extruders, or the true ones of simulated machines, of models.json by material: what `plain` made."""
+    """The nominal extruders, or the true ones of simulated machines,
+    of models.json by material: what `plain` made."""
     return {
         name: Extruder(**{key: np.inf if value is None else value for key, value in found[which].items()})
         for name, found in models.items()

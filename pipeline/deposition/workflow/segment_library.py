@@ -1,4 +1,5 @@
-"""What segment_library does: learned trials -> trainings -> library; and the library with its chains, to two files and back."""
+"""What segment_library does: learned trials -> trainings -> library; and the
+library with its chains, to two files and back."""
 
 import math
 from collections.abc import Sequence
@@ -25,7 +26,9 @@ def learned(p: SegmentLibrary, printer: Printer, path: str, *, filmed: bool) -> 
         return composition.learn(found, sample_time_s=printer.sample_time_s)
 
 
-def trainings(lessons: dict[str, np.ndarray], law: str, routines: Sequence[Routine], nozzle_mm: float) -> list[Training]:
+def trainings(
+    lessons: dict[str, np.ndarray], law: str, routines: Sequence[Routine], nozzle_mm: float
+) -> list[Training]:
     """All trials of a law, by material and routine; those of the reference routine only where there is
     no other. Raises ValueError where there is none."""
     mine = lessons["law"] == law
@@ -50,11 +53,20 @@ def trainings(lessons: dict[str, np.ndarray], law: str, routines: Sequence[Routi
 
 def stored(learned: Learned) -> tuple[dict[str, list], dict[str, Any]]:
     """Columns of the library's table, and the rest as JSON."""
-    rows = [(b.task, b.material, b.nozzle_mm, b.speed, b.pause_s, b.lead, len(b.signal), b.signal) for b in learned.library.columns]
-    table = {column.name: list(values) for column, values in zip(LIBRARY.columns, zip(*rows, strict=True), strict=True)}
+    rows = [
+        (b.task, b.material, b.nozzle_mm, b.speed, b.pause_s, b.lead, len(b.signal), b.signal)
+        for b in learned.library.columns
+    ]
+    table = {
+        column.name: list(values)
+        for column, values in zip(LIBRARY.columns, zip(*rows, strict=True), strict=True)
+    }
     materials = [
         known._asdict()
-        | {"chain": known.chain._asdict() | {"extruder": {k: finite_or_none(v) for k, v in known.chain.extruder._asdict().items()}}}
+        | {
+            "chain": known.chain._asdict()
+            | {"extruder": {k: finite_or_none(v) for k, v in known.chain.extruder._asdict().items()}}
+        }
         for known in learned.materials
     ]
     rest = {
@@ -65,7 +77,9 @@ def stored(learned: Learned) -> tuple[dict[str, list], dict[str, Any]]:
             | {"chain": {k: finite_or_none(v) for k, v in known["chain"].items()}}
             for known in materials
         ],
-        "checks": [{key: finite_or_none(value) for key, value in check._asdict().items()} for check in learned.checks],
+        "checks": [
+            {key: finite_or_none(value) for key, value in check._asdict().items()} for check in learned.checks
+        ],
     }
     return table, rest
 
@@ -78,17 +92,32 @@ def restored(table: dict[str, np.ndarray], rest: dict[str, Any]) -> Learned:
     """What `stored` made."""
     names = ("task", "material", "nozzle_mm", "speed_mm_per_s", "pause_s", "lead", "signal_mm")
     columns = tuple(
-        Basis(str(task), str(material), float(nozzle), float(speed), float(pause), int(lead), np.array(signal, float))
-        for task, material, nozzle, speed, pause, lead, signal in zip(*(table[name] for name in names), strict=True)
+        Basis(
+            str(task),
+            str(material),
+            float(nozzle),
+            float(speed),
+            float(pause),
+            int(lead),
+            np.array(signal, float),
+        )
+        for task, material, nozzle, speed, pause, lead, signal in zip(
+            *(table[name] for name in names), strict=True
+        )
     )
-    library = Library(columns, rest["sample_time_s"], {name: (pair[0], pair[1]) for name, pair in rest["marks"].items()})
+    library = Library(
+        columns, rest["sample_time_s"], {name: (pair[0], pair[1]) for name, pair in rest["marks"].items()}
+    )
     materials = []
     for known in rest["materials"]:
         extruder = known["chain"]["extruder"]
         extruder = Extruder(**{key: math.inf if value is None else value for key, value in extruder.items()})
         chain = Chain(**(known["chain"] | {"extruder": extruder}))
         materials.append(composition.Material(**(known | {"chain": chain})))
-    checks = [Check(**(check | {"percent": math.nan if check["percent"] is None else check["percent"]})) for check in rest["checks"]]
+    checks = [
+        Check(**(check | {"percent": math.nan if check["percent"] is None else check["percent"]}))
+        for check in rest["checks"]
+    ]
     return Learned(library, tuple(materials), checks)
 
 
@@ -99,5 +128,6 @@ def read_learned(table: str, rest: str) -> Learned:
         return restored(columns, known)
     except (AttributeError, IndexError, KeyError, TypeError) as error:
         raise ValueError(
-            f"{rest} is not what segment_library writes ({error}); make it again with ./run dvc repro segment_library"
+            f"{rest} is not what segment_library writes ({error}); "
+            "make it again with ./run dvc repro segment_library"
         ) from None

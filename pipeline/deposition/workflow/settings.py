@@ -1,4 +1,5 @@
-"""Sections `printer` and `camera` of the parameters: the deposition loop's machine, its materials, and what looks at the bead."""
+"""Sections `printer` and `camera` of the parameters: the deposition loop's
+machine, its materials, and what looks at the bead."""
 
 import math
 from typing import Annotated, Literal
@@ -31,7 +32,8 @@ class Training(Section):
 
 
 class Printer(Section):
-    """Section `printer`: nozzle, bead, speed, limits of motion and of the plunger, and the materials with their tools."""
+    """Section `printer`: nozzle, bead, speed, limits of motion and of
+    the plunger, and the materials with their tools."""
 
     sample_time_s: float = Field(gt=0, le=1)
     nozzle_mm: float = Field(gt=0, le=20)
@@ -54,7 +56,10 @@ class Printer(Section):
             found = [getattr(material, key) for material in self.materials]
             twice = sorted({value for value in found if found.count(value) > 1})
             if twice:
-                raise ValueError(f"gives {key} {twice[0]} to more than one material; give every material a {key} of its own")
+                raise ValueError(
+                    f"gives {key} {twice[0]} to more than one material; "
+                    f"give every material a {key} of its own"
+                )
         return self
 
     @property
@@ -71,7 +76,8 @@ class Printer(Section):
         """The training routines: the reference, on which laws are compared, and those of the library."""
         return [
             routine(
-                off_s=t.off_s, on_s=t.on_s, pause_s=t.pause_s, tail_s=t.tail_s, speed=t.speed_mm_per_s, bead_area_mm2=self.bead_area_mm2,
+                off_s=t.off_s, on_s=t.on_s, pause_s=t.pause_s, tail_s=t.tail_s, speed=t.speed_mm_per_s,
+                bead_area_mm2=self.bead_area_mm2,
                 ramp_s=self.ramp_s, sample_time_s=self.sample_time_s,
             )
             for t in [self.reference, *self.routines]
@@ -79,7 +85,8 @@ class Printer(Section):
 
 
 class Camera(Section):
-    """Section `camera`: where it looks, how it was calibrated, and, for simulated trials, how hard the pictures are."""
+    """Section `camera`: where it looks, how it was calibrated, and,
+    for simulated trials, how hard the pictures are."""
 
     frames_per_s: float = Field(gt=0, le=1000)
     mm_per_px: float = Field(gt=-10, lt=10)
@@ -97,11 +104,13 @@ class Camera(Section):
     def _looks(self):
         if abs(self.mm_per_px) < 1e-6:
             raise ValueError(
-                f"has mm_per_px {self.mm_per_px:g}; give the size of a pixel on the stage, negative where the line trails to higher columns"
+                f"has mm_per_px {self.mm_per_px:g}; give the size of a pixel on the stage, "
+                "negative where the line trails to higher columns"
             )
         if self.columns[1] <= self.columns[0]:
             raise ValueError(
-                f"has columns {self.columns[0]} to {self.columns[1]}; give the first and, behind it, the last that is measured"
+                f"has columns {self.columns[0]} to {self.columns[1]}; give the first and, behind it, "
+                "the last that is measured"
             )
         return self
 

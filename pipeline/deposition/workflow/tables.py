@@ -12,14 +12,33 @@ TRIALS = Schema(
     1,
     (
         Column("material", TEXT, NONE, "material"),
-        Column("law", TEXT, NONE, "paper: law (2) of the study; paper_nominal: the same on its own nominal model; ours: inverse of the identified model; pixels: ours, the flow measured from camera frames"),
+        Column(
+            "law",
+            TEXT,
+            NONE,
+            "paper: law (2) of the study; paper_nominal: the same on its own nominal model; ours: "
+            "inverse of the identified model; pixels: ours, the flow measured from camera frames",
+        ),
         Column("routine", INDEX, NONE, "which training routine, counted from 0", low=0),
         Column("speed_mm_per_s", FLOAT, "mm/s", "printing speed of the routine", low=0),
         Column("pause_s", FLOAT, "s", "its pause", low=0),
         Column("trial", INDEX, NONE, "updates before this trial", low=0),
-        Column("rms_true", FLOAT, "mm^3/s", "root mean square error of the true flow; missing on a real machine", low=0, nullable=True),
+        Column(
+            "rms_true",
+            FLOAT,
+            "mm^3/s",
+            "root mean square error of the true flow; missing on a real machine",
+            low=0,
+            nullable=True,
+        ),
         Column("rms_measured", FLOAT, "mm^3/s", "root mean square error of the measured flow", low=0),
-        Column("ratio", FLOAT, NONE, "error as share of trial 0's: of the true flow where known, of the measured one elsewhere", low=0),
+        Column(
+            "ratio",
+            FLOAT,
+            NONE,
+            "error as share of trial 0's: of the true flow where known, of the measured one elsewhere",
+            low=0,
+        ),
         Column("peak_over_steady", FLOAT, NONE, "largest command as multiple of the steady one", low=0),
         Column("saturated", FLOAT, NONE, "share of time at the limit of the command", 0, 1),
         Column("rolled_back", BOOL, NONE, "the error rose, and the next command went back to the best trial"),
@@ -36,7 +55,13 @@ LESSONS = Schema(
         Column("time_s", FLOAT, "s", "time since the trial began"),
         Column("wanted_mm3_per_s", FLOAT, "mm^3/s", "wanted flow"),
         Column("command_mm", FLOAT, "mm", "plunger command as the drive applied it"),
-        Column("measured_mm3_per_s", FLOAT, "mm^3/s", "measured flow; missing where it could not be observed", nullable=True),
+        Column(
+            "measured_mm3_per_s",
+            FLOAT,
+            "mm^3/s",
+            "measured flow; missing where it could not be observed",
+            nullable=True,
+        ),
         Column("true_mm3_per_s", FLOAT, "mm^3/s", "true flow; missing on a real machine", nullable=True),
     ),
 )
@@ -64,7 +89,9 @@ FILMED = Schema(
         Column("frames", COUNT, NONE, "frames read", low=0),
         Column("rejected", COUNT, NONE, "frames without a usable bead", low=0),
         Column("reasons", TEXT, NONE, "why, with counts"),
-        Column("deviation_mm3_per_s", FLOAT, "mm^3/s", "median standard deviation of the measured flow", low=0),
+        Column(
+            "deviation_mm3_per_s", FLOAT, "mm^3/s", "median standard deviation of the measured flow", low=0
+        ),
         Column("observable", FLOAT, NONE, "share of the time in which the flow could be observed", 0, 1),
         Column("outliers", COUNT, NONE, "places that disagreed with their neighbours and count less", low=0),
     ),
@@ -82,11 +109,19 @@ SIGNALS = Schema(
         Column("wanted_mm3_per_s", FLOAT, "mm^3/s", "wanted flow"),
         Column("command_mm", FLOAT, "mm", "plunger command of the composer that was chosen"),
         Column("predicted_mm3_per_s", FLOAT, "mm^3/s", "flow that the identified chain predicts for it"),
-        Column("on_off_mm3_per_s", FLOAT, "mm^3/s", "true flow of on-off control; predicted on a real machine"),
+        Column(
+            "on_off_mm3_per_s", FLOAT, "mm^3/s", "true flow of on-off control; predicted on a real machine"
+        ),
         Column("priority_mm3_per_s", FLOAT, "mm^3/s", "the same of the library by the priority rule"),
         Column("superposition_mm3_per_s", FLOAT, "mm^3/s", "the same of the library by superposition"),
         Column("basis_mm3_per_s", FLOAT, "mm^3/s", "the same of the basis functions"),
-        Column("ilc_mm3_per_s", FLOAT, "mm^3/s", "the same after learning the whole structure; missing on a real machine", nullable=True),
+        Column(
+            "ilc_mm3_per_s",
+            FLOAT,
+            "mm^3/s",
+            "the same after learning the whole structure; missing on a real machine",
+            nullable=True,
+        ),
     ),
 )
 SCORES = Schema(
@@ -95,11 +130,34 @@ SCORES = Schema(
     (
         Column("part", TEXT, NONE, "part program"),
         Column("material", TEXT, NONE, "material"),
-        Column("composer", TEXT, NONE, "on_off, priority, superposition, basis, or ilc on the whole structure"),
+        Column(
+            "composer", TEXT, NONE, "on_off, priority, superposition, basis, or ilc on the whole structure"
+        ),
         Column("chosen", BOOL, NONE, "predicted to do best, and taken"),
-        Column("rms_percent_of_on_off", FLOAT, "percent", "root mean square error of the true flow, as share of on-off control's; predicted on a real machine", low=0),
-        Column("predicted_percent", FLOAT, "percent", "the same as predicted beforehand; missing where nothing predicts it", low=0, nullable=True),
-        Column("worst_line_volume_percent", FLOAT, "percent", "largest error of a printed line's volume, of lines long enough to be judged; missing where there is none", nullable=True),
+        Column(
+            "rms_percent_of_on_off",
+            FLOAT,
+            "percent",
+            "root mean square error of the true flow, as share of on-off control's; "
+            "predicted on a real machine",
+            low=0,
+        ),
+        Column(
+            "predicted_percent",
+            FLOAT,
+            "percent",
+            "the same as predicted beforehand; missing where nothing predicts it",
+            low=0,
+            nullable=True,
+        ),
+        Column(
+            "worst_line_volume_percent",
+            FLOAT,
+            "percent",
+            "largest error of a printed line's volume, of lines long enough to be judged; "
+            "missing where there is none",
+            nullable=True,
+        ),
     ),
 )
 TASKS = Schema(
@@ -114,7 +172,13 @@ TASKS = Schema(
         Column("end_s", FLOAT, "s", "its end"),
         Column("speed_mm_per_s", FLOAT, "mm/s", "printing speed", low=0),
         Column("pause_s", FLOAT, "s", "time lost at a Corner", low=0),
-        Column("error_percent", FLOAT, "percent", "predicted error of the library's signal; missing where nothing tells it", nullable=True),
+        Column(
+            "error_percent",
+            FLOAT,
+            "percent",
+            "predicted error of the library's signal; missing where nothing tells it",
+            nullable=True,
+        ),
     ),
 )
 LINES = Schema(

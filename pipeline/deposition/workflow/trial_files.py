@@ -1,8 +1,8 @@
 """One MCAP recording a deposition trial: camera frames, gantry, plunger command and, where it is
 simulated, the true flow; and the next trial's command.
 
-Written as any ROS 2 or Foxglove viewer opens it: CDR with the ros2msg texts embedded, in the order of time, chunks with CRCs. Read from
-that form or from a machine's own topics. Equal input gives equal bytes.
+Written as any ROS 2 or Foxglove viewer opens it: CDR with the ros2msg texts embedded, in the order of time,
+chunks with CRCs. Read from that form or from a machine's own topics. Equal input gives equal bytes.
 """
 
 import math
@@ -27,15 +27,19 @@ SPEED = Source("speed_mm_per_s", "/gantry:speed_mm_per_s", "mm/s")
 COMMAND = Source("command_mm", "/plunger:displacement_mm", "mm")
 FLOW = Source("flow_mm3_per_s", "/true_flow:flow_mm3_per_s", "mm^3/s")
 SOURCES = (POSITION, SPEED, COMMAND, FLOW)
-TYPES = {"/gantry": "beadline_msgs/msg/Gantry", "/plunger": "beadline_msgs/msg/Plunger", "/true_flow": "beadline_msgs/msg/TrueFlow"}
+TYPES = {
+    "/gantry": "beadline_msgs/msg/Gantry",
+    "/plunger": "beadline_msgs/msg/Plunger",
+    "/true_flow": "beadline_msgs/msg/TrueFlow",
+}
 
 
 class Conditions(NamedTuple):
     """What a trial was run with, kept in the recording's metadata.
 
-    `trial` counts from 0, `law` names what made the command. A bead w_px wide is (w_px - offset_px) / px_per_mm wide, and its
-    section follows from the contact angle; a column of the image lies at gantry position + (column - nozzle_column)
-    mm_per_px, negative where the line trails to higher columns.
+    `trial` counts from 0, `law` names what made the command. A bead w_px wide is (w_px - offset_px) /
+    px_per_mm wide, and its section follows from the contact angle; a column of the image lies at gantry
+    position + (column - nozzle_column) mm_per_px, negative where the line trails to higher columns.
     """
 
     material: str
@@ -84,25 +88,42 @@ def write_trial(
     """One recording of frames (time_s, (height, width) uint8 or uint16) and of signals (T,) at time_s (T,);
     frames are taken one by one, memory is that of a chunk.
 
-    `encoding` is "jpeg" (quality 95, 8 bits only), "png" (level 1) or "raw". Raises ValueError, nothing written, for
-    lengths that differ, values that are not finite, times that do not run forward, frames of changing size or kind, no
-    frame, and frames and signals that do not overlap in time.
+    `encoding` is "jpeg" (quality 95, 8 bits only), "png" (level 1) or "raw". Raises ValueError, nothing
+    written, for lengths that differ, values that are not finite, times that do not run forward, frames of
+    changing size or kind, no frame, and frames and signals that do not overlap in time.
     """
-    signals = [(POSITION, position_mm), (SPEED, speed_mm_per_s), (COMMAND, command_mm), (FLOW, flow_mm3_per_s)]
+    signals = [
+        (POSITION, position_mm),
+        (SPEED, speed_mm_per_s),
+        (COMMAND, command_mm),
+        (FLOW, flow_mm3_per_s),
+    ]
     tables = tables_of(path, time_s, [(source, values) for source, values in signals if values is not None])
     write_frames(path, tables, TYPES, time_s, (encoding, frames), (SCHEMA, _metadata(path, conditions)))
 
 
-def write_command(path: str | Path, conditions: Conditions, *, time_s: np.ndarray, command_mm: np.ndarray) -> None:
+def write_command(
+    path: str | Path, conditions: Conditions, *, time_s: np.ndarray, command_mm: np.ndarray
+) -> None:
     """The next trial's command u (T,) in mm as path.csv (time_s, displacement_mm) and path.mcap; `path` has
     no ending. Raises ValueError as write_trial does."""
     tables = tables_of(path, time_s, [(COMMAND, command_mm)])
     write_frames(f"{path}.mcap", tables, TYPES, time_s, None, (SCHEMA, _metadata(path, conditions)))
-    write_csv(f"{path}.csv", {"time_s": np.asarray(time_s, float), COMMAND.source.partition(":")[2]: np.asarray(command_mm, float)})
+    write_csv(
+        f"{path}.csv",
+        {
+            "time_s": np.asarray(time_s, float),
+            COMMAND.source.partition(":")[2]: np.asarray(command_mm, float),
+        },
+    )
 
 
 def _metadata(path: str | Path, conditions: Conditions) -> dict[str, str]:
-    wrong = [name for name, value in conditions._asdict().items() if isinstance(value, float) and not math.isfinite(value)]
+    wrong = [
+        name
+        for name, value in conditions._asdict().items()
+        if isinstance(value, float) and not math.isfinite(value)
+    ]
     if wrong:
         raise ValueError(f"{path}: the condition {wrong[0]} is not finite; give its value")
     pairs = {"schema_version": VERSION} | {name: str(value) for name, value in conditions._asdict().items()}
@@ -117,24 +138,40 @@ def _crc(pairs: dict[str, str]) -> str:
 # ---- reading
 
 
-def read_trial(path: str | Path, *, sources: Sequence[Source] = SOURCES, image: str = "", time: str = "", unreadable_share: float) -> Trial:
+def read_trial(
+    path: str | Path,
+    *,
+    sources: Sequence[Source] = SOURCES,
+    image: str = "",
+    time: str = "",
+    unreadable_share: float,
+) -> Trial:
     """A trial of `write_trial`, or a machine's own recording through `sources`, which map position_mm,
     speed_mm_per_s, command_mm and, if there is one, flow_mm3_per_s.
 
-    `image` names the image topic, by default the only one; `time` the clock: log_time (the default), publish_time, or the field of a stamp
-    that every topic has, such as header.stamp. A clock of the calendar is counted from the record's first whole second. Raises ValueError,
-    one sentence, where the file cannot be read, for a topic that is not there, and for frames and signals that do not overlap in time; what
-    is damaged is left out and noted. At most `unreadable_share` of the frames may turn out not to be decodable when they are asked for.
+    `image` names the image topic, by default the only one; `time` the clock: log_time (the default),
+    publish_time, or the field of a stamp that every topic has, such as header.stamp. A clock of the
+    calendar is counted from the record's first whole second. Raises ValueError, one sentence, where
+    the file cannot be read, for a topic that is not there, and for frames and signals that do not
+    overlap in time; what is damaged is left out and noted. At most `unreadable_share` of the frames
+    may turn out not to be decodable when they are asked for.
     """
     path = Path(path)
     if not 0 <= unreadable_share <= 1:
-        raise ValueError(f"{path}: unreadable_share should be within 0 and 1 but is {unreadable_share:g}; give a share of the frames")
+        raise ValueError(
+            f"{path}: unreadable_share should be within 0 and 1 but is {unreadable_share:g}; "
+            "give a share of the frames"
+        )
     if file_format(path) != "mcap":
-        raise ValueError(f"{path} is a table but a trial should be an MCAP recording with frames; name the recording")
+        raise ValueError(
+            f"{path} is a table but a trial should be an MCAP recording with frames; name the recording"
+        )
     try:
         return _read(path, sources, image, time or "log_time", unreadable_share)
     except OSError as error:
-        raise ValueError(f"{path} cannot be read ({error.strerror or error}); check the disk, or copy the recording again") from None
+        raise ValueError(
+            f"{path} cannot be read ({error.strerror or error}); check the disk, or copy the recording again"
+        ) from None
 
 
 def _read(path: Path, sources: Sequence[Source], image: str, time: str, unreadable_share: float) -> Trial:
@@ -142,22 +179,37 @@ def _read(path: Path, sources: Sequence[Source], image: str, time: str, unreadab
     if not any(topic.count for topic in found.values()):
         raise ValueError(f"{path}: it has no whole message ({damage(path)}); copy the recording again")
     camera = image_topic(path, found, image)
-    film = read_frames(path, camera, _places(path, sources, found), found, clock=time, unreadable_share=unreadable_share)
+    film = read_frames(
+        path, camera, _places(path, sources, found), found, clock=time, unreadable_share=unreadable_share
+    )
     frames, signals, notes = film.frames, film.signals, film.notes
-    check_overlap(path, span_of(frames.time_s), {name: span_of(time_s) for name, (time_s, _) in signals.items()})
+    check_overlap(
+        path, span_of(frames.time_s), {name: span_of(time_s) for name, (time_s, _) in signals.items()}
+    )
     first, last = span_of(signals[COMMAND.signal][0])
     outside = int(np.count_nonzero((frames.time_s < first) | (frames.time_s > last)))
     if outside:
-        notes.append(Note("outside", "", outside, f"{outside} of {len(frames.time_s)} frames lie before or after the command"))
+        notes.append(
+            Note(
+                "outside",
+                "",
+                outside,
+                f"{outside} of {len(frames.time_s)} frames lie before or after the command",
+            )
+        )
     return Trial(str(path), _conditions(path, film.metadata.get(SCHEMA, {}), notes), signals, frames, notes)
 
 
-def _places(path: Path, sources: Sequence[Source], found: dict[str, Topic]) -> dict[str, tuple[Source, str, str]]:
-    """{signal: (source, topic, field)}; only the true flow, which no machine knows, may be absent where its source is ours."""
+def _places(
+    path: Path, sources: Sequence[Source], found: dict[str, Topic]
+) -> dict[str, tuple[Source, str, str]]:
+    """{signal: (source, topic, field)}; only the true flow, which no
+    machine knows, may be absent where its source is ours."""
     for needed in (POSITION, SPEED, COMMAND):
         if [source.signal for source in sources].count(needed.signal) != 1:
             raise ValueError(
-                f"{path}: the mapping should give {needed.signal} one source; map the gantry's position and speed, and the command"
+                f"{path}: the mapping should give {needed.signal} one source; "
+                "map the gantry's position and speed, and the command"
             )
     places = {}
     for source in sources:
@@ -172,24 +224,36 @@ def _places(path: Path, sources: Sequence[Source], found: dict[str, Topic]) -> d
 
 def _conditions(path: Path, said: dict[str, str], notes: list[Note]) -> Conditions | None:
     if not said:
-        notes.append(Note("conditions", "", 1, f"it does not say what the trial was run with: it has no whole metadata record {SCHEMA}"))
+        notes.append(
+            Note(
+                "conditions",
+                "",
+                1,
+                f"it does not say what the trial was run with: it has no whole metadata record {SCHEMA}",
+            )
+        )
         return None
     pairs = {name: value for name, value in said.items() if name != "crc32"}
     crc = said.get("crc32")
     if crc is not None and crc != _crc(pairs):
         raise ValueError(
-            f"{path}: the trial's conditions should have CRC {_crc(pairs)} but say {crc}, so they are damaged; copy the recording again"
+            f"{path}: the trial's conditions should have CRC {_crc(pairs)} but say {crc}, "
+            "so they are damaged; copy the recording again"
         )
     if pairs.get("schema_version") != VERSION:
         raise ValueError(
-            f"{path}: the trial's conditions have version {pairs.get('schema_version')} but {VERSION} is read; record it with this version"
+            f"{path}: the trial's conditions have version {pairs.get('schema_version')} but {VERSION} is "
+            "read; record it with this version"
         )
     kinds = Conditions.__annotations__
     try:
         return Conditions(**{name: kinds[name](pairs[name]) for name in Conditions._fields})
     except KeyError as error:
-        raise ValueError(f"{path}: the trial's conditions lack {error.args[0]}; write it into the metadata record {SCHEMA}") from None
+        raise ValueError(
+            f"{path}: the trial's conditions lack {error.args[0]}; write it into the metadata record {SCHEMA}"
+        ) from None
     except ValueError as error:
         raise ValueError(
-            f"{path}: the trial's conditions cannot be read ({error}); write numbers into the metadata record {SCHEMA}"
+            f"{path}: the trial's conditions cannot be read ({error}); "
+            f"write numbers into the metadata record {SCHEMA}"
         ) from None

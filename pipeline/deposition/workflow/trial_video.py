@@ -51,13 +51,21 @@ def scene(camera: Camera, rng: np.random.Generator) -> rendering.Camera:
 def calibrate(scene: rendering.Camera, camera: Camera, rng: np.random.Generator) -> bead.Calibration:
     """Pixels to mm on pictures of the known widths of section `camera`."""
     known = np.repeat(camera.known_widths_mm, CALIBRATION_FRAMES)
-    frames = [scene.frame(width / abs(camera.mm_per_px), stage_px=int(rng.integers(0, 10_000))) for width in known]
-    seen = [bead.measure(frame, columns=tuple(camera.columns), longest_blur_px=camera.longest_blur_px) for frame in frames]
+    frames = [
+        scene.frame(width / abs(camera.mm_per_px), stage_px=int(rng.integers(0, 10_000))) for width in known
+    ]
+    seen = [
+        bead.measure(frame, columns=tuple(camera.columns), longest_blur_px=camera.longest_blur_px)
+        for frame in frames
+    ]
     bad = [f"{width:g} mm: {one.reason}" for width, one in zip(known, seen, strict=True) if one.reason]
     if bad:
-        reasons = ", ".join(f"{bad.count(what)} of {CALIBRATION_FRAMES} of {what}" for what in dict.fromkeys(bad))
+        reasons = ", ".join(
+            f"{bad.count(what)} of {CALIBRATION_FRAMES} of {what}" for what in dict.fromkeys(bad)
+        )
         raise ValueError(
-            f"camera: known widths should be seen in every picture but are not ({reasons}); fit camera.known_widths_mm to what is seen at "
+            f"camera: known widths should be seen in every picture but are not ({reasons}); "
+            "fit camera.known_widths_mm to what is seen at "
             f"{abs(camera.mm_per_px):g} mm per px, or raise camera.longest_blur_px"
         )
     return bead.calibrate(np.array([one.width for one in seen]), known)
@@ -76,18 +84,27 @@ def film(
     noise: Noise,
     rng: np.random.Generator,
 ) -> None:
-    """Runs the command u (T,) in mm on a simulated machine before the camera, and records it with its true flow.
+    """Runs the command u (T,) in mm on a simulated machine before the
+    camera, and records it with its true flow.
 
-    What is filmed is the true flow with what does not repeat from trial to trial; a law is judged by the true flow alone.
+    What is filmed is the true flow with what does not repeat from
+    trial to trial; a law is judged by the true flow alone.
     """
     truth = true_flow(plant, u, sample_time_s=printer.sample_time_s, limit=printer.limit)
-    laid = np.maximum(disturb(truth, rng, steady_flow=routine.r.max(), white=noise.white, drift=noise.drift, gain=noise.gain), 0.0)
+    laid = np.maximum(
+        disturb(
+            truth, rng, steady_flow=routine.r.max(), white=noise.white, drift=noise.drift, gain=noise.gain
+        ),
+        0.0,
+    )
     pictures = scene.trial(
         routine.time_s, laid, routine.position, view=view(camera), frame_rate_hz=camera.frames_per_s,
-        nozzle_mm=(printer.nozzle_mm / 2, printer.nozzle_outer_mm / 2), contact_angle_deg=camera.contact_angle_deg,
+        nozzle_mm=(printer.nozzle_mm / 2, printer.nozzle_outer_mm / 2),
+        contact_angle_deg=camera.contact_angle_deg,
     )  # fmt: skip
     trial_files.write_trial(
-        path, conditions, pictures, time_s=routine.time_s, position_mm=routine.position, speed_mm_per_s=routine.speed,
+        path, conditions, pictures, time_s=routine.time_s, position_mm=routine.position,
+        speed_mm_per_s=routine.speed,
         command_mm=np.clip(u, -printer.limit, printer.limit), flow_mm3_per_s=truth, encoding=camera.encoding,
     )  # fmt: skip
 
@@ -99,33 +116,40 @@ def watch(path: str | Path, routine: Routine, *, printer: Printer, camera: Camer
     known = recording.conditions
     if known is None:
         raise ValueError(
-            f"{path}: expected metadata with material, trial and calibration (record beadline.trial), found none; "
+            f"{path}: expected metadata with material, trial and calibration (record "
+            "beadline.trial), found none; "
             "write it as the commands in datasets/train_ilc/next have it"
         )
     if not known.px_per_mm > 0 or known.trial < 0:
         raise ValueError(
-            f"{path}: expected a scale px_per_mm above 0 and a trial from 0 on, found {known.px_per_mm:g} and {known.trial}; "
+            f"{path}: expected a scale px_per_mm above 0 and a trial from 0 on, "
+            f"found {known.px_per_mm:g} and {known.trial}; "
             f"mend the metadata record {trial_files.SCHEMA}"
         )
     late = _late(*recording.signals["position_mm"], routine)
-    recording = recording._replace(signals={name: (time_s - late, values) for name, (time_s, values) in recording.signals.items()})
+    recording = recording._replace(
+        signals={name: (time_s - late, values) for name, (time_s, values) in recording.signals.items()}
+    )
     for name, (time_s, _) in recording.signals.items():
         if len(time_s) == 0 or time_s[0] > SLACK_S or time_s[-1] < routine.time_s[-1] - SLACK_S:
             span = f"{time_s[0]:.2f} to {time_s[-1]:.2f} s" if len(time_s) else "nothing"
             raise ValueError(
-                f"{path}: expected {name} from 0 to {routine.time_s[-1]:.2f} s, as its routine has it, found {span}; "
+                f"{path}: expected {name} from 0 to {routine.time_s[-1]:.2f} s, "
+                f"as its routine has it, found {span}; "
                 "record the whole trial, from its start"
             )
     signals = {name: np.interp(routine.time_s, *at) for name, at in recording.signals.items()}
     for name in ("position_mm", "command_mm"):
         if gaps := int(np.count_nonzero(~np.isfinite(signals[name]))):
             raise ValueError(
-                f"{path}: expected {name} at every moment but {gaps} of {len(routine.time_s)} are missing; record the trial again"
+                f"{path}: expected {name} at every moment but {gaps} of {len(routine.time_s)} are missing; "
+                "record the trial again"
             )
     asked, travelled = np.ptp(routine.position), np.ptp(signals["position_mm"])
     if not 0.9 * asked < travelled < 1.1 * asked:
         raise ValueError(
-            f"{path}: expected the gantry to travel {asked:.4g} mm, as its routine has it, found {travelled:.4g} mm; "
+            f"{path}: expected the gantry to travel {asked:.4g} mm, as its routine has it, "
+            f"found {travelled:.4g} mm; "
             "check topic and unit of its position, or record the trial again"
         )
     rejected: dict[str, int] = {}
@@ -141,7 +165,8 @@ def watch(path: str | Path, routine: Routine, *, printer: Printer, camera: Camer
     if not any(np.any(width > 0) for width in widths):
         reasons = ", ".join(f"{reason} in {count}" for reason, count in sorted(rejected.items()))
         raise ValueError(
-            f"{path}: none of {len(times)} frames shows a usable bead ({reasons}); check light, focus, calibration and camera.columns, "
+            f"{path}: none of {len(times)} frames shows a usable bead ({reasons}); check light, focus, "
+            "calibration and camera.columns, "
             "or record the trial again"
         )
     try:
@@ -163,16 +188,21 @@ def watch(path: str | Path, routine: Routine, *, printer: Printer, camera: Camer
         raise ValueError(f"{path}: {error}") from None
     # within a pause only its volume was measured: a law learns nothing there
     y = np.where(found.observable, found.flow, np.nan)
-    return Watched(Trial(signals["command_mm"], y, signals.get("flow_mm3_per_s")), found, len(times), rejected)
+    return Watched(
+        Trial(signals["command_mm"], y, signals.get("flow_mm3_per_s")), found, len(times), rejected
+    )
 
 
 def _beads(recording: trial_files.Trial, camera: Camera) -> Iterator[tuple[float, bead.Bead]]:
-    """Beads of a few frames at a time: memory stays flat, and what a frame costs beyond its decoding is shared."""
+    """Beads of a few frames at a time: memory stays flat, and what a
+    frame costs beyond its decoding is shared."""
     frames = iter(recording.frames)
     while batch := list(itertools.islice(frames, TOGETHER)):
         times, pictures = zip(*batch, strict=True)
         with about(recording.path):
-            found = bead.measure_all(pictures, columns=tuple(camera.columns), longest_blur_px=camera.longest_blur_px)
+            found = bead.measure_all(
+                pictures, columns=tuple(camera.columns), longest_blur_px=camera.longest_blur_px
+            )
         yield from zip(times, found, strict=True)
 
 
@@ -194,14 +224,23 @@ def _late(time_s: np.ndarray, position: np.ndarray, routine: Routine) -> float:
 
 
 def conditions(
-    material: Material, routine: Routine, trial: int, law: str, *, printer: Printer, camera: Camera, calibration: bead.Calibration
+    material: Material,
+    routine: Routine,
+    trial: int,
+    law: str,
+    *,
+    printer: Printer,
+    camera: Camera,
+    calibration: bead.Calibration,
 ) -> trial_files.Conditions:
     """What the recording of a trial says of itself."""
     pause = routine.pause_s[1] - routine.pause_s[0]
     return trial_files.Conditions(
-        material.name, f"{printer.nozzle_mm:g}", trial, law, float(routine.speed.max()), round(pause, 9), printer.bead_area_mm2,
+        material.name, f"{printer.nozzle_mm:g}", trial, law, float(routine.speed.max()), round(pause, 9),
+        printer.bead_area_mm2,
         1 / calibration.gain,
-        -calibration.offset / calibration.gain, camera.contact_angle_deg, camera.mm_per_px, camera.nozzle_column,
+        -calibration.offset / calibration.gain, camera.contact_angle_deg, camera.mm_per_px,
+        camera.nozzle_column,
     )  # fmt: skip
 
 
@@ -209,7 +248,8 @@ def conditions(
 
 
 def first_and_last(paths: Sequence[Path], camera: Camera) -> list[Path]:
-    """Of recordings with conditions those of the first and the last trial of each material, in the order of their names."""
+    """Of recordings with conditions those of the first and the last
+    trial of each material, in the order of their names."""
     found: dict[str, list[tuple[int, Path]]] = {}
     for path in paths:
         known = trial_files.read_trial(path, unreadable_share=camera.unreadable_share).conditions
@@ -219,8 +259,9 @@ def first_and_last(paths: Sequence[Path], camera: Camera) -> list[Path]:
 
 
 def shown(path: Path, folder: Path, camera: Camera) -> list[dict[str, Any]]:
-    """Writes a few frames of a recording with the measured edges drawn in as JPEG to `folder`, start, steady line, corner, and the first
-    that was rejected for each reason, and returns a row for each: where it is from, what was measured, and why it was rejected."""
+    """Writes a few frames of a recording with the measured edges drawn in as JPEG to `folder`, start, steady
+    line, corner, and the first that was rejected for each reason, and returns a row for each: where it is
+    from, what was measured, and why it was rejected."""
     recording = trial_files.read_trial(path, unreadable_share=camera.unreadable_share)
     known, beads = recording.conditions, list(_beads(recording, camera))
     if known is None or not beads:
@@ -232,8 +273,16 @@ def shown(path: Path, folder: Path, camera: Camera) -> list[dict[str, Any]]:
             continue
         found, name = beads[k][1], f"{path.stem}_{k:05d}.jpg"
         _save(folder / name, bead.drawn(frame, found), found)
-        width = {"width_mm": (found.width - known.offset_px) / known.px_per_mm, "deviation_px": found.deviation}
-        conditions = {"material": known.material, "trial": known.trial, "recording": path.name, "topic": recording.frames.topic}
+        width = {
+            "width_mm": (found.width - known.offset_px) / known.px_per_mm,
+            "deviation_px": found.deviation,
+        }
+        conditions = {
+            "material": known.material,
+            "trial": known.trial,
+            "recording": path.name,
+            "topic": recording.frames.topic,
+        }
         rows.append(
             {
                 "file": name,
@@ -245,17 +294,25 @@ def shown(path: Path, folder: Path, camera: Camera) -> list[dict[str, Any]]:
                 **width,
             }
         )
-    return [{key: None if isinstance(value, float) and not np.isfinite(value) else value for key, value in row.items()} for row in rows]
+    return [
+        {
+            key: None if isinstance(value, float) and not np.isfinite(value) else value
+            for key, value in row.items()
+        }
+        for row in rows
+    ]
 
 
-def _places(recording: trial_files.Trial, beads: Sequence[tuple[float, bead.Bead]], camera: Camera) -> dict[int, str]:
+def _places(
+    recording: trial_files.Trial, beads: Sequence[tuple[float, bead.Bead]], camera: Camera
+) -> dict[int, str]:
     """Numbers of the frames to show, and what they show. After the pause of the gantry the corner takes a
     while to come to the middle of what is measured."""
     time_s, speed = recording.signals["speed_mm_per_s"]
     full = np.median([found.width for _, found in beads if not found.reason] or [0.0])
     good = [k for k, (_, found) in enumerate(beads) if not found.reason and found.width > 0.7 * full]
     rejected = {found.reason: k for k, (_, found) in reversed(list(enumerate(beads))) if found.reason}
-    places = {k: "rejected" for k in rejected.values()}
+    places = dict.fromkeys(rejected.values(), "rejected")
     if not good:
         return places
     begin = beads[good[0]][0]
@@ -264,14 +321,23 @@ def _places(recording: trial_files.Trial, beads: Sequence[tuple[float, bead.Bead
     # the gantry stands at the end too: the pause ends where its first stretch does
     ends = np.flatnonzero(np.diff(still) > 1.5 * np.median(np.diff(time_s))) if len(still) else []
     resumed = float(still[ends[0]]) if len(ends) else float(still[-1]) if len(still) else pause
-    travelled = (np.mean(camera.columns) - camera.nozzle_column) * abs(camera.mm_per_px) / max(float(speed.max()), 1e-9)
-    for place, at in (("start", begin), ("steady line", (begin + pause) / 2), ("corner", resumed + travelled)):
+    travelled = (
+        (np.mean(camera.columns) - camera.nozzle_column)
+        * abs(camera.mm_per_px)
+        / max(float(speed.max()), 1e-9)
+    )
+    for place, at in (
+        ("start", begin),
+        ("steady line", (begin + pause) / 2),
+        ("corner", resumed + travelled),
+    ):
         places.setdefault(min(good, key=lambda k: abs(beads[k][0] - at)), place)
     return places
 
 
 def _save(path: Path, picture: np.ndarray, found: bead.Bead) -> None:
-    """The picture (h, w, 3) in RGB as JPEG, cut to its middle half around the bead, at three quarters of its size."""
+    """The picture (h, w, 3) in RGB as JPEG, cut to its middle half
+    around the bead, at three quarters of its size."""
     h = picture.shape[0]
     rows = np.concatenate([found.top, found.bottom])
     middle = float(np.nanmean(rows)) if np.isfinite(rows).any() and not found.reason else h / 2
@@ -291,5 +357,18 @@ def rows(watched: dict[tuple[str, int], list[Watched]]) -> dict[str, np.ndarray]
             reasons = ", ".join(f"{reason} {count}" for reason, count in sorted(w.rejected.items()))
             seen = (float(np.median(w.flow.deviation)), float(np.mean(w.flow.observable)), w.flow.outliers)
             found.append((material, index, j, w.frames, sum(w.rejected.values()), reasons, *seen))
-    names = ("material", "routine", "trial", "frames", "rejected", "reasons", "deviation_mm3_per_s", "observable", "outliers")
-    return {name: list(values) for name, values in zip(names, zip(*found, strict=True) if found else [[]] * len(names), strict=True)}
+    names = (
+        "material",
+        "routine",
+        "trial",
+        "frames",
+        "rejected",
+        "reasons",
+        "deviation_mm3_per_s",
+        "observable",
+        "outliers",
+    )
+    return {
+        name: list(values)
+        for name, values in zip(names, zip(*found, strict=True) if found else [[]] * len(names), strict=True)
+    }

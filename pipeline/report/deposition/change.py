@@ -1,4 +1,5 @@
-"""The scores of the deposition loop against the accepted run's: which moved by more than two composers may differ and still count as one."""
+"""The scores of the deposition loop against the accepted run's: which moved by more than
+two composers may differ and still count as one."""
 
 from collections.abc import Sequence
 
@@ -9,8 +10,8 @@ from pipeline.report.shared.verdict import Figure, Missing, Question
 
 
 def moves(sources: Sources, found: Sequence[Structure]) -> list[Move]:
-    """Of every structure and material the flow error of the composer in use. These errors have no bands: one simulated print each, the same at
-    every run; so noise is what the choice between composers calls equal.
+    """Of every structure and material the flow error of the composer in use. These errors have no bands: one
+    simulated print each, the same at every run; so noise is what the choice between composers calls equal.
     """
     if sources.accepted is None or isinstance(sources.accepted, Missing):
         return []
@@ -18,10 +19,20 @@ def moves(sources: Sources, found: Sequence[Structure]) -> list[Move]:
 
 
 def _move(sources: Sources, one: Structure) -> Move:
-    question = Question(0, "flow_error_percent", f"Flow error, {one.part}, {one.material}", "%", one.asked.flow_error_percent, False, "")
+    question = Question(
+        0,
+        "flow_error_percent",
+        f"Flow error, {one.part}, {one.material}",
+        "%",
+        one.asked.flow_error_percent,
+        False,
+        "",
+    )
     score, before = one.scores.get(one.chosen), _accepted(sources, one)
     if score is None:
-        return Move(question, before, Missing("not measured", "no composer was chosen"), False, "not measured")
+        return Move(
+            question, before, Missing("not measured", "no composer was chosen"), False, "not measured"
+        )
     now = Figure(score.error, score.error, score.error)
     if before is None:
         return Move(question, None, now, False, "new")

@@ -1,4 +1,5 @@
-"""The learning of the deposition page: error against trial, commands, flow before and after, what the camera saw and what it told."""
+"""The learning of the deposition page: error against trial, commands, flow before
+and after, what the camera saw and what it told."""
 
 from collections.abc import Callable
 from typing import Any
@@ -40,7 +41,12 @@ def _laws(table: Table) -> list[str]:
 
 def _trial(table: Table, material: str, law: str, trial: int) -> Table:
     """The samples of one trial of the reference routine."""
-    rows = (table["material"] == material) & (table["law"] == law) & (table["routine"] == 0) & (table["trial"] == trial)
+    rows = (
+        (table["material"] == material)
+        & (table["law"] == law)
+        & (table["routine"] == 0)
+        & (table["trial"] == trial)
+    )
     return {name: values[rows] for name, values in table.items()}
 
 
@@ -73,22 +79,31 @@ def errors(sources: Sources) -> Picture:
             if not len(mine["trial"]):
                 continue
             bottom = i == len(materials) - 1
-            frame = charts.Frame(charts.linear(0, last, ticks=5), y, 368, 150 if bottom else 138, 30, 16 if bottom else 6)
+            frame = charts.Frame(
+                charts.linear(0, last, ticks=5), y, 368, 150 if bottom else 138, 30, 16 if bottom else 6
+            )
             measured = 100 * mine["rms_measured"] / max(float(mine["rms_measured"][0]), 1e-12)
             true = 100 * mine["ratio"]
             best = int(np.argmin(true))
             ends[law].append(f"{material} {percent(float(true[best]), 2)}")
             first = np.flatnonzero(true < 20)
             alt = (
-                f"{LAWS[law][0]}, material {material}: {percent(float(true[best]), 2)} of trial 0’s error at best, at trial {int(mine['trial'][best])}; "
-                + (f"below 20 % from trial {int(mine['trial'][first[0]])}" if len(first) else "never below 20 %")
+                f"{LAWS[law][0]}, material {material}: {percent(float(true[best]), 2)} of trial 0’s error at "
+                f"best, at trial {int(mine['trial'][best])}; "
+                + (
+                    f"below 20 % from trial {int(mine['trial'][first[0]])}"
+                    if len(first)
+                    else "never below 20 %"
+                )
             )
             layers = [
                 charts.level(frame, 20, "lim"),
                 charts.level(frame, 10, "lim"),
                 *([charts.dots(frame, mine["trial"], measured, "try", 1.8)] if not machine else []),
                 charts.line(frame, mine["trial"], true),
-                charts.dots(frame, mine["trial"][best : best + 1], true[best : best + 1], f"dot {LAWS[law][2]}", 3),
+                charts.dots(
+                    frame, mine["trial"][best : best + 1], true[best : best + 1], f"dot {LAWS[law][2]}", 3
+                ),
                 charts.label(frame, last, 130, f"material {material}", anchor="end"),
             ]
             panels.append(
@@ -116,7 +131,8 @@ def errors(sources: Sources) -> Picture:
         title,
         f"{text}.",
         shown,
-        f"{floor} In % of trial 0’s, log scale, against the trial; the lines at 20 and 10 are the guides. Filled dot: the best trial.",
+        f"{floor} In % of trial 0’s, log scale, against the trial; the lines at 20 and 10 are the guides. "
+        "Filled dot: the best trial.",
         page.origin(sources.source("trials")),
     )
 
@@ -143,35 +159,61 @@ def commands(sources: Sources) -> Picture:
             first, mine = (_trial(table, material, law, k) for k in (0, trial))
             if not len(mine["time_s"]):
                 continue
-            steady = float(np.median(first["command_mm"][first["wanted_mm3_per_s"] > 0.9 * first["wanted_mm3_per_s"].max()]))
+            steady = float(
+                np.median(
+                    first["command_mm"][first["wanted_mm3_per_s"] > 0.9 * first["wanted_mm3_per_s"].max()]
+                )
+            )
             u = mine["command_mm"] / steady
             peak = float(np.abs(u).max())
             if trial == last:
                 peaks.append(f"{material} {number(peak, 0)} times")
             bottom = i == len(materials) - 1
             frame = charts.Frame(
-                charts.linear(0, float(mine["time_s"][-1]), ticks=5), y, 368, 132 if bottom else 120, 30, 16 if bottom else 6
+                charts.linear(0, float(mine["time_s"][-1]), ticks=5),
+                y,
+                368,
+                132 if bottom else 120,
+                30,
+                16 if bottom else 6,
             )
             layers = [
                 charts.line(frame, mine["time_s"], u, most=500),
-                charts.label(frame, float(mine["time_s"][-1]), 10, f"material {material}: peak {short(peak, 2)} ×", anchor="end"),
+                charts.label(
+                    frame,
+                    float(mine["time_s"][-1]),
+                    10,
+                    f"material {material}: peak {short(peak, 2)} ×",
+                    anchor="end",
+                ),
             ]
             alt = f"Trial {trial}, material {material}: the command peaks at {short(peak, 2)} times the steady one"
             panels.append(
                 charts.panel(
-                    frame, layers, alt=alt, css="dd", title="× steady" if column == i == 0 else "", x_ticks=bottom, units=("s", "×")
+                    frame,
+                    layers,
+                    alt=alt,
+                    css="dd",
+                    title="× steady" if column == i == 0 else "",
+                    x_ticks=bottom,
+                    units=("s", "×"),
                 )
             )
         return panels
 
     heads = {0: "on\u2011off control", 1: "after one update", last: "the last"}
-    shown = [Column(f"Trial {trial}", heads[trial], "", draw(trial, i)) for i, trial in enumerate(dict.fromkeys((0, min(1, last), last)))]
+    shown = [
+        Column(f"Trial {trial}", heads[trial], "", draw(trial, i))
+        for i, trial in enumerate(dict.fromkeys((0, min(1, last), last)))
+    ]
     return Picture(
         "commands",
         title,
-        f"At the end the command peaks at {', '.join(peaks)} the steady one: a push at every start, a pull at every stop. A drive that gives less needs longer ramps.",
+        f"At the end the command peaks at {', '.join(peaks)} the steady one: a push at every start, "
+        "a pull at every stop. A drive that gives less needs longer ramps.",
         shown,
-        f"Plunger command of our law, in multiples of the steady command, against time in s. Beyond ± {REACH:g} it runs along the edge.",
+        "Plunger command of our law, in multiples of the steady command, against time in s. "
+        f"Beyond ± {REACH:g} it runs along the edge.",
         page.origin(sources.source("lessons")),
     )
 
@@ -194,7 +236,11 @@ def corner(sources: Sources) -> Picture:
     table, title = sources.tables["lessons"], "Flow around the corner, before and after learning"
     if isinstance(table, Missing):
         return hole("corner", title, table)
-    materials, laws, kind = _materials(table), _laws(table), "measured_mm3_per_s" if real(sources) else "true_mm3_per_s"
+    materials, laws, kind = (
+        _materials(table),
+        _laws(table),
+        "measured_mm3_per_s" if real(sources) else "true_mm3_per_s",
+    )
     stories = [("On\u2011off control", "before learning: trial 0", "baseline", "bl", laws[-1], False)]
     stories += [(*LAWS[law][:2], LAWS[law][3], LAWS[law][2], law, True) for law in laws]
     low: dict[str, float] = {}
@@ -224,26 +270,46 @@ def corner(sources: Sources) -> Picture:
             layers = [
                 charts.line(frame, t, wanted, "ref"),
                 charts.line(frame, t, flow),
-                charts.label(frame, frame.x.high, top, f"material {material}: {percent(error, 2)} off", anchor="end", dy=8),
+                charts.label(
+                    frame,
+                    frame.x.high,
+                    top,
+                    f"material {material}: {percent(error, 2)} off",
+                    anchor="end",
+                    dy=8,
+                ),
             ]
             panels.append(
                 charts.panel(
-                    frame, layers, alt=alt, css=css, title="mm³/s" if column == i == 0 else "", x_ticks=bottom, units=("s", "mm³/s")
+                    frame,
+                    layers,
+                    alt=alt,
+                    css=css,
+                    title="mm³/s" if column == i == 0 else "",
+                    x_ticks=bottom,
+                    units=("s", "mm³/s"),
                 )
             )
         return panels
 
-    shown = [Column(head, small, mark, draw(law, css, after, i)) for i, (head, small, mark, css, law, after) in enumerate(stories)]
+    shown = [
+        Column(head, small, mark, draw(law, css, after, i))
+        for i, (head, small, mark, css, law, after) in enumerate(stories)
+    ]
     after = [
-        f"{LAWS[law][0].lower() if law == 'paper' else LAWS[law][0]} {percent(low[f'{law}True'], 2)}" for law in laws if f"{law}True" in low
+        f"{LAWS[law][0].lower() if law == 'paper' else LAWS[law][0]} {percent(low[f'{law}True'], 2)}"
+        for law in laws
+        if f"{law}True" in low
     ]
     before = low.get(f"{laws[-1]}False")
     return Picture(
         "corner",
         title,
-        f"Through the corner on\u2011off control misses the wanted flow by {percent(before or 0.0, 2)} of a full line; after the last trial: {', '.join(after)}, the worse material each.",
+        f"Through the corner on\u2011off control misses the wanted flow by {percent(before or 0.0, 2)} of a "
+        f"full line; after the last trial: {', '.join(after)}, the worse material each.",
         shown,
-        f"{'Measured' if real(sources) else 'True'} flow in mm³/s against time since the gantry’s pause began, in s; dashed: wanted.",
+        f"{'Measured' if real(sources) else 'True'} flow in mm³/s against time since the gantry’s pause "
+        "began, in s; dashed: wanted.",
         page.origin(sources.source("lessons")),
     )
 
@@ -263,12 +329,19 @@ def frames(sources: Sources) -> dict[str, Any]:
         {
             "uri": Markup("{}").format(one["uri"]),
             "head": f"Material {one['material']}, trial {one['trial']}, {one['place']}",
-            "figure": f"rejected: {one['reason']}" if one["reason"] else f"{number(one['width_mm'], 3)}{THIN}mm wide",
+            "figure": f"rejected: {one['reason']}"
+            if one["reason"]
+            else f"{number(one['width_mm'], 3)}{THIN}mm wide",
             "bad": bool(one["reason"]),
             "foot": (one["recording"], f"{one['topic']} at {number(one['time_s'], 2)}{THIN}s"),
             "alt": (
-                f"Frame of material {one['material']}, trial {one['trial']}, at {number(one['time_s'], 2)} s, "
-                + (f"rejected: {one['reason']}" if one["reason"] else f"the bead’s edges found, {number(one['width_mm'], 3)} mm apart")
+                f"Frame of material {one['material']}, trial {one['trial']}, "
+                f"at {number(one['time_s'], 2)} s, "
+                + (
+                    f"rejected: {one['reason']}"
+                    if one["reason"]
+                    else f"the bead’s edges found, {number(one['width_mm'], 3)} mm apart"
+                )
             ),
         }
         for one in rows
@@ -278,12 +351,18 @@ def frames(sources: Sources) -> dict[str, Any]:
 
 def measured(sources: Sources) -> Picture:
     """The flow that pictures told, with its band, against the true one."""
-    table, film, title = sources.tables["lessons"], sources.tables["filmed"], "The flow that the pictures told"
+    table, film, title = (
+        sources.tables["lessons"],
+        sources.tables["filmed"],
+        "The flow that the pictures told",
+    )
     for found in (table, film):
         if isinstance(found, Missing):
             return hole("told", title, found)
     if "pixels" not in _laws(table):
-        return hole("told", title, Missing("not measured", "no trial was filmed", "Run ./run dvc repro train_ilc"))
+        return hole(
+            "told", title, Missing("not measured", "no trial was filmed", "Run ./run dvc repro train_ilc")
+        )
     materials, machine = _materials(table), real(sources)
 
     def draw(material: str, column: int) -> list[Markup]:
@@ -302,15 +381,21 @@ def measured(sources: Sources) -> Picture:
                 )
         return panels
 
-    shown = [Column(f"Material {material}", "first and last filmed trial", "", draw(material, i)) for i, material in enumerate(materials)]
+    shown = [
+        Column(f"Material {material}", "first and last filmed trial", "", draw(material, i))
+        for i, material in enumerate(materials)
+    ]
     figures = [
         f"{name} {percent(float(whole), 2)}, around the corner {percent(float(near), 2)}"
-        for name, one in (sources.metrics["train_ilc"] if isinstance(sources.metrics["train_ilc"], dict) else {}).items()
+        for name, one in (
+            sources.metrics["train_ilc"] if isinstance(sources.metrics["train_ilc"], dict) else {}
+        ).items()
         if not isinstance(whole := lookup(one, "pixels.flow_error_percent"), Missing)
         and not isinstance(near := lookup(one, "pixels.flow_error_corner_percent"), Missing)
     ]
     finding = (
-        f"Over all trials the measured flow is off by, r.m.s. of a full line’s: {'; '.join(figures)}. At most 2.5{THIN}% and 6{THIN}% are asked for."
+        f"Over all trials the measured flow is off by, r.m.s. of a full line’s: {'; '.join(figures)}. "
+        f"At most 2.5{THIN}% and 6{THIN}% are asked for."
         if figures
         else "No true flow to compare with: the machine is a real one."
     )
@@ -319,32 +404,65 @@ def measured(sources: Sources) -> Picture:
         title,
         finding,
         shown,
-        f"Measured flow in mm³/s against time in s{'' if machine else '; below it measured less true, in % of a full line’s flow, with the band in which 90 % of the measurement’s own uncertainty lies. The camera rightly sees what does not repeat from trial to trial, too; the true flow here is without it'}. "
+        "Measured flow in mm³/s against time in "
+        f"s{'' if machine else '; below it measured less true, in % of a full line’s flow, with the band in which 90 % of the measurement’s own uncertainty lies. The camera rightly sees what does not repeat from trial to trial, too; the true flow here is without it'}. "
         "Grey: the gantry stands, only the volume of the pause is seen, and nothing is learned there.",
         page.origin(sources.source("lessons", "filmed")),
     )
 
 
 def _told(mine: Table, wide: float, name: str, machine: bool, *, titled: bool) -> list[Markup]:
-    """The measured flow of a trial, and, where it is known, its distance from the true one with the band of its uncertainty."""
-    t, seen, true, steady = mine["time_s"], mine["measured_mm3_per_s"], mine["true_mm3_per_s"], float(mine["wanted_mm3_per_s"].max())
+    """The measured flow of a trial, and, where it is known, its distance
+    from the true one with the band of its uncertainty."""
+    t, seen, true, steady = (
+        mine["time_s"],
+        mine["measured_mm3_per_s"],
+        mine["true_mm3_per_s"],
+        float(mine["wanted_mm3_per_s"].max()),
+    )
     frame = charts.Frame(
-        charts.linear(0, float(t[-1]), ticks=5), charts.linear(0, 1.4 * steady, ticks=3), 568, 112, 28, 6 if not machine else 16
+        charts.linear(0, float(t[-1]), ticks=5),
+        charts.linear(0, 1.4 * steady, ticks=3),
+        568,
+        112,
+        28,
+        6 if not machine else 16,
     )
     blind = [(float(t[a]), float(t[min(b, len(t) - 1)])) for a, b in charts.stretches(np.isnan(seen))]
     alt = f"{name}: the flow as measured, between {number(float(np.nanmin(seen)), 1)} and {number(float(np.nanmax(seen)), 1)} mm³/s; standard deviation {short(wide / 1.645, 2)}"
     text = charts.label(frame, float(t[-1]), 1.4 * steady, name, anchor="end", dy=6)
-    layers = [*(charts.interval(frame, *stretch) for stretch in blind), charts.line(frame, t, seen, most=400), text]
-    panels = [charts.panel(frame, layers, alt=alt, css="dd wide", title="mm³/s" if titled else "", x_ticks=machine, units=("s", "mm³/s"))]
+    layers = [
+        *(charts.interval(frame, *stretch) for stretch in blind),
+        charts.line(frame, t, seen, most=400),
+        text,
+    ]
+    panels = [
+        charts.panel(
+            frame,
+            layers,
+            alt=alt,
+            css="dd wide",
+            title="mm³/s" if titled else "",
+            x_ticks=machine,
+            units=("s", "mm³/s"),
+        )
+    ]
     if machine:
         return panels
     error, band = 100 * (seen - true) / steady, 100 * wide / steady
     off = float(np.sqrt(np.nanmean(error**2)))
-    frame = charts.Frame(frame.x, charts.Axis(-12.0, 12.0, ((-10.0, "−10"), (0.0, "0"), (10.0, "10"))), 568, 84, 28)
-    text = charts.label(frame, float(t[-1]), 12, f"measured less true: {percent(off, 2)}, r.m.s.", anchor="end", dy=6)
+    frame = charts.Frame(
+        frame.x, charts.Axis(-12.0, 12.0, ((-10.0, "−10"), (0.0, "0"), (10.0, "10"))), 568, 84, 28
+    )
+    text = charts.label(
+        frame, float(t[-1]), 12, f"measured less true: {percent(off, 2)}, r.m.s.", anchor="end", dy=6
+    )
     layers = [charts.tint(frame, -band, band), charts.line(frame, t, error, "line thin", most=400), text]
     alt = f"{name}: measured less true is {percent(off, 2)} of a full line’s flow, r.m.s., of which its own uncertainty explains ±{percent(band, 2)}"
-    return [*panels, charts.panel(frame, layers, alt=alt, css="dd wide", title="%" if titled else "", units=("s", "%"))]
+    return [
+        *panels,
+        charts.panel(frame, layers, alt=alt, css="dd wide", title="%" if titled else "", units=("s", "%")),
+    ]
 
 
 def camera(sources: Sources) -> dict[str, Any]:
@@ -360,7 +478,11 @@ def camera(sources: Sources) -> dict[str, Any]:
             for item in filter(None, str(text).split(", ")):
                 name, _, n = item.rpartition(" ")
                 reasons[name] = reasons.get(name, 0) + int(n) if n.isdigit() else 1
-        known = lookup(models, f"{material}.calibration") if "." not in str(material) else Missing("not measured", "")
+        known = (
+            lookup(models, f"{material}.calibration")
+            if "." not in str(material)
+            else Missing("not measured", "")
+        )
         frames_, rejected = int(film["frames"][mine].sum()), int(film["rejected"][mine].sum())
         rows.append(
             {

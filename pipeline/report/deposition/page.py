@@ -1,4 +1,5 @@
-"""The page of the deposition loop: whose signal prints the parts, what it leaves of on-off control's error, what that took, and the pictures behind it."""
+"""The page of the deposition loop: whose signal prints the parts, what it leaves of on-off control's error,
+what that took, and the pictures behind it."""
 
 import itertools
 from typing import Any
@@ -9,7 +10,17 @@ from markupsafe import Markup
 from pipeline.report.deposition import change as deposition_change
 from pipeline.report.deposition import learning as deposition_learning
 from pipeline.report.deposition import parts as deposition_parts
-from pipeline.report.deposition.rules import HEADS, LIBRARY, MARK, NAMES, OURS, PAPER, Structure, gamma, structures
+from pipeline.report.deposition.rules import (
+    HEADS,
+    LIBRARY,
+    MARK,
+    NAMES,
+    OURS,
+    PAPER,
+    Structure,
+    gamma,
+    structures,
+)
 from pipeline.report.deposition.verdict import verdict
 from pipeline.report.shared import charts, headline, page, words
 from pipeline.report.shared.difference import Move
@@ -64,7 +75,10 @@ def render(sources: Sources) -> str:
         beforehand=_beforehand(sources),
         real=judged.real,
         no_scores=found if isinstance(found, Missing) else None,
-        answers=[_answer(one) | since(move) for one, move in itertools.zip_longest(measured, deposition_change.moves(sources, measured))],
+        answers=[
+            _answer(one) | since(move)
+            for one, move in itertools.zip_longest(measured, deposition_change.moves(sources, measured))
+        ],
         scoreboard=scoreboard(measured, sources.declared.rules),
         learning=deposition_learning.pictures(sources),
         frames=deposition_learning.frames(sources),
@@ -94,8 +108,18 @@ def render(sources: Sources) -> str:
 def hashes(sources: Sources) -> list[tuple[str, str]]:
     """Short digests by which two pages can be told to be of one run."""
     tables = {source.name: source.sha256 for source in sources.read.values()}
-    found = [(word, tables.get(name, "missing")) for word, name in (("trials", "trials"), ("library", "library"), ("scores", "scores"))]
-    return [(name, value[:8]) for name, value in [*found, ("parameters", digest(sources.declared.everything)), ("code", sources.code)]]
+    found = [
+        (word, tables.get(name, "missing"))
+        for word, name in (("trials", "trials"), ("library", "library"), ("scores", "scores"))
+    ]
+    return [
+        (name, value[:8])
+        for name, value in [
+            *found,
+            ("parameters", digest(sources.declared.everything)),
+            ("code", sources.code),
+        ]
+    ]
 
 
 def _beforehand(sources: Sources) -> str:
@@ -103,9 +127,13 @@ def _beforehand(sources: Sources) -> str:
     if found is None:
         return "The convergence of the paper’s law was not tested beforehand; ours identifies the machine in its first trials and goes back to the best one where the error rises."
     return (
-        f"Tested before anything ran: with γ = max |Q² (1 − L P)| below 1 the paper’s law shrinks the error at every trial. γ is {number(found['gamma'], 2)} on the nominal plant and up to "
-        f"{number(found['gamma_worst'], 2)} over its family, above 1 on {percent(found['gamma_above_1_percent'], 2)} of it: there the law may look fine for a dozen trials and then diverge. "
-        "Ours identifies the machine in its first trials, and goes back to the best one where the error rises."
+        "Tested before anything ran: with γ = max |Q² (1 − L P)| below 1 the paper’s law shrinks the error "
+        f"at every trial. γ is {number(found['gamma'], 2)} on the nominal plant and up to "
+        f"{number(found['gamma_worst'], 2)} over its family, above 1 on "
+        f"{percent(found['gamma_above_1_percent'], 2)} of it: there the law may look fine for a dozen "
+        "trials and then diverge. "
+        "Ours identifies the machine in its first trials, and goes back to the best one "
+        "where the error rises."
     )
 
 
@@ -113,10 +141,17 @@ def _beforehand(sources: Sources) -> str:
 
 
 def _answer(one: Structure) -> dict[str, Any]:
-    """Ours beside the library on one scale, the strip's limit in its middle; the worst line's volume of the composer that was chosen."""
+    """Ours beside the library on one scale, the strip's limit in its middle; the
+    worst line's volume of the composer that was chosen."""
     question = Question(0, "", one.part, "%", one.asked.flow_error_percent, False, "")
     shown = [
-        (NAMES[name], css, Figure(*3 * (one.scores[name].error,)) if name in one.scores else Missing("not measured", "no score"))
+        (
+            NAMES[name],
+            css,
+            Figure(*3 * (one.scores[name].error,))
+            if name in one.scores
+            else Missing("not measured", "no score"),
+        )
         for name, css in ((OURS, "dd"), (LIBRARY, "mb"), ("ilc", "acc"))
     ]
     chosen = one.scores.get(one.chosen)
@@ -157,7 +192,8 @@ def _forecast(value: float | None) -> str:
 
 
 def scoreboard(found: list[Structure], asked: ReportRules) -> dict[str, Any]:
-    """Structures and materials down, composers across: true error, what was forecast, and the worst line's volume."""
+    """Structures and materials down, composers across: true error,
+    what was forecast, and the worst line's volume."""
     names = ("basis", "priority", "superposition", "on_off", "ilc")
     heads = [{"mark": MARK[name], "name": NAMES[name], "method": PAPER[name]} for name in names]
     rows = []
@@ -168,22 +204,39 @@ def scoreboard(found: list[Structure], asked: ReportRules) -> dict[str, Any]:
             score = one.scores.get(name)
             if score is None:
                 cells.append(
-                    {"value": "not measured", "band": "", "line": "", "best": False, "bad": False, "chosen": False, "line_bad": False}
+                    {
+                        "value": "not measured",
+                        "band": "",
+                        "line": "",
+                        "best": False,
+                        "bad": False,
+                        "chosen": False,
+                        "line_bad": False,
+                    }
                 )
                 continue
             cells.append(
                 {
                     "value": percent(score.error, 2),
                     "band": _forecast(score.predicted),
-                    "line": "no line long enough" if score.worst_line is None else f"worst line {percent(score.worst_line, 2)}",
+                    "line": "no line long enough"
+                    if score.worst_line is None
+                    else f"worst line {percent(score.worst_line, 2)}",
                     "best": name == best,
                     "bad": score.error > one.asked.flow_error_percent and name != "on_off",
-                    "line_bad": score.worst_line is not None and score.worst_line > one.asked.line_volume_percent and name != "on_off",
+                    "line_bad": score.worst_line is not None
+                    and score.worst_line > one.asked.line_volume_percent
+                    and name != "on_off",
                     "chosen": name == one.chosen,
                 }
             )
         rows.append({"part": one.part, "material": one.material, "cells": cells})
-    return {"heads": heads, "rows": rows, "limit": f"{asked.flow_error_percent:g}{THIN}%", "line": f"±{asked.line_volume_percent:g}{THIN}%"}
+    return {
+        "heads": heads,
+        "rows": rows,
+        "limit": f"{asked.flow_error_percent:g}{THIN}%",
+        "line": f"±{asked.line_volume_percent:g}{THIN}%",
+    }
 
 
 def declared(sources: Sources) -> list[tuple[str, list[tuple[str, str]]]]:
@@ -193,9 +246,14 @@ def declared(sources: Sources) -> list[tuple[str, list[tuple[str, str]]]]:
 
 def flat(data: Any, name: str = "") -> list[tuple[str, str]]:
     if isinstance(data, dict):
-        return [pair for key, value in data.items() for pair in flat(value, f"{name}.{key}" if name else str(key))]
+        return [
+            pair for key, value in data.items() for pair in flat(value, f"{name}.{key}" if name else str(key))
+        ]
     if isinstance(data, list) and any(isinstance(item, dict) for item in data):
-        return [(f"{name}[{i}]", ", ".join(f"{key} {value}" for key, value in item.items())) for i, item in enumerate(data)]
+        return [
+            (f"{name}[{i}]", ", ".join(f"{key} {value}" for key, value in item.items()))
+            for i, item in enumerate(data)
+        ]
     if isinstance(data, list):
         return [(name, ", ".join(map(str, data)))]
     return [(name, "none" if data is None else str(data))]
@@ -231,46 +289,73 @@ def signals(sources: Sources) -> Picture:
     return Picture(
         "signals",
         title,
-        f"Each signal begins ahead of its event: {text}. A line shorter than the lead of Stop has no room for it.",
+        f"Each signal begins ahead of its event: {text}. A line shorter than the lead of "
+        "Stop has no room for it.",
         shown,
-        "Plunger command in multiples of the steady one, against time from the event (0) in s; grey: the lead. Thick: the fastest speed trained, thin: the others; dashed: the shorter pauses of a corner.",
+        "Plunger command in multiples of the steady one, against time from the event (0) in s; grey: "
+        "the lead. Thick: the fastest speed trained, thin: the others; dashed: "
+        "the shorter pauses of a corner.",
         page.origin(sources.source("library", "learned")),
     )
 
 
 def _steady(table: Table, material: str, speed: float) -> float:
-    rows = (table["material"] == material) & (table["task"] == "Steady-State") & (table["speed_mm_per_s"] == speed)
+    rows = (
+        (table["material"] == material)
+        & (table["task"] == "Steady-State")
+        & (table["speed_mm_per_s"] == speed)
+    )
     found = [float(np.mean(signal)) for signal in table["signal_mm"][rows]]
     return abs(found[0]) if found and found[0] else 1.0
 
 
 def _panel(table: Table, rows: np.ndarray, task: str, material: str, Ts: float, *, titled: bool) -> Markup:
     # the whole task is drawn: the samples that it begins ahead, and those that follow
-    scaled = {int(k): np.asarray(table["signal_mm"][k], float) / _steady(table, material, table["speed_mm_per_s"][k]) for k in rows}
+    scaled = {
+        int(k): np.asarray(table["signal_mm"][k], float)
+        / _steady(table, material, table["speed_mm_per_s"][k])
+        for k in rows
+    }
     lead = Ts * float(table["lead"][rows].max())
     end = max(Ts * (len(scaled[int(k)]) - float(table["lead"][k])) for k in rows)
     low, high = (float(find([find(values) for values in scaled.values()])) for find in (np.min, np.max))
     room = 0.08 * max(high - low, 1.0)
     frame = charts.Frame(
-        charts.linear(-max(lead, Ts), max(end, Ts), ticks=6), charts.linear(min(low, 0) - room, max(high, 1) + room, ticks=4), 568, 170, 30
+        charts.linear(-max(lead, Ts), max(end, Ts), ticks=6),
+        charts.linear(min(low, 0) - room, max(high, 1) + room, ticks=4),
+        568,
+        170,
+        30,
     )
     fastest, longest = float(table["speed_mm_per_s"][rows].max()), float(table["pause_s"][rows].max())
     layers = [charts.interval(frame, -lead, 0.0)]
     for k in rows:
         t = Ts * (np.arange(len(scaled[int(k)])) - float(table["lead"][k]))
         css = "line" if table["speed_mm_per_s"][k] == fastest else "line thin"
-        layers.append(charts.line(frame, t, scaled[int(k)], css + (" dash" if table["pause_s"][k] < longest else "")))
+        layers.append(
+            charts.line(frame, t, scaled[int(k)], css + (" dash" if table["pause_s"][k] < longest else ""))
+        )
     peak = max(scaled.values(), key=lambda values: float(np.abs(values).max()))
     most = float(peak[np.argmax(np.abs(peak))])
     layers.append(
-        charts.label(frame, frame.x.high, frame.y.high, f"{task}: peak {short(most, 2)} ×, lead {number(lead, 2)} s", anchor="end", dy=8)
+        charts.label(
+            frame,
+            frame.x.high,
+            frame.y.high,
+            f"{task}: peak {short(most, 2)} ×, lead {number(lead, 2)} s",
+            anchor="end",
+            dy=8,
+        )
     )
     alt = f"{task} of material {material}: begins {number(lead, 2)} s ahead of its event and peaks at {short(most, 2)} times the steady command"
-    return charts.panel(frame, layers, alt=alt, css="mb wide", title="× steady" if titled else "", units=("s", "×"))
+    return charts.panel(
+        frame, layers, alt=alt, css="mb wide", title="× steady" if titled else "", units=("s", "×")
+    )
 
 
 def assumptions(sources: Sources) -> dict[str, Any]:
-    """The paper's assumptions 1 to 4: what was found of each, by material, against the largest predicted error that compose_parts lets pass."""
+    """The paper's assumptions 1 to 4: what was found of each, by material, against the largest predicted
+    error that compose_parts lets pass."""
     checks = lookup(sources.tables["learned"], "checks", what="the check of the assumptions")
     if isinstance(checks, Missing):
         return {"missing": checks, "rows": [], "materials": []}
@@ -278,7 +363,10 @@ def assumptions(sources: Sources) -> dict[str, Any]:
     materials = [str(m) for m in dict.fromkeys(one["material"] for one in checks)][:MATERIALS]
     rows: dict[tuple[int, str], dict[str, Any]] = {}
     for one in checks:
-        row = rows.setdefault((one["assumption"], one["claim"]), {"number": one["assumption"], "claim": str(one["claim"]), "cells": {}})
+        row = rows.setdefault(
+            (one["assumption"], one["claim"]),
+            {"number": one["assumption"], "claim": str(one["claim"]), "cells": {}},
+        )
         value = one["percent"]
         row["cells"][str(one["material"])] = {
             "text": "not tested" if value is None else percent(float(value), 2),
@@ -286,13 +374,23 @@ def assumptions(sources: Sources) -> dict[str, Any]:
         }
     for row in rows.values():
         name, _, what = row["claim"].partition(": ")
-        row |= {"name": name, "what": what, "cells": [row["cells"].get(m, {"text": "not tested", "bad": False}) for m in materials]}
+        row |= {
+            "name": name,
+            "what": what,
+            "cells": [row["cells"].get(m, {"text": "not tested", "bad": False}) for m in materials],
+        }
         row["holds"] = not any(cell["bad"] for cell in row["cells"])
-    return {"missing": None, "rows": list(rows.values()), "materials": materials, "limit": f"{limit:g}{THIN}%"}
+    return {
+        "missing": None,
+        "rows": list(rows.values()),
+        "materials": materials,
+        "limit": f"{limit:g}{THIN}%",
+    }
 
 
 def chains(sources: Sources) -> dict[str, Any]:
-    """Parameters of each machine: as known beforehand, as identified, and, where it is simulated, as it truly is."""
+    """Parameters of each machine: as known beforehand, as identified,
+    and, where it is simulated, as it truly is."""
     models, learned = sources.tables["models"], lookup(sources.tables["learned"], "materials")
     for found in (learned, models):
         if isinstance(found, Missing):
@@ -301,17 +399,25 @@ def chains(sources: Sources) -> dict[str, Any]:
     for known in learned[:MATERIALS]:
         name = str(known["material"])
         nominal, true = (models.get(name, {}).get(key) for key in ("nominal", "plant"))
-        for word, found in (("beforehand", nominal), ("identified", known["chain"]["extruder"]), ("true", true)):
+        for word, found in (
+            ("beforehand", nominal),
+            ("identified", known["chain"]["extruder"]),
+            ("true", true),
+        ):
             if found:
                 heads.append({"material": name, "word": word})
                 values.append(found)
     rows = [
-        {"title": title, "cells": ["none" if found.get(key) is None else short(float(found[key]), 3) for found in values]}
+        {
+            "title": title,
+            "cells": ["none" if found.get(key) is None else short(float(found[key]), 3) for found in values],
+        }
         for key, title in CHAIN
         if any(found.get(key) for found in values)
     ]
     fits = [
-        f"{known['material']}: on trials that it was not fitted to the chain misses {percent(known['chain']['held_out_percent'], 2)} of the flow’s movement"
+        f"{known['material']}: on trials that it was not fitted to the chain misses "
+        f"{percent(known['chain']['held_out_percent'], 2)} of the flow’s movement"
         for known in learned[:MATERIALS]
         if known["chain"].get("held_out_percent") is not None
     ]

@@ -1,4 +1,5 @@
-"""The parts of the deposition page: each one coloured by its flow error, the flow of every composer over its worst stretch, its lines, what limits it, and what was refused."""
+"""The parts of the deposition page: each one coloured by its flow error, the flow of every composer over its
+worst stretch, its lines, what limits it, and what was refused."""
 
 from typing import Any, NamedTuple
 
@@ -15,7 +16,8 @@ from pipeline.report.shared.verdict import Missing
 # parts and streams that are drawn; the others stand in the tables
 PARTS, STREAMS = 4, 8
 SHOWN = ("priority", "basis", "on_off")
-# share of the steady flow above which the nozzle prints; of it that is neither too little nor too much, and that is much
+# share of the steady flow above which the nozzle prints; of it that is
+# neither too little nor too much, and that is much
 PRINTING, RIGHT, FAR = 0.2, 0.03, 0.10
 STRETCH_S, WORST, REFUSED = 4.0, 10, 20
 # places of a part that are drawn: of a longer one the worst of each stretch
@@ -44,7 +46,10 @@ def maps(sources: Sources) -> list[Picture]:
     if isinstance(table, Missing):
         return [hole("maps", "The parts, coloured by flow error", table)]
     parts = list(dict.fromkeys(table["part"].tolist()))
-    return [_map(sources, table, str(part), i, last=part == parts[:PARTS][-1]) for i, part in enumerate(parts[:PARTS])]
+    return [
+        _map(sources, table, str(part), i, last=part == parts[:PARTS][-1])
+        for i, part in enumerate(parts[:PARTS])
+    ]
 
 
 def _map(sources: Sources, table: Table, part: str, i: int, *, last: bool) -> Picture:
@@ -60,7 +65,8 @@ def _map(sources: Sources, table: Table, part: str, i: int, *, last: bool) -> Pi
         lack = 100 * float(np.mean(error[prints] < -RIGHT)) if prints.any() else 0.0
         said.append(f"{NAMES[name]} {percent(right, 2)}")
         alt = (
-            f"{NAMES[name]}, {part}: {percent(right, 2)} of the printing time within {100 * RIGHT:g} % of a full line’s flow, {percent(lack, 2)} with less, "
+            f"{NAMES[name]}, {part}: {percent(right, 2)} of the printing time within {100 * RIGHT:g} % of a "
+            f"full line’s flow, {percent(lack, 2)} with less, "
             f"{percent(max(100 - right - lack, 0.0), 2)} with more"
         )
         panel = _drawn(mine, error, prints, alt)
@@ -68,12 +74,15 @@ def _map(sources: Sources, table: Table, part: str, i: int, *, last: bool) -> Pi
     return Picture(
         f"part-{i}",
         part,
-        f"Share of the printing time within ±{100 * RIGHT:g}{THIN}% of a full line’s flow: {', '.join(said)}.",
+        f"Share of the printing time within ±{100 * RIGHT:g}{THIN}% of a full line’s flow: "
+        f"{', '.join(said)}.",
         shown,
         ""
         if not last
         else "The nozzle’s path from above where it should print, in mm. Brown: too little, thin; teal: too much, thick; grey: right. "
-        f"Light beyond ±{100 * RIGHT:g}{THIN}%, dark beyond ±{100 * FAR:g}{THIN}% of a full line’s flow; of a long part the worst of each stretch. {'Forecast.' if real(sources) else 'True flow of the simulated machine.'}",
+        f"Light beyond ±{100 * RIGHT:g}{THIN}%, dark beyond ±{100 * FAR:g}{THIN}% of a full line’s flow; "
+        "of a long part the worst of each stretch. "
+        f"{'Forecast.' if real(sources) else 'True flow of the simulated machine.'}",
         page.origin(sources.source("signals")),
     )
 
@@ -86,9 +95,10 @@ def _shares(error: np.ndarray) -> Markup:
     """The legend of a map: how much of the time is of each class."""
     found = np.bincount(_classes(error), minlength=5) / max(len(error), 1)
     items = [
-        Markup('<span><svg class="key" aria-hidden="true" viewBox="0 0 18 8"><path class="{}" d="M1 4H17"/></svg>{} {}</span>').format(
-            css, word, percent(100 * float(share), 2)
-        )
+        Markup(
+            '<span><svg class="key" aria-hidden="true" viewBox="0 0 18 8"><path class="{}" d="M1 '
+            '4H17"/></svg>{} {}</span>'
+        ).format(css, word, percent(100 * float(share), 2))
         for (word, css), share in zip(CLASSES, found, strict=True)
         if share > 0
     ]
@@ -109,7 +119,14 @@ def _drawn(mine: Table, error: np.ndarray, prints: np.ndarray, alt: str) -> Mark
     py = room + scale * (high - y)
     kind = np.where(prints, classes, -1)
     # a line changes its pen with the class, the tool, and where it does not print
-    change = np.flatnonzero((np.diff(kind) != 0) | (np.diff(tool) != 0) | (np.hypot(np.diff(px), np.diff(py)) > 0.2 * scale * span + 2)) + 1
+    change = (
+        np.flatnonzero(
+            (np.diff(kind) != 0)
+            | (np.diff(tool) != 0)
+            | (np.hypot(np.diff(px), np.diff(py)) > 0.2 * scale * span + 2)
+        )
+        + 1
+    )
     paths: dict[int, list[str]] = {}
     for piece in np.split(np.arange(len(kind)), change):
         if kind[piece[0]] >= 0:
@@ -117,14 +134,25 @@ def _drawn(mine: Table, error: np.ndarray, prints: np.ndarray, alt: str) -> Mark
             end = piece[-1] + 1
             joined = (
                 np.append(piece, end)
-                if end < len(kind) and kind[end] >= 0 and abs(px[end] - px[end - 1]) + abs(py[end] - py[end - 1]) < 8
+                if end < len(kind)
+                and kind[end] >= 0
+                and abs(px[end] - px[end - 1]) + abs(py[end] - py[end - 1]) < 8
                 else piece
             )
             paths.setdefault(int(kind[piece[0]]), []).append(_path(px[joined], py[joined]))
-    layers = [Markup('<path class="{}" d="{}"/>').format(CLASSES[k][1], "".join(paths[k])) for k in (2, 1, 3, 0, 4) if k in paths]
+    layers = [
+        Markup('<path class="{}" d="{}"/>').format(CLASSES[k][1], "".join(paths[k]))
+        for k in (2, 1, 3, 0, 4)
+        if k in paths
+    ]
     bar = _round(span / 4)
     ruler = Markup('<path class="ruler" d="M{} {}h{}"/><text x="{}" y="{}">{} mm</text>').format(
-        f"{room:.0f}", f"{height - 5:.0f}", f"{scale * bar:.1f}", f"{room + scale * bar + 5:.1f}", f"{height - 1:.0f}", short(bar, 2)
+        f"{room:.0f}",
+        f"{height - 5:.0f}",
+        f"{scale * bar:.1f}",
+        f"{room + scale * bar + 5:.1f}",
+        f"{height - 1:.0f}",
+        short(bar, 2),
     )
     return Markup('<svg class="plot map" viewBox="0 0 {} {}" role="img" aria-label="{}">{}{}</svg>').format(
         f"{width:.0f}", f"{height:.0f}", alt, Markup("").join(layers), ruler
@@ -132,13 +160,18 @@ def _drawn(mine: Table, error: np.ndarray, prints: np.ndarray, alt: str) -> Mark
 
 
 def _thinned(error: np.ndarray, prints: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of at most POINTS stretches the number of the first sample that prints, the class of the worst error, and whether any sample prints."""
+    """Of at most POINTS stretches the number of the first sample that prints, the class of
+    the worst error, and whether any sample prints."""
     size = -(-len(error) // POINTS)
     pad = -len(error) % size
     some = np.append(prints, np.zeros(pad, bool)).reshape(-1, size)
     errors = np.where(some, np.append(error, np.zeros(pad)).reshape(-1, size), 0.0)
     each = np.arange(len(some))
-    return each * size + some.argmax(axis=1), _classes(errors[each, np.abs(errors).argmax(axis=1)]), some.any(axis=1)
+    return (
+        each * size + some.argmax(axis=1),
+        _classes(errors[each, np.abs(errors).argmax(axis=1)]),
+        some.any(axis=1),
+    )
 
 
 def _round(value: float) -> float:
@@ -161,24 +194,48 @@ def _path(px: np.ndarray, py: np.ndarray) -> str:
 
 def stretches(sources: Sources) -> Picture:
     """Wanted flow and that of every composer where the chosen one errs most, a row for each stream."""
-    table, scores, title = sources.tables["signals"], sources.tables["scores"], "Flow where the chosen signal errs most"
+    table, scores, title = (
+        sources.tables["signals"],
+        sources.tables["scores"],
+        "Flow where the chosen signal errs most",
+    )
     if isinstance(table, Missing):
         return hole("stretches", title, table)
-    rows = () if isinstance(scores, Missing) else zip(*(scores[name] for name in ("part", "material", "composer", "chosen")), strict=True)
+    rows = (
+        ()
+        if isinstance(scores, Missing)
+        else zip(*(scores[name] for name in ("part", "material", "composer", "chosen")), strict=True)
+    )
     chosen = {(part, material): str(composer) for part, material, composer, taken in rows if taken}
-    found = [_stretch(table, part, material, chosen.get((part, material), "basis")) for part, material in _streams(table)[:STREAMS]]
-    names = [name for name in ("priority", "basis", "ilc", "on_off") if any(np.isfinite(one.flows[name]).any() for one in found)]
+    found = [
+        _stretch(table, part, material, chosen.get((part, material), "basis"))
+        for part, material in _streams(table)[:STREAMS]
+    ]
+    names = [
+        name
+        for name in ("priority", "basis", "ilc", "on_off")
+        if any(np.isfinite(one.flows[name]).any() for one in found)
+    ]
     shown = [
-        Column(NAMES[name], PAPER[name], MARK[name], [_panel(one, name, first=name == names[0], top=k == 0) for k, one in enumerate(found)])
+        Column(
+            NAMES[name],
+            PAPER[name],
+            MARK[name],
+            [_panel(one, name, first=name == names[0], top=k == 0) for k, one in enumerate(found)],
+        )
         for name in names
     ]
     worst = {name: max(one.off(name) for one in found) for name in names}
     return Picture(
         "stretches",
         title,
-        f"In its worst {STRETCH_S:g}{THIN}s, of any structure, the flow is off by at most: {', '.join(f'{NAMES[name]} {percent(off, 2)}' for name, off in worst.items())} of a full line’s, r.m.s.",
+        f"In its worst {STRETCH_S:g}{THIN}s, of any structure, the flow is off by at most: "
+        f"{', '.join(f'{NAMES[name]} {percent(off, 2)}' for name, off in worst.items())} of "
+        "a full line’s, r.m.s.",
         shown,
-        f"{'Forecast' if real(sources) else 'True'} flow in mm³/s against time in s, the {STRETCH_S:g} s around the largest error of the signal that was chosen; dashed: wanted. What is larger runs along the edge.",
+        f"{'Forecast' if real(sources) else 'True'} flow in mm³/s against time in s, "
+        f"the {STRETCH_S:g} s around the largest error of the signal that was chosen; dashed: wanted. "
+        "What is larger runs along the edge.",
         page.origin(sources.source("signals")),
     )
 
@@ -205,18 +262,30 @@ class Stretch(NamedTuple):
 def _stretch(table: Table, part: str, material: str, chosen: str) -> Stretch:
     rows = (table["part"] == part) & (table["material"] == material)
     t, wanted = table["time_s"][rows], table["wanted_mm3_per_s"][rows]
-    flows = {name: table[f"{name}_mm3_per_s"][rows] for name in ("priority", "superposition", "basis", "ilc", "on_off")}
+    flows = {
+        name: table[f"{name}_mm3_per_s"][rows]
+        for name in ("priority", "superposition", "basis", "ilc", "on_off")
+    }
     middle = float(t[np.argmax(np.abs(np.nan_to_num(flows[chosen]) - wanted))])
     begin = min(max(middle - STRETCH_S / 2, float(t[0])), max(float(t[-1]) - STRETCH_S, float(t[0])))
     near = (t >= begin) & (t <= begin + STRETCH_S)
     return Stretch(
-        f"{part}, {material}", chosen, t[near], wanted[near], {name: flow[near] for name, flow in flows.items()}, float(wanted.max()) or 1.0
+        f"{part}, {material}",
+        chosen,
+        t[near],
+        wanted[near],
+        {name: flow[near] for name, flow in flows.items()},
+        float(wanted.max()) or 1.0,
     )
 
 
 def _panel(one: Stretch, name: str, *, first: bool, top: bool) -> Markup:
     frame = charts.Frame(
-        charts.linear(float(one.t[0]), float(one.t[-1]), ticks=4), charts.linear(0, 1.45 * one.steady, ticks=3), 270, 112, 26
+        charts.linear(float(one.t[0]), float(one.t[-1]), ticks=4),
+        charts.linear(0, 1.45 * one.steady, ticks=3),
+        270,
+        112,
+        26,
     )
     text = f"{shortened(one.name, 24)}: {percent(one.off(name), 2)} off{', chosen' if name == one.chosen else ''}"
     layers = [
@@ -225,7 +294,9 @@ def _panel(one: Stretch, name: str, *, first: bool, top: bool) -> Markup:
         charts.label(frame, frame.x.high, frame.y.high, text, anchor="end", dy=6),
     ]
     alt = f"{NAMES[name]}, {one.name}: {percent(one.off(name), 2)} of a full line’s flow off the wanted one between {number(float(one.t[0]), 1)} and {number(float(one.t[-1]), 1)} s"
-    return charts.panel(frame, layers, alt=alt, css=CSS[name], title="mm³/s" if first and top else "", units=("s", "mm³/s"))
+    return charts.panel(
+        frame, layers, alt=alt, css=CSS[name], title="mm³/s" if first and top else "", units=("s", "mm³/s")
+    )
 
 
 # ---- the lines
@@ -246,14 +317,20 @@ def lines(sources: Sources) -> dict[str, Any]:
             "duration": number(float(table["duration_s"][k]), 2),
             "planned": number(float(table["planned_mm3"][k]), 3),
             "predicted": number(float(table["predicted_mm3"][k]), 3),
-            "on_off": _signed(100 * (float(table["on_off_mm3"][k]) / max(float(table["planned_mm3"][k]), 1e-12) - 1)),
+            "on_off": _signed(
+                100 * (float(table["on_off_mm3"][k]) / max(float(table["planned_mm3"][k]), 1e-12) - 1)
+            ),
             "error": _signed(float(error[k])),
             "bad": abs(error[k]) > allowed,
             "short": bool(table["shorter_than_lead"][k]),
         }
         for k in order
     ]
-    beyond, whole, short_runs = int(np.sum(np.abs(error) > allowed)), len(error), int(np.sum(table["shorter_than_lead"]))
+    beyond, whole, short_runs = (
+        int(np.sum(np.abs(error) > allowed)),
+        len(error),
+        int(np.sum(table["shorter_than_lead"])),
+    )
     said = f"Of {count(whole, 'line')}, {'none is' if not beyond else count(beyond, 'is', 'are')} predicted more than {allowed:g}{THIN}% off {'its' if beyond <= 1 else 'their'} volume; {count(short_runs, 'belongs', 'belong') if short_runs else 'none belongs'} to runs shorter than the lead of Stop."
     return {"missing": None, "rows": rows, "said": said}
 
@@ -289,7 +366,11 @@ def forecasts(sources: Sources) -> dict[str, Any]:
                     "limit": "none set" if one.get("limit") is None else f"{one['limit']:g}{THIN}mm",
                     "share": percent(float(one["share_percent"]), 2),
                     "bad": not one["enough"],
-                    "ramp": "as it is" if one["enough"] else "none would do" if ramp is None else f"{number(float(ramp), 2)}{THIN}s",
+                    "ramp": "as it is"
+                    if one["enough"]
+                    else "none would do"
+                    if ramp is None
+                    else f"{number(float(ramp), 2)}{THIN}s",
                 }
             )
     return {"missing": None, "rows": rows}
@@ -304,7 +385,18 @@ def refused(sources: Sources) -> dict[str, Any]:
     for part, report in found.items():
         why = report.get("refused", [])
         rows += (
-            [(str(part), "whole", why)] if isinstance(why, str) else [(str(part), f"line {one['line']}", str(one["why"])) for one in why]
+            [(str(part), "whole", why)]
+            if isinstance(why, str)
+            else [(str(part), f"line {one['line']}", str(one["why"])) for one in why]
         )
-    unknown = [f"{part}: {count(report['unknown_words'], 'word')}" for part, report in found.items() if report.get("unknown_words")]
-    return {"missing": None, "rows": rows[:REFUSED], "more": max(len(rows) - REFUSED, 0), "unknown": ", ".join(unknown)}
+    unknown = [
+        f"{part}: {count(report['unknown_words'], 'word')}"
+        for part, report in found.items()
+        if report.get("unknown_words")
+    ]
+    return {
+        "missing": None,
+        "rows": rows[:REFUSED],
+        "more": max(len(rows) - REFUSED, 0),
+        "unknown": ", ".join(unknown),
+    }

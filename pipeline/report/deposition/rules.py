@@ -1,4 +1,5 @@
-"""Scores of the composers, the learning and the conformance -> structures with their scores, and the rules that they must pass."""
+"""Scores of the composers, the learning and the conformance -> structures with
+their scores, and the rules that they must pass."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -35,14 +36,22 @@ USE = {
     "superposition": "the library by superposition",
     "basis": "the basis functions",
 }
-# marks of the other pages: circle data-driven, square model-based, ring baseline; hollow: a second of its kind
-MARK = {"basis": "data_driven", "priority": "model_based", "superposition": "exact_model", "on_off": "baseline", "ilc": "kernel"}
+# marks of the other pages: circle data-driven, square model-based,
+# ring baseline; hollow: a second of its kind
+MARK = {
+    "basis": "data_driven",
+    "priority": "model_based",
+    "superposition": "exact_model",
+    "on_off": "baseline",
+    "ilc": "kernel",
+}
 # what the two columns of its rules are, and the mark of the second
 HEADS = ("Data\u2011driven", "The paper", "model_based")
 
 
 class Score(NamedTuple):
-    """r.m.s. flow error in % of on-off control's, true where the machine is simulated; the same as forecast; largest volume error of a line in %."""
+    """r.m.s. flow error in % of on-off control's, true where the machine is simulated; the same as forecast;
+    largest volume error of a line in %."""
 
     error: float
     predicted: float | None
@@ -50,7 +59,8 @@ class Score(NamedTuple):
 
 
 class Structure(NamedTuple):
-    """One material of one part program, its scores by composer, and the composer that was chosen beforehand."""
+    """One material of one part program, its scores by composer, and
+    the composer that was chosen beforehand."""
 
     part: str
     material: str
@@ -59,8 +69,13 @@ class Structure(NamedTuple):
     asked: ReportRules
 
     def best(self) -> str:
-        """The composer, on-off control too, with the least error; what learned the part itself is a yardstick."""
-        return min((name for name in COMPOSERS if name in self.scores), key=lambda name: self.scores[name].error, default="")
+        """The composer, on-off control too, with the least error; what
+        learned the part itself is a yardstick."""
+        return min(
+            (name for name in COMPOSERS if name in self.scores),
+            key=lambda name: self.scores[name].error,
+            default="",
+        )
 
     def state(self) -> str:
         """Of the composer that was chosen, by flow and volume."""
@@ -68,12 +83,16 @@ class Structure(NamedTuple):
         if score is None:
             return OPEN
         return (
-            FAILED if score.error > self.asked.flow_error_percent or (score.worst_line or 0.0) > self.asked.line_volume_percent else PASSED
+            FAILED
+            if score.error > self.asked.flow_error_percent
+            or (score.worst_line or 0.0) > self.asked.line_volume_percent
+            else PASSED
         )
 
 
 class Rule(NamedTuple):
-    """One test: where its figures stand; state and figure by column, ours and the paper's; as a sentence of the composer in use, and what to do."""
+    """One test: where its figures stand; state and figure by column, ours and the paper's; as a sentence of
+    the composer in use, and what to do."""
 
     name: str
     limit: str
@@ -90,15 +109,30 @@ def structures(sources: Sources) -> list[Structure] | Missing:
     if isinstance(table, Missing):
         return table
     found: dict[tuple[str, str], Structure] = {}
-    names = ("part", "material", "composer", "chosen", "rms_percent_of_on_off", "predicted_percent", "worst_line_volume_percent")
+    names = (
+        "part",
+        "material",
+        "composer",
+        "chosen",
+        "rms_percent_of_on_off",
+        "predicted_percent",
+        "worst_line_volume_percent",
+    )
     for part, material, composer, chosen, *figures in zip(*(table[name] for name in names), strict=True):
-        one = found.setdefault((part, material), Structure(str(part), str(material), {}, "", sources.declared.rules))
-        error, predicted, line = (None if figure is None or math.isnan(figure) else float(figure) for figure in figures)
+        one = found.setdefault(
+            (part, material), Structure(str(part), str(material), {}, "", sources.declared.rules)
+        )
+        error, predicted, line = (
+            None if figure is None or math.isnan(figure) else float(figure) for figure in figures
+        )
         if error is not None:
             found[part, material] = one._replace(
-                scores={**one.scores, str(composer): Score(error, predicted, line)}, chosen=str(composer) if chosen else one.chosen
+                scores={**one.scores, str(composer): Score(error, predicted, line)},
+                chosen=str(composer) if chosen else one.chosen,
             )
-    return list(found.values()) or Missing("not measured", "no part was composed", "Copy a part program to datasets/parts")
+    return list(found.values()) or Missing(
+        "not measured", "no part was composed", "Copy a part program to datasets/parts"
+    )
 
 
 def real(sources: Sources) -> bool:
@@ -108,7 +142,11 @@ def real(sources: Sources) -> bool:
 
 def worst(found: Sequence[Structure], composer: str) -> tuple[float, Structure] | None:
     """The largest error of a composer and where."""
-    return max(((one.scores[composer].error, one) for one in found if composer in one.scores), key=lambda pair: pair[0], default=None)
+    return max(
+        ((one.scores[composer].error, one) for one in found if composer in one.scores),
+        key=lambda pair: pair[0],
+        default=None,
+    )
 
 
 def winner(found: Sequence[Structure]) -> str:
@@ -133,7 +171,15 @@ def rules(sources: Sources, found: Sequence[Structure]) -> tuple[Rule, ...]:
     )
 
 
-def _rule(name: str, limit: str, place: str, pairs: Sequence[tuple[float | None, str]], bound: float, reason: str, remedy: str) -> Rule:
+def _rule(
+    name: str,
+    limit: str,
+    place: str,
+    pairs: Sequence[tuple[float | None, str]],
+    bound: float,
+    reason: str,
+    remedy: str,
+) -> Rule:
     """Two figures, or None where not measured, that should be at most `bound`."""
     states = tuple(OPEN if value is None else PASSED if value <= bound else FAILED for value, _ in pairs)
     return Rule(name, limit, place, states, tuple(text for _, text in pairs), reason, remedy)
@@ -158,7 +204,11 @@ def where(one: Structure) -> str:
 def _line(found: Sequence[Structure], bound: float) -> Rule:
     pairs = [
         max(
-            ((one.scores[name].worst_line, one) for one in found if name in one.scores and one.scores[name].worst_line is not None),
+            (
+                (one.scores[name].worst_line, one)
+                for one in found
+                if name in one.scores and one.scores[name].worst_line is not None
+            ),
             default=None,
             key=lambda p: p[0],
         )
@@ -184,10 +234,18 @@ def _line(found: Sequence[Structure], bound: float) -> Rule:
 def _above(found: Sequence[Structure], bound: float) -> Rule:
     shown, place = [], None
     for name in (OURS, LIBRARY):
-        above = [(one.scores[name].error - one.scores["ilc"].error, one) for one in found if name in one.scores and "ilc" in one.scores]
+        above = [
+            (one.scores[name].error - one.scores["ilc"].error, one)
+            for one in found
+            if name in one.scores and "ilc" in one.scores
+        ]
         most = max(above, key=lambda pair: pair[0], default=None)
         place = place or most
-        shown.append((None, OPEN) if most is None else (most[0], f"{'+' if most[0] > 0 else '−'}{number(abs(most[0]), 1)} points"))
+        shown.append(
+            (None, OPEN)
+            if most is None
+            else (most[0], f"{'+' if most[0] > 0 else '−'}{number(abs(most[0]), 1)} points")
+        )
     reason = (
         ""
         if place is None
@@ -211,7 +269,15 @@ def _learning(sources: Sources) -> Rule:
         shown.append((None, OPEN) if ratios is None else (100 * max(ratios), percent(100 * max(ratios), 2)))
     reason = f"The error after learning is still {shown[0][1]} of trial 0’s; {bound:g}{THIN}% are asked for."
     reason = "No trial was learned from." if shown[0][0] is None else reason
-    return _rule("Learned to", f"≤ {bound:g}{THIN}%", "learning", shown, bound, reason, "Run more trials (train_ilc.trials).")
+    return _rule(
+        "Learned to",
+        f"≤ {bound:g}{THIN}%",
+        "learning",
+        shown,
+        bound,
+        reason,
+        "Run more trials (train_ilc.trials).",
+    )
 
 
 def _each(sources: Sources, key: str) -> list[float]:
@@ -222,7 +288,8 @@ def _each(sources: Sources, key: str) -> list[float]:
 
 
 def gamma(sources: Sources) -> dict[str, float] | None:
-    """Of the paper's law, before anything ran: nominal, worst of the family, and the share of it above 1 in %, each the worst of all materials."""
+    """Of the paper's law, before anything ran: nominal, worst of the family, and the share of it above 1 in
+    %, each the worst of all materials."""
     found = {key: _each(sources, key) for key in ("gamma", "gamma_worst", "gamma_above_1_percent")}
     return {key: max(values) for key, values in found.items()} if all(found.values()) else None
 
@@ -230,7 +297,8 @@ def gamma(sources: Sources) -> dict[str, float] | None:
 def _convergence(sources: Sources) -> Rule:
     found, values = gamma(sources), _each(sources, "gamma_ours_worst")
     paper = (OPEN, OPEN) if found is None else _below_one(found["gamma_worst"])
-    # ours is tested once its first trials have identified the machine, over the machines that these cannot tell apart
+    # ours is tested once its first trials have identified the machine,
+    # over the machines that these cannot tell apart
     ours = _below_one(max(values)) if values else ("not applicable", "rolls back")
     return Rule("Convergence test", "γ < 1", "beforehand", (ours[0], paper[0]), (ours[1], paper[1]), "", "")
 
@@ -249,11 +317,17 @@ def _limit(sources: Sources) -> Rule:
         for name, one in report.get("saturation", {}).items()
     ]
     if not shares:
-        return Rule("Command limit", "0", "saturation", (OPEN, OPEN), (OPEN, OPEN), "No part was composed.", "")
+        return Rule(
+            "Command limit", "0", "saturation", (OPEN, OPEN), (OPEN, OPEN), "No part was composed.", ""
+        )
     share, part, name, one = max(shares, key=lambda s: (not s[3]["enough"], s[0]))
     limited = any(s[3].get("limit") is not None for s in shares)
     text = percent(share, 2) if not one["enough"] else f"0{THIN}%" if limited else "no limit set"
-    ramp = lookup(found, f"{part}.ramp_that_would_do_s.{name}") if "." not in part else Missing("not measured", "")
+    ramp = (
+        lookup(found, f"{part}.ramp_that_would_do_s.{name}")
+        if "." not in part
+        else Missing("not measured", "")
+    )
     remedy = (
         "Print slower, or raise printer.limit_mm: no ramp would do."
         if isinstance(ramp, Missing)
@@ -261,7 +335,9 @@ def _limit(sources: Sources) -> Rule:
     )
     reason = f"The command for {part}, material {name}, is at its limit {percent(share, 2)} of the printing time, and no signal can make up for it."
     state = FAILED if not one["enough"] else PASSED if limited else UNJUDGED
-    return Rule("Time at the command’s limit", f"0{THIN}%", "saturation", (state, state), (text, text), reason, remedy)
+    return Rule(
+        "Time at the command’s limit", f"0{THIN}%", "saturation", (state, state), (text, text), reason, remedy
+    )
 
 
 def _printed(sources: Sources) -> Rule:
@@ -275,7 +351,15 @@ def _printed(sources: Sources) -> Rule:
     reason = f"{count(len(refused), 'line was', 'lines were')} refused".capitalize() + (
         f", the first in {refused[0][0]}: {refused[0][1]}" if refused else ""
     )
-    return Rule("Every line printed", "all", "refused", states, texts, reason, "Mend these lines of the program, or print without them.")
+    return Rule(
+        "Every line printed",
+        "all",
+        "refused",
+        states,
+        texts,
+        reason,
+        "Mend these lines of the program, or print without them.",
+    )
 
 
 def _listed(refused: Any) -> list[str]:

@@ -1,4 +1,5 @@
-"""Figures of the identification -> what the model may be used for: seven rules, three uses, the verdict in words. No page, no file."""
+"""Figures of the identification -> what the model may be used for: seven rules,
+three uses, the verdict in words. No page, no file."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -10,7 +11,8 @@ from pipeline.report.shared.digits import THIN, band, count, decimals, number, q
 from pipeline.report.shared.sources import Sources, lookup
 from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, UNDECIDED, Figure, Missing, Question, state
 
-# below this fit a model misses more than half of an output's movement: the size of its error is more than half of the movement's
+# below this fit a model misses more than half of an output's movement: the size
+# of its error is more than half of the movement's
 LEAST_FIT = 50.0
 
 
@@ -18,7 +20,8 @@ WHITENESS = "Whiteness"
 
 
 class Rule(NamedTuple):
-    """One test of the model: where its picture is, how it ended, the weakest figure, that figure as a sentence, and what to do."""
+    """One test of the model: where its picture is, how it ended, the weakest
+    figure, that figure as a sentence, and what to do."""
 
     name: str
     place: str
@@ -29,7 +32,8 @@ class Rule(NamedTuple):
 
 
 class Trust(NamedTuple):
-    """`state`: passed, failed, open; `uses`: state of each use by the words for it; decision, lead, reason and remedy as the verdict says them."""
+    """`state`: passed, failed, open; `uses`: state of each use by the words for it; decision, lead, reason
+    and remedy as the verdict says them."""
 
     state: str
     decision: str
@@ -41,7 +45,8 @@ class Trust(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """One output on the hold-out: fits in percent, simulated and so many steps ahead, and what the last value gives when it is held."""
+    """One output on the hold-out: fits in percent, simulated and so many steps
+    ahead, and what the last value gives when it is held."""
 
     name: str
     simulated: Figure | Missing
@@ -70,7 +75,14 @@ def trust(sources: Sources) -> Trust:
     # a rule that some use needs comes before one that is only a reservation
     needed = [rule for rule in rules if rule.name != WHITENESS]
     first = next(
-        (rule for among in (needed, rules) for wanted in (FAILED, UNDECIDED, OPEN) for rule in among if rule.state == wanted), None
+        (
+            rule
+            for among in (needed, rules)
+            for wanted in (FAILED, UNDECIDED, OPEN)
+            for rule in among
+            if rule.state == wanted
+        ),
+        None,
     )
     states = list(uses.values())
     whole = PASSED if states == [PASSED] * 3 else FAILED if FAILED in states else OPEN
@@ -79,7 +91,13 @@ def trust(sources: Sources) -> Trust:
         lead = f"All {count(len(rules), 'rule')} passed;"
         reason = f"weakest in simulation: {weakest.name}, {percent_of(weakest.simulated)} of at least {LEAST_FIT:g}{THIN}%."
         return Trust(
-            whole, _decision(uses), lead, reason, "Valid for the range of inputs and temperatures that the record covers.", rules, uses
+            whole,
+            _decision(uses),
+            lead,
+            reason,
+            "Valid for the range of inputs and temperatures that the record covers.",
+            rules,
+            uses,
         )
     word = {FAILED: "failed", UNDECIDED: "undecided", OPEN: "open"}[first.state]
     lead = f"{'First' if whole != PASSED else 'One reservation, the first'} {word} rule: {first.name[:1].lower()}{first.name[1:]}."
@@ -91,10 +109,15 @@ def _worst(states: Sequence[str]) -> str:
 
 
 def _decision(uses: Mapping[str, str]) -> str:
-    good, bad = ([use for use, found in uses.items() if (found == PASSED) == wanted] for wanted in (True, False))
+    good, bad = (
+        [use for use, found in uses.items() if (found == PASSED) == wanted] for wanted in (True, False)
+    )
     if not good:
         return "Do not trust this model." if FAILED in uses.values() else "Do not trust this model yet."
-    groups = [(word, [use for use in bad if (uses[use] == FAILED) == failed]) for word, failed in (("not", True), ("not yet", False))]
+    groups = [
+        (word, [use for use in bad if (uses[use] == FAILED) == failed])
+        for word, failed in (("not", True), ("not yet", False))
+    ]
     return f"Trust this model {_listed(good)}{''.join(f', {word} {_listed(group)}' for word, group in groups if group)}."
 
 
@@ -109,7 +132,13 @@ def fits(sources: Sources) -> list[Fit]:
     """Every output's fits on the hold-out."""
     metrics = sources.metrics["identify_plant"]
     return [
-        Fit(output.name, *(_fit(metrics, key, output.name) for key in ("fit_holdout", "fit_holdout_ahead", "fit_holdout_held")))
+        Fit(
+            output.name,
+            *(
+                _fit(metrics, key, output.name)
+                for key in ("fit_holdout", "fit_holdout_ahead", "fit_holdout_held")
+            ),
+        )
         for output in sources.declared.machine.outputs
     ]
 
@@ -120,7 +149,9 @@ def _fit(metrics: Any, key: str, name: str) -> Figure | Missing:
         if isinstance(metrics, Missing) or key == "fit_holdout":
             return value
         return Missing(
-            "not measured", "no stretch of the hold-out outlasts the start-up of the prediction", "Record longer, or lower ahead_steps"
+            "not measured",
+            "no stretch of the hold-out outlasts the start-up of the prediction",
+            "Record longer, or lower ahead_steps",
         )
     ends = lookup(metrics, f"{key}_band.{name}")
     return Figure(value, *([value, value] if isinstance(ends, Missing) else ends))
@@ -129,7 +160,11 @@ def _fit(metrics: Any, key: str, name: str) -> Figure | Missing:
 def ahead_words(sources: Sources) -> str:
     """ "60 s ahead"."""
     steps = lookup(sources.metrics["identify_plant"], "ahead_steps")
-    return "ahead" if isinstance(steps, Missing) else f"{steps * sources.declared.machine.sample_time_s:g}{THIN}s\u00a0ahead"
+    return (
+        "ahead"
+        if isinstance(steps, Missing)
+        else f"{steps * sources.declared.machine.sample_time_s:g}{THIN}s\u00a0ahead"
+    )
 
 
 def percent_of(figure: Figure) -> str:
@@ -144,7 +179,12 @@ def _with_band(figure: Figure) -> str:
 
 def _missing_rule(name: str, place: str, gap: Missing) -> Rule:
     return Rule(
-        name, place, FAILED if gap.state == FAILED else OPEN, "", gap.reason.rstrip(".") + ".", gap.remedy and gap.remedy.rstrip(".") + "."
+        name,
+        place,
+        FAILED if gap.state == FAILED else OPEN,
+        "",
+        gap.reason.rstrip(".") + ".",
+        gap.remedy and gap.remedy.rstrip(".") + ".",
     )
 
 
@@ -158,14 +198,19 @@ def _simulation(found: Sequence[Fit]) -> Rule:
         return _missing_rule(name, place, gap)
     asked = Question(0, "", "", "%", LEAST_FIT, True, "")
     ended = _worst([state(asked, fit.simulated) for fit in found])
-    weakest = min((fit for fit in found if state(asked, fit.simulated) == ended), key=lambda fit: fit.simulated.value)
-    figure = weakest.simulated
-    reason = (
-        f"{weakest.name} is simulated with a fit of {_with_band(figure)}; the rule asks for {LEAST_FIT:g}{THIN}%, its mean alone gives 0."
+    weakest = min(
+        (fit for fit in found if state(asked, fit.simulated) == ended), key=lambda fit: fit.simulated.value
     )
+    figure = weakest.simulated
+    reason = f"{weakest.name} is simulated with a fit of {_with_band(figure)}; the rule asks for {LEAST_FIT:g}{THIN}%, its mean alone gives 0."
     remedy = "Look for an input or a disturbance that is not recorded; where outputs are measured, predict from them instead."
     return Rule(
-        name, place, ended, f"{weakest.name} {percent_of(figure)}", reason, _longer(figure, LEAST_FIT) if ended == UNDECIDED else remedy
+        name,
+        place,
+        ended,
+        f"{weakest.name} {percent_of(figure)}",
+        reason,
+        _longer(figure, LEAST_FIT) if ended == UNDECIDED else remedy,
     )
 
 
@@ -174,7 +219,11 @@ def _longer(figure: Figure, limit: float) -> str:
     reach = limit - figure.low if figure.value > limit else figure.high - limit
     away = abs(figure.value - limit)
     times = math.ceil(((reach + away) / away) ** 2) if away > 0 else math.inf
-    return f"A hold-out {count(times, 'time', 'times')} as long would decide." if times <= 12 else "Only a far longer record would decide."
+    return (
+        f"A hold-out {count(times, 'time', 'times')} as long would decide."
+        if times <= 12
+        else "Only a far longer record would decide."
+    )
 
 
 def _ahead(found: Sequence[Fit], words: str) -> Rule:
@@ -186,13 +235,24 @@ def _ahead(found: Sequence[Fit], words: str) -> Rule:
     states = [state(question, fit.ahead) for question, fit in zip(asked, found, strict=True)]
     ended = _worst(states)
     weakest, bar = min(
-        ((fit, question.limit) for fit, question, mine in zip(found, asked, states, strict=True) if mine == ended),
+        (
+            (fit, question.limit)
+            for fit, question, mine in zip(found, asked, states, strict=True)
+            if mine == ended
+        ),
         key=lambda pair: pair[0].ahead.value - pair[1],
     )
     figure, last = weakest.ahead, weakest.held
     reason = f"{weakest.name} is predicted {words} with a fit of {_with_band(figure)}; holding its last value gives {percent_of(last)}, the rule asks for more, and for {LEAST_FIT:g}{THIN}%."
     remedy = "Record longer, or ask for fewer steps ahead (identify_plant.ahead_steps)."
-    return Rule(name, place, ended, f"{weakest.name} {percent_of(figure)}", reason, _longer(figure, bar) if ended == UNDECIDED else remedy)
+    return Rule(
+        name,
+        place,
+        ended,
+        f"{weakest.name} {percent_of(figure)}",
+        reason,
+        _longer(figure, bar) if ended == UNDECIDED else remedy,
+    )
 
 
 def _inputs_left(sources: Sources) -> Rule:
@@ -204,7 +264,14 @@ def _inputs_left(sources: Sources) -> Rule:
     worst, excess = _worst_lag(table, pairs & ~table["passed"])
     remedy = "Raise the order, or check the dead time of that input."
     if worst is None:
-        return Rule(name, place, PASSED, f"{count(len(set(table['against'][pairs])), 'input')}", "The errors follow no input.", "")
+        return Rule(
+            name,
+            place,
+            PASSED,
+            f"{count(len(set(table['against'][pairs])), 'input')}",
+            "The errors follow no input.",
+            "",
+        )
     output, against, lag = table["output"][worst], table["against"][worst], int(table["lag"][worst])
     reason = f"The errors of {output} still follow {against}: correlation {_signed(table['correlation'][worst])} at lag {lag}, {short(excess, 2)} times its 99{THIN}% band."
     return Rule(name, place, FAILED, f"{output} after {against}", reason, remedy)
@@ -221,9 +288,7 @@ def _whiteness(sources: Sources) -> Rule:
         return Rule(name, place, PASSED, "noise only", "The errors are noise.", "")
     output, lag = table["output"][worst], int(table["lag"][worst])
     reason = f"The one-step errors of {output} are not noise: correlation {_signed(table['correlation'][worst])} at lag {lag}, {short(excess, 2)} times its 99{THIN}% band."
-    remedy = (
-        "The observer could predict better: lengthen the window, or model the disturbance. What the fits measure they measure all the same."
-    )
+    remedy = "The observer could predict better: lengthen the window, or model the disturbance. What the fits measure they measure all the same."
     return Rule(name, place, FAILED, f"{output}, lag {lag}", reason, remedy)
 
 
@@ -231,7 +296,9 @@ def _worst_lag(table: Mapping[str, np.ndarray], rows: np.ndarray) -> tuple[int |
     """The row whose correlation leaves its band furthest, and how many bands that is."""
     if not rows.any():
         return None, 0.0
-    excess = np.where(rows, np.nan_to_num(np.abs(table["correlation"]) / np.maximum(table["band"], 1e-300)), -1.0)
+    excess = np.where(
+        rows, np.nan_to_num(np.abs(table["correlation"]) / np.maximum(table["band"], 1e-300)), -1.0
+    )
     return int(excess.argmax()), float(excess.max())
 
 
@@ -250,9 +317,18 @@ def _excitation(sources: Sources) -> Rule:
     reason = f"The inputs move in {rank} of {full} directions over the window."
     if rank < full and not isinstance(lags, Missing):
         weak = [key for key, part in metrics["excitation"]["inputs"].items() if part["rank"] < lags]
-        reason += f" Too poor on its own: {_listed(weak)}." if weak else " Each is rich enough alone, but they move alike."
+        reason += (
+            f" Too poor on its own: {_listed(weak)}."
+            if weak
+            else " Each is rich enough alone, but they move alike."
+        )
     return Rule(
-        name, place, PASSED if rank == full else FAILED, figure, reason, "Move each input with a sequence of its own, at more frequencies."
+        name,
+        place,
+        PASSED if rank == full else FAILED,
+        figure,
+        reason,
+        "Move each input with a sequence of its own, at more frequencies.",
     )
 
 
@@ -262,11 +338,27 @@ def _effects(sources: Sources) -> Rule:
     if isinstance(table, Missing):
         return _missing_rule(name, place, table)
     seen = f"{int(table['seen'].sum())} of {len(table['seen'])}"
-    blind = [i.name for i in sources.declared.machine.inputs if not table["seen"][table["input"] == i.name].any()]
+    blind = [
+        i.name for i in sources.declared.machine.inputs if not table["seen"][table["input"] == i.name].any()
+    ]
     if not blind:
-        return Rule(name, place, PASSED, seen, f"The sign of {seen} effects is known, and of each input at least one.", "")
+        return Rule(
+            name,
+            place,
+            PASSED,
+            seen,
+            f"The sign of {seen} effects is known, and of each input at least one.",
+            "",
+        )
     reason = f"What {_listed(blind)} does is not known, not even in sign: the bands of the spread hold zero for every output."
-    return Rule(name, place, FAILED, f"{blind[0]}: sign unknown", reason, f"Move {_listed(blind)} more, or longer, and record again.")
+    return Rule(
+        name,
+        place,
+        FAILED,
+        f"{blind[0]}: sign unknown",
+        reason,
+        f"Move {_listed(blind)} more, or longer, and record again.",
+    )
 
 
 def _stability(sources: Sources) -> Rule:
@@ -278,4 +370,6 @@ def _stability(sources: Sources) -> Rule:
     if radius < 1:
         return Rule(name, place, PASSED, figure, "Every pole lies inside the unit circle.", "")
     reason = f"The largest pole, {number(radius, 4)}, is not inside the unit circle: simulated far ahead, the model runs away."
-    return Rule(name, place, FAILED, figure, reason, "Record longer, or set identify_plant.refinement to validated.")
+    return Rule(
+        name, place, FAILED, figure, reason, "Record longer, or set identify_plant.refinement to validated."
+    )

@@ -1,4 +1,5 @@
-"""The figures of the identification page that show the model itself: step responses, order, poles, and the excitation that it was learned from."""
+"""The figures of the identification page that show the model itself: step responses, order, poles, and the
+excitation that it was learned from."""
 
 from collections.abc import Callable, Mapping
 
@@ -20,8 +21,13 @@ MOST_DOTS = 600  # of the cloud of poles
 
 
 def steps(sources: Sources) -> Matrix:
-    """Response of each output to a step of each input, with the spread's band, and gain, time constant and delay."""
-    table, dynamics, title = sources.tables["steps"], sources.tables["dynamics"], "What each input does: step responses"
+    """Response of each output to a step of each input, with the
+    spread's band, and gain, time constant and delay."""
+    table, dynamics, title = (
+        sources.tables["steps"],
+        sources.tables["dynamics"],
+        "What each input does: step responses",
+    )
     gap = next((part for part in (table, dynamics) if isinstance(part, Missing)), None)
     if gap:
         return blank("steps", title, gap)
@@ -39,27 +45,41 @@ def steps(sources: Sources) -> Matrix:
     seen, end = int(dynamics["seen"].sum()), float(table["time_s"].max())
     every = len(dynamics["seen"])
     text = (
-        f"{seen} of {every} effects are sure in sign; of the others the band over {plants} holds zero. "
-        if seen < every
-        else "Every effect is sure in sign. "
-    ) + "The figure is the largest excursion, with its band; for an effect that turns back, also where it ends."
-    caption = (
-        f"Answer in °C to one per cent of the input, over {short(end)}{THIN}s from rest; the panels of an output share one scale. Band: 90{THIN}% of {plants}, "
-        f"cut where it leaves the panel. τ: 1.5 times the way from 28.3 to 63.2{THIN}% of the largest excursion; delay: what is left of the time to 63.2{THIN}%.{more}"
+        (
+            f"{seen} of {every} effects are sure in sign; of the others the band over {plants} holds zero. "
+            if seen < every
+            else "Every effect is sure in sign. "
+        )
+        + "The figure is the largest excursion, with its band; for an effect that turns back, also where it ends."
     )
-    return Matrix("steps", title, text, rows, caption, page.origin(sources.source("steps", "dynamics")), size.across)
+    caption = (
+        f"Answer in °C to one per cent of the input, over {short(end)}{THIN}s from rest; "
+        f"the panels of an output share one scale. Band: 90{THIN}% of {plants}, "
+        f"cut where it leaves the panel. τ: 1.5 times the way from 28.3 to 63.2{THIN}% of the largest "
+        f"excursion; delay: what is left of the time to 63.2{THIN}%.{more}"
+    )
+    return Matrix(
+        "steps", title, text, rows, caption, page.origin(sources.source("steps", "dynamics")), size.across
+    )
 
 
 def _members(sources: Sources) -> str:
     poles = sources.tables["poles"]
-    return "the plants of the spread" if isinstance(poles, Missing) else count(int(poles["member"].max()), "plant") + " of the spread"
+    return (
+        "the plants of the spread"
+        if isinstance(poles, Missing)
+        else count(int(poles["member"].max()), "plant") + " of the spread"
+    )
 
 
 def _reach(table: Table, rows: np.ndarray) -> charts.Axis:
     """Room for the model's responses, and for half as much of their bands."""
     low, high = float(table["response"][rows].min()), float(table["response"][rows].max())
     room = 0.5 * max(high - low, 1e-12)
-    low, high = max(float(table["low"][rows].min()), low - room), min(float(table["high"][rows].max()), high + room)
+    low, high = (
+        max(float(table["low"][rows].min()), low - room),
+        min(float(table["high"][rows].max()), high + room),
+    )
     return charts.linear(min(low, 0.0), max(high, 0.0) or 1e-12, ticks=3)
 
 
@@ -67,7 +87,12 @@ def _response(table: Table, rows: np.ndarray, dynamics: Table, row: int, y: char
     time, seen = table["time_s"][rows], bool(dynamics["seen"][row])
     end = float(time[-1])
     frame = charts.Frame(
-        charts.Axis(0, end, ((0.0, "0"), (end, short(end)))), y, width=size.width, height=size.height + 8, left=size.left + 2, above=6
+        charts.Axis(0, end, ((0.0, "0"), (end, short(end)))),
+        y,
+        width=size.width,
+        height=size.height + 8,
+        left=size.left + 2,
+        above=6,
     )
     layers = [
         charts.ribbon(frame, time, table["low"][rows], table["high"][rows]),
@@ -75,15 +100,30 @@ def _response(table: Table, rows: np.ndarray, dynamics: Table, row: int, y: char
         charts.line(frame, time, table["response"][rows], "line" if seen else "ref"),
     ]
     output, name = str(dynamics["output"][row]), str(dynamics["input"][row])
-    gain, peak = (tuple(float(dynamics[f"{key}{side}"][row]) for side in ("", "_low", "_high")) for key in ("gain", "peak"))
+    gain, peak = (
+        tuple(float(dynamics[f"{key}{side}"][row]) for side in ("", "_low", "_high"))
+        for key in ("gain", "peak")
+    )
     if not seen:
         alt = f"{output} after {name}: sign not known, {_span(peak)} °C per %"
-        return Cell(name, _span(gain), charts.panel(frame, layers, alt=alt, css=size.css, units=("s", "°C")), "sign not known")
+        return Cell(
+            name,
+            _span(gain),
+            charts.panel(frame, layers, alt=alt, css=size.css, units=("s", "°C")),
+            "sign not known",
+        )
     tau, delay = (f"{short(float(dynamics[key][row]), 2)}{THIN}s" for key in ("time_constant_s", "delay_s"))
     turns = gain[0] / peak[0] < 0.8
-    figure = f"{number(peak[0], _places(peak))} ({_span(peak)})" + (f", then {number(gain[0], _places(gain))}" if turns else "")
+    figure = f"{number(peak[0], _places(peak))} ({_span(peak)})" + (
+        f", then {number(gain[0], _places(gain))}" if turns else ""
+    )
     alt = f"{output} after {name}: {figure} °C per %; time constant {tau}, delay {delay}"
-    return Cell(name, figure, charts.panel(frame, layers, alt=alt, css=size.css, units=("s", "°C")), f"τ {tau}, delay {delay}")
+    return Cell(
+        name,
+        figure,
+        charts.panel(frame, layers, alt=alt, css=size.css, units=("s", "°C")),
+        f"τ {tau}, delay {delay}",
+    )
 
 
 def _places(values: tuple[float, float, float]) -> int:
@@ -106,7 +146,10 @@ def order(sources: Sources) -> Picture:
         return hole("order", title, table)
     chosen = int(table["order"][table["chosen"]][0]) if table["chosen"].any() else 0
     given = sources.declared.everything.get("identify_plant", {}).get("order") or 0
-    tried, tolerance = np.isfinite(table["error"]).any(), lookup(sources.metrics["identify_plant"], "order_tolerance_percent")
+    tried, tolerance = (
+        np.isfinite(table["error"]).any(),
+        lookup(sources.metrics["identify_plant"], "order_tolerance_percent"),
+    )
     near = "near the best" if isinstance(tolerance, Missing) else f"within {tolerance:g}{THIN}% of the best"
     if given:
         text = f"Order {chosen}, as identify_plant.order asks; the data were not asked."
@@ -116,7 +159,8 @@ def order(sources: Sources) -> Picture:
         text = f"Order {chosen}: the record is noise-free, and its rank decides."
     edge = short(float(table["noise_edge"][0]), 3)
     caption = (
-        f"The rule: orders whose singular value rises above what noise alone reaches, {edge}, are tried; each is identified without one block of the record and "
+        f"The rule: orders whose singular value rises above what noise alone reaches, {edge}, are tried; "
+        "each is identified without one block of the record and "
         f"simulated on it. Of those whose error is {near}, the one with the fewest free numbers wins."
     )
     return Picture(
@@ -148,20 +192,30 @@ def poles(sources: Sources) -> Picture:
         frame = (
             _window(real, imag, mine)
             if near
-            else charts.Frame(charts.linear(-1.1, 1.1, ticks=3), charts.linear(-1.1, 1.1, ticks=3), width=270, height=256, left=30, above=6)
+            else charts.Frame(
+                charts.linear(-1.1, 1.1, ticks=3),
+                charts.linear(-1.1, 1.1, ticks=3),
+                width=270,
+                height=256,
+                left=30,
+                above=6,
+            )
         )
-        layers = [charts.line(frame, np.cos(_CIRCLE), np.sin(_CIRCLE), "lim line thin", most=len(_CIRCLE))] if not near else [_arc(frame)]
+        layers = (
+            [charts.line(frame, np.cos(_CIRCLE), np.sin(_CIRCLE), "lim line thin", most=len(_CIRCLE))]
+            if not near
+            else [_arc(frame)]
+        )
         layers += [
-            charts.dots(frame, *_inside(frame, real[part], imag[part]), css, 1.7) for part, css in ((extra, "try pale"), (of_mine, "try"))
+            charts.dots(frame, *_inside(frame, real[part], imag[part]), css, 1.7)
+            for part, css in ((extra, "try pale"), (of_mine, "try"))
         ]
         layers.append(charts.crosses(frame, real[mine], imag[mine]))
         alt = f"{head}: {int(mine.sum())} poles, the largest of size {number(slowest, 4)}, {'inside' if slowest < 1 else 'on or outside'} the unit circle"
         shown.append(Column(head, small, "", [charts.panel(frame, layers, alt=alt)]))
     plants = int(table["member"].max())
     text = f"{count(int(mine.sum()), 'pole').capitalize()}, the largest of size {number(slowest, 4)}: {'stable' if slowest < 1 else 'not stable'}."
-    caption = (
-        f"Crosses: the model; dots: {count(plants, 'plant')} of the spread, each with one state more than the model, whose pole is pale."
-    )
+    caption = f"Crosses: the model; dots: {count(plants, 'plant')} of the spread, each with one state more than the model, whose pole is pale."
     return Picture("poles", title, text, shown, caption, page.origin(sources.source("poles")))
 
 
@@ -199,7 +253,8 @@ def _arc(frame: charts.Frame) -> Markup:
 
 
 def pole_table(sources: Sources) -> list[dict[str, str]]:
-    """Each pole of the model, a pair in one row: size, time constant with its band over the spread, period."""
+    """Each pole of the model, a pair in one row: size, time constant
+    with its band over the spread, period."""
     table, step = sources.tables["poles"], sources.declared.machine.sample_time_s
     if isinstance(table, Missing):
         return []
@@ -209,15 +264,25 @@ def pole_table(sources: Sources) -> list[dict[str, str]]:
         others = (table["pole"] == table["pole"][k]) & (table["member"] > 0)
         sizes = np.hypot(table["real"][others], table["imag"][others])
         constant = _constant(abs(value), step)
-        low, high = np.sort([_constant(size, step) for size in np.quantile(sizes, [0.05, 0.95])]) if len(sizes) else (np.nan, np.nan)
+        low, high = (
+            np.sort([_constant(size, step) for size in np.quantile(sizes, [0.05, 0.95])])
+            if len(sizes)
+            else (np.nan, np.nan)
+        )
         again = low <= constant <= high
         rows.append(
             {
                 "size": number(abs(value), 4),
                 "pair": "pair" if value.imag else "",
                 "constant": f"{short(constant, 3)}{THIN}s" if np.isfinite(constant) else "none",
-                "band": "" if np.isnan(low + high) else f"{short(low, 3)}{DASH}{short(high, 3)}" if again else "not found again",
-                "period": f"{short(2 * np.pi * step / abs(np.angle(value)), 3)}{THIN}s" if value.imag or value.real < 0 else "",
+                "band": ""
+                if np.isnan(low + high)
+                else f"{short(low, 3)}{DASH}{short(high, 3)}"
+                if again
+                else "not found again",
+                "period": f"{short(2 * np.pi * step / abs(np.angle(value)), 3)}{THIN}s"
+                if value.imag or value.real < 0
+                else "",
             }
         )
     return rows
@@ -259,12 +324,25 @@ def excitation(sources: Sources) -> Picture:
                 signal.name,
                 small,
                 "",
-                [charts.panel(frame, [charts.line(frame, edges, np.append(level, level[-1]), steps=True)], alt=alt, css=size.css)],
+                [
+                    charts.panel(
+                        frame,
+                        [charts.line(frame, edges, np.append(level, level[-1]), steps=True)],
+                        alt=alt,
+                        css=size.css,
+                    )
+                ],
             )
         )
     condition = found.get("condition")
-    text = f"Together the inputs move in {found['rank']} of {found['full']} directions over a window of {found['lags']} samples" + (
-        "." if condition is None else f"; the strongest has {short(condition, 2)} times the power of the weakest."
+    text = (
+        f"Together the inputs move in {found['rank']} of {found['full']} directions over a window of "
+        f"{found['lags']} samples"
+        + (
+            "."
+            if condition is None
+            else f"; the strongest has {short(condition, 2)} times the power of the weakest."
+        )
     )
     return Picture(
         "excitation",

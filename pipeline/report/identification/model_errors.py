@@ -1,4 +1,5 @@
-"""The figures of the identification page that show the model's errors: on the hold-out, with themselves, and with the inputs."""
+"""The figures of the identification page that show the model's errors: on the
+hold-out, with themselves, and with the inputs."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -26,7 +27,8 @@ class Cell(NamedTuple):
 
 
 class Room(NamedTuple):
-    """How many panels stand beside one another, and what each of them has in px: four at least, so that few do not grow into posters."""
+    """How many panels stand beside one another, and what each of them has in px: four
+    at least, so that few do not grow into posters."""
 
     across: int
     width: int
@@ -66,24 +68,35 @@ def blank(id: str, title: str, missing: Missing) -> Matrix:
 
 def holdout(sources: Sources, found: Sequence[Fit], ahead: str) -> Picture:
     """Every output of the hold-out: measured, simulated, and predicted so many steps ahead."""
-    table, title = sources.tables["holdout"], "Measured against simulated, on the part of the record that the model did not see"
+    table, title = (
+        sources.tables["holdout"],
+        "Measured against simulated, on the part of the record that the model did not see",
+    )
     if isinstance(table, Missing):
         return hole("holdout", title, table)
     shown, points = [], max(60, 240 * 10 // max(len(found), 10))
     for fit in found:
         parts = [("simulated", fit.simulated), (ahead, fit.ahead)]
-        small = ", ".join(f"{name} {part.state if isinstance(part, Missing) else percent_of(part)}" for name, part in parts)
+        small = ", ".join(
+            f"{name} {part.state if isinstance(part, Missing) else percent_of(part)}" for name, part in parts
+        )
         shown.append(Column(fit.name, f"fit: {small}", "", _stretch(sources, table, fit.name, small, points)))
     segments = len(np.unique(table["segment"]))
     masked = sum(int((~np.isfinite(table[f"{fit.name}_measured"])).sum()) for fit in found)
     text = (
-        f"{number(len(table['time_s']), 0)} samples in {count(segments, 'stretch', 'stretches')}, the last part of each; "
-        + (f"{count(masked, 'measured value is', 'measured values are')} masked and not scored." if masked else "none of them masked.")
+        f"{number(len(table['time_s']), 0)} samples in {count(segments, 'stretch', 'stretches')}, "
+        "the last part of each; "
+        + (
+            f"{count(masked, 'measured value is', 'measured values are')} masked and not scored."
+            if masked
+            else "none of them masked."
+        )
         + f" Simulated: the model runs from the inputs alone. {ahead[:1].upper()}{ahead[1:]}: it also knows the outputs until then."
     )
     caption = (
         "Above, °C against time in s, stretches one after the other: grey measured, ink simulated. "
-        f"Below, measured less predicted: ink simulated, grey {ahead}. Vermillion: masked. Upright lines: where a stretch ends."
+        f"Below, measured less predicted: ink simulated, grey {ahead}. Vermillion: masked. Upright lines: "
+        "where a stretch ends."
     )
     return Picture("holdout", title, text, shown, caption, page.origin(sources.source("holdout")))
 
@@ -94,7 +107,11 @@ def _stretch(sources: Sources, table: Table, name: str, small: str, points: int)
     measured, simulated, ahead = (table[f"{name}_{kind}"] for kind in ("measured", "simulated", "ahead"))
     values = np.concatenate([measured, simulated])
     values = values[np.isfinite(values)]
-    y = charts.linear(float(values.min()), float(values.max()), ticks=3) if len(values) else charts.linear(0, 1)
+    y = (
+        charts.linear(float(values.min()), float(values.max()), ticks=3)
+        if len(values)
+        else charts.linear(0, 1)
+    )
     x = charts.linear(0, float(time[-1]) or 1.0, ticks=6)
     above = charts.Frame(x, y, width=568, height=150, left=40, below=4)
     error = [measured - simulated, measured - ahead]
@@ -108,11 +125,18 @@ def _stretch(sources: Sources, table: Table, name: str, small: str, points: int)
         marks += [charts.interval(frame, float(time[at]), float(time[at]), "end") for at in ends[:100]]
         # a line breaks where one stretch ends and another begins
         return marks + [
-            charts.line(frame, np.insert(time, ends, time[ends]), np.insert(v, ends, np.nan), css, most=points) for v, css in lines
+            charts.line(
+                frame, np.insert(time, ends, time[ends]), np.insert(v, ends, np.nan), css, most=points
+            )
+            for v, css in lines
         ]
 
-    alt = f"{name} on the hold-out: fit {small}; {count(int((~np.isfinite(measured)).sum()), 'sample')} masked"
-    size, late = (float(np.sqrt(np.nanmean(part**2))) if np.isfinite(part).any() else np.nan for part in error)
+    alt = (
+        f"{name} on the hold-out: fit {small}; {count(int((~np.isfinite(measured)).sum()), 'sample')} masked"
+    )
+    size, late = (
+        float(np.sqrt(np.nanmean(part**2))) if np.isfinite(part).any() else np.nan for part in error
+    )
     said = f"{name}: error of simulation {short(size, 2)} °C r.m.s., ahead " + (
         f"{short(late, 2)} °C" if np.isfinite(late) else "not measured"
     )
@@ -146,7 +170,9 @@ def whiteness(sources: Sources) -> Picture:
     if isinstance(table, Missing):
         return hole("white", title, table)
     names = [output.name for output in sources.declared.machine.outputs]
-    mine = {name: (table["output"] == name) & (table["against"] == name) & (table["lag"] > 0) for name in names}
+    mine = {
+        name: (table["output"] == name) & (table["against"] == name) & (table["lag"] > 0) for name in names
+    }
     y = _correlations(table, np.any(list(mine.values()), axis=0))
     shown = []
     for name in names:
@@ -177,7 +203,9 @@ def cross(sources: Sources) -> Matrix:
         passed = bool(table["passed"][mine].all())
 
         def draw() -> Cell:
-            return Cell(name, "" if passed else "failed", _stems(table, mine, y, size, f"{output} after {name}"), "")
+            return Cell(
+                name, "" if passed else "failed", _stems(table, mine, y, size, f"{output} after {name}"), ""
+            )
 
         return float(strength[mine & (table["lag"] >= 0)].max(initial=0)), draw
 
@@ -185,16 +213,30 @@ def cross(sources: Sources) -> Matrix:
     failed = sorted(
         {
             (str(o), str(a))
-            for o, a in zip(table["output"][other & ~table["passed"]], table["against"][other & ~table["passed"]], strict=True)
+            for o, a in zip(
+                table["output"][other & ~table["passed"]],
+                table["against"][other & ~table["passed"]],
+                strict=True,
+            )
         }
     )
-    said = ", ".join(f"{output} after {name}" for output, name in failed[:6]) + (f" and {len(failed) - 6} more" if len(failed) > 6 else "")
-    text = f"Yes: {said}. There the model misses something that an input does." if failed else "No: what the inputs do, the model explains."
-    caption = (
-        f"Correlation of the one-step errors with the input, lag in samples; right of zero the input came first. Grey: the 99{THIN}% band of a single lag; "
-        f"the test widens it for the number of lags. Left of zero, pale: feedback from errors to inputs, no fault of the model.{more}"
+    said = ", ".join(f"{output} after {name}" for output, name in failed[:6]) + (
+        f" and {len(failed) - 6} more" if len(failed) > 6 else ""
     )
-    return Matrix("followed", title, text, rows, caption, page.origin(sources.source("residuals")), size.across)
+    text = (
+        f"Yes: {said}. There the model misses something that an input does."
+        if failed
+        else "No: what the inputs do, the model explains."
+    )
+    caption = (
+        "Correlation of the one-step errors with the input, lag in samples; "
+        f"right of zero the input came first. Grey: the 99{THIN}% band of a single lag; "
+        "the test widens it for the number of lags. Left of zero, pale: feedback from errors to inputs, "
+        f"no fault of the model.{more}"
+    )
+    return Matrix(
+        "followed", title, text, rows, caption, page.origin(sources.source("residuals")), size.across
+    )
 
 
 def _correlations(table: Table, rows: np.ndarray) -> charts.Axis:
@@ -211,7 +253,8 @@ def _stems(table: Table, rows: np.ndarray, y: charts.Axis, size: Room, name: str
         charts.Axis(float(lag.min()) - 1, float(lag.max()) + 1, tuple((k, number(k, 0)) for k in ends)), y,
         width=size.width, height=size.height, left=size.left, above=6,
     )  # fmt: skip
-    # a lag outside of the band is marked only where the test over all lags failed: one in a hundred leaves it by chance
+    # a lag outside of the band is marked only where the test over all
+    # lags failed: one in a hundred leaves it by chance
     outside, judged = np.abs(np.nan_to_num(value)) > limit, lag >= 0
     marked = outside & ~table["passed"][rows]
     layers = [charts.tint(frame, -limit, limit), charts.level(frame, 0.0, "tk")]
@@ -224,7 +267,9 @@ def _stems(table: Table, rows: np.ndarray, y: charts.Axis, size: Room, name: str
     return charts.panel(frame, layers, alt=alt, css=size.css, units=("samples", ""))
 
 
-def matrix(sources: Sources, cell: Callable[[str, str], tuple[float, Callable[[], Cell]]]) -> tuple[list[tuple[str, list[Cell]]], str]:
+def matrix(
+    sources: Sources, cell: Callable[[str, str], tuple[float, Callable[[], Cell]]]
+) -> tuple[list[tuple[str, list[Cell]]], str]:
     """Rows of cells; where the machine has many inputs, of each output the strongest ones, in their order."""
     machine = sources.declared.machine
     rows = []
@@ -233,4 +278,9 @@ def matrix(sources: Sources, cell: Callable[[str, str], tuple[float, Callable[[]
         kept = sorted(sorted(range(len(cells)), key=lambda k: -cells[k][0])[:MOST_INPUTS])
         rows.append((output.name, [cells[k][1]() for k in kept]))
     left = len(machine.inputs) - MOST_INPUTS
-    return rows, f" Of {len(machine.inputs)} inputs the {MOST_INPUTS} strongest of each output are shown." if left > 0 else ""
+    return (
+        rows,
+        f" Of {len(machine.inputs)} inputs the {MOST_INPUTS} strongest of each output are shown."
+        if left > 0
+        else "",
+    )

@@ -1,4 +1,5 @@
-"""The page of the identification: what the model may be used for, every output's fits, what to do, the pictures behind it, and what the record lost on the way."""
+"""The page of the identification: what the model may be used for, every output's fits, what to do, the
+pictures behind it, and what the record lost on the way."""
 
 import math
 from typing import Any
@@ -62,12 +63,16 @@ def render(sources: Sources) -> str:
 
 
 def _judged_on(sources: Sources) -> str:
-    metrics, share = sources.metrics["identify_plant"], sources.declared.everything.get("identify_plant", {}).get("holdout_share")
+    metrics, share = (
+        sources.metrics["identify_plant"],
+        sources.declared.everything.get("identify_plant", {}).get("holdout_share"),
+    )
     held, samples = lookup(metrics, "samples_holdout"), lookup(metrics, "samples")
     if isinstance(held, Missing) or isinstance(samples, Missing) or share is None:
         return ""
     return (
-        f"Judged on the last {100 * share:g}{THIN}% of every stretch, {number(held, 0)} of {number(samples, 0)} samples, by the model of the rest. "
+        f"Judged on the last {100 * share:g}{THIN}% of every stretch, "
+        f"{number(held, 0)} of {number(samples, 0)} samples, by the model of the rest. "
         "The model that is handed on was then fitted to all of them, with the same choices."
     )
 
@@ -76,10 +81,18 @@ def _judged_on(sources: Sources) -> str:
 
 
 def answer(sources: Sources, fit: Fit, ahead: str) -> dict[str, Any]:
-    """Fits with bands, the yardstick, the share that is missed as a strip, what the residuals say, and the change since the accepted run."""
+    """Fits with bands, the yardstick, the share that is missed as a strip, what the
+    residuals say, and the change since the accepted run."""
     question = Question(0, "", fit.name, "%", LEAST_FIT, True, "")
-    bar = fit.held if isinstance(fit.held, Missing) else Question(0, "", fit.name, "%", max(fit.held.value, LEAST_FIT), True, "")
-    states = [state(question, fit.simulated), fit.ahead.state if isinstance(bar, Missing) else state(bar, fit.ahead)]
+    bar = (
+        fit.held
+        if isinstance(fit.held, Missing)
+        else Question(0, "", fit.name, "%", max(fit.held.value, LEAST_FIT), True, "")
+    )
+    states = [
+        state(question, fit.simulated),
+        fit.ahead.state if isinstance(bar, Missing) else state(bar, fit.ahead),
+    ]
     shown = [
         ("Simulation", "mb", _missed(fit.simulated)),
         (ahead, "mb hollow", _missed(fit.ahead)),
@@ -91,7 +104,8 @@ def answer(sources: Sources, fit: Fit, ahead: str) -> dict[str, Any]:
         "name": fit.name,
         "note": _residual_note(sources, fit.name),
         "state": next(
-            (wanted for wanted in (FAILED, UNDECIDED) if wanted in states), PASSED if states == [PASSED, PASSED] else "not measured"
+            (wanted for wanted in (FAILED, UNDECIDED) if wanted in states),
+            PASSED if states == [PASSED, PASSED] else "not measured",
         ),
         "cells": [
             {
@@ -107,7 +121,9 @@ def answer(sources: Sources, fit: Fit, ahead: str) -> dict[str, Any]:
             )
         ],
         "held": _value(fit.held)["value"],
-        "strip": charts.strip(Question(0, "", fit.name, "%", 100 - LEAST_FIT, False, ""), shown, (11, 23, 23)),
+        "strip": charts.strip(
+            Question(0, "", fit.name, "%", 100 - LEAST_FIT, False, ""), shown, (11, 23, 23)
+        ),
         "change": change,
         "moved": moved,
     }
@@ -122,7 +138,11 @@ def _value(figure: Figure | Missing) -> dict[str, str]:
 
 def _missed(figure: Figure | Missing) -> Figure | Missing:
     """The share of the movement that the fit misses; none is 0, the mean misses 100 %."""
-    return figure if isinstance(figure, Missing) else Figure(100 - figure.value, 100 - figure.high, 100 - figure.low)
+    return (
+        figure
+        if isinstance(figure, Missing)
+        else Figure(100 - figure.value, 100 - figure.high, 100 - figure.low)
+    )
 
 
 def _residual_note(sources: Sources, name: str) -> str:
@@ -141,8 +161,14 @@ def _accepted(sources: Sources, name: str) -> Figure | None:
     before = sources.accepted
     if before is None or isinstance(before, Missing):
         return None
-    value, ends = (lookup(before, f"metrics.identify_plant.{key}.{name}") for key in ("fit_holdout", "fit_holdout_band"))
-    return None if isinstance(value, Missing) else Figure(value, *([value, value] if isinstance(ends, Missing) else ends))
+    value, ends = (
+        lookup(before, f"metrics.identify_plant.{key}.{name}") for key in ("fit_holdout", "fit_holdout_band")
+    )
+    return (
+        None
+        if isinstance(value, Missing)
+        else Figure(value, *([value, value] if isinstance(ends, Missing) else ends))
+    )
 
 
 def since(before: Figure | None, now: Figure | Missing) -> tuple[str, bool]:
@@ -156,7 +182,11 @@ def since(before: Figure | None, now: Figure | Missing) -> tuple[str, bool]:
     if before.low <= now.high and now.low <= before.high:
         return f"within noise of {_value(before)['value']}", False
     change = now.value - before.value
-    return f"{'+' if change > 0 else MINUS}{number(abs(change), 1)} points · {'better' if change > 0 else 'worse'}", True
+    return (
+        f"{'+' if change > 0 else MINUS}{number(abs(change), 1)} points · "
+        f"{'better' if change > 0 else 'worse'}",
+        True,
+    )
 
 
 # ---- what to do
@@ -168,9 +198,17 @@ def advice(sources: Sources, judged: Trust) -> list[str]:
     said = [] if isinstance(found, Missing) else [_sentence(text) for text in found]
     spoken = {"Inputs used up", "Whiteness", "Excitation"} if said else set()
     spoken |= {"Simulation"} if any("hold-out fit" in text for text in said) else set()
-    said += [f"{rule.name}: {rule.remedy}" for rule in judged.rules if rule.state != PASSED and rule.remedy and rule.name not in spoken]
+    said += [
+        f"{rule.name}: {rule.remedy}"
+        for rule in judged.rules
+        if rule.state != PASSED and rule.remedy and rule.name not in spoken
+    ]
     notes = lookup(sources.metrics["identify_plant"], "notes")
-    return said + ([] if isinstance(notes, Missing) else [f"Noted while fitting: {text}." for text in dict.fromkeys(notes)])
+    return said + (
+        []
+        if isinstance(notes, Missing)
+        else [f"Noted while fitting: {text}." for text in dict.fromkeys(notes)]
+    )
 
 
 def _sentence(text: str) -> str:
@@ -200,7 +238,11 @@ def candidates(sources: Sources) -> list[dict[str, Any]]:
                 "chosen": bool(table["chosen"][k]),
                 "value": short(value, 3),
                 "parameters": number(float(table["parameters"][k]), 0) if tried[k] else "",
-                "error": f"{number(100 * error, 2)}{THIN}%" if tried[k] else "not tried" if value > edge else "within noise",
+                "error": f"{number(100 * error, 2)}{THIN}%"
+                if tried[k]
+                else "not tried"
+                if value > edge
+                else "within noise",
                 "above": "" if not tried[k] else "the best" if above == 0 else f"{short(above, 2)}{THIN}%",
             }
         )
@@ -244,7 +286,20 @@ def used(sources: Sources) -> list[tuple[str, str]]:
         (found, "dropped_rows", "Rows left out: their window touches a masked sample"),
         (found, "past", "Window, in samples"),
     )
-    rows = [(title, value.state if isinstance(value := lookup(data, key), Missing) else number(value, 0)) for data, key, title in items]
+    rows = [
+        (title, value.state if isinstance(value := lookup(data, key), Missing) else number(value, 0))
+        for data, key, title in items
+    ]
     delays = lookup(found, "delays")
-    late = [] if isinstance(delays, Missing) else [f"{name} {count(steps, 'sample')}" for name, steps in delays.items() if steps]
-    return [*rows, ("Dead time found", ", ".join(late) or ("not measured" if isinstance(delays, Missing) else "none beyond one sample"))]
+    late = (
+        []
+        if isinstance(delays, Missing)
+        else [f"{name} {count(steps, 'sample')}" for name, steps in delays.items() if steps]
+    )
+    return [
+        *rows,
+        (
+            "Dead time found",
+            ", ".join(late) or ("not measured" if isinstance(delays, Missing) else "none beyond one sample"),
+        ),
+    ]

@@ -1,4 +1,5 @@
-"""A card a loop: the winner in words, three small multiples on one scale, three figures. A loop that is not measured keeps its frame."""
+"""A card a loop: the winner in words, three small multiples on one scale, three
+figures. A loop that is not measured keeps its frame."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -13,12 +14,28 @@ from pipeline.report.identification.model import trust
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import decimals, number, percent, quantity, shortened
 from pipeline.report.shared.sources import Sources, Table
-from pipeline.report.shared.verdict import FAILED, OPEN, ROLES, UNDECIDED, Figure, Missing, Question, outcomes, row_places, state
+from pipeline.report.shared.verdict import (
+    FAILED,
+    OPEN,
+    ROLES,
+    UNDECIDED,
+    Figure,
+    Missing,
+    Question,
+    outcomes,
+    row_places,
+    state,
+)
 from pipeline.report.temperature.answers import CONTROLLERS, LABELS, featured
 from pipeline.report.temperature.judgement import NAMES, Judgement
 
 # composer of the deposition loop -> its place in the card
-ROLE = {"basis": "data_driven", "priority": "model_based", "superposition": "model_based", "on_off": "baseline"}
+ROLE = {
+    "basis": "data_driven",
+    "priority": "model_based",
+    "superposition": "model_based",
+    "on_off": "baseline",
+}
 
 
 def temperature(sources: Sources, judged: Judgement) -> dict[str, Any]:
@@ -27,7 +44,9 @@ def temperature(sources: Sources, judged: Judgement) -> dict[str, Any]:
     rows = []
     for key in ("settled_error_degC", "gap_percent", "settling_s"):
         question = next(q for q in judged.asked if q.key == key)
-        rows.append({"title": question.title, "cells": _card_cells(question, [answers[role][key] for role in order])})
+        rows.append(
+            {"title": question.title, "cells": _card_cells(question, [answers[role][key] for role in order])}
+        )
     kernel = judged.by_name.get("kernel", {}).get("gap_percent")
     return {
         "id": "temperature",
@@ -41,8 +60,14 @@ def temperature(sources: Sources, judged: Judgement) -> dict[str, Any]:
             f"Worst zone’s true error over {_SPAN} s, log scale {_FLOOR:g} to {number(_CEILING, 0)}\u00a0°C: "
             f"{featured(sources)}. Grey: what the rule allows once settled."
         ),
-        "panels": [_spark(sources, judged, role, limit=rules.settled_error_degC, named=i == 0) for i, role in enumerate(order)],
-        "heads": [{"mark": role, "name": LABELS[CONTROLLERS[role]][0], "method": LABELS[CONTROLLERS[role]][1]} for role in order],
+        "panels": [
+            _spark(sources, judged, role, limit=rules.settled_error_degC, named=i == 0)
+            for i, role in enumerate(order)
+        ],
+        "heads": [
+            {"mark": role, "name": LABELS[CONTROLLERS[role]][0], "method": LABELS[CONTROLLERS[role]][1]}
+            for role in order
+        ],
         "rows": rows,
         "note": _kernel_note(kernel, sources),
         "model": trust(sources),
@@ -84,15 +109,21 @@ def _win(judged: Judgement) -> tuple[str, str]:
     others = []
     for role in ("data_driven", "model_based", "baseline"):
         if role != best:
-            failed = [o for o in outcomes(judged.asked, judged.roles[role]) if o.state in (FAILED, UNDECIDED, OPEN) and o.rule != "drift"]
+            failed = [
+                o
+                for o in outcomes(judged.asked, judged.roles[role])
+                if o.state in (FAILED, UNDECIDED, OPEN) and o.rule != "drift"
+            ]
             if failed and failed[0].question:
                 others.append(
-                    f"{NAMES[role]} {'fails' if failed[0].state == FAILED else 'is open'} on {_on(failed[0].question, judged.roles[role])}."
+                    f"{NAMES[role]} {'fails' if failed[0].state == FAILED else 'is open'} on "
+                    f"{_on(failed[0].question, judged.roles[role])}."
                 )
             else:
                 others.append(f"{NAMES[role]} passes too.")
-    return f"{'The b' if best == 'baseline' else NAMES[best][:1]}{'aseline' if best == 'baseline' else NAMES[best][1:]} wins.", " ".join(
-        [holds, *others]
+    return (
+        f"{'The b' if best == 'baseline' else NAMES[best][:1]}{'aseline' if best == 'baseline' else NAMES[best][1:]} wins.",
+        " ".join([holds, *others]),
     )
 
 
@@ -140,14 +171,18 @@ def _spark(sources: Sources, judged: Judgement, role: str, *, limit: float, name
     )
 
 
-def _worst_error(sources: Sources, table: Table | Missing, name: str) -> tuple[np.ndarray, np.ndarray] | Missing:
+def _worst_error(
+    sources: Sources, table: Table | Missing, name: str
+) -> tuple[np.ndarray, np.ndarray] | Missing:
     if isinstance(table, Missing):
         return table
     rows = (table["controller"] == name) & (table["mode"] == "deployed")
     if not rows.any():
         return Missing("not measured", f"no trajectory of {name}")
     offset = sources.declared.panel.judging.reference_offsets_degC[0]
-    errors = np.stack([np.abs(table[o.name][rows] - o.reference - offset) for o in sources.declared.machine.outputs])
+    errors = np.stack(
+        [np.abs(table[o.name][rows] - o.reference - offset) for o in sources.declared.machine.outputs]
+    )
     time = table["time_s"][rows]
     return time[time <= _SPAN], errors.max(axis=0)[time <= _SPAN]
 
@@ -161,39 +196,64 @@ def _kernel_note(gap: Figure | Missing | None, sources: Sources) -> str:
     if isinstance(gap, Figure):
         return (
             "Algorithm 2’s kernel, learned from the same record, costs "
-            f"{quantity(gap.value, '%', decimals(gap.low, gap.high, value=gap.value))} more than the optimum: "
+            f"{quantity(gap.value, '%', decimals(gap.low, gap.high, value=gap.value))} "
+            "more than the optimum: "
             f"see the temperature page. {noise}"
         )
     learned = sources.metrics["learn_kernel"]
     refused = learned.get("refused") if isinstance(learned, dict) else None
-    return f"Algorithm 2’s kernel failed: {refused}" if refused else f"Algorithm 2’s kernel: not measured. {noise}"
+    return (
+        f"Algorithm 2’s kernel failed: {refused}"
+        if refused
+        else f"Algorithm 2’s kernel: not measured. {noise}"
+    )
 
 
 def deposition(sources: Sources) -> dict[str, Any]:
-    """In this loop's terms: model-based is the paper's law and its library by priority, data-driven our law and the basis functions, baseline on-off control."""
+    """In this loop's terms: model-based is the paper's law and its library by priority, data-driven our law
+    and the basis functions, baseline on-off control."""
     judged, found = deposition_verdict.verdict(sources), deposition_rules.structures(sources)
     if isinstance(found, Missing):
         return unbuilt("deposition", found.sentence()) | {"link": "deposition.html"}
     parts = list(dict.fromkeys(one.part for one in found))
     # the parts on which the library fares worst say most
     parts.sort(
-        key=lambda part: -max((one.scores["priority"].error for one in found if one.part == part and "priority" in one.scores), default=0.0)
+        key=lambda part: (
+            -max(
+                (
+                    one.scores["priority"].error
+                    for one in found
+                    if one.part == part and "priority" in one.scores
+                ),
+                default=0.0,
+            )
+        )
     )
     names = ("priority", "basis", "on_off")
     rows = [
         {
             "title": f"Flow error, {shortened(part, 30)}",
             "cells": _worst(
-                [[one.scores[name].error for one in found if one.part == part and name in one.scores] for name in names],
+                [
+                    [one.scores[name].error for one in found if one.part == part and name in one.scores]
+                    for name in names
+                ],
                 sources.declared.rules.flow_error_percent,
             ),
         }
         for part in parts[:2]
     ]
     lines = [
-        [one.scores[name].worst_line for one in found if name in one.scores and one.scores[name].worst_line is not None] for name in names
+        [
+            one.scores[name].worst_line
+            for one in found
+            if name in one.scores and one.scores[name].worst_line is not None
+        ]
+        for name in names
     ]
-    rows.append({"title": "Worst line’s volume", "cells": _worst(lines, sources.declared.rules.line_volume_percent)})
+    rows.append(
+        {"title": "Worst line’s volume", "cells": _worst(lines, sources.declared.rules.line_volume_percent)}
+    )
     role = ROLE.get(judged.composer)
     trials = [_learned(sources, law) for law in ("paper", "ours", "")]
     return {
@@ -227,21 +287,25 @@ def deposition(sources: Sources) -> dict[str, Any]:
     }
 
 
-def _deposition_win(found: Sequence[deposition_rules.Structure], judged: deposition_verdict.Verdict, role: str | None) -> tuple[str, str]:
+def _deposition_win(
+    found: Sequence[deposition_rules.Structure], judged: deposition_verdict.Verdict, role: str | None
+) -> tuple[str, str]:
     if judged.state != deposition_verdict.PASSED or role is None:
         return judged.lead or judged.decision, judged.reason
     name = "The baseline" if role == "baseline" else NAMES[role]
     mine, _ = deposition_rules.worst(found, judged.composer) or (0.0, None)
     other = deposition_rules.worst(found, "priority" if judged.composer == "basis" else "basis")
     beside = (
-        f" {deposition_rules.USE['priority' if judged.composer == 'basis' else 'basis'].capitalize()}: {percent(other[0], 2)}."
+        f" {deposition_rules.USE['priority' if judged.composer == 'basis' else 'basis'].capitalize()}: "
+        f"{percent(other[0], 2)}."
         if other
         else ""
     )
     price = judged.price.split(". ")[0].rstrip(".")
     return (
         f"{name} wins.",
-        f"{deposition_rules.NAMES[judged.composer]}: at most {percent(mine, 2)} of on\u2011off control’s flow error on any part.{beside} {price}."
+        f"{deposition_rules.NAMES[judged.composer]}: at most {percent(mine, 2)} of on\u2011off control’s "
+        f"flow error on any part.{beside} {price}."
         if price
         else "",
     )
@@ -262,7 +326,8 @@ def _worst(groups: Sequence[Sequence[float]], limit: float) -> list[dict[str, An
 
 
 def _learned(sources: Sources, law: str) -> np.ndarray | Missing:
-    """The larger of the materials' errors after each trial of the reference routine, in % of trial 0's; on-off control learns nothing."""
+    """The larger of the materials' errors after each trial of the reference routine,
+    in % of trial 0's; on-off control learns nothing."""
     table = sources.tables["trials"]
     if isinstance(table, Missing):
         return table
@@ -272,7 +337,12 @@ def _learned(sources: Sources, law: str) -> np.ndarray | Missing:
     rows = (table["law"] == law) & (table["routine"] == 0)
     if not rows.any():
         return Missing("not measured", "this law was not run")
-    return np.array([100 * float(table["ratio"][rows & (table["trial"] == j)].max()) for j in sorted(set(table["trial"][rows].tolist()))])
+    return np.array(
+        [
+            100 * float(table["ratio"][rows & (table["trial"] == j)].max())
+            for j in sorted(set(table["trial"][rows].tolist()))
+        ]
+    )
 
 
 def _learning_spark(curve: np.ndarray | Missing, css: str, limit: float, *, named: bool) -> Markup:
@@ -298,7 +368,11 @@ def _learning_spark(curve: np.ndarray | Missing, css: str, limit: float, *, name
 def unbuilt(key: str, why: str) -> dict[str, Any]:
     """A loop without figures: the same frame, and the sentence in it."""
     heads = {
-        "deposition": ("Deposition", "Plunger command to flow at the nozzle", ("library + priority", "basis functions", "on-off control")),
+        "deposition": (
+            "Deposition",
+            "Plunger command to flow at the nozzle",
+            ("library + priority", "basis functions", "on-off control"),
+        ),
         "setpoint": (
             "Setpoint",
             "Nozzle camera to flow and temperature setpoints",
@@ -318,7 +392,8 @@ def unbuilt(key: str, why: str) -> dict[str, Any]:
         "caption": "Nothing is shown before it is measured.",
         "panels": [Markup('<div class="hole">{}not measured</div>').format(page.glyph(OPEN)) for _ in order],
         "heads": [
-            {"mark": role, "name": LABELS[CONTROLLERS[role]][0], "method": method} for role, method in zip(order, methods, strict=True)
+            {"mark": role, "name": LABELS[CONTROLLERS[role]][0], "method": method}
+            for role, method in zip(order, methods, strict=True)
         ],
         "rows": [],
         "note": "No figure, so no claim.",

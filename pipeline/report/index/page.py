@@ -44,7 +44,11 @@ def render(sources: Sources, judged: Judgement) -> str:
         accepted_on=accepted.get("on", ""),
         accepted_at=accepted.get("commit", ""),
         loops=[
-            loop._asdict() | {"reason": words.explained(sources, loop.reason), "remedy": words.explained(sources, loop.remedy)}
+            loop._asdict()
+            | {
+                "reason": words.explained(sources, loop.reason),
+                "remedy": words.explained(sources, loop.remedy),
+            }
             for loop in loops
         ],
         claim=f"{headline.claim(sources)} {_drifts(judged)}",
@@ -52,11 +56,17 @@ def render(sources: Sources, judged: Judgement) -> str:
         answers=_rows(judged),
         repetitions=repetitions(sources),
         seeds=len(sources.declared.panel.judging.seeds),
-        change=_change_sentence(judged, sources.accepted, _deposition_moves(sources), setpoint_change.said(sources)),
+        change=_change_sentence(
+            judged, sources.accepted, _deposition_moves(sources), setpoint_change.said(sources)
+        ),
         drift=judged.drifted,
         drift_state=drift_state(judged.roles["data_driven"]),
         hashes=hashes(sources),
-        cards=[cards.temperature(sources, judged), cards.deposition(sources), setpoint_card.setpoint(sources)],
+        cards=[
+            cards.temperature(sources, judged),
+            cards.deposition(sources),
+            setpoint_card.setpoint(sources),
+        ],
         paired=pairs.compared(sources)["finding"],
         difference=difference_parts(sources, judged),
         workflow=workflow.figure(sources),
@@ -73,7 +83,11 @@ def _accepted(sources: Sources) -> dict[str, str]:
     """The day on which the run was accepted, and the commit that was checked out; older files do not say."""
     found = sources.accepted if isinstance(sources.accepted, dict) else {}
     said = found.get("accepted")
-    return {key: str(said[key])[:40] for key in ("on", "commit") if key in said} if isinstance(said, dict) else {}
+    return (
+        {key: str(said[key])[:40] for key in ("on", "commit") if key in said}
+        if isinstance(said, dict)
+        else {}
+    )
 
 
 def _drifts(judged: Judgement) -> str:
@@ -107,7 +121,9 @@ def verdict_parts(judged: Judgement) -> dict[str, Any]:
         "remedy": judged.verdict.remedy,
         "rules": table,
         "claim": "",
-        "changed": f"{count(len(changed), 'parameter').capitalize()} changed since the accepted run" if changed else "",
+        "changed": f"{count(len(changed), 'parameter').capitalize()} changed since the accepted run"
+        if changed
+        else "",
     }
 
 
@@ -136,22 +152,34 @@ def _row(question: Question, judged: Judgement) -> dict[str, Any]:
         "change": move.text() if move else "first run",
         "moved": bool(move and move.moved),
         "worse": bool(move and move.moved and move.word == "worse" and state(question, pair[0][1]) != PASSED),
-        "quiet": state(question, pair[0][1]) == PASSED and state(question, pair[1][1]) == PASSED and not (move and move.moved),
+        "quiet": state(question, pair[0][1]) == PASSED
+        and state(question, pair[1][1]) == PASSED
+        and not (move and move.moved),
     }
 
 
 def _sub(question: Question, pair: Sequence[tuple[str, Figure | Missing]]) -> str:
     notes = list(dict.fromkeys(figure.note for _, figure in pair if isinstance(figure, Figure)))
     if question.key == "settled_error_degC":
-        return ", ".join(filter(None, [notes[0] if notes else "", *(n.removeprefix("zone ") for n in notes[1:])]))
-    return {"gap_percent": "", "at_limits_percent": "clipped commands", "disk": "more is safer", "delay_s": "more is safer"}.get(
-        question.key, ""
-    )
+        return ", ".join(
+            filter(None, [notes[0] if notes else "", *(n.removeprefix("zone ") for n in notes[1:])])
+        )
+    return {
+        "gap_percent": "",
+        "at_limits_percent": "clipped commands",
+        "disk": "more is safer",
+        "delay_s": "more is safer",
+    }.get(question.key, "")
 
 
 def _cell(question: Question, role: str, figure: Figure | Missing, places: int) -> dict[str, Any]:
     found = state(question, figure)
-    cell = {"css": page.MARKS[role], "name": NAMES[role], "state": found, "missing": figure if isinstance(figure, Missing) else None}
+    cell = {
+        "css": page.MARKS[role],
+        "name": NAMES[role],
+        "state": found,
+        "missing": figure if isinstance(figure, Missing) else None,
+    }
     if isinstance(figure, Figure):
         cell["value"] = quantity(figure.value, question.unit, places, beyond=question.beyond)
         cell["band"] = (
@@ -163,19 +191,37 @@ def _cell(question: Question, role: str, figure: Figure | Missing, places: int) 
 
 
 def _finer(figure: Figure, question: Question) -> str:
-    """A band that the row's decimals do not show, with those that do; runs that are all alike are said to be."""
-    return band(figure.low, figure.high, decimals(figure.low, figure.high, value=figure.value), beyond=question.beyond) or "all alike"
+    """A band that the row's decimals do not show, with those that do;
+    runs that are all alike are said to be."""
+    return (
+        band(
+            figure.low,
+            figure.high,
+            decimals(figure.low, figure.high, value=figure.value),
+            beyond=question.beyond,
+        )
+        or "all alike"
+    )
 
 
-def _change_sentence(judged: Judgement, accepted: dict | Missing | None, parts: Sequence[Move], seen: tuple[int, int]) -> dict[str, str]:
+def _change_sentence(
+    judged: Judgement, accepted: dict | Missing | None, parts: Sequence[Move], seen: tuple[int, int]
+) -> dict[str, str]:
     """Answer 3: the figures of the temperature loop that moved, and how many of the other loops'."""
     if isinstance(accepted, Missing):
         return {"strong": "The accepted run cannot be read.", "text": accepted.sentence()}
     if judged.changed is None:
-        return {"strong": "First run: nothing to compare with.", "text": "./run beadline accept marks this one as good."}
+        return {
+            "strong": "First run: nothing to compare with.",
+            "text": "./run beadline accept marks this one as good.",
+        }
     found = [move for move in judged.moved["data_driven"] if move.moved]
     others = sum(move.moved for move in parts), seen[0]
-    elsewhere = f"Deposition: {others[0]} of {len(parts)} moved. Setpoint: {others[1]} of {seen[1]}." if parts or seen[1] else ""
+    elsewhere = (
+        f"Deposition: {others[0]} of {len(parts)} moved. Setpoint: {others[1]} of {seen[1]}."
+        if parts or seen[1]
+        else ""
+    )
     if not found:
         unchanged = judged.changed.empty and all(
             move.word in ("unchanged", "not measured", "failed") for move in judged.moved["data_driven"]
@@ -187,7 +233,10 @@ def _change_sentence(judged: Judgement, accepted: dict | Missing | None, parts: 
             "strong": f"No figure {loop}moved beyond its noise.",
             "text": f"{_inputs(judged.changed)} {elsewhere if any(others) else ''}".strip(),
         }
-    groups = [(word, [BRIEF[move.question.key] for move in found if move.word == word]) for word in ("worse", "better")]
+    groups = [
+        (word, [BRIEF[move.question.key] for move in found if move.word == word])
+        for word in ("worse", "better")
+    ]
     said = "; ".join(f"{word}: {', '.join(names)}" for word, names in groups if names)
     return {
         "strong": f"{len(found)} of {len(judged.asked)} figures moved beyond their noise.",
@@ -231,7 +280,8 @@ def hashes(sources: Sources) -> list[tuple[str, str]]:
 
 
 def difference_parts(sources: Sources, judged: Judgement) -> dict[str, Any]:
-    """What changed, and the figures that moved: of both controllers of the temperature loop, and of the composer in use of the deposition loop."""
+    """What changed, and the figures that moved: of both controllers of the temperature loop, and of the
+    composer in use of the deposition loop."""
     accepted, changed = sources.accepted, judged.changed
     parts = _deposition_moves(sources)
     if isinstance(accepted, Missing) or changed is None:
@@ -244,7 +294,10 @@ def difference_parts(sources: Sources, judged: Judgement) -> dict[str, Any]:
             "empty": False,
         }
     moved = []
-    for role, found in (*((role, judged.moved[role]) for role in ("data_driven", "model_based")), ("deposition", parts)):
+    for role, found in (
+        *((role, judged.moved[role]) for role in ("data_driven", "model_based")),
+        ("deposition", parts),
+    ):
         for move in found:
             if move.moved:
                 places = row_places(move.question, [move.before, move.now])
@@ -256,9 +309,15 @@ def difference_parts(sources: Sources, judged: Judgement) -> dict[str, Any]:
                         "name": "composer in use" if role == "deposition" else NAMES[role],
                         "word": move.word,
                         "worse": move.word == "worse" and state(move.question, move.now) != PASSED,
-                        "before": quantity(move.before.value, move.question.unit, places, beyond=move.question.beyond),
-                        "now": quantity(move.now.value, move.question.unit, places, beyond=move.question.beyond),
-                        "svg": charts.before_and_now(move.question, page.MARKS.get(role, "dd"), move.before, move.now, limit),
+                        "before": quantity(
+                            move.before.value, move.question.unit, places, beyond=move.question.beyond
+                        ),
+                        "now": quantity(
+                            move.now.value, move.question.unit, places, beyond=move.question.beyond
+                        ),
+                        "svg": charts.before_and_now(
+                            move.question, page.MARKS.get(role, "dd"), move.before, move.now, limit
+                        ),
                     }
                 )
     rest: dict[str, list[str]] = {}
@@ -270,7 +329,11 @@ def difference_parts(sources: Sources, judged: Judgement) -> dict[str, Any]:
         "accepted": changed.accepted,
         "missing": None,
         "moved": moved,
-        "rest": [*still, "Not measured in either run: drift." if sources.nightly is None else "", deposition_change.said(parts)],
+        "rest": [
+            *still,
+            "Not measured in either run: drift." if sources.nightly is None else "",
+            deposition_change.said(parts),
+        ],
         "changed": changed,
         "empty": changed.empty and not moved,
     }

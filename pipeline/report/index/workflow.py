@@ -1,4 +1,5 @@
-"""The stages and what each reads of the others, drawn with what is the same as in the accepted run, and what was made anew."""
+"""The stages and what each reads of the others, drawn with what is the same
+as in the accepted run, and what was made anew."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -33,23 +34,37 @@ WIDE, TALL, ACROSS, DOWN = 170, 40, 46, 18
 def figure(sources: Sources) -> dict[str, Any]:
     """Finding, picture, and what both are from."""
     states = {stage: state(sources, stage) for stage in READS}
-    groups = [(word, [stage for stage, found in states.items() if found == word]) for word in (CHANGED, GONE, SAME, FIRST)]
+    groups = [
+        (word, [stage for stage, found in states.items() if found == word])
+        for word in (CHANGED, GONE, SAME, FIRST)
+    ]
     said = "; ".join(f"{word}: {', '.join(names)}" for word, names in groups if names)
     alt = f"{len(states)} stages. {said[:1].upper()}{said[1:]}"
-    return {"finding": _finding(states), "picture": _drawn(states, alt), "origin": page.origin(sources.source("accepted", *READS))}
+    return {
+        "finding": _finding(states),
+        "picture": _drawn(states, alt),
+        "origin": page.origin(sources.source("accepted", *READS)),
+    }
 
 
 def state(sources: Sources, stage: str) -> str:
-    """As accepted: figures and all artifacts that the pages read are the same to the byte, whether they were reused or made again."""
-    if isinstance(sources.metrics.get(stage), Missing) or any(path.startswith(f"datasets/{stage}/") for path in sources.absent):
+    """As accepted: figures and all artifacts that the pages read are the same to
+    the byte, whether they were reused or made again."""
+    if isinstance(sources.metrics.get(stage), Missing) or any(
+        path.startswith(f"datasets/{stage}/") for path in sources.absent
+    ):
         return GONE
     before = sources.accepted
     if before is None or isinstance(before, Missing):
         return FIRST
-    mine = {path: source.sha256 for path, source in sources.read.items() if path.startswith(f"datasets/{stage}/")}
+    mine = {
+        path: source.sha256 for path, source in sources.read.items() if path.startswith(f"datasets/{stage}/")
+    }
     hashes = before.get("hashes") or {}
     equal = all(hashes.get(path) == value for path, value in mine.items())
-    return SAME if equal and (before.get("metrics") or {}).get(stage) == sources.metrics.get(stage) else CHANGED
+    return (
+        SAME if equal and (before.get("metrics") or {}).get(stage) == sources.metrics.get(stage) else CHANGED
+    )
 
 
 def _finding(states: Mapping[str, str]) -> str:
@@ -59,7 +74,8 @@ def _finding(states: Mapping[str, str]) -> str:
         return "No run was accepted yet: nothing says what is new."
     if not names:
         return f"The results of {same} of {len(states)} stages are those of the accepted run, to the byte."
-    # what was made anew although nothing that it reads was: there the cause is in its own inputs, parameters or code
+    # what was made anew although nothing that it reads was: there the
+    # cause is in its own inputs, parameters or code
     first = [stage for stage in names if not any(states[read] == CHANGED for read in READS[stage])]
     return f"{count(same, 'stage').capitalize()} of {len(states)} gave what they gave in the accepted run, to the byte. New results begin at {', '.join(first)}."
 
@@ -73,11 +89,15 @@ def reduced(reads: Mapping[str, tuple[str, ...]]) -> dict[str, list[str]]:
     def all_of(stage: str) -> set[str]:
         return set(reads[stage]).union(*(all_of(read) for read in reads[stage]))
 
-    return {stage: [read for read in reads[stage] if not any(read in all_of(other) for other in reads[stage])] for stage in reads}
+    return {
+        stage: [read for read in reads[stage] if not any(read in all_of(other) for other in reads[stage])]
+        for stage in reads
+    }
 
 
 def places(reads: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[int, int]]:
-    """(column, lane): one column right of the last stage that it reads; in the lane of the first, or in the next one that is free."""
+    """(column, lane): one column right of the last stage that it reads; in the
+    lane of the first, or in the next one that is free."""
     found: dict[str, tuple[int, int]] = {}
     for stage, sources in reads.items():
         column = max((found[read][0] + 1 for read in sources), default=0)
@@ -98,7 +118,8 @@ def _drawn(states: Mapping[str, str], alt: str) -> Markup:
         # straight on in its own lane, then across to the other's
         Markup('<path class="arrow" d="M{} {}H{}C{} {} {} {} {} {}"/>').format(
             left[read] + WIDE, top[read] + TALL // 2, left[stage] - ACROSS,
-            left[stage] - ACROSS // 2, top[read] + TALL // 2, left[stage] - ACROSS // 2, top[stage] + TALL // 2,
+            left[stage] - ACROSS // 2, top[read] + TALL // 2, left[stage] - ACROSS // 2,
+            top[stage] + TALL // 2,
             left[stage], top[stage] + TALL // 2,
         )
         for stage, sources in reduced(READS).items()
@@ -106,7 +127,8 @@ def _drawn(states: Mapping[str, str], alt: str) -> Markup:
     ]  # fmt: skip
     boxes = [
         Markup(
-            '<g class="{}"><rect x="{}" y="{}" width="{}" height="{}" rx="2"/><text x="{}" y="{}">{}</text><text x="{}" y="{}">{}</text></g>'
+            '<g class="{}"><rect x="{}" y="{}" width="{}" height="{}" rx="2"/><text x="{}" '
+            'y="{}">{}</text><text x="{}" y="{}">{}</text></g>'
         ).format(
             CSS[word],
             left[stage],

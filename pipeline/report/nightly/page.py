@@ -1,4 +1,5 @@
-"""reports/nightly.html: what the job decided and why, what has drifted, what was in production when, and whether anybody is watching."""
+"""reports/nightly.html: what the job decided and why, what has drifted, what was in
+production when, and whether anybody is watching."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -15,8 +16,11 @@ SHOWN = 40  # nights in the table, the newest first
 REACH = 20.0  # percent: half the width of the picture of the plant's parameters
 GUARDS = {
     "worst_case": "worst plant's cost", "settled_error_degC": "worst settled error, °C",
-    "margin_short_of_least": "disk margin, short of the least", "holdout_error_degC": "one-step error on hold-out recordings, °C", "unstable_plants": "plants on which it is unstable",
-    "worst_line_volume_percent": "worst line's volume, % off", "worst_unsettled_percent": "runs not settled in the worst case, %, plus one",
+    "margin_short_of_least": "disk margin, short of the least",
+    "holdout_error_degC": "one-step error on hold-out recordings, °C",
+    "unstable_plants": "plants on which it is unstable",
+    "worst_line_volume_percent": "worst line's volume, % off",
+    "worst_unsettled_percent": "runs not settled in the worst case, %, plus one",
     "slowest_p90_steps": "decisions until settled, slowest case",
 }  # fmt: skip
 
@@ -28,16 +32,22 @@ LOOP = {
 
 
 def render(nights: Sequence[Mapping[str, Any]], state: Mapping[str, Any], settings: Nightly) -> str:
-    """The whole page; `nights` as the job remembers them, the oldest first, the last of them tonight's; `state` is champion.json."""
+    """The whole page; `nights` as the job remembers them, the oldest first, the
+    last of them tonight's; `state` is champion.json."""
     tonight = nights[-1]
     seen = next((night for night in reversed(nights) if night.get("drift", {}).get("figures")), None)
     good = [night for night in nights if night["outcome"] != "failed"]
     return page.render(
-        "nightly.html", here="nightly", title=_head(tonight)[0], verdict=_verdict(tonight, state), champions=_champions(state), decisions=_decisions(tonight),
-        drift=_drift(seen, settings) if seen else None, alarms=tonight.get("drift", {}).get("alarms", []), watched=tonight.get("drift", {}).get("watched", []),
-        pictures=_pictures(nights, settings), nights=[_row(night) for night in reversed(nights[-SHOWN:])], more=max(len(nights) - SHOWN, 0),
-        history=[_line(line) for line in reversed(state["history"])], quarantined=tonight.get("quarantined", {}), notes=tonight.get("notes", []),
-        watch={"last": _when(good[-1]["when"]) if good else "never", "run": good[-1]["run"] if good else "", "hours": f"{settings.watch_h:g}",
+        "nightly.html", here="nightly", title=_head(tonight)[0], verdict=_verdict(tonight, state),
+        champions=_champions(state), decisions=_decisions(tonight),
+        drift=_drift(seen, settings) if seen else None, alarms=tonight.get("drift", {}).get("alarms", []),
+        watched=tonight.get("drift", {}).get("watched", []),
+        pictures=_pictures(nights, settings), nights=[_row(night) for night in reversed(nights[-SHOWN:])],
+        more=max(len(nights) - SHOWN, 0),
+        history=[_line(line) for line in reversed(state["history"])],
+        quarantined=tonight.get("quarantined", {}), notes=tonight.get("notes", []),
+        watch={"last": _when(good[-1]["when"]) if good else "never", "run": good[-1]["run"] if good else "",
+        "hours": f"{settings.watch_h:g}",
                "alarm": settings.alarm or "none is set", "webhook": settings.webhook or "none is set"},
         rule=_rule(settings), state=PASSED if _head(tonight)[1] == PASSED else FAILED,
     )  # fmt: skip
@@ -72,12 +82,11 @@ def _verdict(night: Mapping[str, Any], state: Mapping[str, Any]) -> dict[str, An
         "promoted": "To go back: ./run beadline rollback.",
     }.get(night["outcome"], "")
     if night.get("quarantined"):
-        remedy = (
-            f"{remedy} They lie in datasets/quarantine, unchanged, each with its reason beside it; mend them and put them back.".strip()
-        )
+        remedy = f"{remedy} They lie in datasets/quarantine, unchanged, each with its reason beside it; mend them and put them back.".strip()
     if alarms and night["outcome"] != "failed":
         remedy = (
-            "No challenger of this loop is promoted while this lasts. Look at the machine; where the change is meant to stay: "
+            "No challenger of this loop is promoted while this lasts. Look at the machine; "
+            "where the change is meant to stay: "
             f'./run beadline nightly --accept-drift {alarms[0]["loop"]} "WHY".'
         )
     return {
@@ -94,7 +103,9 @@ def _together(night: Mapping[str, Any]) -> list[str]:
     loops: dict[str, list[str]] = {}
     for name, decision in night.get("decisions", {}).items():
         loops.setdefault("; ".join(decision["reasons"]), []).append(name)
-    return [f"{', '.join(names)}: {reason}" for reason, names in loops.items()] or list(night.get("reasons", []))
+    return [f"{', '.join(names)}: {reason}" for reason, names in loops.items()] or list(
+        night.get("reasons", [])
+    )
 
 
 def _champions(state: Mapping[str, Any]) -> list[dict[str, str]]:
@@ -114,7 +125,8 @@ def _decisions(night: Mapping[str, Any]) -> list[dict[str, Any]]:
     found = []
     for name, decision in night.get("decisions", {}).items():
         guards = [
-            {"name": GUARDS.get(guard, guard), "champion": _figure(figures.get("champion")), "challenger": _figure(figures.get("challenger")), "allowed": _figure(figures.get("allowed")),
+            {"name": GUARDS.get(guard, guard), "champion": _figure(figures.get("champion")),
+            "challenger": _figure(figures.get("challenger")), "allowed": _figure(figures.get("allowed")),
              "bad": figures.get("champion") is not None and figures["challenger"] > figures["champion"] + figures["allowed"] + 1e-9 * abs(figures["champion"])}
             for guard, figures in decision.get("guards", {}).items()
         ]  # fmt: skip
@@ -137,8 +149,10 @@ def _paired(found: Mapping[str, float] | None) -> str:
     low, high = number(found["low_percent"], 1), number(found["high_percent"], 1)
     word = "less" if found["improvement_percent"] >= 0 else "more"
     return (
-        f"The challenger's cases cost {number(abs(found['improvement_percent']), 1)} % {word} (90 % interval of the saving {low} to {high} %); chance alone does as well with "
-        f"probability {short(found['p'], 2)}, by a sign-flip test over {count(found['blocks'], 'block')} of {count(found['cases'], 'case')}."
+        f"The challenger's cases cost {number(abs(found['improvement_percent']), 1)} % {word} (90 % interval "
+        f"of the saving {low} to {high} %); chance alone does as well with "
+        f"probability {short(found['p'], 2)}, by a sign-flip test over {count(found['blocks'], 'block')} of "
+        f"{count(found['cases'], 'case')}."
     )
 
 
@@ -158,20 +172,26 @@ def _drift(night: Mapping[str, Any], settings: Nightly) -> dict[str, Any]:
     path, figures = list(night["drift"]["figures"].items())[-1]
     limit = settings.drift.parameter_percent
     rows = [
-        {"name": name, "value": f"{number(one['percent'], 1)} %", "band": f"± {number(one['band_percent'], 1)}", "sigmas": number(one["sigmas"], 1),
-         "svg": _interval(name, one["percent"], one["band_percent"], limit), "bad": abs(one["percent"]) >= limit and abs(one["sigmas"]) >= settings.drift.watch_sigmas}
+        {"name": name, "value": f"{number(one['percent'], 1)} %",
+        "band": f"± {number(one['band_percent'], 1)}", "sigmas": number(one["sigmas"], 1),
+         "svg": _interval(name, one["percent"], one["band_percent"], limit),
+         "bad": abs(one["percent"]) >= limit and abs(one["sigmas"]) >= settings.drift.watch_sigmas}
         for name, one in figures["parameters"].items()
     ]  # fmt: skip
     innovation = [
-        {"name": name, "noise": f"{number(one['noise_percent'], 0)} %", "noise_sigmas": number(one["noise_sigmas"], 1), "mean": f"{short(one['mean_degC'], 2)} °C",
+        {"name": name, "noise": f"{number(one['noise_percent'], 0)} %",
+        "noise_sigmas": number(one["noise_sigmas"], 1), "mean": f"{short(one['mean_degC'], 2)} °C",
          "mean_sigmas": number(one["mean_sigmas"], 1)}
         for name, one in figures["innovation"].items()
     ]  # fmt: skip
     loop = figures["closed_loop"]
     told = loop.get("not_applicable") or ""
-    worst = sorted(((abs(one["sigmas"]), name, one) for name, one in loop.items() if isinstance(one, dict)), reverse=True)[:6]
+    worst = sorted(
+        ((abs(one["sigmas"]), name, one) for name, one in loop.items() if isinstance(one, dict)), reverse=True
+    )[:6]
     return {"recording": path, "run": night["run"], "rows": rows, "innovation": innovation, "limit": f"{limit:g}", "loop_told": told,
-            "loop": [{"name": _words(name), "moved": number(one["moved"], 2), "sigmas": number(one["sigmas"], 1)} for _, name, one in worst]}  # fmt: skip
+            "loop": [{"name": _words(name), "moved": number(one["moved"], 2),
+            "sigmas": number(one["sigmas"], 1)} for _, name, one in worst]}  # fmt: skip
 
 
 def _words(name: str) -> str:
@@ -182,12 +202,18 @@ def _words(name: str) -> str:
 
 def _interval(name: str, value: float, half: float, limit: float) -> Markup:
     """The change of a parameter with its 90 % band, from -REACH to REACH; grey is where nothing is wrong."""
-    at = [160 + 160 * max(-1.0, min(1.0, part / REACH)) for part in (value - half, value, value + half, -limit, limit)]
+    at = [
+        160 + 160 * max(-1.0, min(1.0, part / REACH))
+        for part in (value - half, value, value + half, -limit, limit)
+    ]
     bad = " bad" if abs(value) - half > limit else ""
     return Markup(
-        '<svg viewBox="0 0 320 20" width="320" height="20" role="img" aria-label="{}: {} percent, band {} to {}, allowed {} either way">'
-        '<rect class="beyond" x="{:.1f}" width="{:.1f}" y="0" height="20"/><line class="limit" x1="160" x2="160" y1="0" y2="20"/>'
-        '<line class="mb{}" x1="{:.1f}" x2="{:.1f}" y1="10" y2="10"/><rect class="mb{}" x="{:.1f}" y="6.5" width="7" height="7"/></svg>'
+        '<svg viewBox="0 0 320 20" width="320" height="20" role="img" aria-label="{}: {} percent, '
+        'band {} to {}, allowed {} either way">'
+        '<rect class="beyond" x="{:.1f}" width="{:.1f}" y="0" height="20"/><line class="limit" x1="160" '
+        'x2="160" y1="0" y2="20"/>'
+        '<line class="mb{}" x1="{:.1f}" x2="{:.1f}" y1="10" y2="10"/><rect class="mb{}" x="{:.1f}" y="6.5" '
+        'width="7" height="7"/></svg>'
     ).format(
         name,
         number(value, 1),
@@ -216,7 +242,11 @@ def _pictures(nights: Sequence[Mapping[str, Any]], settings: Nightly) -> list[di
         figures = night.get("drift", {}).get("figures", {})
         if figures:
             x.append(night["night"])
-            y.append(max(abs(one["sigmas"]) for figure in figures.values() for one in figure["parameters"].values()))
+            y.append(
+                max(
+                    abs(one["sigmas"]) for figure in figures.values() for one in figure["parameters"].values()
+                )
+            )
     if len(x) < 2:
         return []
     top = max(*y, settings.drift.alarm_sigmas) * 1.15
@@ -250,8 +280,10 @@ def _row(night: Mapping[str, Any]) -> dict[str, Any]:
     )
     told = "; ".join([*_together(night), *night.get("quarantined", {}).values()])
     return {
-        "run": night["run"], "when": _when(night["when"]), "state": state, "outcome": night["outcome"], "new": sum(map(len, night.get("new_recordings", {}).values())),
-        "reasons": "; ".join([*(alarm for alarm in alarms if alarm not in told), told]), "seconds": number(night.get("seconds", 0), 0),
+        "run": night["run"], "when": _when(night["when"]), "state": state, "outcome": night["outcome"],
+        "new": sum(map(len, night.get("new_recordings", {}).values())),
+        "reasons": "; ".join([*(alarm for alarm in alarms if alarm not in told), told]),
+        "seconds": number(night.get("seconds", 0), 0),
     }  # fmt: skip
 
 

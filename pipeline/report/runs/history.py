@@ -1,4 +1,5 @@
-"""Revisions of reports/metrics in git -> the figures of the pages, run by run; read by one `git cat-file --batch`."""
+"""Revisions of reports/metrics in git -> the figures of the pages, run
+by run; read by one `git cat-file --batch`."""
 
 import json
 import math
@@ -22,8 +23,8 @@ class Figure(NamedTuple):
 
 
 class Run(NamedTuple):
-    """One revision: commit (empty for files that are not committed), its date and subject, the verdict's sentence, and
-    {controller: {key: figure}}.
+    """One revision: commit (empty for files that are not committed), its date and subject, the verdict's
+    sentence, and {controller: {key: figure}}.
     """
 
     commit: str
@@ -34,13 +35,18 @@ class Run(NamedTuple):
 
 
 def runs(most: int) -> Iterator[Run]:
-    """The last `most` revisions that touched the metrics, oldest first, then the files as they are where they differ. Raises ValueError where
-    there is no git, or no revision.
+    """The last `most` revisions that touched the metrics, oldest first, then the files as they are where they
+    differ. Raises ValueError where there is no git, or no revision.
     """
-    log = _git("log", f"--max-count={most}", f"--format={FORMAT}", "--", "reports/metrics").decode(errors="replace")
+    log = _git("log", f"--max-count={most}", f"--format={FORMAT}", "--", "reports/metrics").decode(
+        errors="replace"
+    )
     revisions = [line.split("\0", 2) for line in log.splitlines() if line][::-1]
     if not revisions:
-        raise ValueError("reports/metrics: git has no revision of it; commit the figures of a run first (git add reports/metrics)")
+        raise ValueError(
+            "reports/metrics: git has no revision of it; commit the figures of a run first (git "
+            "add reports/metrics)"
+        )
     wanted = [f"{commit}:reports/metrics/{name}.json" for commit, *_ in revisions for name in FILES]
     found = _contents(wanted)
     last: Run | None = None
@@ -54,12 +60,16 @@ def runs(most: int) -> Iterator[Run]:
 
 def _git(*arguments: str, given: str = "") -> bytes:
     try:
-        return subprocess.run(["git", *arguments], input=given.encode(), capture_output=True, check=True).stdout
+        return subprocess.run(
+            ["git", *arguments], input=given.encode(), capture_output=True, check=True
+        ).stdout
     except FileNotFoundError:
         raise ValueError("git is not installed; install it to see the history") from None
     except subprocess.CalledProcessError as error:
         said = " ".join(error.stderr.decode(errors="replace").split())
-        raise ValueError(f"the history cannot be read ({said}); run this inside the git checkout of the project") from None
+        raise ValueError(
+            f"the history cannot be read ({said}); run this inside the git checkout of the project"
+        ) from None
 
 
 def _contents(names: Iterable[str]) -> Iterator[dict]:
@@ -95,7 +105,9 @@ def _now(name: str) -> dict:
 
 def _run(commit: str, date: str, subject: str, files: Mapping[str, dict]) -> Run:
     report = files["report"]
-    figures = {name: _figures(found) for name, found in _dict(report, "figures").items()} or _judged(files["evaluate_temperature"])
+    figures = {name: _figures(found) for name, found in _dict(report, "figures").items()} or _judged(
+        files["evaluate_temperature"]
+    )
     figures["deposition"] = _deposition(files["compose_parts"], files["train_ilc"])
     return Run(commit, date, subject, str(_dict(report, "verdict").get("decision", "")), figures)
 
@@ -106,7 +118,11 @@ def _dict(data: Any, key: str) -> dict:
 
 
 def _figures(found: Any) -> dict[str, Figure]:
-    return {key: figure for key, ends in (found.items() if isinstance(found, dict) else ()) if (figure := _figure(ends))}
+    return {
+        key: figure
+        for key, ends in (found.items() if isinstance(found, dict) else ())
+        if (figure := _figure(ends))
+    }
 
 
 def _figure(ends: Any) -> Figure | None:
@@ -129,10 +145,22 @@ def _judged(metrics: dict) -> dict[str, dict[str, Figure]]:
 
 
 def _deposition(parts: dict, laws: dict) -> dict[str, Figure]:
-    """Worst flow error and worst line of the composers in use, and what is left of trial 0's error after learning, each the worst material, in %."""
-    streams = [stream for part in parts.values() if isinstance(part, dict) for stream in part.values() if isinstance(stream, dict)]
+    """Worst flow error and worst line of the composers in use, and what is left of trial 0's error after
+    learning, each the worst material, in %."""
+    streams = [
+        stream
+        for part in parts.values()
+        if isinstance(part, dict)
+        for stream in part.values()
+        if isinstance(stream, dict)
+    ]
     used = [_dict(stream, str(stream.get("chosen"))) for stream in streams]
-    learned = [_dict(one, law).get("best_ratio") for one in laws.values() for law in ("pixels", "ours") if _dict(one, law)]
+    learned = [
+        _dict(one, law).get("best_ratio")
+        for one in laws.values()
+        for law in ("pixels", "ours")
+        if _dict(one, law)
+    ]
     values = {
         "flow_error_percent": [one.get("rms_percent_of_on_off") for one in used],
         "line_volume_percent": [one.get("worst_line_volume_percent") for one in used],

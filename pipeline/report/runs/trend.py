@@ -12,8 +12,13 @@ from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import count, decimals, quantity, short
 from pipeline.report.shared.verdict import Question, ReportRules, questions
 
-# controller of the artifacts -> class of its line and its name; the deposition loop has the composer in use alone
-SHOWN = {"window": ("dd", "data-driven"), "model_based": ("mb", "model-based"), "baseline": ("bl", "baseline")}
+# controller of the artifacts -> class of its line and its name; the
+# deposition loop has the composer in use alone
+SHOWN = {
+    "window": ("dd", "data-driven"),
+    "model_based": ("mb", "model-based"),
+    "baseline": ("bl", "baseline"),
+}
 # runs that stand in the table; the pictures show all
 ROWS = 200
 
@@ -24,11 +29,15 @@ class Panel(NamedTuple):
     picture: Markup
 
 
-def render(found: Sequence[Run], rules: ReportRules, *, band_degC: float, pages: Sequence[tuple[str, str]]) -> str:
+def render(
+    found: Sequence[Run], rules: ReportRules, *, band_degC: float, pages: Sequence[tuple[str, str]]
+) -> str:
     """The text of history.html; `pages` (name, file) are those that lie beside it."""
     asked = questions(rules, band_degC=band_degC)
     parts = [
-        Question(0, "flow_error_percent", "Worst flow error of a part", "%", rules.flow_error_percent, False, ""),
+        Question(
+            0, "flow_error_percent", "Worst flow error of a part", "%", rules.flow_error_percent, False, ""
+        ),
         Question(0, "line_volume_percent", "Worst line’s volume", "%", rules.line_volume_percent, False, ""),
         Question(0, "learned_percent", "Left after learning", "%", rules.learned_percent, False, ""),
     ]
@@ -42,7 +51,10 @@ def render(found: Sequence[Run], rules: ReportRules, *, band_degC: float, pages:
         pages=pages,
         loops=[
             ("Temperature", [_panel(question, found, SHOWN) for question in asked]),
-            ("Deposition", [_panel(question, found, {"deposition": ("dd", "composer in use")}) for question in parts]),
+            (
+                "Deposition",
+                [_panel(question, found, {"deposition": ("dd", "composer in use")}) for question in parts],
+            ),
         ],
         heads=[question.title for question in (*asked, *parts)],
         rows=[_row(run, (*asked, *parts)) for run in reversed(found[-ROWS:])],
@@ -55,7 +67,8 @@ def _figure(run: Run, name: str, key: str) -> Figure | None:
 
 
 def _panel(question: Question, found: Sequence[Run], lines: dict[str, tuple[str, str]]) -> Panel:
-    """Medians by run with the first controller's band; the limit of today; a run without the figure leaves a gap."""
+    """Medians by run with the first controller's band; the limit of
+    today; a run without the figure leaves a gap."""
     ends = {name: np.array([_ends(_figure(run, name, question.key)) for run in found]) for name in lines}
     values = np.concatenate([part[np.isfinite(part)] for part in ends.values()] + [[question.limit]])
     frame = charts.Frame(_runs(len(found)), _scale(values), 368, 150, 40)
@@ -66,15 +79,27 @@ def _panel(question: Question, found: Sequence[Run], lines: dict[str, tuple[str,
         middle, low, high = ends[name].T
         if i == 0:
             known = charts.stretches(np.isfinite(low + high))
-            layers += [charts.ribbon(frame, at[a:b], low[a:b], high[a:b], f"ribbon {css}") for a, b in known if b - a > 1]
-        layers += [charts.line(frame, at, middle, f"line {css}"), charts.dots(frame, at, middle, f"dot {css}", 2.2)]
+            layers += [
+                charts.ribbon(frame, at[a:b], low[a:b], high[a:b], f"ribbon {css}")
+                for a, b in known
+                if b - a > 1
+            ]
+        layers += [
+            charts.line(frame, at, middle, f"line {css}"),
+            charts.dots(frame, at, middle, f"dot {css}", 2.2),
+        ]
         known = middle[np.isfinite(middle)]
         if len(known):
             said.append(f"{word} from {_said(question, known[0])} to {_said(question, known[-1])}")
     alt = f"{question.title} over {count(len(found), 'run')}: {'; '.join(said) or 'not measured'}; limit {_said(question, question.limit)}"
     unit = question.unit or "1"
     picture = charts.panel(
-        frame, layers, alt=alt, css="mb wide", title=f"{unit}{', log' if frame.y.log else ''}", units=("", question.unit)
+        frame,
+        layers,
+        alt=alt,
+        css="mb wide",
+        title=f"{unit}{', log' if frame.y.log else ''}",
+        units=("", question.unit),
     )
     now = _figure(found[-1], next(iter(lines)), question.key)
     return Panel(question.title, f"now {_said(question, now.value) if now else 'not measured'}", picture)
@@ -110,7 +135,9 @@ def _row(run: Run, asked: Sequence[Question]) -> dict[str, Any]:
             continue
         beyond = figure.value < question.limit if question.at_least else figure.value > question.limit
         text = f"{short(figure.value, 3)}" if math.isfinite(figure.value) else question.beyond
-        cells.append({"text": text, "number": figure.value if math.isfinite(figure.value) else "", "bad": beyond})
+        cells.append(
+            {"text": text, "number": figure.value if math.isfinite(figure.value) else "", "bad": beyond}
+        )
     return {
         "commit": run.commit[:8],
         "date": run.date[:10],

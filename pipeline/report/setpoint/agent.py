@@ -1,4 +1,5 @@
-"""How controllers of setpoints fare, drawn: ways from the 21 starts over the reward, their flow step by step, training of the agents, settled runs against the classifier's accuracy."""
+"""How controllers of setpoints fare, drawn: ways from the 21 starts over the reward, their flow step by step,
+training of the agents, settled runs against the classifier's accuracy."""
 
 import math
 import re
@@ -13,7 +14,15 @@ from pipeline.report.shared.digits import THIN, number, percent
 from pipeline.report.shared.pictures import Column, Picture, hole
 from pipeline.report.shared.sources import Sources, Table, lookup
 from pipeline.report.shared.verdict import Figure, Missing
-from pipeline.setpoint.workflow.tables import BEST_FLOW, BEST_TEMPERATURE, FLOW_BAND, PHASES, ROTATION, SETTLED_BY, TEMPERATURE_BAND
+from pipeline.setpoint.workflow.tables import (
+    BEST_FLOW,
+    BEST_TEMPERATURE,
+    FLOW_BAND,
+    PHASES,
+    ROTATION,
+    SETTLED_BY,
+    TEMPERATURE_BAND,
+)
 
 # rewards whose lines are drawn, of the last phase
 LEVELS = (0.5, 0.0, -0.5, -0.8)
@@ -35,22 +44,43 @@ TAUGHT = {
 
 
 def shown(board: Board, table: Table, case: Case) -> list[str]:
-    """The default first, then the paper's agent, then the best of the other side, as far as their ways were kept."""
-    kept = {str(name) for name in table["controller"][(table["simulator"] == case[0]) & (table["case"] == case[1])]}
-    other = board.best(BASELINE) if board.default and board.kinds[board.default] != BASELINE else board.best(AGENT)
-    return [name for name in dict.fromkeys((board.default or board.names[0], board.best(PAPER), other)) if name in kept]
+    """The default first, then the paper's agent, then the best of the
+    other side, as far as their ways were kept."""
+    kept = {
+        str(name)
+        for name in table["controller"][(table["simulator"] == case[0]) & (table["case"] == case[1])]
+    }
+    other = (
+        board.best(BASELINE)
+        if board.default and board.kinds[board.default] != BASELINE
+        else board.best(AGENT)
+    )
+    return [
+        name
+        for name in dict.fromkeys((board.default or board.names[0], board.best(PAPER), other))
+        if name in kept
+    ]
 
 
 def ways(sources: Sources, board: Board | Missing) -> list[Picture]:
-    """For each simulator whose ways were kept, everybody's ways over the reward and their flow step by step."""
+    """For each simulator whose ways were kept, everybody's ways over
+    the reward and their flow step by step."""
     table, title = sources.tables["paths"], "From 21 starts to the best setpoint"
     for found in (board, table):
         if isinstance(found, Missing):
             return [hole("ways", title, found)]
     there = list(dict.fromkeys(zip(map(str, table["simulator"]), map(str, table["case"]), strict=True)))
-    cases = [case for case in (*CASES, *(one for one in there if one[0] == "pixels")) if case in there][:3] or there[:1]
+    cases = [case for case in (*CASES, *(one for one in there if one[0] == "pixels")) if case in there][
+        :3
+    ] or there[:1]
     if not cases:
-        return [hole("ways", title, Missing("not measured", "no way was kept", "Run ./run dvc repro evaluate_setpoint"))]
+        return [
+            hole(
+                "ways",
+                title,
+                Missing("not measured", "no way was kept", "Run ./run dvc repro evaluate_setpoint"),
+            )
+        ]
     return [_ways(sources, board, table, case, i) for i, case in enumerate(cases)]
 
 
@@ -65,15 +95,19 @@ def _ways(sources: Sources, board: Board, table: Table, case: Case, i: int) -> P
         said.append(f"{name} {ends} of {len(flow)}")
         first = not columns
         panels = [_surface(name, flow, temperature, ends, css, first), _steps(name, flow, inside, css, first)]
-        columns.append(Column(name, "runs by default" if name == board.default else _kind(board, name), mark, panels))
+        columns.append(
+            Column(name, "runs by default" if name == board.default else _kind(board, name), mark, panels)
+        )
     where = case_text(case, whole=True)
     return Picture(
         f"ways-{i}",
         f"{where}: from 21 starts to the best setpoint",
         f"Inside by decision {SETTLED_BY} and to the end: {'; '.join(said)}.",
         columns,
-        f"One run from each start. Above: temperature against true flow, over the paper’s reward with a, b = {PHASES[-1][0]:g}, {PHASES[-1][1]:g}; lines of equal reward "
-        f"{', '.join(number(level, 1) for level in LEVELS)} outwards. Ring: start; filled: end, vermillion outside. Grey: {BEST_FLOW - FLOW_BAND:g}–{BEST_FLOW + FLOW_BAND:g}{THIN}% and "
+        "One run from each start. Above: temperature against true flow, over the paper’s reward with a, "
+        f"b = {PHASES[-1][0]:g}, {PHASES[-1][1]:g}; lines of equal reward "
+        f"{', '.join(number(level, 1) for level in LEVELS)} outwards. Ring: start; filled: end, "
+        f"vermillion outside. Grey: {BEST_FLOW - FLOW_BAND:g}–{BEST_FLOW + FLOW_BAND:g}{THIN}% and "
         f"{BEST_TEMPERATURE:g}{THIN}±{THIN}{TEMPERATURE_BAND:g}{THIN}°C. Below: flow against decisions.",
         page.origin(sources.source("paths")),
     )
@@ -90,20 +124,24 @@ def _by_start(table: Table, mine: np.ndarray, column: str) -> list[np.ndarray]:
 
 def _inside(flow: list[np.ndarray], temperature: list[np.ndarray]) -> list[np.ndarray]:
     return [
-        (np.abs(q - BEST_FLOW) <= FLOW_BAND + 1e-3) & (np.abs(u - BEST_TEMPERATURE) <= TEMPERATURE_BAND + 1e-3)
+        (np.abs(q - BEST_FLOW) <= FLOW_BAND + 1e-3)
+        & (np.abs(u - BEST_TEMPERATURE) <= TEMPERATURE_BAND + 1e-3)
         for q, u in zip(flow, temperature, strict=True)
     ]
 
 
 def equal_reward(level: float, *, a: float, b: float) -> tuple[np.ndarray, np.ndarray]:
-    """Flow and temperature where (14)-(16) give `level`: the ellipse with semi-axes (a, b) times 2 / (1 + level) - 1, turned by theta."""
+    """Flow and temperature where (14)-(16) give `level`: the ellipse with semi-axes
+    (a, b) times 2 / (1 + level) - 1, turned by theta."""
     t, scale = np.linspace(0, 2 * math.pi, 121), 2 / (1 + level) - 1
     q_r, u_r = scale * a * np.cos(t), scale * b * np.sin(t)
     cos, sin = math.cos(ROTATION), math.sin(ROTATION)
     return BEST_FLOW + q_r * cos + u_r * sin, BEST_TEMPERATURE - q_r * sin + u_r * cos
 
 
-def _surface(name: str, flow: list[np.ndarray], temperature: list[np.ndarray], ends: int, css: str, titled: bool) -> Markup:
+def _surface(
+    name: str, flow: list[np.ndarray], temperature: list[np.ndarray], ends: int, css: str, titled: bool
+) -> Markup:
     frame = charts.Frame(FLOW, TEMPERATURE, 368, 244, 30, above=22)
     layers = [_rings(frame)]
     box = [float(v) for v in (*frame.px([BEST_FLOW - FLOW_BAND, BEST_FLOW + FLOW_BAND]), *frame.py([BEST_TEMPERATURE + TEMPERATURE_BAND, BEST_TEMPERATURE - TEMPERATURE_BAND]))]  # fmt: skip
@@ -118,7 +156,14 @@ def _surface(name: str, flow: list[np.ndarray], temperature: list[np.ndarray], e
     last = [one[-1] for one in _inside(flow, temperature)]
     layers += [charts.dots(frame, q[-1:], u[-1:], "dot whole" if ok else "dot off", 2.8) for q, u, ok in zip(flow, temperature, last, strict=True)]  # fmt: skip
     alt = f"{name}: of {len(flow)} starts {ends} end inside 90–110 % and 205–215 °C and stay there"
-    return charts.panel(frame, layers, alt=alt, css=f"{css} surface", title="°C against % of flow" if titled else "", units=("%", "°C"))
+    return charts.panel(
+        frame,
+        layers,
+        alt=alt,
+        css=f"{css} surface",
+        title="°C against % of flow" if titled else "",
+        units=("%", "°C"),
+    )
 
 
 def _rings(frame: charts.Frame) -> Markup:
@@ -127,10 +172,18 @@ def _rings(frame: charts.Frame) -> Markup:
     for level in sorted(LEVELS):
         q, u = equal_reward(level, a=PHASES[-1][0], b=PHASES[-1][1])
         # unclipped, so that an ellipse that leaves the panel keeps its shape
-        px = frame.left + (q - frame.x.low) / (frame.x.high - frame.x.low) * (frame.width - frame.left - frame.right)
-        py = frame.height - frame.below - (u - frame.y.low) / (frame.y.high - frame.y.low) * (frame.height - frame.below - frame.above)
+        px = frame.left + (q - frame.x.low) / (frame.x.high - frame.x.low) * (
+            frame.width - frame.left - frame.right
+        )
+        py = (
+            frame.height
+            - frame.below
+            - (u - frame.y.low) / (frame.y.high - frame.y.low) * (frame.height - frame.below - frame.above)
+        )
         paths.append(
-            Markup('<path class="iso" d="M{}Z"/>').format("L".join(f"{x:.1f} {y:.1f}" for x, y in zip(px[:-1], py[:-1], strict=True)))
+            Markup('<path class="iso" d="M{}Z"/>').format(
+                "L".join(f"{x:.1f} {y:.1f}" for x, y in zip(px[:-1], py[:-1], strict=True))
+            )
         )
     wide, high = frame.width - frame.left - frame.right, frame.height - frame.below - frame.above
     return Markup('<svg x="{0}" y="{1}" width="{2}" height="{3}" viewBox="{0} {1} {2} {3}">{4}</svg>').format(
@@ -140,7 +193,9 @@ def _rings(frame: charts.Frame) -> Markup:
 
 def _steps(name: str, flow: list[np.ndarray], inside: list[np.ndarray], css: str, titled: bool) -> Markup:
     last = max(len(q) for q in flow) - 1
-    frame = charts.Frame(charts.linear(0, max(last, 1), ticks=5), charts.linear(0, 320, ticks=4), 368, 132, 30)
+    frame = charts.Frame(
+        charts.linear(0, max(last, 1), ticks=5), charts.linear(0, 320, ticks=4), 368, 132, 30
+    )
     since = [int(np.flatnonzero(~one)[-1]) + 1 if not one.all() else 0 for one in inside]
     done = [k for k, one in zip(since, inside, strict=True) if one[-1]]
     text = f"half of them inside after {int(np.median(done))} decisions" if done else "none inside at the end"
@@ -148,8 +203,12 @@ def _steps(name: str, flow: list[np.ndarray], inside: list[np.ndarray], css: str
     layers += [charts.line(frame, np.arange(len(q)), q, "line way") for q in flow]
     layers.append(charts.label(frame, last, 320, text, anchor="end", dy=8))
     lowest, highest = (find(float(find(q[len(q) // 2 :])) for q in flow) for find in (min, max))
-    alt = f"{name}: {text}; in the second half flows lie between {number(lowest, 0)} and {number(highest, 0)} %"
-    return charts.panel(frame, layers, alt=alt, css=css, title="% of flow" if titled else "", units=("decisions", "%"))
+    alt = (
+        f"{name}: {text}; in the second half flows lie between {number(lowest, 0)} and {number(highest, 0)} %"
+    )
+    return charts.panel(
+        frame, layers, alt=alt, css=css, title="% of flow" if titled else "", units=("decisions", "%")
+    )
 
 
 # ---- what the agents learned
@@ -170,7 +229,10 @@ def training(sources: Sources) -> Picture:
             else f"{number(ends[0], 2)}, the last of {len(ends)} at {number(ends[-1], 2)}"
         )
         word = "phase" if agent == "paper" else "round"
-        said.append(f"{_agent(agent)} ends its {f'{word}s' if len(ends) <= 6 else f'first {word}'} at a mean reward of {told}")
+        said.append(
+            f"{_agent(agent)} ends its {f'{word}s' if len(ends) <= 6 else f'first {word}'} at a "
+            f"mean reward of {told}"
+        )
         columns.append(
             Column(
                 _agent(agent),
@@ -184,8 +246,12 @@ def training(sources: Sources) -> Picture:
         title,
         f"{'. '.join(said)}.",
         columns,
-        f"Mean reward of a step, in the reward of its phase, against thousands of updates. As published: {', then '.join(f'a, b = {a:g}, {b:g}' for a, b in PHASES)}, then the last with classes that are wrong at times. "
-        "Ours learns in rounds, of which the one is kept that costs least on episodes it did not learn from; its reward is what a step costs, with a minus. Rewards of two phases, or of two agents, do not compare.",
+        "Mean reward of a step, in the reward of its phase, against thousands of updates. As published: "
+        f"{', then '.join(f'a, b = {a:g}, {b:g}' for a, b in PHASES)}, "
+        "then the last with classes that are wrong at times. "
+        "Ours learns in rounds, of which the one is kept that costs least on episodes it did not learn from; "
+        "its reward is what a step costs, with a minus. Rewards of two phases, "
+        "or of two agents, do not compare.",
         page.origin(sources.source("agents")),
     )
 
@@ -202,12 +268,25 @@ def _course(mine: Table, agent: str, word: str, told: str) -> Markup:
         x = float(frame.px(begin))
         if k > phases[0]:
             layers.append(
-                Markup('<line class="lim" x1="{0:.1f}" x2="{0:.1f}" y1="{1}" y2="{2}"/>').format(x, frame.above, frame.height - frame.below)
+                Markup('<line class="lim" x1="{0:.1f}" x2="{0:.1f}" y1="{1}" y2="{2}"/>').format(
+                    x, frame.above, frame.height - frame.below
+                )
             )
-        layers.append(charts.label(frame, begin, y.low, f"{word} {k}" if len(phases) <= 6 or k == phases[0] else str(k), dx=3, dy=-4))
+        layers.append(
+            charts.label(
+                frame,
+                begin,
+                y.low,
+                f"{word} {k}" if len(phases) <= 6 or k == phases[0] else str(k),
+                dx=3,
+                dy=-4,
+            )
+        )
         layers.append(charts.line(frame, updates[here], reward[here]))
     alt = f"{_agent(agent)}: mean reward at the end of each {word} {told}, after {number(float(mine['update'].max()), 0)} updates in all"
-    return charts.panel(frame, layers, alt=alt, css="dd wide", title="mean reward", units=("thousand updates", ""))
+    return charts.panel(
+        frame, layers, alt=alt, css="dd wide", title="mean reward", units=("thousand updates", "")
+    )
 
 
 def _agent(name: str) -> str:
@@ -215,11 +294,16 @@ def _agent(name: str) -> str:
 
 
 def by_accuracy(sources: Sources, board: Board | Missing) -> Picture:
-    """Settled runs against the share of windows that are named rightly, on the paper's simulator (figure 7, as figures)."""
+    """Settled runs against the share of windows that are named rightly,
+    on the paper's simulator (figure 7, as figures)."""
     title = "How much misnaming each bears"
     if isinstance(board, Missing):
         return hole("by-accuracy", title, board)
-    cases = sorted((float(found[1]), case) for case in board.cases if (found := re.fullmatch(r"accuracy (\d\.?\d*)", case[1])))
+    cases = sorted(
+        (float(found[1]), case)
+        for case in board.cases
+        if (found := re.fullmatch(r"accuracy (\d\.?\d*)", case[1]))
+    )
     if len(cases) < 2:
         return hole("by-accuracy", title, Missing("not measured", "fewer than two accuracies were judged"))
     learned, paper, base = board.learned(), board.best(PAPER), board.best(BASELINE)
@@ -234,19 +318,46 @@ def by_accuracy(sources: Sources, board: Board | Missing) -> Picture:
     ):
         curves = {name: _curve(board, name, cases, what) for name in names}
         curves = {name: curve for name, curve in curves.items() if len(curve)}
-        top = 104.0 if limit else 1.1 * max((max(value for _, value in curve) for curve in curves.values()), default=1.0)
-        y = charts.Axis(0, 104, ((0.0, "0"), (50.0, "50"), (100.0, "100"))) if limit else charts.linear(0, top, ticks=4)
+        top = (
+            104.0
+            if limit
+            else 1.1 * max((max(value for _, value in curve) for curve in curves.values()), default=1.0)
+        )
+        y = (
+            charts.Axis(0, 104, ((0.0, "0"), (50.0, "50"), (100.0, "100")))
+            if limit
+            else charts.linear(0, top, ticks=4)
+        )
         frame = charts.Frame(x, y, 368, 190, 30)
-        layers = [charts.tint(frame, limit, 100), charts.level(frame, limit, "lim", f"limit {limit:g}", above=False)] if limit else []
+        layers = (
+            [
+                charts.tint(frame, limit, 100),
+                charts.level(frame, limit, "lim", f"limit {limit:g}", above=False),
+            ]
+            if limit
+            else []
+        )
         for name, curve in curves.items():
             px, py = map(np.array, zip(*curve, strict=True))
-            css = {"data_driven": "line dd", "kernel": "line dd dash", "model_based": "line", "exact_model": "line dash"}.get(
-                role(board, name), "line bl"
-            )
-            layers += [charts.line(frame, px, py, css), charts.dots(frame, px, py, f"dot whole {page.MARKS[role(board, name)]}", 2.4)]
+            css = {
+                "data_driven": "line dd",
+                "kernel": "line dd dash",
+                "model_based": "line",
+                "exact_model": "line dash",
+            }.get(role(board, name), "line bl")
+            layers += [
+                charts.line(frame, px, py, css),
+                charts.dots(frame, px, py, f"dot whole {page.MARKS[role(board, name)]}", 2.4),
+            ]
         ends = [(curve[0][1], name) for name, curve in curves.items()]
-        layers += _names(frame, ends) if limit else _names(frame, [(curve[-1][1], name) for name, curve in curves.items()], right=True)
-        told = ", ".join(f"{name} {number(value, 1) + THIN + '%' if limit else number(value, 0)}" for value, name in ends)
+        layers += (
+            _names(frame, ends)
+            if limit
+            else _names(frame, [(curve[-1][1], name) for name, curve in curves.items()], right=True)
+        )
+        told = ", ".join(
+            f"{name} {number(value, 1) + THIN + '%' if limit else number(value, 0)}" for value, name in ends
+        )
         said.append(f"{head}: {told}")
         alt = f"At {100 * cases[0][0]:g} % right, {head.lower()}: {told}"
         columns.append(
@@ -256,7 +367,12 @@ def by_accuracy(sources: Sources, board: Board | Missing) -> Picture:
                 "",
                 [
                     charts.panel(
-                        frame, layers, alt=alt, css="mb", title="%" if limit else "decisions", units=("% right", "%" if limit else "")
+                        frame,
+                        layers,
+                        alt=alt,
+                        css="mb",
+                        title="%" if limit else "decisions",
+                        units=("% right", "%" if limit else ""),
                     )
                 ],
             )
@@ -266,7 +382,8 @@ def by_accuracy(sources: Sources, board: Board | Missing) -> Picture:
         title,
         f"With {100 * cases[0][0]:g}{THIN}% of the windows named rightly. {'; '.join(said)}.",
         columns,
-        "Share of runs on the paper’s simulator against the share of windows that are named rightly. Blue: our agent; blue, dashed: the paper’s; ink or grey: the best baseline. Grey area: what is asked for.",
+        "Share of runs on the paper’s simulator against the share of windows that are named rightly. Blue: "
+        "our agent; blue, dashed: the paper’s; ink or grey: the best baseline. Grey area: what is asked for.",
         page.origin(sources.source("scoreboard")),
     )
 
@@ -287,7 +404,9 @@ def _names(frame: charts.Frame, ends: list[tuple[float, str]], *, right: bool = 
         y = min(y, frame.height - frame.below - 3)
         x, anchor = (frame.width - frame.right - 6, "end") if right else (frame.left + 6, "start")
         made.append(
-            Markup('<text x="{}" y="{:.1f}" text-anchor="{}">{} {}</text>').format(x, y, anchor, name, number(value, 0 if right else 1))
+            Markup('<text x="{}" y="{:.1f}" text-anchor="{}">{} {}</text>').format(
+                x, y, anchor, name, number(value, 0 if right else 1)
+            )
         )
         last = y
     return made

@@ -9,7 +9,19 @@ from markupsafe import Markup
 
 from pipeline.report.index.cards import unbuilt
 from pipeline.report.setpoint.agent import CASES
-from pipeline.report.setpoint.verdict import BASELINE, OPEN, PASSED, Board, board, case_text, named, share_text, verdict, within, worst
+from pipeline.report.setpoint.verdict import (
+    BASELINE,
+    OPEN,
+    PASSED,
+    Board,
+    board,
+    case_text,
+    named,
+    share_text,
+    verdict,
+    within,
+    worst,
+)
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import number
 from pipeline.report.shared.sources import Sources, Table
@@ -22,10 +34,13 @@ ORDER = ("model_based", "data_driven", "baseline")
 
 
 def seats(found: Board) -> dict[str, str]:
-    """Who stands for each role: the best Bayes filter, the agent that competes, the best proportional control, or else the best of the other baselines."""
+    """Who stands for each role: the best Bayes filter, the agent that competes, the best proportional
+    control, or else the best of the other baselines."""
 
     def first(fits: Callable[[str], bool]) -> str:
-        return next((name for name in found.names if found.kinds[name] == BASELINE and fits(name.lower())), "")
+        return next(
+            (name for name in found.names if found.kinds[name] == BASELINE and fits(name.lower())), ""
+        )
 
     bayes = first(lambda name: "bayes" in name)
     plain = first(lambda name: "proportional" in name) or first(lambda name: "bayes" not in name)
@@ -35,7 +50,9 @@ def seats(found: Board) -> dict[str, str]:
 def setpoint(sources: Sources) -> dict[str, Any]:
     judged, found = verdict(sources), board(sources)
     if isinstance(found, Missing) or not judged.default:
-        return unbuilt("setpoint", found.sentence() if isinstance(found, Missing) else judged.reason) | {"link": "setpoint.html"}
+        return unbuilt("setpoint", found.sentence() if isinstance(found, Missing) else judged.reason) | {
+            "link": "setpoint.html"
+        }
     who = seats(found)
     role = next((role for role, name in who.items() if name == judged.default), "baseline")
     table = sources.tables["paths"]
@@ -50,12 +67,19 @@ def setpoint(sources: Sources) -> dict[str, Any]:
         "mark": role if judged.state == PASSED else None,
         "win": (f"{'The baseline' if role == 'baseline' else ROLES[role].capitalize().replace('-', chr(0x2011))} wins." if judged.state == PASSED else judged.lead, _win(found, judged.default) if judged.state == PASSED else judged.reason),
         "caption": f"Flow’s distance from 100\u00a0%, 90th percentile of 21 starts over 100 decisions, log scale {FLOOR:g} to {CEILING:g}\u00a0%: {case_text(case, whole=True)}. Grey: within {FLOW_BAND:g}\u00a0%.",
-        "panels": [_spark(table, name, case, css, named=i == 0) for i, (name, css) in enumerate(zip((who[role] for role in ORDER), ("mb", "dd", "bl"), strict=True))],
-        "heads": [{"mark": role, "name": LABELS[CONTROLLERS[role]][0], "method": who[role] or "none judged"} for role in ORDER],
+        "panels": [_spark(table, name, case, css, named=i == 0) for i,
+        (name, css) in enumerate(zip((who[role] for role in ORDER), ("mb", "dd", "bl"), strict=True))],
+        "heads": [{"mark": role, "name": LABELS[CONTROLLERS[role]][0],
+        "method": who[role] or "none judged"} for role in ORDER],
         "rows": [
-            {"title": "Settle, worst case", "cells": _cells([worst(found, who[role], "settled")[0] for role in ORDER], rules.settled_percent)},
-            {"title": "Settle and stay, worst case", "cells": _cells([worst(found, who[role], "stay")[0] for role in ORDER], rules.stay_percent)},
-            {"title": "Recover from a clog", "cells": _cells([worst(found, who[role], "recovered")[0] for role in ORDER], rules.settled_percent)},
+            {"title": "Settle, worst case",
+            "cells": _cells([worst(found, who[role], "settled")[0] for role in ORDER],
+            rules.settled_percent)},
+            {"title": "Settle and stay, worst case",
+            "cells": _cells([worst(found, who[role], "stay")[0] for role in ORDER], rules.stay_percent)},
+            {"title": "Recover from a clog",
+            "cells": _cells([worst(found, who[role], "recovered")[0] for role in ORDER],
+            rules.settled_percent)},
         ],
         "note": judged.claim,
         "model": None,
@@ -70,7 +94,11 @@ def _win(found: Board, default: str) -> str:
     if place is None:
         return ""
     name = named(found, default)
-    others = [f"{named(found, one)} {share_text(worst(found, one, 'lasting')[0])}" for one in found.names if one != default][:2]
+    others = [
+        f"{named(found, one)} {share_text(worst(found, one, 'lasting')[0])}"
+        for one in found.names
+        if one != default
+    ][:2]
     beside = f"; next in their own worst cases: {', '.join(others)}" if others else ""
     return f"{name[:1].upper()}{name[1:]}: {share_text(mine)} of runs settle and stay in its worst case ({within(place)}){beside}."
 
@@ -88,7 +116,11 @@ def _cells(figures: Sequence[Figure | Missing], limit: float) -> list[dict[str, 
 
 
 def _spark(table: Table | Missing, name: str, case: tuple[str, str], css: str, *, named: bool) -> Markup:
-    gap = table if isinstance(table, Missing) else Missing("not measured", f"no way of {name or 'any controller'} was kept")
+    gap = (
+        table
+        if isinstance(table, Missing)
+        else Missing("not measured", f"no way of {name or 'any controller'} was kept")
+    )
     rows = None if isinstance(table, Missing) else (table["controller"] == name) & (table["simulator"] == case[0]) & (table["case"] == case[1])  # fmt: skip
     if rows is None or not rows.any():
         return Markup('<div class="hole">{}</div>').format(page.missing(gap))

@@ -15,9 +15,15 @@ SAME = 0.05
 
 
 def change(sources: Sources, case: Case, cell: Cell | None) -> dict[str, Any]:
-    """How the settled runs of the default moved since the accepted run: beyond noise where their intervals, of as many runs as now, do not overlap."""
+    """How the settled runs of the default moved since the accepted run: beyond noise where their intervals,
+    of as many runs as now, do not overlap."""
     still = {"text": "first run", "moved": False, "worse": False}
-    if sources.accepted is None or isinstance(sources.accepted, Missing) or cell is None or isinstance(cell.settled, Missing):
+    if (
+        sources.accepted is None
+        or isinstance(sources.accepted, Missing)
+        or cell is None
+        or isinstance(cell.settled, Missing)
+    ):
         return still
     stage = lookup(sources.accepted, "metrics.evaluate_setpoint")
     name = None if isinstance(stage, Missing) else stage.get("default")

@@ -1,4 +1,5 @@
-"""The page of the setpoint loop: who sets flow and temperature by default, what each controller makes of each case, and what the camera's classifier is worth."""
+"""The page of the setpoint loop: who sets flow and temperature by default, what each controller makes of each
+case, and what the camera's classifier is worth."""
 
 from typing import Any
 
@@ -63,7 +64,9 @@ def render(sources: Sources) -> str:
         here="setpoint",
         title=f"Setpoint: {judged.decision.rstrip('.')}",
         verdict=judged,
-        heads_of_rules=HEADS if known is None else (*HEADS[:2], role(known, known.best(BASELINE)) if known.best(BASELINE) else HEADS[2]),
+        heads_of_rules=HEADS
+        if known is None
+        else (*HEADS[:2], role(known, known.best(BASELINE)) if known.best(BASELINE) else HEADS[2]),
         second=known is not None and bool(known.default) and known.kinds[known.default] == BASELINE,
         told=told(sources, known) if known and known.default else "",
         no_board=found if isinstance(found, Missing) else None,
@@ -98,7 +101,14 @@ def hashes(sources: Sources) -> list[tuple[str, str]]:
     """Short digests by which two pages can be told to be of one run."""
     tables = {source.name: source.sha256 for source in sources.read.values()}
     found = [(name, tables.get(name, "missing")) for name in ("classified", "scoreboard", "choice")]
-    return [(name, value[:8]) for name, value in [*found, ("parameters", digest(sources.declared.everything)), ("code", sources.code)]]
+    return [
+        (name, value[:8])
+        for name, value in [
+            *found,
+            ("parameters", digest(sources.declared.everything)),
+            ("code", sources.code),
+        ]
+    ]
 
 
 def heads(found: Board | None) -> list[dict[str, Any]]:
@@ -119,22 +129,35 @@ def heads(found: Board | None) -> list[dict[str, Any]]:
 
 
 def answers(sources: Sources, found: Board) -> list[dict[str, Any]]:
-    """Runs that settle and stay of what learned and of the best baseline; the strip shows the runs that are lost, as a share of those that may be."""
+    """Runs that settle and stay of what learned and of the best baseline; the strip shows the runs that are
+    lost, as a share of those that may be."""
     pair = (found.learned(), found.best(BASELINE))
-    cases = [case for case in found.cases if any((cell := found.cells.get((name, case))) and cell.counts for name in pair)]
+    cases = [
+        case
+        for case in found.cases
+        if any((cell := found.cells.get((name, case))) and cell.counts for name in pair)
+    ]
     lost = Question(0, "", "Runs lost", "%", 100 - sources.declared.rules.settled_percent, False, "")
     gone = Question(0, "", "Runs that leave", "%", 100 - sources.declared.rules.stay_percent, False, "")
     rows = []
     for case in cases[:MOST]:
         cells = [found.cells.get((name, case)) for name in pair]
-        shown = [(name, LANES[role(found, name)], _lost(cell)) for name, cell in zip(pair, cells, strict=True) if name]
+        shown = [
+            (name, LANES[role(found, name)], _lost(cell))
+            for name, cell in zip(pair, cells, strict=True)
+            if name
+        ]
         mine = found.cells.get((found.default or pair[0], case))
-        states = [state(lost, _lost(mine)), state(gone, _lost(mine, "stay"))] if mine else ["not measured"] * 2
+        states = (
+            [state(lost, _lost(mine)), state(gone, _lost(mine, "stay"))] if mine else ["not measured"] * 2
+        )
         rows.append({
             "simulator": SIMULATORS.get(case[0], case[0]), "case": case_text(case),
             "state": next((one for one in states if one != "passed"), "passed"),
-            "cells": [_answer(cell, lost, css) | {"name": name} for name, cell, css in zip(pair, cells, ("dd", "mb"), strict=True)],
-            "strip": charts.strip(lost, shown), "stay": _stay(mine), "stay_bad": bool(mine) and state(gone, _lost(mine, "stay")) == FAILED,
+            "cells": [_answer(cell, lost, css) | {"name": name} for name, cell,
+            css in zip(pair, cells, ("dd", "mb"), strict=True)],
+            "strip": charts.strip(lost, shown), "stay": _stay(mine),
+            "stay_bad": bool(mine) and state(gone, _lost(mine, "stay")) == FAILED,
             "change": setpoint_change.change(sources, case, mine),
         })  # fmt: skip
     return rows
@@ -142,7 +165,11 @@ def answers(sources: Sources, found: Board) -> list[dict[str, Any]]:
 
 def _lost(cell: Cell | None, what: str = "settled") -> Figure | Missing:
     share = Missing("not measured", "this case was not run") if cell is None else getattr(cell, what)
-    return share if isinstance(share, Missing) else Figure(*(max(100 - end, 0.0) for end in (share.value, share.high, share.low)))
+    return (
+        share
+        if isinstance(share, Missing)
+        else Figure(*(max(100 - end, 0.0) for end in (share.value, share.high, share.low)))
+    )
 
 
 def _answer(cell: Cell | None, lost: Question, css: str) -> dict[str, Any]:
@@ -165,9 +192,14 @@ def _stay(cell: Cell | None) -> str:
 
 
 def boards(sources: Sources, found: Board) -> list[dict[str, Any]]:
-    """A table for each simulator: controllers down, cases across; vermillion where the whole interval lies beyond a limit, bold in a controller's own worst case."""
+    """A table for each simulator: controllers down, cases across; vermillion where the whole interval lies
+    beyond a limit, bold in a controller's own worst case."""
     asked = sources.declared.rules
-    limits = {"settled": asked.settled_percent, "stay": asked.stay_percent, "recovered": asked.settled_percent}
+    limits = {
+        "settled": asked.settled_percent,
+        "stay": asked.stay_percent,
+        "recovered": asked.settled_percent,
+    }
     tables = []
     for simulator in dict.fromkeys(case[0] for case in found.cases):
         cases = [case for case in found.cases if case[0] == simulator]
@@ -178,8 +210,10 @@ def boards(sources: Sources, found: Board) -> list[dict[str, Any]]:
                 continue
             _, low = worst(found, name, "lasting")
             rows.append({
-                "name": name, "mark": role(found, name), "default": name == found.default, "kind": found.kinds[name],
-                "cells": [_cell(cell, limits, bold=case == low) for case, cell in zip(cases, cells, strict=True)],
+                "name": name, "mark": role(found, name), "default": name == found.default,
+                "kind": found.kinds[name],
+                "cells": [_cell(cell, limits, bold=case == low) for case,
+                cell in zip(cases, cells, strict=True)],
             })  # fmt: skip
         counts = any(cell.counts for (_, case), cell in found.cells.items() if case[0] == simulator)
         runs = sorted({cell.runs for (_, case), cell in found.cells.items() if case[0] == simulator})
@@ -195,8 +229,18 @@ def _cell(cell: Cell | None, limits: dict[str, float], *, bold: bool) -> dict[st
         share = getattr(cell, what)
         if isinstance(share, Figure):
             failed = state(Question(0, "", "", "%", limits[what], True, ""), share) == FAILED
-            lines.append({"text": f"{word}{quantity(share.value, '%', 1)}", "band": band(share.low, share.high, 1), "bad": failed})
-    steps = "none settles" if cell.median != cell.median else f"{number(cell.median, 0)} steps, p90 {number(cell.p90, 0)}"
+            lines.append(
+                {
+                    "text": f"{word}{quantity(share.value, '%', 1)}",
+                    "band": band(share.low, share.high, 1),
+                    "bad": failed,
+                }
+            )
+    steps = (
+        "none settles"
+        if cell.median != cell.median
+        else f"{number(cell.median, 0)} steps, p90 {number(cell.p90, 0)}"
+    )
     more = f"past it {number(cell.overshoot, 0)}{THIN}%" if cell.overshoot == cell.overshoot else ""
     more += f", off {number(cell.flow_error, 1)}{THIN}%" if cell.flow_error == cell.flow_error else ""
     flow, degrees, share = cell.worst_start
@@ -215,8 +259,12 @@ def worsts(found: Board) -> list[dict[str, Any]]:
         others = [share.value for _, one in found.counting(name) if isinstance(share := lasting(one), Figure)]
         flow, degrees, settled = cell.worst_start
         rows.append({
-            "name": name, "mark": role(found, name), "default": name == found.default, "kind": {BASELINE: "no learning", "agent": "ours, learned"}.get(found.kinds[name], "as published"),
-            "case": case_text(case, whole=True), "value": share_text(figure), "band": band(figure.low, figure.high, 1),
-            "mean": percent(sum(others) / len(others), 3), "start": f"{flow:g}{THIN}%, {degrees:g}{THIN}°C: {number(settled, 0)}{THIN}% settle",
+            "name": name, "mark": role(found, name), "default": name == found.default,
+            "kind": {BASELINE: "no learning", "agent": "ours, learned"}.get(found.kinds[name],
+            "as published"),
+            "case": case_text(case, whole=True), "value": share_text(figure),
+            "band": band(figure.low, figure.high, 1),
+            "mean": percent(sum(others) / len(others), 3),
+            "start": f"{flow:g}{THIN}%, {degrees:g}{THIN}°C: {number(settled, 0)}{THIN}% settle",
         })  # fmt: skip
     return rows

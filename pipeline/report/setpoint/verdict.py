@@ -1,4 +1,5 @@
-"""Scoreboard and classifier's figures -> who sets flow and temperature by default, by how much, and whether it may steer a printer, in words. No page, no file."""
+"""Scoreboard and classifier's figures -> who sets flow and temperature by default, by how much, and whether
+it may steer a printer, in words. No page, no file."""
 
 import math
 import re
@@ -14,15 +15,14 @@ from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, UNDECIDED, Figu
 AGENT, PAPER, BASELINE = "agent", "paper", "baseline"
 SIMULATORS = {"paper": "The paper’s simulator", "recorded": "Recorded windows", "pixels": "Through pictures"}
 CLAIM = "The classifier is trained and judged on rendered frames: eight real pictures allow no claim about real printers."
-CLAIM_RECORDED = (
-    "The classifier is trained and judged on recordings of datasets/raw/setpoint, split by print; it is known on these printers only."
-)
+CLAIM_RECORDED = "The classifier is trained and judged on recordings of datasets/raw/setpoint, split by print; it is known on these printers only."
 # what the two columns of its rules are, and the mark of the second
 HEADS = ("Data\u2011driven", "Best baseline", "baseline")
 
 
 class Cell(NamedTuple):
-    """One controller in one case: shares of runs in percent with their 95 % intervals, or why one is missing; steps until inside for good; overshoot and flow error in percent."""
+    """One controller in one case: shares of runs in percent with their 95 % intervals, or why one is missing;
+    steps until inside for good; overshoot and flow error in percent."""
 
     runs: int
     counts: bool
@@ -40,7 +40,8 @@ Case = tuple[str, str]  # simulator, case
 
 
 class Board(NamedTuple):
-    """Who was judged, the best worst case first, with the kind of each; cases in the table's order; who runs by default ("" where nobody chose)."""
+    """Who was judged, the best worst case first, with the kind of each; cases in the table's order; who runs
+    by default ("" where nobody chose)."""
 
     names: list[str]
     kinds: Mapping[str, str]
@@ -58,15 +59,22 @@ class Board(NamedTuple):
 
     def learned(self) -> str:
         """The agent that competes: the default where it is one, else ours, else the paper's."""
-        return self.default if self.default and self.kinds[self.default] != BASELINE else self.best(AGENT) or self.best(PAPER)
+        return (
+            self.default
+            if self.default and self.kinds[self.default] != BASELINE
+            else self.best(AGENT) or self.best(PAPER)
+        )
 
 
 def role(board: Board, name: str) -> str:
-    """The mark of a controller: circle what learned (hollow: not the one that competes), square the Bayes filter, ring the others."""
+    """The mark of a controller: circle what learned (hollow: not the one that
+    competes), square the Bayes filter, ring the others."""
     if board.kinds[name] != BASELINE:
         return "data_driven" if name == board.learned() else "kernel"
     if "bayes" in name.lower():
-        first = next(other for other in board.names if board.kinds[other] == BASELINE and "bayes" in other.lower())
+        first = next(
+            other for other in board.names if board.kinds[other] == BASELINE and "bayes" in other.lower()
+        )
         return "model_based" if name == first else "exact_model"
     return "baseline"
 
@@ -105,7 +113,8 @@ def board(sources: Sources) -> Board | Missing:
 
 def _cell(table: Table, i: int) -> Cell:
     figures = [
-        _figure(*(float(table[f"{name}{end}_percent"][i]) for end in ("", "_low", "_high"))) for name in ("settled", "stay", "recovered")
+        _figure(*(float(table[f"{name}{end}_percent"][i]) for end in ("", "_low", "_high")))
+        for name in ("settled", "stay", "recovered")
     ]
     numbers = ("median_steps", "p90_steps", "overshoot_p95_percent", "flow_error_percent")
     start = ("worst_start_flow_percent", "worst_start_temperature_degC", "worst_start_settled_percent")
@@ -125,7 +134,8 @@ def _figure(value: float, low: float, high: float) -> Figure | Missing:
 
 
 def lasting(cell: Cell) -> Figure | Missing:
-    """The share by which a case is read: settled and staying, or settled where runs end before that can be told."""
+    """The share by which a case is read: settled and staying, or
+    settled where runs end before that can be told."""
     return cell.stay if isinstance(cell.stay, Figure) else cell.settled
 
 
@@ -142,7 +152,9 @@ def worst(board: Board, name: str, what: str) -> tuple[Figure | Missing, Case | 
         if isinstance(figure := lasting(cell) if what == "lasting" else getattr(cell, what), Figure)
     ]
     return (
-        min(found, key=lambda pair: pair[0].value) if found else (Missing("not measured", f"no case of {name or 'any controller'}"), None)
+        min(found, key=lambda pair: pair[0].value)
+        if found
+        else (Missing("not measured", f"no case of {name or 'any controller'}"), None)
     )
 
 
@@ -154,7 +166,8 @@ def share_text(figure: Figure | Missing) -> str:
 
 
 class Rule(NamedTuple):
-    """One test: limit and place on the page; states and figures of what learned and of the best baseline; as a sentence, each, where it does not pass."""
+    """One test: limit and place on the page; states and figures of what learned and of the best baseline; as
+    a sentence, each, where it does not pass."""
 
     name: str
     limit: str
@@ -171,8 +184,10 @@ def rules(sources: Sources, board: Board | None) -> tuple[Rule, ...]:
     return (
         _control(board, "Settles, worst case", "settled", asked.settled_percent, "settle"),
         _control(board, "Stays, worst case", "stay", asked.stay_percent, "settle and stay"),
-        _seeing(sources, "Right, an image", 100 * asked.image_accuracy, "image_accuracy", ("svc", "cnn", "width"), "frames of segments it never saw"),
-        _seeing(sources, "Right, a window", 100 * asked.window_accuracy, "window_accuracy", ("svc",), "windows of segments it never saw"),
+        _seeing(sources, "Right, an image", 100 * asked.image_accuracy, "image_accuracy",
+        ("svc", "cnn", "width"), "frames of segments it never saw"),
+        _seeing(sources, "Right, a window", 100 * asked.window_accuracy, "window_accuracy", ("svc",),
+        "windows of segments it never saw"),
         _calibrated(sources, "Calibrated, an image", asked.ece_image, ("ece_image", "ece_image_raw")),
         _calibrated(sources, "Calibrated, a window", asked.ece_window, ("ece_window", "ece_window_counts")),
     )  # fmt: skip
@@ -182,7 +197,9 @@ def _control(board: Board | None, name: str, what: str, limit: float, does: str)
     question = Question(0, what, name, "%", limit, True, "")
     text = f"≥ {limit:g}{THIN}%"
     if board is None:
-        return Rule(name, text, "scoreboard", (OPEN, OPEN), (OPEN, OPEN), ("Nothing was judged.",) * 2, "", False)
+        return Rule(
+            name, text, "scoreboard", (OPEN, OPEN), (OPEN, OPEN), ("Nothing was judged.",) * 2, "", False
+        )
     found = [worst(board, who, what) for who in (board.learned(), board.best(BASELINE))]
     reasons = tuple(
         figure.sentence()
@@ -197,18 +214,24 @@ def _control(board: Board | None, name: str, what: str, limit: float, does: str)
         tuple(state(question, figure) for figure, _ in found),
         tuple(share_text(figure) for figure, _ in found),
         reasons,
-        "A classifier whose errors persist for fewer decisions, or fewer starts and disturbances to stand (evaluate_setpoint).",
+        "A classifier whose errors persist for fewer decisions, or fewer starts and disturbances to stand "
+        "(evaluate_setpoint).",
         False,
     )
 
 
 def undecided(question: Question, figure: Figure) -> str:
-    """How many runs would tell, where the interval straddles the limit: z^2 p (1 - p) / (p - limit)^2 at 95 %."""
+    """How many runs would tell, where the interval straddles the
+    limit: z^2 p (1 - p) / (p - limit)^2 at 95 %."""
     if state(question, figure) != UNDECIDED:
         return ""
     p, off = figure.value / 100, abs(figure.value - question.limit) / 100
     needed = 1.96**2 * p * (1 - p) / off**2 if off else math.inf
-    more = f"about {_round(needed):,} runs in all would decide" if needed < 1e7 else "no number of runs would decide"
+    more = (
+        f"about {_round(needed):,} runs in all would decide"
+        if needed < 1e7
+        else "no number of runs would decide"
+    )
     return f" Its interval, {band(figure.low, figure.high, 1)}, straddles that; {more}."
 
 
@@ -225,9 +248,13 @@ def _seeing(sources: Sources, name: str, limit: float, key: str, others: Sequenc
     metrics, question = sources.metrics["train_classifier"], Question(0, key, name, "%", limit, True, "")
     mine = accuracy(metrics, key.removesuffix("_accuracy"))
     beside = [
-        (found, other) for other in others if isinstance(found := accuracy(metrics, f"{other}_{key.removesuffix('_accuracy')}"), Figure)
+        (found, other)
+        for other in others
+        if isinstance(found := accuracy(metrics, f"{other}_{key.removesuffix('_accuracy')}"), Figure)
     ]
-    best, who = max(beside, key=lambda pair: pair[0].value, default=(Missing("not measured", "no yardstick"), ""))
+    best, who = max(
+        beside, key=lambda pair: pair[0].value, default=(Missing("not measured", "no yardstick"), "")
+    )
     reason = (
         mine.sentence()
         if isinstance(mine, Missing)
@@ -248,7 +275,9 @@ def accuracy(metrics: Mapping | Missing, name: str) -> Figure | Missing:
 
 def _calibrated(sources: Sources, name: str, limit: float, keys: tuple[str, str]) -> Rule:
     found = [lookup(sources.metrics["train_classifier"], key) for key in keys]
-    states = tuple(OPEN if isinstance(value, Missing) else PASSED if value <= limit else FAILED for value in found)
+    states = tuple(
+        OPEN if isinstance(value, Missing) else PASSED if value <= limit else FAILED for value in found
+    )
     shown = tuple(OPEN if isinstance(value, Missing) else number(value, 3) for value in found)
     reason = (
         f"Stated and true shares of right answers differ by {shown[0]} on average; {limit:g} is allowed."
@@ -262,7 +291,8 @@ def _calibrated(sources: Sources, name: str, limit: float, keys: tuple[str, str]
 
 
 class Verdict(NamedTuple):
-    """`state`: passed, failed, open; the controller that runs by default; sentences as the page says them; `first` names the first rule that does not pass."""
+    """`state`: passed, failed, open; the controller that runs by default; sentences as the page says them;
+    `first` names the first rule that does not pass."""
 
     state: str
     default: str
@@ -278,19 +308,44 @@ class Verdict(NamedTuple):
 
 def verdict(sources: Sources) -> Verdict:
     found = board(sources)
-    claim = CLAIM_RECORDED if sources.declared.everything.get("train_classifier", {}).get("source") == "recordings" else CLAIM
+    claim = (
+        CLAIM_RECORDED
+        if sources.declared.everything.get("train_classifier", {}).get("source") == "recordings"
+        else CLAIM
+    )
     if isinstance(found, Missing) or not found.default:
         gap = found if isinstance(found, Missing) else sources.tables["choice"]
-        why = gap.sentence() if isinstance(gap, Missing) else "The choice names a controller that was not judged."
+        why = (
+            gap.sentence()
+            if isinstance(gap, Missing)
+            else "The choice names a controller that was not judged."
+        )
         tested = rules(sources, None if isinstance(found, Missing) else found)
         return Verdict(
-            OPEN, "", "Let nobody set flow and temperature by this loop yet.", "No controller was chosen.", why, "", claim, tested, "", ""
+            OPEN,
+            "",
+            "Let nobody set flow and temperature by this loop yet.",
+            "No controller was chosen.",
+            why,
+            "",
+            claim,
+            tested,
+            "",
+            "",
         )
     tested = rules(sources, found)
     column = int(found.kinds[found.default] == BASELINE)
     states = [rule.states[0 if rule.seeing else column] for rule in tested]
     failed = FAILED in states
-    first = next((i for wanted in ((FAILED,) if failed else (UNDECIDED, OPEN)) for i, one in enumerate(states) if one == wanted), None)
+    first = next(
+        (
+            i
+            for wanted in ((FAILED,) if failed else (UNDECIDED, OPEN))
+            for i, one in enumerate(states)
+            if one == wanted
+        ),
+        None,
+    )
     passed = first is None
     decision = (
         f"Run {named(found, found.default)} by default."
@@ -318,10 +373,16 @@ def verdict(sources: Sources) -> Verdict:
 
 
 def _conditions(tested: Sequence[Rule], column: int, rendered: bool) -> str:
-    """What would have to come out before the loop may steer: every rule that does not pass with its figure, and what to try."""
-    short = [(rule, 0 if rule.seeing else column) for rule in tested if rule.states[0 if rule.seeing else column] != PASSED]
+    """What would have to come out before the loop may steer: every rule that
+    does not pass with its figure, and what to try."""
+    short = [
+        (rule, 0 if rule.seeing else column)
+        for rule in tested
+        if rule.states[0 if rule.seeing else column] != PASSED
+    ]
     asked = [
-        f"{rule.name[:1].lower()}{rule.name[1:]} {rule.limit} (now {rule.figures[k]}{', but its interval crosses the limit' if rule.states[k] == UNDECIDED else ''})"
+        f"{rule.name[:1].lower()}{rule.name[1:]} {rule.limit} (now "
+        f"{rule.figures[k]}{', but its interval crosses the limit' if rule.states[k] == UNDECIDED else ''})"
         for rule, k in short
     ]
     real = " Recordings of the real printer: none are in (datasets/raw/setpoint)." if rendered else ""
@@ -341,11 +402,16 @@ def _closest(name: str, rule: Rule, column: int) -> str:
 def named(board: Board, name: str) -> str:
     """ "the agent “ours”", "the baseline “Bayes, robust”"."""
     kind = {AGENT: "the agent", PAPER: "the paper’s agent"}.get(board.kinds[name], "the baseline")
-    return kind if name.lower() in ("agent", "our agent", "ours", "the paper's agent", "paper", "the paper’s agent") else f"{kind} “{name}”"
+    return (
+        kind
+        if name.lower() in ("agent", "our agent", "ours", "the paper's agent", "paper", "the paper’s agent")
+        else f"{kind} “{name}”"
+    )
 
 
 def told(sources: Sources, board: Board) -> str:
-    """The default's worst case, by how much it beats the next, and, where the agent is neither, how far it came."""
+    """The default's worst case, by how much it beats the next, and,
+    where the agent is neither, how far it came."""
     mine, place = worst(board, board.default, "lasting")
     if place is None:
         return ""
@@ -359,7 +425,11 @@ def told(sources: Sources, board: Board) -> str:
     points = mine.value - figure.value if isinstance(margin, Missing) else float(margin)
     noise = ", which is within the noise of these runs" if figure.high >= mine.low else ""
     rival = f"the next, {named(board, others[0])}, in its own ({within(where)}: {share_text(figure)})"
-    text += f", {number(points, 1)} points more than of {rival}{noise}." if abs(points) >= 0.05 else f", as many as of {rival}."
+    text += (
+        f", {number(points, 1)} points more than of {rival}{noise}."
+        if abs(points) >= 0.05
+        else f", as many as of {rival}."
+    )
     learned = board.learned()
     if not learned or learned in (board.default, others[0]):
         return text

@@ -1,4 +1,5 @@
-"""What the classifier is worth: calibration, confusion by temperature, what windows say by flow, its training, frames with key areas, what was held and foreign."""
+"""What the classifier is worth: calibration, confusion by temperature, what windows say by flow, its
+training, frames with key areas, what was held and foreign."""
 
 import math
 from typing import Any
@@ -27,7 +28,11 @@ DIAGRAMS = (
 
 def reliability(sources: Sources) -> Picture:
     """Share that is right against the confidence that was stated, before and after calibration."""
-    table, metrics, title = sources.tables["reliability"], sources.metrics["train_classifier"], "When it says 80 %, is it right in 80 %?"
+    table, metrics, title = (
+        sources.tables["reliability"],
+        sources.metrics["train_classifier"],
+        "When it says 80 %, is it right in 80 %?",
+    )
     if isinstance(table, Missing):
         return hole("reliability", title, table)
     columns = []
@@ -36,7 +41,9 @@ def reliability(sources: Sources) -> Picture:
         error = lookup(metrics, key)
         if not mine.any():
             gap = Missing("not measured", f"no diagram of {method}")
-            columns.append(Column(head, small, "", [Markup('<div class="hole">{}</div>').format(page.missing(gap))]))
+            columns.append(
+                Column(head, small, "", [Markup('<div class="hole">{}</div>').format(page.missing(gap))])
+            )
             continue
         frame = charts.Frame(charts.Axis(0.3, 1.0, ((0.4, "0.4"), (0.6, "0.6"), (0.8, "0.8"), (1.0, "1"))), charts.Axis(0, 1, ((0.0, "0"), (0.5, "0.5"), (1.0, "1"))), 270, 220, 30)  # fmt: skip
         x, y, n = (table[name][mine] for name in ("confidence", "accuracy", "count"))
@@ -69,13 +76,18 @@ def confusion(sources: Sources) -> Picture:
         swapped += int(counts[0, 2] + counts[2, 0])
         columns.append(
             Column(
-                f"{degrees:g}{THIN}°C", f"{counts.sum():,} frames, {number(right[degrees], 1)}{THIN}% right", "", [_matrix(counts, degrees)]
+                f"{degrees:g}{THIN}°C",
+                f"{counts.sum():,} frames, {number(right[degrees], 1)}{THIN}% right",
+                "",
+                [_matrix(counts, degrees)],
             )
         )
     worst = min(right, key=right.get)
     n = len(table["label"])
     text = (
-        f"Right most seldom at {worst:g}{THIN}°C, {number(right[worst], 1)}{THIN}%. Under and over are taken for each other in {percent(100 * swapped / n, 2) if swapped else '0' + THIN + '%'} of {n:,} frames: "
+        f"Right most seldom at {worst:g}{THIN}°C, {number(right[worst], 1)}{THIN}%. "
+        "Under and over are taken for each other in "
+        f"{percent(100 * swapped / n, 2) if swapped else '0' + THIN + '%'} of {n:,} frames: "
         "errors sit at the borders of the classes."
     )
     return Picture("confusion", title, text, columns, "True class down, class named across; per cent of the true class. Frames of segments that nothing was learned or calibrated on, rejected ones left out.", page.origin(sources.source("classified")))  # fmt: skip
@@ -86,7 +98,8 @@ def _matrix(counts: np.ndarray, degrees: float) -> Markup:
     left, top, size = 40, 18, 54
     cells = [
         Markup('<rect class="heat" x="{}" y="{}" width="{}" height="40" style="fill-opacity:{:.2f}"/><text class="in" x="{}" y="{}" text-anchor="middle">{}</text>').format(
-            left + size * j, top + 42 * i, size - 2, 0.04 + 0.34 * shares[i, j] / 100, left + size * j + size / 2 - 1, top + 42 * i + 24, number(shares[i, j], 0)
+            left + size * j, top + 42 * i, size - 2, 0.04 + 0.34 * shares[i, j] / 100,
+            left + size * j + size / 2 - 1, top + 42 * i + 24, number(shares[i, j], 0)
         )
         for i in range(3)
         for j in range(3)
@@ -94,20 +107,27 @@ def _matrix(counts: np.ndarray, degrees: float) -> Markup:
     cells += [Markup('<text x="{}" y="{}" text-anchor="end">{}</text>').format(left - 5, top + 42 * i + 24, name) for i, name in enumerate(CLASSES)]  # fmt: skip
     cells += [Markup('<text x="{}" y="12" text-anchor="middle">{}</text>').format(left + size * j + size / 2 - 1, name) for j, name in enumerate(CLASSES)]  # fmt: skip
     alt = f"At {degrees:g} °C: under {number(shares[0, 0], 0)} %, good {number(shares[1, 1], 0)} %, over {number(shares[2, 2], 0)} % named rightly"
-    return Markup('<svg class="plot mb" viewBox="0 0 208 146" role="img" aria-label="{}">{}</svg>').format(alt, Markup("").join(cells))
+    return Markup('<svg class="plot mb" viewBox="0 0 208 146" role="img" aria-label="{}">{}</svg>').format(
+        alt, Markup("").join(cells)
+    )
 
 
 # ---- windows
 
 
 def distributions(sources: Sources) -> Picture:
-    """The scaled distribution (4) by true flow: of recorded windows, and as the paper's simulator draws it (figure 4)."""
+    """The scaled distribution (4) by true flow: of recorded windows,
+    and as the paper's simulator draws it (figure 4)."""
     table, title = sources.tables["windows"], "What a window says, by true flow"
     if isinstance(table, Missing):
         return hole("distributions", title, table)
     mine = {name: values[table["part"] == "judge"] for name, values in table.items()}
     if not len(mine["flow_bin"]):
-        return hole("distributions", title, Missing("not measured", "no window to judge by", "Run ./run dvc repro train_classifier"))
+        return hole(
+            "distributions",
+            title,
+            Missing("not measured", "no window to judge by", "Run ./run dvc repro train_classifier"),
+        )
     flow, scaled, right = _by_bin(mine)
     high = float(mine["flow_high_percent"].max())
     frame = charts.Frame(charts.linear(0, min(high, 320.0), ticks=6), charts.Axis(0, 1.02, ((0.0, "0"), (0.5, "0.5"), (1.0, "1"))), 368, 190, 30)  # fmt: skip
@@ -116,8 +136,12 @@ def distributions(sources: Sources) -> Picture:
     ideal = np.exp(-ALPHA * np.abs(np.arange(3)[None, :] - label[:, None]))
     panels = []
     for head, small, x, y in (("Recorded windows", "of this classifier, segments only judged on", flow, scaled), ("The paper’s simulator", "mean of (7), without its noise", steps, ideal)):  # fmt: skip
-        layers = [Markup('<rect class="allow" x="{:.1f}" width="{:.1f}" y="{}" height="{}"/>').format(*_box(frame))]
-        layers += [charts.line(frame, x, y[:, k], f"line {css}") for k, css in enumerate(("brown", "", "green"))]
+        layers = [
+            Markup('<rect class="allow" x="{:.1f}" width="{:.1f}" y="{}" height="{}"/>').format(*_box(frame))
+        ]
+        layers += [
+            charts.line(frame, x, y[:, k], f"line {css}") for k, css in enumerate(("brown", "", "green"))
+        ]
         spread = float(np.sort(y, axis=1)[:, -2].max())
         alt = f"{head}: the second largest class reaches {number(spread, 2)} of the largest"
         panels.append(Column(head, small, "", [charts.panel(frame, layers, alt=alt, css="mb", title="scaled share" if not panels else "", units=("%", ""))]))  # fmt: skip
@@ -137,7 +161,8 @@ def _box(frame: charts.Frame) -> tuple[float, float, int, int]:
 
 
 def _by_bin(mine: Table) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Middle of each bin of flow, mean scaled shares there (bins, 3), and per cent of its windows whose class is the bin's."""
+    """Middle of each bin of flow, mean scaled shares there (bins, 3), and
+    per cent of its windows whose class is the bin's."""
     p = np.stack([mine[f"p_{name}"] for name in CLASSES], axis=1)
     p = p / p.max(axis=1, keepdims=True)
     flow, scaled, right = [], [], []
@@ -146,7 +171,9 @@ def _by_bin(mine: Table) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         middle = float((mine["flow_low_percent"][here] + mine["flow_high_percent"][here]).mean() / 2)
         flow.append(middle)
         scaled.append(p[here].mean(axis=0))
-        right.append(100 * float(np.mean(mine["named"][here] == int(np.searchsorted(BORDERS, middle, side="right")))))
+        right.append(
+            100 * float(np.mean(mine["named"][here] == int(np.searchsorted(BORDERS, middle, side="right"))))
+        )
     return np.array(flow), np.array(scaled), np.array(right)
 
 
@@ -155,14 +182,21 @@ def _by_bin(mine: Table) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def course(sources: Sources) -> Picture:
     """Loss and accuracy of both networks, epoch by epoch (figure 5b)."""
-    table, metrics, title = sources.tables["course"], sources.metrics["train_classifier"], "The classifier in training"
+    table, metrics, title = (
+        sources.tables["course"],
+        sources.metrics["train_classifier"],
+        "The classifier in training",
+    )
     if isinstance(table, Missing):
         return hole("course", title, table)
     columns, said = [], []
     svc = accuracy(metrics, "svc_image")
     for learner in dict.fromkeys(map(str, table["learner"])):
         mine = {name: values[table["learner"] == learner] for name, values in table.items()}
-        x, best = charts.linear(0, max(float(mine["epoch"].max()), 1.0), ticks=5), lookup(metrics, f"best_epoch.{learner}")
+        x, best = (
+            charts.linear(0, max(float(mine["epoch"].max()), 1.0), ticks=5),
+            lookup(metrics, f"best_epoch.{learner}"),
+        )
         top = 1.05 * float(np.nanmax([mine["training_loss"], mine["held_out_loss"]]))
         losses = charts.Frame(x, charts.linear(0, top, ticks=4), 568, 140, 30, 6)
         least = int(np.nanargmin(mine["held_out_loss"])) if np.isfinite(mine["held_out_loss"]).any() else 0
@@ -172,7 +206,11 @@ def course(sources: Sources) -> Picture:
         ]
         layers += [charts.label(losses, x.high, float(values[-1]), name, anchor="end", dy=dy) for name, values, dy in (("learned from", mine["training_loss"], 12), ("only watched", mine["held_out_loss"], -5)) if math.isfinite(values[-1])]  # fmt: skip
         alt = f"{learner}: the loss on segments that are only watched is least, {number(float(mine['held_out_loss'][least]), 2)}, after {int(mine['epoch'][least])} epochs"
-        panels = [charts.panel(losses, layers, alt=alt, css="dd wide", title="loss", x_ticks=False, units=("epochs", ""))]
+        panels = [
+            charts.panel(
+                losses, layers, alt=alt, css="dd wide", title="loss", x_ticks=False, units=("epochs", "")
+            )
+        ]
         share = 100 * mine["held_out_accuracy"]
         frame = charts.Frame(x, charts.linear(30, 100, ticks=4), 568, 130, 30)
         layers = [
@@ -185,15 +223,26 @@ def course(sources: Sources) -> Picture:
             )
         ]
         layers += (
-            [charts.level(frame, svc.value, "ref", f"support vector machine {number(svc.value, 1)}", above=False)]
+            [
+                charts.level(
+                    frame, svc.value, "ref", f"support vector machine {number(svc.value, 1)}", above=False
+                )
+            ]
             if isinstance(svc, Figure)
             else []
         )
         layers.append(charts.line(frame, mine["epoch"], share))
         highest = float(np.nanmax(share)) if np.isfinite(share).any() else math.nan
-        said.append(f"{learner} {number(highest, 1)}{THIN}% at best" + ("" if isinstance(best, Missing) else f", epoch {best} kept"))
+        said.append(
+            f"{learner} {number(highest, 1)}{THIN}% at best"
+            + ("" if isinstance(best, Missing) else f", epoch {best} kept")
+        )
         alt = f"{learner}: {number(highest, 1)} % of the watched images are named rightly at best"
-        panels.append(charts.panel(frame, layers, alt=alt, css="dd wide", title="% of images right", units=("epochs", "%")))
+        panels.append(
+            charts.panel(
+                frame, layers, alt=alt, css="dd wide", title="% of images right", units=("epochs", "%")
+            )
+        )
         columns.append(Column(learner[:1].upper() + learner[1:], "", "", panels))
     return Picture("course", title, f"On segments that are only watched: {'; '.join(said)}.", columns, "Mean cross entropy above, share of images named rightly below, against epochs. Grey line: what is learned from.", page.origin(sources.source("course", "train_classifier")))  # fmt: skip
 
@@ -207,9 +256,15 @@ def yardsticks(sources: Sources) -> dict[str, Any]:
     if isinstance(metrics, Missing):
         return {"missing": metrics, "rows": []}
     rows = []
-    for name, head in (("", "Vision transformer"), *((key, text[:1].upper() + text[1:]) for key, text in NAMES.items())):
+    for name, head in (
+        ("", "Vision transformer"),
+        *((key, text[:1].upper() + text[1:]) for key, text in NAMES.items()),
+    ):
         cells = []
-        for of, limit in (("image", sources.declared.rules.image_accuracy), ("window", sources.declared.rules.window_accuracy)):
+        for of, limit in (
+            ("image", sources.declared.rules.image_accuracy),
+            ("window", sources.declared.rules.window_accuracy),
+        ):
             found = accuracy(metrics, f"{name}_{of}".strip("_"))
             cells.append({"text": share_text(found), "band": band(found.low, found.high, 1) if isinstance(found, Figure) else "", "bad": isinstance(found, Figure) and not name and found.value < 100 * limit})  # fmt: skip
         rows.append({"name": head, "mark": "baseline" if name else "data_driven", "cells": cells})
@@ -223,7 +278,8 @@ def _conformal(sets: Any) -> str:
         return f"Sets of classes: {sets.sentence()}"
     asked = f" ({percent(100 * sets['asked'], 3)} asked for)" if sets.get("asked") is not None else ""
     return (
-        f"Sets of classes hold the true one in {percent(100 * sets['coverage'], 3)} of {sets['windows']:,} windows{asked}; "
+        f"Sets of classes hold the true one in {percent(100 * sets['coverage'], 3)} of "
+        f"{sets['windows']:,} windows{asked}; "
         f"in {percent(100 * sets['held'], 2)} the set is no single class, and nothing is sent."
     )
 
@@ -237,8 +293,10 @@ def _foreign(found: Any) -> list[dict[str, str]]:
         if isinstance(one, dict) and "auroc" in one:
             alarms = one.get("false_alarms", found.get("false_alarms"))
             rows.append({
-                "kind": str(kind), "auroc": _area(one["auroc"]), "energy": _area(one.get("energy_auroc")), "max_p": _area(one.get("max_p_auroc")),
-                "found": "not measured" if one.get("found") is None else percent(100 * one["found"], 2), "alarms": "not measured" if alarms is None else percent(100 * alarms, 2),
+                "kind": str(kind), "auroc": _area(one["auroc"]), "energy": _area(one.get("energy_auroc")),
+                "max_p": _area(one.get("max_p_auroc")),
+                "found": "not measured" if one.get("found") is None else percent(100 * one["found"], 2),
+                "alarms": "not measured" if alarms is None else percent(100 * alarms, 2),
             })  # fmt: skip
     return rows
 
@@ -255,7 +313,14 @@ def data(sources: Sources) -> list[tuple[str, str]]:
         return [("Frames", found.sentence())]
     frames, valid = found.get("frames"), found.get("valid")
     rejected = found.get("rejected") or {}
-    told = [("Source", str(lookup(metrics, "source")) if not isinstance(lookup(metrics, "source"), Missing) else "not said")]
+    told = [
+        (
+            "Source",
+            str(lookup(metrics, "source"))
+            if not isinstance(lookup(metrics, "source"), Missing)
+            else "not said",
+        )
+    ]
     told += (
         [("Frames", f"{frames:,}, of which {valid:,} ({percent(100 * valid / frames, 3)}) show a fresh line")]
         if frames and valid is not None
@@ -265,7 +330,11 @@ def data(sources: Sources) -> list[tuple[str, str]]:
         told += [("Rejected", ", ".join(f"{reason} {n:,}" for reason, n in rejected.items()) or "none")]
     told += [("Segments", f"{found['segments']:,}")] if isinstance(found.get("segments"), int) else []
     size, n = lookup(metrics, "size"), lookup(metrics, "parameters")
-    told += [("Classifier", f"{size}, {n:,} parameters")] if not isinstance(n, Missing) and not isinstance(size, Missing) else []
+    told += (
+        [("Classifier", f"{size}, {n:,} parameters")]
+        if not isinstance(n, Missing) and not isinstance(size, Missing)
+        else []
+    )
     return told
 
 
@@ -274,17 +343,35 @@ def frames(sources: Sources) -> dict[str, Any]:
     found = sources.tables["nozzle_frames"]
     if isinstance(found, Missing):
         return {"missing": found, "shown": [], "origin": Markup("")}
-    return {"missing": None, "shown": [_frame(one) for one in found], "origin": page.origin(sources.source("nozzle_frames"))}
+    return {
+        "missing": None,
+        "shown": [_frame(one) for one in found],
+        "origin": page.origin(sources.source("nozzle_frames")),
+    }
 
 
 def _frame(one: dict[str, Any]) -> dict[str, Any]:
     said, named, p = one.get("reason") or "", one.get("named"), one.get("p")
-    truth = CLASSES[one["label"]] if isinstance(one.get("label"), int) and 0 <= one["label"] < 3 else "not known"
-    judged = f"named {CLASSES[named]}, {number(max(p), 2)}" if isinstance(named, int) and 0 <= named < 3 and p else "not named"
+    truth = (
+        CLASSES[one["label"]] if isinstance(one.get("label"), int) and 0 <= one["label"] < 3 else "not known"
+    )
+    judged = (
+        f"named {CLASSES[named]}, {number(max(p), 2)}"
+        if isinstance(named, int) and 0 <= named < 3 and p
+        else "not named"
+    )
     state = f"{'held' if p else 'rejected'}: {said}" if said else judged
-    flow = "" if one.get("flow_percent") is None else f"flow {quantity(float(one['flow_percent']), '%', 0)} ({truth})"
+    flow = (
+        ""
+        if one.get("flow_percent") is None
+        else f"flow {quantity(float(one['flow_percent']), '%', 0)} ({truth})"
+    )
     heat = "" if one.get("temperature_degC") is None else f"{one['temperature_degC']:g}{THIN}°C"
-    score = "" if one.get("score") is None else f"the line stands out by {short(float(one['score']), 2)} gray levels"
+    score = (
+        ""
+        if one.get("score") is None
+        else f"the line stands out by {short(float(one['score']), 2)} gray levels"
+    )
     place = "" if one.get("place") in (*CLASSES, "rejected") else str(one.get("place", ""))
     return {
         "uri": Markup("{}").format(one["uri"]),

@@ -1,4 +1,5 @@
-"""The strip "why it acted": what each window of frames said, flow and temperature beside their bands, what was sent, and where nothing was, with the reason."""
+"""The strip "why it acted": what each window of frames said, flow and temperature beside their bands, what
+was sent, and where nothing was, with the reason."""
 
 import itertools
 from typing import Any
@@ -25,8 +26,15 @@ def strips(sources: Sources) -> dict[str, Any]:
     if isinstance(table, Missing):
         return {"missing": table, "shown": [], "origin": Markup("")}
     names = list(dict.fromkeys(map(str, table["episode"])))[:EPISODES]
-    shown = [_strip({key: values[table["episode"] == name] for key, values in table.items()}, name, i) for i, name in enumerate(names)]
-    gap = None if shown else Missing("not measured", "no episode was kept", "Run ./run dvc repro evaluate_setpoint")
+    shown = [
+        _strip({key: values[table["episode"] == name] for key, values in table.items()}, name, i)
+        for i, name in enumerate(names)
+    ]
+    gap = (
+        None
+        if shown
+        else Missing("not measured", "no episode was kept", "Run ./run dvc repro evaluate_setpoint")
+    )
     return {"missing": gap, "shown": shown, "origin": page.origin(sources.source("decisions"))}
 
 
@@ -44,7 +52,11 @@ def _strip(mine: Table, name: str, i: int) -> dict[str, Any]:
         np.abs(mine["temperature_degC"] - BEST_TEMPERATURE) <= TEMPERATURE_BAND
     )
     first = int(np.flatnonzero(~inside)[-1]) + 1 if not inside.all() else 0
-    end = f"inside for good from decision {first}, {number(float(t[first]), 0)}{THIN}s" if inside[-1] else "outside at the end"
+    end = (
+        f"inside for good from decision {first}, {number(float(t[first]), 0)}{THIN}s"
+        if inside[-1]
+        else "outside at the end"
+    )
     sent = int((mine["flow_move_percent"] != 0).sum())
     why = {text: sum(b - a for a, b, other in held if other == text) for _, _, text in held}
     holds = "; ".join(f"{text}, {count(n, 'window')}" for text, n in why.items())
@@ -56,7 +68,8 @@ def _strip(mine: Table, name: str, i: int) -> dict[str, Any]:
         "head": name,
         "controller": str(mine["controller"][0]),
         "finding": finding,
-        "panels": [_shares(mine, x, edges, held), _flow(mine, x, held, edges), _temperature(mine, x), _moves(mine, x)],
+        "panels": [_shares(mine, x, edges, held), _flow(mine, x, held, edges), _temperature(mine, x),
+        _moves(mine, x)],
         "rows": said[:SAID],
         "more": len(said[SAID:]),
     }  # fmt: skip
@@ -66,7 +79,11 @@ def _alike(mine: Table) -> list[tuple[int, int]]:
     """Stretches of windows that were held for one reason."""
     found = []
     for a, b in charts.stretches(np.asarray(mine["held"], bool)):
-        cuts = [a, *(k for k in range(a + 1, b) if reason(str(mine["why"][k])) != reason(str(mine["why"][k - 1]))), b]
+        cuts = [
+            a,
+            *(k for k in range(a + 1, b) if reason(str(mine["why"][k])) != reason(str(mine["why"][k - 1]))),
+            b,
+        ]
         found += itertools.pairwise(cuts)
     return found
 
@@ -81,14 +98,18 @@ def _shares(mine: Table, x: charts.Axis, edges: np.ndarray, held: list[tuple[int
     layers = []
     for column, css in SHARES:
         top, bottom = frame.py(low + mine[column]), frame.py(low)
-        boxes = "".join(f"M{px[k]:.1f} {top[k]:.1f}H{px[k + 1]:.1f}V{bottom[k]:.1f}H{px[k]:.1f}Z" for k in range(len(low)))
+        boxes = "".join(
+            f"M{px[k]:.1f} {top[k]:.1f}H{px[k + 1]:.1f}V{bottom[k]:.1f}H{px[k]:.1f}Z" for k in range(len(low))
+        )
         layers.append(Markup('<path class="{}" d="{}"/>').format(css, boxes))
         low = low + mine[column]
     layers += [_hatch(frame, float(px[a]), float(px[b])) for a, b, _ in held]
     named = [int(mine["p_under"].argmax()), int(mine["p_good"].argmax()), int(mine["p_over"].argmax())]
     alt = (
-        f"Shares of under, good and over-extruded over {len(low)} windows: under peaks at {number(float(mine['p_under'][named[0]]), 2)}, "
-        f"over at {number(float(mine['p_over'][named[2]]), 2)}; {sum(b - a for a, b, _ in held)} windows were held"
+        f"Shares of under, good and over-extruded over {len(low)} windows: "
+        f"under peaks at {number(float(mine['p_under'][named[0]]), 2)}, "
+        f"over at {number(float(mine['p_over'][named[2]]), 2)}; "
+        f"{sum(b - a for a, b, _ in held)} windows were held"
     )
     return charts.panel(frame, layers, alt=alt, css="mb strip-why", title="share of under (brown), good (grey), over (green); hatched: nothing may be sent", x_ticks=False, units=("s", ""))  # fmt: skip
 
@@ -102,9 +123,9 @@ def _hatch(frame: charts.Frame, a: float, b: float) -> Markup:
         first, last = max(x, a), min(x + height, b)
         if last > first:
             strokes.append(f"M{first:.1f} {bottom - (first - x):.1f}L{last:.1f} {bottom - (last - x):.1f}")
-    return Markup('<rect class="veil" x="{:.1f}" width="{:.1f}" y="{}" height="{}"/><path class="hatch" d="{}"/>').format(
-        a, max(b - a, 1.0), top, height, "".join(strokes)
-    )
+    return Markup(
+        '<rect class="veil" x="{:.1f}" width="{:.1f}" y="{}" height="{}"/><path class="hatch" d="{}"/>'
+    ).format(a, max(b - a, 1.0), top, height, "".join(strokes))
 
 
 def _flow(mine: Table, x: charts.Axis, held: list[tuple[int, int, str]], edges: np.ndarray) -> Markup:
@@ -122,14 +143,18 @@ def _flow(mine: Table, x: charts.Axis, held: list[tuple[int, int, str]], edges: 
         start = min(float(frame.px(edges[a])), WIDTH - 6.2 * (len(text) + 6))
         if start < free:
             continue
-        layers.append(Markup('<text x="{:.1f}" y="{}">{}</text>').format(start, frame.above + 9, f"held: {text}"))
+        layers.append(
+            Markup('<text x="{:.1f}" y="{}">{}</text>').format(start, frame.above + 9, f"held: {text}")
+        )
         free = start + 6.2 * (len(text) + 8)
     alt = f"True flow from {number(float(mine['flow_percent'][0]), 0)} to {number(float(mine['flow_percent'][-1]), 0)} %, between {number(float(mine['flow_percent'].min()), 0)} and {number(float(mine['flow_percent'].max()), 0)} %"
     return charts.panel(frame, layers, alt=alt, css="dd strip-why", title="true flow, % (dashed: setpoint; grey: what is asked for)", x_ticks=False, units=("s", "%"))  # fmt: skip
 
 
 def _temperature(mine: Table, x: charts.Axis) -> Markup:
-    values = np.concatenate([mine["temperature_degC"], mine["target_degC"], [BEST_TEMPERATURE - 12, BEST_TEMPERATURE + 12]])
+    values = np.concatenate(
+        [mine["temperature_degC"], mine["target_degC"], [BEST_TEMPERATURE - 12, BEST_TEMPERATURE + 12]]
+    )
     frame = _frame(x, charts.linear(float(values.min()) - 2, float(values.max()) + 2, ticks=3), 104)
     layers = [
         charts.tint(frame, BEST_TEMPERATURE - TEMPERATURE_BAND, BEST_TEMPERATURE + TEMPERATURE_BAND),
@@ -137,14 +162,26 @@ def _temperature(mine: Table, x: charts.Axis) -> Markup:
         charts.line(frame, mine["time_s"], mine["temperature_degC"]),
     ]
     alt = f"Nozzle temperature from {number(float(mine['temperature_degC'][0]), 0)} to {number(float(mine['temperature_degC'][-1]), 0)} °C"
-    return charts.panel(frame, layers, alt=alt, css="dd strip-why", title="nozzle, °C (dashed: target)", x_ticks=False, units=("s", "°C"))
+    return charts.panel(
+        frame,
+        layers,
+        alt=alt,
+        css="dd strip-why",
+        title="nozzle, °C (dashed: target)",
+        x_ticks=False,
+        units=("s", "°C"),
+    )
 
 
 def _moves(mine: Table, x: charts.Axis) -> Markup:
     reach = max(10.0, float(np.abs(mine["flow_move_percent"]).max()))
     frame = _frame(x, charts.Axis(-1.25 * reach, 1.25 * reach, ((-reach, number(-reach, 0)), (0.0, "0"), (reach, number(reach, 0)))), 92, last=True)  # fmt: skip
     moves = np.where(mine["flow_move_percent"] == 0, np.nan, mine["flow_move_percent"])
-    warm = [(float(t), float(move)) for t, move in zip(mine["time_s"], mine["temperature_move_degC"], strict=True) if move]
+    warm = [
+        (float(t), float(move))
+        for t, move in zip(mine["time_s"], mine["temperature_move_degC"], strict=True)
+        if move
+    ]
     layers = [charts.level(frame, 0, "lim"), charts.stems(frame, mine["time_s"], moves)]
     for t, move in warm:
         # text on the free side of its tick

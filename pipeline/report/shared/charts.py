@@ -1,5 +1,5 @@
-"""Figures as inline SVG in the theme's colours: axes, lines, bands, dots and the strip. Each states its finding in words; nothing here
-knows of a stage."""
+"""Figures as inline SVG in the theme's colours: axes, lines, bands, dots and the strip. Each states its
+finding in words; nothing here knows of a stage."""
 
 import math
 from collections.abc import Sequence
@@ -19,11 +19,18 @@ def _n(value: float) -> str:
 # ---- the strip of page one
 
 
-def strip(question: Question, shown: Sequence[tuple[str, str, Figure | Missing]], lanes: Sequence[int] = (11, 23)) -> Markup:
-    """Share of the allowance from 0 to twice the limit, the limit in the middle of every row; (name, class, figure) in `lanes`, which
-    never overlap.
+def strip(
+    question: Question, shown: Sequence[tuple[str, str, Figure | Missing]], lanes: Sequence[int] = (11, 23)
+) -> Markup:
+    """Share of the allowance from 0 to twice the limit, the limit in the middle of every row; (name, class,
+    figure) in `lanes`, which never overlap.
     """
-    parts = [Markup('<rect class="beyond" x="50%" width="50%" height="100%"/><line class="limit" x1="50%" x2="50%" y1="0" y2="100%"/>')]
+    parts = [
+        Markup(
+            '<rect class="beyond" x="50%" width="50%" height="100%"/><line class="limit" x1="50%" '
+            'x2="50%" y1="0" y2="100%"/>'
+        )
+    ]
     said = []
     for (name, css, figure), y in zip(shown, lanes, strict=False):
         if isinstance(figure, Missing):
@@ -32,7 +39,9 @@ def strip(question: Question, shown: Sequence[tuple[str, str, Figure | Missing]]
         parts.append(_lane(question, css, figure, y))
         said.append(f"{name} {_used(question, figure)}")
     alt = "; ".join(said)
-    return Markup('<svg role="img" aria-label="{}">{}</svg>').format(alt[:1].upper() + alt[1:], Markup("").join(parts))
+    return Markup('<svg role="img" aria-label="{}">{}</svg>').format(
+        alt[:1].upper() + alt[1:], Markup("").join(parts)
+    )
 
 
 def _used(question: Question, figure: Figure) -> str:
@@ -51,28 +60,39 @@ def _lane(question: Question, css: str, figure: Figure, y: int) -> Markup:
     low, middle, high = sorted(min(share(question, v), 2.0) for v in (figure.low, figure.value, figure.high))
     css = f"{css} bad" if css != "acc" and state(question, figure) == FAILED else css
     bar = (
-        Markup('<line class="{}" x1="{}%" x2="{}%" y1="{}" y2="{}"/>').format(css, _n(50 * low), _n(50 * high), y, y) if high > low else ""
+        Markup('<line class="{}" x1="{}%" x2="{}%" y1="{}" y2="{}"/>').format(
+            css, _n(50 * low), _n(50 * high), y, y
+        )
+        if high > low
+        else ""
     )
     middle = min(share(question, figure.value), 2.0)
     if middle >= 2.0:
         # beyond the scale: the mark keeps its shape, and an arrow says that it goes on
         arrow = Markup('<path class="more {}" d="M-7 {}l4 3.5l-4 3.5"/>').format(css, _n(y - 3.5))
-        return Markup('{}<svg x="100%" overflow="visible">{}{}</svg>').format(bar, _mark(css, "-14", y), arrow)
+        return Markup('{}<svg x="100%" overflow="visible">{}{}</svg>').format(
+            bar, _mark(css, "-14", y), arrow
+        )
     return Markup("{}{}").format(bar, _mark(css, f"{_n(max(50 * middle, 0.8))}%", y))
 
 
 def _mark(css: str, x: str, y: float) -> Markup:
     kind = css.split()[0]
     if kind == "mb":
-        return Markup('<rect class="{}" x="{}" y="{}" width="7" height="7" transform="translate(-3.5 -3.5)"/>').format(css, x, y)
-    return Markup('<circle class="{}" cx="{}" cy="{}" r="{}"/>').format(css, x, y, "4.5" if kind == "dd" else "4")
+        return Markup(
+            '<rect class="{}" x="{}" y="{}" width="7" height="7" transform="translate(-3.5 -3.5)"/>'
+        ).format(css, x, y)
+    return Markup('<circle class="{}" cx="{}" cy="{}" r="{}"/>').format(
+        css, x, y, "4.5" if kind == "dd" else "4"
+    )
 
 
 def before_and_now(question: Question, css: str, before: Figure, now: Figure, limit: str) -> Markup:
     """The accepted run (ring) above this one (filled), the limit at half width."""
     old, new = _lane(question, "acc", before, 30), _lane(question, css, now, 50)
     frame = Markup(
-        '<rect class="beyond" x="50%" width="50%" y="20" height="40"/><line class="limit" x1="50%" x2="50%" y1="20" y2="60"/>'
+        '<rect class="beyond" x="50%" width="50%" y="20" height="40"/><line class="limit" x1="50%" '
+        'x2="50%" y1="20" y2="60"/>'
         '<text x="50%" y="14" text-anchor="middle">limit {}</text>'
     ).format(limit)
     alt = (
@@ -132,7 +152,11 @@ def logarithmic(low: float, high: float, *, every: int = 0) -> Axis:
 
 
 def _power(k: int) -> str:
-    return number(10.0**k, max(-k, 0)) if -3 <= k <= 4 else "10" + str(k).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    return (
+        number(10.0**k, max(-k, 0))
+        if -3 <= k <= 4
+        else "10" + str(k).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    )
 
 
 class Frame(NamedTuple):
@@ -164,36 +188,51 @@ def panel(
     x_ticks: bool = True,
     units: tuple[str, str] = ("", ""),
 ) -> Markup:
-    """The layers on their axes; `title` stands above the y axis and names quantity and unit, `alt` states the finding, `units` (across, up)
-    stand behind the values that the pointer reads off.
+    """The layers on their axes; `title` stands above the y axis and names quantity and unit, `alt` states the
+    finding, `units` (across, up) stand behind the values that the pointer reads off.
     """
     axes = []
     for value, label in frame.y.ticks:
         y = float(frame.py(value))
         axes.append(
-            Markup('<line class="tk" x1="{}" x2="{}" y1="{}" y2="{}"/><text x="{}" y="{}" text-anchor="end">{}</text>').format(
-                frame.left, frame.width - frame.right, _n(y), _n(y), frame.left - 4, _n(y + 3.5), label
-            )
+            Markup(
+                '<line class="tk" x1="{}" x2="{}" y1="{}" y2="{}"/><text x="{}" y="{}" '
+                'text-anchor="end">{}</text>'
+            ).format(frame.left, frame.width - frame.right, _n(y), _n(y), frame.left - 4, _n(y + 3.5), label)
         )
     base = frame.height - frame.below
     for value, label in frame.x.ticks if x_ticks else ():
         x = float(frame.px(value))
         anchor = "start" if x < frame.left + 5 else "end" if x > frame.width - frame.right - 8 else "middle"
         axes.append(
-            Markup('<line class="ax" x1="{}" x2="{}" y1="{}" y2="{}"/><text x="{}" y="{}" text-anchor="{}">{}</text>').format(
-                _n(x), _n(x), base, base + 3, _n(x), frame.height - 2, anchor, label
-            )
+            Markup(
+                '<line class="ax" x1="{}" x2="{}" y1="{}" y2="{}"/><text x="{}" y="{}" '
+                'text-anchor="{}">{}</text>'
+            ).format(_n(x), _n(x), base, base + 3, _n(x), frame.height - 2, anchor, label)
         )
-    axes.append(Markup('<line class="ax" x1="{}" x2="{}" y1="{}" y2="{}"/>').format(frame.left, frame.width - frame.right, base, base))
+    axes.append(
+        Markup('<line class="ax" x1="{}" x2="{}" y1="{}" y2="{}"/>').format(
+            frame.left, frame.width - frame.right, base, base
+        )
+    )
     head = Markup('<text class="yt" x="0" y="9">{}</text>').format(title) if title else ""
-    return Markup('<svg class="plot {}" viewBox="0 0 {} {}" role="img" aria-label="{}"{}>{}{}{}</svg>').format(
-        css, frame.width, frame.height, alt, readable(frame, units), Markup("").join(axes), Markup("").join(layers), head
+    return Markup(
+        '<svg class="plot {}" viewBox="0 0 {} {}" role="img" aria-label="{}"{}>{}{}{}</svg>'
+    ).format(
+        css,
+        frame.width,
+        frame.height,
+        alt,
+        readable(frame, units),
+        Markup("").join(axes),
+        Markup("").join(layers),
+        head,
     )
 
 
 def readable(frame: Frame, units: tuple[str, str] = ("", "")) -> Markup:
-    """What a script needs to tell the values below the pointer: room left, right, above, below, width and height in px, then the scales.
-    A scale without ticks is one of names, and is not told.
+    """What a script needs to tell the values below the pointer: room left, right, above, below, width and
+    height in px, then the scales. A scale without ticks is one of names, and is not told.
     """
     room = (frame.left, frame.right, frame.above, frame.below, frame.width, frame.height)
     scales = Markup("").join(
@@ -209,7 +248,8 @@ def readable(frame: Frame, units: tuple[str, str] = ("", "")) -> Markup:
 
 
 def decimated(x: np.ndarray, y: np.ndarray, most: int = 240) -> tuple[np.ndarray, np.ndarray]:
-    """At most 3 `most` points: of each of `most` stretches its lowest and its highest, so that no peak is lost, and a missing one."""
+    """At most 3 `most` points: of each of `most` stretches its lowest and its
+    highest, so that no peak is lost, and a missing one."""
     if len(x) <= 2 * most:
         return x, y
     size = -(-len(x) // most)
@@ -219,14 +259,16 @@ def decimated(x: np.ndarray, y: np.ndarray, most: int = 240) -> tuple[np.ndarray
     # and one that is missing, where any is: the line must break there
     missing = np.isnan(rows).argmax(axis=1)
     index = np.unique(
-        np.stack([lowest, highest, np.where(np.isnan(rows).any(axis=1), missing, lowest)], axis=1) + size * np.arange(len(rows))[:, None]
+        np.stack([lowest, highest, np.where(np.isnan(rows).any(axis=1), missing, lowest)], axis=1)
+        + size * np.arange(len(rows))[:, None]
     )
     index = index[index < len(x)]
     return x[index], y[index]
 
 
 def line(frame: Frame, x, y, css: str = "line", *, steps: bool = False, most: int = 240) -> Markup:
-    """A line; it breaks where y is missing. `steps` holds a value until the next sample, as inputs do; `most` as in `decimated`."""
+    """A line; it breaks where y is missing. `steps` holds a value until the next
+    sample, as inputs do; `most` as in `decimated`."""
     x, y = decimated(np.asarray(x, float), np.asarray(y, float), most)
     px, py = frame.px(x), frame.py(y)
     path, pen = [], "M"
@@ -246,7 +288,9 @@ def level(frame: Frame, value: float, css: str, label: str = "", *, above: bool 
     """A horizontal line across the panel, such as a limit or the optimum, with its name at the right end."""
     y = float(frame.py(value))
     text = (
-        Markup('<text x="{}" y="{}" text-anchor="end">{}</text>').format(frame.width - frame.right, _n(y - 4 if above else y + 11), label)
+        Markup('<text x="{}" y="{}" text-anchor="end">{}</text>').format(
+            frame.width - frame.right, _n(y - 4 if above else y + 11), label
+        )
         if label
         else ""
     )
@@ -289,7 +333,9 @@ def ribbon(frame: Frame, x, low, high, css: str = "ribbon") -> Markup:
 def stems(frame: Frame, x, y, css: str = "stem") -> Markup:
     """A stroke from zero to each value."""
     zero = _n(float(frame.py(0.0)))
-    strokes = "".join(f"M{_n(a)} {zero}V{_n(b)}" for a, b in zip(frame.px(x), frame.py(y), strict=True) if not math.isnan(b))
+    strokes = "".join(
+        f"M{_n(a)} {zero}V{_n(b)}" for a, b in zip(frame.px(x), frame.py(y), strict=True) if not math.isnan(b)
+    )
     return Markup('<path class="{}" d="{}"/>').format(css, strokes) if strokes else Markup("")
 
 
@@ -297,7 +343,8 @@ def crosses(frame: Frame, x, y, css: str = "cross", size: float = 3.5) -> Markup
     """Poles, as the field draws them."""
     back = _n(2 * size)
     strokes = "".join(
-        f"M{_n(a - size)} {_n(b - size)}l{back} {back}m-{back} 0l{back} -{back}" for a, b in zip(frame.px(x), frame.py(y), strict=True)
+        f"M{_n(a - size)} {_n(b - size)}l{back} {back}m-{back} 0l{back} -{back}"
+        for a, b in zip(frame.px(x), frame.py(y), strict=True)
     )
     return Markup('<path class="{}" d="{}"/>').format(css, strokes)
 
@@ -305,11 +352,15 @@ def crosses(frame: Frame, x, y, css: str = "cross", size: float = 3.5) -> Markup
 def dots(frame: Frame, x, y, css: str = "dot", radius: float = 2.2) -> Markup:
     pairs = zip(np.atleast_1d(frame.px(x)), np.atleast_1d(frame.py(y)), strict=True)
     return Markup("").join(
-        Markup('<circle class="{}" cx="{}" cy="{}" r="{}"/>').format(css, _n(a), _n(b), radius) for a, b in pairs if not math.isnan(b)
+        Markup('<circle class="{}" cx="{}" cy="{}" r="{}"/>').format(css, _n(a), _n(b), radius)
+        for a, b in pairs
+        if not math.isnan(b)
     )
 
 
-def label(frame: Frame, x: float, y: float, text: str, *, anchor: str = "start", dx: float = 0, dy: float = 0) -> Markup:
+def label(
+    frame: Frame, x: float, y: float, text: str, *, anchor: str = "start", dx: float = 0, dy: float = 0
+) -> Markup:
     return Markup('<text x="{}" y="{}" text-anchor="{}">{}</text>').format(
         _n(float(frame.px(x)) + dx), _n(float(frame.py(y)) + dy), anchor, text
     )
@@ -328,12 +379,18 @@ def spark(
     limit_label: str,
     units: tuple[str, str] = ("", ""),
 ) -> Markup:
-    """A panel of a loop's card: no ticks, the allowed region grey, the last point marked, vermillion where it lies outside."""
+    """A panel of a loop's card: no ticks, the allowed region grey, the last
+    point marked, vermillion where it lies outside."""
     frame = Frame(linear(float(x[0]), float(x[-1])), axis, 104, 88, 1, 4, 4, 4)
     end = Markup('<circle class="end{}" cx="{}" cy="{}" r="3"/>').format(
         " bad" if bad else "", _n(float(frame.px(x[-1]))), _n(float(frame.py(y[-1])))
     )
-    layers = [tint(frame, axis.low, limit), line(frame, x, y), level(frame, limit, "lim", limit_label if named else ""), end]
+    layers = [
+        tint(frame, axis.low, limit),
+        line(frame, x, y),
+        level(frame, limit, "lim", limit_label if named else ""),
+        end,
+    ]
     return Markup('<svg class="spark {}" viewBox="0 0 104 88" role="img" aria-label="{}"{}>{}</svg>').format(
         css, alt, readable(frame, units), Markup("").join(layers)
     )

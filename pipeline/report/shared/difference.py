@@ -12,8 +12,8 @@ from pipeline.report.temperature.answers import all_answers
 
 
 class Move(NamedTuple):
-    """A figure in both runs. `moved`: its bands no longer overlap; `word`: better, worse, within noise, unchanged, or why it cannot be
-    said.
+    """A figure in both runs. `moved`: its bands no longer overlap; `word`: better, worse, within noise,
+    unchanged, or why it cannot be said.
     """
 
     question: Question
@@ -38,8 +38,9 @@ class Move(NamedTuple):
 
 
 class Difference(NamedTuple):
-    """`inputs`, `parameters` (name, before, now), `code` with its `files`, and `artifacts` (path, new | changed | gone) that changed;
-    `same`: how many artifacts did not; `machine`: the accepted run's, where nothing but the machine can differ from it, else {}.
+    """`inputs`, `parameters` (name, before, now), `code` with its `files`, and `artifacts` (path, new |
+    changed | gone) that changed; `same`: how many artifacts did not; `machine`: the accepted run's, where
+    nothing but the machine can differ from it, else {}.
     """
 
     inputs: list[str]
@@ -70,17 +71,26 @@ def difference(sources: Sources) -> Difference | None:
     known = {
         path: value
         for path, value in hashes.items()
-        if path.startswith(("datasets/", "reports/metrics/")) and path.rsplit("/", 1)[-1] not in ("report.json", "nightly.json")
+        if path.startswith(("datasets/", "reports/metrics/"))
+        and path.rsplit("/", 1)[-1] not in ("report.json", "nightly.json")
     }
     recorded = {path.split("/", 1)[0] for path in known}
     now = {path: value for path, value in now.items() if path.split("/", 1)[0] in recorded}
-    changes = [(path, "changed" if path in known else "new") for path in sorted(now) if known.get(path) != now[path]]
+    changes = [
+        (path, "changed" if path in known else "new") for path in sorted(now) if known.get(path) != now[path]
+    ]
     # what no page reads is not hashed again; that it is not there any more is seen
     folders_read = {path.rsplit("/", 1)[0] for path in now}
     changes += [
-        (path, "gone") for path in sorted(known) if path not in now and path.rsplit("/", 1)[0] in folders_read and not Path(path).exists()
+        (path, "gone")
+        for path in sorted(known)
+        if path not in now and path.rsplit("/", 1)[0] in folders_read and not Path(path).exists()
     ]
-    inputs = [path for path, _ in changes if path.split("/")[1] == "raw" or path.split("/")[1:] == ["ingest", "record.parquet"]]
+    inputs = [
+        path
+        for path, _ in changes
+        if path.split("/")[1] == "raw" or path.split("/")[1:] == ["ingest", "record.parquet"]
+    ]
     # the accepted run may know the code by its folders, as it knows artifacts
     folders = {path: value for path, value in hashes.items() if path in ("pipeline", "stages")}
     code = digest(folders) if folders else None
@@ -102,14 +112,25 @@ def difference(sources: Sources) -> Difference | None:
 def _changed(before: Mapping[str, str], now: Mapping[str, str]) -> list[tuple[str, str]]:
     """(path, new | changed | gone) of every file whose digest is another."""
     words = {(True, True): "changed", (False, True): "new", (True, False): "gone"}
-    return [(path, words[path in before, path in now]) for path in sorted(before.keys() | now.keys()) if before.get(path) != now.get(path)]
+    return [
+        (path, words[path in before, path in now])
+        for path in sorted(before.keys() | now.keys())
+        if before.get(path) != now.get(path)
+    ]
 
 
 def _parameters(before: Mapping, now: Mapping) -> Iterator[tuple[str, str, str]]:
     # a section that is new or gone is one change
     for name in sorted(before.keys() ^ now.keys()):
         values = count(len(list(_flat("", before.get(name, now.get(name))))), "value")
-        yield name, *(("no section", f"a section of {values}") if name in now else (f"a section of {values}", "no section"))
+        yield (
+            name,
+            *(
+                ("no section", f"a section of {values}")
+                if name in now
+                else (f"a section of {values}", "no section")
+            ),
+        )
     both = before.keys() & now.keys()
     old, new = (dict(_flat("", {name: part[name] for name in both})) for part in (before, now))
     for name in sorted(old.keys() | new.keys()):
@@ -122,7 +143,13 @@ def _shown(values: Mapping[str, Any], name: str) -> str:
 
 
 def _flat(prefix: str, data: Any) -> Iterator[tuple[str, Any]]:
-    items = data.items() if isinstance(data, Mapping) and data else enumerate(data) if isinstance(data, list) and data else None
+    items = (
+        data.items()
+        if isinstance(data, Mapping) and data
+        else enumerate(data)
+        if isinstance(data, list) and data
+        else None
+    )
     if items is None:
         yield prefix, data
         return
@@ -138,16 +165,26 @@ def accepted_answers(sources: Sources, asked: list[Question]) -> Mapping[str, Ma
     return all_answers(sources._replace(metrics=metrics, tables=dict.fromkeys(sources.tables, gone)), asked)
 
 
-def moves(sources: Sources, asked: list[Question], answers: Mapping[str, Mapping[str, Figure | Missing]]) -> dict[str, list[Move]]:
-    """{controller: every figure against the accepted run's}; unchanged is what the metrics alone say, moved what the bands say."""
+def moves(
+    sources: Sources, asked: list[Question], answers: Mapping[str, Mapping[str, Figure | Missing]]
+) -> dict[str, list[Move]]:
+    """{controller: every figure against the accepted run's}; unchanged is what
+    the metrics alone say, moved what the bands say."""
     if sources.accepted.get("figures"):
         before, plain = _recorded(sources.accepted["figures"]), answers
     else:
         before = accepted_answers(sources, asked)
-        plain = all_answers(sources._replace(tables=dict.fromkeys(sources.tables, Missing("not measured", ""))), asked)
+        plain = all_answers(
+            sources._replace(tables=dict.fromkeys(sources.tables, Missing("not measured", ""))), asked
+        )
     return {
         name: [
-            _move(question, before.get(name, {}).get(question.key), plain[name][question.key], answers[name][question.key])
+            _move(
+                question,
+                before.get(name, {}).get(question.key),
+                plain[name][question.key],
+                answers[name][question.key],
+            )
             for question in asked
         ]
         for name in answers
@@ -157,12 +194,17 @@ def moves(sources: Sources, asked: list[Question], answers: Mapping[str, Mapping
 def _recorded(figures: Mapping[str, Any]) -> dict[str, dict[str, Figure | Missing]]:
     """The figures as the accepted pages showed them; null is without end."""
     return {
-        name: {key: Figure(*(math.inf if f[end] is None else f[end] for end in ("median", "low", "high"))) for key, f in found.items()}
+        name: {
+            key: Figure(*(math.inf if f[end] is None else f[end] for end in ("median", "low", "high")))
+            for key, f in found.items()
+        }
         for name, found in figures.items()
     }
 
 
-def _move(question: Question, before: Figure | Missing | None, plain: Figure | Missing, now: Figure | Missing) -> Move:
+def _move(
+    question: Question, before: Figure | Missing | None, plain: Figure | Missing, now: Figure | Missing
+) -> Move:
     if isinstance(now, Missing):
         return Move(question, None, now, False, now.state)
     if before is None or isinstance(before, Missing):
@@ -171,4 +213,6 @@ def _move(question: Question, before: Figure | Missing | None, plain: Figure | M
         return Move(question, before, now, False, "unchanged")
     if now.low <= before.high and before.low <= now.high:
         return Move(question, before, now, False, "within noise")
-    return Move(question, before, now, True, "better" if (now.value < before.value) != question.at_least else "worse")
+    return Move(
+        question, before, now, True, "better" if (now.value < before.value) != question.at_least else "worse"
+    )

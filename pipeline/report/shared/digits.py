@@ -1,5 +1,5 @@
-"""Numbers as a reader meets them: as many decimals as their band supports, a true minus, thin spaces before units, "never" for what
-never comes."""
+"""Numbers as a reader meets them: as many decimals as their band supports, a true minus, thin spaces before
+units, "never" for what never comes."""
 
 import math
 import re
@@ -8,8 +8,8 @@ MINUS, THIN, DASH = "\u2212", "\u202f", "\u2013"
 
 
 def decimals(low: float, high: float, *, value: float = 0.0) -> int:
-    """Decimals that a band supports: steps of at most a fifth of its width, and at most three significant digits of the value, but at
-    least one of them.
+    """Decimals that a band supports: steps of at most a fifth of its width, and at most three significant
+    digits of the value, but at least one of them.
     """
     size = abs(value) if math.isfinite(value) else 0.0
     if all(float(number).is_integer() for number in (low, high, value) if math.isfinite(number)):
@@ -32,7 +32,8 @@ def number(value: float, places: int) -> str:
 
 
 def typeset(text: str | float) -> str:
-    """A line of a log as a page sets it: "-15.1 %" with a true minus and a thin space; names such as night-0005 and dates stay."""
+    """A line of a log as a page sets it: "-15.1 %" with a true minus and a thin
+    space; names such as night-0005 and dates stay."""
     signed = re.sub(r"(?<![\w.\-])-(?=\d)", MINUS, str(text))
     return re.sub(r"(?<=\d) (?=%|°C)", THIN, signed)
 
@@ -59,7 +60,8 @@ def band(low: float, high: float, places: int, *, beyond: str = "never") -> str:
 
 
 def short(value: float, digits: int = 3) -> str:
-    """A number outside a band, to `digits` significant digits: 0.00123, 45.6, 183,362, 3.1 x 10^-8 in superscript."""
+    """A number outside a band, to `digits` significant digits:
+    0.00123, 45.6, 183,362, 3.1 x 10^-8 in superscript."""
     if value == 0 or not math.isfinite(value):
         return "0" if value == 0 else "none"
     exponent = math.floor(math.log10(abs(value)))
@@ -78,7 +80,21 @@ def _superscript(exponent: int) -> str:
 
 def count(value: int, one: str, many: str = "") -> str:
     """1 -> "one run", 24 -> "24 runs"; small numbers are words."""
-    words = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
+    words = (
+        "no",
+        "one",
+        "two",
+        "three",
+        "four",
+        "five",
+        "six",
+        "seven",
+        "eight",
+        "nine",
+        "ten",
+        "eleven",
+        "twelve",
+    )
     return f"{words[value] if 0 <= value < len(words) else f'{value:,}'} {one if value == 1 else many or one + 's'}"
 
 

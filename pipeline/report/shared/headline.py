@@ -1,4 +1,5 @@
-"""What page one says first: one sentence for the machine, and a row for each loop with its decision, the rule that decided it and what to do."""
+"""What page one says first: one sentence for the machine, and a row for each loop with its
+decision, the rule that decided it and what to do."""
 
 import math
 import re
@@ -14,12 +15,14 @@ from pipeline.report.temperature.judgement import Judgement
 NAMES = ("temperature", "deposition", "setpoint")
 MOVES = ("heaters to barrel", "plunger to flow", "camera to setpoints")
 ABSENT = "not measured"
-# what the first screen has room for beside the answers: lines in all, and letters in a line of the widest font
+# what the first screen has room for beside the answers: lines in all,
+# and letters in a line of the widest font
 LINES, LINE = 11, 72
 
 
 class Loop(NamedTuple):
-    """One loop: its state (passed, failed, open, not measured), and whole sentences; `lead` is bold and vermillion where it failed."""
+    """One loop: its state (passed, failed, open, not measured), and whole
+    sentences; `lead` is bold and vermillion where it failed."""
 
     name: str
     moves: str
@@ -31,7 +34,8 @@ class Loop(NamedTuple):
 
 
 def loops(sources: Sources, judged: Judgement) -> list[Loop]:
-    """Temperature, deposition, setpoint, each as short as page one has room for; the loop's own page has the whole."""
+    """Temperature, deposition, setpoint, each as short as page one has
+    room for; the loop's own page has the whole."""
     mine, parts, seen = judged.verdict, deposition_verdict.verdict(sources), setpoint_verdict.verdict(sources)
     states = (
         {PASSED: "passed", FAILED: "failed"}.get(mine.state, "open"),
@@ -42,26 +46,38 @@ def loops(sources: Sources, judged: Judgement) -> list[Loop]:
         (mine.decision, mine.lead, mine.reason, mine.remedy),
         *((v.decision, v.lead, _first(v.reason), v.remedy) for v in (parts, seen)),
     )
-    found = [Loop(name, moves, state, *one) for name, moves, state, one in zip(NAMES, MOVES, states, said, strict=True)]
+    found = [
+        Loop(name, moves, state, *one)
+        for name, moves, state, one in zip(NAMES, MOVES, states, said, strict=True)
+    ]
     return _fitted(found)
 
 
 def _first(text: str) -> str:
     """The first sentence, up to its first semicolon where that is long."""
     sentence = re.split(_SENTENCES, text, maxsplit=1)[0]
-    return sentence if len(sentence) <= 2 * LINE + 20 else re.split(r"; ", sentence, maxsplit=1)[0].rstrip(".") + "."
+    return (
+        sentence
+        if len(sentence) <= 2 * LINE + 20
+        else re.split(r"; ", sentence, maxsplit=1)[0].rstrip(".") + "."
+    )
 
 
 _SENTENCES = r"(?<=[.!?]) (?=[A-Z])"
 
 
 def _fitted(found: Sequence[Loop]) -> list[Loop]:
-    """Where there is no room for all reasons, those that take more than a third of it are cut at their end; then remedies by whole sentences, those of a loop that did not
-    pass first.
+    """Where there is no room for all reasons, those that take more than a third of it are cut at their end;
+    then remedies by whole sentences, those of a loop that did not pass first.
     """
     kept = [loop._replace(remedy="") for loop in found]
     if sum(map(_lines, kept)) > LINES:
-        kept = [loop._replace(reason=_cut(loop.reason, LINES // 3 * LINE - len(loop.decision) - len(loop.lead) - 2)) for loop in kept]
+        kept = [
+            loop._replace(
+                reason=_cut(loop.reason, LINES // 3 * LINE - len(loop.decision) - len(loop.lead) - 2)
+            )
+            for loop in kept
+        ]
     for i in sorted(range(len(found)), key=lambda i: found[i].state == "passed"):
         for sentence in filter(None, re.split(_SENTENCES, found[i].remedy)):
             longer = kept[i]._replace(remedy=f"{kept[i].remedy} {sentence}".strip())
@@ -98,14 +114,19 @@ def claim(sources: Sources, names: Sequence[str] = NAMES) -> str:
     said = [f"{name} {RECORDED[name]}" for name in names if name not in made]
     if made:
         which = "" if len(names) == len(made) else f"{_listed(made, 'and')} "
-        said.append(f"{which}judged on simulated machines only: nothing is claimed about a real printer".strip())
+        said.append(
+            f"{which}judged on simulated machines only: nothing is claimed about a real printer".strip()
+        )
     text = "; ".join(said)
     return f"{text[:1].upper()}{text[1:]}."
 
 
 def decision(found: Sequence[Loop]) -> str:
     """ "Deploy temperature and deposition; do not deploy setpoint." """
-    groups = {state: [loop.name for loop in found if loop.state == state] for state in ("passed", "failed", "open", ABSENT)}
+    groups = {
+        state: [loop.name for loop in found if loop.state == state]
+        for state in ("passed", "failed", "open", ABSENT)
+    }
     if len(groups["passed"]) == len(found):
         return "Deploy all three loops."
     said = [
@@ -129,4 +150,6 @@ def _listed(names: Sequence[str], word: str) -> str:
 def state(found: Sequence[Loop]) -> str:
     """The worst of the loops that were measured: failed before open before passed."""
     states = {loop.state for loop in found}
-    return next((one for one in ("failed", "open") if one in states), "passed" if "passed" in states else "open")
+    return next(
+        (one for one in ("failed", "open") if one in states), "passed" if "passed" in states else "open"
+    )

@@ -12,9 +12,23 @@ from pipeline.report.shared.sources import Source
 from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, UNDECIDED
 from pipeline.store import artifacts
 
-GLYPHS = {PASSED: "tick", FAILED: "cross", UNDECIDED: "open", OPEN: "open", "not applicable": "open", "stale": "open"}
+GLYPHS = {
+    PASSED: "tick",
+    FAILED: "cross",
+    UNDECIDED: "open",
+    OPEN: "open",
+    "not applicable": "open",
+    "stale": "open",
+}
 # role or controller -> class of its mark: circle data-driven, square model-based, ring baseline
-MARKS = {"data_driven": "dd", "window": "dd", "model_based": "mb", "baseline": "bl", "kernel": "dd", "exact_model": "mb"}
+MARKS = {
+    "data_driven": "dd",
+    "window": "dd",
+    "model_based": "mb",
+    "baseline": "bl",
+    "kernel": "dd",
+    "exact_model": "mb",
+}
 
 
 @functools.cache
@@ -39,7 +53,10 @@ def environment() -> jinja2.Environment:
         "word_id": word_id,
     }
     script = Markup(found.get_template("page.js").render().strip())
-    found.globals |= {"script": script, "script_hash": base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}
+    found.globals |= {
+        "script": script,
+        "script_hash": base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
+    }
     found.filters |= {"shortened": digits.shortened, "typeset": digits.typeset, "count": digits.count}
     return found
 
@@ -50,14 +67,20 @@ BESIDE = (("nightly", "Nightly"), ("history", "History"))
 
 def render(template: str, **values) -> str:
     """A whole page."""
-    beside = [(name, title) for name, title in BESIDE if name == values["here"] or artifacts.exists(f"reports/{name}.html")]
+    beside = [
+        (name, title)
+        for name, title in BESIDE
+        if name == values["here"] or artifacts.exists(f"reports/{name}.html")
+    ]
     return environment().get_template(template).render(beside=beside, **values)
 
 
 def glyph(state: str) -> Markup:
     """Tick, cross or dashed ring; colour never stands alone."""
     bad = " bad" if state == FAILED else ""
-    return Markup('<svg class="g{}" aria-hidden="true"><use href="#{}"/></svg>').format(bad, GLYPHS.get(state, "open"))
+    return Markup('<svg class="g{}" aria-hidden="true"><use href="#{}"/></svg>').format(
+        bad, GLYPHS.get(state, "open")
+    )
 
 
 def mark(controller: str) -> Markup:
@@ -75,14 +98,20 @@ def bdi(text: object) -> Markup:
 
 def missing(found) -> Markup:
     """State first, reason second, remedy third."""
-    return Markup("{}<strong>{}.</strong> <bdi>{}</bdi>").format(glyph(found.state), found.state.capitalize(), found.sentence())
+    return Markup("{}<strong>{}.</strong> <bdi>{}</bdi>").format(
+        glyph(found.state), found.state.capitalize(), found.sentence()
+    )
 
 
 def origin(sources: list[Source]) -> Markup:
-    """Where the figures beside it are from: stage, artifact, schema, hash; the whole hash is in the provenance."""
+    """Where the figures beside it are from: stage, artifact, schema,
+    hash; the whole hash is in the provenance."""
     if not sources:
         return Markup("")
-    parts = [Markup('<a href="#{}"><code>{}</code></a>').format(anchor(s.path), s.path.split("/", 1)[1]) for s in sources]
+    parts = [
+        Markup('<a href="#{}"><code>{}</code></a>').format(anchor(s.path), s.path.split("/", 1)[1])
+        for s in sources
+    ]
     return Markup('<p class="src">From {}.</p>').format(Markup(", ").join(parts))
 
 
@@ -91,8 +120,13 @@ def word_id(word: str) -> str:
 
 
 def term(word: str, text: str = "") -> Markup:
-    """A word of the page's list, linked to its meaning there; where a script runs, the meaning stands beside it on hover and focus."""
-    return Markup('<a class="term" href="#{}">{}</a>').format(word_id(word), text or word) if word else escape(text)
+    """A word of the page's list, linked to its meaning there; where a script runs,
+    the meaning stands beside it on hover and focus."""
+    return (
+        Markup('<a class="term" href="#{}">{}</a>').format(word_id(word), text or word)
+        if word
+        else escape(text)
+    )
 
 
 def hashed(short: str, sources: list[Source]) -> Markup:

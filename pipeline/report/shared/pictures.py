@@ -1,4 +1,5 @@
-"""The figures of the temperature page that show controllers at work: trajectories, errors, cost and inputs."""
+"""The figures of the temperature page that show controllers at work:
+trajectories, errors, cost and inputs."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -26,7 +27,8 @@ class Column(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """A figure with its finding as the sentence above it; in the place of what cannot be drawn, the reason."""
+    """A figure with its finding as the sentence above it; in the place
+    of what cannot be drawn, the reason."""
 
     id: str
     title: str
@@ -58,7 +60,14 @@ def runs(sources: Sources, mode: str) -> list[Run] | Missing:
     for name in ORDER:
         mine = (table["controller"] == name) & (table["mode"] == mode)
         if mine.any():
-            found.append(Run(name, page.MARKS[name], table["time_s"][mine], {key: values[mine] for key, values in table.items()}))
+            found.append(
+                Run(
+                    name,
+                    page.MARKS[name],
+                    table["time_s"][mine],
+                    {key: values[mine] for key, values in table.items()},
+                )
+            )
     return found or Missing("not measured", f"no {mode} trajectory was recorded")
 
 
@@ -72,8 +81,14 @@ def absent(sources: Sources, shown: list[Column]) -> list[Column]:
     refused = learned.get("refused") if isinstance(learned, dict) else None
     if any(column.mark == "kernel" for column in shown):
         return shown
-    why = Missing("failed", str(refused)) if refused else Missing("not measured", "there is no kernel", "Run ./run dvc repro learn_kernel")
-    empty = Column(*LABELS["kernel"], "kernel", [Markup('<div class="hole">{}</div>').format(page.missing(why))])
+    why = (
+        Missing("failed", str(refused))
+        if refused
+        else Missing("not measured", "there is no kernel", "Run ./run dvc repro learn_kernel")
+    )
+    empty = Column(
+        *LABELS["kernel"], "kernel", [Markup('<div class="hole">{}</div>').format(page.missing(why))]
+    )
     return [*shown[:2], empty, *shown[2:]]
 
 
@@ -88,20 +103,27 @@ def trajectories(sources: Sources) -> Picture:
         return hole("trajectories", title, found)
     machine = sources.declared.machine
     offset = sources.declared.panel.judging.reference_offsets_degC[0]
-    lowest = min(float(np.nanmin(run.rows[o.name][run.time <= SPAN_S])) for run in found for o in machine.outputs)
-    highest = max(float(np.nanmax(run.rows[o.name][run.time <= SPAN_S])) for run in found for o in machine.outputs)
+    lowest = min(
+        float(np.nanmin(run.rows[o.name][run.time <= SPAN_S])) for run in found for o in machine.outputs
+    )
+    highest = max(
+        float(np.nanmax(run.rows[o.name][run.time <= SPAN_S])) for run in found for o in machine.outputs
+    )
     y = charts.linear(min(lowest, 0.0), min(highest, 2 * max(o.reference for o in machine.outputs)) * 1.02)
 
     def draw(run: Run, column: int) -> list[Markup]:
         panels, early = [], run.time <= SPAN_S
         for i, output in enumerate(machine.outputs):
             last = i == len(machine.outputs) - 1
-            frame = charts.Frame(charts.linear(0, SPAN_S, ticks=3), y, height=92 if last else 78, below=16 if last else 4)
+            frame = charts.Frame(
+                charts.linear(0, SPAN_S, ticks=3), y, height=92 if last else 78, below=16 if last else 4
+            )
             values, reference = run.rows[output.name][early], output.reference + offset
             past = float(np.nanmax(np.sign(reference - values[0]) * (values - reference)))
             alt = (
                 f"{LABELS[run.name][0]}, zone {i + 1}: from {number(float(values[0]), 0)} to "
-                f"{number(float(values[-1]), 1)} °C of {reference:g} °C in {SPAN_S:g} s, {number(max(past, 0), 1)} "
+                f"{number(float(values[-1]), 1)} °C of {reference:g} °C in {SPAN_S:g} s, "
+                f"{number(max(past, 0), 1)} "
                 "°C past it"
             )
             layers = [
@@ -109,7 +131,17 @@ def trajectories(sources: Sources) -> Picture:
                 charts.line(frame, run.time[early], values),
                 charts.label(frame, SPAN_S, y.low, f"zone {i + 1}: {reference:g}", anchor="end", dy=-5),
             ]
-            panels.append(charts.panel(frame, layers, alt=alt, css=run.css, title="°C" if i == 0 else "", x_ticks=last, units=("s", "°C")))
+            panels.append(
+                charts.panel(
+                    frame,
+                    layers,
+                    alt=alt,
+                    css=run.css,
+                    title="°C" if i == 0 else "",
+                    x_ticks=last,
+                    units=("s", "°C"),
+                )
+            )
         return panels
 
     return Picture(
@@ -118,7 +150,8 @@ def trajectories(sources: Sources) -> Picture:
         _reach(found, machine, offset),
         absent(sources, columns(found, draw)),
         (
-            f"True temperature in °C over the first {SPAN_S:g} s as deployed (inputs clipped, feasible target, "
+            f"True temperature in °C over the first {SPAN_S:g} s as deployed (inputs "
+            "clipped, feasible target, "
             f"integrator); dashed: reference. One run: {featured(sources)}."
         ),
         page.origin(sources.source("trajectories")),
@@ -129,7 +162,12 @@ def _reach(found: list[Run], machine, offset: float) -> str:
     parts = []
     for run in found[:4]:
         past = max(
-            float(np.nanmax(np.sign(o.reference + offset - run.rows[o.name][0]) * (run.rows[o.name] - o.reference - offset)))
+            float(
+                np.nanmax(
+                    np.sign(o.reference + offset - run.rows[o.name][0])
+                    * (run.rows[o.name] - o.reference - offset)
+                )
+            )
             for o in machine.outputs
         )
         parts.append(f"{LABELS[run.name][0]} {number(max(past, 0.0), 1)}{THIN}°C")
@@ -151,7 +189,9 @@ def errors(sources: Sources) -> Picture:
 
     def draw(run: Run, column: int) -> list[Markup]:
         error = np.max([np.abs(run.rows[o.name] - o.reference - offset) for o in machine.outputs], axis=0)
-        frame = charts.Frame(charts.linear(0, float(run.time[-1]), ticks=3), charts.logarithmic(0.01, 300), height=120)
+        frame = charts.Frame(
+            charts.linear(0, float(run.time[-1]), ticks=3), charts.logarithmic(0.01, 300), height=120
+        )
         late = float(np.median(error[2 * len(error) // 3 :]))
         last[LABELS[run.name][0]] = late
         alt = (
@@ -164,7 +204,11 @@ def errors(sources: Sources) -> Picture:
             charts.level(frame, limit, "lim", f"limit {limit:g}" if column == 0 else ""),
             charts.line(frame, run.time, error),
         ]
-        return [charts.panel(frame, layers, alt=alt, css=run.css, title="°C, log" if column == 0 else "", units=("s", "°C"))]
+        return [
+            charts.panel(
+                frame, layers, alt=alt, css=run.css, title="°C, log" if column == 0 else "", units=("s", "°C")
+            )
+        ]
 
     shown = columns(found, draw)
     text = (
@@ -177,7 +221,10 @@ def errors(sources: Sources) -> Picture:
         title,
         text,
         absent(sources, shown),
-        "Largest distance of a zone from its reference, in °C, log scale, against time in s, noise and ripple in it. Line: one run; band: 90 of 100 runs on the nominal plant, all starts, references and seeds. Grey: what the rule allows of the settled error, which is of the mean over the last third.",
+        "Largest distance of a zone from its reference, in °C, log scale, against time in s, "
+        "noise and ripple in it. Line: one run; band: 90 of 100 runs on the nominal plant, all starts, "
+        "references and seeds. Grey: what the rule allows of the settled error, "
+        "which is of the mean over the last third.",
         page.origin(sources.source("trajectories")),
     )
 
@@ -187,8 +234,14 @@ def _band(frame: charts.Frame, run: Run) -> Markup:
     low, high = run.rows["error_low_degC"], run.rows["error_high_degC"]
     of = max(len(low) // 150, 1)
     keep = len(low) // of * of
-    ends = [pick(values[:keep].reshape(-1, of), axis=1) for pick, values in ((np.nanmin, low), (np.nanmax, high))]
-    return charts.ribbon(frame, run.time[:keep:of], *ends, f"ribbon {run.css}") if np.isfinite(ends).all() else Markup("")
+    ends = [
+        pick(values[:keep].reshape(-1, of), axis=1) for pick, values in ((np.nanmin, low), (np.nanmax, high))
+    ]
+    return (
+        charts.ribbon(frame, run.time[:keep:of], *ends, f"ribbon {run.css}")
+        if np.isfinite(ends).all()
+        else Markup("")
+    )
 
 
 def costs(sources: Sources) -> Picture:
@@ -205,18 +258,34 @@ def costs(sources: Sources) -> Picture:
     def draw(run: Run, column: int) -> list[Markup]:
         frame = charts.Frame(charts.logarithmic(1, 1000), y, height=120)
         mine = charts.line(frame, run.time + 1, run.rows["cost"] / 1000)
-        other = [charts.line(frame, exact.time + 1, exact.rows["cost"] / 1000, "ref")] if exact and run is not exact else []
+        other = (
+            [charts.line(frame, exact.time + 1, exact.rows["cost"] / 1000, "ref")]
+            if exact and run is not exact
+            else []
+        )
         above = finals[run.name] / finals["exact_model"] - 1 if exact else 0.0
         text = f"{number(finals[run.name] / 1000, 1)}{f', {_signed(100 * above)}' if exact and run is not exact else ''}"
         end = charts.label(
-            frame, 1000, finals[run.name] / 1000, text, anchor="end", dy=14 if finals[run.name] / 1000 > 0.85 * y.high else -5
+            frame,
+            1000,
+            finals[run.name] / 1000,
+            text,
+            anchor="end",
+            dy=14 if finals[run.name] / 1000 > 0.85 * y.high else -5,
         )
-        alt = f"{LABELS[run.name][0]}: cost {number(finals[run.name], 0)} after {number(float(run.time[-1]) + 1, 0)} s" + (
-            f", {_signed(100 * above)} against the exact model" if exact else ""
+        alt = (
+            f"{LABELS[run.name][0]}: cost {number(finals[run.name], 0)} after "
+            f"{number(float(run.time[-1]) + 1, 0)} s"
+            + (f", {_signed(100 * above)} against the exact model" if exact else "")
         )
         return [
             charts.panel(
-                frame, [*other, mine, end], alt=alt, css=run.css, title="thousands" if column == 0 else "", units=("s", "thousand")
+                frame,
+                [*other, mine, end],
+                alt=alt,
+                css=run.css,
+                title="thousands" if column == 0 else "",
+                units=("s", "thousand"),
             )
         ]
 
@@ -231,7 +300,8 @@ def costs(sources: Sources) -> Picture:
         ),
         absent(sources, shown),
         (
-            f"Discounted cost at the yardstick’s weights (Q = {sources.declared.tracking.yardstick_q:g} I, R = "
+            "Discounted cost at the yardstick’s weights (Q = "
+            f"{sources.declared.tracking.yardstick_q:g} I, R = "
             f"{sources.declared.tracking.yardstick_r:g} I, γ = {sources.declared.tracking.gamma:g}), "
             "unclipped, true outputs, in thousands, against time in s (log). Dashed: exact model."
         ),
@@ -259,27 +329,50 @@ def inputs(sources: Sources) -> Picture:
         for i, signal in enumerate(machine.inputs):
             last = i == len(machine.inputs) - 1
             frame = charts.Frame(
-                charts.linear(0, SPAN_S, ticks=3), y, height=74 if last else 60, below=16 if last else 4, above=10 if i else 14
+                charts.linear(0, SPAN_S, ticks=3),
+                y,
+                height=74 if last else 60,
+                below=16 if last else 4,
+                above=10 if i else 14,
             )
             command = run.rows[f"{signal.name}_command"]
             outside = 100 * float(((command < signal.low) | (command > signal.high)).mean())
             alt = (
                 f"{LABELS[run.name][0]}, {signal.name}: asked for {number(float(np.nanmin(command)), 0)} to "
-                f"{number(float(np.nanmax(command)), 0)} %, beyond its limits {number(outside, 1)} % of the time"
+                f"{number(float(np.nanmax(command)), 0)} %, beyond its limits "
+                f"{number(outside, 1)} % of the time"
             )
             layers = [
                 charts.tint(frame, signal.low, signal.high),
                 charts.line(frame, run.time[early], command[early], steps=True),
                 charts.label(frame, SPAN_S, signal.high, signal.name, anchor="end", dy=10),
             ]
-            panels.append(charts.panel(frame, layers, alt=alt, css=run.css, title="%" if i == 0 else "", x_ticks=last, units=("s", "%")))
+            panels.append(
+                charts.panel(
+                    frame,
+                    layers,
+                    alt=alt,
+                    css=run.css,
+                    title="%" if i == 0 else "",
+                    x_ticks=last,
+                    units=("s", "%"),
+                )
+            )
         return panels
 
     free = [
-        (LABELS[run.name][0], lookup(sources.metrics["evaluate_temperature"], f"controllers.{run.name}.outside_limits_percent.median"))
+        (
+            LABELS[run.name][0],
+            lookup(
+                sources.metrics["evaluate_temperature"],
+                f"controllers.{run.name}.outside_limits_percent.median",
+            ),
+        )
         for run in found
     ]
-    said = ", ".join(f"{name} {number(value, 0)}{THIN}%" for name, value in free if not isinstance(value, Missing))
+    said = ", ".join(
+        f"{name} {number(value, 0)}{THIN}%" for name, value in free if not isinstance(value, Missing)
+    )
     return Picture(
         "inputs",
         title,
@@ -289,7 +382,8 @@ def inputs(sources: Sources) -> Picture:
         ),
         absent(sources, columns(found, draw)),
         (
-            f"Command in per cent over the first {SPAN_S:g} s as deployed; grey: what the machine can give, to "
+            f"Command in per cent over the first {SPAN_S:g} s as deployed; grey: "
+            "what the machine can give, to "
             "which a command is clipped. A command far outside runs along the edge."
         ),
         page.origin(sources.source("trajectories")),

@@ -25,14 +25,20 @@ class Check(NamedTuple):
 
 
 def checks(report: str = "reports/metrics/report.json", lock: str = "dvc.lock") -> list[Check]:
-    """Sources, parameters and code, the pages and their references, and dvc.lock. Raises ValueError where the report's metrics are missing or
-    were written by an older version.
+    """Sources, parameters and code, the pages and their references, and dvc.lock. Raises ValueError where the
+    report's metrics are missing or were written by an older version.
     """
     said = artifacts.read_json(report)
     if not {"read", "pages", "parameters", "code"} <= said.keys():
-        raise ValueError(f"{report}: it does not say what the pages were made from; run ./run dvc repro report")
+        raise ValueError(
+            f"{report}: it does not say what the pages were made from; run ./run dvc repro report"
+        )
     # the night that made these pages has written its own figures since
-    files = [sentence for path, recorded in said["read"].items() if path != NIGHTLY and (sentence := _held(path, recorded))]
+    files = [
+        sentence
+        for path, recorded in said["read"].items()
+        if path != NIGHTLY and (sentence := _held(path, recorded))
+    ]
     written = {f"reports/{name}.html": recorded for name, recorded in said["pages"].items()}
     pages = [sentence for path, recorded in written.items() if (sentence := _held(path, recorded))]
     return [
@@ -58,9 +64,11 @@ def _settings(said: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _references(pages: Mapping[str, str], read: Mapping[str, str]) -> Check:
-    """Every "From ..." below a figure or a table leads to a row with artifact, stage, schema and hash, and the hash is the one that was read."""
+    """Every "From ..." below a figure or a table leads to a row with artifact, stage, schema and hash, and
+    the hash is the one that was read."""
     row = re.compile(
-        r'<tr id="(from-[^"]+)"><td><code>([^<]+)</code></td><td>([^<]+)</td><td>([^<]+)</td><td><code>([0-9a-f]{64})</code></td></tr>'
+        r"<tr "
+        r'id="(from-[^"]+)"><td><code>([^<]+)</code></td><td>([^<]+)</td><td>([^<]+)</td><td><code>([0-9a-f]{64})</code></td></tr>'
     )
     count, wrong = 0, []
     for path in pages:
@@ -68,8 +76,16 @@ def _references(pages: Mapping[str, str], read: Mapping[str, str]) -> Check:
         rows = {found[1]: found for found in row.finditer(text)}
         linked = re.findall(r'href="#(from-[^"]+)"', text)
         count += len(linked)
-        wrong += [f"{path} refers to {name}, which is not among its sources" for name in dict.fromkeys(linked) if name not in rows]
-        wrong += [f"{path} gives another hash of {found[2]} than was read" for found in rows.values() if read.get(found[2]) != found[5]]
+        wrong += [
+            f"{path} refers to {name}, which is not among its sources"
+            for name in dict.fromkeys(linked)
+            if name not in rows
+        ]
+        wrong += [
+            f"{path} gives another hash of {found[2]} than was read"
+            for found in rows.values()
+            if read.get(found[2]) != found[5]
+        ]
     return Check("references of figures and tables", count, wrong)
 
 
@@ -77,13 +93,18 @@ def _references(pages: Mapping[str, str], read: Mapping[str, str]) -> Check:
 
 
 def _lock(path: Path, read: Mapping[str, str]) -> Check:
-    """What every stage wrote, and what the report stage read, by the MD5 that DVC recorded; a source that no stage wrote is said so."""
+    """What every stage wrote, and what the report stage read, by the MD5 that DVC
+    recorded; a source that no stage wrote is said so."""
     if not path.exists():
-        return Check("entries of dvc.lock", 0, [f"{path} is missing: nothing says which run the files are of"])
+        return Check(
+            "entries of dvc.lock", 0, [f"{path} is missing: nothing says which run the files are of"]
+        )
     stages = (yaml.safe_load(path.read_text(encoding="utf-8")) or {}).get("stages", {})
     entries = [(entry, name) for name, stage in stages.items() for entry in stage.get("outs", [])]
     entries += [
-        (entry, "report") for entry in stages.get("report", {}).get("deps", []) if entry["path"] not in {e["path"] for e, _ in entries}
+        (entry, "report")
+        for entry in stages.get("report", {}).get("deps", [])
+        if entry["path"] not in {e["path"] for e, _ in entries}
     ]
     wrong = []
     for entry, stage in entries:
@@ -102,13 +123,19 @@ def _lock(path: Path, read: Mapping[str, str]) -> Check:
 
 
 def md5(path: Path) -> str:
-    """As DVC 3 has it: of a file its bytes', of a folder the MD5 of the JSON list of its files' MD5s and relative names, with .dir behind."""
+    """As DVC 3 has it: of a file its bytes', of a folder the MD5 of the JSON list of its files' MD5s and
+    relative names, with .dir behind."""
     if not path.is_dir():
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "md5").hexdigest()
-    files = [file for file in path.rglob("*") if file.is_file() and not IGNORED & set(file.parts) and file.suffix != ".pyc"]
+    files = [
+        file
+        for file in path.rglob("*")
+        if file.is_file() and not IGNORED & set(file.parts) and file.suffix != ".pyc"
+    ]
     listed = sorted(
-        ({"md5": md5(file), "relpath": file.relative_to(path).as_posix()} for file in files), key=lambda entry: entry["relpath"]
+        ({"md5": md5(file), "relpath": file.relative_to(path).as_posix()} for file in files),
+        key=lambda entry: entry["relpath"],
     )
     return hashlib.md5(json.dumps(listed, sort_keys=True).encode()).hexdigest() + ".dir"
 
@@ -117,5 +144,8 @@ def told(found: list[Check]) -> str:
     """One line for each check that held. Raises ValueError naming all that did not."""
     wrong = [sentence for check in found for sentence in dict.fromkeys(check.wrong)]
     if wrong:
-        raise ValueError(f"reports: {len(wrong)} of {sum(c.count for c in found)} no longer match: {'; '.join(wrong)}; run ./run dvc repro")
+        raise ValueError(
+            f"reports: {len(wrong)} of {sum(c.count for c in found)} no longer match: {'; '.join(wrong)}; "
+            "run ./run dvc repro"
+        )
     return "\n".join(f"{check.count:>5} {check.what}: all match" for check in found)

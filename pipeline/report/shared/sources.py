@@ -1,4 +1,5 @@
-"""What the pages are made of: every artifact that is there, read and hashed; in the place of one that is not, the reason."""
+"""What the pages are made of: every artifact that is there, read and
+hashed; in the place of one that is not, the reason."""
 
 import base64
 import hashlib
@@ -10,9 +11,27 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.deposition.workflow.tables import FILMED, LESSONS, LIBRARY, LINES, SCORES, SIGNALS, TASKS, TRIALS
+from pipeline.deposition.workflow.tables import (
+    FILMED,
+    LESSONS,
+    LIBRARY,
+    LINES,
+    SCORES,
+    SIGNALS,
+    TASKS,
+    TRIALS,
+)
 from pipeline.report.shared.verdict import Missing, ReportRules
-from pipeline.setpoint.workflow.tables import AGENT_COURSE, CLASSIFIED, COURSE, DECISIONS, PATHS, RELIABILITY, SCOREBOARD, WINDOWS
+from pipeline.setpoint.workflow.tables import (
+    AGENT_COURSE,
+    CLASSIFIED,
+    COURSE,
+    DECISIONS,
+    PATHS,
+    RELIABILITY,
+    SCOREBOARD,
+    WINDOWS,
+)
 from pipeline.store import artifacts
 from pipeline.temperature.workflow import tables as schemas
 from pipeline.temperature.workflow.settings import Panel, Plant, Tracking
@@ -21,7 +40,8 @@ Table = dict[str, np.ndarray]
 
 
 class Declared(NamedTuple):
-    """What the parameters say: the sections that figures are labelled with, and all of it as text for the difference."""
+    """What the parameters say: the sections that figures are labelled
+    with, and all of it as text for the difference."""
 
     rules: ReportRules
     machine: Plant
@@ -31,8 +51,8 @@ class Declared(NamedTuple):
 
 
 class Source(NamedTuple):
-    """One file that the pages show: what it is called here (a table's name, or the stage of metrics), the stage that wrote it, name and
-    version of its schema, and the digest of its bytes.
+    """One file that the pages show: what it is called here (a table's name, or the stage of metrics), the
+    stage that wrote it, name and version of its schema, and the digest of its bytes.
     """
 
     name: str
@@ -43,8 +63,8 @@ class Source(NamedTuple):
 
 
 class Sources(NamedTuple):
-    """`metrics` by stage and `tables` by name, each with a Missing where it could not be read; `read`: what was;
-    `absent`: what was not, by path; `accepted`: the last accepted run, or None; `files`: digest of each
+    """`metrics` by stage and `tables` by name, each with a Missing where it could not be read; `read`: what
+    was; `absent`: what was not, by path; `accepted`: the last accepted run, or None; `files`: digest of each
     file of code; `nightly`: what the last night measured, None before the first.
     """
 
@@ -63,29 +83,50 @@ class Sources(NamedTuple):
         return [source for name in names for source in self.read.values() if source.name == name]
 
 
-# what the nightly job writes after the pages: no dependency of theirs (DVC would ask for it before the first night), they show the night before
+# what the nightly job writes after the pages: no dependency of theirs (DVC would ask for it before the first
+# night), they show the night before
 NIGHTLY = "reports/metrics/nightly.json"
 
 
-def collect(declared: Declared, metrics: Mapping[str, str], folders: Mapping[str, str], accepted: str, code: tuple[str, ...]) -> Sources:
-    """Reads the metrics files and the folders of stages, {stage: path} each. What is missing or broken is no error here: its place on
-    the page says so.
+def collect(
+    declared: Declared,
+    metrics: Mapping[str, str],
+    folders: Mapping[str, str],
+    accepted: str,
+    code: tuple[str, ...],
+) -> Sources:
+    """Reads the metrics files and the folders of stages, {stage: path} each. What is missing or broken is no
+    error here: its place on the page says so.
     """
     read: dict[str, Source] = {}
     wanted = [(path, stage, stage, "metrics", artifacts.read_json) for stage, path in metrics.items()]
     tables = _tables(declared.machine)
-    wanted += [(f"{folders[stage]}/{file}", name, stage, kind, reader) for name, stage, file, kind, reader in tables]
-    found = {(path, name): _read(read, path, name, stage, kind, reader) for path, name, stage, kind, reader in wanted}
+    wanted += [
+        (f"{folders[stage]}/{file}", name, stage, kind, reader) for name, stage, file, kind, reader in tables
+    ]
+    found = {
+        (path, name): _read(read, path, name, stage, kind, reader)
+        for path, name, stage, kind, reader in wanted
+    }
     absent = {path: value for (path, _), value in found.items() if isinstance(value, Missing)}
     by_name = [
-        {name: value for (_, name), value in part} for part in (list(found.items())[: len(metrics)], list(found.items())[len(metrics) :])
+        {name: value for (_, name), value in part}
+        for part in (list(found.items())[: len(metrics)], list(found.items())[len(metrics) :])
     ]
     for name, stage in (("frames", "train_ilc"), ("nozzle_frames", "train_classifier")):
         frames = by_name[1].get(name, [])
         for one in [] if isinstance(frames, Missing) else frames:
             read[one["path"]] = Source("frame", one["path"], stage, "JPEG", artifacts.sha256(one["path"]))
-    before = _read(read, accepted, "accepted", "accept", "accepted", artifacts.read_json) if artifacts.exists(accepted) else None
-    night = _read(read, NIGHTLY, "nightly", "nightly", "nightly", artifacts.read_json) if artifacts.exists(NIGHTLY) else None
+    before = (
+        _read(read, accepted, "accepted", "accept", "accepted", artifacts.read_json)
+        if artifacts.exists(accepted)
+        else None
+    )
+    night = (
+        _read(read, NIGHTLY, "nightly", "nightly", "nightly", artifacts.read_json)
+        if artifacts.exists(NIGHTLY)
+        else None
+    )
     folders_of_code = digest({folder: artifacts.sha256(folder) for folder in code})
     return Sources(declared, *by_name, read, absent, before or None, folders_of_code, code_files(code), night)
 
@@ -94,19 +135,27 @@ def code_files(folders: tuple[str, ...]) -> dict[str, str]:
     """Digest of each file of code, so that a difference can name the ones that changed."""
     files = [file for folder in folders for file in sorted(Path(folder).rglob("*")) if file.is_file()]
     return {
-        file.as_posix(): artifacts.sha256(file) for file in files if not any(p.startswith(".") or p == "__pycache__" for p in file.parts)
+        file.as_posix(): artifacts.sha256(file)
+        for file in files
+        if not any(p.startswith(".") or p == "__pycache__" for p in file.parts)
     }
 
 
 def machine(path: str) -> dict[str, Any]:
-    """What `run` wrote beside the pages of the machine it ran on; {} where it did not. Raises ValueError where the file holds another line."""
+    """What `run` wrote beside the pages of the machine it ran on; {} where it did not. Raises ValueError
+    where the file holds another line."""
     if not artifacts.exists(path):
         return {}
-    found = re.fullmatch(r"window\.beadline = (\{.*\});\s*", Path(path).read_text(encoding="utf-8", errors="replace"))
+    found = re.fullmatch(
+        r"window\.beadline = (\{.*\});\s*", Path(path).read_text(encoding="utf-8", errors="replace")
+    )
     try:
         return dict(json.loads(found[1])["machine"])
     except (TypeError, ValueError, KeyError):
-        raise ValueError(f"{path}: expected the line that ./run writes, found another; run ./run dvc repro, which writes it anew") from None
+        raise ValueError(
+            f"{path}: expected the line that ./run writes, found another; run ./run dvc repro, "
+            "which writes it anew"
+        ) from None
 
 
 def digest(data: Any) -> str:
@@ -140,7 +189,12 @@ def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], An
         ("weights", "tune_weights", "weights.json", "weights", artifacts.read_json),
         ("summary", "evaluate_temperature", "summary.json", "summary", artifacts.read_json),
         ("scorecard", "evaluate_temperature", "scorecard.parquet", *table(schemas.SCORECARD)),
-        ("trajectories", "evaluate_temperature", "trajectories.parquet", *table(schemas.trajectories(machine.inputs, machine.outputs))),
+        (
+            "trajectories",
+            "evaluate_temperature",
+            "trajectories.parquet",
+            *table(schemas.trajectories(machine.inputs, machine.outputs)),
+        ),
         ("study", "evaluate_temperature", "study.parquet", *table(schemas.STUDY)),
         ("trials", "train_ilc", "trials.parquet", *table(TRIALS)),
         ("lessons", "train_ilc", "lessons.parquet", f"{LESSONS.name} {LESSONS.version}", _first_routine),
@@ -179,23 +233,33 @@ FRAMES = 24
 
 
 def _frames(path: str) -> list[dict[str, Any]]:
-    """The first rows of an index of frames, each with its picture's path and the picture as a data URI. Raises ValueError where one is missing or no JPEG."""
+    """The first rows of an index of frames, each with its picture's path and the picture as a data URI.
+    Raises ValueError where one is missing or no JPEG."""
     found, stage = artifacts.read_json(path)[:FRAMES], Path(path).parent.parent.name
     for one in found:
         picture = Path(path).with_name(Path(one["file"]).name)
         try:
             data = picture.read_bytes()
         except OSError as error:
-            raise ValueError(f"{picture} cannot be read ({error.strerror}); run ./run dvc repro {stage}") from None
+            raise ValueError(
+                f"{picture} cannot be read ({error.strerror}); run ./run dvc repro {stage}"
+            ) from None
         if not data.startswith(b"\xff\xd8"):
             raise ValueError(f"{picture} is no JPEG; run ./run dvc repro {stage}")
-        one |= {"path": picture.as_posix(), "uri": "data:image/jpeg;base64," + base64.b64encode(data).decode()}
+        one |= {
+            "path": picture.as_posix(),
+            "uri": "data:image/jpeg;base64," + base64.b64encode(data).decode(),
+        }
     return found
 
 
-def _read(read: dict[str, Source], path: str, name: str, stage: str, schema: str, reader: Callable[[str], Any]) -> Any:
+def _read(
+    read: dict[str, Source], path: str, name: str, stage: str, schema: str, reader: Callable[[str], Any]
+) -> Any:
     if not artifacts.exists(path):
-        return Missing("not measured", f"{Path(path).name} of {stage} is not there", f"Run ./run dvc repro {stage}")
+        return Missing(
+            "not measured", f"{Path(path).name} of {stage} is not there", f"Run ./run dvc repro {stage}"
+        )
     try:
         found = reader(path)
     except ValueError as error:

@@ -1,5 +1,5 @@
-"""The tables of the temperature page: every controller on the common yardstick, the study's figures as published, panel, weights, and
-the findings in words."""
+"""The tables of the temperature page: every controller on the common yardstick, the study's figures as
+published, panel, weights, and the findings in words."""
 
 import math
 from typing import Any
@@ -22,12 +22,22 @@ def yardstick(sources: Sources, asked: list[Question]) -> dict[str, Any]:
     """Rows are figures, columns controllers; the rule's limit beside them."""
     answers = all_answers(sources, asked)
     names = [name for name in ORDER if name in answers or name == "kernel"]
-    heads = [{"mark": name, "word": FIXED[name][0], "name": LABELS[name][0], "method": LABELS[name][1]} for name in names]
-    rows = [_row(question, names, [answers.get(name, {}).get(question.key, _no_kernel(sources)) for name in names]) for question in asked]
+    heads = [
+        {"mark": name, "word": FIXED[name][0], "name": LABELS[name][0], "method": LABELS[name][1]}
+        for name in names
+    ]
+    rows = [
+        _row(
+            question, names, [answers.get(name, {}).get(question.key, _no_kernel(sources)) for name in names]
+        )
+        for question in asked
+    ]
     for key, title, unit in EXTRA:
         question = Question(0, key, title, unit, math.inf, False, "")
         rows.append(_row(question, names, [_extra(sources, name, key) for name in names]))
-    stable = [lookup(sources.metrics["evaluate_temperature"], f"controllers.{name}.stable_plants") for name in names]
+    stable = [
+        lookup(sources.metrics["evaluate_temperature"], f"controllers.{name}.stable_plants") for name in names
+    ]
     cells = [
         {
             "value": s.state if isinstance(s, Missing) else f"{s['count']} of {s['of']}",
@@ -38,7 +48,9 @@ def yardstick(sources: Sources, asked: list[Question]) -> dict[str, Any]:
         }
         for s in stable
     ]
-    rows.append({"title": "Plants of the spread held stable", "word": "Plant spread", "limit": "", "cells": cells})
+    rows.append(
+        {"title": "Plants of the spread held stable", "word": "Plant spread", "limit": "", "cells": cells}
+    )
     return {"heads": heads, "rows": rows}
 
 
@@ -57,23 +69,41 @@ def _extra(sources: Sources, name: str, key: str) -> Figure | Missing:
 
 def _row(question: Question, names: list[str], figures: list[Figure | Missing]) -> dict[str, Any]:
     # the controller that was told the truth is a yardstick, not a competitor
-    values = [f.value for name, f in zip(names, figures, strict=True) if isinstance(f, Figure) and name != "exact_model"]
+    values = [
+        f.value
+        for name, f in zip(names, figures, strict=True)
+        if isinstance(f, Figure) and name != "exact_model"
+    ]
     best = (max if question.at_least else min)(values, default=math.nan)
     finite = [f for f in figures if isinstance(f, Figure) and math.isfinite(f.value)]
     limit_places = max((decimals(f.low, f.high, value=f.value) for f in finite), default=1)
     cells = []
     for name, figure in zip(names, figures, strict=True):
         if isinstance(figure, Missing):
-            cells.append({"value": figure.state, "band": "", "bad": figure.state == FAILED, "best": False, "title": figure.sentence()})
+            cells.append(
+                {
+                    "value": figure.state,
+                    "band": "",
+                    "bad": figure.state == FAILED,
+                    "best": False,
+                    "title": figure.sentence(),
+                }
+            )
             continue
-        places = 0 if question.key == "data" and figure.value >= 10 else decimals(figure.low, figure.high, value=figure.value)
+        places = (
+            0
+            if question.key == "data" and figure.value >= 10
+            else decimals(figure.low, figure.high, value=figure.value)
+        )
         held = state(question, figure) if math.isfinite(question.limit) else ""
         note = figure.note if question.key in ("data", "settled_error_degC") else ""
         bands = band(figure.low, figure.high, places, beyond=question.beyond)
         cells.append(
             {
                 "value": quantity(figure.value, question.unit, places, beyond=question.beyond),
-                "band": ", ".join(filter(None, [bands, note.split(" samples")[0], held if held == UNDECIDED else ""])),
+                "band": ", ".join(
+                    filter(None, [bands, note.split(" samples")[0], held if held == UNDECIDED else ""])
+                ),
                 "bad": held == FAILED,
                 "best": figure.value == best and name != "exact_model" and question.key != "data",
                 "title": "",
@@ -102,19 +132,26 @@ CONVENTIONS = {
     ),
     "model_based_tuned": (
         "Model-based, tuned",
-        "The same, and J weighs with the tuned Q and R: another currency. The fifth q is 0.0514, not the printed 0.514.",
+        "The same, and J weighs with the tuned Q and R: another currency. The fifth q is 0.0514, "
+        "not the printed 0.514.",
     ),
     "data_driven": (
         "Data-driven, Q = R = I",
-        "Seven start-up steps first drive the barrel to 0 °C, and make 80 % of J; u′Ru is not discounted; all data are divided by 1000.",
+        "Seven start-up steps first drive the barrel to 0 °C, and make 80 % of J; u′Ru is not discounted; "
+        "all data are divided by 1000.",
     ),
-    "data_driven_tuned": ("Data-driven, tuned", "The same; J weighs u with R = I although the controller was tuned for another R."),
+    "data_driven_tuned": (
+        "Data-driven, tuned",
+        "The same; J weighs u with R = I although the controller was tuned for another R.",
+    ),
 }
 
 
 def published(sources: Sources) -> dict[str, Any]:
     """The study's four columns, printed and reproduced, with the convention that it takes."""
-    printed, found = (lookup(sources.metrics["evaluate_temperature"], key) for key in ("printed", "as_published"))
+    printed, found = (
+        lookup(sources.metrics["evaluate_temperature"], key) for key in ("printed", "as_published")
+    )
     gap = next((part for part in (printed, found) if isinstance(part, Missing)), None)
     if gap:
         return {"missing": gap, "rows": []}
@@ -126,7 +163,11 @@ def published(sources: Sources) -> dict[str, Any]:
                 theirs, ours = printed[key][name], found[key][name]
                 off = abs(ours / theirs - 1)
                 cells.append(
-                    {"printed": number(theirs, places), "ours": number(ours, places), "off": percent(100 * off, 2) if off > 1e-3 else ""}
+                    {
+                        "printed": number(theirs, places),
+                        "ours": number(ours, places),
+                        "off": percent(100 * off, 2) if off > 1e-3 else "",
+                    }
                 )
             rows.append({"title": title, "convention": convention, "cells": cells})
     return {"missing": None, "rows": rows}
@@ -141,7 +182,8 @@ def honest(sources: Sources) -> list[tuple[str, str]]:
         ("observer.J1000_from_50_degC", "Observer started at 50 °C, as published", 1),
     )
     rows = [
-        (title, value.state if isinstance(value := lookup(found, key), Missing) else number(value, places)) for key, title, places in items
+        (title, value.state if isinstance(value := lookup(found, key), Missing) else number(value, places))
+        for key, title, places in items
     ]
     gaps = (
         ("kernel.gap", "Kernel, noise-free, 500 samples: gap"),
@@ -150,7 +192,8 @@ def honest(sources: Sources) -> list[tuple[str, str]]:
         ("takeover.zero_history_gap", "Taking over with an empty history: gap"),
     )
     return rows + [
-        (title, value.state if isinstance(value := lookup(found, key), Missing) else percent(100 * value, 2)) for key, title in gaps
+        (title, value.state if isinstance(value := lookup(found, key), Missing) else percent(100 * value, 2))
+        for key, title in gaps
     ]
 
 
@@ -162,17 +205,24 @@ def panel(sources: Sources) -> list[tuple[str, str]]:
     p, machine, tracking = sources.declared.panel, sources.declared.machine, sources.declared.tracking
 
     def listed(values, unit: str = "") -> str:
-        return ", ".join(short(float(v), 4).replace("-", MINUS) for v in values) + (THIN + unit if unit else "")
+        return ", ".join(short(float(v), 4).replace("-", MINUS) for v in values) + (
+            THIN + unit if unit else ""
+        )
 
     def half(part) -> str:
         return (
-            f"held at {listed(part.starts_degC, '°C')}; references {listed(part.reference_offsets_degC, '°C')} "
+            f"held at {listed(part.starts_degC, '°C')}; references "
+            f"{listed(part.reference_offsets_degC, '°C')} "
             f"off the ones below; seeds {', '.join(map(str, part.seeds))}"
         )
 
     plants = lookup(sources.tables["summary"], "plants")
     simulated = sources.declared.everything.get("generate_probing", {}).get("source") == "simulated"
-    spread = f"each column of B by 1 ± {p.input_gain:g} and A {MINUS} {p.loss:g} I" if simulated else "the identified model’s uncertainty"
+    spread = (
+        f"each column of B by 1 ± {p.input_gain:g} and A {MINUS} {p.loss:g} I"
+        if simulated
+        else "the identified model’s uncertainty"
+    )
     return [
         (
             "Judged on",
@@ -185,9 +235,21 @@ def panel(sources: Sources) -> list[tuple[str, str]]:
         ("Training half", f"{half(p.training)}; weights are tuned here and nowhere else"),
         ("References", ", ".join(f"{o.name} {o.reference:g}" for o in machine.outputs) + f"{THIN}°C"),
         ("Noise", f"{listed(p.noise_degC, '°C')}, seen by the controller, not by the judge"),
-        ("Run", f"{p.hold_steps} steps of watching the plant held, then {number(p.steps, 0)} steps of {machine.sample_time_s:g}{THIN}s"),
-        ("Settled", f"every zone within {p.band_degC:g}{THIN}°C for good; the settled error is the mean of the last third"),
-        ("Yardstick", f"Q = {tracking.yardstick_q:g} I, R = {tracking.yardstick_r:g} I, γ = {tracking.gamma:g}, true outputs"),
+        (
+            "Run",
+            f"{p.hold_steps} steps of watching the plant held, then {number(p.steps, 0)} steps of "
+            f"{machine.sample_time_s:g}{THIN}s",
+        ),
+        (
+            "Settled",
+            f"every zone within {p.band_degC:g}{THIN}°C for good; "
+            "the settled error is the mean of the last third",
+        ),
+        (
+            "Yardstick",
+            f"Q = {tracking.yardstick_q:g} I, R = {tracking.yardstick_r:g} I, "
+            f"γ = {tracking.gamma:g}, true outputs",
+        ),
         (
             "As deployed",
             (
@@ -207,7 +269,11 @@ def weights(sources: Sources) -> dict[str, Any]:
         return {"missing": found, "heads": heads, "rows": []}
     names = {"practical": "practical, deployed", "parity": "the study’s objective"}
     rows = [
-        {"title": names[mode], "q": [short(v, 2) for v in found[mode]["q"]], "r": [short(v, 2) for v in found[mode]["r"]]}
+        {
+            "title": names[mode],
+            "q": [short(v, 2) for v in found[mode]["q"]],
+            "r": [short(v, 2) for v in found[mode]["r"]],
+        }
         for mode in names
         if mode in found and len(found[mode]["q"]) == len(heads[0]) and len(found[mode]["r"]) == len(heads[1])
     ]
@@ -235,7 +301,9 @@ def identified(sources: Sources) -> list[tuple[str, str]]:
             (
                 "Fit on the hold-out",
                 ", ".join(
-                    f"{name} {number(value, 1)}{THIN}%" if isinstance(value, int | float) else f"{name} {value}"
+                    f"{name} {number(value, 1)}{THIN}%"
+                    if isinstance(value, int | float)
+                    else f"{name} {value}"
                     for name, value in fit.items()
                 ),
             )
@@ -263,4 +331,8 @@ def identified(sources: Sources) -> list[tuple[str, str]]:
             else ", ".join(f"{k} {'passed' if v else 'failed'}" for k, v in white.items()),
         )
     )
-    return rows + [(title, str(note)) for key, title in (("notes", "Note"), ("advice", "Advice")) for note in found.get(key) or []]
+    return rows + [
+        (title, str(note))
+        for key, title in (("notes", "Note"), ("advice", "Advice"))
+        for note in found.get(key) or []
+    ]

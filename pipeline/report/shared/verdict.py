@@ -1,4 +1,5 @@
-"""Rules and figures -> verdict: which controller to run, the first rule that failed or is open, what to do instead. No page, no file."""
+"""Rules and figures -> verdict: which controller to run, the first rule that failed
+or is open, what to do instead. No page, no file."""
 
 import functools
 import math
@@ -14,7 +15,8 @@ PASSED, FAILED, UNDECIDED, OPEN = "passed", "failed", "undecided", "not measured
 
 
 class ReportRules(params.Section):
-    """Section `report`: what a controller must hold to be deployed; the worst case is the largest gap over the plants of the panel."""
+    """Section `report`: what a controller must hold to be deployed; the worst case
+    is the largest gap over the plants of the panel."""
 
     gap_percent: float = Field(gt=0, le=1e6)
     settled_error_degC: float = Field(gt=0, le=1000)
@@ -37,8 +39,8 @@ class ReportRules(params.Section):
 
 
 class Figure(NamedTuple):
-    """A median and its 90 % band; infinite where a run never settles, or no delay breaks a loop. `runs` are the repetitions behind them,
-    where they are known.
+    """A median and its 90 % band; infinite where a run never settles, or no delay breaks a loop. `runs` are
+    the repetitions behind them, where they are known.
     """
 
     value: float
@@ -49,7 +51,8 @@ class Figure(NamedTuple):
 
 
 class Missing(NamedTuple):
-    """In the place of a figure: its state (not measured, failed, not applicable, stale), why, and what to do."""
+    """In the place of a figure: its state (not measured, failed, not
+    applicable, stale), why, and what to do."""
 
     state: str
     reason: str
@@ -65,8 +68,8 @@ def _ended(text: str) -> str:
 
 
 class Question(NamedTuple):
-    """One row of page one: the answer's number, the figure's key, what is asked, its unit, its limit, and which of the five rules it
-    belongs to.
+    """One row of page one: the answer's number, the figure's key, what is asked, its unit, its limit, and
+    which of the five rules it belongs to.
     """
 
     answer: int
@@ -87,7 +90,15 @@ def questions(rules: ReportRules, *, band_degC: float) -> list[Question]:
     """Answers 2 and 4 to 10, in their fixed order."""
     return [
         Question(2, "gap_percent", "Gap to the optimum", "%", rules.gap_percent, False, "gap"),
-        Question(4, "settled_error_degC", "Worst settled zone error", "°C", rules.settled_error_degC, False, "settled error"),
+        Question(
+            4,
+            "settled_error_degC",
+            "Worst settled zone error",
+            "°C",
+            rules.settled_error_degC,
+            False,
+            "settled error",
+        ),
         Question(
             5,
             "settling_s",
@@ -101,8 +112,18 @@ def questions(rules: ReportRules, *, band_degC: float) -> list[Question]:
         Question(7, "at_limits_percent", "Time at limits", "%", rules.at_limits_percent, False, "limits"),
         Question(8, "disk", "Margin: disk", "", rules.disk_margin, True, "limits", "unlimited"),
         Question(8, "delay_s", "Margin: delay", "s", rules.delay_margin_s, True, "limits", "unlimited"),
-        Question(9, "worst_case_gap_percent", "Worst case over plant spread", "%", rules.worst_case_gap_percent, False, "limits"),
-        Question(10, "data", "Data: samples, of those needed", "×", 1.0, True, "data sufficiency", "unlimited"),
+        Question(
+            9,
+            "worst_case_gap_percent",
+            "Worst case over plant spread",
+            "%",
+            rules.worst_case_gap_percent,
+            False,
+            "limits",
+        ),
+        Question(
+            10, "data", "Data: samples, of those needed", "×", 1.0, True, "data sufficiency", "unlimited"
+        ),
     ]
 
 
@@ -110,7 +131,8 @@ Answers = Mapping[str, Figure | Missing]
 
 
 def state(question: Question, figure: Figure | Missing) -> str:
-    """Passed: the whole band is inside the limit; failed: the whole band is outside; undecided: it straddles."""
+    """Passed: the whole band is inside the limit; failed: the whole
+    band is outside; undecided: it straddles."""
     if isinstance(figure, Missing):
         return FAILED if figure.state == FAILED else OPEN
     best, worst = (figure.high, figure.low) if question.at_least else (figure.low, figure.high)
@@ -119,7 +141,8 @@ def state(question: Question, figure: Figure | Missing) -> str:
 
 
 def row_places(question: Question, figures: Sequence[Figure | Missing]) -> int:
-    """One number of decimals for a row: what the widest band supports, but enough to show the smallest value at all."""
+    """One number of decimals for a row: what the widest band supports,
+    but enough to show the smallest value at all."""
     mine = [(f, decimals(f.low, f.high, value=f.value)) for f in figures if isinstance(f, Figure)]
     if question.key == "data":
         return 0 if all(f.value >= 10 for f, _ in mine) else 2
@@ -145,7 +168,8 @@ class Outcome(NamedTuple):
 
 
 def outcome(rule: str, asked: Sequence[Question], answers: Answers) -> Outcome:
-    """Failed before open before passed; drift is no question of a limit: the nightly job says whether there is any."""
+    """Failed before open before passed; drift is no question of a
+    limit: the nightly job says whether there is any."""
     if rule == "drift":
         return Outcome(rule, drift_state(answers), None)
     mine = [question for question in asked if question.rule == rule]
@@ -171,7 +195,8 @@ def passes(found: Sequence[Outcome]) -> bool:
 
 
 class Verdict(NamedTuple):
-    """`state` colours the page; decision, reason and remedy are whole sentences. `winner` is the role that should run, or None."""
+    """`state` colours the page; decision, reason and remedy are whole
+    sentences. `winner` is the role that should run, or None."""
 
     state: str
     decision: str
@@ -190,7 +215,8 @@ PREFERENCE = ("settled_error_degC", "gap_percent", "worst_case_gap_percent")
 
 
 def preferred(answers: Mapping[str, Answers], a: str, b: str) -> tuple[str, str]:
-    """The better of two roles, and the figure that tells them apart; an empty text where only the medians of the gap do."""
+    """The better of two roles, and the figure that tells them apart; an
+    empty text where only the medians of the gap do."""
     for key in PREFERENCE:
         one, two = answers[a][key], answers[b][key]
         if one.high < two.low or two.high < one.low:
@@ -199,15 +225,16 @@ def preferred(answers: Mapping[str, Answers], a: str, b: str) -> tuple[str, str]
 
 
 def winner(asked: Sequence[Question], answers: Mapping[str, Answers]) -> str | None:
-    """Of the controllers that pass, the one with the smallest settled error; within its noise the smallest gap, then the smallest worst
-    case.
+    """Of the controllers that pass, the one with the smallest settled error; within its
+    noise the smallest gap, then the smallest worst case.
     """
     fit = [role for role in ROLES if passes(outcomes(asked, answers[role]))]
     return functools.reduce(lambda best, role: preferred(answers, best, role)[0], fit) if fit else None
 
 
 def decide(loop: str, asked: Sequence[Question], answers: Mapping[str, Answers]) -> Verdict:
-    """The verdict on the data-driven controller of a loop, with what to run instead where it does not pass or is not the best that does."""
+    """The verdict on the data-driven controller of a loop, with what to run instead
+    where it does not pass or is not the best that does."""
     found = {role: outcomes(asked, answers[role]) for role in ROLES}
     best = winner(asked, answers)
     mine = found["data_driven"]
@@ -222,23 +249,32 @@ def decide(loop: str, asked: Sequence[Question], answers: Mapping[str, Answers])
         if best
         else _none_passes(asked, answers, found)
     )
-    return Verdict(FAILED if failed else OPEN, decision, lead, reason(first.question, answers), keep, first.rule, best)
+    return Verdict(
+        FAILED if failed else OPEN, decision, lead, reason(first.question, answers), keep, first.rule, best
+    )
 
 
 def _deploy(
-    loop: str, asked: Sequence[Question], answers: Mapping[str, Answers], found: Mapping[str, Sequence[Outcome]], best: str
+    loop: str,
+    asked: Sequence[Question],
+    answers: Mapping[str, Answers],
+    found: Mapping[str, Sequence[Outcome]],
+    best: str,
 ) -> Verdict:
     decision = f"Deploy the {ROLES[best].replace('-', chr(0x2011))} {loop} controller."
     whole = all(o.state == PASSED for o in found[best])
     lead = "All five rules passed." if whole else "It passes every rule measured so far."
     question, figure = min(
-        ((q, answers[best][q.key]) for q in asked if q.rule != "data sufficiency"), key=lambda pair: -share(pair[0], _worst_end(*pair))
+        ((q, answers[best][q.key]) for q in asked if q.rule != "data sufficiency"),
+        key=lambda pair: -share(pair[0], _worst_end(*pair)),
     )
     places = row_places(question, [answers[role][question.key] for role in ("data_driven", "model_based")])
     other = "model_based" if best == "data_driven" else "data_driven"
     theirs = answers[other][question.key]
     beside = (
-        f" ({ROLES[other]}: {quantity(theirs.value, question.unit, places, beyond=question.beyond)})" if isinstance(theirs, Figure) else ""
+        f" ({ROLES[other]}: {quantity(theirs.value, question.unit, places, beyond=question.beyond)})"
+        if isinstance(theirs, Figure)
+        else ""
     )
     closest = (
         f"Closest to its limit: {BRIEF[question.key]}, "
@@ -246,7 +282,15 @@ def _deploy(
         f"{_rule_allows(question, places)}{beside}."
     )
     drift = "" if whole else f"Drift is {drift_state(answers[best])}. {_watched(answers[best])}"
-    first = next((o for wanted in (FAILED, UNDECIDED, OPEN) for o in found[other] if o.state == wanted and o.rule != "drift"), None)
+    first = next(
+        (
+            o
+            for wanted in (FAILED, UNDECIDED, OPEN)
+            for o in found[other]
+            if o.state == wanted and o.rule != "drift"
+        ),
+        None,
+    )
     told = (
         _told_apart(asked, answers, best, other)
         if first is None
@@ -283,14 +327,24 @@ def _worst_end(question: Question, figure: Figure) -> float:
 
 
 def _record(found: Sequence[Outcome]) -> str:
-    return "it passes all five rules" if all(o.state == PASSED for o in found) else "it passes every rule measured so far"
+    return (
+        "it passes all five rules"
+        if all(o.state == PASSED for o in found)
+        else "it passes every rule measured so far"
+    )
 
 
-def _none_passes(asked: Sequence[Question], answers: Mapping[str, Answers], found: Mapping[str, Sequence[Outcome]]) -> str:
+def _none_passes(
+    asked: Sequence[Question], answers: Mapping[str, Answers], found: Mapping[str, Sequence[Outcome]]
+) -> str:
     others = []
     for role in ("model_based", "baseline"):
-        first = next((o for o in found[role] if o.state == FAILED), None) or next(o for o in found[role] if o.state != PASSED)
-        others.append(f"the {ROLES[role]} one {'fails' if first.state == FAILED else 'is open'} on {first.rule}")
+        first = next((o for o in found[role] if o.state == FAILED), None) or next(
+            o for o in found[role] if o.state != PASSED
+        )
+        others.append(
+            f"the {ROLES[role]} one {'fails' if first.state == FAILED else 'is open'} on {first.rule}"
+        )
     return f"No controller passes: {', '.join(others)}. Keep what runs on the machine now."
 
 
@@ -312,21 +366,27 @@ def _rule_allows(question: Question, places: int) -> str:
 
 
 def reason(question: Question | None, answers: Mapping[str, Answers]) -> str:
-    """The data-driven controller's figure of a rule that failed or is open, and its limit, in one or two sentences."""
+    """The data-driven controller's figure of a rule that failed or is
+    open, and its limit, in one or two sentences."""
     if question is None:
         found = answers["data_driven"].get("drift")
-        return found.sentence() if isinstance(found, Missing) else "The nightly job measures it and has not run."
+        return (
+            found.sentence() if isinstance(found, Missing) else "The nightly job measures it and has not run."
+        )
     figure = answers["data_driven"][question.key]
     if isinstance(figure, Missing):
         return figure.sentence()
     if question.key == "data":
         return f"{figure.note} needed." if not figure.note.endswith(".") else figure.note
     places = row_places(question, [figure, answers["model_based"][question.key]])
-    value, limit = (quantity(v, question.unit, places, beyond=question.beyond) for v in (figure.value, question.limit))
+    value, limit = (
+        quantity(v, question.unit, places, beyond=question.beyond) for v in (figure.value, question.limit)
+    )
     said = {
         "gap_percent": f"It costs {value} more than the optimum; the rule allows {limit}.",
         "settled_error_degC": (
-            f"{figure.note[:1].upper()}{figure.note[1:] or 'The worst zone'} settles {value} from its reference; the rule allows {limit}."
+            f"{figure.note[:1].upper()}{figure.note[1:] or 'The worst zone'} settles {value} from its "
+            f"reference; the rule allows {limit}."
         ),
         "settling_s": f"It {'never settles' if math.isinf(figure.value) else f'needs {value} to settle'}; the rule allows {limit}.",
         "overshoot_degC": f"It overshoots by {value}; the rule allows {limit}.",
@@ -339,15 +399,17 @@ def reason(question: Question | None, answers: Mapping[str, Answers]) -> str:
 
 
 def undecided(question: Question, figure: Figure) -> str:
-    """What more runs would do for a band that straddles its limit: enough of them tell, at 95 %, whether more than one run in twenty
-    lies outside.
+    """What more runs would do for a band that straddles its limit: enough of them tell, at 95 %, whether more
+    than one run in twenty lies outside.
     """
     places = decimals(figure.low, figure.high, value=figure.value)
     straddles = f"Its band, {band(figure.low, figure.high, places, beyond=question.beyond)}, straddles that"
     runs = len(figure.runs)
     if not runs:
         return f"{straddles}; more runs would narrow it."
-    outside = sum((run < question.limit) if question.at_least else (run > question.limit) for run in figure.runs)
+    outside = sum(
+        (run < question.limit) if question.at_least else (run > question.limit) for run in figure.runs
+    )
     share_outside, allowed = outside / runs, 0.05
     if share_outside <= allowed:
         return f"{straddles}; {outside} of {runs} runs lie outside."

@@ -59,204 +59,299 @@ ANSWERS = {
 FIXED = {
     "gap": (
         "Gap to the optimum",
-        "By how many per cent a controller’s cost (squared errors and inputs, summed) lies above that of the best possible one on the same plant, from the same start, judged by true temperatures.",
+        "By how many per cent a controller’s cost (squared errors and inputs, summed) lies above that of the "
+        "best possible one on the same plant, from the same start, judged by true temperatures.",
     ),
     "band": (
         "Band",
-        "The range that holds a figure in 90 of 100 repetitions: other starts, references and noise on the nominal plant. "
+        "The range that holds a figure in 90 of 100 repetitions: other starts, "
+        "references and noise on the nominal plant. "
         + "Of a margin it is the range over the plants of the spread; of the worst case, over the noise.",
     ),
     "passed": (
         "Passed",
-        "The whole band lies inside the limit. Failed: the whole band lies outside. Undecided: it straddles the limit, and does not pass.",
+        "The whole band lies inside the limit. Failed: the whole band lies outside. Undecided: "
+        "it straddles the limit, and does not pass.",
     ),
     "margin_disk": (
         "Disk margin",
-        "Change of gain and phase, in all channels at once, that the loop bears before it oscillates; 0.4 bears gains from 2/3 to 3/2.",
+        "Change of gain and phase, in all channels at once, that the loop bears before it oscillates; "
+        "0.4 bears gains from 2/3 to 3/2.",
     ),
-    "margin_delay": ("Delay margin", "Extra delay of all sensors, in seconds, that the loop bears before it oscillates."),
+    "margin_delay": (
+        "Delay margin",
+        "Extra delay of all sensors, in seconds, that the loop bears before it oscillates.",
+    ),
     "worst": ("Worst case", "The largest gap over all plants of the spread, starts and references."),
     "deploy": (
         "Deploy",
-        "Take it to the machine and commission it there, under watch: the rules of this page are passed. It does not say that it ran on a machine.",
+        "Take it to the machine and commission it there, under watch: the rules of this page are passed. "
+        "It does not say that it ran on a machine.",
     ),
     "columns": (
         "Data\u2011driven, model\u2011based, baseline",
-        "On this page one column each in every loop. Temperature: learned from the record alone; from the identified model; PI per zone. Deposition: basis functions of a chain identified "
+        "On this page one column each in every loop. Temperature: learned from the record alone; "
+        "from the identified model; PI per zone. Deposition: basis functions of a chain identified "
         + "from trials; the paper’s law and its library; on\u2011off control. Setpoint: our agent; a Bayes filter, whose model is given; the best proportional rule.",
     ),
-    "settling": ("Settling", "How long it takes until every zone has come within the band around its reference and stays there for good."),
+    "settling": (
+        "Settling",
+        "How long it takes until every zone has come within the band around its reference and "
+        "stays there for good.",
+    ),
     "overshoot": ("Overshoot", "The furthest way that any zone goes past its reference."),
     "drift": (
         "Drift",
-        "How far the machine has moved away from the record that its controller was learned from. Only a machine in use can show it.",
+        "How far the machine has moved away from the record that its controller was learned from. "
+        "Only a machine in use can show it.",
     ),
     "hash": (
         "Hash",
-        "The first digits of a fingerprint (SHA-256) of a file: equal hashes, equal bytes. ./run beadline verify holds all of them against the files.",
+        "The first digits of a fingerprint (SHA-256) of a file: equal hashes, equal bytes. "
+        "./run beadline verify holds all of them against the files.",
     ),
     "accepted": ("Accepted run", "The last run that a person marked as good with ./run beadline accept."),
-    "at_limits": ("Time at limits", "Share of all commands beyond what the machine can give; they are clipped to it."),
+    "at_limits": (
+        "Time at limits",
+        "Share of all commands beyond what the machine can give; they are clipped to it.",
+    ),
     "model_based": (
         "Model-based",
-        "A plant model is identified from the record; an observer estimates its state, and the Riccati equation gives the gains.",
+        "A plant model is identified from the record; an observer estimates its state, "
+        "and the Riccati equation gives the gains.",
     ),
     "window": (
         "Data-driven, window",
         (
-            "A long window of past inputs and outputs predicts the next output; the Riccati equation does the "
+            "A long window of past inputs and outputs predicts the next output; "
+            "the Riccati equation does the "
             "rest. No order, no state to choose."
         ),
     ),
     "kernel": (
         "Kernel",
-        "Algorithm 2 of the study: the value of state and action is fitted to the record directly, and the gain is read off it.",
+        "Algorithm 2 of the study: the value of state and action is fitted to the record directly, "
+        "and the gain is read off it.",
     ),
-    "baseline": ("Baseline", "One PI controller a zone, tuned by SIMC from the identified model, with the same feasible target."),
-    "exact_model": ("Exact model", "The model-based controller, told the true plant: what a perfect identification would give."),
+    "baseline": (
+        "Baseline",
+        "One PI controller a zone, tuned by SIMC from the identified model, with the same feasible target.",
+    ),
+    "exact_model": (
+        "Exact model",
+        "The model-based controller, told the true plant: what a perfect identification would give.",
+    ),
     "trusted": (
         "Trusted",
-        "To simulate: the rules simulation and stability. To predict: the rule ahead. To design controllers: ahead, inputs used up, "
+        "To simulate: the rules simulation and stability. To predict: the rule ahead. To design controllers: "
+        "ahead, inputs used up, "
         + "excitation, effects known and stability. Whiteness is a reservation: where it fails, a better observer exists.",
     ),
     "fit": (
         "Fit",
-        "100 % less the size of the error as a share of the size of the output’s movement about its mean. 100 % is perfect, 0 % is the mean, "
-        + "below 0 % is worse than the mean.",
+        "100 % less the size of the error as a share of the size of the output’s movement about its mean. "
+        "100 % is perfect, 0 % is the mean, " + "below 0 % is worse than the mean.",
     ),
-    "simulation": ("Simulation", "The model runs from the inputs alone and never sees an output; only where it starts is fitted."),
-    "ahead": ("Ahead", "The model predicts so far ahead from all outputs until then, and from the inputs throughout."),
+    "simulation": (
+        "Simulation",
+        "The model runs from the inputs alone and never sees an output; only where it starts is fitted.",
+    ),
+    "ahead": (
+        "Ahead",
+        "The model predicts so far ahead from all outputs until then, and from the inputs throughout.",
+    ),
     "held": ("Held", "The last output seen, held so long: what any prediction must beat."),
-    "holdout": ("Hold-out", "The last part of every stretch of the record. Order, window and model are chosen without it."),
+    "holdout": (
+        "Hold-out",
+        "The last part of every stretch of the record. Order, window and model are chosen without it.",
+    ),
     "fit_band": (
         "Band of a fit",
-        "Where 90 of 100 hold-outs of this length would lie, by resampling blocks of it. A fit whose band straddles its limit is undecided.",
+        "Where 90 of 100 hold-outs of this length would lie, by resampling blocks of it. "
+        "A fit whose band straddles its limit is undecided.",
     ),
-    "whiteness": ("Whiteness", "The errors of predicting one step ahead are noise: none tells the next. Ljung and Box’s test at 99 %."),
-    "inputs_left": ("Inputs used up", "No error follows an input: what inputs do, the model explains. At 99 %, over all lags."),
-    "excitation": ("Excitation", "In how many directions the inputs moved over the window: a direction without movement teaches nothing."),
+    "whiteness": (
+        "Whiteness",
+        "The errors of predicting one step ahead are noise: none tells the next. "
+        "Ljung and Box’s test at 99 %.",
+    ),
+    "inputs_left": (
+        "Inputs used up",
+        "No error follows an input: what inputs do, the model explains. At 99 %, over all lags.",
+    ),
+    "excitation": (
+        "Excitation",
+        "In how many directions the inputs moved over the window: "
+        "a direction without movement teaches nothing.",
+    ),
     "identified_spread": (
         "Spread",
-        "Plants identified anew from records rebuilt with resampled errors: as different as the record allows, and one order higher.",
+        "Plants identified anew from records rebuilt with resampled errors: "
+        "as different as the record allows, and one order higher.",
     ),
     "on_off": (
         "On\u2011off control",
-        "Wanted flow over the gain known beforehand: what a machine does that knows nothing of its own slowness. Its error is 100 %.",
+        "Wanted flow over the gain known beforehand: what a machine does that knows nothing of its own "
+        "slowness. Its error is 100 %.",
     ),
     "basis": (
         "Basis functions",
-        "Our composer: the command for any part is built from a few functions of the wanted flow, fitted to the trials through an identified chain. It needs no trained task.",
+        "Our composer: the command for any part is built from a few functions of the wanted flow, "
+        "fitted to the trials through an identified chain. It needs no trained task.",
     ),
     "library": (
         "Library",
-        "The paper’s composer: signals learned once for Start, Stop, Corner and Steady\u2011State, laid one after another as the part program asks.",
+        "The paper’s composer: signals learned once for Start, Stop, Corner and Steady\u2011State, laid one "
+        "after another as the part program asks.",
     ),
     "priority": (
         "Priority rule",
-        "Where two signals of the library overlap, one is dropped: Stop before Start before Corner before Steady\u2011State before No\u2011Flow.",
+        "Where two signals of the library overlap, one is dropped: Stop before Start before Corner before "
+        "Steady\u2011State before No\u2011Flow.",
     ),
-    "superposition": ("Superposition", "Where two signals overlap, both are added, as deviations from the steady command."),
+    "superposition": (
+        "Superposition",
+        "Where two signals overlap, both are added, as deviations from the steady command.",
+    ),
     "whole": (
         "Learned whole",
-        "Trials of this very part by our law: the best that learning gives, and a yardstick for signals composed without it.",
+        "Trials of this very part by our law: the best that learning gives, "
+        "and a yardstick for signals composed without it.",
     ),
     "forecast": (
         "Forecast",
-        "What the identified chain predicts before anything is printed. True figures come from a simulated machine that nothing was fitted to.",
+        "What the identified chain predicts before anything is printed. "
+        "True figures come from a simulated machine that nothing was fitted to.",
     ),
     "lead": (
         "Lead",
-        "How long before its event a signal must begin: the material answers late. A line shorter than it leaves Stop no room.",
+        "How long before its event a signal must begin: the material answers late. "
+        "A line shorter than it leaves Stop no room.",
     ),
     "trial": (
         "Trial",
-        "One run of the training routine: off, on, a pause of the gantry that stands for a corner, on, off. Trial 0 is on\u2011off control.",
+        "One run of the training routine: off, on, a pause of the gantry that stands for a corner, on, off. "
+        "Trial 0 is on\u2011off control.",
     ),
     "through_pictures": (
         "Through pictures",
-        "The flow is not told to the law but measured from camera frames of the bead, trial by trial, as on a machine.",
+        "The flow is not told to the law but measured from camera frames of the bead, "
+        "trial by trial, as on a machine.",
     ),
     "gamma": (
         "γ",
-        "By how much, at most, the error of one trial can be larger than that of the trial before, over all frequencies. Below 1 learning converges.",
+        "By how much, at most, the error of one trial can be larger than that of the trial before, "
+        "over all frequencies. Below 1 learning converges.",
     ),
     "saturation": (
         "Saturation",
-        "The command asks for more than the drive can give and is cut off. No law makes up for it; longer ramps do.",
+        "The command asks for more than the drive can give and is cut off. "
+        "No law makes up for it; longer ramps do.",
     ),
     "line_volume": (
         "Line volume",
-        "Material between the middles of the gaps before and after a printed line, against bead area times length.",
+        "Material between the middles of the gaps before and after a printed line, "
+        "against bead area times length.",
     ),
     "window_of_frames": (
         "Window",
-        "Twenty frames in a row, on which one decision rests. They are of one segment and repeat each other: their evidence is worth about two frames.",
+        "Twenty frames in a row, on which one decision rests. They are of one segment and repeat each other: "
+        "their evidence is worth about two frames.",
     ),
     "settles": (
         "Settle",
-        "Flow within 90–110 % and nozzle within 210 ± 5 °C from some decision up to the 90th, until the 100th. The true flow counts, which no controller is told.",
+        "Flow within 90–110 % and nozzle within 210 ± 5 °C from some decision up to the 90th, "
+        "until the 100th. The true flow counts, which no controller is told.",
     ),
     "stays": ("Stay", "Settled, and never outside again until decision 200."),
     "recovers": (
         "Recover",
-        "Inside from some decision up to the 90th until the 120th, though at the 60th the nozzle clogged to 60 % of its flow.",
+        "Inside from some decision up to the 90th until the 120th, "
+        "though at the 60th the nozzle clogged to 60 % of its flow.",
     ),
     "agent": (
         "Agent",
-        "A network that learned in simulation what to change: rewards teach it, and nobody tells it a model of the machine (deep Q-learning).",
+        "A network that learned in simulation what to change: rewards teach it, "
+        "and nobody tells it a model of the machine (deep Q-learning).",
     ),
     "as_published": (
         "As published",
-        "The paper’s own agent, network, four phases and settings, trained by its recipe. What the paper prints no value for is in params.expert.yaml or in the notes.",
+        "The paper’s own agent, network, four phases and settings, trained by its recipe. "
+        "What the paper prints no value for is in params.expert.yaml or in the notes.",
     ),
     "bayes": (
         "Bayes filter",
-        "Keeps a list of how likely each flow is, corrects it with every window by how often such windows come at that flow, and moves towards 100 %.",
+        "Keeps a list of how likely each flow is, corrects it with every window by how often such windows "
+        "come at that flow, and moves towards 100 %.",
     ),
-    "sequential": ("Sequential test", "Adds up the evidence of windows until it suffices for a move, then begins anew."),
+    "sequential": (
+        "Sequential test",
+        "Adds up the evidence of windows until it suffices for a move, then begins anew.",
+    ),
     "proportional": (
         "Proportional",
-        "Moves the flow by the difference between the shares of over and under, as seen or smoothed over a few windows.",
+        "Moves the flow by the difference between the shares of over and under, "
+        "as seen or smoothed over a few windows.",
     ),
     "recorded_windows": (
         "Recorded windows",
-        "Windows that the trained classifier really named, drawn again by the flow of the moment: its errors sit at the class borders and persist.",
+        "Windows that the trained classifier really named, drawn again by the flow of the moment: "
+        "its errors sit at the class borders and persist.",
     ),
     "weak_actuator": (
         "Gain 0.6",
-        "The extruder moves only 0.6 of what it is told, as a worn or slipping drive does; the controller is not told.",
+        "The extruder moves only 0.6 of what it is told, as a worn or slipping drive does; "
+        "the controller is not told.",
     ),
     "sticky": (
         "Sticky",
-        "The conditions of a picture last for about ten decisions, so that an error comes again; fresh: each window is of another segment.",
+        "The conditions of a picture last for about ten decisions, so that an error comes again; fresh: "
+        "each window is of another segment.",
     ),
-    "accuracy": ("Accuracy", "Share of windows that the paper’s simulator names rightly; the rest gets one of the two other classes."),
+    "accuracy": (
+        "Accuracy",
+        "Share of windows that the paper’s simulator names rightly; "
+        "the rest gets one of the two other classes.",
+    ),
     "worst_case": (
         "Worst case",
-        "The case in which the fewest runs of a controller settle and stay. The controller with the best worst case runs by default.",
+        "The case in which the fewest runs of a controller settle and stay. "
+        "The controller with the best worst case runs by default.",
     ),
     "interval": (
         "Interval",
-        "Where the true share lies with 95 % confidence, for as many runs as were made (Wilson). A share that straddles its limit is undecided.",
+        "Where the true share lies with 95 % confidence, for as many runs as were made (Wilson). "
+        "A share that straddles its limit is undecided.",
     ),
-    "key_area": ("Key area", "The 48 × 16 pixels beside the nozzle that hold the line just printed, cut out along it."),
+    "key_area": (
+        "Key area",
+        "The 48 × 16 pixels beside the nozzle that hold the line just printed, cut out along it.",
+    ),
     "calibrated": (
         "Calibrated",
-        "Of answers given with 80 % confidence, 80 % are right. The error is the mean distance between the two (expected calibration error).",
+        "Of answers given with 80 % confidence, 80 % are right. The error is the mean distance between the "
+        "two (expected calibration error).",
     ),
     "held_window": (
         "Held",
-        "Nothing is sent: too few frames show a line, they are foreign, the tip moved, or two classes remain possible.",
+        "Nothing is sent: too few frames show a line, they are foreign, the tip moved, "
+        "or two classes remain possible.",
     ),
     "foreign": (
         "Foreign",
-        "A picture that lies further from all that was learned than 95 % of familiar ones (Mahalanobis distance of the features).",
+        "A picture that lies further from all that was learned than 95 % of familiar ones (Mahalanobis "
+        "distance of the features).",
     ),
     "reward": (
         "Reward",
-        "1 at 100 % and 210 °C, falling along ellipses that lean: a hotter nozzle wants less flow. The semi-axes a, b say how soon.",
+        "1 at 100 % and 210 °C, falling along ellipses that lean: a hotter nozzle wants less flow. "
+        "The semi-axes a, b say how soon.",
     ),
-    "study": ("The study", "The published work whose method this is; “as published” repeats its own way of counting, digit by digit."),
+    "study": (
+        "The study",
+        "The published work whose method this is; “as published” repeats its own way of "
+        "counting, digit by digit.",
+    ),
 }
 
 
@@ -265,10 +360,15 @@ def glossary(sources: Sources) -> dict[str, tuple[str, str]]:
     panel, machine = sources.declared.panel, sources.declared.machine
     simulated = sources.declared.everything.get("generate_probing", {}).get("source") == "simulated"
     allowed = sources.declared.everything.get("learn_kernel", {}).get("allowed_gap_percent")
-    enough = "little more than the best" if allowed is None else f"no more than {allowed:g}{THIN}% above the best (learn_kernel.allowed_gap_percent)"
+    enough = (
+        "little more than the best"
+        if allowed is None
+        else f"no more than {allowed:g}{THIN}% above the best (learn_kernel.allowed_gap_percent)"
+    )
     spread = (
         (
-            f"Plants on which nothing was fitted: each column of B by 1 ± {100 * panel.input_gain:g} %, and A "
+            "Plants on which nothing was fitted: each column of B by 1 ± "
+            f"{100 * panel.input_gain:g} %, and A "
             f"less {panel.loss:g} I (more heat lost)."
         )
         if simulated
@@ -278,14 +378,16 @@ def glossary(sources: Sources) -> dict[str, tuple[str, str]]:
         "settled": (
             "Settled error",
             (
-                f"How far the mean temperature of the last third of {panel.steps} steps lies from the reference, for the zone where it lies furthest; "
+                f"How far the mean temperature of the last third of {panel.steps} steps lies from the "
+                "reference, for the zone where it lies furthest; "
                 "noise about that mean does not count."
             ),
         ),
         "spread": ("Plant spread", spread),
         "data": (
             "Samples needed",
-            f"So many that a controller learned from them costs {enough}, and no fewer than it has unknowns to learn.",
+            f"So many that a controller learned from them costs {enough}, "
+            "and no fewer than it has unknowns to learn.",
         ),
         "step": ("Step", f"One sample of the controller, {machine.sample_time_s:g} s here."),
     }

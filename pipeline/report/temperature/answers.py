@@ -10,7 +10,8 @@ from pipeline.report.shared.digits import DASH, number
 from pipeline.report.shared.sources import Sources, Table, lookup
 from pipeline.report.shared.verdict import Figure, Missing, Question
 
-# role on page one -> the controller's name in the artifacts; the window is the data-driven route: the record alone ranks it before the kernel
+# role on page one -> the controller's name in the artifacts; the window is the data-driven
+# route: the record alone ranks it before the kernel
 CONTROLLERS = {"data_driven": "window", "model_based": "model_based", "baseline": "baseline"}
 LABELS = {
     "model_based": ("Model-based", "model + Riccati"),
@@ -29,10 +30,13 @@ RUNS = {
 
 
 def all_answers(sources: Sources, asked: list[Question]) -> dict[str, dict[str, Figure | Missing]]:
-    """{controller: {key: figure}} of every controller that was judged, and of the three roles whether they were or not."""
+    """{controller: {key: figure}} of every controller that was judged,
+    and of the three roles whether they were or not."""
     judged = lookup(sources.metrics["evaluate_temperature"], "controllers", what="the scorecard")
     names = list(dict.fromkeys([*CONTROLLERS.values(), *([] if isinstance(judged, Missing) else judged)]))
-    return {name: {question.key: _answer(sources, judged, name, question) for question in asked} for name in names}
+    return {
+        name: {question.key: _answer(sources, judged, name, question) for question in asked} for name in names
+    }
 
 
 def _answer(sources: Sources, judged: Any, name: str, question: Question) -> Figure | Missing:
@@ -45,9 +49,17 @@ def _answer(sources: Sources, judged: Any, name: str, question: Question) -> Fig
         return worst_case(sources.tables["scorecard"], name, noise(sources), mine.get("gap_percent"))
     found = mine.get(question.key)
     if found is None:
-        return Missing("not measured", f"{question.title} is not in the scorecard", "Run ./run dvc repro evaluate_temperature")
+        return Missing(
+            "not measured",
+            f"{question.title} is not in the scorecard",
+            "Run ./run dvc repro evaluate_temperature",
+        )
     note = _zone(sources, found) if question.key == "settled_error_degC" else ""
-    return Figure(*(_finite(found.get(end)) for end in ("median", "low", "high")), runs=_runs(sources, name, question.key), note=note)
+    return Figure(
+        *(_finite(found.get(end)) for end in ("median", "low", "high")),
+        runs=_runs(sources, name, question.key),
+        note=note,
+    )
 
 
 def _finite(value: float | None) -> float:
@@ -64,7 +76,9 @@ def noise(sources: Sources) -> float:
     found = lookup(sources.tables["summary"], "noise_degC")
     if not isinstance(found, Missing):
         return found
-    return sources.declared.everything.get("evaluate_temperature", {}).get("report_noise_degC", sources.declared.panel.noise_degC[0])
+    return sources.declared.everything.get("evaluate_temperature", {}).get(
+        "report_noise_degC", sources.declared.panel.noise_degC[0]
+    )
 
 
 def _mine(table: Table, name: str, noise: float) -> np.ndarray:
@@ -82,7 +96,8 @@ def _runs(sources: Sources, name: str, key: str) -> tuple[float, ...]:
 
 
 def worst_case(table: Table | Missing, name: str, noise: float, summary: Mapping | None) -> Figure | Missing:
-    """The largest gap over plants, starts and references, in percent; its band is over the seeds of the noise."""
+    """The largest gap over plants, starts and references, in percent;
+    its band is over the seeds of the noise."""
     if isinstance(table, Missing):
         worst = (summary or {}).get("worst")
         return table if worst is None else Figure(worst, worst, worst)
@@ -93,7 +108,9 @@ def worst_case(table: Table | Missing, name: str, noise: float, summary: Mapping
     gap = 100.0 * np.where(np.isnan(gap), math.inf, gap)
     worst = np.array([gap[seed == s].max() for s in np.unique(seed)])
     low, value, high = np.quantile(worst, [0.05, 0.5, 0.95], method="nearest")
-    return Figure(float(value), float(low), float(high), tuple(worst.tolist()), f"{len(np.unique(plant))} plants")
+    return Figure(
+        float(value), float(low), float(high), tuple(worst.tolist()), f"{len(np.unique(plant))} plants"
+    )
 
 
 def _data(sources: Sources, name: str) -> Figure | Missing:
@@ -105,7 +122,9 @@ def _data(sources: Sources, name: str) -> Figure | Missing:
             return Missing("failed", str(learned["refused"]))
         return _of(samples, needed)
     if name == "window":
-        samples, noise, past = (lookup(learned, key) for key in ("samples", "samples_needed_for_noise", "window"))
+        samples, noise, past = (
+            lookup(learned, key) for key in ("samples", "samples_needed_for_noise", "window")
+        )
         missing = next((part for part in (samples, noise, past) if isinstance(part, Missing)), None)
         unknowns = 0 if missing else past * (len(machine.inputs) + len(machine.outputs)) + 1
         return missing or _of(samples, max(noise, unknowns))
@@ -115,15 +134,19 @@ def _data(sources: Sources, name: str) -> Figure | Missing:
 
 
 def _model_data(sources: Sources) -> Figure | Missing:
-    """The model has fewer unknowns than the window, so that noise asks no more of it; its own first step, a long VARX, asks for its
-    unknowns.
+    """The model has fewer unknowns than the window, so that noise asks no more of it; its
+    own first step, a long VARX, asks for its unknowns.
     """
     found, machine = sources.metrics["identify_plant"], sources.declared.machine
     samples, past = lookup(found, "rows"), lookup(found, "past")
     needed = lookup(found, "samples_needed")
     if isinstance(needed, Missing) and not isinstance(past, Missing):
         noise = lookup(sources.metrics["learn_kernel"], "samples_needed_for_noise")
-        needed = noise if isinstance(noise, Missing) else max(noise, past * (len(machine.inputs) + len(machine.outputs)) + 1)
+        needed = (
+            noise
+            if isinstance(noise, Missing)
+            else max(noise, past * (len(machine.inputs) + len(machine.outputs)) + 1)
+        )
     return _of(samples, needed)
 
 
@@ -132,7 +155,9 @@ def _of(samples: Any, needed: Any) -> Figure | Missing:
     if missing or not needed:
         return missing or Missing("not measured", "the number of samples that are needed is not known")
     ratio, more = samples / needed, max(needed - samples, 0)
-    note = f"{number(samples, 0)} of {number(needed, 0)}" + (f" samples; record {number(more, 0)} more." if more else "")
+    note = f"{number(samples, 0)} of {number(needed, 0)}" + (
+        f" samples; record {number(more, 0)} more." if more else ""
+    )
     return Figure(ratio, ratio, ratio, note=note)
 
 

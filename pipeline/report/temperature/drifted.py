@@ -1,4 +1,5 @@
-"""Answer 11: whether the machine has drifted, as the nightly job measured it last; reports/metrics/nightly.json -> a figure, or why there is none."""
+"""Answer 11: whether the machine has drifted, as the nightly job measured it last;
+reports/metrics/nightly.json -> a figure, or why there is none."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -12,7 +13,8 @@ AGAIN = "Look at the machine; where the change is meant to stay, record it anew 
 
 
 class Drift(NamedTuple):
-    """Answer 11 as it is read: what the rule is judged by, the word before the sentence, and which night it is from ("" before the first)."""
+    """Answer 11 as it is read: what the rule is judged by, the word before the sentence,
+    and which night it is from ("" before the first)."""
 
     found: Figure | Missing
     word: str
@@ -21,13 +23,17 @@ class Drift(NamedTuple):
 
 
 def drift(sources: Sources) -> Drift:
-    """Alarm: failed. Watched: undecided. No alarm on a new recording: passed, with the parameter that moved most, in percent with its 90 % band."""
+    """Alarm: failed. Watched: undecided. No alarm on a new recording: passed, with the parameter that moved
+    most, in percent with its 90 % band."""
     nightly = sources.nightly
     if nightly is None:
         return Drift(NEVER, "Not measured.", NEVER.sentence(), "")
     if isinstance(nightly, Missing):
         return Drift(nightly, f"{nightly.state.capitalize()}.", nightly.sentence(), "")
-    night, seen = f"{nightly.get('run', 'last night')}, {str(nightly.get('when', ''))[:10]}".strip(", "), nightly.get("drift") or {}
+    night, seen = (
+        f"{nightly.get('run', 'last night')}, {str(nightly.get('when', ''))[:10]}".strip(", "),
+        nightly.get("drift") or {},
+    )
     for key, state, word in (("alarms", FAILED, "Drifted."), ("watched", UNDECIDED, "Perhaps.")):
         causes = "; ".join(str(one.get("cause", one)) for one in seen.get(key, []))
         if causes:
@@ -48,7 +54,8 @@ def drift(sources: Sources) -> Drift:
 
 
 def _most(figures: Mapping[str, Any]) -> tuple[str, float, float] | None:
-    """The parameter of the plant that moved most of all recordings of the night, against its own noise: name, change and half of its 90 % band in percent."""
+    """The parameter of the plant that moved most of all recordings of the night, against its own noise: name,
+    change and half of its 90 % band in percent."""
     found = [
         (abs(one["sigmas"]), name, float(one["percent"]), float(one["band_percent"]))
         for recording in figures.values()

@@ -1,5 +1,5 @@
-"""The figures of the temperature page that show what the learning rests on: the routes under noise, lengths and orders, the hold-out,
-and the optimiser."""
+"""The figures of the temperature page that show what the learning rests on: the routes under noise, lengths
+and orders, the hold-out, and the optimiser."""
 
 from typing import Any
 
@@ -71,23 +71,35 @@ def _cloud(table: Table, level: float, column: str, factor: float, title: str) -
             px, top, bottom = float(frame.px(middle)), float(frame.py(at + 0.36)), float(frame.py(at - 0.36))
             layers += [
                 charts.dots(frame, mine, spread, f"dot {css}"),
-                Markup('<line class="med" x1="{0:.1f}" x2="{0:.1f}" y1="{1:.1f}" y2="{2:.1f}"/>').format(px, top, bottom),
+                Markup('<line class="med" x1="{0:.1f}" x2="{0:.1f}" y1="{1:.1f}" y2="{2:.1f}"/>').format(
+                    px, top, bottom
+                ),
             ]
             said.append(f"{name} {short(middle, 2)}" + (f" ({failed} unstable)" if failed else ""))
         elif failed:
             said.append(f"{name}: unstable in all {failed}")
     return charts.panel(
-        frame, layers, alt=f"At {level:g} °C of noise, median {title.split(',')[0]}: {', '.join(said)}", css="dd", title=title
+        frame,
+        layers,
+        alt=f"At {level:g} °C of noise, median {title.split(',')[0]}: {', '.join(said)}",
+        css="dd",
+        title=title,
     )
 
 
 def _ranking(table: Table) -> str:
     parts = []
     for level in np.unique(table["noise_degC"]):
-        medians = {route: float(np.nanmedian(table["gap"][(table["route"] == route) & (table["noise_degC"] == level)])) for route in ROUTES}
+        medians = {
+            route: float(
+                np.nanmedian(table["gap"][(table["route"] == route) & (table["noise_degC"] == level)])
+            )
+            for route in ROUTES
+        }
         by = medians["kernel"] / medians["window"], medians["kernel_predicted_state"] / medians["window"]
         parts.append(
-            f"at {level:g} °C the kernel on the raw window costs {number(by[0], 0)} times the window’s gap, on "
+            f"at {level:g} °C the kernel on the raw window costs {number(by[0], 0)} times "
+            "the window’s gap, on "
             f"the predicted state {number(by[1], 1)} times"
         )
     text = "; ".join(parts)
@@ -98,8 +110,15 @@ def _ranking(table: Table) -> str:
 
 
 def orders(sources: Sources) -> Picture:
-    """How long a window, how many states: Akaike's criterion, singular values against the noise, the error of each order, the poles."""
-    shown = [_criterion(sources), *_kernel_state(sources), singular(sources), left_out(sources), _poles(sources)]
+    """How long a window, how many states: Akaike's criterion, singular values
+    against the noise, the error of each order, the poles."""
+    shown = [
+        _criterion(sources),
+        *_kernel_state(sources),
+        singular(sources),
+        left_out(sources),
+        _poles(sources),
+    ]
     learned, model = sources.metrics["learn_kernel"], sources.metrics["identify_plant"]
     window, state, order = lookup(learned, "window"), lookup(learned, "state"), lookup(model, "order")
     parts = [
@@ -133,7 +152,9 @@ def _criterion(sources: Sources) -> Column:
     table = window["table"]
     above = table[:, 2] - table[:, 2].min() + 1
     chosen = float(table[above.argmin(), 0])
-    frame = charts.Frame(charts.linear(0, float(table[-1, 0])), charts.logarithmic(1, float(above.max())), **_SMALL)
+    frame = charts.Frame(
+        charts.linear(0, float(table[-1, 0])), charts.logarithmic(1, float(above.max())), **_SMALL
+    )
     layers = [
         charts.line(frame, table[:, 0], above),
         charts.dots(frame, table[:, 0], above, "dot dd"),
@@ -156,7 +177,11 @@ def singular(sources: Sources) -> Column:
         return _holed(head, small, table, "model_based")
     order, values, edge = table["order"], table["singular_value"], float(table["noise_edge"][0])
     positive = np.append(values[values > 0], edge if edge > 0 else values.max())
-    frame = charts.Frame(charts.linear(0, float(order[-1]) + 1), charts.logarithmic(float(positive.min()), float(positive.max())), **_SMALL)
+    frame = charts.Frame(
+        charts.linear(0, float(order[-1]) + 1),
+        charts.logarithmic(float(positive.min()), float(positive.max())),
+        **_SMALL,
+    )
     chosen = table["chosen"]
     last = int(order[chosen][0]) if chosen.any() else 0
     layers = [
@@ -171,23 +196,36 @@ def singular(sources: Sources) -> Column:
 
 
 def _kernel_state(sources: Sources) -> list[Column]:
-    """Singular values of the kernel's state; none where it is a predicted one, which is made of unit variance."""
+    """Singular values of the kernel's state; none where it is a
+    predicted one, which is made of unit variance."""
     head, small = "State of the kernel", "singular values over the record, r.m.s.; log"
     kernel = sources.tables["kernel"]
     if isinstance(kernel, Missing):
         refused = lookup(sources.metrics["learn_kernel"], "refused")
-        return [_holed(head, small, kernel if isinstance(refused, Missing) else Missing("failed", str(refused)), "kernel")]
+        return [
+            _holed(
+                head,
+                small,
+                kernel if isinstance(refused, Missing) else Missing("failed", str(refused)),
+                "kernel",
+            )
+        ]
     values = kernel["singular_values"]
     values = values[values > 0]
     if len(values) == 0 or values.max() < 1.1 * values.min():
         return []
     kept = int(kernel["rank"]) - len(kernel["u_scale"])
     index = np.arange(1, len(values) + 1)
-    frame = charts.Frame(charts.linear(0, len(values) + 1), charts.logarithmic(float(values.min()), float(values.max())), **_SMALL)
-    layers = [charts.dots(frame, index[:kept], values[:kept], "dot ring", 3), charts.dots(frame, index[kept:], values[kept:], "try", 2.4)]
-    alt = (
-        f"{len(values)} singular values from {short(float(values.max()))} down to {short(float(values.min()))}; {kept} directions are kept"
+    frame = charts.Frame(
+        charts.linear(0, len(values) + 1),
+        charts.logarithmic(float(values.min()), float(values.max())),
+        **_SMALL,
     )
+    layers = [
+        charts.dots(frame, index[:kept], values[:kept], "dot ring", 3),
+        charts.dots(frame, index[kept:], values[kept:], "try", 2.4),
+    ]
+    alt = f"{len(values)} singular values from {short(float(values.max()))} down to {short(float(values.min()))}; {kept} directions are kept"
     return [Column(head, f"{small}; {kept} kept", "kernel", [charts.panel(frame, layers, alt=alt, css="dd")])]
 
 
@@ -198,16 +236,25 @@ def left_out(sources: Sources) -> Column:
         return _holed(head, small, table, "model_based")
     known = np.isfinite(table["error"])
     if not known.any():
-        return _holed(head, small, Missing("not applicable", "the rank alone decided, or the order was given"), "model_based")
+        return _holed(
+            head,
+            small,
+            Missing("not applicable", "the rank alone decided, or the order was given"),
+            "model_based",
+        )
     order, error, chosen = (table[name][known] for name in ("order", "error", "chosen"))
-    frame = charts.Frame(charts.linear(0, float(order[-1]) + 1), charts.linear(0, 1.1 * float(error.max())), **_SMALL)
+    frame = charts.Frame(
+        charts.linear(0, float(order[-1]) + 1), charts.linear(0, 1.1 * float(error.max())), **_SMALL
+    )
     layers = [charts.line(frame, order, error), charts.dots(frame, order, error, "dot", 2.4)]
     said = "none chosen"
     if chosen.any():
         at, least = float(order[chosen][0]), float(error[chosen][0])
         layers += [
             charts.dots(frame, [at], [least], "dot", 4),
-            charts.label(frame, frame.x.high, frame.y.high, f"order {at:g}: {number(least, 3)}", anchor="end", dy=10),
+            charts.label(
+                frame, frame.x.high, frame.y.high, f"order {at:g}: {number(least, 3)}", anchor="end", dy=10
+            ),
         ]
         said = f"order {at:g} leaves {percent(100 * least, 2)} of the variation unexplained"
     alt = f"Error on left-out blocks by order: {said}"
@@ -228,7 +275,10 @@ def _poles(sources: Sources) -> Column:
     reach = 0.5 * (high - low) * (160 - 30) / (270 - 46)
     frame = charts.Frame(charts.linear(low, high, ticks=3), charts.linear(-reach, reach, ticks=3), **_SMALL)
     angle = np.linspace(-np.arcsin(min(reach, 1)), np.arcsin(min(reach, 1)), 60)
-    layers = [charts.line(frame, np.cos(angle), np.sin(angle), "lim line thin"), charts.dots(frame, poles.real, poles.imag, "dot", 3)]
+    layers = [
+        charts.line(frame, np.cos(angle), np.sin(angle), "lim line thin"),
+        charts.dots(frame, poles.real, poles.imag, "dot", 3),
+    ]
     alt = f"{len(poles)} poles, the largest of size {number(largest, 4)}, {'inside' if largest < 1 else 'on or outside'} the unit circle"
     return Column(head, small, "model_based", [charts.panel(frame, layers, alt=alt, css="mb")])
 
@@ -238,29 +288,51 @@ def _poles(sources: Sources) -> Column:
 
 def tuning(sources: Sources) -> Picture:
     """The best cost so far in both modes, each beside its yardstick."""
-    table, found, title = sources.tables["tuning"], sources.metrics["tune_weights"], "The optimiser’s progress"
+    table, found, title = (
+        sources.tables["tuning"],
+        sources.metrics["tune_weights"],
+        "The optimiser’s progress",
+    )
     if isinstance(table, Missing):
         return hole("tuning", title, table)
     best, optimum = lookup(found, "parity.best_cost_perfect_state"), lookup(found, "parity.optimum")
     cost, default = lookup(found, "practical.cost"), default_cost(found)
     shown = [
-        _progress(table, "parity", "The study’s objective", "excess over the optimum in %, log", optimum, excess=True),
-        _progress(table, "practical", "The declared engineering cost", "log; default: Q = R = I", default, excess=False),
+        _progress(
+            table,
+            "parity",
+            "The study’s objective",
+            "excess over the optimum in %, log",
+            optimum,
+            excess=True,
+        ),
+        _progress(
+            table,
+            "practical",
+            "The declared engineering cost",
+            "log; default: Q = R = I",
+            default,
+            excess=False,
+        ),
     ]
     said = []
     if not isinstance(best, Missing) and not isinstance(optimum, Missing):
         excess = percent(100 * (best / optimum - 1), 2)
         said.append(
-            f"On the study’s objective the search ends {excess} above the optimum, {number(optimum, 0)}, which Q = R = I itself reaches."
+            f"On the study’s objective the search ends {excess} above the optimum, {number(optimum, 0)}, "
+            "which Q = R = I itself reaches."
         )
     if not isinstance(cost, Missing) and not isinstance(default, Missing):
         said.append(
-            f"On the engineering cost it ends at {short(cost)}, the default weights at {short(default)}, both "
+            f"On the engineering cost it ends at {short(cost)}, the default weights at "
+            f"{short(default)}, both "
             "on the training half of the panel."
         )
     failed = int(np.isnan(table["cost"].astype(float)).sum())
     caption = "Dots: candidates; line: best so far." + (
-        f" Vermillion at the foot: {count(failed, 'candidate')} that failed." if failed else " No candidate failed."
+        f" Vermillion at the foot: {count(failed, 'candidate')} that failed."
+        if failed
+        else " No candidate failed."
     )
     return Picture("tuning", title, " ".join(said), shown, caption, page.origin(sources.source("tuning")))
 
@@ -268,19 +340,34 @@ def tuning(sources: Sources) -> Picture:
 def default_cost(found: Any) -> Any:
     """The engineering cost of the weights that the search started against."""
     cost = lookup(found, "practical.cost_default", what="the cost of the default weights")
-    return lookup(found, "practical.cost_identity", what="the cost of equal weights") if isinstance(cost, Missing) else cost
+    return (
+        lookup(found, "practical.cost_identity", what="the cost of equal weights")
+        if isinstance(cost, Missing)
+        else cost
+    )
 
 
 def _progress(table: Table, mode: str, head: str, small: str, level: Any, *, excess: bool) -> Column:
     rows = table["mode"] == mode
     if not rows.any() or isinstance(level, Missing):
-        return _holed(head, small, level if isinstance(level, Missing) else Missing("not measured", f"no {mode} search was recorded"))
+        return _holed(
+            head,
+            small,
+            level
+            if isinstance(level, Missing)
+            else Missing("not measured", f"no {mode} search was recorded"),
+        )
     at, cost, best = (table[name][rows].astype(float) for name in ("evaluation", "cost", "incumbent"))
     if excess:
         cost, best = (100 * (values / level - 1) for values in (cost, best))
     least = max(float(np.nanmin(best)), 1e-6)
     frame = charts.Frame(
-        charts.linear(0, float(at[-1])), charts.logarithmic(least, float(np.nanmax(cost))), width=540, height=190, left=44, above=20
+        charts.linear(0, float(at[-1])),
+        charts.logarithmic(least, float(np.nanmax(cost))),
+        width=540,
+        height=190,
+        left=44,
+        above=20,
     )
     failed = at[np.isnan(cost)]
     layers = [
@@ -293,11 +380,18 @@ def _progress(table: Table, mode: str, head: str, small: str, level: Any, *, exc
     end = float(best[-1])
     layers.append(
         charts.label(
-            frame, float(at[-1]), frame.y.high, f"best {percent(end, 2)} above" if excess else f"best {short(end)}", anchor="end", dy=-6
+            frame,
+            float(at[-1]),
+            frame.y.high,
+            f"best {percent(end, 2)} above" if excess else f"best {short(end)}",
+            anchor="end",
+            dy=-6,
         )
     )
     alt = f"{head}: after {count(len(at), 'evaluation')} " + (
-        f"the best is {percent(end, 2)} above the optimum" if excess else f"the best costs {short(end)}, the default weights {short(level)}"
+        f"the best is {percent(end, 2)} above the optimum"
+        if excess
+        else f"the best costs {short(end)}, the default weights {short(level)}"
     )
     return Column(head, small, "", [charts.panel(frame, layers, alt=alt, css="mb")])
 
@@ -325,13 +419,25 @@ def holdout(sources: Sources) -> Picture:
         fit = None if isinstance(fits, Missing) else fits.get(output.name)
         small = "fit not measured" if fit is None else f"fit {number(fit, 1)}{THIN}%"
         alt = f"{output.name}: {small} in simulation on the hold-out"
-        layers = [charts.line(frame, time, measured, "line seen"), charts.line(frame, time, simulated, "line thin")]
+        layers = [
+            charts.line(frame, time, measured, "line seen"),
+            charts.line(frame, time, simulated, "line thin"),
+        ]
         shown.append(
             Column(
-                output.name, small, "", [charts.panel(frame, layers, alt=alt, css="mb", title="°C" if not shown else "", units=("s", "°C"))]
+                output.name,
+                small,
+                "",
+                [
+                    charts.panel(
+                        frame, layers, alt=alt, css="mb", title="°C" if not shown else "", units=("s", "°C")
+                    )
+                ],
             )
         )
-    text = "The model runs from the inputs alone; a fit of 100 % would be perfect, 0 % no better than the mean."
+    text = (
+        "The model runs from the inputs alone; a fit of 100 % would be perfect, 0 % no better than the mean."
+    )
     return Picture(
         "holdout",
         title,

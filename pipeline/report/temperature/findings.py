@@ -9,7 +9,8 @@ from pipeline.report.temperature.evidence import default_cost
 
 
 def findings(sources: Sources) -> list[tuple[str, str]]:
-    """What a reader should take away, each with its figure; a figure that was not measured is said to be so."""
+    """What a reader should take away, each with its figure; a figure
+    that was not measured is said to be so."""
     evaluated, tuned = sources.metrics["evaluate_temperature"], sources.metrics["tune_weights"]
     found = [_claim(sources), _scaled(tuned), _algorithm_1(evaluated), _start(evaluated), _regret(tuned)]
     units = sources.declared.machine.sample_time_s
@@ -17,7 +18,8 @@ def findings(sources: Sources) -> list[tuple[str, str]]:
         (
             "Units are our convention.",
             (
-                f"The study names no unit of time and none of duty. Here a step is {units:g}{THIN}s and inputs are "
+                "The study names no unit of time and none of duty. "
+                f"Here a step is {units:g}{THIN}s and inputs are "
                 "in per cent; read seconds as steps."
             ),
         )
@@ -27,7 +29,8 @@ def findings(sources: Sources) -> list[tuple[str, str]]:
             (
                 "The probing is simulated, the judging is separate.",
                 (
-                    "The record comes from the study’s machine, simulated within limits; every controller is judged "
+                    "The record comes from the study’s machine, simulated within limits; "
+                    "every controller is judged "
                     "on plants that nothing was fitted to. Nothing here is a claim about a real printer."
                 ),
             )
@@ -52,12 +55,16 @@ def _claim(sources: Sources) -> tuple[str, str] | None:
 
 
 def _scaled(tuned: Any) -> tuple[str, str]:
-    change, apart = lookup(tuned, "parity.scaled_weights.change_percent"), lookup(tuned, "parity.scaled_weights.gain_difference")
+    change, apart = (
+        lookup(tuned, "parity.scaled_weights.change_percent"),
+        lookup(tuned, "parity.scaled_weights.gain_difference"),
+    )
     if isinstance(change, Missing) or isinstance(apart, Missing):
         return "The same controller, “improved”.", "Not measured: tune_weights did not try Q = R = 0.4 I."
     return (
         f"Q = R = 0.4 I “improves” the cost by {number(abs(change), 1)} % without changing the controller.",
-        f"Its gain differs from that of Q = R = I by {short(apart, 1)}, which is rounding; every temperature and every input is the same.",
+        f"Its gain differs from that of Q = R = I by {short(apart, 1)}, which is rounding; "
+        "every temperature and every input is the same.",
     )
 
 
@@ -80,17 +87,24 @@ def _start(evaluated: Any) -> tuple[str, str]:
         return "Where the observer starts.", "Not measured."
     return (
         f"Starting the observer at 50 °C costs {percent(100 * (late / best - 1), 2)} for nothing.",
-        "Starting it from the first measurement costs next to nothing, and asks for nothing that is not known.",
+        "Starting it from the first measurement costs next to nothing, "
+        "and asks for nothing that is not known.",
     )
 
 
 def _regret(tuned: Any) -> tuple[str, str]:
-    regret, cost, identity = lookup(tuned, "practical.regret_identity"), lookup(tuned, "practical.cost"), default_cost(tuned)
+    regret, cost, identity = (
+        lookup(tuned, "practical.regret_identity"),
+        lookup(tuned, "practical.cost"),
+        default_cost(tuned),
+    )
     if any(isinstance(v, Missing) for v in (regret, cost, identity)):
         return "What tuning buys.", "Not measured."
     return (
-        f"Practical tuning lowers the engineering cost by {percent(100 * (1 - cost / identity), 2)}, and says what it pays.",
-        f"On the common yardstick the tuned weights cost {percent(100 * regret, 2)} more than the default ones: settling, overshoot and "
+        f"Practical tuning lowers the engineering cost by {percent(100 * (1 - cost / identity), 2)}, "
+        "and says what it pays.",
+        f"On the common yardstick the tuned weights cost {percent(100 * regret, 2)} more than the default "
+        "ones: settling, overshoot and "
         + (
             "limits are bought with quadratic cost. Gaps on these pages are at the yardstick’s weights, "
             "unclipped; everything else is as deployed."

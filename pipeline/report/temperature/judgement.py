@@ -29,7 +29,9 @@ def judgement(sources: Sources) -> Judgement:
     asked = questions(sources.declared.rules, band_degC=sources.declared.panel.band_degC)
     drifted = drift(sources)
     # of the machine, and so of every controller that was learned from its record
-    by_name = {name: {**answers, "drift": drifted.found} for name, answers in all_answers(sources, asked).items()}
+    by_name = {
+        name: {**answers, "drift": drifted.found} for name, answers in all_answers(sources, asked).items()
+    }
     roles = {role: by_name[name] for role, name in CONTROLLERS.items()}
     changed = difference(sources)
     found = moves(sources, asked, by_name) if changed else {}

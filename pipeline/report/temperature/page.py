@@ -1,4 +1,5 @@
-"""The page of the temperature loop: verdict, tables, findings, figures, what was declared, words, provenance."""
+"""The page of the temperature loop: verdict, tables, findings,
+figures, what was declared, words, provenance."""
 
 from pipeline.report.identification.model import trust
 from pipeline.report.index import page as index_page

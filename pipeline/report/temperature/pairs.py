@@ -1,4 +1,5 @@
-"""Two controllers on the very same cases: what the data-driven one saves against each of the others, with a sign-flip test over plants (pipeline/paired.py)."""
+"""Two controllers on the very same cases: what the data-driven one saves against each of the others, with a
+sign-flip test over plants (pipeline/paired.py)."""
 
 from typing import Any
 
@@ -14,13 +15,17 @@ from pipeline.statistics import Paired, paired
 LEVEL = 0.05
 # what is compared: column of the scorecard, and what makes a cost above zero of it
 COSTS = (
-    ("Cost on the yardstick, unclipped", lambda table, rows: 1.0 + table["regret"][rows]),  # J / J*, of which J* is the same for both
+    (
+        "Cost on the yardstick, unclipped",
+        lambda table, rows: 1.0 + table["regret"][rows],
+    ),  # J / J*, of which J* is the same for both
     ("R.m.s. tracking error, as deployed", lambda table, rows: table["tracking_degC"][rows]),
 )
 
 
 def compared(sources: Sources) -> dict[str, Any]:
-    """A row for each of the others and each cost; every case is one plant, start, reference and seed, and cases of a plant are one block."""
+    """A row for each of the others and each cost; every case is one plant, start,
+    reference and seed, and cases of a plant are one block."""
     table = sources.tables["scorecard"]
     if isinstance(table, Missing):
         return {"missing": table, "rows": [], "finding": ""}
@@ -42,13 +47,21 @@ def _paired(table: Table, other: str, mine: str, level: float, cost: Any) -> Pai
     """Costs of the two in the same order of cases; None where one of them lost a run, or ran other cases."""
     rows = {name: (table["controller"] == name) & (table["noise_degC"] == level) for name in (other, mine)}
     cases = {
-        name: np.column_stack([table[key][one].astype(float) for key in ("plant", "start_degC", "reference_degC", "seed")])
+        name: np.column_stack(
+            [table[key][one].astype(float) for key in ("plant", "start_degC", "reference_degC", "seed")]
+        )
         for name, one in rows.items()
     }
-    if not len(cases[mine]) or cases[mine].shape != cases[other].shape or not (cases[mine] == cases[other]).all():
+    if (
+        not len(cases[mine])
+        or cases[mine].shape != cases[other].shape
+        or not (cases[mine] == cases[other]).all()
+    ):
         return None
     theirs, ours = (np.asarray(cost(table, rows[name]), float) for name in (other, mine))
-    if not (np.isfinite(theirs).all() and np.isfinite(ours).all() and (theirs > 0).all() and (ours > 0).all()):
+    if not (
+        np.isfinite(theirs).all() and np.isfinite(ours).all() and (theirs > 0).all() and (ours > 0).all()
+    ):
         return None
     blocks = [f"{plant:g}" for plant in cases[mine][:, 0]]
     # the draws are for more blocks than all signs can be tried of; a fixed generator keeps the page the same

@@ -1,5 +1,5 @@
-"""The figures of the temperature page that show the data: what was excited, the record signal by signal, and what was found strange in
-it."""
+"""The figures of the temperature page that show the data: what was excited, the record
+signal by signal, and what was found strange in it."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -33,10 +33,18 @@ def excitation(sources: Sources) -> Picture:
         frame = charts.Frame(charts.Axis(0, 1, ((0, "0"), (1, "π"))), y, width=150, height=96, left=24)
         layer = charts.line(frame, edges, np.append(levels[:, i], levels[-1, i]), steps=True)
         alt = (
-            f"{name}: level {number(float(levels[:, i].min()), 2)} to {number(float(levels[:, i].max()), 2)} % "
+            f"{name}: level {number(float(levels[:, i].min()), 2)} to "
+            f"{number(float(levels[:, i].max()), 2)} % "
             "in eight bands from 0 to π rad a step"
         )
-        shown.append(Column(name, "", "", [charts.panel(frame, [layer], alt=alt, title="%" if i == 0 else "", units=("of π", "%"))]))
+        shown.append(
+            Column(
+                name,
+                "",
+                "",
+                [charts.panel(frame, [layer], alt=alt, title="%" if i == 0 else "", units=("of π", "%"))],
+            )
+        )
     rank, full, order = (lookup(found, f"excitation_{key}") for key in ("rank", "full_rank", "order"))
     condition, limited = lookup(found, "excitation_condition"), lookup(found, "limited_share")
     text = f"Exciting of order {order}: rank {rank} of {full}" + (
@@ -62,7 +70,11 @@ def excitation(sources: Sources) -> Picture:
 
 def record(sources: Sources) -> Picture:
     """Every signal of the record, what is masked and what was found strange."""
-    table, quality, title = sources.tables["record"], sources.tables["quality"], "The record, with what was flagged and masked"
+    table, quality, title = (
+        sources.tables["record"],
+        sources.tables["quality"],
+        "The record, with what was flagged and masked",
+    )
     if isinstance(table, Missing):
         return hole("record", title, table)
     machine, time = sources.declared.machine, _elapsed(table, sources.declared.machine.sample_time_s)
@@ -74,7 +86,11 @@ def record(sources: Sources) -> Picture:
             masked_total += int(masked.sum())
             halves[half].append(_signal(signal, time, values, masked, quality, last=i == len(signals) - 1))
     recordings = count(len(np.unique(table["recording"])), "recording")
-    masks = f"{count(masked_total, 'value is', 'values are')} masked and not used" if masked_total else "nothing is masked"
+    masks = (
+        f"{count(masked_total, 'value is', 'values are')} masked and not used"
+        if masked_total
+        else "nothing is masked"
+    )
     text = f"{number(len(time), 0)} samples of {recordings}; {masks}. {_found(sources.metrics['ingest'])}"
     heads = (("Inputs", f"{machine.inputs[0].unit}, as applied"), ("Outputs", "°C, as measured"))
     shown = [Column(head, small, "", panels) for (head, small), panels in zip(heads, halves, strict=True)]
@@ -106,12 +122,16 @@ def _elapsed(table: Table, step: float) -> np.ndarray:
     return step * np.arange(len(table["time_s"]))
 
 
-def _signal(signal, time: np.ndarray, values: np.ndarray, masked: np.ndarray, quality: Table | Missing, *, last: bool) -> Markup:
+def _signal(
+    signal, time: np.ndarray, values: np.ndarray, masked: np.ndarray, quality: Table | Missing, *, last: bool
+) -> Markup:
     finite = values[np.isfinite(values)]
     low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
     frame = charts.Frame(
         charts.linear(0, float(time[-1]) or 1.0),
-        charts.Axis(low, high, ((low, short(low, 3)), (high, short(high, 3)))) if high > low else charts.linear(low, high),
+        charts.Axis(low, high, ((low, short(low, 3)), (high, short(high, 3))))
+        if high > low
+        else charts.linear(low, high),
         width=540,
         height=80 if last else 66,
         left=44,
@@ -124,12 +144,15 @@ def _signal(signal, time: np.ndarray, values: np.ndarray, masked: np.ndarray, qu
     mine = [] if isinstance(quality, Missing) else np.flatnonzero(quality["signal"] == signal.name)
     # a flag that spans the record says where it is in words, not in grey over everything
     short_ones = [i for i in mine if quality["end_s"][i] - quality["start_s"][i] < 0.5 * float(time[-1])]
-    layers = [charts.interval(frame, float(quality["start_s"][i]), float(quality["end_s"][i])) for i in short_ones[:100]] + layers
+    layers = [
+        charts.interval(frame, float(quality["start_s"][i]), float(quality["end_s"][i]))
+        for i in short_ones[:100]
+    ] + layers
     flags = ", ".join(sorted({str(quality["kind"][i]) for i in mine}))
     unit = {"degC": "°C"}.get(signal.unit, signal.unit)
-    alt = (f"{signal.name}: {short(low)} to {short(high)} {unit}, {count(int(masked.sum()), 'sample')} masked") + (
-        f"; flagged {flags}" if flags else ""
-    )
+    alt = (
+        f"{signal.name}: {short(low)} to {short(high)} {unit}, {count(int(masked.sum()), 'sample')} masked"
+    ) + (f"; flagged {flags}" if flags else "")
     title = signal.name + (f": {flags}" if flags else "")
     return charts.panel(frame, layers, alt=alt, css="mb", title=title, x_ticks=last, units=("s", unit))
 
@@ -154,7 +177,9 @@ def findings(sources: Sources, most: int = 40) -> tuple[list[Mapping[str, str]],
             "recording": str(table["recording"][i]),
             "signal": str(table["signal"][i]) or "whole recording",
             "kind": str(table["kind"][i]),
-            "place": "" if np.isnan(table["start_s"][i]) else f"{_seconds(table['start_s'][i])} to {_seconds(table['end_s'][i])}{THIN}s",
+            "place": ""
+            if np.isnan(table["start_s"][i])
+            else f"{_seconds(table['start_s'][i])} to {_seconds(table['end_s'][i])}{THIN}s",
             "count": number(float(table["count"][i]), 0),
             "message": str(table["message"][i]),
             "bad": table["kind"][i] == "quarantined",

@@ -1,5 +1,5 @@
-"""The figures of the temperature page that show what a controller pays for what it gives: error against effort, of controllers and of the tuning's candidates, and the gap
-plant by plant."""
+"""The figures of the temperature page that show what a controller pays for what it gives: error against
+effort, of controllers and of the tuning's candidates, and the gap plant by plant."""
 
 from typing import Any, NamedTuple
 
@@ -15,7 +15,8 @@ from pipeline.report.temperature.answers import LABELS, noise
 
 
 class Cloud(NamedTuple):
-    """One controller's runs on the nominal plant: r.m.s. effort in % and r.m.s. error in °C, and their medians."""
+    """One controller's runs on the nominal plant: r.m.s. effort in %
+    and r.m.s. error in °C, and their medians."""
 
     effort: np.ndarray
     error: np.ndarray
@@ -34,7 +35,9 @@ def front(points: dict[str, tuple[float, float]]) -> list[str]:
     kept = [
         name
         for name, (a, b) in points.items()
-        if not any(c <= a and d <= b and (c, d) != (a, b) for other, (c, d) in points.items() if other != name)
+        if not any(
+            c <= a and d <= b and (c, d) != (a, b) for other, (c, d) in points.items() if other != name
+        )
     ]
     return sorted(kept, key=lambda name: points[name])
 
@@ -52,18 +55,31 @@ def tradeoff(sources: Sources) -> Picture:
         if finite.any():
             clouds[name] = Cloud(table["effort_percent"][mine][finite], table["tracking_degC"][mine][finite])
     if not clouds:
-        return hole("tradeoff", title, Missing("not measured", "no run on the nominal plant has both figures"))
+        return hole(
+            "tradeoff", title, Missing("not measured", "no run on the nominal plant has both figures")
+        )
     points = {name: cloud.middle for name, cloud in clouds.items()}
     best = front(points)
-    x, y = (_around(np.concatenate([getattr(cloud, key) for cloud in clouds.values()])) for key in ("effort", "error"))
-    shown = [Column(*LABELS[name], name, [_traded(name, clouds, points, best, x, y, first=i == 0)]) for i, name in enumerate(clouds)]
-    said = ", ".join(f"{LABELS[name][0]} {number(points[name][1], 2)}{THIN}°C at {number(points[name][0], 2)}{THIN}%" for name in best)
+    x, y = (
+        _around(np.concatenate([getattr(cloud, key) for cloud in clouds.values()]))
+        for key in ("effort", "error")
+    )
+    shown = [
+        Column(*LABELS[name], name, [_traded(name, clouds, points, best, x, y, first=i == 0)])
+        for i, name in enumerate(clouds)
+    ]
+    said = ", ".join(
+        f"{LABELS[name][0]} {number(points[name][1], 2)}{THIN}°C at {number(points[name][0], 2)}{THIN}%"
+        for name in best
+    )
     return Picture(
         "tradeoff",
         title,
-        f"On the front, by effort: {said}. Less error than these costs more effort, whichever controller is taken.",
+        f"On the front, by effort: {said}. Less error than these costs more effort, "
+        "whichever controller is taken.",
         shown,
-        "R.m.s. tracking error in °C against r.m.s. effort in per cent, a dot for each run on the nominal plant, as deployed; large: the median. "
+        "R.m.s. tracking error in °C against r.m.s. effort in per cent, "
+        "a dot for each run on the nominal plant, as deployed; large: the median. "
         "Pale: the medians of the others; dashed: Pareto’s front of the medians.",
         page.origin(sources.source("scorecard")),
     )
@@ -74,7 +90,16 @@ def _around(values: np.ndarray) -> charts.Axis:
     return charts.linear(float(values.min()) - room, float(values.max()) + room, ticks=3)
 
 
-def _traded(name: str, clouds: dict[str, Cloud], points: dict, best: list[str], x: charts.Axis, y: charts.Axis, *, first: bool) -> Markup:
+def _traded(
+    name: str,
+    clouds: dict[str, Cloud],
+    points: dict,
+    best: list[str],
+    x: charts.Axis,
+    y: charts.Axis,
+    *,
+    first: bool,
+) -> Markup:
     frame = charts.Frame(x, y, height=140)
     others = np.array([points[other] for other in points if other != name]).reshape(-1, 2)
     ends = np.array([points[other] for other in best])
@@ -85,8 +110,14 @@ def _traded(name: str, clouds: dict[str, Cloud], points: dict, best: list[str], 
         charts.dots(frame, clouds[name].effort, clouds[name].error, f"dot {css}", 2),
         charts.dots(frame, *points[name], f"dot {css} whole", 4),
     ]
-    alt = f"{LABELS[name][0]}: error {number(points[name][1], 2)} °C r.m.s. at an effort of {number(points[name][0], 2)} %, " + (
-        "on the front" if name in best else f"beaten in both by {', '.join(LABELS[other][0] for other in _beating(points, name))}"
+    alt = (
+        f"{LABELS[name][0]}: error {number(points[name][1], 2)} °C r.m.s. "
+        f"at an effort of {number(points[name][0], 2)} %, "
+        + (
+            "on the front"
+            if name in best
+            else f"beaten in both by {', '.join(LABELS[other][0] for other in _beating(points, name))}"
+        )
     )
     return charts.panel(frame, layers, alt=alt, css=css, title="°C" if first else "", units=("%", "°C"))
 
@@ -105,13 +136,22 @@ MODES = {
 
 
 def candidates(sources: Sources) -> Picture:
-    """Error against effort of everything that the search tried, with the front, the chosen one, the default weights and the optimum."""
-    table, found, title = sources.tables["tuning"], sources.metrics["tune_weights"], "What the tuning’s candidates trade"
+    """Error against effort of everything that the search tried, with the front, the
+    chosen one, the default weights and the optimum."""
+    table, found, title = (
+        sources.tables["tuning"],
+        sources.metrics["tune_weights"],
+        "What the tuning’s candidates trade",
+    )
     if isinstance(table, Missing):
         return hole("candidates", title, table)
     shown, said = [], []
     for mode, (head, small) in MODES.items():
-        rows = (table["mode"] == mode) & np.isfinite(table["tracking_degC"]) & np.isfinite(table["effort_percent"])
+        rows = (
+            (table["mode"] == mode)
+            & np.isfinite(table["tracking_degC"])
+            & np.isfinite(table["effort_percent"])
+        )
         if not rows.any():
             gap = page.missing(Missing("not measured", f"no candidate of the {mode} search worked"))
             shown.append(Column(head, small, "", [Markup('<div class="hole">{}</div>').format(gap)]))
@@ -127,18 +167,24 @@ def candidates(sources: Sources) -> Picture:
         title,
         " ".join(filter(None, said)),
         shown,
-        "R.m.s. tracking error in °C, up, against r.m.s. effort in per cent, across. Small: a candidate that worked; line: the front, candidates that no other beats in both; "
-        "filled square: chosen; ring: default weights; cross: the optimum, a Riccati law that is told the plant and its state, unclipped. The searches minimise a cost, not one of "
+        "R.m.s. tracking error in °C, up, against r.m.s. effort in per cent, across. Small: "
+        "a candidate that worked; line: the front, candidates that no other beats in both; "
+        "filled square: chosen; ring: default weights; cross: the optimum, "
+        "a Riccati law that is told the plant and its state, unclipped. "
+        "The searches minimise a cost, not one of "
         "these two alone, so that the chosen one need not lie on the front.",
         page.origin(sources.source("tuning", "tune_weights")),
     )
 
 
 def _marks(points: np.ndarray, chosen: np.ndarray, trade: Any) -> dict[str, tuple[float, float]]:
-    """(effort, error) of the chosen candidate, the default weights and the optimum, as far as they are known."""
+    """(effort, error) of the chosen candidate, the default weights and
+    the optimum, as far as they are known."""
     known = {} if isinstance(trade, Missing) else {name: one for name, one in trade.items() if one}
     found = {name: (one["effort_percent"], one["tracking_degC"]) for name, one in known.items()}
-    return ({"chosen": (float(points[chosen][0, 0]), float(points[chosen][0, 1]))} if chosen.any() else {}) | found
+    return (
+        {"chosen": (float(points[chosen][0, 0]), float(points[chosen][0, 1]))} if chosen.any() else {}
+    ) | found
 
 
 def _best(points: np.ndarray) -> np.ndarray:
@@ -156,7 +202,10 @@ def _place(name: str, marks: dict[str, tuple[float, float]]) -> str:
 def _bought(marks: dict[str, tuple[float, float]]) -> str:
     if not {"chosen", "default"} <= marks.keys():
         return f"Chosen: {_place('chosen', marks)}." if "chosen" in marks else ""
-    words = ["less" if mine < theirs else "more" for mine, theirs in zip(marks["chosen"], marks["default"], strict=True)]
+    words = [
+        "less" if mine < theirs else "more"
+        for mine, theirs in zip(marks["chosen"], marks["default"], strict=True)
+    ]
     return f"The chosen weights have {words[1]} error for {words[0]} effort than the default ones: {_place('chosen', marks)} of effort against {_place('default', marks)}."
 
 
@@ -174,9 +223,12 @@ def _beyond(marks: dict[str, tuple[float, float]], edge: np.ndarray) -> str:
     )
 
 
-def _searched(points: np.ndarray, edge: np.ndarray, marks: dict[str, tuple[float, float]], head: str) -> Markup:
+def _searched(
+    points: np.ndarray, edge: np.ndarray, marks: dict[str, tuple[float, float]], head: str
+) -> Markup:
     every = np.array([*points, *marks.values()])
-    # far candidates would press the front against an axis: what lies beyond nine tenths of them is drawn at the edge
+    # far candidates would press the front against an axis: what lies
+    # beyond nine tenths of them is drawn at the edge
     ends = [
         (min(values.min(), named.min()), max(np.quantile(values, 0.9), named.max()))
         for values, named in zip(points.T, np.array([*marks.values(), edge[0], edge[-1]]).T, strict=True)
@@ -195,7 +247,11 @@ def _searched(points: np.ndarray, edge: np.ndarray, marks: dict[str, tuple[float
         layers.append(charts.crosses(frame, [marks["optimum"][0]], [marks["optimum"][1]], size=4.5))
     if "chosen" in marks:
         a, b = float(frame.px(marks["chosen"][0])), float(frame.py(marks["chosen"][1]))
-        layers.append(Markup('<rect class="picked-mark" x="{:.1f}" y="{:.1f}" width="8" height="8"/>').format(a - 4, b - 4))
+        layers.append(
+            Markup('<rect class="picked-mark" x="{:.1f}" y="{:.1f}" width="8" height="8"/>').format(
+                a - 4, b - 4
+            )
+        )
     # apart even where all three lie on one another
     corners = {"chosen": ("end", -8, -7), "default": ("start", 8, -7), "optimum": ("end", -8, 15)}
     for name, place in marks.items():
@@ -213,7 +269,8 @@ def _searched(points: np.ndarray, edge: np.ndarray, marks: dict[str, tuple[float
 
 
 def plants(sources: Sources) -> Picture:
-    """The gap of every controller on every plant of the spread: the worst run of each, from the easiest plant to the hardest."""
+    """The gap of every controller on every plant of the spread: the worst run
+    of each, from the easiest plant to the hardest."""
     table, title = sources.tables["scorecard"], "The gap, plant by plant"
     if isinstance(table, Missing):
         return hole("plants", title, table)
@@ -223,7 +280,9 @@ def plants(sources: Sources) -> Picture:
     finite = np.concatenate([found[np.isfinite(found)] for found in worst.values()] or [np.zeros(0)])
     finite = finite[finite > 0]
     if not len(finite):
-        return hole("plants", title, Missing("not measured", "the scorecard has no gap at this level of noise"))
+        return hole(
+            "plants", title, Missing("not measured", "the scorecard has no gap at this level of noise")
+        )
     y = charts.logarithmic(min(float(finite.min()), limit), max(float(finite.max()), limit))
     shown, said = [], []
     for i, (name, found) in enumerate(worst.items()):
@@ -231,7 +290,9 @@ def plants(sources: Sources) -> Picture:
         over = int((~(found <= limit)).sum())
         hardest = f"{percent(float(found[-1]), 3)}" if np.isfinite(found[-1]) else "no bound: a run was lost"
         said.append(f"{LABELS[name][0]} {hardest}")
-        frame = charts.Frame(charts.Axis(0.5, of + 0.5, ((1.0, "easiest"), (float(of), "hardest"))), y, height=130)
+        frame = charts.Frame(
+            charts.Axis(0.5, of + 0.5, ((1.0, "easiest"), (float(of), "hardest"))), y, height=130
+        )
         at, drawn = np.arange(1.0, of + 1), np.where(np.isfinite(found), found, y.high)
         inside = found <= limit
         layers = [
@@ -241,14 +302,18 @@ def plants(sources: Sources) -> Picture:
             charts.dots(frame, at[~inside], drawn[~inside], "gone", 3),
         ]
         alt = f"{LABELS[name][0]}: worst run of the easiest plant {short(float(found[0]), 2)} %, of the hardest {hardest}; {over} of {of} plants beyond {limit:g} %"
-        panel = charts.panel(frame, layers, alt=alt, css=page.MARKS[name], title="%, log" if i == 0 else "", units=("", "%"))
+        panel = charts.panel(
+            frame, layers, alt=alt, css=page.MARKS[name], title="%, log" if i == 0 else "", units=("", "%")
+        )
         shown.append(Column(*LABELS[name], name, [panel]))
     return Picture(
         "plants",
         title,
-        f"On its hardest plant each costs more than that plant’s optimum by: {', '.join(said)}; the rule allows {limit:g}{THIN}%.",
+        f"On its hardest plant each costs more than that plant’s optimum by: {', '.join(said)}; "
+        f"the rule allows {limit:g}{THIN}%.",
         shown,
-        "Largest gap of all starts, references and seeds on a plant, in per cent, log scale; each controller’s plants from its easiest to its hardest. "
+        "Largest gap of all starts, references and seeds on a plant, in per cent, log scale; "
+        "each controller’s plants from its easiest to its hardest. "
         "Grey: what the rule allows. Vermillion: beyond it.",
         page.origin(sources.source("scorecard")),
     )

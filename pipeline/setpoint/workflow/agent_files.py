@@ -27,7 +27,11 @@ class Agents(NamedTuple):
 
 def store_agents(path: Path, done: Agents) -> None:
     """Every network, and our belief, by name in one file."""
-    arrays = {f"phase{i + 1}.{name}": a for i, network in enumerate(done.paper) for name, a in agent.weights(network).items()}
+    arrays = {
+        f"phase{i + 1}.{name}": a
+        for i, network in enumerate(done.paper)
+        for name, a in agent.weights(network).items()
+    }
     arrays |= {f"ours.{name}": a for name, a in agent.weights(done.ours).items()} | {
         f"belief.{name}": a for name, a in agent.weights(done.belief).items()
     }
@@ -38,7 +42,10 @@ def restore_agents(path: str) -> Agents:
     """What `store_agents` wrote."""
     arrays, about = read_weights(path, AGENTS_SCHEMA)
     with artifacts.about(path):
-        parts = {name: _part(arrays, name) for name in [*(f"phase{i + 1}" for i in range(int(about["phases"]))), "ours", "belief"]}
+        parts = {
+            name: _part(arrays, name)
+            for name in [*(f"phase{i + 1}" for i in range(int(about["phases"]))), "ours", "belief"]
+        }
         found = parts.pop("belief")
         hypotheses = found["filter.evidence"].shape[0]
         numbers = {name: jnp.asarray(a) for name, a in found.items()}

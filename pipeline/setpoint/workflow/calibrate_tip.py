@@ -37,7 +37,9 @@ def calibrate(image: Path, out: Path, tip: str, *, least_score: float, topic: st
     shown = "" if tip_px is None else _front_end(frame, tip_px, found, least_score)
     start = "null" if tip_px is None else json.dumps(list(tip_px))
     height, width = frame.shape
-    command = json.dumps(f"./run beadline calibrate-tip {shlex.quote(str(image))} --tip ").replace("<", "\\u003c")
+    command = json.dumps(f"./run beadline calibrate-tip {shlex.quote(str(image))} --tip ").replace(
+        "<", "\\u003c"
+    )
     values = {
         "name": html.escape(image.name), "picture": _embedded(_eight_bits(frame)), "width": width, "height": height, "tip": start,
         "command": command,
@@ -55,21 +57,33 @@ def calibrate(image: Path, out: Path, tip: str, *, least_score: float, topic: st
     )
 
 
-def _front_end(frame: np.ndarray, tip_px: tuple[float, float], found: key_area.KeyArea, least_score: float) -> str:
+def _front_end(
+    frame: np.ndarray, tip_px: tuple[float, float], found: key_area.KeyArea, least_score: float
+) -> str:
     """What the front end sees as a piece of HTML: the crop with tip and rectangle, the key area, and the verdict."""
     crop = key_area.crop(frame, tip_px)
     left, top, right, bottom = crop.inside
     seen = crop.gray // 3
     seen[top:bottom, left:right] = crop.gray[top:bottom, left:right]
-    picture = cv2.cvtColor(cv2.resize(seen, None, fx=CROP, fy=CROP, interpolation=cv2.INTER_CUBIC), cv2.COLOR_GRAY2BGR)
+    picture = cv2.cvtColor(
+        cv2.resize(seen, None, fx=CROP, fy=CROP, interpolation=cv2.INTER_CUBIC), cv2.COLOR_GRAY2BGR
+    )
     middle = key_area.SIDE // 2
     colour = RED if found.reason else GREEN
     corners = np.rint((key_area.corners(found.angle_deg, found.miss_px) + middle) * CROP).astype(np.int32)
     cv2.polylines(picture, [corners], True, colour, 2, cv2.LINE_AA)
     cv2.drawMarker(picture, (middle * CROP, middle * CROP), colour, cv2.MARKER_CROSS, 24, 2, cv2.LINE_AA)
-    verdict = f"<strong>rejected</strong>: {html.escape(found.reason)}" if found.reason else "<strong>accepted</strong>"
+    verdict = (
+        f"<strong>rejected</strong>: {html.escape(found.reason)}"
+        if found.reason
+        else "<strong>accepted</strong>"
+    )
     # the rectangle is looked at even where it is rejected: that shows why
-    area = found.image if not found.reason else key_area.find(frame, tip_px, least_score=-np.inf, direction_deg=found.angle_deg).image
+    area = (
+        found.image
+        if not found.reason
+        else key_area.find(frame, tip_px, least_score=-np.inf, direction_deg=found.angle_deg).image
+    )
     enlarged = cv2.resize(area, None, fx=AREA, fy=AREA, interpolation=cv2.INTER_NEAREST)
     figures = {
         "direction of the line": f"{found.angle_deg:.0f}° (0 right, 90 down)",
@@ -94,7 +108,9 @@ def _pixel(text: str) -> tuple[float, float]:
     try:
         x, y = map(float, text.split(","))
     except ValueError:
-        raise ValueError(f"--tip: expected two numbers of pixels such as 571,511, found {text!r}; write X,Y without a blank") from None
+        raise ValueError(
+            f"--tip: expected two numbers of pixels such as 571,511, found {text!r}; write X,Y without a blank"
+        ) from None
     return x, y
 
 

@@ -7,7 +7,13 @@ import numpy as np
 from pipeline.setpoint import calibration
 from pipeline.setpoint.calibration import Calibration
 from pipeline.setpoint.eyes import Eyes
-from pipeline.setpoint.vision_transformer import PAPER, SMALL, from_named_arrays, named_arrays, vision_transformer
+from pipeline.setpoint.vision_transformer import (
+    PAPER,
+    SMALL,
+    from_named_arrays,
+    named_arrays,
+    vision_transformer,
+)
 from pipeline.setpoint.workflow.settings import TrainClassifier
 from pipeline.store import artifacts
 from pipeline.store.artifacts import read_weights, write_weights
@@ -18,7 +24,9 @@ CLASSIFIER_SCHEMA, CALIBRATION = "classifier 1", ("classifier_calibration", 1)
 
 def store_classifier(folder: Path, p: TrainClassifier, known: Eyes) -> None:
     """weights.safetensors, and calibration.parquet with all that was fitted after training."""
-    write_weights(folder / "weights.safetensors", CLASSIFIER_SCHEMA, named_arrays(known.network), {"size": p.size})
+    write_weights(
+        folder / "weights.safetensors", CLASSIFIER_SCHEMA, named_arrays(known.network), {"size": p.size}
+    )
     numbers = {
         "temperature": (np.array(known.known.temperature), "1", "logits of single images are divided by it"),
         "correlation": (
@@ -26,8 +34,16 @@ def store_classifier(folder: Path, p: TrainClassifier, known: Eyes) -> None:
             "1",
             "of a window's frames; summed logarithms are divided by 1 + (m - 1) times it",
         ),
-        "level": (np.array(known.known.level), "1", "classes of at least this share are in the conformal set"),
-        "foreign_above": (np.array(known.known.foreign_above), "1", "squared Mahalanobis distance above which a frame is foreign"),
+        "level": (
+            np.array(known.known.level),
+            "1",
+            "classes of at least this share are in the conformal set",
+        ),
+        "foreign_above": (
+            np.array(known.known.foreign_above),
+            "1",
+            "squared Mahalanobis distance above which a frame is foreign",
+        ),
         "means": (known.known.familiar.means, "1", "mean features of the three classes"),
         "whitening": (known.known.familiar.whitening, "1", "inverse Cholesky factor of their covariance"),
     }
@@ -42,7 +58,14 @@ def restore_classifier(weights_path: str, calibration_path: str) -> Eyes:
             f"{weights_path} should say its size, {' or '.join(SIZES)}, but says {about.get('size')}; {artifacts.remedy(weights_path)}"
         )
     with artifacts.about(weights_path):
-        network = from_named_arrays(vision_transformer(SIZES[about["size"]], np.random.default_rng(0)), arrays)
+        network = from_named_arrays(
+            vision_transformer(SIZES[about["size"]], np.random.default_rng(0)), arrays
+        )
     found = artifacts.read_arrays(calibration_path, *CALIBRATION)
     numbers = (float(found[name]) for name in ("temperature", "correlation", "level"))
-    return Eyes(network, Calibration(*numbers, calibration.Familiar(found["means"], found["whitening"]), float(found["foreign_above"])))
+    return Eyes(
+        network,
+        Calibration(
+            *numbers, calibration.Familiar(found["means"], found["whitening"]), float(found["foreign_above"])
+        ),
+    )

@@ -43,19 +43,34 @@ def seats(p: Baselines, agents: Agents, learned: WindowTable) -> dict[str, Seat]
     agent after its third and its last phase, and ours."""
     without = {
         "proportional": (baselines.proportional(), baselines.Proportional(**p.proportional.model_dump())),
-        "filtered proportional": (baselines.proportional(), baselines.Proportional(**p.filtered_proportional.model_dump())),
-        "sequential test": (baselines.sequential_test(), baselines.SequentialTest(**p.sequential_test.model_dump())),
+        "filtered proportional": (
+            baselines.proportional(),
+            baselines.Proportional(**p.filtered_proportional.model_dump()),
+        ),
+        "sequential test": (
+            baselines.sequential_test(),
+            baselines.SequentialTest(**p.sequential_test.model_dump()),
+        ),
         "Bayes, exact model": (bayes.bayes(1), bayes.class_filter(**p.bayes_exact.model_dump())),
         "Bayes with leak": (bayes.bayes(1), bayes.class_filter(**p.bayes_leak.model_dump())),
-        "Bayes, robust": (bayes.bayes(p.bayes_robust.hypotheses()), bayes.robust_filter(learned, **p.bayes_robust.model_dump())),
+        "Bayes, robust": (
+            bayes.bayes(p.bayes_robust.hypotheses()),
+            bayes.robust_filter(learned, **p.bayes_robust.model_dump()),
+        ),
     }
     paper = agent.greedy(agent.paper_sight())
     found = {
         name: Seat("baseline", one, jax.tree.map(partial(jnp.asarray, dtype=jnp.float32), settings))
         for name, (one, settings) in without.items()
     }
-    found |= {f"paper's agent, {i + 1} phases": Seat("paper", paper, network) for i, network in enumerate(agents.paper) if i >= 2}
-    return found | {"our agent": Seat("agent", agent.greedy(belief_agent.belief_sight(agents.belief)), agents.ours)}
+    found |= {
+        f"paper's agent, {i + 1} phases": Seat("paper", paper, network)
+        for i, network in enumerate(agents.paper)
+        if i >= 2
+    }
+    return found | {
+        "our agent": Seat("agent", agent.greedy(belief_agent.belief_sight(agents.belief)), agents.ours)
+    }
 
 
 def chosen(found: Mapping[str, Mapping[str, Score]]) -> Choice:
@@ -70,11 +85,15 @@ def scores(seats: Mapping[str, Seat], judge: WindowTable, p: EvaluateSetpoint) -
     """Every controller in every case of judging.cases: 21 starts x p.runs, from one key a case."""
     found: dict[str, dict[str, Score]] = {name: {} for name in seats}
     cases = judging.cases(recorded_windows(judge), runs=p.runs, segment=p.segment)
-    with tqdm(total=len(seats) * len(cases), desc="evaluate_setpoint: controllers x cases", mininterval=2) as bar:
+    with tqdm(
+        total=len(seats) * len(cases), desc="evaluate_setpoint: controllers x cases", mininterval=2
+    ) as bar:
         for number, (case, (windows, conditions)) in enumerate(cases.items()):
             key = jax.random.fold_in(jax.random.key(p.seed), number)
             for name, seat in seats.items():
-                found[name][case] = judging.evaluate(seat.controller, seat.parameters, windows, conditions, key)
+                found[name][case] = judging.evaluate(
+                    seat.controller, seat.parameters, windows, conditions, key
+                )
                 bar.update()
     return found
 
@@ -83,13 +102,19 @@ def simulator(case: str) -> str:
     return "recorded" if case.startswith("recorded") else "paper"
 
 
-def scoreboard(seats: Mapping[str, Seat], found: Mapping[str, Mapping[str, Score]], seen: Seen) -> dict[str, list]:
+def scoreboard(
+    seats: Mapping[str, Seat], found: Mapping[str, Mapping[str, Score]], seen: Seen
+) -> dict[str, list]:
     """Columns of schema SCOREBOARD."""
     rows = []
     for name, of in found.items():
         for case, score in of.items():
             clogged = case.endswith("clog")
-            shares = {"settled": score.settled, "stay": score.stay, "recovered": score.recovered if clogged else None}
+            shares = {
+                "settled": score.settled,
+                "stay": score.stay,
+                "recovered": score.recovered if clogged else None,
+            }
             rows.append(
                 {
                     "controller": name, "kind": seats[name].kind, "simulator": simulator(case), "case": case, "counts": True,
@@ -104,7 +129,9 @@ def scoreboard(seats: Mapping[str, Seat], found: Mapping[str, Mapping[str, Score
                     "worst_start_settled_percent": score.worst_start[2],
                 }
             )  # fmt: skip
-    return _columns(rows + [_pixel_row(name, seats[name].kind, "calm", one) for name, one in seen.calm.items()])
+    return _columns(
+        rows + [_pixel_row(name, seats[name].kind, "calm", one) for name, one in seen.calm.items()]
+    )
 
 
 def _columns(rows: list[dict[str, Any]]) -> dict[str, list]:
@@ -119,20 +146,36 @@ def paths(seats: Mapping[str, Seat], judge: WindowTable, p: EvaluateSetpoint, se
     for case in ("accuracy 0.7", "recorded, fresh"):
         windows, conditions = cases[case]
         for name, seat in seats.items():
-            done = rollout(seat.controller, seat.parameters, windows, conditions, jax.random.key(p.seed), steps=100)
+            done = rollout(
+                seat.controller, seat.parameters, windows, conditions, jax.random.key(p.seed), steps=100
+            )
             flow, temperature = np.asarray(done.flow, float), np.asarray(done.temperature, float)
             start, step = np.indices(flow.shape)
-            pieces.append((name, simulator(case), case, start.ravel(), step.ravel(), flow.ravel(), temperature.ravel()))
+            pieces.append(
+                (name, simulator(case), case, start.ravel(), step.ravel(), flow.ravel(), temperature.ravel())
+            )
     for name, episodes in seen.calm.items():
         start, step = np.indices(episodes.flow.shape)
-        pieces.append((name, "pixels", "calm", start.ravel(), step.ravel(), episodes.flow.ravel(), episodes.temperature.ravel()))
+        pieces.append(
+            (
+                name,
+                "pixels",
+                "calm",
+                start.ravel(),
+                step.ravel(),
+                episodes.flow.ravel(),
+                episodes.temperature.ravel(),
+            )
+        )
     sizes = [len(piece[3]) for piece in pieces]
     texts = {
         name: [piece[i] for piece, n in zip(pieces, sizes, strict=True) for _ in range(n)]
         for i, name in enumerate(("controller", "simulator", "case"))
     }
     numbers = ("start", "step", "flow_percent", "temperature_degC")
-    return texts | {name: np.concatenate([piece[3 + i] for piece in pieces]) for i, name in enumerate(numbers)}
+    return texts | {
+        name: np.concatenate([piece[3 + i] for piece in pieces]) for i, name in enumerate(numbers)
+    }
 
 
 # ---- through pixels
@@ -141,7 +184,9 @@ def paths(seats: Mapping[str, Seat], judge: WindowTable, p: EvaluateSetpoint, se
 DWELL = 10
 
 
-def pixel_runs(seats: Mapping[str, Seat], choice: Choice, known: Eyes, p: EvaluateSetpoint, view: TrainClassifier) -> Seen:
+def pixel_runs(
+    seats: Mapping[str, Seat], choice: Choice, known: Eyes, p: EvaluateSetpoint, view: TrainClassifier
+) -> Seen:
     """The default, and our agent or the robust filter beside it, from some starts; and two
     episodes in which something befalls the default."""
     names = dict.fromkeys((choice.name, "our agent", "Bayes, robust"))
@@ -158,13 +203,22 @@ def pixel_runs(seats: Mapping[str, Seat], choice: Choice, known: Eyes, p: Evalua
 
 
 def _through(
-    seat: Seat, known: Eyes, start: np.ndarray, p: EvaluateSetpoint, view: TrainClassifier, disturbances: pixels.Disturbances, *, seed: int
+    seat: Seat,
+    known: Eyes,
+    start: np.ndarray,
+    p: EvaluateSetpoint,
+    view: TrainClassifier,
+    disturbances: pixels.Disturbances,
+    *,
+    seed: int,
 ) -> pixels.Episodes:
     """Episodes from setpoints start (E, 2), with limits of what one action and one minute may change."""
     q, calibrated = p.pixels, known.known
     machine = pixels.Machine(q.heater_s, q.heater_delay_s, q.melt_s, q.softening_per_degC)
     limits = deployment.Limits(
-        *(np.array(pair) for pair in zip(FLOW_LIMITS, TEMPERATURE_LIMITS, strict=True)), np.array(q.per_action), np.array(q.per_minute)
+        *(np.array(pair) for pair in zip(FLOW_LIMITS, TEMPERATURE_LIMITS, strict=True)),
+        np.array(q.per_action),
+        np.array(q.per_minute),
     )
     judge = partial(
         deployment.judge_window, least_frames=q.least_frames, correlation=calibrated.correlation, foreign_above=calibrated.foreign_above,
@@ -182,7 +236,15 @@ def _through(
     )
     rng = np.random.default_rng([p.seed, seed])
     return pixels.run(
-        seat.controller, seat.parameters, partial(eyes.see, known), start, machine, loop, disturbances, decisions=q.decisions, rng=rng
+        seat.controller,
+        seat.parameters,
+        partial(eyes.see, known),
+        start,
+        machine,
+        loop,
+        disturbances,
+        decisions=q.decisions,
+        rng=rng,
     )
 
 
@@ -192,7 +254,9 @@ def some_starts(p: EvaluateSetpoint) -> np.ndarray:
     everything = judging.starts(1, accuracy=1.0)
     chosen = np.unique(np.linspace(0, 20, p.pixels.starts).round().astype(int))
     return np.repeat(
-        np.stack([np.asarray(everything.flow)[chosen], np.asarray(everything.temperature)[chosen]], axis=1), p.pixels.runs, axis=0
+        np.stack([np.asarray(everything.flow)[chosen], np.asarray(everything.temperature)[chosen]], axis=1),
+        p.pixels.runs,
+        axis=0,
     ).astype(float)
 
 
@@ -203,7 +267,9 @@ def _pixel_row(name: str, kind: str, case: str, found: pixels.Episodes) -> dict[
     share = wilson(done)
     past = np.sign(100.0 - found.flow[:, :1]) * (found.flow - 100.0)
     worst = int(since.argmax())
-    nothing = dict.fromkeys((f"{key}_{end}percent" for key in ("stay", "recovered") for end in ("", "low_", "high_")), np.nan)
+    nothing = dict.fromkeys(
+        (f"{key}_{end}percent" for key in ("stay", "recovered") for end in ("", "low_", "high_")), np.nan
+    )
     return {
         "controller": name, "kind": kind, "simulator": "pixels", "case": case, "counts": False, "runs": runs,
         "settled_percent": share.percent, "settled_low_percent": share.low, "settled_high_percent": share.high, **nothing,
@@ -259,7 +325,9 @@ def decisions(name: str, seen: Seen) -> dict[str, list]:
 # ---- metrics
 
 
-def metrics(seats: Mapping[str, Seat], found: Mapping[str, Mapping[str, Score]], choice: Choice, seen: Seen) -> dict[str, Any]:
+def metrics(
+    seats: Mapping[str, Seat], found: Mapping[str, Mapping[str, Score]], choice: Choice, seen: Seen
+) -> dict[str, Any]:
     """By controller, simulator and case; then the default."""
     figures: dict[str, Any] = {}
     for name, of in found.items():

@@ -1,4 +1,5 @@
-"""The CSV beside a folder of nozzle images (the columns of CAXTON: Brion and Pattinson 2022): image, flow, temperature, print and tip of each frame, line by line."""
+"""The CSV beside a folder of nozzle images (the columns of CAXTON: Brion and Pattinson 2022): image, flow,
+temperature, print and tip of each frame, line by line."""
 
 import itertools
 import re
@@ -33,8 +34,9 @@ NOTHING = {*MISSING, "nat"}
 
 
 class Log(NamedTuple):
-    """The n rows of one CSV: flow in percent of nominal, temperature in degC, tip (n, 2) in px, direction in degrees, label 0, 1 or 2; NaN, or empty text, where a row
-    has none. `image` is as it was written, with forward slashes; `setting` counts the stretches of constant settings from 0, over all prints."""
+    """The n rows of one CSV: flow in percent of nominal, temperature in degC, tip (n, 2) in px, direction in
+    degrees, label 0, 1 or 2; NaN, or empty text, where a row has none. `image` is as it was written, with
+    forward slashes; `setting` counts the stretches of constant settings from 0, over all prints."""
 
     path: Path
     line: np.ndarray
@@ -50,8 +52,9 @@ class Log(NamedTuple):
 
 
 def read_log(path: Path) -> Log:
-    """The frames that a CSV lists, those of a print one behind the other. Raises ValueError, one sentence with the line, for a needed column that is not there, text in
-    place of a number, a flow or temperature that no printer has, a label that is no class, and time that runs backwards within a print."""
+    """The frames that a CSV lists, those of a print one behind the other. Raises ValueError, one sentence
+    with the line, for a needed column that is not there, text in place of a number, a flow or temperature
+    that no printer has, a label that is no class, and time that runs backwards within a print."""
     layout = list_layout(path, lambda row: "img_path" in map(_column, row))
     layout = layout._replace(names=[_column(name) for name in layout.names])
     said, notes = list(layout.notes), []
@@ -71,20 +74,28 @@ def read_log(path: Path) -> Log:
         first: dict[str, int] = {}
         stamps = [
             stamp if name and first.setdefault(image, i) == i else ""
-            for i, (image, stamp, name) in enumerate(zip(texts["img_path"], texts["timestamp"], prints, strict=True))
+            for i, (image, stamp, name) in enumerate(
+                zip(texts["img_path"], texts["timestamp"], prints, strict=True)
+            )
         ]
         _check_time(path, lines, stamps, which, prints)
     order = np.argsort(which, kind="stable")
-    settings = [which, *(numbers[name] for name in ("flow_rate", "target_hotend", *SETTINGS) if name in numbers)]
+    settings = [
+        which,
+        *(numbers[name] for name in ("flow_rate", "target_hotend", *SETTINGS) if name in numbers),
+    ]
     tip = np.column_stack([numbers.get(name, missing) for name in ("nozzle_tip_x", "nozzle_tip_y")])
     return Log(
-        path, lines[order], [texts["img_path"][i].replace("\\", "/") for i in order], numbers["flow_rate"][order], temperature[order], [prints[i] for i in order],
-        stretches(np.column_stack(settings)[order]), tip[order], numbers.get(DIRECTION, missing)[order], numbers.get(LABELS, missing)[order], notes,
+        path, lines[order], [texts["img_path"][i].replace("\\", "/") for i in order],
+        numbers["flow_rate"][order], temperature[order], [prints[i] for i in order],
+        stretches(np.column_stack(settings)[order]), tip[order], numbers.get(DIRECTION, missing)[order],
+        numbers.get(LABELS, missing)[order], notes,
     )  # fmt: skip
 
 
 def stretches(settings: np.ndarray) -> np.ndarray:
-    """(n,) numbers from 0 of the stretches in which settings (n, k) are constant; NaN is a value of its own."""
+    """(n,) numbers from 0 of the stretches in which settings (n, k)
+    are constant; NaN is a value of its own."""
     settings = np.nan_to_num(settings, nan=np.inf)
     changes = (settings[1:] != settings[:-1]).any(axis=1)
     return np.concatenate([[0], np.cumsum(changes)]).astype(int)
@@ -97,21 +108,31 @@ def _column(name: str) -> str:
 
 
 def _columns(path: Path, layout: CsvLayout, notes: list[Note]) -> tuple[str, ...]:
-    """The columns to read, the image first and the temperature second; raises ValueError where one that is needed is not there, and notes those that are lived without."""
+    """The columns to read, the image first and the temperature second; raises ValueError where one that is
+    needed is not there, and notes those that are lived without."""
     there = layout.names
     temperature = "target_hotend" if "target_hotend" in there or "hotend" not in there else "hotend"
     for name in ("img_path", temperature, "flow_rate"):
         if name not in there:
             either = "target_hotend or hotend" if name == temperature else name
             raise ValueError(
-                f"{path}: expected a column {either}, found none; {nearest_names(name, there)}; rename it, or move the file out of the folder"
+                f"{path}: expected a column {either}, found none; {nearest_names(name, there)}; rename it, "
+                "or move the file out of the folder"
             )
     if ("nozzle_tip_x" in there) != ("nozzle_tip_y" in there):
         raise ValueError(
-            f"{path}: expected both nozzle_tip_x and nozzle_tip_y, found one; add the other, or remove it and set the tip in params.yaml"
+            f"{path}: expected both nozzle_tip_x and nozzle_tip_y, found one; add the other, "
+            "or remove it and set the tip in params.yaml"
         )
     if temperature == "hotend":
-        notes.append(Note("columns", "temperature", 1, f"{path}: it has no target_hotend, so the measured hotend is the temperature"))
+        notes.append(
+            Note(
+                "columns",
+                "temperature",
+                1,
+                f"{path}: it has no target_hotend, so the measured hotend is the temperature",
+            )
+        )
     without = [f"{name} ({how})" for name, how in OPTIONAL.items() if name not in there]
     if without:
         notes.append(Note("columns", "", len(without), f"{path}: it is read without {', '.join(without)}"))
@@ -124,7 +145,9 @@ def _rows(
 ) -> tuple[dict[str, list[str]], dict[str, np.ndarray], np.ndarray]:
     """({column: texts}, {column: numbers}, lines), NaN and empty text where nothing is written."""
     places = {name: column_place(path, layout.names, name) for name in names}
-    texts: dict[str, list[str]] = {name: [] for name in ("img_path", "print_id", "timestamp") if name in places}
+    texts: dict[str, list[str]] = {
+        name: [] for name in ("img_path", "print_id", "timestamp") if name in places
+    }
     parts: dict[str, list[np.ndarray]] = {name: [] for name in places if name not in texts}
     lines: list[int] = []
     rows = sound_rows(path, layout, None, notes)
@@ -142,23 +165,34 @@ def _rows(
 
 def _check_numbers(path: Path, lines: np.ndarray, numbers: dict[str, np.ndarray]) -> None:
     bounds = {
-        "flow_rate": (*FLOW_PERCENT, "percent of nominal"), "target_hotend": (*TEMPERATURE_DEGC, "degC"), "hotend": (*TEMPERATURE_DEGC, "degC"),
+        "flow_rate": (*FLOW_PERCENT, "percent of nominal"), "target_hotend": (*TEMPERATURE_DEGC, "degC"),
+        "hotend": (*TEMPERATURE_DEGC, "degC"),
         LABELS: (0.0, 2.0, "0 under, 1 good, 2 over"),
     }  # fmt: skip
     for name, (low, high, unit) in bounds.items():
         values = numbers.get(name, np.zeros(0))
-        wrong = (values < low) | (values > high) | ((name == LABELS) & (values != np.rint(values)) & np.isfinite(values))
+        wrong = (
+            (values < low)
+            | (values > high)
+            | ((name == LABELS) & (values != np.rint(values)) & np.isfinite(values))
+        )
         if wrong.any():
             i = int(np.flatnonzero(wrong)[0])
             more = f", the first of {wrong.sum()}" if wrong.sum() > 1 else ""
-            remedy = "mend it, or remove that column" if name == LABELS else "mend it, or write it in that unit"
+            remedy = (
+                "mend it, or remove that column" if name == LABELS else "mend it, or write it in that unit"
+            )
             raise ValueError(
-                f"{path}: line {lines[i]}: expected {name} within {low:g} and {high:g} ({unit}), found {values[i]:g}{more}; {remedy}"
+                f"{path}: line {lines[i]}: expected {name} within {low:g} and {high:g} ({unit}), "
+                f"found {values[i]:g}{more}; {remedy}"
             )
 
 
-def _check_time(path: Path, lines: np.ndarray, stamps: Sequence[str], which: np.ndarray, prints: Sequence[str]) -> None:
-    """Within a print time runs forward or stands still: what follows one another was seen one after the other."""
+def _check_time(
+    path: Path, lines: np.ndarray, stamps: Sequence[str], which: np.ndarray, prints: Sequence[str]
+) -> None:
+    """Within a print time runs forward or stands still: what follows
+    one another was seen one after the other."""
     present = np.array([bool(stamp) for stamp in stamps])
     # CAXTON writes a fraction of a second behind a hyphen, 13:12:50-34
     plain = [re.sub(r"(:\d\d)-(\d{1,6})$", r"\1.\2", stamp) for stamp in stamps if stamp]
@@ -167,7 +201,12 @@ def _check_time(path: Path, lines: np.ndarray, stamps: Sequence[str], which: np.
     except ValueError:
         first = month_first({stamp.split()[0] for stamp in plain}, plain[0])
         try:
-            times = instants(path, "timestamp", plain, lines[present].tolist(), month_first=first).ns.astype(float) / 1e9
+            times = (
+                instants(path, "timestamp", plain, lines[present].tolist(), month_first=first).ns.astype(
+                    float
+                )
+                / 1e9
+            )
         except ValueError as error:
             raise ValueError(str(error).replace("name another column", "remove that column")) from None
     which, lines, names = which[present], lines[present], list(itertools.compress(prints, present))
@@ -177,6 +216,8 @@ def _check_time(path: Path, lines: np.ndarray, stamps: Sequence[str], which: np.
         i, before = order[back[0] + 1], order[back[0]]
         more = f", the first of {len(back)} such lines" if len(back) > 1 else ""
         raise ValueError(
-            f"{path}: line {lines[i]}: expected time to run forward within print {names[i]!r}, found it {times[before] - times[i]:.6g} s before line {lines[before]}{more}; "
-            "sort the rows of each print by timestamp, or give what comes after a clock was set back a print_id of its own"
+            f"{path}: line {lines[i]}: expected time to run forward within print {names[i]!r}, "
+            f"found it {times[before] - times[i]:.6g} s before line {lines[before]}{more}; "
+            "sort the rows of each print by timestamp, or give what comes after a clock was set back "
+            "a print_id of its own"
         )

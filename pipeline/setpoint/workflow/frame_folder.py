@@ -1,7 +1,8 @@
-"""A folder of nozzle frames -> key areas with class, temperature, print and segment for the classifier: CSV files
-with images as CAXTON has them, and MCAP recordings.
+"""A folder of nozzle frames -> key areas with class, temperature, print and segment for the classifier: CSV
+files with images as CAXTON has them, and MCAP recordings.
 
-Nothing is dropped: every frame that is listed has its row, and one that cannot be learned from has the reason why, counted in the notes.
+Nothing is dropped: every frame that is listed has its row, and one that cannot be
+learned from has the reason why, counted in the notes.
 """
 
 import collections
@@ -34,7 +35,12 @@ LOOKED_AT = 2000
 # endings of what is written about recordings, and the longest path that is shown
 TEXTS, LONGEST = {".md", ".txt", ".html", ".yaml", ".yml", ".dvc", ""}, 200
 REPEATED, COPY = "an earlier line lists the image", "the frame is a copy of another"
-NO_FLOW, NO_TEMPERATURE, NO_PRINT, NO_NAME = "no flow is known", "no temperature is known", "no print is named", "no image is named"
+NO_FLOW, NO_TEMPERATURE, NO_PRINT, NO_NAME = (
+    "no flow is known",
+    "no temperature is known",
+    "no print is named",
+    "no image is named",
+)
 REMEDIES = {
     MISSING: "copy the images below that folder, with the paths that the file gives",
     UNREADABLE: "copy the images again",
@@ -51,8 +57,8 @@ LOOK = "look at a few with ./run beadline calibrate-tip IMAGE --tip X,Y"
 
 
 class Reading(NamedTuple):
-    """How frames are read: the tip (x, y) in px of every frame, or None where the data have it; the least score
-    of a line in gray levels; topics of recordings."""
+    """How frames are read: the tip (x, y) in px of every frame, or None where the data have it; the least
+    score of a line in gray levels; topics of recordings."""
 
     tip_px: tuple[float, float] | None
     least_score: float
@@ -66,10 +72,11 @@ def reading(p: TrainClassifier) -> Reading:
 
 
 class NozzleFrames(NamedTuple):
-    """n frames, file by file and in a CSV print by print: images (n, 16, 48) uint8, zeros where not valid; label (n,) 0 under, 1 good, 2
-    over, -1 unknown; flow (n,) in percent of nominal; temperature (n,) in degC; print_number (n,) indexes `prints`; segment (n,) counts the
-    stretches of constant settings; valid (n,); n reasons, empty where valid; angle_deg, score and padded_share (n,) of the front end;
-    `source` says where each frame is from; notes say what was met."""
+    """n frames, file by file and in a CSV print by print: images (n, 16, 48) uint8, zeros where not valid;
+    label (n,) 0 under, 1 good, 2 over, -1 unknown; flow (n,) in percent of nominal; temperature (n,) in degC;
+    print_number (n,) indexes `prints`; segment (n,) counts the stretches of constant settings; valid (n,); n
+    reasons, empty where valid; angle_deg, score and padded_share (n,) of the front end; `source` says where
+    each frame is from; notes say what was met."""
 
     images: np.ndarray
     label: np.ndarray
@@ -104,38 +111,58 @@ def read_folder(folder: Path, how: Reading, execution: Execution, *, memo: Path)
     """Every frame that the CSV files and recordings below `folder` list, in the order of their
     names, cut by as many workers as `execution` says.
 
-    Images are looked for beside their CSV and from `folder` on, with the path as written or without its first folders.
-    Raises ValueError, one sentence, for what read_log and watch refuse, for two lines that contradict one another
-    about an image, and where no frame at all shows a line.
+    Images are looked for beside their CSV and from `folder` on, with the path as written or without its first
+    folders. Raises ValueError, one sentence, for what read_log and watch refuse, for two lines that
+    contradict one another about an image, and where no frame at all shows a line.
     """
     there = _images(folder)
-    files = {ending: sorted(folder / name for name in there if name.lower().endswith(ending)) for ending in (".csv", ".mcap")}
+    files = {
+        ending: sorted(folder / name for name in there if name.lower().endswith(ending))
+        for ending in (".csv", ".mcap")
+    }
     for path in (*files[".csv"], *files[".mcap"]):
         if not path.is_file():
-            raise ValueError(f"{path} is a link to what is not there; copy the file itself, or remove the link")
+            raise ValueError(
+                f"{path} is a link to what is not there; copy the file itself, or remove the link"
+            )
     logs = [read_log(path) for path in files[".csv"]]
     recordings, copies = _different(files[".mcap"])
     if not (logs or recordings):
         raise ValueError(
-            f"{folder}: expected a CSV with its images, or MCAP recordings, found neither; copy them there, or set the source to simulated"
+            f"{folder}: expected a CSV with its images, or MCAP recordings, found neither; copy them there, "
+            "or set the source to simulated"
         )
     found = [_found(log, folder, there) for log in logs]
     reasons = _listed(logs, [images for images, _ in found])
     calls, sizes = [], []
     for log, (images, _), why in zip(logs, found, reasons, strict=True):
         tips = log.tip if how.tip_px is None else np.broadcast_to(np.array(how.tip_px, float), log.tip.shape)
-        paths = ["" if reason else str(folder.resolve() / image) for image, reason in zip(images, why, strict=True)]
+        paths = [
+            "" if reason else str(folder.resolve() / image) for image, reason in zip(images, why, strict=True)
+        ]
         pieces = list(_pieces(log))
         sizes.append(len(pieces))
         calls += [
-            joblib.delayed(cut)(paths[at], tips[at], log.direction[at], least_score=how.least_score, memo=memo.resolve()) for at in pieces
+            joblib.delayed(cut)(
+                paths[at], tips[at], log.direction[at], least_score=how.least_score, memo=memo.resolve()
+            )
+            for at in pieces
         ]
     calls += [
-        joblib.delayed(watch)(path.resolve(), path, how.topics, how.tip_px, least_score=how.least_score, memo=memo.resolve())
+        joblib.delayed(watch)(
+            path.resolve(), path, how.topics, how.tip_px, least_score=how.least_score, memo=memo.resolve()
+        )
         for path in recordings
     ]
     results = iter(
-        list(tqdm(run_all(calls, execution, kept=": what was read is kept"), total=len(calls), desc=f"{folder}: frames", mininterval=2))
+        list(
+            tqdm(
+                run_all(calls, execution, kept=": what was read is kept"),
+                total=len(calls),
+                desc=f"{folder}: frames",
+                mininterval=2,
+            )
+        )
     )
     parts = []
     for log, (_, note), why, size in zip(logs, found, reasons, sizes, strict=True):
@@ -152,9 +179,11 @@ def check(folder: Path, frames: NozzleFrames) -> None:
     prints = np.unique(frames.print_number[frames.valid])
     if len(prints) < 2:
         raise ValueError(
-            f"{folder}: no honest split: expected valid frames of at least 2 prints, one to learn from and one to judge by, "
+            f"{folder}: no honest split: expected valid frames of at least 2 prints, "
+            "one to learn from and one to judge by, "
             f"found {len(prints)} "
-            f"({', '.join(frames.prints[i] for i in prints)}); add another print, or name the prints apart in print_id"
+            f"({', '.join(frames.prints[i] for i in prints)}); add another print, "
+            "or name the prints apart in print_id"
         )
     for c, name in enumerate(CLASSES):
         if not (frames.valid & (frames.label == c)).any():
@@ -171,7 +200,8 @@ def figures(frames: NozzleFrames) -> dict[str, Any]:
     reasons = collections.Counter(_kind(reason) for reason in frames.reasons if reason)
     valid = frames.valid
     return {
-        "frames": len(valid), "valid": int(valid.sum()), "valid_share": float(valid.mean()), "rejected": dict(sorted(reasons.items())),
+        "frames": len(valid), "valid": int(valid.sum()), "valid_share": float(valid.mean()),
+        "rejected": dict(sorted(reasons.items())),
         "prints": len(frames.prints), "segments": len(np.unique(frames.segment)),
         "of_class": [int((valid & (frames.label == c)).sum()) for c in range(3)],
         "temperatures_degC": sorted({round(t, 3) for t in frames.temperature[valid].tolist()}),
@@ -189,7 +219,12 @@ def _different(paths: Sequence[Path]) -> tuple[list[Path], list[Note]]:
     kept = [path for path in paths if first.setdefault(sha256(path), path) == path]
     twice = [path for path in paths if path not in kept]
     return kept, [
-        Note("copies", "", len(twice), f"{twice[0]} is another recording once more, byte for byte, and was left out")
+        Note(
+            "copies",
+            "",
+            len(twice),
+            f"{twice[0]} is another recording once more, byte for byte, and was left out",
+        )
     ] if twice else []
 
 
@@ -197,53 +232,79 @@ def _unread(folder: Path, names: Iterable[str]) -> list[Note]:
     """A note of files that are no recording, that no CSV names, and that are no text about the others."""
     names = [name for name in names if posixpath.splitext(name)[1].lower() not in TEXTS]
     said = (
-        f"{folder}: {len(names)} files are named by no CSV and were not read, the first {min(names, default='')}; "
+        f"{folder}: {len(names)} files are named by no CSV and were not read, "
+        f"the first {min(names, default='')}; "
         "list them in a CSV, or move them out"
     )
     return [Note("unread", "", len(names), said)] if names else []
 
 
 def _images(folder: Path) -> set[str]:
-    """Paths of all files that are not hidden, from `folder` on, with forward slashes; what links lead to once more is walked once."""
+    """Paths of all files that are not hidden, from `folder` on, with forward
+    slashes; what links lead to once more is walked once."""
     found, walked = set(), set()
     for here, folders, names in os.walk(folder, followlinks=True):
         # a link may lead back to where it lies
         walked.add(os.path.realpath(here))
-        folders[:] = sorted(name for name in folders if not name.startswith(".") and os.path.realpath(f"{here}/{name}") not in walked)
+        folders[:] = sorted(
+            name
+            for name in folders
+            if not name.startswith(".") and os.path.realpath(f"{here}/{name}") not in walked
+        )
         inside = Path(here).relative_to(folder).as_posix()
-        found.update(name if inside == "." else f"{inside}/{name}" for name in names if not name.startswith("."))
+        found.update(
+            name if inside == "." else f"{inside}/{name}" for name in names if not name.startswith(".")
+        )
     return found
 
 
 def _found(log: Log, folder: Path, there: set[str]) -> tuple[list[str], list[Note]]:
-    """Each image's path from `folder` on, empty where it is not there: all of a file's lie in one place, that where most are found."""
+    """Each image's path from `folder` on, empty where it is not there: all of a
+    file's lie in one place, that where most are found."""
     parts = [[part for part in image.split("/") if part not in ("", ".")] for image in log.image]
     own = log.path.parent.relative_to(folder).as_posix()
 
     def below(base: str, first: int, some: Sequence[list[str]]) -> list[str]:
-        named = [posixpath.normpath("/".join([base, *names[first:]])) if len(names) > first else "" for names in some]
+        named = [
+            posixpath.normpath("/".join([base, *names[first:]])) if len(names) > first else ""
+            for names in some
+        ]
         return [name if name in there else "" for name in named]
 
     few = parts[:: max(1, len(parts) // LOOKED_AT)]
-    places = [(base, first) for first in range(max(map(len, parts), default=1)) for base in dict.fromkeys([own, "."])]
+    places = [
+        (base, first)
+        for first in range(max(map(len, parts), default=1))
+        for base in dict.fromkeys([own, "."])
+    ]
     if not any(any(below(*place, few)) for place in places):
         # whatever folder has files of these names
         wanted = {names[-1] for names in few if names}
-        places += [(base, -1) for base in sorted({posixpath.dirname(path) for path in there if posixpath.basename(path) in wanted})]
+        places += [
+            (base, -1)
+            for base in sorted(
+                {posixpath.dirname(path) for path in there if posixpath.basename(path) in wanted}
+            )
+        ]
     best = max(places, key=lambda place: sum(map(bool, below(*place, few))), default=(own, 0))
     notes = []
     if best[1] and any(below(*best, few)):
         lost = "/".join(parts[0][: best[1]]) or "."
         notes.append(
             Note(
-                "images", "", 1, f"{log.path}: its images are found in {folder / best[0]} without the first folders of their paths, {lost}/"
+                "images",
+                "",
+                1,
+                f"{log.path}: its images are found in {folder / best[0]} without the first folders of "
+                f"their paths, {lost}/",
             )
         )
     return below(*best, parts), notes
 
 
 def _listed(logs: Sequence[Log], images: Sequence[list[str]]) -> list[list[str]]:
-    """Why a line cannot be learned from, before any image is opened. Raises ValueError where two lines contradict one another."""
+    """Why a line cannot be learned from, before any image is opened. Raises
+    ValueError where two lines contradict one another."""
     first: dict[str, tuple[int, int]] = {}
     reasons = []
     for k, (log, found) in enumerate(zip(logs, images, strict=True)):
@@ -266,11 +327,17 @@ def _listed(logs: Sequence[Log], images: Sequence[list[str]]) -> list[list[str]]
 
 
 def _check_alike(before: Log, i: int, log: Log, j: int) -> None:
-    ours, theirs = ((one.flow[row], one.temperature[row], one.print_id[row]) for one, row in ((before, i), (log, j)))
+    ours, theirs = (
+        (one.flow[row], one.temperature[row], one.print_id[row]) for one, row in ((before, i), (log, j))
+    )
     if ours != theirs:
-        said = [f"{flow:g} percent and {temperature:g} degC in print {name!r}" for flow, temperature, name in (theirs, ours)]
+        said = [
+            f"{flow:g} percent and {temperature:g} degC in print {name!r}"
+            for flow, temperature, name in (theirs, ours)
+        ]
         raise ValueError(
-            f"{log.path}: line {log.line[j]}: expected {log.image[j]} once, found it here with {said[0]} and in line {before.line[i]} "
+            f"{log.path}: line {log.line[j]}: expected {log.image[j]} once, "
+            f"found it here with {said[0]} and in line {before.line[i]} "
             f"of {before.path.name} "
             f"with {said[1]}; remove the line that is wrong"
         )
@@ -297,21 +364,36 @@ def _of_log(log: Log, seen: Sequence[Seen], why: list[str], notes: list[Note]) -
         notes.append(
             Note(
                 "labels", "", len(wrong),
-                f"{log.path}: flow_rate_class contradicts flow_rate in {len(wrong)} of {known.sum()} lines, the first line {log.line[i]}: "
+                f"{log.path}: flow_rate_class contradicts flow_rate in {len(wrong)} of {known.sum()} lines, "
+                f"the first line {log.line[i]}: "
                 f"class {log.label[i]:g} at "
                 f"{log.flow[i]:g} percent, which is class {label[i]}; flow_rate was taken",
             )
         )  # fmt: skip
-    places = [f"line {line}, {' '.join(image.split())[-LONGEST:] or 'no image'}" for line, image in zip(log.line, log.image, strict=True)]
+    places = [
+        f"line {line}, {' '.join(image.split())[-LONGEST:] or 'no image'}"
+        for line, image in zip(log.line, log.image, strict=True)
+    ]
     return _Part(log.path, whole, log.flow, log.temperature, log.print_id, log.setting, places, notes)
 
 
 def _of_film(path: Path, film: Film) -> _Part:
     reasons = film.seen.reasons
     for reason, values in ((NO_TEMPERATURE, film.temperature), (NO_FLOW, film.flow)):
-        reasons = [front if known else reason for front, known in zip(reasons, np.isfinite(values), strict=True)]
+        reasons = [
+            front if known else reason for front, known in zip(reasons, np.isfinite(values), strict=True)
+        ]
     places = [f"{time:.3f} s" for time in film.time_s]
-    return _Part(path, film.seen._replace(reasons=reasons), film.flow, film.temperature, film.prints, film.stretch, places, film.notes)
+    return _Part(
+        path,
+        film.seen._replace(reasons=reasons),
+        film.flow,
+        film.temperature,
+        film.prints,
+        film.stretch,
+        places,
+        film.notes,
+    )
 
 
 def _joined(folder: Path, parts: Sequence[_Part], notes: list[Note]) -> NozzleFrames:
@@ -331,19 +413,40 @@ def _joined(folder: Path, parts: Sequence[_Part], notes: list[Note]) -> NozzleFr
     prints = tuple(dict.fromkeys(name for name in names if name))
     number = {name: i for i, name in enumerate(prints)}
     images, angle, score, padded = (
-        np.concatenate([getattr(part.seen, name) for part in parts]) for name in ("images", "angle_deg", "score", "padded_share")
+        np.concatenate([getattr(part.seen, name) for part in parts])
+        for name in ("images", "angle_deg", "score", "padded_share")
     )
-    flow, temperature = (np.concatenate([getattr(part, name) for part in parts]) for name in ("flow", "temperature"))
+    flow, temperature = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("flow", "temperature")
+    )
     valid = np.array([not reason for reason in reasons], bool)
     if not valid.any():
         worst = max(notes, key=lambda note: note.count if note.kind == "frames" else -1, default=None)
-        raise ValueError(f"{folder}: none of {len(valid)} frames can be learned from: {worst.message if worst else 'none is listed'}")
+        raise ValueError(
+            f"{folder}: none of {len(valid)} frames can be learned from: "
+            f"{worst.message if worst else 'none is listed'}"
+        )
     images = np.where(valid[:, None, None], images, 0).astype(np.uint8).reshape(-1, *SHAPE)
     label = np.where(np.isfinite(flow), nozzle_scene.label(np.nan_to_num(flow)), -1)
     segment = np.concatenate([part.stretch + start for part, start in zip(parts, starts, strict=False)])
     source = [f"{part.path}: {place}" for part in parts for place in part.places]
     which = np.array([number.get(name, -1) for name in names], int)
-    return NozzleFrames(images, label, flow, temperature, which, segment, valid, reasons, angle, score, padded, source, prints, notes)
+    return NozzleFrames(
+        images,
+        label,
+        flow,
+        temperature,
+        which,
+        segment,
+        valid,
+        reasons,
+        angle,
+        score,
+        padded,
+        source,
+        prints,
+        notes,
+    )
 
 
 def _rejections(folder: Path, part: _Part, reasons: Sequence[str]) -> list[Note]:
@@ -358,7 +461,8 @@ def _rejections(folder: Path, part: _Part, reasons: Sequence[str]) -> list[Note]
         detail = reasons[first].partition(": ")[2]
         where = f" (looked for below {folder})" if kind == MISSING else f" ({detail})" if detail else ""
         message = (
-            f"{part.path}: {len(rows)} of {len(reasons)} frames were left out: {kind}, the first {part.places[first]}{where}; "
+            f"{part.path}: {len(rows)} of {len(reasons)} frames were left out: {kind}, "
+            f"the first {part.places[first]}{where}; "
             f"{REMEDIES.get(kind, LOOK)}"
         )
         notes.append(Note("frames", "", len(rows), message))

@@ -1,4 +1,5 @@
-"""Image files -> key areas, a batch at a time; what was cut before, from the same bytes by the same code, is taken from a memo."""
+"""Image files -> key areas, a batch at a time; what was cut before, from the
+same bytes by the same code, is taken from a memo."""
 
 import contextlib
 import itertools
@@ -21,20 +22,29 @@ from pipeline.store.tables import FLOAT, NONE, TEXT, Column, Schema
 HERE = Path(__file__).parents[2]
 # the code that decides what an entry of the memo holds
 CODE = (
-    "setpoint/workflow/frame_images.py", "setpoint/workflow/frame_mcap.py", "setpoint/key_area.py", "store/mcap_frames.py",
+    "setpoint/workflow/frame_images.py", "setpoint/workflow/frame_mcap.py", "setpoint/key_area.py",
+    "store/mcap_frames.py",
     "reading/image_messages.py", "reading/image_topics.py",
 )  # fmt: skip
 DIGEST_BYTES = 16
-# cameras of 10 and 12 bits may leave the upper ones of 16 empty; a picture as dark as that has fewer than 16 of 256 gray levels in any case
+# cameras of 10 and 12 bits may leave the upper ones of 16 empty; a picture as dark as that
+# has fewer than 16 of 256 gray levels in any case
 FILLED_BITS = 12
-MISSING, UNREADABLE, NO_TIP, UNUSABLE = "the image is missing", "the image cannot be read", "no tip is known", "the frame cannot be used"
+MISSING, UNREADABLE, NO_TIP, UNUSABLE = (
+    "the image is missing",
+    "the image cannot be read",
+    "no tip is known",
+    "the frame cannot be used",
+)
 # the error stream is the process's: threads of a cluster's worker take turns
 _LISTENING = threading.Lock()
 KEY_AREAS = Schema(
     "key_areas",
     1,
     (
-        Column("image", pa.binary(key_area.SHAPE[0] * key_area.SHAPE[1]), NONE, "16 x 48 gray levels, row by row"),
+        Column(
+            "image", pa.binary(key_area.SHAPE[0] * key_area.SHAPE[1]), NONE, "16 x 48 gray levels, row by row"
+        ),
         Column("angle_deg", FLOAT, "deg", "direction of the line, 0 right, 90 down", nullable=True),
         Column("score", FLOAT, NONE, "ridge in gray levels", nullable=True),
         Column("padded_share", FLOAT, NONE, "share of the crop outside the frame", nullable=True),
@@ -45,8 +55,9 @@ KEY_AREAS = Schema(
 
 
 class Seen(NamedTuple):
-    """What the front end made of n frames: images (n, 16, 48) uint8, zeros where rejected; angle_deg, score, padded_share (n,), NaN where
-    nothing was looked at; n reasons, empty where there is a key area; n digests of what the frame held."""
+    """What the front end made of n frames: images (n, 16, 48) uint8, zeros where rejected;
+    angle_deg, score, padded_share (n,), NaN where nothing was looked at; n reasons, empty where
+    there is a key area; n digests of what the frame held."""
 
     images: np.ndarray
     angle_deg: np.ndarray
@@ -63,19 +74,26 @@ def read_image(path: str | Path) -> np.ndarray:
         found = _opened(str(path), said)
     reason = found.partition(": ")[2] if isinstance(found, str) else ""
     if reason:
-        raise ValueError(f"{path}: expected a whole picture (JPEG, PNG, TIFF, BMP, WebP), found {reason}; check the name, or copy it again")
+        raise ValueError(
+            f"{path}: expected a whole picture (JPEG, PNG, TIFF, BMP, WebP), found {reason}; "
+            "check the name, or copy it again"
+        )
     return found
 
 
 def decode(data: bytes) -> np.ndarray:
-    """The picture (height, width) in gray, uint8 or uint16, of an encoded file. Raises ValueError that says what was found instead."""
+    """The picture (height, width) in gray, uint8 or uint16, of an encoded file.
+    Raises ValueError that says what was found instead."""
     if not data:
         raise ValueError("an empty file")
     # a broken end is filled with gray: the end mark must follow the last scan
     if data.startswith(b"\xff\xd8") and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
         raise ValueError(f"a JPEG of {len(data)} bytes without its end")
     try:
-        frame = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
+        frame = cv2.imdecode(
+            np.frombuffer(data, np.uint8),
+            cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION,
+        )
     except cv2.error:
         frame = None
     if frame is None:
@@ -85,42 +103,58 @@ def decode(data: bytes) -> np.ndarray:
     return frame
 
 
-def cut(paths: Sequence[str], tips: np.ndarray, directions_deg: np.ndarray, *, least_score: float, memo: Path) -> Seen:
+def cut(
+    paths: Sequence[str], tips: np.ndarray, directions_deg: np.ndarray, *, least_score: float, memo: Path
+) -> Seen:
     """Key areas of image files with tips (n, 2) in px and travel directions (n,) in degrees, NaN where they
     are not known; one file's pixels in memory at a time.
 
-    An empty path is a frame that is not to be looked at. An entry of the memo is named by the hash of all that decides what it holds.
+    An empty path is a frame that is not to be looked at. An entry of the memo is
+    named by the hash of all that decides what it holds.
     """
     digests = [_digest(path) for path in paths]
     entry = entry_of(memo, digests, tips.tolist(), directions_deg.tolist(), least_score)
     found = remembered(entry, len(paths))
     if not found:
         with _said() as said:
-            found = look((_opened(path, said) for path in paths), tips, directions_deg, least_score=least_score)
+            found = look(
+                (_opened(path, said) for path in paths), tips, directions_deg, least_score=least_score
+            )
         remember(entry, found)
     return found._replace(digests=digests)
 
 
-def look(frames: Iterable[np.ndarray | str], tips: np.ndarray, directions_deg: np.ndarray, *, least_score: float) -> Seen:
-    """What the front end makes of n frames, or of a text that says why there is none; digests are left empty."""
+def look(
+    frames: Iterable[np.ndarray | str], tips: np.ndarray, directions_deg: np.ndarray, *, least_score: float
+) -> Seen:
+    """What the front end makes of n frames, or of a text that says why
+    there is none; digests are left empty."""
     found = []
     for frame, tip, direction in zip(frames, tips, directions_deg, strict=True):
-        reason = frame if isinstance(frame, str) else _shallow(frame) or ("" if np.isfinite(tip).all() else NO_TIP)
+        reason = (
+            frame if isinstance(frame, str) else _shallow(frame) or ("" if np.isfinite(tip).all() else NO_TIP)
+        )
         seen = key_area.KeyArea(np.zeros(key_area.SHAPE, np.uint8), np.nan, np.nan, np.nan, np.nan, reason)
         if not reason:
             try:
                 known = float(direction) if np.isfinite(direction) else None
-                seen = key_area.find(frame, (float(tip[0]), float(tip[1])), least_score=least_score, direction_deg=known)
+                seen = key_area.find(
+                    frame, (float(tip[0]), float(tip[1])), least_score=least_score, direction_deg=known
+                )
             except ValueError as error:
                 seen = seen._replace(reason=f"{UNUSABLE}: {error}")
         found.append(seen)
     images = np.array([seen.image for seen in found], np.uint8).reshape(-1, *key_area.SHAPE)
-    figures = (np.array([getattr(seen, name) for seen in found], float) for name in ("angle_deg", "score", "padded_share"))
+    figures = (
+        np.array([getattr(seen, name) for seen in found], float)
+        for name in ("angle_deg", "score", "padded_share")
+    )
     return Seen(images, *figures, [seen.reason for seen in found], [""] * len(found))
 
 
 def _shallow(frame: np.ndarray) -> str:
-    """Why a frame of 16 bits is not used of which a camera filled the lower ones alone: the front end would see black."""
+    """Why a frame of 16 bits is not used of which a camera filled the
+    lower ones alone: the front end would see black."""
     if frame.dtype != np.uint16 or frame.max() >= 1 << FILLED_BITS:
         return ""
     return f"{UNUSABLE}: its 16 bits hold {frame.max()} at most, as of a camera of fewer bits; write its gray levels over all of 0 to 65535"
@@ -128,8 +162,14 @@ def _shallow(frame: np.ndarray) -> str:
 
 def together(parts: Sequence[Seen]) -> Seen:
     """The frames of all parts, one part behind the other."""
-    arrays = (np.concatenate([getattr(part, name) for part in parts]) for name in ("images", "angle_deg", "score", "padded_share"))
-    texts = (list(itertools.chain.from_iterable(getattr(part, name) for part in parts)) for name in ("reasons", "digests"))
+    arrays = (
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in ("images", "angle_deg", "score", "padded_share")
+    )
+    texts = (
+        list(itertools.chain.from_iterable(getattr(part, name) for part in parts))
+        for name in ("reasons", "digests")
+    )
     return Seen(*arrays, *texts)
 
 
@@ -147,8 +187,8 @@ def _opened(path: str, said: Callable[[], str]) -> np.ndarray | str:
 
 @contextlib.contextmanager
 def _said() -> Iterator[Callable[[], str]]:
-    """A function that gives what the JPEG decoder has complained of since it was last asked: it mends what is damaged,
-    and says so on the process's error stream alone."""
+    """A function that gives what the JPEG decoder has complained of since it was last asked: it mends what is
+    damaged, and says so on the process's error stream alone."""
     at = 0
 
     def said() -> str:
@@ -156,7 +196,14 @@ def _said() -> Iterator[Callable[[], str]]:
         text = os.pread(heard.fileno(), 1 << 16, at)
         at += len(text)
         # padding between restart markers, as cameras write it, loses nothing
-        return next((line for line in text.decode(errors="replace").splitlines() if "JPEG" in line and "extraneous" not in line), "")
+        return next(
+            (
+                line
+                for line in text.decode(errors="replace").splitlines()
+                if "JPEG" in line and "extraneous" not in line
+            ),
+            "",
+        )
 
     with _LISTENING, tempfile.TemporaryFile() as heard:
         own = os.dup(2)
@@ -186,7 +233,9 @@ def entry_of(memo: Path, *what: Any) -> Path:
 
 def remember(entry: Path, found: Seen) -> None:
     columns = ([image.tobytes() for image in found.images], *found[1:])
-    artifacts.write_table(entry, KEY_AREAS, dict(zip([column.name for column in KEY_AREAS.columns], columns, strict=True)))
+    artifacts.write_table(
+        entry, KEY_AREAS, dict(zip([column.name for column in KEY_AREAS.columns], columns, strict=True))
+    )
 
 
 def remembered(entry: Path, count: int) -> Seen | None:

@@ -1,5 +1,5 @@
-"""Nozzle frames in MCAP, with the setpoints they were printed at: written as any ROS 2 or Foxglove viewer opens it, and
-read from that form or from a machine's own topics."""
+"""Nozzle frames in MCAP, with the setpoints they were printed at: written as any ROS 2 or Foxglove viewer
+opens it, and read from that form or from a machine's own topics."""
 
 import contextlib
 import hashlib
@@ -40,8 +40,8 @@ TOGETHER = 64
 
 
 class Topics(NamedTuple):
-    """Where a recording has what we need: the image topic (empty: the only one), the clock (log_time, publish_time or a stamp's field), and
-    the mapping {our signal: (source, unit, scale, offset)}."""
+    """Where a recording has what we need: the image topic (empty: the only one), the clock (log_time,
+    publish_time or a stamp's field), and the mapping {our signal: (source, unit, scale, offset)}."""
 
     image: str
     time: str
@@ -51,18 +51,25 @@ class Topics(NamedTuple):
         """{signal: source}. Raises ValueError for a signal that is none of ours, and for another unit."""
         for name, (_, unit, _, _) in self.mapping.items():
             if name not in UNITS:
-                raise ValueError(f"{PLACE}.mapping.{name} is no signal of nozzle frames; {nearest_names(name, UNITS)}")
+                raise ValueError(
+                    f"{PLACE}.mapping.{name} is no signal of nozzle frames; {nearest_names(name, UNITS)}"
+                )
             if unit != UNITS[name]:
                 raise ValueError(
-                    f"{PLACE}.mapping.{name}.unit is {unit} but {name} is in {UNITS[name]}; convert with scale and offset, "
+                    f"{PLACE}.mapping.{name}.unit is {unit} but {name} is in {UNITS[name]}; "
+                    "convert with scale and offset, "
                     f"and write unit: {UNITS[name]}"
                 )
-        return {name: Source(name, *self.mapping.get(name, (name, unit, 1.0, 0.0))) for name, unit in UNITS.items()}
+        return {
+            name: Source(name, *self.mapping.get(name, (name, unit, 1.0, 0.0)))
+            for name, unit in UNITS.items()
+        }
 
 
 class Film(NamedTuple):
-    """The n frames of a recording that can be decoded, at time_s (n,), as the front end sees them: flow in percent, temperature in degC and
-    print that held at that time, NaN and empty before the first; `stretch` numbers those of constant settings."""
+    """The n frames of a recording that can be decoded, at time_s (n,), as the front end sees them: flow in
+    percent, temperature in degC and print that held at that time, NaN and empty before the first; `stretch`
+    numbers those of constant settings."""
 
     time_s: np.ndarray
     seen: Seen
@@ -76,13 +83,21 @@ class Film(NamedTuple):
 # ---- reading
 
 
-def watch(path: Path, shown: Path, where: Topics, tip_px: tuple[float, float] | None, *, least_score: float, memo: Path) -> Film:
+def watch(
+    path: Path,
+    shown: Path,
+    where: Topics,
+    tip_px: tuple[float, float] | None,
+    *,
+    least_score: float,
+    memo: Path,
+) -> Film:
     """The key areas of a recording, with the setpoints that held when each frame was taken, a few frames in
     memory at a time; `shown` is the path that is spoken of.
 
-    The tip is `tip_px` or, where that is None, the recording's; the print is the recording's print_id, or its file. Raises
-    ValueError, one sentence, where the file cannot be read, has no such topic, or has frames and setpoints that do not
-    overlap in time; what is damaged is left out and noted.
+    The tip is `tip_px` or, where that is None, the recording's; the print is the recording's print_id, or its
+    file. Raises ValueError, one sentence, where the file cannot be read, has no such topic, or has frames and
+    setpoints that do not overlap in time; what is damaged is left out and noted.
     """
     try:
         return _watch(path, shown, where, tip_px, least_score, memo)
@@ -92,10 +107,14 @@ def watch(path: Path, shown: Path, where: Topics, tip_px: tuple[float, float] | 
         # what cannot be written is said already
         if not error.strerror:
             raise
-        raise ValueError(f"{shown} cannot be read ({error.strerror}); check the disk, or copy the recording again") from None
+        raise ValueError(
+            f"{shown} cannot be read ({error.strerror}); check the disk, or copy the recording again"
+        ) from None
 
 
-def open_film(path: Path, where: Topics) -> tuple[Frames, dict[str, tuple[np.ndarray, np.ndarray]], list[Note]]:
+def open_film(
+    path: Path, where: Topics
+) -> tuple[Frames, dict[str, tuple[np.ndarray, np.ndarray]], list[Note]]:
     """Frames in the order of time, {signal: (time_s (n,), values (n,))} of those that the recording
     has, on one clock, and notes of what was damaged."""
     clock = where.time or "log_time"
@@ -136,11 +155,14 @@ def middle_frame(path: Path, image: str) -> np.ndarray:
         with contextlib.suppress(UnreadableMessage):
             return image_messages.gray(picture)
     raise ValueError(
-        f"{path}: expected a picture on {camera.name}, found none that can be decoded ({damage(path)}); copy the recording again"
+        f"{path}: expected a picture on {camera.name}, found none that can be decoded ({damage(path)}); "
+        "copy the recording again"
     )
 
 
-def _watch(path: Path, shown: Path, where: Topics, tip_px: tuple[float, float] | None, least_score: float, memo: Path) -> Film:
+def _watch(
+    path: Path, shown: Path, where: Topics, tip_px: tuple[float, float] | None, least_score: float, memo: Path
+) -> Film:
     frames, signals, notes = open_film(path, where)
     check_overlap(path, span_of(frames.time_s), {name: (signals[name][0][0], np.inf) for name in NEEDED})
     entry = entry_of(memo, sha256(path), where, tip_px, least_score)
@@ -149,8 +171,14 @@ def _watch(path: Path, shown: Path, where: Topics, tip_px: tuple[float, float] |
     if not seen:
         time_s, seen = _looked(path, frames, signals, tip_px, least_score)
         remember(entry, seen)
-    flow, temperature, number = (_held(signals, name, time_s) for name in ("flow_percent", "temperature_degC", "print_id"))
-    prints = [f"{value:g}" if np.isfinite(value) else "" for value in number] if "print_id" in signals else [shown.stem] * len(time_s)
+    flow, temperature, number = (
+        _held(signals, name, time_s) for name in ("flow_percent", "temperature_degC", "print_id")
+    )
+    prints = (
+        [f"{value:g}" if np.isfinite(value) else "" for value in number]
+        if "print_id" in signals
+        else [shown.stem] * len(time_s)
+    )
     settings, known = [flow, number], np.nan_to_num(temperature, nan=-1.0)
     if np.count_nonzero(known[1:] != known[:-1]) <= max(MEASURED, len(time_s) / MEASURED):
         settings.append(known)
@@ -170,9 +198,19 @@ def _looked(
         time_s = np.array([time for time, _ in batch])
         tips = np.column_stack([_held(signals, name, time_s) for name in ("tip_x_px", "tip_y_px")])
         tips = tips if tip_px is None else np.broadcast_to(np.array(tip_px, float), tips.shape)
-        seen = look((frame for _, frame in batch), tips, _held(signals, "travel_direction_deg", time_s), least_score=least_score)
+        seen = look(
+            (frame for _, frame in batch),
+            tips,
+            _held(signals, "travel_direction_deg", time_s),
+            least_score=least_score,
+        )
         pieces.append(
-            seen._replace(digests=[hashlib.blake2b(np.ascontiguousarray(frame), digest_size=16).hexdigest() for _, frame in batch])
+            seen._replace(
+                digests=[
+                    hashlib.blake2b(np.ascontiguousarray(frame), digest_size=16).hexdigest()
+                    for _, frame in batch
+                ]
+            )
         )
         times.append(time_s)
     if not times:
@@ -181,7 +219,8 @@ def _looked(
 
 
 def _held(signals: Mapping[str, tuple[np.ndarray, np.ndarray]], name: str, time_s: np.ndarray) -> np.ndarray:
-    """The signal's value at each time (n,): a setpoint holds until the next; NaN before the first, and where there is no such signal."""
+    """The signal's value at each time (n,): a setpoint holds until the next; NaN
+    before the first, and where there is no such signal."""
     if name not in signals:
         return np.full(len(time_s), np.nan)
     at, values = signals[name]

@@ -13,8 +13,8 @@ FINE = (75.0, 125.0)  # in which a controller stays, and would see one window's 
 
 
 class Seen(NamedTuple):
-    """n frames: key areas (n, 16, 48) uint8, class and true flow in percent (n,), temperature (n,) in °C, print and
-    segment (n,), valid (n,) and the reason why not."""
+    """n frames: key areas (n, 16, 48) uint8, class and true flow in percent (n,), temperature (n,) in °C,
+    print and segment (n,), valid (n,) and the reason why not."""
 
     images: np.ndarray
     label: np.ndarray
@@ -36,14 +36,24 @@ class Seen(NamedTuple):
 
 def rendered(seed: Sequence[int], frames: int, least_score: float) -> Seen:
     """A segment of each of the 15 combinations."""
-    made = nozzle_scene.data_set(np.random.default_rng(seed), segments=1, frames=frames, least_score=least_score)
+    made = nozzle_scene.data_set(
+        np.random.default_rng(seed), segments=1, frames=frames, least_score=least_score
+    )
     return Seen(
-        made.images, made.label, made.flow, made.temperature, made.segment, made.segment, made.valid, np.array(made.reasons, object)
+        made.images,
+        made.label,
+        made.flow,
+        made.temperature,
+        made.segment,
+        made.segment,
+        made.valid,
+        np.array(made.reasons, object),
     )
 
 
 def swept(seed: Sequence[int], windows: float, frames: int, least_score: float) -> Seen:
-    """One segment's conditions, all at one temperature, over all bins of the flow: windows of `frames` frames with a flow each.
+    """One segment's conditions, all at one temperature, over all bins of the
+    flow: windows of `frames` frames with a flow each.
 
     windows: how many in each bin within FINE on average; elsewhere no more than one.
     """
@@ -55,10 +65,21 @@ def swept(seed: Sequence[int], windows: float, frames: int, least_score: float) 
         if count == 0:
             continue
         flow, temperature = np.repeat(rng.uniform(low, high, count), frames), np.full(count * frames, degrees)
-        cut = nozzle_scene.key_areas(nozzle_scene.render(segment, flow, temperature, rng), least_score=least_score)
+        cut = nozzle_scene.key_areas(
+            nozzle_scene.render(segment, flow, temperature, rng), least_score=least_score
+        )
         number = np.zeros(len(flow), int)
         pieces.append(
-            Seen(cut.images, nozzle_scene.label(flow), flow, temperature, number, number, cut.valid, np.array(cut.reasons, object))
+            Seen(
+                cut.images,
+                nozzle_scene.label(flow),
+                flow,
+                temperature,
+                number,
+                number,
+                cut.valid,
+                np.array(cut.reasons, object),
+            )
         )
     return Seen(*(np.concatenate(columns) for columns in zip(*pieces, strict=True)))
 

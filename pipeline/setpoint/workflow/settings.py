@@ -20,9 +20,9 @@ class Counts(Section):
 
 
 class Recorded(Section):
-    """Segments whose windows over the whole range of flows are recorded for the simulator, and windows of each in a
-    bin of the flow: those that controllers are trained and tuned on (many segments, as what a segment adds stays with
-    its windows), and those that they are judged on."""
+    """Segments whose windows over the whole range of flows are recorded for the simulator, and windows of
+    each in a bin of the flow: those that controllers are trained and tuned on (many segments, as what a
+    segment adds stays with its windows), and those that they are judged on."""
 
     learn: int = Field(ge=1, le=1000)
     judge: int = Field(ge=1, le=1000)
@@ -76,8 +76,8 @@ class TrainClassifier(Section):
 
 
 class Learning(Section):
-    """Deep Q-learning: environments stepped together, batch, transitions remembered, steps of an episode, Adam's rate, discount, the slow
-    copy's step, and how much is explored."""
+    """Deep Q-learning: environments stepped together, batch, transitions remembered, steps of an episode,
+    Adam's rate, discount, the slow copy's step, and how much is explored."""
 
     environments: int = Field(ge=1, le=100_000)
     batch: int = Field(ge=1, le=100_000)
@@ -91,7 +91,8 @@ class Learning(Section):
 
 
 class Paper(Learning):
-    """The published agent: updates of its phases, exploration again from the second on, accuracy of the last."""
+    """The published agent: updates of its phases, exploration again
+    from the second on, accuracy of the last."""
 
     updates: list[Annotated[int, Field(ge=1, le=10_000_000)]] = Field(min_length=3, max_length=4)
     explore_again: float = Field(ge=0, le=1)
@@ -139,7 +140,8 @@ class Troubles(Section):
 
 
 class Ours(Learning):
-    """Our agent: the filter whose belief it sees, what a step costs, what it meets, and rounds of updates, the best of which is kept."""
+    """Our agent: the filter whose belief it sees, what a step costs, what it meets,
+    and rounds of updates, the best of which is kept."""
 
     filter: RobustFilter
     costs: Costs

@@ -7,21 +7,32 @@ from pipeline.setpoint.published import ALPHA, BEST_FLOW, BEST_TEMPERATURE, PHAS
 from pipeline.setpoint.score import FLOW_BAND, SETTLED_BY, TEMPERATURE_BAND  # noqa: F401
 from pipeline.store.tables import BOOL, COUNT, FLOAT, INDEX, NONE, TEXT, Column, Schema
 
-_SHARES = tuple(Column(f"p_{name}", FLOAT, NONE, f"share of the class {name}, calibrated", 0, 1) for name in ("under", "good", "over"))
+_SHARES = tuple(
+    Column(f"p_{name}", FLOAT, NONE, f"share of the class {name}, calibrated", 0, 1)
+    for name in ("under", "good", "over")
+)
 _CLASS = "0 under, 1 good, 2 over"
 
 CLASSIFIED = Schema(
     "classified",
     1,
     (
-        Column("segment", INDEX, NONE, "segment or print that the frame is of; none of them was learned or calibrated on", low=0),
+        Column(
+            "segment",
+            INDEX,
+            NONE,
+            "segment or print that the frame is of; none of them was learned or calibrated on",
+            low=0,
+        ),
         Column("flow_percent", FLOAT, "percent", "true flow, of nominal", low=0),
         Column("temperature_degC", FLOAT, "degC", "nozzle temperature"),
         Column("label", INDEX, NONE, f"true class: {_CLASS}", 0, 2),
         *_SHARES,
         Column("named", INDEX, NONE, f"class named by the vision transformer: {_CLASS}", 0, 2),
         Column("named_cnn", INDEX, NONE, "the same by the small convolutional network", 0, 2),
-        Column("named_svc", INDEX, NONE, "the same by the support vector machine on the bead's profile", 0, 2),
+        Column(
+            "named_svc", INDEX, NONE, "the same by the support vector machine on the bead's profile", 0, 2
+        ),
         Column("named_width", INDEX, NONE, "the same by Otsu's width and two thresholds", 0, 2),
         Column("distance", FLOAT, NONE, "Mahalanobis distance of the features from what was learned", low=0),
     ),
@@ -88,7 +99,8 @@ SCOREBOARD = Schema(
             "simulator",
             TEXT,
             NONE,
-            "paper: eqs. 6-9; recorded: windows of the trained classifier; pixels: rendered frames through the whole chain",
+            "paper: eqs. 6-9; recorded: windows of the trained classifier; pixels: "
+            "rendered frames through the whole chain",
         ),
         Column("case", TEXT, NONE, "what the machine does: accuracy, clog, actuator gain, persistence"),
         Column("counts", BOOL, NONE, "this case counts for the choice of the default"),
@@ -96,17 +108,39 @@ SCOREBOARD = Schema(
         *(
             column
             for name, meaning in (
-                ("settled", "of runs inside 90-110 % and 210 +- 5 degC from some step up to 90 until step 100"),
+                (
+                    "settled",
+                    "of runs inside 90-110 % and 210 +- 5 degC from some step up to 90 until step 100",
+                ),
                 ("stay", "settled, and never out from step 100 to 200; missing where runs end before"),
-                ("recovered", "inside from some step up to 90 until step 120: after what happens at step 60; missing where nothing does"),
+                (
+                    "recovered",
+                    "inside from some step up to 90 until step 120: after what happens at step 60; "
+                    "missing where nothing does",
+                ),
             )
             for column in (
                 Column(f"{name}_percent", FLOAT, "percent", meaning, 0, 100, nullable=True),
-                Column(f"{name}_low_percent", FLOAT, "percent", "lower end of its 95 % interval (Wilson)", 0, 100, nullable=True),
+                Column(
+                    f"{name}_low_percent",
+                    FLOAT,
+                    "percent",
+                    "lower end of its 95 % interval (Wilson)",
+                    0,
+                    100,
+                    nullable=True,
+                ),
                 Column(f"{name}_high_percent", FLOAT, "percent", "upper end", 0, 100, nullable=True),
             )
         ),
-        Column("median_steps", FLOAT, NONE, "decisions until inside for good, median of settled runs", low=0, nullable=True),
+        Column(
+            "median_steps",
+            FLOAT,
+            NONE,
+            "decisions until inside for good, median of settled runs",
+            low=0,
+            nullable=True,
+        ),
         Column("p90_steps", FLOAT, NONE, "the same, 90th percentile", low=0, nullable=True),
         Column(
             "overshoot_p95_percent",
@@ -116,7 +150,14 @@ SCOREBOARD = Schema(
             low=0,
             nullable=True,
         ),
-        Column("flow_error_percent", FLOAT, "percent", "mean distance of the true flow from 100 % when settled", low=0, nullable=True),
+        Column(
+            "flow_error_percent",
+            FLOAT,
+            "percent",
+            "mean distance of the true flow from 100 % when settled",
+            low=0,
+            nullable=True,
+        ),
         Column("worst_start_flow_percent", FLOAT, "percent", "start from which fewest settle", low=0),
         Column("worst_start_temperature_degC", FLOAT, "degC", "the same start's temperature"),
         Column("worst_start_settled_percent", FLOAT, "percent", "of runs from there", 0, 100),
@@ -159,5 +200,8 @@ DECISIONS = Schema(
     ),
 )
 
-# bins of the true flow in percent: fine where controllers must find 100 %, wide where any window says the same
-FLOW_EDGES = np.concatenate([[20.0, 35, 50, 60, 70], np.arange(75, 125, 2.5), np.arange(125, 150, 5.0), np.arange(150, 311, 40.0)])
+# bins of the true flow in percent: fine where controllers must find
+# 100 %, wide where any window says the same
+FLOW_EDGES = np.concatenate(
+    [[20.0, 35, 50, 60, 70], np.arange(75, 125, 2.5), np.arange(125, 150, 5.0), np.arange(150, 311, 40.0)]
+)

@@ -48,7 +48,8 @@ def taught(p: TrainAgent, learned: WindowTable) -> Taught:
     course: list[tuple[str, int, int, float]] = []
     with tqdm(total=len(q.updates) + p.ours.rounds, desc="train_agent: phases", mininterval=2) as bar:
         published = agent.train_published(
-            jax.random.fold_in(key, 0), setting=setting(q), rate=q.learning_rate, updates=tuple(q.updates), accuracy=q.accuracy,
+            jax.random.fold_in(key, 0), setting=setting(q), rate=q.learning_rate, updates=tuple(q.updates),
+            accuracy=q.accuracy,
             explore=q.explore, explore_again=q.explore_again, least=q.least, on_step=lambda *_: bar.update(),
         )  # fmt: skip
         for i, rewards in enumerate(published.rewards):
@@ -56,7 +57,8 @@ def taught(p: TrainAgent, learned: WindowTable) -> Taught:
         sees = belief(p.ours, learned)
         ours = belief_agent.train(
             jax.random.fold_in(key, 1), sees, learned, costs=belief_agent.Costs(**p.ours.costs.model_dump()),
-            troubles=belief_agent.Troubles(**p.ours.troubles.model_dump()), setting=setting(p.ours), rate=p.ours.learning_rate,
+            troubles=belief_agent.Troubles(**p.ours.troubles.model_dump()), setting=setting(p.ours),
+            rate=p.ours.learning_rate,
             updates=p.ours.updates,
             rounds=p.ours.rounds, explore=p.ours.explore, least=p.ours.least, on_step=lambda *_: bar.update(),
         )  # fmt: skip
@@ -69,12 +71,18 @@ def _course(name: str, phase: int, before: int, rewards) -> list[tuple[str, int,
     """Means of at most POINTS stretches of a phase."""
     values = np.atleast_2d(np.asarray(rewards, float).reshape(len(rewards), -1).T).mean(axis=0)
     ends = np.unique(np.linspace(0, len(values), POINTS + 1).round().astype(int))
-    return [(name, phase, int(before + b), float(values[a:b].mean())) for a, b in itertools.pairwise(ends) if b > a]
+    return [
+        (name, phase, int(before + b), float(values[a:b].mean()))
+        for a, b in itertools.pairwise(ends)
+        if b > a
+    ]
 
 
 def course_rows(taught: Taught) -> dict[str, list]:
     """Columns of schema AGENT_COURSE."""
-    return dict(zip(("agent", "phase", "update", "reward"), map(list, zip(*taught.course, strict=True)), strict=True))
+    return dict(
+        zip(("agent", "phase", "update", "reward"), map(list, zip(*taught.course, strict=True)), strict=True)
+    )
 
 
 def metrics(p: TrainAgent, done: Taught, judge: WindowTable) -> dict[str, Any]:
@@ -85,13 +93,20 @@ def metrics(p: TrainAgent, done: Taught, judge: WindowTable) -> dict[str, Any]:
     right, noisy = cases["accuracy 1"], cases["accuracy 0.7"]
     agents = done.agents
     paper, ours = agent.greedy(agent.paper_sight()), agent.greedy(belief_agent.belief_sight(agents.belief))
-    wanted = {f"phase{i + 1}": (paper, network, right if i < 3 else noisy) for i, network in enumerate(agents.paper) if i >= 2}
+    wanted = {
+        f"phase{i + 1}": (paper, network, right if i < 3 else noisy)
+        for i, network in enumerate(agents.paper)
+        if i >= 2
+    }
     wanted |= {
         "phase3_at_0.7": (paper, agents.paper[2], noisy),
         "ours": (ours, agents.ours, right),
         "ours_at_0.7": (ours, agents.ours, noisy),
     }
-    figures = {name: _figures(judging.evaluate(controller, network, *case, key)) for name, (controller, network, case) in wanted.items()}
+    figures = {
+        name: _figures(judging.evaluate(controller, network, *case, key))
+        for name, (controller, network, case) in wanted.items()
+    }
     return figures | {
         "parameters": {"paper": _size(agents.paper[0]), "ours": _size(agents.ours)}, "kept_round": done.kept,
         "validation": list(done.judged), "rounds": p.ours.rounds,
@@ -108,6 +123,7 @@ def _figures(score: Score) -> dict[str, Any]:
         for name, value in (("median_steps", score.median_steps), ("p90_steps", score.p90_steps))
     }
     return {
-        "runs": score.runs, "settled": score.settled.percent, "settled_low": score.settled.low, "stay": score.stay.percent,
+        "runs": score.runs, "settled": score.settled.percent, "settled_low": score.settled.low,
+        "stay": score.stay.percent,
         "overshoot_p95": score.overshoot_p95, **steps,
     }  # fmt: skip

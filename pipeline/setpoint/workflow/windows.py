@@ -10,7 +10,8 @@ from pipeline.setpoint.workflow.tables import FLOW_EDGES
 
 
 def edges(flows: Sequence[np.ndarray]) -> np.ndarray:
-    """FLOW_EDGES, of which those are left out that would leave a bin without a window in any of several sets of flows (w,)."""
+    """FLOW_EDGES, of which those are left out that would leave a bin
+    without a window in any of several sets of flows (w,)."""
     kept = [min(FLOW_EDGES[0], *(float(flow.min()) for flow in flows))]
     for edge in FLOW_EDGES[1:-1]:
         if all(((flow >= kept[-1]) & (flow < edge)).any() for flow in flows):

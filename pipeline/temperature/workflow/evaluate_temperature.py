@@ -1,5 +1,5 @@
-"""What evaluate_temperature does: every temperature controller judged on one panel of plants, starts, references and noise; and the study's
-learners on many noisy data sets, beside the paper's figures."""
+"""What evaluate_temperature does: every temperature controller judged on one panel of plants, starts,
+references and noise; and the study's learners on many noisy data sets, beside the paper's figures."""
 
 from typing import Any, NamedTuple
 
@@ -22,8 +22,8 @@ SAMPLES, STARTS = 15_000, 300
 
 
 class Learned(NamedTuple):
-    """What the stages before left: the identified plant, the window model, the kernel (None where the record did not determine it), the
-    tuned weights, the plant's spread."""
+    """What the stages before left: the identified plant, the window model, the kernel (None where the record
+    did not determine it), the tuned weights, the plant's spread."""
 
     model: plant.Plant
     window: window.Window
@@ -43,7 +43,8 @@ class Judged(NamedTuple):
 
 
 class Studied(NamedTuple):
-    """The learners on the study's machine: a row a noisy data set and route, and their figures beside the paper's."""
+    """The learners on the study's machine: a row a noisy data set and
+    route, and their figures beside the paper's."""
 
     rows: dict[str, list]
     figures: dict[str, Any]
@@ -53,54 +54,79 @@ def check(p: EvaluateTemperature, panel: Panel) -> None:
     """Raises ValueError where the noise of the report is none of the panel's."""
     if p.report_noise_degC not in panel.noise_degC:
         raise ValueError(
-            f"params.expert.yaml: evaluate_temperature.report_noise_degC is {p.report_noise_degC:g} but must be one of panel.noise_degC "
+            f"params.expert.yaml: evaluate_temperature.report_noise_degC is {p.report_noise_degC:g} but must "
+            "be one of panel.noise_degC "
             f"{panel.noise_degC}; "
             "change one of the two"
         )
 
 
-def read_learned(model_path: str, window_path: str, kernel_path: str, weights_path: str, spread_path: str) -> Learned:
+def read_learned(
+    model_path: str, window_path: str, kernel_path: str, weights_path: str, spread_path: str
+) -> Learned:
     """From the files that the stages before wrote."""
     return Learned(
         plant.restored(artifacts.read_arrays(model_path, "plant", 1))[0],
         window.restored(artifacts.read_arrays(window_path, "window", 1)),
-        kernel.restored(artifacts.read_arrays(kernel_path, "kernel", 1)) if artifacts.exists(kernel_path) else None,
+        kernel.restored(artifacts.read_arrays(kernel_path, "kernel", 1))
+        if artifacts.exists(kernel_path)
+        else None,
         {name: np.array(w) for name, w in artifacts.read_json(weights_path)["practical"].items()},
         plant.restored(artifacts.read_arrays(spread_path, "spread", 1)),
     )
 
 
-def judged(p: EvaluateTemperature, machine: Machine, tracking: Tracking, panel: Panel, known: Learned, *, simulated: bool) -> Judged:
-    """The controllers on the judging half of the panel: at the yardstick's weights unclipped, and at the tuned weights as deployed."""
+def judged(
+    p: EvaluateTemperature,
+    machine: Machine,
+    tracking: Tracking,
+    panel: Panel,
+    known: Learned,
+    *,
+    simulated: bool,
+) -> Judged:
+    """The controllers on the judging half of the panel: at the yardstick's weights
+    unclipped, and at the tuned weights as deployed."""
     inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
     limits = tuple(np.array([(i.low, i.high) for i in machine.inputs]).T)
-    yardstick = scorecard.Yardstick(np.full(len(outputs), tracking.yardstick_q), np.full(len(inputs), tracking.yardstick_r), tracking.gamma)
+    yardstick = scorecard.Yardstick(
+        np.full(len(outputs), tracking.yardstick_q),
+        np.full(len(inputs), tracking.yardstick_r),
+        tracking.gamma,
+    )
     truth = plant.baam()._replace(sample_time_s=machine.sample_time_s) if simulated else None
     plants = plant.spread(truth, input_gain=panel.input_gain, loss=panel.loss) if simulated else known.spread
     reference = np.array([o.reference for o in machine.outputs])
     scenarios = scorecard.panel(
-        plants, starts=panel.judging.starts_degC, references=[reference + offset for offset in panel.judging.reference_offsets_degC],
-        noise=panel.noise_degC, seeds=panel.judging.seeds, steps=panel.steps, hold=panel.hold_steps, cells=simulated,
+        plants, starts=panel.judging.starts_degC,
+        references=[reference + offset for offset in panel.judging.reference_offsets_degC],
+        noise=panel.noise_degC, seeds=panel.judging.seeds, steps=panel.steps, hold=panel.hold_steps,
+        cells=simulated,
     )  # fmt: skip
     q, r = known.weights["q"], known.weights["r"]
     compared = judging.controllers(
-        known.model, known.window, known.kernel, limits=limits, gamma=tracking.gamma, tau=float(known.weights["observer_tau"]),
+        known.model, known.window, known.kernel, limits=limits, gamma=tracking.gamma,
+        tau=float(known.weights["observer_tau"]),
         exact_tau=tracking.observer_tau, horizon=panel.steps, truth=truth,
     )  # fmt: skip
     refused = judging.refusals(compared, [(yardstick.q, yardstick.r), (q, r)])
     kept = [controller for controller in compared if controller.name not in refused]
     found = [
         judging.judge(
-            controller, scenarios, yardstick=yardstick, q=q, r=r, limits=limits, band=panel.band_degC, integral=tracking.integral,
+            controller, scenarios, yardstick=yardstick, q=q, r=r, limits=limits, band=panel.band_degC,
+            integral=tracking.integral,
             integral_limit=tracking.integral_limit_degC,
         )
         for controller in tqdm(kept, desc="evaluate_temperature: controllers", mininterval=2)
     ]  # fmt: skip
     summary = {
         "noise_degC": p.report_noise_degC, "scenarios": len(scenarios.r), "plants": len(plants),
-        "controllers": {one.name: judging.summary(one, scenarios, noise=p.report_noise_degC) for one in found},
+        "controllers": {one.name: judging.summary(one, scenarios,
+        noise=p.report_noise_degC) for one in found},
     }  # fmt: skip
-    shown = judging.trajectories(found, scenarios, inputs, outputs, noise=p.report_noise_degC, yardstick=yardstick)
+    shown = judging.trajectories(
+        found, scenarios, inputs, outputs, noise=p.report_noise_degC, yardstick=yardstick
+    )
     schema = tables.trajectories(machine.inputs, machine.outputs)
     return Judged(judging.rows(found, scenarios, outputs), (schema, shown), summary, refused)
 
@@ -111,8 +137,17 @@ def studied(p: EvaluateTemperature, execution: Execution, folder: str) -> Studie
     sets_u, sets_y = study.data_sets(np.random.default_rng(p.seed), SAMPLES, p.data_sets)
     work = [(noise, i) for noise in study.NOISE for i in range(p.data_sets)]
     calls = [delayed(study.under_noise)(sets_u[:, i], sets_y[:, i], noise=noise, seed=i) for noise, i in work]
-    found = list(tqdm(run_all(calls, execution), total=len(work), desc="evaluate_temperature: noisy data sets", mininterval=2))
+    found = list(
+        tqdm(
+            run_all(calls, execution),
+            total=len(work),
+            desc="evaluate_temperature: noisy data sets",
+            mininterval=2,
+        )
+    )
     noisy, noise_free = study.rows(work, found), study.noise_free(u[1:], y[1:], np.random.default_rng(p.seed))
     failures = published.algorithm_1_failures(STARTS)
-    figures = study.metrics(published.figures(K0, u, y), study.exact(), noise_free, noisy, failures=failures, starts=STARTS)
+    figures = study.metrics(
+        published.figures(K0, u, y), study.exact(), noise_free, noisy, failures=failures, starts=STARTS
+    )
     return Studied(noisy, figures)

@@ -19,7 +19,8 @@ class Planned(NamedTuple):
 
 
 class Probed(NamedTuple):
-    """The recording of the simulated machine, {name: (values (T,), unit, meaning)} at time_s (T,), and metrics."""
+    """The recording of the simulated machine, {name: (values (T,),
+    unit, meaning)} at time_s (T,), and metrics."""
 
     time_s: np.ndarray
     signals: dict[str, tuple[np.ndarray, str, str]]
@@ -27,7 +28,8 @@ class Probed(NamedTuple):
 
 
 def planned(p: GenerateProbing, machine: Plant) -> Planned:
-    """The probing signal about a centre that the user gives, or the middle of the limits, clipped to these."""
+    """The probing signal about a centre that the user gives, or the
+    middle of the limits, clipped to these."""
     low, high = _limits(machine)
     signal = _signal(p, machine, np.random.default_rng(p.seed))
     centre = np.full(len(low), p.centre_percent) if p.centre_percent is not None else (low + high) / 2
@@ -42,7 +44,9 @@ def probed(p: GenerateProbing, machine: Plant) -> Probed:
     signal = _signal(p, machine, rng)
     run = _simulated(p, machine, signal, rng)
     columns = zip([*machine.inputs, *machine.outputs], np.hstack([run.u, run.y]).T, strict=True)
-    signals = {s.name: (values, s.unit, f"{s.name} of the study's extruder, simulated") for s, values in columns}
+    signals = {
+        s.name: (values, s.unit, f"{s.name} of the study's extruder, simulated") for s, values in columns
+    }
     return Probed(_time_s(p, machine), signals, _metrics(p, excitation(run.u, 12), run.limited))
 
 
@@ -52,7 +56,10 @@ def _limits(machine: Plant) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _signal(p: GenerateProbing, machine: Plant, rng: np.random.Generator) -> np.ndarray:
-    shape = {"amplitude": p.amplitude_percent, **({"shortest": p.shortest_steps} if p.signal == "prbs" else {})}
+    shape = {
+        "amplitude": p.amplitude_percent,
+        **({"shortest": p.shortest_steps} if p.signal == "prbs" else {}),
+    }
     return {"multisine": multisine, "prbs": prbs}[p.signal](rng, p.samples, len(machine.inputs), **shape)
 
 
@@ -66,24 +73,37 @@ def _simulated(p: GenerateProbing, machine: Plant, signal: np.ndarray, rng: np.r
         raise ValueError(
             f"params.yaml: plant names {len(machine.inputs)} inputs and {len(machine.outputs)} outputs, "
             "but generate_probing.source: simulated is the "
-            f"study's extruder with {plant.m} and {plant.p}; set generate_probing.source: recordings for your machine, "
+            f"study's extruder with {plant.m} and {plant.p}; set generate_probing.source: "
+            "recordings for your machine, "
             "or restore the plant section"
         )
     target = feasible_target(plant, np.array([o.reference for o in machine.outputs]), low, high)
     centre = target.u if p.centre_percent is None else np.full(plant.m, p.centre_percent)
     feedback = p.feedback_percent_per_degC * np.eye(plant.m, plant.p)
     limits = {
-        "low": np.maximum(low, centre - p.amplitude_percent), "high": np.minimum(high, centre + p.amplitude_percent),
+        "low": np.maximum(low, centre - p.amplitude_percent),
+        "high": np.minimum(high, centre + p.amplitude_percent),
         "rate": p.rate_percent_per_step,
     }  # fmt: skip
     noise = p.noise_degC * rng.standard_normal((len(signal), plant.p))
-    return probe(plant, signal, x0=target.x, u_centre=centre, y_centre=target.y, feedback=feedback, noise=noise, **limits)
+    return probe(
+        plant,
+        signal,
+        x0=target.x,
+        u_centre=centre,
+        y_centre=target.y,
+        feedback=feedback,
+        noise=noise,
+        **limits,
+    )
 
 
 def _metrics(p: GenerateProbing, found: Excitation, limited: float) -> dict[str, Any]:
     return {
-        "source": p.source, "samples": p.samples, "excitation_order": found.order, "excitation_rank": found.rank,
+        "source": p.source, "samples": p.samples, "excitation_order": found.order,
+        "excitation_rank": found.rank,
         "excitation_full_rank": found.full,
-        "excitation_condition": found.condition if np.isfinite(found.condition) else None, "limited_share": limited,
+        "excitation_condition": found.condition if np.isfinite(found.condition) else None,
+        "limited_share": limited,
         "level_percent_per_band": found.level,
     }  # fmt: skip

@@ -1,8 +1,9 @@
-"""What ingest does: a folder of recordings -> one record; which files, which were done before, which are broken.
-How one is read, resampled and flagged is reading's.
+"""What ingest does: a folder of recordings -> one record; which files, which were done before, which are
+broken. How one is read, resampled and flagged is reading's.
 
-The memo is content-addressed: the hash of the recording, of the job's parameters and of the code that reads names the result, so that one
-more recording costs one. An entry counts once its digests are written and as long as its files have them; anything else is read again.
+The memo is content-addressed: the hash of the recording, of the job's parameters and of the code that reads
+names the result, so that one more recording costs one. An entry counts once its digests are written and as
+long as its files have them; anything else is read again.
 """
 
 from collections.abc import Sequence
@@ -35,8 +36,8 @@ READING = (
 
 
 class Job(NamedTuple):
-    """What to take from every recording: the machine's signals, mapping {signal: (source, unit, scale, offset)}
-    (empty: our own names), the clock, the gap limit."""
+    """What to take from every recording: the machine's signals, mapping {signal: (source, unit, scale,
+    offset)} (empty: our own names), the clock, the gap limit."""
 
     machine: Plant
     mapping: dict[str, tuple[str, str, float, float]]
@@ -56,7 +57,8 @@ class Job(NamedTuple):
             source, unit, scale, offset = self.mapping.get(signal.name, (signal.name, signal.unit, 1.0, 0.0))
             if unit != signal.unit:
                 raise ValueError(
-                    f"params.yaml: ingest.mapping.{signal.name}.unit is {unit} but the plant's {signal.name} is in {signal.unit}; "
+                    f"params.yaml: ingest.mapping.{signal.name}.unit is {unit} but the plant's {signal.name} "
+                    f"is in {signal.unit}; "
                     f"convert with scale and offset, and write unit: {signal.unit}"
                 )
             found.append(Source(signal.name, source, unit, scale, offset))
@@ -66,11 +68,17 @@ class Job(NamedTuple):
 def job_of(p: Ingest, machine: Plant, source: str) -> Job:
     """What section `ingest` asks for; what generate_probing wrote has our own names."""
     mapping = p.mapping if source == "recordings" else {}
-    return Job(machine, {name: (m.source, m.unit, m.scale, m.offset) for name, m in mapping.items()}, p.time, p.max_gap_s)
+    return Job(
+        machine,
+        {name: (m.source, m.unit, m.scale, m.offset) for name, m in mapping.items()},
+        p.time,
+        p.max_gap_s,
+    )
 
 
 class Result(NamedTuple):
-    """One recording's share of the record and of its findings; `reason` is why it was quarantined, empty where it was not."""
+    """One recording's share of the record and of its findings; `reason` is
+    why it was quarantined, empty where it was not."""
 
     name: str
     record: dict[str, np.ndarray]
@@ -104,11 +112,23 @@ def process(folder: Path, job: Job, execution: Execution, *, memo: Path) -> list
     code = "".join(artifacts.sha256(path) for pattern in READING for path in sorted(CODE.glob(pattern)))
     hashes = [artifacts.sha256(path) for path in files]
     names = [path.relative_to(folder).as_posix() for path in files]
-    keys = [joblib.hash((content, name, job.machine.model_dump(), job[1:], code)) for content, name in zip(hashes, names, strict=True)]
+    keys = [
+        joblib.hash((content, name, job.machine.model_dump(), job[1:], code))
+        for content, name in zip(hashes, names, strict=True)
+    ]
     twice = _twice(files, hashes)
-    remembered = [None if path in twice else _remembered(memo, key, job.machine) for path, key in zip(files, keys, strict=True)]
-    todo = [(path, key) for path, key, known in zip(files, keys, remembered, strict=True) if known is None and path not in twice]
-    reasons = twice | dict(zip([path for path, _ in todo], _run(todo, folder, job, execution, memo), strict=True))
+    remembered = [
+        None if path in twice else _remembered(memo, key, job.machine)
+        for path, key in zip(files, keys, strict=True)
+    ]
+    todo = [
+        (path, key)
+        for path, key, known in zip(files, keys, remembered, strict=True)
+        if known is None and path not in twice
+    ]
+    reasons = twice | dict(
+        zip([path for path, _ in todo], _run(todo, folder, job, execution, memo), strict=True)
+    )
     return [
         _result(name, known or _remembered(memo, key, job.machine), reasons.get(path, ""), known is not None)
         for path, name, key, known in zip(files, names, keys, remembered, strict=True)
@@ -126,9 +146,14 @@ def _twice(files: Sequence[Path], hashes: Sequence[str]) -> dict[Path, str]:
     }
 
 
-def _run(todo: Sequence[tuple[Path, str]], folder: Path, job: Job, execution: Execution, memo: Path) -> list[str]:
-    """The reasons of `_one`, in the order of `todo`; workers of a cluster see the same file system under absolute paths."""
-    calls = [joblib.delayed(_one)(path.resolve(), path, folder, key, job, memo.resolve()) for path, key in todo]
+def _run(
+    todo: Sequence[tuple[Path, str]], folder: Path, job: Job, execution: Execution, memo: Path
+) -> list[str]:
+    """The reasons of `_one`, in the order of `todo`; workers of a
+    cluster see the same file system under absolute paths."""
+    calls = [
+        joblib.delayed(_one)(path.resolve(), path, folder, key, job, memo.resolve()) for path, key in todo
+    ]
     return list(run_all(calls, execution, kept=": what was read is kept"))
 
 
@@ -143,7 +168,13 @@ def _one(path: Path, shown: Path, folder: Path, key: str, job: Job, memo: Path) 
     )
     try:
         raw = read(path, job.sources(), time=job.time)
-        table = resample(raw, sample_time_s=job.machine.sample_time_s, inputs=inputs, outputs=outputs, max_gap_s=job.max_gap_s)
+        table = resample(
+            raw,
+            sample_time_s=job.machine.sample_time_s,
+            inputs=inputs,
+            outputs=outputs,
+            max_gap_s=job.max_gap_s,
+        )
         table = flag(table, units=units, limits=limits)
         for found in table.flags:
             if found.kind == "mixed" and table.masked[found.signal].mean() > 0.5:
@@ -152,8 +183,13 @@ def _one(path: Path, shown: Path, folder: Path, key: str, job: Job, memo: Path) 
         # on a cluster the path is absolute; what is said is the same wherever the work is done
         return " ".join(str(reason).split()).replace(str(path), str(shown))
     findings = [(f.kind, f.signal, f.start_s, f.end_s, f.count, f.message) for f in table.flags]
-    findings += [(n.kind, n.signal, np.nan, np.nan, n.count, n.message.replace(str(path), str(shown))) for n in raw.notes]
-    kinds, signals, starts, ends, counts, messages = [list(column) for column in zip(*findings, strict=True)] if findings else [[]] * 6
+    findings += [
+        (n.kind, n.signal, np.nan, np.nan, n.count, n.message.replace(str(path), str(shown)))
+        for n in raw.notes
+    ]
+    kinds, signals, starts, ends, counts, messages = (
+        [list(column) for column in zip(*findings, strict=True)] if findings else [[]] * 6
+    )
     quality = {
         "recording": [name] * len(findings),
         "signal": signals,
@@ -163,7 +199,11 @@ def _one(path: Path, shown: Path, folder: Path, key: str, job: Job, memo: Path) 
         "count": counts,
         "message": messages,
     }
-    artifacts.write_table(memo / f"{key}.record.parquet", tables.record(job.machine.inputs, job.machine.outputs), _columns(name, table))
+    artifacts.write_table(
+        memo / f"{key}.record.parquet",
+        tables.record(job.machine.inputs, job.machine.outputs),
+        _columns(name, table),
+    )
     artifacts.write_table(memo / f"{key}.quality.parquet", tables.QUALITY, quality)
     artifacts.write_json(memo / f"{key}.json", _digests(memo, key))
     return ""
@@ -173,13 +213,17 @@ def _digests(memo: Path, key: str) -> dict[str, str]:
     return {part: artifacts.sha256(memo / f"{key}.{part}.parquet") for part in ("record", "quality")}
 
 
-def _remembered(memo: Path, key: str, machine: Plant) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]] | None:
+def _remembered(
+    memo: Path, key: str, machine: Plant
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]] | None:
     """Record and quality of an entry whose digests, written last, are those of its files;
     None where it is absent, half written or damaged."""
     try:
         if artifacts.read_json(memo / f"{key}.json") != _digests(memo, key):
             return None
-        record = artifacts.read_table(memo / f"{key}.record.parquet", tables.record(machine.inputs, machine.outputs))
+        record = artifacts.read_table(
+            memo / f"{key}.record.parquet", tables.record(machine.inputs, machine.outputs)
+        )
         return record, artifacts.read_table(memo / f"{key}.quality.parquet", tables.QUALITY)
     except (OSError, ValueError):
         return None
@@ -197,7 +241,8 @@ def _result(name: str, entry: tuple[dict, dict] | None, reason: str, reused: boo
         return Result(name, {}, {}, reason, False)
     if entry is None:
         raise ValueError(
-            f"{name} was read by a worker but its entry is not in datasets/memo/ingest; let the workers share this folder, "
+            f"{name} was read by a worker but its entry is not in datasets/memo/ingest; "
+            "let the workers share this folder, "
             "or set execution.backend: loky"
         )
     return Result(name, *entry, "", reused)
@@ -208,11 +253,20 @@ def collect(results: Sequence[Result], machine: Plant, *, strict: bool) -> tuple
     recording is left, or `strict` and one is broken."""
     broken = [result for result in results if result.reason]
     if broken and (strict or len(broken) == len(results)):
-        raise ValueError(broken[0].reason + (f" ({len(broken)} of {len(results)} recordings are broken)" if len(results) > 1 else ""))
+        raise ValueError(
+            broken[0].reason
+            + (f" ({len(broken)} of {len(results)} recordings are broken)" if len(results) > 1 else "")
+        )
     good = [result for result in results if not result.reason]
     schema = tables.record(machine.inputs, machine.outputs)
-    record = {column.name: np.concatenate([result.record[column.name] for result in good]) for column in schema.columns}
-    quality = {column.name: np.concatenate([result.quality[column.name] for result in good]) for column in tables.QUALITY.columns}
+    record = {
+        column.name: np.concatenate([result.record[column.name] for result in good])
+        for column in schema.columns
+    }
+    quality = {
+        column.name: np.concatenate([result.quality[column.name] for result in good])
+        for column in tables.QUALITY.columns
+    }
     for result in broken:
         row = {
             "recording": result.name,
@@ -223,7 +277,9 @@ def collect(results: Sequence[Result], machine: Plant, *, strict: bool) -> tuple
             "count": 1,
             "message": result.reason,
         }
-        quality = {name: np.append(values, np.array([row[name]], values.dtype)) for name, values in quality.items()}
+        quality = {
+            name: np.append(values, np.array([row[name]], values.dtype)) for name, values in quality.items()
+        }
     counts: dict[str, dict[str, int]] = {}
     for signal, kind, count in zip(quality["signal"], quality["kind"], quality["count"], strict=True):
         of = counts.setdefault(str(signal) or "recording", {})
@@ -231,10 +287,17 @@ def collect(results: Sequence[Result], machine: Plant, *, strict: bool) -> tuple
     metrics = {
         "recordings": len(results), "processed": sum(not r.reused and not r.reason for r in results),
         "reused": sum(r.reused for r in results),
-        "quarantined": len(broken), "samples": len(record["time_s"]), "segments": int(_segments(record)), "findings": counts,
+        "quarantined": len(broken), "samples": len(record["time_s"]), "segments": int(_segments(record)),
+        "findings": counts,
     }  # fmt: skip
     return Filled(schema, record), Filled(tables.QUALITY, quality), metrics
 
 
 def _segments(record: dict[str, np.ndarray]) -> int:
-    return 1 + ((record["recording"][1:] != record["recording"][:-1]) | (record["segment"][1:] != record["segment"][:-1])).sum()
+    return (
+        1
+        + (
+            (record["recording"][1:] != record["recording"][:-1])
+            | (record["segment"][1:] != record["segment"][:-1])
+        ).sum()
+    )

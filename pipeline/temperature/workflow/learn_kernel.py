@@ -24,30 +24,47 @@ class Learned(NamedTuple):
 def learned(p: LearnKernel, machine: Plant, tracking: Tracking, panel: Panel, path: str) -> Learned:
     """Window and kernel of the record in `path`. Raises ValueError where it has too little to learn from."""
     yardstick = Yardstick(
-        np.full(len(machine.outputs), tracking.yardstick_q), np.full(len(machine.inputs), tracking.yardstick_r), tracking.gamma
+        np.full(len(machine.outputs), tracking.yardstick_q),
+        np.full(len(machine.inputs), tracking.yardstick_r),
+        tracking.gamma,
     )
     u, y = read_record(path, machine.inputs, machine.outputs)
     with artifacts.about(path):
         identification.check_inputs(u, offset=p.offset, names=[i.name for i in machine.inputs])
         identification.check_outputs(y, names=[o.name for o in machine.outputs])
     scenario = {
-        "start": panel.training.starts_degC[0], "reference": np.array([o.reference for o in machine.outputs]), "steps": panel.steps,
+        "start": panel.training.starts_degC[0], "reference": np.array([o.reference for o in machine.outputs]),
+        "steps": panel.steps,
     }  # fmt: skip
     long = window.learn(u, y, longest=p.longest_window, offset=p.offset, gain_spread=p.gain_spread)
-    enough = sufficiency(u, y, long, yardstick, allowed=p.allowed_gap_percent / 100, offset=p.offset, gain_spread=p.gain_spread, **scenario)
-    tried = kernel_candidates(u, y, long, yardstick, largest=p.largest_kernel_window, offset=p.offset, **scenario)
+    enough = sufficiency(
+        u,
+        y,
+        long,
+        yardstick,
+        allowed=p.allowed_gap_percent / 100,
+        offset=p.offset,
+        gain_spread=p.gain_spread,
+        **scenario,
+    )
+    tried = kernel_candidates(
+        u, y, long, yardstick, largest=p.largest_kernel_window, offset=p.offset, **scenario
+    )
     best = min(tried, key=lambda candidate: candidate.gap)
     return Learned(long, best, _metrics(long, enough, tried, best))
 
 
-def _metrics(long: window.Window, enough: Sufficiency, tried: list[Candidate], best: Candidate) -> dict[str, Any]:
+def _metrics(
+    long: window.Window, enough: Sufficiency, tried: list[Candidate], best: Candidate
+) -> dict[str, Any]:
     kernel = best.learned
     return {
         "window": long.N, "samples": long.samples, "half_record_gap_percent": 100 * enough.half_gap,
         "samples_needed_for_noise": enough.needed,
         "state": best.state if kernel else None, "refused": None if kernel else best.refusal,
         "rank": kernel.rank if kernel else None, "identifiable": kernel.unknowns if kernel else None,
-        "samples_needed": kernel.samples_needed if kernel else None, "condition": kernel.condition if kernel else None,
+        "samples_needed": kernel.samples_needed if kernel else None,
+        "condition": kernel.condition if kernel else None,
         "candidates": {
             c.state: {"gap_on_window_model_percent": 100 * c.gap if np.isfinite(c.gap) else None,
             "refusal": c.refusal or None} for c in tried

@@ -16,7 +16,10 @@ def _signal_name(name: str) -> str:
     if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name):
         raise ValueError("but must consist of letters, digits and _ and not begin with a digit")
     if name in _TABLE_COLUMNS or name.endswith("_masked"):
-        raise ValueError(f"but that is taken by the table of the record ({', '.join(_TABLE_COLUMNS)}, ..._masked); rename the signal")
+        raise ValueError(
+            f"but that is taken by the table of the record ({', '.join(_TABLE_COLUMNS)}, "
+            "..._masked); rename the signal"
+        )
     return name
 
 
@@ -58,7 +61,9 @@ class Plant(Section):
         names = [signal.name for signal in [*self.inputs, *self.outputs]]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise ValueError(f"names {', '.join(twice)} more than once; give every input and output a name of its own")
+            raise ValueError(
+                f"names {', '.join(twice)} more than once; give every input and output a name of its own"
+            )
         return self
 
 
@@ -79,12 +84,15 @@ class Half(Section):
     from plant.outputs, and seeds of the sensor noise."""
 
     starts_degC: list[Annotated[float, Field(ge=-273.15, le=1000)]] = Field(min_length=1, max_length=20)
-    reference_offsets_degC: list[Annotated[float, Field(ge=-500, le=500)]] = Field(min_length=1, max_length=20)
+    reference_offsets_degC: list[Annotated[float, Field(ge=-500, le=500)]] = Field(
+        min_length=1, max_length=20
+    )
     seeds: list[Annotated[int, Field(ge=0, le=2**31)]] = Field(min_length=1, max_length=100)
 
 
 class Panel(Section):
-    """Section `panel`: the scenarios on which controllers are compared; nothing is tuned on the judging half."""
+    """Section `panel`: the scenarios on which controllers are
+    compared; nothing is tuned on the judging half."""
 
     noise_degC: list[Annotated[float, Field(ge=0, le=50)]] = Field(min_length=1, max_length=10)
     input_gain: float = Field(gt=0, lt=1)
@@ -99,7 +107,10 @@ class Panel(Section):
     def _halves_differ(self):
         same = sorted(set(self.training.seeds) & set(self.judging.seeds))
         if same:
-            raise ValueError(f"uses seed {same[0]} in the training and in the judging half; give each half seeds of its own")
+            raise ValueError(
+                f"uses seed {same[0]} in the training and in the judging half; "
+                "give each half seeds of its own"
+            )
         return self
 
 

@@ -15,7 +15,8 @@ class _Signal(Protocol):
 
 
 def record(inputs: Sequence[_Signal], outputs: Sequence[_Signal]) -> Schema:
-    """The table that ingest writes: one row a sample. A masked value stays as recorded; the flag beside it says not to use it."""
+    """The table that ingest writes: one row a sample. A masked value stays as
+    recorded; the flag beside it says not to use it."""
     columns = [
         Column("recording", TEXT, NONE, "file below datasets/raw that the sample is from"),
         Column("segment", INDEX, NONE, "stretch of that recording without a gap, counted from 0", low=0),
@@ -24,7 +25,14 @@ def record(inputs: Sequence[_Signal], outputs: Sequence[_Signal]) -> Schema:
     for role, signals in (("input", inputs), ("output", outputs)):
         for signal in signals:
             columns.append(Column(signal.name, FLOAT, signal.unit, f"{role} {signal.name}", nullable=True))
-            columns.append(Column(f"{signal.name}_masked", BOOL, NONE, f"{signal.name} is not to be used here: missing, or found faulty"))
+            columns.append(
+                Column(
+                    f"{signal.name}_masked",
+                    BOOL,
+                    NONE,
+                    f"{signal.name} is not to be used here: missing, or found faulty",
+                )
+            )
     return Schema("record", 1, tuple(columns))
 
 
@@ -33,7 +41,12 @@ QUALITY = Schema(
     1,
     (
         Column("recording", TEXT, NONE, "file below datasets/raw"),
-        Column("signal", TEXT, NONE, "signal that the finding is about; empty where it is about the whole recording"),
+        Column(
+            "signal",
+            TEXT,
+            NONE,
+            "signal that the finding is about; empty where it is about the whole recording",
+        ),
         Column("kind", TEXT, NONE, "what was found: gap, spike, frozen, saturated, ..."),
         Column("start_s", FLOAT, "s", "where it begins", nullable=True),
         Column("end_s", FLOAT, "s", "where it ends", nullable=True),
@@ -44,20 +57,40 @@ QUALITY = Schema(
 
 
 def trajectories(inputs: Sequence[_Signal], outputs: Sequence[_Signal]) -> Schema:
-    """One featured scenario of the panel under every controller, unclipped at the yardstick's weights and as deployed: true outputs, commands, applied inputs."""
+    """One featured scenario of the panel under every controller, unclipped at the yardstick's weights and as
+    deployed: true outputs, commands, applied inputs."""
     columns = [
         Column("controller", TEXT, NONE, "which controller"),
-        Column("mode", TEXT, NONE, "unclipped, or deployed: clipped to the limits, aimed at a feasible target"),
+        Column(
+            "mode", TEXT, NONE, "unclipped, or deployed: clipped to the limits, aimed at a feasible target"
+        ),
         Column("time_s", FLOAT, "s", "time since the controller took over"),
         Column("cost", FLOAT, NONE, "discounted cost so far, at the yardstick's weights", nullable=True),
     ]
     for name, share in (("low", "5th"), ("median", "50th"), ("high", "95th")):
-        meaning = f"worst zone's distance from its reference, {share} percentile of all runs on the nominal plant"
+        meaning = (
+            f"worst zone's distance from its reference, {share} percentile of all runs on the nominal plant"
+        )
         columns.append(Column(f"error_{name}_degC", FLOAT, "degC", meaning, low=0, nullable=True))
-    columns += [Column(signal.name, FLOAT, signal.unit, f"true output {signal.name}", nullable=True) for signal in outputs]
+    columns += [
+        Column(signal.name, FLOAT, signal.unit, f"true output {signal.name}", nullable=True)
+        for signal in outputs
+    ]
     for signal in inputs:
-        columns.append(Column(f"{signal.name}_command", FLOAT, signal.unit, f"{signal.name} as the controller asked", nullable=True))
-        columns.append(Column(f"{signal.name}_applied", FLOAT, signal.unit, f"{signal.name} as it was given", nullable=True))
+        columns.append(
+            Column(
+                f"{signal.name}_command",
+                FLOAT,
+                signal.unit,
+                f"{signal.name} as the controller asked",
+                nullable=True,
+            )
+        )
+        columns.append(
+            Column(
+                f"{signal.name}_applied", FLOAT, signal.unit, f"{signal.name} as it was given", nullable=True
+            )
+        )
     return Schema("trajectories", 2, tuple(columns))
 
 
@@ -77,7 +110,13 @@ SCORECARD = Schema(
         Column("effort_percent", FLOAT, "percent", "root mean square input as deployed", low=0),
         Column("settled_error_degC", FLOAT, "degC", "mean error over the last third, worst zone", low=0),
         Column("settled_zone", TEXT, NONE, "that zone"),
-        Column("settling_s", FLOAT, "s", "time until every zone stays within the band; missing where one never does", nullable=True),
+        Column(
+            "settling_s",
+            FLOAT,
+            "s",
+            "time until every zone stays within the band; missing where one never does",
+            nullable=True,
+        ),
         Column("overshoot_degC", FLOAT, "degC", "largest way past a reference", low=0),
         Column("at_limits_percent", FLOAT, "percent", "commands beyond the limits as deployed", 0, 100),
         Column("input_low_percent", FLOAT, "percent", "lowest input given"),
@@ -104,9 +143,23 @@ TUNING = Schema(
         Column("mode", TEXT, NONE, "parity: the paper's (37); practical: the declared engineering cost"),
         Column("evaluation", COUNT, NONE, "counted from 1", low=1),
         Column("cost", FLOAT, NONE, "cost of this candidate; missing where it failed", nullable=True),
-        Column("incumbent", FLOAT, NONE, "lowest cost so far; missing before the first success", nullable=True),
-        Column("tracking_degC", FLOAT, "degC", "r.m.s. tracking error of this candidate; missing where it failed", nullable=True),
-        Column("effort_percent", FLOAT, "percent", "r.m.s. effort of this candidate; missing where it failed", nullable=True),
+        Column(
+            "incumbent", FLOAT, NONE, "lowest cost so far; missing before the first success", nullable=True
+        ),
+        Column(
+            "tracking_degC",
+            FLOAT,
+            "degC",
+            "r.m.s. tracking error of this candidate; missing where it failed",
+            nullable=True,
+        ),
+        Column(
+            "effort_percent",
+            FLOAT,
+            "percent",
+            "r.m.s. effort of this candidate; missing where it failed",
+            nullable=True,
+        ),
         Column("chosen", BOOL, NONE, "whether the search recommends this candidate"),
         Column("failure", TEXT, NONE, "why the candidate failed; empty where it did not"),
     ),
@@ -120,19 +173,48 @@ ORDER = Schema(
         Column("singular_value", FLOAT, NONE, "that this order keeps last", low=0),
         Column("noise_edge", FLOAT, NONE, "what noise alone puts into the singular values", low=0),
         Column("parameters", COUNT, NONE, "free numbers of the candidate", low=0),
-        Column("error", FLOAT, NONE, "error on left-out blocks, as a share of the outputs' variation; missing where only the rank decided", nullable=True),
+        Column(
+            "error",
+            FLOAT,
+            NONE,
+            "error on left-out blocks, as a share of the outputs' variation; "
+            "missing where only the rank decided",
+            nullable=True,
+        ),
         Column("chosen", BOOL, NONE, "the candidate that was taken"),
     ),
 )
 
 
 def holdout(outputs: Sequence[_Signal]) -> Schema:
-    """The part of the record that judged the model: measured, simulated from its inputs alone, and predicted from outputs so many steps before."""
-    columns = [Column("segment", INDEX, NONE, "stretch of the record", low=0), Column("time_s", FLOAT, "s", "time since the hold-out began")]
+    """The part of the record that judged the model: measured, simulated from its inputs alone, and predicted
+    from outputs so many steps before."""
+    columns = [
+        Column("segment", INDEX, NONE, "stretch of the record", low=0),
+        Column("time_s", FLOAT, "s", "time since the hold-out began"),
+    ]
     for signal in outputs:
-        columns.append(Column(f"{signal.name}_measured", FLOAT, signal.unit, f"{signal.name} as recorded", nullable=True))
-        columns.append(Column(f"{signal.name}_simulated", FLOAT, signal.unit, f"{signal.name} by the model, from the inputs alone", nullable=True))
-        columns.append(Column(f"{signal.name}_ahead", FLOAT, signal.unit, f"{signal.name} by the model, identify_plant.ahead_steps before", nullable=True))
+        columns.append(
+            Column(f"{signal.name}_measured", FLOAT, signal.unit, f"{signal.name} as recorded", nullable=True)
+        )
+        columns.append(
+            Column(
+                f"{signal.name}_simulated",
+                FLOAT,
+                signal.unit,
+                f"{signal.name} by the model, from the inputs alone",
+                nullable=True,
+            )
+        )
+        columns.append(
+            Column(
+                f"{signal.name}_ahead",
+                FLOAT,
+                signal.unit,
+                f"{signal.name} by the model, identify_plant.ahead_steps before",
+                nullable=True,
+            )
+        )
     return Schema("holdout", 2, tuple(columns))
 
 
@@ -143,8 +225,16 @@ RESIDUALS = Schema(
         Column("output", TEXT, NONE, "output whose one-step errors on the hold-out these are"),
         Column("against", TEXT, NONE, "the same output, or the input that they are correlated with"),
         Column("lag", INDEX, NONE, "samples by which the error comes later"),
-        Column("correlation", FLOAT, NONE, "both about zero mean and of unit power; missing where one of them never moves", nullable=True),
-        Column("band", FLOAT, NONE, "what 99 % of such correlations stay under where nothing is left over", low=0),
+        Column(
+            "correlation",
+            FLOAT,
+            NONE,
+            "both about zero mean and of unit power; missing where one of them never moves",
+            nullable=True,
+        ),
+        Column(
+            "band", FLOAT, NONE, "what 99 % of such correlations stay under where nothing is left over", low=0
+        ),
         Column("passed", BOOL, NONE, "the test over all lags, at 99 %"),
     ),
 )
@@ -177,7 +267,11 @@ DYNAMICS = Schema(
                 ("time_constant_s", "s", "1.5 times the way from 28.3 to 63.2 % of the largest excursion", 0),
                 ("delay_s", "s", "what is left of the time to 63.2 % without one time constant", 0),
             )
-            for end, of in (("", ""), ("_low", ", lower end of its 90 % band"), ("_high", ", upper end of its 90 % band"))
+            for end, of in (
+                ("", ""),
+                ("_low", ", lower end of its 90 % band"),
+                ("_high", ", upper end of its 90 % band"),
+            )
         ),
     ),
 )
@@ -187,7 +281,14 @@ POLES = Schema(
     1,
     (
         Column("member", INDEX, NONE, "0 the model, from 1 the plants of the spread", low=0),
-        Column("pole", INDEX, NONE, "number of the model's pole that it belongs to, the largest 0; -1 for one that the model does not have", low=-1),
+        Column(
+            "pole",
+            INDEX,
+            NONE,
+            "number of the model's pole that it belongs to, the largest 0; "
+            "-1 for one that the model does not have",
+            low=-1,
+        ),
         Column("real", FLOAT, NONE, "real part"),
         Column("imag", FLOAT, NONE, "imaginary part"),
     ),
@@ -206,5 +307,3 @@ LEVELS = Schema(
 
 
 # ---- the deposition loop
-
-
