@@ -25,7 +25,7 @@ from pipeline.setpoint.recorded import recorded_windows
 from pipeline.setpoint.score import Score
 from pipeline.setpoint.simulator import paper_windows, rollout
 from pipeline.setpoint.workflow import train_agent
-from pipeline.setpoint.workflow.settings import Paper, TrainAgent
+from pipeline.setpoint.workflow.settings import Li2025, TrainAgent
 from pipeline.store import params
 from tests.setpoint.synthetic import synthetic_table
 
@@ -41,32 +41,31 @@ def figures(score: Score) -> dict[str, float]:
     }
 
 
-def one_seed(p: TrainAgent, runs: int, segment: float) -> dict[str, Any]:
+def one_seed(settings: TrainAgent, runs: int, segment_mean_decisions: float) -> dict[str, Any]:
     """Figures of the paper's agent after phases 3 and 4 and of ours in every case, ours from 30 %, 190 °C
     too, and the seconds and CPU seconds of training both."""
     learn, judge = (synthetic_table(np.random.default_rng(seed), segments=40, windows=10) for seed in (1, 99))
     wall, cpu = time.perf_counter(), time.process_time()
-    done = train_agent.taught(p, learn)
+    trained = train_agent.train_agents(settings, learn)
     row: dict[str, Any] = {
         "train_s": round(time.perf_counter() - wall, 1),
         "train_cpu_s": round(time.process_time() - cpu, 1),
-        "kept_round": done.kept,
+        "kept_round": trained.best_round,
     }
-    paper, ours = (
-        agent.greedy(agent.paper_sight()),
-        agent.greedy(belief_agent.belief_sight(done.agents.belief)),
-    )
-    before = belief_agent.BeliefNetwork(done.agents.belief.filter.evidence.shape[0], jax.random.key(0))
-    seats = {
-        "phases 1-3": (paper, done.agents.paper[2]),
-        "four phases": (paper, done.agents.paper[-1]),
-        "ours": (ours, done.agents.ours),
-        "ours before training": (ours, before),
+    agents = trained.agents
+    published = agent.greedy(agent.paper_encoder())
+    on_belief = agent.greedy(belief_agent.belief_encoder(agents.belief))
+    before = belief_agent.BeliefNetwork(agents.belief.filter.evidence.shape[0], jax.random.key(0))
+    controllers = {
+        "phases 1-3": (published, agents.li_2025[2]),
+        "four phases": (published, agents.li_2025[-1]),
+        "ours": (on_belief, agents.belief_dqn),
+        "ours before training": (on_belief, before),
     }
-    cases = judging.cases(recorded_windows(judge), runs=runs, segment=segment)
-    for name, (controller, network) in seats.items():
+    cases = judging.cases(recorded_windows(judge), runs=runs, segment_mean_decisions=segment_mean_decisions)
+    for name, (controller, network) in controllers.items():
         row[name] = {
-            case: figures(judging.evaluate(controller, network, *of, jax.random.key(1000 + p.seed)))
+            case: figures(judging.evaluate(controller, network, *of, jax.random.key(1000 + settings.seed)))
             for case, of in cases.items()
         }
     windows, conditions = cases["accuracy 0.7"]
@@ -74,44 +73,45 @@ def one_seed(p: TrainAgent, runs: int, segment: float) -> dict[str, Any]:
         lambda leaf: leaf[(conditions.flow == 30.0) & (conditions.temperature == 190.0)], conditions
     )
     row["ours from 30 %, 190 °C"] = figures(
-        judging.evaluate(ours, done.agents.ours, windows, coldest, jax.random.key(2000 + p.seed))
+        judging.evaluate(on_belief, agents.belief_dqn, windows, coldest, jax.random.key(2000 + settings.seed))
     )
     return row
 
 
-def speeds(p: Paper) -> dict[str, Any]:
+def speeds(settings: Li2025) -> dict[str, Any]:
     """Updates of the whole loop, rollout steps with 1,024 environments, and milliseconds of one action;
     compiling is not counted. Beside them the matrix products that an update cannot do without, alone: on a
     machine that others use too, the ratio is what can be compared."""
-    network, optimiser, sight = agent.QNetwork(jax.random.key(0)), optax.adam(1e-4), agent.paper_sight()
+    network, optimiser = agent.QNetwork(jax.random.key(0)), optax.adam(1e-4)
+    encoder = agent.paper_encoder()
     a, b = (jnp.asarray(x) for x in (40.0, 20.0))
-    world = agent.World(
+    env = agent.EnvSpec(
         paper_windows(),
         jax.tree_util.Partial(agent.anywhere, jnp.asarray(1.0)),
         jax.tree_util.Partial(agent.ellipse, a, b),
     )
-    learner, controller = agent.Learner(network, network, optimiser.init(network)), agent.greedy(sight)
+    train_state = agent.TrainState(network, network, optimiser.init(network))
+    controller = agent.greedy(encoder)
+    problem = agent.DqnProblem(encoder, env, optimiser, agent.dqn_target, train_agent.dqn_settings(settings))
     conditions = jax.tree.map(lambda leaf: leaf[:1024], judging.starts(49, accuracy=1.0))
-    keywords = {
-        "sight": sight,
-        "world": world,
-        "optimiser": optimiser,
-        "bootstrap": agent.greatest,
-        "setting": train_agent.setting(p),
-    }
-    act = jax.jit(lambda memory, seen: controller.act(network, memory, seen, None))
-    seen = agent.begin(paper_windows(), jax.tree.map(lambda leaf: leaf[0], conditions), jax.random.key(0))[1]
-    products, flop = update_products(p.batch)
+    act = jax.jit(lambda memory, observation: controller.act(network, memory, observation, None))
+    observation = agent.begin(
+        paper_windows(), jax.tree.map(lambda leaf: leaf[0], conditions), jax.random.key(0)
+    )[1]
+    products, flop = update_products(settings.batch)
 
     def acting():
-        memory = sight.start()
+        memory = encoder.start()
         for _ in range(UPDATES):
-            memory, action = act(memory, seen)
+            memory, action = act(memory, observation)
         return action
 
+    def updating():
+        key, epsilon = jax.random.key(0), (1.0, 0.05)
+        return agent.phase(train_state, key, problem, updates=UPDATES, longest=UPDATES, epsilon=epsilon)
+
     work = {
-        "update": (lambda: agent.phase(learner, jax.random.key(0), updates=UPDATES, longest=UPDATES,
-        epsilon=(1.0, 0.05), **keywords), UPDATES),
+        "update": (updating, UPDATES),
         "products": (products, UPDATES),
         "rollout_step": (lambda: rollout(controller, network, paper_windows(), conditions, jax.random.key(0),
         steps=200).flow, 1024 * 200),
@@ -121,7 +121,7 @@ def speeds(p: Paper) -> dict[str, Any]:
     wall, cpu = ({name: both[i] for name, both in taken.items()} for i in (0, 1))
     return {
         "updates_per_s": 1 / wall["update"], "updates_per_cpu_s": 1 / cpu["update"],
-        "environment_steps_per_s": p.environments / wall["update"],
+        "environment_steps_per_s": settings.environments / wall["update"],
         "update_gflop": flop / 1e9, "products_alone_per_s": 1 / wall["products"],
         "products_alone_per_cpu_s": 1 / cpu["products"],
         "update_by_products_wall": wall["update"] / wall["products"],
@@ -174,29 +174,31 @@ def peer(python: str | None, ours: dict[str, Any]) -> dict[str, Any]:
             "skipped": "no python of an environment with stable-baselines3 and a CPU build of torch was named"
         }
     done = subprocess.run([python, str(PEER), str(UPDATES)], capture_output=True, text=True, check=True)
-    found = {
+    rates = {
         name: [float(x) for x in np.median(values, axis=0)]
         for name, values in json.loads(done.stdout.splitlines()[-1]).items()
     }
-    found = {
+    rates = {
         f"{name}_per_{unit}": value
-        for name, pair in found.items()
+        for name, pair in rates.items()
         for unit, value in zip(("s", "cpu_s"), pair, strict=True)
     }
-    return found | {
-        f"ratio_{name}_{unit}": ours[f"updates_per_{unit}"] / found[f"{name}_per_{unit}"] for name in ("whole_loop", "updates_alone") for unit in ("s", "cpu_s")
-    }  # fmt: skip
+    return rates | {
+        f"ratio_{name}_{unit}": ours[f"updates_per_{unit}"] / rates[f"{name}_per_{unit}"]
+        for name in ("whole_loop", "updates_alone")
+        for unit in ("s", "cpu_s")
+    }
 
 
 if __name__ == "__main__":
     seeds, runs, python = [*sys.argv[1:], *["5", "100", None][len(sys.argv) - 1 :]]
-    p = params.load(TrainAgent, "train_agent")
-    found: dict[str, Any] = {"speed": speeds(p.paper)}
-    print(json.dumps(found, indent=2), flush=True)
-    found["peer"] = peer(python, found["speed"])
-    print(json.dumps(found["peer"], indent=2), flush=True)
-    RESULTS.write_text(json.dumps(found, indent=2, ensure_ascii=False) + "\n")
+    settings = params.load(TrainAgent, "train_agent")
+    results: dict[str, Any] = {"speed": speeds(settings.li_2025)}
+    print(json.dumps(results, indent=2), flush=True)
+    results["peer"] = peer(python, results["speed"])
+    print(json.dumps(results["peer"], indent=2), flush=True)
+    RESULTS.write_text(json.dumps(results, indent=2, ensure_ascii=False) + "\n")
     for seed in range(int(seeds)):
-        found[f"seed {seed}"] = one_seed(p.model_copy(update={"seed": seed}), int(runs), 10.0)
-        print(seed, json.dumps(found[f"seed {seed}"], indent=2, ensure_ascii=False), flush=True)
-        RESULTS.write_text(json.dumps(found, indent=2, ensure_ascii=False) + "\n")
+        results[f"seed {seed}"] = one_seed(settings.model_copy(update={"seed": seed}), int(runs), 10.0)
+        print(seed, json.dumps(results[f"seed {seed}"], indent=2, ensure_ascii=False), flush=True)
+        RESULTS.write_text(json.dumps(results, indent=2, ensure_ascii=False) + "\n")

@@ -39,7 +39,7 @@ class Printer(VecEnv):
         )
         self.target[over], self.history[over] = self.heat[over], 1 / 3
 
-    def seen(self):
+    def observe(self):
         named = (self.flow >= 90).astype(int) + (self.flow > 110)
         distance = np.abs(np.arange(3) - named[:, None])
         p = np.where(
@@ -55,7 +55,7 @@ class Printer(VecEnv):
 
     def reset(self):
         self.restart(np.ones(EPISODES, bool))
-        return self.seen()
+        return self.observe()
 
     def step_async(self, actions):
         self.actions = actions
@@ -74,12 +74,12 @@ class Printer(VecEnv):
             (2 / (1 + np.sqrt((q / 40) ** 2 + (u / 20) ** 2)) - 1).astype(np.float32),
             self.step_count >= LENGTH,
         )
-        x, infos = self.seen(), [{} for _ in range(EPISODES)]
+        x, infos = self.observe(), [{} for _ in range(EPISODES)]
         if over.any():
             for i in np.flatnonzero(over):
                 infos[i] = {"terminal_observation": x[i], "TimeLimit.truncated": True}
             self.restart(over)
-            x = self.seen()
+            x = self.observe()
         return x, rewards, over, infos
 
     def close(self):

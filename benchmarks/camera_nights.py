@@ -19,6 +19,7 @@ from pipeline.deposition import rendering
 from pipeline.deposition.workflow import trial_files
 from pipeline.nightly import pictures
 from pipeline.nightly.settings import Drift
+from pipeline.report.shared.night import LoopDrift
 from pipeline.store import artifacts
 from tests.nightly.toy_nights import SETTINGS
 
@@ -31,14 +32,11 @@ def filmed(path: Path, seed: int, **changes) -> None:
         (k / 30, camera.frame(float(rng.uniform(100, 116)), stage_px=int(rng.integers(10_000))))
         for k in range(45)
     )
-    signals = {
-        "position_mm": 8 * time_s,
-        "speed_mm_per_s": np.full(76, 8.0),
-        "command_mm": np.ones(76),
-        "flow_mm3_per_s": np.ones(76),
-    }
-    said = trial_files.Conditions("A", "0.8 mm", 0, "ours", 8.0, 0.6, 0.304, 125.0, 0.0, 90.0, -0.008, 30.0)
-    trial_files.write_trial(path, said, frames, encoding="jpeg", time_s=time_s, **signals)
+    signals = trial_files.Signals(time_s, 8 * time_s, np.full(76, 8.0), np.ones(76), np.ones(76))
+    conditions = trial_files.Conditions(
+        "A", "0.8 mm", 0, "model_inverse", 8.0, 0.6, 0.304, 125.0, 0.0, 90.0, -0.008, 30.0
+    )
+    trial_files.write_trial(path, conditions, frames, signals, encoding="jpeg")
 
 
 def camera(seed: int, count: int, folder: Path) -> dict:
@@ -47,20 +45,20 @@ def camera(seed: int, count: int, folder: Path) -> dict:
     limits, nominal = Drift(**SETTINGS["drift"]), rendering.NOMINAL
     for k in range(6):
         filmed(folder / f"champion/trial_{k}.mcap", 1000 * seed + k)
-    kept = {"camera": pictures.of_trials(folder / "champion", 6)}
+    reference = {"camera": pictures.of_trials(folder / "champion", 6)}
 
-    def look(name: str, pending: set[str], **changes) -> dict:
-        found = {"alarms": [], "watched": [], "notes": [], "quarantined": {}}
+    def look(name: str, pending: set[str], **changes) -> LoopDrift:
+        drift = LoopDrift.none("deposition")
         path = folder / "new.mcap"
         filmed(path, 1000 * seed + zlib.crc32(name.encode()) % 10**6, **changes)
-        pictures.trials_of(limits, "deposition", str(folder), [str(path)], kept, pending, found)
-        return found
+        pictures.trials_of(limits, [str(path)], reference, pending, drift)
+        return drift
 
     false, pending = [], set()
     for k in range(count):
-        found = look(f"night {k}", pending)
-        pending = {one["key"] for one in found["watched"] + found["alarms"]}
-        false += [one["cause"] for one in found["alarms"]]
+        drift = look(f"night {k}", pending)
+        pending = {alarm.key for alarm in drift.watched + drift.alarms}
+        false += [alarm.cause for alarm in drift.alarms]
     result = {"nights": count, "false_alarms": len(false), "alarms": false}
     for name, changes in {
         "camera 4 px lower": {"offset_px": nominal.offset_px + 4},
@@ -71,14 +69,14 @@ def camera(seed: int, count: int, folder: Path) -> dict:
         "specular": 1.25 * nominal.specular},
         "out of focus": {"blur_px": 4.0},
     }.items():  # fmt: skip
-        nights, found, pending = 0, {"alarms": []}, set()
-        while nights < 2 and not found["alarms"]:
+        nights, drift, pending = 0, LoopDrift.none("deposition"), set()
+        while nights < 2 and not drift.alarms:
             nights += 1
-            found = look(f"{name} {nights}", pending, **changes)
-            pending = {one["key"] for one in found["watched"]}
+            drift = look(f"{name} {nights}", pending, **changes)
+            pending = {alarm.key for alarm in drift.watched}
         result[name] = {
-            "nights": nights if found["alarms"] else None,
-            "causes": [one["cause"] for one in found["alarms"]],
+            "nights": nights if drift.alarms else None,
+            "causes": [alarm.cause for alarm in drift.alarms],
         }
         print(f"  {name}: {result[name]}", flush=True)
     return result
@@ -91,10 +89,10 @@ def main() -> None:
     a = parser.parse_args()
     cv2.setNumThreads(1)
     with tempfile.TemporaryDirectory(prefix="nights-") as folder:
-        found = camera(a.seed, a.nights, Path(folder))
-    known = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    artifacts.write_json(RESULTS, known | {f"camera_seed_{a.seed}": found})
-    print(json.dumps(found, indent=1, ensure_ascii=False))
+        figures = camera(a.seed, a.nights, Path(folder))
+    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    artifacts.write_json(RESULTS, results | {f"camera_seed_{a.seed}": figures})
+    print(json.dumps(figures, indent=1, ensure_ascii=False))
 
 
 if __name__ == "__main__":

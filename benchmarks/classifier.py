@@ -19,8 +19,18 @@ import cv2
 import jax
 import numpy as np
 
-from pipeline.setpoint import calibration, eyes, nozzle_scene, yardsticks
-from pipeline.setpoint.classifier import Labelled, Rates, _step, adr, along_bead, predict, train, untrained
+from pipeline.setpoint import calibrated_classifier, calibration, nozzle_scene, yardsticks
+from pipeline.setpoint.classifier import (
+    Labelled,
+    Rates,
+    TrainingSettings,
+    _step,
+    adr,
+    along_bead,
+    predict,
+    train,
+    untrained,
+)
 from pipeline.setpoint.vision_transformer import PAPER, SMALL, Classifier, convolutional, vision_transformer
 
 RESULTS = Path(__file__).parent / "results" / "classifier.json"
@@ -31,11 +41,16 @@ PARTS = {
     "test": (20, 20),
 }  # segments for each of 15 combinations, frames
 LEAST_SCORE, WINDOW, BINS = 10.0, 20, 10
-TRAINING = {
-    "cycle_epochs": 12, "warmup_epochs": 2, "batch": 64, "learning_rate": 1e-3, "weight_decay": 0.01,
-    "smoothing": 0.0, "averaging": 0.99, "patience": 6,
-    "augment": along_bead,
-}  # fmt: skip
+TRAINING = TrainingSettings(
+    cycle_epochs=12,
+    warmup_epochs=2,
+    batch=64,
+    learning_rate=1e-3,
+    weight_decay=0.01,
+    smoothing=0.0,
+    averaging=0.99,
+    patience=6,
+)
 EPOCHS = 12
 SETS = {"coverage": 0.95, "confidence": 0.8, "false_alarms": 0.03}
 BARS = {
@@ -56,17 +71,16 @@ def parts(seed: int) -> dict[str, tuple[Labelled, np.ndarray]]:
     return out
 
 
-def trained(network: Classifier, data: dict, seed: int, **settings) -> Classifier:
+def trained(network: Classifier, data: dict, seed: int, *, augment=along_bead) -> Classifier:
     learned, stopping = (
         data[name][0].take(np.flatnonzero(data[name][1])) for name in ("learned", "stopping")
     )
-    return train(
-        untrained(network, epochs=EPOCHS), learned, stopping, key=jax.random.key(seed), **TRAINING | settings
-    ).best
+    start, key = untrained(network, epochs=EPOCHS), jax.random.key(seed)
+    return train(start, learned, stopping, TRAINING, key=key, augment=augment).best
 
 
 def foreign(
-    network: Classifier, fitted: calibration.Calibration, test: calibration.Seen, data: Labelled
+    network: Classifier, fitted: calibration.Calibration, test: calibration.ClassifierOutputs, data: Labelled
 ) -> dict:
     """AUROC of blur and transposed crops by the distance, and by its yardsticks; with the share of foreign
     images that the threshold finds."""
@@ -74,7 +88,7 @@ def foreign(
     familiar = calibration.mahalanobis(fitted.familiar, test.features[v])
     confidence = np.exp(calibration.log_probabilities(test.logits[v], fitted.temperature)).max(axis=1)
     out = {}
-    for name, area in eyes.foreign(data.key_area[v]).items():
+    for name, area in calibrated_classifier.foreign_images(data.key_area[v]).items():
         shown = predict(network, area, data.temperature_degC[v])
         score = calibration.mahalanobis(
             fitted.familiar, np.hstack([shown.features, calibration.appearance(area)])
@@ -102,7 +116,9 @@ class Judgement(NamedTuple):
     false_alarms: float
 
 
-def judge(fitted: calibration.Calibration, test: calibration.Seen, *, length: int, bins: int) -> Judgement:
+def judge(
+    fitted: calibration.Calibration, test: calibration.ClassifierOutputs, *, length: int, bins: int
+) -> Judgement:
     """How a calibrated classifier does on segments that neither learning nor calibration saw."""
     v, log_p = test.valid, calibration.log_probabilities(test.logits, fitted.temperature)
     rows = calibration.windows(test.segment, test.label, length=length).rows
@@ -125,20 +141,21 @@ def judge(fitted: calibration.Calibration, test: calibration.Seen, *, length: in
 def judged(network: Classifier, data: dict) -> dict:
     """Every figure of a trained network; `head_...` are those of the
     distance in the head's features alone."""
-    looks = {
-        name: calibration.seen(predict(network, d.key_area, d.temperature_degC), d, v)
+    outputs = {
+        name: calibration.classifier_outputs(predict(network, d.key_area, d.temperature_degC), d, v)
         for name, (d, v) in data.items()
     }
-    fitted = calibration.calibrate(looks["learned"], looks["unseen"], length=WINDOW, **SETS)
-    found = judge(fitted, looks["test"], length=WINDOW, bins=BINS)
+    fitted = calibration.calibrate(outputs["learned"], outputs["unseen"], length=WINDOW, **SETS)
+    judgement = judge(fitted, outputs["test"], length=WINDOW, bins=BINS)
     return {
-        "image_accuracy": found.image_accuracy, "window_accuracy": found.window_accuracy,
+        "image_accuracy": judgement.image_accuracy, "window_accuracy": judgement.window_accuracy,
         "temperature": fitted.temperature, "divisor": 1 + (WINDOW - 1) * fitted.correlation,
-        "ece_image": found.image.error, "ece_image_floor": found.image.floor,
-        "ece_window": found.window.error, "ece_window_floor": found.window.floor,
-        "ece_window_hard": found.hard_window.error, "coverage_error": found.sets.coverage - SETS["coverage"],
-        "held": found.sets.held, "false_alarms": found.false_alarms,
-    } | foreign(network, fitted, looks["test"], data["test"][0])  # fmt: skip
+        "ece_image": judgement.image.error, "ece_image_floor": judgement.image.floor,
+        "ece_window": judgement.window.error, "ece_window_floor": judgement.window.floor,
+        "ece_window_hard": judgement.hard_window.error,
+        "coverage_error": judgement.sets.coverage - SETS["coverage"],
+        "held": judgement.sets.held, "false_alarms": judgement.false_alarms,
+    } | foreign(network, fitted, outputs["test"], data["test"][0])  # fmt: skip
 
 
 def yardstick(data: dict) -> dict:
@@ -171,10 +188,10 @@ def row(seed: int, others: bool) -> dict:
             "small_published_crop": (vision_transformer(SMALL, np.random.default_rng(seed)), adr),
         }
         for name, (network, augment) in forms.items():
-            found = judged(trained(network, data, seed, augment=augment), data)
+            figures = judged(trained(network, data, seed, augment=augment), data)
             out |= {
-                f"{name}_image_accuracy": found["image_accuracy"],
-                f"{name}_window_accuracy": found["window_accuracy"],
+                f"{name}_image_accuracy": figures["image_accuracy"],
+                f"{name}_window_accuracy": figures["window_accuracy"],
             }
     return out
 
@@ -207,7 +224,7 @@ def speed(batch: int = 64, repeats: int = 4) -> dict:
         jax.numpy.arange(batch) % 3,
     ]
     carry, drawn = untrained(network, epochs=1), (jax.random.key(0), jax.numpy.arange(batch))
-    carry = (carry.network, carry.average, carry.moments)
+    carry = (carry.network, carry.average, carry.opt_state)
 
     def timed(f) -> tuple[float, float]:
         jax.block_until_ready(f())
@@ -218,7 +235,7 @@ def speed(batch: int = 64, repeats: int = 4) -> dict:
 
     step = timed(lambda: _step(along_bead, carry, drawn, rows, Rates(1e-4, 1, 100, 0.0, 0.0, 0.0)))
     forward = jax.jit(lambda x, u: network(x, u))
-    look = timed(lambda: forward(rows[0], rows[1]))
+    forward_pass = timed(lambda: forward(rows[0], rows[1]))
     x, W = (
         jax.numpy.asarray(rng.normal(size=shape), jax.numpy.float32)
         for shape in ((batch * 49, PAPER.width), (PAPER.width, PAPER.feed_forward))
@@ -232,14 +249,14 @@ def speed(batch: int = 64, repeats: int = 4) -> dict:
         "forward_gflop": flop / 1e9,
         "step_by_products_wall": step[0] / (3 * flop * products[0]),
         "step_by_products_cpu": step[1] / (3 * flop * products[1]),
-        "forward_by_products_wall": look[0] / (flop * products[0]),
-        "forward_by_products_cpu": look[1] / (flop * products[1]),
+        "forward_by_products_wall": forward_pass[0] / (flop * products[0]),
+        "forward_by_products_cpu": forward_pass[1] / (flop * products[1]),
         "products_gflop_per_s_wall": 1e-9 / products[0],
         "products_gflop_per_cpu_s": 1e-9 / products[1],
         "images_per_s_wall": 1 / step[0],
         "images_per_cpu_s": 1 / step[1],
-        "ms_per_image_wall": 1e3 * look[0],
-        "cpu_ms_per_image": 1e3 * look[1],
+        "ms_per_image_wall": 1e3 * forward_pass[0],
+        "cpu_ms_per_image": 1e3 * forward_pass[1],
     }
 
 
@@ -258,10 +275,10 @@ def main(seeds: int, others: bool) -> None:
         rows.append(row(seed, others=others))
         print(json.dumps({k: round(v, 4) for k, v in rows[-1].items()}), flush=True)
         RESULTS.write_text(json.dumps({"seeds": rows, "worst": worst(rows)}, indent=1) + "\n")
-    for name, found in worst(rows).items():
+    for name, figure in worst(rows).items():
         print(
-            f"{name:20s} worst {found['worst']:8.4f}   bar {BARS[name][0]} {found['bar']}   "
-            f"{'met' if found['met'] else 'MISSED'}"
+            f"{name:20s} worst {figure['worst']:8.4f}   bar {BARS[name][0]} {figure['bar']}   "
+            f"{'met' if figure['met'] else 'MISSED'}"
         )
 
 

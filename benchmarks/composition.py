@@ -3,9 +3,9 @@ made from measured, noisy trials of the training routine.
 
 `./run python -m benchmarks.composition` prints the tables with their bars and writes
 benchmarks/results/composition.json; `... composition 4 1` takes 4 plants a material and one seed. Training:
-two speeds, two pauses, 20 updates by our law. Errors are r.m.s. in % of on-off control r / K_nominal on the
-same structure, over plants and seeds as median and worst. The yardstick is learning the whole structure with
-the same law and as many trials. Times are CPU seconds.
+two speeds, two pauses, 20 updates by the model inverse. Errors are r.m.s. in % of on-off control r /
+K_nominal on the same structure, over plants and seeds as median and worst. The yardstick is full-part ILC:
+learning on the part itself with the same law and as many trials. Times are CPU seconds.
 """
 
 import json
@@ -17,7 +17,15 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.deposition import basis, gcode, ilc
-from pipeline.deposition.composition import Composed, Learned, compose, learn, priority, superposition
+from pipeline.deposition.composition import (
+    Composed,
+    Learned,
+    PartSettings,
+    compose,
+    learn,
+    priority,
+    superposition,
+)
 from pipeline.deposition.conformance import conform, line_volumes, saturation
 from pipeline.deposition.extruder import Extruder, disturb, draw, flow, routine
 from pipeline.deposition.library import CORNER, NO_FLOW, START, STEADY, STOP, Training
@@ -30,7 +38,7 @@ TS, AREA, NOZZLE, RAMP = 0.02, 0.304, 0.6, 0.15
 MATERIALS = {"A": Extruder(1.08, 2.7), "B": Extruder(0.89, 4.5)}
 SPEEDS, PAUSES, UPDATES = (8.0, 5.0), (0.6, 0.3), 20
 NOISE = {"white": 0.03, "drift": 0.01, "gain": 0.01}
-LAW = {"identify_trials": 3, "floor": 0.1, "order": 4, "cutoff_hz": 5.0}
+INVERSE = ilc.InverseSettings(identify_trials=3, floor=0.1, order=4, cutoff_hz=5.0)
 MACHINE = {
     "acceleration": 1000.0,
     "junction_deviation_mm": 0.05,
@@ -38,13 +46,7 @@ MACHINE = {
     "unset_feed": 8.0,
     "tool_change_s": 2.0,
 }
-PART = {
-    "nozzle_mm": NOZZLE,
-    "bead_area_mm2": AREA,
-    "ramp_s": RAMP,
-    "corner_deg": 30.0,
-    "longest_pause_s": 1.0,
-}
+PART = PartSettings(NOZZLE, AREA, RAMP, corner_deg=30.0, longest_pause_s=1.0, limit=np.inf)
 BARS = {
     "tic_tac_toe": (3.0, 5.0),
     "dashes": (6.0, 6.0),
@@ -91,7 +93,7 @@ def forbidden(tasks: Sequence[str], tools: Sequence[int]) -> np.ndarray:
 def learned_trials(
     plant: Extruder, nominal: Extruder, r: np.ndarray, rng: np.random.Generator, *, limit: float = np.inf
 ) -> list[ilc.Trial]:
-    law = ilc.InverseLaw(r, limit=limit, sample_time_s=TS, **LAW)
+    law = ilc.InverseLaw(r, INVERSE, limit=limit, sample_time_s=TS)
 
     def measure(u):
         y = flow(plant, u, sample_time_s=TS, limit=limit)
@@ -104,7 +106,7 @@ def train(plant: Extruder, name: str, rng: np.random.Generator) -> list[Training
     out = []
     for speed in SPEEDS:
         for pause in PAUSES:
-            lesson = routine(
+            task = routine(
                 off_s=4,
                 on_s=14,
                 pause_s=pause,
@@ -114,11 +116,9 @@ def train(plant: Extruder, name: str, rng: np.random.Generator) -> list[Training
                 ramp_s=RAMP,
                 sample_time_s=TS,
             )
-            trials = learned_trials(plant, MATERIALS[name], lesson.r, rng)
+            trials = learned_trials(plant, MATERIALS[name], task.r, rng)
             out.append(
-                Training(
-                    name, NOZZLE, lesson, np.array([t.u for t in trials]), np.array([t.y for t in trials])
-                )
+                Training(name, NOZZLE, task, np.array([t.u for t in trials]), np.array([t.y for t in trials]))
             )
     return out
 
@@ -145,9 +145,9 @@ def program(name: str, tool: int) -> gcode.Program:
     return gcode.parse(text)
 
 
-def part(known: Learned, name: str, material: str) -> Composed:
+def part(learned: Learned, name: str, material: str) -> Composed:
     read = program(name, 0)
-    return compose(known, read, plan(read.moves, **MACHINE), materials={0: material}, limit=np.inf, **PART)
+    return compose(learned, read, plan(read.moves, **MACHINE), PART, materials={0: material})
 
 
 def percent(plant: Extruder, nominal: Extruder, u: np.ndarray, r: np.ndarray) -> float:
@@ -157,17 +157,17 @@ def percent(plant: Extruder, nominal: Extruder, u: np.ndarray, r: np.ndarray) ->
 
 def one(plant: Extruder, name: str, rng: np.random.Generator) -> dict[str, float]:
     """All figures of one plant, keyed structure.composer."""
-    nominal, known = MATERIALS[name], learn(train(plant, name, rng), sample_time_s=TS)
+    nominal, learned = MATERIALS[name], learn(train(plant, name, rng), sample_time_s=TS)
     out = {}
     for structure in ("fig9", "tic_tac_toe", "dashes"):
-        made = part(known, structure, name)
+        made = part(learned, structure, name)
         stream = made.streams[0]
-        whole = (known.library, name, NOZZLE, made.tasks, made.lines, 0)
+        where = (learned.library, name, NOZZLE, made.tasks, made.lines, 0)
         commands = {
             "chosen": stream.u,
-            "basis": basis.compose(known.materials[0].chain.extruder, stream.r, sample_time_s=TS),
-            "priority": priority(*whole, samples=len(stream.r)),
-            "superposition": superposition(*whole, samples=len(stream.r)),
+            "basis": basis.compose(learned.materials[0].chain.extruder, stream.r, sample_time_s=TS),
+            "priority": priority(*where, samples=len(stream.r)),
+            "superposition": superposition(*where, samples=len(stream.r)),
             "ilc": learned_trials(plant, nominal, stream.r, rng)[-1].u,
         }
         for composer, u in commands.items():
@@ -176,7 +176,7 @@ def one(plant: Extruder, name: str, rng: np.random.Generator) -> dict[str, float
             out[f"{structure}.{prediction.composer}_predicted"] = prediction.rms_percent_of_on_off
         out[f"{structure}.over_ilc"] = out[f"{structure}.chosen"] - out[f"{structure}.ilc"]
         true = made._replace(streams=(stream._replace(y=flow(plant, stream.u, sample_time_s=TS)),))
-        volumes = line_volumes(true, known.library, bead_area_mm2=AREA)
+        volumes = line_volumes(true, learned.library, bead_area_mm2=AREA)
         out[f"{structure}.line_volume"] = float(
             np.abs(volumes.error_percent[volumes.duration_s >= 0.4 - 1e-9]).max()
         )
@@ -186,7 +186,7 @@ def one(plant: Extruder, name: str, rng: np.random.Generator) -> dict[str, float
         "speed_1.5x": protocol(12.0, 0.6),
     }.items():
         out[f"{label}.basis"] = percent(
-            plant, nominal, basis.compose(known.materials[0].chain.extruder, r, sample_time_s=TS), r
+            plant, nominal, basis.compose(learned.materials[0].chain.extruder, r, sample_time_s=TS), r
         )
     return out
 
@@ -242,8 +242,8 @@ def bars(result: dict) -> dict:
 
 
 def saturations(plants: int) -> dict:
-    """Forecast by the chain of the training against the true plant: the same command, and our law learning
-    under the same limit. Points of percent of on-off."""
+    """Forecast by the chain of the training against the true plant: the same command, and the model
+    inverse learning under the same limit. Points of percent of on-off."""
     rng, rows = np.random.default_rng(7), []
     for name, nominal in MATERIALS.items():
         for _ in range(plants):
@@ -256,14 +256,14 @@ def saturations(plants: int) -> dict:
                 r = basis.boxed(on, ramp_s, TS)
                 for times in (3.0, 5.0, 10.0, 20.0):
                     limit = times * r.max() / nominal.gain
-                    found = saturation(
+                    predicted = saturation(
                         extruder, on, on_off_gain=nominal.gain, ramp_s=ramp_s, limit=limit, sample_time_s=TS
                     )
                     on_off = np.linalg.norm(
                         flow(plant, np.clip(r / nominal.gain, -limit, limit), sample_time_s=TS) - r
                     )
                     u = basis.compose(extruder, r, sample_time_s=TS, limit=limit)
-                    forecast = found.rms_percent_of_on_off
+                    forecast = predicted.rms_percent_of_on_off
                     same = 100 * np.linalg.norm(flow(plant, u, sample_time_s=TS, limit=limit) - r) / on_off
                     trials = learned_trials(plant, nominal, r, rng, limit=limit)
                     law = 100 * np.mean([np.linalg.norm(t.truth - r) for t in trials[-3:]]) / on_off
@@ -281,12 +281,12 @@ def sequences(programs: int) -> dict:
     Steady-State -> No-Flow are refused by line number."""
     from tests.deposition.test_tasks import random_tasks
 
-    rng, found, refused = np.random.default_rng(0), 0, 0
+    rng, forbidden_pairs, refused = np.random.default_rng(0), 0, 0
     for _ in range(programs):
         tasks = random_tasks(rng)
         refused += tasks is None
-        found += 0 if tasks is None else len(forbidden(tasks.task, tasks.tool))
-    return {"programs": programs, "forbidden": found, "refused": refused}
+        forbidden_pairs += 0 if tasks is None else len(forbidden(tasks.task, tasks.tool))
+    return {"programs": programs, "forbidden": forbidden_pairs, "refused": refused}
 
 
 def job(lines: int) -> str:
@@ -304,7 +304,7 @@ def job(lines: int) -> str:
     return "\n".join(text)
 
 
-def speed(known: Learned) -> dict:
+def speed(learned: Learned) -> dict:
     """A job of 62,000 lines in two materials: reading, planning, composing, and the report."""
     text, times = job(62_000), []
     for _ in range(3):
@@ -313,11 +313,11 @@ def speed(known: Learned) -> dict:
         marks.append(time.process_time())
         motion = plan(read.moves, **MACHINE)
         marks.append(time.process_time())
-        made = compose(known, read, motion, materials={0: "A", 1: "B"}, limit=np.inf, **PART)
+        made = compose(learned, read, motion, PART, materials={0: "A", 1: "B"})
         marks.append(time.process_time())
         conform(
             made,
-            known,
+            learned,
             bead_area_mm2=AREA,
             ramp_s=RAMP,
             limit=np.inf,
@@ -339,16 +339,14 @@ def main() -> None:
     plants, seeds = (int(a) for a in sys.argv[1:3]) if len(sys.argv) > 2 else (14, 2)
     result = {"plants": plants, "seeds": seeds}
     rng = np.random.default_rng(1)
-    known = learn(
+    learned = learn(
         [t for name, e in MATERIALS.items() for t in train(e._replace(delay_s=0.1, lag_hz=4.0), name, rng)],
         sample_time_s=TS,
     )
-    result["speed"] = speed(known)
-    tasks = part(known, "fig9", "A").tasks
+    result["speed"] = speed(learned)
+    tasks = part(learned, "fig9", "A").tasks
     read = program("tic_tac_toe", None)
-    crosses = compose(
-        known, read, plan(read.moves, **MACHINE), materials={0: "A", 1: "B"}, limit=np.inf, **PART
-    )
+    crosses = compose(learned, read, plan(read.moves, **MACHINE), PART, materials={0: "A", 1: "B"})
     result["sequences"] = {
         "fig9_exact": tasks.task.tolist() == FIG_9,
         "tic_tac_toe_runs": int(crosses.lines.run[-1]) + 1,

@@ -288,8 +288,21 @@ def staircase(rng):
 RECORDS: dict[str, Callable[[np.random.Generator], tuple[np.ndarray, np.ndarray]]] = {
     f.__name__: f
     for f in (
-        hot_end, power_station, robot_arm, flutter, disc_player_arm, ball_and_beam, heat_exchanger, wall,
+        hot_end,
+        power_station,
+        robot_arm,
+        flutter,
+        disc_player_arm,
+        ball_and_beam,
+        heat_exchanger,
+        wall,
         titration,
-        steam_generator, relay_bed, two_heaters, ganged_zones, unstable_reactor, barrel, staircase,
+        steam_generator,
+        relay_bed,
+        two_heaters,
+        ganged_zones,
+        unstable_reactor,
+        barrel,
+        staircase,
     )
-}  # fmt: skip
+}

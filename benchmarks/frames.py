@@ -36,7 +36,7 @@ R = routine(
 CORNER = (R.time_s > R.pause_s[0] - 0.5) & (R.time_s < R.pause_s[1] + 0.5)
 MATERIALS = {"A": Extruder(1.08, 2.7), "B": Extruder(0.89, 4.5)}
 NOISE = {"white": 0.03, "drift": 0.01, "gain": 0.01}
-OURS = {"identify_trials": 3, "floor": 0.1, "order": 4, "cutoff_hz": 5.0}
+INVERSE = ilc.InverseSettings(identify_trials=3, floor=0.1, order=4, cutoff_hz=5.0)
 WIDTHS = np.array([60.0, 85.0, 110.0, 135.0, 160.0])
 LEVELS = {"nominal": (NOMINAL, 0.12), "hard": (HARD, 0.30)}
 OTHERS = {
@@ -71,9 +71,9 @@ def widths(scene: Scene, seed: int, frames: int) -> tuple[np.ndarray, np.ndarray
 
     gauges = np.array([measured(w) for w in WIDTHS[::2]])
     calibration = calibrate(gauges.ravel(), np.repeat(WIDTHS[::2], frames) / PX_PER_MM)
-    found = np.array([measured(w) for w in WIDTHS])
-    calibrated = millimetres(calibration, found) * PX_PER_MM
-    return found.mean(axis=1) - WIDTHS, found.std(axis=1), calibrated.mean(axis=1) - WIDTHS
+    measured_px = np.array([measured(w) for w in WIDTHS])
+    calibrated = millimetres(calibration, measured_px) * PX_PER_MM
+    return measured_px.mean(axis=1) - WIDTHS, measured_px.std(axis=1), calibrated.mean(axis=1) - WIDTHS
 
 
 def width_figures(seeds: int = 6, frames: int = 40) -> dict[str, Any]:
@@ -103,10 +103,10 @@ def empty_figures(frames: int = 500) -> dict[str, Any]:
     """Empty frames of 25 cameras a level, each with its own glare and texture."""
     out: dict[str, Any] = {"bar": "0 of 500 give a bead"}
     for name, (scene, _) in LEVELS.items():
-        rng, found = np.random.default_rng(300), []
+        rng, beads = np.random.default_rng(300), []
         for _ in range(25):
             camera = Camera(scene, rng)
-            found += [
+            beads += [
                 measure(
                     camera.empty(stage_px=int(rng.integers(0, 10**6))),
                     columns=COLUMNS,
@@ -115,17 +115,17 @@ def empty_figures(frames: int = 500) -> dict[str, Any]:
                 for _ in range(frames // 25)
             ]
         out[name] = {
-            "frames": len(found),
-            "beads": sum(not bead.reason for bead in found),
-            "frames_with_any_width": sum(bool(np.nansum(bead.widths)) for bead in found),
+            "frames": len(beads),
+            "beads": sum(not bead.reason for bead in beads),
+            "frames_with_any_width": sum(bool(np.nansum(bead.widths)) for bead in beads),
             "blocks_unread_percent": round(
-                100 * float(np.mean([np.isnan(bead.widths) for bead in found])), 3
+                100 * float(np.mean([np.isnan(bead.widths) for bead in beads])), 3
             ),
         }
     return out
 
 
-def seen(camera: Camera, Q: np.ndarray, calibration) -> Flow:
+def flow_through_camera(camera: Camera, Q: np.ndarray, calibration) -> Flow:
     frames = camera.trial(
         R.time_s,
         Q,
@@ -157,30 +157,34 @@ def seen(camera: Camera, Q: np.ndarray, calibration) -> Flow:
 
 def gauged(camera: Camera, rng: np.random.Generator, each: int = 5):
     """A calibration on four known widths, as a user would make it."""
-    known = np.repeat([0.55, 0.75, 0.95, 1.2], each)
-    frames = [camera.frame(w * PX_PER_MM, stage_px=int(rng.integers(0, 10**6))) for w in known]
+    widths_mm = np.repeat([0.55, 0.75, 0.95, 1.2], each)
+    frames = [camera.frame(w * PX_PER_MM, stage_px=int(rng.integers(0, 10**6))) for w in widths_mm]
     return calibrate(
         np.array(
             [measure(frame, columns=COLUMNS, longest_blur_px=LONGEST_BLUR_PX).width for frame in frames]
         ),
-        known,
+        widths_mm,
     )
 
 
-def errors(found: Flow, Q: np.ndarray) -> dict[str, float]:
-    e, slope = 100 * (found.flow - Q) / NOMINAL_FLOW, np.gradient(Q, TS)
-    pause = found.pauses[0]
+def errors(estimated: Flow, Q: np.ndarray) -> dict[str, float]:
+    e, slope = 100 * (estimated.flow - Q) / NOMINAL_FLOW, np.gradient(Q, TS)
+    pause = estimated.pauses[0]
     laid = Q[(R.time_s >= pause.begin_s) & (R.time_s <= pause.end_s)].sum() * TS
     steady = (R.time_s > R.start_s + 2) & (R.time_s < R.pause_s[0] - 0.5)
     return {
         "rms_percent": float(np.sqrt(np.mean(e**2))),
         "corner_percent": float(np.sqrt(np.mean(e[CORNER] ** 2))),
         "mean_steady_percent": float(abs(e[steady].mean())),
-        "lag_ms": float(abs(1e3 * slope @ (found.flow - Q) / (slope @ slope))),
+        "lag_ms": float(abs(1e3 * slope @ (estimated.flow - Q) / (slope @ slope))),
         "pause_volume_percent_of_0.6_s": float(100 * abs(pause.volume - laid) / (0.6 * NOMINAL_FLOW)),
         "errors_over_deviation": float(
             np.sqrt(
-                np.mean(np.square((found.flow - Q)[found.observable] / found.deviation[found.observable]))
+                np.mean(
+                    np.square(
+                        (estimated.flow - Q)[estimated.observable] / estimated.deviation[estimated.observable]
+                    )
+                )
             )
         ),
     }
@@ -209,10 +213,10 @@ def flow_figures(seeds: int = 3) -> dict[str, Any]:
             for name, plant in plants(seed):
                 first = flow(plant, R.r / MATERIALS[name].gain, sample_time_s=TS)
                 for kind, Q in {"on_off": first, "half_way": (first + R.r) / 2, "as_wanted": R.r}.items():
-                    rows.setdefault(kind, []).append(errors(seen(camera, Q, calibration), Q))
+                    rows.setdefault(kind, []).append(errors(flow_through_camera(camera, Q, calibration), Q))
         out[level] = {
-            kind: {f"worst_{key}": round(max(row[key] for row in found), 2) for key in found[0]}
-            for kind, found in rows.items()
+            kind: {f"worst_{key}": round(max(row[key] for row in of_kind), 2) for key in of_kind[0]}
+            for kind, of_kind in rows.items()
         }
         print(level, out[level], flush=True)
     return out
@@ -230,10 +234,10 @@ def learned(name: str, plant: Extruder, scene: Scene, seed: int, trials: int) ->
     def run(u):
         Q = flow(plant, u, sample_time_s=TS)
         laid = np.maximum(disturb(Q, rng, steady_flow=NOMINAL_FLOW, **NOISE), 0.0)
-        found = seen(camera, laid, calibration)
-        return ilc.Trial(u, np.where(found.observable, found.flow, np.nan), Q)
+        estimated = flow_through_camera(camera, laid, calibration)
+        return ilc.Trial(u, np.where(estimated.observable, estimated.flow, np.nan), Q)
 
-    law = ilc.InverseLaw(R.r, limit=np.inf, sample_time_s=TS, **OURS)
+    law = ilc.InverseLaw(R.r, INVERSE, limit=np.inf, sample_time_s=TS)
     done = ilc.learn(law, run, R.r / MATERIALS[name].gain, R.r, trials=trials, rise=0.05)
     rows = ilc.table(done, R.r, steady=NOMINAL_FLOW / MATERIALS[name].gain, limit=np.inf, rise=0.05)
     ratios = [round(100 * row.ratio, 2) for row in rows]
@@ -257,13 +261,13 @@ def pixel_figures(trials: int = 15) -> dict[str, Any]:
 
 
 def quickest_ms(function: Callable[[], Any], rounds: int = 15, each: int = 20) -> float:
-    found = []
+    times_ms = []
     for _ in range(rounds):
         start = time.process_time()
         for _ in range(each):
             function()
-        found.append(1e3 * (time.process_time() - start) / each)
-    return round(min(found), 3)
+        times_ms.append(1e3 * (time.process_time() - start) / each)
+    return round(min(times_ms), 3)
 
 
 def speed_figures() -> dict[str, Any]:
@@ -274,8 +278,8 @@ def speed_figures() -> dict[str, Any]:
     rng = np.random.default_rng(601)
     calibration = gauged(camera, rng)
     start = time.process_time()
-    seen(camera, R.r, calibration)
-    whole = time.process_time() - start
+    flow_through_camera(camera, R.r, calibration)
+    trial_s = time.process_time() - start
     return {
         "bars": "render <= 1.5 ms a frame, measure about 0.25 ms, raw >= 2,500 frames/s for frame -> area",
         "render_ms": quickest_ms(lambda: camera.frame(110.0, stage_px=0)),
@@ -294,7 +298,7 @@ def speed_figures() -> dict[str, Any]:
         ),
         "raw_frames_per_s": round(1e3 / ms),
         "jpeg_decode_ms": quickest_ms(lambda: cv2.imdecode(jpeg, cv2.IMREAD_GRAYSCALE)),
-        "trial_of_738_frames_s": round(whole, 2),
+        "trial_of_738_frames_s": round(trial_s, 2),
     }
 
 

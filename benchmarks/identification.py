@@ -20,7 +20,7 @@ import numpy as np
 
 from benchmarks.foreign_records import RECORDS
 from benchmarks.moesp import moesp, moesp_singular_values, varx
-from pipeline.temperature.identification import identify
+from pipeline.temperature.identification import Settings, identify
 from pipeline.temperature.order import LARGEST_RADIUS, stabilised
 from pipeline.temperature.plant import Plant, baam, markov_parameters, simulate
 from pipeline.temperature.plant import plant as make_plant
@@ -45,10 +45,10 @@ MARKOV_BARS = {0.1: 2e-3, 0.5: 1.5e-2}
 def nrmse(y: np.ndarray, predicted: np.ndarray, *, means_removed: bool = False) -> np.ndarray:
     """Fit of each output in percent, 100 (1 - |y - ŷ| / |y - mean y|); NaN in y is left out. With
     `means_removed` the mean of the error is taken off first."""
-    seen = np.isfinite(y)
-    error = np.where(seen, y - predicted, np.nan)
+    mask = np.isfinite(y)
+    error = np.where(mask, y - predicted, np.nan)
     error = error - np.nanmean(error, axis=0) if means_removed else error
-    spread = np.where(seen, y, np.nan) - np.nanmean(np.where(seen, y, np.nan), axis=0)
+    spread = np.where(mask, y, np.nan) - np.nanmean(np.where(mask, y, np.nan), axis=0)
     return 100.0 * (
         1.0
         - np.sqrt(
@@ -96,10 +96,10 @@ def resampled(
 def probed(seed: int, noise: float, samples: int = 15_000) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     signal = study_signal(rng, samples, 7, amplitudes=AMPLITUDES, bandwidth=1.65, variance=1.5)
-    found = study_probe(
+    recorded = study_probe(
         baam(), signal, K_DATA, x0=np.full(6, 50.0), noise=noise * rng.standard_normal((samples, 5))
     )
-    return found.u, found.y
+    return recorded.u, recorded.y
 
 
 def records() -> dict[str, tuple[np.ndarray, np.ndarray, int]]:
@@ -130,9 +130,9 @@ def nfoursid_plant(u: np.ndarray, y: np.ndarray, order: int) -> Plant:
 
     inputs, outputs = [f"u{j}" for j in range(u.shape[1])], [f"y{j}" for j in range(y.shape[1])]
     frame = pd.DataFrame(np.hstack([u, y]), columns=inputs + outputs)
-    found = NFourSID(frame, output_columns=outputs, input_columns=inputs, num_block_rows=10)
-    found.subspace_identification()
-    model, _ = found.system_identification(rank=order)
+    peer = NFourSID(frame, output_columns=outputs, input_columns=inputs, num_block_rows=10)
+    peer.subspace_identification()
+    model, _ = peer.system_identification(rank=order)
     return make_plant(model.a, model.b, model.c, model.d)
 
 
@@ -161,21 +161,22 @@ PEERS = {
 
 
 def installed_peers() -> dict[str, Callable]:
-    found = {}
+    peers = {}
     for name, (module, function) in PEERS.items():
         if importlib.util.find_spec(module) is None:
             print(f"{name} is not installed: left out")
         else:
-            found[name] = function
-    return found
+            peers[name] = function
+    return peers
 
 
 def hold_out(name: str, u: np.ndarray, y: np.ndarray, cut: int, peers: dict[str, Callable]) -> dict:
     """Mean NRMSE over the outputs, means of the hold-out removed to score, for ours and each peer at our
     number of states, delays included; the peers get data without their means."""
-    settings = {"sample_time_s": 1.0, "feedthrough": None}
-    ours, seconds = timed(identify, [u[:cut]], [y[:cut]], **settings, refinement="validated")
-    rough, rough_seconds = timed(identify, [u[:cut]], [y[:cut]], **settings)
+    settings = Settings(feedthrough=None)
+    validated = settings._replace(refinement="validated")
+    ours, seconds = timed(identify, [u[:cut]], [y[:cut]], sample_time_s=1.0, settings=validated)
+    rough, rough_seconds = timed(identify, [u[:cut]], [y[:cut]], sample_time_s=1.0, settings=settings)
     test = ([u[cut:]], [y[cut:]])
     row = {
         "order": ours.order,
@@ -196,9 +197,9 @@ def hold_out(name: str, u: np.ndarray, y: np.ndarray, cut: int, peers: dict[str,
     for peer, function in peers.items():
         mean_u, mean_y = u[:cut].mean(axis=0), y[:cut].mean(axis=0)
         try:
-            found, seconds = timed(function, u[:cut] - mean_u, y[:cut] - mean_y, ours.plant.n)
+            model, seconds = timed(function, u[:cut] - mean_u, y[:cut] - mean_y, ours.plant.n)
             with np.errstate(all="ignore"):
-                score = simulate_fit(found, [u[cut:] - mean_u], [y[cut:] - mean_y], means_removed=True)
+                score = simulate_fit(model, [u[cut:] - mean_u], [y[cut:] - mean_y], means_removed=True)
             if not np.isfinite(score).all():
                 raise ValueError("the simulation of the hold-out is not finite")
             row[peer] = {"error_percent": round(100 - float(score.mean()), 2), "s": round(seconds, 2)}
@@ -224,8 +225,8 @@ def parity(sets) -> dict:
     }
     for name, (block_rows, order, published) in ERR1.items():
         u, y, _ = sets[name]
-        found, x0 = moesp([u], [y], block_rows, order)
-        err1 = np.linalg.norm(y - simulate(found, u, x0[0])[1], 1) / np.linalg.norm(y, 1)
+        model, x0 = moesp([u], [y], block_rows, order)
+        err1 = np.linalg.norm(y - simulate(model, u, x0[0])[1], 1) / np.linalg.norm(y, 1)
         out[f"err1_{name}"] = {"ours": round(float(err1), 5), "published": published}
     return out
 
@@ -239,11 +240,11 @@ def study_plant(sets: int = 20) -> dict:
     out = {}
     for noise, bar in MARKOV_BARS.items():
         for refinement in ("none", "validated"):
-            settings = {"sample_time_s": 1.0, "refinement": refinement}
+            settings = {"sample_time_s": 1.0, "settings": Settings(refinement=refinement)}
             runs = [timed(identify, *([a] for a in probed(seed, noise)), **settings) for seed in range(sets)]
-            errors = [markov_error(found.plant) for found, _ in runs]
+            errors = [markov_error(identified.plant) for identified, _ in runs]
             out[f"noise_{noise}_{refinement}"] = {
-                "order_six": sum(found.order == 6 for found, _ in runs),
+                "order_six": sum(identified.order == 6 for identified, _ in runs),
                 "of": sets,
                 "worst_error": max(errors),
                 "median_error": float(np.median(errors)),
@@ -277,16 +278,16 @@ def score(plant: Plant, u: np.ndarray, y: np.ndarray) -> list[float]:
 
 def arx_plant(u: np.ndarray, y: np.ndarray, past: int) -> Plant:
     """The least-squares ARX model of `past` lags, its window as the state."""
-    found, m, p = varx([u], [y], past), u.shape[1], y.shape[1]
+    fit, m, p = varx([u], [y], past), u.shape[1], y.shape[1]
     q, size = m + p, past * (m + p)
     A, B, C, b = (
         np.zeros((size, size)),
         np.zeros((size, m)),
-        np.concatenate([found.B, found.A], axis=2).transpose(1, 0, 2).reshape(p, size),
+        np.concatenate([fit.B, fit.A], axis=2).transpose(1, 0, 2).reshape(p, size),
         np.zeros(size),
     )
-    A[m:q], A[q:, :-q], B[:m], b[m:q] = C, np.eye(size - q), np.eye(m), found.constant
-    return make_plant(A, B, C, None, b, found.constant)
+    A[m:q], A[q:, :-q], B[:m], b[m:q] = C, np.eye(size - q), np.eye(m), fit.constant
+    return make_plant(A, B, C, None, b, fit.constant)
 
 
 def arx_lags(u: np.ndarray, y: np.ndarray, price: Callable[[int], float]) -> int:
@@ -296,9 +297,9 @@ def arx_lags(u: np.ndarray, y: np.ndarray, price: Callable[[int], float]) -> int
         features = past * (u.shape[1] + p)
         if len(u) - past < 2 * features:
             break
-        found = varx([u], [y], past)
-        S = found.covariance * (found.rows - features - 1) / found.rows
-        tried.append((found.rows * np.linalg.slogdet(S)[1] + price(found.rows) * p * features, past))
+        fit = varx([u], [y], past)
+        S = fit.covariance * (fit.rows - features - 1) / fit.rows
+        tried.append((fit.rows * np.linalg.slogdet(S)[1] + price(fit.rows) * p * features, past))
     return min(tried)[1]
 
 
@@ -332,15 +333,21 @@ def foreign(name: str, seed: int) -> dict:
         identify, *([a] for a in train), sample_time_s=1.0, feedthrough=None, refinement="validated"
     )
     row = {
-        "samples": len(u), "inputs": u.shape[1], "outputs": y.shape[1],
-        "order": ours.order, "past": ours.past, "delays": list(ours.delays), "feedthrough": ours.feedthrough,
-        "fit": ours.fit, "s": round(seconds, 1),
+        "samples": len(u),
+        "inputs": u.shape[1],
+        "outputs": y.shape[1],
+        "order": ours.order,
+        "past": ours.past,
+        "delays": list(ours.delays),
+        "feedthrough": ours.feedthrough,
+        "fit": ours.fit,
+        "s": round(seconds, 1),
         "ours": score(ours.plant, *test),
         "arx_akaike": score(arx_plant(*train, arx_lags(*train, lambda rows: 2.0)), *test),
         "arx_schwarz": score(arx_plant(*train, arx_lags(*train, np.log)), *test),
-    }  # fmt: skip
-    for kind, found in subspace_plants(*train):
-        best, now = row.setdefault(f"best_{kind}", [LOWEST, LOWEST]), score(found, *test)
+    }
+    for kind, scores in subspace_plants(*train):
+        best, now = row.setdefault(f"best_{kind}", [LOWEST, LOWEST]), score(scores, *test)
         row[f"best_{kind}"] = max(best, now)
     return row
 

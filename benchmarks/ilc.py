@@ -26,9 +26,9 @@ TS, AREA, SPEED = 0.02, 0.304, 8.0
 STEADY = AREA * SPEED
 MATERIALS = {"A": Extruder(1.08, 2.7), "B": Extruder(0.89, 4.5)}
 NOISE = {"white": 0.03, "drift": 0.01, "gain": 0.01}
-PAPER = {"learning_gain": 0.25, "fast_zero_s": 0.03, "sample_time_s": TS}
-PAPER_Q = {"order": 2, "cutoff_hz": 3.0}
-OURS = {"identify_trials": 3, "floor": 0.1, "order": 4, "cutoff_hz": 5.0}
+HOELZLE = ilc.HoelzleSettings(learning_gain=0.25, fast_zero_s=0.03, order=2, cutoff_hz=3.0)
+HOELZLE_Q = {"order": 2, "cutoff_hz": 3.0}
+INVERSE = ilc.InverseSettings(identify_trials=3, floor=0.1, order=4, cutoff_hz=5.0)
 NO_ROLL_BACK, ROLL_BACK = np.inf, 0.1
 
 
@@ -94,27 +94,27 @@ def run(
     return rows + [best] * (trials + 1 - len(rows))
 
 
-def paper(name: str, r: np.ndarray, q=ilc.zero_phase) -> ilc.Law:
-    return ilc.paper_law(r, MATERIALS[name], q, limit=np.inf, **PAPER, **PAPER_Q)
+def hoelzle_2009(name: str, r: np.ndarray, q=ilc.zero_phase) -> ilc.Law:
+    return ilc.hoelzle_law(r, MATERIALS[name], q, HOELZLE, limit=np.inf, sample_time_s=TS)
 
 
 def percent(rows: list[ilc.Row], trial: int) -> float:
     return round(100 * rows[trial].ratio, 2)
 
 
-def paper_figures(seeds: int) -> dict[str, Any]:
+def hoelzle_figures(seeds: int) -> dict[str, Any]:
     """Worst over seeds of the noise; gamma before anything runs, on the nominal plant with its delay and as
     the maximum over 200 plants of the family."""
     r, f, out = reference(), np.linspace(0.0, 24.9, 4000), {}
-    Q = ilc.magnitude(f, sample_time_s=TS, **PAPER_Q) ** 2
+    Q = ilc.magnitude(f, sample_time_s=TS, **HOELZLE_Q) ** 2
     settings = {"limit": np.inf, "rise": NO_ROLL_BACK}
     for name, nominal in MATERIALS.items():
-        L = ilc.paper_filter(f, nominal, **PAPER)
+        L = ilc.hoelzle_filter(f, nominal, HOELZLE, sample_time_s=TS)
         row: dict[str, Any] = {}
         for delay in (0.0, 0.1, 0.12, 0.15):
             plant = nominal._replace(delay_s=delay)
             runs = [
-                run(plant, nominal, paper(name, r), r, trials=120, seed=seed, **settings)
+                run(plant, nominal, hoelzle_2009(name, r), r, trials=120, seed=seed, **settings)
                 for seed in range(seeds)
             ]
             row[f"delay_{round(1000 * delay)}_ms"] = {
@@ -131,12 +131,12 @@ def paper_figures(seeds: int) -> dict[str, Any]:
             if material == name
         ]
         row["gamma_worst_of_200"] = round(float(ilc.gamma(Q, L, np.array(spread)).max()), 3)
-        causal = run(nominal, nominal, paper(name, r, causal_q), r, trials=60, seed=0, **settings)
+        causal = run(nominal, nominal, hoelzle_2009(name, r, causal_q), r, trials=60, seed=0, **settings)
         row["causal_q_best"] = round(100 * min(line.ratio for line in causal), 1)
         caught = run(
             nominal._replace(delay_s=0.15),
             nominal,
-            paper(name, r),
+            hoelzle_2009(name, r),
             r,
             trials=120,
             seed=0,
@@ -166,22 +166,25 @@ def spread(rows: list[list[ilc.Row]], bars: dict[int, float | None]) -> dict[str
     return out
 
 
-def ours_figures(count: int, seeds: int) -> dict[str, Any]:
+def inverse_figures(count: int, seeds: int) -> dict[str, Any]:
     out: dict[str, Any] = {
-        "bars": "trial 2: <= 20 in 95 %; 3: <= 10 in 90 %; 15: median <= 3; 60: worst <= 6; none diverges; limited, 15: median <= 4"
+        "bars": (
+            "trial 2: <= 20 in 95 %; 3: <= 10 in 90 %; 15: median <= 3; 60: worst <= 6; none diverges; "
+            "limited, 15: median <= 4"
+        )
     }
     variants: dict[str, tuple[int, float, int]] = {
         f"seed_{seed}": (seed, 0.0, 120 if seed == 0 else 60) for seed in range(seeds)
     }
     variants |= {"creep": (50, 0.12, 15), "limited_10x_ramp_0.5_s": (60, 0.0, 15)}
     f = np.linspace(0.0, 24.9, 2000)
-    Q = ilc.magnitude(f, order=OURS["order"], cutoff_hz=OURS["cutoff_hz"], sample_time_s=TS) ** 2
+    Q = ilc.magnitude(f, order=INVERSE.order, cutoff_hz=INVERSE.cutoff_hz, sample_time_s=TS) ** 2
     for variant, (seed, creep_share, trials) in variants.items():
         limited = variant.startswith("limited")
         r, rows, gammas, start = reference(0.5 if limited else 0.15), [], [], time.process_time()
         for i, (name, plant) in enumerate(family(seed, count, creep_share)):
             limit = 10 * STEADY / MATERIALS[name].gain if limited else np.inf
-            law = ilc.InverseLaw(r, limit=limit, sample_time_s=TS, **OURS)
+            law = ilc.InverseLaw(r, INVERSE, limit=limit, sample_time_s=TS)
             rows.append(
                 run(
                     plant,
@@ -256,28 +259,28 @@ def norm_optimal_figures() -> dict[str, Any]:
     return out
 
 
-def authority_figures(count: int) -> dict[str, Any]:
+def headroom_figures(count: int) -> dict[str, Any]:
     """What the forecast of trial 0's model says of the error that the limit leaves, beside trial 10; in
     points of percent, the worst of the plants."""
     out: dict[str, Any] = {"bar_points": 3.0}
     for ramp_s in (0.1, 0.15, 0.3, 0.5, 1.0):
         for times in (3, 5, 10, 20):
-            r, found = reference(ramp_s), []
+            r, rows_of_plants = reference(ramp_s), []
             for i, (name, plant) in enumerate(family(70, count)):
                 nominal = MATERIALS[name]
                 limit = times * STEADY / nominal.gain
-                law = ilc.InverseLaw(r, limit=limit, sample_time_s=TS, **OURS)
+                law = ilc.InverseLaw(r, INVERSE, limit=limit, sample_time_s=TS)
                 rows = run(plant, nominal, law, r, trials=10, seed=i, limit=limit, rise=ROLL_BACK)
                 u0 = np.clip(r / nominal.gain, -limit, limit)
-                forecast = ilc.authority(
+                forecast = ilc.actuator_headroom(
                     r, u0, law.model.extruder, order=4, cutoff_hz=5.0, limit=limit, sample_time_s=TS
                 )
-                found.append((percent(rows, 10), 100 * forecast.ratio, 100 * rows[10].saturated))
-            real, said, saturated = np.array(found).T
+                rows_of_plants.append((percent(rows, 10), 100 * forecast.ratio, 100 * rows[10].saturated))
+            real, predicted, saturated = np.array(rows_of_plants).T
             out[f"ramp_{ramp_s}_s_limit_{times}x"] = {
                 "median_ratio": round(float(np.median(real)), 2),
-                "median_forecast": round(float(np.median(said)), 2),
-                "worst_difference": round(float(np.abs(real - said).max()), 2),
+                "median_forecast": round(float(np.median(predicted)), 2),
+                "worst_difference": round(float(np.abs(real - predicted).max()), 2),
                 "median_saturated_percent": round(float(np.median(saturated)), 2),
             }  # fmt: skip
     return out
@@ -286,13 +289,13 @@ def authority_figures(count: int) -> dict[str, Any]:
 def main() -> None:
     count, seeds = (int(value) for value in (sys.argv[1:3] if len(sys.argv) > 2 else (200, 3)))
     result = {
-        "paper": paper_figures(seeds),
+        "paper": hoelzle_figures(seeds),
         "norm_optimal": norm_optimal_figures(),
         "norm_optimal_law": norm_optimal_law_figures(min(count, 60)),
-        "authority": authority_figures(min(count, 8)),
+        "authority": headroom_figures(min(count, 8)),
     }
     print(json.dumps(result, indent=2), flush=True)
-    result["ours"] = ours_figures(count, seeds)
+    result["ours"] = inverse_figures(count, seeds)
     RESULTS.parent.mkdir(exist_ok=True)
     RESULTS.write_text(json.dumps(result, indent=2) + "\n")
 

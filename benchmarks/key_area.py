@@ -117,18 +117,18 @@ def real() -> dict:
     video, frames = cv2.VideoCapture(str(DATA / "fast_caxton_frames/nozzle_video.gif")), []
     while (read := video.read())[0]:
         frames.append(read[1])
-    found = key_area.find_all(frames, (301, 190), least_score=LEAST)
+    areas = key_area.find_all(frames, (301, 190), least_score=LEAST)
     out["nozzle_video"] = {
         "frames": len(frames),
-        "accepted": int(found.valid.sum()),
-        "least_score": round(float(found.score.min()), 1),
+        "accepted": int(areas.valid.sum()),
+        "least_score": round(float(areas.score.min()), 1),
     }
     stills = [cv2.imread(str(path)) for path in sorted((DATA / "fast_caxton_frames/imgs").glob("*.jpg"))]
-    found = key_area.find_all(stills, (134, 120), least_score=LEAST)
+    areas = key_area.find_all(stills, (134, 120), least_score=LEAST)
     out["stills"] = {
         "frames": len(stills),
-        "accepted": int(found.valid.sum()),
-        "least_score": round(float(found.score.min()), 1),
+        "accepted": int(areas.valid.sum()),
+        "least_score": round(float(areas.score.min()), 1),
     }
     return out
 
@@ -139,13 +139,13 @@ def difficulty() -> dict:
     rows = []
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        seen = nozzle_scene.data_set(rng, segments=60, frames=5, least_score=LEAST)
+        learned = nozzle_scene.data_set(rng, segments=60, frames=5, least_score=LEAST)
         test = nozzle_scene.data_set(rng, segments=14, frames=20, least_score=LEAST)
-        v, w = seen.valid, test.valid
-        rule = yardsticks.fit_width_rule(seen.images[v], seen.label[v])
+        v, w = learned.valid, test.valid
+        rule = yardsticks.fit_width_rule(learned.images[v], learned.label[v])
         begin = time.process_time()
         fitted = yardsticks.fit_profile_machine(
-            seen.images[v], seen.temperature[v], seen.label[v], seen.segment[v]
+            learned.images[v], learned.temperature[v], learned.label[v], learned.segment[v]
         )
         took = time.process_time() - begin
         p = yardsticks.profile_probabilities(fitted, test.images[w], test.temperature[w])

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.temperature.plant import Plant, drawn_in
+from pipeline.temperature.plant import Plant, clip_spectral_radius
 from pipeline.temperature.plant import plant as make_plant
 from pipeline.temperature.refinement import fit_inputs
 from pipeline.temperature.subspace import Segments, complete_runs, lagged, one_step
@@ -102,7 +102,9 @@ def moesp(
             f"{order} was asked for; take more block rows"
         )
     gamma = _moesp_svd(u, y, block_rows, offset)[0][:, :order]
-    A = drawn_in(np.linalg.lstsq(gamma[:-p], gamma[p:], rcond=None)[0], GROWTH ** (1.0 / max(map(len, u))))
+    A = clip_spectral_radius(
+        np.linalg.lstsq(gamma[:-p], gamma[p:], rcond=None)[0], GROWTH ** (1.0 / max(map(len, u)))
+    )
     model = fit_inputs(A, gamma[:p], u, y, feedthrough=feedthrough, offset=offset)
     m = u[0].shape[1]
     return make_plant(

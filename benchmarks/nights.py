@@ -32,7 +32,7 @@ from pipeline.nightly import champion, judge, night, processes
 from pipeline.store import artifacts, params
 from pipeline.temperature import judging, scorecard
 from pipeline.temperature.plant import Plant, hold_output, plant
-from pipeline.temperature.probing import prbs, probe
+from pipeline.temperature.probing import InputLimits, OperatingPoint, prbs, probe
 
 reproduce = night._reproduce
 ROOT = Path(__file__).resolve().parents[1]
@@ -75,14 +75,10 @@ def recording(
     run = probe(
         truth,
         signal,
-        x0=x0,
-        u_centre=u0,
-        y_centre=REFERENCE + aim_degC,
+        OperatingPoint(x0, u0, REFERENCE + aim_degC),
+        InputLimits(np.zeros(2), np.full(2, 100.0), 20.0),
         feedback=0.5 * np.eye(2),
         noise=noise,
-        low=np.zeros(2),
-        high=np.full(2, 100.0),
-        rate=20.0,
     )
     return {
         "time_s": np.arange(samples, dtype=float),

@@ -112,7 +112,7 @@ def norm_optimal_law(
     """u_{j+1} = u_j + argmin |e - G du|^2 + |u + du|_Ru^2 + |du|_Rd^2 of the last trial; R_u and R_d as
     shares of the squared steady gain of the model."""
     ones = np.ones(len(r))
-    found = plan(
+    prepared = plan(
         transfer(model, sample_time_s=sample_time_s),
         W=ones,
         R_u=R_u * model.gain**2 * ones,
@@ -121,6 +121,6 @@ def norm_optimal_law(
 
     def law(trials: Sequence[Trial]) -> np.ndarray:
         u, y, _ = trials[-1]
-        return np.clip(u + step(found, u, np.where(np.isfinite(y), r - y, 0.0)), -limit, limit)
+        return np.clip(u + step(prepared, u, np.where(np.isfinite(y), r - y, 0.0)), -limit, limit)
 
     return law

@@ -124,16 +124,19 @@ def peak_MB(*, again: bool = False) -> float:
     parent had is not in it, as in getrusage it is."""
     if again:
         Path("/proc/self/clear_refs").write_text("5")
-    found = next(
+    line = next(
         line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM")
     )
-    return int(found.split()[1]) / 1024
+    return int(line.split()[1]) / 1024
 
 
 def apart(reader: str, path: Path, kind: str) -> dict[str, float]:
     """`measure` in a process of its own, so that its peak is its own."""
     call = f"b.measure(b.{reader}, Path({str(path)!r}), {kind!r})"
-    code = f"import json; from pathlib import Path; from benchmarks import recordings as b; print(json.dumps({call}))"
+    code = (
+        f"import json; from pathlib import Path; from benchmarks import recordings as b; "
+        f"print(json.dumps({call}))"
+    )
     return json.loads(
         subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     )
@@ -146,14 +149,14 @@ def main() -> None:
             for count in LENGTHS:
                 path = Path(folder) / f"{kind}_{count}"
                 write(path, kind, count)
-                found = results[f"{kind}_{count}"] = apart("ours", path, kind)
-                # the samples that are kept: time and three signals of eight bytes
-                found["kept_MB"] = count * 4 * 8 / 2**20
+                figures = results[f"{kind}_{count}"] = apart("ours", path, kind)
+                # the samples that stay: time and three signals of eight bytes
+                figures["kept_MB"] = count * 4 * 8 / 2**20
                 bar = f" (bar {BARS[kind]:,})" if kind in BARS else ""
                 print(
-                    f"{kind:>11} {count:>9,} rows: {found['rows_per_s']:>9,.0f} per second{bar}, "
-                    f"peak {found['peak_MB']:.0f} MB,"
-                    f" {found['above_warm_MB']:.1f} MB above warm, of which kept {found['kept_MB']:.1f} MB"
+                    f"{kind:>11} {count:>9,} rows: {figures['rows_per_s']:>9,.0f} per second{bar}, "
+                    f"peak {figures['peak_MB']:.0f} MB, {figures['above_warm_MB']:.1f} MB above warm, "
+                    f"of which kept {figures['kept_MB']:.1f} MB"
                 )
                 if kind in BARS and count == LENGTHS[1]:
                     undecoded = results[f"{kind}_mcap_package_undecoded"] = apart("package", path, kind)

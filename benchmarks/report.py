@@ -50,7 +50,7 @@ def stage(folder: Path) -> tuple[float, float, float]:
 def past() -> tuple[int, float]:
     """Runs that git holds, and the seconds from git to the text of the page."""
     started = time.perf_counter()
-    found = list(history.runs(500))
+    found = list(history.revisions(500))
     trend.render(
         found, params.load(ReportRules, "report"), band_degC=params.load(Panel, "panel").band_degC, pages=[]
     )

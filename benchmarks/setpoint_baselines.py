@@ -19,7 +19,14 @@ import numpy as np
 
 from pipeline.setpoint import judging
 from pipeline.setpoint.baselines import Proportional, SequentialTest, proportional, sequential_test
-from pipeline.setpoint.bayes import Filter, bayes, class_filter, recorded_evidence, robust_filter
+from pipeline.setpoint.bayes import (
+    CameraErrorModel,
+    Filter,
+    bayes,
+    class_filter,
+    recorded_evidence,
+    robust_filter,
+)
 from pipeline.setpoint.recorded import recorded_windows
 from pipeline.setpoint.score import Score
 from pipeline.setpoint.simulator import begin, paper_windows, rollout
@@ -30,20 +37,20 @@ RESULTS = Path(__file__).parent / "results" / "setpoint_baselines.json"
 LEARNED = synthetic_table(
     np.random.default_rng(100), segments=30, windows=10
 )  # the filters' evidence; other tables are judged on
-ROBUST = {
-    "accuracies": [0.7, 0.97],
-    "gains": [1.0, 0.65],
-    "looks": 5,
-    "look": 0.055,
-    "floor": 0.03,
-    "smoothing": 4.0,
-    "segment": 12.0,
-    "switch": 3e-4,
-    "repeats": 0.3,
-    "hazard": 6e-4,
-    "move_cost": 0.38,
-    "outside_cost": 5.0,
-}
+ROBUST = CameraErrorModel(
+    accuracies=[0.7, 0.97],
+    gains=[1.0, 0.65],
+    width_bias_levels=5,
+    width_bias_std=0.055,
+    floor=0.03,
+    smoothing=4.0,
+    segment_mean_decisions=12.0,
+    mode_switch_probability=3e-4,
+    window_repeat_probability=0.3,
+    hazard=6e-4,
+    move_cost=0.38,
+    outside_cost=5.0,
+)
 CONTROLLERS = {
     "proportional": (proportional(), Proportional(gain=20.0, time_constant=1.0)),
     "filtered proportional": (proportional(), Proportional(gain=11.4, time_constant=11.2)),
@@ -57,19 +64,23 @@ CONTROLLERS = {
     "Bayes, soft window": (
         bayes(1),
         Filter(
-            evidence=recorded_evidence(LEARNED, look=0.0, looks=1, floor=0.35, smoothing=4.0),
+            evidence=recorded_evidence(
+                LEARNED, width_bias_std=0.0, width_bias_levels=1, floor=0.35, smoothing=4.0
+            ),
             transition=np.ones((1, 1)),
             after_jump=np.ones((1, 1)),
             gains=np.ones(1),
-            repeats=np.zeros(1),
+            window_repeat_probability=np.zeros(1),
             hazard=7.7e-4,
             move_cost=0.4,
             outside_cost=6.4,
         ),
     ),
-    "Bayes, robust": (bayes(2 * (2 + ROBUST["looks"])), robust_filter(LEARNED, **ROBUST)),
+    "Bayes, robust": (bayes(2 * (2 + ROBUST.width_bias_levels)), robust_filter(LEARNED, ROBUST)),
 }
-SPEC = {  # figures of an earlier trial implementation: (settled at accuracy 1, then settled, median, p90, stay at 0.7, recovered from the clog)
+# figures of an earlier trial implementation: (settled at accuracy 1, then settled, median, p90, stay at 0.7,
+# recovered from the clog)
+SPEC = {
     "proportional": (66, 17, 86, 90, 0, None),
     "sequential test": (100, 99.9, 11, 30, 98.5, 98),
     "Bayes, exact model": (100, 100, 9, 22, 100, 1.5),
@@ -153,7 +164,7 @@ def main(seeds: int, runs: int) -> None:
         for seed in range(seeds):
             table = recorded_windows(synthetic_table(np.random.default_rng(seed), segments=30, windows=10))
             for number, (case, (windows, conditions)) in enumerate(
-                judging.cases(table, runs=runs, segment=10.0).items()
+                judging.cases(table, runs=runs, segment_mean_decisions=10.0).items()
             ):
                 key = jax.random.fold_in(jax.random.key(seed), number)
                 scores[seed][name][case] = judging.evaluate(

@@ -31,8 +31,8 @@ from benchmarks.waits import (
 )
 from pipeline.setpoint import calibration, deployment, judging, nozzle_scene, pixels
 from pipeline.setpoint.baselines import Proportional, proportional
-from pipeline.setpoint.bayes import bayes, robust_filter
-from pipeline.setpoint.classifier import Labelled, along_bead, predict, train, untrained
+from pipeline.setpoint.bayes import CameraErrorModel, bayes, robust_filter
+from pipeline.setpoint.classifier import Labelled, TrainingSettings, along_bead, predict, train, untrained
 from pipeline.setpoint.deployment import ACTS, Limits, Waits
 from pipeline.setpoint.pixels import Disturbances, Episodes, Loop, Machine, calm
 from pipeline.setpoint.recorded import WindowTable
@@ -52,13 +52,23 @@ EDGES = np.r_[20, 30, 40, 50, 60, np.arange(70, 130.1, 2.5), 150, 180, 220, 260,
 SECTION = params.load(EvaluateSetpoint, "evaluate_setpoint")
 ROBUST, TIP_TOLERANCE_PX = SECTION.baselines.bayes_robust, SECTION.pixels.tip_tolerance_px
 SEGMENTS = 24  # whose windows are recorded
+TRAINING = TrainingSettings(
+    cycle_epochs=25,
+    warmup_epochs=2,
+    batch=64,
+    learning_rate=1e-3,
+    weight_decay=0.01,
+    smoothing=0.0,
+    averaging=0.99,
+    patience=25,
+)
 
 
-class Sight(NamedTuple):
-    """A calibrated classifier: see(images, temperature) ->
+class CameraModel(NamedTuple):
+    """A calibrated classifier: classify(images, temperature) ->
     probabilities, scores; the rest as in calibration."""
 
-    see: object
+    classify: object
     correlation: float
     level: float
     foreign_above: float
@@ -74,29 +84,32 @@ def scenes(seed: int, segments: int, frames: int) -> tuple[Labelled, np.ndarray]
     return Labelled(d.images, d.temperature.astype(np.float32), d.label, d.segment + 100_000 * seed), d.valid
 
 
-def sight(weights: Path | None) -> Sight:
+def camera_model(weights: Path | None) -> CameraModel:
     """The small vision transformer, trained or read, and calibrated on segments that it never saw."""
-    learned, seen = scenes(1, 30, 10)
+    learned, learned_valid = scenes(1, 30, 10)
     network = vision_transformer(SMALL, np.random.default_rng(0))
     if weights and weights.exists():
         network = from_named_arrays(network, dict(np.load(weights)))
     else:
-        held, held_seen = scenes(2, 4, 20)
+        held, held_valid = scenes(2, 4, 20)
         network = train(
-            untrained(network, epochs=25), learned.take(np.flatnonzero(seen)),
-            held.take(np.flatnonzero(held_seen)), key=jax.random.key(0), cycle_epochs=25,
-            warmup_epochs=2, batch=64, learning_rate=1e-3, weight_decay=0.01, smoothing=0.0, averaging=0.99,
-            patience=25, augment=along_bead,
-        ).best  # fmt: skip
+            untrained(network, epochs=25),
+            learned.take(np.flatnonzero(learned_valid)),
+            held.take(np.flatnonzero(held_valid)),
+            TRAINING,
+            key=jax.random.key(0),
+            augment=along_bead,
+        ).best
         if weights:
             np.savez(weights, **named_arrays(network))
     familiar = calibration.fit_familiar(
-        predict(network, learned.key_area[seen], learned.temperature_degC[seen]).features, learned.label[seen]
+        predict(network, learned.key_area[learned_valid], learned.temperature_degC[learned_valid]).features,
+        learned.label[learned_valid],
     )
     held, valid = scenes(3, 12, LONGEST)
-    found = predict(network, held.key_area, held.temperature_degC)
-    T = calibration.fit_temperature(found.logits[valid], held.label[valid])
-    log_p, shape = calibration.log_probabilities(found.logits, T), (-1, LONGEST)
+    prediction = predict(network, held.key_area, held.temperature_degC)
+    T = calibration.fit_temperature(prediction.logits[valid], held.label[valid])
+    log_p, shape = calibration.log_probabilities(prediction.logits, T), (-1, LONGEST)
     label, windows = held.label.reshape(shape)[:, 0], log_p.reshape(*shape, 3)
     correlation = calibration.fit_correlation(windows, valid.reshape(shape), label)
     p = calibration.window_probabilities(windows, valid.reshape(shape), correlation)
@@ -104,21 +117,22 @@ def sight(weights: Path | None) -> Sight:
         p, label, held.segment.reshape(shape)[:, 0], coverage=0.9, confidence=0.5
     )
     foreign_above = calibration.foreign_above(
-        calibration.mahalanobis(familiar, found.features[valid]), false_alarms=0.02
+        calibration.mahalanobis(familiar, prediction.features[valid]), false_alarms=0.02
     )
     errors = np.where(valid, 1 - np.exp(log_p[np.arange(len(log_p)), held.label]), np.nan).reshape(shape)
 
-    def see(images, temperature):
-        found = predict(network, images, temperature)
-        return np.exp(calibration.log_probabilities(found.logits, T)), calibration.mahalanobis(
-            familiar, found.features
+    def classify(images, temperature):
+        prediction = predict(network, images, temperature)
+        return np.exp(calibration.log_probabilities(prediction.logits, T)), calibration.mahalanobis(
+            familiar, prediction.features
         )
 
     right = float(np.mean((log_p.argmax(axis=1) == held.label)[valid]))
-    return Sight(see, correlation, level, foreign_above, autocorrelation(errors, longest=LONGEST), right)
+    rho = autocorrelation(errors, longest=LONGEST)
+    return CameraModel(classify, correlation, level, foreign_above, rho, right)
 
 
-def recorded(eyes: Sight, frames: int, segments: int) -> WindowTable:
+def recorded(camera: CameraModel, frames: int, segments: int) -> WindowTable:
     """Windows of segments, each at every bin of the flow."""
     rng, rows = np.random.default_rng(4), []
     for s in range(segments):
@@ -126,11 +140,13 @@ def recorded(eyes: Sight, frames: int, segments: int) -> WindowTable:
         for low, high in itertools.pairwise(EDGES):
             flow, temperature = rng.uniform(low, high), rng.uniform(200, 220)
             made = nozzle_scene.render(segment, np.full(frames, flow), np.full(frames, temperature), rng)
-            found = nozzle_scene.key_areas(made, least_score=LEAST_SCORE)
-            p, score = eyes.see(found.images, made.temperature)
-            rows.append((np.log(np.clip(p, 1e-6, 1.0)), found.valid & (score <= eyes.foreign_above), flow, s))
+            areas = nozzle_scene.key_areas(made, least_score=LEAST_SCORE)
+            p, score = camera.classify(areas.images, made.temperature)
+            rows.append(
+                (np.log(np.clip(p, 1e-6, 1.0)), areas.valid & (score <= camera.foreign_above), flow, s)
+            )
     log_p, valid, flow, segment = (np.array(column) for column in zip(*rows, strict=True))
-    return calibration.recorded(log_p, valid, flow, segment, correlation=eyes.correlation, flow_edges=EDGES)
+    return calibration.recorded(log_p, valid, flow, segment, correlation=camera.correlation, flow_edges=EDGES)
 
 
 def measured_waits(rng: np.random.Generator) -> tuple[Waits, dict]:
@@ -218,35 +234,43 @@ def bursts(n: int) -> dict[str, Disturbances]:
 
 def main(runs: int, weights: Path | None) -> None:
     cv2.setNumThreads(1)
-    eyes = sight(weights)
+    camera = camera_model(weights)
     waits, measured = measured_waits(np.random.default_rng(5))
-    frames = window_frames(eyes.rho, wait_s=waits.flow_s, frame_rate_hz=RATE_HZ)
-    effective = effective_frames(eyes.rho)
+    frames = window_frames(camera.rho, wait_s=waits.flow_s, frame_rate_hz=RATE_HZ)
+    effective = effective_frames(camera.rho)
     report = {
         "command": f"./run python -m benchmarks.setpoint_pixels {runs}", "machine": {"cores": os.cpu_count()},
         "bar": "21 starts x 10: >= 95 % settled",
-        "image_accuracy": round(eyes.image_accuracy, 3),
+        "image_accuracy": round(camera.image_accuracy, 3),
         "measured_waits_s": {k: round(v, 2) for k, v in measured.items()}, "window_frames": frames,
         "effective_frames": {str(frames): round(float(effective[frames - 1]), 2),
         "20": round(float(effective[19]), 2)}, "segment_s": SEGMENT_S, "cases": {},
     }  # fmt: skip
     print(json.dumps(report), flush=True)
-    table = recorded(eyes, frames, SEGMENTS)
+    table = recorded(camera, frames, SEGMENTS)
     judge = functools.partial(
-        deployment.judge_window, least_frames=max(2, round(0.4 * frames)), correlation=eyes.correlation,
-        foreign_above=eyes.foreign_above,
-        conformal_level=eyes.level,
+        deployment.judge_window, least_frames=max(2, round(0.4 * frames)), correlation=camera.correlation,
+        foreign_above=camera.foreign_above,
+        conformal_level=camera.level,
     )  # fmt: skip
     published = Loop(
-        frames, RATE_HZ, Waits(6.0, 6.0, 6.0), LIMITS, judge, LEAST_SCORE, TIP_TOLERANCE_PX, SEGMENT_S
+        machine=MACHINE,
+        classify=camera.classify,
+        frames=frames,
+        frame_rate_hz=RATE_HZ,
+        waits=Waits(6.0, 6.0, 6.0),
+        limits=LIMITS,
+        judge=judge,
+        least_score=LEAST_SCORE,
+        tip_tolerance_px=TIP_TOLERANCE_PX,
+        segment_mean_s=SEGMENT_S,
     )
     starts = np.array([[f, t] for f in judging.START_FLOWS for t in judging.START_TEMPERATURES])
 
-    def ours(loop):
+    def robust(loop):
         decisions = max(SEGMENT_S / (loop.waits.flow_s + frames / RATE_HZ), 1.2)
-        return bayes(ROBUST.hypotheses()), robust_filter(
-            table, **ROBUST.model_dump() | {"segment": decisions}
-        )
+        model = CameraErrorModel(**ROBUST.model_dump() | {"segment_mean_decisions": decisions})
+        return bayes(ROBUST.hypotheses()), robust_filter(table, model)
 
     def case(name, controller, loop, disturbances, decisions, judged):
         began, n = time.process_time(), len(disturbances.clog)
@@ -255,9 +279,7 @@ def main(runs: int, weights: Path | None) -> None:
         e = pixels.run(
             controller[0],
             parameters,
-            eyes.see,
             start,
-            MACHINE,
             loop,
             disturbances,
             decisions=decisions,
@@ -269,11 +291,11 @@ def main(runs: int, weights: Path | None) -> None:
 
     derived, n, few = published._replace(waits=waits), 21 * runs, 21 * max(1, runs // 5)
     clog = calm(few)._replace(clog=np.full(few, 0.6), clog_at=np.full(few, 60))
-    case("Bayes, robust, wait 6 s", ours(published), published, calm(n), 100, summary)
-    case("Bayes, robust, derived wait", ours(derived), derived, calm(n), 100, summary)
+    case("Bayes, robust, wait 6 s", robust(published), published, calm(n), 100, summary)
+    case("Bayes, robust, derived wait", robust(derived), derived, calm(n), 100, summary)
     for name, disturbances in bursts(21).items():
-        case(name, ours(published), published, disturbances, 20, held_after)
-    case("Bayes, robust, clog x 0.6 at 60 of 120", ours(published), published, clog, 120, summary)
+        case(name, robust(published), published, disturbances, 20, held_after)
+    case("Bayes, robust, clog x 0.6 at 60 of 120", robust(published), published, clog, 120, summary)
     case(
         "filtered proportional, wait 6 s",
         (proportional(), Proportional(gain=11.4, time_constant=11.2)),

@@ -105,12 +105,12 @@ def measure(name: str) -> dict[str, float]:
     quadratic_gram(np.ones((2, 4)))
     imports = peak_MB()
     work = case()
-    tuples_made, seconds, found = peak_MB(), [], None
+    tuples_made, seconds, result = peak_MB(), [], None
     for _ in range(repeats):
         started = time.process_time()
-        found = work()
+        result = work()
         seconds.append(time.process_time() - started)
-    iterations = getattr(found, "iterations", None)
+    iterations = getattr(result, "iterations", None)
     if name == "kernel_6" and iterations != ITERATIONS:
         raise ValueError(f"kernel_6 should make {ITERATIONS} iterations but made {iterations}")
     return {
@@ -140,24 +140,24 @@ def fresh(name: str) -> dict[str, float]:
     return {key: statistics.median(run[key] for run in runs) for key in runs[0]}
 
 
-def bars(found: dict[str, dict[str, float]]) -> list[tuple[str, float, float, bool]]:
+def bars(measured: dict[str, dict[str, float]]) -> list[tuple[str, float, float, bool]]:
     """Figure, value, bar, and whether more is better."""
     return [
         (
             "N = 6, 15,000 samples, 500 iterations: times faster than the naive form",
-            found["naive_6"]["cpu_s"] / found["kernel_6"]["cpu_s"],
+            measured["naive_6"]["cpu_s"] / measured["kernel_6"]["cpu_s"],
             50.0,
             True,
         ),
         (
             "N = 6, 15,000 samples: GB above the imports",
-            found["kernel_6"]["above_imports_MB"] / 1024,
+            measured["kernel_6"]["above_imports_MB"] / 1024,
             0.6,
             False,
         ),
-        ("N = 2, 500 samples: s", found["kernel_2"]["cpu_s"], 0.05, False),
-        ("new weights: ms", 1000 * found["retune_2"]["cpu_s"], 30.0, False),
-        ("Riccati gains of a pair (Q, R): ms", 1000 * found["riccati"]["cpu_s"], 1.0, False),
+        ("N = 2, 500 samples: s", measured["kernel_2"]["cpu_s"], 0.05, False),
+        ("new weights: ms", 1000 * measured["retune_2"]["cpu_s"], 30.0, False),
+        ("Riccati gains of a pair (Q, R): ms", 1000 * measured["riccati"]["cpu_s"], 1.0, False),
     ]
 
 
@@ -165,16 +165,16 @@ def main() -> None:
     if len(sys.argv) > 1:
         print(json.dumps(measure(sys.argv[1])))
         return
-    found = {}
+    measured = {}
     for name in CASES:
         print(f"{name} ...", file=sys.stderr, flush=True)
-        found[name] = fresh(name)
-    for name, figures in found.items():
+        measured[name] = fresh(name)
+    for name, figures in measured.items():
         print(
             f"{name:10} {figures['cpu_s']:10.4f} CPU s {figures['above_imports_MB']:8.0f} "
             "MB above the imports"
         )
-    table = bars(found)
+    table = bars(measured)
     for figure, value, bar, more in table:
         held = value >= bar if more else value <= bar
         print(
@@ -186,7 +186,7 @@ def main() -> None:
         "machine": {"cores": os.cpu_count(), "blas_threads": 1},
         "cases": {
             name: {key: float(f"{value:.3g}") for key, value in figures.items()}
-            for name, figures in found.items()
+            for name, figures in measured.items()
         },
         "figures": [
             {

@@ -20,7 +20,7 @@ from mcap.reader import make_reader
 
 from pipeline.deposition.bead import area, measure_all
 from pipeline.deposition.rendering import NOMINAL, Camera
-from pipeline.deposition.workflow.trial_files import Conditions, read_trial, write_trial
+from pipeline.deposition.workflow.trial_files import Conditions, Signals, read_trial, write_trial
 from pipeline.store.mcap_frames import IMAGE_TOPIC
 
 FRAMES, ROUNDS = 450, 5
@@ -39,13 +39,8 @@ def rendered(count: int) -> list[np.ndarray]:
 def write(path: Path, frames: list[np.ndarray], encoding: str) -> None:
     t = np.arange(FRAMES // 30 * 50) / 50
     stream: Iterator = ((k / 30, frames[k % len(frames)]) for k in range(FRAMES))
-    signals = {
-        "position_mm": 8 * t,
-        "speed_mm_per_s": np.full(t.size, 8.0),
-        "command_mm": np.sin(t),
-        "flow_mm3_per_s": np.cos(t),
-    }
-    write_trial(path, CONDITIONS, stream, time_s=t, encoding=encoding, **signals)
+    signals = Signals(t, 8 * t, np.full(t.size, 8.0), np.sin(t), np.cos(t))
+    write_trial(path, CONDITIONS, stream, signals, encoding=encoding)
 
 
 def encoded(path: Path) -> list[np.ndarray]:
@@ -119,7 +114,7 @@ def main() -> None:
             path = Path(folder) / f"{encoding}.mcap"
             start = time.process_time()
             write(path, frames, encoding)
-            found = {
+            figures = {
                 "written_per_s": round(FRAMES / (time.process_time() - start), 1),
                 "MB": round(path.stat().st_size / 1e6, 1),
             }
@@ -131,20 +126,20 @@ def main() -> None:
             if encoding != "raw":
                 pictures = encoded(path)
                 ways["bare"] = lambda p=pictures: bare(p)
-            found |= rates(ways)
+            figures |= rates(ways)
             share = (
-                found["measured_per_s"] / found["bare_per_s"]
+                figures["measured_per_s"] / figures["bare_per_s"]
                 if encoding != "raw"
-                else found["measured_per_s"]
+                else figures["measured_per_s"]
             )
-            found |= {
+            figures |= {
                 "measured_of_bare" if encoding != "raw" else "raw_measured_per_s": round(share, 3),
                 "bar": bar,
             }
-            results[encoding] = found
+            results[encoding] = figures
             print(
                 f"{encoding:>5}: {share:.3g} (bar {bar:g}); "
-                + ", ".join(f"{name} {value:g}" for name, value in found.items())
+                + ", ".join(f"{name} {value:g}" for name, value in figures.items())
             )
     RESULTS.parent.mkdir(parents=True, exist_ok=True)
     RESULTS.write_text(json.dumps(results, indent=2) + "\n")

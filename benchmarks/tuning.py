@@ -66,8 +66,8 @@ def tracking_index(weights: np.ndarray) -> Problem:
     scaled = machine._replace(C=scale_y[:, None] * machine.C, B=machine.B / scale_u)
 
     def cost(theta: np.ndarray) -> float:
-        found = gains(machine, np.diag(theta[:5]), np.diag(theta[5:]), 0.99)
-        K_x, K_r = scale_u[:, None] * found.K_x, scale_u[:, None] * found.K_r / scale_y
+        optimal = gains(machine, np.diag(theta[:5]), np.diag(theta[5:]), 0.99)
+        K_x, K_r = scale_u[:, None] * optimal.K_x, scale_u[:, None] * optimal.K_r / scale_y
         return tuning.fitness(
             scaled, K_x, K_r, reference=scale_y * reference, gamma=0.99, steps=100, x0=np.full(6, 20.0)
         )
@@ -110,8 +110,8 @@ def valley(d: int) -> Problem:
 def ours(acquisition: str) -> Callable[[Problem, int], float]:
     def search(problem: Problem, seed: int) -> float:
         rng = np.random.default_rng(seed)
-        settings = {"initial": INITIAL, "evaluations": EVALUATIONS, "acquisition": acquisition}
-        return tuning.minimise(problem.cost, problem.lower, problem.upper, rng=rng, **settings).cost
+        settings = tuning.SearchSettings(INITIAL, EVALUATIONS, acquisition)
+        return tuning.minimise(problem.cost, problem.lower, problem.upper, settings, rng=rng).cost
 
     return search
 
@@ -135,9 +135,10 @@ def optuna_tpe(problem: Problem, seed: int) -> float:
     optuna.logging.set_verbosity(optuna.logging.ERROR)
 
     def objective(trial) -> float:
+        # NaN fails the trial
         return attempted(
             problem, np.array([trial.suggest_float(str(j), 0.0, 1.0) for j in range(len(problem.lower))])
-        )  # NaN fails the trial
+        )
 
     study = optuna.create_study(sampler=optuna.samplers.TPESampler(n_startup_trials=INITIAL, seed=seed))
     study.optimize(objective, n_trials=EVALUATIONS)
@@ -154,9 +155,9 @@ def cma_es(problem: Problem, seed: int) -> float:
     strategy = cma.CMAEvolutionStrategy(points[np.nanargmin(costs)], 0.2, settings)
     while len(costs) < EVALUATIONS:
         asked = strategy.ask()
-        told = [attempted(problem, point) for point in asked]
-        strategy.tell(asked, [np.inf if np.isnan(value) else value for value in told])
-        costs += told[: EVALUATIONS - len(costs)]
+        costs_of_round = [attempted(problem, point) for point in asked]
+        strategy.tell(asked, [np.inf if np.isnan(value) else value for value in costs_of_round])
+        costs += costs_of_round[: EVALUATIONS - len(costs)]
     return float(np.nanmin(costs))
 
 
@@ -182,13 +183,13 @@ def timed(search: Callable[[Problem, int], float], problem: Problem, seeds: int)
         began = time.perf_counter()
         costs.append(search(problem, seed))
         walls.append(time.perf_counter() - began)
-    found = {
+    record = {
         "optimum": problem.optimum,
         "median": statistics.median(costs),
         "worst": max(costs),
         "costs": costs,
     }
-    return found | {"wall_s": statistics.median(walls)}
+    return record | {"wall_s": statistics.median(walls)}
 
 
 def main() -> None:
@@ -202,11 +203,11 @@ def main() -> None:
             continue
         results[name] = {}
         for label, problem in PROBLEMS.items():
-            found = results[name][label] = timed(search, problem, seeds)
-            excess = found["median"] - problem.optimum, found["worst"] - problem.optimum
+            record = results[name][label] = timed(search, problem, seeds)
+            excess = record["median"] - problem.optimum, record["worst"] - problem.optimum
             print(
                 f"{name:>20} {label:>20}: above the optimum {excess[0]:10.4g} median {excess[1]:10.4g} "
-                f"worst, {found['wall_s']:5.1f} s"
+                f"worst, {record['wall_s']:5.1f} s"
             )
     best = results["expected improvement"]["(37)"]
     print(*(f"(37) {key}: {best[key]:,.1f}, bar {bar:,}" for key, bar in BARS.items()), sep="\n")

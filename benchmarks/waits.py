@@ -78,10 +78,10 @@ def autocorrelation(errors: np.ndarray, *, longest: int) -> np.ndarray:
             f"all alike, found {e.shape}; "
             "take longer segments, and flows near the class borders"
         )
-    seen = np.isfinite(e)
-    e = np.where(seen, e - e[seen].mean(), 0.0)
+    mask = np.isfinite(e)
+    e = np.where(mask, e - e[mask].mean(), 0.0)
     pairs = [
-        (e[:, : e.shape[1] - k] * e[:, k:]).sum() / max((seen[:, : e.shape[1] - k] & seen[:, k:]).sum(), 1)
+        (e[:, : e.shape[1] - k] * e[:, k:]).sum() / max((mask[:, : e.shape[1] - k] & mask[:, k:]).sum(), 1)
         for k in range(longest)
     ]
     return np.array(pairs) / pairs[0]

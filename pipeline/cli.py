@@ -2,8 +2,10 @@
 
 import argparse
 import datetime
+import importlib.metadata
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 from pipeline.nightly import commands as nights
@@ -91,7 +93,7 @@ def history(arguments: argparse.Namespace) -> None:
     from pipeline.report.runs import trend
     from pipeline.report.shared.verdict import ReportRules
 
-    found = list(tqdm(past.runs(arguments.most), desc="history", unit=" runs", file=sys.stderr))
+    found = list(tqdm(past.revisions(arguments.most), desc="history", unit=" runs", file=sys.stderr))
     pages = [
         (path.stem, path.name) for path in sorted(Path("reports").glob("*.html")) if path.stem != "history"
     ]
@@ -130,7 +132,7 @@ def compose(arguments: argparse.Namespace) -> None:
     )
     arguments.out.mkdir(parents=True, exist_ok=True)
     files = compose_parts.write(part, arguments.out)
-    print(compose_parts.told(part))
+    print(compose_parts.summary_lines(part))
     print("written: " + ", ".join(str(file) for file in files))
 
 
@@ -153,10 +155,19 @@ def calibrate_tip(arguments: argparse.Namespace) -> None:
     print(calibrate(arguments.image, out, arguments.tip, least_score=least_score, topic=topic))
 
 
+def version() -> str:
+    """The version that pyproject.toml beside the code states; without one, that of the installed package."""
+    project = Path(__file__).resolve().parents[1] / "pyproject.toml"
+    if project.exists():
+        return tomllib.loads(project.read_text(encoding="utf-8"))["project"]["version"]
+    return importlib.metadata.version("beadline")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         prog="beadline", description="Extrusion-printer recordings into controllers that can be trusted."
     )
+    parser.add_argument("--version", action="version", version=f"beadline {version()}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     commands.add_parser("accept", help=accept.__doc__).set_defaults(run=accept)
     commands.add_parser("verify", help=verify.__doc__).set_defaults(run=verify)

@@ -1,5 +1,7 @@
-"""Is the challenger better than the champion beyond noise? Both ran the same cases; cases that share a plant,
-a part or a recording are one block, and blocks are what repeats.
+"""Paired tests and intervals: is the challenger better than the champion beyond noise?
+
+Both ran the same cases. Cases that share a plant, a part or a recording are one block, and the blocks are
+independent.
 
 d_b = mean over the cases of block b of log(champion's cost / challenger's cost). Under
 "no difference" every d_b is as likely with either sign: the sign-flip test (Fisher
@@ -12,12 +14,15 @@ from typing import NamedTuple
 import numpy as np
 import scipy.special
 
-EXACT = 14  # blocks up to which all 2^n signs are tried
+# up to so many blocks all 2^n signs are tried
+EXACT = 14
 
 
 class Paired(NamedTuple):
-    """improvement of the mean cost in percent with the ends of its 90 % interval (Student's t over blocks),
-    and the one-sided probability that chance alone does as well."""
+    """Improvement of the mean cost in percent with the ends of its 90 % interval (Student's t over blocks).
+
+    `p` is the one-sided probability that chance alone does as well.
+    """
 
     improvement_percent: float
     low_percent: float
@@ -35,8 +40,11 @@ def paired(
     rng: np.random.Generator,
     draws: int = 20_000,
 ) -> Paired:
-    """Costs (cases,) above 0, less is better; an infinite cost of the challenger counts as a thousand times
-    the champion's. Raises ValueError for costs that are none."""
+    """The challenger's improvement over the champion, from costs (cases,) above 0; less is better.
+
+    An infinite cost of the challenger counts as a thousand times the champion's. Raises ValueError for a
+    champion's cost that is not finite and above 0, and for a negative one of the challenger.
+    """
     champion, challenger = np.asarray(champion, float), np.asarray(challenger, float)
     if len(champion) == 0 or not (
         np.isfinite(champion).all() and (champion > 0).all() and (challenger >= 0).all()
@@ -61,7 +69,7 @@ def paired(
 
 
 def blocks_needed(level: float) -> int:
-    """The fewest blocks with which a sign-flip test can reach `level`: 2^-n <= level."""
+    """The smallest number of blocks with which a sign-flip test can reach `level`: 2^-n <= level."""
     return int(np.ceil(np.log2(1 / level)))
 
 
@@ -74,11 +82,11 @@ class Share(NamedTuple):
 
 
 def wilson(happened: np.ndarray) -> Share:
-    """The share of True (n,) in percent with the interval of Wilson 1927 at 95 %: (p + z^2 / 2n +- z sqrt(p
-    (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n)."""
+    """The share of True (n,) in percent with its 95 % interval (Wilson 1927).
+
+    (p + z^2 / 2n +- z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n)
+    """
     n, p, z = len(happened), float(np.mean(happened)), float(scipy.special.ndtri(0.975))
-    centre, half = (
-        (p + z**2 / (2 * n)) / (1 + z**2 / n),
-        z * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2)) / (1 + z**2 / n),
-    )
+    centre = (p + z**2 / (2 * n)) / (1 + z**2 / n)
+    half = z * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2)) / (1 + z**2 / n)
     return Share(100.0 * p, float(100.0 * max(centre - half, 0.0)), float(100.0 * min(centre + half, 1.0)))

@@ -13,7 +13,7 @@ from pipeline.store import artifacts, params
 
 def main() -> None:
     with artifacts.stage("compose_parts") as out:
-        p, printer, taught = (
+        settings, printer, training = (
             params.load(ComposeParts, "compose_parts"),
             params.load(Printer, "printer"),
             params.load(TrainIlc, "train_ilc"),
@@ -22,8 +22,8 @@ def main() -> None:
             "datasets/segment_library/library.parquet", "datasets/segment_library/learned.json"
         )
         models = artifacts.read_json("datasets/train_ilc/models.json")
-        parts, refused = compose_parts.compose_all(Path("datasets/parts"), learned, printer, p)
-        done = compose_parts.judged(parts, learned, models, printer, p, taught)
+        parts, refused = compose_parts.compose_all(Path("datasets/parts"), learned, printer, settings)
+        done = compose_parts.judged(parts, learned, models, printer, settings, training)
         rows = compose_parts.rows(done)
         for name, schema in (("signals", SIGNALS), ("scores", SCORES), ("tasks", TASKS), ("lines", LINES)):
             artifacts.write_table(out / f"{name}.parquet", schema, rows[name])

@@ -14,31 +14,37 @@ from pipeline.store import artifacts, params
 
 def main() -> None:
     with artifacts.stage("evaluate_setpoint") as out:
-        p, view = (
+        settings, view = (
             params.load(EvaluateSetpoint, "evaluate_setpoint"),
             params.load(TrainClassifier, "train_classifier"),
         )
-        known = restore_classifier(
+        model = restore_classifier(
             "datasets/train_classifier/weights.safetensors", "datasets/train_classifier/calibration.parquet"
         )
-        tables = window_tables(artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS))
-        seats = evaluate_setpoint.seats(
-            p.baselines, restore_agents("datasets/train_agent/weights.safetensors"), tables["learn"]
+        windows = window_tables(artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS))
+        controllers = evaluate_setpoint.controllers(
+            settings.baselines, restore_agents("datasets/train_agent/weights.safetensors"), windows["learn"]
         )
-        scores = evaluate_setpoint.scores(seats, tables["judge"], p)
+        scores = evaluate_setpoint.scores(controllers, windows["judge"], settings)
         choice = evaluate_setpoint.chosen(scores)
-        pixels = evaluate_setpoint.pixel_runs(seats, choice, known, p, view)
+        rollouts = evaluate_setpoint.pixel_rollouts(controllers, choice, model, settings, view)
         artifacts.write_table(
-            out / "scoreboard.parquet", SCOREBOARD, evaluate_setpoint.scoreboard(seats, scores, pixels)
+            out / "scoreboard.parquet",
+            SCOREBOARD,
+            evaluate_setpoint.scoreboard(controllers, scores, rollouts),
         )
         artifacts.write_table(
-            out / "paths.parquet", PATHS, evaluate_setpoint.paths(seats, tables["judge"], p, pixels)
+            out / "paths.parquet",
+            PATHS,
+            evaluate_setpoint.paths(controllers, windows["judge"], settings, rollouts),
         )
         artifacts.write_table(
-            out / "decisions.parquet", DECISIONS, evaluate_setpoint.decisions(choice.name, pixels)
+            out / "decisions.parquet", DECISIONS, evaluate_setpoint.decisions(choice.name, rollouts)
         )
         artifacts.write_json(out / "choice.json", choice)
-        artifacts.write_metrics("evaluate_setpoint", evaluate_setpoint.metrics(seats, scores, choice, pixels))
+        artifacts.write_metrics(
+            "evaluate_setpoint", evaluate_setpoint.metrics(controllers, scores, choice, rollouts)
+        )
 
 
 if __name__ == "__main__":

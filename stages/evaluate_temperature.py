@@ -9,18 +9,22 @@ from pipeline.temperature.workflow.settings import EvaluateTemperature, Panel, P
 
 def main() -> None:
     with artifacts.stage("evaluate_temperature") as out:
-        p, machine = params.load(EvaluateTemperature, "evaluate_temperature"), params.load(Plant, "plant")
+        settings, machine = (
+            params.load(EvaluateTemperature, "evaluate_temperature"),
+            params.load(Plant, "plant"),
+        )
         tracking, panel = params.load(Tracking, "tracking"), params.load(Panel, "panel")
         execution = params.load(params.Execution, "execution")
         simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
-        evaluate_temperature.check(p, panel)
-        known = evaluate_temperature.read_learned(
-            "datasets/identify_plant/plant.parquet", "datasets/learn_kernel/window.parquet",
-            "datasets/learn_kernel/kernel.parquet",
-            "datasets/tune_weights/weights.json", "datasets/identify_plant/spread.parquet",
-        )  # fmt: skip
-        judged = evaluate_temperature.judged(p, machine, tracking, panel, known, simulated=simulated)
-        studied = evaluate_temperature.studied(p, execution, "datasets/published")
+        evaluate_temperature.check(settings, panel)
+        learned = evaluate_temperature.read_learned(
+            "datasets/identify_plant/plant.parquet",
+            "datasets/identify_plant/spread.parquet",
+            "datasets/tune_weights/weights.json",
+            "datasets/learn_kernel",
+        )
+        judged = evaluate_temperature.judged(settings, machine, tracking, panel, learned, simulated=simulated)
+        studied = evaluate_temperature.studied(settings, execution, "datasets/published")
         artifacts.write_table(out / "scorecard.parquet", tables.SCORECARD, judged.scorecard)
         artifacts.write_table(out / "trajectories.parquet", *judged.trajectories)
         artifacts.write_table(out / "study.parquet", tables.STUDY, studied.rows)

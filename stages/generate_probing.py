@@ -8,14 +8,14 @@ from pipeline.temperature.workflow.settings import GenerateProbing, Plant
 
 def main() -> None:
     with artifacts.stage("generate_probing") as out:
-        p, machine = params.load(GenerateProbing, "generate_probing"), params.load(Plant, "plant")
-        if p.source == "recordings":
-            found = generate_probing.planned(p, machine)
-            artifacts.write_csv(out / "next_experiment.csv", found.columns)
+        settings, machine = params.load(GenerateProbing, "generate_probing"), params.load(Plant, "plant")
+        if settings.source == "recordings":
+            result = generate_probing.planned(settings, machine)
+            artifacts.write_csv(out / "next_experiment.csv", result.columns)
         else:
-            found = generate_probing.probed(p, machine)
-            artifacts.write_recording(out / "probing.mcap", found.time_s, found.signals)
-        artifacts.write_metrics("generate_probing", found.metrics)
+            result = generate_probing.probed(settings, machine)
+            artifacts.write_recording(out / "probing.mcap", result.time_s, result.signals)
+        artifacts.write_metrics("generate_probing", result.metrics)
 
 
 if __name__ == "__main__":

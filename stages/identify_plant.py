@@ -10,13 +10,13 @@ from pipeline.temperature.workflow.settings import IdentifyPlant, Plant
 
 def main() -> None:
     with artifacts.stage("identify_plant") as out:
-        p, machine = params.load(IdentifyPlant, "identify_plant"), params.load(Plant, "plant")
-        found = identify_plant.identified(p, machine, "datasets/ingest/record.parquet")
-        artifacts.write_arrays(out / "plant.parquet", "plant", 1, plant.stored([found.plant]))
-        artifacts.write_arrays(out / "spread.parquet", "spread", 1, plant.stored(found.spread))
-        for name, (schema, columns) in found.tables.items():
+        settings, machine = params.load(IdentifyPlant, "identify_plant"), params.load(Plant, "plant")
+        identified = identify_plant.identified(settings, machine, "datasets/ingest/record.parquet")
+        artifacts.write_arrays(out / "plant.parquet", "plant", 1, plant.stored([identified.plant]))
+        artifacts.write_arrays(out / "spread.parquet", "spread", 1, plant.stored(identified.spread))
+        for name, (schema, columns) in identified.tables.items():
             artifacts.write_table(out / f"{name}.parquet", schema, columns)
-        artifacts.write_metrics("identify_plant", found.metrics)
+        artifacts.write_metrics("identify_plant", identified.metrics)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from pipeline.temperature.workflow.settings import Ingest, Plant
 
 def main() -> None:
     with artifacts.stage("ingest") as out:
-        p, machine, execution = (
+        settings, machine, execution = (
             params.load(Ingest, "ingest"),
             params.load(Plant, "plant"),
             params.load(params.Execution, "execution"),
@@ -23,9 +23,11 @@ def main() -> None:
             {"simulated": "datasets/generate_probing", "recordings": "datasets/raw/temperature"}[source]
         )
         results = ingest.process(
-            folder, ingest.job_of(p, machine, source), execution, memo=Path("datasets/memo/ingest")
+            folder, ingest.spec_of(settings, machine, source), execution, memo=Path("datasets/memo/ingest")
         )
-        record, quality, metrics = ingest.collect(results, machine, strict=p.strict or "--strict" in sys.argv)
+        record, quality, metrics = ingest.collect(
+            results, machine, strict=settings.strict or "--strict" in sys.argv
+        )
         artifacts.write_table(out / "record.parquet", record.schema, record.columns)
         artifacts.write_table(out / "quality.parquet", quality.schema, quality.columns)
         artifacts.write_metrics("ingest", metrics)

@@ -10,13 +10,13 @@ from pipeline.temperature.workflow.settings import LearnKernel, Panel, Plant, Tr
 
 def main() -> None:
     with artifacts.stage("learn_kernel") as out:
-        p, machine = params.load(LearnKernel, "learn_kernel"), params.load(Plant, "plant")
+        settings, machine = params.load(LearnKernel, "learn_kernel"), params.load(Plant, "plant")
         tracking, panel = params.load(Tracking, "tracking"), params.load(Panel, "panel")
-        found = learn_kernel.learned(p, machine, tracking, panel, "datasets/ingest/record.parquet")
-        artifacts.write_arrays(out / "window.parquet", "window", 1, window.stored(found.window))
-        if found.best.learned is not None:
-            artifacts.write_arrays(out / "kernel.parquet", "kernel", 1, found.best.learned.stored())
-        artifacts.write_metrics("learn_kernel", found.metrics)
+        learned = learn_kernel.learned(settings, machine, tracking, panel, "datasets/ingest/record.parquet")
+        artifacts.write_arrays(out / "window.parquet", "window", 1, window.stored(learned.window))
+        if learned.best.learned is not None:
+            artifacts.write_arrays(out / "kernel.parquet", "kernel", 1, learned.best.learned.stored())
+        artifacts.write_metrics("learn_kernel", learned.metrics)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
-"""Artifacts -> pages: reads the metrics and tables of every stage and reports/accepted.json; writes
-reports/index.html, temperature.html, identification.html, deposition.html and setpoint.html.
+"""Artifacts -> pages: reports/index.html, temperature.html, identification.html, deposition.html,
+setpoint.html.
 
-What is missing is shown as missing; what was read is hashed, and the pages carry the hashes. The drift on
-page one is that of the last night before (reports/metrics/nightly.json), which the nightly job writes after
-the pages and which is therefore no dependency of theirs.
+It reads the metrics and tables of every stage and reports/accepted.json. A missing file is shown as missing.
+Every file read is hashed, and the pages carry the hashes. The drift on page one is that of the last night
+(reports/metrics/nightly.json). The nightly job writes that file after the pages, so it is no dependency.
 """
 
 import hashlib
@@ -19,6 +19,35 @@ from pipeline.report.temperature.judgement import judgement, shown
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow.settings import Panel, Plant, Tracking
 
+# what the pages show of each stage: its figures, and its folder of tables
+METRICS = {
+    "generate_probing": "reports/metrics/generate_probing.json",
+    "ingest": "reports/metrics/ingest.json",
+    "identify_plant": "reports/metrics/identify_plant.json",
+    "learn_kernel": "reports/metrics/learn_kernel.json",
+    "tune_weights": "reports/metrics/tune_weights.json",
+    "evaluate_temperature": "reports/metrics/evaluate_temperature.json",
+    "train_ilc": "reports/metrics/train_ilc.json",
+    "segment_library": "reports/metrics/segment_library.json",
+    "compose_parts": "reports/metrics/compose_parts.json",
+    "train_classifier": "reports/metrics/train_classifier.json",
+    "train_agent": "reports/metrics/train_agent.json",
+    "evaluate_setpoint": "reports/metrics/evaluate_setpoint.json",
+}
+FOLDERS = {
+    "ingest": "datasets/ingest",
+    "identify_plant": "datasets/identify_plant",
+    "learn_kernel": "datasets/learn_kernel",
+    "tune_weights": "datasets/tune_weights",
+    "evaluate_temperature": "datasets/evaluate_temperature",
+    "train_ilc": "datasets/train_ilc",
+    "segment_library": "datasets/segment_library",
+    "compose_parts": "datasets/compose_parts",
+    "train_classifier": "datasets/train_classifier",
+    "train_agent": "datasets/train_agent",
+    "evaluate_setpoint": "datasets/evaluate_setpoint",
+}
+
 
 def main() -> None:
     with artifacts.stage("report"):
@@ -29,34 +58,7 @@ def main() -> None:
             params.load(Tracking, "tracking"),
             params.read(),
         )
-        metrics = {
-            "generate_probing": "reports/metrics/generate_probing.json",
-            "ingest": "reports/metrics/ingest.json",
-            "identify_plant": "reports/metrics/identify_plant.json",
-            "learn_kernel": "reports/metrics/learn_kernel.json",
-            "tune_weights": "reports/metrics/tune_weights.json",
-            "evaluate_temperature": "reports/metrics/evaluate_temperature.json",
-            "train_ilc": "reports/metrics/train_ilc.json",
-            "segment_library": "reports/metrics/segment_library.json",
-            "compose_parts": "reports/metrics/compose_parts.json",
-            "train_classifier": "reports/metrics/train_classifier.json",
-            "train_agent": "reports/metrics/train_agent.json",
-            "evaluate_setpoint": "reports/metrics/evaluate_setpoint.json",
-        }
-        folders = {
-            "ingest": "datasets/ingest",
-            "identify_plant": "datasets/identify_plant",
-            "learn_kernel": "datasets/learn_kernel",
-            "tune_weights": "datasets/tune_weights",
-            "evaluate_temperature": "datasets/evaluate_temperature",
-            "train_ilc": "datasets/train_ilc",
-            "segment_library": "datasets/segment_library",
-            "compose_parts": "datasets/compose_parts",
-            "train_classifier": "datasets/train_classifier",
-            "train_agent": "datasets/train_agent",
-            "evaluate_setpoint": "datasets/evaluate_setpoint",
-        }
-        sources = collect(declared, metrics, folders, "reports/accepted.json", ("pipeline", "stages"))
+        sources = collect(declared, METRICS, FOLDERS, "reports/accepted.json", ("pipeline", "stages"))
         judged = judgement(sources)
         pages = {
             "index": index_page.render(sources, judged),
@@ -73,7 +75,7 @@ def main() -> None:
         artifacts.write_metrics(
             "report",
             {
-                "verdict": judged.verdict._asdict(),
+                "verdict": judged.verdict.metrics(),
                 "figures": shown(judged),
                 "bytes": {name: len(text.encode()) for name, text in pages.items()},
                 "pictures": {name: text.count('role="img"') for name, text in pages.items()},

@@ -10,9 +10,12 @@ from pipeline.store import artifacts, params
 
 def main() -> None:
     with artifacts.stage("segment_library") as out:
-        p, printer = params.load(SegmentLibrary, "segment_library"), params.load(Printer, "printer")
-        filmed = params.value("train_ilc.source", one_of=("simulated", "recordings")) == "recordings"
-        learned = segment_library.learned(p, printer, "datasets/train_ilc/lessons.parquet", filmed=filmed)
+        settings = params.load(SegmentLibrary, "segment_library")
+        printer = params.load(Printer, "printer")
+        recorded = params.value("train_ilc.source", one_of=("simulated", "recordings")) == "recordings"
+        learned = segment_library.learned(
+            settings, printer, "datasets/train_ilc/lessons.parquet", recorded=recorded
+        )
         table, rest = segment_library.stored(learned)
         artifacts.write_table(out / "library.parquet", LIBRARY, table)
         artifacts.write_json(out / "learned.json", rest)

@@ -6,40 +6,48 @@ the simulator, and frames for the page."""
 from pipeline.setpoint.workflow import parts, train_classifier
 from pipeline.setpoint.workflow.classifier_files import store_classifier
 from pipeline.setpoint.workflow.settings import TrainClassifier
-from pipeline.setpoint.workflow.tables import CLASSIFIED, COURSE, RELIABILITY, WINDOWS
+from pipeline.setpoint.workflow.tables import CLASSIFIED, CLASSIFIER_CURVE, RELIABILITY, WINDOWS
 from pipeline.setpoint.workflow.windows import window_rows
 from pipeline.store import artifacts, params
 
 
 def main() -> None:
     with artifacts.stage("train_classifier") as out:
-        p, execution = (
+        settings, execution = (
             params.load(TrainClassifier, "train_classifier"),
             params.load(params.Execution, "execution"),
         )
-        found, read = parts.parts(p, "datasets/raw/setpoint", execution)
-        networks = train_classifier.trained(p, found)
-        done = train_classifier.judged(p, found, networks)
-        tables = train_classifier.recorded(p, done.eyes, parts.to_record(p, found, execution))
-        store_classifier(out, p, done.eyes)
+        by_part, read = parts.parts(settings, "datasets/raw/setpoint", execution)
+        networks = train_classifier.trained(settings, by_part)
+        judged = train_classifier.judged(settings, by_part, networks)
+        windows = train_classifier.recorded(
+            settings, judged.model, parts.to_record(settings, by_part, execution)
+        )
+        store_classifier(out, settings, judged.model)
         artifacts.write_table(
-            out / "classified.parquet", CLASSIFIED, train_classifier.classified(done, found["judged"].flow)
+            out / "classified.parquet",
+            CLASSIFIED,
+            train_classifier.classified(judged, by_part["judged"].flow),
         )
         artifacts.write_table(
-            out / "reliability.parquet", RELIABILITY, train_classifier.reliability_rows(p, done)
+            out / "reliability.parquet", RELIABILITY, train_classifier.reliability_rows(settings, judged)
         )
-        course = train_classifier.course_rows(networks)
-        artifacts.write_table(out / "course.parquet", COURSE, course)
-        artifacts.write_course(
+        curves = train_classifier.curve_rows(networks)
+        artifacts.write_table(out / "course.parquet", CLASSIFIER_CURVE, curves)
+        artifacts.write_learning_curve(
             out / "live",
-            course,
+            curves,
             of="learner",
             step="epoch",
             figures=("training_loss", "held_out_loss", "held_out_accuracy"),
         )
-        artifacts.write_table(out / "windows.parquet", WINDOWS, window_rows(tables))
-        artifacts.write_json(out / "frames/frames.json", train_classifier.shown(p, done.eyes, out / "frames"))
-        artifacts.write_metrics("train_classifier", train_classifier.metrics(p, done, networks, read))
+        artifacts.write_table(out / "windows.parquet", WINDOWS, window_rows(windows))
+        artifacts.write_json(
+            out / "frames/frames.json", train_classifier.shown(settings, judged.model, out / "frames")
+        )
+        artifacts.write_metrics(
+            "train_classifier", train_classifier.metrics(settings, judged, networks, read)
+        )
 
 
 if __name__ == "__main__":

@@ -12,21 +12,22 @@ from pipeline.store import artifacts, params
 
 def main() -> None:
     with artifacts.stage("train_ilc") as out:
-        p, printer, camera = (
+        settings, printer, camera = (
             params.load(TrainIlc, "train_ilc"),
             params.load(Printer, "printer"),
             params.load(Camera, "camera"),
         )
         execution, recorded = params.load(params.Execution, "execution"), "datasets/raw/deposition"
-        found = train_ilc.trained(p, printer, camera, execution, recorded=recorded, out=out)
-        artifacts.write_table(out / "trials.parquet", TRIALS, training.rows(found.runs))
-        artifacts.write_table(out / "lessons.parquet", LESSONS, training.lessons(found.runs))
-        artifacts.write_table(out / "filmed.parquet", FILMED, trial_video.rows(found.watched))
-        artifacts.write_json(out / "models.json", found.models)
+        done = train_ilc.trained(settings, printer, camera, execution, recorded=recorded, out=out)
+        artifacts.write_table(out / "trials.parquet", TRIALS, training.trial_rows(done.sequences))
+        artifacts.write_table(out / "lessons.parquet", LESSONS, training.sample_rows(done.sequences))
+        artifacts.write_table(out / "filmed.parquet", FILMED, trial_video.rows(done.measured))
+        artifacts.write_json(out / "models.json", done.models)
         artifacts.write_json(
-            out / "frames/frames.json", train_ilc.shown(p, camera, execution, recorded=recorded, out=out)
+            out / "frames/frames.json",
+            train_ilc.shown(settings, camera, execution, recorded=recorded, out=out),
         )
-        artifacts.write_metrics("train_ilc", found.metrics)
+        artifacts.write_metrics("train_ilc", done.metrics)
 
 
 if __name__ == "__main__":

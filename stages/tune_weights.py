@@ -9,16 +9,16 @@ from pipeline.temperature.workflow.settings import Panel, Plant, Tracking, TuneW
 
 def main() -> None:
     with artifacts.stage("tune_weights") as out:
-        p, machine = params.load(TuneWeights, "tune_weights"), params.load(Plant, "plant")
+        settings, machine = params.load(TuneWeights, "tune_weights"), params.load(Plant, "plant")
         tracking, panel = params.load(Tracking, "tracking"), params.load(Panel, "panel")
         model = plant.restored(artifacts.read_arrays("datasets/identify_plant/plant.parquet", "plant", 1))[0]
-        found = tune_weights.tuned(p, machine, tracking, panel, model)
-        artifacts.write_json(out / "weights.json", found.weights)
-        artifacts.write_table(out / "history.parquet", tables.TUNING, found.history)
-        artifacts.write_course(
-            out / "live", found.history, of="mode", step="evaluation", figures=("cost", "incumbent")
+        tuned = tune_weights.tuned(settings, machine, tracking, panel, model)
+        artifacts.write_json(out / "weights.json", tuned.weights)
+        artifacts.write_table(out / "history.parquet", tables.TUNING, tuned.history)
+        artifacts.write_learning_curve(
+            out / "live", tuned.history, of="mode", step="evaluation", figures=("cost", "incumbent")
         )
-        artifacts.write_metrics("tune_weights", found.metrics)
+        artifacts.write_metrics("tune_weights", tuned.metrics)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
-"""The house, read off the syntax tree: who imports whom, who opens
-files, and the dvc.yaml that the stages ask for."""
+"""The rules of the house on the syntax tree: imports, open files, and the dvc.yaml that the stages ask
+for."""
 
 import ast
 import functools
@@ -105,8 +105,7 @@ def files(root: Path, *folders: str) -> Iterator[File]:
 
 
 def imports(tree: ast.AST) -> Iterator[tuple[int, str]]:
-    """(line, dotted name) of what is imported, `from a import b` as
-    a.b; a relative import begins with a dot."""
+    """(line, dotted name) of each import; `from a import b` is a.b. A relative import begins with a dot."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from ((node.lineno, alias.name) for alias in node.names)
@@ -128,8 +127,8 @@ def project_file(root: Path, name: str) -> str | None:
 
 
 def calls(tree: ast.AST) -> Iterator[tuple[ast.Call, str, str]]:
-    """(call, receiver, function): artifacts.write_text(...) is
-    ("artifacts", "write_text"), open(...) ("", "open")."""
+    """(call, receiver, function) of each call: artifacts.write_text(...) is ("artifacts", "write_text"),
+    open(...) ("", "open")."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Call):
             *receiver, function = ast.unparse(node.func).rsplit(".", 1)
@@ -161,28 +160,28 @@ def may_know(room: str, target: str) -> bool:
 
 
 def forbidden_imports(root: Path) -> list[str]:
-    found = []
+    sentences = []
     for file in files(root, "pipeline", "stages"):
         numerics = file.room in LOOPS or file.room == "statistics"
         for line, name in imports(file.tree):
             target = project_file(root, name)
             room = File(target, file.tree).room if target and target != "pipeline/__init__.py" else ""
-            why = ""
+            reason = ""
             if name.startswith("."):
-                why = "write the whole name"
+                reason = "write the whole name"
             elif room == "stages" or name.split(".")[0] == "tests":
-                why = "nothing imports a stage or a test"
+                reason = "nothing imports a stage or a test"
             elif room and not may_know(file.room, room):
-                why = f"{file.room} must not know {room}"
+                reason = f"{file.room} must not know {room}"
             elif numerics and not target and name.split(".")[0] not in NUMERICS | LANGUAGE:
-                why = f"{file.room} knows arrays, nothing of files, clocks, processes or figures"
+                reason = f"{file.room} knows arrays, nothing of files, clocks, processes or figures"
             elif file.room.endswith("/settings") and name.split(".")[0] in HEAVY:
-                why = "a settings class imports nothing heavy"
+                reason = "a settings class imports nothing heavy"
             elif file.room == "stages" and name.split(".")[0] in FORMATS:
-                why = "only artifacts opens artifacts"
-            if why:
-                found.append(f"{file.name}:{line} imports {name}: {why}")
-    return found
+                reason = "only artifacts opens artifacts"
+            if reason:
+                sentences.append(f"{file.name}:{line} imports {name}: {reason}")
+    return sentences
 
 
 def misplaced(root: Path) -> list[str]:
@@ -195,8 +194,8 @@ def misplaced(root: Path) -> list[str]:
 
 
 def forbidden_files(root: Path) -> list[str]:
-    """Loops and stages read and write nothing by themselves; the edge writes through artifacts."""
-    found = []
+    """Files that loops and stages open by themselves, and files that the edge writes without artifacts."""
+    sentences = []
     for file in files(root, "pipeline", "stages"):
         forbidden = WRITES | READS if file.room in (*LOOPS, "statistics", "stages") else WRITES
         for call, receiver, function in calls(file.tree):
@@ -210,30 +209,30 @@ def forbidden_files(root: Path) -> list[str]:
                 and receiver not in EDGE_CALLS
                 and (function in forbidden or opened_to_write)
             ):
-                found.append(
+                sentences.append(
                     f"{file.name}:{call.lineno} {ast.unparse(call.func)}: only artifacts opens artifacts"
                 )
-    return found
+    return sentences
 
 
 def forbidden_randomness(root: Path) -> list[str]:
-    found = []
+    sentences = []
     for file in files(root, "pipeline", "stages"):
         for call, receiver, function in calls(file.tree):
             if receiver in ("np.random", "numpy.random") and (
                 function not in GENERATORS or (function == "default_rng" and not call.args)
             ):
-                found.append(
+                sentences.append(
                     f"{file.name}:{call.lineno} {ast.unparse(call)}: "
                     "the stage makes a seeded generator and hands it on"
                 )
-    return found
+    return sentences
 
 
 def unframed(root: Path) -> list[str]:
-    """What a stage reads outside `with artifacts.stage(...)`: there bad
-    input would end in a traceback, not in one sentence."""
-    found = []
+    """Reads of a stage outside `with artifacts.stage(...)`. Bad input there ends in a traceback, not in one
+    sentence."""
+    sentences = []
     for file in files(root, "stages"):
         mains = [node for node in file.tree.body if isinstance(node, ast.FunctionDef) and node.name == "main"]
         for statement in [statement for main in mains for statement in main.body]:
@@ -242,19 +241,19 @@ def unframed(root: Path) -> list[str]:
             )
             for call, receiver, _ in calls(statement):
                 if not framed and receiver in EDGE_CALLS:
-                    found.append(
+                    sentences.append(
                         f"{file.name}:{call.lineno} {ast.unparse(call)}: "
                         "move it into `with artifacts.stage(...)`"
                     )
-    return found
+    return sentences
 
 
 # ---- dvc.yaml
 
 
 def modules(root: Path, name: str) -> set[str]:
-    """The file itself and every file of the project that it imports,
-    and that those import; empty __init__.py left out."""
+    """The file itself and every file of the project that it imports, directly or not, without empty
+    __init__.py."""
     reached, todo = set(), [name]
     while todo:
         here = todo.pop()
@@ -268,7 +267,7 @@ def modules(root: Path, name: str) -> set[str]:
 
 def data_files(root: Path, modules: set[str]) -> set[str]:
     """Templates and the like beside the modules: a file, or a folder without modules."""
-    found = set()
+    data = set()
     for folder in {(root / name).parent for name in modules}:
         for path in folder.iterdir():
             inside = [
@@ -277,8 +276,8 @@ def data_files(root: Path, modules: set[str]) -> set[str]:
                 if file.is_file() and "__pycache__" not in file.parts
             ]
             if inside and not path.name.startswith(".") and all(file.suffix != ".py" for file in inside):
-                found.add(path.relative_to(root).as_posix())
-    return found
+                data.add(path.relative_to(root).as_posix())
+    return data
 
 
 def literal(file: str, call: ast.Call, position: int) -> str:
@@ -290,8 +289,8 @@ def literal(file: str, call: ast.Call, position: int) -> str:
 
 
 def loads(name: str, tree: ast.AST) -> Iterator[tuple[str, str]]:
-    """(model, key): the sections that params.load reads whole, and
-    with model "" the keys that params.value reads."""
+    """(model, key): the sections that params.load reads, and with model "" the keys that params.value
+    reads."""
     for call, receiver, function in calls(tree):
         if receiver == "params" and function == "load":
             yield ast.unparse(call.args[0]), literal(name, call, 1)
@@ -325,13 +324,13 @@ def tracked(root: Path, keys: set[str]) -> list[Any]:
     """Keys as DVC lists them, each under the files in which it stands: those of params.yaml bare, those of
     params.expert.yaml below its name."""
     owner, expert = root / params.FILE, root / params.EXPERT
-    found = params.files(owner) if owner.exists() else {}
-    standing = {
-        name: sorted(key for key in keys if key in _flattened(sections)) for name, sections in found.items()
+    by_file = params.files(owner) if owner.exists() else {}
+    present = {
+        name: sorted(key for key in keys if key in _flattened(sections)) for name, sections in by_file.items()
     }
-    methods = standing.get(str(expert), [])
+    methods = present.get(str(expert), [])
     # what stands nowhere is asked for where a person looks first
-    return sorted({*standing.get(str(owner), []), *(keys - {*methods})}) + (
+    return sorted({*present.get(str(owner), []), *(keys - {*methods})}) + (
         [{params.EXPERT: methods}] if methods else []
     )
 
@@ -351,19 +350,22 @@ def expected(root: Path, stage: str) -> dict[str, Any]:
     code = modules(root, name)
     read, written, keys = set(), set(), set()
     for module in code:
-        keys |= {key for _, key in loads(module, parsed(root / module))}
+        # how work is spread over processes changes no byte of what comes out
+        keys |= {key for _, key in loads(module, parsed(root / module)) if key != "execution"}
     tree = parsed(root / name)
-    # paths stand in the stage's file, where one can grep for them: what it imports takes them as arguments
-    found = paths(stage, name, tree)
-    read, written = read | found[0], written | found[1]
+    # paths stand in the stage's file, where one can grep for them; imported functions take them as arguments
+    opened = paths(stage, name, tree)
+    read, written = read | opened[0], written | opened[1]
     # a stage that hashes whole folders of code, or reads the parameters whole, depends on them whole
     read |= {
         node.value
         for node in ast.walk(tree)
         if isinstance(node, ast.Constant) and node.value in ("pipeline", "stages")
     }
-    whole = any((receiver, function) == ("params", "read") for _, receiver, function in calls(tree))
-    read |= {params.FILE, params.EXPERT} if whole else set()
+    reads_all_parameters = any(
+        (receiver, function) == ("params", "read") for _, receiver, function in calls(tree)
+    )
+    read |= {params.FILE, params.EXPERT} if reads_all_parameters else set()
     frames = [
         item
         for node in ast.walk(tree)
@@ -391,8 +393,7 @@ def expected(root: Path, stage: str) -> dict[str, Any]:
         ]
         + sorted(read),
         "params": tracked(root, keys),
-        # DVC deletes outs before it runs a stage unless they persist, and the
-        # last good artifacts must outlive a stage that fails
+        # DVC deletes outs before a stage unless they persist; the last good artifacts must outlive a failure
         "outs": [{path: {"persist": True}} for path in sorted(written)],
         "metrics": [{path: {"cache": False, "persist": True}} for path in metrics],
     }
@@ -418,21 +419,23 @@ def pipeline(root: Path) -> dict[str, Any]:
         for stage, entry in entries.items()
     }
     ordered = {stage: entries[stage] for stage in graphlib.TopologicalSorter(order).static_order()}
-    courses = [
+    curves = [
         stage
         for stage in ordered
-        if any(function == "write_course" for *_, function in calls(parsed(root / f"stages/{stage}.py")))
+        if any(
+            function == "write_learning_curve" for *_, function in calls(parsed(root / f"stages/{stage}.py"))
+        )
     ]
     return {"stages": ordered} | (
-        {"plots": [{f"datasets/{stage}/live/plots/metrics": {"x": "step"}} for stage in courses]}
-        if courses
+        {"plots": [{f"datasets/{stage}/live/plots/metrics": {"x": "step"}} for stage in curves]}
+        if curves
         else {}
     )
 
 
-def differences(found: dict[str, Any], wanted: dict[str, Any]) -> list[str]:
-    """Sentences, empty where dvc.yaml is what the stages ask for; the
-    order of entries and `desc` are free."""
+def differences(entries: dict[str, Any], wanted: dict[str, Any]) -> list[str]:
+    """Sentences on the differences between dvc.yaml and what the stages ask for. The order of entries and
+    `desc` are free."""
 
     def flat(entry, kind):
         value = entry.get(kind, [])
@@ -447,11 +450,11 @@ def differences(found: dict[str, Any], wanted: dict[str, Any]) -> list[str]:
 
     sentences = [
         f"{stage}: stage is {'missing' if stage in wanted else 'not in stages/'}"
-        for stage in sorted(found.keys() ^ wanted.keys())
+        for stage in sorted(entries.keys() ^ wanted.keys())
     ]
-    for stage in found.keys() & wanted.keys():
-        for kind in sorted((found[stage].keys() | wanted[stage].keys()) - {"desc"}):
-            have, want = flat(found[stage], kind), flat(wanted[stage], kind)
+    for stage in entries.keys() & wanted.keys():
+        for kind in sorted((entries[stage].keys() | wanted[stage].keys()) - {"desc"}):
+            have, want = flat(entries[stage], kind), flat(wanted[stage], kind)
             sentences += [f"{stage}: {kind} lacks {item}" for item in sorted(want - have)] + [
                 f"{stage}: {kind} has {item}" for item in sorted(have - want)
             ]

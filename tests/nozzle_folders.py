@@ -73,7 +73,7 @@ def folder(path: Path, prints: int = 2) -> Path:
 def read(
     path: Path, *, tip=None, topics: Topics = ANY, jobs: int = 1, memo: Path | None = None
 ) -> frame_folder.NozzleFrames:
-    how = frame_folder.Reading(tip_px=tip, least_score=LEAST, topics=topics)
+    how = frame_folder.ReadOptions(tip_px=tip, least_score=LEAST, topics=topics)
     return frame_folder.read_folder(
         path, how, Execution(backend="loky", jobs=jobs, scheduler=""), memo=memo or path.parent / "memo"
     )

@@ -5,6 +5,7 @@ import pytest
 
 from pipeline.nightly.decision import FIRST, KEPT, PROMOTED, Evidence, decide
 from pipeline.nightly.settings import Rule
+from pipeline.report.shared.night import Alarm
 from pipeline.statistics import blocks_needed, paired
 
 RULE = Rule(
@@ -31,31 +32,34 @@ def test_chance_alone_promotes_as_seldom_as_the_level_says():
 def test_ten_percent_better_is_found_among_ten_percent_of_noise():
     rng = np.random.default_rng(2)
     champion = np.exp(0.1 * rng.standard_normal(64)) * np.repeat(rng.uniform(1, 5, 16), 4)
-    found = paired(
+    result = paired(
         champion,
         0.9 * champion * np.exp(0.02 * rng.standard_normal(64)),
         [str(k // 4) for k in range(64)],
         rng=rng,
     )
-    assert found.p < 0.001 and found.low_percent < 10 < found.high_percent
+    assert result.p < 0.001 and result.low_percent < 10 < result.high_percent
 
 
 def test_cases_of_one_plant_count_once():
     """A thousand copies of one plant's case are one block: no evidence at all."""
-    found = paired(np.ones(1000), np.full(1000, 0.5), ["one plant"] * 1000, rng=np.random.default_rng(0))
-    assert found.p == 0.5 and found.blocks == 1
+    result = paired(np.ones(1000), np.full(1000, 0.5), ["one plant"] * 1000, rng=np.random.default_rng(0))
+    assert result.p == 0.5 and result.blocks == 1
 
 
 def test_the_sign_flip_test_worked_by_hand():
     # three blocks, all better by the same: of 8 signs only +++ does as well
-    found = paired(np.ones(3), np.full(3, 0.8), ["a", "b", "c"], rng=np.random.default_rng(0))
-    assert found.p == 1 / 8 and found.improvement_percent == pytest.approx(20)
+    result = paired(np.ones(3), np.full(3, 0.8), ["a", "b", "c"], rng=np.random.default_rng(0))
+    assert result.p == 1 / 8 and result.improvement_percent == pytest.approx(20)
     assert blocks_needed(0.01) == 7  # 2^-7 = 0.0078
 
 
 def test_costs_that_are_none_are_refused():
     with pytest.raises(ValueError, match="expected costs above 0 of at least one case that both ran"):
         paired(np.array([0.0]), np.array([1.0]), ["a"], rng=np.random.default_rng(0))
+
+
+GAIN_ALARM = Alarm("temperature", "gain", "shift.csv", "the gain from heater_1 has changed", 6.0)
 
 
 def _evidence(cost: float, **guards: float) -> Evidence:
@@ -85,7 +89,7 @@ def test_the_rule_promotes_what_is_better_and_nothing_else():
         "guard worst_case is 10.6 against 10; at most 0.5 more is allowed"),
         (_evidence(0.9, unstable_plants=1.0), (), "unstable_plants is 1; none is allowed"),
         (_evidence(0.9)._replace(panel="another"), (), "judged on different cases"),
-        (_evidence(0.9), ("the gain from heater_1 has changed",),
+        (_evidence(0.9), (GAIN_ALARM,),
         "drift: the gain from heater_1 has changed"),
         (_evidence(0.9)._replace(cases={f"case {k}": ("plant", 0.9) for k in range(8)}), (),
         "blocks cannot tell at level 0.01; at least 7 are needed"),
@@ -98,13 +102,13 @@ def test_a_better_mean_alone_does_not_promote(challenger, alarms, reason):
         if challenger.cases["case 0"][0] != "plant"
         else _evidence(1.0)._replace(cases={f"case {k}": ("plant", 1.0) for k in range(8)})
     )
-    found = _decide(champion, challenger, alarms)
-    assert found.decision == KEPT and any(reason in sentence for sentence in found.reasons), found.reasons
+    result = _decide(champion, challenger, alarms)
+    assert result.decision == KEPT and any(reason in sentence for sentence in result.reasons), result.reasons
 
 
 def test_a_first_challenger_that_is_unstable_somewhere_is_no_champion():
-    found = _decide(None, _evidence(1.0, unstable_plants=2.0))
-    assert found.decision == KEPT and "unstable_plants is 2" in found.reasons[0]
+    result = _decide(None, _evidence(1.0, unstable_plants=2.0))
+    assert result.decision == KEPT and "unstable_plants is 2" in result.reasons[0]
 
 
 def test_a_challenger_that_fails_cases_is_no_better():

@@ -149,27 +149,29 @@ def measure_all(
     g = edges.profiles(frames, columns)
     n = g.shape[1]
     where = columns[0] + BLOCK * np.arange(n) + (BLOCK - 1) / 2
-    run = edges.coarse(g, np.iinfo(frames[0].dtype).max / 255)
+    coarse = edges.coarse(g, np.iinfo(frames[0].dtype).max / 255)
     # most frames of a trial are bare
-    (top, bottom), blur = edges.fine(g, run) if run.seen.any() else (run.rows, np.full(len(frames), math.nan))
-    good = run.seen & (bottom > top)
-    widths = np.where(run.seen | run.unclear | run.cut, math.nan, 0.0)
-    cut, few = run.cut.sum(axis=1) > n / 2, good.sum(axis=1) < FEWEST_BLOCKS
+    (top, bottom), blur = (
+        edges.fine(g, coarse) if coarse.solid.any() else (coarse.rows, np.full(len(frames), math.nan))
+    )
+    good = coarse.solid & (bottom > top)
+    widths = np.where(coarse.solid | coarse.unclear | coarse.cut, math.nan, 0.0)
+    cut, few = coarse.cut.sum(axis=1) > n / 2, good.sum(axis=1) < FEWEST_BLOCKS
     out = []
     for i in range(len(frames)):
         reasons = {
             "cut by the frame": cut[i],
-            "saturated": run.saturated[i],
+            "saturated": coarse.saturated[i],
             "no bead": few[i],
             "blurred": blur[i] > longest_blur_px,
         }
         reason = next((name for name, holds in reasons.items() if holds), "")
         if reason:
-            # in a frame without a bead what is bare substrate stays 0, in a spoilt one nothing is known
+            # in a frame without a bead what is bare substrate stays 0, in a spoilt one nothing is measured
             nothing = np.full(n, math.nan)
-            known = widths[i] if reason == "no bead" else nothing
+            measured = widths[i] if reason == "no bead" else nothing
             out.append(
-                Bead(where, known, nothing, nothing, *[math.nan] * 3, float(blur[i]), math.nan, reason)
+                Bead(where, measured, nothing, nothing, *[math.nan] * 3, float(blur[i]), math.nan, reason)
             )
         else:
             out.append(
@@ -180,7 +182,7 @@ def measure_all(
                     top[i],
                     bottom[i],
                     float(blur[i]),
-                    float(run.sign[i] * run.plateau[i]),
+                    float(coarse.sign[i] * coarse.plateau[i]),
                 )
             )
     return out
@@ -199,10 +201,10 @@ def _bead(
     x, lower, upper = where[good], top[good], bottom[good]
     x = x - x.sum() / len(x)
     slope = float(x @ (lower + upper) / (2 * x @ x))
-    widths[good] = found = (upper - lower) / math.hypot(1.0, slope)
+    widths[good] = across = (upper - lower) / math.hypot(1.0, slope)
     top[~good] = bottom[~good] = math.nan
     return Bead(
-        where, widths, top, bottom, *_line(x, found), math.degrees(math.atan(slope)), blur, contrast, ""
+        where, widths, top, bottom, *_line(x, across), math.degrees(math.atan(slope)), blur, contrast, ""
     )
 
 

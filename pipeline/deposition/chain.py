@@ -59,9 +59,9 @@ def records(trainings: Sequence[Training], *, early: int = 3) -> Records:
         u, y = np.asarray(training.u, float), np.asarray(training.y, float)
         alone = min(early, len(u) - 1)
         for part in (*(slice(j, j + 1) for j in range(alone)), slice(alone, len(u))):
-            seen = np.isfinite(y[part])
-            count = seen.sum(axis=0)
-            mean = np.where(seen, y[part], 0.0).sum(axis=0) / np.maximum(count, 1)
+            observable = np.isfinite(y[part])
+            count = observable.sum(axis=0)
+            mean = np.where(observable, y[part], 0.0).sum(axis=0) / np.maximum(count, 1)
             rows.append((u[part].mean(axis=0), mean, np.sqrt(count), index))
     longest = max(len(row[0]) for row in rows)
     padded = [np.stack([np.pad(row[k], (0, longest - len(row[k]))) for row in rows]) for k in range(3)]
@@ -151,8 +151,8 @@ def innovations(error: np.ndarray, weight: np.ndarray, sample_time_s: float) -> 
     That is the whitening filter of such a measurement (Muth 1960). Where nothing
     was seen (weight (N, T) 0) the last error seen stays.
     """
-    seen = np.maximum.accumulate(np.where(weight > 0, np.arange(weight.shape[1]), 0), axis=1)
-    held = np.take_along_axis(error * weight, np.broadcast_to(seen, error.shape), axis=-1)
+    last = np.maximum.accumulate(np.where(weight > 0, np.arange(weight.shape[1]), 0), axis=1)
+    held = np.take_along_axis(error * weight, np.broadcast_to(last, error.shape), axis=-1)
     return scipy.signal.lfilter([1.0, -1.0], [1.0, -math.exp(-sample_time_s / DRIFT_S)], held)[
         ..., weight > 0
     ]
@@ -191,7 +191,7 @@ def fit(
         return weighted(flows[1:] - flows[0]).T / sides[free]
 
     start = np.clip(z[free], LOW[free], HIGH[free])
-    found = scipy.optimize.least_squares(
+    solution = scipy.optimize.least_squares(
         errors,
         start,
         jacobian,
@@ -201,7 +201,7 @@ def fit(
         xtol=1e-6,
         max_nfev=evaluations,
     )
-    return moved(found.x), 2 * float(found.cost)
+    return moved(solution.x), 2 * float(solution.cost)
 
 
 def _start(rows: Records, steady_flow: float, sample_time_s: float) -> np.ndarray:
@@ -242,14 +242,17 @@ def _held_out(
     return math.sqrt(np.mean(squares)) / steady_flow
 
 
-def averaged(error: np.ndarray, seen: np.ndarray, sample_time_s: float) -> float:
+def averaged(error: np.ndarray, observable: np.ndarray, sample_time_s: float) -> float:
     """R.m.s. of the means of an error over AVERAGE_S, where it was seen: what is left of white noise is a
     fraction, what is left of an error of flow all of it."""
     box = np.ones(round(AVERAGE_S / sample_time_s))
-    count = np.convolve(seen, box, "same")
+    count = np.convolve(observable, box, "same")
     return float(
         np.sqrt(
-            np.mean((np.convolve(np.where(seen, error, 0.0), box, "same")[count > 0] / count[count > 0]) ** 2)
+            np.mean(
+                (np.convolve(np.where(observable, error, 0.0), box, "same")[count > 0] / count[count > 0])
+                ** 2
+            )
         )
     )
 

@@ -55,6 +55,19 @@ class Learned(NamedTuple):
     checks: list[Check]
 
 
+class PartSettings(NamedTuple):
+    """How a part is printed: nozzle in mm; the wanted flow is bead area x printing speed, its steps shaped by
+    two boxes of ramp_s; a junction is a Corner from corner_deg on; a longer halt than longest_pause_s ends a
+    run; |u| <= limit (mm)."""
+
+    nozzle_mm: float
+    bead_area_mm2: float
+    ramp_s: float
+    corner_deg: float
+    longest_pause_s: float
+    limit: float
+
+
 class Prediction(NamedTuple):
     """Predicted r.m.s. error of one composer on one tool's share of a part: the chain's
     forecast together with the composer's own error on trials it did not see, in % of the
@@ -82,6 +95,17 @@ class Stream(NamedTuple):
     y: np.ndarray
     on_off: np.ndarray
     saturated: float
+
+
+class Share(NamedTuple):
+    """One tool's share of a part before it is composed: the tool, its material, the wanted flow r (T,) in
+    mm^3/s, and the tasks and lines of the whole part."""
+
+    tool: int
+    material: Material
+    r: np.ndarray
+    tasks: Tasks
+    lines: Lines
 
 
 class Composed(NamedTuple):
@@ -198,93 +222,87 @@ def _rms(a: np.ndarray) -> float:
     return math.sqrt(np.mean(np.square(a)))
 
 
-def _command(
-    composer: str,
-    learned: Learned,
-    known: Material,
-    r: np.ndarray,
-    tasks: Tasks,
-    lines: Lines,
-    tool: int,
-    limit: float,
-) -> np.ndarray:
+def _command(composer: str, library: Library, share: Share, limit: float) -> np.ndarray:
+    """u (T,) in mm of one composer for one tool's share of a part; |u| <= limit."""
+    material = share.material
     if composer == BASIS:
         return basis.compose(
-            known.chain.extruder, r, sample_time_s=learned.library.sample_time_s, limit=limit
+            material.chain.extruder, share.r, sample_time_s=library.sample_time_s, limit=limit
         )
     by = priority if composer == PRIORITY else superposition
-    return np.clip(
-        by(learned.library, known.material, known.nozzle_mm, tasks, lines, tool, samples=len(r)),
-        -limit,
-        limit,
+    u = by(
+        library,
+        material.material,
+        material.nozzle_mm,
+        share.tasks,
+        share.lines,
+        share.tool,
+        samples=len(share.r),
     )
+    return np.clip(u, -limit, limit)
 
 
 def commands(learned: Learned, composed: Composed, stream: Stream, *, limit: float) -> dict[str, np.ndarray]:
     """The command (T,) of every composer for one stream of a part, to set beside the chosen one."""
-    known = next(
-        k for k in learned.materials if (k.material, k.nozzle_mm) == (stream.material, stream.nozzle_mm)
+    material = next(
+        one
+        for one in learned.materials
+        if (one.material, one.nozzle_mm) == (stream.material, stream.nozzle_mm)
     )
-    return {
-        name: _command(name, learned, known, stream.r, composed.tasks, composed.lines, stream.tool, limit)
-        for name in COMPOSERS
-    }
+    share = Share(stream.tool, material, stream.r, composed.tasks, composed.lines)
+    return {name: _command(name, learned.library, share, limit) for name in COMPOSERS}
 
 
-def _judge(
-    learned: Learned, known: Material, r: np.ndarray, tasks: Tasks, lines: Lines, tool: int, limit: float
-) -> dict[str, float]:
+def _judge(library: Library, share: Share, limit: float) -> dict[str, float]:
     """Predicted error of each composer in % of on-off control's, over the first
     EXCERPT_S from where this tool begins to print."""
-    Ts, extruder = learned.library.sample_time_s, known.chain.extruder
-    begin = max(0, int(np.argmax(r > 0)) - round(MARGIN_S / Ts))
-    upto = min(len(r), begin + round(EXCERPT_S / Ts))
-    # the excerpt's own events
-    near = (tasks.begin_s < (upto + 1) * Ts) & (tasks.begin_s >= (begin - 1) * Ts)
-    few = Tasks(*(np.asarray(column)[near] for column in tasks))
-    few = few._replace(begin_s=few.begin_s - begin * Ts)
-    near = (lines.begin_s < (upto + 1) * Ts) & (lines.begin_s >= (begin - 1) * Ts)
-    row = Lines(*(np.asarray(column)[near] for column in lines))
-    row = row._replace(begin_s=row.begin_s - begin * Ts, end_s=row.end_s - begin * Ts)
-    wanted = r[begin:upto]
-    on_off = _rms(
-        forecast(extruder, np.clip(wanted / known.on_off_gain, -limit, limit), sample_time_s=Ts) - wanted
-    )
+    Ts, extruder = library.sample_time_s, share.material.chain.extruder
+    excerpt = _excerpt(share, Ts)
+    on_off = _on_off(excerpt, limit)
+    yardstick = _rms(forecast(extruder, on_off, sample_time_s=Ts) - excerpt.r)
     percent = {}
     for name in COMPOSERS:
-        error = _rms(
-            forecast(
-                extruder, _command(name, learned, known, wanted, few, row, tool, limit), sample_time_s=Ts
-            )
-            - wanted
-        )
-        own = known.chain.held_out_percent if name == BASIS else known.learned_percent
-        percent[name] = 100 * math.hypot(error, own / 100 * r.max()) / max(on_off, 1e-12)
+        u = _command(name, library, excerpt, limit)
+        error = _rms(forecast(extruder, u, sample_time_s=Ts) - excerpt.r)
+        own = share.material.chain.held_out_percent if name == BASIS else share.material.learned_percent
+        percent[name] = 100 * math.hypot(error, own / 100 * share.r.max()) / max(yardstick, 1e-12)
     return percent
 
 
+def _excerpt(share: Share, Ts: float) -> Share:
+    """The first EXCERPT_S of a share with its own tasks and lines, its clock from MARGIN_S before the tool
+    begins to print."""
+    r, tasks, lines = share.r, share.tasks, share.lines
+    begin = max(0, int(np.argmax(r > 0)) - round(MARGIN_S / Ts))
+    upto = min(len(r), begin + round(EXCERPT_S / Ts))
+    near = (tasks.begin_s < (upto + 1) * Ts) & (tasks.begin_s >= (begin - 1) * Ts)
+    tasks = Tasks(*(np.asarray(column)[near] for column in tasks))
+    tasks = tasks._replace(begin_s=tasks.begin_s - begin * Ts)
+    near = (lines.begin_s < (upto + 1) * Ts) & (lines.begin_s >= (begin - 1) * Ts)
+    lines = Lines(*(np.asarray(column)[near] for column in lines))
+    lines = lines._replace(begin_s=lines.begin_s - begin * Ts, end_s=lines.end_s - begin * Ts)
+    return share._replace(r=r[begin:upto], tasks=tasks, lines=lines)
+
+
+def _on_off(share: Share, limit: float) -> np.ndarray:
+    """u (T,) in mm of on-off control, as the first trial set out: r over the gain known then."""
+    return np.clip(share.r / share.material.on_off_gain, -limit, limit)
+
+
 def compose(
-    learned: Learned,
-    program: Program,
-    motion: Motion,
-    *,
-    materials: dict[int, str],
-    nozzle_mm: float,
-    bead_area_mm2: float,
-    ramp_s: float,
-    corner_deg: float,
-    longest_pause_s: float,
-    limit: float,
+    learned: Learned, program: Program, motion: Motion, settings: PartSettings, *, materials: dict[int, str]
 ) -> Composed:
     """Commands for all tools of a part, each by the composer that is predicted to do best for its material.
 
-    `materials` names the material of each tool; the wanted flow is r = bead area x printing speed, its steps
-    shaped by two boxes of ramp_s. |u| <= limit (mm). Raises ValueError for a tool without a material, a
+    `materials` names the material of each tool. Raises ValueError for a tool without a material, a
     material or nozzle that was not learned, where nothing is printed, and, with its line number, where the
     program would go from Steady-State to No-Flow without a Stop.
     """
-    Ts, marks, moves = learned.library.sample_time_s, learned.library.marks, program.moves
-    lines = printed_lines(moves, motion, corner_deg=corner_deg, longest_pause_s=longest_pause_s)
+    library, limit, moves = learned.library, settings.limit, program.moves
+    Ts, marks = library.sample_time_s, library.marks
+    lines = printed_lines(
+        moves, motion, corner_deg=settings.corner_deg, longest_pause_s=settings.longest_pause_s
+    )
     refuse(
         lines,
         moves,
@@ -299,64 +317,58 @@ def compose(
     tasks = sequence(lines, end_s=samples * Ts)
     error, streams, predictions = np.zeros(len(tasks.task)), [], []
     for tool in np.unique(lines.tool).tolist():
-        known = _known(learned, materials, tool, nozzle_mm, lines)
+        material = _material(learned, materials, tool, settings.nozzle_mm, lines)
         printed = np.where((moves.kind == Kind.EXTRUDE) & (moves.tool == tool), moves.length, 0.0)
-        unshaped = bead_area_mm2 * np.pad(rate(signal, printed, sample_time_s=Ts), (ahead, behind))
-        r = basis.boxed(unshaped, ramp_s, Ts)
+        unshaped = settings.bead_area_mm2 * np.pad(rate(signal, printed, sample_time_s=Ts), (ahead, behind))
+        r = basis.boxed(unshaped, settings.ramp_s, Ts)
         r[r < 1e-9 * r.max()] = 0.0  # rounding of the sums behind the rate
-        judged = _judge(learned, known, r, tasks, lines, tool, limit)
-        best = min(judged, key=judged.__getitem__)
+        share = Share(tool, material, r, tasks, lines)
+        percents = _judge(library, share, limit)
+        best = min(percents, key=percents.__getitem__)
         predictions += [
-            Prediction(tool, known.material, name, percent, name == best) for name, percent in judged.items()
+            Prediction(tool, material.material, name, percent, name == best)
+            for name, percent in percents.items()
         ]
-        streams.append(_stream(learned, known, r, unshaped, tasks, lines, tool, limit, best))
+        streams.append(_stream(library, share, unshaped, best, limit))
         for name in (START, STOP, CORNER, STEADY):
             at = _of(tasks, tool, name)
             error[at] = nearest(
-                learned.library, name, known.material, nozzle_mm, tasks.speed[at], tasks.pause_s[at]
+                library, name, material.material, settings.nozzle_mm, tasks.speed[at], tasks.pause_s[at]
             ).error_percent
     return Composed(tuple(streams), tasks, lines, error, predictions, ahead * Ts, Ts)
 
 
-def _known(
+def _material(
     learned: Learned, materials: dict[int, str], tool: int, nozzle_mm: float, lines: Lines
 ) -> Material:
+    """What was learned of the tool's material with this nozzle."""
     first = lines.line[lines.tool == tool][0]
     if tool not in materials:
         raise ValueError(
             f"line {first}: T{tool} prints but has no material; expected one of tools {sorted(materials)}, "
             "or name its material"
         )
-    for known in learned.materials:
-        if (known.material, known.nozzle_mm) == (materials[tool], nozzle_mm):
-            return known
-    held = ", ".join(f"{known.material} with {known.nozzle_mm:g} mm" for known in learned.materials)
+    for material in learned.materials:
+        if (material.material, material.nozzle_mm) == (materials[tool], nozzle_mm):
+            return material
+    trained = ", ".join(f"{one.material} with {one.nozzle_mm:g} mm" for one in learned.materials)
     raise ValueError(
         f"line {first}: T{tool} prints {materials[tool]} with a nozzle of {nozzle_mm:g} mm, "
-        f"but what was learned is {held}; train it first"
+        f"but what was learned is {trained}; train it first"
     )
 
 
-def _stream(
-    learned: Learned,
-    known: Material,
-    r: np.ndarray,
-    unshaped: np.ndarray,
-    tasks: Tasks,
-    lines: Lines,
-    tool: int,
-    limit: float,
-    composer: str,
-) -> Stream:
-    u = _command(composer, learned, known, r, tasks, lines, tool, limit)
-    rows = np.stack([u, np.clip(r / known.on_off_gain, -limit, limit)])
-    y, on_off = simulate([known.chain.extruder], rows, sample_time_s=learned.library.sample_time_s)[0]
+def _stream(library: Library, share: Share, unshaped: np.ndarray, composer: str, limit: float) -> Stream:
+    """The share by one composer: its command, and the flows that the chain predicts for it and for on-off."""
+    material, u = share.material, _command(composer, library, share, limit)
+    rows = np.stack([u, _on_off(share, limit)])
+    y, on_off = simulate([material.chain.extruder], rows, sample_time_s=library.sample_time_s)[0]
     return Stream(
-        tool,
-        known.material,
-        known.nozzle_mm,
+        share.tool,
+        material.material,
+        material.nozzle_mm,
         composer,
-        r,
+        share.r,
         unshaped,
         u,
         y,

@@ -89,18 +89,18 @@ def conform(
     Ts = composed.sample_time_s
     saturations, ramps = {}, {}
     for stream in composed.streams:
-        known = next(
-            known
-            for known in learned.materials
-            if (known.material, known.nozzle_mm) == (stream.material, stream.nozzle_mm)
+        material = next(
+            material
+            for material in learned.materials
+            if (material.material, material.nozzle_mm) == (stream.material, stream.nozzle_mm)
         )
         first = int(np.argmax(stream.unshaped > 0))
         some = stream.unshaped[max(0, first - round(MARGIN_S / Ts)) : first + round(EXCERPT_S / Ts)]
         settings = {"ramp_s": ramp_s, "limit": limit, "sample_time_s": Ts}
         saturations[stream.tool] = saturation(
-            known.chain.extruder, some, on_off_gain=known.on_off_gain, **settings
+            material.chain.extruder, some, on_off_gain=material.on_off_gain, **settings
         )
-        ramps[stream.tool] = ramp_that_would_do(known.chain.extruder, some, **settings)
+        ramps[stream.tool] = ramp_that_would_do(material.chain.extruder, some, **settings)
     refused = [Refused(refusal.line, refusal.why) for refusal in refusals]
     by_library = np.isin(
         composed.tasks.tool, [stream.tool for stream in composed.streams if stream.composer != BASIS]

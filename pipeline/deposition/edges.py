@@ -72,13 +72,13 @@ def profiles(frames: list[np.ndarray], columns: tuple[int, int]) -> np.ndarray:
     return g
 
 
-class Run(NamedTuple):
+class CoarseEdges(NamedTuple):
     """Of k frames: rows (2, k, n) of the coarse edges; blocks (k, n) bool with a solid run,
     with an unclear one, with one that the frame cuts; plateau (k,) in levels above background,
     NONE without a bead; sign (k,), saturated (k,)."""
 
     rows: np.ndarray
-    seen: np.ndarray
+    solid: np.ndarray
     unclear: np.ndarray
     cut: np.ndarray
     plateau: np.ndarray
@@ -86,7 +86,7 @@ class Run(NamedTuple):
     saturated: np.ndarray
 
 
-def coarse(g: np.ndarray, level: float) -> Run:
+def coarse(g: np.ndarray, level: float) -> CoarseEdges:
     """The outermost run above half the plateau in each block, on rows averaged by four.
 
     Background is the straight line between the means of the first and the last sixteenth of the rows; its
@@ -121,7 +121,7 @@ def coarse(g: np.ndarray, level: float) -> Run:
     lopsided = np.abs(margins[..., 0] - margins[..., 1]) > step[:, None] / 2
     cut = some & ((at[0] < m) | (at[1] >= h - m) | ~solid & lopsided)
     white = np.add.reduce((c > 0.98 * 255 * level).reshape(k, -1), axis=1, dtype=np.int32)
-    return Run(
+    return CoarseEdges(
         edges, some & solid & ~cut, some & ~solid & ~cut, cut, plateau, sign, white > 0.3 * rows.sum(axis=1)
     )
 
@@ -156,7 +156,7 @@ def _background(h: int) -> tuple[int, np.ndarray, np.ndarray]:
     return m, ends, np.stack([1 - share, share])
 
 
-def fine(g: np.ndarray, run: Run) -> tuple[np.ndarray, np.ndarray]:
+def fine(g: np.ndarray, first: CoarseEdges) -> tuple[np.ndarray, np.ndarray]:
     """(2, k, n) sub-pixel rows of the top and the bottom edge, and each frame's blur (k,): standard deviation
     of its edge in px, NaN without a bead.
 
@@ -166,15 +166,15 @@ def fine(g: np.ndarray, run: Run) -> tuple[np.ndarray, np.ndarray]:
     """
     k, n, h = g.shape
     # a speck beside the bead moves one block's coarse edge, not its neighbours'
-    coarse = run.rows.astype(np.float32).reshape(2 * k, 1, n)
+    coarse = first.rows.astype(np.float32).reshape(2 * k, 1, n)
     rows = np.rint([cv2.medianBlur(edge, 5)[0] for edge in coarse]).astype(int).reshape(2, k, n)
     E = g.ravel().take((rows + (h * np.arange(k * n)).reshape(k, n))[..., None] + REACH, mode="clip") * (
-        run.sign[:, None, None] / BLOCK
+        first.sign[:, None, None] / BLOCK
     ).astype(np.float32)
     # a bead narrower than its windows has no plateau of its own
-    whole = run.seen & (rows[1] - rows[0] > OUT + IN)
-    flat = whole.any(axis=1)
-    used = np.where(flat[:, None], whole, run.seen)
+    wide = first.solid & (rows[1] - rows[0] > OUT + IN)
+    flat = wide.any(axis=1)
+    used = np.where(flat[:, None], wide, first.solid)
     share = used / np.maximum(np.count_nonzero(used, axis=1), 1)[:, None]
 
     def mean(x):
@@ -182,20 +182,20 @@ def fine(g: np.ndarray, run: Run) -> tuple[np.ndarray, np.ndarray]:
 
     outside, near, far = np.moveaxis(E @ LEVELS, -1, 0)
     top, bottom = mean(far - outside)
-    darker = np.where(run.sign * (bottom - top) < 0, 1, 0)
-    clean = np.where(np.abs(top - bottom) > UNEVEN * run.plateau, darker, [[0], [1]]), np.arange(k)
+    darker = np.where(first.sign * (bottom - top) < 0, 1, 0)
+    clean = np.where(np.abs(top - bottom) > UNEVEN * first.plateau, darker, [[0], [1]]), np.arange(k)
     rise, width = (
         np.where(flat, mean((far - near)[clean]).mean(axis=0), 0.0),
         np.maximum(mean(rows[1] - rows[0]), OUT + IN),
     )
     fall, _ = _shading(rise, width, 0.0)
     along = _along(np.concatenate([outside, near]), used)
-    outside, plateau = along[:2], run.plateau[:, None]
+    outside, plateau = along[:2], first.plateau[:, None]
     level = np.minimum(np.maximum((along[2:] - outside)[clean] - fall[:, None], 0.3 * plateau), plateau)
-    level = np.where(whole, level, plateau)
+    level = np.where(wide, level, plateau)
     into, step = _crossing(E, (outside + level / 2).astype(np.float32))
     shift, blur = _settled(
-        mean(level).mean(axis=0), mean(step).mean(axis=0), mean(into), clean, rise, width, fall, run.plateau
+        mean(level).mean(axis=0), mean(step).mean(axis=0), mean(into), clean, rise, width, fall, first.plateau
     )
     return rows - OUTWARD * (into + shift[:, None]), np.where(used.any(axis=1), blur, math.nan)
 
@@ -259,10 +259,10 @@ def _shading(rise: np.ndarray, width: np.ndarray, into: np.ndarray | float) -> t
     return b * (1 - near), 4 * b / width
 
 
-def _along(levels: np.ndarray, seen: np.ndarray) -> np.ndarray:
+def _along(levels: np.ndarray, has_bead: np.ndarray) -> np.ndarray:
     """levels (edges, k, n) averaged over nine blocks along the bead, blocks without a bead left out."""
     near = _neighbours(levels.shape[-1])
-    weight = seen.astype(np.float32)
+    weight = has_bead.astype(np.float32)
     return (levels * weight) @ near / np.maximum(weight @ near, np.float32(1e-9))
 
 

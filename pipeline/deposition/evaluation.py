@@ -1,5 +1,5 @@
-"""Every composer on one part beside on-off control and beside learning the whole structure, judged by the
-true flow of the machine; on a real one, by the forecast."""
+"""Every composer on one part, beside on-off control and full-part ILC; judged by the true flow of the
+machine, on a real one by the forecast."""
 
 from typing import NamedTuple
 
@@ -10,9 +10,9 @@ from pipeline.deposition.chain import forecast
 from pipeline.deposition.composition import Composed, Learned, Stream, commands
 from pipeline.deposition.conformance import line_volumes
 from pipeline.deposition.extruder import Extruder, Routine, flow
-from pipeline.deposition.training import Noise, Settings
+from pipeline.deposition.training import LawSettings, Noise
 
-ON_OFF, WHOLE = "on_off", "ilc"
+ON_OFF, FULL_PART_ILC = "on_off", "ilc"
 
 
 class Score(NamedTuple):
@@ -29,44 +29,47 @@ class Score(NamedTuple):
     y: np.ndarray
 
 
-def evaluate(
-    learned: Learned,
-    composed: Composed,
-    *,
-    nominals: dict[str, Extruder],
-    plants: dict[str, Extruder],
-    rng: np.random.Generator,
-    noise: Noise,
-    updates: int,
-    bead_area_mm2: float,
-    shortest_s: float,
-    s: Settings,
-) -> list[Score]:
-    """Scores of all composers on all streams. `plants` are the true machines by material, empty where there
-    is only a real one: then the identified chain forecasts the flow, and the whole structure is not learned.
-    Volumes count for lines of at least shortest_s."""
-    scores = []
+class Judging(NamedTuple):
+    """What composers are judged by: the nominal and the true extruders by material, the latter empty where
+    there is only a real machine; the laws' settings and the noise; the updates of full-part ILC; the bead's
+    area, and the shortest line whose volume counts."""
+
+    nominals: dict[str, Extruder]
+    plants: dict[str, Extruder]
+    laws: LawSettings
+    noise: Noise
+    updates: int
+    bead_area_mm2: float
+    shortest_s: float
+
+
+def evaluate(learned: Learned, composed: Composed, judging: Judging, rng: np.random.Generator) -> list[Score]:
+    """Scores of all composers on all streams.
+
+    On a real machine the identified chain forecasts the flow, and full-part ILC is left out.
+    """
+    scores, Ts, limit = [], judging.laws.sample_time_s, judging.laws.limit
     for i, stream in enumerate(composed.streams):
-        nominal, plant = nominals[stream.material], plants.get(stream.material)
-        chain = next(k.chain.extruder for k in learned.materials if k.material == stream.material)
-        asked = {ON_OFF: np.clip(stream.r / nominal.gain, -s.limit, s.limit)} | commands(
-            learned, composed, stream, limit=s.limit
+        nominal, plant = judging.nominals[stream.material], judging.plants.get(stream.material)
+        chain = next(one.chain.extruder for one in learned.materials if one.material == stream.material)
+        by_composer = {ON_OFF: np.clip(stream.r / nominal.gain, -limit, limit)} | commands(
+            learned, composed, stream, limit=limit
         )
         if plant:
-            asked[WHOLE] = _learned(plant, nominal, stream, rng, noise, updates, s)
+            by_composer[FULL_PART_ILC] = _full_part_ilc(plant, nominal, stream, judging, rng)
         predicted = {
             p.composer: p.rms_percent_of_on_off for p in composed.predictions if p.tool == stream.tool
         }
         yardstick = np.nan
-        for name, u in asked.items():
+        for name, u in by_composer.items():
             y = (
-                flow(plant, u, sample_time_s=s.sample_time_s, limit=s.limit)
+                flow(plant, u, sample_time_s=Ts, limit=limit)
                 if plant
-                else forecast(chain, u, sample_time_s=s.sample_time_s)
+                else forecast(chain, u, sample_time_s=Ts)
             )
             error = float(np.linalg.norm(y - stream.r))
             yardstick = error if name == ON_OFF else yardstick
-            worst = _worst_line(learned, composed, i, y, bead_area_mm2, shortest_s)
+            worst = _worst_line(learned, composed, i, y, judging)
             percent = 100 * error / max(yardstick, 1e-12)
             scores.append(
                 Score(i, name, name == stream.composer, percent, predicted.get(name, np.nan), worst, y)
@@ -74,33 +77,27 @@ def evaluate(
     return scores
 
 
-def _learned(
-    plant: Extruder,
-    nominal: Extruder,
-    stream: Stream,
-    rng: np.random.Generator,
-    noise: Noise,
-    updates: int,
-    s: Settings,
+def _full_part_ilc(
+    plant: Extruder, nominal: Extruder, stream: Stream, judging: Judging, rng: np.random.Generator
 ) -> np.ndarray:
-    """The command after `updates` trials of the whole structure by our law."""
-    t = np.arange(len(stream.r)) * s.sample_time_s
-    whole = Routine(t, stream.r, np.zeros(len(t)), np.zeros(len(t)), stream.r > 0, 0.0, (0.0, 0.0), 0.0)
-    measure = training.simulated(plant, rng, noise, steady_flow=float(stream.r.max()), s=s)
-    law = training.ours(whole, s)
-    trials = ilc.learn(
-        law, measure, training.on_off(stream.r, nominal), stream.r, trials=updates, rise=s.rise
-    )
-    return ilc.next_step(trials, stream.r, law, rise=s.rise).u
+    """The command after `updates` trials of the full part by the inverse of the identified model."""
+    laws = judging.laws
+    t = np.arange(len(stream.r)) * laws.sample_time_s
+    part = Routine(t, stream.r, np.zeros(len(t)), np.zeros(len(t)), stream.r > 0, 0.0, (0.0, 0.0), 0.0)
+    measure = training.simulated(plant, rng, judging.noise, steady_flow=float(stream.r.max()), settings=laws)
+    law = training.model_inverse(part, laws)
+    u0 = training.on_off(stream.r, nominal)
+    trials = ilc.learn(law, measure, u0, stream.r, trials=judging.updates, rise=laws.rise)
+    return ilc.next_step(trials, stream.r, law, rise=laws.rise).u
 
 
-def _worst_line(
-    learned: Learned, composed: Composed, i: int, y: np.ndarray, bead_area_mm2: float, shortest_s: float
-) -> float:
+def _worst_line(learned: Learned, composed: Composed, i: int, y: np.ndarray, judging: Judging) -> float:
     """Largest error in % of the volume of a line of stream i under the flow y."""
-    mine = composed._replace(
+    with_flow = composed._replace(
         streams=(*composed.streams[:i], composed.streams[i]._replace(y=y), *composed.streams[i + 1 :])
     )
-    volumes = line_volumes(mine, learned.library, bead_area_mm2=bead_area_mm2)
-    judged = (volumes.tool == composed.streams[i].tool) & (volumes.duration_s >= shortest_s - 1e-9)
-    return float(np.abs(volumes.error_percent[judged]).max()) if judged.any() else float("nan")
+    volumes = line_volumes(with_flow, learned.library, bead_area_mm2=judging.bead_area_mm2)
+    long_enough = (volumes.tool == composed.streams[i].tool) & (
+        volumes.duration_s >= judging.shortest_s - 1e-9
+    )
+    return float(np.abs(volumes.error_percent[long_enough]).max()) if long_enough.any() else float("nan")

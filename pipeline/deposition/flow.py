@@ -127,6 +127,27 @@ def sections(
             f"sections: expected widths of {len(position)} frames x {len(columns)} columns but found "
             f"{widths.shape}; give one row a frame"
         )
+    s, w = _readings(position, columns, widths, view, nozzle_radius_mm)
+    px = abs(view.mm_per_px)
+    length = BLOCK * px
+    place = np.floor((s - s.min()) / length).astype(int)
+    order = np.lexsort((w, place))
+    place, s, w = place[order], s[order], w[order]
+    of, keep, scatter = _without_specks(place, w, px)
+    count = np.bincount(of, keep)
+    A, where = np.bincount(of, area(w, contact_angle_deg) * keep) / count, np.bincount(of, s * keep) / count
+    slope, blind = np.sqrt(4 * area(1.0, contact_angle_deg) * A), area(BLIND_PX * px, contact_angle_deg)
+    # a place averages over its length: where A bends within it, the mean is not the value in the middle
+    bend = np.convolve(np.pad(A, 1, "edge"), [1.0, -2.0, 1.0], "valid") / 12
+    deviation = np.sqrt(slope**2 * scatter**2 / count + blind**2 / 12 + bend**2)
+    return Sections(where, A, deviation, count.astype(int), length, int(np.sum(~keep)))
+
+
+def _readings(
+    position: np.ndarray, columns: np.ndarray, widths: np.ndarray, view: View, nozzle_radius_mm: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Places (N,) in mm and widths (N,) in mm of the readings that count. Raises ValueError where there is
+    none, or where the gantry goes back."""
     behind = (columns - view.nozzle_column) * view.mm_per_px
     used = np.isfinite(widths) & (np.abs(behind) >= nozzle_radius_mm) & np.isfinite(position)[:, None]
     if not used.any():
@@ -142,11 +163,12 @@ def sections(
             "so a place is seen before it is printed; "
             "cut the record to one pass along the line, or turn the sign of the view's mm per px"
         )
-    s, w = (position[:, None] + behind)[used], widths[used]
-    length = BLOCK * abs(view.mm_per_px)
-    place = np.floor((s - s.min()) / length).astype(int)
-    order = np.lexsort((w, place))
-    place, s, w = place[order], s[order], w[order]
+    return (position[:, None] + behind)[used], widths[used]
+
+
+def _without_specks(place: np.ndarray, w: np.ndarray, px: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """For readings w (N,) sorted by place and width: the index of their place (N,), whether they count (N,),
+    and the robust scatter of one reading in mm."""
     first = np.flatnonzero(np.diff(place, prepend=-1))
     count = np.diff(np.append(first, len(place)))
     of = np.repeat(np.arange(len(first)), count)
@@ -154,26 +176,15 @@ def sections(
     miss = np.abs(w - median[of])
     # one scatter for all places, a dozen readings each do not tell it;
     # beside it the width may change along a place
-    scatter = max(
-        1.4826 * float(np.median(miss[w > 0])) if (w > 0).any() else 0.0, 0.02 * abs(view.mm_per_px)
-    )
+    scatter = max(1.4826 * float(np.median(miss[w > 0])) if (w > 0).any() else 0.0, 0.02 * px)
     keep = miss <= (GATE * scatter + np.abs(np.gradient(np.pad(median, 1, "edge"))[1:-1]))[of]
-    kept = np.bincount(of, keep)
-    A, where = np.bincount(of, area(w, contact_angle_deg) * keep) / kept, np.bincount(of, s * keep) / kept
-    slope, blind = (
-        np.sqrt(4 * area(1.0, contact_angle_deg) * A),
-        area(BLIND_PX * abs(view.mm_per_px), contact_angle_deg),
-    )
-    # a place averages over its length: where A bends within it, the mean is not the value in the middle
-    bend = np.convolve(np.pad(A, 1, "edge"), [1.0, -2.0, 1.0], "valid") / 12
-    deviation = np.sqrt(slope**2 * scatter**2 / kept + blind**2 / 12 + bend**2)
-    return Sections(where, A, deviation, kept.astype(int), length, int(np.sum(~keep)))
+    return of, keep, scatter
 
 
 def estimate(
     time_s: np.ndarray,
     position: np.ndarray,
-    seen: Sections,
+    sections: Sections,
     *,
     nozzle_radius_mm: float,
     shapes: np.ndarray,
@@ -199,43 +210,20 @@ def estimate(
         np.asarray(shapes, float),
     )
     _check(time_s, position, shapes)
-    steps, dt = len(time_s), float(np.mean(np.diff(time_s)))
-    K = _laid(position, dt, seen, nozzle_radius_mm)
+    dt = float(np.mean(np.diff(time_s)))
+    K = _laid(position, dt, sections, nozzle_radius_mm)
     reached = np.asarray(K.sum(axis=1)).ravel() > 0
     if not reached.any():
         raise ValueError(
             "estimate: the nozzle reached no place of A(s) in this record; "
             "do frames and gantry overlap in time, and has the view the right direction?"
         )
-    K, A, expected = K[reached], seen.area[reached], seen.deviation[reached]
+    K, A = K[reached], sections.area[reached]
     bead = A > 0
-    noise = _roughness(A, expected, bead)
-    P, tall, robust, deviation = (
-        _penalty(steps),
-        shapes.T,
-        np.ones(len(A)),
-        np.where(bead, noise * expected, expected),
+    fit, deviation, spread, strength, noise, outliers = _robust_fit(
+        K, A, sections.deviation[reached], bead, shapes.T
     )
-    for _ in range(ROUNDS):
-        weight = np.sqrt(robust) / deviation
-        H = scipy.sparse.diags(weight) @ K
-        data = _Data(
-            _banded((H.T @ H).tocoo(), steps),
-            P,
-            H.T @ (H @ tall),
-            tall,
-            H.T @ (weight * A),
-            float(np.sum((weight * A) ** 2)),
-        )
-        best = scipy.optimize.minimize_scalar(
-            _unlikely, args=(data,), bounds=STRENGTHS, method="bounded", options={"xatol": 0.1}
-        )
-        fit = _solve(best.x, data)
-        Q = fit.z + tall @ fit.a
-        robust = np.minimum(1.0, HUBER * deviation / np.maximum(np.abs(A - K @ Q), 1e-12))
-    U = tall - scipy.linalg.cho_solve_banded((fit.factor, True), data.C)
-    spread = U @ np.linalg.inv(np.linalg.cholesky(fit.S)).T
-    deviation = np.sqrt(_inverse_diagonal(_sum(data.M, P, np.exp(best.x))) + np.sum(spread**2, axis=1))
+    Q = fit.z + shapes.T @ fit.a
     share = (
         2 * width_deviation_mm / np.sqrt(np.median(A[bead]) / area(1.0, contact_angle_deg))
         if bead.any()
@@ -244,20 +232,53 @@ def estimate(
     deviation = np.hypot(deviation, share * Q)
     speed = np.abs(np.gradient(position, dt))
     moving = speed > SLOW * speed.max()
-    lit = np.asarray(K.sum(axis=0)).ravel() * seen.length > 0.4 * dt
+    lit = np.asarray(K.sum(axis=0)).ravel() * sections.length > 0.4 * dt
     per_travel = np.where(moving, Q / np.where(moving, speed, 1.0), np.nan)
     pauses = tuple(_pause(a, b, time_s, Q, fit.factor, spread) for a, b in _runs(~moving))
-    return Flow(
-        Q,
-        deviation,
-        moving & lit,
-        per_travel,
-        pauses,
-        fit.a,
-        float(np.exp(best.x)),
-        noise,
-        int(np.sum(robust < 0.5)),
-    )
+    return Flow(Q, deviation, moving & lit, per_travel, pauses, fit.a, strength, noise, outliers)
+
+
+class _RobustFit(NamedTuple):
+    """The solution, the deviation (T,) of its flow, the part (T, k) of the latter that the amplitudes
+    spread, the strength of the prior, the noise of A(s), and how many places are outliers."""
+
+    fit: "_Fit"
+    deviation: np.ndarray
+    spread: np.ndarray
+    strength: float
+    noise: float
+    outliers: int
+
+
+def _robust_fit(
+    K: scipy.sparse.csr_matrix, A: np.ndarray, expected: np.ndarray, bead: np.ndarray, shapes: np.ndarray
+) -> _RobustFit:
+    """Least squares with Huber's weights, reweighted ROUNDS times; each time the likeliest strength."""
+    steps = K.shape[1]
+    noise = _roughness(A, expected, bead)
+    P, robust = _penalty(steps), np.ones(len(A))
+    deviation = np.where(bead, noise * expected, expected)
+    for _ in range(ROUNDS):
+        weight = np.sqrt(robust) / deviation
+        H = scipy.sparse.diags(weight) @ K
+        data = _Data(
+            _banded((H.T @ H).tocoo(), steps),
+            P,
+            H.T @ (H @ shapes),
+            shapes,
+            H.T @ (weight * A),
+            float(np.sum((weight * A) ** 2)),
+        )
+        best = scipy.optimize.minimize_scalar(
+            _unlikely, args=(data,), bounds=STRENGTHS, method="bounded", options={"xatol": 0.1}
+        )
+        fit = _solve(best.x, data)
+        Q = fit.z + shapes @ fit.a
+        robust = np.minimum(1.0, HUBER * deviation / np.maximum(np.abs(A - K @ Q), 1e-12))
+    U = shapes - scipy.linalg.cho_solve_banded((fit.factor, True), data.C)
+    spread = U @ np.linalg.inv(np.linalg.cholesky(fit.S)).T
+    deviation = np.sqrt(_inverse_diagonal(_sum(data.M, P, np.exp(best.x))) + np.sum(spread**2, axis=1))
+    return _RobustFit(fit, deviation, spread, float(np.exp(best.x)), noise, int(np.sum(robust < 0.5)))
 
 
 def _roughness(A: np.ndarray, expected: np.ndarray, bead: np.ndarray) -> float:
@@ -269,8 +290,8 @@ def _roughness(A: np.ndarray, expected: np.ndarray, bead: np.ndarray) -> float:
         A[: 3 * n].reshape(n, 3).mean(axis=1),
         np.square(expected[: 3 * n]).reshape(n, 3).sum(axis=1) / 9,
     )
-    whole = bead[: 3 * n].reshape(n, 3).all(axis=1)
-    inside = whole[:-2] & whole[1:-1] & whole[2:]
+    covered = bead[: 3 * n].reshape(n, 3).all(axis=1)
+    inside = covered[:-2] & covered[1:-1] & covered[2:]
     if not inside.any():
         return 1.0
     spread = np.sqrt(variance[:-2] + 4 * variance[1:-1] + variance[2:])
@@ -302,20 +323,20 @@ def _check(time_s: np.ndarray, position: np.ndarray, shapes: np.ndarray) -> None
         )
 
 
-def _laid(position: np.ndarray, dt: float, seen: Sections, radius: float) -> scipy.sparse.csr_matrix:
+def _laid(position: np.ndarray, dt: float, sections: Sections, radius: float) -> scipy.sparse.csr_matrix:
     """K (n, T) in s/mm: section at place i from unit flow at sample k;
     positions straight between samples, flow too."""
     share = (np.arange(INSTANTS) + 0.5) / INSTANTS
     x = (position[:-1, None] + np.diff(position)[:, None] * share).ravel()
-    begin = np.searchsorted(seen.s, x - radius - seen.length / 2)
-    many = int(2 * radius / seen.length) + 3
+    begin = np.searchsorted(sections.s, x - radius - sections.length / 2)
+    many = int(2 * radius / sections.length) + 3
     place = begin[:, None] + np.arange(many)
-    s = seen.s[np.minimum(place, len(seen.s) - 1)] - x[:, None]
-    half = seen.length / 2
+    s = sections.s[np.minimum(place, len(sections.s) - 1)] - x[:, None]
+    half = sections.length / 2
     f = (
         (deposit_share(s + half, radius) - deposit_share(s - half, radius))
-        * (place < len(seen.s))
-        / seen.length
+        * (place < len(sections.s))
+        / sections.length
     )
     f *= dt / INSTANTS
     late = np.tile(share, len(position) - 1)[:, None]
@@ -324,7 +345,7 @@ def _laid(position: np.ndarray, dt: float, seen: Sections, radius: float) -> sci
     rows = np.concatenate([place[on]] * 2)
     columns = np.concatenate([np.broadcast_to(sample, f.shape)[on], np.broadcast_to(sample + 1, f.shape)[on]])
     values = np.concatenate([(f * (1 - late))[on], (f * late)[on]])
-    return scipy.sparse.coo_matrix((values, (rows, columns)), shape=(len(seen.s), len(position))).tocsr()
+    return scipy.sparse.coo_matrix((values, (rows, columns)), shape=(len(sections.s), len(position))).tocsr()
 
 
 def _penalty(steps: int) -> np.ndarray:

@@ -159,8 +159,8 @@ def _words(data: bytes) -> tuple[list[np.ndarray], list[tuple[int, str]], list[R
         parts.append(words)
         texts = body.decode("latin-1").split("\n") if len(odd) else []
         for k in odd.tolist():
-            found, unknown, why = _odd(texts[k])
-            extra += [(first + k, ord(letter), value) for letter, value in found]
+            pairs, unknown, why = _odd(texts[k])
+            extra += [(first + k, ord(letter), value) for letter, value in pairs]
             others += [(first + k, unknown)] if unknown else []
             refusals += [Refusal(first + k, why)] if why else []
         at, first = end, first + count
@@ -233,17 +233,17 @@ def _odd(text: str) -> tuple[list[tuple[str, float]], str, str]:
     host = "@" + host.split()[0][:40] if host else ""
     if why or not text:
         return [], host, why
-    if found := ACCELERATION.match(text):
-        return [("M", 204.0), ("S", float(found[1]))], "", ""
-    if found := ACTIVATE.match(text):
-        return [("T", float(found[1] or 0))], "", ""
+    if match := ACCELERATION.match(text):
+        return [("M", 204.0), ("S", float(match[1]))], "", ""
+    if match := ACTIVATE.match(text):
+        return [("T", float(match[1] or 0))], "", ""
     if MACRO.match(text) or text[0] in NOT_WORDS or re.match("[MTmt][^0-9]", text):
         return [], re.split(r"[\s=]", text, maxsplit=1)[0][:40] or text[0], ""
     words, at, owner, strict = [], 0, ("", 0.0), True
     while at < len(text):
-        found = WORD.match(text, at)
-        letter, number, end = (found[1].upper(), found[2], found.end()) if found else ("", None, at)
-        if number and words and found.start(1) > at and (exponent := EXPONENT.match(text, end)):
+        match = WORD.match(text, at)
+        letter, number, end = (match[1].upper(), match[2], match.end()) if match else ("", None, at)
+        if number and words and match.start(1) > at and (exponent := EXPONENT.match(text, end)):
             number, end = (
                 number + exponent[0],
                 exponent.end(),
@@ -253,7 +253,7 @@ def _odd(text: str) -> tuple[list[tuple[str, float]], str, str]:
             strict = letter != "M" and (letter != "G" or owner[1] in READ)
         if number is None and strict:
             return [], "", f"expected letters with a number each, found {text[at : at + 24].strip()!r}"
-        if not found:
+        if not match:
             break
         words.append((letter, float(number or 0)))
         if strict and not abs(words[-1][1]) < LARGEST:
@@ -269,11 +269,11 @@ def _checked(text: str) -> tuple[str, str]:
     fails. Five digits are a CRC, which is not checked."""
     body, star, digits = text.rpartition("*")
     if star and digits.strip().isdecimal() and text[0] in "NGTngt":
-        found = functools.reduce(operator.xor, body.encode("latin-1"), 0)
-        if int(digits) < 256 and int(digits) != found:
+        checksum = functools.reduce(operator.xor, body.encode("latin-1"), 0)
+        if int(digits) < 256 and int(digits) != checksum:
             return (
                 "",
-                f"expected the checksum {digits.strip()} of the line, found {found}; "
+                f"expected the checksum {digits.strip()} of the line, found {checksum}; "
                 "the line was damaged on its way",
             )
         text = body

@@ -37,6 +37,25 @@ class Trial(NamedTuple):
 Law = Callable[[Sequence[Trial]], np.ndarray]
 
 
+class HoelzleSettings(NamedTuple):
+    """Settings of Hoelzle's law: learning gain k_p, fast zero in s, order and cut-off (Hz) of Q."""
+
+    learning_gain: float
+    fast_zero_s: float
+    order: int
+    cutoff_hz: float
+
+
+class InverseSettings(NamedTuple):
+    """Settings of the model inverse: the trials that identify the model, the least weight of a new trial,
+    order and cut-off (Hz) of Q."""
+
+    identify_trials: int
+    floor: float
+    order: int
+    cutoff_hz: float
+
+
 # ---- Q
 
 
@@ -71,38 +90,30 @@ def magnitude(frequency_hz: np.ndarray, *, order: int, cutoff_hz: float, sample_
 
 
 def _slow_inverse(
-    model: Extruder, learning_gain: float, fast_zero_s: float, sample_time_s: float
+    model: Extruder, settings: HoelzleSettings, sample_time_s: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    scale = learning_gain / model.gain
+    scale = settings.learning_gain / model.gain
     return scipy.signal.bilinear(
-        [scale * model.time_constant_s, scale], [fast_zero_s, 1.0], 1 / sample_time_s
+        [scale * model.time_constant_s, scale], [settings.fast_zero_s, 1.0], 1 / sample_time_s
     )
 
 
-def paper_filter(
-    frequency_hz: np.ndarray,
-    model: Extruder,
-    *,
-    learning_gain: float,
-    fast_zero_s: float,
-    sample_time_s: float,
+def hoelzle_filter(
+    frequency_hz: np.ndarray, model: Extruder, settings: HoelzleSettings, *, sample_time_s: float
 ) -> np.ndarray:
     """L(f) = k_p / P̂ (F,), P̂ = K (fast_zero s + 1) / (tau s + 1): the fast zero makes the inverse proper
     (Hoelzle 2009, eq. 2); bilinear."""
     return scipy.signal.freqz(
-        *_slow_inverse(model, learning_gain, fast_zero_s, sample_time_s), frequency_hz, fs=1 / sample_time_s
+        *_slow_inverse(model, settings, sample_time_s), frequency_hz, fs=1 / sample_time_s
     )[1]
 
 
-def paper_law(
+def hoelzle_law(
     r: np.ndarray,
     model: Extruder,
     q: Callable[..., np.ndarray],
+    settings: HoelzleSettings,
     *,
-    learning_gain: float,
-    fast_zero_s: float,
-    order: int,
-    cutoff_hz: float,
     limit: float,
     sample_time_s: float,
 ) -> Law:
@@ -112,7 +123,7 @@ def paper_law(
     u_j is what the drive applied, so that nothing winds up at the
     limit; e_j = 0 where the flow was not observable.
     """
-    b, a = _slow_inverse(model, learning_gain, fast_zero_s, sample_time_s)
+    b, a = _slow_inverse(model, settings, sample_time_s)
 
     def law(trials: Sequence[Trial]) -> np.ndarray:
         u, y, _ = trials[-1]
@@ -120,8 +131,8 @@ def paper_law(
         return np.clip(
             q(
                 u + scipy.signal.lfilter(b, a, e),
-                order=order,
-                cutoff_hz=cutoff_hz,
+                order=settings.order,
+                cutoff_hz=settings.cutoff_hz,
                 sample_time_s=sample_time_s,
             ),
             -limit,
@@ -167,13 +178,13 @@ def disturbance(
     """
     extruder, d = model.extruder, np.zeros(len(r))
     y = np.array([trial.y for trial in trials])
-    seen, y = np.isfinite(y), np.nan_to_num(y)
+    observable, y = np.isfinite(y), np.nan_to_num(y)
     linear = pressed(extruder, np.array([trial.u for trial in trials]), sample_time_s=sample_time_s)
     oozing = scipy.ndimage.uniform_filter1d(y, max(round(OOZE_S / sample_time_s), 1)) > model.noise
     for j in range(len(trials)):
         x = linear[j] + d
         flowing = (r > 0) | (x > extruder.yield_) | oozing[j]
-        d = d + max(1 / max(j, 1), floor) * np.where(seen[j] & flowing, y[j] + extruder.yield_ - x, 0.0)
+        d = d + max(1 / max(j, 1), floor) * np.where(observable[j] & flowing, y[j] + extruder.yield_ - x, 0.0)
     return d
 
 
@@ -197,42 +208,25 @@ def command(
 
 
 class InverseLaw:
-    """Our law, u_{j+1} = Q sum_i w_i (u_i + L e_i) over all trials i <= j, L the inverse of the model
-    identified from the first ones; it remembers that model.
+    """The model inverse, u_{j+1} = Q sum_i w_i (u_i + L e_i) over all trials i <= j, L the inverse of the
+    model identified from the first ones; it remembers that model.
 
     Written with the average d of what the model misses: u_{j+1} = Q L (r + yield - d), the same thing, and
     for one trial Q (u + L e). The weights w_i average what does not repeat; Q stays outside, so that it
     erodes nothing as they fall, and |1 - k + k Q (1 - L P)| < 1 wherever |Q (1 - L P)| < 1, for any k.
 
     `identify_trials` trials are identified together: beyond the on-off trial 0 the first
-    learned commands show the extruder as it will be driven. `floor` is the least weight of a
-    new trial; `order` and `cutoff_hz` are those of Q.
+    learned commands show the extruder as it will be driven.
     """
 
-    def __init__(
-        self,
-        r: np.ndarray,
-        *,
-        identify_trials: int,
-        floor: float,
-        order: int,
-        cutoff_hz: float,
-        limit: float,
-        sample_time_s: float,
-    ):
-        self.r, self.identify_trials, self.floor, self.limit, self.sample_time_s = (
-            r,
-            identify_trials,
-            floor,
-            limit,
-            sample_time_s,
-        )
-        self.q = {"order": order, "cutoff_hz": cutoff_hz, "sample_time_s": sample_time_s}
+    def __init__(self, r: np.ndarray, settings: InverseSettings, *, limit: float, sample_time_s: float):
+        self.r, self.settings, self.limit, self.sample_time_s = r, settings, limit, sample_time_s
+        self.q = {"order": settings.order, "cutoff_hz": settings.cutoff_hz, "sample_time_s": sample_time_s}
         self._first: list[Trial] = []
         self.model: TrialModel | None = None
 
     def __call__(self, trials: Sequence[Trial]) -> np.ndarray:
-        first = list(trials[: self.identify_trials])
+        first = list(trials[: self.settings.identify_trials])
         if (
             self.model is None
             or len(first) != len(self._first)
@@ -243,7 +237,9 @@ class InverseLaw:
                 identify([t.u for t in first], [t.y for t in first], sample_time_s=self.sample_time_s),
             )
         extruder = self.model.extruder
-        d = disturbance(trials, self.r, self.model, floor=self.floor, sample_time_s=self.sample_time_s)
+        d = disturbance(
+            trials, self.r, self.model, floor=self.settings.floor, sample_time_s=self.sample_time_s
+        )
         x = zero_phase(wanted(self.r, extruder.yield_, sample_time_s=self.sample_time_s) - d, **self.q)
         return command(x, self.r, extruder, limit=self.limit, sample_time_s=self.sample_time_s)
 
@@ -261,7 +257,7 @@ def gamma(Q: np.ndarray, L: np.ndarray, P: np.ndarray) -> np.ndarray:
     return np.max(np.abs(Q * (1 - L * P)), axis=-1)
 
 
-class Authority(NamedTuple):
+class ActuatorHeadroom(NamedTuple):
     """What a limit on the command leaves: peak and steady command (mm) that r needs, the least error as a
     share of trial 0's, and the ramp that would do."""
 
@@ -271,7 +267,7 @@ class Authority(NamedTuple):
     ramp_s: float
 
 
-def authority(
+def actuator_headroom(
     r: np.ndarray,
     u0: np.ndarray,
     model: Extruder,
@@ -280,8 +276,8 @@ def authority(
     cutoff_hz: float,
     limit: float,
     sample_time_s: float,
-) -> Authority:
-    """Authority of the drive over the model for r (T,): the least error is that of the nearest flow within
+) -> ActuatorHeadroom:
+    """Headroom of the drive over the model for r (T,): the least error is that of the nearest flow within
     the limit, as a share of what u0 (T,) leaves.
 
     ramp_s solves (1 + tau / t_ramp) steady = limit; it is infinite
@@ -302,22 +298,26 @@ def authority(
     )
     first = flow(model, u0, sample_time_s=sample_time_s, limit=limit)
     ramp_s = model.time_constant_s / (limit / steady - 1) if limit > steady else math.inf
-    return Authority(float(peak), float(steady), rms(r - best) / rms(r - first), ramp_s)
+    return ActuatorHeadroom(float(peak), float(steady), rms(r - best) / rms(r - first), ramp_s)
 
 
-def check_authority(found: Authority, *, limit: float, worst_ratio: float) -> None:
+def check_headroom(headroom: ActuatorHeadroom, *, limit: float, worst_ratio: float) -> None:
     """Raises ValueError where no law can come below `worst_ratio` of trial 0's
     error: the sentence names the ramp that would do."""
-    if found.ratio <= worst_ratio:
+    if headroom.ratio <= worst_ratio:
         return
-    needs = f"these ramps need a peak command of {found.peak / found.steady:.1f} x steady and the limit is {limit / found.steady:.1f} x"
+    needs = (
+        f"these ramps need a peak command of {headroom.peak / headroom.steady:.1f} x steady "
+        f"and the limit is {limit / headroom.steady:.1f} x"
+    )
     do = (
-        f"ramps of {found.ramp_s:.2f} s would do"
-        if math.isfinite(found.ramp_s)
+        f"ramps of {headroom.ramp_s:.2f} s would do"
+        if math.isfinite(headroom.ramp_s)
         else "no ramp would do: print slower, or raise the limit above the steady command"
     )
     raise ValueError(
-        f"authority: {needs}, so no law comes below {found.ratio:.0%} of the error of trial 0; {do}"
+        f"actuator headroom: {needs}, so no law comes below {headroom.ratio:.0%} of the error of trial 0; "
+        f"{do}"
     )
 
 
@@ -336,11 +336,11 @@ class Step(NamedTuple):
 
 def rms(e: np.ndarray) -> float:
     """Root mean square over what was observable."""
-    seen = e[np.isfinite(e)]
-    return float(np.sqrt(seen @ seen / len(seen)))
+    observable = e[np.isfinite(e)]
+    return float(np.sqrt(observable @ observable / len(observable)))
 
 
-class Judged(NamedTuple):
+class LearningState(NamedTuple):
     """The trials to learn from, the one with the least error, whether each has risen, and whether two have
     without a better one between: learning is over."""
 
@@ -350,7 +350,7 @@ class Judged(NamedTuple):
     stopped: bool
 
 
-def judge(errors: Sequence[float], *, rise: float) -> Judged:
+def judge(errors: Sequence[float], *, rise: float) -> LearningState:
     """Which trials to learn from: one whose error exceeds the best so far by more than `rise` of trial 0's
     has risen, and all since the best are left."""
     keep, best, rises, risen = [0], 0, 0, [False]
@@ -363,8 +363,8 @@ def judge(errors: Sequence[float], *, rise: float) -> Judged:
         if errors[j] < errors[best]:
             best, rises = j, 0
         if rises == 2:
-            return Judged(keep, best, risen + [False] * (len(errors) - j - 1), True)
-    return Judged(keep, best, risen, False)
+            return LearningState(keep, best, risen + [False] * (len(errors) - j - 1), True)
+    return LearningState(keep, best, risen, False)
 
 
 def next_step(trials: Sequence[Trial], r: np.ndarray, law: Law, *, rise: float) -> Step:

@@ -87,9 +87,9 @@ def learned(training: Training) -> tuple[np.ndarray, np.ndarray]:
     measured error is within a tenth of the lowest."""
     error = np.sqrt(np.nanmean((training.y - training.r) ** 2, axis=1))
     best = error <= 1.1 * error.min()
-    seen = np.isfinite(training.y[best])
-    y = np.where(seen, training.y[best], 0.0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
-    return training.u[best].mean(axis=0), np.where(seen.any(axis=0), y, np.nan)
+    observable = np.isfinite(training.y[best])
+    y = np.where(observable, training.y[best], 0.0).sum(axis=0) / np.maximum(observable.sum(axis=0), 1)
+    return training.u[best].mean(axis=0), np.where(observable.any(axis=0), y, np.nan)
 
 
 def smoothed(u: np.ndarray, sample_time_s: float) -> np.ndarray:
@@ -186,13 +186,13 @@ def build(trainings: Sequence[Training], *, sample_time_s: float) -> Library:
     if not trainings:
         raise ValueError("library: expected at least one learned routine but found none; run train_ilc first")
     marks = demarcate(trainings, sample_time_s=sample_time_s)
-    taught: dict[tuple, list[Basis]] = {}
+    by_task: dict[tuple, list[Basis]] = {}
     for training in trainings:
         for basis in segment(training, marks, sample_time_s=sample_time_s):
-            taught.setdefault((*basis[1:4], TASKS.index(basis.task), basis.pause_s), []).append(basis)
+            by_task.setdefault((*basis[1:4], TASKS.index(basis.task), basis.pause_s), []).append(basis)
     columns = tuple(
         same[0]._replace(signal=np.mean([basis.signal for basis in same], axis=0))
-        for _, same in sorted(taught.items())
+        for _, same in sorted(by_task.items())
     )
     return Library(columns, sample_time_s, marks)
 

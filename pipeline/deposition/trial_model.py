@@ -1,7 +1,7 @@
 """What one measured trial tells of the extruder: gain, time constant, total delay and yield by least squares,
 each with its uncertainty; up and down apart."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -42,29 +42,21 @@ def identify(
     """
     u, y = [np.asarray(a, float) for a in u], [np.asarray(b, float) for b in y]
     _check(u, y)
-    seen = [np.isfinite(b) for b in y]
-    measured = np.concatenate([b[s] for b, s in zip(y, seen, strict=True)])
+    observable = [np.isfinite(b) for b in y]
+    measured = np.concatenate([b[mask] for b, mask in zip(y, observable, strict=True)])
 
     def predicted(gain, tau, delay, yield_):
         model = Extruder(gain, tau, delay)
         x = np.concatenate(
-            [pressed(model, a, sample_time_s=sample_time_s)[s] for a, s in zip(u, seen, strict=True)]
+            [
+                pressed(model, a, sample_time_s=sample_time_s)[mask]
+                for a, mask in zip(u, observable, strict=True)
+            ]
         )
         return np.maximum(x - yield_, 0.0)
 
-    starts = []
-    for tau in TIME_CONSTANTS_S:
-        for delay in DELAYS_S:
-            shape = predicted(1.0, tau, delay, 0.0)
-            gain = shape @ measured / max(shape @ shape, np.finfo(float).tiny)
-            starts.append((float(np.sum((gain * shape - measured) ** 2)), gain, tau, delay))
-    _, gain, tau, delay = min(starts)
-    if gain <= 0:
-        raise ValueError(
-            f"identify: expected a flow that rises with the command but found a best gain of {gain:.3g} "
-            "mm^3/s per mm; check the command's sign and its clock against the frames'"
-        )
-    # the yield is a share of the flow that was seen; the command's peaks say nothing of it
+    gain, tau, delay = _coarse(predicted, measured)
+    # the yield is a share of the flow that was measured; the command's peaks say nothing of it
     span = float(np.quantile(measured, 0.95))
 
     def four(theta):
@@ -83,8 +75,8 @@ def identify(
         lambda theta: predicted(*four(theta)) - measured, start, bounds=(low, high),
         x_scale=[0.1, 0.1, 0.02, 0.02][:n], diff_step=1e-4, xtol=1e-7, ftol=1e-9
     )  # fmt: skip
-    K, tau, delay, found = four(fit.x)
-    extruder = Extruder(K, tau, delay, yield_=found)
+    K, tau, delay, fitted_yield = four(fit.x)
+    extruder = Extruder(K, tau, delay, yield_=fitted_yield)
     spread = max(np.linalg.norm(measured - measured.mean()), np.finfo(float).tiny)
     fit_percent = float(100 * (1 - np.linalg.norm(fit.fun) / spread))
     if fit_percent < LEAST_FIT_PERCENT:
@@ -93,6 +85,26 @@ def identify(
             "%; check that command and frames are of the same trial and clock"
         )
     return TrialModel(extruder, float(np.sqrt(np.mean(fit.fun**2))), fit_percent)
+
+
+def _coarse(
+    predicted: Callable[[float, float, float, float], np.ndarray], measured: np.ndarray
+) -> tuple[float, float, float]:
+    """Gain, time constant and delay of the best first-order model on a grid. Raises ValueError where its gain
+    is not above 0."""
+    starts = []
+    for tau in TIME_CONSTANTS_S:
+        for delay in DELAYS_S:
+            shape = predicted(1.0, tau, delay, 0.0)
+            gain = shape @ measured / max(shape @ shape, np.finfo(float).tiny)
+            starts.append((float(np.sum((gain * shape - measured) ** 2)), gain, tau, delay))
+    _, gain, tau, delay = min(starts)
+    if gain <= 0:
+        raise ValueError(
+            f"identify: expected a flow that rises with the command but found a best gain of {gain:.3g} "
+            "mm^3/s per mm; check the command's sign and its clock against the frames'"
+        )
+    return gain, tau, delay
 
 
 def deviations(

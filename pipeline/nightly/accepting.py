@@ -17,24 +17,20 @@ def accept(loop: str, why: str) -> str:
         state, remembered = champion.read(), watch.last()
         recordings = remembered.get("drift", {}).get("drifted", {}).get(loop, [])
         if loop not in state["champions"] or not recordings:
-            known = (
-                ", ".join(
-                    name for name, found in remembered.get("drift", {}).get("drifted", {}).items() if found
-                )
-                or "none"
-            )
+            drifted = remembered.get("drift", {}).get("drifted", {})
+            names = ", ".join(name for name, paths in drifted.items() if paths) or "none"
             raise ValueError(
                 f"{loop}: expected a loop with a champion and a drift alarm, found none; "
-                f"loops with an alarm: {known}"
+                f"loops with an alarm: {names}"
             )
         folder = champion.FOLDER / loop
-        found = screening.reference(settings.loops[loop], folder, only=recordings)
-        if found is None:
+        reference = screening.reference(settings.loops[loop], folder, only=recordings)
+        if reference is None:
             raise ValueError(
                 f"{', '.join(recordings)}: too short, or gone, to hold later nights against; "
                 "record a longer shift, and run a night first"
             )
-        artifacts.write_json(folder / screening.REFERENCE, found)
+        artifacts.write_json(folder / screening.REFERENCE, reference)
         dvc("add", "--quiet", str(folder))
         entry = state["champions"][loop] | {"folder": champion.pointer(loop), "files": champion.md5s(folder)}
         state = champion.promoted(state, loop, entry, event="drift accepted")

@@ -71,21 +71,21 @@ def md5_of(files: Sequence[str]) -> dict[str, str]:
     return {name.removeprefix("datasets/"): _md5(Path(name)) for name in sorted(files)}
 
 
-def same(known: Mapping[str, str], files: Sequence[str]) -> bool:
+def same(md5s: Mapping[str, str], files: Sequence[str]) -> bool:
     """Whether a champion's files are these, byte for byte."""
-    return all(known.get(name) == found for name, found in md5_of(files).items())
+    return all(md5s.get(name) == md5 for name, md5 in md5_of(files).items())
 
 
 def rolled_back(state: Mapping[str, Any], loop: str, files: Sequence[str]) -> str:
     """The run whose champion these very files are, where somebody has
     rolled it back since; empty otherwise."""
-    found = ""
+    run = ""
     for line in (line for line in state["history"] if line["loop"] == loop):
         if line["event"] == "rolled back" and same(line["replaced"], files):
-            found = line["before"]
+            run = line["before"]
         elif same(line["champion"]["files"], files):
-            found = ""
-    return found
+            run = ""
+    return run
 
 
 def missing(files: Sequence[str]) -> list[str]:
@@ -139,21 +139,21 @@ def earlier(state: Mapping[str, Any], run: str, loop: str) -> dict[str, dict[str
     """{loop: entry} to go back to: those that were in production in `run`, or, where `run` is empty, before
     the present ones. Raises ValueError where there is none."""
     history = [line for line in state["history"] if not loop or line["loop"] == loop]
-    found: dict[str, dict[str, Any]] = {}
+    entries: dict[str, dict[str, Any]] = {}
     for line in history:
         present = state["champions"][line["loop"]]
         if line["run"] == run or (not run and line["champion"]["folder"]["md5"] != present["folder"]["md5"]):
-            found[line["loop"]] = line["champion"]
-    if run and found:
-        return found
-    if not run and found:
+            entries[line["loop"]] = line["champion"]
+    if run and entries:
+        return entries
+    if not run and entries:
         # only what was changed last goes back, unless a loop was named
-        last = next(line["loop"] for line in reversed(history) if line["loop"] in found)
-        return {last: found[last]}
-    known = ", ".join(dict.fromkeys(f"{line['run']} ({line['loop']})" for line in state["history"])) or "none"
+        last = next(line["loop"] for line in reversed(history) if line["loop"] in entries)
+        return {last: entries[last]}
+    runs = ", ".join(dict.fromkeys(f"{line['run']} ({line['loop']})" for line in state["history"])) or "none"
     raise ValueError(
         f"{FILE}: expected {f'a champion of {run}' if run else 'an earlier champion'} to go back to, "
-        f"found none; known are: {known}"
+        f"found none; known are: {runs}"
     )
 
 

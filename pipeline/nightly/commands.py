@@ -15,8 +15,8 @@ def nightly(arguments: argparse.Namespace) -> None:
         return
     if arguments.merge:
         print(merging.merge(arguments.merge))
-    status, said = night.watchdog() if arguments.watch else night.nightly()
-    print(said, file=sys.stderr if status else sys.stdout)
+    status, summary = night.watchdog() if arguments.watch else night.nightly()
+    print(summary, file=sys.stderr if status else sys.stdout)
     sys.exit(status)
 
 

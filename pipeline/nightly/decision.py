@@ -1,12 +1,13 @@
 """Champion and challenger on the same cases -> promote or keep, with every number that decided."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from pipeline.nightly.settings import Rule
-from pipeline.statistics import blocks_needed, paired
+from pipeline.report.shared.night import Alarm
+from pipeline.statistics import Paired, blocks_needed, paired
 
 PROMOTED, KEPT, FIRST = "promoted", "kept", "first champion"
 
@@ -36,33 +37,14 @@ def decide(
     rule: Rule,
     *,
     allowed: Mapping[str, float],
-    alarms: list[str],
+    alarms: Sequence[Alarm],
     seed: int,
 ) -> Decision:
     """Promote where the paired test finds the challenger better by at least `rule.least_improvement_percent`,
-    no guard is worse by more than `allowed`, and nothing has drifted."""
-    infinite = [case for case, (_, cost) in challenger.cases.items() if not np.isfinite(cost)]
-    unfit = [
-        f"{name} is {figure:g}; none is allowed"
-        for name, figure in challenger.guards.items()
-        if name.startswith("unstable") and figure > 0
-    ]
+    no guard is worse by more than `allowed`, and nothing has drifted: `alarms` are those of this loop
+    alone."""
     if champion is None:
-        reasons = unfit + (
-            [f"{len(infinite)} of {len(challenger.cases)} cases fail, such as {infinite[0]}"]
-            if infinite
-            else []
-        )
-        figures = {"guards": {name: {"challenger": figure} for name, figure in challenger.guards.items()}}
-        return (
-            Decision(
-                KEPT,
-                ["there is no champion, and the challenger is not fit to be one: " + "; ".join(reasons)],
-                figures,
-            )
-            if reasons
-            else Decision(FIRST, ["there was no champion to compare with"], figures)
-        )
+        return _first(challenger)
     if champion.panel != challenger.panel:
         return Decision(
             KEPT,
@@ -73,15 +55,16 @@ def decide(
             {},
         )
     shared = [case for case in champion.cases if case in challenger.cases]
-    found = paired(
+    test = paired(
         np.array([champion.cases[case][1] for case in shared]),
         np.array([challenger.cases[case][1] for case in shared]),
-        [champion.cases[case][0] for case in shared], rng=np.random.default_rng(seed),
-    )  # fmt: skip
-    against = _against(found, rule) + _guards(champion, challenger, allowed) + unfit
-    against += [f"drift: {alarm}; what the panel stands for has changed" for alarm in alarms]
+        [champion.cases[case][0] for case in shared],
+        rng=np.random.default_rng(seed),
+    )
+    against = _against(test, rule) + _guards(champion, challenger, allowed) + _unfit(challenger)
+    against += [f"drift: {alarm.cause}; what the panel stands for has changed" for alarm in alarms]
     figures = {
-        "paired": found._asdict(),
+        "paired": test._asdict(),
         "guards": {
             name: {
                 "champion": champion.guards[name],
@@ -92,37 +75,62 @@ def decide(
             if name in challenger.guards
         },
     }
-    better = f"{found.improvement_percent:.1f} % better ({found.low_percent:.1f} to {found.high_percent:.1f} %, {_chance(found)}) on {found.cases} cases of {found.blocks} blocks"
-    return (
-        Decision(KEPT, against, figures)
-        if against
-        else Decision(PROMOTED, [better, "no guard is worse"], figures)
+    if against:
+        return Decision(KEPT, against, figures)
+    better = (
+        f"{test.improvement_percent:.1f} % better ({test.low_percent:.1f} to {test.high_percent:.1f} %, "
+        f"{_chance(test)}) on {test.cases} cases of {test.blocks} blocks"
     )
+    return Decision(PROMOTED, [better, "no guard is worse"], figures)
 
 
-def _chance(found) -> str:
-    return "p < 0.0001" if found.p < 1e-4 else f"p = {found.p:.2g}"
+def _first(challenger: Evidence) -> Decision:
+    """Where there is no champion, a challenger that is fit becomes one."""
+    failing = [case for case, (_, cost) in challenger.cases.items() if not np.isfinite(cost)]
+    reasons = _unfit(challenger)
+    if failing:
+        reasons.append(f"{len(failing)} of {len(challenger.cases)} cases fail, such as {failing[0]}")
+    figures = {"guards": {name: {"challenger": figure} for name, figure in challenger.guards.items()}}
+    if not reasons:
+        return Decision(FIRST, ["there was no champion to compare with"], figures)
+    start = "there is no champion, and the challenger is not fit to be one: "
+    return Decision(KEPT, [start + "; ".join(reasons)], figures)
 
 
-def _against(found, rule: Rule) -> list[str]:
-    if found.blocks < blocks_needed(rule.level):
+def _unfit(challenger: Evidence) -> list[str]:
+    return [
+        f"{name} is {figure:g}; none is allowed"
+        for name, figure in challenger.guards.items()
+        if name.startswith("unstable") and figure > 0
+    ]
+
+
+def _chance(test: Paired) -> str:
+    return "p < 0.0001" if test.p < 1e-4 else f"p = {test.p:.2g}"
+
+
+def _against(test: Paired, rule: Rule) -> list[str]:
+    if test.blocks < blocks_needed(rule.level):
         return [
-            f"{found.blocks} blocks cannot tell at level {rule.level:g}; "
+            f"{test.blocks} blocks cannot tell at level {rule.level:g}; "
             f"at least {blocks_needed(rule.level)} are needed"
         ]
-    told = f"{found.improvement_percent:.1f} % ({found.low_percent:.1f} to {found.high_percent:.1f} %, {_chance(found)})"
-    if found.improvement_percent <= 0:
+    margin = (
+        f"{test.improvement_percent:.1f} % ({test.low_percent:.1f} to {test.high_percent:.1f} %, "
+        f"{_chance(test)})"
+    )
+    if test.improvement_percent <= 0:
         return [
-            f"the challenger is no better: its cases cost {-found.improvement_percent:.1f} % more "
-            f"({-found.high_percent:.1f} to {-found.low_percent:.1f} %)"
+            f"the challenger is no better: its cases cost {-test.improvement_percent:.1f} % more "
+            f"({-test.high_percent:.1f} to {-test.low_percent:.1f} %)"
         ]
-    if found.improvement_percent < rule.least_improvement_percent:
+    if test.improvement_percent < rule.least_improvement_percent:
         return [
-            f"the challenger is better by {told}; at least {rule.least_improvement_percent:g} "
+            f"the challenger is better by {margin}; at least {rule.least_improvement_percent:g} "
             "% is worth a change"
         ]
-    if found.p > rule.level:
-        return [f"the challenger is better by {told}, within noise at level {rule.level:g}"]
+    if test.p > rule.level:
+        return [f"the challenger is better by {margin}, within noise at level {rule.level:g}"]
     return []
 
 

@@ -20,14 +20,17 @@ import numpy as np
 import scipy.linalg
 import scipy.stats
 
-from pipeline.temperature.plant import Plant, drawn_in
+from pipeline.temperature.plant import Plant, clip_spectral_radius
 from pipeline.temperature.refinement import Predictor, free_response, linear_recurrence
 from pipeline.temperature.tracking import robust_observer_gain
 
 STEP = 0.02  # relative change by which sensitivities are taken: small beside 10 %, large beside rounding
 BLOCKS = 24  # into which a record is cut for the variance of an estimate
-MEMORY = 8  # the slow observer forgets in an eighth of the record: long enough to tell a gain from a time constant, short enough to pass a slow disturbance over
-TELLING = 1.3  # a gain explains so much more than a time constant, or the other way round, or the record cannot tell
+# the slow observer forgets in an eighth of the record: long enough to tell a gain from a time constant,
+# short enough to pass a slow disturbance over
+MEMORY = 8
+# a gain explains so much more than a time constant, or the other way round, or the record cannot tell
+TELLING = 1.3
 
 Segments = Sequence[tuple[np.ndarray, np.ndarray]]
 
@@ -68,17 +71,17 @@ def faster(plant: Plant, share: float) -> Plant:
     """
     n, m = plant.n, plant.m
     rate = 1.0 + share
-    whole = np.block([[plant.A, plant.B, plant.b[:, None]], [np.zeros((m + 1, n)), np.eye(m + 1)]])
+    augmented = np.block([[plant.A, plant.B, plant.b[:, None]], [np.zeros((m + 1, n)), np.eye(m + 1)]])
     eigenvalues = np.linalg.eigvals(plant.A)
     if (
         np.abs(eigenvalues).min() > 0.05
         and not ((eigenvalues.real < 0) & (np.abs(eigenvalues.imag) < 1e-9)).any()
     ):
         with np.errstate(all="ignore"):
-            found = scipy.linalg.expm(scipy.linalg.logm(whole) * rate)
-        if np.isfinite(found).all() and np.abs(found.imag).max() < 1e-6:
-            found = found.real
-            return plant._replace(A=found[:n, :n], B=found[:n, n : n + m], b=found[:n, -1])
+            power = scipy.linalg.expm(scipy.linalg.logm(augmented) * rate)
+        if np.isfinite(power).all() and np.abs(power.imag).max() < 1e-6:
+            power = power.real
+            return plant._replace(A=power[:n, :n], B=power[:n, n : n + m], b=power[:n, -1])
     eye = np.eye(n)
     return plant._replace(A=eye - (eye - plant.A) * rate, B=plant.B * rate, b=plant.b * rate)
 
@@ -110,9 +113,9 @@ def slow_observer(plant: Plant, samples: int) -> np.ndarray:
     mode forgets in 1 / MEMORY of the record."""
     wanted = max(1.0 - MEMORY / samples, 0.5)
     taus = np.geomspace(1e-2, 1e7, 19)
-    found = [robust_observer_gain(plant, tau) for tau in taus]
-    radii = [np.abs(np.linalg.eigvals(plant.A - K @ plant.C)).max() for K in found]
-    return found[int(np.abs(np.array(radii) - wanted).argmin())]
+    gains = [robust_observer_gain(plant, tau) for tau in taus]
+    radii = [np.abs(np.linalg.eigvals(plant.A - K @ plant.C)).max() for K in gains]
+    return gains[int(np.abs(np.array(radii) - wanted).argmin())]
 
 
 def estimate(
@@ -131,13 +134,13 @@ def estimate(
         np.concatenate([part[0] for part in parts]),
         np.concatenate([part[1] for part in parts]),
     )  # (T, p), (T, p, causes)
-    seen = np.isfinite(e)
-    e, psi = np.where(seen, e, 0.0), np.where(seen[:, :, None], psi, 0.0)
+    mask = np.isfinite(e)
+    e, psi = np.where(mask, e, 0.0), np.where(mask[:, :, None], psi, 0.0)
     raw_mean = np.array(
-        [np.average(e[:, i], weights=seen[:, i]) if seen[:, i].any() else 0.0 for i in range(p)]
+        [np.average(e[:, i], weights=mask[:, i]) if mask[:, i].any() else 0.0 for i in range(p)]
     )
-    centred = np.where(seen, e - raw_mean, 0.0)
-    counts = np.maximum(seen.sum(axis=0), 2)
+    centred = np.where(mask, e - raw_mean, 0.0)
+    counts = np.maximum(mask.sum(axis=0), 2)
     own = np.maximum((centred**2).sum(axis=0) / (counts - 1), 1e-12)
     variance = own if variance is None else variance
     score = np.einsum("tpc,tp->tc", psi, centred / variance)
@@ -149,7 +152,7 @@ def estimate(
     sums = np.stack([part.sum(axis=0) for part in np.array_split(left, BLOCKS)])
     deviation = np.sqrt(np.maximum((sums**2).sum(axis=0) * BLOCKS / (BLOCKS - 1), information)) / alone
     blocks = [
-        (part, on) for part, on in zip(np.array_split(e, BLOCKS), np.array_split(seen, BLOCKS), strict=True)
+        (part, on) for part, on in zip(np.array_split(e, BLOCKS), np.array_split(mask, BLOCKS), strict=True)
     ]
     means = np.stack([part.sum(axis=0) / np.maximum(on.sum(axis=0), 1) for part, on in blocks])
     powers = np.stack(
@@ -176,7 +179,7 @@ def _free(
     forgets = plant.A - K @ plant.C
     # what each input alone has done to the state, about its mean; the
     # observer's state would bring its noise along
-    moved, A = u - u.mean(axis=0), drawn_in(plant.A, 1.0 - 1.0 / len(u))
+    moved, A = u - u.mean(axis=0), clip_spectral_radius(plant.A, 1.0 - 1.0 / len(u))
     gains = [
         _passed(plant, K, forgets, np.outer(u[:, j], plant.B[:, j]), np.outer(u[:, j], plant.D[:, j]))
         for j in range(plant.m)
@@ -191,11 +194,11 @@ def _free(
     ]
     gamma = free_response_of(plant, K, len(y))
     psi = np.stack(columns, axis=2)
-    seen = np.isfinite(e).all(axis=1)
+    mask = np.isfinite(e).all(axis=1)
     # the initial state and each output's mean are fitted along, and taken off both
     T, p, n = gamma.shape
-    nuisance = np.concatenate([gamma, np.broadcast_to(np.eye(p), (T, p, p))], axis=2)[seen].reshape(-1, n + p)
-    both = np.concatenate([np.nan_to_num(e)[:, :, None], np.nan_to_num(psi)], axis=2)[seen].reshape(
+    nuisance = np.concatenate([gamma, np.broadcast_to(np.eye(p), (T, p, p))], axis=2)[mask].reshape(-1, n + p)
+    both = np.concatenate([np.nan_to_num(e)[:, :, None], np.nan_to_num(psi)], axis=2)[mask].reshape(
         -1, 1 + len(asked)
     )
     fitted = np.linalg.lstsq(nuisance, both, rcond=1e-10)[0]
@@ -217,8 +220,8 @@ def _passed(
     """d y-hat (T, p) of the observer where its state is driven by
     `drive` (T, n) and its output by `straight` (T, p)."""
     through = drive if straight is None else drive - straight @ K.T
-    found = linear_recurrence(forgets, through, np.zeros(plant.n))[:-1] @ plant.C.T
-    return found if straight is None else found + straight
+    y = linear_recurrence(forgets, through, np.zeros(plant.n))[:-1] @ plant.C.T
+    return y if straight is None else y + straight
 
 
 # ---- the new record against those of the champion
@@ -255,15 +258,15 @@ def shift(
     own, scatter = np.maximum(deviation**2 + inside / nights, 1e-24), between * (1 + 1 / nights)
     spread = np.sqrt(own + scatter)
     t = (value - before.mean(axis=0)) / spread
-    known = spread**4 / (own**2 / freedom + scatter**2 / max(nights - 1, 1))
-    tail = np.maximum(scipy.stats.t.sf(np.abs(t), known), 1e-290)
+    degrees = spread**4 / (own**2 / freedom + scatter**2 / max(nights - 1, 1))
+    tail = np.maximum(scipy.stats.t.sf(np.abs(t), degrees), 1e-290)
     return Shift(value, before.mean(axis=0), spread, np.sign(t) * scipy.stats.norm.isf(tail))
 
 
-def explained(shifted: Shift, found: Estimate) -> np.ndarray:
+def explained(shifted: Shift, estimated: Estimate) -> np.ndarray:
     """(causes,): the weighted squared error that each change explains; causes are rivals for the same error,
     and the largest is the likeliest."""
-    information = found.explained / np.maximum(found.change**2, 1e-30)
+    information = estimated.explained / np.maximum(estimated.change**2, 1e-30)
     return (shifted.value - shifted.reference) ** 2 * information
 
 
@@ -317,13 +320,13 @@ def mistakes(
     def misfit(a: np.ndarray, b: np.ndarray) -> float:
         e = errors(plant, K, a, b)
         gamma = free_response_of(plant, K, len(b))
-        seen = np.isfinite(e)
-        x0 = np.linalg.lstsq(gamma[seen], e[seen], rcond=1e-10)[0]
+        measured = np.isfinite(e)
+        x0 = np.linalg.lstsq(gamma[measured], e[measured], rcond=1e-10)[0]
         rest = (e - gamma @ x0) / scale
         # bounded, so that one wild channel does not drown the others
-        return float(np.mean(np.minimum(rest[seen] ** 2, 1e4)))
+        return float(np.mean(np.minimum(rest[measured] ** 2, 1e4)))
 
-    as_is, found = misfit(u, y), []
+    as_is, suspects = misfit(u, y), []
     if as_is < gross:
         return [Mistake("", as_is)]
     for names, signals, word, other in ((outputs, y, "sensors", u), (inputs, u, "inputs", y)):
@@ -332,21 +335,25 @@ def mistakes(
                 swapped = signals.copy()
                 swapped[:, [i, j]] = swapped[:, [j, i]]
                 pair = (other, swapped) if word == "sensors" else (swapped, other)
-                found.append(
+                suspects.append(
                     Mistake(f"the {word} {names[j]} and {names[i]} are swapped", misfit(*pair) / as_is)
                 )
     for name, undo in (("°F", lambda c: (c - 32) / 1.8), ("K", lambda c: c - 273.15)):
-        found.append(Mistake(f"every sensor is in {name} where °C is declared", misfit(u, undo(y)) / as_is))
+        suspects.append(
+            Mistake(f"every sensor is in {name} where °C is declared", misfit(u, undo(y)) / as_is)
+        )
         for i, output in enumerate(outputs):
             one = y.copy()
             one[:, i] = undo(y[:, i])
-            found.append(Mistake(f"{output} is in {name} where °C is declared", misfit(u, one) / as_is))
+            suspects.append(Mistake(f"{output} is in {name} where °C is declared", misfit(u, one) / as_is))
     for factor, words in ((100.0, "shares of 1"), (100.0 / 255.0, "counts of 255")):
-        found.append(
+        suspects.append(
             Mistake(f"every input is in {words} where percent is declared", misfit(factor * u, y) / as_is)
         )
         for j, name in enumerate(inputs):
             one = u.copy()
             one[:, j] *= factor
-            found.append(Mistake(f"{name} is in {words} where percent is declared", misfit(one, y) / as_is))
-    return [Mistake("", as_is), *sorted(found, key=lambda mistake: mistake.left)]
+            suspects.append(
+                Mistake(f"{name} is in {words} where percent is declared", misfit(one, y) / as_is)
+            )
+    return [Mistake("", as_is), *sorted(suspects, key=lambda mistake: mistake.left)]

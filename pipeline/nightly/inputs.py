@@ -50,23 +50,24 @@ class Hashes:
         self.now: dict[str, list] = {}
 
     def of(self, path: Path) -> str:
-        found = path.stat()
-        stamp = [found.st_size, found.st_mtime_ns, found.st_ino]
-        known = self.remembered.get(str(path))
-        self.now[str(path)] = known if known and known[:3] == stamp else [*stamp, artifacts.sha256(path)]
+        status = path.stat()
+        stamp = [status.st_size, status.st_mtime_ns, status.st_ino]
+        before = self.remembered.get(str(path))
+        same = bool(before) and before[:3] == stamp
+        self.now[str(path)] = before if same else [*stamp, artifacts.sha256(path)]
         return self.now[str(path)][3]
 
     def below(self, place: str) -> dict[str, str]:
         """{path: digest} of a file, or of every file below a folder that a stage would read."""
         path = Path(place)
         files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
-        kept = [
+        relevant = [
             file
             for file in files
             if not any(part.startswith(".") or part == "__pycache__" for part in file.parts)
             and file.suffix != ".pyc"
         ]
-        return {file.as_posix(): self.of(file) for file in kept}
+        return {file.as_posix(): self.of(file) for file in relevant}
 
 
 def contents(hashes: Hashes, places: list[str]) -> dict[str, str]:
@@ -74,26 +75,26 @@ def contents(hashes: Hashes, places: list[str]) -> dict[str, str]:
     return {name: content for place in places for name, content in hashes.below(place).items()}
 
 
-def digest(found: Mapping[str, str]) -> str:
+def digest(digests: Mapping[str, str]) -> str:
     """One digest over names and contents."""
-    whole = hashlib.sha256()
-    for name, content in found.items():
-        whole.update(f"{name}\0{content}\n".encode())
-    return whole.hexdigest()
+    total = hashlib.sha256()
+    for name, content in digests.items():
+        total.update(f"{name}\0{content}\n".encode())
+    return total.hexdigest()
 
 
-def recordings(found: Mapping[str, str], folder: str) -> dict[str, str]:
+def recordings(digests: Mapping[str, str], folder: str) -> dict[str, str]:
     """{path: digest} of the recordings below a loop's folder, of all
     that was found; notes and files of dvc are none."""
     notes = (".md", ".txt", ".yaml", ".dvc")
     return {
         name: content
-        for name, content in found.items()
+        for name, content in digests.items()
         if folder and name.startswith(f"{folder}/") and not name.lower().endswith(notes)
     }
 
 
-def aside(path: str, loop: str, reason: str) -> str:
+def quarantine(path: str, loop: str, reason: str) -> str:
     """Moves the recording, unchanged, to datasets/quarantine, where no stage looks and git does not either,
     its reason beside it; nothing there is overwritten. The reason."""
     name, folder = Path(path), QUARANTINE / loop

@@ -43,15 +43,15 @@ def judge(loop: Loop, settings: Nightly) -> Judge:
 def _cases(path: Path) -> tuple[Evidence, dict[str, float]]:
     """{"panel": name, "cases": {case: {"block": name, "cost": number}}, "guards":
     {guard: {"value": number, "allowed": number}}}."""
-    found = artifacts.read_json(path)
+    declared = artifacts.read_json(path)
     try:
         cases = {
             name: (str(case["block"]), float(case["cost"]) if case["cost"] is not None else np.inf)
-            for name, case in found["cases"].items()
+            for name, case in declared["cases"].items()
         }
-        guards = {name: float(guard["value"]) for name, guard in found["guards"].items()}
-        return Evidence(str(found["panel"]), cases, guards), {
-            name: float(guard["allowed"]) for name, guard in found["guards"].items()
+        guards = {name: float(guard["value"]) for name, guard in declared["guards"].items()}
+        return Evidence(str(declared["panel"]), cases, guards), {
+            name: float(guard["allowed"]) for name, guard in declared["guards"].items()
         }
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError(
@@ -100,51 +100,72 @@ def _setpoint(folder: Path) -> Evidence:
 
 
 def _allowed(champion: Evidence, rule: Rule) -> dict[str, float]:
+    holdout = champion.guards.get("holdout_error_degC", 0.0)
     return {
         "worst_case": champion.guards["worst_case"] * rule.worst_case_percent / 100,
         "settled_error_degC": rule.settled_error_degC,
-        "holdout_error_degC": champion.guards.get("holdout_error_degC",
-        0.0) * rule.holdout_error_percent / 100,
-    }  # fmt: skip
+        "holdout_error_degC": holdout * rule.holdout_error_percent / 100,
+    }
+
+
+class FrozenPanel(NamedTuple):
+    """What every controller of the temperature loop is judged on, night after night; `name` is the hash of
+    all that it was made from."""
+
+    name: str
+    machine: Plant
+    tracking: Tracking
+    band_degC: float
+    plants: list
+    scenarios: Any
+    allowance: Any
+    records: list[tuple[np.ndarray, np.ndarray]]
+
+    @property
+    def limits(self) -> tuple[np.ndarray, np.ndarray]:
+        low, high = np.array([(i.low, i.high) for i in self.machine.inputs]).T
+        return low, high
 
 
 def _temperature(settings: Nightly) -> Callable[[Path], Evidence]:
     """Closed loop on every plant of the frozen panel, from starts and to references of section
     `nightly.holdout`, with its seeds; prediction on the hold-out recordings."""
-    from pipeline.temperature import judging, plant, scorecard
+    panel = _frozen_panel(settings.holdout)
+    return lambda folder: _closed_loop(panel, folder, settings)
 
-    h, machine, tracking, panel = (
-        settings.holdout,
-        params.load(Plant, "plant"),
-        params.load(Tracking, "tracking"),
-        params.load(Panel, "panel"),
-    )
-    weights = params.read()["tune_weights"]
+
+def _frozen_panel(holdout: HoldOut) -> FrozenPanel:
+    from pipeline.temperature import plant, scorecard
+
+    machine, tracking = params.load(Plant, "plant"), params.load(Tracking, "tracking")
+    panel, weights = params.load(Panel, "panel"), params.read()["tune_weights"]
     allowance = scorecard.Allowance(
         *(float(weights[f"allow_{name}"]) for name in scorecard.Allowance._fields[:-1]), 0.0
     )
     simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
-    records = [] if simulated else _holdout_records(h, machine)
+    records = [] if simulated else _holdout_records(holdout, machine)
     if simulated:
         plants = plant.spread(
             plant.baam()._replace(sample_time_s=machine.sample_time_s),
             input_gain=panel.input_gain,
-            loss=panel.loss,
+            extra_heat_loss=panel.extra_heat_loss_per_step,
         )
         # between the declared plants: the panel that the stages judge on has the ends
-        plants = plant.spread(plants[0], input_gain=0.6 * panel.input_gain, loss=0.6 * panel.loss)
+        plants = plant.spread(
+            plants[0], input_gain=0.6 * panel.input_gain, extra_heat_loss=0.6 * panel.extra_heat_loss_per_step
+        )
     else:
         plants = _panel_plants(records, machine)
     reference = np.array([output.reference for output in machine.outputs])
     scenarios = scorecard.panel(
-        plants, starts=h.starts_degC, references=[reference + offset for offset in h.reference_offsets_degC],
-        noise=[h.noise_degC], seeds=h.seeds,
-        steps=h.steps, hold=panel.hold_steps, cells=simulated,
+        plants, starts=holdout.starts_degC,
+        references=[reference + offset for offset in holdout.reference_offsets_degC],
+        noise=[holdout.noise_degC], seeds=holdout.seeds,
+        steps=holdout.steps, hold=panel.hold_steps, cells=simulated,
     )  # fmt: skip
-    limits = tuple(np.array([(i.low, i.high) for i in machine.inputs]).T)
     name = joblib.hash(
         (
-            h.model_dump(),
+            holdout.model_dump(),
             [tuple(map(np.asarray, one)) for one in plants],
             machine.model_dump(),
             tracking.model_dump(),
@@ -152,59 +173,27 @@ def _temperature(settings: Nightly) -> Callable[[Path], Evidence]:
             tuple(allowance),
         )
     )
-
-    def measured(folder: Path) -> Evidence:
-        made, predictor, weight = controller(folder, h.controller, tracking.gamma)
-        law = made.design(weight["q"], weight["r"], tracking.integral)
-        aims = judging.targets(made.model, scenarios.r, limits)
-        run = scorecard.simulate(
-            scenarios,
-            law,
-            scorecard.feed_forward(scenarios, law, aims),
-            limits=limits,
-            integral_band=tracking.integral_limit_degC,
-        )
-        found = scorecard.figures(
-            scenarios, run, limits=limits, band=panel.band_degC, sample_time_s=machine.sample_time_s
-        )
-        margins = scorecard.margins(plants, law, grid=80)
-        return _temperature_evidence(
-            name,
-            scenarios,
-            found,
-            margins,
-            allowance,
-            machine.sample_time_s,
-            _prediction_error(predictor, records),
-            settings.rule.least_disk_margin,
-        )
-
-    return measured
+    return FrozenPanel(name, machine, tracking, panel.band_degC, plants, scenarios, allowance, records)
 
 
-def _temperature_evidence(
-    name: str,
-    scenarios,
-    found,
-    margins,
-    allowance,
-    sample_time_s: float,
-    holdout: float | None,
-    least_margin: float,
-) -> Evidence:
-    from pipeline.temperature import scorecard
+def _closed_loop(panel: FrozenPanel, folder: Path, settings: Nightly) -> Evidence:
+    from pipeline.temperature import judging, scorecard
 
-    costs = []
-    for i in range(len(scenarios.plant)):
-        one = type(found)(*(figure[i : i + 1] for figure in found))
-        try:
-            costs.append(
-                scorecard.engineering_cost(
-                    one, scenarios.plant[i : i + 1], allowance, longest_s=scenarios.steps * sample_time_s
-                )
-            )
-        except ValueError:
-            costs.append(np.inf)
+    scenarios, limits, tracking = panel.scenarios, panel.limits, panel.tracking
+    made, predictor, weight = controller(folder, settings.holdout.controller, tracking.gamma)
+    law = made.design(weight["q"], weight["r"], tracking.integral)
+    aims = judging.targets(made.model, scenarios.r, limits)
+    rollout = scorecard.simulate(
+        scenarios,
+        law,
+        scorecard.feed_forward(scenarios, law, aims),
+        limits=limits,
+        integral_band=tracking.integral_limit_degC,
+    )
+    figures = scorecard.figures(
+        scenarios, rollout, limits=limits, band=panel.band_degC, sample_time_s=panel.machine.sample_time_s
+    )
+    costs = _costs(panel, figures)
     cases = {
         f"plant {p}, {start:g} °C to {r:g} °C, seed {seed}": (f"plant {p}", float(cost))
         for p, start, r, seed, cost in zip(
@@ -212,12 +201,31 @@ def _temperature_evidence(
         )
     }
     by_plant = [np.mean(np.array(costs)[scenarios.plant == p]) for p in np.unique(scenarios.plant)]
+    margins = scorecard.margins(panel.plants, law, grid=80)
+    smallest = min(margin.disk for margin in margins)
     guards = {
-        "worst_case": float(np.max(by_plant)), "settled_error_degC": float(found.settled_error_degC.max()),
-        "margin_short_of_least": max(least_margin - min(margin.disk for margin in margins), 0.0),
+        "worst_case": float(np.max(by_plant)),
+        "settled_error_degC": float(figures.settled_error_degC.max()),
+        "margin_short_of_least": max(settings.rule.least_disk_margin - smallest, 0.0),
         "unstable_plants": float(sum(not margin.stable for margin in margins)),
-    }  # fmt: skip
-    return Evidence(name, cases, guards | ({"holdout_error_degC": holdout} if holdout is not None else {}))
+    }
+    error = _prediction_error(predictor, panel.records)
+    return Evidence(panel.name, cases, guards | ({"holdout_error_degC": error} if error is not None else {}))
+
+
+def _costs(panel: FrozenPanel, figures: Any) -> list[float]:
+    """The engineering cost of each case; infinite where it fails."""
+    from pipeline.temperature import scorecard
+
+    costs, longest_s = [], panel.scenarios.steps * panel.machine.sample_time_s
+    for i in range(len(panel.scenarios.plant)):
+        one = type(figures)(*(figure[i : i + 1] for figure in figures))
+        plant_of_case = panel.scenarios.plant[i : i + 1]
+        try:
+            costs.append(scorecard.engineering_cost(one, plant_of_case, panel.allowance, longest_s=longest_s))
+        except ValueError:
+            costs.append(np.inf)
+    return costs
 
 
 def controller(folder: Path, which: str, gamma: float):
@@ -256,19 +264,19 @@ def record_segments(
         name: (m["source"], m["unit"], float(m["scale"]), float(m["offset"]))
         for name, m in declared["mapping"].items()
     }
-    job = ingest.Job(machine, mapping, declared["time"], float(declared["max_gap_s"]))
+    spec = ingest.IngestSpec(machine, mapping, declared["time"], float(declared["max_gap_s"]))
     results = ingest.process(
-        folder, job, params.load(params.Execution, "execution"), memo=Path("datasets/memo/ingest")
+        folder, spec, params.load(params.Execution, "execution"), memo=Path("datasets/memo/ingest")
     )
-    found = {}
+    segments = {}
     for result in results:
         if result.reason:
             if broken is None:
                 raise ValueError(result.reason)
             broken[result.name] = result.reason
             continue
-        found[result.name] = _segments(result.record, machine)
-    return found
+        segments[result.name] = _segments(result.record, machine)
+    return segments
 
 
 def _segments(record: dict[str, np.ndarray], machine: Plant) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -302,20 +310,12 @@ def _panel_plants(records: list[tuple[np.ndarray, np.ndarray]], machine: Plant):
     u, _ = identification.within_limits(
         u, tuple(zip(*((i.low, i.high) for i in machine.inputs), strict=True)), names=names
     )
-    found = identification.identify(
-        u,
-        y,
-        sample_time_s=machine.sample_time_s,
-        order=None,
-        offset=p["offset"],
-        refinement="none",
-        max_order=p["max_order"],
-        names=names,
-    )
+    settings = identification.Settings(offset=p["offset"], max_order=p["max_order"])
+    fit = identification.identify(u, y, sample_time_s=machine.sample_time_s, settings=settings, names=names)
     family = validation.bootstrap_spread(
-        u, y, found, count=p["spread_plants"], order=found.order, rng=np.random.default_rng(p["seed"])
+        u, y, fit, count=p["spread_plants"], order=fit.order, rng=np.random.default_rng(p["seed"])
     )
-    artifacts.write_arrays(path, "holdout_plants", 1, plant.stored([found.plant, *family]))
+    artifacts.write_arrays(path, "holdout_plants", 1, plant.stored([fit.plant, *family]))
     return plant.restored(artifacts.read_arrays(path, "holdout_plants", 1))
 
 

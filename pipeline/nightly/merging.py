@@ -26,8 +26,8 @@ def merge(branch: str) -> str:
         git("merge", "--no-commit", "--no-ff", "--no-edit", branch, check=False, env=identity())
         if not git("rev-parse", "-q", "--verify", "MERGE_HEAD", check=False):
             return f"{branch} has nothing that is not here already"
-        if known := git("ls-tree", "-r", "--name-only", "HEAD", "--", *OURS).splitlines():
-            git("checkout", "-q", "HEAD", "--", *known)
+        if tracked := git("ls-tree", "-r", "--name-only", "HEAD", "--", *OURS).splitlines():
+            git("checkout", "-q", "HEAD", "--", *tracked)
         conflicts = git("diff", "--name-only", "--diff-filter=U").splitlines()
         if conflicts:
             git("merge", "--abort")
@@ -35,8 +35,8 @@ def merge(branch: str) -> str:
                 f"{branch} and this branch both changed {', '.join(conflicts)}; "
                 f"merge them by hand (git merge {branch}), then run ./run beadline nightly"
             )
-        seen = {_key(line) for line in mine["history"]}
-        both = [*mine["history"], *(line for line in theirs["history"] if _key(line) not in seen)]
+        ours = {_key(line) for line in mine["history"]}
+        both = [*mine["history"], *(line for line in theirs["history"] if _key(line) not in ours)]
         # a loop that has no champion here keeps theirs
         artifacts.write_json(
             champion.FILE,

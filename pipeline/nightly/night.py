@@ -5,6 +5,7 @@ aside; 75: another night is at work."""
 
 import datetime
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,16 +52,16 @@ def _night(settings: Nightly, now: datetime.datetime, left: list[str]) -> tuple[
             f"the clock was set back: it is {entry['when']}, and the last success was at {success}"
         )
     overdue = watch.overdue(now, settings.watch_h) if success else ""
-    hashes, known = inputs.Hashes(remembered.get("hashes", {})), None
+    hashes, digests = inputs.Hashes(remembered.get("hashes", {})), None
     try:
         guarding.ready(settings.least_free_mb)
-        known = _work(settings, entry, remembered, hashes)
+        digests = _work(settings, entry, remembered, hashes)
     except (ValueError, OSError, np.linalg.LinAlgError) as error:
         guarding.RESERVE.unlink(missing_ok=True)  # on a full disk, what follows is written from it
         entry |= {"outcome": "failed", "reasons": [" ".join(str(error).split())]}
     entry["seconds"] = round(time.monotonic() - clock, 1)
     entry["notes"] += [f"watch: {overdue}"] if overdue else []
-    return _say(settings, entry, remembered, hashes, known)
+    return _say(settings, entry, remembered, hashes, digests)
 
 
 def _work(
@@ -71,33 +72,30 @@ def _work(
     *,
     again: bool = True,
 ) -> dict[str, str]:
-    """The night itself; what it did goes to `entry`. What it was made from, {path: digest}: where that
-    changes from the first look on, the night begins once again."""
-    places = [
-        *inputs.sources(),
-        settings.holdout.recordings,
-        *(loop.recordings for loop in settings.loops.values() if loop.recordings),
-    ]
+    """The night itself; what it did goes to `entry`. Returns what it was made from, {path: digest}.
+    If that changes while the stages run, the night restarts once."""
+    places = _places(settings)
     before = inputs.contents(hashes, places)
-    if inputs.digest(before) == remembered.get("inputs") and not remembered.get("unpushed"):
-        nothing = "no recording, parameter or code has changed since the last night"
+    if _nothing_new(before, remembered):
+        outcome = "quarantined" if entry.get("quarantined") else "nothing new"
         entry |= {
-            "outcome": "quarantined" if entry.get("quarantined") else "nothing new",
-            "reasons": [nothing],
+            "outcome": outcome,
+            "reasons": ["no recording, parameter or code has changed since the last night"],
         }
         return before
     new = {
         name: _new(before, loop.recordings, remembered.get("recordings", {}).get(name, {}))
         for name, loop in settings.loops.items()
     }
-    entry["new_recordings"] = {name: sorted(found) for name, found in new.items() if found}
+    entry["new_recordings"] = {name: sorted(paths) for name, paths in new.items() if paths}
     from pipeline.nightly import screening
 
     state = champion.read()
-    entry["drift"] = screening.look(settings, state, new, remembered.get("drift", {}), night=entry["night"])
-    entry["quarantined"] = entry.get("quarantined", {}) | entry["drift"].pop("quarantined")
+    screened = screening.look(settings, state, new, remembered.get("drift", {}), night=entry["night"])
+    entry |= {"drift": screened.drift, "memory": screened.memory}
+    entry["quarantined"] = entry.get("quarantined", {}) | screened.drift.quarantined
     before = {name: content for name, content in before.items() if name not in entry["quarantined"]}
-    if inputs.digest(before) == remembered.get("inputs") and not remembered.get("unpushed"):
+    if _nothing_new(before, remembered):
         entry |= {"outcome": "quarantined", "reasons": ["all that was new is quarantined"]}
         return before
     guarding.remember_before()
@@ -121,18 +119,29 @@ def _work(
             *guarding.back_to_before(),
             f"{', '.join(moved[:3])} changed while the stages ran: the night began once again",
         ]
-        for key in ("drift", "new_recordings"):
+        for key in ("drift", "memory", "new_recordings"):
             entry.pop(key)
         return _work(params.load(Nightly, "nightly"), entry, remembered, hashes, again=False)
     _keep(settings, entry, state)
     return before
 
 
-def _new(found: dict[str, str], folder: str, known: dict[str, str]) -> dict[str, str]:
+def _places(settings: Nightly) -> list[str]:
+    """All that a night is made from."""
+    recordings = [loop.recordings for loop in settings.loops.values() if loop.recordings]
+    return [*inputs.sources(), settings.holdout.recordings, *recordings]
+
+
+def _nothing_new(digests: dict[str, str], remembered: dict[str, Any]) -> bool:
+    return inputs.digest(digests) == remembered.get("inputs") and not remembered.get("unpushed")
+
+
+def _new(digests: dict[str, str], folder: str, before: dict[str, str]) -> dict[str, str]:
+    """The recordings below a folder whose content was not there the night before."""
     return {
         name: content
-        for name, content in inputs.recordings(found, folder).items()
-        if content not in known.values()
+        for name, content in inputs.recordings(digests, folder).items()
+        if content not in before.values()
     }
 
 
@@ -162,8 +171,9 @@ def _judge(
         decisions[name] = {"decision": decision.decision, "reasons": decision.reasons, **decision.figures}
         if decision.promotes:
             promoted.append(name)
-            known = screening.reference(loop, Path("datasets"))
-            made = champion.install(name, loop.artifacts, {screening.REFERENCE: known} if known else {})
+            reference = screening.reference(loop, Path("datasets"))
+            beside = {screening.REFERENCE: reference} if reference else {}
+            made = champion.install(name, loop.artifacts, beside)
             described = {
                 "run": entry["run"],
                 "when": entry["when"],
@@ -177,7 +187,7 @@ def _judge(
     entry |= {
         "outcome": "promoted" if promoted else "kept",
         "promoted": promoted,
-        "reasons": [f"{name}: {reason}" for name, found in decisions.items() for reason in found["reasons"]],
+        "reasons": [f"{name}: {reason}" for name, one in decisions.items() for reason in one["reasons"]],
     }
     return state
 
@@ -199,16 +209,21 @@ def _decide(
     judged = judge.judge(loop, settings)
     challenger = judged.measure(Path("datasets"))
     before = judged.measure(champion.FOLDER / name) if present else None
-    alarms = [alarm["cause"] for alarm in entry["drift"].get("alarms", []) if alarm["loop"] == name]
     allowed = judged.allowed(before) if before else {}
     figures = {
         "panel": challenger.panel,
         "mean_cost": float(np.mean([cost for _, cost in challenger.cases.values()])),
         "guards": challenger.guards,
     }
-    return decide(
-        before, challenger, settings.rule, allowed=allowed, alarms=alarms, seed=entry["night"]
-    ), figures
+    decision = decide(
+        before,
+        challenger,
+        settings.rule,
+        allowed=allowed,
+        alarms=entry["drift"].of(name).alarms,
+        seed=entry["night"],
+    )
+    return decision, figures
 
 
 def _lineage(settings: Nightly, made_from: dict[str, str]) -> dict[str, Any]:
@@ -246,7 +261,7 @@ def _keep(settings: Nightly, entry: dict[str, Any], state: dict[str, Any]) -> No
         *(pointer if Path(pointer := f"{place}.dvc").exists() else place for place in recordings if place),
         *(champion.paths() if entry["promoted"] else []),
     ]
-    told = f"promoted {', '.join(entry['promoted'])}" if entry["promoted"] else "kept the champions"
+    done = f"promoted {', '.join(entry['promoted'])}" if entry["promoted"] else "kept the champions"
     changed = (
         bool(
             git(
@@ -261,7 +276,7 @@ def _keep(settings: Nightly, entry: dict[str, Any], state: dict[str, Any]) -> No
     if changed and (on_branch or settings.promotion == "at_once"):
         _metrics(entry, state)
         entry["commit"] = commit(
-            tracked, f"nightly {entry['run']}: {told}\n\n" + "\n".join(entry["reasons"]), branch=on_branch
+            tracked, f"nightly {entry['run']}: {done}\n\n" + "\n".join(entry["reasons"]), branch=on_branch
         )
     if settings.remote:
         try:
@@ -279,10 +294,10 @@ def _keep(settings: Nightly, entry: dict[str, Any], state: dict[str, Any]) -> No
 def _metrics(entry: dict[str, Any], state: dict[str, Any]) -> None:
     """reports/metrics/nightly.json."""
     production = {
-        name: {key: found[key] for key in ("run", "when", "why")}
-        for name, found in state["champions"].items()
+        name: {key: present[key] for key in ("run", "when", "why")}
+        for name, present in state["champions"].items()
     }
-    kept = {
+    rest = {
         key: entry.get(key)
         for key in ("night", "run", "when", "seconds", "notes", "new_recordings", "quarantined")
     }
@@ -292,10 +307,10 @@ def _metrics(entry: dict[str, Any], state: dict[str, Any]) -> None:
             "decision": entry["outcome"],
             "reasons": entry.get("reasons", []),
             "decisions": entry.get("decisions", {}),
-            "drift": entry.get("drift", {}),
+            "drift": _written(entry).get("drift", {}),
             "champion": production,
         }
-        | kept,
+        | rest,
     )
 
 
@@ -304,14 +319,14 @@ def _say(
     entry: dict[str, Any],
     remembered: dict[str, Any],
     hashes: inputs.Hashes,
-    known: dict[str, str] | None,
+    digests: dict[str, str] | None,
 ) -> tuple[int, str]:
     """State, page, alarm; the exit status and the summary. On a disk without room the summary still comes."""
-    alarms = [alarm["cause"] for alarm in entry.get("drift", {}).get("alarms", [])]
+    alarms = [alarm.cause for alarm in entry["drift"].alarms] if "drift" in entry else []
     status = _status(entry)
     troubles: list[str] = []
     try:
-        _remember(settings, entry, remembered, hashes, known)
+        _remember(settings, entry, remembered, hashes, digests)
         if entry["outcome"] != "nothing new":
             from pipeline.report.nightly import page
 
@@ -319,11 +334,11 @@ def _say(
     except OSError as error:
         troubles.append(str(error))
     if status != OK:
-        told = {
+        details = {
             "night": entry["run"],
             "when": entry["when"],
             "status": status,
-            "drift": entry.get("drift", {}),
+            "drift": _written(entry).get("drift", {}),
             "quarantined": entry.get("quarantined", {}),
             "log": f".beadline/logs/{entry['run']}.log",
         }
@@ -332,7 +347,7 @@ def _say(
             DRIFTED: ("drift", alarms),
             QUARANTINED: ("quarantined", [*entry.get("quarantined", {}).values()]),
         }[status]
-        troubles += watch.wake(kind, reasons, told, command=settings.alarm, webhook=settings.webhook)
+        troubles += watch.wake(kind, reasons, details, command=settings.alarm, webhook=settings.webhook)
     return status, _summary(entry, alarms, troubles)
 
 
@@ -340,7 +355,7 @@ def _status(entry: dict[str, Any]) -> int:
     """What a scheduler is told: the gravest of what the night met."""
     if entry["outcome"] == "failed" or entry.get("unpushed"):
         return FAILED
-    if entry.get("drift", {}).get("alarms"):
+    if "drift" in entry and entry["drift"].alarms:
         return DRIFTED
     return QUARANTINED if entry.get("quarantined") else OK
 
@@ -350,13 +365,13 @@ def _remember(
     entry: dict[str, Any],
     remembered: dict[str, Any],
     hashes: inputs.Hashes,
-    known: dict[str, str] | None,
+    digests: dict[str, str] | None,
 ) -> None:
     good = entry["outcome"] != "failed"
     if good and entry["outcome"] != "nothing new" and not entry.get("commit"):
         _metrics(entry, champion.read())
     # a recording of a failed night is new again the next one, and must not count as two
-    memory = entry.get("drift", {}).pop("memory", remembered.get("drift", {}))
+    memory = entry.get("memory", remembered.get("drift", {}))
     artifacts.write_json(
         watch.LAST,
         {
@@ -365,10 +380,11 @@ def _remember(
             "success": max(entry["when"], remembered.get("success") or "")
             if good
             else remembered.get("success"),
-            "inputs": inputs.digest(known or {}) if good else remembered.get("inputs"),
+            "inputs": inputs.digest(digests or {}) if good else remembered.get("inputs"),
             "unpushed": bool(entry.get("unpushed")),
             "recordings": {
-                name: inputs.recordings(known or {}, loop.recordings) for name, loop in settings.loops.items()
+                name: inputs.recordings(digests or {}, loop.recordings)
+                for name, loop in settings.loops.items()
             }
             if good
             else remembered.get("recordings", {}),
@@ -376,7 +392,13 @@ def _remember(
             "hashes": hashes.now,
         },
     )
-    artifacts.write_json(NIGHTS, [*nights(), entry][-LONGEST_HISTORY:])
+    artifacts.write_json(NIGHTS, [*nights(), _written(entry)][-LONGEST_HISTORY:])
+
+
+def _written(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """The night as its files have it."""
+    rest = {key: value for key, value in entry.items() if key != "memory"}
+    return rest | ({"drift": entry["drift"].written()} if "drift" in entry else {})
 
 
 def nights() -> list[dict[str, Any]]:
@@ -420,9 +442,9 @@ def rollback(run: str, loop: str) -> str:
     params.load(Nightly, "nightly")
     with guarding.alone():
         state = champion.read()
-        found = champion.earlier(state, run, loop)
+        earlier = champion.earlier(state, run, loop)
         when = watch.stamp(datetime.datetime.now(datetime.UTC))
-        for name, entry in found.items():
+        for name, entry in earlier.items():
             champion.put_back(name, entry)
             state = champion.promoted(
                 state,
@@ -432,6 +454,6 @@ def rollback(run: str, loop: str) -> str:
             )
             state["history"][-1] |= {"when": when, "why": "by hand"}
         artifacts.write_json(champion.FILE, state)
-        names = ", ".join(f"{name} is {entry['run']}" for name, entry in found.items())
+        names = ", ".join(f"{name} is {entry['run']}" for name, entry in earlier.items())
         made = commit(champion.paths(), f"rollback: {names}")
         return f"rollback: {names} again, every file as it was; commit {made[:12]}"

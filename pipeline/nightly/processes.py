@@ -10,14 +10,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 STATE = Path(".beadline")
-TOKEN = "BEADLINE_NIGHT"  # in the environment of every child, so that the next night finds what a killed one left running
+# in the environment of every child, so that the next night finds what a killed one left running
+TOKEN = "BEADLINE_NIGHT"
 FALLBACK = {"GIT_AUTHOR_NAME": "beadline nightly", "GIT_AUTHOR_EMAIL": "nightly@beadline.invalid"}
 
 
 def git(*arguments: str, env: dict[str, str] | None = None, check: bool = True) -> str:
     """Standard output of `git ...`. Raises ValueError with git's last
     line where it fails and `check` is on."""
-    found = subprocess.run(
+    ended = subprocess.run(
         ["git", *arguments],
         check=False,
         capture_output=True,
@@ -25,11 +26,11 @@ def git(*arguments: str, env: dict[str, str] | None = None, check: bool = True) 
         env=os.environ | (env or {}),
         stdin=subprocess.DEVNULL,
     )
-    if check and found.returncode:
+    if check and ended.returncode:
         raise ValueError(
-            f"git {arguments[0]} failed: {_last(found.stderr) or f'exit status {found.returncode}'}"
+            f"git {arguments[0]} failed: {_last(ended.stderr) or f'exit status {ended.returncode}'}"
         )
-    return found.stdout.strip() if found.returncode == 0 else ""
+    return ended.stdout.strip() if ended.returncode == 0 else ""
 
 
 def dvc(*arguments: str, log: Path | None = None, limit_s: float = 3600) -> str:
@@ -70,12 +71,12 @@ def _sentence(text: str) -> str:
     where it has one, dvc's last error otherwise."""
     lines = [line.strip() for line in text.replace("\r", "\n").splitlines() if line.strip()]
     stages = [line.split("'")[1] for line in lines if line.startswith("Running stage '")]
-    said = [line for line in lines if stages and line.startswith(f"{stages[-1]}: ") and "|" not in line]
+    own = [line for line in lines if stages and line.startswith(f"{stages[-1]}: ") and "|" not in line]
     errors = [line.removeprefix("ERROR: ") for line in lines if line.startswith("ERROR:")]
-    reason = (said or errors or lines or ["it said nothing"])[-1]
+    reason = (own or errors or lines or ["it said nothing"])[-1]
     # a traceback or a full disk shows in the line before dvc's own
     before = [line for line in lines if "Error" in line and not line.startswith("ERROR:")]
-    return reason if said or not before else f"{before[-1]} ({reason})"
+    return reason if own or not before else f"{before[-1]} ({reason})"
 
 
 def _last(text: str) -> str:
@@ -87,8 +88,8 @@ def _last(text: str) -> str:
 
 def identity() -> dict[str, str]:
     """The user's name in git, or the job's own where none is set, as on a build machine."""
-    known = {} if git("config", "user.email", check=False) else FALLBACK
-    return known | {key.replace("AUTHOR", "COMMITTER"): value for key, value in known.items()}
+    author = {} if git("config", "user.email", check=False) else FALLBACK
+    return author | {key.replace("AUTHOR", "COMMITTER"): value for key, value in author.items()}
 
 
 def commit(paths: Sequence[str], message: str, *, branch: str = "") -> str:
@@ -103,11 +104,11 @@ def commit(paths: Sequence[str], message: str, *, branch: str = "") -> str:
     env = {"GIT_INDEX_FILE": str(index.resolve())}
     try:
         git("read-tree", base, env=env)
-        known = set(git("ls-files", "--", *paths).splitlines())
+        tracked = set(git("ls-files", "--", *paths).splitlines())
         there = [
             path
             for path in paths
-            if Path(path).exists() or any(name == path or name.startswith(f"{path}/") for name in known)
+            if Path(path).exists() or any(name == path or name.startswith(f"{path}/") for name in tracked)
         ]
         if there:
             git("add", "-A", "--", *there, env=env)
@@ -136,29 +137,29 @@ def fresh_index(paths: Sequence[str]) -> None:
 
 def orphans() -> list[int]:
     """Processes with an earlier night's token in their environment; empty where the system has no /proc."""
-    mine, found = os.getpid(), []
+    mine, pids = os.getpid(), []
     for entry in Path("/proc").glob("[0-9]*"):
         try:
             if (
                 int(entry.name) != mine
                 and f"{TOKEN}={Path.cwd()}\0".encode() in (entry / "environ").read_bytes()
             ):
-                found.append(int(entry.name))
+                pids.append(int(entry.name))
         except OSError:
             continue
-    return found
+    return pids
 
 
 def end_orphans() -> int:
     """Ends what a killed night left running, for it would write beside this
     one; call with the lock held. How many there were."""
-    found = [pid for pid in orphans() if pid != os.getppid()]
-    for pid in found:
+    pids = [pid for pid in orphans() if pid != os.getppid()]
+    for pid in pids:
         try:
             os.kill(pid, signal.SIGKILL)
         except ProcessLookupError:
             continue
-    return len(found)
+    return len(pids)
 
 
 def stale_git_locks() -> list[Path]:

@@ -8,8 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipeline.nightly import champion, drift, judge, pictures
-from pipeline.nightly.inputs import aside
+from pipeline.nightly.camera_drift import Change
+from pipeline.nightly.inputs import quarantine
 from pipeline.nightly.settings import Drift, Loop, Nightly
+from pipeline.report.shared.night import LoopDrift, NightDrift, alarm_of, written
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow.settings import Plant
 
@@ -20,7 +22,9 @@ GROSS = (
     3.0  # mean squared error, in the champion's own, from which a record is asked whether it is what it says
 )
 UNDONE = 0.5  # share of that error which undoing a mistake must leave at most
-SETTLED = 5.0  # mean offset of the champion's own nights, in units of drift.offset_degC, up to which they count as a closed loop at the references
+# mean offset of the champion's own nights, in units of drift.offset_degC, up to which they count as a
+# closed loop at the references
+SETTLED = 5.0
 
 
 PARTS = 4  # of a record, whose scatter tells how well its closed-loop figures are known
@@ -37,6 +41,13 @@ class Reference(NamedTuple):
     loop: list[dict[str, list[list[float]]]]
 
 
+class Screening(NamedTuple):
+    """Of one night: the drift of every loop, and what the next night must remember of it."""
+
+    drift: NightDrift
+    memory: dict[str, Any]
+
+
 def look(
     settings: Nightly,
     state: Mapping[str, Any],
@@ -44,100 +55,101 @@ def look(
     memory: Mapping[str, Any],
     *,
     night: int,
-) -> dict[str, Any]:
-    """{"alarms": [{loop, kind, cause, figures}], "watched": what would be one if it stayed, "figures": by
-    recording, "quarantined": {path: reason}, "memory": for the next night}."""
-    found: dict[str, Any] = {"alarms": [], "watched": [], "figures": {}, "quarantined": {}, "notes": []}
+) -> Screening:
+    """New recordings {loop: {path: digest}} held against those of each loop's champion; `memory` is that of
+    the night before. A loop's alarms say nothing of another loop."""
+    pending = set(memory.get("pending", []))
+    loops = {name: LoopDrift.none(name) for name in settings.loops}
     for name, loop in settings.loops.items():
+        paths = list(new.get(name, {}))
+        if not paths:
+            continue
         if loop.judge == "temperature" and loop.recordings and _recorded():
             _temperature(
-                settings,
-                name,
-                loop.recordings,
-                name in state["champions"],
-                list(new.get(name, {})),
-                memory,
-                found,
+                settings.drift, loop.recordings, name in state["champions"], paths, pending, loops[name]
             )
-        elif loop.judge in ("deposition", "setpoint") and new.get(name):
-            cameras = pictures.trials_of if loop.judge == "deposition" else pictures.nozzle_of
-            pending = set(memory.get("pending", []))
-            cameras(
-                settings.drift,
-                name,
-                loop.recordings,
-                list(new[name]),
-                _read(champion.FOLDER / name),
-                pending,
-                found,
-            )
+        elif loop.judge == "deposition":
+            pictures.trials_of(settings.drift, paths, _read(champion.FOLDER / name), pending, loops[name])
+        elif loop.judge == "setpoint":
+            reference = _read(champion.FOLDER / name)
+            pictures.nozzle_of(settings.drift, loop.recordings, paths, reference, pending, loops[name])
+    drift = NightDrift(loops)
     if not any(new.values()):
-        found["memory"] = dict(memory)
         # nothing was recorded: what was found last still stands
-        found["alarms"] = list(memory.get("alarms", []))
-        return found
+        for alarm in map(alarm_of, memory.get("alarms", [])):
+            loops.setdefault(alarm.loop, LoopDrift.none(alarm.loop)).alarms.append(alarm)
+        return Screening(drift, dict(memory))
     # what each loop recorded since its alarm: a person may accept that as how things are
     since = dict(memory.get("drifted", {}))
     for name in (name for name, recorded in new.items() if recorded):
-        raised = [one["recording"] for one in found["alarms"] if one["loop"] == name]
+        raised = [alarm.recording for alarm in drift.of(name).alarms]
         since[name] = list(dict.fromkeys([*since.get(name, []), *raised])) if raised else []
-    pending = [one["key"] for one in [*found["watched"], *found["alarms"]]]
-    found["memory"] = {"pending": pending, "alarms": found["alarms"], "drifted": since, "night": night}
-    return found
+    return Screening(
+        drift,
+        {
+            "pending": [alarm.key for alarm in [*drift.watched, *drift.alarms]],
+            "alarms": [written(alarm) for alarm in drift.alarms],
+            "drifted": since,
+            "night": night,
+        },
+    )
 
 
 def _temperature(
-    settings: Nightly,
-    name: str,
-    folder: str,
-    has_champion: bool,
-    new: Sequence[str],
-    memory: Mapping[str, Any],
-    found: dict[str, Any],
+    limits: Drift, folder: str, has_champion: bool, new: Sequence[str], pending: set[str], drift_of: LoopDrift
 ) -> None:
     machine, broken = params.load(Plant, "plant"), {}
-    if not new or not Path(folder).is_dir():
+    if not Path(folder).is_dir():
         return
     records = judge.record_segments(Path(folder), machine, broken=broken)
     for path, reason in broken.items():
         if f"{folder}/{path}" in new:
-            found["quarantined"][f"{folder}/{path}"] = aside(f"{folder}/{path}", name, reason)
+            drift_of.quarantined[f"{folder}/{path}"] = quarantine(f"{folder}/{path}", drift_of.loop, reason)
     good = [
         path
         for path in new
-        if path not in found["quarantined"] and records.get(path.removeprefix(f"{folder}/"))
+        if path not in drift_of.quarantined and records.get(path.removeprefix(f"{folder}/"))
     ]
     if not has_champion or not good:
         return
-    reference = _kept(champion.FOLDER / name)
+    reference = _champions_reference(champion.FOLDER / drift_of.loop)
     if reference is None:
-        found["notes"].append(
-            f"{name}: the champion has no reference of its own recordings: drift was not measured"
+        drift_of.notes.append(
+            f"{drift_of.loop}: the champion has no reference of its own recordings: drift was not measured"
         )
         return
-    scale = np.exp(0.5 * np.mean([one.log_variance for one in reference.own], axis=0))
-    names = {"inputs": [i.name for i in machine.inputs], "outputs": [o.name for o in machine.outputs]}
     for path in good:
         segments = records[path.removeprefix(f"{folder}/")]
-        u, y = max(segments, key=lambda pair: len(pair[0]))
-        suspects = drift.mistakes(reference.model, u, y, scale=scale, gross=GROSS, **names)
-        if len(suspects) > 1 and suspects[1].left < UNDONE:
-            reason = f"{path}: {suspects[1].words}: undone, the record fits the champion's model {1 / suspects[1].left:.0f} times better; mend it and put it back"
-            found["quarantined"][path] = aside(path, name, reason)
+        if reason := _mistake(path, segments, reference, machine):
+            drift_of.quarantined[path] = quarantine(path, drift_of.loop, reason)
             continue
         try:
-            _measure(
-                settings.drift,
-                name,
-                path,
-                segments,
-                reference,
-                machine,
-                set(memory.get("pending", [])),
-                found,
-            )
+            measured = _measure(limits, segments, reference, machine)
         except ValueError as error:
-            found["notes"].append(f"{path}: {error}")
+            drift_of.notes.append(f"{path}: {error}")
+            continue
+        drift_of.figures[path] = measured.figures
+        pictures.raise_alarms(limits, path, measured.causes, measured.consequences, pending, drift_of)
+
+
+def _mistake(path: str, segments: Sequence, reference: Reference, machine: Plant) -> str:
+    """Why a recording is not what it says it is; empty where it is."""
+    u, y = max(segments, key=lambda pair: len(pair[0]))
+    suspects = drift.mistakes(
+        reference.model,
+        u,
+        y,
+        inputs=[i.name for i in machine.inputs],
+        outputs=[o.name for o in machine.outputs],
+        scale=np.exp(0.5 * np.mean([one.log_variance for one in reference.own], axis=0)),
+        gross=GROSS,
+    )
+    if len(suspects) < 2 or suspects[1].left >= UNDONE:
+        return ""
+    return (
+        f"{path}: {suspects[1].words}: undone, the record fits the champion's model "
+        f"{1 / suspects[1].left:.0f} times better; mend it and put it back"
+    )
 
 
 # ---- the champion's own recordings
@@ -151,10 +163,9 @@ def reference(loop: Loop, folder: Path, only: Sequence[str] = ()) -> dict[str, A
     if not loop.recordings or not Path(loop.recordings).is_dir():
         return None
     if loop.judge in ("deposition", "setpoint"):
-        known = {"deposition": pictures.of_trials, "setpoint": pictures.of_prints}[loop.judge](
-            Path(loop.recordings), NIGHTS, only
-        )
-        return {"schema": "reference", "version": 1, "camera": known} if known else None
+        figures_of = {"deposition": pictures.of_trials, "setpoint": pictures.of_prints}[loop.judge]
+        rows = figures_of(Path(loop.recordings), NIGHTS, only)
+        return {"schema": "reference", "version": 1, "camera": rows} if rows else None
     if loop.judge != "temperature" or not _recorded():
         return None
     machine = params.load(Plant, "plant")
@@ -192,13 +203,13 @@ def _read(folder: Path) -> dict[str, Any]:
     return artifacts.read_json(folder / REFERENCE) if (folder / REFERENCE).exists() else {}
 
 
-def _kept(folder: Path) -> Reference | None:
-    kept = _read(folder)
-    if not kept:
+def _champions_reference(folder: Path) -> Reference | None:
+    entry = _read(folder)
+    if not entry:
         return None
-    own, slow = ([drift.Estimate(*map(np.array, one)) for one in kept[key]] for key in ("own", "slow"))
+    own, slow = ([drift.Estimate(*map(np.array, one)) for one in entry[key]] for key in ("own", "slow"))
     _, model, _ = judge.controller(folder, "model_based", 0.99)
-    return Reference(model, drift.causes(model), own, slow, kept["loop"])
+    return Reference(model, drift.causes(model), own, slow, entry["loop"])
 
 
 def _recorded() -> bool:
@@ -241,78 +252,93 @@ def _mean(values: np.ndarray) -> list[list[float]]:
 # ---- the new one against them
 
 
-def _measure(
-    limits: Drift,
-    loop: str,
-    path: str,
-    segments: Sequence,
-    reference: Reference,
-    machine: Plant,
-    pending: set[str],
-    found: dict[str, Any],
-) -> None:
+class Measured(NamedTuple):
+    """Of one recording: figures for the page, causes of an alarm, and what follows from them in words."""
+
+    figures: dict[str, Any]
+    causes: list[Change]
+    consequences: list[str]
+
+
+class Moved(NamedTuple):
+    """Of one observer: its estimate on the new recording, and how far that is from the champion's nights."""
+
+    estimate: drift.Estimate
+    shift: drift.Shift
+
+
+def _measure(limits: Drift, segments: Sequence, reference: Reference, machine: Plant) -> Measured:
+    """The plant's parameters first. Where they have not changed, noise, offsets and the closed loop are
+    causes of their own; where they have, what the closed loop does is a consequence."""
     inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
     samples = sum(len(u) for u, _ in segments)
-    estimates = []
-    for known, K in (
-        (reference.own, drift.observer(reference.model, samples)),
-        (reference.slow, drift.slow_observer(reference.model, samples)),
-    ):
-        variance = np.exp(np.mean([one.log_variance for one in known], axis=0))
-        one = drift.estimate(reference.model, segments, reference.asked, K, variance)
-        estimates.append((one, _shift(one, known, "change", "deviation")))
-    (own, shifted), (slow, slower) = estimates
-    figures: dict[str, Any] = {"parameters": _parameters(shifted, reference.asked, inputs)}
-    causes = _plant(limits, shifted, own, slower, slow, reference.asked, inputs)
+    own = _moved(segments, reference, reference.own, drift.observer(reference.model, samples))
+    slow = _moved(segments, reference, reference.slow, drift.slow_observer(reference.model, samples))
+    causes = _plant(limits, own, slow, reference.asked, inputs)
     explained = bool(causes)
-    noise = _shift(own, reference.own, "log_variance", "log_variance_deviation")
-    mean = _shift(own, reference.own, "mean", "mean_deviation")
-    figures["innovation"] = {
-        output: {"noise_percent": 100 * float(np.expm1(0.5 * (noise.value - noise.reference)[i])),
-        "noise_sigmas": float(noise.sigmas[i]),
-                 "mean_degC": float((mean.value - mean.reference)[i]), "mean_sigmas": float(mean.sigmas[i])}
-        for i, output in enumerate(outputs)
-    }  # fmt: skip
-    spread = np.exp(0.5 * noise.reference)
-    for i, output in enumerate(outputs):
-        grown, moved = (
-            100 * np.expm1(0.5 * (noise.value - noise.reference)[i]),
-            (mean.value - mean.reference)[i],
-        )
-        if abs(grown) >= limits.noise_percent and not explained:
-            causes.append(
-                (
-                    f"noise of {output}",
-                    f"the noise of {output} has {'grown' if grown > 0 else 'fallen'} by {abs(grown):.0f} %",
-                    float(noise.sigmas[i]),
-                )
-            )
-        if abs(moved) >= limits.noise_percent / 100 * spread[i] and not explained:
-            words = f"{output} reads {moved:+.3g} °C a step from what the model expects of it: its offset, or the heat lost around it, has changed"
-            causes.append((f"offset of {output}", words, float(mean.sigmas[i])))
-    loop_figures, consequences = _loop(
+    innovation, noise_causes = _innovation(limits, own.estimate, reference.own, outputs)
+    loop_figures, loop_causes = _loop(
         limits, _closed_loop(segments, machine), reference.loop, inputs, outputs
     )
-    figures["closed_loop"] = loop_figures
-    causes += consequences if not explained else []
-    found["figures"][path] = figures
-    pictures.raised(
-        limits,
-        loop,
-        path,
-        causes,
-        [words for _, words, _ in consequences] if explained else [],
-        pending,
-        found,
+    return Measured(
+        {
+            "parameters": _parameters(own.shift, reference.asked, inputs),
+            "innovation": innovation,
+            "closed_loop": loop_figures,
+        },
+        causes if explained else [*noise_causes, *loop_causes],
+        [cause.words for cause in loop_causes] if explained else [],
     )
 
 
-def _shift(one: drift.Estimate, known: Sequence[drift.Estimate], value: str, deviation: str) -> drift.Shift:
+def _moved(
+    segments: Sequence, reference: Reference, nights: Sequence[drift.Estimate], K: np.ndarray
+) -> Moved:
+    variance = np.exp(np.mean([night.log_variance for night in nights], axis=0))
+    estimate = drift.estimate(reference.model, segments, reference.asked, K, variance)
+    return Moved(estimate, _shift(estimate, nights, "change", "deviation"))
+
+
+def _innovation(
+    limits: Drift, estimate: drift.Estimate, nights: Sequence[drift.Estimate], outputs: Sequence[str]
+) -> tuple[dict[str, dict[str, float]], list[Change]]:
+    """Noise and mean of the one-step errors, output by output, and what of both is more than matters."""
+    noise = _shift(estimate, nights, "log_variance", "log_variance_deviation")
+    mean = _shift(estimate, nights, "mean", "mean_deviation")
+    grown, moved = np.expm1(0.5 * (noise.value - noise.reference)), mean.value - mean.reference
+    figures = {
+        output: {
+            "noise_percent": 100 * float(grown[i]),
+            "noise_sigmas": float(noise.sigmas[i]),
+            "mean_degC": float(moved[i]),
+            "mean_sigmas": float(mean.sigmas[i]),
+        }
+        for i, output in enumerate(outputs)
+    }
+    causes, spread = [], np.exp(0.5 * noise.reference)
+    for i, output in enumerate(outputs):
+        percent = 100 * grown[i]
+        if abs(percent) >= limits.noise_percent:
+            word = "grown" if percent > 0 else "fallen"
+            words = f"the noise of {output} has {word} by {abs(percent):.0f} %"
+            causes.append(Change(f"noise of {output}", words, float(noise.sigmas[i])))
+        if abs(moved[i]) >= limits.noise_percent / 100 * spread[i]:
+            words = (
+                f"{output} reads {moved[i]:+.3g} °C a step from what the model expects of it: its offset, or "
+                "the heat lost around it, has changed"
+            )
+            causes.append(Change(f"offset of {output}", words, float(mean.sigmas[i])))
+    return figures, causes
+
+
+def _shift(
+    estimate: drift.Estimate, nights: Sequence[drift.Estimate], value: str, deviation: str
+) -> drift.Shift:
     return drift.shift(
-        getattr(one, value),
-        getattr(one, deviation),
-        np.array([getattr(k, value) for k in known]),
-        np.array([getattr(k, deviation) for k in known]),
+        getattr(estimate, value),
+        getattr(estimate, deviation),
+        np.array([getattr(night, value) for night in nights]),
+        np.array([getattr(night, deviation) for night in nights]),
     )
 
 
@@ -342,34 +368,28 @@ def _percent(shifted: drift.Shift, asked: Sequence[drift.Cause]) -> np.ndarray:
 
 
 def _plant(
-    limits: Drift,
-    shifted: drift.Shift,
-    own: drift.Estimate,
-    slower: drift.Shift,
-    slow: drift.Estimate,
-    asked: Sequence[drift.Cause],
-    inputs: Sequence[str],
-) -> list:
+    limits: Drift, own: Moved, slow: Moved, asked: Sequence[drift.Cause], inputs: Sequence[str]
+) -> list[Change]:
     """The likeliest cause among those that moved by what matters: the input by the champion's own observer,
     gain or time constant by the slow one, both where neither can tell."""
-    percent = _percent(shifted, asked)
-    fits = (np.abs(percent) >= limits.parameter_percent) & (np.abs(shifted.sigmas) >= limits.watch_sigmas)
-    found = drift.named(fits, drift.explained(shifted, own), drift.explained(slower, slow))
-    if not found:
+    percent, sigmas = _percent(own.shift, asked), own.shift.sigmas
+    fits = (np.abs(percent) >= limits.parameter_percent) & (np.abs(sigmas) >= limits.watch_sigmas)
+    named = drift.named(
+        fits, drift.explained(own.shift, own.estimate), drift.explained(slow.shift, slow.estimate)
+    )
+    if not named:
         return []
-    where = inputs[asked[found[0]].channel] if asked[found[0]].channel >= 0 else "every input"
-    said = {
+    channel = asked[named[0]].channel
+    where = inputs[channel] if channel >= 0 else "every input"
+    sentences = {
         "gain": "the gain from {} has changed by {:+.1f} %",
         "time constant": "the time constants of what answers to {} have changed by {:+.1f} %",
     }
-    words = ", or ".join(said[asked[k].kind].format(where, percent[k]) for k in found) + (
-        ": this record cannot tell which" if len(found) == 2 else ""
+    words = ", or ".join(sentences[asked[k].kind].format(where, percent[k]) for k in named) + (
+        ": this record cannot tell which" if len(named) == 2 else ""
     )
-    sigmas = max(
-        (float(shifted.sigmas[k]) for k in range(len(asked)) if asked[k].channel == asked[found[0]].channel),
-        key=abs,
-    )
-    return [(f"plant at {where}", words, sigmas)]
+    surest = max((float(sigmas[k]) for k in range(len(asked)) if asked[k].channel == channel), key=abs)
+    return [Change(f"plant at {where}", words, surest)]
 
 
 def _loop(
@@ -378,38 +398,37 @@ def _loop(
     before: Sequence[Mapping[str, list[list[float]]]],
     inputs: Sequence[str],
     outputs: Sequence[str],
-) -> tuple[dict, list]:
+) -> tuple[dict[str, Any], list[Change]]:
     """Offset, effort and share at limits against the champion's own nights; not asked where
     those nights were not settled at the references."""
-    known = {
-        key: np.array([night[key] for night in before]) for key in now
-    }  # (nights, 2, signals): figures and their deviations
-    offset, unsure = (
-        known["offset_degC"][:, 0].mean(axis=0),
-        np.sqrt((known["offset_degC"][:, 1] ** 2).mean(axis=0) / len(before)),
-    )
+    # (nights, 2, signals): figures and their deviations
+    usual = {key: np.array([night[key] for night in before]) for key in now}
+    offset = usual["offset_degC"][:, 0].mean(axis=0)
+    unsure = np.sqrt((usual["offset_degC"][:, 1] ** 2).mean(axis=0) / len(before))
     if (np.abs(offset) > SETTLED * limits.offset_degC + 2 * unsure).any():
         return {
             "not_applicable": "the champion's own recordings are not of a loop settled at the references"
         }, []
     figures, causes = {}, []
-    words = {"offset_degC": ("settles", "°C from where it did", limits.offset_degC, outputs), "effort_percent": ("needs", "points of effort more than it did", limits.effort_percent, inputs),
-             "at_limits_percent": ("is at a limit", "points more of the time than it was",
-             limits.at_limits_points, inputs)}  # fmt: skip
+    effort, at_limits = "points of effort more than it did", "points more of the time than it was"
+    words = {
+        "offset_degC": ("settles", "°C from where it did", limits.offset_degC, outputs),
+        "effort_percent": ("needs", effort, limits.effort_percent, inputs),
+        "at_limits_percent": ("is at a limit", at_limits, limits.at_limits_points, inputs),
+    }
     for key, (verb, rest, least, names) in words.items():
         # a figure counts as known to a sixth of what matters at best, so that
         # nights that agree by chance make no alarm of a trifle
-        own = np.maximum([*known[key][:, 1], now[key][1]], least / 6)
+        own = np.maximum([*usual[key][:, 1], now[key][1]], least / 6)
         # a few parts of one night say little of how well a mean is known: those of all nights say it
         # together; a short or restless night is known less well
         pooled = np.maximum(np.sqrt((own**2).mean(axis=0)), own[-1])
         moved = drift.shift(
-            np.array(now[key][0]), pooled, known[key][:, 0], own[:-1], freedom=(PARTS - 1) * len(own)
+            np.array(now[key][0]), pooled, usual[key][:, 0], own[:-1], freedom=(PARTS - 1) * len(own)
         )
         for name, by, sigmas in zip(names, moved.value - moved.reference, moved.sigmas, strict=True):
             figures[f"{name} {key}"] = {"moved": float(by), "sigmas": float(sigmas)}
             if abs(by) >= least:
-                causes.append(
-                    (f"{key} of {name}", f"closed loop: {name} {verb} {by:+.2g} {rest}", float(sigmas))
-                )
+                sentence = f"closed loop: {name} {verb} {by:+.2g} {rest}"
+                causes.append(Change(f"{key} of {name}", sentence, float(sigmas)))
     return figures, causes

@@ -97,4 +97,11 @@ class Nightly(Section):
     def _loop(self):
         if not self.loops:
             raise ValueError("has no loops; name at least one, with its artifacts and judge")
+        for name, loop in self.loops.items():
+            # pages and alarms go by the name: a loop's drift must not be read as another's
+            if loop.judge != "cases" and loop.judge != name:
+                raise ValueError(
+                    f"has loop {name} with judge {loop.judge}; name the loop {loop.judge}, "
+                    "or let it be judged by cases"
+                )
         return self

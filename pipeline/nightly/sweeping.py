@@ -20,9 +20,9 @@ def grid(settings: Sequence[str]) -> list[dict[str, str]]:
     axes = {}
     for text in settings:
         key, _, values = text.partition("=")
-        said, _, dotted = key.rpartition(":")
+        file, _, dotted = key.rpartition(":")
         home = params.home(dotted)
-        if not home or said not in ("", home) or not values:
+        if not home or file not in ("", home) or not values:
             raise ValueError(
                 f"sweep: expected KEY=VALUE,VALUE with a key of {' or '.join(params.files())}, found {text}; "
                 "write for example tune_weights.seed=1,2,3"
@@ -43,61 +43,49 @@ def sweep(settings: Sequence[str], target: str, metric: str) -> str:
     points, rows = grid(settings), []
     head = git("rev-parse", "HEAD")
     for k, point in enumerate(points, 1):
-        name = (
-            "sweep-"
-            + "-".join(f"{part.rsplit('.', 1)[-1]}-{value}" for part, value in point.items())
-            .replace(".", "_")
-            .lower()
+        shown = ", ".join(f"{part}={value}" for part, value in point.items())
+        print(f"sweep: {k} of {len(points)}: {shown}", flush=True)
+        name = _experiment(point, target)
+        rows.append(
+            {"experiment": name, **point, metric: _figure(f"{head[:2]}/{head[2:]}/{name}", stage, key)}
         )
-        chosen = [
-            word
-            for part, value in point.items()
-            for word in ("--set-param", f"{params.home(part)}:{part}={value}")
-        ]
-        print(
-            f"sweep: {k} of {len(points)}: {', '.join(f'{part}={value}' for part, value in point.items())}",
-            flush=True,
-        )
-        dvc(
-            "exp",
-            "run",
-            "--temp",
-            "--force",
-            "--name",
-            name,
-            *chosen,
-            target,
-            log=STATE / "logs" / f"{name}.log",
-        )
-        found: Any = json.loads(
-            git("show", f"refs/exps/{head[:2]}/{head[2:]}/{name}:reports/metrics/{stage}.json")
-        )
-        for part in key.split("."):
-            found = found.get(part) if isinstance(found, dict) else None
-        figure = found if isinstance(found, int | float) else None
-        if figure is None:
-            raise ValueError(
-                f"sweep: reports/metrics/{stage}.json has no number at {key}; look at the file for its keys"
-            )
-        rows.append({"experiment": name, **point, metric: float(figure)})
     lines = [",".join(rows[0])] + [",".join(str(value) for value in row.values()) for row in rows]
     artifacts.write_text("reports/sweep.csv", "\n".join(lines) + "\n")
-    artifacts.write_text(
-        "reports/sweep.html",
-        page.render(
-            "sweep.html",
-            here="sweep",
-            title="Sweep",
-            rows=rows,
-            metric=metric,
-            picture=_picture(rows, metric),
-        ),
+    html = page.render(
+        "sweep.html", here="sweep", title="Sweep", rows=rows, metric=metric, picture=_picture(rows, metric)
     )
+    artifacts.write_text("reports/sweep.html", html)
     width = [max(len(line.split(",")[k]) for line in lines) for k in range(len(rows[0]))]
     table = "\n".join(
         "  ".join(cell.ljust(w) for cell, w in zip(line.split(","), width, strict=True)) for line in lines
     )
     return f"{table}\nreports/sweep.csv, reports/sweep.html; to take one: dvc exp apply NAME"
+
+
+def _experiment(point: dict[str, str], target: str) -> str:
+    """Runs one point of the grid up to stage `target`; the experiment's name."""
+    words = [f"{part.rsplit('.', 1)[-1]}-{value}" for part, value in point.items()]
+    name = "sweep-" + "-".join(words).replace(".", "_").lower()
+    chosen = [
+        word
+        for part, value in point.items()
+        for word in ("--set-param", f"{params.home(part)}:{part}={value}")
+    ]
+    log = STATE / "logs" / f"{name}.log"
+    dvc("exp", "run", "--temp", "--force", "--name", name, *chosen, target, log=log)
+    return name
+
+
+def _figure(experiment: str, stage: str, key: str) -> float:
+    """The number at a dotted key of a stage's metrics, as the experiment wrote them."""
+    value: Any = json.loads(git("show", f"refs/exps/{experiment}:reports/metrics/{stage}.json"))
+    for part in key.split("."):
+        value = value.get(part) if isinstance(value, dict) else None
+    if not isinstance(value, int | float):
+        raise ValueError(
+            f"sweep: reports/metrics/{stage}.json has no number at {key}; look at the file for its keys"
+        )
+    return float(value)
 
 
 def _picture(rows: Sequence[dict[str, Any]], metric: str):

@@ -26,11 +26,11 @@ def last() -> dict[str, Any]:
     """The last nights as the job itself remembers them; on a fresh clone, as the committed metrics do."""
     for path in (LAST, Path("reports/metrics/nightly.json")):
         if path.exists():
-            found = artifacts.read_json(path)
+            entry = artifacts.read_json(path)
             return (
-                found
+                entry
                 if path == LAST
-                else {"night": found["night"], "success": found["when"], "watch_since": found["when"]}
+                else {"night": entry["night"], "success": entry["when"], "watch_since": entry["when"]}
             )
     return {"night": 0, "success": None}
 
@@ -43,16 +43,24 @@ def overdue(now: datetime.datetime, watch_h: float) -> str:
         return "no night has ever succeeded; run ./run beadline nightly, and look at its schedule"
     age_h = (now - datetime.datetime.fromisoformat(success)).total_seconds() / 3600
     if age_h < -0.1:
-        return f"the clock is wrong: the last success, {success}, is {-age_h:.1f} h from now in the future; set the clock"
+        return (
+            f"the clock is wrong: the last success, {success}, is {-age_h:.1f} h from now in the future; "
+            "set the clock"
+        )
     if age_h > watch_h:
-        return f"the last success was {age_h:.1f} h ago ({success}); nightly.watch_h allows {watch_h:g} h; look at .beadline/logs and at the schedule"
+        return (
+            f"the last success was {age_h:.1f} h ago ({success}); nightly.watch_h allows {watch_h:g} h; "
+            "look at .beadline/logs and at the schedule"
+        )
     return ""
 
 
-def wake(kind: str, reasons: list[str], told: Mapping[str, Any], *, command: str, webhook: str) -> list[str]:
+def wake(
+    kind: str, reasons: list[str], details: Mapping[str, Any], *, command: str, webhook: str
+) -> list[str]:
     """Writes the alarm, runs `command FILE`, posts the file to `webhook`; what went wrong on the way, as
     sentences, for an alarm that fails must not hide the night."""
-    alarm = {"schema": "alarm", "version": 1, "kind": kind, "reasons": reasons, **told}
+    alarm = {"schema": "alarm", "version": 1, "kind": kind, "reasons": reasons, **details}
     troubles = []
     text = json.dumps(alarm, indent=2, ensure_ascii=False, default=str)
     try:
@@ -61,7 +69,7 @@ def wake(kind: str, reasons: list[str], told: Mapping[str, Any], *, command: str
         troubles.append(f"the alarm could not be written: {error}")
     if command:
         try:
-            found = subprocess.run(
+            ended = subprocess.run(
                 [*shlex.split(command), str(ALARM)],
                 check=False,
                 input=text,
@@ -70,10 +78,10 @@ def wake(kind: str, reasons: list[str], told: Mapping[str, Any], *, command: str
                 timeout=60,
                 env={**os.environ, "BEADLINE_ALARM": kind},
             )
-            if found.returncode:
+            if ended.returncode:
                 troubles.append(
-                    f"nightly.alarm: {command} ended with status {found.returncode}: "
-                    f"{found.stderr.strip()[-200:]}"
+                    f"nightly.alarm: {command} ended with status {ended.returncode}: "
+                    f"{ended.stderr.strip()[-200:]}"
                 )
         except (OSError, ValueError, subprocess.TimeoutExpired) as error:
             troubles.append(f"nightly.alarm: {error}")

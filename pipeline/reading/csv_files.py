@@ -37,7 +37,7 @@ FIELDS_AT_ONCE = 20_000
 
 
 def csv_columns(path: Path) -> list[Column]:
-    """The columns of a text file; "number" is what the first rows show."""
+    """The columns of a text file. A column is of type "number" by its first rows."""
     layout = csv_layout(path)
     shown = list(itertools.islice(rows(path, layout), 200))
     columns = []
@@ -79,8 +79,8 @@ def read_csv(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns, lis
         lines.append(np.array(numbers))
         columns.append(
             *(
-                floats(path, name, found, layout.decimal, numbers, switches)
-                for name, found in zip(wanted, fields, strict=True)
+                floats(path, name, texts, layout.decimal, numbers, switches)
+                for name, texts in zip(wanted, fields, strict=True)
             )
         )
         if clocks:
@@ -97,19 +97,16 @@ def read_csv(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns, lis
         )
     times, zone = clocks.finished(notes) if clocks else (np.arange(len(line)) * interval, "")
     values = dict(zip(wanted, columns.finished(), strict=True))
-    found, turned = forward(Columns("rows", times, values, lambda i: f"line {line[i]}", zone))
-    return found, notes + turned
-
-
-# ---- rows
+    columns_forward, turned = forward(Columns("rows", times, values, lambda i: f"line {line[i]}", zone))
+    return columns_forward, notes + turned
 
 
 # ---- the clock
 
 
 class _Clock:
-    """The column of the time, a part of the file at a time: numbers, or text that names instants, with the
-    date in another column or without."""
+    """The column of the time, read a part of the file at a time: numbers, or text that names instants. The
+    date may stand in another column."""
 
     def __init__(self, path: Path, layout: CsvLayout, name: str):
         self.path, self.layout, self.name, self.place = (
@@ -140,8 +137,7 @@ class _Clock:
         return row[self.place] if self.date is None else f"{row[self.date]} {row[self.place]}"
 
     def is_time(self, row: list[str]) -> bool:
-        """Whether there is something like a time, not a word or
-        nothing; what it is exactly is looked at later."""
+        """Whether the field looks like a time and not like a word. `append` reads it exactly."""
         field = row[self.place].strip()
         return (
             field[:1].isdigit()
@@ -154,17 +150,17 @@ class _Clock:
         if self.numeric:
             self.times.append(floats(self.path, self.name, fields, self.layout.decimal, lines, {}))
             return
-        found = instants(self.path, self.name, fields, lines, month_first=self.month_first)
-        self.times.append(found.ns)
-        self.zoned, self.dated = self.zoned and found.zoned, found.dated
+        dates = instants(self.path, self.name, fields, lines, month_first=self.month_first)
+        self.times.append(dates.ns)
+        self.zoned, self.dated = self.zoned and dates.zoned, dates.dated
 
     def finished(self, notes: list[Note]) -> tuple[np.ndarray, str]:
         """time_s or time_ns (n,) and its zone."""
         times = self.times.finished()[0]
         if self.numeric:
-            times, said = seconds(self.name, times)
-            if said:
-                notes.append(Note("clock", "", 1, said))
+            times, remark = seconds(self.name, times)
+            if remark:
+                notes.append(Note("clock", "", 1, remark))
             return times, "UTC"
         if not self.dated:
             times, midnights = over_midnight(times)
@@ -178,6 +174,3 @@ class _Clock:
                     )
                 )
         return times, "UTC" if self.zoned else ""
-
-
-# ---- numbers

@@ -1,5 +1,5 @@
-"""How a text file of numbers is laid out: encoding, delimiter, decimal mark, where its
-names and units stand and where its data begin."""
+"""The layout of a text file of numbers: encoding, delimiter, decimal mark, names, units, first line of
+data."""
 
 import collections
 from collections.abc import Sequence
@@ -11,8 +11,8 @@ from pipeline.store.csv_rows import CsvLayout, is_quantity, opening
 
 
 def csv_layout(path: Path) -> CsvLayout:
-    """Encoding, delimiter, decimal mark and header of a text file.
-    Raises ValueError where it has no rows of numbers."""
+    """Encoding, delimiter, decimal mark and header of a text file. Raises ValueError for a file without rows
+    of numbers."""
     encoding, delimiter, decimal, rows, comment, notes = opening(path)
     numbers = [
         0 if remark else sum(is_quantity(field, decimal) for field in row)
@@ -61,15 +61,17 @@ def _names_time(row: Sequence[str]) -> bool:
 def _first_row(
     path: Path, rows: Sequence[list[str]], numbers: Sequence[int], comment: Sequence[bool], delimiter: str
 ) -> tuple[int, int]:
-    """(index, width) of the first row of the table: behind the first line that names a time, where there is
-    one, of the width that most rows with numbers have."""
+    """(index, width) of the first row of the table. It stands behind the first line that names a time, if
+    there is one, and has the width of most rows with numbers."""
     header = next((i for i, row in enumerate(rows) if _names_time(row) and any(numbers[i + 1 :])), -1)
     data = [i for i in range(header + 1, len(rows)) if numbers[i]]
     if not data:
         text = sum(bool(row) and not remark for row, remark in zip(rows, comment, strict=True))
-        found = f"{text} lines of text" if text > 1 else "a header" if text else "only blank or comment lines"
+        content = (
+            f"{text} lines of text" if text > 1 else "a header" if text else "only blank or comment lines"
+        )
         raise ValueError(
-            f"{path}: line 2 on should hold rows of numbers, but the file has {found} and no data; "
+            f"{path}: line 2 on should hold rows of numbers, but the file has {content} and no data; "
             "record it again or remove it"
         )
     widths = collections.Counter(len(rows[i]) for i in data)
@@ -81,7 +83,6 @@ def _first_row(
     if len(table) < len(written) / 2 or words or (len(table) == 1 and header < 0):
         raise ValueError(
             f"{path} is text but no table: {len(table)} of its first {len(written)} lines have {width} "
-            "fields with numbers among them;"
-            " name a recording, or save it as CSV with one row a sample"
+            "fields with numbers among them; name a recording, or save it as CSV with one row a sample"
         )
     return table[0], width

@@ -1,5 +1,4 @@
-"""What a recording is written in, and what all formats have in common: columns on a
-clock, and how a column shows that it is the time."""
+"""The format of a recording, and what all formats share: columns on a clock, and which column is the time."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -10,8 +9,8 @@ import numpy as np
 
 from pipeline.reading.signals import Note, nearest_names
 
-# a number beyond that is no time in seconds but an epoch in ms, us, ns, or 100 ns as
-# Windows counts from 1601 (1e11 s is the year 5138)
+# a number beyond the first of each row is no time in seconds but an epoch in ms, us, ns, or 100 ns as Windows
+# counts from 1601 (1e11 s is the year 5138)
 _EPOCHS = (
     (5e17, 1e9, 0, "ns"),
     (1e17, 1e7, 11_644_473_600, "100 ns since 1601"),
@@ -51,13 +50,14 @@ _TIME_NAMES = (
     "index",
 )
 DATE_NAMES = ("date", "datum")
-_PER_SECOND = {"s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e3, "msec": 1e3, "us": 1e6, "µs": 1e6,
+_PER_SECOND = {"s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0,
+               "ms": 1e3, "msec": 1e3, "us": 1e6, "µs": 1e6,
                "usec": 1e6, "ns": 1e9, "nsec": 1e9, "min": 1 / 60, "mins": 1 / 60, "minutes": 1 / 60,
                "h": 1 / 3600, "hours": 1 / 3600,
                "d": 1 / 86400, "days": 1 / 86400}  # fmt: skip
 
 _PARQUET = b"PAR1"
-_STRANGERS = {
+_OTHER_FORMATS = {
     b"\x1f\x8b": ("gzip", "unpack it with gunzip"),
     b"PK\x03\x04": ("zip or Excel", "unpack it, or save the sheet as CSV"),
     b"\x28\xb5\x2f\xfd": ("zstd", "unpack it with zstd -d"),
@@ -85,8 +85,11 @@ _STRANGERS = {
 
 
 class Columns(NamedTuple):
-    """Columns on one clock: time_s (n,) or, where it is on a calendar, time_ns (n,); `place(i)` says where
-    sample i stands in the file; `zone` is that of the calendar, empty where the file does not say it."""
+    """Columns on one clock.
+
+    `time` is time_s (n,), or time_ns (n,) on a calendar. `place(i)` names the place of sample i in the file.
+    `zone` is the calendar's zone, empty if the file does not give it.
+    """
 
     name: str
     time: np.ndarray
@@ -96,7 +99,7 @@ class Columns(NamedTuple):
 
 
 class Column(NamedTuple):
-    """A column there is; `unit` where the file says it."""
+    """A column of a file; `unit` is empty if the file does not give it."""
 
     name: str
     type: str
@@ -104,8 +107,8 @@ class Column(NamedTuple):
 
 
 class Growing:
-    """Columns (n,) that grow in place as parts of a file come in: parts that
-    are joined at the end would need twice the memory."""
+    """Columns (n,) that grow in place as parts of a file come in. (Joining the parts at the end would need
+    twice the memory.)"""
 
     def __init__(self, kinds: Sequence[type], expected: int = 0):
         self.count = 0
@@ -132,8 +135,8 @@ class Growing:
 
 
 def file_format(path: Path) -> str:
-    """ "mcap", "parquet" or "csv", by the file's first bytes, whatever its name ends
-    in. Raises ValueError for what is none of them."""
+    """ "mcap", "parquet" or "csv", by the file's first bytes and not by its name. Raises ValueError for any
+    other format."""
     if path.is_dir():
         raise ValueError(f"{path} is a folder but should be one recording; name a file in it")
     try:
@@ -151,7 +154,7 @@ def file_format(path: Path) -> str:
         return "mcap"
     if start.startswith(_PARQUET):
         return "parquet"
-    for magic, (name, remedy) in _STRANGERS.items():
+    for magic, (name, remedy) in _OTHER_FORMATS.items():
         if start.startswith(magic):
             raise ValueError(f"{path} is {name} but should be MCAP, Parquet or CSV; {remedy}")
     if not start.strip(b"\0"):
@@ -162,8 +165,7 @@ def file_format(path: Path) -> str:
     if path.suffix in (".mcap", ".parquet"):
         raise ValueError(
             f"{path}: the bytes at offset 0 are {start[:8].hex(' ')}, "
-            f"which begin no {path.suffix[1:]} file; copy the"
-            f" recording again as binary"
+            f"which begin no {path.suffix[1:]} file; copy the recording again as binary"
         )
     return "csv"
 
@@ -172,7 +174,8 @@ def file_format(path: Path) -> str:
 
 
 def time_column(path: Path, names: Sequence[str], time: str) -> str:
-    """The column `time`, or the first that is called like a time. Raises ValueError naming what there is."""
+    """The column `time`, or the first with a name of a time. Raises ValueError with the names that there
+    are."""
     if time:
         if time not in names:
             raise ValueError(f"{path}: there is no time column {time!r}; {nearest_names(time, names)}")
@@ -190,7 +193,7 @@ def time_column(path: Path, names: Sequence[str], time: str) -> str:
 def column_place(path: Path, names: Sequence[str], name: str) -> int:
     if name not in names:
         raise ValueError(
-            f"{path}: there is no column {name!r}; {nearest_names(name, [known for known in names if known])}"
+            f"{path}: there is no column {name!r}; {nearest_names(name, [other for other in names if other])}"
         )
     if names.count(name) > 1:
         raise ValueError(
@@ -205,18 +208,18 @@ def is_time_name(name: str) -> bool:
 
 
 def _time_rank(name: str) -> tuple[bool, int] | None:
-    """A column with a unit of time comes before one without; None is no time."""
+    """The rank of a column as the time, None for no time. A name with a unit of time comes first."""
     base, unit = _time_unit(name)
     return (not unit, _TIME_NAMES.index(base)) if base in _TIME_NAMES else None
 
 
 def _time_unit(name: str) -> tuple[str, str]:
-    """("time", "ms") of "Time [ms]", "time_ms" and the like; a time
-    zone at the end is no part of the name."""
+    """("time", "ms") of "Time [ms]", "time_ms" and the like. A time zone at the end is no part of the
+    name."""
     plain = re.sub(r"[\s_.]*[(\[/_\s]\s*(utc|gmt|local)\s*[)\]]?$", "", name.strip().casefold())
-    found = re.match(r"^(.*?)[\s_.]*[(\[/_\s]\s*(\w+)\s*[)\]]?$", plain)
-    if found and found[2] in _PER_SECOND:
-        return _word(found[1]), found[2]
+    match = re.match(r"^(.*?)[\s_.]*[(\[/_\s]\s*(\w+)\s*[)\]]?$", plain)
+    if match and match[2] in _PER_SECOND:
+        return _word(match[1]), match[2]
     return _word(plain), ""
 
 
@@ -230,13 +233,16 @@ def date_column(names: Sequence[str], clock: str) -> str | None:
 
 
 def seconds(name: str, numbers: np.ndarray) -> tuple[np.ndarray, str]:
-    """Time in seconds from numbers in the unit of the column's name; without one, in seconds or in what the
-    size of an epoch or of a spreadsheet's days tells (then said)."""
+    """Time in seconds, and a remark if the unit was guessed.
+
+    The unit is that of the column's name. Without one it is seconds, or what the size of the numbers tells:
+    an epoch, or a spreadsheet's days.
+    """
     unit = _time_unit(name)[1]
     if unit:
         return numbers / _PER_SECOND[unit], ""
-    known = numbers[np.isfinite(numbers)]
-    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
+    finite = numbers[np.isfinite(numbers)]
+    low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
     for limit, per_second, epoch, unit in _EPOCHS:
         if high > limit:
             return (
@@ -247,20 +253,20 @@ def seconds(name: str, numbers: np.ndarray) -> tuple[np.ndarray, str]:
         if (
             first <= low
             and high <= last
-            and len(known) > 1
-            and _in_days(float(np.median(np.abs(np.diff(known)))))
+            and len(finite) > 1
+            and _in_days(float(np.median(np.abs(np.diff(finite)))))
         ):
-            said = (
+            remark = (
                 f"column {name} holds {low:.8g} to {high:.8g} and was taken as days, as {program} count them"
             )
-            # to the microsecond: what is left of a double there
-            return np.round((numbers - epoch) * 86400, 6), said
+            # to the microsecond, a double's resolution there
+            return np.round((numbers - epoch) * 86400, 6), remark
     return numbers, ""
 
 
 def _in_days(interval: float) -> bool:
-    """Whether an interval is one of days: up to a second, or whole seconds up to a minute. Taken as seconds
-    it would be 80 kHz, or a rate that no machine of ours has: 1 kHz would be 86.4 s."""
+    """Whether an interval is in days: up to a second, or whole seconds up to a minute. In seconds it would be
+    80 kHz, or a rate that no such machine has: 1 kHz would be 86.4 s."""
     in_seconds = interval * 86400
     return 0 < in_seconds < 1.05 or (in_seconds < 61 and abs(in_seconds - round(in_seconds)) < 0.02)
 
@@ -269,11 +275,12 @@ def _in_days(interval: float) -> bool:
 
 
 def forward(columns: Columns) -> tuple[Columns, list[Note]]:
-    """The columns from the oldest sample on where they stand newest first; nothing else is sorted."""
+    """The columns from the oldest sample on. Columns with the newest first are reversed; nothing else is
+    sorted."""
     last = len(columns.time) - 1
     if last < 1 or not (np.diff(columns.time) < 0).all():
         return columns, []
-    values = {name: found[::-1] for name, found in columns.values.items()}
+    values = {name: column[::-1] for name, column in columns.values.items()}
     turned = columns._replace(time=columns.time[::-1], values=values, place=lambda i: columns.place(last - i))
     return turned, [
         Note(
@@ -286,7 +293,7 @@ def forward(columns: Columns) -> tuple[Columns, list[Note]]:
 
 
 def check_clock(path: Path, group: Columns) -> None:
-    """Raises ValueError where a time is missing, repeated or before the one ahead of it, with the place."""
+    """Raises ValueError with the place if a time is missing, repeated or before the one ahead of it."""
     time = group.time
     if np.issubdtype(time.dtype, np.floating) and not np.isfinite(time).all():
         i = int(np.flatnonzero(~np.isfinite(time))[0])
@@ -304,44 +311,49 @@ def check_clock(path: Path, group: Columns) -> None:
     start = time[0] if unit == 1e9 else 0
     now, before = (float(time[j] - start) / unit for j in (i + 1, i))
     since = " after the first" if start else ""
-    said = (
+    problem = (
         f"has the same time as the sample before it, {now:.9g} s{since}"
         if steps[i] == 0
         else f"is at {now:.9g} s{since}, which is before the sample ahead of it at {before:.9g} s"
     )
     times = f", the first of {count}" if count > 1 else ""
     raise ValueError(
-        f"{path}: {group.place(i + 1)} {said}{times}, but time should only run forward; "
+        f"{path}: {group.place(i + 1)} {problem}{times}, but time should only run forward; "
         f"{_remedy(group, steps / unit, back)}"
     )
 
 
 def _remedy(group: Columns, steps_s: np.ndarray, back: np.ndarray) -> str:
-    """What to do about a clock that stands still or runs backwards, by how it does."""
+    """The remedy for a clock that stands still or runs backwards, by the way it does."""
     if steps_s[back[0]] == 0:
         return "name a finer clock, or give each device or tag that writes here a column of its own"
     if len(back) > 0.9 * len(steps_s):
         return "sort the rows by time, from the oldest on"
     if len(back) >= 3 and len(steps_s) <= OTHER_DEVICE_RUN * (len(back) + 1):
-        return "two devices with clocks of their own seem to write under one name: record each under a name of its own"
+        return (
+            "two devices with clocks of their own seem to write under one name: "
+            "record each under a name of its own"
+        )
     if len(back) == 1 and abs(steps_s[back[0]] + 3600) <= 3 * np.median(np.abs(steps_s)):
-        return "an hour is what the end of summer time takes away: write the times with their zone or in UTC, or split the recording there"
+        return (
+            "an hour is what the end of summer time takes away: write the times with their zone or in UTC, "
+            "or split the recording there"
+        )
     if group.name == "rows":
         return "split the recording where its clock was set back"
     return "sort it with: mcap sort, or split it where its clock was set back"
 
 
 def every(time: str) -> float | None:
-    """The interval of "every 0.5 s", the time of a table that has none; None for a column's name."""
-    found = re.fullmatch(r"every\s+([0-9.eE+-]+)\s*s", time.strip())
+    """The interval of "every 0.5 s", the time of a table without one; None for a column's name."""
+    match = re.fullmatch(r"every\s+([0-9.eE+-]+)\s*s", time.strip())
     try:
-        interval = float(found[1]) if found else None
+        interval = float(match[1]) if match else None
     except ValueError:
         return None
     return interval if interval is not None and 0 < interval < np.inf else None
 
 
 # a clock that begins later than three years is one of the calendar; it is counted from the record's first
-# whole second, so that floats hold
-# nanoseconds
+# whole second, so that floats hold nanoseconds
 CALENDAR_S = 1e8

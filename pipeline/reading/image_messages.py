@@ -1,11 +1,10 @@
-"""Pictures out of the messages of an image topic, whatever they are
-written in, and gray frames out of pictures.
+"""The messages of an image topic -> pictures -> gray frames.
 
-Read are sensor_msgs Image and CompressedImage in ROS 2 CDR and ROS 1, Foxglove's RawImage and CompressedImage
-in protobuf, JSON (base64), CDR and ROS 1; their layouts are fixed (ros2/common_interfaces,
+The types read are sensor_msgs Image and CompressedImage in ROS 2 CDR and ROS 1, and Foxglove's RawImage and
+CompressedImage in protobuf, JSON (base64), CDR and ROS 1. Their layouts are fixed (ros2/common_interfaces,
 foxglove/foxglove-sdk), so that those of ROS need no schema text. A picture shares the memory of its message,
-and a mono8 frame that of its picture. Gray is luma, 0.299 R + 0.587 G + 0.114 B (ITU-R BT.601), which is also
-what JPEG holds; 16 bits stay 16 bits.
+and a mono8 frame that of its picture. Gray is luma, 0.299 R + 0.587 G + 0.114 B (ITU-R BT.601), as in JPEG.
+16 bits stay 16 bits.
 """
 
 import base64
@@ -31,9 +30,11 @@ _ROS = {
     "foxglove_msgs/CompressedImage": "stamp, frame_id:s, data:b, format:s",
 }
 _FOXGLOVE = ("foxglove/RawImage", "foxglove/CompressedImage")
-READABLE = "sensor_msgs Image and CompressedImage (ROS 2, ROS 1), foxglove RawImage and CompressedImage (protobuf, JSON, ROS)"
-# CDR representation -> byte order; no field is longer than four bytes,
-# so that the two alignments there are agree
+READABLE = (
+    "sensor_msgs Image and CompressedImage (ROS 2, ROS 1), "
+    "foxglove RawImage and CompressedImage (protobuf, JSON, ROS)"
+)
+# CDR representation -> byte order; no field is longer than four bytes, so that both alignments agree
 _ORDERS = {b"\x00\x00": ">", b"\x00\x01": "<", b"\x00\x06": ">", b"\x00\x07": "<"}
 
 _MONO = {"mono8", "8uc1"}
@@ -53,8 +54,8 @@ ENCODINGS = (
 
 
 class Picture(NamedTuple):
-    """A message's picture: `encoding` and the layout of its rows, or, where height is 0,
-    the format ("jpeg", "png") of a compressed one."""
+    """A message's picture: `encoding` and the layout of its rows. With height 0 it is compressed, and
+    `encoding` is its format ("jpeg", "png")."""
 
     stamp_ns: int
     encoding: str
@@ -77,10 +78,10 @@ def is_image(channel: Channel) -> bool:
 
 
 def reader(channel: Channel) -> Read:
-    """A function from one message of the channel to its Picture, nothing of it copied or decoded.
+    """A function from one message of the channel to its Picture, without a copy and without decoding.
 
-    It raises UnreadableMessage for a message that is not what its type says.
-    Raises ValueError for a channel that is none of images.
+    The function raises UnreadableMessage for a message that does not fit its type. Raises ValueError for a
+    channel without images.
     """
     if not is_image(channel):
         raise ValueError(
@@ -117,7 +118,8 @@ def _kind(channel: Channel) -> str:
 
 
 def _ros(message: memoryview, fields: list[tuple[str, ...]], aligned: bool) -> Picture:
-    """`aligned`: ROS 2; ROS 1 has no alignment, and a counter ahead of the stamp of a header."""
+    """The picture of a ROS message. ROS 2 is `aligned`; ROS 1 is not, and has a counter ahead of a header's
+    stamp."""
     order, pos = "<", 0
     if aligned:
         order = _ORDERS.get(bytes(message[:2]), "")
@@ -125,16 +127,16 @@ def _ros(message: memoryview, fields: list[tuple[str, ...]], aligned: bool) -> P
             raise UnreadableMessage(f"CDR representation 0x{message[:2].hex()} is not read")
         message = message[4:]
     word = struct.Struct(order + "I").unpack_from
-    found: dict = {"stamp": 0}
+    values: dict = {"stamp": 0}
     for name, *kind in fields:
         if kind == ["B"]:
-            found[name] = message[pos]
+            values[name] = message[pos]
             pos += 1
             continue
         pos += -pos % 4 if aligned else 0
         if not kind:
             pos += 4 if name == "header" and not aligned else 0
-            found["stamp"] = word(message, pos)[0] * 10**9 + word(message, pos + 4)[0]
+            values["stamp"] = word(message, pos)[0] * 10**9 + word(message, pos + 4)[0]
             pos += 8
             continue
         value = word(message, pos)[0]
@@ -145,30 +147,30 @@ def _ros(message: memoryview, fields: list[tuple[str, ...]], aligned: bool) -> P
                 raise UnreadableMessage(f"{name} of {value} bytes in a message of {len(message)}")
             value = message[pos:end]
             pos = end
-        found[name] = _word(value) if kind == ["s"] else value
-    return _picture(found, found["stamp"])
+        values[name] = _word(value) if kind == ["s"] else value
+    return _picture(values, values["stamp"])
 
 
 def _protobuf(message: memoryview, numbers: dict[int, Field]) -> Picture:
-    found: dict = {}
+    values: dict = {}
     for number, _, value in _wire(message):
         if number in numbers:
-            found[numbers[number].name] = value
-    stamp = {number: value for number, _, value in _wire(found.get("timestamp", b""))}
+            values[numbers[number].name] = value
+    stamp = {number: value for number, _, value in _wire(values.get("timestamp", b""))}
     for name in ("width", "height", "step"):
-        value = found.get(name, 0)
-        found[name] = value if isinstance(value, int) else int.from_bytes(value, "little")
+        value = values.get(name, 0)
+        values[name] = value if isinstance(value, int) else int.from_bytes(value, "little")
     for name in ("encoding", "format"):
-        found[name] = _word(found.get(name, b""))
-    return _picture(found, stamp.get(1, 0) * 10**9 + stamp.get(2, 0))
+        values[name] = _word(values.get(name, b""))
+    return _picture(values, stamp.get(1, 0) * 10**9 + stamp.get(2, 0))
 
 
 def _json(message: memoryview) -> Picture:
     try:
-        found = orjson.loads(message)
-        stamp = found["timestamp"]
-        found["data"] = memoryview(base64.b64decode(found["data"], validate=True))
-        return _picture(found, int(stamp["sec"]) * 10**9 + int(stamp["nsec"]))
+        values = orjson.loads(message)
+        stamp = values["timestamp"]
+        values["data"] = memoryview(base64.b64decode(values["data"], validate=True))
+        return _picture(values, int(stamp["sec"]) * 10**9 + int(stamp["nsec"]))
     except (orjson.JSONDecodeError, KeyError, TypeError, ValueError, binascii.Error) as error:
         raise UnreadableMessage(f"a message that is no image in JSON ({error})") from None
 
@@ -177,19 +179,19 @@ def _word(text: bytes | memoryview) -> str:
     return bytes(text).rstrip(b"\0").decode()
 
 
-def _picture(found: dict, stamp_ns: int) -> Picture:
-    data = found.get("data", memoryview(b""))
+def _picture(values: dict, stamp_ns: int) -> Picture:
+    data = values.get("data", memoryview(b""))
     if not isinstance(data, memoryview):
         raise UnreadableMessage("a number where its type says bytes")
-    if "width" not in found or not found.get("encoding", ""):
-        return Picture(stamp_ns, found.get("format", ""), 0, 0, 0, False, data)
+    if "width" not in values or not values.get("encoding", ""):
+        return Picture(stamp_ns, values.get("format", ""), 0, 0, 0, False, data)
     return Picture(
         stamp_ns,
-        found["encoding"],
-        found["height"],
-        found["width"],
-        found["step"],
-        bool(found.get("is_bigendian", 0)),
+        values["encoding"],
+        values["height"],
+        values["width"],
+        values["step"],
+        bool(values.get("is_bigendian", 0)),
         data,
     )
 
@@ -198,8 +200,8 @@ def _picture(found: dict, stamp_ns: int) -> Picture:
 
 
 def gray(picture: Picture) -> np.ndarray:
-    """The gray frame (height, width), uint8 or uint16; of mono8 a view
-    of the message. Raises UnreadableMessage."""
+    """The gray frame (height, width), uint8 or uint16; of mono8 a view of the message. Raises
+    UnreadableMessage."""
     if not picture.height:
         return _decoded(picture)
     encoding = picture.encoding.casefold()
@@ -255,7 +257,10 @@ MSG: builtin_interfaces/Time
 int32 sec
 uint32 nanosec
 """
-IMAGE = f"{HEADER}uint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data\n{HEADER_TYPES}"
+IMAGE = (
+    f"{HEADER}uint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data\n"
+    f"{HEADER_TYPES}"
+)
 COMPRESSED_IMAGE = f"{HEADER}string format\nuint8[] data\n{HEADER_TYPES}"
 _CDR = b"\x00\x01\x00\x00"
 

@@ -1,6 +1,8 @@
-"""The frames of one image topic of an MCAP file and the numbers of the topics beside
-it: one walk checks all of the file, keeps the numbers and remembers where pictures
-are; frames are decoded when they are asked for."""
+"""The frames of one image topic of an MCAP file and the numbers of the topics beside it.
+
+One walk checks the whole file, reads the numbers and remembers the places of the pictures. Frames are decoded
+when they are asked for.
+"""
 
 import struct
 from collections.abc import Iterator, Sequence
@@ -32,14 +34,17 @@ STAMPS = (("sec", "nanosec"), ("sec", "nsec"), ("secs", "nsecs"), ("seconds", "n
 
 
 class Walk(McapFile):
-    """All of a file, walked once: metadata records, the messages of the topics `wanted`, and the
-    pictures of `image`: their times in ns on the clock `time`, and the offsets of the whole chunks
-    and single messages that hold them, by channel."""
+    """A whole file, walked once.
+
+    It has the metadata records, the messages of the topics `wanted`, and of the pictures of `image`, by
+    channel, their times in ns on the clock `time` and the offsets of the chunks and single messages that hold
+    them.
+    """
 
     def __init__(self, path: Path, image: Topic, wanted: set[str], time: str):
         super().__init__(path)
         self.metadata: dict[str, dict[str, str]] = {}
-        self.kept: dict[int, Messages] = {}
+        self.messages: dict[int, Messages] = {}
         self.offsets: dict[int, list[int]] = {}
         self.picture_ns: dict[int, list[int]] = {}
         self.readers = {channel.id: reader(channel) for channel in image.channels}
@@ -51,16 +56,16 @@ class Walk(McapFile):
                 if number in self.readers:
                     self._remember(number, messages, time)
                 elif messages.data:
-                    kept = self.kept.setdefault(number, Messages([], [], []))
-                    for have, found in zip(kept, messages, strict=True):
-                        have += found
+                    channel_messages = self.messages.setdefault(number, Messages([], [], []))
+                    for all_of_it, part in zip(channel_messages, messages, strict=True):
+                        all_of_it += part
 
     def _framed(self, stream: BinaryIO) -> Iterator[tuple[int, int, bytes, bytes]]:
         for opcode, offset, head, record in super()._framed(stream):
             self._at = (opcode, offset)
             if opcode == METADATA:
-                name, found = _metadata(record)
-                self.metadata[name] = found
+                name, record_pairs = _metadata(record)
+                self.metadata[name] = record_pairs
             elif opcode == MESSAGE:
                 number = struct.unpack_from("<H", record)[0]
                 if number in self.readers:
@@ -90,7 +95,7 @@ class Walk(McapFile):
 
 
 def _metadata(record: bytes) -> tuple[str, dict[str, str]]:
-    """Name and pairs of a metadata record; an empty name where its lengths do not agree."""
+    """Name and pairs of a metadata record; an empty name if its lengths do not agree."""
     try:
         name, pos = string(record, 0)
         return name, pairs(prefixed(record, pos)[0])
@@ -102,16 +107,16 @@ def _metadata(record: bytes) -> tuple[str, dict[str, str]]:
 
 
 def columns(walk: Walk, topic: Topic, names: Sequence[str], time: str) -> tuple[Columns, int]:
-    """The numbers `names` of a topic that the walk has kept, its channels one behind the other, and how many
-    messages were not what the schema says.
+    """The numbers `names` of a topic, its channels one behind the other, and the count of messages that do
+    not fit their schema.
 
-    Raises ValueError for a clock that the topic does not have, for text
-    in place of a number, and where nothing can be read.
+    Raises ValueError for a clock that the topic does not have, for text in place of a number, and if nothing
+    can be read.
     """
     clock = _clock(walk.path, topic, time)
     pieces, dropped = [], 0
     for channel in topic.channels:
-        messages = walk.kept.get(channel.id)
+        messages = walk.messages.get(channel.id)
         if messages is None:
             continue
         try:
@@ -150,7 +155,7 @@ def columns(walk: Walk, topic: Topic, names: Sequence[str], time: str) -> tuple[
 
 
 def _clock(path: Path, topic: Topic, time: str) -> list[str]:
-    """Fields that make the clock: none for log_time and publish_time, one of seconds, or two of a stamp."""
+    """The clock's fields: none for log_time and publish_time, one of seconds, or two of a stamp."""
     if time in ("log_time", "publish_time"):
         return []
     if time in topic.fields:
@@ -165,7 +170,7 @@ def _clock(path: Path, topic: Topic, time: str) -> list[str]:
 
 
 def _rows(decode: Decode, data: Sequence[bytes], width: int) -> tuple[np.ndarray, list[int]]:
-    """Numbers (n, width) of the messages that are what their schema says, and which those are."""
+    """Numbers (n, width) of the messages that fit their schema, and the indices of those messages."""
     try:
         return decode([plain(message) for message in data]), list(range(len(data)))
     except UnreadableMessage:
@@ -183,7 +188,7 @@ def _rows(decode: Decode, data: Sequence[bytes], width: int) -> tuple[np.ndarray
 
 
 def frame_times(walk: Walk, topic: Topic) -> Columns:
-    """The pictures' times in ns, those of channels that took over from one another one behind the other."""
+    """The pictures' times in ns, the channels one behind the other in the order of their first pictures."""
     times = [time for number in walk.picture_order() for time in walk.picture_ns[number]]
     return Columns(
         topic.name,
@@ -194,12 +199,11 @@ def frame_times(walk: Walk, topic: Topic) -> Columns:
 
 
 class Frames:
-    """(time_s, frame) of each picture in the order of time, frame (height, width) uint8 or uint16; as often
-    as wanted, in the memory of a chunk.
+    """(time_s, frame) of each picture in the order of time, frame (height, width) uint8 or uint16.
 
-    time_s (n,) is known beforehand. A picture that cannot be decoded is left out: `unreadable` counts
-    those of the last walk, `notes` says so. Raises ValueError where they are more than
-    `unreadable_share` of all, and where the size changes.
+    It can be walked again and again, in the memory of a chunk; time_s (n,) is there beforehand. A picture
+    that cannot be decoded is left out: `unreadable` counts those of the last walk, `notes` describes them.
+    Raises ValueError if they are more than `unreadable_share` of all, and if the size changes.
     """
 
     def __init__(self, walk: Walk, topic: Topic, time: str, *, start_ns: int, unreadable_share: float):
@@ -221,13 +225,13 @@ class Frames:
             except UnreadableMessage as error:
                 self._leave_out(time, error)
                 continue
-            found = (frame.shape[1], frame.shape[0], 8 * frame.itemsize)
-            kind = kind or found
-            if found != kind:
+            size = (frame.shape[1], frame.shape[0], 8 * frame.itemsize)
+            kind = kind or size
+            if size != kind:
                 raise ValueError(
-                    f"{self.path}: the frame of {self.topic} at {time:.3f} s is {found[0]} x {found[1]} px "
-                    f"of {found[2]} bits but the first is {kind[0]} x"
-                    f" {kind[1]} px of {kind[2]}; record a trial at one size"
+                    f"{self.path}: the frame of {self.topic} at {time:.3f} s is {size[0]} x {size[1]} px "
+                    f"of {size[2]} bits but the first is {kind[0]} x {kind[1]} px of {kind[2]}; "
+                    "record a trial at one size"
                 )
             yield time, frame
 
@@ -267,13 +271,12 @@ class Frames:
         if self.unreadable > self._share * self.count:
             raise ValueError(
                 f"{self.path}: {self.unreadable} of {self.count} frames of {self.topic} {self._first}; "
-                f"that is more than {100 * self._share:g} percent, so"
-                f" record the trial again"
+                f"that is more than {100 * self._share:g} percent, so record the trial again"
             )
 
     def _messages(self, stream: BinaryIO, number: int, offset: int) -> list[tuple[int, int, memoryview]]:
-        """(log_time, publish_time, message) of the channel in the chunk or message at
-        `offset`, whose CRC the first walk has checked."""
+        """(log_time, publish_time, message) of the channel in the chunk or message at `offset`. The first
+        walk has checked its CRC."""
         try:
             stream.seek(offset)
             head = stream.read(9)
@@ -309,10 +312,10 @@ def _split(content: memoryview, number: int) -> Iterator[tuple[int, int, memoryv
         pos += 9 + length
 
 
-def image_topic(path: Path, found: dict[str, Topic], name: str) -> Topic:
-    """The topic `name`, or, where that is empty, the only one with images.
-    Raises ValueError saying which topics there are."""
-    images = [topic for topic in found.values() if topic.channels and all(map(is_image, topic.channels))]
+def image_topic(path: Path, topics: dict[str, Topic], name: str) -> Topic:
+    """The topic `name`, or, if `name` is empty, the only topic with images. Raises ValueError with the topics
+    that there are."""
+    images = [topic for topic in topics.values() if topic.channels and all(map(is_image, topic.channels))]
     chosen = [topic for topic in images if not name or topic.name == name]
     if len(chosen) == 1:
         return chosen[0]
@@ -323,7 +326,7 @@ def image_topic(path: Path, found: dict[str, Topic], name: str) -> Topic:
         )
     there = ", ".join(
         f"{topic.name} ({topic.channels[0].schema_name or 'no type'} in {topic.channels[0].encoding})"
-        for topic in found.values()
+        for topic in topics.values()
     )
     what = f"topic {name} with images" if name else "image topic"
     raise ValueError(

@@ -1,5 +1,7 @@
-"""What is in a recording, in words: format, clocks with rate, jitter and gaps, signals with their ranges,
-damage; and a mapping to paste into params.yaml."""
+"""A recording described in words, and a mapping to paste into params.yaml.
+
+The words give its format, its clocks with rate, jitter and gaps, its signals with their ranges, and damage.
+"""
 
 import json
 import re
@@ -18,9 +20,15 @@ from pipeline.reading.resampling import GAP_INTERVALS
 from pipeline.reading.signals import Note, intervals
 
 MOST_FIELDS = 64
-_NO_TIME = "no column is called like a time; write its name, or time: every 1.0 s with the sample time, beside the mapping"
+_NO_TIME = (
+    "no column is called like a time; write its name, or time: every 1.0 s with the sample time, "
+    "beside the mapping"
+)
 _SET_POINT = r"set.?point|target|reference|\bsp\b|_sp$|^sp_"
-_TEMPERATURE = r"temp|celsius|deg_?c|°c|hot.?end|nozzle|barrel|zone|\bbed\b|^bed|thermo|tool_?\d|chamber|^t_?\d+|^t[_\[(]|_[ckf]$|[\[(][ckf°]"
+_TEMPERATURE = (
+    r"temp|celsius|deg_?c|°c|hot.?end|nozzle|barrel|zone|\bbed\b|^bed|thermo|tool_?\d|chamber|"
+    r"^t_?\d+|^t[_\[(]|_[ckf]$|[\[(][ckf°]"
+)
 # a temperature whatever else the name says, such as heater_bed.temperature
 _SURELY_TEMPERATURE = r"temperature|celsius|deg_?c|°c|(?<!set)[\s._](temp|actual)$"
 _INPUT = r"heat|duty|pwm|power|percent|pct|%|^q_?\d|^u_?\d*$|motor|screw|rpm|fan|voltage|current"
@@ -36,7 +44,7 @@ _UNITS = (
 
 
 class _Signal(NamedTuple):
-    """A column with its source, the unit that the file says, its numbers, and what it is taken for."""
+    """A column: its source, the unit that the file gives, its numbers, and its role in the proposal."""
 
     source: str
     unit: str
@@ -45,10 +53,9 @@ class _Signal(NamedTuple):
 
 
 def inspect(path: str | Path) -> str:
-    """A description of the recording to read, and at its end YAML to
-    paste under `ingest.mapping` and `plant`.
+    """The recording in words, and at the end YAML to paste under `ingest.mapping` and `plant`.
 
-    Raises ValueError where nothing can be read.
+    Raises ValueError if nothing can be read.
     """
     path = Path(path)
     kind = file_format(path)
@@ -110,11 +117,10 @@ def _table(path: Path, kind: str) -> tuple[list[str], list[tuple[Columns, str]],
     wanted = [name for name in numeric if names.count(name) == 1]
     signals = [name for name in wanted if not is_time_name(name)]
     if not signals:
-        found = f" ({', '.join(others[:6] + twice)})" if others or twice else ""
+        examples = f" ({', '.join(others[:6] + twice)})" if others or twice else ""
         raise ValueError(
-            f"{path}: none of its {len(columns)} columns holds numbers beside the time{found}; "
-            "write numbers without"
-            " units, with one decimal mark, and a name for each column"
+            f"{path}: none of its {len(columns)} columns holds numbers beside the time{examples}; "
+            "write numbers without units, with one decimal mark, and a name for each column"
         )
     reader: Callable = read_csv if kind == "csv" else read_parquet
     try:
@@ -128,21 +134,21 @@ def _table(path: Path, kind: str) -> tuple[list[str], list[tuple[Columns, str]],
 
 
 def _mcap(path: Path) -> tuple[list[str], list[tuple[Columns, str]], dict[str, str], list[Note]]:
-    found = topics(path)
-    lines, groups, units, notes = [f"{len(found)} topics"], [], {}, []
-    bare = [field for topic in found.values() for field in topic.fields]
-    for topic in found.values():
+    by_name = topics(path)
+    lines, groups, units, notes = [f"{len(by_name)} topics"], [], {}, []
+    bare = [field for topic in by_name.values() for field in topic.fields]
+    for topic in by_name.values():
         schemas = sorted(
             {f"{channel.encoding}, {channel.schema_name or 'no schema'}" for channel in topic.channels}
         )
-        said = (
+        content = (
             f"cannot be read: {topic.unreadable}"
             if topic.unreadable
             else f"{len(topic.fields)} numbers"
             if topic.fields
             else "no numbers"
         )
-        lines.append(f"  {topic.name}: {topic.count} messages, {'; '.join(schemas)}, {said}")
+        lines.append(f"  {topic.name}: {topic.count} messages, {'; '.join(schemas)}, {content}")
         if topic.fields and topic.count:
             group, more = _topic(path, topic)
             notes += [note for note in more if note not in notes]
@@ -177,7 +183,7 @@ def _topic(path: Path, topic: Topic) -> tuple[Columns | None, list[Note]]:
     return columns[0]._replace(values=values), (notes if len(shown) < len(topic.fields) else []) + more
 
 
-# ---- what is there
+# ---- clocks and ranges
 
 
 def _clock(path: Path, group: Columns) -> list[str]:
@@ -193,28 +199,34 @@ def _clock(path: Path, group: Columns) -> list[str]:
     limit = GAP_INTERVALS * float(np.median(np.diff(time)))
     jitter = intervals(time, limit)
     gaps = np.flatnonzero(np.diff(time) > limit)
-    line = f"{group.name}: {count} samples in {time[-1]:.6g} s, every {jitter.interval_s:.6g} s ({1 / jitter.interval_s:.4g} per second)"
-    said = f"  jitter {jitter.std_s:.2g} s (standard), {jitter.max_s:.2g} s (largest)"
+    line = (
+        f"{group.name}: {count} samples in {time[-1]:.6g} s, "
+        f"every {jitter.interval_s:.6g} s ({1 / jitter.interval_s:.4g} per second)"
+    )
+    timing = f"  jitter {jitter.std_s:.2g} s (standard), {jitter.max_s:.2g} s (largest)"
     if len(gaps):
         longest = gaps[np.argmax(np.diff(time)[gaps])]
-        said += f"; {len(gaps)} gaps beyond {limit:.3g} s, the longest {np.diff(time)[longest]:.4g} s at {time[longest]:.6g} s"
+        timing += (
+            f"; {len(gaps)} gaps beyond {limit:.3g} s, "
+            f"the longest {np.diff(time)[longest]:.4g} s at {time[longest]:.6g} s"
+        )
     else:
-        said += f"; no gap beyond {limit:.3g} s"
-    return [line, said]
+        timing += f"; no gap beyond {limit:.3g} s"
+    return [line, timing]
 
 
 def _range(values: np.ndarray) -> str:
-    known = values[np.isfinite(values)]
-    missing = len(values) - len(known)
-    said = f", {missing} missing" if missing else ""
-    if not len(known):
-        return f"no value{said}"
-    if np.ptp(known) == 0:
-        return f"constant {known[0]:g}{said}"
-    step = quantisation_step(known)
-    levels = len(np.unique(known))
+    finite = values[np.isfinite(values)]
+    lost = len(values) - len(finite)
+    missing = f", {lost} missing" if lost else ""
+    if not len(finite):
+        return f"no value{missing}"
+    if np.ptp(finite) == 0:
+        return f"constant {finite[0]:g}{missing}"
+    step = quantisation_step(finite)
+    levels = len(np.unique(finite))
     steps = f", {levels} levels" if levels <= 12 else f", steps of {step:.3g}" if step else ""
-    return f"{known.min():g} to {known.max():g}, median {np.median(known):g}{steps}{said}"
+    return f"{finite.min():g} to {finite.max():g}, median {np.median(finite):g}{steps}{missing}"
 
 
 # ---- the proposal
@@ -279,8 +291,8 @@ def _bare(source: str) -> str:
 
 def _role(signal: _Signal) -> str:
     name, unit = _bare(signal.source), signal.unit.casefold()
-    known = signal.values[np.isfinite(signal.values)]
-    if re.search(_STAMP, name) or not len(known) or np.ptp(known) == 0:
+    finite = signal.values[np.isfinite(signal.values)]
+    if re.search(_STAMP, name) or not len(finite) or np.ptp(finite) == 0:
         return ""
     if re.search(_SET_POINT, name):
         return "set-point"
@@ -294,25 +306,26 @@ def _role(signal: _Signal) -> str:
 
 
 def _behaviour(signal: _Signal) -> str:
-    """Commands rest and jump between few levels; measurements do neither. A counter is none of both."""
-    known = signal.values[np.isfinite(signal.values)]
+    """The role by the values alone. Commands rest and jump between few levels; measurements do neither. A
+    counter has no role."""
+    finite = signal.values[np.isfinite(signal.values)]
     if (
-        len(known) < 2
-        or np.ptp(known) == 0
-        or np.ptp(np.diff(known)) == 0
+        len(finite) < 2
+        or np.ptp(finite) == 0
+        or np.ptp(np.diff(finite)) == 0
         or re.search(_STAMP, _bare(signal.source))
     ):
         return ""
     return (
         "input"
-        if len(np.unique(np.round(known, 1))) <= max(10, len(known) // 100)
-        and not quantisation_step(known) < 0.1
+        if len(np.unique(np.round(finite, 1))) <= max(10, len(finite) // 100)
+        and not quantisation_step(finite) < 0.1
         else "output"
     )
 
 
 def _name(signal: _Signal, names: set[str]) -> str:
-    """heater_1, temperature_1, ... or, for what moves, its own name made of letters, digits and _."""
+    """heater_1, temperature_1, ...; a motor or fan keeps its own name in letters, digits and _."""
     bare = _bare(signal.source)
     own = re.sub(r"\W+", "_", bare, flags=re.ASCII).strip("_")
     number = re.search(r"\d+", bare)
@@ -330,27 +343,27 @@ def _name(signal: _Signal, names: set[str]) -> str:
 
 def _conversion(signal: _Signal) -> tuple[str, float, float]:
     bare, unit = _bare(signal.source), signal.unit.casefold()
-    known = signal.values[np.isfinite(signal.values)]
-    low, high = known.min(), known.max()
-    found = next(
+    finite = signal.values[np.isfinite(signal.values)]
+    low, high = finite.min(), finite.max()
+    conversion = next(
         (ours for pattern, ours in _UNITS if re.search(pattern, bare) or re.search(rf"^{pattern}$", unit)),
         None,
     )
-    if found is None and unit in ("k", "f"):
-        found = ("degC", 1.0, -273.15) if unit == "k" else ("degC", 0.555556, -17.7778)
-    if signal.role == "input" and (found is None or found[0] == "percent"):
+    if conversion is None and unit in ("k", "f"):
+        conversion = ("degC", 1.0, -273.15) if unit == "k" else ("degC", 0.555556, -17.7778)
+    if signal.role == "input" and (conversion is None or conversion[0] == "percent"):
         if low >= 0 and high <= 1:
             return "percent", 100.0, 0.0
-        whole = bool((known == np.rint(known)).all())
-        full = next((top for top in (255, 1023, 4095) if 100 < high <= top and low >= 0 and whole), None)
-        return "percent", float(f"{100 / full:.6g}") if full and found is None else 1.0, 0.0
-    if found is None:
-        return "degC", 1.0, -273.15 if ROOM_KELVIN[0] <= known[0] <= ROOM_KELVIN[1] and low > 250 else 0.0
-    return found
+        integer = bool((finite == np.rint(finite)).all())
+        full = next((top for top in (255, 1023, 4095) if 100 < high <= top and low >= 0 and integer), None)
+        return "percent", float(f"{100 / full:.6g}") if full and conversion is None else 1.0, 0.0
+    if conversion is None:
+        return "degC", 1.0, -273.15 if ROOM_KELVIN[0] <= finite[0] <= ROOM_KELVIN[1] and low > 250 else 0.0
+    return conversion
 
 
 def _yaml(source: str) -> str:
-    """A YAML scalar: as it is where it cannot be taken for anything else."""
+    """A YAML scalar, quoted if it could be taken for anything else."""
     return (
         source
         if re.fullmatch(r"[A-Za-z_]\w*|/[\w/.:]*\w", source) and ": " not in source

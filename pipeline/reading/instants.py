@@ -1,5 +1,5 @@
-"""Times that are written as text: ISO 8601, the dates of other countries, times
-of day; each becomes nanoseconds on one calendar."""
+"""Times written as text -> nanoseconds on one calendar: ISO 8601, the dates of other countries, times of
+day."""
 
 import calendar
 import datetime
@@ -14,8 +14,14 @@ import numpy as np
 DAY_NS = 86_400 * 10**9
 _EPOCH = datetime.date(1970, 1, 1).toordinal()
 _MONTHS = {name: i for i, name in enumerate(calendar.month_abbr)}
-_DATE = r"(?P<date>\d{4}(?P<m>[-/.])\d{1,2}(?P=m)\d{1,2}|\d{8}|\d{1,2}(?P<k>[./-])(?:\d{1,2}|[A-Za-z]{3})(?P=k)(?:\d{4}|\d{2}))"
-_TIME = r"(?P<hours>\d+):(?P<minutes>\d\d)(?::(?P<seconds>\d\d)(?:[.,:](?P<fraction>\d+))?)?\s*(?P<half>[AaPp]\.?[Mm]\.?)?"
+_DATE = (
+    r"(?P<date>\d{4}(?P<m>[-/.])\d{1,2}(?P=m)\d{1,2}|\d{8}|"
+    r"\d{1,2}(?P<k>[./-])(?:\d{1,2}|[A-Za-z]{3})(?P=k)(?:\d{4}|\d{2}))"
+)
+_TIME = (
+    r"(?P<hours>\d+):(?P<minutes>\d\d)(?::(?P<seconds>\d\d)(?:[.,:](?P<fraction>\d+))?)?"
+    r"\s*(?P<half>[AaPp]\.?[Mm]\.?)?"
+)
 _TEXT = re.compile(
     rf"\s*(?:{_DATE}(?:[T,\s]+|$))?(?:{_TIME})?\s*(?P<zone>Z|z|UTC|GMT|[+-]\d\d(?::?\d\d)?)?\s*$"
 )
@@ -26,8 +32,7 @@ EXPECTED = "seconds or ISO 8601 such as 2025-11-21T13:00:00.5"
 
 
 class Instants(NamedTuple):
-    """ns (n,) since 1970, or since midnight where the text has no
-    date; `zoned` where every time names its zone."""
+    """ns (n,) since 1970, or since midnight for text without a date. `zoned`: every time names its zone."""
 
     ns: np.ndarray
     zoned: bool
@@ -42,27 +47,27 @@ def is_compact(text: str) -> bool:
 def instants(
     path: Path, name: str, fields: Sequence[str], lines: Sequence[int], *, month_first: bool | None
 ) -> Instants:
-    """The instants that `fields` name. `month_first` says how 05/03/2025 is meant; None refuses it.
+    """The instants that `fields` name. `month_first` decides 05/03/2025; None refuses it.
 
-    Raises ValueError with the line for what is no time.
+    Raises ValueError with the line of a field that is no time.
     """
-    found = np.empty(len(fields), np.int64)
+    ns = np.empty(len(fields), np.int64)
     zoned, dated = True, False
     for i, (field, line) in enumerate(zip(fields, lines, strict=True)):
         try:
-            found[i], has_zone, dated = _instant(field, month_first)
+            ns[i], has_zone, dated = _instant(field, month_first)
         except ValueError as error:
-            why = f" ({error}?)" if str(error).startswith(("day", "hours")) else ""
+            hint = f" ({error}?)" if str(error).startswith(("day", "hours")) else ""
             raise ValueError(
-                f"{path}: line {line}, time {name} should be {EXPECTED} but is {field.strip()[:40]!r}{why}; "
+                f"{path}: line {line}, time {name} should be {EXPECTED} but is {field.strip()[:40]!r}{hint}; "
                 "convert it, or name another column"
             ) from None
         zoned = zoned and has_zone
-    return Instants(found, zoned, dated)
+    return Instants(ns, zoned, dated)
 
 
 def _instant(field: str, month_first: bool | None) -> tuple[int, bool, bool]:
-    """(ns, has a zone, has a date) of one text; ValueError where it is none."""
+    """(ns, has a zone, has a date) of one text. Raises ValueError for text that is no time."""
     compact = _COMPACT.match(field)
     if compact:
         date, hours, minutes, seconds, fraction = compact.groups()
@@ -123,12 +128,15 @@ def _day_and_month(first: int, second: int, mark: str, month_first: bool | None)
 
 
 def month_first(dates: Iterable[str], sample: str) -> bool | None:
-    """How dates such as 05/03/2025 are meant: by one that can be only one of both, or by the am and pm of
-    `sample`; a single day is the same either way. None where that is not known."""
+    """Whether dates such as 05/03/2025 begin with the month, None if nothing tells.
+
+    A date that can be only one of both tells, and so do the am and pm of `sample`. A single day is the same
+    either way.
+    """
     pairs = {
-        (int(found[1]), int(found[2]))
+        (int(match[1]), int(match[2]))
         for date in dates
-        if (found := re.match(r"\s*(\d{1,2})[/-](\d{1,2})[/-]\d", date))
+        if (match := re.match(r"\s*(\d{1,2})[/-](\d{1,2})[/-]\d", date))
     }
     if any(first > 12 for first, _ in pairs):
         return False
@@ -147,7 +155,7 @@ def _offset_ns(zone: str) -> int:
 
 
 def over_midnight(ns: np.ndarray) -> tuple[np.ndarray, int]:
-    """Times of day made to run on over midnight, and how often they do: a day is
-    added where they fall by more than half of one."""
+    """Times of day that run on over midnight, and the count of midnights. A day is added after each fall by
+    more than half a day."""
     midnights = np.cumsum(np.r_[0, np.diff(ns) < -DAY_NS // 2])
     return ns + midnights * DAY_NS, int(midnights[-1])

@@ -1,5 +1,4 @@
-"""Columns out of an MCAP file: which topics have which numbers, and
-those that are wanted, a chunk at a time."""
+"""Columns of an MCAP file: the topics with their numbers, and the wanted numbers a chunk at a time."""
 
 import itertools
 import re
@@ -32,8 +31,8 @@ _STAMPS = (("sec", "nanosec"), ("sec", "nsec"), ("secs", "nsecs"), ("seconds", "
 
 
 class Topic(NamedTuple):
-    """A topic with its channels, the numbers in its messages, or why they
-    cannot be read, and how many messages were seen."""
+    """A topic: its channels, the fields with numbers, the reason if it cannot be read, and the count of its
+    messages."""
 
     name: str
     channels: list[Channel]
@@ -43,74 +42,77 @@ class Topic(NamedTuple):
 
 
 class _Wanted(NamedTuple):
-    """What is wanted of one topic: its fields, then those of its clock."""
+    """The fields that are wanted of one topic, and the fields of its clock."""
 
     topic: str
     fields: list[str]
     clock: list[str]
 
 
-# ---- what there is
+# ---- topics
 
 
 def topics(path: Path, samples: int | None = SAMPLES) -> dict[str, Topic]:
-    """The topics of a file, after its summary and the first `samples` messages of each channel (None: all).
+    """The topics of a file, by its summary and the first `samples` messages of each channel (None: all).
 
-    Raises ValueError where it is no MCAP.
+    Raises ValueError for a file that is no MCAP.
     """
     file = McapFile(path)
-    looked_at: dict[int, int] = {}
+    sampled: dict[int, int] = {}
     names: dict[int, dict[str, None]] = {}
     unreadable: dict[int, str] = {}
-    for batch in file.batches(lambda channel: samples is None or looked_at.get(channel.id, 0) < samples):
+    for batch in file.batches(lambda channel: samples is None or sampled.get(channel.id, 0) < samples):
         for number, messages in batch.items():
-            data = messages.data[: None if samples is None else samples - looked_at.get(number, 0)]
-            looked_at[number] = looked_at.get(number, 0) + len(data)
+            data = messages.data[: None if samples is None else samples - sampled.get(number, 0)]
+            sampled[number] = sampled.get(number, 0) + len(data)
             if number in file.channels and data:
-                _look(file.channels[number], data, names, unreadable)
+                _add_fields(file.channels[number], data, names, unreadable)
         if (
             samples
             and file.promised
-            and all(
-                looked_at.get(number, 0) >= min(samples, count) for number, count in file.promised.items()
-            )
+            and all(sampled.get(number, 0) >= min(samples, count) for number, count in file.promised.items())
         ):
             break
     counts = file.counts if samples is None or file.promised is None else file.promised
-    found: dict[str, Topic] = {}
+    by_name: dict[str, Topic] = {}
     for number, channel in sorted(file.channels.items()):
-        if number not in looked_at:
-            _look(channel, [], names, unreadable)
-        before = found.get(channel.topic, Topic(channel.topic, [], [], "", 0))
-        together = list(dict.fromkeys([*before.fields, *names.get(number, ())]))
-        why = unreadable.get(number, before.unreadable)
-        found[channel.topic] = Topic(
-            channel.topic, [*before.channels, channel], together, why, before.count + counts.get(number, 0)
+        if number not in sampled:
+            _add_fields(channel, [], names, unreadable)
+        before = by_name.get(channel.topic, Topic(channel.topic, [], [], "", 0))
+        all_fields = list(dict.fromkeys([*before.fields, *names.get(number, ())]))
+        reason = unreadable.get(number, before.unreadable)
+        by_name[channel.topic] = Topic(
+            channel.topic,
+            [*before.channels, channel],
+            all_fields,
+            reason,
+            before.count + counts.get(number, 0),
         )
-    return found
+    return by_name
 
 
-def _look(
+def _add_fields(
     channel: Channel, data: Sequence[bytes], names: dict[int, dict[str, None]], unreadable: dict[int, str]
 ) -> None:
-    """Adds the numbers that are in `data` to the names of the channel, or why they cannot be read."""
+    """Adds the fields of the messages `data` to the names of the channel, or the reason why they cannot be
+    read."""
     try:
         names.setdefault(channel.id, {}).update(dict.fromkeys(fields(channel, data)))
     except (ValueError, RecursionError) as error:
         unreadable.setdefault(channel.id, str(error))
 
 
-def resolve(path: Path, source: str, found: dict[str, Topic]) -> tuple[str, str]:
-    """(topic, field) of "/topic:field", or of a field's bare name that only one
-    topic has. Raises ValueError with the nearest names."""
-    for topic in found.values():
+def resolve(path: Path, source: str, topics: dict[str, Topic]) -> tuple[str, str]:
+    """(topic, field) of "/topic:field", or of a field's bare name that only one topic has. Raises ValueError
+    with the nearest names."""
+    for topic in topics.values():
         if source.startswith(f"{topic.name}:"):
             field = source[len(topic.name) + 1 :]
             if field in topic.fields or _element(field, topic.fields):
                 return topic.name, field
             if topic.unreadable:
                 raise ValueError(f"{path}: topic {topic.name} cannot be read because {topic.unreadable}")
-    having = [topic.name for topic in found.values() if source in topic.fields]
+    having = [topic.name for topic in topics.values() if source in topic.fields]
     if len(having) == 1:
         return having[0], source
     if having:
@@ -118,13 +120,14 @@ def resolve(path: Path, source: str, found: dict[str, Topic]) -> tuple[str, str]
             f"{path}: {len(having)} topics have a field {source!r} ({', '.join(having)}); write which, "
             f"as in {having[0]}:{source}"
         )
-    names = [f"{topic.name}:{field}" for topic in found.values() for field in topic.fields]
+    names = [f"{topic.name}:{field}" for topic in topics.values() for field in topic.fields]
     raise ValueError(f"{path}: no message has a number {source!r}; {nearest_names(source, names)}")
 
 
-def _element(field: str, known: Sequence[str]) -> bool:
-    """Whether `field` is an element of a list whose first is known: a longer one than the sample's."""
-    return re.sub(r"\[\d+\]", "[0]", field) in known
+def _element(field: str, fields: Sequence[str]) -> bool:
+    """Whether `field` is an element of a list whose first element is among the fields; the list may be longer
+    than in the sample."""
+    return re.sub(r"\[\d+\]", "[0]", field) in fields
 
 
 # ---- reading
@@ -133,17 +136,17 @@ def _element(field: str, known: Sequence[str]) -> bool:
 def mcap_columns(
     path: Path, sources: Sequence[str], time: str
 ) -> tuple[list[Columns], dict[str, tuple[str, str]], dict[str, int], list[Note]]:
-    """The columns of each topic that `sources` need, {source: (topic,
-    field)}, messages of each topic, and notes.
+    """The columns of each topic that `sources` need, {source: (topic, field)}, {topic: count of its
+    messages}, and notes.
 
     The clock is log_time, or publish_time, or a field of each topic such as header.stamp. Raises ValueError
-    for what is not there and for what has no whole chunk.
+    for a source that is not there, and for a topic without a whole chunk.
     """
-    places, found = _places(path, sources)
+    places, by_name = _places(path, sources)
     wanted = {}
     for topic in dict.fromkeys(topic for topic, _ in places.values()):
         names = list(dict.fromkeys(field for at, field in places.values() if at == topic))
-        wanted[topic] = _Wanted(topic, names, _clock(path, found[topic], time))
+        wanted[topic] = _Wanted(topic, names, _clock(path, by_name[topic], time))
     file = McapFile(path)
     parts: dict[int, Growing] = {}
     decoders: dict[int, Decode] = {}
@@ -170,34 +173,43 @@ def mcap_columns(
     for number, count in file.counts.items():
         topic = file.channels[number].topic if number in file.channels else f"channel {number}"
         counts[topic] = counts.get(topic, 0) + count
-    notes = file.notes()
-    for topic, count in bad.items():
-        if count:
-            notes.append(
-                Note(
-                    "unreadable",
-                    "",
-                    count,
-                    f"{count} messages of {topic} are not what its schema says and were left out",
-                )
-            )
-    for topic, count in backwards.items():
-        if count > OUT_OF_ORDER * counts[topic]:
-            message = f"the publish times of {topic} run back {count} times in {counts[topic]} messages: two devices with clocks of their own"
-            notes.append(
-                Note(
-                    "mixed", "", count, f"{message} seem to publish it; record each under a topic of its own"
-                )
-            )
+    notes = file.notes() + _unreadable_notes(bad) + _order_notes(backwards, counts)
     columns = [_join(path, need, file, parts, notes, bad) for need in wanted.values()]
     return columns, places, counts, notes
 
 
+def _unreadable_notes(bad: dict[str, int]) -> list[Note]:
+    return [
+        Note(
+            "unreadable",
+            "",
+            count,
+            f"{count} messages of {topic} are not what its schema says and were left out",
+        )
+        for topic, count in bad.items()
+        if count
+    ]
+
+
+def _order_notes(backwards: dict[str, int], counts: dict[str, int]) -> list[Note]:
+    """A note for each topic whose publish times run back too often to be a network's doing."""
+    notes = []
+    for topic, count in backwards.items():
+        if count > OUT_OF_ORDER * counts[topic]:
+            message = (
+                f"the publish times of {topic} run back {count} times in {counts[topic]} messages: "
+                "two devices with clocks of their own seem to publish it; "
+                "record each under a topic of its own"
+            )
+            notes.append(Note("mixed", "", count, message))
+    return notes
+
+
 def _places(path: Path, sources: Sequence[str]) -> tuple[dict[str, tuple[str, str]], dict[str, Topic]]:
-    """{source: (topic, field)}, and the topics."""
-    found = topics(path)
-    if not any(topic.fields for topic in found.values()):
-        reasons = [f"{topic.name}: {topic.unreadable}" for topic in found.values() if topic.unreadable]
+    """{source: (topic, field)}, and {name: topic}."""
+    by_name = topics(path)
+    if not any(topic.fields for topic in by_name.values()):
+        reasons = [f"{topic.name}: {topic.unreadable}" for topic in by_name.values() if topic.unreadable]
         file = McapFile(path)
         for _ in file.batches(lambda channel: False):
             pass
@@ -208,11 +220,11 @@ def _places(path: Path, sources: Sequence[str]) -> tuple[dict[str, tuple[str, st
             "or copy the recording again"
         )
     try:
-        return {source: resolve(path, source, found) for source in sources}, found
+        return {source: resolve(path, source, by_name) for source in sources}, by_name
     except ValueError:
         # a key that JSON messages get later than the first ones
-        found = topics(path, None)
-        return {source: resolve(path, source, found) for source in sources}, found
+        by_name = topics(path, None)
+        return {source: resolve(path, source, by_name) for source in sources}, by_name
 
 
 def _clock(path: Path, topic: Topic, time: str) -> list[str]:
@@ -225,14 +237,14 @@ def _clock(path: Path, topic: Topic, time: str) -> list[str]:
         names = [f"{time}.{part}" for part in parts]
         if all(name in topic.fields for name in names):
             return names
-    known = [
+    stamps = [
         name.rpartition(".")[0]
         for name in topic.fields
         if name.endswith(tuple(f".{part}" for part, _ in _STAMPS))
     ]
     raise ValueError(
         f"{path}: topic {topic.name} has no time {time!r}; "
-        f"{nearest_names(time, ['log_time', 'publish_time', *known])}"
+        f"{nearest_names(time, ['log_time', 'publish_time', *stamps])}"
     )
 
 
@@ -248,13 +260,13 @@ def _decoder(path: Path, channel: Channel, names: Sequence[str]) -> Decode:
 def _numbers(
     path: Path, channel: Channel, decode: Decode, messages: Messages, need: _Wanted, time: str
 ) -> tuple[np.ndarray, np.ndarray, int]:
-    """Times (n,), values (n, fields), and how many messages were no messages."""
-    data, kept = messages.data, None
+    """Times (n,), values (n, fields), and the count of messages that do not fit their schema."""
+    data, sound = messages.data, None
     try:
         data = [plain(message) for message in data] if any(map(compressed, data)) else data
         values = decode(data)
     except UnreadableMessage:
-        values, kept = _one_by_one(decode, messages.data, len(need.fields) + len(need.clock))
+        values, sound = _one_by_one(decode, messages.data, len(need.fields) + len(need.clock))
     except ValueError as error:
         place = f"one of its messages from {min(messages.log_time)} to {max(messages.log_time)} ns"
         raise ValueError(f"{path}: topic {channel.topic}, {place}: {error}") from None
@@ -270,19 +282,19 @@ def _numbers(
         times = np.array(
             messages.publish_time if time == "publish_time" else messages.log_time, np.uint64
         ).astype(np.int64)
-        times = times if kept is None else times[kept]
-    return times, values[:, : len(need.fields)], 0 if kept is None else len(messages.data) - len(kept)
+        times = times if sound is None else times[sound]
+    return times, values[:, : len(need.fields)], 0 if sound is None else len(messages.data) - len(sound)
 
 
 def _one_by_one(decode: Decode, data: Sequence[bytes], width: int) -> tuple[np.ndarray, list[int]]:
-    rows, kept = [np.empty((0, width))], []
+    rows, sound = [np.empty((0, width))], []
     for i, message in enumerate(data):
         try:
             rows.append(decode([plain(message)]))
-            kept.append(i)
+            sound.append(i)
         except UnreadableMessage:
             continue
-    return np.concatenate(rows), kept
+    return np.concatenate(rows), sound
 
 
 def _join(
@@ -293,8 +305,8 @@ def _join(
     notes: list[Note],
     bad: dict[str, int],
 ) -> Columns:
-    """The topic's channels one behind the other; two that run at the
-    same time are two devices under one name."""
+    """The topic's channels one behind the other. Two channels at the same time are two devices under one
+    name, and refused."""
     pieces = []
     for number in [number for number in parts if file.channels[number].topic == need.topic]:
         time, *values = parts.pop(number).finished()
@@ -306,18 +318,16 @@ def _join(
             if bad.get(need.topic)
             else "it has no whole message"
         )
-        said = "; ".join(note.message for note in notes[:2])
+        damage = "; ".join(note.message for note in notes[:2])
         raise ValueError(
             f"{path}: nothing of topic {need.topic} could be read because "
-            f"{why}{f' ({said})' if said else ''}; copy the recording again"
+            f"{why}{f' ({damage})' if damage else ''}; copy the recording again"
         )
     for before, after in itertools.pairwise(pieces):
         if after[1].min() <= before[1].max():
             raise ValueError(
                 f"{path}: topic {need.topic} comes from channels {before[0]} and {after[0]} at the "
-                "same time, as if two"
-                f" devices had one name; record each"
-                " under a topic of its own"
+                "same time, as if two devices had one name; record each under a topic of its own"
             )
     if len(pieces) > 1:
         notes.append(
@@ -330,7 +340,7 @@ def _join(
             )
         )
         time = np.concatenate([piece[1] for piece in pieces])
-        values = [np.concatenate(found) for found in zip(*(piece[2] for piece in pieces), strict=True)]
+        values = [np.concatenate(arrays) for arrays in zip(*(piece[2] for piece in pieces), strict=True)]
     else:
         _, time, values = pieces[0]
     return Columns(need.topic, time, dict(zip(need.fields, values, strict=True)), _place(need.topic))

@@ -1,8 +1,7 @@
-"""Walks an MCAP file: chunks and their CRCs; what is whole comes out a chunk at a time, what is damaged is
-left out, counted and named by its offset.
+"""A walk through an MCAP file, chunk by chunk, with its CRCs.
 
-The mcap package's reader takes 7 us a message and stops at the first damage;
-here it is 3 us, and the next chunk is looked for.
+Whole chunks are read; damaged ones are left out, counted and named by their offset. (The mcap package's
+reader takes 7 us a message and stops at the first damage; this one takes 3 us and goes on at the next chunk.)
 """
 
 import struct
@@ -41,8 +40,8 @@ GROUP_BYTES = 1 << 20
 
 
 class Messages(NamedTuple):
-    """Messages of one channel in the order of the file: times in ns, and the bytes
-    of each (none where the channel is not wanted)."""
+    """Messages of one channel in the order of the file: times in ns, and the bytes of each (none for a
+    channel that is not wanted)."""
 
     log_time: list[int]
     publish_time: list[int]
@@ -56,8 +55,8 @@ class _Damage(NamedTuple):
 
 
 class McapFile:
-    """Walks a file once; remembers schemas, channels, counts and damage on the
-    way. Raises ValueError where the file is no MCAP."""
+    """Walks a file once and remembers schemas, channels, counts and damage. Raises ValueError for a file that
+    is no MCAP."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -93,12 +92,12 @@ class McapFile:
             return
         stream.seek(start)
         summary = stream.read(end - start)
-        found = zlib.crc32(summary + tail[: FOOTER_RECORD.size - 4])
-        if crc and found != crc:
+        actual = zlib.crc32(summary + tail[: FOOTER_RECORD.size - 4])
+        if crc and actual != crc:
             self._remark(
                 "damage",
                 1,
-                f"the summary at byte {start} has CRC 0x{found:08x} instead of 0x{crc:08x} and was not used",
+                f"the summary at byte {start} has CRC 0x{actual:08x} instead of 0x{crc:08x} and was not used",
             )
             return
         try:
@@ -134,8 +133,8 @@ class McapFile:
     # ---- the data
 
     def batches(self, wanted: Callable[[Channel], bool]) -> Iterator[dict[int, Messages]]:
-        """{channel: Messages} of each chunk, or of a megabyte of messages
-        outside chunks; only wanted channels come with data."""
+        """{channel: Messages} of each chunk, or of a megabyte of messages outside chunks. Only wanted
+        channels come with data."""
         with self.path.open("rb", buffering=1 << 16) as stream:
             stream.seek(8)
             crc, group, grouped = zlib.crc32(MAGIC), {}, 0
@@ -162,7 +161,7 @@ class McapFile:
                 yield self._counted(group)
 
     def _framed(self, stream: BinaryIO) -> Iterator[tuple[int, int, bytes, bytes]]:
-        """(opcode, offset, head, body) of the records; behind damage it goes on at the next chunk."""
+        """(opcode, offset, head, body) of the records. Behind damage it goes on at the next chunk."""
         offset = 8
         while offset < self.size:
             head = stream.read(9)
@@ -197,8 +196,8 @@ class McapFile:
         return ""
 
     def _unsound_body(self, opcode: int, record: bytes) -> str:
-        """Whether the lengths inside agree with the record's own; where
-        they do not, the next record is not where it seems."""
+        """The reason why the lengths inside do not agree with the record's own, "" if they do. If they do
+        not, the next record is not where it seems."""
         try:
             if opcode == CHUNK:
                 start = CHUNK_HEAD.size + CHUNK_HEAD.unpack_from(record)[4]
@@ -244,9 +243,11 @@ class McapFile:
             content, begin = (decompress(method, record[begin:], size), 0) if method else (record, begin)
             if len(content) - begin != size:
                 raise UnreadableMessage(f"it should hold {size} bytes but holds {len(content) - begin}")
-            found = zlib.crc32(memoryview(content)[begin:]) if crc else 0
-            if found != crc:
-                raise UnreadableMessage(f"the CRC of its contents should be 0x{crc:08x} but is 0x{found:08x}")
+            actual = zlib.crc32(memoryview(content)[begin:]) if crc else 0
+            if actual != crc:
+                raise UnreadableMessage(
+                    f"the CRC of its contents should be 0x{crc:08x} but is 0x{actual:08x}"
+                )
             batch: dict[int, Messages] = {}
             self._split(content, begin, wanted, batch)
         except (UnreadableMessage, struct.error, UnicodeDecodeError) as error:
@@ -260,25 +261,21 @@ class McapFile:
             time for messages in batch.values() for time in (min(messages.log_time), max(messages.log_time))
         ]
         if times and (min(times), max(times)) != (first, last):
-            message = f"the chunk at byte {offset} says {first} to {last} ns but has messages from {min(times)} to {max(times)} ns; its contents"
-            self._remark(
-                "damage", 1, f"{message} {'agree with their CRC and' if crc else 'have no CRC and'} were kept"
+            checked = "agree with their CRC and" if crc else "have no CRC and"
+            message = (
+                f"the chunk at byte {offset} says {first} to {last} ns but has messages from {min(times)} to "
+                f"{max(times)} ns; its contents {checked} were kept"
             )
+            self._remark("damage", 1, message)
         return batch
 
     def _split(
         self, data: bytes, begin: int, wanted: Callable[[Channel], bool], batch: dict[int, Messages]
     ) -> None:
-        """Sorts the records in data[begin:] by channel into `batch`;
-        raises UnreadableMessage where one runs over the end."""
-        pos, end, unpack, current, messages, kept = (
-            begin,
-            len(data),
-            MESSAGE_HEAD.unpack_from,
-            -1,
-            None,
-            False,
-        )
+        """Sorts the records in data[begin:] by channel into `batch`. Raises UnreadableMessage for a record
+        that runs over the end."""
+        pos, end, unpack = begin, len(data), MESSAGE_HEAD.unpack_from
+        current, messages, has_data = -1, None, False
         while pos < end:
             if data[pos] != MESSAGE:
                 opcode, length = RECORD_HEAD.unpack_from(data, pos)
@@ -290,9 +287,9 @@ class McapFile:
                 if number != current:
                     current, channel = number, self.channels.get(number)
                     messages = batch.setdefault(number, Messages([], [], []))
-                    kept = channel is not None and wanted(channel)
+                    has_data = channel is not None and wanted(channel)
                 messages.log_time.append(log_time)
-                if kept:
+                if has_data:
                     messages.publish_time.append(publish_time)
                     messages.data.append(data[pos + 31 : following])
             if following > end or (data[pos] == MESSAGE and length < 22):
@@ -307,28 +304,27 @@ class McapFile:
             self.undeclared += len(messages.log_time) * (number not in self.channels)
         return batch
 
-    def _check_data_crc(self, expected: int, found: int) -> None:
-        self.verified = bool(expected) and expected == found
-        if not expected or expected == found or self.damage:
+    def _check_data_crc(self, expected: int, actual: int) -> None:
+        self.verified = bool(expected) and expected == actual
+        if not expected or expected == actual or self.damage:
             return
         if self.unchunked or self.unchecked:
             raise ValueError(
                 f"{self.path}: the data section's CRC should be 0x{expected:08x} but is "
-                f"0x{found:08x}, and its messages"
-                f" have no CRC of their own that would"
-                " tell which are damaged; copy the recording again from the machine"
+                f"0x{actual:08x}, and its messages have no CRC of their own that would tell which are "
+                "damaged; copy the recording again from the machine"
             )
         self._remark(
             "damage",
             1,
-            f"the data section's CRC is 0x{found:08x} instead of 0x{expected:08x}; all chunks are whole, "
+            f"the data section's CRC is 0x{actual:08x} instead of 0x{expected:08x}; all chunks are whole, "
             "so it is beside them",
         )
 
-    # ---- what to say
+    # ---- notes
 
     def notes(self) -> list[Note]:
-        """Damage and its extent; to be asked when the batches have been walked."""
+        """Damage and its extent. It is complete when the batches have been walked."""
         notes = []
         for damage in self.damage:
             lost = f"{damage.lost[0]} messages" if damage.lost[0] else "messages, how many is not known,"

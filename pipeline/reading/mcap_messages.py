@@ -1,5 +1,5 @@
-"""Numbers out of the messages of an MCAP channel, whatever they are written in: ROS 2 CDR, ROS 1, protobuf,
-JSON; a message may be compressed by itself."""
+"""Numbers of the messages of an MCAP channel in ROS 2 CDR, ROS 1, protobuf or JSON. A message may be
+compressed by itself."""
 
 import json
 import operator
@@ -24,7 +24,7 @@ Decode = Callable[[list[bytes]], np.ndarray]
 
 
 class Channel(NamedTuple):
-    """A channel of the file with its schema; `metadata` is what the writer put beside it."""
+    """A channel of the file with its schema and the writer's metadata."""
 
     id: int
     topic: str
@@ -36,9 +36,9 @@ class Channel(NamedTuple):
 
 
 def fields(channel: Channel, samples: Sequence[bytes]) -> list[str]:
-    """Paths of the numbers in the channel's messages, after its schema and a few messages of it.
+    """Paths of the numbers in the channel's messages, by its schema and a few of its messages.
 
-    Raises ValueError where they cannot be read, and why.
+    Raises ValueError with the reason for messages that cannot be read.
     """
     kind = _kind(channel)
     samples = [plain(sample) for sample in samples]
@@ -57,10 +57,10 @@ def fields(channel: Channel, samples: Sequence[bytes]) -> list[str]:
 
 
 def decoder(channel: Channel, names: Sequence[str]) -> Decode:
-    """A function from n messages to their numbers (n, len(names)), NaN where a message has none.
+    """A function from n messages to their numbers (n, len(names)), NaN for a number that a message lacks.
 
-    It raises UnreadableMessage for a message that is not what the channel
-    says, and ValueError for text where a number is wanted.
+    It raises UnreadableMessage for a message that does not fit its channel, and ValueError for text in place
+    of a wanted number.
     """
     kind = _kind(channel)
     if kind == "json":
@@ -100,33 +100,33 @@ def compressed(message: bytes) -> bool:
 
 
 def plain(message: bytes) -> bytes:
-    """The message, decompressed where it is compressed."""
+    """The message, decompressed if it is compressed."""
     if not compressed(message):
         return message
     return decompress("zstd" if message[:4] == _ZSTD else "lz4", message, None)
 
 
 def decompress(method: str, data: bytes, size: int | None) -> bytes:
-    """The bytes of a zstd or lz4 frame, `size` of them if that is
-    known. Raises UnreadableMessage where they are damaged.
+    """The bytes of a zstd or lz4 frame; `size` is their count, or None. Raises UnreadableMessage for a
+    damaged frame.
 
-    What the frame itself says of its size is compared first: after one flipped bit it may ask for terabytes.
+    The size that the frame declares is checked first: after one flipped bit it may ask for terabytes.
     """
     room = LARGEST_MESSAGE if size is None else size
     try:
         if method == "zstd":
-            said = zstandard.frame_content_size(data)
-            _check_size(said if said >= 0 else None, size)
+            declared = zstandard.frame_content_size(data)
+            _check_size(declared if declared >= 0 else None, size)
             unpacker = zstandard.ZstdDecompressor()
-            if said >= 0:
-                found = unpacker.decompress(data)
+            if declared >= 0:
+                unpacked = unpacker.decompress(data)
             else:
                 with unpacker.stream_reader(data) as reader:
-                    found = reader.read(room + 1)
+                    unpacked = reader.read(room + 1)
         elif method == "lz4":
-            said = lz4.frame.get_frame_info(data)["content_size"]
-            _check_size(said or None, size)
-            found = lz4.frame.LZ4FrameDecompressor().decompress(data, room + 1)
+            declared = lz4.frame.get_frame_info(data)["content_size"]
+            _check_size(declared or None, size)
+            unpacked = lz4.frame.LZ4FrameDecompressor().decompress(data, room + 1)
         else:
             raise UnreadableMessage(f"the compression {method!r} is not known; zstd and lz4 are")
     except (zstandard.ZstdError, RuntimeError, EOFError, MemoryError, OverflowError) as error:
@@ -134,15 +134,15 @@ def decompress(method: str, data: bytes, size: int | None) -> bytes:
             f"{method} data that cannot be unpacked "
             f"({str(error).splitlines()[0] if str(error) else 'too large'})"
         ) from None
-    if size is not None and len(found) != size:
-        raise UnreadableMessage(f"{method} data that unpack to {len(found)} bytes, not {size}")
-    return found
+    if size is not None and len(unpacked) != size:
+        raise UnreadableMessage(f"{method} data that unpack to {len(unpacked)} bytes, not {size}")
+    return unpacked
 
 
-def _check_size(said: int | None, size: int | None) -> None:
-    if said is not None and (said > LARGEST_MESSAGE if size is None else said != size):
+def _check_size(declared: int | None, size: int | None) -> None:
+    if declared is not None and (declared > LARGEST_MESSAGE if size is None else declared != size):
         raise UnreadableMessage(
-            f"data that say they unpack to {said} bytes{'' if size is None else f', not {size}'}"
+            f"data that say they unpack to {declared} bytes{'' if size is None else f', not {size}'}"
         )
 
 
@@ -161,7 +161,7 @@ def _document(message: bytes):
 
 
 def _schema_fields(channel: Channel) -> list[str]:
-    """Numbers that a JSON schema promises."""
+    """Paths of the numbers that a JSON schema promises."""
     if channel.schema_encoding != "jsonschema" or not channel.schema:
         return []
     try:
@@ -187,7 +187,7 @@ def _promised(schema, prefix: str, depth: int) -> list[str]:
 
 
 def _numbers(value, prefix: str = "", depth: int = 0) -> list[str]:
-    """Paths of the numbers in a value; null counts, for another message may have a number there."""
+    """Paths of the numbers in a value. Null counts, as another message may have a number there."""
     if isinstance(value, int | float) or (value is None and prefix):
         return [prefix]
     names = []
@@ -213,7 +213,7 @@ def _json_decoder(names: Sequence[str]) -> Decode:
             )
         except (KeyError, TypeError, IndexError, ValueError):
             numbers = None
-        # other kinds are text, null, or a mixture; they are looked at one by one
+        # other kinds are text, null, or a mixture; they are read one by one
         if numbers is None or numbers.dtype.kind not in "fiub":
             numbers = np.array(
                 [
@@ -247,14 +247,15 @@ def _value(document, name: str, steps: tuple) -> float:
 
 
 def _by_prefix(document, name: str):
-    """The value where a key itself holds dots, such as {"heater.1": 30}; None where there is none."""
+    """The value of a path whose keys hold dots themselves, such as {"heater.1": 30}; None if there is
+    none."""
     if not isinstance(document, dict):
         return None
     if name in document:
         return document[name]
     for i, letter in enumerate(name):
         if letter == "." and name[:i] in document:
-            found = _by_prefix(document[name[:i]], name[i + 1 :])
-            if found is not None:
-                return found
+            value = _by_prefix(document[name[:i]], name[i + 1 :])
+            if value is not None:
+                return value
     return None

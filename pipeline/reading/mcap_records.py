@@ -31,8 +31,8 @@ _CHUNK_START = re.compile(
 
 
 def check_magic(path: Path, start: bytes) -> None:
-    """Raises ValueError where the first 8 bytes are not MCAP's, saying
-    so where text-mode copying converted them."""
+    """Raises ValueError if the first 8 bytes are not MCAP's. The message names a conversion by text-mode
+    copying."""
     if start[:8] == MAGIC:
         return
     converted = {
@@ -45,9 +45,8 @@ def check_magic(path: Path, start: bytes) -> None:
         if start.startswith(damaged):
             raise ValueError(
                 f"{path}: the bytes at offset 0 should be {MAGIC.hex(' ')} but are "
-                f"{start[:8].hex(' ')}: line ends were"
-                f" converted ({how}), which destroys the"
-                " whole file; copy it again as binary (*.mcap binary in .gitattributes)"
+                f"{start[:8].hex(' ')}: line ends were converted ({how}), which destroys the whole file; "
+                "copy it again as binary (*.mcap binary in .gitattributes)"
             )
     raise ValueError(
         f"{path}: the bytes at offset 0 should be MCAP's {MAGIC.hex(' ')} but are {start[:8].hex(' ')}; "
@@ -56,27 +55,27 @@ def check_magic(path: Path, start: bytes) -> None:
 
 
 def next_chunk(stream: BinaryIO, offset: int) -> int | None:
-    """Offset of the next whole chunk from `offset` on, by its own agreement of lengths."""
+    """Offset of the next chunk from `offset` on whose lengths agree, None if there is none."""
     size = stream.seek(0, 2)
     if offset >= size:
         return None
     with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content:
         pos = offset
-        while found := _CHUNK_START.search(content, pos):
+        while start := _CHUNK_START.search(content, pos):
             length, method, held = (
-                struct.unpack("<Q", found[1])[0],
-                len(found[2]),
-                struct.unpack("<Q", found[3])[0],
+                struct.unpack("<Q", start[1])[0],
+                len(start[2]),
+                struct.unpack("<Q", start[3])[0],
             )
-            if length == 28 + method + 8 + held and found.start() + 9 + length <= size:
-                return found.start()
-            pos = found.start() + 1
+            if length == 28 + method + 8 + held and start.start() + 9 + length <= size:
+                return start.start()
+            pos = start.start() + 1
     return None
 
 
 def records(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """(opcode, body) of records one behind the other. Raises
-    UnreadableMessage where one runs over the end."""
+    """(opcode, body) of records one behind the other. Raises UnreadableMessage for a record that runs over
+    the end."""
     pos = 0
     while pos < len(data):
         opcode, length = RECORD_HEAD.unpack_from(data, pos)
@@ -87,7 +86,7 @@ def records(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def prefixed(data: bytes, pos: int) -> tuple[bytes, int]:
-    """The bytes at `pos` behind their length (uint32), and where they end."""
+    """The bytes at `pos` behind their length (uint32), and the position of their end."""
     length = struct.unpack_from("<I", data, pos)[0]
     if pos + 4 + length > len(data):
         raise UnreadableMessage("text that does not fit")
@@ -95,7 +94,7 @@ def prefixed(data: bytes, pos: int) -> tuple[bytes, int]:
 
 
 def string(data: bytes, pos: int) -> tuple[str, int]:
-    """The text at `pos` behind its length, and where it ends."""
+    """The text at `pos` behind its length, and the position of its end."""
     text, pos = prefixed(data, pos)
     return text.decode(), pos
 

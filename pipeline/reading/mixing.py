@@ -1,29 +1,28 @@
-"""Two devices that write under one name: samples that jump to and fro
-between two courses, and intervals that alternate."""
+"""Two devices that write under one name: samples jump to and fro between two courses, and intervals
+alternate."""
 
 import numpy as np
 
-# windows of so many samples, half overlapping: the short ones for devices that write in
-# turn, the long ones for those that write in batches
+# windows of so many samples, half overlapping: short ones for devices that write in turn, long ones for
+# devices that write in batches
 WINDOWS = (32, 128)
 LEAST_SHARE, LEAST_CROSSINGS, LEAST_WINDOWS = 1 / 8, 4, 3
-# between the two courses nothing lies: a gap three times any other, and three steps of
-# a coarse sensor, of which none is coarser than 2
+# between the two courses lies nothing: a gap three times any other, and three steps of a coarse sensor, of
+# which none is coarser than 2
 GAP, COARSEST_STEP = 3.0, 2.0
 WINDOWS_AT_ONCE = 1000
 
 
 def mixed(values: np.ndarray) -> list[tuple[int, int, float]]:
-    """(first, last, distance) of the stretches of values (n,) in which the
-    samples belong to two courses at once, `distance` apart.
+    """(first, last, distance) of the stretches of values (n,) whose samples belong to two courses at once,
+    `distance` apart.
 
-    In each window the best parabola is taken off and the rest sorted: it falls into two groups with a gap
-    between, and the samples change group again and again, as a step (once) or a spike (twice) does not.
+    In each window the best parabola is taken off and the rest sorted. Two courses make two groups with a gap
+    between, and the samples change group again and again. (A step changes it once, a spike twice.)
     """
-    known = np.flatnonzero(np.isfinite(values))
-    y = values[known]
-    # over one sample and over more: of two devices that write in turn
-    # every change from sample to sample is a jump
+    finite = np.flatnonzero(np.isfinite(values))
+    y = values[finite]
+    # over one sample and over more: with two devices in turn every change from sample to sample is a jump
     step = min(COARSEST_STEP, *(_least_change(y, lag) for lag in (1, 2, 3)))
     suspect, distance = np.zeros(len(y), bool), np.zeros(len(y), np.float32)
     for size in WINDOWS:
@@ -42,21 +41,20 @@ def mixed(values: np.ndarray) -> list[tuple[int, int, float]]:
             distance[start : start + size] = width
     edges = np.flatnonzero(np.diff(np.r_[False, suspect, False].astype(np.int8)))
     return [
-        (int(known[a]), int(known[b - 1]), float(np.median(distance[a:b])))
+        (int(finite[a]), int(finite[b - 1]), float(np.median(distance[a:b])))
         for a, b in zip(edges[::2], edges[1::2], strict=True)
     ]
 
 
 def _least_change(y: np.ndarray, lag: int) -> float:
-    """The hundredth part of the changes is no larger: one step of a
-    coarse sensor, next to nothing of a fine one."""
+    """The first percentile of the changes: one step of a coarse sensor, next to nothing of a fine one."""
     changes = np.abs(y[lag:] - y[:-lag])
     changes = changes[changes > 0]
     return float(np.percentile(changes, 1)) if len(changes) else np.inf
 
 
 def _gaps(y: np.ndarray, starts: np.ndarray, size: int, step: float) -> np.ndarray:
-    """The gap between the two courses in each window, 0 where there are not two."""
+    """The gap between the two courses in each window, 0 for a window without two."""
     windows = np.lib.stride_tricks.sliding_window_view(y, size)[starts]
     parabola = np.linalg.qr(np.vander(np.linspace(-1, 1, size), 3))[0]
     rest = windows - windows @ parabola @ parabola.T
@@ -73,16 +71,17 @@ def _gaps(y: np.ndarray, starts: np.ndarray, size: int, step: float) -> np.ndarr
 
 
 def _in_a_row(hit: np.ndarray, least: int) -> np.ndarray:
-    """Those of `hit` that belong to at least so many in a row."""
+    """Mask (n,) of the hits that stand in a row of at least `least`."""
     edges = np.flatnonzero(np.diff(np.r_[False, hit, False].astype(int)))
-    kept = np.zeros(len(hit), bool)
+    long_enough = np.zeros(len(hit), bool)
     for a, b in zip(edges[::2], edges[1::2], strict=True):
-        kept[a:b] = b - a >= least
-    return kept
+        long_enough[a:b] = b - a >= least
+    return long_enough
 
 
 def alternate(intervals_s: np.ndarray) -> bool:
-    """Whether a long interval follows each short one: two clocks of one rate, one behind the other."""
+    """Whether a long interval follows each short one, as with two clocks of one rate, one behind the
+    other."""
     if len(intervals_s) < 20:
         return False
     deviation = intervals_s - intervals_s.mean()

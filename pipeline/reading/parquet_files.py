@@ -1,4 +1,4 @@
-"""Parquet from other people's programs, read a part at a time."""
+"""Parquet files of other people's programs, read a part at a time."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -55,7 +55,7 @@ def _is_numeric(kind: pa.DataType) -> bool:
 
 
 def parquet_columns(path: Path) -> list[Column]:
-    """The columns of a Parquet file; of a structure its parts as "a.b"."""
+    """The columns of a Parquet file. The parts of a structure are "a.b"."""
     columns = []
     for name, field in _leaves(_parquet(path).schema_arrow, ""):
         kind = (
@@ -78,8 +78,8 @@ def _leaves(fields: pa.Schema | pa.StructType, prefix: str) -> Iterator[tuple[st
 
 
 def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns, list[Note]]:
-    """The wanted columns, NaN where a value is null. Raises ValueError for a missing
-    column, one that is no number, or a damaged file."""
+    """The wanted columns, NaN for null. Raises ValueError for a column that is missing or holds no numbers,
+    and for a damaged file."""
     file, columns = _parquet(path), parquet_columns(path)
     names = [column.name for column in columns]
     interval = every(time)
@@ -124,17 +124,17 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns,
     )
     zone = "UTC" if zoned or not clock or kinds[clock] is float else ""
     if interval:
-        clock_values, said = np.arange(parts.count) * interval, ""
+        clock_values, remark = np.arange(parts.count) * interval, ""
     else:
-        clock_values, said = (
+        clock_values, remark = (
             (values[clock], "") if kinds[clock] is np.int64 else seconds(clock, values[clock])
         )
-    if said:
-        notes.append(Note("clock", "", 1, said))
-    found, turned = forward(
+    if remark:
+        notes.append(Note("clock", "", 1, remark))
+    table_columns, turned = forward(
         Columns("rows", clock_values, {name: values[name] for name in wanted}, lambda i: f"row {i}", zone)
     )
-    return found, notes + turned
+    return table_columns, notes + turned
 
 
 def _array(path: Path, name: str, column: pa.ChunkedArray, clock: str) -> np.ndarray:
@@ -152,8 +152,8 @@ def _array(path: Path, name: str, column: pa.ChunkedArray, clock: str) -> np.nda
 
 
 def _numbers(column: pa.ChunkedArray, kind: type) -> np.ndarray:
-    """The values of a column, NaN for null; to_numpy and fill_null would
-    do it too, but load pandas, which takes longer."""
+    """The values of a column, NaN for null. (to_numpy and fill_null would load pandas, which takes
+    longer.)"""
     parts = [np.empty(0, kind)]
     for chunk in column.chunks:
         valid, content = chunk.buffers()

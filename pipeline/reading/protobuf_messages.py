@@ -1,8 +1,8 @@
-"""Numbers out of protobuf messages: the FileDescriptorSet of the schema says where the fields are, and the
-wire is walked for those that are wanted.
+"""Numbers of protobuf messages. The FileDescriptorSet of the schema gives the fields, and the wire is walked
+for the wanted ones.
 
-Wire format: protobuf.dev/programming-guides/encoding; numbers of the
-descriptor's fields: google/protobuf/descriptor.proto.
+Wire format: protobuf.dev/programming-guides/encoding. Numbers of the descriptor's fields:
+google/protobuf/descriptor.proto.
 """
 
 import re
@@ -28,8 +28,8 @@ _DEEPEST = 6
 
 
 class Field(NamedTuple):
-    """A field of a message type. Without `presence` (proto3's plain numbers) a field that is
-    not on the wire is 0; with it, it has no value."""
+    """A field of a message type. A field that is not on the wire has no value with `presence`, and is 0
+    without (proto3's plain numbers)."""
 
     name: str
     type: int
@@ -39,8 +39,8 @@ class Field(NamedTuple):
 
 
 class _Node(NamedTuple):
-    """What is wanted of one field: places of its numbers and plans of its
-    messages by index; `length` is the place of the count."""
+    """The wanted part of one field: places of its numbers and plans of its messages by index. `length` is the
+    place of the count."""
 
     field: Field
     places: dict[int, int]
@@ -49,8 +49,8 @@ class _Node(NamedTuple):
 
 
 def message_types(descriptor_set: bytes) -> dict[str, dict[int, Field]]:
-    """{full name of the message: {field number: Field}} of a serialised
-    FileDescriptorSet. Raises ValueError where it is none."""
+    """{full name of the message: {field number: Field}} of a serialised FileDescriptorSet. Raises ValueError
+    for other bytes."""
     types: dict[str, dict[int, Field]] = {}
     try:
         for file in _parts(descriptor_set).get(1, []):
@@ -105,8 +105,8 @@ def _varint(data: bytes, pos: int) -> tuple[int, int]:
 
 
 def _wire(data: bytes):
-    """(field number, wire type, value) in the order of the wire; the
-    value is an int for a varint, else the bytes."""
+    """(field number, wire type, value) in the order of the wire. The value is an int for a varint, else the
+    bytes."""
     pos, end = 0, len(data)
     while pos < end:
         key, pos = _varint(data, pos)
@@ -155,8 +155,9 @@ def _packed(kind: int, data: bytes) -> list[float]:
 
 
 def fields(types: dict[str, dict[int, Field]], name: str, sample: bytes | None) -> list[str]:
-    """Paths of the numbers; of a repeated field those that the message `sample` has, up to LONGEST_LISTED."""
-    names, repeated = _plain_fields(types, _known(types, name), "", 0)
+    """Paths of the numbers. Of a repeated field they are those of the message `sample`, up to
+    LONGEST_LISTED."""
+    names, repeated = _plain_fields(types, _defined(types, name), "", 0)
     if sample is not None and repeated:
         try:
             lengths = decoder(types, name, [f"{path}[#]" for path, _ in repeated])([sample])[0]
@@ -171,7 +172,7 @@ def fields(types: dict[str, dict[int, Field]], name: str, sample: bytes | None) 
     return names
 
 
-def _known(types: dict, name: str) -> str:
+def _defined(types: dict, name: str) -> str:
     if name not in types:
         raise ValueError(
             f"the schema does not define its own message {name}; it defines {', '.join(sorted(types)[:5])}"
@@ -206,11 +207,11 @@ def _plain_fields(
 def decoder(
     types: dict[str, dict[int, Field]], name: str, names: Sequence[str]
 ) -> Callable[[list[bytes]], np.ndarray]:
-    """A function from n messages to their numbers (n, len(names)), NaN where a field with presence is absent.
+    """A function from n messages to their numbers (n, len(names)), NaN for an absent field with presence.
 
     It raises UnreadableMessage.
     """
-    plan = _plan(types, _known(types, name), {path: place for place, path in enumerate(names)})
+    plan = _plan(types, _defined(types, name), {path: place for place, path in enumerate(names)})
     count = len(names)
 
     def decode(messages: list[bytes]) -> np.ndarray:
@@ -230,20 +231,20 @@ def _plan(types: dict, name: str, wanted: dict[str, int]) -> dict[int, _Node]:
     plan: dict[int, _Node] = {}
     below: dict[tuple[int, int], dict[str, int]] = {}
     for path, place in wanted.items():
-        found = re.match(r"(\w+)(?:\[(\d+|#)\])?(?:\.(.+))?$", path)
-        if not found or found[1] not in numbers:
+        match = re.match(r"(\w+)(?:\[(\d+|#)\])?(?:\.(.+))?$", path)
+        if not match or match[1] not in numbers:
             raise ValueError(f"no numeric field {path}")
-        number = numbers[found[1]]
+        number = numbers[match[1]]
         field = types[name][number]
-        if (found[2] is not None) != field.repeated:
+        if (match[2] is not None) != field.repeated:
             raise ValueError(f"no numeric field {path}")
         node = plan.setdefault(number, _Node(field, {}, {}, None))
-        if found[2] == "#":
+        if match[2] == "#":
             plan[number] = node._replace(length=place)
-        elif found[3] and field.type == _MESSAGE:
-            below.setdefault((number, int(found[2] or 0)), {})[found[3]] = place
-        elif not found[3] and field.type in _NUMBERS:
-            node.places[int(found[2] or 0)] = place
+        elif match[3] and field.type == _MESSAGE:
+            below.setdefault((number, int(match[2] or 0)), {})[match[3]] = place
+        elif not match[3] and field.type in _NUMBERS:
+            node.places[int(match[2] or 0)] = place
         else:
             raise ValueError(f"no numeric field {path}")
     for (number, index), inner in below.items():
@@ -252,8 +253,8 @@ def _plan(types: dict, name: str, wanted: dict[str, int]) -> dict[int, _Node]:
 
 
 def _walk(data: bytes, plan: dict[int, _Node], row: list[float]) -> None:
-    """Fills the places of `row` that the message `data` has values for; the last
-    value of a single field counts, as the format says."""
+    """Fills the places of `row` for which the message `data` has values. The last value of a single field
+    counts, as the format says."""
     for node in plan.values():
         if not node.field.presence and not node.field.repeated:
             for place in node.places.values():
@@ -265,18 +266,18 @@ def _walk(data: bytes, plan: dict[int, _Node], row: list[float]) -> None:
         node = plan.get(number)
         if node is None:
             continue
-        found = _values(wire, value, node, counts[number], row)
-        for i, one in enumerate(found, counts[number]):
+        numbers = _values(wire, value, node, counts[number], row)
+        for i, value_i in enumerate(numbers, counts[number]):
             if i in node.places:
-                row[node.places[i]] = one
+                row[node.places[i]] = value_i
         if node.field.repeated:
-            counts[number] += len(found)
+            counts[number] += len(numbers)
         if node.length is not None:
             row[node.length] = counts[number]
 
 
 def _values(wire: int, value: int | bytes, node: _Node, index: int, row: list[float]) -> Sequence[float]:
-    """The numbers of one field on the wire; a message is walked and counts as one."""
+    """The numbers of one field on the wire. A message is walked and counts as one."""
     if node.field.type == _MESSAGE:
         if wire != BYTES:
             raise UnreadableMessage("a number where the schema says a message")

@@ -1,5 +1,5 @@
-"""What is doubtful in a table: spikes, frozen sensors, rails, constants, quantisation, units; said with place
-and count, and masked where wrong."""
+"""Flags for doubtful samples of a table, with place and count: spikes, frozen sensors, rails, constants,
+quantisation, units. Wrong samples are masked."""
 
 from collections.abc import Callable, Mapping
 
@@ -10,16 +10,15 @@ from pipeline.reading.signals import Flag, Table
 from pipeline.reading.stuck import frozen, rails
 
 SPIKE_WINDOW = 7
-# a spike is beyond eight robust standard deviations of the residual of the local
-# median, and beyond three times what its neighbours do
-# among themselves
+# a spike is beyond eight robust standard deviations of the residual of the local median, and beyond three
+# times its neighbours' own changes
 SPIKE_SIGMAS, SPIKE_OVER_NEIGHBOURS = 8.0, 3.0
 SPIKE_LONGEST = 2
-# an input with no more levels than that between its limits follows a
-# plan, and is not held back by the lower one
+# an input with no more levels than that between its limits follows a plan, and is not held back by the lower
+# one
 PLANNED_LEVELS = 20
-# an extruder's barrel, nozzle and bed: beyond it a number in °C is
-# doubtful; rooms in °C, K and °F for a machine at rest
+# an extruder's barrel, nozzle and bed: a higher number in °C is doubtful; rooms in K and °F for a machine at
+# rest
 HOTTEST_DEGC = 450.0
 ROOM_KELVIN, ROOM_FAHRENHEIT = (283.0, 313.0), (55.0, 100.0)
 _CELSIUS = {"degc", "°c", "c", "celsius"}
@@ -27,19 +26,18 @@ _PERCENT = {"percent", "%", "pct"}
 
 
 def flag(table: Table, *, units: Mapping[str, str], limits: Mapping[str, tuple[float, float]]) -> Table:
-    """The table with what is doubtful flagged and, where it is no
-    measurement, masked; values stay as they are.
+    """The table with flags for doubtful samples. Samples that are no measurement are masked; values stay.
 
-    `limits` are {input: (low, high)} in its unit: its signals are the inputs, all others outputs. Masked:
-    spike, frozen. Reported only: quantised, saturated, outside (an input beyond its limits), constant, unit
-    (looks like kelvin, fahrenheit, a duty of 0-1).
+    `limits` are {input: (low, high)} in the input's unit; all other signals are outputs. Spikes and frozen
+    stretches are masked. These are only reported: quantised, saturated, outside (an input beyond its limits),
+    constant, unit (looks like kelvin, fahrenheit, a duty of 0-1).
     """
     outputs = [name for name in table.values if name not in limits]
     flags, masked = list(table.flags), {name: mask.copy() for name, mask in table.masked.items()}
     for name in outputs:
-        for found in (_spikes(table, name), frozen(table, name)):
-            for one, where in found:
-                flags.append(one)
+        for doubtful in (_spikes(table, name), frozen(table, name)):
+            for finding, where in doubtful:
+                flags.append(finding)
                 masked[name][where] = True
     checked = table._replace(masked=masked)
     for name in outputs:
@@ -63,22 +61,22 @@ def _flag(table: Table, name: str, kind: str, where: np.ndarray, message: str) -
 
 
 def _groups(where: np.ndarray, segment: np.ndarray) -> list[np.ndarray]:
-    """Sorted indices split where they are not neighbours or where a segment ends."""
+    """Sorted indices, split at every index that is missing and at the ends of segments."""
     if not len(where):
         return []
     return np.split(where, np.flatnonzero((np.diff(where) > 1) | (np.diff(segment[where]) != 0)) + 1)
 
 
 def _in_segments(table: Table, name: str, of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """`of` the values of each segment, gaps of masked values bridged by the last one before."""
-    found = np.zeros(len(table.time_s))
+    """The filter `of` on the values of each segment. The last value before a masked gap bridges the gap."""
+    filtered = np.zeros(len(table.time_s))
     values = np.where(table.masked[name], np.nan, table.values[name])
     for inside in np.split(np.arange(len(values)), np.flatnonzero(np.diff(table.segment)) + 1):
-        known = inside[np.isfinite(values[inside])]
-        if len(known):
-            last = np.maximum(np.searchsorted(known, inside, side="right") - 1, 0)
-            found[inside] = of(values[known[last]])
-    return found
+        finite = inside[np.isfinite(values[inside])]
+        if len(finite):
+            last = np.maximum(np.searchsorted(finite, inside, side="right") - 1, 0)
+            filtered[inside] = of(values[finite[last]])
+    return filtered
 
 
 # ---- spikes
@@ -92,23 +90,25 @@ def _spikes(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
     size = np.abs(residual)
     if usable.sum() < 3 * SPIKE_WINDOW:
         return []
-    # the median alone is 0 for a quantised signal, so the 90th
-    # percentile and the step of the values count too
+    # the median alone is 0 for a quantised signal: the 90th percentile and the step of the values count too
     sigma = max(
         1.4826 * np.median(size[usable]),
         np.percentile(size[usable], 90) / 1.645,
         quantisation_step(table.values[name][usable]),
     )
-    found = []
+    spikes = []
     for group in _groups(np.flatnonzero(usable & (size > SPIKE_SIGMAS * sigma)), table.segment):
         # beside a spike the median of a smooth signal is off by what it does in a sample
         group = group[size[group] > size[group].max() / 2]
         if len(group) <= SPIKE_LONGEST and _stands_alone(table, name, group, size[group].min()):
             at, value = float(table.time_s[group[0]]), float(table.values[name][group[0]])
             local = value - float(residual[group[0]])
-            message = f"{name} is {value:g} at {at:g} s while its neighbours are at {local:g}: a spike of the sensor, masked"
-            found.append((_flag(table, name, "spike", group, message), group))
-    return found
+            message = (
+                f"{name} is {value:g} at {at:g} s while its neighbours are at {local:g}: "
+                "a spike of the sensor, masked"
+            )
+            spikes.append((_flag(table, name, "spike", group, message), group))
+    return spikes
 
 
 def _stands_alone(table: Table, name: str, group: np.ndarray, size: float) -> bool:
@@ -123,7 +123,7 @@ def _stands_alone(table: Table, name: str, group: np.ndarray, size: float) -> bo
 
 
 def quantisation_step(values: np.ndarray) -> float:
-    """The step of a quantised signal; 0 where the levels have no common step.
+    """The step of a quantised signal, 0 if the levels have no common step.
 
     The median distance d of neighbouring levels is the step if nine tenths of the distances are whole
     multiples of it (to a tenth: rounded print-outs of 0.0322 differ by 0.032 or 0.033) and if values come
@@ -139,8 +139,8 @@ def quantisation_step(values: np.ndarray) -> float:
         return 0.0
     step = float(np.median(distances))
     ratio = distances / step
-    whole = np.abs(ratio - np.rint(ratio)) <= 0.1 * np.maximum(1.0, np.rint(ratio))
-    return step if np.mean(whole & (ratio > 0.5)) >= 0.9 else 0.0
+    multiple = np.abs(ratio - np.rint(ratio)) <= 0.1 * np.maximum(1.0, np.rint(ratio))
+    return step if np.mean(multiple & (ratio > 0.5)) >= 0.9 else 0.0
 
 
 # ---- constants, limits, quantisation
@@ -150,7 +150,10 @@ def _constant(table: Table, name: str) -> list[Flag]:
     usable = _usable(table, name)
     if not len(usable) or np.ptp(usable) > 0:
         return []
-    message = f"{name} is {usable[0]:g} throughout: the recording says nothing of what it does; move it, or leave it out"
+    message = (
+        f"{name} is {usable[0]:g} throughout: the recording says nothing of what it does; "
+        "move it, or leave it out"
+    )
     return [_flag(table, name, "constant", np.arange(len(table.time_s)), message)]
 
 
@@ -163,9 +166,8 @@ def _at_limits(table: Table, name: str, low: float, high: float) -> list[Flag]:
         where = np.flatnonzero(at & usable)
         if len(where) and np.ptp(values[usable]) > 0 and not (planned and limit == low):
             message = (
-                f"{name} is at its limit {limit:g} in {len(where)} of {usable.sum()} "
-                "samples: there it follows"
-                f" the limit, not the controller"
+                f"{name} is at its limit {limit:g} in {len(where)} of {usable.sum()} samples: "
+                "there it follows the limit, not the controller"
             )
             flags.append(_flag(table, name, "saturated", where, message))
     where = np.flatnonzero(usable & ((values < low - tolerance) | (values > high + tolerance)))
@@ -184,7 +186,11 @@ def _quantised(table: Table, name: str) -> list[Flag]:
     if not step:
         return []
     levels = len(np.unique(usable))
-    message = f"{name} comes in steps of {step:.3g} ({levels} levels): that is a noise of {step / np.sqrt(12):.2g} that no model explains"
+    noise = step / np.sqrt(12)
+    message = (
+        f"{name} comes in steps of {step:.3g} ({levels} levels): "
+        f"that is a noise of {noise:.2g} that no model explains"
+    )
     return [_flag(table, name, "quantised", np.flatnonzero(~table.masked[name]), message)]
 
 
@@ -200,21 +206,21 @@ def _unit_flags(
         usable, unit = _usable(table, name), units.get(name, "").casefold()
         if not len(usable):
             continue
-        said = (
+        doubt = (
             _doubtful_celsius(name, usable, resting)
             if unit in _CELSIUS
             else _doubtful_percent(name, usable, limits.get(name, (0.0, 100.0))[1])
             if unit in _PERCENT
             else ""
         )
-        if said:
-            flags.append(_flag(table, name, "unit", np.flatnonzero(~table.masked[name]), said))
+        if doubt:
+            flags.append(_flag(table, name, "unit", np.flatnonzero(~table.masked[name]), doubt))
     return flags
 
 
 def _at_rest(table: Table, units: Mapping[str, str], limits: Mapping[str, tuple[float, float]]) -> bool:
-    """Whether the recording begins on a machine at the room's temperature: every input at 0 or its lowest, or
-    several temperatures that are alike."""
+    """Whether the recording begins on a machine at the room's temperature: every input is at 0 or its lowest,
+    or several temperatures are alike."""
     first = {name: float(_usable(table, name)[0]) for name in table.values if len(_usable(table, name))}
     idle = bool(limits) and all(first.get(name, np.nan) in (0.0, low) for name, (low, _) in limits.items())
     starts = [
@@ -228,21 +234,39 @@ def _at_rest(table: Table, units: Mapping[str, str], limits: Mapping[str, tuple[
 def _doubtful_celsius(name: str, values: np.ndarray, resting: bool) -> str:
     first, middle = values[0], float(np.median(values))
     if values.min() < -273.15:
-        return f"{name} falls to {values.min():g} °C, which no temperature does; mend the mapping's scale and offset"
+        return (
+            f"{name} falls to {values.min():g} °C, which no temperature does; "
+            "mend the mapping's scale and offset"
+        )
     if middle > HOTTEST_DEGC or (resting and ROOM_KELVIN[0] <= first <= ROOM_KELVIN[1]):
-        return f"{name} begins at {first:g} and is {middle:g} in the middle: it looks like kelvin; set offset: -273.15 if it is"
+        return (
+            f"{name} begins at {first:g} and is {middle:g} in the middle: it looks like kelvin; "
+            "set offset: -273.15 if it is"
+        )
     if resting and ROOM_FAHRENHEIT[0] <= first <= ROOM_FAHRENHEIT[1]:
-        return f"{name} begins at {first:g} on a machine at rest: it looks like fahrenheit; set scale: 0.555556 and offset: -17.7778 if it is"
+        return (
+            f"{name} begins at {first:g} on a machine at rest: it looks like fahrenheit; "
+            "set scale: 0.555556 and offset: -17.7778 if it is"
+        )
     if resting and values.max() <= 1.0 and values.min() >= 0.0:
-        return f"{name} lies within 0 to 1: it looks like a share or a voltage; set the sensor's scale and offset if it is"
+        return (
+            f"{name} lies within 0 to 1: it looks like a share or a voltage; "
+            "set the sensor's scale and offset if it is"
+        )
     return ""
 
 
 def _doubtful_percent(name: str, values: np.ndarray, high: float) -> str:
     top = values.max()
     if 0.0 < top <= 1.0 and values.min() >= 0.0:
-        return f"{name} lies within {values.min():g} to {top:g}: it looks like a duty of 0 to 1; set scale: 100 if it is"
+        return (
+            f"{name} lies within {values.min():g} to {top:g}: it looks like a duty of 0 to 1; "
+            "set scale: 100 if it is"
+        )
     for full in (255, 1023, 4095, 65535):
         if max(100.0, high) < top <= full and values.min() >= 0.0 and (values == np.rint(values)).all():
-            return f"{name} reaches {top:g} in whole numbers: it looks like a converter's 0 to {full}; set scale: {100 / full:.6g} if it is"
+            return (
+                f"{name} reaches {top:g} in whole numbers: it looks like a converter's 0 to {full}; "
+                f"set scale: {100 / full:.6g} if it is"
+            )
     return ""

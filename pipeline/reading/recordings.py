@@ -1,7 +1,8 @@
-"""Recordings of other people's machines: MCAP, Parquet and CSV -> signals on their own clocks, with what was
-damaged, missing or left out counted.
+"""Recordings of other people's machines: MCAP, Parquet and CSV -> signals on their own clocks. Damaged,
+missing and left-out samples are counted.
 
-`read` is the door; `resample` and `flag` make a table of it, `inspect` says in words what is in a file.
+`read` is the entry point. `resample` and `flag` make a table of its result; `inspect` describes a file in
+words.
 """
 
 from collections.abc import Sequence
@@ -37,12 +38,14 @@ __all__ = [
 def read(path: str | Path, sources: Sequence[Source], *, time: str = "") -> Raw:
     """The signals of a recording, each on its own clock, in our units.
 
-    `time` names the clock: in a table a column (by default one that is called like a time) or "every 0.5 s"
-    where there is none; in MCAP log_time (the default), publish_time, or a field of every topic such as
+    `time` names the clock. In a table it is a column (by default one with a name of a time) or, without one,
+    "every 0.5 s". In MCAP it is log_time (the default), publish_time, or a field of every topic such as
     header.stamp. A clock of the calendar is counted from the first whole second of the record. Missing
-    numbers are NaN, and counted in a note. Raises ValueError, one sentence with file, place, expected, found
-    and remedy, for a source that is not there, text in place of a number, a signal without any number, a time
-    that is missing, repeated or runs backwards, and a file that cannot be read.
+    numbers are NaN, and counted in a note.
+
+    Raises ValueError, one sentence with file, place, expected, found and remedy, for a source that is not
+    there, text in place of a number, a signal without any number, a time that is missing, repeated or runs
+    backwards, and a file that cannot be read.
     """
     path = Path(path)
     _check_sources(path, sources)
@@ -87,13 +90,12 @@ def _check_sources(path: Path, sources: Sequence[Source]) -> None:
         if not (np.isfinite(source.scale) and np.isfinite(source.offset) and source.scale != 0):
             raise ValueError(
                 f"{path}: the mapping of {source.signal} has scale {source.scale:g} and offset "
-                f"{source.offset:g}; both"
-                f" must be finite, scale not 0"
+                f"{source.offset:g}; both must be finite, scale not 0"
             )
 
 
 def _clocks(path: Path, columns: Sequence[Columns], notes: list[Note]) -> dict[str, np.ndarray]:
-    """{topic: time_s (n,)}, all counted from one instant; each checked to run forward."""
+    """{topic: time_s (n,)}, all counted from one instant. Each clock is checked to run forward."""
     for group in columns:
         check_clock(path, group)
     first = min(group.time[0] for group in columns)
@@ -115,35 +117,39 @@ def _clocks(path: Path, columns: Sequence[Columns], notes: list[Note]) -> dict[s
 
 
 def _signal(
-    path: Path, source: Source, time: np.ndarray, group: Columns, found: np.ndarray, notes: list[Note]
+    path: Path, source: Source, time: np.ndarray, group: Columns, recorded: np.ndarray, notes: list[Note]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Time and values in our unit; a signal that is there in less than half of the rows, spread among them,
-    keeps only those: it has its own clock."""
-    present = np.isfinite(found)
+    """Time and values in the signal's unit. A signal that has a value in less than half of the rows, spread
+    among them, has its own clock: those rows."""
+    present = np.isfinite(recorded)
     if not present.any():
         raise ValueError(
             f"{path}: {source.source} should hold numbers for {source.signal} but all of its "
-            f"{len(found)} values are"
-            f" missing; map another source"
+            f"{len(recorded)} values are missing; map another source"
         )
-    values = found if (source.scale, source.offset) == (1.0, 0.0) else found * source.scale + source.offset
+    values = (
+        recorded if (source.scale, source.offset) == (1.0, 0.0) else recorded * source.scale + source.offset
+    )
     if present.all():
         return time, values
     where = np.flatnonzero(present)
-    missing = len(found) - len(where)
-    if where.size < len(found) / 2 and where.size > 1 and np.median(np.diff(where)) > 1:
+    missing = len(recorded) - len(where)
+    if where.size < len(recorded) / 2 and where.size > 1 and np.median(np.diff(where)) > 1:
         notes.append(
             Note(
                 "sparse",
                 source.signal,
                 missing,
-                f"{source.source} has a value in {where.size} of {len(found)} rows; those are its samples",
+                f"{source.source} has a value in {where.size} of {len(recorded)} rows; those are its samples",
             )
         )
         return time[where], values[where]
     first = int(np.flatnonzero(~present)[0])
-    infinite = int(np.isinf(found).sum())
+    infinite = int(np.isinf(recorded).sum())
     kinds = f" ({infinite} of them infinite)" if infinite else ""
-    message = f"{missing} of {len(found)} values of {source.source} are missing{kinds}, the first in {group.place(first)}; they are masked"
+    message = (
+        f"{missing} of {len(recorded)} values of {source.source} are missing{kinds}, "
+        f"the first in {group.place(first)}; they are masked"
+    )
     notes.append(Note("missing", source.signal, missing, message))
     return time, np.where(present, values, np.nan)

@@ -1,5 +1,5 @@
-"""Signals on their own clocks -> one table on one sample time: inputs are held, outputs interpolated between
-near neighbours, gaps make segments."""
+"""Signals on their own clocks -> one table on one sample time. Inputs are held, outputs interpolated between
+near neighbours; a gap begins a new segment."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -7,22 +7,21 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.reading.mixing import alternate, mixed
-from pipeline.reading.signals import Flag, Raw, Table, intervals
+from pipeline.reading.signals import Flag, Jitter, Raw, Table, intervals
 
-# a sample within that share of the sample time from the grid is on it: what a temperature
-# does in a hundredth of a sample is far below any
-# sensor's step
+# a sample within that share of the sample time from the grid is on it: a temperature's change in a hundredth
+# of a sample is far below any sensor's step
 ON_GRID = 0.01
 GAP_INTERVALS = 3.0
-# commands are sent periodically if nearly all of their intervals are alike;
-# else they are events, and a long silence is no gap
+# commands are sent periodically if nearly all of their intervals are alike; else they are events, and a long
+# silence is no gap
 PERIODIC_SHARE = 0.95
 JITTER_SHARE, JITTER_OFTEN = 0.1, 0.01
 
 
 class _Clock(NamedTuple):
-    """One clock and who is on it; a gap is an interval beyond
-    `gap_limit_s` (infinite for commands that come as events)."""
+    """One clock and the signals on it. A gap is an interval beyond `gap_limit_s` (infinite for commands that
+    come as events)."""
 
     time_s: np.ndarray
     signals: list[str]
@@ -39,14 +38,17 @@ def resample(
 ) -> Table:
     """The table of a recording on the grid t_k = t_0 + k T of each segment.
 
-    Inputs: u_k is the last command at or before t_k. Outputs: y_k is the sample at t_k where there is
-    one (within T / 100: the record's own numbers, unaltered), else the straight line between its
-    neighbours. An interval longer than `max_gap_s` (default: three sample times or three median
-    intervals, whichever is longer) on any clock is a gap: nothing is interpolated or held across it, and
-    a new segment begins behind it. Segments span what all clocks have in common. A value whose
-    neighbours are missing is NaN and masked. Flags say what was done: gap, jitter, filled, step_inside,
-    step_lost, missing, mixed, trimmed, short, rate. Raises ValueError where a signal is not in the
-    recording, clocks have no time in common, or no segment has two samples.
+    Inputs: u_k is the last command at or before t_k. Outputs: y_k is the sample at t_k if there is one
+    (within T / 100: the record's own numbers, unaltered), else the straight line between its neighbours.
+
+    A gap is an interval longer than `max_gap_s` (default: three sample times or three median intervals,
+    whichever is longer) on any clock. Nothing is interpolated or held across a gap, and a new segment begins
+    behind it. Segments span the time that all clocks have in common. A value whose neighbours are missing is
+    NaN and masked. Flags report gap, jitter, filled, step_inside, step_lost, missing, mixed, trimmed, short
+    and rate.
+
+    Raises ValueError if a signal is not in the recording, if the clocks have no time in common, or if no
+    segment has two samples.
     """
     _check(raw, sample_time_s, inputs, outputs, max_gap_s)
     clocks = _clocks(raw, sample_time_s, inputs, outputs, max_gap_s)
@@ -55,22 +57,21 @@ def resample(
         start + sample_time_s * np.arange(int(np.floor((end - start) / sample_time_s + ON_GRID)) + 1)
         for start, end in pieces
     ]
-    whole = [grid for grid in grids if len(grid) > 1]
-    if not whole:
+    segments = [grid for grid in grids if len(grid) > 1]
+    if not segments:
         raise ValueError(
             f"{raw.path}: the recording should have two samples {sample_time_s:g} s apart without a gap but "
-            "its longest stretch is"
-            f" {max(end - start for start, end in pieces):g} s; record longer, "
+            f"its longest stretch is {max(end - start for start, end in pieces):g} s; record longer, "
             "or set a smaller sample time or a larger gap limit"
         )
-    time = np.concatenate(whole)
-    segment = np.repeat(np.arange(len(whole), dtype=np.int32), [len(grid) for grid in whole])
+    time = np.concatenate(segments)
+    segment = np.repeat(np.arange(len(segments), dtype=np.int32), [len(grid) for grid in segments])
     values = {name: _held(*raw.signals[name], time, sample_time_s) for name in inputs}
     values |= {
-        name: np.concatenate([_interpolated(*raw.signals[name], grid, sample_time_s) for grid in whole])
+        name: np.concatenate([_interpolated(*raw.signals[name], grid, sample_time_s) for grid in segments])
         for name in outputs
     }
-    masked = {name: ~np.isfinite(found) for name, found in values.items()}
+    masked = {name: ~np.isfinite(column) for name, column in values.items()}
     flags = _gap_flags(clocks) + _jitter_flags(clocks) + _trim_flags(raw, clocks, pieces, grids)
     for name in outputs:
         flags += _filled_flags(name, raw.signals[name][0], time, sample_time_s) + _rate_flags(
@@ -82,13 +83,7 @@ def resample(
         flags += _missing_flags(name, masked[name], time)
     for name in outputs:
         flags += _mixed_flags(name, *raw.signals[name], time, masked[name])
-    jitter = {
-        name: intervals(clock.time_s, clock.gap_limit_s)
-        for clock in clocks
-        for name in clock.signals
-        if len(clock.time_s) > 1
-    }
-    return Table(raw.path, segment, time, values, masked, flags, jitter)
+    return Table(raw.path, segment, time, values, masked, flags, _jitter(clocks))
 
 
 def _check(
@@ -175,24 +170,24 @@ def _common(
     left: Sequence[tuple[float, float]], right: Sequence[tuple[float, float]], tolerance: float
 ) -> list[tuple[float, float]]:
     """Intersections of two sorted lists of intervals."""
-    found, i, j = [], 0, 0
+    common, i, j = [], 0, 0
     while i < len(left) and j < len(right):
         start, end = max(left[i][0], right[j][0]), min(left[i][1], right[j][1])
         if end - start >= -tolerance:
-            found.append((start, max(start, end)))
+            common.append((start, max(start, end)))
         if left[i][1] < right[j][1]:
             i += 1
         else:
             j += 1
-    return found
+    return common
 
 
 # ---- values
 
 
 def _held(time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, sample_time_s: float) -> np.ndarray:
-    """u(t_k): the last command at or before t_k. Pieces begin at or
-    behind the first command, so there is one."""
+    """u(t_k): the last command at or before t_k. There is one, as pieces begin at or behind the first
+    command."""
     return values[np.maximum(np.searchsorted(time_s, grid + ON_GRID * sample_time_s, side="right") - 1, 0)]
 
 
@@ -205,7 +200,7 @@ def _nearest(time_s: np.ndarray, grid: np.ndarray) -> np.ndarray:
 def _interpolated(
     time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, sample_time_s: float
 ) -> np.ndarray:
-    """y(t_k): the sample on t_k itself, else the line between its neighbours; a NaN neighbour gives NaN."""
+    """y(t_k): the sample on t_k itself, else the line between its neighbours. A NaN neighbour gives NaN."""
     after = np.clip(np.searchsorted(time_s, grid), 1, len(time_s) - 1)
     share = (grid - time_s[after - 1]) / (time_s[after] - time_s[after - 1])
     line = values[after - 1] + np.clip(share, 0.0, 1.0) * (values[after] - values[after - 1])
@@ -213,7 +208,7 @@ def _interpolated(
     return np.where(np.abs(time_s[nearest] - grid) <= ON_GRID * sample_time_s, values[nearest], line)
 
 
-# ---- what was done
+# ---- flags
 
 
 def _flag(signal: str, kind: str, where_s: np.ndarray, message: str) -> list[Flag]:
@@ -240,27 +235,37 @@ def _gap_flags(clocks: Sequence[_Clock]) -> list[Flag]:
     return flags
 
 
+def _jitter(clocks: Sequence[_Clock]) -> dict[str, Jitter]:
+    """{signal: jitter of its clock}."""
+    return {
+        name: intervals(clock.time_s, clock.gap_limit_s)
+        for clock in clocks
+        for name in clock.signals
+        if len(clock.time_s) > 1
+    }
+
+
 def _jitter_flags(clocks: Sequence[_Clock]) -> list[Flag]:
-    """Clocks of which one interval in a hundred is off by a tenth, or any by a
-    half; commands that come as events have no interval."""
+    """A flag for each clock with one interval in a hundred off by a tenth, or with any off by a half.
+    Commands that come as events have no interval."""
     flags = []
     for clock in clocks:
         if not np.isfinite(clock.gap_limit_s) or len(clock.time_s) < 3:
             continue
         jitter, steps = intervals(clock.time_s, clock.gap_limit_s), np.diff(clock.time_s)
-        kept = np.flatnonzero(steps <= clock.gap_limit_s)
-        off = kept[np.abs(steps[kept] - jitter.interval_s) > JITTER_SHARE * jitter.interval_s]
-        if len(off) < JITTER_OFTEN * len(kept) and jitter.max_s <= 0.5 * jitter.interval_s:
+        inside = np.flatnonzero(steps <= clock.gap_limit_s)
+        off = inside[np.abs(steps[inside] - jitter.interval_s) > JITTER_SHARE * jitter.interval_s]
+        if len(off) < JITTER_OFTEN * len(inside) and jitter.max_s <= 0.5 * jitter.interval_s:
             continue
-        said = (
+        pattern = (
             ", by turns longer and shorter: two devices may write under one name"
-            if alternate(steps[kept])
+            if alternate(steps[inside])
             else ""
         )
         message = (
             f"the intervals of {', '.join(clock.signals)} differ from {jitter.interval_s:.4g} s by "
-            f"{jitter.std_s:.2g} s (standard) and"
-            f" {jitter.max_s:.2g} s (largest), {len(off)} of {len(kept)} by more than a tenth{said}"
+            f"{jitter.std_s:.2g} s (standard) and {jitter.max_s:.2g} s (largest), "
+            f"{len(off)} of {len(inside)} by more than a tenth{pattern}"
         )
         flags.append(
             Flag(
@@ -273,16 +278,15 @@ def _jitter_flags(clocks: Sequence[_Clock]) -> list[Flag]:
 def _mixed_flags(
     name: str, time_s: np.ndarray, values: np.ndarray, grid: np.ndarray, masked: np.ndarray
 ) -> list[Flag]:
-    """Stretches in which two devices write under one name, found in the record's own samples; they are
-    masked, for nobody knows which of the two a sample of the table is."""
+    """Stretches of the record's own samples in which two devices write under one name. They are masked, as
+    nothing tells which of the two a sample is of."""
     flags = []
     for first, last, distance in mixed(values):
         start, end = float(time_s[first]), float(time_s[last])
         masked[(grid >= start) & (grid <= end)] = True
         message = (
             f"{name} jumps to and fro between two courses {distance:.3g} apart from {start:g} to {end:g} s, "
-            "masked: two devices seem to write"
-            f" under one name; record each under a name of its own"
+            "masked: two devices seem to write under one name; record each under a name of its own"
         )
         flags.append(Flag(name, "mixed", start, end, last - first + 1, message))
     return flags
@@ -299,7 +303,10 @@ def _trim_flags(
             for clock in clocks
             if np.isfinite(clock.gap_limit_s)
         )
-        message = f"{len(clocks)} clocks were aligned over their common time {start:g} to {end:g} s; {cut} samples lie outside"
+        message = (
+            f"{len(clocks)} clocks were aligned over their common time {start:g} to {end:g} s; "
+            f"{cut} samples lie outside"
+        )
         flags.append(Flag("", "trimmed", start, end, cut, message))
     for grid in grids:
         if len(grid) < 2:
@@ -328,15 +335,13 @@ def _rate_flags(name: str, time_s: np.ndarray, sample_time_s: float) -> list[Fla
     if interval < sample_time_s / 2:
         message = (
             f"{name} is sampled every {interval:g} s, the table every {sample_time_s:g} s: "
-            "only the samples at"
-            f" its times are used, without averaging"
+            "only the samples at its times are used, without averaging"
         )
         return [Flag(name, "rate", float(span[0]), float(span[1]), len(time_s), message)]
     if interval > 1.5 * sample_time_s:
         message = (
-            f"{name} is sampled every {interval:g} s but the table every {sample_time_s:g} "
-            "s: what lies between"
-            f" is interpolated, no measurement"
+            f"{name} is sampled every {interval:g} s but the table every {sample_time_s:g} s: "
+            "what lies between is interpolated, no measurement"
         )
         return [Flag(name, "rate", float(span[0]), float(span[1]), len(time_s), message)]
     return []
@@ -350,8 +355,8 @@ def _step_flags(
     segment: np.ndarray,
     sample_time_s: float,
 ) -> list[Flag]:
-    """Commands that change between two samples act from the next sample on;
-    those that another overtakes before it are lost."""
+    """Flags for commands that change between two samples. They act from the next sample on; a command that
+    another overtakes before that sample is lost."""
     changes = np.flatnonzero(values[1:] != values[:-1]) + 1
     when = time_s[changes]
     following = np.searchsorted(grid, when - ON_GRID * sample_time_s)
@@ -362,7 +367,10 @@ def _step_flags(
     late = grid[following] - when
     between = late > ON_GRID * sample_time_s
     mean = f"{late[between].mean():.3g} s later on average" if between.any() else ""
-    message = f"{name} changes {between.sum()} times between two samples; it is not smeared but acts from the next sample on, {mean}"
+    message = (
+        f"{name} changes {between.sum()} times between two samples; "
+        f"it is not smeared but acts from the next sample on, {mean}"
+    )
     flags = _flag(name, "step_inside", when[between], message)
     overtaken = np.r_[following[1:] == following[:-1], False] if len(following) else np.zeros(0, bool)
     message = (

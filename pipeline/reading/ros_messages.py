@@ -1,9 +1,9 @@
-"""Numbers out of ROS messages: the message definition becomes a short program
-of struct formats, made once, run for each message.
+"""Numbers of ROS messages. The message definition becomes a short program of struct formats, made once and
+run for each message.
 
-Layouts: CDR as ROS 2 writes it (OMG DDSI-RTPS 10.2, "classic CDR", and XCDR2 for final types), aligned to the
-size of each number behind a header of four bytes; ROS 1 has no header and no alignment. Sequences and text
-begin with their length (uint32); text is skipped, wide text ends what can be read.
+Layouts: ROS 2 writes CDR (OMG DDSI-RTPS 10.2, "classic CDR", and XCDR2 for final types), aligned to the size
+of each number behind a header of four bytes. ROS 1 has no header and no alignment. Sequences and text begin
+with their length (uint32). Text is skipped; fields behind a wide text cannot be read.
 """
 
 import re
@@ -20,7 +20,7 @@ ROS2_NUMBERS = {
 }  # fmt: skip
 ROS1_NUMBERS = {**ROS2_NUMBERS, "byte": "b"}
 ROS1_NUMBERS.pop("octet")
-# left out of many schema texts because every reader knows them
+# types that many schema texts leave out, as every reader has them
 KNOWN = {
     "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
     "builtin_interfaces/Duration": "int32 sec\nuint32 nanosec",
@@ -30,8 +30,8 @@ KNOWN = {
 LARGEST_LAYOUT = 20_000
 LONGEST_LISTED = 64
 _FIELD = re.compile(r"^([A-Za-z]\w*(?:/\w+)*)(?:<=\d+)?\s*(\[(?:<=)?(\d*)\])?\s+([A-Za-z]\w*)\s*(=?)")
-# representation -> byte order, largest alignment; the lists of parameters
-# (0x0002, 0x0003 and others) are not written by ROS
+# representation -> byte order, largest alignment; ROS does not write lists of parameters (0x0002, 0x0003 and
+# others)
 _REPRESENTATIONS = {
     b"\x00\x00": (">", 8),
     b"\x00\x01": ("<", 8),
@@ -42,7 +42,7 @@ _LENGTH = {order: struct.Struct(order + "I") for order in "<>"}
 
 
 class UnreadableMessage(ValueError):
-    """A message that is not what its schema says."""
+    """A message that does not fit its schema."""
 
 
 class Item(NamedTuple):
@@ -58,9 +58,9 @@ class Item(NamedTuple):
 
 
 def layout(definition: str, name: str, *, version: int) -> list[Item]:
-    """The message's numbers, texts and sequences in the order of the wire; `version` is 1 or 2.
+    """The message's numbers, texts and sequences in the order of the wire. `version` is 1 or 2.
 
-    Raises ValueError where the definition cannot be read.
+    Raises ValueError for a definition that cannot be read.
     """
     if re.search(r"^---", definition, re.MULTILINE):
         raise ValueError(f"the schema of {name} is a service's (---), not a message's")
@@ -71,7 +71,7 @@ def layout(definition: str, name: str, *, version: int) -> list[Item]:
 def _types(definition: str, name: str, version: int) -> dict[str, list[tuple[str, str, str | None]]]:
     """{type: [(field, its type, None | "" | length)]}; "" is a sequence without a fixed length."""
     parts = re.split(r"^={3,}\s*$", definition, flags=re.MULTILINE)
-    texts = {known: text for known, text in KNOWN.items()} | {_plain(name): parts[0]}
+    texts = dict(KNOWN) | {_plain(name): parts[0]}
     for part in parts[1:]:
         head, _, body = part.strip().partition("\n")
         if not head.startswith("MSG:"):
@@ -90,17 +90,17 @@ def _fields(text: str, kind: str) -> list[tuple[str, str, str | None]]:
         line = line.split("#")[0].strip()
         if not line:
             continue
-        found = _FIELD.match(line)
-        if not found:
+        match = _FIELD.match(line)
+        if not match:
             raise ValueError(f"the schema of {kind} has the line {line[:60]!r}, which is no field")
-        if not found[5]:  # NAME=value is a constant and not on the wire
-            fields.append((found[4], found[1], found[3] if found[2] else None))
+        if not match[5]:  # NAME=value is a constant and not on the wire
+            fields.append((match[4], match[1], match[3] if match[2] else None))
     return fields
 
 
 def _resolve(kind: str, parent: str, types: dict) -> str:
     candidates = [_plain(kind), f"{parent.rpartition('/')[0]}/{kind}", f"std_msgs/{kind}", f"ros1/{kind}"]
-    candidates += [known for known in types if known.endswith(f"/{kind}")]
+    candidates += [name for name in types if name.endswith(f"/{kind}")]
     for candidate in candidates:
         if candidate in types:
             return candidate
@@ -145,7 +145,7 @@ def _element(of: str, path: str, parent: str, types: dict, version: int, room: l
 
 
 def fields(items: Sequence[Item], sample: bytes | None, *, version: int) -> list[str]:
-    """Paths of the numbers; of a sequence those that the message `sample` has, up to LONGEST_LISTED."""
+    """Paths of the numbers. Of a sequence they are those of the message `sample`, up to LONGEST_LISTED."""
     names: list[str] = []
     sequences = []
     for item in _readable(items):
@@ -171,7 +171,7 @@ def fields(items: Sequence[Item], sample: bytes | None, *, version: int) -> list
 
 
 def _readable(items: Sequence[Item]) -> list[Item]:
-    """The items up to the first wide text: writers do not agree on how long its characters are."""
+    """The items up to the first wide text, as writers do not agree on the length of its characters."""
     for i, item in enumerate(items):
         if item.kind == "wstring" or (
             item.kind == "sequence" and len(_readable(item.items)) < len(item.items)
@@ -183,13 +183,13 @@ def _readable(items: Sequence[Item]) -> list[Item]:
 # ---- programs
 
 
-class _Run:
-    """Numbers of fixed size in a row; `layouts[phase]` unpacks the wanted ones
-    when the run begins at that phase of the alignment."""
+class _FixedRow:
+    """Numbers of fixed size in a row. `layouts[phase]` unpacks the wanted ones of a row that begins at that
+    phase of the alignment."""
 
     def __init__(self, items: Sequence[Item], wanted: set[str], order: str, alignment: int):
         self.layouts = [
-            struct.Struct(order + _run_format(items, wanted, phase, alignment)) for phase in range(8)
+            struct.Struct(order + _row_format(items, wanted, phase, alignment)) for phase in range(8)
         ]
         self.names = [name for item in items for name in _names(item) if name in wanted]
 
@@ -203,7 +203,7 @@ def _names(item: Item) -> list[str]:
     return [f"{item.path}[{i}]" for i in range(item.count)] if item.array else [item.path]
 
 
-def _run_format(items: Sequence[Item], wanted: set[str], phase: int, alignment: int) -> str:
+def _row_format(items: Sequence[Item], wanted: set[str], phase: int, alignment: int) -> str:
     parts, pos = [], phase
     for item in items:
         size = struct.calcsize("=" + item.format)
@@ -230,16 +230,13 @@ class _Text:
 
 
 class _Sequence:
-    """A length and so many elements; those asked for by index are read
-    (NaN where there are fewer), the others skipped.
-
-    "[#]" is the length itself.
-    """
+    """A length and so many elements. Elements that are wanted by index are read (NaN if there are fewer), the
+    others skipped. "[#]" is the length itself."""
 
     def __init__(self, item: Item, wanted: set[str], order: str, alignment: int):
         self.unpack, self.alignment = _LENGTH[order].unpack_from, min(4, alignment)
         indices = {
-            int(found[1]) for name in wanted if (found := re.match(re.escape(item.path) + r"\[(\d+)\]", name))
+            int(match[1]) for name in wanted if (match := re.match(re.escape(item.path) + r"\[(\d+)\]", name))
         }
         self.skip = _program(item.items, set(), order, alignment)
         self.elements = {i: _program(_at(item, i), wanted, order, alignment) for i in sorted(indices)}
@@ -283,7 +280,7 @@ class _Sequence:
 
 
 def _at(item: Item, i: int) -> list[Item]:
-    """The elements of a sequence with the paths that they have at index i."""
+    """The elements of a sequence with their paths at index i."""
     start = len(item.path)
     return [
         part._replace(
@@ -299,14 +296,14 @@ def _at_prefix(part: Item, prefix: str, i: int) -> list[Item]:
 
 
 def _program(items: Sequence[Item], wanted: set[str], order: str, alignment: int) -> list:
-    steps, run = [], []
+    steps, row = [], []
     for item in [*items, None]:
         if item is not None and item.kind == "numbers":
-            run.append(item)
+            row.append(item)
             continue
-        if run:
-            steps.append(_Run(run, wanted, order, alignment))
-            run = []
+        if row:
+            steps.append(_FixedRow(row, wanted, order, alignment))
+            row = []
         if item is not None:
             steps.append(
                 _Text(order, alignment)
@@ -319,8 +316,8 @@ def _program(items: Sequence[Item], wanted: set[str], order: str, alignment: int
 def decoder(
     items: Sequence[Item], names: Sequence[str], *, version: int
 ) -> Callable[[list[bytes]], np.ndarray]:
-    """A function from n messages to their numbers (n, len(names)). It raises
-    UnreadableMessage where one is not what the layout says."""
+    """A function from n messages to their numbers (n, len(names)). It raises UnreadableMessage for a message
+    that does not fit the layout."""
     readable = _readable(items)
     exact = len(readable) == len(items)
     if version == 1:
@@ -346,18 +343,18 @@ def decoder(
 
 
 def _order(steps: list, names: Sequence[str]) -> list[int]:
-    found = [name for step in steps for name in step.names]
-    missing = [name for name in names if name not in found]
+    read = [name for step in steps for name in step.names]
+    missing = [name for name in names if name not in read]
     if missing:
         raise ValueError(f"no numeric field {missing[0]}")
-    return [found.index(name) for name in names]
+    return [read.index(name) for name in names]
 
 
 def _decode(messages: list[bytes], steps: list, exact: bool, padding: int) -> np.ndarray:
-    """Runs the steps; behind the last one there may be up to `padding` bytes that fill a message up."""
+    """The numbers of the messages by the steps. Up to `padding` bytes may follow the last step."""
     rows = []
     try:
-        if len(steps) == 1 and isinstance(steps[0], _Run):
+        if len(steps) == 1 and isinstance(steps[0], _FixedRow):
             layout = steps[0].layouts[0]
             unpack, shortest, longest = (
                 layout.unpack_from,

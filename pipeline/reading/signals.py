@@ -1,5 +1,5 @@
-"""What passes between a recording and the learners: a mapping's source, raw signals on their own clocks, a
-table on one clock, and findings with place and count."""
+"""The records that pass between a recording and the learners: a mapping's source, raw signals on their own
+clocks, a table on one clock, and flags with place and count."""
 
 import difflib
 from collections.abc import Iterable
@@ -9,10 +9,10 @@ import numpy as np
 
 
 class Source(NamedTuple):
-    """Our `signal` is `scale` value + `offset`, in `unit`, of what the recording calls `source`.
+    """`signal` in `unit` is `scale` value + `offset` of the recording's `source`.
 
-    A source is a column, or "/topic:field.sub[2]" in MCAP; a bare name there is
-    the field of that name in the only topic that has it.
+    A source is a column, or "/topic:field.sub[2]" in MCAP. There a bare name is the field of that name in the
+    only topic that has it.
     """
 
     signal: str
@@ -23,8 +23,8 @@ class Source(NamedTuple):
 
 
 class Note(NamedTuple):
-    """What reading met: `count` messages, chunks, values or lines; `signal`
-    is empty where it is about the whole recording."""
+    """A remark of the reader on `count` messages, chunks, values or lines. `signal` is empty for the whole
+    recording."""
 
     kind: str
     signal: str
@@ -33,10 +33,10 @@ class Note(NamedTuple):
 
 
 class Raw(NamedTuple):
-    """A recording as it was made: {signal: (time_s (n,), values (n,))}
-    with a clock each; NaN where no value was written.
+    """A recording as it was made: {signal: (time_s (n,), values (n,))} with a clock each. A missing value is
+    NaN.
 
-    `messages` counts each topic's, or rows.
+    `messages` has the count of each topic's messages, or of the rows.
     """
 
     path: str
@@ -46,8 +46,8 @@ class Raw(NamedTuple):
 
 
 class Flag(NamedTuple):
-    """A finding: what (`kind`), where (start_s to end_s), how many samples, and one
-    sentence; `signal` is empty for the whole recording."""
+    """A finding: what (`kind`), where (start_s to end_s), how many samples, and one sentence. `signal` is
+    empty for the whole recording."""
 
     signal: str
     kind: str
@@ -58,8 +58,8 @@ class Flag(NamedTuple):
 
 
 class Jitter(NamedTuple):
-    """Intervals of one clock, those across gaps left out: their median,
-    and the deviation from it (standard and largest)."""
+    """Intervals of one clock without those across gaps: their median, and the deviation from it (standard and
+    largest)."""
 
     interval_s: float
     std_s: float
@@ -69,8 +69,8 @@ class Jitter(NamedTuple):
 class Table(NamedTuple):
     """A recording on one sample time: T samples in segments without a gap.
 
-    `values` are as measured, never altered; `masked` says which are not to be used. `jitter` is that of each
-    signal's own clock before resampling.
+    `values` are as measured, never altered. `masked` marks those that are not to be used. `jitter` is that of
+    each signal's own clock before resampling.
     """
 
     recording: str
@@ -83,27 +83,27 @@ class Table(NamedTuple):
 
 
 def nearest_names(name: str, names: Iterable[str]) -> str:
-    """ "the nearest names are a, b": those like `name`, or the first ten that there are."""
+    """ "the nearest names are a, b": names like `name`, or the first ten that there are."""
     names = sorted(set(names))
     if not names:
         return "it has none that can be read as a number"
     # "/topic:field" is found by its field alone too
-    known = [
+    aliases = [
         (part, full)
         for full in names
         for part in sorted({full.casefold(), full.casefold().rpartition(":")[2]})
     ]
-    close = difflib.get_close_matches(name.casefold(), sorted({part for part, _ in known}), n=3, cutoff=0.5)
+    close = difflib.get_close_matches(name.casefold(), sorted({part for part, _ in aliases}), n=3, cutoff=0.5)
     close += [name.casefold().rpartition(":")[2]]
-    close = list(dict.fromkeys(full for wanted in close for part, full in known if part == wanted))
+    close = list(dict.fromkeys(full for wanted in close for part, full in aliases if part == wanted))
     if close:
         return f"the nearest names are {', '.join(close[:5])}"
     return f"it has {', '.join(names[:10])}{' and more' if len(names) > 10 else ''}"
 
 
 def intervals(time_s: np.ndarray, gap_limit_s: float = np.inf) -> Jitter:
-    """Jitter of a clock time_s (n,), n >= 2, from the intervals that are no longer than `gap_limit_s`."""
+    """Jitter of a clock time_s (n,), n >= 2, from the intervals up to `gap_limit_s`."""
     steps = np.diff(time_s)
-    kept = steps[steps <= gap_limit_s] if (steps <= gap_limit_s).any() else steps
-    deviation = kept - np.median(kept)
+    regular = steps[steps <= gap_limit_s] if (steps <= gap_limit_s).any() else steps
+    deviation = regular - np.median(regular)
     return Jitter(float(np.median(steps)), float(deviation.std()), float(np.abs(deviation).max()))

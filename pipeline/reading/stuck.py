@@ -1,6 +1,8 @@
-"""Signals that stand still where they should not: frozen sensors, and converters on their rail. A
-process comes to rest by and by, and a coarse sensor shows that in longer and longer stretches;
-only what stops at once was stopped by the sensor."""
+"""Signals that stand still but should not: frozen sensors, and converters on their rail.
+
+A process comes to rest slowly, and a coarse sensor shows that in longer and longer stretches. A signal that
+stops at once was stopped by its sensor.
+"""
 
 import numpy as np
 
@@ -12,13 +14,15 @@ BESIDE = 24
 
 
 def frozen(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
-    """Stretches of one value, far longer than is usual for the signal, at whose ends
-    noise ends at once, or a movement does and is then seen to have gone on: by a jump at
-    the end of the stretch, or by what moves beside it."""
+    """Stretches of one value that are far longer than usual for the signal and begin at once.
+
+    Noise ends at once at an end of the stretch, or a movement does although it went on: a jump at the end of
+    the stretch shows that, or other signals that move meanwhile.
+    """
     values = np.where(table.masked[name], np.nan, table.values[name])
     first, last = runs(values, table.segment)
     length = last - first + 1
-    found = []
+    stretches = []
     for i in np.flatnonzero(length >= FROZEN_SHORTEST):
         a, b = int(first[i]), int(last[i])
         if length[i] <= OVER_USUAL * _usual(np.delete(length, i)) or _at_rail(values, table.segment, a):
@@ -37,7 +41,7 @@ def frozen(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
             message = (
                 f"{name} stays at {values[a]:g} for {b - a + 1} samples{beside}: a frozen sensor, masked"
             )
-            found.append(
+            stretches.append(
                 (
                     Flag(
                         name,
@@ -50,20 +54,20 @@ def frozen(table: Table, name: str) -> list[tuple[Flag, np.ndarray]]:
                     where,
                 )
             )
-    return found
+    return stretches
 
 
 def rails(table: Table, name: str) -> list[Flag]:
-    """A largest or smallest value at which the signal stops at once, and stays for long."""
+    """Flags for a largest or smallest value at which the signal stops at once and stays for long."""
     values = np.where(table.masked[name], np.nan, table.values[name])
-    known = values[np.isfinite(values)]
-    if not len(known) or np.ptp(known) == 0:
+    finite = values[np.isfinite(values)]
+    if not len(finite) or np.ptp(finite) == 0:
         return []
     first, last = runs(values, table.segment)
     length = last - first + 1
     limit = max(RAIL_SHORTEST, OVER_USUAL * float(np.percentile(length, 95)))
     flags = []
-    for rail, side in ((known.max(), "largest"), (known.min(), "smallest")):
+    for rail, side in ((finite.max(), "largest"), (finite.min(), "smallest")):
         there = (values[first] == rail) & (length > limit)
         long = [
             (int(a), int(b))
@@ -92,18 +96,18 @@ def rails(table: Table, name: str) -> list[Flag]:
 
 
 def runs(values: np.ndarray, segment: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """First and last index (m,) of stretches of equal values within
-    segments; NaN end a stretch and are none."""
+    """First and last index (m,) of stretches of equal values within segments. A NaN ends a stretch and is in
+    none."""
     same = (values[1:] == values[:-1]) & (segment[1:] == segment[:-1])
     first = np.flatnonzero(np.r_[True, ~same])
     last = np.r_[first[1:], len(values)] - 1
-    known = np.isfinite(values[first])
-    return first[known], last[known]
+    finite = np.isfinite(values[first])
+    return first[finite], last[finite]
 
 
 def _usual(lengths: np.ndarray) -> float:
-    """The length that nine tenths of the samples are within: a coarse
-    or slow signal rests long, if not often."""
+    """The length of stretch that holds nine tenths of the samples. A coarse or slow signal rests long, if not
+    often."""
     ordered = np.sort(lengths)
     held = np.cumsum(ordered)
     return float(ordered[np.searchsorted(held, 0.9 * held[-1])]) if len(ordered) else np.inf
@@ -122,16 +126,15 @@ def _after(values: np.ndarray, segment: np.ndarray, last: int) -> np.ndarray:
 
 
 def _step(values: np.ndarray) -> float:
-    """The smallest change there is, but for rounding: the step of a coarse signal."""
+    """The smallest change but for rounding: the step of a coarse signal."""
     changes = np.abs(np.diff(values))
     changes = changes[changes > 0]
     return float(np.percentile(changes, 1)) if len(changes) else 0.0
 
 
 def _alive(changes: np.ndarray, step: float) -> str:
-    """What a signal does before it stops: "noise" of more than its step, "movement"
-    one way that does not slow down, "" for neither (it rests, or comes to rest), and
-    "edge" where the record has too little of it to tell."""
+    """The signal before it stops: "noise" of more than its step, "movement" one way that does not slow down,
+    "" for neither (it rests, or comes to rest), "edge" if the record has too little of it."""
     changes = changes[np.isfinite(changes)]
     if len(changes) < BESIDE // 2:
         return "edge"
@@ -162,7 +165,7 @@ def _moves(table: Table, name: str, first: int, last: int) -> bool:
 
 
 def _at_rail(values: np.ndarray, segment: np.ndarray, first: int) -> bool:
-    """Whether a stretch lies on the largest or smallest value of all, and the signal came there from
-    elsewhere: a machine at rest begins at its smallest."""
+    """Whether a stretch lies on the largest or smallest value of all, and the signal came there from another
+    value. (A machine at rest begins at its smallest.)"""
     begins = first == 0 or segment[first] != segment[first - 1]
     return not begins and bool(values[first] in (np.nanmax(values), np.nanmin(values)))

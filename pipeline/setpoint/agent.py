@@ -1,9 +1,10 @@
 """Deep Q-learning of setpoints as published (Li and Pattinson 2025, eqs. 10-13, tables 1 and 2): network,
 replay, one phase as one program, and the four phases.
 
-What the network sees is a `Sight`, so that the paper's 35 numbers and ours (belief_agent.py) train by the
-same lines. Two heads, one for the flow and one for the temperature, each with one maximum and a one-step
-target of its own; step 100 ends an episode without ending the task, so its target still looks ahead.
+An `ObservationEncoder` makes the network's input, so that the paper's 35 numbers and the belief
+(belief_agent.py) train by the same lines. Two heads, one for the flow and one for the temperature, each with
+one maximum and a one-step target of its own; step 100 ends an episode without ending the task, so its target
+still looks ahead.
 """
 
 from collections.abc import Callable
@@ -17,7 +18,6 @@ import optax
 from jax.tree_util import Partial
 
 from pipeline.setpoint.published import BEST_TEMPERATURE, LAMBDA, PHASES
-from pipeline.setpoint.reward import reward
 from pipeline.setpoint.simulator import (
     CHANCES,
     FLOW_LIMITS,
@@ -36,12 +36,15 @@ from pipeline.setpoint.simulator import (
     paper_state,
     paper_windows,
     remembered,
+    reward,
     stepped,
 )
 
 VISION = HISTORY + 3  # numbers of the state that come from the camera; the rest are temperatures
 ACTIONS = 5  # of each head
-SHORT = 256  # rows that one product sums: the linear algebra under XLA cuts longer sums by the size of the CPU's first cache (288 numbers in 32 kB)
+# rows that one product sums: the linear algebra under XLA cuts longer sums by the size of the CPU's first
+# cache (288 numbers in 32 kB)
+SHORT = 256
 TEMPERATURE_SCALE = 30.0  # °C, half the range of the targets: degrees as they come drown the camera's numbers
 
 
@@ -67,60 +70,57 @@ class QNetwork(eqx.Module):
         # both first layers as one product, zeros where one does not see the other's numbers: for a batch that
         # is dearer in sums and cheaper in moving them
         both = jax.scipy.linalg.block_diag(self.vision.weight, self.temperature.weight)
-        seen = jax.nn.relu(both @ state + jnp.concatenate([self.vision.bias, self.temperature.bias]))
-        return self.heads(jax.nn.relu(self.joint(seen))).reshape(2, ACTIONS)
+        hidden = jax.nn.relu(both @ state + jnp.concatenate([self.vision.bias, self.temperature.bias]))
+        return self.heads(jax.nn.relu(self.joint(hidden))).reshape(2, ACTIONS)
 
 
-class Sight(NamedTuple):
-    """What a network sees: start() -> memory; see(parameters, memory,
-    observation) -> (memory, x (d,)). Pure, for one episode."""
+class ObservationEncoder(NamedTuple):
+    """Observations -> the network's input: start() -> memory; encode(parameters, memory, observation) ->
+    (memory, x (d,)). Pure, for one episode."""
 
     start: Callable[[], Any]
-    see: Callable[[Any, Any, Observation], tuple[Any, jax.Array]]
+    encode: Callable[[Any, Any, Observation], tuple[Any, jax.Array]]
 
 
-def paper_sight() -> Sight:
+def paper_encoder() -> ObservationEncoder:
     """The state (9): 30 former classes, the scaled distribution, and both temperatures as (u - 210) / 30."""
 
-    def see(network, history, observation):
+    def encode(network, history, observation):
         state = paper_state(history, observation)
         return remembered(history, observation.named), state.at[VISION:].add(-BEST_TEMPERATURE).at[
             VISION:
         ].divide(TEMPERATURE_SCALE)
 
-    return Sight(first_history, see)
+    return ObservationEncoder(first_history, encode)
 
 
-def greedy(sight: Sight) -> Controller:
+def greedy(encoder: ObservationEncoder) -> Controller:
     """The controller that takes the best action of each head; its parameters are the network. The simulator
     heeds the temperature's every 10th step."""
 
     def act(network, memory, observation, key):
-        memory, x = sight.see(network, memory, observation)
+        memory, x = encoder.encode(network, memory, observation)
         best = network(x).argmax(axis=1)
         return memory, Action(best[0], best[1])
 
-    return Controller(sight.start, act)
+    return Controller(encoder.start, act)
 
 
 # ---- learning
 
 
-class Learner(NamedTuple):
-    """Network, its slow copy (13), and the optimiser's state: all that goes from one phase to the next. The
-    replay does not: its rewards are of the old phase."""
+class TrainState(NamedTuple):
+    """Network, its target network (13), and the optimiser's state: all that goes from one phase to the next.
+    The replay buffer does not: its rewards are of the old phase."""
 
     network: eqx.Module
-    slow: eqx.Module
-    moments: Any
+    target_network: eqx.Module
+    opt_state: Any
 
 
-class Setting(NamedTuple):
-    """Numbers of table 2 and those it leaves open: `updates` of a phase, each
-    after one step of `environments` episodes at once.
-
-    gamma of both heads, or (2,) of each.
-    """
+class DqnSettings(NamedTuple):
+    """Numbers of table 2 and those it leaves open. Each update comes after one step of `environments`
+    episodes at once. gamma is of both heads, or (2,) of each."""
 
     gamma: float | jax.Array
     tau: float
@@ -132,28 +132,31 @@ class Setting(NamedTuple):
 
 class Replay(NamedTuple):
     """Transitions: x and what followed (n, d), action and reward of both heads (n, 2), and
-    whether lambda's clock heeds no temperature action next (n,): then the temperature stands,
-    and the target says so; a maximum there would make waiting free. The ring keeps them as
-    rows of 2 d + 5 numbers: one place to look up each."""
+    temperature_action_masked (n,): lambda's clock heeds no temperature action next.
+
+    Where it is masked, the temperature stands, and the target says so; a maximum there would make waiting
+    free. The replay buffer keeps them as rows of 2 d + 5 numbers: one place to look up each.
+    """
 
     x: jax.Array
     after: jax.Array
     action: jax.Array
     reward: jax.Array
-    waits: jax.Array
+    temperature_action_masked: jax.Array
 
 
 def _packed(rows: Replay) -> jax.Array:
-    return jnp.concatenate([rows.x, rows.after, rows.action, rows.reward, rows.waits[:, None]], axis=1)
+    masked = rows.temperature_action_masked
+    return jnp.concatenate([rows.x, rows.after, rows.action, rows.reward, masked[:, None]], axis=1)
 
 
 def _unpacked(table: jax.Array) -> Replay:
     d = (table.shape[1] - 5) // 2
-    x, after, action, reward, waits = jnp.split(table, (d, 2 * d, 2 * d + 2, 2 * d + 4), axis=1)
-    return Replay(x, after, action.astype(jnp.int8), reward, waits[:, 0] > 0)
+    x, after, action, reward, masked = jnp.split(table, (d, 2 * d, 2 * d + 2, 2 * d + 4), axis=1)
+    return Replay(x, after, action.astype(jnp.int8), reward, masked[:, 0] > 0)
 
 
-class World(NamedTuple):
+class EnvSpec(NamedTuple):
     """Where experience comes from: windows, conditions(key) of a new
     episode, and rewards(state) -> (2,) of both heads."""
 
@@ -162,71 +165,85 @@ class World(NamedTuple):
     rewards: Callable[[State], jax.Array]
 
 
-def greatest(network, slow, after: jax.Array) -> jax.Array:
-    """max_a Q(s', a; slow) of each head (11)."""
-    return slow(after).max(axis=1)
+class DqnProblem(NamedTuple):
+    """What a phase trains on: encoder of the network's input, environment, optimiser,
+    bootstrap(network, target_network, x (d,)) -> values (2,), and the settings."""
+
+    encoder: ObservationEncoder
+    env: EnvSpec
+    optimiser: optax.GradientTransformation
+    bootstrap: Callable
+    settings: DqnSettings
 
 
-def double(network, slow, after: jax.Array) -> jax.Array:
-    """Q(s', argmax_a Q(s', a); slow): the network chooses, the slow
-    copy values (van Hasselt, Guez and Silver 2016)."""
-    return jnp.take_along_axis(slow(after), network(after).argmax(axis=1)[:, None], axis=1)[:, 0]
+def dqn_target(network, target_network, after: jax.Array) -> jax.Array:
+    """max_a Q(s', a; target network) of each head (11)."""
+    return target_network(after).max(axis=1)
 
 
-def _fresh(world: World, sight: Sight, network, keys):
-    """New episodes, one a key: conditions, state, memory and what the network sees."""
+def double_dqn_target(network, target_network, after: jax.Array) -> jax.Array:
+    """Q(s', argmax_a Q(s', a); target network): the network chooses, the target network values
+    (van Hasselt, Guez and Silver 2016)."""
+    return jnp.take_along_axis(target_network(after), network(after).argmax(axis=1)[:, None], axis=1)[:, 0]
+
+
+def _fresh(problem: DqnProblem, network, keys):
+    """New episodes, one a key: conditions, state, memory and the network's input."""
+    env, encoder = problem.env, problem.encoder
 
     def one(key):
-        conditions = world.conditions(key)
-        state, observation = begin(world.windows, conditions, key)
-        return conditions, state, *sight.see(network, sight.start(), observation)
+        conditions = env.conditions(key)
+        state, observation = begin(env.windows, conditions, key)
+        return conditions, state, *encoder.encode(network, encoder.start(), observation)
 
     return jax.vmap(one)(keys)
 
 
-def _stepped(world: World, sight: Sight, network, episodes, epsilon, u: jax.Array, key, length: int):
+def _stepped(problem: DqnProblem, network, episodes, epsilon, u: jax.Array, key):
     """One step of all episodes under the epsilon-greedy policy, by u (n, 4 + CHANCES) uniform in [0, 1) ->
     (episodes, their transitions); those that are over start anew, from the key."""
+    env = problem.env
     conditions, state, memory, x = episodes
     explores, at_random, befalls = u[:, :2] < epsilon, (ACTIONS * u[:, 2:4]).astype(jnp.int32), u[:, 4:]
     action = jnp.where(explores, at_random, jax.vmap(network)(x).argmax(axis=2))
     action = action.at[:, 1].set(
         jnp.where(state.step % LAMBDA == 0, action[:, 1], STAND)
     )  # what is not heeded is standing
-    state, observation = jax.vmap(Partial(stepped, world.windows))(
+    state, observation = jax.vmap(Partial(stepped, env.windows))(
         conditions, state, Action(action[:, 0], action[:, 1]), befalls
     )
-    memory, after = jax.vmap(Partial(sight.see, network))(memory, observation)
-    rewards = jax.vmap(world.rewards)(state)
-    over, waits = state.step >= length, state.step % LAMBDA != 0
+    memory, after = jax.vmap(Partial(problem.encoder.encode, network))(memory, observation)
+    rewards = jax.vmap(env.rewards)(state)
+    over, masked = state.step >= problem.settings.episode, state.step % LAMBDA != 0
 
     def renewed(going):
-        again = _fresh(world, sight, network, jax.random.split(key, len(x)))
+        again = _fresh(problem, network, jax.random.split(key, len(x)))
         return jax.tree.map(
             lambda new, old: jnp.where(over.reshape(-1, *[1] * (old.ndim - 1)), new, old), again, going
         )
 
     episodes = jax.lax.cond(over.any(), renewed, lambda going: going, (conditions, state, memory, after))
-    return episodes, Replay(x, after, action.astype(jnp.int8), rewards, waits)
+    return episodes, Replay(x, after, action.astype(jnp.int8), rewards, masked)
 
 
-def _updated(
-    learner: Learner, rows: Replay, optimiser, bootstrap, gamma: float | jax.Array, tau: float
-) -> Learner:
+def _updated(train_state: TrainState, rows: Replay, problem: DqnProblem) -> TrainState:
     """One step on (12) for a batch, then (13)."""
-    ahead = jax.vmap(Partial(bootstrap, learner.network, learner.slow))(rows.after)
-    standing = jax.vmap(learner.slow)(rows.after)[:, 1, STAND]
-    y = rows.reward + gamma * ahead.at[:, 1].set(jnp.where(rows.waits, standing, ahead[:, 1]))
+    network, target_network = train_state.network, train_state.target_network
+    gamma, tau = problem.settings.gamma, problem.settings.tau
+    ahead = jax.vmap(Partial(problem.bootstrap, network, target_network))(rows.after)
+    standing = jax.vmap(target_network)(rows.after)[:, 1, STAND]
+    masked = rows.temperature_action_masked
+    y = rows.reward + gamma * ahead.at[:, 1].set(jnp.where(masked, standing, ahead[:, 1]))
     taken = jax.nn.one_hot(rows.action, ACTIONS)
 
     def loss(network, x, taken, y):
         return ((y - (jax.vmap(network)(x) * taken).sum(axis=2)) ** 2).mean()
 
-    gradient = _mean_gradient(loss, learner.network, rows.x, taken, y)
-    change, moments = optimiser.update(gradient, learner.moments)
-    network = optax.apply_updates(learner.network, change)
-    slow = jax.tree.map(lambda old, new: tau * new + (1 - tau) * old, learner.slow, network)
-    return Learner(network, slow, moments)
+    gradient = _mean_gradient(loss, network, rows.x, taken, y)
+    change, opt_state = problem.optimiser.update(gradient, train_state.opt_state)
+    network = optax.apply_updates(network, change)
+    target_network = jax.tree.map(lambda old, new: tau * new + (1 - tau) * old, target_network, network)
+    return TrainState(network, target_network, opt_state)
 
 
 def _mean_gradient(loss: Callable, network, *batch: jax.Array):
@@ -240,71 +257,55 @@ def _mean_gradient(loss: Callable, network, *batch: jax.Array):
 
 
 def phase(
-    learner: Learner, key: jax.Array, *, sight: Sight, world: World, optimiser: optax.GradientTransformation,
-    bootstrap: Callable, setting: Setting,
-    updates: int, longest: int, epsilon: tuple[float, float],
-) -> tuple[Learner, jax.Array]:  # fmt: skip
-    """A whole phase as one program -> the learner after it and the mean reward of each step (updates,);
+    train_state: TrainState,
+    key: jax.Array,
+    problem: DqnProblem,
+    *,
+    updates: int,
+    longest: int,
+    epsilon: tuple[float, float],
+) -> tuple[TrainState, jax.Array]:
+    """A whole phase as one program -> the train state after it and the mean reward of each step (updates,);
     epsilon falls in a line over the first third.
 
-    A step of all episodes, one batch from an empty replay, one update, `updates` times. Episodes start at
-    different steps, so that they do not end together. Phases with the same `longest`, the updates of the
+    A step of all episodes, one batch from an empty replay buffer, one update, `updates` times. Episodes start
+    at different steps, so that they do not end together. Phases with the same `longest`, the updates of the
     longest of them, are one program compiled once.
     """
-    learner, rewards = _phase(
-        learner, key, jnp.asarray(updates), jnp.asarray(epsilon), sight=sight, world=world,
-        optimiser=optimiser, bootstrap=bootstrap, setting=setting, longest=longest
-    )  # fmt: skip
-    return learner, rewards[:updates]
+    train_state, rewards = _phase(
+        train_state, key, problem, jnp.asarray(updates), jnp.asarray(epsilon), longest=longest
+    )
+    return train_state, rewards[:updates]
 
 
 @eqx.filter_jit
-def _phase(
-    learner,
-    key,
-    updates,
-    epsilon,
-    *,
-    sight: Sight,
-    world: World,
-    optimiser,
-    bootstrap,
-    setting: Setting,
-    longest: int,
-):
+def _phase(train_state: TrainState, key, problem: DqnProblem, updates, epsilon, *, longest: int):
+    settings = problem.settings
     k_start, k_clock, key = jax.random.split(key, 3)
-    n, capacity = setting.environments, setting.capacity
-    conditions, state, memory, x = _fresh(world, sight, learner.network, jax.random.split(k_start, n))
-    state = state._replace(step=LAMBDA * jax.random.randint(k_clock, (n,), 0, setting.episode // LAMBDA))
+    n, capacity = settings.environments, settings.capacity
+    conditions, state, memory, x = _fresh(problem, train_state.network, jax.random.split(k_start, n))
+    state = state._replace(step=LAMBDA * jax.random.randint(k_clock, (n,), 0, settings.episode // LAMBDA))
     # a step draws some thousand numbers: by XLA's own generator
     # (Philox), which costs a tenth of jax's default there
     fast = jax.random.wrap_key_data(jnp.tile(jax.random.key_data(key), 2), impl="rbg")
 
     def one(i, carry):
-        learner, episodes, ring, paid = carry
+        train_state, episodes, replay_buffer, rewards = carry
         k_step, k_batch = (jax.random.fold_in(fast, 2 * i + j) for j in (0, 1))
         now = epsilon[0] + (epsilon[1] - epsilon[0]) * jnp.minimum(3.0 * i / updates, 1.0)
-        episodes, new = _stepped(
-            world,
-            sight,
-            learner.network,
-            episodes,
-            now,
-            jax.random.uniform(k_step, (n, 4 + CHANCES)),
-            jax.random.fold_in(key, i),
-            setting.episode,
-        )
-        ring = jax.lax.dynamic_update_slice_in_dim(ring, _packed(new), i * n % capacity, 0)
+        u = jax.random.uniform(k_step, (n, 4 + CHANCES))
+        episodes, new = _stepped(problem, train_state.network, episodes, now, u, jax.random.fold_in(key, i))
+        replay_buffer = jax.lax.dynamic_update_slice_in_dim(replay_buffer, _packed(new), i * n % capacity, 0)
         filled = jnp.minimum((i + 1) * n, capacity).astype(jnp.uint32)
-        chosen = (jax.random.bits(k_batch, (setting.batch,)) % filled).astype(jnp.int32)
-        learner = _updated(learner, _unpacked(ring[chosen]), optimiser, bootstrap, setting.gamma, setting.tau)
-        return learner, episodes, ring, paid.at[i].set(new.reward.mean())
+        chosen = (jax.random.bits(k_batch, (settings.batch,)) % filled).astype(jnp.int32)
+        train_state = _updated(train_state, _unpacked(replay_buffer[chosen]), problem)
+        return train_state, episodes, replay_buffer, rewards.at[i].set(new.reward.mean())
 
-    ring = jnp.zeros((capacity, 2 * x.shape[1] + 5))
-    learner, _, _, rewards = jax.lax.fori_loop(
-        0, updates, one, (learner, (conditions, state, memory, x), ring, jnp.zeros(longest))
+    replay_buffer = jnp.zeros((capacity, 2 * x.shape[1] + 5))
+    train_state, _, _, rewards = jax.lax.fori_loop(
+        0, updates, one, (train_state, (conditions, state, memory, x), replay_buffer, jnp.zeros(longest))
     )
-    return learner, rewards
+    return train_state, rewards
 
 
 # ---- the paper's four phases
@@ -330,44 +331,50 @@ def anywhere(accuracy, key: jax.Array) -> Conditions:
     return nominal(flow, temperature, accuracy=accuracy)
 
 
-def train_published(
-    key: jax.Array,
-    *,
-    setting: Setting,
-    rate: float,
-    updates: tuple[int, ...],
-    accuracy: float,
-    explore: float,
-    explore_again: float,
-    least: float,
-    on_step=None,
-) -> Published:
+class PublishedTraining(NamedTuple):
+    """`updates` of each phase, as many phases as there are numbers; accuracy of the windows in the last one.
+
+    Epsilon falls to `least`: from `explore` in phase 1, from `explore_again` in the later ones.
+    """
+
+    dqn: DqnSettings
+    learning_rate: float
+    updates: tuple[int, ...]
+    accuracy: float
+    explore: float
+    explore_again: float
+    least: float
+
+
+def train_published(key: jax.Array, settings: PublishedTraining, *, on_step=None) -> Published:
     """The four phases: reward shapes (40, 20), (40, 10), (20, 10) on windows that are always right, then the
     last shape with `accuracy`; Adam at one rate throughout.
 
-    epsilon falls from `explore` in phase 1, from `explore_again` in the later ones, to
-    `least`; `updates` of each phase, as many phases as there are numbers.
     on_step(phase, network, rewards) is called after each phase.
     """
     k_network, key = jax.random.split(key)
-    network, optimiser, sight, windows = QNetwork(k_network), optax.adam(rate), paper_sight(), paper_windows()
-    learner = Learner(network, network, optimiser.init(eqx.filter(network, eqx.is_array)))
+    network, optimiser = QNetwork(k_network), optax.adam(settings.learning_rate)
+    encoder, windows = paper_encoder(), paper_windows()
+    train_state = TrainState(network, network, optimiser.init(eqx.filter(network, eqx.is_array)))
     networks, all_rewards = [], []
-    for i, count in enumerate(updates):
+    for i, count in enumerate(settings.updates):
         a, b = PHASES[min(i, len(PHASES) - 1)]
-        right = 1.0 if i < len(PHASES) else accuracy
-        world = World(
+        right = 1.0 if i < len(PHASES) else settings.accuracy
+        env = EnvSpec(
             windows, Partial(anywhere, jnp.asarray(right)), Partial(ellipse, jnp.asarray(a), jnp.asarray(b))
         )
-        learner, rewards = phase(
-            learner, jax.random.fold_in(key, i), sight=sight, world=world, optimiser=optimiser,
-            bootstrap=greatest, setting=setting, updates=count,
-            longest=max(updates), epsilon=(explore if i == 0 else explore_again, least),
-        )  # fmt: skip
-        networks.append(learner.network)
+        train_state, rewards = phase(
+            train_state,
+            jax.random.fold_in(key, i),
+            DqnProblem(encoder, env, optimiser, dqn_target, settings.dqn),
+            updates=count,
+            longest=max(settings.updates),
+            epsilon=(settings.explore if i == 0 else settings.explore_again, settings.least),
+        )
+        networks.append(train_state.network)
         all_rewards.append(rewards)
         if on_step is not None:
-            on_step(i + 1, learner.network, rewards)
+            on_step(i + 1, train_state.network, rewards)
     return Published(tuple(networks), tuple(all_rewards))
 
 
@@ -392,11 +399,11 @@ def with_weights(network: eqx.Module, arrays: dict[str, np.ndarray]) -> eqx.Modu
         name for name in own if own[name].shape != np.shape(arrays[name])
     ]
     if wrong:
-        found = f"shape {np.shape(arrays[wrong[0]])}" if wrong[0] in arrays else "none"
+        shape = f"shape {np.shape(arrays[wrong[0]])}" if wrong[0] in arrays else "none"
         raise ValueError(
             f"weights of another architecture: {wrong[0]!r} is "
             f"{f'of shape {own[wrong[0]].shape}' if wrong[0] in own else 'unknown'} in this "
-            f"network and {found} in "
+            f"network and {shape} in "
             "the file; train again, or load them into the network that they were trained in"
         )
     return jax.tree.unflatten(jax.tree.structure(network), [jnp.asarray(arrays[name]) for name in own])

@@ -46,8 +46,8 @@ def proportional() -> Controller:
     ) -> tuple[jax.Array, Action]:
         y = y + (observation.shares[UNDER] - observation.shares[OVER] - y) / parameters.time_constant
         move = nearest(FLOW_MOVES, parameters.gain * y)
-        kept = jnp.where(move == STAND, y, y * (1.0 - 1.0 / parameters.time_constant))
-        return kept, Action(move, temperature_move(observation))
+        remembered = jnp.where(move == STAND, y, y * (1.0 - 1.0 / parameters.time_constant))
+        return remembered, Action(move, temperature_move(observation))
 
     return Controller(lambda: jnp.zeros(()), act)
 

@@ -1,7 +1,7 @@
 """Bayes filters for the flow: what the windows say on a grid of flows, under several hypotheses of how the
 camera errs, and the move with the least expected loss.
 
-The flow is known by its moves and by the windows it shows. The filter carries b(h, q), the belief that the
+Its moves and the windows it shows tell the flow. The filter carries b(h, q), the belief that the
 flow is q, the camera errs in the manner of h, and the extruder follows its commands with the gain g_h:
 
 b(h, q) <- sum_h' T(h', h) [(1 - hazard) b(h', q - g_h' move) + hazard b'(h') prior(q)] the move; a
@@ -13,8 +13,8 @@ Manners of erring (`evidence`): anywhere with one probability, as in the paper's
 trained classifier does by its recorded windows, seen through a segment that makes every bead look
 wider or narrower. Which it is, and how the extruder follows, shows by itself. b'(h) is b(h) with all
 gains alike: what clogs a nozzle changes how its flow follows, too. Windows of a segment are alike:
-where the flow setpoint stood, one shows with probability `repeats` what the one before did, whatever
-the flow, so that ten alike are not ten witnesses.
+where the flow setpoint stood, one shows with window_repeat_probability what the one before did,
+whatever the flow, so that ten alike are not ten witnesses.
 """
 
 from collections.abc import Sequence
@@ -51,33 +51,34 @@ CODES = CLASSES * LEVELS
 
 
 class Filter(NamedTuple):
-    """evidence (H, CODES, N) is P(code | h, q); transition and after_jump (H, H) from row to
-    column at each decision and each jump of the flow; gains (H,), true by commanded move; repeats
-    (H,): probability that a window shows what the one before did where the flow setpoint stood;
-    hazard: probability a decision that the flow jumps; move_cost in percent of flow error by
-    percent of move, outside_cost in percent of flow error."""
+    """evidence (H, CODES, N) is P(code | h, q). transition and after_jump (H, H) lead from row to column at
+    each decision and at each jump of the flow. gains (H,): true by commanded move. window_repeat_probability
+    (H,): that a window shows what the one before did where the flow setpoint stood. hazard: probability a
+    decision that the flow jumps. move_cost in percent of flow error by percent of move, outside_cost in
+    percent of flow error."""
 
     evidence: jax.Array
     transition: jax.Array
     after_jump: jax.Array
     gains: jax.Array
-    repeats: jax.Array
+    window_repeat_probability: jax.Array
     hazard: float
     move_cost: float
     outside_cost: float
 
 
-class Known(NamedTuple):
+class FilterState(NamedTuple):
     """What the filter remembers: belief (H, N), sum 1, and the code of
     the last window, -1 before the first."""
 
     belief: jax.Array
-    last: jax.Array
+    last_code: jax.Array
 
 
-def unknown(hypotheses: int) -> Known:
+def initial_state(hypotheses: int) -> FilterState:
     """Before the first window."""
-    return Known(jnp.tile(jnp.asarray(PRIOR, jnp.float32) / hypotheses, (hypotheses, 1)), jnp.int32(-1))
+    belief = jnp.tile(jnp.asarray(PRIOR, jnp.float32) / hypotheses, (hypotheses, 1))
+    return FilterState(belief, jnp.int32(-1))
 
 
 @cache  # one pair of functions, so that what was compiled for it is found again
@@ -85,28 +86,29 @@ def bayes(hypotheses: int) -> Controller:
     """The filter and its greedy move, for Filter parameters of so many hypotheses."""
 
     def act(
-        parameters: Filter, known: Known, observation: Observation, key: jax.Array
-    ) -> tuple[Known, Action]:
-        known = believed(parameters, known, observation)
-        return known, Action(
-            jnp.argmin(expected_loss(parameters, known.belief)).astype(jnp.int32),
+        parameters: Filter, state: FilterState, observation: Observation, key: jax.Array
+    ) -> tuple[FilterState, Action]:
+        state = filter_update(parameters, state, observation)
+        return state, Action(
+            jnp.argmin(expected_loss(parameters, state.belief)).astype(jnp.int32),
             temperature_move(observation),
         )
 
-    return Controller(lambda: unknown(hypotheses), act)
+    return Controller(lambda: initial_state(hypotheses), act)
 
 
-def believed(parameters: Filter, known: Known, observation: Observation) -> Known:
-    """What is known after the move that led to this window, and the window."""
-    moved = jax.vmap(shifted)(known.belief, parameters.gains * observation.flow_move)
-    jumped = (parameters.after_jump.T @ known.belief.sum(axis=1))[:, None] * jnp.asarray(PRIOR, jnp.float32)
+def filter_update(parameters: Filter, state: FilterState, observation: Observation) -> FilterState:
+    """The state after the move that led to this window, and the window."""
+    moved = jax.vmap(predict_shift)(state.belief, parameters.gains * observation.flow_move)
+    jumped = (parameters.after_jump.T @ state.belief.sum(axis=1))[:, None] * jnp.asarray(PRIOR, jnp.float32)
     predicted = parameters.transition.T @ ((1.0 - parameters.hazard) * moved + parameters.hazard * jumped)
     shown = code(observation.shares, observation.named)
-    repeats = (parameters.repeats * ((known.last >= 0) & (observation.flow_move == 0)))[:, None]
+    may_repeat = (state.last_code >= 0) & (observation.flow_move == 0)
+    repeats = (parameters.window_repeat_probability * may_repeat)[:, None]
     posterior = predicted * (
-        repeats * (shown == known.last) + (1.0 - repeats) * parameters.evidence[:, shown]
+        repeats * (shown == state.last_code) + (1.0 - repeats) * parameters.evidence[:, shown]
     )
-    return Known(posterior / posterior.sum(), shown)
+    return FilterState(posterior / posterior.sum(), shown)
 
 
 def expected_loss(parameters: Filter, belief: jax.Array) -> jax.Array:
@@ -119,12 +121,12 @@ def expected_loss(parameters: Filter, belief: jax.Array) -> jax.Array:
     ) + parameters.move_cost * jnp.abs(moves)
 
 
-def shifted(belief: jax.Array, move: jax.Array) -> jax.Array:
+def predict_shift(belief: jax.Array, move: jax.Array) -> jax.Array:
     """The belief (..., N) moved by `move` percent, linear between grid points;
     what would leave the grid stays on its last point."""
-    whole = jnp.floor(move / SPACING)
-    fraction = move / SPACING - whole
-    source = jnp.arange(len(GRID)) - whole.astype(jnp.int32)
+    steps = jnp.floor(move / SPACING)
+    fraction = move / SPACING - steps
+    source = jnp.arange(len(GRID)) - steps.astype(jnp.int32)
 
     def at(index):
         return jnp.where(
@@ -156,25 +158,25 @@ def _paper_levels() -> np.ndarray:
     """(CODES,) P(code | class named) under (7), by the midpoints of its two
     uniform numbers, with a floor of 1 % for every level."""
     u = jnp.stack(jnp.meshgrid(*2 * [(jnp.arange(100) + 0.5) / 100], indexing="ij"), axis=-1).reshape(-1, 2)
-    found = np.zeros(CODES)
+    frequency = np.zeros(CODES)
     for flow in (50.0, 100.0, 150.0):
         drawn = jax.vmap(
             lambda pair, flow=flow: paper_windows().draw(
                 (), nominal(flow, 210.0, accuracy=1.0), flow, 0.0, jnp.concatenate([jnp.zeros(1), pair])
             )
         )(u)
-        found += np.bincount(np.asarray(code(*drawn)), minlength=CODES) / len(u)
-    return 0.99 * found + 0.01 / LEVELS
+        frequency += np.bincount(np.asarray(code(*drawn)), minlength=CODES) / len(u)
+    return 0.99 * frequency + 0.01 / LEVELS
 
 
 def recorded_evidence(
-    table: WindowTable, *, look: float, looks: int, floor: float, smoothing: float
+    table: WindowTable, *, width_bias_std: float, width_bias_levels: int, floor: float, smoothing: float
 ) -> np.ndarray:
-    """(looks, CODES, N): frequencies of the codes by flow, in hypothesis j seen as if the flow were q
-    exp(look z_j), z_j the middles of `looks` equal parts of N(0, 1).
+    """(width_bias_levels, CODES, N): frequencies of the codes by flow, under hypothesis j as if the flow were
+    q exp(width_bias_std z_j), z_j the middles of width_bias_levels equal parts of N(0, 1).
 
-    look: relative width that a segment adds to its beads, one deviation; floor: share of windows that may
-    show anything; smoothing over flow in percent, one deviation, at least half a bin.
+    width_bias_std: relative width that a segment adds to its beads, one deviation; floor: share of windows
+    that may show anything; smoothing over flow in percent, one deviation, at least half a bin.
     """
     edges = np.asarray(table.flow_edges, float)
     centre, width = (edges[1:] + edges[:-1]) / 2, np.diff(edges)
@@ -183,44 +185,77 @@ def recorded_evidence(
         counts, (table.flow_bin, np.asarray(code(jnp.asarray(table.shares), jnp.asarray(table.named)))), 1.0
     )
     counts *= (width / counts.sum(axis=1))[:, None]  # as if every percent of flow had been recorded alike
-    z = scipy.special.ndtri((np.arange(looks) + 0.5) / looks)
-    seen = GRID * np.exp(look * z)[:, None]
-    weight = np.exp(-0.5 * ((seen[..., None] - centre) / np.maximum(smoothing, width / 2)) ** 2)
-    shown = weight @ counts
-    return np.swapaxes((1.0 - floor) * shown / shown.sum(axis=2, keepdims=True) + floor / CODES, 1, 2)
+    z = scipy.special.ndtri((np.arange(width_bias_levels) + 0.5) / width_bias_levels)
+    biased = GRID * np.exp(width_bias_std * z)[:, None]
+    weight = np.exp(-0.5 * ((biased[..., None] - centre) / np.maximum(smoothing, width / 2)) ** 2)
+    frequency = weight @ counts
+    frequency = (1.0 - floor) * frequency / frequency.sum(axis=2, keepdims=True) + floor / CODES
+    return np.swapaxes(frequency, 1, 2)
 
 
-def robust_filter(table: WindowTable, *, accuracies: Sequence[float], gains: Sequence[float], looks: int, look: float, floor: float, smoothing: float,
-                  segment: float, switch: float, repeats: float, hazard: float, move_cost: float,
-                  outside_cost: float) -> Filter:  # fmt: skip
-    """The filter for both simulators: for each of `gains` the manners of erring are anywhere with each of
-    `accuracies`, then `looks` as recorded, each the look of a segment that lasts `segment` decisions.
+class CameraErrorModel(NamedTuple):
+    """How the camera may err and the extruder follow, and what a miss costs: the settings of `robust_filter`.
 
-    switch: probability a decision of going over from one way of erring (any of `accuracies`, or as recorded)
-    to another; repeats: of the manners as recorded.
+    Manners of erring: anywhere with each of `accuracies`; or as recorded, every bead of a segment wider or
+    narrower by one of `width_bias_levels` biases, of deviation `width_bias_std` (relative). A segment lasts
+    segment_mean_decisions. mode_switch_probability: a decision, of going over from one way of erring (any of
+    `accuracies`, or as recorded) to another. window_repeat_probability: that a window shows what the one
+    before did, of the manners as recorded. gains: true by commanded move. floor and smoothing as
+    `recorded_evidence` says; hazard and costs as `Filter` says.
     """
-    recorded = recorded_evidence(table, look=look, looks=looks, floor=floor, smoothing=smoothing)
-    evidence = np.concatenate([*(class_evidence(accuracy) for accuracy in accuracies), recorded])
-    transition = np.kron(np.eye(len(gains)), _changes(len(accuracies), looks, segment, switch))
+
+    accuracies: Sequence[float]
+    gains: Sequence[float]
+    width_bias_levels: int
+    width_bias_std: float
+    floor: float
+    smoothing: float
+    segment_mean_decisions: float
+    mode_switch_probability: float
+    window_repeat_probability: float
+    hazard: float
+    move_cost: float
+    outside_cost: float
+
+
+def robust_filter(table: WindowTable, model: CameraErrorModel) -> Filter:
+    """The filter for both simulators: for each of the gains the manners of erring are anywhere with each of
+    the accuracies, then each width bias as recorded in `table`."""
+    recorded = recorded_evidence(
+        table,
+        width_bias_std=model.width_bias_std,
+        width_bias_levels=model.width_bias_levels,
+        floor=model.floor,
+        smoothing=model.smoothing,
+    )
+    anywhere, gains = len(model.accuracies), model.gains
+    evidence = np.concatenate([*(class_evidence(accuracy) for accuracy in model.accuracies), recorded])
+    transition = np.kron(np.eye(len(gains)), _mode_transition(model))
     after_jump = np.kron(np.full((len(gains), len(gains)), 1 / len(gains)), np.eye(len(evidence)))
-    repeating = np.tile(np.repeat([0.0, repeats], [len(accuracies), looks]), len(gains))
+    repeats = np.repeat([0.0, model.window_repeat_probability], [anywhere, model.width_bias_levels])
     return Filter(
-        jnp.asarray(np.tile(evidence, (len(gains), 1, 1)), jnp.float32), jnp.asarray(transition, jnp.float32),
+        jnp.asarray(np.tile(evidence, (len(gains), 1, 1)), jnp.float32),
+        jnp.asarray(transition, jnp.float32),
         jnp.asarray(after_jump, jnp.float32),
-        jnp.repeat(jnp.asarray(gains, jnp.float32), len(evidence)), jnp.asarray(repeating, jnp.float32),
-        hazard, move_cost, outside_cost,
-    )  # fmt: skip
+        jnp.repeat(jnp.asarray(gains, jnp.float32), len(evidence)),
+        jnp.asarray(np.tile(repeats, len(gains)), jnp.float32),
+        model.hazard,
+        model.move_cost,
+        model.outside_cost,
+    )
 
 
-def _changes(anywhere: int, looks: int, segment: float, switch: float) -> np.ndarray:
-    """(anywhere + looks, anywhere + looks): ways of erring are left with probability `switch` for any of them
-    alike; looks last `segment` decisions."""
+def _mode_transition(model: CameraErrorModel) -> np.ndarray:
+    """(anywhere + levels, anywhere + levels): a way of erring is left with mode_switch_probability for any of
+    them alike; a width bias lasts segment_mean_decisions."""
+    anywhere, levels = len(model.accuracies), model.width_bias_levels
+    segment, switch = model.segment_mean_decisions, model.mode_switch_probability
     ways = anywhere + 1
-    transition = np.full((anywhere + looks, anywhere + looks), switch / ways)
-    transition[:, anywhere:] /= looks
+    transition = np.full((anywhere + levels, anywhere + levels), switch / ways)
+    transition[:, anywhere:] /= levels
     transition[:anywhere, :anywhere] += (1.0 - switch) * np.eye(anywhere)
     transition[anywhere:, anywhere:] += (1.0 - switch) * (
-        (1.0 - 1.0 / segment) * np.eye(looks) + 1.0 / segment / looks
+        (1.0 - 1.0 / segment) * np.eye(levels) + 1.0 / segment / levels
     )
     return transition
 

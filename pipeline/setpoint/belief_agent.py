@@ -1,6 +1,6 @@
-"""Our agent: deep Q-learning on a belief. The Bayes filter of bayes.py turns windows and moves into what is
-known of the flow, so that a small network meets a problem that is nearly Markov. It starts from the value
-that the belief would have were the flow seen from the next step on, and double Q-learning in disturbed
+"""Belief DQN: deep Q-learning on a belief. The Bayes filter of bayes.py turns windows and moves into a belief
+of the flow, so that a small network meets a problem that is nearly Markov. It starts from the value
+that the belief would have were the flow observed from the next step on, and double Q-learning in disturbed
 episodes adds what that leaves out: hesitation while moves are cheap to regret, haste after a clog, and
 distrust of the filter where the machine is none of its hypotheses.
 
@@ -21,11 +21,12 @@ from pipeline.setpoint import bayes
 from pipeline.setpoint.agent import (
     ACTIONS,
     TEMPERATURE_SCALE,
-    Learner,
-    Setting,
-    Sight,
-    World,
-    double,
+    DqnProblem,
+    DqnSettings,
+    EnvSpec,
+    ObservationEncoder,
+    TrainState,
+    double_dqn_target,
     greedy,
     phase,
 )
@@ -39,7 +40,6 @@ from pipeline.setpoint.published import (
     TEMPERATURE_MOVES,
 )
 from pipeline.setpoint.recorded import WindowTable, recorded_windows
-from pipeline.setpoint.reward import reward
 from pipeline.setpoint.simulator import (
     FLOW_LIMITS,
     GOOD,
@@ -51,6 +51,7 @@ from pipeline.setpoint.simulator import (
     Windows,
     flow_class,
     paper_windows,
+    reward,
     rollout,
 )
 
@@ -64,8 +65,8 @@ AHEAD = 40  # steps after which a heater of (6) has 1e-4 of its way left
 
 
 class Belief(NamedTuple):
-    """filter: of bayes.py; values (5, N): of each flow action were the
-    flow seen, under the discount gamma."""
+    """filter: of bayes.py; values (5, N): of each flow action were the flow observed, under the discount
+    gamma."""
 
     filter: bayes.Filter
     values: jax.Array
@@ -103,8 +104,8 @@ def temperature_reward(temperature: jax.Array) -> jax.Array:
     return reward(BEST_FLOW, temperature, a=a, b=b)
 
 
-def seen_values(costs: Costs, gamma: float) -> np.ndarray:
-    """Q (5, N) were the flow seen: Q(a, q) = r(q + a, a) + gamma max_a' Q(a',
+def observed_values(costs: Costs, gamma: float) -> np.ndarray:
+    """Q (5, N) were the flow observed: Q(a, q) = r(q + a, a) + gamma max_a' Q(a',
     q + a), by value iteration on the filter's grid."""
     moves = np.array(FLOW_MOVES)[:, None]
     after = np.clip(np.arange(len(bayes.GRID)) + (moves / bayes.SPACING).astype(int), 0, len(bayes.GRID) - 1)
@@ -150,15 +151,15 @@ def standing_values(observation: Observation, gamma: float) -> jax.Array:
     ) * temperature_reward(target)
 
 
-def belief_sight(of: Belief) -> Sight:
+def belief_encoder(of: Belief) -> ObservationEncoder:
     """x = [values of the flow's actions (5), pooled belief, hypotheses (H), values of the temperature's
     actions (5), u_hat, u_bar, clock, heeded]."""
     hypotheses = of.filter.evidence.shape[0]
     pooling = jnp.asarray(POOLING, jnp.float32)
 
-    def see(network, known, observation):
-        known = bayes.believed(of.filter, known, observation)
-        belief = known.belief
+    def encode(network, state, observation):
+        state = bayes.filter_update(of.filter, state, observation)
+        belief = state.belief
         flow, clock = belief.sum(axis=0), observation.step % LAMBDA
         temperatures = (
             jnp.stack([observation.temperature, observation.target]) - BEST_TEMPERATURE
@@ -168,9 +169,9 @@ def belief_sight(of: Belief) -> Sight:
             temperatures,
             jnp.stack([clock / LAMBDA, clock == 0]),
         ]
-        return known, jnp.concatenate([of.values @ flow, flow @ pooling, belief.sum(axis=1), *rest])
+        return state, jnp.concatenate([of.values @ flow, flow @ pooling, belief.sum(axis=1), *rest])
 
-    return Sight(lambda: bayes.unknown(hypotheses), see)
+    return ObservationEncoder(lambda: bayes.initial_state(hypotheses), encode)
 
 
 class Correction(eqx.Module):
@@ -207,20 +208,20 @@ class BeliefNetwork(eqx.Module):
         self.temperature = Correction((ACTIONS + 4, 32), keys[1])
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        known, rest = x[: -ACTIONS - 4], x[-ACTIONS - 4 :]
-        value, worth = known[:ACTIONS], rest[:ACTIONS]
-        heeded = rest[-1] > 0
-        warmer = self.temperature(rest)
-        Q = value + self.flow(known.at[:ACTIONS].add(-value.max()))
+        flow_part, temperature_part = x[: -ACTIONS - 4], x[-ACTIONS - 4 :]
+        values, temperature_values = flow_part[:ACTIONS], temperature_part[:ACTIONS]
+        heeded = temperature_part[-1] > 0
+        correction = self.temperature(temperature_part)
+        Q = values + self.flow(flow_part.at[:ACTIONS].add(-values.max()))
         return jnp.stack(
-            [Q, worth + jnp.where(heeded, warmer, warmer[STAND])]
+            [Q, temperature_values + jnp.where(heeded, correction, correction[STAND])]
         )  # what is not heeded is standing
 
 
 # ---- training
 
 
-class Troubles(NamedTuple):
+class Disturbances(NamedTuple):
     """What training episodes meet, each drawn uniformly: the share of episodes on recorded windows (the rest
     on the paper's) and how long a segment may last; from which accuracy, gain and clog up to 1, clogs in a
     share of the episodes and at any step; drift a step up to +- this."""
@@ -250,7 +251,7 @@ def paper_or_recorded(table: WindowTable) -> Windows:
     return Windows(draw, recorded.table)
 
 
-def troubled(troubles: Troubles, length: int, key: jax.Array) -> Conditions:
+def disturbed(disturbances: Disturbances, length: int, key: jax.Array) -> Conditions:
     """Conditions of one episode; starts are uniform in the logarithm
     of the flow, as errors of extrusion are ratios."""
     u = jax.random.uniform(key, (10,))
@@ -258,73 +259,94 @@ def troubled(troubles: Troubles, length: int, key: jax.Array) -> Conditions:
     return Conditions(
         flow=jnp.exp(low + (high - low) * u[0]),
         temperature=TEMPERATURE_LIMITS[0] + (TEMPERATURE_LIMITS[1] - TEMPERATURE_LIMITS[0]) * u[1],
-        accuracy=troubles.accuracy + (1 - troubles.accuracy) * u[2],
-        persistence=jnp.where(u[3] < troubles.recorded_share, troubles.longest_segment ** u[4], 0.0),
-        gain=troubles.gain + (1 - troubles.gain) * u[5],
-        clog=troubles.clog + (1 - troubles.clog) * u[6],
-        clog_step=jnp.where(u[7] < troubles.clog_share, jnp.floor(length * u[8]), -1.0),
-        drift=troubles.drift * (2 * u[9] - 1),
+        accuracy=disturbances.accuracy + (1 - disturbances.accuracy) * u[2],
+        persistence=jnp.where(u[3] < disturbances.recorded_share, disturbances.longest_segment ** u[4], 0.0),
+        gain=disturbances.gain + (1 - disturbances.gain) * u[5],
+        clog=disturbances.clog + (1 - disturbances.clog) * u[6],
+        clog_step=jnp.where(u[7] < disturbances.clog_share, jnp.floor(length * u[8]), -1.0),
+        drift=disturbances.drift * (2 * u[9] - 1),
         jump_rate=jnp.zeros(()),
         jump_size=jnp.zeros(()),
     )
 
 
+class BeliefTraining(NamedTuple):
+    """What a step costs, what episodes meet, and how deep Q-learning goes: `rounds` of `updates`; epsilon
+    falls from `explore` to `least` in each."""
+
+    costs: Costs
+    disturbances: Disturbances
+    dqn: DqnSettings
+    learning_rate: float
+    updates: int
+    rounds: int
+    explore: float
+    least: float
+
+
 class Trained(NamedTuple):
-    """The network kept; judged: mean cost-less-reward a step of validation episodes before training and after
-    each round, the best of which (`kept`) it is; rewards of each training step."""
+    """The network kept; validation: mean cost-less-reward a step of validation episodes before training and
+    after each round, the best of which (best_round) it is; rewards of each training step."""
 
     network: BeliefNetwork
-    judged: tuple[float, ...]
-    kept: int
+    validation: tuple[float, ...]
+    best_round: int
     rewards: jax.Array
 
 
 def train(
-    key: jax.Array, of: Belief, table: WindowTable, *, costs: Costs, troubles: Troubles, setting: Setting,
-    rate: float, updates: int, rounds: int, explore: float,
-    least: float, on_step=None,
-) -> Trained:  # fmt: skip
-    """Double Q-learning in troubled episodes on the paper's windows and on recorded ones, Adam with a rate
+    key: jax.Array, of: Belief, table: WindowTable, settings: BeliefTraining, *, on_step=None
+) -> Trained:
+    """Double Q-learning in disturbed episodes on the paper's windows and on recorded ones, Adam with a rate
     that falls by a cosine to zero over all rounds.
 
     After each of the rounds the network is judged on VALIDATION episodes drawn as the
     training's are, and the best is kept: what it started from, if nothing was better.
     on_step(round, network, judged) is called after each.
     """
+    dqn, updates, rounds = settings.dqn, settings.updates, settings.rounds
     k_network, k_judge, key = jax.random.split(key, 3)
-    sight, world = (
-        belief_sight(of),
-        World(
-            paper_or_recorded(table), Partial(troubled, troubles, setting.episode), Partial(rewards, costs)
-        ),
-    )
+    encoder, env = belief_encoder(of), _environment(table, settings)
     network, optimiser = (
         BeliefNetwork(of.filter.evidence.shape[0], k_network),
-        optax.adam(optax.cosine_decay_schedule(rate, rounds * updates)),
+        optax.adam(optax.cosine_decay_schedule(settings.learning_rate, rounds * updates)),
     )
-    learner = Learner(network, network, optimiser.init(network))
-    episodes, controller = jax.vmap(world.conditions)(jax.random.split(k_judge, VALIDATION)), greedy(sight)
+    train_state = TrainState(network, network, optimiser.init(network))
+    episodes, controller = jax.vmap(env.conditions)(jax.random.split(k_judge, VALIDATION)), greedy(encoder)
 
     def judge(network):
-        seen = rollout(controller, network, world.windows, episodes, k_judge, steps=setting.episode)
-        moves = jnp.asarray(FLOW_MOVES)[seen.action.flow]
+        trajectory = rollout(controller, network, env.windows, episodes, k_judge, steps=dqn.episode)
+        moves = jnp.asarray(FLOW_MOVES)[trajectory.action.flow]
         return float(
-            flow_reward(costs, seen.flow[:, 1:], moves).mean()
-            + temperature_reward(seen.temperature[:, 1:]).mean()
+            flow_reward(settings.costs, trajectory.flow[:, 1:], moves).mean()
+            + temperature_reward(trajectory.temperature[:, 1:]).mean()
         )
 
-    setting = setting._replace(gamma=jnp.array([setting.gamma, slower(setting.gamma)]))
-    networks, judged, paid = [network], [judge(network)], []
+    dqn = dqn._replace(gamma=jnp.array([dqn.gamma, slower(dqn.gamma)]))
+    problem = DqnProblem(encoder, env, optimiser, double_dqn_target, dqn)
+    networks, validation, all_rewards = [network], [judge(network)], []
     for i in range(rounds):
-        learner, gained = phase(
-            learner, jax.random.fold_in(key, i), sight=sight, world=world, optimiser=optimiser,
-            bootstrap=double, setting=setting, updates=updates,
-            longest=updates, epsilon=(explore, least),
-        )  # fmt: skip
-        networks.append(learner.network)
-        judged.append(judge(learner.network))
-        paid.append(gained)
+        train_state, mean_rewards = phase(
+            train_state,
+            jax.random.fold_in(key, i),
+            problem,
+            updates=updates,
+            longest=updates,
+            epsilon=(settings.explore, settings.least),
+        )
+        networks.append(train_state.network)
+        validation.append(judge(train_state.network))
+        all_rewards.append(mean_rewards)
         if on_step is not None:
-            on_step(i + 1, learner.network, judged[-1])
-    kept = int(np.argmax(judged))
-    return Trained(networks[kept], tuple(judged), kept, jnp.concatenate(paid))
+            on_step(i + 1, train_state.network, validation[-1])
+    best = int(np.argmax(validation))
+    return Trained(networks[best], tuple(validation), best, jnp.concatenate(all_rewards))
+
+
+def _environment(table: WindowTable, settings: BeliefTraining) -> EnvSpec:
+    """Disturbed episodes on the paper's windows and on recorded ones, paid by what a step costs."""
+    return EnvSpec(
+        paper_or_recorded(table),
+        Partial(disturbed, settings.disturbances, settings.dqn.episode),
+        Partial(rewards, settings.costs),
+    )

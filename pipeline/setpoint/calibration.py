@@ -31,12 +31,12 @@ def log_probabilities(logits: np.ndarray, temperature: float) -> np.ndarray:
 def fit_temperature(logits: np.ndarray, label: np.ndarray) -> float:
     """The T that makes the labels (n,) most likely, between 1/20 and 20."""
     label = np.asarray(label)
-    found = scipy.optimize.minimize_scalar(
+    fit = scipy.optimize.minimize_scalar(
         lambda log_t: -log_probabilities(logits, np.exp(log_t))[np.arange(len(label)), label].mean(),
         bounds=(-3.0, 3.0),
         method="bounded",
     )
-    return float(np.exp(found.x))
+    return float(np.exp(fit.x))
 
 
 # ---- a window of images
@@ -119,10 +119,10 @@ def recorded(
             f"flows are expected within {flow_edges[0]:g} .. {flow_edges[-1]:g} % but {outside.sum()} are "
             f"not, the first {flow[outside][0]:g}; widen the bins"
         )
-    seen = valid.any(axis=1)
-    p = window_probabilities(log_p[seen], valid[seen], correlation)
-    flow_bin = np.clip(np.searchsorted(flow_edges, flow[seen], side="right") - 1, 0, len(flow_edges) - 2)
-    return WindowTable(p, p.argmax(axis=1), flow_bin, np.asarray(segment)[seen], flow_edges)
+    mask = valid.any(axis=1)
+    prob = window_probabilities(log_p[mask], valid[mask], correlation)
+    flow_bin = np.clip(np.searchsorted(flow_edges, flow[mask], side="right") - 1, 0, len(flow_edges) - 2)
+    return WindowTable(prob, prob.argmax(axis=1), flow_bin, np.asarray(segment)[mask], flow_edges)
 
 
 # ---- how true the probabilities are
@@ -280,9 +280,9 @@ def auroc(familiar: np.ndarray, foreign: np.ndarray) -> float:
 # ---- all of it together
 
 
-class Seen(NamedTuple):
-    """What was seen of n frames: logits (n, 3), features with
-    appearance (n, f), label, segment and valid (n,)."""
+class ClassifierOutputs(NamedTuple):
+    """A network's outputs on n frames: logits (n, 3), features with appearance (n, f); and the frames' label,
+    segment and valid (n,)."""
 
     logits: np.ndarray
     features: np.ndarray
@@ -291,10 +291,10 @@ class Seen(NamedTuple):
     valid: np.ndarray
 
 
-def seen(prediction: Prediction, data: Labelled, valid: np.ndarray) -> Seen:
+def classifier_outputs(prediction: Prediction, data: Labelled, valid: np.ndarray) -> ClassifierOutputs:
     """The head's features with the appearance of the key areas beside them;
     frames that the front end rejected are not valid."""
-    return Seen(
+    return ClassifierOutputs(
         prediction.logits,
         np.hstack([prediction.features, appearance(data.key_area)]),
         data.label,
@@ -315,7 +315,13 @@ class Calibration(NamedTuple):
 
 
 def calibrate(
-    learned: Seen, unseen: Seen, *, length: int, coverage: float, confidence: float, false_alarms: float
+    learned: ClassifierOutputs,
+    unseen: ClassifierOutputs,
+    *,
+    length: int,
+    coverage: float,
+    confidence: float,
+    false_alarms: float,
 ) -> Calibration:
     """Everything fitted on segments `unseen` in training, but for the familiar features, which are those
     `learned`; windows have `length` frames."""
@@ -340,7 +346,7 @@ def calibrate(
     )
 
 
-def _rows(frames: Seen, length: int) -> np.ndarray:
+def _rows(frames: ClassifierOutputs, length: int) -> np.ndarray:
     rows = windows(frames.segment, frames.label, length=length).rows
     if not len(rows):
         raise ValueError(

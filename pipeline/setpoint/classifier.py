@@ -155,24 +155,25 @@ AT_ONCE = 512  # images looked at together: what the paper's size holds of them 
 ADAM = optax.scale_by_adam()  # Kingma and Ba 2015, its own beta 0.9 and 0.999
 
 
-class State(NamedTuple):
-    """All that training needs to go on: epochs done, network, the running average of its weights, Adam's
-    moments, the best average so far and its epoch, and the course: history (epochs, 3) holds training loss,
-    held-out loss and held-out accuracy of each epoch done, NaN after."""
+class TrainState(NamedTuple):
+    """All that training needs to go on: epochs done, network, the running average of its weights, the
+    optimiser's state, the best average so far and its epoch, and the learning curve:
+    history (epochs, 3) holds training loss, held-out loss and held-out accuracy of each epoch done, NaN
+    after."""
 
     epoch: Array
     network: Classifier
     average: Classifier
-    moments: optax.OptState
+    opt_state: optax.OptState
     best: Classifier
     best_epoch: Array
     history: Array
 
 
-def untrained(network: Classifier, *, epochs: int) -> State:
+def untrained(network: Classifier, *, epochs: int) -> TrainState:
     """The state before the first of at most `epochs` epochs; a
     checkpoint is put into one by from_named_arrays."""
-    return State(
+    return TrainState(
         jnp.array(0),
         network,
         network,
@@ -181,6 +182,22 @@ def untrained(network: Classifier, *, epochs: int) -> State:
         jnp.array(0),
         jnp.full((epochs, 3), jnp.nan),
     )
+
+
+class TrainingSettings(NamedTuple):
+    """How a network is trained by AdamW. The learning rate rises over warmup_epochs to learning_rate and
+    falls by a cosine of half period cycle_epochs. `averaging` is the decay a step of the running average of
+    the weights, which is what is judged and kept (0: the weights themselves). Training ends after `patience`
+    epochs without a better held-out loss."""
+
+    cycle_epochs: int
+    warmup_epochs: float
+    batch: int
+    learning_rate: float
+    weight_decay: float
+    smoothing: float
+    averaging: float
+    patience: int
 
 
 class Rates(NamedTuple):
@@ -213,55 +230,46 @@ def cross_entropy(logits: Float[Array, "n 3"], label: Array, smoothing: float) -
 
 
 def train(
-    state: State,
+    state: TrainState,
     learned: Labelled,
     held_out: Labelled,
+    settings: TrainingSettings,
     *,
     key: Array,
-    cycle_epochs: int,
-    warmup_epochs: float,
-    batch: int,
-    learning_rate: float,
-    weight_decay: float,
-    smoothing: float,
-    averaging: float,
-    patience: int,
     augment: Callable[[Array, Array], Array],
-    on_step: Callable[[State], None] = lambda state: None,
-) -> State:
-    """Trains by AdamW on `learned` until the loss on `held_out` has not improved for `patience` epochs;
-    `best` of the state returned is the classifier.
+    on_step: Callable[[TrainState], None] = lambda state: None,
+) -> TrainState:
+    """Trains on `learned` until the loss on `held_out` has not improved for settings.patience epochs; `best`
+    of the state returned is the classifier.
 
-    `averaging` is the decay a step of the running average of the weights, which is what is
-    judged and kept (0: the weights themselves). After each epoch on_step gets the state:
-    what a checkpoint holds. All randomness is that of (key, epoch), so that training from
-    any of these states ends at the very same weights.
+    After each epoch on_step gets the state: what a checkpoint holds. All randomness is that of (key, epoch),
+    so that training from any of these states ends at the very same weights.
     """
     learned, held_out = checked(learned), checked(held_out)
-    shared = np.intersect1d(learned.segment, held_out.segment)
-    if len(shared):
-        raise ValueError(
-            f"{len(shared)} segments are both learned and held out, the first {shared[0]}; "
-            "split with split_by_segment"
-        )
-    batch, epochs = min(batch, len(learned.label)), len(state.history)
+    _check_apart(learned, held_out)
+    batch, epochs = min(settings.batch, len(learned.label)), len(state.history)
     steps = len(learned.label) // batch
     rates = Rates(
-        learning_rate, warmup_epochs * steps, cycle_epochs * steps, weight_decay, smoothing, averaging
+        settings.learning_rate,
+        settings.warmup_epochs * steps,
+        settings.cycle_epochs * steps,
+        settings.weight_decay,
+        settings.smoothing,
+        settings.averaging,
     )
     rows, judged = [[jnp.asarray(a) for a in data[:3]] for data in (learned, held_out)]
     run = _steps_on_cpu if jax.default_backend() == "cpu" else _steps
-    while int(state.epoch) < epochs and int(state.epoch) - int(state.best_epoch) <= patience:
+    while int(state.epoch) < epochs and int(state.epoch) - int(state.best_epoch) <= settings.patience:
         order, drawn = jax.random.split(jax.random.fold_in(key, state.epoch))
         chosen = jax.random.permutation(order, len(learned.label))[: steps * batch].reshape(steps, batch)
-        (network, average, moments), loss = run(
+        (network, average, opt_state), loss = run(
             augment,
-            (state.network, state.average, state.moments),
+            (state.network, state.average, state.opt_state),
             (jax.random.split(drawn, steps), chosen),
             rows,
             rates,
         )
-        state = state._replace(network=network, average=average, moments=moments)
+        state = state._replace(network=network, average=average, opt_state=opt_state)
         logits = [
             _logits(average, *(a[i : i + AT_ONCE] for a in judged[:2]))
             for i in range(0, len(judged[2]), AT_ONCE)
@@ -271,27 +279,37 @@ def train(
     if int(state.best_epoch) == 0:
         raise ValueError(
             f"no epoch of {int(state.epoch)} had a held-out loss that is a number; "
-            f"lower the learning rate of {learning_rate:g}"
+            f"lower the learning rate of {settings.learning_rate:g}"
         )
     return state
+
+
+def _check_apart(learned: Labelled, held_out: Labelled) -> None:
+    """Raises ValueError where a segment is in both."""
+    shared = np.intersect1d(learned.segment, held_out.segment)
+    if len(shared):
+        raise ValueError(
+            f"{len(shared)} segments are both learned and held out, the first {shared[0]}; "
+            "split with split_by_segment"
+        )
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _step(augment, carry, drawn: tuple[Array, Array], rows: list[Array], rates: Rates):
     """One batch, drawn as (key, rows): AdamW (Loshchilov and Hutter 2019), theta <- theta - rate (Adam's
     direction + decay theta), and the running average of theta."""
-    (network, average, moments), (key, chosen) = carry, drawn
+    (network, average, opt_state), (key, chosen) = carry, drawn
     key_area, temperature, label = [a[chosen] for a in rows]
-    seen = augment(key, key_area.astype(jnp.float32))
+    augmented = augment(key, key_area.astype(jnp.float32))
     loss, gradient = jax.value_and_grad(
-        lambda net: cross_entropy(net(seen, temperature), label, rates.smoothing)
+        lambda net: cross_entropy(net(augmented, temperature), label, rates.smoothing)
     )(network)
-    t = moments.count
-    direction, moments = ADAM.update(gradient, moments)
+    t = opt_state.count
+    direction, opt_state = ADAM.update(gradient, opt_state)
     rate = cosine(t, rates)
     network = jax.tree.map(lambda w, d: w - rate * (d + rates.weight_decay * w), network, direction)
     keep = jnp.minimum(rates.averaging, (1 + t) / (10 + t))  # the first steps are forgotten sooner
-    return (network, jax.tree.map(lambda a, w: keep * a + (1 - keep) * w, average, network), moments), loss
+    return (network, jax.tree.map(lambda a, w: keep * a + (1 - keep) * w, average, network), opt_state), loss
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -315,7 +333,7 @@ def _logits(network: Classifier, key_area: Array, temperature_degC: Array) -> Ar
 
 
 @jax.jit
-def _judged(state: State, loss: Array, logits: Array, label: Array) -> State:
+def _judged(state: TrainState, loss: Array, logits: Array, label: Array) -> TrainState:
     """The state with its average judged by its logits for the held-out
     segments, and kept where its loss is the lowest yet."""
     row = jnp.stack(

@@ -77,13 +77,13 @@ def judge_window(
             "an empty window says nothing"
         )
     P = np.where(np.isfinite(P) & (np.abs(P) <= 2), P, -1.0)
-    seen = valid & (P >= 0).all(axis=2) & (np.abs(P.sum(axis=2) - 1) < 1e-3)
-    known = seen & (scores <= foreign_above)
-    m = known.sum(axis=1)
+    sound = valid & (P >= 0).all(axis=2) & (np.abs(P.sum(axis=2) - 1) < 1e-3)
+    familiar = sound & (scores <= foreign_above)
+    m = familiar.sum(axis=1)
     logs = np.log(np.clip(P, 1e-6, 1.0))
-    p, shares = window_probabilities(logs, known, correlation), hard_shares(logs, known)
+    p, shares = window_probabilities(logs, familiar, correlation), hard_shares(logs, familiar)
     members = p >= conformal_level
-    few = np.where(seen.sum(axis=1) >= least_frames, FOREIGN, FEW)
+    few = np.where(sound.sum(axis=1) >= least_frames, FOREIGN, FEW)
     reason = np.where(members.sum(axis=1) != 1, AMBIGUOUS, ACTS)
     reason = np.where(tip_moved, TIP, np.where(m < least_frames, few, reason))
     return Window(
@@ -92,18 +92,18 @@ def judge_window(
         shares / shares.max(axis=1, keepdims=True),
         p.argmax(axis=1),
         members,
-        _median(scores, seen),
+        _median(scores, sound),
         valid.sum(axis=1),
         m,
         reason,
     )
 
 
-def _median(scores: np.ndarray, seen: np.ndarray) -> np.ndarray:
+def _median(scores: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """The median (the upper one of two) of each row over what was seen, NaN where nothing was. A missing
     score is infinite: nothing vouches for that frame."""
-    ordered = np.sort(np.where(seen & ~np.isnan(scores), scores, np.inf), axis=1)
-    n = seen.sum(axis=1)
+    ordered = np.sort(np.where(mask & ~np.isnan(scores), scores, np.inf), axis=1)
+    n = mask.sum(axis=1)
     ordered = np.concatenate([ordered, np.full((len(n), 1), np.nan)], axis=1)
     return ordered[np.arange(len(n)), np.where(n > 0, n // 2, -1)]
 
@@ -154,13 +154,13 @@ def moved(state: Setpoints, change: np.ndarray, time_s: np.ndarray, limits: Limi
     recent = np.asarray(time_s)[:, None] - state.times < 60.0
     left = np.maximum(limits.per_minute - (np.abs(state.moves) * recent[:, :, None]).sum(axis=1), 0.0)
     small = np.clip(wanted, -limits.per_action, limits.per_action)
-    slow = np.clip(small, -left, left)
-    value = np.clip(state.value + slow, limits.low, limits.high)
+    allowed = np.clip(small, -left, left)
+    value = np.clip(state.value + allowed, limits.low, limits.high)
     cuts = np.stack(
         [
             (small != wanted).any(axis=1),
-            (slow != small).any(axis=1),
-            (value != state.value + slow).any(axis=1),
+            (allowed != small).any(axis=1),
+            (value != state.value + allowed).any(axis=1),
             ~number,
         ],
         axis=1,

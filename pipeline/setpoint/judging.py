@@ -34,16 +34,17 @@ def starts(runs: int, *, accuracy: float) -> Conditions:
     return nominal(flow, temperature, accuracy=accuracy)
 
 
-def cases(recorded: Windows, *, runs: int, segment: float) -> dict[str, tuple[Windows, Conditions]]:
+def cases(
+    recorded: Windows, *, runs: int, segment_mean_decisions: float
+) -> dict[str, tuple[Windows, Conditions]]:
     """What every controller is judged on, by name: both simulators, with the actuator at 0.6 of its gain, and
     with a clog (flow x 0.6 from step 60).
 
-    recorded: from `recorded_windows`; segment: decisions that its
-    conditions last on average in the sticky cases.
+    recorded: from `recorded_windows`; its conditions last segment_mean_decisions in the sticky cases.
     """
     paper, rough, fresh = paper_windows(), starts(runs, accuracy=0.7), starts(runs, accuracy=1.0)
     one = jax.numpy.ones_like(fresh.flow)
-    sticky = fresh._replace(persistence=segment * one)
+    sticky = fresh._replace(persistence=segment_mean_decisions * one)
     weak, clog = {"gain": 0.6 * one}, {"clog": 0.6 * one, "clog_step": CLOG_STEP * one}
     return {
         **{
@@ -65,8 +66,8 @@ def evaluate(
     controller: Controller, parameters, windows: Windows, conditions: Conditions, key: jax.Array
 ) -> Score:
     """Roll out and judge."""
-    ran = rollout(controller, parameters, windows, conditions, key, steps=STEPS)
-    return judge(ran.flow, ran.temperature)
+    trajectory = rollout(controller, parameters, windows, conditions, key, steps=STEPS)
+    return judge(trajectory.flow, trajectory.temperature)
 
 
 def choose(scores: dict[str, dict[str, Score]]) -> Choice:
@@ -75,14 +76,15 @@ def choose(scores: dict[str, dict[str, Score]]) -> Choice:
 
     Raises ValueError where controllers were not judged on the same cases.
     """
-    cases = {frozenset(of) for of in scores.values()}
+    cases = {frozenset(by_case) for by_case in scores.values()}
     if len(cases) != 1:
         raise ValueError(
             "choose: expected every controller judged on the same cases, "
             f"found {sorted(sorted(c) for c in cases)}; judge all on all"
         )
     figures = {
-        name: sorted((score.stay.percent, case) for case, score in of.items()) for name, of in scores.items()
+        name: sorted((score.stay.percent, case) for case, score in by_case.items())
+        for name, by_case in scores.items()
     }
     ranked = sorted(
         figures,

@@ -110,7 +110,10 @@ def find(
     outside = _outside(c, angle, miss)
     reason = ""
     if score < least_score:
-        reason = f"no fresh line: the best ridge at {angle:.0f} degrees stands {score:.1f} gray levels above its brighter flank, below {least_score:g}"
+        reason = (
+            f"no fresh line: the best ridge at {angle:.0f} degrees stands {score:.1f} gray levels above its "
+            f"brighter flank, below {least_score:g}"
+        )
     elif outside > 0.5:
         reason = f"cut by the frame: {outside:.0%} of the rectangle at {angle:.0f} degrees lie outside"
     image = np.zeros(SHAPE, np.uint8) if reason else _rectangle(c, angle, miss)
@@ -129,7 +132,7 @@ def find_all(
     frames = list(frames)
     tips = np.broadcast_to(np.asarray(tips, float), (len(frames), 2))
     directions = np.broadcast_to(np.nan if directions_deg is None else directions_deg, len(frames))
-    found = [
+    areas = [
         find(
             frame,
             tip,
@@ -138,12 +141,12 @@ def find_all(
         )
         for frame, tip, direction in zip(frames, tips, directions, strict=True)
     ]
-    images = np.array([k.image for k in found], np.uint8).reshape(-1, *SHAPE)
+    images = np.array([k.image for k in areas], np.uint8).reshape(-1, *SHAPE)
     columns = (
-        np.array([getattr(k, name) for k in found])
+        np.array([getattr(k, name) for k in areas])
         for name in ("angle_deg", "miss_px", "score", "padded_share")
     )
-    reasons = tuple(k.reason for k in found)
+    reasons = tuple(k.reason for k in areas)
     return KeyAreas(images, *columns, reasons, np.array([not r for r in reasons], bool))
 
 
@@ -216,18 +219,18 @@ def drift(
     )
 
 
-def drawn(frame: np.ndarray, tip: tuple[float, float], found: KeyArea) -> np.ndarray:
+def drawn(frame: np.ndarray, tip: tuple[float, float], area: KeyArea) -> np.ndarray:
     """The crop as (350, 350, 3) uint8 RGB with the tip and the rectangle, green where the key area was
     accepted, red with the reason where not, for a report."""
     picture = cv2.cvtColor(crop(frame, tip).gray, cv2.COLOR_GRAY2RGB)
-    colour = (220, 40, 40) if found.reason else (40, 200, 80)
-    at = np.rint(corners(found.angle_deg, found.miss_px) + SIDE // 2).astype(np.int32)
+    colour = (220, 40, 40) if area.reason else (40, 200, 80)
+    at = np.rint(corners(area.angle_deg, area.miss_px) + SIDE // 2).astype(np.int32)
     cv2.polylines(picture, [at], True, colour, 1, cv2.LINE_AA)
     cv2.drawMarker(picture, (SIDE // 2, SIDE // 2), colour, cv2.MARKER_CROSS, 9, 1)
-    words = found.reason.partition(":")[0] or "accepted"
+    words = area.reason.partition(":")[0] or "accepted"
     cv2.putText(
         picture,
-        f"{words}, {found.score:.1f} gray levels",
+        f"{words}, {area.score:.1f} gray levels",
         (8, SIDE - 10),
         cv2.FONT_HERSHEY_SIMPLEX,
         0.45,

@@ -145,10 +145,14 @@ class Episodes(NamedTuple):
 
 
 class Loop(NamedTuple):
-    """How the loop is deployed: frames a window at frame_rate_hz, waits, limits, the rule of the window
-    judge(P, valid, scores, tip_moved) -> Window, the least ridge score of a key area, how far the nozzle may
-    be from where its tip was calibrated, and how long a segment's conditions last on average, in s."""
+    """What is closed into a loop, and how it is deployed: the machine; the classifier classify(images
+    (n, 16, 48), temperature (n,)) -> class probabilities (n, 3), out-of-distribution scores (n,); frames a
+    window at frame_rate_hz, waits, limits, the rule of the window judge(P, valid, scores, tip_moved) ->
+    Window, the least ridge score of a key area, how far the nozzle may be from where its tip was calibrated,
+    and how long a segment's conditions last on average."""
 
+    machine: Machine
+    classify: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
     frames: int
     frame_rate_hz: float
     waits: Waits
@@ -156,12 +160,12 @@ class Loop(NamedTuple):
     judge: Callable[..., Window]
     least_score: float
     tip_tolerance_px: float
-    segment_s: float
+    segment_mean_s: float
 
 
-def _told(reason: np.ndarray) -> np.ndarray:
-    """Whether the controller hears of a window: of those acted on, and
-    of those that cannot tell the classes apart."""
+def _is_evidence(reason: np.ndarray) -> np.ndarray:
+    """Whether the controller is shown a window: those acted on, and
+    those that cannot tell the classes apart."""
     return (reason == ACTS) | (reason == AMBIGUOUS)
 
 
@@ -176,7 +180,7 @@ def _answer(
     """Memory and the change (E, 2) wanted of flow and target; the target's only where lambda's clock allows
     it, none where the window is held."""
     shown = Observation(*(jnp.asarray(a, jnp.int32 if a.dtype.kind == "i" else jnp.float32) for a in shown))
-    memory, q, u = _decided(controller, parameters, memory, shown, keys, jnp.asarray(_told(reason)))
+    memory, q, u = _decided(controller, parameters, memory, shown, keys, jnp.asarray(_is_evidence(reason)))
     wanted = np.stack(
         [
             np.asarray(FLOW_MOVES)[q],
@@ -189,21 +193,48 @@ def _answer(
 
 @eqx.filter_jit
 def _decided(
-    controller: Controller, parameters: Any, memory: Any, shown: Observation, keys: jax.Array, told: jax.Array
+    controller: Controller,
+    parameters: Any,
+    memory: Any,
+    shown: Observation,
+    keys: jax.Array,
+    evidence: jax.Array,
 ):
-    """Memory, which stays where nothing was told, and action indices of every episode."""
+    """Memory, which stays where the window is no evidence, and action indices of every episode."""
     after, action = jax.vmap(controller.act, (None, 0, 0, 0))(parameters, memory, shown, keys)
     return jax.tree.map(
-        lambda new, old: jnp.where(told.reshape(-1, *[1] * (new.ndim - 1)), new, old), after, memory
+        lambda new, old: jnp.where(evidence.reshape(-1, *[1] * (new.ndim - 1)), new, old), after, memory
     ), *action
+
+
+class _Cameras(NamedTuple):
+    """The cameras of E episodes, changed in place: generators; the segments on the plate; templates of the
+    nozzles, cut from the first frames, where the tip was calibrated; when each segment ends (E,) in s, and
+    its number (E,)."""
+
+    rngs: list[np.random.Generator]
+    segments: list
+    templates: list
+    ends: np.ndarray
+    numbers: np.ndarray
+
+
+class _Step(NamedTuple):
+    """A decision of E episodes, as `Episodes` has it."""
+
+    flow: np.ndarray
+    temperature: np.ndarray
+    time_s: np.ndarray
+    setpoint: np.ndarray
+    sent: np.ndarray
+    window: Window
+    segment: np.ndarray
 
 
 def run(
     controller: Controller,
     parameters: Any,
-    see: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]],
     start: np.ndarray,
-    machine: Machine,
     loop: Loop,
     disturbances: Disturbances,
     *,
@@ -213,8 +244,6 @@ def run(
 ) -> Episodes:
     """Episodes from the setpoints start (E, 2), at rest there; the first frame of each
     (episode, decision) in `draw` is kept as a picture.
-
-    see(images (n, 16, 48), temperature (n,)) -> class probabilities (n, 3), out-of-distribution scores (n,).
 
     A window whose classes cannot be told apart is no reason to act, but it is evidence: the controller is
     shown it and remembers, and its answer is not sent. Of windows held for another reason it hears nothing.
@@ -227,35 +256,27 @@ def run(
             f"pixels.run: expected disturbances of {E} episodes, found {len(disturbances.clog)}; "
             f"make them by calm({E})"
         )
-    rngs = rng.spawn(E)
+    cameras = _Cameras(rng.spawn(E), [None] * E, [None] * E, np.zeros(E), np.zeros(E, int))
     keys = jax.random.split(jax.random.key(int(rng.integers(2**31))), E)
     setpoints = deployment.setpoints(start, loop.limits)
-    running = at_rest(machine, *setpoints.value.T, tick_s=tick_s)
+    running = at_rest(loop.machine, *setpoints.value.T, tick_s=tick_s)
     memory = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (E, *jnp.shape(leaf))), controller.start())
-    time_s, ends, numbers = np.zeros(E), np.zeros(E), np.zeros(E, int)
-    segments: list = [None] * E
-    templates: list = [None] * E
+    time_s, change = np.zeros(E), np.zeros((E, 2))
+    acted, since = np.zeros(E, int), np.zeros(E)
+    steps: list[_Step] = []
     pictures: dict[tuple[int, int], np.ndarray] = {}
-    acted, since, change = np.zeros(E, int), np.zeros(E), np.zeros((E, 2))
-    rows = []
     for decision in range(decisions + 1):
-        feed = setpoints.value[:, 0] * np.where(decision >= disturbances.clog_at, disturbances.clog, 1.0)
+        clog = np.where(decision >= disturbances.clog_at, disturbances.clog, 1.0)
         ticks = np.rint(deployment.wait_after(change, loop.waits) / tick_s).astype(int) * (decision > 0)
-        running, _, _ = _advance(machine, running, feed, setpoints.value[:, 1], ticks, tick_s)
-        running, flow, temperature = _advance(
-            machine, running, feed, setpoints.value[:, 1], np.full(E, loop.frames), tick_s
-        )
+        running, flow, temperature = _filmed_window(loop, running, setpoints.value, clog, ticks)
         time_s = time_s + (ticks + loop.frames) * tick_s
         if decision == decisions:
             break
-        for i in np.flatnonzero(time_s > ends):
-            segments[i] = _next_segment(segments[i], rngs[i])
-            ends[i] = time_s[i] + rngs[i].exponential(loop.segment_s)
-            numbers[i] += 1
-        seen = _seen(segments, templates, flow, temperature, loop, disturbances, decision, rngs, draw)
-        P, scores = see(seen.images.reshape(-1, *key_area.SHAPE), temperature.ravel())
-        window = loop.judge(P.reshape(E, -1, 3), seen.valid, scores.reshape(E, -1), seen.tip_moved)
-        pictures |= seen.pictures
+        _renew_segments(cameras, time_s, loop.segment_mean_s)
+        areas = _window_areas(cameras, flow, temperature, loop, disturbances, decision, draw)
+        P, scores = loop.classify(areas.images.reshape(-1, *key_area.SHAPE), temperature.ravel())
+        window = loop.judge(P.reshape(E, -1, 3), areas.valid, scores.reshape(E, -1), areas.tip_moved)
+        pictures |= areas.pictures
         step_keys = jax.vmap(jax.random.fold_in, (0, None))(keys, decision)
         shown = Observation(
             window.p, window.label, since, temperature.mean(axis=1), setpoints.value[:, 1], acted
@@ -263,29 +284,47 @@ def run(
         memory, wanted = _answer(controller, parameters, memory, shown, step_keys, window.reason)
         before, setpoints = setpoints, deployment.moved(setpoints, wanted, time_s, loop.limits)
         change = setpoints.value - before.value
-        rows.append(
-            (
-                flow.mean(axis=1),
-                temperature.mean(axis=1),
-                time_s,
-                before.value,
-                change,
-                window,
-                numbers.copy(),
-            )
-        )
-        since, acted = (
-            np.where(_told(window.reason), 0.0, since) + change[:, 0],
-            acted + (window.reason == ACTS),
-        )
-    flows, temperatures, times, values, changes, windows, segment = zip(*rows, strict=True)
+        means = flow.mean(axis=1), temperature.mean(axis=1)
+        steps.append(_Step(*means, time_s, before.value, change, window, cameras.numbers.copy()))
+        since = np.where(_is_evidence(window.reason), 0.0, since) + change[:, 0]
+        acted = acted + (window.reason == ACTS)
+    last = flow.mean(axis=1), temperature.mean(axis=1)
+    return _episodes(steps, *last, setpoints.clipped, pictures)
+
+
+def _episodes(
+    steps: list[_Step], flow: np.ndarray, temperature: np.ndarray, clipped: np.ndarray, pictures: dict
+) -> Episodes:
+    """The decisions of E episodes behind one another; flow and temperature (E,) are of the window after the
+    last."""
+    flows, temperatures, times, values, changes, windows, segments = zip(*steps, strict=True)
     return Episodes(
-        flow=np.stack([*flows, flow.mean(axis=1)], axis=1),
-        temperature=np.stack([*temperatures, temperature.mean(axis=1)], axis=1),
-        time_s=np.stack(times, axis=1), setpoint=np.stack(values, axis=1), sent=np.stack(changes, axis=1),
+        flow=np.stack([*flows, flow], axis=1),
+        temperature=np.stack([*temperatures, temperature], axis=1),
+        time_s=np.stack(times, axis=1),
+        setpoint=np.stack(values, axis=1),
+        sent=np.stack(changes, axis=1),
         windows=Window(*(np.stack(field, axis=1) for field in zip(*windows, strict=True))),
-        segment=np.stack(segment, axis=1), clipped=setpoints.clipped, pictures=pictures,
-    )  # fmt: skip
+        segment=np.stack(segments, axis=1),
+        clipped=clipped,
+        pictures=pictures,
+    )
+
+
+def _filmed_window(loop: Loop, state: Running, setpoint: np.ndarray, clog: np.ndarray, ticks: np.ndarray):
+    """The machines after a wait of ticks (E,) and a window of frames, at setpoints (E, 2) with the flow times
+    clog (E,); flow and temperature (E, W) of each frame."""
+    feed, target, tick_s = setpoint[:, 0] * clog, setpoint[:, 1], 1.0 / loop.frame_rate_hz
+    state, _, _ = _advance(loop.machine, state, feed, target, ticks, tick_s)
+    return _advance(loop.machine, state, feed, target, np.full(len(feed), loop.frames), tick_s)
+
+
+def _renew_segments(cameras: _Cameras, time_s: np.ndarray, segment_mean_s: float) -> None:
+    """A new segment where the old one has ended by time_s (E,)."""
+    for i in np.flatnonzero(time_s > cameras.ends):
+        cameras.segments[i] = _next_segment(cameras.segments[i], cameras.rngs[i])
+        cameras.ends[i] = time_s[i] + cameras.rngs[i].exponential(segment_mean_s)
+        cameras.numbers[i] += 1
 
 
 def _advance(
@@ -309,7 +348,7 @@ def _next_segment(segment, rng: np.random.Generator):
     return new._replace(nozzle=segment.nozzle, mask=segment.mask, tip=segment.tip, ground=ground)
 
 
-class _Seen(NamedTuple):
+class _WindowAreas(NamedTuple):
     """Key areas (E, W, 16, 48) uint8, whether they are valid (E, W), whether the nozzle is elsewhere than
     where it was calibrated (E,), and the pictures asked for."""
 
@@ -319,31 +358,29 @@ class _Seen(NamedTuple):
     pictures: dict[tuple[int, int], np.ndarray]
 
 
-def _seen(
-    segments: list,
-    templates: list,
-    flow,
-    temperature,
+def _window_areas(
+    cameras: _Cameras,
+    flow: np.ndarray,
+    temperature: np.ndarray,
     loop: Loop,
-    d: Disturbances,
+    disturbances: Disturbances,
     decision: int,
-    rngs: list,
     draw: frozenset,
-) -> _Seen:
-    """What the cameras show of flow and temperature (E, W); `templates` of the nozzles are cut from the first
-    frames, where the tip was calibrated."""
+) -> _WindowAreas:
+    """What the cameras show of flow and temperature (E, W)."""
     images, valid, moved, pictures = [], [], [], {}
-    for i, segment in enumerate(segments):
-        made = nozzle_scene.render(segment, flow[i], temperature[i], rngs[i])
-        frames, tip = _filmed(made.frames, d, i, decision, segment.tip), segment.tip
-        found = key_area.find_all(
+    for i, segment in enumerate(cameras.segments):
+        scene = nozzle_scene.render(segment, flow[i], temperature[i], cameras.rngs[i])
+        frames, tip = _filmed(scene.frames, disturbances, i, decision, segment.tip), segment.tip
+        areas = key_area.find_all(
             frames, tip, least_score=loop.least_score, directions_deg=segment.direction_deg
         )
-        if templates[i] is None:
-            templates[i] = key_area.nozzle_template(made.frames[0], tip, size_px=TEMPLATE_PX)
-        nozzle = key_area.drift(frames[:: max(1, len(frames) // LOOKS)], templates[i], tip, reach_px=REACH_PX)
-        images.append(found.images)
-        valid.append(found.valid)
+        if cameras.templates[i] is None:
+            cameras.templates[i] = key_area.nozzle_template(scene.frames[0], tip, size_px=TEMPLATE_PX)
+        some = frames[:: max(1, len(frames) // LOOKS)]
+        nozzle = key_area.drift(some, cameras.templates[i], tip, reach_px=REACH_PX)
+        images.append(areas.images)
+        valid.append(areas.valid)
         moved.append(
             np.hypot(*nozzle.offset_px) > loop.tip_tolerance_px
             and nozzle.correlation >= LIKENESS
@@ -354,7 +391,7 @@ def _seen(
                 frames[0], tip, least_score=loop.least_score, direction_deg=segment.direction_deg
             )
             pictures[i, decision] = key_area.drawn(frames[0], tip, one)
-    return _Seen(np.stack(images), np.stack(valid), np.array(moved), pictures)
+    return _WindowAreas(np.stack(images), np.stack(valid), np.array(moved), pictures)
 
 
 def settled_since(episodes: Episodes) -> np.ndarray:

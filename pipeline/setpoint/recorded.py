@@ -52,8 +52,8 @@ def recorded_windows(table: WindowTable) -> Windows:
     pairs, place = np.unique(np.stack([table.flow_bin, table.segment], axis=1), axis=0, return_inverse=True)
     place = place.ravel()
     counts = np.bincount(place)
-    look = np.bincount(place, weights=shares[:, 2] - shares[:, 0]) / counts
-    order = np.lexsort([look, pairs[:, 0]])  # by bin, then by look
+    thickness = np.bincount(place, weights=shares[:, 2] - shares[:, 0]) / counts
+    order = np.lexsort([thickness, pairs[:, 0]])  # by bin, then by thickness
     position = np.empty_like(order)
     position[order] = np.arange(len(order))
     rows = np.argsort(position[place], kind="stable")

@@ -19,7 +19,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from pipeline.setpoint.published import ALPHA, DELTA, FLOW_MOVES, LAMBDA, SIGMA, TEMPERATURE_MOVES
+from pipeline.setpoint.published import (
+    ALPHA,
+    BEST_FLOW,
+    BEST_TEMPERATURE,
+    DELTA,
+    FLOW_MOVES,
+    LAMBDA,
+    ROTATION,
+    SIGMA,
+    TEMPERATURE_MOVES,
+)
 
 STAND = 2  # the index of no move
 FLOW_LIMITS, TEMPERATURE_LIMITS = (20.0, 310.0), (180.0, 240.0)
@@ -147,8 +157,8 @@ def _paper_draw(table, conditions: Conditions, flow, segment, u) -> tuple[jax.Ar
     noise = SIGMA * jnp.stack(
         [z[0], jnp.where(x0 == 0, z[0], z[1]), z[1]]
     )  # two numbers serve, as x0 itself takes none
-    p = jnp.where(distance == 0, 1.0, jnp.clip(jnp.exp(-ALPHA * distance) + noise, 0.0, 1.0))
-    return p / p.sum(), x0
+    prob = jnp.where(distance == 0, 1.0, jnp.clip(jnp.exp(-ALPHA * distance) + noise, 0.0, 1.0))
+    return prob / prob.sum(), x0
 
 
 def _normal(u: jax.Array) -> jax.Array:
@@ -266,8 +276,8 @@ def _rolled(
         u, t = chance
         now = jax.vmap(jax.random.fold_in, (0, None))(keys, t)
         memory, action = jax.vmap(controller.act, (None, 0, 0, 0))(parameters, memory, observation, now)
-        after, seen = jax.vmap(stepped, (None, 0, 0, 0, 0))(windows, conditions, state, action, u)
-        return (after, seen, memory), (
+        after, next_observation = jax.vmap(stepped, (None, 0, 0, 0, 0))(windows, conditions, state, action, u)
+        return (after, next_observation, memory), (
             after.flow,
             after.temperature,
             after.target,
@@ -292,3 +302,16 @@ def _rolled(
     return Trajectory(
         *jax.tree.map(lambda leaf: jnp.swapaxes(leaf, 0, 1), (flow, temperature, target, *per_decision))
     )
+
+
+def reward(flow: jax.Array, temperature: jax.Array, *, a: float, b: float) -> jax.Array:
+    """The paper's elliptical reward (Li and Pattinson 2025, eqs. 14-16):
+    r = 2 / (1 + sqrt(q_r^2 / a^2 + u_r^2 / b^2)) - 1 in (-1, 1], 1 at (q*, u*) = (100 %, 210 °C); flow in
+    percent, temperature in °C, any one shape.
+
+    q_r = (q - q*) cos theta - (u - u*) sin theta,   u_r = (q - q*) sin theta + (u - u*) cos theta
+    """
+    dq, du = flow - BEST_FLOW, temperature - BEST_TEMPERATURE
+    q_r = dq * jnp.cos(ROTATION) - du * jnp.sin(ROTATION)
+    u_r = dq * jnp.sin(ROTATION) + du * jnp.cos(ROTATION)
+    return 2.0 / (1.0 + jnp.sqrt(q_r**2 / a**2 + u_r**2 / b**2)) - 1.0

@@ -92,9 +92,9 @@ class Block(eqx.Module):
         """The first `wanted` tokens after the layer: of the last one the class token
         alone is read, and the others are not worked out."""
         n, tokens, d = x.shape
-        seen, W, b = self.norm_1(x), self.queries_keys_values.W, self.queries_keys_values.b
-        q = (seen[:, :wanted] @ W[:, :d] + b[:d]).reshape(n, wanted, self.heads, d // self.heads)
-        kv = (seen @ W[:, d:] + b[d:]).reshape(n, tokens, 2, self.heads, d // self.heads)
+        normed, W, b = self.norm_1(x), self.queries_keys_values.W, self.queries_keys_values.b
+        q = (normed[:, :wanted] @ W[:, :d] + b[:d]).reshape(n, wanted, self.heads, d // self.heads)
+        kv = (normed @ W[:, d:] + b[d:]).reshape(n, tokens, 2, self.heads, d // self.heads)
         k, v = kv[:, :, 0], kv[:, :, 1]
         weight = jax.nn.softmax(jnp.einsum("nqhd,nkhd->nhqk", q, k) / np.sqrt(d / self.heads), axis=-1)
         x = x[:, :wanted] + self.attended(jnp.einsum("nhqk,nkhd->nqhd", weight, v).reshape(n, wanted, d))
@@ -235,11 +235,11 @@ def from_named_arrays(like, arrays: dict[str, np.ndarray]):
     paths, structure = jax.tree_util.tree_flatten_with_path(like)
     names = {_name(path): np.shape(leaf) for path, leaf in paths if eqx.is_array_like(leaf)}
     for name in sorted(names.keys() | arrays.keys()):
-        expected, found = names.get(name), np.shape(arrays[name]) if name in arrays else None
-        if expected != found:
+        expected, actual = names.get(name), np.shape(arrays[name]) if name in arrays else None
+        if expected != actual:
             raise ValueError(
                 f"weights of another architecture: {name} is expected {_shape(expected)} but "
-                f"found {_shape(found)}; "
+                f"found {_shape(actual)}; "
                 "load them into the size that they were trained with, or train again"
             )
     leaves = [

@@ -1,8 +1,8 @@
 """Parquet, MCAP, JSON and text: the only module that opens an artifact.
 
-Equal inputs give equal bytes: no clock, host, commit or duration is written. Every writer
-writes beside its target and renames, and `stage` does so for all that a stage writes:
-whatever goes wrong, the last good artifacts stay.
+Equal inputs give equal bytes: no clock, host, commit or duration is written. Every writer writes beside its
+target and renames, and `stage` does so for all that a stage writes. If anything fails, the last good
+artifacts stay.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ import pyarrow.parquet as pq
 import safetensors
 from safetensors.numpy import load_file, save_file
 
-from pipeline.store import tables
+from pipeline.store import renamed, tables
 from pipeline.store.tables import ARRAYS, Column, Schema
 
 DATASETS, REPORTS = Path("datasets"), Path("reports")
@@ -40,8 +40,8 @@ _waiting: ContextVar[Path | None] = ContextVar("_waiting", default=None)
 def write_table(
     path: str | Path, schema: Schema, columns: Mapping[str, np.ndarray | list | pa.Array]
 ) -> None:
-    """Columns of equal length as Parquet; name and version of the
-    schema in the file, unit and meaning in each field.
+    """Columns of equal length as Parquet. The file has name and version of the schema, each field unit and
+    meaning.
 
     Missing floats are NaN. Raises ValueError naming the column and the row.
     """
@@ -59,17 +59,21 @@ def write_table(
 
 
 def read_table(path: str | Path, schema: Schema) -> dict[str, np.ndarray]:
-    """Columns by name: text as objects, missing floats as NaN, lists as
-    objects. Raises ValueError where it is not `schema`."""
-    wanted = remedy(path)
+    """Columns by name: text as objects, missing floats as NaN, lists as objects.
+
+    A table of an earlier version is read under today's names if only names have changed. Raises ValueError
+    for a table of another schema.
+    """
+    command = remedy(path)
     try:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             table = file.read()
     except FileNotFoundError:
-        raise ValueError(f"{path} is missing; {wanted}") from None
+        raise ValueError(f"{path} is missing; {command}") from None
     except (OSError, pa.ArrowException) as error:
-        raise ValueError(f"{path} is not a whole Parquet file ({reason(error)}); {wanted}") from None
-    tables.check(path, schema, table, wanted)
+        raise ValueError(f"{path} is not a whole Parquet file ({reason(error)}); {command}") from None
+    table = tables.under_new_names(schema, table)
+    tables.check(path, schema, table, command)
     return {
         column.name: np.array(table[column.name].to_numpy(zero_copy_only=False)) for column in schema.columns
     }
@@ -78,8 +82,8 @@ def read_table(path: str | Path, schema: Schema) -> dict[str, np.ndarray]:
 def write_arrays(
     path: str | Path, name: str, version: int, arrays: Mapping[str, tuple[np.ndarray, str, str]]
 ) -> None:
-    """Named real arrays {name: (array, unit, meaning)} of any shape as one Parquet
-    table; integers and booleans come back as floats."""
+    """Named real arrays {name: (array, unit, meaning)} of any shape as one Parquet table. Integers and
+    booleans come back as floats."""
     rows = []
     for key, (array, unit, meaning) in arrays.items():
         values = np.asarray(array)
@@ -113,7 +117,7 @@ def read_arrays(path: str | Path, name: str, version: int) -> dict[str, np.ndarr
 
 
 def _array(path: str | Path, column: Column, values) -> pa.Array:
-    """Values in the column's type, NaN as missing; nothing is rounded on the way."""
+    """Values in the column's type, NaN as missing. Nothing is rounded."""
     try:
         if isinstance(values, pa.Array | pa.ChunkedArray):
             values = values.to_numpy(zero_copy_only=False)
@@ -132,13 +136,13 @@ def _array(path: str | Path, column: Column, values) -> pa.Array:
 def write_json(path: str | Path, data) -> None:
     """Dictionaries in their order, lists, text, numbers (numpy's too), NamedTuples as dictionaries.
 
-    Raises ValueError naming the key of NaN, infinity, or of what JSON does not know.
+    Raises ValueError naming the key of NaN, of infinity, or of a type that JSON does not know.
     """
     write_text(path, json.dumps(_plain(path, "", data), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
 
 
 def read_json(path: str | Path):
-    """What `write_json` wrote. Raises ValueError where the file is missing or broken."""
+    """The data of a file of `write_json`. Raises ValueError if the file is missing or broken."""
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -148,24 +152,35 @@ def read_json(path: str | Path):
 
 
 def write_metrics(stage: str, data: Mapping) -> None:
-    """reports/metrics/<stage>.json; inside the frame of a stage it is
-    put in place when the stage has ended well."""
+    """Writes reports/metrics/<stage>.json. Inside the frame of a stage the file is put in place when the
+    stage has ended well."""
     write_json(REPORTS / "metrics" / f"{stage}.json", data)
 
 
 def read_metrics(stage: str) -> dict:
-    """What the stage wrote with `write_metrics`."""
+    """The data that the stage wrote with `write_metrics`."""
     return read_json(REPORTS / "metrics" / f"{stage}.json")
 
 
-def write_course(
+def read_old_metrics(path: str | Path) -> dict:
+    """A file of reports/metrics that may be of an earlier version, under today's names."""
+    return renamed.metrics({Path(path).stem: read_json(path)})[Path(path).stem]
+
+
+def read_accepted(path: str | Path):
+    """reports/accepted.json, which may be of an earlier version, under today's names."""
+    run = read_json(path)
+    return renamed.accepted(run) if isinstance(run, dict) else run
+
+
+def write_learning_curve(
     folder: str | Path, columns: Mapping[str, Sequence], *, of: str, step: str, figures: Sequence[str]
 ) -> None:
-    """The course of a training in DVCLive's files, for `dvc plots` and whatever else reads them:
-    <folder>/plots/metrics/<name>/<figure>.tsv by `step`, for every name in column `of`.
+    """A training's learning curve in DVCLive's files, for `dvc plots` and other readers.
 
-    A figure that is missing at a step has no line there. (The library itself takes hold of git, of dvc.yaml
-    and, where a token is set, of the network.)
+    There is one file <folder>/plots/metrics/<name>/<figure>.tsv by `step` for every name in column `of`. A
+    figure that is missing at a step has no line there. (DVCLive itself is not used: it changes git and
+    dvc.yaml, and with a token set it sends to the network.)
     """
     lines: dict[tuple[str, str], list[str]] = {}
     for name, at, *values in zip(*(columns[key] for key in (of, step, *figures)), strict=True):
@@ -198,8 +213,8 @@ def write_jpeg(path: str | Path, picture: np.ndarray) -> None:
 
 
 def write_csv(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
-    """Numbers and plain words for people and machines that read no Parquet: a header line
-    of names, then one line a sample, floats by repr."""
+    """A CSV file of numbers and plain words for readers without Parquet: a header line of names, then one
+    line a sample, floats by repr."""
     rows = zip(*(map(str, np.asarray(values).tolist()) for values in columns.values()), strict=True)
     write_text(path, ",".join(columns) + "\n" + "".join(",".join(row) + "\n" for row in rows))
 
@@ -210,11 +225,11 @@ def _plain(path: str | Path, place: str, data):
     if isinstance(data, np.ndarray | np.generic):
         data = data.tolist()
     if isinstance(data, Mapping):
-        wrong = next((key for key in data if not isinstance(key, str)), None)
-        if wrong is not None:
+        bad_key = next((key for key in data if not isinstance(key, str)), None)
+        if bad_key is not None:
             raise ValueError(
-                f"{path}: key {wrong!r} of {place or 'the whole'} should be text but is "
-                f"{type(wrong).__name__}; write it as text"
+                f"{path}: key {bad_key!r} of {place or 'the whole'} should be text but is "
+                f"{type(bad_key).__name__}; write it as text"
             )
         return {key: _plain(path, f"{place}.{key}" if place else key, value) for key, value in data.items()}
     if isinstance(data, list | tuple):
@@ -242,7 +257,7 @@ def exists(path: str | Path) -> bool:
 
 @contextlib.contextmanager
 def about(path: str | Path) -> Iterator[None]:
-    """What the body refuses is said of this file."""
+    """Puts the file's name in front of what the body refuses."""
     try:
         yield
     except ValueError as error:
@@ -256,11 +271,11 @@ def write_recording(
     *,
     topic: str = "/machine",
 ) -> None:
-    """One MCAP file: at each of time_s (T,) a JSON message {signal: value, ...} on
-    `topic`; signals {name: (values (T,), unit, meaning)}.
+    """One MCAP file with a JSON message {signal: value, ...} on `topic` at each of time_s (T,).
 
-    log_time is round(1e9 time_s) ns. The channel's metadata has name and version of the schema, and unit and
-    meaning of each signal. Raises ValueError for lengths that differ and for values that are not finite.
+    `signals` is {name: (values (T,), unit, meaning)}. log_time is round(1e9 time_s) ns. The channel's
+    metadata has name and version of the schema, and unit and meaning of each signal. Raises ValueError for
+    lengths that differ and for values that are not finite.
     """
     time = np.asarray(time_s, float)
     for name, (values, _, _) in {"time_s": (time, "s", ""), **signals}.items():
@@ -284,8 +299,7 @@ def write_recording(
     json_schema = json.dumps(
         {"title": "recording", "type": "object", "properties": properties}, ensure_ascii=False
     ).encode()
-    # a float's repr is a JSON number, so a message is one formatting
-    # of a row; json.dumps takes six times as long
+    # a float's repr is a JSON number, so one formatting makes a message; json.dumps takes six times as long
     message = "{" + ", ".join(json.dumps(name).replace("%", "%%") + ": %r" for name in signals) + "}"
     rows = zip(*(np.asarray(values, float).tolist() for values, _, _ in signals.values()), strict=True)
     with beside(path) as temporary, temporary.open("wb") as stream:
@@ -307,8 +321,8 @@ def write_recording(
 
 
 def sha256(path: str | Path) -> str:
-    """Digest of a file, or of a folder by relative names and contents;
-    dot files and __pycache__ do not count."""
+    """Digest of a file, or of a folder by relative names and contents. Dot files and __pycache__ do not
+    count."""
     path = Path(path)
     if not path.is_dir():
         with path.open("rb") as stream:
@@ -325,25 +339,25 @@ def sha256(path: str | Path) -> str:
 
 @contextlib.contextmanager
 def stage(name: str) -> Iterator[Path]:
-    """The frame around a stage: a fresh folder that becomes datasets/<name> when the
-    body ends well, and what it wrote to reports/ with it.
+    """The frame around a stage: a fresh folder becomes datasets/<name> when the body ends well, together with
+    the files that the body wrote to reports/.
 
-    Bad input (ValueError, LinAlgError, OSError, Arrow's errors) ends the
-    process with status 1 and one line; nothing was touched.
+    Bad input (ValueError, LinAlgError, OSError, Arrow's errors) ends the process with status 1 and one line,
+    and changes no file.
     """
-    folder, aside, waiting = (DATASETS / f".{name}.{os.getpid()}{end}" for end in ("", ".old", ".reports"))
+    folder, retired, waiting = (DATASETS / f".{name}.{os.getpid()}{end}" for end in ("", ".old", ".reports"))
     token = _waiting.set(waiting)
     try:
         _tidy(name)
         folder.mkdir(parents=True)
         yield folder
-        _replace(folder, aside, DATASETS / name)
+        _replace(folder, retired, DATASETS / name)
         for temporary in sorted(file for file in waiting.rglob("*") if file.is_file()):
             target = temporary.relative_to(waiting)
             target.parent.mkdir(parents=True, exist_ok=True)
             temporary.replace(target)
     except (ValueError, OSError, np.linalg.LinAlgError, pa.ArrowException) as error:
-        # a temporary folder's name says nothing to a reader
+        # the temporary folder's name means nothing to a reader
         print(f"{name}: {reason(error).replace(str(folder), str(DATASETS / name))}", file=sys.stderr)
         raise SystemExit(1) from None
     finally:
@@ -352,29 +366,29 @@ def stage(name: str) -> Iterator[Path]:
             shutil.rmtree(left, ignore_errors=True)
 
 
-def _replace(folder: Path, aside: Path, target: Path) -> None:
-    """Target is `folder` afterwards, or, should the second rename fail, what it was. A
-    stage that wrote only to reports/ has no folder."""
+def _replace(folder: Path, retired: Path, target: Path) -> None:
+    """Puts `folder` in the place of `target`; if the second rename fails, `target` stays what it was. A stage
+    that wrote only to reports/ has no folder."""
     filled = any(folder.iterdir())
     if target.exists():
-        target.rename(aside)
+        target.rename(retired)
     try:
         if filled:
             folder.rename(target)
     finally:
-        if filled and not target.exists() and aside.exists():
-            aside.rename(target)
-    shutil.rmtree(aside, ignore_errors=True)
+        if filled and not target.exists() and retired.exists():
+            retired.rename(target)
+    shutil.rmtree(retired, ignore_errors=True)
 
 
 def _tidy(name: str) -> None:
-    """Removes what killed runs left, and puts back the folder of one
-    that was killed between its two renames."""
+    """Removes what killed runs left, and puts back the folder of a run that was killed between its two
+    renames."""
     for left in DATASETS.glob(f".{name}.*"):
-        found = re.fullmatch(r"\.(\d+)(\.old|\.reports)?", left.name.removeprefix(f".{name}"))
-        if not found or (_alive(int(found[1])) and int(found[1]) != os.getpid()):
+        ending = re.fullmatch(r"\.(\d+)(\.old|\.reports)?", left.name.removeprefix(f".{name}"))
+        if not ending or (_alive(int(ending[1])) and int(ending[1]) != os.getpid()):
             continue
-        if found[2] == ".old" and not (DATASETS / name).exists():
+        if ending[2] == ".old" and not (DATASETS / name).exists():
             left.rename(DATASETS / name)
         else:
             shutil.rmtree(left)
@@ -392,8 +406,8 @@ def _alive(pid: int) -> bool:
 
 @contextlib.contextmanager
 def beside(path: str | Path) -> Iterator[Path]:
-    """A temporary file that takes the target's place when the body ends well;
-    inside a stage, one in reports/ waits for its end."""
+    """A temporary file that takes the target's place when the body ends well. Inside a stage, a file in
+    reports/ waits for the stage's end."""
     target, waiting = Path(path), _waiting.get()
     place = waiting / target if waiting and target.parts[0] == REPORTS.name else target
     temporary = place.with_name(f".{place.name}.{os.getpid()}")
@@ -419,7 +433,7 @@ def _mend(error: OSError, folder: Path) -> str:
 
 
 def remedy(path: str | Path) -> str:
-    """The command that makes the artifact again; the stage is in its path."""
+    """The command that makes the artifact again. The path names the stage."""
     parts = Path(path).parts
     if parts[:2] == ("reports", "metrics"):
         return f"make it again with ./run dvc repro {Path(path).stem}"
@@ -430,7 +444,7 @@ def remedy(path: str | Path) -> str:
 
 
 def reason(error: Exception) -> str:
-    """The error in one line; of an operating system's error the file, the words and the remedy."""
+    """The error in one line. An operating system's error becomes file, words and remedy."""
     text = str(error) or type(error).__name__
     if isinstance(error, OSError) and error.filename:
         text = f"{error.filename}: {error.strerror}; {_mend(error, Path(error.filename).parent)}"
@@ -440,11 +454,10 @@ def reason(error: Exception) -> str:
 def write_weights(
     path: str | Path, name: str, arrays: Mapping[str, np.ndarray], about: Mapping[str, str]
 ) -> None:
-    """Arrays of any shape and kind, each with its bits as they are; `about` is what a reader must know to use
-    them. Equal arrays give equal bytes."""
+    """Writes arrays of any shape and kind, bit by bit, with `about`: what a reader must know to use them.
+    Equal arrays give equal bytes."""
     metadata = {"schema": name, **about}
-    # the library writes metadata in the order of a hash that differs
-    # from process to process; one key holds all
+    # the library writes metadata in the order of a hash that differs between processes, so one key has all
     packed = {"beadline": "\n".join(f"{key}={metadata[key]}" for key in sorted(metadata))}
     with beside(path) as temporary:
         save_file(
@@ -453,19 +466,19 @@ def write_weights(
 
 
 def read_weights(path: str | Path, name: str) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Arrays and `about` of `write_weights`. Raises ValueError where
-    the file is missing, broken, or of another schema."""
-    mend = remedy(path)
+    """Arrays and `about` of `write_weights`. Raises ValueError if the file is missing, broken, or of another
+    schema."""
+    command = remedy(path)
     try:
         arrays = load_file(path)
         with safetensors.safe_open(path, "numpy") as file:
             lines = (file.metadata() or {}).get("beadline", "").splitlines()
     except FileNotFoundError:
-        raise ValueError(f"{path} is missing; {mend}") from None
+        raise ValueError(f"{path} is missing; {command}") from None
     except (OSError, safetensors.SafetensorError, ValueError) as error:
-        raise ValueError(f"{path} holds no whole weights ({error}); {mend}") from None
+        raise ValueError(f"{path} holds no whole weights ({error}); {command}") from None
     about = dict(line.partition("=")[::2] for line in lines)
-    found = about.pop("schema", "none")
-    if found != name:
-        raise ValueError(f"{path} should hold weights of {name} but has schema {found}; {mend}")
+    schema = about.pop("schema", "none")
+    if schema != name:
+        raise ValueError(f"{path} should hold weights of {name} but has schema {schema}; {command}")
     return arrays, about

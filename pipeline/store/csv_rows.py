@@ -1,5 +1,5 @@
-"""Rows of text and numbers out of a CSV file of somebody else's: what the
-readers of records and of lists of images share."""
+"""Rows of text and numbers from a stranger's CSV file: what the readers of records and of lists of images
+share."""
 
 import csv
 import itertools
@@ -13,20 +13,20 @@ import numpy as np
 from pipeline.reading.signals import Note
 
 COMMENT = ("#", "%", "//")
-LOOKED_AT = 1 << 16
+OPENING_BYTES = 1 << 16
 _NUMBER = {
     decimal: re.compile(rf"\s*[+-]?(\d+({mark}\d*)?|{mark}\d+)([eE][+-]?\d+)?\s*$")
     for decimal, mark in ((".", r"\."), (",", ","))
 }
 # a number with its unit, 21.5 °C: it shows where the table is, and is refused with its line when it is read
 _QUANTITY = re.compile(r"\s*[+-]?\d[\d.,]*\s*(%|°\s?[CFK]|[a-zA-Z]{1,3}(/[a-zA-Z]{1,3})?)$")
-# text has tabs, line ends and form feeds, and at times the end mark of an old
-# system; other control characters are of binary files
+# text has tabs, line ends and form feeds, and sometimes the end mark of an old system; other control
+# characters are of binary files
 _CONTROL = bytes(set(range(32)) - set(b"\t\n\r\f\x1a"))
 
 
 class Clock(Protocol):
-    """The column of the time, as a reader with a clock knows it."""
+    """The column of the time, for a reader with a clock."""
 
     name: str
 
@@ -36,7 +36,7 @@ class Clock(Protocol):
 
 
 class CsvLayout(NamedTuple):
-    """How a text file is laid out: `skip` lines before the data, in which names and units stand."""
+    """The layout of a text file. Names and units stand in the `skip` lines before the data."""
 
     encoding: str
     delimiter: str
@@ -48,8 +48,8 @@ class CsvLayout(NamedTuple):
 
 
 class Opening(NamedTuple):
-    """The first lines of a text file as fields, a remark's marks taken
-    off; `remark` says which lines are remarks."""
+    """The first lines of a text file as fields. `remark` says which lines are remarks; their marks are taken
+    off."""
 
     encoding: str
     delimiter: str
@@ -60,13 +60,13 @@ class Opening(NamedTuple):
 
 
 def opening(path: Path) -> Opening:
-    """Encoding, delimiter, decimal mark and first lines of a text
-    file. Raises ValueError where it is no text."""
+    """Encoding, delimiter, decimal mark and first lines of a text file. Raises ValueError for a binary
+    file."""
     with path.open("rb") as stream:
         # zeros behind the text are what a file system leaves after a power failure
-        start = stream.read(LOOKED_AT).rstrip(b"\0")
+        start = stream.read(OPENING_BYTES).rstrip(b"\0")
     encoding, notes = _encoding(path, start)
-    lines = start.decode(encoding, errors="replace").splitlines()[: 400 if len(start) < LOOKED_AT else -1]
+    lines = start.decode(encoding, errors="replace").splitlines()[: 400 if len(start) < OPENING_BYTES else -1]
     remark = [line.lstrip().startswith(COMMENT) for line in lines]
     delimiter, decimal = _delimiter(
         [line for line, is_remark in zip(lines, remark, strict=True) if line.strip() and not is_remark]
@@ -79,18 +79,18 @@ def opening(path: Path) -> Opening:
 
 
 def list_layout(path: Path, is_header: Callable[[list[str]], bool]) -> CsvLayout:
-    """The layout of a list whose columns are known by name: its header is the first line
-    that `is_header`, or else the first line; rows follow.
+    """The layout of a list whose columns are found by name.
 
-    Raises ValueError where no row follows.
+    The header is the first line that `is_header`, or else the first line. Raises ValueError if no row
+    follows.
     """
     start = opening(path)
     written = [i for i, row in enumerate(start.rows) if any(row) and not start.remark[i]]
     heads = [i for i, row in enumerate(start.rows) if is_header(row)] or written
     if not heads or not any(i > heads[0] for i in written):
-        found = "a header" if heads else "only blank or comment lines"
+        content = "a header" if heads else "only blank or comment lines"
         raise ValueError(
-            f"{path}: line 2 on should hold rows of numbers, but the file has {found} and no data; "
+            f"{path}: line 2 on should hold rows of numbers, but the file has {content} and no data; "
             "record it again or remove it"
         )
     names = [field.strip() for field in start.rows[heads[0]]]
@@ -118,12 +118,13 @@ def _encoding(path: Path, start: bytes) -> tuple[str, list[Note]]:
     if control > len(start) // 100:
         raise ValueError(
             f"{path}: the bytes at offset 0 ({start[:8].hex(' ')}) are neither text nor Parquet "
-            "nor MCAP; convert the"
-            f" recording to one of them"
+            "nor MCAP; convert the recording to one of them"
         )
     try:
         # a letter of several bytes may be cut at the end of the part that was read
-        start.decode("utf-8") if len(start) < LOOKED_AT else start[: start.rfind(b"\n") + 1].decode("utf-8")
+        start.decode("utf-8") if len(start) < OPENING_BYTES else start[: start.rfind(b"\n") + 1].decode(
+            "utf-8"
+        )
     except UnicodeDecodeError as error:
         return "cp1252", [
             Note("encoding", "", 1, f"byte {error.start} is not UTF-8, so the text was read as Windows-1252")
@@ -132,13 +133,13 @@ def _encoding(path: Path, start: bytes) -> tuple[str, list[Note]]:
 
 
 def _delimiter(lines: Sequence[str]) -> tuple[str, str]:
-    """The delimiter and decimal mark with which most fields are numbers,
-    and then fewest are not; the blank is tried last."""
+    """The delimiter and decimal mark that make most fields numbers. Of equal ones, those that leave the
+    fewest other fields are taken; the blank is tried last."""
     best, choice = (0.0, 0.0), (",", ".")
     for delimiter, decimal in itertools.product((",", ";", "\t", "|", " "), (".", ",")):
         fields = [field for line in lines[:50] for field in _split(line, delimiter)]
-        found = sum(is_quantity(field, decimal) for field in fields)
-        score = (found, found / max(len(fields), 1))
+        quantities = sum(is_quantity(field, decimal) for field in fields)
+        score = (quantities, quantities / max(len(fields), 1))
         if score > best:
             best, choice = score, (delimiter, decimal)
     return choice
@@ -148,22 +149,21 @@ def _split(line: str, delimiter: str) -> list[str]:
     if delimiter == " ":
         return line.split()
     row = next(csv.reader([line], delimiter=delimiter), [])
-    return (
-        row[:-1] if len(row) > 1 and not row[-1].strip() and line.rstrip("\r\n ").endswith(delimiter) else row
-    )
+    ends_with_delimiter = line.rstrip("\r\n ").endswith(delimiter)
+    return row[:-1] if len(row) > 1 and not row[-1].strip() and ends_with_delimiter else row
 
 
 # what programs write where they have no number
-MISSING = {"", "nan", "na", "n/a", "#n/a", "null", "<null>", "none", "-", "--", "---", "?", "bad", "bad input", "no data", "nodata", "error",
-           "fault", "i/o timeout", "unavailable", "unknown", "-nan(ind)", "1.#qnan", "-1.#ind", "#value!",
-           "#ref!", "#div/0!"}  # fmt: skip
+MISSING = {"", "nan", "na", "n/a", "#n/a", "null", "<null>", "none", "-", "--", "---", "?", "bad",
+           "bad input", "no data", "nodata", "error", "fault", "i/o timeout", "unavailable", "unknown",
+           "-nan(ind)", "1.#qnan", "-1.#ind", "#value!", "#ref!", "#div/0!"}  # fmt: skip
 SWITCH = {"on": 1.0, "true": 1.0, "off": 0.0, "false": 0.0}
 # totals and remarks behind the data; more than that is no tail
 LONGEST_TAIL = 20
 
 
 def rows(path: Path, layout: CsvLayout) -> Iterator[tuple[int, list[str]]]:
-    """(line, fields) of the rows of data; blank lines and comments are passed over."""
+    """(line, fields) of the rows of data, without blank lines and comments."""
     with path.open(encoding=layout.encoding, newline="") as stream:
         try:
             if layout.delimiter == " ":
@@ -195,14 +195,13 @@ def sound_rows(
 ) -> Iterator[tuple[int, list[str]]]:
     """The rows with one field a column and a time.
 
-    A header that is repeated is passed over and counted; what stands behind the data (a
-    row that breaks off as loggers leave it that lose their power, totals, remarks) is
-    left out and noted; the same amid the data is refused.
+    A repeated header is counted and left out. Lines behind the data are left out and noted: a row that breaks
+    off (a logger lost its power), totals, remarks. The same lines amid the data are refused.
     """
     width, tail, repeated = len(layout.names), [], []
     for line, row in rows(path, layout):
-        whole = len(row) == width or (len(row) > width and not any(field.strip() for field in row[width:]))
-        if whole and (clock is None or clock.is_time(row)):
+        complete = len(row) == width or (len(row) > width and not any(field.strip() for field in row[width:]))
+        if complete and (clock is None or clock.is_time(row)):
             if tail:
                 raise ValueError(f"{path}: {_unsound(*tail[0], layout, clock)}; mend or remove that line")
             yield line, row
@@ -227,7 +226,8 @@ def sound_rows(
             )
         )
     if len(tail) == 1 and len(tail[0][1]) < width:
-        message = f"line {tail[0][0]}, the last, breaks off after {len(tail[0][1])} of {width} fields and was left out"
+        line, row = tail[0]
+        message = f"line {line}, the last, breaks off after {len(row)} of {width} fields and was left out"
         notes.append(Note("truncated", "", 1, message))
     elif tail:
         shown = layout.delimiter.join(tail[0][1])[:60]
@@ -240,8 +240,8 @@ def sound_rows(
 def _unsound(line: int, row: list[str], layout: CsvLayout, clock: "Clock | None") -> str:
     if clock is None or len(row) != len(layout.names):
         return f"line {line} has {len(row)} fields but the header has {len(layout.names)} columns"
-    found = clock.text(row).strip()
-    return f"line {line} should have a time in {clock.name} but has {repr(found[:40]) if found else 'none'}"
+    time = clock.text(row).strip()
+    return f"line {line} should have a time in {clock.name} but has {repr(time[:40]) if time else 'none'}"
 
 
 def floats(
@@ -280,5 +280,6 @@ def _float(
     if re.fullmatch(r"[+-]?[\d.,]+\s*[^\d\s.,]{1,6}", plain):
         remedy = "write the numbers without their unit"
     elif re.fullmatch(r"[+-]?[\d.,\s']+", plain):
-        remedy = f"write the numbers without marks between thousands, with {'a point' if decimal == '.' else 'a comma'} before the decimals"
+        mark = "a point" if decimal == "." else "a comma"
+        remedy = f"write the numbers without marks between thousands, with {mark} before the decimals"
     raise ValueError(f"{path}: line {line}, column {name} should be a number but is {plain[:40]!r}; {remedy}")

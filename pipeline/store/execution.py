@@ -1,5 +1,5 @@
-"""Work over recordings, seeds and data sets -> processes of this machine (loky) or of a dask cluster, as
-section `execution` of params.yaml says."""
+"""Work over recordings, seeds and data sets -> processes of this machine (loky) or of a dask cluster, by
+section `execution` of params.yaml."""
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
@@ -12,20 +12,18 @@ from pipeline.store.params import Execution
 
 
 def run_all(
-    calls: Sequence[tuple[Callable, tuple, dict]], execution: Execution, *, kept: str = ""
+    calls: Sequence[tuple[Callable, tuple, dict]], execution: Execution, *, remains: str = ""
 ) -> Iterator[Any]:
-    """The results of calls made with joblib.delayed, in their order,
-    as they come; the same wherever they run.
+    """The results of calls made with joblib.delayed, in their order, as they come. Both back ends give the
+    same results.
 
-    The workers of a cluster have the same code and see the same file system, under
-    absolute paths. `kept` says what a killed run leaves behind. Raises ValueError where a
-    worker is killed, or where the cluster is not there.
+    The workers of a cluster have the same code and the same file system, under absolute paths. `remains` says
+    what a killed run leaves behind. Raises ValueError if a worker is killed, or if there is no cluster.
     """
     if execution.backend == "dask" and calls:
-        with _cluster(execution.scheduler, kept):
-            with joblib.parallel_config(
-                backend="dask"
-            ):  # only a configuration loads joblib's back end for dask
+        with _cluster(execution.scheduler, remains):
+            # only a configuration loads joblib's back end for dask
+            with joblib.parallel_config(backend="dask"):
                 parallel = joblib.Parallel(return_as="generator")
             yield from parallel(calls)
     elif len(calls) <= 1 or execution.jobs == 1:
@@ -37,14 +35,13 @@ def run_all(
             raise ValueError(
                 f"params.yaml: execution.jobs: one of {execution.jobs} workers was killed at its work, "
                 "as a system does that runs out of memory; "
-                f"lower execution.jobs, and run it again{kept}"
+                f"lower execution.jobs, and run it again{remains}"
             ) from None
 
 
 @contextlib.contextmanager
-def _cluster(scheduler: str, kept: str) -> Iterator[None]:
-    """joblib's back end `dask` is the cluster of this address; what
-    goes wrong with the cluster is one sentence."""
+def _cluster(scheduler: str, remains: str) -> Iterator[None]:
+    """joblib's back end `dask` is the cluster of this address. A failure of the cluster is one sentence."""
     try:
         import distributed
     except ImportError:
@@ -70,5 +67,5 @@ def _cluster(scheduler: str, kept: str) -> Iterator[None]:
             raise ValueError(
                 f"params.yaml: execution.scheduler: {error.allowed_failures + 1} workers of {scheduler} died "
                 "over the same work; "
-                f"give each worker more memory, and run it again{kept}"
+                f"give each worker more memory, and run it again{remains}"
             ) from None

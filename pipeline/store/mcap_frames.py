@@ -1,7 +1,7 @@
 """Frames and numeric topics of one MCAP recording: what both camera loops write and read.
 
-Written as any ROS 2 or Foxglove viewer opens it: CDR with the ros2msg texts embedded, in the order of time,
-chunks with CRCs. Equal input gives equal bytes.
+Any ROS 2 or Foxglove viewer opens the file: CDR with the ros2msg texts embedded, in the order of time, chunks
+with CRCs. Equal input gives equal bytes.
 """
 
 import heapq
@@ -25,9 +25,9 @@ from pipeline.store.artifacts import beside
 
 FRAME_ID = "nozzle"
 IMAGE_TOPIC = "/nozzle/image"
-# encoding -> ending and settings of cv2.imencode. A camera's frame is noise to a
-# compressor: with one filter and runs only, a PNG of level 1
-# is smaller than with a filter chosen for each row, is written in half the time and read in two thirds of it
+# encoding -> ending and settings of cv2.imencode. A camera's frame is noise to a compressor: with one filter
+# and runs only, a PNG of level 1 is smaller than with a filter chosen for each row, is written in half the
+# time and read in two thirds of it
 _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE,
         cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP]  # fmt: skip
 ENCODERS = {"jpeg": (".jpg", [cv2.IMWRITE_JPEG_QUALITY, 95]), "png": (".png", _PNG), "raw": ("", [])}
@@ -35,7 +35,7 @@ ENCODERS = {"jpeg": (".jpg", [cv2.IMWRITE_JPEG_QUALITY, 95]), "png": (".png", _P
 
 class Recording(NamedTuple):
     """Frames in the order of time, signals {name: (time_s (n,), values (n,))} on the same clock, metadata
-    {record: {key: value}}, and notes of what was damaged."""
+    {record: {key: value}}, and notes on damage."""
 
     frames: Frames
     signals: dict[str, tuple[np.ndarray, np.ndarray]]
@@ -82,11 +82,12 @@ def write_frames(
     pictures: tuple[str, Iterable[tuple[float, np.ndarray]]] | None,
     metadata: tuple[str, Mapping[str, str]] | None = None,
 ) -> None:
-    """One recording of the tables {topic: {field: (T,)}} of `tables_of`, whose messages are named `types`,
-    and of pictures (encoding, frames (time_s, (height, width))).
+    """Writes one recording.
 
-    Frames are taken one by one: memory is that of a chunk. Raises ValueError, nothing written, for an unknown
-    encoding and for frames that `_frame_messages` refuses.
+    `tables` {topic: {field: (T,)}} are those of `tables_of`, `types` {topic: message type}, `pictures`
+    (encoding, frames (time_s, (height, width))). Frames are taken one by one, so that memory is that of a
+    chunk. Raises ValueError, with no file written, for an unknown encoding and for frames that
+    `_frame_messages` refuses.
     """
     if pictures and pictures[0] not in ENCODERS:
         raise ValueError(
@@ -148,8 +149,8 @@ def _signal_messages(
 def _frame_messages(
     path, channel: int, encoding: str, frames: Iterable, span: tuple[float, float]
 ) -> Iterator[tuple[int, int, bytes]]:
-    """CDR messages of the frames, each checked; at the end, whether
-    they have anything to do with the signals' time."""
+    """CDR messages of the frames. Each frame is checked, and at the end the overlap with the signals'
+    time."""
     ending, settings = ENCODERS[encoding]
     kind, before, first = None, -1, math.nan
     for k, (time, frame) in enumerate(frames):
@@ -193,13 +194,15 @@ def read_frames(
     path: Path,
     camera: Topic,
     places: Mapping[str, tuple[Source, str, str]],
-    found: Mapping[str, Topic],
+    topics_of_file: Mapping[str, Topic],
     *,
     clock: str,
     unreadable_share: float,
 ) -> Recording:
-    """Frames of `camera` and the signals of places {signal: (source, topic, field)}. Raises ValueError where
-    no picture can be read, or a clock runs backwards."""
+    """Frames of `camera` and the signals of places {signal: (source, topic, field)}.
+
+    Raises ValueError if no picture can be read, or if a clock runs backwards.
+    """
     topics = list(dict.fromkeys(topic for _, topic, _ in places.values()))
     walk = Walk(path, camera, set(topics), clock)
     notes = walk.notes()
@@ -210,7 +213,7 @@ def read_frames(
     groups: dict[str, Columns] = {}
     for topic in topics:
         fields = list(dict.fromkeys(field for _, at, field in places.values() if at == topic))
-        groups[topic], dropped = columns(walk, found[topic], fields, clock)
+        groups[topic], dropped = columns(walk, topics_of_file[topic], fields, clock)
         if dropped:
             notes.append(
                 Note(
@@ -246,8 +249,7 @@ def check_overlap(
         if frames[1] < first or last < frames[0]:
             raise ValueError(
                 f"{path}: the frames run from {frames[0]:.3f} to {frames[1]:.3f} s but {name} from "
-                f"{first:.3f} to {last:.3f} s, so they do not overlap in"
-                f" time; record both on one clock"
+                f"{first:.3f} to {last:.3f} s, so they do not overlap in time; record both on one clock"
             )
 
 
@@ -255,10 +257,10 @@ def span_of(time_s: np.ndarray) -> tuple[float, float]:
     return float(time_s[0]), float(time_s[-1])
 
 
-def _values(path: Path, source: Source, found: np.ndarray, notes: list[Note]) -> np.ndarray:
-    """In our unit; what is missing is NaN, and counted."""
-    missing = int(np.count_nonzero(~np.isfinite(found)))
-    if missing == len(found):
+def _values(path: Path, source: Source, recorded: np.ndarray, notes: list[Note]) -> np.ndarray:
+    """The recorded values in the signal's unit. A missing value is NaN, and counted."""
+    missing = int(np.count_nonzero(~np.isfinite(recorded)))
+    if missing == len(recorded):
         raise ValueError(
             f"{path}: {source.source} should hold numbers for {source.signal} but all of its {missing} "
             "values are missing; map another"
@@ -269,15 +271,17 @@ def _values(path: Path, source: Source, found: np.ndarray, notes: list[Note]) ->
                 "missing",
                 source.signal,
                 missing,
-                f"{missing} of {len(found)} values of {source.source} are missing",
+                f"{missing} of {len(recorded)} values of {source.source} are missing",
             )
         )
-    return np.where(np.isfinite(found), found * source.scale + source.offset, np.nan)
+    return np.where(np.isfinite(recorded), recorded * source.scale + source.offset, np.nan)
 
 
 def _start(path: Path, groups: Sequence[Columns], notes: list[Note]) -> int:
-    """The instant in ns from which time is counted, every clock checked to run
-    forward: 0, or the first whole second of a calendar."""
+    """The instant in ns from which time is counted: 0, or the first whole second of a calendar.
+
+    Every clock is checked to run forward.
+    """
     for group in groups:
         check_clock(path, group)
     first = min(int(group.time[0]) for group in groups)
@@ -289,7 +293,7 @@ def _start(path: Path, groups: Sequence[Columns], notes: list[Note]) -> int:
 
 
 def damage(path: Path) -> str:
-    """What reading the whole file met."""
+    """The damage that reading the whole file meets, in words."""
     file = McapFile(path)
     for _ in file.batches(lambda channel: False):
         pass

@@ -1,9 +1,8 @@
-"""A section of params.yaml and params.expert.yaml -> a frozen, bounded, typed object; each problem with it
-becomes one sentence that ends with the remedy.
+"""A section of params.yaml and params.expert.yaml -> a frozen, bounded, typed object.
 
-params.yaml has what the owner of a machine decides, params.expert.yaml what a developer of a
-method sets. A section may stand in both, a key of it in one. Whoever names a params.yaml means
-both files: the other one is looked for beside it.
+Each problem with a section becomes one sentence that ends with the remedy. params.yaml has what the owner of
+a machine decides, params.expert.yaml what a developer of a method sets. A section may stand in both files, a
+key of it in one. A path to params.yaml means both files: the other one lies beside it.
 """
 
 import copy
@@ -22,15 +21,16 @@ import pydantic
 import yaml
 from pydantic import Field
 
+from pipeline.store import renamed
+
 FILE, EXPERT = "params.yaml", "params.expert.yaml"
 
 
 class Section(pydantic.BaseModel):
-    """One section of the two files. Fields have bounds and no
-    defaults: the files are the only home of a value.
+    """One section of the two files. Fields have bounds and no defaults: only the files hold values.
 
-    Strict: "true" is no number and 3.5 no integer, but 3 is a float. A list of YAML
-    fills lists and tuples; NaN and infinity are refused.
+    Types are strict: "true" is no number and 3.5 no integer, but 3 is a float. A list of YAML fills lists and
+    tuples. NaN and infinity are refused.
     """
 
     model_config = pydantic.ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
@@ -49,8 +49,8 @@ class Mapped(Section):
 
 
 class Execution(Section):
-    """Section `execution`: where joblib sends its work; one machine (loky) or a
-    cluster (dask with the address of its scheduler)."""
+    """Section `execution`: joblib sends its work to one machine (loky) or to a cluster (dask, by the
+    address of its scheduler)."""
 
     backend: Literal["loky", "dask"]
     jobs: int = Field(ge=1, le=64)
@@ -77,76 +77,86 @@ S = TypeVar("S", bound=Section)
 
 
 def load(model: type[S], section: str, path: str | Path = FILE) -> S:
-    """Section `section` of both files as a frozen `model`. Raises ValueError with a line for each key
-    unknown, missing or out of bounds."""
+    """Section `section` of both files as a frozen `model`.
+
+    Raises ValueError with a line for each key that is unknown, renamed, missing or out of bounds.
+    """
     sections = files(path)
     values = _section(section, path)
     try:
         # through JSON, where strictness knows no difference between a list and a tuple
         return model.model_validate_json(json.dumps(values))
     except pydantic.ValidationError as error:
-        found = _sentences(model, section, error.errors())
+        problems = _sentences(model, section, error.errors())
         raise ValueError(
-            "\n".join(f"{_files_of(sections, section, location)}: {sentence}" for location, sentence in found)
+            "\n".join(
+                f"{_files_of(sections, section, location)}: {sentence}" for location, sentence in problems
+            )
         ) from None
 
 
 def value(dotted: str, path: str | Path = FILE, *, one_of: tuple) -> Any:
-    """One key of another stage's section, such as generate_probing.source; it must be
-    one of `one_of`. Raises ValueError as `load` does."""
+    """One key of another stage's section, such as generate_probing.source; its value is one of `one_of`.
+
+    Raises ValueError as `load` does.
+    """
     section, *keys = dotted.split(".")
-    found = _section(section, path)
+    choice: Any = _section(section, path)
     place = _files_of(files(path), section, keys)
-    for key in keys:
-        if not isinstance(found, dict) or key not in found:
-            near = _nearest(key, found if isinstance(found, dict) else ())
-            raise ValueError(
-                f"{place}: {dotted} is missing; "
-                f"{f'is {near} meant?' if near else f'add it (one of {_listed(one_of)})'}"
-            )
-        found = found[key]
-    if not any(type(found) is type(choice) and found == choice for choice in one_of):
+    for depth, key in enumerate(keys):
+        if not isinstance(choice, dict) or key not in choice:
+            names = choice if isinstance(choice, dict) else ()
+            above = ".".join([section, *keys[:depth]])
+            if old := _old_name(above, key, names):
+                raise ValueError(f"{place}: {_renamed(f'{above}.{old}')}")
+            near = _nearest(key, names)
+            remedy = f"is {near} meant?" if near else f"add it (one of {_listed(one_of)})"
+            raise ValueError(f"{place}: {dotted} is missing; {remedy}")
+        choice = choice[key]
+    if not any(type(choice) is type(allowed) and choice == allowed for allowed in one_of):
         raise ValueError(
-            f"{place}: {dotted} is {_shown(found)} but must be one of "
-            f"{_listed(one_of)}{_did_you_mean(found, one_of)}"
+            f"{place}: {dotted} is {_shown(choice)} but must be one of "
+            f"{_listed(one_of)}{_choice_remedy(dotted, choice, one_of)}"
         )
-    return found
+    return choice
 
 
 def home(dotted: str, path: str | Path = FILE) -> str:
     """The file in which a key such as train_agent.seed stands, "" where it stands in none."""
-    for name, found in files(path).items():
+    for name, values in files(path).items():
         for key in dotted.split("."):
-            if not isinstance(found, dict) or key not in found:
+            if not isinstance(values, dict) or key not in values:
                 break
-            found = found[key]
+            values = values[key]
         else:
             return name
     return ""
 
 
 def digest(model: Section) -> str:
-    """SHA-256 of the section's canonical JSON: equal parameters have equal
-    digests, whatever their order and spelling in the file."""
+    """SHA-256 of the section's canonical JSON. Equal parameters have equal digests, whatever their order and
+    spelling in the file."""
     canonical = json.dumps(model.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML 1.2 as DVC reads it: 1e-6 is a number, `no` and `on` are words,
-    12:30 is no number; a key given twice is refused."""
+    """YAML 1.2 as DVC reads it: 1e-6 is a number, `no` and `on` are words, 12:30 is no number.
+
+    A key given twice is refused.
+    """
 
     yaml_implicit_resolvers: ClassVar[dict] = {}
 
     def construct_mapping(self, node, deep=False):
-        seen = {}
+        lines: dict[str, int] = {}
         for key_node, _ in node.value:
             key = key_node.value
-            if key in seen:
+            if key in lines:
                 raise yaml.constructor.ConstructorError(
-                    None, None, f"{key} is given twice, first in line {seen[key]}", key_node.start_mark
+                    None, None, f"{key} is given twice, first in line {lines[key]}", key_node.start_mark
                 )
-            seen[key] = key_node.start_mark.line + 1
+            lines[key] = key_node.start_mark.line + 1
         return super().construct_mapping(node, deep)
 
 
@@ -173,12 +183,14 @@ def _parsed(text: str) -> Any:
 
 
 def read(path: str | Path = FILE) -> dict:
-    """Every section with its keys of both files, unchecked. Raises ValueError as `files` does, and where a
-    key of a section stands in both."""
-    (name, whole), *others = files(path).items()
+    """Every section with its keys of both files, unchecked.
+
+    Raises ValueError as `files` does, and for a key of a section that stands in both.
+    """
+    (name, merged), *others = files(path).items()
     for other, sections in others:
         for section, keys in sections.items():
-            mine = whole.get(section, {})
+            mine = merged.get(section, {})
             for file, part in ((name, mine), (other, keys)):
                 if type(part) is not dict:
                     raise ValueError(f"{file}: {section} {_NO_SECTION.format(_shown(part))}")
@@ -187,15 +199,14 @@ def read(path: str | Path = FILE) -> dict:
                 raise ValueError(
                     f"{name} and {other}: {section}.{twice[0]} stands in both; take it out of one of the two"
                 )
-            whole[section] = mine | keys
-    return whole
+            merged[section] = mine | keys
+    return merged
 
 
 def files(path: str | Path = FILE) -> dict[str, dict]:
-    """The sections of params.yaml and, where it is there, of
-    params.expert.yaml beside it, by the files' names, unchecked.
+    """{file: its sections} of params.yaml and of params.expert.yaml beside it if there is one, unchecked.
 
-    Raises ValueError with file and line where one is no YAML or has a key twice.
+    Raises ValueError with file and line for a file that is no YAML or has a key twice.
     """
     expert = Path(path).with_name(EXPERT)
     return {str(name): _sections(name) for name in (path, *([expert] if expert.exists() else []))}
@@ -248,9 +259,9 @@ def _section(section: str, path: str | Path) -> dict:
 
 
 def _files_of(sections: dict[str, dict], section: str, location: Sequence = ()) -> str:
-    """The file in which a key stands; of a key that is missing, and of the
-    section as such, those in which the section does."""
-    having = [name for name, found in sections.items() if section in found] or list(sections)
+    """The file in which a key stands. For a missing key, and for the section itself, the files that have the
+    section."""
+    having = [name for name, names in sections.items() if section in names] or list(sections)
     exact = [name for name in having if location and location[0] in sections[name].get(section, {})]
     return (" or " if location else " and ").join(exact or having)
 
@@ -277,67 +288,93 @@ _TYPES = {
 
 
 def _sentences(model: type[Section], section: str, errors: list) -> Iterator[tuple[tuple, str]]:
-    """(location, sentence) of each problem; a key that is missing
-    because it is misspelt is one problem, not two."""
-    misspelt = set()
+    """(location, sentence) of each problem; a misspelt or renamed key is one problem, not one unknown and one
+    missing key."""
+    explained = set()
     for error in errors:
         if error["type"] == "extra_forbidden":
-            parent = _at(model, error["loc"][:-1])
-            names = (
-                tuple(parent.model_fields) if isinstance(parent, type) and issubclass(parent, Section) else ()
-            )
-            near = _nearest(error["loc"][-1], names)
-            misspelt.add((*error["loc"][:-1], near))
+            *above, name = error["loc"]
+            old = _dotted(section, error["loc"])
+            if renamed.new_name(old, renamed.PARAMETERS) != old:
+                explained.add(renamed.new_name(old, renamed.PARAMETERS))
+                yield error["loc"], _renamed(old)
+                continue
+            parent = _at(model, tuple(above))
+            is_section = isinstance(parent, type) and issubclass(parent, Section)
+            names = tuple(parent.model_fields) if is_section else ()
+            near = _nearest(name, names)
+            explained.add(_dotted(section, (*above, near)))
             remedy = f"did you mean {near}?" if near else f"remove it, or use {_listed(names)}"
             yield error["loc"], f"{_place(section, error['loc'])} is unknown; {remedy}"
     for error in errors:
-        if error["type"] == "missing" and error["loc"] not in misspelt:
-            yield (
-                error["loc"],
-                f"{_place(section, error['loc'])} is missing; add it ({_expected(model, error['loc'])})",
-            )
+        if error["type"] == "missing" and _dotted(section, error["loc"]) not in explained:
+            remedy = f"add it ({_expected(model, error['loc'])})"
+            yield error["loc"], f"{_place(section, error['loc'])} is missing; {remedy}"
         elif error["type"] not in ("missing", "extra_forbidden"):
-            yield error["loc"], f"{_place(section, error['loc'])} {_complaint(error)}"
+            yield error["loc"], f"{_place(section, error['loc'])} {_complaint(section, error)}"
 
 
-def _complaint(error: dict) -> str:
-    kind, context, found = error["type"], error.get("ctx", {}), _shown(error["input"])
+def _dotted(section: str, location: Sequence) -> str:
+    return ".".join(map(str, (section, *location)))
+
+
+def _renamed(old: str) -> str:
+    return f"{old} was renamed to {renamed.new_name(old, renamed.PARAMETERS)}"
+
+
+def _old_name(section: str, name: str, names) -> str:
+    """Which of the section's names is the old one of `name`; "" where none is."""
+    today = f"{section}.{name}"
+    return next(
+        (old for old in names if renamed.new_name(f"{section}.{old}", renamed.PARAMETERS) == today), ""
+    )
+
+
+def _complaint(section: str, error: dict) -> str:
+    kind, context, shown = error["type"], error.get("ctx", {}), _shown(error["input"])
     if kind in _COMPARISONS:
         bound = _COMPARISONS[kind]
-        return f"is {found} but must be {_BOUNDS[bound]} {context[bound]:g}"
+        return f"is {shown} but must be {_BOUNDS[bound]} {context[bound]:g}"
     if kind in _TYPES:
-        return f"is {found} but must be {_TYPES[kind]}"
+        return f"is {shown} but must be {_TYPES[kind]}"
     if kind == "literal_error":
-        return f"is {found} but must be one of {context['expected'].replace(chr(39), '')}{_did_you_mean(error['input'], context['expected'])}"
+        choices = context["expected"]
+        remedy = _choice_remedy(_dotted(section, error["loc"]), error["input"], choices)
+        return f"is {shown} but must be one of {choices.replace(chr(39), '')}{remedy}"
     if kind in ("too_short", "string_too_short"):
-        return f"is {found} but needs at least {context.get('min_length')} {'entries' if kind == 'too_short' else 'characters'}"
+        counted = "entries" if kind == "too_short" else "characters"
+        return f"is {shown} but needs at least {context.get('min_length')} {counted}"
     if kind in ("too_long", "string_too_long"):
-        return f"is {found} but takes at most {context.get('max_length')} {'entries' if kind == 'too_long' else 'characters'}"
+        counted = "entries" if kind == "too_long" else "characters"
+        return f"is {shown} but takes at most {context.get('max_length')} {counted}"
     if kind == "value_error":
         message = str(context["error"])
-        # what is wrong between the keys of a section is told without repeating the section
-        return message if isinstance(error["input"], dict) else f"is {found} {message}"
-    return f"is {found}: {error['msg'][0].lower()}{error['msg'][1:]}"
+        # a problem between the keys of a section is described without repeating the section
+        return message if isinstance(error["input"], dict) else f"is {shown} {message}"
+    return f"is {shown}: {error['msg'][0].lower()}{error['msg'][1:]}"
 
 
 def _place(section: str, location: tuple) -> str:
     return section + "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in location)
 
 
-def _shown(found: Any) -> str:
-    text = json.dumps(found, ensure_ascii=False, default=str)
+def _shown(value: Any) -> str:
+    text = json.dumps(value, ensure_ascii=False, default=str)
     return text if len(text) <= 60 else text[:57] + "..."
 
 
 def _nearest(name: Any, names) -> str:
-    return next(
-        iter(difflib.get_close_matches(str(name), [str(other) for other in names], n=1, cutoff=0.6)), ""
-    )
+    """The name that is most like `name`, "" where none is."""
+    matches = difflib.get_close_matches(str(name), [str(other) for other in names], n=1, cutoff=0.6)
+    return next(iter(matches), "")
 
 
-def _did_you_mean(found: Any, choices) -> str:
+def _choice_remedy(dotted: str, value: Any, choices) -> str:
+    """How a value that is none of the choices is mended: its new name, or the choice most like it."""
+    if isinstance(value, str) and (dotted, value) in renamed.CHOICES:
+        return f"; {value} was renamed to {renamed.CHOICES[dotted, value]}"
     words = re.findall(r"'([^']*)'", choices) if isinstance(choices, str) else choices
-    near = _nearest(found, words)
+    near = _nearest(value, words)
     return f"; did you mean {near}?" if near else ""
 
 

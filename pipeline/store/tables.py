@@ -1,5 +1,7 @@
-"""A table against its schema: columns with type, unit, meaning and range, and a version;
-what does not fit is refused by column and row."""
+"""A table against its schema: columns with type, unit, meaning and range, and a version.
+
+What does not fit is refused by column and row.
+"""
 
 import math
 from pathlib import Path
@@ -8,10 +10,14 @@ from typing import NamedTuple
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from pipeline.store import renamed
+
 
 class Column(NamedTuple):
-    """`low` and `high` are checked whenever the column is written or read; NaN is
-    missing, and refused where the column is not nullable."""
+    """`low` and `high` are checked whenever the column is written or read.
+
+    NaN stands for a missing value; only a nullable column may have one.
+    """
 
     name: str
     type: pa.DataType
@@ -34,9 +40,6 @@ TEXT, FLOAT, BOOL, COUNT, INDEX = pa.string(), pa.float64(), pa.bool_(), pa.int6
 NONE = "1"
 
 
-# `remedy` ends the sentence
-
-
 def arrow(schema: Schema) -> pa.Schema:
     """Arrow's schema: name and version in its metadata, unit and meaning in each field's."""
     fields = [
@@ -46,21 +49,38 @@ def arrow(schema: Schema) -> pa.Schema:
     return pa.schema(fields, {"schema": schema.name, "schema_version": str(schema.version)})
 
 
+def under_new_names(schema: Schema, table: pa.Table) -> pa.Table:
+    """A table of an earlier version with today's names, if its columns were renamed since and nothing else
+    changed; any other table as it is."""
+    metadata = table.schema.metadata or {}
+    version = metadata.get(b"schema_version", b"").decode()
+    if metadata.get(b"schema", b"").decode() != schema.name or not version.isdigit():
+        return table
+    old = renamed.columns(schema.name)
+    names = [old.get(name, name) for name in table.column_names]
+    changed = names != table.column_names
+    same_columns = sorted(names) == sorted(column.name for column in schema.columns)
+    if int(version) >= schema.version or not changed or not same_columns:
+        return table
+    today = metadata | {b"schema_version": str(schema.version).encode()}
+    return table.rename_columns(names).replace_schema_metadata(today)
+
+
 def check(path: str | Path, schema: Schema, table: pa.Table, remedy: str) -> None:
-    """Refuses a table of another schema or version, with other columns or
-    types, or with values that its columns do not allow."""
+    """Refuses a table of another schema or version, with other columns or types, or with values that its
+    columns do not allow. `remedy` ends the sentence."""
     metadata = {key.decode(): text.decode() for key, text in (table.schema.metadata or {}).items()}
     name, version = metadata.get("schema"), metadata.get("schema_version")
     if (name, version) != (schema.name, str(schema.version)):
-        found = f"schema {name} version {version}" if name else "no schema"
+        held = f"schema {name} version {version}" if name else "no schema"
         raise ValueError(
-            f"{path} holds {found} but {schema.name} version {schema.version} is expected; {remedy}"
+            f"{path} holds {held} but {schema.name} version {schema.version} is expected; {remedy}"
         )
     check_names(path, schema, table.column_names, remedy)
     for column in schema.columns:
-        found = table.schema.field(column.name).type
-        if found != column.type:
-            raise ValueError(f"{path}: column {column.name} is {found} but should be {column.type}; {remedy}")
+        kind = table.schema.field(column.name).type
+        if kind != column.type:
+            raise ValueError(f"{path}: column {column.name} is {kind} but should be {column.type}; {remedy}")
         unit = (table.schema.field(column.name).metadata or {}).get(b"unit", b"").decode()
         if unit != column.unit:
             raise ValueError(
@@ -73,14 +93,12 @@ def check(path: str | Path, schema: Schema, table: pa.Table, remedy: str) -> Non
 def check_names(path: str | Path, schema: Schema, names, remedy: str) -> None:
     """Refuses a table that lacks columns or has others."""
     expected = [column.name for column in schema.columns]
-    missing, extra = (
-        [name for name in expected if name not in names],
-        [name for name in names if name not in expected],
-    )
-    if missing or extra:
-        parts = [f"lacks {', '.join(missing)}"] * bool(missing) + [f"has {', '.join(extra)} too many"] * bool(
-            extra
-        )
+    missing = [name for name in expected if name not in names]
+    extra = [name for name in names if name not in expected]
+    parts = [f"lacks {', '.join(missing)}"] if missing else []
+    if extra:
+        parts.append(f"has {', '.join(extra)} too many")
+    if parts:
         raise ValueError(
             f"{path}: table {schema.name} version {schema.version} {' and '.join(parts)}; {remedy}"
         )
@@ -106,26 +124,19 @@ def _check_range(path: str | Path, column: Column, values: pa.ChunkedArray, reme
     if smallest is None:
         return
     unit = "" if column.unit == "1" else f" {column.unit}"
-    low, high = (
-        (-math.inf if column.low is None else column.low),
-        (math.inf if column.high is None else column.high),
-    )
-    for found, inside, bound in [
-        (
-            smallest,
-            smallest >= low and smallest != -math.inf,
-            f"at least {low:g}{unit}" if column.low is not None else "finite",
-        ),
-        (
-            largest,
-            largest <= high and largest != math.inf,
-            f"at most {high:g}{unit}" if column.high is not None else "finite",
-        ),
+    low = -math.inf if column.low is None else column.low
+    high = math.inf if column.high is None else column.high
+    at_least = "finite" if column.low is None else f"at least {low:g}{unit}"
+    at_most = "finite" if column.high is None else f"at most {high:g}{unit}"
+    for extreme, inside, bound in [
+        (smallest, smallest >= low and smallest != -math.inf, at_least),
+        (largest, largest <= high and largest != math.inf, at_most),
     ]:
         if not inside:
-            row = pc.index(values, pa.scalar(found, values.type)).as_py()
+            row = pc.index(values, pa.scalar(extreme, values.type)).as_py()
             raise ValueError(
-                f"{path}: column {column.name} is {found:g}{unit} in row {row} but must be {bound}; {remedy}"
+                f"{path}: column {column.name} is {extreme:g}{unit} in row {row} but must be {bound}; "
+                f"{remedy}"
             )
 
 

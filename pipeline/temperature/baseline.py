@@ -66,8 +66,17 @@ def pi_law(pairs: Pairing, *, inputs: int) -> Law:
     to_input[pairs.inputs, np.arange(p)] = pairs.gain
     none = np.zeros((0, 0))
     return Law(
-        A=none, B_u=np.zeros((0, inputs)), B_y=np.zeros((0, p)), B_r=np.zeros((0, p)), c=np.zeros(0),
-        K=np.zeros((inputs, 0)), D=to_input, K_r=-to_input,
-        k=np.zeros(inputs), start_u=np.zeros((0, inputs)), start_y=np.zeros((0, p)), start=np.zeros(0),
+        A=none,
+        B_u=np.zeros((0, inputs)),
+        B_y=np.zeros((0, p)),
+        B_r=np.zeros((0, p)),
+        c=np.zeros(0),
+        K=np.zeros((inputs, 0)),
+        D=to_input,
+        K_r=-to_input,
+        k=np.zeros(inputs),
+        start_u=np.zeros((0, inputs)),
+        start_y=np.zeros((0, p)),
+        start=np.zeros(0),
         integral=1 / pairs.reset.max(),
-    )  # fmt: skip
+    )

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.temperature.judging import Controller, Limits, model_based, targets
+from pipeline.temperature.judging import Controller, Deployment, Limits, model_based, targets
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.scorecard import (
     Figures,
@@ -24,24 +24,23 @@ from pipeline.temperature.scorecard import (
 from pipeline.temperature.tuning import Result
 
 
-class Trade(NamedTuple):
-    """What a candidate gives and takes: r.m.s. tracking error in °C and r.m.s.
-    effort in percent, each the mean over the scenarios."""
+class ErrorEffort(NamedTuple):
+    """Of a candidate: r.m.s. tracking error in °C and r.m.s. effort in percent, means over the scenarios."""
 
     tracking_degC: float
     effort_percent: float
 
 
 def deployed(
-    plant: Plant, scenarios: Panel, *, gamma: float, limits: Limits, band: float, integral: float,
-    integral_limit: float, least_disk_margin: float
-) -> Callable[[np.ndarray], Figures]:  # fmt: skip
+    plant: Plant, scenarios: Panel, deployment: Deployment, *, gamma: float, least_disk_margin: float
+) -> Callable[[np.ndarray], Figures]:
     """The figures of theta = [q; r; tau]: weights and observer of the
     model's controller, as deployed on the training panel.
 
     A candidate whose disk margin on its own model is below `least_disk_margin` fails (ValueError): figures in
     simulation are no reason to give robustness away.
     """
+    limits, band, integral, integral_limit = deployment
     aims, p, m = targets(plant, scenarios.r, limits), plant.p, plant.m
 
     def run(theta: np.ndarray) -> Figures:
@@ -49,22 +48,24 @@ def deployed(
         disk = margins([plant], law, grid=80)[0].disk
         if disk < least_disk_margin:
             raise ValueError(f"the disk margin is {disk:.2f}, below the least of {least_disk_margin:.2f}")
-        found = simulate(
+        rollout = simulate(
             scenarios, law, feed_forward(scenarios, law, aims), limits=limits, integral_band=integral_limit
         )
-        return figures(scenarios, found, limits=limits, band=band, sample_time_s=plant.sample_time_s)
+        return figures(scenarios, rollout, limits=limits, band=band, sample_time_s=plant.sample_time_s)
 
     return run
 
 
-def trade(found: Figures) -> Trade:
-    return Trade(float(found.tracking_degC.mean()), float(found.effort_percent.mean()))
+def error_effort_of(results: Figures) -> ErrorEffort:
+    return ErrorEffort(float(results.tracking_degC.mean()), float(results.effort_percent.mean()))
 
 
-def optimum_trade(scenarios: Panel, yardstick: Yardstick, *, limits: Limits, band: float) -> Trade:
+def optimum_error_effort(
+    scenarios: Panel, yardstick: Yardstick, *, limits: Limits, band: float
+) -> ErrorEffort:
     """Of the Riccati law of each scenario's own plant, told the state and left
     unclipped: what no controller undercuts on the yardstick."""
-    return trade(
+    return error_effort_of(
         figures(
             scenarios,
             optimum_run(scenarios, yardstick),
@@ -75,11 +76,11 @@ def optimum_trade(scenarios: Panel, yardstick: Yardstick, *, limits: Limits, ban
     )
 
 
-def found_or_none(asked: Callable[[np.ndarray], object], theta: np.ndarray):
+def value_or_none(function: Callable[[np.ndarray], object], theta: np.ndarray):
     """What theta gives, None where it fails: default weights may fail on somebody
     else's plant, and the search is not lost for that."""
     try:
-        return asked(theta)
+        return function(theta)
     except ValueError:
         return None
 
@@ -90,15 +91,15 @@ def yardstick_regret(
     """What weights q, r cost on the common yardstick: median regret, unclipped,
     on the quietest scenarios of the nominal plant."""
     law = controller.design(q, r, 0.0)
-    found = regret(
+    regrets = regret(
         cost(scenarios, simulate(scenarios, law, feed_forward(scenarios, law, None), limits=None), yardstick),
         optimum(scenarios, yardstick),
     )
-    return float(np.median(found[(scenarios.plant == 0) & (scenarios.noise == scenarios.noise.min())]))
+    return float(np.median(regrets[(scenarios.plant == 0) & (scenarios.noise == scenarios.noise.min())]))
 
 
 def histories(
-    results: Mapping[str, Result], trades: Mapping[str, Sequence[Trade | None]]
+    results: Mapping[str, Result], trades: Mapping[str, Sequence[ErrorEffort | None]]
 ) -> dict[str, list | np.ndarray]:
     """The candidates of several searches as columns, one row a candidate; `trades` as
     many a search, None for a candidate that failed."""

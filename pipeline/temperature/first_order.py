@@ -98,7 +98,7 @@ def fit_record(
 
     bounds = ([np.log(taus[0] / 10), 0.0], [np.log(taus[-1] * 10), max(longest, sample_time_s * 1e-6)])
     start = [np.log(tau), float(np.clip(delay, 0.0, bounds[1][1]))]
-    found = scipy.optimize.least_squares(
+    best = scipy.optimize.least_squares(
         errors,
         start,
         bounds=bounds,
@@ -108,7 +108,7 @@ def fit_record(
         ftol=1e-12,
         gtol=1e-12,
     )
-    tau, delay = float(np.exp(found.x[0])), float(found.x[1])
+    tau, delay = float(np.exp(best.x[0])), float(best.x[1])
     theta, error, z = _linear_part(u, y, tau, delay, sample_time_s)
     fit = 100.0 * (1.0 - np.linalg.norm(error) / max(np.linalg.norm(z - z.mean()), np.finfo(float).tiny))
     return FirstOrder(
@@ -132,10 +132,11 @@ def _check(u, y, sample_time_s) -> None:
             "fit_record: expected an input without gaps but found NaN in u; "
             "split the record into segments at the gaps"
         )
-    seen = sum(int(np.isfinite(b).sum()) for b in y)
-    if seen < 10:
+    measured = sum(int(np.isfinite(b).sum()) for b in y)
+    if measured < 10:
         raise ValueError(
-            f"fit_record: expected at least 10 samples of y but found {seen}; record {10 - seen} samples more"
+            f"fit_record: expected at least 10 samples of y but found {measured}; "
+            f"record {10 - measured} samples more"
         )
     if all(np.ptp(a) <= 1e-12 * max(np.abs(a).max(), 1e-300) for a in u):
         raise ValueError("fit_record: the input never moves, so its gain is not identified; record a step")
@@ -166,11 +167,11 @@ def _deviations(u, y, gain, tau, delay, sample_time_s, error) -> tuple[float, fl
     nuisance = [np.ones(len(J))]
     at = 0
     for b in y:
-        seen = np.isfinite(b)
+        mask = np.isfinite(b)
         column = np.zeros(len(J))
-        column[at : at + seen.sum()] = np.exp(-np.arange(len(b)) * sample_time_s / tau)[seen]
+        column[at : at + mask.sum()] = np.exp(-np.arange(len(b)) * sample_time_s / tau)[mask]
         nuisance.append(column)
-        at += int(seen.sum())
+        at += int(mask.sum())
     N = np.column_stack(nuisance)
     J = J - N @ np.linalg.lstsq(N, J, rcond=None)[0]
     variance = np.sum(error**2) / max(len(J) - 3 - N.shape[1], 1)

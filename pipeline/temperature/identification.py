@@ -1,16 +1,21 @@
-"""From a record to a plant: window, dead time, feed-through, order and refinement chosen on the
-identification data by stated rules, then one fit on all of it.
+"""From a record to a plant. Stated rules choose window, dead time, feed-through, order and refinement on the
+identification data; then one fit is made on all of it.
 
 The rules, each with its reason:
-window twice the lags of Akaike's criterion (corrected for few samples) over VARX models: long enough to
-whiten; and Schwarz's lags, for records that say little feed-through with and without u(t), where
-`feedthrough` is None and Schwarz's criterion of the one-step predictor prefers it largest order singular
-values, in units of the noise, above what coefficient errors alone reach: sqrt(2) (sqrt(rows) + sqrt(columns))
-of the noise matrix dead time none; the lags at which the largest model's impulse response stays under 5 % of
-its peak; those under a quarter that Wald's test finds silent too order of all these, the fewest parameters
-whose error in simulation of left-out blocks (geometric mean) is within 2 % of the best refinement where
-`refinement` is "validated": prediction-error fits of the chosen model, where one takes more than 5 % off the
-error on the left-out blocks; for simulation only where that beats prediction by a fifth
+
+window: Twice the lags of Akaike's criterion (corrected for few samples) over VARX models, long enough to
+    whiten. Schwarz's lags beside them, for records that say little.
+feed-through: With and without u(t), where `feedthrough` is None and Schwarz's criterion of the one-step
+    predictor prefers it.
+largest order: The singular values, in units of the noise, above what coefficient errors alone reach:
+    sqrt(2) (sqrt(rows) + sqrt(columns)) of the noise matrix.
+dead time: None; the lags at which the largest model's impulse response stays under 5 % of its peak; those
+    under a quarter of it that Wald's test finds silent too.
+order: The fewest parameters whose error is within 2 % of the best. The error is that of
+    simulating left-out blocks (geometric mean).
+refinement: Where `refinement` is "validated", prediction-error fits of the chosen model. One is taken where
+    it takes more than 5 % off the error on the left-out blocks; one for simulation only where it beats
+    prediction by a fifth.
 """
 
 from collections.abc import Sequence
@@ -22,6 +27,7 @@ from pipeline.temperature.order import (
     WORTH_REFINING,
     WORTH_THE_NOISE,
     Candidate,
+    Fit,
     Structure,
     cross_validate,
     dead_time,
@@ -36,8 +42,17 @@ from pipeline.temperature.order import (
     with_delays,
 )
 from pipeline.temperature.plant import Plant
-from pipeline.temperature.refinement import drives, estimate_state, simulation_form
-from pipeline.temperature.subspace import Segments, complete_runs, gapless, lagged, realise, subspace
+from pipeline.temperature.refinement import FitSettings, drives, estimate_state, simulation_form
+from pipeline.temperature.subspace import (
+    Lagged,
+    Segments,
+    Subspace,
+    complete_runs,
+    gapless,
+    lagged,
+    realise,
+    subspace,
+)
 
 EXACT_RANK = 1e-7  # singular values of a noise-free record below this share of the largest are rounding
 
@@ -68,6 +83,37 @@ class Identified(NamedTuple):
     notes: list[str]
 
 
+class Settings(NamedTuple):
+    """What is given and what is chosen. None leaves order, window `past` and feed-through to the data.
+
+    `refinement` "prediction" or "simulation" moves the plant to the least errors of that kind. "validated"
+    does so only where the left-out `blocks` prefer it. `max_radius` bounds every pole.
+    """
+
+    order: int | None = None
+    past: int | None = None
+    feedthrough: bool | None = False
+    offset: bool = True
+    refinement: Literal["none", "prediction", "simulation", "validated"] = "none"
+    max_order: int = 12
+    max_radius: float | None = None
+    blocks: int = 5
+
+
+DEFAULTS = Settings()
+
+
+class Choice(NamedTuple):
+    """The class of model that one fit on all of the record is made of; `exact`: the record is noise-free;
+    `table`: the candidates that were compared."""
+
+    structure: Structure
+    order: int
+    fit: Fit
+    exact: bool
+    table: list[Candidate]
+
+
 def name_of(names: Sequence[str], letter: str, j: int) -> str:
     return names[j] if names else f"{letter}{j + 1}"
 
@@ -76,9 +122,9 @@ def check_outputs(y: Segments, *, names: Sequence[str] = ()) -> None:
     """Raises ValueError where an output never moves: no model of it is possible."""
     rows = np.vstack(y)
     for j in range(rows.shape[1]):
-        seen = rows[np.isfinite(rows[:, j]), j]
-        if seen.size == 0 or np.ptp(seen) <= 1e-12 * np.abs(seen).max():
-            shown = f"{seen[0]:g} in every sample" if seen.size else "missing in every sample"
+        values = rows[np.isfinite(rows[:, j]), j]
+        if values.size == 0 or np.ptp(values) <= 1e-12 * np.abs(values).max():
+            shown = f"{values[0]:g} in every sample" if values.size else "missing in every sample"
             raise ValueError(
                 f"output {name_of(names, 'y', j)} is constant ({shown}), so no model of it is possible; "
                 "check the sensor, or leave it out of plant.outputs"
@@ -125,7 +171,7 @@ def within_limits(
     the record wherever the actuator stands at its stop.
     """
     low, high = (np.asarray(side, float) for side in limits)
-    m, said = u[0].shape[1], []
+    m, notes = u[0].shape[1], []
     if low.shape != (m,) or high.shape != (m,) or not (low < high).all():
         raise ValueError(
             f"limits: expected {m} low and {m} high limits with low < high but found {low.tolist()} and "
@@ -135,11 +181,11 @@ def within_limits(
     for j in range(m):
         beyond = int(((rows[:, j] < low[j]) | (rows[:, j] > high[j])).sum())
         if beyond:
-            said.append(
+            notes.append(
                 f"{name_of(names, 'u', j)} was asked beyond {low[j]:g}..{high[j]:g} in {beyond} of "
                 f"{len(rows)} samples: the limit is taken as its input there"
             )
-    return [np.clip(a, low, high) for a in u], said
+    return [np.clip(a, low, high) for a in u], notes
 
 
 def identify(
@@ -147,77 +193,27 @@ def identify(
     y: Segments,
     *,
     sample_time_s: float,
-    order: int | None = None,
-    past: int | None = None,
-    feedthrough: bool | None = False,
-    offset: bool = True,
-    refinement: Literal["none", "prediction", "simulation", "validated"] = "none",
-    max_order: int = 12,
-    max_radius: float | None = None,
-    blocks: int = 5,
+    settings: Settings = DEFAULTS,
     limits: tuple[Sequence[float], Sequence[float]] | None = None,
     names: Sequence[str] = (),
 ) -> Identified:
     """The plant that a record shows, by the rules at the head of this module; u segments (T, m), y segments
     (T, p), NaN where a sample is masked.
 
-    PBSID makes the start, in innovation form. `refinement` "prediction" or "simulation" moves it to the least
-    errors of that kind; "validated" does so only where the left-out blocks prefer it. `feedthrough` None lets
-    the data decide. `limits` (low, high) of the actuators clip u; `max_radius` bounds every pole. Works in
-    closed loop, unless refined on simulation errors. Raises ValueError for a constant or collinear input, a
-    constant output, a record too short for the order, and shapes that do not agree.
+    PBSID makes the start, in innovation form. `limits` (low, high) of the actuators clip u. Works in closed
+    loop, unless refined on simulation errors. Raises ValueError for a constant or collinear input, a constant
+    output, a record too short for the order, and shapes that do not agree.
     """
-    u, y, cut, notes = _prepared(u, y, order, past, offset, limits, names)
-    m = u[0].shape[1]
-    pasts, exact = _windows(u, y, order, past, offset)
-    direct = (feedthrough,)
-    if feedthrough is None:
-        direct = (False, True) if feedthrough_shows(u, y, pasts[0], offset) else (False,)
-    structure, kind, table = (
-        Structure(pasts[0], direct[-1], offset, (0,) * m),
-        refinement.replace("none", "subspace"),
-        [],
-    )
-    if exact:
-        sub = subspace(lagged(u, y, pasts[0], feedthrough=direct[-1], offset=offset, exact=True), pasts[0])
-        rank = max(int((sub.singular_values > EXACT_RANK * sub.singular_values[0]).sum()), 1)
-        exact = (
-            rank <= max_order
-        )  # else no rank but a nonlinearity without noise, and the order is a choice as with noise
-    if exact:
-        notes.append(
-            f"the record is noise-free: {pasts[0]} past samples predict it to rounding, "
-            "and the order is a rank"
-        )
-        order, kind = order or rank, kind.replace("validated", "subspace")
-    elif order is None or refinement == "validated":
-        structures = [structure._replace(past=n, feedthrough=d) for n in pasts for d in direct]
-        chosen, table = _choose(
-            u,
-            y,
-            structures,
-            order,
-            max_order,
-            refinement == "validated",
-            {"blocks": blocks, "max_radius": max_radius},
-        )
-        order, structure, kind = (
-            chosen.order,
-            chosen.structure,
-            chosen.fit if refinement == "validated" else kind,
-        )
-    if feedthrough is None:
-        notes.append(
-            f"direct feed-through {'kept' if structure.feedthrough else 'left out'} as the data prefer"
-        )
-    found = _fit_all(u, y, structure, exact, order, kind, sample_time_s, table, max_radius)
-    return found._replace(dropped_rows=found.dropped_rows + cut, notes=notes + _remarks(found, names))
+    record = _prepared(u, y, settings, limits, names)
+    choice, reasons = _chosen(record.u, record.y, settings)
+    fitted = _fit_all(record.u, record.y, choice, sample_time_s, settings.max_radius)
+    return _with_remarks(fitted, record._replace(notes=record.notes + reasons), names)
 
 
 def refit(
     u: Segments,
     y: Segments,
-    found: Identified,
+    identified: Identified,
     *,
     max_radius: float | None = None,
     limits: tuple[Sequence[float], Sequence[float]] | None = None,
@@ -225,46 +221,78 @@ def refit(
 ) -> Identified:
     """What was chosen on a part of the record (window, feed-through, dead times, order, refinement) fitted to
     all of it, nothing chosen anew; as `identify` otherwise."""
-    u, y, cut, notes = _prepared(u, y, found.order, found.past, found.offset, limits, names)
-    structure = Structure(found.past, found.feedthrough, found.offset, found.delays)
-    exact = (
-        not found.order_table
-        and windows(lagged(u, y, found.past, feedthrough=found.feedthrough, offset=found.offset))[1]
+    past, offset, table = identified.past, identified.offset, identified.order_table
+    settings = Settings(order=identified.order, past=past, offset=offset)
+    record = _prepared(u, y, settings, limits, names)
+    structure = Structure(past, identified.feedthrough, offset, identified.delays)
+    data = (
+        None if table else lagged(record.u, record.y, past, feedthrough=structure.feedthrough, offset=offset)
     )
-    again = _fit_all(
-        u,
-        y,
-        structure,
-        exact,
-        found.order,
-        found.fit,
-        found.plant.sample_time_s,
-        found.order_table,
-        max_radius,
-    )
-    return again._replace(dropped_rows=again.dropped_rows + cut, notes=notes + _remarks(again, names))
+    exact = data is not None and windows(data)[1]
+    choice = Choice(structure, identified.order, identified.fit, exact, table)
+    fitted = _fit_all(record.u, record.y, choice, identified.plant.sample_time_s, max_radius)
+    return _with_remarks(fitted, record, names)
 
 
-def _prepared(
-    u, y, order, past, offset, limits, names
-) -> tuple[list[np.ndarray], list[np.ndarray], int, list[str]]:
-    """The record as it can be identified, checked: clipped at the limits, cut at masked inputs; how many
-    samples that cost, and what was done, a sentence each."""
+class _Record(NamedTuple):
+    """A record as it can be identified; `cut` samples were left out, and `notes` say what was done."""
+
+    u: list[np.ndarray]
+    y: list[np.ndarray]
+    cut: int
+    notes: list[str]
+
+
+def _prepared(u, y, settings: Settings, limits, names) -> _Record:
+    """The record as it can be identified, checked: clipped at the limits, cut at masked inputs."""
     u, y = [np.atleast_2d(np.asarray(a, float)) for a in u], [np.atleast_2d(np.asarray(b, float)) for b in y]
     _check_shapes(u, y)
-    whole = sum(map(len, u))
+    samples = sum(map(len, u))
     u, notes = within_limits(u, limits, names=names) if limits is not None else (u, [])
     u, y = gapless(u, y)
-    cut = whole - sum(map(len, u))
-    _check_length(u, y, order, past)
-    check_inputs(u, offset=offset, names=names)
+    cut = samples - sum(map(len, u))
+    _check_length(u, y, settings.order, settings.past)
+    check_inputs(u, offset=settings.offset, names=names)
     check_outputs(y)
-    return (
-        u,
-        y,
-        cut,
-        notes + ([f"{cut} samples with a masked input, or without any output, were cut out"] if cut else []),
+    if cut:
+        notes = [*notes, f"{cut} samples with a masked input, or without any output, were cut out"]
+    return _Record(u, y, cut, notes)
+
+
+def _chosen(u: Segments, y: Segments, settings: Settings) -> tuple[Choice, list[str]]:
+    """What the rules choose, and a sentence for each choice that a user should know of."""
+    pasts, exact = _windows(u, y, settings.order, settings.past, settings.offset)
+    direct = (settings.feedthrough,)
+    if settings.feedthrough is None:
+        direct = (False, True) if feedthrough_shows(u, y, pasts[0], settings.offset) else (False,)
+    structure = Structure(pasts[0], direct[-1], settings.offset, (0,) * u[0].shape[1])
+    choice = Choice(structure, settings.order, settings.refinement.replace("none", "subspace"), False, [])
+    validated, notes = settings.refinement == "validated", []
+    # a rank beyond max_order is a nonlinearity without noise: the order is then a choice, as with noise
+    if exact and (rank := _exact_rank(u, y, structure)) <= settings.max_order:
+        notes.append(
+            f"the record is noise-free: {pasts[0]} past samples predict it to rounding, "
+            "and the order is a rank"
+        )
+        kind = choice.fit.replace("validated", "subspace")
+        choice = Choice(structure, settings.order or rank, kind, True, [])
+    elif settings.order is None or validated:
+        structures = [structure._replace(past=n, feedthrough=d) for n in pasts for d in direct]
+        best, table = _best_candidate(u, y, structures, settings)
+        choice = Choice(best.structure, best.order, best.fit if validated else choice.fit, False, table)
+    if settings.feedthrough is None:
+        verb = "kept" if choice.structure.feedthrough else "left out"
+        notes.append(f"direct feed-through {verb} as the data prefer")
+    return choice, notes
+
+
+def _exact_rank(u: Segments, y: Segments, structure: Structure) -> int:
+    """The order of a noise-free record: singular values that are more than rounding, at least 1."""
+    data = lagged(
+        u, y, structure.past, feedthrough=structure.feedthrough, offset=structure.offset, exact=True
     )
+    values = subspace(data, structure.past).singular_values
+    return max(int((values > EXACT_RANK * values[0]).sum()), 1)
 
 
 def _windows(u, y, order, past, offset) -> tuple[tuple[int, ...], bool]:
@@ -272,90 +300,85 @@ def _windows(u, y, order, past, offset) -> tuple[tuple[int, ...], bool]:
     if past:
         return (past,), False
     longest = longest_window(u, y)
-    pasts, exact = windows(
-        lagged(u, y, min(longest, 6), offset=offset)
-    )  # a few lags tell whether the record is noise-free
+    # a few lags tell whether the record is noise-free
+    pasts, exact = windows(lagged(u, y, min(longest, 6), offset=offset))
     if not exact:
         pasts, exact = windows(lagged(u, y, longest, offset=offset))
     least = -(-(order or 1) // y[0].shape[1])
     return tuple(sorted({max(n, least) for n in pasts}, reverse=True)), exact
 
 
-def _choose(u, y, structures, order, max_order, validated, settings) -> tuple[Candidate, list[Candidate]]:
+def _best_candidate(
+    u: Segments, y: Segments, structures: list[Structure], settings: Settings
+) -> tuple[Candidate, list[Candidate]]:
     """The candidate that the rules take, and the table: structures and orders of the
     subspace fit, then the refined fits of the winner."""
+    validation = {"blocks": settings.blocks, "max_radius": settings.max_radius}
     table = []
     for structure in structures:
         data = lagged(u, y, structure.past, feedthrough=structure.feedthrough, offset=structure.offset)
         sub = subspace(data, structure.past)
-        orders, delays, furthest = [order], {structure.delays}, max(data.past // 2, 1)
-        if order is None:
-            largest = max(
-                1,
-                min(
-                    int((sub.singular_values > noise_edge(data, structure.past)).sum()),
-                    max_order,
-                    len(sub.singular_values),
-                ),
-            )
-            orders = range(1, largest + 1)
-            model = realise(data, sub.basis[:largest], 1.0)
-            quiet = np.minimum(tested_dead_times(data, furthest)[0], dead_time(model, furthest, 0.25))
-            delays |= {dead_time(model, furthest), tuple(quiet.tolist())}
+        orders, delays = _candidates(data, sub, structure, settings)
         for d in sorted(delays):
+            delayed = structure._replace(delays=d)
             table += cross_validate(
-                u,
-                y,
-                orders,
-                structure._replace(delays=d),
-                ("subspace",),
-                singular_values=sub.singular_values,
-                **settings,
+                u, y, orders, delayed, ("subspace",), singular_values=sub.singular_values, **validation
             )
     if not table:
         raise ValueError(
-            f"the record is too short to choose a model by leaving out one of {settings['blocks']} blocks: "
+            f"the record is too short to choose a model by leaving out one of {settings.blocks} blocks: "
             f"{sum(map(len, u))} samples do not carry a window of"
             f" {structures[-1].past} without one; record longer, or give order and past"
         )
-    chosen = simplest(table)
-    if validated:
-        known = {row.order: row.singular_value for row in table if row.structure == chosen.structure}
-        values = np.array([known.get(n, np.nan) for n in range(1, chosen.order + 1)])
+    best = simplest(table)
+    if settings.refinement == "validated":
+        value_of = {row.order: row.singular_value for row in table if row.structure == best.structure}
+        values = np.array([value_of.get(n, np.nan) for n in range(1, best.order + 1)])
+        kinds = ("prediction", "simulation")
         refined = cross_validate(
-            u,
-            y,
-            [chosen.order],
-            chosen.structure,
-            ("prediction", "simulation"),
-            singular_values=values,
-            **settings,
+            u, y, [best.order], best.structure, kinds, singular_values=values, **validation
         )
         table += refined
-        best = min(
+        challenger = min(
             refined,
             key=lambda row: row.error * (1 - WORTH_THE_NOISE) ** (row.fit == "prediction"),
-            default=chosen,
+            default=best,
         )
-        chosen = best if best.error < (1 - WORTH_REFINING) * chosen.error else chosen
-    return chosen, table
+        best = challenger if challenger.error < (1 - WORTH_REFINING) * best.error else best
+    return best, table
 
 
-def _fit_all(u, y, structure, exact, order, kind, sample_time_s, table, max_radius) -> Identified:
+def _candidates(
+    data: Lagged, sub: Subspace, structure: Structure, settings: Settings
+) -> tuple[Sequence[int], set[tuple[int, ...]]]:
+    """Orders and dead times worth trying: those asked for, or those that stand out of the noise."""
+    delays = {structure.delays}
+    if settings.order is not None:
+        return [settings.order], delays
+    above_noise = int((sub.singular_values > noise_edge(data, structure.past)).sum())
+    largest = max(1, min(above_noise, settings.max_order, len(sub.singular_values)))
+    furthest = max(data.past // 2, 1)
+    model = realise(data, sub.basis[:largest], 1.0)
+    quiet = np.minimum(tested_dead_times(data, furthest)[0], dead_time(model, furthest, 0.25))
+    return range(1, largest + 1), delays | {dead_time(model, furthest), tuple(quiet.tolist())}
+
+
+def _fit_all(
+    u: Segments, y: Segments, choice: Choice, sample_time_s: float, max_radius: float | None
+) -> Identified:
     """One fit of the chosen model on all of the record."""
-    past, rest = structure.past, {"feedthrough": structure.feedthrough, "offset": structure.offset}
+    structure, order, kind, exact, table = choice
+    past, settings = structure.past, FitSettings(structure.feedthrough, structure.offset, max_radius, 30)
     us, ys = shifted(u, y, structure.delays)
-    data = lagged(us, ys, past, **rest, exact=exact)
+    data = lagged(us, ys, past, feedthrough=structure.feedthrough, offset=structure.offset, exact=exact)
     sub = subspace(data, past)
     if order > len(sub.singular_values):
         raise ValueError(
             f"order {order} needs a longer window: {past} past samples give at most "
             f"{len(sub.singular_values)} states; raise past"
         )
-    plant = realise(data, sub.basis[:order], sample_time_s)
-    plant = with_delays(
-        fit(kind, plant, us, ys, max_iterations=30, max_radius=max_radius, **rest), structure.delays
-    )
+    start = realise(data, sub.basis[:order], sample_time_s)
+    plant = with_delays(fit(kind, start, us, ys, settings), structure.delays)
     model = simulation_form(plant, [])
     return Identified(
         plant=plant,
@@ -376,34 +399,40 @@ def _fit_all(u, y, structure, exact, order, kind, sample_time_s, table, max_radi
     )
 
 
-def _remarks(found: Identified, names: Sequence[str]) -> list[str]:
+def _with_remarks(fitted: Identified, record: _Record, names: Sequence[str]) -> Identified:
+    return fitted._replace(
+        dropped_rows=fitted.dropped_rows + record.cut, notes=record.notes + _remarks(fitted, names)
+    )
+
+
+def _remarks(fitted: Identified, names: Sequence[str]) -> list[str]:
     """What a user should know of the fit, a sentence each."""
-    said = []
-    if found.dropped_rows:
-        said.append(f"{found.dropped_rows} rows touch a masked sample and were left out of the fit")
-    said += [
+    notes = []
+    if fitted.dropped_rows:
+        notes.append(f"{fitted.dropped_rows} rows touch a masked sample and were left out of the fit")
+    notes += [
         f"dead time of {name_of(names, 'u', j)}: {delay} samples beyond the one of sampling"
-        for j, delay in enumerate(found.delays)
+        for j, delay in enumerate(fitted.delays)
         if delay
     ]
-    said += [
+    notes += [
         f"no output answers {name_of(names, 'u', j)} (99.9 %): leave it out, or excite it more"
-        for j in range(found.plant.m)
-        if found.silent[j]
+        for j in range(fitted.plant.m)
+        if fitted.silent[j]
     ]
-    determined = int((found.singular_values > found.noise_edge).sum())
-    if found.order > max(determined, 1) and not found.order_table:
-        said.append(
-            f"order {found.order} was asked but the record determines {determined} states above its noise; "
+    determined = int((fitted.singular_values > fitted.noise_edge).sum())
+    if fitted.order > max(determined, 1) and not fitted.order_table:
+        notes.append(
+            f"order {fitted.order} was asked but the record determines {determined} states above its noise; "
             "the others fit noise"
         )
-    radius = float(np.abs(np.linalg.eigvals(found.plant.A)).max())
+    radius = float(np.abs(np.linalg.eigvals(fitted.plant.A)).max())
     if radius > 1:
-        said.append(
+        notes.append(
             f"the largest pole is at {radius:.5f}, outside the unit circle; refine with a limit, "
             "or record longer, before simulating far ahead"
         )
-    return said
+    return notes
 
 
 def _check_shapes(u: Segments, y: Segments) -> None:
@@ -453,18 +482,20 @@ def _check_length(u: Segments, y: Segments, order: int | None, past: int | None)
         )
 
 
-def rows(found: Identified) -> dict[str, list]:
+def rows(identified: Identified) -> dict[str, list]:
     """The table by which the order was chosen, as columns: every candidate,
     or the singular values alone where they decided."""
-    structure = Structure(found.past, found.feedthrough, found.offset, found.delays)
-    shown_rows = [row for row in found.order_table if row.structure == structure]
-    tried = {row.order: row for row in shown_rows if row.fit == found.fit or row.order != found.order}
-    shown = [k for k in range(1, len(found.singular_values) + 1) if k <= 30 or k in tried]
+    structure = Structure(identified.past, identified.feedthrough, identified.offset, identified.delays)
+    shown_rows = [row for row in identified.order_table if row.structure == structure]
+    tried = {
+        row.order: row for row in shown_rows if row.fit == identified.fit or row.order != identified.order
+    }
+    orders = [k for k in range(1, len(identified.singular_values) + 1) if k <= 30 or k in tried]
     return {
-        "order": np.array(shown, np.int32),
-        "singular_value": found.singular_values[np.array(shown) - 1],
-        "noise_edge": np.full(len(shown), found.noise_edge),
-        "parameters": [tried[k].parameters if k in tried else 0 for k in shown],
-        "error": np.array([tried[k].error if k in tried else np.nan for k in shown]),
-        "chosen": [k == found.order for k in shown],
+        "order": np.array(orders, np.int32),
+        "singular_value": identified.singular_values[np.array(orders) - 1],
+        "noise_edge": np.full(len(orders), identified.noise_edge),
+        "parameters": [tried[k].parameters if k in tried else 0 for k in orders],
+        "error": np.array([tried[k].error if k in tried else np.nan for k in orders]),
+        "chosen": [k == identified.order for k in orders],
     }

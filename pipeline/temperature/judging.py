@@ -14,7 +14,7 @@ from pipeline.temperature.scorecard import (
     Figures,
     Margins,
     Panel,
-    Run,
+    PanelRun,
     Yardstick,
     cost,
     feed_forward,
@@ -39,11 +39,11 @@ Targets = dict[bytes, tuple[np.ndarray, np.ndarray]]
 
 
 class Controller(NamedTuple):
-    """One way to control: `design(q, r, integral)` gives its law for weights diag(q), diag(r); `model` is
-    what its feasible targets are computed on.
+    """One way to control. `design(q, r, integral)` gives its law for weights diag(q), diag(r). Its feasible
+    targets are computed on `model`.
 
-    `own_feed_forward`: unclipped, the law's own feed-forward is part of its optimum;
-    a rule that has none aims at the target there too.
+    `own_feed_forward`: the law's own feed-forward is part of its unclipped optimum. A rule that has none aims
+    at the feasible target there too.
     """
 
     name: str
@@ -52,18 +52,40 @@ class Controller(NamedTuple):
     own_feed_forward: bool = True
 
 
+class Deployment(NamedTuple):
+    """How a law runs on the machine: limits of the inputs in percent, the band in °C that counts as settled,
+    the integrator's share a step, and the largest error in °C that it sees."""
+
+    limits: Limits
+    band: float
+    integral: float
+    integral_limit: float
+
+
+class LearnedModels(NamedTuple):
+    """What controllers are designed from: the identified plant, the VARX window, and the kernel where the
+    record determines it."""
+
+    plant: Plant
+    window: window_route.Window
+    kernel: Regression | None
+
+
 class Judged(NamedTuple):
-    """Of one controller: regret (scenarios,) unclipped under the yardstick, share of its unclipped commands
-    outside the limits in percent, figures and margins as deployed (clipped, aimed at feasible targets,
-    integrator on), margins one a plant; and both runs."""
+    """One controller on the panel, run twice.
+
+    `unclipped`, at the yardstick's weights: regret (scenarios,), and the share of commands outside the limits
+    in percent. `deployed`, clipped, aimed at feasible targets, integrator on: figures, and the margins of
+    `law` with each plant.
+    """
 
     name: str
     regret: np.ndarray
     outside_percent: np.ndarray
     figures: Figures
     margins: list[Margins]
-    unclipped: Run
-    deployed: Run
+    unclipped: PanelRun
+    deployed: PanelRun
     law: Law
 
 
@@ -98,8 +120,8 @@ def kernel(learned: Regression, gamma: float, model: Plant) -> Controller:
     """Algorithm 2; its feasible targets come from the window that was learned from the same record."""
 
     def design(q: np.ndarray, r: np.ndarray, integral: float) -> Law:
-        found: Kernel = value_iteration(learned, np.diag(q), np.diag(r), gamma)
-        return window_law(found.K, found.K_r, found.k, learned.N, integral=integral)
+        solution: Kernel = value_iteration(learned, np.diag(q), np.diag(r), gamma)
+        return window_law(solution.K, solution.K_r, solution.k, learned.N, integral=integral)
 
     return Controller("kernel", design, model)
 
@@ -111,49 +133,61 @@ def baseline(plant: Plant, limits: Limits, *, horizon: int) -> Controller:
 
 
 def controllers(
-    model: Plant, long: window_route.Window, learned: Regression | None, *, limits: Limits, gamma: float,
-    tau: float, exact_tau: float, horizon: int, truth: Plant | None
-) -> list[Controller]:  # fmt: skip
-    """All that the scorecard compares; the kernel where it could be learned, and where the true plant is
-    known a controller that was told its model, as a yardstick."""
-    found = [model_based(model, gamma, tau=tau), window(long, gamma)]
-    if learned is not None:
-        found.append(kernel(learned, gamma, found[1].model))
-    found.append(baseline(model, limits, horizon=horizon))
-    return [*found, exact_model(truth, gamma, tau=exact_tau)] if truth is not None else found
+    models: LearnedModels,
+    *,
+    limits: Limits,
+    gamma: float,
+    tau: float,
+    exact_tau: float,
+    horizon: int,
+    truth: Plant | None,
+) -> list[Controller]:
+    """All controllers that the scorecard compares. The kernel is among them where it could be learned. Where
+    the true plant is known, a controller designed on it is the yardstick."""
+    compared = [model_based(models.plant, gamma, tau=tau), window(models.window, gamma)]
+    if models.kernel is not None:
+        compared.append(kernel(models.kernel, gamma, compared[1].model))
+    compared.append(baseline(models.plant, limits, horizon=horizon))
+    return [*compared, exact_model(truth, gamma, tau=exact_tau)] if truth is not None else compared
 
 
 def refusals(
     compared: Sequence[Controller], designs: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> dict[str, str]:
-    """The controllers that have no law for one of these (q, r), each with the reason: a kernel can be
-    learned, and still have no minimum at other weights."""
-    found = {}
+    """The controllers that have no law for one of these (q, r), each with the reason. A learned kernel may
+    have no minimum at other weights."""
+    refused = {}
     for controller in compared:
         for q, r in designs:
             try:
                 controller.design(q, r, 0.0)
             except ValueError as reason:
-                found[controller.name] = str(reason)
-    return found
+                refused[controller.name] = str(reason)
+    return refused
 
 
 def targets(model: Plant, references: np.ndarray, limits: Limits) -> Targets:
     """The feasible steady (u, y) of every reference (scenarios, p) on
     the panel, by the controller's own model."""
-    found = {}
+    by_reference = {}
     for r in np.unique(references, axis=0):
         aim = feasible_target(model, r, *limits)
-        found[r.tobytes()] = (aim.u, aim.y)
-    return found
+        by_reference[r.tobytes()] = (aim.u, aim.y)
+    return by_reference
 
 
 def judge(
-    controller: Controller, scenarios: Panel, *, yardstick: Yardstick, q: np.ndarray, r: np.ndarray,
-    limits: Limits, band: float, integral: float, integral_limit: float
-) -> Judged:  # fmt: skip
-    """Run one controller on the panel twice: designed for the yardstick's weights and unclipped; designed for
-    (q, r), clipped, as it would be deployed."""
+    controller: Controller,
+    scenarios: Panel,
+    *,
+    yardstick: Yardstick,
+    q: np.ndarray,
+    r: np.ndarray,
+    deployment: Deployment,
+) -> Judged:
+    """One controller run on the panel twice: designed for the yardstick's weights and unclipped, and designed
+    for (q, r) and clipped, as it would be deployed."""
+    limits = deployment.limits
     plain = controller.design(yardstick.q, yardstick.r, 0.0)
     aims = targets(controller.model, scenarios.r, limits)
     unclipped = simulate(
@@ -163,17 +197,25 @@ def judge(
         limits=None,
     )
     outside = (unclipped.command < limits[0]) | (unclipped.command > limits[1])
-    law = controller.design(q, r, integral)
+    law = controller.design(q, r, deployment.integral)
     deployed = simulate(
-        scenarios, law, feed_forward(scenarios, law, aims), limits=limits, integral_band=integral_limit
+        scenarios,
+        law,
+        feed_forward(scenarios, law, aims),
+        limits=limits,
+        integral_band=deployment.integral_limit,
     )
     sample_time_s = scenarios.plants[0].sample_time_s
     return Judged(
-        controller.name, regret(cost(scenarios, unclipped, yardstick), optimum(scenarios, yardstick)),
+        controller.name,
+        regret(cost(scenarios, unclipped, yardstick), optimum(scenarios, yardstick)),
         100.0 * outside.mean(axis=(0, 2)),
-        figures(scenarios, deployed, limits=limits, band=band, sample_time_s=sample_time_s),
-        margins(scenarios.plants, law), unclipped, deployed, law,
-    )  # fmt: skip
+        figures(scenarios, deployed, limits=limits, band=deployment.band, sample_time_s=sample_time_s),
+        margins(scenarios.plants, law),
+        unclipped,
+        deployed,
+        law,
+    )
 
 
 def summary(judged: Judged, scenarios: Panel, *, noise: float) -> dict[str, dict[str, float | str | None]]:
@@ -228,61 +270,63 @@ def _number(value: float) -> float | None:
 
 
 class Sufficiency(NamedTuple):
-    """`half_gap`: what a controller learned from half of the record costs more than one from all of it, on
-    the model from all of it; `needed`: the samples at which a controller from all of them would cost
-    `allowed` more than the best, since the excess falls as one over the samples."""
+    """Whether the record of `samples` is long enough.
+
+    `half_gap` is the extra cost of a controller learned from half of the record, on the model learned from
+    all of it. The excess falls as one over the samples. At `needed` samples it would be the excess allowed.
+    """
 
     half_gap: float
     samples: int
     needed: int
 
 
+class CheckRun(NamedTuple):
+    """The noise-free run on which candidates are compared: from temperature `start` to `reference` (p,), both
+    in °C, over `steps`."""
+
+    start: float
+    reference: np.ndarray
+    steps: int
+
+    def on(self, model: Plant) -> Panel:
+        return panel(
+            [model],
+            starts=[self.start],
+            references=[self.reference],
+            noise=[0.0],
+            seeds=[0],
+            steps=self.steps,
+            hold=0,
+            cells=False,
+        )
+
+
 def sufficiency(
-    u: Sequence[np.ndarray], y: Sequence[np.ndarray], learned: window_route.Window, yardstick: Yardstick, *,
-    start: float, reference: np.ndarray, allowed: float, offset: bool,
-    gain_spread: float, steps: int,
-) -> Sufficiency:  # fmt: skip
-    """Whether the record is long enough for its noise, asked of the record alone: learn from each half of it,
-    judge by the model of the whole."""
-    model = window_route.predictor(learned)
-    scenarios = panel(
-        [model],
-        starts=[start],
-        references=[reference],
-        noise=[0.0],
-        seeds=[0],
-        steps=steps,
-        hold=0,
-        cells=False,
-    )
+    u: Sequence[np.ndarray],
+    y: Sequence[np.ndarray],
+    learned: window_route.Window,
+    yardstick: Yardstick,
+    check: CheckRun,
+    *,
+    allowed: float,
+    offset: bool,
+    gain_spread: float,
+) -> Sufficiency:
+    """Whether the record is long enough for its noise, by the record alone. A controller is learned from each
+    half of it and judged by the model learned from all of it."""
+    scenarios = check.on(window_route.predictor(learned))
     best = optimum(scenarios, yardstick)
     gaps = []
     for part in (0, 1):
-        halves = [
-            (
-                us[part * len(us) // 2 : (part + 1) * len(us) // 2],
-                ys[part * len(ys) // 2 : (part + 1) * len(ys) // 2],
-            )
-            for us, ys in zip(u, y, strict=True)
-        ]
-        half = window_route.learn(
-            [h[0] for h in halves],
-            [h[1] for h in halves],
-            longest=learned.N,
-            offset=offset,
-            gain_spread=gain_spread,
+        half_u, half_y = (
+            [rows[part * len(rows) // 2 : (part + 1) * len(rows) // 2] for rows in signal]
+            for signal in (u, y)
         )
+        half = window_route.learn(half_u, half_y, longest=learned.N, offset=offset, gain_spread=gain_spread)
         law = window_route.law(half, np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma)
-        gaps.append(
-            regret(
-                cost(
-                    scenarios,
-                    simulate(scenarios, law, feed_forward(scenarios, law, None), limits=None),
-                    yardstick,
-                ),
-                best,
-            )[0]
-        )
+        run = simulate(scenarios, law, feed_forward(scenarios, law, None), limits=None)
+        gaps.append(regret(cost(scenarios, run, yardstick), best)[0])
     half_gap = float(np.mean(gaps))
     # never fewer than twice the numbers of one output's predictor:
     # below that the half-record test itself means nothing
@@ -293,8 +337,8 @@ def sufficiency(
 
 
 class Candidate(NamedTuple):
-    """One state that Algorithm 2 was tried on: what it found, the gap of its gain on the window's model (inf
-    where it was refused), and the sentence of a refusal."""
+    """One state that Algorithm 2 was tried on: the regression, the gap of its gain on the window's model, and
+    the reason of a refusal. The gap of a refused candidate is infinite."""
 
     state: str
     learned: Regression | None
@@ -303,41 +347,38 @@ class Candidate(NamedTuple):
 
 
 def kernel_candidates(
-    u: Sequence[np.ndarray], y: Sequence[np.ndarray], long: window_route.Window, yardstick: Yardstick, *,
-    largest: int, offset: bool, start: float, reference: np.ndarray, steps: int
-) -> list[Candidate]:  # fmt: skip
-    """Algorithm 2 on windows of 1 to `largest` samples and on the predicted state, each checked on the model
-    of the long window: all from the one record.
+    u: Sequence[np.ndarray],
+    y: Sequence[np.ndarray],
+    long: window_route.Window,
+    yardstick: Yardstick,
+    check: CheckRun,
+    *,
+    largest: int,
+    offset: bool,
+) -> list[Candidate]:
+    """Algorithm 2 on windows of 1 to `largest` samples and on the predicted state, all from one record. The
+    model of the long window judges each.
 
-    The shortest window that holds the plant's state is exact without noise; with noise longer ones are
-    biased, and the predicted state is not.
+    Without noise the shortest window that holds the plant's state is exact. With noise longer windows are
+    biased; the predicted state is not.
     """
     model = window_route.predictor(long)
-    scenarios = panel(
-        [model],
-        starts=[start],
-        references=[reference],
-        noise=[0.0],
-        seeds=[0],
-        steps=steps,
-        hold=0,
-        cells=False,
-    )
+    scenarios = check.on(model)
     best = optimum(scenarios, yardstick)
     tried = [(f"window of {N}", lambda N=N: tuples(u, y, N, offset=offset)) for N in range(1, largest + 1)]
     tried.append(("predicted state", lambda: window_route.predicted_tuples(long, u, y, offset=offset)))
-    found = []
+    candidates = []
     for state, features in tried:
         try:
             learned = regress(features())
             law = kernel(learned, yardstick.gamma, model).design(yardstick.q, yardstick.r, 0.0)
         except ValueError as refusal:
-            found.append(Candidate(state, None, float("inf"), str(refusal)))
+            candidates.append(Candidate(state, None, float("inf"), str(refusal)))
             continue
         run = simulate(scenarios, law, feed_forward(scenarios, law, None), limits=None)
         gap = float(regret(cost(scenarios, run, yardstick), best)[0])
-        found.append(Candidate(state, learned, gap if np.isfinite(gap) else float("inf"), ""))
-    return found
+        candidates.append(Candidate(state, learned, gap if np.isfinite(gap) else float("inf"), ""))
+    return candidates
 
 
 def rows(judged: Sequence[Judged], scenarios: Panel, zones: Sequence[str]) -> dict[str, list | np.ndarray]:
@@ -374,8 +415,8 @@ def trajectories(
     noise: float,
     yardstick: Yardstick,
 ) -> dict[str, list | np.ndarray]:
-    """The featured scenario under every controller, in both modes, as columns; beside it the worst zone's
-    error of all runs on the nominal plant, 5th, 50th and 95th percentile."""
+    """The featured scenario under every controller, in both modes, as columns. Beside it stand the 5th, 50th
+    and 95th percentile of the worst zone's error over all runs on the nominal plant."""
     i, alike = featured(scenarios, noise), (scenarios.plant == 0) & (scenarios.noise == noise)
     runs = [
         (j.name, mode, run)
@@ -404,7 +445,7 @@ def trajectories(
         for _, _, run in runs
     ]
     columns |= {
-        f"error_{name}_degC": np.concatenate([found[k] for found in worst])
+        f"error_{name}_degC": np.concatenate([percentiles[k] for percentiles in worst])
         for k, name in enumerate(("low", "median", "high"))
     }
     for channel, name in enumerate(outputs):

@@ -203,43 +203,59 @@ def regress(data: Tuples, *, mu: float = 0.0, tolerance: float = 1e-9, limit: fl
     v = np.hstack([data.s @ W.T, data.u / u_scale])
     targets = np.hstack([data.s_next @ W.T, data.e])
     linear = np.linalg.lstsq(v, targets, rcond=None)[0]
-    news, share = _innovation(targets - v @ linear, np.sqrt((targets**2).mean(axis=0)), tolerance)
-    # j = [v; news]: all that a sample holds; s(t+1), e and u are linear in it, so that one Gram matrix of its
-    # half-vectors serves for every right-hand side
+    innovation, share = _innovation(targets - v @ linear, np.sqrt((targets**2).mean(axis=0)), tolerance)
+    # regressor j = [v; innovation] of one sample: s(t+1), e and u are linear in it, so that one Gram matrix
+    # of its half-vectors serves for every right-hand side
     of_j = np.hstack([linear.T, share])
-    action = np.hstack([np.zeros((m, q)), np.diag(u_scale), np.zeros((m, news.shape[1]))])
-    gram = quadratic_gram(np.hstack([v, news]).T)
+    action = np.hstack([np.zeros((m, q)), np.diag(u_scale), np.zeros((m, innovation.shape[1]))])
+    gram = quadratic_gram(np.hstack([v, innovation]).T)
     row, column = np.triu_indices(of_j.shape[1])
-    known = (row < q + m) & (column < q + m)
-    inside, outside = np.flatnonzero(known), np.flatnonzero(~known)
+    of_v = (row < q + m) & (column < q + m)
+    inside, outside = np.flatnonzero(of_v), np.flatnonzero(~of_v)
     wanted = np.vstack([skron(of_j[:q]), skron(of_j[q:]), skron(action)])
     normal = gram[np.ix_(inside, inside)]
     # what is linear in v regresses on itself; left to solve for is the
-    # share of the news, and what the ridge holds back
+    # share of the innovation, and what the ridge holds back
     rest = gram[np.ix_(inside, outside)] @ wanted[:, outside].T
     if mu:
-        size = np.concatenate([1 / np.linalg.norm(W, axis=1), u_scale])
-        ridge = mu / (size[row[inside]] * size[column[inside]]) ** 2
+        ridge = _ridge(mu, W, u_scale, row[inside], column[inside])
         normal[np.diag_indices_from(normal)] += ridge
         rest -= ridge[:, None] * wanted[:, inside].T
     solution, condition = _solve(
         normal, rest if mu or len(outside) else rest[:, :0], limit, samples, unknowns
     )
     squares = q * (q + 1) // 2
-    G, own = (
-        solution[:, :squares],
-        wanted[squares:, inside].T + (solution[:, squares:] if solution.size else 0.0),
-    )
+    G = solution[:, :squares]
+    own = wanted[squares:, inside].T + (solution[:, squares:] if solution.size else 0.0)
     G_e, G_u = np.split(own, [p * (p + 1) // 2], axis=1)
     return Regression(
-        G, G_e, G_u, linear.T[:q], linear.T[q:], W @ data.features, u_scale, data.base, data.N, sv, q + m,
-        unknowns, (k + m) * (k + m + 1) // 2, samples, condition
-    )  # fmt: skip
+        G,
+        G_e,
+        G_u,
+        linear.T[:q],
+        linear.T[q:],
+        W @ data.features,
+        u_scale,
+        data.base,
+        data.N,
+        sv,
+        q + m,
+        unknowns,
+        (k + m) * (k + m + 1) // 2,
+        samples,
+        condition,
+    )
+
+
+def _ridge(mu: float, W: np.ndarray, u_scale: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """The ridge mu on the entries (row, column) of the kernel of [s; u], in the whitened coordinates."""
+    size = np.concatenate([1 / np.linalg.norm(W, axis=1), u_scale])
+    return mu / (size[row] * size[column]) ** 2
 
 
 def _innovation(residual: np.ndarray, size: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
     """What the successor and the error hold beyond v, as uncorrelated columns of unit variance, and the share
-    of each in the targets: residual = news share'."""
+    of each in the targets: residual = innovation share'."""
     _, sv, Vt = np.linalg.svd(np.linalg.qr(residual, mode="r") / np.sqrt(len(residual)))
     rank = int((sv > tolerance * size.max()).sum())
     return residual @ Vt[:rank].T / sv[:rank], Vt[:rank].T * sv[:rank]
@@ -352,7 +368,7 @@ def value_iteration(
     place = np.rint(place / unweighted).astype(int)
     H = smat(h_0, q + m) if H0 is None else H0
     K, P = _greedy(H, q)
-    for iteration in range(1, max_iterations + 1):
+    for iteration in range(1, max_iterations + 1):  # noqa: B007 (reported after the loop)
         h = h_0 + gamma * svec(data.step.T @ P @ data.step)
         if data.G.size:
             h += gamma * (data.G @ (P[row, column] * weight))

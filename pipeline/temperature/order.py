@@ -7,9 +7,10 @@ import numpy as np
 import scipy.linalg
 import scipy.stats
 
-from pipeline.temperature.plant import Plant, drawn_in, markov_parameters
+from pipeline.temperature.plant import Plant, clip_spectral_radius, markov_parameters
 from pipeline.temperature.plant import plant as make_plant
 from pipeline.temperature.refinement import (
+    FitSettings,
     drives,
     fit_inputs,
     fitted_state,
@@ -24,17 +25,16 @@ from pipeline.temperature.subspace import Lagged, Segments, complete_runs, lagge
 Fit = Literal["subspace", "prediction", "simulation"]
 NOISE_FREE = 1e-10  # share of the outputs' power that a noise-free record's one-step errors stay under
 WIDEST = 360  # columns of the lagged record: the cost of a fit grows with their square
-WORTH_REFINING = (
-    0.05  # a refined fit must take this share off the error: its own cost of computing and of fitting noise
-)
-WORTH_THE_NOISE = 0.2  # a simulation fit must take this share off a prediction fit's error: it leaves no model of the noise, and a tracker needs one
-WORTH_A_STATE = (
-    0.02  # a state that takes less than this share off the error is not worth carrying in a controller
-)
+# a refined fit must take this share off the error: its own cost of computing and of fitting noise
+WORTH_REFINING = 0.05
+# a simulation fit must take this share off a prediction fit's error: it leaves no model of the noise, and a
+# tracker needs one
+WORTH_THE_NOISE = 0.2
+# a state that takes less than this share off the error is not worth carrying in a controller
+WORTH_A_STATE = 0.02
 SMALLEST = 1e-9  # share of an output's variation below which an error is rounding
-LARGEST_RADIUS = (
-    1.0 - 1e-6
-)  # of the plants of a spread, which are simulated for ever: no record shows a time constant of a million samples
+# of the plants of a spread, which are simulated for ever: no record shows a time constant of 10^6 samples
+LARGEST_RADIUS = 1.0 - 1e-6
 
 
 class Structure(NamedTuple):
@@ -215,7 +215,7 @@ def with_delays(plant: Plant, delays: tuple[int, ...]) -> Plant:
 
 def stabilised(plant: Plant, radius: float) -> Plant:
     """The plant with every pole beyond `radius` drawn back onto it along its ray."""
-    return plant._replace(A=drawn_in(plant.A, radius))
+    return plant._replace(A=clip_spectral_radius(plant.A, radius))
 
 
 def simulation_errors(plant: Plant, u: Segments, y: Segments) -> np.ndarray:
@@ -279,31 +279,22 @@ def largest_radius(u: Segments) -> float:
 
 
 def fit(
-    kind: Fit,
-    start: Plant,
-    u: Segments,
-    y: Segments,
-    *,
-    feedthrough: bool,
-    offset: bool,
-    max_iterations: int,
-    max_radius: float | None = None,
-    gain: bool = True,
+    kind: Fit, start: Plant, u: Segments, y: Segments, settings: FitSettings, *, gain: bool = True
 ) -> Plant:
     """The plant that the named fit makes of the subspace start: the start itself, refined
     on one-step errors, or refined on simulation errors.
 
-    Every pole stays within `max_radius` where given, and a refined plant's within `largest_radius`. `gain`
-    False leaves a plant refined on simulation errors without K.
+    Every pole stays within `settings.max_radius` where given, and a refined plant's within `largest_radius`.
+    `gain` False leaves a plant refined on simulation errors without K.
     """
-    radius = max_radius or largest_radius(u)
+    radius = settings.max_radius or largest_radius(u)
     if kind == "subspace":
-        return stabilised(start, radius) if max_radius else start
+        return stabilised(start, radius) if settings.max_radius else start
     start = stabilised(start, radius)
     if kind == "prediction" and np.abs(np.linalg.eigvals(start.A - start.K @ start.C)).max() >= 1:
         start = kalman_gain(start, u, y)
     if kind == "simulation":
-        linear = fit_inputs(start.A, start.C, u, y, feedthrough=feedthrough, offset=offset)
+        linear = fit_inputs(start.A, start.C, u, y, feedthrough=settings.feedthrough, offset=settings.offset)
         m = start.m
         start = make_plant(
             linear.F,
@@ -315,14 +306,8 @@ def fit(
             None,
             start.sample_time_s,
         )
-    settings = {
-        "feedthrough": feedthrough,
-        "offset": offset,
-        "max_radius": radius * (1 + 1e-12),
-        "max_iterations": max_iterations,
-    }
-    found = refine(start, u, y, criterion=kind, **settings).plant
-    return kalman_gain(found, u, y) if gain and kind == "simulation" else found
+    refined = refine(start, u, y, kind, settings._replace(max_radius=radius * (1 + 1e-12))).plant
+    return kalman_gain(refined, u, y) if gain and kind == "simulation" else refined
 
 
 def cross_validate(
@@ -342,26 +327,25 @@ def cross_validate(
     A structure whose window does not fit into what remains of the record has no rows.
     """
     u, y = shifted(u, y, structure.delays)
-    rest, errors = {"feedthrough": structure.feedthrough, "offset": structure.offset}, {}
+    settings, errors = FitSettings(structure.feedthrough, structure.offset, max_radius, 8), {}
     for train_u, train_y, test_u, test_y in folds(u, y, blocks):
         try:
-            data = lagged(train_u, train_y, structure.past, **rest)
+            data = lagged(
+                train_u, train_y, structure.past, feedthrough=structure.feedthrough, offset=structure.offset
+            )
         except ValueError:
             return []
         basis = subspace(data, structure.past).basis
         for order in orders:
             start = realise(data, basis[:order], 1.0)
             for kind in kinds:
-                plant = fit(
-                    kind, start, train_u, train_y, **rest, max_iterations=8, max_radius=max_radius, gain=False
-                )
+                plant = fit(kind, start, train_u, train_y, settings, gain=False)
                 errors.setdefault((order, kind), []).append(
                     max(float(simulation_errors(plant, test_u, test_y).mean()), SMALLEST)
                 )
     m, p = u[0].shape[1], y[0].shape[1]
-    more = (
-        p * m * structure.feedthrough + p * structure.offset + (m + p) * sum(map(bool, structure.delays))
-    )  # a dead time must be worth a state
+    # a dead time must be worth a state
+    more = p * m * structure.feedthrough + p * structure.offset + (m + p) * sum(map(bool, structure.delays))
     return [
         Candidate(order, structure, kind, order * (m + p) + more, float(singular_values[order - 1]), tuple(e))
         for (order, kind), e in errors.items()

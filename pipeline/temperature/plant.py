@@ -2,10 +2,13 @@
 BAAM study, simulation and plant spread."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import scipy.linalg
+
+if TYPE_CHECKING:
+    import control
 
 
 class Plant(NamedTuple):
@@ -36,6 +39,47 @@ class Plant(NamedTuple):
     @property
     def p(self) -> int:
         return self.C.shape[0]
+
+    def to_control(self, input_names: Sequence[str], output_names: Sequence[str]) -> "control.StateSpace":
+        """The plant as a control.StateSpace with named signals and its sample time, for a notebook to go on.
+
+        python-control knows linear systems only: b, d and K stay behind. Its y is then the distance from the
+        outputs at rest, and `from_control` takes b, d and K back.
+        """
+        import control
+
+        for kind, names, size in (("input", input_names, self.m), ("output", output_names, self.p)):
+            if len(names) != size:
+                raise ValueError(
+                    f"to_control: expected {size} {kind} names but found {len(names)}; "
+                    f"give one for each {kind}"
+                )
+        return control.ss(
+            self.A,
+            self.B,
+            self.C,
+            self.D,
+            self.sample_time_s,
+            inputs=list(input_names),
+            outputs=list(output_names),
+        )
+
+    @classmethod
+    def from_control(cls, system: "control.StateSpace", *, b=None, d=None, K=None) -> "Plant":
+        """The plant of a discrete control.StateSpace; b (n,), d (p,) and K (n, p) are zero where left out."""
+        import control
+
+        if not isinstance(system, control.StateSpace):
+            raise ValueError(
+                f"from_control: expected a control.StateSpace but found {type(system).__name__}; "
+                "convert it with control.ss"
+            )
+        if system.dt is None or system.dt is True or not system.dt > 0:
+            raise ValueError(
+                f"from_control: expected a discrete system with a sample time in seconds but found "
+                f"dt = {system.dt}; sample it with control.sample_system, or give its dt"
+            )
+        return plant(system.A, system.B, system.C, system.D, b, d, K, float(system.dt))
 
 
 def plant(A, B, C, D=None, b=None, d=None, K=None, sample_time_s: float = 1.0) -> Plant:
@@ -104,17 +148,16 @@ def markov_parameters(plant: Plant, lags: int) -> np.ndarray:
     return h
 
 
-def drawn_in(A: np.ndarray, radius: float) -> np.ndarray:
+def clip_spectral_radius(A: np.ndarray, radius: float) -> np.ndarray:
     """A with every eigenvalue beyond `radius` drawn back onto it along its ray, in the modal basis."""
     eigenvalues, T = np.linalg.eig(A)
     size = np.abs(eigenvalues)
     if size.max() <= radius:
         return A
-    drawn = eigenvalues * np.where(size > radius, radius * (1 - 1e-9) / np.maximum(size, 1e-300), 1.0)
-    found = np.real((T * drawn) @ np.linalg.inv(T))
-    return found * min(
-        1.0, radius * (1 - 1e-9) / np.abs(np.linalg.eigvals(found)).max()
-    )  # a defective A has no modal basis to draw in
+    clipped = eigenvalues * np.where(size > radius, radius * (1 - 1e-9) / np.maximum(size, 1e-300), 1.0)
+    A_clipped = np.real((T * clipped) @ np.linalg.inv(T))
+    # a defective A has no modal basis to draw in
+    return A_clipped * min(1.0, radius * (1 - 1e-9) / np.abs(np.linalg.eigvals(A_clipped)).max())
 
 
 def observability_matrix(A: np.ndarray, C: np.ndarray, blocks: int) -> np.ndarray:
@@ -138,7 +181,8 @@ def _rank_test(matrix: np.ndarray, n: int, name: str, remedy: str) -> RankTest:
     reason = (
         ""
         if rank == n
-        else f"the plant is not {name}: rank {rank} of {n}, smallest singular values {np.array2string(sv[-2:], precision=2)}; {remedy}"
+        else f"the plant is not {name}: rank {rank} of {n}, smallest singular values "
+        f"{np.array2string(sv[-2:], precision=2)}; {remedy}"
     )
     return RankTest(rank == n, rank, sv, reason)
 
@@ -188,29 +232,32 @@ def hold_output(plant: Plant, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def spread(
-    nominal: Plant, *, input_gain: float, loss: float, scale: Sequence[float] = (-1.0, 1.0)
+    nominal: Plant, *, input_gain: float, extra_heat_loss: float, scale: Sequence[float] = (-1.0, 1.0)
 ) -> list[Plant]:
     """The declared family around a plant: the plant itself, each column of B by
-    1 +- input_gain, and A - loss I, in that order."""
+    1 +- input_gain, and A - extra_heat_loss I, in that order."""
     family = [nominal]
     for column in range(nominal.m):
         for sign in scale:
             B = nominal.B.copy()
             B[:, column] *= 1 + sign * input_gain
             family.append(nominal._replace(B=B))
-    return [*family, nominal._replace(A=nominal.A - loss * np.eye(nominal.n))]
+    return [*family, nominal._replace(A=nominal.A - extra_heat_loss * np.eye(nominal.n))]
 
 
 def stored(plants: Sequence[Plant]) -> dict[str, tuple[np.ndarray, str, str]]:
     """Plants of one order as named arrays with unit and meaning, stacked along the first axis, for an
     artifact; `restored` reads them back."""
     meaning = {
-        "A": ("1", "state matrix"), "B": ("per percent", "input matrix"), "C": ("degC", "output matrix"),
+        "A": ("1", "state matrix"),
+        "B": ("per percent", "input matrix"),
+        "C": ("degC", "output matrix"),
         "D": ("degC per percent", "feed-through"),
-        "b": ("1", "offset of the state"), "d": ("degC", "offset of the output"),
+        "b": ("1", "offset of the state"),
+        "d": ("degC", "offset of the output"),
         "K": ("per degC", "Kalman gain"),
         "sample_time_s": ("s", "one step"),
-    }  # fmt: skip
+    }
     return {
         name: (np.stack([np.asarray(getattr(plant, name), float) for plant in plants]), *meaning[name])
         for name in Plant._fields

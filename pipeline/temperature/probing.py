@@ -67,18 +67,40 @@ class Probe(NamedTuple):
     limited: float
 
 
+class OperatingPoint(NamedTuple):
+    """State x (n,) at the start, and the inputs u (m,) and outputs y (p,) that probing stays around."""
+
+    x: np.ndarray
+    u: np.ndarray
+    y: np.ndarray
+
+
+class InputLimits(NamedTuple):
+    """low (m,) <= u <= high (m,), and at most `rate` percent a step."""
+
+    low: np.ndarray
+    high: np.ndarray
+    rate: float
+
+
 def probe(
-    plant: Plant, signal: np.ndarray, *, x0: np.ndarray, u_centre: np.ndarray, y_centre: np.ndarray,
-    feedback: np.ndarray, low: np.ndarray, high: np.ndarray, rate: float,
+    plant: Plant,
+    signal: np.ndarray,
+    point: OperatingPoint,
+    limits: InputLimits,
+    *,
+    feedback: np.ndarray,
     noise: np.ndarray,
-) -> Probe:  # fmt: skip
-    """u = u_centre + feedback (y_centre - y measured) + signal, within [low, high] and `rate` percent a step:
-    outputs stay near y_centre, from measurements only.
+) -> Probe:
+    """u = point.u + feedback (point.y - y measured) + signal, within the limits: outputs stay near point.y,
+    from measurements only.
 
     feedback (m, p) in percent per °C; noise (samples, p) in °C. What is
     applied is what is recorded, so that limits bias nothing.
     """
-    x, last = x0, u_centre
+    x, u_centre, y_centre = point
+    low, high, rate = limits
+    last = u_centre
     u, y, limited = np.empty_like(signal), np.empty((len(signal), plant.p)), 0
     for t in range(len(signal)):
         y[t] = plant.C @ x + plant.d + noise[t]

@@ -17,6 +17,22 @@ import scipy.signal
 
 from pipeline.temperature.plant import Plant
 
+Criterion = Literal["prediction", "simulation"]
+
+
+class FitSettings(NamedTuple):
+    """What a fit may move, and when it stops. `feedthrough`: D is free; `offset`: b and d are; every pole
+    stays within `max_radius` where given; a step must gain `tolerance` of the cost."""
+
+    feedthrough: bool = False
+    offset: bool = True
+    max_radius: float | None = None
+    max_iterations: int = 20
+    tolerance: float = 1e-5
+
+
+DEFAULTS = FitSettings()
+
 
 class Predictor(NamedTuple):
     """x(t+1) = F x + G v, ŷ = C x + H v, with one initial state a segment: F (n,
@@ -86,8 +102,8 @@ def fitted_state(gamma: np.ndarray, error: np.ndarray, *, free_mean: bool) -> np
     regressors = (
         gamma if not free_mean else np.concatenate([gamma, np.broadcast_to(np.eye(p), (T, p, p))], axis=2)
     )
-    seen = np.isfinite(error) & (np.abs(gamma).max(axis=2, initial=0.0) < 1e100)
-    return np.linalg.lstsq(regressors[seen], error[seen], rcond=1e-10)[0]
+    usable = np.isfinite(error) & (np.abs(gamma).max(axis=2, initial=0.0) < 1e100)
+    return np.linalg.lstsq(regressors[usable], error[usable], rcond=1e-10)[0]
 
 
 def _block_modal(model: Predictor) -> tuple[Predictor, list[tuple[int, complex]], np.ndarray]:
@@ -174,17 +190,17 @@ def _normal_equations(
                 _filtered(blocks, pulse, [1.0])[:, :, 0],
             ]
         )
-        e, seen, ZZ = y - predicted, None, None
+        e, mask, ZZ = y - predicted, None, None
         first = size - n * (len(v_all) - segment)
         for o in range(p):
-            if seen is None or not np.array_equal(seen, np.isfinite(y[:, o])):
-                seen = np.isfinite(y[:, o])
-                Z_seen = Z if seen.all() else Z[seen]
-                ZZ = Z_seen.T @ Z_seen
+            if mask is None or not np.array_equal(mask, np.isfinite(y[:, o])):
+                mask = np.isfinite(y[:, o])
+                Z_measured = Z if mask.all() else Z[mask]
+                ZZ = Z_measured.T @ Z_measured
             M = mixing[o]
             at = np.r_[0:state, state + o * output : state + (o + 1) * output, first : first + n]
             JJ[np.ix_(at, at)] += M @ ZZ @ M.T
-            Je[at] += M @ (Z_seen.T @ e[seen, o])
+            Je[at] += M @ (Z_measured.T @ e[mask, o])
     return JJ, Je
 
 
@@ -281,17 +297,17 @@ def fit_inputs(A, C, u, y, *, feedthrough: bool, offset: bool) -> Predictor:
             J[:, : n * len(inputs)] = _mixed(model.C[o], blocks, f)
             J[:, n * len(inputs) + o * len(direct) : n * len(inputs) + (o + 1) * len(direct)] = v[:, direct]
             J[:, size + segment * n : size + (segment + 1) * n] = _mixed(model.C[o], blocks, f0)
-            seen = np.isfinite(b[:, o])
-            rows.append(J[seen])
-            target.append(b[seen, o])
+            mask = np.isfinite(b[:, o])
+            rows.append(J[mask])
+            target.append(b[mask, o])
     J = np.vstack(rows)
     scale = np.linalg.norm(J, axis=0)
     scale[scale == 0] = 1.0
-    found = np.linalg.lstsq(J / scale, np.concatenate(target), rcond=1e-12)[0] / scale
+    theta = np.linalg.lstsq(J / scale, np.concatenate(target), rcond=1e-12)[0] / scale
     G, H = np.zeros((n, m + 1)), np.zeros((p, m + 1))
-    G[:, inputs] = found[: n * len(inputs)].reshape(n, -1)
-    H[:, direct] = found[n * len(inputs) : size].reshape(p, -1)
-    return model._replace(G=G, H=H, x0=list(found[size:].reshape(segments, n)))
+    G[:, inputs] = theta[: n * len(inputs)].reshape(n, -1)
+    H[:, direct] = theta[n * len(inputs) : size].reshape(p, -1)
+    return model._replace(G=G, H=H, x0=list(theta[size:].reshape(segments, n)))
 
 
 def prediction_form(plant: Plant, x0: Sequence[np.ndarray]) -> Predictor:
@@ -336,13 +352,8 @@ def refine(
     plant: Plant,
     u: Sequence[np.ndarray],
     y: Sequence[np.ndarray],
-    *,
-    criterion: Literal["prediction", "simulation"] = "prediction",
-    feedthrough: bool = False,
-    offset: bool = True,
-    max_radius: float | None = None,
-    max_iterations: int = 20,
-    tolerance: float = 1e-5,
+    criterion: Criterion = "prediction",
+    settings: FitSettings = DEFAULTS,
 ) -> Refined:
     """The plant moved to the least sum of weighted squared errors, one step ahead or in free
     simulation, over every segment u (T, m), y (T, p).
@@ -352,61 +363,85 @@ def refine(
     at the start). With `simulation` K is left zero: `kalman_gain` fits it. NaN in y is a masked sample; in u
     it is refused. Raises ValueError where u holds NaN, or the start violates `max_radius`.
     """
+    _check_start(plant, u, settings.max_radius)
+    m, ahead = plant.m, criterion == "prediction"
+    problem = _weighted(plant, u, y, criterion)
+    direct = np.arange(m) if settings.feedthrough else []
+    free = np.r_[direct, m if settings.offset else []].astype(int)
+
+    def admissible(F, G, C):
+        if ahead and np.abs(np.linalg.eigvals(F)).max() >= 1:
+            return False
+        if settings.max_radius is None:
+            return True
+        A = F + G[:, m + 1 :] @ C if ahead else F
+        return np.abs(np.linalg.eigvals(A)).max() <= settings.max_radius
+
+    best, costs = gauss_newton(
+        problem.start,
+        problem.v,
+        problem.y,
+        free=free,
+        admissible=admissible,
+        max_iterations=settings.max_iterations,
+        tolerance=settings.tolerance,
+    )
+    return Refined(_plant_of(best, problem, plant, ahead=ahead), best.x0, costs)
+
+
+def _check_start(plant: Plant, u: Sequence[np.ndarray], max_radius: float | None) -> None:
     if any(not np.isfinite(a).all() for a in u):
         raise ValueError(
             "refine: expected inputs without gaps but found NaN in u; "
             "split the record into segments at the gaps"
         )
-    if max_radius is not None and np.abs(np.linalg.eigvals(plant.A)).max() > max_radius:
+    radius = np.abs(np.linalg.eigvals(plant.A)).max()
+    if max_radius is not None and radius > max_radius:
         raise ValueError(
-            f"refine: the start has a pole at {np.abs(np.linalg.eigvals(plant.A)).max():.6f}, "
+            f"refine: the start has a pole at {radius:.6f}, "
             f"outside max_radius {max_radius}; start from a stabilised plant"
         )
-    m, p, ahead = plant.m, plant.p, criterion == "prediction"
+
+
+class _Weighted(NamedTuple):
+    """What Gauss-Newton solves: the starting predictor, its drives and the outputs, in units in which the
+    starting errors have covariance I; `unweight` leads back."""
+
+    start: Predictor
+    v: list[np.ndarray]
+    y: list[np.ndarray]
+    weight: np.ndarray
+    unweight: np.ndarray
+
+
+def _weighted(plant: Plant, u, y, criterion: Criterion) -> _Weighted:
+    m, ahead = plant.m, criterion == "prediction"
     start = prediction_form(plant, []) if ahead else simulation_form(plant, [])
-    y_full = (
-        y
-        if not ahead
-        else [
+    y_full = y
+    if ahead:
+        y_full = [
             filled(plant, a, b, _first_state(plant, start, criterion, a, b))
             for a, b in zip(u, y, strict=True)
         ]
-    )
     v = [drives(criterion, a, b) for a, b in zip(u, y_full, strict=True)]
     x0 = [estimate_state(start, a, b) for a, b in zip(v, y, strict=True)]
     errors = np.vstack([b - respond(start, a, x)[1] for a, b, x in zip(v, y, x0, strict=True)])
     weight, unweight = _weights(errors, diagonal=not ahead)
-    y_weighted = [b @ weight.T for b in y]
     if ahead:
         start = start._replace(G=np.hstack([start.G[:, : m + 1], start.G[:, m + 1 :] @ unweight]))
         v = [np.hstack([a[:, : m + 1], a[:, m + 1 :] @ weight.T]) for a in v]
     start = start._replace(C=weight @ start.C, H=weight @ start.H, x0=x0)
-    free = np.r_[np.arange(m) if feedthrough else [], m if offset else []].astype(int)
+    return _Weighted(start, v, [b @ weight.T for b in y], weight, unweight)
 
-    def admissible(F, G, C):
-        if ahead and np.abs(np.linalg.eigvals(F)).max() >= 1:
-            return False
-        return (
-            max_radius is None
-            or np.abs(np.linalg.eigvals(F + G[:, m + 1 :] @ C if ahead else F)).max() <= max_radius
-        )
 
-    best, costs = gauss_newton(
-        start,
-        v,
-        y_weighted,
-        free=free,
-        admissible=admissible,
-        max_iterations=max_iterations,
-        tolerance=tolerance,
-    )
-    C, H = unweight @ best.C, unweight @ best.H
-    K = best.G[:, m + 1 :] @ weight if ahead else np.zeros((plant.n, p))
+def _plant_of(best: Predictor, problem: _Weighted, plant: Plant, *, ahead: bool) -> Plant:
+    """The plant whose weighted predictor or simulator is `best`, in the units of `plant`."""
+    m = plant.m
+    C, H = problem.unweight @ best.C, problem.unweight @ best.H
+    K = best.G[:, m + 1 :] @ problem.weight if ahead else np.zeros((plant.n, plant.p))
     D, d = H[:, :m], H[:, m]
-    found = Plant(
-        best.F + K @ C, best.G[:, :m] + K @ D, C, D, best.G[:, m] + K @ d, d, K, plant.sample_time_s
-    )
-    return Refined(found, best.x0, costs)
+    A, B, b = best.F + K @ C, best.G[:, :m] + K @ D, best.G[:, m] + K @ d
+    return Plant(A, B, C, D, b, d, K, plant.sample_time_s)
 
 
 def stabilising_gain(plant: Plant) -> np.ndarray:

@@ -20,8 +20,8 @@ class Panel(NamedTuple):
     """Scenarios, one a row: plant[i] of `plants` (all of one order), held at x0 by u0, reference r, sensor
     noise of `noise` °C drawn from `seed`.
 
-    The controller watches the hold for `hold` steps before it takes over, so that its memory holds what a
-    machine would have put there, then runs for `steps`.
+    The controller watches the hold for `hold` steps before it takes over: its memory then holds what a
+    machine would have put there. It runs for `steps`.
     """
 
     plants: list[Plant]
@@ -51,7 +51,7 @@ class Cost(NamedTuple):
     yardstick: Yardstick
 
 
-class Run(NamedTuple):
+class PanelRun(NamedTuple):
     """True outputs y, commanded and applied inputs (steps, scenarios, p or m),
     and the sensors' errors that the controller saw."""
 
@@ -76,10 +76,16 @@ class Figures(NamedTuple):
 
 
 def panel(
-    plants: Sequence[Plant], *, starts: Sequence[float], references: Sequence[Sequence[float]],
-    noise: Sequence[float], seeds: Sequence[int], steps: int,
-    hold: int, cells: bool,
-) -> Panel:  # fmt: skip
+    plants: Sequence[Plant],
+    *,
+    starts: Sequence[float],
+    references: Sequence[Sequence[float]],
+    noise: Sequence[float],
+    seeds: Sequence[int],
+    steps: int,
+    hold: int,
+    cells: bool,
+) -> Panel:
     """Every plant x start x reference x noise level, once without noise and once a seed with it.
 
     A start is a temperature in °C at which the plant is held by its steady input: of every cell where the
@@ -130,7 +136,7 @@ def simulate(
     *,
     limits: tuple[np.ndarray, np.ndarray] | None,
     integral_band: float = np.inf,
-) -> Run:
+) -> PanelRun:
     """Every scenario at once under one law with feed-forward k (scenarios, m); limits (low, high) in percent
     clip what is applied and what enters the memory.
 
@@ -165,7 +171,7 @@ def simulate(
         if not np.abs(x).max() < 1e9:
             x = np.clip(np.nan_to_num(x), -1e9, 1e9)
             z = np.clip(np.nan_to_num(z), -1e9, 1e9)
-    return Run(y, command, applied)
+    return PanelRun(y, command, applied)
 
 
 def feed_forward(
@@ -179,7 +185,7 @@ def feed_forward(
     return np.stack([rest[r.tobytes()] for r in panel.r])
 
 
-def cost(panel: Panel, run: Run, yardstick: Yardstick) -> Cost:
+def cost(panel: Panel, run: PanelRun, yardstick: Yardstick) -> Cost:
     """(3) of every scenario: discounted, on true outputs and applied inputs."""
     error = run.y - panel.r
     stage = error**2 @ yardstick.q + run.u**2 @ yardstick.r
@@ -191,7 +197,7 @@ def optimum(panel: Panel, yardstick: Yardstick) -> Cost:
     return cost(panel, optimum_run(panel, yardstick), yardstick)
 
 
-def optimum_run(panel: Panel, yardstick: Yardstick) -> Run:
+def optimum_run(panel: Panel, yardstick: Yardstick) -> PanelRun:
     """The run behind J*."""
     best = [
         gains(plant, np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma) for plant in panel.plants
@@ -199,7 +205,7 @@ def optimum_run(panel: Panel, yardstick: Yardstick) -> Run:
     return _state_feedback(panel, best)
 
 
-def _state_feedback(panel: Panel, best: Sequence[Gains]) -> Run:
+def _state_feedback(panel: Panel, best: Sequence[Gains]) -> PanelRun:
     plants = [panel.plants[i] for i in panel.plant]
     A, B, C, b, d = (
         np.stack([getattr(plant, name) for plant in plants]) for name in ("A", "B", "C", "b", "d")
@@ -211,7 +217,7 @@ def _state_feedback(panel: Panel, best: Sequence[Gains]) -> Run:
         y[t] = np.einsum("sij,sj->si", C, x) + d
         u[t] = -np.einsum("sij,sj->si", K_x, x) - feed
         x = np.einsum("sij,sj->si", A, x) + np.einsum("sij,sj->si", B, u[t]) + b
-    return Run(y, u, u)
+    return PanelRun(y, u, u)
 
 
 def regret(J: Cost, best: Cost) -> np.ndarray:
@@ -233,7 +239,7 @@ def _short(values: np.ndarray) -> str:
 
 
 def figures(
-    panel: Panel, run: Run, *, limits: tuple[np.ndarray, np.ndarray], band: float, sample_time_s: float
+    panel: Panel, run: PanelRun, *, limits: tuple[np.ndarray, np.ndarray], band: float, sample_time_s: float
 ) -> Figures:
     """What an engineer reads off a run. Settled: the mean error over the last third, of the worst zone.
     Settling: the first time after which every zone stays within `band` °C of its reference. Overshoot: past
@@ -271,23 +277,23 @@ class Allowance(NamedTuple):
     worst_case: float
 
 
-def engineering_cost(found: Figures, plant: np.ndarray, allowance: Allowance, *, longest_s: float) -> float:
+def engineering_cost(results: Figures, plant: np.ndarray, allowance: Allowance, *, longest_s: float) -> float:
     """The declared cost of practical tuning: mean over scenarios of figure / allowance, summed, plus
     `worst_case` times that of the worst plant.
 
     A run that never settles counts as one that settles at the end of the panel. Raises ValueError where a run
     leaves every scale: the candidate has failed.
     """
-    settling = np.where(np.isnan(found.settling_s), longest_s, found.settling_s)
+    settling = np.where(np.isnan(results.settling_s), longest_s, results.settling_s)
     parts = [
         settling / allowance.settling_s,
-        found.overshoot_degC / allowance.overshoot_degC,
-        found.settled_error_degC / allowance.settled_error_degC,
-        found.at_limits_percent / allowance.at_limits_percent,
-        found.effort_percent / allowance.effort_percent,
+        results.overshoot_degC / allowance.overshoot_degC,
+        results.settled_error_degC / allowance.settled_error_degC,
+        results.at_limits_percent / allowance.at_limits_percent,
+        results.effort_percent / allowance.effort_percent,
     ]
     each = np.sum(parts, axis=0)
-    if not (np.isfinite(each).all() and found.tracking_degC.max() < 1e4):
+    if not (np.isfinite(each).all() and results.tracking_degC.max() < 1e4):
         raise ValueError("the loop is unstable on a plant of the training panel")
     worst = max(each[plant == index].mean() for index in np.unique(plant))
     return float((each.mean() + allowance.worst_case * worst) / (1 + allowance.worst_case))

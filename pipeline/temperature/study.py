@@ -57,8 +57,8 @@ def data_sets(rng: np.random.Generator, samples: int, sets: int) -> tuple[np.nda
     signal = study_signal(
         rng, samples, 7 * sets, amplitudes=AMPLITUDES, bandwidth=BANDWIDTH, variance=VARIANCE
     ).reshape(samples, sets, 7)
-    found = study_probe(baam(), signal, K_DATA, x0=np.full(6, 50.0), noise=np.zeros((samples, sets, 5)))
-    return found.u, found.y
+    recorded = study_probe(baam(), signal, K_DATA, x0=np.full(6, 50.0), noise=np.zeros((samples, sets, 5)))
+    return recorded.u, recorded.y
 
 
 def kernel_of(u: np.ndarray, y: np.ndarray, N: int) -> Kernel:
@@ -103,9 +103,11 @@ def exact() -> Exact:
         for run in (law, from_50)
     ]
     return Exact(
-        float(optimum(scenarios, YARDSTICK).J[0]), float(optimum(short, YARDSTICK).J[0]), *J,
-        float(gap(empty, scenarios)[0])
-    )  # fmt: skip
+        float(optimum(scenarios, YARDSTICK).J[0]),
+        float(optimum(short, YARDSTICK).J[0]),
+        *J,
+        float(gap(empty, scenarios)[0]),
+    )
 
 
 class NoiseFree(NamedTuple):
@@ -161,12 +163,12 @@ def under_noise(
 
 
 def rows(
-    work: Sequence[tuple[float, int]], found: Sequence[dict[str, tuple[float, float]]]
+    work: Sequence[tuple[float, int]], results: Sequence[dict[str, tuple[float, float]]]
 ) -> dict[str, list]:
     """`under_noise` of each (noise, data set) as columns, one row a route."""
     table = [
         (route, noise, index, *result[route])
-        for (noise, index), result in zip(work, found, strict=True)
+        for (noise, index), result in zip(work, results, strict=True)
         for route in ROUTES
     ]
     route, noise, index, gaps, errors = (list(column) for column in zip(*table, strict=True))
@@ -186,7 +188,7 @@ def metrics(
     """The figures by which the learners are known: as published, on the common
     yardstick without noise, and over the noisy data sets."""
     result = {
-        "as_published": {name: found._asdict() for name, found in as_published.items()},
+        "as_published": {name: column._asdict() for name, column in as_published.items()},
         "printed": PRINTED,
         "algorithm_1": {"failures": failures, "of": starts},
         "optimal": {"J1000": exact.optimal_J1000, "J100": exact.optimal_J100},
@@ -221,8 +223,9 @@ def metrics(
             }
             result[route][f"noise_{noise:g}".replace(".", "_")] = {
                 **{name: float(value) if np.isfinite(value) else None for name, value in figures.items()},
-                "stable": stable, "of": len(mine),
-            }  # fmt: skip
+                "stable": stable,
+                "of": len(mine),
+            }
     return result
 
 

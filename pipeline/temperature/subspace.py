@@ -144,7 +144,8 @@ def _moment_factor(runs, past, columns, mean, rows) -> np.ndarray:
     scale = np.sqrt(np.maximum(np.diag(S), np.finfo(float).tiny))
     try:
         return np.linalg.cholesky(S / np.outer(scale, scale) + ROUNDING * np.eye(len(S))).T * scale
-    except np.linalg.LinAlgError:  # a channel whose movement is lost in the rounding of its mean: the rows themselves, with the same ridge
+    except np.linalg.LinAlgError:
+        # a channel's movement is lost in the rounding of its mean: the rows themselves, with the same ridge
         return np.linalg.qr(
             np.vstack([_exact_factor(runs, past, columns, mean, rows), np.sqrt(ROUNDING) * np.diag(scale)]),
             mode="r",
@@ -219,7 +220,8 @@ def realise(data: Lagged, basis: np.ndarray, sample_time_s: float) -> Plant:
     u, y = data.R[:, data.now_u], data.R[:, data.now_y]
     CD = _least_squares(np.hstack([x, u]) if data.feedthrough else x, y)
     C, D = CD[:, :n], CD[:, n:] if data.feedthrough else np.zeros((data.p, m))
-    if data.exact:  # errors are rounding and tell nothing of K; the gain by which the window's own predictor takes up y(t-1) is used
+    if data.exact:
+        # errors are rounding and tell nothing of K: the window's own predictor has the gain of y(t-1)
         AB = _least_squares(np.hstack([x, u]), x_next)
         A, B, K = AB[:, :n], AB[:, n:], basis[:, m : m + data.p]
     else:

@@ -198,11 +198,20 @@ def observer_law(plant: Plant, gains: Gains, L: np.ndarray, *, integral: float =
     _strictly_proper(plant)
     C_inverse = np.linalg.pinv(plant.C)
     return Law(
-        A=plant.A - L @ plant.C, B_u=plant.B, B_y=L, B_r=np.zeros((n, p)), c=plant.b - L @ plant.d,
-        K=gains.K_x, D=np.zeros((m, p)),
-        K_r=gains.K_r, k=gains.k, start_u=np.zeros((n, m)), start_y=C_inverse, start=-C_inverse @ plant.d,
+        A=plant.A - L @ plant.C,
+        B_u=plant.B,
+        B_y=L,
+        B_r=np.zeros((n, p)),
+        c=plant.b - L @ plant.d,
+        K=gains.K_x,
+        D=np.zeros((m, p)),
+        K_r=gains.K_r,
+        k=gains.k,
+        start_u=np.zeros((n, m)),
+        start_y=C_inverse,
+        start=-C_inverse @ plant.d,
         integral=integral,
-    )  # fmt: skip
+    )
 
 
 class Target(NamedTuple):

@@ -42,8 +42,8 @@ class Steps(NamedTuple):
     plants: response, low, high (K, p, m) at samples (K,).
 
     gain, peak, time_constant, delay (3, p, m): value and the ends of its band. gain is the last value, peak
-    the largest excursion; times are in samples, NaN where `seen` (p, m) is False: the band of the peak holds
-    zero, so that not even the sign of the effect is known.
+    the largest excursion; times are in samples, NaN where `significant` (p, m) is False: the band of the peak
+    holds zero, so that not even the sign of the effect is known.
     """
 
     samples: np.ndarray
@@ -54,7 +54,7 @@ class Steps(NamedTuple):
     peak: np.ndarray
     time_constant: np.ndarray
     delay: np.ndarray
-    seen: np.ndarray
+    significant: np.ndarray
 
 
 def held(y: np.ndarray, steps: int) -> np.ndarray:
@@ -75,17 +75,17 @@ def fit_with_band(
     fewer than ten fit, and joined where more than 200 do.
     """
     y, predicted = np.vstack(y), np.vstack(predicted)
-    seen = np.isfinite(y) & np.isfinite(predicted)
-    mean = np.where(seen, y, 0.0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
+    mask = np.isfinite(y) & np.isfinite(predicted)
+    mean = np.where(mask, y, 0.0).sum(axis=0) / np.maximum(mask.sum(axis=0), 1)
     size = max(min(block, len(y) // 10), len(y) // 200, 1)
     parts = [
-        np.add.reduceat(np.where(seen, part, 0.0) ** 2, np.arange(0, len(y), size), axis=0)
+        np.add.reduceat(np.where(mask, part, 0.0) ** 2, np.arange(0, len(y), size), axis=0)
         for part in (y - predicted, y - mean)
     ]
     drawn = rng.integers(0, len(parts[0]), (draws, len(parts[0])))
     error, spread = (np.vstack([part.sum(axis=0), part[drawn].sum(axis=1)]) for part in parts)
     fit = np.where(
-        seen.any(axis=0), 100.0 * (1.0 - np.sqrt(error / np.maximum(spread, np.finfo(float).tiny))), np.nan
+        mask.any(axis=0), 100.0 * (1.0 - np.sqrt(error / np.maximum(spread, np.finfo(float).tiny))), np.nan
     )
     return np.vstack([fit[0], np.quantile(fit[1:], ENDS, axis=0)])
 
@@ -98,10 +98,12 @@ def holdout(
     simulations = [simulated(plant, a, b) for a, b in zip(u, y, strict=True)]
     skip, ahead = max(3 * plant.n, 30) + steps, []  # the start-up of `predict_fit`
     for a, b in zip(u, y, strict=True):
-        found = predicted_ahead(plant, a, b, steps) if len(a) > skip else np.full(b.shape, np.nan)
-        found[:skip] = np.nan
-        ahead.append(found)
-    last = [np.where(np.isfinite(found), held(b, steps), np.nan) for b, found in zip(y, ahead, strict=True)]
+        forecast = predicted_ahead(plant, a, b, steps) if len(a) > skip else np.full(b.shape, np.nan)
+        forecast[:skip] = np.nan
+        ahead.append(forecast)
+    last = [
+        np.where(np.isfinite(forecast), held(b, steps), np.nan) for b, forecast in zip(y, ahead, strict=True)
+    ]
     fits = [fit_with_band(y, part, block=block, rng=rng) for part in (simulations, ahead, last)]
     return Holdout(simulations, ahead, fits[0], fits[1], fits[2][0])
 
@@ -156,14 +158,13 @@ def steps(nominal: Plant, family: Sequence[Plant], longest: int, *, points: int 
         np.stack([part[-1] for part in bands[:3]]),
         np.concatenate([np.take_along_axis(part, at, axis=0) for part in bands[:3]]),
     )
-    seen = peak[1] * peak[2] > 0
-    shapes = np.stack(
-        [two_points(step_response(plant, samples + 1)) for plant in (nominal, *family)]
-    )  # (1 + family, 2, p, m)
-    times = np.where(seen, np.concatenate([shapes[:1], np.quantile(shapes[1:], ENDS, axis=0)]), np.nan)
+    significant = peak[1] * peak[2] > 0
+    # (1 + family, 2, p, m)
+    shapes = np.stack([two_points(step_response(plant, samples + 1)) for plant in (nominal, *family)])
+    times = np.where(significant, np.concatenate([shapes[:1], np.quantile(shapes[1:], ENDS, axis=0)]), np.nan)
     grid = np.arange(0, samples + 1, -(-samples // points))
     response, low, high = (part[grid] for part in bands[:3])
-    return Steps(grid, response, low, high, gain, peak, times[:, 0], times[:, 1], seen)
+    return Steps(grid, response, low, high, gain, peak, times[:, 0], times[:, 1], significant)
 
 
 def input_levels(u: Segments, *, bands: int = 8) -> np.ndarray:
@@ -184,7 +185,7 @@ def input_levels(u: Segments, *, bands: int = 8) -> np.ndarray:
 
 
 def holdout_rows(
-    measured: Segments, found: Holdout, outputs: Sequence[str], sample_time_s: float
+    measured: Segments, predictions: Holdout, outputs: Sequence[str], sample_time_s: float
 ) -> dict[str, np.ndarray]:
     """Measured, simulated and predicted outputs of the held-out segments."""
     columns = {
@@ -192,7 +193,11 @@ def holdout_rows(
         "time_s": np.concatenate([sample_time_s * np.arange(len(y)) for y in measured]),
     }
     for channel, name in enumerate(outputs):
-        for kind, part in (("measured", measured), ("simulated", found.simulated), ("ahead", found.ahead)):
+        for kind, part in (
+            ("measured", measured),
+            ("simulated", predictions.simulated),
+            ("ahead", predictions.ahead),
+        ):
             columns[f"{name}_{kind}"] = np.concatenate([y[:, channel] for y in part])
     return columns
 
@@ -200,56 +205,56 @@ def holdout_rows(
 def residual_rows(tests: Residuals, outputs: Sequence[str], inputs: Sequence[str]) -> dict[str, list]:
     """Every correlation with its 99 % band: of each output's residuals
     with themselves, then with each input."""
-    lags, found = tests.autocorrelation.shape[1] - 1, []
+    lags, table = tests.autocorrelation.shape[1] - 1, []
     for o, output in enumerate(outputs):
-        found += [
+        table += [
             (output, output, k, c, tests.band, tests.whiteness_passed[o])
             for k, c in enumerate(tests.autocorrelation[o])
         ]
         for j, name in enumerate(inputs):
             mine = zip(range(-lags, lags + 1), tests.cross_correlation[o, j], strict=True)
-            found += [
+            table += [
                 (output, name, k, c, tests.cross_band[o, j], tests.independence_passed[o, j]) for k, c in mine
             ]
     return dict(
         zip(
             ("output", "against", "lag", "correlation", "band", "passed"),
-            map(list, zip(*found, strict=True)),
+            map(list, zip(*table, strict=True)),
             strict=True,
         )
     )
 
 
 def step_rows(
-    found: Steps, outputs: Sequence[str], inputs: Sequence[str], sample_time_s: float
+    steps: Steps, outputs: Sequence[str], inputs: Sequence[str], sample_time_s: float
 ) -> dict[str, np.ndarray | list]:
     """The responses of `steps`, input by input within output by output."""
-    pairs, count = [(o, j) for o in range(len(outputs)) for j in range(len(inputs))], len(found.samples)
+    pairs, count = [(o, j) for o in range(len(outputs)) for j in range(len(inputs))], len(steps.samples)
     columns = {
         "output": [outputs[o] for o, _ in pairs for _ in range(count)],
         "input": [inputs[j] for _, j in pairs for _ in range(count)],
-        "time_s": np.tile(sample_time_s * found.samples, len(pairs)),
+        "time_s": np.tile(sample_time_s * steps.samples, len(pairs)),
     }
     return columns | {
-        name: np.concatenate([getattr(found, name)[:, o, j] for o, j in pairs])
+        name: np.concatenate([getattr(steps, name)[:, o, j] for o, j in pairs])
         for name in ("response", "low", "high")
     }
 
 
 def dynamics_rows(
-    found: Steps, outputs: Sequence[str], inputs: Sequence[str], sample_time_s: float
+    steps: Steps, outputs: Sequence[str], inputs: Sequence[str], sample_time_s: float
 ) -> dict[str, np.ndarray | list]:
     """Gain, peak, time constant and delay of `steps`, in the same order."""
     columns = {
         "output": [name for name in outputs for _ in inputs],
         "input": [*inputs] * len(outputs),
-        "seen": found.seen.ravel().tolist(),
+        "seen": steps.significant.ravel().tolist(),
     }
     for name, part in (
-        ("gain", found.gain),
-        ("peak", found.peak),
-        ("time_constant_s", sample_time_s * found.time_constant),
-        ("delay_s", sample_time_s * found.delay),
+        ("gain", steps.gain),
+        ("peak", steps.peak),
+        ("time_constant_s", sample_time_s * steps.time_constant),
+        ("delay_s", sample_time_s * steps.delay),
     ):
         columns |= {name: part[0].ravel(), f"{name}_low": part[1].ravel(), f"{name}_high": part[2].ravel()}
     return columns
@@ -263,14 +268,14 @@ def pole_rows(nominal: Plant, family: Sequence[Plant]) -> dict[str, np.ndarray]:
     """
     mine = np.linalg.eigvals(nominal.A)
     mine = mine[np.lexsort((-mine.imag, -np.abs(mine).round(12)))]
-    found = [(0, k, pole.real, pole.imag) for k, pole in enumerate(mine)]
+    table = [(0, k, pole.real, pole.imag) for k, pole in enumerate(mine)]
     for i, plant in enumerate(family, 1):
         poles = np.linalg.eigvals(plant.A)
         of_mine, of_theirs = scipy.optimize.linear_sum_assignment(np.abs(mine[:, None] - poles))
         number = np.full(len(poles), -1)
         number[of_theirs] = of_mine
-        found += [(i, int(k), pole.real, pole.imag) for k, pole in zip(number, poles, strict=True)]
-    member, pole, real, imag = zip(*found, strict=True)
+        table += [(i, int(k), pole.real, pole.imag) for k, pole in zip(number, poles, strict=True)]
+    member, pole, real, imag = zip(*table, strict=True)
     return {
         "member": np.array(member, np.int32),
         "pole": np.array(pole, np.int32),
@@ -293,15 +298,15 @@ def level_rows(levels: np.ndarray, inputs: Sequence[str]) -> dict[str, np.ndarra
 # ---- as figures by name; None where there is none
 
 
-def fit_figures(found: Holdout, outputs: Sequence[str]) -> dict[str, dict | None]:
+def fit_figures(judged: Holdout, outputs: Sequence[str]) -> dict[str, dict | None]:
     """Fits on the hold-out by output, with their bands and what they must beat; those
     ahead are None where no segment was long enough."""
-    named = {"fit_holdout": found.fit, "fit_holdout_ahead": found.ahead_fit}
+    named = {"fit_holdout": judged.fit, "fit_holdout_ahead": judged.ahead_fit}
     figures = {key: dict(zip(outputs, part[0].tolist(), strict=True)) for key, part in named.items()}
     figures |= {
         f"{key}_band": dict(zip(outputs, part[1:].T.tolist(), strict=True)) for key, part in named.items()
     }
-    figures["fit_holdout_held"] = dict(zip(outputs, found.held_fit.tolist(), strict=True))
+    figures["fit_holdout_held"] = dict(zip(outputs, judged.held_fit.tolist(), strict=True))
     return {key: part if np.isfinite(list(part.values())).all() else None for key, part in figures.items()}
 
 

@@ -50,6 +50,16 @@ class History(NamedTuple):
     incumbent: np.ndarray
 
 
+class SearchSettings(NamedTuple):
+    """The first `initial` of all `evaluations` candidates are a scrambled Sobol set. `exploration` is epsilon
+    of (42), which the paper does not give."""
+
+    initial: int
+    evaluations: int
+    acquisition: Acquisition = "expected_improvement"
+    exploration: float = 2.0
+
+
 class Result(NamedTuple):
     """The weights theta (d,) that the search recommends, their cost as it
     was evaluated, and everything that was evaluated."""
@@ -137,9 +147,8 @@ def _posterior_slopes(gp: _Surrogate, x: np.ndarray) -> tuple[float, float, np.n
 
 def _surrogate(points: np.ndarray, values: np.ndarray, kernel) -> _Surrogate:
     """scikit-learn's process at fixed kernel parameters, kernel = variance * Matern(length) + noise."""
-    from sklearn.gaussian_process import (
-        GaussianProcessRegressor,
-    )  # here: the import takes seconds, and few callers search
+    # here: the import takes seconds, and few callers search
+    from sklearn.gaussian_process import GaussianProcessRegressor
 
     fitted = GaussianProcessRegressor(kernel, alpha=1e-10, optimizer=None).fit(points, values)
     inverse = scipy.linalg.solve_triangular(fitted.L_, np.eye(len(values)), lower=True)
@@ -169,7 +178,7 @@ def _likeliest(kernel, points: np.ndarray, values: np.ndarray, iterations: int):
     spread = np.concatenate([[3.0], np.ones(d), [3.0]])
     process = GaussianProcessRegressor(kernel, alpha=1e-10, optimizer=None).fit(points, values)
 
-    def loss(parameters):
+    def objective(parameters):
         likelihood, gradient = process.log_marginal_likelihood(
             parameters, eval_gradient=True, clone_kernel=False
         )
@@ -178,7 +187,7 @@ def _likeliest(kernel, points: np.ndarray, values: np.ndarray, iterations: int):
 
     start = process.kernel_.theta.copy()
     best = scipy.optimize.minimize(
-        loss, start, jac=True, method="L-BFGS-B", bounds=kernel.bounds, options={"maxiter": iterations}
+        objective, start, jac=True, method="L-BFGS-B", bounds=kernel.bounds, options={"maxiter": iterations}
     )
     return kernel.clone_with_theta(best.x)
 
@@ -241,11 +250,11 @@ def _least(
     screened = sum(acquisition(*_posterior(gp, candidates))[0] for gp, acquisition in terms)
     best, least, bounds = candidates[np.argmin(screened)], np.inf, np.column_stack([low, high])
     for first in candidates[np.argsort(screened, kind="stable")[:starts]]:
-        found = scipy.optimize.minimize(
+        optimum = scipy.optimize.minimize(
             objective, first, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 30}
         )
-        if found.fun < least:
-            best, least = found.x, found.fun
+        if optimum.fun < least:
+            best, least = optimum.x, optimum.fun
     return np.clip(best, low, high)
 
 
@@ -406,8 +415,9 @@ def _recommended(search: _Search, history: History, kernel) -> Result:
 
 
 def _checked(
-    lower, upper, initial: int, evaluations: int, acquisition: str, start: History | None
+    lower, upper, settings: SearchSettings, start: History | None
 ) -> tuple[np.ndarray, np.ndarray, History]:
+    initial, evaluations, acquisition, _ = settings
     lower, upper = np.asarray(lower, float), np.asarray(upper, float)
     if (
         lower.ndim != 1
@@ -444,29 +454,24 @@ def minimise(
     cost: Callable[[np.ndarray], float],
     lower: np.ndarray,
     upper: np.ndarray,
+    settings: SearchSettings,
     *,
     rng: np.random.Generator,
-    initial: int,
-    evaluations: int,
-    acquisition: Acquisition = "expected_improvement",
-    exploration: float = 2.0,
     on_step: Callable[[History], None] | None = None,
     start: History | None = None,
 ) -> Result:
-    """The weights of least cost among `evaluations` candidates between lower (d,) and
-    upper (d,), `initial` of them a scrambled Sobol set.
+    """The weights of least cost among the candidates evaluated between lower (d,) and upper (d,).
 
     `cost(theta)` takes weights (d,); a ValueError from it, or a number that is not finite, is a failure of
-    the candidate. `exploration` is epsilon of (42), which the paper does not give. `on_step(history)` is
-    called after every evaluation; with that history as `start` and a generator of the same seed, a run that
-    was stopped goes on as if it had not been. The model costs O(k^3) after k candidates: meant for hundreds.
-    Raises ValueError where every candidate failed.
+    the candidate. `on_step(history)` is called after every evaluation. With that history as `start` and a
+    generator of the same seed, a run that was stopped goes on as if it had not been. The model costs O(k^3)
+    after k candidates: meant for hundreds. Raises ValueError where every candidate failed.
     """
-    lower, upper, start = _checked(lower, upper, initial, evaluations, acquisition, start)
+    lower, upper, start = _checked(lower, upper, settings, start)
+    initial, evaluations, acquisition, exploration = settings
     search = _Search(lower, upper, acquisition, exploration)
-    first, *later = rng.spawn(
-        1 + evaluations
-    )  # a generator for each candidate: what is drawn does not depend on where a run was stopped
+    # a generator for each candidate: what is drawn does not depend on where a run was stopped
+    first, *later = rng.spawn(1 + evaluations)
     design, kernel, region, fitted = _design(search, first, initial), search.kernel(), _TrustRegion(), False
     history = History(start.theta[:0], start.cost[:0], (), start.cost[:0])
     for index in range(evaluations):

@@ -10,6 +10,7 @@ import scipy.stats
 from pipeline.temperature.order import LARGEST_RADIUS, fit, shifted, stabilised, with_delays
 from pipeline.temperature.plant import Plant, markov_parameters
 from pipeline.temperature.refinement import (
+    FitSettings,
     drives,
     estimate_state,
     filled,
@@ -98,8 +99,9 @@ def predicted_ahead(
             np.where(np.isfinite(y[:first]), y[:first], np.nanmean(y[:first], axis=0)),
         )
         x0 = estimate_state(model, start, y[:first])
-    known = filled(plant, u, y, x0)
-    x = linear_recurrence(model.F, drives("prediction", u, known) @ model.G.T, x0)[:-1]  # x(t | y up to t-1)
+    y_filled = filled(plant, u, y, x0)
+    # x(t | y up to t-1)
+    x = linear_recurrence(model.F, drives("prediction", u, y_filled) @ model.G.T, x0)[:-1]
     for ahead in range(1, min(steps, len(u))):  # row t then holds x(t | y up to t-1-ahead)
         x[ahead:] = x[ahead - 1 : -1] @ plant.A.T + u[ahead - 1 : -1] @ plant.B.T + plant.b
     return x @ plant.C.T + u @ plant.D.T + plant.d
@@ -167,9 +169,8 @@ def excitation(u: Segments, past: int) -> Excitation:
             f"excitation: no segment holds {past + 1} complete samples of the inputs; record longer, "
             "or look at a shorter window"
         )
-    stacked = np.vstack(
-        [np.stack([a[past - k : len(a) - k] for k in range(past)], axis=2) for a in complete]
-    )  # (N, m, past)
+    # (N, m, past)
+    stacked = np.vstack([np.stack([a[past - k : len(a) - k] for k in range(past)], axis=2) for a in complete])
     stacked = stacked - stacked.mean(axis=0)
     levels = stacked[:, :, 0].std(axis=0)
     stacked = stacked / np.maximum(levels, np.finfo(float).tiny)[:, None]
@@ -244,17 +245,9 @@ def _reidentified(u: Segments, y: Segments, identified, order: int) -> Plant:
         realise(data, subspace(data, identified.past).basis[:order], identified.plant.sample_time_s),
         LARGEST_RADIUS,
     )
-    found = fit(
-        identified.fit,
-        start,
-        us,
-        ys,
-        feedthrough=identified.feedthrough,
-        offset=identified.offset,
-        max_iterations=5,
-        gain=False,
-    )
-    return with_delays(stabilised(found, LARGEST_RADIUS), identified.delays)
+    settings = FitSettings(identified.feedthrough, identified.offset, max_iterations=5)
+    refitted = fit(identified.fit, start, us, ys, settings, gain=False)
+    return with_delays(stabilised(refitted, LARGEST_RADIUS), identified.delays)
 
 
 def step_response(plant: Plant, steps: int) -> np.ndarray:

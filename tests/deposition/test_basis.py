@@ -44,9 +44,9 @@ def test_the_weights_are_those_of_the_docstring():
     for k in range(len(x) - 1):
         slow[k + 1] = a * slow[k] + (1 - a) * x[k]
     expected = rate * np.gradient(x, 0.001) + level * x + (1 / K - level) * slow
-    found = basis._inverse(Extruder(K, tau, creep_share=c, creep_time_s=T), x, 0.001)
+    u = basis._inverse(Extruder(K, tau, creep_share=c, creep_time_s=T), x, 0.001)
     np.testing.assert_allclose(
-        found[:2400], expected[:2400], atol=0.01 * expected.max()
+        u[:2400], expected[:2400], atol=0.01 * expected.max()
     )  # 1 ms steps against derivatives; the cut at 2.5 s left out
 
 

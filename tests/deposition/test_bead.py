@@ -33,11 +33,11 @@ def figures(scene, *, seed: int, frames: int = 20) -> tuple[np.ndarray, np.ndarr
     """Mean error and standard deviation in px at each of WIDTHS; every frame on another part of the stage."""
     rng = np.random.default_rng(seed)
     camera = Camera(scene, rng)
-    found = [
+    widths = [
         [measure(camera.frame(w, stage_px=int(rng.integers(0, 10**6))), **VIEW).width for _ in range(frames)]
         for w in WIDTHS
     ]
-    return np.mean(found, axis=1) - WIDTHS, np.std(found, axis=1)
+    return np.mean(widths, axis=1) - WIDTHS, np.std(widths, axis=1)
 
 
 # ---- width
@@ -61,9 +61,9 @@ def test_nominal_frames_scatter_less_than_0_12_px_and_err_less_than_0_2_px():
 def test_hard_frames_scatter_less_than_0_3_px_and_err_less_than_0_2_px_after_calibration():
     bias, deviation = figures(HARD, seed=102)
     assert deviation.max() <= 0.3
-    measured, known = np.array(WIDTHS) + bias, np.array(WIDTHS) / 125
-    found = calibrate(measured[[0, 2, 4]], known[[0, 2, 4]])
-    assert np.abs(found.gain * measured + found.offset - known).max() * 125 <= 0.2
+    measured, true_mm = np.array(WIDTHS) + bias, np.array(WIDTHS) / 125
+    calibration = calibrate(measured[[0, 2, 4]], true_mm[[0, 2, 4]])
+    assert np.abs(calibration.gain * measured + calibration.offset - true_mm).max() * 125 <= 0.2
 
 
 @pytest.mark.parametrize(
@@ -102,8 +102,8 @@ def test_the_angle_of_a_tilted_line_comes_out_and_its_width_is_across_it():
 def test_the_blur_of_the_edge_comes_out():
     for blur in (1.2, 2.0, 3.0):
         camera = Camera(NOMINAL._replace(blur_px=blur), np.random.default_rng(106))
-        found = np.mean([measure(camera.frame(110.0, stage_px=97 * i), **VIEW).blur_px for i in range(5)])
-        assert found == pytest.approx(blur, rel=0.2)  # the pixel's own width and the wander add to it
+        measured = np.mean([measure(camera.frame(110.0, stage_px=97 * i), **VIEW).blur_px for i in range(5)])
+        assert measured == pytest.approx(blur, rel=0.2)  # the pixel's own width and the wander add to it
 
 
 def test_a_line_that_begins_in_the_frame_is_read_where_it_is_and_zero_before():
@@ -159,11 +159,11 @@ def test_a_frame_that_cannot_be_measured_says_why_and_gives_no_width(frame, reas
 
 def test_16_bit_and_colour_frames_give_the_same_width():
     frame = Camera(NOMINAL, np.random.default_rng(110)).frame(110.0, stage_px=0)
-    ours = measure(frame, **VIEW).width
-    assert measure(frame.astype(np.uint16) * 257, **VIEW).width == pytest.approx(ours, abs=1e-3)  # float32
+    width = measure(frame, **VIEW).width
+    assert measure(frame.astype(np.uint16) * 257, **VIEW).width == pytest.approx(width, abs=1e-3)  # float32
     for code in (cv2.COLOR_GRAY2BGR, cv2.COLOR_GRAY2BGRA):
-        assert measure(cv2.cvtColor(frame, code), **VIEW).width == ours
-    assert measure(frame[:, :, None], **VIEW).width == ours
+        assert measure(cv2.cvtColor(frame, code), **VIEW).width == width
+    assert measure(frame[:, :, None], **VIEW).width == width
 
 
 @pytest.mark.parametrize(("h", "w"), [(240, 320), (241, 323), (720, 1280), (1080, 1920)])
@@ -235,9 +235,9 @@ def test_frames_of_two_sizes_are_not_measured_together():
 
 def test_gain_and_offset_come_back_and_the_residuals_are_what_is_left():
     px = np.array([60.0, 90.0, 120.0, 150.0])
-    found = calibrate(px, 0.008 * px + 0.01)
-    assert (found.gain, found.offset) == pytest.approx((0.008, 0.01), abs=1e-12)  # rounding
-    assert found.deviation < 1e-12
+    calibration = calibrate(px, 0.008 * px + 0.01)
+    assert (calibration.gain, calibration.offset) == pytest.approx((0.008, 0.01), abs=1e-12)  # rounding
+    assert calibration.deviation < 1e-12
     # by hand: misses 1, -2, 1 are orthogonal to a line through three
     # even places, so they stay: sqrt(6 / (3 - 2))
     bent = calibrate(np.array([1.0, 2.0, 3.0]), np.array([2.0, 0.0, 4.0]))

@@ -7,7 +7,7 @@ import pytest
 from pipeline.deposition import extruder
 from pipeline.deposition.chain import backlash, forecast, identify, simulate
 from pipeline.deposition.extruder import Extruder
-from tests.deposition.trained import CREEPING, PLANT, TS, known, trainings
+from tests.deposition.trained import CREEPING, PLANT, TS, learned, trainings
 
 
 @pytest.mark.parametrize("length", [1, 2, 7, 100, 1001])
@@ -29,8 +29,8 @@ def test_many_extruders_at_once_flow_as_each_alone():
         extruder.draw(rng, gain=1.08, time_constant_s=2.7, steady_flow=2.4, creep_share=c)
         for c in (0.0, 0.12, 0.0)
     ] + [Extruder(1.0, 2.0)]
-    found = simulate(family, u, sample_time_s=TS)
-    for one, rows in zip(family, found, strict=True):
+    flows = simulate(family, u, sample_time_s=TS)
+    for one, rows in zip(family, flows, strict=True):
         for command, y in zip(u, rows, strict=True):
             np.testing.assert_allclose(
                 y, extruder.flow(one, command, sample_time_s=TS), atol=1e-9
@@ -41,9 +41,9 @@ def test_many_extruders_at_once_flow_as_each_alone():
 
 
 def test_the_chain_of_the_plant_is_found_from_noisy_trials():
-    found = known(PLANT).materials[0].chain
-    assert not found.creeps and found.trials == sum(len(t.u) for t in trainings(PLANT))
-    e = found.extruder
+    chain = learned(PLANT).materials[0].chain
+    assert not chain.creeps and chain.trials == sum(len(t.u) for t in trainings(PLANT))
+    e = chain.extruder
     # 52 trials with 1 % gain noise each leave some 0.2 %; delay and
     # lag trade against each other, their sum does not
     assert e.gain == pytest.approx(PLANT.gain, rel=0.01)
@@ -52,14 +52,14 @@ def test_the_chain_of_the_plant_is_found_from_noisy_trials():
     late = [x.delay_s + extruder.DAMPING / (np.pi * x.lag_hz) for x in (e, PLANT)]
     assert late[0] == pytest.approx(late[1], abs=0.005)  # a quarter of a sample
     assert (
-        found.residual_percent < 3.5 and 0 < found.held_out_percent < 0.8
+        chain.residual_percent < 3.5 and 0 < chain.held_out_percent < 0.8
     )  # the noise of a trial is 3 % white; 12 of them averaged
 
 
 def test_creep_is_found_where_there_is_creep():
-    found = known(CREEPING).materials[0].chain
-    assert found.creeps
-    assert found.extruder.creep_share == pytest.approx(
+    chain = learned(CREEPING).materials[0].chain
+    assert chain.creeps
+    assert chain.extruder.creep_share == pytest.approx(
         0.12, abs=0.03
     )  # share and time trade against each other within 30 s of trial
 
@@ -70,12 +70,12 @@ def test_samples_that_were_not_observed_do_not_matter():
         y = t.y.copy()
         y[:, 300:340] = np.nan
         holed.append(t._replace(y=y))
-    found, whole = (
+    gappy, complete = (
         identify(holed, sample_time_s=TS).extruder,
         identify(trainings(PLANT)[:2], sample_time_s=TS).extruder,
     )
-    assert found.gain == pytest.approx(whole.gain, rel=0.01) and found.time_constant_s == pytest.approx(
-        whole.time_constant_s, rel=0.01
+    assert gappy.gain == pytest.approx(complete.gain, rel=0.01) and gappy.time_constant_s == pytest.approx(
+        complete.time_constant_s, rel=0.01
     )
 
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from pipeline.deposition import basis, gcode
-from pipeline.deposition.composition import BASIS, commands, compose, priority, superposition
-from pipeline.deposition.library import Basis, Library, learned
+from pipeline.deposition.composition import BASIS, PartSettings, commands, compose, priority, superposition
+from pipeline.deposition.library import Basis, Library
+from pipeline.deposition.library import learned as learned_command
 from pipeline.deposition.motion import plan
 from tests.deposition.trained import (
     AREA,
@@ -18,7 +19,7 @@ from tests.deposition.trained import (
     PLANT,
     RAMP,
     TS,
-    known,
+    learned,
     percent_of_on_off,
     protocol,
     trainings,
@@ -32,24 +33,17 @@ MACHINE = {
     "unset_feed": 8.0,
     "tool_change_s": 2.0,
 }
-PART = {
-    "nozzle_mm": NOZZLE,
-    "bead_area_mm2": AREA,
-    "ramp_s": RAMP,
-    "corner_deg": 30.0,
-    "longest_pause_s": 1.0,
-    "limit": np.inf,
-}
+PART = PartSettings(NOZZLE, AREA, RAMP, corner_deg=30.0, longest_pause_s=1.0, limit=np.inf)
 
 
 def composed(text, plant=PLANT, materials=None, **changes):
     program = gcode.parse(text)
     return compose(
-        known(plant),
+        learned(plant),
         program,
         plan(program.moves, **MACHINE),
+        PART._replace(**changes),
         materials=materials or {0: "A", 1: "B"},
-        **{**PART, **changes},
     )
 
 
@@ -67,7 +61,7 @@ def test_parts_pauses_and_speeds_that_were_not_trained_stay_within_the_bars(plan
             assert (
                 percent_of_on_off(plant, stream.u, stream.r) < bar / 2
             )  # half of the bar: one plant stands for a family
-    chain = known(plant).materials[0].chain.extruder
+    chain = learned(plant).materials[0].chain.extruder
     for r, bar in (
         (protocol(8.0, 0.2).r, bars[2]),
         (protocol(4.0, 0.6).r, bars[3]),
@@ -80,7 +74,7 @@ def test_the_prediction_of_each_composer_is_near_its_true_error():
     for name in ("fig9", "tic_tac_toe", "dashes"):
         made = of_part(name)
         for stream in made.streams:
-            true = commands(known(PLANT), made, stream, limit=np.inf)
+            true = commands(learned(PLANT), made, stream, limit=np.inf)
             assert true[stream.composer].tobytes() == stream.u.tobytes()
             for prediction in made.predictions:
                 if prediction.material == stream.material:
@@ -93,13 +87,13 @@ def test_the_prediction_of_each_composer_is_near_its_true_error():
 
 
 def test_short_lines_need_superposition_and_long_ones_do_not():
-    made, known_ = of_part("dashes"), known(PLANT)
-    where = (known_.library, "A", NOZZLE, made.tasks, made.lines, 0)
+    made, library = of_part("dashes"), learned(PLANT).library
+    where = (library, "A", NOZZLE, made.tasks, made.lines, 0)
     r = made.streams[0].r
     errors = [percent_of_on_off(PLANT, by(*where, samples=len(r)), r) for by in (priority, superposition)]
     assert errors[0] > 50 and errors[1] < errors[0] / 3  # notes, 5: the priority rule prints next to nothing
     made = of_part("fig9")
-    where = (known_.library, "A", NOZZLE, made.tasks, made.lines, 0)
+    where = (library, "A", NOZZLE, made.tasks, made.lines, 0)
     one, other = (by(*where, samples=len(made.streams[0].r)) for by in (priority, superposition))
     np.testing.assert_allclose(one, other, atol=1e-9 * np.abs(one).max())  # nothing overlaps: the same
 
@@ -110,19 +104,19 @@ def test_short_lines_need_superposition_and_long_ones_do_not():
 def test_the_library_composed_for_its_own_routine_is_what_was_learned():
     """A line as long as the routine's, with its pause: the composed command is
     the learned one, but for the flattened plateaus."""
-    lesson = protocol(8.0, 0.6, on_s=11)
+    case = protocol(8.0, 0.6, on_s=11)
     made = composed(
         f"G21\nG90\nM83\nT0\nG0 X0 Y0 F480\nG1 X{8 * 11} E1 F480\nG4 P600\nG1 X{2 * 8 * 11} "
         "E1\nG0 X200\nG4 P5000"
     )
     tasks, lines = made.tasks, made.lines
-    u = priority(known(PLANT).library, "A", NOZZLE, tasks, lines, 0, samples=len(made.streams[0].r))
-    taught = learned(trainings(PLANT)[0])[0]
+    u = priority(learned(PLANT).library, "A", NOZZLE, tasks, lines, 0, samples=len(made.streams[0].r))
+    command = learned_command(trainings(PLANT)[0])[0]
     begin = round(lines.begin_s[0] / TS)
-    start = round(lesson.start_s / TS)
-    ours, theirs = u[begin - 20 : begin + 500], taught[start - 20 : start + 500]
-    assert np.linalg.norm(ours - theirs) < 0.2 * np.linalg.norm(
-        theirs
+    start = round(case.start_s / TS)
+    composed_u, learned_u = u[begin - 20 : begin + 500], command[start - 20 : start + 500]
+    assert np.linalg.norm(composed_u - learned_u) < 0.2 * np.linalg.norm(
+        learned_u
     )  # Start is the mean over two pauses, and each plateau its mean
 
 
@@ -149,6 +143,36 @@ def test_where_tasks_overlap_the_higher_one_rules_and_superposition_adds_them():
     # from 0.2 s to 0.4 s both: 3 + (-5 - 1); then Stop alone
     expected = np.repeat([0.0, 3.0, -3.0, -5.0, 0.0], [5, 20, 10, 15, 5])
     np.testing.assert_allclose(added[k - 15 : k + 40], expected, atol=1e-12)
+
+
+def test_each_material_is_composed_by_its_own_chain_gain_and_signals():
+    """B is another plant than A: beside each other both are composed as each is alone."""
+    a, b = learned(PLANT), learned(CREEPING)
+    b = b._replace(library=b.library._replace(marks=a.library.marks))
+    columns = [one for one in a.library.columns if one.material == "A"]
+    columns += [one for one in b.library.columns if one.material == "B"]
+    library = a.library._replace(columns=tuple(columns))
+    both = a._replace(library=library, materials=(a.materials[0], b.materials[1]))
+    program = gcode.parse((PARTS / "tic_tac_toe.gcode").read_text())
+    motion = plan(program.moves, **MACHINE)
+    made, alone_a, alone_b = (
+        compose(each, program, motion, PART, materials={0: "A", 1: "B"}) for each in (both, a, b)
+    )
+    assert [stream.material for stream in made.streams] == ["A", "B"]
+    for k, (material, own, alone) in enumerate((("A", a, alone_a), ("B", b, alone_b))):
+        stream, expected = made.streams[k], alone.streams[k]
+        assert stream.composer == expected.composer
+        for name in ("r", "u", "y", "on_off"):
+            np.testing.assert_array_equal(getattr(stream, name), getattr(expected, name), err_msg=name)
+        assert [p for p in made.predictions if p.material == material] == [
+            p for p in alone.predictions if p.material == material
+        ]
+        by_composer = commands(both, made, stream, limit=np.inf)
+        for composer, u in commands(own, alone, expected, limit=np.inf).items():
+            np.testing.assert_array_equal(by_composer[composer], u, err_msg=composer)
+    # the two plants ask for other commands: the wrong chain would show
+    u, wrong = alone_b.streams[1].u, alone_a.streams[1].u
+    assert np.linalg.norm(u - wrong) > 0.05 * np.linalg.norm(u)
 
 
 def test_the_wanted_flow_holds_the_volume_of_every_line_and_of_no_travel():
@@ -206,6 +230,9 @@ def test_a_program_that_would_jump_from_steady_state_to_no_flow_is_refused_with_
     motion = plan(program.moves, **{**MACHINE, "tool_change_s": 0.0})
     with pytest.raises(
         ValueError,
-        match="line 7: T1 comes 0.00 s after line 6 still printed with T0, so Steady-State would go to No-Flow without a Stop",
+        match=(
+            "line 7: T1 comes 0.00 s after line 6 still printed with T0, so Steady-State would go to "
+            "No-Flow without a Stop"
+        ),
     ):
-        compose(known(PLANT), program, motion, materials={0: "A", 1: "B"}, **PART)
+        compose(learned(PLANT), program, motion, PART, materials={0: "A", 1: "B"})

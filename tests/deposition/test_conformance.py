@@ -15,7 +15,7 @@ from pipeline.deposition.conformance import (
 from pipeline.deposition.extruder import Extruder, flow
 from pipeline.deposition.gcode import Refusal
 from tests.deposition.test_composition import composed, of_part
-from tests.deposition.trained import AREA, NOMINAL, PLANT, RAMP, TS, known, protocol
+from tests.deposition.trained import AREA, NOMINAL, PLANT, RAMP, TS, learned, protocol
 
 REPORT = {
     "bead_area_mm2": AREA,
@@ -32,8 +32,8 @@ def test_every_printed_line_of_0_4_s_has_its_volume_in_truth_within_3_percent(na
     true = made._replace(
         streams=tuple(s._replace(y=flow(PLANT, s.u, sample_time_s=TS)) for s in made.streams)
     )
-    volumes = line_volumes(true, known(PLANT).library, bead_area_mm2=AREA)
-    report = conform(made, known(PLANT), **REPORT)
+    volumes = line_volumes(true, learned(PLANT).library, bead_area_mm2=AREA)
+    report = conform(made, learned(PLANT), **REPORT)
     assert np.abs(volumes.error_percent).max() < 3.0  # the bar
     np.testing.assert_allclose(
         report.lines.predicted_mm3, volumes.predicted_mm3, rtol=0.02
@@ -43,7 +43,7 @@ def test_every_printed_line_of_0_4_s_has_its_volume_in_truth_within_3_percent(na
 
 def test_the_lines_of_a_run_share_its_volume_out_without_rest():
     made = composed("G21\nG90\nM83\nT0\nG0 X10 F480\nG1 X20 E1\nG1 Y7 E1\nG1 X35 E1\nG0 X0\nG4 P3000")
-    volumes = line_volumes(made, known(PLANT).library, bead_area_mm2=AREA)
+    volumes = line_volumes(made, learned(PLANT).library, bead_area_mm2=AREA)
     assert volumes.line.tolist() == [6, 7, 8]
     assert volumes.predicted_mm3.sum() == pytest.approx(
         made.streams[0].y.sum() * TS, rel=1e-3
@@ -65,38 +65,40 @@ def test_a_run_shorter_than_the_stop_lead_is_listed_and_a_long_one_is_not():
     made = composed(
         "G21\nG90\nM83\nT0\nG0 X10 F480\nG1 X12 E1\nG0 X20\nG1 X40 E1\nG0 X0\nG4 P3000"
     )  # 0.25 s and 2.5 s
-    report = conform(made, known(PLANT), **REPORT)
+    report = conform(made, learned(PLANT), **REPORT)
     assert report.lines.line.tolist() == [6, 8] and report.lines.shorter_than_lead.tolist() == [True, False]
     assert report.judged == 1
 
 
 @pytest.mark.parametrize("ramp_s", [0.15, 0.5, 1.0])
 def test_the_forecast_of_saturation_is_within_3_points_of_the_plant(ramp_s):
-    chain, gain = known(PLANT).materials[0].chain.extruder, known(PLANT).materials[0].on_off_gain
+    chain, gain = learned(PLANT).materials[0].chain.extruder, learned(PLANT).materials[0].on_off_gain
     assert gain == pytest.approx(NOMINAL.gain, rel=1e-6)  # what the first trials ran with
     on = protocol(ramp_s=1e-9).r
     r = basis.boxed(on, ramp_s, TS)
     for times in (3.0, 5.0, 10.0, 20.0):
         limit = times * r.max() / NOMINAL.gain
-        found = saturation(chain, on, on_off_gain=gain, ramp_s=ramp_s, limit=limit, sample_time_s=TS)
+        forecast = saturation(chain, on, on_off_gain=gain, ramp_s=ramp_s, limit=limit, sample_time_s=TS)
         u = basis.compose(chain, r, sample_time_s=TS, limit=limit)
         true = np.linalg.norm(flow(PLANT, u, sample_time_s=TS, limit=limit) - r)
         on_off = np.linalg.norm(flow(PLANT, np.clip(r / NOMINAL.gain, -limit, limit), sample_time_s=TS) - r)
-        assert found.rms_percent_of_on_off == pytest.approx(100 * true / on_off, abs=3.0)  # points: the bar
-        assert found.enough == (found.share_percent == 0.0)
+        assert forecast.rms_percent_of_on_off == pytest.approx(
+            100 * true / on_off, abs=3.0
+        )  # points: the bar
+        assert forecast.enough == (forecast.share_percent == 0.0)
 
 
 def test_the_peak_is_about_1_plus_tau_over_ramp():
     plant, on = Extruder(1.0, 3.0), protocol(ramp_s=1e-9).r
     for ramp_s in (0.3, 0.6, 1.2):
-        found = saturation(plant, on, on_off_gain=1.0, ramp_s=ramp_s, limit=np.inf, sample_time_s=TS)
+        forecast = saturation(plant, on, on_off_gain=1.0, ramp_s=ramp_s, limit=np.inf, sample_time_s=TS)
         # the slope is steepest in the middle, where half of the flow
         # is there: 1/2 + tau / ramp; dt of 0.02 s blunts it
-        assert found.peak_over_steady == pytest.approx(0.5 + 3.0 / ramp_s, rel=0.05)
+        assert forecast.peak_over_steady == pytest.approx(0.5 + 3.0 / ramp_s, rel=0.05)
 
 
 def test_the_ramp_that_would_do_does_and_a_shorter_one_does_not():
-    chain, on = known(PLANT).materials[0].chain.extruder, protocol(ramp_s=1e-9).r
+    chain, on = learned(PLANT).materials[0].chain.extruder, protocol(ramp_s=1e-9).r
     limit = 8 * on.max() / chain.gain
     ramp_s = ramp_that_would_do(chain, on, ramp_s=RAMP, limit=limit, sample_time_s=TS)
     peaks = [
@@ -114,8 +116,8 @@ def test_the_ramp_that_would_do_does_and_a_shorter_one_does_not():
 def test_refusals_carry_their_lines_and_the_library_s_guesses_only_where_it_is_used():
     made = composed("G21\nG90\nM83\nT0\nG0 X10 F480\nG1 X20 E1\nG4 P200\nG1 X30 E1\nG0 X0\nG4 P3000")
     reader = [Refusal(3, "cannot be read")]
-    assert conform(made, known(PLANT), **REPORT, refusals=reader).refused == [(3, "cannot be read")]
+    assert conform(made, learned(PLANT), **REPORT, refusals=reader).refused == [(3, "cannot be read")]
     forced = made._replace(streams=tuple(s._replace(composer="priority") for s in made.streams))
-    refused = conform(forced, known(PLANT), **REPORT, refusals=reader).refused
+    refused = conform(forced, learned(PLANT), **REPORT, refusals=reader).refused
     assert [r.line for r in refused] == [3, 6]
     assert refused[1].why.startswith("the library lacks Corner at 8 mm/s with a pause of 0.2")

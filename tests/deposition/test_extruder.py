@@ -174,22 +174,22 @@ def test_each_kind_of_noise_has_its_share_of_the_steady_flow(share):
 
 
 def test_the_wanted_flow_is_the_bead_area_times_the_speed_while_printing():
-    found = reference()
-    inside = (found.time_s > 4.2) & (found.time_s < 16.4)
-    np.testing.assert_allclose(found.r[inside], 0.304 * found.speed[inside], atol=1e-9)  # rounding
-    assert np.array_equal(found.printing, found.r > 0)
+    task = reference()
+    inside = (task.time_s > 4.2) & (task.time_s < 16.4)
+    np.testing.assert_allclose(task.r[inside], 0.304 * task.speed[inside], atol=1e-9)  # rounding
+    assert np.array_equal(task.printing, task.r > 0)
 
 
 def test_the_reference_protocol_by_hand():
-    found = reference()
-    assert len(found.r) == 1230  # 24.6 s at 50 Hz
-    assert (found.start_s, found.pause_s, found.stop_s) == (4.0, (10.0, 10.6), 16.6)
-    assert found.r[: round(3.85 / TS)].max() == 0 and found.r[round(16.76 / TS) :].max() == 0
-    assert found.r[round(4 / TS)] == pytest.approx(STEADY / 2)  # ramps are centred on the events
-    assert found.r[round(10.3 / TS)] == 0 and found.speed[round(10.3 / TS)] == 0
-    assert found.speed[0] == found.speed[-1] == 8.0  # ooze is laid on the line
+    task = reference()
+    assert len(task.r) == 1230  # 24.6 s at 50 Hz
+    assert (task.start_s, task.pause_s, task.stop_s) == (4.0, (10.0, 10.6), 16.6)
+    assert task.r[: round(3.85 / TS)].max() == 0 and task.r[round(16.76 / TS) :].max() == 0
+    assert task.r[round(4 / TS)] == pytest.approx(STEADY / 2)  # ramps are centred on the events
+    assert task.r[round(10.3 / TS)] == 0 and task.speed[round(10.3 / TS)] == 0
+    assert task.speed[0] == task.speed[-1] == 8.0  # ooze is laid on the line
     # the last sample is at 24.58 s; halves of ramps take 0.6 s off; trapezia of a curve of 0.15 s
-    assert found.position[-1] == pytest.approx((24.58 - 0.6) * 8.0, abs=1e-3)
+    assert task.position[-1] == pytest.approx((24.58 - 0.6) * 8.0, abs=1e-3)
 
 
 def test_a_ramp_is_a_step_after_two_moving_averages():

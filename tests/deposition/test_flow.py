@@ -53,12 +53,12 @@ def exact_sections(time_s, Q, position) -> Sections:
     return Sections((faces[:-1] + faces[1:]) / 2, A, np.full(len(A), 1e-4), np.full(len(A), 17), LENGTH, 0)
 
 
-def inverted(r, seen, shapes=None):
+def inverted(r, places, shapes=None):
     shapes = r.r[None] if shapes is None else shapes
     return estimate(
         r.time_s,
         r.position,
-        seen,
+        places,
         nozzle_radius_mm=RADIUS,
         shapes=shapes,
         contact_angle_deg=90.0,
@@ -72,18 +72,18 @@ def seen_through(camera, r, Q, *, view=VIEW, position=None):
         r.time_s, Q, position, view=view, frame_rate_hz=30.0, nozzle_mm=(RADIUS, 0.32), contact_angle_deg=90.0
     )
     columns = (0, 600) if view.mm_per_px > 0 else (40, 640)
-    found = [(t, measure(frame, columns=columns, longest_blur_px=6.0)) for t, frame in frames]
+    beads = [(t, measure(frame, columns=columns, longest_blur_px=6.0)) for t, frame in frames]
     x, widths = (
-        np.interp([t for t, _ in found], r.time_s, position),
-        np.array([bead.widths for _, bead in found]),
+        np.interp([t for t, _ in beads], r.time_s, position),
+        np.array([bead.widths for _, bead in beads]),
     )
     return sections(
-        x, found[0][1].columns, widths / 125, view=view, nozzle_radius_mm=RADIUS, contact_angle_deg=90.0
+        x, beads[0][1].columns, widths / 125, view=view, nozzle_radius_mm=RADIUS, contact_angle_deg=90.0
     )
 
 
-def percent(found, Q, within=slice(None)):
-    return 100 * np.sqrt(np.mean(np.square(found.flow - Q)[within])) / NOMINAL_FLOW
+def percent(estimated, Q, within=slice(None)):
+    return 100 * np.sqrt(np.mean(np.square(estimated.flow - Q)[within])) / NOMINAL_FLOW
 
 
 def on_off(r, seed=3):
@@ -108,30 +108,30 @@ def test_the_footprint_is_the_chord_of_the_nozzle():
 @pytest.mark.parametrize("name", ["wanted", "on-off"])
 def test_without_noise_the_flow_comes_back_everywhere_it_is_observable(name):
     Q = SHORT.r if name == "wanted" else on_off(SHORT)
-    found = inverted(SHORT, exact_sections(SHORT.time_s, Q, SHORT.position))
-    assert percent(found, Q, found.observable) < 0.5  # flow straight between samples, kinks smoothed
-    assert 100 * abs((found.flow - Q).mean()) / NOMINAL_FLOW < 0.1  # volume is not lost
+    estimated = inverted(SHORT, exact_sections(SHORT.time_s, Q, SHORT.position))
+    assert percent(estimated, Q, estimated.observable) < 0.5  # flow straight between samples, kinks smoothed
+    assert 100 * abs((estimated.flow - Q).mean()) / NOMINAL_FLOW < 0.1  # volume is not lost
 
 
 def test_the_volume_of_a_pause_is_known_within_its_deviation_though_its_flow_is_not():
     Q = on_off(SHORT)
-    found = inverted(SHORT, exact_sections(SHORT.time_s, Q, SHORT.position))
-    assert len(found.pauses) == 1
-    pause = found.pauses[0]
+    estimated = inverted(SHORT, exact_sections(SHORT.time_s, Q, SHORT.position))
+    assert len(estimated.pauses) == 1
+    pause = estimated.pauses[0]
     inside = (SHORT.time_s >= pause.begin_s) & (SHORT.time_s <= pause.end_s)
-    assert not found.observable[inside].any()
+    assert not estimated.observable[inside].any()
     assert pause.volume == pytest.approx(Q[inside].sum() * 0.02, rel=0.02)
-    assert np.isnan(found.per_travel[inside]).all()
+    assert np.isnan(estimated.per_travel[inside]).all()
     steady = (SHORT.time_s > 2.2) & (SHORT.time_s < 3.0)
-    np.testing.assert_allclose(found.per_travel[steady], Q[steady] / SPEED, rtol=0.02)
+    np.testing.assert_allclose(estimated.per_travel[steady], Q[steady] / SPEED, rtol=0.02)
 
 
 def test_the_deviation_is_larger_where_the_gantry_stands():
-    found = inverted(
+    estimated = inverted(
         SHORT, exact_sections(SHORT.time_s, on_off(SHORT), SHORT.position), np.zeros((0, len(SHORT.time_s)))
     )
     steady = (SHORT.time_s > 2.2) & (SHORT.time_s < 3.0)
-    assert found.deviation[~found.observable].max() > 3 * found.deviation[steady].mean()
+    assert estimated.deviation[~estimated.observable].max() > 3 * estimated.deviation[steady].mean()
 
 
 def test_the_deviation_is_that_of_the_errors_under_white_noise():
@@ -142,10 +142,10 @@ def test_the_deviation_is_that_of_the_errors_under_white_noise():
             area=exact.area + np.where(exact.area > 0, 2e-3, 0) * rng.standard_normal(len(exact.s)),
             deviation=np.full(len(exact.s), 2e-3),
         )
-        found = inverted(SHORT, noisy)
+        estimated = inverted(SHORT, noisy)
         steady = (SHORT.time_s > 2.2) & (SHORT.time_s < 3.0)
-        errors.append((found.flow - clean.flow)[steady])
-        deviations.append(found.deviation[steady])
+        errors.append((estimated.flow - clean.flow)[steady])
+        deviations.append(estimated.deviation[steady])
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(
         np.mean(deviations), rel=0.5
     )  # some 20 independent errors
@@ -153,7 +153,7 @@ def test_the_deviation_is_that_of_the_errors_under_white_noise():
 
 def test_a_shift_of_the_calibration_is_in_the_deviation():
     exact = exact_sections(SHORT.time_s, SHORT.r, SHORT.position)
-    found = estimate(
+    estimated = estimate(
         SHORT.time_s,
         SHORT.position,
         exact,
@@ -164,7 +164,7 @@ def test_a_shift_of_the_calibration_is_in_the_deviation():
     )
     steady = (SHORT.time_s > 2.2) & (SHORT.time_s < 3.0)
     np.testing.assert_allclose(
-        found.deviation[steady] / found.flow[steady], 0.02, rtol=0.05
+        estimated.deviation[steady] / estimated.flow[steady], 0.02, rtol=0.05
     )  # 2 x 1 % of 0.88 mm
 
 
@@ -172,9 +172,9 @@ def test_a_speck_on_the_line_does_not_become_flow():
     exact = exact_sections(SHORT.time_s, SHORT.r, SHORT.position)
     spoilt = exact.area.copy()
     spoilt[np.argmin(np.abs(exact.s - 22.0))] *= 2
-    found = inverted(SHORT, exact._replace(area=spoilt))
-    assert percent(found, SHORT.r) < 0.5
-    assert found.outliers >= 1
+    estimated = inverted(SHORT, exact._replace(area=spoilt))
+    assert percent(estimated, SHORT.r) < 0.5
+    assert estimated.outliers >= 1
 
 
 # ---- places
@@ -184,20 +184,20 @@ def test_readings_of_one_place_are_averaged_and_specks_dropped():
     position, columns = np.arange(10) * 8 / 125, 80 + 8.0 * np.arange(60)
     widths = np.full((10, 60), 0.88)
     widths[4, 30] = 1.5
-    found = sections(position, columns, widths, view=VIEW, nozzle_radius_mm=RADIUS, contact_angle_deg=90.0)
-    np.testing.assert_allclose(found.area, AREA, rtol=1e-9)
-    assert found.dropped == 1
-    assert found.frames.max() == 10
-    assert np.all(np.diff(found.s) == pytest.approx(LENGTH, abs=1e-9))
+    places = sections(position, columns, widths, view=VIEW, nozzle_radius_mm=RADIUS, contact_angle_deg=90.0)
+    np.testing.assert_allclose(places.area, AREA, rtol=1e-9)
+    assert places.dropped == 1
+    assert places.frames.max() == 10
+    assert np.all(np.diff(places.s) == pytest.approx(LENGTH, abs=1e-9))
 
 
 def test_columns_under_the_nozzle_and_unread_blocks_are_left_out():
     columns = np.array([560.0, 640.0])
     widths = np.array([[0.88, 0.2], [np.nan, 0.2]])
-    found = sections(
+    places = sections(
         np.array([0.0, 0.5]), columns, widths, view=VIEW, nozzle_radius_mm=RADIUS, contact_angle_deg=90.0
     )
-    np.testing.assert_allclose(found.s, [-88 / 125])
+    np.testing.assert_allclose(places.s, [-88 / 125])
     with pytest.raises(
         ValueError, match=r"none of 4 readings is usable; look at why the frames were rejected"
     ):
@@ -217,7 +217,10 @@ def test_a_gantry_that_comes_back_is_refused():
     for position, view in ((there_and_back, VIEW), (np.arange(40.0), View(-1 / 125, 648.0))):
         with pytest.raises(
             ValueError,
-            match=r"the gantry goes back by (19|39) mm, .* cut the record to one pass along the line, or turn the sign",
+            match=(
+                r"the gantry goes back by (19|39) mm, .* cut the record to one pass along the line, or "
+                r"turn the sign"
+            ),
         ):
             sections(position, columns, widths, view=view, nozzle_radius_mm=RADIUS, contact_angle_deg=90.0)
 
@@ -225,12 +228,12 @@ def test_a_gantry_that_comes_back_is_refused():
 def test_what_no_frame_saw_is_not_observable_and_the_rest_does_not_suffer():
     exact = exact_sections(SHORT.time_s, SHORT.r, SHORT.position)
     dark = (exact.s > 18.0) & (exact.s < 21.0)
-    kept = Sections(*(part[~dark] for part in exact[:4]), LENGTH, 0)
-    found = inverted(SHORT, kept)
+    lit = Sections(*(part[~dark] for part in exact[:4]), LENGTH, 0)
+    estimated = inverted(SHORT, lit)
     blind = (SHORT.position > 18.3) & (SHORT.position < 20.7)
-    assert not found.observable[blind].any()
-    assert found.observable[SHORT.position < 17.5].all()
-    assert percent(found, SHORT.r, found.observable) < 0.5
+    assert not estimated.observable[blind].any()
+    assert estimated.observable[SHORT.position < 17.5].all()
+    assert percent(estimated, SHORT.r, estimated.observable) < 0.5
 
 
 # ---- through pixels
@@ -240,26 +243,26 @@ def test_what_no_frame_saw_is_not_observable_and_the_rest_does_not_suffer():
 def test_through_pixels_the_flow_is_within_2_5_percent_and_6_in_the_corner_without_lag(case):
     Q = {"wanted": SHORT.r, "on-off": on_off(SHORT), "between": (SHORT.r + on_off(SHORT)) / 2}[case]
     cv2.setNumThreads(1)
-    found = inverted(SHORT, seen_through(Camera(NOMINAL, np.random.default_rng(20)), SHORT, Q))
+    estimated = inverted(SHORT, seen_through(Camera(NOMINAL, np.random.default_rng(20)), SHORT, Q))
     corner = (SHORT.time_s > SHORT.pause_s[0] - 0.5) & (SHORT.time_s < SHORT.pause_s[1] + 0.5)
-    assert percent(found, Q) <= 2.5
-    assert percent(found, Q, corner) <= 6.0
+    assert percent(estimated, Q) <= 2.5
+    assert percent(estimated, Q, corner) <= 6.0
     slope = np.gradient(Q, 0.02)
-    assert abs(slope @ (found.flow - Q) / (slope @ slope)) < 1 / 30
+    assert abs(slope @ (estimated.flow - Q) / (slope @ slope)) < 1 / 30
 
 
 def test_through_hard_pixels_the_flow_is_within_the_bars_too():
     Q = on_off(SHORT)
-    found = inverted(SHORT, seen_through(Camera(HARD, np.random.default_rng(21)), SHORT, Q))
+    estimated = inverted(SHORT, seen_through(Camera(HARD, np.random.default_rng(21)), SHORT, Q))
     corner = (SHORT.time_s > SHORT.pause_s[0] - 0.5) & (SHORT.time_s < SHORT.pause_s[1] + 0.5)
-    assert percent(found, Q) <= 2.5
-    assert percent(found, Q, corner) <= 6.0
+    assert percent(estimated, Q) <= 2.5
+    assert percent(estimated, Q, corner) <= 6.0
 
 
 def test_a_line_printed_the_other_way_is_read_by_a_mirrored_view():
     Q = on_off(SHORT)
-    found = seen_through(Camera(NOMINAL, np.random.default_rng(22)), SHORT, Q, view=View(-1 / 125, -9.0))
-    assert percent(inverted(SHORT, found), Q) <= 2.5
+    places = seen_through(Camera(NOMINAL, np.random.default_rng(22)), SHORT, Q, view=View(-1 / 125, -9.0))
+    assert percent(inverted(SHORT, places), Q) <= 2.5
 
 
 # ---- refusals
@@ -301,12 +304,14 @@ def test_a_line_printed_the_other_way_is_read_by_a_mirrored_view():
     ],
 )
 def test_a_record_that_cannot_be_inverted_is_refused(time_s, position, shapes, message):
-    seen = Sections(np.arange(10) * LENGTH, np.full(10, AREA), np.full(10, 1e-3), np.full(10, 17), LENGTH, 0)
+    places = Sections(
+        np.arange(10) * LENGTH, np.full(10, AREA), np.full(10, 1e-3), np.full(10, 17), LENGTH, 0
+    )
     with pytest.raises(ValueError, match=message):
         estimate(
             time_s,
             position,
-            seen,
+            places,
             nozzle_radius_mm=RADIUS,
             shapes=shapes,
             contact_angle_deg=90.0,

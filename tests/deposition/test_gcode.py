@@ -119,7 +119,7 @@ COMMANDS = st.one_of(
 def programs(draw):
     """Text as slicers, people and hosts write it, and the commands that it stands for."""
     lines, meant = [], []
-    for number, (command, words) in enumerate(draw(st.lists(COMMANDS, min_size=1, max_size=40)), 1):
+    for command, words in draw(st.lists(COMMANDS, min_size=1, max_size=40)):
         gap = draw(st.sampled_from([" ", " ", " ", "", "  ", "\t", " (a (nested; G1 X9) one) "]))
         line = (
             gap.join([command, *(letter + value for letter, value in words.items())])
@@ -129,7 +129,8 @@ def programs(draw):
         line = draw(st.sampled_from(["", "", "", " ", "N12 "])) + line
         line = line.lower() if draw(st.integers(0, 4)) == 0 else line
         if line[0] in "Nn" and draw(st.booleans()):
-            line += f"*{np.bitwise_xor.reduce(np.frombuffer(re.sub(r'[(].*?one[)]', ' ', line).encode(), np.uint8))}"
+            text = re.sub(r"[(].*?one[)]", " ", line).encode()
+            line += f"*{np.bitwise_xor.reduce(np.frombuffer(text, np.uint8))}"
         line += draw(st.sampled_from(["", "", " ", ";", " ; X5 (Y7", "; done é", " (speed)"]))
         lines.append(
             line + draw(st.sampled_from(["", "", "", "\n", "\n;G1 X1", "\nM117 G1 X9 Y9", "\nM104 S200"]))
@@ -194,11 +195,11 @@ def test_columns_agree_with_a_machine_that_reads_one_line_at_a_time(program):
     ],
 )
 def test_a_move_is_read_however_it_is_written(line, end, e):
-    found = parse(f"M83\n{line}\n")
-    assert found.refusals == []
-    assert found.moves.line.tolist() == [2]
-    np.testing.assert_allclose(found.moves.end[0], end, atol=1e-14)  # as the literal: both are rounded once
-    assert found.moves.e[0] == e
+    program = parse(f"M83\n{line}\n")
+    assert program.refusals == []
+    assert program.moves.line.tolist() == [2]
+    np.testing.assert_allclose(program.moves.end[0], end, atol=1e-14)  # as the literal: both are rounded once
+    assert program.moves.e[0] == e
 
 
 @pytest.mark.parametrize(
@@ -216,21 +217,27 @@ def test_line_ends_byte_order_marks_and_foreign_letters_do_not_matter(wrapped):
 
 
 def test_free_text_is_never_a_move():
-    text = 'M117 G1 X50 E5\nM117 X10 Y10\nM118 E1 P0 X5\nM486 AG1 X99\nM23 G1.gco\nM98 P"X5"\nM28 X5.g\nM1002 gcode_claim_action : 2\nM204 P800\nG1 X1\n@info G1 X3\n%\n'
-    found = parse(text)
-    assert found.moves.line.tolist() == [10] and found.refusals == []
-    assert list(zip(found.other_line.tolist(), found.other_word.tolist(), strict=True)) == [
+    text = (
+        'M117 G1 X50 E5\nM117 X10 Y10\nM118 E1 P0 X5\nM486 AG1 X99\nM23 G1.gco\nM98 P"X5"\nM28 X5.g\n'
+        "M1002 gcode_claim_action : 2\nM204 P800\nG1 X1\n@info G1 X3\n%\n"
+    )
+    program = parse(text)
+    assert program.moves.line.tolist() == [10] and program.refusals == []
+    assert list(zip(program.other_line.tolist(), program.other_word.tolist(), strict=True)) == [
         (1, "M117"), (2, "M117"), (3, "M118"), (4, "M486"), (5, "M23"), (6, "M98"), (7, "M28"), (8, "M1002"),
         (11, "@info"), (12, "%"),
     ]  # fmt: skip
 
 
 def test_macros_and_template_rests_are_kept_with_their_lines():
-    text = "START_PRINT BED=60 X=5\nEXCLUDE_OBJECT_START NAME=cube_id_0\n{if layer_z > 5}\n_HEAT\nG1 X1\nT[next_extruder]\nTx\nif {state.x} = 1\nset global.y = 2\n$DO6.0=1\n"
-    found = parse(text)
-    assert found.moves.line.tolist() == [5] and found.refusals == []
-    assert found.other_line.tolist() == [1, 2, 3, 4, 6, 7, 8, 9, 10]
-    assert found.other_word.tolist()[:2] == ["START_PRINT", "EXCLUDE_OBJECT_START"]
+    text = (
+        "START_PRINT BED=60 X=5\nEXCLUDE_OBJECT_START NAME=cube_id_0\n{if layer_z > 5}\n_HEAT\nG1 X1\n"
+        "T[next_extruder]\nTx\nif {state.x} = 1\nset global.y = 2\n$DO6.0=1\n"
+    )
+    program = parse(text)
+    assert program.moves.line.tolist() == [5] and program.refusals == []
+    assert program.other_line.tolist() == [1, 2, 3, 4, 6, 7, 8, 9, 10]
+    assert program.other_word.tolist()[:2] == ["START_PRINT", "EXCLUDE_OBJECT_START"]
 
 
 def test_accelerations_of_both_firmwares_are_kept_with_the_moves():
@@ -243,17 +250,20 @@ def test_accelerations_of_both_firmwares_are_kept_with_the_moves():
 
 def test_checksums_are_checked():
     good, bad = "N3 T0*57", "N4 G1 X5*12"
-    found = parse(f"{good}\n{bad}\nN5 G1 X7 *92\nG1 X8\n")
-    assert [r.line for r in found.refusals] == [2, 3]
-    assert "expected the checksum 12 of the line, found" in found.refusals[0].why
-    assert found.moves.end[:, 0].tolist() == [8]
+    program = parse(f"{good}\n{bad}\nN5 G1 X7 *92\nG1 X8\n")
+    assert [r.line for r in program.refusals] == [2, 3]
+    assert "expected the checksum 12 of the line, found" in program.refusals[0].why
+    assert program.moves.end[:, 0].tolist() == [8]
 
 
 # ---- state, by hand
 
 
 def test_kinds_of_moves():
-    text = "M83\nG1 F1800\nG0 X1\nG1 X2 E1\nG1 E-2\nG1 X3 E-.5\nG0 Z1\nG0 X9 Z1\nG0 Z0\nG1 E2.5\nG1 E3\nG1 X10 E1\nG10\nG11\nG4 P250\nT1\nG28 X\nG10 P0 S200\nG1 X0 F0\nG1 X0\n"
+    text = (
+        "M83\nG1 F1800\nG0 X1\nG1 X2 E1\nG1 E-2\nG1 X3 E-.5\nG0 Z1\nG0 X9 Z1\nG0 Z0\nG1 E2.5\nG1 E3\nG1 "
+        "X10 E1\nG10\nG11\nG4 P250\nT1\nG28 X\nG10 P0 S200\nG1 X0 F0\nG1 X0\n"
+    )
     names = [
         "TRAVEL",
         "EXTRUDE",
@@ -271,11 +281,11 @@ def test_kinds_of_moves():
         "TOOL",
         "HOME",
     ]
-    found = parse(text)
-    assert [Kind(k).name for k in found.moves.kind] == names
-    assert found.other_word.tolist() == ["G10"]  # with P it sets temperatures
-    assert found.moves.dwell_s[12] == 0.25 and found.moves.tool[13] == 1
-    assert set(found.moves.feed) == {30.0}  # F alone counts, F0 does not
+    program = parse(text)
+    assert [Kind(k).name for k in program.moves.kind] == names
+    assert program.other_word.tolist() == ["G10"]  # with P it sets temperatures
+    assert program.moves.dwell_s[12] == 0.25 and program.moves.tool[13] == 1
+    assert set(program.moves.feed) == {30.0}  # F alone counts, F0 does not
 
 
 def test_a_prime_while_lifting_back_is_no_printing():
@@ -358,21 +368,21 @@ def test_words_that_change_the_tool(text, tools):
     ],
 )
 def test_paste_printers_that_switch_extrusion(on, off, name):
-    found = parse(f"G0 X1\n{on}\nG1 X4 Y4\nG2 X4 Y4 I1\n{off}\nG0 X0\n")
-    assert found.extruder == name and found.other_word.tolist() == []
-    assert [Kind(k).name for k in found.moves.kind] == ["TRAVEL", "EXTRUDE", "EXTRUDE", "TRAVEL"]
-    np.testing.assert_allclose(found.moves.e, [0, 5, 2 * np.pi, 0], rtol=1e-15)  # mm of path; rounding
+    program = parse(f"G0 X1\n{on}\nG1 X4 Y4\nG2 X4 Y4 I1\n{off}\nG0 X0\n")
+    assert program.extruder == name and program.other_word.tolist() == []
+    assert [Kind(k).name for k in program.moves.kind] == ["TRAVEL", "EXTRUDE", "EXTRUDE", "TRAVEL"]
+    np.testing.assert_allclose(program.moves.e, [0, 5, 2 * np.pi, 0], rtol=1e-15)  # mm of path; rounding
 
 
 def test_a_fan_is_no_switch_where_e_is_driven():
-    found = parse("M106 S255\nG1 X1 E1\nG0 X2\nM107\n")
-    assert found.extruder == "E" and found.moves.e.tolist() == [1, 0]
+    program = parse("M106 S255\nG1 X1 E1\nG0 X2\nM107\n")
+    assert program.extruder == "E" and program.moves.e.tolist() == [1, 0]
 
 
 @pytest.mark.parametrize("letter", ["U", "A", "B", "C"])
 def test_paste_printers_that_drive_another_letter(letter):
-    found = parse(f"G92 {letter}0\nG1 X1 {letter}2\nG1 X2 {letter}2.5\nG0 X3\n")
-    assert found.extruder == letter and found.moves.e.tolist() == [2, 0.5, 0]
+    program = parse(f"G92 {letter}0\nG1 X1 {letter}2\nG1 X2 {letter}2.5\nG0 X3\n")
+    assert program.extruder == letter and program.moves.e.tolist() == [2, 0.5, 0]
 
 
 # ---- arcs
@@ -398,13 +408,13 @@ def test_paste_printers_that_drive_another_letter(letter):
     ],
 )
 def test_arcs_have_their_true_centre_sweep_and_length(arc, centre, angle, length):
-    found = parse(f"G0 X10\n{arc}\n")
-    assert found.refusals == []
-    np.testing.assert_allclose(found.moves.centre[1], centre, atol=1e-9)  # rounding
-    assert found.moves.angle[1] == pytest.approx(
+    program = parse(f"G0 X10\n{arc}\n")
+    assert program.refusals == []
+    np.testing.assert_allclose(program.moves.centre[1], centre, atol=1e-9)  # rounding
+    assert program.moves.angle[1] == pytest.approx(
         angle, rel=1e-3 if "9.99" in arc else 1e-12
     )  # the rounded radius moves the centre
-    assert found.moves.length[1] == pytest.approx(length, rel=1e-3 if "9.99" in arc else 1e-12)
+    assert program.moves.length[1] == pytest.approx(length, rel=1e-3 if "9.99" in arc else 1e-12)
 
 
 @settings(max_examples=60, deadline=None)
@@ -448,10 +458,10 @@ def test_both_forms_of_an_arc_are_the_same_arc(radius, heading, sweep, code):
     ],
 )
 def test_a_line_that_cannot_be_read_is_refused_with_its_number(line, why):
-    found = parse(f"G1 X1 Y1\n{line}\nG1 X2 Y2\n")
-    assert [r.line for r in found.refusals] == [2 + line.count("\n")]
-    assert why in found.refusals[0].why
-    assert found.moves.line.tolist() == [1, 3 + line.count("\n")]
+    program = parse(f"G1 X1 Y1\n{line}\nG1 X2 Y2\n")
+    assert [r.line for r in program.refusals] == [2 + line.count("\n")]
+    assert why in program.refusals[0].why
+    assert program.moves.line.tolist() == [1, 3 + line.count("\n")]
 
 
 @pytest.mark.parametrize(
@@ -482,13 +492,13 @@ def test_what_is_no_program_is_refused_in_one_sentence(data, why):
 def test_damaged_text_never_raises_and_never_jumps(damage, random):
     lines = ["G1 X1 Y2 E3", "G28", "T1", "G92 E0", "G2 X5 Y5 I2 J2"] * 3 + damage
     random.shuffle(lines)
-    found = parse("G1 X0\n" * 200 + "\n".join(lines))
+    program = parse("G1 X0\n" * 200 + "\n".join(lines))
     assert (
-        np.isfinite(found.moves.end).all()
-        and np.isfinite(found.moves.length).all()
-        and np.isfinite(found.moves.e).all()
+        np.isfinite(program.moves.end).all()
+        and np.isfinite(program.moves.length).all()
+        and np.isfinite(program.moves.e).all()
     )
-    assert (np.diff(found.moves.line) >= 0).all() and (found.moves.length >= 0).all()
+    assert (np.diff(program.moves.line) >= 0).all() and (program.moves.length >= 0).all()
 
 
 # ---- the parts, and other people's programs
@@ -497,9 +507,9 @@ def test_damaged_text_never_raises_and_never_jumps(damage, random):
 def test_the_parts_are_read_whole():
     lines = {"fig9": 3, "tic_tac_toe": 9, "dashes": 12}
     for name, printed in lines.items():
-        found = parse((PARTS / f"{name}.gcode").read_bytes())
-        m = found.moves
-        assert found.refusals == [] and found.other_word.tolist() == []
+        program = parse((PARTS / f"{name}.gcode").read_bytes())
+        m = program.moves
+        assert program.refusals == [] and program.other_word.tolist() == []
         assert np.count_nonzero(m.kind == Kind.EXTRUDE) == printed
         # E is written as travelled length, to two decimals
         np.testing.assert_allclose(m.e[m.kind == Kind.EXTRUDE], m.length[m.kind == Kind.EXTRUDE], atol=0.006)
@@ -575,7 +585,10 @@ G2 X30 Y0 I5 J0 E.7
 G1 E-.8 F1800
 M1006 A0 B10 L100 C37 D10 M60 E37 F10 N60
 """
-SIMPLIFY = "G90\nM82\nG28 ; home all axes\nG92 E0\nG1 E0.0 F540\nT0\n; layer 1, Z = 0.200\nG1 Z0.200 F1000\nG1 X1 Y0 F4800\nG1 E2 F540\nG92 E0\nG1 X11 Y0 E1.5 F1200\nT1\nG92 E0\nG1 X21 E1.5\n"
+SIMPLIFY = (
+    "G90\nM82\nG28 ; home all axes\nG92 E0\nG1 E0.0 F540\nT0\n; layer 1, Z = 0.200\nG1 Z0.200 F1000\nG1 X1 "
+    "Y0 F4800\nG1 E2 F540\nG92 E0\nG1 X11 Y0 E1.5 F1200\nT1\nG92 E0\nG1 X21 E1.5\n"
+)
 VALVE = "G21\nG90\nM751 P1\nG92 X0 Y0 Z0\nG0 X10 F900\nM760\nG1 X20\nG4 P50\nG1 Y10\nM761\nG0 Z50\n"
 
 
@@ -594,7 +607,7 @@ VALVE = "G21\nG90\nM751 P1\nG92 X0 Y0 Z0\nG0 X10 F900\nM760\nG1 X20\nG4 P50\nG1 
     ],
 )
 def test_programs_as_slicers_write_them(text, names, extruded):
-    found = parse(text)
-    assert found.refusals == []
-    assert [Kind(k).name for k in found.moves.kind] == names.split()
-    assert found.moves.e[found.moves.kind == Kind.EXTRUDE].sum() == pytest.approx(extruded, rel=1e-12)
+    program = parse(text)
+    assert program.refusals == []
+    assert [Kind(k).name for k in program.moves.kind] == names.split()
+    assert program.moves.e[program.moves.kind == Kind.EXTRUDE].sum() == pytest.approx(extruded, rel=1e-12)

@@ -20,9 +20,9 @@ def lookup(library, task, material, nozzle_mm, *, speed, pause_s):
 def handmade(material="A", speed=8.0, pause_s=0.6, level=2.0, noise=0.0):
     """A command as learning would end with, its edges known: Start from 0.4 s before to 0.2 s after, Corner
     0.3 s before to 0.2 s after, Stop 0.4 s and 0.3 s."""
-    lesson = protocol(speed, pause_s)
-    t, u = lesson.time_s, np.zeros(len(lesson.time_s))
-    a, (b, c), d = lesson.start_s, lesson.pause_s, lesson.stop_s
+    task = protocol(speed, pause_s)
+    t, u = task.time_s, np.zeros(len(task.time_s))
+    a, (b, c), d = task.start_s, task.pause_s, task.stop_s
     u[(t >= a) & (t < d)] = level * speed
     edge = 1e-9
     u[(t >= a - 0.4 - edge) & (t < a + 0.2 - edge)] = 12 * speed
@@ -32,7 +32,7 @@ def handmade(material="A", speed=8.0, pause_s=0.6, level=2.0, noise=0.0):
     u[(t >= d - 0.4 - edge) & (t < d + 0.3 - edge)] = -11 * speed
     rng = np.random.default_rng(0)
     u = u + noise * speed * rng.standard_normal((3, len(u)))
-    return Training(material, NOZZLE, lesson, u, np.tile(lesson.r, (3, 1)))
+    return Training(material, NOZZLE, task, u, np.tile(task.r, (3, 1)))
 
 
 # ---- segmentation
@@ -85,9 +85,9 @@ def test_the_segments_put_together_again_are_the_command():
     training = handmade()
     marks = demarcate([training], sample_time_s=TS)
     cut = {basis.task: basis for basis in segment(training, marks, sample_time_s=TS)}
-    u, lesson = np.zeros_like(training.r), training.routine
-    u[round(lesson.start_s / TS) : round(lesson.stop_s / TS)] = cut["Steady-State"].signal[0]
-    for task, event in (("Corner", lesson.pause_s[0]), ("Start", lesson.start_s), ("Stop", lesson.stop_s)):
+    u, routine = np.zeros_like(training.r), training.routine
+    u[round(routine.start_s / TS) : round(routine.stop_s / TS)] = cut["Steady-State"].signal[0]
+    for task, event in (("Corner", routine.pause_s[0]), ("Start", routine.start_s), ("Stop", routine.stop_s)):
         at = round(event / TS) - cut[task].lead
         u[at : at + len(cut[task].signal)] = cut[task].signal
     np.testing.assert_allclose(
@@ -97,14 +97,16 @@ def test_the_segments_put_together_again_are_the_command():
 
 
 def test_a_command_that_does_not_settle_is_refused():
-    expected = r"segment: the command of A at 8 mm/s with a pause of 0.6 s does not settle on its plateaus \(3 sigma .*\); lengthen the plateaus to 3 time constants"
+    expected = (
+        r"segment: the command of A at 8 mm/s with a pause of 0.6 s does not settle on its plateaus \(3 "
+        r"sigma .*\); lengthen the plateaus to 3 time constants"
+    )
     for on_s in (0.4, 0.6, 1.0):  # Start, Corner and Stop take a second and more
-        lesson = protocol(on_s=on_s)
-        u = compose(PLANT, lesson.r, sample_time_s=TS)
+        task = protocol(on_s=on_s)
+        u = compose(PLANT, task.r, sample_time_s=TS)
         with pytest.raises(ValueError, match=expected):
             demarcate(
-                [Training("A", NOZZLE, lesson, np.tile(u, (3, 1)), np.tile(lesson.r, (3, 1)))],
-                sample_time_s=TS,
+                [Training("A", NOZZLE, task, np.tile(u, (3, 1)), np.tile(task.r, (3, 1)))], sample_time_s=TS
             )
 
 
@@ -126,8 +128,8 @@ def test_the_learned_command_is_the_mean_of_the_best_trials():
 def test_what_was_trained_is_found_with_no_error():
     library = build([handmade(speed=s, pause_s=p) for s in (8.0, 5.0) for p in (0.6, 0.3)], sample_time_s=TS)
     for basis in library.columns:
-        found, factor, error = lookup(library, *basis[:3], speed=basis.speed, pause_s=basis.pause_s)
-        assert factor == 1.0 and error == 0.0 and found is basis
+        column, factor, error = lookup(library, *basis[:3], speed=basis.speed, pause_s=basis.pause_s)
+        assert factor == 1.0 and error == 0.0 and column is basis
 
 
 def test_a_speed_between_costs_nothing_on_a_linear_command_and_scales_it():
@@ -138,14 +140,14 @@ def test_a_speed_between_costs_nothing_on_a_linear_command_and_scales_it():
 
 def test_a_pause_that_was_not_trained_comes_with_its_predicted_error():
     library = build(trainings(PLANT), sample_time_s=TS)
-    found, _, error = lookup(library, "Corner", "A", NOZZLE, speed=8.0, pause_s=0.2)
-    assert found.pause_s == 0.3 and 10 < error < 60  # notes: an untrained pause costs 27-37 %
+    column, _, error = lookup(library, "Corner", "A", NOZZLE, speed=8.0, pause_s=0.2)
+    assert column.pause_s == 0.3 and 10 < error < 60  # notes: an untrained pause costs 27-37 %
 
 
 def test_a_corner_of_no_pause_is_the_steady_state():
     library = build([handmade()], sample_time_s=TS)
-    found, _, error = lookup(library, "Corner", "A", NOZZLE, speed=8.0, pause_s=0.0)
-    assert found.signal.tolist() == [pytest.approx(16.0)] and error == 0.0
+    column, _, error = lookup(library, "Corner", "A", NOZZLE, speed=8.0, pause_s=0.0)
+    assert column.signal.tolist() == [pytest.approx(16.0)] and error == 0.0
 
 
 def test_one_speed_cannot_predict_another():

@@ -71,11 +71,11 @@ def test_samples_follow_the_plan(program):
     signal = motion.sampled(plan, moves, sample_time_s=Ts)
     end = plan.begin_s[-1] + plan.duration_s[-1]
     assert 0 < end - signal.time_s[-1] <= Ts * (1 + 1e-9)
-    for amount, found in (
+    for amount, spent in (
         (moves.e, signal.e_rate),
         (moves.length, motion.rate(signal, moves.length, sample_time_s=Ts)),
     ):
-        assert found.sum() * Ts == pytest.approx(amount.sum(), rel=1e-12, abs=1e-12)
+        assert spent.sum() * Ts == pytest.approx(amount.sum(), rel=1e-12, abs=1e-12)
     mean = motion.rate(signal, moves.length, sample_time_s=Ts)
     # the mean speed over a sample lies within a Ts / 2 of the trapezoid's at
     # both ends, and more only where a ramp turns inside

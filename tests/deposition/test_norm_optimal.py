@@ -40,9 +40,9 @@ def test_the_banded_step_equals_the_dense_lifted_form(extruder):
     W, R_u, R_d, u, e = problem(400)
     G = lifted(extruder, 400)
     dense = np.linalg.solve(G.T @ (W[:, None] * G) + np.diag(R_u + R_d), G.T @ (W * e) - R_u * u)
-    found = step(plan(transfer(extruder, sample_time_s=TS), W=W, R_u=R_u, R_d=R_d), u, e)
+    banded = step(plan(transfer(extruder, sample_time_s=TS), W=W, R_u=R_u, R_d=R_d), u, e)
     np.testing.assert_allclose(
-        found, dense, atol=1e-9 * np.abs(dense).max()
+        banded, dense, atol=1e-9 * np.abs(dense).max()
     )  # rounding times a condition of about 1e5; the bar is 1e-6
 
 
@@ -60,18 +60,18 @@ def test_no_other_step_costs_less():
 
 def test_one_sample_by_hand():
     # G = [0.5], W = 2, R_u = 1, R_d = 0.5, e = 3, u = 1: (2 x 0.25 + 1.5) du = 0.5 x 2 x 3 - 1
-    found = plan(Transfer(np.array([1.0]), np.array([0.5]), 0), W=[2.0], R_u=[1.0], R_d=[0.5])
-    assert step(found, np.array([1.0]), np.array([3.0]))[0] == pytest.approx(1.0)
+    made = plan(Transfer(np.array([1.0]), np.array([0.5]), 0), W=[2.0], R_u=[1.0], R_d=[0.5])
+    assert step(made, np.array([1.0]), np.array([3.0]))[0] == pytest.approx(1.0)
 
 
 def test_memory_grows_with_the_length_and_not_with_its_square():
-    found = plan(
+    made = plan(
         transfer(PLANTS[1], sample_time_s=TS),
         W=np.ones(100_000),
         R_u=np.full(100_000, 1e-4),
         R_d=np.full(100_000, 1e-4),
     )
-    assert found.factor.shape == (2, 100_000)
+    assert made.factor.shape == (2, 100_000)
 
 
 def test_weights_that_leave_the_step_undetermined_are_refused():

@@ -16,28 +16,28 @@ def rates(x, pole):
 
 def test_a_flow_within_reach_is_its_own_nearest():
     x = np.sin(np.linspace(0, np.pi, 200)) ** 2
-    found = nearest(x, np.zeros(200, bool), pole=0.95, bound=2 * np.abs(rates(x, 0.95)).max())
-    np.testing.assert_allclose(found, x, atol=1e-5)  # the barrier's last weight
+    flow = nearest(x, np.zeros(200, bool), pole=0.95, bound=2 * np.abs(rates(x, 0.95)).max())
+    np.testing.assert_allclose(flow, x, atol=1e-5)  # the barrier's last weight
 
 
 def test_the_nearest_flow_is_within_reach_and_as_near_as_a_general_solver_gets():
     N, pole, bound = 120, 0.95, 0.08
     G = np.array([[pole ** (t - s) if t >= s else 0.0 for s in range(N)] for t in range(N)])
     best = scipy.optimize.lsq_linear(G, pulse(N), bounds=(-bound, bound), tol=1e-12)
-    found = nearest(pulse(N), np.zeros(N, bool), pole=pole, bound=bound)
-    assert np.abs(rates(found, pole)).max() <= bound
+    flow = nearest(pulse(N), np.zeros(N, bool), pole=pole, bound=bound)
+    assert np.abs(rates(flow, pole)).max() <= bound
     # the barrier stops within 2 N 1e-7 bound^2 of the least cost
-    assert np.sum((found - pulse(N)) ** 2) / 2 <= best.cost + 2 * N * 1e-7
+    assert np.sum((flow - pulse(N)) ** 2) / 2 <= best.cost + 2 * N * 1e-7
 
 
 def test_where_no_flow_is_wanted_only_what_lies_above_costs():
     free = pulse(120) == 0
     # a target before the pulse that cannot be followed: tied to it, x lies above it half of the time
     target = np.where(free, 0.2 * np.sin(np.arange(120.0)), 1.0)
-    found, tied = (nearest(target, mask, pole=0.95, bound=0.08) for mask in (free, np.zeros(120, bool)))
+    flow, tied = (nearest(target, mask, pole=0.95, bound=0.08) for mask in (free, np.zeros(120, bool)))
 
     def cost(x):
         return np.sum(np.where(free, np.maximum(x - target, 0.0), x - target) ** 2)
 
-    assert cost(found) < 0.999 * cost(tied)
-    assert np.abs(rates(found, 0.95)).max() <= 0.08
+    assert cost(flow) < 0.999 * cost(tied)
+    assert np.abs(rates(flow, 0.95)).max() <= 0.08

@@ -40,16 +40,16 @@ def summed_width(frame: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("width", [12.0, 60.1, 110.33, 300.0])
 def test_the_bead_is_as_wide_as_asked_for_on_average_over_the_columns(width):
     camera = Camera(CLEAN, np.random.default_rng(1))
-    found = np.mean([summed_width(camera.frame(width, stage_px=0)) for _ in range(5)])
-    assert found == pytest.approx(
+    measured = np.mean([summed_width(camera.frame(width, stage_px=0)) for _ in range(5)])
+    assert measured == pytest.approx(
         width, abs=0.03
     )  # dither of a quarter of a pixel over 3,200 columns, levels in whole numbers
 
 
 def test_a_tilted_bead_is_as_wide_across_its_line():
     camera = Camera(CLEAN._replace(tilt_deg=2.0), np.random.default_rng(1))
-    found = summed_width(camera.frame(110.0, stage_px=0)).mean() * np.cos(np.radians(2.0))
-    assert found == pytest.approx(110.0, abs=0.05)
+    measured = summed_width(camera.frame(110.0, stage_px=0)).mean() * np.cos(np.radians(2.0))
+    assert measured == pytest.approx(110.0, abs=0.05)
 
 
 def test_the_volume_on_the_stage_is_the_volume_that_flowed():

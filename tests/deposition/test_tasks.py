@@ -107,8 +107,8 @@ def test_the_rules_are_those_of_figure_8():
 
 
 def test_figure_9_is_the_papers_sequence():
-    found = tasks_of((PARTS / "fig9.gcode").read_text())
-    assert found.task.tolist() == [
+    tasks = tasks_of((PARTS / "fig9.gcode").read_text())
+    assert tasks.task.tolist() == [
         "No-Flow",
         "Start",
         "Steady-State",
@@ -119,16 +119,16 @@ def test_figure_9_is_the_papers_sequence():
         "Stop",
         "No-Flow",
     ]
-    assert found.line[1] == 9  # the first printed line of the file
+    assert tasks.line[1] == 9  # the first printed line of the file
 
 
 def test_tic_tac_toe_is_eight_runs_with_one_change_of_material_between_a_stop_and_a_start():
-    found = tasks_of((PARTS / "tic_tac_toe.gcode").read_text())
-    assert np.sum(found.task == "Start") == 8
-    k = int(np.flatnonzero(found.task == DWELL)[0])
-    assert found.task[k - 1 : k + 2].tolist() == ["Stop", DWELL, "Start"]
-    assert found.tool[k - 1 : k + 2].tolist() == [0, 0, 1]
-    assert np.sum(found.task == "Corner") == 0  # the two halves of the circle join smoothly
+    tasks = tasks_of((PARTS / "tic_tac_toe.gcode").read_text())
+    assert np.sum(tasks.task == "Start") == 8
+    k = int(np.flatnonzero(tasks.task == DWELL)[0])
+    assert tasks.task[k - 1 : k + 2].tolist() == ["Stop", DWELL, "Start"]
+    assert tasks.tool[k - 1 : k + 2].tolist() == [0, 0, 1]
+    assert np.sum(tasks.task == "Corner") == 0  # the two halves of the circle join smoothly
 
 
 def test_dashes_are_twelve_runs_of_0_4_s():
@@ -178,7 +178,10 @@ def test_a_retract_in_place_is_no_stop_and_a_travel_is():
 
 def test_a_change_of_material_without_time_to_stop_is_refused_with_its_line():
     text = HEAD + "G1 X20 Y0 E1\nT1\nG1 X30 Y0 E1\nG0 X0 Y0"
-    expected = r"line 7: T1 comes 0\.00 s after line 6 still printed with T0, so Steady-State would go to No-Flow without a Stop; .* write G4 P1000 at the change"
+    expected = (
+        r"line 7: T1 comes 0\.00 s after line 6 still printed with T0, so Steady-State would go to No-Flow "
+        r"without a Stop; .* write G4 P1000 at the change"
+    )
     with pytest.raises(ValueError, match=expected):
         tasks_of(text)
     with pytest.raises(
@@ -191,7 +194,10 @@ def test_a_change_of_material_without_time_to_stop_is_refused_with_its_line():
 def test_a_halt_of_the_machine_in_the_middle_of_a_run_is_refused_with_its_line():
     with pytest.raises(
         ValueError,
-        match=r"line 7: the machine halts here while line 6 still prints, .* end the line with a travel before the halt",
+        match=(
+            r"line 7: the machine halts here while line 6 still prints, .* end the line with a travel "
+            r"before the halt"
+        ),
     ):
         tasks_of(HEAD + "G1 X20 Y0 E1\nM600\nG1 X30 Y0 E1\nG0 X0 Y0")
     tasks_of(HEAD + "G1 X20 Y0 E1\nG0 X25 Y0\nM600\nG1 X30 Y0 E1\nG0 X0 Y0")

@@ -21,6 +21,7 @@ from pipeline.deposition.workflow.trial_files import (
     POSITION,
     SPEED,
     Conditions,
+    Signals,
     Trial,
     read_trial,
     write_command,
@@ -35,7 +36,7 @@ CONDITIONS = Conditions(
     material="A",
     nozzle="0.6 mm",
     trial=3,
-    law="ours",
+    law="model_inverse",
     speed_mm_per_s=8.0,
     pause_s=0.6,
     bead_area_mm2=0.304,
@@ -69,9 +70,9 @@ def pictures(count: int = 60, **kind):
 
 
 def written(path: Path, encoding: str = "raw", frames=None, **changes) -> Path:
-    write_trial(
-        path, CONDITIONS, pictures() if frames is None else frames, encoding=encoding, **(SIGNALS | changes)
-    )
+    conditions = changes.pop("conditions", CONDITIONS)
+    signals = Signals(**(SIGNALS | changes))
+    write_trial(path, conditions, pictures() if frames is None else frames, signals, encoding=encoding)
     return path
 
 
@@ -308,8 +309,8 @@ def test_a_machines_own_topics_units_and_calendar_are_read_by_the_mapping(tmp_pa
     )  # a double of 1.7e9 s has steps of 0.24 us
     np.testing.assert_allclose(trial.frames.time_s, np.arange(20) / 10 + 0.001, atol=1e-6)
     assert [note.kind for note in trial.notes] == ["clock", "outside", "conditions"]
-    for (_, found), frame in zip(trial.frames, frames, strict=True):
-        np.testing.assert_array_equal(found, frame)
+    for (_, read_back), frame in zip(trial.frames, frames, strict=True):
+        np.testing.assert_array_equal(read_back, frame)
 
 
 def test_a_machines_clock_may_be_the_time_of_publishing(tmp_path):
@@ -338,7 +339,10 @@ def test_a_topic_whose_recorder_was_restarted_gives_the_frames_of_both_channels(
 def test_frames_and_command_without_a_common_time_are_refused_with_both_ranges(tmp_path):
     with pytest.raises(
         ValueError,
-        match=r"the frames run from 5.000 to 6.967 s but signals from 0.000 to 1.980 s, so they do not overlap in time; record both",
+        match=(
+            r"the frames run from 5.000 to 6.967 s but signals from 0.000 to 1.980 s, so they do not "
+            r"overlap in time; record both"
+        ),
     ):
         written(tmp_path / "trial.mcap", frames=((time + 5, frame) for time, frame in pictures()))
     assert list(tmp_path.iterdir()) == []
@@ -377,17 +381,17 @@ def test_a_recording_without_images_or_command_is_refused_with_what_it_has(tmp_p
     camera = made.topic("/camera", "cdr", "sensor_msgs/msg/Image", "ros2msg", b"uint8 unused")
     made.message(camera, 0.0, image_at(0, picture(0))[2])
     path.write_bytes(made.bytes())
-    found = refusal(path)
-    assert "no message has a number '/gantry:position_mm'" in found
-    assert "map position_mm to the topic that has it" in found
+    message = refusal(path)
+    assert "no message has a number '/gantry:position_mm'" in message
+    assert "map position_mm to the topic that has it" in message
     written(path)
     sources = [POSITION, SPEED, COMMAND._replace(source="/plunger:displacement"), FLOW]
-    found = refusal(path, sources=sources)
+    message = refusal(path, sources=sources)
     assert (
         "no message has a number '/plunger:displacement'; the nearest names are /plunger:displacement_mm"
-        in found
+        in message
     )
-    assert "map command_mm to" in found
+    assert "map command_mm to" in message
     assert "the mapping should give command_mm one source" in refusal(path, sources=[POSITION, SPEED])
     assert (
         "there is no topic /camera with images; it has /gantry (beadline_msgs/msg/Gantry in cdr)"
@@ -428,10 +432,10 @@ def test_frames_of_changing_size_are_refused_in_writing_and_in_reading(tmp_path)
             [image_at(0, picture(k, height=24 if k == 12 else 48)) for k in range(20)], start_s=0.0
         )
     )
-    found = refusal(path, sources=MAPPED)
+    message = refusal(path, sources=MAPPED)
     assert (
         "the frame of /camera at 1.201 s is 64 x 24 px of 8 bits but the first is 64 x 48 px of 8; "
-        "record a trial at one size" in found
+        "record a trial at one size" in message
     )
 
 
@@ -444,8 +448,8 @@ def test_frames_that_cannot_be_decoded_are_left_out_and_counted_until_they_are_t
     path = tmp_path / "machine.mcap"
     path.write_bytes(machine_recording(frames, start_s=0.0))
     trial = opened(path, sources=MAPPED, time=clock)
-    found = [frame for _, frame in trial.frames]
-    np.testing.assert_array_equal(found, [picture(k) for k in range(20) if k not in (3, 11)])
+    pictures = [frame for _, frame in trial.frames]
+    np.testing.assert_array_equal(pictures, [picture(k) for k in range(20) if k not in (3, 11)])
     assert trial.frames.unreadable == 2
     (note,) = trial.frames.notes()
     assert note.message.startswith("2 of 20 frames of /camera cannot be decoded, the first at 0.30")
@@ -457,14 +461,14 @@ def test_frames_that_cannot_be_decoded_are_left_out_and_counted_until_they_are_t
 
 def test_a_jpeg_that_is_cut_off_is_no_frame(tmp_path):
     data = cv2.imencode(".jpg", picture(0))[1]
-    whole, cut = (
+    intact_bytes, cut = (
         image_messages.compressed_image(image_messages.header(0, "cam"), "jpeg", part)
         for part in (data, data[:-200])
     )
     path = tmp_path / "machine.mcap"
     path.write_bytes(
         machine_recording(
-            [("cdr", "sensor_msgs/msg/CompressedImage", cut if k == 5 else whole) for k in range(20)],
+            [("cdr", "sensor_msgs/msg/CompressedImage", cut if k == 5 else intact_bytes) for k in range(20)],
             start_s=0.0,
         )
     )
@@ -474,7 +478,7 @@ def test_a_jpeg_that_is_cut_off_is_no_frame(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"command_mm": np.where(TIME == TIME[7], np.nan, 0.0)},
         "command_mm is not finite at sample 7; leave that sample out"),
@@ -493,10 +497,10 @@ def test_a_jpeg_that_is_cut_off_is_no_frame(tmp_path):
         ({"encoding": "gif"}, "the encoding should be jpeg, png or raw but is 'gif'; name one of them"),
     ],
 )  # fmt: skip
-def test_what_is_not_a_trial_is_not_written_and_the_last_good_one_stays(tmp_path, changes, said):
+def test_what_is_not_a_trial_is_not_written_and_the_last_good_one_stays(tmp_path, changes, message):
     path = tmp_path / "trial.mcap"
     path.write_bytes(b"the last good one")
-    with pytest.raises(ValueError, match=f"trial.mcap: {said}"):
+    with pytest.raises(ValueError, match=f"trial.mcap: {message}"):
         written(path, **changes)
     assert [(file.name, file.read_bytes()) for file in tmp_path.iterdir()] == [
         ("trial.mcap", b"the last good one")
@@ -547,7 +551,8 @@ def intact(trial: Trial) -> int:
     time, command = trial.signals["command_mm"]
     np.testing.assert_array_equal(command, SIGNALS["command_mm"][np.rint(time * 50).astype(int)])
     count = 0
-    for count, (time, frame) in enumerate(trial.frames, 1):
+    for time, frame in trial.frames:
+        count += 1
         assert zlib.crc32(frame) == zlib.crc32(picture(round(time * 7), 480, 640))
     return count
 
@@ -643,12 +648,12 @@ def test_a_chunk_of_frames_alone_that_is_lost_leaves_the_signals_whole(tmp_path)
 def test_conditions_of_another_version_or_with_a_gap_are_refused(tmp_path):
     pairs = {"schema_version": "1"} | {name: str(value) for name, value in CONDITIONS._asdict().items()}
     assert trial_files._conditions(tmp_path, pairs, []) == CONDITIONS
-    for change, said in [
+    for change, message in [
         ({"schema_version": "2"}, "have version 2 but 1 is read"),
         ({"pause_s": "short"}, "could not convert string to float: 'short'"),
         ({"crc32": "00000000"}, "say 00000000, so they are damaged"),
     ]:
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             trial_files._conditions(tmp_path, pairs | change, [])
     with pytest.raises(ValueError, match="the trial's conditions lack pause_s"):
         trial_files._conditions(

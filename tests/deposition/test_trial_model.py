@@ -35,11 +35,11 @@ def asymmetric(u, slower):
 
 
 def test_without_noise_the_four_parameters_are_found():
-    found = identify([U], [flow(TRUE, U, sample_time_s=TS)], sample_time_s=TS)
+    model = identify([U], [flow(TRUE, U, sample_time_s=TS)], sample_time_s=TS)
     np.testing.assert_allclose(
-        parameters(found.extruder), parameters(TRUE), rtol=1e-4
+        parameters(model.extruder), parameters(TRUE), rtol=1e-4
     )  # the solver stops at 1e-7 of the cost
-    assert found.fit_percent > 99.9
+    assert model.fit_percent > 99.9
 
 
 @pytest.mark.parametrize(
@@ -48,9 +48,9 @@ def test_without_noise_the_four_parameters_are_found():
 def test_no_guess_is_needed_for_any_material(gain, time_constant_s, delay_s):
     true = Extruder(gain, time_constant_s, delay_s, yield_=0.1)
     u = R / gain
-    found = identify([u], [flow(true, u, sample_time_s=TS)], sample_time_s=TS)
+    model = identify([u], [flow(true, u, sample_time_s=TS)], sample_time_s=TS)
     np.testing.assert_allclose(
-        parameters(found.extruder), parameters(true), rtol=1e-3, atol=1e-4
+        parameters(model.extruder), parameters(true), rtol=1e-3, atol=1e-4
     )  # the solver's stop; a delay at its bound
 
 
@@ -86,16 +86,16 @@ def test_a_second_trial_halves_the_variance():
 def test_samples_that_were_not_observable_are_left_out():
     y = flow(TRUE, U, sample_time_s=TS)
     y[500:560] = np.nan
-    found = identify([U], [y], sample_time_s=TS)
-    np.testing.assert_allclose(parameters(found.extruder), parameters(TRUE), rtol=1e-4)  # the solver's stop
+    model = identify([U], [y], sample_time_s=TS)
+    np.testing.assert_allclose(parameters(model.extruder), parameters(TRUE), rtol=1e-4)  # the solver's stop
 
 
 def test_a_spiky_learned_command_does_not_hide_the_yield():
     u = U + 20 * np.diff(U, prepend=0.0) / TS * 0.1
-    found = identify(
+    model = identify(
         [U, u], [flow(TRUE, U, sample_time_s=TS), flow(TRUE, u, sample_time_s=TS)], sample_time_s=TS
     )
-    np.testing.assert_allclose(parameters(found.extruder), parameters(TRUE), rtol=1e-4)  # the solver's stop
+    np.testing.assert_allclose(parameters(model.extruder), parameters(TRUE), rtol=1e-4)  # the solver's stop
 
 
 def test_an_extruder_that_relaxes_slowly_shows_in_the_downward_step():

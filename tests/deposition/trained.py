@@ -1,4 +1,4 @@
-"""One plant of the family, trained by our law on two speeds and two pauses,
+"""One plant of the family, trained by the model inverse on two speeds and two pauses,
 for the tests of what is made of learned trials."""
 
 import functools
@@ -14,6 +14,7 @@ TS, AREA, NOZZLE, RAMP = 0.02, 0.304, 0.6, 0.15
 NOMINAL = Extruder(1.08, 2.7)
 PLANT = Extruder(0.92, 3.2, delay_s=0.113, lag_hz=4.3, play=0.06, yield_=0.15)
 CREEPING = PLANT._replace(creep_share=0.12)
+INVERSE = ilc.InverseSettings(identify_trials=3, floor=0.1, order=4, cutoff_hz=5.0)
 SPEEDS, PAUSES = (8.0, 5.0), (0.6, 0.3)
 
 
@@ -35,11 +36,9 @@ def trainings(plant: Extruder, material: str = "A", updates: int = 12) -> tuple[
     rng, out = np.random.default_rng(5), []
     for speed in SPEEDS:
         for pause in PAUSES:
-            lesson = protocol(speed, pause, on_s=11)
-            steady_flow = float(lesson.r.max())
-            law = ilc.InverseLaw(
-                lesson.r, identify_trials=3, floor=0.1, order=4, cutoff_hz=5.0, limit=np.inf, sample_time_s=TS
-            )
+            training_routine = protocol(speed, pause, on_s=11)
+            steady_flow = float(training_routine.r.max())
+            law = ilc.InverseLaw(training_routine.r, INVERSE, limit=np.inf, sample_time_s=TS)
 
             def measure(u, steady_flow=steady_flow):
                 y = flow(plant, u, sample_time_s=TS)
@@ -47,17 +46,23 @@ def trainings(plant: Extruder, material: str = "A", updates: int = 12) -> tuple[
                     u, disturb(y, rng, steady_flow=steady_flow, white=0.03, drift=0.01, gain=0.01), y
                 )
 
-            trials = ilc.learn(law, measure, lesson.r / NOMINAL.gain, lesson.r, trials=updates, rise=0.1)
+            trials = ilc.learn(
+                law, measure, training_routine.r / NOMINAL.gain, training_routine.r, trials=updates, rise=0.1
+            )
             out.append(
                 Training(
-                    material, NOZZLE, lesson, np.array([t.u for t in trials]), np.array([t.y for t in trials])
+                    material,
+                    NOZZLE,
+                    training_routine,
+                    np.array([t.u for t in trials]),
+                    np.array([t.y for t in trials]),
                 )
             )
     return tuple(out)
 
 
 @functools.cache
-def known(plant: Extruder) -> Learned:
+def learned(plant: Extruder) -> Learned:
     """What was learned of the plant as material A, and the same under the name of B."""
     made = learn(trainings(plant), sample_time_s=TS)
     columns = made.library.columns + tuple(basis._replace(material="B") for basis in made.library.columns)

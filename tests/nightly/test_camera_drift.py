@@ -10,7 +10,7 @@ from pipeline.nightly import camera_drift
 LIMITS = {"moved_px": 2.0, "contrast_percent": 15.0}
 
 
-def night(seed: int, **changes) -> camera_drift.Seen:
+def night(seed: int, **changes) -> camera_drift.FrameStats:
     """25 frames of a bead between 100 and 116 px wide, as the ink lies that night."""
     rng = np.random.default_rng(seed)
     camera = rendering.Camera(rendering.NOMINAL._replace(**changes), rng)
@@ -20,7 +20,7 @@ def night(seed: int, **changes) -> camera_drift.Seen:
 
 
 @pytest.fixture(scope="module")
-def good() -> list[camera_drift.Seen]:
+def good() -> list[camera_drift.FrameStats]:
     return [night(k) for k in range(4)]
 
 

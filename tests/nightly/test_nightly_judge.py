@@ -8,7 +8,7 @@ import yaml
 
 from pipeline.deposition.workflow.tables import SCORES
 from pipeline.nightly import judge
-from pipeline.nightly.decision import KEPT, PROMOTED, decide
+from pipeline.nightly.decision import KEPT, PROMOTED, Evidence, decide
 from pipeline.nightly.settings import Loop, Nightly
 from pipeline.setpoint.workflow import tables
 from pipeline.store import artifacts, params
@@ -146,3 +146,38 @@ def test_a_file_of_cases_that_lacks_its_costs_is_refused(project):
         match="expected panel, cases with block and cost, and guards with value and allowed, found no 'cost'",
     ):
         judge.judge(loop, project).measure(Path("datasets"))
+
+
+@pytest.mark.parametrize("loop", ["deposition", "setpoint"])
+def test_a_guard_may_be_worse_by_the_percentage_that_is_declared_and_no_more(project, loop):
+    """5 % of 2.0 is 0.1: 2.1 passes and 2.11 does not."""
+    settings = project.model_copy(
+        update={"rule": project.rule.model_copy(update={"worst_case_percent": 5.0})}
+    )
+    judged = judge.judge(Loop(artifacts=["x"], judge=loop, cases="", recordings=""), settings)
+    champion = Evidence("a", {f"part {k}": (f"part {k}", 2.0) for k in range(8)}, {"worst": 2.0})
+    allowed = judged.allowed(champion)
+    assert allowed == {"worst": pytest.approx(0.1)}
+    better = champion._replace(cases={name: (block, 1.0) for name, (block, _) in champion.cases.items()})
+    for guard, decision in ((2.1, PROMOTED), (2.11, KEPT)):
+        decided = decide(
+            champion,
+            better._replace(guards={"worst": guard}),
+            project.rule,
+            allowed=allowed,
+            alarms=[],
+            seed=1,
+        )
+        assert decided.decision == decision, decided.reasons
+
+
+def test_the_temperature_loop_allows_its_worst_case_and_its_hold_out_a_percentage(project):
+    rule = project.rule.model_copy(update={"worst_case_percent": 5.0, "holdout_error_percent": 10.0})
+    settings = project.model_copy(update={"rule": rule})
+    champion = Evidence("a", {}, {"worst_case": 40.0, "holdout_error_degC": 0.5})
+    allowed = judge.judge(project.loops["temperature"], settings).allowed(champion)
+    assert allowed == {
+        "worst_case": pytest.approx(2.0),
+        "settled_error_degC": rule.settled_error_degC,
+        "holdout_error_degC": pytest.approx(0.05),
+    }

@@ -8,8 +8,10 @@ import pytest
 
 from pipeline.deposition.workflow.tables import SCORES
 from pipeline.nightly import accepting, champion, inputs, night, screening, watch
+from pipeline.nightly.settings import Nightly
+from pipeline.report.shared.night import read
 from pipeline.setpoint.workflow import tables
-from pipeline.store import artifacts
+from pipeline.store import artifacts, params
 from tests.nightly.toy_nights import Project, entered
 
 LOOPS = {
@@ -58,8 +60,14 @@ def setpoint(cost: float, guard: float) -> None:
         else np.ones(10)
         for c in tables.SCOREBOARD.columns
     }
-    named = {"controller": [r[0] for r in rows], "simulator": ["paper"] * 10, "case": [r[1] for r in rows], "counts": [r[2] for r in rows],
-             "settled_percent": [r[3] for r in rows], "p90_steps": [guard] * 8 + [99.0] * 2}  # fmt: skip
+    named = {
+        "controller": [r[0] for r in rows],
+        "simulator": ["paper"] * 10,
+        "case": [r[1] for r in rows],
+        "counts": [r[2] for r in rows],
+        "settled_percent": [r[3] for r in rows],
+        "p90_steps": [guard] * 8 + [99.0] * 2,
+    }
     artifacts.write_table("datasets/evaluate_setpoint/scoreboard.parquet", tables.SCOREBOARD, filler | named)
     artifacts.write_json("datasets/evaluate_setpoint/choice.json", {"name": "ours"})
 
@@ -122,7 +130,7 @@ def test_a_recording_that_cannot_be_read_is_set_aside_and_the_scheduler_is_told(
 
 
 def test_the_gravest_of_a_night_is_its_exit_status():
-    aside, alarm = {"quarantined": {"a": "b"}}, {"drift": {"alarms": [{"cause": "c"}]}}
+    aside, alarm = {"quarantined": {"a": "b"}}, {"drift": read({"alarms": [{"loop": "toy", "cause": "c"}]})}
     found = [
         night._status({"outcome": "kept"} | more)
         for more in ({}, aside, aside | alarm, aside | alarm | {"outcome": "failed"}, {"unpushed": True})
@@ -169,3 +177,33 @@ def test_drift_that_is_meant_is_accepted_by_hand_and_the_champion_stays(project,
     line = champion.read()["history"][-1]
     assert (line["event"], line["why"], line["run"]) == ("drift accepted", "a new camera", "night-0001")
     assert not any(entry.endswith(("champion.json", ".dvc")) for entry in project.dirty())
+
+
+def test_an_alarm_of_the_setpoint_camera_changes_nothing_for_another_loop(project, monkeypatch):
+    both = {
+        loop: {"judge": loop, "cases": "", "recordings": "", "artifacts": LOOPS[loop]}
+        for loop in ("deposition", "setpoint")
+    }
+    project.set(loops=both)
+    monkeypatch.setattr(night, "_reproduce", lambda *_: (deposition(10.0, 2.0), setpoint(10.0, 2.0)))
+    assert night.nightly()[0] == night.OK
+    raised = {"loop": "setpoint", "cause": "the line stands out by 25 gray levels", "sigmas": 9.0}
+    memory = {"alarms": [raised], "pending": [], "drifted": {"setpoint": ["print_8.csv"]}, "night": 1}
+    artifacts.write_json(watch.LAST, watch.last() | {"drift": memory})
+    monkeypatch.setattr(night, "_reproduce", lambda *_: (deposition(5.0, 2.0), setpoint(5.0, 2.0)))
+    Path("learn.py").write_text("# something is new\n")
+    status, summary = night.nightly()
+    entry = night.nights()[-1]
+    # the camera's loop keeps its champion, the other one is promoted as on any night
+    assert status == night.DRIFTED and entry["promoted"] == ["deposition"], summary
+    assert not any("drift" in reason for reason in entry["decisions"]["deposition"]["reasons"])
+    assert "drift: the line stands out" in " ".join(entry["decisions"]["setpoint"]["reasons"])
+    html = Path("reports/nightly.html").read_text()
+    assert "Drift of setpoint; promoted: deposition." in html and "--accept-drift setpoint" in html
+    assert "machine has drifted" not in html and "--accept-drift deposition" not in html
+
+
+def test_a_loop_is_named_after_its_judge_so_that_no_alarm_is_read_as_another_s(project):
+    project.set(loops={"nozzle": {"judge": "setpoint", "cases": "", "recordings": "", "artifacts": ["a"]}})
+    with pytest.raises(ValueError, match="has loop nozzle with judge setpoint; name the loop setpoint"):
+        params.load(Nightly, "nightly")

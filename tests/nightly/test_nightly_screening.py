@@ -10,6 +10,7 @@ import yaml
 from benchmarks import nights
 from pipeline.nightly import inputs, screening
 from pipeline.nightly.settings import Nightly
+from pipeline.report.shared.night import alarm_of
 from pipeline.store import artifacts, params
 from pipeline.temperature import identification, plant
 
@@ -32,7 +33,11 @@ def commissioned(folder, loop):
             for kind in ("heater", "sensor")
         )
         model = identification.identify(
-            u, y, sample_time_s=1.0, max_order=3, names=["heater_1", "heater_2"]
+            u,
+            y,
+            sample_time_s=1.0,
+            settings=identification.Settings(max_order=3),
+            names=["heater_1", "heater_2"],
         ).plant
         champion = Path("champion/temperature")
         artifacts.write_arrays(champion / "identify_plant/plant.parquet", "plant", 1, plant.stored([model]))
@@ -81,7 +86,7 @@ def look(made, monkeypatch):
 def test_a_good_shift_raises_nothing(look):
     for k in range(5):
         found = look(nights.a_night(1, 100 + k))
-        assert found["alarms"] == [] and found["quarantined"] == {}, found
+        assert found.drift.alarms == [] and found.drift.quarantined == {}, found
 
 
 @pytest.mark.parametrize(
@@ -96,10 +101,10 @@ def test_ten_percent_of_drift_is_named_within_two_nights(look, changes, words):
     memory = {}
     for k in (200, 201):
         found = look(nights.a_night(1, k, **changes), memory)
-        memory = found["memory"]
-        if found["alarms"]:
+        memory = found.memory
+        if found.drift.alarms:
             break
-    assert any(words in alarm["cause"] for alarm in found["alarms"]), found["alarms"]
+    assert any(words in alarm.cause for alarm in found.drift.alarms), found.drift.alarms
 
 
 @pytest.mark.parametrize(
@@ -123,15 +128,15 @@ def test_a_loop_that_settles_elsewhere_works_harder_or_saturates_is_found_within
     memory = {}
     for k in (250, 251):
         found = screened(nights.a_night(1, k, **changes), memory)
-        memory = found["memory"]
-        if any(alarm["cause"].startswith(words) for alarm in found["alarms"]):
+        memory = found.memory
+        if any(alarm.cause.startswith(words) for alarm in found.drift.alarms):
             break
-    assert any(alarm["cause"].startswith(words) for alarm in found["alarms"]), (
-        found["alarms"],
-        found["watched"],
+    assert any(alarm.cause.startswith(words) for alarm in found.drift.alarms), (
+        found.drift.alarms,
+        found.drift.watched,
     )
     # the plant has not changed
-    assert not any("gain" in alarm["cause"] or "time constant" in alarm["cause"] for alarm in found["alarms"])
+    assert not any("gain" in alarm.cause or "time constant" in alarm.cause for alarm in found.drift.alarms)
 
 
 def test_good_shifts_of_production_raise_nothing(calm, monkeypatch):
@@ -139,20 +144,21 @@ def test_good_shifts_of_production_raise_nothing(calm, monkeypatch):
     for k in range(5):
         found = screened(nights.a_night(1, 400 + k, loop=CALM))
         assert (
-            found["alarms"] == [] and "sensor_1 offset_degC" in found["figures"][str(NEW)]["closed_loop"]
+            found.drift.alarms == []
+            and "sensor_1 offset_degC" in found.drift.figures[str(NEW)]["closed_loop"]
         ), found
 
 
 def test_swapped_sensors_are_set_aside_with_the_reason_beside_them(look):
     good = nights.a_night(1, 300)
     found = look(good | {"sensor_1": good["sensor_2"], "sensor_2": good["sensor_1"]})
-    assert "the sensors sensor_1 and sensor_2 are swapped" in found["quarantined"][str(NEW)]
+    assert "the sensors sensor_1 and sensor_2 are swapped" in found.drift.quarantined[str(NEW)]
     assert (inputs.QUARANTINE / "temperature/new.csv").exists()
     assert "swapped" in (inputs.QUARANTINE / "temperature/new.csv.reason.txt").read_text()
     # another of the same name does not take its place
     again = look(good | {"sensor_1": good["sensor_2"], "sensor_2": good["sensor_1"]})
     assert (
-        again["quarantined"]
+        again.drift.quarantined
         and (inputs.QUARANTINE / "temperature/new.2.csv").exists()
         and (inputs.QUARANTINE / "temperature/new.csv").exists()
     )
@@ -163,13 +169,15 @@ def test_a_night_without_recordings_keeps_the_alarm_of_the_one_before(look):
     found = screening.look(
         params.load(Nightly, "nightly"), STATE, {"temperature": {}}, {"alarms": [alarm]}, night=9
     )
-    assert found["alarms"] == [alarm]
+    assert (
+        found.drift.of("temperature").alarms == [alarm_of(alarm)] and found.drift.of("setpoint").alarms == []
+    )
 
 
 def test_what_drifted_is_remembered_until_a_good_night_and_can_be_what_later_nights_are_held_against(look):
     found = look(nights.a_night(1, 200, gain=(0.9, 1.0)))
-    assert found["alarms"] and found["memory"]["drifted"] == {"temperature": [str(NEW)]}
-    assert look(nights.a_night(1, 101), found["memory"])["memory"]["drifted"] == {"temperature": []}
+    assert found.drift.alarms and found.memory["drifted"] == {"temperature": [str(NEW)]}
+    assert look(nights.a_night(1, 101), found.memory).memory["drifted"] == {"temperature": []}
     # held against one drifted shift alone, another one like it is no news, and a shift as before is
     folder, loop = Path("champion/temperature"), params.load(Nightly, "nightly").loops["temperature"]
     before = artifacts.read_json(folder / screening.REFERENCE)
@@ -178,8 +186,8 @@ def test_what_drifted_is_remembered_until_a_good_night_and_can_be_what_later_nig
         artifacts.write_json(
             folder / screening.REFERENCE, screening.reference(loop, folder, only=[str(RAW / "drifted.csv")])
         )
-        assert look(nights.a_night(1, 201, gain=(0.9, 1.0)))["alarms"] == []
-        assert "gain from heater_1 has changed by +1" in look(nights.a_night(1, 101))["alarms"][0]["cause"]
+        assert look(nights.a_night(1, 201, gain=(0.9, 1.0))).drift.alarms == []
+        assert "gain from heater_1 has changed by +1" in look(nights.a_night(1, 101)).drift.alarms[0].cause
     finally:
         artifacts.write_json(folder / screening.REFERENCE, before)
         (RAW / "drifted.csv").unlink()

@@ -88,7 +88,8 @@ class Project:
     def __init__(self, folder: Path):
         self.folder = folder
         folder.mkdir(parents=True, exist_ok=True)
-        self.env = {key: value for key, value in os.environ.items() if not key.startswith(("GIT_", "DVC_", "BEADLINE_"))} | {
+        ours = ("GIT_", "DVC_", "BEADLINE_")
+        self.env = {key: value for key, value in os.environ.items() if not key.startswith(ours)} | {
             "PYTHONPATH": str(ROOT), "DVC_NO_ANALYTICS": "1", "GIT_CONFIG_GLOBAL": "/dev/null",
             "GIT_CONFIG_SYSTEM": "/dev/null",
             "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",

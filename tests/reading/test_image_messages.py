@@ -17,27 +17,42 @@ from tests.mcap_writing import cdr
 # A picture of 2 rows, [1 2 3] and [4 5 6], each with a byte of padding, taken at 7.000000500 s by "cam"; and
 # PNGDATA as format "png" of the same camera.
 # rosbags 0.11: serialize_ros1 (counter 9), serialize_cdr in both byte orders
-ROS1 = "0900000007000000f40100000300000063616d0200000003000000050000006d6f6e6f380004000000080000000102030004050600"
+ROS1 = (
+    "0900000007000000f40100000300000063616d0200000003000000050000006d6f6e6f38000400000008000000010203000405"
+    "0600"
+)
 ROS1_COMPRESSED = "0900000007000000f40100000300000063616d03000000706e6707000000504e4744415441"
-CDR = "0001000007000000f40100000400000063616d000200000003000000060000006d6f6e6f3800000004000000080000000102030004050600"
-CDR_BIG = "0000000000000007000001f40000000463616d000000000200000003000000066d6f6e6f3800000000000004000000080102030004050600"
+CDR = (
+    "0001000007000000f40100000400000063616d000200000003000000060000006d6f6e6f380000000400000008000000010203"
+    "0004050600"
+)
+CDR_BIG = (
+    "0000000000000007000001f40000000463616d000000000200000003000000066d6f6e6f380000000000000400000008010203"
+    "0004050600"
+)
 CDR_COMPRESSED = "0001000007000000f40100000400000063616d0004000000706e670007000000504e4744415441"
 # foxglove-schemas-protobuf 0.3 and google.protobuf 7.36: the descriptor set and a message of each
 PROTOBUF = "0a05080710f40315030000001d0200000022056d6f6e6f382d04000000320801020300040506003a0363616d"
 PROTOBUF_COMPRESSED = "0a05080710f4031207504e47444154411a03706e67220363616d"
 TIMESTAMP_FILE = (
-    "Cv8BCh9nb29nbGUvcHJvdG9idWYvdGltZXN0YW1wLnByb3RvEg9nb29nbGUucHJvdG9idWYiOwoJVGltZXN0YW1wEhgKB3NlY29uZHMYASABKANSB3NlY29uZHMSFAoFbmFub3MYAiABKAVSBW5h"
-    "bm9zQoUBChNjb20uZ29vZ2xlLnByb3RvYnVmQg5UaW1lc3RhbXBQcm90b1ABWjJnb29nbGUuZ29sYW5nLm9yZy9wcm90b2J1Zi90eXBlcy9rbm93bi90aW1lc3RhbXBwYvgBAaICA0dQQqoCHkdv"
+    "Cv8BCh9nb29nbGUvcHJvdG9idWYvdGltZXN0YW1wLnByb3RvEg9nb29nbGUucHJvdG9idWYiOwoJVGltZXN0YW1wEhgKB3NlY2"
+    "9uZHMYASABKANSB3NlY29uZHMSFAoFbmFub3MYAiABKAVSBW5h"
+    "bm9zQoUBChNjb20uZ29vZ2xlLnByb3RvYnVmQg5UaW1lc3RhbXBQcm90b1ABWjJnb29nbGUuZ29sYW5nLm9yZy9wcm90b2J1Zi"
+    "90eXBlcy9rbm93bi90aW1lc3RhbXBwYvgBAaICA0dQQqoCHkdv"
     "b2dsZS5Qcm90b2J1Zi5XZWxsS25vd25UeXBlc2IGcHJvdG8z"
 )
 RAW_IMAGE_FILE = (
-    "CucBChdmb3hnbG92ZS9SYXdJbWFnZS5wcm90bxIIZm94Z2xvdmUaH2dvb2dsZS9wcm90b2J1Zi90aW1lc3RhbXAucHJvdG8imAEKCFJhd0ltYWdlEi0KCXRpbWVzdGFtcBgBIAEoCzIaLmdvb2ds"
-    "ZS5wcm90b2J1Zi5UaW1lc3RhbXASEAoIZnJhbWVfaWQYByABKAkSDQoFd2lkdGgYAiABKAcSDgoGaGVpZ2h0GAMgASgHEhAKCGVuY29kaW5nGAQgASgJEgwKBHN0ZXAYBSABKAcSDAoEZGF0YRgG"
+    "CucBChdmb3hnbG92ZS9SYXdJbWFnZS5wcm90bxIIZm94Z2xvdmUaH2dvb2dsZS9wcm90b2J1Zi90aW1lc3RhbXAucHJvdG8imA"
+    "EKCFJhd0ltYWdlEi0KCXRpbWVzdGFtcBgBIAEoCzIaLmdvb2ds"
+    "ZS5wcm90b2J1Zi5UaW1lc3RhbXASEAoIZnJhbWVfaWQYByABKAkSDQoFd2lkdGgYAiABKAcSDgoGaGVpZ2h0GAMgASgHEhAKCG"
+    "VuY29kaW5nGAQgASgJEgwKBHN0ZXAYBSABKAcSDAoEZGF0YRgG"
     "IAEoDGIGcHJvdG8z"
 )
 COMPRESSED_IMAGE_FILE = (
-    "CsUBCh5mb3hnbG92ZS9Db21wcmVzc2VkSW1hZ2UucHJvdG8SCGZveGdsb3ZlGh9nb29nbGUvcHJvdG9idWYvdGltZXN0YW1wLnByb3RvInAKD0NvbXByZXNzZWRJbWFnZRItCgl0aW1lc3RhbXAY"
-    "ASABKAsyGi5nb29nbGUucHJvdG9idWYuVGltZXN0YW1wEhAKCGZyYW1lX2lkGAQgASgJEgwKBGRhdGEYAiABKAwSDgoGZm9ybWF0GAMgASgJYgZwcm90bzM="
+    "CsUBCh5mb3hnbG92ZS9Db21wcmVzc2VkSW1hZ2UucHJvdG8SCGZveGdsb3ZlGh9nb29nbGUvcHJvdG9idWYvdGltZXN0YW1wLn"
+    "Byb3RvInAKD0NvbXByZXNzZWRJbWFnZRItCgl0aW1lc3RhbXAY"
+    "ASABKAsyGi5nb29nbGUucHJvdG9idWYuVGltZXN0YW1wEhAKCGZyYW1lX2lkGAQgASgJEgwKBGRhdGEYAiABKAwSDgoGZm9ybW"
+    "F0GAMgASgJYgZwcm90bzM="
 )
 STAMP = {"sec": 7, "nsec": 500}
 ROWS = base64.b64encode(bytes([1, 2, 3, 0, 4, 5, 6, 0])).decode()
@@ -186,7 +201,8 @@ def test_a_topic_of_text_is_no_image_topic_and_is_refused_by_its_type():
     assert not is_image(channel("protobuf", "sensor_msgs/msg/Image"))
     with pytest.raises(
         ValueError,
-        match=r"type 'std_msgs/msg/String' in 'cdr' are no images that are read; sensor_msgs Image and CompressedImage",
+        match=r"type 'std_msgs/msg/String' in 'cdr' are no images that are read; sensor_msgs Image and "
+        r"CompressedImage",
     ):
         reader(text)
 
@@ -253,7 +269,7 @@ def test_a_compressed_picture_is_decoded_whole_or_not_at_all(ending):
 
 
 @pytest.mark.parametrize(
-    ("picture", "said"),
+    ("picture", "reason"),
     [
         (rows("mono8", 2, 3, bytes(5)), "3 x 2 px mono8 in rows of 3 bytes do not go with 5 bytes of data"),
         (
@@ -265,15 +281,15 @@ def test_a_compressed_picture_is_decoded_whole_or_not_at_all(ending):
         (rows("32FC1", 1, 1, bytes(4)), "the encoding '32FC1' is not read; mono8, mono16"),
     ],
 )
-def test_a_picture_that_does_not_agree_with_itself_is_refused(picture, said):
+def test_a_picture_that_does_not_agree_with_itself_is_refused(picture, reason):
     with pytest.raises(UnreadableMessage) as refusal:
         gray(picture)
-    assert said in str(refusal.value)
+    assert reason in str(refusal.value)
 
 
 def test_the_frames_of_a_viewers_own_test_recording_are_read(shared):
     with shared("data/mcap_ros2/custom-camera-model.mcap").open("rb") as stream:
-        found = [
+        frames = [
             gray(
                 reader(
                     Channel(
@@ -283,7 +299,7 @@ def test_the_frames_of_a_viewers_own_test_recording_are_read(shared):
             )
             for schema, of, message in make_reader(stream).iter_messages(topics=["/image/compressed"])
         ]
-    assert len(found) == 10
-    assert {frame.shape for frame in found} == {found[0].shape}
-    assert found[0].dtype == np.uint8
-    assert found[0].std() > 1
+    assert len(frames) == 10
+    assert {frame.shape for frame in frames} == {frames[0].shape}
+    assert frames[0].dtype == np.uint8
+    assert frames[0].std() > 1

@@ -23,17 +23,17 @@ def test_the_proposal_is_yaml_that_maps_the_recording(tmp_path):
         "Time (sec),Heater 1 (%),duty_2,Zone 1 [K],T2_F,Set Point 1\n"
         + "".join(f"{k},{k % 50},{k % 2},{290 + k},{70 + k},{k}\n" for k in range(60))
     )
-    found = proposal(inspect(path))
-    assert found["ingest"]["mapping"] == {
+    proposed = proposal(inspect(path))
+    assert proposed["ingest"]["mapping"] == {
         "heater_1": {"source": "Heater 1 (%)", "unit": "percent", "scale": 1.0, "offset": 0.0},
         "heater_2": {"source": "duty_2", "unit": "percent", "scale": 100.0, "offset": 0.0},
         "temperature_1": {"source": "Zone 1 [K]", "unit": "degC", "scale": 1.0, "offset": -273.15},
         "temperature_2": {"source": "T2_F", "unit": "degC", "scale": 0.555556, "offset": -17.7778},
     }
-    Plant.model_validate_json(json.dumps(found["plant"]))
+    Plant.model_validate_json(json.dumps(proposed["plant"]))
     sources = [
         Source(name, one["source"], one["unit"], one["scale"], one["offset"])
-        for name, one in found["ingest"]["mapping"].items()
+        for name, one in proposed["ingest"]["mapping"].items()
     ]
     raw = read(path, sources)
     assert raw.signals["temperature_1"][1][0] == pytest.approx(16.85)
@@ -116,13 +116,13 @@ def test_our_own_recordings_are_proposed_under_their_own_names(tmp_path):
         "sensor_1": (150 + time / 10, "degC", ""),
     }
     write_recording(tmp_path / "ours.mcap", time, signals)
-    found = proposal(inspect(tmp_path / "ours.mcap"))
-    assert {name: one["source"] for name, one in found["ingest"]["mapping"].items()} == {
+    proposed = proposal(inspect(tmp_path / "ours.mcap"))
+    assert {name: one["source"] for name, one in proposed["ingest"]["mapping"].items()} == {
         "heater_1": "heater_1",
         "motor": "motor",
         "temperature_1": "sensor_1",
     }
-    assert found["plant"]["sample_time_s"] == 1.0
+    assert proposed["plant"]["sample_time_s"] == 1.0
 
 
 def test_the_same_file_gives_the_same_words(shared):
@@ -148,7 +148,7 @@ def test_mcap_files_of_others_are_inspected(shared, name):
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "sentence"),
     [
         (b"", "is empty (0 bytes)"),
         (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", "is a PNG picture but should be MCAP, Parquet or CSV"),
@@ -169,7 +169,7 @@ def test_mcap_files_of_others_are_inspected(shared, name):
     ids=["empty", "picture", "bytes", "text", "program", "units"],
 )
 def test_what_is_no_recording_is_refused_in_one_sentence_of_the_command(
-    tmp_path, monkeypatch, capsys, content, said
+    tmp_path, monkeypatch, capsys, content, sentence
 ):
     path = tmp_path / "rig.csv"
     path.write_bytes(content)
@@ -181,7 +181,7 @@ def test_what_is_no_recording_is_refused_in_one_sentence_of_the_command(
     assert printed.out == ""
     assert printed.err.startswith(f"beadline: {path}")
     assert printed.err.count("\n") == 1
-    assert said in printed.err
+    assert sentence in printed.err
 
 
 def test_a_table_without_a_time_is_told_what_to_write_and_the_proposal_has_it(tmp_path):

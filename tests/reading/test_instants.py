@@ -47,9 +47,9 @@ def test_the_zone_counts_as_known_only_where_every_time_names_it():
 
 
 def test_times_of_day_count_from_midnight_and_run_on_over_the_next():
-    found = read("23:59:58", "23:59:59.5", "0:00:01")
-    assert not found.dated
-    times, midnights = over_midnight(found.ns)
+    clock = read("23:59:58", "23:59:59.5", "0:00:01")
+    assert not clock.dated
+    times, midnights = over_midnight(clock.ns)
     np.testing.assert_allclose(np.diff(times) / 1e9, [1.5, 1.5], rtol=1e-12)
     assert midnights == 1
     # an elapsed time may have more than 24 hours
@@ -66,7 +66,7 @@ def test_day_and_month_are_told_by_a_date_that_can_be_only_one_of_both():
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "reason"),
     [
         ("warm", "is 'warm'; convert it"),
         ("05/03/2025 12:00", "is '05/03/2025 12:00' (day and month, or month and day?); convert it"),
@@ -77,10 +77,10 @@ def test_day_and_month_are_told_by_a_date_that_can_be_only_one_of_both():
         ("2025-11-21T12:00:00-34", "is '2025-11-21T12:00:00-34'"),
     ],
 )
-def test_what_is_no_time_is_refused_with_its_line(text, said):
+def test_what_is_no_time_is_refused_with_its_line(text, reason):
     with pytest.raises(
         ValueError, match=r"^rig\.csv: line 3, time time should be seconds or ISO 8601"
     ) as refusal:
         read("2025-11-21T12:00:00", text)
-    assert said in str(refusal.value)
+    assert reason in str(refusal.value)
     assert str(refusal.value).endswith("; convert it, or name another column")

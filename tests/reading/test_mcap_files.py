@@ -143,7 +143,8 @@ def test_damage_in_messages_outside_chunks_is_refused_because_it_cannot_be_place
     place = content.index(b'"heater_1": 700.0') + 13
     with pytest.raises(
         ValueError,
-        match=r"the data section's CRC should be 0x\w+ but is 0x\w+, and its messages have no CRC of their own",
+        match=r"the data section's CRC should be 0x\w+ but is 0x\w+, and its messages have no CRC of their "
+        r"own",
     ):
         opened(tmp_path, flipped(content, place, 0))
 
@@ -164,7 +165,8 @@ def test_messages_without_any_crc_are_read_and_said_to_be_unchecked(tmp_path):
 def test_converted_line_ends_are_named_as_such(tmp_path, old, new, how):
     with pytest.raises(
         ValueError,
-        match=rf"offset 0 should be 89 4d 43 41 50 30 0d 0a .* line ends were converted \({how}\).*\.gitattributes",
+        match=rf"offset 0 should be 89 4d 43 41 50 30 0d 0a .* line ends were converted "
+        rf"\({how}\).*\.gitattributes",
     ):
         opened(tmp_path, json_recording(SAMPLES).replace(old, new))
 

@@ -28,13 +28,13 @@ def mcap(encoding: str, samples: int, *, late: bool = False) -> bytes:
     channel = made.topic("/rig", encoding, *schema)
     for k in range(samples):
         u, y = k % 50 + 0.25, k % 70 + 0.5
-        known = {"u": u, "note": "a remark that nobody reads"}
+        always = {"u": u, "note": "a remark that nobody reads"}
         made.message(
             channel,
             k,
             struct.pack("<4sdd", b"\0\1\0\0", u, y)
             if encoding == "cdr"
-            else known | ({} if late and k < 500 else {"y": y}),
+            else always | ({} if late and k < 500 else {"y": y}),
         )
     return made.bytes()
 
@@ -56,10 +56,10 @@ def test_a_longer_recording_costs_its_numbers_and_nothing_else(tmp_path, written
         path.write_bytes(written(samples))
         tracemalloc.start()
         raw = read(path, SOURCES)
-        found = tracemalloc.get_traced_memory()[1]
+        used = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert len(raw.signals["y"][1]) >= 0.9 * samples
-        return found
+        return used
 
     peak(1000)  # what is loaded at the first time
     assert peak(LONG) - peak(SHORT) < BYTES_A_SAMPLE * (LONG - SHORT)

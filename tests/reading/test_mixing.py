@@ -83,10 +83,10 @@ def test_what_is_mixed_is_masked_with_its_place_though_the_table_would_show_one_
         inputs=["u"],
         outputs=["y"],
     )
-    (found,) = [one for one in table.flags if one.kind == "mixed"]
-    assert (found.signal, found.start_s, found.end_s, found.count) == ("y", 0.0, 299.5, 600)
+    (flag,) = [one for one in table.flags if one.kind == "mixed"]
+    assert (flag.signal, flag.start_s, flag.end_s, flag.count) == ("y", 0.0, 299.5, 600)
     assert table.masked["y"].all()
-    assert "two devices seem to write under one name; record each under a name of its own" in found.message
+    assert "two devices seem to write under one name; record each under a name of its own" in flag.message
 
 
 def test_intervals_that_alternate_are_two_clocks_and_jitter_is_one():

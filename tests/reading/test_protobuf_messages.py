@@ -24,7 +24,8 @@ DESCRIPTOR = bytes.fromhex(
 # 70000], steps=4000000000, name="extruder",
 #   zones=[Zone(celsius=180.5, trim=-3, limit=0.0), Zone(trim=2)], nozzle=Zone())
 MESSAGE = bytes.fromhex(
-    "08fbffffffffffffffff01110000000000c042401a100d0080344310051900000000000000001a021004220e03ffffffffffffffffff01f0a2042a003500286bee3a08"
+    "08fbffffffffffffffff01110000000000c042401a100d0080344310051900000000000000001a021004220e03ffffffff"
+    "ffffffffff01f0a2042a003500286bee3a08"
     "6578747275646572"
 )
 TYPES = message_types(DESCRIPTOR)
@@ -35,7 +36,7 @@ def numbers(message: bytes, *names: str) -> np.ndarray:
 
 
 def test_numbers_of_every_kind_are_what_protobuf_wrote():
-    found = numbers(
+    values = numbers(
         MESSAGE,
         "steps",
         "duty",
@@ -46,13 +47,13 @@ def test_numbers_of_every_kind_are_what_protobuf_wrote():
         "counts[1]",
         "counts[2]",
     )
-    assert found.tolist() == [4e9, 37.5, -5, 180.5, -3, 2, -1, 70000]
+    assert values.tolist() == [4e9, 37.5, -5, 180.5, -3, 2, -1, 70000]
 
 
 def test_what_is_not_on_the_wire_is_zero_only_where_proto3_says_so():
     """A plain number that is 0 is not written; an optional one, an
     element or a message that is absent has no value."""
-    found = numbers(
+    values = numbers(
         MESSAGE,
         "zones[1].celsius",
         "nozzle.celsius",
@@ -61,7 +62,7 @@ def test_what_is_not_on_the_wire_is_zero_only_where_proto3_says_so():
         "zones[2].celsius",
         "counts[3]",
     )
-    np.testing.assert_array_equal(found, [0, 0, 0, np.nan, np.nan, np.nan])
+    np.testing.assert_array_equal(values, [0, 0, 0, np.nan, np.nan, np.nan])
     np.testing.assert_array_equal(numbers(b"", "duty", "nozzle.celsius"), [0, np.nan])
 
 
@@ -76,10 +77,10 @@ def test_a_message_cut_anywhere_is_unreadable_or_shorter_but_never_a_crash():
     whole = numbers(MESSAGE, "steps", "duty")
     for end in range(len(MESSAGE)):
         try:
-            found = numbers(MESSAGE[:end], "steps", "duty")
+            values = numbers(MESSAGE[:end], "steps", "duty")
         except UnreadableMessage:
             continue
-        assert all(one in (0.0, other) for one, other in zip(found, whole, strict=True))
+        assert all(one in (0.0, other) for one, other in zip(values, whole, strict=True))
 
 
 def test_a_schema_or_field_that_is_not_there_is_named():

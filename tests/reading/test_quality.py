@@ -25,7 +25,7 @@ def flagged(
 ) -> Table:
     count = len(next(iter(values.values())))
     segment = np.zeros(count, np.int32) if segment is None else segment
-    masked = {name: ~np.isfinite(found) for name, found in values.items()}
+    masked = {name: ~np.isfinite(signal) for name, signal in values.items()}
     return flag(
         Table("rig.csv", segment, np.arange(float(count)), values, masked, [], {}), units=units, limits=limits
     )
@@ -46,10 +46,10 @@ def test_a_healthy_record_has_no_finding_but_its_quantisation_and_nothing_is_mas
 def test_values_are_never_altered():
     values = rig()
     values["y"][500] = 0.0
-    before = {name: found.copy() for name, found in values.items()}
+    before = {name: signal.copy() for name, signal in values.items()}
     table = flagged(values)
-    for name, found in before.items():
-        np.testing.assert_array_equal(table.values[name], found)
+    for name, signal in before.items():
+        np.testing.assert_array_equal(table.values[name], signal)
 
 
 @pytest.mark.parametrize("size", [1.5, -1.5, 5.0, -40.0])
@@ -73,7 +73,7 @@ def test_isolated_spikes_are_found_where_they_are_and_masked(size, length):
 
 def test_steps_ramps_and_smooth_peaks_are_no_spikes():
     time = np.arange(400.0)
-    for found in (
+    for signal in (
         np.where(time < 200, 20.0, 60.0),
         np.maximum(0, time - 200),
         50 - 0.01 * (time - 200) ** 2,
@@ -81,7 +81,7 @@ def test_steps_ramps_and_smooth_peaks_are_no_spikes():
         np.abs(time - 200),
         20 + 30 * (1 - np.exp(-np.maximum(0, time - 100) / 20)),
     ):
-        assert of(flagged({"u": time % 50, "y": found}), "spike") == []
+        assert of(flagged({"u": time % 50, "y": signal}), "spike") == []
 
 
 def test_a_spike_at_the_edge_of_a_segment_is_left_alone_for_nothing_tells_which_side_is_right():
@@ -161,9 +161,9 @@ def test_a_heater_that_is_switched_off_is_not_held_back_by_its_limit_and_a_contr
     values = approach()
     assert of(flagged(values), "saturated") == []
     controlled = np.clip(60 - values["y"] + values["z"] - 20, 0.0, 100.0)
-    found = of(flagged(values | {"u": controlled}), "saturated")
-    assert [(one.signal, one.count) for one in found] == [("u", (controlled == 0).sum())]
-    assert "at its limit 0" in found[0].message
+    flags = of(flagged(values | {"u": controlled}), "saturated")
+    assert [(one.signal, one.count) for one in flags] == [("u", (controlled == 0).sum())]
+    assert "at its limit 0" in flags[0].message
 
 
 def test_an_output_on_its_rail_is_saturated_and_not_masked():
@@ -196,7 +196,7 @@ def test_constant_signals_are_named():
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "sentence"),
     [
         (
             lambda v: v | {"y": v["y"] - 20 + 273.15, "z": v["z"] - 15 + 273.15},
@@ -212,12 +212,12 @@ def test_constant_signals_are_named():
         (lambda v: v | {"y": v["y"] - 400}, "which no temperature does"),
     ],
 )
-def test_suspicious_units_are_said_and_nothing_is_changed(change, said):
+def test_suspicious_units_are_said_and_nothing_is_changed(change, sentence):
     values = change(rig())
     table = flagged(values)
-    found = of(table, "unit")
-    assert found
-    assert all(said in one.message for one in found)
+    flags = of(table, "unit")
+    assert flags
+    assert all(sentence in one.message for one in flags)
     for name in values:
         np.testing.assert_array_equal(table.values[name], values[name])
         assert not table.masked[name].any()
@@ -251,8 +251,8 @@ def test_the_spike_of_the_two_heater_kit_and_nothing_else_is_masked(shared):
         units={**dict.fromkeys(inputs, "percent"), **dict.fromkeys(outputs, "degC")},
         limits=dict.fromkeys(inputs, (0.0, 100.0)),
     )
-    found = {(one.signal, one.kind, one.start_s, one.count) for one in table.flags}
-    assert found == {
+    flags = {(one.signal, one.kind, one.start_s, one.count) for one in table.flags}
+    assert flags == {
         ("temperature_1", "spike", 1789, 1),
         ("temperature_1", "quantised", 0, 5099),
         ("temperature_2", "quantised", 0, 5100),

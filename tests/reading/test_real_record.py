@@ -137,10 +137,10 @@ def test_the_spike_of_the_sensor_is_found_masked_and_kept_as_it_was_recorded(kit
         for i in np.flatnonzero(quality["kind"] == "spike")
     ]
     assert spikes == [("prbs.csv", "T1", SPIKE_S, SPIKE_S, 1)]
-    found = record(kit)
-    assert np.flatnonzero(found["T1_masked"]).tolist() == [SPIKE_S]
-    assert found["T1"][SPIKE_S] == SPIKE_DEGC
-    assert not any(found[f"{name}_masked"].any() for name in ("heater_1", "heater_2", "T2"))
+    table = record(kit)
+    assert np.flatnonzero(table["T1_masked"]).tolist() == [SPIKE_S]
+    assert table["T1"][SPIKE_S] == SPIKE_DEGC
+    assert not any(table[f"{name}_masked"].any() for name in ("heater_1", "heater_2", "T2"))
     ingested = metrics(kit, "ingest")
     assert (ingested["recordings"], ingested["quarantined"], ingested["samples"], ingested["segments"]) == (
         1,
@@ -165,10 +165,10 @@ def test_the_same_record_in_another_format_is_the_same_record(kit, root, shared,
             table["t_s"].to_numpy(),
             {name: (table[name].to_numpy(), unit, name) for name, unit in units.items()},
         )
-    found, expected = record(run(tree, "ingest")), record(kit)
-    assert set(found["recording"]) == {f"kit.{form}"}
+    converted, expected = record(run(tree, "ingest")), record(kit)
+    assert set(converted["recording"]) == {f"kit.{form}"}
     for name in set(expected) - {"recording"}:
-        np.testing.assert_array_equal(found[name], expected[name])
+        np.testing.assert_array_equal(converted[name], expected[name])
 
 
 # ---- what is learned from it
@@ -183,12 +183,12 @@ def test_the_next_experiment_is_written_within_the_limits(kit):
 
 
 def test_the_plant_is_judged_on_the_part_of_the_record_that_it_has_not_seen(kit):
-    found = metrics(kit, "identify_plant")
+    figures = metrics(kit, "identify_plant")
     # a plain subspace fit reaches 58 and 60 % here; the drift of the
     # room limits what inputs alone can explain
-    assert min(found["fit_holdout"][name] for name in ("T1", "T2")) >= 62
-    assert found["ahead_steps"] == 60
-    assert min(found["fit_holdout_ahead"][name] for name in ("T1", "T2")) >= 75
+    assert min(figures["fit_holdout"][name] for name in ("T1", "T2")) >= 62
+    assert figures["ahead_steps"] == 60
+    assert min(figures["fit_holdout_ahead"][name] for name in ("T1", "T2")) >= 75
     holdout = artifacts.read_table(
         kit / "datasets/identify_plant/holdout.parquet", tables.holdout(machine(kit).outputs)
     )
@@ -211,11 +211,11 @@ def test_the_plant_is_judged_on_the_part_of_the_record_that_it_has_not_seen(kit)
 def test_the_kernel_is_learned_or_refused_with_its_reason(kit):
     """The kit steps both heaters at once and one of the products u1(t-1)
     u2(t), u2(t-1) u1(t) never appears without the other."""
-    found, kernel = metrics(kit, "learn_kernel"), kit / "datasets/learn_kernel/kernel.parquet"
-    assert (found["refused"] is None) == kernel.exists()
-    if found["refused"]:
-        assert "the record does not determine the kernel" in found["refused"]
-    assert found["window"] >= 1
+    figures, kernel = metrics(kit, "learn_kernel"), kit / "datasets/learn_kernel/kernel.parquet"
+    assert (figures["refused"] is None) == kernel.exists()
+    if figures["refused"]:
+        assert "the record does not determine the kernel" in figures["refused"]
+    assert figures["window"] >= 1
 
 
 def test_every_controller_is_judged_on_the_spread_and_the_model_based_and_the_window_hold(kit):
@@ -280,9 +280,9 @@ def test_a_folder_with_a_gap_a_missing_input_and_a_broken_file_goes_all_the_way(
     ingested = metrics(tree, "ingest")
     assert (ingested["recordings"], ingested["quarantined"], ingested["segments"]) == (3, 1, 4)
     assert "broken.csv" in (tree / "reports/temperature.html").read_text(encoding="utf-8")
-    found = metrics(tree, "identify_plant")
+    figures = metrics(tree, "identify_plant")
     assert (
-        min(found["fit_holdout"].values()) > 50
+        min(figures["fit_holdout"].values()) > 50
     )  # less record than the whole, in pieces; half of the movement is a model still
     judged = metrics(tree, "evaluate_temperature")["controllers"]["model_based"]
     assert judged["disk"]["median"] > 0

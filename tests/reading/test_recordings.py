@@ -20,10 +20,10 @@ def opened(tmp_path, content: bytes | str, sources=SOURCES, name: str = "recordi
 
 
 def refusal(tmp_path, content: bytes | str, sources=SOURCES, name: str = "recording.csv", **options) -> str:
-    with pytest.raises(ValueError, match=name) as found:
+    with pytest.raises(ValueError, match=name) as error:
         opened(tmp_path, content, sources, name, **options)
-    assert "\n" not in str(found.value)
-    return str(found.value)
+    assert "\n" not in str(error.value)
+    return str(error.value)
 
 
 # ---- the same record in every format
@@ -75,7 +75,8 @@ def test_scale_and_offset_turn_kelvin_and_duty_into_our_units(tmp_path):
         "timestamp,u,y\n1763730000000,1.5,2\n1763730001000,2.5,3\n",
         "time_min,u,y\n0,1.5,2\n0.016666666666666666,2.5,3\n",
         # of controllers, spreadsheets and historians
-        "Recorder;R-7\nSerial;12345\n\nDatum;Uhrzeit;u;y\n;;%;C\n21.11.2025;13:00:00;1,5;2\n21.11.2025;13:00:01;2,5;3\n",
+        "Recorder;R-7\nSerial;12345\n\nDatum;Uhrzeit;u;y\n;;%;C\n21.11.2025;13:00:00;1,5;2\n"
+        "21.11.2025;13:00:01;2,5;3\n",
         "sep=;\nZeit;u;y\n21.11.2025 23:59:59,5;1,5;2,0\n22.11.2025 00:00:00,5;2,5;3,0\n",
         "time,u,y\n23:59:59,1.5,2\n00:00:00,2.5,3\n",
         "Timestamp (UTC),u,y\n11/21/2025 01:00:00 PM,1.5,2\n11/21/2025 01:00:01 PM,2.5,3\n",
@@ -208,7 +209,7 @@ def test_zeros_after_a_power_failure_are_left_out_and_noted(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "sentence"),
     [
         (
             "t,u,y\n0,1,2\n2,1,2\n1,1,2\n",
@@ -304,8 +305,8 @@ def test_zeros_after_a_power_failure_are_left_out_and_noted(tmp_path):
         (np.random.default_rng(0).bytes(5000), "recording.csv"),
     ],
 )
-def test_bad_tables_are_refused_with_the_place_and_the_remedy(tmp_path, content, said):
-    assert said in refusal(tmp_path, content)
+def test_bad_tables_are_refused_with_the_place_and_the_remedy(tmp_path, content, sentence):
+    assert sentence in refusal(tmp_path, content)
 
 
 def test_one_row_is_a_record_of_one_sample(tmp_path):
@@ -328,12 +329,12 @@ def test_a_folder_and_a_missing_file_are_refused(tmp_path):
 
 
 def test_mappings_that_make_no_sense_are_refused(tmp_path):
-    for sources, said in (
+    for sources, sentence in (
         ([], "the mapping names no signal"),
         ([SOURCES[0], SOURCES[0]], "gives u more than one source"),
         ([Source("u", "u", "percent", 0.0)], "has scale 0 and offset 0; both must be finite, scale not 0"),
     ):
-        assert said in refusal(tmp_path, "t,u,y\n0,1,2\n", sources)
+        assert sentence in refusal(tmp_path, "t,u,y\n0,1,2\n", sources)
 
 
 # ---- Parquet
@@ -392,29 +393,29 @@ def test_a_clock_of_the_calendar_counts_from_the_first_second_to_the_nanosecond(
 
 
 @pytest.mark.parametrize(
-    ("step", "said"),
+    ("step", "sentence"),
     [
         (-1.0, "is at 3 s, which is before the sample ahead of it at 4 s"),
         (0.0, "has the same time as the sample before it, 4 s"),
     ],
 )
-def test_mcap_whose_clock_does_not_run_forward_is_refused_with_the_message(tmp_path, step, said):
+def test_mcap_whose_clock_does_not_run_forward_is_refused_with_the_message(tmp_path, step, sentence):
     made = Written()
     channel = made.topic("/machine", "json")
     for k in range(5):
         made.message(channel, k, {"u": k, "y": k})
     made.message(channel, 4 + step, {"u": 0, "y": 0})
-    assert f"message 6 of /machine {said}" in refusal(tmp_path, made.bytes(), name="back.mcap")
+    assert f"message 6 of /machine {sentence}" in refusal(tmp_path, made.bytes(), name="back.mcap")
 
 
 # ---- names, and real records
 
 
 def test_nearest_names_look_at_the_field_behind_a_topic_too():
-    known = ["/zone:degC", "/zone:duty", "heater_1", "Temperature 1 (degC)"]
-    assert nearest_names("dutty", known) == "the nearest names are /zone:duty"
-    assert nearest_names("heater1", known) == "the nearest names are heater_1"
-    assert nearest_names("xyz", known).startswith("it has /zone:degC, /zone:duty")
+    names = ["/zone:degC", "/zone:duty", "heater_1", "Temperature 1 (degC)"]
+    assert nearest_names("dutty", names) == "the nearest names are /zone:duty"
+    assert nearest_names("heater1", names) == "the nearest names are heater_1"
+    assert nearest_names("xyz", names).startswith("it has /zone:degC, /zone:duty")
 
 
 def test_the_two_heater_kit_is_read_as_it_was_recorded(shared):

@@ -29,31 +29,31 @@ def table(raw: Raw, sample_time_s: float = 1.0, **options) -> Table:
     )
 
 
-def kinds(found: Table) -> dict[str, int]:
-    return {flag.kind: flag.count for flag in found.flags}
+def kinds(resampled: Table) -> dict[str, int]:
+    return {flag.kind: flag.count for flag in resampled.flags}
 
 
 def test_a_record_on_the_grid_passes_unaltered_and_without_a_finding():
     rng = np.random.default_rng(0)
     time, u, y = 5 + 0.1 * np.arange(500), rng.normal(size=500), rng.normal(size=500)
-    found = table(recorded(u=(time, u), y=(time, y)), 0.1)
-    np.testing.assert_array_equal(found.values["u"], u)
-    np.testing.assert_array_equal(found.values["y"], y)
-    np.testing.assert_allclose(found.time_s, time, rtol=1e-15)
-    assert found.flags == []
-    assert not found.segment.any()
-    assert not found.masked["u"].any()
-    assert not found.masked["y"].any()
+    resampled = table(recorded(u=(time, u), y=(time, y)), 0.1)
+    np.testing.assert_array_equal(resampled.values["u"], u)
+    np.testing.assert_array_equal(resampled.values["y"], y)
+    np.testing.assert_allclose(resampled.time_s, time, rtol=1e-15)
+    assert resampled.flags == []
+    assert not resampled.segment.any()
+    assert not resampled.masked["u"].any()
+    assert not resampled.masked["y"].any()
 
 
 def test_outputs_follow_the_line_between_neighbours_and_inputs_hold():
     """By hand: y = 10 t on a jittered clock; u steps from 1 to 2 at 1.4 s."""
     time = np.array([0, 0.9, 1.4, 2.2, 3.0])
-    found = table(recorded(u=(time, [1, 1, 2, 2, 2]), y=(time, 10 * time)))
+    resampled = table(recorded(u=(time, [1, 1, 2, 2, 2]), y=(time, 10 * time)))
     # a straight line is its own interpolation; floats round at 1e-16
-    np.testing.assert_allclose(found.values["y"], [0, 10, 20, 30], rtol=1e-14)
-    assert found.values["u"].tolist() == [1, 1, 2, 2]
-    flags = {flag.kind: flag for flag in found.flags}
+    np.testing.assert_allclose(resampled.values["y"], [0, 10, 20, 30], rtol=1e-14)
+    assert resampled.values["u"].tolist() == [1, 1, 2, 2]
+    flags = {flag.kind: flag for flag in resampled.flags}
     assert (flags["step_inside"].signal, flags["step_inside"].start_s, flags["step_inside"].count) == (
         "u",
         1.4,
@@ -68,25 +68,25 @@ def test_every_value_lies_between_its_neighbours_and_every_command_was_given(see
     rng = np.random.default_rng(seed)
     time = np.cumsum(rng.uniform(0.5, 1.5, 60))
     raw = recorded(u=(time, rng.integers(0, 4, 60)), y=(time, rng.normal(size=60)))
-    found = table(raw, sample_time_s)
+    resampled = table(raw, sample_time_s)
     y = raw.signals["y"][1]
     # a sample within a hundredth of the sample time is on the grid: it is its own neighbour on both sides
-    before = np.searchsorted(time, found.time_s + 0.01 * sample_time_s, side="right") - 1
-    after = np.minimum(np.searchsorted(time, found.time_s - 0.01 * sample_time_s), 59)
+    before = np.searchsorted(time, resampled.time_s + 0.01 * sample_time_s, side="right") - 1
+    after = np.minimum(np.searchsorted(time, resampled.time_s - 0.01 * sample_time_s), 59)
     low, high = np.minimum(y[before], y[after]), np.maximum(y[before], y[after])
     assert (
-        (found.values["y"] >= low - 1e-12) & (found.values["y"] <= high + 1e-12)
+        (resampled.values["y"] >= low - 1e-12) & (resampled.values["y"] <= high + 1e-12)
     ).all()  # the line rounds at 1e-16
-    np.testing.assert_array_equal(found.values["u"], raw.signals["u"][1][before])
+    np.testing.assert_array_equal(resampled.values["u"], raw.signals["u"][1][before])
 
 
 def test_nothing_is_interpolated_or_held_across_a_gap():
     time = np.r_[0:10, 20:30].astype(float)
-    found = table(recorded(u=(time, time), y=(time, time)))
-    assert found.segment.tolist() == [0] * 10 + [1] * 10
-    np.testing.assert_array_equal(found.time_s, time)
-    np.testing.assert_array_equal(found.values["y"], time)
-    (gap,) = found.flags
+    resampled = table(recorded(u=(time, time), y=(time, time)))
+    assert resampled.segment.tolist() == [0] * 10 + [1] * 10
+    np.testing.assert_array_equal(resampled.time_s, time)
+    np.testing.assert_array_equal(resampled.values["y"], time)
+    (gap,) = resampled.flags
     assert (gap.kind, gap.start_s, gap.end_s) == ("gap", 9, 20)
     # a limit beyond the hole makes it a stretch to fill, and says so
     filled = table(recorded(u=(time, time), y=(time, time)), max_gap_s=12.0)
@@ -98,9 +98,9 @@ def test_nothing_is_interpolated_or_held_across_a_gap():
 
 def test_two_missing_samples_are_no_gap_but_three_sample_times_and_more_are():
     time = np.r_[0:10, 12:20, 23.5:30].astype(float)
-    found = table(recorded(y=(time, time)))
-    assert found.segment[-1] == 1
-    assert [(flag.start_s, flag.end_s) for flag in found.flags if flag.kind == "gap"] == [(19, 23.5)]
+    resampled = table(recorded(y=(time, time)))
+    assert resampled.segment[-1] == 1
+    assert [(flag.start_s, flag.end_s) for flag in resampled.flags if flag.kind == "gap"] == [(19, 23.5)]
 
 
 def test_missing_values_are_masked_with_what_is_interpolated_from_them():
@@ -115,31 +115,31 @@ def test_missing_values_are_masked_with_what_is_interpolated_from_them():
 
 def test_clocks_are_aligned_over_their_common_time():
     slow, fast = np.arange(0.0, 50), np.arange(3.05, 40, 0.1)
-    found = table(recorded(u=(slow, slow), y=(fast, 2 * fast)))
-    assert found.time_s[0] == pytest.approx(3.05)
-    assert found.time_s[-1] <= fast[-1] + 1e-9
-    np.testing.assert_allclose(found.values["y"], 2 * found.time_s, rtol=1e-12)
-    np.testing.assert_array_equal(found.values["u"], np.floor(found.time_s))
-    assert {"trimmed", "rate"} <= set(kinds(found))
+    resampled = table(recorded(u=(slow, slow), y=(fast, 2 * fast)))
+    assert resampled.time_s[0] == pytest.approx(3.05)
+    assert resampled.time_s[-1] <= fast[-1] + 1e-9
+    np.testing.assert_allclose(resampled.values["y"], 2 * resampled.time_s, rtol=1e-12)
+    np.testing.assert_array_equal(resampled.values["u"], np.floor(resampled.time_s))
+    assert {"trimmed", "rate"} <= set(kinds(resampled))
     assert "2 clocks were aligned over their common time 3.05 to 39.95 s" in " ".join(
-        flag.message for flag in found.flags
+        flag.message for flag in resampled.flags
     )
 
 
 def test_commands_that_come_as_events_are_held_however_long():
     time = np.arange(0.0, 1000)
     events = np.array([0.0, 100, 105, 400, 408, 410])
-    found = table(recorded(u=(events, [1, 2, 3, 4, 5, 6]), y=(time, time)))
-    assert not found.segment.any()
-    np.testing.assert_array_equal(found.values["u"], 1 + np.searchsorted(events, time, side="right") - 1)
+    resampled = table(recorded(u=(events, [1, 2, 3, 4, 5, 6]), y=(time, time)))
+    assert not resampled.segment.any()
+    np.testing.assert_array_equal(resampled.values["u"], 1 + np.searchsorted(events, time, side="right") - 1)
 
 
 def test_commands_that_others_overtake_are_counted_as_lost():
     time = np.arange(0.0, 10)
-    found = table(recorded(u=([0, 2.2, 2.4, 2.6, 7.5], [0, 1, 2, 3, 4]), y=(time, time)))
-    assert found.values["u"].tolist() == [0, 0, 0, 3, 3, 3, 3, 3, 4, 4]
-    assert kinds(found)["step_lost"] == 2
-    assert kinds(found)["step_inside"] == 4
+    resampled = table(recorded(u=([0, 2.2, 2.4, 2.6, 7.5], [0, 1, 2, 3, 4]), y=(time, time)))
+    assert resampled.values["u"].tolist() == [0, 0, 0, 3, 3, 3, 3, 3, 4, 4]
+    assert kinds(resampled)["step_lost"] == 2
+    assert kinds(resampled)["step_inside"] == 4
 
 
 def test_jitter_is_that_of_the_recording_s_clock_without_its_gaps():
@@ -155,7 +155,7 @@ def test_jitter_is_that_of_the_recording_s_clock_without_its_gaps():
 
 
 @pytest.mark.parametrize(
-    ("signals", "options", "said"),
+    ("signals", "options", "sentence"),
     [
         (
             {"y": ([0, 1], [1, 2]), "u": ([5, 6], [1, 2])},
@@ -181,18 +181,18 @@ def test_jitter_is_that_of_the_recording_s_clock_without_its_gaps():
         ),
     ],
 )
-def test_what_cannot_be_resampled_is_refused(signals, options, said):
+def test_what_cannot_be_resampled_is_refused(signals, options, sentence):
     with pytest.raises(ValueError, match="^rig.csv: ") as refusal:
         table(recorded(**signals), **options)
-    assert said in str(refusal.value)
+    assert sentence in str(refusal.value)
 
 
 def test_a_printer_s_log_with_holes_becomes_segments(shared):
     path = shared("data/caxton_print0_log/caxton_print0_early.csv")
-    found = table(read(path, [Source("u", "target_hotend", "degC"), Source("y", "hotend", "degC")]), 0.5)
+    resampled = table(read(path, [Source("u", "target_hotend", "degC"), Source("y", "hotend", "degC")]), 0.5)
     # twelve holes of some seven seconds, where the data set's makers left rows out
-    assert found.segment[-1] == 12
-    assert all(7 < flag.end_s - flag.start_s < 8 for flag in found.flags if flag.kind == "gap")
+    assert resampled.segment[-1] == 12
+    assert all(7 < flag.end_s - flag.start_s < 8 for flag in resampled.flags if flag.kind == "gap")
 
 
 def flags_of(time: np.ndarray, *kinds: str) -> list:
@@ -207,25 +207,25 @@ def test_jitter_is_told_with_its_size_and_place_and_a_steady_clock_has_none():
     time = np.arange(300.0)
     assert flags_of(time, "jitter") == []
     assert flags_of(time + 0.01 * np.random.default_rng(0).standard_normal(300), "jitter") == []
-    (found,) = flags_of(time + np.random.default_rng(0).uniform(-0.3, 0.3, 300), "jitter")
-    assert "the intervals of y, u differ from" in found.message
-    assert "two devices" not in found.message
+    (flag,) = flags_of(time + np.random.default_rng(0).uniform(-0.3, 0.3, 300), "jitter")
+    assert "the intervals of y, u differ from" in flag.message
+    assert "two devices" not in flag.message
     late = time.copy()
     late[100] += 0.6
-    (found,) = flags_of(late, "jitter")
-    assert (found.start_s, found.end_s, found.count) == (99.0, 101.0, 2)
+    (flag,) = flags_of(late, "jitter")
+    assert (flag.start_s, flag.end_s, flag.count) == (99.0, 101.0, 2)
 
 
 def test_two_clocks_one_behind_the_other_are_told():
-    (found,) = flags_of(np.sort(np.r_[np.arange(100.0), np.arange(100) + 0.3]), "jitter")
-    assert "by turns longer and shorter: two devices may write under one name" in found.message
+    (flag,) = flags_of(np.sort(np.r_[np.arange(100.0), np.arange(100) + 0.3]), "jitter")
+    assert "by turns longer and shorter: two devices may write under one name" in flag.message
 
 
 def test_a_gap_of_an_hour_and_an_interval_may_be_summer_time():
     time = np.arange(300.0)
     time[150:] += 3600
-    (found,) = flags_of(time, "gap")
-    assert "where summer time begins" in found.message
+    (flag,) = flags_of(time, "gap")
+    assert "where summer time begins" in flag.message
     time[150:] += 60
-    (found,) = flags_of(time, "gap")
-    assert "summer" not in found.message
+    (flag,) = flags_of(time, "gap")
+    assert "summer" not in flag.message

@@ -120,7 +120,7 @@ def test_messages_that_do_not_fit_their_schema_are_unreadable():
 
 
 @pytest.mark.parametrize(
-    ("definition", "said"),
+    ("definition", "reason"),
     [
         ("float64 a\n---\nfloat64 b\n", "is a service's"),
         ("Zone zone\n", "uses Zone but does not define it"),
@@ -132,8 +132,8 @@ def test_messages_that_do_not_fit_their_schema_are_unreadable():
         ),
     ],
 )
-def test_a_schema_that_cannot_be_read_says_why(definition, said):
-    with pytest.raises(ValueError, match=said):
+def test_a_schema_that_cannot_be_read_says_why(definition, reason):
+    with pytest.raises(ValueError, match=reason):
         layout(definition, "machine/msg/State", version=2)
 
 
@@ -147,9 +147,9 @@ def test_wide_text_ends_what_is_read_and_all_before_it_stays_readable():
 def test_messages_recorded_by_ros_2_are_read_to_their_last_field(shared):
     """Every message is used up to its end: `_decode` refuses one that is longer than what its schema says."""
     with shared("data/mcap_ros2/cdr_test_0.mcap").open("rb") as stream:
-        found = [(schema, message.data) for schema, _, message in make_reader(stream).iter_messages()]
-    assert len(found) == 7
-    arrays = [(schema, data) for schema, data in found if schema.name == "test_msgs/msg/Arrays"]
+        messages = [(schema, message.data) for schema, _, message in make_reader(stream).iter_messages()]
+    assert len(messages) == 7
+    arrays = [(schema, data) for schema, data in messages if schema.name == "test_msgs/msg/Arrays"]
     for schema, data in arrays:
         definition = schema.data.decode()
         names = [

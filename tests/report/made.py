@@ -166,12 +166,12 @@ def deposition_metrics():
         "gamma": 0.76,
         "gamma_worst": 1.2,
         "gamma_above_1_percent": 70.0,
-        "gamma_ours": 0.1,
-        "gamma_ours_worst": 0.3,
+        "gamma_model_inverse": 0.1,
+        "gamma_model_inverse_worst": 0.3,
     }
     trained = before | {
-        "paper": law(0.4),
-        "ours": law(0.02),
+        "hoelzle_2009_nominal": law(0.4),
+        "model_inverse": law(0.02),
         "pixels": law(0.03, **pixels),
         "other_routines": [law(0.02)],
     }
@@ -398,7 +398,7 @@ def deposition(scores=None):
     time = np.arange(200) / 50
     wanted = np.where((time > 1) & (time < 3) & ~((time > 1.8) & (time < 2.2)), 2.0, 0.0)
     folder = Path("datasets/train_ilc")
-    runs = [(law, j) for law in ("paper", "ours", "pixels") for j in range(3)]
+    runs = [(law, j) for law in ("hoelzle_2009", "model_inverse", "pixels") for j in range(3)]
     ratio = [1.0, 0.7, 0.4, 1.0, 0.1, 0.02, 1.0, 0.1, 0.03]
     rows = [
         ("A", law, 0, 8.0, 0.4, j, r, r + 0.05, r, 1.0 + 9.5 * j, 0.0, False)

@@ -70,10 +70,50 @@ def scoreboard(lost=LOST, runs=RUNS):
                     max(100 - 1.5 * least - 1.5 * more * hard, 0.0),
                 )
                 recovered = wilson(max(settled - 1, 0.0), runs) if case.endswith("clog") else nothing
-                rows.append((name, KINDS[name], simulator, case, True, runs, *wilson(settled, runs), *wilson(stay, runs), *recovered, 9.0 + hard, 22.0 + 4 * hard, 12.0, 0.8 + 0.2 * hard, 300.0, 230.0, settled))  # fmt: skip
+                rows.append(
+                    (
+                        name,
+                        KINDS[name],
+                        simulator,
+                        case,
+                        True,
+                        runs,
+                        *wilson(settled, runs),
+                        *wilson(stay, runs),
+                        *recovered,
+                        9.0 + hard,
+                        22.0 + 4 * hard,
+                        12.0,
+                        0.8 + 0.2 * hard,
+                        300.0,
+                        230.0,
+                        settled,
+                    )
+                )
         if name in (DEFAULT, "Bayes, robust", "the paper's agent"):
-            rows.append((name, KINDS[name], "pixels", "as published", False, 21, *wilson(max(100 - 3 * least, 0.0), 21), *nothing, *nothing, 14.0, 30.0, 15.0, 2.0, 30.0, 190.0, 100.0))  # fmt: skip
-    artifacts.write_table("datasets/evaluate_setpoint/scoreboard.parquet", tables.SCOREBOARD, columns(tables.SCOREBOARD, rows))  # fmt: skip
+            rows.append(
+                (
+                    name,
+                    KINDS[name],
+                    "pixels",
+                    "as published",
+                    False,
+                    21,
+                    *wilson(max(100 - 3 * least, 0.0), 21),
+                    *nothing,
+                    *nothing,
+                    14.0,
+                    30.0,
+                    15.0,
+                    2.0,
+                    30.0,
+                    190.0,
+                    100.0,
+                )
+            )
+    artifacts.write_table(
+        "datasets/evaluate_setpoint/scoreboard.parquet", tables.SCOREBOARD, columns(tables.SCOREBOARD, rows)
+    )
 
 
 def choice(name=DEFAULT, **more):
@@ -119,7 +159,10 @@ def paths(steps=100):
 
 def decisions(steps=50, why=""):
     rng, rows = np.random.default_rng(1), []
-    for episode, flow, target in (("from 30 % and 190 °C", 30.0, 190.0), ("clogged to 60 % at decision 16, out of focus from 37", 120.0, 210.0)):  # fmt: skip
+    for episode, flow, target in (
+        ("from 30 % and 190 °C", 30.0, 190.0),
+        ("clogged to 60 % at decision 16, out of focus from 37", 120.0, 210.0),
+    ):
         setpoint, degrees = flow, target
         for k in range(steps):
             gain = 0.6 if flow > 100 and k >= 16 else 1.0
@@ -139,7 +182,25 @@ def decisions(steps=50, why=""):
             text = f"{8.0 * k:6.1f} s: 20 frames valid, 20 count, " + (
                 f"held: {reason}" if held else f"good {p[1]:.2f}; flow {move:+g} %"
             )
-            rows.append((episode, DEFAULT, k, 8.0 * k, max(true, 0.0), degrees, setpoint, target, *(p / p.sum()), 4 if held else 20, 9.0, move, warm, bool(held), why or text))  # fmt: skip
+            rows.append(
+                (
+                    episode,
+                    DEFAULT,
+                    k,
+                    8.0 * k,
+                    max(true, 0.0),
+                    degrees,
+                    setpoint,
+                    target,
+                    *(p / p.sum()),
+                    4 if held else 20,
+                    9.0,
+                    move,
+                    warm,
+                    bool(held),
+                    why or text,
+                )
+            )
             setpoint, target, degrees = (
                 setpoint + move,
                 target + warm,
@@ -158,16 +219,58 @@ def classifier(seed=0):
     seen = np.searchsorted([90.0, 110.0], flow + rng.normal(0, 14, n), side="right")
     p = 0.1 + 0.7 * np.eye(3)[seen]
     others = [np.searchsorted([90.0, 110.0], flow + rng.normal(0, 18, n), side="right") for _ in range(3)]
-    table = {"segment": np.arange(n) // 20, "flow_percent": flow, "temperature_degC": heat, "label": label, "p_under": p[:, 0], "p_good": p[:, 1], "p_over": p[:, 2], "named": seen, "named_cnn": others[0], "named_svc": others[1], "named_width": others[2], "distance": rng.chisquare(8, n)}  # fmt: skip
+    table = {
+        "segment": np.arange(n) // 20,
+        "flow_percent": flow,
+        "temperature_degC": heat,
+        "label": label,
+        "p_under": p[:, 0],
+        "p_good": p[:, 1],
+        "p_over": p[:, 2],
+        "named": seen,
+        "named_cnn": others[0],
+        "named_svc": others[1],
+        "named_width": others[2],
+        "distance": rng.chisquare(8, n),
+    }
     artifacts.write_table(folder / "classified.parquet", tables.CLASSIFIED, table)
     rows = []
-    for of, method, off in (("image", "raw", 0.07), ("image", "calibrated", 0.01), ("window", "hard_counts", 0.1), ("window", "mean", 0.18), ("window", "log_sum", 0.02)):  # fmt: skip
-        rows += [(of, method, k / 10, (k + 1) / 10, 20 * k if k > 3 else 0, k / 10 + 0.05 if k > 3 else math.nan, min(k / 10 + 0.05 - off, 1.0) if k > 3 else math.nan) for k in range(10)]  # fmt: skip
+    for of, method, off in (
+        ("image", "raw", 0.07),
+        ("image", "calibrated", 0.01),
+        ("window", "hard_counts", 0.1),
+        ("window", "mean", 0.18),
+        ("window", "log_sum", 0.02),
+    ):
+        rows += [
+            (
+                of,
+                method,
+                k / 10,
+                (k + 1) / 10,
+                20 * k if k > 3 else 0,
+                k / 10 + 0.05 if k > 3 else math.nan,
+                min(k / 10 + 0.05 - off, 1.0) if k > 3 else math.nan,
+            )
+            for k in range(10)
+        ]
     artifacts.write_table(
         folder / "reliability.parquet", tables.RELIABILITY, columns(tables.RELIABILITY, rows)
     )
-    rows = [(learner, k, 1.1 * math.exp(-k / 15) + 0.4, 1.1 * math.exp(-k / 12) + 0.5, 0.79 - 0.45 * math.exp(-k / 8)) for learner, last in (("vision transformer", 40), ("convolutional network", 20)) for k in range(1, last + 1)]  # fmt: skip
-    artifacts.write_table(folder / "course.parquet", tables.COURSE, columns(tables.COURSE, rows))
+    rows = [
+        (
+            learner,
+            k,
+            1.1 * math.exp(-k / 15) + 0.4,
+            1.1 * math.exp(-k / 12) + 0.5,
+            0.79 - 0.45 * math.exp(-k / 8),
+        )
+        for learner, last in (("vision transformer", 40), ("convolutional network", 20))
+        for k in range(1, last + 1)
+    ]
+    artifacts.write_table(
+        folder / "course.parquet", tables.CLASSIFIER_CURVE, columns(tables.CLASSIFIER_CURVE, rows)
+    )
     edges = [20.0, 40.0, 60.0, 80.0, 90.0, 100.0, 110.0, 120.0, 150.0, 200.0, 310.0]
     rows = []
     for part in ("learn", "judge"):
@@ -190,7 +293,13 @@ def classifier(seed=0):
 def frames():
     folder, rows = Path("datasets/train_classifier/frames"), []
     folder.mkdir(parents=True, exist_ok=True)
-    wanted = [("under", "", 0), ("good", "", 1), ("over", "", 2), ("rejected", f"no line stands out: 4 of 10 gray levels {HOSTILE}", 1), ("out of focus", "foreign: further from what was learned than allowed", 1)]  # fmt: skip
+    wanted = [
+        ("under", "", 0),
+        ("good", "", 1),
+        ("over", "", 2),
+        ("rejected", f"no line stands out: 4 of 10 gray levels {HOSTILE}", 1),
+        ("out of focus", "foreign: further from what was learned than allowed", 1),
+    ]
     for k, (place, reason, label) in enumerate(wanted):
         picture = np.full((175, 175, 3), 60 + 10 * k, np.uint8)
         cv2.line(picture, (88, 88), (30, 120), (190, 190, 190), 6 + 3 * label)
@@ -199,12 +308,30 @@ def frames():
         assert ok
         (folder / f"frame_{k:02d}.jpg").write_bytes(data.tobytes())
         seen = place != "rejected"
-        rows.append({"file": f"frame_{k:02d}.jpg", "place": place, "reason": reason, "score": 4.0 if not seen else 27.3, "direction_deg": 144.0, "flow_percent": 60.0 + 40 * label, "temperature_degC": 210.0, "label": label, "named": label if seen else None, "p": [0.1, 0.8, 0.1] if seen else None, "distance": 9.0 if seen else None, "foreign_above": 20.0})  # fmt: skip
+        rows.append(
+            {
+                "file": f"frame_{k:02d}.jpg",
+                "place": place,
+                "reason": reason,
+                "score": 4.0 if not seen else 27.3,
+                "direction_deg": 144.0,
+                "flow_percent": 60.0 + 40 * label,
+                "temperature_degC": 210.0,
+                "label": label,
+                "named": label if seen else None,
+                "p": [0.1, 0.8, 0.1] if seen else None,
+                "distance": 9.0 if seen else None,
+                "foreign_above": 20.0,
+            }
+        )
     artifacts.write_json(folder / "frames.json", rows)
 
 
 def metrics():
-    out = {kind: {"auroc": 0.95 - 0.01 * i, "found": 0.7, "energy_auroc": 0.8, "max_p_auroc": 0.72} for i, kind in enumerate(("blur", "transposed"))}  # fmt: skip
+    out = {
+        kind: {"auroc": 0.95 - 0.01 * i, "found": 0.7, "energy_auroc": 0.8, "max_p_auroc": 0.72}
+        for i, kind in enumerate(("blur", "transposed"))
+    }
     seen = {
         "image_accuracy": 0.797, "window_accuracy": 0.931, "svc_image_accuracy": 0.747,
         "svc_window_accuracy": 0.86, "cnn_image_accuracy": 0.789, "width_image_accuracy": 0.638,
@@ -221,8 +348,8 @@ def metrics():
     taught = {
         "phase3": {"settled": 100.0, "stay": 100.0, "median_steps": 7.0, "runs": 2100},
         "phase4": {"settled": 31.0, "stay": 0.0, "median_steps": 82.0, "runs": 2100},
-        "ours": {"settled": 99.7, "stay": 98.9, "median_steps": 11.0, "runs": 2100},
-        "parameters": {"paper": 47_082, "ours": 60_000},
+        "belief_dqn": {"settled": 99.7, "stay": 98.9, "median_steps": 11.0, "runs": 2100},
+        "parameters": {"li_2025": 47_082, "belief_dqn": 60_000},
         "kept_round": 2,
         "validation": [-0.41, -0.38, -0.352],
         "rounds": 2,
@@ -237,10 +364,15 @@ def metrics():
 
 def agents():
     rows = []
-    for agent, phases in (("paper", 4), ("ours", 2)):
+    for agent, phases in (("li_2025", 4), ("belief_dqn", 2)):
         for phase in range(1, phases + 1):
-            rows += [(agent, phase, 500 * (10 * (phase - 1) + k), 0.8 - 0.6 * math.exp(-k / 3) - 0.1 * phase) for k in range(1, 11)]  # fmt: skip
-    artifacts.write_table("datasets/train_agent/agents.parquet", tables.AGENT_COURSE, columns(tables.AGENT_COURSE, rows))  # fmt: skip
+            rows += [
+                (agent, phase, 500 * (10 * (phase - 1) + k), 0.8 - 0.6 * math.exp(-k / 3) - 0.1 * phase)
+                for k in range(1, 11)
+            ]
+    artifacts.write_table(
+        "datasets/train_agent/agents.parquet", tables.AGENT_CURVE, columns(tables.AGENT_CURVE, rows)
+    )
 
 
 def write():

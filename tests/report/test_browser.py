@@ -28,7 +28,10 @@ def test_nothing_overflows_nothing_is_fetched_but_the_machine_and_the_console_is
         page.url,
         beside,
     ] and page.said == []
-    told = "Last run on Some CPU @ 3.00GHz, pins avx2, beadline 0.1.0, commit abc12345 with uncommitted changes, 22 Nov 2026"
+    told = (
+        "Last run on Some CPU @ 3.00GHz, pins avx2, beadline 0.1.0, commit abc12345 "
+        "with uncommitted changes, 22 Nov 2026"
+    )
     assert page.locator("body > footer").inner_text() == told
     paper = page.evaluate("getComputedStyle(document.body).backgroundColor")
     assert paper == {"light": "rgb(255, 255, 255)", "dark": "rgb(18, 21, 25)"}[theme]
@@ -231,7 +234,10 @@ def test_every_picture_stands_where_a_link_leads_to_stage_artifact_schema_and_ha
 
 def test_text_from_the_data_runs_nothing_even_where_it_were_not_escaped(open_page, reports, tmp_path):
     text = (reports / "index.html").read_text(encoding="utf-8")
-    hostile = '<script>window.hit = 1</script><script src="evil.js"></script><img src="http://evil.example/x" onerror="window.hit = 2"><a href="javascript:window.hit=3">x</a>'
+    hostile = (
+        '<script>window.hit = 1</script><script src="evil.js"></script><img '
+        'src="http://evil.example/x" onerror="window.hit = 2"><a href="javascript:window.hit=3">x</a>'
+    )
     (tmp_path / "bad.html").write_text(text.replace("<main>", f"<main>{hostile}"), encoding="utf-8")
     (tmp_path / "machine.js").write_text(MACHINE)
     (tmp_path / "evil.js").write_text("window.hit = 4")

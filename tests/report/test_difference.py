@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pipeline import cli
-from pipeline.store import artifacts
+from pipeline.store import artifacts, renamed
 from stages.report import main
 from tests.report import made
 from tests.report.test_pages import INDEX, Page, change
@@ -50,6 +50,17 @@ def test_two_equal_runs_give_an_empty_difference(accepted):
     ]
     assert "Inputs unchanged Parameters unchanged Code unchanged Artifacts 0 changed" in place
     assert "0 of 1 flow errors moved" in place and "unchanged" in Page(DEPOSITION).text
+
+
+def test_a_parameter_that_was_renamed_since_the_accepted_run_has_not_changed(accepted, monkeypatch):
+    run = artifacts.read_json("reports/accepted.json")
+    run["params"]["report"]["gap"] = run["params"]["report"].pop("gap_percent")
+    artifacts.write_json("reports/accepted.json", run)
+    main()
+    assert "Nothing changed" not in Page(INDEX).text
+    monkeypatch.setattr(renamed, "PARAMETERS", {"report.gap": "report.gap_percent"})
+    main()
+    assert "Nothing changed; no figure moved." in Page(INDEX).text
 
 
 def test_a_changed_parameter_code_file_and_artifact_are_each_named(accepted):

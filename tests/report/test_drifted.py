@@ -5,10 +5,11 @@ import re
 from pathlib import Path
 
 from pipeline.report.shared import provenance
-from pipeline.report.shared.verdict import Missing, Outcome, outcome
+from pipeline.report.shared.verdict import Missing
+from pipeline.report.temperature.verdict import rule
 from pipeline.store import artifacts
 from stages.report import main
-from tests.report.test_pages import INDEX, TEMPERATURE, Page, figures
+from tests.report.test_pages import DEPOSITION, INDEX, TEMPERATURE, Page, figures
 
 NIGHT = Path("reports/metrics/nightly.json")
 FIGURES = {
@@ -63,8 +64,21 @@ def test_an_alarm_fails_the_rule_for_every_controller_and_gives_the_cause(projec
     )
 
 
+def test_an_alarm_of_another_loop_s_camera_changes_nothing_that_is_said_of_this_one(project):
+    def shown():
+        """The pages, but for the hash of the night's own file."""
+        own = artifacts.sha256(NIGHT)
+        return [page.read_text().replace(own, "") for page in (INDEX, TEMPERATURE, DEPOSITION)]
+
+    night(figures=FIGURES)
+    calm = shown()
+    camera = {"loop": "setpoint", "cause": "the line stands out less", "sigmas": -9.0}
+    night(figures=FIGURES, alarms=[camera], watched=[camera])
+    assert shown() == calm
+
+
 def test_what_is_watched_is_undecided_and_a_night_without_recordings_measures_nothing(project):
-    assert night(watched=[{"cause": "the noise of sensor_2 grew"}]).startswith(
+    assert night(watched=[{"loop": "temperature", "cause": "the noise of sensor_2 grew"}]).startswith(
         "Perhaps. The noise of sensor_2 grew; an alarm where"
     )
     assert night().startswith("Not measured. The last night had no new recording")
@@ -78,7 +92,7 @@ def test_a_broken_file_of_the_night_is_said_so(project):
 
 
 def test_text_of_the_night_is_escaped(project):
-    night(alarms=[{"cause": "<script>alert(1)</script>"}])
+    night(alarms=[{"loop": "temperature", "cause": "<script>alert(1)</script>"}])
     assert "<script>alert" not in INDEX.read_text()
 
 
@@ -89,5 +103,5 @@ def test_a_later_night_is_no_change_of_what_the_pages_were_made_from(project):
 
 
 def test_drift_is_judged_by_the_night_alone():
-    assert outcome("drift", [], {}) == Outcome("drift", "not measured", None)
-    assert outcome("drift", [], {"drift": Missing("failed", "")}) == Outcome("drift", "failed", None)
+    assert rule("drift", [], {}).state == "not measured"
+    assert rule("drift", [], {"drift": Missing("failed", "")}).state == "failed"

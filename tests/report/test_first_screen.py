@@ -72,7 +72,11 @@ def long_sentences():
     made_setpoint.choice("x" * 300)
     artifacts.write_json(
         "reports/metrics/nightly.json",
-        {"run": "night-0003", "when": "2026-11-20T02", "drift": {"alarms": [{"cause": LONG}]}},
+        {
+            "run": "night-0003",
+            "when": "2026-11-20T02",
+            "drift": {"alarms": [{"loop": "temperature", "cause": LONG}]},
+        },
     )
     Path("reports/metrics/evaluate_temperature.json").write_text("{")
 
@@ -138,7 +142,15 @@ def hundred(folder):
         "datasets/ingest/record.parquet", tables.record(machine.inputs, machine.outputs), whole
     )
     names = [f"night_{k:03d}.mcap" for k in range(100)]
-    flaws = {"recording": names, "signal": ["zone_1"] * 100, "kind": ["spike"] * 100, "start_s": [10.0] * 100, "end_s": [12.0] * 100, "count": [2] * 100, "message": ["2 samples stand out"] * 100}  # fmt: skip
+    flaws = {
+        "recording": names,
+        "signal": ["zone_1"] * 100,
+        "kind": ["spike"] * 100,
+        "start_s": [10.0] * 100,
+        "end_s": [12.0] * 100,
+        "count": [2] * 100,
+        "message": ["2 samples stand out"] * 100,
+    }
     artifacts.write_table("datasets/ingest/quality.parquet", tables.QUALITY, flaws)
 
 

@@ -72,7 +72,7 @@ def test_two_hundred_revisions_are_drawn_within_ten_seconds_with_their_own_figur
     command(monkeypatch)
     # the bar; a quiet machine takes under one
     assert time.perf_counter() - started < 10
-    found = list(history.runs(500))
+    found = list(history.revisions(500))
     np.testing.assert_allclose(
         [run.figures["window"]["gap_percent"].value for run in found],
         [1 + k / 100 for k in range(200)],
@@ -91,14 +91,14 @@ def test_two_hundred_revisions_are_drawn_within_ten_seconds_with_their_own_figur
 
 def test_the_newest_are_taken_where_there_are_more_and_they_stay_in_their_order(empty, monkeypatch):
     commits([(f"run {k}", {"report.json": report(1 + k)}) for k in range(5)])
-    assert [run.subject for run in history.runs(2)] == ["run 3", "run 4"]
+    assert [run.subject for run in history.revisions(2)] == ["run 3", "run 4"]
 
 
 def test_figures_that_are_not_committed_come_last_and_equal_ones_do_not_come_twice(empty):
     commits([("one", {"report.json": report(1.0)}), ("two", {"report.json": report(2.0)})])
-    assert [run.subject for run in history.runs(9)] == ["one", "two"]
+    assert [run.subject for run in history.revisions(9)] == ["one", "two"]
     artifacts.write_metrics("report", report(3.0))
-    assert [run.subject for run in history.runs(9)] == ["one", "two", "not committed"]
+    assert [run.subject for run in history.revisions(9)] == ["one", "two", "not committed"]
 
 
 def test_a_revision_before_the_pages_kept_figures_is_read_from_its_scorecard_and_a_broken_one_leaves_a_gap(
@@ -127,7 +127,7 @@ def test_a_revision_before_the_pages_kept_figures_is_read_from_its_scorecard_and
             ("new", {"report.json": report(1.0)}),
         ]
     )
-    first, broken, new = history.runs(9)
+    first, broken, new = history.revisions(9)
     # by hand: the figures of made.controller, the largest gap of the
     # spread, the worse material after learning
     assert (

@@ -13,7 +13,7 @@ from pipeline.report.setpoint import verdict as setpoint_verdict
 from pipeline.report.setpoint import vision as setpoint_vision
 from pipeline.report.setpoint import why as setpoint_why
 from pipeline.report.shared.verdict import Figure, Question
-from pipeline.setpoint.reward import reward
+from pipeline.setpoint.simulator import reward
 from pipeline.setpoint.workflow.tables import PATHS
 from pipeline.store import artifacts, params
 from stages.report import main
@@ -45,12 +45,18 @@ def test_the_default_is_named_with_its_worst_case_and_its_lead_over_the_next(pro
     text = page()
     # by hand: 100 - 1.5 (0.2 + 5 x 0.1) = 98.95, and 97.6 for the next
     assert "Run the agent by default. All six rules passed." in text
-    assert "In its worst case (the paper’s simulator, accuracy 70 %, clog) 99.0 % of 2,100 runs settle and stay, 1.1 points more than of the next, the baseline “Bayes, robust”" in text  # fmt: skip
+    assert (
+        "In its worst case (the paper’s simulator, accuracy 70 %, clog) 99.0 % of 2,100 runs settle "
+        "and stay, 1.1 points more than of the next, the baseline “Bayes, robust”" in text
+    )
     assert re.search(r"<title>(.*?) ·", PAGE.read_text())[1] == "Setpoint: Run the agent by default"
 
 
 def test_what_may_be_claimed_stands_in_the_verdict_and_on_page_one(project):
-    claim = "The classifier is trained and judged on rendered frames: eight real pictures allow no claim about real printers."
+    claim = (
+        "The classifier is trained and judged on rendered frames: eight real pictures "
+        "allow no claim about real printers."
+    )
     assert claim in page() and claim in Page(INDEX).text
     sections = params.read("params.yaml")
     sections["train_classifier"]["source"] = "recordings"
@@ -247,9 +253,19 @@ def test_cases_are_said_in_words():
 def test_two_hundred_starts_and_a_thousand_decisions_stay_within_the_size_of_a_page(project):
     made_setpoint.decisions(steps=1000)
     rows = 40_000
-    table = {"controller": ["our agent"] * rows, "simulator": ["paper"] * rows, "case": ["accuracy 0.7"] * rows, "start": np.repeat(np.arange(200), 200), "step": np.tile(np.arange(200), 200)}  # fmt: skip
+    table = {
+        "controller": ["our agent"] * rows,
+        "simulator": ["paper"] * rows,
+        "case": ["accuracy 0.7"] * rows,
+        "start": np.repeat(np.arange(200), 200),
+        "step": np.tile(np.arange(200), 200),
+    }
     walk = 100 + 20 * np.random.default_rng(0).standard_normal(rows)
-    artifacts.write_table("datasets/evaluate_setpoint/paths.parquet", PATHS, table | {"flow_percent": walk, "temperature_degC": 210 + walk / 20})  # fmt: skip
+    artifacts.write_table(
+        "datasets/evaluate_setpoint/paths.parquet",
+        PATHS,
+        table | {"flow_percent": walk, "temperature_degC": 210 + walk / 20},
+    )
     main()
     # the limit of a page: 1.5 MB
     assert figures()["bytes"]["setpoint"] <= 1_500_000

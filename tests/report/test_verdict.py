@@ -4,6 +4,9 @@ import math
 
 import pytest
 
+from pipeline.report.deposition.verdict import verdict as deposition
+from pipeline.report.identification.model import trust
+from pipeline.report.setpoint.verdict import verdict as setpoint
 from pipeline.report.shared.verdict import (
     FAILED,
     OPEN,
@@ -11,15 +14,19 @@ from pipeline.report.shared.verdict import (
     UNDECIDED,
     Figure,
     Missing,
+    Question,
     ReportRules,
-    decide,
-    questions,
+    Rule,
+    Verdict,
+    deciding,
+    overall,
     share,
     state,
-    undecided,
-    winner,
 )
+from pipeline.report.temperature.judgement import judgement
+from pipeline.report.temperature.verdict import decide, questions, undecided, winner
 from pipeline.store import params
+from stages import report
 
 RULES = ReportRules(
     gap_percent=5.0,
@@ -86,6 +93,40 @@ def roles(data_driven=None, model_based=None, baseline=None):
 )
 def test_a_band_inside_passes_outside_fails_and_one_that_straddles_is_undecided(key, figure, expected):
     assert state(BY_KEY[key], figure) == expected
+
+
+def rule(name: str, figure: Figure | Missing) -> Rule:
+    return Rule(name, Question(0, "", name, "%", 5.0, False, name), figure)
+
+
+def test_one_engine_for_every_loop_the_first_rule_of_the_gravest_state_decides():
+    passed, failed = rule("passed", Figure(1.0, 1.0, 1.0)), rule("failed", Figure(9.0, 8.0, 10.0))
+    unsure, unmeasured = (
+        rule("unsure", Figure(5.0, 4.0, 6.0)),
+        rule("unmeasured", Missing("not measured", "")),
+    )
+    assert [one.state for one in (passed, failed, unsure, unmeasured)] == [PASSED, FAILED, UNDECIDED, OPEN]
+    assert deciding([passed, unmeasured, unsure, failed, rule("later", failed.figure)]).name == "failed"
+    assert deciding([passed, unmeasured, unsure]).name == "unsure"
+    assert deciding([passed]) is None
+    # what is undecided holds a loop up as what was not measured does, and fails it as little
+    assert overall([PASSED]) == PASSED
+    assert overall([PASSED, UNDECIDED]) == OPEN
+    assert overall([OPEN, FAILED]) == FAILED
+
+
+def test_the_verdict_of_every_loop_has_the_same_fields(project, monkeypatch):
+    caught = []
+    monkeypatch.setattr(report, "judgement", lambda sources: caught.append(sources) or judgement(sources))
+    report.main()
+    sources = caught[0]
+    verdicts = [judgement(sources).verdict, deposition(sources), setpoint(sources), trust(sources)]
+    assert [one.loop for one in verdicts] == ["temperature", "deposition", "setpoint", "identification"]
+    assert {type(one) for one in verdicts} == {Verdict}
+    for one in verdicts:
+        assert one.rules and {type(rule) for line in one.rules for rule in line} == {Rule}
+        assert (one.rule == "") == (one.state == PASSED) or one.loop == "identification"
+        assert one.rule in {"", *(line[0].name for line in one.rules)}
 
 
 def test_share_of_the_allowance_is_inverted_where_more_is_better():

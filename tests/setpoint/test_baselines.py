@@ -24,11 +24,20 @@ from tests.setpoint.synthetic import synthetic_table
 
 KEY = jax.random.key(0)
 PURE = {0: [0.76, 0.17, 0.07], 1: [0.15, 0.7, 0.15], 2: [0.07, 0.17, 0.76]}  # the mean window of each class
-ROBUST = {
-    "accuracies": [0.7, 0.97], "gains": [1.0, 0.65], "looks": 5, "look": 0.055, "floor": 0.03,
-    "smoothing": 4.0, "segment": 12.0, "switch": 3e-4, "repeats": 0.3, "hazard": 6e-4, "move_cost": 0.38,
-    "outside_cost": 5.0,
-}  # fmt: skip
+ROBUST = bayes.CameraErrorModel(
+    accuracies=[0.7, 0.97],
+    gains=[1.0, 0.65],
+    width_bias_levels=5,
+    width_bias_std=0.055,
+    floor=0.03,
+    smoothing=4.0,
+    segment_mean_decisions=12.0,
+    mode_switch_probability=3e-4,
+    window_repeat_probability=0.3,
+    hazard=6e-4,
+    move_cost=0.38,
+    outside_cost=5.0,
+)
 EXACT = {"accuracy": 0.7, "hazard": 0.0, "move_cost": 0.0, "outside_cost": 0.0}
 
 
@@ -111,8 +120,8 @@ def test_the_sequential_test_moves_when_one_class_leads_good_by_its_threshold():
 
 
 def test_the_exact_filter_is_bayes_rule_over_every_start():
-    parameters, controller, believed = bayes.class_filter(**EXACT), bayes.bayes(1), jax.jit(bayes.believed)
-    rng, known = np.random.default_rng(0), controller.start()
+    parameters, controller, update = bayes.class_filter(**EXACT), bayes.bayes(1), jax.jit(bayes.filter_update)
+    rng, state = np.random.default_rng(0), controller.start()
     flow, prior = bayes.GRID.copy(), bayes.PRIOR.copy()
     for t in range(12):
         move = float(rng.choice(FLOW_MOVES)) if t else 0.0
@@ -120,22 +129,22 @@ def test_the_exact_filter_is_bayes_rule_over_every_start():
         flow = np.clip(flow + move, 20, 310)
         true = np.where(flow < 90, 0, np.where(flow > 110, 2, 1))
         prior = prior * np.where(true == named, 0.7, 0.15)
-        known = believed(parameters, known, seen(named, move=move))
+        state = update(parameters, state, seen(named, move=move))
     expected = np.zeros(len(bayes.GRID))
     np.add.at(expected, np.rint((flow - 20) / bayes.SPACING).astype(int), prior / prior.sum())
-    np.testing.assert_allclose(known.belief[0], expected, atol=1e-6)  # float32
+    np.testing.assert_allclose(state.belief[0], expected, atol=1e-6)  # float32
 
 
 def test_a_part_of_a_spacing_moves_the_mean_by_as_much_and_loses_nothing():
     belief = jnp.zeros((2, len(bayes.GRID))).at[0, 40].set(0.3).at[1, 50].set(0.7)
     for move in (-6.0, -0.5, 0.0, 1.2, 6.0):
-        moved = np.asarray(bayes.shifted(belief, jnp.float32(move)))
+        moved = np.asarray(bayes.predict_shift(belief, jnp.float32(move)))
         np.testing.assert_allclose(moved.sum(axis=1), [0.3, 0.7], rtol=1e-6)
         np.testing.assert_allclose(
             moved @ bayes.GRID / moved.sum(axis=1), bayes.GRID[[40, 50]] + move, rtol=1e-6
         )
     np.testing.assert_allclose(
-        np.asarray(bayes.shifted(belief, jnp.float32(400.0)))[:, -1], [0.3, 0.7], rtol=1e-6
+        np.asarray(bayes.predict_shift(belief, jnp.float32(400.0)))[:, -1], [0.3, 0.7], rtol=1e-6
     )
 
 
@@ -153,7 +162,7 @@ def test_the_move_is_the_one_with_the_least_expected_loss():
 
 
 def test_evidence_sums_to_one_for_every_flow_and_transitions_for_every_hypothesis(table):
-    parameters = bayes.robust_filter(table, **ROBUST)
+    parameters = bayes.robust_filter(table, ROBUST)
     assert parameters.evidence.shape == (14, bayes.CODES, len(bayes.GRID))
     np.testing.assert_allclose(parameters.evidence.sum(axis=1), 1.0, rtol=1e-5)  # float32
     np.testing.assert_allclose(parameters.transition.sum(axis=1), 1.0, rtol=1e-6)
@@ -181,7 +190,7 @@ def test_codes_tell_the_classes_apart_and_rise_with_the_flow():
 def test_a_thin_looking_segment_is_told_from_a_low_flow_by_its_end(table):
     """Two hundred good windows, then three that lean to under: a segment that looks thin explains them, and
     the flow stays; eight that name under move it."""
-    controller, parameters = bayes.bayes(14), bayes.robust_filter(table, **ROBUST)
+    controller, parameters = bayes.bayes(14), bayes.robust_filter(table, ROBUST)
     act, memory = jax.jit(controller.act), controller.start()
     answers = []
     for shares in [[0.02, 0.96, 0.02]] * 200 + [[0.1, 0.89, 0.01]] * 3 + [[0.9, 0.1, 0.0]] * 8:
@@ -200,7 +209,7 @@ def test_a_weak_extruder_moves_its_own_hypothesis_by_less_and_asks_for_more(tabl
     )
     belief = jnp.zeros((2, len(bayes.GRID))).at[:, 16].set(0.5)  # 60 %, either way of following
     after = np.asarray(
-        bayes.believed(parameters, bayes.Known(belief, jnp.int32(-1)), seen(1, move=10.0)).belief
+        bayes.filter_update(parameters, bayes.FilterState(belief, jnp.int32(-1)), seen(1, move=10.0)).belief
     )
     np.testing.assert_allclose(after @ bayes.GRID / after.sum(axis=1), [70.0, 65.0], rtol=1e-6)
     # from 60 % a move of 10 leaves a miss of 30 where the extruder follows, of 35 where it follows by half
@@ -212,45 +221,54 @@ def test_a_weak_extruder_moves_its_own_hypothesis_by_less_and_asks_for_more(tabl
 def test_an_extruder_that_follows_by_half_is_found_out(table):
     """Moves of + 10 % from 60 %: the windows name good four moves later where the
     extruder follows, eight later where it follows by half."""
-    parameters = bayes.robust_filter(table, **{**ROBUST, "gains": [1.0, 0.5]})
-    known, one = bayes.bayes(14).start(), jax.jit(bayes.believed)
+    parameters = bayes.robust_filter(table, ROBUST._replace(gains=[1.0, 0.5]))
+    state, one = bayes.bayes(14).start(), jax.jit(bayes.filter_update)
     for k in range(24):
         named = 0 if k < 8 else 1 if k < 12 else 2
-        known = one(parameters, known, seen(named, move=10.0 if k else 0.0, step=k))
-    weak = float(known.belief[7:].sum())
-    known = bayes.bayes(14).start()
+        state = one(parameters, state, seen(named, move=10.0 if k else 0.0, step=k))
+    weak = float(state.belief[7:].sum())
+    state = bayes.bayes(14).start()
     for k in range(14):
         named = 0 if k < 4 else 1 if k < 6 else 2
-        known = one(parameters, known, seen(named, move=10.0 if k else 0.0, step=k))
+        state = one(parameters, state, seen(named, move=10.0 if k else 0.0, step=k))
     assert weak > 0.8
-    assert float(known.belief[7:].sum()) < 0.6
+    assert float(state.belief[7:].sum()) < 0.6
 
 
 def test_a_window_that_repeats_is_a_weaker_witness_by_the_rule_and_one_that_differs_a_full_one():
     evidence = np.full((1, bayes.CODES, len(bayes.GRID)), 0.01)
-    parameters = bayes.Filter(jnp.asarray(evidence, jnp.float32).at[:, :, 32].set(0.2), jnp.ones((1, 1)), jnp.ones((1, 1)), jnp.ones(1), jnp.array([0.4]), 0.0, 0.0, 0.0)  # fmt: skip
-    start = bayes.Known(jnp.full((1, len(bayes.GRID)), 1 / len(bayes.GRID)), jnp.int32(-1))
+    parameters = bayes.Filter(
+        evidence=jnp.asarray(evidence, jnp.float32).at[:, :, 32].set(0.2),
+        transition=jnp.ones((1, 1)),
+        after_jump=jnp.ones((1, 1)),
+        gains=jnp.ones(1),
+        window_repeat_probability=jnp.array([0.4]),
+        hazard=0.0,
+        move_cost=0.0,
+        outside_cost=0.0,
+    )
+    start = bayes.FilterState(jnp.full((1, len(bayes.GRID)), 1 / len(bayes.GRID)), jnp.int32(-1))
 
-    def ratio(known):
-        return float(known.belief[0, 32] / known.belief[0, 10])
+    def ratio(state):
+        return float(state.belief[0, 32] / state.belief[0, 10])
 
-    first = bayes.believed(parameters, start, seen(1))
+    first = bayes.filter_update(parameters, start, seen(1))
     assert ratio(first) == pytest.approx(20.0, rel=1e-5)  # 0.2 / 0.01: nothing came before it
-    same, other = (bayes.believed(parameters, first, seen(named)) for named in (1, 2))
+    same, other = (bayes.filter_update(parameters, first, seen(named)) for named in (1, 2))
     assert ratio(same) / ratio(first) == pytest.approx((0.4 + 0.6 * 0.2) / (0.4 + 0.6 * 0.01), rel=1e-5)
     assert ratio(other) / ratio(first) == pytest.approx(20.0, rel=1e-5)
-    moved = bayes.believed(
+    moved = bayes.filter_update(
         parameters, first, seen(1, move=5.0)
     )  # what stood at 95 % is at 100 now: a repeat after a move is a full witness
     assert float(moved.belief[0, 32] / moved.belief[0, 10]) == pytest.approx(20.0, rel=1e-5)
-    assert int(first.last) == int(bayes.code(seen(1).shares, seen(1).named))
+    assert int(first.last_code) == int(bayes.code(seen(1).shares, seen(1).named))
 
 
 def test_a_jump_of_the_flow_leaves_open_how_the_extruder_follows(table):
-    parameters = bayes.robust_filter(table, **{**ROBUST, "hazard": 1.0})
-    sure = bayes.Known(bayes.bayes(14).start().belief.at[7:].set(0.0), jnp.int32(-1))
+    parameters = bayes.robust_filter(table, ROBUST._replace(hazard=1.0))
+    sure = bayes.FilterState(bayes.bayes(14).start().belief.at[7:].set(0.0), jnp.int32(-1))
     blind = parameters._replace(evidence=jnp.ones_like(parameters.evidence))
-    shares = np.asarray(bayes.believed(blind, sure, seen(1)).belief.sum(axis=1)).reshape(2, 7)
+    shares = np.asarray(bayes.filter_update(blind, sure, seen(1)).belief.sum(axis=1)).reshape(2, 7)
     np.testing.assert_allclose(shares.sum(axis=1), 0.5, rtol=1e-5)
     np.testing.assert_allclose(shares[0], shares[1], rtol=1e-5)
 
@@ -285,8 +303,10 @@ def score(controller, parameters, windows, conditions, seed=0):
 
 
 def test_the_robust_filter_holds_its_bars_on_the_paper_s_windows_with_a_clog(table):
-    controller, parameters = bayes.bayes(14), bayes.robust_filter(table, **ROBUST)
-    windows, conditions = judging.cases(recorded_windows(table), runs=6, segment=10.0)["accuracy 0.7, clog"]
+    controller, parameters = bayes.bayes(14), bayes.robust_filter(table, ROBUST)
+    windows, conditions = judging.cases(recorded_windows(table), runs=6, segment_mean_decisions=10.0)[
+        "accuracy 0.7, clog"
+    ]
     found = score(controller, parameters, windows, conditions)
     # 98.5 and 96.9 on 2,100 runs; of 126 runs the deviation is 1.5 points
     assert found.settled.percent >= 95
@@ -324,10 +344,10 @@ def test_the_trial_s_figures_come_out():
 
 @pytest.mark.slow
 def test_the_robust_filter_holds_every_bar_of_the_default(table):
-    controller, parameters = bayes.bayes(14), bayes.robust_filter(table, **ROBUST)
+    controller, parameters = bayes.bayes(14), bayes.robust_filter(table, ROBUST)
     unseen = recorded_windows(synthetic_table(np.random.default_rng(11), segments=30, windows=10))
     for number, (case, (windows, conditions)) in enumerate(
-        judging.cases(unseen, runs=100, segment=10.0).items()
+        judging.cases(unseen, runs=100, segment_mean_decisions=10.0).items()
     ):
         found = score(controller, parameters, windows, conditions, seed=number)
         assert found.settled.percent >= 97, case

@@ -10,8 +10,8 @@ import scipy.special
 
 from benchmarks.classifier import judge
 from pipeline.setpoint.calibration import (
+    ClassifierOutputs,
     Familiar,
-    Seen,
     appearance,
     auroc,
     calibrate,
@@ -212,7 +212,10 @@ def test_the_level_by_hand():
 
 def test_too_few_segments_promise_nothing():
     logits, label = draw(200, seed=0)
-    expected = "sets that cover 95% with confidence 80% need at least 32 calibration segments but found 20; film more, or ask for less"
+    expected = (
+        "sets that cover 95% with confidence 80% need at least 32 calibration segments but found 20; "
+        "film more, or ask for less"
+    )
     with pytest.raises(ValueError, match=expected):
         conformal_level(
             scipy.special.softmax(logits, axis=1), label, np.arange(200) % 20, coverage=0.95, confidence=0.8
@@ -282,7 +285,7 @@ def test_blur_and_a_turned_key_area_look_unlike_beads_and_light_does_not_matter(
 # ---- all of it together
 
 
-def frames(segments: int, *, seed: int) -> Seen:
+def frames(segments: int, *, seed: int) -> ClassifierOutputs:
     """Segments of 20 frames: a frame shows its flow with an error of its own and one of its segment, as if
     both were its own, and 1.7 times as sure as that allows."""
     rng = np.random.default_rng(seed)
@@ -291,7 +294,7 @@ def frames(segments: int, *, seed: int) -> Seen:
     logits = -1.7 * (shown[:, :, None] - np.arange(3)) ** 2 / (2 * (0.4**2 + 0.5**2))
     features = shown[:, :, None] + 0.1 * rng.normal(size=(segments, 20, 4))
     valid = rng.random((segments, 20)) > 0.06
-    return Seen(
+    return ClassifierOutputs(
         logits.reshape(-1, 3),
         features.reshape(-1, 4),
         np.repeat(label, 20),
@@ -322,7 +325,10 @@ def test_frames_that_share_an_error_are_calibrated_alone_and_in_windows_on_segme
 def test_segments_shorter_than_a_window_are_refused():
     with pytest.raises(
         ValueError,
-        match="expected a segment with 21 frames in a row of one class but found none among 200 frames; film longer ones",
+        match=(
+            "expected a segment with 21 frames in a row of one class but found none among 200 frames; "
+            "film longer ones"
+        ),
     ):
         calibrate(
             frames(10, seed=0), frames(10, seed=1), length=21, coverage=0.9, confidence=0.5, false_alarms=0.05

@@ -13,6 +13,7 @@ from pipeline.setpoint import classifier
 from pipeline.setpoint.classifier import (
     Labelled,
     Rates,
+    TrainingSettings,
     adr,
     along_bead,
     checked,
@@ -55,11 +56,17 @@ def stripes(segments: int, frames: int, *, seed: int) -> Labelled:
     return Labelled(area, rng.choice([190.0, 210.0, 230.0], len(label)), label, segment)
 
 
-SETTINGS = {
-    "key": KEY, "cycle_epochs": 4, "warmup_epochs": 1, "batch": 16, "learning_rate": 3e-3,
-    "weight_decay": 0.01, "smoothing": 0.0, "averaging": 0.9,
-    "patience": 10, "augment": along_bead,
-}  # fmt: skip
+SETTINGS = TrainingSettings(
+    cycle_epochs=4,
+    warmup_epochs=1,
+    batch=16,
+    learning_rate=3e-3,
+    weight_decay=0.01,
+    smoothing=0.0,
+    averaging=0.9,
+    patience=10,
+)
+DRAW = {"key": KEY, "augment": along_bead}
 
 
 @functools.cache
@@ -71,7 +78,8 @@ def parts() -> tuple[Labelled, Labelled]:
 def trained():
     """Four epochs of the tiny network, and the states that it handed out."""
     states = []
-    return train(untrained(drawn(TINY), epochs=4), *parts(), on_step=states.append, **SETTINGS), states
+    start = untrained(drawn(TINY), epochs=4)
+    return train(start, *parts(), SETTINGS, on_step=states.append, **DRAW), states
 
 
 def same(a, b) -> bool:
@@ -175,7 +183,10 @@ def test_weights_survive_as_named_arrays():
 
 def test_weights_of_another_architecture_are_refused_by_the_first_array_that_differs():
     arrays = named_arrays(drawn(TINY))
-    expected = "weights of another architecture: body.blocks.0.attended.W is expected of shape (12, 12) but found of shape (8, 8); load them into"
+    expected = (
+        "weights of another architecture: body.blocks.0.attended.W is expected of shape (12, 12) but "
+        "found of shape (8, 8); load them into"
+    )
     with pytest.raises(ValueError, match=re.escape(expected)):
         from_named_arrays(drawn(TINY._replace(width=12)), arrays)
     with pytest.raises(
@@ -227,7 +238,10 @@ def test_one_print_or_too_few_allow_no_split():
         split_by_segment(data._replace(segment=np.zeros(24)), shares=(0.5, 0.5), rng=np.random.default_rng(0))
     with pytest.raises(
         ValueError,
-        match=r"6 segments do not let each of 3 parts hold every class: part \d has none of class \d, .* film more prints",
+        match=(
+            r"6 segments do not let each of 3 parts hold every class: part \d has none of class \d, .* "
+            r"film more prints"
+        ),
     ):
         split_by_segment(data, shares=(0.4, 0.3, 0.3), rng=np.random.default_rng(0))
 
@@ -259,7 +273,7 @@ def test_data_that_no_classifier_can_learn_from_is_refused_in_a_sentence():
         ValueError,
         match=r"6 segments are both learned and held out, the first 0; split with split_by_segment",
     ):
-        train(untrained(drawn(TINY), epochs=1), data, data, **SETTINGS)
+        train(untrained(drawn(TINY), epochs=1), data, data, SETTINGS, **DRAW)
 
 
 # ---- augmentation
@@ -319,8 +333,8 @@ def test_the_loss_by_hand():
 
 
 def test_a_tiny_network_learns_widths_that_anyone_can_see():
-    settings = SETTINGS | {"learning_rate": 1e-2, "cycle_epochs": 30, "patience": 30}
-    state = train(untrained(drawn(TINY), epochs=30), *parts(), **settings)
+    settings = SETTINGS._replace(learning_rate=1e-2, cycle_epochs=30, patience=30)
+    state = train(untrained(drawn(TINY), epochs=30), *parts(), settings, **DRAW)
     test = stripes(30, 10, seed=5)
     assert (
         np.mean(predict(state.best, test.key_area, test.temperature_degC).logits.argmax(axis=1) == test.label)
@@ -331,9 +345,9 @@ def test_a_tiny_network_learns_widths_that_anyone_can_see():
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_does_not():
-    again = train(untrained(drawn(TINY), epochs=4), *parts(), **SETTINGS)
+    again = train(untrained(drawn(TINY), epochs=4), *parts(), SETTINGS, **DRAW)
     assert same(again, trained()[0])
-    other = train(untrained(drawn(TINY), epochs=4), *parts(), **SETTINGS | {"key": jax.random.key(1)})
+    other = train(untrained(drawn(TINY), epochs=4), *parts(), SETTINGS, **DRAW | {"key": jax.random.key(1)})
     assert not same(other.network, again.network)
 
 
@@ -341,7 +355,8 @@ def test_training_that_was_killed_resumes_to_the_very_same_weights():
     whole, states = trained()
     assert [int(s.epoch) for s in states] == [1, 2, 3, 4]
     checkpoint = named_arrays(states[1])
-    resumed = train(from_named_arrays(untrained(drawn(TINY, 9), epochs=4), checkpoint), *parts(), **SETTINGS)
+    start = from_named_arrays(untrained(drawn(TINY, 9), epochs=4), checkpoint)
+    resumed = train(start, *parts(), SETTINGS, **DRAW)
     assert same(resumed, whole)
 
 
@@ -372,8 +387,9 @@ def test_training_ends_when_the_held_out_loss_has_not_improved_for_patience_epoc
         untrained(drawn(TINY), epochs=40),
         learned,
         shuffled,
+        SETTINGS._replace(patience=3, averaging=0.0, cycle_epochs=40),
         on_step=states.append,
-        **SETTINGS | {"patience": 3, "averaging": 0.0, "cycle_epochs": 40},
+        **DRAW,
     )
     assert int(state.epoch) == int(state.best_epoch) + 4 < 40
     assert same(state.best, states[int(state.best_epoch) - 1].average)
@@ -385,10 +401,10 @@ def test_training_that_diverges_says_so():
         ValueError,
         match=r"no epoch of 4 had a held-out loss that is a number; lower the learning rate of 1e\+30",
     ):
-        train(untrained(drawn(TINY), epochs=4), *parts(), **SETTINGS | {"learning_rate": 1e30})
+        train(untrained(drawn(TINY), epochs=4), *parts(), SETTINGS._replace(learning_rate=1e30), **DRAW)
 
 
 def test_without_averaging_the_weights_themselves_are_judged():
-    state = train(untrained(drawn(TINY), epochs=1), *parts(), **SETTINGS | {"averaging": 0.0})
+    state = train(untrained(drawn(TINY), epochs=1), *parts(), SETTINGS._replace(averaging=0.0), **DRAW)
     assert same(state.average, state.network)
     assert not same(trained()[0].average, trained()[0].network)

@@ -291,11 +291,17 @@ def test_one_print_allows_no_honest_split_and_every_class_is_needed(made):
     check(made, found)
     with pytest.raises(
         ValueError,
-        match=r"no honest split: expected valid frames of at least 2 prints.*found 1 \(0\); add another print",
+        match=(
+            r"no honest split: expected valid frames of at least 2 prints.*found 1 \(0\); add another "
+            r"print"
+        ),
     ):
         check(made, found._replace(valid=found.valid & (found.print_number == 0)))
     with pytest.raises(
         ValueError,
-        match=r"found none of class 2, over \(above 110 %\), in \d+ with flow_rate 60 to 100 percent.*; add prints",
+        match=(
+            r"found none of class 2, over \(above 110 %\), in \d+ with flow_rate 60 to 100 percent.*; "
+            r"add prints"
+        ),
     ):
         check(made, found._replace(valid=found.valid & (found.label < 2)))

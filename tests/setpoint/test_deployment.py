@@ -205,7 +205,10 @@ def test_limits_by_hand():
 def test_a_start_outside_the_box_is_refused():
     with pytest.raises(
         ValueError,
-        match=r"expected a start within \[ 20. 180.\] to \[310. 240.\] .* found \[330. 210.\]; bring the machine there by hand",
+        match=(
+            r"expected a start within \[ 20. 180.\] to \[310. 240.\] .* found \[330. 210.\]; bring the "
+            r"machine there by hand"
+        ),
     ):
         setpoints(np.array([[100.0, 210.0], [330.0, 210.0]]), LIMITS)
 
@@ -283,7 +286,10 @@ def test_autocorrelation_reads_past_rejected_frames():
     )  # between / (between + within) variance; 3,000 segments
     with pytest.raises(
         ValueError,
-        match="expected errors .* that are not all alike, found .*; take longer segments, and flows near the class borders",
+        match=(
+            "expected errors .* that are not all alike, found .*; take longer segments, and flows near "
+            "the class borders"
+        ),
     ):
         autocorrelation(np.zeros((5, 40)), longest=20)
 

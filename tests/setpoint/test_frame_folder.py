@@ -292,9 +292,17 @@ def test_the_real_frames_in_a_folder_as_users_have_them(shared, tmp_path):
         (tmp_path / "raw").mkdir(exist_ok=True)
         shutil.copy(shared(f"data/caxton_samples/full/sample{name}.jpg"), tmp_path / "raw")
         flow, heat = (50, 100, 150)[int(name[0])], (190, 210, 230)[int(name[3])]
-        lines.append({"img_path": f"data/full/sample{name}.jpg", "flow_rate": f"{flow}", "target_hotend": f"{heat}", "nozzle_tip_x": f"{tip[0]}",
-                      "nozzle_tip_y": f"{tip[1]}", "print_id": f"{k}",
-                      "flow_rate_class": name[0]})  # fmt: skip
+        lines.append(
+            {
+                "img_path": f"data/full/sample{name}.jpg",
+                "flow_rate": f"{flow}",
+                "target_hotend": f"{heat}",
+                "nozzle_tip_x": f"{tip[0]}",
+                "nozzle_tip_y": f"{tip[1]}",
+                "print_id": f"{k}",
+                "flow_rate_class": name[0],
+            }
+        )
     table(tmp_path / "raw/log.csv", lines)
     found = read(tmp_path / "raw")
     valid = dict(zip(tips, found.valid.tolist(), strict=True))

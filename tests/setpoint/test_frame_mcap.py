@@ -133,9 +133,16 @@ def test_what_cannot_be_written_is_refused_and_leaves_nothing(tmp_path, changes,
 
 
 def test_a_setpoint_holds_until_the_next_and_nothing_is_known_before_the_first(tmp_path):
-    film(tmp_path / "raw/a.mcap", frames=((k / 10, frame) for k, (_, frame) in enumerate(pictures())), time_s=np.array([0.35, 0.8]),
-         flow_percent=np.array([80.0, 120.0]), temperature_degC=np.full(2, 200.0), print_id=None,
-         tip_x_px=None, tip_y_px=None)  # fmt: skip
+    film(
+        tmp_path / "raw/a.mcap",
+        frames=((k / 10, frame) for k, (_, frame) in enumerate(pictures())),
+        time_s=np.array([0.35, 0.8]),
+        flow_percent=np.array([80.0, 120.0]),
+        temperature_degC=np.full(2, 200.0),
+        print_id=None,
+        tip_x_px=None,
+        tip_y_px=None,
+    )
     found = read(tmp_path / "raw", tip=(175, 175))
     # frames at 0, 0.1, ... 1.7 s
     assert found.reasons[:4] == ["no flow is known"] * 4
@@ -147,8 +154,16 @@ def test_a_setpoint_holds_until_the_next_and_nothing_is_known_before_the_first(t
 def test_a_measured_temperature_ends_no_segment_and_is_said_to_be_one(tmp_path):
     long = np.arange(60) / RATE
     still = ((k / RATE, np.roll(frame, k, 1)) for k, (_, frame) in enumerate([*pictures()] * 4) if k < 60)
-    film(tmp_path / "raw/a.mcap", frames=still, time_s=long, flow_percent=np.full(60, 100.0), temperature_degC=205 + np.sin(long), print_id=None,
-         tip_x_px=None, tip_y_px=None)  # fmt: skip
+    film(
+        tmp_path / "raw/a.mcap",
+        frames=still,
+        time_s=long,
+        flow_percent=np.full(60, 100.0),
+        temperature_degC=205 + np.sin(long),
+        print_id=None,
+        tip_x_px=None,
+        tip_y_px=None,
+    )
     found = read(tmp_path / "raw", tip=(175, 175))
     assert set(found.segment) == {0}
     assert "changes all the time" in "\n".join(note.message for note in found.notes)

@@ -74,7 +74,7 @@ def test_every_start_comes_as_often_in_every_case():
     all_cases = cases(
         recorded_windows(synthetic_table(np.random.default_rng(0), segments=1, windows=1)),
         runs=3,
-        segment=10.0,
+        segment_mean_decisions=10.0,
     )
     assert len(all_cases) == 12
     for _, conditions in all_cases.values():
@@ -129,7 +129,10 @@ def test_of_two_with_one_worst_case_the_better_mean_wins():
 def test_controllers_judged_on_different_cases_are_not_compared():
     with pytest.raises(
         ValueError,
-        match=r"expected every controller judged on the same cases, found \[\['x'\], \['y'\]\]; judge all on all",
+        match=(
+            r"expected every controller judged on the same cases, found \[\['x'\], \['y'\]\]; judge all "
+            r"on all"
+        ),
     ):
         choose({"a": {"x": scored(90.0)}, "b": {"y": scored(90.0)}})
 

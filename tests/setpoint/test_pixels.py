@@ -22,16 +22,6 @@ LIMITS = Limits(
 JUDGE = functools.partial(
     deployment.judge_window, least_frames=4, correlation=0.45, foreign_above=5.0, conformal_level=0.15
 )
-LOOP = Loop(
-    frames=8,
-    frame_rate_hz=20.0,
-    waits=Waits(6.0, 6.0, 6.0),
-    limits=LIMITS,
-    judge=JUDGE,
-    least_score=10.0,
-    tip_tolerance_px=4.0,
-    segment_s=20.0,
-)
 TICK = 0.05
 
 
@@ -97,7 +87,7 @@ def test_a_hotter_melt_lets_go_of_what_it_holds_and_then_flows_as_it_is_fed():
 # ---- the loop, with a scene of one number in place of pictures
 
 
-def _see(images, temperature):
+def _classify(images, temperature):
     """Class probabilities from a width in percent that stands in a key area's first
     two bytes; a key area without a width is foreign."""
     width = images[:, 0, 0] + 256.0 * images[:, 0, 1]
@@ -105,23 +95,38 @@ def _see(images, temperature):
     return np.stack([under, np.clip(1 - under - over, 0, 1), over], axis=1), np.where(width > 0, 0.0, 9.0)
 
 
+LOOP = Loop(
+    machine=MACHINE,
+    classify=_classify,
+    frames=8,
+    frame_rate_hz=20.0,
+    waits=Waits(6.0, 6.0, 6.0),
+    limits=LIMITS,
+    judge=JUDGE,
+    least_score=10.0,
+    tip_tolerance_px=4.0,
+    segment_mean_s=20.0,
+)
+
+
 @pytest.fixture
 def numbers(monkeypatch):
     """A scene and front end of one number: the bead's width in percent, 5 %
     off for a segment, 8 % an image; blurred, it is 0."""
 
-    def seen(segments, templates, flow, temperature, loop, disturbances, decision, rngs, draw):
+    def areas(cameras, flow, temperature, loop, disturbances, decision, draw):
         images = np.zeros((*flow.shape, 16, 48), np.uint8)
-        for i, rng in enumerate(rngs):
+        for i, rng in enumerate(cameras.rngs):
             burst = 0 <= decision - disturbances.burst_at[i] < disturbances.burst_for[i]
-            width = flow[i] * (1 + segments[i]) * (1 + 0.08 * rng.normal(size=loop.frames)) * (not burst)
+            width = (
+                flow[i] * (1 + cameras.segments[i]) * (1 + 0.08 * rng.normal(size=loop.frames)) * (not burst)
+            )
             images[i, :, 0, 0], images[i, :, 0, 1] = width % 256, width // 256
-        return pixels._Seen(
-            images, np.stack([rng.random(loop.frames) > 0.06 for rng in rngs]), np.zeros(len(rngs), bool), {}
-        )
+        valid = np.stack([rng.random(loop.frames) > 0.06 for rng in cameras.rngs])
+        return pixels._WindowAreas(images, valid, np.zeros(len(valid), bool), {})
 
     monkeypatch.setattr(pixels, "_next_segment", lambda segment, rng: 0.05 * rng.normal())
-    monkeypatch.setattr(pixels, "_seen", seen)
+    monkeypatch.setattr(pixels, "_window_areas", areas)
 
 
 def _filtered(parameters, memory, observation, key):
@@ -143,41 +148,25 @@ STARTS = np.array(
 
 
 def test_all_starts_settle(numbers):
-    got = run(
-        FILTERED, None, _see, STARTS, MACHINE, LOOP, calm(21), decisions=60, rng=np.random.default_rng(0)
-    )
+    got = run(FILTERED, None, STARTS, LOOP, calm(21), decisions=60, rng=np.random.default_rng(0))
     assert (pixels.settled_since(got) <= 50).mean() >= 0.95
     assert got.flow.shape == (21, 61)
 
 
 def test_each_episode_is_its_own_and_the_same_again(numbers):
-    got = run(
-        FILTERED, None, _see, STARTS, MACHINE, LOOP, calm(21), decisions=8, rng=np.random.default_rng(0)
-    )
-    few = run(
-        FILTERED, None, _see, STARTS[:3], MACHINE, LOOP, calm(3), decisions=8, rng=np.random.default_rng(0)
-    )
+    got = run(FILTERED, None, STARTS, LOOP, calm(21), decisions=8, rng=np.random.default_rng(0))
+    few = run(FILTERED, None, STARTS[:3], LOOP, calm(3), decisions=8, rng=np.random.default_rng(0))
     np.testing.assert_array_equal(few.flow, got.flow[:3])
     np.testing.assert_array_equal(few.windows.p, got.windows.p[:3])
     with pytest.raises(
         ValueError, match=r"expected disturbances of 3 episodes, found 21; make them by calm\(3\)"
     ):
-        run(
-            FILTERED,
-            None,
-            _see,
-            STARTS[:3],
-            MACHINE,
-            LOOP,
-            calm(21),
-            decisions=8,
-            rng=np.random.default_rng(0),
-        )
+        run(FILTERED, None, STARTS[:3], LOOP, calm(21), decisions=8, rng=np.random.default_rng(0))
 
 
 def test_a_held_window_moves_nothing_and_the_controller_does_not_hear_of_it(numbers):
     d = calm(21)._replace(burst_at=np.full(21, 3), burst_for=np.full(21, 5))
-    got = run(FILTERED, None, _see, STARTS, MACHINE, LOOP, d, decisions=20, rng=np.random.default_rng(1))
+    got = run(FILTERED, None, STARTS, LOOP, d, decisions=20, rng=np.random.default_rng(1))
     held = got.windows.reason != ACTS
     assert held[:, 3:8].all()
     assert (got.windows.reason[:, 3:8] == deployment.FOREIGN).all()
@@ -187,17 +176,7 @@ def test_a_held_window_moves_nothing_and_the_controller_does_not_hear_of_it(numb
 
 def test_the_temperature_waits_for_lambda_s_clock_which_a_hold_does_not_advance(numbers):
     d = calm(1)._replace(burst_at=np.array([0]), burst_for=np.array([4]))
-    got = run(
-        BANG,
-        None,
-        _see,
-        np.array([[180.0, 190.0]]),
-        MACHINE,
-        LOOP,
-        d,
-        decisions=16,
-        rng=np.random.default_rng(2),
-    )
+    got = run(BANG, None, np.array([[180.0, 190.0]]), LOOP, d, decisions=16, rng=np.random.default_rng(2))
     np.testing.assert_array_equal(
         np.flatnonzero(got.sent[0, :, 1]), [4, 14]
     )  # 180 % and more is never ambiguous: ten shown windows lie between
@@ -205,15 +184,7 @@ def test_the_temperature_waits_for_lambda_s_clock_which_a_hold_does_not_advance(
 
 def test_a_controller_that_pushes_on_stays_within_box_and_slew_and_its_cuts_are_counted(numbers):
     got = run(
-        BANG,
-        None,
-        _see,
-        np.array([[250.0, 230.0]]),
-        MACHINE,
-        LOOP,
-        calm(1),
-        decisions=20,
-        rng=np.random.default_rng(3),
+        BANG, None, np.array([[250.0, 230.0]]), LOOP, calm(1), decisions=20, rng=np.random.default_rng(3)
     )
     assert got.setpoint[0].max(axis=0).tolist() == [310.0, 240.0]
     assert got.clipped[0, 2] > 0
@@ -221,7 +192,7 @@ def test_a_controller_that_pushes_on_stays_within_box_and_slew_and_its_cuts_are_
 
 def test_a_clog_in_mid_episode_is_recovered_from(numbers):
     d = calm(21)._replace(clog=np.full(21, 0.6), clog_at=np.full(21, 30))
-    got = run(FILTERED, None, _see, STARTS, MACHINE, LOOP, d, decisions=60, rng=np.random.default_rng(4))
+    got = run(FILTERED, None, STARTS, LOOP, d, decisions=60, rng=np.random.default_rng(4))
     late = np.flatnonzero(got.flow[:, 29] > 90)
     assert (got.flow[late, 31] < 0.8 * got.flow[late, 29]).all()
     # twenty decisions for 40 % of flow; it takes four of 10 %, and holds near the border
@@ -231,15 +202,7 @@ def test_a_clog_in_mid_episode_is_recovered_from(numbers):
 def test_time_counts_waits_and_windows(numbers):
     loop = LOOP._replace(waits=Waits(2.0, 9.0, 0.0))
     got = run(
-        BANG,
-        None,
-        _see,
-        np.array([[30.0, 190.0]]),
-        MACHINE,
-        loop,
-        calm(1),
-        decisions=12,
-        rng=np.random.default_rng(5),
+        BANG, None, np.array([[30.0, 190.0]]), loop, calm(1), decisions=12, rng=np.random.default_rng(5)
     )
     # the first sends a temperature: 9 s; then flow alone: 2 s; each window takes 0.4 s
     np.testing.assert_allclose(np.diff(got.time_s[0])[:3], [9.4, 2.4, 2.4])
@@ -254,7 +217,9 @@ def _over(images, temperature):
 
 
 # six starts in one segment each: the template is cut and found again under the same light
-CALM_LIGHT = LOOP._replace(frames=4, segment_s=1e6, judge=functools.partial(JUDGE, least_frames=2))
+CALM_LIGHT = LOOP._replace(
+    classify=_over, frames=4, segment_mean_s=1e6, judge=functools.partial(JUDGE, least_frames=2)
+)
 SIX = np.tile([[200.0, 210.0]], (6, 1))
 
 
@@ -262,9 +227,7 @@ def test_frames_are_rendered_seen_and_acted_on_and_pictures_are_kept():
     got = run(
         FILTERED,
         None,
-        _over,
         SIX,
-        MACHINE,
         CALM_LIGHT,
         calm(6),
         decisions=3,
@@ -288,7 +251,7 @@ def test_a_camera_that_moved_is_held_for_that_and_one_that_shook_a_little_is_not
         for by in ([12.0, 8.0], [2.0, -1.0])
     )
     moved, shaken = (
-        run(FILTERED, None, _over, SIX, MACHINE, CALM_LIGHT, d, decisions=4, rng=np.random.default_rng(1))
+        run(FILTERED, None, SIX, CALM_LIGHT, d, decisions=4, rng=np.random.default_rng(1))
         for d in (far, little)
     )
     assert (
@@ -300,7 +263,7 @@ def test_a_camera_that_moved_is_held_for_that_and_one_that_shook_a_little_is_not
 
 def test_a_picture_without_any_detail_is_held():
     d = calm(6)._replace(blur_px=np.full(6, 25.0), burst_at=np.zeros(6, int), burst_for=np.full(6, 2))
-    got = run(FILTERED, None, _over, SIX, MACHINE, CALM_LIGHT, d, decisions=4, rng=np.random.default_rng(2))
+    got = run(FILTERED, None, SIX, CALM_LIGHT, d, decisions=4, rng=np.random.default_rng(2))
     assert (got.windows.reason[:, :2] != ACTS).all()
     assert (got.sent[:, :2] == 0).all()
     assert (got.sent[:, 2:] != 0).any()

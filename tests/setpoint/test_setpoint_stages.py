@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.setpoint import eyes
+from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, classify
 from pipeline.setpoint.calibration import Calibration, Familiar
 from pipeline.setpoint.recorded import WindowTable
 from pipeline.setpoint.vision_transformer import SMALL as SMALL_SIZE
 from pipeline.setpoint.vision_transformer import named_arrays, vision_transformer
 from pipeline.setpoint.workflow import parts, train_agent, train_classifier
-from pipeline.setpoint.workflow.agent_files import Agents, restore_agents, store_agents
+from pipeline.setpoint.workflow.agent_files import AGENTS_SCHEMA, Agents, restore_agents, store_agents
 from pipeline.setpoint.workflow.classifier_files import (
     CLASSIFIER_SCHEMA,
     restore_classifier,
@@ -26,9 +26,9 @@ from pipeline.setpoint.workflow.classifier_files import (
 )
 from pipeline.setpoint.workflow.settings import TrainAgent, TrainClassifier
 from pipeline.setpoint.workflow.tables import (
-    AGENT_COURSE,
+    AGENT_CURVE,
     CLASSIFIED,
-    COURSE,
+    CLASSIFIER_CURVE,
     DECISIONS,
     PATHS,
     RELIABILITY,
@@ -44,7 +44,7 @@ from tests.setpoint.synthetic import synthetic_table
 
 ROOT = Path(__file__).parents[2]
 TABLES = {
-    "classified": CLASSIFIED, "reliability": RELIABILITY, "course": COURSE, "windows": WINDOWS,
+    "classified": CLASSIFIED, "reliability": RELIABILITY, "course": CLASSIFIER_CURVE, "windows": WINDOWS,
 }  # fmt: skip
 RECIPE = {"epochs": 2, "cycle_epochs": 2, "warmup_epochs": 0, "batch": 16}
 # a few frames of everything, and as much promised as so few allow
@@ -60,10 +60,10 @@ SMALL = {
     **{f"train_classifier.{network}.{key}": value for network in ("small", "cnn") for key,
     value in RECIPE.items()},
     "train_agent.runs": 1,
-    "train_agent.paper.updates": [20, 20, 20, 20],
-    "train_agent.ours.updates": 20,
-    "train_agent.ours.rounds": 2,
-    **{f"train_agent.{who}.{key}": value for who in ("paper", "ours") for key,
+    "train_agent.li_2025.updates": [20, 20, 20, 20],
+    "train_agent.belief_dqn.updates": 20,
+    "train_agent.belief_dqn.rounds": 2,
+    **{f"train_agent.{who}.{key}": value for who in ("li_2025", "belief_dqn") for key,
     value in {"environments": 4, "batch": 16, "capacity": 1000}.items()},
     "evaluate_setpoint.runs": 1,
     "evaluate_setpoint.pixels.starts": 1,
@@ -120,7 +120,7 @@ def stored(project) -> Path:
     store_classifier(
         out,
         params.load(TrainClassifier, "train_classifier"),
-        eyes.Eyes(vision_transformer(SMALL_SIZE, np.random.default_rng(0)), known),
+        CalibratedClassifier(vision_transformer(SMALL_SIZE, np.random.default_rng(0)), known),
     )
     tables = {
         part: synthetic_table(np.random.default_rng(1), segments=1, windows=2) for part in ("learn", "judge")
@@ -189,7 +189,7 @@ def test_on_rendered_frames_every_artifact_is_written_with_its_schema(simulated,
     figures = check_classifier("simulated")
     assert figures["data"]["frames"] == 15 * (3 * 1 + 1 * 2 + 2 * SHOTS + 2 * SHOTS)
     assert figures["data"]["valid"] + sum(figures["data"]["rejected"].values()) == figures["data"]["frames"]
-    course = artifacts.read_table("datasets/train_classifier/course.parquet", COURSE)
+    course = artifacts.read_table("datasets/train_classifier/course.parquet", CLASSIFIER_CURVE)
     assert course["epoch"].tolist() == [1, 2] * 2
 
 
@@ -225,7 +225,7 @@ def test_a_training_that_was_killed_goes_on_and_ends_at_the_very_same_weights(
 # ---- there and back
 
 
-def test_the_eyes_survive_being_stored(simulated, project):
+def test_the_calibrated_classifier_survives_being_stored(simulated, project):
     names = [
         f"{simulated}/datasets/train_classifier/{name}"
         for name in ("weights.safetensors", "calibration.parquet")
@@ -236,7 +236,7 @@ def test_the_eyes_survive_being_stored(simulated, project):
         assert Path("again", Path(name).name).read_bytes() == Path(name).read_bytes()
     images = np.random.default_rng(1).integers(0, 256, (5, 16, 48), np.uint8)
     once, twice = (
-        eyes.see(one, images, np.full(5, 210.0))
+        classify(one, images, np.full(5, 210.0))
         for one in (found, restore_classifier("again/weights.safetensors", "again/calibration.parquet"))
     )
     for a, b in zip(once, twice, strict=True):
@@ -276,15 +276,18 @@ def test_agents_survive_being_stored(project, tmp_path):
     from pipeline.setpoint.agent import QNetwork
     from pipeline.setpoint.belief_agent import BeliefNetwork
 
-    p = params.load(TrainAgent, "train_agent")
-    sees = train_agent.belief(p.ours, synthetic_table(np.random.default_rng(0), segments=3, windows=2))
+    settings = params.load(TrainAgent, "train_agent").belief_dqn
+    belief = train_agent.belief(settings, synthetic_table(np.random.default_rng(0), segments=3, windows=2))
     keys = jax.random.split(jax.random.key(3), 5)
     networks = tuple(QNetwork(key) for key in keys[:4])
-    ours = BeliefNetwork(sees.filter.evidence.shape[0], keys[4])
-    store_agents(tmp_path / "a.safetensors", Agents(networks, sees, ours))
-    found = restore_agents(str(tmp_path / "a.safetensors"))
-    for made, again in zip((*networks, sees, ours), (*found.paper, found.belief, found.ours), strict=True):
-        leaves = [jax.tree.leaves(one) for one in (made, again)]
+    on_belief = BeliefNetwork(belief.filter.evidence.shape[0], keys[4])
+    store_agents(tmp_path / "a.safetensors", Agents(networks, belief, on_belief))
+    arrays, _ = read_weights(tmp_path / "a.safetensors", AGENTS_SCHEMA)
+    assert "belief.filter.repeats" in arrays  # names in the file stay as an older version wrote them
+    agents = restore_agents(str(tmp_path / "a.safetensors"))
+    restored = (*agents.li_2025, agents.belief, agents.belief_dqn)
+    for stored, again in zip((*networks, belief, on_belief), restored, strict=True):
+        leaves = [jax.tree.leaves(one) for one in (stored, again)]
         assert len(leaves[0]) == len(leaves[1]) > 0
         for a, b in zip(*leaves, strict=True):
             np.testing.assert_array_equal(np.asarray(a, np.float32), np.asarray(b))
@@ -423,8 +426,8 @@ def test_more_than_the_prints_can_promise_is_refused_with_what_would_do(users, c
 
 
 def check_agents() -> None:
-    course = artifacts.read_table("datasets/train_agent/agents.parquet", AGENT_COURSE)
-    assert {"paper", "ours"} == set(course["agent"])
+    course = artifacts.read_table("datasets/train_agent/agents.parquet", AGENT_CURVE)
+    assert {"li_2025", "belief_dqn"} == set(course["agent"])
     figures = artifacts.read_metrics("train_agent")
     assert 0 <= figures["phase3"]["settled"] <= 100
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from pipeline.setpoint.recorded import WindowTable, recorded_windows
-from pipeline.setpoint.reward import reward
 from pipeline.setpoint.simulator import (
     FLOW_MOVES,
     TEMPERATURE_MOVES,
@@ -20,6 +19,7 @@ from pipeline.setpoint.simulator import (
     paper_state,
     paper_windows,
     remembered,
+    reward,
     rollout,
 )
 from tests.setpoint.synthetic import synthetic_table

@@ -91,10 +91,10 @@ def test_a_table_comes_back_as_it_was_written():
 
 def test_the_file_says_its_schema_and_each_field_its_unit_and_meaning():
     artifacts.write_table("record.parquet", RECORD, columns())
-    found = pq.read_schema("record.parquet")
-    assert (found.metadata[b"schema"], found.metadata[b"schema_version"]) == (b"record", b"1")
-    assert found.field("zone_1").metadata[b"unit"].decode() == "°C"
-    assert found.field("heater_1").metadata[b"meaning"] == b"input heater_1"
+    schema = pq.read_schema("record.parquet")
+    assert (schema.metadata[b"schema"], schema.metadata[b"schema_version"]) == (b"record", b"1")
+    assert schema.field("zone_1").metadata[b"unit"].decode() == "°C"
+    assert schema.field("heater_1").metadata[b"meaning"] == b"input heater_1"
 
 
 def test_equal_tables_are_equal_bytes_whatever_container_they_came_in():
@@ -148,7 +148,7 @@ def with_column(number, **changed):
 
 
 @pytest.mark.parametrize(
-    ("found", "sentence"),
+    ("other", "sentence"),
     [
         (
             table(SCORES._replace(version=2)),
@@ -165,11 +165,11 @@ def with_column(number, **changed):
         (table(share=[3.0, 200.0]), ": column share is 200 percent in row 1 but must be at most 100 percent"),
     ],
 )
-def test_a_table_of_another_schema_is_refused_with_the_command_that_makes_it_again(project, found, sentence):
+def test_a_table_of_another_schema_is_refused_with_the_command_that_makes_it_again(project, other, sentence):
     """The file is written past `write_table`, as an older version or another tool leaves it."""
     path = "datasets/evaluate_temperature/scores.parquet"
     (project / path).parent.mkdir(parents=True)
-    pq.write_table(found, path)
+    pq.write_table(other, path)
     with pytest.raises(
         ValueError,
         match=f"^{re.escape(path + sentence)}; make it again with ./run dvc repro evaluate_temperature$",
@@ -185,11 +185,11 @@ def test_a_missing_table_is_one_sentence():
         artifacts.read_table("datasets/ingest/record.parquet", RECORD)
 
 
-@pytest.mark.parametrize("kept", [0, 3, 200, -20, -1])
-def test_a_truncated_table_is_refused(project, kept):
+@pytest.mark.parametrize("length", [0, 3, 200, -20, -1])
+def test_a_truncated_table_is_refused(project, length):
     artifacts.write_table("datasets/ingest/record.parquet", RECORD, columns())
     whole = (project / "datasets/ingest/record.parquet").read_bytes()
-    (project / "datasets/ingest/record.parquet").write_bytes(whole[:kept])
+    (project / "datasets/ingest/record.parquet").write_bytes(whole[:length])
     with pytest.raises(
         ValueError,
         match=r"record.parquet is not a whole Parquet file .*; make it again with ./run dvc repro ingest$",
@@ -227,11 +227,11 @@ def test_arrays_of_any_shape_come_back():
         "on": (A > 0, "1", ""),
     }
     artifacts.write_arrays("model.parquet", "model", 1, arrays)
-    found = artifacts.read_arrays("model.parquet", "model", 1)
-    assert list(found) == list(arrays)
+    stored = artifacts.read_arrays("model.parquet", "model", 1)
+    assert list(stored) == list(arrays)
     for name, (array, _, _) in arrays.items():
-        assert found[name].shape == array.shape
-        np.testing.assert_array_equal(found[name], array)
+        assert stored[name].shape == array.shape
+        np.testing.assert_array_equal(stored[name], array)
     artifacts.write_arrays("model.parquet", "model", 1, {})
     assert artifacts.read_arrays("model.parquet", "model", 1) == {}
 
@@ -239,7 +239,8 @@ def test_arrays_of_any_shape_come_back():
 def test_arrays_that_are_not_finite_real_numbers_are_refused():
     with pytest.raises(
         ValueError,
-        match=r"model.parquet: array poles is complex128 but should be real numbers; write real and imaginary part",
+        match=r"model.parquet: array poles is complex128 but should be real numbers; write real and "
+        r"imaginary part",
     ):
         artifacts.write_arrays("model.parquet", "model", 1, {"poles": (np.array([1j]), "1", "")})
     with pytest.raises(
@@ -305,7 +306,8 @@ def test_broken_json_is_refused_with_its_place(project):
     (project / "reports/metrics/ingest.json").write_text(whole[:-4])
     with pytest.raises(
         ValueError,
-        match=r"reports/metrics/ingest.json is not whole JSON \(.*line 2.*\); make it again with ./run dvc repro ingest",
+        match=r"reports/metrics/ingest.json is not whole JSON \(.*line 2.*\); make it again with ./run dvc "
+        r"repro ingest",
     ):
         artifacts.read_metrics("ingest")
     with pytest.raises(
@@ -314,18 +316,18 @@ def test_broken_json_is_refused_with_its_place(project):
         artifacts.read_metrics("report")
 
 
-# ---- courses and recordings
+# ---- learning curves and recordings
 
 
-def test_a_course_is_a_table_a_figure_without_what_is_missing(project):
-    course = {
+def test_a_learning_curve_is_a_table_a_figure_without_the_missing_values(project):
+    curve = {
         "agent": ["ours", "ours", "the paper"],
         "update": [10, 20, 10],
         "reward": [0.1, None, 1 / 3],
         "cost": [1.0, 2.0, float("nan")],
     }
     for folder in ("a", "b"):
-        artifacts.write_course(folder, course, of="agent", step="update", figures=("reward", "cost"))
+        artifacts.write_learning_curve(folder, curve, of="agent", step="update", figures=("reward", "cost"))
     files = {
         path.relative_to("a/plots/metrics").as_posix(): path.read_text()
         for path in Path("a/plots").rglob("*.tsv")
@@ -433,9 +435,9 @@ def learn(error=None):
 
 def test_a_stage_that_ends_well_replaces_all_that_it_writes(project, last_good):
     learn()
-    found = everything(project)
-    assert set(found) == set(last_good) - {"datasets/learn_kernel/obsolete.txt"}
-    assert found["datasets/learn_kernel/kernel.txt"] == found["reports/index.html"] == b"new"
+    contents = everything(project)
+    assert set(contents) == set(last_good) - {"datasets/learn_kernel/obsolete.txt"}
+    assert contents["datasets/learn_kernel/kernel.txt"] == contents["reports/index.html"] == b"new"
     assert artifacts.read_metrics("learn_kernel") == {"rank": 56}
 
 

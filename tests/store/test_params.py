@@ -132,7 +132,8 @@ def test_each_mistake_is_one_sentence_with_place_expectation_and_remedy(load, ol
 def test_two_mistakes_are_two_lines(load):
     with pytest.raises(
         ValueError,
-        match="horizon is 0 but must be at least 1\nparams.yaml: learn_kernel.gamma is 1 but must be less than 1$",
+        match="horizon is 0 but must be at least 1\nparams.yaml: learn_kernel.gamma is 1 but must be less "
+        "than 1$",
     ):
         load(GOOD.replace("horizon: 6", "horizon: 0").replace("1e-3", "1"))
 
@@ -277,7 +278,10 @@ def test_a_section_may_stand_in_both_files_and_is_one(load, tmp_path):
 
 @pytest.mark.parametrize("twice", ["method: window", "method: direct", "progress:"])
 def test_a_key_that_stands_in_both_files_is_refused(load, twice):
-    sentence = f"params.yaml and params.expert.yaml: learn_kernel.{twice.split(':')[0]} stands in both; take it out of one of the two"
+    sentence = (
+        f"params.yaml and params.expert.yaml: learn_kernel.{twice.split(':')[0]} stands in both; take it "
+        f"out of one of the two"
+    )
     with pytest.raises(ValueError, match=f"^{re.escape(sentence)}$"):
         load(OWNER, expert=f"learn_kernel:\n  horizon: 6\n  {twice}\n")
 
@@ -351,12 +355,14 @@ def test_a_key_or_a_section_that_is_missing_says_where_it_is_looked_for(load):
         params.load(LearnKernel, "trackin")
     with pytest.raises(
         ValueError,
-        match=r"^params.yaml and params.expert.yaml: section colours is missing; add colours: with its keys below it$",
+        match=r"^params.yaml and params.expert.yaml: section colours is missing; add colours: with its keys "
+        r"below it$",
     ):
         params.load(LearnKernel, "colours")
     with pytest.raises(
         ValueError,
-        match=r"^params.yaml: section colours is missing, and so is params.expert.yaml; run from .* git checkout params.expert.yaml$",
+        match=r"^params.yaml: section colours is missing, and so is params.expert.yaml; run from .* git "
+        r"checkout params.expert.yaml$",
     ):
         load(OWNER, section="colours")
 

@@ -18,15 +18,15 @@ def test_simc_by_hand_on_an_integrator_with_dead_time():
     """y(t+1) = y(t) + 0.5 u(t-2): slope 0.5 from lag 3 on, so theta = 2 and, with
     tau_c = theta, K_c = 1 / (0.5 x 4) and T_i = 16."""
     A = np.array([[1.0, 0.5, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
-    found = pairing(
+    pairs = pairing(
         plant(A, [[0.0], [0.0], [1.0]], [[1.0, 0.0, 0.0]]), np.zeros(1), np.full(1, 100.0), horizon=40
     )
-    np.testing.assert_allclose([found.gain[0], found.reset[0]], [0.5, 16.0], rtol=1e-12)  # rounding
+    np.testing.assert_allclose([pairs.gain[0], pairs.reset[0]], [0.5, 16.0], rtol=1e-12)  # rounding
 
 
 def test_a_cooling_input_gets_a_negative_gain():
-    found = pairing(plant([[1.0]], [[-0.5]], [[1.0]]), np.zeros(1), np.ones(1), horizon=10)
-    assert found.gain[0] == pytest.approx(-1.0)  # theta at its least, one sample
+    pairs = pairing(plant([[1.0]], [[-0.5]], [[1.0]]), np.zeros(1), np.ones(1), horizon=10)
+    assert pairs.gain[0] == pytest.approx(-1.0)  # theta at its least, one sample
 
 
 def test_each_output_gets_the_input_whose_range_moves_it_fastest():
@@ -58,7 +58,7 @@ def test_the_law_is_the_pi_equation():
 
 
 def test_the_baseline_settles_on_every_plant_of_the_spread():
-    plants = spread(baam(), input_gain=0.15, loss=0.005)
+    plants = spread(baam(), input_gain=0.15, extra_heat_loss=0.005)
     scenarios = panel(
         plants, starts=[20.0], references=[REFERENCE], noise=[0.0], seeds=[0], steps=600, hold=0, cells=True
     )
@@ -73,18 +73,18 @@ def test_the_baseline_settles_on_every_plant_of_the_spread():
         limits=(LOW, HIGH),
         integral_band=1.0,
     )
-    found = figures(scenarios, run, limits=(LOW, HIGH), band=1.0, sample_time_s=1.0)
-    assert found.settled_error_degC.max() < 1.0
-    assert not np.isnan(found.settling_s).any()
+    results = figures(scenarios, run, limits=(LOW, HIGH), band=1.0, sample_time_s=1.0)
+    assert results.settled_error_degC.max() < 1.0
+    assert not np.isnan(results.settling_s).any()
 
 
 def test_an_output_that_no_free_input_moves_is_refused():
     sentence = "PI needs an input for each of the 2 outputs; found "
-    for B, found in (
+    for B, reason in (
         ([[1.0], [1.0]], "1 inputs"),
         ([[1.0, 1.0], [0.0, 0.0]], "an output that none of the free inputs moves"),
     ):
-        with pytest.raises(ValueError, match=re.escape(sentence + found)):
+        with pytest.raises(ValueError, match=re.escape(sentence + reason)):
             pairing(
                 plant(np.diag([0.9, 0.9]), B, np.eye(2)), np.zeros(len(B[0])), np.ones(len(B[0])), horizon=5
             )

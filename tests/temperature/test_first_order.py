@@ -8,9 +8,8 @@ def test_response_to_a_step_is_the_textbook_one_also_for_a_fraction_of_a_sample_
     u = np.r_[0.0, np.ones(40)]
     y = response(u, time_constant_s=5.0, delay_s=2.3, sample_time_s=1.0)
     t = np.arange(41.0) - 1.0 - 2.3
-    np.testing.assert_allclose(
-        y, np.where(t > 0, 1 - np.exp(-t / 5.0), 0.0), atol=1e-12
-    )  # exact discretisation: rounding only
+    # exact discretisation: rounding only
+    np.testing.assert_allclose(y, np.where(t > 0, 1 - np.exp(-t / 5.0), 0.0), atol=1e-12)
 
 
 def test_a_noise_free_record_gives_its_own_constants_back():
@@ -69,9 +68,8 @@ def test_a_step_counts_only_as_long_as_the_other_inputs_stand_still():
     y = response(u, 5.0, 2.0, 1.0) + 3.0 * response(other, 5.0, 2.0, 1.0)
     (step,) = fit_steps(u, y, sample_time_s=1.0, others=other[:, None])
     np.testing.assert_allclose([step.model.gain, step.model.time_constant_s], [1.0, 5.0], rtol=1e-3)
-    assert (
-        abs(fit_steps(u, y, sample_time_s=1.0)[0].model.gain - 1.0) > 1.0
-    )  # blind to the other input, its effect is taken for u's
+    # blind to the other input, its effect is taken for u's
+    assert abs(fit_steps(u, y, sample_time_s=1.0)[0].model.gain - 1.0) > 1.0
 
 
 def test_each_step_of_the_two_heater_kit_says_what_its_hold_can_say(shared):

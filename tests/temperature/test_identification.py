@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from benchmarks.moesp import moesp, moesp_singular_values, varx
-from pipeline.temperature.identification import identify, refit
+from pipeline.temperature.identification import Settings, identify, refit
 from pipeline.temperature.order import dead_time, with_delays
 from pipeline.temperature.plant import baam, markov_parameters, plant, simulate
 from pipeline.temperature.probing import study_probe, study_signal
 from pipeline.temperature.published import K_DATA
 from pipeline.temperature.refinement import (
+    FitSettings,
     estimate_state,
     kalman_gain,
     linear_recurrence,
@@ -20,14 +21,14 @@ from pipeline.temperature.subspace import lagged
 from pipeline.temperature.validation import simulated
 
 
-def markov_error(found, true):
+def markov_error(model, true):
     h = markov_parameters(true, 100)
-    return np.linalg.norm(markov_parameters(found, 100) - h) / np.linalg.norm(h)
+    return np.linalg.norm(markov_parameters(model, 100) - h) / np.linalg.norm(h)
 
 
-def markov_error_of(found, true):
+def markov_error_of(model, true):
     h = markov_parameters(true, 40)
-    return np.linalg.norm(markov_parameters(found, 40) - h) / np.linalg.norm(h)
+    return np.linalg.norm(markov_parameters(model, 40) - h) / np.linalg.norm(h)
 
 
 def two_zones(T=3000, noise=0.05, seed=0, offset=20.0):
@@ -51,10 +52,10 @@ def probed(seed, noise, T=15000):
     anew at every step as the authors' script does."""
     rng = np.random.default_rng(seed)
     signal = study_signal(rng, T, 7, amplitudes=np.arange(100.0, 0.0, -10.0), bandwidth=1.65, variance=1.5)
-    found = study_probe(
+    recorded = study_probe(
         baam(), signal, K_DATA, x0=np.full(6, 50.0), noise=noise * rng.standard_normal((T, 5))
     )
-    return found.u, found.y
+    return recorded.u, recorded.y
 
 
 @pytest.fixture(scope="module")
@@ -85,8 +86,8 @@ def test_moesp_poles_are_those_of_slicots_printed_matrix(hair_dryer, shared):
             printed(shared("data/slicot_reference/IB01BD.res"), "state matrix A", 4).reshape(4, 4)
         )
     )
-    found = np.sort_complex(np.linalg.eigvals(moesp([hair_dryer[0]], [hair_dryer[1]], 15, 4)[0].A))
-    np.testing.assert_allclose(found, expected, atol=2e-3)  # A is printed to four decimals
+    poles = np.sort_complex(np.linalg.eigvals(moesp([hair_dryer[0]], [hair_dryer[1]], 15, 4)[0].A))
+    np.testing.assert_allclose(poles, expected, atol=2e-3)  # A is printed to four decimals
 
 
 @pytest.mark.parametrize(
@@ -102,8 +103,8 @@ def test_moesp_simulates_the_benchmark_sets_as_well_as_slicot(
 ):
     record = np.loadtxt(shared(f"data/daisy_a/{name}.dat"))
     u, y = record[:, inputs], record[:, outputs]
-    found, x0 = moesp([u], [y], block_rows, order)
-    err1 = np.linalg.norm(y - simulate(found, u, x0[0])[1], 1) / np.linalg.norm(y, 1)
+    model, x0 = moesp([u], [y], block_rows, order)
+    err1 = np.linalg.norm(y - simulate(model, u, x0[0])[1], 1) / np.linalg.norm(y, 1)
     assert err1 <= 1.03 * published  # the bar: 3 % over SLICOT working note 2000-4, table 7
 
 
@@ -115,31 +116,31 @@ def test_a_noise_free_record_gives_the_plant_back_to_rounding(shared):
         .to_pandas()
         .to_numpy()[1:]
     )
-    found = identify([record[:, :7]], [record[:, 7:]], sample_time_s=1.0)
-    assert found.order == 6
-    assert markov_error(found.plant, baam()) <= 1e-10  # the bar; measured 1e-12
+    identified = identify([record[:, :7]], [record[:, 7:]], sample_time_s=1.0)
+    assert identified.order == 6
+    assert markov_error(identified.plant, baam()) <= 1e-10  # the bar; measured 1e-12
 
 
 @pytest.mark.parametrize(("noise", "bar"), [(0.1, 2e-3), (0.5, 1.5e-2)])
 def test_the_studys_plant_is_found_with_its_order_under_noise(noise, bar):
     u, y = probed(100, noise)
-    found = identify([u], [y], sample_time_s=1.0)
-    assert found.order == 6
-    assert markov_error(found.plant, baam()) <= bar
+    identified = identify([u], [y], sample_time_s=1.0)
+    assert identified.order == 6
+    assert markov_error(identified.plant, baam()) <= bar
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("noise", "bar"), [(0.1, 2e-3), (0.5, 1.5e-2)])
 def test_order_six_in_twenty_of_twenty_records(noise, bar):
-    found = [identify(*([a] for a in probed(seed, noise)), sample_time_s=1.0) for seed in range(20)]
-    assert [f.order for f in found] == [6] * 20
-    assert max(markov_error(f.plant, baam()) for f in found) <= bar
+    identified = [identify(*([a] for a in probed(seed, noise)), sample_time_s=1.0) for seed in range(20)]
+    assert [f.order for f in identified] == [6] * 20
+    assert max(markov_error(f.plant, baam()) for f in identified) <= bar
 
 
 def test_refinement_on_one_step_errors_brings_a_noisy_plant_nearer():
     u, y = probed(7, 0.5, T=3000)
-    rough = identify([u], [y], sample_time_s=1.0, order=6, past=24).plant
-    refined = refine(rough, [u], [y], offset=False)
+    rough = identify([u], [y], sample_time_s=1.0, settings=Settings(order=6, past=24)).plant
+    refined = refine(rough, [u], [y], settings=FitSettings(offset=False))
     assert np.all(np.diff(refined.costs) <= 0)
     assert markov_error(refined.plant, baam()) < 0.7 * markov_error(rough, baam())  # measured 0.2 to 0.5
 
@@ -148,7 +149,7 @@ def test_varx_coefficients_are_those_of_plain_least_squares_over_two_segments_wi
     _, u, y = two_zones(400)
     y[50, 1] = np.nan
     segments_u, segments_y, past = [u[:150], u[150:]], [y[:150], y[150:]], 3
-    found = varx(segments_u, segments_y, past)
+    fit = varx(segments_u, segments_y, past)
     rows, target = [], []
     for a, b in zip(segments_u, segments_y, strict=True):
         for t in range(past, len(a)):
@@ -159,9 +160,9 @@ def test_varx_coefficients_are_those_of_plain_least_squares_over_two_segments_wi
     theta = np.linalg.lstsq(np.array(rows), np.array(target), rcond=None)[0]
     by_lag = theta[:-1].reshape(past, 4, 2).transpose(0, 2, 1)
     # second moments carry half the digits: 1e-13 of ridge times a condition of 1e5
-    np.testing.assert_allclose(np.concatenate([found.B, found.A], axis=2), by_lag, atol=1e-6)
-    np.testing.assert_allclose(found.constant, theta[-1], atol=1e-4)
-    assert (found.rows, found.dropped_rows) == (len(rows), 4)
+    np.testing.assert_allclose(np.concatenate([fit.B, fit.A], axis=2), by_lag, atol=1e-6)
+    np.testing.assert_allclose(fit.constant, theta[-1], atol=1e-4)
+    assert (fit.rows, fit.dropped_rows) == (len(rows), 4)
 
 
 def test_fast_moments_and_the_rows_themselves_give_the_same_factor():
@@ -178,9 +179,10 @@ def test_the_offset_of_the_room_is_found_and_moves_with_it():
     _, u, y = two_zones(noise=0.01)
     cold, warm = identify([u], [y], sample_time_s=1.0), identify([u], [y + 300.0], sample_time_s=1.0)
     assert cold.order == warm.order
+    # rounding of 300 °C squared
     np.testing.assert_allclose(
         markov_parameters(cold.plant, 50), markov_parameters(warm.plant, 50), atol=1e-7
-    )  # rounding of 300 °C squared
+    )
     np.testing.assert_allclose(
         simulated(warm.plant, u, y + 300.0) - simulated(cold.plant, u, y), 300.0, atol=1e-4
     )
@@ -203,12 +205,11 @@ def test_closed_loop_data_are_identified_without_the_bias_of_feedback():
         y[t] = x + e
         u[t] = -3.0 * y[t] + rng.normal(0, 1.0)
         x = 0.9 * x + 0.1 * u[t, 0] + 0.4 * e
-    found = identify([u], [y], sample_time_s=1.0, order=1).plant
-    h = markov_parameters(found, 5)[:, 0, 0]
-    np.testing.assert_allclose(
-        h, 0.1 * 0.9 ** np.arange(5), rtol=0.05
-    )  # 20,000 samples: 1 % of deviation, the feedback's bias is 30 %
-    np.testing.assert_allclose(found.C @ found.K, true.K, atol=0.05)
+    model = identify([u], [y], sample_time_s=1.0, settings=Settings(order=1)).plant
+    h = markov_parameters(model, 5)[:, 0, 0]
+    # 20,000 samples: 1 % of deviation, the feedback's bias is 30 %
+    np.testing.assert_allclose(h, 0.1 * 0.9 ** np.arange(5), rtol=0.05)
+    np.testing.assert_allclose(model.C @ model.K, true.K, atol=0.05)
 
 
 def test_a_dead_time_is_found_and_becomes_a_chain_of_states():
@@ -217,12 +218,13 @@ def test_a_dead_time_is_found_and_becomes_a_chain_of_states():
     u = rng.integers(0, 2, (2000, 1)).astype(float)
     y = simulate(true, u, np.zeros(5))[1] + 0.01 * rng.standard_normal((2000, 1))
     assert dead_time(true, 10) == (4,)
-    found = identify([u], [y], sample_time_s=1.0)
-    assert (found.order, found.delays) == (1, (4,))
-    assert "dead time of u1: 4 samples beyond the one of sampling" in found.notes
+    identified = identify([u], [y], sample_time_s=1.0)
+    assert (identified.order, identified.delays) == (1, (4,))
+    assert "dead time of u1: 4 samples beyond the one of sampling" in identified.notes
+    # 0.01 of noise, 2,000 samples
     np.testing.assert_allclose(
-        markov_parameters(found.plant, 20), markov_parameters(true, 20), atol=5e-3
-    )  # 0.01 of noise, 2,000 samples
+        markov_parameters(identified.plant, 20), markov_parameters(true, 20), atol=5e-3
+    )
 
 
 def test_a_refit_keeps_what_was_chosen_and_uses_the_whole_record():
@@ -230,24 +232,26 @@ def test_a_refit_keeps_what_was_chosen_and_uses_the_whole_record():
     true = with_delays(plant([[0.8]], [[0.5]], [[1.0]]), (4,))
     u = rng.integers(0, 2, (2000, 1)).astype(float)
     y = simulate(true, u, np.zeros(5))[1] + 0.05 * rng.standard_normal((2000, 1))
-    chosen = identify([u[:1000]], [y[:1000]], sample_time_s=2.0, refinement="validated")
-    found = refit([u], [y], chosen)
-    assert (found.order, found.past, found.delays, found.fit) == (
+    chosen = identify([u[:1000]], [y[:1000]], sample_time_s=2.0, settings=Settings(refinement="validated"))
+    refitted = refit([u], [y], chosen)
+    assert (refitted.order, refitted.past, refitted.delays, refitted.fit) == (
         chosen.order,
         chosen.past,
         chosen.delays,
         chosen.fit,
     )
-    assert found.plant.sample_time_s == 2.0
-    assert found.rows > chosen.rows
+    assert refitted.plant.sample_time_s == 2.0
+    assert refitted.rows > chosen.rows
     same = refit([u[:1000]], [y[:1000]], chosen).plant
     np.testing.assert_array_equal(same.A, chosen.plant.A)
 
 
 def test_feed_through_is_left_to_the_data_where_asked():
     _, u, y = two_zones()
-    assert not identify([u], [y], sample_time_s=1.0, feedthrough=None).feedthrough
-    assert identify([u], [y + u @ [[0.5, 0.0], [0.0, 0.0]]], sample_time_s=1.0, feedthrough=None).feedthrough
+    assert not identify([u], [y], sample_time_s=1.0, settings=Settings(feedthrough=None)).feedthrough
+    assert identify(
+        [u], [y + u @ [[0.5, 0.0], [0.0, 0.0]]], sample_time_s=1.0, settings=Settings(feedthrough=None)
+    ).feedthrough
 
 
 def test_linear_recurrence_is_the_loop_that_it_stands_for():
@@ -264,37 +268,36 @@ def test_the_initial_state_is_found_around_masked_samples():
     y = simulate(true, u, np.array([1.0, -2.0, 3.0]))[1]
     y[::7] = np.nan
     model = simulation_form(true, [])
-    found = estimate_state(model, np.hstack([u, np.ones((200, 1))]), y)
-    np.testing.assert_allclose(
-        found, [1.0, -2.0, 3.0], atol=1e-8
-    )  # rounding through an observability matrix of condition 1e3
+    x0_fitted = estimate_state(model, np.hstack([u, np.ones((200, 1))]), y)
+    # rounding through an observability matrix of condition 1e3
+    np.testing.assert_allclose(x0_fitted, [1.0, -2.0, 3.0], atol=1e-8)
 
 
 def test_a_refined_plant_stays_within_the_radius_that_was_asked_for():
     true, u, y = two_zones(600, noise=1.0)
-    refined = refine(true, [u], [y], criterion="simulation", max_radius=0.97)
+    refined = refine(true, [u], [y], criterion="simulation", settings=FitSettings(max_radius=0.97))
     assert np.abs(np.linalg.eigvals(refined.plant.A)).max() <= 0.97
 
 
 def test_masked_samples_are_counted_and_do_not_bend_the_plant():
     true, u, y = two_zones(3000)
     y[700:703] += 80.0
-    whole = identify([u], [y], sample_time_s=1.0, order=3)
+    whole = identify([u], [y], sample_time_s=1.0, settings=Settings(order=3))
     y[699:703], u[2000] = np.nan, np.nan
-    found = identify([u], [y], sample_time_s=1.0, order=3)
+    identified = identify([u], [y], sample_time_s=1.0, settings=Settings(order=3))
     # 0.05 of noise over 3,000 samples moves the plant by some tenths of a
     # per cent; the spike, left in, by several times that
-    assert markov_error_of(found.plant, true) < 0.01 < markov_error_of(whole.plant, true)
-    assert found.dropped_rows == 4 + found.past + 1
-    assert len(found.x0) == 2
-    assert found.notes[0].startswith("1 samples with a masked input")
+    assert markov_error_of(identified.plant, true) < 0.01 < markov_error_of(whole.plant, true)
+    assert identified.dropped_rows == 4 + identified.past + 1
+    assert len(identified.x0) == 2
+    assert identified.notes[0].startswith("1 samples with a masked input")
 
 
 def test_many_short_segments_are_enough():
     true, u, y = two_zones(3000)
     cut = np.arange(0, 3000, 40)
-    found = identify([u[i : i + 40] for i in cut], [y[i : i + 40] for i in cut], sample_time_s=1.0)
-    assert markov_error_of(found.plant, true) < 0.1  # measured 0.03
+    identified = identify([u[i : i + 40] for i in cut], [y[i : i + 40] for i in cut], sample_time_s=1.0)
+    assert markov_error_of(identified.plant, true) < 0.1  # measured 0.03
 
 
 def test_a_constant_input_is_named():
@@ -318,7 +321,7 @@ def test_a_record_that_is_too_short_says_how_many_samples_more():
     with pytest.raises(
         ValueError, match="expected at least 96 complete samples, found 40; record 56 samples more"
     ):
-        identify([u[:40]], [y[:40]], sample_time_s=1.0, order=6)
+        identify([u[:40]], [y[:40]], sample_time_s=1.0, settings=Settings(order=6))
 
 
 def test_two_hundred_samples_of_five_inputs_are_enough_for_a_plant():
@@ -326,8 +329,8 @@ def test_two_hundred_samples_of_five_inputs_are_enough_for_a_plant():
     true = plant(np.diag([0.9, 0.7]), rng.standard_normal((2, 5)), rng.standard_normal((3, 2)))
     u = rng.standard_normal((140, 5))
     y = simulate(true, u, np.zeros(2))[1]
-    found = identify([u], [y + 0.1 * y.std() * rng.standard_normal(y.shape)], sample_time_s=1.0)
-    assert markov_error_of(found.plant, true) < 0.25  # measured 0.1: 10 % of noise, 140 samples
+    identified = identify([u], [y + 0.1 * y.std() * rng.standard_normal(y.shape)], sample_time_s=1.0)
+    assert markov_error_of(identified.plant, true) < 0.25  # measured 0.1: 10 % of noise, 140 samples
 
 
 def test_an_output_that_never_moves_is_named():
@@ -351,27 +354,32 @@ def test_segments_shorter_than_the_window_say_what_is_missing():
         ValueError, match="too short for a window of 12 samples: the longest complete stretch has 10"
     ):
         cut = np.arange(0, 600, 10)
-        identify([u[i : i + 10] for i in cut], [y[i : i + 10] for i in cut], sample_time_s=1.0, past=12)
+        identify(
+            [u[i : i + 10] for i in cut],
+            [y[i : i + 10] for i in cut],
+            sample_time_s=1.0,
+            settings=Settings(past=12),
+        )
 
 
 def test_an_order_beyond_what_the_record_determines_is_said_so():
     _, u, y = two_zones(1000, noise=2.0)
     assert any(
         note.startswith("order 12 was asked but the record determines")
-        for note in identify([u], [y], sample_time_s=1.0, order=12).notes
+        for note in identify([u], [y], sample_time_s=1.0, settings=Settings(order=12)).notes
     )
 
 
 def test_an_input_that_no_output_answers_is_named():
     _, u, y = two_zones(1500)
-    found = identify(
+    identified = identify(
         [np.column_stack([u, np.random.default_rng(9).standard_normal(1500)])],
         [y],
         sample_time_s=1.0,
         names=["h1", "h2", "fan"],
     )
-    assert found.silent == (False, False, True)
-    assert "no output answers fan (99.9 %): leave it out, or excite it more" in found.notes
+    assert identified.silent == (False, False, True)
+    assert "no output answers fan (99.9 %): leave it out, or excite it more" in identified.notes
 
 
 def test_an_actuator_asked_beyond_its_limit_is_taken_at_its_limit():
@@ -379,12 +387,14 @@ def test_an_actuator_asked_beyond_its_limit_is_taken_at_its_limit():
     y = simulate(true, np.clip(u, 0.0, 10.0), np.zeros(3))[1] + 0.05 * np.random.default_rng(
         3
     ).standard_normal((2000, 2))
-    bent = identify([u], [y], sample_time_s=1.0, order=3)
-    found = identify([u], [y], sample_time_s=1.0, order=3, limits=([0.0, 0.0], [10.0, 10.0]))
+    bent = identify([u], [y], sample_time_s=1.0, settings=Settings(order=3))
+    identified = identify(
+        [u], [y], sample_time_s=1.0, settings=Settings(order=3), limits=([0.0, 0.0], [10.0, 10.0])
+    )
     # u is either 0 or 10 with deviation 1, so half of that is clipped
     # away: part of what the unclipped input says is not so
-    assert markov_error_of(found.plant, true) < 0.01 < markov_error_of(bent.plant, true)
-    assert found.notes[0].startswith("u1 was asked beyond 0..10 in ")
+    assert markov_error_of(identified.plant, true) < 0.01 < markov_error_of(bent.plant, true)
+    assert identified.notes[0].startswith("u1 was asked beyond 0..10 in ")
 
 
 def test_limits_of_another_number_than_the_inputs_are_refused():
@@ -401,9 +411,9 @@ def test_a_controller_that_answers_at_once_is_not_taken_for_feed_through():
         y[t] = x + 0.05 * rng.standard_normal()
         u[t] = 2.0 * (target[t] - y[t, 0])
         x = 0.95 * x + 0.05 * u[t, 0] + 0.02 * rng.standard_normal()
-    found = identify([u], [y], sample_time_s=1.0, feedthrough=None).plant
-    gain = (found.C @ np.linalg.solve(np.eye(found.n) - found.A, found.B) + found.D)[0, 0]
-    assert abs(found.D[0, 0]) < 0.05  # the controller's own answer, turned round, is -1 / 2
+    model = identify([u], [y], sample_time_s=1.0, settings=Settings(feedthrough=None)).plant
+    gain = (model.C @ np.linalg.solve(np.eye(model.n) - model.A, model.B) + model.D)[0, 0]
+    assert abs(model.D[0, 0]) < 0.05  # the controller's own answer, turned round, is -1 / 2
     assert gain == pytest.approx(1.0, abs=0.05)
 
 
@@ -414,15 +424,15 @@ def test_the_gain_fitted_to_a_moesp_plant_is_slicots_kalman_gain(hair_dryer, sha
         printed(lines, "output matrix C", 1)[None],
         printed(lines, "Kalman gain", 4)[:, None],
     )
-    found = kalman_gain(moesp([hair_dryer[0]], [hair_dryer[1]], 15, 4)[0], [hair_dryer[0]], [hair_dryer[1]])
+    model = kalman_gain(moesp([hair_dryer[0]], [hair_dryer[1]], 15, 4)[0], [hair_dryer[0]], [hair_dryer[1]])
     expected, response = (
         [(P @ np.linalg.matrix_power(M, k) @ G)[0, 0] for k in range(4)]
-        for P, M, G in ((C, A, K), (found.C, found.A, found.K))
+        for P, M, G in ((C, A, K), (model.C, model.A, model.K))
     )
     # SLICOT solves a Riccati equation on estimated covariances, ours minimises the one-step errors: two
     # estimates of one gain, 1000 samples
     np.testing.assert_allclose(response, expected, rtol=0.04)
-    assert np.abs(np.linalg.eigvals(found.A - found.K @ found.C)).max() < 1
+    assert np.abs(np.linalg.eigvals(model.A - model.K @ model.C)).max() < 1
 
 
 def test_a_plant_comes_in_innovation_form():
@@ -433,8 +443,8 @@ def test_a_plant_comes_in_innovation_form():
         e = 0.1 * rng.standard_normal()
         y[t] = x[0] + e
         x = true.A @ x + true.B @ u[t] + true.K[:, 0] * e
-    found = identify([u], [y], sample_time_s=1.0, order=2, past=15).plant
-    response = [(found.C @ np.linalg.matrix_power(found.A, k) @ found.K)[0, 0] for k in range(4)]
+    model = identify([u], [y], sample_time_s=1.0, settings=Settings(order=2, past=15)).plant
+    response = [(model.C @ np.linalg.matrix_power(model.A, k) @ model.K)[0, 0] for k in range(4)]
     # 6,000 samples: a hundredth or two on each
     np.testing.assert_allclose(
         response, [(true.C @ np.linalg.matrix_power(true.A, k) @ true.K)[0, 0] for k in range(4)], atol=0.06
@@ -449,24 +459,28 @@ def test_an_unstable_plant_has_a_gain_that_predicts_it():
         y[t] = x + 0.02 * rng.standard_normal()
         u[t] = -1.5 * y[t] + rng.standard_normal()
         x = 1.03 * x + 0.1 * u[t, 0]
-    found = kalman_gain(true, [u], [y])
-    assert abs((found.A - found.K @ found.C)[0, 0]) < 1
+    model = kalman_gain(true, [u], [y])
+    assert abs((model.A - model.K @ model.C)[0, 0]) < 1
 
 
 def test_a_refined_plant_may_keep_a_pole_that_grows_no_more_than_the_record_can_show():
     u, y = probed(3, 0.1, T=6000)
-    found = identify([u], [y], sample_time_s=1.0, order=6, past=24, refinement="simulation")
+    identified = identify(
+        [u], [y], sample_time_s=1.0, settings=Settings(order=6, past=24, refinement="simulation")
+    )
     # the study's plant has its largest pole at 1.0000029; drawn inside the circle
     # it costs the refinement its convergence (2.4e-3)
-    assert markov_error(found.plant, baam()) < 5e-4
-    assert np.abs(np.linalg.eigvals(found.plant.A)).max() < 1.0005
+    assert markov_error(identified.plant, baam()) < 5e-4
+    assert np.abs(np.linalg.eigvals(identified.plant.A)).max() < 1.0005
 
 
 def test_every_pole_stays_within_the_radius_asked():
     _, u, y = two_zones(600)
     for refinement in ("none", "simulation"):
-        found = identify([u], [y], sample_time_s=1.0, order=3, refinement=refinement, max_radius=0.9).plant
-        assert np.abs(np.linalg.eigvals(found.A)).max() <= 0.9 + 1e-9
+        model = identify(
+            [u], [y], sample_time_s=1.0, settings=Settings(order=3, refinement=refinement, max_radius=0.9)
+        ).plant
+        assert np.abs(np.linalg.eigvals(model.A)).max() <= 0.9 + 1e-9
 
 
 def damaged(rng):
@@ -498,22 +512,25 @@ def damaged(rng):
 
 @pytest.mark.parametrize("seeds", [range(25), pytest.param(range(25, 400), marks=pytest.mark.slow)])
 def test_any_damaged_record_gives_a_finite_plant_or_one_sentence(seeds):
-    told = 0
+    refused = 0
     for seed in seeds:
         rng = np.random.default_rng(seed)
         us, ys = damaged(rng)
         try:
-            found = identify(
-                us, ys, sample_time_s=1.0, feedthrough=None, refinement=str(rng.choice(["none", "validated"]))
+            identified = identify(
+                us,
+                ys,
+                sample_time_s=1.0,
+                settings=Settings(feedthrough=None, refinement=str(rng.choice(["none", "validated"]))),
             )
-            assert all(np.isfinite(M).all() for M in found.plant[:7])
+            assert all(np.isfinite(M).all() for M in identified.plant[:7])
         except np.linalg.LinAlgError:
             raise
         except ValueError as refusal:
-            told += 1
+            refused += 1
             assert re.search(r"record|input u\d|output y\d|segments", str(refusal))
             assert "\n" not in str(refusal)
-    assert 0 < told < len(seeds)
+    assert 0 < refused < len(seeds)
 
 
 def test_segments_of_unequal_length_are_refused():

@@ -13,7 +13,7 @@ from pipeline.store import artifacts, params
 from pipeline.store.execution import run_all
 from pipeline.temperature import study
 from pipeline.temperature.workflow import ingest
-from pipeline.temperature.workflow.ingest import Job, collect, process
+from pipeline.temperature.workflow.ingest import IngestSpec, collect, process
 from pipeline.temperature.workflow.settings import Plant
 from tests.cluster import Cluster
 
@@ -24,7 +24,7 @@ MACHINE = Plant.model_validate(
         "outputs": [{"name": "zone", "unit": "degC", "reference": 50.0}],
     }
 )
-JOB = Job(MACHINE, {}, "", 5.0)
+JOB = IngestSpec(MACHINE, {}, "", 5.0)
 INLINE = params.Execution(backend="loky", jobs=1, scheduler="")
 LOKY = params.Execution(backend="loky", jobs=2, scheduler="")
 NAMES = ("record.parquet", "quality.parquet", "metrics.json")
@@ -219,25 +219,26 @@ def test_a_copy_of_a_recording_is_quarantined_for_it_would_count_twice(tmp_path)
 
 def test_two_devices_in_one_recording_are_quarantined_with_the_place_and_in_a_part_of_it_masked(tmp_path):
     def mixed(path: Path, start: int) -> None:
-        found = np.genfromtxt(recording(path, seed=1, samples=600), delimiter=",", names=True)
+        columns = np.genfromtxt(recording(path, seed=1, samples=600), delimiter=",", names=True)
         zone = np.where(
-            (np.arange(600) >= start) & (np.arange(600) % 2 == 0), found["zone"] + 9, found["zone"]
+            (np.arange(600) >= start) & (np.arange(600) % 2 == 0), columns["zone"] + 9, columns["zone"]
         )
-        artifacts.write_csv(path, {"time_s": found["time_s"], "heater": found["heater"], "zone": zone})
+        artifacts.write_csv(path, {"time_s": columns["time_s"], "heater": columns["heater"], "zone": zone})
 
     raw = folder(tmp_path, 1)
     mixed(raw / "all.csv", 0)
     mixed(raw / "end.csv", 450)
     assert done(ingested(raw, tmp_path)) == (2, 0, 1)
     quality = artifacts.read_table(tmp_path / "quality.parquet", ingest.tables.QUALITY)
-    found = {
+    columns = {
         (str(quality["recording"][i]), str(quality["kind"][i])): str(quality["message"][i])
         for i in range(len(quality["kind"]))
     }
     assert (
-        "from 0 to 599 s, masked: two devices seem to write under one name" in found["all.csv", "quarantined"]
+        "from 0 to 599 s, masked: two devices seem to write under one name"
+        in columns["all.csv", "quarantined"]
     )
-    assert "to 599 s, masked: two devices" in found["end.csv", "mixed"]
+    assert "to 599 s, masked: two devices" in columns["end.csv", "mixed"]
     record = artifacts.read_table(
         tmp_path / "record.parquet", ingest.tables.record(MACHINE.inputs, MACHINE.outputs)
     )
@@ -321,9 +322,8 @@ def test_a_worker_killed_at_its_work_costs_nothing_but_time(tmp_path, cluster):
         [sys.executable, "-c", KILLER, memo, str(cluster.workers[1].pid)], stdout=subprocess.PIPE
     )
     ingested(raw, tmp_path / "cluster", params.Execution(backend="dask", jobs=2, scheduler=cluster.address))
-    assert (
-        int(killer.communicate(timeout=60)[0]) < 6
-    )  # entries that were whole when it died: there was work left
+    # entries that were whole when it died: there was work left
+    assert int(killer.communicate(timeout=60)[0]) < 6
     cluster.workers[1].join(timeout=60)
     assert cluster.workers[1].exitcode == -signal.SIGKILL
     assert cluster.workers[0].is_alive()
@@ -336,7 +336,8 @@ def test_a_worker_killed_at_its_work_costs_nothing_but_time(tmp_path, cluster):
 def test_no_scheduler_at_the_address_is_one_sentence(tmp_path):
     with pytest.raises(
         ValueError,
-        match=r"execution\.scheduler: expected a dask scheduler with a worker at tcp://127\.0\.0\.1:9, found none",
+        match=r"execution\.scheduler: expected a dask scheduler with a worker at tcp://127\.0\.0\.1:9, found "
+        r"none",
     ):
         ingested(
             folder(tmp_path, 2),

@@ -76,18 +76,16 @@ def test_skron_carries_a_congruence(a, d):
     rng = np.random.default_rng(a)
     X, S = rng.normal(size=(a, d)), rng.normal(size=(d, d))
     S = S + S.T
-    np.testing.assert_allclose(
-        skron(X) @ svec(S), svec(X @ S @ X.T), atol=1e-13
-    )  # rounding of numbers near 10
+    # rounding of numbers near 10
+    np.testing.assert_allclose(skron(X) @ svec(S), svec(X @ S @ X.T), atol=1e-13)
 
 
 def test_the_gram_matrix_in_blocks_is_that_of_all_samples():
     Z = np.random.default_rng(0).normal(size=(4, 37))
     features = np.stack([svec(np.outer(z, z)) for z in Z.T])
     for block in (5, 37, 1024):
-        np.testing.assert_allclose(
-            quadratic_gram(Z, block=block), features.T @ features, rtol=1e-12
-        )  # rounding of 37 terms
+        # rounding of 37 terms
+        np.testing.assert_allclose(quadratic_gram(Z, block=block), features.T @ features, rtol=1e-12)
 
 
 # ---- windows
@@ -125,7 +123,8 @@ def test_segments_give_the_kernel_of_one_record():
 def test_records_shorter_than_the_window_are_refused():
     with pytest.raises(
         ValueError,
-        match="no segment is longer than the window of 3 samples; lower the window, or record a longer stretch without gaps",
+        match="no segment is longer than the window of 3 samples; lower the window, or record a longer "
+        "stretch without gaps",
     ):
         windows([np.ones((3, 1))], [np.ones((3, 1))], 3)
 
@@ -147,19 +146,15 @@ def test_whitening_keeps_the_range_and_makes_the_second_moment_the_identity():
     W, sv = whitening(s, s_next, tolerance=1e-9)
     assert (W.shape, len(sv)) == ((3, 8), 8)
     v = np.vstack([s, s_next]) @ W.T
-    np.testing.assert_allclose(
-        v.T @ v / 400, np.eye(3), atol=1e-9
-    )  # rounding times the spread of scales, 1e7
+    # rounding times the spread of scales, 1e7
+    np.testing.assert_allclose(v.T @ v / 400, np.eye(3), atol=1e-9)
     np.testing.assert_allclose(v @ np.linalg.pinv(W).T, np.vstack([s, s_next]), rtol=1e-6)
 
 
 def test_the_study_s_window_of_six_has_rank_56_of_79(record):
     data = regress(tuples([record[0]], [record[1]], 6))
-    assert (data.rank, data.unknowns, data.samples_needed) == (
-        55,
-        1540,
-        1540,
-    )  # [past u; past y; u]: 7 x 6 + 6 states + 7, no reference
+    # [past u; past y; u]: 7 x 6 + 6 states + 7, no reference
+    assert (data.rank, data.unknowns, data.samples_needed) == (55, 1540, 1540)
     assert data.entries == 79 * 80 // 2
     assert data.condition < 1e6  # 6.6e13 without whitening
     reference = tuples_with_reference([record[0]], [record[1]], 6, REFERENCE, I5)
@@ -181,8 +176,10 @@ def differences(data, iterations):
     H, K = naive.value_iteration(
         data.s, data.u, data.e, data.s_next, I5, I7, GAMMA, mu=1e-4, iterations=iterations
     )
-    found = value_iteration(regress(data, mu=1e-4), I5, I7, GAMMA, tolerance=0.0, max_iterations=iterations)
-    assert found.iterations == iterations
+    solution = value_iteration(
+        regress(data, mu=1e-4), I5, I7, GAMMA, tolerance=0.0, max_iterations=iterations
+    )
+    assert solution.iterations == iterations
     W, _ = whitening(data.s, data.s_next, tolerance=1e-9)
     scale = np.block(
         [
@@ -190,17 +187,16 @@ def differences(data, iterations):
             [np.zeros((7, W.shape[1])), np.diag(1 / np.sqrt((data.u**2).mean(axis=0)))],
         ]
     )
-    ours = np.column_stack([found.K, found.k + found.K_r @ data.base])
-    return np.abs(scale.T @ found.H @ scale - H).max() / np.abs(H).max(), np.abs(
+    ours = np.column_stack([solution.K, solution.k + solution.K_r @ data.base])
+    return np.abs(scale.T @ solution.H @ scale - H).max() / np.abs(H).max(), np.abs(
         ours - K @ data.features
     ).max() / np.abs(K @ data.features).max()
 
 
 def test_the_kernel_equals_the_naive_form_at_the_published_ridge(record):
     in_kernel, in_gain = differences(explicit(record, 2, 600), 20)
-    assert (
-        in_kernel <= 1e-7
-    )  # the naive Gram matrix has a condition near 1e9 at this ridge: seven digits of sixteen remain
+    # the naive Gram matrix has a condition near 1e9 at this ridge: seven digits of sixteen remain
+    assert in_kernel <= 1e-7
     assert in_gain <= 1e-7
 
 
@@ -215,15 +211,15 @@ def test_the_kernel_equals_the_naive_form_on_the_study_s_whole_problem():
 @pytest.mark.parametrize(("N", "samples"), [(2, 502), (6, 1616)])
 def test_the_kernel_learned_without_noise_is_the_exact_one(record, N, samples):
     u, y = (signal[:samples] for signal in record)
-    found = value_iteration(regress(tuples([u], [y], N)), I5, I7, GAMMA, tolerance=1e-9)
+    solution = value_iteration(regress(tuples([u], [y], N)), I5, I7, GAMMA, tolerance=1e-9)
     best = gains(baam(), I5, I7, GAMMA)
     K, K_r = exact_gains(baam(), best, N)
     w = windows([u], [y], N)[0]
     # gains on redundant windows differ where no window of the plant lies; on every window of the record the
     # input is the same to 1e-6 of its 100 percent
-    np.testing.assert_allclose(w @ found.K.T, w @ K.T, atol=1e-4)
-    np.testing.assert_allclose(found.K_r, K_r, rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(found.k, 0.0, atol=1e-6)
+    np.testing.assert_allclose(w @ solution.K.T, w @ K.T, atol=1e-4)
+    np.testing.assert_allclose(solution.K_r, K_r, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(solution.k, 0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize("F", [np.eye(2), TURN], ids=["constant reference", "turning and decaying reference"])
@@ -234,13 +230,13 @@ def test_the_kernel_learned_without_noise_is_the_exact_one(record, N, samples):
 )
 def test_the_learned_law_is_the_optimal_one_for_any_generator_and_offset(machine, offset, F):
     x, u, y = small_record(machine)
-    found = value_iteration(regress(tuples([u], [y], 2, offset=offset)), Q2, R2, 0.9, F=F, tolerance=1e-12)
+    solution = value_iteration(regress(tuples([u], [y], 2, offset=offset)), Q2, R2, 0.9, F=F, tolerance=1e-12)
     best = gains(machine, Q2, R2, 0.9, F)
     w = windows([u], [y], 2)[0]
     # 1e-12 on the gain at stop leaves 1e-11 of a contraction 0.9;
     # whitening multiplies rounding by its condition of 1e3
-    np.testing.assert_allclose(w @ found.K.T + found.k, x[2:-1] @ best.K_x.T + best.k, atol=1e-8)
-    np.testing.assert_allclose(found.K_r, best.K_r, atol=1e-8)
+    np.testing.assert_allclose(w @ solution.K.T + solution.k, x[2:-1] @ best.K_x.T + best.k, atol=1e-8)
+    np.testing.assert_allclose(solution.K_r, best.K_r, atol=1e-8)
 
 
 def test_policies_and_values_lead_to_one_kernel():
@@ -249,9 +245,8 @@ def test_policies_and_values_lead_to_one_kernel():
     by_value = value_iteration(data, Q2, R2, 0.9, tolerance=1e-13)
     by_policy = policy_iteration(data, Q2, R2, 0.9, np.zeros((2, len(data.W))))
     assert by_policy.iterations < 10 < by_value.iterations
-    np.testing.assert_allclose(
-        by_policy.H, by_value.H, rtol=1e-8, atol=1e-8 * np.abs(by_value.H).max()
-    )  # H creeps at 0.9^k after the gain has settled
+    # H creeps at 0.9^k after the gain has settled
+    np.testing.assert_allclose(by_policy.H, by_value.H, rtol=1e-8, atol=1e-8 * np.abs(by_value.H).max())
     np.testing.assert_allclose(by_policy.K, by_value.K, atol=1e-9)
     np.testing.assert_allclose(by_policy.k, by_value.k, atol=1e-9)
 
@@ -260,22 +255,23 @@ def test_the_kernel_solves_the_bellman_equation_on_every_sample():
     """v'H v = e'Qe + u'Ru + gamma s+'P s+ with P the Schur complement of H: no noise, so sample by sample."""
     _, u, y = small_record(SMALL)
     data = tuples([u], [y], 2)
-    found = (
+    solution = (
         policy_iteration(regress(data), Q2, R2, 0.9, np.zeros((2, 7)), tolerance=1e-12)
         if len(regress(data).W) == 7
         else None
     )
-    assert found is not None, "the window of two holds 2 x 2 inputs and 3 states"
+    assert solution is not None, "the window of two holds 2 x 2 inputs and 3 states"
     W, _ = whitening(data.s, data.s_next, tolerance=1e-9)
     v, s_next = np.hstack([data.s @ W.T, data.u / np.sqrt((data.u**2).mean(axis=0))]), data.s_next @ W.T
-    P = found.H[:7, :7] - found.H[:7, 7:] @ np.linalg.solve(found.H[7:, 7:], found.H[7:, :7])
+    P = solution.H[:7, :7] - solution.H[:7, 7:] @ np.linalg.solve(solution.H[7:, 7:], solution.H[7:, :7])
     stage = ((data.e @ Q2) * data.e + (data.u @ R2) * data.u).sum(axis=1)
+    # rounding times condition
     np.testing.assert_allclose(
-        ((v @ found.H) * v).sum(axis=1),
+        ((v @ solution.H) * v).sum(axis=1),
         stage + 0.9 * ((s_next @ P) * s_next).sum(axis=1),
         rtol=1e-8,
         atol=1e-8,
-    )  # rounding times condition
+    )
 
 
 def test_exactly_so_many_iterations_are_made_as_asked_for():
@@ -307,18 +303,16 @@ def test_window_law_takes_over_with_the_history_of_the_hold():
     u, y = np.array([3.0, -1.0]), np.array([50.0])
     start = law.start_u @ u + law.start_y @ y + law.start
     np.testing.assert_array_equal(start, [3, -1, 3, -1, 3, -1, 3, -1, 50, 50, 50, 50])
-    np.testing.assert_array_equal(
-        law.A @ start + law.B_u @ u + law.B_y @ y, start
-    )  # a hold goes on as a hold
+    # a hold goes on as a hold
+    np.testing.assert_array_equal(law.A @ start + law.B_u @ u + law.B_y @ y, start)
 
 
 @pytest.mark.parametrize("N", [2, 3, 6])
 def test_the_state_is_reconstructed_from_the_window_to_rounding(N, record):
     u, _ = record
     x, y = simulate(baam(), u[:40], np.linspace(10, 60, 6))
-    np.testing.assert_allclose(
-        windows([u[:40]], [y], N)[0] @ reconstruction(baam(), N).T, x[N:-1], atol=1e-9
-    )  # rounding at 100 °C times the inverse of C
+    # rounding at 100 °C times the inverse of C
+    np.testing.assert_allclose(windows([u[:40]], [y], N)[0] @ reconstruction(baam(), N).T, x[N:-1], atol=1e-9)
 
 
 # ---- refusals
@@ -357,7 +351,8 @@ def test_an_input_that_only_feeds_back_is_refused_by_name():
         x = machine.A @ x + machine.B @ u
     with pytest.raises(
         ValueError,
-        match=r"input 2 of 2 follows from the past of inputs and outputs \(rank \d+ of \d+\), .* add probing that no feedback produces",
+        match=r"input 2 of 2 follows from the past of inputs and outputs \(rank \d+ of \d+\), .* add probing "
+        r"that no feedback produces",
     ):
         regress(tuples([np.array(rows)], [np.array(measured)], 2))
 
@@ -370,7 +365,8 @@ def test_inputs_of_two_levels_at_one_frequency_do_not_determine_the_kernel():
     y = simulate(machine, bits, np.ones(1))[1]
     with pytest.raises(
         ValueError,
-        match=r"does not determine the kernel: expected a Gram matrix of condition below 1e\+13 for \d+ unknowns, found .* probe with more levels",
+        match=r"does not determine the kernel: expected a Gram matrix of condition below 1e\+13 for \d+ "
+        r"unknowns, found .* probe with more levels",
     ):
         regress(tuples([bits], [y], 1))
 
@@ -388,6 +384,7 @@ def test_value_iteration_that_does_not_settle_is_refused():
     _, u, y = small_record(SMALL)
     with pytest.raises(
         ValueError,
-        match=r"value iteration did not settle in 1 iterations \(last relative change of the gain .*\); record longer, or lower the window",
+        match=r"value iteration did not settle in 1 iterations \(last relative change of the gain .*\); "
+        r"record longer, or lower the window",
     ):
         value_iteration(regress(tuples([u], [y], 2)), Q2, R2, 0.9, max_iterations=1)

@@ -3,11 +3,13 @@
 import re
 import tomllib
 
+import control
 import numpy as np
 import pytest
 
 from pipeline.temperature import plant as plants
 from pipeline.temperature.plant import (
+    Plant,
     baam,
     controllability,
     hold_output,
@@ -33,9 +35,8 @@ def test_the_study_s_machine_is_the_one_of_its_tables(shared):
 
 def test_the_study_s_machine_nearly_integrates():
     slowest = np.abs(np.linalg.eigvals(baam().A)).max()
-    assert slowest == pytest.approx(
-        1.00000285, abs=1e-8
-    )  # printed digits of the temperature notes' "open-loop pole at 1 + its band"
+    # printed digits of the temperature notes' "open-loop pole at 1 + its band"
+    assert slowest == pytest.approx(1.00000285, abs=1e-8)
 
 
 def test_two_steps_by_hand():
@@ -52,9 +53,10 @@ def test_markov_parameters_are_the_response_to_a_unit_pulse():
     for channel in range(machine.m):
         pulse = np.zeros((lags + 1, machine.m))
         pulse[0, channel] = 1.0
+        # rounding of numbers near 1
         np.testing.assert_allclose(
             h[:, :, channel], simulate(machine, pulse, np.zeros(machine.n))[1][1:], atol=1e-14
-        )  # rounding of numbers near 1
+        )
 
 
 def test_the_study_s_machine_shows_every_state_and_obeys_in_every_state():
@@ -93,15 +95,13 @@ def test_the_holding_input_of_an_output_rests_there_and_is_the_smallest(machine)
     y = np.linspace(40.0, 60.0, machine.p)
     x, u = hold_output(machine, y)
     np.testing.assert_allclose(machine.A @ x + machine.B @ u + machine.b, x, atol=1e-11)  # rounding at 60 °C
-    np.testing.assert_allclose(
-        machine.C @ x + machine.D @ u + machine.d, y, atol=1e-8
-    )  # rounding times the gain of 5e5 of the study's machine at rest
+    # rounding times the gain of 5e5 of the study's machine at rest
+    np.testing.assert_allclose(machine.C @ x + machine.D @ u + machine.d, y, atol=1e-8)
     # smallest: the map from u to y at rest is surjective here, and its pseudo-inverse gives the least norm
     rest = machine.C @ np.linalg.inv(np.eye(machine.n) - machine.A)
     expected = np.linalg.pinv(rest @ machine.B + machine.D) @ (y - machine.d - rest @ machine.b)
-    np.testing.assert_allclose(
-        u, expected, atol=1e-6
-    )  # both lose the digits of that gain, far below a percent of duty
+    # both lose the digits of that gain, far below a percent of duty
+    np.testing.assert_allclose(u, expected, atol=1e-6)
 
 
 def test_an_integrator_holds_its_output_too():
@@ -110,7 +110,7 @@ def test_an_integrator_holds_its_output_too():
 
 
 def test_the_declared_spread_is_each_column_of_B_both_ways_and_one_more_loss():
-    family = spread(baam(), input_gain=0.15, loss=0.005)
+    family = spread(baam(), input_gain=0.15, extra_heat_loss=0.005)
     assert len(family) == 1 + 2 * 7 + 1
     np.testing.assert_allclose(family[5].B[:, 2], 0.85 * baam().B[:, 2])
     np.testing.assert_allclose(family[6].B[:, 2], 1.15 * baam().B[:, 2])
@@ -140,3 +140,48 @@ def test_a_matrix_of_the_wrong_shape_is_named():
         match="plant: C holds a number that is not finite; identify the plant again on a clean record",
     ):
         plant(SMALL.A, SMALL.B, [[np.nan, 1.0]])
+
+
+# ---- python-control
+
+
+NAMES = ["heater", "motor"], ["sensor"]
+
+
+def test_a_plant_comes_back_from_control_with_its_names_and_sample_time():
+    plain = SMALL._replace(sample_time_s=0.5)
+    system = plain.to_control(*NAMES)
+    assert (system.input_labels, system.output_labels, system.dt) == (*NAMES, 0.5)
+    back = Plant.from_control(system, b=plain.b, d=plain.d, K=plain.K)
+    for name in Plant._fields:
+        np.testing.assert_array_equal(getattr(back, name), getattr(plain, name))
+    assert not np.any(Plant.from_control(system).b)
+
+
+def test_control_s_forced_response_is_the_simulation():
+    machine, rng = baam(), np.random.default_rng(0)
+    u, x0 = rng.standard_normal((40, 7)), rng.standard_normal(6)
+    names = [f"input_{i}" for i in range(7)], [f"sensor_{i}" for i in range(5)]
+    response = control.forced_response(
+        machine.to_control(*names), np.arange(40) * machine.sample_time_s, u.T, x0
+    )
+    # rounding of 40 steps
+    np.testing.assert_allclose(response.outputs.T, simulate(machine, u, x0)[1], atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("system", "sentence"),
+    [
+        (lambda: control.ss([[-1.0]], [[1.0]], [[1.0]], [[0.0]]), "found dt = 0; sample it"),
+        (lambda: control.ss([[0.5]], [[1.0]], [[1.0]], [[0.0]], True), "found dt = True"),
+        (lambda: control.tf([1.0], [1.0, -0.5], 1.0), "found TransferFunction; convert it with control.ss"),
+    ],
+)
+def test_a_system_without_states_or_sample_time_is_refused(system, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        Plant.from_control(system())
+
+
+def test_a_name_for_each_signal_is_wanted():
+    with pytest.raises(ValueError, match="to_control: expected 2 input names but found 1"):
+        SMALL.to_control(["heater"], ["sensor"])

@@ -8,7 +8,16 @@ import pytest
 
 from pipeline.temperature import window as window_route
 from pipeline.temperature.plant import baam, simulate
-from pipeline.temperature.probing import excitation, multisine, prbs, probe, study_probe, study_signal
+from pipeline.temperature.probing import (
+    InputLimits,
+    OperatingPoint,
+    excitation,
+    multisine,
+    prbs,
+    probe,
+    study_probe,
+    study_signal,
+)
 from pipeline.temperature.published import GAMMA, K_DATA, REFERENCE
 from pipeline.temperature.study import gap, study_panel
 from pipeline.temperature.tracking import feasible_target
@@ -19,19 +28,17 @@ LOW, HIGH = np.zeros(7), np.full(7, 100.0)
 def gentle(signal, *, rate=5.0, noise=0.1, seed=0, low=None, high=None):
     """Probing of +-5 % around the study's feasible target, with a little feedback from what is measured."""
     target, rng = feasible_target(baam(), REFERENCE, LOW, HIGH), np.random.default_rng(seed)
-    limits = {"low": target.u - 5 if low is None else low, "high": target.u + 5 if high is None else high}
+    low, high = target.u - 5 if low is None else low, target.u + 5 if high is None else high
     disturbance = noise * rng.standard_normal((len(signal), 5))
-    return probe(
+    recorded = probe(
         baam(),
         signal,
-        x0=target.x,
-        u_centre=target.u,
-        y_centre=target.y,
+        OperatingPoint(target.x, target.u, target.y),
+        InputLimits(low, high, rate),
         feedback=0.2 * np.eye(7, 5),
-        rate=rate,
         noise=disturbance,
-        **limits,
-    ), target
+    )
+    return recorded, target
 
 
 def test_a_multisine_stays_within_its_amplitude_and_reaches_it():
@@ -52,9 +59,10 @@ def test_the_inputs_of_a_multisine_share_no_line_and_have_none_below_the_lowest(
     assert on.sum(axis=1).max() == 1
     assert (2 * np.pi * np.flatnonzero(on.any(axis=1)) / samples).min() >= 0.5
     for channel in range(3):
+        # equal power; rounding
         np.testing.assert_allclose(
             power[on[:, channel], channel], power[on[:, channel], channel].mean(), rtol=1e-9
-        )  # equal power; rounding
+        )
 
 
 def test_a_prbs_has_two_levels_and_switches_no_faster_than_told():
@@ -79,9 +87,8 @@ def test_a_probe_keeps_amplitude_rate_and_machine_limits(kind, rate):
     run, _ = gentle(signal, rate=rate, low=low, high=high)
     assert (run.u >= low).all()
     assert (run.u <= high).all()
-    assert (
-        np.abs(np.diff(np.vstack([target.u, run.u]), axis=0)).max() <= rate + 1e-12
-    )  # rounding of the sum of two inputs
+    # rounding of the sum of two inputs
+    assert np.abs(np.diff(np.vstack([target.u, run.u]), axis=0)).max() <= rate + 1e-12
     assert 0 < run.limited <= 1
 
 
@@ -105,9 +112,8 @@ def test_feedback_reads_measured_outputs_only():
     quiet, target = gentle(signal, noise=0.0)
     shown = gentle(signal, noise=1.0, seed=3)[0]
     difference = shown.y[0] - quiet.y[0]
-    np.testing.assert_allclose(
-        shown.u[0] - target.u, -0.2 * np.r_[difference, 0, 0], atol=1e-9
-    )  # the target is met within 1e-8 °C
+    # the target is met within 1e-8 °C
+    np.testing.assert_allclose(shown.u[0] - target.u, -0.2 * np.r_[difference, 0, 0], atol=1e-9)
 
 
 def test_an_unlimited_probe_counts_no_sample_as_limited():
@@ -124,17 +130,15 @@ def test_two_thousand_gentle_samples_leave_a_gap_of_at_most_15_millionths(seed):
     run, _ = gentle(prbs(np.random.default_rng(seed), 2000, 7, amplitude=5.0, shortest=1), seed=100 + seed)
     assert np.abs(run.y - REFERENCE).max() < 60.0  # the study's own probing swings the plant by 70 to 190 °C
     law = window_route.law(window_route.learn([run.u], [run.y], longest=12), np.eye(5), np.eye(7), GAMMA)
-    assert (
-        gap(law, study_panel(REFERENCE[None], noise=0.1, seeds=(seed,), hold=24))[0] <= 1.5e-5
-    )  # the bar; 1.0e-5 measured
+    # the bar; 1.0e-5 measured
+    assert gap(law, study_panel(REFERENCE[None], noise=0.1, seeds=(seed,), hold=24))[0] <= 1.5e-5
 
 
 def test_the_study_s_signal_is_a_sinusoid_at_the_bandwidth_and_draws():
     settings = {"amplitudes": np.array([2.0]), "bandwidth": 1.65, "variance": 0.0}
     signal = study_signal(np.random.default_rng(0), 20, 2, **settings)
-    np.testing.assert_allclose(
-        signal, np.tile(2 * np.sin(1.65 * np.arange(20))[:, None], 2), atol=1e-14
-    )  # rounding
+    # rounding
+    np.testing.assert_allclose(signal, np.tile(2 * np.sin(1.65 * np.arange(20))[:, None], 2), atol=1e-14)
     noise = study_signal(
         np.random.default_rng(0), 20_000, 1, amplitudes=np.array([0.0]), bandwidth=1.65, variance=1.5
     )
@@ -190,10 +194,8 @@ def test_the_level_of_a_frequency_lands_in_its_band_with_its_r_m_s_value():
     )
     level = excitation(u, 1, bands=8).level
     expected = np.zeros((8, 2))
-    expected[0, 0], expected[6, 1] = (
-        3 / np.sqrt(2),
-        2 / np.sqrt(2),
-    )  # lines 1-50 are the first of eight bands, 301-350 the seventh
+    # lines 1-50 are the first of eight bands, 301-350 the seventh
+    expected[0, 0], expected[6, 1] = (3 / np.sqrt(2), 2 / np.sqrt(2))
     np.testing.assert_allclose(level, expected, atol=1e-12)  # whole periods: rounding
 
 

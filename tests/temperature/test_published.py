@@ -44,10 +44,10 @@ def learned(draws):
     ids=["identity", "tuned"],
 )
 def test_the_model_based_figures_come_out_as_printed(draws, weights, J100, J1000, error):
-    found = model_based(weights, draws[0])
-    assert found.J100 == pytest.approx(J100, abs=0.01)  # the bar
-    assert found.J1000 == pytest.approx(J1000, abs=0.05)  # printed digits
-    assert found.error == pytest.approx(error, abs=1e-5)  # the bar
+    results = model_based(weights, draws[0])
+    assert results.J100 == pytest.approx(J100, abs=0.01)  # the bar
+    assert results.J1000 == pytest.approx(J1000, abs=0.05)  # printed digits
+    assert results.error == pytest.approx(error, abs=1e-5)  # the bar
 
 
 def test_the_data_driven_cost_comes_out_as_printed(learned):
@@ -55,9 +55,8 @@ def test_the_data_driven_cost_comes_out_as_printed(learned):
 
 
 def test_the_tuned_data_driven_cost_is_the_one_of_the_notes(learned):
-    assert data_driven(TUNED_DATA[0], learned[1]).J100 == pytest.approx(
-        204_666.9, abs=1.0
-    )  # printed 204,635.7; both are shown, without a bar
+    # printed 204,635.7; both are shown, without a bar
+    assert data_driven(TUNED_DATA[0], learned[1]).J100 == pytest.approx(204_666.9, abs=1.0)
 
 
 def test_most_of_the_data_driven_cost_accrues_in_the_start_up_steps(learned):
@@ -70,14 +69,13 @@ def test_most_of_the_data_driven_cost_accrues_in_the_start_up_steps(learned):
 
 def test_algorithm_1_misses_the_stabilising_gain_in_a_third_of_300_starts():
     failures = algorithm_1_failures(300)
-    assert (
-        80 <= failures <= 120
-    )  # about 100 of 300; the count turns on how a failure is told, not on rounding
+    # about 100 of 300; the count turns on how a failure is told, not on rounding
+    assert 80 <= failures <= 120
 
 
 def test_the_four_columns_are_the_study_s(draws, learned, monkeypatch):
     monkeypatch.setattr(published, "kernel_gains", lambda *_: learned)
-    found = published.figures(*draws)
-    assert set(found) == set(published.PRINTED)
-    assert found["model_based"] == model_based(IDENTITY, draws[0])
-    assert found["data_driven_tuned"] == data_driven(TUNED_DATA[0], learned[1])
+    results = published.figures(*draws)
+    assert set(results) == set(published.PRINTED)
+    assert results["model_based"] == model_based(IDENTITY, draws[0])
+    assert results["data_driven_tuned"] == data_driven(TUNED_DATA[0], learned[1])

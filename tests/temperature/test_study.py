@@ -16,19 +16,19 @@ def record():
 
 
 def test_the_optimum_and_the_observer_cost_what_the_notes_say():
-    found = study.exact()
-    assert found.optimal_J1000 == pytest.approx(151_875.28, abs=0.01)  # printed digits
-    assert found.optimal_J100 == pytest.approx(151_819.56, abs=0.01)
-    assert found.observer_J1000 <= 151_876  # the bar
-    assert found.observer_published_start_J1000 == pytest.approx(159_183, abs=1)
-    assert found.zero_history_gap == pytest.approx(8e-7, abs=1e-7)
+    exact = study.exact()
+    assert exact.optimal_J1000 == pytest.approx(151_875.28, abs=0.01)  # printed digits
+    assert exact.optimal_J100 == pytest.approx(151_819.56, abs=0.01)
+    assert exact.observer_J1000 <= 151_876  # the bar
+    assert exact.observer_published_start_J1000 == pytest.approx(159_183, abs=1)
+    assert exact.zero_history_gap == pytest.approx(8e-7, abs=1e-7)
 
 
 def test_one_record_without_noise_gives_the_optimum_for_every_reference(record):
-    found = study.noise_free(*record, np.random.default_rng(4))
-    assert found.gap <= 1e-7  # the bars
-    assert found.gap_window_6 <= 1e-7
-    assert found.any_reference_gap <= 1e-7
+    result = study.noise_free(*record, np.random.default_rng(4))
+    assert result.gap <= 1e-7  # the bars
+    assert result.gap_window_6 <= 1e-7
+    assert result.any_reference_gap <= 1e-7
 
 
 def test_a_kernel_short_of_samples_for_any_reference_is_refused(record):
@@ -40,27 +40,27 @@ def test_a_kernel_short_of_samples_for_any_reference_is_refused(record):
 def test_both_routes_stand_sensor_noise(noise, window_bar, kernel_bar):
     """One data set here; twenty in the slow test."""
     u, y = study.data_sets(np.random.default_rng(1), 15_000, 1)
-    found = study.under_noise(u[:, 0], y[:, 0], noise=noise, seed=0)
-    assert found["window"][0] <= window_bar
-    assert found["kernel"][0] <= kernel_bar
-    assert found["kernel_predicted_state"][0] < found["kernel"][0]
-    assert max(error for _, error in found.values()) < 2.0  # °C over the second half: 0.03 to 0.7 measured
+    gaps = study.under_noise(u[:, 0], y[:, 0], noise=noise, seed=0)
+    assert gaps["window"][0] <= window_bar
+    assert gaps["kernel"][0] <= kernel_bar
+    assert gaps["kernel_predicted_state"][0] < gaps["kernel"][0]
+    assert max(error for _, error in gaps.values()) < 2.0  # °C over the second half: 0.03 to 0.7 measured
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("noise", "window_bar", "kernel_bar"), [(0.1, 4e-6, 1.5e-4), (0.5, 1e-4, 1e-3)])
 def test_both_routes_stand_sensor_noise_on_twenty_data_sets(noise, window_bar, kernel_bar):
     u, y = study.data_sets(np.random.default_rng(1), 15_000, 20)
-    found = [study.under_noise(u[:, i], y[:, i], noise=noise, seed=i) for i in range(20)]
-    assert max(f["window"][0] for f in found) <= window_bar
-    assert np.median([f["kernel"][0] for f in found]) <= kernel_bar
-    assert all(f["kernel"][0] < 1 for f in found)  # stable
+    gaps = [study.under_noise(u[:, i], y[:, i], noise=noise, seed=i) for i in range(20)]
+    assert max(f["window"][0] for f in gaps) <= window_bar
+    assert np.median([f["kernel"][0] for f in gaps]) <= kernel_bar
+    assert all(f["kernel"][0] < 1 for f in gaps)  # stable
 
 
 def test_scaling_all_weights_changes_the_index_and_not_the_controller():
-    found = study.scaled_weights(0.4)
-    assert found.change_percent == pytest.approx(-60.0, abs=1e-9)  # J is linear in the weights
-    assert found.gain_difference < 1e-12  # rounding
+    scaled = study.scaled_weights(0.4)
+    assert scaled.change_percent == pytest.approx(-60.0, abs=1e-9)  # J is linear in the weights
+    assert scaled.gain_difference < 1e-12  # rounding
 
 
 def test_the_index_of_the_tuner_is_the_known_optimum_at_equal_weights_and_more_elsewhere():
@@ -76,11 +76,11 @@ def test_the_index_of_the_tuner_is_the_known_optimum_at_equal_weights_and_more_e
 
 def test_noisy_data_sets_become_a_table_and_its_figures():
     work = [(noise, i) for noise in study.NOISE for i in range(3)]
-    found = [
+    results = [
         {route: (10.0 * noise + i + k, 0.1 * i) for k, route in enumerate(study.ROUTES)} for noise, i in work
     ]
-    found[0]["kernel"] = (float("inf"), float("nan"))
-    table = study.rows(work, found)
+    results[0]["kernel"] = (float("inf"), float("nan"))
+    table = study.rows(work, results)
     assert len(table["gap"]) == len(work) * len(study.ROUTES)
     figures = study.metrics(
         {}, study.Exact(1, 2, 3, 4, 5), study.NoiseFree(6, 7, 8), table, failures=9, starts=10
@@ -93,11 +93,8 @@ def test_noisy_data_sets_become_a_table_and_its_figures():
         "of": 3,
     }
     kernel = figures["kernel"]["noise_0_1"]
-    assert (kernel["worst_gap"], kernel["median_gap"], kernel["stable"]) == (
-        None,
-        4.0,
-        0,
-    )  # an unstable one is the worst, and no number
+    # an unstable one is the worst, and no number
+    assert (kernel["worst_gap"], kernel["median_gap"], kernel["stable"]) == (None, 4.0, 0)
     assert (
         figures["kernel"]["gap"],
         figures["kernel"]["any_reference_gap"],
@@ -107,6 +104,6 @@ def test_noisy_data_sets_become_a_table_and_its_figures():
 
 
 def test_the_study_s_panel_holds_every_cell_at_20_degrees():
-    found = study.study_panel(REFERENCE[None], noise=0.1, seeds=(3,), hold=5)
-    np.testing.assert_array_equal(found.x0, np.full((1, 6), 20.0))
-    assert (found.steps, found.hold, found.seed.tolist(), found.noise.tolist()) == (1000, 5, [3], [0.1])
+    cases = study.study_panel(REFERENCE[None], noise=0.1, seeds=(3,), hold=5)
+    np.testing.assert_array_equal(cases.x0, np.full((1, 6), 20.0))
+    assert (cases.steps, cases.hold, cases.seed.tolist(), cases.noise.tolist()) == (1000, 5, [3], [0.1])

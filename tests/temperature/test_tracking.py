@@ -3,6 +3,7 @@ observer, and targets within the limits."""
 
 import re
 
+import control
 import numpy as np
 import pytest
 import scipy.linalg
@@ -42,9 +43,8 @@ TURN = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
 
 def test_a_scalar_riccati_equation_by_hand():
     P = riccati(np.eye(1), np.eye(1), np.eye(1), np.eye(1))
-    assert P[0, 0] == pytest.approx(
-        (1 + np.sqrt(5)) / 2, rel=1e-14
-    )  # P = 1 + P - P^2 / (1 + P) is the golden ratio; rounding
+    # P = 1 + P - P^2 / (1 + P) is the golden ratio; rounding
+    assert P[0, 0] == pytest.approx((1 + np.sqrt(5)) / 2, rel=1e-14)
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -60,9 +60,8 @@ def test_the_riccati_solution_solves_stabilises_and_is_symmetric(seed):
     Q, R = Q @ Q.T, R @ R.T + np.eye(m)
     P = riccati(A, B, Q, R)
     K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
-    np.testing.assert_allclose(
-        Q + A.T @ P @ (A - B @ K), P, atol=1e-10 * np.abs(P).max()
-    )  # rounding times the condition of the draw
+    # rounding times the condition of the draw
+    np.testing.assert_allclose(Q + A.T @ P @ (A - B @ K), P, atol=1e-10 * np.abs(P).max())
     assert np.abs(np.linalg.eigvals(A - B @ K)).max() < 1
     np.testing.assert_allclose(P, P.T, atol=1e-12 * np.abs(P).max())
     np.testing.assert_allclose(P, scipy.linalg.solve_discrete_are(A, B, Q, R), atol=1e-9 * np.abs(P).max())
@@ -80,9 +79,8 @@ def test_slicot_s_discrete_example_comes_out_to_its_printed_digits(shared):
         numbers(shared("data/slicot_reference/SB02ND.res")),
     )
     A, B, C = data[:4].reshape(2, 2), data[4:6].reshape(2, 1), data[6:12].reshape(3, 2)
-    R = np.full(
-        (1, 1), 1e-7
-    )  # printed for R = 0, which ours excludes: the limit differs by less than the fourth digit
+    # printed for R = 0, which ours excludes: the limit differs by less than the fourth digit
+    R = np.full((1, 1), 1e-7)
     P = riccati(A, B, C.T @ C, R)
     np.testing.assert_allclose(P.ravel(), printed[:4], atol=5e-5)  # printed digits
     np.testing.assert_allclose(np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A).ravel(), printed[4:], atol=5e-5)
@@ -129,11 +127,11 @@ def best_inputs(machine, Q, R, gamma, F, x0, r0, steps):
     ids=["constant", "turning", "turning and decaying", "one decaying"],
 )
 def test_gains_are_optimal_for_every_reference_generator_and_offset(F):
-    found, x0, r0 = gains(SMALL, Q2, R2, 0.9, F), np.array([1.0, -2.0, 3.0]), np.array([20.0, -10.0])
+    optimal, x0, r0 = gains(SMALL, Q2, R2, 0.9, F), np.array([1.0, -2.0, 3.0]), np.array([20.0, -10.0])
     u = best_inputs(SMALL, Q2, R2, 0.9, F, x0, r0, 150)[0]
     # the end of the horizon counts 0.9^150 = 1e-7 of it, squared in its
     # effect on the first input through the closed loop
-    np.testing.assert_allclose(-found.K_x @ x0 - found.K_r @ r0 - found.k, u, rtol=1e-7)
+    np.testing.assert_allclose(-optimal.K_x @ x0 - optimal.K_r @ r0 - optimal.k, u, rtol=1e-7)
 
 
 def test_stein_solves_its_equation_for_any_F():
@@ -146,16 +144,16 @@ def test_stein_solves_its_equation_for_any_F():
 
 def test_weights_in_one_proportion_are_one_controller():
     one, other = (gains(baam(), scale * I5, scale * I7, GAMMA) for scale in (1.0, 0.4))
-    np.testing.assert_allclose(
-        one.K_x, other.K_x, atol=1e-13
-    )  # rounding: the minimiser of 0.4 J is that of J
+    # rounding: the minimiser of 0.4 J is that of J
+    np.testing.assert_allclose(one.K_x, other.K_x, atol=1e-13)
     np.testing.assert_allclose(one.K_r, other.K_r, atol=1e-13)
 
 
 def test_the_design_refuses_a_plant_that_jumps_with_its_input():
     with pytest.raises(
         ValueError,
-        match=r"expects outputs that do not jump with the input \(D = 0\) .* identify it with feedthrough: false",
+        match=r"expects outputs that do not jump with the input \(D = 0\) .* identify it with feedthrough: "
+        r"false",
     ):
         gains(baam()._replace(D=np.ones((5, 7))), I5, I7, GAMMA)
 
@@ -169,32 +167,32 @@ def test_policy_iteration_reaches_the_stabilising_gain_from_300_of_300():
     expected = np.hstack([best.K_x, best.K_r])
     for seed in range(300):
         K0 = np.random.default_rng(seed).normal(0.0, 10.0, (7, 11))
-        found = policy_iteration(machine, I5, I7, GAMMA, K0)
-        np.testing.assert_allclose(
-            found.K, expected, atol=1e-11, err_msg=f"seed {seed}"
-        )  # its own tolerance of 1e-9, converging quadratically
-        assert found.settled
+        iterated = policy_iteration(machine, I5, I7, GAMMA, K0)
+        # its own tolerance of 1e-9, converging quadratically
+        np.testing.assert_allclose(iterated.K, expected, atol=1e-11, err_msg=f"seed {seed}")
+        assert iterated.settled
 
 
 def test_algorithm_1_from_the_probing_gain_takes_five_to_eight_policies():
-    found = algorithm_1(baam(), I5, I7, GAMMA, np.hstack([K_DATA, np.zeros((7, 5))]), tolerance=0.1)
-    assert found.settled
-    assert 5 <= found.iterations <= 8
-    assert stabilises(baam(), found.K[:, :6])
+    iterated = algorithm_1(baam(), I5, I7, GAMMA, np.hstack([K_DATA, np.zeros((7, 5))]), tolerance=0.1)
+    assert iterated.settled
+    assert 5 <= iterated.iterations <= 8
+    assert stabilises(baam(), iterated.K[:, :6])
 
 
 def test_algorithm_1_says_when_its_iterations_ran_out():
-    found = algorithm_1(
+    iterated = algorithm_1(
         baam(), I5, I7, GAMMA, np.hstack([K_DATA, np.zeros((7, 5))]), tolerance=0.0, max_iterations=3
     )
-    assert (found.iterations, found.settled) == (3, False)
+    assert (iterated.iterations, iterated.settled) == (3, False)
 
 
 def test_policy_iteration_says_when_a_mode_obeys_no_input():
     stuck = plant(np.diag([1.1, 0.5]), [[0.0], [1.0]], np.eye(2))
     with pytest.raises(
         ValueError,
-        match=r"policy iteration did not settle in 200 policies \(discount 0\.\d+ of 0.99\); is every slow mode moved by an input\?",
+        match=r"policy iteration did not settle in 200 policies \(discount 0\.\d+ of 0.99\); is every slow "
+        r"mode moved by an input\?",
     ):
         policy_iteration(stuck, np.eye(2), np.eye(1), 0.99, np.zeros((1, 4)))
 
@@ -206,9 +204,8 @@ def test_the_observer_is_started_where_its_first_output_is_the_measured_one():
     machine = SMALL._replace(K=np.zeros((3, 2)))
     law = observer_law(machine, gains(machine, Q2, R2, 0.9), observer_gain(machine, TAU))
     y = np.array([3.0, -4.0])
-    np.testing.assert_allclose(
-        machine.C @ (law.start_y @ y + law.start) + machine.d, y, atol=1e-14
-    )  # rounding
+    # rounding
+    np.testing.assert_allclose(machine.C @ (law.start_y @ y + law.start) + machine.d, y, atol=1e-14)
 
 
 def test_the_observer_follows_the_state_of_a_plant_with_offsets():
@@ -219,9 +216,8 @@ def test_the_observer_follows_the_state_of_a_plant_with_offsets():
     for t in range(400):
         z = law.A @ z + law.B_u @ u[t] + law.B_y @ y[t] + law.c
     slowest = np.abs(np.linalg.eigvals(law.A)).max()
-    assert (
-        np.abs(z - x[400]).max() < 100 * slowest**400 + 1e-12
-    )  # the error decays as the slowest pole of A - L C
+    # the error decays as the slowest pole of A - L C
+    assert np.abs(z - x[400]).max() < 100 * slowest**400 + 1e-12
 
 
 @pytest.mark.parametrize("tau", [1e-3, 1.0, 1e3])
@@ -232,13 +228,13 @@ def test_the_robust_observer_is_stable_and_the_same_in_any_coordinates(tau):
     other = machine._replace(
         A=V @ machine.A @ np.linalg.inv(V), B=V @ machine.B, C=machine.C @ np.linalg.inv(V)
     )
-    np.testing.assert_allclose(
-        robust_observer_gain(other, tau), V @ L, atol=1e-6
-    )  # rounding times the square of the condition of V, 1e3
+    # rounding times the square of the condition of V, 1e3
+    np.testing.assert_allclose(robust_observer_gain(other, tau), V @ L, atol=1e-6)
     P = scipy.linalg.solve_discrete_are(machine.A.T, machine.C.T, machine.B @ machine.B.T, tau * I5)
+    # scipy's rounding
     np.testing.assert_allclose(
         L, machine.A @ P @ machine.C.T @ np.linalg.inv(machine.C @ P @ machine.C.T + tau * I5), atol=1e-8
-    )  # scipy's rounding
+    )
 
 
 def test_a_feasible_reference_is_hit_exactly_with_every_input_off_its_limits():
@@ -262,12 +258,10 @@ def test_an_infeasible_reference_is_missed_by_the_least_that_a_steady_state_allo
         rest @ scipy.optimize.lsq_linear(rest, r, (LOW, HIGH), method="bvls", tol=1e-15).x - r
     )
     assert least > 0.5
-    assert np.linalg.norm(rest @ target.u - r) == pytest.approx(
-        least, abs=2e-3
-    )  # 1e-3 of reach is given up for slack
-    np.testing.assert_allclose(
-        target.y, rest @ target.u, atol=1e-3
-    )  # the y that it names is the y that u holds
+    # 1e-3 of reach is given up for slack
+    assert np.linalg.norm(rest @ target.u - r) == pytest.approx(least, abs=2e-3)
+    # the y that it names is the y that u holds
+    np.testing.assert_allclose(target.y, rest @ target.u, atol=1e-3)
     np.testing.assert_allclose(machine.A @ target.x + machine.B @ target.u, target.x, atol=1e-7)
 
 
@@ -281,12 +275,10 @@ def test_an_aimed_law_rests_at_its_target():
         target.y,
     )
     z = np.linalg.solve(np.eye(6) - law.A, law.B_u @ target.u + law.B_y @ target.y + law.c)
-    np.testing.assert_allclose(
-        z, target.x, atol=1e-4
-    )  # the memory at rest is the state at rest: 1e-9 of the target's balance through the slowest observer pole
-    np.testing.assert_allclose(
-        -law.K @ z - law.K_r @ REFERENCE - law.k, target.u, atol=1e-11
-    )  # rounding at 180 °C
+    # the memory at rest is the state at rest: 1e-9 of the target's balance through the slowest observer pole
+    np.testing.assert_allclose(z, target.x, atol=1e-4)
+    # rounding at 180 °C
+    np.testing.assert_allclose(-law.K @ z - law.K_r @ REFERENCE - law.k, target.u, atol=1e-11)
 
 
 def test_an_aimed_law_takes_over_from_manual_without_a_bump():
@@ -296,6 +288,15 @@ def test_an_aimed_law_takes_over_from_manual_without_a_bump():
     z = np.linalg.pinv(machine.C) @ y
     for _ in range(6000):  # the slowest pole of the observer is 0.9966
         z = law.A @ z + law.B_u @ u + law.B_y @ y + law.c
-    np.testing.assert_allclose(
-        -law.K @ z - law.K_r @ y - law.k, u, atol=1e-6
-    )  # what is left of the start, 0.9966^6000 of some 10 °C
+    # what is left of the start, 0.9966^6000 of some 10 °C
+    np.testing.assert_allclose(-law.K @ z - law.K_r @ y - law.k, u, atol=1e-6)
+
+
+def test_the_gain_is_control_s_dlqr_of_the_discounted_plant():
+    machine = baam()
+    Q, R, root = np.diag([1.0, 2.0, 0.5, 1.0, 3.0]), np.diag([0.1, 1.0, 2.0, 1.0, 0.3, 1.0, 5.0]), GAMMA**0.5
+    K, P, _ = control.dlqr(root * machine.A, root * machine.B, machine.C.T @ Q @ machine.C, R)
+    optimal = gains(machine, Q, R, GAMMA)
+    # two ways to one solution, through a condition of 1e4
+    np.testing.assert_allclose(optimal.K_x, K, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(optimal.P, P, rtol=1e-8, atol=1e-8)

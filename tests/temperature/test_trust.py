@@ -51,16 +51,16 @@ def test_fits_are_those_of_validation_and_lie_in_their_bands():
     u, y = innovations_record(HEATER, 900, 0.1, 3)
     y[200:210] = np.nan
     us, ys = [u[:500], u[500:]], [y[:500], y[500:]]
-    found = holdout(HEATER, us, ys, 7, block=20, rng=np.random.default_rng(0))
-    np.testing.assert_allclose(found.fit[0], simulate_fit(HEATER, us, ys), rtol=1e-12)
-    np.testing.assert_allclose(found.ahead_fit[0], predict_fit(HEATER, us, ys, 7), rtol=1e-12)
-    for part in (found.fit, found.ahead_fit):
+    judged = holdout(HEATER, us, ys, 7, block=20, rng=np.random.default_rng(0))
+    np.testing.assert_allclose(judged.fit[0], simulate_fit(HEATER, us, ys), rtol=1e-12)
+    np.testing.assert_allclose(judged.ahead_fit[0], predict_fit(HEATER, us, ys, 7), rtol=1e-12)
+    for part in (judged.fit, judged.ahead_fit):
         assert (part[1] < part[0]).all() and (part[0] < part[2]).all()
     # the start-up of predict_fit: 30 samples and the steps, in each segment
-    assert np.flatnonzero(np.isfinite(found.ahead[0][:, 0]))[0] == 37
-    last = [np.where(np.isfinite(found.ahead[k]), held(ys[k], 7), np.nan) for k in range(2)]
+    assert np.flatnonzero(np.isfinite(judged.ahead[0][:, 0]))[0] == 37
+    last = [np.where(np.isfinite(judged.ahead[k]), held(ys[k], 7), np.nan) for k in range(2)]
     np.testing.assert_allclose(
-        found.held_fit, nrmse(np.vstack([b[37:] for b in ys]), np.vstack([b[37:] for b in last])), rtol=1e-12
+        judged.held_fit, nrmse(np.vstack([b[37:] for b in ys]), np.vstack([b[37:] for b in last])), rtol=1e-12
     )
 
 
@@ -80,9 +80,9 @@ def test_the_band_of_a_fit_holds_the_fit_of_another_hold_out_of_that_length_nine
 
 def test_a_hold_out_without_a_segment_long_enough_has_no_fit_ahead_and_is_written_as_none():
     u, y = innovations_record(HEATER, 60, 0.1, 3)
-    found = holdout(HEATER, [u], [y], 60, block=20, rng=np.random.default_rng(0))
-    figures = fit_figures(found, ["T1"])
-    assert figures["fit_holdout"]["T1"] == found.fit[0, 0]
+    judged = holdout(HEATER, [u], [y], 60, block=20, rng=np.random.default_rng(0))
+    figures = fit_figures(judged, ["T1"])
+    assert figures["fit_holdout"]["T1"] == judged.fit[0, 0]
     assert (
         figures["fit_holdout_ahead"] is None
         and figures["fit_holdout_ahead_band"] is None
@@ -126,22 +126,24 @@ def test_of_an_unstable_plant_three_time_constants_are_shown():
 def test_steps_hold_the_truth_and_say_where_the_sign_is_not_known():
     nominal = plant(np.diag([0.95, 0.9]), np.diag([1.0, 0.01]), [[1.0, 1.0]])
     family = [nominal._replace(B=np.diag([b, 0.01 * c])) for b, c in ((0.9, 2.0), (1.0, -1.0), (1.1, -2.0))]
-    found = steps(nominal, family, 500)
-    assert found.seen.tolist() == [[True, False]]
+    responses = steps(nominal, family, 500)
+    assert responses.significant.tolist() == [[True, False]]
     # 1 / (1 - 0.95) = 20, less what is left after 1.33 settling times
-    np.testing.assert_allclose(found.gain[0, 0, 0], 20.0, rtol=0.03)
-    assert (found.low[1:, 0, 0] < found.response[1:, 0, 0]).all() and (
-        found.response[1:, 0, 0] < found.high[1:, 0, 0]
+    np.testing.assert_allclose(responses.gain[0, 0, 0], 20.0, rtol=0.03)
+    assert (responses.low[1:, 0, 0] < responses.response[1:, 0, 0]).all() and (
+        responses.response[1:, 0, 0] < responses.high[1:, 0, 0]
     ).all()
     # -1 / ln 0.95 = 19.5
-    np.testing.assert_allclose(found.time_constant[0, 0, 0], 19.5, rtol=0.05)
-    assert np.isnan(found.time_constant[:, 0, 1]).all() and np.isnan(found.delay[:, 0, 1]).all()
+    np.testing.assert_allclose(responses.time_constant[0, 0, 0], 19.5, rtol=0.05)
+    assert np.isnan(responses.time_constant[:, 0, 1]).all() and np.isnan(responses.delay[:, 0, 1]).all()
 
 
 def test_a_response_that_turns_back_has_its_peak_beside_its_end():
     # fast up, slow back: 10 (0.9) against -8 (0.98) of the same input
-    found = steps(plant(np.diag([0.9, 0.98]), [[1.0], [-0.16]], [[1.0, 1.0]]), [first_order(1.0, 5.0)], 2000)
-    assert found.peak[0, 0, 0] > 1.5 * found.gain[0, 0, 0] > 0
+    responses = steps(
+        plant(np.diag([0.9, 0.98]), [[1.0], [-0.16]], [[1.0, 1.0]]), [first_order(1.0, 5.0)], 2000
+    )
+    assert responses.peak[0, 0, 0] > 1.5 * responses.gain[0, 0, 0] > 0
 
 
 # ---- as tables
@@ -181,11 +183,14 @@ def test_tables_name_each_pair_and_keep_their_values():
     figures = outcome_figures(tests, excited, ["T1"], ["a", "b"])
     assert figures["independence_passed"]["T1"] == {"a": True, "b": True}
     assert figures["excitation"]["inputs"]["b"]["rank"] == 3 and figures["excitation"]["lags"] == 3
-    found = steps(HEATER, [HEATER, HEATER], 300)
-    rows, summary = step_rows(found, ["T1"], ["a", "b"], 2.0), dynamics_rows(found, ["T1"], ["a", "b"], 2.0)
-    np.testing.assert_array_equal(rows["response"][len(found.samples) :], found.response[:, 0, 1])
-    assert rows["time_s"][1] == 2.0 * found.samples[1] and summary["input"] == ["a", "b"]
-    np.testing.assert_array_equal(summary["time_constant_s"], 2.0 * found.time_constant[0, 0])
+    responses = steps(HEATER, [HEATER, HEATER], 300)
+    rows, summary = (
+        step_rows(responses, ["T1"], ["a", "b"], 2.0),
+        dynamics_rows(responses, ["T1"], ["a", "b"], 2.0),
+    )
+    np.testing.assert_array_equal(rows["response"][len(responses.samples) :], responses.response[:, 0, 1])
+    assert rows["time_s"][1] == 2.0 * responses.samples[1] and summary["input"] == ["a", "b"]
+    np.testing.assert_array_equal(summary["time_constant_s"], 2.0 * responses.time_constant[0, 0])
     judged = holdout(HEATER, [u], [y], 5, block=20, rng=np.random.default_rng(0))
     columns = holdout_rows([y], judged, ["T1"], 2.0)
     np.testing.assert_array_equal(columns["T1_simulated"], judged.simulated[0][:, 0])

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from benchmarks.identification import nrmse, predict_fit, simulate_fit
-from pipeline.temperature.identification import identify
+from pipeline.temperature.identification import Settings, identify
 from pipeline.temperature.plant import plant, simulate
 from pipeline.temperature.validation import (
     advice,
@@ -48,20 +48,19 @@ def test_a_constant_error_costs_nothing_where_means_are_removed():
 def test_the_true_plant_simulates_its_own_noise_free_record_in_full_from_any_start():
     u = np.random.default_rng(0).standard_normal((300, 2))
     y = simulate(HEATER, u, np.array([3.0, -4.0]))[1]
-    np.testing.assert_allclose(
-        simulate_fit(HEATER, [u], [y]), 100.0, atol=1e-6
-    )  # x0 by least squares: rounding
+    # x0 by least squares: rounding
+    np.testing.assert_allclose(simulate_fit(HEATER, [u], [y]), 100.0, atol=1e-6)
 
 
 def test_prediction_ahead_is_the_kalman_recursion_written_out():
     u, y = innovations_record(HEATER, 60, 0.1, 1)
-    found, x0 = predicted_ahead(HEATER, u, y, 3, x0=np.zeros(2)), np.zeros(2)
+    predicted, x0 = predicted_ahead(HEATER, u, y, 3, x0=np.zeros(2)), np.zeros(2)
     t, x = 40, x0
     for k in range(t - 2):  # x(t-2 | y up to t-3)
         x = HEATER.A @ x + HEATER.B @ u[k] + HEATER.b + HEATER.K @ (y[k] - HEATER.C @ x - HEATER.d)
     for k in (t - 2, t - 1):
         x = HEATER.A @ x + HEATER.B @ u[k] + HEATER.b
-    np.testing.assert_allclose(found[t], HEATER.C @ x + HEATER.d, rtol=1e-10)
+    np.testing.assert_allclose(predicted[t], HEATER.C @ x + HEATER.d, rtol=1e-10)
 
 
 def test_prediction_ahead_does_not_look_at_outputs_that_are_not_there_yet():
@@ -76,10 +75,12 @@ def test_prediction_ahead_does_not_look_at_outputs_that_are_not_there_yet():
 def test_a_drift_that_simulation_misses_is_followed_ahead():
     u, y = innovations_record(HEATER, 2000, 0.02, 2)
     y = y + np.cumsum(0.02 * np.random.default_rng(3).standard_normal((2000, 1)), axis=0)
-    found = identify([u[:1400]], [y[:1400]], sample_time_s=1.0, refinement="prediction")
+    identified = identify(
+        [u[:1400]], [y[:1400]], sample_time_s=1.0, settings=Settings(refinement="prediction")
+    )
     assert (
-        predict_fit(found.plant, [u[1400:]], [y[1400:]], 5)[0]
-        > simulate_fit(found.plant, [u[1400:]], [y[1400:]])[0]
+        predict_fit(identified.plant, [u[1400:]], [y[1400:]], 5)[0]
+        > simulate_fit(identified.plant, [u[1400:]], [y[1400:]])[0]
     )
 
 
@@ -87,7 +88,7 @@ def test_residuals_of_the_true_plant_pass_and_those_of_a_lower_order_do_not():
     u, y = innovations_record(HEATER, 4000, 0.1, 4)
     true = residual_tests(HEATER, [u], [y])
     assert true.whiteness_passed.all() and true.independence_passed.all()
-    low = residual_tests(identify([u], [y], sample_time_s=1.0, order=1).plant, [u], [y])
+    low = residual_tests(identify([u], [y], sample_time_s=1.0, settings=Settings(order=1)).plant, [u], [y])
     assert not low.independence_passed.all()
 
 
@@ -127,20 +128,18 @@ def test_excitation_counts_what_a_sine_cannot_excite():
     excited = excitation(
         [np.column_stack([np.sin(0.3 * t), np.random.default_rng(0).standard_normal(500)])], 6
     )
-    assert excited.per_input_rank.tolist() == [
-        2,
-        6,
-    ]  # a sine spans two directions, whatever the number of lags
+    # a sine spans two directions, whatever the number of lags
+    assert excited.per_input_rank.tolist() == [2, 6]
     assert (excited.rank, excited.full) == (8, 12)
 
 
 def test_bootstrap_gives_finite_stable_plants_whose_step_responses_hold_the_truth():
     u, y = innovations_record(HEATER, 1500, 0.1, 6)
-    found = identify([u], [y], sample_time_s=1.0, order=2)
-    family = bootstrap_spread([u], [y], found, count=20, rng=np.random.default_rng(0))
+    identified = identify([u], [y], sample_time_s=1.0, settings=Settings(order=2))
+    family = bootstrap_spread([u], [y], identified, count=20, rng=np.random.default_rng(0))
     assert len(family) == 20
     assert max(np.abs(np.linalg.eigvals(member.A)).max() for member in family) < 1.0
-    bands, true = spread_bands(found.plant, family, 40), step_response(HEATER, 40)
+    bands, true = spread_bands(identified.plant, family, 40), step_response(HEATER, 40)
     width = bands.high - bands.low
     assert (width[5:] > 0).all()
     # 20 members: their range holds some 90 %; one width more on either side is far outside chance
@@ -149,9 +148,10 @@ def test_bootstrap_gives_finite_stable_plants_whose_step_responses_hold_the_trut
 
 def test_bootstrap_is_repeatable_and_may_take_another_order():
     u, y = innovations_record(HEATER, 800, 0.1, 6)
-    found = identify([u], [y], sample_time_s=1.0, order=2)
+    identified = identify([u], [y], sample_time_s=1.0, settings=Settings(order=2))
     first, second = (
-        bootstrap_spread([u], [y], found, count=2, order=3, rng=np.random.default_rng(1)) for _ in range(2)
+        bootstrap_spread([u], [y], identified, count=2, order=3, rng=np.random.default_rng(1))
+        for _ in range(2)
     )
     assert first[0].n == 3
     np.testing.assert_array_equal(first[1].A, second[1].A)
@@ -184,15 +184,16 @@ def test_benchmark_sets_are_simulated_on_the_hold_out_as_well_as_published(
 ):
     record = np.loadtxt(shared(f"data/daisy_a/{name}.dat"))
     u, y = record[:, inputs], record[:, outputs]
-    found = identify([u[:cut]], [y[:cut]], sample_time_s=1.0, feedthrough=None, refinement="validated")
-    assert 100 - simulate_fit(found.plant, [u[cut:]], [y[cut:]], means_removed=True).mean() <= bar
+    identified = identify(
+        [u[:cut]], [y[:cut]], sample_time_s=1.0, settings=Settings(feedthrough=None, refinement="validated")
+    )
+    assert 100 - simulate_fit(identified.plant, [u[cut:]], [y[cut:]], means_removed=True).mean() <= bar
 
 
 def test_two_heater_kit_is_simulated_and_predicted_on_the_last_third(shared):
     record = np.genfromtxt(shared("data/tclab_mlid_prbs/prbs.csv"), delimiter=",", skip_header=1)
     u, y, cut = record[:, 1:3], record[:, 3:5], int(0.7 * len(record))
-    found = identify([u[:cut]], [y[:cut]], sample_time_s=1.0)
-    assert (
-        simulate_fit(found.plant, [u[cut:]], [y[cut:]]) >= 62
-    ).all()  # plain MOESP of order 3 reaches 58 and 60 %
-    assert (predict_fit(found.plant, [u[cut:]], [y[cut:]], 60) >= 75).all()
+    identified = identify([u[:cut]], [y[:cut]], sample_time_s=1.0)
+    # plain MOESP of order 3 reaches 58 and 60 %
+    assert (simulate_fit(identified.plant, [u[cut:]], [y[cut:]]) >= 62).all()
+    assert (predict_fit(identified.plant, [u[cut:]], [y[cut:]], 60) >= 75).all()

@@ -34,10 +34,10 @@ def noisy(y, noise, seed=0):
 
 
 def test_without_noise_the_window_is_as_long_as_the_plant_needs(record):
-    found = learn([record[0][:600]], [record[1][:600]], longest=6)
-    assert found.N == 2  # the observability index of the study's machine
+    window = learn([record[0][:600]], [record[1][:600]], longest=6)
+    assert window.N == 2  # the observability index of the study's machine
     w, _, y = windows([record[0]], [record[1]], 2)
-    np.testing.assert_allclose(w @ found.Theta.T, y, atol=1e-8)  # rounding at 100 °C
+    np.testing.assert_allclose(w @ window.Theta.T, y, atol=1e-8)  # rounding at 100 °C
 
 
 def test_under_noise_the_window_is_longer(record):
@@ -46,81 +46,77 @@ def test_under_noise_the_window_is_longer(record):
 
 def test_one_factorisation_gives_the_least_squares_fit_of_its_window(record):
     u, y = record[0][:900], noisy(record[1], 0.5)[:900]
-    found = learn([u], [y], longest=8, offset=True)
-    w, _, y_now = windows(
-        [u[8 - found.N :]], [y[8 - found.N :]], found.N
-    )  # the samples that the longest window leaves
+    window = learn([u], [y], longest=8, offset=True)
+    # the samples that the longest window leaves
+    w, _, y_now = windows([u[8 - window.N :]], [y[8 - window.N :]], window.N)
     columns = np.hstack([w, np.ones((len(w), 1))])
     expected = np.linalg.lstsq(columns, y_now, rcond=None)[0]
-    np.testing.assert_allclose(
-        np.vstack([found.Theta.T, found.theta_0]), expected, atol=1e-7
-    )  # two roads through a condition of 1e4
+    # two roads through a condition of 1e4
+    np.testing.assert_allclose(np.vstack([window.Theta.T, window.theta_0]), expected, atol=1e-7)
     rest = y_now - columns @ expected
-    np.testing.assert_allclose(found.covariance, rest.T @ rest / (len(w) - columns.shape[1]), rtol=1e-8)
+    np.testing.assert_allclose(window.covariance, rest.T @ rest / (len(w) - columns.shape[1]), rtol=1e-8)
 
 
 def test_a_spread_of_gains_adds_to_each_input_its_own_moments(record):
     u, y = record[0][:900], noisy(record[1], 0.5)[:900]
-    found = learn([u], [y], longest=3, gain_spread=0.2)
-    w, _, y_now = windows([u[3 - found.N :]], [y[3 - found.N :]], found.N)
-    own = np.zeros((found.N * 12,) * 2)
-    own[: found.N * 7, : found.N * 7] = np.kron(
-        np.ones((found.N, found.N)), np.eye(7)
-    )  # lags of one input with one another, no two inputs
+    window = learn([u], [y], longest=3, gain_spread=0.2)
+    w, _, y_now = windows([u[3 - window.N :]], [y[3 - window.N :]], window.N)
+    own = np.zeros((window.N * 12,) * 2)
+    # lags of one input with one another, no two inputs
+    own[: window.N * 7, : window.N * 7] = np.kron(np.ones((window.N, window.N)), np.eye(7))
     moments = w.T @ w
+    # rounding times a condition of 1e5
     np.testing.assert_allclose(
-        found.Theta.T, np.linalg.solve(moments + 0.04 * own * moments, w.T @ y_now), atol=1e-8
-    )  # rounding times a condition of 1e5
-    assert np.abs(found.Theta - learn([u], [y], longest=3).Theta).max() > 1e-3
+        window.Theta.T, np.linalg.solve(moments + 0.04 * own * moments, w.T @ y_now), atol=1e-8
+    )
+    assert np.abs(window.Theta - learn([u], [y], longest=3).Theta).max() > 1e-3
 
 
 def test_the_table_holds_akaike_s_criterion(record):
     u, y = record[0][:900], noisy(record[1], 0.5)[:900]
-    found = learn([u], [y], longest=4)
-    for N, parameters, criterion in found.table:
+    window = learn([u], [y], longest=4)
+    for N, parameters, criterion in window.table:
         w, _, y_now = windows([u[4 - int(N) :]], [y[4 - int(N) :]], int(N))
         rest = y_now - w @ np.linalg.lstsq(w, y_now, rcond=None)[0]
         assert parameters == 5 * 12 * N
+        # rounding
         assert criterion == pytest.approx(
             len(w) * np.linalg.slogdet(rest.T @ rest / len(w))[1] + 2 * parameters, rel=1e-9
-        )  # rounding
+        )
 
 
 def test_segments_and_masked_samples_leave_the_predictor_exact():
     u = np.random.default_rng(0).normal(size=(300, 2))
     y = simulate(SMALL, u, np.ones(3))[1]
     y[40] = np.nan
-    found = learn([u[:120], u[120:]], [y[:120], y[120:]], longest=3, offset=True)
-    assert found.samples == 300 - 2 * 3 - 4
-    w, _, y_now = windows([u[120:]], [y[120:]], found.N)
-    np.testing.assert_allclose(
-        w @ found.Theta.T + found.theta_0, y_now, atol=1e-10
-    )  # rounding of numbers near 10
+    window = learn([u[:120], u[120:]], [y[:120], y[120:]], longest=3, offset=True)
+    assert window.samples == 300 - 2 * 3 - 4
+    w, _, y_now = windows([u[120:]], [y[120:]], window.N)
+    # rounding of numbers near 10
+    np.testing.assert_allclose(w @ window.Theta.T + window.theta_0, y_now, atol=1e-10)
 
 
 def test_the_predictor_is_the_plant_from_its_window_on():
     u = np.random.default_rng(0).normal(size=(300, 2))
     y = simulate(SMALL, u, np.ones(3))[1]
-    found = learn([u[:200]], [y[:200]], longest=4, offset=True)
-    w = windows([u], [y], found.N)[0][200 - found.N]
-    model = predictor(found, sample_time_s=2.0)
-    np.testing.assert_allclose(
-        simulate(model, u[200:], w)[1], y[200:], atol=1e-9
-    )  # rounding fed back for 100 steps
+    window = learn([u[:200]], [y[:200]], longest=4, offset=True)
+    w = windows([u], [y], window.N)[0][200 - window.N]
+    model = predictor(window, sample_time_s=2.0)
+    # rounding fed back for 100 steps
+    np.testing.assert_allclose(simulate(model, u[200:], w)[1], y[200:], atol=1e-9)
     assert model.sample_time_s == 2.0
 
 
 def test_the_law_of_the_window_is_the_optimal_one_on_a_plant_with_offset():
     u = np.random.default_rng(0).normal(size=(300, 2))
     x, y = simulate(SMALL, u, np.ones(3))
-    found = law(learn([u], [y], longest=4, offset=True), Q2, R2, 0.9)
+    learned_law = law(learn([u], [y], longest=4, offset=True), Q2, R2, 0.9)
     best = gains(SMALL, Q2, R2, 0.9)
-    N = found.K.shape[1] // 4
+    N = learned_law.K.shape[1] // 4
     w = windows([u], [y], N)[0]
-    np.testing.assert_allclose(
-        w @ found.K.T + found.k, x[N:-1] @ best.K_x.T + best.k, atol=1e-9
-    )  # rounding of a least-squares fit
-    np.testing.assert_allclose(found.K_r, best.K_r, atol=1e-9)
+    # rounding of a least-squares fit
+    np.testing.assert_allclose(w @ learned_law.K.T + learned_law.k, x[N:-1] @ best.K_x.T + best.k, atol=1e-9)
+    np.testing.assert_allclose(learned_law.K_r, best.K_r, atol=1e-9)
 
 
 @pytest.mark.parametrize(("noise", "orders"), [(0.0, {6}), (0.1, {5, 6}), (0.5, {5, 6})])
@@ -149,7 +145,8 @@ def test_a_window_that_predicts_nothing_is_refused():
     u, y = rng.normal(size=(400, 1)), rng.normal(size=(400, 1))
     with pytest.raises(
         ValueError,
-        match="the window predicts nothing beyond the noise of the sensors; probe with a larger amplitude, or record longer",
+        match="the window predicts nothing beyond the noise of the sensors; probe with a larger amplitude, "
+        "or record longer",
     ):
         predicted_tuples(learn([u], [y], longest=2), [u], [y])
 
@@ -162,12 +159,12 @@ def test_a_record_shorter_than_the_shortest_window_needs_is_refused(record):
 
 
 def test_a_stored_window_comes_back_as_it_was(record):
-    found = learn([record[0][:900]], [noisy(record[1], 0.1)[:900]], longest=4, offset=True)
-    stored = window_route.stored(found)
+    window = learn([record[0][:900]], [noisy(record[1], 0.1)[:900]], longest=4, offset=True)
+    stored = window_route.stored(window)
     assert all(unit and meaning for _, unit, meaning in stored.values())
     back = window_route.restored({name: values for name, (values, _, _) in stored.items()})
-    for name, before, after in zip(found._fields, found, back, strict=True):
+    for name, before, after in zip(window._fields, window, back, strict=True):
         np.testing.assert_array_equal(after, before, err_msg=name)
-    one, other = (law(w, I5, I7, GAMMA) for w in (found, back))
+    one, other = (law(w, I5, I7, GAMMA) for w in (window, back))
     np.testing.assert_array_equal(one.K, other.K)
     assert baam().m == back.Theta.shape[1] // back.N - 5

@@ -10,9 +10,9 @@ import numpy as np
 from tqdm import tqdm
 
 from pipeline.deposition import composition, conformance, evaluation, gcode, motion
-from pipeline.deposition.composition import Composed, Learned
+from pipeline.deposition.composition import Composed, Learned, PartSettings
 from pipeline.deposition.conformance import Conformance
-from pipeline.deposition.evaluation import Score
+from pipeline.deposition.evaluation import Judging, Score
 from pipeline.deposition.workflow import laws
 from pipeline.deposition.workflow.segment_library import finite_or_none
 from pipeline.deposition.workflow.settings import ComposeParts, Printer, TrainIlc
@@ -31,14 +31,14 @@ class Part(NamedTuple):
 
 
 def compose_all(
-    folder: Path, learned: Learned, printer: Printer, p: ComposeParts
+    folder: Path, learned: Learned, printer: Printer, settings: ComposeParts
 ) -> tuple[list[Part], dict[str, str]]:
     """Every part program in `folder`, and the reasons of those that
     cannot be composed; raises ValueError where none can."""
     parts, refused = [], {}
     for path in programs(folder):
         try:
-            parts.append(compose(path, learned, printer, p))
+            parts.append(compose(path, learned, printer, settings))
         except ValueError as error:
             refused[path.stem] = str(error)
     if not parts:
@@ -51,12 +51,12 @@ def compose_all(
 
 def programs(folder: Path) -> list[Path]:
     """The part programs in a folder, by name. Raises ValueError where there is none."""
-    found = sorted(
+    paths = sorted(
         path for path in folder.glob("*") if path.suffix.lower() in {".gcode", ".gco", ".g", ".nc"}
     )
-    if not found:
+    if not paths:
         raise ValueError(f"{folder}: expected part programs (*.gcode), found none; copy one there")
-    return found
+    return paths
 
 
 def judged(
@@ -64,20 +64,23 @@ def judged(
     learned: Learned,
     models: dict[str, Any],
     printer: Printer,
-    p: ComposeParts,
-    taught: TrainIlc,
+    settings: ComposeParts,
+    training: TrainIlc,
 ) -> list[tuple[Part, list[Score]]]:
     """Every part with the scores of its composers, on the extruders of
     models.json and with the noise of train_ilc."""
-    settings = {
-        "nominals": laws.extruders(models, "nominal"), "plants": laws.extruders(models, "plant"),
-        "noise": laws.noise(taught),
-        "s": laws.settings(taught, printer), "updates": p.whole_updates,
-        "bead_area_mm2": printer.bead_area_mm2, "shortest_s": p.shortest_s,
-    }  # fmt: skip
-    rng = np.random.default_rng(p.seed)
+    judging = Judging(
+        nominals=laws.extruders(models, "nominal"),
+        plants=laws.extruders(models, "plant"),
+        laws=laws.law_settings(training, printer),
+        noise=laws.noise(training),
+        updates=settings.full_part_updates,
+        bead_area_mm2=printer.bead_area_mm2,
+        shortest_s=settings.shortest_s,
+    )
+    rng = np.random.default_rng(settings.seed)
     return [
-        (part, evaluation.evaluate(learned, part.composed, rng=rng, **settings))
+        (part, evaluation.evaluate(learned, part.composed, judging, rng))
         for part in tqdm(parts, desc="compose_parts: parts", mininterval=2)
     ]
 
@@ -85,7 +88,7 @@ def judged(
 # ---- one part
 
 
-def compose(path: Path, learned: Learned, printer: Printer, p: ComposeParts) -> Part:
+def compose(path: Path, learned: Learned, printer: Printer, settings: ComposeParts) -> Part:
     """A part program, composed. Raises ValueError naming the file, and the line where there is one."""
     learned_s = learned.library.sample_time_s
     if learned_s != printer.sample_time_s:
@@ -112,19 +115,25 @@ def compose(path: Path, learned: Learned, printer: Printer, p: ComposeParts) -> 
             speed_limit=printer.speed_limit_mm_per_s, unset_feed=printer.speed_mm_per_s,
             tool_change_s=printer.tool_change_s,
         )  # fmt: skip
-        settings = {"bead_area_mm2": printer.bead_area_mm2, "ramp_s": printer.ramp_s, "limit": printer.limit}
-        composed = composition.compose(
-            learned, program, planned, materials={m.tool: m.name for m in printer.materials},
-            nozzle_mm=printer.nozzle_mm,
-            corner_deg=p.corner_deg, longest_pause_s=p.longest_pause_s, **settings,
-        )  # fmt: skip
+        part_settings = PartSettings(
+            printer.nozzle_mm,
+            printer.bead_area_mm2,
+            printer.ramp_s,
+            settings.corner_deg,
+            settings.longest_pause_s,
+            printer.limit,
+        )
+        materials = {material.tool: material.name for material in printer.materials}
+        composed = composition.compose(learned, program, planned, part_settings, materials=materials)
         report = conformance.conform(
             composed,
             learned,
-            shortest_s=p.shortest_s,
-            largest_error_percent=p.largest_error_percent,
+            bead_area_mm2=printer.bead_area_mm2,
+            ramp_s=printer.ramp_s,
+            limit=printer.limit,
+            shortest_s=settings.shortest_s,
+            largest_error_percent=settings.largest_error_percent,
             refusals=program.refusals,
-            **settings,
         )
     return Part(path.stem, program, planned, composed, report)
 
@@ -151,10 +160,10 @@ def write(part: Part, folder: Path) -> list[Path]:
     return files
 
 
-def told(part: Part) -> str:
-    """The conformance report in words."""
-    found, composed = part.conformance, part.composed
-    lines, text = found.lines, []
+def summary_lines(part: Part) -> str:
+    """The conformance report in words, line by line."""
+    checks, composed = part.conformance, part.composed
+    lines, text = checks.lines, []
     duration = len(composed.streams[0].u) * composed.sample_time_s
     text.append(
         f"{part.name}: {len(lines.line)} printed lines in {int(composed.lines.run[-1]) + 1} runs, "
@@ -172,9 +181,9 @@ def told(part: Part) -> str:
             f"T{stream.tool} {stream.material}: by {stream.composer}; predicted flow error, "
             f"of on-off control's: {others}"
         )
-        sat = found.saturation[stream.tool]
+        sat = checks.saturation[stream.tool]
         if not sat.enough:
-            ramp = found.ramp_that_would_do_s[stream.tool]
+            ramp = checks.ramp_that_would_do_s[stream.tool]
             do = (
                 f"ramps of {ramp:.2f} s would do"
                 if math.isfinite(ramp)
@@ -184,10 +193,10 @@ def told(part: Part) -> str:
                 f"  the command reaches its limit {sat.share_percent:.1f} % of the printing time (peak "
                 f"{sat.peak_over_steady:.1f} x steady); {do}"
             )
-    if found.judged:
+    if checks.judged:
         worst = int(np.argmax(np.where(lines.duration_s >= 0, np.abs(lines.error_percent), 0)))
         text.append(
-            f"volume of {found.judged} lines within {found.worst_line_volume_percent:.1f} % of the plan; "
+            f"volume of {checks.judged} lines within {checks.worst_line_volume_percent:.1f} % of the plan; "
             f"of all lines the worst is line {lines.line[worst]}: {lines.error_percent[worst]:+.1f} % of "
             f"{lines.planned_mm3[worst]:.3g} mm^3"
         )
@@ -196,7 +205,7 @@ def told(part: Part) -> str:
             f"{int(np.sum(lines.shorter_than_lead))} lines belong to runs shorter than the lead of Stop: "
             "the priority rule would not print them"
         )
-    text += [f"line {one.line}: {one.why}" for one in found.refused]
+    text += [f"line {one.line}: {one.why}" for one in checks.refused]
     return "\n".join(text)
 
 
@@ -275,15 +284,15 @@ def reports(done: Sequence[tuple[Part, Sequence[Score]]], refused: dict[str, str
 
 def report(part: Part) -> dict[str, Any]:
     """What the conformance report says, as JSON."""
-    found, composed = part.conformance, part.composed
-    lines, refused = found.lines, [one._asdict() for one in found.refused]
+    checks, composed = part.conformance, part.composed
+    lines, refused = checks.lines, [one._asdict() for one in checks.refused]
     return {
         "lines_of_the_program": part.program.lines,
         "printed_lines": len(lines.line),
         "runs": int(composed.lines.run[-1]) + 1,
         "duration_s": len(composed.streams[0].r) * composed.sample_time_s,
-        "worst_line_volume_percent": finite_or_none(found.worst_line_volume_percent),
-        "judged_lines": found.judged,
+        "worst_line_volume_percent": finite_or_none(checks.worst_line_volume_percent),
+        "judged_lines": checks.judged,
         "shorter_than_lead": int(np.sum(lines.shorter_than_lead)),
         "composer": {stream.material: stream.composer for stream in composed.streams},
         "predicted_percent": {
@@ -296,10 +305,10 @@ def report(part: Part) -> dict[str, Any]:
         },
         "saturation": {
             name: {key: finite_or_none(value) for key, value in one._asdict().items()}
-            for name, one in _by_material(part, found.saturation)
+            for name, one in _by_material(part, checks.saturation)
         },
         "ramp_that_would_do_s": {
-            name: finite_or_none(value) for name, value in _by_material(part, found.ramp_that_would_do_s)
+            name: finite_or_none(value) for name, value in _by_material(part, checks.ramp_that_would_do_s)
         },
         "refused": refused,
         "unknown_words": len(part.program.other_line),
@@ -313,11 +322,11 @@ def _by_material(part: Part, of_tool: dict[int, Any]) -> list[tuple[str, Any]]:
 def figures(judged: Sequence[tuple[Part, Sequence[Score]]]) -> dict[str, Any]:
     """By part, material and composer: the error of the true flow in % of on-off
     control's, the worst line's volume, and which was chosen."""
-    found: dict[str, Any] = {}
+    by_part: dict[str, Any] = {}
     for part, scores in judged:
         for score in scores:
             material = part.composed.streams[score.stream].material
-            one = found.setdefault(part.name, {}).setdefault(material, {})
+            one = by_part.setdefault(part.name, {}).setdefault(material, {})
             one[score.composer] = {
                 "rms_percent_of_on_off": score.rms_percent_of_on_off,
                 "worst_line_volume_percent": finite_or_none(score.worst_line_volume_percent),
@@ -325,4 +334,4 @@ def figures(judged: Sequence[tuple[Part, Sequence[Score]]]) -> dict[str, Any]:
             }
             if score.chosen:
                 one["chosen"] = score.composer
-    return found
+    return by_part

@@ -6,23 +6,30 @@ from typing import Any
 import numpy as np
 
 from pipeline.deposition.extruder import Extruder
-from pipeline.deposition.training import Noise, Settings
+from pipeline.deposition.ilc import HoelzleSettings, InverseSettings
+from pipeline.deposition.training import LawSettings, Noise
 from pipeline.deposition.workflow.settings import Printer, TrainIlc
 
 
-def settings(p: TrainIlc, printer: Printer) -> Settings:
-    """Of the paper's law and of ours, on this printer."""
-    paper, law = p.paper, p.law
-    return Settings(
-        printer.sample_time_s, printer.limit, paper.learning_gain, paper.fast_zero_s, paper.order,
-        paper.cutoff_hz,
-        law.identify_trials, law.floor, law.order, law.cutoff_hz, law.rise,
-    )  # fmt: skip
+def law_settings(settings: TrainIlc, printer: Printer) -> LawSettings:
+    """Settings of both laws on this printer."""
+    hoelzle, inverse = settings.hoelzle_2009, settings.model_inverse
+    return LawSettings(
+        printer.sample_time_s,
+        printer.limit,
+        HoelzleSettings(hoelzle.learning_gain, hoelzle.fast_zero_s, hoelzle.order, hoelzle.cutoff_hz),
+        InverseSettings(inverse.identify_trials, inverse.floor, inverse.order, inverse.cutoff_hz),
+        inverse.rise,
+    )
 
 
-def noise(p: TrainIlc) -> Noise:
+def noise(settings: TrainIlc) -> Noise:
     """What does not repeat from trial to trial, as shares."""
-    return Noise(p.noise.white_percent / 100, p.noise.drift_percent / 100, p.noise.gain_percent / 100)
+    return Noise(
+        settings.noise.white_percent / 100,
+        settings.noise.drift_percent / 100,
+        settings.noise.gain_percent / 100,
+    )
 
 
 def plain(extruder: Extruder) -> dict[str, float | None]:
@@ -34,7 +41,7 @@ def extruders(models: dict[str, dict[str, Any]], which: str) -> dict[str, Extrud
     """The nominal extruders, or the true ones of simulated machines,
     of models.json by material: what `plain` made."""
     return {
-        name: Extruder(**{key: np.inf if value is None else value for key, value in found[which].items()})
-        for name, found in models.items()
-        if which in found
+        name: Extruder(**{key: np.inf if value is None else value for key, value in model[which].items()})
+        for name, model in models.items()
+        if which in model
     }

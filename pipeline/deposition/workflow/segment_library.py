@@ -17,38 +17,42 @@ from pipeline.deposition.workflow.tables import LESSONS, LIBRARY
 from pipeline.store import artifacts
 
 
-def learned(p: SegmentLibrary, printer: Printer, path: str, *, filmed: bool) -> Learned:
-    """The library from the lessons in `path`; what was filmed on a real machine has but one
+def learned(settings: SegmentLibrary, printer: Printer, path: str, *, recorded: bool) -> Learned:
+    """The library from the sampled trials in `path`; the recordings of a real machine have but one
     law. Raises ValueError where they do not suffice."""
-    lessons = artifacts.read_table(path, LESSONS)
-    found = trainings(lessons, "pixels" if filmed else p.law, printer.trained(), printer.nozzle_mm)
+    samples = artifacts.read_table(path, LESSONS)
+    law = "pixels" if recorded else settings.law
+    learned_trials = trainings(samples, law, printer.trained(), printer.nozzle_mm)
     with artifacts.about(path):
-        return composition.learn(found, sample_time_s=printer.sample_time_s)
+        return composition.learn(learned_trials, sample_time_s=printer.sample_time_s)
 
 
 def trainings(
-    lessons: dict[str, np.ndarray], law: str, routines: Sequence[Routine], nozzle_mm: float
+    samples: dict[str, np.ndarray], law: str, routines: Sequence[Routine], nozzle_mm: float
 ) -> list[Training]:
     """All trials of a law, by material and routine; those of the reference routine only where there is
     no other. Raises ValueError where there is none."""
-    mine = lessons["law"] == law
-    if not mine.any():
-        there = ", ".join(sorted(set(lessons["law"])))
-        do = "print the commands in datasets/train_ilc/next, and put their recordings into datasets/raw/deposition"
+    of_law = samples["law"] == law
+    if not of_law.any():
+        there = ", ".join(sorted(set(samples["law"])))
+        do = (
+            "print the commands in datasets/train_ilc/next, "
+            "and put their recordings into datasets/raw/deposition"
+        )
         raise ValueError(
             f"datasets/train_ilc/lessons.parquet: expected trials of law {law} (segment_library.law), "
             + (f"found {there}; name one of those" if there else f"found none yet; {do}")
         )
-    found = []
-    for material in sorted(set(lessons["material"][mine])):
-        numbers = sorted(set(lessons["routine"][mine & (lessons["material"] == material)].tolist()))
+    by_routine = []
+    for material in sorted(set(samples["material"][of_law])):
+        numbers = sorted(set(samples["routine"][of_law & (samples["material"] == material)].tolist()))
         for number in [n for n in numbers if n > 0] or numbers:
-            here = mine & (lessons["material"] == material) & (lessons["routine"] == number)
+            here = of_law & (samples["material"] == material) & (samples["routine"] == number)
             if here.any():
                 shape = (-1, len(routines[number].r))
-                u, y = (lessons[name][here].reshape(shape) for name in ("command_mm", "measured_mm3_per_s"))
-                found.append(Training(material, nozzle_mm, routines[number], u, y))
-    return found
+                u, y = (samples[name][here].reshape(shape) for name in ("command_mm", "measured_mm3_per_s"))
+                by_routine.append(Training(material, nozzle_mm, routines[number], u, y))
+    return by_routine
 
 
 def stored(learned: Learned) -> tuple[dict[str, list], dict[str, Any]]:
@@ -61,27 +65,25 @@ def stored(learned: Learned) -> tuple[dict[str, list], dict[str, Any]]:
         column.name: list(values)
         for column, values in zip(LIBRARY.columns, zip(*rows, strict=True), strict=True)
     }
-    materials = [
-        known._asdict()
-        | {
-            "chain": known.chain._asdict()
-            | {"extruder": {k: finite_or_none(v) for k, v in known.chain.extruder._asdict().items()}}
-        }
-        for known in learned.materials
-    ]
     rest = {
         "sample_time_s": learned.library.sample_time_s,
         "marks": {name: list(pair) for name, pair in learned.library.marks.items()},
-        "materials": [
-            {key: finite_or_none(value) for key, value in known.items() if key != "chain"}
-            | {"chain": {k: finite_or_none(v) for k, v in known["chain"].items()}}
-            for known in materials
-        ],
-        "checks": [
-            {key: finite_or_none(value) for key, value in check._asdict().items()} for check in learned.checks
-        ],
+        "materials": [_material_as_json(material) for material in learned.materials],
+        "checks": [finite(check._asdict()) for check in learned.checks],
     }
     return table, rest
+
+
+def _material_as_json(material: composition.Material) -> dict[str, Any]:
+    values = material._asdict()
+    del values["chain"]
+    chain = material.chain._asdict() | {"extruder": finite(material.chain.extruder._asdict())}
+    return finite(values) | {"chain": finite(chain)}
+
+
+def finite(values: dict[str, Any]) -> dict[str, Any]:
+    """The same with null for what JSON has no number for."""
+    return {key: finite_or_none(value) for key, value in values.items()}
 
 
 def finite_or_none(value: Any) -> Any:
@@ -109,11 +111,11 @@ def restored(table: dict[str, np.ndarray], rest: dict[str, Any]) -> Learned:
         columns, rest["sample_time_s"], {name: (pair[0], pair[1]) for name, pair in rest["marks"].items()}
     )
     materials = []
-    for known in rest["materials"]:
-        extruder = known["chain"]["extruder"]
+    for material in rest["materials"]:
+        extruder = material["chain"]["extruder"]
         extruder = Extruder(**{key: math.inf if value is None else value for key, value in extruder.items()})
-        chain = Chain(**(known["chain"] | {"extruder": extruder}))
-        materials.append(composition.Material(**(known | {"chain": chain})))
+        chain = Chain(**(material["chain"] | {"extruder": extruder}))
+        materials.append(composition.Material(**(material | {"chain": chain})))
     checks = [
         Check(**(check | {"percent": math.nan if check["percent"] is None else check["percent"]}))
         for check in rest["checks"]
@@ -123,9 +125,9 @@ def restored(table: dict[str, np.ndarray], rest: dict[str, Any]) -> Learned:
 
 def read_learned(table: str, rest: str) -> Learned:
     """Library and chains of segment_library, from its two files."""
-    columns, known = artifacts.read_table(table, LIBRARY), artifacts.read_json(rest)
+    columns, chains = artifacts.read_table(table, LIBRARY), artifacts.read_json(rest)
     try:
-        return restored(columns, known)
+        return restored(columns, chains)
     except (AttributeError, IndexError, KeyError, TypeError) as error:
         raise ValueError(
             f"{rest} is not what segment_library writes ({error}); "

@@ -53,8 +53,8 @@ class Printer(Section):
     @pydantic.model_validator(mode="after")
     def _distinct(self):
         for key in ("name", "tool"):
-            found = [getattr(material, key) for material in self.materials]
-            twice = sorted({value for value in found if found.count(value) > 1})
+            values = [getattr(material, key) for material in self.materials]
+            twice = sorted({value for value in values if values.count(value) > 1})
             if twice:
                 raise ValueError(
                     f"gives {key} {twice[0]} to more than one material; "
@@ -127,8 +127,8 @@ class TrialNoise(Section):
     gain_percent: float = Field(ge=0, le=100)
 
 
-class PaperLaw(Section):
-    """The paper's law."""
+class Hoelzle2009(Section):
+    """The paper's law, u <- Q (u + k_p P^-1 e) (Hoelzle 2009, eq. 2)."""
 
     learning_gain: float = Field(gt=0, le=2)
     fast_zero_s: float = Field(gt=0, le=10)
@@ -136,8 +136,8 @@ class PaperLaw(Section):
     cutoff_hz: float = Field(gt=0, le=1000)
 
 
-class OurLaw(Section):
-    """Ours, on a model that the first trials identify."""
+class ModelInverse(Section):
+    """The inverse of the model that the first trials identify."""
 
     identify_trials: int = Field(ge=1, le=100)
     floor: float = Field(gt=0, le=1)
@@ -156,14 +156,14 @@ class TrainIlc(Section):
     family_plants: int = Field(ge=1, le=100_000)
     worst_ratio: float = Field(gt=0, le=1)
     noise: TrialNoise
-    paper: PaperLaw
-    law: OurLaw
+    hoelzle_2009: Hoelzle2009
+    model_inverse: ModelInverse
 
 
 class SegmentLibrary(Section):
     """Section `segment_library`."""
 
-    law: Literal["ours", "pixels"]
+    law: Literal["model_inverse", "pixels"]
 
 
 class ComposeParts(Section):
@@ -174,4 +174,4 @@ class ComposeParts(Section):
     longest_pause_s: float = Field(ge=0, le=600)
     shortest_s: float = Field(ge=0, le=600)
     largest_error_percent: float = Field(gt=0, le=1000)
-    whole_updates: int = Field(ge=1, le=1000)
+    full_part_updates: int = Field(ge=1, le=1000)

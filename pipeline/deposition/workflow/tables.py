@@ -9,15 +9,16 @@ from pipeline.store.tables import BOOL, COUNT, FLOAT, INDEX, NONE, TEXT, Column,
 
 TRIALS = Schema(
     "trials",
-    1,
+    2,
     (
         Column("material", TEXT, NONE, "material"),
         Column(
             "law",
             TEXT,
             NONE,
-            "paper: law (2) of the study; paper_nominal: the same on its own nominal model; ours: "
-            "inverse of the identified model; pixels: ours, the flow measured from camera frames",
+            "hoelzle_2009: law (2) of the study; hoelzle_2009_nominal: the same on its own nominal model; "
+            "model_inverse: inverse of the identified model; pixels: the same, the flow measured from camera "
+            "frames",
         ),
         Column("routine", INDEX, NONE, "which training routine, counted from 0", low=0),
         Column("speed_mm_per_s", FLOAT, "mm/s", "printing speed of the routine", low=0),
@@ -46,10 +47,10 @@ TRIALS = Schema(
 )
 LESSONS = Schema(
     "lessons",
-    1,
+    2,
     (
         Column("material", TEXT, NONE, "material"),
-        Column("law", TEXT, NONE, "paper, ours or pixels"),
+        Column("law", TEXT, NONE, "hoelzle_2009, hoelzle_2009_nominal, model_inverse or pixels"),
         Column("routine", INDEX, NONE, "which training routine, counted from 0", low=0),
         Column("trial", INDEX, NONE, "updates before this trial", low=0),
         Column("time_s", FLOAT, "s", "time since the trial began"),
@@ -119,7 +120,7 @@ SIGNALS = Schema(
             "ilc_mm3_per_s",
             FLOAT,
             "mm^3/s",
-            "the same after learning the whole structure; missing on a real machine",
+            "the same after full-part ILC; missing on a real machine",
             nullable=True,
         ),
     ),
@@ -130,9 +131,7 @@ SCORES = Schema(
     (
         Column("part", TEXT, NONE, "part program"),
         Column("material", TEXT, NONE, "material"),
-        Column(
-            "composer", TEXT, NONE, "on_off, priority, superposition, basis, or ilc on the whole structure"
-        ),
+        Column("composer", TEXT, NONE, "on_off, priority, superposition, basis, or ilc: full-part ILC"),
         Column("chosen", BOOL, NONE, "predicted to do best, and taken"),
         Column(
             "rms_percent_of_on_off",

@@ -1,5 +1,5 @@
-"""What train_ilc does for its materials: a simulated machine taught in flow and in pictures, or the
-trials of a real one and the command of the next."""
+"""What train_ilc does for its materials: a simulated machine trained in flow and in pictures, or
+the trials of a real one and the command of the next."""
 
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -12,10 +12,10 @@ from tqdm import tqdm
 from pipeline.deposition import bead, ilc, training
 from pipeline.deposition.extruder import Extruder, Routine, draw
 from pipeline.deposition.ilc import Trial
-from pipeline.deposition.training import Lesson, Noise, Run, Settings, on_off, ours, run
+from pipeline.deposition.training import LawSettings, Noise, TrainingCase, TrialSequence, on_off
 from pipeline.deposition.workflow import laws, trial_files, trial_video
 from pipeline.deposition.workflow.settings import Camera, Material, Printer, TrainIlc
-from pipeline.deposition.workflow.trial_video import Watched
+from pipeline.deposition.workflow.trial_video import MeasuredTrial, SimulatedMachine
 from pipeline.store.artifacts import about
 from pipeline.store.execution import run_all
 from pipeline.store.params import Execution
@@ -28,36 +28,36 @@ WRONG_GAIN = 3.0
 class Work(NamedTuple):
     """Section train_ilc and what it shares with others."""
 
-    p: TrainIlc
-    settings: Settings
+    settings: TrainIlc
+    laws: LawSettings
     noise: Noise
     printer: Printer
     camera: Camera
 
 
 class Part(NamedTuple):
-    """What came of one material, or of all, by material and number of the routine: runs,
-    what was filmed, models and metrics by material."""
+    """What came of one material, or of all: trial sequences and measured trials by material and number of
+    the routine, models and metrics by material."""
 
-    runs: dict[tuple[str, int], list[Run]]
-    watched: dict[tuple[str, int], list[Watched]]
+    sequences: dict[tuple[str, int], list[TrialSequence]]
+    measured: dict[tuple[str, int], list[MeasuredTrial]]
     models: dict[str, dict[str, Any]]
     metrics: dict[str, dict[str, Any]]
 
 
 def trained(
-    p: TrainIlc, printer: Printer, camera: Camera, execution: Execution, *, recorded: str, out: Path
+    settings: TrainIlc, printer: Printer, camera: Camera, execution: Execution, *, recorded: str, out: Path
 ) -> Part:
     """Every material, simulated in flow and in pictures with recordings in out/recordings; or the trials in
     `recorded`, and in out/next the command of the next one."""
-    work = Work(p, laws.settings(p, printer), laws.noise(p), printer, camera)
+    work = Work(settings, laws.law_settings(settings, printer), laws.noise(settings), printer, camera)
     (out / "recordings").mkdir()
     calls = [
         delayed(simulate)(out / "recordings", work, i, kind)
         for i in range(len(printer.materials))
         for kind in ("flow", "pixels")
     ]
-    if p.source == "recordings":
+    if settings.source == "recordings":
         calls = [delayed(recordings)(recorded, out / "next", work)]
     return joined(
         tqdm(
@@ -67,41 +67,41 @@ def trained(
 
 
 def shown(
-    p: TrainIlc, camera: Camera, execution: Execution, *, recorded: str, out: Path
+    settings: TrainIlc, camera: Camera, execution: Execution, *, recorded: str, out: Path
 ) -> list[dict[str, Any]]:
     """A few frames of the first and the last trial of each material in out/frames, and a row for each."""
-    kept = sorted((out / "recordings").glob("*.mcap"))
-    if p.source == "recordings":
-        kept = trial_video.first_and_last(sorted(Path(recorded).rglob("[!.]*.mcap")), camera)
-    frames = run_all([delayed(trial_video.shown)(path, out / "frames", camera) for path in kept], execution)
+    paths = sorted((out / "recordings").glob("*.mcap"))
+    if settings.source == "recordings":
+        paths = trial_video.first_and_last(sorted(Path(recorded).rglob("[!.]*.mcap")), camera)
+    frames = run_all([delayed(trial_video.shown)(path, out / "frames", camera) for path in paths], execution)
     return [row for rows in frames for row in rows]
 
 
 def joined(parts: Iterable[Part]) -> Part:
     """All parts as one; dictionaries of one material are put together."""
-    whole = Part({}, {}, {}, {})
+    joint = Part({}, {}, {}, {})
     for part in parts:
-        for key, found in part.runs.items():
-            whole.runs.setdefault(key, []).extend(found)
-        whole.watched.update(part.watched)
-        for mine, others in ((whole.models, part.models), (whole.metrics, part.metrics)):
-            for name, found in others.items():
-                mine.setdefault(name, {}).update(found)
-    return whole
+        for key, sequences in part.sequences.items():
+            joint.sequences.setdefault(key, []).extend(sequences)
+        joint.measured.update(part.measured)
+        for mine, others in ((joint.models, part.models), (joint.metrics, part.metrics)):
+            for name, values in others.items():
+                mine.setdefault(name, {}).update(values)
+    return joint
 
 
 def _nominal(material: Material) -> Extruder:
     return Extruder(material.gain_mm3_per_s_per_mm, material.time_constant_s)
 
 
-def _model(found: ilc.TrialModel | None) -> dict[str, float] | None:
-    if found is None:
+def _model(model: ilc.TrialModel | None) -> dict[str, float] | None:
+    if model is None:
         return None
-    e = found.extruder
+    e = model.extruder
     return {
         "gain": e.gain, "time_constant_s": e.time_constant_s, "delay_s": e.delay_s, "yield": e.yield_,
-        "noise": found.noise,
-        "fit_percent": found.fit_percent,
+        "noise": model.noise,
+        "fit_percent": model.fit_percent,
     }  # fmt: skip
 
 
@@ -110,154 +110,167 @@ def _model(found: ilc.TrialModel | None) -> dict[str, float] | None:
 
 def simulate(folder: Path, work: Work, index: int, kind: str) -> Part:
     """Material `index` on a machine drawn from the family: in "flow", measured with noise, by the paper's law
-    and by ours; in "pixels", through recordings in `folder`."""
+    and by the model inverse; in "pixels", through recordings in `folder`."""
     material, routines = work.printer.materials[index], work.printer.trained()
-    nominal, steady = _nominal(material), work.printer.steady_flow
+    nominal = _nominal(material)
     plant = draw(
-        np.random.default_rng([work.p.seed, index]),
+        np.random.default_rng([work.settings.seed, index]),
         gain=nominal.gain,
         time_constant_s=nominal.time_constant_s,
-        steady_flow=steady,
+        steady_flow=work.printer.steady_flow,
     )
-    lesson, s, name = Lesson(nominal, plant, routines), work.settings, material.name
-    rngs = tuple(np.random.default_rng([work.p.seed, index, number]) for number in range(1, 5))
+    case = TrainingCase(nominal, plant, routines)
+    rngs = tuple(np.random.default_rng([work.settings.seed, index, number]) for number in range(1, 5))
     before = _before(nominal, routines, work)
-    updates = work.p.trials * (len(routines) + 2) if kind == "flow" else work.p.pixel_trials
+    in_flow = kind == "flow"
+    updates = work.settings.trials * (len(routines) + 2) if in_flow else work.settings.pixel_trials
     with tqdm(
         total=updates,
-        desc=f"train_ilc: {name} in {kind}",
+        desc=f"train_ilc: {material.name} in {kind}",
         position=1 + 2 * index + (kind == "pixels"),
         mininterval=2,
         leave=False,
     ) as bar:
-        if kind == "pixels":
-            done, seen, calibration = _pictures(
-                folder,
-                material,
-                lesson,
-                rngs[:2],
-                work.noise,
-                trials=work.p.pixel_trials,
-                printer=work.printer,
-                camera=work.camera,
-                s=s,
-                on_step=lambda _: bar.update(),
-            )
-            figures = {"pixels": training.figures(done, rise=s.rise) | _seen(seen, routines[0])}
-            return Part(
-                {(name, 0): [done]},
-                {(name, 0): seen},
-                {name: {"calibration": calibration._asdict()}},
-                {name: figures},
-            )
-        taught = training.teach(
-            lesson, rngs[2], work.noise, trials=work.p.trials, s=s, on_step=lambda _: bar.update()
-        )
-    after = training.convergence_of_ours(taught[1], rngs[3], work.noise, plants=work.p.family_plants, s=s)
+
+        def on_step(_: Trial) -> None:
+            bar.update()
+
+        if in_flow:
+            return _in_flow(material, case, rngs[2:], work, before, on_step)
+        return _in_pictures(folder, material, case, rngs[:2], work, on_step)
+
+
+def _in_flow(
+    material: Material,
+    case: TrainingCase,
+    rngs: tuple[np.random.Generator, np.random.Generator],
+    work: Work,
+    before: dict[str, Any],
+    on_step: Callable[[Trial], None],
+) -> Part:
+    """Both laws on the measured flow of a simulated machine. `rngs` draw what does not repeat, and the plants
+    of the convergence test."""
+    name, rise = material.name, work.laws.rise
+    sequences = training.train(
+        case, rngs[0], work.noise, trials=work.settings.trials, settings=work.laws, on_step=on_step
+    )
+    hoelzle, reference, *others, hoelzle_nominal = sequences
+    after = training.convergence_of_model_inverse(
+        reference, rngs[1], work.noise, plants=work.settings.family_plants, settings=work.laws
+    )
     figures = before | {
-        "gamma_ours": after.nominal, "gamma_ours_worst": after.family.max(),
-        "paper": training.figures(taught[-1], rise=s.rise),
-        "paper_on_machine": training.figures(taught[0], rise=s.rise),
-        "ours": training.figures(taught[1], rise=s.rise),
-        "other_routines": [training.figures(done, rise=s.rise) for done in taught[2:-1]],
+        "gamma_model_inverse": after.nominal, "gamma_model_inverse_worst": after.family.max(),
+        "hoelzle_2009_nominal": training.figures(hoelzle_nominal, rise=rise),
+        "hoelzle_2009": training.figures(hoelzle, rise=rise),
+        "model_inverse": training.figures(reference, rise=rise),
+        "other_routines": [training.figures(sequence, rise=rise) for sequence in others],
     }  # fmt: skip
-    runs = {(name, 0): [taught[-1], *taught[:2]]} | {
-        (name, i): [done] for i, done in enumerate(taught[2:-1], 1)
+    by_routine = {(name, 0): [hoelzle_nominal, hoelzle, reference]} | {
+        (name, i): [sequence] for i, sequence in enumerate(others, 1)
     }
     models = {
-        "nominal": laws.plain(nominal),
-        "plant": laws.plain(plant),
-        "identified": _model(taught[1].model),
+        "nominal": laws.plain(case.nominal),
+        "plant": laws.plain(case.plant),
+        "identified": _model(reference.model),
     }
-    return Part(runs, {}, {name: models}, {name: figures})
+    return Part(by_routine, {}, {name: models}, {name: figures})
 
 
-def _before(nominal: Extruder, routines: Sequence[Routine], work: Work) -> dict[str, Any]:
-    """What is known before anything runs: gamma of the paper's law on the nominal model and over the family,
-    and the authority of the drive over each routine."""
-    s, steady = work.settings, work.printer.steady_flow
-    found = training.convergence(
-        nominal,
-        np.random.default_rng([work.p.seed, 0, 0]),
-        plants=work.p.family_plants,
-        steady_flow=steady,
-        s=s,
-    )
-    has = [training.authority(routine, nominal, worst_ratio=work.p.worst_ratio, s=s) for routine in routines]
-    return {
-        "gamma": found.nominal, "gamma_worst": found.family.max(),
-        "gamma_above_1_percent": 100 * np.mean(found.family > 1),
-        "authority": [{"peak_over_steady": a.peak / a.steady, "least_ratio": a.ratio,
-        "ramp_s": a.ramp_s} for a in has],
-    }  # fmt: skip
-
-
-def _seen(seen: Sequence[Watched], routine: Routine) -> dict[str, float]:
-    """How well the pictures told the flow, over all trials: r.m.s. error in % of the steady flow, in the
-    whole trial and around its pause, and frames without a bead."""
-    errors = np.array([w.flow.flow - w.trial.truth for w in seen]) / routine.r.max()
-    near = (routine.time_s > routine.pause_s[0] - 0.3) & (routine.time_s < routine.pause_s[1] + 0.3)
-    whole, corner = (100 * np.sqrt(np.mean(part**2, axis=1)) for part in (errors, errors[:, near]))
-    frames = sum(w.frames for w in seen)
-    return {
-        "flow_error_percent": float(np.median(whole)), "flow_error_corner_percent": float(np.median(corner)),
-        "rejected_percent": 100 * sum(sum(w.rejected.values()) for w in seen) / frames,
-    }  # fmt: skip
-
-
-def _pictures(
+def _in_pictures(
     folder: Path,
     material: Material,
-    lesson: Lesson,
+    case: TrainingCase,
     rngs: tuple[np.random.Generator, np.random.Generator],
-    noise: Noise,
-    *,
-    trials: int,
-    printer: Printer,
-    camera: Camera,
-    s: Settings,
+    work: Work,
     on_step: Callable[[Trial], None],
-) -> tuple[Run, list[Watched], bead.Calibration]:
-    """Our law on the reference routine of a simulated machine, the flow measured from pictures: every trial
-    is one recording in `folder`, written and read back; those of the first and last trial are kept. `rngs`
-    draw what the camera sees, and what does not repeat."""
-    routine, seen = lesson.routines[0], []
-    looks = trial_video.scene(camera, rngs[0])
-    calibration = trial_video.calibrate(looks, camera, rngs[0])
+) -> Part:
+    """The model inverse on the reference routine of a simulated machine, the flow measured from pictures.
+
+    Every trial is one recording in `folder`, written and read back; those of the first and last trial are
+    kept. `rngs` draw what the camera sees, and what does not repeat.
+    """
+    name, camera, routine = material.name, work.camera, case.routines[0]
+    scene = trial_video.scene(camera, rngs[0])
+    calibration = trial_video.calibrate(scene, camera, rngs[0])
+    machine = SimulatedMachine(case.plant, work.printer, camera, scene, work.noise)
+    measured: list[MeasuredTrial] = []
 
     def measure(u: np.ndarray) -> Trial:
-        j = len(seen)
-        path = folder / f"{material.name}_{j:02d}.mcap"
-        known = trial_video.conditions(
+        j = len(measured)
+        path = folder / f"{name}_{j:02d}.mcap"
+        conditions = trial_video.conditions(
             material,
             routine,
             j,
             "pixels" if j else "on_off",
-            printer=printer,
+            printer=work.printer,
             camera=camera,
             calibration=calibration,
         )
-        trial_video.film(
-            path,
-            known,
-            lesson.plant,
-            routine,
-            u,
-            printer=printer,
-            camera=camera,
-            scene=looks,
-            noise=noise,
-            rng=rngs[1],
-        )
-        seen.append(trial_video.watch(path, routine, printer=printer, camera=camera))
+        trial_video.simulate_recording(path, conditions, machine, routine, u, rngs[1])
+        measured.append(trial_video.measure_trial(path, routine, printer=work.printer, camera=camera))
         if j > 1:
-            (folder / f"{material.name}_{j - 1:02d}.mcap").unlink()
-        return seen[-1].trial
+            (folder / f"{name}_{j - 1:02d}.mcap").unlink()
+        return measured[-1].trial
 
-    done = run(
-        "pixels", ours(routine, s), measure, routine, lesson.nominal, trials=trials, s=s, on_step=on_step
+    sequence = training.run_trials(
+        "pixels",
+        training.model_inverse(routine, work.laws),
+        measure,
+        routine,
+        case.nominal,
+        trials=work.settings.pixel_trials,
+        settings=work.laws,
+        on_step=on_step,
     )
-    return done, seen, calibration
+    figures = training.figures(sequence, rise=work.laws.rise) | _flow_errors(measured, routine)
+    return Part(
+        {(name, 0): [sequence]},
+        {(name, 0): measured},
+        {name: {"calibration": calibration._asdict()}},
+        {name: {"pixels": figures}},
+    )
+
+
+def _before(nominal: Extruder, routines: Sequence[Routine], work: Work) -> dict[str, Any]:
+    """What is known before anything runs: gamma of the paper's law on the nominal model and over the family,
+    and the headroom of the drive over each routine."""
+    settings = work.settings
+    convergence = training.convergence(
+        nominal,
+        np.random.default_rng([settings.seed, 0, 0]),
+        plants=settings.family_plants,
+        steady_flow=work.printer.steady_flow,
+        settings=work.laws,
+    )
+    headrooms = [
+        training.actuator_headroom(routine, nominal, worst_ratio=settings.worst_ratio, settings=work.laws)
+        for routine in routines
+    ]
+    return {
+        "gamma": convergence.nominal,
+        "gamma_worst": convergence.family.max(),
+        "gamma_above_1_percent": 100 * np.mean(convergence.family > 1),
+        "actuator_headroom": [
+            {"peak_over_steady": one.peak / one.steady, "least_ratio": one.ratio, "ramp_s": one.ramp_s}
+            for one in headrooms
+        ],
+    }
+
+
+def _flow_errors(measured: Sequence[MeasuredTrial], routine: Routine) -> dict[str, float]:
+    """How well pictures measure the flow, over all trials: r.m.s. error in % of the steady flow, in the
+    whole trial and around its pause, and frames without a bead."""
+    errors = np.array([one.flow.flow - one.trial.truth for one in measured]) / routine.r.max()
+    near = (routine.time_s > routine.pause_s[0] - 0.3) & (routine.time_s < routine.pause_s[1] + 0.3)
+    trial, corner = (100 * np.sqrt(np.mean(part**2, axis=1)) for part in (errors, errors[:, near]))
+    frames = sum(one.frames for one in measured)
+    rejected = sum(sum(one.rejected.values()) for one in measured)
+    return {
+        "flow_error_percent": float(np.median(trial)),
+        "flow_error_corner_percent": float(np.median(corner)),
+        "rejected_percent": 100 * rejected / frames,
+    }
 
 
 # ---- trials of a real machine
@@ -265,95 +278,99 @@ def _pictures(
 
 def _recorded(
     folder: Path, printer: Printer, camera: Camera, routines: Sequence[Routine]
-) -> dict[tuple[str, int], list[Watched]]:
+) -> dict[tuple[str, int], list[MeasuredTrial]]:
     """The trials that lie in `folder`, by (material, number of the routine) in the order of their numbers.
 
     Raises ValueError, naming the file, for an unknown material, nozzle or
     routine, and where a trial is missing or there twice.
     """
-    found: dict[tuple[str, int], dict[int, tuple[Path, Watched]]] = {}
+    by_routine: dict[tuple[str, int], dict[int, tuple[Path, MeasuredTrial]]] = {}
     for path in sorted(file for file in folder.rglob("*.mcap") if not file.name.startswith(".")):
-        known = trial_files.read_trial(path, unreadable_share=camera.unreadable_share).conditions
-        if known is None:
+        conditions = trial_files.read_trial(path, unreadable_share=camera.unreadable_share).conditions
+        if conditions is None:
             raise ValueError(
                 f"{path}: expected the metadata record {trial_files.SCHEMA} with material "
                 "and trial, found none; "
                 "copy it from the command in datasets/train_ilc/next"
             )
-        key = (known.material, _routine(path, known, printer, routines))
-        done = found.setdefault(key, {})
-        if known.trial in done:
+        number, material = conditions.trial, conditions.material
+        index = _routine(path, conditions, printer, routines)
+        trials = by_routine.setdefault((material, index), {})
+        if number in trials:
             raise ValueError(
-                f"{path}: trial {known.trial} of material {known.material} is in {done[known.trial][0]} too; "
+                f"{path}: trial {number} of material {material} is in {trials[number][0]} too; "
                 "keep one of the two"
             )
-        done[known.trial] = (path, trial_video.watch(path, routines[key[1]], printer=printer, camera=camera))
-    for (material, index), done in found.items():
-        lacking = sorted(set(range(max(done))) - set(done))
+        measured = trial_video.measure_trial(path, routines[index], printer=printer, camera=camera)
+        trials[number] = (path, measured)
+    for (material, index), trials in by_routine.items():
+        lacking = sorted(set(range(max(trials))) - set(trials))
         if lacking:
             raise ValueError(
                 f"{folder}: trial {lacking[0]} of material {material}, routine {index}, "
-                f"is missing beside trial {max(done)}; add it, "
+                f"is missing beside trial {max(trials)}; add it, "
                 "or renumber the others"
             )
-    return {key: [done[j][1] for j in sorted(done)] for key, done in sorted(found.items())}
+    return {key: [trials[j][1] for j in sorted(trials)] for key, trials in sorted(by_routine.items())}
 
 
-def _routine(path: Path, known: trial_files.Conditions, printer: Printer, routines: Sequence[Routine]) -> int:
+def _routine(
+    path: Path, conditions: trial_files.Conditions, printer: Printer, routines: Sequence[Routine]
+) -> int:
     names = [material.name for material in printer.materials]
-    if known.material not in names:
+    if conditions.material not in names:
         raise ValueError(
-            f"{path}: material {known.material} is not among printer.materials {', '.join(names)}; "
+            f"{path}: material {conditions.material} is not among printer.materials {', '.join(names)}; "
             "add it to params.yaml, "
             "or take the file away"
         )
-    if known.nozzle != f"{printer.nozzle_mm:g}":
+    if conditions.nozzle != f"{printer.nozzle_mm:g}":
         raise ValueError(
             f"{path}: expected a nozzle of {printer.nozzle_mm:g} mm (printer.nozzle_mm), "
-            f"found {known.nozzle}; "
+            f"found {conditions.nozzle}; "
             "what one nozzle learned does not hold for another"
         )
     for index, routine in enumerate(routines):
         if (
-            abs(routine.speed.max() - known.speed_mm_per_s) < 1e-6
-            and abs(routine.pause_s[1] - routine.pause_s[0] - known.pause_s) < 1e-6
+            abs(routine.speed.max() - conditions.speed_mm_per_s) < 1e-6
+            and abs(routine.pause_s[1] - routine.pause_s[0] - conditions.pause_s) < 1e-6
         ):
             return index
     asked = ", ".join(f"{r.speed.max():g} mm/s with {r.pause_s[1] - r.pause_s[0]:g} s" for r in routines)
     raise ValueError(
         f"{path}: expected one of the routines of train_ilc ({asked}), "
-        f"found {known.speed_mm_per_s:g} mm/s with a pause of "
-        f"{known.pause_s:g} s; add that routine to printer.routines in params.expert.yaml"
+        f"found {conditions.speed_mm_per_s:g} mm/s with a pause of "
+        f"{conditions.pause_s:g} s; add that routine to printer.routines in params.expert.yaml"
     )
 
 
 def _resume(
-    watched: Sequence[Watched], routine: Routine, nominal: Extruder, s: Settings
-) -> tuple[Run | None, ilc.Step]:
+    measured: Sequence[MeasuredTrial], routine: Routine, nominal: Extruder, settings: LawSettings
+) -> tuple[TrialSequence | None, ilc.Step]:
     """What was learned in the trials so far, and what follows: trial 0 is on-off control."""
     u0 = on_off(routine.r, nominal)
-    done = [one.trial for one in watched]
-    if not done:
+    trials = [one.trial for one in measured]
+    if not trials:
         return None, ilc.Step(u0, 0, False, False)
-    law = ours(routine, s)
-    step = ilc.next_step(done, routine.r, law, rise=s.rise)
-    found = law.model.extruder.gain / nominal.gain if law.model else 1.0
-    if not 1 / WRONG_GAIN < found < WRONG_GAIN:
+    law = training.model_inverse(routine, settings)
+    step = ilc.next_step(trials, routine.r, law, rise=settings.rise)
+    gain_ratio = law.model.extruder.gain / nominal.gain if law.model else 1.0
+    if not 1 / WRONG_GAIN < gain_ratio < WRONG_GAIN:
         raise ValueError(
-            f"the trials show {found:.3g} times the gain of printer.materials; "
+            f"the trials show {gain_ratio:.3g} times the gain of printer.materials; "
             "check the units of the command, "
             "the calibration and the frames' size, or write the gain as it is"
         )
-    rows = ilc.table(done, routine.r, steady=float(u0.max()), limit=s.limit, rise=s.rise)
-    return Run("pixels", routine, done, rows, law.model), step
+    rows = ilc.table(trials, routine.r, steady=float(u0.max()), limit=settings.limit, rise=settings.rise)
+    return TrialSequence("pixels", routine, trials, rows, law.model), step
 
 
 def recordings(folder: Path, following: Path, work: Work) -> Part:
     """The trials in `folder`, and in `following` the command of the next trial of every
     material and routine, on-off where there is none yet."""
-    printer, camera, s = work.printer, work.camera, work.settings
-    routines, whole = printer.trained(), Part({}, {}, {}, {})
-    seen = _recorded(Path(folder), printer, camera, routines)
+    printer, camera = work.printer, work.camera
+    routines, part = printer.trained(), Part({}, {}, {}, {})
+    by_routine = _recorded(Path(folder), printer, camera, routines)
     px = abs(camera.mm_per_px)
     following.mkdir()
     for material in printer.materials:
@@ -361,29 +378,32 @@ def recordings(folder: Path, following: Path, work: Work) -> Part:
         figures = _before(nominal, routines, work)
         models: dict[str, Any] = {"nominal": laws.plain(nominal)}
         for index, routine in enumerate(routines):
-            watched = seen.get((material.name, index), [])
+            key = (material.name, index)
+            measured = by_routine.get(key, [])
             with about(f"{folder}: material {material.name}, routine {index}"):
-                done, step = _resume(watched, routine, nominal, s)
-            name = f"{material.name}_routine_{index}_trial_{len(watched):02d}"
-            known = trial_video.conditions(
+                sequence, step = _resume(measured, routine, nominal, work.laws)
+            name = f"{material.name}_routine_{index}_trial_{len(measured):02d}"
+            conditions = trial_video.conditions(
                 material,
                 routine,
-                len(watched),
-                "ours" if watched else "on_off",
+                len(measured),
+                "model_inverse" if measured else "on_off",
                 printer=printer,
                 camera=camera,
                 calibration=bead.Calibration(px, 0.0, 0.0, np.zeros(0)),
             )
-            trial_files.write_command(following / name, known, time_s=routine.time_s, command_mm=step.u)
+            trial_files.write_command(following / name, conditions, time_s=routine.time_s, command_mm=step.u)
             figures[f"routine_{index}"] = {
                 "next": name,
                 "best_trial": step.best,
                 "rolled_back": step.rolled_back,
                 "stopped": step.stopped,
             }
-            if done:
-                whole.runs[material.name, index], whole.watched[material.name, index] = [done], list(watched)
-                figures["pixels" if index == 0 else f"pixels_{index}"] = training.figures(done, rise=s.rise)
-                models["identified" if index == 0 else f"identified_{index}"] = _model(done.model)
-        whole.metrics[material.name], whole.models[material.name] = figures, models
-    return whole
+            if sequence:
+                part.sequences[key], part.measured[key] = [sequence], list(measured)
+                figures["pixels" if index == 0 else f"pixels_{index}"] = training.figures(
+                    sequence, rise=work.laws.rise
+                )
+                models["identified" if index == 0 else f"identified_{index}"] = _model(sequence.model)
+        part.metrics[material.name], part.models[material.name] = figures, models
+    return part

@@ -56,6 +56,17 @@ class Conditions(NamedTuple):
     nozzle_column: float
 
 
+class Signals(NamedTuple):
+    """What a machine did in one trial, on one clock time_s (T,): gantry, plunger command and, where it is
+    simulated, the true flow; all (T,)."""
+
+    time_s: np.ndarray
+    position_mm: np.ndarray
+    speed_mm_per_s: np.ndarray
+    command_mm: np.ndarray
+    flow_mm3_per_s: np.ndarray | None = None
+
+
 class Trial(NamedTuple):
     """A recording as it was made: signals {name: (time_s (n,), values (n,))} on their own clocks,
     frames, and notes of what was damaged or left out.
@@ -77,28 +88,22 @@ def write_trial(
     path: str | Path,
     conditions: Conditions,
     frames: Iterable[tuple[float, np.ndarray]],
+    signals: Signals,
     *,
-    time_s: np.ndarray,
-    position_mm: np.ndarray,
-    speed_mm_per_s: np.ndarray,
-    command_mm: np.ndarray,
-    flow_mm3_per_s: np.ndarray | None = None,
     encoding: str,
 ) -> None:
-    """One recording of frames (time_s, (height, width) uint8 or uint16) and of signals (T,) at time_s (T,);
-    frames are taken one by one, memory is that of a chunk.
+    """One recording of frames (time_s, (height, width) uint8 or uint16) and of signals; frames are taken
+    one by one, memory is that of a chunk.
 
     `encoding` is "jpeg" (quality 95, 8 bits only), "png" (level 1) or "raw". Raises ValueError, nothing
     written, for lengths that differ, values that are not finite, times that do not run forward, frames of
     changing size or kind, no frame, and frames and signals that do not overlap in time.
     """
-    signals = [
-        (POSITION, position_mm),
-        (SPEED, speed_mm_per_s),
-        (COMMAND, command_mm),
-        (FLOW, flow_mm3_per_s),
+    time_s = signals.time_s
+    columns = [
+        (source, values) for source, values in zip(SOURCES, signals[1:], strict=True) if values is not None
     ]
-    tables = tables_of(path, time_s, [(source, values) for source, values in signals if values is not None])
+    tables = tables_of(path, time_s, columns)
     write_frames(path, tables, TYPES, time_s, (encoding, frames), (SCHEMA, _metadata(path, conditions)))
 
 
@@ -175,14 +180,14 @@ def read_trial(
 
 
 def _read(path: Path, sources: Sequence[Source], image: str, time: str, unreadable_share: float) -> Trial:
-    found = topics(path)
-    if not any(topic.count for topic in found.values()):
+    there = topics(path)
+    if not any(topic.count for topic in there.values()):
         raise ValueError(f"{path}: it has no whole message ({damage(path)}); copy the recording again")
-    camera = image_topic(path, found, image)
-    film = read_frames(
-        path, camera, _places(path, sources, found), found, clock=time, unreadable_share=unreadable_share
+    camera = image_topic(path, there, image)
+    recording = read_frames(
+        path, camera, _places(path, sources, there), there, clock=time, unreadable_share=unreadable_share
     )
-    frames, signals, notes = film.frames, film.signals, film.notes
+    frames, signals, notes = recording.frames, recording.signals, recording.notes
     check_overlap(
         path, span_of(frames.time_s), {name: span_of(time_s) for name, (time_s, _) in signals.items()}
     )
@@ -197,11 +202,13 @@ def _read(path: Path, sources: Sequence[Source], image: str, time: str, unreadab
                 f"{outside} of {len(frames.time_s)} frames lie before or after the command",
             )
         )
-    return Trial(str(path), _conditions(path, film.metadata.get(SCHEMA, {}), notes), signals, frames, notes)
+    return Trial(
+        str(path), _conditions(path, recording.metadata.get(SCHEMA, {}), notes), signals, frames, notes
+    )
 
 
 def _places(
-    path: Path, sources: Sequence[Source], found: dict[str, Topic]
+    path: Path, sources: Sequence[Source], there: dict[str, Topic]
 ) -> dict[str, tuple[Source, str, str]]:
     """{signal: (source, topic, field)}; only the true flow, which no
     machine knows, may be absent where its source is ours."""
@@ -213,17 +220,17 @@ def _places(
             )
     places = {}
     for source in sources:
-        if source == FLOW and FLOW.source.partition(":")[0] not in found:
+        if source == FLOW and FLOW.source.partition(":")[0] not in there:
             continue
         try:
-            places[source.signal] = (source, *resolve(path, source.source, found))
+            places[source.signal] = (source, *resolve(path, source.source, there))
         except ValueError as error:
             raise ValueError(f"{error}; map {source.signal} to the topic that has it") from None
     return places
 
 
-def _conditions(path: Path, said: dict[str, str], notes: list[Note]) -> Conditions | None:
-    if not said:
+def _conditions(path: Path, metadata: dict[str, str], notes: list[Note]) -> Conditions | None:
+    if not metadata:
         notes.append(
             Note(
                 "conditions",
@@ -233,8 +240,8 @@ def _conditions(path: Path, said: dict[str, str], notes: list[Note]) -> Conditio
             )
         )
         return None
-    pairs = {name: value for name, value in said.items() if name != "crc32"}
-    crc = said.get("crc32")
+    pairs = {name: value for name, value in metadata.items() if name != "crc32"}
+    crc = metadata.get("crc32")
     if crc is not None and crc != _crc(pairs):
         raise ValueError(
             f"{path}: the trial's conditions should have CRC {_crc(pairs)} but say {crc}, "

@@ -1,5 +1,5 @@
-"""A trial in pictures: a simulated machine filmed into one recording, and a recording, ours or a machine's
-own, measured to the flow that a law learns from."""
+"""A trial in pictures: the recording of a simulated machine, and the flow that a law learns from, measured
+from a recording, ours or a machine's own."""
 
 import itertools
 from collections.abc import Iterator, Sequence
@@ -28,14 +28,25 @@ TOGETHER = 16
 CALIBRATION_FRAMES = 12
 
 
-class Watched(NamedTuple):
-    """What the frames of one trial told: the trial as a law sees it, the flow with its uncertainty, frames
-    seen, and frames without a usable bead by reason."""
+class MeasuredTrial(NamedTuple):
+    """One trial measured from its frames: the trial as a law sees it, the flow with its uncertainty, the
+    number of frames, and frames without a usable bead by reason."""
 
     trial: Trial
     flow: flow.Flow
     frames: int
     rejected: dict[str, int]
+
+
+class SimulatedMachine(NamedTuple):
+    """A simulated machine before a simulated camera: true extruder, sections `printer` and `camera`, the
+    scene that the camera sees, and what does not repeat from trial to trial."""
+
+    plant: Extruder
+    printer: Printer
+    camera: Camera
+    scene: rendering.Camera
+    noise: Noise
 
 
 def view(camera: Camera) -> flow.View:
@@ -50,15 +61,16 @@ def scene(camera: Camera, rng: np.random.Generator) -> rendering.Camera:
 
 def calibrate(scene: rendering.Camera, camera: Camera, rng: np.random.Generator) -> bead.Calibration:
     """Pixels to mm on pictures of the known widths of section `camera`."""
-    known = np.repeat(camera.known_widths_mm, CALIBRATION_FRAMES)
+    widths_mm = np.repeat(camera.known_widths_mm, CALIBRATION_FRAMES)
     frames = [
-        scene.frame(width / abs(camera.mm_per_px), stage_px=int(rng.integers(0, 10_000))) for width in known
+        scene.frame(width / abs(camera.mm_per_px), stage_px=int(rng.integers(0, 10_000)))
+        for width in widths_mm
     ]
-    seen = [
+    beads = [
         bead.measure(frame, columns=tuple(camera.columns), longest_blur_px=camera.longest_blur_px)
         for frame in frames
     ]
-    bad = [f"{width:g} mm: {one.reason}" for width, one in zip(known, seen, strict=True) if one.reason]
+    bad = [f"{width:g} mm: {one.reason}" for width, one in zip(widths_mm, beads, strict=True) if one.reason]
     if bad:
         reasons = ", ".join(
             f"{bad.count(what)} of {CALIBRATION_FRAMES} of {what}" for what in dict.fromkeys(bad)
@@ -68,68 +80,98 @@ def calibrate(scene: rendering.Camera, camera: Camera, rng: np.random.Generator)
             "fit camera.known_widths_mm to what is seen at "
             f"{abs(camera.mm_per_px):g} mm per px, or raise camera.longest_blur_px"
         )
-    return bead.calibrate(np.array([one.width for one in seen]), known)
+    return bead.calibrate(np.array([one.width for one in beads]), widths_mm)
 
 
-def film(
+def simulate_recording(
     path: str | Path,
     conditions: trial_files.Conditions,
-    plant: Extruder,
+    machine: SimulatedMachine,
     routine: Routine,
     u: np.ndarray,
-    *,
-    printer: Printer,
-    camera: Camera,
-    scene: rendering.Camera,
-    noise: Noise,
     rng: np.random.Generator,
 ) -> None:
-    """Runs the command u (T,) in mm on a simulated machine before the
-    camera, and records it with its true flow.
+    """Runs the command u (T,) in mm on a simulated machine before its camera, and records it with its true
+    flow.
 
-    What is filmed is the true flow with what does not repeat from
-    trial to trial; a law is judged by the true flow alone.
+    The camera sees the true flow with what does not repeat from trial to trial. A law is judged by the true
+    flow alone.
     """
-    truth = true_flow(plant, u, sample_time_s=printer.sample_time_s, limit=printer.limit)
+    printer, camera, noise = machine.printer, machine.camera, machine.noise
+    truth = true_flow(machine.plant, u, sample_time_s=printer.sample_time_s, limit=printer.limit)
     laid = np.maximum(
         disturb(
             truth, rng, steady_flow=routine.r.max(), white=noise.white, drift=noise.drift, gain=noise.gain
         ),
         0.0,
     )
-    pictures = scene.trial(
+    pictures = machine.scene.trial(
         routine.time_s, laid, routine.position, view=view(camera), frame_rate_hz=camera.frames_per_s,
         nozzle_mm=(printer.nozzle_mm / 2, printer.nozzle_outer_mm / 2),
         contact_angle_deg=camera.contact_angle_deg,
     )  # fmt: skip
-    trial_files.write_trial(
-        path, conditions, pictures, time_s=routine.time_s, position_mm=routine.position,
-        speed_mm_per_s=routine.speed,
-        command_mm=np.clip(u, -printer.limit, printer.limit), flow_mm3_per_s=truth, encoding=camera.encoding,
-    )  # fmt: skip
+    applied = np.clip(u, -printer.limit, printer.limit)
+    signals = trial_files.Signals(routine.time_s, routine.position, routine.speed, applied, truth)
+    trial_files.write_trial(path, conditions, pictures, signals, encoding=camera.encoding)
 
 
-def watch(path: str | Path, routine: Routine, *, printer: Printer, camera: Camera) -> Watched:
+def measure_trial(path: str | Path, routine: Routine, *, printer: Printer, camera: Camera) -> MeasuredTrial:
     """The trial of a recording on the clock of its routine. Raises ValueError, naming the file, where it
     says nothing of its conditions or shows no bead."""
     recording = trial_files.read_trial(path, unreadable_share=camera.unreadable_share)
-    known = recording.conditions
-    if known is None:
+    conditions = _checked_conditions(path, recording)
+    late = _late(*recording.signals["position_mm"], routine)
+    recording = recording._replace(
+        signals={name: (time_s - late, values) for name, (time_s, values) in recording.signals.items()}
+    )
+    signals = _on_routine_clock(path, recording, routine)
+    times, columns, widths, rejected = _widths(path, recording, conditions, camera, late)
+    try:
+        sections = flow.sections(
+            np.interp(times, *recording.signals["position_mm"]), columns, np.array(widths),
+            view=flow.View(conditions.mm_per_px, conditions.nozzle_column),
+            nozzle_radius_mm=printer.nozzle_mm / 2, contact_angle_deg=conditions.contact_angle_deg,
+        )  # fmt: skip
+        estimate = flow.estimate(
+            routine.time_s,
+            signals["position_mm"],
+            sections,
+            nozzle_radius_mm=printer.nozzle_mm / 2,
+            shapes=routine.r[None],
+            contact_angle_deg=conditions.contact_angle_deg,
+            width_deviation_mm=camera.width_deviation_mm,
+        )
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    # within a pause only its volume was measured: a law learns nothing there
+    y = np.where(estimate.observable, estimate.flow, np.nan)
+    trial = Trial(signals["command_mm"], y, signals.get("flow_mm3_per_s"))
+    return MeasuredTrial(trial, estimate, len(times), rejected)
+
+
+def _checked_conditions(path: str | Path, recording: trial_files.Trial) -> trial_files.Conditions:
+    """What a recording was made with. Raises ValueError where it does not say, or says what cannot be."""
+    conditions = recording.conditions
+    if conditions is None:
         raise ValueError(
             f"{path}: expected metadata with material, trial and calibration (record "
             "beadline.trial), found none; "
             "write it as the commands in datasets/train_ilc/next have it"
         )
-    if not known.px_per_mm > 0 or known.trial < 0:
+    if not conditions.px_per_mm > 0 or conditions.trial < 0:
         raise ValueError(
             f"{path}: expected a scale px_per_mm above 0 and a trial from 0 on, "
-            f"found {known.px_per_mm:g} and {known.trial}; "
+            f"found {conditions.px_per_mm:g} and {conditions.trial}; "
             f"mend the metadata record {trial_files.SCHEMA}"
         )
-    late = _late(*recording.signals["position_mm"], routine)
-    recording = recording._replace(
-        signals={name: (time_s - late, values) for name, (time_s, values) in recording.signals.items()}
-    )
+    return conditions
+
+
+def _on_routine_clock(
+    path: str | Path, recording: trial_files.Trial, routine: Routine
+) -> dict[str, np.ndarray]:
+    """The signals (T,) of a recording at the samples of its routine. Raises ValueError where the recording
+    is too short, has gaps, or shows another travel."""
     for name, (time_s, _) in recording.signals.items():
         if len(time_s) == 0 or time_s[0] > SLACK_S or time_s[-1] < routine.time_s[-1] - SLACK_S:
             span = f"{time_s[0]:.2f} to {time_s[-1]:.2f} s" if len(time_s) else "nothing"
@@ -145,21 +187,35 @@ def watch(path: str | Path, routine: Routine, *, printer: Printer, camera: Camer
                 f"{path}: expected {name} at every moment but {gaps} of {len(routine.time_s)} are missing; "
                 "record the trial again"
             )
-    asked, travelled = np.ptp(routine.position), np.ptp(signals["position_mm"])
-    if not 0.9 * asked < travelled < 1.1 * asked:
+    expected, travelled = np.ptp(routine.position), np.ptp(signals["position_mm"])
+    if not 0.9 * expected < travelled < 1.1 * expected:
         raise ValueError(
-            f"{path}: expected the gantry to travel {asked:.4g} mm, as its routine has it, "
+            f"{path}: expected the gantry to travel {expected:.4g} mm, as its routine has it, "
             f"found {travelled:.4g} mm; "
             "check topic and unit of its position, or record the trial again"
         )
+    return signals
+
+
+def _widths(
+    path: str | Path,
+    recording: trial_files.Trial,
+    conditions: trial_files.Conditions,
+    camera: Camera,
+    late: float,
+) -> tuple[list[float], np.ndarray, list[np.ndarray], dict[str, int]]:
+    """Times of the frames, measured columns (m,), widths (m,) in mm of each frame, and counts of rejected
+    frames by reason. Raises ValueError where no frame shows a usable bead."""
     rejected: dict[str, int] = {}
     times, columns, widths = [], None, []
-    for time, found in _beads(recording, camera):
+    for time, one in _beads(recording, camera):
         times.append(time - late)
-        columns = found.columns
-        widths.append(np.where(found.widths == 0, 0.0, (found.widths - known.offset_px) / known.px_per_mm))
-        if found.reason:
-            rejected[found.reason] = rejected.get(found.reason, 0) + 1
+        columns = one.columns
+        widths.append(
+            np.where(one.widths == 0, 0.0, (one.widths - conditions.offset_px) / conditions.px_per_mm)
+        )
+        if one.reason:
+            rejected[one.reason] = rejected.get(one.reason, 0) + 1
     if not times:
         raise ValueError(f"{path}: expected frames but none could be read; record the trial again")
     if not any(np.any(width > 0) for width in widths):
@@ -169,28 +225,7 @@ def watch(path: str | Path, routine: Routine, *, printer: Printer, camera: Camer
             "calibration and camera.columns, "
             "or record the trial again"
         )
-    try:
-        seen = flow.sections(
-            np.interp(times, *recording.signals["position_mm"]), columns, np.array(widths),
-            view=flow.View(known.mm_per_px, known.nozzle_column),
-            nozzle_radius_mm=printer.nozzle_mm / 2, contact_angle_deg=known.contact_angle_deg,
-        )  # fmt: skip
-        found = flow.estimate(
-            routine.time_s,
-            signals["position_mm"],
-            seen,
-            nozzle_radius_mm=printer.nozzle_mm / 2,
-            shapes=routine.r[None],
-            contact_angle_deg=known.contact_angle_deg,
-            width_deviation_mm=camera.width_deviation_mm,
-        )
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    # within a pause only its volume was measured: a law learns nothing there
-    y = np.where(found.observable, found.flow, np.nan)
-    return Watched(
-        Trial(signals["command_mm"], y, signals.get("flow_mm3_per_s")), found, len(times), rejected
-    )
+    return times, columns, widths, rejected
 
 
 def _beads(recording: trial_files.Trial, camera: Camera) -> Iterator[tuple[float, bead.Bead]]:
@@ -200,10 +235,10 @@ def _beads(recording: trial_files.Trial, camera: Camera) -> Iterator[tuple[float
     while batch := list(itertools.islice(frames, TOGETHER)):
         times, pictures = zip(*batch, strict=True)
         with about(recording.path):
-            found = bead.measure_all(
+            beads = bead.measure_all(
                 pictures, columns=tuple(camera.columns), longest_blur_px=camera.longest_blur_px
             )
-        yield from zip(times, found, strict=True)
+        yield from zip(times, beads, strict=True)
 
 
 def _late(time_s: np.ndarray, position: np.ndarray, routine: Routine) -> float:
@@ -250,12 +285,12 @@ def conditions(
 def first_and_last(paths: Sequence[Path], camera: Camera) -> list[Path]:
     """Of recordings with conditions those of the first and the last
     trial of each material, in the order of their names."""
-    found: dict[str, list[tuple[int, Path]]] = {}
+    by_material: dict[str, list[tuple[int, Path]]] = {}
     for path in paths:
-        known = trial_files.read_trial(path, unreadable_share=camera.unreadable_share).conditions
-        if known:
-            found.setdefault(known.material, []).append((known.trial, path))
-    return sorted({path for done in found.values() for _, path in (min(done), max(done))})
+        conditions = trial_files.read_trial(path, unreadable_share=camera.unreadable_share).conditions
+        if conditions:
+            by_material.setdefault(conditions.material, []).append((conditions.trial, path))
+    return sorted({path for trials in by_material.values() for _, path in (min(trials), max(trials))})
 
 
 def shown(path: Path, folder: Path, camera: Camera) -> list[dict[str, Any]]:
@@ -263,35 +298,29 @@ def shown(path: Path, folder: Path, camera: Camera) -> list[dict[str, Any]]:
     line, corner, and the first that was rejected for each reason, and returns a row for each: where it is
     from, what was measured, and why it was rejected."""
     recording = trial_files.read_trial(path, unreadable_share=camera.unreadable_share)
-    known, beads = recording.conditions, list(_beads(recording, camera))
-    if known is None or not beads:
+    conditions, beads = recording.conditions, list(_beads(recording, camera))
+    if conditions is None or not beads:
         return []
-    wanted = _places(recording, beads, camera)
+    places = _places(recording, beads, camera)
     rows = []
     for k, (time, frame) in enumerate(recording.frames):
-        if k not in wanted:
+        if k not in places:
             continue
-        found, name = beads[k][1], f"{path.stem}_{k:05d}.jpg"
-        _save(folder / name, bead.drawn(frame, found), found)
-        width = {
-            "width_mm": (found.width - known.offset_px) / known.px_per_mm,
-            "deviation_px": found.deviation,
-        }
-        conditions = {
-            "material": known.material,
-            "trial": known.trial,
-            "recording": path.name,
-            "topic": recording.frames.topic,
-        }
+        one, name = beads[k][1], f"{path.stem}_{k:05d}.jpg"
+        _save(folder / name, bead.drawn(frame, one), one)
         rows.append(
             {
                 "file": name,
-                "place": wanted[k],
-                **conditions,
+                "place": places[k],
+                "material": conditions.material,
+                "trial": conditions.trial,
+                "recording": path.name,
+                "topic": recording.frames.topic,
                 "time_s": round(time, 6),
-                "reason": found.reason,
-                "blur_px": found.blur_px,
-                **width,
+                "reason": one.reason,
+                "blur_px": one.blur_px,
+                "width_mm": (one.width - conditions.offset_px) / conditions.px_per_mm,
+                "deviation_px": one.deviation,
             }
         )
     return [
@@ -309,9 +338,9 @@ def _places(
     """Numbers of the frames to show, and what they show. After the pause of the gantry the corner takes a
     while to come to the middle of what is measured."""
     time_s, speed = recording.signals["speed_mm_per_s"]
-    full = np.median([found.width for _, found in beads if not found.reason] or [0.0])
-    good = [k for k, (_, found) in enumerate(beads) if not found.reason and found.width > 0.7 * full]
-    rejected = {found.reason: k for k, (_, found) in reversed(list(enumerate(beads))) if found.reason}
+    full = np.median([one.width for _, one in beads if not one.reason] or [0.0])
+    good = [k for k, (_, one) in enumerate(beads) if not one.reason and one.width > 0.7 * full]
+    rejected = {one.reason: k for k, (_, one) in reversed(list(enumerate(beads))) if one.reason}
     places = dict.fromkeys(rejected.values(), "rejected")
     if not good:
         return places
@@ -335,12 +364,12 @@ def _places(
     return places
 
 
-def _save(path: Path, picture: np.ndarray, found: bead.Bead) -> None:
+def _save(path: Path, picture: np.ndarray, measured: bead.Bead) -> None:
     """The picture (h, w, 3) in RGB as JPEG, cut to its middle half
     around the bead, at three quarters of its size."""
     h = picture.shape[0]
-    rows = np.concatenate([found.top, found.bottom])
-    middle = float(np.nanmean(rows)) if np.isfinite(rows).any() and not found.reason else h / 2
+    edges = np.concatenate([measured.top, measured.bottom])
+    middle = float(np.nanmean(edges)) if np.isfinite(edges).any() and not measured.reason else h / 2
     first = int(np.clip(middle - h / 4, 0, h - h // 2))
     cut = cv2.resize(picture[first : first + h // 2], None, fx=0.75, fy=0.75, interpolation=cv2.INTER_AREA)
     write_jpeg(path, cut)
@@ -349,26 +378,30 @@ def _save(path: Path, picture: np.ndarray, found: bead.Bead) -> None:
 # ---- as a table
 
 
-def rows(watched: dict[tuple[str, int], list[Watched]]) -> dict[str, np.ndarray]:
-    """One row a filmed trial, by (material, number of the routine)."""
-    found = []
-    for (material, index), trials_ in watched.items():
-        for j, w in enumerate(trials_):
-            reasons = ", ".join(f"{reason} {count}" for reason, count in sorted(w.rejected.items()))
-            seen = (float(np.median(w.flow.deviation)), float(np.mean(w.flow.observable)), w.flow.outliers)
-            found.append((material, index, j, w.frames, sum(w.rejected.values()), reasons, *seen))
-    names = (
-        "material",
-        "routine",
-        "trial",
-        "frames",
-        "rejected",
-        "reasons",
-        "deviation_mm3_per_s",
-        "observable",
-        "outliers",
-    )
-    return {
-        name: list(values)
-        for name, values in zip(names, zip(*found, strict=True) if found else [[]] * len(names), strict=True)
+def rows(measured: dict[tuple[str, int], list[MeasuredTrial]]) -> dict[str, list]:
+    """One row a measured trial, by (material, number of the routine)."""
+    columns: dict[str, list] = {
+        name: []
+        for name in (
+            "material",
+            "routine",
+            "trial",
+            "frames",
+            "rejected",
+            "reasons",
+            "deviation_mm3_per_s",
+            "observable",
+            "outliers",
+        )
     }
+    for (material, index), trials in measured.items():
+        for j, one in enumerate(trials):
+            reasons = ", ".join(f"{reason} {count}" for reason, count in sorted(one.rejected.items()))
+            deviation, observable = float(np.median(one.flow.deviation)), float(np.mean(one.flow.observable))
+            rejected = sum(one.rejected.values())
+            row = (
+                material, index, j, one.frames, rejected, reasons, deviation, observable, one.flow.outliers
+            )  # fmt: skip
+            for name, value in zip(columns, row, strict=True):
+                columns[name].append(value)
+    return columns

@@ -9,13 +9,13 @@ from pipeline.report.shared.sources import Sources, lookup
 from pipeline.report.shared.verdict import Figure, Missing, Question
 
 
-def moves(sources: Sources, found: Sequence[Structure]) -> list[Move]:
+def moves(sources: Sources, parts: Sequence[Structure]) -> list[Move]:
     """Of every structure and material the flow error of the composer in use. These errors have no bands: one
     simulated print each, the same at every run; so noise is what the choice between composers calls equal.
     """
     if sources.accepted is None or isinstance(sources.accepted, Missing):
         return []
-    return [_move(sources, one) for one in found]
+    return [_move(sources, one) for one in parts]
 
 
 def _move(sources: Sources, one: Structure) -> Move:
@@ -51,7 +51,7 @@ def _accepted(sources: Sources, one: Structure) -> Figure | None:
     return Figure(*3 * (float(score["rms_percent_of_on_off"]),)) if score else None
 
 
-def said(found: Sequence[Move]) -> str:
+def sentence(moves: Sequence[Move]) -> str:
     """ "Deposition: 1 of 4 flow errors moved." """
-    moved = sum(move.moved for move in found)
-    return f"Deposition: {moved} of {len(found)} flow errors moved." if found else ""
+    changed = sum(move.moved for move in moves)
+    return f"Deposition: {changed} of {len(moves)} flow errors moved." if moves else ""

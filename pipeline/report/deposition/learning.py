@@ -1,8 +1,8 @@
 """The learning of the deposition page: error against trial, commands, flow before
-and after, what the camera saw and what it told."""
+and after, what the camera saw and what was measured from it."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from markupsafe import Markup
@@ -16,9 +16,9 @@ from pipeline.report.shared.verdict import Missing
 
 # law -> head, what it is, class of its line; the order of every row of panels
 LAWS = {
-    "paper": ("The paper’s law", "nominal model, Q both ways", "mb", "model_based"),
-    "ours": ("Ours", "identified model, inverted", "dd", "data_driven"),
-    "pixels": ("Ours, through pictures", "flow measured from camera frames", "dd", "kernel"),
+    "hoelzle_2009": ("The paper’s law", "nominal model, Q both ways", "mb", "model_based"),
+    "model_inverse": ("Model inversion", "identified model, inverted", "dd", "data_driven"),
+    "pixels": ("Model inversion through pictures", "flow measured from camera frames", "dd", "kernel"),
 }
 # more materials than this, and the rest stands in the tables alone
 MATERIALS = 4
@@ -55,8 +55,8 @@ def _trials(table: Table, material: str, law: str) -> Table:
     return {name: values[rows] for name, values in table.items()}
 
 
-def _columns(found: list[str], draw: Callable[[str, int], list[Markup]]) -> list[Column]:
-    return [Column(*LAWS[law][:2], LAWS[law][3], draw(law, i)) for i, law in enumerate(found)]
+def _columns(laws: list[str], draw: Callable[[str, int], list[Markup]]) -> list[Column]:
+    return [Column(*LAWS[law][:2], LAWS[law][3], draw(law, i)) for i, law in enumerate(laws)]
 
 
 # ---- error against trial
@@ -69,62 +69,34 @@ def errors(sources: Sources) -> Picture:
         return hole("learning-error", title, table)
     materials, laws, machine = _materials(table), _laws(table), real(sources)
     last = max(int(table["trial"].max()), 1)
-    y = charts.Axis(0.3, 200.0, ((1.0, "1"), (10.0, "10"), (20.0, "20"), (100.0, "100")), True)
-    ends: dict[str, list[str]] = {law: [] for law in laws}
+    curves = {law: {name: _trials(table, name, law) for name in materials} for law in laws}
+    curves = {
+        law: {name: mine for name, mine in of_law.items() if len(mine["trial"])}
+        for law, of_law in curves.items()
+    }
 
     def draw(law: str, column: int) -> list[Markup]:
-        panels = []
-        for i, material in enumerate(materials):
-            mine = _trials(table, material, law)
-            if not len(mine["trial"]):
-                continue
-            bottom = i == len(materials) - 1
-            frame = charts.Frame(
-                charts.linear(0, last, ticks=5), y, 368, 150 if bottom else 138, 30, 16 if bottom else 6
+        return [
+            _error_panel(
+                curves[law][material], law, material, last, machine, column == i == 0, i == len(materials) - 1
             )
-            measured = 100 * mine["rms_measured"] / max(float(mine["rms_measured"][0]), 1e-12)
-            true = 100 * mine["ratio"]
-            best = int(np.argmin(true))
-            ends[law].append(f"{material} {percent(float(true[best]), 2)}")
-            first = np.flatnonzero(true < 20)
-            alt = (
-                f"{LAWS[law][0]}, material {material}: {percent(float(true[best]), 2)} of trial 0’s error at "
-                f"best, at trial {int(mine['trial'][best])}; "
-                + (
-                    f"below 20 % from trial {int(mine['trial'][first[0]])}"
-                    if len(first)
-                    else "never below 20 %"
-                )
-            )
-            layers = [
-                charts.level(frame, 20, "lim"),
-                charts.level(frame, 10, "lim"),
-                *([charts.dots(frame, mine["trial"], measured, "try", 1.8)] if not machine else []),
-                charts.line(frame, mine["trial"], true),
-                charts.dots(
-                    frame, mine["trial"][best : best + 1], true[best : best + 1], f"dot {LAWS[law][2]}", 3
-                ),
-                charts.label(frame, last, 130, f"material {material}", anchor="end"),
-            ]
-            panels.append(
-                charts.panel(
-                    frame,
-                    layers,
-                    alt=alt,
-                    css=LAWS[law][2],
-                    title="% of trial 0, log" if column == i == 0 else "",
-                    x_ticks=bottom,
-                    units=("trials", "%"),
-                )
-            )
-        return panels
+            for i, material in enumerate(materials)
+            if material in curves[law]
+        ]
 
     shown = _columns(laws, draw)
-    text = "; ".join(f"{LAWS[law][0]} reaches {', '.join(found)}" for law, found in ends.items() if found)
+    ends = {
+        law: [
+            f"{material} {percent(100 * float(mine['ratio'].min()), 2)}" for material, mine in of_law.items()
+        ]
+        for law, of_law in curves.items()
+    }
+    text = "; ".join(f"{LAWS[law][0]} reaches {', '.join(best)}" for law, best in ends.items() if best)
     floor = (
         "Line: error measured from pictures; nobody knows the true flow of a real machine."
         if machine
-        else "Line: r.m.s. error of the true flow; grey dots: of the measured one, which ends higher because noise that does not repeat counts in it, and cannot be learned away."
+        else "Line: r.m.s. error of the true flow; grey dots: of the measured one, which ends higher because "
+        "noise that does not repeat counts in it, and cannot be learned away."
     )
     return Picture(
         "learning-error",
@@ -137,6 +109,40 @@ def errors(sources: Sources) -> Picture:
     )
 
 
+def _error_panel(
+    mine: Table, law: str, material: str, last: int, machine: bool, titled: bool, bottom: bool
+) -> Markup:
+    """Errors of one law on one material against the trial."""
+    name, css = LAWS[law][0], LAWS[law][2]
+    y = charts.Axis(0.3, 200.0, ((1.0, "1"), (10.0, "10"), (20.0, "20"), (100.0, "100")), True)
+    frame = charts.Frame(
+        charts.linear(0, last, ticks=5), y, 368, 150 if bottom else 138, 30, 16 if bottom else 6
+    )
+    trial, true = mine["trial"], 100 * mine["ratio"]
+    measured = 100 * mine["rms_measured"] / max(float(mine["rms_measured"][0]), 1e-12)
+    best = int(np.argmin(true))
+    below = np.flatnonzero(true < 20)
+    since = f"below 20 % from trial {int(trial[below[0]])}" if len(below) else "never below 20 %"
+    layers = [
+        charts.level(frame, 20, "lim"),
+        charts.level(frame, 10, "lim"),
+        *([charts.dots(frame, trial, measured, "try", 1.8)] if not machine else []),
+        charts.line(frame, trial, true),
+        charts.dots(frame, trial[best : best + 1], true[best : best + 1], f"dot {css}", 3),
+        charts.label(frame, last, 130, f"material {material}", anchor="end"),
+    ]
+    return charts.panel(
+        frame,
+        layers,
+        alt=f"{name}, material {material}: {percent(float(true[best]), 2)} of trial 0’s error at "
+        f"best, at trial {int(trial[best])}; {since}",
+        css=css,
+        title="% of trial 0, log" if titled else "",
+        x_ticks=bottom,
+        units=("trials", "%"),
+    )
+
+
 # ---- commands
 
 
@@ -146,12 +152,12 @@ def commands(sources: Sources) -> Picture:
     if isinstance(table, Missing):
         return hole("commands", title, table)
     materials = _materials(table)
-    law = next((name for name in ("ours", "pixels") if name in set(table["law"].tolist())), None)
+    there = set(table["law"].tolist())
+    law = next((name for name in ("model_inverse", "pixels") if name in there), None)
     if law is None:
-        return hole("commands", title, Missing("not measured", "no trial of our law is there"))
+        return hole("commands", title, Missing("not measured", "no trial of the model inversion is there"))
     last = int(_trials(table, materials[0], law)["trial"].max(initial=0))
     peaks: list[str] = []
-    y = charts.Axis(-REACH, REACH, ((-10.0, "−10"), (0.0, "0"), (10.0, "10")))
 
     def draw(trial: int, column: int) -> list[Markup]:
         panels = []
@@ -159,45 +165,13 @@ def commands(sources: Sources) -> Picture:
             first, mine = (_trial(table, material, law, k) for k in (0, trial))
             if not len(mine["time_s"]):
                 continue
-            steady = float(
-                np.median(
-                    first["command_mm"][first["wanted_mm3_per_s"] > 0.9 * first["wanted_mm3_per_s"].max()]
-                )
-            )
-            u = mine["command_mm"] / steady
-            peak = float(np.abs(u).max())
+            wanted = first["wanted_mm3_per_s"]
+            u = mine["command_mm"] / float(np.median(first["command_mm"][wanted > 0.9 * wanted.max()]))
             if trial == last:
-                peaks.append(f"{material} {number(peak, 0)} times")
-            bottom = i == len(materials) - 1
-            frame = charts.Frame(
-                charts.linear(0, float(mine["time_s"][-1]), ticks=5),
-                y,
-                368,
-                132 if bottom else 120,
-                30,
-                16 if bottom else 6,
-            )
-            layers = [
-                charts.line(frame, mine["time_s"], u, most=500),
-                charts.label(
-                    frame,
-                    float(mine["time_s"][-1]),
-                    10,
-                    f"material {material}: peak {short(peak, 2)} ×",
-                    anchor="end",
-                ),
-            ]
-            alt = f"Trial {trial}, material {material}: the command peaks at {short(peak, 2)} times the steady one"
+                peaks.append(f"{material} {number(float(np.abs(u).max()), 0)} times")
+            name = f"Trial {trial}, material {material}"
             panels.append(
-                charts.panel(
-                    frame,
-                    layers,
-                    alt=alt,
-                    css="dd",
-                    title="× steady" if column == i == 0 else "",
-                    x_ticks=bottom,
-                    units=("s", "×"),
-                )
+                _command_panel(mine["time_s"], u, name, material, column == i == 0, i == len(materials) - 1)
             )
         return panels
 
@@ -212,9 +186,30 @@ def commands(sources: Sources) -> Picture:
         f"At the end the command peaks at {', '.join(peaks)} the steady one: a push at every start, "
         "a pull at every stop. A drive that gives less needs longer ramps.",
         shown,
-        "Plunger command of our law, in multiples of the steady command, against time in s. "
+        "Plunger command of the model inversion, in multiples of the steady command, against time in s. "
         f"Beyond ± {REACH:g} it runs along the edge.",
         page.origin(sources.source("lessons")),
+    )
+
+
+def _command_panel(
+    time_s: np.ndarray, u: np.ndarray, name: str, material: str, titled: bool, bottom: bool
+) -> Markup:
+    """One command, in multiples of the steady one, against time."""
+    end, peak = float(time_s[-1]), float(np.abs(u).max())
+    y = charts.Axis(-REACH, REACH, ((-10.0, "−10"), (0.0, "0"), (10.0, "10")))
+    frame = charts.Frame(
+        charts.linear(0, end, ticks=5), y, 368, 132 if bottom else 120, 30, 16 if bottom else 6
+    )
+    text = f"material {material}: peak {short(peak, 2)} ×"
+    return charts.panel(
+        frame,
+        [charts.line(frame, time_s, u, most=500), charts.label(frame, end, 10, text, anchor="end")],
+        alt=f"{name}: the command peaks at {short(peak, 2)} times the steady one",
+        css="dd",
+        title="× steady" if titled else "",
+        x_ticks=bottom,
+        units=("s", "×"),
     )
 
 
@@ -231,77 +226,52 @@ def _pause(one: Table) -> tuple[float, float]:
     return float(one["time_s"][on[gaps[0]]]), float(one["time_s"][on[gaps[0] + 1]])
 
 
+class Story(NamedTuple):
+    """One column of the corner: its head, what it is, mark and class, the law, and whether its last trial is
+    drawn or its first."""
+
+    head: str
+    small: str
+    mark: str
+    css: str
+    law: str
+    after: bool
+
+
 def corner(sources: Sources) -> Picture:
     """Wanted and true flow around the pause, before and after."""
     table, title = sources.tables["lessons"], "Flow around the corner, before and after learning"
     if isinstance(table, Missing):
         return hole("corner", title, table)
-    materials, laws, kind = (
-        _materials(table),
-        _laws(table),
-        "measured_mm3_per_s" if real(sources) else "true_mm3_per_s",
-    )
-    stories = [("On\u2011off control", "before learning: trial 0", "baseline", "bl", laws[-1], False)]
-    stories += [(*LAWS[law][:2], LAWS[law][3], LAWS[law][2], law, True) for law in laws]
-    low: dict[str, float] = {}
+    materials, laws = _materials(table), _laws(table)
+    kind = "measured_mm3_per_s" if real(sources) else "true_mm3_per_s"
+    stories = [Story("On\u2011off control", "before learning: trial 0", "baseline", "bl", laws[-1], False)]
+    stories += [Story(*LAWS[law][:2], LAWS[law][3], LAWS[law][2], law, True) for law in laws]
+    # the worse material's error, in % of a full line's flow
+    errors: dict[tuple[str, bool], float] = {}
 
-    def draw(law: str, css: str, after: bool, column: int) -> list[Markup]:
+    def draw(story: Story, column: int) -> list[Markup]:
         panels = []
         for i, material in enumerate(materials):
-            trials = _trials(table, material, law)["trial"]
+            trials = _trials(table, material, story.law)["trial"]
             if not len(trials):
                 continue
-            mine = _trial(table, material, law, int(trials.max()) if after else 0)
-            begin, end = _pause(mine)
-            near = (mine["time_s"] >= begin - 1.0) & (mine["time_s"] <= end + 1.5)
-            t, flow, wanted = mine["time_s"][near] - begin, mine[kind][near], mine["wanted_mm3_per_s"][near]
-            top, bottom = 1.45 * float(wanted.max()), i == len(materials) - 1
-            frame = charts.Frame(
-                charts.linear(-1.0, end - begin + 1.5, ticks=4),
-                charts.linear(0, top, ticks=3),
-                270,
-                128 if bottom else 116,
-                26,
-                16 if bottom else 6,
+            mine = _trial(table, material, story.law, int(trials.max()) if story.after else 0)
+            error, panel = _corner_panel(
+                mine, mine[kind], story, material, column == i == 0, i == len(materials) - 1
             )
-            error = 100 * float(np.sqrt(np.nanmean((flow - wanted) ** 2))) / float(wanted.max())
-            low[f"{law}{after}"] = max(low.get(f"{law}{after}", 0.0), error)
-            alt = f"{'After learning' if after else 'Before learning'}, {LAWS[law][0] if after else 'on-off control'}, material {material}: the flow misses the wanted one by {percent(error, 2)} of a full line, r.m.s."
-            layers = [
-                charts.line(frame, t, wanted, "ref"),
-                charts.line(frame, t, flow),
-                charts.label(
-                    frame,
-                    frame.x.high,
-                    top,
-                    f"material {material}: {percent(error, 2)} off",
-                    anchor="end",
-                    dy=8,
-                ),
-            ]
-            panels.append(
-                charts.panel(
-                    frame,
-                    layers,
-                    alt=alt,
-                    css=css,
-                    title="mm³/s" if column == i == 0 else "",
-                    x_ticks=bottom,
-                    units=("s", "mm³/s"),
-                )
-            )
+            key = (story.law, story.after)
+            errors[key] = max(errors.get(key, 0.0), error)
+            panels.append(panel)
         return panels
 
-    shown = [
-        Column(head, small, mark, draw(law, css, after, i))
-        for i, (head, small, mark, css, law, after) in enumerate(stories)
-    ]
+    shown = [Column(story.head, story.small, story.mark, draw(story, i)) for i, story in enumerate(stories)]
     after = [
-        f"{LAWS[law][0].lower() if law == 'paper' else LAWS[law][0]} {percent(low[f'{law}True'], 2)}"
+        f"{LAWS[law][0][:1].lower()}{LAWS[law][0][1:]} {percent(errors[law, True], 2)}"
         for law in laws
-        if f"{law}True" in low
+        if (law, True) in errors
     ]
-    before = low.get(f"{laws[-1]}False")
+    before = errors.get((laws[-1], False))
     return Picture(
         "corner",
         title,
@@ -314,17 +284,54 @@ def corner(sources: Sources) -> Picture:
     )
 
 
+def _corner_panel(
+    mine: Table, flow: np.ndarray, story: Story, material: str, titled: bool, bottom: bool
+) -> tuple[float, Markup]:
+    """r.m.s. error in % of a full line's flow around the pause, and the flow drawn beside the wanted one."""
+    begin, end = _pause(mine)
+    near = (mine["time_s"] >= begin - 1.0) & (mine["time_s"] <= end + 1.5)
+    t, flow, wanted = mine["time_s"][near] - begin, flow[near], mine["wanted_mm3_per_s"][near]
+    top = 1.45 * float(wanted.max())
+    frame = charts.Frame(
+        charts.linear(-1.0, end - begin + 1.5, ticks=4),
+        charts.linear(0, top, ticks=3),
+        270,
+        128 if bottom else 116,
+        26,
+        16 if bottom else 6,
+    )
+    error = 100 * float(np.sqrt(np.nanmean((flow - wanted) ** 2))) / float(wanted.max())
+    text = f"material {material}: {percent(error, 2)} off"
+    layers = [
+        charts.line(frame, t, wanted, "ref"),
+        charts.line(frame, t, flow),
+        charts.label(frame, frame.x.high, top, text, anchor="end", dy=8),
+    ]
+    when = "After" if story.after else "Before"
+    panel = charts.panel(
+        frame,
+        layers,
+        alt=f"{when} learning, {LAWS[story.law][0] if story.after else 'on-off control'}, material "
+        f"{material}: the flow misses the wanted one by {percent(error, 2)} of a full line, r.m.s.",
+        css=story.css,
+        title="mm³/s" if titled else "",
+        x_ticks=bottom,
+        units=("s", "mm³/s"),
+    )
+    return error, panel
+
+
 # ---- what the camera saw
 
 
 def frames(sources: Sources) -> dict[str, Any]:
     """Frames with the measured edges drawn in, and those that were rejected with the reason."""
-    found = sources.tables["frames"]
-    if isinstance(found, Missing):
-        return {"missing": found, "shown": [], "origin": Markup("")}
+    pictures = sources.tables["frames"]
+    if isinstance(pictures, Missing):
+        return {"missing": pictures, "shown": [], "origin": Markup("")}
     # the corner tells most, then what was rejected
     order = {"start": 0, "steady line": 1, "corner": 2, "rejected": 3}
-    rows = sorted(found, key=lambda one: (one["material"], one["trial"], order.get(one["place"], 9)))
+    rows = sorted(pictures, key=lambda one: (one["material"], one["trial"], order.get(one["place"], 9)))
     shown = [
         {
             "uri": Markup("{}").format(one["uri"]),
@@ -350,15 +357,15 @@ def frames(sources: Sources) -> dict[str, Any]:
 
 
 def measured(sources: Sources) -> Picture:
-    """The flow that pictures told, with its band, against the true one."""
-    table, film, title = (
+    """The flow measured from pictures, with its band, against the true one."""
+    table, filmed, title = (
         sources.tables["lessons"],
         sources.tables["filmed"],
         "The flow that the pictures told",
     )
-    for found in (table, film):
-        if isinstance(found, Missing):
-            return hole("told", title, found)
+    for missing in (table, filmed):
+        if isinstance(missing, Missing):
+            return hole("told", title, missing)
     if "pixels" not in _laws(table):
         return hole(
             "told", title, Missing("not measured", "no trial was filmed", "Run ./run dvc repro train_ilc")
@@ -370,11 +377,11 @@ def measured(sources: Sources) -> Picture:
         panels = []
         for trial in dict.fromkeys((0, last)):
             mine = _trial(table, material, "pixels", trial)
-            here = (film["material"] == material) & (film["routine"] == 0) & (film["trial"] == trial)
+            here = (filmed["material"] == material) & (filmed["routine"] == 0) & (filmed["trial"] == trial)
             if len(mine["time_s"]) and here.any():
-                panels += _told(
+                panels += _measured_panels(
                     mine,
-                    1.645 * float(film["deviation_mm3_per_s"][here][0]),
+                    1.645 * float(filmed["deviation_mm3_per_s"][here][0]),
                     f"Material {material}, trial {trial}",
                     machine,
                     titled=column == 0 and not panels,
@@ -385,36 +392,46 @@ def measured(sources: Sources) -> Picture:
         Column(f"Material {material}", "first and last filmed trial", "", draw(material, i))
         for i, material in enumerate(materials)
     ]
-    figures = [
-        f"{name} {percent(float(whole), 2)}, around the corner {percent(float(near), 2)}"
-        for name, one in (
-            sources.metrics["train_ilc"] if isinstance(sources.metrics["train_ilc"], dict) else {}
-        ).items()
-        if not isinstance(whole := lookup(one, "pixels.flow_error_percent"), Missing)
-        and not isinstance(near := lookup(one, "pixels.flow_error_corner_percent"), Missing)
-    ]
-    finding = (
-        f"Over all trials the measured flow is off by, r.m.s. of a full line’s: {'; '.join(figures)}. "
-        f"At most 2.5{THIN}% and 6{THIN}% are asked for."
-        if figures
-        else "No true flow to compare with: the machine is a real one."
+    below = (
+        ""
+        if machine
+        else "; below it measured less true, in % of a full line’s flow, with the band in which 90 % of the "
+        "measurement’s own uncertainty lies. The camera rightly sees what does not repeat from trial to "
+        "trial, too; the true flow here is without it"
     )
     return Picture(
         "told",
         title,
-        finding,
+        _flow_error(sources),
         shown,
-        "Measured flow in mm³/s against time in "
-        f"s{'' if machine else '; below it measured less true, in % of a full line’s flow, with the band in which 90 % of the measurement’s own uncertainty lies. The camera rightly sees what does not repeat from trial to trial, too; the true flow here is without it'}. "
+        f"Measured flow in mm³/s against time in s{below}. "
         "Grey: the gantry stands, only the volume of the pause is seen, and nothing is learned there.",
         page.origin(sources.source("lessons", "filmed")),
     )
 
 
-def _told(mine: Table, wide: float, name: str, machine: bool, *, titled: bool) -> list[Markup]:
+def _flow_error(sources: Sources) -> str:
+    """How far the measured flow is off the true one, by material, in a sentence."""
+    figures = [
+        f"{name} {percent(float(in_all), 2)}, around the corner {percent(float(near), 2)}"
+        for name, one in (
+            sources.metrics["train_ilc"] if isinstance(sources.metrics["train_ilc"], dict) else {}
+        ).items()
+        if not isinstance(in_all := lookup(one, "pixels.flow_error_percent"), Missing)
+        and not isinstance(near := lookup(one, "pixels.flow_error_corner_percent"), Missing)
+    ]
+    return (
+        f"Over all trials the measured flow is off by, r.m.s. of a full line’s: {'; '.join(figures)}. "
+        f"At most 2.5{THIN}% and 6{THIN}% are asked for."
+        if figures
+        else "No true flow to compare with: the machine is a real one."
+    )
+
+
+def _measured_panels(mine: Table, wide: float, name: str, machine: bool, *, titled: bool) -> list[Markup]:
     """The measured flow of a trial, and, where it is known, its distance
     from the true one with the band of its uncertainty."""
-    t, seen, true, steady = (
+    t, measured, true, steady = (
         mine["time_s"],
         mine["measured_mm3_per_s"],
         mine["true_mm3_per_s"],
@@ -428,12 +445,16 @@ def _told(mine: Table, wide: float, name: str, machine: bool, *, titled: bool) -
         28,
         6 if not machine else 16,
     )
-    blind = [(float(t[a]), float(t[min(b, len(t) - 1)])) for a, b in charts.stretches(np.isnan(seen))]
-    alt = f"{name}: the flow as measured, between {number(float(np.nanmin(seen)), 1)} and {number(float(np.nanmax(seen)), 1)} mm³/s; standard deviation {short(wide / 1.645, 2)}"
+    blind = [(float(t[a]), float(t[min(b, len(t) - 1)])) for a, b in charts.stretches(np.isnan(measured))]
+    least, most = (number(float(of(measured)), 1) for of in (np.nanmin, np.nanmax))
+    alt = (
+        f"{name}: the flow as measured, between {least} and {most} mm³/s; "
+        f"standard deviation {short(wide / 1.645, 2)}"
+    )
     text = charts.label(frame, float(t[-1]), 1.4 * steady, name, anchor="end", dy=6)
     layers = [
         *(charts.interval(frame, *stretch) for stretch in blind),
-        charts.line(frame, t, seen, most=400),
+        charts.line(frame, t, measured, most=400),
         text,
     ]
     panels = [
@@ -449,7 +470,7 @@ def _told(mine: Table, wide: float, name: str, machine: bool, *, titled: bool) -
     ]
     if machine:
         return panels
-    error, band = 100 * (seen - true) / steady, 100 * wide / steady
+    error, band = 100 * (measured - true) / steady, 100 * wide / steady
     off = float(np.sqrt(np.nanmean(error**2)))
     frame = charts.Frame(
         frame.x, charts.Axis(-12.0, 12.0, ((-10.0, "−10"), (0.0, "0"), (10.0, "10"))), 568, 84, 28
@@ -458,7 +479,10 @@ def _told(mine: Table, wide: float, name: str, machine: bool, *, titled: bool) -
         frame, float(t[-1]), 12, f"measured less true: {percent(off, 2)}, r.m.s.", anchor="end", dy=6
     )
     layers = [charts.tint(frame, -band, band), charts.line(frame, t, error, "line thin", most=400), text]
-    alt = f"{name}: measured less true is {percent(off, 2)} of a full line’s flow, r.m.s., of which its own uncertainty explains ±{percent(band, 2)}"
+    alt = (
+        f"{name}: measured less true is {percent(off, 2)} of a full line’s flow, r.m.s., "
+        f"of which its own uncertainty explains ±{percent(band, 2)}"
+    )
     return [
         *panels,
         charts.panel(frame, layers, alt=alt, css="dd wide", title="%" if titled else "", units=("s", "%")),
@@ -467,23 +491,24 @@ def _told(mine: Table, wide: float, name: str, machine: bool, *, titled: bool) -
 
 def camera(sources: Sources) -> dict[str, Any]:
     """By material: frames read and rejected, uncertainty, and what the calibration left."""
-    film, models = sources.tables["filmed"], sources.tables["models"]
-    if isinstance(film, Missing):
-        return {"missing": film, "rows": []}
+    filmed, models = sources.tables["filmed"], sources.tables["models"]
+    if isinstance(filmed, Missing):
+        return {"missing": filmed, "rows": []}
     rows = []
-    for material in dict.fromkeys(film["material"]):
-        mine = film["material"] == material
+    for material in dict.fromkeys(filmed["material"]):
+        mine = filmed["material"] == material
         reasons: dict[str, int] = {}
-        for text in film["reasons"][mine]:
+        for text in filmed["reasons"][mine]:
             for item in filter(None, str(text).split(", ")):
                 name, _, n = item.rpartition(" ")
                 reasons[name] = reasons.get(name, 0) + int(n) if n.isdigit() else 1
-        known = (
+        calibration = (
             lookup(models, f"{material}.calibration")
             if "." not in str(material)
             else Missing("not measured", "")
         )
-        frames_, rejected = int(film["frames"][mine].sum()), int(film["rejected"][mine].sum())
+        deviation = float(np.median(filmed["deviation_mm3_per_s"][mine]))
+        frames_, rejected = int(filmed["frames"][mine].sum()), int(filmed["rejected"][mine].sum())
         rows.append(
             {
                 "material": str(material),
@@ -491,12 +516,20 @@ def camera(sources: Sources) -> dict[str, Any]:
                 "frames": number(frames_, 0),
                 "rejected": f"{number(rejected, 0)} ({percent(100 * rejected / max(frames_, 1), 2)})",
                 "why": ", ".join(f"{name} {number(n, 0)}" for name, n in sorted(reasons.items())) or "none",
-                "deviation": f"{short(1000 * float(np.median(film['deviation_mm3_per_s'][mine])), 2)}{THIN}·10⁻³ mm³/s",
-                "seen": percent(100 * float(np.mean(film["observable"][mine])), 3),
-                "outliers": number(int(film["outliers"][mine].sum()), 0),
+                "deviation": f"{short(1000 * deviation, 2)}{THIN}·10⁻³ mm³/s",
+                "observable": percent(100 * float(np.mean(filmed["observable"][mine])), 3),
+                "outliers": number(int(filmed["outliers"][mine].sum()), 0),
                 "calibration": "as recorded"
-                if isinstance(known, Missing)
-                else f"{number(1000 * known['gain'], 3)}{THIN}µm/px, residual {number(1000 * known['deviation'], 2)}{THIN}µm ({number(known['deviation'] / known['gain'], 2)}{THIN}px)",
+                if isinstance(calibration, Missing)
+                else _residual(calibration["gain"], calibration["deviation"]),
             }
         )
     return {"missing": None, "rows": rows}
+
+
+def _residual(gain: float, deviation: float) -> str:
+    """Scale of a calibration and what it left, in um and px."""
+    return (
+        f"{number(1000 * gain, 3)}{THIN}µm/px, residual {number(1000 * deviation, 2)}{THIN}µm "
+        f"({number(deviation / gain, 2)}{THIN}px)"
+    )

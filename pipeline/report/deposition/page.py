@@ -19,6 +19,7 @@ from pipeline.report.deposition.rules import (
     PAPER,
     Structure,
     gamma,
+    real,
     structures,
 )
 from pipeline.report.deposition.verdict import verdict
@@ -62,8 +63,8 @@ SECTIONS = ("printer", "camera", "train_ilc", "segment_library", "compose_parts"
 
 def render(sources: Sources) -> str:
     """The text of deposition.html."""
-    judged, found = verdict(sources), structures(sources)
-    measured = [] if isinstance(found, Missing) else found
+    judged, parts = verdict(sources), structures(sources)
+    measured = [] if isinstance(parts, Missing) else parts
     return page.render(
         "deposition.html",
         here="deposition",
@@ -71,10 +72,10 @@ def render(sources: Sources) -> str:
         verdict=judged,
         heads_of_rules=HEADS,
         claim=headline.claim(sources, ("deposition",)),
-        verdict_mark=MARK.get(judged.composer, "data_driven"),
+        verdict_mark=MARK.get(judged.winner, "data_driven"),
         beforehand=_beforehand(sources),
-        real=judged.real,
-        no_scores=found if isinstance(found, Missing) else None,
+        real=real(sources),
+        no_scores=parts if isinstance(parts, Missing) else None,
         answers=[
             _answer(one) | since(move)
             for one, move in itertools.zip_longest(measured, deposition_change.moves(sources, measured))
@@ -108,14 +109,14 @@ def render(sources: Sources) -> str:
 def hashes(sources: Sources) -> list[tuple[str, str]]:
     """Short digests by which two pages can be told to be of one run."""
     tables = {source.name: source.sha256 for source in sources.read.values()}
-    found = [
+    artifacts = [
         (word, tables.get(name, "missing"))
         for word, name in (("trials", "trials"), ("library", "library"), ("scores", "scores"))
     ]
     return [
         (name, value[:8])
         for name, value in [
-            *found,
+            *artifacts,
             ("parameters", digest(sources.declared.everything)),
             ("code", sources.code),
         ]
@@ -123,16 +124,19 @@ def hashes(sources: Sources) -> list[tuple[str, str]]:
 
 
 def _beforehand(sources: Sources) -> str:
-    found = gamma(sources)
-    if found is None:
-        return "The convergence of the paper’s law was not tested beforehand; ours identifies the machine in its first trials and goes back to the best one where the error rises."
+    before = gamma(sources)
+    if before is None:
+        return (
+            "The convergence of the paper’s law was not tested beforehand; the model inversion identifies "
+            "the machine in its first trials and goes back to the best one where the error rises."
+        )
     return (
         "Tested before anything ran: with γ = max |Q² (1 − L P)| below 1 the paper’s law shrinks the error "
-        f"at every trial. γ is {number(found['gamma'], 2)} on the nominal plant and up to "
-        f"{number(found['gamma_worst'], 2)} over its family, above 1 on "
-        f"{percent(found['gamma_above_1_percent'], 2)} of it: there the law may look fine for a dozen "
+        f"at every trial. γ is {number(before['gamma'], 2)} on the nominal plant and up to "
+        f"{number(before['gamma_worst'], 2)} over its family, above 1 on "
+        f"{percent(before['gamma_above_1_percent'], 2)} of it: there the law may look fine for a dozen "
         "trials and then diverge. "
-        "Ours identifies the machine in its first trials, and goes back to the best one "
+        "The model inversion identifies the machine in its first trials, and goes back to the best one "
         "where the error rises."
     )
 
@@ -141,7 +145,7 @@ def _beforehand(sources: Sources) -> str:
 
 
 def _answer(one: Structure) -> dict[str, Any]:
-    """Ours beside the library on one scale, the strip's limit in its middle; the
+    """The basis functions beside the library on one scale, the strip's limit in its middle; the
     worst line's volume of the composer that was chosen."""
     question = Question(0, "", one.part, "%", one.asked.flow_error_percent, False, "")
     shown = [
@@ -191,13 +195,13 @@ def _forecast(value: float | None) -> str:
     return "" if value is None else f"forecast {percent(value, 2)}"
 
 
-def scoreboard(found: list[Structure], asked: ReportRules) -> dict[str, Any]:
+def scoreboard(parts: list[Structure], asked: ReportRules) -> dict[str, Any]:
     """Structures and materials down, composers across: true error,
     what was forecast, and the worst line's volume."""
     names = ("basis", "priority", "superposition", "on_off", "ilc")
     heads = [{"mark": MARK[name], "name": NAMES[name], "method": PAPER[name]} for name in names]
     rows = []
-    for one in found:
+    for one in parts:
         best = one.best()
         cells = []
         for name in names:
@@ -263,8 +267,8 @@ def flat(data: Any, name: str = "") -> list[tuple[str, str]]:
 
 
 def _step(sources: Sources) -> float:
-    found = lookup(sources.tables["learned"], "sample_time_s")
-    return float("nan") if isinstance(found, Missing) else float(found)
+    step_s = lookup(sources.tables["learned"], "sample_time_s")
+    return float("nan") if isinstance(step_s, Missing) else float(step_s)
 
 
 def signals(sources: Sources) -> Picture:
@@ -305,8 +309,8 @@ def _steady(table: Table, material: str, speed: float) -> float:
         & (table["task"] == "Steady-State")
         & (table["speed_mm_per_s"] == speed)
     )
-    found = [float(np.mean(signal)) for signal in table["signal_mm"][rows]]
-    return abs(found[0]) if found and found[0] else 1.0
+    levels = [float(np.mean(signal)) for signal in table["signal_mm"][rows]]
+    return abs(levels[0]) if levels and levels[0] else 1.0
 
 
 def _panel(table: Table, rows: np.ndarray, task: str, material: str, Ts: float, *, titled: bool) -> Markup:
@@ -347,7 +351,10 @@ def _panel(table: Table, rows: np.ndarray, task: str, material: str, Ts: float, 
             dy=8,
         )
     )
-    alt = f"{task} of material {material}: begins {number(lead, 2)} s ahead of its event and peaks at {short(most, 2)} times the steady command"
+    alt = (
+        f"{task} of material {material}: begins {number(lead, 2)} s ahead of its event "
+        f"and peaks at {short(most, 2)} times the steady command"
+    )
     return charts.panel(
         frame, layers, alt=alt, css="mb wide", title="× steady" if titled else "", units=("s", "×")
     )
@@ -392,34 +399,36 @@ def chains(sources: Sources) -> dict[str, Any]:
     """Parameters of each machine: as known beforehand, as identified,
     and, where it is simulated, as it truly is."""
     models, learned = sources.tables["models"], lookup(sources.tables["learned"], "materials")
-    for found in (learned, models):
-        if isinstance(found, Missing):
-            return {"missing": found, "rows": [], "heads": []}
+    for missing in (learned, models):
+        if isinstance(missing, Missing):
+            return {"missing": missing, "rows": [], "heads": []}
     heads, values = [], []
-    for known in learned[:MATERIALS]:
-        name = str(known["material"])
+    for material in learned[:MATERIALS]:
+        name = str(material["material"])
         nominal, true = (models.get(name, {}).get(key) for key in ("nominal", "plant"))
-        for word, found in (
+        for word, extruder in (
             ("beforehand", nominal),
-            ("identified", known["chain"]["extruder"]),
+            ("identified", material["chain"]["extruder"]),
             ("true", true),
         ):
-            if found:
+            if extruder:
                 heads.append({"material": name, "word": word})
-                values.append(found)
+                values.append(extruder)
     rows = [
         {
             "title": title,
-            "cells": ["none" if found.get(key) is None else short(float(found[key]), 3) for found in values],
+            "cells": [
+                "none" if extruder.get(key) is None else short(float(extruder[key]), 3) for extruder in values
+            ],
         }
         for key, title in CHAIN
-        if any(found.get(key) for found in values)
+        if any(extruder.get(key) for extruder in values)
     ]
     fits = [
-        f"{known['material']}: on trials that it was not fitted to the chain misses "
-        f"{percent(known['chain']['held_out_percent'], 2)} of the flow’s movement"
-        for known in learned[:MATERIALS]
-        if known["chain"].get("held_out_percent") is not None
+        f"{material['material']}: on trials that it was not fitted to the chain misses "
+        f"{percent(material['chain']['held_out_percent'], 2)} of the flow’s movement"
+        for material in learned[:MATERIALS]
+        if material["chain"].get("held_out_percent") is not None
     ]
     return {"missing": None, "rows": rows, "heads": heads, "fit": "; ".join(fits)}
 

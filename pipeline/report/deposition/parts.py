@@ -58,12 +58,12 @@ def _map(sources: Sources, table: Table, part: str, i: int, *, last: bool) -> Pi
     wanted = mine["wanted_mm3_per_s"]
     steady = float(wanted.max()) or 1.0
     prints = wanted > PRINTING * steady
-    shown, said = [], []
+    shown, shares = [], []
     for name in SHOWN:
         error = (mine[f"{name}_mm3_per_s"] - wanted) / steady
         right = 100 * float(np.mean(np.abs(error[prints]) <= RIGHT)) if prints.any() else 0.0
         lack = 100 * float(np.mean(error[prints] < -RIGHT)) if prints.any() else 0.0
-        said.append(f"{NAMES[name]} {percent(right, 2)}")
+        shares.append(f"{NAMES[name]} {percent(right, 2)}")
         alt = (
             f"{NAMES[name]}, {part}: {percent(right, 2)} of the printing time within {100 * RIGHT:g} % of a "
             f"full line’s flow, {percent(lack, 2)} with less, "
@@ -75,11 +75,12 @@ def _map(sources: Sources, table: Table, part: str, i: int, *, last: bool) -> Pi
         f"part-{i}",
         part,
         f"Share of the printing time within ±{100 * RIGHT:g}{THIN}% of a full line’s flow: "
-        f"{', '.join(said)}.",
+        f"{', '.join(shares)}.",
         shown,
         ""
         if not last
-        else "The nozzle’s path from above where it should print, in mm. Brown: too little, thin; teal: too much, thick; grey: right. "
+        else "The nozzle’s path from above where it should print, in mm. "
+        "Brown: too little, thin; teal: too much, thick; grey: right. "
         f"Light beyond ±{100 * RIGHT:g}{THIN}%, dark beyond ±{100 * FAR:g}{THIN}% of a full line’s flow; "
         "of a long part the worst of each stretch. "
         f"{'Forecast.' if real(sources) else 'True flow of the simulated machine.'}",
@@ -93,13 +94,13 @@ def _classes(error: np.ndarray) -> np.ndarray:
 
 def _shares(error: np.ndarray) -> Markup:
     """The legend of a map: how much of the time is of each class."""
-    found = np.bincount(_classes(error), minlength=5) / max(len(error), 1)
+    shares = np.bincount(_classes(error), minlength=5) / max(len(error), 1)
     items = [
         Markup(
             '<span><svg class="key" aria-hidden="true" viewBox="0 0 18 8"><path class="{}" d="M1 '
             '4H17"/></svg>{} {}</span>'
         ).format(css, word, percent(100 * float(share), 2))
-        for (word, css), share in zip(CLASSES, found, strict=True)
+        for (word, css), share in zip(CLASSES, shares, strict=True)
         if share > 0
     ]
     return Markup('<div class="keys">{}</div>').format(Markup("").join(items))
@@ -181,12 +182,12 @@ def _round(value: float) -> float:
 
 def _path(px: np.ndarray, py: np.ndarray) -> str:
     """Points less than a pixel from the one before are left out, the ends never."""
-    kept = [0]
+    points = [0]
     for i in range(1, len(px)):
-        if abs(px[i] - px[kept[-1]]) + abs(py[i] - py[kept[-1]]) >= 1.2:
-            kept.append(i)
-    kept += [len(px) - 1] if kept[-1] != len(px) - 1 or len(kept) == 1 else []
-    return "M" + "L".join(f"{px[i]:.1f} {py[i]:.1f}" for i in kept)
+        if abs(px[i] - px[points[-1]]) + abs(py[i] - py[points[-1]]) >= 1.2:
+            points.append(i)
+    points += [len(px) - 1] if points[-1] != len(px) - 1 or len(points) == 1 else []
+    return "M" + "L".join(f"{px[i]:.1f} {py[i]:.1f}" for i in points)
 
 
 # ---- the worst stretch
@@ -207,25 +208,25 @@ def stretches(sources: Sources) -> Picture:
         else zip(*(scores[name] for name in ("part", "material", "composer", "chosen")), strict=True)
     )
     chosen = {(part, material): str(composer) for part, material, composer, taken in rows if taken}
-    found = [
+    worst_of_each = [
         _stretch(table, part, material, chosen.get((part, material), "basis"))
         for part, material in _streams(table)[:STREAMS]
     ]
     names = [
         name
         for name in ("priority", "basis", "ilc", "on_off")
-        if any(np.isfinite(one.flows[name]).any() for one in found)
+        if any(np.isfinite(one.flows[name]).any() for one in worst_of_each)
     ]
     shown = [
         Column(
             NAMES[name],
             PAPER[name],
             MARK[name],
-            [_panel(one, name, first=name == names[0], top=k == 0) for k, one in enumerate(found)],
+            [_panel(one, name, first=name == names[0], top=k == 0) for k, one in enumerate(worst_of_each)],
         )
         for name in names
     ]
-    worst = {name: max(one.off(name) for one in found) for name in names}
+    worst = {name: max(one.off(name) for one in worst_of_each) for name in names}
     return Picture(
         "stretches",
         title,
@@ -287,13 +288,17 @@ def _panel(one: Stretch, name: str, *, first: bool, top: bool) -> Markup:
         112,
         26,
     )
-    text = f"{shortened(one.name, 24)}: {percent(one.off(name), 2)} off{', chosen' if name == one.chosen else ''}"
+    off, chosen = percent(one.off(name), 2), ", chosen" if name == one.chosen else ""
+    text = f"{shortened(one.name, 24)}: {off} off{chosen}"
     layers = [
         charts.line(frame, one.t, one.wanted, "ref"),
         charts.line(frame, one.t, one.flows[name]),
         charts.label(frame, frame.x.high, frame.y.high, text, anchor="end", dy=6),
     ]
-    alt = f"{NAMES[name]}, {one.name}: {percent(one.off(name), 2)} of a full line’s flow off the wanted one between {number(float(one.t[0]), 1)} and {number(float(one.t[-1]), 1)} s"
+    alt = (
+        f"{NAMES[name]}, {one.name}: {off} of a full line’s flow off the wanted one "
+        f"between {number(float(one.t[0]), 1)} and {number(float(one.t[-1]), 1)} s"
+    )
     return charts.panel(
         frame, layers, alt=alt, css=CSS[name], title="mm³/s" if first and top else "", units=("s", "mm³/s")
     )
@@ -306,7 +311,7 @@ def lines(sources: Sources) -> dict[str, Any]:
     """The lines that are furthest from their volume, the worst first."""
     table = sources.tables["lines"]
     if isinstance(table, Missing):
-        return {"missing": table, "rows": [], "said": ""}
+        return {"missing": table, "rows": [], "summary": ""}
     error, allowed = np.nan_to_num(table["error_percent"]), sources.declared.rules.line_volume_percent
     order = np.argsort(-np.abs(error), kind="stable")[:WORST]
     rows = [
@@ -326,13 +331,14 @@ def lines(sources: Sources) -> dict[str, Any]:
         }
         for k in order
     ]
-    beyond, whole, short_runs = (
-        int(np.sum(np.abs(error) > allowed)),
-        len(error),
-        int(np.sum(table["shorter_than_lead"])),
+    beyond, short_runs = int(np.sum(np.abs(error) > allowed)), int(np.sum(table["shorter_than_lead"]))
+    summary = (
+        f"Of {count(len(error), 'line')}, {'none is' if not beyond else count(beyond, 'is', 'are')} "
+        f"predicted more than {allowed:g}{THIN}% off {'its' if beyond <= 1 else 'their'} volume; "
+        f"{count(short_runs, 'belongs', 'belong') if short_runs else 'none belongs'} to runs shorter than "
+        "the lead of Stop."
     )
-    said = f"Of {count(whole, 'line')}, {'none is' if not beyond else count(beyond, 'is', 'are')} predicted more than {allowed:g}{THIN}% off {'its' if beyond <= 1 else 'their'} volume; {count(short_runs, 'belongs', 'belong') if short_runs else 'none belongs'} to runs shorter than the lead of Stop."
-    return {"missing": None, "rows": rows, "said": said}
+    return {"missing": None, "rows": rows, "summary": summary}
 
 
 def _signed(value: float) -> str:
@@ -345,11 +351,11 @@ def _signed(value: float) -> str:
 
 def forecasts(sources: Sources) -> dict[str, Any]:
     """By part and material: composer, saturation and the ramp that would do, and lines that need a look."""
-    found = sources.tables["conformance"]
-    if isinstance(found, Missing):
-        return {"missing": found, "rows": []}
+    conformance = sources.tables["conformance"]
+    if isinstance(conformance, Missing):
+        return {"missing": conformance, "rows": []}
     rows = []
-    for part, report in found.items():
+    for part, report in conformance.items():
         for material, one in report.get("saturation", {}).items():
             ramp = report.get("ramp_that_would_do_s", {}).get(material)
             composer = report.get("composer", {}).get(material, "")
@@ -378,11 +384,11 @@ def forecasts(sources: Sources) -> dict[str, Any]:
 
 def refused(sources: Sources) -> dict[str, Any]:
     """Lines and whole parts that were refused, each with its sentence."""
-    found = sources.tables["conformance"]
-    if isinstance(found, Missing):
-        return {"missing": found, "rows": [], "more": 0}
+    conformance = sources.tables["conformance"]
+    if isinstance(conformance, Missing):
+        return {"missing": conformance, "rows": [], "more": 0}
     rows = []
-    for part, report in found.items():
+    for part, report in conformance.items():
         why = report.get("refused", [])
         rows += (
             [(str(part), "whole", why)]
@@ -391,7 +397,7 @@ def refused(sources: Sources) -> dict[str, Any]:
         )
     unknown = [
         f"{part}: {count(report['unknown_words'], 'word')}"
-        for part, report in found.items()
+        for part, report in conformance.items()
         if report.get("unknown_words")
     ]
     return {

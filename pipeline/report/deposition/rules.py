@@ -7,13 +7,23 @@ from typing import Any, NamedTuple
 
 from pipeline.report.shared.digits import THIN, count, number, percent
 from pipeline.report.shared.sources import Sources, lookup
-from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Missing, ReportRules
+from pipeline.report.shared.verdict import (
+    BELOW_ONE,
+    FAILED,
+    OPEN,
+    PASSED,
+    UNJUDGED,
+    Figure,
+    Missing,
+    Question,
+    ReportRules,
+    Rule,
+    count_of,
+)
 
 # errors closer than this, in points of on-off control's, are one: the simpler composer is taken
 SAME = 0.5
 OURS, LIBRARY = "basis", "priority"
-# a rule that cannot be judged before somebody declares what it asks about
-UNJUDGED = "not applicable"
 # simplest first
 COMPOSERS = ("on_off", "priority", "superposition", "basis")
 NAMES = {
@@ -90,25 +100,12 @@ class Structure(NamedTuple):
         )
 
 
-class Rule(NamedTuple):
-    """One test: where its figures stand; state and figure by column, ours and the paper's; as a sentence of
-    the composer in use, and what to do."""
-
-    name: str
-    limit: str
-    place: str
-    states: tuple[str, str]
-    figures: tuple[str, str]
-    reason: str
-    remedy: str
-
-
 def structures(sources: Sources) -> list[Structure] | Missing:
     """Every material of every part, in the order of the table."""
     table = sources.tables["scores"]
     if isinstance(table, Missing):
         return table
-    found: dict[tuple[str, str], Structure] = {}
+    parts: dict[tuple[str, str], Structure] = {}
     names = (
         "part",
         "material",
@@ -119,18 +116,18 @@ def structures(sources: Sources) -> list[Structure] | Missing:
         "worst_line_volume_percent",
     )
     for part, material, composer, chosen, *figures in zip(*(table[name] for name in names), strict=True):
-        one = found.setdefault(
+        one = parts.setdefault(
             (part, material), Structure(str(part), str(material), {}, "", sources.declared.rules)
         )
         error, predicted, line = (
             None if figure is None or math.isnan(figure) else float(figure) for figure in figures
         )
         if error is not None:
-            found[part, material] = one._replace(
+            parts[part, material] = one._replace(
                 scores={**one.scores, str(composer): Score(error, predicted, line)},
                 chosen=str(composer) if chosen else one.chosen,
             )
-    return list(found.values()) or Missing(
+    return list(parts.values()) or Missing(
         "not measured", "no part was composed", "Copy a part program to datasets/parts"
     )
 
@@ -140,30 +137,33 @@ def real(sources: Sources) -> bool:
     return sources.declared.everything.get("train_ilc", {}).get("source") == "recordings"
 
 
-def worst(found: Sequence[Structure], composer: str) -> tuple[float, Structure] | None:
+def worst(parts: Sequence[Structure], composer: str) -> tuple[float, Structure] | None:
     """The largest error of a composer and where."""
     return max(
-        ((one.scores[composer].error, one) for one in found if composer in one.scores),
+        ((one.scores[composer].error, one) for one in parts if composer in one.scores),
         key=lambda pair: pair[0],
         default=None,
     )
 
 
-def winner(found: Sequence[Structure]) -> str:
+def winner(parts: Sequence[Structure]) -> str:
     """The composer with the least worst error; among those as good, the simplest."""
-    errors = {name: pair[0] for name in COMPOSERS if (pair := worst(found, name))}
+    errors = {name: pair[0] for name in COMPOSERS if (pair := worst(parts, name))}
     return next((name for name, error in errors.items() if error <= min(errors.values()) + SAME), "")
 
 
-# ---- the rules
+# ---- the rules: of each a pair, ours and the paper's
 
 
-def rules(sources: Sources, found: Sequence[Structure]) -> tuple[Rule, ...]:
+Pair = tuple[Rule, Rule]
+
+
+def rules(sources: Sources, parts: Sequence[Structure]) -> tuple[Pair, ...]:
     asked = sources.declared.rules
     return (
-        _flow(found, asked.flow_error_percent),
-        _line(found, asked.line_volume_percent),
-        _above(found, asked.above_whole_points),
+        _flow(parts, asked.flow_error_percent),
+        _line(parts, asked.line_volume_percent),
+        _above(parts, asked.above_whole_points),
         _learning(sources),
         _convergence(sources),
         _limit(sources),
@@ -171,199 +171,219 @@ def rules(sources: Sources, found: Sequence[Structure]) -> tuple[Rule, ...]:
     )
 
 
-def _rule(
-    name: str,
-    limit: str,
-    place: str,
-    pairs: Sequence[tuple[float | None, str]],
-    bound: float,
-    reason: str,
-    remedy: str,
-) -> Rule:
-    """Two figures, or None where not measured, that should be at most `bound`."""
-    states = tuple(OPEN if value is None else PASSED if value <= bound else FAILED for value, _ in pairs)
-    return Rule(name, limit, place, states, tuple(text for _, text in pairs), reason, remedy)
-
-
-def _flow(found: Sequence[Structure], bound: float) -> Rule:
-    pairs = [worst(found, name) for name in (OURS, LIBRARY)]
-    shown = [(None, OPEN) if pair is None else (pair[0], percent(pair[0], 2)) for pair in pairs]
-    reason = (
-        ""
-        if pairs[0] is None
-        else f"{where(pairs[0][1])} keeps {percent(pairs[0][0], 2)} of on\u2011off control’s flow error; {bound:g}{THIN}% are allowed."
+def _pair(shared: Rule, figures: Sequence[Figure | Missing], texts: Sequence[str]) -> Pair:
+    """The rule for ours and for the paper's, each with its own figure."""
+    ours, paper = (
+        shared._replace(figure=figure, text=text) for figure, text in zip(figures, texts, strict=True)
     )
-    remedy = "Run more trials, or train the speeds and pauses of that part (printer.routines)."
-    return _rule("Flow error", f"≤ {bound:g}{THIN}%", "scoreboard", shown, bound, reason, remedy)
+    return ours, paper
+
+
+def _at_most(name: str, most: float, **words: str) -> Rule:
+    """A rule that asks for at most so much; its figures come with `_pair`."""
+    return Rule(name, Question(0, "", name, "", most, False, name), Missing(OPEN, ""), **words)
+
+
+def _measured(pair: tuple[float, Any] | None) -> Figure | Missing:
+    return Missing(OPEN, "") if pair is None else count_of(pair[0])
+
+
+def _flow(parts: Sequence[Structure], limit: float) -> Pair:
+    pairs = [worst(parts, name) for name in (OURS, LIBRARY)]
+    rule = _at_most(
+        "Flow error",
+        limit,
+        limit=f"≤ {limit:g}{THIN}%",
+        place="scoreboard",
+        reason=""
+        if pairs[0] is None
+        else (
+            f"{where(pairs[0][1])} keeps {percent(pairs[0][0], 2)} of on\u2011off control’s flow error; "
+            f"{limit:g}{THIN}% are allowed."
+        ),
+        remedy="Run more trials, or train the speeds and pauses of that part (printer.routines).",
+    )
+    texts = [OPEN if pair is None else percent(pair[0], 2) for pair in pairs]
+    return _pair(rule, [_measured(pair) for pair in pairs], texts)
 
 
 def where(one: Structure) -> str:
     return f"{one.part}, material {one.material},"
 
 
-def _line(found: Sequence[Structure], bound: float) -> Rule:
-    pairs = [
-        max(
-            (
-                (one.scores[name].worst_line, one)
-                for one in found
-                if name in one.scores and one.scores[name].worst_line is not None
-            ),
-            default=None,
-            key=lambda p: p[0],
-        )
-        for name in (OURS, LIBRARY)
-    ]
-    shown = [(None, OPEN) if pair is None else (pair[0], f"±{percent(pair[0], 2)}") for pair in pairs]
-    reason = (
-        ""
-        if pairs[0] is None
-        else f"A line of {where(pairs[0][1])} is {percent(pairs[0][0], 2)} off its volume; ±{bound:g}{THIN}% is allowed."
-    )
-    return _rule(
+def _line(parts: Sequence[Structure], limit: float) -> Pair:
+    pairs = [_worst_line(parts, name) for name in (OURS, LIBRARY)]
+    rule = _at_most(
         "Line volume",
-        f"±{bound:g}{THIN}%",
-        "lines",
-        shown,
-        bound,
-        reason,
-        "Print that line slower, or longer: the table of lines names it.",
+        limit,
+        limit=f"±{limit:g}{THIN}%",
+        place="lines",
+        reason=""
+        if pairs[0] is None
+        else (
+            f"A line of {where(pairs[0][1])} is {percent(pairs[0][0], 2)} off its volume; "
+            f"±{limit:g}{THIN}% is allowed."
+        ),
+        remedy="Print that line slower, or longer: the table of lines names it.",
     )
+    texts = [OPEN if pair is None else f"±{percent(pair[0], 2)}" for pair in pairs]
+    return _pair(rule, [_measured(pair) for pair in pairs], texts)
 
 
-def _above(found: Sequence[Structure], bound: float) -> Rule:
-    shown, place = [], None
-    for name in (OURS, LIBRARY):
-        above = [
-            (one.scores[name].error - one.scores["ilc"].error, one)
-            for one in found
-            if name in one.scores and "ilc" in one.scores
-        ]
-        most = max(above, key=lambda pair: pair[0], default=None)
-        place = place or most
-        shown.append(
-            (None, OPEN)
-            if most is None
-            else (most[0], f"{'+' if most[0] > 0 else '−'}{number(abs(most[0]), 1)} points")
-        )
-    reason = (
-        ""
-        if place is None
-        else f"{where(place[1])} lies {number(place[0], 1)} points above what learning it trial by trial reaches; {bound:g} is allowed."
-    )
-    return _rule(
+def _worst_line(parts: Sequence[Structure], name: str) -> tuple[float, Structure] | None:
+    lines = [
+        (one.scores[name].worst_line, one)
+        for one in parts
+        if name in one.scores and one.scores[name].worst_line is not None
+    ]
+    return max(lines, default=None, key=lambda pair: pair[0])
+
+
+def _above(parts: Sequence[Structure], limit: float) -> Pair:
+    pairs = [_most_above(parts, name) for name in (OURS, LIBRARY)]
+    place = pairs[0] or pairs[1]
+    rule = _at_most(
         "Above learning it whole",
-        f"≤ {bound:g} point",
-        "scoreboard",
-        shown,
-        bound,
-        reason,
-        "Learn that part itself, where it is printed often.",
+        limit,
+        limit=f"≤ {limit:g} point",
+        place="scoreboard",
+        reason=""
+        if place is None
+        else (
+            f"{where(place[1])} lies {number(place[0], 1)} points above what learning it trial by trial "
+            f"reaches; {limit:g} is allowed."
+        ),
+        remedy="Learn that part itself, where it is printed often.",
     )
+    texts = [
+        OPEN if pair is None else f"{'+' if pair[0] > 0 else '−'}{number(abs(pair[0]), 1)} points"
+        for pair in pairs
+    ]
+    return _pair(rule, [_measured(pair) for pair in pairs], texts)
 
 
-def _learning(sources: Sources) -> Rule:
-    shown, bound = [], sources.declared.rules.learned_percent
-    for laws in (("pixels", "ours"), ("paper_on_machine",)):
-        ratios = next((found for law in laws if (found := _each(sources, f"{law}.best_ratio"))), None)
-        shown.append((None, OPEN) if ratios is None else (100 * max(ratios), percent(100 * max(ratios), 2)))
-    reason = f"The error after learning is still {shown[0][1]} of trial 0’s; {bound:g}{THIN}% are asked for."
-    reason = "No trial was learned from." if shown[0][0] is None else reason
-    return _rule(
+def _most_above(parts: Sequence[Structure], name: str) -> tuple[float, Structure] | None:
+    """By how many points a composer lies above what learned the part itself, at most, and where."""
+    above = [
+        (one.scores[name].error - one.scores["ilc"].error, one)
+        for one in parts
+        if name in one.scores and "ilc" in one.scores
+    ]
+    return max(above, key=lambda pair: pair[0], default=None)
+
+
+def _learning(sources: Sources) -> Pair:
+    limit, shares = sources.declared.rules.learned_percent, []
+    for laws in (("pixels", "model_inverse"), ("hoelzle_2009",)):
+        ratios = next((ratios for law in laws if (ratios := _each(sources, f"{law}.best_ratio"))), None)
+        shares.append(None if ratios is None else 100 * max(ratios))
+    texts = [OPEN if share is None else percent(share, 2) for share in shares]
+    rule = _at_most(
         "Learned to",
-        f"≤ {bound:g}{THIN}%",
-        "learning",
-        shown,
-        bound,
-        reason,
-        "Run more trials (train_ilc.trials).",
+        limit,
+        limit=f"≤ {limit:g}{THIN}%",
+        place="learning",
+        reason="No trial was learned from."
+        if shares[0] is None
+        else (f"The error after learning is still {texts[0]} of trial 0’s; {limit:g}{THIN}% are asked for."),
+        remedy="Run more trials (train_ilc.trials).",
     )
+    return _pair(rule, [Missing(OPEN, "") if share is None else count_of(share) for share in shares], texts)
 
 
 def _each(sources: Sources, key: str) -> list[float]:
     """A figure of every material that has it."""
     metrics = sources.metrics["train_ilc"]
-    found = [] if isinstance(metrics, Missing) else [lookup(one, key) for one in metrics.values()]
-    return [float(value) for value in found if not isinstance(value, Missing)]
+    figures = [] if isinstance(metrics, Missing) else [lookup(one, key) for one in metrics.values()]
+    return [float(value) for value in figures if not isinstance(value, Missing)]
 
 
 def gamma(sources: Sources) -> dict[str, float] | None:
     """Of the paper's law, before anything ran: nominal, worst of the family, and the share of it above 1 in
     %, each the worst of all materials."""
-    found = {key: _each(sources, key) for key in ("gamma", "gamma_worst", "gamma_above_1_percent")}
-    return {key: max(values) for key, values in found.items()} if all(found.values()) else None
+    figures = {key: _each(sources, key) for key in ("gamma", "gamma_worst", "gamma_above_1_percent")}
+    return {key: max(values) for key, values in figures.items()} if all(figures.values()) else None
 
 
-def _convergence(sources: Sources) -> Rule:
-    found, values = gamma(sources), _each(sources, "gamma_ours_worst")
-    paper = (OPEN, OPEN) if found is None else _below_one(found["gamma_worst"])
+def _convergence(sources: Sources) -> Pair:
+    before, values = gamma(sources), _each(sources, "gamma_model_inverse_worst")
+    rule = _at_most("Convergence test", BELOW_ONE, limit="γ < 1", place="beforehand")
+    ours, paper = _pair(
+        rule,
+        [
+            count_of(max(values)) if values else Missing(UNJUDGED, ""),
+            Missing(OPEN, "") if before is None else count_of(before["gamma_worst"]),
+        ],
+        [
+            f"γ up to {number(max(values), 2)}" if values else "rolls back",
+            OPEN if before is None else f"γ up to {number(before['gamma_worst'], 2)}",
+        ],
+    )
     # ours is tested once its first trials have identified the machine,
     # over the machines that these cannot tell apart
-    ours = _below_one(max(values)) if values else ("not applicable", "rolls back")
-    return Rule("Convergence test", "γ < 1", "beforehand", (ours[0], paper[0]), (ours[1], paper[1]), "", "")
+    return ours if values else ours._replace(question=None), paper
 
 
-def _below_one(gamma: float) -> tuple[str, str]:
-    return (PASSED if gamma < 1 else FAILED, f"γ up to {number(gamma, 2)}")
-
-
-def _limit(sources: Sources) -> Rule:
-    found = sources.tables["conformance"]
-    if isinstance(found, Missing):
-        return Rule("Command limit", "0", "saturation", (OPEN, OPEN), (OPEN, OPEN), found.sentence(), "")
+def _limit(sources: Sources) -> Pair:
+    conformance = sources.tables["conformance"]
+    if isinstance(conformance, Missing):
+        rule = _at_most("Command limit", 0, limit="0", place="saturation", reason=conformance.sentence())
+        return _pair(rule, [conformance._replace(state=OPEN)] * 2, [OPEN] * 2)
     shares = [
         (float(one["share_percent"]), part, name, one)
-        for part, report in found.items()
+        for part, report in conformance.items()
         for name, one in report.get("saturation", {}).items()
     ]
     if not shares:
-        return Rule(
-            "Command limit", "0", "saturation", (OPEN, OPEN), (OPEN, OPEN), "No part was composed.", ""
-        )
+        rule = _at_most("Command limit", 0, limit="0", place="saturation", reason="No part was composed.")
+        return _pair(rule, [Missing(OPEN, "")] * 2, [OPEN] * 2)
     share, part, name, one = max(shares, key=lambda s: (not s[3]["enough"], s[0]))
+    too_little = sum(not s[3]["enough"] for s in shares)
     limited = any(s[3].get("limit") is not None for s in shares)
     text = percent(share, 2) if not one["enough"] else f"0{THIN}%" if limited else "no limit set"
     ramp = (
-        lookup(found, f"{part}.ramp_that_would_do_s.{name}")
+        lookup(conformance, f"{part}.ramp_that_would_do_s.{name}")
         if "." not in part
         else Missing("not measured", "")
     )
-    remedy = (
-        "Print slower, or raise printer.limit_mm: no ramp would do."
+    rule = _at_most(
+        "Time at the command’s limit",
+        0,
+        limit=f"0{THIN}%",
+        place="saturation",
+        reason=(
+            f"The command for {part}, material {name}, is at its limit {percent(share, 2)} of the "
+            "printing time, and no signal can make up for it."
+        ),
+        remedy="Print slower, or raise printer.limit_mm: no ramp would do."
         if isinstance(ramp, Missing)
-        else f"Ramps of {ramp:.2f}{THIN}s would do (printer.ramp_s)."
+        else f"Ramps of {ramp:.2f}{THIN}s would do (printer.ramp_s).",
     )
-    reason = f"The command for {part}, material {name}, is at its limit {percent(share, 2)} of the printing time, and no signal can make up for it."
-    state = FAILED if not one["enough"] else PASSED if limited else UNJUDGED
-    return Rule(
-        "Time at the command’s limit", f"0{THIN}%", "saturation", (state, state), (text, text), reason, remedy
-    )
+    if too_little or limited:
+        return _pair(rule, [count_of(too_little)] * 2, [text] * 2)
+    # before the drive's limit is declared, nothing can be asked
+    return _pair(rule._replace(question=None), [Missing(UNJUDGED, "")] * 2, [text] * 2)
 
 
-def _printed(sources: Sources) -> Rule:
-    found = sources.tables["conformance"]
-    if isinstance(found, Missing):
-        return Rule("Every line printed", "all", "refused", (OPEN, OPEN), (OPEN, OPEN), found.sentence(), "")
-    refused = [(part, one) for part, report in found.items() for one in _listed(report.get("refused", []))]
-    short = sum(report.get("shorter_than_lead", 0) for report in found.values())
-    states = (FAILED if refused else PASSED, FAILED if refused or short else PASSED)
-    texts = tuple("all" if not n else f"{n:,} not" for n in (len(refused), len(refused) + short))
-    reason = f"{count(len(refused), 'line was', 'lines were')} refused".capitalize() + (
-        f", the first in {refused[0][0]}: {refused[0][1]}" if refused else ""
+def _printed(sources: Sources) -> Pair:
+    conformance = sources.tables["conformance"]
+    rule = _at_most("Every line printed", 0, limit="all", place="refused")
+    if isinstance(conformance, Missing):
+        rule = rule._replace(reason=conformance.sentence())
+        return _pair(rule, [conformance._replace(state=OPEN)] * 2, [OPEN] * 2)
+    refused = [
+        (part, one) for part, report in conformance.items() for one in _listed(report.get("refused", []))
+    ]
+    # the priority rule does not print a line that is shorter than the lead
+    short = sum(report.get("shorter_than_lead", 0) for report in conformance.values())
+    counts = (len(refused), len(refused) + short)
+    rule = rule._replace(
+        reason=f"{count(len(refused), 'line was', 'lines were')} refused".capitalize()
+        + (f", the first in {refused[0][0]}: {refused[0][1]}" if refused else ""),
+        remedy="Mend these lines of the program, or print without them.",
     )
-    return Rule(
-        "Every line printed",
-        "all",
-        "refused",
-        states,
-        texts,
-        reason,
-        "Mend these lines of the program, or print without them.",
-    )
+    return _pair(rule, [count_of(n) for n in counts], ["all" if not n else f"{n:,} not" for n in counts])
 
 
 def _listed(refused: Any) -> list[str]:
     return [refused] if isinstance(refused, str) else [f"line {one['line']}, {one['why']}" for one in refused]
-
-
-# ---- the verdict

@@ -2,15 +2,12 @@
 whether the parts will print, in words."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 from pipeline.report.deposition.rules import (
     COMPOSERS,
     OURS,
     SAME,
-    UNJUDGED,
     USE,
-    Rule,
     Structure,
     gamma,
     real,
@@ -22,88 +19,82 @@ from pipeline.report.deposition.rules import (
 )
 from pipeline.report.shared.digits import THIN, count, number, percent
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Missing
+from pipeline.report.shared.verdict import (
+    FAILED,
+    OPEN,
+    PASSED,
+    UNJUDGED,
+    Missing,
+    Rule,
+    Verdict,
+    deciding,
+    overall,
+)
 
-
-class Verdict(NamedTuple):
-    """`state`: passed, failed, open; the composer to use ("" where none is known); decision, lead, reason,
-    price and caution as the page says them."""
-
-    state: str
-    composer: str
-    decision: str
-    lead: str
-    reason: str
-    remedy: str
-    price: str
-    rules: tuple[Rule, ...]
-    first: str
-    real: bool
+# what the library by its priority rule is not held against: the paper's law is not what it was learned by
+OF_THE_LAW = ("Convergence test", "Learned to")
 
 
 def verdict(sources: Sources) -> Verdict:
-    """Whose signal to use: the composer with the least worst error; then the rules, for it."""
-    found, machine = structures(sources), real(sources)
-    if isinstance(found, Missing):
-        tested = rules(sources, [])
+    """Whose signal to use: the composer with the least worst error; then the rules, for it. `winner` is the
+    composer, "" where nothing was composed; `note` is the price of the signals."""
+    parts = structures(sources)
+    if isinstance(parts, Missing):
         return Verdict(
-            OPEN,
-            "",
-            "Do not print by this loop yet.",
-            "Nothing was composed.",
-            found.sentence(),
-            "",
-            _price(sources, []),
-            tested,
-            "",
-            machine,
+            loop="deposition",
+            state=OPEN,
+            decision="Do not print by this loop yet.",
+            lead="Nothing was composed.",
+            reason=parts.sentence(),
+            remedy="",
+            rule="",
+            winner="",
+            note=_price(sources, []),
+            rules=rules(sources, []),
         )
-    use, tested = winner(found), rules(sources, found)
-    # ours' column for the basis functions, the paper's for the library; the
-    # paper's law is not what the library was learned by
+    use, machine, lines = winner(parts), real(sources), rules(sources, parts)
+    # ours' column for the basis functions, the paper's for the library
     column = 0 if use == OURS else 1
-    needed = [rule for rule in tested if use == OURS or rule.name not in ("Convergence test", "Learned to")]
-    unjudged = [rule for rule in needed if rule.states[column] == UNJUDGED]
-    needed = [rule for rule in needed if rule not in unjudged]
-    states = [rule.states[column] for rule in needed]
-    state = (
-        FAILED if FAILED in states or use == "on_off" else OPEN if OPEN in states and not machine else PASSED
-    )
-    first = (
-        next((rule for wanted in (FAILED, OPEN) for rule in needed if rule.states[column] == wanted), None)
-        if state != PASSED
-        else None
-    )
-    if state == PASSED:
-        decision = f"{'By forecast, t' if machine else 'T'}his machine prints these parts: use {USE[use]}."
-        peak = (
-            f", where the drive can give {number(peak, 0)} times the steady command"
-            if unjudged and use == OURS and (peak := _peak(sources))
-            else ""
-        )
-        lead = f"All {count(len(needed), 'rule')} {'that can be judged ' if unjudged else ''}passed{peak}."
-    else:
-        decision = f"{'Do not print these parts yet' if state == FAILED else 'Do not decide yet'}: {USE[use]} {'comes' if use == 'on_off' or use != OURS else 'come'} closest."
-        lead = (
-            f"First {'failed' if state == FAILED else 'open'} rule: {first.name[:1].lower()}{first.name[1:]}."
-            if first
-            else "Nothing beats on\u2011off control."
-        )
-    reason = " ".join(
-        part for part in (first.reason if first and column == 0 else "", told(found, use, machine)) if part
-    )
+    asked = [line[column] for line in lines if use == OURS or line[column].name not in OF_THE_LAW]
+    unjudged = [rule for rule in asked if rule.state == UNJUDGED]
+    judged = [rule for rule in asked if rule.state != UNJUDGED]
+    # what cannot be measured on a machine's own trials does not hold them up
+    state = overall([rule.state for rule in judged if not (machine and rule.state == OPEN)])
+    state = FAILED if use == "on_off" else state
+    first = None if state == PASSED else deciding(judged)
+    lacking = [first.remedy if first else "", _unlimited(sources) if unjudged else ""]
+    summary = _summary(parts, use, machine)
     return Verdict(
-        state,
-        use,
-        decision,
-        lead,
-        reason,
-        " ".join(filter(None, [first.remedy if first else "", _unlimited(sources) if unjudged else ""])),
-        _price(sources, found),
-        tested,
-        first.name if first else "",
-        machine,
+        loop="deposition",
+        state=state,
+        decision=_decision(state, use, machine),
+        lead=_lead(sources, state, first, len(judged), condition=bool(unjudged), use=use),
+        reason=f"{first.reason} {summary}" if first and first.reason and column == 0 else summary,
+        remedy=" ".join(filter(None, lacking)),
+        rule=first.name if first else "",
+        winner=use,
+        note=_price(sources, parts),
+        rules=lines,
     )
+
+
+def _decision(state: str, use: str, machine: bool) -> str:
+    if state == PASSED:
+        return f"{'By forecast, t' if machine else 'T'}his machine prints these parts: use {USE[use]}."
+    start = "Do not print these parts yet" if state == FAILED else "Do not decide yet"
+    return f"{start}: {USE[use]} {'come' if use == OURS else 'comes'} closest."
+
+
+def _lead(sources: Sources, state: str, first: Rule | None, judged: int, *, condition: bool, use: str) -> str:
+    """How many rules passed, and on what condition; or the first that did not."""
+    if state != PASSED:
+        if first is None:
+            return "Nothing beats on\u2011off control."
+        word = "failed" if state == FAILED else "open"
+        return f"First {word} rule: {first.name[:1].lower()}{first.name[1:]}."
+    peak = _peak(sources) if condition and use == OURS else 0.0
+    drive = f", where the drive can give {number(peak, 0)} times the steady command" if peak else ""
+    return f"All {count(judged, 'rule')} {'that can be judged ' if condition else ''}passed{drive}."
 
 
 def _unlimited(sources: Sources) -> str:
@@ -120,25 +111,25 @@ def _peak(sources: Sources) -> float:
     learned = (
         []
         if isinstance(metrics, Missing)
-        else [one[law] for one in metrics.values() for law in ("ours", "pixels") if law in one]
+        else [one[law] for one in metrics.values() for law in ("model_inverse", "pixels") if law in one]
     )
     return max((law["peak_over_steady"] for law in learned), default=0.0)
 
 
-def told(found: Sequence[Structure], use: str, machine: bool) -> str:
+def _summary(parts: Sequence[Structure], use: str, machine: bool) -> str:
     """The composer in use with its figure and its yardsticks: on-off control, the
     others, and what learning each structure reaches."""
-    error, place = worst(found, use)
+    error, place = worst(parts, use)
     others = [
         f"{_bare(name)} {percent(pair[0], 2)}"
         for name in COMPOSERS
-        if name not in (use, "on_off") and (pair := worst(found, name))
+        if name not in (use, "on_off") and (pair := worst(parts, name))
     ]
-    whole = worst(found, "ilc")
-    others += [f"learning each part from scratch {percent(whole[0], 2)}"] if whole else []
+    full = worst(parts, "ilc")
+    others += [f"learning each part from scratch {percent(full[0], 2)}"] if full else []
     lines = [
         one.scores[use].worst_line
-        for one in found
+        for one in parts
         if use in one.scores and one.scores[use].worst_line is not None
     ]
     volume = (
@@ -147,7 +138,7 @@ def told(found: Sequence[Structure], use: str, machine: bool) -> str:
         if lines
         else ""
     )
-    known = (
+    forecast = (
         " These figures are forecasts of the identified machine: the true flow of a real one is not known."
         if machine
         else ""
@@ -155,7 +146,7 @@ def told(found: Sequence[Structure], use: str, machine: bool) -> str:
     return (
         f"{_bare(use)[:1].upper()}{_bare(use)[1:]} {'leave' if use == OURS else 'leaves'} at most "
         f"{percent(error, 2)} of on\u2011off control’s flow error "
-        f"({place.part}, {place.material}); {', '.join(others)}.{volume}{known}"
+        f"({place.part}, {place.material}); {', '.join(others)}.{volume}{forecast}"
     )
 
 
@@ -163,25 +154,25 @@ def _bare(name: str) -> str:
     return USE[name].removeprefix("the ")
 
 
-def _price(sources: Sources, found: Sequence[Structure]) -> str:
+def _price(sources: Sources, parts: Sequence[Structure]) -> str:
     """What the signals cost: trials, peak command, what the paper's law would have done,
     and the lines that the priority rule would lose."""
-    metrics, parts = sources.metrics["train_ilc"], []
+    metrics, sentences = sources.metrics["train_ilc"], []
     if not isinstance(metrics, Missing):
-        laws = [one[law] for one in metrics.values() for law in ("ours", "pixels") if law in one]
+        laws = [one[law] for one in metrics.values() for law in ("model_inverse", "pixels") if law in one]
         routines = max((len(one.get("other_routines", [])) for one in metrics.values()), default=0)
         if laws:
             trials, peak = max(law["trials"] for law in laws), _peak(sources)
             of = (
                 f"{count(routines, 'routine')} of {trials + 1} trials" if routines else f"{trials + 1} trials"
             )
-            parts.append(
+            sentences.append(
                 f"Price: {of} for each material, and commands up to {number(peak, 0)} times the steady one."
             )
     before = gamma(sources)
     if before:
         safe = before["gamma_worst"] < 1
-        parts.append(
+        sentences.append(
             f"Before anything ran, γ of the paper’s law was {number(before['gamma'], 2)} on the nominal "
             f"plant and {number(before['gamma_worst'], 2)} on the worst of its family, "
             f"above 1 on {percent(before['gamma_above_1_percent'], 2)}: "
@@ -193,7 +184,7 @@ def _price(sources: Sources, found: Sequence[Structure]) -> str:
         if isinstance(conformance, Missing)
         else {part: report.get("shorter_than_lead", 0) for part, report in conformance.items()}
     )
-    parts += [
+    sentences += [
         f"{count(n, 'line', 'lines').capitalize()} of {part} {'is' if n == 1 else 'are'} shorter than the "
         f"lead: the priority rule would not print {'it' if n == 1 else 'them'}."
         for part, n in short.items()
@@ -201,14 +192,14 @@ def _price(sources: Sources, found: Sequence[Structure]) -> str:
     ][:2]
     missed = [
         one
-        for one in found
+        for one in parts
         if one.chosen
         and one.chosen != one.best()
         and one.scores[one.chosen].error > one.scores[one.best()].error + SAME
     ]
-    parts += (
+    sentences += (
         [f"The forecast chose wrongly for {where(missed[0])[:-1]}: {_bare(missed[0].best())} is better."]
         if missed
         else []
     )
-    return " ".join(parts)
+    return " ".join(sentences)

@@ -9,7 +9,23 @@ import numpy as np
 
 from pipeline.report.shared.digits import THIN, band, count, decimals, number, quantity, short
 from pipeline.report.shared.sources import Sources, lookup
-from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, UNDECIDED, Figure, Missing, Question, state
+from pipeline.report.shared.verdict import (
+    BELOW_ONE,
+    FAILED,
+    OPEN,
+    PASSED,
+    UNDECIDED,
+    Figure,
+    Missing,
+    Question,
+    Rule,
+    Verdict,
+    count_of,
+    deciding,
+    overall,
+    state,
+    worst_state,
+)
 
 # below this fit a model misses more than half of an output's movement: the size
 # of its error is more than half of the movement's
@@ -17,31 +33,6 @@ LEAST_FIT = 50.0
 
 
 WHITENESS = "Whiteness"
-
-
-class Rule(NamedTuple):
-    """One test of the model: where its picture is, how it ended, the weakest
-    figure, that figure as a sentence, and what to do."""
-
-    name: str
-    place: str
-    state: str
-    figure: str
-    reason: str
-    remedy: str
-
-
-class Trust(NamedTuple):
-    """`state`: passed, failed, open; `uses`: state of each use by the words for it; decision, lead, reason
-    and remedy as the verdict says them."""
-
-    state: str
-    decision: str
-    lead: str
-    reason: str
-    remedy: str
-    rules: tuple[Rule, ...]
-    uses: Mapping[str, str]
 
 
 class Fit(NamedTuple):
@@ -54,12 +45,12 @@ class Fit(NamedTuple):
     held: Figure | Missing
 
 
-def trust(sources: Sources) -> Trust:
+def trust(sources: Sources) -> Verdict:
     """Which uses the model is good for. A use is passed where each rule that it needs is passed."""
-    found, ahead = fits(sources), ahead_words(sources)
+    outputs, ahead = fits(sources), ahead_words(sources)
     rules = (
-        _simulation(found),
-        _ahead(found, ahead),
+        _simulation(outputs),
+        _ahead(outputs, ahead),
         _inputs_left(sources),
         _whiteness(sources),
         _excitation(sources),
@@ -68,49 +59,42 @@ def trust(sources: Sources) -> Trust:
     )
     simulation, prediction, inputs_left, _, excitation, effects, stability = (rule.state for rule in rules)
     uses = {
-        "to design controllers": _worst([prediction, inputs_left, excitation, effects, stability]),
+        "to design controllers": worst_state([prediction, inputs_left, excitation, effects, stability]),
         f"to predict {ahead}": prediction,
-        "to simulate": _worst([simulation, stability]),
+        "to simulate": worst_state([simulation, stability]),
     }
     # a rule that some use needs comes before one that is only a reservation
-    needed = [rule for rule in rules if rule.name != WHITENESS]
-    first = next(
-        (
-            rule
-            for among in (needed, rules)
-            for wanted in (FAILED, UNDECIDED, OPEN)
-            for rule in among
-            if rule.state == wanted
-        ),
-        None,
-    )
-    states = list(uses.values())
-    whole = PASSED if states == [PASSED] * 3 else FAILED if FAILED in states else OPEN
+    first = deciding(rule for rule in rules if rule.name != WHITENESS) or deciding(rules)
+    ended = overall(list(uses.values()))
     if first is None:
-        weakest = min((fit for fit in found), key=lambda fit: fit.simulated.value)
+        weakest = min(outputs, key=lambda fit: fit.simulated.value)
         lead = f"All {count(len(rules), 'rule')} passed;"
-        reason = f"weakest in simulation: {weakest.name}, {percent_of(weakest.simulated)} of at least {LEAST_FIT:g}{THIN}%."
-        return Trust(
-            whole,
-            _decision(uses),
-            lead,
-            reason,
-            "Valid for the range of inputs and temperatures that the record covers.",
-            rules,
-            uses,
+        reason = (
+            f"weakest in simulation: {weakest.name}, {percent_of(weakest.simulated)} "
+            f"of at least {LEAST_FIT:g}{THIN}%."
         )
-    word = {FAILED: "failed", UNDECIDED: "undecided", OPEN: "open"}[first.state]
-    lead = f"{'First' if whole != PASSED else 'One reservation, the first'} {word} rule: {first.name[:1].lower()}{first.name[1:]}."
-    return Trust(whole, _decision(uses), lead, first.reason, first.remedy, rules, uses)
-
-
-def _worst(states: Sequence[str]) -> str:
-    return next((wanted for wanted in (FAILED, OPEN, UNDECIDED) if wanted in states), PASSED)
+        remedy = "Valid for the range of inputs and temperatures that the record covers."
+    else:
+        word = {FAILED: "failed", UNDECIDED: "undecided", OPEN: "open"}[first.state]
+        place = "First" if ended != PASSED else "One reservation, the first"
+        lead = f"{place} {word} rule: {first.name[:1].lower()}{first.name[1:]}."
+        reason, remedy = first.reason, first.remedy
+    return Verdict(
+        loop="identification",
+        state=ended,
+        decision=_decision(uses),
+        lead=lead,
+        reason=reason,
+        remedy=remedy,
+        rule=first.name if first else "",
+        winner=None,
+        rules=tuple((rule,) for rule in rules),
+    )
 
 
 def _decision(uses: Mapping[str, str]) -> str:
     good, bad = (
-        [use for use, found in uses.items() if (found == PASSED) == wanted] for wanted in (True, False)
+        [use for use, ended in uses.items() if (ended == PASSED) == wanted] for wanted in (True, False)
     )
     if not good:
         return "Do not trust this model." if FAILED in uses.values() else "Do not trust this model yet."
@@ -118,7 +102,10 @@ def _decision(uses: Mapping[str, str]) -> str:
         (word, [use for use in bad if (uses[use] == FAILED) == failed])
         for word, failed in (("not", True), ("not yet", False))
     ]
-    return f"Trust this model {_listed(good)}{''.join(f', {word} {_listed(group)}' for word, group in groups if group)}."
+    return (
+        "Trust this model "
+        f"{_listed(good)}{''.join(f', {word} {_listed(group)}' for word, group in groups if group)}."
+    )
 
 
 def _listed(items: Sequence[str]) -> str:
@@ -178,39 +165,46 @@ def _with_band(figure: Figure) -> str:
 
 
 def _missing_rule(name: str, place: str, gap: Missing) -> Rule:
-    return Rule(
-        name,
-        place,
-        FAILED if gap.state == FAILED else OPEN,
-        "",
-        gap.reason.rstrip(".") + ".",
-        gap.remedy and gap.remedy.rstrip(".") + ".",
-    )
+    gap = gap if gap.state == FAILED else gap._replace(state=OPEN)
+    remedy = gap.remedy and gap.remedy.rstrip(".") + "."
+    return Rule(name, None, gap, place=place, reason=gap.reason.rstrip(".") + ".", remedy=remedy)
+
+
+def _none(name: str, place: str, number: int, text: str, reason: str, remedy: str = "") -> Rule:
+    """A rule that allows none of what was counted."""
+    question = Question(0, "", name, "", 0.0, False, "")
+    return Rule(name, question, count_of(number), text=text, place=place, reason=reason, remedy=remedy)
 
 
 # ---- the rules
 
 
-def _simulation(found: Sequence[Fit]) -> Rule:
+def _simulation(outputs: Sequence[Fit]) -> Rule:
     name, place = "Simulation", "holdout"
-    gap = next((fit.simulated for fit in found if isinstance(fit.simulated, Missing)), None)
+    gap = next((fit.simulated for fit in outputs if isinstance(fit.simulated, Missing)), None)
     if gap:
         return _missing_rule(name, place, gap)
-    asked = Question(0, "", "", "%", LEAST_FIT, True, "")
-    ended = _worst([state(asked, fit.simulated) for fit in found])
+    asked = Question(0, "", name, "%", LEAST_FIT, True, "")
+    ended = worst_state([state(asked, fit.simulated) for fit in outputs])
     weakest = min(
-        (fit for fit in found if state(asked, fit.simulated) == ended), key=lambda fit: fit.simulated.value
+        (fit for fit in outputs if state(asked, fit.simulated) == ended), key=lambda fit: fit.simulated.value
     )
     figure = weakest.simulated
-    reason = f"{weakest.name} is simulated with a fit of {_with_band(figure)}; the rule asks for {LEAST_FIT:g}{THIN}%, its mean alone gives 0."
-    remedy = "Look for an input or a disturbance that is not recorded; where outputs are measured, predict from them instead."
+    remedy = (
+        "Look for an input or a disturbance that is not recorded; where outputs are measured, predict from "
+        "them instead."
+    )
     return Rule(
         name,
-        place,
-        ended,
-        f"{weakest.name} {percent_of(figure)}",
-        reason,
-        _longer(figure, LEAST_FIT) if ended == UNDECIDED else remedy,
+        asked,
+        figure,
+        text=f"{weakest.name} {percent_of(figure)}",
+        place=place,
+        reason=(
+            f"{weakest.name} is simulated with a fit of {_with_band(figure)}; the rule asks for "
+            f"{LEAST_FIT:g}{THIN}%, its mean alone gives 0."
+        ),
+        remedy=_longer(figure, LEAST_FIT) if ended == UNDECIDED else remedy,
     )
 
 
@@ -226,32 +220,32 @@ def _longer(figure: Figure, limit: float) -> str:
     )
 
 
-def _ahead(found: Sequence[Fit], words: str) -> Rule:
+def _ahead(outputs: Sequence[Fit], words: str) -> Rule:
     name, place = words[:1].upper() + words[1:], "holdout"
-    gap = next((part for fit in found for part in (fit.ahead, fit.held) if isinstance(part, Missing)), None)
+    gap = next((part for fit in outputs for part in (fit.ahead, fit.held) if isinstance(part, Missing)), None)
     if gap:
         return _missing_rule(name, place, gap)
-    asked = [Question(0, "", "", "%", max(fit.held.value, LEAST_FIT), True, "") for fit in found]
-    states = [state(question, fit.ahead) for question, fit in zip(asked, found, strict=True)]
-    ended = _worst(states)
-    weakest, bar = min(
-        (
-            (fit, question.limit)
-            for fit, question, mine in zip(found, asked, states, strict=True)
-            if mine == ended
-        ),
-        key=lambda pair: pair[0].ahead.value - pair[1],
+    # the bar of each output: what holding its last value gives, and the least fit
+    asked = [Question(0, "", name, "%", max(fit.held.value, LEAST_FIT), True, "") for fit in outputs]
+    states = [state(question, fit.ahead) for question, fit in zip(asked, outputs, strict=True)]
+    ended = worst_state(states)
+    weakest, question = min(
+        (pair for pair, own in zip(zip(outputs, asked, strict=True), states, strict=True) if own == ended),
+        key=lambda pair: pair[0].ahead.value - pair[1].limit,
     )
-    figure, last = weakest.ahead, weakest.held
-    reason = f"{weakest.name} is predicted {words} with a fit of {_with_band(figure)}; holding its last value gives {percent_of(last)}, the rule asks for more, and for {LEAST_FIT:g}{THIN}%."
+    figure = weakest.ahead
     remedy = "Record longer, or ask for fewer steps ahead (identify_plant.ahead_steps)."
     return Rule(
         name,
-        place,
-        ended,
-        f"{weakest.name} {percent_of(figure)}",
-        reason,
-        _longer(figure, bar) if ended == UNDECIDED else remedy,
+        question,
+        figure,
+        text=f"{weakest.name} {percent_of(figure)}",
+        place=place,
+        reason=(
+            f"{weakest.name} is predicted {words} with a fit of {_with_band(figure)}; holding its last value "
+            f"gives {percent_of(weakest.held)}, the rule asks for more, and for {LEAST_FIT:g}{THIN}%."
+        ),
+        remedy=_longer(figure, question.limit) if ended == UNDECIDED else remedy,
     )
 
 
@@ -261,20 +255,18 @@ def _inputs_left(sources: Sources) -> Rule:
     if isinstance(table, Missing):
         return _missing_rule(name, place, table)
     pairs = (table["against"] != table["output"]) & (table["lag"] >= 0)
-    worst, excess = _worst_lag(table, pairs & ~table["passed"])
-    remedy = "Raise the order, or check the dead time of that input."
+    left = pairs & ~table["passed"]
+    worst, excess = _worst_lag(table, left)
     if worst is None:
-        return Rule(
-            name,
-            place,
-            PASSED,
-            f"{count(len(set(table['against'][pairs])), 'input')}",
-            "The errors follow no input.",
-            "",
-        )
+        inputs = count(len(set(table["against"][pairs])), "input")
+        return _none(name, place, 0, inputs, "The errors follow no input.")
     output, against, lag = table["output"][worst], table["against"][worst], int(table["lag"][worst])
-    reason = f"The errors of {output} still follow {against}: correlation {_signed(table['correlation'][worst])} at lag {lag}, {short(excess, 2)} times its 99{THIN}% band."
-    return Rule(name, place, FAILED, f"{output} after {against}", reason, remedy)
+    reason = (
+        f"The errors of {output} still follow {against}: correlation "
+        f"{_signed(table['correlation'][worst])} at lag {lag}, {short(excess, 2)} times its 99{THIN}% band."
+    )
+    remedy = "Raise the order, or check the dead time of that input."
+    return _none(name, place, int(left.sum()), f"{output} after {against}", reason, remedy)
 
 
 def _whiteness(sources: Sources) -> Rule:
@@ -282,14 +274,20 @@ def _whiteness(sources: Sources) -> Rule:
     table = sources.tables["residuals"]
     if isinstance(table, Missing):
         return _missing_rule(name, place, table)
-    mine = (table["against"] == table["output"]) & (table["lag"] > 0)
-    worst, excess = _worst_lag(table, mine & ~table["passed"])
+    coloured = (table["against"] == table["output"]) & (table["lag"] > 0) & ~table["passed"]
+    worst, excess = _worst_lag(table, coloured)
     if worst is None:
-        return Rule(name, place, PASSED, "noise only", "The errors are noise.", "")
+        return _none(name, place, 0, "noise only", "The errors are noise.")
     output, lag = table["output"][worst], int(table["lag"][worst])
-    reason = f"The one-step errors of {output} are not noise: correlation {_signed(table['correlation'][worst])} at lag {lag}, {short(excess, 2)} times its 99{THIN}% band."
-    remedy = "The observer could predict better: lengthen the window, or model the disturbance. What the fits measure they measure all the same."
-    return Rule(name, place, FAILED, f"{output}, lag {lag}", reason, remedy)
+    reason = (
+        f"The one-step errors of {output} are not noise: correlation "
+        f"{_signed(table['correlation'][worst])} at lag {lag}, {short(excess, 2)} times its 99{THIN}% band."
+    )
+    remedy = (
+        "The observer could predict better: lengthen the window, or model the disturbance. "
+        "What the fits measure they measure all the same."
+    )
+    return _none(name, place, int(coloured.sum()), f"{output}, lag {lag}", reason, remedy)
 
 
 def _worst_lag(table: Mapping[str, np.ndarray], rows: np.ndarray) -> tuple[int | None, float]:
@@ -313,7 +311,7 @@ def _excitation(sources: Sources) -> Rule:
     gap = next((part for part in (rank, full) if isinstance(part, Missing)), None)
     if gap:
         return _missing_rule(name, place, gap)
-    figure, lags = f"rank {rank} of {full}", lookup(metrics, "excitation.lags")
+    lags = lookup(metrics, "excitation.lags")
     reason = f"The inputs move in {rank} of {full} directions over the window."
     if rank < full and not isinstance(lags, Missing):
         weak = [key for key, part in metrics["excitation"]["inputs"].items() if part["rank"] < lags]
@@ -324,11 +322,12 @@ def _excitation(sources: Sources) -> Rule:
         )
     return Rule(
         name,
-        place,
-        PASSED if rank == full else FAILED,
-        figure,
-        reason,
-        "Move each input with a sequence of its own, at more frequencies.",
+        Question(0, "", name, "", full, True, ""),
+        count_of(rank),
+        text=f"rank {rank} of {full}",
+        place=place,
+        reason=reason,
+        remedy="Move each input with a sequence of its own, at more frequencies.",
     )
 
 
@@ -337,28 +336,19 @@ def _effects(sources: Sources) -> Rule:
     table = sources.tables["dynamics"]
     if isinstance(table, Missing):
         return _missing_rule(name, place, table)
-    seen = f"{int(table['seen'].sum())} of {len(table['seen'])}"
+    signed = f"{int(table['seen'].sum())} of {len(table['seen'])}"
     blind = [
         i.name for i in sources.declared.machine.inputs if not table["seen"][table["input"] == i.name].any()
     ]
     if not blind:
-        return Rule(
-            name,
-            place,
-            PASSED,
-            seen,
-            f"The sign of {seen} effects is known, and of each input at least one.",
-            "",
-        )
-    reason = f"What {_listed(blind)} does is not known, not even in sign: the bands of the spread hold zero for every output."
-    return Rule(
-        name,
-        place,
-        FAILED,
-        f"{blind[0]}: sign unknown",
-        reason,
-        f"Move {_listed(blind)} more, or longer, and record again.",
+        reason = f"The sign of {signed} effects is known, and of each input at least one."
+        return _none(name, place, 0, signed, reason)
+    reason = (
+        f"What {_listed(blind)} does is not known, not even in sign: the bands of the spread hold zero for "
+        "every output."
     )
+    remedy = f"Move {_listed(blind)} more, or longer, and record again."
+    return _none(name, place, len(blind), f"{blind[0]}: sign unknown", reason, remedy)
 
 
 def _stability(sources: Sources) -> Rule:
@@ -366,10 +356,20 @@ def _stability(sources: Sources) -> Rule:
     radius = lookup(sources.metrics["identify_plant"], "largest_pole")
     if isinstance(radius, Missing):
         return _missing_rule(name, place, radius)
-    figure = f"largest pole {number(radius, 4)}"
-    if radius < 1:
-        return Rule(name, place, PASSED, figure, "Every pole lies inside the unit circle.", "")
-    reason = f"The largest pole, {number(radius, 4)}, is not inside the unit circle: simulated far ahead, the model runs away."
-    return Rule(
-        name, place, FAILED, figure, reason, "Record longer, or set identify_plant.refinement to validated."
+    rule = Rule(
+        name,
+        Question(0, "", name, "", BELOW_ONE, False, ""),
+        count_of(radius),
+        text=f"largest pole {number(radius, 4)}",
+        place=place,
+        reason="Every pole lies inside the unit circle.",
+    )
+    if rule.state == PASSED:
+        return rule
+    return rule._replace(
+        reason=(
+            f"The largest pole, {number(radius, 4)}, is not inside the unit circle: simulated far ahead, "
+            "the model runs away."
+        ),
+        remedy="Record longer, or set identify_plant.refinement to validated.",
     )

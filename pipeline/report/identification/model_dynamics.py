@@ -42,15 +42,16 @@ def steps(sources: Sources) -> Matrix:
 
     rows, more = matrix(sources, cell)
     plants = _members(sources)
-    seen, end = int(dynamics["seen"].sum()), float(table["time_s"].max())
+    sure, end = int(dynamics["seen"].sum()), float(table["time_s"].max())
     every = len(dynamics["seen"])
     text = (
         (
-            f"{seen} of {every} effects are sure in sign; of the others the band over {plants} holds zero. "
-            if seen < every
+            f"{sure} of {every} effects are sure in sign; of the others the band over {plants} holds zero. "
+            if sure < every
             else "Every effect is sure in sign. "
         )
-        + "The figure is the largest excursion, with its band; for an effect that turns back, also where it ends."
+        + "The figure is the largest excursion, with its band; for an effect that turns back, also where "
+        "it ends."
     )
     caption = (
         f"Answer in °C to one per cent of the input, over {short(end)}{THIN}s from rest; "
@@ -84,7 +85,7 @@ def _reach(table: Table, rows: np.ndarray) -> charts.Axis:
 
 
 def _response(table: Table, rows: np.ndarray, dynamics: Table, row: int, y: charts.Axis, size: Room) -> Cell:
-    time, seen = table["time_s"][rows], bool(dynamics["seen"][row])
+    time, sure = table["time_s"][rows], bool(dynamics["seen"][row])
     end = float(time[-1])
     frame = charts.Frame(
         charts.Axis(0, end, ((0.0, "0"), (end, short(end)))),
@@ -97,14 +98,14 @@ def _response(table: Table, rows: np.ndarray, dynamics: Table, row: int, y: char
     layers = [
         charts.ribbon(frame, time, table["low"][rows], table["high"][rows]),
         charts.level(frame, 0.0, "tk"),
-        charts.line(frame, time, table["response"][rows], "line" if seen else "ref"),
+        charts.line(frame, time, table["response"][rows], "line" if sure else "ref"),
     ]
     output, name = str(dynamics["output"][row]), str(dynamics["input"][row])
     gain, peak = (
         tuple(float(dynamics[f"{key}{side}"][row]) for side in ("", "_low", "_high"))
         for key in ("gain", "peak")
     )
-    if not seen:
+    if not sure:
         alt = f"{output} after {name}: sign not known, {_span(peak)} °C per %"
         return Cell(
             name,
@@ -211,11 +212,20 @@ def poles(sources: Sources) -> Picture:
             for part, css in ((extra, "try pale"), (of_mine, "try"))
         ]
         layers.append(charts.crosses(frame, real[mine], imag[mine]))
-        alt = f"{head}: {int(mine.sum())} poles, the largest of size {number(slowest, 4)}, {'inside' if slowest < 1 else 'on or outside'} the unit circle"
+        alt = (
+            f"{head}: {int(mine.sum())} poles, the largest of size {number(slowest, 4)}, "
+            f"{'inside' if slowest < 1 else 'on or outside'} the unit circle"
+        )
         shown.append(Column(head, small, "", [charts.panel(frame, layers, alt=alt)]))
     plants = int(table["member"].max())
-    text = f"{count(int(mine.sum()), 'pole').capitalize()}, the largest of size {number(slowest, 4)}: {'stable' if slowest < 1 else 'not stable'}."
-    caption = f"Crosses: the model; dots: {count(plants, 'plant')} of the spread, each with one state more than the model, whose pole is pale."
+    text = (
+        f"{count(int(mine.sum()), 'pole').capitalize()}, the largest of size {number(slowest, 4)}: "
+        f"{'stable' if slowest < 1 else 'not stable'}."
+    )
+    caption = (
+        f"Crosses: the model; dots: {count(plants, 'plant')} of the spread, each with one state more than "
+        "the model, whose pole is pale."
+    )
     return Picture("poles", title, text, shown, caption, page.origin(sources.source("poles")))
 
 
@@ -223,8 +233,8 @@ _CIRCLE = np.linspace(0, 2 * np.pi, 181)
 
 
 def _inside(frame: charts.Frame, real: np.ndarray, imag: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    kept = (real >= frame.x.low) & (real <= frame.x.high) & (imag >= frame.y.low) & (imag <= frame.y.high)
-    return real[kept], imag[kept]
+    inside = (real >= frame.x.low) & (real <= frame.x.high) & (imag >= frame.y.low) & (imag <= frame.y.high)
+    return real[inside], imag[inside]
 
 
 def _window(real: np.ndarray, imag: np.ndarray, shown: np.ndarray) -> charts.Frame:
@@ -248,8 +258,8 @@ def _arc(frame: charts.Frame) -> Markup:
     """The part of the unit circle that the frame shows, at the right."""
     reach = np.arcsin(min(frame.y.high, 1.0))
     angle = np.linspace(-reach, reach, 61)
-    seen = (np.cos(angle) >= frame.x.low) & (np.cos(angle) <= frame.x.high)
-    return charts.line(frame, np.cos(angle), np.where(seen, np.sin(angle), np.nan), "lim line thin")
+    inside = (np.cos(angle) >= frame.x.low) & (np.cos(angle) <= frame.x.high)
+    return charts.line(frame, np.cos(angle), np.where(inside, np.sin(angle), np.nan), "lim line thin")
 
 
 def pole_table(sources: Sources) -> list[dict[str, str]]:
@@ -299,8 +309,8 @@ def _constant(size: float, step: float) -> float:
 def excitation(sources: Sources) -> Picture:
     """How strongly the record moved each input, by frequency."""
     table, title = sources.tables["levels"], "How well the record excites the machine"
-    found = lookup(sources.metrics["identify_plant"], "excitation")
-    gap = next((part for part in (table, found) if isinstance(part, Missing)), None)
+    excited = lookup(sources.metrics["identify_plant"], "excitation")
+    gap = next((part for part in (table, excited) if isinstance(part, Missing)), None)
     if gap:
         return hole("excitation", title, gap)
     y, shown = charts.linear(0, 1.1 * float(table["level"].max()) or 1.0, ticks=3), []
@@ -316,9 +326,12 @@ def excitation(sources: Sources) -> Picture:
             left=size.left,
             above=8,
         )
-        own: Mapping = found["inputs"].get(signal.name, {})
-        small = f"{short(own['level'], 2)}{THIN}%, rank {own['rank']} of {found['lags']}" if own else ""
-        alt = f"{signal.name}: {small}; level {short(float(level.min()), 2)} to {short(float(level.max()), 2)} % in {len(level)} bands"
+        own: Mapping = excited["inputs"].get(signal.name, {})
+        small = f"{short(own['level'], 2)}{THIN}%, rank {own['rank']} of {excited['lags']}" if own else ""
+        alt = (
+            f"{signal.name}: {small}; level {short(float(level.min()), 2)} to "
+            f"{short(float(level.max()), 2)} % in {len(level)} bands"
+        )
         shown.append(
             Column(
                 signal.name,
@@ -334,10 +347,10 @@ def excitation(sources: Sources) -> Picture:
                 ],
             )
         )
-    condition = found.get("condition")
+    condition = excited.get("condition")
     text = (
-        f"Together the inputs move in {found['rank']} of {found['full']} directions over a window of "
-        f"{found['lags']} samples"
+        f"Together the inputs move in {excited['rank']} of {excited['full']} directions over a window of "
+        f"{excited['lags']} samples"
         + (
             "."
             if condition is None

@@ -66,7 +66,7 @@ def blank(id: str, title: str, missing: Missing) -> Matrix:
 # ---- the hold-out
 
 
-def holdout(sources: Sources, found: Sequence[Fit], ahead: str) -> Picture:
+def holdout(sources: Sources, fits: Sequence[Fit], ahead: str) -> Picture:
     """Every output of the hold-out: measured, simulated, and predicted so many steps ahead."""
     table, title = (
         sources.tables["holdout"],
@@ -74,15 +74,15 @@ def holdout(sources: Sources, found: Sequence[Fit], ahead: str) -> Picture:
     )
     if isinstance(table, Missing):
         return hole("holdout", title, table)
-    shown, points = [], max(60, 240 * 10 // max(len(found), 10))
-    for fit in found:
+    shown, points = [], max(60, 240 * 10 // max(len(fits), 10))
+    for fit in fits:
         parts = [("simulated", fit.simulated), (ahead, fit.ahead)]
         small = ", ".join(
             f"{name} {part.state if isinstance(part, Missing) else percent_of(part)}" for name, part in parts
         )
         shown.append(Column(fit.name, f"fit: {small}", "", _stretch(sources, table, fit.name, small, points)))
     segments = len(np.unique(table["segment"]))
-    masked = sum(int((~np.isfinite(table[f"{fit.name}_measured"])).sum()) for fit in found)
+    masked = sum(int((~np.isfinite(table[f"{fit.name}_measured"])).sum()) for fit in fits)
     text = (
         f"{number(len(table['time_s']), 0)} samples in {count(segments, 'stretch', 'stretches')}, "
         "the last part of each; "
@@ -91,7 +91,8 @@ def holdout(sources: Sources, found: Sequence[Fit], ahead: str) -> Picture:
             if masked
             else "none of them masked."
         )
-        + f" Simulated: the model runs from the inputs alone. {ahead[:1].upper()}{ahead[1:]}: it also knows the outputs until then."
+        + f" Simulated: the model runs from the inputs alone. {ahead[:1].upper()}{ahead[1:]}: it also "
+        "knows the outputs until then."
     )
     caption = (
         "Above, °C against time in s, stretches one after the other: grey measured, ink simulated. "
@@ -137,7 +138,7 @@ def _stretch(sources: Sources, table: Table, name: str, small: str, points: int)
     size, late = (
         float(np.sqrt(np.nanmean(part**2))) if np.isfinite(part).any() else np.nan for part in error
     )
-    said = f"{name}: error of simulation {short(size, 2)} °C r.m.s., ahead " + (
+    alt_of_error = f"{name}: error of simulation {short(size, 2)} °C r.m.s., ahead " + (
         f"{short(late, 2)} °C" if np.isfinite(late) else "not measured"
     )
     return [
@@ -153,7 +154,7 @@ def _stretch(sources: Sources, table: Table, name: str, small: str, points: int)
         charts.panel(
             below,
             drawn(below, [(error[1], "line seen"), (error[0], "line thin")]),
-            alt=said,
+            alt=alt_of_error,
             css="mb wide",
             title="error, °C",
             units=("s", "°C"),
@@ -183,9 +184,14 @@ def whiteness(sources: Sources) -> Picture:
     text = (
         "Yes: the one-step errors of every output are noise, by Ljung and Box’s test at 99 %."
         if not bad
-        else f"Not for {', '.join(bad)}: the next error can be told in part from the ones before, so the observer could do better."
+        else f"Not for {', '.join(bad)}: the next error can be told in part from the ones before, so the "
+        "observer could do better."
     )
-    caption = f"Autocorrelation of the one-step errors on the hold-out against lag in samples. Grey: the 99{THIN}% band; one lag in a hundred may leave it by chance. Vermillion: lags outside where the test failed."
+    caption = (
+        "Autocorrelation of the one-step errors on the hold-out against lag in samples. Grey: the "
+        f"99{THIN}% band; one lag in a hundred may leave it by chance. Vermillion: lags outside where the "
+        "test failed."
+    )
     return Picture("white", title, text, shown, caption, page.origin(sources.source("residuals")))
 
 
@@ -220,11 +226,11 @@ def cross(sources: Sources) -> Matrix:
             )
         }
     )
-    said = ", ".join(f"{output} after {name}" for output, name in failed[:6]) + (
+    pairs = ", ".join(f"{output} after {name}" for output, name in failed[:6]) + (
         f" and {len(failed) - 6} more" if len(failed) > 6 else ""
     )
     text = (
-        f"Yes: {said}. There the model misses something that an input does."
+        f"Yes: {pairs}. There the model misses something that an input does."
         if failed
         else "No: what the inputs do, the model explains."
     )
@@ -250,9 +256,13 @@ def _stems(table: Table, rows: np.ndarray, y: charts.Axis, size: Room, name: str
     lag, value, limit = table["lag"][rows], table["correlation"][rows], float(table["band"][rows][0])
     ends = dict.fromkeys((float(lag.min()), float(max(lag.min(), 0)), float(lag.max())))
     frame = charts.Frame(
-        charts.Axis(float(lag.min()) - 1, float(lag.max()) + 1, tuple((k, number(k, 0)) for k in ends)), y,
-        width=size.width, height=size.height, left=size.left, above=6,
-    )  # fmt: skip
+        charts.Axis(float(lag.min()) - 1, float(lag.max()) + 1, tuple((k, number(k, 0)) for k in ends)),
+        y,
+        width=size.width,
+        height=size.height,
+        left=size.left,
+        above=6,
+    )
     # a lag outside of the band is marked only where the test over all
     # lags failed: one in a hundred leaves it by chance
     outside, judged = np.abs(np.nan_to_num(value)) > limit, lag >= 0
@@ -263,7 +273,11 @@ def _stems(table: Table, rows: np.ndarray, y: charts.Axis, size: Room, name: str
         for part, css in ((judged & ~marked, "stem"), (judged & marked, "stem bad"), (~judged, "stem pale"))
     ]
     worst = int(np.abs(np.nan_to_num(np.where(judged, value, 0.0))).argmax())
-    alt = f"{name}: {int((outside & judged).sum())} of {int(judged.sum())} lags outside of ±{number(limit, 2)}, most {number(float(np.nan_to_num(value[worst])), 2)} at lag {int(lag[worst])}"
+    alt = (
+        f"{name}: {int((outside & judged).sum())} of {int(judged.sum())} lags outside of "
+        f"±{number(limit, 2)}, most {number(float(np.nan_to_num(value[worst])), 2)} at lag "
+        f"{int(lag[worst])}"
+    )
     return charts.panel(frame, layers, alt=alt, css=size.css, units=("samples", ""))
 
 
@@ -275,8 +289,8 @@ def matrix(
     rows = []
     for output in machine.outputs:
         cells = [cell(output.name, i.name) for i in machine.inputs]
-        kept = sorted(sorted(range(len(cells)), key=lambda k: -cells[k][0])[:MOST_INPUTS])
-        rows.append((output.name, [cells[k][1]() for k in kept]))
+        largest = sorted(sorted(range(len(cells)), key=lambda k: -cells[k][0])[:MOST_INPUTS])
+        rows.append((output.name, [cells[k][1]() for k in largest]))
     left = len(machine.inputs) - MOST_INPUTS
     return (
         rows,

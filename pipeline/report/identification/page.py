@@ -7,12 +7,21 @@ from typing import Any
 import numpy as np
 
 from pipeline.report.identification import model_dynamics, model_errors
-from pipeline.report.identification.model import LEAST_FIT, Fit, Trust, ahead_words, fits, trust
+from pipeline.report.identification.model import LEAST_FIT, Fit, ahead_words, fits, trust
 from pipeline.report.index import page as index_page
 from pipeline.report.shared import charts, page, words
 from pipeline.report.shared.digits import MINUS, THIN, band, count, decimals, number, short
 from pipeline.report.shared.sources import Sources, lookup
-from pipeline.report.shared.verdict import FAILED, PASSED, UNDECIDED, Figure, Missing, Question, state
+from pipeline.report.shared.verdict import (
+    FAILED,
+    PASSED,
+    UNDECIDED,
+    Figure,
+    Missing,
+    Question,
+    Verdict,
+    state,
+)
 
 WORDS = (
     "trusted",
@@ -32,17 +41,17 @@ WORDS = (
 
 def render(sources: Sources) -> str:
     """The text of identification.html."""
-    found, judged, ahead = fits(sources), trust(sources), ahead_words(sources)
+    judged_fits, judged, ahead = fits(sources), trust(sources), ahead_words(sources)
     return page.render(
         "identification.html",
         here="identification",
         title=f"Identification: {judged.decision.rstrip('.')}",
         trust=judged,
         ahead=ahead[:1].upper() + ahead[1:],
-        answers=[answer(sources, fit, ahead) for fit in found],
+        answers=[answer(sources, fit, ahead) for fit in judged_fits],
         judged_on=_judged_on(sources),
         advice=advice(sources, judged),
-        holdout=model_errors.holdout(sources, found, ahead),
+        holdout=model_errors.holdout(sources, judged_fits, ahead),
         white=model_errors.whiteness(sources),
         cross=model_errors.cross(sources),
         steps=model_dynamics.steps(sources),
@@ -192,19 +201,19 @@ def since(before: Figure | None, now: Figure | Missing) -> tuple[str, bool]:
 # ---- what to do
 
 
-def advice(sources: Sources, judged: Trust) -> list[str]:
+def advice(sources: Sources, judged: Verdict) -> list[str]:
     """The identification's own sentences, then the remedies of rules that they do not speak of."""
-    found = lookup(sources.metrics["identify_plant"], "advice")
-    said = [] if isinstance(found, Missing) else [_sentence(text) for text in found]
-    spoken = {"Inputs used up", "Whiteness", "Excitation"} if said else set()
-    spoken |= {"Simulation"} if any("hold-out fit" in text for text in said) else set()
-    said += [
+    advised = lookup(sources.metrics["identify_plant"], "advice")
+    sentences = [] if isinstance(advised, Missing) else [_sentence(text) for text in advised]
+    spoken = {"Inputs used up", "Whiteness", "Excitation"} if sentences else set()
+    spoken |= {"Simulation"} if any("hold-out fit" in text for text in sentences) else set()
+    sentences += [
         f"{rule.name}: {rule.remedy}"
-        for rule in judged.rules
+        for (rule,) in judged.rules
         if rule.state != PASSED and rule.remedy and rule.name not in spoken
     ]
     notes = lookup(sources.metrics["identify_plant"], "notes")
-    return said + (
+    return sentences + (
         []
         if isinstance(notes, Missing)
         else [f"Noted while fitting: {text}." for text in dict.fromkeys(notes)]
@@ -259,11 +268,12 @@ def losses(sources: Sources) -> dict[str, Any]:
     for signal in [*sources.declared.machine.inputs, *sources.declared.machine.outputs]:
         masked, total = int(table[f"{signal.name}_masked"].sum()), len(table["time_s"])
         mine = {} if isinstance(flags, Missing) else flags.get(signal.name, {})
+        share = f" ({short(100 * masked / total, 2)}{THIN}%)" if masked else ""
         rows.append(
             {
                 "name": signal.name,
                 "samples": number(total, 0),
-                "masked": f"{number(masked, 0)}{f' ({short(100 * masked / total, 2)}{THIN}%)' if masked else ''}",
+                "masked": f"{number(masked, 0)}{share}",
                 "bad": masked > 0.1 * total,
                 "flags": ", ".join(f"{kind} {number(number_of, 0)}" for kind, number_of in mine.items())
                 or ("not measured" if isinstance(flags, Missing) else "none"),
@@ -274,23 +284,23 @@ def losses(sources: Sources) -> dict[str, Any]:
 
 def used(sources: Sources) -> list[tuple[str, str]]:
     """What became of the samples between the recordings and the fit."""
-    ingested, found = sources.metrics["ingest"], sources.metrics["identify_plant"]
+    ingested, identified = sources.metrics["ingest"], sources.metrics["identify_plant"]
     items = (
         (ingested, "recordings", "Recordings read"),
         (ingested, "quarantined", "Recordings quarantined, not used"),
         (ingested, "segments", "Stretches without a gap"),
-        (found, "samples", "Samples of the record"),
-        (found, "samples_cut", "Cut out: an input masked, or no output at all"),
-        (found, "samples_holdout", "Held out to judge"),
-        (found, "rows", "Rows of the regression"),
-        (found, "dropped_rows", "Rows left out: their window touches a masked sample"),
-        (found, "past", "Window, in samples"),
+        (identified, "samples", "Samples of the record"),
+        (identified, "samples_cut", "Cut out: an input masked, or no output at all"),
+        (identified, "samples_holdout", "Held out to judge"),
+        (identified, "rows", "Rows of the regression"),
+        (identified, "dropped_rows", "Rows left out: their window touches a masked sample"),
+        (identified, "past", "Window, in samples"),
     )
     rows = [
         (title, value.state if isinstance(value := lookup(data, key), Missing) else number(value, 0))
         for data, key, title in items
     ]
-    delays = lookup(found, "delays")
+    delays = lookup(identified, "delays")
     late = (
         []
         if isinstance(delays, Missing)

@@ -17,17 +17,19 @@ from pipeline.report.shared.sources import Sources, Table
 from pipeline.report.shared.verdict import (
     FAILED,
     OPEN,
+    PASSED,
     ROLES,
-    UNDECIDED,
     Figure,
     Missing,
     Question,
-    outcomes,
+    ReportRules,
+    Verdict,
     row_places,
     state,
 )
 from pipeline.report.temperature.answers import CONTROLLERS, LABELS, featured
 from pipeline.report.temperature.judgement import NAMES, Judgement
+from pipeline.report.temperature.verdict import rules
 
 # composer of the deposition loop -> its place in the card
 ROLE = {
@@ -40,7 +42,7 @@ ROLE = {
 
 def temperature(sources: Sources, judged: Judgement) -> dict[str, Any]:
     order = ("model_based", "data_driven", "baseline")
-    answers, rules = judged.roles, sources.declared.rules
+    answers, allowed = judged.roles, sources.declared.rules
     rows = []
     for key in ("settled_error_degC", "gap_percent", "settling_s"):
         question = next(q for q in judged.asked if q.key == key)
@@ -61,7 +63,7 @@ def temperature(sources: Sources, judged: Judgement) -> dict[str, Any]:
             f"{featured(sources)}. Grey: what the rule allows once settled."
         ),
         "panels": [
-            _spark(sources, judged, role, limit=rules.settled_error_degC, named=i == 0)
+            _spark(sources, judged, role, limit=allowed.settled_error_degC, named=i == 0)
             for i, role in enumerate(order)
         ],
         "heads": [
@@ -109,22 +111,17 @@ def _win(judged: Judgement) -> tuple[str, str]:
     others = []
     for role in ("data_driven", "model_based", "baseline"):
         if role != best:
-            failed = [
-                o
-                for o in outcomes(judged.asked, judged.roles[role])
-                if o.state in (FAILED, UNDECIDED, OPEN) and o.rule != "drift"
-            ]
-            if failed and failed[0].question:
+            judged_rules = rules(judged.asked, judged.roles[role])
+            first = next((rule for rule in judged_rules if rule.state != PASSED and rule.question), None)
+            if first:
                 others.append(
-                    f"{NAMES[role]} {'fails' if failed[0].state == FAILED else 'is open'} on "
-                    f"{_on(failed[0].question, judged.roles[role])}."
+                    f"{NAMES[role]} {'fails' if first.state == FAILED else 'is open'} on "
+                    f"{_on(first.question, judged.roles[role])}."
                 )
             else:
                 others.append(f"{NAMES[role]} passes too.")
-    return (
-        f"{'The b' if best == 'baseline' else NAMES[best][:1]}{'aseline' if best == 'baseline' else NAMES[best][1:]} wins.",
-        " ".join([holds, *others]),
-    )
+    name = "The baseline" if best == "baseline" else NAMES[best]
+    return f"{name} wins.", " ".join([holds, *others])
 
 
 def _on(question: Question, answers: Mapping[str, Figure | Missing]) -> str:
@@ -151,11 +148,13 @@ def _spark(sources: Sources, judged: Judgement, role: str, *, limit: float, name
     if isinstance(error, Missing):
         return Markup('<div class="hole">{}</div>').format(page.missing(error))
     time, values = error
-    said = "not judged" if isinstance(figure, Missing) else f"settled error {quantity(figure.value, '°C', 3)}"
+    settled = (
+        "not judged" if isinstance(figure, Missing) else f"settled error {quantity(figure.value, '°C', 3)}"
+    )
     alt = (
         f"{ROLES[role].capitalize()}: worst zone {number(float(values[-1]), 2)} °C from its reference "
         f"after {number(float(time[-1]), 0)} s, {'above' if values[-1] > limit else 'below'} the {limit:g} "
-        f"°C limit; {said}"
+        f"°C limit; {settled}"
     )
     return charts.spark(
         time,
@@ -164,9 +163,7 @@ def _spark(sources: Sources, judged: Judgement, role: str, *, limit: float, name
         css=page.MARKS[role],
         limit=limit,
         alt=alt,
-        named=named,
-        bad=values[-1] > limit,
-        limit_label=f"limit {limit:g}",
+        limit_label=f"limit {limit:g}" if named else "",
         units=("s", "°C"),
     )
 
@@ -212,59 +209,23 @@ def _kernel_note(gap: Figure | Missing | None, sources: Sources) -> str:
 def deposition(sources: Sources) -> dict[str, Any]:
     """In this loop's terms: model-based is the paper's law and its library by priority, data-driven our law
     and the basis functions, baseline on-off control."""
-    judged, found = deposition_verdict.verdict(sources), deposition_rules.structures(sources)
-    if isinstance(found, Missing):
-        return unbuilt("deposition", found.sentence()) | {"link": "deposition.html"}
-    parts = list(dict.fromkeys(one.part for one in found))
-    # the parts on which the library fares worst say most
-    parts.sort(
-        key=lambda part: (
-            -max(
-                (
-                    one.scores["priority"].error
-                    for one in found
-                    if one.part == part and "priority" in one.scores
-                ),
-                default=0.0,
-            )
-        )
-    )
-    names = ("priority", "basis", "on_off")
-    rows = [
-        {
-            "title": f"Flow error, {shortened(part, 30)}",
-            "cells": _worst(
-                [
-                    [one.scores[name].error for one in found if one.part == part and name in one.scores]
-                    for name in names
-                ],
-                sources.declared.rules.flow_error_percent,
-            ),
-        }
-        for part in parts[:2]
-    ]
-    lines = [
-        [
-            one.scores[name].worst_line
-            for one in found
-            if name in one.scores and one.scores[name].worst_line is not None
-        ]
-        for name in names
-    ]
-    rows.append(
-        {"title": "Worst line’s volume", "cells": _worst(lines, sources.declared.rules.line_volume_percent)}
-    )
-    role = ROLE.get(judged.composer)
-    trials = [_learned(sources, law) for law in ("paper", "ours", "")]
+    judged, structures = deposition_verdict.verdict(sources), deposition_rules.structures(sources)
+    if isinstance(structures, Missing):
+        return unbuilt("deposition", structures.sentence()) | {"link": "deposition.html"}
+    role = ROLE.get(judged.winner)
+    trials = [_learned(sources, law) for law in ("hoelzle_2009", "model_inverse", "")]
     return {
         "id": "deposition",
         "name": "Deposition",
         "link": "deposition.html",
         "moves": "Plunger command to flow at the nozzle",
-        "state": f"Run {ROLES[role]}" if judged.state == deposition_verdict.PASSED else "Do not print yet",
-        "mark": role if judged.state == deposition_verdict.PASSED else None,
-        "win": _deposition_win(found, judged, role),
-        "caption": "Error while learning, in % of on\u2011off control’s, log scale 0.3 to 200\u00a0%, the worse material: the paper’s law, ours, none. Grey: what is asked for.",
+        "state": f"Run {ROLES[role]}" if judged.state == PASSED else "Do not print yet",
+        "mark": role if judged.state == PASSED else None,
+        "win": _deposition_win(structures, judged, role),
+        "caption": (
+            "Error while learning, in % of on\u2011off control’s, log scale 0.3 to 200\u00a0%, the worse "
+            "material: the paper’s law, model inversion, none. Grey: what is asked for."
+        ),
         "panels": [
             _learning_spark(curve, css, sources.declared.rules.learned_percent, named=i == 1)
             for i, (curve, css) in enumerate(zip(trials, ("mb", "dd", "bl"), strict=True))
@@ -277,9 +238,9 @@ def deposition(sources: Sources) -> dict[str, Any]:
                 ("baseline", "on\u2011off control"),
             )
         ],
-        "rows": rows,
+        "rows": _deposition_rows(structures, sources.declared.rules),
         "note": "Forecasts of the identified machine: the true flow of a real one is not known."
-        if judged.real
+        if deposition_rules.real(sources)
         else "Judged by the true flow of simulated machines that nothing was fitted to.",
         "model": None,
         "sources": sources.source("scores", "trials"),
@@ -287,24 +248,55 @@ def deposition(sources: Sources) -> dict[str, Any]:
     }
 
 
+def _deposition_rows(
+    structures: Sequence[deposition_rules.Structure], allowed: ReportRules
+) -> list[dict[str, Any]]:
+    """Flow error of the two parts on which the library fares worst, which say most, and the worst line."""
+    names = ("priority", "basis", "on_off")
+    parts = list(dict.fromkeys(one.part for one in structures))
+
+    def errors(part: str, name: str) -> list[float]:
+        return [one.scores[name].error for one in structures if one.part == part and name in one.scores]
+
+    parts.sort(key=lambda part: -max(errors(part, "priority"), default=0.0))
+    lines = [
+        [
+            one.scores[name].worst_line
+            for one in structures
+            if name in one.scores and one.scores[name].worst_line is not None
+        ]
+        for name in names
+    ]
+    return [
+        *(
+            {
+                "title": f"Flow error, {shortened(part, 30)}",
+                "cells": _worst([errors(part, name) for name in names], allowed.flow_error_percent),
+            }
+            for part in parts[:2]
+        ),
+        {"title": "Worst line’s volume", "cells": _worst(lines, allowed.line_volume_percent)},
+    ]
+
+
 def _deposition_win(
-    found: Sequence[deposition_rules.Structure], judged: deposition_verdict.Verdict, role: str | None
+    structures: Sequence[deposition_rules.Structure], judged: Verdict, role: str | None
 ) -> tuple[str, str]:
-    if judged.state != deposition_verdict.PASSED or role is None:
+    if judged.state != PASSED or role is None:
         return judged.lead or judged.decision, judged.reason
     name = "The baseline" if role == "baseline" else NAMES[role]
-    mine, _ = deposition_rules.worst(found, judged.composer) or (0.0, None)
-    other = deposition_rules.worst(found, "priority" if judged.composer == "basis" else "basis")
+    mine, _ = deposition_rules.worst(structures, judged.winner) or (0.0, None)
+    other = deposition_rules.worst(structures, "priority" if judged.winner == "basis" else "basis")
     beside = (
-        f" {deposition_rules.USE['priority' if judged.composer == 'basis' else 'basis'].capitalize()}: "
+        f" {deposition_rules.USE['priority' if judged.winner == 'basis' else 'basis'].capitalize()}: "
         f"{percent(other[0], 2)}."
         if other
         else ""
     )
-    price = judged.price.split(". ")[0].rstrip(".")
+    price = judged.note.split(". ")[0].rstrip(".")
     return (
         f"{name} wins.",
-        f"{deposition_rules.NAMES[judged.composer]}: at most {percent(mine, 2)} of on\u2011off control’s "
+        f"{deposition_rules.NAMES[judged.winner]}: at most {percent(mine, 2)} of on\u2011off control’s "
         f"flow error on any part.{beside} {price}."
         if price
         else "",
@@ -349,8 +341,12 @@ def _learning_spark(curve: np.ndarray | Missing, css: str, limit: float, *, name
     if isinstance(curve, Missing):
         return Markup('<div class="hole">{}</div>').format(page.missing(curve))
     curve = curve if len(curve) > 1 else np.repeat(curve, 2)
-    bad = bool(curve[-1] > limit)
-    alt = f"{'On-off control learns nothing' if css == 'bl' else f'The error ends at {percent(float(curve[-1]), 2)} of trial 0’s after {len(curve) - 1} trials'}, {'above' if bad else 'below'} the {limit:g} % asked for"
+    finding = (
+        "On-off control learns nothing"
+        if css == "bl"
+        else f"The error ends at {percent(float(curve[-1]), 2)} of trial 0’s after {len(curve) - 1} trials"
+    )
+    alt = f"{finding}, {'above' if curve[-1] > limit else 'below'} the {limit:g} % asked for"
     return charts.spark(
         np.arange(float(len(curve))),
         curve,
@@ -358,9 +354,7 @@ def _learning_spark(curve: np.ndarray | Missing, css: str, limit: float, *, name
         css=css,
         limit=limit,
         alt=alt,
-        named=named,
-        bad=bad,
-        limit_label=f"learned to {limit:g}",
+        limit_label=f"learned to {limit:g}" if named else "",
         units=("trials", "%"),
     )
 

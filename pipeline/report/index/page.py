@@ -13,9 +13,6 @@ from pipeline.report.shared.difference import Difference, Move
 from pipeline.report.shared.digits import band, count, decimals, declared, quantity
 from pipeline.report.shared.sources import Sources, digest
 from pipeline.report.shared.verdict import (
-    ANSWERS,
-    BRIEF,
-    FAILED,
     OPEN,
     PASSED,
     ROLES,
@@ -23,14 +20,13 @@ from pipeline.report.shared.verdict import (
     Figure,
     Missing,
     Question,
-    drift_state,
-    outcomes,
     row_places,
     state,
 )
 from pipeline.report.temperature import pairs
 from pipeline.report.temperature.answers import repetitions
 from pipeline.report.temperature.judgement import NAMES, Judgement
+from pipeline.report.temperature.verdict import ANSWERS, BRIEF, drift_state
 
 
 def render(sources: Sources, judged: Judgement) -> str:
@@ -57,7 +53,7 @@ def render(sources: Sources, judged: Judgement) -> str:
         repetitions=repetitions(sources),
         seeds=len(sources.declared.panel.judging.seeds),
         change=_change_sentence(
-            judged, sources.accepted, _deposition_moves(sources), setpoint_change.said(sources)
+            judged, sources.accepted, _deposition_moves(sources), setpoint_change.moved_cases(sources)
         ),
         drift=judged.drifted,
         drift_state=drift_state(judged.roles["data_driven"]),
@@ -94,7 +90,8 @@ def _drifts(judged: Judgement) -> str:
     """Drift of the three loops in a sentence; only the temperature loop's is measured, by the nightly job."""
     if drift_state(judged.roles["data_driven"]) in (OPEN, UNDECIDED):
         return "Drift is not measured in any loop."
-    return f"Drift: temperature {judged.drifted.word[:1].lower()}{judged.drifted.word[1:].rstrip('.')}, not measured in the others."
+    word = judged.drifted.word
+    return f"Drift: temperature {word[:1].lower()}{word[1:].rstrip('.')}, not measured in the others."
 
 
 # ---- the verdict
@@ -102,19 +99,18 @@ def _drifts(judged: Judgement) -> str:
 
 def verdict_parts(judged: Judgement) -> dict[str, Any]:
     """Decision, reason and remedy, and the five rules for the two controllers that compete."""
-    found = {role: outcomes(judged.asked, judged.roles[role]) for role in ("data_driven", "model_based")}
     table = [
         {
-            "rule": rule[:1].upper() + rule[1:],
-            "answers": ANSWERS[rule],
-            "states": [found[role][i].state for role in found],
-            "first": rule == judged.verdict.rule,
+            "rule": learned.name[:1].upper() + learned.name[1:],
+            "answers": ANSWERS[learned.name],
+            "states": [learned.state, designed.state],
+            "first": learned.name == judged.verdict.rule,
         }
-        for i, rule in enumerate(ANSWERS)
+        for learned, designed, _ in judged.verdict.rules
     ]
     changed = judged.changed.parameters if judged.changed else []
     return {
-        "state": {FAILED: "failed", OPEN: "open", PASSED: "passed"}[judged.verdict.state],
+        "state": judged.verdict.word,
         "decision": judged.verdict.decision,
         "lead": judged.verdict.lead,
         "reason": judged.verdict.reason,
@@ -146,7 +142,8 @@ def _row(question: Question, judged: Judgement) -> dict[str, Any]:
         "sub": _sub(question, pair),
         "cells": [_cell(question, role, figure, places) for role, figure in pair],
         # as it was declared: "10.000 %" reads as ten thousand where a point parts thousands
-        "limit": f"{'≥' if question.at_least else '≤'} {quantity(question.limit, question.unit, declared(question.limit))}",
+        "limit": f"{'≥' if question.at_least else '≤'} "
+        f"{quantity(question.limit, question.unit, declared(question.limit))}",
         "state": state(question, pair[0][1]),
         "strip": charts.strip(question, [(ROLES[role], page.MARKS[role], figure) for role, figure in pair]),
         "change": move.text() if move else "first run",
@@ -242,7 +239,12 @@ def _change_sentence(
         "strong": f"{len(found)} of {len(judged.asked)} figures moved beyond their noise.",
         # in its place where the page finds, by script, that nothing but the machine differs
         "alone": f"{len(found)} of {len(judged.asked)} figures moved with the machine alone.",
-        "text": f"{said[:1].upper()}{said[1:]}. {_inputs(judged.changed)} {elsewhere if any(others) else ''}".strip(),
+        "text": " ".join(
+            filter(
+                None,
+                [f"{said[:1].upper()}{said[1:]}.", _inputs(judged.changed), elsewhere if any(others) else ""],
+            )
+        ),
     }
 
 
@@ -332,7 +334,7 @@ def difference_parts(sources: Sources, judged: Judgement) -> dict[str, Any]:
         "rest": [
             *still,
             "Not measured in either run: drift." if sources.nightly is None else "",
-            deposition_change.said(parts),
+            deposition_change.sentence(parts),
         ],
         "changed": changed,
         "empty": changed.empty and not moved,

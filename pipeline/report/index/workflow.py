@@ -77,7 +77,10 @@ def _finding(states: Mapping[str, str]) -> str:
     # what was made anew although nothing that it reads was: there the
     # cause is in its own inputs, parameters or code
     first = [stage for stage in names if not any(states[read] == CHANGED for read in READS[stage])]
-    return f"{count(same, 'stage').capitalize()} of {len(states)} gave what they gave in the accepted run, to the byte. New results begin at {', '.join(first)}."
+    return (
+        f"{count(same, 'stage').capitalize()} of {len(states)} gave what they gave in the accepted run, to "
+        f"the byte. New results begin at {', '.join(first)}."
+    )
 
 
 # ---- the drawing

@@ -9,6 +9,7 @@ from markupsafe import Markup
 
 from pipeline.nightly.settings import Nightly
 from pipeline.report.shared import charts, page
+from pipeline.report.shared import night as records
 from pipeline.report.shared.digits import count, number, short
 from pipeline.report.shared.verdict import FAILED, OPEN, PASSED
 
@@ -35,13 +36,13 @@ def render(nights: Sequence[Mapping[str, Any]], state: Mapping[str, Any], settin
     """The whole page; `nights` as the job remembers them, the oldest first, the
     last of them tonight's; `state` is champion.json."""
     tonight = nights[-1]
-    seen = next((night for night in reversed(nights) if night.get("drift", {}).get("figures")), None)
+    drift = records.read(tonight.get("drift"))
+    measured = next((night for night in reversed(nights) if night.get("drift", {}).get("figures")), None)
     good = [night for night in nights if night["outcome"] != "failed"]
     return page.render(
         "nightly.html", here="nightly", title=_head(tonight)[0], verdict=_verdict(tonight, state),
         champions=_champions(state), decisions=_decisions(tonight),
-        drift=_drift(seen, settings) if seen else None, alarms=tonight.get("drift", {}).get("alarms", []),
-        watched=tonight.get("drift", {}).get("watched", []),
+        drift=_drift(measured, settings) if measured else None, alarms=drift.alarms, watched=drift.watched,
         pictures=_pictures(nights, settings), nights=[_row(night) for night in reversed(nights[-SHOWN:])],
         more=max(len(nights) - SHOWN, 0),
         history=[_line(line) for line in reversed(state["history"])],
@@ -58,36 +59,51 @@ def _when(text: str) -> str:
 
 
 def _head(night: Mapping[str, Any]) -> tuple[str, str]:
-    alarms = night.get("drift", {}).get("alarms", [])
+    drifted = _drifted(night)
     if night["outcome"] == "failed":
         return "The night failed; the champions stay.", FAILED
-    if alarms:
-        return "The machine has drifted; the champions stay.", FAILED
+    if drifted:
+        what = "The machine has drifted" if drifted == [records.PLANT] else f"Drift of {', '.join(drifted)}"
+        promoted = ", ".join(night.get("promoted", []))
+        return (f"{what}; promoted: {promoted}." if promoted else f"{what}; the champions stay."), FAILED
     if night["outcome"] == "quarantined":
         return "Bad recordings are set aside; the champions stay.", FAILED
     head = f"Promoted: {', '.join(night['promoted'])}." if night.get("promoted") else "The champions stay."
     return (f"{head} Bad recordings are set aside.", FAILED) if night.get("quarantined") else (head, PASSED)
 
 
+def _drifted(night: Mapping[str, Any]) -> list[str]:
+    """The loops that raised an alarm."""
+    return list(dict.fromkeys(alarm.loop for alarm in records.read(night.get("drift")).alarms))
+
+
 def _verdict(night: Mapping[str, Any], state: Mapping[str, Any]) -> dict[str, Any]:
     head, kind = _head(night)
-    alarms = night.get("drift", {}).get("alarms", [])
+    alarms, drifted = records.read(night.get("drift")).alarms, _drifted(night)
     reasons = (
-        [alarm["cause"] for alarm in alarms]
+        # of the loops that did not drift is said what is said on any night
+        [*(alarm.cause for alarm in alarms), *_reasons(night, without=drifted)]
         if alarms and night["outcome"] != "failed"
-        else [*_together(night), *night.get("quarantined", {}).values()]
+        else [*_reasons(night), *night.get("quarantined", {}).values()]
     )
     remedy = {
-        "failed": f"Nothing of what is in production has changed. The log is .beadline/logs/{night['run']}.log; mend the cause, and the next night works.",
+        "failed": (
+            "Nothing of what is in production has changed. "
+            f"The log is .beadline/logs/{night['run']}.log; mend the cause, and the next night works."
+        ),
         "promoted": "To go back: ./run beadline rollback.",
     }.get(night["outcome"], "")
     if night.get("quarantined"):
-        remedy = f"{remedy} They lie in datasets/quarantine, unchanged, each with its reason beside it; mend them and put them back.".strip()
+        remedy = (
+            f"{remedy} They lie in datasets/quarantine, unchanged, each with its reason beside it; mend them "
+            "and put them back."
+        ).strip()
     if alarms and night["outcome"] != "failed":
         remedy = (
-            "No challenger of this loop is promoted while this lasts. Look at the machine; "
-            "where the change is meant to stay: "
-            f'./run beadline nightly --accept-drift {alarms[0]["loop"]} "WHY".'
+            f"No challenger of {'this loop' if len(drifted) == 1 else 'these loops'} is promoted while this "
+            "lasts. Look at the machine; where the change is meant to stay: "
+            + " and ".join(f'./run beadline nightly --accept-drift {loop} "WHY"' for loop in drifted)
+            + "."
         )
     return {
         "state": "failed" if kind == FAILED else "passed",
@@ -98,14 +114,14 @@ def _verdict(night: Mapping[str, Any], state: Mapping[str, Any]) -> dict[str, An
     }
 
 
-def _together(night: Mapping[str, Any]) -> list[str]:
-    """The night's reasons, those that several loops share said once."""
+def _reasons(night: Mapping[str, Any], *, without: Sequence[str] = ()) -> list[str]:
+    """The night's reasons, those that several loops share once; of the loops `without` nothing."""
     loops: dict[str, list[str]] = {}
     for name, decision in night.get("decisions", {}).items():
-        loops.setdefault("; ".join(decision["reasons"]), []).append(name)
-    return [f"{', '.join(names)}: {reason}" for reason, names in loops.items()] or list(
-        night.get("reasons", [])
-    )
+        if name not in without:
+            loops.setdefault("; ".join(decision["reasons"]), []).append(name)
+    by_loop = [f"{', '.join(names)}: {reason}" for reason, names in loops.items()]
+    return by_loop if by_loop or without else list(night.get("reasons", []))
 
 
 def _champions(state: Mapping[str, Any]) -> list[dict[str, str]]:
@@ -122,15 +138,10 @@ def _champions(state: Mapping[str, Any]) -> list[dict[str, str]]:
 
 
 def _decisions(night: Mapping[str, Any]) -> list[dict[str, Any]]:
-    found = []
+    rows = []
     for name, decision in night.get("decisions", {}).items():
-        guards = [
-            {"name": GUARDS.get(guard, guard), "champion": _figure(figures.get("champion")),
-            "challenger": _figure(figures.get("challenger")), "allowed": _figure(figures.get("allowed")),
-             "bad": figures.get("champion") is not None and figures["challenger"] > figures["champion"] + figures["allowed"] + 1e-9 * abs(figures["champion"])}
-            for guard, figures in decision.get("guards", {}).items()
-        ]  # fmt: skip
-        found.append(
+        guards = [_guard(guard, figures) for guard, figures in decision.get("guards", {}).items()]
+        rows.append(
             {
                 "loop": name,
                 "decision": decision["decision"],
@@ -140,19 +151,30 @@ def _decisions(night: Mapping[str, Any]) -> list[dict[str, Any]]:
                 "compared": any(guard["champion"] for guard in guards),
             }
         )
-    return found
+    return rows
 
 
-def _paired(found: Mapping[str, float] | None) -> str:
-    if not found:
+def _guard(name: str, figures: Mapping[str, float | None]) -> dict[str, Any]:
+    champion, challenger, allowed = (figures.get(key) for key in ("champion", "challenger", "allowed"))
+    return {
+        "name": GUARDS.get(name, name),
+        "champion": _figure(champion),
+        "challenger": _figure(challenger),
+        "allowed": _figure(allowed),
+        "bad": champion is not None and challenger > champion + allowed + 1e-9 * abs(champion),
+    }
+
+
+def _paired(test: Mapping[str, float] | None) -> str:
+    if not test:
         return ""
-    low, high = number(found["low_percent"], 1), number(found["high_percent"], 1)
-    word = "less" if found["improvement_percent"] >= 0 else "more"
+    low, high = number(test["low_percent"], 1), number(test["high_percent"], 1)
+    word = "less" if test["improvement_percent"] >= 0 else "more"
     return (
-        f"The challenger's cases cost {number(abs(found['improvement_percent']), 1)} % {word} (90 % interval "
+        f"The challenger's cases cost {number(abs(test['improvement_percent']), 1)} % {word} (90 % interval "
         f"of the saving {low} to {high} %); chance alone does as well with "
-        f"probability {short(found['p'], 2)}, by a sign-flip test over {count(found['blocks'], 'block')} of "
-        f"{count(found['cases'], 'case')}."
+        f"probability {short(test['p'], 2)}, by a sign-flip test over {count(test['blocks'], 'block')} of "
+        f"{count(test['cases'], 'case')}."
     )
 
 
@@ -162,7 +184,10 @@ def _figure(value: float | None) -> str:
 
 def _rule(settings: Nightly) -> str:
     r = settings.rule
-    return f"Promoted is what is at least {r.least_improvement_percent:g} % better, at level {r.level:g}, with no guard worse than is allowed, on a night without drift; otherwise the champion stays."
+    return (
+        f"Promoted is what is at least {r.least_improvement_percent:g} % better, at level {r.level:g}, with "
+        "no guard worse than is allowed, on a night without drift; otherwise the champion stays."
+    )
 
 
 # ---- drift
@@ -185,13 +210,21 @@ def _drift(night: Mapping[str, Any], settings: Nightly) -> dict[str, Any]:
         for name, one in figures["innovation"].items()
     ]  # fmt: skip
     loop = figures["closed_loop"]
-    told = loop.get("not_applicable") or ""
     worst = sorted(
         ((abs(one["sigmas"]), name, one) for name, one in loop.items() if isinstance(one, dict)), reverse=True
     )[:6]
-    return {"recording": path, "run": night["run"], "rows": rows, "innovation": innovation, "limit": f"{limit:g}", "loop_told": told,
-            "loop": [{"name": _words(name), "moved": number(one["moved"], 2),
-            "sigmas": number(one["sigmas"], 1)} for _, name, one in worst]}  # fmt: skip
+    return {
+        "recording": path,
+        "run": night["run"],
+        "rows": rows,
+        "innovation": innovation,
+        "limit": f"{limit:g}",
+        "not_applicable": loop.get("not_applicable") or "",
+        "loop": [
+            {"name": _words(name), "moved": number(one["moved"], 2), "sigmas": number(one["sigmas"], 1)}
+            for _, name, one in worst
+        ],
+    }
 
 
 def _words(name: str) -> str:
@@ -257,7 +290,10 @@ def _pictures(nights: Sequence[Mapping[str, Any]], settings: Nightly) -> list[di
         charts.dots(frame, x, y),
         charts.level(frame, settings.drift.alarm_sigmas, "lim", "alarm"),
     ]
-    alt = f"Largest change of a plant parameter over {len(x)} nights: {number(y[-1], 1)} sigmas last night, {number(max(y), 1)} at most; the alarm is at {settings.drift.alarm_sigmas:g}"
+    alt = (
+        f"Largest change of a plant parameter over {len(x)} nights: {number(y[-1], 1)} sigmas last night, "
+        f"{number(max(y), 1)} at most; the alarm is at {settings.drift.alarm_sigmas:g}"
+    )
     return [
         {
             "svg": charts.panel(frame, layers, alt=alt, title="Largest change of a plant parameter, sigmas"),
@@ -270,7 +306,7 @@ def _pictures(nights: Sequence[Mapping[str, Any]], settings: Nightly) -> list[di
 
 
 def _row(night: Mapping[str, Any]) -> dict[str, Any]:
-    alarms = [alarm["cause"] for alarm in night.get("drift", {}).get("alarms", [])]
+    alarms = [alarm.cause for alarm in records.read(night.get("drift")).alarms]
     state = (
         FAILED
         if night["outcome"] == "failed" or night.get("quarantined") or alarms
@@ -278,15 +314,22 @@ def _row(night: Mapping[str, Any]) -> dict[str, Any]:
         if night["outcome"] == "nothing new"
         else PASSED
     )
-    told = "; ".join([*_together(night), *night.get("quarantined", {}).values()])
+    reasons = "; ".join([*_reasons(night), *night.get("quarantined", {}).values()])
     return {
         "run": night["run"], "when": _when(night["when"]), "state": state, "outcome": night["outcome"],
         "new": sum(map(len, night.get("new_recordings", {}).values())),
-        "reasons": "; ".join([*(alarm for alarm in alarms if alarm not in told), told]),
+        "reasons": "; ".join([*(alarm for alarm in alarms if alarm not in reasons), reasons]),
         "seconds": number(night.get("seconds", 0), 0),
     }  # fmt: skip
 
 
 def _line(line: Mapping[str, Any]) -> dict[str, str]:
-    return {"when": _when(line["when"]), "loop": line["loop"], "run": line["run"], "event": line["event"], "before": line["before"] or "nothing", "why": line["why"],
-            "hash": line["champion"]["folder"]["md5"][:12]}  # fmt: skip
+    return {
+        "when": _when(line["when"]),
+        "loop": line["loop"],
+        "run": line["run"],
+        "event": line["event"],
+        "before": line["before"] or "nothing",
+        "why": line["why"],
+        "hash": line["champion"]["folder"]["md5"][:12],
+    }

@@ -7,13 +7,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.report.runs.history import Figure, Run
+from pipeline.report.runs.history import Figure, Revision
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import count, decimals, quantity, short
-from pipeline.report.shared.verdict import Question, ReportRules, questions
+from pipeline.report.shared.verdict import Question, ReportRules
+from pipeline.report.temperature.verdict import questions
 
-# controller of the artifacts -> class of its line and its name; the
-# deposition loop has the composer in use alone
+# controller of the artifacts -> class of its line and its name; of the deposition loop only the composer in
+# use is drawn
 SHOWN = {
     "window": ("dd", "data-driven"),
     "model_based": ("mb", "model-based"),
@@ -30,9 +31,9 @@ class Panel(NamedTuple):
 
 
 def render(
-    found: Sequence[Run], rules: ReportRules, *, band_degC: float, pages: Sequence[tuple[str, str]]
+    runs: Sequence[Revision], rules: ReportRules, *, band_degC: float, pages: Sequence[tuple[str, str]]
 ) -> str:
-    """The text of history.html; `pages` (name, file) are those that lie beside it."""
+    """The text of history.html. `pages` (name, file) are those that lie beside it."""
     asked = questions(rules, band_degC=band_degC)
     parts = [
         Question(
@@ -44,89 +45,94 @@ def render(
     return page.render(
         "history.html",
         here="history",
-        title=f"History: {count(len(found), 'run')}",
-        first=found[0],
-        last=found[-1],
-        runs=len(found),
+        title=f"History: {count(len(runs), 'run')}",
+        first=runs[0],
+        last=runs[-1],
+        runs=len(runs),
         pages=pages,
         loops=[
-            ("Temperature", [_panel(question, found, SHOWN) for question in asked]),
+            ("Temperature", [_panel(question, runs, SHOWN) for question in asked]),
             (
                 "Deposition",
-                [_panel(question, found, {"deposition": ("dd", "composer in use")}) for question in parts],
+                [_panel(question, runs, {"deposition": ("dd", "composer in use")}) for question in parts],
             ),
         ],
         heads=[question.title for question in (*asked, *parts)],
-        rows=[_row(run, (*asked, *parts)) for run in reversed(found[-ROWS:])],
-        more=max(len(found) - ROWS, 0),
+        rows=[_row(run, (*asked, *parts)) for run in reversed(runs[-ROWS:])],
+        more=max(len(runs) - ROWS, 0),
     )
 
 
-def _figure(run: Run, name: str, key: str) -> Figure | None:
+def _figure(run: Revision, name: str, key: str) -> Figure | None:
     return run.figures.get(name, {}).get(key)
 
 
-def _panel(question: Question, found: Sequence[Run], lines: dict[str, tuple[str, str]]) -> Panel:
-    """Medians by run with the first controller's band; the limit of
-    today; a run without the figure leaves a gap."""
-    ends = {name: np.array([_ends(_figure(run, name, question.key)) for run in found]) for name in lines}
+def _panel(question: Question, runs: Sequence[Revision], lines: dict[str, tuple[str, str]]) -> Panel:
+    """Medians by run, the first controller's band, and today's limit. A run without the figure leaves a
+    gap."""
+    ends = {name: np.array([_ends(_figure(run, name, question.key)) for run in runs]) for name in lines}
     values = np.concatenate([part[np.isfinite(part)] for part in ends.values()] + [[question.limit]])
-    frame = charts.Frame(_runs(len(found)), _scale(values), 368, 150, 40)
+    frame = charts.Frame(_runs(len(runs)), _scale(values), 368, 150, 40)
     layers: list[Markup] = [charts.level(frame, question.limit, "lim", f"limit {question.limit:g}")]
-    at = np.arange(1, len(found) + 1)
-    said = []
+    at = np.arange(1, len(runs) + 1)
+    changes = []
     for i, (name, (css, word)) in enumerate(lines.items()):
         middle, low, high = ends[name].T
         if i == 0:
-            known = charts.stretches(np.isfinite(low + high))
             layers += [
                 charts.ribbon(frame, at[a:b], low[a:b], high[a:b], f"ribbon {css}")
-                for a, b in known
+                for a, b in charts.stretches(np.isfinite(low + high))
                 if b - a > 1
             ]
         layers += [
             charts.line(frame, at, middle, f"line {css}"),
             charts.dots(frame, at, middle, f"dot {css}", 2.2),
         ]
-        known = middle[np.isfinite(middle)]
-        if len(known):
-            said.append(f"{word} from {_said(question, known[0])} to {_said(question, known[-1])}")
-    alt = f"{question.title} over {count(len(found), 'run')}: {'; '.join(said) or 'not measured'}; limit {_said(question, question.limit)}"
+        measured = middle[np.isfinite(middle)]
+        if len(measured):
+            first, last = _words(question, measured[0]), _words(question, measured[-1])
+            changes.append(f"{word} from {first} to {last}")
     unit = question.unit or "1"
     picture = charts.panel(
         frame,
         layers,
-        alt=alt,
+        alt=_alternative(question, len(runs), changes),
         css="mb wide",
         title=f"{unit}{', log' if frame.y.log else ''}",
         units=("", question.unit),
     )
-    now = _figure(found[-1], next(iter(lines)), question.key)
-    return Panel(question.title, f"now {_said(question, now.value) if now else 'not measured'}", picture)
+    now = _figure(runs[-1], next(iter(lines)), question.key)
+    return Panel(question.title, f"now {_words(question, now.value) if now else 'not measured'}", picture)
+
+
+def _alternative(question: Question, runs: int, changes: Sequence[str]) -> str:
+    """The picture in words."""
+    lines = "; ".join(changes) or "not measured"
+    return f"{question.title} over {count(runs, 'run')}: {lines}; limit {_words(question, question.limit)}"
 
 
 def _ends(figure: Figure | None) -> tuple[float, float, float]:
     return (math.nan,) * 3 if figure is None else tuple(v if math.isfinite(v) else math.nan for v in figure)
 
 
-def _said(question: Question, value: float) -> str:
+def _words(question: Question, value: float) -> str:
     return quantity(value, question.unit, min(decimals(0, 0, value=value), 3), beyond=question.beyond)
 
 
 def _runs(number: int) -> charts.Axis:
-    """Whole runs, the first and the last of them named."""
+    """An axis of runs; the first and the last are named."""
     return charts.Axis(0.5, number + 0.5, tuple((k, f"run {k}") for k in dict.fromkeys((1, number))))
 
 
 def _scale(values: np.ndarray) -> charts.Axis:
-    """Linear from zero, or decades where the figures span more than fifty to one."""
+    """Linear from zero, or decades if the figures span more than fifty to one."""
     positive = values[values > 0]
     if len(positive) and positive.max() > 50 * positive.min():
         return charts.logarithmic(float(positive.min()), float(positive.max()))
     return charts.linear(min(float(values.min()), 0.0), 1.1 * float(values.max()))
 
 
-def _row(run: Run, asked: Sequence[Question]) -> dict[str, Any]:
+def _row(run: Revision, asked: Sequence[Question]) -> dict[str, Any]:
     cells = []
     for question in asked:
         figure = _figure(run, "window", question.key) or _figure(run, "deposition", question.key)
@@ -134,10 +140,9 @@ def _row(run: Run, asked: Sequence[Question]) -> dict[str, Any]:
             cells.append({"text": "not measured", "number": "", "bad": False})
             continue
         beyond = figure.value < question.limit if question.at_least else figure.value > question.limit
-        text = f"{short(figure.value, 3)}" if math.isfinite(figure.value) else question.beyond
-        cells.append(
-            {"text": text, "number": figure.value if math.isfinite(figure.value) else "", "bad": beyond}
-        )
+        finite = math.isfinite(figure.value)
+        text = f"{short(figure.value, 3)}" if finite else question.beyond
+        cells.append({"text": text, "number": figure.value if finite else "", "bad": beyond})
     return {
         "commit": run.commit[:8],
         "date": run.date[:10],

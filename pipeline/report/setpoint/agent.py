@@ -35,8 +35,17 @@ TAUGHT = {
     "phase3": ("The paper’s agent", "phases 1 to 3, judged with classes that are always right"),
     "phase3_at_0.7": ("The paper’s agent", f"phases 1 to 3, judged with 70{THIN}% right"),
     "phase4": ("The paper’s agent", f"all four phases, judged with 70{THIN}% right"),
-    "ours": ("Our agent", "as deployed, judged with classes that are always right"),
-    "ours_at_0.7": ("Our agent", f"as deployed, judged with 70{THIN}% right"),
+    "belief_dqn": ("Our agent", "as deployed, judged with classes that are always right"),
+    "belief_dqn_at_0.7": ("Our agent", f"as deployed, judged with 70{THIN}% right"),
+}
+
+
+# the line of a controller, by its mark
+LINES = {
+    "data_driven": "line dd",
+    "kernel": "line dd dash",
+    "model_based": "line",
+    "exact_model": "line dash",
 }
 
 
@@ -46,7 +55,7 @@ TAUGHT = {
 def shown(board: Board, table: Table, case: Case) -> list[str]:
     """The default first, then the paper's agent, then the best of the
     other side, as far as their ways were kept."""
-    kept = {
+    in_paths = {
         str(name)
         for name in table["controller"][(table["simulator"] == case[0]) & (table["case"] == case[1])]
     }
@@ -58,7 +67,7 @@ def shown(board: Board, table: Table, case: Case) -> list[str]:
     return [
         name
         for name in dict.fromkeys((board.default or board.names[0], board.best(PAPER), other))
-        if name in kept
+        if name in in_paths
     ]
 
 
@@ -66,9 +75,9 @@ def ways(sources: Sources, board: Board | Missing) -> list[Picture]:
     """For each simulator whose ways were kept, everybody's ways over
     the reward and their flow step by step."""
     table, title = sources.tables["paths"], "From 21 starts to the best setpoint"
-    for found in (board, table):
-        if isinstance(found, Missing):
-            return [hole("ways", title, found)]
+    for needed in (board, table):
+        if isinstance(needed, Missing):
+            return [hole("ways", title, needed)]
     there = list(dict.fromkeys(zip(map(str, table["simulator"]), map(str, table["case"]), strict=True)))
     cases = [case for case in (*CASES, *(one for one in there if one[0] == "pixels")) if case in there][
         :3
@@ -85,14 +94,14 @@ def ways(sources: Sources, board: Board | Missing) -> list[Picture]:
 
 
 def _ways(sources: Sources, board: Board, table: Table, case: Case, i: int) -> Picture:
-    columns, said = [], []
+    columns, sentences = [], []
     for name in shown(board, table, case):
         mine = (table["controller"] == name) & (table["simulator"] == case[0]) & (table["case"] == case[1])
         flow, temperature = _by_start(table, mine, "flow_percent"), _by_start(table, mine, "temperature_degC")
         inside = _inside(flow, temperature)
         ends = sum(one[min(len(one) - 1, SETTLED_BY) :].all() for one in inside)
         mark, css = role(board, name), page.MARKS[role(board, name)]
-        said.append(f"{name} {ends} of {len(flow)}")
+        sentences.append(f"{name} {ends} of {len(flow)}")
         first = not columns
         panels = [_surface(name, flow, temperature, ends, css, first), _steps(name, flow, inside, css, first)]
         columns.append(
@@ -102,7 +111,7 @@ def _ways(sources: Sources, board: Board, table: Table, case: Case, i: int) -> P
     return Picture(
         f"ways-{i}",
         f"{where}: from 21 starts to the best setpoint",
-        f"Inside by decision {SETTLED_BY} and to the end: {'; '.join(said)}.",
+        f"Inside by decision {SETTLED_BY} and to the end: {'; '.join(sentences)}.",
         columns,
         "One run from each start. Above: temperature against true flow, over the paper’s reward with a, "
         f"b = {PHASES[-1][0]:g}, {PHASES[-1][1]:g}; lines of equal reward "
@@ -144,7 +153,13 @@ def _surface(
 ) -> Markup:
     frame = charts.Frame(FLOW, TEMPERATURE, 368, 244, 30, above=22)
     layers = [_rings(frame)]
-    box = [float(v) for v in (*frame.px([BEST_FLOW - FLOW_BAND, BEST_FLOW + FLOW_BAND]), *frame.py([BEST_TEMPERATURE + TEMPERATURE_BAND, BEST_TEMPERATURE - TEMPERATURE_BAND]))]  # fmt: skip
+    box = [
+        float(v)
+        for v in (
+            *frame.px([BEST_FLOW - FLOW_BAND, BEST_FLOW + FLOW_BAND]),
+            *frame.py([BEST_TEMPERATURE + TEMPERATURE_BAND, BEST_TEMPERATURE - TEMPERATURE_BAND]),
+        )
+    ]
     layers.append(
         Markup('<rect class="flag" x="{:.1f}" width="{:.1f}" y="{:.1f}" height="{:.1f}"/>').format(
             box[0], box[1] - box[0], box[2], box[3] - box[2]
@@ -154,7 +169,10 @@ def _surface(
         layers.append(charts.line(frame, q, u, "line way"))
     layers += [charts.dots(frame, q[:1], u[:1], "begin", 2.4) for q, u in zip(flow, temperature, strict=True)]
     last = [one[-1] for one in _inside(flow, temperature)]
-    layers += [charts.dots(frame, q[-1:], u[-1:], "dot whole" if ok else "dot off", 2.8) for q, u, ok in zip(flow, temperature, last, strict=True)]  # fmt: skip
+    layers += [
+        charts.dots(frame, q[-1:], u[-1:], "dot whole" if ok else "dot off", 2.8)
+        for q, u, ok in zip(flow, temperature, last, strict=True)
+    ]
     alt = f"{name}: of {len(flow)} starts {ends} end inside 90–110 % and 205–215 °C and stay there"
     return charts.panel(
         frame,
@@ -219,32 +237,32 @@ def training(sources: Sources) -> Picture:
     table, title = sources.tables["agents"], "The agents in training, phase after phase"
     if isinstance(table, Missing):
         return hole("agents", title, table)
-    columns, said = [], []
+    columns, sentences = [], []
     for agent in dict.fromkeys(map(str, table["agent"])):
         mine = {name: values[table["agent"] == agent] for name, values in table.items()}
         ends = [float(mine["reward"][mine["phase"] == k][-1]) for k in np.unique(mine["phase"])]
-        told = (
+        values = (
             ", ".join(number(end, 2) for end in ends)
             if len(ends) <= 6
             else f"{number(ends[0], 2)}, the last of {len(ends)} at {number(ends[-1], 2)}"
         )
-        word = "phase" if agent == "paper" else "round"
-        said.append(
+        word = "phase" if agent == "li_2025" else "round"
+        sentences.append(
             f"{_agent(agent)} ends its {f'{word}s' if len(ends) <= 6 else f'first {word}'} at a "
-            f"mean reward of {told}"
+            f"mean reward of {values}"
         )
         columns.append(
             Column(
                 _agent(agent),
-                "as published" if agent == "paper" else "ours",
-                "kernel" if agent == "paper" else "data_driven",
-                [_course(mine, agent, word, told)],
+                "as published" if agent == "li_2025" else "ours",
+                "kernel" if agent == "li_2025" else "data_driven",
+                [_course(mine, agent, word, values)],
             )
         )
     return Picture(
         "agents",
         title,
-        f"{'. '.join(said)}.",
+        f"{'. '.join(sentences)}.",
         columns,
         "Mean reward of a step, in the reward of its phase, against thousands of updates. As published: "
         f"{', then '.join(f'a, b = {a:g}, {b:g}' for a, b in PHASES)}, "
@@ -256,7 +274,7 @@ def training(sources: Sources) -> Picture:
     )
 
 
-def _course(mine: Table, agent: str, word: str, told: str) -> Markup:
+def _course(mine: Table, agent: str, word: str, reward_text: str) -> Markup:
     updates, reward, phases = mine["update"] / 1000, mine["reward"], np.unique(mine["phase"])
     span = max(float(reward.max() - reward.min()), 0.2)
     y = charts.linear(float(reward.min()) - 0.25 * span, float(reward.max()) + 0.1 * span, ticks=4)
@@ -283,14 +301,17 @@ def _course(mine: Table, agent: str, word: str, told: str) -> Markup:
             )
         )
         layers.append(charts.line(frame, updates[here], reward[here]))
-    alt = f"{_agent(agent)}: mean reward at the end of each {word} {told}, after {number(float(mine['update'].max()), 0)} updates in all"
+    alt = (
+        f"{_agent(agent)}: mean reward at the end of each {word} {reward_text}, "
+        f"after {number(float(mine['update'].max()), 0)} updates in all"
+    )
     return charts.panel(
         frame, layers, alt=alt, css="dd wide", title="mean reward", units=("thousand updates", "")
     )
 
 
 def _agent(name: str) -> str:
-    return {"paper": "The paper’s agent", "ours": "Our agent"}.get(name, name)
+    return {"li_2025": "The paper’s agent", "belief_dqn": "Our agent"}.get(name, name)
 
 
 def by_accuracy(sources: Sources, board: Board | Missing) -> Picture:
@@ -300,92 +321,84 @@ def by_accuracy(sources: Sources, board: Board | Missing) -> Picture:
     if isinstance(board, Missing):
         return hole("by-accuracy", title, board)
     cases = sorted(
-        (float(found[1]), case)
+        (float(match[1]), case)
         for case in board.cases
-        if (found := re.fullmatch(r"accuracy (\d\.?\d*)", case[1]))
+        if (match := re.fullmatch(r"accuracy (\d\.?\d*)", case[1]))
     )
     if len(cases) < 2:
         return hole("by-accuracy", title, Missing("not measured", "fewer than two accuracies were judged"))
-    learned, paper, base = board.learned(), board.best(PAPER), board.best(BASELINE)
-    names = [name for name in dict.fromkeys((learned, paper, base)) if name]
-    x = charts.Axis(100 * cases[0][0], 100 * cases[-1][0], tuple((100 * a, f"{100 * a:g}") for a, _ in cases))
     asked = sources.declared.rules
-    columns, said = [], []
-    for what, head, limit in (
-        ("settled", "Settle", asked.settled_percent),
-        ("stay", "Settle and stay", asked.stay_percent),
-        ("median", "Decisions until inside", None),
-    ):
-        curves = {name: _curve(board, name, cases, what) for name in names}
-        curves = {name: curve for name, curve in curves.items() if len(curve)}
-        top = (
-            104.0
-            if limit
-            else 1.1 * max((max(value for _, value in curve) for curve in curves.values()), default=1.0)
+    panels = [
+        _accuracy_panel(board, cases, what, head, limit)
+        for what, head, limit in (
+            ("settled", "Settle", asked.settled_percent),
+            ("stay", "Settle and stay", asked.stay_percent),
+            ("median", "Decisions until inside", None),
         )
-        y = (
-            charts.Axis(0, 104, ((0.0, "0"), (50.0, "50"), (100.0, "100")))
-            if limit
-            else charts.linear(0, top, ticks=4)
-        )
-        frame = charts.Frame(x, y, 368, 190, 30)
-        layers = (
-            [
-                charts.tint(frame, limit, 100),
-                charts.level(frame, limit, "lim", f"limit {limit:g}", above=False),
-            ]
-            if limit
-            else []
-        )
-        for name, curve in curves.items():
-            px, py = map(np.array, zip(*curve, strict=True))
-            css = {
-                "data_driven": "line dd",
-                "kernel": "line dd dash",
-                "model_based": "line",
-                "exact_model": "line dash",
-            }.get(role(board, name), "line bl")
-            layers += [
-                charts.line(frame, px, py, css),
-                charts.dots(frame, px, py, f"dot whole {page.MARKS[role(board, name)]}", 2.4),
-            ]
-        ends = [(curve[0][1], name) for name, curve in curves.items()]
-        layers += (
-            _names(frame, ends)
-            if limit
-            else _names(frame, [(curve[-1][1], name) for name, curve in curves.items()], right=True)
-        )
-        told = ", ".join(
-            f"{name} {number(value, 1) + THIN + '%' if limit else number(value, 0)}" for value, name in ends
-        )
-        said.append(f"{head}: {told}")
-        alt = f"At {100 * cases[0][0]:g} % right, {head.lower()}: {told}"
-        columns.append(
-            Column(
-                head,
-                "of runs, in per cent" if limit else "median of the runs that settle",
-                "",
-                [
-                    charts.panel(
-                        frame,
-                        layers,
-                        alt=alt,
-                        css="mb",
-                        title="%" if limit else "decisions",
-                        units=("% right", "%" if limit else ""),
-                    )
-                ],
-            )
-        )
+    ]
     return Picture(
         "by-accuracy",
         title,
-        f"With {100 * cases[0][0]:g}{THIN}% of the windows named rightly. {'; '.join(said)}.",
-        columns,
+        f"With {100 * cases[0][0]:g}{THIN}% of the windows named rightly. "
+        f"{'; '.join(sentence for _, sentence in panels)}.",
+        [column for column, _ in panels],
         "Share of runs on the paper’s simulator against the share of windows that are named rightly. Blue: "
         "our agent; blue, dashed: the paper’s; ink or grey: the best baseline. Grey area: what is asked for.",
         page.origin(sources.source("scoreboard")),
     )
+
+
+def _accuracy_panel(
+    board: Board, cases: list[tuple[float, Case]], what: str, head: str, limit: float | None
+) -> tuple[Column, str]:
+    """The panel of one figure, which has a limit where it is a share of runs, and its values at the lowest
+    accuracy in words."""
+    names = [
+        name for name in dict.fromkeys((board.learned(), board.best(PAPER), board.best(BASELINE))) if name
+    ]
+    curves = {name: curve for name in names if (curve := _curve(board, name, cases, what))}
+    frame = charts.Frame(_accuracies(cases), _figure_axis(curves, limit), 368, 190, 30)
+    layers = []
+    if limit:
+        layers = [
+            charts.tint(frame, limit, 100),
+            charts.level(frame, limit, "lim", f"limit {limit:g}", above=False),
+        ]
+    for name, curve in curves.items():
+        px, py = map(np.array, zip(*curve, strict=True))
+        mark = role(board, name)
+        layers += [
+            charts.line(frame, px, py, LINES.get(mark, "line bl")),
+            charts.dots(frame, px, py, f"dot whole {page.MARKS[mark]}", 2.4),
+        ]
+    first = [(curve[0][1], name) for name, curve in curves.items()]
+    last = [(curve[-1][1], name) for name, curve in curves.items()]
+    layers += _names(frame, first) if limit else _names(frame, last, right=True)
+    values = ", ".join(
+        f"{name} {number(value, 1) + THIN + '%' if limit else number(value, 0)}" for value, name in first
+    )
+    panel = charts.panel(
+        frame,
+        layers,
+        alt=f"At {100 * cases[0][0]:g} % right, {head.lower()}: {values}",
+        css="mb",
+        title="%" if limit else "decisions",
+        units=("% right", "%" if limit else ""),
+    )
+    small = "of runs, in per cent" if limit else "median of the runs that settle"
+    return Column(head, small, "", [panel]), f"{head}: {values}"
+
+
+def _accuracies(cases: list[tuple[float, Case]]) -> charts.Axis:
+    ticks = tuple((100 * a, f"{100 * a:g}") for a, _ in cases)
+    return charts.Axis(100 * cases[0][0], 100 * cases[-1][0], ticks)
+
+
+def _figure_axis(curves: dict[str, list[tuple[float, float]]], limit: float | None) -> charts.Axis:
+    if limit:
+        return charts.Axis(0, 104, ((0.0, "0"), (50.0, "50"), (100.0, "100")))
+    top = max((max(value for _, value in curve) for curve in curves.values()), default=1.0)
+    return charts.linear(0, 1.1 * top, ticks=4)
 
 
 def _curve(board: Board, name: str, cases: list[tuple[float, Case]], what: str) -> list[tuple[float, float]]:
@@ -393,7 +406,7 @@ def _curve(board: Board, name: str, cases: list[tuple[float, Case]], what: str) 
     cells = [(100 * a, cell) for a, case in cases if (cell := board.cells.get((name, case)))]
     if what == "median":
         return [(a, cell.median) for a, cell in cells if not math.isnan(cell.median)]
-    return [(a, found.value) for a, cell in cells if isinstance(found := getattr(cell, what), Figure)]
+    return [(a, share.value) for a, cell in cells if isinstance(share := getattr(cell, what), Figure)]
 
 
 def _names(frame: charts.Frame, ends: list[tuple[float, str]], *, right: bool = False) -> list[Markup]:
@@ -419,16 +432,16 @@ def phases(sources: Sources) -> dict[str, Any]:
         return {"missing": metrics, "rows": []}
     rows = []
     for name, (head, small) in TAUGHT.items():
-        found = metrics.get(name)
-        if not isinstance(found, dict):
+        figures = metrics.get(name)
+        if not isinstance(figures, dict):
             continue
-        steps, runs, stay = (lookup(found, key) for key in ("median_steps", "runs", "stay"))
+        steps, runs, stay = (lookup(figures, key) for key in ("median_steps", "runs", "stay"))
         rows.append(
             {
                 "name": head,
                 "small": small,
-                "mark": "data_driven" if name.startswith("ours") else "kernel",
-                "settled": percent(float(found["settled"]), 3),
+                "mark": "data_driven" if name.startswith("belief_dqn") else "kernel",
+                "settled": percent(float(figures["settled"]), 3),
                 "stay": "not measured" if isinstance(stay, Missing) else percent(float(stay), 3),
                 "steps": "none settled" if isinstance(steps, Missing) else number(float(steps), 0),
                 "runs": "not said" if isinstance(runs, Missing) else f"{runs:,}",
@@ -440,10 +453,17 @@ def phases(sources: Sources) -> dict[str, Any]:
 
 def _kept(metrics: dict[str, Any]) -> str:
     """What the rounds of our agent came to, on episodes that it did not learn from."""
-    judged, kept, rounds = (metrics.get(key) for key in ("validation", "kept_round", "rounds"))
-    if not judged or kept is None or not 0 <= kept < len(judged):
+    judged, best_round, rounds = (metrics.get(key) for key in ("validation", "kept_round", "rounds"))
+    if not judged or best_round is None or not 0 <= best_round < len(judged):
         return ""
-    before, after = number(float(judged[0]), 3), number(float(judged[kept]), 3)
-    if kept == 0:
-        return f"No round of ours was better than what it began with: {before} a step on episodes it did not learn from, and that is kept."
-    return f"Of ours round {kept} of {rounds} is kept: {after} a step on episodes it did not learn from, {before} before any training."
+    before, after = number(float(judged[0]), 3), number(float(judged[best_round]), 3)
+    if best_round == 0:
+        return (
+            f"No round of ours was better than what it began with: {before} a step on episodes it "
+            "did not learn "
+            "from, and that is kept."
+        )
+    return (
+        f"Of ours round {best_round} of {rounds} is kept: {after} a step on episodes it did not learn from, "
+        f"{before} before any training."
+    )

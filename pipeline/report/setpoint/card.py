@@ -33,74 +33,82 @@ FLOOR, CEILING = 1.0, 300.0
 ORDER = ("model_based", "data_driven", "baseline")
 
 
-def seats(found: Board) -> dict[str, str]:
+def controllers(scores: Board) -> dict[str, str]:
     """Who stands for each role: the best Bayes filter, the agent that competes, the best proportional
     control, or else the best of the other baselines."""
 
     def first(fits: Callable[[str], bool]) -> str:
         return next(
-            (name for name in found.names if found.kinds[name] == BASELINE and fits(name.lower())), ""
+            (name for name in scores.names if scores.kinds[name] == BASELINE and fits(name.lower())), ""
         )
 
     bayes = first(lambda name: "bayes" in name)
     plain = first(lambda name: "proportional" in name) or first(lambda name: "bayes" not in name)
-    return {"model_based": bayes, "data_driven": found.learned(), "baseline": plain}
+    return {"model_based": bayes, "data_driven": scores.learned(), "baseline": plain}
 
 
 def setpoint(sources: Sources) -> dict[str, Any]:
-    judged, found = verdict(sources), board(sources)
-    if isinstance(found, Missing) or not judged.default:
-        return unbuilt("setpoint", found.sentence() if isinstance(found, Missing) else judged.reason) | {
+    judged, scores = verdict(sources), board(sources)
+    if isinstance(scores, Missing) or not judged.winner:
+        return unbuilt("setpoint", scores.sentence() if isinstance(scores, Missing) else judged.reason) | {
             "link": "setpoint.html"
         }
-    who = seats(found)
-    role = next((role for role, name in who.items() if name == judged.default), "baseline")
+    who = controllers(scores)
+    role = next((role for role, name in who.items() if name == judged.winner), "baseline")
     table = sources.tables["paths"]
     case = CASES[1]
     rules = sources.declared.rules
+    passed, winner = judged.state == PASSED, ROLES[role]
+    who_wins = "The baseline" if role == "baseline" else winner.capitalize().replace("-", "\u2011")
+    state = f"Run {winner}" if passed else "Do not decide yet" if judged.state == OPEN else "Do not steer yet"
+    sparks = zip((who[role] for role in ORDER), ("mb", "dd", "bl"), strict=True)
     return {
         "id": "setpoint",
         "name": "Setpoint",
         "link": "setpoint.html",
         "moves": "Nozzle camera to flow and temperature setpoints",
-        "state": f"Run {ROLES[role]}" if judged.state == PASSED else "Do not decide yet" if judged.state == OPEN else "Do not steer yet",
-        "mark": role if judged.state == PASSED else None,
-        "win": (f"{'The baseline' if role == 'baseline' else ROLES[role].capitalize().replace('-', chr(0x2011))} wins." if judged.state == PASSED else judged.lead, _win(found, judged.default) if judged.state == PASSED else judged.reason),
-        "caption": f"Flow’s distance from 100\u00a0%, 90th percentile of 21 starts over 100 decisions, log scale {FLOOR:g} to {CEILING:g}\u00a0%: {case_text(case, whole=True)}. Grey: within {FLOW_BAND:g}\u00a0%.",
-        "panels": [_spark(table, name, case, css, named=i == 0) for i,
-        (name, css) in enumerate(zip((who[role] for role in ORDER), ("mb", "dd", "bl"), strict=True))],
-        "heads": [{"mark": role, "name": LABELS[CONTROLLERS[role]][0],
-        "method": who[role] or "none judged"} for role in ORDER],
-        "rows": [
-            {"title": "Settle, worst case",
-            "cells": _cells([worst(found, who[role], "settled")[0] for role in ORDER],
-            rules.settled_percent)},
-            {"title": "Settle and stay, worst case",
-            "cells": _cells([worst(found, who[role], "stay")[0] for role in ORDER], rules.stay_percent)},
-            {"title": "Recover from a clog",
-            "cells": _cells([worst(found, who[role], "recovered")[0] for role in ORDER],
-            rules.settled_percent)},
+        "state": state,
+        "mark": role if passed else None,
+        "win": (f"{who_wins} wins.", _win(scores, judged.winner)) if passed else (judged.lead, judged.reason),
+        "caption": "Flow’s distance from 100\u00a0%, 90th percentile of 21 starts over 100 decisions, log "
+        f"scale {FLOOR:g} to {CEILING:g}\u00a0%: {case_text(case, whole=True)}. Grey: within "
+        f"{FLOW_BAND:g}\u00a0%.",
+        "panels": [_spark(table, name, case, css, named=i == 0) for i, (name, css) in enumerate(sparks)],
+        "heads": [
+            {"mark": role, "name": LABELS[CONTROLLERS[role]][0], "method": who[role] or "none judged"}
+            for role in ORDER
         ],
-        "note": judged.claim,
+        "rows": [
+            {"title": title, "cells": _cells([worst(scores, who[role], what)[0] for role in ORDER], limit)}
+            for title, what, limit in (
+                ("Settle, worst case", "settled", rules.settled_percent),
+                ("Settle and stay, worst case", "stay", rules.stay_percent),
+                ("Recover from a clog", "recovered", rules.settled_percent),
+            )
+        ],
+        "note": judged.note,
         "model": None,
         "sources": sources.source("scoreboard", "paths", "choice"),
         "missing": None,
-    }  # fmt: skip
+    }
 
 
-def _win(found: Board, default: str) -> str:
+def _win(scores: Board, default: str) -> str:
     """The default's worst case beside those of the others."""
-    mine, place = worst(found, default, "lasting")
+    mine, place = worst(scores, default, "lasting")
     if place is None:
         return ""
-    name = named(found, default)
+    name = named(scores, default)
     others = [
-        f"{named(found, one)} {share_text(worst(found, one, 'lasting')[0])}"
-        for one in found.names
+        f"{named(scores, one)} {share_text(worst(scores, one, 'lasting')[0])}"
+        for one in scores.names
         if one != default
     ][:2]
     beside = f"; next in their own worst cases: {', '.join(others)}" if others else ""
-    return f"{name[:1].upper()}{name[1:]}: {share_text(mine)} of runs settle and stay in its worst case ({within(place)}){beside}."
+    return (
+        f"{name[:1].upper()}{name[1:]}: {share_text(mine)} of runs settle and stay in its worst case "
+        f"({within(place)}){beside}."
+    )
 
 
 def _cells(figures: Sequence[Figure | Missing], limit: float) -> list[dict[str, Any]]:
@@ -121,13 +129,29 @@ def _spark(table: Table | Missing, name: str, case: tuple[str, str], css: str, *
         if isinstance(table, Missing)
         else Missing("not measured", f"no way of {name or 'any controller'} was kept")
     )
-    rows = None if isinstance(table, Missing) else (table["controller"] == name) & (table["simulator"] == case[0]) & (table["case"] == case[1])  # fmt: skip
+    rows = (
+        None
+        if isinstance(table, Missing)
+        else (table["controller"] == name) & (table["simulator"] == case[0]) & (table["case"] == case[1])
+    )
     if rows is None or not rows.any():
         return Markup('<div class="hole">{}</div>').format(page.missing(gap))
     steps = np.unique(table["step"][rows])
     off = np.abs(table["flow_percent"][rows] - BEST_FLOW)
     curve = np.array([float(np.percentile(off[table["step"][rows] == k], 90)) for k in steps])
     bad = bool(curve[-1] > FLOW_BAND)
-    alt = f"{name}: nine of ten starts are within {number(float(curve[-1]), 1)} % of full flow after {int(steps[-1])} decisions, {'outside' if bad else 'inside'} the {FLOW_BAND:g} % asked for"
+    alt = (
+        f"{name}: nine of ten starts are within {number(float(curve[-1]), 1)} % of full flow after "
+        f"{int(steps[-1])} decisions, {'outside' if bad else 'inside'} the {FLOW_BAND:g} % asked for"
+    )
     axis = charts.logarithmic(FLOOR, CEILING)._replace(low=FLOOR, high=CEILING)
-    return charts.spark(steps.astype(float), np.maximum(curve, FLOOR), axis, css=css, limit=FLOW_BAND, alt=alt, named=named, bad=bad, limit_label=f"limit {FLOW_BAND:g}", units=("decisions", "%"))  # fmt: skip
+    return charts.spark(
+        steps.astype(float),
+        np.maximum(curve, FLOOR),
+        axis,
+        css=css,
+        limit=FLOW_BAND,
+        alt=alt,
+        limit_label=f"limit {FLOW_BAND:g}" if named else "",
+        units=("decisions", "%"),
+    )

@@ -39,14 +39,17 @@ def change(sources: Sources, case: Case, cell: Cell | None) -> dict[str, Any]:
     if now.low <= then.high and then.low <= now.high:
         return still | {"text": "within noise"}
     question = Question(0, "", "Settled", "%", sources.declared.rules.settled_percent, True, "")
-    text = f"{'+' if points > 0 else MINUS}{number(abs(points), 1)}{THIN}points · {'better' if points > 0 else 'worse'}"
+    text = (
+        f"{'+' if points > 0 else MINUS}{number(abs(points), 1)}{THIN}points · "
+        f"{'better' if points > 0 else 'worse'}"
+    )
     return {"text": text, "moved": True, "worse": points < 0 and state(question, now) == FAILED}
 
 
-def said(sources: Sources) -> tuple[int, int]:
+def moved_cases(sources: Sources) -> tuple[int, int]:
     """How many cases of the default moved beyond noise, of how many that count."""
-    found = board(sources)
-    if isinstance(found, Missing) or not found.default:
+    scores = board(sources)
+    if isinstance(scores, Missing) or not scores.default:
         return 0, 0
-    changes = [change(sources, case, cell) for case, cell in found.counting(found.default)]
+    changes = [change(sources, case, cell) for case, cell in scores.counting(scores.default)]
     return sum(one["moved"] for one in changes), len(changes)

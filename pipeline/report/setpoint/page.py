@@ -19,7 +19,7 @@ from pipeline.report.setpoint.verdict import (
     lasting,
     role,
     share_text,
-    told,
+    summary,
     verdict,
     worst,
 )
@@ -57,33 +57,38 @@ LANES = {"data_driven": "dd", "kernel": "dd", "model_based": "mb", "exact_model"
 
 def render(sources: Sources) -> str:
     """The text of setpoint.html."""
-    judged, found = verdict(sources), board(sources)
-    known = None if isinstance(found, Missing) else found
+    judged, scores = verdict(sources), board(sources)
+    judged_scores = None if isinstance(scores, Missing) else scores
     return page.render(
         "setpoint.html",
         here="setpoint",
         title=f"Setpoint: {judged.decision.rstrip('.')}",
         verdict=judged,
         heads_of_rules=HEADS
-        if known is None
-        else (*HEADS[:2], role(known, known.best(BASELINE)) if known.best(BASELINE) else HEADS[2]),
-        second=known is not None and bool(known.default) and known.kinds[known.default] == BASELINE,
-        told=told(sources, known) if known and known.default else "",
-        no_board=found if isinstance(found, Missing) else None,
-        heads=heads(known),
-        answers=answers(sources, known) if known else [],
-        boards=boards(sources, known) if known else [],
-        worsts=worsts(known) if known else [],
-        ways=setpoint_agent.ways(sources, found),
+        if judged_scores is None
+        else (
+            *HEADS[:2],
+            role(judged_scores, judged_scores.best(BASELINE)) if judged_scores.best(BASELINE) else HEADS[2],
+        ),
+        second=judged_scores is not None
+        and bool(judged_scores.default)
+        and judged_scores.kinds[judged_scores.default] == BASELINE,
+        summary=summary(sources, judged_scores) if judged_scores and judged_scores.default else "",
+        no_board=scores if isinstance(scores, Missing) else None,
+        heads=heads(judged_scores),
+        answers=answers(sources, judged_scores) if judged_scores else [],
+        boards=boards(sources, judged_scores) if judged_scores else [],
+        worsts=worsts(judged_scores) if judged_scores else [],
+        ways=setpoint_agent.ways(sources, scores),
         strips=setpoint_why.strips(sources),
         training=setpoint_agent.training(sources),
-        by_accuracy=setpoint_agent.by_accuracy(sources, found),
+        by_accuracy=setpoint_agent.by_accuracy(sources, scores),
         phases=setpoint_agent.phases(sources),
         yardsticks=setpoint_vision.yardsticks(sources),
         reliability=setpoint_vision.reliability(sources),
         confusion=setpoint_vision.confusion(sources),
         distributions=setpoint_vision.distributions(sources),
-        course=setpoint_vision.course(sources),
+        course=setpoint_vision.learning_curves(sources),
         frames=setpoint_vision.frames(sources),
         data=setpoint_vision.data(sources),
         declared=[(section, flat(sources.declared.everything.get(section, {}))) for section in SECTIONS],
@@ -100,25 +105,25 @@ def render(sources: Sources) -> str:
 def hashes(sources: Sources) -> list[tuple[str, str]]:
     """Short digests by which two pages can be told to be of one run."""
     tables = {source.name: source.sha256 for source in sources.read.values()}
-    found = [(name, tables.get(name, "missing")) for name in ("classified", "scoreboard", "choice")]
+    digests = [(name, tables.get(name, "missing")) for name in ("classified", "scoreboard", "choice")]
     return [
         (name, value[:8])
         for name, value in [
-            *found,
+            *digests,
             ("parameters", digest(sources.declared.everything)),
             ("code", sources.code),
         ]
     ]
 
 
-def heads(found: Board | None) -> list[dict[str, Any]]:
+def heads(scores: Board | None) -> list[dict[str, Any]]:
     """The two controllers of the first screen: what learned, and the best baseline."""
-    pair = ("", "") if found is None else (found.learned(), found.best(BASELINE))
+    pair = ("", "") if scores is None else (scores.learned(), scores.best(BASELINE))
     return [
         {
             "name": name or "none",
-            "default": bool(name) and found is not None and name == found.default,
-            "mark": role(found, name) if name else fallback,
+            "default": bool(name) and scores is not None and name == scores.default,
+            "mark": role(scores, name) if name else fallback,
             "css": css,
         }
         for name, fallback, css in zip(pair, ("data_driven", "baseline"), ("dd", "mb"), strict=True)
@@ -128,26 +133,26 @@ def heads(found: Board | None) -> list[dict[str, Any]]:
 # ---- the first screen: a row for each case that counts
 
 
-def answers(sources: Sources, found: Board) -> list[dict[str, Any]]:
+def answers(sources: Sources, scores: Board) -> list[dict[str, Any]]:
     """Runs that settle and stay of what learned and of the best baseline; the strip shows the runs that are
     lost, as a share of those that may be."""
-    pair = (found.learned(), found.best(BASELINE))
+    pair = (scores.learned(), scores.best(BASELINE))
     cases = [
         case
-        for case in found.cases
-        if any((cell := found.cells.get((name, case))) and cell.counts for name in pair)
+        for case in scores.cases
+        if any((cell := scores.cells.get((name, case))) and cell.counts for name in pair)
     ]
     lost = Question(0, "", "Runs lost", "%", 100 - sources.declared.rules.settled_percent, False, "")
     gone = Question(0, "", "Runs that leave", "%", 100 - sources.declared.rules.stay_percent, False, "")
     rows = []
     for case in cases[:MOST]:
-        cells = [found.cells.get((name, case)) for name in pair]
+        cells = [scores.cells.get((name, case)) for name in pair]
         shown = [
-            (name, LANES[role(found, name)], _lost(cell))
+            (name, LANES[role(scores, name)], _lost(cell))
             for name, cell in zip(pair, cells, strict=True)
             if name
         ]
-        mine = found.cells.get((found.default or pair[0], case))
+        mine = scores.cells.get((scores.default or pair[0], case))
         states = (
             [state(lost, _lost(mine)), state(gone, _lost(mine, "stay"))] if mine else ["not measured"] * 2
         )
@@ -191,7 +196,7 @@ def _stay(cell: Cell | None) -> str:
 # ---- the scoreboard
 
 
-def boards(sources: Sources, found: Board) -> list[dict[str, Any]]:
+def boards(sources: Sources, scores: Board) -> list[dict[str, Any]]:
     """A table for each simulator: controllers down, cases across; vermillion where the whole interval lies
     beyond a limit, bold in a controller's own worst case."""
     asked = sources.declared.rules
@@ -201,23 +206,32 @@ def boards(sources: Sources, found: Board) -> list[dict[str, Any]]:
         "recovered": asked.settled_percent,
     }
     tables = []
-    for simulator in dict.fromkeys(case[0] for case in found.cases):
-        cases = [case for case in found.cases if case[0] == simulator]
+    for simulator in dict.fromkeys(case[0] for case in scores.cases):
+        cases = [case for case in scores.cases if case[0] == simulator]
         rows = []
-        for name in found.names:
-            cells = [found.cells.get((name, case)) for case in cases]
+        for name in scores.names:
+            cells = [scores.cells.get((name, case)) for case in cases]
             if not any(cells):
                 continue
-            _, low = worst(found, name, "lasting")
+            _, low = worst(scores, name, "lasting")
             rows.append({
-                "name": name, "mark": role(found, name), "default": name == found.default,
-                "kind": found.kinds[name],
+                "name": name, "mark": role(scores, name), "default": name == scores.default,
+                "kind": scores.kinds[name],
                 "cells": [_cell(cell, limits, bold=case == low) for case,
                 cell in zip(cases, cells, strict=True)],
             })  # fmt: skip
-        counts = any(cell.counts for (_, case), cell in found.cells.items() if case[0] == simulator)
-        runs = sorted({cell.runs for (_, case), cell in found.cells.items() if case[0] == simulator})
-        tables.append({"id": f"board-{simulator}", "name": SIMULATORS.get(simulator, simulator), "heads": [case_text(case) for case in cases], "rows": rows, "counts": counts, "runs": f"{runs[0]:,}" if len(runs) == 1 else f"{runs[0]:,} to {runs[-1]:,}"})  # fmt: skip
+        counts = any(cell.counts for (_, case), cell in scores.cells.items() if case[0] == simulator)
+        runs = sorted({cell.runs for (_, case), cell in scores.cells.items() if case[0] == simulator})
+        tables.append(
+            {
+                "id": f"board-{simulator}",
+                "name": SIMULATORS.get(simulator, simulator),
+                "heads": [case_text(case) for case in cases],
+                "rows": rows,
+                "counts": counts,
+                "runs": f"{runs[0]:,}" if len(runs) == 1 else f"{runs[0]:,} to {runs[-1]:,}",
+            }
+        )
     return tables
 
 
@@ -248,19 +262,21 @@ def _cell(cell: Cell | None, limits: dict[str, float], *, bold: bool) -> dict[st
     return {"lines": lines, "steps": steps, "more": more.strip(", "), "tip": tip, "bold": bold}
 
 
-def worsts(found: Board) -> list[dict[str, Any]]:
+def worsts(scores: Board) -> list[dict[str, Any]]:
     """Everybody's worst case, the best first, with the start from which fewest settle there."""
     rows = []
-    for name in found.names:
-        figure, case = worst(found, name, "lasting")
+    for name in scores.names:
+        figure, case = worst(scores, name, "lasting")
         if case is None:
             continue
-        cell = found.cells[name, case]
-        others = [share.value for _, one in found.counting(name) if isinstance(share := lasting(one), Figure)]
+        cell = scores.cells[name, case]
+        others = [
+            share.value for _, one in scores.counting(name) if isinstance(share := lasting(one), Figure)
+        ]
         flow, degrees, settled = cell.worst_start
         rows.append({
-            "name": name, "mark": role(found, name), "default": name == found.default,
-            "kind": {BASELINE: "no learning", "agent": "ours, learned"}.get(found.kinds[name],
+            "name": name, "mark": role(scores, name), "default": name == scores.default,
+            "kind": {BASELINE: "no learning", "agent": "ours, learned"}.get(scores.kinds[name],
             "as published"),
             "case": case_text(case, whole=True), "value": share_text(figure),
             "band": band(figure.low, figure.high, 1),

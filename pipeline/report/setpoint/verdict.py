@@ -10,19 +10,40 @@ import numpy as np
 
 from pipeline.report.shared.digits import THIN, band, count, number, quantity
 from pipeline.report.shared.sources import Sources, Table, lookup
-from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, UNDECIDED, Figure, Missing, Question, state
+from pipeline.report.shared.verdict import (
+    FAILED,
+    OPEN,
+    PASSED,
+    UNDECIDED,
+    Figure,
+    Missing,
+    Question,
+    Rule,
+    Verdict,
+    count_of,
+    deciding,
+    overall,
+    state,
+)
 
 AGENT, PAPER, BASELINE = "agent", "paper", "baseline"
 SIMULATORS = {"paper": "The paper’s simulator", "recorded": "Recorded windows", "pixels": "Through pictures"}
-CLAIM = "The classifier is trained and judged on rendered frames: eight real pictures allow no claim about real printers."
-CLAIM_RECORDED = "The classifier is trained and judged on recordings of datasets/raw/setpoint, split by print; it is known on these printers only."
+CLAIM = (
+    "The classifier is trained and judged on rendered frames: eight real pictures allow no claim about real "
+    "printers."
+)
+CLAIM_RECORDED = (
+    "The classifier is trained and judged on recordings of datasets/raw/setpoint, split by print; "
+    "it is known "
+    "on these printers only."
+)
 # what the two columns of its rules are, and the mark of the second
 HEADS = ("Data\u2011driven", "Best baseline", "baseline")
 
 
 class Cell(NamedTuple):
-    """One controller in one case: shares of runs in percent with their 95 % intervals, or why one is missing;
-    steps until inside for good; overshoot and flow error in percent."""
+    """One controller in one case: shares of runs in percent with their 95 % intervals, or why one is missing.
+    Then steps until inside for good; overshoot and flow error in percent."""
 
     runs: int
     counts: bool
@@ -83,7 +104,7 @@ def case_text(case: Case, *, whole: bool = False) -> str:
     """ "accuracy 0.7, clog" -> "accuracy 70 %, clog"; `whole`: after the simulator's name."""
     simulator, name = case
     name = re.sub(rf"^{re.escape(simulator)}[, ]*", "", name) or "as it is"
-    name = re.sub(r"accuracy (\d\.?\d*)", lambda found: f"accuracy {100 * float(found[1]):g}{THIN}%", name)
+    name = re.sub(r"accuracy (\d\.?\d*)", lambda match: f"accuracy {100 * float(match[1]):g}{THIN}%", name)
     return f"{SIMULATORS.get(simulator, simulator)}, {name}" if whole else name
 
 
@@ -105,10 +126,10 @@ def board(sources: Sources) -> Board | Missing:
     ]
     cells = {key: _cell(table, i) for i, key in enumerate(keys)}
     kinds = {name: str(kind) for (name, _), kind in zip(keys, table["kind"], strict=True)}
-    found = Board(list(kinds), kinds, list(dict.fromkeys(case for _, case in keys)), cells, "")
-    ranked = sorted(kinds, key=lambda name: _rank(found, name), reverse=True)
+    unranked = Board(list(kinds), kinds, list(dict.fromkeys(case for _, case in keys)), cells, "")
+    ranked = sorted(kinds, key=lambda name: _rank(unranked, name), reverse=True)
     chosen = str(choice.get("name", "")) if isinstance(choice, Mapping) else ""
-    return found._replace(names=ranked, default=chosen if chosen in kinds else "")
+    return unranked._replace(names=ranked, default=chosen if chosen in kinds else "")
 
 
 def _cell(table: Table, i: int) -> Cell:
@@ -140,22 +161,20 @@ def lasting(cell: Cell) -> Figure | Missing:
 
 
 def _rank(board: Board, name: str) -> tuple[float, float]:
-    values = [found.value for _, cell in board.counting(name) if isinstance(found := lasting(cell), Figure)]
+    values = [share.value for _, cell in board.counting(name) if isinstance(share := lasting(cell), Figure)]
     return (min(values), float(np.mean(values))) if values else (-1.0, -1.0)
 
 
 def worst(board: Board, name: str, what: str) -> tuple[Figure | Missing, Case | None]:
     """The smallest share `what` (settled, stay, lasting) of the cases that count, and where."""
-    found = [
+    shares = [
         (figure, case)
         for case, cell in board.counting(name)
         if isinstance(figure := lasting(cell) if what == "lasting" else getattr(cell, what), Figure)
     ]
-    return (
-        min(found, key=lambda pair: pair[0].value)
-        if found
-        else (Missing("not measured", f"no case of {name or 'any controller'}"), None)
-    )
+    if not shares:
+        return Missing("not measured", f"no case of {name or 'any controller'}"), None
+    return min(shares, key=lambda pair: pair[0].value)
 
 
 def share_text(figure: Figure | Missing) -> str:
@@ -165,59 +184,62 @@ def share_text(figure: Figure | Missing) -> str:
 # ---- the rules
 
 
-class Rule(NamedTuple):
-    """One test: limit and place on the page; states and figures of what learned and of the best baseline; as
-    a sentence, each, where it does not pass."""
-
-    name: str
-    limit: str
-    place: str
-    states: tuple[str, str]
-    figures: tuple[str, str]
-    reasons: tuple[str, str]
-    remedy: str
-    seeing: bool  # of the classifier, on which every controller rests
+# of each a pair: what learned, and the best baseline; a rule of the classifier holds for every controller
+Pair = tuple[Rule, Rule]
+SEEING = ("vision", "reliability")
 
 
-def rules(sources: Sources, board: Board | None) -> tuple[Rule, ...]:
+def of_classifier(rule: Rule) -> bool:
+    """Whether the rule is asked of the classifier, on which every controller rests."""
+    return rule.place in SEEING
+
+
+def rules(sources: Sources, board: Board | None) -> tuple[Pair, ...]:
     asked = sources.declared.rules
     return (
         _control(board, "Settles, worst case", "settled", asked.settled_percent, "settle"),
         _control(board, "Stays, worst case", "stay", asked.stay_percent, "settle and stay"),
-        _seeing(sources, "Right, an image", 100 * asked.image_accuracy, "image_accuracy",
-        ("svc", "cnn", "width"), "frames of segments it never saw"),
-        _seeing(sources, "Right, a window", 100 * asked.window_accuracy, "window_accuracy", ("svc",),
-        "windows of segments it never saw"),
+        _accurate(
+            sources,
+            Question(0, "image_accuracy", "Right, an image", "%", 100 * asked.image_accuracy, True, ""),
+            ("svc", "cnn", "width"),
+            "frames of segments it never saw",
+        ),
+        _accurate(
+            sources,
+            Question(0, "window_accuracy", "Right, a window", "%", 100 * asked.window_accuracy, True, ""),
+            ("svc",),
+            "windows of segments it never saw",
+        ),
         _calibrated(sources, "Calibrated, an image", asked.ece_image, ("ece_image", "ece_image_raw")),
         _calibrated(sources, "Calibrated, a window", asked.ece_window, ("ece_window", "ece_window_counts")),
-    )  # fmt: skip
+    )
 
 
-def _control(board: Board | None, name: str, what: str, limit: float, does: str) -> Rule:
+def _control(board: Board | None, name: str, what: str, limit: float, does: str) -> Pair:
     question = Question(0, what, name, "%", limit, True, "")
-    text = f"≥ {limit:g}{THIN}%"
+    rule = Rule(
+        name, question, Missing(OPEN, ""), text=OPEN, limit=f"≥ {limit:g}{THIN}%", place="scoreboard",
+        reason="Nothing was judged.",
+    )  # fmt: skip
     if board is None:
-        return Rule(
-            name, text, "scoreboard", (OPEN, OPEN), (OPEN, OPEN), ("Nothing was judged.",) * 2, "", False
-        )
-    found = [worst(board, who, what) for who in (board.learned(), board.best(BASELINE))]
-    reasons = tuple(
-        figure.sentence()
-        if isinstance(figure, Missing)
-        else f"In its worst case ({within(case)}) {share_text(figure)} of its runs {does}; {limit:g}{THIN}% are asked for.{undecided(question, figure)}"
-        for figure, case in found
-    )
-    return Rule(
-        name,
-        text,
-        "scoreboard",
-        tuple(state(question, figure) for figure, _ in found),
-        tuple(share_text(figure) for figure, _ in found),
-        reasons,
+        return rule, rule
+    remedy = (
         "A classifier whose errors persist for fewer decisions, or fewer starts and disturbances to stand "
-        "(evaluate_setpoint).",
-        False,
+        "(evaluate_setpoint)."
     )
+
+    def held(controller: str) -> Rule:
+        figure, case = worst(board, controller, what)
+        reason = (
+            figure.sentence()
+            if isinstance(figure, Missing)
+            else f"In its worst case ({within(case)}) {share_text(figure)} of its runs {does}; "
+            f"{limit:g}{THIN}% are asked for.{undecided(question, figure)}"
+        )
+        return rule._replace(figure=figure, text=share_text(figure), reason=reason, remedy=remedy)
+
+    return held(board.learned()), held(board.best(BASELINE))
 
 
 def undecided(question: Question, figure: Figure) -> str:
@@ -244,13 +266,14 @@ NAMES = {"svc": "support vector machine", "cnn": "convolutional network", "width
 BRIEF = {"svc": "SVC", "cnn": "CNN", "width": "width"}
 
 
-def _seeing(sources: Sources, name: str, limit: float, key: str, others: Sequence[str], of: str) -> Rule:
-    metrics, question = sources.metrics["train_classifier"], Question(0, key, name, "%", limit, True, "")
-    mine = accuracy(metrics, key.removesuffix("_accuracy"))
+def _accurate(sources: Sources, question: Question, others: Sequence[str], of: str) -> Pair:
+    """The classifier's accuracy, beside the best of its yardsticks."""
+    metrics, kind = sources.metrics["train_classifier"], question.key.removesuffix("_accuracy")
+    mine = accuracy(metrics, kind)
     beside = [
-        (found, other)
+        (figure, other)
         for other in others
-        if isinstance(found := accuracy(metrics, f"{other}_{key.removesuffix('_accuracy')}"), Figure)
+        if isinstance(figure := accuracy(metrics, f"{other}_{kind}"), Figure)
     ]
     best, who = max(
         beside, key=lambda pair: pair[0].value, default=(Missing("not measured", "no yardstick"), "")
@@ -258,10 +281,20 @@ def _seeing(sources: Sources, name: str, limit: float, key: str, others: Sequenc
     reason = (
         mine.sentence()
         if isinstance(mine, Missing)
-        else f"The classifier names {share_text(mine)} of {of} rightly; {limit:g}{THIN}% are asked for.{undecided(question, mine)}"
+        else f"The classifier names {share_text(mine)} of {of} rightly; "
+        f"{question.limit:g}{THIN}% are asked for.{undecided(question, mine)}"
     )
-    shown = share_text(best) + (f" {BRIEF[who]}" if who else "")
-    return Rule(name, f"≥ {limit:g}{THIN}%", "vision", (state(question, mine), state(question, best)), (share_text(mine), shown), (reason, reason), "More segments to train on (train_classifier.segments), or another view of the nozzle.", True)  # fmt: skip
+    rule = Rule(
+        question.title,
+        question,
+        mine,
+        text=share_text(mine),
+        limit=f"≥ {question.limit:g}{THIN}%",
+        place="vision",
+        reason=reason,
+        remedy="More segments to train on (train_classifier.segments), or another view of the nozzle.",
+    )
+    return rule, rule._replace(figure=best, text=share_text(best) + (f" {BRIEF[who]}" if who else ""))
 
 
 def accuracy(metrics: Mapping | Missing, name: str) -> Figure | Missing:
@@ -273,129 +306,104 @@ def accuracy(metrics: Mapping | Missing, name: str) -> Figure | Missing:
     return Figure(100 * value, *((100 * value,) * 2 if isinstance(ends, Missing) else map(float, ends)))
 
 
-def _calibrated(sources: Sources, name: str, limit: float, keys: tuple[str, str]) -> Rule:
-    found = [lookup(sources.metrics["train_classifier"], key) for key in keys]
-    states = tuple(
-        OPEN if isinstance(value, Missing) else PASSED if value <= limit else FAILED for value in found
+def _calibrated(sources: Sources, name: str, limit: float, keys: tuple[str, str]) -> Pair:
+    mine, raw = (lookup(sources.metrics["train_classifier"], key) for key in keys)
+    texts = [OPEN if isinstance(value, Missing) else number(value, 3) for value in (mine, raw)]
+    rule = Rule(
+        name,
+        Question(0, keys[0], name, "", limit, False, ""),
+        _plain(mine),
+        text=texts[0],
+        limit=f"≤ {limit:g}",
+        place="reliability",
+        reason="It was not measured."
+        if isinstance(mine, Missing)
+        else (
+            f"Stated and true shares of right answers differ by {texts[0]} on average; {limit:g} is allowed."
+        ),
+        remedy="Calibrate on more segments (train_classifier.segments.calibration).",
     )
-    shown = tuple(OPEN if isinstance(value, Missing) else number(value, 3) for value in found)
-    reason = (
-        f"Stated and true shares of right answers differ by {shown[0]} on average; {limit:g} is allowed."
-        if states[0] != OPEN
-        else "It was not measured."
-    )
-    return Rule(name, f"≤ {limit:g}", "reliability", states, shown, (reason, reason), "Calibrate on more segments (train_classifier.segments.calibration).", True)  # fmt: skip
+    return rule, rule._replace(figure=_plain(raw), text=texts[1])
+
+
+def _plain(value: float | Missing) -> Figure | Missing:
+    return value._replace(state=OPEN) if isinstance(value, Missing) else count_of(value)
 
 
 # ---- the verdict
 
 
-class Verdict(NamedTuple):
-    """`state`: passed, failed, open; the controller that runs by default; sentences as the page says them;
-    `first` names the first rule that does not pass."""
-
-    state: str
-    default: str
-    decision: str
-    lead: str
-    reason: str
-    remedy: str
-    claim: str
-    rules: tuple[Rule, ...]
-    first: str
-    role: str
-
-
 def verdict(sources: Sources) -> Verdict:
-    found = board(sources)
-    claim = (
-        CLAIM_RECORDED
-        if sources.declared.everything.get("train_classifier", {}).get("source") == "recordings"
-        else CLAIM
-    )
-    if isinstance(found, Missing) or not found.default:
-        gap = found if isinstance(found, Missing) else sources.tables["choice"]
-        why = (
-            gap.sentence()
-            if isinstance(gap, Missing)
-            else "The choice names a controller that was not judged."
-        )
-        tested = rules(sources, None if isinstance(found, Missing) else found)
+    """Who sets flow and temperature by default: `winner`, "" where nobody chose. `note` says of what printers
+    anything is claimed."""
+    scores = board(sources)
+    recorded = sources.declared.everything.get("train_classifier", {}).get("source") == "recordings"
+    claim = CLAIM_RECORDED if recorded else CLAIM
+    if isinstance(scores, Missing) or not scores.default:
+        gap = scores if isinstance(scores, Missing) else sources.tables["choice"]
         return Verdict(
-            OPEN,
-            "",
-            "Let nobody set flow and temperature by this loop yet.",
-            "No controller was chosen.",
-            why,
-            "",
-            claim,
-            tested,
-            "",
-            "",
+            loop="setpoint",
+            state=OPEN,
+            decision="Let nobody set flow and temperature by this loop yet.",
+            lead="No controller was chosen.",
+            reason=gap.sentence()
+            if isinstance(gap, Missing)
+            else "The choice names a controller that was not judged.",
+            remedy="",
+            rule="",
+            winner="",
+            note=claim,
+            rules=rules(sources, None if isinstance(scores, Missing) else scores),
         )
-    tested = rules(sources, found)
-    column = int(found.kinds[found.default] == BASELINE)
-    states = [rule.states[0 if rule.seeing else column] for rule in tested]
-    failed = FAILED in states
-    first = next(
-        (
-            i
-            for wanted in ((FAILED,) if failed else (UNDECIDED, OPEN))
-            for i, one in enumerate(states)
-            if one == wanted
-        ),
-        None,
+    lines, name = rules(sources, scores), named(scores, scores.default)
+    column = int(scores.kinds[scores.default] == BASELINE)
+    asked = [line[0 if of_classifier(line[0]) else column] for line in lines]
+    ended, first = overall([rule.state for rule in asked]), deciding(asked)
+    settled = Verdict(
+        loop="setpoint",
+        state=PASSED,
+        decision=f"Run {name} by default.",
+        lead=f"All {count(len(asked), 'rule')} passed.",
+        reason=summary(sources, scores),
+        remedy="",
+        rule="",
+        winner=scores.default,
+        note=claim,
+        rules=lines,
     )
-    passed = first is None
-    decision = (
-        f"Run {named(found, found.default)} by default."
-        if passed
-        else f"{'Do not let the camera steer a printer yet' if failed else 'Do not decide yet'}."
-    )
-    lead = (
-        f"All {count(len(tested), 'rule')} passed."
-        if passed
-        else f"First {'failed' if failed else 'open'} rule: {tested[first].name[:1].lower()}{tested[first].name[1:]}."
-    )
-    reason = "" if passed else _closest(named(found, found.default), tested[first], column)
-    return Verdict(
-        PASSED if passed else FAILED if failed else OPEN,
-        found.default,
-        decision,
-        lead,
-        told(sources, found) if passed else reason,
-        "" if passed else _conditions(tested, column, claim == CLAIM),
-        claim,
-        tested,
-        "" if passed else tested[first].name,
-        role(found, found.default),
+    if first is None:
+        return settled
+    failed = first.state == FAILED
+    return settled._replace(
+        state=ended,
+        decision=f"{'Do not let the camera steer a printer yet' if failed else 'Do not decide yet'}.",
+        lead=f"First {'failed' if failed else 'open'} rule: {first.name[:1].lower()}{first.name[1:]}.",
+        reason=_closest(name, first),
+        remedy=_conditions(asked, claim == CLAIM),
+        rule=first.name,
     )
 
 
-def _conditions(tested: Sequence[Rule], column: int, rendered: bool) -> str:
+def _conditions(asked: Sequence[Rule], rendered: bool) -> str:
     """What would have to come out before the loop may steer: every rule that
     does not pass with its figure, and what to try."""
-    short = [
-        (rule, 0 if rule.seeing else column)
-        for rule in tested
-        if rule.states[0 if rule.seeing else column] != PASSED
-    ]
-    asked = [
+    short = [rule for rule in asked if rule.state != PASSED]
+    figures = [
         f"{rule.name[:1].lower()}{rule.name[1:]} {rule.limit} (now "
-        f"{rule.figures[k]}{', but its interval crosses the limit' if rule.states[k] == UNDECIDED else ''})"
-        for rule, k in short
+        f"{rule.text}{', but its interval crosses the limit' if rule.state == UNDECIDED else ''})"
+        for rule in short
     ]
     real = " Recordings of the real printer: none are in (datasets/raw/setpoint)." if rendered else ""
-    return f"Before it may: {', '.join(asked)}.{real} To try: {' '.join(dict.fromkeys(rule.remedy for rule, _ in short if rule.remedy))}"
+    remedies = dict.fromkeys(rule.remedy for rule in short if rule.remedy)
+    return f"Before it may: {', '.join(figures)}.{real} To try: {' '.join(remedies)}"
 
 
-def _closest(name: str, rule: Rule, column: int) -> str:
+def _closest(name: str, rule: Rule) -> str:
     """Who comes closest, and how far it is off; a rule of the classifier holds whoever controls."""
-    reason = rule.reasons[column]
     return (
-        f"{reason} By runs that settle and stay {name} comes closest."
-        if rule.seeing
-        else f"Best, by runs that settle and stay, is {name}: {reason[:1].lower()}{reason[1:]}"
+        f"{rule.reason} By runs that settle and stay {name} comes closest."
+        if of_classifier(rule)
+        else f"Best, by runs that settle and stay, is {name}: {rule.reason[:1].lower()}{rule.reason[1:]}"
     )
 
 
@@ -409,7 +417,7 @@ def named(board: Board, name: str) -> str:
     )
 
 
-def told(sources: Sources, board: Board) -> str:
+def summary(sources: Sources, board: Board) -> str:
     """The default's worst case, by how much it beats the next, and,
     where the agent is neither, how far it came."""
     mine, place = worst(board, board.default, "lasting")
@@ -434,8 +442,7 @@ def told(sources: Sources, board: Board) -> str:
     if not learned or learned in (board.default, others[0]):
         return text
     figure, where = worst(board, learned, "lasting")
-    return (
-        text
-        if where is None
-        else f"{text} {named(board, learned)[:1].upper()}{named(board, learned)[1:]} did not earn it: {share_text(figure)} ({within(where)})."
-    )
+    if where is None:
+        return text
+    name = named(board, learned)
+    return f"{text} {name[:1].upper()}{name[1:]} did not earn it: {share_text(figure)} ({within(where)})."

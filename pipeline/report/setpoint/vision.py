@@ -28,38 +28,58 @@ DIAGRAMS = (
 
 def reliability(sources: Sources) -> Picture:
     """Share that is right against the confidence that was stated, before and after calibration."""
-    table, metrics, title = (
-        sources.tables["reliability"],
-        sources.metrics["train_classifier"],
-        "When it says 80 %, is it right in 80 %?",
-    )
+    table, metrics = sources.tables["reliability"], sources.metrics["train_classifier"]
+    title = "When it says 80 %, is it right in 80 %?"
     if isinstance(table, Missing):
         return hole("reliability", title, table)
+    errors = [lookup(metrics, key) for *_, key in DIAGRAMS]
     columns = []
-    for of, method, head, small, key in DIAGRAMS:
+    for (of, method, head, small, _), error in zip(DIAGRAMS, errors, strict=True):
         mine = (table["of"] == of) & (table["method"] == method) & (table["count"] > 0)
-        error = lookup(metrics, key)
-        if not mine.any():
+        if mine.any():
+            words = "not measured" if isinstance(error, Missing) else f"off by {number(error, 3)} on average"
+            bins = {name: table[name][mine] for name in ("confidence", "accuracy", "count")}
+            panel = _diagram(bins, head, of, words, title="" if columns else "share right")
+        else:
             gap = Missing("not measured", f"no diagram of {method}")
-            columns.append(
-                Column(head, small, "", [Markup('<div class="hole">{}</div>').format(page.missing(gap))])
-            )
-            continue
-        frame = charts.Frame(charts.Axis(0.3, 1.0, ((0.4, "0.4"), (0.6, "0.6"), (0.8, "0.8"), (1.0, "1"))), charts.Axis(0, 1, ((0.0, "0"), (0.5, "0.5"), (1.0, "1"))), 270, 220, 30)  # fmt: skip
-        x, y, n = (table[name][mine] for name in ("confidence", "accuracy", "count"))
-        said = "not measured" if isinstance(error, Missing) else f"off by {number(error, 3)} on average"
-        layers = [charts.line(frame, [0.3, 1.0], [0.3, 1.0], "ref"), charts.line(frame, x, y)]
-        layers += [charts.dots(frame, a, b, "dot whole dd", round(1.5 + 4.5 * math.sqrt(k / n.max()), 1)) for a, b, k in zip(x, y, n, strict=True)]  # fmt: skip
-        layers.append(charts.label(frame, 1.0, 0.04, said, anchor="end"))
-        alt = f"{head}: stated and true share of right answers are {said}, over {int(n.sum())} {of}s"
-        columns.append(Column(head, small, "", [charts.panel(frame, layers, alt=alt, css="dd", title="share right" if not columns else "", units=("stated", "right"))]))  # fmt: skip
-    found = [lookup(metrics, key) for *_, key in DIAGRAMS]
+            panel = Markup('<div class="hole">{}</div>').format(page.missing(gap))
+        columns.append(Column(head, small, "", [panel]))
     text = (
         "Some of the calibration errors were not measured."
-        if any(isinstance(value, Missing) for value in found)
-        else f"Calibration takes the error of an image from {number(found[0], 3)} to {number(found[1], 3)}, and of a window from {number(found[2], 3)} (counting classes, as published) to {number(found[3], 3)}."
+        if any(isinstance(value, Missing) for value in errors)
+        else f"Calibration takes the error of an image from {number(errors[0], 3)} to "
+        f"{number(errors[1], 3)}, and of a window from {number(errors[2], 3)} (counting classes, as "
+        f"published) to {number(errors[3], 3)}."
     )
-    return Picture("reliability", title, text, columns, "Share of answers that are right, against the confidence stated with them; dashed: as stated. Below the line it is too sure. Larger dots: more of them.", page.origin(sources.source("reliability", "train_classifier")))  # fmt: skip
+    return Picture(
+        "reliability",
+        title,
+        text,
+        columns,
+        "Share of answers that are right, against the confidence stated with them; dashed: as "
+        "stated. Below the line it is too sure. Larger dots: more of them.",
+        page.origin(sources.source("reliability", "train_classifier")),
+    )
+
+
+def _diagram(bins: Table, head: str, of: str, words: str, *, title: str) -> Markup:
+    """Accuracy against confidence of the bins, a larger dot for more answers."""
+    frame = charts.Frame(
+        charts.Axis(0.3, 1.0, ((0.4, "0.4"), (0.6, "0.6"), (0.8, "0.8"), (1.0, "1"))),
+        charts.Axis(0, 1, ((0.0, "0"), (0.5, "0.5"), (1.0, "1"))),
+        270,
+        220,
+        30,
+    )
+    x, y, n = bins["confidence"], bins["accuracy"], bins["count"]
+    layers = [charts.line(frame, [0.3, 1.0], [0.3, 1.0], "ref"), charts.line(frame, x, y)]
+    layers += [
+        charts.dots(frame, a, b, "dot whole dd", round(1.5 + 4.5 * math.sqrt(k / n.max()), 1))
+        for a, b, k in zip(x, y, n, strict=True)
+    ]
+    layers.append(charts.label(frame, 1.0, 0.04, words, anchor="end"))
+    alt = f"{head}: stated and true share of right answers are {words}, over {int(n.sum())} {of}s"
+    return charts.panel(frame, layers, alt=alt, css="dd", title=title, units=("stated", "right"))
 
 
 def confusion(sources: Sources) -> Picture:
@@ -90,23 +110,45 @@ def confusion(sources: Sources) -> Picture:
         f"{percent(100 * swapped / n, 2) if swapped else '0' + THIN + '%'} of {n:,} frames: "
         "errors sit at the borders of the classes."
     )
-    return Picture("confusion", title, text, columns, "True class down, class named across; per cent of the true class. Frames of segments that nothing was learned or calibrated on, rejected ones left out.", page.origin(sources.source("classified")))  # fmt: skip
+    return Picture(
+        "confusion",
+        title,
+        text,
+        columns,
+        (
+            "True class down, class named across; per cent of the true class. Frames of segments that "
+            "nothing was learned or calibrated on, rejected ones left out."
+        ),
+        page.origin(sources.source("classified")),
+    )
 
 
 def _matrix(counts: np.ndarray, degrees: float) -> Markup:
     shares = 100 * counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
     left, top, size = 40, 18, 54
     cells = [
-        Markup('<rect class="heat" x="{}" y="{}" width="{}" height="40" style="fill-opacity:{:.2f}"/><text class="in" x="{}" y="{}" text-anchor="middle">{}</text>').format(
+        Markup('<rect class="heat" x="{}" y="{}" width="{}" height="40" '
+'style="fill-opacity:{:.2f}"/><text class="in" x="{}" y="{}" text-anchor="middle">{}</text>').format(
             left + size * j, top + 42 * i, size - 2, 0.04 + 0.34 * shares[i, j] / 100,
             left + size * j + size / 2 - 1, top + 42 * i + 24, number(shares[i, j], 0)
         )
         for i in range(3)
         for j in range(3)
     ]  # fmt: skip
-    cells += [Markup('<text x="{}" y="{}" text-anchor="end">{}</text>').format(left - 5, top + 42 * i + 24, name) for i, name in enumerate(CLASSES)]  # fmt: skip
-    cells += [Markup('<text x="{}" y="12" text-anchor="middle">{}</text>').format(left + size * j + size / 2 - 1, name) for j, name in enumerate(CLASSES)]  # fmt: skip
-    alt = f"At {degrees:g} °C: under {number(shares[0, 0], 0)} %, good {number(shares[1, 1], 0)} %, over {number(shares[2, 2], 0)} % named rightly"
+    cells += [
+        Markup('<text x="{}" y="{}" text-anchor="end">{}</text>').format(left - 5, top + 42 * i + 24, name)
+        for i, name in enumerate(CLASSES)
+    ]
+    cells += [
+        Markup('<text x="{}" y="12" text-anchor="middle">{}</text>').format(
+            left + size * j + size / 2 - 1, name
+        )
+        for j, name in enumerate(CLASSES)
+    ]
+    alt = (
+        f"At {degrees:g} °C: under {number(shares[0, 0], 0)} %, good {number(shares[1, 1], 0)} %, over "
+        f"{number(shares[2, 2], 0)} % named rightly"
+    )
     return Markup('<svg class="plot mb" viewBox="0 0 208 146" role="img" aria-label="{}">{}</svg>').format(
         alt, Markup("").join(cells)
     )
@@ -129,30 +171,78 @@ def distributions(sources: Sources) -> Picture:
             Missing("not measured", "no window to judge by", "Run ./run dvc repro train_classifier"),
         )
     flow, scaled, right = _by_bin(mine)
-    high = float(mine["flow_high_percent"].max())
-    frame = charts.Frame(charts.linear(0, min(high, 320.0), ticks=6), charts.Axis(0, 1.02, ((0.0, "0"), (0.5, "0.5"), (1.0, "1"))), 368, 190, 30)  # fmt: skip
+    high = min(float(mine["flow_high_percent"].max()), 320.0)
+    frame = charts.Frame(
+        charts.linear(0, high, ticks=6),
+        charts.Axis(0, 1.02, ((0.0, "0"), (0.5, "0.5"), (1.0, "1"))),
+        368,
+        190,
+        30,
+    )
     steps = np.array([0.0, BORDERS[0], BORDERS[0], BORDERS[1], BORDERS[1], frame.x.high])
     label = np.array([0, 0, 1, 1, 2, 2])
     ideal = np.exp(-ALPHA * np.abs(np.arange(3)[None, :] - label[:, None]))
-    panels = []
-    for head, small, x, y in (("Recorded windows", "of this classifier, segments only judged on", flow, scaled), ("The paper’s simulator", "mean of (7), without its noise", steps, ideal)):  # fmt: skip
-        layers = [
-            Markup('<rect class="allow" x="{:.1f}" width="{:.1f}" y="{}" height="{}"/>').format(*_box(frame))
-        ]
-        layers += [
-            charts.line(frame, x, y[:, k], f"line {css}") for k, css in enumerate(("brown", "", "green"))
-        ]
-        spread = float(np.sort(y, axis=1)[:, -2].max())
-        alt = f"{head}: the second largest class reaches {number(spread, 2)} of the largest"
-        panels.append(Column(head, small, "", [charts.panel(frame, layers, alt=alt, css="mb", title="scaled share" if not panels else "", units=("%", ""))]))  # fmt: skip
-    frame = frame._replace(y=charts.Axis(0, 102, ((0.0, "0"), (50.0, "50"), (100.0, "100"))))
-    layers = [Markup('<rect class="allow" x="{:.1f}" width="{:.1f}" y="{}" height="{}"/>').format(*_box(frame)), charts.line(frame, flow, right), charts.dots(frame, flow, right, "dot whole dd", 2.4)]  # fmt: skip
-    worst = int(np.argmin(right))
-    places = [f"{low:g}–{top:g}{THIN}%" for low, top in sorted({(float(a), float(b)) for a, b in zip(mine["flow_low_percent"], mine["flow_high_percent"], strict=True)})]  # fmt: skip
-    alt = f"Windows are named rightly in {number(float(right[worst]), 0)} % at worst, between {places[worst]} of flow"
-    panels.append(Column("Named rightly", "windows, in per cent", "", [charts.panel(frame, layers, alt=alt, css="dd", title="%", units=("%", "%"))]))  # fmt: skip
+    recorded, published = "Recorded windows", "The paper’s simulator"
+    worst, places = int(np.argmin(right)), _places(mine)
+    columns = [
+        Column(
+            recorded,
+            "of this classifier, segments only judged on",
+            "",
+            [_scaled_shares(frame, recorded, flow, scaled, title="scaled share")],
+        ),
+        Column(
+            published,
+            "mean of (7), without its noise",
+            "",
+            [_scaled_shares(frame, published, steps, ideal, title="")],
+        ),
+        Column("Named rightly", "windows, in per cent", "", [_right(frame, flow, right, places[worst])]),
+    ]
     rest = float(np.mean(np.delete(right, worst))) if len(right) > 1 else float(right[0])
-    return Picture("distributions", title, f"Between {places[worst]} of flow only {number(float(right[worst]), 0)}{THIN}% of the windows are named rightly, elsewhere {number(rest, 0)}{THIN}% on average: what the paper’s simulator draws does not know this.", panels, "Shares of under (brown), good (ink), over (green), divided by the largest of the three, against the true flow in %. Grey: good. Means over the windows of each bin of flow.", page.origin(sources.source("windows")))  # fmt: skip
+    return Picture(
+        "distributions",
+        title,
+        f"Between {places[worst]} of flow only {number(float(right[worst]), 0)}{THIN}% of the "
+        f"windows are named rightly, elsewhere {number(rest, 0)}{THIN}% on average: what the "
+        "paper’s simulator draws does not know this.",
+        columns,
+        "Shares of under (brown), good (ink), over (green), divided by the largest of the three, "
+        "against the true flow in %. Grey: good. Means over the windows of each bin of flow.",
+        page.origin(sources.source("windows")),
+    )
+
+
+def _places(mine: Table) -> list[str]:
+    """The bins of flow in words, rising."""
+    ends = zip(mine["flow_low_percent"], mine["flow_high_percent"], strict=True)
+    return [f"{low:g}–{top:g}{THIN}%" for low, top in sorted({(float(a), float(b)) for a, b in ends})]
+
+
+def _scaled_shares(frame: charts.Frame, head: str, x: np.ndarray, y: np.ndarray, *, title: str) -> Markup:
+    """Scaled shares y (n, 3) of the three classes against flow x (n,)."""
+    layers = [_good(frame)]
+    layers += [charts.line(frame, x, y[:, k], f"line {css}") for k, css in enumerate(("brown", "", "green"))]
+    spread = float(np.sort(y, axis=1)[:, -2].max())
+    alt = f"{head}: the second largest class reaches {number(spread, 2)} of the largest"
+    return charts.panel(frame, layers, alt=alt, css="mb", title=title, units=("%", ""))
+
+
+def _right(frame: charts.Frame, flow: np.ndarray, right: np.ndarray, place: str) -> Markup:
+    """Windows named rightly in percent against flow; `place` is the worst bin."""
+    frame = frame._replace(y=charts.Axis(0, 102, ((0.0, "0"), (50.0, "50"), (100.0, "100"))))
+    layers = [
+        _good(frame),
+        charts.line(frame, flow, right),
+        charts.dots(frame, flow, right, "dot whole dd", 2.4),
+    ]
+    alt = f"Windows are named rightly in {number(float(right.min()), 0)} % at worst, between {place} of flow"
+    return charts.panel(frame, layers, alt=alt, css="dd", title="%", units=("%", "%"))
+
+
+def _good(frame: charts.Frame) -> Markup:
+    """Grey, where the flow is good."""
+    return Markup('<rect class="allow" x="{:.1f}" width="{:.1f}" y="{}" height="{}"/>').format(*_box(frame))
 
 
 def _box(frame: charts.Frame) -> tuple[float, float, int, int]:
@@ -180,71 +270,75 @@ def _by_bin(mine: Table) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 # ---- training
 
 
-def course(sources: Sources) -> Picture:
+def learning_curves(sources: Sources) -> Picture:
     """Loss and accuracy of both networks, epoch by epoch (figure 5b)."""
-    table, metrics, title = (
-        sources.tables["course"],
-        sources.metrics["train_classifier"],
-        "The classifier in training",
-    )
+    table, metrics = sources.tables["course"], sources.metrics["train_classifier"]
+    title = "The classifier in training"
     if isinstance(table, Missing):
         return hole("course", title, table)
-    columns, said = [], []
-    svc = accuracy(metrics, "svc_image")
+    svc, limit = accuracy(metrics, "svc_image"), 100 * sources.declared.rules.image_accuracy
+    columns, sentences = [], []
     for learner in dict.fromkeys(map(str, table["learner"])):
         mine = {name: values[table["learner"] == learner] for name, values in table.items()}
-        x, best = (
-            charts.linear(0, max(float(mine["epoch"].max()), 1.0), ticks=5),
-            lookup(metrics, f"best_epoch.{learner}"),
-        )
-        top = 1.05 * float(np.nanmax([mine["training_loss"], mine["held_out_loss"]]))
-        losses = charts.Frame(x, charts.linear(0, top, ticks=4), 568, 140, 30, 6)
-        least = int(np.nanargmin(mine["held_out_loss"])) if np.isfinite(mine["held_out_loss"]).any() else 0
-        layers = [
-            charts.line(losses, mine["epoch"], mine["training_loss"], "line bl"),
-            charts.line(losses, mine["epoch"], mine["held_out_loss"]),
-        ]
-        layers += [charts.label(losses, x.high, float(values[-1]), name, anchor="end", dy=dy) for name, values, dy in (("learned from", mine["training_loss"], 12), ("only watched", mine["held_out_loss"], -5)) if math.isfinite(values[-1])]  # fmt: skip
-        alt = f"{learner}: the loss on segments that are only watched is least, {number(float(mine['held_out_loss'][least]), 2)}, after {int(mine['epoch'][least])} epochs"
-        panels = [
-            charts.panel(
-                losses, layers, alt=alt, css="dd wide", title="loss", x_ticks=False, units=("epochs", "")
-            )
-        ]
+        x = charts.linear(0, max(float(mine["epoch"].max()), 1.0), ticks=5)
+        best = lookup(metrics, f"best_epoch.{learner}")
         share = 100 * mine["held_out_accuracy"]
-        frame = charts.Frame(x, charts.linear(30, 100, ticks=4), 568, 130, 30)
-        layers = [
-            charts.level(
-                frame,
-                100 * sources.declared.rules.image_accuracy,
-                "lim",
-                f"limit {100 * sources.declared.rules.image_accuracy:g}",
-                above=True,
-            )
-        ]
-        layers += (
-            [
-                charts.level(
-                    frame, svc.value, "ref", f"support vector machine {number(svc.value, 1)}", above=False
-                )
-            ]
-            if isinstance(svc, Figure)
-            else []
-        )
-        layers.append(charts.line(frame, mine["epoch"], share))
         highest = float(np.nanmax(share)) if np.isfinite(share).any() else math.nan
-        said.append(
+        sentences.append(
             f"{learner} {number(highest, 1)}{THIN}% at best"
             + ("" if isinstance(best, Missing) else f", epoch {best} kept")
         )
         alt = f"{learner}: {number(highest, 1)} % of the watched images are named rightly at best"
-        panels.append(
-            charts.panel(
-                frame, layers, alt=alt, css="dd wide", title="% of images right", units=("epochs", "%")
-            )
-        )
+        panels = [_losses(learner, mine, x), _accuracies(mine["epoch"], share, x, limit, svc, alt)]
         columns.append(Column(learner[:1].upper() + learner[1:], "", "", panels))
-    return Picture("course", title, f"On segments that are only watched: {'; '.join(said)}.", columns, "Mean cross entropy above, share of images named rightly below, against epochs. Grey line: what is learned from.", page.origin(sources.source("course", "train_classifier")))  # fmt: skip
+    return Picture(
+        "course",
+        title,
+        f"On segments that are only watched: {'; '.join(sentences)}.",
+        columns,
+        "Mean cross entropy above, share of images named rightly below, against epochs. Grey line: "
+        "what is learned from.",
+        page.origin(sources.source("course", "train_classifier")),
+    )
+
+
+def _losses(learner: str, mine: Table, x: charts.Axis) -> Markup:
+    """Training and held-out loss of a network against its epochs."""
+    training, held_out = mine["training_loss"], mine["held_out_loss"]
+    top = 1.05 * float(np.nanmax([training, held_out]))
+    frame = charts.Frame(x, charts.linear(0, top, ticks=4), 568, 140, 30, 6)
+    least = int(np.nanargmin(held_out)) if np.isfinite(held_out).any() else 0
+    layers = [
+        charts.line(frame, mine["epoch"], training, "line bl"),
+        charts.line(frame, mine["epoch"], held_out),
+    ]
+    layers += [
+        charts.label(frame, x.high, float(values[-1]), name, anchor="end", dy=dy)
+        for name, values, dy in (("learned from", training, 12), ("only watched", held_out, -5))
+        if math.isfinite(values[-1])
+    ]
+    alt = (
+        f"{learner}: the loss on segments that are only watched is least, "
+        f"{number(float(held_out[least]), 2)}, after {int(mine['epoch'][least])} epochs"
+    )
+    return charts.panel(
+        frame, layers, alt=alt, css="dd wide", title="loss", x_ticks=False, units=("epochs", "")
+    )
+
+
+def _accuracies(
+    epoch: np.ndarray, share: np.ndarray, x: charts.Axis, limit: float, svc: Figure | Missing, alt: str
+) -> Markup:
+    """Held-out accuracy in percent against epochs, beside the limit and the support vector machine."""
+    frame = charts.Frame(x, charts.linear(30, 100, ticks=4), 568, 130, 30)
+    layers = [charts.level(frame, limit, "lim", f"limit {limit:g}", above=True)]
+    if isinstance(svc, Figure):
+        text = f"support vector machine {number(svc.value, 1)}"
+        layers.append(charts.level(frame, svc.value, "ref", text, above=False))
+    layers.append(charts.line(frame, epoch, share))
+    return charts.panel(
+        frame, layers, alt=alt, css="dd wide", title="% of images right", units=("epochs", "%")
+    )
 
 
 # ---- tables and frames
@@ -265,8 +359,14 @@ def yardsticks(sources: Sources) -> dict[str, Any]:
             ("image", sources.declared.rules.image_accuracy),
             ("window", sources.declared.rules.window_accuracy),
         ):
-            found = accuracy(metrics, f"{name}_{of}".strip("_"))
-            cells.append({"text": share_text(found), "band": band(found.low, found.high, 1) if isinstance(found, Figure) else "", "bad": isinstance(found, Figure) and not name and found.value < 100 * limit})  # fmt: skip
+            share = accuracy(metrics, f"{name}_{of}".strip("_"))
+            cells.append(
+                {
+                    "text": share_text(share),
+                    "band": band(share.low, share.high, 1) if isinstance(share, Figure) else "",
+                    "bad": isinstance(share, Figure) and not name and share.value < 100 * limit,
+                }
+            )
         rows.append({"name": head, "mark": "baseline" if name else "data_driven", "cells": cells})
     sets = lookup(metrics, "conformal")
     foreign = lookup(metrics, "out_of_distribution")
@@ -284,14 +384,14 @@ def _conformal(sets: Any) -> str:
     )
 
 
-def _foreign(found: Any) -> list[dict[str, str]]:
+def _foreign(detection: Any) -> list[dict[str, str]]:
     """A row for each kind of foreign picture."""
-    if isinstance(found, Missing):
+    if isinstance(detection, Missing):
         return []
     rows = []
-    for kind, one in found.items():
+    for kind, one in detection.items():
         if isinstance(one, dict) and "auroc" in one:
-            alarms = one.get("false_alarms", found.get("false_alarms"))
+            alarms = one.get("false_alarms", detection.get("false_alarms"))
             rows.append({
                 "kind": str(kind), "auroc": _area(one["auroc"]), "energy": _area(one.get("energy_auroc")),
                 "max_p": _area(one.get("max_p_auroc")),
@@ -308,12 +408,12 @@ def _area(value: float | None) -> str:
 def data(sources: Sources) -> list[tuple[str, str]]:
     """What was shown to it: frames, rejections by reason, segments."""
     metrics = sources.metrics["train_classifier"]
-    found = lookup(metrics, "data")
-    if isinstance(found, Missing):
-        return [("Frames", found.sentence())]
-    frames, valid = found.get("frames"), found.get("valid")
-    rejected = found.get("rejected") or {}
-    told = [
+    counts = lookup(metrics, "data")
+    if isinstance(counts, Missing):
+        return [("Frames", counts.sentence())]
+    frames, valid = counts.get("frames"), counts.get("valid")
+    rejected = counts.get("rejected") or {}
+    rows = [
         (
             "Source",
             str(lookup(metrics, "source"))
@@ -321,37 +421,37 @@ def data(sources: Sources) -> list[tuple[str, str]]:
             else "not said",
         )
     ]
-    told += (
+    rows += (
         [("Frames", f"{frames:,}, of which {valid:,} ({percent(100 * valid / frames, 3)}) show a fresh line")]
         if frames and valid is not None
         else []
     )
     if isinstance(rejected, dict):
-        told += [("Rejected", ", ".join(f"{reason} {n:,}" for reason, n in rejected.items()) or "none")]
-    told += [("Segments", f"{found['segments']:,}")] if isinstance(found.get("segments"), int) else []
+        rows += [("Rejected", ", ".join(f"{reason} {n:,}" for reason, n in rejected.items()) or "none")]
+    rows += [("Segments", f"{counts['segments']:,}")] if isinstance(counts.get("segments"), int) else []
     size, n = lookup(metrics, "size"), lookup(metrics, "parameters")
-    told += (
+    rows += (
         [("Classifier", f"{size}, {n:,} parameters")]
         if not isinstance(n, Missing) and not isinstance(size, Missing)
         else []
     )
-    return told
+    return rows
 
 
 def frames(sources: Sources) -> dict[str, Any]:
     """Frames with key area and direction drawn in; of a rejected one the reason."""
-    found = sources.tables["nozzle_frames"]
-    if isinstance(found, Missing):
-        return {"missing": found, "shown": [], "origin": Markup("")}
+    table = sources.tables["nozzle_frames"]
+    if isinstance(table, Missing):
+        return {"missing": table, "shown": [], "origin": Markup("")}
     return {
         "missing": None,
-        "shown": [_frame(one) for one in found],
+        "shown": [_frame(one) for one in table],
         "origin": page.origin(sources.source("nozzle_frames")),
     }
 
 
 def _frame(one: dict[str, Any]) -> dict[str, Any]:
-    said, named, p = one.get("reason") or "", one.get("named"), one.get("p")
+    reason, named, p = one.get("reason") or "", one.get("named"), one.get("p")
     truth = (
         CLASSES[one["label"]] if isinstance(one.get("label"), int) and 0 <= one["label"] < 3 else "not known"
     )
@@ -360,7 +460,7 @@ def _frame(one: dict[str, Any]) -> dict[str, Any]:
         if isinstance(named, int) and 0 <= named < 3 and p
         else "not named"
     )
-    state = f"{'held' if p else 'rejected'}: {said}" if said else judged
+    state = f"{'held' if p else 'rejected'}: {reason}" if reason else judged
     flow = (
         ""
         if one.get("flow_percent") is None
@@ -377,7 +477,7 @@ def _frame(one: dict[str, Any]) -> dict[str, Any]:
         "uri": Markup("{}").format(one["uri"]),
         "head": ", ".join(filter(None, (flow, heat))) or "Frame",
         "figure": state,
-        "bad": bool(said),
+        "bad": bool(reason),
         "foot": ", ".join(filter(None, (place, score))),
         "alt": f"Frame {one['file']}: {state}",
     }

@@ -15,7 +15,7 @@ from pipeline.setpoint.workflow.tables import BEST_FLOW, BEST_TEMPERATURE, FLOW_
 
 EPISODES, WIDTH, LEFT = 2, 1112, 36
 # decisions that are told in words
-SAID = 200
+MOST_SENTENCES = 200
 # colours of the deposition page: too little, right, too much
 SHARES = (("p_under", "too-little"), ("p_good", "flag"), ("p_over", "too-much"))
 
@@ -60,9 +60,12 @@ def _strip(mine: Table, name: str, i: int) -> dict[str, Any]:
     sent = int((mine["flow_move_percent"] != 0).sum())
     why = {text: sum(b - a for a, b, other in held if other == text) for _, _, text in held}
     holds = "; ".join(f"{text}, {count(n, 'window')}" for text, n in why.items())
-    finding = f"{end[:1].upper()}{end[1:]}; the flow was moved {number(sent, 0)} times in {count(len(t), 'decision')}, {f'and held for: {holds}' if holds else 'and never held'}."
+    finding = (
+        f"{end[:1].upper()}{end[1:]}; the flow was moved {number(sent, 0)} times in "
+        f"{count(len(t), 'decision')}, {f'and held for: {holds}' if holds else 'and never held'}."
+    )
     moved = (mine["flow_move_percent"] != 0) | (mine["temperature_move_degC"] != 0)
-    said = [str(text) for text in mine["why"][moved | mine["held"]]]
+    sentences = [str(text) for text in mine["why"][moved | mine["held"]]]
     return {
         "id": f"why-{i}",
         "head": name,
@@ -70,22 +73,22 @@ def _strip(mine: Table, name: str, i: int) -> dict[str, Any]:
         "finding": finding,
         "panels": [_shares(mine, x, edges, held), _flow(mine, x, held, edges), _temperature(mine, x),
         _moves(mine, x)],
-        "rows": said[:SAID],
-        "more": len(said[SAID:]),
+        "rows": sentences[:MOST_SENTENCES],
+        "more": len(sentences[MOST_SENTENCES:]),
     }  # fmt: skip
 
 
 def _alike(mine: Table) -> list[tuple[int, int]]:
     """Stretches of windows that were held for one reason."""
-    found = []
+    stretches = []
     for a, b in charts.stretches(np.asarray(mine["held"], bool)):
         cuts = [
             a,
             *(k for k in range(a + 1, b) if reason(str(mine["why"][k])) != reason(str(mine["why"][k - 1]))),
             b,
         ]
-        found += itertools.pairwise(cuts)
-    return found
+        stretches += itertools.pairwise(cuts)
+    return stretches
 
 
 def _frame(x: charts.Axis, y: charts.Axis, height: int, *, last: bool = False) -> charts.Frame:
@@ -111,7 +114,15 @@ def _shares(mine: Table, x: charts.Axis, edges: np.ndarray, held: list[tuple[int
         f"over at {number(float(mine['p_over'][named[2]]), 2)}; "
         f"{sum(b - a for a, b, _ in held)} windows were held"
     )
-    return charts.panel(frame, layers, alt=alt, css="mb strip-why", title="share of under (brown), good (grey), over (green); hatched: nothing may be sent", x_ticks=False, units=("s", ""))  # fmt: skip
+    return charts.panel(
+        frame,
+        layers,
+        alt=alt,
+        css="mb strip-why",
+        title="share of under (brown), good (grey), over (green); hatched: nothing may be sent",
+        x_ticks=False,
+        units=("s", ""),
+    )
 
 
 def _hatch(frame: charts.Frame, a: float, b: float) -> Markup:
@@ -147,8 +158,21 @@ def _flow(mine: Table, x: charts.Axis, held: list[tuple[int, int, str]], edges: 
             Markup('<text x="{:.1f}" y="{}">{}</text>').format(start, frame.above + 9, f"held: {text}")
         )
         free = start + 6.2 * (len(text) + 8)
-    alt = f"True flow from {number(float(mine['flow_percent'][0]), 0)} to {number(float(mine['flow_percent'][-1]), 0)} %, between {number(float(mine['flow_percent'].min()), 0)} and {number(float(mine['flow_percent'].max()), 0)} %"
-    return charts.panel(frame, layers, alt=alt, css="dd strip-why", title="true flow, % (dashed: setpoint; grey: what is asked for)", x_ticks=False, units=("s", "%"))  # fmt: skip
+    alt = (
+        f"True flow from {number(float(mine['flow_percent'][0]), 0)} to "
+        f"{number(float(mine['flow_percent'][-1]), 0)} %, between "
+        f"{number(float(mine['flow_percent'].min()), 0)} and "
+        f"{number(float(mine['flow_percent'].max()), 0)} %"
+    )
+    return charts.panel(
+        frame,
+        layers,
+        alt=alt,
+        css="dd strip-why",
+        title="true flow, % (dashed: setpoint; grey: what is asked for)",
+        x_ticks=False,
+        units=("s", "%"),
+    )
 
 
 def _temperature(mine: Table, x: charts.Axis) -> Markup:
@@ -161,7 +185,10 @@ def _temperature(mine: Table, x: charts.Axis) -> Markup:
         charts.line(frame, mine["time_s"], mine["target_degC"], "ref", steps=True),
         charts.line(frame, mine["time_s"], mine["temperature_degC"]),
     ]
-    alt = f"Nozzle temperature from {number(float(mine['temperature_degC'][0]), 0)} to {number(float(mine['temperature_degC'][-1]), 0)} °C"
+    alt = (
+        f"Nozzle temperature from {number(float(mine['temperature_degC'][0]), 0)} to "
+        f"{number(float(mine['temperature_degC'][-1]), 0)} °C"
+    )
     return charts.panel(
         frame,
         layers,
@@ -175,7 +202,14 @@ def _temperature(mine: Table, x: charts.Axis) -> Markup:
 
 def _moves(mine: Table, x: charts.Axis) -> Markup:
     reach = max(10.0, float(np.abs(mine["flow_move_percent"]).max()))
-    frame = _frame(x, charts.Axis(-1.25 * reach, 1.25 * reach, ((-reach, number(-reach, 0)), (0.0, "0"), (reach, number(reach, 0)))), 92, last=True)  # fmt: skip
+    frame = _frame(
+        x,
+        charts.Axis(
+            -1.25 * reach, 1.25 * reach, ((-reach, number(-reach, 0)), (0.0, "0"), (reach, number(reach, 0)))
+        ),
+        92,
+        last=True,
+    )
     moves = np.where(mine["flow_move_percent"] == 0, np.nan, mine["flow_move_percent"])
     warm = [
         (float(t), float(move))
@@ -196,4 +230,11 @@ def _moves(mine: Table, x: charts.Axis) -> Markup:
             )
         )
     alt = f"{int(np.isfinite(moves).sum())} moves of the flow setpoint, {len(warm)} of the target temperature"
-    return charts.panel(frame, layers, alt=alt, css="dd strip-why", title="moves that were sent: flow, points (strokes); target (lines with their °C)", units=("s", "points"))  # fmt: skip
+    return charts.panel(
+        frame,
+        layers,
+        alt=alt,
+        css="dd strip-why",
+        title="moves that were sent: flow, points (strokes); target (lines with their °C)",
+        units=("s", "points"),
+    )

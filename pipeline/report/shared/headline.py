@@ -9,7 +9,6 @@ from typing import NamedTuple
 from pipeline.report.deposition import verdict as deposition_verdict
 from pipeline.report.setpoint import verdict as setpoint_verdict
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import FAILED, PASSED
 from pipeline.report.temperature.judgement import Judgement
 
 NAMES = ("temperature", "deposition", "setpoint")
@@ -36,21 +35,25 @@ class Loop(NamedTuple):
 def loops(sources: Sources, judged: Judgement) -> list[Loop]:
     """Temperature, deposition, setpoint, each as short as page one has
     room for; the loop's own page has the whole."""
-    mine, parts, seen = judged.verdict, deposition_verdict.verdict(sources), setpoint_verdict.verdict(sources)
-    states = (
-        {PASSED: "passed", FAILED: "failed"}.get(mine.state, "open"),
-        {PASSED: "passed", FAILED: "failed"}.get(parts.state, "open") if parts.composer else ABSENT,
-        {PASSED: "passed", FAILED: "failed"}.get(seen.state, "open") if seen.default else ABSENT,
+    mine = judged.verdict
+    parts, camera = deposition_verdict.verdict(sources), setpoint_verdict.verdict(sources)
+    return _fitted(
+        [
+            Loop("temperature", MOVES[0], mine.word, mine.decision, mine.lead, mine.reason, mine.remedy),
+            *(
+                Loop(
+                    verdict.loop,
+                    moves,
+                    verdict.word if verdict.winner else ABSENT,
+                    verdict.decision,
+                    verdict.lead,
+                    _first(verdict.reason),
+                    verdict.remedy,
+                )
+                for verdict, moves in zip((parts, camera), MOVES[1:], strict=True)
+            ),
+        ]
     )
-    said = (
-        (mine.decision, mine.lead, mine.reason, mine.remedy),
-        *((v.decision, v.lead, _first(v.reason), v.remedy) for v in (parts, seen)),
-    )
-    found = [
-        Loop(name, moves, state, *one)
-        for name, moves, state, one in zip(NAMES, MOVES, states, said, strict=True)
-    ]
-    return _fitted(found)
 
 
 def _first(text: str) -> str:

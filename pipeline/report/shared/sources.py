@@ -23,9 +23,9 @@ from pipeline.deposition.workflow.tables import (
 )
 from pipeline.report.shared.verdict import Missing, ReportRules
 from pipeline.setpoint.workflow.tables import (
-    AGENT_COURSE,
+    AGENT_CURVE,
     CLASSIFIED,
-    COURSE,
+    CLASSIFIER_CURVE,
     DECISIONS,
     PATHS,
     RELIABILITY,
@@ -99,7 +99,7 @@ def collect(
     error here: its place on the page says so.
     """
     read: dict[str, Source] = {}
-    wanted = [(path, stage, stage, "metrics", artifacts.read_json) for stage, path in metrics.items()]
+    wanted = [(path, stage, stage, "metrics", artifacts.read_old_metrics) for stage, path in metrics.items()]
     tables = _tables(declared.machine)
     wanted += [
         (f"{folders[stage]}/{file}", name, stage, kind, reader) for name, stage, file, kind, reader in tables
@@ -118,12 +118,12 @@ def collect(
         for one in [] if isinstance(frames, Missing) else frames:
             read[one["path"]] = Source("frame", one["path"], stage, "JPEG", artifacts.sha256(one["path"]))
     before = (
-        _read(read, accepted, "accepted", "accept", "accepted", artifacts.read_json)
+        _read(read, accepted, "accepted", "accept", "accepted", artifacts.read_accepted)
         if artifacts.exists(accepted)
         else None
     )
     night = (
-        _read(read, NIGHTLY, "nightly", "nightly", "nightly", artifacts.read_json)
+        _read(read, NIGHTLY, "nightly", "nightly", "nightly", artifacts.read_old_metrics)
         if artifacts.exists(NIGHTLY)
         else None
     )
@@ -210,10 +210,10 @@ def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], An
         ("conformance", "compose_parts", "conformance.json", "conformance", artifacts.read_json),
         ("classified", "train_classifier", "classified.parquet", *table(CLASSIFIED)),
         ("reliability", "train_classifier", "reliability.parquet", *table(RELIABILITY)),
-        ("course", "train_classifier", "course.parquet", *table(COURSE)),
+        ("course", "train_classifier", "course.parquet", *table(CLASSIFIER_CURVE)),
         ("windows", "train_classifier", "windows.parquet", *table(WINDOWS)),
         ("nozzle_frames", "train_classifier", "frames/frames.json", "frames 1", _frames),
-        ("agents", "train_agent", "agents.parquet", *table(AGENT_COURSE)),
+        ("agents", "train_agent", "agents.parquet", *table(AGENT_CURVE)),
         ("scoreboard", "evaluate_setpoint", "scoreboard.parquet", *table(SCOREBOARD)),
         ("paths", "evaluate_setpoint", "paths.parquet", *table(PATHS)),
         ("decisions", "evaluate_setpoint", "decisions.parquet", *table(DECISIONS)),

@@ -219,7 +219,7 @@ def panel(sources: Sources) -> list[tuple[str, str]]:
     plants = lookup(sources.tables["summary"], "plants")
     simulated = sources.declared.everything.get("generate_probing", {}).get("source") == "simulated"
     spread = (
-        f"each column of B by 1 ± {p.input_gain:g} and A {MINUS} {p.loss:g} I"
+        f"each column of B by 1 ± {p.input_gain:g} and A {MINUS} {p.extra_heat_loss_per_step:g} I"
         if simulated
         else "the identified model’s uncertainty"
     )

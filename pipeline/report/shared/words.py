@@ -369,7 +369,7 @@ def glossary(sources: Sources) -> dict[str, tuple[str, str]]:
         (
             "Plants on which nothing was fitted: each column of B by 1 ± "
             f"{100 * panel.input_gain:g} %, and A "
-            f"less {panel.loss:g} I (more heat lost)."
+            f"less {panel.extra_heat_loss_per_step:g} I (more heat lost)."
         )
         if simulated
         else "Plants within the uncertainty of the identified model, of another order than the model."

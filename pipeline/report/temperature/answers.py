@@ -42,21 +42,21 @@ def all_answers(sources: Sources, asked: list[Question]) -> dict[str, dict[str, 
 def _answer(sources: Sources, judged: Any, name: str, question: Question) -> Figure | Missing:
     if question.key == "data":
         return _data(sources, name)
-    mine = lookup(judged, name, what=f"{LABELS.get(name, (name,))[0]}")
-    if isinstance(mine, Missing):
-        return mine
+    of_controller = lookup(judged, name, what=f"{LABELS.get(name, (name,))[0]}")
+    if isinstance(of_controller, Missing):
+        return of_controller
     if question.key == "worst_case_gap_percent":
-        return worst_case(sources.tables["scorecard"], name, noise(sources), mine.get("gap_percent"))
-    found = mine.get(question.key)
-    if found is None:
+        return worst_case(sources.tables["scorecard"], name, noise(sources), of_controller.get("gap_percent"))
+    figures = of_controller.get(question.key)
+    if figures is None:
         return Missing(
             "not measured",
             f"{question.title} is not in the scorecard",
             "Run ./run dvc repro evaluate_temperature",
         )
-    note = _zone(sources, found) if question.key == "settled_error_degC" else ""
+    note = _zone(sources, figures) if question.key == "settled_error_degC" else ""
     return Figure(
-        *(_finite(found.get(end)) for end in ("median", "low", "high")),
+        *(_finite(figures.get(end)) for end in ("median", "low", "high")),
         runs=_runs(sources, name, question.key),
         note=note,
     )
@@ -66,16 +66,16 @@ def _finite(value: float | None) -> float:
     return math.inf if value is None else float(value)
 
 
-def _zone(sources: Sources, found: Mapping) -> str:
-    zone = found.get("zone")
+def _zone(sources: Sources, figures: Mapping) -> str:
+    zone = figures.get("zone")
     return f"zone {zone + 1}" if isinstance(zone, int) else f"zone {zone}" if zone else ""
 
 
 def noise(sources: Sources) -> float:
     """The noise level that the figures were judged at, in °C."""
-    found = lookup(sources.tables["summary"], "noise_degC")
-    if not isinstance(found, Missing):
-        return found
+    level = lookup(sources.tables["summary"], "noise_degC")
+    if not isinstance(level, Missing):
+        return level
     return sources.declared.everything.get("evaluate_temperature", {}).get(
         "report_noise_degC", sources.declared.panel.noise_degC[0]
     )
@@ -137,9 +137,9 @@ def _model_data(sources: Sources) -> Figure | Missing:
     """The model has fewer unknowns than the window, so that noise asks no more of it; its
     own first step, a long VARX, asks for its unknowns.
     """
-    found, machine = sources.metrics["identify_plant"], sources.declared.machine
-    samples, past = lookup(found, "rows"), lookup(found, "past")
-    needed = lookup(found, "samples_needed")
+    identified, machine = sources.metrics["identify_plant"], sources.declared.machine
+    samples, past = lookup(identified, "rows"), lookup(identified, "past")
+    needed = lookup(identified, "samples_needed")
     if isinstance(needed, Missing) and not isinstance(past, Missing):
         noise = lookup(sources.metrics["learn_kernel"], "samples_needed_for_noise")
         needed = (
@@ -174,4 +174,7 @@ def featured(sources: Sources) -> str:
     offset = panel.judging.reference_offsets_degC[0]
     references = [o.reference + offset for o in sources.declared.machine.outputs]
     ends = f"{number(min(references), 0)}{DASH}{number(max(references), 0)}"
-    return f"nominal plant, held at {panel.judging.starts_degC[0]:g} °C, then sent to {ends} °C; sensor noise {noise(sources):g} °C"
+    return (
+        f"nominal plant, held at {panel.judging.starts_degC[0]:g} °C, then sent to {ends} °C; sensor noise "
+        f"{noise(sources):g} °C"
+    )

@@ -4,11 +4,13 @@ reports/metrics/nightly.json -> a figure, or why there is none."""
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from pipeline.report.shared import night
 from pipeline.report.shared.digits import number
 from pipeline.report.shared.sources import Sources
 from pipeline.report.shared.verdict import FAILED, OPEN, UNDECIDED, Figure, Missing
+from pipeline.report.temperature.verdict import NEVER
 
-NEVER = Missing(OPEN, "The nightly job measures it and has not run")
+LOOP = "temperature"  # whose alarms are read: those of another loop's camera say nothing of this machine
 AGAIN = "Look at the machine; where the change is meant to stay, record it anew and learn again"
 
 
@@ -16,7 +18,7 @@ class Drift(NamedTuple):
     """Answer 11 as it is read: what the rule is judged by, the word before the sentence,
     and which night it is from ("" before the first)."""
 
-    found: Figure | Missing
+    answer: Figure | Missing
     word: str
     text: str
     night: str
@@ -30,35 +32,36 @@ def drift(sources: Sources) -> Drift:
         return Drift(NEVER, "Not measured.", NEVER.sentence(), "")
     if isinstance(nightly, Missing):
         return Drift(nightly, f"{nightly.state.capitalize()}.", nightly.sentence(), "")
-    night, seen = (
-        f"{nightly.get('run', 'last night')}, {str(nightly.get('when', ''))[:10]}".strip(", "),
-        nightly.get("drift") or {},
-    )
-    for key, state, word in (("alarms", FAILED, "Drifted."), ("watched", UNDECIDED, "Perhaps.")):
-        causes = "; ".join(str(one.get("cause", one)) for one in seen.get(key, []))
+    when = f"{nightly.get('run', 'last night')}, {str(nightly.get('when', ''))[:10]}".strip(", ")
+    drifted = night.read(nightly.get("drift")).of(LOOP)
+    for alarms, state, word in (
+        (drifted.alarms, FAILED, "Drifted."),
+        (drifted.watched, UNDECIDED, "Perhaps."),
+    ):
+        causes = "; ".join(alarm.cause for alarm in alarms)
         if causes:
             text = causes if state == FAILED else f"{causes}; an alarm where the next night finds it again"
-            found = Missing(
+            answer = Missing(
                 state,
                 f"The machine has changed: {text}" if state == FAILED else f"{text[:1].upper()}{text[1:]}",
                 AGAIN if state == FAILED else "",
             )
-            return Drift(found, word, f"{text[:1].upper()}{text[1:]}.", night)
-    most = _most(seen.get("figures") or {})
+            return Drift(answer, word, f"{text[:1].upper()}{text[1:]}.", when)
+    most = _most(drifted.figures)
     if most is None:
-        found = Missing(OPEN, "The last night had no new recording of the machine to measure it on")
-        return Drift(found, "Not measured.", found.sentence(), night)
+        answer = Missing(OPEN, "The last night had no new recording of the machine to measure it on")
+        return Drift(answer, "Not measured.", answer.sentence(), when)
     name, percent, half = most
     text = f"Largest change of the machine: {name}, {number(percent, 1)} % ± {number(half, 1)}."
-    return Drift(Figure(percent, percent - half, percent + half, note=text), "None found.", text, night)
+    return Drift(Figure(percent, percent - half, percent + half, note=text), "None found.", text, when)
 
 
 def _most(figures: Mapping[str, Any]) -> tuple[str, float, float] | None:
     """The parameter of the plant that moved most of all recordings of the night, against its own noise: name,
     change and half of its 90 % band in percent."""
-    found = [
+    changes = [
         (abs(one["sigmas"]), name, float(one["percent"]), float(one["band_percent"]))
         for recording in figures.values()
         for name, one in (recording.get("parameters") or {}).items()
     ]
-    return max(found)[1:] if found else None
+    return max(changes)[1:] if changes else None

@@ -58,7 +58,7 @@ def _cloud(table: Table, level: float, column: str, factor: float, title: str) -
     x = charts.logarithmic(float(positive.min()), float(positive.max()))
     y = charts.Axis(-0.5, len(ROUTES) - 0.5, ())
     frame = charts.Frame(x, y, width=440, height=120, left=128, below=18, above=18, right=10)
-    layers, said = [], []
+    layers, medians = [], []
     for lane, (route, (name, css)) in enumerate(ROUTES.items()):
         at = len(ROUTES) - 1 - lane
         mine = values[(table["route"] == route) & (table["noise_degC"] == level)]
@@ -75,13 +75,13 @@ def _cloud(table: Table, level: float, column: str, factor: float, title: str) -
                     px, top, bottom
                 ),
             ]
-            said.append(f"{name} {short(middle, 2)}" + (f" ({failed} unstable)" if failed else ""))
+            medians.append(f"{name} {short(middle, 2)}" + (f" ({failed} unstable)" if failed else ""))
         elif failed:
-            said.append(f"{name}: unstable in all {failed}")
+            medians.append(f"{name}: unstable in all {failed}")
     return charts.panel(
         frame,
         layers,
-        alt=f"At {level:g} °C of noise, median {title.split(',')[0]}: {', '.join(said)}",
+        alt=f"At {level:g} °C of noise, median {title.split(',')[0]}: {', '.join(medians)}",
         css="dd",
         title=title,
     )
@@ -126,7 +126,8 @@ def orders(sources: Sources) -> Picture:
         "" if isinstance(order, Missing) else f"a model of order {order}",
         ""
         if isinstance(state, Missing)
-        else f"the kernel on the {state}, whose {lookup(learned, 'identifiable')} unknowns the data determine",
+        else f"the kernel on the {state}, whose {lookup(learned, 'identifiable')} unknowns the data "
+        "determine",
     ]
     text = "; ".join(filter(None, parts)) or "nothing"
     title = "How much memory the data ask for"
@@ -190,8 +191,9 @@ def singular(sources: Sources) -> Column:
     ]
     if edge > 0:
         layers.append(charts.level(frame, edge, "lim", "noise alone"))
-    kept = values[order == last]
-    alt = f"Order {last} is chosen: its singular value {short(float(kept[0])) if len(kept) else 'none'}, noise alone reaches {short(edge)}"
+    last_value = values[order == last]
+    size = short(float(last_value[0])) if len(last_value) else "none"
+    alt = f"Order {last} is chosen: its singular value {size}, noise alone reaches {short(edge)}"
     return Column(head, small, "model_based", [charts.panel(frame, layers, alt=alt, css="mb")])
 
 
@@ -214,7 +216,7 @@ def _kernel_state(sources: Sources) -> list[Column]:
     values = values[values > 0]
     if len(values) == 0 or values.max() < 1.1 * values.min():
         return []
-    kept = int(kernel["rank"]) - len(kernel["u_scale"])
+    directions = int(kernel["rank"]) - len(kernel["u_scale"])
     index = np.arange(1, len(values) + 1)
     frame = charts.Frame(
         charts.linear(0, len(values) + 1),
@@ -222,11 +224,18 @@ def _kernel_state(sources: Sources) -> list[Column]:
         **_SMALL,
     )
     layers = [
-        charts.dots(frame, index[:kept], values[:kept], "dot ring", 3),
-        charts.dots(frame, index[kept:], values[kept:], "try", 2.4),
+        charts.dots(frame, index[:directions], values[:directions], "dot ring", 3),
+        charts.dots(frame, index[directions:], values[directions:], "try", 2.4),
     ]
-    alt = f"{len(values)} singular values from {short(float(values.max()))} down to {short(float(values.min()))}; {kept} directions are kept"
-    return [Column(head, f"{small}; {kept} kept", "kernel", [charts.panel(frame, layers, alt=alt, css="dd")])]
+    alt = (
+        f"{len(values)} singular values from {short(float(values.max()))} down to "
+        f"{short(float(values.min()))}; {directions} directions are kept"
+    )
+    return [
+        Column(
+            head, f"{small}; {directions} kept", "kernel", [charts.panel(frame, layers, alt=alt, css="dd")]
+        )
+    ]
 
 
 def left_out(sources: Sources) -> Column:
@@ -234,20 +243,20 @@ def left_out(sources: Sources) -> Column:
     table = sources.tables["order"]
     if isinstance(table, Missing):
         return _holed(head, small, table, "model_based")
-    known = np.isfinite(table["error"])
-    if not known.any():
+    compared = np.isfinite(table["error"])
+    if not compared.any():
         return _holed(
             head,
             small,
             Missing("not applicable", "the rank alone decided, or the order was given"),
             "model_based",
         )
-    order, error, chosen = (table[name][known] for name in ("order", "error", "chosen"))
+    order, error, chosen = (table[name][compared] for name in ("order", "error", "chosen"))
     frame = charts.Frame(
         charts.linear(0, float(order[-1]) + 1), charts.linear(0, 1.1 * float(error.max())), **_SMALL
     )
     layers = [charts.line(frame, order, error), charts.dots(frame, order, error, "dot", 2.4)]
-    said = "none chosen"
+    outcome = "none chosen"
     if chosen.any():
         at, least = float(order[chosen][0]), float(error[chosen][0])
         layers += [
@@ -256,8 +265,8 @@ def left_out(sources: Sources) -> Column:
                 frame, frame.x.high, frame.y.high, f"order {at:g}: {number(least, 3)}", anchor="end", dy=10
             ),
         ]
-        said = f"order {at:g} leaves {percent(100 * least, 2)} of the variation unexplained"
-    alt = f"Error on left-out blocks by order: {said}"
+        outcome = f"order {at:g} leaves {percent(100 * least, 2)} of the variation unexplained"
+    alt = f"Error on left-out blocks by order: {outcome}"
     return Column(head, small, "model_based", [charts.panel(frame, layers, alt=alt, css="mb")])
 
 
@@ -279,7 +288,10 @@ def _poles(sources: Sources) -> Column:
         charts.line(frame, np.cos(angle), np.sin(angle), "lim line thin"),
         charts.dots(frame, poles.real, poles.imag, "dot", 3),
     ]
-    alt = f"{len(poles)} poles, the largest of size {number(largest, 4)}, {'inside' if largest < 1 else 'on or outside'} the unit circle"
+    alt = (
+        f"{len(poles)} poles, the largest of size {number(largest, 4)}, "
+        f"{'inside' if largest < 1 else 'on or outside'} the unit circle"
+    )
     return Column(head, small, "model_based", [charts.panel(frame, layers, alt=alt, css="mb")])
 
 
@@ -288,15 +300,15 @@ def _poles(sources: Sources) -> Column:
 
 def tuning(sources: Sources) -> Picture:
     """The best cost so far in both modes, each beside its yardstick."""
-    table, found, title = (
+    table, metrics, title = (
         sources.tables["tuning"],
         sources.metrics["tune_weights"],
         "The optimiser’s progress",
     )
     if isinstance(table, Missing):
         return hole("tuning", title, table)
-    best, optimum = lookup(found, "parity.best_cost_perfect_state"), lookup(found, "parity.optimum")
-    cost, default = lookup(found, "practical.cost"), default_cost(found)
+    best, optimum = lookup(metrics, "parity.best_cost_perfect_state"), lookup(metrics, "parity.optimum")
+    cost, default = lookup(metrics, "practical.cost"), default_cost(metrics)
     shown = [
         _progress(
             table,
@@ -315,15 +327,15 @@ def tuning(sources: Sources) -> Picture:
             excess=False,
         ),
     ]
-    said = []
+    sentences = []
     if not isinstance(best, Missing) and not isinstance(optimum, Missing):
         excess = percent(100 * (best / optimum - 1), 2)
-        said.append(
+        sentences.append(
             f"On the study’s objective the search ends {excess} above the optimum, {number(optimum, 0)}, "
             "which Q = R = I itself reaches."
         )
     if not isinstance(cost, Missing) and not isinstance(default, Missing):
-        said.append(
+        sentences.append(
             f"On the engineering cost it ends at {short(cost)}, the default weights at "
             f"{short(default)}, both "
             "on the training half of the panel."
@@ -334,14 +346,16 @@ def tuning(sources: Sources) -> Picture:
         if failed
         else " No candidate failed."
     )
-    return Picture("tuning", title, " ".join(said), shown, caption, page.origin(sources.source("tuning")))
+    return Picture(
+        "tuning", title, " ".join(sentences), shown, caption, page.origin(sources.source("tuning"))
+    )
 
 
-def default_cost(found: Any) -> Any:
+def default_cost(metrics: Any) -> Any:
     """The engineering cost of the weights that the search started against."""
-    cost = lookup(found, "practical.cost_default", what="the cost of the default weights")
+    cost = lookup(metrics, "practical.cost_default", what="the cost of the default weights")
     return (
-        lookup(found, "practical.cost_identity", what="the cost of equal weights")
+        lookup(metrics, "practical.cost_identity", what="the cost of equal weights")
         if isinstance(cost, Missing)
         else cost
     )

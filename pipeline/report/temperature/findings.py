@@ -12,9 +12,9 @@ def findings(sources: Sources) -> list[tuple[str, str]]:
     """What a reader should take away, each with its figure; a figure
     that was not measured is said to be so."""
     evaluated, tuned = sources.metrics["evaluate_temperature"], sources.metrics["tune_weights"]
-    found = [_claim(sources), _scaled(tuned), _algorithm_1(evaluated), _start(evaluated), _regret(tuned)]
+    claims = [_claim(sources), _scaled(tuned), _algorithm_1(evaluated), _start(evaluated), _regret(tuned)]
     units = sources.declared.machine.sample_time_s
-    found.append(
+    claims.append(
         (
             "Units are our convention.",
             (
@@ -25,7 +25,7 @@ def findings(sources: Sources) -> list[tuple[str, str]]:
         )
     )
     if sources.declared.everything.get("generate_probing", {}).get("source") == "simulated":
-        found.append(
+        claims.append(
             (
                 "The probing is simulated, the judging is separate.",
                 (
@@ -35,7 +35,7 @@ def findings(sources: Sources) -> list[tuple[str, str]]:
                 ),
             )
         )
-    return [item for item in found if item]
+    return [item for item in claims if item]
 
 
 def _claim(sources: Sources) -> tuple[str, str] | None:

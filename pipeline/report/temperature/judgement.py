@@ -6,9 +6,10 @@ from typing import NamedTuple
 
 from pipeline.report.shared.difference import Difference, Move, difference, moves
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import Figure, Missing, Question, Verdict, decide, questions
+from pipeline.report.shared.verdict import Figure, Missing, Question, Verdict
 from pipeline.report.temperature.answers import CONTROLLERS, all_answers
 from pipeline.report.temperature.drifted import Drift, drift
+from pipeline.report.temperature.verdict import decide, questions
 
 NAMES = {"data_driven": "Data\u2011driven", "model_based": "Model\u2011based", "baseline": "Baseline"}
 
@@ -30,12 +31,12 @@ def judgement(sources: Sources) -> Judgement:
     drifted = drift(sources)
     # of the machine, and so of every controller that was learned from its record
     by_name = {
-        name: {**answers, "drift": drifted.found} for name, answers in all_answers(sources, asked).items()
+        name: {**answers, "drift": drifted.answer} for name, answers in all_answers(sources, asked).items()
     }
     roles = {role: by_name[name] for role, name in CONTROLLERS.items()}
     changed = difference(sources)
-    found = moves(sources, asked, by_name) if changed else {}
-    moved = {role: found[name] for role, name in CONTROLLERS.items()} if changed else {}
+    moves_of = moves(sources, asked, by_name) if changed else {}
+    moved = {role: moves_of[name] for role, name in CONTROLLERS.items()} if changed else {}
     return Judgement(asked, by_name, roles, decide("temperature", asked, roles), changed, moved, drifted)
 
 

@@ -1,5 +1,5 @@
 """Two controllers on the very same cases: what the data-driven one saves against each of the others, with a
-sign-flip test over plants (pipeline/paired.py)."""
+sign-flip test over plants (pipeline/statistics.py)."""
 
 from typing import Any
 
@@ -30,17 +30,17 @@ def compared(sources: Sources) -> dict[str, Any]:
     if isinstance(table, Missing):
         return {"missing": table, "rows": [], "finding": ""}
     mine, level = CONTROLLERS["data_driven"], noise(sources)
-    rows, said = [], []
+    rows, sentences = [], []
     for name in (name for name in ORDER if name != mine):
         for what, cost in COSTS:
-            found = _paired(table, name, mine, level, cost)
-            if found is None:
+            pair = _paired(table, name, mine, level, cost)
+            if pair is None:
                 continue
-            rows.append({"name": name, "title": LABELS[name][0], "what": what, **_row(found)})
+            rows.append({"name": name, "title": LABELS[name][0], "what": what, **_row(pair)})
             if name == CONTROLLERS["model_based"]:
-                said.append(_sentence(what, found))
+                sentences.append(_sentence(what, pair))
     gap = None if rows else Missing("not measured", "no two controllers ran the same cases with finite costs")
-    return {"missing": gap, "rows": rows, "finding": " ".join(said)}
+    return {"missing": gap, "rows": rows, "finding": " ".join(sentences)}
 
 
 def _paired(table: Table, other: str, mine: str, level: float, cost: Any) -> Paired | None:
@@ -68,14 +68,14 @@ def _paired(table: Table, other: str, mine: str, level: float, cost: Any) -> Pai
     return paired(theirs, ours, blocks, rng=np.random.default_rng(0))
 
 
-def _row(found: Paired) -> dict[str, Any]:
-    word = "less" if found.improvement_percent >= 0 else "more"
-    chance = min(found.p, 1 - found.p)
+def _row(pair: Paired) -> dict[str, Any]:
+    word = "less" if pair.improvement_percent >= 0 else "more"
+    chance = min(pair.p, 1 - pair.p)
     return {
-        "saved": f"{short(abs(found.improvement_percent), 2)}{THIN}% {word}",
-        "band": f"{_signed(found.low_percent)} to {_signed(found.high_percent)}",
+        "saved": f"{short(abs(pair.improvement_percent), 2)}{THIN}% {word}",
+        "band": f"{_signed(pair.low_percent)} to {_signed(pair.high_percent)}",
         "p": f"{short(chance, 2)}" if chance >= 1e-4 else "< 0.0001",
-        "cases": f"{number(found.cases, 0)} on {count(found.blocks, 'plant')}",
+        "cases": f"{number(pair.cases, 0)} on {count(pair.blocks, 'plant')}",
         "sure": chance < LEVEL,
     }
 
@@ -86,9 +86,15 @@ def _signed(percent: float) -> str:
     return f"−{text}" if percent < 0 and text != "0" else text
 
 
-def _sentence(what: str, found: Paired) -> str:
-    row = _row(found)
+def _sentence(what: str, pair: Paired) -> str:
+    row = _row(pair)
     name = what.split(",")[0]
     if not row["sure"]:
-        return f"{name}: no difference beyond chance between data-driven and model-based ({row['saved']}, p = {row['p']})."
-    return f"{name}: on the same {row['cases']} data-driven has {row['saved']} than model-based (90{THIN}% interval {row['band']}{THIN}%)."
+        return (
+            f"{name}: no difference beyond chance between data-driven and model-based ({row['saved']}, p = "
+            f"{row['p']})."
+        )
+    return (
+        f"{name}: on the same {row['cases']} data-driven has {row['saved']} than model-based (90{THIN}% "
+        f"interval {row['band']}{THIN}%)."
+    )

@@ -16,8 +16,8 @@ from pipeline.report.shared.verdict import Missing
 
 def excitation(sources: Sources) -> Picture:
     """How strongly each input was moved, by frequency."""
-    found, title = sources.metrics["generate_probing"], "What the probing excites"
-    levels = lookup(found, "level_percent_per_band")
+    metrics, title = sources.metrics["generate_probing"], "What the probing excites"
+    levels = lookup(metrics, "level_percent_per_band")
     if isinstance(levels, Missing):
         return hole("excitation", title, levels)
     levels, machine = np.array(levels), sources.declared.machine
@@ -45,8 +45,8 @@ def excitation(sources: Sources) -> Picture:
                 [charts.panel(frame, [layer], alt=alt, title="%" if i == 0 else "", units=("of π", "%"))],
             )
         )
-    rank, full, order = (lookup(found, f"excitation_{key}") for key in ("rank", "full_rank", "order"))
-    condition, limited = lookup(found, "excitation_condition"), lookup(found, "limited_share")
+    rank, full, order = (lookup(metrics, f"excitation_{key}") for key in ("rank", "full_rank", "order"))
+    condition, limited = lookup(metrics, "excitation_condition"), lookup(metrics, "limited_share")
     text = f"Exciting of order {order}: rank {rank} of {full}" + (
         "." if isinstance(condition, Missing) else f", condition {short(condition)}."
     )
@@ -114,7 +114,8 @@ def _found(metrics: Any) -> str:
     return (
         "No recording is quarantined."
         if quarantined == 0
-        else f"{count(quarantined, 'recording is', 'recordings are').capitalize()} quarantined: see the findings."
+        else f"{count(quarantined, 'recording is', 'recordings are').capitalize()} quarantined: see the "
+        "findings."
     )
 
 

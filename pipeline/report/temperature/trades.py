@@ -32,14 +32,14 @@ def _names(table: Table) -> list[str]:
 
 def front(points: dict[str, tuple[float, float]]) -> list[str]:
     """Pareto's: those that no other beats in one figure without losing in the other, by the first figure."""
-    kept = [
+    on_front = [
         name
         for name, (a, b) in points.items()
         if not any(
             c <= a and d <= b and (c, d) != (a, b) for other, (c, d) in points.items() if other != name
         )
     ]
-    return sorted(kept, key=lambda name: points[name])
+    return sorted(on_front, key=lambda name: points[name])
 
 
 def tradeoff(sources: Sources) -> Picture:
@@ -68,14 +68,14 @@ def tradeoff(sources: Sources) -> Picture:
         Column(*LABELS[name], name, [_traded(name, clouds, points, best, x, y, first=i == 0)])
         for i, name in enumerate(clouds)
     ]
-    said = ", ".join(
+    places = ", ".join(
         f"{LABELS[name][0]} {number(points[name][1], 2)}{THIN}°C at {number(points[name][0], 2)}{THIN}%"
         for name in best
     )
     return Picture(
         "tradeoff",
         title,
-        f"On the front, by effort: {said}. Less error than these costs more effort, "
+        f"On the front, by effort: {places}. Less error than these costs more effort, "
         "whichever controller is taken.",
         shown,
         "R.m.s. tracking error in °C against r.m.s. effort in per cent, "
@@ -138,14 +138,14 @@ MODES = {
 def candidates(sources: Sources) -> Picture:
     """Error against effort of everything that the search tried, with the front, the
     chosen one, the default weights and the optimum."""
-    table, found, title = (
+    table, metrics, title = (
         sources.tables["tuning"],
         sources.metrics["tune_weights"],
         "What the tuning’s candidates trade",
     )
     if isinstance(table, Missing):
         return hole("candidates", title, table)
-    shown, said = [], []
+    shown, sentences = [], []
     for mode, (head, small) in MODES.items():
         rows = (
             (table["mode"] == mode)
@@ -157,15 +157,15 @@ def candidates(sources: Sources) -> Picture:
             shown.append(Column(head, small, "", [Markup('<div class="hole">{}</div>').format(gap)]))
             continue
         points = np.column_stack([table["effort_percent"][rows], table["tracking_degC"][rows]])
-        marks = _marks(points, table["chosen"][rows], lookup(found, f"{mode}.trade"))
+        marks = _marks(points, table["chosen"][rows], lookup(metrics, f"{mode}.trade"))
         edge = points[_best(points)]
         shown.append(Column(head, small, "", [_searched(points, edge, marks, head)]))
         if mode == "practical":
-            said = [_bought(marks), _beyond(marks, edge)]
+            sentences = [_bought(marks), _beyond(marks, edge)]
     return Picture(
         "candidates",
         title,
-        " ".join(filter(None, said)),
+        " ".join(filter(None, sentences)),
         shown,
         "R.m.s. tracking error in °C, up, against r.m.s. effort in per cent, across. Small: "
         "a candidate that worked; line: the front, candidates that no other beats in both; "
@@ -180,11 +180,11 @@ def candidates(sources: Sources) -> Picture:
 def _marks(points: np.ndarray, chosen: np.ndarray, trade: Any) -> dict[str, tuple[float, float]]:
     """(effort, error) of the chosen candidate, the default weights and
     the optimum, as far as they are known."""
-    known = {} if isinstance(trade, Missing) else {name: one for name, one in trade.items() if one}
-    found = {name: (one["effort_percent"], one["tracking_degC"]) for name, one in known.items()}
+    given = {} if isinstance(trade, Missing) else {name: one for name, one in trade.items() if one}
+    at = {name: (one["effort_percent"], one["tracking_degC"]) for name, one in given.items()}
     return (
         {"chosen": (float(points[chosen][0, 0]), float(points[chosen][0, 1]))} if chosen.any() else {}
-    ) | found
+    ) | at
 
 
 def _best(points: np.ndarray) -> np.ndarray:
@@ -206,7 +206,10 @@ def _bought(marks: dict[str, tuple[float, float]]) -> str:
         "less" if mine < theirs else "more"
         for mine, theirs in zip(marks["chosen"], marks["default"], strict=True)
     ]
-    return f"The chosen weights have {words[1]} error for {words[0]} effort than the default ones: {_place('chosen', marks)} of effort against {_place('default', marks)}."
+    return (
+        f"The chosen weights have {words[1]} error for {words[0]} effort than the default ones: "
+        f"{_place('chosen', marks)} of effort against {_place('default', marks)}."
+    )
 
 
 def _beyond(marks: dict[str, tuple[float, float]], edge: np.ndarray) -> str:
@@ -219,7 +222,8 @@ def _beyond(marks: dict[str, tuple[float, float]], edge: np.ndarray) -> str:
     return (
         "It lies on the front."
         if above < 0.05
-        else f"No candidate of its effort has less than {short(least, 3)}{THIN}°C: it lies {percent(above, 2)} above the front."
+        else f"No candidate of its effort has less than {short(least, 3)}{THIN}°C: it lies "
+        f"{percent(above, 2)} above the front."
     )
 
 
@@ -276,32 +280,35 @@ def plants(sources: Sources) -> Picture:
         return hole("plants", title, table)
     limit, rows = sources.declared.rules.worst_case_gap_percent, table["noise_degC"] == noise(sources)
     worst = {name: _worst(table, rows & (table["controller"] == name)) for name in _names(table)}
-    worst = {name: found for name, found in worst.items() if len(found)}
-    finite = np.concatenate([found[np.isfinite(found)] for found in worst.values()] or [np.zeros(0)])
+    worst = {name: gaps for name, gaps in worst.items() if len(gaps)}
+    finite = np.concatenate([gaps[np.isfinite(gaps)] for gaps in worst.values()] or [np.zeros(0)])
     finite = finite[finite > 0]
     if not len(finite):
         return hole(
             "plants", title, Missing("not measured", "the scorecard has no gap at this level of noise")
         )
     y = charts.logarithmic(min(float(finite.min()), limit), max(float(finite.max()), limit))
-    shown, said = [], []
-    for i, (name, found) in enumerate(worst.items()):
-        of = len(found)
-        over = int((~(found <= limit)).sum())
-        hardest = f"{percent(float(found[-1]), 3)}" if np.isfinite(found[-1]) else "no bound: a run was lost"
-        said.append(f"{LABELS[name][0]} {hardest}")
+    shown, costs = [], []
+    for i, (name, gaps) in enumerate(worst.items()):
+        of = len(gaps)
+        over = int((~(gaps <= limit)).sum())
+        hardest = f"{percent(float(gaps[-1]), 3)}" if np.isfinite(gaps[-1]) else "no bound: a run was lost"
+        costs.append(f"{LABELS[name][0]} {hardest}")
         frame = charts.Frame(
             charts.Axis(0.5, of + 0.5, ((1.0, "easiest"), (float(of), "hardest"))), y, height=130
         )
-        at, drawn = np.arange(1.0, of + 1), np.where(np.isfinite(found), found, y.high)
-        inside = found <= limit
+        at, drawn = np.arange(1.0, of + 1), np.where(np.isfinite(gaps), gaps, y.high)
+        inside = gaps <= limit
         layers = [
             charts.tint(frame, y.low, limit),
             charts.level(frame, limit, "lim", f"limit {limit:g}" if i == 0 else ""),
             charts.dots(frame, at[inside], drawn[inside], f"dot {page.MARKS[name]}", 2.6),
             charts.dots(frame, at[~inside], drawn[~inside], "gone", 3),
         ]
-        alt = f"{LABELS[name][0]}: worst run of the easiest plant {short(float(found[0]), 2)} %, of the hardest {hardest}; {over} of {of} plants beyond {limit:g} %"
+        alt = (
+            f"{LABELS[name][0]}: worst run of the easiest plant {short(float(gaps[0]), 2)} %, of the "
+            f"hardest {hardest}; {over} of {of} plants beyond {limit:g} %"
+        )
         panel = charts.panel(
             frame, layers, alt=alt, css=page.MARKS[name], title="%, log" if i == 0 else "", units=("", "%")
         )
@@ -309,7 +316,7 @@ def plants(sources: Sources) -> Picture:
     return Picture(
         "plants",
         title,
-        f"On its hardest plant each costs more than that plant’s optimum by: {', '.join(said)}; "
+        f"On its hardest plant each costs more than that plant’s optimum by: {', '.join(costs)}; "
         f"the rule allows {limit:g}{THIN}%.",
         shown,
         "Largest gap of all starts, references and seeds on a plant, in per cent, log scale; "

@@ -1,4 +1,4 @@
-"""What train_agent leaves: the agents and the belief that ours sees, to one file and back."""
+"""What train_agent leaves: the agents and the belief that the belief DQN reads, to one file and back."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,27 +15,30 @@ from pipeline.store import artifacts
 from pipeline.store.artifacts import read_weights, write_weights
 
 AGENTS_SCHEMA = "agents 2"
+# names of arrays in the file, which stay as they were first written: the belief network, and a field of the
+# filter
+OURS, FILE_NAMES = "ours", {"filter.window_repeat_probability": "filter.repeats"}
 
 
 class Agents(NamedTuple):
-    """The paper's networks after each phase, our belief and network."""
+    """The networks of Li and Pattinson (2025) after each phase; the belief, and the network that reads it."""
 
-    paper: tuple[QNetwork, ...]
+    li_2025: tuple[QNetwork, ...]
     belief: Belief
-    ours: BeliefNetwork
+    belief_dqn: BeliefNetwork
 
 
-def store_agents(path: Path, done: Agents) -> None:
-    """Every network, and our belief, by name in one file."""
+def store_agents(path: Path, agents: Agents) -> None:
+    """Every network, and the belief, by name in one file."""
     arrays = {
         f"phase{i + 1}.{name}": a
-        for i, network in enumerate(done.paper)
+        for i, network in enumerate(agents.li_2025)
         for name, a in agent.weights(network).items()
     }
-    arrays |= {f"ours.{name}": a for name, a in agent.weights(done.ours).items()} | {
-        f"belief.{name}": a for name, a in agent.weights(done.belief).items()
+    arrays |= {f"{OURS}.{name}": a for name, a in agent.weights(agents.belief_dqn).items()} | {
+        f"belief.{FILE_NAMES.get(name, name)}": a for name, a in agent.weights(agents.belief).items()
     }
-    write_weights(path, AGENTS_SCHEMA, arrays, {"phases": str(len(done.paper))})
+    write_weights(path, AGENTS_SCHEMA, arrays, {"phases": str(len(agents.li_2025))})
 
 
 def restore_agents(path: str) -> Agents:
@@ -44,15 +47,19 @@ def restore_agents(path: str) -> Agents:
     with artifacts.about(path):
         parts = {
             name: _part(arrays, name)
-            for name in [*(f"phase{i + 1}" for i in range(int(about["phases"]))), "ours", "belief"]
+            for name in [*(f"phase{i + 1}" for i in range(int(about["phases"]))), OURS, "belief"]
         }
-        found = parts.pop("belief")
-        hypotheses = found["filter.evidence"].shape[0]
-        numbers = {name: jnp.asarray(a) for name, a in found.items()}
-        model = bayes.Filter(*(numbers[f"filter.{name}"] for name in bayes.Filter._fields))
-        ours = agent.with_weights(BeliefNetwork(hypotheses, jax.random.key(0)), parts.pop("ours"))
-        paper = tuple(agent.with_weights(QNetwork(jax.random.key(0)), part) for part in parts.values())
-        return Agents(paper, Belief(model, *(numbers[name] for name in Belief._fields[1:])), ours)
+        belief = {name: jnp.asarray(a) for name, a in parts.pop("belief").items()}
+        model = bayes.Filter(
+            *(
+                belief[FILE_NAMES.get(name, name)]
+                for name in (f"filter.{field}" for field in bayes.Filter._fields)
+            )
+        )
+        hypotheses = model.evidence.shape[0]
+        network = agent.with_weights(BeliefNetwork(hypotheses, jax.random.key(0)), parts.pop(OURS))
+        li_2025 = tuple(agent.with_weights(QNetwork(jax.random.key(0)), part) for part in parts.values())
+        return Agents(li_2025, Belief(model, *(belief[name] for name in Belief._fields[1:])), network)
 
 
 def _part(arrays: Mapping[str, np.ndarray], name: str) -> dict[str, np.ndarray]:

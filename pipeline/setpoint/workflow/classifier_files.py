@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.setpoint import calibration
+from pipeline.setpoint.calibrated_classifier import CalibratedClassifier
 from pipeline.setpoint.calibration import Calibration
-from pipeline.setpoint.eyes import Eyes
 from pipeline.setpoint.vision_transformer import (
     PAPER,
     SMALL,
@@ -22,50 +22,53 @@ SIZES = {"small": SMALL, "paper": PAPER}
 CLASSIFIER_SCHEMA, CALIBRATION = "classifier 1", ("classifier_calibration", 1)
 
 
-def store_classifier(folder: Path, p: TrainClassifier, known: Eyes) -> None:
+def store_classifier(folder: Path, settings: TrainClassifier, model: CalibratedClassifier) -> None:
     """weights.safetensors, and calibration.parquet with all that was fitted after training."""
     write_weights(
-        folder / "weights.safetensors", CLASSIFIER_SCHEMA, named_arrays(known.network), {"size": p.size}
+        folder / "weights.safetensors",
+        CLASSIFIER_SCHEMA,
+        named_arrays(model.network),
+        {"size": settings.size},
     )
+    fitted = model.calibration
     numbers = {
-        "temperature": (np.array(known.known.temperature), "1", "logits of single images are divided by it"),
+        "temperature": (np.array(fitted.temperature), "1", "logits of single images are divided by it"),
         "correlation": (
-            np.array(known.known.correlation),
+            np.array(fitted.correlation),
             "1",
             "of a window's frames; summed logarithms are divided by 1 + (m - 1) times it",
         ),
-        "level": (
-            np.array(known.known.level),
-            "1",
-            "classes of at least this share are in the conformal set",
-        ),
+        "level": (np.array(fitted.level), "1", "classes of at least this share are in the conformal set"),
         "foreign_above": (
-            np.array(known.known.foreign_above),
+            np.array(fitted.foreign_above),
             "1",
             "squared Mahalanobis distance above which a frame is foreign",
         ),
-        "means": (known.known.familiar.means, "1", "mean features of the three classes"),
-        "whitening": (known.known.familiar.whitening, "1", "inverse Cholesky factor of their covariance"),
+        "means": (fitted.familiar.means, "1", "mean features of the three classes"),
+        "whitening": (fitted.familiar.whitening, "1", "inverse Cholesky factor of their covariance"),
     }
     artifacts.write_arrays(folder / "calibration.parquet", *CALIBRATION, numbers)
 
 
-def restore_classifier(weights_path: str, calibration_path: str) -> Eyes:
+def restore_classifier(weights_path: str, calibration_path: str) -> CalibratedClassifier:
     """What `store_classifier` wrote."""
     arrays, about = read_weights(weights_path, CLASSIFIER_SCHEMA)
     if about.get("size") not in SIZES:
         raise ValueError(
-            f"{weights_path} should say its size, {' or '.join(SIZES)}, but says {about.get('size')}; {artifacts.remedy(weights_path)}"
+            f"{weights_path} should say its size, {' or '.join(SIZES)}, but says {about.get('size')}; "
+            f"{artifacts.remedy(weights_path)}"
         )
     with artifacts.about(weights_path):
         network = from_named_arrays(
             vision_transformer(SIZES[about["size"]], np.random.default_rng(0)), arrays
         )
-    found = artifacts.read_arrays(calibration_path, *CALIBRATION)
-    numbers = (float(found[name]) for name in ("temperature", "correlation", "level"))
-    return Eyes(
+    fitted = artifacts.read_arrays(calibration_path, *CALIBRATION)
+    numbers = (float(fitted[name]) for name in ("temperature", "correlation", "level"))
+    return CalibratedClassifier(
         network,
         Calibration(
-            *numbers, calibration.Familiar(found["means"], found["whitening"]), float(found["foreign_above"])
+            *numbers,
+            calibration.Familiar(fitted["means"], fitted["whitening"]),
+            float(fitted["foreign_above"]),
         ),
     )

@@ -57,10 +57,10 @@ def read_log(path: Path) -> Log:
     that no printer has, a label that is no class, and time that runs backwards within a print."""
     layout = list_layout(path, lambda row: "img_path" in map(_column, row))
     layout = layout._replace(names=[_column(name) for name in layout.names])
-    said, notes = list(layout.notes), []
+    row_notes, notes = list(layout.notes), []
     columns = _columns(path, layout, notes)
-    texts, numbers, lines = _rows(path, layout, columns, said)
-    notes = [note._replace(message=f"{path}: {note.message}") for note in said] + notes
+    texts, numbers, lines = _rows(path, layout, columns, row_notes)
+    notes = [note._replace(message=f"{path}: {note.message}") for note in row_notes] + notes
     count, missing = len(lines), np.full(len(lines), np.nan)
     _check_numbers(path, lines, numbers)
     temperature = numbers[columns[1]]
@@ -136,8 +136,8 @@ def _columns(path: Path, layout: CsvLayout, notes: list[Note]) -> tuple[str, ...
     without = [f"{name} ({how})" for name, how in OPTIONAL.items() if name not in there]
     if without:
         notes.append(Note("columns", "", len(without), f"{path}: it is read without {', '.join(without)}"))
-    known = [name for name in (*OPTIONAL, "nozzle_tip_y", *SETTINGS, LABELS) if name in there]
-    return ("img_path", temperature, "flow_rate", *known)
+    optional = [name for name in (*OPTIONAL, "nozzle_tip_y", *SETTINGS, LABELS) if name in there]
+    return ("img_path", temperature, "flow_rate", *optional)
 
 
 def _rows(
@@ -160,7 +160,7 @@ def _rows(
                 texts[name] += ["" if field.casefold() in NOTHING else field for field in fields]
             else:
                 parts[name].append(floats(path, name, fields, layout.decimal, here, {}))
-    return texts, {name: np.concatenate(found) for name, found in parts.items()}, np.array(lines)
+    return texts, {name: np.concatenate(blocks) for name, blocks in parts.items()}, np.array(lines)
 
 
 def _check_numbers(path: Path, lines: np.ndarray, numbers: dict[str, np.ndarray]) -> None:

@@ -6,6 +6,7 @@ learned from has the reason why, counted in the notes.
 """
 
 import collections
+import itertools
 import os
 import posixpath
 from collections.abc import Iterable, Iterator, Sequence
@@ -20,8 +21,16 @@ from pipeline.reading.signals import Note
 from pipeline.setpoint import nozzle_scene
 from pipeline.setpoint.key_area import SHAPE
 from pipeline.setpoint.workflow.frame_csv import Log, read_log
-from pipeline.setpoint.workflow.frame_images import MISSING, NO_TIP, UNREADABLE, UNUSABLE, Seen, cut, together
-from pipeline.setpoint.workflow.frame_mcap import Film, Topics, watch
+from pipeline.setpoint.workflow.frame_images import (
+    MISSING,
+    NO_TIP,
+    UNREADABLE,
+    UNUSABLE,
+    FrameKeyAreas,
+    concatenate,
+    crop_key_areas,
+)
+from pipeline.setpoint.workflow.frame_mcap import RecordedFrames, Topics, read_recording
 from pipeline.setpoint.workflow.settings import TrainClassifier
 from pipeline.store.artifacts import sha256
 from pipeline.store.execution import run_all
@@ -45,9 +54,11 @@ REMEDIES = {
     MISSING: "copy the images below that folder, with the paths that the file gives",
     UNREADABLE: "copy the images again",
     NO_TIP: "find it with ./run beadline calibrate-tip IMAGE, and set tip_px in params.yaml",
-    UNUSABLE: "find the tip of these pictures with ./run beadline calibrate-tip IMAGE, and set tip_px in params.yaml",
+    UNUSABLE: "find the tip of these pictures with ./run beadline calibrate-tip IMAGE, and set tip_px in "
+    "params.yaml",
     NO_FLOW: "fill it in, in percent of nominal, or remove those lines",
-    NO_TEMPERATURE: "fill it in, or remove those lines; without a column target_hotend the measured hotend is taken",
+    NO_TEMPERATURE: "fill it in, or remove those lines; without a column target_hotend "
+    "the measured hotend is taken",
     NO_PRINT: "fill in print_id, or remove that column where the file is one print",
     NO_NAME: "fill in img_path, or remove those lines",
     REPEATED: "remove the lines that repeat others",
@@ -56,7 +67,7 @@ REMEDIES = {
 LOOK = "look at a few with ./run beadline calibrate-tip IMAGE --tip X,Y"
 
 
-class Reading(NamedTuple):
+class ReadOptions(NamedTuple):
     """How frames are read: the tip (x, y) in px of every frame, or None where the data have it; the least
     score of a line in gray levels; topics of recordings."""
 
@@ -65,10 +76,12 @@ class Reading(NamedTuple):
     topics: Topics
 
 
-def reading(p: TrainClassifier) -> Reading:
+def read_options(settings: TrainClassifier) -> ReadOptions:
     """As section `train_classifier` says."""
-    mapping = {name: (m.source, m.unit, m.scale, m.offset) for name, m in p.topics.mapping.items()}
-    return Reading(p.tip_px, p.least_score, Topics(p.topics.image, p.topics.time, mapping))
+    mapping = {name: (m.source, m.unit, m.scale, m.offset) for name, m in settings.topics.mapping.items()}
+    return ReadOptions(
+        settings.tip_px, settings.least_score, Topics(settings.topics.image, settings.topics.time, mapping)
+    )
 
 
 class NozzleFrames(NamedTuple):
@@ -98,7 +111,7 @@ class _Part(NamedTuple):
     """The frames of one file; reasons that the file itself gives go before those of the front end."""
 
     path: Path
-    seen: Seen
+    areas: FrameKeyAreas
     flow: np.ndarray
     temperature: np.ndarray
     prints: list[str]
@@ -107,12 +120,12 @@ class _Part(NamedTuple):
     notes: list[Note]
 
 
-def read_folder(folder: Path, how: Reading, execution: Execution, *, memo: Path) -> NozzleFrames:
+def read_folder(folder: Path, options: ReadOptions, execution: Execution, *, memo: Path) -> NozzleFrames:
     """Every frame that the CSV files and recordings below `folder` list, in the order of their
     names, cut by as many workers as `execution` says.
 
     Images are looked for beside their CSV and from `folder` on, with the path as written or without its first
-    folders. Raises ValueError, one sentence, for what read_log and watch refuse, for two lines that
+    folders. Raises ValueError, one sentence, for what read_log and read_recording refuse, for two lines that
     contradict one another about an image, and where no frame at all shows a line.
     """
     there = _images(folder)
@@ -132,45 +145,45 @@ def read_folder(folder: Path, how: Reading, execution: Execution, *, memo: Path)
             f"{folder}: expected a CSV with its images, or MCAP recordings, found neither; copy them there, "
             "or set the source to simulated"
         )
-    found = [_found(log, folder, there) for log in logs]
-    reasons = _listed(logs, [images for images, _ in found])
-    calls, sizes = [], []
-    for log, (images, _), why in zip(logs, found, reasons, strict=True):
-        tips = log.tip if how.tip_px is None else np.broadcast_to(np.array(how.tip_px, float), log.tip.shape)
-        paths = [
-            "" if reason else str(folder.resolve() / image) for image, reason in zip(images, why, strict=True)
-        ]
-        pieces = list(_pieces(log))
-        sizes.append(len(pieces))
-        calls += [
-            joblib.delayed(cut)(
-                paths[at], tips[at], log.direction[at], least_score=how.least_score, memo=memo.resolve()
-            )
-            for at in pieces
-        ]
-    calls += [
-        joblib.delayed(watch)(
-            path.resolve(), path, how.topics, how.tip_px, least_score=how.least_score, memo=memo.resolve()
-        )
+    listed = [_image_paths(log, folder, there) for log in logs]
+    reasons = _listed(logs, [images for images, _ in listed])
+    calls = [
+        _crops(log, folder, images, why, options, memo)
+        for log, (images, _), why in zip(logs, listed, reasons, strict=True)
+    ]
+    tip_px, settings = options.tip_px, {"least_score": options.least_score, "memo": memo.resolve()}
+    films = [
+        joblib.delayed(read_recording)(path.resolve(), path, options.topics, tip_px, **settings)
         for path in recordings
     ]
-    results = iter(
-        list(
-            tqdm(
-                run_all(calls, execution, kept=": what was read is kept"),
-                total=len(calls),
-                desc=f"{folder}: frames",
-                mininterval=2,
-            )
-        )
-    )
-    parts = []
-    for log, (_, note), why, size in zip(logs, found, reasons, sizes, strict=True):
-        parts.append(_of_log(log, [next(results) for _ in range(size)], why, note))
-    parts += [_of_film(path, film) for path, film in zip(recordings, results, strict=True)]
+    every = [*itertools.chain.from_iterable(calls), *films]
+    running = run_all(every, execution, remains=": what was read is kept")
+    results = iter(list(tqdm(running, total=len(every), desc=f"{folder}: frames", mininterval=2)))
+    parts = [
+        _of_log(log, [next(results) for _ in pieces], why, notes)
+        for log, (_, notes), why, pieces in zip(logs, listed, reasons, calls, strict=True)
+    ]
+    parts += [_of_recording(path, film) for path, film in zip(recordings, results, strict=True)]
     read = {path.relative_to(folder).as_posix() for paths in files.values() for path in paths}
-    unread = there.difference(read, *(images for images, _ in found))
+    unread = there.difference(read, *(images for images, _ in listed))
     return _joined(folder, parts, copies + _unread(folder, unread))
+
+
+def _crops(
+    log: Log, folder: Path, images: list[str], why: list[str], options: ReadOptions, memo: Path
+) -> list:
+    """Calls that crop the key areas of a log's images, piece by piece; a line with a reason has no path."""
+    tips = log.tip
+    if options.tip_px is not None:
+        tips = np.broadcast_to(np.array(options.tip_px, float), log.tip.shape)
+    paths = [
+        "" if reason else str(folder.resolve() / image) for image, reason in zip(images, why, strict=True)
+    ]
+    settings = {"least_score": options.least_score, "memo": memo.resolve()}
+    return [
+        joblib.delayed(crop_key_areas)(paths[at], tips[at], log.direction[at], **settings)
+        for at in _pieces(log)
+    ]
 
 
 def check(folder: Path, frames: NozzleFrames) -> None:
@@ -187,10 +200,10 @@ def check(folder: Path, frames: NozzleFrames) -> None:
         )
     for c, name in enumerate(CLASSES):
         if not (frames.valid & (frames.label == c)).any():
-            seen = frames.flow[frames.valid]
+            flow = frames.flow[frames.valid]
             raise ValueError(
                 f"{folder}: expected valid frames of every class, found none of class {c}, {name}, "
-                f"in {frames.valid.sum()} with flow_rate {seen.min():g} to {seen.max():g} "
+                f"in {frames.valid.sum()} with flow_rate {flow.min():g} to {flow.max():g} "
                 "percent of nominal; add prints at such a flow, or write flow_rate in percent"
             )
 
@@ -216,9 +229,9 @@ def _different(paths: Sequence[Path]) -> tuple[list[Path], list[Note]]:
     """The files without those that are another once more: what is learned from twice is
     trusted twice, and judged by what it was learned from."""
     first: dict[str, Path] = {}
-    kept = [path for path in paths if first.setdefault(sha256(path), path) == path]
-    twice = [path for path in paths if path not in kept]
-    return kept, [
+    different = [path for path in paths if first.setdefault(sha256(path), path) == path]
+    twice = [path for path in paths if path not in different]
+    return different, [
         Note(
             "copies",
             "",
@@ -231,18 +244,18 @@ def _different(paths: Sequence[Path]) -> tuple[list[Path], list[Note]]:
 def _unread(folder: Path, names: Iterable[str]) -> list[Note]:
     """A note of files that are no recording, that no CSV names, and that are no text about the others."""
     names = [name for name in names if posixpath.splitext(name)[1].lower() not in TEXTS]
-    said = (
+    sentence = (
         f"{folder}: {len(names)} files are named by no CSV and were not read, "
         f"the first {min(names, default='')}; "
         "list them in a CSV, or move them out"
     )
-    return [Note("unread", "", len(names), said)] if names else []
+    return [Note("unread", "", len(names), sentence)] if names else []
 
 
 def _images(folder: Path) -> set[str]:
     """Paths of all files that are not hidden, from `folder` on, with forward
     slashes; what links lead to once more is walked once."""
-    found, walked = set(), set()
+    files, walked = set(), set()
     for here, folders, names in os.walk(folder, followlinks=True):
         # a link may lead back to where it lies
         walked.add(os.path.realpath(here))
@@ -252,13 +265,13 @@ def _images(folder: Path) -> set[str]:
             if not name.startswith(".") and os.path.realpath(f"{here}/{name}") not in walked
         )
         inside = Path(here).relative_to(folder).as_posix()
-        found.update(
+        files.update(
             name if inside == "." else f"{inside}/{name}" for name in names if not name.startswith(".")
         )
-    return found
+    return files
 
 
-def _found(log: Log, folder: Path, there: set[str]) -> tuple[list[str], list[Note]]:
+def _image_paths(log: Log, folder: Path, there: set[str]) -> tuple[list[str], list[Note]]:
     """Each image's path from `folder` on, empty where it is not there: all of a
     file's lie in one place, that where most are found."""
     parts = [[part for part in image.split("/") if part not in ("", ".")] for image in log.image]
@@ -307,18 +320,18 @@ def _listed(logs: Sequence[Log], images: Sequence[list[str]]) -> list[list[str]]
     ValueError where two lines contradict one another."""
     first: dict[str, tuple[int, int]] = {}
     reasons = []
-    for k, (log, found) in enumerate(zip(logs, images, strict=True)):
+    for k, (log, paths) in enumerate(zip(logs, images, strict=True)):
         unknown = (
             (NO_FLOW, ~np.isfinite(log.flow)),
             (NO_TEMPERATURE, ~np.isfinite(log.temperature)),
             (NO_PRINT, np.array([not name for name in log.print_id], bool)),
         )
-        why = [MISSING if not image else "" for image in found]
+        why = [MISSING if not image else "" for image in paths]
         why = [NO_NAME if not named else reason for named, reason in zip(log.image, why, strict=True)]
         for reason, rows in unknown:
             for i in np.flatnonzero(rows):
                 why[i] = reason
-        for i, image in enumerate(found):
+        for i, image in enumerate(paths):
             if why[i] == "" and first.setdefault(image, (k, i)) != (k, i):
                 _check_alike(logs[first[image][0]], first[image][1], log, i)
                 why[i] = REPEATED
@@ -331,15 +344,15 @@ def _check_alike(before: Log, i: int, log: Log, j: int) -> None:
         (one.flow[row], one.temperature[row], one.print_id[row]) for one, row in ((before, i), (log, j))
     )
     if ours != theirs:
-        said = [
+        settings = [
             f"{flow:g} percent and {temperature:g} degC in print {name!r}"
             for flow, temperature, name in (theirs, ours)
         ]
         raise ValueError(
             f"{log.path}: line {log.line[j]}: expected {log.image[j]} once, "
-            f"found it here with {said[0]} and in line {before.line[i]} "
+            f"found it here with {settings[0]} and in line {before.line[i]} "
             f"of {before.path.name} "
-            f"with {said[1]}; remove the line that is wrong"
+            f"with {settings[1]}; remove the line that is wrong"
         )
 
 
@@ -353,19 +366,19 @@ def _pieces(log: Log) -> Iterator[slice]:
 # ---- parts -> one
 
 
-def _of_log(log: Log, seen: Sequence[Seen], why: list[str], notes: list[Note]) -> _Part:
-    whole = together(seen)
-    whole = whole._replace(reasons=[mine or front for mine, front in zip(why, whole.reasons, strict=True)])
-    label, known = nozzle_scene.label(log.flow), np.isfinite(log.label) & np.isfinite(log.flow)
-    wrong = np.flatnonzero(known & (log.label != label))
+def _of_log(log: Log, pieces: Sequence[FrameKeyAreas], why: list[str], notes: list[Note]) -> _Part:
+    areas = concatenate(pieces)
+    areas = areas._replace(reasons=[mine or front for mine, front in zip(why, areas.reasons, strict=True)])
+    label, labelled = nozzle_scene.label(log.flow), np.isfinite(log.label) & np.isfinite(log.flow)
+    wrong = np.flatnonzero(labelled & (log.label != label))
     notes = [*log.notes, *notes]
     if len(wrong):
         i = wrong[0]
         notes.append(
             Note(
                 "labels", "", len(wrong),
-                f"{log.path}: flow_rate_class contradicts flow_rate in {len(wrong)} of {known.sum()} lines, "
-                f"the first line {log.line[i]}: "
+                f"{log.path}: flow_rate_class contradicts flow_rate in {len(wrong)} of {labelled.sum()} "
+                f"lines, the first line {log.line[i]}: "
                 f"class {log.label[i]:g} at "
                 f"{log.flow[i]:g} percent, which is class {label[i]}; flow_rate was taken",
             )
@@ -374,19 +387,19 @@ def _of_log(log: Log, seen: Sequence[Seen], why: list[str], notes: list[Note]) -
         f"line {line}, {' '.join(image.split())[-LONGEST:] or 'no image'}"
         for line, image in zip(log.line, log.image, strict=True)
     ]
-    return _Part(log.path, whole, log.flow, log.temperature, log.print_id, log.setting, places, notes)
+    return _Part(log.path, areas, log.flow, log.temperature, log.print_id, log.setting, places, notes)
 
 
-def _of_film(path: Path, film: Film) -> _Part:
-    reasons = film.seen.reasons
+def _of_recording(path: Path, film: RecordedFrames) -> _Part:
+    reasons = film.areas.reasons
     for reason, values in ((NO_TEMPERATURE, film.temperature), (NO_FLOW, film.flow)):
         reasons = [
-            front if known else reason for front, known in zip(reasons, np.isfinite(values), strict=True)
+            front if present else reason for front, present in zip(reasons, np.isfinite(values), strict=True)
         ]
     places = [f"{time:.3f} s" for time in film.time_s]
     return _Part(
         path,
-        film.seen._replace(reasons=reasons),
+        film.areas._replace(reasons=reasons),
         film.flow,
         film.temperature,
         film.prints,
@@ -401,8 +414,8 @@ def _joined(folder: Path, parts: Sequence[_Part], notes: list[Note]) -> NozzleFr
     digests: set[str] = set()
     notes, reasons, starts = list(notes), [], [0]
     for part in parts:
-        why = list(part.seen.reasons)
-        for i, digest in enumerate(part.seen.digests):
+        why = list(part.areas.reasons)
+        for i, digest in enumerate(part.areas.digests):
             if digest and not why[i]:
                 why[i] = COPY if digest in digests else ""
                 digests.add(digest)
@@ -413,7 +426,7 @@ def _joined(folder: Path, parts: Sequence[_Part], notes: list[Note]) -> NozzleFr
     prints = tuple(dict.fromkeys(name for name in names if name))
     number = {name: i for i, name in enumerate(prints)}
     images, angle, score, padded = (
-        np.concatenate([getattr(part.seen, name) for part in parts])
+        np.concatenate([getattr(part.areas, name) for part in parts])
         for name in ("images", "angle_deg", "score", "padded_share")
     )
     flow, temperature = (
@@ -451,12 +464,12 @@ def _joined(folder: Path, parts: Sequence[_Part], notes: list[Note]) -> NozzleFr
 
 def _rejections(folder: Path, part: _Part, reasons: Sequence[str]) -> list[Note]:
     """One note for each kind of reason, with the first frame and what to do."""
-    found: dict[str, list[int]] = {}
+    by_kind: dict[str, list[int]] = {}
     for i, reason in enumerate(reasons):
         if reason:
-            found.setdefault(_kind(reason), []).append(i)
+            by_kind.setdefault(_kind(reason), []).append(i)
     notes = []
-    for kind, rows in found.items():
+    for kind, rows in by_kind.items():
         first = rows[0]
         detail = reasons[first].partition(": ")[2]
         where = f" (looked for below {folder})" if kind == MISSING else f" ({detail})" if detail else ""

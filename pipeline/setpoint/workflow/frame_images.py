@@ -54,7 +54,7 @@ KEY_AREAS = Schema(
 )
 
 
-class Seen(NamedTuple):
+class FrameKeyAreas(NamedTuple):
     """What the front end made of n frames: images (n, 16, 48) uint8, zeros where rejected;
     angle_deg, score, padded_share (n,), NaN where nothing was looked at; n reasons, empty where
     there is a key area; n digests of what the frame held."""
@@ -70,15 +70,15 @@ class Seen(NamedTuple):
 def read_image(path: str | Path) -> np.ndarray:
     """The picture (height, width) in gray, uint8 or uint16, as the camera wrote it: a rotation noted
     beside the pixels is not applied. Raises ValueError."""
-    with _said() as said:
-        found = _opened(str(path), said)
-    reason = found.partition(": ")[2] if isinstance(found, str) else ""
+    with _decoder_complaints() as complaint_of:
+        picture = _opened(str(path), complaint_of)
+    reason = picture.partition(": ")[2] if isinstance(picture, str) else ""
     if reason:
         raise ValueError(
             f"{path}: expected a whole picture (JPEG, PNG, TIFF, BMP, WebP), found {reason}; "
             "check the name, or copy it again"
         )
-    return found
+    return picture
 
 
 def decode(data: bytes) -> np.ndarray:
@@ -103,9 +103,9 @@ def decode(data: bytes) -> np.ndarray:
     return frame
 
 
-def cut(
+def crop_key_areas(
     paths: Sequence[str], tips: np.ndarray, directions_deg: np.ndarray, *, least_score: float, memo: Path
-) -> Seen:
+) -> FrameKeyAreas:
     """Key areas of image files with tips (n, 2) in px and travel directions (n,) in degrees, NaN where they
     are not known; one file's pixels in memory at a time.
 
@@ -114,42 +114,45 @@ def cut(
     """
     digests = [_digest(path) for path in paths]
     entry = entry_of(memo, digests, tips.tolist(), directions_deg.tolist(), least_score)
-    found = remembered(entry, len(paths))
-    if not found:
-        with _said() as said:
-            found = look(
-                (_opened(path, said) for path in paths), tips, directions_deg, least_score=least_score
+    areas = read_memo(entry, len(paths))
+    if not areas:
+        with _decoder_complaints() as complaint_of:
+            areas = find_key_areas(
+                (_opened(path, complaint_of) for path in paths), tips, directions_deg, least_score=least_score
             )
-        remember(entry, found)
-    return found._replace(digests=digests)
+        write_memo(entry, areas)
+    return areas._replace(digests=digests)
 
 
-def look(
+def find_key_areas(
     frames: Iterable[np.ndarray | str], tips: np.ndarray, directions_deg: np.ndarray, *, least_score: float
-) -> Seen:
+) -> FrameKeyAreas:
     """What the front end makes of n frames, or of a text that says why
     there is none; digests are left empty."""
-    found = []
+    areas = []
     for frame, tip, direction in zip(frames, tips, directions_deg, strict=True):
         reason = (
             frame if isinstance(frame, str) else _shallow(frame) or ("" if np.isfinite(tip).all() else NO_TIP)
         )
-        seen = key_area.KeyArea(np.zeros(key_area.SHAPE, np.uint8), np.nan, np.nan, np.nan, np.nan, reason)
+        area = key_area.KeyArea(np.zeros(key_area.SHAPE, np.uint8), np.nan, np.nan, np.nan, np.nan, reason)
         if not reason:
             try:
-                known = float(direction) if np.isfinite(direction) else None
-                seen = key_area.find(
-                    frame, (float(tip[0]), float(tip[1])), least_score=least_score, direction_deg=known
+                direction_deg = float(direction) if np.isfinite(direction) else None
+                area = key_area.find(
+                    frame,
+                    (float(tip[0]), float(tip[1])),
+                    least_score=least_score,
+                    direction_deg=direction_deg,
                 )
             except ValueError as error:
-                seen = seen._replace(reason=f"{UNUSABLE}: {error}")
-        found.append(seen)
-    images = np.array([seen.image for seen in found], np.uint8).reshape(-1, *key_area.SHAPE)
+                area = area._replace(reason=f"{UNUSABLE}: {error}")
+        areas.append(area)
+    images = np.array([area.image for area in areas], np.uint8).reshape(-1, *key_area.SHAPE)
     figures = (
-        np.array([getattr(seen, name) for seen in found], float)
+        np.array([getattr(area, name) for area in areas], float)
         for name in ("angle_deg", "score", "padded_share")
     )
-    return Seen(images, *figures, [seen.reason for seen in found], [""] * len(found))
+    return FrameKeyAreas(images, *figures, [area.reason for area in areas], [""] * len(areas))
 
 
 def _shallow(frame: np.ndarray) -> str:
@@ -157,10 +160,13 @@ def _shallow(frame: np.ndarray) -> str:
     lower ones alone: the front end would see black."""
     if frame.dtype != np.uint16 or frame.max() >= 1 << FILLED_BITS:
         return ""
-    return f"{UNUSABLE}: its 16 bits hold {frame.max()} at most, as of a camera of fewer bits; write its gray levels over all of 0 to 65535"
+    return (
+        f"{UNUSABLE}: its 16 bits hold {frame.max()} at most, as of a camera of fewer bits; "
+        "write its gray levels over all of 0 to 65535"
+    )
 
 
-def together(parts: Sequence[Seen]) -> Seen:
+def concatenate(parts: Sequence[FrameKeyAreas]) -> FrameKeyAreas:
     """The frames of all parts, one part behind the other."""
     arrays = (
         np.concatenate([getattr(part, name) for part in parts])
@@ -170,10 +176,10 @@ def together(parts: Sequence[Seen]) -> Seen:
         list(itertools.chain.from_iterable(getattr(part, name) for part in parts))
         for name in ("reasons", "digests")
     )
-    return Seen(*arrays, *texts)
+    return FrameKeyAreas(*arrays, *texts)
 
 
-def _opened(path: str, said: Callable[[], str]) -> np.ndarray | str:
+def _opened(path: str, complaint_of: Callable[[], str]) -> np.ndarray | str:
     """The frame, or the reason why there is none."""
     try:
         frame = decode(Path(path).read_bytes()) if path else MISSING
@@ -181,19 +187,19 @@ def _opened(path: str, said: Callable[[], str]) -> np.ndarray | str:
         frame = f"{UNREADABLE}: {os.strerror(error.errno or 0).lower()}"
     except ValueError as error:
         frame = f"{UNREADABLE}: {error}"
-    complaint = said()
+    complaint = complaint_of()
     return f"{UNREADABLE}: {complaint}" if complaint and not isinstance(frame, str) else frame
 
 
 @contextlib.contextmanager
-def _said() -> Iterator[Callable[[], str]]:
+def _decoder_complaints() -> Iterator[Callable[[], str]]:
     """A function that gives what the JPEG decoder has complained of since it was last asked: it mends what is
     damaged, and says so on the process's error stream alone."""
     at = 0
 
-    def said() -> str:
+    def complaint_of() -> str:
         nonlocal at
-        text = os.pread(heard.fileno(), 1 << 16, at)
+        text = os.pread(stream.fileno(), 1 << 16, at)
         at += len(text)
         # padding between restart markers, as cameras write it, loses nothing
         return next(
@@ -205,11 +211,11 @@ def _said() -> Iterator[Callable[[], str]]:
             "",
         )
 
-    with _LISTENING, tempfile.TemporaryFile() as heard:
+    with _LISTENING, tempfile.TemporaryFile() as stream:
         own = os.dup(2)
-        os.dup2(heard.fileno(), 2)
+        os.dup2(stream.fileno(), 2)
         try:
-            yield said
+            yield complaint_of
         finally:
             os.dup2(own, 2)
             os.close(own)
@@ -231,14 +237,14 @@ def entry_of(memo: Path, *what: Any) -> Path:
     return memo / f"{joblib.hash((what, [artifacts.sha256(HERE / name) for name in CODE]))}.parquet"
 
 
-def remember(entry: Path, found: Seen) -> None:
-    columns = ([image.tobytes() for image in found.images], *found[1:])
+def write_memo(entry: Path, areas: FrameKeyAreas) -> None:
+    columns = ([image.tobytes() for image in areas.images], *areas[1:])
     artifacts.write_table(
         entry, KEY_AREAS, dict(zip([column.name for column in KEY_AREAS.columns], columns, strict=True))
     )
 
 
-def remembered(entry: Path, count: int) -> Seen | None:
+def read_memo(entry: Path, count: int) -> FrameKeyAreas | None:
     """An entry of so many frames that is whole, which the checksums of its pages tell."""
     try:
         table = artifacts.read_table(entry, KEY_AREAS)
@@ -248,4 +254,4 @@ def remembered(entry: Path, count: int) -> Seen | None:
         return None
     images = np.frombuffer(b"".join(table["image"]), np.uint8).reshape(-1, *key_area.SHAPE)
     columns = (table[name].tolist() for name in ("reason", "digest"))
-    return Seen(images, table["angle_deg"], table["score"], table["padded_share"], *columns)
+    return FrameKeyAreas(images, table["angle_deg"], table["score"], table["padded_share"], *columns)

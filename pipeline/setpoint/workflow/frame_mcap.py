@@ -17,7 +17,14 @@ from pipeline.reading.mcap_columns import Topic, resolve, topics
 from pipeline.reading.mcap_messages import UnreadableMessage
 from pipeline.reading.signals import Note, Source, nearest_names
 from pipeline.setpoint.workflow.frame_csv import stretches
-from pipeline.setpoint.workflow.frame_images import Seen, entry_of, look, remember, remembered, together
+from pipeline.setpoint.workflow.frame_images import (
+    FrameKeyAreas,
+    concatenate,
+    entry_of,
+    find_key_areas,
+    read_memo,
+    write_memo,
+)
 from pipeline.store.artifacts import sha256
 from pipeline.store.mcap_frames import check_overlap, damage, read_frames, span_of
 
@@ -66,13 +73,13 @@ class Topics(NamedTuple):
         }
 
 
-class Film(NamedTuple):
+class RecordedFrames(NamedTuple):
     """The n frames of a recording that can be decoded, at time_s (n,), as the front end sees them: flow in
     percent, temperature in degC and print that held at that time, NaN and empty before the first; `stretch`
     numbers those of constant settings."""
 
     time_s: np.ndarray
-    seen: Seen
+    areas: FrameKeyAreas
     flow: np.ndarray
     temperature: np.ndarray
     prints: list[str]
@@ -83,7 +90,7 @@ class Film(NamedTuple):
 # ---- reading
 
 
-def watch(
+def read_recording(
     path: Path,
     shown: Path,
     where: Topics,
@@ -91,7 +98,7 @@ def watch(
     *,
     least_score: float,
     memo: Path,
-) -> Film:
+) -> RecordedFrames:
     """The key areas of a recording, with the setpoints that held when each frame was taken, a few frames in
     memory at a time; `shown` is the path that is spoken of.
 
@@ -100,7 +107,7 @@ def watch(
     setpoints that do not overlap in time; what is damaged is left out and noted.
     """
     try:
-        return _watch(path, shown, where, tip_px, least_score, memo)
+        return _read_recording(path, shown, where, tip_px, least_score, memo)
     except ValueError as error:
         raise ValueError(str(error).replace(str(path), str(shown))) from None
     except OSError as error:
@@ -118,17 +125,17 @@ def open_film(
     """Frames in the order of time, {signal: (time_s (n,), values (n,))} of those that the recording
     has, on one clock, and notes of what was damaged."""
     clock = where.time or "log_time"
-    found = _topics(path)
-    camera = _camera(path, found, where.image)
+    in_file = _topics(path)
+    camera = _camera(path, in_file, where.image)
     places = {}
     for name, source in where.sources().items():
         try:
-            places[name] = (source, *resolve(path, source.source, found))
+            places[name] = (source, *resolve(path, source.source, in_file))
         except ValueError as error:
             # what was mapped on purpose must be there
             if name in NEEDED or name in where.mapping:
                 raise ValueError(f"{error}; map it in {PLACE}.mapping.{name}") from None
-    film = read_frames(path, camera, places, found, clock=clock, unreadable_share=1.0)
+    film = read_frames(path, camera, places, in_file, clock=clock, unreadable_share=1.0)
     return film.frames, film.signals, film.notes
 
 
@@ -138,9 +145,9 @@ def _topics(path: Path) -> dict[str, Topic]:
     return topics(path)
 
 
-def _camera(path: Path, found: dict[str, Topic], name: str) -> Topic:
+def _camera(path: Path, in_file: dict[str, Topic], name: str) -> Topic:
     try:
-        return image_topic(path, found, name)
+        return image_topic(path, in_file, name)
     except ValueError as error:
         raise ValueError(f"{error} ({PLACE}.image)") from None
 
@@ -160,17 +167,17 @@ def middle_frame(path: Path, image: str) -> np.ndarray:
     )
 
 
-def _watch(
+def _read_recording(
     path: Path, shown: Path, where: Topics, tip_px: tuple[float, float] | None, least_score: float, memo: Path
-) -> Film:
+) -> RecordedFrames:
     frames, signals, notes = open_film(path, where)
     check_overlap(path, span_of(frames.time_s), {name: (signals[name][0][0], np.inf) for name in NEEDED})
     entry = entry_of(memo, sha256(path), where, tip_px, least_score)
     # frames that cannot be decoded are met again, and counted
-    time_s, seen = frames.time_s, remembered(entry, len(frames))
-    if not seen:
-        time_s, seen = _looked(path, frames, signals, tip_px, least_score)
-        remember(entry, seen)
+    time_s, areas = frames.time_s, read_memo(entry, len(frames))
+    if not areas:
+        time_s, areas = _find_all(path, frames, signals, tip_px, least_score)
+        write_memo(entry, areas)
     flow, temperature, number = (
         _held(signals, name, time_s) for name in ("flow_percent", "temperature_degC", "print_id")
     )
@@ -179,33 +186,38 @@ def _watch(
         if "print_id" in signals
         else [shown.stem] * len(time_s)
     )
-    settings, known = [flow, number], np.nan_to_num(temperature, nan=-1.0)
-    if np.count_nonzero(known[1:] != known[:-1]) <= max(MEASURED, len(time_s) / MEASURED):
-        settings.append(known)
+    settings, degrees = [flow, number], np.nan_to_num(temperature, nan=-1.0)
+    if np.count_nonzero(degrees[1:] != degrees[:-1]) <= max(MEASURED, len(time_s) / MEASURED):
+        settings.append(degrees)
     else:
-        said = "its temperature changes all the time, so it is measured and ends no segment; map the setpoint where there is one"
-        notes.append(Note("temperature", "temperature_degC", 1, said))
+        sentence = (
+            "its temperature changes all the time, so it is measured and ends no segment; "
+            "map the setpoint where there is one"
+        )
+        notes.append(Note("temperature", "temperature_degC", 1, sentence))
     notes = [note._replace(message=f"{shown}: {note.message}") for note in [*notes, *frames.notes()]]
-    return Film(time_s, seen, flow, temperature, prints, stretches(np.column_stack(settings)), notes)
+    return RecordedFrames(
+        time_s, areas, flow, temperature, prints, stretches(np.column_stack(settings)), notes
+    )
 
 
-def _looked(
+def _find_all(
     path: Path, frames: Frames, signals: Mapping, tip_px: tuple[float, float] | None, least_score: float
-) -> tuple[np.ndarray, Seen]:
+) -> tuple[np.ndarray, FrameKeyAreas]:
     """(time_s (n,), what the front end makes of the frames), of those that can be decoded."""
     times, pieces, walking = [], [], iter(frames)
     while batch := list(itertools.islice(walking, TOGETHER)):
         time_s = np.array([time for time, _ in batch])
         tips = np.column_stack([_held(signals, name, time_s) for name in ("tip_x_px", "tip_y_px")])
         tips = tips if tip_px is None else np.broadcast_to(np.array(tip_px, float), tips.shape)
-        seen = look(
+        areas = find_key_areas(
             (frame for _, frame in batch),
             tips,
             _held(signals, "travel_direction_deg", time_s),
             least_score=least_score,
         )
         pieces.append(
-            seen._replace(
+            areas._replace(
                 digests=[
                     hashlib.blake2b(np.ascontiguousarray(frame), digest_size=16).hexdigest()
                     for _, frame in batch
@@ -215,7 +227,7 @@ def _looked(
         times.append(time_s)
     if not times:
         raise ValueError(f"{path}: expected frames, found none that can be decoded; record again")
-    return np.concatenate(times), together(pieces)
+    return np.concatenate(times), concatenate(pieces)
 
 
 def _held(signals: Mapping[str, tuple[np.ndarray, np.ndarray]], name: str, time_s: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from pipeline.setpoint.workflow.tables import FLOW_EDGES
 FINE = (75.0, 125.0)  # in which a controller stays, and would see one window's chance again and again
 
 
-class Seen(NamedTuple):
+class LabelledFrames(NamedTuple):
     """n frames: key areas (n, 16, 48) uint8, class and true flow in percent (n,), temperature (n,) in °C,
     print and segment (n,), valid (n,) and the reason why not."""
 
@@ -25,8 +25,8 @@ class Seen(NamedTuple):
     valid: np.ndarray
     reasons: np.ndarray
 
-    def take(self, rows: np.ndarray) -> "Seen":
-        return Seen(*(a[rows] for a in self))
+    def take(self, rows: np.ndarray) -> "LabelledFrames":
+        return LabelledFrames(*(a[rows] for a in self))
 
     def labelled(self) -> tuple[np.ndarray, ...]:
         """Of the valid ones what a learner needs: images, temperature, class, segment."""
@@ -34,24 +34,24 @@ class Seen(NamedTuple):
         return some.images, some.temperature, some.label, some.segment
 
 
-def rendered(seed: Sequence[int], frames: int, least_score: float) -> Seen:
+def rendered(seed: Sequence[int], frames: int, least_score: float) -> LabelledFrames:
     """A segment of each of the 15 combinations."""
-    made = nozzle_scene.data_set(
+    scene = nozzle_scene.data_set(
         np.random.default_rng(seed), segments=1, frames=frames, least_score=least_score
     )
-    return Seen(
-        made.images,
-        made.label,
-        made.flow,
-        made.temperature,
-        made.segment,
-        made.segment,
-        made.valid,
-        np.array(made.reasons, object),
+    return LabelledFrames(
+        scene.images,
+        scene.label,
+        scene.flow,
+        scene.temperature,
+        scene.segment,
+        scene.segment,
+        scene.valid,
+        np.array(scene.reasons, object),
     )
 
 
-def swept(seed: Sequence[int], windows: float, frames: int, least_score: float) -> Seen:
+def swept(seed: Sequence[int], windows: float, frames: int, least_score: float) -> LabelledFrames:
     """One segment's conditions, all at one temperature, over all bins of the
     flow: windows of `frames` frames with a flow each.
 
@@ -65,29 +65,29 @@ def swept(seed: Sequence[int], windows: float, frames: int, least_score: float) 
         if count == 0:
             continue
         flow, temperature = np.repeat(rng.uniform(low, high, count), frames), np.full(count * frames, degrees)
-        cut = nozzle_scene.key_areas(
+        areas = nozzle_scene.key_areas(
             nozzle_scene.render(segment, flow, temperature, rng), least_score=least_score
         )
         number = np.zeros(len(flow), int)
         pieces.append(
-            Seen(
-                cut.images,
+            LabelledFrames(
+                areas.images,
                 nozzle_scene.label(flow),
                 flow,
                 temperature,
                 number,
                 number,
-                cut.valid,
-                np.array(cut.reasons, object),
+                areas.valid,
+                np.array(areas.reasons, object),
             )
         )
-    return Seen(*(np.concatenate(columns) for columns in zip(*pieces, strict=True)))
+    return LabelledFrames(*(np.concatenate(columns) for columns in zip(*pieces, strict=True)))
 
 
-def joined(several: Sequence[Seen]) -> Seen:
+def joined(several: Sequence[LabelledFrames]) -> LabelledFrames:
     """One behind the other, their prints and segments numbered on."""
     shift, pieces = 0, []
     for one in several:
         pieces.append(one._replace(print_number=one.print_number + shift, segment=one.segment + shift))
         shift += int(one.segment.max()) + 1
-    return Seen(*(np.concatenate(columns) for columns in zip(*pieces, strict=True)))
+    return LabelledFrames(*(np.concatenate(columns) for columns in zip(*pieces, strict=True)))

@@ -77,7 +77,7 @@ class TrainClassifier(Section):
 
 class Learning(Section):
     """Deep Q-learning: environments stepped together, batch, transitions remembered, steps of an episode,
-    Adam's rate, discount, the slow copy's step, and how much is explored."""
+    Adam's rate, discount, the target network's step, and how much is explored."""
 
     environments: int = Field(ge=1, le=100_000)
     batch: int = Field(ge=1, le=100_000)
@@ -90,8 +90,8 @@ class Learning(Section):
     least: float = Field(ge=0, le=1)
 
 
-class Paper(Learning):
-    """The published agent: updates of its phases, exploration again
+class Li2025(Learning):
+    """The agent of Li and Pattinson (2025): updates of its phases, exploration again
     from the second on, accuracy of the last."""
 
     updates: list[Annotated[int, Field(ge=1, le=10_000_000)]] = Field(min_length=3, max_length=4)
@@ -100,23 +100,23 @@ class Paper(Learning):
 
 
 class RobustFilter(Section):
-    """Settings of bayes.robust_filter."""
+    """The section of bayes.CameraErrorModel."""
 
     accuracies: list[Annotated[float, Field(gt=0.34, lt=1)]] = Field(min_length=1, max_length=20)
     gains: list[Annotated[float, Field(gt=0, le=10)]] = Field(min_length=1, max_length=20)
-    looks: int = Field(ge=1, le=51)
-    look: float = Field(gt=0, le=1)
+    width_bias_levels: int = Field(ge=1, le=51)
+    width_bias_std: float = Field(gt=0, le=1)
     floor: float = Field(gt=0, lt=1)
     smoothing: float = Field(gt=0, le=100)
-    segment: float = Field(ge=1, le=10_000)
-    switch: float = Field(gt=0, lt=1)
-    repeats: float = Field(ge=0, lt=1)
+    segment_mean_decisions: float = Field(ge=1, le=10_000)
+    mode_switch_probability: float = Field(gt=0, lt=1)
+    window_repeat_probability: float = Field(ge=0, lt=1)
     hazard: float = Field(ge=0, lt=1)
     move_cost: float = Field(ge=0, le=10)
     outside_cost: float = Field(ge=0, le=1000)
 
     def hypotheses(self) -> int:
-        return len(self.gains) * (len(self.accuracies) + self.looks)
+        return len(self.gains) * (len(self.accuracies) + self.width_bias_levels)
 
 
 class Costs(Section):
@@ -127,8 +127,8 @@ class Costs(Section):
     move: float = Field(ge=0, le=10)
 
 
-class Troubles(Section):
-    """What training episodes meet, belief_agent.Troubles."""
+class Disturbances(Section):
+    """What training episodes meet, belief_agent.Disturbances."""
 
     recorded_share: float = Field(ge=0, le=1)
     longest_segment: float = Field(ge=1, le=10_000)
@@ -139,13 +139,13 @@ class Troubles(Section):
     drift: float = Field(ge=0, le=0.1)
 
 
-class Ours(Learning):
-    """Our agent: the filter whose belief it sees, what a step costs, what it meets,
+class BeliefDqn(Learning):
+    """Belief DQN: the filter whose belief the network reads, what a step costs, what episodes meet,
     and rounds of updates, the best of which is kept."""
 
     filter: RobustFilter
     costs: Costs
-    troubles: Troubles
+    disturbances: Disturbances
     updates: int = Field(ge=1, le=10_000_000)
     rounds: int = Field(ge=1, le=1000)
 
@@ -155,8 +155,8 @@ class TrainAgent(Section):
 
     seed: int = Field(ge=0, le=2**31)
     runs: int = Field(ge=1, le=10_000)
-    paper: Paper
-    ours: Ours
+    li_2025: Li2025
+    belief_dqn: BeliefDqn
 
 
 class Proportional(Section):
@@ -200,7 +200,7 @@ class Pixels(Section):
     tip_tolerance_px: float = Field(ge=8, le=REACH_PX)
     per_action: tuple[Annotated[float, Field(gt=0, le=1000)], Annotated[float, Field(gt=0, le=1000)]]
     per_minute: tuple[Annotated[float, Field(gt=0, le=10_000)], Annotated[float, Field(gt=0, le=10_000)]]
-    segment_s: float = Field(gt=0, le=1e6)
+    segment_mean_s: float = Field(gt=0, le=1e6)
     least_frames: int = Field(ge=1, le=1000)
     heater_s: float = Field(gt=0, le=1000)
     heater_delay_s: float = Field(ge=0, le=1000)
@@ -213,6 +213,6 @@ class EvaluateSetpoint(Section):
 
     seed: int = Field(ge=0, le=2**31)
     runs: int = Field(ge=1, le=10_000)
-    segment: float = Field(ge=1, le=10_000)
+    segment_mean_decisions: float = Field(ge=1, le=10_000)
     baselines: Baselines
     pixels: Pixels

@@ -52,7 +52,7 @@ RELIABILITY = Schema(
     ),
 )
 
-COURSE = Schema(
+CLASSIFIER_CURVE = Schema(
     "course",
     1,
     (
@@ -78,11 +78,11 @@ WINDOWS = Schema(
     ),
 )
 
-AGENT_COURSE = Schema(
+AGENT_CURVE = Schema(
     "agents",
-    1,
+    2,
     (
-        Column("agent", TEXT, NONE, "paper: as published; ours"),
+        Column("agent", TEXT, NONE, "li_2025: as published; belief_dqn: on the belief of a filter"),
         Column("phase", INDEX, NONE, "phase of training, from 1", low=1),
         Column("update", COUNT, NONE, "updates done in all phases so far", low=0),
         Column("reward", FLOAT, NONE, "mean reward of a step in the reward of that phase"),

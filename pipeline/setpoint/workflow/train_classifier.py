@@ -2,7 +2,8 @@
 beside their yardsticks; tables, metrics and a few frames of it."""
 
 import contextlib
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,10 +13,10 @@ import joblib
 import numpy as np
 from tqdm import tqdm
 
-from pipeline.setpoint import calibration, classifier, eyes, key_area, nozzle_scene
-from pipeline.setpoint.calibration import Seen as CalibrationSeen
-from pipeline.setpoint.classifier import Labelled, State
-from pipeline.setpoint.eyes import Beside, Eyes, Said
+from pipeline.setpoint import calibrated_classifier, calibration, classifier, key_area, nozzle_scene
+from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, WindowPredictions, YardstickClasses
+from pipeline.setpoint.calibration import ClassifierOutputs
+from pipeline.setpoint.classifier import Labelled, TrainingSettings, TrainState
 from pipeline.setpoint.recorded import WindowTable
 from pipeline.setpoint.vision_transformer import (
     Classifier,
@@ -26,8 +27,8 @@ from pipeline.setpoint.vision_transformer import (
     vision_transformer,
 )
 from pipeline.setpoint.workflow.classifier_files import CLASSIFIER_SCHEMA, SIZES
-from pipeline.setpoint.workflow.render_frames import Seen
-from pipeline.setpoint.workflow.settings import Recipe, TrainClassifier
+from pipeline.setpoint.workflow.render_frames import LabelledFrames
+from pipeline.setpoint.workflow.settings import TrainClassifier
 from pipeline.setpoint.workflow.windows import edges
 from pipeline.statistics import wilson
 from pipeline.store import artifacts
@@ -43,90 +44,75 @@ MEMO = Path("datasets/memo/train_classifier")
 
 
 class Trained(NamedTuple):
-    """The two networks at their best epoch, and the course of both."""
+    """The two networks at their best epoch, and the learning curves of both."""
 
     network: Classifier
     cnn: Classifier
-    course: dict[str, State]
+    curves: dict[str, TrainState]
 
 
-def trained(p: TrainClassifier, found: Mapping[str, Seen], checkpoints: Path = MEMO) -> Trained:
-    """The vision transformer of p.size and the small CNN, trained alike; a
+def trained(
+    settings: TrainClassifier, by_part: Mapping[str, LabelledFrames], checkpoints: Path = MEMO
+) -> Trained:
+    """The vision transformer of settings.size and the small CNN, trained alike; a
     training that was killed goes on from its last epoch.
 
     Raises ValueError, nothing trained, where the other parts do not
     suffice for what is fitted and judged afterwards.
     """
-    _check_parts(p, found)
-    learned, held_out = Labelled(*found["learned"].labelled()), Labelled(*found["held_out"].labelled())
-    key = jax.random.key(p.seed)
+    _check_parts(settings, by_part)
+    learned, held_out = (Labelled(*by_part[part].labelled()) for part in ("learned", "held_out"))
+    key, size = jax.random.key(settings.seed), SIZES[settings.size]
     untrained = {
         "vision transformer": (
-            vision_transformer(SIZES[p.size], np.random.default_rng([p.seed, 10])),
-            getattr(p, p.size),
+            vision_transformer(size, np.random.default_rng([settings.seed, 10])),
+            getattr(settings, settings.size),
         ),
-        "convolutional network": (convolutional(np.random.default_rng([p.seed, 11])), p.cnn),
+        "convolutional network": (convolutional(np.random.default_rng([settings.seed, 11])), settings.cnn),
     }
-    course = {
-        name: _trained(name, network, recipe, p, learned, held_out, jax.random.fold_in(key, i), checkpoints)
-        for i, (name, (network, recipe)) in enumerate(untrained.items())
-    }
-    return Trained(course["vision transformer"].best, course["convolutional network"].best, course)
+    curves = {}
+    for i, (name, (network, recipe)) in enumerate(untrained.items()):
+        inputs = settings.size, settings.augmentation, settings.seed, recipe.model_dump()
+        what = (name, *inputs, [a.tobytes() for data in (learned, held_out) for a in data], _code())
+        train = functools.partial(
+            classifier.train,
+            learned=learned,
+            held_out=held_out,
+            settings=TrainingSettings(**recipe.model_dump(exclude={"epochs"})),
+            key=jax.random.fold_in(key, i),
+            augment=AUGMENTATIONS[settings.augmentation],
+        )
+        state = classifier.untrained(network, epochs=recipe.epochs)
+        curves[name] = _resumed(train, state, name, checkpoints / f"{joblib.hash(what)}.safetensors")
+    return Trained(curves["vision transformer"].best, curves["convolutional network"].best, curves)
 
 
-def _trained(
-    name: str,
-    network: Classifier,
-    recipe: Recipe,
-    p: TrainClassifier,
-    learned: Labelled,
-    held_out: Labelled,
-    key: jax.Array,
-    checkpoints: Path,
-) -> State:
-    what = (
-        name,
-        p.size,
-        p.augmentation,
-        p.seed,
-        recipe.model_dump(),
-        [a.tobytes() for data in (learned, held_out) for a in data],
-        _code(),
-    )
-    path = checkpoints / f"{joblib.hash(what)}.safetensors"
-    state = classifier.untrained(network, epochs=recipe.epochs)
+def _resumed(train: Callable, state: TrainState, name: str, checkpoint: Path) -> TrainState:
+    """train(state, on_step=...) from the checkpoint, where there is one; it is written after each epoch."""
     with contextlib.suppress(ValueError):  # there is none yet, or it is damaged: from the beginning
-        state = from_named_arrays(state, read_weights(path, CLASSIFIER_SCHEMA)[0])
+        state = from_named_arrays(state, read_weights(checkpoint, CLASSIFIER_SCHEMA)[0])
     with tqdm(
-        total=recipe.epochs,
+        total=len(state.history),
         initial=int(state.epoch),
         desc=f"train_classifier: {name}",
         unit="epoch",
         mininterval=2,
     ) as bar:
 
-        def on_step(state: State) -> None:
-            write_weights(path, CLASSIFIER_SCHEMA, named_arrays(state), {"epoch": str(int(state.epoch))})
-            bar.set_postfix(held_out=f"{float(state.history[int(state.epoch) - 1, 2]):.3f}", refresh=False)
+        def on_step(state: TrainState) -> None:
+            epoch = int(state.epoch)
+            write_weights(checkpoint, CLASSIFIER_SCHEMA, named_arrays(state), {"epoch": str(epoch)})
+            bar.set_postfix(held_out=f"{float(state.history[epoch - 1, 2]):.3f}", refresh=False)
             bar.update()
 
-        settings = recipe.model_dump(exclude={"epochs"})
-        return classifier.train(
-            state,
-            learned,
-            held_out,
-            key=key,
-            augment=AUGMENTATIONS[p.augmentation],
-            on_step=on_step,
-            **settings,
-        )
+        return train(state, on_step=on_step)
 
 
-def _check_parts(p: TrainClassifier, found: Mapping[str, Seen]) -> None:
+def _check_parts(settings: TrainClassifier, by_part: Mapping[str, LabelledFrames]) -> None:
     """Raises ValueError where a class is learned in too few stretches for the yardstick's folds, a part has
     no window, or too few segments have one for the sets that are asked for (calibration.conformal_level)."""
-    of = "prints" if p.source == "recordings" else "segments"
-    learned = Labelled(*found["learned"].labelled())
+    of = "prints" if settings.source == "recordings" else "segments"
+    learned = Labelled(*by_part["learned"].labelled())
     for c, name in enumerate(classifier.CLASS_NAMES):
         stretches = len(np.unique(learned.segment[learned.label == c]))
         if stretches < FOLDS:
@@ -137,24 +123,24 @@ def _check_parts(p: TrainClassifier, found: Mapping[str, Seen]) -> None:
                 f"or raise train_classifier.{of}.learned"
             )
     for part in ("judged", "calibration"):
-        data = _all(p, found[part])
-        rows = calibration.windows(data.segment, data.label, length=p.window).rows
+        data = _all(settings, by_part[part])
+        rows = calibration.windows(data.segment, data.label, length=settings.window).rows
         if not len(rows):
             raise ValueError(
-                f"expected {p.window} frames in a row at one class in the frames for {part}, "
+                f"expected {settings.window} frames in a row at one class in the frames for {part}, "
                 f"found none in {len(data.label)}; "
                 "record longer stretches, "
                 "or lower train_classifier.window"
             )
-    there, needed = (
+    calibrated, needed = (
         len(np.unique(data.segment[rows[:, 0]])),
-        int(np.ceil(np.log(1 - p.confidence) / np.log(p.coverage))),
+        int(np.ceil(np.log(1 - settings.confidence) / np.log(settings.coverage))),
     )
-    if there < needed:
+    if calibrated < needed:
         raise ValueError(
             f"expected windows of at least log(1 - confidence) / log(coverage) = {needed} "
             f"{of} to calibrate with, "
-            f"found {there}; add {of}, raise "
+            f"found {calibrated}; add {of}, raise "
             f"train_classifier.{of}.calibration, or lower train_classifier.coverage or confidence"
         )
 
@@ -171,73 +157,79 @@ def _code() -> list[str]:
 
 
 class Judged(NamedTuple):
-    """The eyes; the judged frames and what the network sees of them; its
-    windows; the small CNN's classes and the yardsticks."""
+    """The calibrated classifier; the judged frames, its outputs on them, and its windows; the small CNN's
+    classes and the yardsticks'."""
 
-    eyes: Eyes
+    model: CalibratedClassifier
     data: Labelled
-    frames: CalibrationSeen
-    says: Said
+    frames: ClassifierOutputs
+    windows: WindowPredictions
     cnn: np.ndarray
-    yardsticks: Beside
+    yardsticks: YardstickClasses
 
 
-def _all(p: TrainClassifier, seen: Seen) -> Labelled:
+def _all(settings: TrainClassifier, frames: LabelledFrames) -> Labelled:
     """All frames, rejected ones too; of a folder, what errs together is a print."""
     return Labelled(
-        seen.images,
-        seen.temperature,
-        seen.label,
-        seen.print_number if p.source == "recordings" else seen.segment,
+        frames.images,
+        frames.temperature,
+        frames.label,
+        frames.print_number if settings.source == "recordings" else frames.segment,
     )
 
 
-def judged(p: TrainClassifier, found: Mapping[str, Seen], networks: Trained) -> Judged:
-    learned, data = Labelled(*found["learned"].labelled()), _all(p, found["judged"])
-    looks = {
-        part: eyes.look(networks.network, _all(p, found[part]), found[part].valid)
+def judged(settings: TrainClassifier, by_part: Mapping[str, LabelledFrames], networks: Trained) -> Judged:
+    """The networks calibrated on one part and judged on another, beside their yardsticks."""
+    learned, data = Labelled(*by_part["learned"].labelled()), _all(settings, by_part["judged"])
+    outputs = {
+        part: calibrated_classifier.outputs(
+            networks.network, _all(settings, by_part[part]), by_part[part].valid
+        )
         for part in ("learned", "calibration", "judged")
     }
-    known = calibration.calibrate(
-        looks["learned"],
-        looks["calibration"],
-        length=p.window,
-        coverage=p.coverage,
-        confidence=p.confidence,
-        false_alarms=p.false_alarms,
+    fitted = calibration.calibrate(
+        outputs["learned"],
+        outputs["calibration"],
+        length=settings.window,
+        coverage=settings.coverage,
+        confidence=settings.confidence,
+        false_alarms=settings.false_alarms,
     )
-    says = eyes.windows_said(known, looks["judged"], length=p.window)
+    windows = calibrated_classifier.window_predictions(fitted, outputs["judged"], length=settings.window)
     cnn = classifier.predict(networks.cnn, data.key_area, data.temperature_degC).logits.argmax(axis=1)
     return Judged(
-        Eyes(networks.network, known),
+        CalibratedClassifier(networks.network, fitted),
         data,
-        looks["judged"],
-        says,
+        outputs["judged"],
+        windows,
         cnn,
-        eyes.beside(learned, data, says, found["judged"].valid),
+        calibrated_classifier.yardstick_classes(learned, data, windows, by_part["judged"].valid),
     )
 
 
-def metrics(p: TrainClassifier, done: Judged, networks: Trained, read: dict[str, Any]) -> dict[str, Any]:
+def metrics(
+    settings: TrainClassifier, result: Judged, networks: Trained, read: dict[str, Any]
+) -> dict[str, Any]:
     """Accuracies with their 95 % intervals (Wilson, as if frames and windows were
     independent), calibration, what is held, what is foreign."""
-    frames, says, some, known = done.frames, done.says, done.frames.valid, done.eyes.known
+    frames, windows, valid = result.frames, result.windows, result.frames.valid
+    fitted, some = result.model.calibration, result.windows.any_valid
     named = {
         "image": frames.logits.argmax(axis=1),
-        "svc_image": done.yardsticks.svc,
-        "cnn_image": done.cnn,
-        "width_image": done.yardsticks.width,
+        "svc_image": result.yardsticks.svc,
+        "cnn_image": result.cnn,
+        "width_image": result.yardsticks.width,
     }
-    right = {name: (classes == frames.label)[some] for name, classes in named.items()} | {
-        "window": (says.p.argmax(axis=1) == says.label)[says.seen]
+    right = {name: (classes == frames.label)[valid] for name, classes in named.items()} | {
+        "window": (windows.prob.argmax(axis=1) == windows.label)[some]
     }
-    errors = {way: found for way, found in eyes.reliabilities(known, frames, length=p.window).items()}
-    sets = calibration.sets(says.p[says.seen], says.label[says.seen], known.level)
+    errors = calibrated_classifier.reliabilities(fitted, frames, length=settings.window)
+    sets = calibration.sets(windows.prob[some], windows.label[some], fitted.level)
     return {
         **{f"{name}_accuracy": float(np.mean(hits)) for name, hits in right.items()},
-        "svc_window_accuracy": done.yardsticks.svc_window_accuracy,
+        "svc_window_accuracy": result.yardsticks.svc_window_accuracy,
         "intervals_percent": {name: [wilson(hits).low, wilson(hits).high] for name, hits in right.items()},
-        "images": int(some.sum()), "windows": int(says.seen.sum()),
+        "images": int(valid.sum()), "windows": int(some.sum()),
         "judged_segments": len(np.unique(frames.segment)),
         "ece_image": errors["image", "calibrated"].error, "ece_image_raw": errors["image", "raw"].error,
         "ece_image_floor": errors["image", "calibrated"].floor,
@@ -245,57 +237,69 @@ def metrics(p: TrainClassifier, done: Judged, networks: Trained, read: dict[str,
         "ece_window_counts": errors["window", "hard_counts"].error,
         "ece_window_mean": errors["window", "mean"].error,
         "ece_window_floor": errors["window", "log_sum"].floor,
-        "temperature": known.temperature, "window_correlation": known.correlation,
-        "conformal_level": known.level,
-        "conformal": {"asked": p.coverage, "coverage": sets.coverage, "held": sets.held,
-        "windows": int(says.seen.sum())},
-        "out_of_distribution": eyes.knows_not(done.eyes, frames, done.data),
-        "size": p.size, "augmentation": p.augmentation, "source": p.source,
+        "temperature": fitted.temperature, "window_correlation": fitted.correlation,
+        "conformal_level": fitted.level,
+        "conformal": {"asked": settings.coverage, "coverage": sets.coverage, "held": sets.held,
+        "windows": int(some.sum())},
+        "out_of_distribution": calibrated_classifier.foreign_detection(result.model, frames, result.data),
+        "size": settings.size, "augmentation": settings.augmentation, "source": settings.source,
         "parameters": parameters(networks.network),
         "cnn_parameters": parameters(networks.cnn),
-        "epochs": {name: int(state.epoch) for name, state in networks.course.items()},
-        "best_epoch": {name: int(state.best_epoch) for name, state in networks.course.items()},
+        "epochs": {name: int(state.epoch) for name, state in networks.curves.items()},
+        "best_epoch": {name: int(state.best_epoch) for name, state in networks.curves.items()},
         "data": read,
     }  # fmt: skip
 
 
-def classified(done: Judged, flow: np.ndarray) -> dict[str, np.ndarray]:
+def classified(result: Judged, flow: np.ndarray) -> dict[str, np.ndarray]:
     """Columns of schema CLASSIFIED: the valid frames of the judged part, flow (n,) the true one."""
-    frames, known = done.frames, done.eyes.known
-    p = np.clip(np.exp(calibration.log_probabilities(frames.logits, known.temperature)), 0, 1)
+    frames, fitted = result.frames, result.model.calibration
+    prob = np.clip(np.exp(calibration.log_probabilities(frames.logits, fitted.temperature)), 0, 1)
     columns = {
-        "segment": frames.segment, "flow_percent": flow, "temperature_degC": done.data.temperature_degC,
+        "segment": frames.segment, "flow_percent": flow, "temperature_degC": result.data.temperature_degC,
         "label": frames.label,
-        "p_under": p[:, 0], "p_good": p[:, 1], "p_over": p[:, 2], "named": frames.logits.argmax(axis=1),
-        "named_cnn": done.cnn,
-        "named_svc": done.yardsticks.svc, "named_width": done.yardsticks.width,
-        "distance": calibration.mahalanobis(known.familiar, frames.features),
+        "p_under": prob[:, 0], "p_good": prob[:, 1], "p_over": prob[:, 2],
+        "named": frames.logits.argmax(axis=1),
+        "named_cnn": result.cnn,
+        "named_svc": result.yardsticks.svc, "named_width": result.yardsticks.width,
+        "distance": calibration.mahalanobis(fitted.familiar, frames.features),
     }  # fmt: skip
     return {name: values[frames.valid] for name, values in columns.items()}
 
 
-def reliability_rows(p: TrainClassifier, done: Judged) -> dict[str, list]:
+def reliability_rows(settings: TrainClassifier, result: Judged) -> dict[str, list]:
     """Columns of schema RELIABILITY."""
     columns: dict[str, list] = {
         name: [] for name in ("of", "method", "low", "high", "count", "confidence", "accuracy")
     }
-    for (of, method), found in eyes.reliabilities(done.eyes.known, done.frames, length=p.window).items():
-        n = len(found.count)
-        high = np.append(found.edges[1:], 1.0)
+    bins = calibrated_classifier.reliabilities(
+        result.model.calibration, result.frames, length=settings.window
+    )
+    for (of, method), reliability in bins.items():
+        n = len(reliability.count)
+        high = np.append(reliability.edges[1:], 1.0)
         for name, values in zip(
             columns,
-            ([of] * n, [method] * n, found.edges, high, found.count, found.confidence, found.accuracy),
+            (
+                [of] * n,
+                [method] * n,
+                reliability.edges,
+                high,
+                reliability.count,
+                reliability.confidence,
+                reliability.accuracy,
+            ),
             strict=True,
         ):
             columns[name] += list(values)
     return columns
 
 
-def course_rows(networks: Trained) -> dict[str, list]:
-    """Columns of schema COURSE."""
+def curve_rows(networks: Trained) -> dict[str, list]:
+    """Columns of schema CLASSIFIER_CURVE."""
     rows = [
         (name, epoch + 1, *(float(v) for v in state.history[epoch]))
-        for name, state in networks.course.items()
+        for name, state in networks.curves.items()
         for epoch in range(int(state.epoch))
     ]
     return dict(
@@ -307,37 +311,58 @@ def course_rows(networks: Trained) -> dict[str, list]:
     )
 
 
-def recorded(p: TrainClassifier, known: Eyes, several: Mapping[str, Seen]) -> dict[str, WindowTable]:
+def recorded(
+    settings: TrainClassifier, model: CalibratedClassifier, by_part: Mapping[str, LabelledFrames]
+) -> dict[str, WindowTable]:
     """The windows of "learn" and "judge" as the simulator draws them
     again; of a folder, windows at one flow."""
-    looks = {
-        part: eyes.look(
-            known.network, Labelled(seen.images, seen.temperature, seen.label, seen.segment), seen.valid
+    fitted = model.calibration
+    outputs = {
+        part: calibrated_classifier.outputs(
+            model.network,
+            Labelled(frames.images, frames.temperature, frames.label, frames.segment),
+            frames.valid,
         )
-        for part, seen in several.items()
+        for part, frames in by_part.items()
     }
-    said = {part: eyes.windows_said(known.known, frames, length=p.window) for part, frames in looks.items()}
-    flows = {part: several[part].flow[says.rows[:, 0]] for part, says in said.items()}
-    bins = edges([flows[part][says.seen] for part, says in said.items()])
+    windows = {
+        part: calibrated_classifier.window_predictions(fitted, frames, length=settings.window)
+        for part, frames in outputs.items()
+    }
+    flows = {part: by_part[part].flow[of.rows[:, 0]] for part, of in windows.items()}
+    bins = edges([flows[part][of.any_valid] for part, of in windows.items()])
     return {
         part: calibration.recorded(
-            calibration.log_probabilities(looks[part].logits, known.known.temperature)[says.rows],
-            looks[part].valid[says.rows],
+            calibration.log_probabilities(outputs[part].logits, fitted.temperature)[of.rows],
+            outputs[part].valid[of.rows],
             flows[part],
-            looks[part].segment[says.rows[:, 0]], correlation=known.known.correlation, flow_edges=bins,
+            outputs[part].segment[of.rows[:, 0]],
+            correlation=fitted.correlation,
+            flow_edges=bins,
         )
-        for part, says in said.items()
-    }  # fmt: skip
+        for part, of in windows.items()
+    }
 
 
 # ---- a few frames for the page
 
 
-def shown(p: TrainClassifier, known: Eyes, folder: Path) -> list[dict[str, Any]]:
+class Shown(NamedTuple):
+    """A rendered frame for the page: its place there, the picture, tip and key area, and the truth."""
+
+    place: str
+    frame: np.ndarray
+    tip: tuple[float, float]
+    area: key_area.KeyArea
+    flow: float
+    temperature: float
+
+
+def shown(settings: TrainClassifier, model: CalibratedClassifier, folder: Path) -> list[dict[str, Any]]:
     """Writes rendered frames with their key areas drawn in as JPEG, two of each
     class, the first rejected ones and a blurred one, and returns a row for each:
     truth, what was named, score, and why it was rejected."""
-    rng = np.random.default_rng([p.seed, 9])
+    rng = np.random.default_rng([settings.seed, 9])
     rows: list[dict[str, Any]] = []
     wanted = {"under": 2, "good": 2, "over": 2, "rejected": 3}
     for i in range(200):
@@ -347,67 +372,40 @@ def shown(p: TrainClassifier, known: Eyes, folder: Path) -> list[dict[str, Any]]
             nozzle_scene.draw_flow(rng, i % 3, 1),
             np.array([nozzle_scene.TEMPERATURES[i % 5]]),
         )
-        made = nozzle_scene.render(nozzle_scene.draw_segment(rng), flow, temperature, rng)
-        found = key_area.find(
-            made.frames[0], made.tip, least_score=p.least_score, direction_deg=made.direction_deg
-        )
-        place = "rejected" if found.reason else ("under", "good", "over")[int(nozzle_scene.label(flow)[0])]
+        scene = nozzle_scene.render(nozzle_scene.draw_segment(rng), flow, temperature, rng)
+        frame, direction = scene.frames[0], scene.direction_deg
+        area = key_area.find(frame, scene.tip, least_score=settings.least_score, direction_deg=direction)
+        place = "rejected" if area.reason else ("under", "good", "over")[int(nozzle_scene.label(flow)[0])]
         if wanted[place] == 0:
             continue
         wanted[place] -= 1
-        rows.append(
-            _row(
-                known,
-                folder,
-                len(rows),
-                place,
-                made.frames[0],
-                made.tip,
-                found,
-                float(flow[0]),
-                float(temperature[0]),
-            )
-        )
+        one = Shown(place, frame, scene.tip, area, float(flow[0]), float(temperature[0]))
+        rows.append(_row(model, folder, len(rows), one))
         if place == "good" and wanted["good"] == 0:
-            soft = cv2.GaussianBlur(made.frames[0], (0, 0), 5.0)
-            found = key_area.find(soft, made.tip, least_score=p.least_score, direction_deg=made.direction_deg)
-            rows.append(
-                _row(
-                    known,
-                    folder,
-                    len(rows),
-                    "out of focus",
-                    soft,
-                    made.tip,
-                    found,
-                    float(flow[0]),
-                    float(temperature[0]),
-                )
-            )
+            soft = cv2.GaussianBlur(frame, (0, 0), 5.0)
+            area = key_area.find(soft, scene.tip, least_score=settings.least_score, direction_deg=direction)
+            one = one._replace(place="out of focus", frame=soft, area=area)
+            rows.append(_row(model, folder, len(rows), one))
     return rows
 
 
-def _row(
-    known: Eyes,
-    folder: Path,
-    number: int,
-    place: str,
-    frame: np.ndarray,
-    tip,
-    found,
-    flow: float,
-    temperature: float,
-) -> dict[str, Any]:
-    name = f"frame_{number:02d}.jpg"
-    artifacts.write_jpeg(folder / name, key_area.drawn(frame, tip, found))
-    p, score = eyes.see(known, found.image[None], np.array([temperature]))
-    valid = not found.reason
+def _row(model: CalibratedClassifier, folder: Path, number: int, one: Shown) -> dict[str, Any]:
+    name, area, limit = f"frame_{number:02d}.jpg", one.area, model.calibration.foreign_above
+    artifacts.write_jpeg(folder / name, key_area.drawn(one.frame, one.tip, area))
+    prob, score = calibrated_classifier.classify(model, area.image[None], np.array([one.temperature]))
+    valid = not area.reason
+    foreign = "foreign: further from what was learned than allowed" if score[0] > limit else ""
     return {
-        "file": name, "place": place,
-        "reason": found.reason or ("foreign: further from what was learned than allowed" if score[0] > known.known.foreign_above else ""),
-        "score": found.score, "direction_deg": found.angle_deg, "flow_percent": flow,
-        "temperature_degC": temperature,
-        "label": int(nozzle_scene.label(flow)),
-        "named": int(p[0].argmax()) if valid else None, "p": p[0].tolist() if valid else None,
-        "distance": float(score[0]) if valid else None, "foreign_above": known.known.foreign_above,
-    }  # fmt: skip
+        "file": name,
+        "place": one.place,
+        "reason": area.reason or foreign,
+        "score": area.score,
+        "direction_deg": area.angle_deg,
+        "flow_percent": one.flow,
+        "temperature_degC": one.temperature,
+        "label": int(nozzle_scene.label(one.flow)),
+        "named": int(prob[0].argmax()) if valid else None,
+        "p": prob[0].tolist() if valid else None,
+        "distance": float(score[0]) if valid else None,
+        "foreign_above": limit,
+    }

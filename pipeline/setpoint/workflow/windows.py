@@ -12,13 +12,13 @@ from pipeline.setpoint.workflow.tables import FLOW_EDGES
 def edges(flows: Sequence[np.ndarray]) -> np.ndarray:
     """FLOW_EDGES, of which those are left out that would leave a bin
     without a window in any of several sets of flows (w,)."""
-    kept = [min(FLOW_EDGES[0], *(float(flow.min()) for flow in flows))]
+    bounds = [min(FLOW_EDGES[0], *(float(flow.min()) for flow in flows))]
     for edge in FLOW_EDGES[1:-1]:
-        if all(((flow >= kept[-1]) & (flow < edge)).any() for flow in flows):
-            kept.append(edge)
-    while len(kept) > 1 and not all((flow >= kept[-1]).any() for flow in flows):
-        kept.pop()
-    return np.array([*kept, max(FLOW_EDGES[-1], *(float(flow.max()) for flow in flows))])
+        if all(((flow >= bounds[-1]) & (flow < edge)).any() for flow in flows):
+            bounds.append(edge)
+    while len(bounds) > 1 and not all((flow >= bounds[-1]).any() for flow in flows):
+        bounds.pop()
+    return np.array([*bounds, max(FLOW_EDGES[-1], *(float(flow.max()) for flow in flows))])
 
 
 def window_rows(tables: dict[str, WindowTable]) -> dict[str, np.ndarray]:
@@ -38,17 +38,17 @@ def window_rows(tables: dict[str, WindowTable]) -> dict[str, np.ndarray]:
 
 def window_tables(columns: dict[str, np.ndarray]) -> dict[str, WindowTable]:
     """The reverse of `window_rows`."""
-    found = {}
+    tables = {}
     for part in ("learn", "judge"):
         rows = columns["part"] == part
         bins, first = np.unique(columns["flow_bin"][rows], return_index=True)
         low, high = (columns[f"flow_{end}_percent"][rows][first] for end in ("low", "high"))
         shares = np.stack([columns[f"p_{name}"][rows] for name in ("under", "good", "over")], axis=1)
-        found[part] = WindowTable(
+        tables[part] = WindowTable(
             shares,
             columns["named"][rows],
             np.searchsorted(bins, columns["flow_bin"][rows]),
             columns["segment"][rows],
             np.append(low, high[-1]),
         )
-    return found
+    return tables

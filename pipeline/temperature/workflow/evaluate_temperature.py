@@ -1,6 +1,7 @@
 """What evaluate_temperature does: every temperature controller judged on one panel of plants, starts,
 references and noise; and the study's learners on many noisy data sets, beside the paper's figures."""
 
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -50,21 +51,24 @@ class Studied(NamedTuple):
     figures: dict[str, Any]
 
 
-def check(p: EvaluateTemperature, panel: Panel) -> None:
+def check(settings: EvaluateTemperature, panel: Panel) -> None:
     """Raises ValueError where the noise of the report is none of the panel's."""
-    if p.report_noise_degC not in panel.noise_degC:
+    if settings.report_noise_degC not in panel.noise_degC:
         raise ValueError(
-            f"params.expert.yaml: evaluate_temperature.report_noise_degC is {p.report_noise_degC:g} but must "
+            "params.expert.yaml: evaluate_temperature.report_noise_degC is "
+            f"{settings.report_noise_degC:g} but must "
             "be one of panel.noise_degC "
             f"{panel.noise_degC}; "
             "change one of the two"
         )
 
 
-def read_learned(
-    model_path: str, window_path: str, kernel_path: str, weights_path: str, spread_path: str
-) -> Learned:
-    """From the files that the stages before wrote."""
+def read_learned(model_path: str, spread_path: str, weights_path: str, learned_folder: str | Path) -> Learned:
+    """What the stages before wrote. `learned_folder` has a kernel only where the record determines one."""
+    window_path, kernel_path = (
+        Path(learned_folder) / "window.parquet",
+        Path(learned_folder) / "kernel.parquet",
+    )
     return Learned(
         plant.restored(artifacts.read_arrays(model_path, "plant", 1))[0],
         window.restored(artifacts.read_arrays(window_path, "window", 1)),
@@ -77,11 +81,11 @@ def read_learned(
 
 
 def judged(
-    p: EvaluateTemperature,
+    settings: EvaluateTemperature,
     machine: Machine,
     tracking: Tracking,
     panel: Panel,
-    known: Learned,
+    learned: Learned,
     *,
     simulated: bool,
 ) -> Judged:
@@ -95,49 +99,68 @@ def judged(
         tracking.gamma,
     )
     truth = plant.baam()._replace(sample_time_s=machine.sample_time_s) if simulated else None
-    plants = plant.spread(truth, input_gain=panel.input_gain, loss=panel.loss) if simulated else known.spread
-    reference = np.array([o.reference for o in machine.outputs])
-    scenarios = scorecard.panel(
-        plants, starts=panel.judging.starts_degC,
-        references=[reference + offset for offset in panel.judging.reference_offsets_degC],
-        noise=panel.noise_degC, seeds=panel.judging.seeds, steps=panel.steps, hold=panel.hold_steps,
-        cells=simulated,
-    )  # fmt: skip
-    q, r = known.weights["q"], known.weights["r"]
+    scenarios = _scenarios(machine, panel, learned, truth)
+    q, r = learned.weights["q"], learned.weights["r"]
     compared = judging.controllers(
-        known.model, known.window, known.kernel, limits=limits, gamma=tracking.gamma,
-        tau=float(known.weights["observer_tau"]),
-        exact_tau=tracking.observer_tau, horizon=panel.steps, truth=truth,
-    )  # fmt: skip
+        judging.LearnedModels(learned.model, learned.window, learned.kernel),
+        limits=limits,
+        gamma=tracking.gamma,
+        tau=float(learned.weights["observer_tau"]),
+        exact_tau=tracking.observer_tau,
+        horizon=panel.steps,
+        truth=truth,
+    )
     refused = judging.refusals(compared, [(yardstick.q, yardstick.r), (q, r)])
-    kept = [controller for controller in compared if controller.name not in refused]
-    found = [
-        judging.judge(
-            controller, scenarios, yardstick=yardstick, q=q, r=r, limits=limits, band=panel.band_degC,
-            integral=tracking.integral,
-            integral_limit=tracking.integral_limit_degC,
-        )
-        for controller in tqdm(kept, desc="evaluate_temperature: controllers", mininterval=2)
-    ]  # fmt: skip
+    designed = [controller for controller in compared if controller.name not in refused]
+    deployment = judging.Deployment(limits, panel.band_degC, tracking.integral, tracking.integral_limit_degC)
+    results = [
+        judging.judge(controller, scenarios, yardstick=yardstick, q=q, r=r, deployment=deployment)
+        for controller in tqdm(designed, desc="evaluate_temperature: controllers", mininterval=2)
+    ]
     summary = {
-        "noise_degC": p.report_noise_degC, "scenarios": len(scenarios.r), "plants": len(plants),
-        "controllers": {one.name: judging.summary(one, scenarios,
-        noise=p.report_noise_degC) for one in found},
-    }  # fmt: skip
+        "noise_degC": settings.report_noise_degC,
+        "scenarios": len(scenarios.r),
+        "plants": len(scenarios.plants),
+        "controllers": {
+            one.name: judging.summary(one, scenarios, noise=settings.report_noise_degC) for one in results
+        },
+    }
     shown = judging.trajectories(
-        found, scenarios, inputs, outputs, noise=p.report_noise_degC, yardstick=yardstick
+        results, scenarios, inputs, outputs, noise=settings.report_noise_degC, yardstick=yardstick
     )
     schema = tables.trajectories(machine.inputs, machine.outputs)
-    return Judged(judging.rows(found, scenarios, outputs), (schema, shown), summary, refused)
+    return Judged(judging.rows(results, scenarios, outputs), (schema, shown), summary, refused)
 
 
-def studied(p: EvaluateTemperature, execution: Execution, folder: str) -> Studied:
+def _scenarios(
+    machine: Machine, panel: Panel, learned: Learned, truth: plant.Plant | None
+) -> scorecard.Panel:
+    """The judging half of the panel: around the true plant where it is known, else the identified spread."""
+    plants = learned.spread
+    if truth is not None:
+        plants = plant.spread(
+            truth, input_gain=panel.input_gain, extra_heat_loss=panel.extra_heat_loss_per_step
+        )
+    reference = np.array([o.reference for o in machine.outputs])
+    return scorecard.panel(
+        plants,
+        starts=panel.judging.starts_degC,
+        references=[reference + offset for offset in panel.judging.reference_offsets_degC],
+        noise=panel.noise_degC,
+        seeds=panel.judging.seeds,
+        steps=panel.steps,
+        hold=panel.hold_steps,
+        cells=truth is not None,
+    )
+
+
+def studied(settings: EvaluateTemperature, execution: Execution, folder: str) -> Studied:
     """`folder` has the draws behind the paper's figures."""
     K0, u, y = read_published(folder)
-    sets_u, sets_y = study.data_sets(np.random.default_rng(p.seed), SAMPLES, p.data_sets)
-    work = [(noise, i) for noise in study.NOISE for i in range(p.data_sets)]
+    sets_u, sets_y = study.data_sets(np.random.default_rng(settings.seed), SAMPLES, settings.data_sets)
+    work = [(noise, i) for noise in study.NOISE for i in range(settings.data_sets)]
     calls = [delayed(study.under_noise)(sets_u[:, i], sets_y[:, i], noise=noise, seed=i) for noise, i in work]
-    found = list(
+    results = list(
         tqdm(
             run_all(calls, execution),
             total=len(work),
@@ -145,7 +168,10 @@ def studied(p: EvaluateTemperature, execution: Execution, folder: str) -> Studie
             mininterval=2,
         )
     )
-    noisy, noise_free = study.rows(work, found), study.noise_free(u[1:], y[1:], np.random.default_rng(p.seed))
+    noisy, noise_free = (
+        study.rows(work, results),
+        study.noise_free(u[1:], y[1:], np.random.default_rng(settings.seed)),
+    )
     failures = published.algorithm_1_failures(STARTS)
     figures = study.metrics(
         published.figures(K0, u, y), study.exact(), noise_free, noisy, failures=failures, starts=STARTS

@@ -6,7 +6,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipeline.temperature.plant import baam
-from pipeline.temperature.probing import Excitation, Probe, excitation, multisine, prbs, probe
+from pipeline.temperature.probing import (
+    Excitation,
+    InputLimits,
+    OperatingPoint,
+    Probe,
+    excitation,
+    multisine,
+    prbs,
+    probe,
+)
 from pipeline.temperature.tracking import feasible_target
 from pipeline.temperature.workflow.settings import GenerateProbing, Plant
 
@@ -27,27 +36,34 @@ class Probed(NamedTuple):
     metrics: dict[str, Any]
 
 
-def planned(p: GenerateProbing, machine: Plant) -> Planned:
+def planned(settings: GenerateProbing, machine: Plant) -> Planned:
     """The probing signal about a centre that the user gives, or the
     middle of the limits, clipped to these."""
     low, high = _limits(machine)
-    signal = _signal(p, machine, np.random.default_rng(p.seed))
-    centre = np.full(len(low), p.centre_percent) if p.centre_percent is not None else (low + high) / 2
+    signal = _signal(settings, machine, np.random.default_rng(settings.seed))
+    centre = (
+        np.full(len(low), settings.centre_percent)
+        if settings.centre_percent is not None
+        else (low + high) / 2
+    )
     u = np.clip(centre + signal, low, high)
-    columns = {"time_s": _time_s(p, machine), **{i.name: u[:, k] for k, i in enumerate(machine.inputs)}}
-    return Planned(columns, _metrics(p, excitation(u, 2), float((u != centre + signal).mean())))
+    columns = {
+        "time_s": _time_s(settings, machine),
+        **{i.name: u[:, k] for k, i in enumerate(machine.inputs)},
+    }
+    return Planned(columns, _metrics(settings, excitation(u, 2), float((u != centre + signal).mean())))
 
 
-def probed(p: GenerateProbing, machine: Plant) -> Probed:
+def probed(settings: GenerateProbing, machine: Plant) -> Probed:
     """A run of the study's extruder. Raises ValueError where the machine is another."""
-    rng = np.random.default_rng(p.seed)
-    signal = _signal(p, machine, rng)
-    run = _simulated(p, machine, signal, rng)
+    rng = np.random.default_rng(settings.seed)
+    signal = _signal(settings, machine, rng)
+    run = _simulated(settings, machine, signal, rng)
     columns = zip([*machine.inputs, *machine.outputs], np.hstack([run.u, run.y]).T, strict=True)
     signals = {
         s.name: (values, s.unit, f"{s.name} of the study's extruder, simulated") for s, values in columns
     }
-    return Probed(_time_s(p, machine), signals, _metrics(p, excitation(run.u, 12), run.limited))
+    return Probed(_time_s(settings, machine), signals, _metrics(settings, excitation(run.u, 12), run.limited))
 
 
 def _limits(machine: Plant) -> tuple[np.ndarray, np.ndarray]:
@@ -55,19 +71,23 @@ def _limits(machine: Plant) -> tuple[np.ndarray, np.ndarray]:
     return low, high
 
 
-def _signal(p: GenerateProbing, machine: Plant, rng: np.random.Generator) -> np.ndarray:
+def _signal(settings: GenerateProbing, machine: Plant, rng: np.random.Generator) -> np.ndarray:
     shape = {
-        "amplitude": p.amplitude_percent,
-        **({"shortest": p.shortest_steps} if p.signal == "prbs" else {}),
+        "amplitude": settings.amplitude_percent,
+        **({"shortest": settings.shortest_steps} if settings.signal == "prbs" else {}),
     }
-    return {"multisine": multisine, "prbs": prbs}[p.signal](rng, p.samples, len(machine.inputs), **shape)
+    return {"multisine": multisine, "prbs": prbs}[settings.signal](
+        rng, settings.samples, len(machine.inputs), **shape
+    )
 
 
-def _time_s(p: GenerateProbing, machine: Plant) -> np.ndarray:
-    return machine.sample_time_s * np.arange(p.samples)
+def _time_s(settings: GenerateProbing, machine: Plant) -> np.ndarray:
+    return machine.sample_time_s * np.arange(settings.samples)
 
 
-def _simulated(p: GenerateProbing, machine: Plant, signal: np.ndarray, rng: np.random.Generator) -> Probe:
+def _simulated(
+    settings: GenerateProbing, machine: Plant, signal: np.ndarray, rng: np.random.Generator
+) -> Probe:
     plant, (low, high) = baam()._replace(sample_time_s=machine.sample_time_s), _limits(machine)
     if (len(machine.inputs), len(machine.outputs)) != (plant.m, plant.p):
         raise ValueError(
@@ -78,32 +98,26 @@ def _simulated(p: GenerateProbing, machine: Plant, signal: np.ndarray, rng: np.r
             "or restore the plant section"
         )
     target = feasible_target(plant, np.array([o.reference for o in machine.outputs]), low, high)
-    centre = target.u if p.centre_percent is None else np.full(plant.m, p.centre_percent)
-    feedback = p.feedback_percent_per_degC * np.eye(plant.m, plant.p)
-    limits = {
-        "low": np.maximum(low, centre - p.amplitude_percent),
-        "high": np.minimum(high, centre + p.amplitude_percent),
-        "rate": p.rate_percent_per_step,
-    }  # fmt: skip
-    noise = p.noise_degC * rng.standard_normal((len(signal), plant.p))
-    return probe(
-        plant,
-        signal,
-        x0=target.x,
-        u_centre=centre,
-        y_centre=target.y,
-        feedback=feedback,
-        noise=noise,
-        **limits,
+    centre = target.u if settings.centre_percent is None else np.full(plant.m, settings.centre_percent)
+    feedback = settings.feedback_percent_per_degC * np.eye(plant.m, plant.p)
+    limits = InputLimits(
+        np.maximum(low, centre - settings.amplitude_percent),
+        np.minimum(high, centre + settings.amplitude_percent),
+        settings.rate_percent_per_step,
     )
+    noise = settings.noise_degC * rng.standard_normal((len(signal), plant.p))
+    point = OperatingPoint(target.x, centre, target.y)
+    return probe(plant, signal, point, limits, feedback=feedback, noise=noise)
 
 
-def _metrics(p: GenerateProbing, found: Excitation, limited: float) -> dict[str, Any]:
+def _metrics(settings: GenerateProbing, excited: Excitation, limited: float) -> dict[str, Any]:
     return {
-        "source": p.source, "samples": p.samples, "excitation_order": found.order,
-        "excitation_rank": found.rank,
-        "excitation_full_rank": found.full,
-        "excitation_condition": found.condition if np.isfinite(found.condition) else None,
+        "source": settings.source,
+        "samples": settings.samples,
+        "excitation_order": excited.order,
+        "excitation_rank": excited.rank,
+        "excitation_full_rank": excited.full,
+        "excitation_condition": excited.condition if np.isfinite(excited.condition) else None,
         "limited_share": limited,
-        "level_percent_per_band": found.level,
-    }  # fmt: skip
+        "level_percent_per_band": excited.level,
+    }

@@ -1,6 +1,5 @@
-"""What identify_plant does: order and window chosen on the first part of every segment,
-judged on the last; the plant that is handed on is fitted to both with what was chosen, and a
-family of plants around it says how well it is known."""
+"""What identify_plant does: it chooses order and window on the first part of every segment and judges them on
+the last. The plant that it hands on is fitted to both parts. A family of plants around it shows its error."""
 
 from typing import Any, NamedTuple
 
@@ -17,7 +16,7 @@ from pipeline.temperature.workflow.settings import Plant as Machine
 Segments = list[np.ndarray]
 
 
-class Found(NamedTuple):
+class IdentifiedPlant(NamedTuple):
     """The plant, the plants of its spread, tables {name: (schema, columns)}
     for the page of the identification, and metrics."""
 
@@ -27,65 +26,147 @@ class Found(NamedTuple):
     metrics: dict[str, Any]
 
 
-def identified(p: IdentifyPlant, machine: Machine, path: str) -> Found:
+class _Record(NamedTuple):
+    """The record as it can be identified; `recorded` samples before any were cut, and what was clipped."""
+
+    u: Segments
+    y: Segments
+    recorded: int
+    notes: list[str]
+
+    @property
+    def samples(self) -> int:
+        return sum(map(len, self.u))
+
+
+class _Judgement(NamedTuple):
+    """The chosen model on the last part of the record, and what the first part excites."""
+
+    holdout: trust.Holdout
+    residuals: validation.Residuals
+    excitation: validation.Excitation
+    samples: int
+
+
+def identified(settings: IdentifyPlant, machine: Machine, path: str) -> IdentifiedPlant:
     """The plant of the record in `path`. Raises ValueError where the record cannot tell it."""
-    inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
-    recorded = read_record(path, machine.inputs, machine.outputs)
-    u, y = identification.gapless(*recorded)
-    with artifacts.about(path):
-        identification.check_inputs(u, offset=p.offset, names=inputs)
-        identification.check_outputs(y, names=outputs)
-    u, clipped = identification.within_limits(
-        u, tuple(zip(*((i.low, i.high) for i in machine.inputs), strict=True)), names=inputs
+    inputs = [i.name for i in machine.inputs]
+    record = _read(settings, machine, path)
+    first, last = _parted(record.u, record.y, settings.holdout_share)
+    choices = identification.Settings(
+        order=settings.order or None,
+        offset=settings.offset,
+        refinement=settings.refinement,
+        max_order=settings.max_order,
     )
-    first, last = _parted(u, y, p.holdout_share)
-    samples, kept = sum(map(len, recorded[0])), sum(map(len, u))
     with artifacts.about(path):
         chosen = identification.identify(
-            *first, sample_time_s=machine.sample_time_s, order=p.order or None, offset=p.offset,
-            refinement=p.refinement,
-            max_order=p.max_order,
-            names=inputs,
-        )  # fmt: skip
-    judged = trust.holdout(
-        chosen.plant, *last, p.ahead_steps, block=2 * chosen.past, rng=np.random.default_rng(p.seed)
-    )
-    tests = validation.residual_tests(chosen.plant, *last, lags=trust.residual_lags(last[0]))
-    excited = validation.excitation(first[0], chosen.past)
-    found = identification.refit(u, y, chosen, names=inputs)
-    if not (observed := plant.observability(found.plant)).passed:
+            *first, sample_time_s=machine.sample_time_s, settings=choices, names=inputs
+        )
+    judgement = _judged(settings, chosen, first, last)
+    fitted = identification.refit(record.u, record.y, chosen, names=inputs)
+    if not (observed := plant.observability(fitted.plant)).passed:
         raise ValueError(f"{path}: {observed.reason}")
     family = validation.bootstrap_spread(
-        u, y, found, count=p.spread_plants, order=found.order + 1, rng=np.random.default_rng(p.seed)
+        record.u,
+        record.y,
+        fitted,
+        count=settings.spread_plants,
+        order=fitted.order + 1,
+        rng=np.random.default_rng(settings.seed),
     )
-    steps = trust.steps(found.plant, family, max(map(len, u)))
-    shown = {
+    page_tables = {
         "order": (tables.ORDER, identification.rows(chosen)),
-        "holdout": (
-            tables.holdout(machine.outputs),
-            trust.holdout_rows(last[1], judged, outputs, machine.sample_time_s),
-        ),
-        "residuals": (tables.RESIDUALS, trust.residual_rows(tests, outputs, inputs)),
+        **_judgement_tables(machine, last[1], judgement),
+        **_model_tables(machine, record.u, fitted.plant, family),
+    }
+    metrics = _metrics(settings, machine, record, chosen, fitted, judgement)
+    return IdentifiedPlant(fitted.plant, family, page_tables, metrics)
+
+
+def _read(settings: IdentifyPlant, machine: Machine, path: str) -> _Record:
+    recorded = read_record(path, machine.inputs, machine.outputs)
+    u, y = identification.gapless(*recorded)
+    inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
+    with artifacts.about(path):
+        identification.check_inputs(u, offset=settings.offset, names=inputs)
+        identification.check_outputs(y, names=outputs)
+    limits = tuple(zip(*((i.low, i.high) for i in machine.inputs), strict=True))
+    u, clipped = identification.within_limits(u, limits, names=inputs)
+    return _Record(u, y, sum(map(len, recorded[0])), clipped)
+
+
+def _judged(
+    settings: IdentifyPlant,
+    chosen: identification.Identified,
+    first: tuple[Segments, Segments],
+    last: tuple[Segments, Segments],
+) -> _Judgement:
+    holdout = trust.holdout(
+        chosen.plant,
+        *last,
+        settings.ahead_steps,
+        block=2 * chosen.past,
+        rng=np.random.default_rng(settings.seed),
+    )
+    residuals = validation.residual_tests(chosen.plant, *last, lags=trust.residual_lags(last[0]))
+    excitation = validation.excitation(first[0], chosen.past)
+    return _Judgement(holdout, residuals, excitation, sum(map(len, last[0])))
+
+
+def _judgement_tables(
+    machine: Machine, measured: Segments, judgement: _Judgement
+) -> dict[str, tuple[Schema, dict[str, Any]]]:
+    inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
+    ahead = trust.holdout_rows(measured, judgement.holdout, outputs, machine.sample_time_s)
+    return {
+        "holdout": (tables.holdout(machine.outputs), ahead),
+        "residuals": (tables.RESIDUALS, trust.residual_rows(judgement.residuals, outputs, inputs)),
+    }
+
+
+def _model_tables(
+    machine: Machine, u: Segments, fitted: plant.Plant, family: list[plant.Plant]
+) -> dict[str, tuple[Schema, dict[str, Any]]]:
+    inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
+    steps = trust.steps(fitted, family, max(map(len, u)))
+    return {
         "steps": (tables.STEPS, trust.step_rows(steps, outputs, inputs, machine.sample_time_s)),
         "dynamics": (tables.DYNAMICS, trust.dynamics_rows(steps, outputs, inputs, machine.sample_time_s)),
-        "poles": (tables.POLES, trust.pole_rows(found.plant, family)),
+        "poles": (tables.POLES, trust.pole_rows(fitted, family)),
         "levels": (tables.LEVELS, trust.level_rows(trust.input_levels(u), inputs)),
     }
-    metrics = {
-        "order": found.order, "order_tolerance_percent": 100 * order.WORTH_A_STATE, "past": found.past,
-        "fit": found.fit,
-        "rows": found.rows,
-        "dropped_rows": found.dropped_rows, "samples": samples, "samples_cut": samples - kept,
-        "samples_holdout": sum(map(len, last[0])),
-        "delays": dict(zip(inputs, found.delays, strict=True)),
-        "notes": list(dict.fromkeys([*clipped, *chosen.notes, *found.notes])),
-        "ahead_steps": p.ahead_steps, **trust.fit_figures(judged, outputs),
-        **trust.outcome_figures(tests, excited, outputs, inputs),
-        "controllable": plant.controllability(found.plant).passed,
-        "largest_pole": np.abs(np.linalg.eigvals(found.plant.A)).max(),
-        "advice": validation.advice(tests, excited, judged.fit[0], outputs=outputs, inputs=inputs),
-    }  # fmt: skip
-    return Found(found.plant, family, shown, metrics)
+
+
+def _metrics(
+    settings: IdentifyPlant,
+    machine: Machine,
+    record: _Record,
+    chosen: identification.Identified,
+    fitted: identification.Identified,
+    judgement: _Judgement,
+) -> dict[str, Any]:
+    holdout, residuals, excitation, holdout_samples = judgement
+    inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
+    return {
+        "order": fitted.order,
+        "order_tolerance_percent": 100 * order.WORTH_A_STATE,
+        "past": fitted.past,
+        "fit": fitted.fit,
+        "rows": fitted.rows,
+        "dropped_rows": fitted.dropped_rows,
+        "samples": record.recorded,
+        "samples_cut": record.recorded - record.samples,
+        "samples_holdout": holdout_samples,
+        "delays": dict(zip(inputs, fitted.delays, strict=True)),
+        "notes": list(dict.fromkeys([*record.notes, *chosen.notes, *fitted.notes])),
+        "ahead_steps": settings.ahead_steps,
+        **trust.fit_figures(holdout, outputs),
+        **trust.outcome_figures(residuals, excitation, outputs, inputs),
+        "controllable": plant.controllability(fitted.plant).passed,
+        "largest_pole": np.abs(np.linalg.eigvals(fitted.plant.A)).max(),
+        "advice": validation.advice(residuals, excitation, holdout.fit[0], outputs=outputs, inputs=inputs),
+    }
 
 
 def _parted(

@@ -1,9 +1,9 @@
-"""What ingest does: a folder of recordings -> one record; which files, which were done before, which are
-broken. How one is read, resampled and flagged is reading's.
+"""What ingest does: it makes one record of a folder of recordings. It decides which files are read, which
+were read before and which are broken; `pipeline.reading` reads, resamples and flags a file.
 
-The memo is content-addressed: the hash of the recording, of the job's parameters and of the code that reads
-names the result, so that one more recording costs one. An entry counts once its digests are written and as
-long as its files have them; anything else is read again.
+The memo is content-addressed. The hash of the recording, of the parameters and of the code that reads names
+the entry, so that one more recording costs one reading. An entry counts where its files have the digests that
+were written last; otherwise the recording is read again.
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ READING = (
 )
 
 
-class Job(NamedTuple):
+class IngestSpec(NamedTuple):
     """What to take from every recording: the machine's signals, mapping {signal: (source, unit, scale,
     offset)} (empty: our own names), the clock, the gap limit."""
 
@@ -52,7 +52,7 @@ class Job(NamedTuple):
                 f"params.yaml: ingest.mapping.{unknown[0]} is no signal of the plant; "
                 f"{nearest_names(unknown[0], [s.name for s in signals])}"
             )
-        found = []
+        sources = []
         for signal in signals:
             source, unit, scale, offset = self.mapping.get(signal.name, (signal.name, signal.unit, 1.0, 0.0))
             if unit != signal.unit:
@@ -61,18 +61,18 @@ class Job(NamedTuple):
                     f"is in {signal.unit}; "
                     f"convert with scale and offset, and write unit: {signal.unit}"
                 )
-            found.append(Source(signal.name, source, unit, scale, offset))
-        return found
+            sources.append(Source(signal.name, source, unit, scale, offset))
+        return sources
 
 
-def job_of(p: Ingest, machine: Plant, source: str) -> Job:
+def spec_of(settings: Ingest, machine: Plant, source: str) -> IngestSpec:
     """What section `ingest` asks for; what generate_probing wrote has our own names."""
-    mapping = p.mapping if source == "recordings" else {}
-    return Job(
+    mapping = settings.mapping if source == "recordings" else {}
+    return IngestSpec(
         machine,
         {name: (m.source, m.unit, m.scale, m.offset) for name, m in mapping.items()},
-        p.time,
-        p.max_gap_s,
+        settings.time,
+        settings.max_gap_s,
     )
 
 
@@ -87,12 +87,12 @@ class Result(NamedTuple):
     reused: bool
 
 
-class Filled(NamedTuple):
+class Columns(NamedTuple):
     schema: tables.Schema
     columns: dict[str, np.ndarray]
 
 
-def process(folder: Path, job: Job, execution: Execution, *, memo: Path) -> list[Result]:
+def process(folder: Path, spec: IngestSpec, execution: Execution, *, memo: Path) -> list[Result]:
     """Every recording below `folder`, in the order of names, on as many workers as
     `execution` says. Raises ValueError where there is none."""
     files = sorted(
@@ -108,30 +108,30 @@ def process(folder: Path, job: Job, execution: Execution, *, memo: Path) -> list
             f"{folder}: expected at least one recording (CSV, Parquet or MCAP), found none; copy one there, "
             "or set generate_probing.source: simulated"
         )
-    job.sources()
+    spec.sources()
     code = "".join(artifacts.sha256(path) for pattern in READING for path in sorted(CODE.glob(pattern)))
     hashes = [artifacts.sha256(path) for path in files]
     names = [path.relative_to(folder).as_posix() for path in files]
     keys = [
-        joblib.hash((content, name, job.machine.model_dump(), job[1:], code))
+        joblib.hash((content, name, spec.machine.model_dump(), spec[1:], code))
         for content, name in zip(hashes, names, strict=True)
     ]
     twice = _twice(files, hashes)
     remembered = [
-        None if path in twice else _remembered(memo, key, job.machine)
+        None if path in twice else _remembered(memo, key, spec.machine)
         for path, key in zip(files, keys, strict=True)
     ]
     todo = [
         (path, key)
-        for path, key, known in zip(files, keys, remembered, strict=True)
-        if known is None and path not in twice
+        for path, key, entry in zip(files, keys, remembered, strict=True)
+        if entry is None and path not in twice
     ]
     reasons = twice | dict(
-        zip([path for path, _ in todo], _run(todo, folder, job, execution, memo), strict=True)
+        zip([path for path, _ in todo], _run(todo, folder, spec, execution, memo), strict=True)
     )
     return [
-        _result(name, known or _remembered(memo, key, job.machine), reasons.get(path, ""), known is not None)
-        for path, name, key, known in zip(files, names, keys, remembered, strict=True)
+        _result(name, entry or _remembered(memo, key, spec.machine), reasons.get(path, ""), entry is not None)
+        for path, name, key, entry in zip(files, names, keys, remembered, strict=True)
     ]
 
 
@@ -147,38 +147,38 @@ def _twice(files: Sequence[Path], hashes: Sequence[str]) -> dict[Path, str]:
 
 
 def _run(
-    todo: Sequence[tuple[Path, str]], folder: Path, job: Job, execution: Execution, memo: Path
+    todo: Sequence[tuple[Path, str]], folder: Path, spec: IngestSpec, execution: Execution, memo: Path
 ) -> list[str]:
     """The reasons of `_one`, in the order of `todo`; workers of a
     cluster see the same file system under absolute paths."""
     calls = [
-        joblib.delayed(_one)(path.resolve(), path, folder, key, job, memo.resolve()) for path, key in todo
+        joblib.delayed(_one)(path.resolve(), path, folder, key, spec, memo.resolve()) for path, key in todo
     ]
-    return list(run_all(calls, execution, kept=": what was read is kept"))
+    return list(run_all(calls, execution, remains=": what was read is kept"))
 
 
-def _one(path: Path, shown: Path, folder: Path, key: str, job: Job, memo: Path) -> str:
+def _one(path: Path, shown: Path, folder: Path, key: str, spec: IngestSpec, memo: Path) -> str:
     """Read, resample and flag one recording into the memo, under the path that is
     `shown`; the reason why it cannot be, or an empty text."""
     name = shown.relative_to(folder).as_posix()
-    inputs, outputs = [s.name for s in job.machine.inputs], [s.name for s in job.machine.outputs]
+    inputs, outputs = [s.name for s in spec.machine.inputs], [s.name for s in spec.machine.outputs]
     units, limits = (
-        {s.name: s.unit for s in [*job.machine.inputs, *job.machine.outputs]},
-        {s.name: (s.low, s.high) for s in job.machine.inputs},
+        {s.name: s.unit for s in [*spec.machine.inputs, *spec.machine.outputs]},
+        {s.name: (s.low, s.high) for s in spec.machine.inputs},
     )
     try:
-        raw = read(path, job.sources(), time=job.time)
+        raw = read(path, spec.sources(), time=spec.time)
         table = resample(
             raw,
-            sample_time_s=job.machine.sample_time_s,
+            sample_time_s=spec.machine.sample_time_s,
             inputs=inputs,
             outputs=outputs,
-            max_gap_s=job.max_gap_s,
+            max_gap_s=spec.max_gap_s,
         )
         table = flag(table, units=units, limits=limits)
-        for found in table.flags:
-            if found.kind == "mixed" and table.masked[found.signal].mean() > 0.5:
-                raise ValueError(f"{path}: {found.message}")
+        for flagged in table.flags:
+            if flagged.kind == "mixed" and table.masked[flagged.signal].mean() > 0.5:
+                raise ValueError(f"{path}: {flagged.message}")
     except ValueError as reason:
         # on a cluster the path is absolute; what is said is the same wherever the work is done
         return " ".join(str(reason).split()).replace(str(path), str(shown))
@@ -201,7 +201,7 @@ def _one(path: Path, shown: Path, folder: Path, key: str, job: Job, memo: Path) 
     }
     artifacts.write_table(
         memo / f"{key}.record.parquet",
-        tables.record(job.machine.inputs, job.machine.outputs),
+        tables.record(spec.machine.inputs, spec.machine.outputs),
         _columns(name, table),
     )
     artifacts.write_table(memo / f"{key}.quality.parquet", tables.QUALITY, quality)
@@ -248,7 +248,7 @@ def _result(name: str, entry: tuple[dict, dict] | None, reason: str, reused: boo
     return Result(name, *entry, "", reused)
 
 
-def collect(results: Sequence[Result], machine: Plant, *, strict: bool) -> tuple[Filled, Filled, dict]:
+def collect(results: Sequence[Result], machine: Plant, *, strict: bool) -> tuple[Columns, Columns, dict]:
     """One record and one table of findings in the order of names, and the metrics. Raises ValueError where no
     recording is left, or `strict` and one is broken."""
     broken = [result for result in results if result.reason]
@@ -285,12 +285,15 @@ def collect(results: Sequence[Result], machine: Plant, *, strict: bool) -> tuple
         of = counts.setdefault(str(signal) or "recording", {})
         of[str(kind)] = of.get(str(kind), 0) + int(count)
     metrics = {
-        "recordings": len(results), "processed": sum(not r.reused and not r.reason for r in results),
+        "recordings": len(results),
+        "processed": sum(not r.reused and not r.reason for r in results),
         "reused": sum(r.reused for r in results),
-        "quarantined": len(broken), "samples": len(record["time_s"]), "segments": int(_segments(record)),
+        "quarantined": len(broken),
+        "samples": len(record["time_s"]),
+        "segments": int(_segments(record)),
         "findings": counts,
-    }  # fmt: skip
-    return Filled(schema, record), Filled(tables.QUALITY, quality), metrics
+    }
+    return Columns(schema, record), Columns(tables.QUALITY, quality), metrics
 
 
 def _segments(record: dict[str, np.ndarray]) -> int:

@@ -1,5 +1,5 @@
-"""What learn_kernel does: the window model, and the kernel where the record determines it, learned from the
-record alone; new weights need no pass over the data."""
+"""What learn_kernel does: it learns the window model from the record alone, and the kernel where the record
+determines it. New weights need no further pass over the data."""
 
 from typing import Any, NamedTuple
 
@@ -7,7 +7,7 @@ import numpy as np
 
 from pipeline.store import artifacts
 from pipeline.temperature import identification, window
-from pipeline.temperature.judging import Candidate, Sufficiency, kernel_candidates, sufficiency
+from pipeline.temperature.judging import Candidate, CheckRun, Sufficiency, kernel_candidates, sufficiency
 from pipeline.temperature.scorecard import Yardstick
 from pipeline.temperature.workflow.record import read_record
 from pipeline.temperature.workflow.settings import LearnKernel, Panel, Plant, Tracking
@@ -21,7 +21,7 @@ class Learned(NamedTuple):
     metrics: dict[str, Any]
 
 
-def learned(p: LearnKernel, machine: Plant, tracking: Tracking, panel: Panel, path: str) -> Learned:
+def learned(settings: LearnKernel, machine: Plant, tracking: Tracking, panel: Panel, path: str) -> Learned:
     """Window and kernel of the record in `path`. Raises ValueError where it has too little to learn from."""
     yardstick = Yardstick(
         np.full(len(machine.outputs), tracking.yardstick_q),
@@ -30,28 +30,28 @@ def learned(p: LearnKernel, machine: Plant, tracking: Tracking, panel: Panel, pa
     )
     u, y = read_record(path, machine.inputs, machine.outputs)
     with artifacts.about(path):
-        identification.check_inputs(u, offset=p.offset, names=[i.name for i in machine.inputs])
+        identification.check_inputs(u, offset=settings.offset, names=[i.name for i in machine.inputs])
         identification.check_outputs(y, names=[o.name for o in machine.outputs])
-    scenario = {
-        "start": panel.training.starts_degC[0], "reference": np.array([o.reference for o in machine.outputs]),
-        "steps": panel.steps,
-    }  # fmt: skip
-    long = window.learn(u, y, longest=p.longest_window, offset=p.offset, gain_spread=p.gain_spread)
-    enough = sufficiency(
+    reference = np.array([o.reference for o in machine.outputs])
+    check = CheckRun(panel.training.starts_degC[0], reference, panel.steps)
+    long = window.learn(
+        u, y, longest=settings.longest_window, offset=settings.offset, gain_spread=settings.gain_spread
+    )
+    record_test = sufficiency(
         u,
         y,
         long,
         yardstick,
-        allowed=p.allowed_gap_percent / 100,
-        offset=p.offset,
-        gain_spread=p.gain_spread,
-        **scenario,
+        check,
+        allowed=settings.allowed_gap_percent / 100,
+        offset=settings.offset,
+        gain_spread=settings.gain_spread,
     )
-    tried = kernel_candidates(
-        u, y, long, yardstick, largest=p.largest_kernel_window, offset=p.offset, **scenario
+    candidates = kernel_candidates(
+        u, y, long, yardstick, check, largest=settings.largest_kernel_window, offset=settings.offset
     )
-    best = min(tried, key=lambda candidate: candidate.gap)
-    return Learned(long, best, _metrics(long, enough, tried, best))
+    best = min(candidates, key=lambda candidate: candidate.gap)
+    return Learned(long, best, _metrics(long, record_test, candidates, best))
 
 
 def _metrics(
@@ -59,14 +59,21 @@ def _metrics(
 ) -> dict[str, Any]:
     kernel = best.learned
     return {
-        "window": long.N, "samples": long.samples, "half_record_gap_percent": 100 * enough.half_gap,
+        "window": long.N,
+        "samples": long.samples,
+        "half_record_gap_percent": 100 * enough.half_gap,
         "samples_needed_for_noise": enough.needed,
-        "state": best.state if kernel else None, "refused": None if kernel else best.refusal,
-        "rank": kernel.rank if kernel else None, "identifiable": kernel.unknowns if kernel else None,
+        "state": best.state if kernel else None,
+        "refused": None if kernel else best.refusal,
+        "rank": kernel.rank if kernel else None,
+        "identifiable": kernel.unknowns if kernel else None,
         "samples_needed": kernel.samples_needed if kernel else None,
         "condition": kernel.condition if kernel else None,
         "candidates": {
-            c.state: {"gap_on_window_model_percent": 100 * c.gap if np.isfinite(c.gap) else None,
-            "refusal": c.refusal or None} for c in tried
+            c.state: {
+                "gap_on_window_model_percent": 100 * c.gap if np.isfinite(c.gap) else None,
+                "refusal": c.refusal or None,
+            }
+            for c in tried
         },
-    }  # fmt: skip
+    }

@@ -96,7 +96,7 @@ class Panel(Section):
 
     noise_degC: list[Annotated[float, Field(ge=0, le=50)]] = Field(min_length=1, max_length=10)
     input_gain: float = Field(gt=0, lt=1)
-    loss: float = Field(ge=0, lt=1)
+    extra_heat_loss_per_step: float = Field(ge=0, lt=1)
     steps: int = Field(ge=60, le=20000)
     hold_steps: int = Field(ge=0, le=2000)
     band_degC: float = Field(gt=0, le=100)

@@ -304,6 +304,3 @@ LEVELS = Schema(
         Column("level", FLOAT, "percent", "root mean square of the input within the band", low=0),
     ),
 )
-
-
-# ---- the deposition loop

@@ -24,56 +24,69 @@ class Tuned(NamedTuple):
 
 
 class Search(NamedTuple):
-    """A search and what its candidates trade, None for one that failed; metrics of its mode."""
+    """A search, error and effort of its candidates (None for one that failed), and metrics of its mode."""
 
-    found: tuning.Result
-    trades: list[engineering.Trade | None]
+    result: tuning.Result
+    trades: list[engineering.ErrorEffort | None]
     metrics: dict[str, Any]
 
 
-def tuned(p: TuneWeights, machine: Machine, tracking: Tracking, panel: Panel, model: plant.Plant) -> Tuned:
+def tuned(
+    settings: TuneWeights, machine: Machine, tracking: Tracking, panel: Panel, model: plant.Plant
+) -> Tuned:
     """Both searches; `model` is the identified plant."""
+    training, reference = panel.training, np.array([o.reference for o in machine.outputs])
     scenarios = scorecard.panel(
-        plant.spread(model, input_gain=panel.input_gain, loss=panel.loss), starts=panel.training.starts_degC,
-        references=[np.array([o.reference for o in machine.outputs]) + offset for offset in panel.training.reference_offsets_degC],
-        noise=panel.noise_degC, seeds=panel.training.seeds, steps=panel.steps, hold=panel.hold_steps,
+        plant.spread(model, input_gain=panel.input_gain, extra_heat_loss=panel.extra_heat_loss_per_step),
+        starts=training.starts_degC,
+        references=[reference + offset for offset in training.reference_offsets_degC],
+        noise=panel.noise_degC,
+        seeds=training.seeds,
+        steps=panel.steps,
+        hold=panel.hold_steps,
         cells=False,
-    )  # fmt: skip
-    parity = _parity(p)
-    practical = _practical(p, machine, tracking, panel, model, scenarios)
-    q, r, tau = np.split(practical.found.theta, [model.p, model.p + model.m])
-    theta = parity.found.theta
+    )
+    parity = _parity(settings)
+    practical = _practical(settings, machine, tracking, panel, model, scenarios)
+    q, r, tau = np.split(practical.result.theta, [model.p, model.p + model.m])
+    theta = parity.result.theta
     return Tuned(
         {
             "practical": {"q": q, "r": r, "observer_tau": float(tau[0])},
             "parity": {"q": theta[:OUTPUTS], "r": theta[OUTPUTS:]},
         },
         engineering.histories(
-            {"parity": parity.found, "practical": practical.found},
+            {"parity": parity.result, "practical": practical.result},
             {"parity": parity.trades, "practical": practical.trades},
         ),
         {"parity": parity.metrics, "practical": practical.metrics},
     )
 
 
-def _parity(p: TuneWeights) -> Search:
-    low, high = ([q] * OUTPUTS + [r] * INPUTS for q, r in ((p.q_low, p.r_low), (p.q_high, p.r_high)))
-    found = _search("parity", study.tuning_objective, p, p.initial, p.evaluations, low, high)
+def _parity(settings: TuneWeights) -> Search:
+    low, high = (
+        [q] * OUTPUTS + [r] * INPUTS
+        for q, r in ((settings.q_low, settings.r_low), (settings.q_high, settings.r_high))
+    )
+    result = _search(
+        "parity", study.tuning_objective, settings, settings.initial, settings.evaluations, low, high
+    )
     trades = [
-        None if failed else engineering.Trade(*study.tuning_parts(theta))
-        for theta, failed in zip(found.history.theta, found.history.failed, strict=True)
+        None if failed else engineering.ErrorEffort(*study.tuning_parts(theta))
+        for theta, failed in zip(result.history.theta, result.history.failed, strict=True)
     ]
     optimum = np.ones(OUTPUTS + INPUTS)
     metrics = {
-        "best_cost_perfect_state": found.cost, "optimum": study.tuning_objective(optimum),
+        "best_cost_perfect_state": result.cost,
+        "optimum": study.tuning_objective(optimum),
         "scaled_weights": study.scaled_weights(),
-        "trade": {"optimum": engineering.Trade(*study.tuning_parts(optimum))},
-    }  # fmt: skip
-    return Search(found, trades, metrics)
+        "trade": {"optimum": engineering.ErrorEffort(*study.tuning_parts(optimum))},
+    }
+    return Search(result, trades, metrics)
 
 
 def _practical(
-    p: TuneWeights,
+    settings: TuneWeights,
     machine: Machine,
     tracking: Tracking,
     panel: Panel,
@@ -82,59 +95,75 @@ def _practical(
 ) -> Search:
     limits = tuple(np.array([(i.low, i.high) for i in machine.inputs]).T)
     allowance = scorecard.Allowance(
-        *(getattr(p, f"allow_{name}") for name in scorecard.Allowance._fields[:-1]), p.worst_case
+        *(getattr(settings, f"allow_{name}") for name in scorecard.Allowance._fields[:-1]),
+        settings.worst_case,
     )
-    run = engineering.deployed(
-        model, scenarios, gamma=tracking.gamma, limits=limits, band=panel.band_degC,
-        integral=tracking.integral,
-        integral_limit=tracking.integral_limit_degC, least_disk_margin=p.least_disk_margin,
-    )  # fmt: skip
-    traded: dict[bytes, engineering.Trade] = {}
+    deployment = judging.Deployment(limits, panel.band_degC, tracking.integral, tracking.integral_limit_degC)
+    figures_of = engineering.deployed(
+        model, scenarios, deployment, gamma=tracking.gamma, least_disk_margin=settings.least_disk_margin
+    )
+    error_effort: dict[bytes, engineering.ErrorEffort] = {}
 
     def cost(theta: np.ndarray) -> float:
-        found = run(theta)
+        result = figures_of(theta)
         value = scorecard.engineering_cost(
-            found, scenarios.plant, allowance, longest_s=scenarios.steps * model.sample_time_s
+            result, scenarios.plant, allowance, longest_s=scenarios.steps * model.sample_time_s
         )
-        traded[theta.tobytes()] = engineering.trade(found)
+        error_effort[theta.tobytes()] = engineering.error_effort_of(result)
         return value
 
-    low, high = (
-        [q] * model.p + [r] * model.m + [tau]
-        for q, r, tau in ((p.q_low, p.r_low, p.tau_low), (p.q_high, p.r_high, p.tau_high))
+    low, high = _bounds(settings, model)
+    result = _search(
+        "practical", cost, settings, settings.practical_initial, settings.practical_evaluations, low, high
     )
-    found = _search("practical", cost, p, p.practical_initial, p.practical_evaluations, low, high)
-    trades = [traded.get(theta.tobytes()) for theta in found.history.theta]
+    trades = [error_effort.get(theta.tobytes()) for theta in result.history.theta]
     default = np.array(
         [tracking.yardstick_q] * model.p + [tracking.yardstick_r] * model.m + [tracking.observer_tau]
     )
     yardstick = scorecard.Yardstick(*np.split(default[:-1], [model.p]), tracking.gamma)
-    q, r, tau = np.split(found.theta, [model.p, model.p + model.m])
+    q, r, tau = np.split(result.theta, [model.p, model.p + model.m])
     observed = judging.model_based(model, tracking.gamma, tau=float(tau[0]))
-    default_cost = engineering.found_or_none(cost, default)
+    default_cost = engineering.value_or_none(cost, default)
     metrics = {
-        "cost": found.cost, "cost_default": default_cost,
+        "cost": result.cost,
+        "cost_default": default_cost,
         "regret_identity": engineering.yardstick_regret(observed, scenarios, yardstick, q, r),
-        "failed": int(np.isnan(found.history.cost).sum()), "q": q, "r": r, "observer_tau": float(tau[0]),
+        "failed": int(np.isnan(result.history.cost).sum()),
+        "q": q,
+        "r": r,
+        "observer_tau": float(tau[0]),
         "trade": {
-            "default": traded.get(default.tobytes()),
-            "optimum": engineering.optimum_trade(scenarios, yardstick, limits=limits, band=panel.band_degC),
+            "default": error_effort.get(default.tobytes()),
+            "optimum": engineering.optimum_error_effort(
+                scenarios, yardstick, limits=limits, band=panel.band_degC
+            ),
         },
-    }  # fmt: skip
-    return Search(found, trades, metrics)
+    }
+    return Search(result, trades, metrics)
+
+
+def _bounds(settings: TuneWeights, model: plant.Plant) -> tuple[list[float], list[float]]:
+    """Lowest and highest [q; r; tau]."""
+    low = [settings.q_low] * model.p + [settings.r_low] * model.m + [settings.tau_low]
+    high = [settings.q_high] * model.p + [settings.r_high] * model.m + [settings.tau_high]
+    return low, high
 
 
 def _search(
-    name: str, cost, p: TuneWeights, initial: int, evaluations: int, low: list[float], high: list[float]
+    name: str,
+    cost,
+    settings: TuneWeights,
+    initial: int,
+    evaluations: int,
+    low: list[float],
+    high: list[float],
 ) -> tuning.Result:
     with tqdm(total=evaluations, desc=f"tune_weights: {name}", unit="candidate", mininterval=2) as bar:
-        rng, sizes = np.random.default_rng(p.seed), {"initial": initial, "evaluations": evaluations}
         return tuning.minimise(
             cost,
             np.array(low),
             np.array(high),
-            rng=rng,
-            acquisition=p.acquisition,
+            tuning.SearchSettings(initial, evaluations, settings.acquisition),
+            rng=np.random.default_rng(settings.seed),
             on_step=lambda _: bar.update(),
-            **sizes,
         )

@@ -1,0 +1,70 @@
+"""The walk-throughs in docs/ run as they stand, what they print holds, and the version is one."""
+
+import re
+import runpy
+
+import numpy as np
+import pytest
+
+from pipeline import cli
+from pipeline.setpoint import score
+
+LOOPS = ("temperature", "deposition", "setpoint")
+
+
+@pytest.fixture
+def walked(root, tmp_path, monkeypatch):
+    """walked("setpoint"): the names that the walk-through leaves behind."""
+    monkeypatch.chdir(tmp_path)
+
+    def walk(loop: str) -> dict:
+        left = runpy.run_path(str(root / f"docs/{loop}.py"))
+        assert (tmp_path / f"{loop}.svg").read_text(encoding="utf-8").rstrip().endswith("</svg>")
+        return left
+
+    return walk
+
+
+@pytest.mark.parametrize("loop", LOOPS)
+def test_a_walk_through_is_read_in_a_sitting(root, loop):
+    text = (root / f"docs/{loop}.py").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 80 and text.count("\n# %% ") >= 5
+
+
+def test_every_learned_law_of_the_temperature_walk_through_is_within_a_percent_of_the_optimum(walked):
+    left = walked("temperature")
+    assert set(left["gaps"]) == {"subspace + LQG", "VARX + Riccati", "learned kernel"}
+    assert max(left["gaps"].values()) < 0.01
+    for name in left["gaps"]:  # as deployed, all zones settle on their references
+        np.testing.assert_allclose(left["runs"][name].y[-1, 0], left["references"][0], atol=0.5)  # noise 0.1
+
+
+def test_the_deposition_walk_through_learns_the_line_and_the_model_inverse_learns_it_sooner(walked):
+    ratios = walked("deposition")["ratios"]
+    assert ratios["model inverse"].min() < 0.15 and ratios["Hoelzle 2009"].min() < 0.6
+    assert ratios["model inverse"][3] < ratios["Hoelzle 2009"][3]
+
+
+def test_the_bayes_filter_of_the_setpoint_walk_through_stays_and_one_that_expects_jumps_survives_a_clog(
+    walked,
+):
+    left = walked("setpoint")
+    stay = {name: one.stay.percent for name, one in left["scores"].items()}
+    assert max(stay, key=stay.get) == "Bayes filter" and stay["Bayes filter"] > 95
+    last = {
+        name: np.median(np.asarray(run.flow)[:, score.RECOVERED_UNTIL])
+        for name, run in left["clogged"].items()
+    }
+    assert last["Bayes filter"] < 90 < last["Bayes filter, expects jumps"]
+
+
+def test_the_version_is_one_and_the_same_wherever_it_stands(root, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["beadline", "--version"])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    version = capsys.readouterr().out.split()[1]
+    assert ended.value.code == 0
+    assert f"\nversion: {version}\n" in (root / "CITATION.cff").read_text(encoding="utf-8")
+    assert f'name = "beadline"\nversion = "{version}"\n' in (root / "uv.lock").read_text(encoding="utf-8")
+    changes = (root / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert re.findall(r"^## \[(.*?)\]", changes, re.MULTILINE)[0] == version
