@@ -7,8 +7,8 @@ import pytest
 
 from tests.report import made
 
-MACHINE = """window.beadline = {"machine": {"cpu": "Some CPU @ 3.00GHz", "cores": 2, "pins": "avx2", "version": "0.1.0", \
-"commit": "abc12345", "changed": true, "locked": "1", "date": "2026-11-22T07:00:00Z"}};
+MACHINE = """window.beadline = {"machine": {"cpu": "Some CPU @ 3.00GHz", "cores": 2, "pins": "avx2", \
+"version": "0.1.0", "commit": "abc12345", "changed": true, "locked": "1", "date": "2026-11-22T07:00:00Z"}};
 """
 
 

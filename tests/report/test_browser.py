@@ -19,7 +19,8 @@ def test_nothing_overflows_nothing_is_fetched_but_the_machine_and_the_console_is
 ):
     page = open_page(name, width=width, theme=theme)
     assert page.evaluate("document.documentElement.scrollWidth") <= width
-    wide = """width => [...document.querySelectorAll("body *")].filter(e => !e.closest("svg, .scroll, .vh, dialog, .tip") &&
+    wide = """width => [...document.querySelectorAll("body *")].filter(e =>
+        !e.closest("svg, .scroll, .vh, dialog, .tip") &&
         e.getBoundingClientRect().right > width + 1).map(e => e.outerHTML.slice(0, 120))"""
     assert page.evaluate(wide, width) == []
     # the page itself and the pictures inside it; beside it what it was made on
@@ -186,7 +187,8 @@ def test_a_page_prints_on_a4_landscape_and_no_figure_is_cut(open_page, name):
     assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
     cut = """([width, height]) => [...document.querySelectorAll("svg[role=img], img")].filter(e => {
         const box = e.getBoundingClientRect(), kept = e.closest("figure, .card, tr, .mv");
-        return box.right > width + 1 || !kept || getComputedStyle(kept).breakInside !== "avoid" || kept.getBoundingClientRect().height > height;
+        return box.right > width + 1 || !kept ||
+            getComputedStyle(kept).breakInside !== "avoid" || kept.getBoundingClientRect().height > height;
     }).map(e => e.outerHTML.slice(0, 120))"""
     assert page.evaluate(cut, list(SHEET)) == []
     # one sheet each: the first screen, the cards
@@ -220,14 +222,17 @@ def test_axe_finds_nothing_serious(open_page, name, theme, width):
 def test_every_picture_stands_where_a_link_leads_to_stage_artifact_schema_and_hash(open_page, name):
     page = open_page(name)
     lost = """() => [...document.querySelectorAll("main svg[role=img], main img")].filter(e => {
-        const links = [...(e.closest("article, section, .answers")?.querySelectorAll("a[href^='#from-']") ?? [])];
+        const around = e.closest("article, section, .answers");
+        const links = [...(around?.querySelectorAll("a[href^='#from-']") ?? [])];
         return !links.length || links.some(a => document.getElementById(a.hash.slice(1)).cells.length !== 4);
     }).map(e => e.closest("section, .answers")?.id + " " + e.outerHTML.slice(0, 160))"""
     assert page.evaluate(lost) == []
     # a table of figures too; what params.yaml declares has no
     # artifact, and a loop that is not measured no figure
-    unsaid = """() => [...document.querySelectorAll("main table.tab, main table.fig, main .answers table")].filter(e =>
-        !(e.closest("article, section, .answers").querySelector("a[href^='#from-']")) && e.closest("section").getAttribute("aria-labelledby") !== "declared"
+    unsaid = """() => [
+        ...document.querySelectorAll("main table.tab, main table.fig, main .answers table")].filter(e =>
+        !(e.closest("article, section, .answers").querySelector("a[href^='#from-']")) &&
+        e.closest("section").getAttribute("aria-labelledby") !== "declared"
         && !e.querySelector(".hole")).map(e => e.outerHTML.slice(0, 160))"""
     assert page.evaluate(unsaid) == []
 

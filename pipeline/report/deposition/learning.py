@@ -10,7 +10,7 @@ from markupsafe import Markup
 from pipeline.report.deposition.rules import real
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import THIN, count, number, percent, short
-from pipeline.report.shared.pictures import Column, Picture, hole
+from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources, Table, lookup
 from pipeline.report.shared.verdict import Missing
 
@@ -66,7 +66,7 @@ def errors(sources: Sources) -> Picture:
     """Both errors after every update, as share of trial 0's."""
     table, title = sources.tables["trials"], "Error after each trial"
     if isinstance(table, Missing):
-        return hole("learning-error", title, table)
+        return placeholder("learning-error", title, table)
     materials, laws, machine = _materials(table), _laws(table), real(sources)
     last = max(int(table["trial"].max()), 1)
     curves = {law: {name: _trials(table, name, law) for name in materials} for law in laws}
@@ -150,12 +150,14 @@ def commands(sources: Sources) -> Picture:
     """What the plunger is asked for: first, second and last trial."""
     table, title = sources.tables["lessons"], "What the plunger is asked for"
     if isinstance(table, Missing):
-        return hole("commands", title, table)
+        return placeholder("commands", title, table)
     materials = _materials(table)
     there = set(table["law"].tolist())
     law = next((name for name in ("model_inverse", "pixels") if name in there), None)
     if law is None:
-        return hole("commands", title, Missing("not measured", "no trial of the model inversion is there"))
+        return placeholder(
+            "commands", title, Missing("not measured", "no trial of the model inversion is there")
+        )
     last = int(_trials(table, materials[0], law)["trial"].max(initial=0))
     peaks: list[str] = []
 
@@ -242,7 +244,7 @@ def corner(sources: Sources) -> Picture:
     """Wanted and true flow around the pause, before and after."""
     table, title = sources.tables["lessons"], "Flow around the corner, before and after learning"
     if isinstance(table, Missing):
-        return hole("corner", title, table)
+        return placeholder("corner", title, table)
     materials, laws = _materials(table), _laws(table)
     kind = "measured_mm3_per_s" if real(sources) else "true_mm3_per_s"
     stories = [Story("On\u2011off control", "before learning: trial 0", "baseline", "bl", laws[-1], False)]
@@ -365,9 +367,9 @@ def measured(sources: Sources) -> Picture:
     )
     for missing in (table, filmed):
         if isinstance(missing, Missing):
-            return hole("told", title, missing)
+            return placeholder("told", title, missing)
     if "pixels" not in _laws(table):
-        return hole(
+        return placeholder(
             "told", title, Missing("not measured", "no trial was filmed", "Run ./run dvc repro train_ilc")
         )
     materials, machine = _materials(table), real(sources)

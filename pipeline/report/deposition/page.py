@@ -26,7 +26,7 @@ from pipeline.report.deposition.verdict import verdict
 from pipeline.report.shared import charts, headline, page, words
 from pipeline.report.shared.difference import Move
 from pipeline.report.shared.digits import THIN, number, percent, short
-from pipeline.report.shared.pictures import Column, Picture, hole
+from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources, Table, digest, lookup
 from pipeline.report.shared.verdict import Figure, Missing, Question, ReportRules
 
@@ -275,7 +275,9 @@ def signals(sources: Sources) -> Picture:
     """Each basis signal from its lead to its end, materials beside one another."""
     table, title = sources.tables["library"], "Its signals"
     if isinstance(table, Missing) or isinstance(sources.tables["learned"], Missing):
-        return hole("signals", title, table if isinstance(table, Missing) else sources.tables["learned"])
+        return placeholder(
+            "signals", title, table if isinstance(table, Missing) else sources.tables["learned"]
+        )
     Ts = _step(sources)
     shown: list[Column] = []
     leads: dict[str, float] = {}

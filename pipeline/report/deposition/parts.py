@@ -9,7 +9,7 @@ from markupsafe import Markup
 from pipeline.report.deposition.rules import MARK, NAMES, PAPER, real
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import MINUS, THIN, count, number, percent, short, shortened
-from pipeline.report.shared.pictures import Column, Picture, hole
+from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources, Table
 from pipeline.report.shared.verdict import Missing
 
@@ -44,7 +44,7 @@ def maps(sources: Sources) -> list[Picture]:
     """Every part from above, coloured by the error of the flow where it prints."""
     table = sources.tables["signals"]
     if isinstance(table, Missing):
-        return [hole("maps", "The parts, coloured by flow error", table)]
+        return [placeholder("maps", "The parts, coloured by flow error", table)]
     parts = list(dict.fromkeys(table["part"].tolist()))
     return [
         _map(sources, table, str(part), i, last=part == parts[:PARTS][-1])
@@ -201,7 +201,7 @@ def stretches(sources: Sources) -> Picture:
         "Flow where the chosen signal errs most",
     )
     if isinstance(table, Missing):
-        return hole("stretches", title, table)
+        return placeholder("stretches", title, table)
     rows = (
         ()
         if isinstance(scores, Missing)

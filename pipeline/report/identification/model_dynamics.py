@@ -9,7 +9,7 @@ from markupsafe import Markup
 from pipeline.report.identification.model_errors import Cell, Matrix, Room, blank, matrix, room
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import DASH, THIN, band, count, decimals, number, short
-from pipeline.report.shared.pictures import Column, Picture, hole
+from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources, Table, lookup
 from pipeline.report.shared.verdict import Missing
 from pipeline.report.temperature import evidence
@@ -144,7 +144,7 @@ def order(sources: Sources) -> Picture:
     shown = [evidence.singular(sources), evidence.left_out(sources)]
     table, title = sources.tables["order"], "How many states the record asks for"
     if isinstance(table, Missing):
-        return hole("order", title, table)
+        return placeholder("order", title, table)
     chosen = int(table["order"][table["chosen"]][0]) if table["chosen"].any() else 0
     given = sources.declared.everything.get("identify_plant", {}).get("order") or 0
     tried, tolerance = (
@@ -178,7 +178,7 @@ def poles(sources: Sources) -> Picture:
     """Poles of the model with the spread's cloud: the whole circle, and where they crowd."""
     table, title = sources.tables["poles"], "Poles, and how surely they are known"
     if isinstance(table, Missing):
-        return hole("poles", title, table)
+        return placeholder("poles", title, table)
     mine = table["member"] == 0
     others = np.flatnonzero(~mine)[:: max(1, -(-int((~mine).sum()) // MOST_DOTS))]
     of_mine, extra = others[table["pole"][others] >= 0], others[table["pole"][others] < 0]
@@ -312,7 +312,7 @@ def excitation(sources: Sources) -> Picture:
     excited = lookup(sources.metrics["identify_plant"], "excitation")
     gap = next((part for part in (table, excited) if isinstance(part, Missing)), None)
     if gap:
-        return hole("excitation", title, gap)
+        return placeholder("excitation", title, gap)
     y, shown = charts.linear(0, 1.1 * float(table["level"].max()) or 1.0, ticks=3), []
     size = room(len(sources.declared.machine.inputs))
     for signal in sources.declared.machine.inputs:

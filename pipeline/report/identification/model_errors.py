@@ -10,7 +10,7 @@ from markupsafe import Markup
 from pipeline.report.identification.model import Fit, percent_of
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import THIN, count, number, short
-from pipeline.report.shared.pictures import Column, Picture, hole
+from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources, Table
 from pipeline.report.shared.verdict import Missing
 
@@ -73,7 +73,7 @@ def holdout(sources: Sources, fits: Sequence[Fit], ahead: str) -> Picture:
         "Measured against simulated, on the part of the record that the model did not see",
     )
     if isinstance(table, Missing):
-        return hole("holdout", title, table)
+        return placeholder("holdout", title, table)
     shown, points = [], max(60, 240 * 10 // max(len(fits), 10))
     for fit in fits:
         parts = [("simulated", fit.simulated), (ahead, fit.ahead)]
@@ -169,7 +169,7 @@ def whiteness(sources: Sources) -> Picture:
     """Autocorrelation of the one-step errors of each output, with its 99 % band."""
     table, title = sources.tables["residuals"], "What the model leaves over: is it noise?"
     if isinstance(table, Missing):
-        return hole("white", title, table)
+        return placeholder("white", title, table)
     names = [output.name for output in sources.declared.machine.outputs]
     mine = {
         name: (table["output"] == name) & (table["against"] == name) & (table["lag"] > 0) for name in names

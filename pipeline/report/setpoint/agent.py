@@ -11,7 +11,7 @@ from markupsafe import Markup
 from pipeline.report.setpoint.verdict import AGENT, BASELINE, PAPER, Board, Case, case_text, role
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import THIN, number, percent
-from pipeline.report.shared.pictures import Column, Picture, hole
+from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources, Table, lookup
 from pipeline.report.shared.verdict import Figure, Missing
 from pipeline.setpoint.workflow.tables import (
@@ -77,14 +77,14 @@ def ways(sources: Sources, board: Board | Missing) -> list[Picture]:
     table, title = sources.tables["paths"], "From 21 starts to the best setpoint"
     for needed in (board, table):
         if isinstance(needed, Missing):
-            return [hole("ways", title, needed)]
+            return [placeholder("ways", title, needed)]
     there = list(dict.fromkeys(zip(map(str, table["simulator"]), map(str, table["case"]), strict=True)))
     cases = [case for case in (*CASES, *(one for one in there if one[0] == "pixels")) if case in there][
         :3
     ] or there[:1]
     if not cases:
         return [
-            hole(
+            placeholder(
                 "ways",
                 title,
                 Missing("not measured", "no way was kept", "Run ./run dvc repro evaluate_setpoint"),
@@ -236,7 +236,7 @@ def training(sources: Sources) -> Picture:
     """Mean reward while the agents learn, phase after phase (figure 6 of the paper)."""
     table, title = sources.tables["agents"], "The agents in training, phase after phase"
     if isinstance(table, Missing):
-        return hole("agents", title, table)
+        return placeholder("agents", title, table)
     columns, sentences = [], []
     for agent in dict.fromkeys(map(str, table["agent"])):
         mine = {name: values[table["agent"] == agent] for name, values in table.items()}
@@ -319,14 +319,16 @@ def by_accuracy(sources: Sources, board: Board | Missing) -> Picture:
     on the paper's simulator (figure 7, as figures)."""
     title = "How much misnaming each bears"
     if isinstance(board, Missing):
-        return hole("by-accuracy", title, board)
+        return placeholder("by-accuracy", title, board)
     cases = sorted(
         (float(match[1]), case)
         for case in board.cases
         if (match := re.fullmatch(r"accuracy (\d\.?\d*)", case[1]))
     )
     if len(cases) < 2:
-        return hole("by-accuracy", title, Missing("not measured", "fewer than two accuracies were judged"))
+        return placeholder(
+            "by-accuracy", title, Missing("not measured", "fewer than two accuracies were judged")
+        )
     asked = sources.declared.rules
     panels = [
         _accuracy_panel(board, cases, what, head, limit)

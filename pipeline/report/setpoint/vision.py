@@ -10,7 +10,7 @@ from markupsafe import Markup
 from pipeline.report.setpoint.verdict import NAMES, accuracy, share_text
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import THIN, band, number, percent, quantity, short
-from pipeline.report.shared.pictures import Column, Picture, hole
+from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources, Table, lookup
 from pipeline.report.shared.verdict import Figure, Missing
 from pipeline.setpoint.workflow.tables import ALPHA
@@ -31,7 +31,7 @@ def reliability(sources: Sources) -> Picture:
     table, metrics = sources.tables["reliability"], sources.metrics["train_classifier"]
     title = "When it says 80 %, is it right in 80 %?"
     if isinstance(table, Missing):
-        return hole("reliability", title, table)
+        return placeholder("reliability", title, table)
     errors = [lookup(metrics, key) for *_, key in DIAGRAMS]
     columns = []
     for (of, method, head, small, _), error in zip(DIAGRAMS, errors, strict=True):
@@ -86,7 +86,7 @@ def confusion(sources: Sources) -> Picture:
     """True class against the class named, by temperature (figure 5c)."""
     table, title = sources.tables["classified"], "What is taken for what, by temperature"
     if isinstance(table, Missing):
-        return hole("confusion", title, table)
+        return placeholder("confusion", title, table)
     columns, right, swapped = [], {}, 0
     for degrees in np.unique(np.round(table["temperature_degC"] / 10) * 10)[:7]:
         mine = np.abs(table["temperature_degC"] - degrees) <= 5
@@ -162,10 +162,10 @@ def distributions(sources: Sources) -> Picture:
     and as the paper's simulator draws it (figure 4)."""
     table, title = sources.tables["windows"], "What a window says, by true flow"
     if isinstance(table, Missing):
-        return hole("distributions", title, table)
+        return placeholder("distributions", title, table)
     mine = {name: values[table["part"] == "judge"] for name, values in table.items()}
     if not len(mine["flow_bin"]):
-        return hole(
+        return placeholder(
             "distributions",
             title,
             Missing("not measured", "no window to judge by", "Run ./run dvc repro train_classifier"),
@@ -275,7 +275,7 @@ def learning_curves(sources: Sources) -> Picture:
     table, metrics = sources.tables["course"], sources.metrics["train_classifier"]
     title = "The classifier in training"
     if isinstance(table, Missing):
-        return hole("course", title, table)
+        return placeholder("course", title, table)
     svc, limit = accuracy(metrics, "svc_image"), 100 * sources.declared.rules.image_accuracy
     columns, sentences = [], []
     for learner in dict.fromkeys(map(str, table["learner"])):

@@ -95,7 +95,10 @@ def count(value: int, one: str, many: str = "") -> str:
         "eleven",
         "twelve",
     )
-    return f"{words[value] if 0 <= value < len(words) else f'{value:,}'} {one if value == 1 else many or one + 's'}"
+    return (
+        f"{words[value] if 0 <= value < len(words) else f'{value:,}'} "
+        f"{one if value == 1 else many or one + 's'}"
+    )
 
 
 def shortened(text: str, longest: int = 60) -> str:

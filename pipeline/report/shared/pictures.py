@@ -39,7 +39,7 @@ class Picture(NamedTuple):
     missing: Missing | None = None
 
 
-def hole(id: str, title: str, missing: Missing) -> Picture:
+def placeholder(id: str, title: str, missing: Missing) -> Picture:
     return Picture(id, title, "", [], "", Markup(""), missing)
 
 
@@ -100,7 +100,7 @@ def trajectories(sources: Sources) -> Picture:
     found = runs(sources, "deployed")
     title = "Every zone on its way to its reference"
     if isinstance(found, Missing):
-        return hole("trajectories", title, found)
+        return placeholder("trajectories", title, found)
     machine = sources.declared.machine
     offset = sources.declared.panel.judging.reference_offsets_degC[0]
     lowest = min(
@@ -179,7 +179,7 @@ def errors(sources: Sources) -> Picture:
     found = runs(sources, "deployed")
     title = "The worst zone’s error at each moment, noise and ripple in it"
     if isinstance(found, Missing):
-        return hole("errors", title, found)
+        return placeholder("errors", title, found)
     machine, offset, limit = (
         sources.declared.machine,
         sources.declared.panel.judging.reference_offsets_degC[0],
@@ -249,7 +249,7 @@ def costs(sources: Sources) -> Picture:
     found = runs(sources, "unclipped")
     title = "Cost so far, on the common yardstick"
     if isinstance(found, Missing):
-        return hole("costs", title, found)
+        return placeholder("costs", title, found)
     exact = next((run for run in found if run.name == "exact_model"), None)
     finals = {run.name: float(run.rows["cost"][-1]) for run in found}
     first_step = min(float(run.rows["cost"][0]) for run in found)
@@ -264,7 +264,10 @@ def costs(sources: Sources) -> Picture:
             else []
         )
         above = finals[run.name] / finals["exact_model"] - 1 if exact else 0.0
-        text = f"{number(finals[run.name] / 1000, 1)}{f', {_signed(100 * above)}' if exact and run is not exact else ''}"
+        text = (
+            f"{number(finals[run.name] / 1000, 1)}"
+            f"{f', {_signed(100 * above)}' if exact and run is not exact else ''}"
+        )
         end = charts.label(
             frame,
             1000,
@@ -318,7 +321,7 @@ def inputs(sources: Sources) -> Picture:
     found = runs(sources, "deployed")
     title = "Inputs against their limits"
     if isinstance(found, Missing):
-        return hole("inputs", title, found)
+        return placeholder("inputs", title, found)
     machine = sources.declared.machine
     low, high = min(i.low for i in machine.inputs), max(i.high for i in machine.inputs)
     room = 0.35 * (high - low)

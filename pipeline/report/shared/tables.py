@@ -227,7 +227,8 @@ def panel(sources: Sources) -> list[tuple[str, str]]:
         (
             "Judged on",
             (
-                f"{'' if isinstance(plants, Missing) else f'{plants} plants: '}{'the study’s machine and ' if simulated else ''}its "
+                f"{'' if isinstance(plants, Missing) else f'{plants} plants: '}"
+                f"{'the study’s machine and ' if simulated else ''}its "
                 f"spread, {spread}"
             ),
         ),

@@ -92,7 +92,8 @@ FIXED = {
         "Data\u2011driven, model\u2011based, baseline",
         "On this page one column each in every loop. Temperature: learned from the record alone; "
         "from the identified model; PI per zone. Deposition: basis functions of a chain identified "
-        + "from trials; the paper’s law and its library; on\u2011off control. Setpoint: our agent; a Bayes filter, whose model is given; the best proportional rule.",
+        + "from trials; the paper’s law and its library; on\u2011off control. Setpoint: our agent; a "
+        "Bayes filter, whose model is given; the best proportional rule.",
     ),
     "settling": (
         "Settling",
@@ -145,7 +146,8 @@ FIXED = {
         "Trusted",
         "To simulate: the rules simulation and stability. To predict: the rule ahead. To design controllers: "
         "ahead, inputs used up, "
-        + "excitation, effects known and stability. Whiteness is a reservation: where it fails, a better observer exists.",
+        + "excitation, effects known and stability. Whiteness is a reservation: where "
+        "it fails, a better observer exists.",
     ),
     "fit": (
         "Fit",

@@ -8,7 +8,7 @@ from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import THIN, count, number, percent, short
-from pipeline.report.shared.pictures import Column, Picture, hole
+from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources, Table, lookup
 from pipeline.report.shared.verdict import Missing
 
@@ -25,7 +25,7 @@ def noise(sources: Sources) -> Picture:
     """Gap and error of each route, a dot a data set."""
     table, title = sources.tables["study"], "What noise costs the learners"
     if isinstance(table, Missing):
-        return hole("noise", title, table)
+        return placeholder("noise", title, table)
     shown = [
         Column(
             f"{level:g} °C of noise",
@@ -306,7 +306,7 @@ def tuning(sources: Sources) -> Picture:
         "The optimiser’s progress",
     )
     if isinstance(table, Missing):
-        return hole("tuning", title, table)
+        return placeholder("tuning", title, table)
     best, optimum = lookup(metrics, "parity.best_cost_perfect_state"), lookup(metrics, "parity.optimum")
     cost, default = lookup(metrics, "practical.cost"), default_cost(metrics)
     shown = [
@@ -417,7 +417,7 @@ def holdout(sources: Sources) -> Picture:
     """The part of the record that judged the model, measured against simulated."""
     table, title = sources.tables["holdout"], "The model on the part of the record that it did not see"
     if isinstance(table, Missing):
-        return hole("holdout", title, table)
+        return placeholder("holdout", title, table)
     machine, fits = sources.declared.machine, lookup(sources.metrics["identify_plant"], "fit_holdout")
     shown = []
     for output in machine.outputs:

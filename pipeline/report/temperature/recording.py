@@ -9,7 +9,7 @@ from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import THIN, count, number, short
-from pipeline.report.shared.pictures import Column, Picture, hole
+from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources, Table, lookup
 from pipeline.report.shared.verdict import Missing
 
@@ -19,7 +19,7 @@ def excitation(sources: Sources) -> Picture:
     metrics, title = sources.metrics["generate_probing"], "What the probing excites"
     levels = lookup(metrics, "level_percent_per_band")
     if isinstance(levels, Missing):
-        return hole("excitation", title, levels)
+        return placeholder("excitation", title, levels)
     levels, machine = np.array(levels), sources.declared.machine
     y = charts.linear(0, 1.1 * float(levels.max()), ticks=3)
     names = (
@@ -76,7 +76,7 @@ def record(sources: Sources) -> Picture:
         "The record, with what was flagged and masked",
     )
     if isinstance(table, Missing):
-        return hole("record", title, table)
+        return placeholder("record", title, table)
     machine, time = sources.declared.machine, _elapsed(table, sources.declared.machine.sample_time_s)
     masked_total = 0
     halves: list[list[Markup]] = [[], []]

@@ -8,7 +8,7 @@ from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import THIN, count, number, percent, short
-from pipeline.report.shared.pictures import ORDER, Column, Picture, hole
+from pipeline.report.shared.pictures import ORDER, Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources, Table, lookup
 from pipeline.report.shared.verdict import Missing
 from pipeline.report.temperature.answers import LABELS, noise
@@ -46,7 +46,7 @@ def tradeoff(sources: Sources) -> Picture:
     """Error against effort of every controller, with the front of those that no other one beats in both."""
     table, title = sources.tables["scorecard"], "What each controller trades: error against effort"
     if isinstance(table, Missing):
-        return hole("tradeoff", title, table)
+        return placeholder("tradeoff", title, table)
     rows = (table["noise_degC"] == noise(sources)) & (table["plant"] == 0)
     clouds = {}
     for name in _names(table):
@@ -55,7 +55,7 @@ def tradeoff(sources: Sources) -> Picture:
         if finite.any():
             clouds[name] = Cloud(table["effort_percent"][mine][finite], table["tracking_degC"][mine][finite])
     if not clouds:
-        return hole(
+        return placeholder(
             "tradeoff", title, Missing("not measured", "no run on the nominal plant has both figures")
         )
     points = {name: cloud.middle for name, cloud in clouds.items()}
@@ -144,7 +144,7 @@ def candidates(sources: Sources) -> Picture:
         "What the tuning’s candidates trade",
     )
     if isinstance(table, Missing):
-        return hole("candidates", title, table)
+        return placeholder("candidates", title, table)
     shown, sentences = [], []
     for mode, (head, small) in MODES.items():
         rows = (
@@ -277,14 +277,14 @@ def plants(sources: Sources) -> Picture:
     of each, from the easiest plant to the hardest."""
     table, title = sources.tables["scorecard"], "The gap, plant by plant"
     if isinstance(table, Missing):
-        return hole("plants", title, table)
+        return placeholder("plants", title, table)
     limit, rows = sources.declared.rules.worst_case_gap_percent, table["noise_degC"] == noise(sources)
     worst = {name: _worst(table, rows & (table["controller"] == name)) for name in _names(table)}
     worst = {name: gaps for name, gaps in worst.items() if len(gaps)}
     finite = np.concatenate([gaps[np.isfinite(gaps)] for gaps in worst.values()] or [np.zeros(0)])
     finite = finite[finite > 0]
     if not len(finite):
-        return hole(
+        return placeholder(
             "plants", title, Missing("not measured", "the scorecard has no gap at this level of noise")
         )
     y = charts.logarithmic(min(float(finite.min()), limit), max(float(finite.max()), limit))
