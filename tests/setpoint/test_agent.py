@@ -16,6 +16,7 @@ from pipeline.setpoint.agent import (
     QNetwork,
     Replay,
     TrainState,
+    _mean_gradient,
     _packed,
     _unpacked,
     _updated,
@@ -302,3 +303,18 @@ def test_weights_return_to_the_network_they_came_from_and_no_other():
         ValueError, match="weights of another architecture: 'extra' is unknown in this network"
     ):
         with_weights(network, {**arrays, "extra": np.zeros(1)})
+
+
+def test_a_long_batch_is_summed_in_short_slices_to_the_same_gradient():
+    """Longer sums are cut by the size of the CPU's cache: their last bits would differ between machines."""
+    lengths = []
+
+    def loss(w, x):
+        lengths.append(len(x))
+        return ((x @ w) ** 2).mean()
+
+    x = jax.random.normal(jax.random.key(0), (512, 3))
+    w = jnp.array([1.0, -2.0, 0.5])
+    gradient = _mean_gradient(loss, w, x)
+    assert lengths == [256, 256]
+    np.testing.assert_allclose(gradient, 2 * x.T @ (x @ w) / 512, rtol=1e-5)  # float32 sums of 512
