@@ -9,10 +9,11 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 
 from pipeline import cli
 from pipeline.report.shared.sources import machine
-from pipeline.store import artifacts
+from pipeline.store import artifacts, params
 from stages.report import main
 from tests.report import made
 from tests.report.test_pages import change
@@ -212,6 +213,20 @@ def first_page(open_page, folder):
 
 
 ALONE = "Nothing but the CPU differs from the accepted run: There 3000 then, Here 9000 now."
+
+
+@pytest.mark.parametrize("stage", ["train_ilc", "train_classifier"])
+def test_recordings_that_may_have_changed_unseen_are_not_called_the_cpu(project, monkeypatch, stage):
+    file = next(file for file, sections in params.files().items() if "source" in (sections.get(stage) or {}))
+    sections = params.files()[file]
+    sections[stage]["source"] = "recordings"
+    artifacts.write_text(file, yaml.safe_dump(sections))
+    write(THERE)
+    main()
+    accept(monkeypatch)
+    write(HERE)
+    main()
+    assert "There 3000" not in (project / "reports/index.html").read_text()
 
 
 def test_a_page_says_that_nothing_but_the_cpu_differs(open_page, accepted):
