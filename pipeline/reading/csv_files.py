@@ -20,7 +20,7 @@ from pipeline.reading.formats import (
     seconds,
     time_column,
 )
-from pipeline.reading.instants import instants, is_compact, month_first, over_midnight
+from pipeline.reading.instants import hyphen_fraction, instants, is_compact, month_first, over_midnight
 from pipeline.reading.signals import Note
 from pipeline.store.csv_rows import (
     LONGEST_TAIL,
@@ -131,6 +131,10 @@ class _Clock:
                 if len(row) > self.place and self.text(row).strip()
             }
         self.month_first = month_first(dates, sample)
+        written = (row[self.place] for _, row in rows(path, layout) if len(row) > self.place)
+        self.hyphen_fraction = not self.numeric and hyphen_fraction(
+            field for field in written if ":" in field
+        )
         self.times, self.zoned, self.dated = Growing([float if self.numeric else np.int64]), True, True
 
     def text(self, row: list[str]) -> str:
@@ -150,7 +154,14 @@ class _Clock:
         if self.numeric:
             self.times.append(floats(self.path, self.name, fields, self.layout.decimal, lines, {}))
             return
-        dates = instants(self.path, self.name, fields, lines, month_first=self.month_first)
+        dates = instants(
+            self.path,
+            self.name,
+            fields,
+            lines,
+            month_first=self.month_first,
+            hyphen_fraction=self.hyphen_fraction,
+        )
         self.times.append(dates.ns)
         self.zoned, self.dated = self.zoned and dates.zoned, dates.dated
 

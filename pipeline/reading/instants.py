@@ -28,6 +28,8 @@ _TEXT = re.compile(
 _PARTS = ("date", "hours", "minutes", "seconds", "fraction", "half", "zone")
 # 20251121130000 and 20251121130000250, as controllers stamp
 _COMPACT = re.compile(r"\s*((?:19|20)\d\d(?:0[1-9]|1[0-2])[0-3]\d)([0-2]\d)([0-5]\d)([0-5]\d)(\d{3})?\s*$")
+# what stands behind the seconds and a hyphen: a fraction as the camera program of CAXTON writes it, or a zone
+_HYPHEN = re.compile(r"(:\d\d)-(\d{1,6})\s*$")
 EXPECTED = "seconds or ISO 8601 such as 2025-11-21T13:00:00.5"
 
 
@@ -45,9 +47,16 @@ def is_compact(text: str) -> bool:
 
 
 def instants(
-    path: Path, name: str, fields: Sequence[str], lines: Sequence[int], *, month_first: bool | None
+    path: Path,
+    name: str,
+    fields: Sequence[str],
+    lines: Sequence[int],
+    *,
+    month_first: bool | None,
+    hyphen_fraction: bool = False,
 ) -> Instants:
-    """The instants that `fields` name. `month_first` decides 05/03/2025; None refuses it.
+    """The instants that `fields` name. `month_first` decides 05/03/2025; None refuses it. `hyphen_fraction`
+    decides 13:12:54-05: five hundredths of a second, else five hours west.
 
     Raises ValueError with the line of a field that is no time.
     """
@@ -55,7 +64,8 @@ def instants(
     zoned, dated = True, False
     for i, (field, line) in enumerate(zip(fields, lines, strict=True)):
         try:
-            ns[i], has_zone, dated = _instant(field, month_first)
+            written = _HYPHEN.sub(r"\1.\2", field) if hyphen_fraction else field
+            ns[i], has_zone, dated = _instant(written, month_first)
         except ValueError as error:
             hint = f" ({error}?)" if str(error).startswith(("day", "hours")) else ""
             raise ValueError(
@@ -144,13 +154,34 @@ def month_first(dates: Iterable[str], sample: str) -> bool | None:
     return True if american or len(pairs) == 1 or any(second > 12 for _, second in pairs) else None
 
 
+def hyphen_fraction(fields: Iterable[str]) -> bool:
+    """Whether the digits behind hyphens, as in 14:12:33-797, are fractions of a second.
+
+    One field that can be no zone tells for all: zones are written as -HH or -HHMM, up to 14 hours. Fields
+    are looked at up to it, or up to one without such digits.
+    """
+    for field in fields:
+        match = _HYPHEN.search(field)
+        if not match:
+            return False
+        if not _is_offset(match[2]):
+            return True
+    return False
+
+
+def _is_offset(digits: str) -> bool:
+    """Whether a zone may lie HH or HHMM away from UTC."""
+    hours, minutes = int(digits[:2]), int(digits[2:] or 0)
+    return len(digits) in (2, 4) and minutes < 60 and hours * 60 + minutes <= 14 * 60
+
+
 def _offset_ns(zone: str) -> int:
     if not zone or zone[0] not in "+-":
         return 0
     digits = zone[1:].replace(":", "")
+    if not _is_offset(digits):
+        raise ValueError
     minutes = int(digits[:2]) * 60 + int(digits[2:] or 0)
-    if minutes > 14 * 60:
-        raise ValueError  # no zone; some programs write the fraction of the second behind a hyphen
     return (-1 if zone[0] == "-" else 1) * minutes * 60 * 10**9
 
 

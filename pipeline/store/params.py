@@ -2,7 +2,8 @@
 
 Each problem with a section becomes one sentence that ends with the remedy. params.yaml has what the owner of
 a machine decides, params.expert.yaml what a developer of a method sets. A section may stand in both files, a
-key of it in one. A path to params.yaml means both files: the other one lies beside it.
+key of it in one. A path to params.yaml means both files: the other one lies beside it. Sections of the user's
+own begin with x_.
 """
 
 import copy
@@ -24,6 +25,29 @@ from pydantic import Field
 from pipeline.store import renamed
 
 FILE, EXPERT = "params.yaml", "params.expert.yaml"
+# every section that code reads
+SECTIONS = (
+    "camera",
+    "compose_parts",
+    "evaluate_setpoint",
+    "evaluate_temperature",
+    "execution",
+    "generate_probing",
+    "identify_plant",
+    "ingest",
+    "learn_kernel",
+    "nightly",
+    "panel",
+    "plant",
+    "printer",
+    "report",
+    "segment_library",
+    "tracking",
+    "train_agent",
+    "train_classifier",
+    "train_ilc",
+    "tune_weights",
+)
 
 
 class Section(pydantic.BaseModel):
@@ -79,7 +103,8 @@ S = TypeVar("S", bound=Section)
 def load(model: type[S], section: str, path: str | Path = FILE) -> S:
     """Section `section` of both files as a frozen `model`.
 
-    Raises ValueError with a line for each key that is unknown, renamed, missing or out of bounds.
+    Raises ValueError with a line for each key that is unknown, renamed, missing or out of bounds, and for
+    each section, this or another, that is none of SECTIONS.
     """
     sections = files(path)
     values = _section(section, path)
@@ -241,21 +266,32 @@ def _sections(path: str | Path) -> dict:
 
 def _section(section: str, path: str | Path) -> dict:
     sections = read(path)
+    _check_names(files(path))
     if section not in sections:
-        near = _nearest(section, sections)
         expert = Path(path).with_name(EXPERT)
-        if not near and not expert.exists():
+        if not expert.exists():
             raise ValueError(
                 f"{path}: section {section} is missing, and so is {expert}; {_RESTORE.format(expert)}"
             )
-        place = home(near, path) or _files_of(files(path), section)
         raise ValueError(
-            f"{place}: section {section} is missing; "
-            f"{f'is {near} meant?' if near else f'add {section}: with its keys below it'}"
+            f"{_files_of(files(path), section)}: section {section} is missing; "
+            f"add {section}: with its keys below it"
         )
     if type(sections[section]) is not dict:
         raise ValueError(f"{home(section, path)}: {section} {_NO_SECTION.format(_shown(sections[section]))}")
     return sections[section]
+
+
+def _check_names(by_file: dict[str, dict]) -> None:
+    """Raises ValueError with a line for each section that no code reads."""
+    problems = [
+        f"{file}: {_no_section(str(name))}"
+        for file, sections in by_file.items()
+        for name in sections
+        if name not in SECTIONS and not str(name).startswith("x_")
+    ]
+    if problems:
+        raise ValueError("\n".join(problems))
 
 
 def _files_of(sections: dict[str, dict], section: str, location: Sequence = ()) -> str:
@@ -320,6 +356,14 @@ def _dotted(section: str, location: Sequence) -> str:
 
 def _renamed(old: str) -> str:
     return f"{old} was renamed to {renamed.new_name(old, renamed.PARAMETERS)}"
+
+
+def _no_section(name: str) -> str:
+    if renamed.new_name(name, renamed.PARAMETERS) != name:
+        return _renamed(name)
+    near = _nearest(name, SECTIONS)
+    remedy = f"did you mean {near}?" if near else "remove it, or begin its name with x_ if it is yours"
+    return f"{name} is no section; {remedy}"
 
 
 def _old_name(section: str, name: str, names) -> str:

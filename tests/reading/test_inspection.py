@@ -6,6 +6,7 @@ import pytest
 import yaml
 
 from pipeline import cli
+from pipeline.reading import csv_files
 from pipeline.reading.recordings import Source, inspect, read
 from pipeline.store.artifacts import write_recording
 from pipeline.temperature.workflow.settings import Plant
@@ -55,6 +56,26 @@ def test_rates_jitter_gaps_and_ranges_are_those_of_the_file(tmp_path):
     assert "heater_1                         0 to 2, median 1, 3 levels" in text
     assert "T1_C                             20 to 27, median 23, 7 levels, 1 missing" in text
     assert "not numbers: note (text such as 'ok')" in text
+
+
+def test_fractions_of_a_second_behind_a_hyphen_are_read_as_such_in_every_part_of_the_file(
+    tmp_path, monkeypatch
+):
+    """As the camera program of CAXTON stamps: the last row alone would be read as two hours west."""
+    monkeypatch.setattr(csv_files, "FIELDS_AT_ONCE", 300)
+    rows = [
+        f"2022-03-09T14:{s // 60:02d}:{s % 60:02d}-{hundredths:02d},{s % 7},{20 + s % 5}\n"
+        for s, hundredths in [*((s, 5 + 90 * (s % 2)) for s in range(300)), (300, 2)]
+    ]
+    path = tmp_path / "rig.csv"
+    path.write_text("timestamp,heater_1,T1_C\n" + "".join(rows))
+    assert "rows: 301 samples in 299.97 s" in inspect(path)
+
+
+def test_the_log_of_a_printer_s_camera_is_inspected(shared):
+    text = inspect(shared("data/fast_caxton_frames/example_print_log.csv"))
+    # the first stamp ends in 33-797, the last in 34-602
+    assert "rows: 16 samples in 0.805 s" in text
 
 
 def test_topics_with_their_encodings_and_what_cannot_be_read_are_listed(tmp_path):

@@ -4,13 +4,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.reading.instants import Instants, instants, month_first, over_midnight
+from pipeline.reading.instants import Instants, hyphen_fraction, instants, month_first, over_midnight
 
 NOON = int(datetime.datetime(2025, 11, 21, 12, tzinfo=datetime.UTC).timestamp()) * 10**9
 
 
 def read(*fields: str, order: bool | None = None) -> Instants:
-    return instants(Path("rig.csv"), "time", fields, range(2, 2 + len(fields)), month_first=order)
+    return instants(
+        Path("rig.csv"),
+        "time",
+        fields,
+        range(2, 2 + len(fields)),
+        month_first=order,
+        hyphen_fraction=hyphen_fraction(fields),
+    )
 
 
 @pytest.mark.parametrize(
@@ -39,6 +46,33 @@ def test_one_instant_is_the_same_however_it_is_written(text):
 def test_fractions_are_kept_to_the_nanosecond():
     assert (read("2025-11-21T12:00:00.123456789").ns - NOON).tolist() == [123456789]
     assert (read("20251121120000250").ns - NOON).tolist() == [250_000_000]
+
+
+@pytest.mark.parametrize(
+    ("digits", "ns"),
+    [
+        ("7", 700_000_000),
+        ("34", 340_000_000),
+        ("797", 797_000_000),
+        # 79 minutes are no zone's
+        ("0479", 47_900_000),
+        ("01234", 12_340_000),
+        ("050000", 50_000_000),
+    ],
+)
+def test_digits_behind_a_hyphen_that_are_no_zone_are_a_fraction(digits, ns):
+    clock = read(f"2025-11-21T12:00:00-{digits}")
+    assert (clock.ns - NOON).tolist() == [ns]
+    assert not clock.zoned
+
+
+def test_one_fraction_behind_a_hyphen_tells_how_those_that_look_like_zones_are_read():
+    """The camera program of CAXTON: hundredths, of which 00 to 14 might be hours."""
+    clock = read("2025-11-21T12:00:00-05", "2025-11-21T12:00:00-52", "2025-11-21T12:00:01-14")
+    assert (clock.ns - NOON).tolist() == [50_000_000, 520_000_000, 1_140_000_000]
+    hours = read("2025-11-21T12:00:00-05", "2025-11-21T12:00:01-05")
+    assert hours.zoned
+    assert (hours.ns - NOON).tolist() == [5 * 3600 * 10**9, (5 * 3600 + 1) * 10**9]
 
 
 def test_the_zone_counts_as_known_only_where_every_time_names_it():
@@ -73,8 +107,9 @@ def test_day_and_month_are_told_by_a_date_that_can_be_only_one_of_both():
         ("12:34", "is '12:34' (hours and minutes, or minutes and seconds?)"),
         ("31.02.2025 12:00", "is '31.02.2025 12:00' (day is out of range for month?); convert it"),
         ("2025-11-21T12:61:00", "is '2025-11-21T12:61:00'"),
-        # a fraction behind a hyphen, as a printer's camera program writes it, and no zone
+        # behind a first time without digits behind a hyphen, they can only be a zone
         ("2025-11-21T12:00:00-34", "is '2025-11-21T12:00:00-34'"),
+        ("2025-11-21T12:00:00+34", "is '2025-11-21T12:00:00+34'"),
     ],
 )
 def test_what_is_no_time_is_refused_with_its_line(text, reason):

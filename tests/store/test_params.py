@@ -2,12 +2,13 @@
 whatever is wrong with them is said in one sentence."""
 
 import re
+from pathlib import Path
 from typing import Annotated, Literal
 
 import pytest
 from pydantic import Field
 
-from pipeline.store import params
+from pipeline.store import params, renamed
 from pipeline.store.params import Execution, Section
 from pipeline.temperature.workflow.settings import Plant
 
@@ -120,7 +121,7 @@ def test_numbers_are_read_as_dvc_reads_them(load):
             "line 3: found character '\\t' that cannot start any token; mend the line: key: "
             "value, indented by spaces",
         ),
-        ("learn_kernel:", "lern_kernel:", "section learn_kernel is missing; is lern_kernel meant?"),
+        ("learn_kernel:", "lern_kernel:", "lern_kernel is no section; did you mean learn_kernel?"),
     ],
 )
 def test_each_mistake_is_one_sentence_with_place_expectation_and_remedy(load, old, new, sentence):
@@ -244,7 +245,7 @@ def test_a_cluster_needs_a_scheduler_and_one_machine_has_none(load, text, senten
 # ---- two files
 
 OWNER = """
-probe: {source: recordings}
+ingest: {source: recordings}
 learn_kernel:
   method: window
   progress: true
@@ -266,12 +267,12 @@ def test_a_section_may_stand_in_both_files_and_is_one(load, tmp_path):
         "gamma": 0.001,
         "levels": [0, 0.5],
     }
-    assert list(params.read()) == ["probe", "learn_kernel", "tracking"]
+    assert list(params.read()) == ["ingest", "learn_kernel", "tracking"]
     assert (
         params.value("learn_kernel.horizon", one_of=(6,)) == 6
-        and params.value("probe.source", one_of=("recordings",)) == "recordings"
+        and params.value("ingest.source", one_of=("recordings",)) == "recordings"
     )
-    assert params.home("learn_kernel.method") == params.home("probe") == "params.yaml"
+    assert params.home("learn_kernel.method") == params.home("ingest") == "params.yaml"
     assert params.home("learn_kernel.levels") == params.home("tracking.gamma") == "params.expert.yaml"
     assert params.home("learn_kernel.colour") == params.home("learn_kernel.levels.0") == params.home("") == ""
 
@@ -346,13 +347,9 @@ def test_a_key_or_a_section_that_is_missing_says_where_it_is_looked_for(load):
     with pytest.raises(ValueError, match=r"^params.expert.yaml: tracking.gama is missing; is gamma meant\?$"):
         params.value("tracking.gama", one_of=(1,))
     with pytest.raises(
-        ValueError, match=r"^params.yaml: probe.source is \"recordings\" but must be one of simulated$"
+        ValueError, match=r"^params.yaml: ingest.source is \"recordings\" but must be one of simulated$"
     ):
-        params.value("probe.source", one_of=("simulated",))
-    with pytest.raises(
-        ValueError, match=r"^params.expert.yaml: section trackin is missing; is tracking meant\?$"
-    ):
-        params.load(LearnKernel, "trackin")
+        params.value("ingest.source", one_of=("simulated",))
     with pytest.raises(
         ValueError,
         match=r"^params.yaml and params.expert.yaml: section colours is missing; add colours: with its keys "
@@ -373,3 +370,71 @@ def test_the_digest_is_the_same_wherever_a_key_stands_and_another_with_another_v
     assert params.digest(load(OWNER.replace("window", "direct"), expert=EXPERT)) != one
     assert params.digest(load(OWNER, expert=EXPERT.replace("horizon: 6", "horizon: 7"))) != one
     assert params.digest(load(OWNER, expert=EXPERT.replace("0.9", "0.8"))) == one
+
+
+# ---- sections that nothing reads
+
+
+@pytest.mark.parametrize(
+    ("owner", "expert", "sentence"),
+    [
+        (
+            "lern_kernel: {horizon: 9}",
+            "",
+            "params.yaml: lern_kernel is no section; did you mean learn_kernel?",
+        ),
+        (
+            "",
+            "generate_probin: {samples: 9}",
+            "params.expert.yaml: generate_probin is no section; did you mean generate_probing?",
+        ),
+        (
+            "",
+            "colours: {}",
+            "params.expert.yaml: colours is no section; remove it, or begin its name with x_ if it is yours",
+        ),
+        (
+            "",
+            "7: {}",
+            "params.expert.yaml: 7 is no section; remove it, or begin its name with x_ if it is yours",
+        ),
+        # as .ci/params.yaml writes a change, and as a command line does
+        (
+            "learn_kernel.horizon: 3",
+            "",
+            "params.yaml: learn_kernel.horizon is no section; did you mean learn_kernel?",
+        ),
+        ("", "trackng: {}", "params.expert.yaml: trackng is no section; did you mean tracking?"),
+        (
+            "learn: {}",
+            "panl: {}",
+            "params.yaml: learn was renamed to learn_kernel\n"
+            "params.expert.yaml: panl is no section; did you mean panel?",
+        ),
+    ],
+)
+def test_a_section_that_nothing_reads_is_refused_whatever_section_is_loaded(
+    load, monkeypatch, owner, expert, sentence
+):
+    monkeypatch.setattr(renamed, "PARAMETERS", {"learn": "learn_kernel"})
+    texts = f"{OWNER}{owner}\n", f"{EXPERT}{expert}\n"
+    with pytest.raises(ValueError, match=f"^{re.escape(sentence)}$"):
+        load(texts[0], expert=texts[1])
+    with pytest.raises(ValueError, match=f"^{re.escape(sentence)}$"):
+        params.value("learn_kernel.method", one_of=("window",))
+
+
+def test_a_users_own_section_begins_with_x(load):
+    assert load(f"x_colours: {{red: 1}}\n{OWNER}", expert=f"{EXPERT}x_rig: {{}}\n") == load(GOOD)
+
+
+def test_changes_by_dotted_keys_and_files_of_earlier_versions_are_read_unchecked(load, root):
+    load(GOOD)
+    Path("changes.yaml").write_text("learn_kernel.horizon: 3\nold_section: {seed: 1}\n")
+    assert params.read("changes.yaml") == {"learn_kernel.horizon": 3, "old_section": {"seed": 1}}
+    assert "generate_probing.samples" in params.read(root / ".ci/params.yaml")
+
+
+def test_the_sections_are_those_of_the_two_files(root):
+    both = {name for sections in params.files(root / params.FILE).values() for name in sections}
+    assert {name for name in both if not name.startswith("x_")} == set(params.SECTIONS)

@@ -34,6 +34,8 @@ from pipeline.temperature.scorecard import (
 )
 from pipeline.temperature.study import data_sets
 from pipeline.temperature.tracking import Law, aimed, gains, observer_gain, observer_law
+from pipeline.temperature.workflow import contestants
+from pipeline.temperature.workflow.settings import EvaluateTemperature
 
 I5, I7 = np.eye(5), np.eye(7)
 LIMITS = (np.zeros(7), np.full(7, 100.0))
@@ -365,17 +367,26 @@ def first_unstable_delay(machine: Plant, law: Law, *, most: int) -> float:
     )
 
 
-def test_the_disk_margin_of_many_channels_is_control_s():
-    pytest.importorskip("slycot")
-    machine, law = baam(), observer()
+@pytest.mark.parametrize(("q", "r"), [(1.0, 1.0), (0.01, 1.0)])
+def test_the_disk_margin_of_many_channels_is_control_s(q, r):
+    """The smaller margin of the loops at the plant's outputs and at its inputs, against control.disk_margins.
+
+    Both bound the structured singular value from above. Ours balances the channels by Osborne's scaling,
+    theirs finds the best scaling (AB13MD of SLICOT, by slycot). Ours stays in the pipeline: it takes 0.01 s a
+    loop and theirs 0.7 s on the same grid, after 0.7 s for the import of control, and every trial of the
+    search for practical weights asks for one.
+    """
+    machine, law = baam(), observer(q, r)
     K = control.ss(law.A - law.B_u @ law.K, law.B_y - law.B_u @ law.D, law.K, law.D, 1.0)
     G = control.ss(machine.A, machine.B, machine.C, machine.D, 1.0)
     # the grid of `margins`
     omega = np.concatenate([np.geomspace(1e-4, 0.3, 60, endpoint=False), np.linspace(0.3, np.pi, 60)])
     theirs = min(control.disk_margins(loop, omega)[0] for loop in (G * K, K * G))
     ours = margins([machine], law, grid=120)[0].disk
-    # both bound the structured singular value from above, ours by scaling alone
+    # ours is smaller, by 0.003 % and by 0.84 %
     assert ours == pytest.approx(theirs, rel=0.01)
+    # the best scaling gives the largest margin; 1e-4 for where their search ends
+    assert ours <= theirs * (1 + 1e-4)
 
 
 def test_the_disk_margin_of_the_textbook_loop():
@@ -486,14 +497,19 @@ def judged(learned):
         steps=300,
         hold=8,
     )
-    compared = judging.controllers(
-        judging.LearnedModels(baam(), long, regress(tuples([u], [y], 2))),
-        limits=LIMITS,
-        gamma=GAMMA,
-        tau=TAU,
-        horizon=300,
-        truth=baam(),
-        exact_tau=TAU,
+    compared = contestants.controllers(
+        contestants.Problem(
+            plant=baam(),
+            window=long,
+            kernel=regress(tuples([u], [y], 2)),
+            truth=baam(),
+            limits=LIMITS,
+            gamma=GAMMA,
+            observer_tau=TAU,
+            exact_tau=TAU,
+            horizon=300,
+            settings=EvaluateTemperature(seed=0, data_sets=1, report_noise_degC=0.1),
+        )
     )
     settings = {
         "yardstick": YARDSTICK,
