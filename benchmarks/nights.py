@@ -29,6 +29,7 @@ import scipy.linalg
 import yaml
 
 from pipeline.nightly import champion, judge, night, processes
+from pipeline.report.nightly.record import Night
 from pipeline.store import artifacts, params
 from pipeline.temperature import judging, scorecard
 from pipeline.temperature.plant import Plant, hold_output, plant
@@ -184,9 +185,9 @@ def settings() -> dict:
     return found
 
 
-def _stages(_, entry: dict) -> None:
+def _stages(_, run: str) -> None:
     """The stages in one forked process, in place of `dvc repro`."""
-    log = Path(".beadline/logs") / f"{entry['run']}.log"
+    log = Path(".beadline/logs") / f"{run}.log"
     log.parent.mkdir(parents=True, exist_ok=True)
     child = os.fork()
     if child == 0:
@@ -208,7 +209,7 @@ def _stages(_, entry: dict) -> None:
         raise ValueError(f"dvc repro failed: {processes._sentence(log.read_text())}")
 
 
-def play(index: int, columns: dict[str, np.ndarray] | None) -> tuple[int, str, dict]:
+def play(index: int, columns: dict[str, np.ndarray] | None) -> tuple[int, str, Night]:
     """One night, and what it remembers of itself."""
     if columns is not None:
         # the last KEPT recordings are learned from; the older ones are the archive's
@@ -262,15 +263,15 @@ def null(seed: int, count: int, folder: Path, with_dvc: bool, *, learn: bool = T
     for k in range(4, 4 + count):
         if k == 5 and not learn:
             night._reproduce = lambda *_: None
-        before = true_cost(champion.FOLDER / "temperature") if champion.read()["champions"] else None
+        before = true_cost(champion.FOLDER / "temperature") if champion.read().champions else None
         began = time.monotonic()
-        status, said, entry = play(k, a_night(seed, k) if k > 4 else None)
+        status, said, tonight = play(k, a_night(seed, k) if k > 4 else None)
         seconds.append(time.monotonic() - began)
         assert status in (night.OK, night.DRIFTED), said
-        alarms += [(entry["run"], one["cause"], one["sigmas"]) for one in entry["drift"]["alarms"]]
-        if entry.get("promoted"):
+        alarms += [(tonight.run, alarm.cause, alarm.sigmas) for alarm in tonight.drift.alarms]
+        if tonight.promoted:
             after = true_cost(champion.FOLDER / "temperature")
-            promotions.append((entry["run"], before, after))
+            promotions.append((tonight.run, before, after))
             worse += before is not None and after > before
         costs.append(true_cost(champion.FOLDER / "temperature"))
         print(f"  {said[:230]}", flush=True)
@@ -307,12 +308,8 @@ def drifted(seed: int, folder: Path, with_dvc: bool) -> dict:
         nights, causes = 0, []
         for k in (5, 6, 7):
             nights += 1
-            causes = [
-                one["cause"]
-                for one in play(k, a_night(seed, k + 10 * zlib.crc32(name.encode()) % 1000, **changes))[2][
-                    "drift"
-                ]["alarms"]
-            ]
+            columns = a_night(seed, k + 10 * zlib.crc32(name.encode()) % 1000, **changes)
+            causes = [alarm.cause for alarm in play(k, columns)[2].drift.alarms]
             if causes:
                 break
         found[name] = {"nights": nights if causes else None, "causes": causes}
@@ -343,7 +340,7 @@ def bad(seed: int, folder: Path, with_dvc: bool) -> dict:
     for k, (name, columns) in enumerate(wrong.items()):
         files, run = (
             champion.md5s(champion.FOLDER / "temperature"),
-            champion.read()["champions"]["temperature"]["run"],
+            champion.read().champions["temperature"].run,
         )
         path = Path(f"datasets/raw/temperature/bad_{k}.csv")
         if columns is None:
@@ -353,7 +350,7 @@ def bad(seed: int, folder: Path, with_dvc: bool) -> dict:
         status, said, _ = play(10 + 2 * k, None)
         same = (
             champion.md5s(champion.FOLDER / "temperature") == files
-            and champion.read()["champions"]["temperature"]["run"] == run
+            and champion.read().champions["temperature"].run == run
         )
         path.unlink(missing_ok=True)
         after = play(11 + 2 * k, a_night(seed, 11 + 2 * k))
@@ -395,19 +392,20 @@ def planted(seed: int, folder: Path, with_dvc: bool) -> dict:
         middle = (low + high) / 2
         low, high = (middle, high) if cost(10**middle) < best / 0.9 else (low, middle)
     made = cost(10**high)
-    entry = champion.read()["champions"]["temperature"]
     processes.dvc("add", "--quiet", "champion/temperature")
     state = champion.read()
-    state["champions"]["temperature"] = entry | {
-        "files": champion.md5s(champion.FOLDER / "temperature"),
-        "folder": champion.pointer("temperature"),
-    }
-    artifacts.write_json(champion.FILE, state)
+    present = state.champions["temperature"]
+    files = present.installed._replace(
+        files=champion.md5s(champion.FOLDER / "temperature"), folder=champion.pointer("temperature")
+    )
+    champion.write(
+        state._replace(champions={**state.champions, "temperature": present._replace(installed=files)})
+    )
     processes.commit(champion.paths(), "a champion that is 10 % worse")
     for k in (5, 6, 7):
-        _, said, entry = play(k, a_night(seed, k))
+        _, said, tonight = play(k, a_night(seed, k))
         print(f"  {said[:300]}", flush=True)
-        if entry.get("promoted"):
+        if tonight.promoted:
             return {"planted_percent": 100 * (1 - best / made), "nights": k - 4}
     return {"planted_percent": 100 * (1 - best / made), "nights": None}
 

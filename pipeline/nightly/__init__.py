@@ -7,7 +7,7 @@ promotion**: a reference of git moves whole or not at all, and whatever a killed
 tree is put back to what the last commit says. `datasets/` is the challenger, `champion/` is production.
 
 What is neither's: `.beadline/` (ignored): the lock, the nights so far, the logs,
-what was seen. Losing it costs one repeated night.
+what the last night saw. Losing it costs one repeated night.
 
 The rule: a challenger is promoted where, on scenarios that no stage learns from, a paired test
 finds it better beyond noise and by a margin that is worth a change, no guard figure is worse, and

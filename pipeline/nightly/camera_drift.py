@@ -96,8 +96,8 @@ def changes(
 ) -> tuple[Shift, list[Change]]:
     """What the camera's figures say, the cause named: moved, other light, other ink, out of focus. The bead's
     width is the process's own affair. Changes that do not matter are left out, however sure."""
-    usual = np.stack([one.mean for one in before])
-    moved = shift(now.mean, now.deviation, usual, np.stack([one.deviation for one in before]))
+    usual = np.stack([stats.mean for stats in before])
+    moved = shift(now.mean, now.deviation, usual, np.stack([stats.deviation for stats in before]))
     by = dict(zip(FIGURES, moved.value - moved.reference, strict=True))
     share = {
         name: 100 * by[name] / abs(reference) if reference else 0.0
@@ -171,8 +171,8 @@ def contrast_changes(now: Contrast, before: Sequence[Contrast], *, percent: floa
     moved = shift(
         now.mean,
         now.deviation,
-        np.stack([one.mean for one in before]),
-        np.stack([one.deviation for one in before]),
+        np.stack([stats.mean for stats in before]),
+        np.stack([stats.deviation for stats in before]),
     )
     by = 100 * float(moved.value[0] / max(moved.reference[0], 1e-9) - 1)
     words = (

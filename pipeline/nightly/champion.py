@@ -2,6 +2,7 @@
 checked, put back to an earlier one bit by bit."""
 
 import hashlib
+import json
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,15 +11,25 @@ from typing import Any
 import yaml
 
 from pipeline.nightly.processes import dvc, fresh_index, git
+from pipeline.report.nightly.production import ROLLED_BACK, Champion, ChampionState, HistoryLine, Installed
 from pipeline.store import artifacts
 
 FILE, FOLDER = Path("champion.json"), Path("champion")
-EMPTY: dict[str, Any] = {"schema": "champion", "version": 1, "champions": {}, "history": []}
 
 
-def read() -> dict[str, Any]:
+def read() -> ChampionState:
     """champion.json, or one without champions where there is none yet."""
-    return artifacts.read_json(FILE) if FILE.exists() else {**EMPTY, "champions": {}, "history": []}
+    return ChampionState.read(artifacts.read_json(FILE)) if FILE.exists() else ChampionState()
+
+
+def of_branch(branch: str) -> ChampionState:
+    """champion.json as the last commit of `branch` has it."""
+    text = git("show", f"{branch}:{FILE}", check=False)
+    return ChampionState.read(json.loads(text)) if text else ChampionState()
+
+
+def write(state: ChampionState) -> None:
+    artifacts.write_json(FILE, state.written())
 
 
 def md5s(folder: Path) -> dict[str, str]:
@@ -47,7 +58,7 @@ def locked(paths: Sequence[str]) -> dict[str, str]:
 # ---- promotion
 
 
-def install(loop: str, files: Sequence[str], beside: Mapping[str, Any]) -> dict[str, Any]:
+def install(loop: str, files: Sequence[str], beside: Mapping[str, Any]) -> Installed:
     """Copies the files into champion/<loop>, with what is to lie beside them as JSON by name, and hands the
     folder to DVC; what `put_back` needs to have it again.
 
@@ -63,7 +74,7 @@ def install(loop: str, files: Sequence[str], beside: Mapping[str, Any]) -> dict[
         artifacts.write_json(new / name, content)
     _swap(new, FOLDER / loop)
     dvc("add", "--quiet", str(FOLDER / loop))
-    return {"folder": pointer(loop), "files": md5s(FOLDER / loop), "outs": locked(files)}
+    return Installed(pointer(loop), md5s(FOLDER / loop), locked(files))
 
 
 def md5_of(files: Sequence[str]) -> dict[str, str]:
@@ -76,14 +87,14 @@ def same(md5s: Mapping[str, str], files: Sequence[str]) -> bool:
     return all(md5s.get(name) == md5 for name, md5 in md5_of(files).items())
 
 
-def rolled_back(state: Mapping[str, Any], loop: str, files: Sequence[str]) -> str:
+def rolled_back(state: ChampionState, loop: str, files: Sequence[str]) -> str:
     """The run whose champion these very files are, where somebody has
     rolled it back since; empty otherwise."""
     run = ""
-    for line in (line for line in state["history"] if line["loop"] == loop):
-        if line["event"] == "rolled back" and same(line["replaced"], files):
-            run = line["before"]
-        elif same(line["champion"]["files"], files):
+    for line in (line for line in state.history if line.loop == loop):
+        if line.event == ROLLED_BACK and same(line.replaced or {}, files):
+            run = line.before or ""
+        elif same(line.champion.installed.files, files):
             run = ""
     return run
 
@@ -106,25 +117,23 @@ def pointer(loop: str) -> dict[str, Any]:
     return yaml.safe_load((FOLDER / f"{loop}.dvc").read_text(encoding="utf-8"))["outs"][0]
 
 
-def promoted(state: Mapping[str, Any], loop: str, entry: Mapping[str, Any], *, event: str) -> dict[str, Any]:
-    """champion.json with `entry` in production, and one more line of its history."""
-    before = state["champions"].get(loop, {}).get("run")
-    line = {
-        "run": entry["run"],
-        "loop": loop,
-        "event": event,
-        "when": entry["when"],
-        "why": entry["why"],
-        "before": before,
-        "champion": dict(entry),
-    }
-    if event == "rolled back":
-        line["replaced"] = state["champions"][loop]["files"]
-    return {
-        **state,
-        "champions": {**state["champions"], loop: dict(entry)},
-        "history": [*state["history"], line],
-    }
+def in_production(
+    state: ChampionState, loop: str, champion: Champion, *, event: str, when: str = "", why: str = ""
+) -> ChampionState:
+    """The state with `champion` in production, and one more line of its history: `when` and `why` it went
+    there, which are the champion's own where they are empty."""
+    before = state.champions.get(loop)
+    line = HistoryLine(
+        champion.run,
+        loop,
+        event,
+        when or champion.when,
+        why or champion.why,
+        before.run if before else None,
+        champion,
+        before.installed.files if before and event == ROLLED_BACK else None,
+    )
+    return ChampionState({**state.champions, loop: champion}, (*state.history, line))
 
 
 # ---- the way back
@@ -135,40 +144,44 @@ def paths() -> list[str]:
     return [str(FILE), f"{FOLDER}/.gitignore", *sorted(str(path) for path in FOLDER.glob("*.dvc"))]
 
 
-def earlier(state: Mapping[str, Any], run: str, loop: str) -> dict[str, dict[str, Any]]:
-    """{loop: entry} to go back to: those that were in production in `run`, or, where `run` is empty, before
-    the present ones. Raises ValueError where there is none."""
-    history = [line for line in state["history"] if not loop or line["loop"] == loop]
-    entries: dict[str, dict[str, Any]] = {}
+def earlier(state: ChampionState, run: str, loop: str) -> dict[str, Champion]:
+    """{loop: champion} to go back to: those that were in production in `run`. Where `run` is empty, those
+    before the present ones. Raises ValueError where there is none, or no such loop."""
+    if loop and loop not in state.champions:
+        loops = ", ".join(state.champions) or "none"
+        raise ValueError(
+            f"{FILE}: expected a loop with a champion, found {loop}; loops with a champion are: {loops}"
+        )
+    history = [line for line in state.history if not loop or line.loop == loop]
+    champions: dict[str, Champion] = {}
     for line in history:
-        present = state["champions"][line["loop"]]
-        if line["run"] == run or (not run and line["champion"]["folder"]["md5"] != present["folder"]["md5"]):
-            entries[line["loop"]] = line["champion"]
-    if run and entries:
-        return entries
-    if not run and entries:
+        if line.run == run or (not run and line.champion.md5 != state.champions[line.loop].md5):
+            champions[line.loop] = line.champion
+    if run and champions:
+        return champions
+    if not run and champions:
         # only what was changed last goes back, unless a loop was named
-        last = next(line["loop"] for line in reversed(history) if line["loop"] in entries)
-        return {last: entries[last]}
-    runs = ", ".join(dict.fromkeys(f"{line['run']} ({line['loop']})" for line in state["history"])) or "none"
+        last = next(line.loop for line in reversed(history) if line.loop in champions)
+        return {last: champions[last]}
+    runs = ", ".join(dict.fromkeys(f"{line.run} ({line.loop})" for line in state.history)) or "none"
     raise ValueError(
         f"{FILE}: expected {f'a champion of {run}' if run else 'an earlier champion'} to go back to, "
         f"found none; known are: {runs}"
     )
 
 
-def put_back(loop: str, entry: Mapping[str, Any]) -> None:
-    """champion/<loop> as `entry` has it: from DVC's cache, or pulled. Raises ValueError where a file is not
-    what it was, and leaves the present champion then."""
+def put_back(loop: str, champion: Champion) -> None:
+    """champion/<loop> as it was of `champion`: from DVC's cache, or pulled. Raises ValueError where a file is
+    not what it was, and leaves the present champion then."""
     path = FOLDER / f"{loop}.dvc"
     present = path.read_bytes() if path.exists() else b""
-    artifacts.write_text(path, yaml.safe_dump({"outs": [dict(entry["folder"])]}, sort_keys=False))
+    artifacts.write_text(path, yaml.safe_dump({"outs": [dict(champion.installed.folder)]}, sort_keys=False))
     try:
         _fetch(path)
-        wrong = sorted(set(md5s(FOLDER / loop).items()) ^ set(entry["files"].items()))
+        wrong = sorted(set(md5s(FOLDER / loop).items()) ^ set(champion.installed.files.items()))
         if wrong:
             raise ValueError(
-                f"{FOLDER / loop}: {wrong[0][0]} is not what it was in {entry['run']}; "
+                f"{FOLDER / loop}: {wrong[0][0]} is not what it was in {champion.run}; "
                 "bring DVC's cache or remote back, and run it again"
             )
     except ValueError:
@@ -200,16 +213,15 @@ def as_committed() -> list[str]:
         mended.append(f"{', '.join(changed)} put back to the last commit")
     if mended:
         fresh_index([str(FILE), str(FOLDER)])
-    for left in FOLDER.glob(".*.new"):
-        shutil.rmtree(left)
-    for left in FOLDER.glob(".*.old"):
-        shutil.rmtree(left)
-    for loop, entry in read()["champions"].items():
-        if md5s(FOLDER / loop) != entry["files"]:
-            put_back(loop, entry)
-            mended.append(f"{FOLDER / loop} put back to {entry['run']}")
+    for unfinished in (*FOLDER.glob(".*.new"), *FOLDER.glob(".*.old")):
+        shutil.rmtree(unfinished)
+    champions = read().champions
+    for loop, champion in champions.items():
+        if md5s(FOLDER / loop) != champion.installed.files:
+            put_back(loop, champion)
+            mended.append(f"{FOLDER / loop} put back to {champion.run}")
     for folder in FOLDER.iterdir() if FOLDER.is_dir() else ():
-        if folder.is_dir() and folder.name not in read()["champions"] and not folder.name.startswith("."):
+        if folder.is_dir() and folder.name not in champions and not folder.name.startswith("."):
             shutil.rmtree(folder)
             mended.append(f"{folder} was never committed and is removed")
     return mended

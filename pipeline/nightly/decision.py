@@ -1,15 +1,14 @@
 """Champion and challenger on the same cases -> promote or keep, with every number that decided."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.nightly.settings import Rule
+from pipeline.report.nightly.record import FIRST, KEPT, PROMOTED, Guard, LoopDecision
 from pipeline.report.shared.night import Alarm
 from pipeline.statistics import Paired, blocks_needed, paired
-
-PROMOTED, KEPT, FIRST = "promoted", "kept", "first champion"
 
 
 class Evidence(NamedTuple):
@@ -21,16 +20,6 @@ class Evidence(NamedTuple):
     guards: dict[str, float]
 
 
-class Decision(NamedTuple):
-    decision: str
-    reasons: list[str]
-    figures: dict[str, Any]
-
-    @property
-    def promotes(self) -> bool:
-        return self.decision in (PROMOTED, FIRST)
-
-
 def decide(
     champion: Evidence | None,
     challenger: Evidence,
@@ -39,21 +28,16 @@ def decide(
     allowed: Mapping[str, float],
     alarms: Sequence[Alarm],
     seed: int,
-) -> Decision:
+) -> LoopDecision:
     """Promote where the paired test finds the challenger better by at least `rule.least_improvement_percent`,
     no guard is worse by more than `allowed`, and nothing has drifted: `alarms` are those of this loop
     alone."""
     if champion is None:
         return _first(challenger)
     if champion.panel != challenger.panel:
-        return Decision(
-            KEPT,
-            [
-                f"the two were judged on different cases ({champion.panel[:12]}, {challenger.panel[:12]}): "
-                "they cannot be compared"
-            ],
-            {},
-        )
+        names = f"{champion.panel[:12]}, {challenger.panel[:12]}"
+        reason = f"the two were judged on different cases ({names}): they cannot be compared"
+        return LoopDecision(KEPT, [reason])
     shared = [case for case in champion.cases if case in challenger.cases]
     test = paired(
         np.array([champion.cases[case][1] for case in shared]),
@@ -63,38 +47,31 @@ def decide(
     )
     against = _against(test, rule) + _guards(champion, challenger, allowed) + _unfit(challenger)
     against += [f"drift: {alarm.cause}; what the panel stands for has changed" for alarm in alarms]
-    figures = {
-        "paired": test._asdict(),
-        "guards": {
-            name: {
-                "champion": champion.guards[name],
-                "challenger": challenger.guards[name],
-                "allowed": allowed.get(name, 0.0),
-            }
-            for name in champion.guards
-            if name in challenger.guards
-        },
+    guards = {
+        name: Guard(before, challenger.guards[name], allowed.get(name, 0.0))
+        for name, before in champion.guards.items()
+        if name in challenger.guards
     }
     if against:
-        return Decision(KEPT, against, figures)
+        return LoopDecision(KEPT, against, test, guards)
     better = (
         f"{test.improvement_percent:.1f} % better ({test.low_percent:.1f} to {test.high_percent:.1f} %, "
         f"{_chance(test)}) on {test.cases} cases of {test.blocks} blocks"
     )
-    return Decision(PROMOTED, [better, "no guard is worse"], figures)
+    return LoopDecision(PROMOTED, [better, "no guard is worse"], test, guards)
 
 
-def _first(challenger: Evidence) -> Decision:
+def _first(challenger: Evidence) -> LoopDecision:
     """Where there is no champion, a challenger that is fit becomes one."""
     failing = [case for case, (_, cost) in challenger.cases.items() if not np.isfinite(cost)]
     reasons = _unfit(challenger)
     if failing:
         reasons.append(f"{len(failing)} of {len(challenger.cases)} cases fail, such as {failing[0]}")
-    figures = {"guards": {name: {"challenger": figure} for name, figure in challenger.guards.items()}}
+    guards = {name: Guard(None, figure, None) for name, figure in challenger.guards.items()}
     if not reasons:
-        return Decision(FIRST, ["there was no champion to compare with"], figures)
+        return LoopDecision(FIRST, ["there was no champion to compare with"], guards=guards)
     start = "there is no champion, and the challenger is not fit to be one: "
-    return Decision(KEPT, [start + "; ".join(reasons)], figures)
+    return LoopDecision(KEPT, [start + "; ".join(reasons)], guards=guards)
 
 
 def _unfit(challenger: Evidence) -> list[str]:

@@ -148,8 +148,8 @@ def estimate(
     alone = np.maximum(information, 1e-12)
     change = score.sum(axis=0) / alone
     # robust to colour: the spread of the blocks' own scores about what the estimate leaves
-    left = score - np.einsum("tpc,p->tc", psi**2, 1 / variance) * change
-    sums = np.stack([part.sum(axis=0) for part in np.array_split(left, BLOCKS)])
+    residual_score = score - np.einsum("tpc,p->tc", psi**2, 1 / variance) * change
+    sums = np.stack([part.sum(axis=0) for part in np.array_split(residual_score, BLOCKS)])
     deviation = np.sqrt(np.maximum((sums**2).sum(axis=0) * BLOCKS / (BLOCKS - 1), information)) / alone
     blocks = [
         (part, on) for part, on in zip(np.array_split(e, BLOCKS), np.array_split(mask, BLOCKS), strict=True)
@@ -175,7 +175,7 @@ def _free(
     state; sensitivities also of each output's mean."""
     e = errors(plant, K, u, y)
     quick, slow = faster(plant, STEP), faster(plant, -STEP)
-    dA, dB = ((one - other) / (2 * STEP) for one, other in ((quick.A, slow.A), (quick.B, slow.B)))
+    dA, dB = (quick.A - slow.A) / (2 * STEP), (quick.B - slow.B) / (2 * STEP)
     forgets = plant.A - K @ plant.C
     # what each input alone has done to the state, about its mean; the
     # observer's state would bring its noise along
@@ -292,10 +292,10 @@ def named(fits: np.ndarray, own: np.ndarray, slow: np.ndarray) -> list[int]:
 
 class Mistake(NamedTuple):
     """A mistake that makes the record fit the champion: what it is in words, and how far the errors fall with
-    it undone (share of the error left)."""
+    it undone: `error_share` of them is left."""
 
     words: str
-    left: float
+    error_share: float
 
 
 def mistakes(
@@ -312,8 +312,8 @@ def mistakes(
     word, the best first; `scale` (p,) is the errors' usual size. The first of the list is the record as it
     is, with its mean squared error; alone where that is below `gross`, for then nothing is wrong.
 
-    Left is the mean squared error with the mistake undone as a share of that without; the observer starts
-    settled, so that a wrong level is an error too.
+    `error_share` is the mean squared error with the mistake undone, as a share of that without. The observer
+    starts settled, so that a wrong level is an error too.
     """
     K = observer(plant, len(y))
 
@@ -343,17 +343,17 @@ def mistakes(
             Mistake(f"every sensor is in {name} where °C is declared", misfit(u, undo(y)) / as_is)
         )
         for i, output in enumerate(outputs):
-            one = y.copy()
-            one[:, i] = undo(y[:, i])
-            suspects.append(Mistake(f"{output} is in {name} where °C is declared", misfit(u, one) / as_is))
+            undone = y.copy()
+            undone[:, i] = undo(y[:, i])
+            suspects.append(Mistake(f"{output} is in {name} where °C is declared", misfit(u, undone) / as_is))
     for factor, words in ((100.0, "shares of 1"), (100.0 / 255.0, "counts of 255")):
         suspects.append(
             Mistake(f"every input is in {words} where percent is declared", misfit(factor * u, y) / as_is)
         )
         for j, name in enumerate(inputs):
-            one = u.copy()
-            one[:, j] *= factor
+            undone = u.copy()
+            undone[:, j] *= factor
             suspects.append(
-                Mistake(f"{name} is in {words} where percent is declared", misfit(one, y) / as_is)
+                Mistake(f"{name} is in {words} where percent is declared", misfit(undone, y) / as_is)
             )
-    return [Mistake("", as_is), *sorted(suspects, key=lambda mistake: mistake.left)]
+    return [Mistake("", as_is), *sorted(suspects, key=lambda mistake: mistake.error_share)]

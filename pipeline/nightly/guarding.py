@@ -42,11 +42,11 @@ def alone() -> Iterator[list[str]]:
             ) from None
         os.ftruncate(descriptor, 0)
         os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
-        left = _after_a_kill()
+        mended = _after_a_kill()
         os.environ[TOKEN] = str(Path.cwd())
         RUNNING.touch()
         try:
-            yield left
+            yield mended
         except ValueError:  # refused in a sentence, not killed
             RUNNING.unlink(missing_ok=True)
             raise
@@ -60,15 +60,15 @@ def _after_a_kill() -> list[str]:
     """What a night that never ended left: its processes, git's locks,
     an index beside the user's, half a promotion."""
     killed = RUNNING.exists()
-    left = []
+    mended = []
     if killed:
         if ended := end_orphans():
-            left.append(
+            mended.append(
                 f"the night before was killed and had left {ended} processes running; they were ended"
             )
         for path in stale_git_locks():
             path.unlink(missing_ok=True)
-            left.append(f"{path} was left by a killed git and is removed")
+            mended.append(f"{path} was left by a killed git and is removed")
         for pattern in (
             ".champion.json.*",
             "champion/.*.dvc.*",
@@ -77,11 +77,11 @@ def _after_a_kill() -> list[str]:
         ):
             for path in Path().glob(pattern):
                 path.unlink(missing_ok=True)
-        left.append("the night before was killed")
-    left += champion.as_committed()
+        mended.append("the night before was killed")
+    mended += champion.as_committed()
     if killed:
         fresh_index(["dvc.lock", str(METRICS), str(champion.FILE), str(champion.FOLDER)])
-    return left
+    return mended
 
 
 def ready(least_free_mb: float) -> None:

@@ -102,7 +102,7 @@ def quarantine(path: str, loop: str, reason: str) -> str:
     if not (QUARANTINE / ".gitignore").exists():
         artifacts.write_text(QUARANTINE / ".gitignore", "*\n")
     names = itertools.chain([name.name], (f"{name.stem}.{k}{name.suffix}" for k in itertools.count(2)))
-    target = next(folder / one for one in names if not (folder / one).exists())
+    target = next(folder / free for free in names if not (folder / free).exists())
     shutil.move(path, target)
     artifacts.write_text(f"{target}.reason.txt", reason + "\n")
     return reason

@@ -166,7 +166,7 @@ def _frozen_panel(holdout: HoldOut) -> FrozenPanel:
     name = joblib.hash(
         (
             holdout.model_dump(),
-            [tuple(map(np.asarray, one)) for one in plants],
+            [tuple(map(np.asarray, matrices)) for matrices in plants],
             machine.model_dump(),
             tracking.model_dump(),
             panel.model_dump(),
@@ -219,10 +219,12 @@ def _costs(panel: FrozenPanel, figures: Any) -> list[float]:
 
     costs, longest_s = [], panel.scenarios.steps * panel.machine.sample_time_s
     for i in range(len(panel.scenarios.plant)):
-        one = type(figures)(*(figure[i : i + 1] for figure in figures))
+        of_case = type(figures)(*(figure[i : i + 1] for figure in figures))
         plant_of_case = panel.scenarios.plant[i : i + 1]
         try:
-            costs.append(scorecard.engineering_cost(one, plant_of_case, panel.allowance, longest_s=longest_s))
+            costs.append(
+                scorecard.engineering_cost(of_case, plant_of_case, panel.allowance, longest_s=longest_s)
+            )
         except ValueError:
             costs.append(np.inf)
     return costs
@@ -230,7 +232,7 @@ def _costs(panel: FrozenPanel, figures: Any) -> list[float]:
 
 def controller(folder: Path, which: str, gamma: float):
     """The controller whose files lie below `folder`, the model that it predicts with, and its weights."""
-    from pipeline.temperature import judging, plant, window
+    from pipeline.temperature import plant, tracking, window
 
     weights = {
         name: np.array(value)
@@ -238,9 +240,9 @@ def controller(folder: Path, which: str, gamma: float):
     }
     model = plant.restored(artifacts.read_arrays(folder / "identify_plant/plant.parquet", "plant", 1))[0]
     if which == "model_based":
-        return judging.model_based(model, gamma, tau=float(weights["observer_tau"])), model, weights
+        return tracking.model_based(model, gamma, tau=float(weights["observer_tau"])), model, weights
     long = window.restored(artifacts.read_arrays(folder / "learn_kernel/window.parquet", "window", 1))
-    return judging.window(long, gamma), window.predictor(long, model.sample_time_s), weights
+    return window.controller(long, gamma), window.predictor(long, model.sample_time_s), weights
 
 
 def _holdout_records(h: HoldOut, machine: Plant) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -3,7 +3,7 @@ and what of all that has changed is an alarm."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from pipeline.nightly.inputs import quarantine
 from pipeline.nightly.settings import Drift
 from pipeline.report.shared.night import Alarm, LoopDrift
 from pipeline.store import params
+
+if TYPE_CHECKING:
+    from pipeline.setpoint.workflow.settings import TrainClassifier
 
 FRAMES = 40  # pictures of a recording that are looked at
 
@@ -42,11 +45,12 @@ def _frame_stats(trial: trial_files.Trial) -> camera_drift.FrameStats:
     )
 
 
-def trials_of(
-    limits: Drift, paths: Sequence[str], reference: Mapping[str, Any], pending: set[str], drift: LoopDrift
-) -> None:
+def trials_drift(
+    limits: Drift, loop: str, paths: Sequence[str], reference: Mapping[str, Any], pending: set[str]
+) -> LoopDrift:
     """Of new trials: those that cannot be read are set aside, the others' pictures held against those of
-    `reference`. What is found goes to `drift`."""
+    `reference`."""
+    drifted = LoopDrift.none(loop)
     before = [
         camera_drift.FrameStats(np.array(mean), np.array(deviation), frames)
         for mean, deviation, frames in reference.get("camera", [])
@@ -55,10 +59,12 @@ def trials_of(
         try:
             trial = trial_files.read_trial(path, unreadable_share=1.0)
         except ValueError as error:
-            drift.quarantined[path] = quarantine(path, drift.loop, str(error))
+            drifted.quarantined[path] = quarantine(path, loop, str(error))
             continue
         if not before:
-            drift.notes.append(f"{path}: the champion has no pictures of its own: the camera was not judged")
+            drifted.notes.append(
+                f"{path}: the champion has no pictures of its own: the camera was not judged"
+            )
             continue
         try:
             _, causes = camera_drift.changes(
@@ -66,9 +72,10 @@ def trials_of(
                 contrast_percent=limits.contrast_percent,
             )  # fmt: skip
         except ValueError as error:
-            drift.notes.append(f"{path}: {error}")
+            drifted.notes.append(f"{path}: {error}")
             continue
-        raise_alarms(limits, path, causes, [], pending, drift)
+        drifted = with_alarms(drifted, limits, path, causes, pending)
+    return drifted
 
 
 # ---- setpoint: the camera that looks at the nozzle
@@ -90,7 +97,7 @@ class PrintFigures(NamedTuple):
 
 def of_prints(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[Any]]:
     """What reference.json keeps of the last `most` prints below `folder`; `only` those named."""
-    return [one.written() for one in _print_figures(folder, most, only)]
+    return [figures.written() for figures in _print_figures(folder, most, only)]
 
 
 def _print_figures(folder: Path, most: int, only: Sequence[str] = ()) -> list[PrintFigures]:
@@ -107,7 +114,8 @@ def _print_figures(folder: Path, most: int, only: Sequence[str] = ()) -> list[Pr
         memo=Path("datasets/memo/train_classifier"),
     )
     prints = []
-    for number, name in [one for one in enumerate(frames.prints) if not only or one[1] in only][-most:]:
+    numbered = [(number, name) for number, name in enumerate(frames.prints) if not only or name in only]
+    for number, name in numbered[-most:]:
         here = frames.print_number == number
         good = here & frames.valid & (frames.label >= 0)
         if good.any():
@@ -119,71 +127,82 @@ def _print_figures(folder: Path, most: int, only: Sequence[str] = ()) -> list[Pr
     return prints
 
 
-def nozzle_of(
-    limits: Drift,
-    folder: str,
-    paths: Sequence[str],
-    reference: Mapping[str, Any],
-    pending: set[str],
-    drift: LoopDrift,
-) -> None:
+class NewPrints(NamedTuple):
+    """The loop's folder of recordings, the new files in it, and the champion's reference.json."""
+
+    folder: str
+    paths: Sequence[str]
+    reference: Mapping[str, Any]
+
+
+def prints_drift(limits: Drift, loop: str, new: NewPrints, pending: set[str]) -> LoopDrift:
     """Of new prints: files that cannot be read are set aside. Classes, frames without a line, and the line's
-    contrast are held against the prints of `reference`. What is found goes to `drift`."""
-    from pipeline.setpoint.workflow import frame_csv, frame_folder, frame_mcap
+    contrast are held against the prints of the champion's reference."""
     from pipeline.setpoint.workflow.settings import TrainClassifier
 
+    drifted = LoopDrift.none(loop)
     settings = params.load(TrainClassifier, "train_classifier")
     if settings.source != "recordings":
-        return
-    for path in paths:
-        try:
-            if path.lower().endswith(".csv"):
-                frame_csv.read_log(Path(path))
-            elif path.lower().endswith(".mcap"):
-                frame_mcap.open_film(Path(path), frame_folder.read_options(settings).topics)
-        except ValueError as error:
-            drift.quarantined[path] = quarantine(path, drift.loop, str(error))
+        return drifted
+    for path in new.paths:
+        if reason := _unreadable(path, settings):
+            drifted.quarantined[path] = quarantine(path, loop, reason)
     before = [
         PrintFigures(name, np.array(counts), together, camera_drift.Contrast(np.array(mean), np.array(std)))
-        for name, counts, together, mean, std in reference.get("camera", [])
+        for name, counts, together, mean, std in new.reference.get("camera", [])
     ]
     if not before:
-        return
-    names = {one.name for one in before}
+        return drifted
+    names = {figures.name for figures in before}
     try:
-        new = [one for one in _print_figures(Path(folder), 10**6) if one.name not in names]
+        prints = [figures for figures in _print_figures(Path(new.folder), 10**6) if figures.name not in names]
     except ValueError as error:  # what the stage will refuse as well, and say so
-        drift.notes.append(str(error))
-        return
-    usual, contrasts = np.array([one.counts for one in before]), [one.contrast for one in before]
-    for one in new:
+        drifted.notes.append(str(error))
+        return drifted
+    usual, contrasts = np.array([figures.counts for figures in before]), [p.contrast for p in before]
+    for figures in prints:
         causes = camera_drift.balance_changes(
-            one.counts, usual, together=one.segment_frames, points=limits.balance_points
+            figures.counts, usual, together=figures.segment_frames, points=limits.balance_points
         )
-        causes += camera_drift.contrast_changes(one.contrast, contrasts, percent=limits.contrast_percent)
-        raise_alarms(limits, one.name, causes, [], pending, drift)
+        causes += camera_drift.contrast_changes(figures.contrast, contrasts, percent=limits.contrast_percent)
+        drifted = with_alarms(drifted, limits, figures.name, causes, pending)
+    return drifted
+
+
+def _unreadable(path: str, settings: "TrainClassifier") -> str:
+    """Why a print's file cannot be read; empty where it can."""
+    from pipeline.setpoint.workflow import frame_csv, frame_folder, frame_mcap
+
+    try:
+        if path.lower().endswith(".csv"):
+            frame_csv.read_log(Path(path))
+        elif path.lower().endswith(".mcap"):
+            frame_mcap.open_film(Path(path), frame_folder.read_options(settings).topics)
+    except ValueError as error:
+        return str(error)
+    return ""
 
 
 # ---- what is an alarm
 
 
-def raise_alarms(
+def with_alarms(
+    drifted: LoopDrift,
     limits: Drift,
     path: str,
     causes: Sequence[camera_drift.Change],
-    consequences: Sequence[str],
     pending: set[str],
-    drift: LoopDrift,
-) -> None:
-    """An alarm of the loop where a cause is sure at once, or has been watched the night before; watched where
-    it is nearly sure."""
+    consequences: Sequence[str] = (),
+) -> LoopDrift:
+    """The loop's drift with the causes that a recording shows. A cause is an alarm where it is sure at once,
+    or has been watched the night before (`pending`); it is watched where it is nearly sure."""
+    alarms, watched = list(drifted.alarms), list(drifted.watched)
     for key, words, sigmas in causes:
-        alarm = Alarm(
-            drift.loop, f"{drift.loop}: {key}", path, words, round(float(sigmas), 1), tuple(consequences)
-        )
-        if abs(sigmas) >= limits.alarm_sigmas or (
-            abs(sigmas) >= limits.watch_sigmas and alarm.key in pending
-        ):
-            drift.alarms.append(alarm)
-        elif abs(sigmas) >= limits.watch_sigmas:
-            drift.watched.append(alarm)
+        key = f"{drifted.loop}: {key}"
+        alarm = Alarm(drifted.loop, key, path, words, round(float(sigmas), 1), tuple(consequences))
+        nearly_sure = abs(sigmas) >= limits.watch_sigmas
+        if abs(sigmas) >= limits.alarm_sigmas or (nearly_sure and key in pending):
+            alarms.append(alarm)
+        elif nearly_sure:
+            watched.append(alarm)
+    return drifted._replace(alarms=alarms, watched=watched)

@@ -1,7 +1,7 @@
 """New recordings before anything learns from them: what cannot be read or is not what it says goes to
 quarantine; what has changed since the champion was made is drift."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,23 +10,28 @@ import numpy as np
 from pipeline.nightly import champion, drift, judge, pictures
 from pipeline.nightly.camera_drift import Change
 from pipeline.nightly.inputs import quarantine
+from pipeline.nightly.remembered import DriftMemory
 from pipeline.nightly.settings import Drift, Loop, Nightly
-from pipeline.report.shared.night import LoopDrift, NightDrift, alarm_of, written
+from pipeline.report.shared.night import (
+    ClosedLoopChange,
+    InnovationChange,
+    LoopDrift,
+    NightDrift,
+    ParameterChange,
+    RecordingFigures,
+)
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow.settings import Plant
 
 REFERENCE = "reference.json"  # in the champion's folder
 PIECES = 4  # into which a single record of the champion is cut, to stand for nights
 NIGHTS = 12  # of the champion's own recordings that a new one is held against
-GROSS = (
-    3.0  # mean squared error, in the champion's own, from which a record is asked whether it is what it says
-)
+# mean squared error, in the champion's own, from which a record is asked whether it is what it says
+GROSS = 3.0
 UNDONE = 0.5  # share of that error which undoing a mistake must leave at most
 # mean offset of the champion's own nights, in units of drift.offset_degC, up to which they count as a
 # closed loop at the references
 SETTLED = 5.0
-
-
 PARTS = 4  # of a record, whose scatter tells how well its closed-loop figures are known
 
 
@@ -45,91 +50,97 @@ class Screening(NamedTuple):
     """Of one night: the drift of every loop, and what the next night must remember of it."""
 
     drift: NightDrift
-    memory: dict[str, Any]
+    memory: DriftMemory
 
 
 def look(
     settings: Nightly,
-    state: Mapping[str, Any],
+    champions: Collection[str],
     new: Mapping[str, Mapping[str, str]],
-    memory: Mapping[str, Any],
+    memory: DriftMemory,
     *,
     night: int,
 ) -> Screening:
-    """New recordings {loop: {path: digest}} held against those of each loop's champion; `memory` is that of
-    the night before. A loop's alarms say nothing of another loop."""
-    pending = set(memory.get("pending", []))
-    loops = {name: LoopDrift.none(name) for name in settings.loops}
-    for name, loop in settings.loops.items():
-        paths = list(new.get(name, {}))
-        if not paths:
-            continue
-        if loop.judge == "temperature" and loop.recordings and _recorded():
-            _temperature(
-                settings.drift, loop.recordings, name in state["champions"], paths, pending, loops[name]
-            )
-        elif loop.judge == "deposition":
-            pictures.trials_of(settings.drift, paths, _read(champion.FOLDER / name), pending, loops[name])
-        elif loop.judge == "setpoint":
-            reference = _read(champion.FOLDER / name)
-            pictures.nozzle_of(settings.drift, loop.recordings, paths, reference, pending, loops[name])
+    """New recordings {loop: {path: digest}} held against those of each loop's champion; `champions` are the
+    loops that have one, `memory` is that of the night before. A loop's alarms say nothing of another loop."""
+    pending = set(memory.pending)
+    loops = {
+        name: _loop_drift(settings, name, list(new.get(name, ())), pending, has_champion=name in champions)
+        for name in settings.loops
+    }
     drift = NightDrift(loops)
     if not any(new.values()):
         # nothing was recorded: what was found last still stands
-        for alarm in map(alarm_of, memory.get("alarms", [])):
+        for alarm in memory.alarms:
             loops.setdefault(alarm.loop, LoopDrift.none(alarm.loop)).alarms.append(alarm)
-        return Screening(drift, dict(memory))
+        return Screening(drift, memory)
     # what each loop recorded since its alarm: a person may accept that as how things are
-    since = dict(memory.get("drifted", {}))
+    since = dict(memory.drifted)
     for name in (name for name, recorded in new.items() if recorded):
         raised = [alarm.recording for alarm in drift.of(name).alarms]
         since[name] = list(dict.fromkeys([*since.get(name, []), *raised])) if raised else []
-    return Screening(
-        drift,
-        {
-            "pending": [alarm.key for alarm in [*drift.watched, *drift.alarms]],
-            "alarms": [written(alarm) for alarm in drift.alarms],
-            "drifted": since,
-            "night": night,
-        },
-    )
+    keys = tuple(alarm.key for alarm in (*drift.watched, *drift.alarms))
+    return Screening(drift, DriftMemory(keys, tuple(drift.alarms), since, night))
+
+
+def _loop_drift(
+    settings: Nightly, name: str, paths: Sequence[str], pending: set[str], *, has_champion: bool
+) -> LoopDrift:
+    """Drift of one loop by its new recordings; none where there is no new one, or nothing to hold it
+    against."""
+    loop = settings.loops[name]
+    if not paths:
+        return LoopDrift.none(name)
+    if loop.judge == "temperature" and loop.recordings and _recorded():
+        return _temperature(settings, name, paths, pending, has_champion=has_champion)
+    if loop.judge == "deposition":
+        return pictures.trials_drift(settings.drift, name, paths, _read(champion.FOLDER / name), pending)
+    if loop.judge == "setpoint":
+        prints = pictures.NewPrints(loop.recordings, paths, _read(champion.FOLDER / name))
+        return pictures.prints_drift(settings.drift, name, prints, pending)
+    return LoopDrift.none(name)
 
 
 def _temperature(
-    limits: Drift, folder: str, has_champion: bool, new: Sequence[str], pending: set[str], drift_of: LoopDrift
-) -> None:
+    settings: Nightly, name: str, new: Sequence[str], pending: set[str], *, has_champion: bool
+) -> LoopDrift:
+    """Drift of the temperature loop; what cannot be read, or is not what it says, is set aside."""
+    drifted, folder = LoopDrift.none(name), settings.loops[name].recordings
     machine, broken = params.load(Plant, "plant"), {}
     if not Path(folder).is_dir():
-        return
+        return drifted
     records = judge.record_segments(Path(folder), machine, broken=broken)
     for path, reason in broken.items():
         if f"{folder}/{path}" in new:
-            drift_of.quarantined[f"{folder}/{path}"] = quarantine(f"{folder}/{path}", drift_of.loop, reason)
+            drifted.quarantined[f"{folder}/{path}"] = quarantine(f"{folder}/{path}", name, reason)
     good = [
         path
         for path in new
-        if path not in drift_of.quarantined and records.get(path.removeprefix(f"{folder}/"))
+        if path not in drifted.quarantined and records.get(path.removeprefix(f"{folder}/"))
     ]
     if not has_champion or not good:
-        return
-    reference = _champions_reference(champion.FOLDER / drift_of.loop)
+        return drifted
+    reference = _champions_reference(champion.FOLDER / name)
     if reference is None:
-        drift_of.notes.append(
-            f"{drift_of.loop}: the champion has no reference of its own recordings: drift was not measured"
+        drifted.notes.append(
+            f"{name}: the champion has no reference of its own recordings: drift was not measured"
         )
-        return
+        return drifted
     for path in good:
         segments = records[path.removeprefix(f"{folder}/")]
         if reason := _mistake(path, segments, reference, machine):
-            drift_of.quarantined[path] = quarantine(path, drift_of.loop, reason)
+            drifted.quarantined[path] = quarantine(path, name, reason)
             continue
         try:
-            measured = _measure(limits, segments, reference, machine)
+            measured = _measure(settings.drift, segments, reference, machine)
         except ValueError as error:
-            drift_of.notes.append(f"{path}: {error}")
+            drifted.notes.append(f"{path}: {error}")
             continue
-        drift_of.figures[path] = measured.figures
-        pictures.raise_alarms(limits, path, measured.causes, measured.consequences, pending, drift_of)
+        drifted.figures[path] = measured.figures
+        drifted = pictures.with_alarms(
+            drifted, settings.drift, path, measured.causes, pending, measured.consequences
+        )
+    return drifted
 
 
 def _mistake(path: str, segments: Sequence, reference: Reference, machine: Plant) -> str:
@@ -141,14 +152,14 @@ def _mistake(path: str, segments: Sequence, reference: Reference, machine: Plant
         y,
         inputs=[i.name for i in machine.inputs],
         outputs=[o.name for o in machine.outputs],
-        scale=np.exp(0.5 * np.mean([one.log_variance for one in reference.own], axis=0)),
+        scale=np.exp(0.5 * np.mean([night.log_variance for night in reference.own], axis=0)),
         gross=GROSS,
     )
-    if len(suspects) < 2 or suspects[1].left >= UNDONE:
+    if len(suspects) < 2 or suspects[1].error_share >= UNDONE:
         return ""
     return (
         f"{path}: {suspects[1].words}: undone, the record fits the champion's model "
-        f"{1 / suspects[1].left:.0f} times better; mend it and put it back"
+        f"{1 / suspects[1].error_share:.0f} times better; mend it and put it back"
     )
 
 
@@ -188,8 +199,8 @@ def reference(loop: Loop, folder: Path, only: Sequence[str] = ()) -> dict[str, A
     except ValueError:
         return None
     both = {
-        "own": [list(map(np.ndarray.tolist, one)) for one in own],
-        "slow": [list(map(np.ndarray.tolist, one)) for one in slow],
+        "own": [list(map(np.ndarray.tolist, estimate)) for estimate in own],
+        "slow": [list(map(np.ndarray.tolist, estimate)) for estimate in slow],
     }
     return {
         "schema": "reference",
@@ -204,12 +215,14 @@ def _read(folder: Path) -> dict[str, Any]:
 
 
 def _champions_reference(folder: Path) -> Reference | None:
-    entry = _read(folder)
-    if not entry:
+    fields = _read(folder)
+    if not fields:
         return None
-    own, slow = ([drift.Estimate(*map(np.array, one)) for one in entry[key]] for key in ("own", "slow"))
+    own, slow = (
+        [drift.Estimate(*map(np.array, estimate)) for estimate in fields[key]] for key in ("own", "slow")
+    )
     _, model, _ = judge.controller(folder, "model_based", 0.99)
-    return Reference(model, drift.causes(model), own, slow, entry["loop"])
+    return Reference(model, drift.causes(model), own, slow, fields["loop"])
 
 
 def _recorded() -> bool:
@@ -255,7 +268,7 @@ def _mean(values: np.ndarray) -> list[list[float]]:
 class Measured(NamedTuple):
     """Of one recording: figures for the page, causes of an alarm, and what follows from them in words."""
 
-    figures: dict[str, Any]
+    figures: RecordingFigures
     causes: list[Change]
     consequences: list[str]
 
@@ -277,17 +290,12 @@ def _measure(limits: Drift, segments: Sequence, reference: Reference, machine: P
     causes = _plant(limits, own, slow, reference.asked, inputs)
     explained = bool(causes)
     innovation, noise_causes = _innovation(limits, own.estimate, reference.own, outputs)
-    loop_figures, loop_causes = _loop(
-        limits, _closed_loop(segments, machine), reference.loop, inputs, outputs
-    )
+    loop = _loop(limits, _closed_loop(segments, machine), reference.loop, inputs, outputs)
+    parameters = _parameters(own.shift, reference.asked, inputs)
     return Measured(
-        {
-            "parameters": _parameters(own.shift, reference.asked, inputs),
-            "innovation": innovation,
-            "closed_loop": loop_figures,
-        },
-        causes if explained else [*noise_causes, *loop_causes],
-        [cause.words for cause in loop_causes] if explained else [],
+        RecordingFigures(parameters, innovation, loop.figures, loop.not_applicable),
+        causes if explained else [*noise_causes, *loop.causes],
+        [cause.words for cause in loop.causes] if explained else [],
     )
 
 
@@ -301,18 +309,15 @@ def _moved(
 
 def _innovation(
     limits: Drift, estimate: drift.Estimate, nights: Sequence[drift.Estimate], outputs: Sequence[str]
-) -> tuple[dict[str, dict[str, float]], list[Change]]:
+) -> tuple[dict[str, InnovationChange], list[Change]]:
     """Noise and mean of the one-step errors, output by output, and what of both is more than matters."""
     noise = _shift(estimate, nights, "log_variance", "log_variance_deviation")
     mean = _shift(estimate, nights, "mean", "mean_deviation")
     grown, moved = np.expm1(0.5 * (noise.value - noise.reference)), mean.value - mean.reference
     figures = {
-        output: {
-            "noise_percent": 100 * float(grown[i]),
-            "noise_sigmas": float(noise.sigmas[i]),
-            "mean_degC": float(moved[i]),
-            "mean_sigmas": float(mean.sigmas[i]),
-        }
+        output: InnovationChange(
+            100 * float(grown[i]), float(noise.sigmas[i]), float(moved[i]), float(mean.sigmas[i])
+        )
         for i, output in enumerate(outputs)
     }
     causes, spread = [], np.exp(0.5 * noise.reference)
@@ -344,16 +349,14 @@ def _shift(
 
 def _parameters(
     shifted: drift.Shift, asked: Sequence[drift.Cause], inputs: Sequence[str]
-) -> dict[str, dict[str, float]]:
+) -> dict[str, ParameterChange]:
     """{cause: change in percent, half of its 90 % band, sigmas}; time constants from rates."""
     change, band = _percent(shifted, asked), 100 * 1.645 * shifted.deviation
     return {
-        f"{cause.kind} from {inputs[cause.channel] if cause.channel >= 0 else 'all inputs'}": {
-            "percent": float(p),
-            "band_percent": float(b),
-            "sigmas": float(s),
-        }
-        for cause, p, b, s in zip(asked, change, band, shifted.sigmas, strict=True)
+        f"{cause.kind} from {inputs[cause.channel] if cause.channel >= 0 else 'all inputs'}": (
+            ParameterChange(float(percent), float(half), float(sigmas))
+        )
+        for cause, percent, half, sigmas in zip(asked, change, band, shifted.sigmas, strict=True)
     }
 
 
@@ -392,13 +395,22 @@ def _plant(
     return [Change(f"plant at {where}", words, surest)]
 
 
+class LoopChanges(NamedTuple):
+    """Of the closed loop: figures by name, causes of an alarm, and why it was not asked (empty where it
+    was)."""
+
+    figures: dict[str, ClosedLoopChange]
+    causes: list[Change]
+    not_applicable: str = ""
+
+
 def _loop(
     limits: Drift,
     now: Mapping[str, list[list[float]]],
     before: Sequence[Mapping[str, list[list[float]]]],
     inputs: Sequence[str],
     outputs: Sequence[str],
-) -> tuple[dict[str, Any], list[Change]]:
+) -> LoopChanges:
     """Offset, effort and share at limits against the champion's own nights; not asked where
     those nights were not settled at the references."""
     # (nights, 2, signals): figures and their deviations
@@ -406,9 +418,9 @@ def _loop(
     offset = usual["offset_degC"][:, 0].mean(axis=0)
     unsure = np.sqrt((usual["offset_degC"][:, 1] ** 2).mean(axis=0) / len(before))
     if (np.abs(offset) > SETTLED * limits.offset_degC + 2 * unsure).any():
-        return {
-            "not_applicable": "the champion's own recordings are not of a loop settled at the references"
-        }, []
+        return LoopChanges(
+            {}, [], "the champion's own recordings are not of a loop settled at the references"
+        )
     figures, causes = {}, []
     effort, at_limits = "points of effort more than it did", "points more of the time than it was"
     words = {
@@ -427,8 +439,8 @@ def _loop(
             np.array(now[key][0]), pooled, usual[key][:, 0], own[:-1], freedom=(PARTS - 1) * len(own)
         )
         for name, by, sigmas in zip(names, moved.value - moved.reference, moved.sigmas, strict=True):
-            figures[f"{name} {key}"] = {"moved": float(by), "sigmas": float(sigmas)}
+            figures[f"{name} {key}"] = ClosedLoopChange(float(by), float(sigmas))
             if abs(by) >= least:
                 sentence = f"closed loop: {name} {verb} {by:+.2g} {rest}"
                 causes.append(Change(f"{key} of {name}", sentence, float(sigmas)))
-    return figures, causes
+    return LoopChanges(figures, causes)

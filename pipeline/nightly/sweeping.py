@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from pipeline.nightly.processes import STATE, dvc, git
 from pipeline.report.shared import charts, page
@@ -40,6 +41,8 @@ def sweep(settings: Sequence[str], target: str, metric: str) -> str:
             "sweep: expected a metric as STAGE:dotted.key, such as "
             f"tune_weights:practical.cost, found {metric}"
         )
+    import pandas as pd
+
     points, rows = grid(settings), []
     head = git("rev-parse", "HEAD")
     for k, point in enumerate(points, 1):
@@ -49,22 +52,19 @@ def sweep(settings: Sequence[str], target: str, metric: str) -> str:
         rows.append(
             {"experiment": name, **point, metric: _figure(f"{head[:2]}/{head[2:]}/{name}", stage, key)}
         )
-    lines = [",".join(rows[0])] + [",".join(str(value) for value in row.values()) for row in rows]
-    artifacts.write_text("reports/sweep.csv", "\n".join(lines) + "\n")
-    html = page.render(
-        "sweep.html", here="sweep", title="Sweep", rows=rows, metric=metric, picture=_picture(rows, metric)
-    )
+    table = pd.DataFrame(rows)
+    artifacts.write_csv("reports/sweep.csv", {str(name): column.to_numpy() for name, column in table.items()})
+    picture = _picture(table[metric].to_numpy(), metric)
+    html = page.render("sweep.html", here="sweep", title="Sweep", table=table, metric=metric, picture=picture)
     artifacts.write_text("reports/sweep.html", html)
-    width = [max(len(line.split(",")[k]) for line in lines) for k in range(len(rows[0]))]
-    table = "\n".join(
-        "  ".join(cell.ljust(w) for cell, w in zip(line.split(","), width, strict=True)) for line in lines
-    )
-    return f"{table}\nreports/sweep.csv, reports/sweep.html; to take one: dvc exp apply NAME"
+    files = "reports/sweep.csv, reports/sweep.html; to take one: dvc exp apply NAME"
+    return f"{table.astype(str).to_string(index=False)}\n{files}"
 
 
 def _experiment(point: dict[str, str], target: str) -> str:
     """Runs one point of the grid up to stage `target`; the experiment's name."""
-    words = [f"{part.rsplit('.', 1)[-1]}-{value}" for part, value in point.items()]
+    # the whole key: seed alone would be that of any stage
+    words = [f"{part}-{value}" for part, value in point.items()]
     name = "sweep-" + "-".join(words).replace(".", "_").lower()
     chosen = [
         word
@@ -88,13 +88,12 @@ def _figure(experiment: str, stage: str, key: str) -> float:
     return float(value)
 
 
-def _picture(rows: Sequence[dict[str, Any]], metric: str):
+def _picture(values: np.ndarray, metric: str) -> Markup:
     """The metric over the experiments in their order."""
-    values = np.array([row[metric] for row in rows])
     margin = 0.1 * (np.ptp(values) or max(abs(values[0]), 1.0))
-    ticks = tuple((float(k), str(k)) for k in range(1, len(rows) + 1, max(1, math.ceil(len(rows) / 12))))
+    ticks = tuple((float(k), str(k)) for k in range(1, len(values) + 1, max(1, math.ceil(len(values) / 12))))
     frame = charts.Frame(
-        charts.Axis(0.5, len(rows) + 0.5, ticks),
+        charts.Axis(0.5, len(values) + 0.5, ticks),
         charts.linear(values.min() - margin, values.max() + margin),
         760,
         220,
@@ -106,7 +105,7 @@ def _picture(rows: Sequence[dict[str, Any]], metric: str):
     best = int(values.argmin()) + 1
     return charts.panel(
         frame,
-        [charts.dots(frame, np.arange(1, len(rows) + 1), values, radius=4)],
+        [charts.dots(frame, np.arange(1, len(values) + 1), values, radius=4)],
         alt=f"{metric}: lowest in experiment {best}, {values.min():.4g}",
         title=metric,
     )

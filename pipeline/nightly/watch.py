@@ -9,36 +9,23 @@ import subprocess
 import urllib.error
 import urllib.request
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
+from pipeline.nightly import remembered
 from pipeline.nightly.processes import STATE
 from pipeline.store import artifacts
 
-ALARM, LAST = STATE / "alarm.json", STATE / "last.json"
+ALARM = STATE / "alarm.json"
 
 
 def stamp(now: datetime.datetime) -> str:
     return now.astimezone(datetime.UTC).isoformat(timespec="seconds")
 
 
-def last() -> dict[str, Any]:
-    """The last nights as the job itself remembers them; on a fresh clone, as the committed metrics do."""
-    for path in (LAST, Path("reports/metrics/nightly.json")):
-        if path.exists():
-            entry = artifacts.read_json(path)
-            return (
-                entry
-                if path == LAST
-                else {"night": entry["night"], "success": entry["when"], "watch_since": entry["when"]}
-            )
-    return {"night": 0, "success": None}
-
-
 def overdue(now: datetime.datetime, watch_h: float) -> str:
     """Why somebody should look: the last success is older than `watch_h` hours,
     or lies in the future; empty where all is well."""
-    success = last().get("success")
+    success = remembered.last().success
     if success is None:
         return "no night has ever succeeded; run ./run beadline nightly, and look at its schedule"
     age_h = (now - datetime.datetime.fromisoformat(success)).total_seconds() / 3600

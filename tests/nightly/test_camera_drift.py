@@ -26,10 +26,10 @@ def good() -> list[camera_drift.FrameStats]:
 
 def test_pictures_of_the_same_scene_raise_nothing_in_six_nights(good):
     for k in range(6):
-        found, causes = camera_drift.changes(night(20 + k), good, **LIMITS)
+        shift, causes = camera_drift.changes(night(20 + k), good, **LIMITS)
         assert causes == []
         assert (
-            np.abs(found.sigmas).max() < 5
+            np.abs(shift.sigmas).max() < 5
         )  # 36 figures; the night's alarm needs the change to matter as well
 
 
@@ -54,7 +54,7 @@ def test_a_change_is_named_and_found_in_two_nights(good, changes, key):
 
 def test_the_line_s_place_is_read_to_a_tenth_of_a_pixel(good):
     moved = night(60, offset_px=rendering.NOMINAL.offset_px + 4)
-    assert moved.mean[0] - np.mean([one.mean[0] for one in good]) == pytest.approx(
+    assert moved.mean[0] - np.mean([stats.mean[0] for stats in good]) == pytest.approx(
         4, abs=0.3
     )  # the bead's own wander is 0.2 px
 
@@ -72,8 +72,8 @@ def test_the_balance_of_classes_moves_when_it_moves():
     other = camera_drift.class_balance(rng.multinomial(400, [0.4, 0.45, 0.15]), before, together=1)
     assert np.abs(same.sigmas).max() < 4 < np.abs(other.sigmas).max()
     # by hand: 30 of 60 where 10 of 60 is usual
-    found = camera_drift.class_balance(np.array([30, 20, 10]), np.array([[10, 40, 10]] * 3), together=1)
-    np.testing.assert_allclose(found.value - found.reference, [100 / 3, -100 / 3, 0], atol=1e-9)
+    balance = camera_drift.class_balance(np.array([30, 20, 10]), np.array([[10, 40, 10]] * 3), together=1)
+    np.testing.assert_allclose(balance.value - balance.reference, [100 / 3, -100 / 3, 0], atol=1e-9)
 
 
 def prints(seed: int, shares: list[float], level: float) -> tuple[np.ndarray, camera_drift.Contrast]:
@@ -110,5 +110,5 @@ def test_a_print_like_the_others_raises_nothing_and_another_balance_is_named():
 def test_a_line_that_stands_out_less_is_named():
     before = [prints(k, [0.25, 0.45, 0.27, 0.03], 40.0)[1] for k in range(6)]
     assert camera_drift.contrast_changes(prints(80, [1, 0, 0, 0], 40.0)[1], before, percent=15.0) == []
-    found = camera_drift.contrast_changes(prints(81, [1, 0, 0, 0], 25.0)[1], before, percent=15.0)
-    assert [cause.key for cause in found] == ["contrast"] and found[0].sigmas < -5
+    causes = camera_drift.contrast_changes(prints(81, [1, 0, 0, 0], 25.0)[1], before, percent=15.0)
+    assert [cause.key for cause in causes] == ["contrast"] and causes[0].sigmas < -5

@@ -33,29 +33,29 @@ def record(truth: Plant, seed: int, samples: int = SAMPLES) -> tuple[np.ndarray,
 
 def shifts(truth: Plant, seed: int, K: np.ndarray) -> tuple[drift.Shift, np.ndarray]:
     before = [drift.estimate(MODEL, [record(two_zones(), 900 + k)], CAUSES, K) for k in range(4)]
-    variance = np.exp(np.mean([one.log_variance for one in before], axis=0))
+    variance = np.exp(np.mean([estimate.log_variance for estimate in before], axis=0))
     now = drift.estimate(MODEL, [record(truth, seed)], CAUSES, K, variance)
-    found = drift.shift(
+    shift = drift.shift(
         now.change,
         now.deviation,
-        np.array([one.change for one in before]),
-        np.array([one.deviation for one in before]),
+        np.array([estimate.change for estimate in before]),
+        np.array([estimate.deviation for estimate in before]),
     )
-    return found, drift.explained(found, now)
+    return shift, drift.explained(shift, now)
 
 
 def test_the_change_of_a_gain_is_measured_to_a_percent():
     for share, channel in ((0.9, 0), (1.1, 1)):
         gain = [1.0, 1.0]
         gain[channel] = share
-        found, explained = shifts(two_zones(gain=tuple(gain)), 1, drift.observer(MODEL, SAMPLES))
+        shift, explained = shifts(two_zones(gain=tuple(gain)), 1, drift.observer(MODEL, SAMPLES))
         assert CAUSES[int(explained.argmax())] == drift.Cause("gain", channel)
         # three of its own deviations, which are below a percent here
         assert (
-            abs(found.value[channel] - found.reference[channel] - (share - 1))
-            < 3 * found.deviation[channel] + 0.002
+            abs(shift.value[channel] - shift.reference[channel] - (share - 1))
+            < 3 * shift.deviation[channel] + 0.002
         )
-        assert abs(found.sigmas[channel]) > 6
+        assert abs(shift.sigmas[channel]) > 6
 
 
 @pytest.mark.parametrize(
@@ -73,10 +73,10 @@ def test_a_longer_time_constant_is_told_from_a_lower_gain(changes, cause):
             shifts(two_zones(**changes), seed, K)
             for K in (drift.observer(MODEL, SAMPLES), drift.slow_observer(MODEL, SAMPLES))
         )
-        found = drift.named(np.abs(own.value - own.reference) > 0.04, mine, slow)
-        assert [CAUSES[k] for k in found] == [cause]
+        named = drift.named(np.abs(own.value - own.reference) > 0.04, mine, slow)
+        assert [CAUSES[k] for k in named] == [cause]
         # of 10 %, to a fifth: rates fall to 1 / 1.1
-        assert abs(own.value - own.reference)[found[0]] == pytest.approx(0.1, abs=0.02)
+        assert abs(own.value - own.reference)[named[0]] == pytest.approx(0.1, abs=0.02)
 
 
 def test_a_plant_that_did_not_change_raises_nothing_in_forty_nights():
@@ -91,15 +91,15 @@ def test_every_rate_scaled_back_is_the_plant_again():
     there = drift.faster(drift.faster(MODEL, 0.25), -0.2)
     np.testing.assert_allclose(there.A, MODEL.A, atol=1e-10)  # expm and logm to rounding
     np.testing.assert_allclose(there.B, MODEL.B, atol=1e-10)
-    gains = [np.linalg.solve(np.eye(2) - one.A, one.B) for one in (MODEL, drift.faster(MODEL, 0.3))]
+    gains = [np.linalg.solve(np.eye(2) - zones.A, zones.B) for zones in (MODEL, drift.faster(MODEL, 0.3))]
     np.testing.assert_allclose(*gains, rtol=1e-8)  # its steady gains stay
 
 
 def test_a_first_order_lag_quickened_by_hand():
     # exp(-1 / 50) at twice the rate is exp(-2 / 50); B keeps the gain of 3
     lag = plant([[np.exp(-1 / 50)]], [[3 * (1 - np.exp(-1 / 50))]], [[1.0]])
-    found = drift.faster(lag, 1.0)
-    assert found.A[0, 0] == pytest.approx(np.exp(-2 / 50)) and found.B[0, 0] == pytest.approx(
+    quick = drift.faster(lag, 1.0)
+    assert quick.A[0, 0] == pytest.approx(np.exp(-2 / 50)) and quick.B[0, 0] == pytest.approx(
         3 * (1 - np.exp(-2 / 50))
     )
 
@@ -116,19 +116,19 @@ def test_a_first_order_lag_quickened_by_hand():
 )
 def test_a_mistake_in_a_record_is_named(spoil, words):
     u, y = spoil(*record(two_zones(), 5))
-    found = drift.mistakes(
+    mistakes = drift.mistakes(
         MODEL, u, y, inputs=["one", "two"], outputs=["left", "right"], scale=np.full(2, NOISE), gross=3.0
     )
-    assert found[1].words == words and found[1].left < 0.5
+    assert mistakes[1].words == words and mistakes[1].error_share < 0.5
 
 
 @pytest.mark.parametrize("truth", [two_zones(), two_zones(gain=(0.85, 1.0)), two_zones(slower=(1.2, 1.2))])
 def test_a_drifted_plant_is_no_mistake_of_the_record(truth):
     u, y = record(truth, 6)
-    found = drift.mistakes(
+    mistakes = drift.mistakes(
         MODEL, u, y, inputs=["one", "two"], outputs=["left", "right"], scale=np.full(2, NOISE), gross=3.0
     )
-    assert len(found) == 1 or found[1].left > 0.5
+    assert len(mistakes) == 1 or mistakes[1].error_share > 0.5
 
 
 def test_gaps_in_the_outputs_are_passed_over():

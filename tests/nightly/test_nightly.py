@@ -15,7 +15,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.nightly import champion, guarding, inputs, night, processes, screening, sweeping, watch
+from pipeline.nightly import (
+    champion,
+    guarding,
+    inputs,
+    night,
+    processes,
+    remembered,
+    screening,
+    sweeping,
+    watch,
+)
+from pipeline.report.nightly.production import Champion
 from tests.nightly.toy_nights import Project, entered
 
 TOMORROW = datetime.timedelta(days=1)
@@ -25,8 +36,8 @@ TOMORROW = datetime.timedelta(days=1)
 def first(tmp_path_factory):
     """The project after its first night: mean 11, the champion of night-0001."""
     project = Project(tmp_path_factory.mktemp("nights") / "toy").make()
-    found = project.night()
-    assert found.returncode == 0 and "promoted toy" in found.stdout, found
+    ended = project.night()
+    assert ended.returncode == 0 and "promoted toy" in ended.stdout, ended
     return project
 
 
@@ -38,9 +49,9 @@ def project(first, tmp_path, monkeypatch):
 
 def test_a_night_without_new_data_is_done_in_seconds_and_commits_nothing(project):
     head, began = project.head(), os.times()
-    found = project.night()
+    ended = project.night()
     spent = os.times()
-    assert found.returncode == 0 and "nothing new" in found.stdout
+    assert ended.returncode == 0 and "nothing new" in ended.stdout
     assert project.head() == head and project.dirty() == []
     # the bar is 15 s; counted in the processor's seconds, which do not depend on what else the machine does:
     # half of it leaves room for the disk
@@ -50,8 +61,8 @@ def test_a_night_without_new_data_is_done_in_seconds_and_commits_nothing(project
 def test_a_better_challenger_is_promoted_and_the_champion_before_it_comes_back_bit_by_bit(project):
     before, name = project.production(), project.champion()["folder"]["md5"]
     project.record("second", [9.0, 9.0, 9.0])  # the mean of all is 10, the truth
-    status, said = night.nightly()
-    assert status == night.OK and "promoted toy" in said
+    status, summary = night.nightly()
+    assert status == night.OK and "promoted toy" in summary
     assert project.production() != before and project.champion()["run"] == "night-0002"
     assert project.champion()["files"] == champion.md5s(project.folder / "champion/toy")
     assert project.dirty() == []
@@ -68,9 +79,11 @@ def test_a_better_challenger_is_promoted_and_the_champion_before_it_comes_back_b
     (project.folder / "learn.py").write_text(
         (project.folder / "learn.py").read_text() + "# other code, same model\n"
     )
-    status, said = night.nightly()
+    status, summary = night.nightly()
     assert (
-        status == night.OK and "was rolled back by hand" in said and project.champion()["run"] == "night-0001"
+        status == night.OK
+        and "was rolled back by hand" in summary
+        and project.champion()["run"] == "night-0001"
     )
 
 
@@ -78,8 +91,8 @@ def test_a_better_challenger_is_promoted_and_the_champion_before_it_comes_back_b
 def test_a_worse_challenger_changes_nothing_but_the_report(project):
     before = project.production()
     project.record("second", [30.0])
-    status, said = night.nightly()
-    assert status == night.OK and "kept" in said and "no better" in said
+    status, summary = night.nightly()
+    assert status == night.OK and "kept" in summary and "no better" in summary
     assert (
         project.production() == before and project.champion()["run"] == "night-0001" and project.dirty() == []
     )
@@ -96,8 +109,8 @@ def test_a_night_with_bad_data_leaves_the_last_good_run_and_the_next_night_works
         (project.folder / name).read_bytes() for name in ("dvc.lock", "datasets/learn/model.json")
     )
     bad = project.record("bad", ["x"])
-    status, said = night.nightly()
-    assert status == night.FAILED and "bad.csv: expected numbers, found none; mend the file" in said
+    status, summary = night.nightly()
+    assert status == night.FAILED and "bad.csv: expected numbers, found none; mend the file" in summary
     assert (project.folder / "dvc.lock").read_bytes() == lock and (
         project.folder / "datasets/learn/model.json"
     ).read_bytes() == learned
@@ -107,11 +120,11 @@ def test_a_night_with_bad_data_leaves_the_last_good_run_and_the_next_night_works
     assert night.nightly()[0] == night.OK and project.champion()["run"] == "night-0003"
 
 
-@pytest.mark.parametrize(("times", "kept_by"), [(1, "git"), (2, "git"), (1, "dvc")])
+@pytest.mark.parametrize(("times", "versioned_by"), [(1, "git"), (2, "git"), (1, "dvc")])
 def test_what_changes_while_the_stages_run_is_learned_whole_or_not_at_all(
-    project, monkeypatch, times, kept_by
+    project, monkeypatch, times, versioned_by
 ):
-    if kept_by == "dvc":
+    if versioned_by == "dvc":
         project.run("git", "rm", "-rq", "--cached", "datasets/raw/toy")
         project.run(sys.executable, "-m", "dvc", "add", "-q", "datasets/raw/toy")
         project.run("git", "add", "datasets/raw")
@@ -126,15 +139,15 @@ def test_what_changes_while_the_stages_run_is_learned_whole_or_not_at_all(
             project.set(watch_h=48 + k)
 
     monkeypatch.setattr(night, "_reproduce", meanwhile)
-    status, said = night.nightly()
+    status, summary = night.nightly()
     if times == 1:
-        assert status == night.OK, said
-        assert status == night.OK and "promoted toy" in said
+        assert status == night.OK, summary
+        assert status == night.OK and "promoted toy" in summary
         assert json.loads((project.folder / "datasets/learn/model.json").read_text()) == (33 + 18) / 5
-        assert night.nights()[-1]["notes"] == [
+        assert night.nights()[-1].notes == (
             "datasets/raw/toy/late_0.csv, params.yaml changed while the stages ran: "
-            "the night began once again"
-        ]
+            "the night began once again",
+        )
         assert sorted(project.champion()["lineage"]["recordings"]["toy"]) == [
             f"datasets/raw/toy/{name}.csv" for name in ("first", "late_0", "second")
         ]
@@ -142,7 +155,7 @@ def test_what_changes_while_the_stages_run_is_learned_whole_or_not_at_all(
         return
     assert (
         status == night.FAILED
-        and "datasets/raw/toy/late_1.csv changed again while the stages ran; start the night when" in said
+        and "datasets/raw/toy/late_1.csv changed again while the stages ran; start the night when" in summary
     )
     assert (project.folder / "dvc.lock").read_bytes() == lock and project.champion()["run"] == "night-0001"
     assert night.nightly()[0] == night.OK and project.champion()["run"] == "night-0003"
@@ -166,11 +179,11 @@ def test_a_recording_that_comes_while_others_are_judged_is_looked_at_tonight_or_
     monkeypatch.setattr(screening, "look", looked)
     monkeypatch.setattr(night, "_judge", judged)
     assert night.nightly()[0] == night.OK
-    tonight = night.nights()[-1]["new_recordings"]["toy"]
+    tonight = night.nights()[-1].new_recordings["toy"]
     assert tonight == ["datasets/raw/toy/second.csv", "datasets/raw/toy/while_looking.csv"]
     monkeypatch.setattr(night, "_judge", judge)
     assert night.nightly()[0] == night.OK
-    assert night.nights()[-1]["new_recordings"] == {"toy": ["datasets/raw/toy/while_judging.csv"]}
+    assert night.nights()[-1].new_recordings == {"toy": ["datasets/raw/toy/while_judging.csv"]}
 
 
 @pytest.mark.parametrize("lock", [None, "schema: '2.0'\nstages: {}\n", ""])
@@ -197,10 +210,10 @@ def test_code_that_changes_while_the_stages_run_ends_the_night(project, monkeypa
 
     project.record("second", [9.0])
     monkeypatch.setattr(night, "_reproduce", meanwhile)
-    status, said = night.nightly()
+    status, summary = night.nightly()
     assert (
         status == night.FAILED
-        and "learn.py changed while the stages ran" in said
+        and "learn.py changed while the stages ran" in summary
         and project.champion()["run"] == "night-0001"
     )
 
@@ -210,8 +223,8 @@ def test_an_empty_folder_is_a_failed_night_with_its_cause(project):
     shutil.rmtree(project.folder / "datasets/raw/toy")
     (project.folder / "datasets/raw/toy").mkdir()
     before = project.production()
-    status, said = night.nightly()
-    assert status == night.FAILED and "datasets/raw/toy" in said
+    status, summary = night.nightly()
+    assert status == night.FAILED and "datasets/raw/toy" in summary
     assert project.production() == before and project.champion()["run"] == "night-0001"
 
 
@@ -240,31 +253,33 @@ def test_on_a_full_disk_the_champion_stays_and_the_cause_is_reported(project, mo
     before = project.production()
     with monkeypatch.context() as broken:
         broken.setattr(champion.shutil, "copyfile", full)
-        status, said = night.nightly()
-    assert status == night.FAILED and "No space left on device" in said
+        status, summary = night.nightly()
+    assert status == night.FAILED and "No space left on device" in summary
     assert project.production() == before and project.champion()["run"] == "night-0001"
     assert night.nightly()[0] == night.OK and project.champion()["run"] == "night-0003"
 
 
 def test_too_little_room_ends_the_night_before_it_begins(project):
     project.set(least_free_mb=1e7)
-    status, said = night.nightly()
+    status, summary = night.nightly()
     assert (
         status == night.FAILED
-        and "nightly.least_free_mb" in said
+        and "nightly.least_free_mb" in summary
         and project.champion()["run"] == "night-0001"
     )
 
 
 @pytest.mark.slow
 def test_a_clock_that_was_set_back_is_said_and_does_not_make_the_last_success_older(project):
-    success = watch.last()["success"]
+    success = remembered.last().success
     project.record("second", [9.0, 9.0, 9.0])
-    status, said = night.nightly(datetime.datetime.fromisoformat(success) - 30 * TOMORROW)
+    status, summary = night.nightly(datetime.datetime.fromisoformat(success) - 30 * TOMORROW)
     assert (
-        status == night.OK and "the clock was set back" in said and project.champion()["run"] == "night-0002"
+        status == night.OK
+        and "the clock was set back" in summary
+        and project.champion()["run"] == "night-0002"
     )
-    assert watch.last()["success"] == success
+    assert remembered.last().success == success
 
 
 def test_a_promotion_that_was_killed_before_its_commit_never_was(project):
@@ -272,19 +287,14 @@ def test_a_promotion_that_was_killed_before_its_commit_never_was(project):
     before, head = project.production(), project.head()
     model = project.folder / "datasets/learn/model.json"
     model.write_text("10.0")
-    described = {"run": "night-0002", "when": "2030-01-01T00:00:00+00:00", "why": "killed"}
-    state = champion.promoted(
-        champion.read(),
-        "toy",
-        described | champion.install("toy", ["datasets/learn/model.json"], {}),
-        event="promoted",
-    )
-    (project.folder / "champion.json").write_text(json.dumps(state))
+    files = champion.install("toy", ["datasets/learn/model.json"], {})
+    killed = Champion("night-0002", "2030-01-01T00:00:00+00:00", "killed", files)
+    champion.write(champion.in_production(champion.read(), "toy", killed, event="promoted"))
     guarding.RUNNING.touch()
     assert project.production() != before
     (project.folder / "datasets/learn/model.json").write_text("11.0")
-    status, said = night.nightly()
-    assert status == night.OK and "the night before was killed" in said
+    status, summary = night.nightly()
+    assert status == night.OK and "the night before was killed" in summary
     assert (
         project.production() == before
         and project.champion()["run"] == "night-0001"
@@ -298,10 +308,10 @@ def test_gits_lock_left_by_a_killed_night_does_not_stop_the_next_one(project):
     (project.folder / ".git/index.lock").touch()
     (project.folder / ".git/refs/heads/main.lock").touch()
     project.record("second", [9.0, 9.0, 9.0])
-    status, said = night.nightly()
+    status, summary = night.nightly()
     assert (
         status == night.OK
-        and "was left by a killed git" in said
+        and "was left by a killed git" in summary
         and project.champion()["run"] == "night-0002"
     )
 
@@ -320,8 +330,8 @@ def test_a_promotion_on_a_branch_waits_for_a_person(project):
     before = project.production()
     project.set(promotion="branch")
     project.record("second", [9.0, 9.0, 9.0])
-    status, said = night.nightly()
-    assert status == night.OK and "git merge nightly" in said
+    status, summary = night.nightly()
+    assert status == night.OK and "git merge nightly" in summary
     assert project.production() == before and project.champion()["run"] == "night-0001"
     project.run("git", "add", "-A")
     project.run("git", "stash", "-q")
@@ -341,12 +351,12 @@ def test_nights_of_two_branches_are_merged_by_one_command(project):
     assert night.nightly()[0] == night.OK
     assert project.run("git", "merge", "other", check=False).returncode != 0  # by itself git cannot
     project.run("git", "merge", "--abort")
-    found = project.beadline("nightly", "--merge", "other")
-    assert found.returncode == 0, found
+    merged = project.beadline("nightly", "--merge", "other")
+    assert merged.returncode == 0, merged
     assert json.loads((project.folder / "datasets/learn/model.json").read_text()) == pytest.approx(
         np.mean([11, 9.5, 9.4])
     )
-    assert {line["run"] for line in champion.read()["history"]} >= {
+    assert {line.run for line in champion.read().history} >= {
         "night-0001",
         "night-0002",
     } and project.dirty() == []
@@ -358,8 +368,8 @@ def test_the_watchdog_wakes_somebody_when_the_last_success_is_old(project):
         alarm=f"{sys.executable} -c \"import sys,shutil; shutil.copy(sys.argv[1], 'woken.json')\"",
     )
     time.sleep(0.5)
-    status, said = night.watchdog()
-    assert status == night.FAILED and "nightly.watch_h allows 0.0001 h" in said
+    status, summary = night.watchdog()
+    assert status == night.FAILED and "nightly.watch_h allows 0.0001 h" in summary
     woken = json.loads((project.folder / "woken.json").read_text())
     assert woken["kind"] == "watch" and "last success was" in woken["reasons"][0]
 
@@ -368,11 +378,23 @@ def test_the_watchdog_wakes_somebody_when_the_last_success_is_old(project):
 def test_a_failed_night_wakes_somebody_and_an_alarm_that_fails_does_not_hide_it(project):
     project.set(alarm="no-such-command", webhook="http://127.0.0.1:9/none")
     project.record("bad", ["x"])
-    status, said = night.nightly()
+    status, summary = night.nightly()
     assert (
-        status == night.FAILED and "bad.csv" in said and "nightly.alarm" in said and "nightly.webhook" in said
+        status == night.FAILED
+        and "bad.csv" in summary
+        and "nightly.alarm" in summary
+        and "nightly.webhook" in summary
     )
     assert json.loads(watch.ALARM.read_text())["kind"] == "failed"
+
+
+def test_rollback_of_an_unknown_loop_names_the_loops(project):
+    with pytest.raises(
+        ValueError,
+        match=r"champion.json: expected a loop with a champion, found foo; loops with a champion are: toy$",
+    ):
+        night.rollback("", "foo")
+    assert not guarding.RUNNING.exists()
 
 
 def test_rollback_to_an_unknown_run_names_the_known_ones(project):
@@ -418,8 +440,8 @@ def test_killed_at_twenty_random_moments_the_champion_is_whole_and_the_next_nigh
         child.communicate()
         now = project.champion()
         assert now["run"] == before["run"] or now["run"] > before["run"]
-        status, said = night.nightly()
-        assert status == night.OK, f"after a kill at {share:.2f} of a night: {said}"
+        status, summary = night.nightly()
+        assert status == night.OK, f"after a kill at {share:.2f} of a night: {summary}"
         present = project.champion()
         assert champion.md5s(project.folder / "champion/toy") == present["files"] and project.dirty() == []
         assert not processes.orphans()
@@ -445,8 +467,8 @@ def test_a_sweep_runs_every_point_beside_the_working_tree_and_tabulates_it(proje
     )
     project.run("git", "commit", "-qam", "a parameter")
     before = (project.folder / "datasets/learn/model.json").read_bytes()
-    found = project.beadline("sweep", "-S", "shift=1,2", "--target", "learn", "--metric", "learn:mean")
-    assert found.returncode == 0, found
+    swept = project.beadline("sweep", "-S", "shift=1,2", "--target", "learn", "--metric", "learn:mean")
+    assert swept.returncode == 0, swept
     table = (project.folder / "reports/sweep.csv").read_text().splitlines()
     assert table == ["experiment,shift,learn:mean", "sweep-shift-1,1,12.0", "sweep-shift-2,2,13.0"]
     assert (
@@ -466,12 +488,12 @@ def test_a_sweep_finds_the_file_of_each_key(tmp_path, monkeypatch):
         sweeping, "dvc", lambda *words, log: asked.append(words[words.index("--set-param") : -1])
     )
     monkeypatch.setattr(sweeping, "git", lambda *words: '{"cost": 1}')
-    said = sweeping.sweep(["params.expert.yaml:learn.seed=1,2", "learn.window=3"], "learn", "learn:cost")
+    table = sweeping.sweep(["params.expert.yaml:learn.seed=1,2", "learn.window=3"], "learn", "learn:cost")
     assert asked == [
         ("--set-param", f"params.expert.yaml:learn.seed={seed}", "--set-param", "params.yaml:learn.window=3")
         for seed in (1, 2)
     ]
-    assert said.splitlines()[0].split() == ["experiment", "learn.seed", "learn.window", "learn:cost"]
+    assert table.splitlines()[0].split() == ["experiment", "learn.seed", "learn.window", "learn:cost"]
     with pytest.raises(
         ValueError, match=r"with a key of params.yaml or params.expert.yaml, found params.yaml:learn.seed=1; "
     ):
@@ -495,8 +517,8 @@ def test_a_change_of_either_file_of_parameters_is_something_new(tmp_path, monkey
 
 
 def test_a_sweep_over_a_key_that_is_not_there_is_refused(project):
-    found = project.beadline("sweep", "-S", "colour=1,2", "--target", "learn", "--metric", "learn:mean")
+    refused = project.beadline("sweep", "-S", "colour=1,2", "--target", "learn", "--metric", "learn:mean")
     assert (
-        found.returncode == 1
-        and "expected KEY=VALUE,VALUE with a key of params.yaml, found colour=1,2" in found.stderr
+        refused.returncode == 1
+        and "expected KEY=VALUE,VALUE with a key of params.yaml, found colour=1,2" in refused.stderr
     )

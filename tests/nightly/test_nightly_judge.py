@@ -96,10 +96,10 @@ def test_a_part_s_chosen_composer_is_its_case(project):
         "worst_line_volume_percent": [0.5, 90.0, np.nan],
     }  # fmt: skip
     artifacts.write_table("datasets/compose_parts/scores.parquet", SCORES, columns)
-    found = judge.judge(Loop(artifacts=["x"], judge="deposition", cases="", recordings=""), project).measure(
-        Path("datasets")
-    )
-    assert found.cases == {"a, A": ("a, A", 1.0), "b, A": ("b, A", 2.0)} and found.guards == {
+    evidence = judge.judge(
+        Loop(artifacts=["x"], judge="deposition", cases="", recordings=""), project
+    ).measure(Path("datasets"))
+    assert evidence.cases == {"a, A": ("a, A", 1.0), "b, A": ("b, A", 2.0)} and evidence.guards == {
         "worst_line_volume_percent": 0.5
     }
 
@@ -126,14 +126,14 @@ def test_a_setpoint_case_costs_the_runs_that_do_not_settle(project):
     }
     artifacts.write_table("datasets/evaluate_setpoint/scoreboard.parquet", tables.SCOREBOARD, filler | named)
     artifacts.write_json("datasets/evaluate_setpoint/choice.json", {"name": "ours"})
-    found = judge.judge(Loop(artifacts=["x"], judge="setpoint", cases="", recordings=""), project).measure(
+    evidence = judge.judge(Loop(artifacts=["x"], judge="setpoint", cases="", recordings=""), project).measure(
         Path("datasets")
     )
-    assert {name: cost for name, (_, cost) in found.cases.items()} == {
+    assert {name: cost for name, (_, cost) in evidence.cases.items()} == {
         "paper: calm": 2.0,
         "recorded: clog": 6.0,
     }
-    assert found.guards == {"worst_unsettled_percent": 6.0, "slowest_p90_steps": 30.0}
+    assert evidence.guards == {"worst_unsettled_percent": 6.0, "slowest_p90_steps": 30.0}
 
 
 def test_a_file_of_cases_that_lacks_its_costs_is_refused(project):

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from pipeline.deposition.workflow.tables import SCORES
-from pipeline.nightly import accepting, champion, inputs, night, screening, watch
+from pipeline.nightly import accepting, champion, inputs, night, remembered, screening, watch
+from pipeline.nightly.remembered import DriftMemory
 from pipeline.nightly.settings import Nightly
-from pipeline.report.shared.night import read
+from pipeline.report.nightly.record import Night
+from pipeline.report.shared.night import Alarm, LoopDrift, NightDrift
 from pipeline.setpoint.workflow import tables
 from pipeline.store import artifacts, params
 from tests.nightly.toy_nights import Project, entered
@@ -90,15 +92,16 @@ def test_a_better_challenger_is_promoted_and_a_worse_one_or_one_with_a_worse_gua
         monkeypatch.setattr(night, "_reproduce", lambda *_, of=(cost, guard): score(*of))
         project.record(f"night {k}", [10.0])
         Path("learn.py").write_text(f"# night {k}\n")  # something is new
-        status, said = night.nightly()
-        entry = night.nights()[-1]["decisions"][loop]
-        assert (
-            status == night.OK and entry["decision"] == decision and reason in " ".join(entry["reasons"])
-        ), (said, entry)
-        assert champion.read()["champions"][loop]["run"] == ("night-0005" if k >= 4 else "night-0001")
+        status, summary = night.nightly()
+        decided = night.nights()[-1].decisions[loop]
+        assert status == night.OK and decided.decision == decision and reason in " ".join(decided.reasons), (
+            summary,
+            decided,
+        )
+        assert champion.read().champions[loop].run == ("night-0005" if k >= 4 else "night-0001")
     # production holds what was promoted, not what was scored last
-    present = champion.read()["champions"][loop]["metrics"]["mean_cost"]
-    assert present == pytest.approx(8.0 + 0.35 + (1.0 if loop == "setpoint" else 0.0))
+    metrics = champion.read().champions[loop].metrics
+    assert metrics and metrics.mean_cost == pytest.approx(8.0 + 0.35 + (1.0 if loop == "setpoint" else 0.0))
 
 
 def test_a_recording_that_cannot_be_read_is_set_aside_and_the_scheduler_is_told(project, monkeypatch):
@@ -118,24 +121,24 @@ def test_a_recording_that_cannot_be_read_is_set_aside_and_the_scheduler_is_told(
     broken.parent.mkdir(parents=True)
     broken.write_bytes(b"\x89MCAP0\r\n half a file")
     Path("learn.py").write_text("# something else is new\n")
-    status, said = night.nightly()
-    assert status == night.QUARANTINED == 4 and "trial_7.mcap" in said
+    status, summary = night.nightly()
+    assert status == night.QUARANTINED == 4 and "trial_7.mcap" in summary
     assert not broken.exists() and (inputs.QUARANTINE / "deposition/trial_7.mcap").read_bytes().endswith(
         b"half a file"
     )
-    assert champion.read()["champions"]["deposition"]["run"] == "night-0001"
-    told = artifacts.read_json(watch.ALARM)
-    assert told["kind"] == "quarantined" and "trial_7.mcap" in told["reasons"][0]
+    assert champion.read().champions["deposition"].run == "night-0001"
+    alarm = artifacts.read_json(watch.ALARM)
+    assert alarm["kind"] == "quarantined" and "trial_7.mcap" in alarm["reasons"][0]
     assert "Bad recordings are set aside." in Path("reports/nightly.html").read_text()
 
 
 def test_the_gravest_of_a_night_is_its_exit_status():
-    aside, alarm = {"quarantined": {"a": "b"}}, {"drift": read({"alarms": [{"loop": "toy", "cause": "c"}]})}
-    found = [
-        night._status({"outcome": "kept"} | more)
-        for more in ({}, aside, aside | alarm, aside | alarm | {"outcome": "failed"}, {"unpushed": True})
-    ]
-    assert found == [0, 4, 3, 1, 1]
+    alarm = Alarm("toy", "key", "a.csv", "cause", 9.0)
+    quiet = Night(1, "night-0001", "2030-01-01T02:00:00+00:00", "kept")
+    set_aside = quiet._replace(quarantined={"a.csv": "reason"})
+    drifted = set_aside._replace(drift=NightDrift({"toy": LoopDrift.none("toy")._replace(alarms=[alarm])}))
+    gravest = (quiet, set_aside, drifted, drifted.ended("failed"), quiet._replace(unpushed=True))
+    assert [night._status(record) for record in gravest] == [0, 4, 3, 1, 1]
 
 
 def test_drift_that_is_meant_is_accepted_by_hand_and_the_champion_stays(project, monkeypatch):
@@ -157,12 +160,13 @@ def test_drift_that_is_meant_is_accepted_by_hand_and_the_champion_stays(project,
     ):
         accepting.accept("deposition", "a new camera")
     before = project.production_of("deposition")
+    # as version 0.1 wrote it
     memory = {
         "alarms": [{"loop": "deposition"}],
         "pending": ["deposition: camera"],
         "drifted": {"deposition": ["trial_8.mcap"]},
     }
-    artifacts.write_json(watch.LAST, watch.last() | {"drift": memory})
+    artifacts.write_json(remembered.LAST, artifacts.read_json(remembered.LAST) | {"drift": memory})
     monkeypatch.setattr(
         screening,
         "reference",
@@ -171,11 +175,11 @@ def test_drift_that_is_meant_is_accepted_by_hand_and_the_champion_stays(project,
     assert "is held against trial_8.mcap from now on" in accepting.accept("deposition", "a new camera")
     after = project.production_of("deposition")
     assert artifacts.read_json("champion/deposition/reference.json")["camera"] == ["trial_8.mcap"]
-    assert {name: after[name] for name in before} == before and watch.last()["drift"]["drifted"] == {
+    assert {name: after[name] for name in before} == before and remembered.last().drift.drifted == {
         "deposition": []
     }
-    line = champion.read()["history"][-1]
-    assert (line["event"], line["why"], line["run"]) == ("drift accepted", "a new camera", "night-0001")
+    line = champion.read().history[-1]
+    assert (line.event, line.why, line.run) == ("drift accepted", "a new camera", "night-0001")
     assert not any(entry.endswith(("champion.json", ".dvc")) for entry in project.dirty())
 
 
@@ -187,17 +191,20 @@ def test_an_alarm_of_the_setpoint_camera_changes_nothing_for_another_loop(projec
     project.set(loops=both)
     monkeypatch.setattr(night, "_reproduce", lambda *_: (deposition(10.0, 2.0), setpoint(10.0, 2.0)))
     assert night.nightly()[0] == night.OK
-    raised = {"loop": "setpoint", "cause": "the line stands out by 25 gray levels", "sigmas": 9.0}
-    memory = {"alarms": [raised], "pending": [], "drifted": {"setpoint": ["print_8.csv"]}, "night": 1}
-    artifacts.write_json(watch.LAST, watch.last() | {"drift": memory})
+    raised = Alarm(
+        "setpoint", "setpoint: contrast", "print_8.csv", "the line stands out by 25 gray levels", 9.0
+    )
+    memory = DriftMemory((), (raised,), {"setpoint": ["print_8.csv"]}, night=1)
+    remembered.remember(remembered.last()._replace(drift=memory))
     monkeypatch.setattr(night, "_reproduce", lambda *_: (deposition(5.0, 2.0), setpoint(5.0, 2.0)))
     Path("learn.py").write_text("# something is new\n")
     status, summary = night.nightly()
-    entry = night.nights()[-1]
-    # the camera's loop keeps its champion, the other one is promoted as on any night
-    assert status == night.DRIFTED and entry["promoted"] == ["deposition"], summary
-    assert not any("drift" in reason for reason in entry["decisions"]["deposition"]["reasons"])
-    assert "drift: the line stands out" in " ".join(entry["decisions"]["setpoint"]["reasons"])
+    tonight = night.nights()[-1]
+    # the setpoint loop, whose camera it is, keeps its champion; the other is promoted as on any night
+    assert status == night.DRIFTED and tonight.promoted == ("deposition",), summary
+    assert tonight.drift.of("setpoint").alarms == [raised] and tonight.drift.of("deposition").alarms == []
+    assert not any("drift" in reason for reason in tonight.decisions["deposition"].reasons)
+    assert "drift: the line stands out" in " ".join(tonight.decisions["setpoint"].reasons)
     html = Path("reports/nightly.html").read_text()
     assert "Drift of setpoint; promoted: deposition." in html and "--accept-drift setpoint" in html
     assert "machine has drifted" not in html and "--accept-drift deposition" not in html

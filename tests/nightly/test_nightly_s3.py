@@ -60,8 +60,8 @@ def test_a_night_pushes_to_s3_and_a_fresh_clone_has_the_champion_bit_by_bit(serv
     project.run(*dvc, "remote", "modify", "-q", "store", "endpointurl", server)
     project.set(remote="store")
     project.run("git", "commit", "-qam", "a remote")
-    found = project.night()
-    assert found.returncode == 0 and "not on remote" not in found.stdout, found
+    ended = project.night()
+    assert ended.returncode == 0 and "not on remote" not in ended.stdout, ended
     project.run("git", "clone", "-q", str(project.folder), str(tmp_path / "clone"))
     clone = Project(tmp_path / "clone")
     clone.env = project.env

@@ -9,12 +9,14 @@ import yaml
 
 from benchmarks import nights
 from pipeline.nightly import inputs, screening
+from pipeline.nightly.remembered import DriftMemory
 from pipeline.nightly.settings import Nightly
-from pipeline.report.shared.night import alarm_of
+from pipeline.report.shared.night import Alarm
 from pipeline.store import artifacts, params
 from pipeline.temperature import identification, plant
 
-STATE = {"champions": {"temperature": {}}}
+CHAMPIONS = {"temperature"}
+NOTHING = DriftMemory()
 RAW = Path("datasets/raw/temperature")
 CALM = {"dither": 1.0}
 
@@ -29,7 +31,7 @@ def commissioned(folder, loop):
         for k, columns in enumerate(shifts):
             nights.write(RAW / f"shift_{k}.csv", columns)
         u, y = (
-            [np.column_stack([one[f"{kind}_1"], one[f"{kind}_2"]]) for one in shifts]
+            [np.column_stack([shift[f"{kind}_1"], shift[f"{kind}_2"]]) for shift in shifts]
             for kind in ("heater", "sensor")
         )
         model = identification.identify(
@@ -66,12 +68,12 @@ def calm(tmp_path_factory):
 NEW = RAW / "new.csv"
 
 
-def screened(columns, memory=None):
+def screened(columns, memory=NOTHING):
     """The screening of one new shift."""
     nights.write(NEW, columns)
     try:
         return screening.look(
-            params.load(Nightly, "nightly"), STATE, {"temperature": {str(NEW): "new"}}, memory or {}, night=9
+            params.load(Nightly, "nightly"), CHAMPIONS, {"temperature": {str(NEW): "new"}}, memory, night=9
         )
     finally:
         NEW.unlink(missing_ok=True)
@@ -85,8 +87,8 @@ def look(made, monkeypatch):
 
 def test_a_good_shift_raises_nothing(look):
     for k in range(5):
-        found = look(nights.a_night(1, 100 + k))
-        assert found.drift.alarms == [] and found.drift.quarantined == {}, found
+        result = look(nights.a_night(1, 100 + k))
+        assert result.drift.alarms == [] and result.drift.quarantined == {}, result
 
 
 @pytest.mark.parametrize(
@@ -98,13 +100,13 @@ def test_a_good_shift_raises_nothing(look):
     ],
 )
 def test_ten_percent_of_drift_is_named_within_two_nights(look, changes, words):
-    memory = {}
+    memory = NOTHING
     for k in (200, 201):
-        found = look(nights.a_night(1, k, **changes), memory)
-        memory = found.memory
-        if found.drift.alarms:
+        result = look(nights.a_night(1, k, **changes), memory)
+        memory = result.memory
+        if result.drift.alarms:
             break
-    assert any(words in alarm.cause for alarm in found.drift.alarms), found.drift.alarms
+    assert any(words in alarm.cause for alarm in result.drift.alarms), result.drift.alarms
 
 
 @pytest.mark.parametrize(
@@ -125,34 +127,33 @@ def test_a_loop_that_settles_elsewhere_works_harder_or_saturates_is_found_within
     calm, monkeypatch, changes, words
 ):
     monkeypatch.chdir(calm)
-    memory = {}
+    memory = NOTHING
     for k in (250, 251):
-        found = screened(nights.a_night(1, k, **changes), memory)
-        memory = found.memory
-        if any(alarm.cause.startswith(words) for alarm in found.drift.alarms):
+        result = screened(nights.a_night(1, k, **changes), memory)
+        memory = result.memory
+        if any(alarm.cause.startswith(words) for alarm in result.drift.alarms):
             break
-    assert any(alarm.cause.startswith(words) for alarm in found.drift.alarms), (
-        found.drift.alarms,
-        found.drift.watched,
+    assert any(alarm.cause.startswith(words) for alarm in result.drift.alarms), (
+        result.drift.alarms,
+        result.drift.watched,
     )
     # the plant has not changed
-    assert not any("gain" in alarm.cause or "time constant" in alarm.cause for alarm in found.drift.alarms)
+    assert not any("gain" in alarm.cause or "time constant" in alarm.cause for alarm in result.drift.alarms)
 
 
 def test_good_shifts_of_production_raise_nothing(calm, monkeypatch):
     monkeypatch.chdir(calm)
     for k in range(5):
-        found = screened(nights.a_night(1, 400 + k, loop=CALM))
+        result = screened(nights.a_night(1, 400 + k, loop=CALM))
         assert (
-            found.drift.alarms == []
-            and "sensor_1 offset_degC" in found.drift.figures[str(NEW)]["closed_loop"]
-        ), found
+            result.drift.alarms == [] and "sensor_1 offset_degC" in result.drift.figures[str(NEW)].closed_loop
+        ), result
 
 
 def test_swapped_sensors_are_set_aside_with_the_reason_beside_them(look):
     good = nights.a_night(1, 300)
-    found = look(good | {"sensor_1": good["sensor_2"], "sensor_2": good["sensor_1"]})
-    assert "the sensors sensor_1 and sensor_2 are swapped" in found.drift.quarantined[str(NEW)]
+    result = look(good | {"sensor_1": good["sensor_2"], "sensor_2": good["sensor_1"]})
+    assert "the sensors sensor_1 and sensor_2 are swapped" in result.drift.quarantined[str(NEW)]
     assert (inputs.QUARANTINE / "temperature/new.csv").exists()
     assert "swapped" in (inputs.QUARANTINE / "temperature/new.csv.reason.txt").read_text()
     # another of the same name does not take its place
@@ -165,19 +166,18 @@ def test_swapped_sensors_are_set_aside_with_the_reason_beside_them(look):
 
 
 def test_a_night_without_recordings_keeps_the_alarm_of_the_one_before(look):
-    alarm = {"loop": "temperature", "cause": "the gain from heater_1 has changed by -10 %"}
-    found = screening.look(
-        params.load(Nightly, "nightly"), STATE, {"temperature": {}}, {"alarms": [alarm]}, night=9
+    cause = "the gain from heater_1 has changed by -10 %"
+    alarm = Alarm("temperature", "temperature: plant at heater_1", "shift_8.csv", cause, -9.0)
+    result = screening.look(
+        params.load(Nightly, "nightly"), CHAMPIONS, {"temperature": {}}, DriftMemory(alarms=(alarm,)), night=9
     )
-    assert (
-        found.drift.of("temperature").alarms == [alarm_of(alarm)] and found.drift.of("setpoint").alarms == []
-    )
+    assert result.drift.of("temperature").alarms == [alarm] and result.drift.of("setpoint").alarms == []
 
 
 def test_what_drifted_is_remembered_until_a_good_night_and_can_be_what_later_nights_are_held_against(look):
-    found = look(nights.a_night(1, 200, gain=(0.9, 1.0)))
-    assert found.drift.alarms and found.memory["drifted"] == {"temperature": [str(NEW)]}
-    assert look(nights.a_night(1, 101), found.memory).memory["drifted"] == {"temperature": []}
+    result = look(nights.a_night(1, 200, gain=(0.9, 1.0)))
+    assert result.drift.alarms and result.memory.drifted == {"temperature": [str(NEW)]}
+    assert look(nights.a_night(1, 101), result.memory).memory.drifted == {"temperature": []}
     # held against one drifted shift alone, another one like it is no news, and a shift as before is
     folder, loop = Path("champion/temperature"), params.load(Nightly, "nightly").loops["temperature"]
     before = artifacts.read_json(folder / screening.REFERENCE)

@@ -125,11 +125,11 @@ class Project:
         return path
 
     def run(self, *command: str, check: bool = True) -> subprocess.CompletedProcess:
-        found = subprocess.run(
+        ended = subprocess.run(
             command, check=False, cwd=self.folder, env=self.env, capture_output=True, text=True
         )
-        assert not check or found.returncode == 0, f"{command}: {found.stdout}{found.stderr}"
-        return found
+        assert not check or ended.returncode == 0, f"{command}: {ended.stdout}{ended.stderr}"
+        return ended
 
     def beadline(self, *arguments: str) -> subprocess.CompletedProcess:
         return self.run(sys.executable, "-m", "pipeline.cli", *arguments, check=False)
@@ -152,8 +152,8 @@ class Project:
 
     def champion(self) -> dict:
         """As the last commit has it."""
-        found = self.run("git", "show", "HEAD:champion.json", check=False)
-        return json.loads(found.stdout)["champions"]["toy"] if found.returncode == 0 else {}
+        shown = self.run("git", "show", "HEAD:champion.json", check=False)
+        return json.loads(shown.stdout)["champions"]["toy"] if shown.returncode == 0 else {}
 
     def production(self) -> dict[str, bytes]:
         return self.production_of("toy")

@@ -2,16 +2,20 @@
 production when, and whether anybody is watching."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from markupsafe import Markup
 
 from pipeline.nightly.settings import Nightly
+from pipeline.report.nightly import record
+from pipeline.report.nightly.production import ChampionState, HistoryLine
+from pipeline.report.nightly.record import Guard, LoopDecision, Night
 from pipeline.report.shared import charts, page
-from pipeline.report.shared import night as records
 from pipeline.report.shared.digits import count, number, short
+from pipeline.report.shared.night import PLANT
 from pipeline.report.shared.verdict import FAILED, OPEN, PASSED
+from pipeline.statistics import Paired
 
 SHOWN = 40  # nights in the table, the newest first
 REACH = 20.0  # percent: half the width of the picture of the plant's parameters
@@ -32,149 +36,166 @@ LOOP = {
 }
 
 
-def render(nights: Sequence[Mapping[str, Any]], state: Mapping[str, Any], settings: Nightly) -> str:
+def render(nights: Sequence[Night], state: ChampionState, settings: Nightly) -> str:
     """The whole page; `nights` as the job remembers them, the oldest first, the
     last of them tonight's; `state` is champion.json."""
     tonight = nights[-1]
-    drift = records.read(tonight.get("drift"))
-    measured = next((night for night in reversed(nights) if night.get("drift", {}).get("figures")), None)
-    good = [night for night in nights if night["outcome"] != "failed"]
+    measured = next((night for night in reversed(nights) if night.drift.figures), None)
     return page.render(
-        "nightly.html", here="nightly", title=_head(tonight)[0], verdict=_verdict(tonight, state),
-        champions=_champions(state), decisions=_decisions(tonight),
-        drift=_drift(measured, settings) if measured else None, alarms=drift.alarms, watched=drift.watched,
-        pictures=_pictures(nights, settings), nights=[_row(night) for night in reversed(nights[-SHOWN:])],
+        "nightly.html",
+        here="nightly",
+        title=_head(tonight)[0],
+        verdict=_verdict(tonight),
+        champions=_champions(state),
+        decisions=[_decision(name, decision) for name, decision in tonight.decisions.items()],
+        drift=_drift(measured, settings) if measured else None,
+        alarms=tonight.drift.alarms,
+        watched=tonight.drift.watched,
+        pictures=_pictures(nights, settings),
+        nights=[_row(night) for night in reversed(nights[-SHOWN:])],
         more=max(len(nights) - SHOWN, 0),
-        history=[_line(line) for line in reversed(state["history"])],
-        quarantined=tonight.get("quarantined", {}), notes=tonight.get("notes", []),
-        watch={"last": _when(good[-1]["when"]) if good else "never", "run": good[-1]["run"] if good else "",
-        "hours": f"{settings.watch_h:g}",
-               "alarm": settings.alarm or "none is set", "webhook": settings.webhook or "none is set"},
-        rule=_rule(settings), state=PASSED if _head(tonight)[1] == PASSED else FAILED,
-    )  # fmt: skip
+        history=[_line(line) for line in reversed(state.history)],
+        quarantined=tonight.quarantined,
+        notes=tonight.notes,
+        watch=_watch(nights, settings),
+        rule=_rule(settings),
+        state=_head(tonight)[1],
+    )
 
 
 def _when(text: str) -> str:
     return text[:16].replace("T", " ") + " UTC"
 
 
-def _head(night: Mapping[str, Any]) -> tuple[str, str]:
-    drifted = _drifted(night)
-    if night["outcome"] == "failed":
+def _watch(nights: Sequence[Night], settings: Nightly) -> dict[str, str]:
+    good = [night for night in nights if night.outcome != record.FAILED]
+    return {
+        "last": _when(good[-1].when) if good else "never",
+        "run": good[-1].run if good else "",
+        "hours": f"{settings.watch_h:g}",
+        "alarm": settings.alarm or "none is set",
+        "webhook": settings.webhook or "none is set",
+    }
+
+
+def _head(night: Night) -> tuple[str, str]:
+    """The decision in a sentence, and whether it is as it should be."""
+    drifted, promoted = _drifted(night), ", ".join(night.promoted)
+    if night.outcome == record.FAILED:
         return "The night failed; the champions stay.", FAILED
     if drifted:
-        what = "The machine has drifted" if drifted == [records.PLANT] else f"Drift of {', '.join(drifted)}"
-        promoted = ", ".join(night.get("promoted", []))
+        what = "The machine has drifted" if drifted == [PLANT] else f"Drift of {', '.join(drifted)}"
         return (f"{what}; promoted: {promoted}." if promoted else f"{what}; the champions stay."), FAILED
-    if night["outcome"] == "quarantined":
+    if night.outcome == record.QUARANTINED:
         return "Bad recordings are set aside; the champions stay.", FAILED
-    head = f"Promoted: {', '.join(night['promoted'])}." if night.get("promoted") else "The champions stay."
-    return (f"{head} Bad recordings are set aside.", FAILED) if night.get("quarantined") else (head, PASSED)
+    head = f"Promoted: {promoted}." if promoted else "The champions stay."
+    return (f"{head} Bad recordings are set aside.", FAILED) if night.quarantined else (head, PASSED)
 
 
-def _drifted(night: Mapping[str, Any]) -> list[str]:
+def _drifted(night: Night) -> list[str]:
     """The loops that raised an alarm."""
-    return list(dict.fromkeys(alarm.loop for alarm in records.read(night.get("drift")).alarms))
+    return list(dict.fromkeys(alarm.loop for alarm in night.drift.alarms))
 
 
-def _verdict(night: Mapping[str, Any], state: Mapping[str, Any]) -> dict[str, Any]:
+def _verdict(night: Night) -> dict[str, Any]:
     head, kind = _head(night)
-    alarms, drifted = records.read(night.get("drift")).alarms, _drifted(night)
+    drifted = [] if night.outcome == record.FAILED else _drifted(night)
+    causes = [alarm.cause for alarm in night.drift.alarms]
     reasons = (
         # of the loops that did not drift is said what is said on any night
-        [*(alarm.cause for alarm in alarms), *_reasons(night, without=drifted)]
-        if alarms and night["outcome"] != "failed"
-        else [*_reasons(night), *night.get("quarantined", {}).values()]
+        [*causes, *_reasons(night, without=drifted)]
+        if drifted
+        else [*_reasons(night), *night.quarantined.values()]
     )
-    remedy = {
-        "failed": (
-            "Nothing of what is in production has changed. "
-            f"The log is .beadline/logs/{night['run']}.log; mend the cause, and the next night works."
-        ),
-        "promoted": "To go back: ./run beadline rollback.",
-    }.get(night["outcome"], "")
-    if night.get("quarantined"):
-        remedy = (
-            f"{remedy} They lie in datasets/quarantine, unchanged, each with its reason beside it; mend them "
-            "and put them back."
-        ).strip()
-    if alarms and night["outcome"] != "failed":
-        remedy = (
-            f"No challenger of {'this loop' if len(drifted) == 1 else 'these loops'} is promoted while this "
-            "lasts. Look at the machine; where the change is meant to stay: "
-            + " and ".join(f'./run beadline nightly --accept-drift {loop} "WHY"' for loop in drifted)
-            + "."
-        )
     return {
         "state": "failed" if kind == FAILED else "passed",
         "decision": head,
-        "lead": f"{night['run']}, {_when(night['when'])}:",
+        "lead": f"{night.run}, {_when(night.when)}:",
         "reason": "; ".join(reasons),
-        "remedy": remedy,
+        "remedy": _remedy(night, drifted),
     }
 
 
-def _reasons(night: Mapping[str, Any], *, without: Sequence[str] = ()) -> list[str]:
+def _remedy(night: Night, drifted: Sequence[str]) -> str:
+    """What to do; `drifted` are the loops whose alarm stands."""
+    if drifted:
+        commands = (f'./run beadline nightly --accept-drift {loop} "WHY"' for loop in drifted)
+        return (
+            f"No challenger of {'this loop' if len(drifted) == 1 else 'these loops'} is promoted while this "
+            f"lasts. Look at the machine; where the change is meant to stay: {' and '.join(commands)}."
+        )
+    remedy = {
+        record.FAILED: (
+            "Nothing of what is in production has changed. "
+            f"The log is .beadline/logs/{night.run}.log; mend the cause, and the next night works."
+        ),
+        record.PROMOTED: "To go back: ./run beadline rollback.",
+    }.get(night.outcome, "")
+    if not night.quarantined:
+        return remedy
+    set_aside = (
+        "They lie in datasets/quarantine, unchanged, each with its reason beside it; mend them and put them "
+        "back."
+    )
+    return f"{remedy} {set_aside}".strip()
+
+
+def _reasons(night: Night, *, without: Sequence[str] = ()) -> list[str]:
     """The night's reasons, those that several loops share once; of the loops `without` nothing."""
     loops: dict[str, list[str]] = {}
-    for name, decision in night.get("decisions", {}).items():
+    for name, decision in night.decisions.items():
         if name not in without:
-            loops.setdefault("; ".join(decision["reasons"]), []).append(name)
+            loops.setdefault("; ".join(decision.reasons), []).append(name)
     by_loop = [f"{', '.join(names)}: {reason}" for reason, names in loops.items()]
-    return by_loop if by_loop or without else list(night.get("reasons", []))
+    return by_loop if by_loop or without else list(night.reasons)
 
 
-def _champions(state: Mapping[str, Any]) -> list[dict[str, str]]:
+def _champions(state: ChampionState) -> list[dict[str, str]]:
     return [
-        {
-            "loop": name,
-            "run": entry["run"],
-            "since": _when(entry.get("since", entry["when"])),
-            "hash": entry["folder"]["md5"][:12],
-            "commit": entry["lineage"]["commit"][:12],
-        }
-        for name, entry in state["champions"].items()
+        {"loop": name, "run": champion.run, "since": _when(champion.since or champion.when)}
+        for name, champion in state.champions.items()
     ]
 
 
-def _decisions(night: Mapping[str, Any]) -> list[dict[str, Any]]:
-    rows = []
-    for name, decision in night.get("decisions", {}).items():
-        guards = [_guard(guard, figures) for guard, figures in decision.get("guards", {}).items()]
-        rows.append(
-            {
-                "loop": name,
-                "decision": decision["decision"],
-                "reasons": decision["reasons"],
-                "paired": _paired(decision.get("paired")),
-                "guards": guards,
-                "compared": any(guard["champion"] for guard in guards),
-            }
-        )
-    return rows
-
-
-def _guard(name: str, figures: Mapping[str, float | None]) -> dict[str, Any]:
-    champion, challenger, allowed = (figures.get(key) for key in ("champion", "challenger", "allowed"))
+def _decision(name: str, decision: LoopDecision) -> dict[str, Any]:
+    guards = [_guard(guard, figures) for guard, figures in (decision.guards or {}).items()]
     return {
-        "name": GUARDS.get(name, name),
-        "champion": _figure(champion),
-        "challenger": _figure(challenger),
-        "allowed": _figure(allowed),
-        "bad": champion is not None and challenger > champion + allowed + 1e-9 * abs(champion),
+        "loop": name,
+        "decision": decision.decision,
+        "reasons": decision.reasons,
+        "paired": _paired(decision.paired),
+        "guards": guards,
+        "compared": any(guard["champion"] for guard in guards),
     }
 
 
-def _paired(test: Mapping[str, float] | None) -> str:
+def _guard(name: str, guard: Guard) -> dict[str, Any]:
+    return {
+        "name": GUARDS.get(name, name),
+        "champion": _figure(guard.champion),
+        "challenger": _figure(guard.challenger),
+        "allowed": _figure(guard.allowed),
+        "bad": _worse_than_allowed(guard),
+    }
+
+
+def _worse_than_allowed(guard: Guard) -> bool:
+    champion, challenger, allowed = guard
+    if champion is None or challenger is None or allowed is None:
+        return False
+    return challenger > champion + allowed + 1e-9 * abs(champion)
+
+
+def _paired(test: Paired | None) -> str:
     if not test:
         return ""
-    low, high = number(test["low_percent"], 1), number(test["high_percent"], 1)
-    word = "less" if test["improvement_percent"] >= 0 else "more"
+    low, high = number(test.low_percent, 1), number(test.high_percent, 1)
+    word = "less" if test.improvement_percent >= 0 else "more"
     return (
-        f"The challenger's cases cost {number(abs(test['improvement_percent']), 1)} % {word} (90 % interval "
+        f"The challenger's cases cost {number(abs(test.improvement_percent), 1)} % {word} (90 % interval "
         f"of the saving {low} to {high} %); chance alone does as well with "
-        f"probability {short(test['p'], 2)}, by a sign-flip test over {count(test['blocks'], 'block')} of "
-        f"{count(test['cases'], 'case')}."
+        f"probability {short(test.p, 2)}, by a sign-flip test over {count(test.blocks, 'block')} of "
+        f"{count(test.cases, 'case')}."
     )
 
 
@@ -193,36 +214,34 @@ def _rule(settings: Nightly) -> str:
 # ---- drift
 
 
-def _drift(night: Mapping[str, Any], settings: Nightly) -> dict[str, Any]:
-    path, figures = list(night["drift"]["figures"].items())[-1]
+def _drift(night: Night, settings: Nightly) -> dict[str, Any]:
+    path, figures = list(night.drift.figures.items())[-1]
     limit = settings.drift.parameter_percent
     rows = [
-        {"name": name, "value": f"{number(one['percent'], 1)} %",
-        "band": f"± {number(one['band_percent'], 1)}", "sigmas": number(one["sigmas"], 1),
-         "svg": _interval(name, one["percent"], one["band_percent"], limit),
-         "bad": abs(one["percent"]) >= limit and abs(one["sigmas"]) >= settings.drift.watch_sigmas}
-        for name, one in figures["parameters"].items()
+        {"name": name, "value": f"{number(change.percent, 1)} %",
+        "band": f"± {number(change.band_percent, 1)}", "sigmas": number(change.sigmas, 1),
+         "svg": _interval(name, change.percent, change.band_percent, limit),
+         "bad": abs(change.percent) >= limit and abs(change.sigmas) >= settings.drift.watch_sigmas}
+        for name, change in figures.parameters.items()
     ]  # fmt: skip
     innovation = [
-        {"name": name, "noise": f"{number(one['noise_percent'], 0)} %",
-        "noise_sigmas": number(one["noise_sigmas"], 1), "mean": f"{short(one['mean_degC'], 2)} °C",
-         "mean_sigmas": number(one["mean_sigmas"], 1)}
-        for name, one in figures["innovation"].items()
+        {"name": output, "noise": f"{number(errors.noise_percent, 0)} %",
+        "noise_sigmas": number(errors.noise_sigmas, 1), "mean": f"{short(errors.mean_degC, 2)} °C",
+         "mean_sigmas": number(errors.mean_sigmas, 1)}
+        for output, errors in figures.innovation.items()
     ]  # fmt: skip
-    loop = figures["closed_loop"]
-    worst = sorted(
-        ((abs(one["sigmas"]), name, one) for name, one in loop.items() if isinstance(one, dict)), reverse=True
-    )[:6]
+    by_sigmas = ((abs(change.sigmas), name, change) for name, change in figures.closed_loop.items())
+    worst = sorted(by_sigmas, reverse=True)[:6]
     return {
         "recording": path,
-        "run": night["run"],
+        "run": night.run,
         "rows": rows,
         "innovation": innovation,
         "limit": f"{limit:g}",
-        "not_applicable": loop.get("not_applicable") or "",
+        "not_applicable": figures.not_applicable,
         "loop": [
-            {"name": _words(name), "moved": number(one["moved"], 2), "sigmas": number(one["sigmas"], 1)}
-            for _, name, one in worst
+            {"name": _words(name), "moved": number(change.moved, 2), "sigmas": number(change.sigmas, 1)}
+            for _, name, change in worst
         ],
     }
 
@@ -268,18 +287,14 @@ def _nights_axis(x: Sequence[int]) -> charts.Axis:
     return charts.Axis(x[0], x[-1], tuple((float(k), str(k)) for k in range(x[0], x[-1] + 1, every)))
 
 
-def _pictures(nights: Sequence[Mapping[str, Any]], settings: Nightly) -> list[dict[str, Any]]:
+def _pictures(nights: Sequence[Night], settings: Nightly) -> list[dict[str, Any]]:
     """The largest change of the plant's parameters, night by night, in sigmas, beside the alarm."""
     x, y = [], []
     for night in nights:
-        figures = night.get("drift", {}).get("figures", {})
-        if figures:
-            x.append(night["night"])
-            y.append(
-                max(
-                    abs(one["sigmas"]) for figure in figures.values() for one in figure["parameters"].values()
-                )
-            )
+        if figures := night.drift.figures.values():
+            changes = [change for recording in figures for change in recording.parameters.values()]
+            x.append(night.number)
+            y.append(max(abs(change.sigmas) for change in changes))
     if len(x) < 2:
         return []
     top = max(*y, settings.drift.alarm_sigmas) * 1.15
@@ -305,31 +320,30 @@ def _pictures(nights: Sequence[Mapping[str, Any]], settings: Nightly) -> list[di
 # ---- the nights
 
 
-def _row(night: Mapping[str, Any]) -> dict[str, Any]:
-    alarms = [alarm.cause for alarm in records.read(night.get("drift")).alarms]
-    state = (
-        FAILED
-        if night["outcome"] == "failed" or night.get("quarantined") or alarms
-        else OPEN
-        if night["outcome"] == "nothing new"
-        else PASSED
-    )
-    reasons = "; ".join([*_reasons(night), *night.get("quarantined", {}).values()])
+def _row(night: Night) -> dict[str, Any]:
+    causes = [alarm.cause for alarm in night.drift.alarms]
+    state = OPEN if night.outcome == record.NOTHING_NEW else PASSED
+    if night.outcome == record.FAILED or night.quarantined or causes:
+        state = FAILED
+    reasons = "; ".join([*_reasons(night), *night.quarantined.values()])
     return {
-        "run": night["run"], "when": _when(night["when"]), "state": state, "outcome": night["outcome"],
-        "new": sum(map(len, night.get("new_recordings", {}).values())),
-        "reasons": "; ".join([*(alarm for alarm in alarms if alarm not in reasons), reasons]),
-        "seconds": number(night.get("seconds", 0), 0),
-    }  # fmt: skip
+        "run": night.run,
+        "when": _when(night.when),
+        "state": state,
+        "outcome": night.outcome,
+        "new": sum(map(len, night.new_recordings.values())),
+        "reasons": "; ".join([*(cause for cause in causes if cause not in reasons), reasons]),
+        "seconds": number(night.seconds or 0, 0),
+    }
 
 
-def _line(line: Mapping[str, Any]) -> dict[str, str]:
+def _line(line: HistoryLine) -> dict[str, str]:
     return {
-        "when": _when(line["when"]),
-        "loop": line["loop"],
-        "run": line["run"],
-        "event": line["event"],
-        "before": line["before"] or "nothing",
-        "why": line["why"],
-        "hash": line["champion"]["folder"]["md5"][:12],
+        "when": _when(line.when),
+        "loop": line.loop,
+        "run": line.run,
+        "event": line.event,
+        "before": line.before or "nothing",
+        "why": line.why,
+        "hash": line.champion.md5[:12],
     }

@@ -18,6 +18,60 @@ class Alarm(NamedTuple):
     consequences: tuple[str, ...] = ()
 
 
+class ParameterChange(NamedTuple):
+    """Change of one parameter of the plant in percent, half of its 90 % band in percent, and in sigmas."""
+
+    percent: float
+    band_percent: float
+    sigmas: float
+
+
+class InnovationChange(NamedTuple):
+    """Of one output: by how much the observer's one-step errors scatter more in percent, and by how much
+    their mean has moved in °C; both also in sigmas."""
+
+    noise_percent: float
+    noise_sigmas: float
+    mean_degC: float
+    mean_sigmas: float
+
+
+class ClosedLoopChange(NamedTuple):
+    """By how much a figure of the closed loop has moved, in its own unit and in sigmas."""
+
+    moved: float
+    sigmas: float
+
+
+class RecordingFigures(NamedTuple):
+    """What the champion's observer measured on one recording, against the champion's own: by parameter of the
+    plant, by output, and by figure of the closed loop. `not_applicable` is why the closed loop was not asked,
+    empty where it was."""
+
+    parameters: Mapping[str, ParameterChange]
+    innovation: Mapping[str, InnovationChange] = {}
+    closed_loop: Mapping[str, ClosedLoopChange] = {}
+    not_applicable: str = ""
+
+    @classmethod
+    def read(cls, fields: Mapping[str, Any]) -> "RecordingFigures":
+        loop = fields.get("closed_loop") or {}
+        return cls(
+            {name: ParameterChange(**change) for name, change in (fields.get("parameters") or {}).items()},
+            {name: InnovationChange(**change) for name, change in (fields.get("innovation") or {}).items()},
+            {name: ClosedLoopChange(**moved) for name, moved in loop.items() if isinstance(moved, dict)},
+            loop.get("not_applicable") or "",
+        )
+
+    def written(self) -> dict[str, Any]:
+        loop: dict[str, Any] = {name: moved._asdict() for name, moved in self.closed_loop.items()}
+        return {
+            "parameters": {name: change._asdict() for name, change in self.parameters.items()},
+            "innovation": {name: change._asdict() for name, change in self.innovation.items()},
+            "closed_loop": {"not_applicable": self.not_applicable} if self.not_applicable else loop,
+        }
+
+
 class LoopDrift(NamedTuple):
     """Of one loop: alarms, what would be one if it stayed, and the plant's figures by recording.
     `quarantined` has the reason of each recording that was set aside."""
@@ -25,7 +79,7 @@ class LoopDrift(NamedTuple):
     loop: str
     alarms: list[Alarm]
     watched: list[Alarm]
-    figures: dict[str, Any]
+    figures: dict[str, RecordingFigures]
     quarantined: dict[str, str]
     notes: list[str]
 
@@ -44,27 +98,27 @@ class NightDrift(NamedTuple):
 
     @property
     def alarms(self) -> list[Alarm]:
-        return [alarm for one in self.loops.values() for alarm in one.alarms]
+        return [alarm for drift in self.loops.values() for alarm in drift.alarms]
 
     @property
     def watched(self) -> list[Alarm]:
-        return [alarm for one in self.loops.values() for alarm in one.watched]
+        return [alarm for drift in self.loops.values() for alarm in drift.watched]
 
     @property
-    def figures(self) -> dict[str, Any]:
-        return {path: figures for one in self.loops.values() for path, figures in one.figures.items()}
+    def figures(self) -> dict[str, RecordingFigures]:
+        return {path: figures for drift in self.loops.values() for path, figures in drift.figures.items()}
 
     @property
     def quarantined(self) -> dict[str, str]:
-        return {path: reason for one in self.loops.values() for path, reason in one.quarantined.items()}
+        return {path: reason for drift in self.loops.values() for path, reason in drift.quarantined.items()}
 
     def written(self) -> dict[str, Any]:
         """As reports/metrics/nightly.json and .beadline/nights.json have it."""
         return {
             "alarms": [written(alarm) for alarm in self.alarms],
             "watched": [written(alarm) for alarm in self.watched],
-            "figures": self.figures,
-            "notes": [note for one in self.loops.values() for note in one.notes],
+            "figures": {path: figures.written() for path, figures in self.figures.items()},
+            "notes": [note for drift in self.loops.values() for note in drift.notes],
         }
 
 
@@ -91,6 +145,7 @@ def read(drift: Mapping[str, Any] | None) -> NightDrift:
         for alarm in map(alarm_of, drift.get(key) or []):
             loop = night.loops.setdefault(alarm.loop, LoopDrift.none(alarm.loop))
             getattr(loop, key).append(alarm)
-    if drift.get("figures"):
-        night.loops.setdefault(PLANT, LoopDrift.none(PLANT)).figures.update(drift["figures"])
+    for path, figures in (drift.get("figures") or {}).items():
+        plant = night.loops.setdefault(PLANT, LoopDrift.none(PLANT))
+        plant.figures[path] = RecordingFigures.read(figures)
     return night

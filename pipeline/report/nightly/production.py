@@ -1,0 +1,138 @@
+"""What is in production, and what was: the records of champion.json, which the nightly job writes and its
+page reads."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+ROLLED_BACK, DRIFT_ACCEPTED = "rolled back", "drift accepted"  # events of the history, beside promotions
+
+
+class Lineage(NamedTuple):
+    """What a champion was made from: the commit, and what lay uncommitted on it. Then SHA-256 of dvc.lock, of
+    the files of parameters, and of each loop's recordings by path."""
+
+    commit: str = ""
+    uncommitted: tuple[str, ...] = ()
+    dvc_lock: str = ""
+    params: Mapping[str, str] = {}
+    recordings: Mapping[str, Mapping[str, str]] = {}
+
+    @classmethod
+    def read(cls, fields: Mapping[str, Any]) -> "Lineage":
+        lineage = cls(**{name: fields[name] for name in cls._fields if name in fields})
+        return lineage._replace(uncommitted=tuple(lineage.uncommitted))
+
+    def written(self) -> dict[str, Any]:
+        return self._asdict() | {"uncommitted": list(self.uncommitted)}
+
+
+class Installed(NamedTuple):
+    """The files of champion/<loop>: what DVC's pointer says of the folder, MD5 by path, and of the outs of
+    dvc.lock that they were copied from."""
+
+    folder: Mapping[str, Any]
+    files: Mapping[str, str] = {}
+    outs: Mapping[str, str] = {}
+
+
+class ChampionMetrics(NamedTuple):
+    """What the judge measured of a champion when it was promoted: the panel's name, mean cost of its cases,
+    and {guard: figure}."""
+
+    panel: str
+    mean_cost: float
+    guards: Mapping[str, float]
+
+
+class Champion(NamedTuple):
+    """One loop's champion: the night that promoted it, when and why, its files, figures and lineage. `since`
+    is the time of a rollback to it, empty where there was none."""
+
+    run: str
+    when: str
+    why: str
+    installed: Installed
+    metrics: ChampionMetrics | None = None
+    lineage: Lineage = Lineage()
+    since: str = ""
+
+    @property
+    def md5(self) -> str:
+        """DVC's hash of the whole folder."""
+        return self.installed.folder["md5"]
+
+    @classmethod
+    def read(cls, fields: Mapping[str, Any]) -> "Champion":
+        metrics = fields.get("metrics")
+        return cls(
+            fields["run"],
+            fields["when"],
+            fields.get("why", ""),
+            Installed(fields["folder"], fields.get("files", {}), fields.get("outs", {})),
+            ChampionMetrics(metrics["panel"], metrics["mean_cost"], metrics["guards"]) if metrics else None,
+            Lineage.read(fields.get("lineage", {})),
+            fields.get("since", ""),
+        )
+
+    def written(self) -> dict[str, Any]:
+        return {
+            "run": self.run,
+            "when": self.when,
+            "why": self.why,
+            **self.installed._asdict(),
+            "metrics": self.metrics._asdict() if self.metrics else {},
+            "lineage": self.lineage.written(),
+        } | ({"since": self.since} if self.since else {})
+
+
+class HistoryLine(NamedTuple):
+    """One change of production: which loop, what happened, when and why, and the champion from then on.
+    `before` is the run of the champion until then, None where there was none. `replaced` are the files of
+    the champion that a rollback took out, MD5 by path."""
+
+    run: str
+    loop: str
+    event: str
+    when: str
+    why: str
+    before: str | None
+    champion: Champion
+    replaced: Mapping[str, str] | None = None
+
+    @classmethod
+    def read(cls, fields: Mapping[str, Any]) -> "HistoryLine":
+        plain = (fields[name] for name in ("run", "loop", "event", "when", "why", "before"))
+        return cls(*plain, Champion.read(fields["champion"]), fields.get("replaced"))
+
+    def written(self) -> dict[str, Any]:
+        fields = self._asdict() | {"champion": self.champion.written()}
+        if self.replaced is None:
+            del fields["replaced"]
+        return fields
+
+
+class ChampionState(NamedTuple):
+    """champion.json: {loop: champion}, and every change of production, the oldest first."""
+
+    champions: Mapping[str, Champion] = {}
+    history: tuple[HistoryLine, ...] = ()
+
+    @classmethod
+    def read(cls, fields: Mapping[str, Any]) -> "ChampionState":
+        """Raises ValueError where the file lacks a field that production cannot be known without."""
+        try:
+            champions = {loop: Champion.read(entry) for loop, entry in fields["champions"].items()}
+            return cls(champions, tuple(map(HistoryLine.read, fields["history"])))
+        except (KeyError, TypeError, AttributeError) as error:
+            raise ValueError(
+                "champion.json: expected champions and history, each with run, when and folder, "
+                f"found no {error}; take the file of the last good commit (git log champion.json)"
+            ) from None
+
+    def written(self) -> dict[str, Any]:
+        return {
+            "schema": "champion",
+            "version": 1,
+            "champions": {loop: champion.written() for loop, champion in self.champions.items()},
+            "history": [line.written() for line in self.history],
+        }
