@@ -3,7 +3,7 @@ and datasets/train_agent; writes datasets/evaluate_setpoint: scoreboard.parquet,
 paths.parquet of one run from each start, decisions.parquet of two episodes through pixels,
 and choice.json, the default with its worst case."""
 
-from pipeline.setpoint.workflow import evaluate_setpoint
+from pipeline.setpoint.workflow import contestants, evaluate_setpoint
 from pipeline.setpoint.workflow.agent_files import restore_agents
 from pipeline.setpoint.workflow.classifier_files import restore_classifier
 from pipeline.setpoint.workflow.settings import EvaluateSetpoint, TrainClassifier
@@ -22,8 +22,9 @@ def main() -> None:
             "datasets/train_classifier/weights.safetensors", "datasets/train_classifier/calibration.parquet"
         )
         windows = window_tables(artifacts.read_table("datasets/train_classifier/windows.parquet", WINDOWS))
-        controllers = evaluate_setpoint.controllers(
-            settings.baselines, restore_agents("datasets/train_agent/weights.safetensors"), windows["learn"]
+        agents = restore_agents("datasets/train_agent/weights.safetensors")
+        controllers = contestants.controllers(
+            contestants.Problem(settings.baselines, agents, windows["learn"])
         )
         scores = evaluate_setpoint.scores(controllers, windows["judge"], settings)
         choice = evaluate_setpoint.chosen(scores)

@@ -77,14 +77,14 @@ class File(NamedTuple):
     @property
     def room(self) -> str:
         """stages, store, reading, report, nightly, runtime, statistics, cli; of a loop temperature its
-        methods, temperature/workflow, and tables and settings apart."""
+        methods, temperature/workflow, and tables, settings and contestants apart."""
         parts = self.name.removesuffix(".py").split("/")
         if parts[0] != "pipeline" or len(parts) < 2:
             return parts[0]
         if parts[1] in LOOPS and parts[2:3] == ["workflow"]:
             return (
                 f"{parts[1]}/{parts[3]}"
-                if parts[3:] in (["tables"], ["settings"])
+                if parts[3:] in (["tables"], ["settings"], ["contestants"])
                 else f"{parts[1]}/workflow"
             )
         return "nightly/settings" if parts[1:] == ["nightly", "settings"] else parts[1]
@@ -147,11 +147,13 @@ def may_know(room: str, target: str) -> bool:
         return target in (room, "statistics")
     if loop in LOOPS:  # 2: a workflow knows its own loop and what every stage stands on
         light = room.endswith(("/tables", "/settings"))
-        return target in ("store", "reading", "statistics", loop, f"{loop}/tables", f"{loop}/settings") or (
+        own = (loop, f"{loop}/tables", f"{loop}/settings", f"{loop}/contestants")
+        return target in ("store", "reading", "statistics", *own) or (
             target == f"{loop}/workflow" and not light
         )
-    if room == "report":  # 3: pages know what a table and a setting is, and nothing that computes
-        return target in ("store", "statistics", "report") or target.endswith(("/tables", "/settings"))
+    if room == "report":  # 3: pages know what a table, a setting and a contestant is, and do not compute
+        described = target.endswith(("/tables", "/settings", "/contestants"))
+        return target in ("store", "statistics", "report") or described
     if room == "runtime":  # 4: beside a machine run the methods
         return target in (*LOOPS, "store", "statistics", "runtime")
     if room in ("store", "reading"):  # 5: below the loops

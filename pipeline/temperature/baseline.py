@@ -11,7 +11,7 @@ import numpy as np
 import scipy.optimize
 
 from pipeline.temperature.plant import Plant, markov_parameters
-from pipeline.temperature.tracking import Law
+from pipeline.temperature.tracking import Controller, Law
 
 
 class Pairing(NamedTuple):
@@ -80,3 +80,9 @@ def pi_law(pairs: Pairing, *, inputs: int) -> Law:
         start=np.zeros(0),
         integral=1 / pairs.reset.max(),
     )
+
+
+def controller(plant: Plant, limits: tuple[np.ndarray, np.ndarray], *, horizon: int) -> Controller:
+    """PI a zone, tuned by SIMC; the weights mean nothing to it. `limits` low and high (m,)."""
+    law = pi_law(pairing(plant, *limits, horizon=horizon), inputs=plant.m)
+    return Controller("baseline", lambda q, r, integral: law, plant, own_feed_forward=False)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.temperature.judging import Controller, Deployment, Limits, model_based, targets
+from pipeline.temperature.judging import Deployment, Limits, targets
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.scorecard import (
     Figures,
@@ -21,6 +21,7 @@ from pipeline.temperature.scorecard import (
     regret,
     simulate,
 )
+from pipeline.temperature.tracking import Controller, model_based
 from pipeline.temperature.tuning import Result
 
 

@@ -1,14 +1,12 @@
-"""Every controller of the temperature loop on one panel: built from what the stages learned,
-judged on plants that nothing was learned from."""
+"""Controllers of the temperature loop on one panel, judged on plants that nothing was learned from."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.temperature import kernel
 from pipeline.temperature import window as window_route
-from pipeline.temperature.baseline import pairing, pi_law
-from pipeline.temperature.kernel import Kernel, Regression, regress, tuples, value_iteration, window_law
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.scorecard import (
     Figures,
@@ -25,31 +23,10 @@ from pipeline.temperature.scorecard import (
     regret,
     simulate,
 )
-from pipeline.temperature.tracking import (
-    Law,
-    feasible_target,
-    gains,
-    observer_gain,
-    observer_law,
-    robust_observer_gain,
-)
+from pipeline.temperature.tracking import Controller, Law, feasible_target
 
 Limits = tuple[np.ndarray, np.ndarray]
 Targets = dict[bytes, tuple[np.ndarray, np.ndarray]]
-
-
-class Controller(NamedTuple):
-    """One way to control. `design(q, r, integral)` gives its law for weights diag(q), diag(r). Its feasible
-    targets are computed on `model`.
-
-    `own_feed_forward`: the law's own feed-forward is part of its unclipped optimum. A rule that has none aims
-    at the feasible target there too.
-    """
-
-    name: str
-    design: Callable[[np.ndarray, np.ndarray, float], Law]
-    model: Plant
-    own_feed_forward: bool = True
 
 
 class Deployment(NamedTuple):
@@ -60,15 +37,6 @@ class Deployment(NamedTuple):
     band: float
     integral: float
     integral_limit: float
-
-
-class LearnedModels(NamedTuple):
-    """What controllers are designed from: the identified plant, the VARX window, and the kernel where the
-    record determines it."""
-
-    plant: Plant
-    window: window_route.Window
-    kernel: Regression | None
 
 
 class Judged(NamedTuple):
@@ -87,68 +55,6 @@ class Judged(NamedTuple):
     unclipped: PanelRun
     deployed: PanelRun
     law: Law
-
-
-def model_based(plant: Plant, gamma: float, *, tau: float) -> Controller:
-    """Riccati gains of an identified model, and an observer that stands its errors
-    (tracking.robust_observer_gain)."""
-    return _observed("model_based", plant, gamma, robust_observer_gain(plant, tau))
-
-
-def exact_model(plant: Plant, gamma: float, *, tau: float) -> Controller:
-    """The paper's controller, told the true plant: Riccati gains and (8)."""
-    return _observed("exact_model", plant, gamma, observer_gain(plant, tau))
-
-
-def _observed(name: str, plant: Plant, gamma: float, L: np.ndarray) -> Controller:
-    def design(q: np.ndarray, r: np.ndarray, integral: float) -> Law:
-        return observer_law(plant, gains(plant, np.diag(q), np.diag(r), gamma), L, integral=integral)
-
-    return Controller(name, design, plant)
-
-
-def window(learned: window_route.Window, gamma: float) -> Controller:
-    """VARX window and Riccati."""
-    return Controller(
-        "window",
-        lambda q, r, integral: window_route.law(learned, np.diag(q), np.diag(r), gamma, integral=integral),
-        window_route.predictor(learned),
-    )
-
-
-def kernel(learned: Regression, gamma: float, model: Plant) -> Controller:
-    """Algorithm 2; its feasible targets come from the window that was learned from the same record."""
-
-    def design(q: np.ndarray, r: np.ndarray, integral: float) -> Law:
-        solution: Kernel = value_iteration(learned, np.diag(q), np.diag(r), gamma)
-        return window_law(solution.K, solution.K_r, solution.k, learned.N, integral=integral)
-
-    return Controller("kernel", design, model)
-
-
-def baseline(plant: Plant, limits: Limits, *, horizon: int) -> Controller:
-    """PI a zone, tuned by SIMC; the weights mean nothing to it."""
-    law = pi_law(pairing(plant, *limits, horizon=horizon), inputs=plant.m)
-    return Controller("baseline", lambda q, r, integral: law, plant, own_feed_forward=False)
-
-
-def controllers(
-    models: LearnedModels,
-    *,
-    limits: Limits,
-    gamma: float,
-    tau: float,
-    exact_tau: float,
-    horizon: int,
-    truth: Plant | None,
-) -> list[Controller]:
-    """All controllers that the scorecard compares. The kernel is among them where it could be learned. Where
-    the true plant is known, a controller designed on it is the yardstick."""
-    compared = [model_based(models.plant, gamma, tau=tau), window(models.window, gamma)]
-    if models.kernel is not None:
-        compared.append(kernel(models.kernel, gamma, compared[1].model))
-    compared.append(baseline(models.plant, limits, horizon=horizon))
-    return [*compared, exact_model(truth, gamma, tau=exact_tau)] if truth is not None else compared
 
 
 def refusals(
@@ -341,7 +247,7 @@ class Candidate(NamedTuple):
     the reason of a refusal. The gap of a refused candidate is infinite."""
 
     state: str
-    learned: Regression | None
+    learned: kernel.Regression | None
     gap: float
     refusal: str
 
@@ -365,13 +271,15 @@ def kernel_candidates(
     model = window_route.predictor(long)
     scenarios = check.on(model)
     best = optimum(scenarios, yardstick)
-    tried = [(f"window of {N}", lambda N=N: tuples(u, y, N, offset=offset)) for N in range(1, largest + 1)]
+    tried = [
+        (f"window of {N}", lambda N=N: kernel.tuples(u, y, N, offset=offset)) for N in range(1, largest + 1)
+    ]
     tried.append(("predicted state", lambda: window_route.predicted_tuples(long, u, y, offset=offset)))
     candidates = []
     for state, features in tried:
         try:
-            learned = regress(features())
-            law = kernel(learned, yardstick.gamma, model).design(yardstick.q, yardstick.r, 0.0)
+            learned = kernel.regress(features())
+            law = kernel.controller(learned, yardstick.gamma, model).design(yardstick.q, yardstick.r, 0.0)
         except ValueError as refusal:
             candidates.append(Candidate(state, None, float("inf"), str(refusal)))
             continue

@@ -1,6 +1,7 @@
 """Linear-quadratic tracking of a known model: Riccati gains, observer, Algorithm 1 of seed 1, and the
 feasible target within the limits of the inputs."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -46,6 +47,20 @@ class Law(NamedTuple):
     start_y: np.ndarray
     start: np.ndarray
     integral: float = 0.0
+
+
+class Controller(NamedTuple):
+    """One way to control. `design(q, r, integral)` gives its law for weights diag(q), diag(r). Its feasible
+    targets are computed on `model`.
+
+    `own_feed_forward`: the law's own feed-forward is part of its unclipped optimum. A rule that has none aims
+    at the feasible target there too.
+    """
+
+    name: str
+    design: Callable[[np.ndarray, np.ndarray, float], Law]
+    model: Plant
+    own_feed_forward: bool = True
 
 
 def riccati(
@@ -212,6 +227,24 @@ def observer_law(plant: Plant, gains: Gains, L: np.ndarray, *, integral: float =
         start=-C_inverse @ plant.d,
         integral=integral,
     )
+
+
+def model_based(plant: Plant, gamma: float, *, tau: float) -> Controller:
+    """Riccati gains of an identified model, and an observer that stands its errors
+    (robust_observer_gain)."""
+    return _observed("model_based", plant, gamma, robust_observer_gain(plant, tau))
+
+
+def exact_model(plant: Plant, gamma: float, *, tau: float) -> Controller:
+    """The paper's controller, told the true plant: Riccati gains and (8)."""
+    return _observed("exact_model", plant, gamma, observer_gain(plant, tau))
+
+
+def _observed(name: str, plant: Plant, gamma: float, L: np.ndarray) -> Controller:
+    def design(q: np.ndarray, r: np.ndarray, integral: float) -> Law:
+        return observer_law(plant, gains(plant, np.diag(q), np.diag(r), gamma), L, integral=integral)
+
+    return Controller(name, design, plant)
 
 
 class Target(NamedTuple):

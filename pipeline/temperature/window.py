@@ -15,7 +15,7 @@ import scipy.linalg.lapack
 from pipeline.temperature.kernel import Tuples, window_law, window_shift, windows
 from pipeline.temperature.plant import Plant, observability_matrix
 from pipeline.temperature.plant import plant as make_plant
-from pipeline.temperature.tracking import Law, gains
+from pipeline.temperature.tracking import Controller, Law, gains
 
 
 class Window(NamedTuple):
@@ -147,6 +147,15 @@ def law(window: Window, Q: np.ndarray, R: np.ndarray, gamma: float, *, integral:
     the window of past inputs and outputs."""
     K_x, K_r, k, _ = gains(predictor(window), Q, R, gamma)
     return window_law(K_x, K_r, k, window.N, integral=integral)
+
+
+def controller(window: Window, gamma: float) -> Controller:
+    """VARX window and Riccati."""
+    return Controller(
+        "window",
+        lambda q, r, integral: law(window, np.diag(q), np.diag(r), gamma, integral=integral),
+        predictor(window),
+    )
 
 
 def predicted_tuples(

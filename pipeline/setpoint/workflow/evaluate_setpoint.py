@@ -6,29 +6,18 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from pipeline.setpoint import agent, baselines, bayes, belief_agent, deployment, judging, pixels
+from pipeline.setpoint import deployment, judging, pixels
 from pipeline.setpoint.calibrated_classifier import CalibratedClassifier, classify
 from pipeline.setpoint.judging import Choice
 from pipeline.setpoint.recorded import WindowTable, recorded_windows
 from pipeline.setpoint.score import Score
-from pipeline.setpoint.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS, Controller, rollout
-from pipeline.setpoint.workflow.agent_files import Agents
-from pipeline.setpoint.workflow.settings import Baselines, EvaluateSetpoint, TrainClassifier
+from pipeline.setpoint.simulator import FLOW_LIMITS, TEMPERATURE_LIMITS, rollout
+from pipeline.setpoint.workflow.contestants import THROUGH_PIXELS, ControllerSpec
+from pipeline.setpoint.workflow.settings import EvaluateSetpoint, TrainClassifier
 from pipeline.statistics import wilson
-
-# ---- every controller behind the one interface
-
-
-class ControllerSpec(NamedTuple):
-    """A controller with its parameters; kind is agent, baseline or paper."""
-
-    kind: str
-    controller: Controller
-    parameters: Any
 
 
 class PixelRollouts(NamedTuple):
@@ -38,47 +27,6 @@ class PixelRollouts(NamedTuple):
     calm: dict[str, pixels.Episodes]
     disturbed: pixels.Episodes
     words: tuple[str, ...]
-
-
-def controllers(settings: Baselines, agents: Agents, windows: WindowTable) -> dict[str, ControllerSpec]:
-    """Every controller by name: those that learn nothing but the evidence of recorded windows, the agent of
-    Li and Pattinson (2025) after its third and its last phase, and the belief DQN."""
-    published = agent.greedy(agent.paper_encoder())
-    specs = {
-        name: ControllerSpec(
-            "baseline", controller, jax.tree.map(partial(jnp.asarray, dtype=jnp.float32), parameters)
-        )
-        for name, (controller, parameters) in _without_learning(settings, windows).items()
-    }
-    specs |= {
-        f"paper's agent, {i + 1} phases": ControllerSpec("paper", published, network)
-        for i, network in enumerate(agents.li_2025)
-        if i >= 2
-    }
-    on_belief = agent.greedy(belief_agent.belief_encoder(agents.belief))
-    return specs | {"our agent": ControllerSpec("agent", on_belief, agents.belief_dqn)}
-
-
-def _without_learning(settings: Baselines, windows: WindowTable) -> dict[str, tuple[Controller, Any]]:
-    proportional, sequential_test = baselines.proportional(), baselines.sequential_test()
-    robust = bayes.CameraErrorModel(**settings.bayes_robust.model_dump())
-    return {
-        "proportional": (proportional, baselines.Proportional(**settings.proportional.model_dump())),
-        "filtered proportional": (
-            proportional,
-            baselines.Proportional(**settings.filtered_proportional.model_dump()),
-        ),
-        "sequential test": (
-            sequential_test,
-            baselines.SequentialTest(**settings.sequential_test.model_dump()),
-        ),
-        "Bayes, exact model": (bayes.bayes(1), bayes.class_filter(**settings.bayes_exact.model_dump())),
-        "Bayes with leak": (bayes.bayes(1), bayes.class_filter(**settings.bayes_leak.model_dump())),
-        "Bayes, robust": (
-            bayes.bayes(settings.bayes_robust.hypotheses()),
-            bayes.robust_filter(windows, robust),
-        ),
-    }
 
 
 def chosen(scores: Mapping[str, Mapping[str, Score]]) -> Choice:
@@ -211,7 +159,7 @@ def pixel_rollouts(
 ) -> PixelRollouts:
     """The default, and our agent or the robust filter beside it, from some starts; and two
     episodes in which something befalls the default."""
-    names = dict.fromkeys((choice.name, "our agent", "Bayes, robust"))
+    names = dict.fromkeys((choice.name, *THROUGH_PIXELS))
     start, disturbances, words = _disturbed(settings)
     at, loop = some_starts(settings), _loop(model, settings, view)
     with tqdm(total=3, desc="evaluate_setpoint: through pixels", mininterval=2) as bar:
@@ -376,24 +324,24 @@ def metrics(
     rollouts: PixelRollouts,
 ) -> dict[str, Any]:
     """By controller, simulator and case; then the default."""
-    figures: dict[str, Any] = {}
-    for name, by_case in scores.items():
-        for case, score in by_case.items():
-            figures.setdefault(name, {}).setdefault(simulator(case), {})[case] = {
-                "settled": score.settled.percent,
-                "stay": score.stay.percent,
-                "median_steps": _plain(score.median_steps),
-                "overshoot_p95": score.overshoot_p95,
-                "clog_recovered": score.recovered.percent if case.endswith("clog") else None,
-                "flow_error": score.flow_error,
+    figures: dict[str, Any] = {
+        name: {
+            source: {
+                case: _figures(case, score) for case, score in by_case.items() if simulator(case) == source
             }
+            for source in dict.fromkeys(map(simulator, by_case))
+        }
+        for name, by_case in scores.items()
+    }
     for name, episodes in rollouts.calm.items():
         row = _pixel_row(name, specs[name].kind, "calm", episodes)
-        figures.setdefault(name, {}).setdefault("pixels", {})["calm"] = {
-            "settled": row["settled_percent"],
-            "median_steps": _plain(row["median_steps"]),
-            "overshoot_p95": row["overshoot_p95_percent"],
-            "flow_error": row["flow_error_percent"],
+        figures[name]["pixels"] = {
+            "calm": {
+                "settled": row["settled_percent"],
+                "median_steps": _plain(row["median_steps"]),
+                "overshoot_p95": row["overshoot_p95_percent"],
+                "flow_error": row["flow_error_percent"],
+            }
         }
     return figures | {
         "default": choice.name,
@@ -401,6 +349,17 @@ def metrics(
         "case": choice.case,
         "margin": _plain(choice.margin),
         "sentence": choice.sentence,
+    }
+
+
+def _figures(case: str, score: Score) -> dict[str, float | None]:
+    return {
+        "settled": score.settled.percent,
+        "stay": score.stay.percent,
+        "median_steps": _plain(score.median_steps),
+        "overshoot_p95": score.overshoot_p95,
+        "clog_recovered": score.recovered.percent if case.endswith("clog") else None,
+        "flow_error": score.flow_error,
     }
 
 

@@ -194,19 +194,17 @@ def _check_time(
     """Within a print time runs forward or stands still: what follows
     one another was seen one after the other."""
     present = np.array([bool(stamp) for stamp in stamps])
-    # CAXTON writes a fraction of a second behind a hyphen, 13:12:50-34
-    plain = [re.sub(r"(:\d\d)-(\d{1,6})$", r"\1.\2", stamp) for stamp in stamps if stamp]
+    plain = [stamp for stamp in stamps if stamp]
     try:
         times = np.array(plain, float)
     except ValueError:
         first = month_first({stamp.split()[0] for stamp in plain}, plain[0])
         try:
-            times = (
-                instants(path, "timestamp", plain, lines[present].tolist(), month_first=first).ns.astype(
-                    float
-                )
-                / 1e9
+            # CAXTON writes a fraction of a second behind a hyphen, 13:12:50-34
+            clock = instants(
+                path, "timestamp", plain, lines[present].tolist(), month_first=first, hyphen_fraction=True
             )
+            times = clock.ns.astype(float) / 1e9
         except ValueError as error:
             raise ValueError(str(error).replace("name another column", "remove that column")) from None
     which, lines, names = which[present], lines[present], list(itertools.compress(prints, present))

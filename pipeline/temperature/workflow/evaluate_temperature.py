@@ -13,7 +13,7 @@ from pipeline.store.execution import run_all
 from pipeline.store.params import Execution
 from pipeline.store.tables import Schema
 from pipeline.temperature import judging, kernel, plant, published, scorecard, study, window
-from pipeline.temperature.workflow import tables
+from pipeline.temperature.workflow import contestants, tables
 from pipeline.temperature.workflow.record import read_published
 from pipeline.temperature.workflow.settings import EvaluateTemperature, Panel, Tracking
 from pipeline.temperature.workflow.settings import Plant as Machine
@@ -101,14 +101,19 @@ def judged(
     truth = plant.baam()._replace(sample_time_s=machine.sample_time_s) if simulated else None
     scenarios = _scenarios(machine, panel, learned, truth)
     q, r = learned.weights["q"], learned.weights["r"]
-    compared = judging.controllers(
-        judging.LearnedModels(learned.model, learned.window, learned.kernel),
-        limits=limits,
-        gamma=tracking.gamma,
-        tau=float(learned.weights["observer_tau"]),
-        exact_tau=tracking.observer_tau,
-        horizon=panel.steps,
-        truth=truth,
+    compared = contestants.controllers(
+        contestants.Problem(
+            plant=learned.model,
+            window=learned.window,
+            kernel=learned.kernel,
+            truth=truth,
+            limits=limits,
+            gamma=tracking.gamma,
+            observer_tau=float(learned.weights["observer_tau"]),
+            exact_tau=tracking.observer_tau,
+            horizon=panel.steps,
+            settings=settings,
+        )
     )
     refused = judging.refusals(compared, [(yardstick.q, yardstick.r), (q, r)])
     designed = [controller for controller in compared if controller.name not in refused]
@@ -122,7 +127,8 @@ def judged(
         "scenarios": len(scenarios.r),
         "plants": len(scenarios.plants),
         "controllers": {
-            one.name: judging.summary(one, scenarios, noise=settings.report_noise_degC) for one in results
+            result.name: judging.summary(result, scenarios, noise=settings.report_noise_degC)
+            for result in results
         },
     }
     shown = judging.trajectories(

@@ -8,6 +8,7 @@ import numpy as np
 from tqdm import tqdm
 
 from pipeline.temperature import engineering, judging, plant, scorecard, study, tuning
+from pipeline.temperature.tracking import model_based
 from pipeline.temperature.workflow.settings import Panel, Tracking, TuneWeights
 from pipeline.temperature.workflow.settings import Plant as Machine
 
@@ -122,7 +123,7 @@ def _practical(
     )
     yardstick = scorecard.Yardstick(*np.split(default[:-1], [model.p]), tracking.gamma)
     q, r, tau = np.split(result.theta, [model.p, model.p + model.m])
-    observed = judging.model_based(model, tracking.gamma, tau=float(tau[0]))
+    observed = model_based(model, tracking.gamma, tau=float(tau[0]))
     default_cost = engineering.value_or_none(cost, default)
     metrics = {
         "cost": result.cost,
