@@ -82,7 +82,7 @@ def verify(_: argparse.Namespace) -> None:
     longer matches is named, with exit status 1."""
     from pipeline.report.shared import provenance
 
-    print(provenance.told(provenance.checks()))
+    print(provenance.summary(provenance.checks()))
 
 
 def history(arguments: argparse.Namespace) -> None:

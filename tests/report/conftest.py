@@ -41,26 +41,49 @@ def reports(tmp_path_factory):
     return folder / "reports"
 
 
+def loaded(browser, folder, name, *, width=1280, height=800, theme="light", script=True):
+    """A page in a browser context of its own; the addresses that it asked for in .asked, the messages of its
+    console in .console."""
+    context = browser.new_context(
+        viewport={"width": width, "height": height}, color_scheme=theme, java_script_enabled=script
+    )
+    page = context.new_page()
+    page.asked, page.console = [], []
+    page.on("request", lambda request: page.asked.append(request.url))
+    page.on("console", lambda message: page.console.append(message.text))
+    page.on("pageerror", lambda error: page.console.append(str(error)))
+    page.on("dialog", lambda dialog: page.console.append(dialog.message))
+    page.goto(f"file://{folder}/{name}.html")
+    return page
+
+
 @pytest.fixture
 def open_page(browser, reports):
-    """open_page(name, width, theme, script): a page in a browser of its own; what it
-    asked for, and what it said, in .asked and .said."""
-    contexts = []
+    """open_page(name, width, theme, script): a page that the test may change."""
+    pages = []
 
-    def opened(name, *, width=1280, height=800, theme="light", script=True, folder=reports):
-        context = browser.new_context(
-            viewport={"width": width, "height": height}, color_scheme=theme, java_script_enabled=script
-        )
-        contexts.append(context)
-        page = context.new_page()
-        page.asked, page.said = [], []
-        page.on("request", lambda request: page.asked.append(request.url))
-        page.on("console", lambda message: page.said.append(message.text))
-        page.on("pageerror", lambda error: page.said.append(str(error)))
-        page.on("dialog", lambda dialog: page.said.append(dialog.message))
-        page.goto(f"file://{folder}/{name}.html")
-        return page
+    def opened(name, *, folder=reports, **view):
+        pages.append(loaded(browser, folder, name, **view))
+        return pages[-1]
 
     yield opened
-    for context in contexts:
-        context.close()
+    for page in pages:
+        page.context.close()
+
+
+@pytest.fixture(scope="module")
+def shown(request, browser, reports):
+    """A page of the small project that several tests look at and none changes: its parameter is
+    (name, width, theme)."""
+    name, width, theme = request.param
+    page = loaded(browser, reports, name, width=width, theme=theme)
+    yield page
+    page.context.close()
+
+
+@pytest.fixture(scope="module")
+def unscripted(request, browser, reports):
+    """The page that its parameter names, in a browser that runs no script."""
+    page = loaded(browser, reports, request.param, script=False)
+    yield page
+    page.context.close()

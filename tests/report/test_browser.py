@@ -8,16 +8,17 @@ import pytest
 from tests.report.conftest import MACHINE
 
 PAGES = ("index", "temperature", "identification", "deposition", "setpoint")
+# name, width and theme of the pages that are loaded once for all tests that look at them
+WIDE = [(name, 1280, "light") for name in PAGES]
+DARK = [(name, 1024, "dark") for name in PAGES]
+NARROW = [(name, 390, "light") for name in PAGES]
 # A4 landscape less its margins, in px
 SHEET = (1016, 703)
 
 
-@pytest.mark.parametrize("name", PAGES)
-@pytest.mark.parametrize(("width", "theme"), [(1280, "light"), (1024, "dark"), (390, "light")])
-def test_nothing_overflows_nothing_is_fetched_but_the_machine_and_the_console_is_silent(
-    open_page, name, width, theme
-):
-    page = open_page(name, width=width, theme=theme)
+@pytest.mark.parametrize("shown", [*WIDE, *DARK, *NARROW], indirect=True, ids=str)
+def test_nothing_overflows_nothing_is_fetched_but_the_machine_and_the_console_is_silent(shown, request):
+    page, (name, width, theme) = shown, request.node.callspec.params["shown"]
     assert page.evaluate("document.documentElement.scrollWidth") <= width
     wide = """width => [...document.querySelectorAll("body *")].filter(e =>
         !e.closest("svg, .scroll, .vh, dialog, .tip") &&
@@ -28,20 +29,20 @@ def test_nothing_overflows_nothing_is_fetched_but_the_machine_and_the_console_is
     assert [url for url in page.asked if not url.startswith("data:")] == [
         page.url,
         beside,
-    ] and page.said == []
-    told = (
+    ] and page.console == []
+    footer = (
         "Last run on Some CPU @ 3.00GHz, pins avx2, beadline 0.1.0, commit abc12345 "
         "with uncommitted changes, 22 Nov 2026"
     )
-    assert page.locator("body > footer").inner_text() == told
+    assert page.locator("body > footer").inner_text() == footer
     paper = page.evaluate("getComputedStyle(document.body).backgroundColor")
     assert paper == {"light": "rgb(255, 255, 255)", "dark": "rgb(18, 21, 25)"}[theme]
     # no row of the answers is lost at any width
     assert all(box["height"] > 0 for box in map(box_of, page.locator(".answers tbody tr").all()))
 
 
-def box_of(found):
-    return found.bounding_box()
+def box_of(locator):
+    return locator.bounding_box()
 
 
 ANSWERS = (
@@ -60,24 +61,25 @@ ANSWERS = (
 )
 
 
-@pytest.mark.parametrize("script", [True, False])
-def test_the_first_screen_holds_the_verdict_and_the_twelve_answers_in_their_order(open_page, script):
-    page = open_page("index", script=script)
-    rows = page.locator(".answers tbody tr").all()
-    assert len(rows) == len(ANSWERS)
-    for row, title in zip(rows, ANSWERS, strict=True):
-        assert row.locator("th").inner_text().startswith(title)
-        assert row.locator("td").nth(1).inner_text().strip()
-    for found in (page.locator("h1"), page.locator(".rules"), *page.locator(".why").all(), *rows):
-        box = box_of(found)
-        assert box["y"] >= 0 and box["y"] + box["height"] <= 800 and box["x"] + box["width"] <= 1280
+@pytest.mark.parametrize(("shown", "unscripted"), [(WIDE[0], "index")], indirect=True, ids=["index"])
+def test_the_first_screen_holds_the_verdict_and_the_twelve_answers_in_their_order(shown, unscripted):
+    for page in (shown, unscripted):
+        rows = page.locator(".answers tbody tr").all()
+        assert len(rows) == len(ANSWERS)
+        for row, title in zip(rows, ANSWERS, strict=True):
+            assert row.locator("th").inner_text().startswith(title)
+            assert row.locator("td").nth(1).inner_text().strip()
+        for part in (page.locator("h1"), page.locator(".rules"), *page.locator(".why").all(), *rows):
+            box = box_of(part)
+            assert box["y"] >= 0 and box["y"] + box["height"] <= 800 and box["x"] + box["width"] <= 1280
 
 
-@pytest.mark.parametrize("name", PAGES)
-def test_a_page_says_the_same_without_a_script(open_page, name):
-    with_script, without = (open_page(name, script=script).locator("main") for script in (True, False))
+@pytest.mark.parametrize(
+    ("shown", "unscripted"), list(zip(WIDE, PAGES, strict=True)), indirect=True, ids=PAGES
+)
+def test_a_page_says_the_same_without_a_script(shown, unscripted):
     # the only text that a script adds are the arrows of style sheets, which are no text
-    assert with_script.inner_text() == without.inner_text()
+    assert shown.locator("main").inner_text() == unscripted.locator("main").inner_text()
 
 
 def test_a_table_sorts_by_number_both_ways_and_back_and_what_has_no_value_stands_last(open_page):
@@ -133,27 +135,27 @@ def test_the_pointer_tells_time_and_value_as_they_are_in_the_artifact(open_page)
 def test_a_picture_enlarges_zooms_and_closes(open_page, name, figure, picture):
     page = open_page(name)
     page.set_default_timeout(5000)
-    found = page.locator(figure).first
-    found.locator("button.zoom").focus()
+    small = page.locator(figure).first
+    small.locator("button.zoom").focus()
     page.keyboard.press("Enter")
-    dialog, shown = page.locator("dialog"), page.locator("dialog .stage svg")
-    assert dialog.is_visible() and box_of(shown)["width"] > 1.5 * box_of(found)["width"]
-    assert shown.get_attribute("aria-label") == (
-        found.locator(picture).get_attribute("aria-label") or found.locator(picture).get_attribute("alt")
+    dialog, enlarged = page.locator("dialog"), page.locator("dialog .stage svg")
+    assert dialog.is_visible() and box_of(enlarged)["width"] > 1.5 * box_of(small)["width"]
+    assert enlarged.get_attribute("aria-label") == (
+        small.locator(picture).get_attribute("aria-label") or small.locator(picture).get_attribute("alt")
     )
-    whole = shown.get_attribute("viewBox")
-    box = box_of(shown)
+    whole = enlarged.get_attribute("viewBox")
+    box = box_of(enlarged)
     page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     page.mouse.wheel(0, -200)
     page.wait_for_function(
         "whole => document.querySelector('dialog .stage svg').getAttribute('viewBox') !== whole", arg=whole
     )
     page.keyboard.press("0")
-    assert [float(part) for part in shown.get_attribute("viewBox").split()] == [
+    assert [float(part) for part in enlarged.get_attribute("viewBox").split()] == [
         float(part) for part in whole.split()
     ]
     page.keyboard.press("Escape")
-    assert not dialog.is_visible() and page.said == []
+    assert not dialog.is_visible() and page.console == []
 
 
 def test_the_keys_read_values_off_an_enlarged_picture(open_page):
@@ -198,29 +200,32 @@ def test_a_page_prints_on_a4_landscape_and_no_figure_is_cut(open_page, name):
     assert not page.locator(".zoom:visible, .way:visible").count()
 
 
-@pytest.mark.parametrize("name", PAGES)
 @pytest.mark.parametrize(
-    ("theme", "width"), [("light", 1280), ("dark", 1280), pytest.param("light", 390, marks=pytest.mark.slow)]
+    "shown",
+    [*WIDE, *DARK, *(pytest.param(view, marks=pytest.mark.slow) for view in NARROW)],
+    indirect=True,
+    ids=str,
 )
-def test_axe_finds_nothing_serious(open_page, name, theme, width):
+def test_axe_finds_nothing_serious(shown, request):
     axe = pytest.importorskip(
         "axe_playwright_python.sync_playwright", reason="axe is not installed; uv sync installs it"
     )
     # a theme changes colours and nothing else
-    options = {"resultTypes": ["violations"]} | ({"runOnly": ["color-contrast"]} if theme == "dark" else {})
-    found = axe.Axe().run(open_page(name, theme=theme, width=width), options=options).response["violations"]
+    dark = request.node.callspec.params["shown"] in DARK
+    options = {"resultTypes": ["violations"]} | ({"runOnly": ["color-contrast"]} if dark else {})
+    violations = axe.Axe().run(shown, options=options).response["violations"]
     serious = [
-        (one["id"], node["html"][:160], node["failureSummary"])
-        for one in found
-        if one["impact"] in ("serious", "critical")
-        for node in one["nodes"]
+        (violation["id"], node["html"][:160], node["failureSummary"])
+        for violation in violations
+        if violation["impact"] in ("serious", "critical")
+        for node in violation["nodes"]
     ]
     assert serious == []
 
 
-@pytest.mark.parametrize("name", PAGES)
-def test_every_picture_stands_where_a_link_leads_to_stage_artifact_schema_and_hash(open_page, name):
-    page = open_page(name)
+@pytest.mark.parametrize("shown", WIDE, indirect=True, ids=str)
+def test_every_picture_stands_where_a_link_leads_to_stage_artifact_schema_and_hash(shown):
+    page = shown
     lost = """() => [...document.querySelectorAll("main svg[role=img], main img")].filter(e => {
         const around = e.closest("article, section, .answers");
         const links = [...(around?.querySelectorAll("a[href^='#from-']") ?? [])];
@@ -250,7 +255,7 @@ def test_text_from_the_data_runs_nothing_even_where_it_were_not_escaped(open_pag
     assert page.evaluate("window.hit") is None
     # the browser refuses before it asks
     assert not any(url.startswith("http") and "evil" in url for url in page.asked) or all(
-        "Content Security Policy" in s for s in page.said
+        "Content Security Policy" in message for message in page.console
     )
     page.locator("a", has_text="x").first.click()
     assert page.evaluate("window.hit") is None

@@ -325,7 +325,7 @@ def test_hostile_facts_of_the_accepted_run_stay_text(open_page, accepted):
     assert (
         f"the accepted run: {hostile} then, Here 9000 now." in page.locator("section:has(> #d)").inner_text()
     )
-    assert page.evaluate("window.hit") is None and page.said == []
+    assert page.evaluate("window.hit") is None and page.console == []
 
 
 def test_without_the_file_a_page_says_the_same_and_the_browser_alone_remarks_on_it(
@@ -336,7 +336,7 @@ def test_without_the_file_a_page_says_the_same_and_the_browser_alone_remarks_on_
     for page in (alone, beside):
         page.wait_for_load_state()
     assert alone.locator("main").inner_text() == beside.locator("main").inner_text()
-    assert alone.locator(".made").count() == 0 and alone.said == [
+    assert alone.locator(".made").count() == 0 and alone.console == [
         "Failed to load resource: net::ERR_FILE_NOT_FOUND"
     ]
     assert beside.locator(".made").inner_text().startswith("Last run on ")

@@ -179,6 +179,9 @@ def test_a_kernel_that_was_refused_is_shown_as_failed_with_its_sentence(project)
     main()
     assert "failed: the record does not determine the kernel; record longer" in Page(INDEX).text
     assert "Failed. the record does not determine the kernel; record longer." in Page(TEMPERATURE).text
+    # learning again from the same record would refuse again: no page advises it
+    for path in PAGES:
+        assert "dvc repro learn_kernel" not in Page(path).text, path
 
 
 def test_never_settling_is_said_in_words(project):

@@ -108,9 +108,9 @@ def test_a_figure_whose_source_is_not_in_the_provenance_or_has_another_hash_is_f
 def test_what_dvc_recorded_otherwise_is_found_and_a_source_of_no_stage_too(checked):
     Path("datasets/train_ilc/extra.txt").write_text("x")
     assert wrong() == ["datasets/train_ilc is not what dvc.lock has of train_ilc"]
-    found = yaml.safe_load(Path("dvc.lock").read_text())
-    del found["stages"]["train_ilc"]
-    Path("dvc.lock").write_text(yaml.safe_dump(found))
+    locked = yaml.safe_load(Path("dvc.lock").read_text())
+    del locked["stages"]["train_ilc"]
+    Path("dvc.lock").write_text(yaml.safe_dump(locked))
     assert "datasets/train_ilc/trials.parquet is in no entry of dvc.lock" in wrong()
     Path("dvc.lock").unlink()
     assert wrong() == ["dvc.lock is missing: nothing says which run the files are of"]

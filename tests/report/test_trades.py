@@ -150,17 +150,17 @@ def cases(factor, *, plants=6, seeds=3):
     }
 
 
-def tracking(table, rows):
-    return table["tracking_degC"][rows]
+def tracking(runs):
+    return runs["tracking_degC"]
 
 
 def test_the_paired_saving_is_that_of_the_costs_ratio_over_plants():
-    found = pairs._paired(cases(np.full(6, 2.0)), "model_based", "window", 0.1, tracking)
+    pair = pairs._paired(cases(np.full(6, 2.0)), "model_based", "window", 0.1, tracking)
     # half the cost in every case, and one sign pattern of 2^6 does as well
-    np.testing.assert_allclose([found.improvement_percent, found.p], [50.0, 1 / 64], rtol=1e-12)
-    assert (found.cases, found.blocks) == (18, 6)
-    row = pairs._row(found)
-    assert (row["saved"].replace("\u202f", " "), row["cases"], row["sure"]) == (
+    np.testing.assert_allclose([pair.improvement_percent, pair.p], [50.0, 1 / 64], rtol=1e-12)
+    assert (pair.cases, pair.blocks) == (18, 6)
+    saving = pairs._saving(pair)
+    assert (saving.saved.replace("\u202f", " "), saving.cases, saving.sure) == (
         "50 % less",
         "18 on six plants",
         True,
@@ -168,9 +168,9 @@ def test_the_paired_saving_is_that_of_the_costs_ratio_over_plants():
 
 
 def test_a_difference_that_changes_its_sign_from_plant_to_plant_is_chance():
-    found = pairs._paired(cases([2.0, 0.5, 2.0, 0.5, 2.0, 0.5]), "model_based", "window", 0.1, tracking)
-    assert abs(found.improvement_percent) < 1e-9 and not pairs._row(found)["sure"]
-    assert pairs._sentence("Error, as deployed", found).startswith("Error: no difference beyond chance")
+    pair = pairs._paired(cases([2.0, 0.5, 2.0, 0.5, 2.0, 0.5]), "model_based", "window", 0.1, tracking)
+    assert abs(pair.improvement_percent) < 1e-9 and not pairs._saving(pair).sure
+    assert pairs._sentence("Error, as deployed", pair).startswith("Error: no difference beyond chance")
 
 
 def test_other_cases_or_a_lost_run_are_no_pair():

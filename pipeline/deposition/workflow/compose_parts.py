@@ -322,16 +322,24 @@ def _by_material(part: Part, of_tool: dict[int, Any]) -> list[tuple[str, Any]]:
 def figures(judged: Sequence[tuple[Part, Sequence[Score]]]) -> dict[str, Any]:
     """By part, material and composer: the error of the true flow in % of on-off
     control's, the worst line's volume, and which was chosen."""
-    by_part: dict[str, Any] = {}
-    for part, scores in judged:
-        for score in scores:
-            material = part.composed.streams[score.stream].material
-            one = by_part.setdefault(part.name, {}).setdefault(material, {})
-            one[score.composer] = {
-                "rms_percent_of_on_off": score.rms_percent_of_on_off,
-                "worst_line_volume_percent": finite_or_none(score.worst_line_volume_percent),
-                "predicted_percent": finite_or_none(score.predicted_percent),
-            }
-            if score.chosen:
-                one["chosen"] = score.composer
-    return by_part
+    return {
+        part.name: {
+            stream.material: _by_composer([score for score in scores if score.stream == i])
+            for i, stream in enumerate(part.composed.streams)
+        }
+        for part, scores in judged
+    }
+
+
+def _by_composer(scores: Sequence[Score]) -> dict[str, Any]:
+    """The figures of one stream."""
+    errors = {
+        score.composer: {
+            "rms_percent_of_on_off": score.rms_percent_of_on_off,
+            "worst_line_volume_percent": finite_or_none(score.worst_line_volume_percent),
+            "predicted_percent": finite_or_none(score.predicted_percent),
+        }
+        for score in scores
+    }
+    chosen = [score.composer for score in scores if score.chosen]
+    return errors | {"chosen": chosen[-1]} if chosen else errors

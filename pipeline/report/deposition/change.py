@@ -15,20 +15,20 @@ def moves(sources: Sources, parts: Sequence[Structure]) -> list[Move]:
     """
     if sources.accepted is None or isinstance(sources.accepted, Missing):
         return []
-    return [_move(sources, one) for one in parts]
+    return [_move(sources, part) for part in parts]
 
 
-def _move(sources: Sources, one: Structure) -> Move:
+def _move(sources: Sources, structure: Structure) -> Move:
     question = Question(
         0,
         "flow_error_percent",
-        f"Flow error, {one.part}, {one.material}",
+        f"Flow error, {structure.part}, {structure.material}",
         "%",
-        one.asked.flow_error_percent,
+        structure.asked.flow_error_percent,
         False,
         "",
     )
-    score, before = one.scores.get(one.chosen), _accepted(sources, one)
+    score, before = structure.scores.get(structure.chosen), _accepted(sources, structure)
     if score is None:
         return Move(
             question, before, Missing("not measured", "no composer was chosen"), False, "not measured"
@@ -43,10 +43,10 @@ def _move(sources: Sources, one: Structure) -> Move:
     return Move(question, before, now, True, "better" if now.value < before.value else "worse")
 
 
-def _accepted(sources: Sources, one: Structure) -> Figure | None:
+def _accepted(sources: Sources, structure: Structure) -> Figure | None:
     """The error of the composer that was in use then, which may be another one."""
     parts = lookup(sources.accepted, "metrics.compose_parts")
-    then = {} if isinstance(parts, Missing) else parts.get(one.part, {}).get(one.material, {})
+    then = {} if isinstance(parts, Missing) else parts.get(structure.part, {}).get(structure.material, {})
     score = then.get(then.get("chosen"))
     return Figure(*3 * (float(score["rms_percent_of_on_off"]),)) if score else None
 

@@ -1,10 +1,12 @@
 """The learning of the deposition page: error against trial, commands, flow before
 and after, what the camera saw and what was measured from it."""
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.deposition.rules import real
@@ -218,14 +220,14 @@ def _command_panel(
 # ---- the corner, before and after
 
 
-def _pause(one: Table) -> tuple[float, float]:
+def _pause(trial: Table) -> tuple[float, float]:
     """Begin and end of the pause of a routine: the gap in its wanted flow."""
-    on = np.flatnonzero(one["wanted_mm3_per_s"] > 0.02 * one["wanted_mm3_per_s"].max())
+    on = np.flatnonzero(trial["wanted_mm3_per_s"] > 0.02 * trial["wanted_mm3_per_s"].max())
     gaps = np.flatnonzero(np.diff(on) > 1)
     if not len(gaps):
-        middle = float(one["time_s"][on[len(on) // 2]])
+        middle = float(trial["time_s"][on[len(on) // 2]])
         return middle, middle
-    return float(one["time_s"][on[gaps[0]]]), float(one["time_s"][on[gaps[0] + 1]])
+    return float(trial["time_s"][on[gaps[0]]]), float(trial["time_s"][on[gaps[0] + 1]])
 
 
 class Story(NamedTuple):
@@ -326,36 +328,50 @@ def _corner_panel(
 # ---- what the camera saw
 
 
-def frames(sources: Sources) -> dict[str, Any]:
+class Frame(NamedTuple):
+    """A picture as the page shows it; `foot` is its recording, and the topic with its time."""
+
+    uri: Markup
+    head: str
+    figure: str
+    bad: bool
+    foot: tuple[str, str]
+    alt: str
+
+
+class Frames(NamedTuple):
+    missing: Missing | None = None
+    shown: Sequence[Frame] = ()
+    origin: Markup = Markup("")
+
+
+def frames(sources: Sources) -> Frames:
     """Frames with the measured edges drawn in, and those that were rejected with the reason."""
     pictures = sources.tables["frames"]
     if isinstance(pictures, Missing):
-        return {"missing": pictures, "shown": [], "origin": Markup("")}
+        return Frames(pictures)
     # the corner tells most, then what was rejected
     order = {"start": 0, "steady line": 1, "corner": 2, "rejected": 3}
-    rows = sorted(pictures, key=lambda one: (one["material"], one["trial"], order.get(one["place"], 9)))
-    shown = [
-        {
-            "uri": Markup("{}").format(one["uri"]),
-            "head": f"Material {one['material']}, trial {one['trial']}, {one['place']}",
-            "figure": f"rejected: {one['reason']}"
-            if one["reason"]
-            else f"{number(one['width_mm'], 3)}{THIN}mm wide",
-            "bad": bool(one["reason"]),
-            "foot": (one["recording"], f"{one['topic']} at {number(one['time_s'], 2)}{THIN}s"),
-            "alt": (
-                f"Frame of material {one['material']}, trial {one['trial']}, "
-                f"at {number(one['time_s'], 2)} s, "
-                + (
-                    f"rejected: {one['reason']}"
-                    if one["reason"]
-                    else f"the bead’s edges found, {number(one['width_mm'], 3)} mm apart"
-                )
-            ),
-        }
-        for one in rows
-    ]
-    return {"missing": None, "shown": shown, "origin": page.origin(sources.source("frames"))}
+    rows = sorted(pictures, key=lambda row: (row["material"], row["trial"], order.get(row["place"], 9)))
+    return Frames(None, [_frame(row) for row in rows], page.origin(sources.source("frames")))
+
+
+def _frame(row: dict[str, Any]) -> Frame:
+    """A row of the index of frames, in words."""
+    of, at = f"aterial {row['material']}, trial {row['trial']}", number(row["time_s"], 2)
+    if row["reason"]:
+        figure = judged = f"rejected: {row['reason']}"
+    else:
+        width = number(row["width_mm"], 3)
+        figure, judged = f"{width}{THIN}mm wide", f"the bead’s edges found, {width} mm apart"
+    return Frame(
+        Markup("{}").format(row["uri"]),
+        f"M{of}, {row['place']}",
+        figure,
+        bad=bool(row["reason"]),
+        foot=(row["recording"], f"{row['topic']} at {at}{THIN}s"),
+        alt=f"Frame of m{of}, at {at} s, {judged}",
+    )
 
 
 def measured(sources: Sources) -> Picture:
@@ -416,11 +432,11 @@ def _flow_error(sources: Sources) -> str:
     """How far the measured flow is off the true one, by material, in a sentence."""
     figures = [
         f"{name} {percent(float(in_all), 2)}, around the corner {percent(float(near), 2)}"
-        for name, one in (
+        for name, laws in (
             sources.metrics["train_ilc"] if isinstance(sources.metrics["train_ilc"], dict) else {}
         ).items()
-        if not isinstance(in_all := lookup(one, "pixels.flow_error_percent"), Missing)
-        and not isinstance(near := lookup(one, "pixels.flow_error_corner_percent"), Missing)
+        if not isinstance(in_all := lookup(laws, "pixels.flow_error_percent"), Missing)
+        and not isinstance(near := lookup(laws, "pixels.flow_error_corner_percent"), Missing)
     ]
     return (
         f"Over all trials the measured flow is off by, r.m.s. of a full line’s: {'; '.join(figures)}. "
@@ -491,42 +507,73 @@ def _measured_panels(mine: Table, wide: float, name: str, machine: bool, *, titl
     ]
 
 
-def camera(sources: Sources) -> dict[str, Any]:
+class Filmed(NamedTuple):
+    """What the camera read of one material, in words."""
+
+    material: str
+    trials: str
+    frames: str
+    rejected: str
+    why: str
+    deviation: str
+    observable: str
+    outliers: str
+    calibration: str
+
+
+class Camera(NamedTuple):
+    missing: Missing | None = None
+    rows: Sequence[Filmed] = ()
+
+
+def camera(sources: Sources) -> Camera:
     """By material: frames read and rejected, uncertainty, and what the calibration left."""
     filmed, models = sources.tables["filmed"], sources.tables["models"]
     if isinstance(filmed, Missing):
-        return {"missing": filmed, "rows": []}
-    rows = []
-    for material in dict.fromkeys(filmed["material"]):
-        mine = filmed["material"] == material
-        reasons: dict[str, int] = {}
-        for text in filmed["reasons"][mine]:
-            for item in filter(None, str(text).split(", ")):
-                name, _, n = item.rpartition(" ")
-                reasons[name] = reasons.get(name, 0) + int(n) if n.isdigit() else 1
-        calibration = (
-            lookup(models, f"{material}.calibration")
-            if "." not in str(material)
-            else Missing("not measured", "")
-        )
-        deviation = float(np.median(filmed["deviation_mm3_per_s"][mine]))
-        frames_, rejected = int(filmed["frames"][mine].sum()), int(filmed["rejected"][mine].sum())
-        rows.append(
-            {
-                "material": str(material),
-                "trials": count(int(mine.sum()), "trial"),
-                "frames": number(frames_, 0),
-                "rejected": f"{number(rejected, 0)} ({percent(100 * rejected / max(frames_, 1), 2)})",
-                "why": ", ".join(f"{name} {number(n, 0)}" for name, n in sorted(reasons.items())) or "none",
-                "deviation": f"{short(1000 * deviation, 2)}{THIN}·10⁻³ mm³/s",
-                "observable": percent(100 * float(np.mean(filmed["observable"][mine])), 3),
-                "outliers": number(int(filmed["outliers"][mine].sum()), 0),
-                "calibration": "as recorded"
-                if isinstance(calibration, Missing)
-                else _residual(calibration["gain"], calibration["deviation"]),
-            }
-        )
-    return {"missing": None, "rows": rows}
+        return Camera(filmed)
+    by_material = pd.DataFrame(filmed).groupby("material", sort=False).agg(
+        trials=("trial", "size"),
+        frames=("frames", "sum"),
+        rejected=("rejected", "sum"),
+        reasons=("reasons", _reasons),
+        deviation=("deviation_mm3_per_s", "median"),
+        observable=("observable", "mean"),
+        outliers=("outliers", "sum"),
+    )  # fmt: skip
+    return Camera(None, [_filmed(row, models) for row in by_material.itertuples()])
+
+
+def _filmed(row: Any, models: dict[str, Any] | Missing) -> Filmed:
+    """One material's sums, in words."""
+    return Filmed(
+        row.Index,
+        count(row.trials, "trial"),
+        number(row.frames, 0),
+        f"{number(row.rejected, 0)} ({percent(100 * row.rejected / max(row.frames, 1), 2)})",
+        row.reasons,
+        f"{short(1000 * row.deviation, 2)}{THIN}·10⁻³ mm³/s",
+        percent(100 * row.observable, 3),
+        number(row.outliers, 0),
+        _calibration(models, row.Index),
+    )
+
+
+def _reasons(texts: Iterable[str]) -> str:
+    """How many frames were rejected for what: "blur 3", "dark 1, blur 2" -> "blur 5, dark 1"."""
+    frames_of: Counter[str] = Counter()
+    for reason in filter(None, ", ".join(texts).split(", ")):
+        name, _, frames = reason.rpartition(" ")
+        frames_of[name] += int(frames) if frames.isdigit() else 1
+    return ", ".join(f"{name} {number(frames, 0)}" for name, frames in sorted(frames_of.items())) or "none"
+
+
+def _calibration(models: dict[str, Any] | Missing, material: str) -> str:
+    calibration = (
+        Missing("not measured", "") if "." in material else lookup(models, f"{material}.calibration")
+    )
+    if isinstance(calibration, Missing):
+        return "as recorded"
+    return _residual(calibration["gain"], calibration["deviation"])
 
 
 def _residual(gain: float, deviation: float) -> str:

@@ -2,9 +2,12 @@
 what that took, and the pictures behind it."""
 
 import itertools
-from typing import Any
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.deposition import change as deposition_change
@@ -24,7 +27,7 @@ from pipeline.report.deposition.rules import (
 )
 from pipeline.report.deposition.verdict import verdict
 from pipeline.report.shared import charts, headline, page, words
-from pipeline.report.shared.difference import Move
+from pipeline.report.shared.difference import Change, Move
 from pipeline.report.shared.digits import THIN, number, percent, short
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources, Table, digest, lookup
@@ -77,8 +80,8 @@ def render(sources: Sources) -> str:
         real=real(sources),
         no_scores=parts if isinstance(parts, Missing) else None,
         answers=[
-            _answer(one) | since(move)
-            for one, move in itertools.zip_longest(measured, deposition_change.moves(sources, measured))
+            _answer(part, move)
+            for part, move in itertools.zip_longest(measured, deposition_change.moves(sources, measured))
         ],
         scoreboard=scoreboard(measured, sources.declared.rules),
         learning=deposition_learning.pictures(sources),
@@ -144,103 +147,136 @@ def _beforehand(sources: Sources) -> str:
 # ---- the first screen: a row for each structure and material
 
 
-def _answer(one: Structure) -> dict[str, Any]:
+class Reading(NamedTuple):
+    """The flow error of one composer, and its forecast, in words."""
+
+    css: str
+    name: str
+    value: str
+    band: str
+    bad: bool
+    best: bool
+
+
+class Answer(NamedTuple):
+    """A row of the first screen: one material of one part."""
+
+    part: str
+    material: str
+    state: str
+    cells: list[Reading]
+    whole: str
+    strip: Markup
+    line: str
+    line_bad: bool
+    change: Change
+
+
+def _answer(structure: Structure, move: Move | None) -> Answer:
     """The basis functions beside the library on one scale, the strip's limit in its middle; the
     worst line's volume of the composer that was chosen."""
-    question = Question(0, "", one.part, "%", one.asked.flow_error_percent, False, "")
+    scores, limit = structure.scores, structure.asked.flow_error_percent
+    question = Question(0, "", structure.part, "%", limit, False, "")
     shown = [
         (
             NAMES[name],
             css,
-            Figure(*3 * (one.scores[name].error,))
-            if name in one.scores
-            else Missing("not measured", "no score"),
+            Figure(*3 * (scores[name].error,)) if name in scores else Missing("not measured", "no score"),
         )
         for name, css in ((OURS, "dd"), (LIBRARY, "mb"), ("ilc", "acc"))
     ]
-    chosen = one.scores.get(one.chosen)
+    chosen = scores.get(structure.chosen)
     line = chosen.worst_line if chosen else None
-    best = one.best()
-    return {
-        "part": one.part,
-        "material": one.material,
-        "state": one.state(),
-        "cells": [
-            {
-                "css": css,
-                "name": NAMES[name],
-                "value": percent(one.scores[name].error, 2) if name in one.scores else "not measured",
-                "band": _forecast(one.scores[name].predicted) if name in one.scores else "",
-                "bad": name in one.scores and one.scores[name].error > one.asked.flow_error_percent,
-                "best": name == best,
-            }
+    best = structure.best()
+    return Answer(
+        structure.part,
+        structure.material,
+        structure.state(),
+        [
+            Reading(
+                css,
+                NAMES[name],
+                percent(scores[name].error, 2) if name in scores else "not measured",
+                _forecast(scores[name].predicted) if name in scores else "",
+                bad=name in scores and scores[name].error > limit,
+                best=name == best,
+            )
             for css, name in (("dd", OURS), ("mb", LIBRARY))
         ],
-        "whole": percent(one.scores["ilc"].error, 2) if "ilc" in one.scores else "none",
-        "strip": charts.strip(question, shown, (9, 25, 17)),
-        "line": "no line" if line is None else percent(line, 2),
-        "line_bad": line is not None and line > one.asked.line_volume_percent,
-        "chosen": NAMES.get(one.chosen, one.chosen),
-    }
-
-
-def since(move: Move | None) -> dict[str, Any]:
-    """How the figure of the composer in use moved since the accepted run."""
-    if move is None:
-        return {"change": "first run", "moved": False, "worse": False}
-    return {"change": move.text(), "moved": move.moved, "worse": move.word == "worse"}
+        whole=percent(scores["ilc"].error, 2) if "ilc" in scores else "none",
+        strip=charts.strip(question, shown, (9, 25, 17)),
+        line="no line" if line is None else percent(line, 2),
+        line_bad=line is not None and line > structure.asked.line_volume_percent,
+        change=Change("first run") if move is None else Change(move.text(), move.moved, move.word == "worse"),
+    )
 
 
 def _forecast(value: float | None) -> str:
     return "" if value is None else f"forecast {percent(value, 2)}"
 
 
-def scoreboard(parts: list[Structure], asked: ReportRules) -> dict[str, Any]:
-    """Structures and materials down, composers across: true error,
-    what was forecast, and the worst line's volume."""
-    names = ("basis", "priority", "superposition", "on_off", "ilc")
-    heads = [{"mark": MARK[name], "name": NAMES[name], "method": PAPER[name]} for name in names]
-    rows = []
-    for one in parts:
-        best = one.best()
-        cells = []
-        for name in names:
-            score = one.scores.get(name)
-            if score is None:
-                cells.append(
-                    {
-                        "value": "not measured",
-                        "band": "",
-                        "line": "",
-                        "best": False,
-                        "bad": False,
-                        "chosen": False,
-                        "line_bad": False,
-                    }
-                )
-                continue
-            cells.append(
-                {
-                    "value": percent(score.error, 2),
-                    "band": _forecast(score.predicted),
-                    "line": "no line long enough"
-                    if score.worst_line is None
-                    else f"worst line {percent(score.worst_line, 2)}",
-                    "best": name == best,
-                    "bad": score.error > one.asked.flow_error_percent and name != "on_off",
-                    "line_bad": score.worst_line is not None
-                    and score.worst_line > one.asked.line_volume_percent
-                    and name != "on_off",
-                    "chosen": name == one.chosen,
-                }
-            )
-        rows.append({"part": one.part, "material": one.material, "cells": cells})
-    return {
-        "heads": heads,
-        "rows": rows,
-        "limit": f"{asked.flow_error_percent:g}{THIN}%",
-        "line": f"±{asked.line_volume_percent:g}{THIN}%",
-    }
+class Cell(NamedTuple):
+    """One composer on one structure: error, forecast and worst line in words, and what is marked."""
+
+    value: str = "not measured"
+    band: str = ""
+    line: str = ""
+    best: bool = False
+    bad: bool = False
+    line_bad: bool = False
+    chosen: bool = False
+
+
+class Composer(NamedTuple):
+    """The head of a composer's column."""
+
+    mark: str
+    name: str
+    method: str
+
+
+class BoardRow(NamedTuple):
+    part: str
+    material: str
+    cells: list[Cell]
+
+
+class Scoreboard(NamedTuple):
+    """Structures and materials down, composers across; both limits in words."""
+
+    heads: list[Composer]
+    rows: list[BoardRow]
+    limit: str
+    line: str
+
+
+BOARD = ("basis", "priority", "superposition", "on_off", "ilc")
+
+
+def scoreboard(parts: list[Structure], asked: ReportRules) -> Scoreboard:
+    """True error, what was forecast, and the worst line's volume."""
+    return Scoreboard(
+        [Composer(MARK[name], NAMES[name], PAPER[name]) for name in BOARD],
+        [BoardRow(part.part, part.material, [_cell(part, name) for name in BOARD]) for part in parts],
+        f"{asked.flow_error_percent:g}{THIN}%",
+        f"±{asked.line_volume_percent:g}{THIN}%",
+    )
+
+
+def _cell(structure: Structure, name: str) -> Cell:
+    score = structure.scores.get(name)
+    if score is None:
+        return Cell()
+    line, asked = score.worst_line, structure.asked
+    return Cell(
+        percent(score.error, 2),
+        _forecast(score.predicted),
+        "no line long enough" if line is None else f"worst line {percent(line, 2)}",
+        best=name == structure.best(),
+        bad=score.error > asked.flow_error_percent and name != "on_off",
+        line_bad=line is not None and line > asked.line_volume_percent and name != "on_off",
+        chosen=name == structure.chosen,
+    )
 
 
 def declared(sources: Sources) -> list[tuple[str, list[tuple[str, str]]]]:
@@ -324,7 +360,7 @@ def _panel(table: Table, rows: np.ndarray, task: str, material: str, Ts: float, 
     }
     lead = Ts * float(table["lead"][rows].max())
     end = max(Ts * (len(scaled[int(k)]) - float(table["lead"][k])) for k in rows)
-    low, high = (float(find([find(values) for values in scaled.values()])) for find in (np.min, np.max))
+    low, high = (float(of([of(values) for values in scaled.values()])) for of in (np.min, np.max))
     room = 0.08 * max(high - low, 1.0)
     frame = charts.Frame(
         charts.linear(-max(lead, Ts), max(end, Ts), ticks=6),
@@ -362,48 +398,77 @@ def _panel(table: Table, rows: np.ndarray, task: str, material: str, Ts: float, 
     )
 
 
-def assumptions(sources: Sources) -> dict[str, Any]:
+class Tested(NamedTuple):
+    """What was measured of an assumption on one material, in words."""
+
+    text: str
+    bad: bool
+
+
+class Assumption(NamedTuple):
+    """One claim of the paper, a cell for each material."""
+
+    number: int
+    name: str
+    what: str
+    cells: list[Tested]
+    holds: bool
+
+
+class Assumptions(NamedTuple):
+    missing: Missing | None = None
+    rows: Sequence[Assumption] = ()
+    materials: Sequence[str] = ()
+    limit: str = ""
+
+
+def assumptions(sources: Sources) -> Assumptions:
     """The paper's assumptions 1 to 4: what was found of each, by material, against the largest predicted
     error that compose_parts lets pass."""
     checks = lookup(sources.tables["learned"], "checks", what="the check of the assumptions")
     if isinstance(checks, Missing):
-        return {"missing": checks, "rows": [], "materials": []}
+        return Assumptions(checks)
     limit = sources.declared.everything.get("compose_parts", {}).get("largest_error_percent", 20)
-    materials = [str(m) for m in dict.fromkeys(one["material"] for one in checks)][:MATERIALS]
-    rows: dict[tuple[int, str], dict[str, Any]] = {}
-    for one in checks:
-        row = rows.setdefault(
-            (one["assumption"], one["claim"]),
-            {"number": one["assumption"], "claim": str(one["claim"]), "cells": {}},
-        )
-        value = one["percent"]
-        row["cells"][str(one["material"])] = {
-            "text": "not tested" if value is None else percent(float(value), 2),
-            "bad": value is not None and value > limit,
-        }
-    for row in rows.values():
-        name, _, what = row["claim"].partition(": ")
-        row |= {
-            "name": name,
-            "what": what,
-            "cells": [row["cells"].get(m, {"text": "not tested", "bad": False}) for m in materials],
-        }
-        row["holds"] = not any(cell["bad"] for cell in row["cells"])
-    return {
-        "missing": None,
-        "rows": list(rows.values()),
-        "materials": materials,
-        "limit": f"{limit:g}{THIN}%",
-    }
+    tests = pd.DataFrame(checks, columns=["assumption", "claim", "material", "percent"])
+    by_claim = tests.set_index(["assumption", "claim", "material"])["percent"].astype(float)
+    measured = by_claim.unstack(sort=False).iloc[:, :MATERIALS]
+    rows = []
+    for (place, claim), percents in measured.iterrows():
+        name, _, what = claim.partition(": ")
+        cells = [
+            Tested("not tested" if math.isnan(value) else percent(value, 2), value > limit)
+            for value in percents
+        ]
+        rows.append(Assumption(place, name, what, cells, holds=not any(cell.bad for cell in cells)))
+    return Assumptions(None, rows, list(measured.columns), f"{limit:g}{THIN}%")
 
 
-def chains(sources: Sources) -> dict[str, Any]:
+class Machine(NamedTuple):
+    """The head of a column of the chains: whose machine, and as known from where."""
+
+    material: str
+    word: str
+
+
+class Parameter(NamedTuple):
+    title: str
+    cells: list[str]
+
+
+class Chains(NamedTuple):
+    missing: Missing | None = None
+    rows: Sequence[Parameter] = ()
+    heads: Sequence[Machine] = ()
+    fit: str = ""
+
+
+def chains(sources: Sources) -> Chains:
     """Parameters of each machine: as known beforehand, as identified,
     and, where it is simulated, as it truly is."""
     models, learned = sources.tables["models"], lookup(sources.tables["learned"], "materials")
     for missing in (learned, models):
         if isinstance(missing, Missing):
-            return {"missing": missing, "rows": [], "heads": []}
+            return Chains(missing)
     heads, values = [], []
     for material in learned[:MATERIALS]:
         name = str(material["material"])
@@ -414,15 +479,13 @@ def chains(sources: Sources) -> dict[str, Any]:
             ("true", true),
         ):
             if extruder:
-                heads.append({"material": name, "word": word})
+                heads.append(Machine(name, word))
                 values.append(extruder)
     rows = [
-        {
-            "title": title,
-            "cells": [
-                "none" if extruder.get(key) is None else short(float(extruder[key]), 3) for extruder in values
-            ],
-        }
+        Parameter(
+            title,
+            ["none" if extruder.get(key) is None else short(float(extruder[key]), 3) for extruder in values],
+        )
         for key, title in CHAIN
         if any(extruder.get(key) for extruder in values)
     ]
@@ -432,28 +495,51 @@ def chains(sources: Sources) -> dict[str, Any]:
         for material in learned[:MATERIALS]
         if material["chain"].get("held_out_percent") is not None
     ]
-    return {"missing": None, "rows": rows, "heads": heads, "fit": "; ".join(fits)}
+    return Chains(None, rows, heads, "; ".join(fits))
 
 
-def columns(sources: Sources) -> dict[str, Any]:
+class Signal(NamedTuple):
+    """One column of the library, in words."""
+
+    task: str
+    material: str
+    nozzle: str
+    speed: str
+    pause: str
+    lead: str
+    length: str
+    extreme: str
+
+
+class Columns(NamedTuple):
+    """The columns that are shown, and how many more there are."""
+
+    missing: Missing | None = None
+    rows: Sequence[Signal] = ()
+    more: int = 0
+
+
+def columns(sources: Sources) -> Columns:
     """The matrix (3), a row for each of its columns."""
     table = sources.tables["library"]
     if isinstance(table, Missing):
-        return {"missing": table, "rows": [], "more": 0}
-    Ts, rows = _step(sources), []
-    for k in range(min(len(table["task"]), MOST)):
-        signal = np.asarray(table["signal_mm"][k], float)
-        extreme = float(signal[np.argmax(np.abs(signal))]) if len(signal) else 0.0
-        rows.append(
-            {
-                "task": str(table["task"][k]),
-                "material": str(table["material"][k]),
-                "nozzle": f"{table['nozzle_mm'][k]:g}",
-                "speed": f"{table['speed_mm_per_s'][k]:g}",
-                "pause": f"{table['pause_s'][k]:g}" if table["pause_s"][k] else "",
-                "lead": f"{number(Ts * int(table['lead'][k]), 2)} ({int(table['lead'][k])})",
-                "length": f"{number(Ts * int(table['length'][k]), 2)} ({int(table['length'][k])})",
-                "extreme": short(extreme, 3) if extreme else "0",
-            }
-        )
-    return {"missing": None, "rows": rows, "more": max(len(table["task"]) - MOST, 0)}
+        return Columns(table)
+    library = pd.DataFrame(table)
+    rows = [_signal(row, _step(sources)) for row in library.head(MOST).itertuples()]
+    return Columns(None, rows, max(len(library) - MOST, 0))
+
+
+def _signal(row: Any, Ts: float) -> Signal:
+    """A row of the library, sampled every Ts seconds."""
+    command = np.asarray(row.signal_mm, float)
+    extreme = float(command[np.argmax(np.abs(command))]) if len(command) else 0.0
+    return Signal(
+        row.task,
+        row.material,
+        nozzle=f"{row.nozzle_mm:g}",
+        speed=f"{row.speed_mm_per_s:g}",
+        pause=f"{row.pause_s:g}" if row.pause_s else "",
+        lead=f"{number(Ts * row.lead, 2)} ({row.lead})",
+        length=f"{number(Ts * row.length, 2)} ({row.length})",
+        extreme=short(extreme, 3) if extreme else "0",
+    )

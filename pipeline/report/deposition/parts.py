@@ -1,9 +1,11 @@
 """The parts of the deposition page: each one coloured by its flow error, the flow of every composer over its
 worst stretch, its lines, what limits it, and what was refused."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.deposition.rules import MARK, NAMES, PAPER, real
@@ -215,18 +217,21 @@ def stretches(sources: Sources) -> Picture:
     names = [
         name
         for name in ("priority", "basis", "ilc", "on_off")
-        if any(np.isfinite(one.flows[name]).any() for one in worst_of_each)
+        if any(np.isfinite(stretch.flows[name]).any() for stretch in worst_of_each)
     ]
     shown = [
         Column(
             NAMES[name],
             PAPER[name],
             MARK[name],
-            [_panel(one, name, first=name == names[0], top=k == 0) for k, one in enumerate(worst_of_each)],
+            [
+                _panel(stretch, name, first=name == names[0], top=k == 0)
+                for k, stretch in enumerate(worst_of_each)
+            ],
         )
         for name in names
     ]
-    worst = {name: max(one.off(name) for one in worst_of_each) for name in names}
+    worst = {name: max(stretch.off(name) for stretch in worst_of_each) for name in names}
     return Picture(
         "stretches",
         title,
@@ -280,24 +285,21 @@ def _stretch(table: Table, part: str, material: str, chosen: str) -> Stretch:
     )
 
 
-def _panel(one: Stretch, name: str, *, first: bool, top: bool) -> Markup:
+def _panel(stretch: Stretch, name: str, *, first: bool, top: bool) -> Markup:
+    begin, end = float(stretch.t[0]), float(stretch.t[-1])
     frame = charts.Frame(
-        charts.linear(float(one.t[0]), float(one.t[-1]), ticks=4),
-        charts.linear(0, 1.45 * one.steady, ticks=3),
-        270,
-        112,
-        26,
+        charts.linear(begin, end, ticks=4), charts.linear(0, 1.45 * stretch.steady, ticks=3), 270, 112, 26
     )
-    off, chosen = percent(one.off(name), 2), ", chosen" if name == one.chosen else ""
-    text = f"{shortened(one.name, 24)}: {off} off{chosen}"
+    off, chosen = percent(stretch.off(name), 2), ", chosen" if name == stretch.chosen else ""
+    text = f"{shortened(stretch.name, 24)}: {off} off{chosen}"
     layers = [
-        charts.line(frame, one.t, one.wanted, "ref"),
-        charts.line(frame, one.t, one.flows[name]),
+        charts.line(frame, stretch.t, stretch.wanted, "ref"),
+        charts.line(frame, stretch.t, stretch.flows[name]),
         charts.label(frame, frame.x.high, frame.y.high, text, anchor="end", dy=6),
     ]
     alt = (
-        f"{NAMES[name]}, {one.name}: {off} of a full line’s flow off the wanted one "
-        f"between {number(float(one.t[0]), 1)} and {number(float(one.t[-1]), 1)} s"
+        f"{NAMES[name]}, {stretch.name}: {off} of a full line’s flow off the wanted one "
+        f"between {number(begin, 1)} and {number(end, 1)} s"
     )
     return charts.panel(
         frame, layers, alt=alt, css=CSS[name], title="mm³/s" if first and top else "", units=("s", "mm³/s")
@@ -307,38 +309,58 @@ def _panel(one: Stretch, name: str, *, first: bool, top: bool) -> Markup:
 # ---- the lines
 
 
-def lines(sources: Sources) -> dict[str, Any]:
+class Line(NamedTuple):
+    """A printed line in words: planned and predicted volume, and how far both signals are off."""
+
+    part: str
+    line: int
+    tool: str
+    duration: str
+    planned: str
+    predicted: str
+    on_off: str
+    error: str
+    bad: bool
+    short: bool
+
+
+class Lines(NamedTuple):
+    missing: Missing | None = None
+    rows: Sequence[Line] = ()
+    summary: str = ""
+
+
+def lines(sources: Sources) -> Lines:
     """The lines that are furthest from their volume, the worst first."""
     table = sources.tables["lines"]
     if isinstance(table, Missing):
-        return {"missing": table, "rows": [], "summary": ""}
-    error, allowed = np.nan_to_num(table["error_percent"]), sources.declared.rules.line_volume_percent
-    order = np.argsort(-np.abs(error), kind="stable")[:WORST]
+        return Lines(table)
+    allowed = sources.declared.rules.line_volume_percent
+    printed = pd.DataFrame(table).fillna({"error_percent": 0.0})
+    printed["off_percent"] = printed.error_percent.abs()
     rows = [
-        {
-            "part": str(table["part"][k]),
-            "line": int(table["line"][k]),
-            "tool": f"T{int(table['tool'][k])}",
-            "duration": number(float(table["duration_s"][k]), 2),
-            "planned": number(float(table["planned_mm3"][k]), 3),
-            "predicted": number(float(table["predicted_mm3"][k]), 3),
-            "on_off": _signed(
-                100 * (float(table["on_off_mm3"][k]) / max(float(table["planned_mm3"][k]), 1e-12) - 1)
-            ),
-            "error": _signed(float(error[k])),
-            "bad": abs(error[k]) > allowed,
-            "short": bool(table["shorter_than_lead"][k]),
-        }
-        for k in order
+        Line(
+            row.part,
+            row.line,
+            f"T{row.tool}",
+            duration=number(row.duration_s, 2),
+            planned=number(row.planned_mm3, 3),
+            predicted=number(row.predicted_mm3, 3),
+            on_off=_signed(100 * (row.on_off_mm3 / max(row.planned_mm3, 1e-12) - 1)),
+            error=_signed(row.error_percent),
+            bad=row.off_percent > allowed,
+            short=row.shorter_than_lead,
+        )
+        for row in printed.nlargest(WORST, "off_percent").itertuples()
     ]
-    beyond, short_runs = int(np.sum(np.abs(error) > allowed)), int(np.sum(table["shorter_than_lead"]))
+    beyond, short_runs = int((printed.off_percent > allowed).sum()), int(printed.shorter_than_lead.sum())
     summary = (
-        f"Of {count(len(error), 'line')}, {'none is' if not beyond else count(beyond, 'is', 'are')} "
+        f"Of {count(len(printed), 'line')}, {'none is' if not beyond else count(beyond, 'is', 'are')} "
         f"predicted more than {allowed:g}{THIN}% off {'its' if beyond <= 1 else 'their'} volume; "
         f"{count(short_runs, 'belongs', 'belong') if short_runs else 'none belongs'} to runs shorter than "
         "the lead of Stop."
     )
-    return {"missing": None, "rows": rows, "summary": summary}
+    return Lines(None, rows, summary)
 
 
 def _signed(value: float) -> str:
@@ -349,60 +371,97 @@ def _signed(value: float) -> str:
 # ---- what limits a part, and what was refused
 
 
-def forecasts(sources: Sources) -> dict[str, Any]:
+class Forecast(NamedTuple):
+    """What one stream of a part asks of the drive, in words."""
+
+    part: str
+    material: str
+    mark: str
+    composer: str
+    time: str
+    lines: str
+    short: str
+    peak: str
+    limit: str
+    share: str
+    bad: bool
+    ramp: str
+
+
+class Forecasts(NamedTuple):
+    missing: Missing | None = None
+    rows: Sequence[Forecast] = ()
+
+
+def forecasts(sources: Sources) -> Forecasts:
     """By part and material: composer, saturation and the ramp that would do, and lines that need a look."""
     conformance = sources.tables["conformance"]
     if isinstance(conformance, Missing):
-        return {"missing": conformance, "rows": []}
-    rows = []
-    for part, report in conformance.items():
-        for material, one in report.get("saturation", {}).items():
-            ramp = report.get("ramp_that_would_do_s", {}).get(material)
-            composer = report.get("composer", {}).get(material, "")
-            rows.append(
-                {
-                    "part": str(part),
-                    "material": str(material),
-                    "mark": MARK.get(composer, "baseline"),
-                    "composer": NAMES.get(composer, composer),
-                    "time": number(float(report.get("duration_s", 0.0)), 1),
-                    "lines": f"{report.get('printed_lines', 0):,} in {report.get('runs', 0):,}",
-                    "short": number(float(report.get("shorter_than_lead", 0)), 0),
-                    "peak": f"{short(float(one['peak_over_steady']), 2)} ×",
-                    "limit": "none set" if one.get("limit") is None else f"{one['limit']:g}{THIN}mm",
-                    "share": percent(float(one["share_percent"]), 2),
-                    "bad": not one["enough"],
-                    "ramp": "as it is"
-                    if one["enough"]
-                    else "none would do"
-                    if ramp is None
-                    else f"{number(float(ramp), 2)}{THIN}s",
-                }
-            )
-    return {"missing": None, "rows": rows}
+        return Forecasts(conformance)
+    rows = [
+        _forecast(part, material, report)
+        for part, report in conformance.items()
+        for material in report.get("saturation", {})
+    ]
+    return Forecasts(None, rows)
 
 
-def refused(sources: Sources) -> dict[str, Any]:
+def _forecast(part: str, material: str, report: dict[str, Any]) -> Forecast:
+    """One stream out of the conformance report of its part."""
+    drive = report["saturation"][material]
+    ramp = report.get("ramp_that_would_do_s", {}).get(material)
+    composer = report.get("composer", {}).get(material, "")
+    if drive["enough"]:
+        remedy = "as it is"
+    else:
+        remedy = "none would do" if ramp is None else f"{number(float(ramp), 2)}{THIN}s"
+    return Forecast(
+        part,
+        material,
+        MARK.get(composer, "baseline"),
+        NAMES.get(composer, composer),
+        time=number(float(report.get("duration_s", 0.0)), 1),
+        lines=f"{report.get('printed_lines', 0):,} in {report.get('runs', 0):,}",
+        short=number(float(report.get("shorter_than_lead", 0)), 0),
+        peak=f"{short(float(drive['peak_over_steady']), 2)} ×",
+        limit="none set" if drive.get("limit") is None else f"{drive['limit']:g}{THIN}mm",
+        share=percent(float(drive["share_percent"]), 2),
+        bad=not drive["enough"],
+        ramp=remedy,
+    )
+
+
+class Refusal(NamedTuple):
+    part: str
+    where: str
+    why: str
+
+
+class Refused(NamedTuple):
+    """What is shown of the refusals, how many more there are, and the words that were not understood."""
+
+    missing: Missing | None = None
+    rows: Sequence[Refusal] = ()
+    more: int = 0
+    unknown: str = ""
+
+
+def refused(sources: Sources) -> Refused:
     """Lines and whole parts that were refused, each with its sentence."""
     conformance = sources.tables["conformance"]
     if isinstance(conformance, Missing):
-        return {"missing": conformance, "rows": [], "more": 0}
+        return Refused(conformance)
     rows = []
     for part, report in conformance.items():
         why = report.get("refused", [])
         rows += (
-            [(str(part), "whole", why)]
+            [Refusal(part, "whole", why)]
             if isinstance(why, str)
-            else [(str(part), f"line {one['line']}", str(one["why"])) for one in why]
+            else [Refusal(part, f"line {line['line']}", str(line["why"])) for line in why]
         )
     unknown = [
         f"{part}: {count(report['unknown_words'], 'word')}"
         for part, report in conformance.items()
         if report.get("unknown_words")
     ]
-    return {
-        "missing": None,
-        "rows": rows[:REFUSED],
-        "more": max(len(rows) - REFUSED, 0),
-        "unknown": ", ".join(unknown),
-    }
+    return Refused(None, rows[:REFUSED], max(len(rows) - REFUSED, 0), ", ".join(unknown))

@@ -5,6 +5,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import pandas as pd
+
 from pipeline.report.shared.digits import THIN, count, number, percent
 from pipeline.report.shared.sources import Sources, lookup
 from pipeline.report.shared.verdict import (
@@ -105,31 +107,27 @@ def structures(sources: Sources) -> list[Structure] | Missing:
     table = sources.tables["scores"]
     if isinstance(table, Missing):
         return table
-    parts: dict[tuple[str, str], Structure] = {}
-    names = (
-        "part",
-        "material",
-        "composer",
-        "chosen",
-        "rms_percent_of_on_off",
-        "predicted_percent",
-        "worst_line_volume_percent",
-    )
-    for part, material, composer, chosen, *figures in zip(*(table[name] for name in names), strict=True):
-        one = parts.setdefault(
-            (part, material), Structure(str(part), str(material), {}, "", sources.declared.rules)
+    groups = pd.DataFrame(table).groupby(["part", "material"], sort=False)
+    parts = [_structure(rows, sources.declared.rules) for _, rows in groups]
+    return parts or Missing("not measured", "no part was composed", "Copy a part program to datasets/parts")
+
+
+def _structure(rows: pd.DataFrame, rules: ReportRules) -> Structure:
+    """One material of one part from its rows of the scores; a composer without an error is left out."""
+    judged = rows.dropna(subset="rms_percent_of_on_off")
+    scores = {
+        row.composer: Score(
+            row.rms_percent_of_on_off, _finite(row.predicted_percent), _finite(row.worst_line_volume_percent)
         )
-        error, predicted, line = (
-            None if figure is None or math.isnan(figure) else float(figure) for figure in figures
-        )
-        if error is not None:
-            parts[part, material] = one._replace(
-                scores={**one.scores, str(composer): Score(error, predicted, line)},
-                chosen=str(composer) if chosen else one.chosen,
-            )
-    return list(parts.values()) or Missing(
-        "not measured", "no part was composed", "Copy a part program to datasets/parts"
-    )
+        for row in judged.itertuples()
+    }
+    chosen = judged.composer[judged.chosen.astype(bool)]
+    part, material = rows.part.iloc[0], rows.material.iloc[0]
+    return Structure(part, material, scores, "" if chosen.empty else chosen.iloc[-1], rules)
+
+
+def _finite(figure: float) -> float | None:
+    return None if math.isnan(figure) else figure
 
 
 def real(sources: Sources) -> bool:
@@ -140,7 +138,7 @@ def real(sources: Sources) -> bool:
 def worst(parts: Sequence[Structure], composer: str) -> tuple[float, Structure] | None:
     """The largest error of a composer and where."""
     return max(
-        ((one.scores[composer].error, one) for one in parts if composer in one.scores),
+        ((part.scores[composer].error, part) for part in parts if composer in part.scores),
         key=lambda pair: pair[0],
         default=None,
     )
@@ -207,8 +205,8 @@ def _flow(parts: Sequence[Structure], limit: float) -> Pair:
     return _pair(rule, [_measured(pair) for pair in pairs], texts)
 
 
-def where(one: Structure) -> str:
-    return f"{one.part}, material {one.material},"
+def where(structure: Structure) -> str:
+    return f"{structure.part}, material {structure.material},"
 
 
 def _line(parts: Sequence[Structure], limit: float) -> Pair:
@@ -232,9 +230,9 @@ def _line(parts: Sequence[Structure], limit: float) -> Pair:
 
 def _worst_line(parts: Sequence[Structure], name: str) -> tuple[float, Structure] | None:
     lines = [
-        (one.scores[name].worst_line, one)
-        for one in parts
-        if name in one.scores and one.scores[name].worst_line is not None
+        (part.scores[name].worst_line, part)
+        for part in parts
+        if name in part.scores and part.scores[name].worst_line is not None
     ]
     return max(lines, default=None, key=lambda pair: pair[0])
 
@@ -265,9 +263,9 @@ def _above(parts: Sequence[Structure], limit: float) -> Pair:
 def _most_above(parts: Sequence[Structure], name: str) -> tuple[float, Structure] | None:
     """By how many points a composer lies above what learned the part itself, at most, and where."""
     above = [
-        (one.scores[name].error - one.scores["ilc"].error, one)
-        for one in parts
-        if name in one.scores and "ilc" in one.scores
+        (part.scores[name].error - part.scores["ilc"].error, part)
+        for part in parts
+        if name in part.scores and "ilc" in part.scores
     ]
     return max(above, key=lambda pair: pair[0], default=None)
 
@@ -294,7 +292,7 @@ def _learning(sources: Sources) -> Pair:
 def _each(sources: Sources, key: str) -> list[float]:
     """A figure of every material that has it."""
     metrics = sources.metrics["train_ilc"]
-    figures = [] if isinstance(metrics, Missing) else [lookup(one, key) for one in metrics.values()]
+    figures = [] if isinstance(metrics, Missing) else [lookup(material, key) for material in metrics.values()]
     return [float(value) for value in figures if not isinstance(value, Missing)]
 
 
@@ -324,26 +322,37 @@ def _convergence(sources: Sources) -> Pair:
     return ours if values else ours._replace(question=None), paper
 
 
+class Saturated(NamedTuple):
+    """One stream of a part: the share of its time at the command's limit in %, whether the drive gives
+    enough, and whether a limit is declared."""
+
+    part: str
+    material: str
+    share: float
+    enough: bool
+    limited: bool
+
+
 def _limit(sources: Sources) -> Pair:
     conformance = sources.tables["conformance"]
     if isinstance(conformance, Missing):
         rule = _at_most("Command limit", 0, limit="0", place="saturation", reason=conformance.sentence())
         return _pair(rule, [conformance._replace(state=OPEN)] * 2, [OPEN] * 2)
     shares = [
-        (float(one["share_percent"]), part, name, one)
+        Saturated(part, name, float(drive["share_percent"]), drive["enough"], drive.get("limit") is not None)
         for part, report in conformance.items()
-        for name, one in report.get("saturation", {}).items()
+        for name, drive in report.get("saturation", {}).items()
     ]
     if not shares:
         rule = _at_most("Command limit", 0, limit="0", place="saturation", reason="No part was composed.")
         return _pair(rule, [Missing(OPEN, "")] * 2, [OPEN] * 2)
-    share, part, name, one = max(shares, key=lambda s: (not s[3]["enough"], s[0]))
-    too_little = sum(not s[3]["enough"] for s in shares)
-    limited = any(s[3].get("limit") is not None for s in shares)
-    text = percent(share, 2) if not one["enough"] else f"0{THIN}%" if limited else "no limit set"
+    worst = max(shares, key=lambda stream: (not stream.enough, stream.share))
+    too_little = sum(not stream.enough for stream in shares)
+    limited = any(stream.limited for stream in shares)
+    text = percent(worst.share, 2) if not worst.enough else f"0{THIN}%" if limited else "no limit set"
     ramp = (
-        lookup(conformance, f"{part}.ramp_that_would_do_s.{name}")
-        if "." not in part
+        lookup(conformance, f"{worst.part}.ramp_that_would_do_s.{worst.material}")
+        if "." not in worst.part
         else Missing("not measured", "")
     )
     rule = _at_most(
@@ -352,8 +361,8 @@ def _limit(sources: Sources) -> Pair:
         limit=f"0{THIN}%",
         place="saturation",
         reason=(
-            f"The command for {part}, material {name}, is at its limit {percent(share, 2)} of the "
-            "printing time, and no signal can make up for it."
+            f"The command for {worst.part}, material {worst.material}, is at its limit "
+            f"{percent(worst.share, 2)} of the printing time, and no signal can make up for it."
         ),
         remedy="Print slower, or raise printer.limit_mm: no ramp would do."
         if isinstance(ramp, Missing)
@@ -372,7 +381,7 @@ def _printed(sources: Sources) -> Pair:
         rule = rule._replace(reason=conformance.sentence())
         return _pair(rule, [conformance._replace(state=OPEN)] * 2, [OPEN] * 2)
     refused = [
-        (part, one) for part, report in conformance.items() for one in _listed(report.get("refused", []))
+        (part, line) for part, report in conformance.items() for line in _listed(report.get("refused", []))
     ]
     # the priority rule does not print a line that is shorter than the lead
     short = sum(report.get("shorter_than_lead", 0) for report in conformance.values())
@@ -386,4 +395,6 @@ def _printed(sources: Sources) -> Pair:
 
 
 def _listed(refused: Any) -> list[str]:
-    return [refused] if isinstance(refused, str) else [f"line {one['line']}, {one['why']}" for one in refused]
+    if isinstance(refused, str):
+        return [refused]
+    return [f"line {line['line']}, {line['why']}" for line in refused]

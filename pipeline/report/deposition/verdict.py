@@ -111,7 +111,7 @@ def _peak(sources: Sources) -> float:
     learned = (
         []
         if isinstance(metrics, Missing)
-        else [one[law] for one in metrics.values() for law in ("model_inverse", "pixels") if law in one]
+        else [laws[law] for laws in metrics.values() for law in ("model_inverse", "pixels") if law in laws]
     )
     return max((law["peak_over_steady"] for law in learned), default=0.0)
 
@@ -128,9 +128,9 @@ def _summary(parts: Sequence[Structure], use: str, machine: bool) -> str:
     full = worst(parts, "ilc")
     others += [f"learning each part from scratch {percent(full[0], 2)}"] if full else []
     lines = [
-        one.scores[use].worst_line
-        for one in parts
-        if use in one.scores and one.scores[use].worst_line is not None
+        part.scores[use].worst_line
+        for part in parts
+        if use in part.scores and part.scores[use].worst_line is not None
     ]
     volume = (
         f" Worst printed line: {percent(max(lines), 2)} off its volume, "
@@ -159,10 +159,12 @@ def _price(sources: Sources, parts: Sequence[Structure]) -> str:
     and the lines that the priority rule would lose."""
     metrics, sentences = sources.metrics["train_ilc"], []
     if not isinstance(metrics, Missing):
-        laws = [one[law] for one in metrics.values() for law in ("model_inverse", "pixels") if law in one]
-        routines = max((len(one.get("other_routines", [])) for one in metrics.values()), default=0)
-        if laws:
-            trials, peak = max(law["trials"] for law in laws), _peak(sources)
+        learned = [
+            laws[law] for laws in metrics.values() for law in ("model_inverse", "pixels") if law in laws
+        ]
+        routines = max((len(laws.get("other_routines", [])) for laws in metrics.values()), default=0)
+        if learned:
+            trials, peak = max(law["trials"] for law in learned), _peak(sources)
             of = (
                 f"{count(routines, 'routine')} of {trials + 1} trials" if routines else f"{trials + 1} trials"
             )
@@ -191,11 +193,11 @@ def _price(sources: Sources, parts: Sequence[Structure]) -> str:
         if n
     ][:2]
     missed = [
-        one
-        for one in parts
-        if one.chosen
-        and one.chosen != one.best()
-        and one.scores[one.chosen].error > one.scores[one.best()].error + SAME
+        part
+        for part in parts
+        if part.chosen
+        and part.chosen != part.best()
+        and part.scores[part.chosen].error > part.scores[part.best()].error + SAME
     ]
     sentences += (
         [f"The forecast chose wrongly for {where(missed[0])[:-1]}: {_bare(missed[0].best())} is better."]

@@ -2,6 +2,7 @@
 excitation that it was learned from."""
 
 from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 from markupsafe import Markup
@@ -262,7 +263,17 @@ def _arc(frame: charts.Frame) -> Markup:
     return charts.line(frame, np.cos(angle), np.where(inside, np.sin(angle), np.nan), "lim line thin")
 
 
-def pole_table(sources: Sources) -> list[dict[str, str]]:
+class PoleRow(NamedTuple):
+    """A pole, or a pair: size, time constant with its band over the spread, period."""
+
+    size: str
+    pair: str
+    constant: str
+    band: str
+    period: str
+
+
+def pole_table(sources: Sources) -> list[PoleRow]:
     """Each pole of the model, a pair in one row: size, time constant
     with its band over the spread, period."""
     table, step = sources.tables["poles"], sources.declared.machine.sample_time_s
@@ -281,19 +292,19 @@ def pole_table(sources: Sources) -> list[dict[str, str]]:
         )
         again = low <= constant <= high
         rows.append(
-            {
-                "size": number(abs(value), 4),
-                "pair": "pair" if value.imag else "",
-                "constant": f"{short(constant, 3)}{THIN}s" if np.isfinite(constant) else "none",
-                "band": ""
+            PoleRow(
+                size=number(abs(value), 4),
+                pair="pair" if value.imag else "",
+                constant=f"{short(constant, 3)}{THIN}s" if np.isfinite(constant) else "none",
+                band=""
                 if np.isnan(low + high)
                 else f"{short(low, 3)}{DASH}{short(high, 3)}"
                 if again
                 else "not found again",
-                "period": f"{short(2 * np.pi * step / abs(np.angle(value)), 3)}{THIN}s"
+                period=f"{short(2 * np.pi * step / abs(np.angle(value)), 3)}{THIN}s"
                 if value.imag or value.real < 0
                 else "",
-            }
+            )
         )
     return rows
 

@@ -46,13 +46,20 @@ def room(panels: int) -> Room:
     return Room(across, width, height, "mb wide" if across < 6 else "mb")
 
 
+class OutputRow(NamedTuple):
+    """An output and its panels, one an input."""
+
+    output: str
+    cells: list[Cell]
+
+
 class Matrix(NamedTuple):
     """Outputs x inputs, a row of panels for each output; in the place of what cannot be drawn, the reason."""
 
     id: str
     title: str
     finding: str
-    rows: list[tuple[str, list[Cell]]]
+    rows: list[OutputRow]
     caption: str
     origin: Markup
     across: int
@@ -283,14 +290,14 @@ def _stems(table: Table, rows: np.ndarray, y: charts.Axis, size: Room, name: str
 
 def matrix(
     sources: Sources, cell: Callable[[str, str], tuple[float, Callable[[], Cell]]]
-) -> tuple[list[tuple[str, list[Cell]]], str]:
+) -> tuple[list[OutputRow], str]:
     """Rows of cells; where the machine has many inputs, of each output the strongest ones, in their order."""
     machine = sources.declared.machine
     rows = []
     for output in machine.outputs:
         cells = [cell(output.name, i.name) for i in machine.inputs]
         largest = sorted(sorted(range(len(cells)), key=lambda k: -cells[k][0])[:MOST_INPUTS])
-        rows.append((output.name, [cells[k][1]() for k in largest]))
+        rows.append(OutputRow(output.name, [cells[k][1]() for k in largest]))
     left = len(machine.inputs) - MOST_INPUTS
     return (
         rows,

@@ -2,9 +2,10 @@
 pictures behind it, and what the record lost on the way."""
 
 import math
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
+from markupsafe import Markup
 
 from pipeline.report.identification import model_dynamics, model_errors
 from pipeline.report.identification.model import LEAST_FIT, Fit, ahead_words, fits, trust
@@ -89,7 +90,31 @@ def _judged_on(sources: Sources) -> str:
 # ---- a row for each output
 
 
-def answer(sources: Sources, fit: Fit, ahead: str) -> dict[str, Any]:
+class FitCell(NamedTuple):
+    """A fit with its band; `missing` where it was not measured."""
+
+    css: str
+    name: str
+    state: str
+    missing: Missing | None
+    value: str
+    band: str
+
+
+class Answer(NamedTuple):
+    """An output's row: its fits, the yardstick, the picture of what is missed, and the change."""
+
+    name: str
+    note: str
+    state: str
+    cells: list[FitCell]
+    held: str
+    strip: Markup
+    change: str
+    moved: bool
+
+
+def answer(sources: Sources, fit: Fit, ahead: str) -> Answer:
     """Fits with bands, the yardstick, the share that is missed as a strip, what the
     residuals say, and the change since the accepted run."""
     question = Question(0, "", fit.name, "%", LEAST_FIT, True, "")
@@ -109,40 +134,36 @@ def answer(sources: Sources, fit: Fit, ahead: str) -> dict[str, Any]:
     ]
     before = _accepted(sources, fit.name)
     change, moved = since(before, fit.simulated)
-    return {
-        "name": fit.name,
-        "note": _residual_note(sources, fit.name),
-        "state": next(
+    return Answer(
+        name=fit.name,
+        note=_residual_note(sources, fit.name),
+        state=next(
             (wanted for wanted in (FAILED, UNDECIDED) if wanted in states),
             PASSED if states == [PASSED, PASSED] else "not measured",
         ),
-        "cells": [
-            {
-                "css": css,
-                "name": name,
-                "state": found.replace(" ", "-"),
-                "missing": part if isinstance(part, Missing) else None,
-                **_value(part),
-            }
-            for css, name, part, found in (
-                ("dd", "Simulation", fit.simulated, states[0]),
-                ("mb", ahead[:1].upper() + ahead[1:], fit.ahead, states[1]),
-            )
+        cells=[
+            _fit_cell("dd", "Simulation", fit.simulated, states[0]),
+            _fit_cell("mb", ahead[:1].upper() + ahead[1:], fit.ahead, states[1]),
         ],
-        "held": _value(fit.held)["value"],
-        "strip": charts.strip(
-            Question(0, "", fit.name, "%", 100 - LEAST_FIT, False, ""), shown, (11, 23, 23)
-        ),
-        "change": change,
-        "moved": moved,
-    }
+        held=_value(fit.held),
+        strip=charts.strip(Question(0, "", fit.name, "%", 100 - LEAST_FIT, False, ""), shown, (11, 23, 23)),
+        change=change,
+        moved=moved,
+    )
 
 
-def _value(figure: Figure | Missing) -> dict[str, str]:
-    if isinstance(figure, Missing):
-        return {"value": figure.state, "band": ""}
-    places = min(decimals(figure.low, figure.high, value=figure.value), 1)
-    return {"value": f"{number(figure.value, places)}{THIN}%", "band": band(figure.low, figure.high, places)}
+def _fit_cell(css: str, name: str, fit: Figure | Missing, outcome: str) -> FitCell:
+    missing = fit if isinstance(fit, Missing) else None
+    bands = "" if isinstance(fit, Missing) else band(fit.low, fit.high, _places(fit))
+    return FitCell(css, name, outcome.replace(" ", "-"), missing, _value(fit), bands)
+
+
+def _places(fit: Figure) -> int:
+    return min(decimals(fit.low, fit.high, value=fit.value), 1)
+
+
+def _value(fit: Figure | Missing) -> str:
+    return fit.state if isinstance(fit, Missing) else f"{number(fit.value, _places(fit))}{THIN}%"
 
 
 def _missed(figure: Figure | Missing) -> Figure | Missing:
@@ -187,9 +208,9 @@ def since(before: Figure | None, now: Figure | Missing) -> tuple[str, bool]:
     if before is None:
         return "first run", False
     if math.isclose(before.value, now.value, rel_tol=1e-6):
-        return f"unchanged, {_value(before)['value']}", False
+        return f"unchanged, {_value(before)}", False
     if before.low <= now.high and now.low <= before.high:
-        return f"within noise of {_value(before)['value']}", False
+        return f"within noise of {_value(before)}", False
     change = now.value - before.value
     return (
         f"{'+' if change > 0 else MINUS}{number(abs(change), 1)} points · "
@@ -228,7 +249,18 @@ def _sentence(text: str) -> str:
 # ---- tables
 
 
-def candidates(sources: Sources) -> list[dict[str, Any]]:
+class Candidate(NamedTuple):
+    """An order that was tried: its singular value, free numbers, error, and how far above the best."""
+
+    order: int
+    chosen: bool
+    value: str
+    parameters: str
+    error: str
+    above: str
+
+
+def candidates(sources: Sources) -> list[Candidate]:
     """The order table with its rule: what each order keeps, costs and leaves unexplained."""
     table = sources.tables["order"]
     if isinstance(table, Missing):
@@ -242,27 +274,42 @@ def candidates(sources: Sources) -> list[dict[str, Any]]:
         error, value, edge = (float(table[name][k]) for name in ("error", "singular_value", "noise_edge"))
         above = 100 * (error / best - 1) if best > 0 else 0.0
         rows.append(
-            {
-                "order": int(table["order"][k]),
-                "chosen": bool(table["chosen"][k]),
-                "value": short(value, 3),
-                "parameters": number(float(table["parameters"][k]), 0) if tried[k] else "",
-                "error": f"{number(100 * error, 2)}{THIN}%"
+            Candidate(
+                order=int(table["order"][k]),
+                chosen=bool(table["chosen"][k]),
+                value=short(value, 3),
+                parameters=number(float(table["parameters"][k]), 0) if tried[k] else "",
+                error=f"{number(100 * error, 2)}{THIN}%"
                 if tried[k]
                 else "not tried"
                 if value > edge
                 else "within noise",
-                "above": "" if not tried[k] else "the best" if above == 0 else f"{short(above, 2)}{THIN}%",
-            }
+                above="" if not tried[k] else "the best" if above == 0 else f"{short(above, 2)}{THIN}%",
+            )
         )
     return rows
 
 
-def losses(sources: Sources) -> dict[str, Any]:
+class Loss(NamedTuple):
+    """A signal: samples, how many are masked (bad: more than a tenth), and what was flagged."""
+
+    name: str
+    samples: str
+    masked: str
+    bad: bool
+    flags: str
+
+
+class Losses(NamedTuple):
+    missing: Missing | None
+    rows: list[Loss]
+
+
+def losses(sources: Sources) -> Losses:
     """For each signal: samples, how many are masked, and what was flagged."""
     table = sources.tables["record"]
     if isinstance(table, Missing):
-        return {"missing": table, "rows": []}
+        return Losses(table, [])
     flags = lookup(sources.metrics["ingest"], "findings")
     rows = []
     for signal in [*sources.declared.machine.inputs, *sources.declared.machine.outputs]:
@@ -270,16 +317,16 @@ def losses(sources: Sources) -> dict[str, Any]:
         mine = {} if isinstance(flags, Missing) else flags.get(signal.name, {})
         share = f" ({short(100 * masked / total, 2)}{THIN}%)" if masked else ""
         rows.append(
-            {
-                "name": signal.name,
-                "samples": number(total, 0),
-                "masked": f"{number(masked, 0)}{share}",
-                "bad": masked > 0.1 * total,
-                "flags": ", ".join(f"{kind} {number(number_of, 0)}" for kind, number_of in mine.items())
+            Loss(
+                name=signal.name,
+                samples=number(total, 0),
+                masked=f"{number(masked, 0)}{share}",
+                bad=masked > 0.1 * total,
+                flags=", ".join(f"{kind} {number(number_of, 0)}" for kind, number_of in mine.items())
                 or ("not measured" if isinstance(flags, Missing) else "none"),
-            }
+            )
         )
-    return {"missing": None, "rows": rows}
+    return Losses(None, rows)
 
 
 def used(sources: Sources) -> list[tuple[str, str]]:

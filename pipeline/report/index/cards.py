@@ -3,9 +3,10 @@ figures. A loop that is not measured keeps its frame."""
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.deposition import rules as deposition_rules
@@ -13,7 +14,7 @@ from pipeline.report.deposition import verdict as deposition_verdict
 from pipeline.report.identification.model import trust
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import decimals, number, percent, quantity, shortened
-from pipeline.report.shared.sources import Sources, Table
+from pipeline.report.shared.sources import Source, Sources, Table
 from pipeline.report.shared.verdict import (
     FAILED,
     OPEN,
@@ -40,62 +41,100 @@ ROLE = {
 }
 
 
-def temperature(sources: Sources, judged: Judgement) -> dict[str, Any]:
+class Cell(NamedTuple):
+    """A figure of one controller in words; `best` of its row, `bad` where it failed."""
+
+    text: str
+    best: bool
+    bad: bool
+
+
+class Row(NamedTuple):
+    title: str
+    cells: list[Cell]
+
+
+class Head(NamedTuple):
+    """Who stands for a role: its mark, the role's name, the method."""
+
+    mark: str
+    name: str
+    method: str
+
+
+class Card(NamedTuple):
+    """One loop on page one. `mark` is the role of the controller that should run, None where none should;
+    `win` says who wins and by what; `missing`: nothing was measured."""
+
+    id: str
+    name: str
+    link: str
+    moves: str
+    state: str
+    mark: str | None
+    win: tuple[str, str]
+    caption: str
+    panels: list[Markup]
+    heads: list[Head]
+    rows: list[Row]
+    note: str
+    sources: list[Source]
+    model: Any = None
+    missing: bool = False
+
+
+def heads(roles: Sequence[str], methods: Sequence[str]) -> list[Head]:
+    """The roles of a card, each with its method."""
+    return [
+        Head(role, LABELS[CONTROLLERS[role]][0], method) for role, method in zip(roles, methods, strict=True)
+    ]
+
+
+def temperature(sources: Sources, judged: Judgement) -> Card:
     order = ("model_based", "data_driven", "baseline")
     answers, allowed = judged.roles, sources.declared.rules
     rows = []
     for key in ("settled_error_degC", "gap_percent", "settling_s"):
         question = next(q for q in judged.asked if q.key == key)
-        rows.append(
-            {"title": question.title, "cells": _card_cells(question, [answers[role][key] for role in order])}
-        )
+        rows.append(Row(question.title, _card_cells(question, [answers[role][key] for role in order])))
     kernel = judged.by_name.get("kernel", {}).get("gap_percent")
-    return {
-        "id": "temperature",
-        "name": "Temperature",
-        "link": "temperature.html",
-        "moves": "Heaters and motor to barrel temperatures",
-        "state": f"Run {ROLES[judged.verdict.winner]}" if judged.verdict.winner else "Run none of them",
-        "mark": judged.verdict.winner,
-        "win": _win(judged),
-        "caption": (
+    return Card(
+        id="temperature",
+        name="Temperature",
+        link="temperature.html",
+        moves="Heaters and motor to barrel temperatures",
+        state=f"Run {ROLES[judged.verdict.winner]}" if judged.verdict.winner else "Run none of them",
+        mark=judged.verdict.winner,
+        win=_win(judged),
+        caption=(
             f"Worst zone’s true error over {_SPAN} s, log scale {_FLOOR:g} to {number(_CEILING, 0)}\u00a0°C: "
             f"{featured(sources)}. Grey: what the rule allows once settled."
         ),
-        "panels": [
+        panels=[
             _spark(sources, judged, role, limit=allowed.settled_error_degC, named=i == 0)
             for i, role in enumerate(order)
         ],
-        "heads": [
-            {"mark": role, "name": LABELS[CONTROLLERS[role]][0], "method": LABELS[CONTROLLERS[role]][1]}
-            for role in order
-        ],
-        "rows": rows,
-        "note": _kernel_note(kernel, sources),
-        "model": trust(sources),
-        "sources": sources.source("evaluate_temperature", "scorecard", "trajectories"),
-        "missing": None,
-    }
+        heads=heads(order, [LABELS[CONTROLLERS[role]][1] for role in order]),
+        rows=rows,
+        note=_kernel_note(kernel, sources),
+        sources=sources.source("evaluate_temperature", "scorecard", "trajectories"),
+        model=trust(sources),
+    )
 
 
-def _card_cells(question: Question, figures: Sequence[Figure | Missing]) -> list[dict[str, Any]]:
+def _card_cells(question: Question, figures: Sequence[Figure | Missing]) -> list[Cell]:
     places = row_places(question, figures[:2])
     values = [f.value if isinstance(f, Figure) else math.inf for f in figures]
     best = min(values)
     cells = []
     for figure, value in zip(figures, values, strict=True):
         if isinstance(figure, Missing):
-            cells.append({"text": figure.state, "best": False, "bad": False})
+            cells.append(Cell(figure.state, best=False, bad=False))
             continue
         mine = min(places, decimals(0, 0, value=value)) if math.isfinite(value) else places
         text = quantity(value, question.unit, mine, beyond=question.beyond)
-        cells.append(
-            {
-                "text": text,
-                "best": text == quantity(best, question.unit, mine) and math.isfinite(best),
-                "bad": state(question, figure) == FAILED,
-            }
-        )
+        leads = text == quantity(best, question.unit, mine) and math.isfinite(best)
+        cells.append(Cell(text, leads, bad=state(question, figure) == FAILED))
     return cells
 
 
@@ -206,76 +245,63 @@ def _kernel_note(gap: Figure | Missing | None, sources: Sources) -> str:
     )
 
 
-def deposition(sources: Sources) -> dict[str, Any]:
+def deposition(sources: Sources) -> Card:
     """In this loop's terms: model-based is the paper's law and its library by priority, data-driven our law
     and the basis functions, baseline on-off control."""
     judged, structures = deposition_verdict.verdict(sources), deposition_rules.structures(sources)
     if isinstance(structures, Missing):
-        return unbuilt("deposition", structures.sentence()) | {"link": "deposition.html"}
+        return unbuilt("deposition", structures.sentence())._replace(link="deposition.html")
     role = ROLE.get(judged.winner)
     trials = [_learned(sources, law) for law in ("hoelzle_2009", "model_inverse", "")]
-    return {
-        "id": "deposition",
-        "name": "Deposition",
-        "link": "deposition.html",
-        "moves": "Plunger command to flow at the nozzle",
-        "state": f"Run {ROLES[role]}" if judged.state == PASSED else "Do not print yet",
-        "mark": role if judged.state == PASSED else None,
-        "win": _deposition_win(structures, judged, role),
-        "caption": (
+    return Card(
+        id="deposition",
+        name="Deposition",
+        link="deposition.html",
+        moves="Plunger command to flow at the nozzle",
+        state=f"Run {ROLES[role]}" if judged.state == PASSED else "Do not print yet",
+        mark=role if judged.state == PASSED else None,
+        win=_deposition_win(structures, judged, role),
+        caption=(
             "Error while learning, in % of on\u2011off control’s, log scale 0.3 to 200\u00a0%, the worse "
             "material: the paper’s law, model inversion, none. Grey: what is asked for."
         ),
-        "panels": [
+        panels=[
             _learning_spark(curve, css, sources.declared.rules.learned_percent, named=i == 1)
             for i, (curve, css) in enumerate(zip(trials, ("mb", "dd", "bl"), strict=True))
         ],
-        "heads": [
-            {"mark": key, "name": LABELS[CONTROLLERS[key]][0], "method": method}
-            for key, method in (
-                ("model_based", "library + priority"),
-                ("data_driven", "basis functions"),
-                ("baseline", "on\u2011off control"),
-            )
-        ],
-        "rows": _deposition_rows(structures, sources.declared.rules),
-        "note": "Forecasts of the identified machine: the true flow of a real one is not known."
+        heads=heads(
+            ("model_based", "data_driven", "baseline"),
+            ("library + priority", "basis functions", "on\u2011off control"),
+        ),
+        rows=_deposition_rows(structures, sources.declared.rules),
+        note="Forecasts of the identified machine: the true flow of a real one is not known."
         if deposition_rules.real(sources)
         else "Judged by the true flow of simulated machines that nothing was fitted to.",
-        "model": None,
-        "sources": sources.source("scores", "trials"),
-        "missing": None,
-    }
+        sources=sources.source("scores", "trials"),
+    )
 
 
-def _deposition_rows(
-    structures: Sequence[deposition_rules.Structure], allowed: ReportRules
-) -> list[dict[str, Any]]:
+def _deposition_rows(structures: Sequence[deposition_rules.Structure], allowed: ReportRules) -> list[Row]:
     """Flow error of the two parts on which the library fares worst, which say most, and the worst line."""
     names = ("priority", "basis", "on_off")
-    parts = list(dict.fromkeys(one.part for one in structures))
-
-    def errors(part: str, name: str) -> list[float]:
-        return [one.scores[name].error for one in structures if one.part == part and name in one.scores]
-
-    parts.sort(key=lambda part: -max(errors(part, "priority"), default=0.0))
-    lines = [
+    scores = pd.DataFrame(
         [
-            one.scores[name].worst_line
-            for one in structures
-            if name in one.scores and one.scores[name].worst_line is not None
-        ]
-        for name in names
-    ]
+            (structure.part, name, score.error, score.worst_line)
+            for structure in structures
+            for name, score in structure.scores.items()
+        ],
+        columns=["part", "composer", "error", "line"],
+    ).astype({"error": float, "line": float})
+    errors = scores.pivot_table(index="part", columns="composer", values="error", aggfunc="max", sort=False)
+    errors = errors.reindex(columns=names)
+    hardest = errors.sort_values("priority", ascending=False, kind="stable").head(2)
+    lines = scores.groupby("composer").line.max().reindex(names)
     return [
         *(
-            {
-                "title": f"Flow error, {shortened(part, 30)}",
-                "cells": _worst([errors(part, name) for name in names], allowed.flow_error_percent),
-            }
-            for part in parts[:2]
+            Row(f"Flow error, {shortened(part, 30)}", _worst(list(values), allowed.flow_error_percent))
+            for part, *values in hardest.itertuples()
         ),
-        {"title": "Worst line’s volume", "cells": _worst(lines, allowed.line_volume_percent)},
+        Row("Worst line’s volume", _worst(lines.tolist(), allowed.line_volume_percent)),
     ]
 
 
@@ -303,16 +329,15 @@ def _deposition_win(
     )
 
 
-def _worst(groups: Sequence[Sequence[float]], limit: float) -> list[dict[str, Any]]:
-    """A cell for each group: its largest value, the least of all bold."""
-    values = [max(group) if group else math.inf for group in groups]
-    least = min(values)
+def _worst(values: Sequence[float], limit: float) -> list[Cell]:
+    """A cell for each value, the least of all bold; NaN is not measured."""
+    least = min((value for value in values if math.isfinite(value)), default=math.nan)
     return [
-        {
-            "text": percent(value, 2) if math.isfinite(value) else "not measured",
-            "best": value == least and math.isfinite(value),
-            "bad": limit < value < math.inf,
-        }
+        Cell(
+            percent(value, 2) if math.isfinite(value) else "not measured",
+            best=value == least,
+            bad=limit < value < math.inf,
+        )
         for value in values
     ]
 
@@ -329,12 +354,7 @@ def _learned(sources: Sources, law: str) -> np.ndarray | Missing:
     rows = (table["law"] == law) & (table["routine"] == 0)
     if not rows.any():
         return Missing("not measured", "this law was not run")
-    return np.array(
-        [
-            100 * float(table["ratio"][rows & (table["trial"] == j)].max())
-            for j in sorted(set(table["trial"][rows].tolist()))
-        ]
-    )
+    return 100 * pd.Series(table["ratio"][rows]).groupby(table["trial"][rows]).max().to_numpy()
 
 
 def _learning_spark(curve: np.ndarray | Missing, css: str, limit: float, *, named: bool) -> Markup:
@@ -359,9 +379,9 @@ def _learning_spark(curve: np.ndarray | Missing, css: str, limit: float, *, name
     )
 
 
-def unbuilt(key: str, why: str) -> dict[str, Any]:
+def unbuilt(key: str, why: str) -> Card:
     """A loop without figures: the same frame, and the sentence in it."""
-    heads = {
+    loops = {
         "deposition": (
             "Deposition",
             "Plunger command to flow at the nozzle",
@@ -373,25 +393,21 @@ def unbuilt(key: str, why: str) -> dict[str, Any]:
             ("Bayes filter", "Q-learning agent", "proportional"),
         ),
     }
-    name, moved, methods = heads[key]
-    order = ("model_based", "data_driven", "baseline")
-    return {
-        "id": key,
-        "name": name,
-        "link": "",
-        "moves": moved,
-        "state": "Not measured",
-        "mark": None,
-        "win": ("Not measured.", why),
-        "caption": "Nothing is shown before it is measured.",
-        "panels": [Markup('<div class="hole">{}not measured</div>').format(page.glyph(OPEN)) for _ in order],
-        "heads": [
-            {"mark": role, "name": LABELS[CONTROLLERS[role]][0], "method": method}
-            for role, method in zip(order, methods, strict=True)
-        ],
-        "rows": [],
-        "note": "No figure, so no claim.",
-        "model": None,
-        "sources": [],
-        "missing": True,
-    }
+    name, moves, methods = loops[key]
+    hole = Markup('<div class="hole">{}not measured</div>').format(page.glyph(OPEN))
+    return Card(
+        id=key,
+        name=name,
+        link="",
+        moves=moves,
+        state="Not measured",
+        mark=None,
+        win=("Not measured.", why),
+        caption="Nothing is shown before it is measured.",
+        panels=[hole] * len(methods),
+        heads=heads(("model_based", "data_driven", "baseline"), methods),
+        rows=[],
+        note="No figure, so no claim.",
+        sources=[],
+        missing=True,
+    )

@@ -1,7 +1,9 @@
 """Page one: the verdict, the twelve answers, a card a loop, the difference, words, provenance."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import NamedTuple
+
+from markupsafe import Markup
 
 from pipeline.report.deposition import change as deposition_change
 from pipeline.report.deposition import rules as deposition_rules
@@ -25,8 +27,8 @@ from pipeline.report.shared.verdict import (
 )
 from pipeline.report.temperature import pairs
 from pipeline.report.temperature.answers import repetitions
-from pipeline.report.temperature.judgement import NAMES, Judgement
-from pipeline.report.temperature.verdict import ANSWERS, BRIEF, drift_state
+from pipeline.report.temperature.judgement import NAMES, Judgement, verdict_parts
+from pipeline.report.temperature.verdict import BRIEF, drift_state
 
 
 def render(sources: Sources, judged: Judgement) -> str:
@@ -40,15 +42,13 @@ def render(sources: Sources, judged: Judgement) -> str:
         accepted_on=accepted.get("on", ""),
         accepted_at=accepted.get("commit", ""),
         loops=[
-            loop._asdict()
-            | {
-                "reason": words.explained(sources, loop.reason),
-                "remedy": words.explained(sources, loop.remedy),
-            }
+            loop._replace(
+                reason=words.explained(sources, loop.reason), remedy=words.explained(sources, loop.remedy)
+            )
             for loop in loops
         ],
         claim=f"{headline.claim(sources)} {_drifts(judged)}",
-        rules=verdict_parts(judged)["rules"],
+        rules=verdict_parts(judged).rules,
         answers=_rows(judged),
         repetitions=repetitions(sources),
         seeds=len(sources.declared.panel.judging.seeds),
@@ -63,7 +63,7 @@ def render(sources: Sources, judged: Judgement) -> str:
             cards.deposition(sources),
             setpoint_card.setpoint(sources),
         ],
-        paired=pairs.compared(sources)["finding"],
+        paired=pairs.compared(sources).finding,
         difference=difference_parts(sources, judged),
         workflow=workflow.figure(sources),
         from_accepted=sources.source("accepted"),
@@ -77,13 +77,11 @@ def render(sources: Sources, judged: Judgement) -> str:
 
 def _accepted(sources: Sources) -> dict[str, str]:
     """The day on which the run was accepted, and the commit that was checked out; older files do not say."""
-    found = sources.accepted if isinstance(sources.accepted, dict) else {}
-    said = found.get("accepted")
-    return (
-        {key: str(said[key])[:40] for key in ("on", "commit") if key in said}
-        if isinstance(said, dict)
-        else {}
-    )
+    run = sources.accepted if isinstance(sources.accepted, dict) else {}
+    accepted = run.get("accepted")
+    if not isinstance(accepted, dict):
+        return {}
+    return {key: str(accepted[key])[:40] for key in ("on", "commit") if key in accepted}
 
 
 def _drifts(judged: Judgement) -> str:
@@ -94,65 +92,66 @@ def _drifts(judged: Judgement) -> str:
     return f"Drift: temperature {word[:1].lower()}{word[1:].rstrip('.')}, not measured in the others."
 
 
-# ---- the verdict
-
-
-def verdict_parts(judged: Judgement) -> dict[str, Any]:
-    """Decision, reason and remedy, and the five rules for the two controllers that compete."""
-    table = [
-        {
-            "rule": learned.name[:1].upper() + learned.name[1:],
-            "answers": ANSWERS[learned.name],
-            "states": [learned.state, designed.state],
-            "first": learned.name == judged.verdict.rule,
-        }
-        for learned, designed, _ in judged.verdict.rules
-    ]
-    changed = judged.changed.parameters if judged.changed else []
-    return {
-        "state": judged.verdict.word,
-        "decision": judged.verdict.decision,
-        "lead": judged.verdict.lead,
-        "reason": judged.verdict.reason,
-        "remedy": judged.verdict.remedy,
-        "rules": table,
-        "claim": "",
-        "changed": f"{count(len(changed), 'parameter').capitalize()} changed since the accepted run"
-        if changed
-        else "",
-    }
-
-
 # ---- the answers
 
 
-def _rows(judged: Judgement) -> list[dict[str, Any]]:
+class Cell(NamedTuple):
+    """The answer of one controller: its figure and band in words, or what is missing."""
+
+    css: str
+    name: str
+    state: str
+    missing: Missing | None = None
+    value: str = ""
+    band: str = ""
+
+
+class Answer(NamedTuple):
+    """A row of the answers. `moved` and `worse` since the accepted run; `quiet`: both controllers pass, and
+    nothing moved."""
+
+    n: int
+    key: str
+    title: str
+    word: str
+    sub: str
+    cells: list[Cell]
+    limit: str
+    state: str
+    strip: Markup
+    change: str
+    moved: bool
+    worse: bool
+    quiet: bool
+
+
+def _rows(judged: Judgement) -> list[Answer]:
     return [_row(question, judged) for question in judged.asked]
 
 
-def _row(question: Question, judged: Judgement) -> dict[str, Any]:
+def _row(question: Question, judged: Judgement) -> Answer:
     pair = [(role, judged.roles[role][question.key]) for role in ("data_driven", "model_based")]
     places = row_places(question, [figure for _, figure in pair])
     move = next((m for m in judged.moved.get("data_driven", []) if m.question == question), None)
-    return {
-        "n": question.answer,
-        "key": question.key,
-        "title": question.title,
-        "word": words.explaining(question.key),
-        "sub": _sub(question, pair),
-        "cells": [_cell(question, role, figure, places) for role, figure in pair],
-        # as it was declared: "10.000 %" reads as ten thousand where a point parts thousands
-        "limit": f"{'≥' if question.at_least else '≤'} "
-        f"{quantity(question.limit, question.unit, declared(question.limit))}",
-        "state": state(question, pair[0][1]),
-        "strip": charts.strip(question, [(ROLES[role], page.MARKS[role], figure) for role, figure in pair]),
-        "change": move.text() if move else "first run",
-        "moved": bool(move and move.moved),
-        "worse": bool(move and move.moved and move.word == "worse" and state(question, pair[0][1]) != PASSED),
-        "quiet": state(question, pair[0][1]) == PASSED
-        and state(question, pair[1][1]) == PASSED
-        and not (move and move.moved),
-    }
+    moved = move is not None and move.moved
+    learned, designed = (state(question, figure) for _, figure in pair)
+    # as it was declared: "10.000 %" reads as ten thousand where a point parts thousands
+    limit = quantity(question.limit, question.unit, declared(question.limit))
+    return Answer(
+        question.answer,
+        question.key,
+        question.title,
+        words.explaining(question.key),
+        _sub(question, pair),
+        [_cell(question, role, figure, places) for role, figure in pair],
+        limit=f"{'≥' if question.at_least else '≤'} {limit}",
+        state=learned,
+        strip=charts.strip(question, [(ROLES[role], page.MARKS[role], figure) for role, figure in pair]),
+        change=move.text() if move else "first run",
+        moved=moved,
+        worse=moved and move.word == "worse" and learned != PASSED,
+        quiet=learned == designed == PASSED and not moved,
+    )
 
 
 def _sub(question: Question, pair: Sequence[tuple[str, Figure | Missing]]) -> str:
@@ -169,22 +168,16 @@ def _sub(question: Question, pair: Sequence[tuple[str, Figure | Missing]]) -> st
     }.get(question.key, "")
 
 
-def _cell(question: Question, role: str, figure: Figure | Missing, places: int) -> dict[str, Any]:
-    found = state(question, figure)
-    cell = {
-        "css": page.MARKS[role],
-        "name": NAMES[role],
-        "state": found,
-        "missing": figure if isinstance(figure, Missing) else None,
-    }
-    if isinstance(figure, Figure):
-        cell["value"] = quantity(figure.value, question.unit, places, beyond=question.beyond)
-        cell["band"] = (
-            figure.note.split(" samples")[0].replace(" of ", " / ")
-            if question.key == "data"
-            else band(figure.low, figure.high, places, beyond=question.beyond) or _finer(figure, question)
-        )
-    return cell
+def _cell(question: Question, role: str, figure: Figure | Missing, places: int) -> Cell:
+    cell = Cell(page.MARKS[role], NAMES[role], state(question, figure))
+    if isinstance(figure, Missing):
+        return cell._replace(missing=figure)
+    return cell._replace(
+        value=quantity(figure.value, question.unit, places, beyond=question.beyond),
+        band=figure.note.split(" samples")[0].replace(" of ", " / ")
+        if question.key == "data"
+        else band(figure.low, figure.high, places, beyond=question.beyond) or _finer(figure, question),
+    )
 
 
 def _finer(figure: Figure, question: Question) -> str:
@@ -201,51 +194,59 @@ def _finer(figure: Figure, question: Question) -> str:
     )
 
 
+class ChangeSentence(NamedTuple):
+    """Answer 3; `alone` stands in the place of `strong` where the page finds, by script, that nothing but the
+    machine differs."""
+
+    strong: str
+    text: str = ""
+    alone: str = ""
+
+
 def _change_sentence(
-    judged: Judgement, accepted: dict | Missing | None, parts: Sequence[Move], seen: tuple[int, int]
-) -> dict[str, str]:
+    judged: Judgement, accepted: dict | Missing | None, parts: Sequence[Move], cases: tuple[int, int]
+) -> ChangeSentence:
     """Answer 3: the figures of the temperature loop that moved, and how many of the other loops'."""
     if isinstance(accepted, Missing):
-        return {"strong": "The accepted run cannot be read.", "text": accepted.sentence()}
+        return ChangeSentence("The accepted run cannot be read.", accepted.sentence())
     if judged.changed is None:
-        return {
-            "strong": "First run: nothing to compare with.",
-            "text": "./run beadline accept marks this one as good.",
-        }
-    found = [move for move in judged.moved["data_driven"] if move.moved]
-    others = sum(move.moved for move in parts), seen[0]
+        return ChangeSentence(
+            "First run: nothing to compare with.", "./run beadline accept marks this one as good."
+        )
+    moved = [move for move in judged.moved["data_driven"] if move.moved]
+    others = sum(move.moved for move in parts), cases[0]
     elsewhere = (
-        f"Deposition: {others[0]} of {len(parts)} moved. Setpoint: {others[1]} of {seen[1]}."
-        if parts or seen[1]
+        f"Deposition: {others[0]} of {len(parts)} moved. Setpoint: {others[1]} of {cases[1]}."
+        if parts or cases[1]
         else ""
     )
-    if not found:
+    if not moved:
         unchanged = judged.changed.empty and all(
             move.word in ("unchanged", "not measured", "failed") for move in judged.moved["data_driven"]
         )
         if unchanged and not any(others):
-            return {"strong": "Nothing changed; no figure moved.", "text": ""}
+            return ChangeSentence("Nothing changed; no figure moved.")
         loop = "of this loop " if any(others) else ""
-        return {
-            "strong": f"No figure {loop}moved beyond its noise.",
-            "text": f"{_inputs(judged.changed)} {elsewhere if any(others) else ''}".strip(),
-        }
+        return ChangeSentence(
+            f"No figure {loop}moved beyond its noise.",
+            f"{_inputs(judged.changed)} {elsewhere if any(others) else ''}".strip(),
+        )
     groups = [
-        (word, [BRIEF[move.question.key] for move in found if move.word == word])
+        (word, [BRIEF[move.question.key] for move in moved if move.word == word])
         for word in ("worse", "better")
     ]
-    said = "; ".join(f"{word}: {', '.join(names)}" for word, names in groups if names)
-    return {
-        "strong": f"{len(found)} of {len(judged.asked)} figures moved beyond their noise.",
-        # in its place where the page finds, by script, that nothing but the machine differs
-        "alone": f"{len(found)} of {len(judged.asked)} figures moved with the machine alone.",
-        "text": " ".join(
-            filter(
-                None,
-                [f"{said[:1].upper()}{said[1:]}.", _inputs(judged.changed), elsewhere if any(others) else ""],
-            )
-        ),
-    }
+    listed = "; ".join(f"{word}: {', '.join(names)}" for word, names in groups if names)
+    sentences = [
+        f"{listed[:1].upper()}{listed[1:]}.",
+        _inputs(judged.changed),
+        elsewhere if any(others) else "",
+    ]
+    figures = f"{len(moved)} of {len(judged.asked)} figures moved"
+    return ChangeSentence(
+        f"{figures} beyond their noise.",
+        " ".join(filter(None, sentences)),
+        alone=f"{figures} with the machine alone.",
+    )
 
 
 def _inputs(changed: Difference) -> str:
@@ -260,8 +261,8 @@ def _inputs(changed: Difference) -> str:
 
 
 def _deposition_moves(sources: Sources) -> list[Move]:
-    found = deposition_rules.structures(sources)
-    return [] if isinstance(found, Missing) else deposition_change.moves(sources, found)
+    parts = deposition_rules.structures(sources)
+    return [] if isinstance(parts, Missing) else deposition_change.moves(sources, parts)
 
 
 def hashes(sources: Sources) -> list[tuple[str, str]]:
@@ -281,61 +282,66 @@ def hashes(sources: Sources) -> list[tuple[str, str]]:
 # ---- the difference
 
 
-def difference_parts(sources: Sources, judged: Judgement) -> dict[str, Any]:
+class MovedFigure(NamedTuple):
+    """A figure that moved beyond its noise: whose, how, and what it was and is."""
+
+    title: str
+    role: str
+    name: str
+    word: str
+    worse: bool
+    before: str
+    now: str
+    svg: Markup
+
+
+class DifferenceParts(NamedTuple):
+    """What changed since the accepted run, the figures that moved, and the rest in sentences."""
+
+    accepted: str = ""
+    missing: Missing | None = None
+    moved: Sequence[MovedFigure] = ()
+    rest: Sequence[str] = ()
+    changed: Difference | None = None
+    empty: bool = False
+
+
+def _moved(role: str, move: Move) -> MovedFigure:
+    """A move of a controller of the temperature loop, or of the deposition loop's composer in use."""
+    question = move.question
+    places = row_places(question, [move.before, move.now])
+    limit = quantity(question.limit, question.unit, places)
+    return MovedFigure(
+        question.title,
+        "data_driven" if role == "deposition" else role,
+        "composer in use" if role == "deposition" else NAMES[role],
+        move.word,
+        worse=move.word == "worse" and state(question, move.now) != PASSED,
+        before=quantity(move.before.value, question.unit, places, beyond=question.beyond),
+        now=quantity(move.now.value, question.unit, places, beyond=question.beyond),
+        svg=charts.before_and_now(question, page.MARKS.get(role, "dd"), move.before, move.now, limit),
+    )
+
+
+def difference_parts(sources: Sources, judged: Judgement) -> DifferenceParts:
     """What changed, and the figures that moved: of both controllers of the temperature loop, and of the
     composer in use of the deposition loop."""
     accepted, changed = sources.accepted, judged.changed
     parts = _deposition_moves(sources)
     if isinstance(accepted, Missing) or changed is None:
-        return {
-            "accepted": "",
-            "missing": accepted if isinstance(accepted, Missing) else None,
-            "moved": [],
-            "rest": [],
-            "changed": None,
-            "empty": False,
-        }
-    moved = []
-    for role, found in (
-        *((role, judged.moved[role]) for role in ("data_driven", "model_based")),
-        ("deposition", parts),
-    ):
-        for move in found:
-            if move.moved:
-                places = row_places(move.question, [move.before, move.now])
-                limit = quantity(move.question.limit, move.question.unit, places)
-                moved.append(
-                    {
-                        "title": move.question.title,
-                        "role": "data_driven" if role == "deposition" else role,
-                        "name": "composer in use" if role == "deposition" else NAMES[role],
-                        "word": move.word,
-                        "worse": move.word == "worse" and state(move.question, move.now) != PASSED,
-                        "before": quantity(
-                            move.before.value, move.question.unit, places, beyond=move.question.beyond
-                        ),
-                        "now": quantity(
-                            move.now.value, move.question.unit, places, beyond=move.question.beyond
-                        ),
-                        "svg": charts.before_and_now(
-                            move.question, page.MARKS.get(role, "dd"), move.before, move.now, limit
-                        ),
-                    }
-                )
+        return DifferenceParts(missing=accepted if isinstance(accepted, Missing) else None)
+    by_role = {role: judged.moved[role] for role in ("data_driven", "model_based")} | {"deposition": parts}
+    moved = [_moved(role, move) for role, moves in by_role.items() for move in moves if move.moved]
     rest: dict[str, list[str]] = {}
     for move in judged.moved["data_driven"]:
         if not move.moved:
             rest.setdefault(move.word, []).append(BRIEF[move.question.key])
     still = [f"{word[:1].upper()}{word[1:]}: {', '.join(names)}." for word, names in rest.items()]
-    return {
-        "accepted": changed.accepted,
-        "missing": None,
-        "moved": moved,
-        "rest": [
-            *still,
-            "Not measured in either run: drift." if sources.nightly is None else "",
-            deposition_change.sentence(parts),
-        ],
-        "changed": changed,
-        "empty": changed.empty and not moved,
-    }
+    drift = "Not measured in either run: drift." if sources.nightly is None else ""
+    return DifferenceParts(
+        changed.accepted,
+        moved=moved,
+        rest=[*still, drift, deposition_change.sentence(parts)],
+        changed=changed,
+        empty=changed.empty and not moved,
+    )

@@ -2,7 +2,7 @@
 as in the accepted run, and what was made anew."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import NamedTuple
 
 from markupsafe import Markup
 
@@ -31,20 +31,24 @@ CSS = {SAME: "same", CHANGED: "anew", GONE: "lost", FIRST: "same"}
 WIDE, TALL, ACROSS, DOWN = 170, 40, 46, 18
 
 
-def figure(sources: Sources) -> dict[str, Any]:
+class Workflow(NamedTuple):
     """Finding, picture, and what both are from."""
+
+    finding: str
+    picture: Markup
+    origin: Markup
+
+
+def figure(sources: Sources) -> Workflow:
+    """The stages, and which of them were made anew."""
     states = {stage: state(sources, stage) for stage in READS}
     groups = [
-        (word, [stage for stage, found in states.items() if found == word])
+        (word, [stage for stage, is_now in states.items() if is_now == word])
         for word in (CHANGED, GONE, SAME, FIRST)
     ]
-    said = "; ".join(f"{word}: {', '.join(names)}" for word, names in groups if names)
-    alt = f"{len(states)} stages. {said[:1].upper()}{said[1:]}"
-    return {
-        "finding": _finding(states),
-        "picture": _drawn(states, alt),
-        "origin": page.origin(sources.source("accepted", *READS)),
-    }
+    listed = "; ".join(f"{word}: {', '.join(names)}" for word, names in groups if names)
+    alt = f"{len(states)} stages. {listed[:1].upper()}{listed[1:]}"
+    return Workflow(_finding(states), _drawn(states, alt), page.origin(sources.source("accepted", *READS)))
 
 
 def state(sources: Sources, stage: str) -> str:
@@ -68,8 +72,8 @@ def state(sources: Sources, stage: str) -> str:
 
 
 def _finding(states: Mapping[str, str]) -> str:
-    names = [stage for stage, found in states.items() if found == CHANGED]
-    same = sum(found == SAME for found in states.values())
+    names = [stage for stage, word in states.items() if word == CHANGED]
+    same = sum(word == SAME for word in states.values())
     if FIRST in states.values():
         return "No run was accepted yet: nothing says what is new."
     if not names:
@@ -101,14 +105,14 @@ def reduced(reads: Mapping[str, tuple[str, ...]]) -> dict[str, list[str]]:
 def places(reads: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[int, int]]:
     """(column, lane): one column right of the last stage that it reads; in the
     lane of the first, or in the next one that is free."""
-    found: dict[str, tuple[int, int]] = {}
+    taken: dict[str, tuple[int, int]] = {}
     for stage, sources in reads.items():
-        column = max((found[read][0] + 1 for read in sources), default=0)
-        lane = found[sources[0]][1] if sources else max((lane for _, lane in found.values()), default=-1) + 1
-        while (column, lane) in found.values():
+        column = max((taken[read][0] + 1 for read in sources), default=0)
+        lane = taken[sources[0]][1] if sources else max((lane for _, lane in taken.values()), default=-1) + 1
+        while (column, lane) in taken.values():
             lane += 1
-        found[stage] = column, lane
-    return found
+        taken[stage] = column, lane
+    return taken
 
 
 def _drawn(states: Mapping[str, str], alt: str) -> Markup:

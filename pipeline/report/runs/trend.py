@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from markupsafe import Markup
@@ -132,22 +132,34 @@ def _scale(values: np.ndarray) -> charts.Axis:
     return charts.linear(min(float(values.min()), 0.0), 1.1 * float(values.max()))
 
 
-def _row(run: Revision, asked: Sequence[Question]) -> dict[str, Any]:
+class Cell(NamedTuple):
+    """A figure in words, the number that its column sorts by, and whether it lies beyond today's limit."""
+
+    text: str
+    number: float | str = ""
+    bad: bool = False
+
+
+class Row(NamedTuple):
+    """A run in the table."""
+
+    commit: str
+    date: str
+    when: str
+    subject: str
+    verdict: str
+    cells: list[Cell]
+
+
+def _row(run: Revision, asked: Sequence[Question]) -> Row:
     cells = []
     for question in asked:
         figure = _figure(run, "window", question.key) or _figure(run, "deposition", question.key)
         if figure is None:
-            cells.append({"text": "not measured", "number": "", "bad": False})
+            cells.append(Cell("not measured"))
             continue
         beyond = figure.value < question.limit if question.at_least else figure.value > question.limit
         finite = math.isfinite(figure.value)
-        text = f"{short(figure.value, 3)}" if finite else question.beyond
-        cells.append({"text": text, "number": figure.value if finite else "", "bad": beyond})
-    return {
-        "commit": run.commit[:8],
-        "date": run.date[:10],
-        "when": run.date,
-        "subject": run.subject,
-        "verdict": run.verdict,
-        "cells": cells,
-    }
+        text = short(figure.value, 3) if finite else question.beyond
+        cells.append(Cell(text, figure.value if finite else "", beyond))
+    return Row(run.commit[:8], run.date[:10], run.date, run.subject, run.verdict, cells)

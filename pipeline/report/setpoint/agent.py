@@ -3,9 +3,11 @@ training of the agents, settled runs against the classifier's accuracy."""
 
 import math
 import re
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.setpoint.verdict import AGENT, BASELINE, PAPER, Board, Case, case_text, role
@@ -78,10 +80,11 @@ def ways(sources: Sources, board: Board | Missing) -> list[Picture]:
     for needed in (board, table):
         if isinstance(needed, Missing):
             return [placeholder("ways", title, needed)]
-    there = list(dict.fromkeys(zip(map(str, table["simulator"]), map(str, table["case"]), strict=True)))
-    cases = [case for case in (*CASES, *(one for one in there if one[0] == "pixels")) if case in there][
-        :3
-    ] or there[:1]
+    run = list(
+        pd.DataFrame(table)[["simulator", "case"]].drop_duplicates().itertuples(index=False, name=None)
+    )
+    wanted = (*CASES, *(case for case in run if case[0] == "pixels"))
+    cases = [case for case in wanted if case in run][:3] or run[:1]
     if not cases:
         return [
             placeholder(
@@ -99,7 +102,7 @@ def _ways(sources: Sources, board: Board, table: Table, case: Case, i: int) -> P
         mine = (table["controller"] == name) & (table["simulator"] == case[0]) & (table["case"] == case[1])
         flow, temperature = _by_start(table, mine, "flow_percent"), _by_start(table, mine, "temperature_degC")
         inside = _inside(flow, temperature)
-        ends = sum(one[min(len(one) - 1, SETTLED_BY) :].all() for one in inside)
+        ends = sum(way[min(len(way) - 1, SETTLED_BY) :].all() for way in inside)
         mark, css = role(board, name), page.MARKS[role(board, name)]
         sentences.append(f"{name} {ends} of {len(flow)}")
         first = not columns
@@ -127,8 +130,9 @@ def _kind(board: Board, name: str) -> str:
 
 
 def _by_start(table: Table, mine: np.ndarray, column: str) -> list[np.ndarray]:
-    starts = np.unique(table["start"][mine])
-    return [table[column][mine & (table["start"] == k)] for k in starts[:: -(-len(starts) // MOST)]]
+    from_start = pd.Series(table[column][mine]).groupby(table["start"][mine])
+    ways = [way.to_numpy() for _, way in from_start]
+    return ways[:: -(-len(ways) // MOST)]
 
 
 def _inside(flow: list[np.ndarray], temperature: list[np.ndarray]) -> list[np.ndarray]:
@@ -168,7 +172,7 @@ def _surface(
     for q, u in zip(flow, temperature, strict=True):
         layers.append(charts.line(frame, q, u, "line way"))
     layers += [charts.dots(frame, q[:1], u[:1], "begin", 2.4) for q, u in zip(flow, temperature, strict=True)]
-    last = [one[-1] for one in _inside(flow, temperature)]
+    last = [way[-1] for way in _inside(flow, temperature)]
     layers += [
         charts.dots(frame, q[-1:], u[-1:], "dot whole" if ok else "dot off", 2.8)
         for q, u, ok in zip(flow, temperature, last, strict=True)
@@ -214,13 +218,13 @@ def _steps(name: str, flow: list[np.ndarray], inside: list[np.ndarray], css: str
     frame = charts.Frame(
         charts.linear(0, max(last, 1), ticks=5), charts.linear(0, 320, ticks=4), 368, 132, 30
     )
-    since = [int(np.flatnonzero(~one)[-1]) + 1 if not one.all() else 0 for one in inside]
-    done = [k for k, one in zip(since, inside, strict=True) if one[-1]]
+    since = [int(np.flatnonzero(~way)[-1]) + 1 if not way.all() else 0 for way in inside]
+    done = [k for k, way in zip(since, inside, strict=True) if way[-1]]
     text = f"half of them inside after {int(np.median(done))} decisions" if done else "none inside at the end"
     layers = [charts.tint(frame, BEST_FLOW - FLOW_BAND, BEST_FLOW + FLOW_BAND)]
     layers += [charts.line(frame, np.arange(len(q)), q, "line way") for q in flow]
     layers.append(charts.label(frame, last, 320, text, anchor="end", dy=8))
-    lowest, highest = (find(float(find(q[len(q) // 2 :])) for q in flow) for find in (min, max))
+    lowest, highest = (end(float(end(q[len(q) // 2 :])) for q in flow) for end in (min, max))
     alt = (
         f"{name}: {text}; in the second half flows lie between {number(lowest, 0)} and {number(highest, 0)} %"
     )
@@ -238,9 +242,8 @@ def training(sources: Sources) -> Picture:
     if isinstance(table, Missing):
         return placeholder("agents", title, table)
     columns, sentences = [], []
-    for agent in dict.fromkeys(map(str, table["agent"])):
-        mine = {name: values[table["agent"] == agent] for name, values in table.items()}
-        ends = [float(mine["reward"][mine["phase"] == k][-1]) for k in np.unique(mine["phase"])]
+    for agent, mine in pd.DataFrame(table).groupby("agent", sort=False):
+        ends = mine.groupby("phase").reward.last().tolist()
         values = (
             ", ".join(number(end, 2) for end in ends)
             if len(ends) <= 6
@@ -274,17 +277,17 @@ def training(sources: Sources) -> Picture:
     )
 
 
-def _course(mine: Table, agent: str, word: str, reward_text: str) -> Markup:
-    updates, reward, phases = mine["update"] / 1000, mine["reward"], np.unique(mine["phase"])
+def _course(mine: pd.DataFrame, agent: str, word: str, reward_text: str) -> Markup:
+    updates, reward = mine["update"] / 1000, mine.reward
     span = max(float(reward.max() - reward.min()), 0.2)
     y = charts.linear(float(reward.min()) - 0.25 * span, float(reward.max()) + 0.1 * span, ticks=4)
     frame = charts.Frame(charts.linear(0, float(updates.max()) or 1.0, ticks=5), y, 568, 180, 34)
     layers = []
-    for k in phases:
-        here = mine["phase"] == k
-        begin = 0.0 if k == phases[0] else float(updates[here].min())
+    phases = mine.groupby("phase")
+    for i, (k, here) in enumerate(phases.indices.items()):
+        begin = float(updates.iloc[here].min()) if i else 0.0
         x = float(frame.px(begin))
-        if k > phases[0]:
+        if i:
             layers.append(
                 Markup('<line class="lim" x1="{0:.1f}" x2="{0:.1f}" y1="{1}" y2="{2}"/>').format(
                     x, frame.above, frame.height - frame.below
@@ -292,15 +295,10 @@ def _course(mine: Table, agent: str, word: str, reward_text: str) -> Markup:
             )
         layers.append(
             charts.label(
-                frame,
-                begin,
-                y.low,
-                f"{word} {k}" if len(phases) <= 6 or k == phases[0] else str(k),
-                dx=3,
-                dy=-4,
+                frame, begin, y.low, f"{word} {k}" if len(phases) <= 6 or not i else str(k), dx=3, dy=-4
             )
         )
-        layers.append(charts.line(frame, updates[here], reward[here]))
+        layers.append(charts.line(frame, updates.to_numpy()[here], reward.to_numpy()[here]))
     alt = (
         f"{_agent(agent)}: mean reward at the end of each {word} {reward_text}, "
         f"after {number(float(mine['update'].max()), 0)} updates in all"
@@ -427,11 +425,29 @@ def _names(frame: charts.Frame, ends: list[tuple[float, str]], *, right: bool = 
     return made
 
 
-def phases(sources: Sources) -> dict[str, Any]:
+class Phase(NamedTuple):
+    """What one training came to, in words."""
+
+    name: str
+    small: str
+    mark: str
+    settled: str
+    stay: str
+    steps: str
+    runs: str
+
+
+class Phases(NamedTuple):
+    missing: Missing | None = None
+    rows: Sequence[Phase] = ()
+    best_round: str = ""
+
+
+def phases(sources: Sources) -> Phases:
     """What training came to: settled, staying and steps, by what was trained."""
     metrics = sources.metrics["train_agent"]
     if isinstance(metrics, Missing):
-        return {"missing": metrics, "rows": []}
+        return Phases(metrics)
     rows = []
     for name, (head, small) in TAUGHT.items():
         figures = metrics.get(name)
@@ -439,21 +455,21 @@ def phases(sources: Sources) -> dict[str, Any]:
             continue
         steps, runs, stay = (lookup(figures, key) for key in ("median_steps", "runs", "stay"))
         rows.append(
-            {
-                "name": head,
-                "small": small,
-                "mark": "data_driven" if name.startswith("belief_dqn") else "kernel",
-                "settled": percent(float(figures["settled"]), 3),
-                "stay": "not measured" if isinstance(stay, Missing) else percent(float(stay), 3),
-                "steps": "none settled" if isinstance(steps, Missing) else number(float(steps), 0),
-                "runs": "not said" if isinstance(runs, Missing) else f"{runs:,}",
-            }
+            Phase(
+                head,
+                small,
+                "data_driven" if name.startswith("belief_dqn") else "kernel",
+                settled=percent(float(figures["settled"]), 3),
+                stay="not measured" if isinstance(stay, Missing) else percent(float(stay), 3),
+                steps="none settled" if isinstance(steps, Missing) else number(float(steps), 0),
+                runs="not said" if isinstance(runs, Missing) else f"{runs:,}",
+            )
         )
     gap = None if rows else Missing("not measured", "train_agent.json holds no run")
-    return {"missing": gap, "rows": rows, "kept": _kept(metrics)}
+    return Phases(gap, rows, _best_round(metrics))
 
 
-def _kept(metrics: dict[str, Any]) -> str:
+def _best_round(metrics: dict[str, Any]) -> str:
     """What the rounds of our agent came to, on episodes that it did not learn from."""
     judged, best_round, rounds = (metrics.get(key) for key in ("validation", "kept_round", "rounds"))
     if not judged or best_round is None or not 0 <= best_round < len(judged):

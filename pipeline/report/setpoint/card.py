@@ -2,12 +2,12 @@
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
+import pandas as pd
 from markupsafe import Markup
 
-from pipeline.report.index.cards import unbuilt
+from pipeline.report.index.cards import Card, Cell, Row, heads, unbuilt
 from pipeline.report.setpoint.agent import CASES
 from pipeline.report.setpoint.verdict import (
     BASELINE,
@@ -26,7 +26,6 @@ from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import number
 from pipeline.report.shared.sources import Sources, Table
 from pipeline.report.shared.verdict import ROLES, Figure, Missing
-from pipeline.report.temperature.answers import CONTROLLERS, LABELS
 from pipeline.setpoint.workflow.tables import BEST_FLOW, FLOW_BAND
 
 FLOOR, CEILING = 1.0, 300.0
@@ -47,12 +46,11 @@ def controllers(scores: Board) -> dict[str, str]:
     return {"model_based": bayes, "data_driven": scores.learned(), "baseline": plain}
 
 
-def setpoint(sources: Sources) -> dict[str, Any]:
+def setpoint(sources: Sources) -> Card:
     judged, scores = verdict(sources), board(sources)
     if isinstance(scores, Missing) or not judged.winner:
-        return unbuilt("setpoint", scores.sentence() if isinstance(scores, Missing) else judged.reason) | {
-            "link": "setpoint.html"
-        }
+        why = scores.sentence() if isinstance(scores, Missing) else judged.reason
+        return unbuilt("setpoint", why)._replace(link="setpoint.html")
     who = controllers(scores)
     role = next((role for role, name in who.items() if name == judged.winner), "baseline")
     table = sources.tables["paths"]
@@ -62,35 +60,30 @@ def setpoint(sources: Sources) -> dict[str, Any]:
     who_wins = "The baseline" if role == "baseline" else winner.capitalize().replace("-", "\u2011")
     state = f"Run {winner}" if passed else "Do not decide yet" if judged.state == OPEN else "Do not steer yet"
     sparks = zip((who[role] for role in ORDER), ("mb", "dd", "bl"), strict=True)
-    return {
-        "id": "setpoint",
-        "name": "Setpoint",
-        "link": "setpoint.html",
-        "moves": "Nozzle camera to flow and temperature setpoints",
-        "state": state,
-        "mark": role if passed else None,
-        "win": (f"{who_wins} wins.", _win(scores, judged.winner)) if passed else (judged.lead, judged.reason),
-        "caption": "Flow’s distance from 100\u00a0%, 90th percentile of 21 starts over 100 decisions, log "
+    return Card(
+        id="setpoint",
+        name="Setpoint",
+        link="setpoint.html",
+        moves="Nozzle camera to flow and temperature setpoints",
+        state=state,
+        mark=role if passed else None,
+        win=(f"{who_wins} wins.", _win(scores, judged.winner)) if passed else (judged.lead, judged.reason),
+        caption="Flow’s distance from 100\u00a0%, 90th percentile of 21 starts over 100 decisions, log "
         f"scale {FLOOR:g} to {CEILING:g}\u00a0%: {case_text(case, whole=True)}. Grey: within "
         f"{FLOW_BAND:g}\u00a0%.",
-        "panels": [_spark(table, name, case, css, named=i == 0) for i, (name, css) in enumerate(sparks)],
-        "heads": [
-            {"mark": role, "name": LABELS[CONTROLLERS[role]][0], "method": who[role] or "none judged"}
-            for role in ORDER
-        ],
-        "rows": [
-            {"title": title, "cells": _cells([worst(scores, who[role], what)[0] for role in ORDER], limit)}
+        panels=[_spark(table, name, case, css, named=i == 0) for i, (name, css) in enumerate(sparks)],
+        heads=heads(ORDER, [who[role] or "none judged" for role in ORDER]),
+        rows=[
+            Row(title, _cells([worst(scores, who[role], what)[0] for role in ORDER], limit))
             for title, what, limit in (
                 ("Settle, worst case", "settled", rules.settled_percent),
                 ("Settle and stay, worst case", "stay", rules.stay_percent),
                 ("Recover from a clog", "recovered", rules.settled_percent),
             )
         ],
-        "note": judged.note,
-        "model": None,
-        "sources": sources.source("scoreboard", "paths", "choice"),
-        "missing": None,
-    }
+        note=judged.note,
+        sources=sources.source("scoreboard", "paths", "choice"),
+    )
 
 
 def _win(scores: Board, default: str) -> str:
@@ -100,9 +93,9 @@ def _win(scores: Board, default: str) -> str:
         return ""
     name = named(scores, default)
     others = [
-        f"{named(scores, one)} {share_text(worst(scores, one, 'lasting')[0])}"
-        for one in scores.names
-        if one != default
+        f"{named(scores, other)} {share_text(worst(scores, other, 'lasting')[0])}"
+        for other in scores.names
+        if other != default
     ][:2]
     beside = f"; next in their own worst cases: {', '.join(others)}" if others else ""
     return (
@@ -111,14 +104,14 @@ def _win(scores: Board, default: str) -> str:
     )
 
 
-def _cells(figures: Sequence[Figure | Missing], limit: float) -> list[dict[str, Any]]:
+def _cells(figures: Sequence[Figure | Missing], limit: float) -> list[Cell]:
     most = max((figure.value for figure in figures if isinstance(figure, Figure)), default=math.nan)
     return [
-        {
-            "text": share_text(figure),
-            "best": isinstance(figure, Figure) and figure.value == most,
-            "bad": isinstance(figure, Figure) and figure.high < limit,
-        }
+        Cell(
+            share_text(figure),
+            best=isinstance(figure, Figure) and figure.value == most,
+            bad=isinstance(figure, Figure) and figure.high < limit,
+        )
         for figure in figures
     ]
 
@@ -136,9 +129,9 @@ def _spark(table: Table | Missing, name: str, case: tuple[str, str], css: str, *
     )
     if rows is None or not rows.any():
         return Markup('<div class="hole">{}</div>').format(page.missing(gap))
-    steps = np.unique(table["step"][rows])
-    off = np.abs(table["flow_percent"][rows] - BEST_FLOW)
-    curve = np.array([float(np.percentile(off[table["step"][rows] == k], 90)) for k in steps])
+    off = pd.Series(np.abs(table["flow_percent"][rows] - BEST_FLOW)).groupby(table["step"][rows])
+    reached = off.quantile(0.9)
+    steps, curve = reached.index.to_numpy(), reached.to_numpy()
     bad = bool(curve[-1] > FLOW_BAND)
     alt = (
         f"{name}: nine of ten starts are within {number(float(curve[-1]), 1)} % of full flow after "

@@ -1,10 +1,9 @@
 """How the settled runs of the setpoint loop's default moved since the accepted run."""
 
-from typing import Any
-
 import numpy as np
 
 from pipeline.report.setpoint.verdict import Case, Cell, board
+from pipeline.report.shared.difference import Change
 from pipeline.report.shared.digits import MINUS, THIN, number
 from pipeline.report.shared.sources import Sources, lookup
 from pipeline.report.shared.verdict import FAILED, Missing, Question, state
@@ -14,36 +13,35 @@ from pipeline.statistics import wilson
 SAME = 0.05
 
 
-def change(sources: Sources, case: Case, cell: Cell | None) -> dict[str, Any]:
+def change(sources: Sources, case: Case, cell: Cell | None) -> Change:
     """How the settled runs of the default moved since the accepted run: beyond noise where their intervals,
     of as many runs as now, do not overlap."""
-    still = {"text": "first run", "moved": False, "worse": False}
     if (
         sources.accepted is None
         or isinstance(sources.accepted, Missing)
         or cell is None
         or isinstance(cell.settled, Missing)
     ):
-        return still
+        return Change("first run")
     stage = lookup(sources.accepted, "metrics.evaluate_setpoint")
     name = None if isinstance(stage, Missing) else stage.get("default")
-    of = {} if not name or not isinstance(stage.get(name), dict) else stage[name]
-    before = of.get(case[0], {}).get(case[1], {}).get("settled")
+    cases = {} if not name or not isinstance(stage.get(name), dict) else stage[name]
+    before = cases.get(case[0], {}).get(case[1], {}).get("settled")
     if before is None:
-        return still | {"text": "new"}
+        return Change("new")
     now = cell.settled
     points = now.value - before
     if abs(points) < SAME:
-        return still | {"text": "unchanged"}
+        return Change("unchanged")
     then = wilson(np.arange(cell.runs) < round(before / 100 * cell.runs))
     if now.low <= then.high and then.low <= now.high:
-        return still | {"text": "within noise"}
+        return Change("within noise")
     question = Question(0, "", "Settled", "%", sources.declared.rules.settled_percent, True, "")
     text = (
         f"{'+' if points > 0 else MINUS}{number(abs(points), 1)}{THIN}points · "
         f"{'better' if points > 0 else 'worse'}"
     )
-    return {"text": text, "moved": True, "worse": points < 0 and state(question, now) == FAILED}
+    return Change(text, moved=True, worse=points < 0 and state(question, now) == FAILED)
 
 
 def moved_cases(sources: Sources) -> tuple[int, int]:
@@ -52,4 +50,4 @@ def moved_cases(sources: Sources) -> tuple[int, int]:
     if isinstance(scores, Missing) or not scores.default:
         return 0, 0
     changes = [change(sources, case, cell) for case, cell in scores.counting(scores.default)]
-    return sum(one["moved"] for one in changes), len(changes)
+    return sum(case.moved for case in changes), len(changes)

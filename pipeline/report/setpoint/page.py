@@ -1,7 +1,9 @@
 """The page of the setpoint loop: who sets flow and temperature by default, what each controller makes of each
 case, and what the camera's classifier is worth."""
 
-from typing import Any
+from typing import NamedTuple
+
+from markupsafe import Markup
 
 from pipeline.report.deposition.page import flat
 from pipeline.report.setpoint import agent as setpoint_agent
@@ -13,6 +15,7 @@ from pipeline.report.setpoint.verdict import (
     HEADS,
     SIMULATORS,
     Board,
+    Case,
     Cell,
     board,
     case_text,
@@ -24,9 +27,10 @@ from pipeline.report.setpoint.verdict import (
     worst,
 )
 from pipeline.report.shared import charts, page, words
+from pipeline.report.shared.difference import Change
 from pipeline.report.shared.digits import THIN, band, number, percent, quantity
 from pipeline.report.shared.sources import Sources, digest
-from pipeline.report.shared.verdict import FAILED, Figure, Missing, Question, state
+from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Figure, Missing, Question, state
 
 WORDS = (
     "window_of_frames",
@@ -116,16 +120,25 @@ def hashes(sources: Sources) -> list[tuple[str, str]]:
     ]
 
 
-def heads(scores: Board | None) -> list[dict[str, Any]]:
+class Head(NamedTuple):
+    """A controller of the first screen; `default`: it is the one that runs."""
+
+    name: str
+    default: bool
+    mark: str
+    css: str
+
+
+def heads(scores: Board | None) -> list[Head]:
     """The two controllers of the first screen: what learned, and the best baseline."""
     pair = ("", "") if scores is None else (scores.learned(), scores.best(BASELINE))
     return [
-        {
-            "name": name or "none",
-            "default": bool(name) and scores is not None and name == scores.default,
-            "mark": role(scores, name) if name else fallback,
-            "css": css,
-        }
+        Head(
+            name or "none",
+            bool(name) and scores is not None and name == scores.default,
+            role(scores, name) if name else fallback,
+            css,
+        )
         for name, fallback, css in zip(pair, ("data_driven", "baseline"), ("dd", "mb"), strict=True)
     ]
 
@@ -133,7 +146,30 @@ def heads(scores: Board | None) -> list[dict[str, Any]]:
 # ---- the first screen: a row for each case that counts
 
 
-def answers(sources: Sources, scores: Board) -> list[dict[str, Any]]:
+class Reading(NamedTuple):
+    """Runs of one controller that settle in one case, in words."""
+
+    css: str
+    name: str
+    value: str = "not measured"
+    band: str = ""
+    bad: bool = False
+
+
+class Answer(NamedTuple):
+    """A row of the first screen: one case."""
+
+    simulator: str
+    case: str
+    state: str
+    cells: list[Reading]
+    strip: Markup
+    stay: str
+    stay_bad: bool
+    change: Change
+
+
+def answers(sources: Sources, scores: Board) -> list[Answer]:
     """Runs that settle and stay of what learned and of the best baseline; the strip shows the runs that are
     lost, as a share of those that may be."""
     pair = (scores.learned(), scores.best(BASELINE))
@@ -153,18 +189,22 @@ def answers(sources: Sources, scores: Board) -> list[dict[str, Any]]:
             if name
         ]
         mine = scores.cells.get((scores.default or pair[0], case))
-        states = (
-            [state(lost, _lost(mine)), state(gone, _lost(mine, "stay"))] if mine else ["not measured"] * 2
+        states = [state(lost, _lost(mine)), state(gone, _lost(mine, "stay"))] if mine else [OPEN] * 2
+        rows.append(
+            Answer(
+                SIMULATORS.get(case[0], case[0]),
+                case_text(case),
+                next((verdict for verdict in states if verdict != PASSED), PASSED),
+                [
+                    _reading(name, cell, lost, css)
+                    for name, cell, css in zip(pair, cells, ("dd", "mb"), strict=True)
+                ],
+                strip=charts.strip(lost, shown),
+                stay=_stay(mine),
+                stay_bad=states[1] == FAILED,
+                change=setpoint_change.change(sources, case, mine),
+            )
         )
-        rows.append({
-            "simulator": SIMULATORS.get(case[0], case[0]), "case": case_text(case),
-            "state": next((one for one in states if one != "passed"), "passed"),
-            "cells": [_answer(cell, lost, css) | {"name": name} for name, cell,
-            css in zip(pair, cells, ("dd", "mb"), strict=True)],
-            "strip": charts.strip(lost, shown), "stay": _stay(mine),
-            "stay_bad": bool(mine) and state(gone, _lost(mine, "stay")) == FAILED,
-            "change": setpoint_change.change(sources, case, mine),
-        })  # fmt: skip
     return rows
 
 
@@ -177,16 +217,11 @@ def _lost(cell: Cell | None, what: str = "settled") -> Figure | Missing:
     )
 
 
-def _answer(cell: Cell | None, lost: Question, css: str) -> dict[str, Any]:
+def _reading(name: str, cell: Cell | None, lost: Question, css: str) -> Reading:
     if cell is None or isinstance(cell.settled, Missing):
-        return {"css": css, "value": "not measured", "band": "", "bad": False, "steps": ""}
-    return {
-        "css": css,
-        "value": share_text(cell.settled),
-        "band": band(cell.settled.low, cell.settled.high, 1),
-        "bad": state(lost, _lost(cell)) == FAILED,
-        "steps": "" if cell.median != cell.median else f"{number(cell.median, 0)} steps",
-    }
+        return Reading(css, name)
+    interval = band(cell.settled.low, cell.settled.high, 1)
+    return Reading(css, name, share_text(cell.settled), interval, state(lost, _lost(cell)) == FAILED)
 
 
 def _stay(cell: Cell | None) -> str:
@@ -196,7 +231,44 @@ def _stay(cell: Cell | None) -> str:
 # ---- the scoreboard
 
 
-def boards(sources: Sources, scores: Board) -> list[dict[str, Any]]:
+class Share(NamedTuple):
+    """A line of a cell: a share of runs with its interval."""
+
+    text: str
+    band: str
+    bad: bool
+
+
+class BoardCell(NamedTuple):
+    """One controller in one case, in words; bold in its own worst case."""
+
+    lines: list[Share]
+    steps: str = ""
+    more: str = ""
+    tip: str = ""
+    bold: bool = False
+
+
+class BoardRow(NamedTuple):
+    name: str
+    mark: str
+    default: bool
+    kind: str
+    cells: list[BoardCell]
+
+
+class SimulatorBoard(NamedTuple):
+    """The scoreboard of one simulator; `counts`: its cases count for the choice."""
+
+    id: str
+    name: str
+    heads: list[str]
+    rows: list[BoardRow]
+    counts: bool
+    runs: str
+
+
+def boards(sources: Sources, scores: Board) -> list[SimulatorBoard]:
     """A table for each simulator: controllers down, cases across; vermillion where the whole interval lies
     beyond a limit, bold in a controller's own worst case."""
     asked = sources.declared.rules
@@ -208,48 +280,39 @@ def boards(sources: Sources, scores: Board) -> list[dict[str, Any]]:
     tables = []
     for simulator in dict.fromkeys(case[0] for case in scores.cases):
         cases = [case for case in scores.cases if case[0] == simulator]
-        rows = []
-        for name in scores.names:
-            cells = [scores.cells.get((name, case)) for case in cases]
-            if not any(cells):
-                continue
-            _, low = worst(scores, name, "lasting")
-            rows.append({
-                "name": name, "mark": role(scores, name), "default": name == scores.default,
-                "kind": scores.kinds[name],
-                "cells": [_cell(cell, limits, bold=case == low) for case,
-                cell in zip(cases, cells, strict=True)],
-            })  # fmt: skip
-        counts = any(cell.counts for (_, case), cell in scores.cells.items() if case[0] == simulator)
-        runs = sorted({cell.runs for (_, case), cell in scores.cells.items() if case[0] == simulator})
+        cells = [cell for (_, case), cell in scores.cells.items() if case[0] == simulator]
+        runs = sorted({cell.runs for cell in cells})
+        names = [name for name in scores.names if any((name, case) in scores.cells for case in cases)]
         tables.append(
-            {
-                "id": f"board-{simulator}",
-                "name": SIMULATORS.get(simulator, simulator),
-                "heads": [case_text(case) for case in cases],
-                "rows": rows,
-                "counts": counts,
-                "runs": f"{runs[0]:,}" if len(runs) == 1 else f"{runs[0]:,} to {runs[-1]:,}",
-            }
+            SimulatorBoard(
+                f"board-{simulator}",
+                SIMULATORS.get(simulator, simulator),
+                [case_text(case) for case in cases],
+                [_row(scores, name, cases, limits) for name in names],
+                counts=any(cell.counts for cell in cells),
+                runs=f"{runs[0]:,}" if len(runs) == 1 else f"{runs[0]:,} to {runs[-1]:,}",
+            )
         )
     return tables
 
 
-def _cell(cell: Cell | None, limits: dict[str, float], *, bold: bool) -> dict[str, Any]:
+def _row(scores: Board, name: str, cases: list[Case], limits: dict[str, float]) -> BoardRow:
+    """One controller's row in the cases of one simulator."""
+    _, lowest = worst(scores, name, "lasting")
+    cells = [_cell(scores.cells.get((name, case)), limits, bold=case == lowest) for case in cases]
+    return BoardRow(name, role(scores, name), name == scores.default, scores.kinds[name], cells)
+
+
+def _cell(cell: Cell | None, limits: dict[str, float], *, bold: bool) -> BoardCell:
     if cell is None:
-        return {"lines": [], "bold": False}
+        return BoardCell([])
     lines = []
     for what, word in (("settled", ""), ("stay", "stay "), ("recovered", "recover ")):
         share = getattr(cell, what)
         if isinstance(share, Figure):
             failed = state(Question(0, "", "", "%", limits[what], True, ""), share) == FAILED
-            lines.append(
-                {
-                    "text": f"{word}{quantity(share.value, '%', 1)}",
-                    "band": band(share.low, share.high, 1),
-                    "bad": failed,
-                }
-            )
+            text = f"{word}{quantity(share.value, '%', 1)}"
+            lines.append(Share(text, band(share.low, share.high, 1), failed))
     steps = (
         "none settles"
         if cell.median != cell.median
@@ -259,10 +322,24 @@ def _cell(cell: Cell | None, limits: dict[str, float], *, bold: bool) -> dict[st
     more += f", off {number(cell.flow_error, 1)}{THIN}%" if cell.flow_error == cell.flow_error else ""
     flow, degrees, share = cell.worst_start
     tip = f"{cell.runs:,} runs; fewest settle from {flow:g} % and {degrees:g} °C: {number(share, 0)} %"
-    return {"lines": lines, "steps": steps, "more": more.strip(", "), "tip": tip, "bold": bold}
+    return BoardCell(lines, steps, more.strip(", "), tip, bold)
 
 
-def worsts(scores: Board) -> list[dict[str, Any]]:
+class Worst(NamedTuple):
+    """Somebody's worst case, and the start from which fewest settle there, in words."""
+
+    name: str
+    mark: str
+    default: bool
+    kind: str
+    case: str
+    value: str
+    band: str
+    mean: str
+    start: str
+
+
+def worsts(scores: Board) -> list[Worst]:
     """Everybody's worst case, the best first, with the start from which fewest settle there."""
     rows = []
     for name in scores.names:
@@ -270,17 +347,22 @@ def worsts(scores: Board) -> list[dict[str, Any]]:
         if case is None:
             continue
         cell = scores.cells[name, case]
-        others = [
-            share.value for _, one in scores.counting(name) if isinstance(share := lasting(one), Figure)
+        shares = [
+            share.value for _, other in scores.counting(name) if isinstance(share := lasting(other), Figure)
         ]
         flow, degrees, settled = cell.worst_start
-        rows.append({
-            "name": name, "mark": role(scores, name), "default": name == scores.default,
-            "kind": {BASELINE: "no learning", "agent": "ours, learned"}.get(scores.kinds[name],
-            "as published"),
-            "case": case_text(case, whole=True), "value": share_text(figure),
-            "band": band(figure.low, figure.high, 1),
-            "mean": percent(sum(others) / len(others), 3),
-            "start": f"{flow:g}{THIN}%, {degrees:g}{THIN}°C: {number(settled, 0)}{THIN}% settle",
-        })  # fmt: skip
+        kinds = {BASELINE: "no learning", "agent": "ours, learned"}
+        rows.append(
+            Worst(
+                name,
+                role(scores, name),
+                name == scores.default,
+                kinds.get(scores.kinds[name], "as published"),
+                case_text(case, whole=True),
+                share_text(figure),
+                band(figure.low, figure.high, 1),
+                mean=percent(sum(shares) / len(shares), 3),
+                start=f"{flow:g}{THIN}%, {degrees:g}{THIN}°C: {number(settled, 0)}{THIN}% settle",
+            )
+        )
     return rows

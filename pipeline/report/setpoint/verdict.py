@@ -4,12 +4,13 @@ it may steer a printer, in words. No page, no file."""
 import math
 import re
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from pipeline.report.shared.digits import THIN, band, count, number, quantity
-from pipeline.report.shared.sources import Sources, Table, lookup
+from pipeline.report.shared.sources import Sources, lookup
 from pipeline.report.shared.verdict import (
     FAILED,
     OPEN,
@@ -120,31 +121,28 @@ def board(sources: Sources) -> Board | Missing:
         return table
     if not len(table["controller"]):
         return Missing("not measured", "the scoreboard is empty", "Run ./run dvc repro evaluate_setpoint")
-    keys = [
-        (str(name), (str(simulator), str(case)))
-        for name, simulator, case in zip(table["controller"], table["simulator"], table["case"], strict=True)
-    ]
-    cells = {key: _cell(table, i) for i, key in enumerate(keys)}
-    kinds = {name: str(kind) for (name, _), kind in zip(keys, table["kind"], strict=True)}
-    unranked = Board(list(kinds), kinds, list(dict.fromkeys(case for _, case in keys)), cells, "")
+    rows: list[Any] = list(pd.DataFrame(table).itertuples())
+    cells = {(row.controller, (row.simulator, row.case)): _cell(row) for row in rows}
+    kinds = {row.controller: row.kind for row in rows}
+    unranked = Board(list(kinds), kinds, list(dict.fromkeys(case for _, case in cells)), cells, "")
     ranked = sorted(kinds, key=lambda name: _rank(unranked, name), reverse=True)
     chosen = str(choice.get("name", "")) if isinstance(choice, Mapping) else ""
     return unranked._replace(names=ranked, default=chosen if chosen in kinds else "")
 
 
-def _cell(table: Table, i: int) -> Cell:
-    figures = [
-        _figure(*(float(table[f"{name}{end}_percent"][i]) for end in ("", "_low", "_high")))
-        for name in ("settled", "stay", "recovered")
-    ]
-    numbers = ("median_steps", "p90_steps", "overshoot_p95_percent", "flow_error_percent")
-    start = ("worst_start_flow_percent", "worst_start_temperature_degC", "worst_start_settled_percent")
+def _cell(row: Any) -> Cell:
+    """A row of the scoreboard."""
     return Cell(
-        int(table["runs"][i]),
-        bool(table["counts"][i]),
-        *figures,
-        *(float(table[name][i]) for name in numbers),
-        tuple(float(table[name][i]) for name in start),
+        row.runs,
+        row.counts,
+        _figure(row.settled_percent, row.settled_low_percent, row.settled_high_percent),
+        _figure(row.stay_percent, row.stay_low_percent, row.stay_high_percent),
+        _figure(row.recovered_percent, row.recovered_low_percent, row.recovered_high_percent),
+        row.median_steps,
+        row.p90_steps,
+        row.overshoot_p95_percent,
+        row.flow_error_percent,
+        (row.worst_start_flow_percent, row.worst_start_temperature_degC, row.worst_start_settled_percent),
     )
 
 

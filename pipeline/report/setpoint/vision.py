@@ -2,9 +2,11 @@
 training, frames with key areas, what was held and foreign."""
 
 import math
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.setpoint.verdict import NAMES, accuracy, share_text
@@ -253,18 +255,13 @@ def _box(frame: charts.Frame) -> tuple[float, float, int, int]:
 def _by_bin(mine: Table) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Middle of each bin of flow, mean scaled shares there (bins, 3), and
     per cent of its windows whose class is the bin's."""
-    p = np.stack([mine[f"p_{name}"] for name in CLASSES], axis=1)
-    p = p / p.max(axis=1, keepdims=True)
-    flow, scaled, right = [], [], []
-    for k in np.unique(mine["flow_bin"]):
-        here = mine["flow_bin"] == k
-        middle = float((mine["flow_low_percent"][here] + mine["flow_high_percent"][here]).mean() / 2)
-        flow.append(middle)
-        scaled.append(p[here].mean(axis=0))
-        right.append(
-            100 * float(np.mean(mine["named"][here] == int(np.searchsorted(BORDERS, middle, side="right"))))
-        )
-    return np.array(flow), np.array(scaled), np.array(right)
+    windows, shares = pd.DataFrame(mine), [f"p_{name}" for name in CLASSES]
+    windows[shares] = windows[shares].div(windows[shares].max(axis=1), axis=0)
+    windows["flow"] = (windows.flow_low_percent + windows.flow_high_percent) / 2
+    flow = windows.groupby("flow_bin").flow.transform("mean")
+    windows["right"] = windows.named == np.searchsorted(BORDERS, flow, side="right")
+    means = windows.groupby("flow_bin")[["flow", *shares, "right"]].mean()
+    return means.flow.to_numpy(), means[shares].to_numpy(), 100 * means.right.to_numpy()
 
 
 # ---- training
@@ -278,8 +275,8 @@ def learning_curves(sources: Sources) -> Picture:
         return placeholder("course", title, table)
     svc, limit = accuracy(metrics, "svc_image"), 100 * sources.declared.rules.image_accuracy
     columns, sentences = [], []
-    for learner in dict.fromkeys(map(str, table["learner"])):
-        mine = {name: values[table["learner"] == learner] for name, values in table.items()}
+    for name, rows in pd.DataFrame(table).groupby("learner", sort=False):
+        learner, mine = str(name), {str(column): values.to_numpy() for column, values in rows.items()}
         x = charts.linear(0, max(float(mine["epoch"].max()), 1.0), ticks=5)
         best = lookup(metrics, f"best_epoch.{learner}")
         share = 100 * mine["held_out_accuracy"]
@@ -344,11 +341,45 @@ def _accuracies(
 # ---- tables and frames
 
 
-def yardsticks(sources: Sources) -> dict[str, Any]:
+class Accuracy(NamedTuple):
+    """A share that is named rightly, with its interval, in words."""
+
+    text: str
+    band: str
+    bad: bool
+
+
+class Yardstick(NamedTuple):
+    """A classifier: its accuracy on an image and on a window."""
+
+    name: str
+    mark: str
+    cells: list[Accuracy]
+
+
+class Foreign(NamedTuple):
+    """How one kind of foreign picture was detected, in words."""
+
+    kind: str
+    auroc: str
+    energy: str
+    max_p: str
+    detected: str
+    alarms: str
+
+
+class Yardsticks(NamedTuple):
+    missing: Missing | None = None
+    rows: Sequence[Yardstick] = ()
+    conformal: str = ""
+    foreign: Sequence[Foreign] = ()
+
+
+def yardsticks(sources: Sources) -> Yardsticks:
     """The transformer beside the simpler ways, an image and a window."""
     metrics = sources.metrics["train_classifier"]
     if isinstance(metrics, Missing):
-        return {"missing": metrics, "rows": []}
+        return Yardsticks(metrics)
     rows = []
     for name, head in (
         ("", "Vision transformer"),
@@ -361,16 +392,16 @@ def yardsticks(sources: Sources) -> dict[str, Any]:
         ):
             share = accuracy(metrics, f"{name}_{of}".strip("_"))
             cells.append(
-                {
-                    "text": share_text(share),
-                    "band": band(share.low, share.high, 1) if isinstance(share, Figure) else "",
-                    "bad": isinstance(share, Figure) and not name and share.value < 100 * limit,
-                }
+                Accuracy(
+                    share_text(share),
+                    band(share.low, share.high, 1) if isinstance(share, Figure) else "",
+                    bad=isinstance(share, Figure) and not name and share.value < 100 * limit,
+                )
             )
-        rows.append({"name": head, "mark": "baseline" if name else "data_driven", "cells": cells})
+        rows.append(Yardstick(head, "baseline" if name else "data_driven", cells))
     sets = lookup(metrics, "conformal")
     foreign = lookup(metrics, "out_of_distribution")
-    return {"missing": None, "rows": rows, "conformal": _conformal(sets), "foreign": _foreign(foreign)}
+    return Yardsticks(None, rows, _conformal(sets), _foreign(foreign))
 
 
 def _conformal(sets: Any) -> str:
@@ -384,21 +415,21 @@ def _conformal(sets: Any) -> str:
     )
 
 
-def _foreign(detection: Any) -> list[dict[str, str]]:
+def _foreign(detection: Any) -> list[Foreign]:
     """A row for each kind of foreign picture."""
     if isinstance(detection, Missing):
         return []
     rows = []
-    for kind, one in detection.items():
-        if isinstance(one, dict) and "auroc" in one:
-            alarms = one.get("false_alarms", detection.get("false_alarms"))
-            rows.append({
-                "kind": str(kind), "auroc": _area(one["auroc"]), "energy": _area(one.get("energy_auroc")),
-                "max_p": _area(one.get("max_p_auroc")),
-                "found": "not measured" if one.get("found") is None else percent(100 * one["found"], 2),
-                "alarms": "not measured" if alarms is None else percent(100 * alarms, 2),
-            })  # fmt: skip
+    for kind, figures in detection.items():
+        if isinstance(figures, dict) and "auroc" in figures:
+            areas = (_area(figures.get(name)) for name in ("auroc", "energy_auroc", "max_p_auroc"))
+            alarms = figures.get("false_alarms", detection.get("false_alarms"))
+            rows.append(Foreign(str(kind), *areas, _share(figures.get("found")), _share(alarms)))
     return rows
+
+
+def _share(value: float | None) -> str:
+    return "not measured" if value is None else percent(100 * value, 2)
 
 
 def _area(value: float | None) -> str:
@@ -438,23 +469,35 @@ def data(sources: Sources) -> list[tuple[str, str]]:
     return rows
 
 
-def frames(sources: Sources) -> dict[str, Any]:
+class Frame(NamedTuple):
+    """A picture as the page shows it."""
+
+    uri: Markup
+    head: str
+    figure: str
+    bad: bool
+    foot: str
+    alt: str
+
+
+class Frames(NamedTuple):
+    missing: Missing | None = None
+    shown: Sequence[Frame] = ()
+    origin: Markup = Markup("")
+
+
+def frames(sources: Sources) -> Frames:
     """Frames with key area and direction drawn in; of a rejected one the reason."""
     table = sources.tables["nozzle_frames"]
     if isinstance(table, Missing):
-        return {"missing": table, "shown": [], "origin": Markup("")}
-    return {
-        "missing": None,
-        "shown": [_frame(one) for one in table],
-        "origin": page.origin(sources.source("nozzle_frames")),
-    }
+        return Frames(table)
+    return Frames(None, [_frame(row) for row in table], page.origin(sources.source("nozzle_frames")))
 
 
-def _frame(one: dict[str, Any]) -> dict[str, Any]:
-    reason, named, p = one.get("reason") or "", one.get("named"), one.get("p")
-    truth = (
-        CLASSES[one["label"]] if isinstance(one.get("label"), int) and 0 <= one["label"] < 3 else "not known"
-    )
+def _frame(row: dict[str, Any]) -> Frame:
+    """A row of the index of frames, in words."""
+    reason, named, p, label = row.get("reason") or "", row.get("named"), row.get("p"), row.get("label")
+    truth = CLASSES[label] if isinstance(label, int) and 0 <= label < 3 else "not known"
     judged = (
         f"named {CLASSES[named]}, {number(max(p), 2)}"
         if isinstance(named, int) and 0 <= named < 3 and p
@@ -463,21 +506,21 @@ def _frame(one: dict[str, Any]) -> dict[str, Any]:
     state = f"{'held' if p else 'rejected'}: {reason}" if reason else judged
     flow = (
         ""
-        if one.get("flow_percent") is None
-        else f"flow {quantity(float(one['flow_percent']), '%', 0)} ({truth})"
+        if row.get("flow_percent") is None
+        else f"flow {quantity(float(row['flow_percent']), '%', 0)} ({truth})"
     )
-    heat = "" if one.get("temperature_degC") is None else f"{one['temperature_degC']:g}{THIN}°C"
+    heat = "" if row.get("temperature_degC") is None else f"{row['temperature_degC']:g}{THIN}°C"
     score = (
         ""
-        if one.get("score") is None
-        else f"the line stands out by {short(float(one['score']), 2)} gray levels"
+        if row.get("score") is None
+        else f"the line stands out by {short(float(row['score']), 2)} gray levels"
     )
-    place = "" if one.get("place") in (*CLASSES, "rejected") else str(one.get("place", ""))
-    return {
-        "uri": Markup("{}").format(one["uri"]),
-        "head": ", ".join(filter(None, (flow, heat))) or "Frame",
-        "figure": state,
-        "bad": bool(reason),
-        "foot": ", ".join(filter(None, (place, score))),
-        "alt": f"Frame {one['file']}: {state}",
-    }
+    place = "" if row.get("place") in (*CLASSES, "rejected") else str(row.get("place", ""))
+    return Frame(
+        Markup("{}").format(row["uri"]),
+        ", ".join(filter(None, (flow, heat))) or "Frame",
+        state,
+        bad=bool(reason),
+        foot=", ".join(filter(None, (place, score))),
+        alt=f"Frame {row['file']}: {state}",
+    )

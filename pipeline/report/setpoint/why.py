@@ -2,9 +2,11 @@
 was sent, and where nothing was, with the reason."""
 
 import itertools
-from typing import Any
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
@@ -20,22 +22,45 @@ MOST_SENTENCES = 200
 SHARES = (("p_under", "too-little"), ("p_good", "flag"), ("p_over", "too-much"))
 
 
-def strips(sources: Sources) -> dict[str, Any]:
-    """For each episode its name, its finding, its panels, and its decisions in words."""
+class Strip(NamedTuple):
+    """One episode: its name, its finding, its panels, and its decisions in words, of which `more` are not
+    shown."""
+
+    id: str
+    head: str
+    controller: str
+    finding: str
+    panels: list[Markup]
+    rows: list[str]
+    more: int
+
+
+class Strips(NamedTuple):
+    missing: Missing | None = None
+    shown: Sequence[Strip] = ()
+    origin: Markup = Markup("")
+
+
+class Held(NamedTuple):
+    """Windows begin to end - 1, held for one reason."""
+
+    begin: int
+    end: int
+    reason: str
+
+
+def strips(sources: Sources) -> Strips:
+    """The episodes in the order of the table."""
     table = sources.tables["decisions"]
     if isinstance(table, Missing):
-        return {"missing": table, "shown": [], "origin": Markup("")}
-    names = list(dict.fromkeys(map(str, table["episode"])))[:EPISODES]
+        return Strips(table)
+    episodes = itertools.islice(pd.DataFrame(table).groupby("episode", sort=False), EPISODES)
     shown = [
-        _strip({key: values[table["episode"] == name] for key, values in table.items()}, name, i)
-        for i, name in enumerate(names)
+        _strip({str(column): values.to_numpy() for column, values in rows.items()}, str(name), i)
+        for i, (name, rows) in enumerate(episodes)
     ]
-    gap = (
-        None
-        if shown
-        else Missing("not measured", "no episode was kept", "Run ./run dvc repro evaluate_setpoint")
-    )
-    return {"missing": gap, "shown": shown, "origin": page.origin(sources.source("decisions"))}
+    gap = Missing("not measured", "no episode was kept", "Run ./run dvc repro evaluate_setpoint")
+    return Strips(None if shown else gap, shown, page.origin(sources.source("decisions")))
 
 
 def reason(why: str) -> str:
@@ -43,11 +68,11 @@ def reason(why: str) -> str:
     return why.rsplit("held: ", 1)[-1].strip()
 
 
-def _strip(mine: Table, name: str, i: int) -> dict[str, Any]:
+def _strip(mine: Table, name: str, i: int) -> Strip:
     t = mine["time_s"]
     edges = np.append(t, t[-1] + (t[-1] - t[-2] if len(t) > 1 else 1.0))
     x = charts.linear(float(t[0]), float(edges[-1]), ticks=10)
-    held = [(a, b, reason(str(mine["why"][a]))) for a, b in _alike(mine)]
+    held = [Held(a, b, reason(str(mine["why"][a]))) for a, b in _alike(mine)]
     inside = (np.abs(mine["flow_percent"] - BEST_FLOW) <= FLOW_BAND) & (
         np.abs(mine["temperature_degC"] - BEST_TEMPERATURE) <= TEMPERATURE_BAND
     )
@@ -58,24 +83,24 @@ def _strip(mine: Table, name: str, i: int) -> dict[str, Any]:
         else "outside at the end"
     )
     sent = int((mine["flow_move_percent"] != 0).sum())
-    why = {text: sum(b - a for a, b, other in held if other == text) for _, _, text in held}
-    holds = "; ".join(f"{text}, {count(n, 'window')}" for text, n in why.items())
+    windows = pd.DataFrame(held, columns=Held._fields).groupby("reason", sort=False)[["begin", "end"]].sum()
+    holds = "; ".join(f"{why}, {count(end - begin, 'window')}" for why, begin, end in windows.itertuples())
     finding = (
         f"{end[:1].upper()}{end[1:]}; the flow was moved {number(sent, 0)} times in "
         f"{count(len(t), 'decision')}, {f'and held for: {holds}' if holds else 'and never held'}."
     )
     moved = (mine["flow_move_percent"] != 0) | (mine["temperature_move_degC"] != 0)
     sentences = [str(text) for text in mine["why"][moved | mine["held"]]]
-    return {
-        "id": f"why-{i}",
-        "head": name,
-        "controller": str(mine["controller"][0]),
-        "finding": finding,
-        "panels": [_shares(mine, x, edges, held), _flow(mine, x, held, edges), _temperature(mine, x),
-        _moves(mine, x)],
-        "rows": sentences[:MOST_SENTENCES],
-        "more": len(sentences[MOST_SENTENCES:]),
-    }  # fmt: skip
+    panels = [_shares(mine, x, edges, held), _flow(mine, x, held, edges), _temperature(mine, x)]
+    return Strip(
+        f"why-{i}",
+        name,
+        str(mine["controller"][0]),
+        finding,
+        [*panels, _moves(mine, x)],
+        sentences[:MOST_SENTENCES],
+        len(sentences[MOST_SENTENCES:]),
+    )
 
 
 def _alike(mine: Table) -> list[tuple[int, int]]:
@@ -95,7 +120,7 @@ def _frame(x: charts.Axis, y: charts.Axis, height: int, *, last: bool = False) -
     return charts.Frame(x, y, WIDTH, height, LEFT, 16 if last else 6, 16)
 
 
-def _shares(mine: Table, x: charts.Axis, edges: np.ndarray, held: list[tuple[int, int, str]]) -> Markup:
+def _shares(mine: Table, x: charts.Axis, edges: np.ndarray, held: list[Held]) -> Markup:
     frame = _frame(x, charts.Axis(0, 1, ((0.0, "0"), (0.5, "0.5"), (1.0, "1"))), 112)
     px, low = frame.px(edges), np.zeros(len(mine["time_s"]))
     layers = []
@@ -106,13 +131,12 @@ def _shares(mine: Table, x: charts.Axis, edges: np.ndarray, held: list[tuple[int
         )
         layers.append(Markup('<path class="{}" d="{}"/>').format(css, boxes))
         low = low + mine[column]
-    layers += [_hatch(frame, float(px[a]), float(px[b])) for a, b, _ in held]
-    named = [int(mine["p_under"].argmax()), int(mine["p_good"].argmax()), int(mine["p_over"].argmax())]
+    layers += [_hatch(frame, float(px[stretch.begin]), float(px[stretch.end])) for stretch in held]
     alt = (
         f"Shares of under, good and over-extruded over {len(low)} windows: "
-        f"under peaks at {number(float(mine['p_under'][named[0]]), 2)}, "
-        f"over at {number(float(mine['p_over'][named[2]]), 2)}; "
-        f"{sum(b - a for a, b, _ in held)} windows were held"
+        f"under peaks at {number(float(mine['p_under'].max()), 2)}, "
+        f"over at {number(float(mine['p_over'].max()), 2)}; "
+        f"{sum(stretch.end - stretch.begin for stretch in held)} windows were held"
     )
     return charts.panel(
         frame,
@@ -139,7 +163,7 @@ def _hatch(frame: charts.Frame, a: float, b: float) -> Markup:
     ).format(a, max(b - a, 1.0), top, height, "".join(strokes))
 
 
-def _flow(mine: Table, x: charts.Axis, held: list[tuple[int, int, str]], edges: np.ndarray) -> Markup:
+def _flow(mine: Table, x: charts.Axis, held: list[Held], edges: np.ndarray) -> Markup:
     highest = max(160.0, float(max(mine["flow_percent"].max(), mine["flow_setpoint_percent"].max())) * 1.3)
     frame = _frame(x, charts.linear(0, highest, ticks=4), 150)
     t = mine["time_s"]
@@ -149,9 +173,9 @@ def _flow(mine: Table, x: charts.Axis, held: list[tuple[int, int, str]], edges: 
         charts.line(frame, t, mine["flow_percent"]),
     ]
     free = -1e9
-    for a, _, text in held:
+    for begin, _, text in held:
         # at the right end it begins earlier; what would run into the one before it is left to the words below
-        start = min(float(frame.px(edges[a])), WIDTH - 6.2 * (len(text) + 6))
+        start = min(float(frame.px(edges[begin])), WIDTH - 6.2 * (len(text) + 6))
         if start < free:
             continue
         layers.append(

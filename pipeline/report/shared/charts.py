@@ -31,14 +31,14 @@ def strip(
             'x2="50%" y1="0" y2="100%"/>'
         )
     ]
-    said = []
+    sentences = []
     for (name, css, figure), y in zip(shown, lanes, strict=False):
         if isinstance(figure, Missing):
-            said.append(f"{name}: {figure.state}")
+            sentences.append(f"{name}: {figure.state}")
             continue
         parts.append(_lane(question, css, figure, y))
-        said.append(f"{name} {_used(question, figure)}")
-    alt = "; ".join(said)
+        sentences.append(f"{name} {_used(question, figure)}")
+    alt = "; ".join(sentences)
     return Markup('<svg role="img" aria-label="{}">{}</svg>').format(
         alt[:1].upper() + alt[1:], Markup("").join(parts)
     )
@@ -240,8 +240,8 @@ def readable(frame: Frame, units: tuple[str, str] = ("", "")) -> Markup:
         for name, axis in (("x", frame.x), ("y", frame.y))
         if axis.ticks
     )
-    told = Markup(' data-u="{}|{}"').format(*units) if any(units) else ""
-    return Markup(' data-f="{}"{}{}').format(" ".join(map(str, room)), scales, told)
+    behind = Markup(' data-u="{}|{}"').format(*units) if any(units) else ""
+    return Markup(' data-f="{}"{}{}').format(" ".join(map(str, room)), scales, behind)
 
 
 # ---- layers

@@ -37,6 +37,14 @@ class Move(NamedTuple):
         return f"{sign}{size}{THIN + unit if unit else ''} · {self.word}"
 
 
+class Change(NamedTuple):
+    """How a figure moved since the accepted run, as a cell of a table says it."""
+
+    text: str
+    moved: bool = False
+    worse: bool = False
+
+
 class Difference(NamedTuple):
     """`inputs`, `parameters` (name, before, now), `code` with its `files`, and `artifacts` (path, new |
     changed | gone) that changed; `same`: how many artifacts did not; `machine`: the accepted run's, where
@@ -68,22 +76,22 @@ def difference(sources: Sources) -> Difference | None:
         for path, source in sources.read.items()
         if path.startswith(("datasets/", "reports/metrics/")) and path != NIGHTLY
     }
-    known = {
+    then = {
         path: value
         for path, value in hashes.items()
         if path.startswith(("datasets/", "reports/metrics/"))
         and path.rsplit("/", 1)[-1] not in ("report.json", "nightly.json")
     }
-    recorded = {path.split("/", 1)[0] for path in known}
+    recorded = {path.split("/", 1)[0] for path in then}
     now = {path: value for path, value in now.items() if path.split("/", 1)[0] in recorded}
     changes = [
-        (path, "changed" if path in known else "new") for path in sorted(now) if known.get(path) != now[path]
+        (path, "changed" if path in then else "new") for path in sorted(now) if then.get(path) != now[path]
     ]
     # what no page reads is not hashed again; that it is not there any more is seen
     folders_read = {path.rsplit("/", 1)[0] for path in now}
     changes += [
         (path, "gone")
-        for path in sorted(known)
+        for path in sorted(then)
         if path not in now and path.rsplit("/", 1)[0] in folders_read and not Path(path).exists()
     ]
     inputs = [
@@ -107,7 +115,7 @@ def difference(sources: Sources) -> Difference | None:
         "not recorded" if code is None else "unchanged" if code == sources.code else "changed",
         _changed(before["code"], sources.files) if before.get("code") else [],
         [change for change in changes if change[0] not in inputs],
-        sum(known.get(path) == now[path] for path in now),
+        sum(then.get(path) == now[path] for path in now),
         digest(before)[:8],
         machine if alike and isinstance(machine, dict) else {},
     )
@@ -200,9 +208,9 @@ def _recorded(figures: Mapping[str, Any]) -> dict[str, dict[str, Figure | Missin
     return {
         name: {
             key: Figure(*(math.inf if f[end] is None else f[end] for end in ("median", "low", "high")))
-            for key, f in found.items()
+            for key, f in bands.items()
         }
-        for name, found in figures.items()
+        for name, bands in figures.items()
     }
 
 

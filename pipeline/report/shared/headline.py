@@ -69,25 +69,25 @@ def _first(text: str) -> str:
 _SENTENCES = r"(?<=[.!?]) (?=[A-Z])"
 
 
-def _fitted(found: Sequence[Loop]) -> list[Loop]:
+def _fitted(loops: Sequence[Loop]) -> list[Loop]:
     """Where there is no room for all reasons, those that take more than a third of it are cut at their end;
     then remedies by whole sentences, those of a loop that did not pass first.
     """
-    kept = [loop._replace(remedy="") for loop in found]
-    if sum(map(_lines, kept)) > LINES:
-        kept = [
+    fitted = [loop._replace(remedy="") for loop in loops]
+    if sum(map(_lines, fitted)) > LINES:
+        fitted = [
             loop._replace(
                 reason=_cut(loop.reason, LINES // 3 * LINE - len(loop.decision) - len(loop.lead) - 2)
             )
-            for loop in kept
+            for loop in fitted
         ]
-    for i in sorted(range(len(found)), key=lambda i: found[i].state == "passed"):
-        for sentence in filter(None, re.split(_SENTENCES, found[i].remedy)):
-            longer = kept[i]._replace(remedy=f"{kept[i].remedy} {sentence}".strip())
-            if sum(_lines(loop) for loop in [*kept[:i], longer, *kept[i + 1 :]]) > LINES:
+    for i in sorted(range(len(loops)), key=lambda i: loops[i].state == "passed"):
+        for sentence in filter(None, re.split(_SENTENCES, loops[i].remedy)):
+            longer = fitted[i]._replace(remedy=f"{fitted[i].remedy} {sentence}".strip())
+            if sum(_lines(loop) for loop in [*fitted[:i], longer, *fitted[i + 1 :]]) > LINES:
                 break
-            kept[i] = longer
-    return kept
+            fitted[i] = longer
+    return fitted
 
 
 def _cut(text: str, room: int) -> str:
@@ -114,31 +114,31 @@ def simulated(sources: Sources, name: str) -> bool:
 def claim(sources: Sources, names: Sequence[str] = NAMES) -> str:
     """What was judged on what, and so what may be claimed of a real printer."""
     made = [name for name in names if simulated(sources, name)]
-    said = [f"{name} {RECORDED[name]}" for name in names if name not in made]
+    claims = [f"{name} {RECORDED[name]}" for name in names if name not in made]
     if made:
         which = "" if len(names) == len(made) else f"{_listed(made, 'and')} "
-        said.append(
+        claims.append(
             f"{which}judged on simulated machines only: nothing is claimed about a real printer".strip()
         )
-    text = "; ".join(said)
+    text = "; ".join(claims)
     return f"{text[:1].upper()}{text[1:]}."
 
 
-def decision(found: Sequence[Loop]) -> str:
+def decision(loops: Sequence[Loop]) -> str:
     """ "Deploy temperature and deposition; do not deploy setpoint." """
     groups = {
-        state: [loop.name for loop in found if loop.state == state]
+        state: [loop.name for loop in loops if loop.state == state]
         for state in ("passed", "failed", "open", ABSENT)
     }
-    if len(groups["passed"]) == len(found):
+    if len(groups["passed"]) == len(loops):
         return "Deploy all three loops."
-    said = [
+    parts = [
         f"deploy {_listed(groups['passed'], 'and')}" if groups["passed"] else "",
         f"do not deploy {_listed(groups['failed'], 'or')}" if groups["failed"] else "",
         f"{_listed(groups['open'], 'and')} {_is(groups['open'])} undecided" if groups["open"] else "",
         f"{_listed(groups[ABSENT], 'and')} {_is(groups[ABSENT])} not measured" if groups[ABSENT] else "",
     ]
-    text = "; ".join(filter(None, said))
+    text = "; ".join(filter(None, parts))
     return f"{text[:1].upper()}{text[1:]}."
 
 
@@ -150,9 +150,7 @@ def _listed(names: Sequence[str], word: str) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} {word} {names[-1]}"
 
 
-def state(found: Sequence[Loop]) -> str:
+def state(loops: Sequence[Loop]) -> str:
     """The worst of the loops that were measured: failed before open before passed."""
-    states = {loop.state for loop in found}
-    return next(
-        (one for one in ("failed", "open") if one in states), "passed" if "passed" in states else "open"
-    )
+    states = {loop.state for loop in loops}
+    return next((state for state in ("failed", "open", "passed") if state in states), "open")

@@ -3,14 +3,16 @@
 import base64
 import functools
 import hashlib
+import itertools
 
 import jinja2
 from markupsafe import Markup, escape
 
 from pipeline.report.shared import digits
 from pipeline.report.shared.sources import Source
-from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, UNDECIDED
+from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, UNDECIDED, Missing
 from pipeline.store import artifacts
+from pipeline.temperature.workflow.contestants import CONTESTANTS
 
 GLYPHS = {
     PASSED: "tick",
@@ -20,28 +22,33 @@ GLYPHS = {
     "not applicable": "open",
     "stale": "open",
 }
-# role or controller -> class of its mark: circle data-driven, square model-based, ring baseline
-MARKS = {
-    "data_driven": "dd",
-    "window": "dd",
-    "model_based": "mb",
-    "baseline": "bl",
-    "kernel": "dd",
-    "exact_model": "mb",
+# marks of controllers that the table gives none: told apart by their outline, in print and in grey too
+SHAPES = {
+    "triangle": "50% 0,100% 100%,0 100%",
+    "diamond": "50% 0,100% 50%,50% 100%,0 50%",
+    "wedge": "0 0,100% 0,50% 100%",
 }
+_unmarked = [contestant.name for contestant in CONTESTANTS if not contestant.mark]
+# role or controller -> class of its mark: circle data-driven, square model-based, ring baseline
+MARKS = (
+    {"data_driven": "dd", "model_based": "mb", "baseline": "bl"}
+    | {contestant.name: contestant.mark for contestant in CONTESTANTS if contestant.mark}
+    | dict(zip(_unmarked, itertools.cycle(SHAPES), strict=False))
+)
+HOLLOW = {contestant.name for contestant in CONTESTANTS if contestant.hollow}
 
 
 @functools.cache
 def environment() -> jinja2.Environment:
     """Escapes everything that is not Markup; a name that a template misspells is an error."""
-    found = jinja2.Environment(
+    templates = jinja2.Environment(
         loader=jinja2.PackageLoader("pipeline.report", "templates"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    found.globals |= {
+    templates.globals |= {
         "glyph": glyph,
         "mark": mark,
         "bdi": bdi,
@@ -52,13 +59,13 @@ def environment() -> jinja2.Environment:
         "hashed": hashed,
         "word_id": word_id,
     }
-    script = Markup(found.get_template("page.js").render().strip())
-    found.globals |= {
+    script = Markup(templates.get_template("page.js").render().strip())
+    templates.globals |= {
         "script": script,
         "script_hash": base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
     }
-    found.filters |= {"shortened": digits.shortened, "typeset": digits.typeset, "count": digits.count}
-    return found
+    templates.filters |= {"shortened": digits.shortened, "typeset": digits.typeset, "count": digits.count}
+    return templates
 
 
 # pages that the command line writes, linked where they are
@@ -84,8 +91,13 @@ def glyph(state: str) -> Markup:
 
 
 def mark(controller: str) -> Markup:
-    hollow = " hollow" if controller in ("kernel", "exact_model") else ""
-    return Markup('<span class="mk {}{}" aria-hidden="true"></span>').format(MARKS[controller], hollow)
+    css = MARKS[controller] + (" hollow" if controller in HOLLOW else "")
+    if css in SHAPES:
+        return Markup(
+            '<span class="mk {}" style="background:var(--ink);clip-path:polygon({})" '
+            'aria-hidden="true"></span>'
+        ).format(css, SHAPES[css])
+    return Markup('<span class="mk {}" aria-hidden="true"></span>').format(css)
 
 
 def bdi(text: object) -> Markup:
@@ -96,10 +108,10 @@ def bdi(text: object) -> Markup:
     return Markup("<bdi{}>{}</bdi>").format(title, cut)
 
 
-def missing(found) -> Markup:
+def missing(gap: Missing) -> Markup:
     """State first, reason second, remedy third."""
     return Markup("{}<strong>{}.</strong> <bdi>{}</bdi>").format(
-        glyph(found.state), found.state.capitalize(), found.sentence()
+        glyph(gap.state), gap.state.capitalize(), gap.sentence()
     )
 
 
@@ -131,9 +143,9 @@ def term(word: str, text: str = "") -> Markup:
 
 def hashed(short: str, sources: list[Source]) -> Markup:
     """The first digits of a hash, linked to the artifact that has it, where it is one's."""
-    found = next((source for source in sources if source.sha256.startswith(short)), None)
+    source = next((source for source in sources if source.sha256.startswith(short)), None)
     code = Markup("<code>{}</code>").format(short)
-    return Markup('<a href="#{}">{}</a>').format(anchor(found.path), code) if found else code
+    return Markup('<a href="#{}">{}</a>').format(anchor(source.path), code) if source else code
 
 
 def anchor(path: str) -> str:

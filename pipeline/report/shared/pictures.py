@@ -11,9 +11,8 @@ from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import THIN, number, percent, short
 from pipeline.report.shared.sources import Sources, Table, lookup
 from pipeline.report.shared.verdict import Missing
-from pipeline.report.temperature.answers import LABELS, featured
+from pipeline.report.temperature.answers import LABELS, YARDSTICKS, featured, without_figures
 
-ORDER = ("model_based", "window", "kernel", "baseline", "exact_model")
 SPAN_S = 40.0
 
 
@@ -56,40 +55,22 @@ def runs(sources: Sources, mode: str) -> list[Run] | Missing:
     table = sources.tables["trajectories"]
     if isinstance(table, Missing):
         return table
-    found = []
-    for name in ORDER:
-        mine = (table["controller"] == name) & (table["mode"] == mode)
-        if mine.any():
-            found.append(
-                Run(
-                    name,
-                    page.MARKS[name],
-                    table["time_s"][mine],
-                    {key: values[mine] for key, values in table.items()},
-                )
-            )
-    return found or Missing("not measured", f"no {mode} trajectory was recorded")
+    recorded = []
+    for name in LABELS:
+        rows = (table["controller"] == name) & (table["mode"] == mode)
+        if rows.any():
+            trajectory = {key: values[rows] for key, values in table.items()}
+            recorded.append(Run(name, page.MARKS[name], trajectory["time_s"], trajectory))
+    return recorded or Missing("not measured", f"no {mode} trajectory was recorded")
 
 
-def columns(found: list[Run], draw: Callable[[Run, int], list[Markup]]) -> list[Column]:
-    return [Column(*LABELS[run.name], run.name, draw(run, i)) for i, run in enumerate(found)]
-
-
-def absent(sources: Sources, shown: list[Column]) -> list[Column]:
-    """The kernel's place stays where it was refused, with its sentence."""
-    learned = sources.metrics["learn_kernel"]
-    refused = learned.get("refused") if isinstance(learned, dict) else None
-    if any(column.mark == "kernel" for column in shown):
-        return shown
-    why = (
-        Missing("failed", str(refused))
-        if refused
-        else Missing("not measured", "there is no kernel", "Run ./run dvc repro learn_kernel")
-    )
-    empty = Column(
-        *LABELS["kernel"], "kernel", [Markup('<div class="hole">{}</div>').format(page.missing(why))]
-    )
-    return [*shown[:2], empty, *shown[2:]]
+def columns(sources: Sources, recorded: list[Run], draw: Callable[[Run, int], list[Markup]]) -> list[Column]:
+    """A column a controller, in the table's order. One that was refused keeps its place, with the reason."""
+    drawn = {run.name: draw(run, i) for i, run in enumerate(recorded)}
+    for name in LABELS.keys() - drawn.keys():
+        if why := without_figures(sources, name):
+            drawn[name] = [Markup('<div class="hole">{}</div>').format(page.missing(why))]
+    return [Column(*LABELS[name], name, drawn[name]) for name in LABELS if name in drawn]
 
 
 # ---- at work
@@ -97,17 +78,17 @@ def absent(sources: Sources, shown: list[Column]) -> list[Column]:
 
 def trajectories(sources: Sources) -> Picture:
     """Every zone under every controller, with its reference."""
-    found = runs(sources, "deployed")
+    recorded = runs(sources, "deployed")
     title = "Every zone on its way to its reference"
-    if isinstance(found, Missing):
-        return placeholder("trajectories", title, found)
+    if isinstance(recorded, Missing):
+        return placeholder("trajectories", title, recorded)
     machine = sources.declared.machine
     offset = sources.declared.panel.judging.reference_offsets_degC[0]
     lowest = min(
-        float(np.nanmin(run.rows[o.name][run.time <= SPAN_S])) for run in found for o in machine.outputs
+        float(np.nanmin(run.rows[o.name][run.time <= SPAN_S])) for run in recorded for o in machine.outputs
     )
     highest = max(
-        float(np.nanmax(run.rows[o.name][run.time <= SPAN_S])) for run in found for o in machine.outputs
+        float(np.nanmax(run.rows[o.name][run.time <= SPAN_S])) for run in recorded for o in machine.outputs
     )
     y = charts.linear(min(lowest, 0.0), min(highest, 2 * max(o.reference for o in machine.outputs)) * 1.02)
 
@@ -147,8 +128,8 @@ def trajectories(sources: Sources) -> Picture:
     return Picture(
         "trajectories",
         title,
-        _reach(found, machine, offset),
-        absent(sources, columns(found, draw)),
+        _reach(recorded, machine, offset),
+        columns(sources, recorded, draw),
         (
             f"True temperature in °C over the first {SPAN_S:g} s as deployed (inputs "
             "clipped, feasible target, "
@@ -158,9 +139,11 @@ def trajectories(sources: Sources) -> Picture:
     )
 
 
-def _reach(found: list[Run], machine, offset: float) -> str:
+def _reach(recorded: list[Run], machine, offset: float) -> str:
     parts = []
-    for run in found[:4]:
+    for run in recorded:
+        if run.name in YARDSTICKS:
+            continue
         past = max(
             float(
                 np.nanmax(
@@ -176,10 +159,10 @@ def _reach(found: list[Run], machine, offset: float) -> str:
 
 def errors(sources: Sources) -> Picture:
     """The worst zone's error over the whole run."""
-    found = runs(sources, "deployed")
+    recorded = runs(sources, "deployed")
     title = "The worst zone’s error at each moment, noise and ripple in it"
-    if isinstance(found, Missing):
-        return placeholder("errors", title, found)
+    if isinstance(recorded, Missing):
+        return placeholder("errors", title, recorded)
     machine, offset, limit = (
         sources.declared.machine,
         sources.declared.panel.judging.reference_offsets_degC[0],
@@ -210,7 +193,7 @@ def errors(sources: Sources) -> Picture:
             )
         ]
 
-    shown = columns(found, draw)
+    shown = columns(sources, recorded, draw)
     text = (
         "At a moment of the last third, median, noise and ripple in it: "
         f"{', '.join(f'{name} {short(value, 2)}{THIN}°C' for name, value in last.items())}; the rule "
@@ -220,7 +203,7 @@ def errors(sources: Sources) -> Picture:
         "errors",
         title,
         text,
-        absent(sources, shown),
+        shown,
         "Largest distance of a zone from its reference, in °C, log scale, against time in s, "
         "noise and ripple in it. Line: one run; band: 90 of 100 runs on the nominal plant, all starts, "
         "references and seeds. Grey: what the rule allows of the settled error, "
@@ -246,13 +229,13 @@ def _band(frame: charts.Frame, run: Run) -> Markup:
 
 def costs(sources: Sources) -> Picture:
     """Cost so far of the unclipped run, beside the controller that was told the true plant."""
-    found = runs(sources, "unclipped")
+    recorded = runs(sources, "unclipped")
     title = "Cost so far, on the common yardstick"
-    if isinstance(found, Missing):
-        return placeholder("costs", title, found)
-    exact = next((run for run in found if run.name == "exact_model"), None)
-    finals = {run.name: float(run.rows["cost"][-1]) for run in found}
-    first_step = min(float(run.rows["cost"][0]) for run in found)
+    if isinstance(recorded, Missing):
+        return placeholder("costs", title, recorded)
+    exact = next((run for run in recorded if run.name in YARDSTICKS), None)
+    finals = {run.name: float(run.rows["cost"][-1]) for run in recorded}
+    first_step = min(float(run.rows["cost"][0]) for run in recorded)
     y = charts.linear(0.97 * first_step / 1000, 1.03 * max(finals.values()) / 1000)
 
     def draw(run: Run, column: int) -> list[Markup]:
@@ -263,7 +246,7 @@ def costs(sources: Sources) -> Picture:
             if exact and run is not exact
             else []
         )
-        above = finals[run.name] / finals["exact_model"] - 1 if exact else 0.0
+        above = finals[run.name] / finals[exact.name] - 1 if exact else 0.0
         text = (
             f"{number(finals[run.name] / 1000, 1)}"
             f"{f', {_signed(100 * above)}' if exact and run is not exact else ''}"
@@ -292,16 +275,16 @@ def costs(sources: Sources) -> Picture:
             )
         ]
 
-    shown = columns(found, draw)
-    first = float(found[0].rows["cost"][0]) / finals[found[0].name]
+    shown = columns(sources, recorded, draw)
+    first = float(recorded[0].rows["cost"][0]) / finals[recorded[0].name]
     return Picture(
         "costs",
         title,
         (
             f"The first step alone makes {number(100 * first, 0)}{THIN}% of the "
-            f"{LABELS[found[0].name][0].lower()} controller’s cost: the way up is long, whoever steers."
+            f"{LABELS[recorded[0].name][0].lower()} controller’s cost: the way up is long, whoever steers."
         ),
-        absent(sources, shown),
+        shown,
         (
             "Discounted cost at the yardstick’s weights (Q = "
             f"{sources.declared.tracking.yardstick_q:g} I, R = "
@@ -318,10 +301,10 @@ def _signed(value: float) -> str:
 
 def inputs(sources: Sources) -> Picture:
     """What each controller asks of each input, against the limits."""
-    found = runs(sources, "deployed")
+    recorded = runs(sources, "deployed")
     title = "Inputs against their limits"
-    if isinstance(found, Missing):
-        return placeholder("inputs", title, found)
+    if isinstance(recorded, Missing):
+        return placeholder("inputs", title, recorded)
     machine = sources.declared.machine
     low, high = min(i.low for i in machine.inputs), max(i.high for i in machine.inputs)
     room = 0.35 * (high - low)
@@ -371,9 +354,9 @@ def inputs(sources: Sources) -> Picture:
                 f"controllers.{run.name}.outside_limits_percent.median",
             ),
         )
-        for run in found
+        for run in recorded
     ]
-    said = ", ".join(
+    shares = ", ".join(
         f"{name} {number(value, 0)}{THIN}%" for name, value in free if not isinstance(value, Missing)
     )
     return Picture(
@@ -381,9 +364,9 @@ def inputs(sources: Sources) -> Picture:
         title,
         (
             "Left unclipped, as the published law is, the controllers ask for what no machine can give (heat "
-            f"below 0, a motor that cools): {said} of their commands lie outside the limits."
+            f"below 0, a motor that cools): {shares} of their commands lie outside the limits."
         ),
-        absent(sources, columns(found, draw)),
+        columns(sources, recorded, draw),
         (
             f"Command in per cent over the first {SPAN_S:g} s as deployed; grey: "
             "what the machine can give, to "

@@ -28,25 +28,25 @@ def checks(report: str = "reports/metrics/report.json", lock: str = "dvc.lock") 
     """Sources, parameters and code, the pages and their references, and dvc.lock. Raises ValueError where the
     report's metrics are missing or were written by an older version.
     """
-    said = artifacts.read_json(report)
-    if not {"read", "pages", "parameters", "code"} <= said.keys():
+    recorded = artifacts.read_json(report)
+    if not {"read", "pages", "parameters", "code"} <= recorded.keys():
         raise ValueError(
             f"{report}: it does not say what the pages were made from; run ./run dvc repro report"
         )
     # the night that made these pages has written its own figures since
     files = [
         sentence
-        for path, recorded in said["read"].items()
-        if path != NIGHTLY and (sentence := _held(path, recorded))
+        for path, sha256 in recorded["read"].items()
+        if path != NIGHTLY and (sentence := _held(path, sha256))
     ]
-    written = {f"reports/{name}.html": recorded for name, recorded in said["pages"].items()}
-    pages = [sentence for path, recorded in written.items() if (sentence := _held(path, recorded))]
+    written = {f"reports/{name}.html": sha256 for name, sha256 in recorded["pages"].items()}
+    pages = [sentence for path, sha256 in written.items() if (sentence := _held(path, sha256))]
     return [
-        Check("sources of the pages", len(said["read"]), files),
-        Check("digests of parameters and code", 2, list(_settings(said))),
+        Check("sources of the pages", len(recorded["read"]), files),
+        Check("digests of parameters and code", 2, list(_settings(recorded))),
         Check("pages", len(written), pages),
-        _references(written, said["read"]),
-        _lock(Path(lock), said["read"]),
+        _references(written, recorded["read"]),
+        _lock(Path(lock), recorded["read"]),
     ]
 
 
@@ -56,10 +56,10 @@ def _held(path: str, recorded: str) -> str:
     return "" if artifacts.sha256(path) == recorded else f"{path} has changed since"
 
 
-def _settings(said: Mapping[str, Any]) -> Iterator[str]:
-    if digest(params.read()) != said["parameters"]:
+def _settings(recorded: Mapping[str, Any]) -> Iterator[str]:
+    if digest(params.read()) != recorded["parameters"]:
         yield f"{' or '.join(params.files())} has changed since"
-    if digest({folder: artifacts.sha256(folder) for folder in ("pipeline", "stages")}) != said["code"]:
+    if digest({folder: artifacts.sha256(folder) for folder in ("pipeline", "stages")}) != recorded["code"]:
         yield "the code (pipeline, stages) has changed since"
 
 
@@ -73,7 +73,7 @@ def _references(pages: Mapping[str, str], read: Mapping[str, str]) -> Check:
     count, wrong = 0, []
     for path in pages:
         text = Path(path).read_text(encoding="utf-8") if Path(path).exists() else ""
-        rows = {found[1]: found for found in row.finditer(text)}
+        rows = {match[1]: match for match in row.finditer(text)}
         linked = re.findall(r'href="#(from-[^"]+)"', text)
         count += len(linked)
         wrong += [
@@ -82,9 +82,9 @@ def _references(pages: Mapping[str, str], read: Mapping[str, str]) -> Check:
             if name not in rows
         ]
         wrong += [
-            f"{path} gives another hash of {found[2]} than was read"
-            for found in rows.values()
-            if read.get(found[2]) != found[5]
+            f"{path} gives another hash of {match[2]} than was read"
+            for match in rows.values()
+            if read.get(match[2]) != match[5]
         ]
     return Check("references of figures and tables", count, wrong)
 
@@ -113,11 +113,11 @@ def _lock(path: Path, read: Mapping[str, str]) -> Check:
             wrong.append(f"{place} of {stage} is gone")
         elif "md5" in entry and md5(place) != entry["md5"]:
             wrong.append(f"{place} is not what dvc.lock has of {stage}")
-    known = [entry["path"] for entry, _ in entries]
+    locked = [entry["path"] for entry, _ in entries]
     wrong += [
         f"{source} is in no entry of dvc.lock"
         for source in read
-        if source != NIGHTLY and not any(f"{source}/".startswith(f"{k}/") for k in known)
+        if source != NIGHTLY and not any(f"{source}/".startswith(f"{path}/") for path in locked)
     ]
     return Check("entries of dvc.lock", len(entries), wrong)
 
@@ -140,12 +140,12 @@ def md5(path: Path) -> str:
     return hashlib.md5(json.dumps(listed, sort_keys=True).encode()).hexdigest() + ".dir"
 
 
-def told(found: list[Check]) -> str:
+def summary(checks: list[Check]) -> str:
     """One line for each check that held. Raises ValueError naming all that did not."""
-    wrong = [sentence for check in found for sentence in dict.fromkeys(check.wrong)]
+    wrong = [sentence for check in checks for sentence in dict.fromkeys(check.wrong)]
     if wrong:
         raise ValueError(
-            f"reports: {len(wrong)} of {sum(c.count for c in found)} no longer match: {'; '.join(wrong)}; "
-            "run ./run dvc repro"
+            f"reports: {len(wrong)} of {sum(check.count for check in checks)} no longer match: "
+            f"{'; '.join(wrong)}; run ./run dvc repro"
         )
-    return "\n".join(f"{check.count:>5} {check.what}: all match" for check in found)
+    return "\n".join(f"{check.count:>5} {check.what}: all match" for check in checks)

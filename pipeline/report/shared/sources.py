@@ -99,24 +99,24 @@ def collect(
     error here: its place on the page says so.
     """
     read: dict[str, Source] = {}
-    wanted = [(path, stage, stage, "metrics", artifacts.read_old_metrics) for stage, path in metrics.items()]
-    tables = _tables(declared.machine)
-    wanted += [
-        (f"{folders[stage]}/{file}", name, stage, kind, reader) for name, stage, file, kind, reader in tables
-    ]
-    found = {
-        (path, name): _read(read, path, name, stage, kind, reader)
-        for path, name, stage, kind, reader in wanted
-    }
-    absent = {path: value for (path, _), value in found.items() if isinstance(value, Missing)}
-    by_name = [
-        {name: value for (_, name), value in part}
-        for part in (list(found.items())[: len(metrics)], list(found.items())[len(metrics) :])
-    ]
+    absent: dict[str, Missing] = {}
+    figures: dict[str, Any] = {}
+    tables: dict[str, Any] = {}
+    for stage, path in metrics.items():
+        figures[stage] = _read(read, path, stage, stage, "metrics", artifacts.read_old_metrics)
+        if isinstance(figures[stage], Missing):
+            absent[path] = figures[stage]
+    for name, stage, file, kind, reader in _tables(declared.machine):
+        path = f"{folders[stage]}/{file}"
+        tables[name] = _read(read, path, name, stage, kind, reader)
+        if name == "kernel" and not artifacts.exists(path):
+            tables[name] = _refusal(figures[stage]) or tables[name]
+        if isinstance(tables[name], Missing):
+            absent[path] = tables[name]
     for name, stage in (("frames", "train_ilc"), ("nozzle_frames", "train_classifier")):
-        frames = by_name[1].get(name, [])
-        for one in [] if isinstance(frames, Missing) else frames:
-            read[one["path"]] = Source("frame", one["path"], stage, "JPEG", artifacts.sha256(one["path"]))
+        for frame in [] if isinstance(tables[name], Missing) else tables[name]:
+            path = frame["path"]
+            read[path] = Source("frame", path, stage, "JPEG", artifacts.sha256(path))
     before = (
         _read(read, accepted, "accepted", "accept", "accepted", artifacts.read_accepted)
         if artifacts.exists(accepted)
@@ -128,7 +128,14 @@ def collect(
         else None
     )
     folders_of_code = digest({folder: artifacts.sha256(folder) for folder in code})
-    return Sources(declared, *by_name, read, absent, before or None, folders_of_code, code_files(code), night)
+    files = code_files(code)
+    return Sources(declared, figures, tables, read, absent, before or None, folders_of_code, files, night)
+
+
+def _refusal(learned: dict | Missing) -> Missing | None:
+    """Why learn_kernel wrote no kernel.parquet: where it refused one, running it again would give none."""
+    refused = None if isinstance(learned, Missing) else learned.get("refused")
+    return Missing("failed", str(refused)) if refused else None
 
 
 def code_files(folders: tuple[str, ...]) -> dict[str, str]:
@@ -146,11 +153,11 @@ def machine(path: str) -> dict[str, Any]:
     where the file holds another line."""
     if not artifacts.exists(path):
         return {}
-    found = re.fullmatch(
+    line = re.fullmatch(
         r"window\.beadline = (\{.*\});\s*", Path(path).read_text(encoding="utf-8", errors="replace")
     )
     try:
-        return dict(json.loads(found[1])["machine"])
+        return dict(json.loads(line[1])["machine"])
     except (TypeError, ValueError, KeyError):
         raise ValueError(
             f"{path}: expected the line that ./run writes, found another; run ./run dvc repro, "
@@ -235,9 +242,9 @@ FRAMES = 24
 def _frames(path: str) -> list[dict[str, Any]]:
     """The first rows of an index of frames, each with its picture's path and the picture as a data URI.
     Raises ValueError where one is missing or no JPEG."""
-    found, stage = artifacts.read_json(path)[:FRAMES], Path(path).parent.parent.name
-    for one in found:
-        picture = Path(path).with_name(Path(one["file"]).name)
+    frames, stage = artifacts.read_json(path)[:FRAMES], Path(path).parent.parent.name
+    for frame in frames:
+        picture = Path(path).with_name(Path(frame["file"]).name)
         try:
             data = picture.read_bytes()
         except OSError as error:
@@ -246,11 +253,11 @@ def _frames(path: str) -> list[dict[str, Any]]:
             ) from None
         if not data.startswith(b"\xff\xd8"):
             raise ValueError(f"{picture} is no JPEG; run ./run dvc repro {stage}")
-        one |= {
+        frame |= {
             "path": picture.as_posix(),
             "uri": "data:image/jpeg;base64," + base64.b64encode(data).decode(),
         }
-    return found
+    return frames
 
 
 def _read(
@@ -261,20 +268,20 @@ def _read(
             "not measured", f"{Path(path).name} of {stage} is not there", f"Run ./run dvc repro {stage}"
         )
     try:
-        found = reader(path)
+        content = reader(path)
     except ValueError as error:
         return Missing("failed", str(error))
     read[path] = Source(name, path, stage, schema, artifacts.sha256(path))
-    return found
+    return content
 
 
 def lookup(data: Any, dotted: str, *, what: str = "") -> Any:
     """data["a"]["b"] of "a.b", or the Missing that stands for it; null is missing too."""
-    found = data
+    value = data
     for key in dotted.split("."):
-        if isinstance(found, Missing):
-            return found
-        found = found.get(key) if isinstance(found, Mapping) else None
-        if found is None:
+        if isinstance(value, Missing):
+            return value
+        value = value.get(key) if isinstance(value, Mapping) else None
+        if value is None:
             return Missing("not measured", f"{what or dotted} is not among what the stage measured")
-    return found
+    return value

@@ -2,14 +2,13 @@
 published, panel, weights, and the findings in words."""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 from pipeline.report.shared.digits import MINUS, THIN, band, decimals, number, percent, quantity, short
-from pipeline.report.shared.pictures import ORDER
 from pipeline.report.shared.sources import Sources, lookup
 from pipeline.report.shared.verdict import FAILED, UNDECIDED, Figure, Missing, Question, state
 from pipeline.report.shared.words import FIXED, explaining
-from pipeline.report.temperature.answers import LABELS, all_answers
+from pipeline.report.temperature.answers import LABELS, YARDSTICKS, all_answers, without_figures
 
 EXTRA = (
     ("tracking_degC", "Tracking error, r.m.s.", "°C"),
@@ -18,18 +17,48 @@ EXTRA = (
 )
 
 
-def yardstick(sources: Sources, asked: list[Question]) -> dict[str, Any]:
-    """Rows are figures, columns controllers; the rule's limit beside them."""
+class Head(NamedTuple):
+    """A controller above its column: mark, the word that explains it, heading, method."""
+
+    mark: str
+    word: str
+    name: str
+    method: str
+
+
+class Cell(NamedTuple):
+    """A figure with what stands below it; `title` says why there is none."""
+
+    value: str
+    band: str = ""
+    bad: bool = False
+    best: bool = False
+    title: str = ""
+
+
+class Row(NamedTuple):
+    """A figure of every controller, with the word that explains it and the rule's limit."""
+
+    title: str
+    word: str
+    limit: str
+    cells: list[Cell]
+
+
+class Yardstick(NamedTuple):
+    """Rows are figures, columns controllers."""
+
+    heads: list[Head]
+    rows: list[Row]
+
+
+def yardstick(sources: Sources, asked: list[Question]) -> Yardstick:
+    """Every controller that was judged or refused; the rule's limit beside them."""
     answers = all_answers(sources, asked)
-    names = [name for name in ORDER if name in answers or name == "kernel"]
-    heads = [
-        {"mark": name, "word": FIXED[name][0], "name": LABELS[name][0], "method": LABELS[name][1]}
-        for name in names
-    ]
+    gaps = {name: without_figures(sources, name) for name in LABELS}
+    names = [name for name in LABELS if name in answers or gaps[name]]
     rows = [
-        _row(
-            question, names, [answers.get(name, {}).get(question.key, _no_kernel(sources)) for name in names]
-        )
+        _row(question, names, [answers.get(name, {}).get(question.key, gaps[name]) for name in names])
         for question in asked
     ]
     for key, title, unit in EXTRA:
@@ -38,77 +67,39 @@ def yardstick(sources: Sources, asked: list[Question]) -> dict[str, Any]:
     stable = [
         lookup(sources.metrics["evaluate_temperature"], f"controllers.{name}.stable_plants") for name in names
     ]
-    cells = [
-        {
-            "value": s.state if isinstance(s, Missing) else f"{s['count']} of {s['of']}",
-            "band": "",
-            "bad": not isinstance(s, Missing) and s["count"] < s["of"],
-            "best": False,
-            "title": "",
-        }
-        for s in stable
-    ]
-    rows.append(
-        {"title": "Plants of the spread held stable", "word": "Plant spread", "limit": "", "cells": cells}
-    )
-    return {"heads": heads, "rows": rows}
+    rows.append(Row("Plants of the spread held stable", "Plant spread", "", [_stable(s) for s in stable]))
+    return Yardstick([Head(name, FIXED[name][0], *LABELS[name]) for name in names], rows)
 
 
-def _no_kernel(sources: Sources) -> Missing:
-    learned = sources.metrics["learn_kernel"]
-    refused = learned.get("refused") if isinstance(learned, dict) else None
-    return Missing("failed", str(refused)) if refused else Missing("not measured", "there is no kernel")
+def _stable(plants: Any) -> Cell:
+    if isinstance(plants, Missing):
+        return Cell(plants.state)
+    return Cell(f"{plants['count']} of {plants['of']}", bad=plants["count"] < plants["of"])
 
 
 def _extra(sources: Sources, name: str, key: str) -> Figure | Missing:
-    found = lookup(sources.metrics["evaluate_temperature"], f"controllers.{name}.{key}")
-    if isinstance(found, Missing):
-        return found
-    return Figure(*(math.inf if found.get(end) is None else found[end] for end in ("median", "low", "high")))
+    ends = lookup(sources.metrics["evaluate_temperature"], f"controllers.{name}.{key}")
+    if isinstance(ends, Missing):
+        return ends
+    return Figure(*(math.inf if ends.get(end) is None else ends[end] for end in ("median", "low", "high")))
 
 
-def _row(question: Question, names: list[str], figures: list[Figure | Missing]) -> dict[str, Any]:
-    # the controller that was told the truth is a yardstick, not a competitor
+def _row(question: Question, names: list[str], figures: list[Figure | Missing]) -> Row:
+    # a controller that was told the truth is a yardstick, not a competitor
     values = [
         f.value
         for name, f in zip(names, figures, strict=True)
-        if isinstance(f, Figure) and name != "exact_model"
+        if isinstance(f, Figure) and name not in YARDSTICKS
     ]
     best = (max if question.at_least else min)(values, default=math.nan)
     finite = [f for f in figures if isinstance(f, Figure) and math.isfinite(f.value)]
     limit_places = max((decimals(f.low, f.high, value=f.value) for f in finite), default=1)
-    cells = []
-    for name, figure in zip(names, figures, strict=True):
-        if isinstance(figure, Missing):
-            cells.append(
-                {
-                    "value": figure.state,
-                    "band": "",
-                    "bad": figure.state == FAILED,
-                    "best": False,
-                    "title": figure.sentence(),
-                }
-            )
-            continue
-        places = (
-            0
-            if question.key == "data" and figure.value >= 10
-            else decimals(figure.low, figure.high, value=figure.value)
-        )
-        held = state(question, figure) if math.isfinite(question.limit) else ""
-        note = figure.note if question.key in ("data", "settled_error_degC") else ""
-        bands = band(figure.low, figure.high, places, beyond=question.beyond)
-        cells.append(
-            {
-                "value": quantity(figure.value, question.unit, places, beyond=question.beyond),
-                "band": ", ".join(
-                    filter(None, [bands, note.split(" samples")[0], held if held == UNDECIDED else ""])
-                ),
-                "bad": held == FAILED,
-                "best": figure.value == best and name != "exact_model" and question.key != "data",
-                "title": "",
-            }
-        )
+    cells = [
+        Cell(figure.state, bad=figure.state == FAILED, title=figure.sentence())
+        if isinstance(figure, Missing)
+        else _cell(question, figure, best=figure.value == best and name not in YARDSTICKS)
+        for name, figure in zip(names, figures, strict=True)
+    ]
     limit = (
         ""
         if math.isinf(question.limit)
@@ -117,7 +108,22 @@ def _row(question: Question, names: list[str], figures: list[Figure | Missing]) 
             f"{quantity(question.limit, question.unit, min(limit_places, 1 if question.limit < 10 else 0))}"
         )
     )
-    return {"title": question.title, "word": explaining(question.key), "limit": limit, "cells": cells}
+    return Row(question.title, explaining(question.key), limit, cells)
+
+
+def _cell(question: Question, figure: Figure, *, best: bool) -> Cell:
+    samples = question.key == "data"
+    places = 0 if samples and figure.value >= 10 else decimals(figure.low, figure.high, value=figure.value)
+    held = state(question, figure) if math.isfinite(question.limit) else ""
+    note = figure.note if question.key in ("data", "settled_error_degC") else ""
+    bands = band(figure.low, figure.high, places, beyond=question.beyond)
+    below = [bands, note.split(" samples")[0], held if held == UNDECIDED else ""]
+    return Cell(
+        quantity(figure.value, question.unit, places, beyond=question.beyond),
+        ", ".join(filter(None, below)),
+        bad=held == FAILED,
+        best=best and not samples,
+    )
 
 
 # ---- as published
@@ -147,42 +153,66 @@ CONVENTIONS = {
 }
 
 
-def published(sources: Sources) -> dict[str, Any]:
+class Reproduced(NamedTuple):
+    """A printed figure, ours, and how far apart they lie where that is more than a thousandth."""
+
+    printed: str
+    ours: str
+    off: str
+
+
+class Convention(NamedTuple):
+    """A column of the study and the way of counting that it takes."""
+
+    title: str
+    convention: str
+    cells: list[Reproduced]
+
+
+class Published(NamedTuple):
+    missing: Missing | None
+    rows: list[Convention]
+
+
+def published(sources: Sources) -> Published:
     """The study's four columns, printed and reproduced, with the convention that it takes."""
-    printed, found = (
+    printed, reproduced = (
         lookup(sources.metrics["evaluate_temperature"], key) for key in ("printed", "as_published")
     )
-    gap = next((part for part in (printed, found) if isinstance(part, Missing)), None)
+    gap = next((part for part in (printed, reproduced) if isinstance(part, Missing)), None)
     if gap:
-        return {"missing": gap, "rows": []}
+        return Published(gap, [])
     rows = []
     for key, (title, convention) in CONVENTIONS.items():
-        if key in printed and key in found:
-            cells = []
-            for name, places in (("J100", 1), ("J1000", 1), ("error", 4)):
-                theirs, ours = printed[key][name], found[key][name]
-                off = abs(ours / theirs - 1)
-                cells.append(
-                    {
-                        "printed": number(theirs, places),
-                        "ours": number(ours, places),
-                        "off": percent(100 * off, 2) if off > 1e-3 else "",
-                    }
-                )
-            rows.append({"title": title, "convention": convention, "cells": cells})
-    return {"missing": None, "rows": rows}
+        if key in printed and key in reproduced:
+            cells = [
+                _reproduced(printed[key][name], reproduced[key][name], places)
+                for name, places in (("J100", 1), ("J1000", 1), ("error", 4))
+            ]
+            rows.append(Convention(title, convention, cells))
+    return Published(None, rows)
+
+
+def _reproduced(theirs: float, ours: float, places: int) -> Reproduced:
+    off = abs(ours / theirs - 1)
+    return Reproduced(
+        number(theirs, places), number(ours, places), percent(100 * off, 2) if off > 1e-3 else ""
+    )
 
 
 def honest(sources: Sources) -> list[tuple[str, str]]:
     """The same machine, counted once: true outputs, Q = R = I, from 20 °C."""
-    found = sources.metrics["evaluate_temperature"]
+    evaluated = sources.metrics["evaluate_temperature"]
     items = (
         ("optimal.J1000", "Exact optimum, J over 1,000 steps", 1),
         ("observer.J1000", "Observer started from the first measurement", 1),
         ("observer.J1000_from_50_degC", "Observer started at 50 °C, as published", 1),
     )
     rows = [
-        (title, value.state if isinstance(value := lookup(found, key), Missing) else number(value, places))
+        (
+            title,
+            value.state if isinstance(value := lookup(evaluated, key), Missing) else number(value, places),
+        )
         for key, title, places in items
     ]
     gaps = (
@@ -192,7 +222,10 @@ def honest(sources: Sources) -> list[tuple[str, str]]:
         ("takeover.zero_history_gap", "Taking over with an empty history: gap"),
     )
     return rows + [
-        (title, value.state if isinstance(value := lookup(found, key), Missing) else percent(100 * value, 2))
+        (
+            title,
+            value.state if isinstance(value := lookup(evaluated, key), Missing) else percent(100 * value, 2),
+        )
         for key, title in gaps
     ]
 
@@ -262,41 +295,54 @@ def panel(sources: Sources) -> list[tuple[str, str]]:
     ]
 
 
-def weights(sources: Sources) -> dict[str, Any]:
-    """The tuned weights, a row a mode."""
-    found, machine = sources.tables["weights"], sources.declared.machine
-    heads = [o.name for o in machine.outputs], [i.name for i in machine.inputs]
-    if isinstance(found, Missing):
-        return {"missing": found, "heads": heads, "rows": []}
+class Diagonals(NamedTuple):
+    """Diagonals of Q and R as one mode of tuning left them."""
+
+    title: str
+    q: list[str]
+    r: list[str]
+
+
+class Weights(NamedTuple):
+    """The tuned weights, a row a mode, a column an output or an input."""
+
+    missing: Missing | None
+    outputs: list[str]
+    inputs: list[str]
+    rows: list[Diagonals]
+
+
+def weights(sources: Sources) -> Weights:
+    """The tuned weights of both modes; those of another machine are left out."""
+    tuned, machine = sources.tables["weights"], sources.declared.machine
+    outputs, inputs = [o.name for o in machine.outputs], [i.name for i in machine.inputs]
+    if isinstance(tuned, Missing):
+        return Weights(tuned, outputs, inputs, [])
     names = {"practical": "practical, deployed", "parity": "the study’s objective"}
     rows = [
-        {
-            "title": names[mode],
-            "q": [short(v, 2) for v in found[mode]["q"]],
-            "r": [short(v, 2) for v in found[mode]["r"]],
-        }
-        for mode in names
-        if mode in found and len(found[mode]["q"]) == len(heads[0]) and len(found[mode]["r"]) == len(heads[1])
+        Diagonals(title, *([short(weight, 2) for weight in tuned[mode][key]] for key in ("q", "r")))
+        for mode, title in names.items()
+        if mode in tuned and [len(tuned[mode][key]) for key in ("q", "r")] == [len(outputs), len(inputs)]
     ]
-    return {"missing": None, "heads": heads, "rows": rows}
+    return Weights(None, outputs, inputs, rows)
 
 
 def identified(sources: Sources) -> list[tuple[str, str]]:
     """What identification says about its model."""
-    found = sources.metrics["identify_plant"]
-    if isinstance(found, Missing):
-        return [("Model", f"{found.state}: {found.sentence()}")]
+    metrics = sources.metrics["identify_plant"]
+    if isinstance(metrics, Missing):
+        return [("Model", f"{metrics.state}: {metrics.sentence()}")]
     rows = [
-        (title, str(found[key]))
+        (title, str(metrics[key]))
         for key, title in (
             ("order", "Order"),
             ("past", "Past samples used"),
             ("rows", "Rows of the regression"),
             ("dropped_rows", "Rows left out"),
         )
-        if key in found
+        if key in metrics
     ]
-    fit = found.get("fit_holdout")
+    fit = metrics.get("fit_holdout")
     if isinstance(fit, dict):
         rows.append(
             (
@@ -311,15 +357,15 @@ def identified(sources: Sources) -> list[tuple[str, str]]:
         )
     else:
         rows.append(("Fit on the hold-out", "not measured"))
-    ahead = found.get("fit_holdout_ahead")
+    ahead = metrics.get("fit_holdout_ahead")
     if isinstance(ahead, dict):
         rows.append(
             (
-                f"Fit {found.get('ahead_steps', '')} steps ahead",
+                f"Fit {metrics.get('ahead_steps', '')} steps ahead",
                 ", ".join(f"{name} {number(value, 1)}{THIN}%" for name, value in ahead.items()),
             )
         )
-    white = found.get("whiteness_passed")
+    white = metrics.get("whiteness_passed")
     words = {
         True: "passed: what the model leaves over looks like noise",
         False: "failed: the model leaves something over that it should explain",
@@ -335,5 +381,5 @@ def identified(sources: Sources) -> list[tuple[str, str]]:
     return rows + [
         (title, str(note))
         for key, title in (("notes", "Note"), ("advice", "Advice"))
-        for note in found.get(key) or []
+        for note in metrics.get(key) or []
     ]

@@ -5,6 +5,7 @@ from markupsafe import Markup, escape
 from pipeline.report.shared import page
 from pipeline.report.shared.digits import THIN
 from pipeline.report.shared.sources import Sources
+from pipeline.temperature.workflow.contestants import CONTESTANTS
 
 INDEX = (
     "deploy",
@@ -115,32 +116,6 @@ FIXED = {
     "at_limits": (
         "Time at limits",
         "Share of all commands beyond what the machine can give; they are clipped to it.",
-    ),
-    "model_based": (
-        "Model-based",
-        "A plant model is identified from the record; an observer estimates its state, "
-        "and the Riccati equation gives the gains.",
-    ),
-    "window": (
-        "Data-driven, window",
-        (
-            "A long window of past inputs and outputs predicts the next output; "
-            "the Riccati equation does the "
-            "rest. No order, no state to choose."
-        ),
-    ),
-    "kernel": (
-        "Kernel",
-        "Algorithm 2 of the study: the value of state and action is fitted to the record directly, "
-        "and the gain is read off it.",
-    ),
-    "baseline": (
-        "Baseline",
-        "One PI controller a zone, tuned by SIMC from the identified model, with the same feasible target.",
-    ),
-    "exact_model": (
-        "Exact model",
-        "The model-based controller, told the true plant: what a perfect identification would give.",
     ),
     "trusted": (
         "Trusted",
@@ -354,6 +329,9 @@ FIXED = {
         "The published work whose method this is; “as published” repeats its own way of "
         "counting, digit by digit.",
     ),
+} | {
+    contestant.name: (contestant.word or contestant.heading, contestant.explanation)
+    for contestant in CONTESTANTS
 }
 
 
@@ -397,21 +375,22 @@ def glossary(sources: Sources) -> dict[str, tuple[str, str]]:
 
 def explained(sources: Sources, text: str) -> Markup:
     """A sentence whose words of the page's list lead there, each where it stands first."""
-    said = escape(text)
-    known, listed = glossary(sources), set(INDEX)
+    sentence = escape(text)
+    meanings, listed = glossary(sources), set(INDEX)
     for phrase, key in INLINE.items():
-        if key in listed and key in known and phrase in said:
-            before, after = said.split(phrase, 1)
-            said = Markup("{}{}{}").format(Markup(before), page.term(known[key][0], phrase), Markup(after))
-    return said
+        if key in listed and key in meanings and phrase in sentence:
+            before, after = sentence.split(phrase, 1)
+            linked = page.term(meanings[key][0], phrase)
+            sentence = Markup("{}{}{}").format(Markup(before), linked, Markup(after))
+    return sentence
 
 
 def chosen(sources: Sources, keys: tuple[str, ...]) -> list[tuple[str, str]]:
-    found = glossary(sources)
-    return [found[key] for key in keys]
+    meanings = glossary(sources)
+    return [meanings[key] for key in keys]
 
 
 def explaining(key: str) -> str:
     """The word that explains an answer; none where it explains itself."""
-    known = {"settled": "Settled error", "data": "Samples needed"}
-    return known.get(ANSWERS.get(key, ""), FIXED.get(ANSWERS.get(key, ""), ("",))[0])
+    word_of_run = {"settled": "Settled error", "data": "Samples needed"}
+    return word_of_run.get(ANSWERS.get(key, ""), FIXED.get(ANSWERS.get(key, ""), ("",))[0])

@@ -5,21 +5,22 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from pipeline.report.shared.digits import DASH, number
 from pipeline.report.shared.sources import Sources, Table, lookup
-from pipeline.report.shared.verdict import Figure, Missing, Question
+from pipeline.report.shared.verdict import ROLES, Figure, Missing, Question
+from pipeline.temperature.workflow.contestants import CONTESTANTS
 
-# role on page one -> the controller's name in the artifacts; the window is the data-driven
-# route: the record alone ranks it before the kernel
-CONTROLLERS = {"data_driven": "window", "model_based": "model_based", "baseline": "baseline"}
-LABELS = {
-    "model_based": ("Model-based", "model + Riccati"),
-    "window": ("Data-driven", "window + Riccati"),
-    "kernel": ("Kernel", "Algorithm 2"),
-    "baseline": ("Baseline", "PI per zone"),
-    "exact_model": ("Exact model", "told the truth"),
+# role on page one -> the controller's name in the artifacts
+CONTROLLERS = {
+    role: next(contestant.name for contestant in CONTESTANTS if contestant.role == role) for role in ROLES
 }
+# controllers in the order of the pages, each with heading and method
+LABELS = {contestant.name: (contestant.heading, contestant.method) for contestant in CONTESTANTS}
+# shown beside the others, never the best of them
+YARDSTICKS = {contestant.name for contestant in CONTESTANTS if contestant.role == "yardstick"}
+LEARNED_FROM = {contestant.name: contestant.learned_from for contestant in CONTESTANTS}
 RUNS = {
     "gap_percent": ("regret", 100.0),
     "settled_error_degC": ("settled_error_degC", 1.0),
@@ -37,6 +38,19 @@ def all_answers(sources: Sources, asked: list[Question]) -> dict[str, dict[str, 
     return {
         name: {question.key: _answer(sources, judged, name, question) for question in asked} for name in names
     }
+
+
+def without_figures(sources: Sources, name: str) -> Missing | None:
+    """Why a controller has no figures. None where it could not take part: nobody knows the true plant.
+
+    The kernel's place stays where the record does not determine one.
+    """
+    refused = lookup(sources.metrics["evaluate_temperature"], f"refused.{name}")
+    if isinstance(refused, Missing) and LEARNED_FROM[name] == "kernel":
+        refused = lookup(sources.metrics["learn_kernel"], "refused")
+        if isinstance(refused, Missing):
+            return Missing("not measured", "there is no kernel", "Run ./run dvc repro learn_kernel")
+    return None if isinstance(refused, Missing) else Missing("failed", str(refused))
 
 
 def _answer(sources: Sources, judged: Any, name: str, question: Question) -> Figure | Missing:
@@ -101,34 +115,34 @@ def worst_case(table: Table | Missing, name: str, noise: float, summary: Mapping
     if isinstance(table, Missing):
         worst = (summary or {}).get("worst")
         return table if worst is None else Figure(worst, worst, worst)
-    rows = _mine(table, name, noise)
-    if not rows.any():
+    runs = pd.DataFrame(table)[_mine(table, name, noise)]
+    if runs.empty:
         return Missing("not measured", f"the scorecard has no run of {name} at {noise:g} °C of noise")
-    gap, seed, plant = (table[column][rows] for column in ("regret", "seed", "plant"))
-    gap = 100.0 * np.where(np.isnan(gap), math.inf, gap)
-    worst = np.array([gap[seed == s].max() for s in np.unique(seed)])
+    gap = 100.0 * runs["regret"].fillna(math.inf)
+    worst = gap.groupby(runs["seed"]).max().to_numpy()
     low, value, high = np.quantile(worst, [0.05, 0.5, 0.95], method="nearest")
     return Figure(
-        float(value), float(low), float(high), tuple(worst.tolist()), f"{len(np.unique(plant))} plants"
+        float(value), float(low), float(high), tuple(worst.tolist()), f"{runs['plant'].nunique()} plants"
     )
 
 
 def _data(sources: Sources, name: str) -> Figure | Missing:
     """Samples of the record over the samples that a controller needs: for its noise, and for its unknowns."""
     learned, machine = sources.metrics["learn_kernel"], sources.declared.machine
-    if name == "kernel":
+    learned_from = LEARNED_FROM.get(name, "")
+    if learned_from == "kernel":
         needed, samples = lookup(learned, "samples_needed"), lookup(learned, "samples")
         if isinstance(needed, Missing) and isinstance(learned, dict) and learned.get("refused"):
             return Missing("failed", str(learned["refused"]))
         return _of(samples, needed)
-    if name == "window":
+    if learned_from == "window":
         samples, noise, past = (
             lookup(learned, key) for key in ("samples", "samples_needed_for_noise", "window")
         )
         missing = next((part for part in (samples, noise, past) if isinstance(part, Missing)), None)
         unknowns = 0 if missing else past * (len(machine.inputs) + len(machine.outputs)) + 1
         return missing or _of(samples, max(noise, unknowns))
-    if name in ("model_based", "baseline"):
+    if learned_from == "plant":
         return _model_data(sources)
     return Missing("not applicable", f"{LABELS.get(name, (name,))[0]} learns nothing from the record")
 

@@ -2,7 +2,7 @@
 reports/metrics/nightly.json -> a figure, or why there is none."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from pipeline.report.shared import night
 from pipeline.report.shared.digits import number
@@ -56,12 +56,12 @@ def drift(sources: Sources) -> Drift:
     return Drift(Figure(percent, percent - half, percent + half, note=text), "None found.", text, when)
 
 
-def _most(figures: Mapping[str, Any]) -> tuple[str, float, float] | None:
+def _most(figures: Mapping[str, night.RecordingFigures]) -> tuple[str, float, float] | None:
     """The parameter of the plant that moved most of all recordings of the night, against its own noise: name,
     change and half of its 90 % band in percent."""
     changes = [
-        (abs(one["sigmas"]), name, float(one["percent"]), float(one["band_percent"]))
+        (abs(change.sigmas), name, float(change.percent), float(change.band_percent))
         for recording in figures.values()
-        for name, one in (recording.get("parameters") or {}).items()
+        for name, change in recording.parameters.items()
     ]
     return max(changes)[1:] if changes else None

@@ -4,6 +4,7 @@ and orders, the hold-out, and the optimiser."""
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
@@ -88,20 +89,15 @@ def _cloud(table: Table, level: float, column: str, factor: float, title: str) -
 
 
 def _ranking(table: Table) -> str:
-    parts = []
-    for level in np.unique(table["noise_degC"]):
-        medians = {
-            route: float(
-                np.nanmedian(table["gap"][(table["route"] == route) & (table["noise_degC"] == level)])
-            )
-            for route in ROUTES
-        }
-        by = medians["kernel"] / medians["window"], medians["kernel_predicted_state"] / medians["window"]
-        parts.append(
-            f"at {level:g} °C the kernel on the raw window costs {number(by[0], 0)} times "
-            "the window’s gap, on "
-            f"the predicted state {number(by[1], 1)} times"
+    medians = pd.DataFrame(table).groupby(["noise_degC", "route"])["gap"].median().unstack("route")
+    ratios = medians.div(medians["window"], axis=0)
+    parts = [
+        f"at {level:g} °C the kernel on the raw window costs {number(raw, 0)} times the window’s gap, on "
+        f"the predicted state {number(predicted, 1)} times"
+        for level, raw, predicted in zip(
+            ratios.index, ratios["kernel"], ratios["kernel_predicted_state"], strict=True
         )
+    ]
     text = "; ".join(parts)
     return f"{text[:1].upper()}{text[1:]}. All gaps are small; the order of the routes is what stays."
 

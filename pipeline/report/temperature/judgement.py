@@ -5,11 +5,12 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from pipeline.report.shared.difference import Difference, Move, difference, moves
+from pipeline.report.shared.digits import count
 from pipeline.report.shared.sources import Sources
 from pipeline.report.shared.verdict import Figure, Missing, Question, Verdict
 from pipeline.report.temperature.answers import CONTROLLERS, all_answers
 from pipeline.report.temperature.drifted import Drift, drift
-from pipeline.report.temperature.verdict import decide, questions
+from pipeline.report.temperature.verdict import ANSWERS, decide, questions
 
 NAMES = {"data_driven": "Data\u2011driven", "model_based": "Model\u2011based", "baseline": "Baseline"}
 
@@ -38,6 +39,54 @@ def judgement(sources: Sources) -> Judgement:
     moves_of = moves(sources, asked, by_name) if changed else {}
     moved = {role: moves_of[name] for role, name in CONTROLLERS.items()} if changed else {}
     return Judgement(asked, by_name, roles, decide("temperature", asked, roles), changed, moved, drifted)
+
+
+class RuleLine(NamedTuple):
+    """A rule with the number of its answers, and its state for the two controllers that compete."""
+
+    rule: str
+    answers: str
+    states: tuple[str, str]
+    first: bool
+
+
+class VerdictParts(NamedTuple):
+    """The head of the page: decision, reason, remedy, rules, and what changed since the accepted run."""
+
+    state: str
+    decision: str
+    lead: str
+    reason: str
+    remedy: str
+    rules: list[RuleLine]
+    claim: str
+    changed: str
+
+
+def verdict_parts(judged: Judgement, *, claim: str = "") -> VerdictParts:
+    """The verdict in words; `claim` says under which condition it holds."""
+    verdict = judged.verdict
+    rules = [
+        RuleLine(
+            learned.name[:1].upper() + learned.name[1:],
+            ANSWERS[learned.name],
+            (learned.state, designed.state),
+            first=learned.name == verdict.rule,
+        )
+        for learned, designed, _ in verdict.rules
+    ]
+    parameters = judged.changed.parameters if judged.changed else []
+    changed = f"{count(len(parameters), 'parameter').capitalize()} changed since the accepted run"
+    return VerdictParts(
+        verdict.word,
+        verdict.decision,
+        verdict.lead,
+        verdict.reason,
+        verdict.remedy,
+        rules,
+        claim,
+        changed if parameters else "",
+    )
 
 
 def shown(judged: Judgement) -> dict[str, dict[str, dict[str, float | None]]]:

@@ -7,14 +7,11 @@ from pipeline.report.shared import headline, page, pictures, tables, words
 from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature import evidence, findings, pairs, recording, trades
 from pipeline.report.temperature.answers import featured, repetitions
-from pipeline.report.temperature.judgement import Judgement
+from pipeline.report.temperature.judgement import Judgement, verdict_parts
+from pipeline.temperature.workflow.contestants import CONTESTANTS
 
 WORDS = (
-    "model_based",
-    "window",
-    "kernel",
-    "baseline",
-    "exact_model",
+    *(contestant.name for contestant in CONTESTANTS),
     "study",
     "gap",
     "band",
@@ -34,12 +31,11 @@ WORDS = (
 
 def render(sources: Sources, judged: Judgement) -> str:
     """The text of temperature.html."""
-    flaws, more, no_quality = recording.findings(sources)
     return page.render(
         "temperature.html",
         here="temperature",
         title=f"Temperature: {judged.verdict.decision.rstrip('.')}",
-        verdict=index_page.verdict_parts(judged) | {"claim": headline.claim(sources, ("temperature",))},
+        verdict=verdict_parts(judged, claim=headline.claim(sources, ("temperature",))),
         featured=featured(sources),
         repetitions=repetitions(sources),
         yardstick=tables.yardstick(sources, judged.asked),
@@ -63,9 +59,7 @@ def render(sources: Sources, judged: Judgement) -> str:
             trades.candidates(sources),
         ],
         record=[recording.excitation(sources), recording.record(sources)],
-        flaws=flaws,
-        more=more,
-        no_quality=no_quality,
+        flaws=recording.flaws(sources),
         panel=tables.panel(sources),
         weights=tables.weights(sources),
         identified=tables.identified(sources),

@@ -1,83 +1,98 @@
 """Two controllers on the very same cases: what the data-driven one saves against each of the others, with a
 sign-flip test over plants (pipeline/statistics.py)."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from pipeline.report.shared.digits import THIN, count, number, short
-from pipeline.report.shared.pictures import ORDER
 from pipeline.report.shared.sources import Sources, Table
 from pipeline.report.shared.verdict import Missing
 from pipeline.report.temperature.answers import CONTROLLERS, LABELS, noise
 from pipeline.statistics import Paired, paired
 
 LEVEL = 0.05
+# what makes two runs the same case
+CASE = ["plant", "start_degC", "reference_degC", "seed"]
 # what is compared: column of the scorecard, and what makes a cost above zero of it
 COSTS = (
-    (
-        "Cost on the yardstick, unclipped",
-        lambda table, rows: 1.0 + table["regret"][rows],
-    ),  # J / J*, of which J* is the same for both
-    ("R.m.s. tracking error, as deployed", lambda table, rows: table["tracking_degC"][rows]),
+    # J / J*, of which J* is the same for both
+    ("Cost on the yardstick, unclipped", lambda runs: 1.0 + runs["regret"]),
+    ("R.m.s. tracking error, as deployed", lambda runs: runs["tracking_degC"]),
 )
 
 
-def compared(sources: Sources) -> dict[str, Any]:
+class Saving(NamedTuple):
+    """What the data-driven controller saves, with its band, the chance of it, and on how many cases."""
+
+    saved: str
+    band: str
+    p: str
+    cases: str
+    sure: bool
+
+
+class Against(NamedTuple):
+    """A row of the page: which controller, which cost, and what is saved against it."""
+
+    name: str
+    title: str
+    what: str
+    saving: Saving
+
+
+class Comparison(NamedTuple):
+    missing: Missing | None
+    rows: list[Against]
+    finding: str
+
+
+def compared(sources: Sources) -> Comparison:
     """A row for each of the others and each cost; every case is one plant, start,
     reference and seed, and cases of a plant are one block."""
     table = sources.tables["scorecard"]
     if isinstance(table, Missing):
-        return {"missing": table, "rows": [], "finding": ""}
+        return Comparison(table, [], "")
     mine, level = CONTROLLERS["data_driven"], noise(sources)
     rows, sentences = [], []
-    for name in (name for name in ORDER if name != mine):
+    for name in (name for name in LABELS if name != mine):
         for what, cost in COSTS:
             pair = _paired(table, name, mine, level, cost)
             if pair is None:
                 continue
-            rows.append({"name": name, "title": LABELS[name][0], "what": what, **_row(pair)})
+            rows.append(Against(name, LABELS[name][0], what, _saving(pair)))
             if name == CONTROLLERS["model_based"]:
                 sentences.append(_sentence(what, pair))
     gap = None if rows else Missing("not measured", "no two controllers ran the same cases with finite costs")
-    return {"missing": gap, "rows": rows, "finding": " ".join(sentences)}
+    return Comparison(gap, rows, " ".join(sentences))
 
 
-def _paired(table: Table, other: str, mine: str, level: float, cost: Any) -> Paired | None:
-    """Costs of the two in the same order of cases; None where one of them lost a run, or ran other cases."""
-    rows = {name: (table["controller"] == name) & (table["noise_degC"] == level) for name in (other, mine)}
-    cases = {
-        name: np.column_stack(
-            [table[key][one].astype(float) for key in ("plant", "start_degC", "reference_degC", "seed")]
-        )
-        for name, one in rows.items()
-    }
-    if (
-        not len(cases[mine])
-        or cases[mine].shape != cases[other].shape
-        or not (cases[mine] == cases[other]).all()
-    ):
+def _paired(
+    table: Table, other: str, mine: str, level: float, cost: Callable[[pd.DataFrame], pd.Series]
+) -> Paired | None:
+    """Costs of the two, case by case; None where one of them lost a run, or ran other cases."""
+    runs = pd.DataFrame(table)
+    runs = runs[runs["controller"].isin([other, mine]) & (runs["noise_degC"] == level)]
+    costs = cost(runs).groupby([runs[key] for key in [*CASE, "controller"]]).mean().unstack("controller")
+    if not {other, mine} <= set(costs) or not (np.isfinite(costs) & (costs > 0)).all(axis=None):
         return None
-    theirs, ours = (np.asarray(cost(table, rows[name]), float) for name in (other, mine))
-    if not (
-        np.isfinite(theirs).all() and np.isfinite(ours).all() and (theirs > 0).all() and (ours > 0).all()
-    ):
-        return None
-    blocks = [f"{plant:g}" for plant in cases[mine][:, 0]]
+    blocks = [f"{plant:g}" for plant in costs.index.get_level_values("plant")]
     # the draws are for more blocks than all signs can be tried of; a fixed generator keeps the page the same
-    return paired(theirs, ours, blocks, rng=np.random.default_rng(0))
+    return paired(costs[other].to_numpy(), costs[mine].to_numpy(), blocks, rng=np.random.default_rng(0))
 
 
-def _row(pair: Paired) -> dict[str, Any]:
+def _saving(pair: Paired) -> Saving:
     word = "less" if pair.improvement_percent >= 0 else "more"
     chance = min(pair.p, 1 - pair.p)
-    return {
-        "saved": f"{short(abs(pair.improvement_percent), 2)}{THIN}% {word}",
-        "band": f"{_signed(pair.low_percent)} to {_signed(pair.high_percent)}",
-        "p": f"{short(chance, 2)}" if chance >= 1e-4 else "< 0.0001",
-        "cases": f"{number(pair.cases, 0)} on {count(pair.blocks, 'plant')}",
-        "sure": chance < LEVEL,
-    }
+    return Saving(
+        saved=f"{short(abs(pair.improvement_percent), 2)}{THIN}% {word}",
+        band=f"{_signed(pair.low_percent)} to {_signed(pair.high_percent)}",
+        p=f"{short(chance, 2)}" if chance >= 1e-4 else "< 0.0001",
+        cases=f"{number(pair.cases, 0)} on {count(pair.blocks, 'plant')}",
+        sure=chance < LEVEL,
+    )
 
 
 def _signed(percent: float) -> str:
@@ -87,14 +102,14 @@ def _signed(percent: float) -> str:
 
 
 def _sentence(what: str, pair: Paired) -> str:
-    row = _row(pair)
+    saving = _saving(pair)
     name = what.split(",")[0]
-    if not row["sure"]:
+    if not saving.sure:
         return (
-            f"{name}: no difference beyond chance between data-driven and model-based ({row['saved']}, p = "
-            f"{row['p']})."
+            f"{name}: no difference beyond chance between data-driven and model-based ({saving.saved}, p = "
+            f"{saving.p})."
         )
     return (
-        f"{name}: on the same {row['cases']} data-driven has {row['saved']} than model-based (90{THIN}% "
-        f"interval {row['band']}{THIN}%)."
+        f"{name}: on the same {saving.cases} data-driven has {saving.saved} than model-based (90{THIN}% "
+        f"interval {saving.band}{THIN}%)."
     )

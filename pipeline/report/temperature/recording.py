@@ -1,10 +1,10 @@
 """The figures of the temperature page that show the data: what was excited, the record
 signal by signal, and what was found strange in it."""
 
-from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
@@ -91,7 +91,9 @@ def record(sources: Sources) -> Picture:
         if masked_total
         else "nothing is masked"
     )
-    text = f"{number(len(time), 0)} samples of {recordings}; {masks}. {_found(sources.metrics['ingest'])}"
+    text = (
+        f"{number(len(time), 0)} samples of {recordings}; {masks}. {_quarantined(sources.metrics['ingest'])}"
+    )
     heads = (("Inputs", f"{machine.inputs[0].unit}, as applied"), ("Outputs", "°C, as measured"))
     shown = [Column(head, small, "", panels) for (head, small), panels in zip(heads, halves, strict=True)]
     return Picture(
@@ -107,7 +109,7 @@ def record(sources: Sources) -> Picture:
     )
 
 
-def _found(metrics: Any) -> str:
+def _quarantined(metrics: Any) -> str:
     quarantined = lookup(metrics, "quarantined")
     if isinstance(quarantined, Missing):
         return ""
@@ -158,36 +160,49 @@ def _signal(
     return charts.panel(frame, layers, alt=alt, css="mb", title=title, x_ticks=last, units=("s", unit))
 
 
-def findings(sources: Sources, most: int = 40) -> tuple[list[Mapping[str, str]], int, Missing | None]:
-    """The quality findings as rows, quarantined recordings first, and how many more there are."""
+class Flaw(NamedTuple):
+    """What was found strange in a recording, and where."""
+
+    recording: str
+    signal: str
+    kind: str
+    place: str
+    samples: str
+    message: str
+    bad: bool
+
+
+class Flaws(NamedTuple):
+    """The first findings, how many more there are, and why there are none to show."""
+
+    rows: list[Flaw]
+    more: int
+    missing: Missing | None
+
+
+def flaws(sources: Sources, most: int = 40) -> Flaws:
+    """The quality findings, those of quarantined recordings first."""
     table = sources.tables["quality"]
     if isinstance(table, Missing):
-        return [], 0, table
-    order = sorted(
-        range(len(table["kind"])),
-        key=lambda i: (
-            table["kind"][i] != "quarantined",
-            str(table["recording"][i]),
-            str(table["signal"][i]),
-            str(table["kind"][i]),
-            float(np.nan_to_num(table["start_s"][i])),
-        ),
-    )
+        return Flaws([], 0, table)
+    quality = pd.DataFrame(table)
+    quality = quality.assign(used=quality["kind"] != "quarantined", start=quality["start_s"].fillna(0.0))
+    quality = quality.sort_values(["used", "recording", "signal", "kind", "start"])
     rows = [
-        {
-            "recording": str(table["recording"][i]),
-            "signal": str(table["signal"][i]) or "whole recording",
-            "kind": str(table["kind"][i]),
-            "place": ""
-            if np.isnan(table["start_s"][i])
-            else f"{_seconds(table['start_s'][i])} to {_seconds(table['end_s'][i])}{THIN}s",
-            "count": number(float(table["count"][i]), 0),
-            "message": str(table["message"][i]),
-            "bad": table["kind"][i] == "quarantined",
-        }
-        for i in order[:most]
+        Flaw(
+            recording=str(row["recording"]),
+            signal=str(row["signal"]) or "whole recording",
+            kind=str(row["kind"]),
+            place=""
+            if np.isnan(row["start_s"])
+            else f"{_seconds(row['start_s'])} to {_seconds(row['end_s'])}{THIN}s",
+            samples=number(float(row["count"]), 0),
+            message=str(row["message"]),
+            bad=row["kind"] == "quarantined",
+        )
+        for row in quality.head(most).to_dict("records")
     ]
-    return rows, max(len(order) - most, 0), None
+    return Flaws(rows, max(len(quality) - most, 0), None)
 
 
 def _seconds(value: float) -> str:

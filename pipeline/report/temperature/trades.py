@@ -4,11 +4,12 @@ effort, of controllers and of the tuning's candidates, and the gap plant by plan
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import THIN, count, number, percent, short
-from pipeline.report.shared.pictures import ORDER, Column, Picture, placeholder
+from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources, Table, lookup
 from pipeline.report.shared.verdict import Missing
 from pipeline.report.temperature.answers import LABELS, noise
@@ -24,10 +25,6 @@ class Cloud(NamedTuple):
     @property
     def middle(self) -> tuple[float, float]:
         return float(np.median(self.effort)), float(np.median(self.error))
-
-
-def _names(table: Table) -> list[str]:
-    return [name for name in ORDER if (table["controller"] == name).any()]
 
 
 def front(points: dict[str, tuple[float, float]]) -> list[str]:
@@ -47,13 +44,7 @@ def tradeoff(sources: Sources) -> Picture:
     table, title = sources.tables["scorecard"], "What each controller trades: error against effort"
     if isinstance(table, Missing):
         return placeholder("tradeoff", title, table)
-    rows = (table["noise_degC"] == noise(sources)) & (table["plant"] == 0)
-    clouds = {}
-    for name in _names(table):
-        mine = rows & (table["controller"] == name)
-        finite = np.isfinite(table["effort_percent"][mine]) & np.isfinite(table["tracking_degC"][mine])
-        if finite.any():
-            clouds[name] = Cloud(table["effort_percent"][mine][finite], table["tracking_degC"][mine][finite])
+    clouds = _clouds(table, noise(sources))
     if not clouds:
         return placeholder(
             "tradeoff", title, Missing("not measured", "no run on the nominal plant has both figures")
@@ -83,6 +74,18 @@ def tradeoff(sources: Sources) -> Picture:
         "Pale: the medians of the others; dashed: Pareto’s front of the medians.",
         page.origin(sources.source("scorecard")),
     )
+
+
+def _clouds(table: Table, level: float) -> dict[str, Cloud]:
+    """Of each controller the runs on the nominal plant that have both figures, in the order of the pages."""
+    runs = pd.DataFrame(table)
+    finite = np.isfinite(runs[["effort_percent", "tracking_degC"]]).all(axis=1)
+    by_controller = runs[finite & (runs["noise_degC"] == level) & (runs["plant"] == 0)].groupby("controller")
+    clouds = {
+        name: Cloud(rows["effort_percent"].to_numpy(), rows["tracking_degC"].to_numpy())
+        for name, rows in by_controller
+    }
+    return {name: clouds[name] for name in LABELS if name in clouds}
 
 
 def _around(values: np.ndarray) -> charts.Axis:
@@ -180,8 +183,8 @@ def candidates(sources: Sources) -> Picture:
 def _marks(points: np.ndarray, chosen: np.ndarray, trade: Any) -> dict[str, tuple[float, float]]:
     """(effort, error) of the chosen candidate, the default weights and
     the optimum, as far as they are known."""
-    given = {} if isinstance(trade, Missing) else {name: one for name, one in trade.items() if one}
-    at = {name: (one["effort_percent"], one["tracking_degC"]) for name, one in given.items()}
+    named = {} if isinstance(trade, Missing) else {name: place for name, place in trade.items() if place}
+    at = {name: (place["effort_percent"], place["tracking_degC"]) for name, place in named.items()}
     return (
         {"chosen": (float(points[chosen][0, 0]), float(points[chosen][0, 1]))} if chosen.any() else {}
     ) | at
@@ -278,9 +281,7 @@ def plants(sources: Sources) -> Picture:
     table, title = sources.tables["scorecard"], "The gap, plant by plant"
     if isinstance(table, Missing):
         return placeholder("plants", title, table)
-    limit, rows = sources.declared.rules.worst_case_gap_percent, table["noise_degC"] == noise(sources)
-    worst = {name: _worst(table, rows & (table["controller"] == name)) for name in _names(table)}
-    worst = {name: gaps for name, gaps in worst.items() if len(gaps)}
+    limit, worst = sources.declared.rules.worst_case_gap_percent, _worst(table, noise(sources))
     finite = np.concatenate([gaps[np.isfinite(gaps)] for gaps in worst.values()] or [np.zeros(0)])
     finite = finite[finite > 0]
     if not len(finite):
@@ -326,8 +327,11 @@ def plants(sources: Sources) -> Picture:
     )
 
 
-def _worst(table: Table, rows: np.ndarray) -> np.ndarray:
-    """The largest gap in % on each plant, ascending; a run that was lost is infinite."""
-    gap = 100.0 * np.where(np.isnan(table["regret"][rows]), np.inf, table["regret"][rows])
-    plant = table["plant"][rows]
-    return np.sort([gap[plant == k].max() for k in np.unique(plant)])
+def _worst(table: Table, level: float) -> dict[str, np.ndarray]:
+    """Of each controller the largest gap in % on each plant, ascending; a run that was lost is infinite."""
+    runs = pd.DataFrame(table)
+    runs = runs[runs["noise_degC"] == level]
+    gap = 100.0 * runs["regret"].fillna(np.inf)
+    worst = gap.groupby([runs["controller"], runs["plant"]]).max()
+    judged = set(runs["controller"])
+    return {name: np.sort(worst[name].to_numpy()) for name in LABELS if name in judged}

@@ -88,7 +88,7 @@ def rules(asked: Sequence[Question], answers: Answers) -> list[Rule]:
 def passes(judged: Sequence[Rule]) -> bool:
     """Every rule; drift may be open, for only the machine itself shows it, once the controller runs on it."""
     return all(
-        one.state == PASSED or (one.name == "drift" and one.state in (OPEN, UNDECIDED)) for one in judged
+        rule.state == PASSED or (rule.name == "drift" and rule.state in (OPEN, UNDECIDED)) for rule in judged
     )
 
 
@@ -100,9 +100,9 @@ def preferred(answers: Mapping[str, Answers], a: str, b: str) -> tuple[str, str]
     """The better of two roles, and the figure that tells them apart; an
     empty text where only the medians of the gap do."""
     for key in PREFERENCE:
-        one, two = answers[a][key], answers[b][key]
-        if one.high < two.low or two.high < one.low:
-            return (a if one.value < two.value else b), key
+        of_a, of_b = answers[a][key], answers[b][key]
+        if of_a.high < of_b.low or of_b.high < of_a.low:
+            return (a if of_a.value < of_b.value else b), key
     return (a if answers[a]["gap_percent"].value <= answers[b]["gap_percent"].value else b), ""
 
 
@@ -149,10 +149,10 @@ def _deploy(
     judged: Mapping[str, Sequence[Rule]],
     best: str,
 ) -> Verdict:
-    all_pass = all(one.state == PASSED for one in judged[best])
+    all_pass = all(rule.state == PASSED for rule in judged[best])
     other = "model_based" if best == "data_driven" else "data_driven"
     drift = "" if all_pass else f"Drift is {drift_state(answers[best])}. {_drift_sentence(answers[best])}"
-    against = deciding(one for one in judged[other] if one.name != "drift")
+    against = deciding(rule for rule in judged[other] if rule.name != "drift")
     apart = (
         _difference(asked, answers, best, other)
         if against is None
@@ -209,7 +209,7 @@ def _difference(asked: Sequence[Question], answers: Mapping[str, Answers], best:
     key = preferred(answers, best, other)[1]
     if not key:
         return f"{_name(other)} passes too and is as good within noise; the smaller median gap decides."
-    alike = [BRIEF[one] for one in PREFERENCE[: PREFERENCE.index(key)]]
+    alike = [BRIEF[figure] for figure in PREFERENCE[: PREFERENCE.index(key)]]
     noise = f"{' and '.join(alike)} {'is' if len(alike) == 1 else 'are'} within noise, so " if alike else ""
     question = next(q for q in asked if q.key == key)
     mine, theirs = answers[best][key], answers[other][key]
@@ -225,7 +225,7 @@ def _worst_end(question: Question, figure: Figure) -> float:
 def _record(judged: Sequence[Rule]) -> str:
     return (
         "it passes all five rules"
-        if all(one.state == PASSED for one in judged)
+        if all(rule.state == PASSED for rule in judged)
         else "it passes every rule measured so far"
     )
 
@@ -233,8 +233,8 @@ def _record(judged: Sequence[Rule]) -> str:
 def _none_passes(judged: Mapping[str, Sequence[Rule]]) -> str:
     first = {role: deciding(judged[role], FAILED_FIRST) for role in ("model_based", "baseline")}
     others = [
-        f"the {ROLES[role]} one {'fails' if one.state == FAILED else 'is open'} on {one.name}"
-        for role, one in first.items()
+        f"the {ROLES[role]} one {'fails' if rule.state == FAILED else 'is open'} on {rule.name}"
+        for role, rule in first.items()
     ]
     return f"No controller passes: {', '.join(others)}. Keep what runs on the machine now."
 
