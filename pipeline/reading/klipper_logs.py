@@ -34,7 +34,6 @@ _KEYS = {
     b"pwm": ("pwm", "percent", 100.0),
     b"fan_speed": ("fan_speed", "percent", 100.0),
 }
-_MARKS = (b"Starting Klippy", b"Start printer at", b"===== Config file =====", b"Log rollover at")
 
 
 class PrinterPid(NamedTuple):
@@ -67,13 +66,6 @@ class _Session(NamedTuple):
 
     first: int
     zero_s: float
-
-
-def is_klippy(start: bytes) -> bool:
-    """Whether the opening of a text file is that of a klippy.log."""
-    if any(mark in start for mark in _MARKS):
-        return True
-    return bool(re.search(rb"^(INFO:root:)?Stats \d+\.\d+: .*=", start, re.MULTILINE))
 
 
 def load_klippy(path: Path) -> WholeTable:
