@@ -46,6 +46,7 @@ _TIME_NAMES = (
     "uptime",
     "runtime",
     "timestring",
+    "tout",
     "date",
     "datum",
     "index",
@@ -56,6 +57,9 @@ _PER_SECOND = {"s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0,
                "usec": 1e6, "ns": 1e9, "nsec": 1e9, "min": 1 / 60, "mins": 1 / 60, "minutes": 1 / 60,
                "h": 1 / 3600, "hours": 1 / 3600,
                "d": 1 / 86400, "days": 1 / 86400}  # fmt: skip
+
+# names that are a time and its unit in one
+_COUNTS = {"millis": "ms", "milliseconds": "ms", "micros": "us", "microseconds": "us", "nanoseconds": "ns"}
 
 _PARQUET = b"PAR1"
 _OTHER_FORMATS = {
@@ -216,6 +220,8 @@ def is_time_name(name: str) -> bool:
 
 def _time_rank(name: str) -> tuple[bool, int] | None:
     """The rank of a column as the time, None for no time. A name with a unit of time comes first."""
+    if name.strip() == "T":  # more often a temperature
+        return True, len(_TIME_NAMES)
     base, unit = _time_unit(name)
     return (not unit, _TIME_NAMES.index(base)) if base in _TIME_NAMES else None
 
@@ -224,6 +230,8 @@ def _time_unit(name: str) -> tuple[str, str]:
     """("time", "ms") of "Time [ms]", "time_ms" and the like. A time zone at the end is no part of the
     name."""
     plain = re.sub(r"[\s_.]*[(\[/_\s]\s*(utc|gmt|local)\s*[)\]]?$", "", name.strip().casefold())
+    if plain in _COUNTS:
+        return "time", _COUNTS[plain]
     match = re.match(r"^(.*?)[\s_.]*[(\[/_\s]\s*(\w+)\s*[)\]]?$", plain)
     if match and match[2] in _PER_SECOND:
         return _word(match[1]), match[2]

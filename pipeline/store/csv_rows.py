@@ -169,8 +169,9 @@ def rows(path: Path, layout: CsvLayout) -> Iterator[tuple[int, list[str]]]:
             if layout.delimiter == " ":
                 numbered = ((i, line.split()) for i, line in enumerate(stream, 1))
             else:
-                reader = csv.reader(stream, delimiter=layout.delimiter)
+                reader = csv.reader(stream, delimiter=layout.delimiter, strict=True)
                 numbered = ((reader.line_num, row) for row in reader)
+            line = 0
             for line, row in numbered:
                 start = row[0].lstrip() if row else ""
                 if (
@@ -185,6 +186,11 @@ def rows(path: Path, layout: CsvLayout) -> Iterator[tuple[int, list[str]]]:
                 "save the file as UTF-8"
             ) from None
         except csv.Error as error:
+            if "unexpected end" in str(error):
+                raise ValueError(
+                    f"{path}: line {line + 1}: a quotation mark is opened there and never closed; "
+                    "remove or close it"
+                ) from None
             raise ValueError(
                 f"{path}: a line cannot be split into columns ({error}); save the file again as plain CSV"
             ) from None

@@ -130,10 +130,10 @@ def print_log(
         for heater, load in zip(heaters, (flow, 0.05 * flow), strict=True):
             heater.step(now, load)
         if now >= next_stats:
-            next_stats += STATS_S
+            written, next_stats = count_s + next_stats, next_stats + STATS_S
             active = any(heater.target or heater.measured > 50 for heater in heaters)
             if active and not off:
-                lines.append(stats_line(count_s + now, heaters[1].stats(), heaters[0].stats()))
+                lines.append(stats_line(written, heaters[1].stats(), heaters[0].stats()))
     return "\n".join(lines) + "\n"
 
 

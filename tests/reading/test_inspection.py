@@ -208,6 +208,6 @@ def test_columns_of_one_name_are_named_and_those_of_other_programs_are_recognise
     assert "the same name twice, so that none of them can be mapped; give each its own: x (2 times)" in text
     assert {name: one["source"] for name, one in proposal(text)["ingest"]["mapping"].items()} == {
         "temperature_0": "tool0 actual",
-        "temperature_1": "heater_bed.temperature",
-        "heater_1": "extruder.power",
+        "temperature_bed": "heater_bed.temperature",
+        "heater_extruder": "extruder.power",
     }
