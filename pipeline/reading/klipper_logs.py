@@ -241,7 +241,7 @@ def _on_calendar(
         for session, a, b in zip(sessions, starts[:-1], starts[1:], strict=True)
         if b > a
     ]
-    zeros = _zeros(pieces, counts_s)
+    zeros = _zeros(pieces, counts_s, values)
     on_calendar = bool(np.isfinite(zeros).any())
     notes: list[Note] = []
     rows, times = _sorted(pieces, zeros, counts_s, notes)
@@ -255,17 +255,28 @@ def _on_calendar(
     return times, rows, notes
 
 
-def _zeros(pieces: list[tuple[np.ndarray, float]], counts_s: np.ndarray) -> np.ndarray:
+def _zeros(
+    pieces: list[tuple[np.ndarray, float]], counts_s: np.ndarray, values: dict[str, np.ndarray]
+) -> np.ndarray:
     """The system time at zero of each run; a run without a start takes that of a neighbour whose count runs
-    on, as the computer was not started anew between them."""
+    on, as the computer was not started anew between them, or which it repeats."""
     zeros = np.array([zero for _, zero in pieces])
     for i in range(1, len(pieces)):
-        if np.isnan(zeros[i]) and counts_s[pieces[i][0][0]] > counts_s[pieces[i - 1][0][-1]]:
+        before, first = pieces[i - 1][0], pieces[i][0][0]
+        runs_on = counts_s[first] > counts_s[before[-1]]
+        if np.isnan(zeros[i]) and (runs_on or _repeats(first, before, counts_s, values)):
             zeros[i] = zeros[i - 1]
     for i in range(len(pieces) - 2, -1, -1):
         if np.isnan(zeros[i]) and counts_s[pieces[i][0][-1]] < counts_s[pieces[i + 1][0][0]]:
             zeros[i] = zeros[i + 1]
     return zeros
+
+
+def _repeats(row: int, before: np.ndarray, counts_s: np.ndarray, values: dict[str, np.ndarray]) -> bool:
+    """Whether a row stands among the rows `before` too, with the same count and values."""
+    at = before[min(np.searchsorted(counts_s[before], counts_s[row] - 0.05), len(before) - 1)]
+    same = [np.array_equal(column[at], column[row], equal_nan=True) for column in values.values()]
+    return abs(counts_s[at] - counts_s[row]) < 0.05 and all(same)
 
 
 def _sorted(pieces, zeros: np.ndarray, counts_s: np.ndarray, notes: list[Note]):
