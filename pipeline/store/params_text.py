@@ -6,7 +6,8 @@ import yaml
 
 
 def replaced(text: str, dotted: str, lines: Sequence[str]) -> str:
-    """`text` with the value of a key such as plant.inputs replaced: by one line, or by several below the key.
+    """`text` with the value of a key such as plant.inputs replaced: by a scalar or [...] on its line, or by the
+    entries of a block below the key.
 
     Raises ValueError for a key that the text does not have.
     """
@@ -14,7 +15,8 @@ def replaced(text: str, dotted: str, lines: Sequence[str]) -> str:
     start, end = value.start_mark.index, _end(value)
     line_end = text.find("\n", key.end_mark.index)
     line_end = len(text) if line_end < 0 else line_end
-    if len(lines) == 1:
+    is_entry = lines[0].startswith("- ") or isinstance(yaml.safe_load(lines[0]), dict)
+    if len(lines) == 1 and not is_entry:
         if value.start_mark.line != key.start_mark.line:  # a block below the key
             return text[: key.end_mark.index] + f": {lines[0]}" + text[end:]
         return text[:start] + lines[0] + text[end:]
