@@ -15,7 +15,7 @@ from pipeline.reading.formats import Column, Columns, check_clock, file_format, 
 from pipeline.reading.mcap_columns import Topic, survey
 from pipeline.reading.other_formats import LOADERS
 from pipeline.reading.parquet_files import parquet_columns, read_parquet
-from pipeline.reading.proposals import Signal, has_bare_field, propose, sampled, yaml_lines
+from pipeline.reading.proposals import CLOCK_SAMPLES, Signal, has_bare_field, propose, sampled, yaml_lines
 from pipeline.reading.quality import quantisation_step
 from pipeline.reading.resampling import GAP_INTERVALS
 from pipeline.reading.signals import Note, intervals
@@ -80,7 +80,7 @@ def look(path: Path) -> Inspected:
     else:
         lines, groups, units, notes = _file(path, kind)
     signals = [
-        Signal(prefix + name, units.get(name, ""), values, limits.get(name))
+        Signal(prefix + name, units.get(name, ""), finite(values), limits.get(name))
         for group, prefix in groups
         for name, values in group.values.items()
     ]
@@ -165,11 +165,11 @@ def _clock_name(path: Path, columns: Sequence[Column]) -> str:
 
 def _unit_note(clock: str, group: Columns) -> list[Note]:
     """A note on a clock that would have minutes between its samples, as one in ms has without its unit."""
-    if not clock or group.time.dtype == np.int64 or len(group.time) < 3 or not np.isfinite(group.time).all():
+    time = group.time[:CLOCK_SAMPLES]
+    if not clock or time.dtype == np.int64 or len(time) < 3:
         return []
-    step = float(np.median(np.diff(group.time)))
-    whole = bool((group.time == np.rint(group.time)).all())
-    if not (whole and step >= 50) or step % 60 == 0:
+    step = float(np.median(np.diff(time)))  # NaN where a time is missing
+    if not step >= 50 or step % 60 == 0 or (time != np.rint(time)).any():
         return []
     unit = "ms" if step < 2e4 else "us" if step < 2e7 else "ns"
     message = (
@@ -221,37 +221,46 @@ def _clock(path: Path, group: Columns) -> list[str]:
         return [f"{group.name}: {count} samples", f"  {error}"]
     if count < 2:
         return [f"{group.name}: {count} sample"]
-    time = group.time / 1e9 if group.time.dtype == np.int64 else group.time
-    time = time - time[0]
-    limit = GAP_INTERVALS * float(np.median(np.diff(time)))
+    time = (group.time - group.time[0]) / (1e9 if group.time.dtype == np.int64 else 1.0)
+    steps = np.diff(time)
+    limit = GAP_INTERVALS * float(np.median(steps))
     jitter = intervals(time, limit)
-    gaps = np.flatnonzero(np.diff(time) > limit)
+    gaps = np.flatnonzero(steps > limit)
     line = (
         f"{group.name}: {count} samples in {time[-1]:.6g} s, "
         f"every {jitter.interval_s:.6g} s ({1 / jitter.interval_s:.4g} per second)"
     )
     timing = f"  jitter {jitter.std_s:.2g} s (standard), {jitter.max_s:.2g} s (largest)"
     if len(gaps):
-        longest = gaps[np.argmax(np.diff(time)[gaps])]
+        longest = gaps[np.argmax(steps[gaps])]
         timing += (
             f"; {len(gaps)} gaps beyond {limit:.3g} s, "
-            f"the longest {np.diff(time)[longest]:.4g} s at {time[longest]:.6g} s"
+            f"the longest {steps[longest]:.4g} s at {time[longest]:.6g} s"
         )
     else:
         timing += f"; no gap beyond {limit:.3g} s"
     return [line, timing]
 
 
+def finite(values: np.ndarray) -> np.ndarray:
+    """The values that are finite; no copy where all are."""
+    if len(values) and np.isfinite(values.min()) and np.isfinite(values.max()):
+        return values
+    return values[np.isfinite(values)]
+
+
 def _range(values: np.ndarray) -> str:
-    finite = values[np.isfinite(values)]
-    lost = len(values) - len(finite)
+    numbers = finite(values)
+    lost = len(values) - len(numbers)
     missing = f", {lost} missing" if lost else ""
-    if not len(finite):
+    if not len(numbers):
         return f"no value{missing}"
-    if np.ptp(finite) == 0:
-        return f"constant {finite[0]:g}{missing}"
-    few = len(np.unique(sampled(finite))) <= 12
-    levels = len(np.unique(finite)) if few else 13
-    step = 0.0 if levels <= 12 else quantisation_step(sampled(finite))
+    low, high = numbers.min(), numbers.max()
+    if low == high:
+        return f"constant {low:g}{missing}"
+    some = sampled(numbers)
+    few = len(np.unique(some)) <= 12
+    levels = len(np.unique(numbers)) if few else 13
+    step = 0.0 if levels <= 12 else quantisation_step(some)
     steps = f", {levels} levels" if levels <= 12 else f", steps of {step:.3g}" if step else ""
-    return f"{finite.min():g} to {finite.max():g}, median {np.median(finite):g}{steps}{missing}"
+    return f"{low:g} to {high:g}, median {np.median(some):g}{steps}{missing}"

@@ -387,8 +387,9 @@ def survey(path: Path, most_fields: int) -> Survey:
                 continue
             state = channels.setdefault(number, _Surveyed())
             if state.decode is None:
-                for waiting, more in zip(state.waiting, messages, strict=True):
-                    waiting.extend(more)
+                state.waiting.log_time.extend(messages.log_time)
+                state.waiting.publish_time.extend(messages.publish_time)
+                state.waiting.data.extend(messages.data)
                 if len(state.waiting.data) < SAMPLES:
                     continue
                 messages = _begin(path, file, number, channels, names, unreadable, most_fields)
@@ -461,7 +462,9 @@ def _surveyed(
         for number, state in channels.items()
         if state.parts is not None and number not in unreadable
     }
-    needs = {state.need.topic: state.need for number, state in channels.items() if number in parts}
+    needs = {
+        state.need.topic: state.need for number, state in channels.items() if number in parts and state.need
+    }
     columns = []
     for need in needs.values():
         try:

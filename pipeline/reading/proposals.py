@@ -11,11 +11,13 @@ from pipeline.reading.formats import Columns
 from pipeline.reading.quality import ROOM_KELVIN, quantisation_step
 
 # levels and steps are looked up in so many values of a signal
-LOOKED_AT = 20_000
+LOOKED_AT = 6000
 # records of commands without names have 0.88 to 1.0, measurements of a dryer, a furnace, an evaporator and a
 # kit 0.29 to 0.57
 TWO_LEVELS = 0.7
 FEWEST_ROWS = 20
+# a clock's interval is that of so many samples
+CLOCK_SAMPLES = 100_000
 _SET_POINT = r"set.?point|target|reference|\bsp\b|_sp$|^sp_"
 _TEMPERATURE = (
     r"temp|celsius|deg_?c|°c|hot.?end|nozzle|barrel|zone|\bbed\b|^bed|thermo|tool_?\d|chamber|"
@@ -51,8 +53,8 @@ _UNITS = (
 
 
 class Signal(NamedTuple):
-    """A column: its source, the unit that the file gives, its numbers, the limits that the file gives, the
-    name of its topic, and its role in the proposal."""
+    """A column: its source, the unit that the file gives, its finite numbers, the limits that the file gives,
+    and its role in the proposal."""
 
     source: str
     unit: str
@@ -184,10 +186,6 @@ def has_bare_field(fields: Sequence[str]) -> bool:
     return any(field.casefold() in _BARE_FIELDS for field in fields)
 
 
-def _finite(signal: Signal) -> np.ndarray:
-    return signal.values[np.isfinite(signal.values)]
-
-
 def sampled(values: np.ndarray) -> np.ndarray:
     """At most LOOKED_AT of the values, from one end to the other."""
     return values[:: max(1, len(values) // LOOKED_AT)]
@@ -195,17 +193,18 @@ def sampled(values: np.ndarray) -> np.ndarray:
 
 def _is_switch(signal: Signal) -> bool:
     """Whether a signal has the values 0 and 1 alone."""
-    return bool(np.isin(_finite(signal), (0.0, 1.0)).all())
+    few = sampled(signal.values)
+    return bool(((few == 0) | (few == 1)).all()) and bool(np.isin(signal.values, (0.0, 1.0)).all())
 
 
 def _has_no_role(signal: Signal) -> bool:
-    name, finite = words(signal.source), _finite(signal)
+    name, finite = words(signal.source), signal.values
     return bool(
         re.search(_STAMP, name)
         or re.search(_COUNTER, name)
         or re.search(_STATUS, name)
         or not len(finite)
-        or np.ptp(finite) == 0
+        or (np.ptp(sampled(finite)) == 0 and np.ptp(finite) == 0)
     )
 
 
@@ -229,7 +228,7 @@ def _role(signal: Signal) -> str:
 def _behaviour(signal: Signal) -> str:
     """The role by the values alone. Commands rest and jump between few levels, or stay near two of them;
     measurements do neither. A counter has no role, nor has a table of a few rows."""
-    finite = _finite(signal)
+    finite = signal.values
     if _has_no_role(signal) or len(finite) < FEWEST_ROWS or np.ptp(np.diff(finite)) < 1e-9 * np.ptp(finite):
         return ""
     if _bimodality(sampled(finite)) > TWO_LEVELS:
@@ -269,14 +268,13 @@ def _stem(source: str, pattern: str) -> str:
 
 def _proposed(signal: Signal, target: Signal | None, names: set[str]) -> Proposed:
     unit, scale, offset = _conversion(signal)
-    ours = _finite(signal) * scale + offset
     low = high = reference = None
     if signal.limits is not None and np.isfinite(signal.limits).all():
         low, high = (limit * scale + offset for limit in signal.limits)
     elif signal.role == "input":
-        high, low = 100.0, float(max(-100, min(0, np.floor(ours.min()))))
+        high, low = 100.0, float(max(-100, min(0, np.floor(signal.values.min() * scale + offset))))
     if signal.role == "output":
-        reference = _reference(ours, target, scale, offset)
+        reference = _reference(sampled(signal.values) * scale + offset, target, scale, offset)
     return Proposed(
         _name(signal, names), signal.role, signal.source, unit, scale, offset, low, high, reference
     )
@@ -284,7 +282,7 @@ def _proposed(signal: Signal, target: Signal | None, names: set[str]) -> Propose
 
 def _reference(ours: np.ndarray, target: Signal | None, scale: float, offset: float) -> float:
     """The set-point that was held longest, or the median where there is none."""
-    held = _finite(target) if target is not None else np.empty(0)
+    held = target.values if target is not None else np.empty(0)
     held = held[held > 0]
     if len(held):
         levels, counts = np.unique(held, return_counts=True)
@@ -316,7 +314,7 @@ def _name(signal: Signal, names: set[str]) -> str:
 
 def _conversion(signal: Signal) -> tuple[str, float, float]:
     bare, unit = words(signal.source), signal.unit.casefold()
-    finite = _finite(signal)
+    finite = signal.values
     low, high = finite.min(), finite.max()
     conversion = next(
         (ours for pattern, ours in _UNITS if re.search(pattern, bare) or re.search(rf"^{pattern}$", unit)),
@@ -327,7 +325,7 @@ def _conversion(signal: Signal) -> tuple[str, float, float]:
     if signal.role == "input" and (conversion is None or conversion[0] == "percent"):
         if low >= 0 and high <= 1 and signal.limits is None:
             return "percent", 100.0, 0.0
-        integer = bool((finite == np.rint(finite)).all())
+        integer = high > 100 and bool((finite == np.rint(finite)).all())
         full = next((top for top in (255, 1023, 4095) if 100 < high <= top and low >= 0 and integer), None)
         if conversion is None and full is None and max(high, -low) > 100:
             full = max(high, -low)  # rpm, mV: percent of the largest
@@ -351,6 +349,6 @@ def _sample_time(groups: Sequence[tuple[Columns, str]]) -> float:
     medians = []
     for group, _ in groups:
         if len(group.time) > 1:
-            steps = np.diff(group.time) / (1e9 if group.time.dtype == np.int64 else 1.0)
+            steps = np.diff(group.time[:CLOCK_SAMPLES]) / (1e9 if group.time.dtype == np.int64 else 1.0)
             medians.append(float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0)
     return float(f"{max(medians, default=1.0):.2g}")

@@ -75,7 +75,21 @@ def opening(path: Path) -> Opening:
         _split(line.lstrip("#% ") if is_remark else line, delimiter)
         for line, is_remark in zip(lines, remark, strict=True)
     ]
+    if delimiter == " ":
+        rows = _with_wide_names(rows, lines, decimal)
     return Opening(encoding, delimiter, decimal, rows, remark, notes)
+
+
+def _with_wide_names(rows: list[list[str]], lines: list[str], decimal: str) -> list[list[str]]:
+    """The rows of a table with blanks between its columns; a header whose names have blanks inside ("Zone 1
+    (C)   Heater 1") is split where two or a tab stand, if that gives as many names as there are columns."""
+    widths = [len(row) for row in rows if row and all(is_number(field, decimal) for field in row)]
+    width = max(widths, key=widths.count, default=0)
+    wide = [re.split(r"\s{2,}|\t", line.lstrip("#% \t").rstrip()) for line in lines]
+    return [
+        names if len(row) > width > 1 and len(names) == width else row
+        for row, names in zip(rows, wide, strict=True)
+    ]
 
 
 def list_layout(path: Path, is_header: Callable[[list[str]], bool]) -> CsvLayout:

@@ -6,8 +6,8 @@ import yaml
 
 
 def replaced(text: str, dotted: str, lines: Sequence[str]) -> str:
-    """`text` with the value of a key such as plant.inputs replaced: by a scalar or [...] on its line, or by the
-    entries of a block below the key.
+    """`text` with the value of a key such as plant.inputs replaced: by a scalar or [...] on its line, or by
+    the entries of a block below the key.
 
     Raises ValueError for a key that the text does not have.
     """
@@ -18,7 +18,7 @@ def replaced(text: str, dotted: str, lines: Sequence[str]) -> str:
     is_entry = lines[0].startswith("- ") or isinstance(yaml.safe_load(lines[0]), dict)
     if len(lines) == 1 and not is_entry:
         if value.start_mark.line != key.start_mark.line:  # a block below the key
-            return text[: key.end_mark.index] + f": {lines[0]}" + text[end:]
+            return text[: key.end_mark.index] + f": {lines[0]}{_comment(text, key, line_end)}" + text[end:]
         return text[:start] + lines[0] + text[end:]
     indent = " " * (key.start_mark.column + 2)
     block = "".join(f"\n{indent}{line}" for line in lines)
@@ -26,7 +26,13 @@ def replaced(text: str, dotted: str, lines: Sequence[str]) -> str:
         rest = text[end:line_end].strip()
         comment = f"  {rest}" if rest else ""
         return text[: key.end_mark.index] + ":" + comment + block + text[line_end:]
-    return text[: key.end_mark.index] + ":" + block + text[end:]
+    return text[: key.end_mark.index] + ":" + _comment(text, key, line_end) + block + text[end:]
+
+
+def _comment(text: str, key: yaml.Node, line_end: int) -> str:
+    """The comment behind the colon of a key whose value stands below it."""
+    rest = text[key.end_mark.index : line_end].lstrip().removeprefix(":").strip()
+    return f"  {rest}" if rest else ""
 
 
 def _nodes(text: str, dotted: str) -> tuple[yaml.Node, yaml.Node]:

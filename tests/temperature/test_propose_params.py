@@ -134,6 +134,8 @@ def test_the_time_constant_is_the_one_that_made_the_record():
         ),
         ("a.c", ["[]"], "a:  # one\n  b: 1    # two\n  c: []\n    # three\nd: 4\n"),
         ("a.c", ["- 7"], "a:  # one\n  b: 1    # two\n  c:\n    - 7\n    # three\nd: 4\n"),
+        ("a", ["2"], "a: 2  # one\n    # three\nd: 4\n"),
+        ("a", ["e: 2", "f: 3"], "a:  # one\n  e: 2\n  f: 3\n    # three\nd: 4\n"),
     ],
 )
 def test_a_value_is_replaced_in_place(dotted, lines, result):

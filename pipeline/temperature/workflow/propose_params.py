@@ -16,7 +16,7 @@ from pipeline.reading.inspection import Inspected, look
 from pipeline.reading.proposals import Proposal, mapping_lines, plant_lines, propose
 from pipeline.reading.recordings import Source, read
 from pipeline.reading.resampling import resample
-from pipeline.store import params
+from pipeline.store import artifacts, params
 from pipeline.store.params_text import replaced
 from pipeline.temperature.time_scale import time_constant
 
@@ -201,9 +201,7 @@ def write(values: dict[str, list[str]], *, force: bool, path: str | Path = param
             if params.home(dotted, path) == file:
                 text = replaced(text, dotted, lines)
         if text != before:
-            beside = Path(f"{file}.new")
-            beside.write_text(text, encoding="utf-8")
-            beside.replace(file)
+            artifacts.write_text(file, text)
     return list(changes)
 
 
