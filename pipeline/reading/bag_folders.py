@@ -28,7 +28,10 @@ def bag_parts(path: Path) -> list[Path]:
     try:
         content = yaml.safe_load(file.read_text(encoding="utf-8"))
         bag = content["rosbag2_bagfile_information"]
-        storage, names = str(bag["storage_identifier"]), [str(name) for name in bag["relative_file_paths"]]
+        storage, names = (
+            _text(bag["storage_identifier"]),
+            [_text(name) for name in bag["relative_file_paths"]],
+        )
     except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, RecursionError) as error:
         raise ValueError(
             f"{file}: expected rosbag2_bagfile_information with storage_identifier and relative_file_paths, "
@@ -50,6 +53,13 @@ def bag_parts(path: Path) -> list[Path]:
     if not parts:
         raise ValueError(f"{file} names no file; run: ros2 bag reindex {path.name}")
     return parts
+
+
+def _text(value: object) -> str:
+    """A text of the metadata. Raises TypeError for anything else, which may be as large as it likes."""
+    if not isinstance(value, str):
+        raise TypeError("no text")
+    return value
 
 
 def read_bag(

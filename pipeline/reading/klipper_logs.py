@@ -15,11 +15,13 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 
 from pipeline.reading.signals import Note
-from pipeline.reading.whole_tables import WholeTable
+from pipeline.reading.whole_tables import WholeTable, check_values
 
 # Stats lines have some 1,500 characters; a longer line is no line of Klipper's
 LONGEST_LINE = 1 << 16
 MOST_DEVICES = 200
+# how often the size of what was read is looked at
+LINES_A_CHECK = 10_000
 LONGEST_CONFIG = 20_000
 # sessions whose order in time is not known stand so far apart, in s: no gap limit joins them
 APART_S = 3600.0
@@ -78,6 +80,8 @@ def load_klippy(path: Path) -> WholeTable:
     with path.open("rb") as stream:
         for line, text in _lines(stream):
             log.add(line, text)
+            if line % LINES_A_CHECK == 0:
+                check_values(path, len(log.times), len(log.columns))
     if not log.times or not log.columns:
         what = f"{len(log.times)} Stats lines, none of a heater" if log.times else "no Stats line"
         raise ValueError(
@@ -307,9 +311,11 @@ def _sorted(pieces, zeros: np.ndarray, counts_s: np.ndarray, notes: list[Note]):
 
 def _without_repeats(rows: np.ndarray, times: np.ndarray, values: dict[str, np.ndarray], notes: list[Note]):
     """Lines that stand twice (a log and its rollover in one file) count once."""
-    table = np.column_stack([column[rows] for column in values.values()])
     close = np.r_[False, np.diff(times) < 0.05]  # times have one decimal
-    same = np.r_[False, [np.array_equal(table[i], table[i - 1], equal_nan=True) for i in range(1, len(rows))]]
+    same = np.zeros(len(rows), bool)
+    for i in np.flatnonzero(close):
+        pairs = [(column[rows[i]], column[rows[i - 1]]) for column in values.values()]
+        same[i] = all(now == before or (np.isnan(now) and np.isnan(before)) for now, before in pairs)
     if (close & same).any():
         count = int((close & same).sum())
         notes.append(Note("repeated", "", count, f"{count} Stats lines stand twice and were used once"))

@@ -12,7 +12,7 @@ from scipy.io.matlab import MatReadError, mat_struct
 
 from pipeline.reading.formats import is_time_name, seconds
 from pipeline.reading.signals import Note
-from pipeline.reading.whole_tables import LARGEST_UNPACKED, WholeTable, check_width
+from pipeline.reading.whole_tables import LARGEST_UNPACKED, WholeTable, check_values, check_width
 
 _COMPRESSED = 15
 _DEEPEST = 6
@@ -37,12 +37,14 @@ def load_matlab(path: Path) -> WholeTable:
             f"{path} is a MATLAB file that cannot be read ({_first_line(error)}); save it again with "
             "save(..., '-v7')"
         ) from None
-    arrays, others = {}, {}
+    arrays, others, numbers = {}, {}, 0
     for name, value in content.items():
         if not name.startswith("__"):
             for full, part in _leaves(name, value, 0):
                 if isinstance(part, np.ndarray):
-                    arrays[full] = part
+                    numbers += part.size
+                    check_values(path, numbers, 1)
+                    arrays[full] = part.astype(float)
                 else:
                     others[full] = part
     length = _common_length(arrays)
@@ -127,7 +129,7 @@ def _leaves(name: str, value: Any, depth: int) -> Iterator[tuple[str, Any]]:
         for i, part in enumerate(value.ravel()[:200]):
             yield from _leaves(f"{name}_{i + 1}", part, depth + 1)
     elif isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.ndim:
-        yield name, value.astype(float)
+        yield name, value
     elif isinstance(value, int | float):
         yield name, f"one number, {value:g}"
     elif isinstance(value, str):

@@ -11,11 +11,13 @@ import orjson
 
 from pipeline.reading.instants import instants, over_midnight
 from pipeline.reading.signals import Note
-from pipeline.reading.whole_tables import WholeTable, check_width
+from pipeline.reading.whole_tables import WholeTable, check_values, check_width
 
 # a temperature store holds twenty minutes, some 100 kB
-LARGEST_JSON = 1 << 27
+LARGEST_JSON = 1 << 25
 LONGEST_LINE = 1 << 14
+# how often the size of what was read is looked at
+LINES_A_CHECK = 10_000
 # Moonraker's lists -> name, unit, factor; one entry a second
 _LISTS = {
     "temperatures": ("temp", "degC", 1.0),
@@ -101,6 +103,8 @@ def load_serial_log(path: Path) -> WholeTable:
             number += 1
             if b"Recv:" in text and _REPORT.search(text):
                 rows.add(number, text)
+                if len(rows.lines) % LINES_A_CHECK == 0:
+                    check_values(path, len(rows.lines), len(rows.columns))
     if not rows.stamps:
         raise ValueError(
             f"{path}: expected lines such as 2025-11-21 13:00:00,500 - Recv: ok T:200.1 /200.0 B:60.0 /60.0, "

@@ -20,9 +20,12 @@ from pipeline.reading.signals import Note
 from pipeline.reading.whole_tables import LARGEST_UNPACKED, WholeTable, check_width
 from pipeline.store.csv_rows import MISSING
 
-MOST_CELLS = 30_000_000
-_CELL = re.compile(rb'<(?:\w+:)?c\s[^>]*?\br="([A-Z]{1,3})(\d{1,7})"')
-_ROW = re.compile(rb'<(?:\w+:)?row\s[^>]*?\br="(\d{1,7})"')
+MOST_CELLS = 15_000_000
+# of all cells together, in characters
+MOST_TEXT = 1 << 28
+_CELL = re.compile(rb'<(?:\w+:)?c\s[^>]*?\br=["\']([A-Z]{1,3})(\d{1,7})')
+_SHEET = re.compile(r"xl/worksheets/[^/]+\.xml$")
+_ROW = re.compile(rb'<(?:\w+:)?row\s[^>]*?\br=["\'](\d{1,7})')
 _EPOCH = datetime.datetime(1970, 1, 1)
 
 
@@ -34,10 +37,8 @@ def load_spreadsheet(path: Path) -> WholeTable:
     _check_size(path)
     try:
         workbook = python_calamine.CalamineWorkbook.from_path(str(path))
-        sheets = [
-            (name, workbook.get_sheet_by_name(name).to_python(skip_empty_area=False))
-            for name in workbook.sheet_names[:50]
-        ]
+        names = workbook.sheet_names
+        sheets = [(name, workbook.get_sheet_by_name(name).to_python(skip_empty_area=False)) for name in names]
     except (python_calamine.CalamineError, zipfile.BadZipFile, OSError, ValueError) as error:
         raise ValueError(
             f"{path} is a workbook that cannot be read ({str(error).splitlines()[0]}); open it and save it "
@@ -143,8 +144,8 @@ def _ns(cell: Any) -> int:
 
 
 def _check_size(path: Path) -> None:
-    """Raises ValueError for a workbook that unpacks to more than LARGEST_UNPACKED bytes, or whose last cell
-    stands so far out that its sheet would have more than MOST_CELLS."""
+    """Raises ValueError for a workbook that unpacks to more than LARGEST_UNPACKED bytes, whose last cells
+    stand so far out that its sheets would have more than MOST_CELLS, or with more text than MOST_TEXT."""
     try:
         with zipfile.ZipFile(path) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
@@ -153,17 +154,29 @@ def _check_size(path: Path) -> None:
                     f"{path}: the workbook unpacks to {size >> 20} MB, more than the "
                     f"{LARGEST_UNPACKED >> 20} MB that are read; save the sheet as CSV or Parquet"
                 )
-            for entry in archive.infolist():
-                if entry.filename.startswith("xl/worksheets/") and entry.filename.endswith(".xml"):
-                    _check_cells(path, archive, entry)
+            sheets = [entry for entry in archive.infolist() if _SHEET.match(entry.filename)]
+            sizes = [_size(archive, entry) for entry in sheets]
+            longest = _longest_text(archive)
     except (zipfile.BadZipFile, OSError, EOFError, NotImplementedError, RuntimeError, zlib.error) as error:
         raise ValueError(
             f"{path} is not a whole workbook ({error}); its index is at its end, so copy the recording again"
         ) from None
+    cells = sum(rows * columns for rows, columns, _ in sizes)
+    if cells > MOST_CELLS:
+        rows, columns, _ = max(sizes, key=lambda size: size[0] * size[1])
+        raise ValueError(
+            f"{path}: a sheet reaches to row {rows} and column {columns}; {cells} cells are more than the "
+            f"{MOST_CELLS} that are read; delete what stands far out, or save it as CSV"
+        )
+    if sum(texts for _, _, texts in sizes) * longest > MOST_TEXT:
+        raise ValueError(
+            f"{path}: its cells may hold more than {MOST_TEXT >> 20} MB of text; save the numbers alone"
+        )
 
 
-def _check_cells(path: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> None:
-    rows = columns = 0
+def _size(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> tuple[int, int, int]:
+    """(last row, last column, cells with a shared text) of a sheet."""
+    rows = columns = texts = 0
     with archive.open(entry) as stream:
         rest = b""
         while piece := stream.read(1 << 20):
@@ -171,12 +184,22 @@ def _check_cells(path: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -
             for letters, number in _CELL.findall(text):
                 rows, columns = max(rows, int(number)), max(columns, _column(letters))
             rows = max([rows, *map(int, _ROW.findall(text))])
+            texts += piece.count(b't="s"')
             rest = text[-200:]
-    if rows * columns > MOST_CELLS:
-        raise ValueError(
-            f"{path}: {entry.filename} reaches to row {rows} and column {columns}, {rows * columns} cells, "
-            f"more than the {MOST_CELLS} that are read; delete what stands far out, or save it as CSV"
-        )
+    return rows, columns, texts
+
+
+def _longest_text(archive: zipfile.ZipFile) -> int:
+    """Bytes of the longest of the texts that cells share."""
+    longest = length = 0
+    if "xl/sharedStrings.xml" not in archive.namelist():
+        return 0
+    with archive.open("xl/sharedStrings.xml") as stream:
+        while piece := stream.read(1 << 20):
+            runs = piece.split(b"<")
+            longest = max([longest, length + len(runs[0]), *map(len, runs[1:])])
+            length = len(runs[-1]) + (length if len(runs) == 1 else 0)
+    return longest
 
 
 def _column(letters: bytes) -> int:

@@ -12,6 +12,8 @@ from pipeline.reading.signals import Note
 # what is unpacked of one spreadsheet or MATLAB file, in bytes; a print log of a day has 100 MB
 LARGEST_UNPACKED = 1 << 30
 MOST_COLUMNS = 2000
+# numbers of one table: 0.8 GB
+MOST_VALUES = 100_000_000
 
 
 class WholeTable(NamedTuple):
@@ -91,6 +93,15 @@ def _clock(path: Path, table: WholeTable, names: Sequence[str], time: str) -> tu
         )
     clock, remark = seconds(name, table.values[name])
     return clock, "UTC", remark
+
+
+def check_values(path: Path, rows: int, columns: int) -> None:
+    """Raises ValueError for a table of more numbers than fit into memory."""
+    if rows * columns > MOST_VALUES:
+        raise ValueError(
+            f"{path}: {rows} rows of {columns} columns are more than the {MOST_VALUES} numbers "
+            "that are read; split the recording"
+        )
 
 
 def check_width(path: Path, count: int) -> None:

@@ -78,3 +78,13 @@ def test_a_damaged_part_is_counted_and_the_rest_is_read(tmp_path):
     raw = read(path, SOURCES)
     assert len(raw.signals["y"][0]) >= 40
     assert any(note.message.startswith("run_1.mcap: ") for note in raw.notes)
+
+
+def test_metadata_that_swells_when_it_is_written_out_is_refused_at_once(tmp_path):
+    path = bag(tmp_path / "run")
+    text = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n"
+    text += "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 12))
+    text += "rosbag2_bagfile_information: {storage_identifier: mcap, relative_file_paths: [*a11]}\n"
+    (path / "metadata.yaml").write_text(text)
+    with pytest.raises(ValueError, match="ros2 bag reindex run"):
+        read(path, SOURCES)

@@ -174,3 +174,15 @@ def test_a_device_beside_the_heaters_is_no_output(tmp_path):
     ]
     text = inspect(write(tmp_path, "Starting Klippy...\n" + "\n".join(lines) + "\n"))
     assert "# temperatures that nothing heats, left out: raspberry_pi.temp" in text
+
+
+def test_a_log_of_more_numbers_than_fit_into_memory_is_refused(tmp_path, monkeypatch):
+    from pipeline.reading import klipper_logs, whole_tables
+
+    monkeypatch.setattr(klipper_logs, "LINES_A_CHECK", 10)
+    monkeypatch.setattr(whole_tables, "MOST_VALUES", 1000)
+    wide = " ".join(f"d{i}: temp=1 pwm=0" for i in range(50))
+    lines = [f"Stats 1.0: gcodein=0 {wide} print_time=1"]
+    lines += [f"Stats {k}.0: gcodein=0 print_time={k}" for k in range(2, 200)]
+    with pytest.raises(ValueError, match="are more than the 1000 numbers that are read; split the recording"):
+        load_klippy(write(tmp_path, "\n".join(lines) + "\n"))

@@ -162,3 +162,14 @@ def test_a_workbook_that_would_unpack_to_gigabytes_is_refused_unread(tmp_path):
                 member.write(bytes(1 << 20))
     with pytest.raises(ValueError, match="unpacks to 1100 MB, more than the 1024 MB"):
         read(write(tmp_path, stream.getvalue()), SOURCES)
+
+
+def test_a_text_that_thousands_of_cells_share_is_refused_before_it_is_copied(tmp_path):
+    cells = "".join(f'<row r="{i}"><c r="A{i}" t="s"><v>0</v></c></row>' for i in range(1, 3001))
+    content = io.BytesIO(workbook(f'<worksheet xmlns="{MAIN}"><sheetData>{cells}</sheetData></worksheet>'))
+    with zipfile.ZipFile(content, "a", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(
+            "xl/sharedStrings.xml", f'<sst xmlns="{MAIN}"><si><t>{"x" * (1 << 20)}</t></si></sst>'
+        )
+    with pytest.raises(ValueError, match="its cells may hold more than 256 MB of text"):
+        read(write(tmp_path, content.getvalue()), SOURCES)
