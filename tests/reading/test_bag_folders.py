@@ -13,7 +13,7 @@ FLOAT64 = b"float64 data"
 
 def bag(folder, parts: int = 2, *, storage: str = "mcap", pack=bytes, samples: int = 40):
     """A bag of std_msgs/Float64 on /heater and /zone, a message a second."""
-    folder.mkdir()
+    folder.mkdir(parents=True)
     names = [f"{folder.name}_{i}.mcap" for i in range(parts)]
     for i, name in enumerate(names):
         made = Written(NO)

@@ -96,11 +96,11 @@ class Columns(NamedTuple):
 def process(folder: Path, spec: IngestSpec, execution: Execution, *, memo: Path) -> list[Result]:
     """Every recording below `folder`, in the order of names, on as many workers as
     `execution` says. Raises ValueError where there is none."""
-    bags = sorted(path.parent for path in folder.rglob("metadata.yaml") if is_bag(path.parent))
+    bags = {path.parent for path in folder.rglob("metadata.yaml") if is_bag(path.parent)} - {folder}
     files = sorted(
         path
-        for path in [*folder.rglob("*"), *bags]
-        if (path in bags or (path.is_file() and not set(bags) & set(path.parents)))
+        for path in folder.rglob("*")
+        if (path in bags or (path.is_file() and not bags & set(path.parents)))
         and not path.name.startswith(".")
         and path.suffix.lower() not in {".md", ".yaml", ".dvc"}
         and path.name.lower() not in {"readme.txt", "license.txt", "source.txt", "notes.txt"}
