@@ -240,7 +240,11 @@ def _behaviour(signal: Signal) -> str:
 def _bimodality(values: np.ndarray) -> float:
     """(skewness^2 + 1) / kurtosis: 1 for two levels, 5/9 for a uniform distribution, 1/3 for a normal one
     (Pearson)."""
-    z = (values - values.mean()) / values.std()
+    values = values / np.abs(values).max()
+    spread = values.std()
+    if not spread > 0:
+        return 0.0
+    z = (values - values.mean()) / spread
     return float((np.mean(z**3) ** 2 + 1) / np.mean(z**4))
 
 

@@ -10,7 +10,7 @@ from pipeline.reading.formats import Column, Columns, column_place, every, forwa
 from pipeline.reading.signals import Note
 
 # what is unpacked of one spreadsheet or MATLAB file, in bytes; a print log of a day has 100 MB
-LARGEST_UNPACKED = 1 << 30
+LARGEST_UNPACKED = 1 << 29
 MOST_COLUMNS = 2000
 # numbers of one table: 0.8 GB
 MOST_VALUES = 100_000_000
