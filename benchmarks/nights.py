@@ -150,7 +150,8 @@ def settings() -> dict:
     signal = {"unit": "percent", "low": 0, "high": 100}
     found["plant"] = {
         "sample_time_s": 1.0, "inputs": [{"name": f"heater_{k}", **signal} for k in (1, 2)],
-        "outputs": [{"name": f"sensor_{k}", "unit": "degC", "reference": float(REFERENCE[k - 1])} for k in (1,
+        "outputs": [{"name": f"sensor_{k}", "unit": "degC", "low": 0, "high": 300,
+                     "reference": float(REFERENCE[k - 1])} for k in (1,
         2)],
     }  # fmt: skip
     found["execution"] |= {

@@ -112,6 +112,18 @@ def inspect(arguments: argparse.Namespace) -> None:
     print(describe(arguments.file))
 
 
+def init(arguments: argparse.Namespace) -> None:
+    """Recordings of a new machine into params.yaml: mapping, plant, panel and
+    rules that fit its pace; and what a person must still decide."""
+    from pipeline.temperature.workflow import propose_params
+
+    initialised = propose_params.proposed(arguments.recordings)
+    changed = propose_params.write(initialised.values, force=arguments.force)
+    if arguments.copy:
+        propose_params.copy(arguments.recordings)
+    print(propose_params.summary(initialised, changed, arguments.recordings, arguments.copy))
+
+
 def compose(arguments: argparse.Namespace) -> None:
     """A part program into plunger commands: signal and tasks as CSV,
     and whether it will print, line by line."""
@@ -179,6 +191,11 @@ def main() -> None:
     command = commands.add_parser("inspect", help=inspect.__doc__)
     command.add_argument("file", type=Path)
     command.set_defaults(run=inspect)
+    command = commands.add_parser("init", help=init.__doc__)
+    command.add_argument("recordings", type=Path, nargs="+", metavar="RECORDING")
+    command.add_argument("--copy", action="store_true", help="copy them into datasets/raw/temperature")
+    command.add_argument("--force", action="store_true", help="overwrite values that were edited")
+    command.set_defaults(run=init)
     command = commands.add_parser("compose", help=compose.__doc__)
     command.add_argument("part", type=Path, help="the part program (G-code)")
     command.add_argument("--out", type=Path, default=Path("."), help="folder for signal, tasks and report")

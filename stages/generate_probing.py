@@ -3,12 +3,13 @@ user's recordings come in, or next_experiment.csv (recordings), what to play on 
 
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow import generate_probing
-from pipeline.temperature.workflow.settings import GenerateProbing, Plant
+from pipeline.temperature.workflow.settings import GenerateProbing, Plant, check_output_limits
 
 
 def main() -> None:
     with artifacts.stage("generate_probing") as out:
         settings, machine = params.load(GenerateProbing, "generate_probing"), params.load(Plant, "plant")
+        check_output_limits(machine, settings.source)
         if settings.source == "recordings":
             result = generate_probing.planned(settings, machine)
             artifacts.write_csv(out / "next_experiment.csv", result.columns)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow import ingest
-from pipeline.temperature.workflow.settings import Ingest, Plant
+from pipeline.temperature.workflow.settings import Ingest, Plant, check_output_limits
 
 
 def main() -> None:
@@ -19,6 +19,7 @@ def main() -> None:
             params.load(params.Execution, "execution"),
         )
         source = params.value("generate_probing.source", one_of=("simulated", "recordings"))
+        check_output_limits(machine, source)
         folder = Path(
             {"simulated": "datasets/generate_probing", "recordings": "datasets/raw/temperature"}[source]
         )

@@ -467,14 +467,20 @@ def differences(entries: dict[str, Any], wanted: dict[str, Any]) -> list[str]:
 
 
 def unbounded(kind: Any, place: str, limits: tuple = ()) -> list[str]:
-    """The places in a type where a number has no lower or no upper bound, or a key has a default."""
+    """The places in a type where a number has no lower or no upper bound, or a key has a default other
+    than None."""
     if typing.get_origin(kind) is Annotated:
         kind, *extra = typing.get_args(kind)
         limits = (*limits, *(limit for item in extra for limit in getattr(item, "metadata", [item])))
         return unbounded(kind, place, limits)
     if isinstance(kind, type) and issubclass(kind, params.Section):
         fields = kind.model_fields.items()
-        defaults = [f"{place}.{name} has a default" for name, field in fields if not field.is_required()]
+        # None alone: what a simulated machine has no need of
+        defaults = [
+            f"{place}.{name} has a default"
+            for name, field in fields
+            if not field.is_required() and field.default is not None
+        ]
         return defaults + [
             item
             for name, field in fields

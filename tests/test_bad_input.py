@@ -85,7 +85,9 @@ def ready(root, tmp_path_factory) -> Path:
             "plant.inputs": [
                 {"name": f"heater_{i}", "unit": "percent", "low": 0, "high": 100} for i in (1, 2)
             ],
-            "plant.outputs": [{"name": f"zone_{i}", "unit": "degC", "reference": 35} for i in (1, 2)],
+            "plant.outputs": [
+                {"name": f"zone_{i}", "unit": "degC", "reference": 35, "low": 0, "high": 90} for i in (1, 2)
+            ],
             "generate_probing.source": "recordings",
             "ingest.mapping": {
                 ours: {"source": theirs, "unit": unit, "scale": 1.0, "offset": 0.0}

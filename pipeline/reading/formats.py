@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.reading.signals import Note, nearest_names
+from pipeline.reading.signatures import is_bag, other_format
 
 # a number beyond the first of each row is no time in seconds but an epoch in ms, us, ns, or 100 ns as Windows
 # counts from 1601 (1e11 s is the year 5138)
@@ -45,6 +46,7 @@ _TIME_NAMES = (
     "uptime",
     "runtime",
     "timestring",
+    "tout",
     "date",
     "datum",
     "index",
@@ -56,10 +58,13 @@ _PER_SECOND = {"s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0,
                "h": 1 / 3600, "hours": 1 / 3600,
                "d": 1 / 86400, "days": 1 / 86400}  # fmt: skip
 
+# names that are a time and its unit in one
+_COUNTS = {"millis": "ms", "milliseconds": "ms", "micros": "us", "microseconds": "us", "nanoseconds": "ns"}
+
 _PARQUET = b"PAR1"
 _OTHER_FORMATS = {
     b"\x1f\x8b": ("gzip", "unpack it with gunzip"),
-    b"PK\x03\x04": ("zip or Excel", "unpack it, or save the sheet as CSV"),
+    b"PK\x03\x04": ("a zip file", "unpack it, or save the sheet as .xlsx or CSV"),
     b"\x28\xb5\x2f\xfd": ("zstd", "unpack it with zstd -d"),
     b"\x04\x22\x4d\x18": ("lz4", "unpack it with lz4 -d"),
     b"BZh": ("bzip2", "unpack it with bunzip2"),
@@ -67,7 +72,7 @@ _OTHER_FORMATS = {
     b"#ROSBAG V": ("a ROS 1 bag", "convert it with: mcap convert FILE.bag FILE.mcap"),
     b"SQLite format 3": ("SQLite (a rosbag2 .db3)", "convert it with: ros2 bag convert, storage mcap"),
     b"\x89HDF": ("HDF5 or MATLAB 7.3", "save the signals as CSV or Parquet"),
-    b"MATLAB 5.0": ("a MATLAB file", "save the signals as CSV or Parquet"),
+    b"MATLAB 7.3": ("a MATLAB 7.3 file (HDF5)", "save it with save(..., '-v7'), or write CSV with h5py"),
     b"\x80\x04": ("a pickle", "save the signals as CSV or Parquet"),
     b"<": ("HTML or XML", "save the signals as CSV or Parquet"),
     b"{": ("JSON", "save the signals as CSV or Parquet"),
@@ -79,7 +84,7 @@ _OTHER_FORMATS = {
     b"\x7fELF": ("a program (ELF)", "name the recording"),
     b"\x93NUMPY": ("a NumPy array", "save the signals as CSV or Parquet"),
     b"TDSm": ("TDMS of LabVIEW", "export it as CSV"),
-    b"\xd0\xcf\x11\xe0": ("Excel 97", "save the sheet as CSV"),
+    b"\xd0\xcf\x11\xe0": ("Excel 97 or a workbook with a password", "save it as .xlsx without one"),
     b"ARROW1": ("an Arrow file", "write it as Parquet"),
 }
 
@@ -135,8 +140,12 @@ class Growing:
 
 
 def file_format(path: Path) -> str:
-    """ "mcap", "parquet" or "csv", by the file's first bytes and not by its name. Raises ValueError for any
-    other format."""
+    """ "mcap", "parquet", "csv", "bag" or a name of `LOADERS`, by the first bytes and not by the name.
+
+    Raises ValueError for any other format.
+    """
+    if is_bag(path):
+        return "bag"
     if path.is_dir():
         raise ValueError(f"{path} is a folder but should be one recording; name a file in it")
     try:
@@ -154,6 +163,8 @@ def file_format(path: Path) -> str:
         return "mcap"
     if start.startswith(_PARQUET):
         return "parquet"
+    if kind := other_format(path, start):
+        return kind
     for magic, (name, remedy) in _OTHER_FORMATS.items():
         if start.startswith(magic):
             raise ValueError(f"{path} is {name} but should be MCAP, Parquet or CSV; {remedy}")
@@ -209,6 +220,8 @@ def is_time_name(name: str) -> bool:
 
 def _time_rank(name: str) -> tuple[bool, int] | None:
     """The rank of a column as the time, None for no time. A name with a unit of time comes first."""
+    if name.strip() == "T":  # more often a temperature
+        return True, len(_TIME_NAMES)
     base, unit = _time_unit(name)
     return (not unit, _TIME_NAMES.index(base)) if base in _TIME_NAMES else None
 
@@ -217,6 +230,8 @@ def _time_unit(name: str) -> tuple[str, str]:
     """("time", "ms") of "Time [ms]", "time_ms" and the like. A time zone at the end is no part of the
     name."""
     plain = re.sub(r"[\s_.]*[(\[/_\s]\s*(utc|gmt|local)\s*[)\]]?$", "", name.strip().casefold())
+    if plain in _COUNTS:
+        return "time", _COUNTS[plain]
     match = re.match(r"^(.*?)[\s_.]*[(\[/_\s]\s*(\w+)\s*[)\]]?$", plain)
     if match and match[2] in _PER_SECOND:
         return _word(match[1]), match[2]

@@ -19,7 +19,7 @@ _DATE = (
     r"\d{1,2}(?P<k>[./-])(?:\d{1,2}|[A-Za-z]{3})(?P=k)(?:\d{4}|\d{2}))"
 )
 _TIME = (
-    r"(?P<hours>\d+):(?P<minutes>\d\d)(?::(?P<seconds>\d\d)(?:[.,:](?P<fraction>\d+))?)?"
+    r"(?P<hours>\d+):(?P<minutes>\d\d)(?::(?P<seconds>\d\d)(?:(?:[.,:]|-(?=\d{3}\s*$))(?P<fraction>\d+))?)?"
     r"\s*(?P<half>[AaPp]\.?[Mm]\.?)?"
 )
 _TEXT = re.compile(

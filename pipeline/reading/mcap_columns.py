@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.reading.formats import Columns, Growing
+from pipeline.reading.formats import Columns, Growing, seconds
 from pipeline.reading.mcap_files import McapFile, Messages
 from pipeline.reading.mcap_messages import (
     Channel,
@@ -274,7 +274,7 @@ def _numbers(
         stamp = values[:, len(need.fields) :]
         # both parts are whole numbers below 2^53, so that floats hold them and the nanoseconds are exact
         times = (
-            np.rint(stamp[:, 0] * 1e9).astype(np.int64)
+            np.rint(seconds(need.clock[0].rpartition(".")[2], stamp[:, 0])[0] * 1e9).astype(np.int64)
             if stamp.shape[1] == 1
             else stamp[:, 0].astype(np.int64) * 10**9 + stamp[:, 1].astype(np.int64)
         )
@@ -348,3 +348,127 @@ def _join(
 
 def _place(topic: str) -> Callable[[int], str]:
     return lambda i: f"message {i + 1} of {topic}"
+
+
+# ---- everything at once
+
+
+class Survey(NamedTuple):
+    """Every topic of a file, the columns of those with numbers, and notes on damage and on what is unread."""
+
+    topics: dict[str, Topic]
+    columns: list[Columns]
+    notes: list[Note]
+
+
+class _Surveyed:
+    """A channel while the file is walked: its first messages until there are SAMPLES, then its columns."""
+
+    def __init__(self) -> None:
+        self.waiting = Messages([], [], [])
+        self.need: _Wanted | None = None
+        self.decode: Decode | None = None
+        self.parts: Growing | None = None
+
+
+def survey(path: Path, most_fields: int) -> Survey:
+    """The topics of a file with the first `most_fields` numbers of each on log_time, in one walk.
+
+    Raises ValueError for a file that is no MCAP.
+    """
+    file = McapFile(path)
+    channels: dict[int, _Surveyed] = {}
+    names: dict[int, dict[str, None]] = {}
+    unreadable: dict[int, str] = {}
+    bad: dict[str, int] = {}
+    for batch in file.batches(lambda channel: channel.id not in unreadable):
+        for number, messages in batch.items():
+            if number not in file.channels or not messages.data:
+                continue
+            state = channels.setdefault(number, _Surveyed())
+            if state.decode is None:
+                state.waiting.log_time.extend(messages.log_time)
+                state.waiting.publish_time.extend(messages.publish_time)
+                state.waiting.data.extend(messages.data)
+                if len(state.waiting.data) < SAMPLES:
+                    continue
+                messages = _begin(path, file, number, channels, names, unreadable, most_fields)
+            _survey_batch(path, file.channels[number], state, messages, unreadable, bad)
+    for number, state in channels.items():
+        if state.decode is None and number not in unreadable:
+            messages = _begin(path, file, number, channels, names, unreadable, most_fields)
+            _survey_batch(path, file.channels[number], state, messages, unreadable, bad)
+    for number, channel in file.channels.items():
+        if number not in channels:
+            _add_fields(channel, [], names, unreadable)
+    return _surveyed(path, file, channels, names, unreadable, bad)
+
+
+def _begin(path, file: McapFile, number: int, channels, names, unreadable, most_fields: int) -> Messages:
+    """The messages that waited, after their fields have been looked up."""
+    channel, state = file.channels[number], channels[number]
+    messages, state.waiting = state.waiting, Messages([], [], [])
+    _add_fields(channel, messages.data[:SAMPLES], names, unreadable)
+    shown = list(names.get(number, ()))[:most_fields]
+    others = [
+        other.need
+        for id, other in channels.items()
+        if other.need and file.channels[id].topic == channel.topic
+    ]
+    if number in unreadable or not shown:
+        unreadable.setdefault(number, "")
+        return Messages([], [], [])
+    state.need = others[0] if others else _Wanted(channel.topic, shown, [])
+    try:
+        state.decode = decoder(channel, state.need.fields)
+    except ValueError as error:
+        unreadable[number] = str(error)
+        return Messages([], [], [])
+    expected = min((file.promised or {}).get(number, 0), MOST_EXPECTED)
+    state.parts = Growing([np.int64, *[float] * len(state.need.fields)], expected)
+    return messages
+
+
+def _survey_batch(
+    path: Path, channel: Channel, state: _Surveyed, messages: Messages, unreadable, bad: dict[str, int]
+) -> None:
+    if state.decode is None or state.need is None or state.parts is None or not messages.data:
+        return
+    try:
+        times, values, dropped = _numbers(path, channel, state.decode, messages, state.need, "")
+    except ValueError as error:
+        unreadable[channel.id] = str(error)
+        return
+    bad[channel.topic] = bad.get(channel.topic, 0) + dropped
+    state.parts.append(times, *values.T)
+
+
+def _surveyed(
+    path: Path, file: McapFile, channels: dict[int, _Surveyed], names, unreadable, bad: dict[str, int]
+) -> Survey:
+    by_name: dict[str, Topic] = {}
+    for number, channel in sorted(file.channels.items()):
+        before = by_name.get(channel.topic, Topic(channel.topic, [], [], "", 0))
+        by_name[channel.topic] = Topic(
+            channel.topic,
+            [*before.channels, channel],
+            list(dict.fromkeys([*before.fields, *names.get(number, ())])),
+            unreadable.get(number, "") or before.unreadable,
+            before.count + file.counts.get(number, 0),
+        )
+    notes = file.notes() + _unreadable_notes(bad)
+    parts = {
+        number: state.parts
+        for number, state in channels.items()
+        if state.parts is not None and number not in unreadable
+    }
+    needs = {
+        state.need.topic: state.need for number, state in channels.items() if number in parts and state.need
+    }
+    columns = []
+    for need in needs.values():
+        try:
+            columns.append(_join(path, need, file, parts, notes, bad))
+        except ValueError as error:
+            notes.append(Note("unreadable", "", by_name[need.topic].count, str(error)))
+    return Survey(by_name, columns, notes)

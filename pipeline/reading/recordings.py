@@ -1,5 +1,5 @@
-"""Recordings of other people's machines: MCAP, Parquet and CSV -> signals on their own clocks. Damaged,
-missing and left-out samples are counted.
+"""Recordings of other people's machines -> signals on their own clocks: MCAP and bags, Parquet, CSV, logs of
+printers, spreadsheets, MATLAB files. Damaged, missing and left-out samples are counted.
 
 `read` is the entry point. `resample` and `flag` make a table of its result; `inspect` describes a file in
 words.
@@ -10,15 +10,18 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.reading.bag_folders import read_bag
 from pipeline.reading.csv_files import read_csv
 from pipeline.reading.formats import CALENDAR_S, Columns, check_clock, file_format
 from pipeline.reading.inspection import inspect
 from pipeline.reading.mcap_columns import mcap_columns
 from pipeline.reading.mcap_records import check_magic
+from pipeline.reading.other_formats import LOADERS
 from pipeline.reading.parquet_files import read_parquet
 from pipeline.reading.quality import flag
 from pipeline.reading.resampling import resample
 from pipeline.reading.signals import Flag, Jitter, Note, Raw, Source, Table, nearest_names
+from pipeline.reading.whole_tables import select
 
 __all__ = [
     "Flag",
@@ -56,8 +59,13 @@ def read(path: str | Path, sources: Sequence[Source], *, time: str = "") -> Raw:
             with path.open("rb") as stream:
                 check_magic(path, stream.read(16))
             columns, places, messages, notes = mcap_columns(path, names, time)
+        elif kind == "bag":
+            columns, places, messages, notes = read_bag(path, names, time)
         else:
-            table, notes = (read_csv if kind == "csv" else read_parquet)(path, names, time)
+            if kind in LOADERS:
+                table, notes = select(path, LOADERS[kind](path), names, time)
+            else:
+                table, notes = (read_csv if kind == "csv" else read_parquet)(path, names, time)
             columns, places, messages = (
                 [table],
                 {name: (table.name, name) for name in names},

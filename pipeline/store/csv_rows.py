@@ -75,7 +75,21 @@ def opening(path: Path) -> Opening:
         _split(line.lstrip("#% ") if is_remark else line, delimiter)
         for line, is_remark in zip(lines, remark, strict=True)
     ]
+    if delimiter == " ":
+        rows = _with_wide_names(rows, lines, decimal)
     return Opening(encoding, delimiter, decimal, rows, remark, notes)
+
+
+def _with_wide_names(rows: list[list[str]], lines: list[str], decimal: str) -> list[list[str]]:
+    """The rows of a table with blanks between its columns; a header whose names have blanks inside ("Zone 1
+    (C)   Heater 1") is split where two or a tab stand, if that gives as many names as there are columns."""
+    widths = [len(row) for row in rows if row and all(is_number(field, decimal) for field in row)]
+    width = max(widths, key=widths.count, default=0)
+    wide = [re.split(r"\s{2,}|\t", line.lstrip("#% \t").rstrip()) for line in lines]
+    return [
+        names if len(row) > width > 1 and len(names) == width else row
+        for row, names in zip(rows, wide, strict=True)
+    ]
 
 
 def list_layout(path: Path, is_header: Callable[[list[str]], bool]) -> CsvLayout:
@@ -169,8 +183,9 @@ def rows(path: Path, layout: CsvLayout) -> Iterator[tuple[int, list[str]]]:
             if layout.delimiter == " ":
                 numbered = ((i, line.split()) for i, line in enumerate(stream, 1))
             else:
-                reader = csv.reader(stream, delimiter=layout.delimiter)
+                reader = csv.reader(stream, delimiter=layout.delimiter, strict=True)
                 numbered = ((reader.line_num, row) for row in reader)
+            line = 0
             for line, row in numbered:
                 start = row[0].lstrip() if row else ""
                 if (
@@ -185,6 +200,11 @@ def rows(path: Path, layout: CsvLayout) -> Iterator[tuple[int, list[str]]]:
                 "save the file as UTF-8"
             ) from None
         except csv.Error as error:
+            if "unexpected end" in str(error):
+                raise ValueError(
+                    f"{path}: line {line + 1}: a quotation mark is opened there and never closed; "
+                    "remove or close it"
+                ) from None
             raise ValueError(
                 f"{path}: a line cannot be split into columns ({error}); save the file again as plain CSV"
             ) from None

@@ -51,7 +51,8 @@ SECTIONS = (
 
 
 class Section(pydantic.BaseModel):
-    """One section of the two files. Fields have bounds and no defaults: only the files hold values.
+    """One section of the two files. Fields have bounds and no defaults but None: only the files hold
+    values.
 
     Types are strict: "true" is no number and 3.5 no integer, but 3 is a float. A list of YAML fills lists and
     tuples. NaN and infinity are refused.

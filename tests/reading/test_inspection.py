@@ -229,6 +229,154 @@ def test_columns_of_one_name_are_named_and_those_of_other_programs_are_recognise
     assert "the same name twice, so that none of them can be mapped; give each its own: x (2 times)" in text
     assert {name: one["source"] for name, one in proposal(text)["ingest"]["mapping"].items()} == {
         "temperature_0": "tool0 actual",
-        "temperature_1": "heater_bed.temperature",
-        "heater_1": "extruder.power",
+        "temperature_bed": "heater_bed.temperature",
+        "heater_extruder": "extruder.power",
     }
+
+
+# ---- what a person meets first
+
+
+def plc(path) -> None:
+    """35 topics of a controller, each with one number `data`: 16 zones with temperature and duty, an
+    emergency stop, a status word and a cycle counter."""
+    made, rng = Written(), np.random.default_rng(0)
+    names = [f"/plc/zone_{i}_temperature" for i in range(1, 17)]
+    names += [f"/plc/zone_{i}_duty" for i in range(1, 17)]
+    names += ["/plc/emergency_stop", "/plc/status", "/plc/cycle_counter"]
+    channels = [made.topic(name, "json") for name in names]
+    for k in range(60):
+        values = [
+            *(200 + rng.normal(0, 1, 16)),
+            *(50 + 10 * rng.integers(0, 4, 16)),
+            float(k > 40),
+            float(k % 3),
+            float(k),
+        ]
+        for channel, value in zip(channels, values, strict=True):
+            made.message(channel, float(k), {"data": float(value)})
+    path.write_bytes(made.bytes())
+
+
+def test_a_controller_with_a_topic_a_signal_is_named_by_its_topics(tmp_path):
+    plc(tmp_path / "plc.mcap")
+    proposed = proposal(inspect(tmp_path / "plc.mcap"))
+    mapping = {name: one["source"] for name, one in proposed["ingest"]["mapping"].items()}
+    expected = {f"temperature_{i}": f"/plc/zone_{i}_temperature:data" for i in range(1, 17)}
+    expected |= {f"heater_{i}": f"/plc/zone_{i}_duty:data" for i in range(1, 17)}
+    assert mapping == expected
+    Plant.model_validate_json(json.dumps(proposed["plant"]))
+
+
+def test_a_file_is_walked_once_whatever_the_number_of_topics(tmp_path, monkeypatch):
+    from pipeline.reading import mcap_files
+
+    walks, batches = [], mcap_files.McapFile.batches
+
+    def counted(self, wanted):
+        walks.append(self.path)
+        return batches(self, wanted)
+
+    plc(tmp_path / "plc.mcap")
+    monkeypatch.setattr(mcap_files.McapFile, "batches", counted)
+    inspect(tmp_path / "plc.mcap")
+    assert len(walks) == 1
+
+
+def test_rubbish_behind_the_first_bytes_is_among_the_findings(tmp_path):
+    (tmp_path / "rig.mcap").write_bytes(b"\x89MCAP0\r\nabc")
+    text = inspect(tmp_path / "rig.mcap")
+    assert "Findings: none" not in text
+    assert "truncated: the file breaks off: from byte 8 on" in text
+
+
+def test_a_temperature_called_T_is_none_of_the_times(tmp_path):
+    rows = "".join(f"{k},{20 + k % 7},{k % 5 * 20}\n" for k in range(60))
+    for head in ("time_s,T,duty", "time,T,duty", "millis,T,duty"):
+        (tmp_path / "rig.csv").write_text(f"{head}\n{rows}")
+        proposed = proposal(inspect(tmp_path / "rig.csv"))
+        sources = [one["source"] for one in proposed["ingest"]["mapping"].values()]
+        assert sources == ["T", "duty"]
+        assert "time" not in proposed["ingest"]
+    # alone it is no time either
+    (tmp_path / "rig.csv").write_text("T,duty\n" + "".join(f"{20 + k % 7},{k % 5 * 20}\n" for k in range(60)))
+    assert proposal(inspect(tmp_path / "rig.csv"))["ingest"]["time"] == "every 1.0 s"
+
+
+def test_a_clock_in_milliseconds_is_read_by_its_name_or_remarked_by_its_step(tmp_path):
+    rows = "".join(f"{k * 100},{20 + k % 7},{k % 5 * 20}\n" for k in range(60))
+    for head in ("time_ms", "millis", "t [ms]"):
+        (tmp_path / "rig.csv").write_text(f"{head},zone_C,duty\n{rows}")
+        assert "every 0.1 s (10 per second)" in inspect(tmp_path / "rig.csv")
+    (tmp_path / "rig.csv").write_text(f"time,zone_C,duty\n{rows}")
+    assert "time steps by 100, read as seconds; if it counts ms, name the column time_ms" in inspect(
+        tmp_path / "rig.csv"
+    )
+
+
+@pytest.mark.parametrize("scale", [("stamp_ms", 1e3), ("stamp_us", 1e6), ("stamp_ns", 1e9)])
+def test_a_field_that_is_the_clock_counts_in_the_unit_of_its_name(tmp_path, scale):
+    name, per_second = scale
+    made = Written()
+    channel = made.topic("/rig", "json")
+    for k in range(20):
+        made.message(channel, 100.0 + k, {"temperature": 20.0 + k, name: k * 0.5 * per_second})
+    (tmp_path / "rig.mcap").write_bytes(made.bytes())
+    raw = read(tmp_path / "rig.mcap", [Source("y", "temperature", "degC")], time=name)
+    np.testing.assert_allclose(raw.signals["y"][0], np.arange(20) * 0.5, atol=1e-9)  # ns
+    assert f"source: {name}" not in inspect(tmp_path / "rig.mcap")
+
+
+@pytest.mark.parametrize("text", ['a,b\n0,1\n1,"2', 'a,b\n0,1\n1,"2\n2,3\n3,4\n'])
+def test_a_quotation_mark_that_is_never_closed_is_named_with_its_line(tmp_path, text):
+    (tmp_path / "rig.csv").write_text(text)
+    with pytest.raises(ValueError, match="line 3: a quotation mark is opened there and never closed"):
+        inspect(tmp_path / "rig.csv")
+
+
+@pytest.mark.parametrize(
+    ("name", "inputs", "outputs"),
+    [
+        ("daisy_a/dryer.dat", 1, 1),
+        ("daisy_a/evaporator.dat", 3, 3),
+        ("daisy_a/glassfurnace.dat", 3, 6),
+        ("tclab_apmonitor/energy_balance_mimo.csv", 2, 2),
+        ("tclab_apmonitor/second_order_mimo.csv", 2, 2),
+        ("tclab_mlid_prbs/prbs.csv", 2, 2),
+        ("paper_reference/probing_log_seed1.parquet", 7, 5),
+        # logs of a printer's temperatures without any duty: the sentence says so
+        ("caxton_print0_log/caxton_print0_early.csv", 0, 2),
+        ("fast_caxton_frames/example_print_log.csv", 0, 2),
+    ],
+)
+def test_the_proposal_of_a_real_record_reads_it_and_is_a_plant(shared, name, inputs, outputs):
+    path = shared(f"data/{name}")
+    proposed = proposal(inspect(path))
+    plant = proposed["plant"]
+    assert (len(plant["inputs"]), len(plant["outputs"])) == (inputs, outputs)
+    sources = [
+        Source(signal, one["source"], one["unit"], one["scale"], one["offset"])
+        for signal, one in proposed["ingest"]["mapping"].items()
+    ]
+    raw = read(path, sources, time=proposed["ingest"].get("time", ""))
+    for one in plant["inputs"]:
+        values = raw.signals[one["name"]][1]
+        assert one["low"] - 1e-3 <= values.min() and values.max() <= one["high"] + 1e-3  # six digits of scale
+    if inputs:
+        Plant.model_validate_json(json.dumps(plant))
+    else:
+        assert "a plant cannot be identified without; if the duty is not in the recording" in inspect(path)
+
+
+@pytest.mark.parametrize(
+    "line", ["{:8.2f}    {:8.1f}    {:10.3f}\n", "{:.2f}\t{:.1f}\t{:.3f}\n"], ids=["widths", "tabs"]
+)
+def test_a_text_with_fixed_widths_or_tabs_is_a_table_with_names_of_several_words(tmp_path, line):
+    head = "Time (s)    Heater 1    Zone 1 (C)\n".replace("    ", "\t" if "\t" in line else "    ")
+    (tmp_path / "rig.txt").write_text(
+        head + "".join(line.format(k / 2, k % 4 * 20, 20 + k / 7) for k in range(60))
+    )
+    text = inspect(tmp_path / "rig.txt")
+    assert "every 0.5 s (2 per second)" in text
+    sources = [one["source"] for one in proposal(text)["ingest"]["mapping"].values()]
+    assert sources == ["Heater 1", "Zone 1 (C)"]

@@ -36,8 +36,8 @@ KIT = {
         "sample_time_s": 1.0,
         "inputs": [{"name": f"heater_{i}", "unit": "percent", "low": 0, "high": 100} for i in (1, 2)],
         "outputs": [
-            {"name": "T1", "unit": "degC", "reference": 50},
-            {"name": "T2", "unit": "degC", "reference": 45},
+            {"name": "T1", "unit": "degC", "reference": 50, "low": 0, "high": 80},
+            {"name": "T2", "unit": "degC", "reference": 45, "low": 0, "high": 80},
         ],
     },
     "generate_probing.source": "recordings",

@@ -296,7 +296,7 @@ def test_zeros_after_a_power_failure_are_left_out_and_noted(tmp_path):
             gzip.compress(b"t,u,y\n0,1,2\n", mtime=0),
             "is gzip but should be MCAP, Parquet or CSV; unpack it with gunzip",
         ),
-        (b"PK\x03\x04 and so on", "is zip or Excel"),
+        (b"PK\x03\x04 and so on", "is a zip file"),
         (
             b"#ROSBAG V2.0\n",
             "is a ROS 1 bag but should be MCAP, Parquet or CSV; convert it with: mcap convert",

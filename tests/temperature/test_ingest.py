@@ -16,6 +16,7 @@ from pipeline.temperature.workflow import ingest
 from pipeline.temperature.workflow.ingest import IngestSpec, collect, process
 from pipeline.temperature.workflow.settings import Plant
 from tests.cluster import Cluster
+from tests.reading.test_bag_folders import bag
 
 MACHINE = Plant.model_validate(
     {
@@ -344,3 +345,17 @@ def test_no_scheduler_at_the_address_is_one_sentence(tmp_path):
             tmp_path,
             params.Execution(backend="dask", jobs=2, scheduler="tcp://127.0.0.1:9"),
         )
+
+
+def test_a_bag_is_one_recording_among_files(tmp_path):
+    """Its parts and its metadata are no recordings of their own."""
+    raw = folder(tmp_path, 1)
+    bag(raw / "night" / "run")
+    mapped = {
+        "heater": ("/heater/duty:data", "percent", 1.0, 0.0),
+        "zone": ("/zone_1/temperature:data", "degC", 1.0, 0.0),
+    }
+    results = process(raw, JOB._replace(mapping=mapped), INLINE, memo=tmp_path / "memo")
+    assert [result.name for result in results] == ["000.csv", "night/run"]
+    assert "there is no column '/heater/duty:data'" in results[0].reason
+    assert results[1].reason == "" and len(results[1].record["zone"]) == 80

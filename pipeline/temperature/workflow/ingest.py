@@ -16,6 +16,7 @@ import numpy as np
 from pipeline.reading.quality import flag
 from pipeline.reading.recordings import Source, Table, nearest_names, read
 from pipeline.reading.resampling import resample
+from pipeline.reading.signatures import is_bag
 from pipeline.store import artifacts
 from pipeline.store.execution import run_all
 from pipeline.store.params import Execution
@@ -95,10 +96,11 @@ class Columns(NamedTuple):
 def process(folder: Path, spec: IngestSpec, execution: Execution, *, memo: Path) -> list[Result]:
     """Every recording below `folder`, in the order of names, on as many workers as
     `execution` says. Raises ValueError where there is none."""
+    bags = {path.parent for path in folder.rglob("metadata.yaml") if is_bag(path.parent)} - {folder}
     files = sorted(
         path
         for path in folder.rglob("*")
-        if path.is_file()
+        if (path in bags or (path.is_file() and not bags & set(path.parents)))
         and not path.name.startswith(".")
         and path.suffix.lower() not in {".md", ".yaml", ".dvc"}
         and path.name.lower() not in {"readme.txt", "license.txt", "source.txt", "notes.txt"}

@@ -44,9 +44,23 @@ class Input(Signal):
 
 
 class Output(Signal):
-    """A barrel temperature and the reference that it should settle at, in °C."""
+    """A barrel temperature, the reference that it should settle at, and between which temperatures the
+    machine must stay, in °C; a simulated machine needs no limits."""
 
     reference: float = Field(ge=-273.15, le=1000)
+    low: float | None = Field(default=None, ge=-273.15, le=2000)
+    high: float | None = Field(default=None, ge=-273.15, le=2000)
+
+    @pydantic.model_validator(mode="after")
+    def _ordered(self):
+        low, high = self.low, self.high
+        if low is not None and high is not None and not low < high:
+            raise ValueError(f"has low {low:g} but high {high:g}; low must be less than high")
+        if not (-300 if low is None else low) <= self.reference <= (2000 if high is None else high):
+            raise ValueError(
+                f"has reference {self.reference:g} outside its low {low} and high {high}; mend one"
+            )
+        return self
 
 
 class Plant(Section):
@@ -65,6 +79,18 @@ class Plant(Section):
                 f"names {', '.join(twice)} more than once; give every input and output a name of its own"
             )
         return self
+
+
+def check_output_limits(machine: Plant, source: str) -> None:
+    """Raises ValueError where recordings are the source and an output has no limits: nobody else knows how
+    hot the machine may get."""
+    lacking = [output.name for output in machine.outputs if output.low is None or output.high is None]
+    if source == "recordings" and lacking:
+        raise ValueError(
+            f"params.yaml: plant.outputs: {', '.join(lacking)} should have low and high, the temperatures in "
+            "degC between which the machine must stay, as generate_probing.source is recordings; add them, "
+            f"as in {{name: {lacking[0]}, ..., low: 0, high: 280}}"
+        )
 
 
 class Tracking(Section):

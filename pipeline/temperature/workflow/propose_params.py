@@ -1,0 +1,244 @@
+"""What `beadline init` does: recordings of a new machine -> the values of the params files that fit it.
+
+The mapping and the signals are those that `inspect` proposes. Times follow from the slowest and the fastest
+output's time constant, temperatures from what was recorded.
+"""
+
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+
+from pipeline.reading.inspection import Inspected, look
+from pipeline.reading.proposals import Proposal, mapping_lines, plant_lines, propose
+from pipeline.reading.recordings import Source, read
+from pipeline.reading.resampling import resample
+from pipeline.store import artifacts, params
+from pipeline.store.params_text import replaced
+from pipeline.temperature.time_scale import time_constant
+
+RAW = Path("datasets/raw/temperature")
+# what the files hold before anybody has touched them: the study's machine
+SHIPPED: dict[str, Any] = {
+    "plant.sample_time_s": 1.0,
+    "plant.inputs": [
+        {"name": name, "unit": "percent", "low": 0, "high": 100}
+        for name in (*(f"heater_{i}" for i in range(1, 7)), "motor")
+    ],
+    "plant.outputs": [
+        {"name": f"sensor_{i}", "unit": "degC", "reference": reference}
+        for i, reference in enumerate((150, 160, 170, 175, 180), 1)
+    ],
+    "generate_probing.source": "simulated",
+    "ingest.mapping": {},
+    "ingest.time": "",
+    "panel.steps": 600,
+    "panel.training.starts_degC": [20, 70],
+    "panel.judging.starts_degC": [20, 45, 90],
+    "panel.judging.reference_offsets_degC": [0, -15],
+    "report.settling_s": 60.0,
+    "report.overshoot_degC": 5.0,
+    "tune_weights.allow_settling_s": 15.0,
+}
+FEWEST_STEPS, MOST_STEPS = 300, 3000
+
+
+class Scale(NamedTuple):
+    """The machine's pace and range: time constants in s by output, the sample time that suits them, and the
+    lowest and highest temperature of the record."""
+
+    time_constants_s: dict[str, float]
+    sample_time_s: float
+    coldest_degC: float
+    hottest_degC: float
+
+
+class Initialised(NamedTuple):
+    """The lines of each key that is to be written, and sentences on what a person must decide."""
+
+    values: dict[str, list[str]]
+    open_questions: list[str]
+
+
+def proposed(paths: Sequence[Path]) -> Initialised:
+    """What the params files should hold for the machine of these recordings.
+
+    Raises ValueError for recordings of different machines, and for one without a heater or a temperature.
+    """
+    recordings = [look(path) for path in paths]
+    proposal = _widest(recordings)
+    for role, word in (("input", "a heater or a motor"), ("output", "a temperature")):
+        if not any(signal.role == role for signal in proposal.signals):
+            raise ValueError(
+                f"{paths[0]}: nothing in it looks like {word}; name the columns so (heater_1_pct, zone_1_C), "
+                "or write ingest.mapping and plant in params.yaml by hand"
+            )
+    for path, recording in zip(paths, recordings, strict=True):
+        sources = {signal.source for signal in recording.signals}
+        lacking = [signal.source for signal in proposal.signals if signal.source not in sources]
+        if lacking:
+            raise ValueError(
+                f"{path}: there is no {lacking[0]}, which another of the recordings has; "
+                "give recordings of one machine"
+            )
+    scale = _scale(paths, proposal)
+    return Initialised(_values(proposal, scale), _open_questions(proposal, scale))
+
+
+def _widest(recordings: Sequence[Inspected]) -> Proposal:
+    """The proposal of the recording that shows the most signals at work."""
+    proposals = [propose(one.signals, one.groups, one.time) for one in recordings]
+    return max(proposals, key=lambda proposal: len(proposal.signals))
+
+
+# ---- pace and range
+
+
+def _scale(paths: Sequence[Path], proposal: Proposal) -> Scale:
+    inputs = [s.name for s in proposal.signals if s.role == "input"]
+    outputs = [s for s in proposal.signals if s.role == "output"]
+    sources = [Source(s.name, s.source, s.unit, s.scale, s.offset) for s in proposal.signals]
+    interval = proposal.sample_time_s
+    u, y = [], {output.name: [] for output in outputs}
+    for path in paths:
+        raw = read(path, sources, time=proposal.time)
+        table = resample(
+            raw, sample_time_s=interval, inputs=inputs, outputs=list(y), max_gap_s=max(5.0, 3 * interval)
+        )
+        for segment in np.unique(table.segment):
+            rows = table.segment == segment
+            u.append(np.nan_to_num(np.column_stack([table.values[name][rows] for name in inputs])))
+            for name in y:
+                y[name].append(np.where(table.masked[name][rows], np.nan, table.values[name][rows]))
+    constants = {}
+    for name, segments in y.items():
+        try:
+            constants[name] = time_constant(u, segments, sample_time_s=interval)
+        except ValueError as error:
+            raise ValueError(f"{paths[0]}: {name}: {error}") from None
+    # two hundred samples a time constant of the fastest are enough
+    sample_time = max(interval, float(f"{min(constants.values()) / 200:.1g}"))
+    lows = [np.nanmin(np.concatenate(segments)) for segments in y.values()]
+    highs = [np.nanmax(np.concatenate(segments)) for segments in y.values()]
+    return Scale(constants, sample_time, float(np.max(lows)), float(np.min(highs)))
+
+
+# ---- values
+
+
+def _values(proposal: Proposal, scale: Scale) -> dict[str, list[str]]:
+    """The lines of each key; times scale with the slowest output, temperatures with what was recorded."""
+    slowest, outputs = (
+        max(scale.time_constants_s.values()),
+        [s for s in proposal.signals if s.role == "output"],
+    )
+    reference = min(s.reference for s in outputs if s.reference is not None)
+    reach = min(reference, scale.hottest_degC) - scale.coldest_degC
+    starts = [round(scale.coldest_degC + share * reach, 1) for share in (0.1, 0.6, 0.2, 0.5, 0.9)]
+    steps = int(np.clip(round(3 * slowest / scale.sample_time_s, -1), FEWEST_STEPS, MOST_STEPS))
+    settling = float(f"{slowest:.2g}")
+    input_lines, output_lines = plant_lines(proposal)
+    return {
+        "plant.sample_time_s": [repr(scale.sample_time_s)],
+        "plant.inputs": ["- " + line for line in input_lines],
+        "plant.outputs": ["- " + line for line in output_lines],
+        "generate_probing.source": ["recordings"],
+        "ingest.mapping": mapping_lines(proposal),
+        "ingest.time": [proposal.time or '""'],
+        "panel.steps": [str(steps)],
+        "panel.training.starts_degC": [f"[{starts[0]}, {starts[1]}]"],
+        "panel.judging.starts_degC": [f"[{starts[2]}, {starts[3]}, {starts[4]}]"],
+        "panel.judging.reference_offsets_degC": [f"[0, {round(-0.1 * reach, 1)}]"],
+        "report.settling_s": [repr(settling)],
+        "report.overshoot_degC": [repr(float(f"{max(0.5, 0.05 * reach):.1g}"))],
+        "tune_weights.allow_settling_s": [repr(settling / 4)],
+    }
+
+
+def _open_questions(proposal: Proposal, scale: Scale) -> list[str]:
+    questions = []
+    if proposal.how != "names and ranges":
+        questions.append(
+            "which column is what: the file names nothing, and the mapping was guessed by values"
+        )
+    if proposal.time:
+        questions.append("ingest.time: the file has no time; write the sample time in place of 1.0 s")
+    unlimited = [s.name for s in proposal.signals if s.role == "output" and s.low is None]
+    if unlimited:
+        questions.append(
+            f"plant.outputs low and high of {', '.join(unlimited)}: between which °C the machine must stay"
+        )
+    references = [f"{s.name} {s.reference:g}" for s in proposal.signals if s.role == "output"]
+    questions.append(f"plant.outputs reference, where each should settle: now {', '.join(references)} °C")
+    paces = [f"{name} {tau:.2g} s" for name, tau in scale.time_constants_s.items()]
+    questions.append(f"report: whether the rules suit you; the time constants are {', '.join(paces)}")
+    return questions
+
+
+# ---- files
+
+
+def write(values: dict[str, list[str]], *, force: bool, path: str | Path = params.FILE) -> list[str]:
+    """Writes the values into params.yaml and params.expert.yaml beside it; returns the keys that changed.
+
+    A key that holds neither what was shipped nor what is written now was edited: without `force` nothing is
+    written then. Raises ValueError that names such keys.
+    """
+    sections = params.read(path)
+    changes = {dotted: lines for dotted, lines in values.items() if _at(sections, dotted) != _parsed(lines)}
+    edited = [dotted for dotted in changes if _at(sections, dotted) != SHIPPED[dotted]]
+    if edited and not force:
+        raise ValueError(
+            f"{params.home(edited[0], path) or path}: {', '.join(edited)} was edited and would be "
+            "overwritten; nothing was written: keep the file, or give --force"
+        )
+    for file in params.files(path):
+        before = text = Path(file).read_text(encoding="utf-8")
+        for dotted, lines in changes.items():
+            if params.home(dotted, path) == file:
+                text = replaced(text, dotted, lines)
+        if text != before:
+            artifacts.write_text(file, text)
+    return list(changes)
+
+
+def _parsed(lines: Sequence[str]) -> Any:
+    return yaml.safe_load("\n".join(lines))
+
+
+def _at(sections: dict, dotted: str) -> Any:
+    value: Any = sections
+    for key in dotted.split("."):
+        value = value.get(key) if isinstance(value, dict) else None
+    return value
+
+
+def copy(paths: Sequence[Path], folder: Path = RAW) -> list[Path]:
+    """The recordings copied into `folder`; one that lies there already stays. Raises ValueError for another
+    file of the same name."""
+    folder.mkdir(parents=True, exist_ok=True)
+    copied = []
+    for path in paths:
+        target = folder / path.name
+        if target.resolve() == path.resolve():
+            continue
+        if target.exists() and (path.is_dir() or target.read_bytes() != path.read_bytes()):
+            raise ValueError(f"{target} is there already with other content; rename one of the two")
+        if path.is_dir():
+            shutil.copytree(path, target)
+        elif not target.exists():
+            shutil.copyfile(path, target)
+        copied.append(target)
+    return copied
+
+
+def summary(initialised: Initialised, changed: Sequence[str], paths: Sequence[Path], copied: bool) -> str:
+    """What was written, and what is left to a person."""
+    lines = [f"written: {', '.join(changed)}" if changed else "nothing to change: the files say so already"]
+    lines += ["to decide:", *(f"  {question}" for question in initialised.open_questions)]
+    if not copied and any(RAW.resolve() not in path.resolve().parents for path in paths):
+        lines.append(f"  put the recordings into {RAW} (or give --copy)")
+    return "\n".join([*lines, "then: ./run dvc repro"])

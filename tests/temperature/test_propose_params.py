@@ -1,0 +1,188 @@
+"""beadline init: from recordings of a new machine to params files that its stages read."""
+
+import shutil
+import sys
+
+import numpy as np
+import pytest
+import yaml
+
+from pipeline import cli
+from pipeline.store import artifacts, params
+from pipeline.store.params_text import replaced
+from pipeline.temperature.time_scale import time_constant
+from pipeline.temperature.workflow import propose_params, tables
+from pipeline.temperature.workflow.settings import IdentifyPlant, Panel, Plant, TuneWeights
+from tests.reading.klipper_machine import BED, EXTRUDER, print_log
+from tests.reading.test_real_record import project, run
+
+PRINT = [(0, 0, 60), (60, 200, 60), (600, 215, 70), (900, 205, 65), (1200, 220, 75), (1500, 200, 60),
+         (1750, 0, 0)]  # fmt: skip
+
+
+@pytest.fixture
+def tree(root, tmp_path, monkeypatch):
+    """The params files as shipped, in a folder of their own."""
+    for name in ("params.yaml", "params.expert.yaml"):
+        shutil.copy(root / name, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "klippy.log").write_text(print_log(PRINT, longest_s=1900))
+    return tmp_path
+
+
+def init(monkeypatch, *arguments: str) -> None:
+    monkeypatch.setattr(sys, "argv", ["beadline", "init", *arguments])
+    cli.main()
+
+
+def test_what_init_takes_for_untouched_is_what_is_shipped(root):
+    sections = params.read(root / "params.yaml")
+    for dotted, shipped in propose_params.SHIPPED.items():
+        section, *keys = dotted.split(".")
+        value = sections[section]
+        for key in keys:
+            value = value[key]
+        assert value == shipped, dotted
+
+
+def test_a_klippy_log_fills_the_files_and_keeps_their_comments(tree, monkeypatch, capsys):
+    before = (tree / "params.yaml").read_text()
+    init(monkeypatch, "klippy.log", "--copy")
+    machine = params.load(Plant, "plant")
+    assert [signal.name for signal in machine.inputs] == ["heater_bed", "heater_extruder"]
+    limits = {signal.name: (signal.reference, signal.low, signal.high) for signal in machine.outputs}
+    assert limits == {"temperature_bed": (60, 0, 130), "temperature_extruder": (200, 0, 260)}
+    assert machine.sample_time_s == 1.0
+    assert params.value("generate_probing.source", one_of=("simulated", "recordings")) == "recordings"
+    params.load(Panel, "panel"), params.load(TuneWeights, "tune_weights")
+    assert (tree / "datasets/raw/temperature/klippy.log").exists()
+    after = (tree / "params.yaml").read_text()
+    kept = [line for line in before.splitlines() if "#" in line]
+    comments = [line.partition("#")[2] for line in kept]
+    assert [line.partition("#")[2] for line in after.splitlines() if "#" in line] == comments
+    assert "where each should settle" in capsys.readouterr().out
+
+
+def test_a_second_run_changes_nothing_and_an_edited_value_is_not_overwritten(tree, monkeypatch, capsys):
+    init(monkeypatch, "klippy.log")
+    first = (tree / "params.yaml").read_bytes(), (tree / "params.expert.yaml").read_bytes()
+    init(monkeypatch, "klippy.log")
+    assert "nothing to change" in capsys.readouterr().out
+    assert ((tree / "params.yaml").read_bytes(), (tree / "params.expert.yaml").read_bytes()) == first
+    edited = (tree / "params.yaml").read_text().replace("reference: 200.0", "reference: 210.0")
+    (tree / "params.yaml").write_text(edited)
+    with pytest.raises(SystemExit):
+        init(monkeypatch, "klippy.log")
+    assert "plant.outputs was edited and would be overwritten; nothing was written" in capsys.readouterr().err
+    assert (tree / "params.yaml").read_text() == edited
+    init(monkeypatch, "klippy.log", "--force")
+    assert ((tree / "params.yaml").read_bytes(), (tree / "params.expert.yaml").read_bytes()) == first
+
+
+def test_limits_that_no_file_tells_are_left_to_a_person_and_asked_for_by_the_stage(
+    tree, root, monkeypatch, capsys
+):
+    k = np.arange(400)
+    heat = 40.0 + 30 * (k // 100 % 2)
+    y = 20 + np.convolve(heat - 40, 0.02 * np.exp(-k / 50))[:400]
+    rows = "".join(f"{i},{u},{v:.3f}\n" for i, u, v in zip(k, heat, y, strict=True))
+    (tree / "rig.csv").write_text("time_s,heater_1_pct,zone_1_C\n" + rows)
+    init(monkeypatch, "rig.csv", "--copy")
+    assert "low and high of temperature_1: between which °C the machine must stay" in capsys.readouterr().out
+    from stages import ingest
+
+    with pytest.raises(SystemExit):
+        ingest.main()
+    asked = capsys.readouterr().err
+    assert "plant.outputs: temperature_1 should have low and high" in asked
+
+
+def test_recordings_of_two_machines_and_one_without_heaters_are_refused(tree, monkeypatch, capsys):
+    header = "time_s,heater_1_pct,zone_1_C\n"
+    (tree / "a.csv").write_text(header + "".join(f"{k},{k % 50},{20 + k / 9}\n" for k in range(60)))
+    (tree / "b.csv").write_text("time_s,duty,T1\n" + "".join(f"{k},{k % 5},{20 + k}\n" for k in range(60)))
+    (tree / "c.csv").write_text("time_s,zone_1_C\n" + "".join(f"{k},{20 + k / 9}\n" for k in range(60)))
+    before = (tree / "params.yaml").read_bytes()
+    for files, sentence in (
+        (("a.csv", "b.csv"), "give recordings of one machine"),
+        (("c.csv",), "nothing in it looks like a heater or a motor"),
+    ):
+        with pytest.raises(SystemExit):
+            init(monkeypatch, *files)
+        assert sentence in capsys.readouterr().err
+    assert (tree / "params.yaml").read_bytes() == before
+
+
+def test_the_time_constant_is_the_one_that_made_the_record():
+    rng, tau = np.random.default_rng(0), 80.0
+    u = np.repeat(rng.choice([0.0, 100.0], (40, 2)), 50, axis=0)
+    y = np.zeros(2000)
+    for t in range(1999):
+        y[t + 1] = y[t] + (0.5 * u[t, 0] + 0.2 * u[t, 1] - y[t]) / tau
+    estimate = time_constant([u], [y + rng.normal(0, 0.1, 2000)], sample_time_s=1.0)
+    assert tau / 1.25 < estimate < 1.25 * tau  # the grid has steps of 24 %
+
+
+@pytest.mark.parametrize(
+    ("dotted", "lines", "result"),
+    [
+        ("a.b", ["2"], "a:  # one\n  b: 2    # two\n  c:\n    - 1\n    # three\nd: 4\n"),
+        (
+            "a.b",
+            ["- 5", "- 6"],
+            "a:  # one\n  b:  # two\n    - 5\n    - 6\n  c:\n    - 1\n    # three\nd: 4\n",
+        ),
+        ("a.c", ["[]"], "a:  # one\n  b: 1    # two\n  c: []\n    # three\nd: 4\n"),
+        ("a.c", ["- 7"], "a:  # one\n  b: 1    # two\n  c:\n    - 7\n    # three\nd: 4\n"),
+        ("a", ["2"], "a: 2  # one\n    # three\nd: 4\n"),
+        ("a", ["e: 2", "f: 3"], "a:  # one\n  e: 2\n  f: 3\n    # three\nd: 4\n"),
+    ],
+)
+def test_a_value_is_replaced_in_place(dotted, lines, result):
+    text = "a:  # one\n  b: 1    # two\n  c:\n    - 1\n    # three\nd: 4\n"
+    assert replaced(text, dotted, lines) == result
+    assert yaml.safe_load(result)
+
+
+# ---- from the log to the plant
+
+
+@pytest.fixture(scope="module")
+def printer(root, tmp_path_factory):
+    """A project whose only recording is a printer's own log, through init, ingest and identify_plant."""
+    folder = tmp_path_factory.mktemp("printer")
+    tree = project(root, folder, {})
+    # as shipped, with comments: what init edits
+    for name in ("params.yaml", "params.expert.yaml"):
+        shutil.copy(root / name, tree)
+    (tree / "klippy.log").write_text(print_log(PRINT, longest_s=1900))
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.chdir(tree)
+        init(monkeypatch, "klippy.log", "--copy")
+    expert = (tree / "params.expert.yaml").read_text()
+    (tree / "params.expert.yaml").write_text(expert.replace("max_order: 12", "max_order: 4"))
+    return run(tree, "generate_probing", "ingest", "identify_plant")
+
+
+def test_the_record_is_the_print_without_a_conversion(printer):
+    machine = params.load(Plant, "plant", printer / "params.yaml")
+    record = artifacts.read_table(
+        printer / "datasets/ingest/record.parquet", tables.record(machine.inputs, machine.outputs)
+    )
+    assert set(record["recording"]) == {"klippy.log"}
+    lines = [line for line in (printer / "klippy.log").read_text().splitlines() if line.startswith("Stats")]
+    assert len(record["time_s"]) == len(lines)
+    temperatures = [float(line.rpartition("extruder:")[2].split("temp=")[1].split()[0]) for line in lines]
+    np.testing.assert_array_equal(record["temperature_extruder"], temperatures)
+    findings = artifacts.read_json(printer / "reports/metrics/ingest.json")
+    assert findings["quarantined"] == 0
+
+
+def test_the_plant_of_the_print_has_both_heaters_and_their_pace(printer):
+    settings = params.load(IdentifyPlant, "identify_plant", printer / "params.yaml")
+    assert settings.max_order == 4
+    figures = artifacts.read_json(printer / "reports/metrics/identify_plant.json")
+    assert set(figures["fit_holdout"]) == {"temperature_bed", "temperature_extruder"}
+    # one-minute predictions: the printer's PID holds the bed within its noise, where a fit says little
+    assert figures["fit_holdout_ahead"]["temperature_extruder"] > 50
+    assert EXTRUDER.tau_s < BED.tau_s
