@@ -53,15 +53,9 @@ def identified(settings: IdentifyPlant, machine: Machine, path: str) -> Identifi
     inputs = [i.name for i in machine.inputs]
     record = _read(settings, machine, path)
     first, last = _parted(record.u, record.y, settings.holdout_share)
-    choices = identification.Settings(
-        order=settings.order or None,
-        offset=settings.offset,
-        refinement=settings.refinement,
-        max_order=settings.max_order,
-    )
     with artifacts.about(path):
         chosen = identification.identify(
-            *first, sample_time_s=machine.sample_time_s, settings=choices, names=inputs
+            *first, sample_time_s=machine.sample_time_s, settings=choices(settings), names=inputs
         )
     judgement = _judged(settings, chosen, first, last)
     fitted = identification.refit(record.u, record.y, chosen, names=inputs)
@@ -82,6 +76,16 @@ def identified(settings: IdentifyPlant, machine: Machine, path: str) -> Identifi
     }
     metrics = _metrics(settings, machine, record, chosen, fitted, judgement)
     return IdentifiedPlant(fitted.plant, family, page_tables, metrics)
+
+
+def choices(settings: IdentifyPlant) -> identification.Settings:
+    """What the stage gives, and what it leaves to the data."""
+    return identification.Settings(
+        order=settings.order or None,
+        offset=settings.offset,
+        refinement=settings.refinement,
+        max_order=settings.max_order,
+    )
 
 
 def _read(settings: IdentifyPlant, machine: Machine, path: str) -> _Record:
