@@ -5,8 +5,8 @@ The rules, each with its reason:
 
 window: Twice the lags of Akaike's criterion (corrected for few samples) over VARX models, long enough to
     whiten. Schwarz's lags beside them, for records that say little.
-feed-through: With and without u(t), where `feedthrough` is None and Schwarz's criterion of the one-step
-    predictor prefers it.
+feed-through: With and without u(t) in the outputs whose one-step predictor Schwarz's criterion prefers with
+    it, where `feedthrough` is None.
 largest order: The singular values, in units of the noise, above what coefficient errors alone reach:
     sqrt(2) (sqrt(rows) + sqrt(columns)) of the noise matrix.
 dead time: None; the lags at which the largest model's impulse response stays under 5 % of its peak; those
@@ -62,7 +62,7 @@ class Identified(NamedTuple):
     order_table: candidates with their errors.
 
     delays are the dead times in the plant, in samples for each input; silent marks
-    inputs that no output answers. x0 has the initial state of each segment, or of
+    inputs that no output answers, feedthrough the outputs with a row of D. x0 has the initial state of each segment, or of
     each piece where masked inputs cut one (`gapless`).
     """
 
@@ -71,7 +71,7 @@ class Identified(NamedTuple):
     past: int
     delays: tuple[int, ...]
     silent: tuple[bool, ...]
-    feedthrough: bool
+    feedthrough: tuple[bool, ...]
     offset: bool
     fit: str
     singular_values: np.ndarray
@@ -92,7 +92,7 @@ class Settings(NamedTuple):
 
     order: int | None = None
     past: int | None = None
-    feedthrough: bool | None = False
+    feedthrough: bool | None = None
     offset: bool = True
     refinement: Literal["none", "prediction", "simulation", "validated"] = "none"
     max_order: int = 12
@@ -226,7 +226,9 @@ def refit(
     record = _prepared(u, y, settings, limits, names)
     structure = Structure(past, identified.feedthrough, offset, identified.delays)
     data = (
-        None if table else lagged(record.u, record.y, past, feedthrough=structure.feedthrough, offset=offset)
+        None
+        if table
+        else lagged(record.u, record.y, past, feedthrough=any(structure.feedthrough), offset=offset)
     )
     exact = data is not None and windows(data)[1]
     choice = Choice(structure, identified.order, identified.fit, exact, table)
@@ -262,9 +264,11 @@ def _prepared(u, y, settings: Settings, limits, names) -> _Record:
 def _chosen(u: Segments, y: Segments, settings: Settings) -> tuple[Choice, list[str]]:
     """What the rules choose, and a sentence for each choice that a user should know of."""
     pasts, exact = _windows(u, y, settings.order, settings.past, settings.offset)
-    direct = (settings.feedthrough,)
+    none = (False,) * y[0].shape[1]
+    direct = [(bool(settings.feedthrough),) * len(none)]
     if settings.feedthrough is None:
-        direct = (False, True) if feedthrough_shows(u, y, pasts[0], settings.offset) else (False,)
+        shows = feedthrough_shows(u, y, pasts[0], settings.offset)
+        direct = [none, shows] if any(shows) else [none]
     structure = Structure(pasts[0], direct[-1], settings.offset, (0,) * u[0].shape[1])
     choice = Choice(structure, settings.order, settings.refinement.replace("none", "subspace"), False, [])
     validated, notes = settings.refinement == "validated", []
@@ -280,16 +284,17 @@ def _chosen(u: Segments, y: Segments, settings: Settings) -> tuple[Choice, list[
         structures = [structure._replace(past=n, feedthrough=d) for n in pasts for d in direct]
         best, table = _best_candidate(u, y, structures, settings)
         choice = Choice(best.structure, best.order, best.fit if validated else choice.fit, False, table)
-    if settings.feedthrough is None:
-        verb = "kept" if choice.structure.feedthrough else "left out"
-        notes.append(f"direct feed-through {verb} as the data prefer")
+    if len(direct) > 1:
+        rows = [j for j, row in enumerate(choice.structure.feedthrough) if row]
+        verb = f"kept in {len(rows)} of {len(none)} outputs" if rows else "left out"
+        notes.append(f"direct feed-through {verb}, as the left-out blocks prefer")
     return choice, notes
 
 
 def _exact_rank(u: Segments, y: Segments, structure: Structure) -> int:
     """The order of a noise-free record: singular values that are more than rounding, at least 1."""
     data = lagged(
-        u, y, structure.past, feedthrough=structure.feedthrough, offset=structure.offset, exact=True
+        u, y, structure.past, feedthrough=any(structure.feedthrough), offset=structure.offset, exact=True
     )
     values = subspace(data, structure.past).singular_values
     return max(int((values > EXACT_RANK * values[0]).sum()), 1)
@@ -316,7 +321,7 @@ def _best_candidate(
     validation = {"blocks": settings.blocks, "max_radius": settings.max_radius}
     table = []
     for structure in structures:
-        data = lagged(u, y, structure.past, feedthrough=structure.feedthrough, offset=structure.offset)
+        data = lagged(u, y, structure.past, feedthrough=any(structure.feedthrough), offset=structure.offset)
         sub = subspace(data, structure.past)
         orders, delays = _candidates(data, sub, structure, settings)
         for d in sorted(delays):
@@ -358,7 +363,7 @@ def _candidates(
     above_noise = int((sub.singular_values > noise_edge(data, structure.past)).sum())
     largest = max(1, min(above_noise, settings.max_order, len(sub.singular_values)))
     furthest = max(data.past // 2, 1)
-    model = realise(data, sub.basis[:largest], 1.0)
+    model = realise(data, sub.basis[:largest], 1.0, structure.feedthrough)
     quiet = np.minimum(tested_dead_times(data, furthest)[0], dead_time(model, furthest, 0.25))
     return range(1, largest + 1), delays | {dead_time(model, furthest), tuple(quiet.tolist())}
 
@@ -370,14 +375,14 @@ def _fit_all(
     structure, order, kind, exact, table = choice
     past, settings = structure.past, FitSettings(structure.feedthrough, structure.offset, max_radius, 30)
     us, ys = shifted(u, y, structure.delays)
-    data = lagged(us, ys, past, feedthrough=structure.feedthrough, offset=structure.offset, exact=exact)
+    data = lagged(us, ys, past, feedthrough=any(structure.feedthrough), offset=structure.offset, exact=exact)
     sub = subspace(data, past)
     if order > len(sub.singular_values):
         raise ValueError(
             f"order {order} needs a longer window: {past} past samples give at most "
             f"{len(sub.singular_values)} states; raise past"
         )
-    start = realise(data, sub.basis[:order], sample_time_s)
+    start = realise(data, sub.basis[:order], sample_time_s, structure.feedthrough)
     plant = with_delays(fit(kind, start, us, ys, settings), structure.delays)
     model = simulation_form(plant, [])
     return Identified(

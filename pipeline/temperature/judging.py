@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.temperature import window as window_route
 from pipeline.temperature.baseline import pairing, pi_law
 from pipeline.temperature.kernel import Kernel, Regression, regress, tuples, value_iteration, window_law
-from pipeline.temperature.plant import Plant
+from pipeline.temperature.plant import Plant, strictly_proper
 from pipeline.temperature.scorecard import (
     Figures,
     Margins,
@@ -32,6 +32,7 @@ from pipeline.temperature.tracking import (
     observer_gain,
     observer_law,
     robust_observer_gain,
+    started_held,
 )
 
 Limits = tuple[np.ndarray, np.ndarray]
@@ -91,8 +92,12 @@ class Judged(NamedTuple):
 
 def model_based(plant: Plant, gamma: float, *, tau: float) -> Controller:
     """Riccati gains of an identified model, and an observer that stands its errors
-    (tracking.robust_observer_gain)."""
-    return _observed("model_based", plant, gamma, robust_observer_gain(plant, tau))
+    (tracking.robust_observer_gain), started from a hold. Feed-through counts as one sample of delay."""
+    plant = strictly_proper(plant)
+    observed = _observed("model_based", plant, gamma, robust_observer_gain(plant, tau))
+    return observed._replace(
+        design=lambda q, r, integral: started_held(observed.design(q, r, integral), plant)
+    )
 
 
 def exact_model(plant: Plant, gamma: float, *, tau: float) -> Controller:
@@ -128,6 +133,7 @@ def kernel(learned: Regression, gamma: float, model: Plant) -> Controller:
 
 def baseline(plant: Plant, limits: Limits, *, horizon: int) -> Controller:
     """PI a zone, tuned by SIMC; the weights mean nothing to it."""
+    plant = strictly_proper(plant)
     law = pi_law(pairing(plant, *limits, horizon=horizon), inputs=plant.m)
     return Controller("baseline", lambda q, r, integral: law, plant, own_feed_forward=False)
 

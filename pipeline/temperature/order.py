@@ -38,11 +38,11 @@ LARGEST_RADIUS = 1.0 - 1e-6
 
 
 class Structure(NamedTuple):
-    """What is fixed before an order is: window (samples), direct feed-through,
+    """What is fixed before an order is: window (samples), which outputs have direct feed-through (p,),
     offset, and the dead time of each input (samples)."""
 
     past: int
-    feedthrough: bool
+    feedthrough: tuple[bool, ...]
     offset: bool
     delays: tuple[int, ...]
 
@@ -102,17 +102,15 @@ def windows(data: Lagged) -> tuple[tuple[int, ...], bool]:
     ), False
 
 
-def feedthrough_shows(u: Segments, y: Segments, past: int, offset: bool) -> bool:
-    """Whether Schwarz's criterion of the one-step predictor falls when u(t) is added to it. So it does too
-    where a controller answers y(t) at once: the blocks decide."""
-    criterion = []
+def feedthrough_shows(u: Segments, y: Segments, past: int, offset: bool) -> tuple[bool, ...]:
+    """For each output (p,), whether Schwarz's criterion of its one-step predictor falls when u(t) is added to
+    it. So it does too where a controller answers y(t) at once: the blocks decide."""
+    power = []
     for feedthrough in (False, True):
         data = lagged(u, y, past, feedthrough=feedthrough, offset=offset)
-        coefficients, errors = one_step(data, past)
-        criterion.append(
-            data.rows * log_det(errors.T @ errors / data.rows) + np.log(data.rows) * coefficients.size
-        )
-    return bool(criterion[1] < criterion[0])
+        power.append(np.sum(one_step(data, past)[1] ** 2, axis=0))
+    gain = data.rows * np.log(np.maximum(power[0], 1e-300) / np.maximum(power[1], 1e-300))
+    return tuple((gain > np.log(data.rows) * data.m).tolist())
 
 
 def log_det(S: np.ndarray) -> float:
@@ -331,13 +329,17 @@ def cross_validate(
     for train_u, train_y, test_u, test_y in folds(u, y, blocks):
         try:
             data = lagged(
-                train_u, train_y, structure.past, feedthrough=structure.feedthrough, offset=structure.offset
+                train_u,
+                train_y,
+                structure.past,
+                feedthrough=any(structure.feedthrough),
+                offset=structure.offset,
             )
         except ValueError:
             return []
         basis = subspace(data, structure.past).basis
         for order in orders:
-            start = realise(data, basis[:order], 1.0)
+            start = realise(data, basis[:order], 1.0, structure.feedthrough)
             for kind in kinds:
                 plant = fit(kind, start, train_u, train_y, settings, gain=False)
                 errors.setdefault((order, kind), []).append(
@@ -345,7 +347,7 @@ def cross_validate(
                 )
     m, p = u[0].shape[1], y[0].shape[1]
     # a dead time must be worth a state
-    more = p * m * structure.feedthrough + p * structure.offset + (m + p) * sum(map(bool, structure.delays))
+    more = m * sum(structure.feedthrough) + p * structure.offset + (m + p) * sum(map(bool, structure.delays))
     return [
         Candidate(order, structure, kind, order * (m + p) + more, float(singular_values[order - 1]), tuple(e))
         for (order, kind), e in errors.items()

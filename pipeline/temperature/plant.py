@@ -208,6 +208,31 @@ def controllability(plant: Plant) -> RankTest:
     )
 
 
+def strictly_proper(plant: Plant) -> Plant:
+    """The plant as a controller meets it: each output is sampled just before the input of its step is
+    applied, so that D u acts on it one sample later, as the state w(t+1) = u(t).
+
+    y(t) = C x(t) + D u(t-1) + d: what the input before left in the output is still there when the next one is
+    computed from it. Only as many states are added as D has rank. A plant without D is returned as it is.
+    """
+    U, sizes, V = np.linalg.svd(plant.D)
+    rank = int((sizes > 1e-12 * max(sizes[0], np.finfo(float).tiny)).sum()) if np.any(plant.D) else 0
+    if rank == 0:
+        return plant
+    n, m, p = plant.n, plant.m, plant.p
+    root = np.sqrt(sizes[:rank])
+    A = np.zeros((n + rank, n + rank))
+    A[:n, :n] = plant.A
+    return plant._replace(
+        A=A,
+        B=np.vstack([plant.B, root[:, None] * V[:rank]]),
+        C=np.hstack([plant.C, U[:, :rank] * root]),
+        D=np.zeros((p, m)),
+        b=np.r_[plant.b, np.zeros(rank)],
+        K=np.vstack([plant.K, np.zeros((rank, p))]),
+    )
+
+
 def hold_state(plant: Plant, x: np.ndarray) -> np.ndarray:
     """The steady input u (m,) of least norm that holds the plant at state x (n,): (I - A) x = B u + b; the
     nearest one where none is exact."""

@@ -214,6 +214,29 @@ def observer_law(plant: Plant, gains: Gains, L: np.ndarray, *, integral: float =
     )
 
 
+def started_held(law: Law, plant: Plant) -> Law:
+    """`observer_law` started at the state that keeps all outputs where they are while u0 goes on, nearest in
+    least squares over as many samples as the plant has states.
+
+    pinv(C) y(0) depends on the coordinates of the model, and leaves what C does not show at zero: in those of a
+    refined model that cost half of J. This estimate is the same in any coordinates.
+    """
+    rows, per_u, rest = [], [], []
+    free, driven, drift = np.eye(plant.n), np.zeros((plant.n, plant.m)), np.zeros(plant.n)
+    for _ in range(plant.n):
+        rows.append(plant.C @ free)
+        per_u.append(plant.C @ driven + plant.D)
+        rest.append(plant.C @ drift + plant.d)
+        free, driven, drift = plant.A @ free, plant.A @ driven + plant.B, plant.A @ drift + plant.b
+    # directions that n samples do not show are left out: noise would decide them
+    inverse = np.linalg.pinv(np.vstack(rows), rcond=1e-8)
+    return law._replace(
+        start_u=-inverse @ np.vstack(per_u),
+        start_y=inverse @ np.tile(np.eye(plant.p), (plant.n, 1)),
+        start=-inverse @ np.concatenate(rest),
+    )
+
+
 class Target(NamedTuple):
     """A steady state x (n,), u (m,) inside the limits with y (p,) as near the reference as the limits allow;
     `miss` (p,) is y - r in °C, `slack` the distance of u from the nearest limit in percent."""
@@ -273,5 +296,5 @@ def _strictly_proper(plant: Plant) -> None:
     if np.any(plant.D):
         raise ValueError(
             "the design expects outputs that do not jump with the input (D = 0) but the model has "
-            "feed-through; identify it with feedthrough: false"
+            "feed-through; design on plant.strictly_proper of it"
         )
