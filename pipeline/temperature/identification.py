@@ -23,12 +23,17 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from pipeline.temperature.closed_loop import ClosedLoop, closed_loop
 from pipeline.temperature.order import (
+    WORK,
+    WORTH_A_STATE,
+    WORTH_AHEAD,
     WORTH_REFINING,
     WORTH_THE_NOISE,
     Candidate,
     Fit,
     Structure,
+    Validation,
     cross_validate,
     dead_time,
     feedthrough_shows,
@@ -37,6 +42,7 @@ from pipeline.temperature.order import (
     noise_edge,
     shifted,
     simplest,
+    slow_window,
     tested_dead_times,
     windows,
     with_delays,
@@ -81,13 +87,15 @@ class Identified(NamedTuple):
     rows: int
     dropped_rows: int
     notes: list[str]
+    feedback: ClosedLoop | None = None
 
 
 class Settings(NamedTuple):
     """What is given and what is chosen. None leaves order, window `past` and feed-through to the data.
 
     `refinement` "prediction" or "simulation" moves the plant to the least errors of that kind. "validated"
-    does so only where the left-out `blocks` prefer it. `max_radius` bounds every pole.
+    does so only where the left-out `blocks` prefer it. `max_radius` bounds every pole. `recordings` labels the
+    segments: of several recordings, whole ones are left out.
     """
 
     order: int | None = None
@@ -98,6 +106,7 @@ class Settings(NamedTuple):
     max_order: int = 12
     max_radius: float | None = None
     blocks: int = 5
+    recordings: tuple[int, ...] = ()
 
 
 DEFAULTS = Settings()
@@ -205,8 +214,9 @@ def identify(
     output, a record too short for the order, and shapes that do not agree.
     """
     record = _prepared(u, y, settings, limits, names)
-    choice, reasons = _chosen(record.u, record.y, settings)
+    choice, reasons, feedback = _chosen(record, settings)
     fitted = _fit_all(record.u, record.y, choice, sample_time_s, settings.max_radius)
+    fitted = fitted._replace(feedback=feedback)
     return _with_remarks(fitted, record._replace(notes=record.notes + reasons), names)
 
 
@@ -233,7 +243,7 @@ def refit(
     exact = data is not None and windows(data)[1]
     choice = Choice(structure, identified.order, identified.fit, exact, table)
     fitted = _fit_all(record.u, record.y, choice, identified.plant.sample_time_s, max_radius)
-    return _with_remarks(fitted, record, names)
+    return _with_remarks(fitted._replace(feedback=identified.feedback), record, names)
 
 
 class _Record(NamedTuple):
@@ -243,6 +253,7 @@ class _Record(NamedTuple):
     y: list[np.ndarray]
     cut: int
     notes: list[str]
+    recordings: tuple[int, ...]
 
 
 def _prepared(u, y, settings: Settings, limits, names) -> _Record:
@@ -251,23 +262,31 @@ def _prepared(u, y, settings: Settings, limits, names) -> _Record:
     _check_shapes(u, y)
     samples = sum(map(len, u))
     u, notes = within_limits(u, limits, names=names) if limits is not None else (u, [])
-    u, y = gapless(u, y)
+    pieces = [gapless([a], [b]) for a, b in zip(u, y, strict=True)]
+    labels = settings.recordings or (0,) * len(u)
+    recordings = tuple(label for label, (a, _) in zip(labels, pieces, strict=True) for _ in a)
+    u, y = [a for piece, _ in pieces for a in piece], [b for _, piece in pieces for b in piece]
     cut = samples - sum(map(len, u))
     _check_length(u, y, settings.order, settings.past)
     check_inputs(u, offset=settings.offset, names=names)
     check_outputs(y)
     if cut:
         notes = [*notes, f"{cut} samples with a masked input, or without any output, were cut out"]
-    return _Record(u, y, cut, notes)
+    return _Record(u, y, cut, notes, recordings)
 
 
-def _chosen(u: Segments, y: Segments, settings: Settings) -> tuple[Choice, list[str]]:
-    """What the rules choose, and a sentence for each choice that a user should know of."""
+def _chosen(record: _Record, settings: Settings) -> tuple[Choice, list[str], ClosedLoop | None]:
+    """What the rules choose, a sentence for each choice that a user should know of, and whether the inputs
+    answer the outputs (None of a noise-free record)."""
+    u, y = record.u, record.y
     pasts, exact = _windows(u, y, settings.order, settings.past, settings.offset)
     none = (False,) * y[0].shape[1]
+    feedback = None if exact else closed_loop(u, y, pasts[0], offset=settings.offset)
+    closed = feedback is not None and feedback.closed
     direct = [(bool(settings.feedthrough),) * len(none)]
     if settings.feedthrough is None:
-        shows = feedthrough_shows(u, y, pasts[0], settings.offset)
+        # under feedback, u(t) holds what noise did to y(t): a row of D would be the controller's inverse
+        shows = none if closed else feedthrough_shows(u, y, pasts[0], settings.offset)
         direct = [none, shows] if any(shows) else [none]
     structure = Structure(pasts[0], direct[-1], settings.offset, (0,) * u[0].shape[1])
     choice = Choice(structure, settings.order, settings.refinement.replace("none", "subspace"), False, [])
@@ -282,13 +301,26 @@ def _chosen(u: Segments, y: Segments, settings: Settings) -> tuple[Choice, list[
         choice = Choice(structure, settings.order or rank, kind, True, [])
     elif settings.order is None or validated:
         structures = [structure._replace(past=n, feedthrough=d) for n in pasts for d in direct]
-        best, table = _best_candidate(u, y, structures, settings)
+        validation = Validation(settings.blocks, record.recordings, closed, settings.max_radius)
+        best, table = _best_candidate(u, y, structures, settings, validation)
         choice = Choice(best.structure, best.order, best.fit if validated else choice.fit, False, table)
+    return choice, notes + _reasons(choice, direct, closed), feedback
+
+
+def _reasons(choice: Choice, direct: list[tuple[bool, ...]], closed: bool) -> list[str]:
+    """A sentence for feed-through and feedback, where the record raises the question."""
+    notes = []
     if len(direct) > 1:
-        rows = [j for j, row in enumerate(choice.structure.feedthrough) if row]
-        verb = f"kept in {len(rows)} of {len(none)} outputs" if rows else "left out"
+        rows = sum(choice.structure.feedthrough)
+        verb = f"kept in {rows} of {len(direct[0])} outputs" if rows else "left out"
         notes.append(f"direct feed-through {verb}, as the left-out blocks prefer")
-    return choice, notes
+    if closed:
+        notes.append(
+            "the record was taken in closed loop (inputs follow past errors of the outputs): candidates are "
+            "judged one step ahead, without feed-through and without fits to simulated outputs, which feedback "
+            "biases; the hold-out fit of a simulation is flattered by feedback too"
+        )
+    return notes
 
 
 def _exact_rank(u: Segments, y: Segments, structure: Structure) -> int:
@@ -314,43 +346,98 @@ def _windows(u, y, order, past, offset) -> tuple[tuple[int, ...], bool]:
 
 
 def _best_candidate(
-    u: Segments, y: Segments, structures: list[Structure], settings: Settings
+    u: Segments, y: Segments, structures: list[Structure], settings: Settings, validation: Validation
 ) -> tuple[Candidate, list[Candidate]]:
-    """The candidate that the rules take, and the table: structures and orders of the
-    subspace fit, then the refined fits of the winner."""
-    validation = {"blocks": settings.blocks, "max_radius": settings.max_radius}
-    table = []
+    """The candidate that the rules take, and the table: structures and orders of the subspace fit, then refined
+    fits of the best candidate of each structure, as many as `WORK` allows."""
+    singular_values, table = {}, []
+    structures = _with_slow_window(u, y, structures, settings)
     for structure in structures:
         data = lagged(u, y, structure.past, feedthrough=any(structure.feedthrough), offset=structure.offset)
         sub = subspace(data, structure.past)
+        singular_values[structure.past, structure.feedthrough] = sub.singular_values
         orders, delays = _candidates(data, sub, structure, settings)
         for d in sorted(delays):
             delayed = structure._replace(delays=d)
             table += cross_validate(
-                u, y, orders, delayed, ("subspace",), singular_values=sub.singular_values, **validation
+                u,
+                y,
+                orders,
+                delayed,
+                ("subspace",),
+                singular_values=sub.singular_values,
+                validation=validation,
             )
+    if not table and validation.recordings:
+        # what is left without one recording is too short: blocks of every recording instead
+        return _best_candidate(u, y, structures, settings, validation._replace(recordings=()))
     if not table:
         raise ValueError(
-            f"the record is too short to choose a model by leaving out one of {settings.blocks} blocks: "
+            f"the record is too short to choose a model by leaving out one of {validation.blocks} blocks: "
             f"{sum(map(len, u))} samples do not carry a window of"
             f" {structures[-1].past} without one; record longer, or give order and past"
         )
-    best = simplest(table)
-    if settings.refinement == "validated":
-        value_of = {row.order: row.singular_value for row in table if row.structure == best.structure}
-        values = np.array([value_of.get(n, np.nan) for n in range(1, best.order + 1)])
-        kinds = ("prediction", "simulation")
+    worth = WORTH_AHEAD if validation.ahead else WORTH_A_STATE
+    if settings.refinement != "validated":
+        return simplest(table, worth), table
+    kinds: tuple[Fit, ...] = ("prediction",) if validation.ahead else ("prediction", "simulation")
+    entrants = []
+    for start in _shortlist(u, table, worth):
+        values = singular_values[start.structure.past, start.structure.feedthrough]
         refined = cross_validate(
-            u, y, [best.order], best.structure, kinds, singular_values=values, **validation
+            u, y, [start.order], start.structure, kinds, singular_values=values, validation=validation
         )
         table += refined
-        challenger = min(
-            refined,
-            key=lambda row: row.error * (1 - WORTH_THE_NOISE) ** (row.fit == "prediction"),
-            default=best,
-        )
-        best = challenger if challenger.error < (1 - WORTH_REFINING) * best.error else best
-    return best, table
+        entrants.append(_better_fit(start, refined))
+    return simplest(entrants, worth), table
+
+
+def _with_slow_window(
+    u: Segments, y: Segments, structures: list[Structure], settings: Settings
+) -> list[Structure]:
+    """The structures, and the longest of them with a window that spans the slowest mode that it shows, where
+    that is longer by half: criteria of one step ahead stop where a slow mode still gains them nothing."""
+    first = max(structures, key=lambda structure: structure.past)
+    if settings.past:
+        return structures
+    data = lagged(u, y, first.past, feedthrough=any(first.feedthrough), offset=first.offset)
+    sub = subspace(data, first.past)
+    determined = max(
+        1, min(int((sub.singular_values > noise_edge(data, first.past)).sum()), settings.max_order)
+    )
+    model = realise(data, sub.basis[:determined], 1.0, first.feedthrough)
+    past = slow_window(model, longest_window(u, y))
+    if past < 1.5 * first.past:
+        return structures
+    longer = {structure.feedthrough: structure._replace(past=past) for structure in structures}
+    return [*longer.values(), *structures]
+
+
+def _shortlist(u: Segments, table: list[Candidate], worth: float) -> list[Candidate]:
+    """The best candidate of each structure, the best first: as many as `WORK` allows, at least one, and none
+    whose error is more than half above the best's."""
+    of: dict[Structure, list[Candidate]] = {}
+    for row in table:
+        of.setdefault(row.structure, []).append(row)
+    first = simplest(table, worth)
+    best = sorted((simplest(rows, worth) for rows in of.values()), key=lambda row: row.error)
+    others = [row for row in best if row != first and row.error < 1.5 * best[0].error]
+    samples, m = sum(map(len, u)), u[0].shape[1]
+    taken, work = [], 0.0
+    for row in [first, *others]:
+        work += samples * (row.order * (row.order + m)) ** 2
+        if taken and work > WORK:
+            break
+        taken.append(row)
+    return taken
+
+
+def _better_fit(start: Candidate, refined: list[Candidate]) -> Candidate:
+    """The subspace candidate, or its best refined fit where that is worth its cost."""
+    challenger = min(
+        refined, key=lambda row: row.error * (1 - WORTH_THE_NOISE) ** (row.fit == "prediction"), default=start
+    )
+    return challenger if challenger.error < (1 - WORTH_REFINING) * start.error else start
 
 
 def _candidates(

@@ -12,10 +12,13 @@ from pipeline.temperature.plant import plant as make_plant
 from pipeline.temperature.refinement import (
     FitSettings,
     drives,
+    estimate_state,
+    filled,
     fit_inputs,
     fitted_state,
     free_response,
     kalman_gain,
+    prediction_form,
     refine,
     respond,
     simulation_form,
@@ -32,6 +35,11 @@ WORTH_REFINING = 0.05
 WORTH_THE_NOISE = 0.2
 # a state that takes less than this share off the error is not worth carrying in a controller
 WORTH_A_STATE = 0.02
+# where one step ahead is judged: the error is noise for the most part, and a state takes off little of it
+WORTH_AHEAD = 0.002
+# a refined fit costs some samples x (states + inputs)^2 an iteration: as many candidates are refined as this
+# allows, at least the best one
+WORK = 3e8
 SMALLEST = 1e-9  # share of an output's variation below which an error is rounding
 # of the plants of a spread, which are simulated for ever: no record shows a time constant of 10^6 samples
 LARGEST_RADIUS = 1.0 - 1e-6
@@ -45,6 +53,17 @@ class Structure(NamedTuple):
     feedthrough: tuple[bool, ...]
     offset: bool
     delays: tuple[int, ...]
+
+
+class Validation(NamedTuple):
+    """How candidates are judged: `blocks` left out in turn, or whole recordings where `recordings` labels the
+    segments with more than one; on simulated outputs, or one step `ahead`, which feedback does not bias.
+    `max_radius` bounds their poles."""
+
+    blocks: int = 5
+    recordings: tuple[int, ...] = ()
+    ahead: bool = False
+    max_radius: float | None = None
 
 
 class Candidate(NamedTuple):
@@ -247,14 +266,27 @@ def simulation_errors(plant: Plant, u: Segments, y: Segments) -> np.ndarray:
     return np.nan_to_num(np.array(shares), nan=1.0)
 
 
-def folds(u: Segments, y: Segments, count: int) -> list[tuple[list, list, list, list]]:
+def folds(
+    u: Segments, y: Segments, count: int, recordings: tuple[int, ...] = ()
+) -> list[tuple[list, list, list, list]]:
     """(u, y, u left out, y left out) with one of `count` blocks of each segment left out in turn; what
     remains on either side are segments of their own.
 
     Of several segments, those too short to be cut into blocks of 10 samples
-    are left out whole, every count-th of them in turn.
+    are left out whole, every count-th of them in turn. Of several `recordings` (a label for each
+    segment) one is left out at a time, or every count-th of more than `count`.
     """
-    out = []
+    out, labels = [], sorted(set(recordings))
+    if len(labels) > 1:
+        for k in range(min(count, len(labels))):
+            left_out = [label in labels[k::count] for label in recordings]
+            test, train = (
+                [[part[s] for s, out_now in enumerate(left_out) if out_now == wanted] for part in (u, y)]
+                for wanted in (True, False)
+            )
+            if train[0] and any(np.isfinite(b).any() for b in test[1]):
+                out.append((*train, *test))
+        return out
     for k in range(count):
         fold = ([], [], [], [])
         for s, (a, b) in enumerate(zip(u, y, strict=True)):
@@ -268,6 +300,20 @@ def folds(u: Segments, y: Segments, count: int) -> list[tuple[list, list, list, 
         if fold[0] and fold[2] and any(np.isfinite(b).any() for b in fold[3]):
             out.append(fold)
     return out
+
+
+def prediction_errors(plant: Plant, u: Segments, y: Segments) -> np.ndarray:
+    """For each segment and output, the size of the one-step error as a share of the output's variation, at
+    most 1; shape (segments, p). The initial state is fitted to the segment."""
+    model, shares = prediction_form(plant, []), []
+    for a, b in zip(u, y, strict=True):
+        v = drives("prediction", a, filled(plant, a, b, np.zeros(plant.n)))
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = b - respond(model, v, estimate_state(model, v, b))[1]
+        spread = np.maximum(np.nanstd(b, axis=0), np.finfo(float).tiny)
+        with np.errstate(over="ignore", invalid="ignore"):
+            shares.append(np.minimum(np.sqrt(np.nanmean(error**2, axis=0)) / spread, 1.0))
+    return np.nan_to_num(np.array(shares), nan=1.0)
 
 
 def largest_radius(u: Segments) -> float:
@@ -309,24 +355,17 @@ def fit(
 
 
 def cross_validate(
-    u,
-    y,
-    orders,
-    structure: Structure,
-    kinds: tuple[Fit, ...],
-    *,
-    blocks: int,
-    singular_values,
-    max_radius: float | None = None,
+    u, y, orders, structure: Structure, kinds: tuple[Fit, ...], *, singular_values, validation: Validation
 ) -> list[Candidate]:
-    """The order table's rows for one structure: each order and fit, identified without a block and simulated
-    on it, for each of `blocks` blocks.
+    """The order table's rows for one structure: each order and fit, identified without a block and judged
+    on it, for each block or recording.
 
     A structure whose window does not fit into what remains of the record has no rows.
     """
     u, y = shifted(u, y, structure.delays)
-    settings, errors = FitSettings(structure.feedthrough, structure.offset, max_radius, 8), {}
-    for train_u, train_y, test_u, test_y in folds(u, y, blocks):
+    settings, errors = FitSettings(structure.feedthrough, structure.offset, validation.max_radius, 8), {}
+    judged = prediction_errors if validation.ahead else simulation_errors
+    for train_u, train_y, test_u, test_y in folds(u, y, validation.blocks, validation.recordings):
         try:
             data = lagged(
                 train_u,
@@ -343,7 +382,7 @@ def cross_validate(
             for kind in kinds:
                 plant = fit(kind, start, train_u, train_y, settings, gain=False)
                 errors.setdefault((order, kind), []).append(
-                    max(float(simulation_errors(plant, test_u, test_y).mean()), SMALLEST)
+                    max(float(judged(plant, test_u, test_y).mean()), SMALLEST)
                 )
     m, p = u[0].shape[1], y[0].shape[1]
     # a dead time must be worth a state
@@ -354,8 +393,15 @@ def cross_validate(
     ]
 
 
-def simplest(table: list[Candidate]) -> Candidate:
-    """The row with the fewest parameters whose error is within 2 % of the best row's.
+def slow_window(plant: Plant, longest: int) -> int:
+    """The window that spans the time constant of a plant's slowest mode that decays, at most `longest`."""
+    radii = np.abs(np.linalg.eigvals(plant.A))
+    slowest = max(radii[radii < 1 - 1e-6], default=0.0)
+    return int(min(np.ceil(-1.0 / np.log(max(slowest, 1e-3))), longest))
+
+
+def simplest(table: list[Candidate], worth: float = WORTH_A_STATE) -> Candidate:
+    """The row with the fewest parameters whose error is within `worth` of the best row's.
 
     Not within one standard error: five blocks of which one holds a disturbance have so wide a one that models
     much too small pass, and these cost more on new data than models somewhat too large (measured on the
@@ -363,6 +409,5 @@ def simplest(table: list[Candidate]) -> Candidate:
     """
     best = min(row.error for row in table)
     return min(
-        (row for row in table if row.error <= (1 + WORTH_A_STATE) * best),
-        key=lambda row: (row.parameters, row.error),
+        (row for row in table if row.error <= (1 + worth) * best), key=lambda row: (row.parameters, row.error)
     )
