@@ -41,9 +41,15 @@ class Machine(NamedTuple):
         """A, B, C of [blocks; sensors] about the room's temperature, without the dead time."""
         p = self.zones
         neighbours = np.eye(p, k=1) + np.eye(p, k=-1)
-        blocks = np.eye(p) - np.diag(self.loss) + self.exchange * (neighbours - np.diag(neighbours.sum(axis=1)))
+        blocks = (
+            np.eye(p) - np.diag(self.loss) + self.exchange * (neighbours - np.diag(neighbours.sum(axis=1)))
+        )
         A = np.block([[blocks, np.zeros((p, p))], [self.lag * np.eye(p), (1 - self.lag) * np.eye(p)]])
-        return A, np.vstack([np.diag(self.heating), np.zeros((p, p))]), np.hstack([np.zeros((p, p)), np.eye(p)])
+        return (
+            A,
+            np.vstack([np.diag(self.heating), np.zeros((p, p))]),
+            np.hstack([np.zeros((p, p)), np.eye(p)]),
+        )
 
     def gain(self) -> np.ndarray:
         """Steady gains (p, p) in °C per percent."""

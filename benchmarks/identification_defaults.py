@@ -102,7 +102,9 @@ def centred(peer: Callable, u: np.ndarray, y: np.ndarray) -> Plant:
 
 def play(name: str, u: np.ndarray, y: np.ndarray, cut: int) -> dict:
     """One record: ours and each peer, [means removed, as it is] in percent, with times in CPU seconds."""
-    settings = choices(params.load(IdentifyPlant, "identify_plant"))._replace(feedthrough=None, refinement="validated")
+    settings = choices(params.load(IdentifyPlant, "identify_plant"))._replace(
+        feedthrough=None, refinement="validated"
+    )
     ours, seconds = timed(identify, [u[:cut]], [y[:cut]], sample_time_s=1.0, settings=settings)
     row = {
         "samples": len(u),

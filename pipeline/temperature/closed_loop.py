@@ -27,17 +27,19 @@ class _Answers(NamedTuple):
     errors_now: np.ndarray
 
 
-def closed_loop(u: Segments, y: Segments, past: int, *, offset: bool = True, lags: int = 5) -> ClosedLoop:
+def closed_loop(
+    u: Segments, y: Segments, past: int, *, offset: bool = True, lags: int = 5, inputs: int | None = None
+) -> ClosedLoop:
     """Whether inputs follow innovations (Granger 1969): what the past of u does not foretell of u(t) is regressed
     on one-step errors of VARX models, which are consistent with and without feedback.
 
     Errors before t speak of feedback alone. The error at t correlates with u(t) under feed-through too, and then
     by as much where an input jumps: a jump of a set-point moves u, and y only later. Of inputs set by a plan the
     statistics are chi-squared, whatever the plan, as errors are white. Jumps are clipped: they would drown the
-    small answers to noise, by which feedback is recognised.
+    small answers to noise, by which feedback is recognised. Only the first `inputs` columns are tested.
     """
     answers = _answers(u, y, past, offset=offset, lags=lags)
-    m = u[0].shape[1]
+    m = inputs or u[0].shape[1]
     p_value = np.ones(m)
     if answers is None:
         return ClosedLoop(p_value, False)

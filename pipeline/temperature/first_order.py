@@ -25,6 +25,39 @@ class FirstOrder(NamedTuple):
     deviations: tuple[float, float, float]
 
 
+class Pid(NamedTuple):
+    """u = Kp e + Ki integral of e + Kd de/dt: Kp in units of u by units of y, Ki by second, Kd seconds."""
+
+    Kp: float
+    Ki: float
+    Kd: float
+
+
+def simc_pid(gain: float, time_constant_s: float, delay_s: float, *, sample_time_s: float) -> Pid:
+    """PID of a first-order model with delay, SIMC with a third of the delay as derivative time (Grimholt and
+    Skogestad 2018, iSIMC), series form rewritten as parallel:
+
+    K_c = tau / (K (tau_c + theta)), tau_I = min(tau, 4 (tau_c + theta)), tau_D = theta / 3, tau_c = theta. The
+    delay counts half a sample more, by which a held input is late, and as no less than one sample.
+    """
+    theta = max(delay_s + sample_time_s / 2, sample_time_s)
+    tau = max(time_constant_s, sample_time_s)
+    K_c, tau_I, tau_D = tau / (gain * 2 * theta), min(tau, 8 * theta), theta / 3
+    return Pid(K_c * (1 + tau_D / tau_I), K_c / tau_I, K_c * tau_D)
+
+
+def step_fit_percent(
+    responses: np.ndarray, gain: np.ndarray, time_constant: np.ndarray, delay: np.ndarray
+) -> np.ndarray:
+    """NRMSE (p, m) in percent of gain (1 - exp(-(t - delay) / time_constant)) beside step responses (T, p, m);
+    times in samples."""
+    t = np.arange(len(responses))[:, None, None] - delay
+    model = gain * (1.0 - np.exp(-np.maximum(t, 0.0) / np.maximum(time_constant, 1e-9)))
+    spread = np.linalg.norm(responses - responses.mean(axis=0), axis=0)
+    error = np.linalg.norm(responses - model, axis=0)
+    return 100.0 * (1.0 - error / np.maximum(spread, np.finfo(float).tiny))
+
+
 class StepFit(NamedTuple):
     """The model of one step of the input: the sample at which it came,
     its size in units of u (negative is downward)."""

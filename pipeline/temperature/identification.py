@@ -95,7 +95,8 @@ class Settings(NamedTuple):
 
     `refinement` "prediction" or "simulation" moves the plant to the least errors of that kind. "validated"
     does so only where the left-out `blocks` prefer it. `max_radius` bounds every pole. `recordings` labels the
-    segments: of several recordings, whole ones are left out.
+    segments: of several recordings, whole ones are left out. The first `inputs` columns of u are moved by
+    people or controllers, all where None; the others are measured disturbances.
     """
 
     order: int | None = None
@@ -107,6 +108,7 @@ class Settings(NamedTuple):
     max_radius: float | None = None
     blocks: int = 5
     recordings: tuple[int, ...] = ()
+    inputs: int | None = None
 
 
 DEFAULTS = Settings()
@@ -281,7 +283,7 @@ def _chosen(record: _Record, settings: Settings) -> tuple[Choice, list[str], Clo
     u, y = record.u, record.y
     pasts, exact = _windows(u, y, settings.order, settings.past, settings.offset)
     none = (False,) * y[0].shape[1]
-    feedback = None if exact else closed_loop(u, y, pasts[0], offset=settings.offset)
+    feedback = None if exact else closed_loop(u, y, pasts[0], offset=settings.offset, inputs=settings.inputs)
     closed = feedback is not None and feedback.closed
     direct = [(bool(settings.feedthrough),) * len(none)]
     if settings.feedthrough is None:

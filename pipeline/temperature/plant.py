@@ -141,11 +141,12 @@ def simulate(plant: Plant, u: np.ndarray, x0: np.ndarray) -> tuple[np.ndarray, n
 
 def markov_parameters(plant: Plant, lags: int) -> np.ndarray:
     """h (lags, p, m) with h[k-1] = C A^(k-1) B, the response of y at lag k to a unit pulse of u."""
-    h, column = np.empty((lags, plant.p, plant.m)), plant.B
-    for k in range(lags):
-        h[k] = plant.C @ column
-        column = plant.A @ column
-    return h
+    # columns A^k B in blocks that double: two products where there were `lags`
+    columns, power = plant.B, plant.A
+    while columns.shape[1] < lags * plant.m:
+        columns, power = np.hstack([columns, power @ columns]), power @ power
+    h = (plant.C @ columns[:, : lags * plant.m]).reshape(plant.p, lags, plant.m)
+    return h.transpose(1, 0, 2)
 
 
 def clip_spectral_radius(A: np.ndarray, radius: float) -> np.ndarray:
@@ -230,6 +231,17 @@ def strictly_proper(plant: Plant) -> Plant:
         D=np.zeros((p, m)),
         b=np.r_[plant.b, np.zeros(rank)],
         K=np.vstack([plant.K, np.zeros((rank, p))]),
+    )
+
+
+def at_disturbances(plant: Plant, inputs: int, level: np.ndarray) -> Plant:
+    """The plant of the first `inputs` columns of u, the others held at `level`: what a controller meets that is
+    not told the disturbances."""
+    return plant._replace(
+        B=plant.B[:, :inputs],
+        D=plant.D[:, :inputs],
+        b=plant.b + plant.B[:, inputs:] @ level,
+        d=plant.d + plant.D[:, inputs:] @ level,
     )
 
 
