@@ -26,8 +26,6 @@ import numpy as np
 from pipeline.temperature.closed_loop import ClosedLoop, closed_loop
 from pipeline.temperature.order import (
     WORK,
-    WORTH_A_STATE,
-    WORTH_AHEAD,
     WORTH_REFINING,
     WORTH_THE_NOISE,
     Candidate,
@@ -319,8 +317,8 @@ def _reasons(choice: Choice, direct: list[tuple[bool, ...]], closed: bool) -> li
     if closed:
         notes.append(
             "the record was taken in closed loop (inputs follow past errors of the outputs): candidates are "
-            "judged one step ahead, without feed-through and without fits to simulated outputs, which feedback "
-            "biases; the hold-out fit of a simulation is flattered by feedback too"
+            "judged one step ahead too, without feed-through and without fits to simulated outputs, which "
+            "feedback biases; it flatters the hold-out fit of a simulation as well"
         )
     return notes
 
@@ -379,19 +377,19 @@ def _best_candidate(
             f"{sum(map(len, u))} samples do not carry a window of"
             f" {structures[-1].past} without one; record longer, or give order and past"
         )
-    worth = WORTH_AHEAD if validation.ahead else WORTH_A_STATE
     if settings.refinement != "validated":
-        return simplest(table, worth), table
-    kinds: tuple[Fit, ...] = ("prediction",) if validation.ahead else ("prediction", "simulation")
+        return simplest(table), table
+    # a fit to simulated outputs takes what feedback put into u for an effect of u
+    kinds: tuple[Fit, ...] = ("prediction",) if validation.closed else ("prediction", "simulation")
     entrants = []
-    for start in _shortlist(u, table, worth):
+    for start in _shortlist(u, table):
         values = singular_values[start.structure.past, start.structure.feedthrough]
         refined = cross_validate(
             u, y, [start.order], start.structure, kinds, singular_values=values, validation=validation
         )
         table += refined
         entrants.append(_better_fit(start, refined))
-    return simplest(entrants, worth), table
+    return simplest(entrants), table
 
 
 def _with_slow_window(
@@ -415,14 +413,14 @@ def _with_slow_window(
     return [*longer.values(), *structures]
 
 
-def _shortlist(u: Segments, table: list[Candidate], worth: float) -> list[Candidate]:
+def _shortlist(u: Segments, table: list[Candidate]) -> list[Candidate]:
     """The best candidate of each structure, the best first: as many as `WORK` allows, at least one, and none
     whose error is more than half above the best's."""
     of: dict[Structure, list[Candidate]] = {}
     for row in table:
         of.setdefault(row.structure, []).append(row)
-    first = simplest(table, worth)
-    best = sorted((simplest(rows, worth) for rows in of.values()), key=lambda row: row.error)
+    first = simplest(table)
+    best = sorted((simplest(rows) for rows in of.values()), key=lambda row: row.error)
     others = [row for row in best if row != first and row.error < 1.5 * best[0].error]
     samples, m = sum(map(len, u)), u[0].shape[1]
     taken, work = [], 0.0

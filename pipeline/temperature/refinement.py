@@ -176,10 +176,14 @@ def _normal_equations(
     state, output = n * (n + r), n + h
     size = state + p * output + n * len(v_all)
     JJ, Je = np.zeros((size, size)), np.zeros(size)
-    mixing = [
-        scipy.linalg.block_diag(np.kron(M, np.eye(n + r)), np.eye(output), M)
-        for M in (_mixing(c, blocks) for c in model.C)
-    ]
+    mixing = [_mixing(c, blocks) for c in model.C]
+
+    def mixed(M, rows):  # block_diag(kron(M, I), I, M) @ rows, without the zeros
+        first, last = (M @ part.reshape(n, -1) for part in (rows[:state], rows[-n:]))
+        return np.concatenate(
+            [first.reshape(state, *rows.shape[1:]), rows[state:-n], last.reshape(n, *rows.shape[1:])]
+        )
+
     for segment, (v, y) in enumerate(zip(v_all, y_all, strict=True)):
         x, predicted = respond(model, v, model.x0[segment])
         pulse = np.zeros((len(v), 1))
@@ -201,8 +205,8 @@ def _normal_equations(
                 ZZ = Z_measured.T @ Z_measured
             M = mixing[o]
             at = np.r_[0:state, state + o * output : state + (o + 1) * output, first : first + n]
-            JJ[np.ix_(at, at)] += M @ ZZ @ M.T
-            Je[at] += M @ (Z_measured.T @ e[mask, o])
+            JJ[np.ix_(at, at)] += mixed(M, mixed(M, ZZ).T)
+            Je[at] += mixed(M, Z_measured.T @ e[mask, o])
     for o in range(p):
         fixed = state + o * output + n + np.flatnonzero(~free[o, columns])
         JJ[fixed], JJ[:, fixed], Je[fixed] = 0.0, 0.0, 0.0

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.optimize
 
-from pipeline.temperature.first_order import simc_pid, step_fit_percent
+from pipeline.temperature.first_order import StepModels, of_step_responses, simc_pid
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.subspace import Segments
 from pipeline.temperature.validation import (
@@ -44,7 +44,7 @@ class Steps(NamedTuple):
     """Responses to unit steps, beside their bands over a family of
     plants: response, low, high (K, p, m) at samples (K,).
 
-    first_order_fit (p, m), in percent: how far a first-order model of these figures is the response.
+    first_order: models of the plant's responses and the family's, (1 + family, p, m).
     gain, peak, time_constant, delay (3, p, m): value and the ends of its band. gain is the last value, peak
     the largest excursion; times are in samples, NaN where `significant` (p, m) is False: the band of the peak
     holds zero, so that not even the sign of the effect is known.
@@ -59,7 +59,7 @@ class Steps(NamedTuple):
     time_constant: np.ndarray
     delay: np.ndarray
     significant: np.ndarray
-    first_order_fit: np.ndarray
+    first_order: StepModels
 
 
 class ForbiddenGain(NamedTuple):
@@ -185,13 +185,15 @@ def steps(nominal: Plant, family: Sequence[Plant], longest: int, *, points: int 
         np.concatenate([np.take_along_axis(part, at, axis=0) for part in bands[:3]]),
     )
     significant = peak[1] * peak[2] > 0
-    # (1 + family, 2, p, m)
-    shapes = np.stack([two_points(step_response(plant, samples + 1)) for plant in (nominal, *family)])
+    responses = [step_response(plant, samples + 1) for plant in (nominal, *family)]
+    shapes = np.stack([two_points(part) for part in responses])  # (1 + family, 2, p, m)
     times = np.where(significant, np.concatenate([shapes[:1], np.quantile(shapes[1:], ENDS, axis=0)]), np.nan)
     grid = np.arange(0, samples + 1, -(-samples // points))
     response, low, high = (part[grid] for part in bands[:3])
-    fit = step_fit_percent(bands.nominal, gain[0], shapes[0, 0], shapes[0, 1])
-    return Steps(grid, response, low, high, gain, peak, times[:, 0], times[:, 1], significant, fit)
+    # equal ratios: what a controller meets first counts as much as what a drift does in the end
+    ratios = np.unique(np.geomspace(1, samples, points).round().astype(int))
+    models = of_step_responses(ratios, np.stack([part[ratios] for part in responses], axis=1))
+    return Steps(grid, response, low, high, gain, peak, times[:, 0], times[:, 1], significant, models)
 
 
 # no heated part outlives it: an input whose whole range moves an output by more was not identified
@@ -316,18 +318,25 @@ def dynamics_rows(
 def first_order_rows(
     steps: Steps, outputs: Sequence[str], inputs: Sequence[str], sample_time_s: float
 ) -> dict[str, np.ndarray | list]:
-    """A first-order model with delay for every pair, in the order of `step_rows`, with bands, and the PID that
-    SIMC makes of it; missing where not even the sign is known."""
-    columns = dynamics_rows(steps, outputs, inputs, sample_time_s)
-    columns = {name: part for name, part in columns.items() if not name.startswith("peak")}
-    seen = np.array(columns["seen"], bool)
-    columns["fit_percent"] = np.where(seen, steps.first_order_fit.ravel(), np.nan)
-    figures = [columns[name] for name in ("gain", "time_constant_s", "delay_s")]
-    pids = [
-        simc_pid(gain, tau, delay, sample_time_s=sample_time_s) if known and gain else (np.nan,) * 3
-        for known, gain, tau, delay in zip(seen, *figures, strict=True)
+    """A first-order model with delay for every pair, in the order of `step_rows`, with bands over the family,
+    and the PID that SIMC makes of it; missing where not even the sign of its gain is known."""
+    models, columns = steps.first_order, {"output": [o for o in outputs for _ in inputs]}
+    columns |= {"input": [*inputs] * len(outputs)}
+    banded = [
+        np.concatenate([part[:1], np.quantile(part[1:], ENDS, axis=0)]).reshape(3, -1)
+        for part in (models.gain, sample_time_s * models.time_constant, sample_time_s * models.delay)
     ]
-    return columns | dict(zip(("Kp", "Ki", "Kd"), np.array(pids).T, strict=True))
+    seen = (banded[0][1] * banded[0][2] > 0) & (banded[0][0] * banded[0][1] > 0)
+    columns["seen"] = seen.tolist()
+    for name, part in zip(("gain", "time_constant_s", "delay_s"), banded, strict=True):
+        shown = part if name == "gain" else np.where(seen, part, np.nan)
+        columns |= {name: shown[0], f"{name}_low": shown[1], f"{name}_high": shown[2]}
+    columns["fit_percent"] = np.where(seen, models.fit_percent[0].ravel(), np.nan)
+    pids = [
+        simc_pid(gain, tau, delay, sample_time_s=sample_time_s) if known else (np.nan,) * 3
+        for known, gain, tau, delay in zip(seen, *(part[0] for part in banded), strict=True)
+    ]
+    return columns | dict(zip(("Kp", "Ki", "Kd"), np.array(pids, float).T, strict=True))
 
 
 def pole_rows(nominal: Plant, family: Sequence[Plant]) -> dict[str, np.ndarray]:
