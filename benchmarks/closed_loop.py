@@ -1,8 +1,8 @@
-"""Twenty heated machines of random size and speed under PI, under a printer firmware's PID and under a small MPC,
-and with their inputs set by a plan: is feedback recognised, and what becomes of the gains?
+"""Twenty heated machines of random size and speed under PI, under a printer firmware's PID and under a small
+MPC, and with their inputs set by a plan: is feedback recognised, and what becomes of the gains?
 
-`./run python -m benchmarks.closed_loop` prints the table and writes benchmarks/results/closed_loop.json; a number
-behind it plays only so many machines. The truth is known: every heater warms every zone.
+`./run python -m benchmarks.closed_loop` prints the table and writes benchmarks/results/closed_loop.json; a
+number behind it plays only so many machines. The truth is known: every heater warms every zone.
 """
 
 import json
@@ -15,14 +15,18 @@ import numpy as np
 import scipy.optimize
 
 from benchmarks.foreign_records import levels, quantised
+from pipeline.temperature.identification import Settings, identify
+from pipeline.temperature.trust import forbidden_gains, steps
+from pipeline.temperature.validation import bootstrap_spread
 
 RESULTS = Path(__file__).parent / "results" / "closed_loop.json"
 MACHINES, SAMPLES, ROOM = 20, 2400, 22.0
 
 
 class Machine(NamedTuple):
-    """Zones with a block and a sensor each, sampled once a second: heating in °C per percent and second, loss and
-    exchange with the neighbours a second, sensor lag, dead time in samples, noise and step of the converter."""
+    """Zones with a block and a sensor each, sampled once a second: heating in °C per percent and second, loss
+    and exchange with the neighbours a second, sensor lag, dead time in samples, noise and step of the
+    converter."""
 
     heating: np.ndarray
     loss: np.ndarray
@@ -90,8 +94,9 @@ class Pi:
 
 
 class Pid(Pi):
-    """The law of Klipper's ControlPID (heaters.py): derivative of the measured value smoothed over a second, the
-    integral bounded and kept where the output is; a change below 5 % waits for up to 5 s, as its set_pwm does."""
+    """The law of Klipper's ControlPID (heaters.py): derivative of the measured value smoothed over a second,
+    the integral bounded and kept where the output is; a change below 5 % waits for up to 5 s, as its set_pwm
+    does."""
 
     def __init__(self, plant: Machine):
         super().__init__(plant)
@@ -111,8 +116,8 @@ class Pid(Pi):
 
 
 class Mpc:
-    """Least squares over 30 s with one input held, limits as bounds, on a model with 20 % too little heat, and an
-    observer with one output disturbance a zone."""
+    """Least squares over 30 s with one input held, limits as bounds, on a model with 20 % too little heat,
+    and an observer with one output disturbance a zone."""
 
     def __init__(self, plant: Machine):
         self.A, self.B, self.C = plant.dynamics()
@@ -166,3 +171,44 @@ def record(rng: np.random.Generator, plant: Machine, how: str) -> tuple[np.ndarr
         u[t] = law(y[t], r[t]) if law else plan[t]
         x = A @ x + B @ u[max(t - plant.delay, 0)]
     return u, y
+
+
+def judged(i: int, how: str) -> dict:
+    """One machine once: whether feedback was recognised, and how many of its gains, all positive in truth,
+    came out negative and were flagged, or positive and were flagged all the same."""
+    rng = np.random.default_rng([i, 7])
+    plant = machine(rng)
+    u, y = record(rng, plant, how)
+    fitted = identify([u], [y], sample_time_s=1.0, settings=Settings(refinement="validated"))
+    family = bootstrap_spread([u], [y], fitted, count=20, order=fitted.order + 1, rng=rng)
+    p = plant.zones
+    shown = steps(fitted.plant, family, len(u))
+    names = [str(k) for k in range(p)]
+    flagged = {(g.output, g.input) for g in forbidden_gains(shown, names, names, [True] * p, [100.0] * p)}
+    wrong = {(str(o), str(j)) for o in range(p) for j in range(p) if shown.gain[0, o, j] < 0}
+    error = np.abs(np.diag(shown.gain[0]) / np.diag(plant.gain()) - 1)
+    return {
+        "closed": bool(fitted.feedback.closed) if fitted.feedback else False,
+        "wrong": len(wrong),
+        "wrong_flagged": len(wrong & flagged),
+        "right": p * p - len(wrong),
+        "right_flagged": len(flagged - wrong),
+        "gain_error_percent": round(100 * float(error.max()), 1),
+    }
+
+
+def main() -> None:
+    count = int(sys.argv[1]) if len(sys.argv) > 1 else MACHINES
+    result = {}
+    for how in (*CONTROLLERS, *PLANS):
+        rows = [judged(i, how) for i in range(count)]
+        total = {name: sum(row[name] for row in rows) for name in rows[0] if name != "gain_error_percent"}
+        median = float(np.median([row["gain_error_percent"] for row in rows]))
+        result[how] = total | {"machines": count, "median_gain_error_percent": median}
+        print(how, result[how], flush=True)
+    if count == MACHINES:
+        RESULTS.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -286,8 +286,8 @@ def staircase(rng):
 
 
 def winding(rng):
-    """Tension of a web between two reels: what the drives are given acts within the sample, and a slow mode of
-    the reels' radii behind it, 2,500 samples of 0.1 s."""
+    """Tension of a web between two reels: what the drives are given acts within the sample, and a slow mode
+    of the reels' radii behind it, 2,500 samples of 0.1 s."""
     T = 2500
     u = levels(rng, T, 3, 25, -1, 1) + 0.05 * rng.standard_normal((T, 3))
     x, y = np.zeros(3), np.empty((T, 2))
@@ -303,8 +303,8 @@ def winding(rng):
 
 
 def tube_exchanger(rng):
-    """Outlet temperatures of both sides of a tube exchanger: half of each inlet's step passes within a sample,
-    the rest through its wall, 1,500 samples."""
+    """Outlet temperatures of both sides of a tube exchanger: half of each inlet's step passes within a
+    sample, the rest through its wall, 1,500 samples."""
     T, wall_degC, y = 1500, 50.0, np.empty((1500, 2))
     u = np.column_stack([80 + levels(rng, T, 1, 40, -8, 8)[:, 0], 20 + levels(rng, T, 1, 55, -5, 5)[:, 0]])
     for t in range(T):
@@ -351,7 +351,8 @@ def _in_room(rng, *, recorded: bool):
 
 
 def another_day(rng):
-    """Two heaters; the room's temperature is recorded as third input, and the last 30 % is a day 9 °C warmer."""
+    """Two heaters; the room's temperature is recorded as third input, and the last 30 % is a day 9 °C
+    warmer."""
     return _in_room(rng, recorded=True)
 
 

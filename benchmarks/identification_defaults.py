@@ -1,10 +1,11 @@
-"""Every record with the stage's own settings, beside what its user would have got from another tool's defaults.
+"""Every record with the stage's own settings, beside what its user would have got from another tool's
+defaults.
 
-`UV_PROJECT_ENVIRONMENT=... ./run --group peers python -m benchmarks.identification_defaults` prints the table and
-writes benchmarks/results/identification_defaults.json; names behind it play only these records. One split a
-record, one score: the fit of free simulation on the hold-out, mean over the outputs in percent, with and
-without the mean of the error. Peers get data without their means, as their manuals ask. The bars: the best peer
-less `BEHIND_PEER` points, and published minima with `BEHIND_PUBLISHED` points more error.
+`UV_PROJECT_ENVIRONMENT=... ./run --group peers python -m benchmarks.identification_defaults` prints the table
+and writes benchmarks/results/identification_defaults.json; names behind it play only these records. One split
+a record, one score: the fit of free simulation on the hold-out, mean over the outputs in percent, with and
+without the mean of the error. Peers get data without their means, as their manuals ask. The bars: the best
+peer less `BEHIND_PEER` points, and published minima with `BEHIND_PUBLISHED` points more error.
 """
 
 import contextlib
@@ -39,7 +40,8 @@ from pipeline.temperature.workflow.settings import IdentifyPlant
 RESULTS = Path(__file__).parent / "results" / "identification_defaults.json"
 SEED = 20  # of the records of our own making
 BEHIND_PEER, BEHIND_PUBLISHED = 1.0, 3.0
-# SLICOT WN 1998-6, tables 3 and 4: least simulation error in percent of |y| on the hold-out, over methods and orders
+# SLICOT WN 1998-6, tables 3 and 4: least simulation error in percent of |y| on the hold-out, over methods and
+# orders
 PUBLISHED = {"dryer": 7.51, "glass_furnace": 38.1, "evaporator": 37.4}
 # records too long for nfoursid's dense projections, and the reason why none of theirs is missing elsewhere
 LONGEST_FOR_NFOURSID = 7000

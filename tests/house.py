@@ -472,7 +472,12 @@ def unbounded(kind: Any, place: str, limits: tuple = ()) -> list[str]:
         return unbounded(kind, place, limits)
     if isinstance(kind, type) and issubclass(kind, params.Section):
         fields = kind.model_fields.items()
-        defaults = [f"{place}.{name} has a default" for name, field in fields if not field.is_required()]
+        # left out is not there: an empty list and false are no values
+        defaults = [
+            f"{place}.{name} has a default"
+            for name, field in fields
+            if not field.is_required() and field.default not in ([], False)
+        ]
         return defaults + [
             item
             for name, field in fields

@@ -11,8 +11,8 @@ LEVEL_CLOSED = 0.001  # of the test for feedback: far below 5 %, as records are 
 
 
 class ClosedLoop(NamedTuple):
-    """Whether the inputs answer what the outputs did: p_value (m,) of each input, and `closed` where one of them
-    is below `LEVEL_CLOSED` shared among the inputs."""
+    """Whether the inputs answer what the outputs did: p_value (m,) of each input, and `closed` where one of
+    them is below `LEVEL_CLOSED` shared among the inputs."""
 
     p_value: np.ndarray
     closed: bool
@@ -30,13 +30,14 @@ class _Answers(NamedTuple):
 def closed_loop(
     u: Segments, y: Segments, past: int, *, offset: bool = True, lags: int = 5, inputs: int | None = None
 ) -> ClosedLoop:
-    """Whether inputs follow innovations (Granger 1969): what the past of u does not foretell of u(t) is regressed
-    on one-step errors of VARX models, which are consistent with and without feedback.
+    """Whether inputs follow innovations (Granger 1969): what the past of u does not foretell of u(t) is
+    regressed on one-step errors of VARX models, which are consistent with and without feedback.
 
-    Errors before t speak of feedback alone. The error at t correlates with u(t) under feed-through too, and then
-    by as much where an input jumps: a jump of a set-point moves u, and y only later. Of inputs set by a plan the
-    statistics are chi-squared, whatever the plan, as errors are white. Jumps are clipped: they would drown the
-    small answers to noise, by which feedback is recognised. Only the first `inputs` columns are tested.
+    Errors before t speak of feedback alone. The error at t correlates with u(t) under feed-through too, and
+    then by as much where an input jumps: a jump of a set-point moves u, and y only later. Of inputs set by a
+    plan the statistics are chi-squared, whatever the plan, as errors are white. Jumps are clipped: they would
+    drown the small answers to noise, by which feedback is recognised. Only the first `inputs` columns are
+    tested.
     """
     answers = _answers(u, y, past, offset=offset, lags=lags)
     m = inputs or u[0].shape[1]
@@ -84,8 +85,8 @@ def _answers(u: Segments, y: Segments, past: int, *, offset: bool, lags: int) ->
 
 
 def _unforeseen(now: np.ndarray, history: np.ndarray, j: int) -> np.ndarray:
-    """What the past of all inputs (T, past, m) does not foretell of input j (T,): by regression, or by its last
-    value where that is nearer in the median."""
+    """What the past of all inputs (T, past, m) does not foretell of input j (T,): by regression, or by its
+    last value where that is nearer in the median."""
     centred = history.reshape(len(now), -1) - history.reshape(len(now), -1).mean(axis=0)
     design = np.hstack([np.ones((len(now), 1)), centred])
     by_regression = now - design @ np.linalg.lstsq(design, now, rcond=1e-10)[0]
@@ -110,8 +111,8 @@ def _p_value(moved: np.ndarray, errors: np.ndarray) -> float:
 
 
 def _jumps_with(errors: np.ndarray, excess: np.ndarray) -> bool:
-    """Whether outputs answer the large moves of an input at once, or it makes none that could tell: feed-through
-    then explains what a correlation at lag 0 shows."""
+    """Whether outputs answer the large moves of an input at once, or it makes none that could tell:
+    feed-through then explains what a correlation at lag 0 shows."""
     if np.count_nonzero(excess) < 4:
         return True
     about_mean = excess - excess.mean()

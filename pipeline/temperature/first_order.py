@@ -37,8 +37,8 @@ def simc_pid(gain: float, time_constant_s: float, delay_s: float, *, sample_time
     """PID of a first-order model with delay, SIMC with a third of the delay as derivative time (Grimholt and
     Skogestad 2018, iSIMC), series form rewritten as parallel:
 
-    K_c = tau / (K (tau_c + theta)), tau_I = min(tau, 4 (tau_c + theta)), tau_D = theta / 3, tau_c = theta. The
-    delay counts half a sample more, by which a held input is late, and as no less than one sample.
+    K_c = tau / (K (tau_c + theta)), tau_I = min(tau, 4 (tau_c + theta)), tau_D = theta / 3, tau_c = theta.
+    The delay counts half a sample more, by which a held input is late, and as no less than one sample.
     """
     theta = max(delay_s + sample_time_s / 2, sample_time_s)
     tau = max(time_constant_s, sample_time_s)
@@ -47,8 +47,8 @@ def simc_pid(gain: float, time_constant_s: float, delay_s: float, *, sample_time
 
 
 class StepModels(NamedTuple):
-    """First-order models of step responses, each (...): gain, time constant and delay in samples, and the NRMSE
-    in percent of the model beside the response, 100 for a response of one such mode."""
+    """First-order models of step responses, each (...): gain, time constant and delay in samples, and the
+    NRMSE in percent of the model beside the response, 100 for a response of one such mode."""
 
     gain: np.ndarray
     time_constant: np.ndarray
@@ -62,8 +62,8 @@ def of_step_responses(
     """K (1 - exp(-(t - theta) / tau)) nearest in least squares to each response (T, ...) at samples t (T,).
 
     tau and theta are sought on one grid for all: tau from half a sample to three times the horizon, in equal
-    ratios of some tenth; theta up to a third of the horizon, closer together where it is short. K is the best for
-    each; among equals the model without delay wins.
+    ratios of some tenth; theta up to a third of the horizon, closer together where it is short. K is the best
+    for each; among equals the model without delay wins.
     """
     horizon = float(t[-1])
     tau = np.geomspace(0.5, 3 * horizon, taus)

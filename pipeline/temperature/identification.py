@@ -65,9 +65,9 @@ class Identified(NamedTuple):
     """An identified plant and how it was chosen. order: states without those of the delays; past: window;
     order_table: candidates with their errors.
 
-    delays are the dead times in the plant, in samples for each input; silent marks
-    inputs that no output answers, feedthrough the outputs with a row of D. x0 has the initial state of each segment, or of
-    each piece where masked inputs cut one (`gapless`).
+    delays are the dead times in the plant, in samples for each input; silent marks inputs that no output
+    answers, feedthrough the outputs with a row of D. x0 has the initial state of each segment, or of each
+    piece where masked inputs cut one (`gapless`).
     """
 
     plant: Plant
@@ -92,8 +92,8 @@ class Settings(NamedTuple):
     """What is given and what is chosen. None leaves order, window `past` and feed-through to the data.
 
     `refinement` "prediction" or "simulation" moves the plant to the least errors of that kind. "validated"
-    does so only where the left-out `blocks` prefer it. `max_radius` bounds every pole. `recordings` labels the
-    segments: of several recordings, whole ones are left out. The first `inputs` columns of u are moved by
+    does so only where the left-out `blocks` prefer it. `max_radius` bounds every pole. `recordings` labels
+    the segments: of several recordings, whole ones are left out. The first `inputs` columns of u are moved by
     people or controllers, all where None; the others are measured disturbances.
     """
 
@@ -348,8 +348,8 @@ def _windows(u, y, order, past, offset) -> tuple[tuple[int, ...], bool]:
 def _best_candidate(
     u: Segments, y: Segments, structures: list[Structure], settings: Settings, validation: Validation
 ) -> tuple[Candidate, list[Candidate]]:
-    """The candidate that the rules take, and the table: structures and orders of the subspace fit, then refined
-    fits of the best candidate of each structure, as many as `WORK` allows."""
+    """The candidate that the rules take, and the table: structures and orders of the subspace fit, then
+    refined fits of the best candidate of each structure, as many as `WORK` allows."""
     singular_values, table = {}, []
     structures = _with_slow_window(u, y, structures, settings)
     for structure in structures:

@@ -32,7 +32,7 @@ from pipeline.temperature.tracking import (
     observer_gain,
     observer_law,
     robust_observer_gain,
-    started_held,
+    started_reached,
 )
 
 Limits = tuple[np.ndarray, np.ndarray]
@@ -92,11 +92,12 @@ class Judged(NamedTuple):
 
 def model_based(plant: Plant, gamma: float, *, tau: float) -> Controller:
     """Riccati gains of an identified model, and an observer that stands its errors
-    (tracking.robust_observer_gain), started from a hold. Feed-through counts as one sample of delay."""
+    (tracking.robust_observer_gain), started where inputs may
+    have brought it. Feed-through counts as one sample of delay."""
     plant = strictly_proper(plant)
     observed = _observed("model_based", plant, gamma, robust_observer_gain(plant, tau))
     return observed._replace(
-        design=lambda q, r, integral: started_held(observed.design(q, r, integral), plant)
+        design=lambda q, r, integral: started_reached(observed.design(q, r, integral), plant)
     )
 
 

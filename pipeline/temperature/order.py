@@ -317,8 +317,8 @@ def prediction_errors(plant: Plant, u: Segments, y: Segments) -> np.ndarray:
 
 
 def closed_loop_errors(plant: Plant, u: Segments, y: Segments) -> np.ndarray:
-    """Geometric mean of `simulation_errors` and `prediction_errors`. Under feedback a simulation is right in part
-    because u holds the noise of y; one step ahead it is not, but slow modes gain little there."""
+    """Geometric mean of `simulation_errors` and `prediction_errors`. Under feedback a simulation is right in
+    part because u holds the noise of y; one step ahead it is not, but slow modes gain little there."""
     return np.sqrt(simulation_errors(plant, u, y) * prediction_errors(plant, u, y))
 
 

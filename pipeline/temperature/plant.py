@@ -235,8 +235,8 @@ def strictly_proper(plant: Plant) -> Plant:
 
 
 def at_disturbances(plant: Plant, inputs: int, level: np.ndarray) -> Plant:
-    """The plant of the first `inputs` columns of u, the others held at `level`: what a controller meets that is
-    not told the disturbances."""
+    """The plant of the first `inputs` columns of u, the others held at `level`: what a controller meets that
+    is not told the disturbances."""
     return plant._replace(
         B=plant.B[:, :inputs],
         D=plant.D[:, :inputs],

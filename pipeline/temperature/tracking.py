@@ -214,27 +214,18 @@ def observer_law(plant: Plant, gains: Gains, L: np.ndarray, *, integral: float =
     )
 
 
-def started_held(law: Law, plant: Plant) -> Law:
-    """`observer_law` started at the state that keeps all outputs where they are while u0 goes on, nearest in
-    least squares over as many samples as the plant has states.
+def started_reached(law: Law, plant: Plant, *, forgets: float = 0.01) -> Law:
+    """`observer_law` started at the likeliest state that shows y(0), for a plant that inputs have moved:
+    x = W C'(C W C')^-1 (y(0) - d), W the Gramian of what inputs of equal power reach, older ones forgotten.
 
-    pinv(C) y(0) depends on the coordinates of the model, and leaves what C does not show at zero: in those of a
-    refined model that cost half of J. This estimate is the same in any coordinates.
+    pinv(C) (y(0) - d) depends on the coordinates of the model: in those of a refined one it cost half of J.
+    This one is the same in any coordinates. A start that trusts the hold, x = A x + B u0 + b, costs half as
+    much on the model's own plant, and a settling three times as long on plants whose gains differ.
     """
-    rows, per_u, rest = [], [], []
-    free, driven, drift = np.eye(plant.n), np.zeros((plant.n, plant.m)), np.zeros(plant.n)
-    for _ in range(plant.n):
-        rows.append(plant.C @ free)
-        per_u.append(plant.C @ driven + plant.D)
-        rest.append(plant.C @ drift + plant.d)
-        free, driven, drift = plant.A @ free, plant.A @ driven + plant.B, plant.A @ drift + plant.b
-    # directions that n samples do not show are left out: noise would decide them
-    inverse = np.linalg.pinv(np.vstack(rows), rcond=1e-8)
-    return law._replace(
-        start_u=-inverse @ np.vstack(per_u),
-        start_y=inverse @ np.tile(np.eye(plant.p), (plant.n, 1)),
-        start=-inverse @ np.concatenate(rest),
-    )
+    radius = max(1.0, np.abs(np.linalg.eigvals(plant.A)).max())
+    W = scipy.linalg.solve_discrete_lyapunov((1 - forgets) / radius * plant.A, plant.B @ plant.B.T)
+    inverse = W @ plant.C.T @ np.linalg.pinv(plant.C @ W @ plant.C.T, hermitian=True)
+    return law._replace(start_y=inverse, start=-inverse @ plant.d)
 
 
 class Target(NamedTuple):

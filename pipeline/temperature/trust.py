@@ -207,8 +207,8 @@ def forbidden_gains(
     heats: Sequence[bool],
     ranges: Sequence[float],
 ) -> list[ForbiddenGain]:
-    """The effects of inputs that `heats` marks which are negative, or which over the input's range (percent) are
-    larger than `LARGEST_RISE_DEGC`."""
+    """The effects of inputs that `heats` marks which are negative, or which over the input's range (percent)
+    are larger than `LARGEST_RISE_DEGC`."""
     flagged = []
     for j, name in enumerate(inputs):
         for o, output in enumerate(outputs if heats[j] else ()):

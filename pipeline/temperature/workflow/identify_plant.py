@@ -27,8 +27,8 @@ class IdentifiedPlant(NamedTuple):
 
 
 class _Record(NamedTuple):
-    """The record as it can be identified, u with disturbances after the inputs; the recording of each segment;
-    `recorded` samples before any were cut, and what was clipped."""
+    """The record as it can be identified, u with disturbances after the inputs; the recording of each
+    segment; `recorded` samples before any were cut, and what was clipped."""
 
     u: Segments
     y: Segments

@@ -31,8 +31,8 @@ class Signal(Section):
 
 
 class Input(Signal):
-    """A heater or the motor; low and high are the limits of what the machine can give, in percent. `heats`: no
-    output can fall for good when it is raised."""
+    """A heater or the motor; low and high are the limits of what the machine can give, in percent. `heats`:
+    no output can fall for good when it is raised."""
 
     low: float = Field(ge=-100, le=100)
     high: float = Field(ge=-100, le=100)
@@ -52,8 +52,8 @@ class Output(Signal):
 
 
 class Plant(Section):
-    """Section `plant`: the machine's signals and its sample time. `disturbances` are recorded signals that act
-    on the outputs and that no controller moves: fan, feed, a sensor of the room."""
+    """Section `plant`: the machine's signals and its sample time. `disturbances` are recorded signals that
+    act on the outputs and that no controller moves: fan, feed, a sensor of the room."""
 
     inputs: list[Input] = Field(min_length=1, max_length=32)
     disturbances: list[Signal] = Field(default=[], max_length=16)
