@@ -285,6 +285,82 @@ def staircase(rng):
     return u, y
 
 
+def winding(rng):
+    """Tension of a web between two reels: what the drives are given acts within the sample, and a slow mode
+    of the reels' radii behind it, 2,500 samples of 0.1 s."""
+    T = 2500
+    u = levels(rng, T, 3, 25, -1, 1) + 0.05 * rng.standard_normal((T, 3))
+    x, y = np.zeros(3), np.empty((T, 2))
+    for t in range(T):
+        y[t, 0] = x[0] + 0.6 * u[t, 0] - 0.4 * u[t, 1] + 0.03 * rng.standard_normal()
+        y[t, 1] = x[1] + 0.3 * x[2] + 0.5 * u[t, 2] + 0.03 * rng.standard_normal()
+        x = np.array([0.8, 0.7, 0.985]) * x + [
+            0.15 * u[t, 0] - 0.1 * u[t, 1],
+            0.2 * u[t, 2],
+            0.02 * (u[t, 0] - u[t, 2]) + 0.005 * rng.standard_normal(),
+        ]
+    return u, y
+
+
+def tube_exchanger(rng):
+    """Outlet temperatures of both sides of a tube exchanger: half of each inlet's step passes within a
+    sample, the rest through its wall, 1,500 samples."""
+    T, wall_degC, y = 1500, 50.0, np.empty((1500, 2))
+    u = np.column_stack([80 + levels(rng, T, 1, 40, -8, 8)[:, 0], 20 + levels(rng, T, 1, 55, -5, 5)[:, 0]])
+    for t in range(T):
+        y[t] = [0.45 * u[t, 0] + 0.55 * wall_degC, 0.5 * u[t, 1] + 0.5 * wall_degC]
+        y[t] += 0.1 * rng.standard_normal(2)
+        wall_degC += 0.04 * (u[t, 0] - wall_degC) + 0.05 * (u[t, 1] - wall_degC)
+    return u, y
+
+
+def drying(rng):
+    """Moisture and air temperature of a band dryer: air answers in 3 samples, the bed in 150; 867 samples."""
+    T, x, y = 867, np.array([0.0, 0.0, 0.0]), np.empty((867, 3))
+    u = levels(rng, T, 3, 30, -1, 1)
+    for t in range(T):
+        y[t] = [x[0], x[1] - 0.3 * x[0], 0.5 * x[1] + 0.2 * x[2]]
+        y[t] += [0.05, 0.02, 0.03] * rng.standard_normal(3)
+        x = x + [
+            (u[t, 0] + 0.3 * u[t, 2] - x[0]) / 3,
+            (0.8 * x[0] - u[t, 1] - x[1]) / 150 + 0.002 * rng.standard_normal(),
+            (u[t, 2] - x[2]) / 40,
+        ]
+    return u, y
+
+
+def wandering_ambient(rng):
+    """A heater and its block in a room whose temperature nobody records and that wanders, 3,000 samples."""
+    T, x, y = 3000, np.array([60.0, 60.0]), np.empty((3000, 1))
+    u, room = levels(rng, T, 1, 60, 10, 60), 22 + 0.08 * np.cumsum(rng.standard_normal(T))
+    for t in range(T):
+        y[t] = x[1] + 0.05 * rng.standard_normal()
+        x = x + [0.05 * u[t, 0] - 0.02 * (x[0] - room[t]) - 0.03 * (x[0] - x[1]), 0.04 * (x[0] - x[1])]
+    return u, y
+
+
+def _in_room(rng, *, recorded: bool):
+    T, x, y = 3000, np.array([60.0, 60.0]), np.empty((3000, 2))
+    u = levels(rng, T, 2, 70, 10, 60)
+    room = 21 + 1.5 * coloured(rng, T, 1, 0.995)[:, 0] + np.where(np.arange(T) >= 0.7 * T, 9.0, 0.0)
+    for t in range(T):
+        y[t] = x + 0.05 * rng.standard_normal(2)
+        x = x + [0.04, 0.03] * u[t] - 0.015 * (x - room[t]) + 0.01 * (x[::-1] - x)
+    seen = room + 0.1 * rng.standard_normal(T)
+    return (np.column_stack([u, seen]) if recorded else u), y
+
+
+def another_day(rng):
+    """Two heaters; the room's temperature is recorded as third input, and the last 30 % is a day 9 °C
+    warmer."""
+    return _in_room(rng, recorded=True)
+
+
+def another_day_unrecorded(rng):
+    """The same day, its room's temperature not recorded: only what is about the mean can be foretold."""
+    return _in_room(rng, recorded=False)
+
+
 RECORDS: dict[str, Callable[[np.random.Generator], tuple[np.ndarray, np.ndarray]]] = {
     f.__name__: f
     for f in (
@@ -304,5 +380,11 @@ RECORDS: dict[str, Callable[[np.random.Generator], tuple[np.ndarray, np.ndarray]
         unstable_reactor,
         barrel,
         staircase,
+        winding,
+        tube_exchanger,
+        drying,
+        wandering_ambient,
+        another_day,
+        another_day_unrecorded,
     )
 }

@@ -261,7 +261,11 @@ def study_plant(sets: int = 20) -> dict:
     }
     u, y = probed(0, 0.1)
     out["fixed_order_s"] = round(
-        min(timed(identify, [u], [y], sample_time_s=1.0, order=6, past=24)[1] for _ in range(3)), 3
+        min(
+            timed(identify, [u], [y], sample_time_s=1.0, settings=Settings(order=6, past=24))[1]
+            for _ in range(3)
+        ),
+        3,
     )
     return out
 
@@ -330,7 +334,10 @@ def foreign(name: str, seed: int) -> dict:
     cut = int(0.7 * len(u))
     train, test = (u[:cut], y[:cut]), (u[cut:], y[cut:])
     ours, seconds = timed(
-        identify, *([a] for a in train), sample_time_s=1.0, feedthrough=None, refinement="validated"
+        identify,
+        *([a] for a in train),
+        sample_time_s=1.0,
+        settings=Settings(feedthrough=None, refinement="validated"),
     )
     row = {
         "samples": len(u),

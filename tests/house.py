@@ -475,11 +475,11 @@ def unbounded(kind: Any, place: str, limits: tuple = ()) -> list[str]:
         return unbounded(kind, place, limits)
     if isinstance(kind, type) and issubclass(kind, params.Section):
         fields = kind.model_fields.items()
-        # None alone: what a simulated machine has no need of
+        # left out is not there: None, an empty list and false are no values
         defaults = [
             f"{place}.{name} has a default"
             for name, field in fields
-            if not field.is_required() and field.default is not None
+            if not field.is_required() and field.default not in (None, [], False)
         ]
         return defaults + [
             item

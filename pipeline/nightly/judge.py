@@ -317,7 +317,8 @@ def _panel_plants(records: list[tuple[np.ndarray, np.ndarray]], machine: Plant):
     family = validation.bootstrap_spread(
         u, y, fit, count=p["spread_plants"], order=fit.order, rng=np.random.default_rng(p["seed"])
     )
-    artifacts.write_arrays(path, "holdout_plants", 1, plant.stored([fit.plant, *family]))
+    plants = [plant.strictly_proper(one) for one in (fit.plant, *family)]
+    artifacts.write_arrays(path, "holdout_plants", 1, plant.stored(plants))
     return plant.restored(artifacts.read_arrays(path, "holdout_plants", 1))
 
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.optimize
 
-from pipeline.temperature.plant import Plant, markov_parameters
+from pipeline.temperature.plant import Plant, markov_parameters, strictly_proper
 from pipeline.temperature.tracking import Controller, Law
 
 
@@ -84,5 +84,6 @@ def pi_law(pairs: Pairing, *, inputs: int) -> Law:
 
 def controller(plant: Plant, limits: tuple[np.ndarray, np.ndarray], *, horizon: int) -> Controller:
     """PI a zone, tuned by SIMC; the weights mean nothing to it. `limits` low and high (m,)."""
+    plant = strictly_proper(plant)
     law = pi_law(pairing(plant, *limits, horizon=horizon), inputs=plant.m)
     return Controller("baseline", lambda q, r, integral: law, plant, own_feed_forward=False)

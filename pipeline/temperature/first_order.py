@@ -25,6 +25,64 @@ class FirstOrder(NamedTuple):
     deviations: tuple[float, float, float]
 
 
+class Pid(NamedTuple):
+    """u = Kp e + Ki integral of e + Kd de/dt: Kp in units of u by units of y, Ki by second, Kd seconds."""
+
+    Kp: float
+    Ki: float
+    Kd: float
+
+
+def simc_pid(gain: float, time_constant_s: float, delay_s: float, *, sample_time_s: float) -> Pid:
+    """PID of a first-order model with delay, SIMC with a third of the delay as derivative time (Grimholt and
+    Skogestad 2018, iSIMC), series form rewritten as parallel:
+
+    K_c = tau / (K (tau_c + theta)), tau_I = min(tau, 4 (tau_c + theta)), tau_D = theta / 3, tau_c = theta.
+    The delay counts half a sample more, by which a held input is late, and as no less than one sample.
+    """
+    theta = max(delay_s + sample_time_s / 2, sample_time_s)
+    tau = max(time_constant_s, sample_time_s)
+    K_c, tau_I, tau_D = tau / (gain * 2 * theta), min(tau, 8 * theta), theta / 3
+    return Pid(K_c * (1 + tau_D / tau_I), K_c / tau_I, K_c * tau_D)
+
+
+class StepModels(NamedTuple):
+    """First-order models of step responses, each (...): gain, time constant and delay in samples, and the
+    NRMSE in percent of the model beside the response, 100 for a response of one such mode."""
+
+    gain: np.ndarray
+    time_constant: np.ndarray
+    delay: np.ndarray
+    fit_percent: np.ndarray
+
+
+def of_step_responses(
+    t: np.ndarray, responses: np.ndarray, *, taus: int = 90, delays: int = 40
+) -> StepModels:
+    """K (1 - exp(-(t - theta) / tau)) nearest in least squares to each response (T, ...) at samples t (T,).
+
+    tau and theta are sought on one grid for all: tau from half a sample to three times the horizon, in equal
+    ratios of some tenth; theta up to a third of the horizon, closer together where it is short. K is the best
+    for each; among equals the model without delay wins.
+    """
+    horizon = float(t[-1])
+    tau = np.geomspace(0.5, 3 * horizon, taus)
+    theta = horizon / 3 * np.linspace(0.0, 1.0, delays) ** 2
+    grid_theta, grid_tau = (part.ravel() for part in np.meshgrid(theta, tau, indexing="ij"))
+    models = 1.0 - np.exp(-np.maximum(t[:, None] - grid_theta, 0.0) / grid_tau)
+    power = np.maximum(np.sum(models**2, axis=0), 1e-12)
+    flat = responses.reshape(len(t), -1)
+    products = models.T @ flat
+    best = (products**2 / power[:, None]).argmax(axis=0)
+    columns = np.arange(flat.shape[1])
+    gain = products[best, columns] / power[best]
+    error = np.linalg.norm(flat - models[:, best] * gain, axis=0)
+    spread = np.maximum(np.linalg.norm(flat - flat.mean(axis=0), axis=0), np.finfo(float).tiny)
+    shape = responses.shape[1:]
+    fit = 100.0 * (1.0 - error / spread)
+    return StepModels(*(part.reshape(shape) for part in (gain, grid_tau[best], grid_theta[best], fit)))
+
+
 class StepFit(NamedTuple):
     """The model of one step of the input: the sample at which it came,
     its size in units of u (negative is downward)."""

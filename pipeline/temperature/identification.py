@@ -5,8 +5,8 @@ The rules, each with its reason:
 
 window: Twice the lags of Akaike's criterion (corrected for few samples) over VARX models, long enough to
     whiten. Schwarz's lags beside them, for records that say little.
-feed-through: With and without u(t), where `feedthrough` is None and Schwarz's criterion of the one-step
-    predictor prefers it.
+feed-through: With and without u(t) in the outputs whose one-step predictor Schwarz's criterion prefers with
+    it, where `feedthrough` is None.
 largest order: The singular values, in units of the noise, above what coefficient errors alone reach:
     sqrt(2) (sqrt(rows) + sqrt(columns)) of the noise matrix.
 dead time: None; the lags at which the largest model's impulse response stays under 5 % of its peak; those
@@ -23,12 +23,15 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from pipeline.temperature.closed_loop import ClosedLoop, closed_loop
 from pipeline.temperature.order import (
+    WORK,
     WORTH_REFINING,
     WORTH_THE_NOISE,
     Candidate,
     Fit,
     Structure,
+    Validation,
     cross_validate,
     dead_time,
     feedthrough_shows,
@@ -37,6 +40,7 @@ from pipeline.temperature.order import (
     noise_edge,
     shifted,
     simplest,
+    slow_window,
     tested_dead_times,
     windows,
     with_delays,
@@ -61,9 +65,9 @@ class Identified(NamedTuple):
     """An identified plant and how it was chosen. order: states without those of the delays; past: window;
     order_table: candidates with their errors.
 
-    delays are the dead times in the plant, in samples for each input; silent marks
-    inputs that no output answers. x0 has the initial state of each segment, or of
-    each piece where masked inputs cut one (`gapless`).
+    delays are the dead times in the plant, in samples for each input; silent marks inputs that no output
+    answers, feedthrough the outputs with a row of D. x0 has the initial state of each segment, or of each
+    piece where masked inputs cut one (`gapless`).
     """
 
     plant: Plant
@@ -71,7 +75,7 @@ class Identified(NamedTuple):
     past: int
     delays: tuple[int, ...]
     silent: tuple[bool, ...]
-    feedthrough: bool
+    feedthrough: tuple[bool, ...]
     offset: bool
     fit: str
     singular_values: np.ndarray
@@ -81,23 +85,28 @@ class Identified(NamedTuple):
     rows: int
     dropped_rows: int
     notes: list[str]
+    feedback: ClosedLoop | None = None
 
 
 class Settings(NamedTuple):
     """What is given and what is chosen. None leaves order, window `past` and feed-through to the data.
 
     `refinement` "prediction" or "simulation" moves the plant to the least errors of that kind. "validated"
-    does so only where the left-out `blocks` prefer it. `max_radius` bounds every pole.
+    does so only where the left-out `blocks` prefer it. `max_radius` bounds every pole. `recordings` labels
+    the segments: of several recordings, whole ones are left out. The first `inputs` columns of u are moved by
+    people or controllers, all where None; the others are measured disturbances.
     """
 
     order: int | None = None
     past: int | None = None
-    feedthrough: bool | None = False
+    feedthrough: bool | None = None
     offset: bool = True
     refinement: Literal["none", "prediction", "simulation", "validated"] = "none"
     max_order: int = 12
     max_radius: float | None = None
     blocks: int = 5
+    recordings: tuple[int, ...] = ()
+    inputs: int | None = None
 
 
 DEFAULTS = Settings()
@@ -205,8 +214,9 @@ def identify(
     output, a record too short for the order, and shapes that do not agree.
     """
     record = _prepared(u, y, settings, limits, names)
-    choice, reasons = _chosen(record.u, record.y, settings)
+    choice, reasons, feedback = _chosen(record, settings)
     fitted = _fit_all(record.u, record.y, choice, sample_time_s, settings.max_radius)
+    fitted = fitted._replace(feedback=feedback)
     return _with_remarks(fitted, record._replace(notes=record.notes + reasons), names)
 
 
@@ -226,12 +236,14 @@ def refit(
     record = _prepared(u, y, settings, limits, names)
     structure = Structure(past, identified.feedthrough, offset, identified.delays)
     data = (
-        None if table else lagged(record.u, record.y, past, feedthrough=structure.feedthrough, offset=offset)
+        None
+        if table
+        else lagged(record.u, record.y, past, feedthrough=any(structure.feedthrough), offset=offset)
     )
     exact = data is not None and windows(data)[1]
     choice = Choice(structure, identified.order, identified.fit, exact, table)
     fitted = _fit_all(record.u, record.y, choice, identified.plant.sample_time_s, max_radius)
-    return _with_remarks(fitted, record, names)
+    return _with_remarks(fitted._replace(feedback=identified.feedback), record, names)
 
 
 class _Record(NamedTuple):
@@ -241,6 +253,7 @@ class _Record(NamedTuple):
     y: list[np.ndarray]
     cut: int
     notes: list[str]
+    recordings: tuple[int, ...]
 
 
 def _prepared(u, y, settings: Settings, limits, names) -> _Record:
@@ -249,22 +262,32 @@ def _prepared(u, y, settings: Settings, limits, names) -> _Record:
     _check_shapes(u, y)
     samples = sum(map(len, u))
     u, notes = within_limits(u, limits, names=names) if limits is not None else (u, [])
-    u, y = gapless(u, y)
+    pieces = [gapless([a], [b]) for a, b in zip(u, y, strict=True)]
+    labels = settings.recordings or (0,) * len(u)
+    recordings = tuple(label for label, (a, _) in zip(labels, pieces, strict=True) for _ in a)
+    u, y = [a for piece, _ in pieces for a in piece], [b for _, piece in pieces for b in piece]
     cut = samples - sum(map(len, u))
     _check_length(u, y, settings.order, settings.past)
     check_inputs(u, offset=settings.offset, names=names)
     check_outputs(y)
     if cut:
         notes = [*notes, f"{cut} samples with a masked input, or without any output, were cut out"]
-    return _Record(u, y, cut, notes)
+    return _Record(u, y, cut, notes, recordings)
 
 
-def _chosen(u: Segments, y: Segments, settings: Settings) -> tuple[Choice, list[str]]:
-    """What the rules choose, and a sentence for each choice that a user should know of."""
+def _chosen(record: _Record, settings: Settings) -> tuple[Choice, list[str], ClosedLoop | None]:
+    """What the rules choose, a sentence for each choice that a user should know of, and whether the inputs
+    answer the outputs (None of a noise-free record)."""
+    u, y = record.u, record.y
     pasts, exact = _windows(u, y, settings.order, settings.past, settings.offset)
-    direct = (settings.feedthrough,)
+    none = (False,) * y[0].shape[1]
+    feedback = None if exact else closed_loop(u, y, pasts[0], offset=settings.offset, inputs=settings.inputs)
+    closed = feedback is not None and feedback.closed
+    direct = [(bool(settings.feedthrough),) * len(none)]
     if settings.feedthrough is None:
-        direct = (False, True) if feedthrough_shows(u, y, pasts[0], settings.offset) else (False,)
+        # under feedback, u(t) holds what noise did to y(t): a row of D would be the controller's inverse
+        shows = none if closed else feedthrough_shows(u, y, pasts[0], settings.offset)
+        direct = [none, shows] if any(shows) else [none]
     structure = Structure(pasts[0], direct[-1], settings.offset, (0,) * u[0].shape[1])
     choice = Choice(structure, settings.order, settings.refinement.replace("none", "subspace"), False, [])
     validated, notes = settings.refinement == "validated", []
@@ -278,18 +301,32 @@ def _chosen(u: Segments, y: Segments, settings: Settings) -> tuple[Choice, list[
         choice = Choice(structure, settings.order or rank, kind, True, [])
     elif settings.order is None or validated:
         structures = [structure._replace(past=n, feedthrough=d) for n in pasts for d in direct]
-        best, table = _best_candidate(u, y, structures, settings)
+        validation = Validation(settings.blocks, record.recordings, closed, settings.max_radius)
+        best, table = _best_candidate(u, y, structures, settings, validation)
         choice = Choice(best.structure, best.order, best.fit if validated else choice.fit, False, table)
-    if settings.feedthrough is None:
-        verb = "kept" if choice.structure.feedthrough else "left out"
-        notes.append(f"direct feed-through {verb} as the data prefer")
-    return choice, notes
+    return choice, notes + _reasons(choice, direct, closed), feedback
+
+
+def _reasons(choice: Choice, direct: list[tuple[bool, ...]], closed: bool) -> list[str]:
+    """A sentence for feed-through and feedback, where the record raises the question."""
+    notes = []
+    if len(direct) > 1:
+        rows = sum(choice.structure.feedthrough)
+        verb = f"kept in {rows} of {len(direct[0])} outputs" if rows else "left out"
+        notes.append(f"direct feed-through {verb}, as the left-out blocks prefer")
+    if closed:
+        notes.append(
+            "the record was taken in closed loop (inputs follow past errors of the outputs): candidates are "
+            "judged one step ahead too, without feed-through and without fits to simulated outputs, which "
+            "feedback biases; it flatters the hold-out fit of a simulation as well"
+        )
+    return notes
 
 
 def _exact_rank(u: Segments, y: Segments, structure: Structure) -> int:
     """The order of a noise-free record: singular values that are more than rounding, at least 1."""
     data = lagged(
-        u, y, structure.past, feedthrough=structure.feedthrough, offset=structure.offset, exact=True
+        u, y, structure.past, feedthrough=any(structure.feedthrough), offset=structure.offset, exact=True
     )
     values = subspace(data, structure.past).singular_values
     return max(int((values > EXACT_RANK * values[0]).sum()), 1)
@@ -309,43 +346,98 @@ def _windows(u, y, order, past, offset) -> tuple[tuple[int, ...], bool]:
 
 
 def _best_candidate(
-    u: Segments, y: Segments, structures: list[Structure], settings: Settings
+    u: Segments, y: Segments, structures: list[Structure], settings: Settings, validation: Validation
 ) -> tuple[Candidate, list[Candidate]]:
-    """The candidate that the rules take, and the table: structures and orders of the
-    subspace fit, then the refined fits of the winner."""
-    validation = {"blocks": settings.blocks, "max_radius": settings.max_radius}
-    table = []
+    """The candidate that the rules take, and the table: structures and orders of the subspace fit, then
+    refined fits of the best candidate of each structure, as many as `WORK` allows."""
+    singular_values, table = {}, []
+    structures = _with_slow_window(u, y, structures, settings)
     for structure in structures:
-        data = lagged(u, y, structure.past, feedthrough=structure.feedthrough, offset=structure.offset)
+        data = lagged(u, y, structure.past, feedthrough=any(structure.feedthrough), offset=structure.offset)
         sub = subspace(data, structure.past)
+        singular_values[structure.past, structure.feedthrough] = sub.singular_values
         orders, delays = _candidates(data, sub, structure, settings)
         for d in sorted(delays):
             delayed = structure._replace(delays=d)
             table += cross_validate(
-                u, y, orders, delayed, ("subspace",), singular_values=sub.singular_values, **validation
+                u,
+                y,
+                orders,
+                delayed,
+                ("subspace",),
+                singular_values=sub.singular_values,
+                validation=validation,
             )
+    if not table and validation.recordings:
+        # what is left without one recording is too short: blocks of every recording instead
+        return _best_candidate(u, y, structures, settings, validation._replace(recordings=()))
     if not table:
         raise ValueError(
-            f"the record is too short to choose a model by leaving out one of {settings.blocks} blocks: "
+            f"the record is too short to choose a model by leaving out one of {validation.blocks} blocks: "
             f"{sum(map(len, u))} samples do not carry a window of"
             f" {structures[-1].past} without one; record longer, or give order and past"
         )
-    best = simplest(table)
-    if settings.refinement == "validated":
-        value_of = {row.order: row.singular_value for row in table if row.structure == best.structure}
-        values = np.array([value_of.get(n, np.nan) for n in range(1, best.order + 1)])
-        kinds = ("prediction", "simulation")
+    if settings.refinement != "validated":
+        return simplest(table), table
+    # a fit to simulated outputs takes what feedback put into u for an effect of u
+    kinds: tuple[Fit, ...] = ("prediction",) if validation.closed else ("prediction", "simulation")
+    entrants = []
+    for start in _shortlist(u, table):
+        values = singular_values[start.structure.past, start.structure.feedthrough]
         refined = cross_validate(
-            u, y, [best.order], best.structure, kinds, singular_values=values, **validation
+            u, y, [start.order], start.structure, kinds, singular_values=values, validation=validation
         )
         table += refined
-        challenger = min(
-            refined,
-            key=lambda row: row.error * (1 - WORTH_THE_NOISE) ** (row.fit == "prediction"),
-            default=best,
-        )
-        best = challenger if challenger.error < (1 - WORTH_REFINING) * best.error else best
-    return best, table
+        entrants.append(_better_fit(start, refined))
+    return simplest(entrants), table
+
+
+def _with_slow_window(
+    u: Segments, y: Segments, structures: list[Structure], settings: Settings
+) -> list[Structure]:
+    """The structures, and the longest of them with a window that spans the slowest mode that it shows, where
+    that is longer by half: criteria of one step ahead stop where a slow mode still gains them nothing."""
+    first = max(structures, key=lambda structure: structure.past)
+    if settings.past:
+        return structures
+    data = lagged(u, y, first.past, feedthrough=any(first.feedthrough), offset=first.offset)
+    sub = subspace(data, first.past)
+    determined = max(
+        1, min(int((sub.singular_values > noise_edge(data, first.past)).sum()), settings.max_order)
+    )
+    model = realise(data, sub.basis[:determined], 1.0, first.feedthrough)
+    past = slow_window(model, longest_window(u, y))
+    if past < 1.5 * first.past:
+        return structures
+    longer = {structure.feedthrough: structure._replace(past=past) for structure in structures}
+    return [*longer.values(), *structures]
+
+
+def _shortlist(u: Segments, table: list[Candidate]) -> list[Candidate]:
+    """The best candidate of each structure, the best first: as many as `WORK` allows, at least one, and none
+    whose error is more than half above the best's."""
+    of: dict[Structure, list[Candidate]] = {}
+    for row in table:
+        of.setdefault(row.structure, []).append(row)
+    first = simplest(table)
+    best = sorted((simplest(rows) for rows in of.values()), key=lambda row: row.error)
+    others = [row for row in best if row != first and row.error < 1.5 * best[0].error]
+    samples, m = sum(map(len, u)), u[0].shape[1]
+    taken, work = [], 0.0
+    for row in [first, *others]:
+        work += samples * (row.order * (row.order + m)) ** 2
+        if taken and work > WORK:
+            break
+        taken.append(row)
+    return taken
+
+
+def _better_fit(start: Candidate, refined: list[Candidate]) -> Candidate:
+    """The subspace candidate, or its best refined fit where that is worth its cost."""
+    challenger = min(
+        refined, key=lambda row: row.error * (1 - WORTH_THE_NOISE) ** (row.fit == "prediction"), default=start
+    )
+    return challenger if challenger.error < (1 - WORTH_REFINING) * start.error else start
 
 
 def _candidates(
@@ -358,7 +450,7 @@ def _candidates(
     above_noise = int((sub.singular_values > noise_edge(data, structure.past)).sum())
     largest = max(1, min(above_noise, settings.max_order, len(sub.singular_values)))
     furthest = max(data.past // 2, 1)
-    model = realise(data, sub.basis[:largest], 1.0)
+    model = realise(data, sub.basis[:largest], 1.0, structure.feedthrough)
     quiet = np.minimum(tested_dead_times(data, furthest)[0], dead_time(model, furthest, 0.25))
     return range(1, largest + 1), delays | {dead_time(model, furthest), tuple(quiet.tolist())}
 
@@ -370,14 +462,14 @@ def _fit_all(
     structure, order, kind, exact, table = choice
     past, settings = structure.past, FitSettings(structure.feedthrough, structure.offset, max_radius, 30)
     us, ys = shifted(u, y, structure.delays)
-    data = lagged(us, ys, past, feedthrough=structure.feedthrough, offset=structure.offset, exact=exact)
+    data = lagged(us, ys, past, feedthrough=any(structure.feedthrough), offset=structure.offset, exact=exact)
     sub = subspace(data, past)
     if order > len(sub.singular_values):
         raise ValueError(
             f"order {order} needs a longer window: {past} past samples give at most "
             f"{len(sub.singular_values)} states; raise past"
         )
-    start = realise(data, sub.basis[:order], sample_time_s)
+    start = realise(data, sub.basis[:order], sample_time_s, structure.feedthrough)
     plant = with_delays(fit(kind, start, us, ys, settings), structure.delays)
     model = simulation_form(plant, [])
     return Identified(

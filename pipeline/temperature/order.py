@@ -12,10 +12,13 @@ from pipeline.temperature.plant import plant as make_plant
 from pipeline.temperature.refinement import (
     FitSettings,
     drives,
+    estimate_state,
+    filled,
     fit_inputs,
     fitted_state,
     free_response,
     kalman_gain,
+    prediction_form,
     refine,
     respond,
     simulation_form,
@@ -32,19 +35,35 @@ WORTH_REFINING = 0.05
 WORTH_THE_NOISE = 0.2
 # a state that takes less than this share off the error is not worth carrying in a controller
 WORTH_A_STATE = 0.02
+# a refined fit costs some samples x (states + inputs)^2 an iteration: as many candidates are refined as this
+# allows, at least the best one
+WORK = 3e8
+# of Gauss-Newton for a candidate without one block: from a consistent start the first few take nearly all
+VALIDATED_STEPS = 4
 SMALLEST = 1e-9  # share of an output's variation below which an error is rounding
 # of the plants of a spread, which are simulated for ever: no record shows a time constant of 10^6 samples
 LARGEST_RADIUS = 1.0 - 1e-6
 
 
 class Structure(NamedTuple):
-    """What is fixed before an order is: window (samples), direct feed-through,
+    """What is fixed before an order is: window (samples), which outputs have direct feed-through (p,),
     offset, and the dead time of each input (samples)."""
 
     past: int
-    feedthrough: bool
+    feedthrough: tuple[bool, ...]
     offset: bool
     delays: tuple[int, ...]
+
+
+class Validation(NamedTuple):
+    """How candidates are judged: `blocks` left out in turn, or whole recordings where `recordings` labels the
+    segments with more than one; on simulated outputs, of a record in `closed` loop on predicted ones too.
+    `max_radius` bounds their poles."""
+
+    blocks: int = 5
+    recordings: tuple[int, ...] = ()
+    closed: bool = False
+    max_radius: float | None = None
 
 
 class Candidate(NamedTuple):
@@ -102,17 +121,15 @@ def windows(data: Lagged) -> tuple[tuple[int, ...], bool]:
     ), False
 
 
-def feedthrough_shows(u: Segments, y: Segments, past: int, offset: bool) -> bool:
-    """Whether Schwarz's criterion of the one-step predictor falls when u(t) is added to it. So it does too
-    where a controller answers y(t) at once: the blocks decide."""
-    criterion = []
+def feedthrough_shows(u: Segments, y: Segments, past: int, offset: bool) -> tuple[bool, ...]:
+    """For each output (p,), whether Schwarz's criterion of its one-step predictor falls when u(t) is added to
+    it. So it does too where a controller answers y(t) at once: the blocks decide."""
+    power = []
     for feedthrough in (False, True):
         data = lagged(u, y, past, feedthrough=feedthrough, offset=offset)
-        coefficients, errors = one_step(data, past)
-        criterion.append(
-            data.rows * log_det(errors.T @ errors / data.rows) + np.log(data.rows) * coefficients.size
-        )
-    return bool(criterion[1] < criterion[0])
+        power.append(np.sum(one_step(data, past)[1] ** 2, axis=0))
+    gain = data.rows * np.log(np.maximum(power[0], 1e-300) / np.maximum(power[1], 1e-300))
+    return tuple((gain > np.log(data.rows) * data.m).tolist())
 
 
 def log_det(S: np.ndarray) -> float:
@@ -249,14 +266,27 @@ def simulation_errors(plant: Plant, u: Segments, y: Segments) -> np.ndarray:
     return np.nan_to_num(np.array(shares), nan=1.0)
 
 
-def folds(u: Segments, y: Segments, count: int) -> list[tuple[list, list, list, list]]:
+def folds(
+    u: Segments, y: Segments, count: int, recordings: tuple[int, ...] = ()
+) -> list[tuple[list, list, list, list]]:
     """(u, y, u left out, y left out) with one of `count` blocks of each segment left out in turn; what
     remains on either side are segments of their own.
 
     Of several segments, those too short to be cut into blocks of 10 samples
-    are left out whole, every count-th of them in turn.
+    are left out whole, every count-th of them in turn. Of several `recordings` (a label for each
+    segment) one is left out at a time, or every count-th of more than `count`.
     """
-    out = []
+    out, labels = [], sorted(set(recordings))
+    if len(labels) > 1:
+        for k in range(min(count, len(labels))):
+            left_out = [label in labels[k::count] for label in recordings]
+            test, train = (
+                [[part[s] for s, out_now in enumerate(left_out) if out_now == wanted] for part in (u, y)]
+                for wanted in (True, False)
+            )
+            if train[0] and any(np.isfinite(b).any() for b in test[1]):
+                out.append((*train, *test))
+        return out
     for k in range(count):
         fold = ([], [], [], [])
         for s, (a, b) in enumerate(zip(u, y, strict=True)):
@@ -270,6 +300,26 @@ def folds(u: Segments, y: Segments, count: int) -> list[tuple[list, list, list, 
         if fold[0] and fold[2] and any(np.isfinite(b).any() for b in fold[3]):
             out.append(fold)
     return out
+
+
+def prediction_errors(plant: Plant, u: Segments, y: Segments) -> np.ndarray:
+    """For each segment and output, the size of the one-step error as a share of the output's variation, at
+    most 1; shape (segments, p). The initial state is fitted to the segment."""
+    model, shares = prediction_form(plant, []), []
+    for a, b in zip(u, y, strict=True):
+        v = drives("prediction", a, filled(plant, a, b, np.zeros(plant.n)))
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = b - respond(model, v, estimate_state(model, v, b))[1]
+        spread = np.maximum(np.nanstd(b, axis=0), np.finfo(float).tiny)
+        with np.errstate(over="ignore", invalid="ignore"):
+            shares.append(np.minimum(np.sqrt(np.nanmean(error**2, axis=0)) / spread, 1.0))
+    return np.nan_to_num(np.array(shares), nan=1.0)
+
+
+def closed_loop_errors(plant: Plant, u: Segments, y: Segments) -> np.ndarray:
+    """Geometric mean of `simulation_errors` and `prediction_errors`. Under feedback a simulation is right in
+    part because u holds the noise of y; one step ahead it is not, but slow modes gain little there."""
+    return np.sqrt(simulation_errors(plant, u, y) * prediction_errors(plant, u, y))
 
 
 def largest_radius(u: Segments) -> float:
@@ -311,49 +361,56 @@ def fit(
 
 
 def cross_validate(
-    u,
-    y,
-    orders,
-    structure: Structure,
-    kinds: tuple[Fit, ...],
-    *,
-    blocks: int,
-    singular_values,
-    max_radius: float | None = None,
+    u, y, orders, structure: Structure, kinds: tuple[Fit, ...], *, singular_values, validation: Validation
 ) -> list[Candidate]:
-    """The order table's rows for one structure: each order and fit, identified without a block and simulated
-    on it, for each of `blocks` blocks.
+    """The order table's rows for one structure: each order and fit, identified without a block and judged
+    on it, for each block or recording.
 
     A structure whose window does not fit into what remains of the record has no rows.
     """
     u, y = shifted(u, y, structure.delays)
-    settings, errors = FitSettings(structure.feedthrough, structure.offset, max_radius, 8), {}
-    for train_u, train_y, test_u, test_y in folds(u, y, blocks):
+    settings, errors = (
+        FitSettings(structure.feedthrough, structure.offset, validation.max_radius, VALIDATED_STEPS),
+        {},
+    )
+    judged = closed_loop_errors if validation.closed else simulation_errors
+    for train_u, train_y, test_u, test_y in folds(u, y, validation.blocks, validation.recordings):
         try:
             data = lagged(
-                train_u, train_y, structure.past, feedthrough=structure.feedthrough, offset=structure.offset
+                train_u,
+                train_y,
+                structure.past,
+                feedthrough=any(structure.feedthrough),
+                offset=structure.offset,
             )
         except ValueError:
             return []
         basis = subspace(data, structure.past).basis
         for order in orders:
-            start = realise(data, basis[:order], 1.0)
+            start = realise(data, basis[:order], 1.0, structure.feedthrough)
             for kind in kinds:
                 plant = fit(kind, start, train_u, train_y, settings, gain=False)
                 errors.setdefault((order, kind), []).append(
-                    max(float(simulation_errors(plant, test_u, test_y).mean()), SMALLEST)
+                    max(float(judged(plant, test_u, test_y).mean()), SMALLEST)
                 )
     m, p = u[0].shape[1], y[0].shape[1]
     # a dead time must be worth a state
-    more = p * m * structure.feedthrough + p * structure.offset + (m + p) * sum(map(bool, structure.delays))
+    more = m * sum(structure.feedthrough) + p * structure.offset + (m + p) * sum(map(bool, structure.delays))
     return [
         Candidate(order, structure, kind, order * (m + p) + more, float(singular_values[order - 1]), tuple(e))
         for (order, kind), e in errors.items()
     ]
 
 
-def simplest(table: list[Candidate]) -> Candidate:
-    """The row with the fewest parameters whose error is within 2 % of the best row's.
+def slow_window(plant: Plant, longest: int) -> int:
+    """The window that spans the time constant of a plant's slowest mode that decays, at most `longest`."""
+    radii = np.abs(np.linalg.eigvals(plant.A))
+    slowest = max(radii[radii < 1 - 1e-6], default=0.0)
+    return int(min(np.ceil(-1.0 / np.log(max(slowest, 1e-3))), longest))
+
+
+def simplest(table: list[Candidate], worth: float = WORTH_A_STATE) -> Candidate:
+    """The row with the fewest parameters whose error is within `worth` of the best row's.
 
     Not within one standard error: five blocks of which one holds a disturbance have so wide a one that models
     much too small pass, and these cost more on new data than models somewhat too large (measured on the
@@ -361,6 +418,5 @@ def simplest(table: list[Candidate]) -> Candidate:
     """
     best = min(row.error for row in table)
     return min(
-        (row for row in table if row.error <= (1 + WORTH_A_STATE) * best),
-        key=lambda row: (row.parameters, row.error),
+        (row for row in table if row.error <= (1 + worth) * best), key=lambda row: (row.parameters, row.error)
     )

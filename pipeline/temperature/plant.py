@@ -141,11 +141,12 @@ def simulate(plant: Plant, u: np.ndarray, x0: np.ndarray) -> tuple[np.ndarray, n
 
 def markov_parameters(plant: Plant, lags: int) -> np.ndarray:
     """h (lags, p, m) with h[k-1] = C A^(k-1) B, the response of y at lag k to a unit pulse of u."""
-    h, column = np.empty((lags, plant.p, plant.m)), plant.B
-    for k in range(lags):
-        h[k] = plant.C @ column
-        column = plant.A @ column
-    return h
+    # columns A^k B in blocks that double: two products where there were `lags`
+    columns, power = plant.B, plant.A
+    while columns.shape[1] < lags * plant.m:
+        columns, power = np.hstack([columns, power @ columns]), power @ power
+    h = (plant.C @ columns[:, : lags * plant.m]).reshape(plant.p, lags, plant.m)
+    return h.transpose(1, 0, 2)
 
 
 def clip_spectral_radius(A: np.ndarray, radius: float) -> np.ndarray:
@@ -205,6 +206,42 @@ def controllability(plant: Plant) -> RankTest:
         plant.n,
         "controllable",
         "add an input, or lower the order of the model",
+    )
+
+
+def strictly_proper(plant: Plant) -> Plant:
+    """The plant as a controller meets it: each output is sampled just before the input of its step is
+    applied, so that D u acts on it one sample later, as the state w(t+1) = u(t).
+
+    y(t) = C x(t) + D u(t-1) + d: what the input before left in the output is still there when the next one is
+    computed from it. Only as many states are added as D has rank. A plant without D is returned as it is.
+    """
+    U, sizes, V = np.linalg.svd(plant.D)
+    rank = int((sizes > 1e-12 * max(sizes[0], np.finfo(float).tiny)).sum()) if np.any(plant.D) else 0
+    if rank == 0:
+        return plant
+    n, m, p = plant.n, plant.m, plant.p
+    root = np.sqrt(sizes[:rank])
+    A = np.zeros((n + rank, n + rank))
+    A[:n, :n] = plant.A
+    return plant._replace(
+        A=A,
+        B=np.vstack([plant.B, root[:, None] * V[:rank]]),
+        C=np.hstack([plant.C, U[:, :rank] * root]),
+        D=np.zeros((p, m)),
+        b=np.r_[plant.b, np.zeros(rank)],
+        K=np.vstack([plant.K, np.zeros((rank, p))]),
+    )
+
+
+def at_disturbances(plant: Plant, inputs: int, level: np.ndarray) -> Plant:
+    """The plant of the first `inputs` columns of u, the others held at `level`: what a controller meets that
+    is not told the disturbances."""
+    return plant._replace(
+        B=plant.B[:, :inputs],
+        D=plant.D[:, :inputs],
+        b=plant.b + plant.B[:, inputs:] @ level,
+        d=plant.d + plant.D[:, inputs:] @ level,
     )
 
 

@@ -21,10 +21,11 @@ Criterion = Literal["prediction", "simulation"]
 
 
 class FitSettings(NamedTuple):
-    """What a fit may move, and when it stops. `feedthrough`: D is free; `offset`: b and d are; every pole
-    stays within `max_radius` where given; a step must gain `tolerance` of the cost."""
+    """What a fit may move, and when it stops. `feedthrough`: D is free, or the rows of it that are marked;
+    `offset`: b and d are; every pole stays within `max_radius` where given; a step must gain `tolerance` of
+    the cost."""
 
-    feedthrough: bool = False
+    feedthrough: bool | tuple[bool, ...] = False
     offset: bool = True
     max_radius: float | None = None
     max_iterations: int = 20
@@ -163,21 +164,26 @@ def _mixed(c: np.ndarray, blocks: list[tuple[int, complex]], f: np.ndarray) -> n
 def _normal_equations(
     model: Predictor, blocks, free: np.ndarray, v_all, y_all
 ) -> tuple[np.ndarray, np.ndarray]:
-    """J'J and J'e over every segment; parameters: [F G] row by row, then C and the free
-    columns of H for each output, then x0 of each segment.
+    """J'J and J'e over every segment; parameters: [F G] row by row, then C and the columns of H that are free
+    (p, r) in some row for each output, then x0 of each segment. What is not free has zeros there.
 
     With J_o = Z M_o the products over the samples, Z'Z and Z'e, are the same for every output that is
     measured at the same samples: taken once.
     """
     n, r = model.G.shape
-    p, h = len(model.C), len(free)
+    columns = np.flatnonzero(free.any(axis=0))
+    p, h = len(model.C), len(columns)
     state, output = n * (n + r), n + h
     size = state + p * output + n * len(v_all)
     JJ, Je = np.zeros((size, size)), np.zeros(size)
-    mixing = [
-        scipy.linalg.block_diag(np.kron(M, np.eye(n + r)), np.eye(output), M)
-        for M in (_mixing(c, blocks) for c in model.C)
-    ]
+    mixing = [_mixing(c, blocks) for c in model.C]
+
+    def mixed(M, rows):  # block_diag(kron(M, I), I, M) @ rows, without the zeros
+        first, last = (M @ part.reshape(n, -1) for part in (rows[:state], rows[-n:]))
+        return np.concatenate(
+            [first.reshape(state, *rows.shape[1:]), rows[state:-n], last.reshape(n, *rows.shape[1:])]
+        )
+
     for segment, (v, y) in enumerate(zip(v_all, y_all, strict=True)):
         x, predicted = respond(model, v, model.x0[segment])
         pulse = np.zeros((len(v), 1))
@@ -186,7 +192,7 @@ def _normal_equations(
             [
                 _filtered(blocks, np.hstack([x, v]), [0.0, 1.0]).reshape(len(v), state),
                 x,
-                v[:, free],
+                v[:, columns],
                 _filtered(blocks, pulse, [1.0])[:, :, 0],
             ]
         )
@@ -199,8 +205,11 @@ def _normal_equations(
                 ZZ = Z_measured.T @ Z_measured
             M = mixing[o]
             at = np.r_[0:state, state + o * output : state + (o + 1) * output, first : first + n]
-            JJ[np.ix_(at, at)] += M @ ZZ @ M.T
-            Je[at] += M @ (Z_measured.T @ e[mask, o])
+            JJ[np.ix_(at, at)] += mixed(M, mixed(M, ZZ).T)
+            Je[at] += mixed(M, Z_measured.T @ e[mask, o])
+    for o in range(p):
+        fixed = state + o * output + n + np.flatnonzero(~free[o, columns])
+        JJ[fixed], JJ[:, fixed], Je[fixed] = 0.0, 0.0, 0.0
     return JJ, Je
 
 
@@ -208,9 +217,10 @@ def _stepped(model: Predictor, step: np.ndarray, free: np.ndarray) -> Predictor:
     n, r = model.G.shape
     p, state = len(model.C), n * (n + r)
     FG = step[:state].reshape(n, n + r)
-    CH = step[state : state + p * (n + len(free))].reshape(p, n + len(free))
+    columns = np.flatnonzero(free.any(axis=0))
+    CH = step[state : state + p * (n + len(columns))].reshape(p, n + len(columns))
     H = model.H.copy()
-    H[:, free] += CH[:, n:]
+    H[:, columns] += CH[:, n:]
     x0 = step[state + CH.size :].reshape(-1, n)
     return Predictor(
         model.F + FG[:, :n],
@@ -238,8 +248,8 @@ def _cost(model: Predictor, v_all, y_all) -> float:
 def gauss_newton(
     model: Predictor, v_all, y_all, *, free: np.ndarray, admissible, max_iterations: int, tolerance: float
 ) -> tuple[Predictor, list[float]]:
-    """Levenberg-Marquardt on sum |y - ŷ|² over F, G, C, the columns
-    `free` of H and every x0; NaN in y is left out.
+    """Levenberg-Marquardt on sum |y - ŷ|² over F, G, C, the entries of H that are
+    `free` (p, r) and every x0; NaN in y is left out.
 
     The parameters are redundant (any change of state basis); the damping picks the step of least norm among
     equals. `admissible(F, G, C)` refuses steps, which is how stability is kept by construction. Stops when a
@@ -272,19 +282,20 @@ def gauss_newton(
     return model, costs
 
 
-def fit_inputs(A, C, u, y, *, feedthrough: bool, offset: bool) -> Predictor:
+def fit_inputs(A, C, u, y, *, feedthrough: bool | tuple[bool, ...], offset: bool) -> Predictor:
     """B, b, D, d and every x0 that simulate y best for given A (n, n), C (p, n): a linear least-squares
     problem (Verhaegen 1994; SLICOT IB01CD).
 
-    Returns the simulator in its block-modal basis, v = [u; 1]. b is
-    left at zero, and d too, where `offset` is False.
+    Returns the simulator in its block-modal basis, v = [u; 1]. b is left at zero, and d too, where `offset`
+    is False; rows of D that `feedthrough` does not mark are zero.
     """
     n, m, p, segments = len(A), u[0].shape[1], len(C), len(u)
+    allowed = free_entries(p, m, feedthrough, offset=offset)
     model, blocks, _ = _block_modal(
         Predictor(A, np.zeros((n, m + 1)), C, np.zeros((p, m + 1)), [np.zeros(n)] * segments)
     )
     inputs = np.arange(m + 1) if offset else np.arange(m)
-    direct = np.r_[np.arange(m) if feedthrough else [], m if offset else []].astype(int)
+    direct = np.flatnonzero(allowed.any(axis=0))
     size = n * len(inputs) + p * len(direct)
     rows, target = [], []
     for segment, (a, b) in enumerate(zip(u, y, strict=True)):
@@ -295,7 +306,9 @@ def fit_inputs(A, C, u, y, *, feedthrough: bool, offset: bool) -> Predictor:
         for o in range(p):
             J = np.zeros((T, size + n * segments))
             J[:, : n * len(inputs)] = _mixed(model.C[o], blocks, f)
-            J[:, n * len(inputs) + o * len(direct) : n * len(inputs) + (o + 1) * len(direct)] = v[:, direct]
+            J[:, n * len(inputs) + o * len(direct) : n * len(inputs) + (o + 1) * len(direct)] = (
+                v[:, direct] * allowed[o, direct]
+            )
             J[:, size + segment * n : size + (segment + 1) * n] = _mixed(model.C[o], blocks, f0)
             mask = np.isfinite(b[:, o])
             rows.append(J[mask])
@@ -308,6 +321,12 @@ def fit_inputs(A, C, u, y, *, feedthrough: bool, offset: bool) -> Predictor:
     G[:, inputs] = theta[: n * len(inputs)].reshape(n, -1)
     H[:, direct] = theta[n * len(inputs) : size].reshape(p, -1)
     return model._replace(G=G, H=H, x0=list(theta[size:].reshape(segments, n)))
+
+
+def free_entries(p: int, m: int, feedthrough: bool | tuple[bool, ...], *, offset: bool) -> np.ndarray:
+    """Which entries of [D, d] (p, m + 1) a fit may move."""
+    rows = np.broadcast_to(np.asarray(feedthrough, bool), (p,))
+    return np.column_stack([np.repeat(rows[:, None], m, axis=1), np.full(p, offset)])
 
 
 def prediction_form(plant: Plant, x0: Sequence[np.ndarray]) -> Predictor:
@@ -366,8 +385,8 @@ def refine(
     _check_start(plant, u, settings.max_radius)
     m, ahead = plant.m, criterion == "prediction"
     problem = _weighted(plant, u, y, criterion)
-    direct = np.arange(m) if settings.feedthrough else []
-    free = np.r_[direct, m if settings.offset else []].astype(int)
+    free = np.zeros(problem.start.H.shape, bool)
+    free[:, : m + 1] = free_entries(plant.p, m, settings.feedthrough, offset=settings.offset)
 
     def admissible(F, G, C):
         if ahead and np.abs(np.linalg.eigvals(F)).max() >= 1:

@@ -212,14 +212,22 @@ def _least_squares(regressors: np.ndarray, target: np.ndarray) -> np.ndarray:
     return (np.linalg.lstsq(regressors / scale, target, rcond=RANK)[0] / scale[:, None]).T
 
 
-def realise(data: Lagged, basis: np.ndarray, sample_time_s: float) -> Plant:
+def realise(
+    data: Lagged, basis: np.ndarray, sample_time_s: float, direct: Sequence[bool] | None = None
+) -> Plant:
     """The plant whose states are basis (n, past (m+p)) times the past: C, D from y, then A, B, K from the
-    states one step later, all by least squares."""
+    states one step later, all by least squares.
+
+    `direct` (p,) marks the outputs with a row of D, all where None, in a record factored with feed-through.
+    """
     n, m = len(basis), data.m
     x, x_next = data.R[:, data.lags(1, data.past)] @ basis.T, data.R[:, data.lags(0, data.past - 1)] @ basis.T
     u, y = data.R[:, data.now_u], data.R[:, data.now_y]
     CD = _least_squares(np.hstack([x, u]) if data.feedthrough else x, y)
     C, D = CD[:, :n], CD[:, n:] if data.feedthrough else np.zeros((data.p, m))
+    if data.feedthrough and direct is not None and not all(direct):
+        proper = ~np.asarray(direct, bool)
+        C[proper], D[proper] = _least_squares(x, y[:, proper]), 0.0
     if data.exact:
         # errors are rounding and tell nothing of K: the window's own predictor has the gain of y(t-1)
         AB = _least_squares(np.hstack([x, u]), x_next)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.optimize
 
+from pipeline.temperature.first_order import StepModels, of_step_responses, simc_pid
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.subspace import Segments
 from pipeline.temperature.validation import (
@@ -27,7 +28,8 @@ class Holdout(NamedTuple):
 
     simulated, ahead: predictions (T, p) of each segment, the second NaN over its start-up; fit, ahead_fit (3,
     p): value and the ends of its 90 % band; held_fit (p,): the last value seen so many steps before, held,
-    over the rows of ahead_fit. NaN where no segment outlasts the start-up.
+    over the rows of ahead_fit. NaN where no segment outlasts the start-up. free_mean_fit (3, p): of the
+    simulation with the mean of each segment's error taken off, what another ambient alone would cost.
     """
 
     simulated: list[np.ndarray]
@@ -35,12 +37,14 @@ class Holdout(NamedTuple):
     fit: np.ndarray
     ahead_fit: np.ndarray
     held_fit: np.ndarray
+    free_mean_fit: np.ndarray
 
 
 class Steps(NamedTuple):
     """Responses to unit steps, beside their bands over a family of
     plants: response, low, high (K, p, m) at samples (K,).
 
+    first_order: models of the plant's responses and the family's, (1 + family, p, m).
     gain, peak, time_constant, delay (3, p, m): value and the ends of its band. gain is the last value, peak
     the largest excursion; times are in samples, NaN where `significant` (p, m) is False: the band of the peak
     holds zero, so that not even the sign of the effect is known.
@@ -55,6 +59,20 @@ class Steps(NamedTuple):
     time_constant: np.ndarray
     delay: np.ndarray
     significant: np.ndarray
+    first_order: StepModels
+
+
+class ForbiddenGain(NamedTuple):
+    """A steady effect that physics forbids: of `input` on `output`, in °C per percent with its band, and why.
+    `certain`: the whole band is forbidden, not the value alone."""
+
+    output: str
+    input: str
+    gain: float
+    low: float
+    high: float
+    certain: bool
+    reason: str
 
 
 def held(y: np.ndarray, steps: int) -> np.ndarray:
@@ -104,8 +122,16 @@ def holdout(
     last = [
         np.where(np.isfinite(forecast), held(b, steps), np.nan) for b, forecast in zip(y, ahead, strict=True)
     ]
-    fits = [fit_with_band(y, part, block=block, rng=rng) for part in (simulations, ahead, last)]
-    return Holdout(simulations, ahead, fits[0], fits[1], fits[2][0])
+    free = [_mean_removed(b, simulated(plant, a, b, means_removed=True)) for a, b in zip(u, y, strict=True)]
+    fits = [fit_with_band(y, part, block=block, rng=rng) for part in (simulations, ahead, last, free)]
+    return Holdout(simulations, ahead, fits[0], fits[1], fits[2][0], fits[3])
+
+
+def _mean_removed(y: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+    """The prediction moved by the mean of its error, output by output."""
+    seen = np.isfinite(y)
+    error = np.where(seen, y - predicted, 0.0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
+    return predicted + error
 
 
 def residual_lags(u: Segments) -> int:
@@ -159,12 +185,41 @@ def steps(nominal: Plant, family: Sequence[Plant], longest: int, *, points: int 
         np.concatenate([np.take_along_axis(part, at, axis=0) for part in bands[:3]]),
     )
     significant = peak[1] * peak[2] > 0
-    # (1 + family, 2, p, m)
-    shapes = np.stack([two_points(step_response(plant, samples + 1)) for plant in (nominal, *family)])
+    responses = [step_response(plant, samples + 1) for plant in (nominal, *family)]
+    shapes = np.stack([two_points(part) for part in responses])  # (1 + family, 2, p, m)
     times = np.where(significant, np.concatenate([shapes[:1], np.quantile(shapes[1:], ENDS, axis=0)]), np.nan)
     grid = np.arange(0, samples + 1, -(-samples // points))
     response, low, high = (part[grid] for part in bands[:3])
-    return Steps(grid, response, low, high, gain, peak, times[:, 0], times[:, 1], significant)
+    # equal ratios: what a controller meets first counts as much as what a drift does in the end
+    ratios = np.unique(np.geomspace(1, samples, points).round().astype(int))
+    models = of_step_responses(ratios, np.stack([part[ratios] for part in responses], axis=1))
+    return Steps(grid, response, low, high, gain, peak, times[:, 0], times[:, 1], significant, models)
+
+
+# no heated part outlives it: an input whose whole range moves an output by more was not identified
+LARGEST_RISE_DEGC = 2000.0
+
+
+def forbidden_gains(
+    steps: Steps,
+    outputs: Sequence[str],
+    inputs: Sequence[str],
+    heats: Sequence[bool],
+    ranges: Sequence[float],
+) -> list[ForbiddenGain]:
+    """The effects of inputs that `heats` marks which are negative, or which over the input's range (percent)
+    are larger than `LARGEST_RISE_DEGC`."""
+    flagged = []
+    for j, name in enumerate(inputs):
+        for o, output in enumerate(outputs if heats[j] else ()):
+            gain, low, high = (float(part) for part in steps.gain[:, o, j])
+            largest = LARGEST_RISE_DEGC / ranges[j]
+            if gain < 0:
+                flagged.append(ForbiddenGain(output, name, gain, low, high, high < 0, "a heater that cools"))
+            elif gain > largest:
+                reason = f"more than {LARGEST_RISE_DEGC:g} °C over the input's range"
+                flagged.append(ForbiddenGain(output, name, gain, low, high, low > largest, reason))
+    return flagged
 
 
 def input_levels(u: Segments, *, bands: int = 8) -> np.ndarray:
@@ -260,6 +315,30 @@ def dynamics_rows(
     return columns
 
 
+def first_order_rows(
+    steps: Steps, outputs: Sequence[str], inputs: Sequence[str], sample_time_s: float
+) -> dict[str, np.ndarray | list]:
+    """A first-order model with delay for every pair, in the order of `step_rows`, with bands over the family,
+    and the PID that SIMC makes of it; missing where not even the sign of its gain is known."""
+    models, columns = steps.first_order, {"output": [o for o in outputs for _ in inputs]}
+    columns |= {"input": [*inputs] * len(outputs)}
+    banded = [
+        np.concatenate([part[:1], np.quantile(part[1:], ENDS, axis=0)]).reshape(3, -1)
+        for part in (models.gain, sample_time_s * models.time_constant, sample_time_s * models.delay)
+    ]
+    seen = (banded[0][1] * banded[0][2] > 0) & (banded[0][0] * banded[0][1] > 0)
+    columns["seen"] = seen.tolist()
+    for name, part in zip(("gain", "time_constant_s", "delay_s"), banded, strict=True):
+        shown = part if name == "gain" else np.where(seen, part, np.nan)
+        columns |= {name: shown[0], f"{name}_low": shown[1], f"{name}_high": shown[2]}
+    columns["fit_percent"] = np.where(seen, models.fit_percent[0].ravel(), np.nan)
+    pids = [
+        simc_pid(gain, tau, delay, sample_time_s=sample_time_s) if known else (np.nan,) * 3
+        for known, gain, tau, delay in zip(seen, *(part[0] for part in banded), strict=True)
+    ]
+    return columns | dict(zip(("Kp", "Ki", "Kd"), np.array(pids, float).T, strict=True))
+
+
 def pole_rows(nominal: Plant, family: Sequence[Plant]) -> dict[str, np.ndarray]:
     """Poles of the plant (member 0), largest first, and of a family; `pole` is the number of the plant's pole
     that each belongs to, -1 for one too many.
@@ -301,7 +380,11 @@ def level_rows(levels: np.ndarray, inputs: Sequence[str]) -> dict[str, np.ndarra
 def fit_figures(judged: Holdout, outputs: Sequence[str]) -> dict[str, dict | None]:
     """Fits on the hold-out by output, with their bands and what they must beat; those
     ahead are None where no segment was long enough."""
-    named = {"fit_holdout": judged.fit, "fit_holdout_ahead": judged.ahead_fit}
+    named = {
+        "fit_holdout": judged.fit,
+        "fit_holdout_free_mean": judged.free_mean_fit,
+        "fit_holdout_ahead": judged.ahead_fit,
+    }
     figures = {key: dict(zip(outputs, part[0].tolist(), strict=True)) for key, part in named.items()}
     figures |= {
         f"{key}_band": dict(zip(outputs, part[1:].T.tolist(), strict=True)) for key, part in named.items()

@@ -21,6 +21,9 @@ from pipeline.temperature.refinement import (
 )
 from pipeline.temperature.subspace import Segments, lagged, realise, subspace
 
+RESAMPLED_STEPS = (
+    1  # of Gauss-Newton a resampled record: from a consistent start one is efficient (Le Cam 1956)
+)
 QUANTILE_99 = 2.5758  # of the standard normal, two-sided
 
 
@@ -240,12 +243,11 @@ def bootstrap_spread(
 
 def _reidentified(u: Segments, y: Segments, identified, order: int) -> Plant:
     us, ys = shifted(u, y, identified.delays)
-    data = lagged(us, ys, identified.past, feedthrough=identified.feedthrough, offset=identified.offset)
-    start = stabilised(
-        realise(data, subspace(data, identified.past).basis[:order], identified.plant.sample_time_s),
-        LARGEST_RADIUS,
-    )
-    settings = FitSettings(identified.feedthrough, identified.offset, max_iterations=5)
+    direct = identified.feedthrough
+    data = lagged(us, ys, identified.past, feedthrough=any(direct), offset=identified.offset)
+    basis = subspace(data, identified.past).basis[:order]
+    start = stabilised(realise(data, basis, identified.plant.sample_time_s, direct), LARGEST_RADIUS)
+    settings = FitSettings(direct, identified.offset, max_iterations=RESAMPLED_STEPS)
     refitted = fit(identified.fit, start, us, ys, settings, gain=False)
     return with_delays(stabilised(refitted, LARGEST_RADIUS), identified.delays)
 

@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.moesp import moesp, moesp_singular_values, varx
 from pipeline.temperature.identification import Settings, identify, refit
-from pipeline.temperature.order import dead_time, with_delays
+from pipeline.temperature.order import dead_time, folds, slow_window, with_delays
 from pipeline.temperature.plant import baam, markov_parameters, plant, simulate
 from pipeline.temperature.probing import study_probe, study_signal
 from pipeline.temperature.published import K_DATA
@@ -246,12 +246,33 @@ def test_a_refit_keeps_what_was_chosen_and_uses_the_whole_record():
     np.testing.assert_array_equal(same.A, chosen.plant.A)
 
 
-def test_feed_through_is_left_to_the_data_where_asked():
+def test_feed_through_is_found_in_the_outputs_that_have_it_and_in_no_other():
     _, u, y = two_zones()
-    assert not identify([u], [y], sample_time_s=1.0, settings=Settings(feedthrough=None)).feedthrough
-    assert identify(
-        [u], [y + u @ [[0.5, 0.0], [0.0, 0.0]]], sample_time_s=1.0, settings=Settings(feedthrough=None)
-    ).feedthrough
+    assert identify([u], [y], sample_time_s=1.0).feedthrough == (False, False)
+    direct = y + u @ [[0.5, 0.0], [0.0, 0.0]]
+    for refinement in ("none", "prediction", "simulation"):
+        chosen = identify([u], [direct], sample_time_s=1.0, settings=Settings(refinement=refinement))
+        assert chosen.feedthrough == (True, False)
+        # 3,000 samples of 0.05: the sum over a step is known to some per cent
+        np.testing.assert_allclose(chosen.plant.D, [[0.5, 0.0], [0.0, 0.0]], atol=0.03)
+        assert not chosen.plant.D[1].any()
+    never = identify([u], [direct], sample_time_s=1.0, settings=Settings(feedthrough=False))
+    assert not never.plant.D.any()
+
+
+def test_of_several_recordings_whole_ones_are_left_out():
+    u, y = [np.arange(30.0)[:, None]] * 4, [np.arange(30.0)[:, None]] * 4
+    left_out = folds(u, y, 5, (0, 0, 1, 2))
+    assert [len(fold[2]) for fold in left_out] == [2, 1, 1]
+    assert [len(fold[0]) for fold in left_out] == [2, 3, 3]
+    assert len(folds(u, y, 2, (0, 1, 2, 3))) == 2  # no more than asked for
+    assert len(folds(u, y, 5, (0, 0, 0, 0))) == 5  # one recording: blocks of it
+
+
+def test_a_slow_mode_gets_a_window_that_spans_it():
+    assert slow_window(plant(np.diag([0.5, 0.99]), np.ones((2, 1)), np.ones((1, 2))), 500) == 100
+    assert slow_window(plant(np.diag([0.5, 0.99]), np.ones((2, 1)), np.ones((1, 2))), 40) == 40
+    assert slow_window(plant([[1.0]], [[1.0]], [[1.0]]), 40) == 1  # an integrator has no time constant
 
 
 def test_linear_recurrence_is_the_loop_that_it_stands_for():

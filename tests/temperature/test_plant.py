@@ -10,6 +10,7 @@ import pytest
 from pipeline.temperature import plant as plants
 from pipeline.temperature.plant import (
     Plant,
+    at_disturbances,
     baam,
     controllability,
     hold_output,
@@ -19,12 +20,42 @@ from pipeline.temperature.plant import (
     plant,
     simulate,
     spread,
+    strictly_proper,
 )
 
 # a plant with everything in it: offsets, feed-through, two inputs for one output
 SMALL = plant(
     [[0.5, 0.1], [0.0, 0.8]], [[1.0, 0.0], [0.5, 2.0]], [[1.0, 3.0]], D=[[0.25, 0.0]], b=[1.0, -1.0], d=[10.0]
 )
+
+
+def test_feed_through_as_one_sample_of_delay_answers_one_sample_late_and_is_strictly_proper():
+    rng = np.random.default_rng(3)
+    whole = plant(
+        0.9 * np.eye(2),
+        rng.standard_normal((2, 3)),
+        rng.standard_normal((2, 2)),
+        [[0.5, -1.0, 0.0], [0.0, 0.0, 0.0]],
+        [0.1, 0.2],
+        [3.0, 4.0],
+    )
+    proper, u = strictly_proper(whole), rng.standard_normal((50, 3))
+    assert not proper.D.any()
+    assert proper.n == whole.n + 1  # as many states as D has rank
+    y = simulate(proper, u, np.zeros(3))[1]
+    late = np.vstack([np.zeros((1, 3)), u[:-1]])
+    expected = simulate(whole._replace(D=np.zeros((2, 3))), u, np.zeros(2))[1] + late @ whole.D.T
+    np.testing.assert_allclose(y, expected, rtol=0, atol=1e-12)  # rounding
+    assert strictly_proper(proper) is proper
+
+
+def test_disturbances_held_at_a_level_are_part_of_the_offsets():
+    rng = np.random.default_rng(4)
+    whole = plant(0.9 * np.eye(2), rng.standard_normal((2, 3)), np.eye(2), rng.standard_normal((2, 3)))
+    u, room = rng.standard_normal((20, 2)), 21.0
+    told = simulate(whole, np.hstack([u, np.full((20, 1), room)]), np.zeros(2))[1]
+    untold = simulate(at_disturbances(whole, 2, np.array([room])), u, np.zeros(2))[1]
+    np.testing.assert_allclose(untold, told, rtol=1e-12)  # rounding
 
 
 def test_the_study_s_machine_is_the_one_of_its_tables(shared):

@@ -76,7 +76,10 @@ def read_learned(model_path: str, spread_path: str, weights_path: str, learned_f
         if artifacts.exists(kernel_path)
         else None,
         {name: np.array(w) for name, w in artifacts.read_json(weights_path)["practical"].items()},
-        plant.restored(artifacts.read_arrays(spread_path, "spread", 1)),
+        [
+            plant.strictly_proper(one)
+            for one in plant.restored(artifacts.read_arrays(spread_path, "spread", 1))
+        ],
     )
 
 

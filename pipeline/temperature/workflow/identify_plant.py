@@ -9,7 +9,7 @@ from pipeline.store import artifacts
 from pipeline.store.tables import Schema
 from pipeline.temperature import identification, order, plant, trust, validation
 from pipeline.temperature.workflow import tables
-from pipeline.temperature.workflow.record import read_record
+from pipeline.temperature.workflow.record import read_recordings
 from pipeline.temperature.workflow.settings import IdentifyPlant
 from pipeline.temperature.workflow.settings import Plant as Machine
 
@@ -27,10 +27,12 @@ class IdentifiedPlant(NamedTuple):
 
 
 class _Record(NamedTuple):
-    """The record as it can be identified; `recorded` samples before any were cut, and what was clipped."""
+    """The record as it can be identified, u with disturbances after the inputs; the recording of each
+    segment; `recorded` samples before any were cut, and what was clipped."""
 
     u: Segments
     y: Segments
+    recordings: tuple[int, ...]
     recorded: int
     notes: list[str]
 
@@ -50,21 +52,16 @@ class _Judgement(NamedTuple):
 
 def identified(settings: IdentifyPlant, machine: Machine, path: str) -> IdentifiedPlant:
     """The plant of the record in `path`. Raises ValueError where the record cannot tell it."""
-    inputs = [i.name for i in machine.inputs]
+    acting, inputs = [signal.name for signal in machine.acting], len(machine.inputs)
     record = _read(settings, machine, path)
     first, last = _parted(record.u, record.y, settings.holdout_share)
-    choices = identification.Settings(
-        order=settings.order or None,
-        offset=settings.offset,
-        refinement=settings.refinement,
-        max_order=settings.max_order,
-    )
+    asked = choices(settings)._replace(recordings=record.recordings, inputs=inputs)
     with artifacts.about(path):
         chosen = identification.identify(
-            *first, sample_time_s=machine.sample_time_s, settings=choices, names=inputs
+            *first, sample_time_s=machine.sample_time_s, settings=asked, names=acting
         )
     judgement = _judged(settings, chosen, first, last)
-    fitted = identification.refit(record.u, record.y, chosen, names=inputs)
+    fitted = identification.refit(record.u, record.y, chosen, names=acting)
     if not (observed := plant.observability(fitted.plant)).passed:
         raise ValueError(f"{path}: {observed.reason}")
     family = validation.bootstrap_spread(
@@ -75,25 +72,46 @@ def identified(settings: IdentifyPlant, machine: Machine, path: str) -> Identifi
         order=fitted.order + 1,
         rng=np.random.default_rng(settings.seed),
     )
+    # controllers are not told the disturbances: at their mean they are part of the offsets
+    level = np.vstack(record.u).mean(axis=0)[inputs:]
+    controlled, *family = (plant.at_disturbances(one, inputs, level) for one in (fitted.plant, *family))
+    steps = trust.steps(controlled, family, max(map(len, record.u)))
     page_tables = {
         "order": (tables.ORDER, identification.rows(chosen)),
         **_judgement_tables(machine, last[1], judgement),
-        **_model_tables(machine, record.u, fitted.plant, family),
+        **_model_tables(machine, record.u, controlled, family, steps),
     }
-    metrics = _metrics(settings, machine, record, chosen, fitted, judgement)
-    return IdentifiedPlant(fitted.plant, family, page_tables, metrics)
+    metrics = _metrics(settings, machine, record, chosen, fitted, judgement) | _warnings(
+        machine, fitted, steps
+    )
+    return IdentifiedPlant(controlled, family, page_tables, metrics)
+
+
+def choices(settings: IdentifyPlant) -> identification.Settings:
+    """What the stage gives, and what it leaves to the data."""
+    return identification.Settings(
+        order=settings.order or None,
+        feedthrough=None if settings.feedthrough == "chosen" else False,
+        offset=settings.offset,
+        refinement=settings.refinement,
+        max_order=settings.max_order,
+    )
 
 
 def _read(settings: IdentifyPlant, machine: Machine, path: str) -> _Record:
-    recorded = read_record(path, machine.inputs, machine.outputs)
-    u, y = identification.gapless(*recorded)
-    inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
+    u, y, names = read_recordings(path, machine.acting, machine.outputs)
+    recorded = sum(map(len, u))
+    pieces = [identification.gapless([a], [b]) for a, b in zip(u, y, strict=True)]
+    order = {name: k for k, name in enumerate(dict.fromkeys(names))}
+    recordings = tuple(order[name] for name, piece in zip(names, pieces, strict=True) for _ in piece[0])
+    u, y = [a for piece in pieces for a in piece[0]], [b for piece in pieces for b in piece[1]]
+    acting, outputs = [s.name for s in machine.acting], [o.name for o in machine.outputs]
     with artifacts.about(path):
-        identification.check_inputs(u, offset=settings.offset, names=inputs)
+        identification.check_inputs(u, offset=settings.offset, names=acting)
         identification.check_outputs(y, names=outputs)
-    limits = tuple(zip(*((i.low, i.high) for i in machine.inputs), strict=True))
-    u, clipped = identification.within_limits(u, limits, names=inputs)
-    return _Record(u, y, sum(map(len, recorded[0])), clipped)
+    limits = [(i.low, i.high) for i in machine.inputs] + [(-np.inf, np.inf)] * len(machine.disturbances)
+    u, clipped = identification.within_limits(u, tuple(zip(*limits, strict=True)), names=acting)
+    return _Record(u, y, recordings, recorded, clipped)
 
 
 def _judged(
@@ -117,7 +135,7 @@ def _judged(
 def _judgement_tables(
     machine: Machine, measured: Segments, judgement: _Judgement
 ) -> dict[str, tuple[Schema, dict[str, Any]]]:
-    inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
+    inputs, outputs = [s.name for s in machine.acting], [o.name for o in machine.outputs]
     ahead = trust.holdout_rows(measured, judgement.holdout, outputs, machine.sample_time_s)
     return {
         "holdout": (tables.holdout(machine.outputs), ahead),
@@ -126,15 +144,16 @@ def _judgement_tables(
 
 
 def _model_tables(
-    machine: Machine, u: Segments, fitted: plant.Plant, family: list[plant.Plant]
+    machine: Machine, u: Segments, fitted: plant.Plant, family: list[plant.Plant], steps: trust.Steps
 ) -> dict[str, tuple[Schema, dict[str, Any]]]:
     inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
-    steps = trust.steps(fitted, family, max(map(len, u)))
+    shown, moved = (steps, outputs, inputs, machine.sample_time_s), [a[:, : len(inputs)] for a in u]
     return {
-        "steps": (tables.STEPS, trust.step_rows(steps, outputs, inputs, machine.sample_time_s)),
-        "dynamics": (tables.DYNAMICS, trust.dynamics_rows(steps, outputs, inputs, machine.sample_time_s)),
+        "steps": (tables.STEPS, trust.step_rows(*shown)),
+        "dynamics": (tables.DYNAMICS, trust.dynamics_rows(*shown)),
+        "first_order": (tables.FIRST_ORDER, trust.first_order_rows(*shown)),
         "poles": (tables.POLES, trust.pole_rows(fitted, family)),
-        "levels": (tables.LEVELS, trust.level_rows(trust.input_levels(u), inputs)),
+        "levels": (tables.LEVELS, trust.level_rows(trust.input_levels(moved), inputs)),
     }
 
 
@@ -147,12 +166,14 @@ def _metrics(
     judgement: _Judgement,
 ) -> dict[str, Any]:
     holdout, residuals, excitation, holdout_samples = judgement
-    inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
+    inputs, outputs = [s.name for s in machine.acting], [o.name for o in machine.outputs]
     return {
         "order": fitted.order,
         "order_tolerance_percent": 100 * order.WORTH_A_STATE,
         "past": fitted.past,
         "fit": fitted.fit,
+        "feedthrough": dict(zip(outputs, fitted.feedthrough, strict=True)),
+        "validation": "recordings" if len(set(record.recordings)) > 1 else "blocks",
         "rows": fitted.rows,
         "dropped_rows": fitted.dropped_rows,
         "samples": record.recorded,
@@ -166,6 +187,26 @@ def _metrics(
         "controllable": plant.controllability(fitted.plant).passed,
         "largest_pole": np.abs(np.linalg.eigvals(fitted.plant.A)).max(),
         "advice": validation.advice(residuals, excitation, holdout.fit[0], outputs=outputs, inputs=inputs),
+    }
+
+
+def _warnings(machine: Machine, fitted: identification.Identified, steps: trust.Steps) -> dict[str, Any]:
+    """Whether the record was taken in closed loop, and the gains that physics forbids."""
+    names, feedback = [i.name for i in machine.inputs], fitted.feedback
+    forbidden = trust.forbidden_gains(
+        steps,
+        [o.name for o in machine.outputs],
+        names,
+        [i.heats for i in machine.inputs],
+        [i.high - i.low for i in machine.inputs],
+    )
+    answers = [] if feedback is None else feedback.p_value.tolist()
+    return {
+        "closed_loop": {
+            "closed": feedback is not None and feedback.closed,
+            "p_value": dict(zip(names, answers, strict=False)),
+        },
+        "forbidden_gains": [gain._asdict() for gain in forbidden],
     }
 
 

@@ -46,7 +46,7 @@ class IngestSpec(NamedTuple):
     max_gap_s: float
 
     def sources(self) -> list[Source]:
-        signals = [*self.machine.inputs, *self.machine.outputs]
+        signals = [*self.machine.acting, *self.machine.outputs]
         unknown = sorted(set(self.mapping) - {signal.name for signal in signals})
         if unknown:
             raise ValueError(
@@ -163,9 +163,9 @@ def _one(path: Path, shown: Path, folder: Path, key: str, spec: IngestSpec, memo
     """Read, resample and flag one recording into the memo, under the path that is
     `shown`; the reason why it cannot be, or an empty text."""
     name = shown.relative_to(folder).as_posix()
-    inputs, outputs = [s.name for s in spec.machine.inputs], [s.name for s in spec.machine.outputs]
+    inputs, outputs = [s.name for s in spec.machine.acting], [s.name for s in spec.machine.outputs]
     units, limits = (
-        {s.name: s.unit for s in [*spec.machine.inputs, *spec.machine.outputs]},
+        {s.name: s.unit for s in [*spec.machine.acting, *spec.machine.outputs]},
         {s.name: (s.low, s.high) for s in spec.machine.inputs},
     )
     try:
@@ -203,7 +203,7 @@ def _one(path: Path, shown: Path, folder: Path, key: str, spec: IngestSpec, memo
     }
     artifacts.write_table(
         memo / f"{key}.record.parquet",
-        tables.record(spec.machine.inputs, spec.machine.outputs),
+        tables.record(spec.machine.acting, spec.machine.outputs),
         _columns(name, table),
     )
     artifacts.write_table(memo / f"{key}.quality.parquet", tables.QUALITY, quality)
@@ -224,7 +224,7 @@ def _remembered(
         if artifacts.read_json(memo / f"{key}.json") != _digests(memo, key):
             return None
         record = artifacts.read_table(
-            memo / f"{key}.record.parquet", tables.record(machine.inputs, machine.outputs)
+            memo / f"{key}.record.parquet", tables.record(machine.acting, machine.outputs)
         )
         return record, artifacts.read_table(memo / f"{key}.quality.parquet", tables.QUALITY)
     except (OSError, ValueError):
@@ -260,7 +260,7 @@ def collect(results: Sequence[Result], machine: Plant, *, strict: bool) -> tuple
             + (f" ({len(broken)} of {len(results)} recordings are broken)" if len(results) > 1 else "")
         )
     good = [result for result in results if not result.reason]
-    schema = tables.record(machine.inputs, machine.outputs)
+    schema = tables.record(machine.acting, machine.outputs)
     record = {
         column.name: np.concatenate([result.record[column.name] for result in good])
         for column in schema.columns

@@ -28,7 +28,9 @@ def learned(settings: LearnKernel, machine: Plant, tracking: Tracking, panel: Pa
         np.full(len(machine.inputs), tracking.yardstick_r),
         tracking.gamma,
     )
-    u, y = read_record(path, machine.inputs, machine.outputs)
+    u, y = read_record(path, machine.acting, machine.outputs)
+    # window and kernel know inputs alone: what disturbances do counts as noise
+    u = [a[:, : len(machine.inputs)] for a in u]
     with artifacts.about(path):
         identification.check_inputs(u, offset=settings.offset, names=[i.name for i in machine.inputs])
         identification.check_outputs(y, names=[o.name for o in machine.outputs])

@@ -32,7 +32,15 @@ def read_record(
     path: str | Path, inputs: Sequence, outputs: Sequence
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """The record of ingest as segments u (T, m) and y (T, p), masked samples as NaN; a
-    segment ends at a gap and at the end of a recording."""
+    segment ends at a gap and at the end of a recording. `inputs` has what acts on the outputs, disturbances
+    after the inputs."""
+    return read_recordings(path, inputs, outputs)[:2]
+
+
+def read_recordings(
+    path: str | Path, inputs: Sequence, outputs: Sequence
+) -> tuple[list[np.ndarray], list[np.ndarray], list[str]]:
+    """As `read_record`, and the recording that each segment is from."""
     table = artifacts.read_table(path, tables.record(inputs, outputs))
     columns = [
         np.stack([np.where(table[f"{s.name}_masked"], np.nan, table[s.name]) for s in signals], axis=1)
@@ -42,4 +50,5 @@ def read_record(
         table["segment"][1:] != table["segment"][:-1]
     )
     starts = np.flatnonzero(first) + 1
-    return np.split(columns[0], starts), np.split(columns[1], starts)
+    recordings = [str(table["recording"][start]) for start in np.r_[0, starts]]
+    return np.split(columns[0], starts), np.split(columns[1], starts), recordings

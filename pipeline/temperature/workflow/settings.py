@@ -31,10 +31,12 @@ class Signal(Section):
 
 
 class Input(Signal):
-    """A heater or the motor; low and high are the limits of what the machine can give, in percent."""
+    """A heater or the motor; low and high are the limits of what the machine can give, in percent. `heats`:
+    no output can fall for good when it is raised."""
 
     low: float = Field(ge=-100, le=100)
     high: float = Field(ge=-100, le=100)
+    heats: bool = False
 
     @pydantic.model_validator(mode="after")
     def _ordered(self):
@@ -64,21 +66,28 @@ class Output(Signal):
 
 
 class Plant(Section):
-    """Section `plant`: the machine's signals and its sample time."""
+    """Section `plant`: the machine's signals and its sample time. `disturbances` are recorded signals that
+    act on the outputs and that no controller moves: fan, feed, a sensor of the room."""
 
     inputs: list[Input] = Field(min_length=1, max_length=32)
+    disturbances: list[Signal] = Field(default=[], max_length=16)
     outputs: list[Output] = Field(min_length=1, max_length=32)
     sample_time_s: float = Field(gt=0, le=3600)
 
     @pydantic.model_validator(mode="after")
     def _unique(self):
-        names = [signal.name for signal in [*self.inputs, *self.outputs]]
+        names = [signal.name for signal in [*self.acting, *self.outputs]]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(
                 f"names {', '.join(twice)} more than once; give every input and output a name of its own"
             )
         return self
+
+    @property
+    def acting(self) -> list[Signal]:
+        """What acts on the outputs: inputs, then disturbances."""
+        return [*self.inputs, *self.disturbances]
 
 
 def check_output_limits(machine: Plant, source: str) -> None:
@@ -174,6 +183,7 @@ class IdentifyPlant(Section):
     order: int = Field(ge=0, le=60)
     max_order: int = Field(ge=1, le=60)
     offset: bool
+    feedthrough: Literal["chosen", "none"]
     refinement: Literal["none", "prediction", "simulation", "validated"]
     holdout_share: float = Field(gt=0, lt=0.9)
     ahead_steps: int = Field(ge=1, le=10_000)

@@ -276,6 +276,35 @@ DYNAMICS = Schema(
     ),
 )
 
+FIRST_ORDER = Schema(
+    "first_order",
+    1,
+    (
+        Column("output", TEXT, NONE, "output that answers"),
+        Column("input", TEXT, NONE, "input that steps"),
+        Column("seen", BOOL, NONE, "not even the sign of the effect is known where this is false"),
+        *(
+            Column(f"{name}{end}", FLOAT, unit, meaning + of, low, nullable=unit == "s")
+            for name, unit, meaning, low in (
+                ("gain", "degC per percent", "K of K e^(-theta s) / (tau s + 1)", None),
+                ("time_constant_s", "s", "tau", 0),
+                ("delay_s", "s", "theta", 0),
+            )
+            for end, of in (
+                ("", ""),
+                ("_low", ", lower end of its 90 % band"),
+                ("_high", ", upper end of its 90 % band"),
+            )
+        ),
+        Column(
+            "fit_percent", FLOAT, "percent", "of this model's step response to the model's", nullable=True
+        ),
+        Column("Kp", FLOAT, "percent per degC", "PID by SIMC: proportional gain", nullable=True),
+        Column("Ki", FLOAT, "percent per degC s", "PID by SIMC: integral gain", nullable=True),
+        Column("Kd", FLOAT, "percent s per degC", "PID by SIMC: derivative gain", nullable=True),
+    ),
+)
+
 POLES = Schema(
     "poles",
     1,

@@ -35,7 +35,8 @@ class Search(NamedTuple):
 def tuned(
     settings: TuneWeights, machine: Machine, tracking: Tracking, panel: Panel, model: plant.Plant
 ) -> Tuned:
-    """Both searches; `model` is the identified plant."""
+    """Both searches; `model` is the identified plant, its feed-through one sample late."""
+    model = plant.strictly_proper(model)
     training, reference = panel.training, np.array([o.reference for o in machine.outputs])
     scenarios = scorecard.panel(
         plant.spread(model, input_gain=panel.input_gain, extra_heat_loss=panel.extra_heat_loss_per_step),
