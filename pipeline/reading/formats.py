@@ -114,6 +114,11 @@ class Growing:
         self.count = 0
         self._columns = [np.empty(max(expected, 1), kind) for kind in kinds]
 
+    def expect(self, size: int) -> None:
+        """Room for `size` rows at once, so that growing moves nothing."""
+        if size > len(self._columns[0]):
+            self._resize(size)
+
     def append(self, *parts: np.ndarray) -> None:
         end = self.count + len(parts[0])
         if end > len(self._columns[0]):

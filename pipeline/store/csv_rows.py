@@ -13,11 +13,21 @@ import numpy as np
 from pipeline.reading.signals import Note
 
 COMMENT = ("#", "%", "//")
-OPENING_BYTES = 1 << 16
+OPENING_BYTES, LINES_SHOWN = 1 << 16, 400
 _NUMBER = {
     decimal: re.compile(rf"\s*[+-]?(\d+({mark}\d*)?|{mark}\d+)([eE][+-]?\d+)?\s*$")
     for decimal, mark in ((".", r"\."), (",", ","))
 }
+# digits in groups of three, 1,234.5 and 1 234,5 and 1'234.5, by the mark of the decimals
+_GROUPED = {
+    decimal: re.compile(
+        rf"\s*[+-]?\d{{1,3}}(?P<mark>[ '\u2019\xa0\u202f{other}])\d{{3}}((?P=mark)\d{{3}})*({mark}\d*)?\s*$"
+    )
+    for decimal, mark, other in ((".", r"\.", ","), (",", ",", "."))
+}
+# one and a fraction, or a thousand: nothing in the field tells
+_AMBIGUOUS = re.compile(r"\s*[+-]?[1-9]\d{0,2}[.,]\d{3}\s*$")
+_UNGROUPED = re.compile(r"\s*[+-]?\d{4,}")
 # a number with its unit, 21.5 °C: it shows where the table is, and is refused with its line when it is read
 _QUANTITY = re.compile(r"\s*[+-]?\d[\d.,]*\s*(%|°\s?[CFK]|[a-zA-Z]{1,3}(/[a-zA-Z]{1,3})?)$")
 # text has tabs, line ends and form feeds, and sometimes the end mark of an old system; other control
@@ -45,6 +55,9 @@ class CsvLayout(NamedTuple):
     units: list[str]
     skip: int
     notes: list[Note]
+    # whether a field tells the decimal mark from a mark between thousands, and whether its owner declared it
+    decided: bool = True
+    declared: bool = False
 
 
 class Opening(NamedTuple):
@@ -59,17 +72,22 @@ class Opening(NamedTuple):
     notes: list[Note]
 
 
-def opening(path: Path) -> Opening:
-    """Encoding, delimiter, decimal mark and first lines of a text file. Raises ValueError for a binary
-    file."""
+def opening(path: Path, decimal: str = "") -> Opening:
+    """Encoding, delimiter, decimal mark (`decimal`, or the likely one) and first lines of a text file.
+
+    Raises ValueError for a binary file.
+    """
     with path.open("rb") as stream:
         # zeros behind the text are what a file system leaves after a power failure
         start = stream.read(OPENING_BYTES).rstrip(b"\0")
     encoding, notes = _encoding(path, start)
-    lines = start.decode(encoding, errors="replace").splitlines()[: 400 if len(start) < OPENING_BYTES else -1]
+    # as csv counts lines: form feeds and the like end none
+    lines = re.split("\r\n|\r|\n", start.decode(encoding, errors="replace"))
+    lines = lines[: -1 if not lines[-1] or len(start) >= OPENING_BYTES else None][:LINES_SHOWN]
     remark = [line.lstrip().startswith(COMMENT) for line in lines]
     delimiter, decimal = _delimiter(
-        [line for line, is_remark in zip(lines, remark, strict=True) if line.strip() and not is_remark]
+        [line for line, is_remark in zip(lines, remark, strict=True) if line.strip() and not is_remark],
+        (decimal,) if decimal else (".", ","),
     )
     rows = [
         _split(line.lstrip("#% ") if is_remark else line, delimiter)
@@ -105,7 +123,44 @@ def is_number(field: str, decimal: str) -> bool:
 
 
 def is_quantity(field: str, decimal: str) -> bool:
-    return is_number(field, decimal) or bool(_QUANTITY.match(field))
+    return is_number(field, decimal) or bool(_QUANTITY.match(field) or _GROUPED[decimal].match(field))
+
+
+def is_ambiguous(field: str) -> bool:
+    """Whether a field is 1,000 or 1.000 and the like: one with three decimals, or a thousand."""
+    return bool(_AMBIGUOUS.match(field))
+
+
+def decimal_mark(field: str) -> str:
+    """The decimal mark that a field gives away, "" for none: 1,5 and 0,500 and 1.234,5 do, 1,500 and 7 do
+    not."""
+    if is_ambiguous(field):
+        return ""
+    for decimal in (".", ","):
+        if decimal in field and (is_number(field, decimal) or _proves_groups(field, decimal)):
+            return decimal
+    if (grouped := re.match(r"\s*[+-]?\d{1,3}(?:([.,])\d{3}){2,}\s*$", field)) is not None:
+        return "," if grouped[1] == "." else "."
+    return ""
+
+
+def _proves_groups(field: str, decimal: str) -> bool:
+    """Whether a field can only be read as digits in groups: 1,234.5, 1,234,567 or 1'234, but not 1,234."""
+    return bool(_GROUPED[decimal].match(field)) and not is_ambiguous(field)
+
+
+def column_groups(path: Path, layout: CsvLayout, place: int) -> str:
+    """The mark between thousands of a whole column, "" where its numbers are not all written in one manner or
+    nothing proves it."""
+    marks, proven = set(), layout.declared
+    for _, row in rows(path, layout):
+        field = row[place].strip() if place < len(row) else ""
+        if grouped := _GROUPED[layout.decimal].match(field):
+            marks.add(grouped["mark"])
+            proven = proven or _proves_groups(field, layout.decimal)
+        elif is_number(field, layout.decimal) and _UNGROUPED.match(field):
+            return ""
+    return marks.pop() if proven and len(marks) == 1 else ""
 
 
 def _encoding(path: Path, start: bytes) -> tuple[str, list[Note]]:
@@ -132,11 +187,11 @@ def _encoding(path: Path, start: bytes) -> tuple[str, list[Note]]:
     return "utf-8", []
 
 
-def _delimiter(lines: Sequence[str]) -> tuple[str, str]:
+def _delimiter(lines: Sequence[str], decimals: Sequence[str]) -> tuple[str, str]:
     """The delimiter and decimal mark that make most fields numbers. Of equal ones, those that leave the
     fewest other fields are taken; the blank is tried last."""
-    best, choice = (0.0, 0.0), (",", ".")
-    for delimiter, decimal in itertools.product((",", ";", "\t", "|", " "), (".", ",")):
+    best, choice = (0.0, 0.0), (",", decimals[0])
+    for delimiter, decimal in itertools.product((",", ";", "\t", "|", " "), decimals):
         fields = [field for line in lines[:50] for field in _split(line, delimiter)]
         quantities = sum(is_quantity(field, decimal) for field in fields)
         score = (quantities, quantities / max(len(fields), 1))
@@ -164,6 +219,7 @@ LONGEST_TAIL = 20
 
 def rows(path: Path, layout: CsvLayout) -> Iterator[tuple[int, list[str]]]:
     """(line, fields) of the rows of data, without blank lines and comments."""
+    line = 0
     with path.open(encoding=layout.encoding, newline="") as stream:
         try:
             if layout.delimiter == " ":
@@ -186,7 +242,8 @@ def rows(path: Path, layout: CsvLayout) -> Iterator[tuple[int, list[str]]]:
             ) from None
         except csv.Error as error:
             raise ValueError(
-                f"{path}: a line cannot be split into columns ({error}); save the file again as plain CSV"
+                f"{path}: line {line + 1} cannot be split into columns ({error}), as after a quotation mark "
+                "that is never closed; mend that line, or save the file again as plain CSV"
             ) from None
 
 
@@ -245,29 +302,51 @@ def _unsound(line: int, row: list[str], layout: CsvLayout, clock: "Clock | None"
 
 
 def floats(
-    path: Path, name: str, fields: list[str], decimal: str, lines: list[int], switches: dict[str, set[str]]
+    path: Path,
+    name: str,
+    fields: list[str],
+    decimal: str,
+    lines: list[int],
+    switches: dict[str, set[str]],
+    grouping: Callable[[str], str] | None = None,
 ) -> np.ndarray:
+    """The numbers of a column's fields, NaN for a word that says there is none.
+
+    Words of a switch are counted in `switches`. `grouping` gives a column's mark between thousands. Raises
+    ValueError with the line of a field that is no number.
+    """
     try:
-        if decimal == ".":
+        if decimal == "." and not any("_" in field for field in fields):
             return np.array(list(map(float, fields)))
-        if not any("." in field for field in fields):
+        if decimal == "," and not any("." in field or "_" in field for field in fields):
             return np.array([float(field.replace(",", ".")) for field in fields])
     except ValueError:
         pass  # one by one, which names the line
     return np.array(
         [
-            _float(path, name, field, decimal, line, switches)
+            _float(path, name, field, decimal, line, switches, grouping)
             for field, line in zip(fields, lines, strict=True)
         ]
     )
 
 
 def _float(
-    path: Path, name: str, field: str, decimal: str, line: int, switches: dict[str, set[str]]
+    path: Path,
+    name: str,
+    field: str,
+    decimal: str,
+    line: int,
+    switches: dict[str, set[str]],
+    grouping: Callable[[str], str] | None,
 ) -> float:
     plain = field.strip()
-    if is_number(plain, decimal):
-        return float(plain.replace(",", "."))
+    # 1.5D+02, as Fortran writes
+    scientific = re.sub(r"(?<=[\d.,])[dD](?=[+-]?\d+$)", "e", plain)
+    if is_number(scientific, decimal):
+        return float(scientific.replace(",", "."))
+    grouped = _GROUPED[decimal].match(plain)
+    if grouped and grouping is not None and grouping(name) == grouped["mark"]:
+        return float(plain.replace(grouped["mark"], "").replace(",", "."))
     word = plain.casefold()
     if word in MISSING:
         return np.nan
@@ -282,4 +361,7 @@ def _float(
     elif re.fullmatch(r"[+-]?[\d.,\s']+", plain):
         mark = "a point" if decimal == "." else "a comma"
         remedy = f"write the numbers without marks between thousands, with {mark} before the decimals"
+        if is_ambiguous(plain):
+            one, thousand = plain.replace(",", "."), re.sub("[.,]", "", plain)
+            remedy = f"it may be {one} or {thousand}: declare ingest.decimal, or {remedy}"
     raise ValueError(f"{path}: line {line}, column {name} should be a number but is {plain[:40]!r}; {remedy}")
