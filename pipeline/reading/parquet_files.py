@@ -7,6 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from pipeline.reading.arrow_arrays import numbers
 from pipeline.reading.formats import (
     Column,
     Columns,
@@ -142,26 +143,10 @@ def _array(path: Path, name: str, column: pa.ChunkedArray, clock: str) -> np.nda
         if column.null_count:
             raise ValueError(f"{path}: time {name} is missing in {column.null_count} rows; remove them")
         instants = column.cast(pa.timestamp("ns", column.type.tz)).cast(pa.int64())
-        return _numbers(instants, np.int64)
+        return numbers(instants.chunk(0), np.int64)
     if name == clock and not _is_numeric(column.type):
         raise ValueError(
             f"{path}: time {name} should be seconds or a timestamp but is of type {column.type}; convert it, "
             "or name another column"
         )
-    return _numbers(column.cast(pa.float64(), safe=False), np.float64)
-
-
-def _numbers(column: pa.ChunkedArray, kind: type) -> np.ndarray:
-    """The values of a column, NaN for null. (to_numpy and fill_null would load pandas, which takes
-    longer.)"""
-    parts = [np.empty(0, kind)]
-    for chunk in column.chunks:
-        valid, content = chunk.buffers()
-        part = np.frombuffer(content, kind)[chunk.offset : chunk.offset + len(chunk)]
-        if chunk.null_count:
-            bits = np.unpackbits(np.frombuffer(valid, np.uint8), bitorder="little")[
-                chunk.offset : chunk.offset + len(chunk)
-            ]
-            part = np.where(bits.astype(bool), part, np.nan)
-        parts.append(part)
-    return np.concatenate(parts)
+    return numbers(column.cast(pa.float64(), safe=False).chunk(0), np.float64)

@@ -141,16 +141,19 @@ def _clocks(
 
 
 def _pieces(raw: Raw, clocks: Sequence[_Clock], sample_time_s: float) -> list[tuple[float, float]]:
-    """Stretches (start, end) in which every clock runs without a gap."""
-    pieces = [(-np.inf, np.inf)]
+    """Stretches (start, end) in which every clock runs without a gap, and none had started over."""
+    pieces, breaks = [(-np.inf, np.inf)], np.array(raw.breaks)
     for clock in clocks:
-        cuts = np.flatnonzero(np.diff(clock.time_s) > clock.gap_limit_s)
+        behind = np.searchsorted(breaks, clock.time_s, side="right")
+        cuts = np.flatnonzero((np.diff(clock.time_s) > clock.gap_limit_s) | (np.diff(behind) > 0))
         starts, ends = (
             clock.time_s[np.r_[0, cuts + 1]],
             clock.time_s[np.r_[cuts, len(clock.time_s) - 1]].astype(float),
         )
         if np.isinf(clock.gap_limit_s):
-            ends[-1] = np.inf  # the last event holds on
+            # the last event holds on, up to where the clock starts over
+            until = np.nextafter(np.r_[breaks, np.inf], -np.inf)
+            ends = until[behind[np.r_[cuts, len(behind) - 1]]]
         pieces = _common(
             pieces, list(zip(starts.tolist(), ends.tolist(), strict=True)), sample_time_s * ON_GRID
         )
