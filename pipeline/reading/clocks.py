@@ -105,14 +105,13 @@ def _starting_over(group: Columns, notes: list[Note], may_restart: bool) -> tupl
     if not may_restart or not len(starts):
         return time, none
     interval = _interval(time)
-    ends, latest, restarts = np.r_[starts[1:], len(time)], time[: starts[0]].max(), []
+    ends, first, latest, restarts = np.r_[starts[1:], len(time)], time[0], time[starts[0] - 1], []
     for start, end in zip(starts, ends, strict=True):
         run = time[start:end]
-        late = int(np.searchsorted(run, latest))
         # late rows are a few, and soon followed by the one that was due
-        if late > LATEST_ROWS or latest - run[0] > 2 * LATEST_ROWS * interval:
+        if run[0] <= first or np.searchsorted(run, latest) > LATEST_ROWS:
             restarts.append(int(start))
-            latest = run[-1]
+            first, latest = run[0], run[-1]
         else:
             latest = max(latest, run[-1])
     if not restarts or len(time) <= OTHER_DEVICE_RUN * (len(restarts) + 1):
@@ -194,8 +193,10 @@ def _forward_rows(group: Columns, notes: list[Note]) -> np.ndarray:
     many would move or be left out."""
     time, rows = group.time, np.arange(len(group.time))
     order = rows
-    late = np.flatnonzero(time < np.maximum.accumulate(time))
-    if len(late) and _few(len(late), len(time)):
+    behind = np.maximum.accumulate(time) - time
+    late = np.flatnonzero(behind > 0)
+    near = behind.max() <= 2 * LATEST_ROWS * _interval(time)
+    if len(late) and near and _few(len(late), len(time)):
         order = np.argsort(time, kind="stable")
         notes.append(_note("sorted", late, group.place, f"{len(late)} rows came late and were sorted back"))
     if (time[order][1:] < time[order][:-1]).any():

@@ -15,6 +15,7 @@ from pipeline.reading.formats import (
     Column,
     Columns,
     Growing,
+    check_no_counter,
     column_place,
     date_column,
     every,
@@ -90,6 +91,8 @@ def read_csv(path: Path, wanted: Sequence[str], time: str, decimal: str = "") ->
         values, lines = _rows_one_by_one(path, layout, places, wanted, clocks, notes)
         count, place = len(lines), lambda i: f"line {lines[i]}"
     times, zone = clocks.finished(notes) if clocks else (np.arange(count) * interval, "")
+    if clocks and clocks.numeric and not time:
+        check_no_counter(path, clock, times)
     columns_forward, turned = forward(Columns("rows", times, values, place, zone))
     return columns_forward, notes + turned
 

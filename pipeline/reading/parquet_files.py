@@ -12,6 +12,7 @@ from pipeline.reading.formats import (
     Column,
     Columns,
     Growing,
+    check_no_counter,
     column_place,
     every,
     forward,
@@ -19,6 +20,7 @@ from pipeline.reading.formats import (
     seconds,
     time_column,
 )
+from pipeline.reading.instants import instants
 from pipeline.reading.signals import Note
 
 ROWS_AT_ONCE = 50_000
@@ -46,7 +48,13 @@ def _flat(table: pa.Table) -> pa.Table:
     return table
 
 
+def _plain(kind: pa.DataType) -> pa.DataType:
+    """The type of a column's values; those of a category are in its dictionary."""
+    return kind.value_type if pa.types.is_dictionary(kind) else kind
+
+
 def _is_numeric(kind: pa.DataType) -> bool:
+    kind = _plain(kind)
     return (
         pa.types.is_integer(kind)
         or pa.types.is_floating(kind)
@@ -63,11 +71,22 @@ def parquet_columns(path: Path) -> list[Column]:
             "number"
             if _is_numeric(field.type)
             else "time"
-            if pa.types.is_timestamp(field.type)
+            if _is_stamp(field.type)
+            else "duration"
+            if pa.types.is_duration(field.type)
             else str(field.type)
         )
         columns.append(Column(name, kind, (field.metadata or {}).get(b"unit", b"").decode(errors="replace")))
     return columns
+
+
+def _is_stamp(kind: pa.DataType) -> bool:
+    return pa.types.is_timestamp(kind) or pa.types.is_date(kind)
+
+
+def _is_text(kind: pa.DataType) -> bool:
+    kind = _plain(kind)
+    return pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind)
 
 
 def _leaves(fields: pa.Schema | pa.StructType, prefix: str) -> Iterator[tuple[str, pa.Field]]:
@@ -89,7 +108,7 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns,
         stamps = [column.name for column in columns if column.type == "time"]
         clock = (
             stamps[0]
-            if not time and stamps and all(not is_time_name(name) for name in names)
+            if not time and stamps and all(not is_time_name(name) or name == "T" for name in names)
             else time_column(path, names, time)
         )
     for name in wanted:
@@ -100,7 +119,8 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns,
                 "or map another column"
             )
     read = list(dict.fromkeys([*wanted, *([clock] if clock else [])]))
-    kinds = {column.name: np.int64 if column.type == "time" else float for column in columns}
+    types = {name: field.type for name, field in _leaves(file.schema_arrow, "")}
+    kinds = {name: np.int64 if _is_stamp(kind) or _is_text(kind) else float for name, kind in types.items()}
     parts = Growing([kinds[name] for name in read], min(file.metadata.num_rows, MOST_EXPECTED))
     try:
         for batch in file.iter_batches(
@@ -118,18 +138,15 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns,
         raise ValueError(f"{path}: the table should have rows but has none; record it again or remove it")
     values = dict(zip(read, parts.finished(), strict=True))
     notes: list[Note] = []
-    zoned = (
-        clock
-        and kinds[clock] is np.int64
-        and next(field.type.tz for name, field in _leaves(file.schema_arrow, "") if name == clock)
-    )
+    zoned = clock and kinds[clock] is np.int64 and getattr(types[clock], "tz", None)
     zone = "UTC" if zoned or not clock or kinds[clock] is float else ""
     if interval:
         clock_values, remark = np.arange(parts.count) * interval, ""
     else:
-        clock_values, remark = (
-            (values[clock], "") if kinds[clock] is np.int64 else seconds(clock, values[clock])
-        )
+        is_time = kinds[clock] is np.int64 or not _is_numeric(types[clock])
+        clock_values, remark = (values[clock], "") if is_time else seconds(clock, values[clock])
+        if not time and _is_numeric(types[clock]):
+            check_no_counter(path, clock, clock_values)
     if remark:
         notes.append(Note("clock", "", 1, remark))
     table_columns, turned = forward(
@@ -139,14 +156,32 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns,
 
 
 def _array(path: Path, name: str, column: pa.ChunkedArray, clock: str) -> np.ndarray:
-    if pa.types.is_timestamp(column.type):
+    if pa.types.is_dictionary(column.type):
+        column = column.cast(column.type.value_type)
+    if name == clock and _is_text(column.type):
+        return _iso_ns(path, name, column)
+    if name == clock and (pa.types.is_duration(column.type) or pa.types.is_time(column.type)):
+        unit = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}[column.type.unit]
+        counts = column.cast(pa.int32() if column.type.bit_width == 32 else pa.int64())
+        return numbers(counts.cast(pa.float64(), safe=False).chunk(0), np.float64) / unit
+    if _is_stamp(column.type):
         if column.null_count:
             raise ValueError(f"{path}: time {name} is missing in {column.null_count} rows; remove them")
-        instants = column.cast(pa.timestamp("ns", column.type.tz)).cast(pa.int64())
-        return numbers(instants.chunk(0), np.int64)
+        stamps = column.cast(pa.timestamp("ns", getattr(column.type, "tz", None))).cast(pa.int64())
+        return numbers(stamps.chunk(0), np.int64)
     if name == clock and not _is_numeric(column.type):
         raise ValueError(
             f"{path}: time {name} should be seconds or a timestamp but is of type {column.type}; convert it, "
             "or name another column"
         )
+    if pa.types.is_boolean(column.type):
+        column = column.cast(pa.uint8())
     return numbers(column.cast(pa.float64(), safe=False).chunk(0), np.float64)
+
+
+def _iso_ns(path: Path, name: str, column: pa.ChunkedArray) -> np.ndarray:
+    """ns since 1970 of times written as text, which must be dates and times of ISO 8601."""
+    texts = column.to_pylist()
+    if missing := texts.count(None):
+        raise ValueError(f"{path}: time {name} is missing in {missing} rows; remove them")
+    return instants(path, name, texts, range(1, len(texts) + 1), month_first=None).ns

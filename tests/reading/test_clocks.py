@@ -99,6 +99,19 @@ def test_the_hour_that_summer_time_repeats_is_counted_on_without_a_zone(tmp_path
     )
 
 
+def test_one_row_with_a_time_from_long_ago_is_refused_with_its_line(tmp_path):
+    times = np.arange(600.0)
+    times[300] = 20.5
+    with pytest.raises(
+        ValueError, match="line 302 is at 20.5 s, which is before the sample ahead of it at 299 s"
+    ):
+        opened(tmp_path, times)
+
+
+def test_a_clock_that_starts_over_soon_is_no_late_row(tmp_path):
+    assert segments(opened(tmp_path, np.r_[np.arange(4.0), np.arange(100.0)])) == [0, 4]
+
+
 def test_two_clocks_that_take_turns_are_refused(tmp_path):
     with pytest.raises(ValueError, match="two devices with clocks of their own seem to write under one name"):
         opened(tmp_path, np.arange(40) + 100.0 * (np.arange(40) % 2))
