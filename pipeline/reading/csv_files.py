@@ -1,7 +1,6 @@
 """CSV and its relatives from other people's programs: rows of numbers
 out of text, and every refusal names the line."""
 
-import functools
 import itertools
 import re
 from collections.abc import Callable, Sequence
@@ -29,8 +28,9 @@ from pipeline.store.csv_rows import (
     LONGEST_TAIL,
     MISSING,
     SWITCH,
+    ColumnStyle,
     CsvLayout,
-    column_groups,
+    column_style,
     decimal_mark,
     floats,
     is_ambiguous,
@@ -74,11 +74,11 @@ def read_csv(path: Path, wanted: Sequence[str], time: str, decimal: str = "") ->
     """
     layout = csv_layout(path, decimal)
     interval = every(time)
-    clock = "" if interval else time_column(path, layout.names, time)
+    clock = None if interval else time_column(path, layout.names, time)
     places = [column_place(path, layout.names, name) for name in wanted]
-    layout = _decided(path, layout, [*wanted, *([clock] if clock else [])])
+    layout = _decided(path, layout, [*wanted, *([] if clock is None else [clock])])
     notes = list(layout.notes)
-    clocks = _Clock(path, layout, clock) if clock else None
+    clocks = None if clock is None else _Clock(path, layout, clock)
     plain = None
     if clocks is None or clocks.is_plain:
         plain = read_plain(path, layout, places, clocks and clocks.place, clocks and clocks.zone)
@@ -92,7 +92,7 @@ def read_csv(path: Path, wanted: Sequence[str], time: str, decimal: str = "") ->
         count, place = len(lines), lambda i: f"line {lines[i]}"
     times, zone = clocks.finished(notes) if clocks else (np.arange(count) * interval, "")
     if clocks and clocks.numeric and not time:
-        check_no_counter(path, clock, times)
+        check_no_counter(path, clocks.name, times)
     columns_forward, turned = forward(Columns("rows", times, values, place, zone))
     return columns_forward, notes + turned
 
@@ -108,8 +108,15 @@ def _rows_one_by_one(
     """{column: values (n,)} and the line (n,) of each row: the slow way, which knows every word and names the
     line of a fault."""
     columns = Growing([float] * len(wanted))
-    lines, switches = Growing([np.int32]), {}
-    grouping = functools.cache(lambda name: column_groups(path, layout, layout.names.index(name)))
+    lines = Growing([np.int32])
+    switches: dict[str, set[str]] = {}
+    styles: dict[str, ColumnStyle] = {}
+
+    def style(name: str) -> ColumnStyle:
+        if name not in styles:
+            styles[name] = column_style(path, layout, layout.names.index(name))
+        return styles[name]
+
     rows = sound_rows(path, layout, clocks, notes)
     while block := list(itertools.islice(rows, max(1, FIELDS_AT_ONCE // len(layout.names)))):
         numbers = [line for line, _ in block]
@@ -117,7 +124,7 @@ def _rows_one_by_one(
         lines.append(np.array(numbers))
         columns.append(
             *(
-                floats(path, name, texts, layout.decimal, numbers, switches, grouping)
+                floats(path, name, texts, layout.decimal, numbers, switches, style)
                 for name, texts in zip(wanted, fields, strict=True)
             )
         )
@@ -126,6 +133,10 @@ def _rows_one_by_one(
     for name, words in switches.items():
         message = f"{name} is written as {' and '.join(sorted(words))}, which were read as 1 and 0"
         notes.append(Note("words", "", 1, message))
+    for name in wanted:
+        if name in styles and styles[name].unit:
+            message = f"{name} is written with its unit {styles[name].unit}, which was left out"
+            notes.append(Note("words", "", 1, message))
     return dict(zip(wanted, columns.finished(), strict=True)), lines.finished()[0]
 
 

@@ -2,12 +2,13 @@
 data."""
 
 import collections
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
 from pipeline.reading.formats import is_time_name
 from pipeline.reading.signals import Note
-from pipeline.store.csv_rows import CsvLayout, decimal_mark, is_quantity, opening
+from pipeline.store.csv_rows import MISSING, CsvLayout, decimal_mark, is_quantity, opening
 
 
 def csv_layout(path: Path, decimal: str = "") -> CsvLayout:
@@ -49,17 +50,39 @@ def _layout(path: Path, declared: str) -> tuple[CsvLayout, list[list[str]]]:
         names = [f"column_{i + 1}" for i in range(width)]
         return CsvLayout(encoding, delimiter, decimal, names, [""] * width, first, notes), data
     names, units = [field.strip() for field in rows[heads[-1]]], [""] * width
-    if len(heads) > 1 and heads[-2] == heads[-1] - 1 and heads[-1] == first - 1:
+    written = [sum(bool(field.strip()) for field in rows[i]) for i in heads]
+    if (
+        len(heads) > 1
+        and heads[-2] == heads[-1] - 1
+        and heads[-1] == first - 1
+        and written[-2] >= written[-1]
+    ):
         names, units = (
             [field.strip() for field in rows[heads[-2]]],
             [field.strip(" ()[]") for field in rows[heads[-1]]],
         )
+    if len(names) == width + 1 and names[-1].casefold() == "comment":
+        names.pop()  # of LabVIEW, which writes it only where there is one
     units += [""] * (len(names) - len(units))
     return CsvLayout(encoding, delimiter, decimal, names, units, first, notes), data
 
 
 def _names_time(row: Sequence[str]) -> bool:
     return len(row) > 1 and any(is_time_name(field) for field in row)
+
+
+def _is_heading(row: Sequence[str], table: Sequence[Sequence[str]]) -> bool:
+    """Whether a row with numbers begins with a word where the rows of the table begin with numbers, as the
+    lines before LabVIEW's do."""
+    first = row[0].strip().casefold()
+    if first in MISSING or _begins_a_number(first):
+        return False
+    return sum(_begins_a_number(other[0].strip()) for other in table) > 0.8 * len(table)
+
+
+def _begins_a_number(field: str) -> bool:
+    """Whether a field begins as a number or a time does."""
+    return bool(re.match(r"[+-]?[.,]?\d", field))
 
 
 def _first_row(
@@ -89,7 +112,7 @@ def _first_row(
             f"{path} is text but no table: {len(table)} of its first {len(written)} lines have {width} "
             "fields with numbers among them; name a recording, or save it as CSV with one row a sample"
         )
-    begin = table[0]
+    begin = next((i for i in table if not _is_heading(rows[i], [rows[k] for k in table])), table[0])
     # most rows may end with an empty field, and the first ones not
     while begin - 1 in data and len(rows[begin - 1]) == width + 1:
         begin -= 1

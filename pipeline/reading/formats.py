@@ -42,6 +42,7 @@ _TIME_NAMES = (
     "zeitstempel",
     "zeit",
     "uhrzeit",
+    "x_value",
     "epoch",
     "unix_time",
     "unixtime",

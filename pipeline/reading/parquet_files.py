@@ -101,6 +101,7 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns,
     """The wanted columns, NaN for null. Raises ValueError for a column that is missing or holds no numbers,
     and for a damaged file."""
     file, columns = _parquet(path), parquet_columns(path)
+    types = {name: field.type for name, field in _leaves(file.schema_arrow, "")}
     names = [column.name for column in columns]
     interval = every(time)
     clock = ""
@@ -113,14 +114,16 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns,
         )
     for name in wanted:
         column = columns[column_place(path, names, name)]
-        if column.type != "number":
+        if column.type != "number" and not _is_text(types[name]):
             raise ValueError(
                 f"{path}: column {name} should hold numbers but is of type {column.type}; write numbers, "
                 "or map another column"
             )
     read = list(dict.fromkeys([*wanted, *([clock] if clock else [])]))
-    types = {name: field.type for name, field in _leaves(file.schema_arrow, "")}
-    kinds = {name: np.int64 if _is_stamp(kind) or _is_text(kind) else float for name, kind in types.items()}
+    kinds = {
+        name: np.int64 if _is_stamp(kind) or (name == clock and _is_text(kind)) else float
+        for name, kind in types.items()
+    }
     parts = Growing([kinds[name] for name in read], min(file.metadata.num_rows, MOST_EXPECTED))
     try:
         for batch in file.iter_batches(
@@ -156,6 +159,7 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns,
 
 
 def _array(path: Path, name: str, column: pa.ChunkedArray, clock: str) -> np.ndarray:
+    written = column.type
     if pa.types.is_dictionary(column.type):
         column = column.cast(column.type.value_type)
     if name == clock and _is_text(column.type):
@@ -174,9 +178,18 @@ def _array(path: Path, name: str, column: pa.ChunkedArray, clock: str) -> np.nda
             f"{path}: time {name} should be seconds or a timestamp but is of type {column.type}; convert it, "
             "or name another column"
         )
+    if pa.types.is_decimal(column.type) or _is_text(column.type):
+        # by way of the text, as Arrow rounds decimals twice
+        column = column.cast(pa.string())
     if pa.types.is_boolean(column.type):
         column = column.cast(pa.uint8())
-    return numbers(column.cast(pa.float64(), safe=False).chunk(0), np.float64)
+    try:
+        return numbers(column.cast(pa.float64(), safe=False).chunk(0), np.float64)
+    except pa.ArrowInvalid as error:
+        raise ValueError(
+            f"{path}: column {name} should hold numbers but is of type {written} ({_first_line(error)}); "
+            "write numbers, or map another column"
+        ) from None
 
 
 def _iso_ns(path: Path, name: str, column: pa.ChunkedArray) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Rows of text and numbers from a stranger's CSV file: what the readers of records and of lists of images
 share."""
 
+import collections
 import csv
 import itertools
 import re
@@ -30,6 +31,9 @@ _AMBIGUOUS = re.compile(r"\s*[+-]?[1-9]\d{0,2}[.,]\d{3}\s*$")
 _UNGROUPED = re.compile(r"\s*[+-]?\d{4,}")
 # a number with its unit, 21.5 °C: it shows where the table is, and is refused with its line when it is read
 _QUANTITY = re.compile(r"\s*[+-]?\d[\d.,]*\s*(%|°\s?[CFK]|[a-zA-Z]{1,3}(/[a-zA-Z]{1,3})?)$")
+_WITH_UNIT = re.compile(
+    r"(?P<number>[+-]?\d[\d.,]*?)\s*(?P<unit>%|°\s?[CFK]|[a-zA-Z]{1,3}(/[a-zA-Z]{1,3})?)$"
+)
 # text has tabs, line ends and form feeds, and sometimes the end mark of an old system; other control
 # characters are of binary files
 _CONTROL = bytes(set(range(32)) - set(b"\t\n\r\f\x1a"))
@@ -149,26 +153,42 @@ def _proves_groups(field: str, decimal: str) -> bool:
     return bool(_GROUPED[decimal].match(field)) and not is_ambiguous(field)
 
 
-def column_groups(path: Path, layout: CsvLayout, place: int) -> str:
-    """The mark between thousands of a whole column, "" where its numbers are not all written in one manner or
-    nothing proves it."""
-    marks, proven = set(), layout.declared
+class ColumnStyle(NamedTuple):
+    """How a whole column writes its numbers: its mark between thousands and its unit, "" for none."""
+
+    groups: str
+    unit: str
+
+
+def column_style(path: Path, layout: CsvLayout, place: int) -> ColumnStyle:
+    """The style of a column, without a mark or unit that not all of its numbers have, and without a mark that
+    nothing proves."""
+    marks, units, proven = set(), set(), layout.declared
     for _, row in rows(path, layout):
         field = row[place].strip() if place < len(row) else ""
+        if field.casefold() in MISSING:
+            continue
+        quantity = _WITH_UNIT.match(field)
+        units.add(quantity["unit"] if quantity else "")
         if grouped := _GROUPED[layout.decimal].match(field):
             marks.add(grouped["mark"])
             proven = proven or _proves_groups(field, layout.decimal)
         elif is_number(field, layout.decimal) and _UNGROUPED.match(field):
-            return ""
-    return marks.pop() if proven and len(marks) == 1 else ""
+            marks.add("")
+    return ColumnStyle(
+        marks.pop() if proven and len(marks) == 1 else "", units.pop() if len(units) == 1 else ""
+    )
 
 
 def _encoding(path: Path, start: bytes) -> tuple[str, list[Note]]:
     for mark, encoding in ((b"\xef\xbb\xbf", "utf-8-sig"), (b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16")):
         if start.startswith(mark):
             return encoding, []
-    if start[1::2].count(0) > len(start) // 4 and not start[0::2].count(0):
-        return "utf-16-le", [Note("encoding", "", 1, "the text is UTF-16 without a byte order mark")]
+    for order, (high, low) in {"le": (start[1::2], start[0::2]), "be": (start[0::2], start[1::2])}.items():
+        if high.count(0) > len(start) // 4 and not low.count(0):
+            return f"utf-16-{order}", [
+                Note("encoding", "", 1, "the text is UTF-16 without a byte order mark")
+            ]
     control = len(start) - len(start.translate(None, _CONTROL))
     if control > len(start) // 100:
         raise ValueError(
@@ -192,7 +212,11 @@ def _delimiter(lines: Sequence[str], decimals: Sequence[str]) -> tuple[str, str]
     fewest other fields are taken; the blank is tried last."""
     best, choice = (0.0, 0.0), (",", decimals[0])
     for delimiter, decimal in itertools.product((",", ";", "\t", "|", " "), decimals):
-        fields = [field for line in lines[:50] for field in _split(line, delimiter)]
+        split = [_split(line, delimiter) for line in lines[:50]]
+        if delimiter == " ":  # in words before the table there are numbers too
+            width = collections.Counter(map(len, split)).most_common(1)[0][0] if split else 0
+            split = [row for row in split if len(row) == width]
+        fields = [field for row in split for field in row]
         quantities = sum(is_quantity(field, decimal) for field in fields)
         score = (quantities, quantities / max(len(fields), 1))
         if score > best:
@@ -308,12 +332,12 @@ def floats(
     decimal: str,
     lines: list[int],
     switches: dict[str, set[str]],
-    grouping: Callable[[str], str] | None = None,
+    style: Callable[[str], ColumnStyle] | None = None,
 ) -> np.ndarray:
     """The numbers of a column's fields, NaN for a word that says there is none.
 
-    Words of a switch are counted in `switches`. `grouping` gives a column's mark between thousands. Raises
-    ValueError with the line of a field that is no number.
+    Words of a switch are counted in `switches`. `style` gives that of a column. Raises ValueError with the
+    line of a field that is no number.
     """
     try:
         if decimal == "." and not any("_" in field for field in fields):
@@ -324,7 +348,7 @@ def floats(
         pass  # one by one, which names the line
     return np.array(
         [
-            _float(path, name, field, decimal, line, switches, grouping)
+            _float(path, name, field, decimal, line, switches, style)
             for field, line in zip(fields, lines, strict=True)
         ]
     )
@@ -337,7 +361,7 @@ def _float(
     decimal: str,
     line: int,
     switches: dict[str, set[str]],
-    grouping: Callable[[str], str] | None,
+    style: Callable[[str], ColumnStyle] | None,
 ) -> float:
     plain = field.strip()
     # 1.5D+02, as Fortran writes
@@ -345,8 +369,11 @@ def _float(
     if is_number(scientific, decimal):
         return float(scientific.replace(",", "."))
     grouped = _GROUPED[decimal].match(plain)
-    if grouped and grouping is not None and grouping(name) == grouped["mark"]:
+    if grouped and style is not None and style(name).groups == grouped["mark"]:
         return float(plain.replace(grouped["mark"], "").replace(",", "."))
+    quantity = _WITH_UNIT.match(plain)
+    if quantity and style is not None and style(name).unit and is_number(quantity["number"], decimal):
+        return float(quantity["number"].replace(",", "."))
     word = plain.casefold()
     if word in MISSING:
         return np.nan
