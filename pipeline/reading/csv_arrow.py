@@ -24,6 +24,7 @@ _LINE_END = re.compile(rb"\r\n|\r|\n")
 # Arrow knows zones up to 24 h; ours end at 14, and some programs write a fraction behind a hyphen
 _FAR_ZONE = re.compile(rb":\d\d(?:\.\d+)?[+-](?:1[5-9]|2\d|14:?(?!00)\d)")
 _ISO = re.compile(r"\d{4}-\d\d-\d\d(?:[T ]\d\d:\d\d(?::\d\d(?:\.\d{1,9})?)?)?(Z|[+-]\d\d(?::?\d\d)?)?$")
+_REMARK = rf"^\s*({'|'.join(map(re.escape, COMMENT))})"
 _NULLS = sorted({spelt for word in MISSING for spelt in (word, word.upper(), word.title())} | {"NaN"})
 
 
@@ -139,8 +140,8 @@ def _batches(
 
 
 def _has_comment(column: pa.Array) -> bool:
-    start = pc.utf8_ltrim_whitespace(column)
-    return any(pc.any(pc.starts_with(start, mark)).as_py() for mark in COMMENT)
+    remarks = pc.call_function("match_substring_regex", [column], pc.MatchSubstringOptions(_REMARK))
+    return bool(pc.call_function("any", [remarks]).as_py())
 
 
 def _plain_numbers(column: pa.Array, kind: pa.DataType, is_clock: bool) -> np.ndarray:

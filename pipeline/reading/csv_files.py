@@ -80,12 +80,14 @@ def read_csv(path: Path, wanted: Sequence[str], time: str, decimal: str = "") ->
     notes = list(layout.notes)
     clocks = None if clock is None else _Clock(path, layout, clock)
     plain = None
-    if clocks is None or clocks.is_plain:
-        plain = read_plain(path, layout, places, clocks and clocks.place, clocks and clocks.zone)
+    if clocks is None:
+        plain = read_plain(path, layout, places, None, None)
+    elif clocks.is_plain:
+        plain = read_plain(path, layout, places, clocks.place, clocks.zone)
     if plain is not None:
         values, place = dict(zip(wanted, plain.values, strict=True)), _line_of(path, layout)
         count = len(plain.values[0])
-        if clocks:
+        if clocks and plain.time is not None:
             clocks.take(plain.time, plain.zoned)
     else:
         values, lines = _rows_one_by_one(path, layout, places, wanted, clocks, notes)

@@ -183,8 +183,8 @@ def _region_offsets_ns(zone: str, quarter: int) -> tuple[int, int]:
     except (zoneinfo.ZoneInfoNotFoundError, ValueError, OSError):
         raise ValueError(f"zone {zone}") from None
     local = datetime.datetime(1970, 1, 1, tzinfo=region) + datetime.timedelta(minutes=15 * quarter)
-    first, second = (local.replace(fold=fold).utcoffset() for fold in (0, 1))
-    return tuple(int(offset.total_seconds()) * 10**9 for offset in (first, second))
+    first, second = (local.replace(fold=fold).utcoffset() or datetime.timedelta() for fold in (0, 1))
+    return first // datetime.timedelta(seconds=1) * 10**9, second // datetime.timedelta(seconds=1) * 10**9
 
 
 def over_midnight(ns: np.ndarray) -> tuple[np.ndarray, int]:
