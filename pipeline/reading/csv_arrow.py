@@ -20,6 +20,8 @@ from pipeline.reading.formats import Growing
 from pipeline.store.csv_rows import COMMENT, MISSING, CsvLayout, rows
 
 BLOCK_BYTES = 1 << 20
+# a first block of short rows may promise what is not there
+MOST_EXPECTED = 1 << 22
 _LINE_END = re.compile(rb"\r\n|\r|\n")
 # Arrow knows zones up to 24 h; ours end at 14, and some programs write a fraction behind a hyphen
 _FAR_ZONE = re.compile(rb":\d\d(?:\.\d+)?[+-](?:1[5-9]|2\d|14:?(?!00)\d)")
@@ -89,8 +91,9 @@ def read_plain(
 
 
 def _expect(parts: Growing, path: Path, in_block: int) -> None:
-    """Room for as many rows as the first block lets expect, at most one for every two bytes."""
-    parts.expect(int(in_block * max(1.0, 1.02 * path.stat().st_size / BLOCK_BYTES)) + 1)
+    """Room for as many rows as the first block lets expect."""
+    expected = int(in_block * max(1.0, 1.02 * path.stat().st_size / BLOCK_BYTES)) + 1
+    parts.expect(min(expected, MOST_EXPECTED))
 
 
 def _extra_columns(path: Path, layout: CsvLayout) -> int | None:

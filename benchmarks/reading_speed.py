@@ -1,10 +1,12 @@
-"""CPU time of reading tables of a million rows and 12 columns, beside Arrow's own readers on one thread.
+"""CPU time of reading tables of a million rows and 12 columns beside Arrow's own readers on one thread,
+and of protobuf messages beside the official package.
 
-`./run python -m benchmarks.csv_reading` prints every ratio beside its bar and writes
-benchmarks/results/csv_reading.json.
+`./run python -m benchmarks.reading_speed` prints every ratio beside its bar and writes
+benchmarks/results/reading_speed.json.
 """
 
 import json
+import operator
 import subprocess
 import sys
 import tempfile
@@ -26,8 +28,10 @@ BARS = {
     "parquet": 1.3,
     "parquet_stamps": 1.3,
 }
+# the fields are named by the recording and not by hand
+PROTOBUF_BAR = 1.5
 NAMES = [f"signal_{i}" for i in range(1, COLUMNS)]
-RESULTS = Path(__file__).parent / "results" / "csv_reading.json"
+RESULTS = Path(__file__).parent / "results" / "reading_speed.json"
 
 
 def write(path: Path, kind: str, count: int) -> None:
@@ -73,6 +77,35 @@ def arrow(path: Path) -> int:
     ).num_rows
 
 
+def protobuf_s(count: int = 200_000) -> dict[str, float]:
+    """Seconds for the numbers of `count` messages: ours, and the package with its fields named by hand."""
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+
+    from pipeline.reading.protobuf_messages import decoder, message_types
+
+    file = descriptor_pb2.FileDescriptorProto(name="machine.proto", package="machine", syntax="proto3")
+    state = file.message_type.add(name="State")
+    for i, name in enumerate(NAMES):
+        state.field.add(name=name, number=i + 1, type=1, label=1)
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    made = message_factory.GetMessageClass(pool.FindMessageTypeByName("machine.State"))
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(count, len(NAMES)))
+    messages = [made(**dict(zip(NAMES, row, strict=True))).SerializeToString() for row in rows.tolist()]
+    schema = descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()
+    decode, by_hand = decoder(message_types(schema), "machine.State", NAMES), operator.attrgetter(*NAMES)
+    seconds = {}
+    for reader, read in (
+        ("package", lambda: np.array([by_hand(made.FromString(message)) for message in messages])),
+        ("ours", lambda: decode(messages)),
+    ):
+        start = time.process_time()
+        assert np.array_equal(read(), rows), "what is read is not what was written"
+        seconds[reader] = time.process_time() - start
+    return seconds
+
+
 def cpu_s(reader: Callable[[Path], int], path: Path, warm: Path) -> float:
     """The least CPU time of a few readings in this process; imports are paid before by a short table."""
     reader(warm)
@@ -88,7 +121,7 @@ def cpu_s(reader: Callable[[Path], int], path: Path, warm: Path) -> float:
 def apart(reader: str, path: Path, warm: Path) -> float:
     """`cpu_s` in a process of its own."""
     call = f"b.cpu_s(b.{reader}, Path({str(path)!r}), Path({str(warm)!r}))"
-    code = f"from pathlib import Path; from benchmarks import csv_reading as b; print({call})"
+    code = f"from pathlib import Path; from benchmarks import reading_speed as b; print({call})"
     return float(subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout)
 
 
@@ -109,6 +142,14 @@ def main() -> None:
                 flush=True,
             )
             path.unlink()
+    seconds = protobuf_s()
+    ratio = seconds["ours"] / seconds["package"]
+    results["protobuf"] = {f"{reader}_s": round(value, 3) for reader, value in seconds.items()}
+    results["protobuf"] |= {"ratio": round(ratio, 2), "bar": PROTOBUF_BAR}
+    print(
+        f"       protobuf: {seconds['ours']:.2f} s, package {seconds['package']:.2f} s, ratio {ratio:.2f} "
+        f"(bar {PROTOBUF_BAR})"
+    )
     RESULTS.write_text(json.dumps(results, indent=2) + "\n")
 
 
