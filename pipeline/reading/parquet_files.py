@@ -25,7 +25,7 @@ from pipeline.reading.signals import Note
 
 ROWS_AT_ONCE = 50_000
 # an index may promise what is not there
-MOST_EXPECTED = 1 << 26
+MOST_EXPECTED, MOST_IN_ONE_PIECE = 1 << 26, 1 << 22
 
 
 def _parquet(path: Path) -> pq.ParquetFile:
@@ -124,27 +124,13 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns,
         name: np.int64 if _is_stamp(kind) or (name == clock and _is_text(kind)) else float
         for name, kind in types.items()
     }
-    parts = Growing([kinds[name] for name in read], min(file.metadata.num_rows, MOST_EXPECTED))
-    try:
-        for batch in file.iter_batches(
-            ROWS_AT_ONCE,
-            columns=sorted({name.split(".")[0] if "." in name else name for name in read} | set(read)),
-        ):
-            table = _flat(pa.Table.from_batches([batch]))
-            parts.append(*(_array(path, name, table[name], clock) for name in read))
-    except (OSError, pa.ArrowException) as error:
-        raise ValueError(
-            f"{path}: a column cannot be read ({_first_line(error)}); the file is damaged, "
-            "so copy the recording again"
-        ) from None
-    if not parts.count:
-        raise ValueError(f"{path}: the table should have rows but has none; record it again or remove it")
-    values = dict(zip(read, parts.finished(), strict=True))
+    values = _values(path, file, {name: kinds[name] for name in read}, clock)
+    count = len(values[read[0]])
     notes: list[Note] = []
     zoned = clock and kinds[clock] is np.int64 and getattr(types[clock], "tz", None)
     zone = "UTC" if zoned or not clock or kinds[clock] is float else ""
     if interval:
-        clock_values, remark = np.arange(parts.count) * interval, ""
+        clock_values, remark = np.arange(count) * interval, ""
     else:
         is_time = kinds[clock] is np.int64 or not _is_numeric(types[clock])
         clock_values, remark = (values[clock], "") if is_time else seconds(clock, values[clock])
@@ -156,6 +142,33 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns,
         Columns("rows", clock_values, {name: values[name] for name in wanted}, lambda i: f"row {i}", zone)
     )
     return table_columns, notes + turned
+
+
+def _values(path: Path, file: pq.ParquetFile, kinds: dict[str, type], clock: str) -> dict[str, np.ndarray]:
+    """{name: values (n,)} of the columns `kinds` {name: int64 or float}."""
+    columns = sorted({name.split(".")[0] if "." in name else name for name in kinds} | set(kinds))
+    try:
+        # a table in one piece is not copied
+        if file.num_row_groups == 1 and 0 < file.metadata.num_rows <= MOST_IN_ONE_PIECE:
+            table = _flat(file.read_row_group(0, columns, use_threads=False))
+            if table.num_rows:
+                return {name: _array(path, name, _one_chunk(table[name]), clock) for name in kinds}
+        parts = Growing(list(kinds.values()), min(file.metadata.num_rows, MOST_EXPECTED))
+        for batch in file.iter_batches(ROWS_AT_ONCE, columns=columns, use_threads=False):
+            table = _flat(pa.Table.from_batches([batch]))
+            parts.append(*(_array(path, name, table[name], clock) for name in kinds))
+    except (OSError, pa.ArrowException) as error:
+        raise ValueError(
+            f"{path}: a column cannot be read ({_first_line(error)}); the file is damaged, "
+            "so copy the recording again"
+        ) from None
+    if not parts.count:
+        raise ValueError(f"{path}: the table should have rows but has none; record it again or remove it")
+    return dict(zip(kinds, parts.finished(), strict=True))
+
+
+def _one_chunk(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    return column if column.num_chunks == 1 else pa.chunked_array([column.combine_chunks()])
 
 
 def _array(path: Path, name: str, column: pa.ChunkedArray, clock: str) -> np.ndarray:

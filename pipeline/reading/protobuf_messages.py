@@ -2,6 +2,7 @@
 decodes, and the wanted fields are taken out."""
 
 import graphlib
+import operator
 import re
 from collections.abc import Callable, Iterator, Sequence
 
@@ -148,8 +149,12 @@ def decoder(types: Types, name: str, names: Sequence[str]) -> Callable[[list[byt
 
     "zones[#]" is the length of a list. The function raises UnreadableMessage.
     """
-    fill = _filler(_defined(types, name), {path: place for place, path in enumerate(names)})
+    message = _defined(types, name)
+    fill = _filler(message, {path: place for place, path in enumerate(names)})
     read, count = message_reader(types, name), len(names)
+    if names and all(_is_plain(message.fields_by_name.get(path)) for path in names):
+        values = operator.attrgetter(*names)
+        return lambda messages: np.array([values(read(data)) for data in messages], float).reshape(-1, count)
 
     def decode(messages: list[bytes]) -> np.ndarray:
         rows = []
@@ -160,6 +165,11 @@ def decoder(types: Types, name: str, names: Sequence[str]) -> Callable[[list[byt
         return np.array(rows, float).reshape(len(messages), count)
 
     return decode
+
+
+def _is_plain(field: FieldDescriptor | None) -> bool:
+    """Whether a field is a number that every message has."""
+    return field is not None and _is_number(field) and not field.is_repeated and not field.has_presence
 
 
 def _filler(message: Descriptor, wanted: dict[str, int]) -> Fill:
