@@ -20,6 +20,7 @@ from pipeline.reading.formats import Growing
 from pipeline.store.csv_rows import COMMENT, MISSING, CsvLayout, rows
 
 BLOCK_BYTES = 1 << 20
+LONGEST_LINE = 1 << 22
 # a first block of short rows may promise what is not there
 MOST_EXPECTED = 1 << 22
 _LINE_END = re.compile(rb"\r\n|\r|\n")
@@ -27,16 +28,20 @@ _LINE_END = re.compile(rb"\r\n|\r|\n")
 _FAR_ZONE = re.compile(rb":\d\d(?:\.\d+)?[+-](?:1[5-9]|2\d|14:?(?!00)\d)")
 _ISO = re.compile(r"\d{4}-\d\d-\d\d(?:[T ]\d\d:\d\d(?::\d\d(?:\.\d{1,9})?)?)?(Z|[+-]\d\d(?::?\d\d)?)?$")
 _REMARK = rf"^\s*({'|'.join(map(re.escape, COMMENT))})"
+_LAST_REMARK = re.compile(_REMARK.encode())
 _NULLS = sorted({spelt for word in MISSING for spelt in (word, word.upper(), word.title())} | {"NaN"})
 
 
 class PlainTable(NamedTuple):
-    """Values (n,) of the wanted columns; `time` is numbers, or ns since 1970 of a calendar, `zoned` if every
-    time names its zone."""
+    """Values (n,) of the wanted columns. `time` is numbers, or ns since 1970, `zoned` if all name a zone.
+
+    `broken` is the last line and its count of fields, where it breaks off and is left out.
+    """
 
     time: np.ndarray | None
     zoned: bool
     values: list[np.ndarray]
+    broken: tuple[int, int] | None
 
 
 class _NotPlain(Exception):
@@ -71,7 +76,8 @@ def read_plain(
     types |= {len(layout.names) + i: pa.null() for i in range(extra)}
     parts = Growing([np.int64 if pa.types.is_timestamp(types[place]) else float for place in read])
     try:
-        for batch in _batches(path, layout, types, extra, first_row, zone):
+        text = _Text(path, layout, bool(zone))
+        for batch in _batches(text, layout, types, extra, first_row):
             columns = [
                 _plain_numbers(batch.column(f"{place}"), types[place], place == clock) for place in read
             ]
@@ -85,9 +91,9 @@ def read_plain(
     if not parts.count:
         return None
     finished = dict(zip(read, parts.finished(), strict=True))
-    return PlainTable(
-        None if clock is None else finished[clock], bool(zone), [finished[place] for place in places]
-    )
+    time = None if clock is None else finished[clock]
+    broken = (text.lines + 1, text.broken_after) if text.broken_after else None
+    return PlainTable(time, bool(zone), [finished[place] for place in places], broken)
 
 
 def _expect(parts: Growing, path: Path, in_block: int) -> None:
@@ -105,15 +111,9 @@ def _extra_columns(path: Path, layout: CsvLayout) -> int | None:
 
 
 def _batches(
-    path: Path,
-    layout: CsvLayout,
-    types: dict[int, pa.DataType],
-    extra: int,
-    first_row: bool,
-    zone: str | None,
+    text: "_Text", layout: CsvLayout, types: dict[int, pa.DataType], extra: int, first_row: bool
 ) -> Iterator[pa.RecordBatch]:
     """Batches with columns called by their places. Raises _NotPlain and ArrowInvalid."""
-    text = _Text(path, layout, bool(zone))
     shown = [*types, *([0] if first_row else [])]
     reader = pa.csv.open_csv(
         pa.PythonFile(text, mode="r"),
@@ -172,7 +172,10 @@ class _Text:
         self._decoder = codecs.getincrementaldecoder(layout.encoding)()
         self._utf8 = layout.encoding.startswith("utf-8")
         self._zoned, self.strange, self._before = zoned, False, b""
-        self._rest = self._behind(layout.skip)
+        self._delimiter, self._columns = layout.delimiter.encode(), len(layout.names)
+        self.lines, self.broken_after, self._held = 0, 0, b""
+        self._held = self._behind(layout.skip)
+        self._rest = b""
 
     def _behind(self, skip: int) -> bytes:
         """What the first blocks hold behind the lines of the header."""
@@ -207,13 +210,34 @@ class _Text:
         if b"\0" in block or (self._zoned and _FAR_ZONE.search(self._before + block)):
             self.strange = True
             return b""
+        self.lines += block.count(b"\n") + block.count(b"\r") - block.count(b"\r\n")
+        self.lines -= self._before.endswith(b"\r") and block.startswith(b"\n")
         self._before = block[-64:]
         return block
+
+    def _whole_lines(self) -> bytes:
+        """The next block up to its last line end. A last line that breaks off is left out."""
+        block = self._block()
+        while block and not self.strange:
+            text = self._held + block
+            cut = max(text.rfind(b"\n"), text.rfind(b"\r")) + 1
+            self._held = text[cut:]
+            if cut:
+                return text[:cut]
+            if len(self._held) > LONGEST_LINE:
+                self.strange = True
+            block = self._block()
+        last, self._held = self._held, b""
+        fields = last.count(self._delimiter) + 1
+        if last.strip() and fields < self._columns and b'"' not in last and not _LAST_REMARK.match(last):
+            self.broken_after = fields
+            return b""
+        return last
 
     def read(self, size: int = -1) -> bytes:
         if self.strange:
             return b""
-        block = self._rest or self._block()
+        block = self._rest or self._whole_lines()
         if size < 0 or len(block) <= size:
             self._rest = b""
             return block

@@ -30,6 +30,7 @@ from pipeline.store.csv_rows import (
     SWITCH,
     ColumnStyle,
     CsvLayout,
+    broken_line,
     column_style,
     decimal_mark,
     floats,
@@ -87,11 +88,18 @@ def read_csv(path: Path, wanted: Sequence[str], time: str, decimal: str = "") ->
     if plain is not None:
         values, place = dict(zip(wanted, plain.values, strict=True)), _line_of(path, layout)
         count = len(plain.values[0])
+        if plain.broken:
+            notes.append(broken_line(*plain.broken, len(layout.names)))
         if clocks and plain.time is not None:
             clocks.take(plain.time, plain.zoned)
     else:
         values, lines = _rows_one_by_one(path, layout, places, wanted, clocks, notes)
         count, place = len(lines), lambda i: f"line {lines[i]}"
+    if not count:
+        raise ValueError(
+            f"{path}: no row behind line {layout.skip} has a time and the {len(layout.names)} fields of the "
+            "header; mend the rows, or record it again"
+        )
     times, zone = clocks.finished(notes) if clocks else (np.arange(count) * interval, "")
     if clocks and clocks.numeric and not time:
         check_no_counter(path, clocks.name, times)

@@ -307,15 +307,19 @@ def sound_rows(
             )
         )
     if len(tail) == 1 and len(tail[0][1]) < width:
-        line, row = tail[0]
-        message = f"line {line}, the last, breaks off after {len(row)} of {width} fields and was left out"
-        notes.append(Note("truncated", "", 1, message))
+        notes.append(broken_line(tail[0][0], len(tail[0][1]), width))
     elif tail:
         shown = layout.delimiter.join(tail[0][1])[:60]
         message = (
             f"{len(tail)} lines behind the data were left out, from line {tail[0][0]} on, which is {shown!r}"
         )
         notes.append(Note("trailing", "", len(tail), message))
+
+
+def broken_line(line: int, fields: int, width: int) -> Note:
+    """The note on a last line that has fewer fields than the table."""
+    message = f"line {line}, the last, breaks off after {fields} of {width} fields and was left out"
+    return Note("truncated", "", 1, message)
 
 
 def _unsound(line: int, row: list[str], layout: CsvLayout, clock: "Clock | None") -> str:

@@ -76,8 +76,10 @@ TABLES = st.one_of(
 
 
 @settings(max_examples=400, deadline=None, derandomize=True)
-@given(LAYOUTS, TABLES, st.booleans())
-def test_fast_and_slow_reading_agree_to_the_bit_and_in_every_refusal(tmp_path_factory, layout, table, ended):
+@given(LAYOUTS, TABLES, st.booleans(), st.sampled_from([0, 0, 0, 1, 2, 3, 5, 8]))
+def test_fast_and_slow_reading_agree_to_the_bit_and_in_every_refusal(
+    tmp_path_factory, layout, table, ended, cut
+):
     delimiter, end, encoding, header = layout
     path = tmp_path_factory.mktemp("csv") / "a.csv"
     first = ["a"] if header.split("\n")[0].count(",") == 3 and header[-1] != "," else []
@@ -85,6 +87,7 @@ def test_fast_and_slow_reading_agree_to_the_bit_and_in_every_refusal(tmp_path_fa
     lines = [line.replace(",", delimiter) for line in header.split("\n")]
     lines += [delimiter.join([*first, *row, *tail]) for row in table]
     text = end.join(lines) + (end if ended else "")
+    text = text[: len(text) - cut]
     path.write_bytes(text.encode(encoding, errors="ignore"))
     assert outcome(path, slow=False) == outcome(path, slow=True)
 
@@ -130,3 +133,15 @@ def test_a_table_of_many_blocks_is_the_same_on_both_ways(tmp_path):
     (tmp_path / "a.csv").write_text("t,u,y\n" + rows)
     assert is_fast(tmp_path / "a.csv")
     assert outcome(tmp_path / "a.csv", slow=False) == outcome(tmp_path / "a.csv", slow=True)
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_a_last_line_that_breaks_off_is_left_out_on_the_fast_way_too(tmp_path, end):
+    rows = [f"{k},{k}.25,{k}.5" for k in range(120_000)]
+    (tmp_path / "a.csv").write_bytes(end.join(["t,u,y", *rows, "120000,1"]).encode())
+    assert is_fast(tmp_path / "a.csv")
+    assert outcome(tmp_path / "a.csv", slow=False) == outcome(tmp_path / "a.csv", slow=True)
+    _, notes = read_csv(tmp_path / "a.csv", ["u"], "")
+    assert [note.message for note in notes] == [
+        "line 120002, the last, breaks off after 2 of 3 fields and was left out"
+    ]
