@@ -266,7 +266,9 @@ def record_segments(
         name: (m["source"], m["unit"], float(m["scale"]), float(m["offset"]))
         for name, m in declared["mapping"].items()
     }
-    spec = ingest.IngestSpec(machine, mapping, declared["time"], float(declared["max_gap_s"]))
+    spec = ingest.IngestSpec(
+        machine, mapping, declared["time"], float(declared["max_gap_s"]), declared["decimal"]
+    )
     results = ingest.process(
         folder, spec, params.load(params.Execution, "execution"), memo=Path("datasets/memo/ingest")
     )

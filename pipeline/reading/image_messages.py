@@ -17,9 +17,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import orjson
+from google.protobuf.message import Message
 
 from pipeline.reading.mcap_messages import Channel, plain
-from pipeline.reading.protobuf_messages import Field, _wire, message_types
+from pipeline.reading.protobuf_messages import message_reader, message_types
 from pipeline.reading.ros_messages import UnreadableMessage
 
 # the fields of each message in the order of the wire: b bytes, s text, I and B whole numbers
@@ -91,10 +92,8 @@ def reader(channel: Channel) -> Read:
     if channel.encoding == "json":
         parse = _json
     elif channel.encoding == "protobuf":
-        types = message_types(channel.schema)
-        if channel.schema_name not in types:
-            raise ValueError(f"the schema does not define its own message {channel.schema_name}")
-        parse = functools.partial(_protobuf, numbers=types[channel.schema_name])
+        read_message = message_reader(message_types(channel.schema), channel.schema_name)
+        parse = functools.partial(_protobuf, read=read_message)
     else:
         fields = [tuple(field.split(":")) for field in _ROS[_kind(channel)].split(", ")]
         parse = functools.partial(_ros, fields=fields, aligned=channel.encoding == "cdr")
@@ -151,18 +150,18 @@ def _ros(message: memoryview, fields: list[tuple[str, ...]], aligned: bool) -> P
     return _picture(values, values["stamp"])
 
 
-def _protobuf(message: memoryview, numbers: dict[int, Field]) -> Picture:
-    values: dict = {}
-    for number, _, value in _wire(message):
-        if number in numbers:
-            values[numbers[number].name] = value
-    stamp = {number: value for number, _, value in _wire(values.get("timestamp", b""))}
-    for name in ("width", "height", "step"):
-        value = values.get(name, 0)
-        values[name] = value if isinstance(value, int) else int.from_bytes(value, "little")
-    for name in ("encoding", "format"):
-        values[name] = _word(values.get(name, b""))
-    return _picture(values, stamp.get(1, 0) * 10**9 + stamp.get(2, 0))
+def _protobuf(message: memoryview, read: Callable[[memoryview], Message]) -> Picture:
+    values = {field.name: value for field, value in read(message).ListFields()}
+    numbers = {name: values.get(name, 0) for name in ("width", "height", "step")}
+    texts = {name: values.get(name, "") for name in ("encoding", "format")}
+    stamp, data = values.get("timestamp"), values.get("data", b"")
+    since = [0 if stamp is None else getattr(stamp, name, "") for name in ("seconds", "nanos")]
+    if not all(isinstance(whole, int) for whole in (*numbers.values(), *since)):
+        raise UnreadableMessage("something else where an image has a whole number")
+    if not isinstance(data, bytes) or not all(isinstance(text, str) for text in texts.values()):
+        raise UnreadableMessage("something else where an image has its bytes or its format")
+    picture = numbers | texts | {"data": memoryview(data), "is_bigendian": values.get("is_bigendian", 0)}
+    return _picture(picture, int(since[0]) * 10**9 + int(since[1]))
 
 
 def _json(message: memoryview) -> Picture:

@@ -36,13 +36,15 @@ class Raw(NamedTuple):
     """A recording as it was made: {signal: (time_s (n,), values (n,))} with a clock each. A missing value is
     NaN.
 
-    `messages` has the count of each topic's messages, or of the rows.
+    `messages` has the count of each topic's messages, or of the rows. `breaks` are the times at which the
+    clock had started over: nothing is held or interpolated from before to behind one.
     """
 
     path: str
     signals: dict[str, tuple[np.ndarray, np.ndarray]]
     messages: dict[str, int]
     notes: list[Note]
+    breaks: tuple[float, ...] = ()
 
 
 class Flag(NamedTuple):

@@ -38,12 +38,13 @@ READING = (
 
 class IngestSpec(NamedTuple):
     """What to take from every recording: the machine's signals, mapping {signal: (source, unit, scale,
-    offset)} (empty: our own names), the clock, the gap limit."""
+    offset)} (empty: our own names), the clock, the gap limit, the decimal mark of text ("": found)."""
 
     machine: Plant
     mapping: dict[str, tuple[str, str, float, float]]
     time: str
     max_gap_s: float
+    decimal: str = ""
 
     def sources(self) -> list[Source]:
         signals = [*self.machine.acting, *self.machine.outputs]
@@ -74,6 +75,7 @@ def spec_of(settings: Ingest, machine: Plant, source: str) -> IngestSpec:
         {name: (m.source, m.unit, m.scale, m.offset) for name, m in mapping.items()},
         settings.time,
         settings.max_gap_s,
+        settings.decimal,
     )
 
 
@@ -169,7 +171,7 @@ def _one(path: Path, shown: Path, folder: Path, key: str, spec: IngestSpec, memo
         {s.name: (s.low, s.high) for s in spec.machine.inputs},
     )
     try:
-        raw = read(path, spec.sources(), time=spec.time)
+        raw = read(path, spec.sources(), time=spec.time, decimal=spec.decimal)
         table = resample(
             raw,
             sample_time_s=spec.machine.sample_time_s,

@@ -172,6 +172,7 @@ class Ingest(Section):
 
     mapping: dict[str, Mapped]
     time: str = Field(max_length=300)
+    decimal: Literal["", ".", ","]
     max_gap_s: float = Field(gt=0, le=86400)
     strict: bool
 
