@@ -1,5 +1,6 @@
 """beadline init: from recordings of a new machine to params files that its stages read."""
 
+import runpy
 import shutil
 import sys
 
@@ -89,10 +90,8 @@ def test_limits_that_no_file_tells_are_left_to_a_person_and_asked_for_by_the_sta
     (tree / "rig.csv").write_text("time_s,heater_1_pct,zone_1_C\n" + rows)
     init(monkeypatch, "rig.csv", "--copy")
     assert "low and high of temperature_1: between which °C the machine must stay" in capsys.readouterr().out
-    from stages import ingest
-
     with pytest.raises(SystemExit):
-        ingest.main()
+        runpy.run_module("stages.ingest", run_name="__main__")
     asked = capsys.readouterr().err
     assert "plant.outputs: temperature_1 should have low and high" in asked
 
