@@ -112,6 +112,25 @@ def test_recordings_of_two_machines_and_one_without_heaters_are_refused(tree, mo
     assert (tree / "params.yaml").read_bytes() == before
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        "daisy_a/dryer.dat",
+        "daisy_a/glassfurnace.dat",
+        "tclab_apmonitor/second_order_mimo.csv",
+        "tclab_mlid_prbs/prbs.csv",
+        "paper_reference/probing_log_seed1.parquet",
+    ],
+)
+def test_real_records_give_files_that_the_stages_load(shared, tree, name):
+    initialised = propose_params.proposed([shared(f"data/{name}")])
+    propose_params.write(initialised.values, force=False)
+    machine, panel = params.load(Plant, "plant"), params.load(Panel, "panel")
+    assert list(panel.judging.starts_degC) == sorted(panel.judging.starts_degC)
+    assert panel.judging.reference_offsets_degC[1] < 0
+    assert machine.sample_time_s > 0 and machine.inputs
+
+
 def test_the_time_constant_is_the_one_that_made_the_record():
     rng, tau = np.random.default_rng(0), 80.0
     u = np.repeat(rng.choice([0.0, 100.0], (40, 2)), 50, axis=0)
