@@ -151,7 +151,8 @@ def changed(**columns: tuple[int | slice, float]) -> dict[str, np.ndarray]:
             "ingest",
             "ingest.colour",
             1,
-            "params.yaml: ingest.colour is unknown; remove it, or use mapping, time, max_gap_s, strict",
+            "params.yaml: ingest.colour is unknown; remove it, or use mapping, time, max_gap_s, longest_s, "
+            "largest_mb, strict",
         ),
         (
             "ingest",
