@@ -99,7 +99,8 @@ def _take() -> Child:
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=printed,
-        env=os.environ | {"PYTHONPATH": path},
+        # Arrow's own allocator takes a GiB at once, of which most is never used
+        env=os.environ | {"PYTHONPATH": path, "ARROW_DEFAULT_MEMORY_POOL": "system"},
     )
     child = Child(process, printed)
     # at the end of the interpreter: closing its input ends a child that waits
