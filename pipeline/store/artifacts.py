@@ -26,6 +26,7 @@ import safetensors
 from safetensors.numpy import load_file, save_file
 
 from pipeline.store import renamed, tables
+from pipeline.store.printable import printable
 from pipeline.store.tables import ARRAYS, Column, Schema
 
 DATASETS, REPORTS = Path("datasets"), Path("reports")
@@ -358,7 +359,8 @@ def stage(name: str) -> Iterator[Path]:
             temporary.replace(target)
     except (ValueError, OSError, np.linalg.LinAlgError, pa.ArrowException) as error:
         # the temporary folder's name means nothing to a reader
-        print(f"{name}: {reason(error).replace(str(folder), str(DATASETS / name))}", file=sys.stderr)
+        sentence = reason(error).replace(str(folder), str(DATASETS / name))
+        print(printable(f"{name}: {sentence}"), file=sys.stderr)
         raise SystemExit(1) from None
     finally:
         _waiting.reset(token)

@@ -14,6 +14,7 @@ import joblib
 import numpy as np
 
 from pipeline.reading.isolated import Budget, isolated
+from pipeline.reading.plain_files import check_plain_files
 from pipeline.reading.quality import flag
 from pipeline.reading.recordings import Source, Table, nearest_names, read
 from pipeline.reading.resampling import resample
@@ -99,6 +100,7 @@ def process(
     """Every recording below `folder`, in the order of names, on as many workers as
     `execution` says. A recording that needs more than its budget is quarantined. Raises
     ValueError where there is none."""
+    check_plain_files(folder)
     files = sorted(
         path
         for path in folder.rglob("*")
