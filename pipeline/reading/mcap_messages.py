@@ -15,7 +15,9 @@ import zstandard
 from pipeline.reading import protobuf_messages, ros_messages
 from pipeline.reading.ros_messages import LONGEST_LISTED, UnreadableMessage
 
-LARGEST_MESSAGE = 1 << 30
+LARGEST_MESSAGE = 1 << 28
+# the longest in use have some 100 kB
+LARGEST_SCHEMA = 4 << 20
 ENCODINGS = "cdr with ros2msg, ros1 with ros1msg, protobuf, and json"
 _ZSTD, _LZ4 = b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18"
 _STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
@@ -75,9 +77,14 @@ def decoder(channel: Channel, names: Sequence[str]) -> Decode:
 
 def _kind(channel: Channel) -> str:
     pairs = {("cdr", "ros2msg"): "cdr", ("ros1", "ros1msg"): "ros1", ("protobuf", "protobuf"): "protobuf"}
-    if channel.encoding == "json":
+    if channel.encoding == "json" and len(channel.schema) <= LARGEST_SCHEMA:
         return "json"
     kind = pairs.get((channel.encoding, channel.schema_encoding))
+    if len(channel.schema) > LARGEST_SCHEMA:
+        raise ValueError(
+            f"its schema {channel.schema_name[:60]} has {len(channel.schema)} bytes "
+            f"where {LARGEST_SCHEMA} are read"
+        )
     if kind is None:
         schema = f"schema encoding {channel.schema_encoding!r}" if channel.schema_encoding else "no schema"
         raise ValueError(f"message encoding {channel.encoding!r} with {schema} is not read; {ENCODINGS} are")
