@@ -13,7 +13,7 @@ import orjson
 import zstandard
 
 from pipeline.reading import protobuf_messages, ros_messages
-from pipeline.reading.ros_messages import LONGEST_LISTED, UnreadableMessage
+from pipeline.reading.ros_messages import LARGEST_LAYOUT, LONGEST_LISTED, UnreadableMessage
 
 LARGEST_MESSAGE = 1 << 28
 # the longest in use have some 100 kB
@@ -48,6 +48,8 @@ def fields(channel: Channel, samples: Sequence[bytes]) -> list[str]:
         names = dict.fromkeys(_schema_fields(channel))
         for sample in samples:
             names |= dict.fromkeys(_numbers(_document(sample)))
+            if len(names) > LARGEST_LAYOUT:
+                raise ValueError(f"its messages have {len(names)} numbers where {LARGEST_LAYOUT} are read")
         return list(names)
     first = samples[0] if samples else None
     if kind == "protobuf":

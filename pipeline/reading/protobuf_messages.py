@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.reading.ros_messages import LONGEST_LISTED, UnreadableMessage
+from pipeline.reading.ros_messages import LARGEST_LAYOUT, LONGEST_LISTED, UnreadableMessage
 
 VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
 # FieldDescriptorProto.Type -> wire type and struct format, or how a varint is read
@@ -57,7 +57,14 @@ def message_types(descriptor_set: bytes) -> dict[str, dict[int, Field]]:
             parts = _parts(file)
             for message in parts.get(4, []):
                 _add_type(message, _text(parts, 2), _text(parts, 12) == "proto3", types)
-    except (UnreadableMessage, UnicodeDecodeError, TypeError, AttributeError) as error:
+    except (
+        UnreadableMessage,
+        UnicodeDecodeError,
+        TypeError,
+        AttributeError,
+        KeyError,
+        RecursionError,
+    ) as error:
         raise ValueError(f"the schema is no FileDescriptorSet ({error})") from None
     return types
 
@@ -157,7 +164,7 @@ def _packed(kind: int, data: bytes) -> list[float]:
 def fields(types: dict[str, dict[int, Field]], name: str, sample: bytes | None) -> list[str]:
     """Paths of the numbers. Of a repeated field they are those of the message `sample`, up to
     LONGEST_LISTED."""
-    names, repeated = _plain_fields(types, _defined(types, name), "", 0)
+    names, repeated = _plain_fields(types, _defined(types, name), "", 0, [LARGEST_LAYOUT])
     if sample is not None and repeated:
         try:
             lengths = decoder(types, name, [f"{path}[#]" for path, _ in repeated])([sample])[0]
@@ -181,18 +188,22 @@ def _defined(types: dict, name: str) -> str:
 
 
 def _plain_fields(
-    types: dict, name: str, prefix: str, depth: int
+    types: dict, name: str, prefix: str, depth: int, room: list[int]
 ) -> tuple[list[str], list[tuple[str, list[str]]]]:
     names, repeated = [], []
     for field in types.get(name, {}).values() if depth < _DEEPEST else []:
         path = f"{prefix}{field.name}"
+        room[0] -= 1
+        if room[0] < 0:
+            raise ValueError(f"the schema of {name} has more than {LARGEST_LAYOUT} parts")
         if field.type in _NUMBERS:
             if field.repeated:
                 repeated.append((path, [""]))
             else:
                 names.append(path)
         elif field.type == _MESSAGE:
-            inner, deeper = _plain_fields(types, field.of, "" if field.repeated else f"{path}.", depth + 1)
+            below = "" if field.repeated else f"{path}."
+            inner, deeper = _plain_fields(types, field.of, below, depth + 1, room)
             if field.repeated:
                 repeated.append((path, [f".{part}" for part in inner]))
             else:

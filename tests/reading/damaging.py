@@ -26,7 +26,11 @@ class Reading(NamedTuple):
 
 def klippy_log(samples: int = 120) -> bytes:
     """Lines like those of a printer's log, with other lines between them."""
-    lines = ["Start printer at Mon Jan  5 10:00:00 2026 (1767607200.0 5.2)", "===== Config file =====", "[extruder]"]
+    lines = [
+        "Start printer at Mon Jan  5 10:00:00 2026 (1767607200.0 5.2)",
+        "===== Config file =====",
+        "[extruder]",
+    ]
     for k in range(samples):
         lines.append(
             f"Stats {100 + k}.0: gcodein=0 mcu: mcu_awake=0.001 extruder: target=200 "

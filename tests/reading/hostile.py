@@ -38,8 +38,12 @@ def good_mcap(samples: int = 120, **options) -> bytes:
 
 
 def good_parquet(samples: int = 120) -> bytes:
+    """With the checksum of each page, as our own tables have it."""
     k = np.arange(samples)
-    return parquet({"time_s": k * 1.0, "heater": 20.0 + 20 * (k // 15 % 2), "zone": 20 + 5 * np.sin(k / 9)})
+    return parquet(
+        {"time_s": k * 1.0, "heater": 20.0 + 20 * (k // 15 % 2), "zone": 20 + 5 * np.sin(k / 9)},
+        write_page_checksum=True,
+    )
 
 
 def parquet(columns: dict, **options) -> bytes:
