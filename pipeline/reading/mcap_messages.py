@@ -127,11 +127,7 @@ def decompress(method: str, data: bytes, size: int | None) -> bytes:
             declared = zstandard.frame_content_size(data)
             _check_size(declared if declared >= 0 else None, size)
             unpacker = zstandard.ZstdDecompressor()
-            if declared >= 0:
-                unpacked = unpacker.decompress(data)
-            else:
-                with unpacker.stream_reader(data) as reader:
-                    unpacked = reader.read(room + 1)
+            unpacked = unpacker.decompress(data, max_output_size=0 if declared >= 0 else room)
         elif method == "lz4":
             declared = lz4.frame.get_frame_info(data)["content_size"]
             _check_size(declared or None, size)
