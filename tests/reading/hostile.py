@@ -240,12 +240,13 @@ def lying_footer(length: int) -> bytes:
 
 def run_lengths(rows: int) -> bytes:
     """Rows of one value each, run-length-encoded: some kB a column."""
-    values = pa.DictionaryArray.from_arrays(pa.array(np.zeros(1 << 20, np.int8)), pa.array([1.0]))
+    group = 1 << 24
+    values = pa.DictionaryArray.from_arrays(pa.array(np.zeros(group, np.int8)), pa.array([1.0]))
     table = pa.table({"time_s": values, "heater": values, "zone": values})
     out = io.BytesIO()
     with pq.ParquetWriter(out, table.schema, compression="zstd") as writer:
-        for _ in range(rows >> 20):
-            writer.write_table(table, row_group_size=1 << 20)
+        for _ in range(rows // group + 1):
+            writer.write_table(table, row_group_size=group)
     return out.getvalue()
 
 
