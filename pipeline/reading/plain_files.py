@@ -2,7 +2,8 @@
 
 A pipe without a writer stops whoever opens it, `dvc status` too. A link out of the folder is a recording that
 changes, or is gone, without anybody having touched the folder. So both are refused by name before anything is
-opened. The folder itself may be a link, for recordings that lie on another disk.
+opened. For recordings that lie on another disk, datasets/raw, datasets/raw/<loop> and folders of images
+directly below datasets/raw/setpoint may be links.
 """
 
 import os
@@ -60,8 +61,10 @@ def _link(path: Path, top: Path) -> Iterator[str]:
         yield f"{path} is a link to {os.readlink(path)}, which is not there; remove the link"
         return
     if not target.is_relative_to(top):
-        # one below datasets/raw stands for the whole of a loop's recordings
-        if target.is_dir() and path.parent.resolve() == top and top.name == "raw":
+        # a folder of datasets/raw is the whole of a loop's recordings; those of images come by the hundred
+        # thousand, and their reader follows links to folders
+        whole_loop = path.parent.resolve() == top and top.name == "raw"
+        if target.is_dir() and (whole_loop or path.parent.name == "setpoint"):
             yield from _problems(path, target)
             return
         yield (

@@ -61,6 +61,8 @@ def test_links_inside_and_a_folder_of_recordings_on_another_disk_are_taken(raw, 
     disk.mkdir()
     (disk / "film.mcap").write_bytes(b"")
     (raw / "deposition").symlink_to(disk)
+    (raw / "setpoint").mkdir()
+    (raw / "setpoint/images").symlink_to(disk)
     check_plain_files(raw)
     check_plain_files(raw / "deposition")
     os.mkfifo(disk / "pipe.mcap")
