@@ -24,7 +24,11 @@ def main() -> None:
             {"simulated": "datasets/generate_probing", "recordings": "datasets/raw/temperature"}[source]
         )
         results = ingest.process(
-            folder, ingest.spec_of(settings, machine, source), execution, memo=Path("datasets/memo/ingest")
+            folder,
+            ingest.spec_of(settings, machine, source),
+            execution,
+            memo=Path("datasets/memo/ingest"),
+            budget=ingest.Budget(settings.longest_s, settings.largest_mb),
         )
         record, quality, metrics = ingest.collect(
             results, machine, strict=settings.strict or "--strict" in sys.argv

@@ -154,7 +154,7 @@ def changed(**columns: tuple[int | slice, float]) -> dict[str, np.ndarray]:
             "ingest.colour",
             1,
             "params.yaml: ingest.colour is unknown; remove it, or use mapping, time, decimal, max_gap_s, "
-            "strict",
+            "longest_s, largest_mb, strict",
         ),
         (
             "ingest",

@@ -270,7 +270,11 @@ def record_segments(
         machine, mapping, declared["time"], float(declared["max_gap_s"]), declared["decimal"]
     )
     results = ingest.process(
-        folder, spec, params.load(params.Execution, "execution"), memo=Path("datasets/memo/ingest")
+        folder,
+        spec,
+        params.load(params.Execution, "execution"),
+        memo=Path("datasets/memo/ingest"),
+        budget=ingest.Budget(float(declared["longest_s"]), float(declared["largest_mb"])),
     )
     segments = {}
     for result in results:

@@ -84,11 +84,17 @@ class Table(NamedTuple):
     jitter: dict[str, Jitter]
 
 
+# comparing names takes 10 us each
+MOST_COMPARED = 50_000
+
+
 def nearest_names(name: str, names: Iterable[str]) -> str:
     """ "the nearest names are a, b": names like `name`, or the first ten that there are."""
     names = sorted(set(names))
     if not names:
         return "it has none that can be read as a number"
+    if len(names) > MOST_COMPARED:
+        return f"it has {', '.join(names[:10])} and {len(names) - 10} more"
     # "/topic:field" is found by its field alone too
     aliases = [
         (part, full)

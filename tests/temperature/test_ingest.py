@@ -13,7 +13,7 @@ from pipeline.store import artifacts, params
 from pipeline.store.execution import run_all
 from pipeline.temperature import study
 from pipeline.temperature.workflow import ingest
-from pipeline.temperature.workflow.ingest import IngestSpec, collect, process
+from pipeline.temperature.workflow.ingest import Budget, IngestSpec, collect, process
 from pipeline.temperature.workflow.settings import Plant
 from tests.cluster import Cluster
 from tests.reading.test_bag_folders import bag
@@ -26,6 +26,7 @@ MACHINE = Plant.model_validate(
     }
 )
 JOB = IngestSpec(MACHINE, {}, "", 5.0)
+BUDGET = Budget(60.0, 2000)
 INLINE = params.Execution(backend="loky", jobs=1, scheduler="")
 LOKY = params.Execution(backend="loky", jobs=2, scheduler="")
 NAMES = ("record.parquet", "quality.parquet", "metrics.json")
@@ -56,7 +57,7 @@ def ingested(
 ) -> dict:
     """What the stage does with a folder; the tables land in `out` for a look at their bytes."""
     record, quality, metrics = collect(
-        process(raw, job, execution, memo=memo or out / "memo"), MACHINE, strict=strict
+        process(raw, job, execution, memo=memo or out / "memo", budget=BUDGET), MACHINE, strict=strict
     )
     artifacts.write_table(out / "record.parquet", record.schema, record.columns)
     artifacts.write_table(out / "quality.parquet", quality.schema, quality.columns)
@@ -138,7 +139,8 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from pipeline.store import artifacts
-from tests.temperature.test_ingest import INLINE, JOB, process
+from pipeline.temperature.workflow import ingest
+from tests.temperature.test_ingest import BUDGET, INLINE, JOB, process
 
 write_table, written = artifacts.write_table, []
 
@@ -149,7 +151,8 @@ def killed_in_the_second_entry(path, schema, columns):
     write_table(path, schema, columns)
 
 artifacts.write_table = killed_in_the_second_entry
-process(Path(sys.argv[1]), JOB, INLINE, memo=Path(sys.argv[2]))
+ingest.isolated = lambda work, *arguments, shown, budget: work(*arguments)
+process(Path(sys.argv[1]), JOB, INLINE, memo=Path(sys.argv[2]), budget=BUDGET)
 """
 
 

@@ -13,6 +13,8 @@ from typing import NamedTuple
 import joblib
 import numpy as np
 
+from pipeline.reading.isolated import Budget, isolated
+from pipeline.reading.plain_files import check_plain_files
 from pipeline.reading.quality import flag
 from pipeline.reading.recordings import Source, Table, nearest_names, read
 from pipeline.reading.resampling import resample
@@ -95,9 +97,13 @@ class Columns(NamedTuple):
     columns: dict[str, np.ndarray]
 
 
-def process(folder: Path, spec: IngestSpec, execution: Execution, *, memo: Path) -> list[Result]:
+def process(
+    folder: Path, spec: IngestSpec, execution: Execution, *, memo: Path, budget: Budget
+) -> list[Result]:
     """Every recording below `folder`, in the order of names, on as many workers as
-    `execution` says. Raises ValueError where there is none."""
+    `execution` says. A recording that needs more than its budget is quarantined. Raises
+    ValueError where there is none."""
+    check_plain_files(folder)
     bags = {path.parent for path in folder.rglob("metadata.yaml") if is_bag(path.parent)} - {folder}
     files = sorted(
         path
@@ -131,7 +137,7 @@ def process(folder: Path, spec: IngestSpec, execution: Execution, *, memo: Path)
         if entry is None and path not in twice
     ]
     reasons = twice | dict(
-        zip([path for path, _ in todo], _run(todo, folder, spec, execution, memo), strict=True)
+        zip([path for path, _ in todo], _run(todo, folder, spec, execution, (memo, budget)), strict=True)
     )
     return [
         _result(name, entry or _remembered(memo, key, spec.machine), reasons.get(path, ""), entry is not None)
@@ -151,14 +157,30 @@ def _twice(files: Sequence[Path], hashes: Sequence[str]) -> dict[Path, str]:
 
 
 def _run(
-    todo: Sequence[tuple[Path, str]], folder: Path, spec: IngestSpec, execution: Execution, memo: Path
+    todo: Sequence[tuple[Path, str]],
+    folder: Path,
+    spec: IngestSpec,
+    execution: Execution,
+    where: tuple[Path, Budget],
 ) -> list[str]:
-    """The reasons of `_one`, in the order of `todo`; workers of a
-    cluster see the same file system under absolute paths."""
+    """The reasons of `_within`, in the order of `todo`; workers of a cluster see the same file
+    system under absolute paths. On one machine threads wait for children that do the work."""
+    memo, budget = where
     calls = [
-        joblib.delayed(_one)(path.resolve(), path, folder, key, spec, memo.resolve()) for path, key in todo
+        joblib.delayed(_within)(budget, path.resolve(), path, folder, key, spec, memo.resolve())
+        for path, key in todo
     ]
+    if execution.backend == "loky":
+        return joblib.Parallel(n_jobs=execution.jobs, backend="threading")(calls)
     return list(run_all(calls, execution, remains=": what was read is kept"))
+
+
+def _within(budget: Budget, path: Path, shown: Path, *arguments) -> str:
+    """The reason of `_one`, which works in a child; also where it needs more than the budget."""
+    try:
+        return isolated(_one, path, shown, *arguments, shown=shown, budget=budget)
+    except ValueError as reason:
+        return str(reason)
 
 
 def _one(path: Path, shown: Path, folder: Path, key: str, spec: IngestSpec, memo: Path) -> str:
