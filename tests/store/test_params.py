@@ -479,5 +479,5 @@ def test_a_hostile_file_is_one_sentence_at_once(load, text, sentence):
 
 
 def test_an_alias_of_a_few_values_is_what_it_stands_for(load):
-    aliased = GOOD.replace("levels: [0, 0.5]", "levels: &levels [0, 0.5]") + "other:\n  again: *levels\n"
+    aliased = GOOD.replace("levels: [0, 0.5]", "levels: &levels [0, 0.5]") + "x_other:\n  again: *levels\n"
     assert load(aliased) == load(GOOD)
