@@ -20,7 +20,6 @@ from pipeline.reading.formats import Growing
 from pipeline.store.csv_rows import COMMENT, MISSING, CsvLayout, rows
 
 BLOCK_BYTES = 1 << 20
-LONGEST_LINE = 1 << 22
 # a first block of short rows may promise what is not there
 MOST_EXPECTED = 1 << 22
 _LINE_END = re.compile(rb"\r\n|\r|\n")
@@ -173,9 +172,9 @@ class _Text:
         self._utf8 = layout.encoding.startswith("utf-8")
         self._zoned, self.strange, self._before = zoned, False, b""
         self._delimiter, self._columns = layout.delimiter.encode(), len(layout.names)
-        self.lines, self.broken_after, self._held = 0, 0, b""
-        self._held = self._behind(layout.skip)
-        self._rest = b""
+        self.lines, self.broken_after, self._ended = 0, 0, False
+        self._size = path.stat().st_size
+        self._rest = self._behind(layout.skip)
 
     def _behind(self, skip: int) -> bytes:
         """What the first blocks hold behind the lines of the header."""
@@ -210,34 +209,35 @@ class _Text:
         if b"\0" in block or (self._zoned and _FAR_ZONE.search(self._before + block)):
             self.strange = True
             return b""
-        self.lines += block.count(b"\n") + block.count(b"\r") - block.count(b"\r\n")
-        self.lines -= self._before.endswith(b"\r") and block.startswith(b"\n")
+        self.lines += block.count(b"\n")
+        if b"\r" in block or self._before.endswith(b"\r"):
+            self.lines += block.count(b"\r") - block.count(b"\r\n")
+            self.lines -= self._before.endswith(b"\r") and block.startswith(b"\n")
         self._before = block[-64:]
         return block
 
-    def _whole_lines(self) -> bytes:
-        """The next block up to its last line end. A last line that breaks off is left out."""
-        block = self._block()
-        while block and not self.strange:
-            text = self._held + block
-            cut = max(text.rfind(b"\n"), text.rfind(b"\r")) + 1
-            self._held = text[cut:]
-            if cut:
-                return text[:cut]
-            if len(self._held) > LONGEST_LINE:
-                self.strange = True
-            block = self._block()
-        last, self._held = self._held, b""
+    def _next(self) -> bytes:
+        """The next block. The last ones come together, without a last line that breaks off."""
+        block, self._rest = self._rest or self._block(), b""
+        if self._ended or self._stream.tell() < self._size - BLOCK_BYTES:
+            return block
+        self._ended = True
+        parts = [block]
+        while part := self._block():
+            parts.append(part)
+        text = b"".join(parts)
+        cut = max(text.rfind(b"\n"), text.rfind(b"\r")) + 1
+        last = text[cut:]
         fields = last.count(self._delimiter) + 1
         if last.strip() and fields < self._columns and b'"' not in last and not _LAST_REMARK.match(last):
             self.broken_after = fields
-            return b""
-        return last
+            return text[:cut]
+        return text
 
     def read(self, size: int = -1) -> bytes:
         if self.strange:
             return b""
-        block = self._rest or self._whole_lines()
+        block = self._next()
         if size < 0 or len(block) <= size:
             self._rest = b""
             return block
