@@ -195,6 +195,35 @@ def test_broken_recordings_are_quarantined_with_their_reasons_and_the_others_go_
     assert done(ingested(raw, tmp_path / "all")) == (0, 3, 2)
 
 
+def test_the_child_changes_no_byte(tmp_path, monkeypatch):
+    raw = folder(tmp_path, 3)
+    broken(raw)
+    ingested(raw, tmp_path / "child", LOKY)
+    monkeypatch.setattr(ingest, "isolated", lambda work, *arguments, shown, budget: work(*arguments))
+    ingested(raw, tmp_path / "here")
+    for name in NAMES:
+        assert (tmp_path / "child" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("budget", "reason"),
+    [
+        (Budget(0.15, 2000), "long.csv: reading it takes longer than the 0.15 s"),
+        (Budget(60.0, 5), "long.csv: reading it needs more memory than the 5 MB"),
+    ],
+)
+def test_a_recording_beyond_its_budget_is_quarantined_and_the_others_go_on(tmp_path, budget, reason):
+    raw = folder(tmp_path, 2)
+    # what is loaded at the first call counts there: the budget is that of a warm child
+    process(raw, JOB, INLINE, memo=tmp_path / "warm", budget=BUDGET)
+    k = np.arange(300_000)
+    artifacts.write_csv(raw / "long.csv", {"time_s": k, "heater": k % 7, "zone": 20 + k % 5})
+    results = process(raw, JOB, INLINE, memo=tmp_path / "memo", budget=budget)
+    assert [result.name for result in results if result.reason] == ["long.csv"]
+    assert reason in results[2].reason
+    assert "in params.expert.yaml" in results[2].reason
+
+
 def test_strict_and_a_folder_of_broken_recordings_alone_end_with_the_first_reason(tmp_path):
     raw = folder(tmp_path, 1)
     broken(raw)
