@@ -80,19 +80,19 @@ def _answers(u: Segments, y: Segments, past: int, *, offset: bool, lags: int) ->
     if not parts[0]:
         return None
     now, history, before, at_once = (np.concatenate(part) for part in parts)
-    moved = [_unforeseen(now[:, j], history, j) for j in range(now.shape[1])]
-    return _Answers(np.column_stack(moved), before, at_once)
+    return _Answers(_unforeseen(now, history), before, at_once)
 
 
-def _unforeseen(now: np.ndarray, history: np.ndarray, j: int) -> np.ndarray:
-    """What the past of all inputs (T, past, m) does not foretell of input j (T,): by regression, or by its
+def _unforeseen(now: np.ndarray, history: np.ndarray) -> np.ndarray:
+    """What the past of all inputs (N, past, m) does not foretell of each (N, m): by regression, or by its
     last value where that is nearer in the median."""
     centred = history.reshape(len(now), -1) - history.reshape(len(now), -1).mean(axis=0)
     design = np.hstack([np.ones((len(now), 1)), centred])
     by_regression = now - design @ np.linalg.lstsq(design, now, rcond=1e-10)[0]
-    by_holding = now - history[:, 0, j]
-    left = min(by_regression, by_holding, key=lambda part: np.median(np.abs(part)))
-    return np.where(np.abs(left) > 1e-9 * max(np.ptp(now), np.finfo(float).tiny), left, 0.0)
+    by_holding = now - history[:, 0]
+    nearer = np.median(np.abs(by_holding), axis=0) < np.median(np.abs(by_regression), axis=0)
+    left = np.where(nearer, by_holding, by_regression)
+    return np.where(np.abs(left) > 1e-9 * np.maximum(np.ptp(now, axis=0), np.finfo(float).tiny), left, 0.0)
 
 
 def _clipped(moved: np.ndarray) -> np.ndarray:
