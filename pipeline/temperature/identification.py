@@ -5,19 +5,22 @@ Then one fit is made on all of it.
 The rules, each with its reason:
 
 window: Twice the lags of Akaike's criterion (corrected for few samples) over VARX models, long enough to
-whiten. Schwarz's lags beside them, for records that say little, and a window that spans the slowest mode that
-the longest shows, where that is longer by half. feed-through: With and without u(t) in the outputs whose
-one-step predictor Schwarz's criterion prefers with it, where `feedthrough` is None. None in closed loop: a
-row of D would be the controller's inverse. closed loop: Recognised by `closed_loop`. PBSID and
-prediction-error fits stay consistent there, fits to simulated outputs do not, and are not tried; candidates
-are judged one step ahead too. drift: What wanders and is not recorded becomes a state that hardly decays,
-with the rest of the order. largest order: The singular values, in units of the noise, above what coefficient
-errors alone reach: sqrt(2) (sqrt(rows) + sqrt(columns)) of the noise matrix. dead time: None; the lags at
-which the largest model's impulse response stays under 5 % of its peak; those under a quarter of it that
-Wald's test finds silent too. order: The fewest parameters whose error is within 2 % of the best. The error is
-that of simulating left-out blocks (geometric mean). refinement: Where `refinement` is "validated",
-prediction-error fits of the chosen model. One is taken where it takes more than 5 % off the error on the
-left-out blocks; one for simulation only where it beats prediction by a fifth.
+    whiten. Schwarz's lags beside them, for records that say little, and a window that spans the slowest mode
+    that the longest shows, where that is longer by half.
+closed loop: Recognised by `closed_loop`. PBSID and prediction-error fits stay consistent there; fits to
+    simulated outputs do not, and are not tried. Candidates are judged one step ahead too.
+feed-through: With and without u(t) in the outputs whose one-step predictor Schwarz's criterion prefers with
+    it, where `feedthrough` is None. None in closed loop: a row of D would be the controller's inverse.
+drift: What wanders and is not recorded becomes a state that hardly decays, with the rest of the order.
+largest order: The singular values, in units of the noise, above what coefficient errors alone reach:
+    sqrt(2) (sqrt(rows) + sqrt(columns)) of the noise matrix.
+dead time: None; the lags at which the largest model's impulse response stays under 5 % of its peak; those
+    under a quarter of it that Wald's test finds silent too.
+order: The fewest parameters whose error is within 2 % of the best. The error is that of
+    simulating left-out blocks (geometric mean).
+refinement: Where `refinement` is "validated", prediction-error fits of the best candidate of each structure.
+    One is taken where it takes more than 5 % off the error on the left-out blocks; one for simulation only
+    where it beats prediction by a fifth.
 """
 
 from collections.abc import Sequence

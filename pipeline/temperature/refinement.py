@@ -386,7 +386,7 @@ def refine(
     m, ahead = plant.m, criterion == "prediction"
     rows = np.broadcast_to(np.asarray(settings.feedthrough, bool), (plant.p,))
     # a full weight would mix the rows of D that are free with those that are zero
-    problem = _weighted(plant, u, y, criterion, diagonal=not ahead or (rows.any() and not rows.all()))
+    problem = _weighted(plant, u, y, criterion, diagonal=not ahead or bool(rows.any() and not rows.all()))
     free = np.zeros(problem.start.H.shape, bool)
     free[:, : m + 1] = free_entries(plant.p, m, settings.feedthrough, offset=settings.offset)
 
