@@ -180,7 +180,7 @@ def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], An
         return f"{name} 1", lambda path: artifacts.read_arrays(path, name, 1)
 
     return [
-        ("record", "ingest", "record.parquet", *table(schemas.record(machine.inputs, machine.outputs))),
+        ("record", "ingest", "record.parquet", *table(schemas.record(machine.acting, machine.outputs))),
         ("quality", "ingest", "quality.parquet", *table(schemas.QUALITY)),
         ("plant", "identify_plant", "plant.parquet", *arrays("plant")),
         ("order", "identify_plant", "order.parquet", *table(schemas.ORDER)),
