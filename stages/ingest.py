@@ -23,15 +23,14 @@ def main() -> None:
         folder = Path(
             {"simulated": "datasets/generate_probing", "recordings": "datasets/raw/temperature"}[source]
         )
-        results = ingest.process(
-            folder, ingest.spec_of(settings, machine, source), execution, memo=Path("datasets/memo/ingest")
-        )
+        spec = ingest.spec_of(settings, machine, source)
+        results = ingest.process(folder, spec, execution, memo=Path("datasets/memo/ingest"))
         record, quality, metrics = ingest.collect(
             results, machine, strict=settings.strict or "--strict" in sys.argv
         )
         artifacts.write_table(out / "record.parquet", record.schema, record.columns)
         artifacts.write_table(out / "quality.parquet", quality.schema, quality.columns)
-        artifacts.write_metrics("ingest", metrics)
+        artifacts.write_metrics("ingest", metrics | ingest.printer_pids(folder, results, spec))
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from pipeline.report.identification.model import flagged_sentence
 from pipeline.report.shared.digits import THIN, number, percent, short
 from pipeline.report.shared.sources import Sources, lookup
 from pipeline.report.shared.verdict import Missing
@@ -12,7 +13,8 @@ def findings(sources: Sources) -> list[tuple[str, str]]:
     """What a reader should take away, each with its figure; a figure
     that was not measured is said to be so."""
     evaluated, tuned = sources.metrics["evaluate_temperature"], sources.metrics["tune_weights"]
-    claims = [_claim(sources), _scaled(tuned), _algorithm_1(evaluated), _start(evaluated), _regret(tuned)]
+    claims = [_flagged(sources), _claim(sources), _scaled(tuned), _algorithm_1(evaluated)]
+    claims += [_start(evaluated), _regret(tuned)]
     units = sources.declared.machine.sample_time_s
     claims.append(
         (
@@ -36,6 +38,19 @@ def findings(sources: Sources) -> list[tuple[str, str]]:
             )
         )
     return [item for item in claims if item]
+
+
+def _flagged(sources: Sources) -> tuple[str, str] | None:
+    """A word where controllers are designed from a model with gains that physics forbids."""
+    gains = lookup(sources.metrics["identify_plant"], "forbidden_gains")
+    if isinstance(gains, Missing) or not gains:
+        return None
+    return (
+        "The controllers are designed from a model that physics forbids."
+        if any(gain["certain"] for gain in gains)
+        else "The controllers are designed from a model that physics may forbid.",
+        f"{flagged_sentence(gains)} Put none of them to the machine before that is explained.",
+    )
 
 
 def _claim(sources: Sources) -> tuple[str, str] | None:
