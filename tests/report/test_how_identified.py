@@ -104,6 +104,7 @@ def test_a_gain_whose_band_reaches_what_is_possible_is_a_reservation_and_takes_n
     assert "Trust this model to design controllers, to predict 10 s ahead and to simulate." in text
     assert "One reservation, the first undecided rule: gains possible." in text
     assert "would be a heater that cools" in text and "the value, not the whole band" in text
+    assert "before a controller relies on it." in text and "Design no controller" not in text
     assert "designed from a model that physics may forbid." in Page(TEMPERATURE).text
 
 
@@ -179,7 +180,7 @@ def test_a_time_constant_beyond_the_step_responses_is_no_model_and_takes_the_bol
     assert "zone_2 not settled within 40.0 s: heater_1" in page()
     html = IDENTIFICATION.read_text()
     # zone_1's one input; zone_2's strongest does not settle
-    assert re.findall(r'<td class="best"><bdi>(.*?)</bdi>', html) == ["heater_1"]
+    assert re.findall(r'<span class="b best"><bdi>(.*?)</bdi>', html) == ["heater_1"]
 
 
 def test_the_printers_own_pid_stands_beside_in_percent_and_as_its_configuration_has_it(project):
@@ -188,6 +189,25 @@ def test_the_printers_own_pid_stands_beside_in_percent_and_as_its_configuration_
     assert "heater_1 to zone_1 the printer’s own 8.00 0.400 40.0 20.4 1.02 102" in text
     assert "heater_1 to zone_1 SIMC, from this record 2.00 0.200 1.00 5.10 0.510 2.55" in text
     assert "smoothed over 1 s, and its duty ends at 100 %. From the configuration in klippy.log." in text
+
+
+def test_the_page_of_the_loop_says_that_the_printers_own_pid_is_not_judged(project):
+    main()
+    text = Page(TEMPERATURE).text
+    assert "The printer’s own PID is not among these controllers." in text
+    assert "The printer holds heater_1 by Kp 8.00, Ki 0.400, Kd 40.0, in % of duty, °C and s." in text
+
+
+def test_a_page_from_recordings_does_not_call_their_units_a_convention(project):
+    main()
+    assert "read seconds as steps" in Page(TEMPERATURE).text
+    sections = params.read("params.yaml")
+    sections["generate_probing"]["source"] = "recordings"
+    for output in sections["plant"]["outputs"]:
+        output |= {"low": 0, "high": 300}
+    Path("params.yaml").write_text(yaml.safe_dump(sections))
+    main()
+    assert "read seconds as steps" not in Page(TEMPERATURE).text
 
 
 def test_the_printers_own_pid_stays_where_the_models_are_missing(project):
@@ -218,3 +238,11 @@ def _roles(machine):
 
 def _signal(entry):
     return type("Signal", (), entry)
+
+
+def test_a_page_with_a_closed_loop_and_flagged_gains_does_not_overflow_a_phone(project, open_page):
+    heating()
+    change("identify_plant", closed_loop=CLOSED, forbidden_gains=[COOLS, COOLS | {"output": "zone_2"}])
+    main()
+    narrow = open_page("identification", folder=project / "reports", width=390)
+    assert narrow.evaluate("document.documentElement.scrollWidth") == 390

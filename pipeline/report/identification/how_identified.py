@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from pipeline.report.identification.model import (
-    FLAGGED_REMEDY,
     Fit,
     band_of,
     fit_figure,
+    flagged_remedy,
     flagged_sentence,
     percent_of,
 )
@@ -100,14 +100,14 @@ def _listed(items: Sequence[str]) -> str:
 
 
 class FlaggedRow(NamedTuple):
-    """A gain that physics forbids, with its band and how sure that is."""
+    """A gain that physics forbids, with its band; `certain` where all of the band is forbidden."""
 
     output: str
     input: str
     gain: str
     band: str
     reason: str
-    certainty: str
+    certain: bool
 
 
 class Flagged(NamedTuple):
@@ -130,7 +130,9 @@ def flagged(sources: Sources) -> Flagged:
         )
     if not gains:
         return Flagged(f"None: every effect of {_listed(heaters)} is one that a heater can have.", [])
-    return Flagged(f"{flagged_sentence(gains)} {FLAGGED_REMEDY}", [_flagged_row(gain) for gain in gains])
+    return Flagged(
+        f"{flagged_sentence(gains)} {flagged_remedy(gains)}", [_flagged_row(gain) for gain in gains]
+    )
 
 
 def _flagged_row(gain: dict[str, Any]) -> FlaggedRow:
@@ -141,7 +143,7 @@ def _flagged_row(gain: dict[str, Any]) -> FlaggedRow:
         gain=number(gain["gain"], places),
         band=band(gain["low"], gain["high"], places),
         reason=gain["reason"],
-        certainty="the whole band" if gain["certain"] else "the value, not the whole band",
+        certain=gain["certain"],
     )
 
 

@@ -413,15 +413,22 @@ def _possible_gains(sources: Sources) -> list[Rule]:
         return [_none(name, place, 0, "none forbidden", "Every heater heats, by a size that is possible.")]
     worst = max(gains, key=lambda gain: (gain["certain"], abs(gain["gain"])))
     text = f"{worst['input']} on {worst['output']}"
-    rule = _none(name, place, len(gains), text, flagged_sentence(gains), FLAGGED_REMEDY)
+    rule = _none(name, place, len(gains), text, flagged_sentence(gains), flagged_remedy(gains))
     certain = sum(gain["certain"] for gain in gains)
     return [rule._replace(figure=Figure(len(gains), certain, len(gains)))]
 
 
-FLAGGED_REMEDY = (
-    "Design no controller from this model before each is explained: check source and scale in "
-    "ingest.mapping, then record again with every input moved on its own."
-)
+def flagged_remedy(gains: Sequence[Mapping[str, Any]]) -> str:
+    """What to do before a controller is designed from the model."""
+    if any(gain["certain"] for gain in gains):
+        return (
+            "Design no controller from this model before each is explained: check source and scale in "
+            "ingest.mapping, then record again with every input moved on its own."
+        )
+    return (
+        "Its band reaches what is possible, so that the effect is not known: move that input on its own and "
+        "record again before a controller relies on it."
+    )
 
 
 def flagged_sentence(gains: Sequence[Mapping[str, Any]]) -> str:
