@@ -10,7 +10,8 @@ from pathlib import Path
 
 from pipeline.nightly import commands as nights
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow.settings import Panel
+from pipeline.store.printable import printable
+from pipeline.temperature.workflow.settings import Ingest, Panel
 
 
 def accept(_: argparse.Namespace) -> None:
@@ -107,9 +108,15 @@ def history(arguments: argparse.Namespace) -> None:
 def inspect(arguments: argparse.Namespace) -> None:
     """What is in a recording: signals, rates, jitter, gaps, ranges,
     damage; and a mapping to paste into params.yaml."""
-    from pipeline.reading.recordings import inspect as describe
+    from pipeline.reading.inspection import inspect as describe
+    from pipeline.reading.isolated import Budget, isolated
+    from pipeline.reading.plain_files import check_plain_file
 
-    print(describe(arguments.file))
+    here = Path(params.FILE) if Path(params.FILE).exists() else Path(__file__).parents[1] / params.FILE
+    declared = params.load(Ingest, "ingest", here)
+    check_plain_file(arguments.file)
+    budget = Budget(declared.longest_s, declared.largest_mb)
+    print(printable(isolated(describe, arguments.file, shown=arguments.file, budget=budget)))
 
 
 def init(arguments: argparse.Namespace) -> None:
@@ -212,7 +219,7 @@ def main() -> None:
     try:
         arguments.run(arguments)
     except (ValueError, OSError) as error:
-        print(f"beadline: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"beadline: {printable(' '.join(str(error).split()))}", file=sys.stderr)
         sys.exit(1)
 
 

@@ -24,7 +24,8 @@ def main() -> None:
             {"simulated": "datasets/generate_probing", "recordings": "datasets/raw/temperature"}[source]
         )
         spec = ingest.spec_of(settings, machine, source)
-        results = ingest.process(folder, spec, execution, memo=Path("datasets/memo/ingest"))
+        budget = ingest.Budget(settings.longest_s, settings.largest_mb)
+        results = ingest.process(folder, spec, execution, memo=Path("datasets/memo/ingest"), budget=budget)
         record, quality, metrics = ingest.collect(
             results, machine, strict=settings.strict or "--strict" in sys.argv
         )

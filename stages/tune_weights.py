@@ -11,7 +11,9 @@ def main() -> None:
     with artifacts.stage("tune_weights") as out:
         settings, machine = params.load(TuneWeights, "tune_weights"), params.load(Plant, "plant")
         tracking, panel = params.load(Tracking, "tracking"), params.load(Panel, "panel")
-        model = plant.restored(artifacts.read_arrays("datasets/identify_plant/plant.parquet", "plant", 1))[0]
+        shapes = {"D": (None, len(machine.outputs), len(machine.inputs))}
+        arrays = artifacts.read_arrays("datasets/identify_plant/plant.parquet", "plant", 1, shapes=shapes)
+        model = plant.restored(arrays)[0]
         tuned = tune_weights.tuned(settings, machine, tracking, panel, model)
         artifacts.write_json(out / "weights.json", tuned.weights)
         artifacts.write_table(out / "history.parquet", tables.TUNING, tuned.history)

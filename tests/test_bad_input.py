@@ -153,7 +153,8 @@ def changed(**columns: tuple[int | slice, float]) -> dict[str, np.ndarray]:
             "ingest",
             "ingest.colour",
             1,
-            "params.yaml: ingest.colour is unknown; remove it, or use mapping, time, max_gap_s, strict",
+            "params.yaml: ingest.colour is unknown; remove it, or use mapping, time, decimal, max_gap_s, "
+            "longest_s, largest_mb, strict",
         ),
         (
             "ingest",
@@ -234,9 +235,9 @@ def test_a_mapping_that_names_no_signal_is_refused_with_the_nearest_names(tree, 
             ),
         ),
         (
-            changed(t_s=(300, 299.0)),
+            changed(t_s=(slice(300, 320), 299.0)),
             (
-                "line 302 has the same time as the sample before it, 299 s, "
+                "line 302 has the same time as the sample before it, 299 s, the first of 20, "
                 "but time should only run forward; "
                 "name a finer clock, or give each device or tag that writes here a column of its own"
             ),
@@ -247,7 +248,7 @@ def test_a_mapping_that_names_no_signal_is_refused_with_the_nearest_names(tree, 
         ),
         (signals(1), "output zone_1 should have at least two samples but has 1; record longer"),
     ],
-    ids=["backwards", "two at one time", "NaN only", "one sample"],
+    ids=["backwards", "many at one time", "NaN only", "one sample"],
 )
 def test_a_recording_that_is_no_record_is_refused_with_its_place(tree, refused, columns, said):
     record(tree, columns)

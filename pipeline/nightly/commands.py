@@ -3,6 +3,8 @@
 import argparse
 import sys
 
+from pipeline.store.printable import printable
+
 
 def nightly(arguments: argparse.Namespace) -> None:
     """The nightly job: new recordings, dvc repro, judge, promote or keep. Exit status 0: promoted, kept, or
@@ -11,12 +13,12 @@ def nightly(arguments: argparse.Namespace) -> None:
     from pipeline.nightly import accepting, merging, night
 
     if arguments.accept_drift:
-        print(accepting.accept(*arguments.accept_drift))
+        print(printable(accepting.accept(*arguments.accept_drift)))
         return
     if arguments.merge:
-        print(merging.merge(arguments.merge))
+        print(printable(merging.merge(arguments.merge)))
     status, summary = night.watchdog() if arguments.watch else night.nightly()
-    print(summary, file=sys.stderr if status else sys.stdout)
+    print(printable(summary), file=sys.stderr if status else sys.stdout)
     sys.exit(status)
 
 
@@ -25,7 +27,7 @@ def rollback(arguments: argparse.Namespace) -> None:
     of RUN, or the one before the present one."""
     from pipeline.nightly import night
 
-    print(night.rollback(arguments.of, arguments.loop))
+    print(printable(night.rollback(arguments.of, arguments.loop)))
 
 
 def sweep(arguments: argparse.Namespace) -> None:

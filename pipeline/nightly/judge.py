@@ -266,9 +266,15 @@ def record_segments(
         name: (m["source"], m["unit"], float(m["scale"]), float(m["offset"]))
         for name, m in declared["mapping"].items()
     }
-    spec = ingest.IngestSpec(machine, mapping, declared["time"], float(declared["max_gap_s"]))
+    spec = ingest.IngestSpec(
+        machine, mapping, declared["time"], float(declared["max_gap_s"]), declared["decimal"]
+    )
     results = ingest.process(
-        folder, spec, params.load(params.Execution, "execution"), memo=Path("datasets/memo/ingest")
+        folder,
+        spec,
+        params.load(params.Execution, "execution"),
+        memo=Path("datasets/memo/ingest"),
+        budget=ingest.Budget(float(declared["longest_s"]), float(declared["largest_mb"])),
     )
     segments = {}
     for result in results:

@@ -3,16 +3,18 @@ out of text, and every refusal names the line."""
 
 import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from pipeline.reading.csv_arrow import iso_zone, read_plain
 from pipeline.reading.csv_layout import csv_layout
 from pipeline.reading.formats import (
     Column,
     Columns,
     Growing,
+    check_no_counter,
     column_place,
     date_column,
     every,
@@ -26,8 +28,13 @@ from pipeline.store.csv_rows import (
     LONGEST_TAIL,
     MISSING,
     SWITCH,
+    ColumnStyle,
     CsvLayout,
+    broken_line,
+    column_style,
+    decimal_mark,
     floats,
+    is_ambiguous,
     is_number,
     rows,
     sound_rows,
@@ -60,18 +67,66 @@ def csv_columns(path: Path) -> list[Column]:
     return columns
 
 
-def read_csv(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns, list[Note]]:
-    """The wanted columns, NaN where a field is empty.
+def read_csv(path: Path, wanted: Sequence[str], time: str, decimal: str = "") -> tuple[Columns, list[Note]]:
+    """The wanted columns, NaN where a field is empty. `decimal` is the declared decimal mark, "" to find it.
 
-    Raises ValueError with the line for text, a row of another length, or a missing column.
+    Raises ValueError with the line for text, a row of another length, a missing column, and numbers that may
+    be thousands.
     """
-    layout = csv_layout(path)
-    notes = list(layout.notes)
+    layout = csv_layout(path, decimal)
     interval = every(time)
-    clock = "" if interval else time_column(path, layout.names, time)
+    clock = None if interval else time_column(path, layout.names, time)
     places = [column_place(path, layout.names, name) for name in wanted]
+    layout = _decided(path, layout, [*wanted, *([] if clock is None else [clock])])
+    notes = list(layout.notes)
+    clocks = None if clock is None else _Clock(path, layout, clock)
+    plain = None
+    if clocks is None:
+        plain = read_plain(path, layout, places, None, None)
+    elif clocks.is_plain:
+        plain = read_plain(path, layout, places, clocks.place, clocks.zone)
+    if plain is not None:
+        values, place = dict(zip(wanted, plain.values, strict=True)), _line_of(path, layout)
+        count = len(plain.values[0])
+        if plain.broken:
+            notes.append(broken_line(*plain.broken, len(layout.names)))
+        if clocks and plain.time is not None:
+            clocks.take(plain.time, plain.zoned)
+    else:
+        values, lines = _rows_one_by_one(path, layout, places, wanted, clocks, notes)
+        count, place = len(lines), lambda i: f"line {lines[i]}"
+    if not count:
+        raise ValueError(
+            f"{path}: no row behind line {layout.skip} has a time and the {len(layout.names)} fields of the "
+            "header; mend the rows, or record it again"
+        )
+    times, zone = clocks.finished(notes) if clocks else (np.arange(count) * interval, "")
+    if clocks and clocks.numeric and not time:
+        check_no_counter(path, clocks.name, times)
+    columns_forward, turned = forward(Columns("rows", times, values, place, zone))
+    return columns_forward, notes + turned
+
+
+def _rows_one_by_one(
+    path: Path,
+    layout: CsvLayout,
+    places: Sequence[int],
+    wanted: Sequence[str],
+    clocks: "_Clock | None",
+    notes: list[Note],
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """{column: values (n,)} and the line (n,) of each row: the slow way, which knows every word and names the
+    line of a fault."""
     columns = Growing([float] * len(wanted))
-    lines, switches, clocks = Growing([np.int32]), {}, _Clock(path, layout, clock) if clock else None
+    lines = Growing([np.int32])
+    switches: dict[str, set[str]] = {}
+    styles: dict[str, ColumnStyle] = {}
+
+    def style(name: str) -> ColumnStyle:
+        if name not in styles:
+            styles[name] = column_style(path, layout, layout.names.index(name))
+        return styles[name]
+
     rows = sound_rows(path, layout, clocks, notes)
     while block := list(itertools.islice(rows, max(1, FIELDS_AT_ONCE // len(layout.names)))):
         numbers = [line for line, _ in block]
@@ -79,26 +134,57 @@ def read_csv(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns, lis
         lines.append(np.array(numbers))
         columns.append(
             *(
-                floats(path, name, texts, layout.decimal, numbers, switches)
+                floats(path, name, texts, layout.decimal, numbers, switches, style)
                 for name, texts in zip(wanted, fields, strict=True)
             )
         )
         if clocks:
             clocks.append([row for _, row in block], numbers)
-    line = lines.finished()[0]
     for name, words in switches.items():
-        notes.append(
-            Note(
-                "words",
-                "",
-                1,
-                f"{name} is written as {' and '.join(sorted(words))}, which were read as 1 and 0",
-            )
-        )
-    times, zone = clocks.finished(notes) if clocks else (np.arange(len(line)) * interval, "")
-    values = dict(zip(wanted, columns.finished(), strict=True))
-    columns_forward, turned = forward(Columns("rows", times, values, lambda i: f"line {line[i]}", zone))
-    return columns_forward, notes + turned
+        message = f"{name} is written as {' and '.join(sorted(words))}, which were read as 1 and 0"
+        notes.append(Note("words", "", 1, message))
+    for name in wanted:
+        if name in styles and styles[name].unit:
+            message = f"{name} is written with its unit {styles[name].unit}, which was left out"
+            notes.append(Note("words", "", 1, message))
+    return dict(zip(wanted, columns.finished(), strict=True)), lines.finished()[0]
+
+
+def _decided(path: Path, layout: CsvLayout, names: Sequence[str]) -> CsvLayout:
+    """The layout with the decimal mark that some field of the file gives away.
+
+    Raises ValueError with both readings where 1,000 or 1.000 is all that there is.
+    """
+    if layout.decided:
+        return layout
+    places = {column_place(path, layout.names, name): name for name in names}
+    doubtful: tuple[int, str, str] | None = None
+    for line, row in rows(path, layout):
+        for i, field in enumerate(row):
+            if mark := decimal_mark(field):
+                return layout._replace(decimal=mark, decided=True)
+            if doubtful is None and i in places and is_ambiguous(field):
+                doubtful = line, places[i], field.strip()
+    if doubtful is None:
+        return layout._replace(decided=True)
+    line, name, field = doubtful
+    mark = "," if "," in field else "."
+    one, thousand = field.replace(",", "."), re.sub("[.,]", "", field)
+    raise ValueError(
+        f"{path}: line {line}, column {name}: {field} may be {one} or {thousand}, as every fraction in the "
+        f'file has three digits; declare ingest.decimal: "{mark}" for {one}, '
+        f'or "{"." if mark == "," else ","}" for {thousand}'
+    )
+
+
+def _line_of(path: Path, layout: CsvLayout) -> Callable[[int], str]:
+    """The place of a row in a file that was read without counting its lines: it is looked up where somebody
+    asks."""
+
+    def place(i: int) -> str:
+        return f"line {next(itertools.islice(sound_rows(path, layout, None, []), i, None))[0]}"
+
+    return place
 
 
 # ---- the clock
@@ -135,6 +221,10 @@ class _Clock:
         self.hyphen_fraction = not self.numeric and hyphen_fraction(
             field for field in written if ":" in field
         )
+        self.latest: int | None = None
+        # the zone of ISO times; Arrow reads them, and numbers
+        self.zone = None if self.numeric or self.date is not None else iso_zone(sample.strip())
+        self.is_plain = self.numeric or (self.zone is not None and not self.hyphen_fraction)
         self.times, self.zoned, self.dated = Growing([float if self.numeric else np.int64]), True, True
 
     def text(self, row: list[str]) -> str:
@@ -161,9 +251,16 @@ class _Clock:
             lines,
             month_first=self.month_first,
             hyphen_fraction=self.hyphen_fraction,
+            after=self.latest,
         )
         self.times.append(dates.ns)
+        self.latest = int(dates.ns[-1])
         self.zoned, self.dated = self.zoned and dates.zoned, dates.dated
+
+    def take(self, times: np.ndarray, zoned: bool) -> None:
+        """The times that Arrow read."""
+        self.times.append(times)
+        self.zoned = zoned
 
     def finished(self, notes: list[Note]) -> tuple[np.ndarray, str]:
         """time_s or time_ns (n,) and its zone."""

@@ -2,23 +2,36 @@
 data."""
 
 import collections
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
 from pipeline.reading.formats import is_time_name
 from pipeline.reading.signals import Note
-from pipeline.store.csv_rows import CsvLayout, is_quantity, opening
+from pipeline.store.csv_rows import MISSING, CsvLayout, decimal_mark, is_quantity, opening
 
 
-def csv_layout(path: Path) -> CsvLayout:
-    """Encoding, delimiter, decimal mark and header of a text file. Raises ValueError for a file without rows
-    of numbers."""
-    encoding, delimiter, decimal, rows, comment, notes = opening(path)
+def csv_layout(path: Path, decimal: str = "") -> CsvLayout:
+    """Encoding, delimiter, decimal mark (`decimal` where it is declared) and header of a text file.
+
+    Raises ValueError for a file without rows of numbers.
+    """
+    layout, rows = _layout(path, decimal)
+    marks = collections.Counter(mark for row in rows for field in row if (mark := decimal_mark(field)))
+    # what writes commas between fields writes points before decimals
+    decided = bool(decimal) or layout.decimal in marks or (layout.delimiter, layout.decimal) == (",", ".")
+    return layout._replace(decided=decided, declared=bool(decimal))
+
+
+def _layout(path: Path, declared: str) -> tuple[CsvLayout, list[list[str]]]:
+    """The layout, and the rows of data that the file begins with."""
+    encoding, delimiter, decimal, rows, comment, notes = opening(path, declared)
     numbers = [
         0 if remark else sum(is_quantity(field, decimal) for field in row)
         for row, remark in zip(rows, comment, strict=True)
     ]
     first, width = _first_row(path, rows, numbers, comment, delimiter)
+    data = [row for row, remark in zip(rows[first:], comment[first:], strict=True) if not remark]
     heads = [
         i
         for i in range(first)
@@ -34,28 +47,42 @@ def csv_layout(path: Path) -> CsvLayout:
                 f"column_1 to column_{width}",
             )
         )
-        return CsvLayout(
-            encoding,
-            delimiter,
-            decimal,
-            [f"column_{i + 1}" for i in range(width)],
-            [""] * width,
-            first,
-            notes,
-        )
+        names = [f"column_{i + 1}" for i in range(width)]
+        return CsvLayout(encoding, delimiter, decimal, names, [""] * width, first, notes), data
     names, units = [field.strip() for field in rows[heads[-1]]], [""] * width
-    if len(heads) > 1 and heads[-2] == heads[-1] - 1 and heads[-1] == first - 1:
+    written = [sum(bool(field.strip()) for field in rows[i]) for i in heads]
+    if (
+        len(heads) > 1
+        and heads[-2] == heads[-1] - 1
+        and heads[-1] == first - 1
+        and written[-2] >= written[-1]
+    ):
         names, units = (
             [field.strip() for field in rows[heads[-2]]],
             [field.strip(" ()[]") for field in rows[heads[-1]]],
         )
-    return CsvLayout(
-        encoding, delimiter, decimal, names, units + [""] * (len(names) - len(units)), first, notes
-    )
+    if len(names) == width + 1 and names[-1].casefold() == "comment":
+        names.pop()  # of LabVIEW, which writes it only where there is one
+    units += [""] * (len(names) - len(units))
+    return CsvLayout(encoding, delimiter, decimal, names, units, first, notes), data
 
 
 def _names_time(row: Sequence[str]) -> bool:
     return len(row) > 1 and any(is_time_name(field) for field in row)
+
+
+def _is_heading(row: Sequence[str], table: Sequence[Sequence[str]]) -> bool:
+    """Whether a row with numbers begins with a word where the rows of the table begin with numbers, as the
+    lines before LabVIEW's do."""
+    first = row[0].strip().casefold()
+    if first in MISSING or _begins_a_number(first):
+        return False
+    return sum(_begins_a_number(other[0].strip()) for other in table) > 0.8 * len(table)
+
+
+def _begins_a_number(field: str) -> bool:
+    """Whether a field begins as a number or a time does."""
+    return bool(re.match(r"[+-]?[.,]?\d", field))
 
 
 def _first_row(
@@ -85,4 +112,8 @@ def _first_row(
             f"{path} is text but no table: {len(table)} of its first {len(written)} lines have {width} "
             "fields with numbers among them; name a recording, or save it as CSV with one row a sample"
         )
-    return table[0], width
+    begin = next((i for i in table if not _is_heading(rows[i], [rows[k] for k in table])), table[0])
+    # most rows may end with an empty field, and the first ones not
+    while begin - 1 in data and len(rows[begin - 1]) == width + 1:
+        begin -= 1
+    return begin, len(rows[begin])

@@ -18,7 +18,10 @@ _EPOCHS = (
     (1e14, 1e6, 0, "us"),
     (1e11, 1e3, 0, "ms"),
 )
-# days since 1899-12-30 and since the year 0, from 1954 to 2119, and 1970-01-01 in them
+# seconds since 1904, as LabVIEW counts, from 2015 to 2040
+_SINCE_1904_S, _LABVIEW = 2_082_844_800, (3.5e9, 4.3e9)
+# days since 1899-12-30 (since 1904 where the column says so) and since the year 0, from 1954 to 2119, and
+# 1970-01-01 in them
 _SERIAL_DAYS = ((20_000, 80_000, 25_569, "spreadsheets"), (713_000, 774_000, 719_529, "MATLAB"))
 # a clock that runs on for no more than so many samples before it falls back is not one clock
 OTHER_DEVICE_RUN = 8
@@ -40,6 +43,7 @@ _TIME_NAMES = (
     "zeitstempel",
     "zeit",
     "uhrzeit",
+    "x_value",
     "epoch",
     "unix_time",
     "unixtime",
@@ -52,6 +56,8 @@ _TIME_NAMES = (
     "index",
 )
 DATE_NAMES = ("date", "datum")
+# what pandas calls the index of a table where nobody named it
+INDEX_NAMES = ("", "Unnamed: 0", "__index_level_0__", "index")
 _PER_SECOND = {"s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0,
                "ms": 1e3, "msec": 1e3, "us": 1e6, "µs": 1e6,
                "usec": 1e6, "ns": 1e9, "nsec": 1e9, "min": 1 / 60, "mins": 1 / 60, "minutes": 1 / 60,
@@ -118,6 +124,11 @@ class Growing:
     def __init__(self, kinds: Sequence[type], expected: int = 0):
         self.count = 0
         self._columns = [np.empty(max(expected, 1), kind) for kind in kinds]
+
+    def expect(self, size: int) -> None:
+        """Room for `size` rows at once, so that growing moves nothing."""
+        if size > len(self._columns[0]):
+            self._resize(size)
 
     def append(self, *parts: np.ndarray) -> None:
         end = self.count + len(parts[0])
@@ -192,6 +203,10 @@ def time_column(path: Path, names: Sequence[str], time: str) -> str:
             raise ValueError(f"{path}: there is no time column {time!r}; {nearest_names(time, names)}")
         return time
     ranked = [(rank, name) for name in names if (rank := _time_rank(name)) is not None]
+    # an index stands first in CSV, last in Parquet
+    index = [name for name in (names[0], names[-1]) if name in INDEX_NAMES]
+    if not ranked and index:
+        return index[0]
     if not ranked:
         shown = ", ".join(names[:12])
         raise ValueError(
@@ -223,6 +238,8 @@ def _time_rank(name: str) -> tuple[bool, int] | None:
     if name.strip() == "T":  # more often a temperature
         return True, len(_TIME_NAMES)
     base, unit = _time_unit(name)
+    if name.strip() == "T":  # more likely a temperature
+        return True, len(_TIME_NAMES)
     return (not unit, _TIME_NAMES.index(base)) if base in _TIME_NAMES else None
 
 
@@ -264,12 +281,18 @@ def seconds(name: str, numbers: np.ndarray) -> tuple[np.ndarray, str]:
                 numbers / per_second - epoch,
                 f"column {name} holds numbers up to {high:.3g} and was taken as an epoch in {unit}",
             )
+    if _LABVIEW[0] < low and high < _LABVIEW[1] and np.median(np.abs(np.diff(finite))) < 3600:
+        return (
+            numbers - _SINCE_1904_S,
+            f"column {name} was taken as seconds since 1904, as LabVIEW counts them",
+        )
     for first, last, epoch, program in _SERIAL_DAYS:
+        epoch = 24_107 if "1904" in name and program == "spreadsheets" else epoch
         if (
             first <= low
             and high <= last
             and len(finite) > 1
-            and _in_days(float(np.median(np.abs(np.diff(finite)))))
+            and (_time_unit(name)[0] in DATE_NAMES or _in_days(float(np.median(np.abs(np.diff(finite))))))
         ):
             remark = (
                 f"column {name} holds {low:.8g} to {high:.8g} and was taken as days, as {program} count them"
@@ -280,10 +303,19 @@ def seconds(name: str, numbers: np.ndarray) -> tuple[np.ndarray, str]:
 
 
 def _in_days(interval: float) -> bool:
-    """Whether an interval is in days: up to a second, or whole seconds up to a minute. In seconds it would be
-    80 kHz, or a rate that no such machine has: 1 kHz would be 86.4 s."""
+    """Whether an interval is in days: up to 8 s, or whole seconds up to a minute. In seconds it would be
+    11 kHz, or a rate that no such machine has: 1 kHz would be 86.4 s."""
     in_seconds = interval * 86400
-    return 0 < in_seconds < 1.05 or (in_seconds < 61 and abs(in_seconds - round(in_seconds)) < 0.02)
+    return 0 < in_seconds < 8 or (in_seconds < 61 and abs(in_seconds - round(in_seconds)) < 0.02)
+
+
+def check_no_counter(path: Path, name: str, time: np.ndarray) -> None:
+    """Raises ValueError where an index that nobody named as the time counts the rows."""
+    if name in INDEX_NAMES and time[0] in (0, 1) and (np.diff(time) == 1).all():
+        raise ValueError(
+            f"{path}: no column is called like a time, and {name or 'the column without a name'} counts the "
+            "rows 0, 1, 2, ..., which is no time; write time: every 1.0 s with the sample time, or its name"
+        )
 
 
 # ---- which way the time runs

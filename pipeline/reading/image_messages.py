@@ -17,9 +17,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import orjson
+from google.protobuf.message import Message
 
 from pipeline.reading.mcap_messages import Channel, plain
-from pipeline.reading.protobuf_messages import Field, _wire, message_types
+from pipeline.reading.protobuf_messages import message_reader, message_types
 from pipeline.reading.ros_messages import UnreadableMessage
 
 # the fields of each message in the order of the wire: b bytes, s text, I and B whole numbers
@@ -29,6 +30,8 @@ _ROS = {
     "foxglove_msgs/RawImage": "stamp, frame_id:s, width:I, height:I, encoding:s, step:I, data:b",
     "foxglove_msgs/CompressedImage": "stamp, frame_id:s, data:b, format:s",
 }
+# a picture of that many is 256 MB of 16 bits; the largest of cameras have some 1.5e8
+MOST_PIXELS = 1 << 27
 _FOXGLOVE = ("foxglove/RawImage", "foxglove/CompressedImage")
 READABLE = (
     "sensor_msgs Image and CompressedImage (ROS 2, ROS 1), "
@@ -91,10 +94,8 @@ def reader(channel: Channel) -> Read:
     if channel.encoding == "json":
         parse = _json
     elif channel.encoding == "protobuf":
-        types = message_types(channel.schema)
-        if channel.schema_name not in types:
-            raise ValueError(f"the schema does not define its own message {channel.schema_name}")
-        parse = functools.partial(_protobuf, numbers=types[channel.schema_name])
+        read_message = message_reader(message_types(channel.schema), channel.schema_name)
+        parse = functools.partial(_protobuf, read=read_message)
     else:
         fields = [tuple(field.split(":")) for field in _ROS[_kind(channel)].split(", ")]
         parse = functools.partial(_ros, fields=fields, aligned=channel.encoding == "cdr")
@@ -151,18 +152,18 @@ def _ros(message: memoryview, fields: list[tuple[str, ...]], aligned: bool) -> P
     return _picture(values, values["stamp"])
 
 
-def _protobuf(message: memoryview, numbers: dict[int, Field]) -> Picture:
-    values: dict = {}
-    for number, _, value in _wire(message):
-        if number in numbers:
-            values[numbers[number].name] = value
-    stamp = {number: value for number, _, value in _wire(values.get("timestamp", b""))}
-    for name in ("width", "height", "step"):
-        value = values.get(name, 0)
-        values[name] = value if isinstance(value, int) else int.from_bytes(value, "little")
-    for name in ("encoding", "format"):
-        values[name] = _word(values.get(name, b""))
-    return _picture(values, stamp.get(1, 0) * 10**9 + stamp.get(2, 0))
+def _protobuf(message: memoryview, read: Callable[[memoryview], Message]) -> Picture:
+    values = {field.name: value for field, value in read(message).ListFields()}
+    numbers = {name: values.get(name, 0) for name in ("width", "height", "step")}
+    texts = {name: values.get(name, "") for name in ("encoding", "format")}
+    stamp, data = values.get("timestamp"), values.get("data", b"")
+    since = [0 if stamp is None else getattr(stamp, name, "") for name in ("seconds", "nanos")]
+    if not all(isinstance(whole, int) for whole in (*numbers.values(), *since)):
+        raise UnreadableMessage("something else where an image has a whole number")
+    if not isinstance(data, bytes) or not all(isinstance(text, str) for text in texts.values()):
+        raise UnreadableMessage("something else where an image has its bytes or its format")
+    picture = numbers | texts | {"data": memoryview(data), "is_bigendian": values.get("is_bigendian", 0)}
+    return _picture(picture, int(since[0]) * 10**9 + int(since[1]))
 
 
 def _json(message: memoryview) -> Picture:
@@ -230,7 +231,36 @@ def _rows(picture: Picture, size: int) -> np.ndarray:
     return np.frombuffer(picture.data, np.uint8, step * picture.height).reshape(picture.height, step)[:, :row]
 
 
+def check_size(data: bytes | memoryview) -> None:
+    """Raises UnreadableMessage if the header of a PNG or JPEG promises more pixels than are decoded: they
+    would take the memory before the first of them is read."""
+    height, width = _size(bytes(data[: 1 << 16]))
+    if height * width > MOST_PIXELS:
+        raise UnreadableMessage(
+            f"its header says {width} x {height} px; pictures of up to {MOST_PIXELS} px are read"
+        )
+
+
+def _size(data: bytes) -> tuple[int, int]:
+    """Height and width by the header of a PNG or JPEG; (0, 0) if they do not stand in `data`."""
+    if data.startswith(b"\x89PNG") and len(data) >= 24:
+        width, height = struct.unpack_from(">II", data, 16)
+        return height, width
+    pos = 2
+    while data.startswith(b"\xff\xd8") and pos + 9 <= len(data) and data[pos] == 0xFF:
+        if data[pos + 1] == 0xFF:  # a filling byte
+            pos += 1
+            continue
+        # SOF0 to SOF15 without DHT, JPG and DAC, which stand among them
+        if 0xC0 <= data[pos + 1] <= 0xCF and data[pos + 1] not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack_from(">HH", data, pos + 5)
+            return height, width
+        pos += 2 + struct.unpack_from(">H", data, pos + 2)[0]
+    return 0, 0
+
+
 def _decoded(picture: Picture) -> np.ndarray:
+    check_size(picture.data)
     # without ANYDEPTH 16 bits would be cut down to 8
     try:
         frame = cv2.imdecode(

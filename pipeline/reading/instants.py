@@ -5,6 +5,7 @@ import calendar
 import datetime
 import functools
 import re
+import zoneinfo
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -23,13 +24,19 @@ _TIME = (
     r"\s*(?P<half>[AaPp]\.?[Mm]\.?)?"
 )
 _TEXT = re.compile(
-    rf"\s*(?:{_DATE}(?:[T,\s]+|$))?(?:{_TIME})?\s*(?P<zone>Z|z|UTC|GMT|[+-]\d\d(?::?\d\d)?)?\s*$"
+    rf"\s*(?:{_DATE}(?:[T,\s]+|$))?(?:{_TIME})?\s*(?P<zone>Z|z|[+-]\d\d(?::?\d\d)?|[A-Z]{{3,5}}|[A-Z]\w+(?:/[\w+-]+)+)?\s*$"
 )
 _PARTS = ("date", "hours", "minutes", "seconds", "fraction", "half", "zone")
 # 20251121130000 and 20251121130000250, as controllers stamp
 _COMPACT = re.compile(r"\s*((?:19|20)\d\d(?:0[1-9]|1[0-2])[0-3]\d)([0-2]\d)([0-5]\d)([0-5]\d)(\d{3})?\s*$")
 # what stands behind the seconds and a hyphen: a fraction as the camera program of CAXTON writes it, or a zone
 _HYPHEN = re.compile(r"(:\d\d)-(\d{1,6})\s*$")
+# zones by the letters that programs write behind a time; each says whether it is summer
+_ZONE_HOURS = {
+    "UTC": 0, "GMT": 0, "WET": 0, "WEST": 1, "BST": 1, "CET": 1, "CEST": 2, "MEZ": 1, "MESZ": 2,
+    "EET": 2, "EEST": 3, "MSK": 3, "JST": 9, "KST": 9, "AEST": 10, "AEDT": 11,
+    "EST": -5, "EDT": -4, "CST": -6, "CDT": -5, "MST": -7, "MDT": -6, "PST": -8, "PDT": -7,
+}  # fmt: skip
 EXPECTED = "seconds or ISO 8601 such as 2025-11-21T13:00:00.5"
 
 
@@ -54,20 +61,23 @@ def instants(
     *,
     month_first: bool | None,
     hyphen_fraction: bool = False,
+    after: int | None = None,
 ) -> Instants:
     """The instants that `fields` name. `month_first` decides 05/03/2025; None refuses it. `hyphen_fraction`
     decides 13:12:54-05: five hundredths of a second, else five hours west.
 
-    Raises ValueError with the line of a field that is no time.
+    The hour that the end of summer time in Europe/Berlin repeats is its second one behind the instant `after`
+    or that of the field before. Raises ValueError with the line of a field that is no time.
     """
     ns = np.empty(len(fields), np.int64)
     zoned, dated = True, False
     for i, (field, line) in enumerate(zip(fields, lines, strict=True)):
         try:
             written = _HYPHEN.sub(r"\1.\2", field) if hyphen_fraction else field
-            ns[i], has_zone, dated = _instant(written, month_first)
-        except ValueError as error:
-            hint = f" ({error}?)" if str(error).startswith(("day", "hours")) else ""
+            after, has_zone, dated = _instant(written, month_first, after)
+            ns[i] = after
+        except (ValueError, OverflowError) as error:
+            hint = f" ({error}?)" if str(error).startswith(("day", "hours", "zone")) else ""
             raise ValueError(
                 f"{path}: line {line}, time {name} should be {EXPECTED} but is {field.strip()[:40]!r}{hint}; "
                 "convert it, or name another column"
@@ -76,7 +86,7 @@ def instants(
     return Instants(ns, zoned, dated)
 
 
-def _instant(field: str, month_first: bool | None) -> tuple[int, bool, bool]:
+def _instant(field: str, month_first: bool | None, after: int | None) -> tuple[int, bool, bool]:
     """(ns, has a zone, has a date) of one text. Raises ValueError for text that is no time."""
     compact = _COMPACT.match(field)
     if compact:
@@ -95,11 +105,8 @@ def _instant(field: str, month_first: bool | None) -> tuple[int, bool, bool]:
     if half:
         hours = hours % 12 + 12 * (half[0] in "Pp")
     ns = ((hours * 60 + minutes) * 60 + seconds) * 10**9 + int(f"{fraction or 0:0<9}"[:9])
-    return (
-        ns + (_day(date, month_first) * DAY_NS if date else 0) - _offset_ns(zone or ""),
-        bool(zone),
-        bool(date),
-    )
+    ns += _day(date, month_first) * DAY_NS if date else 0
+    return ns - _offset_ns(zone or "", ns, after), bool(zone), bool(date)
 
 
 def _iso(field: str) -> tuple[int, bool, bool]:
@@ -175,14 +182,35 @@ def _is_offset(digits: str) -> bool:
     return len(digits) in (2, 4) and minutes < 60 and hours * 60 + minutes <= 14 * 60
 
 
-def _offset_ns(zone: str) -> int:
-    if not zone or zone[0] not in "+-":
+def _offset_ns(zone: str, local_ns: int, after: int | None) -> int:
+    """What a clock of that zone is ahead of UTC at its time `local_ns`. Raises ValueError for no zone."""
+    if zone in ("", "Z", "z"):
         return 0
+    if zone in _ZONE_HOURS:
+        return _ZONE_HOURS[zone] * 3600 * 10**9
+    if zone[0] not in "+-":
+        first, second = _region_offsets_ns(zone, local_ns // (900 * 10**9))
+        return second if first > second and after is not None and local_ns - first <= after else first
     digits = zone[1:].replace(":", "")
     if not _is_offset(digits):
         raise ValueError
     minutes = int(digits[:2]) * 60 + int(digits[2:] or 0)
     return (-1 if zone[0] == "-" else 1) * minutes * 60 * 10**9
+
+
+@functools.lru_cache(maxsize=4096)
+def _region_offsets_ns(zone: str, quarter: int) -> tuple[int, int]:
+    """Offsets of a zone such as Europe/Berlin in a quarter of an hour of its own clock since 1970.
+
+    They differ in an hour that is repeated or left out.
+    """
+    try:
+        region = zoneinfo.ZoneInfo(zone)
+    except (zoneinfo.ZoneInfoNotFoundError, ValueError, OSError):
+        raise ValueError(f"zone {zone}") from None
+    local = datetime.datetime(1970, 1, 1, tzinfo=region) + datetime.timedelta(minutes=15 * quarter)
+    first, second = (local.replace(fold=fold).utcoffset() or datetime.timedelta() for fold in (0, 1))
+    return first // datetime.timedelta(seconds=1) * 10**9, second // datetime.timedelta(seconds=1) * 10**9
 
 
 def over_midnight(ns: np.ndarray) -> tuple[np.ndarray, int]:

@@ -74,21 +74,21 @@ def topics(path: Path, samples: int | None = SAMPLES) -> dict[str, Topic]:
         ):
             break
     counts = file.counts if samples is None or file.promised is None else file.promised
-    by_name: dict[str, Topic] = {}
+    by_topic: dict[str, list[Channel]] = {}
     for number, channel in sorted(file.channels.items()):
         if number not in sampled:
             _add_fields(channel, [], names, unreadable)
-        before = by_name.get(channel.topic, Topic(channel.topic, [], [], "", 0))
-        all_fields = list(dict.fromkeys([*before.fields, *names.get(number, ())]))
-        reason = unreadable.get(number, before.unreadable)
-        by_name[channel.topic] = Topic(
-            channel.topic,
-            [*before.channels, channel],
-            all_fields,
-            reason,
-            before.count + counts.get(number, 0),
+        by_topic.setdefault(channel.topic, []).append(channel)
+    return {
+        topic: Topic(
+            topic,
+            channels,
+            list(dict.fromkeys(field for channel in channels for field in names.get(channel.id, ()))),
+            ["", *(unreadable[channel.id] for channel in channels if channel.id in unreadable)][-1],
+            sum(counts.get(channel.id, 0) for channel in channels),
         )
-    return by_name
+        for topic, channels in by_topic.items()
+    }
 
 
 def _add_fields(

@@ -34,7 +34,8 @@ from pipeline.reading.mcap_records import (
 )
 from pipeline.reading.signals import Note
 
-LARGEST_CHUNK = 1 << 31
+# packed or not; recorders close a chunk at 1 to 64 MB
+LARGEST_CHUNK = 1 << 29
 # messages outside chunks are handed on in groups of that many bytes
 GROUP_BYTES = 1 << 20
 
@@ -193,6 +194,8 @@ class McapFile:
             return f"its length {length} is not that of its kind"
         if offset + 9 + length > self.size:
             return f"its length {length} is more than the file has left"
+        if length > LARGEST_CHUNK:
+            return f"its length {length} is more than the {LARGEST_CHUNK} bytes that are read at once"
         return ""
 
     def _unsound_body(self, opcode: int, record: bytes) -> str:

@@ -13,9 +13,11 @@ import orjson
 import zstandard
 
 from pipeline.reading import protobuf_messages, ros_messages
-from pipeline.reading.ros_messages import LONGEST_LISTED, UnreadableMessage
+from pipeline.reading.ros_messages import LARGEST_LAYOUT, LONGEST_LISTED, UnreadableMessage
 
-LARGEST_MESSAGE = 1 << 30
+LARGEST_MESSAGE = 1 << 28
+# the longest in use have some 100 kB
+LARGEST_SCHEMA = 4 << 20
 ENCODINGS = "cdr with ros2msg, ros1 with ros1msg, protobuf, and json"
 _ZSTD, _LZ4 = b"\x28\xb5\x2f\xfd", b"\x04\x22\x4d\x18"
 _STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
@@ -46,6 +48,8 @@ def fields(channel: Channel, samples: Sequence[bytes]) -> list[str]:
         names = dict.fromkeys(_schema_fields(channel))
         for sample in samples:
             names |= dict.fromkeys(_numbers(_document(sample)))
+            if len(names) > LARGEST_LAYOUT:
+                raise ValueError(f"its messages have {len(names)} numbers where {LARGEST_LAYOUT} are read")
         return list(names)
     first = samples[0] if samples else None
     if kind == "protobuf":
@@ -75,9 +79,14 @@ def decoder(channel: Channel, names: Sequence[str]) -> Decode:
 
 def _kind(channel: Channel) -> str:
     pairs = {("cdr", "ros2msg"): "cdr", ("ros1", "ros1msg"): "ros1", ("protobuf", "protobuf"): "protobuf"}
-    if channel.encoding == "json":
+    if channel.encoding == "json" and len(channel.schema) <= LARGEST_SCHEMA:
         return "json"
     kind = pairs.get((channel.encoding, channel.schema_encoding))
+    if len(channel.schema) > LARGEST_SCHEMA:
+        raise ValueError(
+            f"its schema {channel.schema_name[:60]} has {len(channel.schema)} bytes "
+            f"where {LARGEST_SCHEMA} are read"
+        )
     if kind is None:
         schema = f"schema encoding {channel.schema_encoding!r}" if channel.schema_encoding else "no schema"
         raise ValueError(f"message encoding {channel.encoding!r} with {schema} is not read; {ENCODINGS} are")
@@ -118,11 +127,7 @@ def decompress(method: str, data: bytes, size: int | None) -> bytes:
             declared = zstandard.frame_content_size(data)
             _check_size(declared if declared >= 0 else None, size)
             unpacker = zstandard.ZstdDecompressor()
-            if declared >= 0:
-                unpacked = unpacker.decompress(data)
-            else:
-                with unpacker.stream_reader(data) as reader:
-                    unpacked = reader.read(room + 1)
+            unpacked = unpacker.decompress(data, max_output_size=0 if declared >= 0 else room)
         elif method == "lz4":
             declared = lz4.frame.get_frame_info(data)["content_size"]
             _check_size(declared or None, size)

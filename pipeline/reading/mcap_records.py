@@ -25,6 +25,7 @@ RECORD_HEAD = struct.Struct("<BQ")
 MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 CHUNK_HEAD = struct.Struct("<QQQII")
 FOOTER_RECORD = struct.Struct("<BQQQI")
+_WINDOW = 1 << 26
 _CHUNK_START = re.compile(
     rb"\x06(.{8}).{28}(\x00\x00\x00\x00|\x03\x00\x00\x00lz4|\x04\x00\x00\x00zstd)(.{8})", re.DOTALL
 )
@@ -61,7 +62,17 @@ def next_chunk(stream: BinaryIO, offset: int) -> int | None:
         return None
     with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as content:
         pos = offset
-        while start := _CHUNK_START.search(content, pos):
+        while pos < size:
+            end = min(pos // _WINDOW * _WINDOW + _WINDOW, size)
+            start = _CHUNK_START.search(content, pos, min(end + 64, size))
+            if start is None:
+                # what was looked through need not stay in memory
+                if hasattr(content, "madvise"):
+                    content.madvise(
+                        mmap.MADV_DONTNEED, pos // _WINDOW * _WINDOW, end - pos // _WINDOW * _WINDOW
+                    )
+                pos = end
+                continue
             length, method, held = (
                 struct.unpack("<Q", start[1])[0],
                 len(start[2]),

@@ -3,6 +3,8 @@ alternate."""
 
 import numpy as np
 
+from pipeline.reading.quality import quantisation_step
+
 # windows of so many samples, half overlapping: short ones for devices that write in turn, long ones for
 # devices that write in batches
 WINDOWS = (32, 128)
@@ -24,6 +26,9 @@ def mixed(values: np.ndarray) -> list[tuple[int, int, float]]:
     y = values[finite]
     # over one sample and over more: with two devices in turn every change from sample to sample is a jump
     step = min(COARSEST_STEP, *(_least_change(y, lag) for lag in (1, 2, 3)))
+    # a converter may be coarser: its levels tell, where there are more than the two of two devices at rest
+    if len(np.unique(y)) > 2:
+        step = max(step, quantisation_step(y))
     suspect, distance = np.zeros(len(y), bool), np.zeros(len(y), np.float32)
     for size in WINDOWS:
         if len(y) < size:

@@ -7,10 +7,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from pipeline.reading.arrow_arrays import numbers
 from pipeline.reading.formats import (
     Column,
     Columns,
     Growing,
+    check_no_counter,
     column_place,
     every,
     forward,
@@ -18,11 +20,12 @@ from pipeline.reading.formats import (
     seconds,
     time_column,
 )
+from pipeline.reading.instants import instants
 from pipeline.reading.signals import Note
 
 ROWS_AT_ONCE = 50_000
 # an index may promise what is not there
-MOST_EXPECTED = 1 << 26
+MOST_EXPECTED, MOST_IN_ONE_PIECE = 1 << 26, 1 << 22
 
 
 def _parquet(path: Path) -> pq.ParquetFile:
@@ -45,7 +48,13 @@ def _flat(table: pa.Table) -> pa.Table:
     return table
 
 
+def _plain(kind: pa.DataType) -> pa.DataType:
+    """The type of a column's values; those of a category are in its dictionary."""
+    return kind.value_type if pa.types.is_dictionary(kind) else kind
+
+
 def _is_numeric(kind: pa.DataType) -> bool:
+    kind = _plain(kind)
     return (
         pa.types.is_integer(kind)
         or pa.types.is_floating(kind)
@@ -62,11 +71,22 @@ def parquet_columns(path: Path) -> list[Column]:
             "number"
             if _is_numeric(field.type)
             else "time"
-            if pa.types.is_timestamp(field.type)
+            if _is_stamp(field.type)
+            else "duration"
+            if pa.types.is_duration(field.type)
             else str(field.type)
         )
         columns.append(Column(name, kind, (field.metadata or {}).get(b"unit", b"").decode(errors="replace")))
     return columns
+
+
+def _is_stamp(kind: pa.DataType) -> bool:
+    return pa.types.is_timestamp(kind) or pa.types.is_date(kind)
+
+
+def _is_text(kind: pa.DataType) -> bool:
+    kind = _plain(kind)
+    return pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind)
 
 
 def _leaves(fields: pa.Schema | pa.StructType, prefix: str) -> Iterator[tuple[str, pa.Field]]:
@@ -81,6 +101,7 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns,
     """The wanted columns, NaN for null. Raises ValueError for a column that is missing or holds no numbers,
     and for a damaged file."""
     file, columns = _parquet(path), parquet_columns(path)
+    types = {name: field.type for name, field in _leaves(file.schema_arrow, "")}
     names = [column.name for column in columns]
     interval = every(time)
     clock = ""
@@ -88,47 +109,33 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns,
         stamps = [column.name for column in columns if column.type == "time"]
         clock = (
             stamps[0]
-            if not time and stamps and all(not is_time_name(name) for name in names)
+            if not time and stamps and all(not is_time_name(name) or name == "T" for name in names)
             else time_column(path, names, time)
         )
     for name in wanted:
         column = columns[column_place(path, names, name)]
-        if column.type != "number":
+        if column.type != "number" and not _is_text(types[name]):
             raise ValueError(
                 f"{path}: column {name} should hold numbers but is of type {column.type}; write numbers, "
                 "or map another column"
             )
     read = list(dict.fromkeys([*wanted, *([clock] if clock else [])]))
-    kinds = {column.name: np.int64 if column.type == "time" else float for column in columns}
-    parts = Growing([kinds[name] for name in read], min(file.metadata.num_rows, MOST_EXPECTED))
-    try:
-        for batch in file.iter_batches(
-            ROWS_AT_ONCE,
-            columns=sorted({name.split(".")[0] if "." in name else name for name in read} | set(read)),
-        ):
-            table = _flat(pa.Table.from_batches([batch]))
-            parts.append(*(_array(path, name, table[name], clock) for name in read))
-    except (OSError, pa.ArrowException) as error:
-        raise ValueError(
-            f"{path}: a column cannot be read ({_first_line(error)}); the file is damaged, "
-            "so copy the recording again"
-        ) from None
-    if not parts.count:
-        raise ValueError(f"{path}: the table should have rows but has none; record it again or remove it")
-    values = dict(zip(read, parts.finished(), strict=True))
+    kinds = {
+        name: np.int64 if _is_stamp(kind) or (name == clock and _is_text(kind)) else float
+        for name, kind in types.items()
+    }
+    values = _values(path, file, {name: kinds[name] for name in read}, clock)
+    count = len(values[read[0]])
     notes: list[Note] = []
-    zoned = (
-        clock
-        and kinds[clock] is np.int64
-        and next(field.type.tz for name, field in _leaves(file.schema_arrow, "") if name == clock)
-    )
+    zoned = clock and kinds[clock] is np.int64 and getattr(types[clock], "tz", None)
     zone = "UTC" if zoned or not clock or kinds[clock] is float else ""
     if interval:
-        clock_values, remark = np.arange(parts.count) * interval, ""
+        clock_values, remark = np.arange(count) * interval, ""
     else:
-        clock_values, remark = (
-            (values[clock], "") if kinds[clock] is np.int64 else seconds(clock, values[clock])
-        )
+        is_time = kinds[clock] is np.int64 or not _is_numeric(types[clock])
+        clock_values, remark = (values[clock], "") if is_time else seconds(clock, values[clock])
+        if not time and _is_numeric(types[clock]):
+            check_no_counter(path, clock, clock_values)
     if remark:
         notes.append(Note("clock", "", 1, remark))
     table_columns, turned = forward(
@@ -137,31 +144,70 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns,
     return table_columns, notes + turned
 
 
+def _values(path: Path, file: pq.ParquetFile, kinds: dict[str, type], clock: str) -> dict[str, np.ndarray]:
+    """{name: values (n,)} of the columns `kinds` {name: int64 or float}."""
+    columns = sorted({name.split(".")[0] if "." in name else name for name in kinds} | set(kinds))
+    try:
+        # a table in one piece is not copied
+        if file.num_row_groups == 1 and 0 < file.metadata.num_rows <= MOST_IN_ONE_PIECE:
+            table = _flat(file.read_row_group(0, columns, use_threads=False))
+            if table.num_rows:
+                return {name: _array(path, name, _one_chunk(table[name]), clock) for name in kinds}
+        parts = Growing(list(kinds.values()), min(file.metadata.num_rows, MOST_EXPECTED))
+        for batch in file.iter_batches(ROWS_AT_ONCE, columns=columns, use_threads=False):
+            table = _flat(pa.Table.from_batches([batch]))
+            parts.append(*(_array(path, name, table[name], clock) for name in kinds))
+    except (OSError, pa.ArrowException) as error:
+        raise ValueError(
+            f"{path}: a column cannot be read ({_first_line(error)}); the file is damaged, "
+            "so copy the recording again"
+        ) from None
+    if not parts.count:
+        raise ValueError(f"{path}: the table should have rows but has none; record it again or remove it")
+    return dict(zip(kinds, parts.finished(), strict=True))
+
+
+def _one_chunk(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    return column if column.num_chunks == 1 else pa.chunked_array([column.combine_chunks()])
+
+
 def _array(path: Path, name: str, column: pa.ChunkedArray, clock: str) -> np.ndarray:
-    if pa.types.is_timestamp(column.type):
+    written = column.type
+    if pa.types.is_dictionary(column.type):
+        column = column.cast(column.type.value_type)
+    if name == clock and _is_text(column.type):
+        return _iso_ns(path, name, column)
+    if name == clock and (pa.types.is_duration(column.type) or pa.types.is_time(column.type)):
+        unit = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}[column.type.unit]
+        counts = column.cast(pa.int32() if column.type.bit_width == 32 else pa.int64())
+        return numbers(counts.cast(pa.float64(), safe=False).chunk(0), np.float64) / unit
+    if _is_stamp(column.type):
         if column.null_count:
             raise ValueError(f"{path}: time {name} is missing in {column.null_count} rows; remove them")
-        instants = column.cast(pa.timestamp("ns", column.type.tz)).cast(pa.int64())
-        return _numbers(instants, np.int64)
+        stamps = column.cast(pa.timestamp("ns", getattr(column.type, "tz", None))).cast(pa.int64())
+        return numbers(stamps.chunk(0), np.int64)
     if name == clock and not _is_numeric(column.type):
         raise ValueError(
             f"{path}: time {name} should be seconds or a timestamp but is of type {column.type}; convert it, "
             "or name another column"
         )
-    return _numbers(column.cast(pa.float64(), safe=False), np.float64)
+    if pa.types.is_decimal(column.type) or _is_text(column.type):
+        # by way of the text, as Arrow rounds decimals twice
+        column = column.cast(pa.string())
+    if pa.types.is_boolean(column.type):
+        column = column.cast(pa.uint8())
+    try:
+        return numbers(column.cast(pa.float64(), safe=False).chunk(0), np.float64)
+    except pa.ArrowInvalid as error:
+        raise ValueError(
+            f"{path}: column {name} should hold numbers but is of type {written} ({_first_line(error)}); "
+            "write numbers, or map another column"
+        ) from None
 
 
-def _numbers(column: pa.ChunkedArray, kind: type) -> np.ndarray:
-    """The values of a column, NaN for null. (to_numpy and fill_null would load pandas, which takes
-    longer.)"""
-    parts = [np.empty(0, kind)]
-    for chunk in column.chunks:
-        valid, content = chunk.buffers()
-        part = np.frombuffer(content, kind)[chunk.offset : chunk.offset + len(chunk)]
-        if chunk.null_count:
-            bits = np.unpackbits(np.frombuffer(valid, np.uint8), bitorder="little")[
-                chunk.offset : chunk.offset + len(chunk)
-            ]
-            part = np.where(bits.astype(bool), part, np.nan)
-        parts.append(part)
-    return np.concatenate(parts)
+def _iso_ns(path: Path, name: str, column: pa.ChunkedArray) -> np.ndarray:
+    """ns since 1970 of times written as text, which must be dates and times of ISO 8601."""
+    texts = column.to_pylist()
+    if missing := texts.count(None):
+        raise ValueError(f"{path}: time {name} is missing in {missing} rows; remove them")
+    return instants(path, name, texts, range(1, len(texts) + 1), month_first=None).ns

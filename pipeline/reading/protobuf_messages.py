@@ -1,291 +1,247 @@
-"""Numbers of protobuf messages. The FileDescriptorSet of the schema gives the fields, and the wire is walked
-for the wanted ones.
+"""Numbers of protobuf messages. The FileDescriptorSet of the schema makes the types, the official package
+decodes, and the wanted fields are taken out."""
 
-Wire format: protobuf.dev/programming-guides/encoding. Numbers of the descriptor's fields:
-google/protobuf/descriptor.proto.
-"""
-
+import graphlib
+import operator
 import re
-import struct
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
+from google.protobuf import (
+    any_pb2,
+    descriptor_pb2,
+    descriptor_pool,
+    duration_pb2,
+    empty_pb2,
+    message_factory,
+    struct_pb2,
+    timestamp_pb2,
+    wrappers_pb2,
+)
+from google.protobuf.descriptor import Descriptor, FieldDescriptor
+from google.protobuf.message import DecodeError, Message
 
 from pipeline.reading.ros_messages import LONGEST_LISTED, UnreadableMessage
 
-VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
-# FieldDescriptorProto.Type -> wire type and struct format, or how a varint is read
-_NUMBERS = {
-    1: (FIXED64, "<d"), 2: (FIXED32, "<f"), 3: (VARINT, "signed"), 4: (VARINT, "unsigned"),
-    5: (VARINT, "signed"), 6: (FIXED64, "<Q"),
-    7: (FIXED32, "<I"), 8: (VARINT, "unsigned"), 13: (VARINT, "unsigned"), 14: (VARINT, "signed"),
-    15: (FIXED32, "<i"), 16: (FIXED64, "<q"),
-    17: (VARINT, "zigzag"), 18: (VARINT, "zigzag"),
-}  # fmt: skip
-_MESSAGE = 11
-_DEEPEST = 6
+# what every compiler of protobuf brings along, and some recorders leave out
+_WELL_KNOWN = {
+    module.DESCRIPTOR.name: module.DESCRIPTOR
+    for module in (any_pb2, duration_pb2, empty_pb2, struct_pb2, timestamp_pb2, wrappers_pb2)
+}
+_FILES, _FILE = (
+    message_factory.GetMessageClass(descriptor_pb2.DESCRIPTOR.message_types_by_name[name])
+    for name in ("FileDescriptorSet", "FileDescriptorProto")
+)
+# a message that holds itself has no end, and one with a few levels of many messages nearly none
+_DEEPEST, _MOST_FIELDS = 6, 20_000
+
+Types = dict[str, Descriptor]
+Fill = Callable[[Message, list[float]], None]
 
 
-class Field(NamedTuple):
-    """A field of a message type. A field that is not on the wire has no value with `presence`, and is 0
-    without (proto3's plain numbers)."""
+def message_types(descriptor_set: bytes) -> Types:
+    """{full name of the message: its type} of a serialised FileDescriptorSet.
 
-    name: str
-    type: int
-    of: str
-    repeated: bool
-    presence: bool
-
-
-class _Node(NamedTuple):
-    """The wanted part of one field: places of its numbers and plans of its messages by index. `length` is the
-    place of the count."""
-
-    field: Field
-    places: dict[int, int]
-    plans: dict[int, dict]
-    length: int | None
-
-
-def message_types(descriptor_set: bytes) -> dict[str, dict[int, Field]]:
-    """{full name of the message: {field number: Field}} of a serialised FileDescriptorSet. Raises ValueError
-    for other bytes."""
-    types: dict[str, dict[int, Field]] = {}
+    Raises ValueError for other bytes, and for a set without a file that it imports.
+    """
     try:
-        for file in _parts(descriptor_set).get(1, []):
-            parts = _parts(file)
-            for message in parts.get(4, []):
-                _add_type(message, _text(parts, 2), _text(parts, 12) == "proto3", types)
-    except (UnreadableMessage, UnicodeDecodeError, TypeError, AttributeError) as error:
+        files = {file.name: file for file in _FILES.FromString(bytes(descriptor_set)).file}
+        order = graphlib.TopologicalSorter({name: list(file.dependency) for name, file in files.items()})
+        pool = descriptor_pool.DescriptorPool()  # ty: ignore[possibly-missing-implicit-call]
+        for name in order.static_order():
+            file = files.get(name, _FILE())
+            if name not in files and name in _WELL_KNOWN:
+                _WELL_KNOWN[name].CopyToProto(file)
+            elif name not in files:
+                raise ValueError(f"the schema imports {name[:80]} and does not hold it")
+            pool.Add(file)
+    except (DecodeError, TypeError, graphlib.CycleError) as error:
         raise ValueError(f"the schema is no FileDescriptorSet ({error})") from None
+    types: Types = {}
+    waiting = [
+        message for name in files for message in pool.FindFileByName(name).message_types_by_name.values()
+    ]
+    while waiting:
+        message = waiting.pop()
+        types[message.full_name] = message
+        waiting += message.nested_types
     return types
 
 
-def _add_type(message: bytes, scope: str, proto3: bool, types: dict[str, dict[int, Field]]) -> None:
-    parts = _parts(message)
-    name = f"{scope}.{_text(parts, 1)}".lstrip(".")
-    types[name] = {}
-    for field in parts.get(2, []):
-        inner = _parts(field)
-        kind, repeated = inner.get(5, [0])[0], inner.get(4, [1])[0] == 3
-        presence = not proto3 or 9 in inner or 17 in inner  # oneof_index, proto3_optional
-        types[name][inner[3][0]] = Field(
-            _text(inner, 1), kind, _text(inner, 6).lstrip("."), repeated, presence
+def _defined(types: Types, name: str) -> Descriptor:
+    if name not in types:
+        raise ValueError(
+            f"the schema does not define its own message {name}; it defines {', '.join(sorted(types)[:5])}"
         )
-    for nested in parts.get(3, []):
-        _add_type(nested, name, proto3, types)
+    return types[name]
 
 
-def _parts(data: bytes) -> dict[int, list]:
-    parts: dict[int, list] = {}
-    for number, _, value in _wire(data):
-        parts.setdefault(number, []).append(value)
-    return parts
+def message_reader(types: Types, name: str) -> Callable[[bytes | memoryview], Message]:
+    """A function from bytes to the message of that name. It raises UnreadableMessage."""
+    made = message_factory.GetMessageClass(_defined(types, name))
 
+    def read(data: bytes | memoryview) -> Message:
+        try:
+            return made.FromString(data)
+        except DecodeError as error:
+            raise UnreadableMessage(f"a message that is not of its type ({error})") from None
 
-def _text(parts: dict[int, list], number: int) -> str:
-    return parts[number][0].decode() if number in parts else ""
-
-
-# ---- the wire
-
-
-def _varint(data: bytes, pos: int) -> tuple[int, int]:
-    value = shift = 0
-    while True:
-        if pos >= len(data) or shift > 63:
-            raise UnreadableMessage("a number that does not end")
-        byte = data[pos]
-        pos += 1
-        value |= (byte & 0x7F) << shift
-        if byte < 0x80:
-            return value, pos
-        shift += 7
-
-
-def _wire(data: bytes):
-    """(field number, wire type, value) in the order of the wire. The value is an int for a varint, else the
-    bytes."""
-    pos, end = 0, len(data)
-    while pos < end:
-        key, pos = _varint(data, pos)
-        kind = key & 7
-        if kind == VARINT:
-            value, pos = _varint(data, pos)
-        else:
-            if kind == BYTES:
-                length, pos = _varint(data, pos)
-            else:
-                length = {FIXED64: 8, FIXED32: 4}.get(kind, -1)
-            if length < 0 or pos + length > end:
-                raise UnreadableMessage(f"a field of wire type {kind} that does not fit into {end} bytes")
-            value = data[pos : pos + length]
-            pos += length
-        yield key >> 3, kind, value
-
-
-def _number(kind: int, value: int | bytes) -> float:
-    wire, how = _NUMBERS[kind]
-    if wire != VARINT:
-        if not isinstance(value, bytes) or len(value) != struct.calcsize(how):
-            raise UnreadableMessage("a number of another size than its schema says")
-        return float(struct.unpack(how, value)[0])
-    if not isinstance(value, int):
-        raise UnreadableMessage("bytes where the schema says a number")
-    if how == "signed":
-        return float(value - (1 << 64) if value >> 63 else value)
-    return float((value >> 1) ^ -(value & 1) if how == "zigzag" else value)
-
-
-def _packed(kind: int, data: bytes) -> list[float]:
-    wire, how = _NUMBERS[kind]
-    if wire != VARINT:
-        if len(data) % struct.calcsize(how):
-            raise UnreadableMessage("a packed list of another size than its schema says")
-        return [float(value) for (value,) in struct.iter_unpack(how, data)]
-    values, pos = [], 0
-    while pos < len(data):
-        value, pos = _varint(data, pos)
-        values.append(_number(kind, value))
-    return values
+    return read
 
 
 # ---- which numbers a message has
 
 
-def fields(types: dict[str, dict[int, Field]], name: str, sample: bytes | None) -> list[str]:
+def _is_number(field: FieldDescriptor) -> bool:
+    texts = (FieldDescriptor.CPPTYPE_MESSAGE, FieldDescriptor.CPPTYPE_STRING)
+    return field.cpp_type not in texts
+
+
+def _is_message(field: FieldDescriptor) -> bool:
+    """Whether a field holds a message. A map holds its entries by key and not by place."""
+    return field.message_type is not None and not field.message_type.GetOptions().map_entry
+
+
+def fields(types: Types, name: str, sample: bytes | None) -> list[str]:
     """Paths of the numbers. Of a repeated field they are those of the message `sample`, up to
-    LONGEST_LISTED."""
-    names, repeated = _plain_fields(types, _defined(types, name), "", 0)
-    if sample is not None and repeated:
-        try:
-            lengths = decoder(types, name, [f"{path}[#]" for path, _ in repeated])([sample])[0]
-        except UnreadableMessage:
-            return names
-        for (path, inner), length in zip(repeated, lengths, strict=True):
-            names += [
-                f"{path}[{i}]{part}"
-                for i in range(min(int(np.nan_to_num(length)), LONGEST_LISTED))
-                for part in inner
-            ]
+    LONGEST_LISTED. Raises ValueError for a type with more than can be listed."""
+    names: list[str] = []
+    lists: dict[str, list[str]] = {}
+    for visited, (path, field) in enumerate(_leaves(_defined(types, name), "", 0)):
+        if visited == _MOST_FIELDS:
+            raise ValueError(f"the message {name} has more than {_MOST_FIELDS} fields; name the wanted ones")
+        single, is_list, part = path.partition("[]")
+        if field is not None and not is_list:
+            names.append(path)
+        elif field is not None:
+            lists.setdefault(single, []).append(part)
+    if sample is None or not lists:
+        return names
+    try:
+        lengths = decoder(types, name, [f"{path}[#]" for path in lists])([sample])[0]
+    except UnreadableMessage:
+        return names
+    for (path, inner), length in zip(lists.items(), lengths, strict=True):
+        count = min(int(np.nan_to_num(length)), LONGEST_LISTED)
+        names += [f"{path}[{i}]{part}" for i in range(count) for part in inner]
     return names
 
 
-def _defined(types: dict, name: str) -> str:
-    if name not in types:
-        raise ValueError(
-            f"the schema does not define its own message {name}; it defines {', '.join(sorted(types)[:5])}"
-        )
-    return name
-
-
-def _plain_fields(
-    types: dict, name: str, prefix: str, depth: int
-) -> tuple[list[str], list[tuple[str, list[str]]]]:
-    names, repeated = [], []
-    for field in types.get(name, {}).values() if depth < _DEEPEST else []:
-        path = f"{prefix}{field.name}"
-        if field.type in _NUMBERS:
-            if field.repeated:
-                repeated.append((path, [""]))
-            else:
-                names.append(path)
-        elif field.type == _MESSAGE:
-            inner, deeper = _plain_fields(types, field.of, "" if field.repeated else f"{path}.", depth + 1)
-            if field.repeated:
-                repeated.append((path, [f".{part}" for part in inner]))
-            else:
-                names += inner
-                repeated += deeper
-    return names, repeated
+def _leaves(message: Descriptor, prefix: str, depth: int) -> Iterator[tuple[str, FieldDescriptor | None]]:
+    """Paths of the numbers, "zones[].celsius" in repeated messages, without what a list holds in lists. A
+    message is a path without a field."""
+    for field in message.fields:
+        path = f"{prefix}{field.name}{'[]' if field.is_repeated else ''}"
+        if field.is_repeated and "[]" in prefix:
+            continue
+        if _is_number(field):
+            yield path, field
+        elif _is_message(field) and depth + 1 < _DEEPEST:
+            yield path, None
+            yield from _leaves(field.message_type, f"{path}.", depth + 1)
 
 
 # ---- decoding
 
 
-def decoder(
-    types: dict[str, dict[int, Field]], name: str, names: Sequence[str]
-) -> Callable[[list[bytes]], np.ndarray]:
+def decoder(types: Types, name: str, names: Sequence[str]) -> Callable[[list[bytes]], np.ndarray]:
     """A function from n messages to their numbers (n, len(names)), NaN for an absent field with presence.
 
-    It raises UnreadableMessage.
+    "zones[#]" is the length of a list. The function raises UnreadableMessage.
     """
-    plan = _plan(types, _defined(types, name), {path: place for place, path in enumerate(names)})
-    count = len(names)
+    message = _defined(types, name)
+    fill = _filler(message, {path: place for place, path in enumerate(names)})
+    read, count = message_reader(types, name), len(names)
+    if names and all(_is_plain(message.fields_by_name.get(path)) for path in names):
+        values = operator.attrgetter(*names)
+        return lambda messages: np.array([values(read(data)) for data in messages], float).reshape(-1, count)
 
     def decode(messages: list[bytes]) -> np.ndarray:
         rows = []
         for message in messages:
             row = [np.nan] * count
-            _walk(message, plan, row)
+            fill(read(message), row)
             rows.append(row)
         return np.array(rows, float).reshape(len(messages), count)
 
     return decode
 
 
-def _plan(types: dict, name: str, wanted: dict[str, int]) -> dict[int, _Node]:
-    """{field number: _Node} for the wanted paths {path below this message: place}."""
-    numbers = {field.name: number for number, field in types.get(name, {}).items()}
-    plan: dict[int, _Node] = {}
-    below: dict[tuple[int, int], dict[str, int]] = {}
+def _is_plain(field: FieldDescriptor | None) -> bool:
+    """Whether a field is a number that every message has."""
+    return field is not None and _is_number(field) and not field.is_repeated and not field.has_presence
+
+
+def _filler(message: Descriptor, wanted: dict[str, int]) -> Fill:
+    """A function that puts the numbers of the paths {path below this message: place} into their places."""
+    plain, parts = [], []
+    below: dict[tuple[str, str | None], dict[str, int]] = {}
     for path, place in wanted.items():
         match = re.match(r"(\w+)(?:\[(\d+|#)\])?(?:\.(.+))?$", path)
-        if not match or match[1] not in numbers:
+        field = message.fields_by_name.get(match[1]) if match else None
+        if match is None or field is None or (match[2] is not None) != field.is_repeated:
             raise ValueError(f"no numeric field {path}")
-        number = numbers[match[1]]
-        field = types[name][number]
-        if (match[2] is not None) != field.repeated:
-            raise ValueError(f"no numeric field {path}")
-        node = plan.setdefault(number, _Node(field, {}, {}, None))
         if match[2] == "#":
-            plan[number] = node._replace(length=place)
-        elif match[3] and field.type == _MESSAGE:
-            below.setdefault((number, int(match[2] or 0)), {})[match[3]] = place
-        elif not match[3] and field.type in _NUMBERS:
-            node.places[int(match[2] or 0)] = place
-        else:
+            parts.append(_length(field.name, place))
+        elif match[3] and _is_message(field):
+            below.setdefault((field.name, match[2]), {})[match[3]] = place
+        elif match[3] or not _is_number(field):
             raise ValueError(f"no numeric field {path}")
-    for (number, index), inner in below.items():
-        plan[number].plans[index] = _plan(types, plan[number].field.of, inner)
-    return plan
+        elif field.is_repeated:
+            parts.append(_element(field.name, int(match[2]), place))
+        elif field.has_presence:
+            parts.append(_optional(field.name, place))
+        else:
+            plain.append((field.name, place))
+    for (name, index), inner in below.items():
+        deeper = _filler(message.fields_by_name[name].message_type, inner)
+        parts.append(_inside(name, deeper) if index is None else _inside_element(name, int(index), deeper))
+
+    def fill(values: Message, row: list[float]) -> None:
+        for name, place in plain:
+            row[place] = getattr(values, name)
+        for part in parts:
+            part(values, row)
+
+    return fill
 
 
-def _walk(data: bytes, plan: dict[int, _Node], row: list[float]) -> None:
-    """Fills the places of `row` for which the message `data` has values. The last value of a single field
-    counts, as the format says."""
-    for node in plan.values():
-        if not node.field.presence and not node.field.repeated:
-            for place in node.places.values():
-                row[place] = 0.0
-        if node.length is not None:
-            row[node.length] = 0.0
-    counts = dict.fromkeys(plan, 0)
-    for number, wire, value in _wire(data):
-        node = plan.get(number)
-        if node is None:
-            continue
-        numbers = _values(wire, value, node, counts[number], row)
-        for i, value_i in enumerate(numbers, counts[number]):
-            if i in node.places:
-                row[node.places[i]] = value_i
-        if node.field.repeated:
-            counts[number] += len(numbers)
-        if node.length is not None:
-            row[node.length] = counts[number]
+def _length(name: str, place: int) -> Fill:
+    def fill(values: Message, row: list[float]) -> None:
+        row[place] = len(getattr(values, name))
+
+    return fill
 
 
-def _values(wire: int, value: int | bytes, node: _Node, index: int, row: list[float]) -> Sequence[float]:
-    """The numbers of one field on the wire. A message is walked and counts as one."""
-    if node.field.type == _MESSAGE:
-        if wire != BYTES:
-            raise UnreadableMessage("a number where the schema says a message")
-        if index in node.plans:
-            _walk(value, node.plans[index], row)
-        return [0.0]
-    if node.field.type not in _NUMBERS:
-        return [0.0]
-    if wire == BYTES and node.field.repeated:
-        return _packed(node.field.type, value)
-    return [_number(node.field.type, value)]
+def _element(name: str, index: int, place: int) -> Fill:
+    def fill(values: Message, row: list[float]) -> None:
+        elements = getattr(values, name)
+        if index < len(elements):
+            row[place] = elements[index]
+
+    return fill
+
+
+def _optional(name: str, place: int) -> Fill:
+    def fill(values: Message, row: list[float]) -> None:
+        if values.HasField(name):
+            row[place] = getattr(values, name)
+
+    return fill
+
+
+def _inside(name: str, deeper: Fill) -> Fill:
+    def fill(values: Message, row: list[float]) -> None:
+        if values.HasField(name):
+            deeper(getattr(values, name), row)
+
+    return fill
+
+
+def _inside_element(name: str, index: int, deeper: Fill) -> Fill:
+    def fill(values: Message, row: list[float]) -> None:
+        elements = getattr(values, name)
+        if index < len(elements):
+            deeper(elements[index], row)
+
+    return fill

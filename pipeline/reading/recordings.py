@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.reading.bag_folders import read_bag
+from pipeline.reading.clocks import mended
 from pipeline.reading.csv_files import read_csv
-from pipeline.reading.formats import CALENDAR_S, Columns, check_clock, file_format
+from pipeline.reading.formats import CALENDAR_S, Columns, file_format
 from pipeline.reading.inspection import inspect
 from pipeline.reading.mcap_columns import mcap_columns
 from pipeline.reading.mcap_records import check_magic
@@ -38,13 +39,16 @@ __all__ = [
 ]
 
 
-def read(path: str | Path, sources: Sequence[Source], *, time: str = "") -> Raw:
+def read(path: str | Path, sources: Sequence[Source], *, time: str = "", decimal: str = "") -> Raw:
     """The signals of a recording, each on its own clock, in our units.
 
     `time` names the clock. In a table it is a column (by default one with a name of a time) or, without one,
     "every 0.5 s". In MCAP it is log_time (the default), publish_time, or a field of every topic such as
     header.stamp. A clock of the calendar is counted from the first whole second of the record. Missing
-    numbers are NaN, and counted in a note.
+    numbers are NaN, and counted in a note. `decimal` is the decimal mark of a text file, "" to find it.
+
+    Of a clock that does not run forward, what can be put right without a guess is, and is counted in notes:
+    see `clocks.mended`.
 
     Raises ValueError, one sentence with file, place, expected, found and remedy, for a source that is not
     there, text in place of a number, a signal without any number, a time that is missing, repeated or runs
@@ -64,8 +68,10 @@ def read(path: str | Path, sources: Sequence[Source], *, time: str = "") -> Raw:
         else:
             if kind in LOADERS:
                 table, notes = select(path, LOADERS[kind](path), names, time)
+            elif kind == "csv":
+                table, notes = read_csv(path, names, time, decimal)
             else:
-                table, notes = (read_csv if kind == "csv" else read_parquet)(path, names, time)
+                table, notes = read_parquet(path, names, time)
             columns, places, messages = (
                 [table],
                 {name: (table.name, name) for name in names},
@@ -75,13 +81,17 @@ def read(path: str | Path, sources: Sequence[Source], *, time: str = "") -> Raw:
         raise ValueError(
             f"{path} cannot be read ({error.strerror or error}); check the disk, or copy the recording again"
         ) from None
-    clocks = _clocks(path, columns, notes)
+    parts = [mended(path, group, may_restart=len(columns) == 1 and kind != "mcap") for group in columns]
+    columns = [part.columns for part in parts]
+    notes += [note for part in parts for note in part.notes]
+    clocks = _clocks(columns, notes)
+    breaks = [float(clocks[part.columns.name][i]) for part in parts for i in part.restarts]
     signals = {}
     for source in sources:
         topic, field = places[source.source]
         group = next(group for group in columns if group.name == topic)
         signals[source.signal] = _signal(path, source, clocks[topic], group, group.values[field], notes)
-    return Raw(str(path), signals, messages, notes)
+    return Raw(str(path), signals, messages, notes, tuple(breaks))
 
 
 def _check_sources(path: Path, sources: Sequence[Source]) -> None:
@@ -102,10 +112,8 @@ def _check_sources(path: Path, sources: Sequence[Source]) -> None:
             )
 
 
-def _clocks(path: Path, columns: Sequence[Columns], notes: list[Note]) -> dict[str, np.ndarray]:
-    """{topic: time_s (n,)}, all counted from one instant. Each clock is checked to run forward."""
-    for group in columns:
-        check_clock(path, group)
+def _clocks(columns: Sequence[Columns], notes: list[Note]) -> dict[str, np.ndarray]:
+    """{topic: time_s (n,)}, all counted from one instant."""
     first = min(group.time[0] for group in columns)
     on_calendar = columns[0].time.dtype == np.int64
     unit = 10**9 if on_calendar else 1.0

@@ -44,8 +44,8 @@ def resample(
     A gap is an interval longer than `max_gap_s` (default: three sample times or three median intervals,
     whichever is longer) on any clock. Nothing is interpolated or held across a gap, and a new segment begins
     behind it. Segments span the time that all clocks have in common. A value whose neighbours are missing is
-    NaN and masked. Flags report gap, jitter, filled, step_inside, step_lost, missing, mixed, trimmed, short
-    and rate.
+    NaN and masked. Flags report gap, jitter, interpolated, filled, step_inside, step_lost, missing, mixed,
+    trimmed, short and rate.
 
     Raises ValueError if a signal is not in the recording, if the clocks have no time in common, or if no
     segment has two samples.
@@ -74,9 +74,9 @@ def resample(
     masked = {name: ~np.isfinite(column) for name, column in values.items()}
     flags = _gap_flags(clocks) + _jitter_flags(clocks) + _trim_flags(raw, clocks, pieces, grids)
     for name in outputs:
-        flags += _filled_flags(name, raw.signals[name][0], time, sample_time_s) + _rate_flags(
-            name, raw.signals[name][0], sample_time_s
-        )
+        own = raw.signals[name][0]
+        flags += _filled_flags(name, own, time, sample_time_s, masked[name])
+        flags += _rate_flags(name, own, sample_time_s)
     for name in inputs:
         flags += _step_flags(name, *raw.signals[name], time, segment, sample_time_s)
     for name in [*inputs, *outputs]:
@@ -141,16 +141,19 @@ def _clocks(
 
 
 def _pieces(raw: Raw, clocks: Sequence[_Clock], sample_time_s: float) -> list[tuple[float, float]]:
-    """Stretches (start, end) in which every clock runs without a gap."""
-    pieces = [(-np.inf, np.inf)]
+    """Stretches (start, end) in which every clock runs without a gap, and none had started over."""
+    pieces, breaks = [(-np.inf, np.inf)], np.array(raw.breaks)
     for clock in clocks:
-        cuts = np.flatnonzero(np.diff(clock.time_s) > clock.gap_limit_s)
+        behind = np.searchsorted(breaks, clock.time_s, side="right")
+        cuts = np.flatnonzero((np.diff(clock.time_s) > clock.gap_limit_s) | (np.diff(behind) > 0))
         starts, ends = (
             clock.time_s[np.r_[0, cuts + 1]],
             clock.time_s[np.r_[cuts, len(clock.time_s) - 1]].astype(float),
         )
         if np.isinf(clock.gap_limit_s):
-            ends[-1] = np.inf  # the last event holds on
+            # the last event holds on, up to where the clock starts over
+            until = np.nextafter(np.r_[breaks, np.inf], -np.inf)
+            ends = until[behind[np.r_[cuts, len(behind) - 1]]]
         pieces = _common(
             pieces, list(zip(starts.tolist(), ends.tolist(), strict=True)), sample_time_s * ON_GRID
         )
@@ -323,10 +326,22 @@ def _trim_flags(
     return flags
 
 
-def _filled_flags(name: str, time_s: np.ndarray, grid: np.ndarray, sample_time_s: float) -> list[Flag]:
-    off = grid[np.abs(time_s[_nearest(time_s, grid)] - grid) > ON_GRID * sample_time_s]
-    message = f"{len(off)} of {len(grid)} samples of {name} lie between its own samples and are interpolated"
-    return _flag(name, "filled", off, message)
+def _filled_flags(
+    name: str, time_s: np.ndarray, grid: np.ndarray, sample_time_s: float, masked: np.ndarray
+) -> list[Flag]:
+    """Flags for samples between two measurements near by, and for those that nothing near by was measured
+    for. A masked sample is neither."""
+    distance = np.abs(time_s[_nearest(time_s, grid)] - grid)
+    far = (distance > (0.5 + ON_GRID) * sample_time_s) & ~masked
+    near = (distance > ON_GRID * sample_time_s) & ~far & ~masked
+    between = (
+        f"{near.sum()} of {len(grid)} samples of {name} lie between its own samples and are interpolated"
+    )
+    invented = (
+        f"{far.sum()} of {len(grid)} samples of {name} have no measurement within half a sample time: "
+        "the straight line to the next ones fills them"
+    )
+    return _flag(name, "interpolated", grid[near], between) + _flag(name, "filled", grid[far], invented)
 
 
 def _rate_flags(name: str, time_s: np.ndarray, sample_time_s: float) -> list[Flag]:

@@ -28,6 +28,8 @@ KNOWN = {
     "ros1/duration": "int32 secs\nint32 nsecs",
 }
 LARGEST_LAYOUT = 20_000
+# numbers of one array: no message is as long as that
+LARGEST_ARRAY = 1 << 30
 LONGEST_LISTED = 64
 _FIELD = re.compile(r"^([A-Za-z]\w*(?:/\w+)*)(?:<=\d+)?\s*(\[(?:<=)?(\d*)\])?\s+([A-Za-z]\w*)\s*(=?)")
 # representation -> byte order, largest alignment; ROS does not write lists of parameters (0x0002, 0x0003 and
@@ -111,20 +113,37 @@ def _expand(kind: str, prefix: str, types: dict, version: int, room: list[int]) 
     items: list[Item] = []
     for field, of, length in types[kind]:
         path = f"{prefix}.{field}" if prefix else field
+        count = _count(kind, field, length)
         if length == "":
             element = _element(of, path, kind, types, version, room)
             items.append(Item("sequence", path, items=tuple(element)))
         elif of in _numbers(version):
-            items.append(Item("numbers", path, _numbers(version)[of], int(length or 1), length is not None))
+            items.append(Item("numbers", path, _numbers(version)[of], count, length is not None))
         else:
-            for i in range(int(length or 1)):
+            for i in range(count):
+                _take_room(kind, room)
                 items += _element(of, f"{path}[{i}]" if length else path, kind, types, version, room)
-        room[0] -= 1
-        if room[0] < 0:
-            raise ValueError(f"the schema of {kind} has more than {LARGEST_LAYOUT} parts")
+        _take_room(kind, room)
     if not items and version == 2:
         items.append(Item("numbers", prefix + "._", "B"))  # ROS 2 gives a message without fields one byte
     return items
+
+
+def _count(kind: str, field: str, length: str | None) -> int:
+    """How often a field of the definition is on the wire; 1 for a single one and for a sequence."""
+    if not length:
+        return 1
+    if len(length) > 12 or int(length) > LARGEST_ARRAY:
+        raise ValueError(
+            f"the schema of {kind} has {length[:20]} elements in {field}, more than any message can hold"
+        )
+    return int(length)
+
+
+def _take_room(kind: str, room: list[int]) -> None:
+    room[0] -= 1
+    if room[0] < 0:
+        raise ValueError(f"the schema of {kind} has more than {LARGEST_LAYOUT} parts")
 
 
 def _numbers(version: int) -> dict[str, str]:
@@ -191,7 +210,7 @@ class _FixedRow:
         self.layouts = [
             struct.Struct(order + _row_format(items, wanted, phase, alignment)) for phase in range(8)
         ]
-        self.names = [name for item in items for name in _names(item) if name in wanted]
+        self.names = [name for item in items for name in _names(item, wanted)]
 
     def read(self, data: bytes, pos: int, values: list[float]) -> int:
         unpack = self.layouts[pos & 7]
@@ -199,8 +218,22 @@ class _FixedRow:
         return pos + unpack.size
 
 
-def _names(item: Item) -> list[str]:
-    return [f"{item.path}[{i}]" for i in range(item.count)] if item.array else [item.path]
+def _names(item: Item, wanted: set[str]) -> list[str]:
+    """The wanted numbers of an item in the order of the wire. A long array is never written out."""
+    if not item.array:
+        return [item.path] if item.path in wanted else []
+    return [f"{item.path}[{i}]" for i in _indices(item, wanted)]
+
+
+def _indices(item: Item, wanted: set[str]) -> list[int]:
+    if item.count <= LONGEST_LISTED:
+        return [i for i in range(item.count) if f"{item.path}[{i}]" in wanted]
+    places = (
+        int(name[len(item.path) + 1 : -1])
+        for name in wanted
+        if name.startswith(f"{item.path}[") and re.fullmatch(r"\[\d{1,12}\]", name[len(item.path) :])
+    )
+    return sorted(i for i in places if i < item.count)
 
 
 def _row_format(items: Sequence[Item], wanted: set[str], phase: int, alignment: int) -> str:
@@ -209,11 +242,14 @@ def _row_format(items: Sequence[Item], wanted: set[str], phase: int, alignment: 
         size = struct.calcsize("=" + item.format)
         pad = -pos % min(size, alignment) if item.count else 0
         parts.append(f"{pad}x")
-        names = _names(item)
-        if wanted.isdisjoint(names):
-            parts.append(f"{size * item.count}x")
+        if not item.array:
+            parts.append(item.format if item.path in wanted else f"{size}x")
         else:
-            parts += [item.format if name in wanted else f"{size}x" for name in names]
+            following = 0
+            for i in _indices(item, wanted):
+                parts += [f"{size * (i - following)}x", item.format]
+                following = i + 1
+            parts.append(f"{size * (item.count - following)}x")
         pos += pad + size * item.count
     return "".join(part for part in parts if part != "0x")
 

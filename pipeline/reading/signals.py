@@ -36,13 +36,15 @@ class Raw(NamedTuple):
     """A recording as it was made: {signal: (time_s (n,), values (n,))} with a clock each. A missing value is
     NaN.
 
-    `messages` has the count of each topic's messages, or of the rows.
+    `messages` has the count of each topic's messages, or of the rows. `breaks` are the times at which the
+    clock had started over: nothing is held or interpolated from before to behind one.
     """
 
     path: str
     signals: dict[str, tuple[np.ndarray, np.ndarray]]
     messages: dict[str, int]
     notes: list[Note]
+    breaks: tuple[float, ...] = ()
 
 
 class Flag(NamedTuple):
@@ -82,11 +84,17 @@ class Table(NamedTuple):
     jitter: dict[str, Jitter]
 
 
+# comparing names takes 10 us each
+MOST_COMPARED = 50_000
+
+
 def nearest_names(name: str, names: Iterable[str]) -> str:
     """ "the nearest names are a, b": names like `name`, or the first ten that there are."""
     names = sorted(set(names))
     if not names:
         return "it has none that can be read as a number"
+    if len(names) > MOST_COMPARED:
+        return f"it has {', '.join(names[:10])} and {len(names) - 10} more"
     # "/topic:field" is found by its field alone too
     aliases = [
         (part, full)

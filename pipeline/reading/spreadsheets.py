@@ -194,7 +194,7 @@ def _longest_text(archive: zipfile.ZipFile) -> int:
     longest = length = 0
     if "xl/sharedStrings.xml" not in archive.namelist():
         return 0
-    with archive.open("xl/sharedStrings.xml") as stream:
+    with archive.open(archive.getinfo("xl/sharedStrings.xml")) as stream:
         while piece := stream.read(1 << 20):
             runs = piece.split(b"<")
             longest = max([longest, length + len(runs[0]), *map(len, runs[1:])])

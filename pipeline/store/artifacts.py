@@ -9,6 +9,7 @@ import contextlib
 import errno
 import hashlib
 import json
+import math
 import os
 import re
 import shutil
@@ -25,7 +26,8 @@ import pyarrow.parquet as pq
 import safetensors
 from safetensors.numpy import load_file, save_file
 
-from pipeline.store import renamed, tables
+from pipeline.store import params, renamed, tables
+from pipeline.store.printable import printable
 from pipeline.store.tables import ARRAYS, Column, Schema
 
 DATASETS, REPORTS = Path("datasets"), Path("reports")
@@ -107,13 +109,40 @@ def write_arrays(
     write_table(path, ARRAYS._replace(name=name, version=version), columns)
 
 
-def read_arrays(path: str | Path, name: str, version: int) -> dict[str, np.ndarray]:
-    """The arrays of `write_arrays`, float64 and in their shapes."""
+def read_arrays(
+    path: str | Path, name: str, version: int, *, shapes: Mapping[str, tuple[int | None, ...]] | None = None
+) -> dict[str, np.ndarray]:
+    """The arrays of `write_arrays`, float64 and in their shapes.
+
+    Raises ValueError where one has not the shape that `shapes` gives it (None: any length): it is of another
+    machine or of another run than what it is read beside.
+    """
     table = read_table(path, ARRAYS._replace(name=name, version=version))
-    return {
-        key: np.array(values, float).reshape(shape)
-        for key, shape, values in zip(table["name"], table["shape"], table["values"], strict=True)
-    }
+    arrays = {}
+    for key, shape, values in zip(table["name"], table["shape"], table["values"], strict=True):
+        if math.prod(shape) != len(values):
+            raise ValueError(
+                f"{path}: array {key} has {len(values)} values but should have {math.prod(shape)}, "
+                f"the shape {_shape(shape)}; {remedy(path)}"
+            )
+        arrays[key] = np.array(values, float).reshape(shape)
+    for key, expected in (shapes or {}).items():
+        found = arrays[key].shape if key in arrays else None
+        if (
+            found is None
+            or len(found) != len(expected)
+            or any(length not in (None, at) for length, at in zip(expected, found, strict=True))
+        ):
+            held = f"has the shape {_shape(found)}" if found is not None else "is not there"
+            raise ValueError(
+                f"{path}: array {key} {held} but {_shape(expected)} is expected of the machine in "
+                f"{params.FILE}, so that the file is of another machine or another run; {remedy(path)}"
+            )
+    return arrays
+
+
+def _shape(lengths: Sequence[int | None]) -> str:
+    return " x ".join("any" if length is None else str(int(length)) for length in lengths) or "of one number"
 
 
 def _array(path: str | Path, column: Column, values) -> pa.Array:
@@ -358,7 +387,8 @@ def stage(name: str) -> Iterator[Path]:
             temporary.replace(target)
     except (ValueError, OSError, np.linalg.LinAlgError, pa.ArrowException) as error:
         # the temporary folder's name means nothing to a reader
-        print(f"{name}: {reason(error).replace(str(folder), str(DATASETS / name))}", file=sys.stderr)
+        sentence = reason(error).replace(str(folder), str(DATASETS / name))
+        print(printable(f"{name}: {sentence}"), file=sys.stderr)
         raise SystemExit(1) from None
     finally:
         _waiting.reset(token)

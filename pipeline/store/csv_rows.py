@@ -1,6 +1,7 @@
 """Rows of text and numbers from a stranger's CSV file: what the readers of records and of lists of images
 share."""
 
+import collections
 import csv
 import itertools
 import re
@@ -13,13 +14,26 @@ import numpy as np
 from pipeline.reading.signals import Note
 
 COMMENT = ("#", "%", "//")
-OPENING_BYTES = 1 << 16
+OPENING_BYTES, LINES_SHOWN = 1 << 16, 400
 _NUMBER = {
     decimal: re.compile(rf"\s*[+-]?(\d+({mark}\d*)?|{mark}\d+)([eE][+-]?\d+)?\s*$")
     for decimal, mark in ((".", r"\."), (",", ","))
 }
+# digits in groups of three, 1,234.5 and 1 234,5 and 1'234.5, by the mark of the decimals
+_GROUPED = {
+    decimal: re.compile(
+        rf"\s*[+-]?\d{{1,3}}(?P<mark>[ '\u2019\xa0\u202f{other}])\d{{3}}((?P=mark)\d{{3}})*({mark}\d*)?\s*$"
+    )
+    for decimal, mark, other in ((".", r"\.", ","), (",", ",", "."))
+}
+# one and a fraction, or a thousand: nothing in the field tells
+_AMBIGUOUS = re.compile(r"\s*[+-]?[1-9]\d{0,2}[.,]\d{3}\s*$")
+_UNGROUPED = re.compile(r"\s*[+-]?\d{4,}")
 # a number with its unit, 21.5 °C: it shows where the table is, and is refused with its line when it is read
 _QUANTITY = re.compile(r"\s*[+-]?\d[\d.,]*\s*(%|°\s?[CFK]|[a-zA-Z]{1,3}(/[a-zA-Z]{1,3})?)$")
+_WITH_UNIT = re.compile(
+    r"(?P<number>[+-]?\d[\d.,]*?)\s*(?P<unit>%|°\s?[CFK]|[a-zA-Z]{1,3}(/[a-zA-Z]{1,3})?)$"
+)
 # text has tabs, line ends and form feeds, and sometimes the end mark of an old system; other control
 # characters are of binary files
 _CONTROL = bytes(set(range(32)) - set(b"\t\n\r\f\x1a"))
@@ -45,6 +59,9 @@ class CsvLayout(NamedTuple):
     units: list[str]
     skip: int
     notes: list[Note]
+    # whether a field tells the decimal mark from a mark between thousands, and whether its owner declared it
+    decided: bool = True
+    declared: bool = False
 
 
 class Opening(NamedTuple):
@@ -59,17 +76,22 @@ class Opening(NamedTuple):
     notes: list[Note]
 
 
-def opening(path: Path) -> Opening:
-    """Encoding, delimiter, decimal mark and first lines of a text file. Raises ValueError for a binary
-    file."""
+def opening(path: Path, decimal: str = "") -> Opening:
+    """Encoding, delimiter, decimal mark (`decimal`, or the likely one) and first lines of a text file.
+
+    Raises ValueError for a binary file.
+    """
     with path.open("rb") as stream:
         # zeros behind the text are what a file system leaves after a power failure
         start = stream.read(OPENING_BYTES).rstrip(b"\0")
     encoding, notes = _encoding(path, start)
-    lines = start.decode(encoding, errors="replace").splitlines()[: 400 if len(start) < OPENING_BYTES else -1]
+    # as csv counts lines: form feeds and the like end none
+    lines = re.split("\r\n|\r|\n", start.decode(encoding, errors="replace"))
+    lines = lines[: -1 if not lines[-1] or len(start) >= OPENING_BYTES else None][:LINES_SHOWN]
     remark = [line.lstrip().startswith(COMMENT) for line in lines]
     delimiter, decimal = _delimiter(
-        [line for line, is_remark in zip(lines, remark, strict=True) if line.strip() and not is_remark]
+        [line for line, is_remark in zip(lines, remark, strict=True) if line.strip() and not is_remark],
+        (decimal,) if decimal else (".", ","),
     )
     rows = [
         _split(line.lstrip("#% ") if is_remark else line, delimiter)
@@ -119,15 +141,68 @@ def is_number(field: str, decimal: str) -> bool:
 
 
 def is_quantity(field: str, decimal: str) -> bool:
-    return is_number(field, decimal) or bool(_QUANTITY.match(field))
+    return is_number(field, decimal) or bool(_QUANTITY.match(field) or _GROUPED[decimal].match(field))
+
+
+def is_ambiguous(field: str) -> bool:
+    """Whether a field is 1,000 or 1.000 and the like: one with three decimals, or a thousand."""
+    return bool(_AMBIGUOUS.match(field))
+
+
+def decimal_mark(field: str) -> str:
+    """The decimal mark that a field gives away, "" for none: 1,5 and 0,500 and 1.234,5 do, 1,500 and 7 do
+    not."""
+    if is_ambiguous(field):
+        return ""
+    for decimal in (".", ","):
+        if decimal in field and (is_number(field, decimal) or _proves_groups(field, decimal)):
+            return decimal
+    if (grouped := re.match(r"\s*[+-]?\d{1,3}(?:([.,])\d{3}){2,}\s*$", field)) is not None:
+        return "," if grouped[1] == "." else "."
+    return ""
+
+
+def _proves_groups(field: str, decimal: str) -> bool:
+    """Whether a field can only be read as digits in groups: 1,234.5, 1,234,567 or 1'234, but not 1,234."""
+    return bool(_GROUPED[decimal].match(field)) and not is_ambiguous(field)
+
+
+class ColumnStyle(NamedTuple):
+    """How a whole column writes its numbers: its mark between thousands and its unit, "" for none."""
+
+    groups: str
+    unit: str
+
+
+def column_style(path: Path, layout: CsvLayout, place: int) -> ColumnStyle:
+    """The style of a column, without a mark or unit that not all of its numbers have, and without a mark that
+    nothing proves."""
+    marks, units, proven = set(), set(), layout.declared
+    for _, row in rows(path, layout):
+        field = row[place].strip() if place < len(row) else ""
+        if field.casefold() in MISSING:
+            continue
+        quantity = _WITH_UNIT.match(field)
+        units.add(quantity["unit"] if quantity else "")
+        if grouped := _GROUPED[layout.decimal].match(field):
+            marks.add(grouped["mark"])
+            proven = proven or _proves_groups(field, layout.decimal)
+        elif is_number(field, layout.decimal) and _UNGROUPED.match(field):
+            marks.add("")
+    return ColumnStyle(
+        marks.pop() if proven and len(marks) == 1 else "", units.pop() if len(units) == 1 else ""
+    )
 
 
 def _encoding(path: Path, start: bytes) -> tuple[str, list[Note]]:
     for mark, encoding in ((b"\xef\xbb\xbf", "utf-8-sig"), (b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16")):
         if start.startswith(mark):
             return encoding, []
-    if start[1::2].count(0) > len(start) // 4 and not start[0::2].count(0):
-        return "utf-16-le", [Note("encoding", "", 1, "the text is UTF-16 without a byte order mark")]
+    for order, (high, low) in {"le": (start[1::2], start[0::2]), "be": (start[0::2], start[1::2])}.items():
+        if high.count(0) > len(start) // 4 and not low.count(0):
+            return f"utf-16-{order}", [
+                Note("encoding", "", 1, "the text is UTF-16 without a byte order mark")
+            ]
     control = len(start) - len(start.translate(None, _CONTROL))
     if control > len(start) // 100:
         raise ValueError(
@@ -146,12 +221,16 @@ def _encoding(path: Path, start: bytes) -> tuple[str, list[Note]]:
     return "utf-8", []
 
 
-def _delimiter(lines: Sequence[str]) -> tuple[str, str]:
+def _delimiter(lines: Sequence[str], decimals: Sequence[str]) -> tuple[str, str]:
     """The delimiter and decimal mark that make most fields numbers. Of equal ones, those that leave the
     fewest other fields are taken; the blank is tried last."""
-    best, choice = (0.0, 0.0), (",", ".")
-    for delimiter, decimal in itertools.product((",", ";", "\t", "|", " "), (".", ",")):
-        fields = [field for line in lines[:50] for field in _split(line, delimiter)]
+    best, choice = (0.0, 0.0), (",", decimals[0])
+    for delimiter, decimal in itertools.product((",", ";", "\t", "|", " "), decimals):
+        split = [_split(line, delimiter) for line in lines[:50]]
+        if delimiter == " ":  # in words before the table there are numbers too
+            width = collections.Counter(map(len, split)).most_common(1)[0][0] if split else 0
+            split = [row for row in split if len(row) == width]
+        fields = [field for row in split for field in row]
         quantities = sum(is_quantity(field, decimal) for field in fields)
         score = (quantities, quantities / max(len(fields), 1))
         if score > best:
@@ -178,6 +257,7 @@ LONGEST_TAIL = 20
 
 def rows(path: Path, layout: CsvLayout) -> Iterator[tuple[int, list[str]]]:
     """(line, fields) of the rows of data, without blank lines and comments."""
+    line = 0
     with path.open(encoding=layout.encoding, newline="") as stream:
         try:
             if layout.delimiter == " ":
@@ -206,7 +286,8 @@ def rows(path: Path, layout: CsvLayout) -> Iterator[tuple[int, list[str]]]:
                     "remove or close it"
                 ) from None
             raise ValueError(
-                f"{path}: a line cannot be split into columns ({error}); save the file again as plain CSV"
+                f"{path}: line {line + 1} cannot be split into columns ({error}), as after a quotation mark "
+                "that is never closed; mend that line, or save the file again as plain CSV"
             ) from None
 
 
@@ -246,15 +327,19 @@ def sound_rows(
             )
         )
     if len(tail) == 1 and len(tail[0][1]) < width:
-        line, row = tail[0]
-        message = f"line {line}, the last, breaks off after {len(row)} of {width} fields and was left out"
-        notes.append(Note("truncated", "", 1, message))
+        notes.append(broken_line(tail[0][0], len(tail[0][1]), width))
     elif tail:
         shown = layout.delimiter.join(tail[0][1])[:60]
         message = (
             f"{len(tail)} lines behind the data were left out, from line {tail[0][0]} on, which is {shown!r}"
         )
         notes.append(Note("trailing", "", len(tail), message))
+
+
+def broken_line(line: int, fields: int, width: int) -> Note:
+    """The note on a last line that has fewer fields than the table."""
+    message = f"line {line}, the last, breaks off after {fields} of {width} fields and was left out"
+    return Note("truncated", "", 1, message)
 
 
 def _unsound(line: int, row: list[str], layout: CsvLayout, clock: "Clock | None") -> str:
@@ -265,29 +350,54 @@ def _unsound(line: int, row: list[str], layout: CsvLayout, clock: "Clock | None"
 
 
 def floats(
-    path: Path, name: str, fields: list[str], decimal: str, lines: list[int], switches: dict[str, set[str]]
+    path: Path,
+    name: str,
+    fields: list[str],
+    decimal: str,
+    lines: list[int],
+    switches: dict[str, set[str]],
+    style: Callable[[str], ColumnStyle] | None = None,
 ) -> np.ndarray:
+    """The numbers of a column's fields, NaN for a word that says there is none.
+
+    Words of a switch are counted in `switches`. `style` gives that of a column. Raises ValueError with the
+    line of a field that is no number.
+    """
     try:
-        if decimal == ".":
+        if decimal == "." and not any("_" in field for field in fields):
             return np.array(list(map(float, fields)))
-        if not any("." in field for field in fields):
+        if decimal == "," and not any("." in field or "_" in field for field in fields):
             return np.array([float(field.replace(",", ".")) for field in fields])
     except ValueError:
         pass  # one by one, which names the line
     return np.array(
         [
-            _float(path, name, field, decimal, line, switches)
+            _float(path, name, field, decimal, line, switches, style)
             for field, line in zip(fields, lines, strict=True)
         ]
     )
 
 
 def _float(
-    path: Path, name: str, field: str, decimal: str, line: int, switches: dict[str, set[str]]
+    path: Path,
+    name: str,
+    field: str,
+    decimal: str,
+    line: int,
+    switches: dict[str, set[str]],
+    style: Callable[[str], ColumnStyle] | None,
 ) -> float:
     plain = field.strip()
-    if is_number(plain, decimal):
-        return float(plain.replace(",", "."))
+    # 1.5D+02, as Fortran writes
+    scientific = re.sub(r"(?<=[\d.,])[dD](?=[+-]?\d+$)", "e", plain)
+    if is_number(scientific, decimal):
+        return float(scientific.replace(",", "."))
+    grouped = _GROUPED[decimal].match(plain)
+    if grouped and style is not None and style(name).groups == grouped["mark"]:
+        return float(plain.replace(grouped["mark"], "").replace(",", "."))
+    quantity = _WITH_UNIT.match(plain)
+    if quantity and style is not None and style(name).unit and is_number(quantity["number"], decimal):
+        return float(quantity["number"].replace(",", "."))
     word = plain.casefold()
     if word in MISSING:
         return np.nan
@@ -302,4 +412,7 @@ def _float(
     elif re.fullmatch(r"[+-]?[\d.,\s']+", plain):
         mark = "a point" if decimal == "." else "a comma"
         remedy = f"write the numbers without marks between thousands, with {mark} before the decimals"
+        if is_ambiguous(plain):
+            one, thousand = plain.replace(",", "."), re.sub("[.,]", "", plain)
+            remedy = f"it may be {one} or {thousand}: declare ingest.decimal, or {remedy}"
     raise ValueError(f"{path}: line {line}, column {name} should be a number but is {plain[:40]!r}; {remedy}")

@@ -48,6 +48,11 @@ SECTIONS = (
     "train_ilc",
     "tune_weights",
 )
+# the project's own files have some 600 values, 6 levels deep
+MOST_VALUES, DEEPEST, LONGEST_NUMBER = 100_000, 50, 30
+_TAGS = [
+    f"tag:yaml.org,2002:{kind}" for kind in ("bool", "null", "int", "float", "str", "map", "seq", "merge")
+]
 
 
 class Section(pydantic.BaseModel):
@@ -169,21 +174,60 @@ def digest(model: Section) -> str:
 class _Loader(yaml.SafeLoader):
     """YAML 1.2 as DVC reads it: 1e-6 is a number, `no` and `on` are words, 12:30 is no number.
 
-    A key given twice is refused.
+    Refused are a key given twice, tags that JSON has no type for, and a file that grows beyond MOST_VALUES
+    once its aliases are written out, or is nested deeper than DEEPEST.
     """
 
     yaml_implicit_resolvers: ClassVar[dict] = {}
+
+    def __init__(self, stream):
+        super().__init__(stream)
+        self.depth = self.values = 0
+        self.sizes: dict[int, int] = {}  # values in a composed node, its aliases written out
+
+    def compose_node(self, parent, index):
+        event = self.peek_event()
+        if isinstance(event, yaml.AliasEvent):
+            node = super().compose_node(parent, index)
+            if id(node) not in self.sizes:
+                raise _refused(f"the alias *{event.anchor} stands inside of what it names", event.start_mark)
+            self.values += self.sizes[id(node)]
+        else:
+            self.depth, before = self.depth + 1, self.values
+            if self.depth > DEEPEST:
+                raise _refused(f"it is nested deeper than {DEEPEST} levels", event.start_mark)
+            if getattr(event, "tag", None) not in (None, "!", *_TAGS):
+                raise _refused(f"the tag {event.tag} names no type of parameters", event.start_mark)
+            node = super().compose_node(parent, index)
+            self.depth -= 1
+            self.values += 1
+            self.sizes[id(node)] = self.values - before
+        if self.values > MOST_VALUES:
+            raise _refused(
+                f"with its aliases written out the file has more than {MOST_VALUES} values", event.start_mark
+            )
+        return node
 
     def construct_mapping(self, node, deep=False):
         lines: dict[str, int] = {}
         for key_node, _ in node.value:
             key = key_node.value
+            if not isinstance(key_node, yaml.ScalarNode):
+                raise _refused("a key is no word", key_node.start_mark)
             if key in lines:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"{key} is given twice, first in line {lines[key]}", key_node.start_mark
-                )
+                raise _refused(f"{key} is given twice, first in line {lines[key]}", key_node.start_mark)
             lines[key] = key_node.start_mark.line + 1
         return super().construct_mapping(node, deep)
+
+
+def _refused(problem: str, mark: yaml.Mark | None) -> yaml.MarkedYAMLError:
+    return yaml.constructor.ConstructorError(None, None, problem, mark)
+
+
+def _whole(_: _Loader, node: yaml.ScalarNode) -> int:
+    if len(node.value) > LONGEST_NUMBER:
+        raise _refused(f"a number has {len(node.value)} digits", node.start_mark)
+    return int(node.value)
 
 
 for _tag, _pattern, _first in [
@@ -197,7 +241,7 @@ for _tag, _pattern, _first in [
     ),
 ]:
     _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(rf"^(?:{_pattern})$"), list(_first))
-_Loader.add_constructor("tag:yaml.org,2002:int", lambda loader, node: int(node.value))
+_Loader.add_constructor("tag:yaml.org,2002:int", _whole)
 _Loader.add_constructor(
     "tag:yaml.org,2002:float", lambda loader, node: float(re.sub(r"\.(inf|nan)", r"\1", node.value.lower()))
 )

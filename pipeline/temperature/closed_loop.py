@@ -57,42 +57,38 @@ def closed_loop(
 
 
 def _answers(u: Segments, y: Segments, past: int, *, offset: bool, lags: int) -> _Answers | None:
-    errors = []
-    for feedthrough in (True, False):
-        data = lagged(u, y, past, feedthrough=feedthrough, offset=offset)
-        coefficients, _ = one_step(data, past)
-        errors.append((data, coefficients))
+    """None where no stretch is long enough to tell."""
+    m, runs = u[0].shape[1], [w for w in complete_runs(u, y) if len(w) > past + lags + 1]
+    # the predictor that is told u(t) has m unknowns more
+    if sum(len(w) - past for w in runs) < (past + 1) * sum(part[0].shape[1] for part in (u, y)) + m + 1:
+        return None
+    data, untold = (lagged(u, y, past, feedthrough=told, offset=offset) for told in (True, False))
+    of_told, of_untold = (one_step(part, past)[0] for part in (data, untold))
     parts = [[], [], [], []]
-    for w in complete_runs(u, y):
-        if len(w) <= past + lags + 1:
-            continue
-        m = u[0].shape[1]
-        data = errors[0][0]
+    for w in runs:
         z = np.hstack([w[past - lag : len(w) - lag] - data.means[lag] for lag in range(1, past + 1)])
         now_u, now_y = w[past:, :m] - data.means[0, :m], w[past:, m:] - data.means[0, m:]
-        told = now_y - np.hstack([now_u, z]) @ errors[0][1]
+        told = now_y - np.hstack([now_u, z]) @ of_told
         parts[0].append(w[past + lags :, :m])
         # as recorded: an input that is held has moved by nothing, to the last bit
         late = [w[past + lags - lag : len(w) - lag, :m] for lag in range(1, min(past, 20) + 1)]
         parts[1].append(np.stack(late, axis=1))
         parts[2].append(np.hstack([told[lags - k : len(told) - k] for k in range(1, lags + 1)]))
-        parts[3].append((now_y - z @ errors[1][1])[lags:])
-    if not parts[0]:
-        return None
+        parts[3].append((now_y - z @ of_untold)[lags:])
     now, history, before, at_once = (np.concatenate(part) for part in parts)
-    moved = [_unforeseen(now[:, j], history, j) for j in range(now.shape[1])]
-    return _Answers(np.column_stack(moved), before, at_once)
+    return _Answers(_unforeseen(now, history), before, at_once)
 
 
-def _unforeseen(now: np.ndarray, history: np.ndarray, j: int) -> np.ndarray:
-    """What the past of all inputs (T, past, m) does not foretell of input j (T,): by regression, or by its
+def _unforeseen(now: np.ndarray, history: np.ndarray) -> np.ndarray:
+    """What the past of all inputs (N, past, m) does not foretell of each (N, m): by regression, or by its
     last value where that is nearer in the median."""
     centred = history.reshape(len(now), -1) - history.reshape(len(now), -1).mean(axis=0)
     design = np.hstack([np.ones((len(now), 1)), centred])
     by_regression = now - design @ np.linalg.lstsq(design, now, rcond=1e-10)[0]
-    by_holding = now - history[:, 0, j]
-    left = min(by_regression, by_holding, key=lambda part: np.median(np.abs(part)))
-    return np.where(np.abs(left) > 1e-9 * max(np.ptp(now), np.finfo(float).tiny), left, 0.0)
+    by_holding = now - history[:, 0]
+    nearer = np.median(np.abs(by_holding), axis=0) < np.median(np.abs(by_regression), axis=0)
+    left = np.where(nearer, by_holding, by_regression)
+    return np.where(np.abs(left) > 1e-9 * np.maximum(np.ptp(now, axis=0), np.finfo(float).tiny), left, 0.0)
 
 
 def _clipped(moved: np.ndarray) -> np.ndarray:
@@ -116,5 +112,6 @@ def _jumps_with(errors: np.ndarray, excess: np.ndarray) -> bool:
     if np.count_nonzero(excess) < 4:
         return True
     about_mean = excess - excess.mean()
-    share = about_mean @ errors / (np.linalg.norm(about_mean) * np.linalg.norm(errors, axis=0))
+    sizes = np.linalg.norm(about_mean) * np.linalg.norm(errors, axis=0)
+    share = about_mean @ errors / np.maximum(sizes, np.finfo(float).tiny)
     return bool((np.abs(share) * np.sqrt(len(excess)) > 4).any())  # far beyond what p outputs show by chance

@@ -1,21 +1,26 @@
-"""From a record to a plant. Stated rules choose window, dead time, feed-through, order and refinement on the
-identification data; then one fit is made on all of it.
+"""From a record to a plant. Stated rules choose window, dead time, feed-through, order and refinement
+together, on what is left out of the identification data: blocks, or whole recordings where there are several.
+Then one fit is made on all of it.
 
 The rules, each with its reason:
 
 window: Twice the lags of Akaike's criterion (corrected for few samples) over VARX models, long enough to
-    whiten. Schwarz's lags beside them, for records that say little.
+    whiten. Schwarz's lags beside them, for records that say little, and a window that spans the slowest mode
+    that the longest shows, where that is longer by half.
+closed loop: Recognised by `closed_loop`. PBSID and prediction-error fits stay consistent there; fits to
+    simulated outputs do not, and are not tried. Candidates are judged one step ahead too.
 feed-through: With and without u(t) in the outputs whose one-step predictor Schwarz's criterion prefers with
-    it, where `feedthrough` is None.
+    it, where `feedthrough` is None. None in closed loop: a row of D would be the controller's inverse.
+drift: What wanders and is not recorded becomes a state that hardly decays, with the rest of the order.
 largest order: The singular values, in units of the noise, above what coefficient errors alone reach:
     sqrt(2) (sqrt(rows) + sqrt(columns)) of the noise matrix.
 dead time: None; the lags at which the largest model's impulse response stays under 5 % of its peak; those
     under a quarter of it that Wald's test finds silent too.
 order: The fewest parameters whose error is within 2 % of the best. The error is that of
     simulating left-out blocks (geometric mean).
-refinement: Where `refinement` is "validated", prediction-error fits of the chosen model. One is taken where
-    it takes more than 5 % off the error on the left-out blocks; one for simulation only where it beats
-    prediction by a fifth.
+refinement: Where `refinement` is "validated", prediction-error fits of the best candidate of each structure.
+    One is taken where it takes more than 5 % off the error on the left-out blocks; one for simulation only
+    where it beats prediction by a fifth.
 """
 
 from collections.abc import Sequence
@@ -384,9 +389,14 @@ def _best_candidate(
     entrants = []
     for start in _shortlist(u, table):
         values = singular_values[start.structure.past, start.structure.feedthrough]
-        refined = cross_validate(
-            u, y, [start.order], start.structure, kinds, singular_values=values, validation=validation
-        )
+        refined: list[Candidate] = []
+        for kind in kinds:
+            # on a long record the fit that may only win by a fifth is tried where the other gains nothing
+            if refined and _work(u, start) > WORK / 20 and _better_fit(start, refined) is not start:
+                break
+            refined += cross_validate(
+                u, y, [start.order], start.structure, (kind,), singular_values=values, validation=validation
+            )
         table += refined
         entrants.append(_better_fit(start, refined))
     return simplest(entrants), table
@@ -422,14 +432,18 @@ def _shortlist(u: Segments, table: list[Candidate]) -> list[Candidate]:
     first = simplest(table)
     best = sorted((simplest(rows) for rows in of.values()), key=lambda row: row.error)
     others = [row for row in best if row != first and row.error < 1.5 * best[0].error]
-    samples, m = sum(map(len, u)), u[0].shape[1]
     taken, work = [], 0.0
     for row in [first, *others]:
-        work += samples * (row.order * (row.order + m)) ** 2
+        work += _work(u, row)
         if taken and work > WORK:
             break
         taken.append(row)
     return taken
+
+
+def _work(u: Segments, row: Candidate) -> float:
+    """What one step of refinement costs, in products."""
+    return float(sum(map(len, u))) * (row.order * (row.order + u[0].shape[1])) ** 2
 
 
 def _better_fit(start: Candidate, refined: list[Candidate]) -> Candidate:

@@ -124,6 +124,9 @@ def windows(data: Lagged) -> tuple[tuple[int, ...], bool]:
 def feedthrough_shows(u: Segments, y: Segments, past: int, offset: bool) -> tuple[bool, ...]:
     """For each output (p,), whether Schwarz's criterion of its one-step predictor falls when u(t) is added to
     it. So it does too where a controller answers y(t) at once: the blocks decide."""
+    q, rows = u[0].shape[1] + y[0].shape[1], sum(max(len(w) - past, 0) for w in complete_runs(u, y))
+    if rows < (past + 2) * q + 1:  # u(t) is one block of unknowns more than the window was chosen for
+        return (False,) * y[0].shape[1]
     power = []
     for feedthrough in (False, True):
         data = lagged(u, y, past, feedthrough=feedthrough, offset=offset)

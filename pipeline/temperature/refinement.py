@@ -319,7 +319,7 @@ def fit_inputs(A, C, u, y, *, feedthrough: bool | tuple[bool, ...], offset: bool
     theta = np.linalg.lstsq(J / scale, np.concatenate(target), rcond=1e-12)[0] / scale
     G, H = np.zeros((n, m + 1)), np.zeros((p, m + 1))
     G[:, inputs] = theta[: n * len(inputs)].reshape(n, -1)
-    H[:, direct] = theta[n * len(inputs) : size].reshape(p, -1)
+    H[:, direct] = theta[n * len(inputs) : size].reshape(p, -1) * allowed[:, direct]
     return model._replace(G=G, H=H, x0=list(theta[size:].reshape(segments, n)))
 
 
@@ -384,7 +384,9 @@ def refine(
     """
     _check_start(plant, u, settings.max_radius)
     m, ahead = plant.m, criterion == "prediction"
-    problem = _weighted(plant, u, y, criterion)
+    rows = np.broadcast_to(np.asarray(settings.feedthrough, bool), (plant.p,))
+    # a full weight would mix the rows of D that are free with those that are zero
+    problem = _weighted(plant, u, y, criterion, diagonal=not ahead or bool(rows.any() and not rows.all()))
     free = np.zeros(problem.start.H.shape, bool)
     free[:, : m + 1] = free_entries(plant.p, m, settings.feedthrough, offset=settings.offset)
 
@@ -405,7 +407,8 @@ def refine(
         max_iterations=settings.max_iterations,
         tolerance=settings.tolerance,
     )
-    return Refined(_plant_of(best, problem, plant, ahead=ahead), best.x0, costs)
+    refined = _plant_of(best, problem, plant, ahead=ahead)
+    return Refined(refined._replace(D=np.where(rows[:, None], refined.D, plant.D)), best.x0, costs)
 
 
 def _check_start(plant: Plant, u: Sequence[np.ndarray], max_radius: float | None) -> None:
@@ -433,7 +436,7 @@ class _Weighted(NamedTuple):
     unweight: np.ndarray
 
 
-def _weighted(plant: Plant, u, y, criterion: Criterion) -> _Weighted:
+def _weighted(plant: Plant, u, y, criterion: Criterion, *, diagonal: bool) -> _Weighted:
     m, ahead = plant.m, criterion == "prediction"
     start = prediction_form(plant, []) if ahead else simulation_form(plant, [])
     y_full = y
@@ -445,7 +448,7 @@ def _weighted(plant: Plant, u, y, criterion: Criterion) -> _Weighted:
     v = [drives(criterion, a, b) for a, b in zip(u, y_full, strict=True)]
     x0 = [estimate_state(start, a, b) for a, b in zip(v, y, strict=True)]
     errors = np.vstack([b - respond(start, a, x)[1] for a, b, x in zip(v, y, x0, strict=True)])
-    weight, unweight = _weights(errors, diagonal=not ahead)
+    weight, unweight = _weights(errors, diagonal=diagonal)
     if ahead:
         start = start._replace(G=np.hstack([start.G[:, : m + 1], start.G[:, m + 1 :] @ unweight]))
         v = [np.hstack([a[:, : m + 1], a[:, m + 1 :] @ weight.T]) for a in v]

@@ -37,6 +37,10 @@ def read(*fields: str, order: bool | None = None) -> Instants:
         "2025-11-21T13:00:00+01:00",
         "2025-11-21T06:30:00-0530",
         "2025-11-21 12:00:00 UTC",
+        "2025-11-21 13:00:00 CET",
+        "2025-11-21 13:00:00 Europe/Berlin",
+        "21.11.2025 01:00:00 PM CET",
+        "2025-11-21 07:00:00 America/New_York",
     ],
 )
 def test_one_instant_is_the_same_however_it_is_written(text):
@@ -99,6 +103,29 @@ def test_day_and_month_are_told_by_a_date_that_can_be_only_one_of_both():
     assert month_first(["05/03/2025"], "05/03/2025") is not None
 
 
+def test_the_hour_that_the_end_of_summer_time_repeats_is_read_in_its_order():
+    local = [
+        f"2025-10-26 {hour}:{minute:02d}:00"
+        for hour in ("01", "02", "02", "03")
+        for minute in range(0, 60, 10)
+    ]
+    named = local[:12], local[12:18], local[18:]
+    for fields in (
+        [f"{text} Europe/Berlin" for text in local],
+        [
+            f"{text} {zone}"
+            for texts, zone in zip(named, ("CEST", "CET", "CET"), strict=True)
+            for text in texts
+        ],
+    ):
+        assert (np.diff(read(*fields).ns) == 600 * 10**9).all()
+
+
+def test_the_hour_that_the_begin_of_summer_time_leaves_out_is_no_gap():
+    clock = read("2025-03-30 01:59:00 Europe/Berlin", "2025-03-30 03:00:00 Europe/Berlin")
+    assert np.diff(clock.ns).tolist() == [60 * 10**9]
+
+
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
@@ -106,6 +133,9 @@ def test_day_and_month_are_told_by_a_date_that_can_be_only_one_of_both():
         ("05/03/2025 12:00", "is '05/03/2025 12:00' (day and month, or month and day?); convert it"),
         ("12:34", "is '12:34' (hours and minutes, or minutes and seconds?)"),
         ("31.02.2025 12:00", "is '31.02.2025 12:00' (day is out of range for month?); convert it"),
+        ("2025-11-21 12:00:00 Mars/Olympus", "(zone Mars/Olympus?)"),
+        ("2025-11-21 12:00:00 XYZ", "(zone XYZ?)"),
+        ("2263-11-21T12:00:00", "is '2263-11-21T12:00:00'"),
         ("2025-11-21T12:61:00", "is '2025-11-21T12:61:00'"),
         # behind a first time without digits behind a hyphen, they can only be a zone
         ("2025-11-21T12:00:00-34", "is '2025-11-21T12:00:00-34'"),

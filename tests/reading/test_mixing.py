@@ -56,6 +56,14 @@ def test_two_devices_at_rest_are_two_and_a_coarse_sensor_between_two_steps_is_on
         assert mixed(20 + step * (rng.random(500) < 0.5)) == []
 
 
+@pytest.mark.parametrize("step", [0.5, 5.0, 10.0, 16.0, 50.0])
+@pytest.mark.parametrize("noise", [0.2, 0.3])
+def test_a_coarse_converter_that_steps_by_one_is_one_device_whatever_its_step(step, noise):
+    rng = np.random.default_rng(3)
+    y = 200 + step * (1.5 * np.sin(np.arange(4000) / 300) + rng.normal(0, noise, 4000))
+    assert mixed(np.round(y / step) * step) == []
+
+
 def test_what_one_device_does_is_not_mixed():
     time = np.arange(2000.0)
     for y in (

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from google.protobuf import descriptor_pb2
 
 from pipeline.reading.protobuf_messages import decoder, fields, message_types
 from pipeline.reading.ros_messages import UnreadableMessage
@@ -94,3 +95,51 @@ def test_a_schema_or_field_that_is_not_there_is_named():
     for field in ("name", "zones", "zones[0]", "duty[0]", "zones[0].speed", "nozzle"):
         with pytest.raises(ValueError, match="no numeric field"):
             numbers(MESSAGE, field)
+
+
+def described(*files: descriptor_pb2.FileDescriptorProto) -> bytes:
+    return descriptor_pb2.FileDescriptorSet(file=files).SerializeToString()
+
+
+def holding_itself(width: int) -> descriptor_pb2.FileDescriptorProto:
+    """A message with `width` fields of its own type and one number."""
+    message = descriptor_pb2.DescriptorProto(name="Tree")
+    message.field.add(name="leaf", number=1, type=1, label=1)
+    for i in range(width):
+        message.field.add(name=f"branch_{i}", number=i + 2, type=11, label=1, type_name=".Tree")
+    return descriptor_pb2.FileDescriptorProto(name="tree.proto", syntax="proto3", message_type=[message])
+
+
+def test_a_message_that_holds_itself_is_followed_a_few_levels_and_no_further():
+    types = message_types(described(holding_itself(1)))
+    assert len(fields(types, "Tree", b"")) == 6
+    with pytest.raises(ValueError, match="Tree has more than 20000 fields; name the wanted ones"):
+        fields(message_types(described(holding_itself(40))), "Tree", b"")
+
+
+def test_files_in_any_order_and_without_the_well_known_ones_are_read_and_others_are_missed():
+    used = descriptor_pb2.FileDescriptorProto(name="b.proto", syntax="proto3")
+    used.message_type.add(name="B").field.add(name="x", number=1, type=1, label=1)
+    user = descriptor_pb2.FileDescriptorProto(
+        name="a.proto", syntax="proto3", dependency=["b.proto", "google/protobuf/timestamp.proto"]
+    )
+    message = user.message_type.add(name="A")
+    message.field.add(name="b", number=1, type=11, label=1, type_name=".B")
+    message.field.add(name="at", number=2, type=11, label=1, type_name=".google.protobuf.Timestamp")
+    assert fields(message_types(described(user, used)), "A", None) == ["b.x", "at.seconds", "at.nanos"]
+    with pytest.raises(ValueError, match="the schema imports b.proto and does not hold it"):
+        message_types(described(user))
+    used.dependency.append("a.proto")
+    with pytest.raises(ValueError, match="no FileDescriptorSet"):
+        message_types(described(user, used))
+
+
+def test_a_schema_flipped_anywhere_is_read_or_refused_but_never_a_crash():
+    for place in range(len(DESCRIPTOR)):
+        changed = bytearray(DESCRIPTOR)
+        changed[place] ^= 1 << place % 8
+        try:
+            names = fields(message_types(bytes(changed)), "machine.State", MESSAGE)
+            decoder(message_types(bytes(changed)), "machine.State", names)([MESSAGE])
+        except (ValueError, UnreadableMessage):
+            continue

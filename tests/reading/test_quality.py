@@ -260,3 +260,27 @@ def test_the_spike_of_the_two_heater_kit_and_nothing_else_is_masked(shared):
     assert np.flatnonzero(table.masked["temperature_1"]).tolist() == [1789]
     assert table.values["temperature_1"][1789] == 40.718
     assert not table.masked["temperature_2"].any()
+
+
+@pytest.mark.parametrize("step", [0.5, 2.0, 10.0, 16.0])
+@pytest.mark.parametrize("noise", [0.02, 0.2, 0.45])
+@pytest.mark.parametrize("even", [True, False])
+def test_steps_of_a_coarse_converter_are_no_spikes(step, noise, even):
+    """A thermistor's converter has steps that differ from level to level."""
+    rng = np.random.default_rng(4)
+    counts = np.round(40 + 2 * np.sin(np.arange(2000) / 200) + rng.normal(0, noise, 2000)).astype(int)
+    levels = step * np.cumsum(1 + (0 if even else 0.3) * np.sin(np.arange(100) / 3))
+    table = flagged({"u": rig()["u"], "y": levels[counts]})
+    assert not of(table, "spike", "frozen")
+    assert not table.masked["y"].any()
+
+
+def test_only_an_input_that_acts_in_most_samples_is_called_a_controller():
+    rng = np.random.default_rng(5)
+    plan = np.repeat(np.clip(rng.uniform(-20, 120, 40), 0, 100), 50)
+    (low, high) = of(flagged(rig() | {"u": plan}), "saturated")
+    assert "controller" not in low.message + high.message
+    feedback = np.clip(50 + 40 * rng.normal(size=2000), 0, 100)
+    assert all(
+        "not the controller" in one.message for one in of(flagged(rig() | {"u": feedback}), "saturated")
+    )

@@ -60,7 +60,8 @@ def test_outputs_follow_the_line_between_neighbours_and_inputs_hold():
         1,
     )
     assert "0.6 s later on average" in flags["step_inside"].message
-    assert flags["filled"].count == 2
+    assert flags["interpolated"].count == 2
+    assert "filled" not in flags
 
 
 @given(st.integers(0, 10_000), st.floats(0.3, 3.0))

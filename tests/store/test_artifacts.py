@@ -606,3 +606,21 @@ def test_a_rename_that_fails_puts_the_last_good_folder_back(project, last_good, 
     with pytest.raises(SystemExit):
         learn()
     assert everything(project) == last_good
+
+
+def test_arrays_of_another_machine_and_of_another_version_are_refused_with_both_and_the_command():
+    path = "datasets/identify_plant/plant.parquet"
+    artifacts.write_arrays(path, "plant", 1, {"D": (np.zeros((1, 2, 3)), "1", "feed-through")})
+    assert artifacts.read_arrays(path, "plant", 1, shapes={"D": (None, 2, 3)})["D"].shape == (1, 2, 3)
+    for shapes, sentence in (
+        ({"D": (None, 5, 7)}, "array D has the shape 1 x 2 x 3 but any x 5 x 7 is expected"),
+        ({"D": (2, 3)}, "array D has the shape 1 x 2 x 3 but 2 x 3 is expected"),
+        ({"E": (None,)}, "array E is not there but any is expected"),
+    ):
+        with pytest.raises(ValueError, match=sentence) as refused:
+            artifacts.read_arrays(path, "plant", 1, shapes=shapes)
+        assert "of another machine or another run; make it again with ./run dvc repro identify_plant" in str(
+            refused.value
+        )
+    with pytest.raises(ValueError, match="holds schema plant version 1 but plant version 2 is expected"):
+        artifacts.read_arrays(path, "plant", 2)

@@ -2,6 +2,7 @@
 whatever is wrong with them is said in one sentence."""
 
 import re
+import time
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -438,3 +439,45 @@ def test_changes_by_dotted_keys_and_files_of_earlier_versions_are_read_unchecked
 def test_the_sections_are_those_of_the_two_files(root):
     both = {name for sections in params.files(root / params.FILE).values() for name in sections}
     assert {name for name in both if not name.startswith("x_")} == set(params.SECTIONS)
+
+
+# ---- hostile files
+
+LAUGHS = "a: &a [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"{after}: &{after} [{', '.join([f'*{before}'] * 10)}]\n"
+    for before, after in zip("abcdefgh", "bcdefghi", strict=True)
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (LAUGHS, "line 5: with its aliases written out the file has more than 100000 values"),
+        ("a: " + "[" * 3000 + "]" * 3000, "line 1: it is nested deeper than 50 levels"),
+        ("a: " + "{b: " * 3000 + "}" * 3000, "line 1: it is nested deeper than 50 levels"),
+        (
+            "\n".join(" " * depth + "a:" for depth in range(3000)),
+            "line 50: it is nested deeper than 50 levels",
+        ),
+        ("a: &a [*a]", "the alias *a stands inside of what it names"),
+        ("a: " + "9" * 5000, "a number has 5000 digits"),
+        ("a: !!python/object/apply:os.system [ls]", "names no type of parameters"),
+        ("a: !!timestamp 2020-01-01", "names no type of parameters"),
+        ("? [a, b]\n: 1", "a key is no word"),
+        ("a: 1\na: 2", "a is given twice, first in line 1"),
+        ("a: \x1b[31m", "unacceptable character"),
+    ],
+)
+def test_a_hostile_file_is_one_sentence_at_once(load, text, sentence):
+    start = time.perf_counter()
+    with pytest.raises(ValueError, match=re.escape(sentence)) as refused:
+        load(text)
+    assert str(refused.value).startswith("params.yaml: ")
+    assert "\n" not in str(refused.value)
+    # milliseconds; the bound leaves room for a busy machine
+    assert time.perf_counter() - start < 5
+
+
+def test_an_alias_of_a_few_values_is_what_it_stands_for(load):
+    aliased = GOOD.replace("levels: [0, 0.5]", "levels: &levels [0, 0.5]") + "x_other:\n  again: *levels\n"
+    assert load(aliased) == load(GOOD)

@@ -13,7 +13,7 @@ from pipeline.store import artifacts, params
 from pipeline.store.execution import run_all
 from pipeline.temperature import study
 from pipeline.temperature.workflow import ingest
-from pipeline.temperature.workflow.ingest import IngestSpec, collect, process
+from pipeline.temperature.workflow.ingest import Budget, IngestSpec, collect, process
 from pipeline.temperature.workflow.settings import Plant
 from tests.cluster import Cluster
 from tests.reading.klipper_machine import EXTRUDER, print_log
@@ -27,6 +27,7 @@ MACHINE = Plant.model_validate(
     }
 )
 JOB = IngestSpec(MACHINE, {}, "", 5.0)
+BUDGET = Budget(60.0, 2000)
 INLINE = params.Execution(backend="loky", jobs=1, scheduler="")
 LOKY = params.Execution(backend="loky", jobs=2, scheduler="")
 NAMES = ("record.parquet", "quality.parquet", "metrics.json")
@@ -57,7 +58,7 @@ def ingested(
 ) -> dict:
     """What the stage does with a folder; the tables land in `out` for a look at their bytes."""
     record, quality, metrics = collect(
-        process(raw, job, execution, memo=memo or out / "memo"), MACHINE, strict=strict
+        process(raw, job, execution, memo=memo or out / "memo", budget=BUDGET), MACHINE, strict=strict
     )
     artifacts.write_table(out / "record.parquet", record.schema, record.columns)
     artifacts.write_table(out / "quality.parquet", quality.schema, quality.columns)
@@ -139,7 +140,8 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from pipeline.store import artifacts
-from tests.temperature.test_ingest import INLINE, JOB, process
+from pipeline.temperature.workflow import ingest
+from tests.temperature.test_ingest import BUDGET, INLINE, JOB, process
 
 write_table, written = artifacts.write_table, []
 
@@ -150,7 +152,8 @@ def killed_in_the_second_entry(path, schema, columns):
     write_table(path, schema, columns)
 
 artifacts.write_table = killed_in_the_second_entry
-process(Path(sys.argv[1]), JOB, INLINE, memo=Path(sys.argv[2]))
+ingest.isolated = lambda work, *arguments, shown, budget: work(*arguments)
+process(Path(sys.argv[1]), JOB, INLINE, memo=Path(sys.argv[2]), budget=BUDGET)
 """
 
 
@@ -191,6 +194,35 @@ def test_broken_recordings_are_quarantined_with_their_reasons_and_the_others_go_
     assert "zone" in reasons["lacks.csv"]
     # what was refused once is refused again, and is no reuse
     assert done(ingested(raw, tmp_path / "all")) == (0, 3, 2)
+
+
+def test_the_child_changes_no_byte(tmp_path, monkeypatch):
+    raw = folder(tmp_path, 3)
+    broken(raw)
+    ingested(raw, tmp_path / "child", LOKY)
+    monkeypatch.setattr(ingest, "isolated", lambda work, *arguments, shown, budget: work(*arguments))
+    ingested(raw, tmp_path / "here")
+    for name in NAMES:
+        assert (tmp_path / "child" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("budget", "reason"),
+    [
+        (Budget(0.15, 2000), "long.csv: reading it takes longer than the 0.15 s"),
+        (Budget(60.0, 5), "long.csv: reading it needs more memory than the 5 MB"),
+    ],
+)
+def test_a_recording_beyond_its_budget_is_quarantined_and_the_others_go_on(tmp_path, budget, reason):
+    raw = folder(tmp_path, 2)
+    # what is loaded at the first call counts there: the budget is that of a warm child
+    process(raw, JOB, INLINE, memo=tmp_path / "warm", budget=BUDGET)
+    k = np.arange(300_000)
+    artifacts.write_csv(raw / "long.csv", {"time_s": k, "heater": k % 7, "zone": 20 + k % 5})
+    results = process(raw, JOB, INLINE, memo=tmp_path / "memo", budget=budget)
+    assert [result.name for result in results if result.reason] == ["long.csv"]
+    assert reason in results[2].reason
+    assert "in params.expert.yaml" in results[2].reason
 
 
 def test_strict_and_a_folder_of_broken_recordings_alone_end_with_the_first_reason(tmp_path):

@@ -1,5 +1,6 @@
 """beadline init: from recordings of a new machine to params files that its stages read."""
 
+import runpy
 import shutil
 import sys
 
@@ -89,10 +90,8 @@ def test_limits_that_no_file_tells_are_left_to_a_person_and_asked_for_by_the_sta
     (tree / "rig.csv").write_text("time_s,heater_1_pct,zone_1_C\n" + rows)
     init(monkeypatch, "rig.csv", "--copy")
     assert "low and high of temperature_1: between which °C the machine must stay" in capsys.readouterr().out
-    from stages import ingest
-
     with pytest.raises(SystemExit):
-        ingest.main()
+        runpy.run_module("stages.ingest", run_name="__main__")
     asked = capsys.readouterr().err
     assert "plant.outputs: temperature_1 should have low and high" in asked
 
@@ -111,6 +110,25 @@ def test_recordings_of_two_machines_and_one_without_heaters_are_refused(tree, mo
             init(monkeypatch, *files)
         assert sentence in capsys.readouterr().err
     assert (tree / "params.yaml").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "daisy_a/dryer.dat",
+        "daisy_a/glassfurnace.dat",
+        "tclab_apmonitor/second_order_mimo.csv",
+        "tclab_mlid_prbs/prbs.csv",
+        "paper_reference/probing_log_seed1.parquet",
+    ],
+)
+def test_real_records_give_files_that_the_stages_load(shared, tree, name):
+    initialised = propose_params.proposed([shared(f"data/{name}")])
+    propose_params.write(initialised.values, force=False)
+    machine, panel = params.load(Plant, "plant"), params.load(Panel, "panel")
+    assert list(panel.judging.starts_degC) == sorted(panel.judging.starts_degC)
+    assert panel.judging.reference_offsets_degC[1] < 0
+    assert machine.sample_time_s > 0 and machine.inputs
 
 
 def test_the_time_constant_is_the_one_that_made_the_record():

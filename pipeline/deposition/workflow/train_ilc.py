@@ -16,6 +16,7 @@ from pipeline.deposition.training import LawSettings, Noise, TrainingCase, Trial
 from pipeline.deposition.workflow import laws, trial_files, trial_video
 from pipeline.deposition.workflow.settings import Camera, Material, Printer, TrainIlc
 from pipeline.deposition.workflow.trial_video import MeasuredTrial, SimulatedMachine
+from pipeline.reading.plain_files import check_plain_files
 from pipeline.store.artifacts import about
 from pipeline.store.execution import run_all
 from pipeline.store.params import Execution
@@ -284,6 +285,7 @@ def _recorded(
     Raises ValueError, naming the file, for an unknown material, nozzle or
     routine, and where a trial is missing or there twice.
     """
+    check_plain_files(folder)
     by_routine: dict[tuple[str, int], dict[int, tuple[Path, MeasuredTrial]]] = {}
     for path in sorted(file for file in folder.rglob("*.mcap") if not file.name.startswith(".")):
         conditions = trial_files.read_trial(path, unreadable_share=camera.unreadable_share).conditions

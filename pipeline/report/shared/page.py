@@ -12,6 +12,7 @@ from pipeline.report.shared import digits
 from pipeline.report.shared.sources import Source
 from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, UNDECIDED, Missing
 from pipeline.store import artifacts
+from pipeline.store.printable import printable_page
 from pipeline.temperature.workflow.contestants import CONTESTANTS
 
 GLYPHS = {
@@ -79,7 +80,7 @@ def render(template: str, **values) -> str:
         for name, title in BESIDE
         if name == values["here"] or artifacts.exists(f"reports/{name}.html")
     ]
-    return environment().get_template(template).render(beside=beside, **values)
+    return printable_page(environment().get_template(template).render(beside=beside, **values))
 
 
 def glyph(state: str) -> Markup:

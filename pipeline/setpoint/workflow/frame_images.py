@@ -15,6 +15,7 @@ import joblib
 import numpy as np
 import pyarrow as pa
 
+from pipeline.reading.image_messages import check_size
 from pipeline.setpoint import key_area
 from pipeline.store import artifacts
 from pipeline.store.tables import FLOAT, NONE, TEXT, Column, Schema
@@ -89,6 +90,7 @@ def decode(data: bytes) -> np.ndarray:
     # a broken end is filled with gray: the end mark must follow the last scan
     if data.startswith(b"\xff\xd8") and data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
         raise ValueError(f"a JPEG of {len(data)} bytes without its end")
+    check_size(data)
     try:
         frame = cv2.imdecode(
             np.frombuffer(data, np.uint8),

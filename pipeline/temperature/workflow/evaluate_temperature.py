@@ -63,22 +63,38 @@ def check(settings: EvaluateTemperature, panel: Panel) -> None:
         )
 
 
-def read_learned(model_path: str, spread_path: str, weights_path: str, learned_folder: str | Path) -> Learned:
-    """What the stages before wrote. `learned_folder` has a kernel only where the record determines one."""
+def read_learned(
+    model_path: str, spread_path: str, weights_path: str, learned_folder: str | Path, machine: Machine
+) -> Learned:
+    """What the stages before wrote. `learned_folder` has a kernel only where the record determines one.
+
+    Raises ValueError for a file of another machine than `machine`, as an earlier run leaves it."""
     window_path, kernel_path = (
         Path(learned_folder) / "window.parquet",
         Path(learned_folder) / "kernel.parquet",
     )
+    m, p = len(machine.inputs), len(machine.outputs)
+    plants = {"D": (None, p, m)}
+    weights = artifacts.read_json(weights_path)["practical"]
+    for key, count, what in (("q", p, "outputs"), ("r", m, "inputs")):
+        if len(weights[key]) != count:
+            raise ValueError(
+                f"{weights_path}: practical.{key} has {len(weights[key])} weights but the machine in "
+                f"params.yaml has {count} {what}, so that the file is of another machine or another run; "
+                f"{artifacts.remedy(weights_path)}"
+            )
     return Learned(
-        plant.restored(artifacts.read_arrays(model_path, "plant", 1))[0],
-        window.restored(artifacts.read_arrays(window_path, "window", 1)),
+        plant.restored(artifacts.read_arrays(model_path, "plant", 1, shapes=plants))[0],
+        window.restored(
+            artifacts.read_arrays(window_path, "window", 1, shapes={"Theta": (p, None), "covariance": (p, p)})
+        ),
         kernel.restored(artifacts.read_arrays(kernel_path, "kernel", 1))
         if artifacts.exists(kernel_path)
         else None,
-        {name: np.array(w) for name, w in artifacts.read_json(weights_path)["practical"].items()},
+        {name: np.array(w) for name, w in weights.items()},
         [
             plant.strictly_proper(one)
-            for one in plant.restored(artifacts.read_arrays(spread_path, "spread", 1))
+            for one in plant.restored(artifacts.read_arrays(spread_path, "spread", 1, shapes=plants))
         ],
     )
 

@@ -14,7 +14,9 @@ import joblib
 import numpy as np
 
 from pipeline.reading.formats import file_format
+from pipeline.reading.isolated import Budget, isolated
 from pipeline.reading.klipper_logs import printer_heaters
+from pipeline.reading.plain_files import check_plain_files
 from pipeline.reading.quality import flag
 from pipeline.reading.recordings import Source, Table, nearest_names, read
 from pipeline.reading.resampling import resample
@@ -40,12 +42,13 @@ READING = (
 
 class IngestSpec(NamedTuple):
     """What to take from every recording: the machine's signals, mapping {signal: (source, unit, scale,
-    offset)} (empty: our own names), the clock, the gap limit."""
+    offset)} (empty: our own names), the clock, the gap limit, the decimal mark of text ("": found)."""
 
     machine: Plant
     mapping: dict[str, tuple[str, str, float, float]]
     time: str
     max_gap_s: float
+    decimal: str = ""
 
     def sources(self) -> list[Source]:
         signals = [*self.machine.acting, *self.machine.outputs]
@@ -76,6 +79,7 @@ def spec_of(settings: Ingest, machine: Plant, source: str) -> IngestSpec:
         {name: (m.source, m.unit, m.scale, m.offset) for name, m in mapping.items()},
         settings.time,
         settings.max_gap_s,
+        settings.decimal,
     )
 
 
@@ -95,9 +99,13 @@ class Columns(NamedTuple):
     columns: dict[str, np.ndarray]
 
 
-def process(folder: Path, spec: IngestSpec, execution: Execution, *, memo: Path) -> list[Result]:
+def process(
+    folder: Path, spec: IngestSpec, execution: Execution, *, memo: Path, budget: Budget
+) -> list[Result]:
     """Every recording below `folder`, in the order of names, on as many workers as
-    `execution` says. Raises ValueError where there is none."""
+    `execution` says. A recording that needs more than its budget is quarantined. Raises
+    ValueError where there is none."""
+    check_plain_files(folder)
     bags = {path.parent for path in folder.rglob("metadata.yaml") if is_bag(path.parent)} - {folder}
     files = sorted(
         path
@@ -131,7 +139,7 @@ def process(folder: Path, spec: IngestSpec, execution: Execution, *, memo: Path)
         if entry is None and path not in twice
     ]
     reasons = twice | dict(
-        zip([path for path, _ in todo], _run(todo, folder, spec, execution, memo), strict=True)
+        zip([path for path, _ in todo], _run(todo, folder, spec, execution, (memo, budget)), strict=True)
     )
     return [
         _result(name, entry or _remembered(memo, key, spec.machine), reasons.get(path, ""), entry is not None)
@@ -151,14 +159,30 @@ def _twice(files: Sequence[Path], hashes: Sequence[str]) -> dict[Path, str]:
 
 
 def _run(
-    todo: Sequence[tuple[Path, str]], folder: Path, spec: IngestSpec, execution: Execution, memo: Path
+    todo: Sequence[tuple[Path, str]],
+    folder: Path,
+    spec: IngestSpec,
+    execution: Execution,
+    where: tuple[Path, Budget],
 ) -> list[str]:
-    """The reasons of `_one`, in the order of `todo`; workers of a
-    cluster see the same file system under absolute paths."""
+    """The reasons of `_within`, in the order of `todo`; workers of a cluster see the same file
+    system under absolute paths. On one machine threads wait for children that do the work."""
+    memo, budget = where
     calls = [
-        joblib.delayed(_one)(path.resolve(), path, folder, key, spec, memo.resolve()) for path, key in todo
+        joblib.delayed(_within)(budget, path.resolve(), path, folder, key, spec, memo.resolve())
+        for path, key in todo
     ]
+    if execution.backend == "loky":
+        return joblib.Parallel(n_jobs=execution.jobs, backend="threading")(calls)
     return list(run_all(calls, execution, remains=": what was read is kept"))
+
+
+def _within(budget: Budget, path: Path, shown: Path, *arguments) -> str:
+    """The reason of `_one`, which works in a child; also where it needs more than the budget."""
+    try:
+        return isolated(_one, path, shown, *arguments, shown=shown, budget=budget)
+    except ValueError as reason:
+        return str(reason)
 
 
 def _one(path: Path, shown: Path, folder: Path, key: str, spec: IngestSpec, memo: Path) -> str:
@@ -171,7 +195,7 @@ def _one(path: Path, shown: Path, folder: Path, key: str, spec: IngestSpec, memo
         {s.name: (s.low, s.high) for s in spec.machine.inputs},
     )
     try:
-        raw = read(path, spec.sources(), time=spec.time)
+        raw = read(path, spec.sources(), time=spec.time, decimal=spec.decimal)
         table = resample(
             raw,
             sample_time_s=spec.machine.sample_time_s,

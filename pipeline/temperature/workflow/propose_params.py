@@ -44,6 +44,7 @@ SHIPPED: dict[str, Any] = {
     "tune_weights.allow_settling_s": 15.0,
 }
 FEWEST_STEPS, MOST_STEPS = 300, 3000
+ABSOLUTE_ZERO_DEGC = -273.15
 
 
 class Scale(NamedTuple):
@@ -123,7 +124,7 @@ def _scale(paths: Sequence[Path], proposal: Proposal) -> Scale:
     sample_time = max(interval, float(f"{min(constants.values()) / 200:.1g}"))
     lows = [np.nanmin(np.concatenate(segments)) for segments in y.values()]
     highs = [np.nanmax(np.concatenate(segments)) for segments in y.values()]
-    return Scale(constants, sample_time, float(np.max(lows)), float(np.min(highs)))
+    return Scale(constants, sample_time, float(np.min(lows)), float(np.max(highs)))
 
 
 # ---- values
@@ -135,9 +136,11 @@ def _values(proposal: Proposal, scale: Scale) -> dict[str, list[str]]:
         max(scale.time_constants_s.values()),
         [s for s in proposal.signals if s.role == "output"],
     )
+    # all outputs are held at one temperature at the start: between the coldest and their lowest reference
+    coldest = max(scale.coldest_degC, ABSOLUTE_ZERO_DEGC)
     reference = min(s.reference for s in outputs if s.reference is not None)
-    reach = min(reference, scale.hottest_degC) - scale.coldest_degC
-    starts = [round(scale.coldest_degC + share * reach, 1) for share in (0.1, 0.6, 0.2, 0.5, 0.9)]
+    reach = max(min(reference, scale.hottest_degC) - coldest, 1.0)
+    starts = [round(coldest + share * reach, 1) for share in (0.1, 0.6, 0.2, 0.5, 0.9)]
     steps = int(np.clip(round(3 * slowest / scale.sample_time_s, -1), FEWEST_STEPS, MOST_STEPS))
     settling = float(f"{slowest:.2g}")
     input_lines, output_lines = plant_lines(proposal)

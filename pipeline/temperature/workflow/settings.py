@@ -172,7 +172,10 @@ class Ingest(Section):
 
     mapping: dict[str, Mapped]
     time: str = Field(max_length=300)
+    decimal: Literal["", ".", ","]
     max_gap_s: float = Field(gt=0, le=86400)
+    longest_s: float = Field(ge=1, le=86400)
+    largest_mb: int = Field(ge=100, le=1_000_000)
     strict: bool
 
 

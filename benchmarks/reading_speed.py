@@ -1,0 +1,157 @@
+"""CPU time of reading tables of a million rows and 12 columns beside Arrow's own readers on one thread,
+and of protobuf messages beside the official package.
+
+`./run python -m benchmarks.reading_speed` prints every ratio beside its bar and writes
+benchmarks/results/reading_speed.json.
+"""
+
+import json
+import operator
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet as pq
+
+ROWS, COLUMNS, REPEATS = 1_000_000, 12, 3
+BARS = {
+    "csv": 1.5,
+    "csv_iso": 1.5,
+    "csv_comma": 1.5,
+    "csv_some_empty": 1.5,
+    "parquet": 1.3,
+    "parquet_stamps": 1.3,
+}
+# the fields are named by the recording and not by hand
+PROTOBUF_BAR = 1.5
+NAMES = [f"signal_{i}" for i in range(1, COLUMNS)]
+RESULTS = Path(__file__).parent / "results" / "reading_speed.json"
+
+
+def write(path: Path, kind: str, count: int) -> None:
+    """A table with a clock at 100 Hz and eleven signals with all their digits, the same at every run."""
+    rng = np.random.default_rng(0)
+    values = np.cumsum(rng.normal(size=(count, len(NAMES))), axis=0)
+    stamps = np.datetime64("2025-11-21T13:00:00", "ms") + 10 * np.arange(count)
+    if kind.startswith("parquet"):
+        clock = pa.array(stamps) if kind == "parquet_stamps" else pa.array(np.arange(count) / 100)
+        columns = {"time": clock} | dict(zip(NAMES, values.T, strict=True))
+        pq.write_table(pa.table(columns), path)
+        return
+    clock = map(str, stamps) if kind == "csv_iso" else (repr(k / 100) for k in range(count))
+    delimiter = ";" if kind == "csv_comma" else ","
+    with path.open("w") as stream:
+        stream.write(delimiter.join(["time", *NAMES]) + "\n")
+        for k, (at, row) in enumerate(zip(clock, values, strict=True)):
+            fields = list(map(repr, row.tolist()))
+            if kind == "csv_some_empty" and k % 10 == 3:
+                fields[3] = ""
+            line = delimiter.join([at, *fields])
+            stream.write((line.replace(".", ",") if kind == "csv_comma" else line) + "\n")
+
+
+def ours(path: Path) -> int:
+    """Every column as float64, quality checks apart."""
+    from pipeline.reading.recordings import Source, read
+
+    raw = read(path, [Source(name, name, "1") for name in NAMES])
+    return len(raw.signals[NAMES[-1]][1])
+
+
+def arrow(path: Path) -> int:
+    """Arrow's own reader on one thread, with what it must know to read numbers."""
+    if path.name.startswith("parquet"):
+        return pq.read_table(path, use_threads=False).num_rows
+    comma = path.name.startswith("csv_comma")
+    return pa.csv.read_csv(
+        path,
+        read_options=pa.csv.ReadOptions(use_threads=False),
+        parse_options=pa.csv.ParseOptions(delimiter=";" if comma else ","),
+        convert_options=pa.csv.ConvertOptions(decimal_point="," if comma else "."),
+    ).num_rows
+
+
+def protobuf_s(count: int = 200_000) -> dict[str, float]:
+    """Seconds for the numbers of `count` messages: ours, and the package with its fields named by hand."""
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+
+    from pipeline.reading.protobuf_messages import decoder, message_types
+
+    file = descriptor_pb2.FileDescriptorProto(name="machine.proto", package="machine", syntax="proto3")
+    state = file.message_type.add(name="State")
+    for i, name in enumerate(NAMES):
+        state.field.add(name=name, number=i + 1, type=1, label=1)
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    made = message_factory.GetMessageClass(pool.FindMessageTypeByName("machine.State"))
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(count, len(NAMES)))
+    messages = [made(**dict(zip(NAMES, row, strict=True))).SerializeToString() for row in rows.tolist()]
+    schema = descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()
+    decode, by_hand = decoder(message_types(schema), "machine.State", NAMES), operator.attrgetter(*NAMES)
+    seconds = {}
+    for reader, read in (
+        ("package", lambda: np.array([by_hand(made.FromString(message)) for message in messages])),
+        ("ours", lambda: decode(messages)),
+    ):
+        start = time.process_time()
+        assert np.array_equal(read(), rows), "what is read is not what was written"
+        seconds[reader] = time.process_time() - start
+    return seconds
+
+
+def cpu_s(reader: Callable[[Path], int], path: Path, warm: Path) -> float:
+    """The least CPU time of a few readings in this process; imports are paid before by a short table."""
+    reader(warm)
+    seconds = []
+    for _ in range(REPEATS):
+        start = time.process_time()
+        count = reader(path)
+        seconds.append(time.process_time() - start)
+        assert count == ROWS, "a row is missing"
+    return min(seconds)
+
+
+def apart(reader: str, path: Path, warm: Path) -> float:
+    """`cpu_s` in a process of its own."""
+    call = f"b.cpu_s(b.{reader}, Path({str(path)!r}), Path({str(warm)!r}))"
+    code = f"from pathlib import Path; from benchmarks import reading_speed as b; print({call})"
+    return float(subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout)
+
+
+def main() -> None:
+    results: dict[str, dict[str, float]] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for kind, bar in BARS.items():
+            path, warm = Path(folder) / kind, Path(folder) / f"{kind}_warm"
+            write(path, kind, ROWS)
+            write(warm, kind, 2000)
+            seconds = {reader: apart(reader, path, warm) for reader in ("arrow", "ours")}
+            ratio = seconds["ours"] / seconds["arrow"]
+            results[kind] = {f"{reader}_s": round(value, 3) for reader, value in seconds.items()}
+            results[kind] |= {"ratio": round(ratio, 2), "bar": bar}
+            print(
+                f"{kind:>15}: {seconds['ours']:.2f} s, Arrow {seconds['arrow']:.2f} s, "
+                f"ratio {ratio:.2f} (bar {bar})",
+                flush=True,
+            )
+            path.unlink()
+    seconds = protobuf_s()
+    ratio = seconds["ours"] / seconds["package"]
+    results["protobuf"] = {f"{reader}_s": round(value, 3) for reader, value in seconds.items()}
+    results["protobuf"] |= {"ratio": round(ratio, 2), "bar": PROTOBUF_BAR}
+    print(
+        f"       protobuf: {seconds['ours']:.2f} s, package {seconds['package']:.2f} s, ratio {ratio:.2f} "
+        f"(bar {PROTOBUF_BAR})"
+    )
+    RESULTS.write_text(json.dumps(results, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,26 @@
+"""Text that came with somebody's file, as a terminal and a page may show it."""
+
+import re
+
+# what moves a cursor, colours, hides or turns text round: C0 without tab and line feed, DEL and C1, marks of
+# direction, separators of lines, halves of pairs (of file names that are no UTF-8)
+_UNSEEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+# the same behind the backslash of JSON, which a script would turn back
+_IN_JSON = re.compile(
+    r"\\u(?=00[01][0-9a-f]|007f|00[89][0-9a-f]|061c|200[ef]|202[89a-e]|206[6-9]|d[89ab]|d[c-f])",
+    re.IGNORECASE,
+)
+
+
+def printable(text: str) -> str:
+    r"""The text with its control characters written out: \x1b, \u202e."""
+    return _UNSEEN.sub(lambda found: _written_out(ord(found[0])), text)
+
+
+def printable_page(page: str) -> str:
+    """A page without control characters, also in the JSON that its scripts read."""
+    return _IN_JSON.sub(r"\\\\u", printable(page))
+
+
+def _written_out(code: int) -> str:
+    return f"\\x{code:02x}" if code < 256 else f"\\u{code:04x}"
