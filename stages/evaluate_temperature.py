@@ -30,9 +30,15 @@ def main() -> None:
         artifacts.write_table(out / "trajectories.parquet", *judged.trajectories)
         artifacts.write_table(out / "study.parquet", tables.STUDY, studied.rows)
         artifacts.write_json(out / "summary.json", judged.summary)
-        controllers = judged.summary["controllers"]
         artifacts.write_metrics(
-            "evaluate_temperature", studied.figures | {"controllers": controllers, "refused": judged.refused}
+            "evaluate_temperature",
+            studied.figures
+            | {
+                "controllers": judged.summary["controllers"],
+                "refused": judged.refused,
+                "without_feed_forward": judged.without_feed_forward,
+                "own_integral": judged.own_integral,
+            },
         )
 
 

@@ -58,15 +58,15 @@ class Judged(NamedTuple):
 
 
 def refusals(
-    compared: Sequence[Controller], designs: Sequence[tuple[np.ndarray, np.ndarray]]
+    compared: Sequence[Controller], designs: Sequence[tuple[np.ndarray, np.ndarray, float]]
 ) -> dict[str, str]:
-    """The controllers that have no law for one of these (q, r), each with the reason. A learned kernel may
-    have no minimum at other weights."""
+    """The controllers that have no law for one of these (q, r, integral), each with the reason. A learned
+    kernel may have no minimum at other weights."""
     refused = {}
     for controller in compared:
-        for q, r in designs:
+        for q, r, integral in designs:
             try:
-                controller.design(q, r, 0.0)
+                controller.design(q, r, integral)
             except ValueError as reason:
                 refused[controller.name] = str(reason)
     return refused

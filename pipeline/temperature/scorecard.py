@@ -363,14 +363,19 @@ def _margins(plant: Plant, law: Law, omega: np.ndarray, z: np.ndarray, K: np.nda
 
 
 def closed_loop(plant: Plant, law: Law) -> np.ndarray:
-    """The state matrix of plant, memory and integrator together, [x; z; xi], unclipped."""
+    """The state matrix of plant, memory and integrator together, [x; z; xi], unclipped.
+
+    With fewer inputs than outputs K_r xi (m,) stands for xi: what else xi holds moves no input, and would
+    count as a mode that never decays.
+    """
     C, D, Kz, Kr = plant.C, law.D, law.K, law.K_r if law.integral else np.zeros_like(law.K_r)
-    p, q = plant.p, len(law.A)
-    u = np.hstack([-D @ C, -Kz, -Kr])
+    q, few = len(law.A), plant.m < plant.p
+    held, into, to_u = (plant.m, Kr @ C, np.eye(plant.m)) if few else (plant.p, C, Kr)
+    u = np.hstack([-D @ C, -Kz, -to_u])
     rows = [
-        np.hstack([plant.A, np.zeros((plant.n, q + p))]) + plant.B @ u,
-        np.hstack([law.B_y @ C, law.A, np.zeros((q, p))]) + law.B_u @ u,
-        np.hstack([-law.integral * C, np.zeros((p, q)), np.eye(p)]),
+        np.hstack([plant.A, np.zeros((plant.n, q + held))]) + plant.B @ u,
+        np.hstack([law.B_y @ C, law.A, np.zeros((q, held))]) + law.B_u @ u,
+        np.hstack([-law.integral * into, np.zeros((held, q)), np.eye(held)]),
     ]
     whole = np.vstack(rows)
     return whole if law.integral else whole[: plant.n + q, : plant.n + q]

@@ -32,6 +32,10 @@ class Law(NamedTuple):
     Shapes with q memories: A (q, q), B_u (q, m), B_y (q, p), B_r (q, p), c (q,), K (m,
     q), D (m, p), K_r (m, p), k (m,). It takes over from a plant that was held by u0 at y0
     with z = start_u u0 + start_y y0 + start and xi = 0.
+
+    `integral` is the share of the error that xi takes a step: the outer integrator's, or that of a law with
+    integral action of its own, which puts its gain into K_r. No eigenvalue of A may be 1, because `aimed`
+    solves (I - A) z for the memory at rest: what integrates belongs into xi.
     """
 
     A: np.ndarray
@@ -50,11 +54,12 @@ class Law(NamedTuple):
 
 
 class Controller(NamedTuple):
-    """One way to control. `design(q, r, integral)` gives its law for weights diag(q), diag(r). Its feasible
-    targets are computed on `model`.
+    """One way to control. `design(q, r, integral)` gives its law for weights diag(q), diag(r); `integral` is
+    the outer integrator's share of the error a step, 0 in the unclipped run. Its feasible targets are
+    computed on `model`.
 
-    `own_feed_forward`: the law's own feed-forward is part of its unclipped optimum. A rule that has none aims
-    at the feasible target there too.
+    `own_feed_forward`: the law's own feed-forward is part of its unclipped optimum. A law that has none
+    (k = 0) aims at the feasible target there too.
     """
 
     name: str

@@ -8,9 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.report.shared.page import MARKS as MARK
+from pipeline.report.shared.page import SHAPES
 from pipeline.store import artifacts
+from pipeline.temperature.workflow.contestants import CONTESTANTS
+from stages.report import main
 from tests.report import made
-from tests.report.test_pages import TEMPERATURE, Page
+from tests.report.test_pages import INDEX, TEMPERATURE, Page, change
 
 # a process of its own, because the pages read the table when they are imported
 ADDED = """
@@ -18,7 +22,8 @@ from pipeline.temperature.workflow import contestants
 new = contestants.Contestant(
     "proportional", "Proportional", "P per zone", "The baseline without its integral.", None, "plant"
 )
-contestants.CONTESTANTS = (*contestants.CONTESTANTS[:-1], new, contestants.CONTESTANTS[-1])
+at = [contestant.name for contestant in contestants.CONTESTANTS].index("exact_model")
+contestants.CONTESTANTS = (*contestants.CONTESTANTS[:at], new, *contestants.CONTESTANTS[at:])
 from stages.report import main
 main()
 """
@@ -33,11 +38,21 @@ def pages_with_the_new_one() -> None:
 
 def columns(text: str, section: str) -> list[str]:
     """Marks of a picture's columns, in their order."""
-    part = text.split(f'<div class="cols c6 {section}">')[1].split("</section>")[0]
+    part = re.split(rf'<div class="cols c\d {section}">', text)[1].split("</section>")[0]
     return re.findall(r'<h4><span class="mk ([a-z ]+)"', part)
 
 
-MARKS = ["mb", "dd", "dd hollow", "bl", "triangle", "mb hollow"]
+# the shape after those of the table's controllers that stand before it and have no mark of their own
+BEFORE = CONTESTANTS[: [contestant.name for contestant in CONTESTANTS].index("exact_model")]
+FREE = list(SHAPES)[sum(not contestant.mark for contestant in BEFORE)]
+MARKS = ["mb", "dd", "dd hollow", "bl", FREE, "mb hollow"]
+
+
+def test_no_two_controllers_have_the_same_mark():
+    """Where it fails there are fewer free shapes than controllers without a mark: add one to SHAPES of
+    pipeline/report/shared/page.py."""
+    marks = [(MARK[contestant.name], contestant.hollow) for contestant in CONTESTANTS]
+    assert len(set(marks)) == len(marks)
 
 
 @pytest.fixture
@@ -57,7 +72,7 @@ def test_a_line_in_the_table_is_all_that_the_pages_ask_of_a_new_controller(with_
     assert "Proportional. The baseline without its integral." in shown
     assert 'id="word-proportional"' in text
     # against the data-driven one by its cost; the small project has no tracking error to compare
-    rows = re.findall(r'<th scope="row"><span class="mk triangle"[^>]*></span>Proportional</th>', text)
+    rows = re.findall(rf'<th scope="row"><span class="mk {FREE}"[^>]*></span>Proportional</th>', text)
     assert len(rows) == 1
 
 
@@ -70,3 +85,55 @@ def test_a_refused_controller_keeps_its_column_with_the_reason(project):
     text = TEMPERATURE.read_text()
     assert columns(text, "trajectories") == MARKS
     assert text.count("no input moves zone 2") >= 2  # in the pictures, and in the table's titles
+
+
+def test_a_refused_baseline_is_shown_as_failed_with_its_reason(project, monkeypatch):
+    """With fewer inputs than outputs: the stage goes on without it, and no page advises to run it again."""
+    monkeypatch.setattr(made, "CONTROLLERS", tuple(name for name in made.CONTROLLERS if name != "baseline"))
+    made.write(project)
+    why = "PI needs an input for each of the 5 outputs; found 3 inputs"
+    change("evaluate_temperature", refused={"baseline": why})
+    main()
+    for path in (INDEX, TEMPERATURE):
+        assert f"Failed. {why}." in Page(path).text, path
+    assert f"Baseline could not be designed: {why}." in Page(INDEX).text
+    assert columns(TEMPERATURE.read_text(), "trajectories") == ["mb", "dd", "dd hollow", "bl", "mb hollow"]
+    assert "dvc repro evaluate_temperature" not in TEMPERATURE.read_text()
+
+
+@pytest.mark.parametrize(
+    ("without", "sentence"),
+    [
+        ([], ""),
+        (["baseline"], "Baseline has no feed-forward of its own and aims at the feasible target {} too."),
+        (
+            ["baseline", "window"],
+            "Data-driven and Baseline have no feed-forward of their own "
+            "and aim at the feasible target {} too.",
+        ),
+    ],
+)
+def test_who_aims_at_the_feasible_target_unclipped_is_said_below_the_table_and_the_picture(
+    project, without, sentence
+):
+    change("evaluate_temperature", without_feed_forward=without)
+    main()
+    text = Page(TEMPERATURE).text
+    for where in ("there", "here"):
+        if without:
+            assert text.count(sentence.format(where)) == 1, where
+    assert text.count("no feed-forward of") == 2 * bool(without)
+
+
+@pytest.mark.parametrize(
+    ("shares", "shown"),
+    [
+        ({}, "a step on errors up to"),
+        ({"baseline": 0.004}, "a step (Baseline: its own) on errors up to"),
+        ({"baseline": 0.004, "kernel": 0.0}, "a step (Kernel: none; Baseline: its own) on errors up to"),
+    ],
+)
+def test_what_was_declared_names_the_laws_whose_integral_action_is_their_own(project, shares, shown):
+    change("evaluate_temperature", own_integral=shares)
+    main()
+    assert shown in Page(TEMPERATURE).text

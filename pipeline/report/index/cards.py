@@ -28,7 +28,7 @@ from pipeline.report.shared.verdict import (
     row_places,
     state,
 )
-from pipeline.report.temperature.answers import CONTROLLERS, LABELS, featured
+from pipeline.report.temperature.answers import CONTROLLERS, LABELS, featured, without_figures
 from pipeline.report.temperature.judgement import NAMES, Judgement
 from pipeline.report.temperature.verdict import rules
 
@@ -105,7 +105,7 @@ def temperature(sources: Sources, judged: Judgement) -> Card:
         moves="Heaters and motor to barrel temperatures",
         state=f"Run {ROLES[judged.verdict.winner]}" if judged.verdict.winner else "Run none of them",
         mark=judged.verdict.winner,
-        win=_win(judged),
+        win=_win(sources, judged),
         caption=(
             f"Worst zone’s true error over {_SPAN} s, log scale {_FLOOR:g} to {number(_CEILING, 0)}\u00a0°C: "
             f"{featured(sources)}. Grey: what the rule allows once settled."
@@ -138,7 +138,7 @@ def _card_cells(question: Question, figures: Sequence[Figure | Missing]) -> list
     return cells
 
 
-def _win(judged: Judgement) -> tuple[str, str]:
+def _win(sources: Sources, judged: Judgement) -> tuple[str, str]:
     """The winner in words, with its figure and its price."""
     best = judged.verdict.winner
     settled = next(q for q in judged.asked if q.key == "settled_error_degC")
@@ -152,7 +152,9 @@ def _win(judged: Judgement) -> tuple[str, str]:
         if role != best:
             judged_rules = rules(judged.asked, judged.roles[role])
             first = next((rule for rule in judged_rules if rule.state != PASSED and rule.question), None)
-            if first:
+            if refused := without_figures(sources, CONTROLLERS[role]):
+                others.append(f"{NAMES[role]} could not be designed: {refused.sentence()}")
+            elif first:
                 others.append(
                     f"{NAMES[role]} {'fails' if first.state == FAILED else 'is open'} on "
                     f"{_on(first.question, judged.roles[role])}."
@@ -214,7 +216,7 @@ def _worst_error(
         return table
     rows = (table["controller"] == name) & (table["mode"] == "deployed")
     if not rows.any():
-        return Missing("not measured", f"no trajectory of {name}")
+        return without_figures(sources, name) or Missing("not measured", f"no trajectory of {name}")
     offset = sources.declared.panel.judging.reference_offsets_degC[0]
     errors = np.stack(
         [np.abs(table[o.name][rows] - o.reference - offset) for o in sources.declared.machine.outputs]

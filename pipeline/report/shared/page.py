@@ -28,6 +28,9 @@ SHAPES = {
     "triangle": "50% 0,100% 100%,0 100%",
     "diamond": "50% 0,100% 50%,50% 100%,0 50%",
     "wedge": "0 0,100% 0,50% 100%",
+    "plus": "35% 0,65% 0,65% 35%,100% 35%,100% 65%,65% 65%,65% 100%,35% 100%,35% 65%,0 65%,0 35%,35% 35%",
+    "hourglass": "0 0,100% 0,50% 50%,100% 100%,0 100%,50% 50%",
+    "bow": "0 0,50% 50%,100% 0,100% 100%,50% 50%,0 100%",
 }
 _unmarked = [contestant.name for contestant in CONTESTANTS if not contestant.mark]
 # role or controller -> class of its mark: circle data-driven, square model-based, ring baseline

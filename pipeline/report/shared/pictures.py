@@ -11,7 +11,7 @@ from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import THIN, number, percent, short
 from pipeline.report.shared.sources import Sources, Table, lookup
 from pipeline.report.shared.verdict import Missing
-from pipeline.report.temperature.answers import LABELS, YARDSTICKS, featured, without_figures
+from pipeline.report.temperature.answers import LABELS, YARDSTICKS, aimed_unclipped, featured, without_figures
 
 SPAN_S = 40.0
 
@@ -289,8 +289,9 @@ def costs(sources: Sources) -> Picture:
             "Discounted cost at the yardstick’s weights (Q = "
             f"{sources.declared.tracking.yardstick_q:g} I, R = "
             f"{sources.declared.tracking.yardstick_r:g} I, γ = {sources.declared.tracking.gamma:g}), "
-            "unclipped, true outputs, in thousands, against time in s (log). Dashed: exact model."
-        ),
+            "unclipped, true outputs, in thousands, against time in s (log). Dashed: exact model. "
+            f"{aimed_unclipped(sources, 'here')}"
+        ).rstrip(),
         page.origin(sources.source("trajectories")),
     )
 

@@ -8,7 +8,7 @@ from pipeline.report.shared.digits import MINUS, THIN, band, decimals, number, p
 from pipeline.report.shared.sources import Sources, lookup
 from pipeline.report.shared.verdict import FAILED, UNDECIDED, Figure, Missing, Question, state
 from pipeline.report.shared.words import FIXED, explaining
-from pipeline.report.temperature.answers import LABELS, YARDSTICKS, all_answers, without_figures
+from pipeline.report.temperature.answers import LABELS, YARDSTICKS, all_answers, own_integral, without_figures
 
 EXTRA = (
     ("tracking_degC", "Tracking error, r.m.s.", "°C"),
@@ -63,24 +63,32 @@ def yardstick(sources: Sources, asked: list[Question]) -> Yardstick:
     ]
     for key, title, unit in EXTRA:
         question = Question(0, key, title, unit, math.inf, False, "")
-        rows.append(_row(question, names, [_extra(sources, name, key) for name in names]))
+        rows.append(_row(question, names, [_extra(sources, name, key, gaps[name]) for name in names]))
     stable = [
         lookup(sources.metrics["evaluate_temperature"], f"controllers.{name}.stable_plants") for name in names
     ]
-    rows.append(Row("Plants of the spread held stable", "Plant spread", "", [_stable(s) for s in stable]))
+    rows.append(
+        Row(
+            "Plants of the spread held stable",
+            "Plant spread",
+            "",
+            [_stable(s, gaps[name]) for name, s in zip(names, stable, strict=True)],
+        )
+    )
     return Yardstick([Head(name, FIXED[name][0], *LABELS[name]) for name in names], rows)
 
 
-def _stable(plants: Any) -> Cell:
+def _stable(plants: Any, gap: Missing | None) -> Cell:
     if isinstance(plants, Missing):
-        return Cell(plants.state)
+        why = gap or plants
+        return Cell(why.state, bad=why.state == FAILED, title=why.sentence() if gap else "")
     return Cell(f"{plants['count']} of {plants['of']}", bad=plants["count"] < plants["of"])
 
 
-def _extra(sources: Sources, name: str, key: str) -> Figure | Missing:
+def _extra(sources: Sources, name: str, key: str, gap: Missing | None) -> Figure | Missing:
     ends = lookup(sources.metrics["evaluate_temperature"], f"controllers.{name}.{key}")
     if isinstance(ends, Missing):
-        return ends
+        return gap or ends
     return Figure(*(math.inf if ends.get(end) is None else ends[end] for end in ("median", "low", "high")))
 
 
@@ -289,7 +297,8 @@ def panel(sources: Sources) -> list[tuple[str, str]]:
             (
                 f"commands clipped to {min(i.low for i in machine.inputs):g} to "
                 f"{max(i.high for i in machine.inputs):g}{THIN}%; feasible target; outer integrator "
-                f"{tracking.integral:g} a step on errors up to {tracking.integral_limit_degC:g}{THIN}°C"
+                f"{tracking.integral:g} a step{own_integral(sources)} on errors up to "
+                f"{tracking.integral_limit_degC:g}{THIN}°C"
             ),
         ),
     ]

@@ -53,12 +53,36 @@ def without_figures(sources: Sources, name: str) -> Missing | None:
     return None if isinstance(refused, Missing) else Missing("failed", str(refused))
 
 
+def aimed_unclipped(sources: Sources, where: str) -> str:
+    """ "Baseline has no feed-forward of its own and aims at the feasible target here too."; empty where every
+    controller has its own."""
+    listed = lookup(sources.metrics["evaluate_temperature"], "without_feed_forward")
+    names = [] if isinstance(listed, Missing) else [LABELS[name][0] for name in LABELS if name in listed]
+    if not names:
+        return ""
+    *others, last = names
+    if others:
+        every = f"{', '.join(others)} and {last}"
+        return f"{every} have no feed-forward of their own and aim at the feasible target {where} too."
+    return f"{last} has no feed-forward of its own and aims at the feasible target {where} too."
+
+
+def own_integral(sources: Sources) -> str:
+    """ " (Baseline: its own)" where some controller's integral action is not the declared one; empty where
+    all have that."""
+    shares = lookup(sources.metrics["evaluate_temperature"], "own_integral")
+    if isinstance(shares, Missing):
+        return ""
+    own = [f"{LABELS[name][0]}: {'its own' if shares[name] else 'none'}" for name in LABELS if name in shares]
+    return f" ({'; '.join(own)})" if own else ""
+
+
 def _answer(sources: Sources, judged: Any, name: str, question: Question) -> Figure | Missing:
     if question.key == "data":
         return _data(sources, name)
     of_controller = lookup(judged, name, what=f"{LABELS.get(name, (name,))[0]}")
     if isinstance(of_controller, Missing):
-        return of_controller
+        return without_figures(sources, name) or of_controller
     if question.key == "worst_case_gap_percent":
         return worst_case(sources.tables["scorecard"], name, noise(sources), of_controller.get("gap_percent"))
     figures = of_controller.get(question.key)

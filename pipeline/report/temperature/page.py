@@ -6,7 +6,7 @@ from pipeline.report.index import page as index_page
 from pipeline.report.shared import headline, page, pictures, tables, words
 from pipeline.report.shared.sources import Sources
 from pipeline.report.temperature import evidence, findings, pairs, recording, trades
-from pipeline.report.temperature.answers import featured, repetitions
+from pipeline.report.temperature.answers import aimed_unclipped, featured, repetitions
 from pipeline.report.temperature.judgement import Judgement, verdict_parts
 from pipeline.temperature.workflow.contestants import CONTESTANTS
 
@@ -39,6 +39,7 @@ def render(sources: Sources, judged: Judgement) -> str:
         featured=featured(sources),
         repetitions=repetitions(sources),
         yardstick=tables.yardstick(sources, judged.asked),
+        aimed_unclipped=aimed_unclipped(sources, "there"),
         pairs=pairs.compared(sources),
         published=tables.published(sources),
         honest=tables.honest(sources),

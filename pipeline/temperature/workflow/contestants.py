@@ -80,12 +80,13 @@ class Contestant(NamedTuple):
     """A controller of the comparison: how it is designed, and what the pages say of it.
 
     `heading` and `method` stand above its column, `explanation` among the words of the page, below `word`
-    where the heading alone would say too little. `design` gives None where the record does not allow it.
-    `learned_from` says whose need of samples is its own: the identified plant, the window, or the kernel.
+    where the heading alone would say too little. `design` gives None where the record does not allow it, and
+    raises ValueError where the machine does not: the page shows that sentence in its column. `learned_from`
+    says whose need of samples is its own: the identified plant, the window, or the kernel.
 
-    `role`: the three that the verdict compares have one each. A yardstick is shown beside the others and is
-    never the best of a row. Every other controller competes without a role. `mark` is the class of its mark;
-    one without takes the next free shape.
+    `role`: the verdict chooses among the three roles. Without a role a controller is shown, judged and can be
+    the best of a row. A yardstick is shown beside the others and is never the best of a row. `mark` is the
+    class of its mark; one without takes the next free shape.
     """
 
     name: str
@@ -160,7 +161,24 @@ CONTESTANTS = (
 )
 
 
-def controllers(problem: Problem, contestants: tuple[Contestant, ...] = CONTESTANTS) -> list[Controller]:
-    """The controllers that the record allows, in the table's order, each by its name in the table."""
-    designed = [(contestant.name, contestant.design(problem)) for contestant in contestants]
-    return [controller._replace(name=name) for name, controller in designed if controller is not None]
+class Designed(NamedTuple):
+    """The controllers that the record and the machine allow, in the table's order, each by its name in the
+    table; `refused` says by name why others cannot be designed."""
+
+    controllers: list[Controller]
+    refused: dict[str, str]
+
+
+def controllers(problem: Problem, contestants: tuple[Contestant, ...] = CONTESTANTS) -> Designed:
+    """Every contestant designed for `problem`. One whose design raises ValueError is refused with that
+    reason, and the others go on."""
+    designed, refused = [], {}
+    for contestant in contestants:
+        try:
+            controller = contestant.design(problem)
+        except ValueError as reason:
+            refused[contestant.name] = str(reason)
+            continue
+        if controller is not None:
+            designed.append(controller._replace(name=contestant.name))
+    return Designed(designed, refused)

@@ -35,12 +35,18 @@ class Learned(NamedTuple):
 
 class Judged(NamedTuple):
     """Every controller on the panel: rows of the scorecard, one featured scenario as (schema, columns),
-    figures by controller, and why others were refused."""
+    figures by controller, and why others were refused.
+
+    `without_feed_forward`: those that aim at the feasible target in the unclipped run too. `own_integral`:
+    the share a step of those whose integral action is not the one declared for all.
+    """
 
     scorecard: dict[str, Any]
     trajectories: tuple[Schema, dict[str, Any]]
     summary: dict[str, Any]
     refused: dict[str, str]
+    without_feed_forward: list[str]
+    own_integral: dict[str, float]
 
 
 class Studied(NamedTuple):
@@ -120,22 +126,19 @@ def judged(
     truth = plant.baam()._replace(sample_time_s=machine.sample_time_s) if simulated else None
     scenarios = _scenarios(machine, panel, learned, truth)
     q, r = learned.weights["q"], learned.weights["r"]
-    compared = contestants.controllers(
-        contestants.Problem(
-            plant=learned.model,
-            window=learned.window,
-            kernel=learned.kernel,
-            truth=truth,
-            limits=limits,
-            gamma=tracking.gamma,
-            observer_tau=float(learned.weights["observer_tau"]),
-            exact_tau=tracking.observer_tau,
-            horizon=panel.steps,
-            settings=settings,
-        )
+    problem = contestants.Problem(
+        plant=learned.model,
+        window=learned.window,
+        kernel=learned.kernel,
+        truth=truth,
+        limits=limits,
+        gamma=tracking.gamma,
+        observer_tau=float(learned.weights["observer_tau"]),
+        exact_tau=tracking.observer_tau,
+        horizon=panel.steps,
+        settings=settings,
     )
-    refused = judging.refusals(compared, [(yardstick.q, yardstick.r), (q, r)])
-    designed = [controller for controller in compared if controller.name not in refused]
+    designed, refused = _designed(problem, [(yardstick.q, yardstick.r, 0.0), (q, r, tracking.integral)])
     deployment = judging.Deployment(limits, panel.band_degC, tracking.integral, tracking.integral_limit_degC)
     results = [
         judging.judge(controller, scenarios, yardstick=yardstick, q=q, r=r, deployment=deployment)
@@ -153,8 +156,36 @@ def judged(
     shown = judging.trajectories(
         results, scenarios, inputs, outputs, noise=settings.report_noise_degC, yardstick=yardstick
     )
-    schema = tables.trajectories(machine.inputs, machine.outputs)
-    return Judged(judging.rows(results, scenarios, outputs), (schema, shown), summary, refused)
+    return Judged(
+        judging.rows(results, scenarios, outputs),
+        (tables.trajectories(machine.inputs, machine.outputs), shown),
+        summary,
+        refused,
+        without_feed_forward=[made.name for made in designed if not made.own_feed_forward],
+        own_integral=_own_integral(results, tracking.integral),
+    )
+
+
+def _own_integral(results: list[judging.Judged], declared: float) -> dict[str, float]:
+    shares = {result.name: float(result.law.integral) for result in results}
+    return {name: share for name, share in shares.items() if share != declared}
+
+
+def _designed(
+    problem: contestants.Problem, designs: list[tuple[np.ndarray, np.ndarray, float]]
+) -> contestants.Designed:
+    """The controllers that have a law for each (q, r, integral). Raises ValueError where there is none."""
+    made = contestants.controllers(problem)
+    refused = made.refused | judging.refusals(made.controllers, designs)
+    designed = [controller for controller in made.controllers if controller.name not in refused]
+    if not designed:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in refused.items())
+        raise ValueError(
+            "evaluate_temperature: expected a controller that can be designed, "
+            f"found none: {reasons}; record the machine longer, "
+            "or change its inputs in section plant of params.yaml"
+        )
+    return contestants.Designed(designed, refused)
 
 
 def _scenarios(
