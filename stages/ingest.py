@@ -23,19 +23,15 @@ def main() -> None:
         folder = Path(
             {"simulated": "datasets/generate_probing", "recordings": "datasets/raw/temperature"}[source]
         )
-        results = ingest.process(
-            folder,
-            ingest.spec_of(settings, machine, source),
-            execution,
-            memo=Path("datasets/memo/ingest"),
-            budget=ingest.Budget(settings.longest_s, settings.largest_mb),
-        )
+        spec = ingest.spec_of(settings, machine, source)
+        budget = ingest.Budget(settings.longest_s, settings.largest_mb)
+        results = ingest.process(folder, spec, execution, memo=Path("datasets/memo/ingest"), budget=budget)
         record, quality, metrics = ingest.collect(
             results, machine, strict=settings.strict or "--strict" in sys.argv
         )
         artifacts.write_table(out / "record.parquet", record.schema, record.columns)
         artifacts.write_table(out / "quality.parquet", quality.schema, quality.columns)
-        artifacts.write_metrics("ingest", metrics)
+        artifacts.write_metrics("ingest", metrics | ingest.printer_pids(folder, results, spec))
 
 
 if __name__ == "__main__":

@@ -126,13 +126,16 @@ def _correlation(a: np.ndarray, b: np.ndarray, lag: int) -> float:
     return float(np.nanmean(x * z))
 
 
-def residual_tests(plant: Plant, u: Segments, y: Segments, *, lags: int = 25) -> Residuals:
+def residual_tests(
+    plant: Plant, u: Segments, y: Segments, *, lags: int = 25, closed: bool = False
+) -> Residuals:
     """Whiteness of the one-step errors and their independence of past
     inputs (Ljung 1999, section 16.6), both at 99 %.
 
     Whiteness is Ljung and Box's test. Independence fails where a correlation at a lag from 0 on leaves the
     band widened for the number of lags (Bonferroni); correlation at negative lags only says that the record
-    was taken in closed loop. Raises ValueError where the record has fewer than 4 lags of samples.
+    was taken in closed loop. There (`closed`) lag 0 says so too, as u(t) answers the error of y(t), and the
+    test begins at lag 1. Raises ValueError where the record has fewer than 4 lags of samples.
     """
     if sum(len(a) for a in u) < 4 * lags:
         raise ValueError(
@@ -157,7 +160,7 @@ def residual_tests(plant: Plant, u: Segments, y: Segments, *, lags: int = 25) ->
     whiteness = N * (N + 2) * (auto[:, 1:] ** 2 / (N - np.arange(1, lags + 1))).sum(axis=1)
     limit = float(scipy.stats.chi2.ppf(0.99, lags))
     widened = scipy.stats.norm.ppf(1 - 0.005 / (lags + 1)) / QUANTILE_99
-    independent = np.abs(cross[:, :, lags:]).max(axis=2) <= widened * cross_band
+    independent = np.abs(cross[:, :, lags + closed :]).max(axis=2) <= widened * cross_band
     return Residuals(
         auto, cross, QUANTILE_99 / np.sqrt(N), cross_band, whiteness, limit, whiteness <= limit, independent
     )

@@ -24,6 +24,16 @@ from tests.report import made_setpoint
 ROOT = Path(__file__).resolve().parents[2]
 CONTROLLERS = ("model_based", "window", "kernel", "baseline", "exact_model")
 HOSTILE = '"><script>alert(1)</script><img src=http://evil.example/x onerror=alert(2)>\u202egpj.mcap'
+PRINTER_PID = {
+    "recording": "klippy.log",
+    "input": "heater_1",
+    "output": "zone_1",
+    "Kp": 8.0,
+    "Ki": 0.4,
+    "Kd": 40.0,
+    "most_percent": 100.0,
+    "smooth_s": 1.0,
+}
 SCALED = {"change_percent": -60.0, "gain_difference": 1e-15}
 TRADES = {
     name: {"tracking_degC": e, "effort_percent": u}
@@ -76,10 +86,22 @@ def metrics():
             "samples": 400,
             "segments": 1,
             "findings": {},
+            "printer_pid": [PRINTER_PID],
         },
         "identify_plant": {
             "order": 2,
             "past": 5,
+            "fit": "prediction",
+            "feedthrough": {"zone_1": False, "zone_2": False},
+            "validation": "blocks",
+            "closed_loop": {
+                "closed": False,
+                "level": 0.00025,
+                "p_value": {"heater_1": 0.4, "heater_2": 0.03},
+            },
+            "forbidden_gains": [],
+            "fit_holdout_free_mean": {"zone_1": 90.5, "zone_2": 81.0},
+            "fit_holdout_free_mean_band": {"zone_1": [88.0, 91.5], "zone_2": [76.0, 85.0]},
             "rows": 380,
             "dropped_rows": 0,
             "notes": [],
@@ -271,6 +293,11 @@ def model(machine):
         seen = (output, name) != ("zone_1", "heater_2")
         known = (10.0, 9.0, 11.0, 1.0, 0.5, 1.5) if seen else (np.nan,) * 6
         dynamics.append((output, name, seen, *(2.0, 1.5 if seen else -1.0, 2.5) * 2, *known))
+    first_order = []
+    for output, name in pairs:
+        seen = (output, name) != ("zone_1", "heater_2")
+        known = (10.0, 9.0, 11.0, 1.0, 0.5, 1.5, 99.0, 2.0, 0.2, 1.0) if seen else (np.nan,) * 10
+        first_order.append((output, name, seen, 2.0, 1.5 if seen else -1.0, 2.5, *known))
     poles = [
         (0, 0, 0.99, 0.0),
         (0, 1, 0.9, 0.0),
@@ -282,6 +309,7 @@ def model(machine):
         "residuals": (tables.RESIDUALS, residuals),
         "steps": (tables.STEPS, rise),
         "dynamics": (tables.DYNAMICS, dynamics),
+        "first_order": (tables.FIRST_ORDER, first_order),
         "poles": (tables.POLES, poles),
         "levels": (tables.LEVELS, levels),
     }

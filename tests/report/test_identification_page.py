@@ -261,7 +261,9 @@ def test_what_was_masked_is_counted_by_signal(project):
     assert "Dead time found heater_2 three samples" in text
 
 
-@pytest.mark.parametrize("name", ["holdout", "residuals", "steps", "dynamics", "poles", "levels", "order"])
+@pytest.mark.parametrize(
+    "name", ["holdout", "residuals", "steps", "dynamics", "first_order", "poles", "levels", "order"]
+)
 @pytest.mark.parametrize("how", ["missing", "broken"])
 def test_a_table_that_is_missing_or_broken_is_said_so_in_its_place(project, name, how):
     path = FOLDER / f"{name}.parquet"

@@ -16,6 +16,7 @@ from pipeline.temperature.workflow import ingest
 from pipeline.temperature.workflow.ingest import Budget, IngestSpec, collect, process
 from pipeline.temperature.workflow.settings import Plant
 from tests.cluster import Cluster
+from tests.reading.klipper_machine import EXTRUDER, print_log
 from tests.reading.test_bag_folders import bag
 
 MACHINE = Plant.model_validate(
@@ -391,3 +392,38 @@ def test_a_bag_is_one_recording_among_files(tmp_path):
     assert [result.name for result in results] == ["000.csv", "night/run"]
     assert "there is no column '/heater/duty:data'" in results[0].reason
     assert results[1].reason == "" and len(results[1].record["zone"]) == 80
+
+
+# ---- the printer's own PID
+
+
+PRINTER = Plant.model_validate(
+    {
+        "sample_time_s": 1.0,
+        "inputs": [{"name": "nozzle_duty", "unit": "percent", "low": 0.0, "high": 100.0}],
+        "outputs": [{"name": "nozzle", "unit": "degC", "reference": 200.0}],
+    }
+)
+
+
+def test_the_printers_own_pid_comes_with_its_log_in_the_units_of_our_signals(tmp_path):
+    (tmp_path / "klippy.log").write_text(print_log([(0, 200, 60)], longest_s=60))
+    mapping = {
+        "nozzle_duty": ("extruder.pwm", "percent", 0.5, 0.0),
+        "nozzle": ("extruder.temp", "degC", 2.0, 0.0),
+    }
+    good = ingest.Result("klippy.log", {}, {}, "", False)
+    spec = IngestSpec(PRINTER, mapping, "", 5.0)
+    (pid,) = ingest.printer_pids(tmp_path, [good], spec)["printer_pid"]
+    assert (pid["recording"], pid["input"], pid["output"]) == ("klippy.log", "nozzle_duty", "nozzle")
+    # percent for a duty of 0 to 255; half the input's unit over twice the output's
+    expected = np.array(EXTRUDER.pid) * 100 / 255 * 0.5 / 2
+    np.testing.assert_allclose([pid["Kp"], pid["Ki"], pid["Kd"]], expected, rtol=1e-12)  # rounding
+    assert ingest.printer_pids(tmp_path, [good._replace(reason="broken")], spec) == {}
+
+
+def test_a_heater_that_is_no_signal_of_ours_and_another_format_have_no_pid(tmp_path):
+    (tmp_path / "klippy.log").write_text(print_log([(0, 200, 60)], longest_s=60))
+    recording(tmp_path / "a.csv", seed=0)
+    results = [ingest.Result(name, {}, {}, "", False) for name in ("klippy.log", "a.csv")]
+    assert ingest.printer_pids(tmp_path, results, JOB) == {}

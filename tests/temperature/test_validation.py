@@ -92,6 +92,18 @@ def test_residuals_of_the_true_plant_pass_and_those_of_a_lower_order_do_not():
     assert not low.independence_passed.all()
 
 
+def test_a_controller_that_answers_at_once_fails_independence_only_where_the_loop_is_not_known_closed():
+    rng, gain = np.random.default_rng(0), 2.0 / 60
+    u, y, x = np.empty((2000, 1)), np.empty((2000, 1)), 0.0
+    for t in range(2000):
+        y[t] = x + 0.1 * rng.standard_normal()
+        u[t] = -3.0 * y[t] + rng.standard_normal()
+        x = x * (1 - 1 / 60) + gain * u[t, 0]
+    heater = plant([[1 - 1 / 60]], [[gain]], [[1.0]], K=[[0.0]], sample_time_s=1.0)
+    assert not residual_tests(heater, [u], [y]).independence_passed.all()
+    assert residual_tests(heater, [u], [y], closed=True).independence_passed.all()
+
+
 def test_advice_names_the_output_the_input_and_the_lag():
     u, y = innovations_record(HEATER, 4000, 0.1, 4)
     y[3:] += u[:-3, :1] * 0.5

@@ -1,5 +1,5 @@
-"""Figures of the identification -> what the model may be used for: seven rules,
-three uses, the verdict in words. No page, no file."""
+"""Figures of the identification -> what the model may be used for: seven rules, an eighth where inputs are
+declared to heat, three uses, the verdict in words. No page, no file."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -32,7 +32,7 @@ from pipeline.report.shared.verdict import (
 LEAST_FIT = 50.0
 
 
-WHITENESS = "Whiteness"
+WHITENESS, POSSIBLE = "Whiteness", "Gains possible"
 
 
 class Fit(NamedTuple):
@@ -56,15 +56,22 @@ def trust(sources: Sources) -> Verdict:
         _excitation(sources),
         _effects(sources),
         _stability(sources),
+        *_possible_gains(sources),
     )
-    simulation, prediction, inputs_left, _, excitation, effects, stability = (rule.state for rule in rules)
+    simulation, prediction, inputs_left, _, excitation, effects, stability, *gains = (
+        rule.state for rule in rules
+    )
+    # a gain that is forbidden by its value alone is one of unknown sign or size: a reservation
+    gains = [outcome for outcome in gains if outcome != UNDECIDED]
     uses = {
-        "to design controllers": worst_state([prediction, inputs_left, excitation, effects, stability]),
+        "to design controllers": worst_state(
+            [prediction, inputs_left, excitation, effects, stability, *gains]
+        ),
         f"to predict {ahead}": prediction,
         "to simulate": worst_state([simulation, stability]),
     }
     # a rule that some use needs comes before one that is only a reservation
-    first = deciding(rule for rule in rules if rule.name != WHITENESS) or deciding(rules)
+    first = deciding(rule for rule in rules if not _reservation(rule)) or deciding(rules)
     ended = overall(list(uses.values()))
     if first is None:
         weakest = min(outputs, key=lambda fit: fit.simulated.value)
@@ -90,6 +97,11 @@ def trust(sources: Sources) -> Verdict:
         winner=None,
         rules=tuple((rule,) for rule in rules),
     )
+
+
+def _reservation(rule: Rule) -> bool:
+    """Whether a rule that does not pass takes no use away."""
+    return rule.name == WHITENESS or (rule.name == POSSIBLE and rule.state == UNDECIDED)
 
 
 def _decision(uses: Mapping[str, str]) -> str:
@@ -122,7 +134,7 @@ def fits(sources: Sources) -> list[Fit]:
         Fit(
             output.name,
             *(
-                _fit(metrics, key, output.name)
+                fit_figure(metrics, key, output.name)
                 for key in ("fit_holdout", "fit_holdout_ahead", "fit_holdout_held")
             ),
         )
@@ -130,10 +142,11 @@ def fits(sources: Sources) -> list[Fit]:
     ]
 
 
-def _fit(metrics: Any, key: str, name: str) -> Figure | Missing:
+def fit_figure(metrics: Any, key: str, name: str) -> Figure | Missing:
+    """The fit `key` of an output in percent, with its band."""
     value = lookup(metrics, f"{key}.{name}")
     if isinstance(value, Missing):
-        if isinstance(metrics, Missing) or key == "fit_holdout":
+        if isinstance(metrics, Missing) or key not in ("fit_holdout_ahead", "fit_holdout_held"):
             return value
         return Missing(
             "not measured",
@@ -158,10 +171,14 @@ def percent_of(figure: Figure) -> str:
     return quantity(figure.value, "%", min(decimals(figure.low, figure.high, value=figure.value), 1))
 
 
+def band_of(figure: Figure) -> str:
+    """Its ends, empty where they are one."""
+    return band(figure.low, figure.high, min(decimals(figure.low, figure.high, value=figure.value), 1))
+
+
 def _with_band(figure: Figure) -> str:
-    places = min(decimals(figure.low, figure.high, value=figure.value), 1)
-    ends = band(figure.low, figure.high, places)
-    return f"{quantity(figure.value, '%', places)}" + (f" ({ends})" if ends else "")
+    ends = band_of(figure)
+    return percent_of(figure) + (f" ({ends})" if ends else "")
 
 
 def _missing_rule(name: str, place: str, gap: Missing) -> Rule:
@@ -254,7 +271,9 @@ def _inputs_left(sources: Sources) -> Rule:
     table = sources.tables["residuals"]
     if isinstance(table, Missing):
         return _missing_rule(name, place, table)
-    pairs = (table["against"] != table["output"]) & (table["lag"] >= 0)
+    # in closed loop u(t) answers the error of y(t): lag 0 is the controller's
+    closed = lookup(sources.metrics["identify_plant"], "closed_loop.closed") is True
+    pairs = (table["against"] != table["output"]) & (table["lag"] >= int(closed))
     left = pairs & ~table["passed"]
     worst, excess = _worst_lag(table, left)
     if worst is None:
@@ -356,11 +375,12 @@ def _stability(sources: Sources) -> Rule:
     radius = lookup(sources.metrics["identify_plant"], "largest_pole")
     if isinstance(radius, Missing):
         return _missing_rule(name, place, radius)
+    shown = number(radius, 4 if abs(radius - 1) > 1e-4 else 6)
     rule = Rule(
         name,
         Question(0, "", name, "", BELOW_ONE, False, ""),
         count_of(radius),
-        text=f"largest pole {number(radius, 4)}",
+        text=f"largest pole {shown}",
         place=place,
         reason="Every pole lies inside the unit circle.",
     )
@@ -368,8 +388,57 @@ def _stability(sources: Sources) -> Rule:
         return rule
     return rule._replace(
         reason=(
-            f"The largest pole, {number(radius, 4)}, is not inside the unit circle: simulated far ahead, "
+            f"The largest pole, {shown}, is not inside the unit circle: simulated far ahead, "
             "the model runs away."
         ),
-        remedy="Record longer, or set identify_plant.refinement to validated.",
+        remedy=(
+            "Record longer."
+            if sources.declared.everything.get("identify_plant", {}).get("refinement") == "validated"
+            else "Record longer, or set identify_plant.refinement to validated."
+        ),
+    )
+
+
+def _possible_gains(sources: Sources) -> list[Rule]:
+    """No gain has a sign or a size that physics forbids: a rule where inputs are declared to heat. A gain
+    whose band reaches what is possible leaves the rule undecided."""
+    name, place = POSSIBLE, "flagged"
+    heaters = [signal.name for signal in sources.declared.machine.inputs if signal.heats]
+    if not heaters:
+        return []
+    gains = lookup(sources.metrics["identify_plant"], "forbidden_gains")
+    if isinstance(gains, Missing):
+        return [_missing_rule(name, place, gains)]
+    if not gains:
+        return [_none(name, place, 0, "none forbidden", "Every heater heats, by a size that is possible.")]
+    worst = max(gains, key=lambda gain: (gain["certain"], abs(gain["gain"])))
+    text = f"{worst['input']} on {worst['output']}"
+    rule = _none(name, place, len(gains), text, flagged_sentence(gains), flagged_remedy(gains))
+    certain = sum(gain["certain"] for gain in gains)
+    return [rule._replace(figure=Figure(len(gains), certain, len(gains)))]
+
+
+def flagged_remedy(gains: Sequence[Mapping[str, Any]]) -> str:
+    """What to do before a controller is designed from the model."""
+    if any(gain["certain"] for gain in gains):
+        return (
+            "Design no controller from this model before each is explained: check source and scale in "
+            "ingest.mapping, then record again with every input moved on its own."
+        )
+    return (
+        "Its band reaches what is possible, so that the effect is not known: move that input on its own and "
+        "record again before a controller relies on it."
+    )
+
+
+def flagged_sentence(gains: Sequence[Mapping[str, Any]]) -> str:
+    """What physics forbids of the model, in a sentence with the gravest gain."""
+    worst = max(gains, key=lambda gain: (gain["certain"], abs(gain["gain"])))
+    places = decimals(worst["low"], worst["high"], value=worst["gain"])
+    ends = band(worst["low"], worst["high"], places)
+    flagged = count(len(gains), "gain is flagged", "gains are flagged").capitalize()
+    return (
+        f"{flagged}: {worst['input']} on {worst['output']}, {number(worst['gain'], places)}"
+        f"{f' ({ends})' if ends else ''} °C per %, {'is' if worst['certain'] else 'would be'} "
+        f"{worst['reason']}."
     )

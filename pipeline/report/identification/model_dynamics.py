@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
+from pipeline.report.identification.how_identified import left_out_words, loop_state
 from pipeline.report.identification.model_errors import Cell, Matrix, Room, blank, matrix, room
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import DASH, THIN, band, count, decimals, number, short
@@ -156,14 +157,16 @@ def order(sources: Sources) -> Picture:
     if given:
         text = f"Order {chosen}, as identify_plant.order asks; the data were not asked."
     elif tried:
-        text = f"Order {chosen}: the fewest free numbers whose error on left-out blocks is {near}."
+        text = f"Order {chosen}: the fewest free numbers whose error on what was left out is {near}."
     else:
         text = f"Order {chosen}: the record is noise-free, and its rank decides."
     edge = short(float(table["noise_edge"][0]), 3)
     caption = (
         f"The rule: orders whose singular value rises above what noise alone reaches, {edge}, are tried; "
-        "each is identified without one block of the record and "
-        f"simulated on it. Of those whose error is {near}, the one with the fewest free numbers wins."
+        f"each is identified with {left_out_words(sources)} and simulated on it"
+        f"{', and predicted one step ahead' if loop_state(sources).closed else ''}. "
+        f"Of those whose error is {near}, the one with the fewest free numbers wins. "
+        "Window, feed-through, order and refinement were chosen together."
     )
     return Picture(
         "order",

@@ -11,7 +11,7 @@ from pipeline.report.identification.model import Fit, percent_of
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import THIN, count, number, short
 from pipeline.report.shared.pictures import Column, Picture, placeholder
-from pipeline.report.shared.sources import Sources, Table
+from pipeline.report.shared.sources import Sources, Table, lookup
 from pipeline.report.shared.verdict import Missing
 
 MOST_INPUTS = 7  # panels in a row of a matrix; a machine with more shows the strongest
@@ -223,6 +223,8 @@ def cross(sources: Sources) -> Matrix:
         return float(strength[mine & (table["lag"] >= 0)].max(initial=0)), draw
 
     rows, more = matrix(sources, cell)
+    feedback = lookup(sources.metrics["identify_plant"], "closed_loop.closed") is True
+    closed = "at zero a controller answers too, and the test begins at one; " if feedback else ""
     failed = sorted(
         {
             (str(o), str(a))
@@ -242,7 +244,7 @@ def cross(sources: Sources) -> Matrix:
         else "No: what the inputs do, the model explains."
     )
     caption = (
-        "Correlation of the one-step errors with the input, lag in samples; "
+        f"Correlation of the one-step errors with the input, lag in samples; {closed}"
         f"right of zero the input came first. Grey: the 99{THIN}% band of a single lag; "
         "the test widens it for the number of lags. Left of zero, pale: feedback from errors to inputs, "
         f"no fault of the model.{more}"

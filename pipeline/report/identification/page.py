@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.report.identification import model_dynamics, model_errors
+from pipeline.report.identification import heater_table, how_identified, model_dynamics, model_errors
 from pipeline.report.identification.model import LEAST_FIT, Fit, ahead_words, fits, trust
 from pipeline.report.index import page as index_page
 from pipeline.report.shared import charts, page, words
@@ -30,6 +30,11 @@ WORDS = (
     "simulation",
     "ahead",
     "held",
+    "free_mean",
+    "closed_loop",
+    "feedthrough",
+    "first_order",
+    "simc",
     "holdout",
     "fit_band",
     "whiteness",
@@ -52,6 +57,11 @@ def render(sources: Sources) -> str:
         answers=[answer(sources, fit, ahead) for fit in judged_fits],
         judged_on=_judged_on(sources),
         advice=advice(sources, judged),
+        taken=how_identified.loop_state(sources),
+        flagged=how_identified.flagged(sources),
+        by_output=how_identified.fit_table(sources, judged_fits),
+        heaters=heater_table.heater_table(sources),
+        chosen_rows=how_identified.chosen_rows(sources),
         holdout=model_errors.holdout(sources, judged_fits, ahead),
         white=model_errors.whiteness(sources),
         cross=model_errors.cross(sources),
@@ -64,6 +74,8 @@ def render(sources: Sources) -> str:
         losses=losses(sources),
         used=used(sources),
         from_metrics=sources.source("identify_plant", "holdout", "residuals"),
+        from_fits=sources.source("identify_plant"),
+        from_heaters=sources.source("first_order", "ingest"),
         from_record=sources.source("record", "quality", "ingest", "identify_plant"),
         words=words.chosen(sources, WORDS),
         sources=list(sources.read.values()),

@@ -188,6 +188,7 @@ def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], An
         ("residuals", "identify_plant", "residuals.parquet", *table(schemas.RESIDUALS)),
         ("steps", "identify_plant", "steps.parquet", *table(schemas.STEPS)),
         ("dynamics", "identify_plant", "dynamics.parquet", *table(schemas.DYNAMICS)),
+        ("first_order", "identify_plant", "first_order.parquet", *table(schemas.FIRST_ORDER)),
         ("poles", "identify_plant", "poles.parquet", *table(schemas.POLES)),
         ("levels", "identify_plant", "levels.parquet", *table(schemas.LEVELS)),
         ("window", "learn_kernel", "window.parquet", *arrays("window")),

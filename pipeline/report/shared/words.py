@@ -121,7 +121,8 @@ FIXED = {
         "Trusted",
         "To simulate: the rules simulation and stability. To predict: the rule ahead. To design controllers: "
         "ahead, inputs used up, "
-        + "excitation, effects known and stability. Whiteness is a reservation: where "
+        + "excitation, effects known, stability, and where inputs are declared to heat "
+        "no gain whose whole band is impossible. Whiteness is a reservation: where "
         "it fails, a better observer exists.",
     ),
     "fit": (
@@ -138,6 +139,30 @@ FIXED = {
         "The model predicts so far ahead from all outputs until then, and from the inputs throughout.",
     ),
     "held": ("Held", "The last output seen, held so long: what any prediction must beat."),
+    "free_mean": (
+        "Free mean",
+        "The same simulation, moved by the mean of its error. What it gains is what another ambient or "
+        "operating point costs.",
+    ),
+    "closed_loop": (
+        "Closed loop",
+        "A controller set the inputs from the outputs while the record was taken. Granger’s test shows it: "
+        "inputs follow past errors of the outputs.",
+    ),
+    "feedthrough": (
+        "Feed-through",
+        "The output answers an input within the same sample: the row of D is not zero.",
+    ),
+    "first_order": (
+        "First order and delay",
+        "K e^(−θs) / (τs + 1): the steady rise by one per cent of the input, the time constant, "
+        "the dead time.",
+    ),
+    "simc": (
+        "SIMC",
+        "Skogestad’s rules from gain, time constant and dead time to a PID: the closed loop as fast as the "
+        "dead time, a third of it as derivative time.",
+    ),
     "holdout": (
         "Hold-out",
         "The last part of every stretch of the record. Order, window and model are chosen without it.",

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from pipeline.report.identification.model import flagged_sentence
 from pipeline.report.shared.digits import THIN, number, percent, short
 from pipeline.report.shared.sources import Sources, lookup
 from pipeline.report.shared.verdict import Missing
@@ -12,30 +13,57 @@ def findings(sources: Sources) -> list[tuple[str, str]]:
     """What a reader should take away, each with its figure; a figure
     that was not measured is said to be so."""
     evaluated, tuned = sources.metrics["evaluate_temperature"], sources.metrics["tune_weights"]
-    claims = [_claim(sources), _scaled(tuned), _algorithm_1(evaluated), _start(evaluated), _regret(tuned)]
+    claims = [_flagged(sources), _claim(sources), _scaled(tuned), _algorithm_1(evaluated)]
+    claims += [_start(evaluated), _regret(tuned)]
+    claims.append(_printer(sources))
     units = sources.declared.machine.sample_time_s
-    claims.append(
-        (
-            "Units are our convention.",
-            (
-                "The study names no unit of time and none of duty. "
-                f"Here a step is {units:g}{THIN}s and inputs are "
-                "in per cent; read seconds as steps."
-            ),
-        )
-    )
     if sources.declared.everything.get("generate_probing", {}).get("source") == "simulated":
-        claims.append(
+        claims += [
+            (
+                "Units are our convention.",
+                "The study names no unit of time and none of duty. "
+                f"Here a step is {units:g}{THIN}s and inputs are in per cent; read seconds as steps.",
+            ),
             (
                 "The probing is simulated, the judging is separate.",
-                (
-                    "The record comes from the study’s machine, simulated within limits; "
-                    "every controller is judged "
-                    "on plants that nothing was fitted to. Nothing here is a claim about a real printer."
-                ),
-            )
-        )
+                "The record comes from the study’s machine, simulated within limits; every controller is "
+                "judged on plants that nothing was fitted to. Nothing here is a claim about a real printer.",
+            ),
+        ]
     return [item for item in claims if item]
+
+
+def _flagged(sources: Sources) -> tuple[str, str] | None:
+    """A word where controllers are designed from a model with gains that physics forbids."""
+    gains = lookup(sources.metrics["identify_plant"], "forbidden_gains")
+    if isinstance(gains, Missing) or not gains:
+        return None
+    certain = any(gain["certain"] for gain in gains)
+    return (
+        f"The controllers are designed from a model that physics {'forbids' if certain else 'may forbid'}.",
+        f"{flagged_sentence(gains)} "
+        + (
+            "Put none of them to the machine before that is explained."
+            if certain
+            else "Watch that effect when one of them takes over."
+        ),
+    )
+
+
+def _printer(sources: Sources) -> tuple[str, str] | None:
+    """The printer's own PID, where a recording tells it, and where it stands beside the others."""
+    own = lookup(sources.metrics["ingest"], "printer_pid")
+    if isinstance(own, Missing):
+        return None
+    gains = [
+        f"{pid['input']} by Kp {short(pid['Kp'])}, Ki {short(pid['Ki'])}, Kd {short(pid['Kd'])}"
+        for pid in own
+    ]
+    return (
+        "The printer’s own PID is not among these controllers.",
+        f"The printer holds {'; '.join(gains)}, in % of duty, °C and s. The page of the identification sets "
+        "it beside one by SIMC; of the controllers here the baseline is its nearest.",
+    )
 
 
 def _claim(sources: Sources) -> tuple[str, str] | None:

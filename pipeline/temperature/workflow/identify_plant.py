@@ -8,6 +8,7 @@ import numpy as np
 from pipeline.store import artifacts
 from pipeline.store.tables import Schema
 from pipeline.temperature import identification, order, plant, trust, validation
+from pipeline.temperature.closed_loop import LEVEL_CLOSED
 from pipeline.temperature.workflow import tables
 from pipeline.temperature.workflow.record import read_recordings
 from pipeline.temperature.workflow.settings import IdentifyPlant
@@ -127,7 +128,10 @@ def _judged(
         block=2 * chosen.past,
         rng=np.random.default_rng(settings.seed),
     )
-    residuals = validation.residual_tests(chosen.plant, *last, lags=trust.residual_lags(last[0]))
+    closed = chosen.feedback is not None and chosen.feedback.closed
+    residuals = validation.residual_tests(
+        chosen.plant, *last, lags=trust.residual_lags(last[0]), closed=closed
+    )
     excitation = validation.excitation(first[0], chosen.past)
     return _Judgement(holdout, residuals, excitation, sum(map(len, last[0])))
 
@@ -204,6 +208,7 @@ def _warnings(machine: Machine, fitted: identification.Identified, steps: trust.
     return {
         "closed_loop": {
             "closed": feedback is not None and feedback.closed,
+            "level": LEVEL_CLOSED / (2 * len(names)),
             "p_value": dict(zip(names, answers, strict=False)),
         },
         "forbidden_gains": [gain._asdict() for gain in forbidden],

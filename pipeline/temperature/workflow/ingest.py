@@ -13,7 +13,9 @@ from typing import NamedTuple
 import joblib
 import numpy as np
 
+from pipeline.reading.formats import file_format
 from pipeline.reading.isolated import Budget, isolated
+from pipeline.reading.klipper_logs import printer_heaters
 from pipeline.reading.plain_files import check_plain_files
 from pipeline.reading.quality import flag
 from pipeline.reading.recordings import Source, Table, nearest_names, read
@@ -320,6 +322,30 @@ def collect(results: Sequence[Result], machine: Plant, *, strict: bool) -> tuple
         "findings": counts,
     }
     return Columns(schema, record), Columns(tables.QUALITY, quality), metrics
+
+
+def printer_pids(folder: Path, results: Sequence[Result], spec: IngestSpec) -> dict[str, list[dict]]:
+    """{"printer_pid": [...]}: by which PID a printer held the heaters whose duty and temperature are signals
+    of ours, gains in our units; {} where no good recording is a klippy.log. The last log's values count."""
+    inputs = {signal.name for signal in spec.machine.inputs}
+    of = {source.source: source for source in spec.sources()}
+    pids: dict[str, dict] = {}
+    logs = [r.name for r in results if not r.reason and file_format(folder / r.name) == "klippy.log"]
+    for name in logs:
+        for pid in [heater.pid for heater in printer_heaters(folder / name) if heater.pid]:
+            u, y = of.get(f"{pid.heater}.pwm"), of.get(f"{pid.heater}.temp")
+            if u is None or y is None or u.signal not in inputs:
+                continue
+            gains = [gain * u.scale / y.scale for gain in pid[1:4]]
+            pids[u.signal] = {
+                "recording": name,
+                "input": u.signal,
+                "output": y.signal,
+                **dict(zip(("Kp", "Ki", "Kd"), gains, strict=True)),
+                "most_percent": pid.most_percent,
+                "smooth_s": pid.smooth_s,
+            }
+    return {"printer_pid": list(pids.values())} if pids else {}
 
 
 def _segments(record: dict[str, np.ndarray]) -> int:

@@ -1,0 +1,243 @@
+"""How the record was taken and the model identified: loop open or closed and what follows, gains that physics
+forbids, what was chosen, and every output's fits with and without a free mean."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from pipeline.report.identification.model import (
+    Fit,
+    band_of,
+    fit_figure,
+    flagged_remedy,
+    flagged_sentence,
+    percent_of,
+)
+from pipeline.report.shared.digits import THIN, band, count, decimals, number, short
+from pipeline.report.shared.sources import Sources, lookup
+from pipeline.report.shared.verdict import Figure, Missing
+
+LEAST_P = 1e-6  # smaller ones are all the same to a reader
+
+REFINED = {
+    "subspace": "none, the subspace fit stands",
+    "prediction": "to the least errors one step ahead",
+    "simulation": "to the least errors of simulation",
+}
+
+
+# ---- open or closed loop
+
+
+class LoopState(NamedTuple):
+    """Open or closed loop in a word, the test behind it, and what follows; `missing` where it was not
+    tested."""
+
+    closed: bool
+    head: str
+    test: str
+    follows: str
+    missing: Missing | None = None
+
+
+def loop_state(sources: Sources) -> LoopState:
+    """Whether inputs answered what the outputs did, and what follows for the model."""
+    tested = lookup(sources.metrics["identify_plant"], "closed_loop", what="the test for feedback")
+    if isinstance(tested, Missing):
+        return LoopState(False, "", "", "", tested)
+    p_values = tested["p_value"]
+    if not p_values:
+        reason = "the record is noise-free: it holds no errors that an input could answer"
+        return LoopState(False, "", "", "", Missing("not applicable", reason))
+    level = tested.get("level", 0.0)
+    if tested["closed"]:
+        answering = [name for name, p in p_values.items() if p < level] or [min(p_values, key=p_values.get)]
+        largest = max(p_values[name] for name in answering)
+        test = (
+            f"{_listed(answering)} {'answers' if len(answering) == 1 else 'answer'} past errors of the "
+            f"outputs ({_p(largest)}), as a controller does."
+        )
+        return LoopState(True, "Recorded in closed loop.", test, _closed_follows(sources))
+    nearest = min(p_values, key=p_values.get)
+    threshold = f"; feedback is called below {short(level, 2)}" if level else ""
+    test = (
+        f"No input answers past errors of the outputs: least {_p(p_values[nearest])}, {nearest}{threshold}."
+    )
+    follows = (
+        "No noise of the outputs is in the inputs, so that fits are not biased by feedback, and the fit in "
+        "simulation on the hold-out can be taken as it stands."
+    )
+    return LoopState(False, "Recorded in open loop.", test, follows)
+
+
+def _closed_follows(sources: Sources) -> str:
+    fitted = lookup(sources.metrics["identify_plant"], "fit")
+    if fitted == "simulation":
+        how = (
+            "identify_plant.refinement asks for a fit to simulated outputs all the same, which feedback "
+            "biases: set it to validated."
+        )
+    else:
+        how = (
+            "The model was therefore identified in predictor form (PBSID), which feedback does not bias, and "
+            "judged one step ahead as well, without feed-through and without fits to simulated outputs."
+        )
+    return (
+        "Noise of the outputs is then in the inputs, and a fit to simulated outputs bends towards the "
+        f"inverse of the controller. {how} The fit in simulation on the hold-out flatters. Set-point steps "
+        "or a small dither on each input make the next record surer."
+    )
+
+
+def _p(value: float) -> str:
+    return "p below 0.000001" if value < LEAST_P else f"p = {short(value, 2)}"
+
+
+def _listed(items: Sequence[str]) -> str:
+    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"
+
+
+# ---- gains that physics forbids
+
+
+class FlaggedRow(NamedTuple):
+    """A gain that physics forbids, with its band; `certain` where all of the band is forbidden."""
+
+    output: str
+    input: str
+    gain: str
+    band: str
+    reason: str
+    certain: bool
+
+
+class Flagged(NamedTuple):
+    finding: str
+    rows: list[FlaggedRow]
+    missing: Missing | None = None
+
+
+def flagged(sources: Sources) -> Flagged:
+    """Gains of heaters with a sign or a size that physics forbids."""
+    gains = lookup(sources.metrics["identify_plant"], "forbidden_gains", what="the check of signs and sizes")
+    if isinstance(gains, Missing):
+        return Flagged("", [], gains)
+    machine = sources.declared.machine
+    heaters = [signal.name for signal in machine.inputs if signal.heats]
+    if not heaters:
+        reason = "no input is declared to heat, so no sign is known to be wrong"
+        return Flagged(
+            "", [], Missing("not applicable", reason, "Set heats: true for heaters in plant.inputs")
+        )
+    if not gains:
+        return Flagged(f"None: every effect of {_listed(heaters)} is one that a heater can have.", [])
+    return Flagged(
+        f"{flagged_sentence(gains)} {flagged_remedy(gains)}", [_flagged_row(gain) for gain in gains]
+    )
+
+
+def _flagged_row(gain: dict[str, Any]) -> FlaggedRow:
+    places = decimals(gain["low"], gain["high"], value=gain["gain"])
+    return FlaggedRow(
+        output=gain["output"],
+        input=gain["input"],
+        gain=number(gain["gain"], places),
+        band=band(gain["low"], gain["high"], places),
+        reason=gain["reason"],
+        certain=gain["certain"],
+    )
+
+
+# ---- what was chosen
+
+
+def chosen_rows(sources: Sources) -> list[tuple[str, str]]:
+    """What the record decided beside the order: (choice, outcome)."""
+    metrics, step = sources.metrics["identify_plant"], sources.declared.machine.sample_time_s
+    past, fitted, direct = (lookup(metrics, key) for key in ("past", "fit", "feedthrough"))
+    rows = [
+        ("Past horizon", past, lambda: f"{count(past, 'sample')}, {past * step:g}{THIN}s"),
+        ("Direct feed-through", direct, lambda: _feedthrough(direct)),
+        ("Refinement", fitted, lambda: REFINED.get(fitted, fitted)),
+        ("Validation", lookup(metrics, "validation"), lambda: left_out_words(sources)),
+    ]
+    disturbances = [signal.name for signal in sources.declared.machine.disturbances]
+    return [
+        *((name, value.state if isinstance(value, Missing) else words()) for name, value, words in rows),
+        ("Measured disturbances", ", ".join(disturbances) or "none declared (plant.disturbances)"),
+    ]
+
+
+def _feedthrough(direct: dict[str, bool]) -> str:
+    outputs = [name for name, free in direct.items() if free]
+    return (
+        f"{_listed(outputs)}, {len(outputs)} of {count(len(direct), 'output')}" if outputs else "in no output"
+    )
+
+
+def left_out_words(sources: Sources) -> str:
+    """What was left out in turn to judge candidates."""
+    if lookup(sources.metrics["identify_plant"], "validation") == "recordings":
+        return "one recording left out in turn"
+    return "blocks of the record left out in turn"
+
+
+# ---- fits by output
+
+
+class FitRow(NamedTuple):
+    """An output's fits: simulated as it stands, with its mean free, and ahead, each with its band; what the
+    mean costs, and whether u(t) acts on it at once."""
+
+    name: str
+    simulated: tuple[str, str]
+    free: tuple[str, str]
+    cost: str
+    sure: bool
+    ahead: tuple[str, str]
+    feedthrough: str
+
+
+class FitTable(NamedTuple):
+    finding: str
+    rows: list[FitRow]
+
+
+def fit_table(sources: Sources, fits: Sequence[Fit]) -> FitTable:
+    """Every output with and without a free mean: what another ambient or operating point costs."""
+    metrics = sources.metrics["identify_plant"]
+    rows = []
+    for fit in fits:
+        free = fit_figure(metrics, "fit_holdout_free_mean", fit.name)
+        direct = lookup(metrics, f"feedthrough.{fit.name}")
+        cost, sure = _cost(fit.simulated, free)
+        words = direct.state if isinstance(direct, Missing) else "yes" if direct else "no"
+        rows.append(FitRow(fit.name, _cell(fit.simulated), _cell(free), cost, sure, _cell(fit.ahead), words))
+    moved = [f"{row.cost} in {row.name}" for row in rows if row.sure]
+    measured = any(
+        not isinstance(fit_figure(metrics, "fit_holdout_free_mean", fit.name), Missing) for fit in fits
+    )
+    if moved:
+        finding = (
+            f"A free mean gains {_listed(moved)}: the level moved up to the hold-out, as another ambient or "
+            "operating point moves it. Record what does so as one of plant.disturbances."
+        )
+    elif measured:
+        finding = "A free mean gains nothing beyond noise: the level did not move up to the hold-out."
+    else:
+        finding = ""
+    return FitTable(finding, rows)
+
+
+def _cost(simulated: Figure | Missing, free: Figure | Missing) -> tuple[str, bool]:
+    """Points that a free mean gains, and whether the bands are apart."""
+    if isinstance(simulated, Missing) or isinstance(free, Missing):
+        return "not measured", False
+    if free.low <= simulated.high:
+        return "within noise", False
+    return f"{number(free.value - simulated.value, 1)} points", True
+
+
+def _cell(fit: Figure | Missing) -> tuple[str, str]:
+    if isinstance(fit, Missing):
+        return fit.state, ""
+    return percent_of(fit), band_of(fit)
