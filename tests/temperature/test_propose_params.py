@@ -96,6 +96,31 @@ def test_limits_that_no_file_tells_are_left_to_a_person_and_asked_for_by_the_sta
     assert "plant.outputs: temperature_1 should have low and high" in asked
 
 
+def test_the_sample_time_of_a_record_without_one_is_given_and_all_times_follow(tree, monkeypatch, capsys):
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.choice([3.4, 6.4], 100), 10)
+    y = np.convolve(u, 0.1 * np.exp(-np.arange(60) / 10))[:1000]
+    np.savetxt(tree / "rig.dat", np.column_stack([u, y + rng.normal(0, 0.05, 1000)]))
+    init(monkeypatch, "rig.dat")
+    asked = capsys.readouterr().out
+    assert "1.0 s was assumed, on which all times rest" in asked
+    assert (
+        "plant.inputs low and high, what the machine can give: now what was recorded, heater_1 3 to 7"
+        in asked
+    )
+    assert "plant.inputs heats of heater_1" in asked
+    slow = params.read("params.yaml")
+    init(monkeypatch, "rig.dat", "--time", "every 0.1 s", "--force")
+    assert "assumed" not in capsys.readouterr().out
+    fast = params.read("params.yaml")
+    assert (fast["plant"]["sample_time_s"], fast["ingest"]["time"]) == (0.1, "every 0.1 s")
+    # written to two digits
+    assert fast["report"]["settling_s"] == pytest.approx(0.1 * slow["report"]["settling_s"], rel=0.05)
+    with pytest.raises(SystemExit):
+        init(monkeypatch, "rig.dat", "--time", "0.1")
+    assert "--time is '0.1' but should be such as 'every 0.08 s'" in capsys.readouterr().err
+
+
 def test_recordings_of_two_machines_and_one_without_heaters_are_refused(tree, monkeypatch, capsys):
     header = "time_s,heater_1_pct,zone_1_C\n"
     (tree / "a.csv").write_text(header + "".join(f"{k},{k % 50},{20 + k / 9}\n" for k in range(60)))
