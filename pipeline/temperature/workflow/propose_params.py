@@ -34,6 +34,11 @@ SHIPPED: dict[str, Any] = {
         for i, reference in enumerate((150, 160, 170, 175, 180), 1)
     ],
     "generate_probing.source": "simulated",
+    "generate_probing.signal": "multisine",
+    "generate_probing.samples": 6000,
+    "generate_probing.amplitude_percent": 5.0,
+    "generate_probing.shortest_steps": 1,
+    "generate_probing.centre_percent": None,
     "ingest.mapping": {},
     "ingest.time": "",
     "panel.steps": 600,
@@ -46,16 +51,20 @@ SHIPPED: dict[str, Any] = {
 }
 FEWEST_STEPS, MOST_STEPS = 300, 3000
 ABSOLUTE_ZERO_DEGC = -273.15
+# the next experiment: no move smaller or larger, in percent; samples that the stage takes
+MOVES_PERCENT, PROBING_SAMPLES = (1.0, 20.0), (300, 100_000)
 
 
 class Scale(NamedTuple):
-    """The machine's pace and range: time constants in s by output, the sample time that suits them, and the
-    lowest and highest temperature of the record."""
+    """The machine's pace and range: time constants in s by output, the sample time that suits them, the
+    lowest and highest temperature of the record, and mean and standard deviation of each input."""
 
     time_constants_s: dict[str, float]
     sample_time_s: float
     coldest_degC: float
     hottest_degC: float
+    input_mean_percent: list[float]
+    input_spread_percent: list[float]
 
 
 class Initialised(NamedTuple):
@@ -140,7 +149,15 @@ def _scale(paths: Sequence[Path], proposal: Proposal) -> Scale:
     sample_time = max(interval, float(f"{min(constants.values()) / 200:.1g}"))
     lows = [np.nanmin(np.concatenate(segments)) for segments in y.values()]
     highs = [np.nanmax(np.concatenate(segments)) for segments in y.values()]
-    return Scale(constants, sample_time, float(np.min(lows)), float(np.max(highs)))
+    rows = np.vstack(u)
+    return Scale(
+        constants,
+        sample_time,
+        float(np.min(lows)),
+        float(np.max(highs)),
+        rows.mean(axis=0).tolist(),
+        rows.std(axis=0).tolist(),
+    )
 
 
 # ---- values
@@ -165,6 +182,7 @@ def _values(proposal: Proposal, scale: Scale) -> dict[str, list[str]]:
         "plant.inputs": ["- " + line for line in input_lines],
         "plant.outputs": ["- " + line for line in output_lines],
         "generate_probing.source": ["recordings"],
+        **_next_experiment(scale),
         "ingest.mapping": mapping_lines(proposal),
         "ingest.time": [proposal.time or '""'],
         "panel.steps": [str(steps)],
@@ -174,6 +192,29 @@ def _values(proposal: Proposal, scale: Scale) -> dict[str, list[str]]:
         "report.settling_s": [repr(settling)],
         "report.overshoot_degC": [repr(float(f"{max(0.5, 0.05 * reach):.1g}"))],
         "tune_weights.allow_settling_s": [repr(settling / 4)],
+    }
+
+
+def _next_experiment(scale: Scale) -> dict[str, list[str]]:
+    """A random binary sequence at the machine's pace, about the inputs' mean and no wider than they moved.
+
+    About the inputs' mean a linear plant keeps the mean of the recorded temperatures; the middle of the
+    limits may hold far more. Switching every half of the fastest time constant puts the power where outputs
+    answer. It lasts for 20 of the slowest, and for 60 chances to switch.
+    """
+    fastest, slowest = (pick(scale.time_constants_s.values()) for pick in (min, max))
+    moves = [spread for spread in scale.input_spread_percent if spread >= MOVES_PERCENT[0]]
+    centre = ", ".join(f"{round(mean, 1) + 0.0:.1f}" for mean in scale.input_mean_percent)
+    hold = int(np.clip(round(fastest / 2 / scale.sample_time_s), 1, 10_000))
+    samples = int(np.clip(max(np.ceil(20 * slowest / scale.sample_time_s), 60 * hold), *PROBING_SAMPLES))
+    return {
+        "generate_probing.signal": ["prbs"],
+        "generate_probing.samples": [str(samples)],
+        "generate_probing.amplitude_percent": [
+            repr(float(f"{np.clip(min(moves, default=0.0), *MOVES_PERCENT):.2g}"))
+        ],
+        "generate_probing.shortest_steps": [str(hold)],
+        "generate_probing.centre_percent": [f"[{centre}]"],
     }
 
 
@@ -197,6 +238,10 @@ def _open_questions(proposal: Proposal, scale: Scale, *, timed: bool) -> list[st
         )
     references = [f"{s.name} {s.reference:g}" for s in proposal.signals if s.role == "output"]
     questions.append(f"plant.outputs reference, where each should settle: now {', '.join(references)} °C")
+    questions.append(
+        "generate_probing: whether the machine may be moved so; the next experiment switches each input "
+        "about its recorded mean, and nothing checks beforehand how hot that gets"
+    )
     paces = [f"{name} {float(f'{tau:.2g}'):g} s" for name, tau in scale.time_constants_s.items()]
     questions.append(f"report: whether the rules suit you; the time constants are {', '.join(paces)}")
     return questions
