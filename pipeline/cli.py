@@ -124,7 +124,7 @@ def init(arguments: argparse.Namespace) -> None:
     rules that fit its pace; and what a person must still decide."""
     from pipeline.temperature.workflow import propose_params
 
-    initialised = propose_params.proposed(arguments.recordings)
+    initialised = propose_params.proposed(arguments.recordings, sample_time=arguments.time)
     changed = propose_params.write(initialised.values, force=arguments.force)
     if arguments.copy:
         propose_params.copy(arguments.recordings)
@@ -202,6 +202,12 @@ def main() -> None:
     command.add_argument("recordings", type=Path, nargs="+", metavar="RECORDING")
     command.add_argument("--copy", action="store_true", help="copy them into datasets/raw/temperature")
     command.add_argument("--force", action="store_true", help="overwrite values that were edited")
+    command.add_argument(
+        "--time",
+        default="",
+        metavar="'every 0.08 s'",
+        help="the sample time of recordings that do not say it",
+    )
     command.set_defaults(run=init)
     command = commands.add_parser("compose", help=compose.__doc__)
     command.add_argument("part", type=Path, help="the part program (G-code)")

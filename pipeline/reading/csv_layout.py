@@ -108,9 +108,10 @@ def _first_row(
     # a language has words and lines of all lengths, with a number here and there
     words = delimiter == " " and sum(numbers[i] for i in table) < width * len(table) / 2
     if len(table) < len(written) / 2 or words or (len(table) == 1 and header < 0):
+        lines = "lines of words or of different widths" if len(written) > 1 else "a single line"
         raise ValueError(
-            f"{path} is text but no table: {len(table)} of its first {len(written)} lines have {width} "
-            "fields with numbers among them; name a recording, or save it as CSV with one row a sample"
+            f"{path} is text but no table: expected rows of numbers of one width but found {lines}; "
+            "name a recording, or save it as CSV with one row a sample"
         )
     begin = next((i for i in table if not _is_heading(rows[i], [rows[k] for k in table])), table[0])
     # most rows may end with an empty field, and the first ones not

@@ -366,15 +366,15 @@ class McapFile:
             message = f"the file has no footer: it was cut off or never closed; {self.chunks} whole chunks"
             notes.append(Note("truncated", "", total, f"{message} and {total} messages were recovered"))
         if (self.unchecked or self.unchunked) and not self.verified:
-            what = (
-                f"{self.unchecked} chunks" if self.unchecked else f"{self.unchunked} messages outside chunks"
-            )
+            count = self.unchecked or self.unchunked
+            what = ("chunk" if self.unchecked else "message") + ("s" if count > 1 else "")
+            where, have = "" if self.unchecked else " outside chunks", "have" if count > 1 else "has"
             notes.append(
                 Note(
                     "unchecked",
                     "",
-                    self.unchecked or self.unchunked,
-                    f"{what} have no CRC, so damage in them would not be seen",
+                    count,
+                    f"{count} {what}{where} {have} no CRC, so damage there would not be seen",
                 )
             )
         return notes

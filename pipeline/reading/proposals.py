@@ -1,6 +1,7 @@
 """A mapping and a plant proposed from the names, units and ranges of a recording's signals."""
 
 import json
+import math
 import re
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -28,6 +29,9 @@ _SURELY_TEMPERATURE = r"temperature|celsius|deg_?c|°c|(?<!set)(^|[\s._])(temp|a
 _HEATING = r"duty|pwm|power|heat|pct|percent|%"
 _INPUT = r"heat|duty|pwm|power|percent|pct|%|^q_?\d|^u_?\d*$|motor|screw|rpm|fan|voltage|current"
 _MOVER = r"motor|screw|rpm|fan"
+# an input of such a name can only warm; Klipper calls the hot end's heater "extruder"
+_HEATER = r"heat|hot.?end|nozzle|barrel|(^|[\s._])bed|^extruder.*\.pwm$"
+_COOLER = r"cool|chill|exchang|fan"
 _STAMP = r"(^|\.)(sec|secs|seconds|nsec|nsecs|nanosec|nanos|seq|sequence)$|class$|(^|_)(id|num|index)$"
 # times and counts of a machine's own: an event counter, a time stamp in any unit
 _COUNTER = (
@@ -65,7 +69,7 @@ class Signal(NamedTuple):
 
 class Proposed(NamedTuple):
     """A signal of the plant, "input" or "output", with its source and conversion. A limit or a reference that
-    nothing tells is None."""
+    nothing tells is None. `heats`: its name says that it can only warm."""
 
     name: str
     role: str
@@ -76,6 +80,7 @@ class Proposed(NamedTuple):
     low: float | None
     high: float | None
     reference: float | None
+    heats: bool = False
 
 
 class Proposal(NamedTuple):
@@ -102,11 +107,11 @@ def propose(signals: Sequence[Signal], groups: Sequence[tuple[Columns, str]], ti
     beside = _beside(taken)
     targets = {_stem(s.source, _SET_POINT): s for s in taken if s.role == "set-point"}
     names: set[str] = set()
-    proposed = []
+    proposed, guessed = [], how != "names and ranges"
     for signal in taken:
         if signal.role in ("input", "output") and signal.source not in beside:
             target = targets.get(_stem(signal.source, r"temperature|temp|actual|measured"))
-            proposed.append(_proposed(signal, target, names))
+            proposed.append(_proposed(signal, target, names, guessed=guessed))
     set_points = [signal.source for signal in taken if signal.role == "set-point"]
     return Proposal(proposed, how, time, _sample_time(groups), set_points, beside)
 
@@ -119,8 +124,8 @@ def yaml_lines(proposal: Proposal) -> list[str]:
     lines = [f"# a proposal from {proposal.how}", "ingest:"]
     if proposal.time:
         lines.append(
-            f"  time: {proposal.time}    # write the sample time here, for the file does not say it; "
-            "or the name of a column"
+            f"  time: {proposal.time}    # write the sample time here and at sample_time_s below, "
+            "for the file does not say it; or the name of a column"
         )
     lines += ["  mapping:", *(f"    {line}" for line in mapping_lines(proposal))]
     if proposal.set_points:
@@ -151,7 +156,8 @@ def mapping_lines(proposal: Proposal) -> list[str]:
 def plant_lines(proposal: Proposal) -> tuple[list[str], list[str]]:
     """`plant.inputs` and `plant.outputs`, a line a signal."""
     inputs = [
-        f"{{name: {s.name}, unit: {s.unit}, low: {_number(s.low)}, high: {_number(s.high)}}}"
+        f"{{name: {s.name}, unit: {s.unit}, low: {_number(s.low)}, high: {_number(s.high)}"
+        + (", heats: true}" if s.heats else "}")
         for s in proposal.signals
         if s.role == "input"
     ]
@@ -270,18 +276,26 @@ def _stem(source: str, pattern: str) -> str:
 # ---- names, units, limits
 
 
-def _proposed(signal: Signal, target: Signal | None, names: set[str]) -> Proposed:
+def _proposed(signal: Signal, target: Signal | None, names: set[str], *, guessed: bool) -> Proposed:
     unit, scale, offset = _conversion(signal)
     low = high = reference = None
     if signal.limits is not None and np.isfinite(signal.limits).all():
         low, high = (limit * scale + offset for limit in signal.limits)
     elif signal.role == "input":
-        high, low = 100.0, float(max(-100, min(0, np.floor(signal.values.min() * scale + offset))))
+        low, high = _input_limits(signal.values * scale + offset, guessed=guessed and scale == 1.0)
     if signal.role == "output":
         reference = _reference(sampled(signal.values) * scale + offset, target, scale, offset)
-    return Proposed(
-        _name(signal, names), signal.role, signal.source, unit, scale, offset, low, high, reference
-    )
+    bare = words(signal.source)
+    heats = signal.role == "input" and bool(re.search(_HEATER, bare)) and not re.search(_COOLER, bare)
+    name = _name(signal, names)
+    return Proposed(name, signal.role, signal.source, unit, scale, offset, low, high, reference, heats)
+
+
+def _input_limits(ours: np.ndarray, *, guessed: bool) -> tuple[float, float]:
+    """0 to 100 percent, or from below zero where it was recorded there. Of a `guessed` input nothing says
+    that it is percent: the whole numbers around what was recorded, so that no experiment asks for more."""
+    low, high = max(-100.0, float(np.floor(ours.min()))), min(100.0, float(np.ceil(ours.max())))
+    return (low, high) if guessed else (min(0.0, low), 100.0)
 
 
 def _reference(ours: np.ndarray, target: Signal | None, scale: float, offset: float) -> float:
@@ -333,10 +347,16 @@ def _conversion(signal: Signal) -> tuple[str, float, float]:
         full = next((top for top in (255, 1023, 4095) if 100 < high <= top and low >= 0 and integer), None)
         if conversion is None and full is None and max(high, -low) > 100:
             full = max(high, -low)  # rpm, mV: percent of the largest
-        return "percent", float(f"{100 / full:.6g}") if full and conversion is None else 1.0, 0.0
+        return "percent", _to_percent(full) if full and conversion is None else 1.0, 0.0
     if conversion is None:
         return "degC", 1.0, -273.15 if ROOM_KELVIN[0] <= finite[0] <= ROOM_KELVIN[1] and low > 250 else 0.0
     return conversion
+
+
+def _to_percent(full: float) -> float:
+    """100 / full to six digits, rounded down: the largest recorded value stays within 100 %."""
+    unit = 10.0 ** (math.floor(math.log10(100 / full)) - 5)
+    return float(f"{math.floor(100 / full / unit) * unit:.6g}")
 
 
 def _yaml(source: str) -> str:

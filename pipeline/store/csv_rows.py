@@ -344,7 +344,8 @@ def broken_line(line: int, fields: int, width: int) -> Note:
 
 def _unsound(line: int, row: list[str], layout: CsvLayout, clock: "Clock | None") -> str:
     if clock is None or len(row) != len(layout.names):
-        return f"line {line} has {len(row)} fields but the header has {len(layout.names)} columns"
+        fields = "1 field" if len(row) == 1 else f"{len(row)} fields"
+        return f"line {line} has {fields} but the header has {len(layout.names)} columns"
     time = clock.text(row).strip()
     return f"line {line} should have a time in {clock.name} but has {repr(time[:40]) if time else 'none'}"
 

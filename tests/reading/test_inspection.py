@@ -129,6 +129,37 @@ def test_a_table_without_names_is_guessed_from_its_values_and_says_so(tmp_path):
     assert "write its name, or time: every 1.0 s with the sample time" in text
 
 
+def test_a_guessed_input_may_not_leave_what_was_recorded(tmp_path):
+    rng = np.random.default_rng(0)
+    path = tmp_path / "rig.dat"
+    levels = [np.repeat(rng.choice(pair, 100), 10) for pair in ([3.4, 6.4], [-1.2, 1.1])]
+    np.savetxt(path, np.column_stack([*levels, np.cumsum(rng.normal(size=1000))]))
+    limits = [(one["low"], one["high"]) for one in proposal(inspect(path))["plant"]["inputs"]]
+    assert limits == [(3, 7), (-2, 2)]
+
+
+@pytest.mark.parametrize("full", [255, 595.346, 514.614, 2999.7, 1e5 / 3])
+def test_the_largest_value_of_a_scaled_input_stays_within_its_limit(tmp_path, full):
+    path = tmp_path / "rig.csv"
+    rows = [f"{t},{full if t % 7 else 0},{20 + t / 9}\n" for t in range(100)]
+    path.write_text("time_s,u1,T1_C\n" + "".join(rows))
+    proposed = proposal(inspect(path))
+    (limit,), scale = proposed["plant"]["inputs"], proposed["ingest"]["mapping"]["heater_1"]["scale"]
+    # six digits are written, so that at most a part in 1e5 is given away
+    assert limit["high"] * (1 - 1e-5) <= full * scale <= limit["high"]
+
+
+def test_an_input_that_its_name_calls_a_heater_is_marked_as_one_that_heats(tmp_path):
+    names = ["heater_1_pct", "bed_duty", "cooling_pct", "heat_exchanger_pct", "fan_pct", "Q1_pct"]
+    rows = [",".join(map(str, [t, *(10 * ((t + k) % 7) for k in range(6)), 20 + t / 9])) for t in range(99)]
+    (tmp_path / "rig.csv").write_text("\n".join([",".join(["time_s", *names, "zone_C"]), *rows]))
+    proposed = proposal(inspect(tmp_path / "rig.csv"))
+    sources = {name: one["source"] for name, one in proposed["ingest"]["mapping"].items()}
+    heating = {sources[one["name"]] for one in proposed["plant"]["inputs"] if one.get("heats")}
+    assert heating == {"heater_1_pct", "bed_duty"}
+    assert {one["name"] for one in proposed["plant"]["inputs"]} < sources.keys()
+
+
 def test_our_own_recordings_are_proposed_under_their_own_names(tmp_path):
     time = np.arange(100.0)
     signals = {
@@ -180,7 +211,7 @@ def test_mcap_files_of_others_are_inspected(shared, name):
         (b"name,owner\nrig,bob\nrig,eve\n", "has 3 lines of text and no data"),
         (
             b"import numpy as np\n\ndef f(x, y):\n    return 1 + x, 2\n\n\nclass A:\n    a: int = 3\n",
-            "is text but no table",
+            "is text but no table: expected rows of numbers of one width but found lines of words",
         ),
         (
             b"t,Q1,T1\n0,20 %,21 C\n1,20 %,21 C\n",

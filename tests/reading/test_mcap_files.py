@@ -152,7 +152,7 @@ def test_damage_in_messages_outside_chunks_is_refused_because_it_cannot_be_place
 def test_messages_without_any_crc_are_read_and_said_to_be_unchecked(tmp_path):
     raw = opened(tmp_path, json_recording(SAMPLES, use_chunking=False))
     assert [note.message for note in raw.notes] == [
-        f"{SAMPLES} messages outside chunks have no CRC, so damage in them would not be seen"
+        f"{SAMPLES} messages outside chunks have no CRC, so damage there would not be seen"
     ]
     raw = opened(tmp_path, json_recording(SAMPLES, enable_crcs=False))
     assert [note.kind for note in raw.notes] == ["unchecked"]

@@ -12,8 +12,8 @@ from pipeline import cli
 from pipeline.store import artifacts, params
 from pipeline.store.params_text import replaced
 from pipeline.temperature.time_scale import time_constant
-from pipeline.temperature.workflow import propose_params, tables
-from pipeline.temperature.workflow.settings import IdentifyPlant, Panel, Plant, TuneWeights
+from pipeline.temperature.workflow import generate_probing, propose_params, tables
+from pipeline.temperature.workflow.settings import GenerateProbing, IdentifyPlant, Panel, Plant, TuneWeights
 from tests.reading.klipper_machine import BED, EXTRUDER, print_log
 from tests.reading.test_real_record import project, run
 
@@ -94,6 +94,65 @@ def test_limits_that_no_file_tells_are_left_to_a_person_and_asked_for_by_the_sta
         runpy.run_module("stages.ingest", run_name="__main__")
     asked = capsys.readouterr().err
     assert "plant.outputs: temperature_1 should have low and high" in asked
+
+
+def test_the_next_experiment_moves_a_slow_machine_more_than_its_noise_and_no_hotter_than_before(
+    tree, monkeypatch
+):
+    rng, tau = np.random.default_rng(1), 200.0
+    u = np.repeat(rng.choice([10.0, 30.0], (20, 2)), 200, axis=0)
+
+    def temperatures(u, start):
+        y = np.full((len(u) + 1, 2), start)
+        for t in range(len(u)):
+            y[t + 1] = y[t] + (20 + u[t] @ np.array([[3.0, 0.5], [0.5, 3.0]]) - y[t]) / tau
+        return y[:-1]
+
+    recorded = temperatures(u, 90.0) + rng.normal(0, 0.1, (len(u), 2))
+    rows = np.column_stack([np.arange(len(u)), u, recorded])
+    header = "time_s,heater_1_pct,heater_2_pct,zone_1_C,zone_2_C"
+    np.savetxt(tree / "rig.csv", rows, delimiter=",", header=header, comments="", fmt="%.3f")
+    init(monkeypatch, "rig.csv")
+    settings, machine = params.load(GenerateProbing, "generate_probing"), params.load(Plant, "plant")
+    plan = generate_probing.planned(settings, machine).columns
+    played = np.column_stack([plan["heater_1"], plan["heater_2"]])
+    answer = temperatures(played, 90.0)
+    # the middle of the limits, 50 %, would hold 195 °C; a quarter of the recorded movement allows for chance
+    assert answer.max() < recorded.max() + 0.25 * np.ptp(recorded)
+    assert (answer.std(axis=0) > 50 * 0.1).all()
+
+
+def test_an_operating_point_for_each_input_is_refused_where_there_are_more_inputs(tree, monkeypatch):
+    text = (tree / "params.expert.yaml").read_text()
+    (tree / "params.expert.yaml").write_text(text.replace("centre_percent: null", "centre_percent: [20, 30]"))
+    settings, machine = params.load(GenerateProbing, "generate_probing"), params.load(Plant, "plant")
+    with pytest.raises(ValueError, match="centre_percent has 2 values, but plant has 7 inputs; give one"):
+        generate_probing.planned(settings, machine)
+
+
+def test_the_sample_time_of_a_record_without_one_is_given_and_all_times_follow(tree, monkeypatch, capsys):
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.choice([3.4, 6.4], 100), 10)
+    y = np.convolve(u, 0.1 * np.exp(-np.arange(60) / 10))[:1000]
+    np.savetxt(tree / "rig.dat", np.column_stack([u, y + rng.normal(0, 0.05, 1000)]))
+    init(monkeypatch, "rig.dat")
+    asked = capsys.readouterr().out
+    assert "1.0 s was assumed, on which all times rest" in asked
+    assert (
+        "plant.inputs low and high, what the machine can give: now what was recorded, heater_1 3 to 7"
+        in asked
+    )
+    assert "plant.inputs heats of heater_1" in asked
+    slow = params.read("params.yaml")
+    init(monkeypatch, "rig.dat", "--time", "every 0.1 s", "--force")
+    assert "assumed" not in capsys.readouterr().out
+    fast = params.read("params.yaml")
+    assert (fast["plant"]["sample_time_s"], fast["ingest"]["time"]) == (0.1, "every 0.1 s")
+    # written to two digits
+    assert fast["report"]["settling_s"] == pytest.approx(0.1 * slow["report"]["settling_s"], rel=0.05)
+    with pytest.raises(SystemExit):
+        init(monkeypatch, "rig.dat", "--time", "0.1")
+    assert "--time is '0.1' but should be such as 'every 0.08 s'" in capsys.readouterr().err
 
 
 def test_recordings_of_two_machines_and_one_without_heaters_are_refused(tree, monkeypatch, capsys):

@@ -41,11 +41,7 @@ def planned(settings: GenerateProbing, machine: Plant) -> Planned:
     middle of the limits, clipped to these."""
     low, high = _limits(machine)
     signal = _signal(settings, machine, np.random.default_rng(settings.seed))
-    centre = (
-        np.full(len(low), settings.centre_percent)
-        if settings.centre_percent is not None
-        else (low + high) / 2
-    )
+    centre = (low + high) / 2 if settings.centre_percent is None else _centre(settings, machine)
     u = np.clip(centre + signal, low, high)
     columns = {
         "time_s": _time_s(settings, machine),
@@ -69,6 +65,17 @@ def probed(settings: GenerateProbing, machine: Plant) -> Probed:
 def _limits(machine: Plant) -> tuple[np.ndarray, np.ndarray]:
     low, high = np.array([(i.low, i.high) for i in machine.inputs]).T
     return low, high
+
+
+def _centre(settings: GenerateProbing, machine: Plant) -> np.ndarray:
+    """The operating point (m,) that the user gives: one number for all inputs, or one each."""
+    given = np.atleast_1d(np.asarray(settings.centre_percent, float))
+    if len(given) not in (1, len(machine.inputs)):
+        raise ValueError(
+            f"generate_probing.centre_percent has {len(given)} values, but plant has {len(machine.inputs)} "
+            "inputs; give one for each, or one number for all"
+        )
+    return np.broadcast_to(given, len(machine.inputs))
 
 
 def _signal(settings: GenerateProbing, machine: Plant, rng: np.random.Generator) -> np.ndarray:
@@ -98,7 +105,7 @@ def _simulated(
             "or restore the plant section"
         )
     target = feasible_target(plant, np.array([o.reference for o in machine.outputs]), low, high)
-    centre = target.u if settings.centre_percent is None else np.full(plant.m, settings.centre_percent)
+    centre = target.u if settings.centre_percent is None else _centre(settings, machine)
     feedback = settings.feedback_percent_per_degC * np.eye(plant.m, plant.p)
     limits = InputLimits(
         np.maximum(low, centre - settings.amplitude_percent),

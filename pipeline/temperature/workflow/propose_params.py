@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
+from pipeline.reading.formats import every
 from pipeline.reading.inspection import Inspected, look
-from pipeline.reading.proposals import Proposal, mapping_lines, plant_lines, propose
+from pipeline.reading.proposals import Proposal, Proposed, mapping_lines, plant_lines, propose
 from pipeline.reading.recordings import Source, read
 from pipeline.reading.resampling import resample
 from pipeline.store import artifacts, params
@@ -33,6 +34,11 @@ SHIPPED: dict[str, Any] = {
         for i, reference in enumerate((150, 160, 170, 175, 180), 1)
     ],
     "generate_probing.source": "simulated",
+    "generate_probing.signal": "multisine",
+    "generate_probing.samples": 6000,
+    "generate_probing.amplitude_percent": 5.0,
+    "generate_probing.shortest_steps": 1,
+    "generate_probing.centre_percent": None,
     "ingest.mapping": {},
     "ingest.time": "",
     "panel.steps": 600,
@@ -45,16 +51,20 @@ SHIPPED: dict[str, Any] = {
 }
 FEWEST_STEPS, MOST_STEPS = 300, 3000
 ABSOLUTE_ZERO_DEGC = -273.15
+# the next experiment: no move smaller or larger, in percent; samples that the stage takes
+MOVES_PERCENT, PROBING_SAMPLES = (1.0, 20.0), (300, 100_000)
 
 
 class Scale(NamedTuple):
-    """The machine's pace and range: time constants in s by output, the sample time that suits them, and the
-    lowest and highest temperature of the record."""
+    """The machine's pace and range: time constants in s by output, the sample time that suits them, the
+    lowest and highest temperature of the record, and mean and standard deviation of each input."""
 
     time_constants_s: dict[str, float]
     sample_time_s: float
     coldest_degC: float
     hottest_degC: float
+    input_mean_percent: list[float]
+    input_spread_percent: list[float]
 
 
 class Initialised(NamedTuple):
@@ -64,18 +74,22 @@ class Initialised(NamedTuple):
     open_questions: list[str]
 
 
-def proposed(paths: Sequence[Path]) -> Initialised:
-    """What the params files should hold for the machine of these recordings.
+def proposed(paths: Sequence[Path], *, sample_time: str = "") -> Initialised:
+    """What the params files should hold for the machine of these recordings; `sample_time`, such as
+    "every 0.08 s", is that of files which do not say it.
 
     Raises ValueError for recordings of different machines, and for one without a heater or a temperature.
     """
     recordings = [look(path) for path in paths]
     proposal = _widest(recordings)
+    if sample_time:
+        proposal = proposal._replace(time=sample_time, sample_time_s=_interval(sample_time))
     for role, word in (("input", "a heater or a motor"), ("output", "a temperature")):
         if not any(signal.role == role for signal in proposal.signals):
             raise ValueError(
-                f"{paths[0]}: nothing in it looks like {word}; name the columns so (heater_1_pct, zone_1_C), "
-                "or write ingest.mapping and plant in params.yaml by hand"
+                f"{paths[0]}: nothing in it looks like {word}, without which no plant can be identified; "
+                "where it was not recorded, record it; where it was, name its column so (heater_1_pct, "
+                "zone_1_C), or write ingest.mapping and plant in params.yaml by hand"
             )
     for path, recording in zip(paths, recordings, strict=True):
         sources = {signal.source for signal in recording.signals}
@@ -86,7 +100,18 @@ def proposed(paths: Sequence[Path]) -> Initialised:
                 "give recordings of one machine"
             )
     scale = _scale(paths, proposal)
-    return Initialised(_values(proposal, scale), _open_questions(proposal, scale))
+    return Initialised(
+        _values(proposal, scale),
+        _open_questions(proposal, scale, timed=not proposal.time or bool(sample_time)),
+    )
+
+
+def _interval(sample_time: str) -> float:
+    """Seconds of "every 0.08 s". Raises ValueError for anything else."""
+    interval = every(sample_time)
+    if interval is None:
+        raise ValueError(f"--time is {sample_time!r} but should be such as 'every 0.08 s'; write it so")
+    return interval
 
 
 def _widest(recordings: Sequence[Inspected]) -> Proposal:
@@ -124,7 +149,15 @@ def _scale(paths: Sequence[Path], proposal: Proposal) -> Scale:
     sample_time = max(interval, float(f"{min(constants.values()) / 200:.1g}"))
     lows = [np.nanmin(np.concatenate(segments)) for segments in y.values()]
     highs = [np.nanmax(np.concatenate(segments)) for segments in y.values()]
-    return Scale(constants, sample_time, float(np.min(lows)), float(np.max(highs)))
+    rows = np.vstack(u)
+    return Scale(
+        constants,
+        sample_time,
+        float(np.min(lows)),
+        float(np.max(highs)),
+        rows.mean(axis=0).tolist(),
+        rows.std(axis=0).tolist(),
+    )
 
 
 # ---- values
@@ -149,6 +182,7 @@ def _values(proposal: Proposal, scale: Scale) -> dict[str, list[str]]:
         "plant.inputs": ["- " + line for line in input_lines],
         "plant.outputs": ["- " + line for line in output_lines],
         "generate_probing.source": ["recordings"],
+        **_next_experiment(scale),
         "ingest.mapping": mapping_lines(proposal),
         "ingest.time": [proposal.time or '""'],
         "panel.steps": [str(steps)],
@@ -161,14 +195,42 @@ def _values(proposal: Proposal, scale: Scale) -> dict[str, list[str]]:
     }
 
 
-def _open_questions(proposal: Proposal, scale: Scale) -> list[str]:
+def _next_experiment(scale: Scale) -> dict[str, list[str]]:
+    """A random binary sequence at the machine's pace, about the inputs' mean and no wider than they moved.
+
+    About the inputs' mean a linear plant keeps the mean of the recorded temperatures; the middle of the
+    limits may hold far more. Switching every half of the fastest time constant puts the power where outputs
+    answer. It lasts for 20 of the slowest, and for 60 chances to switch.
+    """
+    fastest, slowest = (pick(scale.time_constants_s.values()) for pick in (min, max))
+    moves = [spread for spread in scale.input_spread_percent if spread >= MOVES_PERCENT[0]]
+    centre = ", ".join(f"{round(mean, 1) + 0.0:.1f}" for mean in scale.input_mean_percent)
+    hold = int(np.clip(round(fastest / 2 / scale.sample_time_s), 1, 10_000))
+    samples = int(np.clip(max(np.ceil(20 * slowest / scale.sample_time_s), 60 * hold), *PROBING_SAMPLES))
+    return {
+        "generate_probing.signal": ["prbs"],
+        "generate_probing.samples": [str(samples)],
+        "generate_probing.amplitude_percent": [
+            repr(float(f"{np.clip(min(moves, default=0.0), *MOVES_PERCENT):.2g}"))
+        ],
+        "generate_probing.shortest_steps": [str(hold)],
+        "generate_probing.centre_percent": [f"[{centre}]"],
+    }
+
+
+def _open_questions(proposal: Proposal, scale: Scale, *, timed: bool) -> list[str]:
+    """What a person must decide; `timed`: the sample time was recorded or given."""
     questions = []
     if proposal.how != "names and ranges":
         questions.append(
             "which column is what: the file names nothing, and the mapping was guessed by values"
         )
-    if proposal.time:
-        questions.append("ingest.time: the file has no time; write the sample time in place of 1.0 s")
+    if not timed:
+        questions.append(
+            "the sample time: the file has no time, and 1.0 s was assumed, on which all times rest that were "
+            "written; if it is another, run init again with --time 'every 0.08 s' --force"
+        )
+    questions += _questions_on_inputs([s for s in proposal.signals if s.role == "input"])
     unlimited = [s.name for s in proposal.signals if s.role == "output" and s.low is None]
     if unlimited:
         questions.append(
@@ -176,8 +238,33 @@ def _open_questions(proposal: Proposal, scale: Scale) -> list[str]:
         )
     references = [f"{s.name} {s.reference:g}" for s in proposal.signals if s.role == "output"]
     questions.append(f"plant.outputs reference, where each should settle: now {', '.join(references)} °C")
-    paces = [f"{name} {tau:.2g} s" for name, tau in scale.time_constants_s.items()]
+    questions.append(
+        "generate_probing: whether the machine may be moved so; the next experiment switches each input "
+        "about its recorded mean, and nothing checks beforehand how hot that gets"
+    )
+    paces = [f"{name} {float(f'{tau:.2g}'):g} s" for name, tau in scale.time_constants_s.items()]
     questions.append(f"report: whether the rules suit you; the time constants are {', '.join(paces)}")
+    return questions
+
+
+def _questions_on_inputs(inputs: Sequence[Proposed]) -> list[str]:
+    """What the recording cannot tell of the inputs: what 100 % is, the limits, and which can only warm."""
+    questions = []
+    # 0 to 1 is a duty, and one in percent is taken as it is
+    scaled = [f"{s.source} {100 / s.scale:.4g}" for s in inputs if s.scale not in (1.0, 100.0)]
+    if scaled:
+        questions.append(f"ingest.mapping scale, what is 100 % of the input: now {', '.join(scaled)}")
+    odd = [f"{s.name} {s.low:g} to {s.high:g}" for s in inputs if (s.low, s.high) != (0.0, 100.0)]
+    if odd:
+        questions.append(
+            "plant.inputs low and high, what the machine can give: now what was recorded, " + ", ".join(odd)
+        )
+    unmarked = [s.name for s in inputs if not s.heats]
+    if unmarked:
+        questions.append(
+            f"plant.inputs heats of {', '.join(unmarked)}: write heats: true beside each that can only warm; "
+            "an identified gain of the wrong sign is flagged then"
+        )
     return questions
 
 

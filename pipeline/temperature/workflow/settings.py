@@ -164,7 +164,11 @@ class GenerateProbing(Section):
     shortest_steps: int = Field(ge=1, le=10_000)
     noise_degC: float = Field(ge=0, le=50)
     feedback_percent_per_degC: float = Field(ge=0, le=100)
-    centre_percent: float | None = Field(ge=-100, le=100)
+    centre_percent: (
+        Annotated[float, Field(ge=-100, le=100)]
+        | Annotated[list[Annotated[float, Field(ge=-100, le=100)]], Field(min_length=1, max_length=32)]
+        | None
+    )
 
 
 class Ingest(Section):
