@@ -19,8 +19,9 @@ dead time: None; the lags at which the largest model's impulse response stays un
 order: The fewest parameters whose error is within 2 % of the best. The error is that of
     simulating left-out blocks (geometric mean).
 refinement: Where `refinement` is "validated", prediction-error fits of the best candidate of each structure.
-    One is taken where it takes more than 5 % off the error on the left-out blocks; one for simulation only
-    where it beats prediction by a fifth.
+    One is taken where it takes more than 5 % off the error on the left-out blocks, and beyond chance
+    (Student's t) off the error about their means; one for simulation only where it beats prediction by a
+    fifth.
 """
 
 from collections.abc import Sequence
@@ -31,7 +32,6 @@ import numpy as np
 from pipeline.temperature.closed_loop import ClosedLoop, closed_loop
 from pipeline.temperature.order import (
     WORK,
-    WORTH_REFINING,
     WORTH_THE_NOISE,
     Candidate,
     Fit,
@@ -49,6 +49,7 @@ from pipeline.temperature.order import (
     tested_dead_times,
     windows,
     with_delays,
+    worth_refining,
 )
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.refinement import FitSettings, drives, estimate_state, simulation_form
@@ -447,11 +448,12 @@ def _work(u: Segments, row: Candidate) -> float:
 
 
 def _better_fit(start: Candidate, refined: list[Candidate]) -> Candidate:
-    """The subspace candidate, or its best refined fit where that is worth its cost."""
-    challenger = min(
-        refined, key=lambda row: row.error * (1 - WORTH_THE_NOISE) ** (row.fit == "prediction"), default=start
+    """The subspace candidate, or its best refined fit among those worth their cost."""
+    return min(
+        (row for row in refined if worth_refining(start, row)),
+        key=lambda row: row.error * (1 - WORTH_THE_NOISE) ** (row.fit == "prediction"),
+        default=start,
     )
-    return challenger if challenger.error < (1 - WORTH_REFINING) * start.error else start
 
 
 def _candidates(
