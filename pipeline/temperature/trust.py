@@ -143,10 +143,14 @@ def horizon(plant: Plant, longest: int) -> int:
     """Samples until every step response stays within 5 % of its
     output's largest one, and a third more; at most `longest`.
 
-    Of a plant with a pole outside the unit circle, three of its time
-    constants: later there is nothing else to see.
+    Of a plant with a pole outside the unit circle, three of its time constants: later there is nothing else
+    to see. A mode whose time constant is longer than `longest`, the record, is an integrator to it, and is
+    followed over a tenth: the record shows ten such stretches, and of one as long as itself no sign (of the
+    study's plant, 16 of 35 signs at one and 1 of them wrong, 22 at the other and none).
     """
     radius = np.abs(np.linalg.eigvals(plant.A)).max()
+    if abs(np.log(max(radius, np.finfo(float).tiny))) * longest < 1:
+        longest = max(longest // 10, 20)
     longest = min(longest, int(np.ceil(3 / np.log(radius)))) if radius > 1 + 1e-9 else longest
     r = step_response(plant, longest)
     away = (np.abs(r - r[-1]) > 0.05 * np.abs(r).max(axis=(0, 2))[:, None]).any(axis=(1, 2))
