@@ -10,6 +10,7 @@ import scipy.stats
 from pipeline.temperature.plant import Plant, clip_spectral_radius, markov_parameters
 from pipeline.temperature.plant import plant as make_plant
 from pipeline.temperature.refinement import (
+    Criterion,
     FitSettings,
     drives,
     estimate_state,
@@ -30,7 +31,7 @@ NOISE_FREE = 1e-10  # share of the outputs' power that a noise-free record's one
 WIDEST = 360  # columns of the lagged record: the cost of a fit grows with their square
 # a refined fit must take this share off the error: its own cost of computing and of fitting noise
 WORTH_REFINING = 0.05
-CHANCE = 0.1  # that blocks show a gain of a refined fit about their means where there is none
+CHANCE = 0.1  # that blocks show a gain where there is none
 # a simulation fit must take this share off a prediction fit's error: it leaves no model of the noise, and a
 # tracker needs one
 WORTH_THE_NOISE = 0.2
@@ -370,7 +371,7 @@ def fit(
 
 
 def _refined(
-    kind: Fit, start: Plant, u: Segments, y: Segments, settings: FitSettings, radius: float
+    kind: Criterion, start: Plant, u: Segments, y: Segments, settings: FitSettings, radius: float
 ) -> Plant:
     """`refine` with every pole within `radius`, from a start whose predictor may not be stable."""
     if kind == "prediction" and np.abs(np.linalg.eigvals(start.A - start.K @ start.C)).max() >= 1:
@@ -457,7 +458,12 @@ def worth_refining(start: Candidate, refined: Candidate) -> bool:
     """
     if refined.error >= (1 - WORTH_REFINING) * start.error:
         return False
-    gains = np.log(np.array(start.about_mean) / np.array(refined.about_mean))
+    return beyond_chance(np.log(np.array(start.about_mean) / np.array(refined.about_mean)))
+
+
+def beyond_chance(gains: np.ndarray) -> bool:
+    """Whether the mean of paired gains (blocks,) is above zero by Student's t, one-sided at `CHANCE`; of one
+    block, its sign."""
     if len(gains) < 2:
         return bool(gains.mean() > 0)
     uncertain = np.std(gains, ddof=1) / np.sqrt(len(gains))
