@@ -11,7 +11,8 @@ closed loop: Recognised by `closed_loop`. PBSID and prediction-error fits stay c
     simulated outputs do not, and are not tried. Candidates are judged one step ahead too.
 feed-through: With and without u(t) in the outputs whose one-step predictor Schwarz's criterion prefers with
     it, where `feedthrough` is None. None in closed loop: a row of D would be the controller's inverse.
-drift: What wanders and is not recorded becomes a state that hardly decays, with the rest of the order.
+drift: What wanders and is not recorded becomes a state that hardly decays, with the rest of the order; and a
+    random walk beside each output (`drift`), for forecasts, where the left-out blocks prefer it.
 largest order: The singular values, in units of the noise, above what coefficient errors alone reach:
     sqrt(2) (sqrt(rows) + sqrt(columns)) of the noise matrix.
 dead time: None; the lags at which the largest model's impulse response stays under 5 % of its peak; those
@@ -19,8 +20,9 @@ dead time: None; the lags at which the largest model's impulse response stays un
 order: The fewest parameters whose error is within 2 % of the best. The error is that of
     simulating left-out blocks (geometric mean).
 refinement: Where `refinement` is "validated", prediction-error fits of the best candidate of each structure.
-    One is taken where it takes more than 5 % off the error on the left-out blocks; one for simulation only
-    where it beats prediction by a fifth.
+    One is taken where it takes more than 5 % off the error on the left-out blocks, and beyond chance
+    (Student's t) off the error about their means; one for simulation only where it beats prediction by a
+    fifth.
 """
 
 from collections.abc import Sequence
@@ -29,9 +31,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from pipeline.temperature.closed_loop import ClosedLoop, closed_loop
+from pipeline.temperature.drift import chosen_rate
 from pipeline.temperature.order import (
     WORK,
-    WORTH_REFINING,
     WORTH_THE_NOISE,
     Candidate,
     Fit,
@@ -49,6 +51,7 @@ from pipeline.temperature.order import (
     tested_dead_times,
     windows,
     with_delays,
+    worth_refining,
 )
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.refinement import FitSettings, drives, estimate_state, simulation_form
@@ -71,7 +74,8 @@ class Identified(NamedTuple):
     order_table: candidates with their errors.
 
     delays are the dead times in the plant, in samples for each input; silent marks inputs that no output
-    answers, feedthrough the outputs with a row of D. x0 has the initial state of each segment, or of each
+    answers, feedthrough the outputs with a row of D. drift is the rate of a random walk beside the outputs, a
+    sample, 0 for none. x0 has the initial state of each segment, or of each
     piece where masked inputs cut one (`gapless`).
     """
 
@@ -91,6 +95,7 @@ class Identified(NamedTuple):
     dropped_rows: int
     notes: list[str]
     feedback: ClosedLoop | None = None
+    drift: float = 0.0
 
 
 class Settings(NamedTuple):
@@ -221,7 +226,11 @@ def identify(
     record = _prepared(u, y, settings, limits, names)
     choice, reasons, feedback = _chosen(record, settings)
     fitted = _fit_all(record.u, record.y, choice, sample_time_s, settings.max_radius)
-    fitted = fitted._replace(feedback=feedback)
+    rate = 0.0
+    if choice.table:
+        validation = _validation(record, settings, feedback)
+        rate = chosen_rate(record.u, record.y, choice.structure, choice.order, choice.fit, validation)
+    fitted = fitted._replace(feedback=feedback, drift=rate)
     return _with_remarks(fitted, record._replace(notes=record.notes + reasons), names)
 
 
@@ -248,7 +257,8 @@ def refit(
     exact = data is not None and windows(data)[1]
     choice = Choice(structure, identified.order, identified.fit, exact, table)
     fitted = _fit_all(record.u, record.y, choice, identified.plant.sample_time_s, max_radius)
-    return _with_remarks(fitted._replace(feedback=identified.feedback), record, names)
+    fitted = fitted._replace(feedback=identified.feedback, drift=identified.drift)
+    return _with_remarks(fitted, record, names)
 
 
 class _Record(NamedTuple):
@@ -306,10 +316,15 @@ def _chosen(record: _Record, settings: Settings) -> tuple[Choice, list[str], Clo
         choice = Choice(structure, settings.order or rank, kind, True, [])
     elif settings.order is None or validated:
         structures = [structure._replace(past=n, feedthrough=d) for n in pasts for d in direct]
-        validation = Validation(settings.blocks, record.recordings, closed, settings.max_radius)
+        validation = _validation(record, settings, feedback)
         best, table = _best_candidate(u, y, structures, settings, validation)
         choice = Choice(best.structure, best.order, best.fit if validated else choice.fit, False, table)
     return choice, notes + _reasons(choice, direct, closed), feedback
+
+
+def _validation(record: _Record, settings: Settings, feedback: ClosedLoop | None) -> Validation:
+    closed = feedback is not None and feedback.closed
+    return Validation(settings.blocks, record.recordings, closed, settings.max_radius)
 
 
 def _reasons(choice: Choice, direct: list[tuple[bool, ...]], closed: bool) -> list[str]:
@@ -447,11 +462,12 @@ def _work(u: Segments, row: Candidate) -> float:
 
 
 def _better_fit(start: Candidate, refined: list[Candidate]) -> Candidate:
-    """The subspace candidate, or its best refined fit where that is worth its cost."""
-    challenger = min(
-        refined, key=lambda row: row.error * (1 - WORTH_THE_NOISE) ** (row.fit == "prediction"), default=start
+    """The subspace candidate, or its best refined fit among those worth their cost."""
+    return min(
+        (row for row in refined if worth_refining(start, row)),
+        key=lambda row: row.error * (1 - WORTH_THE_NOISE) ** (row.fit == "prediction"),
+        default=start,
     )
-    return challenger if challenger.error < (1 - WORTH_REFINING) * start.error else start
 
 
 def _candidates(
@@ -526,6 +542,11 @@ def _remarks(fitted: Identified, names: Sequence[str]) -> list[str]:
         for j in range(fitted.plant.m)
         if fitted.silent[j]
     ]
+    if fitted.drift:
+        notes.append(
+            f"what is not recorded drifts: a level beside each output, tracked over {1 / fitted.drift:.0f} "
+            "samples, foretells left-out blocks better; it serves forecasts, and controllers do not get it"
+        )
     determined = int((fitted.singular_values > fitted.noise_edge).sum())
     if fitted.order > max(determined, 1) and not fitted.order_table:
         notes.append(

@@ -80,7 +80,13 @@ def free_response(model: Predictor, T: int) -> np.ndarray:
     ):  # an unstable model may overflow far ahead; `fitted_state` leaves those rows out
         while len(gamma) < T:
             gamma, power = np.concatenate([gamma, gamma @ power]), power @ power
-    return gamma[:T]
+    return _without_underflow(gamma[:T])
+
+
+def _without_underflow(response: np.ndarray) -> np.ndarray:
+    """A response that decayed under 1e-100 as zero there: products of such numbers underflow, and processors
+    take ten times as long over them (Z'Z of 6,000 samples: 40 against 4 ms)."""
+    return np.where(np.abs(response) < 1e-100, 0.0, response)
 
 
 def estimate_state(model: Predictor, v: np.ndarray, y: np.ndarray, *, free_mean: bool = False) -> np.ndarray:
@@ -193,7 +199,7 @@ def _normal_equations(
                 _filtered(blocks, np.hstack([x, v]), [0.0, 1.0]).reshape(len(v), state),
                 x,
                 v[:, columns],
-                _filtered(blocks, pulse, [1.0])[:, :, 0],
+                _without_underflow(_filtered(blocks, pulse, [1.0])[:, :, 0]),
             ]
         )
         e, mask, ZZ = y - predicted, None, None
@@ -302,7 +308,10 @@ def fit_inputs(A, C, u, y, *, feedthrough: bool | tuple[bool, ...], offset: bool
         v, T = drives("simulation", a, b), len(a)
         pulse = np.zeros((T, 1))
         pulse[0] = 1.0
-        f, f0 = _filtered(blocks, v[:, inputs], [0.0, 1.0]), _filtered(blocks, pulse, [1.0])
+        f, f0 = (
+            _filtered(blocks, v[:, inputs], [0.0, 1.0]),
+            _without_underflow(_filtered(blocks, pulse, [1.0])),
+        )
         for o in range(p):
             J = np.zeros((T, size + n * segments))
             J[:, : n * len(inputs)] = _mixed(model.C[o], blocks, f)

@@ -87,12 +87,15 @@ def lagged_moments(w: np.ndarray, past: int) -> np.ndarray:
     for j in range(past + 1):
         S[0, :, j] = w[past:].T @ w[past - j : L - j]
         S[j, :, 0] = S[0, :, j].T
+    entering, leaving = w[:past][::-1], w[L - past :][::-1]  # w(past-1-j) and w(L-1-j) at j = 0..past-1
     for i in range(past):
-        for j in range(i, past):
-            S[i + 1, :, j + 1] = (
-                S[i, :, j] + np.outer(w[past - 1 - i], w[past - 1 - j]) - np.outer(w[L - 1 - i], w[L - 1 - j])
-            )
-            S[j + 1, :, i + 1] = S[i + 1, :, j + 1].T
+        row = (
+            S[i, :, i:past]
+            + entering[i][:, None, None] * entering[i:]
+            - leaving[i][:, None, None] * leaving[i:]
+        )
+        S[i + 1, :, i + 1 :] = row
+        S[i + 1 :, :, i + 1] = row.transpose(1, 2, 0)
     return S.reshape((past + 1) * q, -1)
 
 

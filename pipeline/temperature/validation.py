@@ -250,7 +250,7 @@ def _reidentified(u: Segments, y: Segments, identified, order: int) -> Plant:
     data = lagged(us, ys, identified.past, feedthrough=any(direct), offset=identified.offset)
     basis = subspace(data, identified.past).basis[:order]
     start = stabilised(realise(data, basis, identified.plant.sample_time_s, direct), LARGEST_RADIUS)
-    settings = FitSettings(direct, identified.offset, max_iterations=RESAMPLED_STEPS)
+    settings = FitSettings(direct, identified.offset, LARGEST_RADIUS, RESAMPLED_STEPS)
     refitted = fit(identified.fit, start, us, ys, settings, gain=False)
     return with_delays(stabilised(refitted, LARGEST_RADIUS), identified.delays)
 

@@ -127,6 +127,7 @@ def _judged(
         settings.ahead_steps,
         block=2 * chosen.past,
         rng=np.random.default_rng(settings.seed),
+        drift=chosen.drift,
     )
     closed = chosen.feedback is not None and chosen.feedback.closed
     residuals = validation.residual_tests(
@@ -176,6 +177,8 @@ def _metrics(
         "order_tolerance_percent": 100 * order.WORTH_A_STATE,
         "past": fitted.past,
         "fit": fitted.fit,
+        # of what is not recorded; None where the left-out blocks do not prefer it, and in no controller
+        "drift_samples": 1.0 / fitted.drift if fitted.drift else None,
         "feedthrough": dict(zip(outputs, fitted.feedthrough, strict=True)),
         "validation": "recordings" if len(set(record.recordings)) > 1 else "blocks",
         "rows": fitted.rows,
