@@ -23,6 +23,7 @@ from pipeline.reading.formats import (
     time_column,
 )
 from pipeline.reading.instants import hyphen_fraction, instants, is_compact, month_first, over_midnight
+from pipeline.reading.long_tables import check_one_signal, naming_columns
 from pipeline.reading.signals import Note
 from pipeline.store.csv_rows import (
     LONGEST_TAIL,
@@ -77,6 +78,10 @@ def read_csv(path: Path, wanted: Sequence[str], time: str, decimal: str = "") ->
     interval = every(time)
     clock = None if interval else time_column(path, layout.names, time)
     places = [column_place(path, layout.names, name) for name in wanted]
+    for name in naming_columns(layout.names, [*wanted, clock or ""]):
+        place = column_place(path, layout.names, name)
+        owners = ((f"line {line}", row[place]) for line, row in rows(path, layout) if len(row) > place)
+        check_one_signal(path, name, ((at, owner) for at, owner in owners if owner.strip() != name))
     layout = _decided(path, layout, [*wanted, *([] if clock is None else [clock])])
     notes = list(layout.notes)
     clocks = None if clock is None else _Clock(path, layout, clock)
@@ -266,7 +271,7 @@ class _Clock:
         """time_s or time_ns (n,) and its zone."""
         times = self.times.finished()[0]
         if self.numeric:
-            times, remark = seconds(self.name, times)
+            times, remark = seconds(self.name, times, self.layout.units[self.place])
             if remark:
                 notes.append(Note("clock", "", 1, remark))
             return times, "UTC"

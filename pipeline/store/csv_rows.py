@@ -233,6 +233,9 @@ def _delimiter(lines: Sequence[str], decimals: Sequence[str]) -> tuple[str, str]
         fields = [field for row in split for field in row]
         quantities = sum(is_quantity(field, decimal) for field in fields)
         score = (quantities, quantities / max(len(fields), 1))
+        # blanks inside of names and units make no table where another mark gives as many numbers
+        if delimiter == " " and quantities <= best[0]:
+            continue
         if score > best:
             best, choice = score, (delimiter, decimal)
     return choice
