@@ -15,6 +15,7 @@ from pipeline.reading.formats import (
     Columns,
     Growing,
     check_no_counter,
+    check_no_day_fractions,
     column_place,
     date_column,
     every,
@@ -106,8 +107,10 @@ def read_csv(path: Path, wanted: Sequence[str], time: str, decimal: str = "") ->
             "header; mend the rows, or record it again"
         )
     times, zone = clocks.finished(notes) if clocks else (np.arange(count) * interval, "")
-    if clocks and clocks.numeric and not time:
-        check_no_counter(path, clocks.name, times)
+    if clocks and clocks.numeric:
+        check_no_day_fractions(path, clocks.name, times, layout.units[clocks.place])
+        if not time:
+            check_no_counter(path, clocks.name, times)
     columns_forward, turned = forward(Columns("rows", times, values, place, zone))
     return columns_forward, notes + turned
 

@@ -323,6 +323,20 @@ def check_no_counter(path: Path, name: str, time: np.ndarray) -> None:
         )
 
 
+def check_no_day_fractions(path: Path, name: str, time: np.ndarray, written: str = "") -> None:
+    """Raises ValueError where a time without a unit may be the fraction of a day that spreadsheets write for
+    a time of day: as seconds, it would have more than 11,000 samples a second."""
+    if _time_unit(name)[1] or written.strip(" ()[]").casefold() in _PER_SECOND or len(time) < 3:
+        return
+    step = float(np.median(np.abs(np.diff(time))))
+    if time.min() >= 0 and time.max() < 2 and 0 < step * 86400 < 8:
+        raise ValueError(
+            f"{path}: time {name} runs from {time.min():.6g} to {time.max():.6g} in steps of {step:.3g}, "
+            f"which may be seconds, or days with {step * 86400:.3g} s between samples; "
+            f"write its unit into its name, as in {name}_s or {name}_days"
+        )
+
+
 # ---- which way the time runs
 
 

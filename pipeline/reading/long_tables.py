@@ -42,8 +42,8 @@ def check_one_signal(path: Path, name: str, owners: Iterable[tuple[str, str]]) -
         owner = owner.strip()
         if first and owner and owner != first:
             raise ValueError(
-                f"{path}: {place}, column {name} names {owner[:40]!r} but the rows before {first[:40]!r}: values of "
-                "several signals stand in one column; write a column for each (a pivot table), or a file for "
-                "each"
+                f"{path}: {place}, column {name} names {owner[:40]!r} but the rows before {first[:40]!r}: "
+                "values of several signals stand in one column; write a column for each (a pivot table), "
+                "or a file for each"
             )
         first = first or owner

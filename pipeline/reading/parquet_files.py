@@ -14,6 +14,7 @@ from pipeline.reading.formats import (
     Columns,
     Growing,
     check_no_counter,
+    check_no_day_fractions,
     column_place,
     every,
     forward,
@@ -139,6 +140,8 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns,
     else:
         is_time = kinds[clock] is np.int64 or not _is_numeric(types[clock])
         clock_values, remark = (values[clock], "") if is_time else seconds(clock, values[clock], units[clock])
+        if _is_numeric(types[clock]):
+            check_no_day_fractions(path, clock, clock_values, units[clock])
         if not time and _is_numeric(types[clock]):
             check_no_counter(path, clock, clock_values)
     if remark:

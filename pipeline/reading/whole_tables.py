@@ -10,6 +10,7 @@ from pipeline.reading.formats import (
     INDEX_NAMES,
     Column,
     Columns,
+    check_no_day_fractions,
     column_place,
     every,
     forward,
@@ -103,6 +104,7 @@ def _clock(path: Path, table: WholeTable, names: Sequence[str], time: str) -> tu
             "or name another column"
         )
     clock, remark = seconds(name, table.values[name], table.units.get(name, ""))
+    check_no_day_fractions(path, name, clock, table.units.get(name, ""))
     return clock, "UTC", remark
 
 
