@@ -15,6 +15,7 @@ from pipeline.reading.formats import (
     Columns,
     Growing,
     check_no_counter,
+    check_no_day_fractions,
     column_place,
     date_column,
     every,
@@ -23,6 +24,7 @@ from pipeline.reading.formats import (
     time_column,
 )
 from pipeline.reading.instants import hyphen_fraction, instants, is_compact, month_first, over_midnight
+from pipeline.reading.long_tables import check_one_signal, naming_columns
 from pipeline.reading.signals import Note
 from pipeline.store.csv_rows import (
     LONGEST_TAIL,
@@ -77,6 +79,10 @@ def read_csv(path: Path, wanted: Sequence[str], time: str, decimal: str = "") ->
     interval = every(time)
     clock = None if interval else time_column(path, layout.names, time)
     places = [column_place(path, layout.names, name) for name in wanted]
+    for name in naming_columns(layout.names, [*wanted, clock or ""]):
+        place = column_place(path, layout.names, name)
+        owners = ((f"line {line}", row[place]) for line, row in rows(path, layout) if len(row) > place)
+        check_one_signal(path, name, ((at, owner) for at, owner in owners if owner.strip() != name))
     layout = _decided(path, layout, [*wanted, *([] if clock is None else [clock])])
     notes = list(layout.notes)
     clocks = None if clock is None else _Clock(path, layout, clock)
@@ -101,8 +107,10 @@ def read_csv(path: Path, wanted: Sequence[str], time: str, decimal: str = "") ->
             "header; mend the rows, or record it again"
         )
     times, zone = clocks.finished(notes) if clocks else (np.arange(count) * interval, "")
-    if clocks and clocks.numeric and not time:
-        check_no_counter(path, clocks.name, times)
+    if clocks and clocks.numeric:
+        check_no_day_fractions(path, clocks.name, times, layout.units[clocks.place])
+        if not time:
+            check_no_counter(path, clocks.name, times)
     columns_forward, turned = forward(Columns("rows", times, values, place, zone))
     return columns_forward, notes + turned
 
@@ -266,7 +274,7 @@ class _Clock:
         """time_s or time_ns (n,) and its zone."""
         times = self.times.finished()[0]
         if self.numeric:
-            times, remark = seconds(self.name, times)
+            times, remark = seconds(self.name, times, self.layout.units[self.place])
             if remark:
                 notes.append(Note("clock", "", 1, remark))
             return times, "UTC"

@@ -54,7 +54,7 @@ def _layout(path: Path, declared: str) -> tuple[CsvLayout, list[list[str]]]:
     if (
         len(heads) > 1
         and heads[-2] == heads[-1] - 1
-        and heads[-1] == first - 1
+        and not any(any(row) for row in rows[heads[-1] + 1 : first])
         and written[-2] >= written[-1]
     ):
         names, units = (

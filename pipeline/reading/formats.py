@@ -56,6 +56,8 @@ _TIME_NAMES = (
     "index",
 )
 DATE_NAMES = ("date", "datum")
+# times from a start, which no date beside them belongs to
+_ELAPSED = ("elapsed", "elapsed_time", "relative_time", "uptime", "runtime")
 # what pandas calls the index of a table where nobody named it
 INDEX_NAMES = ("", "Unnamed: 0", "__index_level_0__", "index")
 _PER_SECOND = {"s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0,
@@ -92,6 +94,7 @@ _OTHER_FORMATS = {
     b"TDSm": ("TDMS of LabVIEW", "export it as CSV"),
     b"\xd0\xcf\x11\xe0": ("Excel 97 or a workbook with a password", "save it as .xlsx without one"),
     b"ARROW1": ("an Arrow file", "write it as Parquet"),
+    b"PARE": ("an encrypted Parquet file", "write it without encryption"),
 }
 
 
@@ -260,18 +263,20 @@ def _word(name: str) -> str:
 
 
 def date_column(names: Sequence[str], clock: str) -> str | None:
-    """The column of the date beside that of the time of day."""
+    """The column of the date beside that of the time of day, None beside a time from a start."""
+    if _time_unit(clock)[0] in _ELAPSED:
+        return None
     return next((name for name in names if name != clock and _time_unit(name)[0] in DATE_NAMES), None)
 
 
-def seconds(name: str, numbers: np.ndarray) -> tuple[np.ndarray, str]:
+def seconds(name: str, numbers: np.ndarray, written: str = "") -> tuple[np.ndarray, str]:
     """Time in seconds, and a remark if the unit was guessed.
 
-    The unit is that of the column's name. Without one it is seconds, or what the size of the numbers tells:
-    an epoch, or a spreadsheet's days.
+    The unit is that of the column's name, or the one `written` beside it, as in a row of units. Without one
+    it is seconds, or what the size of the numbers tells: an epoch, or a spreadsheet's days.
     """
-    unit = _time_unit(name)[1]
-    if unit:
+    unit = _time_unit(name)[1] or written.strip(" ()[]").casefold()
+    if unit in _PER_SECOND:
         return numbers / _PER_SECOND[unit], ""
     finite = numbers[np.isfinite(numbers)]
     low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
@@ -318,6 +323,20 @@ def check_no_counter(path: Path, name: str, time: np.ndarray) -> None:
         )
 
 
+def check_no_day_fractions(path: Path, name: str, time: np.ndarray, written: str = "") -> None:
+    """Raises ValueError where a time without a unit may be the fraction of a day that spreadsheets write for
+    a time of day: as seconds, it would have more than 11,000 samples a second."""
+    if _time_unit(name)[1] or written.strip(" ()[]").casefold() in _PER_SECOND or len(time) < 3:
+        return
+    step = float(np.median(np.abs(np.diff(time))))
+    if time.min() >= 0 and time.max() < 2 and 0 < step * 86400 < 8:
+        raise ValueError(
+            f"{path}: time {name} runs from {time.min():.6g} to {time.max():.6g} in steps of {step:.3g}, "
+            f"which may be seconds, or days with {step * 86400:.3g} s between samples; "
+            f"write its unit into its name, as in {name}_s or {name}_days"
+        )
+
+
 # ---- which way the time runs
 
 
@@ -352,11 +371,11 @@ def check_clock(path: Path, group: Columns) -> None:
     if (time[1:] > time[:-1]).all():
         return
     steps = np.diff(time)
-    back = np.flatnonzero(steps <= 0)
+    back = np.flatnonzero(time[1:] <= time[:-1])  # a step over half of all int64 would seem to run forward
     i, count = int(back[0]), len(back)
     unit = 1e9 if time.dtype == np.int64 else 1.0
-    start = time[0] if unit == 1e9 else 0
-    now, before = (float(time[j] - start) / unit for j in (i + 1, i))
+    start = time[0].item() if unit == 1e9 else 0
+    now, before = ((time[j].item() - start) / unit for j in (i + 1, i))
     since = " after the first" if start else ""
     problem = (
         f"has the same time as the sample before it, {now:.9g} s{since}"

@@ -147,8 +147,9 @@ def _day_and_month(first: int, second: int, mark: str, month_first: bool | None)
 def month_first(dates: Iterable[str], sample: str) -> bool | None:
     """Whether dates such as 05/03/2025 begin with the month, None if nothing tells.
 
-    A date that can be only one of both tells, and so do the am and pm of `sample`. A single day is the same
-    either way.
+    A date that can be only one of both tells, and so do the am and pm of `sample` where the days run on in
+    one month: 11/03 before 12/03 is the next day in Australia, and a month later in America. A single day is
+    the same either way.
     """
     pairs = {
         (int(match[1]), int(match[2]))
@@ -157,7 +158,7 @@ def month_first(dates: Iterable[str], sample: str) -> bool | None:
     }
     if any(first > 12 for first, _ in pairs):
         return False
-    american = re.search(r"\d\s*[AaPp]\.?[Mm]", sample)
+    american = re.search(r"\d\s*[AaPp]\.?[Mm]", sample) and len({second for _, second in pairs}) > 1
     return True if american or len(pairs) == 1 or any(second > 12 for _, second in pairs) else None
 
 

@@ -147,8 +147,8 @@ def _ended(shown: str | Path, budget: Budget, status: int, last: str) -> str:
             f"{shown}: reading it takes longer than the {budget.longest_s:g} s that a recording may take; "
             "split the recording, or raise ingest.longest_s in params.expert.yaml if it is as long as that"
         )
-    # as C++, Python and Arrow end without memory
-    if any(word in last for word in ("bad_alloc", "MemoryError", "Out of memory")):
+    # as C++, Python, Arrow and Rust end without memory
+    if any(words in last for words in ("bad_alloc", "MemoryError", "Out of memory", "memory allocation of")):
         return _out_of_memory(shown, budget)
     if status == -signal.SIGKILL:
         return (

@@ -171,6 +171,8 @@ class _Log:
         words = text.split()
         at = next((i for i, word in enumerate(words) if word in _STATS), None)
         if at is None:
+            if b"\0" in text:  # what a file system leaves after a power failure
+                self._count_garbled(line)
             return
         if len(words) <= at + 2:
             self.cut += 1
@@ -218,7 +220,9 @@ class _Log:
     def notes(self) -> list[Note]:
         notes = []
         if self.garbled:
-            message = f"{self.garbled} Stats lines hold text in place of a number and were left out"
+            message = (
+                f"{self.garbled} Stats lines hold text or zero bytes in place of a number and were left out"
+            )
             notes.append(
                 Note("damage", "", self.garbled, f"{message}, the first is line {self.first_garbled}")
             )

@@ -22,6 +22,8 @@ _CELL, _STRUCTURE, _OBJECT, _TEXT, _SPARSE, _NUMBERS = 1, 2, 3, 4, 5, range(6, 1
 _COMPLEX = 0x0800
 _CLASSES = {_SPARSE: "a sparse matrix", 16: "a function", 17: "an object; save its time and data as vectors"}
 _DEEPEST, MOST_PARTS = 8, 20_000
+# numpy has 64
+_MOST_DIMENSIONS = 32
 
 
 class _Part(NamedTuple):
@@ -91,8 +93,20 @@ def _with_clock(values: dict[str, np.ndarray], others: dict[str, str]) -> WholeT
         name = min(forward, key=len)
         time, remark = seconds(name.rpartition(".")[2], values[name])
         notes.append(Note("clock", "", 1, remark or f"{name} is the clock"))
-        values = {other: column for other, column in values.items() if other not in forward}
+        for other in sorted(set(values) - set(forward)):
+            own = _own_clock(other, forward)
+            if own and not np.array_equal(values[own], values[name]):
+                others[other] = f"numbers on a clock of its own, {own}; save it with its clock alone"
+        values = {
+            other: column for other, column in values.items() if other not in forward and other not in others
+        }
     return WholeTable(values, {}, time, "UTC", lambda i: f"sample {i + 1}", notes, {}, others, {})
+
+
+def _own_clock(name: str, clocks: list[str]) -> str:
+    """The clock of the innermost structure around `name` that has one, "" for none."""
+    around = [clock for clock in clocks if "." in clock and name.startswith(clock.rpartition(".")[0] + ".")]
+    return max(around, key=lambda clock: clock.count("."), default="")
 
 
 def _common_length(arrays: dict[str, np.ndarray]) -> int:
@@ -201,6 +215,8 @@ def _numeric(name: str, numbers: np.ndarray, shape: tuple[int, ...], is_complex:
         raise _Broken(f"{name} should have {count} numbers but has {len(numbers)}")
     if count > MOST_VALUES:
         raise _Broken(f"{name} has {count} numbers, more than the {MOST_VALUES} that are read")
+    if len(shape) > _MOST_DIMENSIONS:
+        return _Part(name, None, f"an array of {len(shape)} dimensions")
     if is_complex:
         return _Part(name, None, "complex numbers")
     words = f"one number, {float(numbers[0]):g}" if count == 1 else f"{count} numbers"

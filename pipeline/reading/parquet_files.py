@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from pipeline.reading.arrow_arrays import numbers
@@ -13,6 +14,7 @@ from pipeline.reading.formats import (
     Columns,
     Growing,
     check_no_counter,
+    check_no_day_fractions,
     column_place,
     every,
     forward,
@@ -21,6 +23,7 @@ from pipeline.reading.formats import (
     time_column,
 )
 from pipeline.reading.instants import instants
+from pipeline.reading.long_tables import check_one_signal, naming_columns
 from pipeline.reading.signals import Note
 
 ROWS_AT_ONCE = 50_000
@@ -39,7 +42,8 @@ def _parquet(path: Path) -> pq.ParquetFile:
 
 
 def _first_line(error: Exception) -> str:
-    return str(error).strip().splitlines()[0]
+    """The first line of an error, which may hold a whole value of the file."""
+    return str(error).strip().splitlines()[0][:200]
 
 
 def _flat(table: pa.Table) -> pa.Table:
@@ -103,6 +107,7 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns,
     file, columns = _parquet(path), parquet_columns(path)
     types = {name: field.type for name, field in _leaves(file.schema_arrow, "")}
     names = [column.name for column in columns]
+    units = {column.name: column.unit for column in columns}
     interval = every(time)
     clock = ""
     if not interval:
@@ -120,6 +125,7 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns,
                 "or map another column"
             )
     read = list(dict.fromkeys([*wanted, *([clock] if clock else [])]))
+    _check_one_signal(path, file, types, [*wanted, clock])
     kinds = {
         name: np.int64 if _is_stamp(kind) or (name == clock and _is_text(kind)) else float
         for name, kind in types.items()
@@ -133,7 +139,9 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns,
         clock_values, remark = np.arange(count) * interval, ""
     else:
         is_time = kinds[clock] is np.int64 or not _is_numeric(types[clock])
-        clock_values, remark = (values[clock], "") if is_time else seconds(clock, values[clock])
+        clock_values, remark = (values[clock], "") if is_time else seconds(clock, values[clock], units[clock])
+        if _is_numeric(types[clock]):
+            check_no_day_fractions(path, clock, clock_values, units[clock])
         if not time and _is_numeric(types[clock]):
             check_no_counter(path, clock, clock_values)
     if remark:
@@ -142,6 +150,25 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns,
         Columns("rows", clock_values, {name: values[name] for name in wanted}, lambda i: f"row {i}", zone)
     )
     return table_columns, notes + turned
+
+
+def _check_one_signal(
+    path: Path, file: pq.ParquetFile, types: dict[str, pa.DataType], wanted: Sequence[str]
+) -> None:
+    """Raises ValueError for a table whose rows are of several signals."""
+    for name in naming_columns(list(types), wanted):
+        if not _is_text(types[name]):
+            continue
+        owners: dict[str, str] = {}
+        first = 0
+        for batch in file.iter_batches(ROWS_AT_ONCE, columns=[name], use_threads=False):
+            column = _flat(pa.Table.from_batches([batch]))[name].cast(pa.string())
+            for owner in column.unique().drop_null().to_pylist():
+                owners.setdefault(owner, f"row {first + pc.index(column, owner).as_py()}")
+            if len(owners) > 1:
+                break
+            first += len(batch)
+        check_one_signal(path, name, ((place, owner) for owner, place in owners.items()))
 
 
 def _values(path: Path, file: pq.ParquetFile, kinds: dict[str, type], clock: str) -> dict[str, np.ndarray]:

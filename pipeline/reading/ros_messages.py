@@ -387,7 +387,8 @@ def _order(steps: list, names: Sequence[str]) -> list[int]:
 
 
 def _decode(messages: list[bytes], steps: list, exact: bool, padding: int) -> np.ndarray:
-    """The numbers of the messages by the steps. Up to `padding` bytes may follow the last step."""
+    """The numbers of the messages by the steps. Up to `padding` bytes may follow the last step; those from
+    the fourth on would hold a number of another schema, and must be zeros."""
     rows = []
     try:
         if len(steps) == 1 and isinstance(steps[0], _FixedRow):
@@ -397,17 +398,23 @@ def _decode(messages: list[bytes], steps: list, exact: bool, padding: int) -> np
                 layout.size,
                 layout.size + padding if exact else np.inf,
             )
-            rows = [unpack(data) for data in messages if shortest <= len(data) <= longest]
-            if len(rows) < len(messages):
-                wrong = next(len(data) for data in messages if not shortest <= len(data) <= longest)
+            near = shortest + 3 if exact else np.inf
+            fits = [
+                shortest <= len(data) <= near or (near < len(data) <= longest and not any(data[shortest:]))
+                for data in messages
+            ]
+            if not all(fits):
+                wrong = len(messages[fits.index(False)])
                 raise UnreadableMessage(f"a message of {wrong} bytes where {shortest} are expected")
+            rows = [unpack(data) for data in messages]
         else:
             for data in messages:
                 values: list[float] = []
                 pos = 0
                 for step in steps:
                     pos = step.read(data, pos, values)
-                if pos > len(data) or (exact and len(data) - pos > padding):
+                behind = len(data) - pos
+                if behind < 0 or (exact and (behind > padding or (behind > 3 and any(data[pos:])))):
                     raise UnreadableMessage(f"a message of {len(data)} bytes where {pos} are expected")
                 rows.append(values)
     except struct.error as error:

@@ -15,7 +15,9 @@ from typing import Any
 import numpy as np
 import python_calamine
 
-from pipeline.reading.instants import over_midnight
+from pipeline.reading.formats import date_column, is_time_name
+from pipeline.reading.instants import DAY_NS, over_midnight
+from pipeline.reading.long_tables import check_one_signal, naming_columns
 from pipeline.reading.signals import Note
 from pipeline.reading.whole_tables import LARGEST_UNPACKED, WholeTable, check_width
 from pipeline.store.csv_rows import MISSING
@@ -23,9 +25,10 @@ from pipeline.store.csv_rows import MISSING
 MOST_CELLS = 15_000_000
 # of all cells together, in characters
 MOST_TEXT = 1 << 28
-_CELL = re.compile(rb'<(?:\w+:)?c\s[^>]*?\br=["\']([A-Z]{1,3})(\d{1,7})')
-_SHEET = re.compile(r"xl/worksheets/[^/]+\.xml$")
-_ROW = re.compile(rb'<(?:\w+:)?row\s[^>]*?\br=["\'](\d{1,7})')
+_CELL = re.compile(rb'<(?:\w+:)?c\s[^>]*?\br\s*=\s*["\']([A-Za-z]{1,3})(\d{1,7})')
+# sheets may lie anywhere; the list of formulas names cells too
+_SHEET = re.compile(r"(?!xl/calcChain\.xml$).*\.xml$", re.IGNORECASE)
+_ROW = re.compile(rb'<(?:\w+:)?row\s[^>]*?\br\s*=\s*["\'](\d{1,7})')
 _EPOCH = datetime.datetime(1970, 1, 1)
 
 
@@ -76,7 +79,7 @@ def _table(path: Path, sheet: str, rows: list[list[Any]], notes: list[Note]) -> 
         names = [f"column_{j + 1}" for j in range(width)]
     data = [(i + 1, row) for i, row in enumerate(rows) if i >= first and any(cell != "" for cell in row)]
     lines = [line for line, _ in data]
-    values, given, others, stamps = {}, {}, {}, {}
+    values, given, others, stamps, of_day = {}, {}, {}, {}, set()
     for j, column in enumerate(names):
         cells = [row[j] if j < len(row) else "" for _, row in data]
         if not column or column in values or column in stamps:
@@ -86,11 +89,27 @@ def _table(path: Path, sheet: str, rows: list[list[Any]], notes: list[Note]) -> 
             values[column], given[column] = numbers, units[j]
         elif (ns := _instants(cells)) is not None:
             stamps[column] = ns
+            of_day |= {column} if all(isinstance(cell, datetime.time) for cell in cells) else set()
         else:
             others[column] = f"text such as {next((str(c) for c in cells if c != ''), '')[:20]!r}"
+            if naming_columns([column], []):
+                check_one_signal(
+                    path, column, ((f"row {line}", str(c)) for line, c in zip(lines, cells, strict=True))
+                )
+    _join_dates(stamps, of_day, others)
     return WholeTable(
         values, given, None, "", lambda i: f"row {lines[i]} of sheet {sheet}", notes, {}, others, stamps
     )
+
+
+def _join_dates(stamps: dict[str, np.ndarray], of_day: set[str], others: dict[str, str]) -> None:
+    """Puts the column of the date and that of the time of day beside it together."""
+    dates = [name for name, ns in stamps.items() if name not in of_day and not (ns % DAY_NS).any()]
+    for name in of_day:
+        if is_time_name(name) and (date := date_column(dates, name)) is not None:
+            stamps[name] = stamps.pop(date) + stamps[name] % DAY_NS
+            others[date] = f"the date of {name}"
+            return
 
 
 def _is_number(cell: Any) -> bool:
@@ -204,6 +223,6 @@ def _longest_text(archive: zipfile.ZipFile) -> int:
 
 def _column(letters: bytes) -> int:
     number = 0
-    for letter in letters:
+    for letter in letters.upper():
         number = number * 26 + letter - 64
     return number

@@ -6,7 +6,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.reading.formats import Column, Columns, column_place, every, forward, seconds, time_column
+from pipeline.reading.formats import (
+    INDEX_NAMES,
+    Column,
+    Columns,
+    check_no_day_fractions,
+    column_place,
+    every,
+    forward,
+    is_time_name,
+    seconds,
+    time_column,
+)
 from pipeline.reading.signals import Note
 
 # what is unpacked of one spreadsheet or MATLAB file, in bytes; a print log of a day has 100 MB
@@ -82,7 +93,8 @@ def select(path: Path, table: WholeTable, wanted: Sequence[str], time: str) -> t
 def _clock(path: Path, table: WholeTable, names: Sequence[str], time: str) -> tuple[np.ndarray, str, str]:
     """(time, zone, remark) of the column that `time` names, or of the first with the name of a time."""
     if not time and table.stamps:
-        return next(iter(table.stamps.values())), "", ""
+        called = [name for name in (*table.stamps, *table.values) if _is_clock_name(name)]
+        time = time_column(path, called, "") if called else next(iter(table.stamps))
     name = time_column(path, names, time)
     if name in table.stamps:
         return table.stamps[name], "", ""
@@ -91,8 +103,14 @@ def _clock(path: Path, table: WholeTable, names: Sequence[str], time: str) -> tu
             f"{path}: time {name} should be seconds or a date but holds {table.others[name]}; convert it, "
             "or name another column"
         )
-    clock, remark = seconds(name, table.values[name])
+    clock, remark = seconds(name, table.values[name], table.units.get(name, ""))
+    check_no_day_fractions(path, name, clock, table.units.get(name, ""))
     return clock, "UTC", remark
+
+
+def _is_clock_name(name: str) -> bool:
+    """Whether a column beside dates is called like a time, and neither like a temperature nor a counter."""
+    return is_time_name(name) and name not in ("T", *INDEX_NAMES)
 
 
 def check_values(path: Path, rows: int, columns: int) -> None:

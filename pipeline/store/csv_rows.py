@@ -222,9 +222,9 @@ def _encoding(path: Path, start: bytes) -> tuple[str, list[Note]]:
 
 
 def _delimiter(lines: Sequence[str], decimals: Sequence[str]) -> tuple[str, str]:
-    """The delimiter and decimal mark that make most fields numbers. Of equal ones, those that leave the
-    fewest other fields are taken; the blank is tried last."""
-    best, choice = (0.0, 0.0), (",", decimals[0])
+    """The delimiter and decimal mark that make most fields numbers. Of equal ones, those are taken that give
+    most lines one width, and then those that leave the fewest other fields; the blank is tried last."""
+    best, choice = (0.0, 0.0, 0.0), (",", decimals[0])
     for delimiter, decimal in itertools.product((",", ";", "\t", "|", " "), decimals):
         split = [_split(line, delimiter) for line in lines[:50]]
         if delimiter == " ":  # in words before the table there are numbers too
@@ -232,7 +232,13 @@ def _delimiter(lines: Sequence[str], decimals: Sequence[str]) -> tuple[str, str]
             split = [row for row in split if len(row) == width]
         fields = [field for row in split for field in row]
         quantities = sum(is_quantity(field, decimal) for field in fields)
-        score = (quantities, quantities / max(len(fields), 1))
+        # a comma before decimals splits the rows, and not the header
+        widths = collections.Counter(map(len, split)).most_common(1)
+        alike = widths[0][1] / len(split) if widths else 0.0
+        score = (quantities, alike, quantities / max(len(fields), 1))
+        # blanks inside of names and units make no table where another mark gives as many numbers
+        if delimiter == " " and quantities <= best[0]:
+            continue
         if score > best:
             best, choice = score, (delimiter, decimal)
     return choice

@@ -1,6 +1,10 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from pipeline.reading.clocks import mended
+from pipeline.reading.formats import Columns
 from pipeline.reading.recordings import Source, read, resample
 
 SOURCES = [Source("u", "u", "percent"), Source("y", "y", "degC")]
@@ -122,3 +126,10 @@ def test_many_rows_with_the_time_of_another_are_refused(tmp_path):
     times[10:40:5] -= 1
     with pytest.raises(ValueError, match="has the same time as the sample before it, 9.5 s, the first of 6"):
         opened(tmp_path, times)
+
+
+def test_a_clock_that_falls_by_more_than_half_of_all_counts_is_refused_in_one_sentence():
+    time = np.array([2**63 - 2, 2**63 - 1, -(2**63), 1 - 2**63])
+    group = Columns("/zone", time, {"T": np.arange(4.0)}, lambda i: f"message {i + 1}")
+    with pytest.raises(ValueError, match="message 3 is at .* which is before the sample ahead of it"):
+        mended(Path("rig.mcap"), group, may_restart=False)

@@ -97,7 +97,9 @@ def test_times_of_day_count_from_midnight_and_run_on_over_the_next():
 def test_day_and_month_are_told_by_a_date_that_can_be_only_one_of_both():
     assert month_first(["05/03/2025", "13/03/2025"], "05/03/2025") is False
     assert month_first(["05/03/2025", "05/13/2025"], "05/03/2025") is True
-    assert month_first(["05/03/2025", "06/03/2025"], "05/03/2025 1:00:00 PM") is True
+    # the days of one month run on in the second place where the month comes first
+    assert month_first(["03/05/2025", "03/06/2025"], "03/05/2025 1:00:00 PM") is True
+    assert month_first(["05/03/2025", "06/03/2025"], "05/03/2025 1:00:00 PM") is None
     assert month_first(["05/03/2025", "06/03/2025"], "05/03/2025 13:00:00") is None
     # of one day alone only the time of day matters
     assert month_first(["05/03/2025"], "05/03/2025") is not None

@@ -186,3 +186,14 @@ def test_a_log_of_more_numbers_than_fit_into_memory_is_refused(tmp_path, monkeyp
     lines += [f"Stats {k}.0: gcodein=0 print_time={k}" for k in range(2, 200)]
     with pytest.raises(ValueError, match="are more than the 1000 numbers that are read; split the recording"):
         load_klippy(write(tmp_path, "\n".join(lines) + "\n"))
+
+
+def test_a_line_behind_zero_bytes_is_counted_and_left_out(tmp_path, log):
+    lines = log.splitlines(keepends=True)
+    place = [i for i, line in enumerate(lines) if "Stats " in line and "print_time" in line][5]
+    path = write(tmp_path, "".join([*lines[:place], "\0" * 4000, *lines[place:]]))
+    notes = [note.message for note in load_klippy(path).notes]
+    counted = [note for note in notes if "hold text or zero bytes" in note]
+    assert len(counted) == 1
+    assert counted[0].startswith("1 Stats lines ")
+    assert counted[0].endswith(f"the first is line {place + 1}")

@@ -110,3 +110,25 @@ def test_entries_of_a_structure_and_of_a_cell_have_a_name_each(tmp_path):
     text = inspect(path)
     for name in ("zones_1.T", "zones_2.T", "runs_1"):
         assert name in text
+
+
+def test_a_signal_on_a_clock_of_its_own_is_not_read_on_that_of_another(tmp_path):
+    content = {"u": {"t": TIME, "v": HEAT}, "y": {"t": TIME + 0.25, "v": HEAT}}
+    path = write(tmp_path, saved(content))
+    np.testing.assert_array_equal(read(path, [Source("u", "u.v", "percent")]).signals["u"][0], TIME)
+    with pytest.raises(ValueError, match=r"column y.v should hold numbers but .* a clock of its own, y.t;"):
+        read(path, [Source("y", "y.v", "degC")])
+    content["y"]["t"] = TIME
+    raw = read(write(tmp_path, saved(content)), [Source("y", "y.v", "degC")])
+    np.testing.assert_array_equal(raw.signals["y"][0], TIME)
+
+
+def test_an_array_of_eighty_dimensions_is_no_column(tmp_path):
+    shape = struct.pack("<82i", 60, *[1] * 81)
+    body = struct.pack("<IIII", 6, 8, 6, 0) + struct.pack("<II", 5, len(shape)) + shape
+    body += struct.pack("<HH4s", 1, 1, b"X") + struct.pack("<II", 9, HEAT.nbytes) + HEAT.tobytes()
+    content = saved({"t": TIME, "u": HEAT}) + struct.pack("<II", 14, len(body)) + body
+    path = write(tmp_path, content)
+    np.testing.assert_array_equal(read(path, [Source("u", "u", "percent")]).signals["u"][1], HEAT)
+    with pytest.raises(ValueError, match="column X should hold numbers but holds an array of 82 dimensions"):
+        read(path, [Source("u", "X", "percent")])

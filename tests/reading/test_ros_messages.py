@@ -160,3 +160,12 @@ def test_messages_recorded_by_ros_2_are_read_to_their_last_field(shared):
         ]
         # defaults of rosbag2's test_msgs/Arrays, as its message definition prints them
         assert numbers(definition, data, names) == [2**31 - 1, 2.0**64, 1.125, 0]
+
+
+@pytest.mark.parametrize("definition", ["float32 a\n", "string name\nfloat32 a\n"])
+def test_a_message_with_a_number_behind_what_its_schema_says_is_refused(definition):
+    head = [("s", "rig")] if "name" in definition else []
+    assert numbers(definition, cdr(*head, ("f", [2.5])) + bytes(4), ["a"]) == [2.5]  # padded to eight
+    assert numbers(definition, cdr(*head, ("f", [2.5])) + b"abc", ["a"]) == [2.5]
+    with pytest.raises(UnreadableMessage, match=r"a message of \d+ bytes where \d+ are expected"):
+        numbers(definition, cdr(*head, ("I", [7]), ("f", [200.5])), ["a"])

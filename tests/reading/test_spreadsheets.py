@@ -173,3 +173,13 @@ def test_a_text_that_thousands_of_cells_share_is_refused_before_it_is_copied(tmp
         )
     with pytest.raises(ValueError, match="its cells may hold more than 256 MB of text"):
         read(write(tmp_path, content.getvalue()), SOURCES)
+
+
+@pytest.mark.parametrize("far", ['r = "XFD1048570"', "r='xfd1048570'"])
+def test_a_cell_far_out_is_refused_however_its_place_is_written(tmp_path, far):
+    rows = sheet([["time", "T1"], [0, 20.5], [1, 21.5]])
+    text = rows.replace("</sheetData>", f"<row><c t='n' {far}><v>1</v></c></row></sheetData>")
+    path = tmp_path / "rig.xlsx"
+    path.write_bytes(workbook(text))
+    with pytest.raises(ValueError, match="a sheet reaches to row 1048570 and column 16384"):
+        read(path, [Source("zone", "T1", "degC")])

@@ -1,4 +1,5 @@
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -392,6 +393,21 @@ def test_a_bag_is_one_recording_among_files(tmp_path):
     assert [result.name for result in results] == ["000.csv", "night/run"]
     assert "there is no column '/heater/duty:data'" in results[0].reason
     assert results[1].reason == "" and len(results[1].record["zone"]) == 80
+
+
+def test_a_file_whose_name_is_no_text_is_quarantined_and_the_others_are_ingested(tmp_path):
+    raw = folder(tmp_path, 2)
+    strange = raw / os.fsdecode(b"line\xff.csv")
+    try:
+        recording(strange, seed=7)
+    except OSError:
+        pytest.skip("this file system takes names of UTF-8 alone")
+    metrics = ingested(raw, tmp_path)
+    assert done(metrics) == (2, 0, 1)
+    reasons = [result.reason for result in process(raw, JOB, INLINE, memo=tmp_path / "memo", budget=BUDGET)]
+    assert [r for r in reasons if r] == [
+        f"{raw}/line\\udcff.csv: its name should be UTF-8 but has other bytes; rename the file"
+    ]
 
 
 # ---- the printer's own PID

@@ -123,12 +123,12 @@ def process(
     spec.sources()
     code = "".join(artifacts.sha256(path) for pattern in READING for path in sorted(CODE.glob(pattern)))
     hashes = [artifacts.sha256(path) for path in files]
-    names = [path.relative_to(folder).as_posix() for path in files]
+    names = [_utf8(path.relative_to(folder).as_posix()) for path in files]
     keys = [
         joblib.hash((content, name, spec.machine.model_dump(), spec[1:], code))
         for content, name in zip(hashes, names, strict=True)
     ]
-    twice = _twice(files, hashes)
+    twice = _twice(files, hashes) | _without_text(files)
     remembered = [
         None if path in twice else _remembered(memo, key, spec.machine)
         for path, key in zip(files, keys, strict=True)
@@ -142,7 +142,12 @@ def process(
         zip([path for path, _ in todo], _run(todo, folder, spec, execution, (memo, budget)), strict=True)
     )
     return [
-        _result(name, entry or _remembered(memo, key, spec.machine), reasons.get(path, ""), entry is not None)
+        _result(
+            name,
+            entry or _remembered(memo, key, spec.machine),
+            _utf8(reasons.get(path, "")),
+            entry is not None,
+        )
         for path, name, key, entry in zip(files, names, keys, remembered, strict=True)
     ]
 
@@ -152,10 +157,26 @@ def _twice(files: Sequence[Path], hashes: Sequence[str]) -> dict[Path, str]:
     trusted twice, and judged by what it was learned from."""
     first: dict[str, Path] = {}
     return {
-        path: f"{path} is {first[content].name} once more, byte for byte; remove one of the two"
+        path: " ".join(
+            f"{path} is {first[content].name} once more, byte for byte; remove one of the two".split()
+        )
         for path, content in zip(files, hashes, strict=True)
         if first.setdefault(content, path) != path
     }
+
+
+def _without_text(files: Sequence[Path]) -> dict[Path, str]:
+    """Why a file is left out whose name is no text: no table can hold it."""
+    return {
+        path: f"{_utf8(str(path))}: its name should be UTF-8 but has other bytes; rename the file"
+        for path in files
+        if _utf8(str(path)) != str(path)
+    }
+
+
+def _utf8(name: str) -> str:
+    """The name with its bytes that are no UTF-8 written out."""
+    return name.encode("utf-8", "backslashreplace").decode()
 
 
 def _run(
