@@ -16,6 +16,7 @@ from pipeline.reading.formats import (
     Growing,
     check_no_counter,
     column_place,
+    column_places,
     date_column,
     every,
     forward,
@@ -76,7 +77,7 @@ def read_csv(path: Path, wanted: Sequence[str], time: str, decimal: str = "") ->
     layout = csv_layout(path, decimal)
     interval = every(time)
     clock = None if interval else time_column(path, layout.names, time)
-    places = [column_place(path, layout.names, name) for name in wanted]
+    places = column_places(path, layout.names, wanted)
     layout = _decided(path, layout, [*wanted, *([] if clock is None else [clock])])
     notes = list(layout.notes)
     clocks = None if clock is None else _Clock(path, layout, clock)
@@ -157,7 +158,7 @@ def _decided(path: Path, layout: CsvLayout, names: Sequence[str]) -> CsvLayout:
     """
     if layout.decided:
         return layout
-    places = {column_place(path, layout.names, name): name for name in names}
+    places = dict(zip(column_places(path, layout.names, names), names, strict=True))
     doubtful: tuple[int, str, str] | None = None
     for line, row in rows(path, layout):
         for i, field in enumerate(row):

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.reading.formats import Column, Columns, column_place, every, forward, seconds, time_column
+from pipeline.reading.formats import Column, Columns, column_places, every, forward, seconds, time_column
 from pipeline.reading.signals import Note
 
 # what is unpacked of one spreadsheet or MATLAB file, in bytes; a print log of a day has 100 MB
@@ -56,8 +56,8 @@ def select(path: Path, table: WholeTable, wanted: Sequence[str], time: str) -> t
     Raises ValueError for a column that is missing or holds no numbers, and for a table without rows.
     """
     names = [column.name for column in table.columns()]
+    column_places(path, names, wanted)
     for name in wanted:
-        column_place(path, names, name)
         if name not in table.values:
             raise ValueError(
                 f"{path}: column {name} should hold numbers but holds {table.others.get(name, 'times')}; "
