@@ -36,6 +36,7 @@ _NO_TIME = (
     "no column is called like a time; write its name, or time: every 1.0 s with the sample time, "
     "beside the mapping"
 )
+_NOTHING = "# no number could be read, so nothing is proposed; see the findings, and copy the recording again"
 # words, columns with the prefix of their sources, units, notes
 _Content = tuple[list[str], list[tuple[Columns, str]], dict[str, str], list[Note]]
 _Read = Callable[[Sequence[str], str], tuple[Columns, list[Note]]]
@@ -68,7 +69,8 @@ def inspect(path: str | Path) -> str:
     lines += [f"  {note.kind}: {note.message}" for note in looked.notes]
     proposal = propose(looked.signals, looked.groups, looked.time)
     size = sum(part.stat().st_size for part in path.iterdir()) if path.is_dir() else path.stat().st_size
-    return "\n".join([f"{path}: {looked.kind}, {size} bytes", *lines, "", *yaml_lines(proposal)]) + "\n"
+    proposed = yaml_lines(proposal) if looked.signals else [_NOTHING]
+    return "\n".join([f"{path}: {looked.kind}, {size} bytes", *lines, "", *proposed]) + "\n"
 
 
 def look(path: Path) -> Inspected:

@@ -119,6 +119,20 @@ def test_damage_and_a_clock_that_runs_backwards_are_told_and_not_refused(tmp_pat
     assert "line 4 is at 1 s, which is before the sample ahead of it at 2 s" in inspect(path)
 
 
+@pytest.mark.parametrize("kind", ["contents", "heads", "lengths"])
+def test_an_mcap_whose_every_chunk_is_damaged_has_findings_and_no_proposal(tmp_path, kind):
+    content = json_recording(800, NO, chunk_size=4000)
+    path = tmp_path / "rig.mcap"
+    for offset, start, _ in chunks(content):
+        place = {"contents": start + 50, "heads": offset, "lengths": offset + 1}[kind]
+        content = flipped(content, place, 4)
+    path.write_bytes(content)
+    text = inspect(path)
+    assert "/machine: 0 messages" in text
+    assert text.count("  damage: ") == (15 if kind == "contents" else 2)
+    assert "no number could be read, so nothing is proposed" in text
+
+
 def test_a_table_without_names_is_guessed_from_its_values_and_says_so(tmp_path):
     rng = np.random.default_rng(0)
     path = tmp_path / "rig.dat"
