@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.reading.bag_folders import bag_parts, joined, merged
+from pipeline.reading.clocks import Mended, mended_topics
 from pipeline.reading.csv_files import csv_columns, csv_layout, read_csv
 from pipeline.reading.formats import Column, Columns, check_clock, file_format, is_time_name, time_column
 from pipeline.reading.mcap_columns import Topic, survey
@@ -61,8 +62,13 @@ def inspect(path: str | Path) -> str:
     """
     path = Path(path)
     looked = look(path)
-    lines = list(looked.lines)
-    for group, _ in looked.groups:
+    lines, groups = list(looked.lines), [group for group, _ in looked.groups]
+    try:
+        parts = mended_topics(path, groups, one_clock=True) if groups else []
+    except ValueError:
+        parts = [Mended(group, np.empty(0, int), []) for group in groups]
+    looked.notes.extend(note for part in parts for note in part.notes)
+    for group in (part.columns for part in parts):
         lines += ["", *_clock(path, group)]
         lines += [f"  {name:<32} {_range(values)}" for name, values in group.values.items()]
     lines += ["", "Findings:" if looked.notes else "Findings: none"]

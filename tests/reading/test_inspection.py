@@ -133,6 +133,14 @@ def test_an_mcap_whose_every_chunk_is_damaged_has_findings_and_no_proposal(tmp_p
     assert "no number could be read, so nothing is proposed" in text
 
 
+def test_a_clock_that_starts_over_is_among_the_findings_as_it_is_read(tmp_path):
+    path = tmp_path / "rig.csv"
+    path.write_text("t,heater_1,T1\n" + "".join(f"{k},{k % 7},{20 + k}\n" for k in [*range(40)] * 3))
+    text = inspect(path)
+    assert "restart: the clock starts over 2 times: segments begin there, the first in line 42" in text
+    assert "rows: 120 samples in 119 s, every 1 s" in text
+
+
 def test_a_table_without_names_is_guessed_from_its_values_and_says_so(tmp_path):
     rng = np.random.default_rng(0)
     path = tmp_path / "rig.dat"
