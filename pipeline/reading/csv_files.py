@@ -23,7 +23,14 @@ from pipeline.reading.formats import (
     seconds,
     time_column,
 )
-from pipeline.reading.instants import hyphen_fraction, instants, is_compact, month_first, over_midnight
+from pipeline.reading.instants import (
+    hyphen_fraction,
+    instants,
+    is_compact,
+    month_first,
+    over_midnight,
+    steady_order,
+)
 from pipeline.reading.signals import Note
 from pipeline.store.csv_rows import (
     LONGEST_TAIL,
@@ -217,7 +224,11 @@ class _Clock:
                 for _, row in rows(path, layout)
                 if len(row) > self.place and self.text(row).strip()
             }
-        self.month_first = month_first(dates, sample)
+        self.month_first, self.by_steps = month_first(dates, sample), False
+        if dates and self.month_first is None:
+            stamps = (self.text(row) for _, row in rows(path, layout) if len(row) > self.place)
+            self.month_first = steady_order(stamp for stamp in stamps if stamp.strip())
+            self.by_steps = self.month_first is not None
         written = (row[self.place] for _, row in rows(path, layout) if len(row) > self.place)
         self.hyphen_fraction = not self.numeric and hyphen_fraction(
             field for field in written if ":" in field
@@ -282,4 +293,11 @@ class _Clock:
                         f"the time of day runs over midnight {midnights} times: a day was added each time",
                     )
                 )
+        if self.by_steps:
+            first, other = ("month", "day") if self.month_first else ("day", "month")
+            message = (
+                f"the dates of {self.name} were read with the {first} first, in which they run on in equal "
+                f"steps; with the {other} first they do not"
+            )
+            notes.append(Note("clock", "", 1, message))
         return times, "UTC" if self.zoned else ""
