@@ -49,12 +49,15 @@ from pipeline.store.csv_rows import (
 )
 
 FIELDS_AT_ONCE = 20_000
+# rows that tell what a column holds; fewer of a wide table
+MOST_SHOWN, FEWEST_SHOWN = 200, 20
 
 
 def csv_columns(path: Path) -> list[Column]:
     """The columns of a text file. A column is of type "number" by its first rows."""
     layout = csv_layout(path)
-    shown = list(itertools.islice(rows(path, layout), 200))
+    most = min(MOST_SHOWN, max(FEWEST_SHOWN, FIELDS_AT_ONCE // len(layout.names)))
+    shown = list(itertools.islice(rows(path, layout), most))
     columns = []
     for i, (name, unit) in enumerate(zip(layout.names, layout.units, strict=True)):
         fields = [

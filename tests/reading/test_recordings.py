@@ -6,7 +6,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline.reading.recordings import Source, nearest_names, read
+from pipeline.reading.recordings import Source, inspect, nearest_names, read
 from pipeline.store.artifacts import write_recording
 from tests.mcap_writing import Written
 
@@ -468,4 +468,21 @@ def test_two_orders_of_day_and_month_are_refused_where_a_pause_hides_which_is_me
     lines = [f"{day:02d}/03/2025 {hour:02d}:00,1,{20 + hour}\n" for day, hour in days]
     (tmp_path / "a.csv").write_text("time,u,y\n" + "".join(lines))
     with pytest.raises(ValueError, match=r"\(day or month first: 2025-03-05 or 2025-05-03\?\)"):
+        read(tmp_path / "a.csv", SOURCES)
+
+
+@pytest.mark.parametrize("delimiter", [",", ";"])
+def test_a_table_whose_names_are_longer_than_the_opening_is_read(tmp_path, delimiter):
+    """Names of 80 kB; the layout was sought in the first 64 kB."""
+    names = ["t", *(f"zone_{j:05d}_temperature_C" for j in range(3500))]
+    rows = [delimiter.join([str(k), *(f"{20 + j % 7}.5" for j in range(3500))]) for k in range(6)]
+    (tmp_path / "a.csv").write_text("\n".join([delimiter.join(names), *rows]) + "\n")
+    raw = read(tmp_path / "a.csv", [Source("y", names[3500], "degC")])
+    np.testing.assert_array_equal(raw.signals["y"][1], 20.5 + 3499 % 7)
+    assert "3501 columns, 3501 of them numbers" in inspect(tmp_path / "a.csv")
+
+
+def test_a_first_line_without_end_is_refused_in_a_sentence(tmp_path):
+    (tmp_path / "a.csv").write_bytes(b"1," * (1 << 21))
+    with pytest.raises(ValueError, match="its first line has more than 2097152 bytes"):
         read(tmp_path / "a.csv", SOURCES)
