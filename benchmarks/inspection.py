@@ -1,5 +1,5 @@
 """How long `beadline inspect` takes beside one plain read of all columns: `./run python -m
-benchmarks.inspection`. The bar: at most 1.5 times, whatever the number of topics."""
+benchmarks.inspection`. The bar: at most 1.5 times, whatever the number of topics or columns."""
 
 import json
 import sys
@@ -18,7 +18,7 @@ from pipeline.reading.inspection import inspect
 from pipeline.reading.recordings import Source, read
 from tests.reading.klipper_machine import print_log
 
-ROWS, COLUMNS, TOPICS = 300_000, 12, 35
+ROWS, COLUMNS, TOPICS, WIDE = 300_000, 12, 35, 20_000
 
 
 def table(rng: np.random.Generator) -> pa.Table:
@@ -63,10 +63,13 @@ def main() -> None:
         (root / "klippy.log").write_text(
             print_log([(0, 200, 60), (4000, 210, 65)], longest_s=8000), encoding="utf-8"
         )
+        wide = {f"tag_{j}": rng.normal(size=100) for j in range(WIDE)}
+        pa.parquet.write_table(pa.table({"time_s": np.arange(100.0), **wide}), root / "wide.parquet")
         names = [name for name in made.column_names if name != "time_s"]
         sources = {
             "rig.csv": names,
             "rig.parquet": names,
+            "wide.parquet": list(wide),
             "plc.mcap": [f"/plc/zone_{i}:data" for i in range(TOPICS)],
             "klippy.log": ["extruder.temp", "extruder.pwm", "heater_bed.temp", "heater_bed.pwm"],
         }

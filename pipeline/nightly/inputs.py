@@ -9,6 +9,8 @@ from pathlib import Path
 
 import yaml
 
+from pipeline.nightly.settings import Loop
+from pipeline.reading.signatures import METADATA
 from pipeline.store import artifacts, params
 
 QUARANTINE = Path("datasets/quarantine")
@@ -83,20 +85,34 @@ def digest(digests: Mapping[str, str]) -> str:
     return total.hexdigest()
 
 
-def recordings(digests: Mapping[str, str], folder: str) -> dict[str, str]:
-    """{path: digest} of the recordings below a loop's folder, of all
-    that was found; notes and files of dvc are none."""
-    notes = (".md", ".txt", ".yaml", ".dvc")
-    return {
-        name: content
-        for name, content in digests.items()
-        if folder and name.startswith(f"{folder}/") and not name.lower().endswith(notes)
-    }
+def recordings(digests: Mapping[str, str], loop: Loop) -> dict[str, str]:
+    """{path: digest} of the recordings below a loop's folder, of all that was found; notes and files of dvc
+    are none. A bag of ROS 2 is one recording, as `ingest` reads it, under the path of its folder."""
+    folder, notes = loop.recordings, (".md", ".txt", ".yaml", ".dvc")
+    below = {name: content for name, content in digests.items() if folder and within(name, folder)}
+    bags: dict[str, dict[str, str]] = {}
+    if loop.judge == "temperature":
+        parents = {str(Path(name).parent) for name in below if Path(name).name == METADATA} - {folder}
+        # of a bag within a bag, the outer one is read
+        bags = {bag: {} for bag in parents if not any(within(bag, other) for other in parents)}
+    single: dict[str, str] = {}
+    for name, content in below.items():
+        bag = next((str(parent) for parent in Path(name).parents if str(parent) in bags), "")
+        if bag:
+            bags[bag][name] = content
+        elif not name.lower().endswith(notes):
+            single[name] = content
+    return single | {bag: digest(files) for bag, files in bags.items()}
+
+
+def within(name: str, folder: str) -> bool:
+    """Whether a path lies below a folder."""
+    return name.startswith(f"{folder}/")
 
 
 def quarantine(path: str, loop: str, reason: str) -> str:
-    """Moves the recording, unchanged, to datasets/quarantine, where no stage looks and git does not either,
-    its reason beside it; nothing there is overwritten. The reason."""
+    """Moves the recording, a file or a bag, unchanged, to datasets/quarantine, where no stage looks and git
+    does not either, its reason beside it; nothing there is overwritten. The reason."""
     name, folder = Path(path), QUARANTINE / loop
     folder.mkdir(parents=True, exist_ok=True)
     if not (QUARANTINE / ".gitignore").exists():

@@ -15,7 +15,7 @@ import numpy as np
 from pipeline.nightly import champion, guarding, inputs, remembered, watch
 from pipeline.nightly.processes import STATE, commit, dvc, git
 from pipeline.nightly.remembered import METRICS, DriftMemory, Remembered
-from pipeline.nightly.settings import Nightly
+from pipeline.nightly.settings import Loop, Nightly
 from pipeline.report.nightly import record
 from pipeline.report.nightly.production import ROLLED_BACK, Champion, ChampionMetrics, ChampionState, Lineage
 from pipeline.report.nightly.record import KEPT, LoopDecision, Night
@@ -126,7 +126,7 @@ def _unchanged(job: Job, work: Work) -> Work:
 def _compared(job: Job, work: Work) -> Work:
     """The recordings of each loop whose content was not there the night before."""
     new = {
-        name: _new(work.digests, loop.recordings, job.last.recordings.get(name, {}))
+        name: _new(work.digests, loop, job.last.recordings.get(name, {}))
         for name, loop in job.settings.loops.items()
     }
     paths = {name: sorted(recordings) for name, recordings in new.items() if recordings}
@@ -140,7 +140,11 @@ def _screened(job: Job, work: Work) -> Work:
     state, night = champion.read(), work.night
     screened = screening.look(job.settings, state.champions, work.new, work.memory, night=night.number)
     quarantined = {**night.quarantined, **screened.drift.quarantined}
-    digests = {name: content for name, content in work.digests.items() if name not in quarantined}
+    digests = {
+        name: content
+        for name, content in work.digests.items()
+        if name not in quarantined and not any(inputs.within(name, bag) for bag in quarantined)
+    }
     work = Work(
         night._replace(screened=True, drift=screened.drift, quarantined=quarantined),
         screened.memory,
@@ -202,11 +206,11 @@ def _nothing_new(digests: Mapping[str, str], last: Remembered) -> bool:
     return inputs.digest(digests) == last.inputs and not last.unpushed
 
 
-def _new(digests: Mapping[str, str], folder: str, before: Mapping[str, str]) -> dict[str, str]:
-    """The recordings below a folder whose content was not there the night before."""
+def _new(digests: Mapping[str, str], loop: Loop, before: Mapping[str, str]) -> dict[str, str]:
+    """The recordings of a loop whose content was not there the night before."""
     return {
         name: content
-        for name, content in inputs.recordings(digests, folder).items()
+        for name, content in inputs.recordings(digests, loop).items()
         if content not in before.values()
     }
 
@@ -304,9 +308,7 @@ def _lineage(settings: Nightly, made_from: Mapping[str, str]) -> Lineage:
         params={
             name: artifacts.sha256(name) for name in (params.FILE, params.EXPERT) if artifacts.exists(name)
         },
-        recordings={
-            name: inputs.recordings(made_from, loop.recordings) for name, loop in settings.loops.items()
-        },
+        recordings={name: inputs.recordings(made_from, loop) for name, loop in settings.loops.items()},
     )
 
 
@@ -426,8 +428,7 @@ def _remember(job: Job, work: Work) -> None:
             inputs=inputs.digest(work.digests),
             unpushed=night.unpushed,
             recordings={
-                name: inputs.recordings(work.digests, loop.recordings)
-                for name, loop in job.settings.loops.items()
+                name: inputs.recordings(work.digests, loop) for name, loop in job.settings.loops.items()
             },
             drift=work.memory,
             hashes=job.hashes.now,

@@ -1,7 +1,8 @@
 """Clocks that do not run forward: what can be put right without a guess is, and is counted; the rest is left
 for `check_clock` to refuse."""
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,6 +16,8 @@ HOUR_S = 3600
 FEW_SHARE, FEW_ROWS_OF = 0.02, 10
 # a row that came late is no more than so many behind
 LATEST_ROWS = 8
+# stretches between restarts that begin and end within so many intervals are of one clock
+AGREE_INTERVALS = 3
 # seconds that hold as many rows each, but one; and rows that take turns between two courses
 LEAST_STAMPS, ALIKE_SHARE, TURNS_SHARE = 4, 0.9, 0.8
 
@@ -42,9 +45,41 @@ def mended(path: Path, group: Columns, *, may_restart: bool) -> Mended:
         check_clock(path, group)
         return Mended(group, np.empty(0, int), [])
     notes: list[Note] = []
-    time = _summer_time(group, notes)
-    time, restarts = _starting_over(group._replace(time=time), notes, may_restart)
-    time = _spread(group._replace(time=time), restarts, notes)
+    group = group._replace(time=_summer_time(group, notes))
+    restarts = _restarts(group.time) if may_restart else np.empty(0, int)
+    if len(restarts):
+        notes.append(_restart_note(group, restarts))
+        group = group._replace(time=_going_on([group.time], [restarts])[0])
+    return _forward(path, group, restarts, notes)
+
+
+def mended_topics(path: Path, groups: Sequence[Columns], *, one_clock: bool) -> list[Mended]:
+    """`mended` for the groups of a recording, which start over together.
+
+    Each must have started over as often. Where they have not `one_clock`, the recorder's, the stretches
+    between must also agree in start and end, as a clock that one device alone set back would not.
+    """
+    if len(groups) == 1:
+        return [mended(path, groups[0], may_restart=True)]
+    rows = [_restarts(group.time) for group in groups]
+    most = max(map(len, rows))
+    if one_clock:
+        # commands that come as events are too few to tell a restart from a second device
+        rows = [
+            own if len(own) == most else _falls(group.time) for own, group in zip(rows, groups, strict=True)
+        ]
+    if not most or any(len(own) != most for own in rows) or not (one_clock or _agree(groups, rows)):
+        return [mended(path, group, may_restart=False) for group in groups]
+    times = _going_on([group.time for group in groups], rows)
+    return [
+        _forward(path, group._replace(time=time), own, [_restart_note(group, own)])
+        for group, time, own in zip(groups, times, rows, strict=True)
+    ]
+
+
+def _forward(path: Path, group: Columns, restarts: np.ndarray, notes: list[Note]) -> Mended:
+    """Stamps that share a second spread, late rows sorted back, repeats dropped; checked."""
+    time = _spread(group, restarts, notes)
     order = _forward_rows(group._replace(time=time), notes)
     columns = _rows(group._replace(time=time), order)
     check_clock(path, columns)
@@ -97,14 +132,11 @@ def _summer_time(group: Columns, notes: list[Note]) -> np.ndarray:
     return time + np.cumsum(added)
 
 
-def _starting_over(group: Columns, notes: list[Note], may_restart: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Times in which a clock that starts over goes on, one interval behind the row before, and the indices of
-    those rows."""
-    time, none = group.time, np.empty(0, int)
-    starts = np.flatnonzero(np.diff(time) < 0) + 1
-    if not may_restart or not len(starts):
-        return time, none
-    interval = _interval(time)
+def _restarts(time: np.ndarray) -> np.ndarray:
+    """The indices of the rows at which a clock starts over."""
+    none, starts = np.empty(0, int), _falls(time)
+    if not len(starts) or not np.isfinite(time).all():
+        return none
     ends, first, latest, restarts = np.r_[starts[1:], len(time)], time[0], time[starts[0] - 1], []
     for start, end in zip(starts, ends, strict=True):
         run = time[start:end]
@@ -115,16 +147,42 @@ def _starting_over(group: Columns, notes: list[Note], may_restart: bool) -> tupl
         else:
             latest = max(latest, run[-1])
     if not restarts or len(time) <= OTHER_DEVICE_RUN * (len(restarts) + 1):
-        return time, none
-    rows = np.array(restarts)
-    notes.append(
-        _note("restart", rows, group.place, f"the clock starts over {len(rows)} times: segments begin there")
+        return none
+    return np.array(restarts)
+
+
+def _falls(time: np.ndarray) -> np.ndarray:
+    return np.flatnonzero(np.diff(time) < 0) + 1
+
+
+def _restart_note(group: Columns, rows: np.ndarray) -> Note:
+    message = f"the clock starts over {len(rows)} times: segments begin there"
+    return _note("restart", rows, group.place, message)
+
+
+def _going_on(times: Sequence[np.ndarray], restarts: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """The times of each group, in which a stretch begins one interval behind the one before; all groups by
+    the same."""
+    shifted = [time.copy() for time in times]
+    interval = np.asarray(max(_interval(time) for time in times)).astype(times[0].dtype)
+    views = [np.split(time, rows) for time, rows in zip(shifted, restarts, strict=True)]
+    for before, now in itertools.pairwise(zip(*views, strict=True)):
+        by = max(stretch.max() for stretch in before) + interval - min(stretch.min() for stretch in now)
+        for stretch in now:
+            stretch += by
+    return shifted
+
+
+def _agree(groups: Sequence[Columns], restarts: Sequence[np.ndarray]) -> bool:
+    """Whether the stretches of all groups begin and end within a few intervals of each other."""
+    near = AGREE_INTERVALS * max(_interval(group.time) for group in groups)
+    ends = np.array(
+        [
+            [(stretch[0], stretch[-1]) for stretch in np.split(group.time, rows)]
+            for group, rows in zip(groups, restarts, strict=True)
+        ]
     )
-    shifted = time.copy()
-    for start, end in zip(rows, np.r_[rows[1:], len(time)], strict=True):
-        behind = shifted[start - 1] + interval
-        shifted[start:end] += np.asarray(behind - shifted[start:end].min()).astype(time.dtype)
-    return shifted, rows
+    return bool((np.ptp(ends, axis=0) <= near).all())
 
 
 def _spread(group: Columns, restarts: np.ndarray, notes: list[Note]) -> np.ndarray:

@@ -17,13 +17,21 @@ from pipeline.reading.formats import (
     check_no_counter,
     check_no_day_fractions,
     column_place,
+    column_places,
     date_column,
     every,
     forward,
     seconds,
     time_column,
 )
-from pipeline.reading.instants import hyphen_fraction, instants, is_compact, month_first, over_midnight
+from pipeline.reading.instants import (
+    hyphen_fraction,
+    instants,
+    is_compact,
+    month_first,
+    over_midnight,
+    steady_order,
+)
 from pipeline.reading.long_tables import check_one_signal, naming_columns
 from pipeline.reading.signals import Note
 from pipeline.store.csv_rows import (
@@ -43,12 +51,15 @@ from pipeline.store.csv_rows import (
 )
 
 FIELDS_AT_ONCE = 20_000
+# rows that tell what a column holds; fewer of a wide table
+MOST_SHOWN, FEWEST_SHOWN = 200, 20
 
 
 def csv_columns(path: Path) -> list[Column]:
     """The columns of a text file. A column is of type "number" by its first rows."""
     layout = csv_layout(path)
-    shown = list(itertools.islice(rows(path, layout), 200))
+    most = min(MOST_SHOWN, max(FEWEST_SHOWN, FIELDS_AT_ONCE // len(layout.names)))
+    shown = list(itertools.islice(rows(path, layout), most))
     columns = []
     for i, (name, unit) in enumerate(zip(layout.names, layout.units, strict=True)):
         fields = [
@@ -78,7 +89,7 @@ def read_csv(path: Path, wanted: Sequence[str], time: str, decimal: str = "") ->
     layout = csv_layout(path, decimal)
     interval = every(time)
     clock = None if interval else time_column(path, layout.names, time)
-    places = [column_place(path, layout.names, name) for name in wanted]
+    places = column_places(path, layout.names, wanted)
     for name in naming_columns(layout.names, [*wanted, clock or ""]):
         place = column_place(path, layout.names, name)
         owners = ((f"line {line}", row[place]) for line, row in rows(path, layout) if len(row) > place)
@@ -165,7 +176,7 @@ def _decided(path: Path, layout: CsvLayout, names: Sequence[str]) -> CsvLayout:
     """
     if layout.decided:
         return layout
-    places = {column_place(path, layout.names, name): name for name in names}
+    places = dict(zip(column_places(path, layout.names, names), names, strict=True))
     doubtful: tuple[int, str, str] | None = None
     for line, row in rows(path, layout):
         for i, field in enumerate(row):
@@ -224,7 +235,11 @@ class _Clock:
                 for _, row in rows(path, layout)
                 if len(row) > self.place and self.text(row).strip()
             }
-        self.month_first = month_first(dates, sample)
+        self.month_first, self.by_steps = month_first(dates, sample), False
+        if dates and self.month_first is None:
+            stamps = (self.text(row) for _, row in rows(path, layout) if len(row) > self.place)
+            self.month_first = steady_order(stamp for stamp in stamps if stamp.strip())
+            self.by_steps = self.month_first is not None
         written = (row[self.place] for _, row in rows(path, layout) if len(row) > self.place)
         self.hyphen_fraction = not self.numeric and hyphen_fraction(
             field for field in written if ":" in field
@@ -289,4 +304,11 @@ class _Clock:
                         f"the time of day runs over midnight {midnights} times: a day was added each time",
                     )
                 )
+        if self.by_steps:
+            first, other = ("month", "day") if self.month_first else ("day", "month")
+            message = (
+                f"the dates of {self.name} were read with the {first} first, in which they run on in equal "
+                f"steps; with the {other} first they do not"
+            )
+            notes.append(Note("clock", "", 1, message))
         return times, "UTC" if self.zoned else ""

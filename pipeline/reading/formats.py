@@ -1,5 +1,6 @@
 """The format of a recording, and what all formats share: columns on a clock, and which column is the time."""
 
+import collections
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -229,6 +230,14 @@ def column_place(path: Path, names: Sequence[str], name: str) -> int:
             f"{path}: {names.count(name)} columns are called {name!r}; give each a name of its own"
         )
     return names.index(name)
+
+
+def column_places(path: Path, names: Sequence[str], wanted: Sequence[str]) -> list[int]:
+    """The places of the wanted columns, in one pass over the names. Raises ValueError for a name that is not
+    there, or there twice."""
+    counts = collections.Counter(names)
+    at = {name: i for i, name in enumerate(names)}
+    return [at[name] if counts[name] == 1 else column_place(path, names, name) for name in wanted]
 
 
 def is_time_name(name: str) -> bool:

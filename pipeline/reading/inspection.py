@@ -3,6 +3,7 @@
 The words give its format, its clocks with rate, jitter and gaps, its signals with their ranges, and damage.
 """
 
+import collections
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -10,22 +11,33 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.reading.bag_folders import bag_parts, joined, merged
+from pipeline.reading.clocks import Mended, mended_topics
 from pipeline.reading.csv_files import csv_columns, csv_layout, read_csv
 from pipeline.reading.formats import Column, Columns, check_clock, file_format, is_time_name, time_column
 from pipeline.reading.mcap_columns import Topic, survey
 from pipeline.reading.other_formats import LOADERS
 from pipeline.reading.parquet_files import parquet_columns, read_parquet
-from pipeline.reading.proposals import CLOCK_SAMPLES, Signal, has_bare_field, propose, sampled, yaml_lines
+from pipeline.reading.proposals import (
+    CLOCK_SAMPLES,
+    Signal,
+    has_bare_field,
+    propose,
+    sampled,
+    telling,
+    yaml_lines,
+)
 from pipeline.reading.quality import quantisation_step
 from pipeline.reading.resampling import GAP_INTERVALS
 from pipeline.reading.signals import Note, intervals
 from pipeline.reading.whole_tables import select
 
-MOST_FIELDS = 64
+# numbers of a topic, and columns of a table, that are described; the others are counted
+MOST_FIELDS, MOST_SIGNALS = 64, 128
 _NO_TIME = (
     "no column is called like a time; write its name, or time: every 1.0 s with the sample time, "
     "beside the mapping"
 )
+_NOTHING = "# no number could be read, so nothing is proposed; see the findings, and copy the recording again"
 # words, columns with the prefix of their sources, units, notes
 _Content = tuple[list[str], list[tuple[Columns, str]], dict[str, str], list[Note]]
 _Read = Callable[[Sequence[str], str], tuple[Columns, list[Note]]]
@@ -50,15 +62,21 @@ def inspect(path: str | Path) -> str:
     """
     path = Path(path)
     looked = look(path)
-    lines = list(looked.lines)
-    for group, _ in looked.groups:
+    lines, groups = list(looked.lines), [group for group, _ in looked.groups]
+    try:
+        parts = mended_topics(path, groups, one_clock=True) if groups else []
+    except ValueError:
+        parts = [Mended(group, np.empty(0, int), []) for group in groups]
+    looked.notes.extend(note for part in parts for note in part.notes)
+    for group in (part.columns for part in parts):
         lines += ["", *_clock(path, group)]
         lines += [f"  {name:<32} {_range(values)}" for name, values in group.values.items()]
     lines += ["", "Findings:" if looked.notes else "Findings: none"]
     lines += [f"  {note.kind}: {note.message}" for note in looked.notes]
     proposal = propose(looked.signals, looked.groups, looked.time)
     size = sum(part.stat().st_size for part in path.iterdir()) if path.is_dir() else path.stat().st_size
-    return "\n".join([f"{path}: {looked.kind}, {size} bytes", *lines, "", *yaml_lines(proposal)]) + "\n"
+    proposed = yaml_lines(proposal) if looked.signals else [_NOTHING]
+    return "\n".join([f"{path}: {looked.kind}, {size} bytes", *lines, "", *proposed]) + "\n"
 
 
 def look(path: Path) -> Inspected:
@@ -110,20 +128,23 @@ def _table(path: Path, columns: Sequence[Column], has_clock: bool, read: _Read) 
     """Words, columns, units and notes of a table, which `read` reads; `has_clock`: a clock of its own."""
     names = [column.name for column in columns]
     numeric = [column.name for column in columns if column.type == "number" and column.name]
+    numbers = set(numeric)
     others = [
-        f"{column.name or '(no name)'} ({column.type})" for column in columns if column.name not in numeric
+        f"{column.name or '(no name)'} ({column.type})" for column in columns if column.name not in numbers
     ]
-    twice = [f"{name} ({names.count(name)} times)" for name in dict.fromkeys(names) if name]
-    twice = [entry for entry in twice if not entry.endswith(" (1 times)")]
+    counts = collections.Counter(names)
+    twice = [f"{name} ({count} times)" for name, count in counts.items() if name and count > 1]
     lines = [f"{len(columns)} columns, {len(numeric)} of them numbers"]
     lines += [f"not numbers: {', '.join(others[:20])}"] if others else []
     if twice:
         lines.append(
-            "the same name twice, so that none of them can be mapped; give each its own: " + ", ".join(twice)
+            "the same name twice, so that none of them can be mapped; give each its own: "
+            + ", ".join(twice[:20])
         )
-    wanted = [name for name in numeric if names.count(name) == 1]
     clock = "" if has_clock else _clock_name(path, columns)
-    signals = [name for name in wanted if name != clock]
+    every_signal = [name for name in numeric if counts[name] == 1 and name != clock]
+    signals = telling(every_signal, MOST_SIGNALS)
+    wanted = [*([clock] if clock in numbers and counts[clock] == 1 else []), *signals]
     if not signals:
         examples = f" ({', '.join(others[:6] + twice)})" if others or twice else ""
         raise ValueError(
@@ -143,6 +164,12 @@ def _table(path: Path, columns: Sequence[Column], has_clock: bool, read: _Read) 
         untimed = True
         group, notes = read(wanted, "every 1.0 s")
     notes += broken
+    if len(signals) < len(every_signal):
+        message = (
+            f"{len(every_signal)} columns hold numbers; {len(signals)} are shown, those first whose names "
+            "tell what they are"
+        )
+        notes.append(Note("fields", "", len(every_signal), message))
     if untimed:
         notes.append(Note("clock", "", 1, _NO_TIME))
     notes += _unit_note(clock, group)
@@ -184,7 +211,7 @@ def _mcap(path: Path) -> _Content:
     by_name = merged([one.topics for one in surveys])
     lines, groups, units = [f"{len(by_name)} topics"], [], {}
     notes = list(dict.fromkeys(note for one in surveys for note in one.notes))
-    bare = [field for topic in by_name.values() for field in topic.fields]
+    bare = collections.Counter(field for topic in by_name.values() for field in topic.fields)
     for topic in by_name.values():
         lines.append(f"  {topic.name}: {_content(topic)}")
         if len(topic.fields) > MOST_FIELDS:
@@ -193,7 +220,7 @@ def _mcap(path: Path) -> _Content:
         parts = [group for one in surveys for group in one.columns if group.name == topic.name]
         if not parts:
             continue
-        alone = all(bare.count(field) == 1 for field in topic.fields) and not has_bare_field(topic.fields)
+        alone = all(bare[field] == 1 for field in topic.fields) and not has_bare_field(topic.fields)
         groups.append((joined(path, parts), "" if alone else f"{topic.name}:"))
         for channel in topic.channels:
             given = {key: unit for key, unit in channel.metadata.items() if key.endswith(".unit")}
@@ -258,9 +285,11 @@ def _range(values: np.ndarray) -> str:
     low, high = numbers.min(), numbers.max()
     if low == high:
         return f"constant {low:g}{missing}"
-    some = sampled(numbers)
-    few = len(np.unique(some)) <= 12
-    levels = len(np.unique(numbers)) if few else 13
-    step = 0.0 if levels <= 12 else quantisation_step(some)
+    ordered = np.sort(sampled(numbers))
+    levels = 1 + np.count_nonzero(ordered[1:] != ordered[:-1])
+    step = quantisation_step(ordered) if 12 < levels <= len(ordered) / 3 else 0.0
+    if levels <= 12 and len(ordered) < len(numbers):
+        levels = len(np.unique(numbers))
+    median = (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2
     steps = f", {levels} levels" if levels <= 12 else f", steps of {step:.3g}" if step else ""
-    return f"{low:g} to {high:g}, median {np.median(some):g}{steps}{missing}"
+    return f"{low:g} to {high:g}, median {median:g}{steps}{missing}"

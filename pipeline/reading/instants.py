@@ -2,8 +2,10 @@
 day."""
 
 import calendar
+import contextlib
 import datetime
 import functools
+import itertools
 import re
 import zoneinfo
 from collections.abc import Iterable, Sequence
@@ -12,6 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+# a clock is steady where no step is longer than so many medians, and there are so many; steps within a date
+# are the same in either order, and so many of them do
+STEADY, FEWEST_STEPS, FIRST_STEPS = 1.5, 5, 1000
 DAY_NS = 86_400 * 10**9
 _EPOCH = datetime.date(1970, 1, 1).toordinal()
 _MONTHS = {name: i for i, name in enumerate(calendar.month_abbr)}
@@ -133,15 +138,19 @@ def _day(date: str, month_first: bool | None) -> int:
                 day, month = int(first), _MONTHS.get(second.title(), 0)
             else:
                 day, month = _day_and_month(int(first), int(second), mark, month_first)
+                if not month:
+                    one, other = f"{second:0>2}-{first:0>2}", f"{first:0>2}-{second:0>2}"
+                    raise ValueError(f"day or month first: {year}-{one} or {year}-{other}")
     return datetime.date(year, month, day).toordinal() - _EPOCH
 
 
 def _day_and_month(first: int, second: int, mark: str, month_first: bool | None) -> tuple[int, int]:
-    if mark == "." or first > 12 or month_first is False:
+    """(day, month), (0, 0) where nothing tells which is which."""
+    if mark == "." or first > 12 or first == second or month_first is False:
         return first, second
     if second > 12 or month_first:
         return second, first
-    raise ValueError("day and month, or month and day")
+    return 0, 0
 
 
 def month_first(dates: Iterable[str], sample: str) -> bool | None:
@@ -160,6 +169,28 @@ def month_first(dates: Iterable[str], sample: str) -> bool | None:
         return False
     american = re.search(r"\d\s*[AaPp]\.?[Mm]", sample) and len({second for _, second in pairs}) > 1
     return True if american or len(pairs) == 1 or any(second > 12 for _, second in pairs) else None
+
+
+def steady_order(stamps: Iterable[str]) -> bool | None:
+    """Whether the month stands first in dates that can be both, by the one reading that runs forward in
+    steps that are nearly equal; None where neither does or both do.
+
+    Steps count where the date changes, and at the first stamps. Text that is no time is passed over.
+    """
+    steps: dict[bool, list[int]] = {False: [], True: []}
+    for before, now in itertools.pairwise(stamps):
+        if len(steps[False]) >= FIRST_STEPS and before.split()[:1] == now.split()[:1]:
+            continue
+        with contextlib.suppress(ValueError, OverflowError):
+            pair = [(_instant(before, order, None)[0], _instant(now, order, None)[0]) for order in steps]
+            for order, (earlier, later) in zip(steps, pair, strict=True):
+                steps[order].append(later - earlier)
+    steady = [order for order, sizes in steps.items() if _is_steady(np.array(sizes))]
+    return steady[0] if len(steady) == 1 else None
+
+
+def _is_steady(steps: np.ndarray) -> bool:
+    return len(steps) >= FEWEST_STEPS and steps.min() > 0 and steps.max() <= STEADY * np.median(steps)
 
 
 def hyphen_fraction(fields: Iterable[str]) -> bool:

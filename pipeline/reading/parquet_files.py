@@ -15,7 +15,7 @@ from pipeline.reading.formats import (
     Growing,
     check_no_counter,
     check_no_day_fractions,
-    column_place,
+    column_places,
     every,
     forward,
     is_time_name,
@@ -117,8 +117,8 @@ def read_parquet(path: Path, wanted: Sequence[str], time: str) -> tuple[Columns,
             if not time and stamps and all(not is_time_name(name) or name == "T" for name in names)
             else time_column(path, names, time)
         )
-    for name in wanted:
-        column = columns[column_place(path, names, name)]
+    for name, place in zip(wanted, column_places(path, names, wanted), strict=True):
+        column = columns[place]
         if column.type != "number" and not _is_text(types[name]):
             raise ValueError(
                 f"{path}: column {name} should hold numbers but is of type {column.type}; write numbers, "

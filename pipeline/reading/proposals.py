@@ -41,6 +41,8 @@ _STATUS = (
     r"e[\s_-]?stop|emergency|alarm|fault|error|status|(^|[._\s])(state|mode|ok|ready)$|enabled?|door|lamp|"
     r"interlock|warning|running|connected|valid|busy|homed|watchdog|heartbeat"
 )
+_TELLING = re.compile(rf"{_SET_POINT}|{_TEMPERATURE}|{_INPUT}")
+_SILENT = re.compile(rf"{_STAMP}|{_COUNTER}|{_STATUS}")
 # fields that say nothing: their topic's name does
 _BARE_FIELDS = ("data", "value", "val", "reading", "measurement", "float", "double")
 _COMMON_WORDS = {
@@ -185,6 +187,16 @@ def words(source: str) -> str:
         parts = [part for part in topic.casefold().split("/") if part]
         return next((part for part in reversed(parts) if part not in _BARE_FIELDS), field)
     return field
+
+
+def telling(sources: Sequence[str], most: int) -> list[str]:
+    """At most `most` of the sources, in their order: first those whose names tell a heater, a motor, a
+    temperature or a set-point."""
+    if len(sources) <= most:
+        return list(sources)
+    tells = [bool(_TELLING.search(name := words(s)) and not _SILENT.search(name)) for s in sources]
+    chosen = sorted(range(len(sources)), key=lambda i: (not tells[i], i))[:most]
+    return [sources[i] for i in sorted(chosen)]
 
 
 def has_bare_field(fields: Sequence[str]) -> bool:

@@ -162,9 +162,9 @@ def _at_limits(table: Table, name: str, low: float, high: float) -> list[Flag]:
     tolerance = 1e-6 * (high - low)
     inside = values[usable & (values > low + tolerance) & (values < high - tolerance)]
     planned = len(np.unique(inside)) <= PLANNED_LEVELS
-    # a controller acts in most samples, a plan of levels now and then
-    acts = not planned and np.mean(np.diff(inside) != 0) > 0.5
-    remark = ": there it follows the limit, not the controller" if acts else ""
+    # a controller or a random signal moves in most samples and is cut off; a plan of levels asks for it
+    cut_off = not planned and np.mean(np.diff(inside) != 0) > 0.5
+    remark = ": there the limit decides, not what commands it" if cut_off else ""
     for limit, at in ((low, np.abs(values - low) <= tolerance), (high, np.abs(values - high) <= tolerance)):
         where = np.flatnonzero(at & usable)
         if len(where) and np.ptp(values[usable]) > 0 and not (planned and limit == low):

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.reading.bag_folders import read_bag
-from pipeline.reading.clocks import mended
+from pipeline.reading.clocks import mended_topics
 from pipeline.reading.csv_files import read_csv
 from pipeline.reading.formats import CALENDAR_S, Columns, file_format
 from pipeline.reading.inspection import inspect
@@ -81,11 +81,15 @@ def read(path: str | Path, sources: Sequence[Source], *, time: str = "", decimal
         raise ValueError(
             f"{path} cannot be read ({error.strerror or error}); check the disk, or copy the recording again"
         ) from None
-    parts = [mended(path, group, may_restart=len(columns) == 1 and kind != "mcap") for group in columns]
+    parts = mended_topics(path, columns, one_clock=time in ("", "log_time"))
     columns = [part.columns for part in parts]
     notes += [note for part in parts for note in part.notes]
     clocks = _clocks(columns, notes)
-    breaks = [float(clocks[part.columns.name][i]) for part in parts for i in part.restarts]
+    # where several topics start over, they do so together
+    breaks = [
+        min(float(clocks[part.columns.name][i]) for part, i in zip(parts, rows, strict=True))
+        for rows in zip(*(part.restarts for part in parts), strict=True)
+    ]
     signals = {}
     for source in sources:
         topic, field = places[source.source]

@@ -11,7 +11,7 @@ from pipeline.reading.formats import (
     Column,
     Columns,
     check_no_day_fractions,
-    column_place,
+    column_places,
     every,
     forward,
     is_time_name,
@@ -67,8 +67,8 @@ def select(path: Path, table: WholeTable, wanted: Sequence[str], time: str) -> t
     Raises ValueError for a column that is missing or holds no numbers, and for a table without rows.
     """
     names = [column.name for column in table.columns()]
+    column_places(path, names, wanted)
     for name in wanted:
-        column_place(path, names, name)
         if name not in table.values:
             raise ValueError(
                 f"{path}: column {name} should hold numbers but holds {table.others.get(name, 'times')}; "

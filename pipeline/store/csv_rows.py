@@ -15,6 +15,7 @@ from pipeline.reading.signals import Note
 
 COMMENT = ("#", "%", "//")
 OPENING_BYTES, LINES_SHOWN = 1 << 16, 400
+FEWEST_LINES, WIDEST_BYTES = 4, 1 << 21
 _NUMBER = {
     decimal: re.compile(rf"\s*[+-]?(\d+({mark}\d*)?|{mark}\d+)([eE][+-]?\d+)?\s*$")
     for decimal, mark in ((".", r"\."), (",", ","))
@@ -79,15 +80,26 @@ class Opening(NamedTuple):
 def opening(path: Path, decimal: str = "") -> Opening:
     """Encoding, delimiter, decimal mark (`decimal`, or the likely one) and first lines of a text file.
 
-    Raises ValueError for a binary file.
+    Raises ValueError for a binary file, and for a first line without end.
     """
     with path.open("rb") as stream:
         # zeros behind the text are what a file system leaves after a power failure
-        start = stream.read(OPENING_BYTES).rstrip(b"\0")
+        start = stream.read(OPENING_BYTES)
+        # the names of a wide table alone are as long as that
+        while len(start.splitlines()) <= FEWEST_LINES and len(start) < WIDEST_BYTES:
+            if not (more := stream.read(len(start))):
+                break
+            start += more
+        start = start.rstrip(b"\0")
     encoding, notes = _encoding(path, start)
     # as csv counts lines: form feeds and the like end none
     lines = re.split("\r\n|\r|\n", start.decode(encoding, errors="replace"))
     lines = lines[: -1 if not lines[-1] or len(start) >= OPENING_BYTES else None][:LINES_SHOWN]
+    if not lines and len(start) >= WIDEST_BYTES:
+        raise ValueError(
+            f"{path}: its first line has more than {WIDEST_BYTES} bytes, which no header of a table has; "
+            "save it with one row a line"
+        )
     remark = [line.lstrip().startswith(COMMENT) for line in lines]
     delimiter, decimal = _delimiter(
         [line for line, is_remark in zip(lines, remark, strict=True) if line.strip() and not is_remark],
@@ -247,7 +259,12 @@ def _delimiter(lines: Sequence[str], decimals: Sequence[str]) -> tuple[str, str]
 def _split(line: str, delimiter: str) -> list[str]:
     if delimiter == " ":
         return line.split()
-    row = next(csv.reader([line], delimiter=delimiter), [])
+    try:
+        row = next(csv.reader([line], delimiter=delimiter), [])
+    except (
+        csv.Error
+    ):  # a field longer than any is: that delimiter stands nowhere, or a quotation mark is open
+        return [line]
     ends_with_delimiter = line.rstrip("\r\n ").endswith(delimiter)
     return row[:-1] if len(row) > 1 and not row[-1].strip() and ends_with_delimiter else row
 

@@ -1,6 +1,7 @@
 """New recordings of the temperature loop before anything learns from them: set
 aside, or measured against the champion's own nights."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from pipeline.nightly.settings import Nightly
 from pipeline.report.shared.night import Alarm
 from pipeline.store import artifacts, params
 from pipeline.temperature import identification, plant
+from tests.mcap_writing import Written
 
 CHAMPIONS = {"temperature"}
 NOTHING = DriftMemory()
@@ -191,3 +193,56 @@ def test_what_drifted_is_remembered_until_a_good_night_and_can_be_what_later_nig
     finally:
         artifacts.write_json(folder / screening.REFERENCE, before)
         (RAW / "drifted.csv").unlink()
+
+
+def as_bag(folder: Path, columns, parts: int = 2) -> dict[str, str]:
+    """A shift as a bag of several files, and what the night finds in it: {bag: digest}."""
+    folder.mkdir(parents=True)
+    names = [f"{folder.name}_{i}.mcap" for i in range(parts)]
+    for name, rows in zip(names, np.array_split(np.arange(len(columns["time_s"])), parts), strict=True):
+        made_part = Written()
+        channel = made_part.topic("/machine", "json")
+        for k in rows:
+            numbers = {signal: float(values[k]) for signal, values in columns.items() if signal != "time_s"}
+            made_part.message(channel, float(columns["time_s"][k]), numbers)
+        (folder / name).write_bytes(made_part.bytes())
+    information = {"version": 5, "storage_identifier": "mcap", "relative_file_paths": names}
+    (folder / "metadata.yaml").write_text(yaml.safe_dump({"rosbag2_bagfile_information": information}))
+    digests = inputs.contents(inputs.Hashes({}), [str(RAW)])
+    return inputs.recordings(digests, params.load(Nightly, "nightly").loops["temperature"])
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_a_bag_is_one_recording_judged_or_set_aside_whole(made, monkeypatch, swapped):
+    monkeypatch.chdir(made)
+    good, bag = nights.a_night(1, 400), RAW / "run"
+    turned = {"sensor_1": good["sensor_2"], "sensor_2": good["sensor_1"]}
+    below = as_bag(bag, good | turned if swapped else good)
+    try:
+        assert set(below) == {*(f"{RAW}/shift_{k}.csv" for k in range(4)), str(bag)}
+        new = {"temperature": {str(bag): below[str(bag)]}}
+        result = screening.look(params.load(Nightly, "nightly"), CHAMPIONS, new, NOTHING, night=9)
+        assert set(result.drift.quarantined) == ({str(bag)} if swapped else set())
+        assert bag.exists() != swapped
+        if swapped:
+            aside = inputs.QUARANTINE / "temperature/run"
+            assert sorted(path.name for path in aside.iterdir()) == [
+                "metadata.yaml",
+                "run_0.mcap",
+                "run_1.mcap",
+            ]
+        else:
+            assert str(bag) in result.drift.of("temperature").figures
+    finally:
+        shutil.rmtree(bag, ignore_errors=True)
+
+
+def test_one_more_part_makes_a_bag_new(made, monkeypatch):
+    monkeypatch.chdir(made)
+    bag = RAW / "run"
+    try:
+        before = as_bag(bag, nights.a_night(1, 401))[str(bag)]
+        shutil.rmtree(bag)
+        assert as_bag(bag, nights.a_night(1, 401), parts=3)[str(bag)] != before
+    finally:
+        shutil.rmtree(bag, ignore_errors=True)

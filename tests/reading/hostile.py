@@ -367,3 +367,10 @@ def write(folder: Path, name: str) -> Path:
     else:
         path.write_bytes(FILES[name]())
     return path
+
+
+def trial_frames(path: Path) -> int:
+    """The count of frames that the deposition loop's reader has of a recording."""
+    from pipeline.deposition.workflow.trial_files import read_trial
+
+    return len(read_trial(path, unreadable_share=0.1).frames.time_s)

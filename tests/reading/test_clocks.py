@@ -6,6 +6,7 @@ import pytest
 from pipeline.reading.clocks import mended
 from pipeline.reading.formats import Columns
 from pipeline.reading.recordings import Source, read, resample
+from tests.mcap_writing import Written
 
 SOURCES = [Source("u", "u", "percent"), Source("y", "y", "degC")]
 
@@ -133,3 +134,56 @@ def test_a_clock_that_falls_by_more_than_half_of_all_counts_is_refused_in_one_se
     group = Columns("/zone", time, {"T": np.arange(4.0)}, lambda i: f"message {i + 1}")
     with pytest.raises(ValueError, match="message 3 is at .* which is before the sample ahead of it"):
         mended(Path("rig.mcap"), group, may_restart=False)
+
+
+# ---- MCAP: the recorder's clock, or one that each message carries
+
+STARTS = (0, 12)
+
+
+EVERY, EVENTS = range(60), (0, 5, 7, 20, 33)
+
+
+def printed_twice(tmp_path, *, time="", commands=EVERY, motor_late=0):
+    """/zone and /motor for 60 s and 40 s, and in between the clock starts over; /motor at `commands`."""
+    made = Written()
+    zone, motor = made.topic("/zone", "json"), made.topic("/motor", "json")
+    logged = 0
+    for start, count in zip(STARTS, (60, 40), strict=True):
+        for k in range(start, start + count):
+            log = k if not time else logged
+            made.message(zone, log, {"stamp": k, "y": float(k)})
+            if k - start in commands:
+                made.message(motor, log, {"stamp": k + motor_late * (start > 0), "u": float(k)})
+            logged += 1
+    path = tmp_path / "print.mcap"
+    path.write_bytes(made.bytes())
+    return read(path, [Source("y", "/zone:y", "degC"), Source("u", "/motor:u", "percent")], time=time)
+
+
+@pytest.mark.parametrize("commands", [EVERY, EVENTS])
+def test_a_recorder_s_clock_that_starts_over_begins_a_segment_of_every_topic(tmp_path, commands):
+    raw = printed_twice(tmp_path, commands=commands)
+    table = resample(raw, sample_time_s=1.0, inputs=["u"], outputs=["y"])
+    assert np.flatnonzero(np.diff(table.segment)).tolist() == [59]
+    np.testing.assert_array_equal(table.values["y"], [*range(60), *range(12, 52)])
+    start = np.where(table.segment == 0, *STARTS)
+    last = [max(k for k in commands if k <= since) for since in table.values["y"] - start]
+    np.testing.assert_array_equal(table.values["u"], start + last)
+    assert [note.kind for note in raw.notes].count("restart") == 2
+
+
+def test_where_one_topic_does_not_show_that_the_clock_started_over_the_recording_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="message 61 of /zone is at 12 s"):
+        printed_twice(tmp_path, commands=(0,))
+
+
+def test_stamps_of_two_topics_that_start_over_together_are_one_clock(tmp_path):
+    raw = printed_twice(tmp_path, time="stamp")
+    assert len(raw.breaks) == 1
+    np.testing.assert_array_equal(raw.signals["y"][0], raw.signals["u"][0])
+
+
+def test_stamps_that_start_over_at_other_times_are_of_two_clocks_and_refused(tmp_path):
+    with pytest.raises(ValueError, match="which is before the sample ahead of it"):
+        printed_twice(tmp_path, time="stamp", motor_late=-8)

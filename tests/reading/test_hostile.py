@@ -110,6 +110,17 @@ def test_large_hostile_files_stay_within_a_minute_and_2_GB(tmp_path, name):
         assert peak_mb(pid) < 2300  # the budget, and what the child takes itself
 
 
+@pytest.mark.slow  # a second each, most of it the import of the loop
+@pytest.mark.parametrize("name", sorted(n for n in [*QUICK, *hostile.SPARSE] if n.endswith(".mcap")))
+def test_the_readers_of_the_camera_loops_refuse_hostile_recordings_within_the_same_memory(tmp_path, name):
+    """They run in no child of their own: frames are decoded one by one, later, by whoever walks them."""
+    path = hostile.write(tmp_path, name)
+    with pytest.raises(ValueError, match=name) as refused:
+        isolated(hostile.trial_frames, path, shown=path, budget=BUDGET)
+    assert "more memory" not in str(refused.value)
+    assert "ended the process" not in str(refused.value)
+
+
 # ---- damage by chance
 
 

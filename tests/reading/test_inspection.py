@@ -1,7 +1,10 @@
 import json
 import sys
+import time
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import yaml
 
@@ -114,6 +117,28 @@ def test_damage_and_a_clock_that_runs_backwards_are_told_and_not_refused(tmp_pat
     path = tmp_path / "rig.csv"
     path.write_text("t,heater_1\n0,1\n2,2\n1,3\n")
     assert "line 4 is at 1 s, which is before the sample ahead of it at 2 s" in inspect(path)
+
+
+@pytest.mark.parametrize("kind", ["contents", "heads", "lengths"])
+def test_an_mcap_whose_every_chunk_is_damaged_has_findings_and_no_proposal(tmp_path, kind):
+    content = json_recording(800, NO, chunk_size=4000)
+    path = tmp_path / "rig.mcap"
+    for offset, start, _ in chunks(content):
+        place = {"contents": start + 50, "heads": offset, "lengths": offset + 1}[kind]
+        content = flipped(content, place, 4)
+    path.write_bytes(content)
+    text = inspect(path)
+    assert "/machine: 0 messages" in text
+    assert text.count("  damage: ") == (15 if kind == "contents" else 2)
+    assert "no number could be read, so nothing is proposed" in text
+
+
+def test_a_clock_that_starts_over_is_among_the_findings_as_it_is_read(tmp_path):
+    path = tmp_path / "rig.csv"
+    path.write_text("t,heater_1,T1\n" + "".join(f"{k},{k % 7},{20 + k}\n" for k in [*range(40)] * 3))
+    text = inspect(path)
+    assert "restart: the clock starts over 2 times: segments begin there, the first in line 42" in text
+    assert "rows: 120 samples in 119 s, every 1 s" in text
 
 
 def test_a_table_without_names_is_guessed_from_its_values_and_says_so(tmp_path):
@@ -411,3 +436,21 @@ def test_a_text_with_fixed_widths_or_tabs_is_a_table_with_names_of_several_words
     assert "every 0.5 s (2 per second)" in text
     sources = [one["source"] for one in proposal(text)["ingest"]["mapping"].values()]
     assert sources == ["Heater 1", "Zone 1 (C)"]
+
+
+def test_a_wide_table_is_described_by_what_its_names_tell_in_no_longer_than_it_is_read(tmp_path):
+    """The bar is 1.5 times one plain read of all columns; 0.2 to 0.5 times were measured."""
+    rng = np.random.default_rng(0)
+    names = [f"tag_{j}" for j in range(3000)]
+    names[2500], names[2900] = "heater_1_pct", "zone_1_C"
+    path = tmp_path / "plc.parquet"
+    values = {name: 50 + rng.normal(size=50) for name in names}
+    pq.write_table(pa.table({"time_s": np.arange(50.0), **values}), path)
+    start = time.process_time()
+    read(path, [Source(name, name, "") for name in names])
+    plain, start = time.process_time() - start, time.process_time()
+    text = inspect(path)
+    assert time.process_time() - start < 1.5 * plain
+    assert "fields: 3000 columns hold numbers; 128 are shown" in text
+    mapped = {one["source"] for one in proposal(text)["ingest"]["mapping"].values()}
+    assert {"heater_1_pct", "zone_1_C"} <= mapped

@@ -132,7 +132,10 @@ def test_the_hour_that_the_begin_of_summer_time_leaves_out_is_no_gap():
     ("text", "reason"),
     [
         ("warm", "is 'warm'; convert it"),
-        ("05/03/2025 12:00", "is '05/03/2025 12:00' (day and month, or month and day?); convert it"),
+        (
+            "05/03/2025 12:00",
+            "is '05/03/2025 12:00' (day or month first: 2025-03-05 or 2025-05-03?); convert it",
+        ),
         ("12:34", "is '12:34' (hours and minutes, or minutes and seconds?)"),
         ("31.02.2025 12:00", "is '31.02.2025 12:00' (day is out of range for month?); convert it"),
         ("2025-11-21 12:00:00 Mars/Olympus", "(zone Mars/Olympus?)"),

@@ -6,7 +6,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from pipeline.reading.recordings import Source, nearest_names, read
+from pipeline.reading.recordings import Source, inspect, nearest_names, read
 from pipeline.store.artifacts import write_recording
 from tests.mcap_writing import Written
 
@@ -287,7 +287,7 @@ def test_zeros_after_a_power_failure_are_left_out_and_noted(tmp_path):
         (
             "time,u,y\n05/03/2025 13:00,1,2\n06/03/2025 13:00,1,2\n",
             "line 2, time time should be seconds or ISO 8601 such as 2025-11-21T13:00:00.5 but is "
-            "'05/03/2025 13:00' (day and month, or month and day?)",
+            "'05/03/2025 13:00' (day or month first: 2025-03-05 or 2025-05-03?)",
         ),
         ("t,u,y\n", "the file has a header and no data"),
         ("t,u,y\n0,7\n8,1.5\n0,\n", "no row behind line 1 has a time and the 3 fields of the header"),
@@ -446,3 +446,43 @@ def test_recordings_of_others_are_read_by_topic_and_field(shared):
     assert raw.signals["focal"][1].tolist() == [800] * 10
     with pytest.raises(ValueError, match="no topic with numbers could be read"):
         read(shared("data/mcap_ros2/wbag_0.mcap"), [Source("y", "data", "1")])
+
+
+@pytest.mark.parametrize(("written", "order"), [("%d/%m/%Y %H:%M:%S", "day"), ("%m/%d/%Y %H:%M:%S", "month")])
+@pytest.mark.parametrize("rows", [2000, 40])
+def test_of_two_orders_of_day_and_month_the_one_is_read_in_which_the_clock_is_steady(
+    tmp_path, written, order, rows
+):
+    """A night's recording, 5 to 6 March: the other order has a month between two rows."""
+    start = datetime.datetime(2025, 3, 6) - datetime.timedelta(seconds=30 * (rows // 2))
+    stamps = [start + datetime.timedelta(seconds=30 * k) for k in range(rows)]
+    lines = [f"{stamp.strftime(written)},{k % 3},{20 + k % 7}\n" for k, stamp in enumerate(stamps)]
+    (tmp_path / "a.csv").write_text("time,u,y\n" + "".join(lines))
+    raw = read(tmp_path / "a.csv", SOURCES)
+    np.testing.assert_array_equal(np.diff(raw.signals["y"][0]), 30.0)
+    assert f"were read with the {order} first" in raw.notes[0].message
+
+
+def test_two_orders_of_day_and_month_are_refused_where_a_pause_hides_which_is_meant(tmp_path):
+    days = [(5, hour) for hour in range(9, 17)] + [(6, hour) for hour in range(9, 17)]
+    lines = [f"{day:02d}/03/2025 {hour:02d}:00,1,{20 + hour}\n" for day, hour in days]
+    (tmp_path / "a.csv").write_text("time,u,y\n" + "".join(lines))
+    with pytest.raises(ValueError, match=r"\(day or month first: 2025-03-05 or 2025-05-03\?\)"):
+        read(tmp_path / "a.csv", SOURCES)
+
+
+@pytest.mark.parametrize("delimiter", [",", ";"])
+def test_a_table_whose_names_are_longer_than_the_opening_is_read(tmp_path, delimiter):
+    """Names of 80 kB; the layout was sought in the first 64 kB."""
+    names = ["t", *(f"zone_{j:05d}_temperature_C" for j in range(3500))]
+    rows = [delimiter.join([str(k), *(f"{20 + j % 7}.5" for j in range(3500))]) for k in range(6)]
+    (tmp_path / "a.csv").write_text("\n".join([delimiter.join(names), *rows]) + "\n")
+    raw = read(tmp_path / "a.csv", [Source("y", names[3500], "degC")])
+    np.testing.assert_array_equal(raw.signals["y"][1], 20.5 + 3499 % 7)
+    assert "3501 columns, 3501 of them numbers" in inspect(tmp_path / "a.csv")
+
+
+def test_a_first_line_without_end_is_refused_in_a_sentence(tmp_path):
+    (tmp_path / "a.csv").write_bytes(b"1," * (1 << 21))
+    with pytest.raises(ValueError, match="its first line has more than 2097152 bytes"):
+        read(tmp_path / "a.csv", SOURCES)

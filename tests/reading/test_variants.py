@@ -17,7 +17,7 @@ REFUSED = {
     "no_header": "name it, or write time: every 1.0 s",
     "thousands_not_throughout": "write the numbers without marks between thousands",
     "only_thousandths": 'declare ingest.decimal: "," for 1.000, or "." for 1000',
-    "day_or_month_first": "(day and month, or month and day?); convert it",
+    "day_or_month_first": "(day or month first: 2025-01-02 or 2025-02-01?); convert it",
     "pandas_index_of_row_numbers": "counts the rows 0, 1, 2, ..., which is no time; write time: every 1.0 s",
     "parquet_pandas_row_numbers": "counts the rows 0, 1, 2, ..., which is no time; write time: every 1.0 s",
     "parquet_lists": "write numbers, or map another column",
