@@ -147,8 +147,8 @@ def _ended(shown: str | Path, budget: Budget, status: int, last: str) -> str:
             f"{shown}: reading it takes longer than the {budget.longest_s:g} s that a recording may take; "
             "split the recording, or raise ingest.longest_s in params.expert.yaml if it is as long as that"
         )
-    # as C++, Python and Rust say it
-    if any(words in last for words in ("bad_alloc", "MemoryError", "memory allocation of")):
+    # as C++, Python, Rust and Arrow say it
+    if any(words in last for words in ("bad_alloc", "MemoryError", "memory allocation of", "Out of memory")):
         return _out_of_memory(shown, budget)
     if status == -signal.SIGKILL:
         return (
