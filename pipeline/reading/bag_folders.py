@@ -13,6 +13,8 @@ from pipeline.reading.signals import Note
 from pipeline.reading.signatures import METADATA
 
 LARGEST_METADATA = 1 << 20
+# between the parts of one recording
+LONGEST_PAUSE_S = 60.0
 
 
 def bag_parts(path: Path) -> list[Path]:
@@ -85,7 +87,24 @@ def read_bag(
     missing = sorted({topic for topic, _ in places.values()} - set(pieces))
     if missing:
         raise ValueError(f"{path}: no part of the bag holds a message of {missing[0]}; map another topic")
-    return [joined(path, groups) for groups in pieces.values()], places, counts, notes
+    columns = [joined(path, groups) for groups in pieces.values()]
+    return columns, places, counts, notes + _apart(pieces)
+
+
+def _apart(pieces: dict[str, list[Columns]]) -> list[Note]:
+    """A note where parts of a bag stand farther apart than they last: a recorder goes on at once in the next
+    part."""
+    for topic, groups in pieces.items():
+        spans = sorted((group.time[0].item(), group.time[-1].item()) for group in groups)
+        for (first, end), (begin, last) in itertools.pairwise(spans):
+            gap_s, lasting_s = (begin - end) / 1e9, (end - first + last - begin) / 1e9
+            if gap_s > max(LONGEST_PAUSE_S, lasting_s):
+                message = (
+                    f"two parts hold {topic} {gap_s:.0f} s apart, longer than they last: "
+                    "one of them may be of another recording"
+                )
+                return [Note("clock", "", len(spans), message)]
+    return []
 
 
 _NONE = Topic("", [], [], "", 0)

@@ -24,6 +24,8 @@ _SINCE_1904_S, _LABVIEW = 2_082_844_800, (3.5e9, 4.3e9)
 # days since 1899-12-30 (since 1904 where the column says so) and since the year 0, from 1954 to 2119, and
 # 1970-01-01 in them
 _SERIAL_DAYS = ((20_000, 80_000, 25_569, "spreadsheets"), (713_000, 774_000, 719_529, "MATLAB"))
+# fractions of a day, and Julian dates from 1858 to 2132
+_DAYS = ((0, 2), (2_400_000, 2_500_000))
 # a clock that runs on for no more than so many samples before it falls back is not one clock
 OTHER_DEVICE_RUN = 8
 _TIME_NAMES = (
@@ -334,11 +336,12 @@ def check_no_counter(path: Path, name: str, time: np.ndarray) -> None:
 
 def check_no_day_fractions(path: Path, name: str, time: np.ndarray, written: str = "") -> None:
     """Raises ValueError where a time without a unit may be the fraction of a day that spreadsheets write for
-    a time of day: as seconds, it would have more than 11,000 samples a second."""
+    a time of day, or a Julian date: as seconds, it would have more than 11,000 samples a second."""
     if _time_unit(name)[1] or written.strip(" ()[]").casefold() in _PER_SECOND or len(time) < 3:
         return
     step = float(np.median(np.abs(np.diff(time))))
-    if time.min() >= 0 and time.max() < 2 and 0 < step * 86400 < 8:
+    of_days = any(first <= time.min() and time.max() < last for first, last in _DAYS)
+    if of_days and 0 < step * 86400 < 8:
         raise ValueError(
             f"{path}: time {name} runs from {time.min():.6g} to {time.max():.6g} in steps of {step:.3g}, "
             f"which may be seconds, or days with {step * 86400:.3g} s between samples; "

@@ -386,26 +386,26 @@ def _order(steps: list, names: Sequence[str]) -> list[int]:
     return [read.index(name) for name in names]
 
 
+def _ends(data: bytes, size: int, exact: bool, padding: int) -> bool:
+    """Whether a message ends behind its `size` bytes, but for padding. Four bytes and more could be a number
+    of another schema, and must be zeros."""
+    behind = len(data) - size
+    return behind >= 0 and (
+        not exact or behind <= min(3, padding) or (behind <= padding and not any(data[size:]))
+    )
+
+
 def _decode(messages: list[bytes], steps: list, exact: bool, padding: int) -> np.ndarray:
-    """The numbers of the messages by the steps. Up to `padding` bytes may follow the last step; those from
-    the fourth on would hold a number of another schema, and must be zeros."""
+    """The numbers of the messages by the steps. Up to `padding` bytes may follow the last step."""
     rows = []
     try:
         if len(steps) == 1 and isinstance(steps[0], _FixedRow):
-            layout = steps[0].layouts[0]
-            unpack, shortest, longest = (
-                layout.unpack_from,
-                layout.size,
-                layout.size + padding if exact else np.inf,
-            )
-            near = shortest + 3 if exact else np.inf
-            fits = [
-                shortest <= len(data) <= near or (near < len(data) <= longest and not any(data[shortest:]))
-                for data in messages
-            ]
-            if not all(fits):
-                wrong = len(messages[fits.index(False)])
-                raise UnreadableMessage(f"a message of {wrong} bytes where {shortest} are expected")
+            unpack, size = steps[0].layouts[0].unpack_from, steps[0].layouts[0].size
+            # most messages have no more than that, which takes no look at their bytes
+            if not {len(data) for data in messages} <= set(range(size, size + min(3, padding) + 1)):
+                wrong = [len(data) for data in messages if not _ends(data, size, exact, padding)]
+                if wrong:
+                    raise UnreadableMessage(f"a message of {wrong[0]} bytes where {size} are expected")
             rows = [unpack(data) for data in messages]
         else:
             for data in messages:
@@ -413,8 +413,7 @@ def _decode(messages: list[bytes], steps: list, exact: bool, padding: int) -> np
                 pos = 0
                 for step in steps:
                     pos = step.read(data, pos, values)
-                behind = len(data) - pos
-                if behind < 0 or (exact and (behind > padding or (behind > 3 and any(data[pos:])))):
+                if not _ends(data, pos, exact, padding):
                     raise UnreadableMessage(f"a message of {len(data)} bytes where {pos} are expected")
                 rows.append(values)
     except struct.error as error:

@@ -53,6 +53,12 @@ def test_the_unit_below_the_time_of_a_workbook_and_in_a_parquet_field_counts(tmp
     np.testing.assert_allclose(zone(tmp_path / "rig.parquet")[0], MINUTES * 60, atol=1e-9)
 
 
+def test_a_julian_date_is_not_read_as_seconds(tmp_path):
+    rows = "".join(f"{2_461_001 + i / 86400:.9f},{ZONE[i]}\n" for i in range(40))
+    with pytest.raises(ValueError, match="may be seconds, or days with 1 s between samples"):
+        zone(write(tmp_path, "time,T1\n" + rows))
+
+
 def test_a_time_that_may_be_the_fraction_of_a_day_is_refused_unless_its_name_has_a_unit(tmp_path):
     days = 0.5 + np.arange(40) / 86400
     rows = "".join(f"{day:.9f},{value}\n" for day, value in zip(days, ZONE, strict=True))
