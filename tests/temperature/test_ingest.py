@@ -387,7 +387,7 @@ def test_a_bag_is_one_recording_among_files(tmp_path):
         "heater": ("/heater/duty:data", "percent", 1.0, 0.0),
         "zone": ("/zone_1/temperature:data", "degC", 1.0, 0.0),
     }
-    results = process(raw, JOB._replace(mapping=mapped), INLINE, memo=tmp_path / "memo")
+    results = process(raw, JOB._replace(mapping=mapped), INLINE, memo=tmp_path / "memo", budget=BUDGET)
     assert [result.name for result in results] == ["000.csv", "night/run"]
     assert "there is no column '/heater/duty:data'" in results[0].reason
     assert results[1].reason == "" and len(results[1].record["zone"]) == 80
