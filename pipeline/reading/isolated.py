@@ -26,6 +26,8 @@ ROOT = Path(__file__).parents[2]
 _LENGTH = struct.Struct("<Q")
 # a child that keeps so much behind a call is replaced: the next call has its whole budget
 KEPT_MB = 256
+# what C++, Python and Arrow print last where memory is refused them; Arrow then ends the process
+OUT_OF_MEMORY = ("bad_alloc", "MemoryError", "Out of memory", "memory allocation of")
 # the child's own code; -P: a folder `pipeline` in the working directory is not ours
 _SERVE = "from pipeline.reading.isolated import serve; serve()"
 
@@ -147,8 +149,7 @@ def _ended(shown: str | Path, budget: Budget, status: int, last: str) -> str:
             f"{shown}: reading it takes longer than the {budget.longest_s:g} s that a recording may take; "
             "split the recording, or raise ingest.longest_s in params.expert.yaml if it is as long as that"
         )
-    # as C++, Python, Arrow and Rust end without memory
-    if any(words in last for words in ("bad_alloc", "MemoryError", "Out of memory", "memory allocation of")):
+    if any(words in last for words in OUT_OF_MEMORY):
         return _out_of_memory(shown, budget)
     if status == -signal.SIGKILL:
         return (
