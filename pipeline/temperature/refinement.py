@@ -202,17 +202,17 @@ def _normal_equations(
                 _without_underflow(_filtered(blocks, pulse, [1.0])[:, :, 0]),
             ]
         )
-        e, mask, ZZ = y - predicted, None, None
+        e, mask, ZZ, Ze = y - predicted, None, None, np.empty((0, p))
         first = size - n * (len(v_all) - segment)
         for o in range(p):
             if mask is None or not np.array_equal(mask, np.isfinite(y[:, o])):
                 mask = np.isfinite(y[:, o])
                 Z_measured = Z if mask.all() else Z[mask]
-                ZZ = Z_measured.T @ Z_measured
+                ZZ, Ze = Z_measured.T @ Z_measured, Z_measured.T @ e[mask]
             M = mixing[o]
             at = np.r_[0:state, state + o * output : state + (o + 1) * output, first : first + n]
             JJ[np.ix_(at, at)] += mixed(M, mixed(M, ZZ).T)
-            Je[at] += mixed(M, Z_measured.T @ e[mask, o])
+            Je[at] += mixed(M, Ze[:, o])
     for o in range(p):
         fixed = state + o * output + n + np.flatnonzero(~free[o, columns])
         JJ[fixed], JJ[:, fixed], Je[fixed] = 0.0, 0.0, 0.0
@@ -451,7 +451,7 @@ def _weighted(plant: Plant, u, y, criterion: Criterion, *, diagonal: bool) -> _W
     y_full = y
     if ahead:
         y_full = [
-            filled(plant, a, b, _first_state(plant, start, criterion, a, b))
+            b if np.isfinite(b).all() else filled(plant, a, b, _first_state(plant, start, criterion, a, b))
             for a, b in zip(u, y, strict=True)
         ]
     v = [drives(criterion, a, b) for a, b in zip(u, y_full, strict=True)]

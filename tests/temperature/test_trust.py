@@ -119,6 +119,11 @@ def test_the_horizon_ends_when_all_responses_have_settled():
     assert horizon(first_order(2.0, 40.0), 100) == 100
 
 
+def test_a_mode_slower_than_the_record_is_followed_over_a_tenth_of_it():
+    assert horizon(first_order(2.0, 6000.0), 5000) == 500
+    assert horizon(first_order(2.0, 4000.0), 5000) == 5000
+
+
 def test_of_an_unstable_plant_three_time_constants_are_shown():
     assert horizon(plant([[1.01]], [[1.0]], [[1.0]]), 5000) <= int(np.ceil(3 / np.log(1.01)))
 
