@@ -324,9 +324,9 @@ def collect(results: Sequence[Result], machine: Plant, *, strict: bool) -> tuple
     return Columns(schema, record), Columns(tables.QUALITY, quality), metrics
 
 
-def printer_pids(folder: Path, results: Sequence[Result], spec: IngestSpec) -> dict[str, list[dict]]:
-    """{"printer_pid": [...]}: by which PID a printer held the heaters whose duty and temperature are signals
-    of ours, gains in our units; {} where no good recording is a klippy.log. The last log's values count."""
+def printer_pids(folder: Path, results: Sequence[Result], spec: IngestSpec) -> list[dict]:
+    """By which PID a printer held the heaters whose duty and temperature are signals of ours, in our units;
+    empty where no good recording is a klippy.log. The last log's values count."""
     inputs = {signal.name for signal in spec.machine.inputs}
     of = {source.source: source for source in spec.sources()}
     pids: dict[str, dict] = {}
@@ -342,10 +342,10 @@ def printer_pids(folder: Path, results: Sequence[Result], spec: IngestSpec) -> d
                 "input": u.signal,
                 "output": y.signal,
                 **dict(zip(("Kp", "Ki", "Kd"), gains, strict=True)),
-                "most_percent": pid.most_percent,
+                "most_percent": pid.most_percent * u.scale,
                 "smooth_s": pid.smooth_s,
             }
-    return {"printer_pid": list(pids.values())} if pids else {}
+    return list(pids.values())
 
 
 def _segments(record: dict[str, np.ndarray]) -> int:
