@@ -1,7 +1,7 @@
 """Recordings -> one table: reads datasets/generate_probing (simulated) or every file below
 datasets/raw/temperature (recordings); writes datasets/ingest/record.parquet,
-quality.parquet and printer_pid.json. A recording that was processed before, with the same parameters and code, is
-taken from a memo; a broken one is quarantined with its reason."""
+quality.parquet and printer_pid.json. A recording that was processed before, with the same
+parameters and code, is taken from a memo; a broken one is quarantined with its reason."""
 
 import sys
 from pathlib import Path

@@ -6,11 +6,10 @@ With e = r - y, once a sample of T = 0.3 s, Klipper computes
     I(t) = I(t-1) + T e(t), within 0 ... most / Ki
     u(t) = Kp e(t) + Ki I(t) - Kd d(t), cut to 0 ... most
 
-and keeps I(t) only where u was not cut. Here T is our sample time, with two differences where it is longer.
-d is what Klipper's own samples give if y runs straight between two of ours: at 1 s its formula smooths
-nothing, and could call a loop unstable that is stable at 0.3 s. u is held for our T, which costs margin: a loop that is
-stable here is stable at 0.3 s, and not always the other way round.
-I is held within the machine's limits after u is computed, not before.
+and keeps I(t) only where u was not cut. Here T is our sample time, and I is held within the machine's limits
+after u is computed, not before. Where our T is longer, d is what Klipper's own samples give if y runs
+straight between two of ours: at 1 s its formula smooths nothing, and calls loops unstable that are stable at
+0.3 s. u is held for our T, which costs margin: a loop near the edge may be stable at 0.3 s and not here.
 """
 
 from typing import NamedTuple
@@ -41,8 +40,8 @@ class HeaterPid(NamedTuple):
 def controller(
     pids: tuple[HeaterPid, ...], plant: Plant, limits: tuple[np.ndarray, np.ndarray]
 ) -> Controller:
-    """The PIDs of all heaters; weights and the outer integrator mean nothing to it. `limits` low and high (m,)
-    in percent. Raises ValueError where the heaters' PIDs are not the whole control of the machine."""
+    """The PIDs of all heaters; weights and the outer integrator mean nothing to it. `limits` low and high
+    (m,) in percent. Raises ValueError where the heaters' PIDs are not the whole control of the machine."""
     plant = strictly_proper(plant)
     pids = tuple(sorted(pids, key=lambda pid: pid.output))
     _check(pids, plant, limits)
@@ -73,8 +72,9 @@ def _check(pids: tuple[HeaterPid, ...], plant: Plant, limits: tuple[np.ndarray, 
 def law(pids: tuple[HeaterPid, ...], *, sample_time_s: float) -> Law:
     """Klipper's PIDs as one law, in the order of the outputs; memory z = [y(t-1); d(t-1)].
 
-    d(t) = phi d(t-1) + (1 - phi) (y(t) - y(t-1)) / T with phi = (1 - 0.3 s / a)^(T / 0.3 s). Of Ki I(t) the part Ki T e(t) joins the proportional gain G = Kp + Ki T, and the rest is G xi(t) with
-    xi(t+1) = xi(t) + Ki T / G e(t): u = G (r + xi - y) - Kd d.
+    d(t) = phi d(t-1) + (1 - phi) (y(t) - y(t-1)) / T with phi = (1 - 0.3 s / a)^(T / 0.3 s). Of Ki I(t) the
+    part Ki T e(t) joins the proportional gain G = Kp + Ki T, and the rest is G xi(t) with xi(t+1) = xi(t) +
+    Ki T / G e(t): u = G (r + xi - y) - Kd d.
     """
     p, T = len(pids), sample_time_s
     Kp, Ki, Kd, smooth = (

@@ -391,7 +391,7 @@ def write(root, *, samples=400, recording="good.mcap", worst=None):
     artifacts.write_json(
         data / "tune_weights/weights.json", {"practical": {"q": [1.0, 2.0], "r": [0.1, 0.2]}}
     )
-    artifacts.write_json(data / "ingest/printer_pid.json", [PRINTER_PID])
+    artifacts.write_json(data / "ingest/printer_pid.json", {"heaters": [PRINTER_PID]})
     folder = data / "evaluate_temperature"
     artifacts.write_table(folder / "scorecard.parquet", tables.SCORECARD, scorecard(worst or {}))
     artifacts.write_table(

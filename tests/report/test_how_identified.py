@@ -149,7 +149,7 @@ def test_a_free_mean_that_gains_more_than_the_bands_is_named_with_its_points(pro
 def test_figures_of_an_older_run_leave_the_page_whole_and_say_what_is_not_measured(project):
     for key in ("fit_holdout_free_mean", "feedthrough", "validation", "fit", "forbidden_gains"):
         change("identify_plant", **{key: None})
-    artifacts.write_json("datasets/ingest/printer_pid.json", [])
+    artifacts.write_json("datasets/ingest/printer_pid.json", {})
     text = page()
     assert "Refinement not measured" in text and "Direct feed-through not measured" in text
     assert "The printer’s own PID" not in text
@@ -208,7 +208,7 @@ def test_the_page_of_the_loop_says_whether_the_printers_own_pid_was_judged(proje
 
 
 def test_a_machine_without_a_printers_log_shows_nothing_of_its_pid(project):
-    artifacts.write_json("datasets/ingest/printer_pid.json", [])
+    artifacts.write_json("datasets/ingest/printer_pid.json", {})
     main()
     for path in (TEMPERATURE, IDENTIFICATION):
         assert "own PID" not in Page(path).text, path

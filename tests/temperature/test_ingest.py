@@ -414,16 +414,16 @@ def test_the_printers_own_pid_comes_with_its_log_in_the_units_of_our_signals(tmp
     }
     good = ingest.Result("klippy.log", {}, {}, "", False)
     spec = IngestSpec(PRINTER, mapping, "", 5.0)
-    (pid,) = ingest.printer_pids(tmp_path, [good], spec)
+    (pid,) = ingest.printer_pids(tmp_path, [good], spec)["heaters"]
     assert (pid["recording"], pid["input"], pid["output"]) == ("klippy.log", "nozzle_duty", "nozzle")
     # percent for a duty of 0 to 255; half the input's unit over twice the output's
     expected = np.array(EXTRUDER.pid) * 100 / 255 * 0.5 / 2
     np.testing.assert_allclose([pid["Kp"], pid["Ki"], pid["Kd"]], expected, rtol=1e-12)  # rounding
-    assert ingest.printer_pids(tmp_path, [good._replace(reason="broken")], spec) == []
+    assert ingest.printer_pids(tmp_path, [good._replace(reason="broken")], spec) == {}
 
 
 def test_a_heater_that_is_no_signal_of_ours_and_another_format_have_no_pid(tmp_path):
     (tmp_path / "klippy.log").write_text(print_log([(0, 200, 60)], longest_s=60))
     recording(tmp_path / "a.csv", seed=0)
     results = [ingest.Result(name, {}, {}, "", False) for name in ("klippy.log", "a.csv")]
-    assert ingest.printer_pids(tmp_path, results, JOB) == []
+    assert ingest.printer_pids(tmp_path, results, JOB) == {}

@@ -93,7 +93,11 @@ def by_the_formula(cases: Panel, sample_time_s: float, noise: np.ndarray) -> tup
 def test_the_law_warms_the_heaters_as_klippers_formula_does(sample_time_s, noise):
     cases = warm_up(heaters(sample_time_s), noise=noise)
     run = simulate(
-        cases, law((BED, HOT), sample_time_s=sample_time_s), np.zeros((1, 2)), limits=LIMITS, integral_band=1.0
+        cases,
+        law((BED, HOT), sample_time_s=sample_time_s),
+        np.zeros((1, 2)),
+        limits=LIMITS,
+        integral_band=1.0,
     )
     y, u = by_the_formula(cases, sample_time_s, disturbances(cases)[:, 0])
     assert (u == 100).mean() > 0.05  # the way up is at the limit

@@ -52,8 +52,8 @@ def _flagged(sources: Sources) -> tuple[str, str] | None:
 
 def _printer(sources: Sources) -> tuple[str, str] | None:
     """The printer's own PID, where a recording tells it, and where it stands beside the others."""
-    own = sources.tables["printer_pid"]
-    if isinstance(own, Missing) or not own:
+    own = lookup(sources.tables["printer_pid"], "heaters")
+    if isinstance(own, Missing):
         return None
     gains = [
         f"{pid['input']} by Kp {short(pid['Kp'])}, Ki {short(pid['Ki'])}, Kd {short(pid['Kd'])}"
@@ -69,7 +69,7 @@ def _printer(sources: Sources) -> tuple[str, str] | None:
     return (
         "The printer’s own PID is among these controllers, as it is.",
         f"{holds} It runs once in {sources.declared.machine.sample_time_s:g}{THIN}s here, as often as the "
-        f"others, and in Klipper every 0.3{THIN}s. It is not tuned, is told no model, and the verdict does "
+        f"others, and in Klipper every 0.3{THIN}s. It is told no model and no target, is not tuned, and the verdict does "
         f"not choose it. {_held_stable(evaluated)}{simc}",
     )
 

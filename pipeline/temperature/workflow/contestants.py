@@ -163,8 +163,8 @@ CONTESTANTS = (
         "printer_pid",
         "Printer",
         "its own PID",
-        "Klipper’s PID with the gains of the printer’s configuration, as its log has them, at the sample time "
-        "of these pages. It is not tuned and aims at no target: it starts at the input of the hold, and its "
+        "Klipper’s PID with the gains of the printer’s configuration, as its log has them, at our sample "
+        "time. It is not tuned and aims at no target: it starts at the input of the hold, and its "
         "integral rests while the duty is at a limit.",
         _printer_pid,
         "",

@@ -111,7 +111,7 @@ def read_learned(
             plant.strictly_proper(one)
             for one in plant.restored(artifacts.read_arrays(spread_path, "spread", 1, shapes=plants))
         ],
-        _heater_pids(artifacts.read_json(printer_pid_path), machine),
+        _heater_pids(artifacts.read_json(printer_pid_path).get("heaters", []), machine),
     )
 
 

@@ -324,9 +324,9 @@ def collect(results: Sequence[Result], machine: Plant, *, strict: bool) -> tuple
     return Columns(schema, record), Columns(tables.QUALITY, quality), metrics
 
 
-def printer_pids(folder: Path, results: Sequence[Result], spec: IngestSpec) -> list[dict]:
-    """By which PID a printer held the heaters whose duty and temperature are signals of ours, in our units;
-    empty where no good recording is a klippy.log. The last log's values count."""
+def printer_pids(folder: Path, results: Sequence[Result], spec: IngestSpec) -> dict[str, list[dict]]:
+    """{"heaters": [...]}: by which PID a printer held the heaters whose duty and temperature are signals of
+    ours, in our units; {} where no good recording is a klippy.log. The last log's values count."""
     inputs = {signal.name for signal in spec.machine.inputs}
     of = {source.source: source for source in spec.sources()}
     pids: dict[str, dict] = {}
@@ -345,7 +345,7 @@ def printer_pids(folder: Path, results: Sequence[Result], spec: IngestSpec) -> l
                 "most_percent": pid.most_percent * u.scale,
                 "smooth_s": pid.smooth_s,
             }
-    return list(pids.values())
+    return {"heaters": list(pids.values())} if pids else {}
 
 
 def _segments(record: dict[str, np.ndarray]) -> int:
