@@ -69,8 +69,8 @@ def _printer(sources: Sources) -> tuple[str, str] | None:
     return (
         "The printer’s own PID is among these controllers, as it is.",
         f"{holds} It runs once in {sources.declared.machine.sample_time_s:g}{THIN}s here, as often as the "
-        f"others, and in Klipper every 0.3{THIN}s. It is told no model and no target, is not tuned, and the verdict does "
-        f"not choose it. {_held_stable(evaluated)}{simc}",
+        f"others, and in Klipper every 0.3{THIN}s. It is told no model and no target, is not tuned, and "
+        f"the verdict does not choose it. {_held_stable(evaluated)}{simc}",
     )
 
 
