@@ -22,6 +22,7 @@ def main() -> None:
             "datasets/identify_plant/spread.parquet",
             "datasets/tune_weights/weights.json",
             "datasets/learn_kernel",
+            "datasets/ingest/printer_pid.json",
             machine,
         )
         judged = evaluate_temperature.judged(settings, machine, tracking, panel, learned, simulated=simulated)

@@ -1,7 +1,7 @@
 """Recordings -> one table: reads datasets/generate_probing (simulated) or every file below
-datasets/raw/temperature (recordings); writes datasets/ingest/record.parquet and
-quality.parquet. A recording that was processed before, with the same parameters and code, is
-taken from a memo; a broken one is quarantined with its reason."""
+datasets/raw/temperature (recordings); writes datasets/ingest/record.parquet,
+quality.parquet and printer_pid.json. A recording that was processed before, with the same
+parameters and code, is taken from a memo; a broken one is quarantined with its reason."""
 
 import sys
 from pathlib import Path
@@ -31,7 +31,8 @@ def main() -> None:
         )
         artifacts.write_table(out / "record.parquet", record.schema, record.columns)
         artifacts.write_table(out / "quality.parquet", quality.schema, quality.columns)
-        artifacts.write_metrics("ingest", metrics | ingest.printer_pids(folder, results, spec))
+        artifacts.write_json(out / "printer_pid.json", ingest.printer_pids(folder, results, spec))
+        artifacts.write_metrics("ingest", metrics)
 
 
 if __name__ == "__main__":

@@ -107,7 +107,7 @@ def judge(
     deployed = simulate(
         scenarios,
         law,
-        feed_forward(scenarios, law, aims),
+        feed_forward(scenarios, law, None if law.conditional else aims),
         limits=limits,
         integral_band=deployment.integral_limit,
     )

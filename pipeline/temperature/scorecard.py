@@ -149,7 +149,7 @@ def simulate(
     steps, (scenarios, p) = panel.steps, panel.r.shape
     y, command = np.empty((steps, scenarios, p)), np.empty((steps, scenarios, law.K.shape[0]))
     applied, noise = np.empty_like(command), disturbances(panel)
-    x, xi = panel.x0.copy(), np.zeros((scenarios, p))
+    x, xi = panel.x0.copy(), _xi_at_start(law, panel)
     held = np.einsum("sij,sj->si", C, x) + d
     z = panel.u0 @ law.start_u.T + (held + noise[0]) @ law.start_y.T + law.start
     # the memory of a window is a shift: as a sparse matrix it costs a copy, not a product
@@ -165,13 +165,38 @@ def simulate(
         u = u if limits is None else np.clip(u, *limits)
         applied[t] = u
         z = z @ memory + u @ law.B_u.T + measured @ law.B_y.T + panel.r @ law.B_r.T + law.c
-        if law.integral:
+        if law.conditional:
+            xi = _conditional(law, xi, panel.r - measured, command[t], limits)
+        elif np.any(law.integral):
             xi += law.integral * np.clip(panel.r - measured, -integral_band, integral_band)
         x = np.einsum("sij,sj->si", A, x) + np.einsum("sij,sj->si", B, u) + b
         if not np.abs(x).max() < 1e9:
             x = np.clip(np.nan_to_num(x), -1e9, 1e9)
             z = np.clip(np.nan_to_num(z), -1e9, 1e9)
     return PanelRun(y, command, applied)
+
+
+def _xi_at_start(law: Law, panel: Panel) -> np.ndarray:
+    """xi (scenarios, p): zero, or where a conditional law's integral action is the input of the hold."""
+    if not law.conditional:
+        return np.zeros(panel.r.shape)
+    return panel.u0 @ np.linalg.pinv(-law.K_r).T
+
+
+def _conditional(
+    law: Law,
+    xi: np.ndarray,
+    error: np.ndarray,
+    command: np.ndarray,
+    limits: tuple[np.ndarray, np.ndarray] | None,
+) -> np.ndarray:
+    """xi (scenarios, p) a step on under conditional integration, one input an output."""
+    after = xi + law.integral * error
+    if limits is None:
+        return after
+    inside = (command >= limits[0]) & (command <= limits[1])
+    within = np.clip(-after @ law.K_r.T, *limits) @ np.linalg.pinv(-law.K_r).T
+    return np.where(inside @ (law.K_r != 0), within, xi)
 
 
 def feed_forward(
@@ -368,17 +393,18 @@ def closed_loop(plant: Plant, law: Law) -> np.ndarray:
     With fewer inputs than outputs K_r xi (m,) stands for xi: what else xi holds moves no input, and would
     count as a mode that never decays.
     """
-    C, D, Kz, Kr = plant.C, law.D, law.K, law.K_r if law.integral else np.zeros_like(law.K_r)
+    integrates = np.any(law.integral)
+    C, D, Kz, Kr = plant.C, law.D, law.K, law.K_r if integrates else np.zeros_like(law.K_r)
     q, few = len(law.A), plant.m < plant.p
     held, into, to_u = (plant.m, Kr @ C, np.eye(plant.m)) if few else (plant.p, C, Kr)
     u = np.hstack([-D @ C, -Kz, -to_u])
     rows = [
         np.hstack([plant.A, np.zeros((plant.n, q + held))]) + plant.B @ u,
         np.hstack([law.B_y @ C, law.A, np.zeros((q, held))]) + law.B_u @ u,
-        np.hstack([-law.integral * into, np.zeros((held, q)), np.eye(held)]),
+        np.hstack([-np.reshape(law.integral, (-1, 1)) * into, np.zeros((held, q)), np.eye(held)]),
     ]
     whole = np.vstack(rows)
-    return whole if law.integral else whole[: plant.n + q, : plant.n + q]
+    return whole if integrates else whole[: plant.n + q, : plant.n + q]
 
 
 def law_response(law: Law, z: np.ndarray) -> np.ndarray:
@@ -389,7 +415,7 @@ def law_response(law: Law, z: np.ndarray) -> np.ndarray:
     K, identity = law.K @ V, np.eye(len(T))
     response = np.empty((len(z), *law.D.shape), complex)
     for i, point in enumerate(z):
-        xi = -law.integral / (point - 1) if law.integral else 0.0
+        xi = -law.integral / (point - 1) if np.any(law.integral) else 0.0
         response[i] = (
             K @ scipy.linalg.solve_triangular(point * identity - T, from_y - xi * from_xi, check_finite=False)
             + law.D

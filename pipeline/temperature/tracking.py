@@ -34,8 +34,12 @@ class Law(NamedTuple):
     with z = start_u u0 + start_y y0 + start and xi = 0.
 
     `integral` is the share of the error that xi takes a step: the outer integrator's, or that of a law with
-    integral action of its own, which puts its gain into K_r. No eigenvalue of A may be 1, because `aimed`
-    solves (I - A) z for the memory at rest: what integrates belongs into xi.
+    integral action of its own, which puts its gain into K_r; where outputs take different shares, (p,) of
+    them, with no fewer inputs than outputs. No eigenvalue of A may be 1, because `aimed` solves (I - A) z for
+    the memory at rest: what integrates belongs into xi.
+
+    `conditional`: the law aims at no target. xi starts where -K_r xi is u0, takes every error in full, but
+    rests where the command is cut, and -K_r xi stays within the limits (conditional integration).
     """
 
     A: np.ndarray
@@ -50,7 +54,8 @@ class Law(NamedTuple):
     start_u: np.ndarray
     start_y: np.ndarray
     start: np.ndarray
-    integral: float = 0.0
+    integral: float | np.ndarray = 0.0
+    conditional: bool = False
 
 
 class Controller(NamedTuple):

@@ -86,7 +86,6 @@ def metrics():
             "samples": 400,
             "segments": 1,
             "findings": {},
-            "printer_pid": [PRINTER_PID],
         },
         "identify_plant": {
             "order": 2,
@@ -392,6 +391,7 @@ def write(root, *, samples=400, recording="good.mcap", worst=None):
     artifacts.write_json(
         data / "tune_weights/weights.json", {"practical": {"q": [1.0, 2.0], "r": [0.1, 0.2]}}
     )
+    artifacts.write_json(data / "ingest/printer_pid.json", {"heaters": [PRINTER_PID]})
     folder = data / "evaluate_temperature"
     artifacts.write_table(folder / "scorecard.parquet", tables.SCORECARD, scorecard(worst or {}))
     artifacts.write_table(

@@ -10,6 +10,7 @@ import yaml
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow import tables
 from stages.report import main
+from tests.report import made
 from tests.report.test_identification_page import FOLDER, page, rewrite, white
 from tests.report.test_pages import IDENTIFICATION, TEMPERATURE, Page, change
 
@@ -148,7 +149,7 @@ def test_a_free_mean_that_gains_more_than_the_bands_is_named_with_its_points(pro
 def test_figures_of_an_older_run_leave_the_page_whole_and_say_what_is_not_measured(project):
     for key in ("fit_holdout_free_mean", "feedthrough", "validation", "fit", "forbidden_gains"):
         change("identify_plant", **{key: None})
-    change("ingest", printer_pid=None)
+    artifacts.write_json("datasets/ingest/printer_pid.json", {})
     text = page()
     assert "Refinement not measured" in text and "Direct feed-through not measured" in text
     assert "The printer’s own PID" not in text
@@ -191,11 +192,26 @@ def test_the_printers_own_pid_stands_beside_in_percent_and_as_its_configuration_
     assert "smoothed over 1 s, and its duty ends at 100 %. From the configuration in klippy.log." in text
 
 
-def test_the_page_of_the_loop_says_that_the_printers_own_pid_is_not_judged(project):
+def test_the_page_of_the_loop_says_whether_the_printers_own_pid_was_judged(project, monkeypatch):
+    change("evaluate_temperature", refused={"printer_pid": "found those of 1 heaters in the log"})
     main()
     text = Page(TEMPERATURE).text
     assert "The printer’s own PID is not among these controllers." in text
+    assert "It was refused: found those of 1 heaters in the log." in text
     assert "The printer holds heater_1 by Kp 8.00, Ki 0.400, Kd 40.0, in % of duty, °C and s." in text
+    monkeypatch.setattr(made, "CONTROLLERS", (*made.CONTROLLERS, "printer_pid"))
+    made.write(project)
+    main()
+    text = Page(TEMPERATURE).text
+    assert "The printer’s own PID is among these controllers, as it is." in text
+    assert "The printer’s own PID. Klipper’s PID with the gains of the printer’s configuration" in text
+
+
+def test_a_machine_without_a_printers_log_shows_nothing_of_its_pid(project):
+    artifacts.write_json("datasets/ingest/printer_pid.json", {})
+    main()
+    for path in (TEMPERATURE, IDENTIFICATION):
+        assert "own PID" not in Page(path).text, path
 
 
 def test_a_page_from_recordings_does_not_call_their_units_a_convention(project):

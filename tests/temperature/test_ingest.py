@@ -430,7 +430,7 @@ def test_the_printers_own_pid_comes_with_its_log_in_the_units_of_our_signals(tmp
     }
     good = ingest.Result("klippy.log", {}, {}, "", False)
     spec = IngestSpec(PRINTER, mapping, "", 5.0)
-    (pid,) = ingest.printer_pids(tmp_path, [good], spec)["printer_pid"]
+    (pid,) = ingest.printer_pids(tmp_path, [good], spec)["heaters"]
     assert (pid["recording"], pid["input"], pid["output"]) == ("klippy.log", "nozzle_duty", "nozzle")
     # percent for a duty of 0 to 255; half the input's unit over twice the output's
     expected = np.array(EXTRUDER.pid) * 100 / 255 * 0.5 / 2

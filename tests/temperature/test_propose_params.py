@@ -263,3 +263,29 @@ def test_the_plant_of_the_print_has_both_heaters_and_their_pace(printer):
     # one-minute predictions: the printer's PID holds the bed within its noise, where a fit says little
     assert figures["fit_holdout_ahead"]["temperature_extruder"] > 50
     assert EXTRUDER.tau_s < BED.tau_s
+
+
+def test_the_printers_own_pid_is_judged_beside_the_others_and_swings_as_its_log_does(printer):
+    """In the log the hot end's duty goes from limit to limit: that PID holds no plant of it stable."""
+    file = printer / "params.expert.yaml"
+    before = file.read_text()
+    sections = yaml.safe_load(before)
+    sections["panel"] |= {"steps": 300, "noise_degC": [0.1]}
+    sections["panel"]["judging"] |= {"starts_degC": [40.0], "reference_offsets_degC": [0.0], "seeds": [1]}
+    sections["tune_weights"] |= {"initial": 5, "evaluations": 8, "practical_initial": 5}
+    sections["tune_weights"] |= {"practical_evaluations": 8}
+    sections["evaluate_temperature"]["data_sets"] = 1
+    file.write_text(yaml.safe_dump(sections))
+    run(printer, "learn_kernel", "tune_weights", "evaluate_temperature")
+    file.write_text(before)
+    figures = artifacts.read_json(printer / "reports/metrics/evaluate_temperature.json")
+    judged = figures["controllers"]["printer_pid"]
+    lines = [line for line in (printer / "klippy.log").read_text().splitlines() if line.startswith("Stats")]
+    duty = np.array([float(line.rpartition("pwm=")[2].split()[0]) for line in lines[600:800]])
+    assert duty.max() > 0.9 and duty.min() < 0.1
+    assert judged["stable_plants"]["count"] == 0
+    assert judged["at_limits_percent"]["median"] > 10
+    # the larger share is the hot end's: Ki T / (Kp + Ki T) = 1.08 / 23.28 of pid_Ki and pid_Kp
+    assert figures["own_integral"]["printer_pid"] == pytest.approx(1.08 / 23.28, rel=1e-9)
+    assert figures["controllers"]["model_based"]["stable_plants"]["count"] == 20
+    assert "printer_pid" not in figures["without_feed_forward"]

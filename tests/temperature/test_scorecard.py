@@ -547,7 +547,9 @@ def judged(learned):
 
 def test_every_controller_is_judged_on_the_same_scenarios(judged):
     cases, all_of_them = judged
-    assert [j.name for j in all_of_them] == [c.name for c in contestants.CONTESTANTS]
+    # the study's machine is no printer
+    every = [c.name for c in contestants.CONTESTANTS if c.name != "printer_pid"]
+    assert [j.name for j in all_of_them] == every
     by_name = {j.name: j for j in all_of_them}
     nominal = (cases.plant == 0) & (cases.noise == 0)
     assert by_name["exact_model"].regret[nominal].max() < 1e-6  # it is not told the state

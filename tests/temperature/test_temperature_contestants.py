@@ -49,7 +49,8 @@ def test_each_name_and_each_role_of_the_verdict_stands_once():
 
 def test_controllers_come_in_the_tables_order_by_the_tables_names():
     given = problem()
-    assert names(controllers(given).controllers) == names(CONTESTANTS)
+    # the study's machine is no printer
+    assert names(controllers(given).controllers) == [n for n in names(CONTESTANTS) if n != "printer_pid"]
     assert controllers(given).refused == {}
     renamed = (CONTESTANTS[0]._replace(name="another"),)
     assert names(controllers(given, renamed).controllers) == ["another"]
@@ -58,7 +59,7 @@ def test_controllers_come_in_the_tables_order_by_the_tables_names():
 def test_without_a_kernel_or_the_true_plant_the_others_go_on():
     without = controllers(problem()._replace(kernel=None, truth=None))
     assert names(without.controllers) == [
-        name for name in names(CONTESTANTS) if name not in ("kernel", "exact_model")
+        name for name in names(CONTESTANTS) if name not in ("kernel", "printer_pid", "exact_model")
     ]
     assert without.refused == {}
 

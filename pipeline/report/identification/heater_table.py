@@ -135,7 +135,7 @@ def _banded(table: Table, key: str, k: int) -> Banded:
 
 def _printer_rows(sources: Sources, table: Table | Missing) -> tuple[list[PidRow], str]:
     """The printer's PID of each heater over the one by SIMC, and how both are to be read."""
-    own = lookup(sources.metrics["ingest"], "printer_pid")
+    own = lookup(sources.tables["printer_pid"], "heaters")
     if isinstance(own, Missing):
         return [], ""
     rows = []

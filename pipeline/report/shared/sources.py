@@ -111,7 +111,9 @@ def collect(
         tables[name] = _read(read, path, name, stage, kind, reader)
         if name == "kernel" and not artifacts.exists(path):
             tables[name] = _refusal(figures[stage]) or tables[name]
-        if isinstance(tables[name], Missing):
+        if name == "printer_pid" and not tables[name]:
+            del read[path]
+        elif isinstance(tables[name], Missing):
             absent[path] = tables[name]
     for name, stage in (("frames", "train_ilc"), ("nozzle_frames", "train_classifier")):
         for frame in [] if isinstance(tables[name], Missing) else tables[name]:
@@ -182,6 +184,7 @@ def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], An
     return [
         ("record", "ingest", "record.parquet", *table(schemas.record(machine.acting, machine.outputs))),
         ("quality", "ingest", "quality.parquet", *table(schemas.QUALITY)),
+        ("printer_pid", "ingest", "printer_pid.json", "printer_pid", artifacts.read_json),
         ("plant", "identify_plant", "plant.parquet", *arrays("plant")),
         ("order", "identify_plant", "order.parquet", *table(schemas.ORDER)),
         ("holdout", "identify_plant", "holdout.parquet", *table(schemas.holdout(machine.outputs))),

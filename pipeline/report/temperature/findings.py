@@ -52,17 +52,36 @@ def _flagged(sources: Sources) -> tuple[str, str] | None:
 
 def _printer(sources: Sources) -> tuple[str, str] | None:
     """The printer's own PID, where a recording tells it, and where it stands beside the others."""
-    own = lookup(sources.metrics["ingest"], "printer_pid")
+    own = lookup(sources.tables["printer_pid"], "heaters")
     if isinstance(own, Missing):
         return None
     gains = [
         f"{pid['input']} by Kp {short(pid['Kp'])}, Ki {short(pid['Ki'])}, Kd {short(pid['Kd'])}"
         for pid in own
     ]
+    holds = f"The printer holds {'; '.join(gains)}, in % of duty, °C and s."
+    simc = "The page of the identification sets it beside one by SIMC."
+    evaluated = sources.metrics["evaluate_temperature"]
+    if isinstance(lookup(evaluated, "controllers.printer_pid"), Missing):
+        refused = lookup(evaluated, "refused.printer_pid")
+        why = "It was not judged." if isinstance(refused, Missing) else f"It was refused: {refused}."
+        return "The printer’s own PID is not among these controllers.", f"{holds} {why} {simc}"
     return (
-        "The printer’s own PID is not among these controllers.",
-        f"The printer holds {'; '.join(gains)}, in % of duty, °C and s. The page of the identification sets "
-        "it beside one by SIMC; of the controllers here the baseline is its nearest.",
+        "The printer’s own PID is among these controllers, as it is.",
+        f"{holds} It runs once in {sources.declared.machine.sample_time_s:g}{THIN}s here, as often as the "
+        f"others, and in Klipper every 0.3{THIN}s. It is told no model and no target, is not tuned, and "
+        f"the verdict does not choose it. {_held_stable(evaluated)}{simc}",
+    )
+
+
+def _held_stable(evaluated: Any) -> str:
+    """A sentence where the printer's own PID does not hold every plant stable."""
+    plants = lookup(evaluated, "controllers.printer_pid.stable_plants")
+    if isinstance(plants, Missing) or plants["count"] == plants["of"]:
+        return ""
+    return (
+        f"It holds {plants['count']} of {plants['of']} plants stable: look whether the recorded duty swings "
+        "between its limits. At Klipper’s own rate a loop near the edge may hold. "
     )
 
 

@@ -27,10 +27,14 @@ WORDS = (
     "step",
     "hash",
 )
+# controllers that not every machine has: explained where they stand in the table
+SOME = {contestant.name for contestant in CONTESTANTS if not contestant.role}
 
 
 def render(sources: Sources, judged: Judgement) -> str:
     """The text of temperature.html."""
+    yardstick = tables.yardstick(sources, judged.asked)
+    shown = {head.mark for head in yardstick.heads}
     return page.render(
         "temperature.html",
         here="temperature",
@@ -38,7 +42,7 @@ def render(sources: Sources, judged: Judgement) -> str:
         verdict=verdict_parts(judged, claim=headline.claim(sources, ("temperature",))),
         featured=featured(sources),
         repetitions=repetitions(sources),
-        yardstick=tables.yardstick(sources, judged.asked),
+        yardstick=yardstick,
         aimed_unclipped=aimed_unclipped(sources, "there"),
         pairs=pairs.compared(sources),
         published=tables.published(sources),
@@ -65,7 +69,7 @@ def render(sources: Sources, judged: Judgement) -> str:
         weights=tables.weights(sources),
         identified=tables.identified(sources),
         trusted=trust(sources),
-        words=words.chosen(sources, WORDS),
+        words=words.chosen(sources, tuple(word for word in WORDS if word in shown or word not in SOME)),
         sources=list(sources.read.values()),
         absent=sources.absent,
         hashes=index_page.hashes(sources),

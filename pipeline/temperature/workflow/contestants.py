@@ -17,6 +17,7 @@ from pipeline.temperature.workflow.settings import EvaluateTemperature
 if TYPE_CHECKING:
     from pipeline.temperature.kernel import Regression
     from pipeline.temperature.plant import Plant
+    from pipeline.temperature.printer_pid import HeaterPid
     from pipeline.temperature.tracking import Controller
     from pipeline.temperature.window import Window
 
@@ -25,7 +26,8 @@ class Problem(NamedTuple):
     """What a controller may be designed from.
 
     `plant` is identified and `window` learned from the record. `kernel` is None where the record does not
-    determine it, `truth` where nobody knows the plant. `limits` low and high (m,) in percent; `gamma` the
+    determine it, `truth` where nobody knows the plant, `printer_pid` empty where no recording tells the
+    PID of a printer. `limits` low and high (m,) in percent; `gamma` the
     discount; `observer_tau` tuned, `exact_tau` for the true plant; `horizon` in steps.
     """
 
@@ -39,6 +41,7 @@ class Problem(NamedTuple):
     exact_tau: float
     horizon: int
     settings: EvaluateTemperature
+    printer_pid: tuple[HeaterPid, ...] = ()
 
 
 def _model_based(problem: Problem) -> Controller:
@@ -66,6 +69,14 @@ def _baseline(problem: Problem) -> Controller:
     from pipeline.temperature import baseline
 
     return baseline.controller(problem.plant, problem.limits, horizon=problem.horizon)
+
+
+def _printer_pid(problem: Problem) -> Controller | None:
+    from pipeline.temperature import printer_pid
+
+    if not problem.printer_pid:
+        return None
+    return printer_pid.controller(problem.printer_pid, problem.plant, problem.limits)
 
 
 def _exact_model(problem: Problem) -> Controller | None:
@@ -146,6 +157,18 @@ CONTESTANTS = (
         "plant",
         role="baseline",
         mark="bl",
+    ),
+    # only where a recording is a Klipper log
+    Contestant(
+        "printer_pid",
+        "Printer",
+        "its own PID",
+        "Klipper’s PID with the gains of the printer’s configuration, as its log has them, at our sample "
+        "time. It is not tuned and aims at no target: it starts at the input of the hold, and its "
+        "integral rests while the duty is at a limit.",
+        _printer_pid,
+        "",
+        word="The printer’s own PID",
     ),
     Contestant(
         "exact_model",

@@ -13,6 +13,7 @@ from pipeline.store.execution import run_all
 from pipeline.store.params import Execution
 from pipeline.store.tables import Schema
 from pipeline.temperature import judging, kernel, plant, published, scorecard, study, window
+from pipeline.temperature.printer_pid import HeaterPid
 from pipeline.temperature.workflow import contestants, tables
 from pipeline.temperature.workflow.record import read_published
 from pipeline.temperature.workflow.settings import EvaluateTemperature, Panel, Tracking
@@ -24,13 +25,15 @@ SAMPLES, STARTS = 15_000, 300
 
 class Learned(NamedTuple):
     """What the stages before left: the identified plant, the window model, the kernel (None where the record
-    did not determine it), the tuned weights, the plant's spread."""
+    did not determine it), the tuned weights, the plant's spread, and the printer's own PIDs (none where no
+    recording tells them)."""
 
     model: plant.Plant
     window: window.Window
     kernel: kernel.Regression | None
     weights: dict[str, np.ndarray]
     spread: list[plant.Plant]
+    printer_pid: tuple[HeaterPid, ...] = ()
 
 
 class Judged(NamedTuple):
@@ -38,7 +41,8 @@ class Judged(NamedTuple):
     figures by controller, and why others were refused.
 
     `without_feed_forward`: those that aim at the feasible target in the unclipped run too. `own_integral`:
-    the share a step of those whose integral action is not the one declared for all.
+    the share a step, the largest of the outputs', of those whose integral action is not the one declared for
+    all.
     """
 
     scorecard: dict[str, Any]
@@ -70,7 +74,12 @@ def check(settings: EvaluateTemperature, panel: Panel) -> None:
 
 
 def read_learned(
-    model_path: str, spread_path: str, weights_path: str, learned_folder: str | Path, machine: Machine
+    model_path: str,
+    spread_path: str,
+    weights_path: str,
+    learned_folder: str | Path,
+    printer_pid_path: str,
+    machine: Machine,
 ) -> Learned:
     """What the stages before wrote. `learned_folder` has a kernel only where the record determines one.
 
@@ -102,6 +111,21 @@ def read_learned(
             plant.strictly_proper(one)
             for one in plant.restored(artifacts.read_arrays(spread_path, "spread", 1, shapes=plants))
         ],
+        _heater_pids(artifacts.read_json(printer_pid_path).get("heaters", []), machine),
+    )
+
+
+def _heater_pids(pids: list[dict[str, Any]], machine: Machine) -> tuple[HeaterPid, ...]:
+    """Those of heaters whose duty is an input of the machine and whose temperature an output."""
+    inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
+    return tuple(
+        HeaterPid(
+            inputs.index(pid["input"]),
+            outputs.index(pid["output"]),
+            *(pid[key] for key in ("Kp", "Ki", "Kd", "most_percent", "smooth_s")),
+        )
+        for pid in pids
+        if pid["input"] in inputs and pid["output"] in outputs
     )
 
 
@@ -137,6 +161,7 @@ def judged(
         exact_tau=tracking.observer_tau,
         horizon=panel.steps,
         settings=settings,
+        printer_pid=learned.printer_pid,
     )
     designed, refused = _designed(problem, [(yardstick.q, yardstick.r, 0.0), (q, r, tracking.integral)])
     deployment = judging.Deployment(limits, panel.band_degC, tracking.integral, tracking.integral_limit_degC)
@@ -167,7 +192,7 @@ def judged(
 
 
 def _own_integral(results: list[judging.Judged], declared: float) -> dict[str, float]:
-    shares = {result.name: float(result.law.integral) for result in results}
+    shares = {result.name: float(np.max(result.law.integral)) for result in results}
     return {name: share for name, share in shares.items() if share != declared}
 
 

@@ -346,8 +346,8 @@ def collect(results: Sequence[Result], machine: Plant, *, strict: bool) -> tuple
 
 
 def printer_pids(folder: Path, results: Sequence[Result], spec: IngestSpec) -> dict[str, list[dict]]:
-    """{"printer_pid": [...]}: by which PID a printer held the heaters whose duty and temperature are signals
-    of ours, gains in our units; {} where no good recording is a klippy.log. The last log's values count."""
+    """{"heaters": [...]}: by which PID a printer held the heaters whose duty and temperature are signals of
+    ours, in our units; {} where no good recording is a klippy.log. The last log's values count."""
     inputs = {signal.name for signal in spec.machine.inputs}
     of = {source.source: source for source in spec.sources()}
     pids: dict[str, dict] = {}
@@ -363,10 +363,10 @@ def printer_pids(folder: Path, results: Sequence[Result], spec: IngestSpec) -> d
                 "input": u.signal,
                 "output": y.signal,
                 **dict(zip(("Kp", "Ki", "Kd"), gains, strict=True)),
-                "most_percent": pid.most_percent,
+                "most_percent": pid.most_percent * u.scale,
                 "smooth_s": pid.smooth_s,
             }
-    return {"printer_pid": list(pids.values())} if pids else {}
+    return {"heaters": list(pids.values())} if pids else {}
 
 
 def _segments(record: dict[str, np.ndarray]) -> int:

@@ -1,0 +1,103 @@
+"""The printer's own PID beside the others: Klipper's (klippy/extras/heaters.py, class ControlPID).
+
+With e = r - y, once a sample of T = 0.3 s, Klipper computes
+
+    d(t) = ((a - T) d(t-1) + y(t) - y(t-1)) / a,  a = max(smooth time, T)
+    I(t) = I(t-1) + T e(t), within 0 ... most / Ki
+    u(t) = Kp e(t) + Ki I(t) - Kd d(t), cut to 0 ... most
+
+and keeps I(t) only where u was not cut. Here T is our sample time, and I is held within the machine's limits
+after u is computed, not before. Where our T is longer, d is what Klipper's own samples give if y runs
+straight between two of ours: at 1 s its formula smooths nothing, and calls loops unstable that are stable at
+0.3 s. u is held for our T, which costs margin: a loop near the edge may be stable at 0.3 s and not here.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.temperature.plant import Plant, strictly_proper
+from pipeline.temperature.tracking import Controller, Law
+
+# Klipper reads a heater's thermistor so often (klippy/extras/adc_temperature.py, REPORT_TIME)
+KLIPPER_S = 0.3
+
+
+class HeaterPid(NamedTuple):
+    """The PID of one heater, from output `output` to input `input` of the plant: Kp in percent per °C, Ki in
+    percent per °C and s, Kd in percent times s per °C; it ends at `most_percent`, and its derivative is
+    smoothed over `smooth_s`."""
+
+    input: int
+    output: int
+    Kp: float
+    Ki: float
+    Kd: float
+    most_percent: float
+    smooth_s: float
+
+
+def controller(
+    pids: tuple[HeaterPid, ...], plant: Plant, limits: tuple[np.ndarray, np.ndarray]
+) -> Controller:
+    """The PIDs of all heaters; weights and the outer integrator mean nothing to it. `limits` low and high
+    (m,) in percent. Raises ValueError where the heaters' PIDs are not the whole control of the machine."""
+    plant = strictly_proper(plant)
+    pids = tuple(sorted(pids, key=lambda pid: pid.output))
+    _check(pids, plant, limits)
+    made = law(pids, sample_time_s=plant.sample_time_s)
+    return Controller("printer_pid", lambda q, r, integral: made, plant)
+
+
+def _check(pids: tuple[HeaterPid, ...], plant: Plant, limits: tuple[np.ndarray, np.ndarray]) -> None:
+    outputs, inputs = [pid.output for pid in pids], sorted(pid.input for pid in pids)
+    if outputs != list(range(plant.p)) or inputs != list(range(plant.m)):
+        raise ValueError(
+            f"the printer's own PID needs one PID for each of the {plant.p} outputs and {plant.m} inputs; "
+            f"found those of {len(pids)} heaters in the log"
+        )
+    for pid in pids:
+        if pid.Kp <= 0 or pid.Ki < 0:
+            raise ValueError(
+                "the printer's own PID needs Kp above zero and Ki of at least zero; "
+                f"found Kp {pid.Kp:g}, Ki {pid.Ki:g} for output {pid.output + 1}"
+            )
+        if pid.most_percent < limits[1][pid.input] - 1e-6:
+            raise ValueError(
+                f"the printer's own PID ends at {pid.most_percent:g} % of duty (max_power), but input "
+                f"{pid.input + 1} may go to {limits[1][pid.input]:g} %; set its high in plant.inputs to that"
+            )
+
+
+def law(pids: tuple[HeaterPid, ...], *, sample_time_s: float) -> Law:
+    """Klipper's PIDs as one law, in the order of the outputs; memory z = [y(t-1); d(t-1)].
+
+    d(t) = phi d(t-1) + (1 - phi) (y(t) - y(t-1)) / T with phi = (1 - 0.3 s / a)^(T / 0.3 s). Of Ki I(t) the
+    part Ki T e(t) joins the proportional gain G = Kp + Ki T, and the rest is G xi(t) with xi(t+1) = xi(t) +
+    Ki T / G e(t): u = G (r + xi - y) - Kd d.
+    """
+    p, T = len(pids), sample_time_s
+    Kp, Ki, Kd, smooth = (
+        np.array([getattr(pid, key) for pid in pids], float) for key in ("Kp", "Ki", "Kd", "smooth_s")
+    )
+    phi = (1 - KLIPPER_S / np.maximum(smooth, KLIPPER_S)) ** (T / KLIPPER_S)
+    slope, G = (1 - phi) / T, Kp + Ki * T
+    to_input = np.zeros((p, p))
+    to_input[[pid.input for pid in pids], np.arange(p)] = 1.0
+    none, one = np.zeros((p, p)), np.eye(p)
+    return Law(
+        A=np.block([[none, none], [np.diag(-slope), np.diag(phi)]]),
+        B_u=np.zeros((2 * p, p)),
+        B_y=np.vstack([one, np.diag(slope)]),
+        B_r=np.zeros((2 * p, p)),
+        c=np.zeros(2 * p),
+        K=to_input @ np.hstack([np.diag(-Kd * slope), np.diag(Kd * phi)]),
+        D=to_input @ np.diag(G + Kd * slope),
+        K_r=to_input @ np.diag(-G),
+        k=np.zeros(p),
+        start_u=np.zeros((2 * p, p)),
+        start_y=np.vstack([one, none]),
+        start=np.zeros(2 * p),
+        integral=Ki * T / G,
+        conditional=True,
+    )
