@@ -173,7 +173,8 @@ def percent_of(figure: Figure) -> str:
 
 def band_of(figure: Figure) -> str:
     """Its ends, empty where they are one."""
-    return band(figure.low, figure.high, min(decimals(figure.low, figure.high, value=figure.value), 1))
+    places = min(decimals(figure.low, figure.high, value=figure.value), 1)
+    return band(figure.low, figure.high, places, unit="%")
 
 
 def _with_band(figure: Figure) -> str:

@@ -12,7 +12,7 @@ from pipeline.report.setpoint import card as setpoint_card
 from pipeline.report.setpoint import change as setpoint_change
 from pipeline.report.shared import charts, headline, page, words
 from pipeline.report.shared.difference import Difference, Move
-from pipeline.report.shared.digits import band, count, decimals, declared, quantity
+from pipeline.report.shared.digits import band, beyond_meaning, count, decimals, declared, quantity, with_unit
 from pipeline.report.shared.sources import Sources, digest
 from pipeline.report.shared.verdict import (
     OPEN,
@@ -136,7 +136,7 @@ def _row(question: Question, judged: Judgement) -> Answer:
     moved = move is not None and move.moved
     learned, designed = (state(question, figure) for _, figure in pair)
     # as it was declared: "10.000 %" reads as ten thousand where a point parts thousands
-    limit = quantity(question.limit, question.unit, declared(question.limit))
+    limit = with_unit(question.limit, question.unit, declared(question.limit))
     return Answer(
         question.answer,
         question.key,
@@ -176,22 +176,21 @@ def _cell(question: Question, role: str, figure: Figure | Missing, places: int) 
         value=quantity(figure.value, question.unit, places, beyond=question.beyond),
         band=figure.note.split(" samples")[0].replace(" of ", " / ")
         if question.key == "data"
-        else band(figure.low, figure.high, places, beyond=question.beyond) or _finer(figure, question),
+        else band(figure.low, figure.high, places, unit=question.unit, beyond=question.beyond)
+        or _finer(figure, question),
     )
 
 
 def _finer(figure: Figure, question: Question) -> str:
     """A band that the row's decimals do not show, with those that do;
     runs that are all alike are said to be."""
-    return (
-        band(
-            figure.low,
-            figure.high,
-            decimals(figure.low, figure.high, value=figure.value),
-            beyond=question.beyond,
-        )
-        or "all alike"
-    )
+    return band(
+        figure.low,
+        figure.high,
+        decimals(figure.low, figure.high, value=figure.value),
+        unit=question.unit,
+        beyond=question.beyond,
+    ) or ("" if beyond_meaning(figure.value, question.unit) else "all alike")
 
 
 class ChangeSentence(NamedTuple):
@@ -310,7 +309,7 @@ def _moved(role: str, move: Move) -> MovedFigure:
     """A move of a controller of the temperature loop, or of the deposition loop's composer in use."""
     question = move.question
     places = row_places(question, [move.before, move.now])
-    limit = quantity(question.limit, question.unit, places)
+    limit = with_unit(question.limit, question.unit, places)
     return MovedFigure(
         question.title,
         "data_driven" if role == "deposition" else role,
