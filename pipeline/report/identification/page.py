@@ -201,7 +201,7 @@ def _residual_note(sources: Sources, name: str) -> str:
 
 def _accepted(sources: Sources, name: str) -> Figure | None:
     before = sources.accepted
-    if before is None or isinstance(before, Missing):
+    if before is None or isinstance(before, Missing) or sources.another_machine:
         return None
     value, ends = (
         lookup(before, f"metrics.identify_plant.{key}.{name}") for key in ("fit_holdout", "fit_holdout_band")

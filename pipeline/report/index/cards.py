@@ -154,6 +154,8 @@ def _win(sources: Sources, judged: Judgement) -> tuple[str, str]:
     best = judged.verdict.winner
     settled = next(q for q in judged.asked if q.key == "settled_error_degC")
     if best is None:
+        if judged.verdict.rule == "trust":
+            return "No controller wins.", "They were judged on a model that is not trusted."
         return "No controller wins.", "Not one of them passes its rules."
     mine = judged.roles[best]["settled_error_degC"]
     places = row_places(settled, [mine])

@@ -49,10 +49,12 @@ def render(sources: Sources, judged: Judgement) -> str:
         ],
         claim=f"{headline.claim(sources)} {_drifts(judged)}",
         rules=verdict_parts(judged).rules,
-        answers=_rows(judged),
+        answers=_rows(sources, judged),
         repetitions=repetitions(sources),
         seeds=len(sources.declared.panel.judging.seeds),
-        change=_change_sentence(
+        change=ChangeSentence(ANOTHER)
+        if sources.another_machine
+        else _change_sentence(
             judged, sources.accepted, _deposition_moves(sources), setpoint_change.moved_cases(sources)
         ),
         drift=judged.drifted,
@@ -125,11 +127,13 @@ class Answer(NamedTuple):
     quiet: bool
 
 
-def _rows(judged: Judgement) -> list[Answer]:
-    return [_row(question, judged) for question in judged.asked]
+def _rows(sources: Sources, judged: Judgement) -> list[Answer]:
+    unmoved = "other machine" if sources.another_machine else "first run"
+    return [_row(question, judged, unmoved) for question in judged.asked]
 
 
-def _row(question: Question, judged: Judgement) -> Answer:
+def _row(question: Question, judged: Judgement, unmoved: str) -> Answer:
+    """`unmoved`: why nothing is compared, where nothing is."""
     pair = [(role, judged.roles[role][question.key]) for role in ("data_driven", "model_based")]
     places = row_places(question, [figure for _, figure in pair])
     move = next((m for m in judged.moved.get("data_driven", []) if m.question == question), None)
@@ -147,7 +151,7 @@ def _row(question: Question, judged: Judgement) -> Answer:
         limit=f"{'≥' if question.at_least else '≤'} {limit}",
         state=learned,
         strip=charts.strip(question, [(ROLES[role], page.MARKS[role], figure) for role, figure in pair]),
-        change=move.text() if move else "first run",
+        change=move.text() if move else unmoved,
         moved=moved,
         worse=moved and move.word == "worse" and learned != PASSED,
         quiet=learned == designed == PASSED and not moved,
@@ -191,6 +195,9 @@ def _finer(figure: Figure, question: Question) -> str:
         unit=question.unit,
         beyond=question.beyond,
     ) or ("" if beyond_meaning(figure.value, question.unit) else "all alike")
+
+
+ANOTHER = "The accepted run is of another machine: nothing to compare."
 
 
 class ChangeSentence(NamedTuple):
@@ -326,6 +333,10 @@ def difference_parts(sources: Sources, judged: Judgement) -> DifferenceParts:
     """What changed, and the figures that moved: of both controllers of the temperature loop, and of the
     composer in use of the deposition loop."""
     accepted, changed = sources.accepted, judged.changed
+    if sources.another_machine:
+        reason = f"{ANOTHER} Its inputs or outputs have other names than those of plant in params.yaml"
+        remedy = "Mark a run of this machine as good with ./run beadline accept"
+        return DifferenceParts(missing=Missing("not applicable", reason, remedy))
     parts = _deposition_moves(sources)
     if isinstance(accepted, Missing) or changed is None:
         return DifferenceParts(missing=accepted if isinstance(accepted, Missing) else None)

@@ -44,12 +44,12 @@ def declared(value: float) -> int:
 
 
 # what a figure may be at most to say something: ten times the yardstick, or hotter than any machine. Beyond
-# it the loop is unstable, and the digits tell how long the run was
+# it the loop is useless or unstable, and further digits tell nothing
 LARGEST = {"%": 1000.0, "°C": 10000.0}
 
 
 def beyond_meaning(value: float, unit: str) -> str:
-    """ "beyond 1,000 %" in the place of a figure that only an unstable loop has; "" for all others."""
+    """ "beyond 1,000 %" in the place of a figure whose digits say nothing; "" for all others."""
     largest = LARGEST.get(unit, math.inf)
     if not abs(value) > largest:
         return ""

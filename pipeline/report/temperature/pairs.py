@@ -83,12 +83,12 @@ def _paired(
     return paired(costs[other].to_numpy(), costs[mine].to_numpy(), blocks, rng=np.random.default_rng(0))
 
 
-# a saving of more than this is against one that costs beyond 1,000 % more: one of the two is unstable
+# a saving of more than this is against one that costs beyond 1,000 % more, as an unstable one does
 MOST = 100.0 - 100.0 / (1.0 + LARGEST["%"] / 100.0)
 
 
 def _apart(pair: Paired) -> bool:
-    """Whether the costs lie so far apart that their ratio says only that one of the two is unstable."""
+    """Whether the costs lie so far apart that their ratio is no measure, as of an unstable one."""
     return not -LARGEST["%"] <= pair.improvement_percent <= MOST
 
 
@@ -117,10 +117,7 @@ def _sentence(what: str, pair: Paired) -> str:
     name = what.split(",")[0]
     if _apart(pair):
         word, most = saving.saved.split(":")[0], number(LARGEST["%"], 0)
-        return (
-            f"{name}: data-driven has {word} than model-based, beyond {most}{THIN}% apart: "
-            "one of the two is unstable."
-        )
+        return f"{name}: data-driven has {word} than model-based, beyond {most}{THIN}% apart."
     if not saving.sure:
         return (
             f"{name}: no difference beyond chance between data-driven and model-based ({saving.saved}, p = "
