@@ -32,6 +32,8 @@ from pipeline.report.shared.verdict import (
 LEAST_FIT = 50.0
 
 
+# how the decision on a model begins that is good for no use
+UNTRUSTED = "Do not trust this model"
 WHITENESS, POSSIBLE = "Whiteness", "Gains possible"
 
 
@@ -109,7 +111,7 @@ def _decision(uses: Mapping[str, str]) -> str:
         [use for use, ended in uses.items() if (ended == PASSED) == wanted] for wanted in (True, False)
     )
     if not good:
-        return "Do not trust this model." if FAILED in uses.values() else "Do not trust this model yet."
+        return f"{UNTRUSTED}." if FAILED in uses.values() else f"{UNTRUSTED} yet."
     groups = [
         (word, [use for use in bad if (uses[use] == FAILED) == failed])
         for word, failed in (("not", True), ("not yet", False))
@@ -173,7 +175,8 @@ def percent_of(figure: Figure) -> str:
 
 def band_of(figure: Figure) -> str:
     """Its ends, empty where they are one."""
-    return band(figure.low, figure.high, min(decimals(figure.low, figure.high, value=figure.value), 1))
+    places = min(decimals(figure.low, figure.high, value=figure.value), 1)
+    return band(figure.low, figure.high, places, unit="%")
 
 
 def _with_band(figure: Figure) -> str:

@@ -11,7 +11,7 @@ from pipeline.report.identification import heater_table, how_identified, model_d
 from pipeline.report.identification.model import LEAST_FIT, Fit, ahead_words, fits, trust
 from pipeline.report.index import page as index_page
 from pipeline.report.shared import charts, page, words
-from pipeline.report.shared.digits import MINUS, THIN, band, count, decimals, number, short
+from pipeline.report.shared.digits import MINUS, THIN, band, count, decimals, number, percent, quantity, short
 from pipeline.report.shared.sources import Sources, lookup
 from pipeline.report.shared.verdict import (
     FAILED,
@@ -166,7 +166,7 @@ def answer(sources: Sources, fit: Fit, ahead: str) -> Answer:
 
 def _fit_cell(css: str, name: str, fit: Figure | Missing, outcome: str) -> FitCell:
     missing = fit if isinstance(fit, Missing) else None
-    bands = "" if isinstance(fit, Missing) else band(fit.low, fit.high, _places(fit))
+    bands = "" if isinstance(fit, Missing) else band(fit.low, fit.high, _places(fit), unit="%")
     return FitCell(css, name, outcome.replace(" ", "-"), missing, _value(fit), bands)
 
 
@@ -175,7 +175,7 @@ def _places(fit: Figure) -> int:
 
 
 def _value(fit: Figure | Missing) -> str:
-    return fit.state if isinstance(fit, Missing) else f"{number(fit.value, _places(fit))}{THIN}%"
+    return fit.state if isinstance(fit, Missing) else quantity(fit.value, "%", _places(fit))
 
 
 def _missed(figure: Figure | Missing) -> Figure | Missing:
@@ -201,7 +201,7 @@ def _residual_note(sources: Sources, name: str) -> str:
 
 def _accepted(sources: Sources, name: str) -> Figure | None:
     before = sources.accepted
-    if before is None or isinstance(before, Missing):
+    if before is None or isinstance(before, Missing) or sources.another_machine:
         return None
     value, ends = (
         lookup(before, f"metrics.identify_plant.{key}.{name}") for key in ("fit_holdout", "fit_holdout_band")
@@ -291,12 +291,12 @@ def candidates(sources: Sources) -> list[Candidate]:
                 chosen=bool(table["chosen"][k]),
                 value=short(value, 3),
                 parameters=number(float(table["parameters"][k]), 0) if tried[k] else "",
-                error=f"{number(100 * error, 2)}{THIN}%"
+                error=quantity(100 * error, "%", 2)
                 if tried[k]
                 else "not tried"
                 if value > edge
                 else "within noise",
-                above="" if not tried[k] else "the best" if above == 0 else f"{short(above, 2)}{THIN}%",
+                above="" if not tried[k] else "the best" if above == 0 else percent(above, 2),
             )
         )
     return rows

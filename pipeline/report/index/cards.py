@@ -13,7 +13,16 @@ from pipeline.report.deposition import rules as deposition_rules
 from pipeline.report.deposition import verdict as deposition_verdict
 from pipeline.report.identification.model import trust
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import decimals, number, percent, quantity, shortened
+from pipeline.report.shared.digits import (
+    beyond_meaning,
+    decimals,
+    number,
+    percent,
+    quantity,
+    shortened,
+    with_unit,
+)
+from pipeline.report.shared.pictures import CARD_SPAN_S, span
 from pipeline.report.shared.sources import Source, Sources, Table
 from pipeline.report.shared.verdict import (
     FAILED,
@@ -107,7 +116,8 @@ def temperature(sources: Sources, judged: Judgement) -> Card:
         mark=judged.verdict.winner,
         win=_win(sources, judged),
         caption=(
-            f"Worst zone’s true error over {_SPAN} s, log scale {_FLOOR:g} to {number(_CEILING, 0)}\u00a0°C: "
+            f"Worst zone’s true error over {span(sources, CARD_SPAN_S):g} s, log scale "
+            f"{_FLOOR:g} to {number(_CEILING, 0)}\u00a0°C: "
             f"{featured(sources)}. Grey: what the rule allows once settled."
         ),
         panels=[
@@ -134,6 +144,7 @@ def _card_cells(question: Question, figures: Sequence[Figure | Missing]) -> list
         mine = min(places, decimals(0, 0, value=value)) if math.isfinite(value) else places
         text = quantity(value, question.unit, mine, beyond=question.beyond)
         leads = text == quantity(best, question.unit, mine) and math.isfinite(best)
+        leads = leads and not beyond_meaning(best, question.unit)
         cells.append(Cell(text, leads, bad=state(question, figure) == FAILED))
     return cells
 
@@ -143,6 +154,8 @@ def _win(sources: Sources, judged: Judgement) -> tuple[str, str]:
     best = judged.verdict.winner
     settled = next(q for q in judged.asked if q.key == "settled_error_degC")
     if best is None:
+        if judged.verdict.rule == "trust":
+            return "No controller wins.", "They were judged on a model that is not trusted."
         return "No controller wins.", "Not one of them passes its rules."
     mine = judged.roles[best]["settled_error_degC"]
     places = row_places(settled, [mine])
@@ -175,11 +188,11 @@ def _on(question: Question, answers: Mapping[str, Figure | Missing]) -> str:
     places = min(decimals(figure.low, figure.high, value=figure.value), 2)
     return (
         f"{name}: {quantity(figure.value, question.unit, places, beyond=question.beyond)} of "
-        f"{quantity(question.limit, question.unit, 0 if question.limit >= 10 else places)}"
+        f"{with_unit(question.limit, question.unit, 0 if question.limit >= 10 else places)}"
     )
 
 
-_SPAN, _FLOOR, _CEILING = 60, 0.01, 300.0
+_FLOOR, _CEILING = 0.01, 300.0
 
 
 def _spark(sources: Sources, judged: Judgement, role: str, *, limit: float, named: bool) -> Markup:
@@ -222,7 +235,8 @@ def _worst_error(
         [np.abs(table[o.name][rows] - o.reference - offset) for o in sources.declared.machine.outputs]
     )
     time = table["time_s"][rows]
-    return time[time <= _SPAN], errors.max(axis=0)[time <= _SPAN]
+    early = time <= span(sources, CARD_SPAN_S)
+    return time[early], errors.max(axis=0)[early]
 
 
 def _kernel_note(gap: Figure | Missing | None, sources: Sources) -> str:
@@ -238,13 +252,11 @@ def _kernel_note(gap: Figure | Missing | None, sources: Sources) -> str:
             "more than the optimum: "
             f"see the temperature page. {noise}"
         )
-    learned = sources.metrics["learn_kernel"]
-    refused = learned.get("refused") if isinstance(learned, dict) else None
-    return (
-        f"Algorithm 2’s kernel failed: {refused}"
-        if refused
-        else f"Algorithm 2’s kernel: not measured. {noise}"
-    )
+    # the same sentence as in the table of all controllers
+    gap = without_figures(sources, "kernel") or gap
+    if gap is not None and gap.state == FAILED:
+        return f"Algorithm 2’s kernel failed: {gap.sentence()}"
+    return f"Algorithm 2’s kernel: not measured. {noise}"
 
 
 def deposition(sources: Sources) -> Card:

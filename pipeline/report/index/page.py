@@ -12,7 +12,7 @@ from pipeline.report.setpoint import card as setpoint_card
 from pipeline.report.setpoint import change as setpoint_change
 from pipeline.report.shared import charts, headline, page, words
 from pipeline.report.shared.difference import Difference, Move
-from pipeline.report.shared.digits import band, count, decimals, declared, quantity
+from pipeline.report.shared.digits import band, beyond_meaning, count, decimals, declared, quantity, with_unit
 from pipeline.report.shared.sources import Sources, digest
 from pipeline.report.shared.verdict import (
     OPEN,
@@ -49,10 +49,12 @@ def render(sources: Sources, judged: Judgement) -> str:
         ],
         claim=f"{headline.claim(sources)} {_drifts(judged)}",
         rules=verdict_parts(judged).rules,
-        answers=_rows(judged),
+        answers=_rows(sources, judged),
         repetitions=repetitions(sources),
         seeds=len(sources.declared.panel.judging.seeds),
-        change=_change_sentence(
+        change=ChangeSentence(ANOTHER)
+        if sources.another_machine
+        else _change_sentence(
             judged, sources.accepted, _deposition_moves(sources), setpoint_change.moved_cases(sources)
         ),
         drift=judged.drifted,
@@ -125,18 +127,20 @@ class Answer(NamedTuple):
     quiet: bool
 
 
-def _rows(judged: Judgement) -> list[Answer]:
-    return [_row(question, judged) for question in judged.asked]
+def _rows(sources: Sources, judged: Judgement) -> list[Answer]:
+    unmoved = "other machine" if sources.another_machine else "first run"
+    return [_row(question, judged, unmoved) for question in judged.asked]
 
 
-def _row(question: Question, judged: Judgement) -> Answer:
+def _row(question: Question, judged: Judgement, unmoved: str) -> Answer:
+    """`unmoved`: why nothing is compared, where nothing is."""
     pair = [(role, judged.roles[role][question.key]) for role in ("data_driven", "model_based")]
     places = row_places(question, [figure for _, figure in pair])
     move = next((m for m in judged.moved.get("data_driven", []) if m.question == question), None)
     moved = move is not None and move.moved
     learned, designed = (state(question, figure) for _, figure in pair)
     # as it was declared: "10.000 %" reads as ten thousand where a point parts thousands
-    limit = quantity(question.limit, question.unit, declared(question.limit))
+    limit = with_unit(question.limit, question.unit, declared(question.limit))
     return Answer(
         question.answer,
         question.key,
@@ -147,7 +151,7 @@ def _row(question: Question, judged: Judgement) -> Answer:
         limit=f"{'≥' if question.at_least else '≤'} {limit}",
         state=learned,
         strip=charts.strip(question, [(ROLES[role], page.MARKS[role], figure) for role, figure in pair]),
-        change=move.text() if move else "first run",
+        change=move.text() if move else unmoved,
         moved=moved,
         worse=moved and move.word == "worse" and learned != PASSED,
         quiet=learned == designed == PASSED and not moved,
@@ -176,22 +180,24 @@ def _cell(question: Question, role: str, figure: Figure | Missing, places: int) 
         value=quantity(figure.value, question.unit, places, beyond=question.beyond),
         band=figure.note.split(" samples")[0].replace(" of ", " / ")
         if question.key == "data"
-        else band(figure.low, figure.high, places, beyond=question.beyond) or _finer(figure, question),
+        else band(figure.low, figure.high, places, unit=question.unit, beyond=question.beyond)
+        or _finer(figure, question),
     )
 
 
 def _finer(figure: Figure, question: Question) -> str:
     """A band that the row's decimals do not show, with those that do;
     runs that are all alike are said to be."""
-    return (
-        band(
-            figure.low,
-            figure.high,
-            decimals(figure.low, figure.high, value=figure.value),
-            beyond=question.beyond,
-        )
-        or "all alike"
-    )
+    return band(
+        figure.low,
+        figure.high,
+        decimals(figure.low, figure.high, value=figure.value),
+        unit=question.unit,
+        beyond=question.beyond,
+    ) or ("" if beyond_meaning(figure.value, question.unit) else "all alike")
+
+
+ANOTHER = "The accepted run is of another machine: nothing to compare."
 
 
 class ChangeSentence(NamedTuple):
@@ -310,7 +316,7 @@ def _moved(role: str, move: Move) -> MovedFigure:
     """A move of a controller of the temperature loop, or of the deposition loop's composer in use."""
     question = move.question
     places = row_places(question, [move.before, move.now])
-    limit = quantity(question.limit, question.unit, places)
+    limit = with_unit(question.limit, question.unit, places)
     return MovedFigure(
         question.title,
         "data_driven" if role == "deposition" else role,
@@ -327,6 +333,10 @@ def difference_parts(sources: Sources, judged: Judgement) -> DifferenceParts:
     """What changed, and the figures that moved: of both controllers of the temperature loop, and of the
     composer in use of the deposition loop."""
     accepted, changed = sources.accepted, judged.changed
+    if sources.another_machine:
+        reason = f"{ANOTHER} Its inputs or outputs have other names than those of plant in params.yaml"
+        remedy = "Mark a run of this machine as good with ./run beadline accept"
+        return DifferenceParts(missing=Missing("not applicable", reason, remedy))
     parts = _deposition_moves(sources)
     if isinstance(accepted, Missing) or changed is None:
         return DifferenceParts(missing=accepted if isinstance(accepted, Missing) else None)

@@ -27,7 +27,17 @@ READS: dict[str, tuple[str, ...]] = {
     "evaluate_setpoint": ("train_classifier", "train_agent"),
 }
 SAME, CHANGED, GONE, FIRST = "as accepted", "made anew", "not there", "first run"
-CSS = {SAME: "same", CHANGED: "anew", GONE: "lost", FIRST: "same"}
+OTHER = "other machine"
+CSS = {SAME: "same", CHANGED: "anew", GONE: "lost", FIRST: "same", OTHER: "anew"}
+# stages of the loop whose machine the accepted run may not share
+TEMPERATURE = (
+    "generate_probing",
+    "ingest",
+    "identify_plant",
+    "tune_weights",
+    "learn_kernel",
+    "evaluate_temperature",
+)
 WIDE, TALL, ACROSS, DOWN = 170, 40, 46, 18
 
 
@@ -44,7 +54,7 @@ def figure(sources: Sources) -> Workflow:
     states = {stage: state(sources, stage) for stage in READS}
     groups = [
         (word, [stage for stage, is_now in states.items() if is_now == word])
-        for word in (CHANGED, GONE, SAME, FIRST)
+        for word in (CHANGED, OTHER, GONE, SAME, FIRST)
     ]
     listed = "; ".join(f"{word}: {', '.join(names)}" for word, names in groups if names)
     alt = f"{len(states)} stages. {listed[:1].upper()}{listed[1:]}"
@@ -61,6 +71,8 @@ def state(sources: Sources, stage: str) -> str:
     before = sources.accepted
     if before is None or isinstance(before, Missing):
         return FIRST
+    if sources.another_machine and stage in TEMPERATURE:
+        return OTHER
     mine = {
         path: source.sha256 for path, source in sources.read.items() if path.startswith(f"datasets/{stage}/")
     }
@@ -76,6 +88,8 @@ def _finding(states: Mapping[str, str]) -> str:
     same = sum(word == SAME for word in states.values())
     if FIRST in states.values():
         return "No run was accepted yet: nothing says what is new."
+    if OTHER in states.values() and not names:
+        return "The accepted run is of another machine: nothing of the temperature loop is compared with it."
     if not names:
         return f"The results of {same} of {len(states)} stages are those of the accepted run, to the byte."
     # what was made anew although nothing that it reads was: there the

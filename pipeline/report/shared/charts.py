@@ -49,6 +49,8 @@ def _used(question: Question, figure: Figure) -> str:
     if math.isinf(used):
         return "uses more than any allowance"
     words = "beyond its limit" if state(question, figure) == FAILED else "of its allowance"
+    if used > 100:
+        return f"is beyond 100 times the limit, {words}"
     return (
         f"is {number(100 * used, 0)} % of the limit, {words}"
         if words.startswith("beyond")

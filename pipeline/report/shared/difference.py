@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pipeline.report.shared.digits import MINUS, THIN, count, decimals, number, short
+from pipeline.report.shared.digits import MINUS, THIN, beyond_meaning, count, decimals, number, short
 from pipeline.report.shared.sources import NIGHTLY, Sources, digest
 from pipeline.report.shared.verdict import Figure, Missing, Question
 from pipeline.report.temperature.answers import all_answers
@@ -27,7 +27,9 @@ class Move(NamedTuple):
         if not self.moved:
             return self.word
         change = self.now.value - self.before.value
-        if math.isinf(change) or math.isnan(change):
+        unit = self.question.unit
+        ends = (self.before.value, self.now.value)
+        if not math.isfinite(change) or any(beyond_meaning(end, unit) for end in ends):
             return self.word
         places = min(decimals(f.low, f.high, value=f.value) for f in (self.before, self.now))
         exact = all(f.low == f.high for f in (self.before, self.now))

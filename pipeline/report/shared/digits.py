@@ -43,19 +43,39 @@ def declared(value: float) -> int:
     return next((places for places in range(9) if round(value, places) == value), 9)
 
 
+# what a figure may be at most to say something: ten times the yardstick, or hotter than any machine. Beyond
+# it the loop is useless or unstable, and further digits tell nothing
+LARGEST = {"%": 1000.0, "°C": 10000.0}
+
+
+def beyond_meaning(value: float, unit: str) -> str:
+    """ "beyond 1,000 %" in the place of a figure whose digits say nothing; "" for all others."""
+    largest = LARGEST.get(unit, math.inf)
+    if not abs(value) > largest:
+        return ""
+    return f"{'beyond ' if value > 0 else f'below {MINUS}'}{number(largest, 0)}{THIN}{unit}"
+
+
 def quantity(value: float, unit: str, places: int, *, beyond: str = "never") -> str:
-    """The number with its unit after a thin space; `beyond` in place of infinity."""
-    if math.isinf(value):
-        return beyond
+    """The number with its unit after a thin space; `beyond` in place of infinity, "beyond 1,000 %" in that of
+    a figure that says nothing."""
+    if word := beyond_meaning(value, unit):
+        return word
+    return beyond if math.isinf(value) else with_unit(value, unit, places)
+
+
+def with_unit(value: float, unit: str, places: int) -> str:
+    """A number that somebody wrote down with its unit, however large."""
     return number(value, places) + (THIN + unit if unit else "")
 
 
-def band(low: float, high: float, places: int, *, beyond: str = "never") -> str:
+def band(low: float, high: float, places: int, *, unit: str = "", beyond: str = "never") -> str:
     """ "0.61-0.84" with an en dash; "to" where an end is negative or in words."""
-    ends = [beyond if math.isinf(end) else number(end, places) for end in (low, high)]
+    words = [beyond_meaning(end, unit) or (beyond if math.isinf(end) else "") for end in (low, high)]
+    ends = [word or number(end, places) for word, end in zip(words, (low, high), strict=True)]
     if ends[0] == ends[1]:
         return ""
-    worded = low < 0 or math.isinf(low) or math.isinf(high)
+    worded = low < 0 or any(words)
     return f" to {ends[1]}".join([ends[0], ""]) if worded else DASH.join(ends)
 
 
@@ -71,7 +91,8 @@ def short(value: float, digits: int = 3) -> str:
 
 
 def percent(value: float, digits: int = 3) -> str:
-    return short(value, digits) + THIN + "%"
+    """ "45.6 %"; "beyond 1,000 %" where the figure says nothing."""
+    return beyond_meaning(value, "%") or short(value, digits) + THIN + "%"
 
 
 def _superscript(exponent: int) -> str:

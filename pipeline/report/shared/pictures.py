@@ -1,6 +1,7 @@
 """The figures of the temperature page that show controllers at work:
 trajectories, errors, cost and inputs."""
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -8,12 +9,13 @@ import numpy as np
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import THIN, number, percent, short
+from pipeline.report.shared.digits import THIN, beyond_meaning, number, percent, quantity, short
 from pipeline.report.shared.sources import Sources, Table, lookup
 from pipeline.report.shared.verdict import Missing
 from pipeline.report.temperature.answers import LABELS, YARDSTICKS, aimed_unclipped, featured, without_figures
 
-SPAN_S = 40.0
+# of the study's machine
+SPAN_S, CARD_SPAN_S = 40.0, 60.0
 
 
 class Column(NamedTuple):
@@ -40,6 +42,26 @@ class Picture(NamedTuple):
 
 def placeholder(id: str, title: str, missing: Missing) -> Picture:
     return Picture(id, title, "", [], "", Markup(""), missing)
+
+
+def span(sources: Sources, simulated: float = SPAN_S) -> float:
+    """Seconds that the pictures of a way to a reference show: of a user's machine 1.5 times the slowest
+    settling of its controllers, rounded up to a readable number, within the run."""
+    panel, machine = sources.declared.panel, sources.declared.machine
+    if not sources.recorded:
+        return simulated
+    run = panel.steps * machine.sample_time_s
+    medians = [
+        lookup(sources.metrics["evaluate_temperature"], f"controllers.{name}.settling_s.median")
+        for name in LABELS
+        if name not in YARDSTICKS
+    ]
+    settled = [float(median) for median in medians if not isinstance(median, Missing)]
+    if not settled or max(settled) <= 0:
+        return run
+    wanted = 1.5 * max(settled)
+    power = 10.0 ** math.floor(math.log10(wanted))
+    return min(next(k * power for k in (1, 2, 3, 4, 5, 6, 8, 10) if k * power >= wanted * (1 - 1e-9)), run)
 
 
 class Run(NamedTuple):
@@ -82,35 +104,35 @@ def trajectories(sources: Sources) -> Picture:
     title = "Every zone on its way to its reference"
     if isinstance(recorded, Missing):
         return placeholder("trajectories", title, recorded)
-    machine = sources.declared.machine
+    machine, span_s = sources.declared.machine, span(sources)
     offset = sources.declared.panel.judging.reference_offsets_degC[0]
     lowest = min(
-        float(np.nanmin(run.rows[o.name][run.time <= SPAN_S])) for run in recorded for o in machine.outputs
+        float(np.nanmin(run.rows[o.name][run.time <= span_s])) for run in recorded for o in machine.outputs
     )
     highest = max(
-        float(np.nanmax(run.rows[o.name][run.time <= SPAN_S])) for run in recorded for o in machine.outputs
+        float(np.nanmax(run.rows[o.name][run.time <= span_s])) for run in recorded for o in machine.outputs
     )
     y = charts.linear(min(lowest, 0.0), min(highest, 2 * max(o.reference for o in machine.outputs)) * 1.02)
 
     def draw(run: Run, column: int) -> list[Markup]:
-        panels, early = [], run.time <= SPAN_S
+        panels, early = [], run.time <= span_s
         for i, output in enumerate(machine.outputs):
             last = i == len(machine.outputs) - 1
             frame = charts.Frame(
-                charts.linear(0, SPAN_S, ticks=3), y, height=92 if last else 78, below=16 if last else 4
+                charts.linear(0, span_s, ticks=3), y, height=92 if last else 78, below=16 if last else 4
             )
             values, reference = run.rows[output.name][early], output.reference + offset
             past = float(np.nanmax(np.sign(reference - values[0]) * (values - reference)))
             alt = (
-                f"{LABELS[run.name][0]}, zone {i + 1}: from {number(float(values[0]), 0)} to "
-                f"{number(float(values[-1]), 1)} °C of {reference:g} °C in {SPAN_S:g} s, "
+                f"{LABELS[run.name][0]}, {sources.zone(i)}: from {number(float(values[0]), 0)} to "
+                f"{number(float(values[-1]), 1)} °C of {reference:g} °C in {span_s:g} s, "
                 f"{number(max(past, 0), 1)} "
                 "°C past it"
             )
             layers = [
                 charts.level(frame, reference, "ref"),
                 charts.line(frame, run.time[early], values),
-                charts.label(frame, SPAN_S, y.low, f"zone {i + 1}: {reference:g}", anchor="end", dy=-5),
+                charts.label(frame, span_s, y.low, f"{sources.zone(i)}: {reference:g}", anchor="end", dy=-5),
             ]
             panels.append(
                 charts.panel(
@@ -131,7 +153,7 @@ def trajectories(sources: Sources) -> Picture:
         _reach(recorded, machine, offset),
         columns(sources, recorded, draw),
         (
-            f"True temperature in °C over the first {SPAN_S:g} s as deployed (inputs "
+            f"True temperature in °C over the first {span_s:g} s as deployed (inputs "
             "clipped, feasible target, "
             f"integrator); dashed: reference. One run: {featured(sources)}."
         ),
@@ -153,7 +175,7 @@ def _reach(recorded: list[Run], machine, offset: float) -> str:
             )
             for o in machine.outputs
         )
-        parts.append(f"{LABELS[run.name][0]} {number(max(past, 0.0), 1)}{THIN}°C")
+        parts.append(f"{LABELS[run.name][0]} {quantity(max(past, 0.0), '°C', 1)}")
     return f"Largest way past a reference in this run: {', '.join(parts)}."
 
 
@@ -248,7 +270,7 @@ def costs(sources: Sources) -> Picture:
         )
         above = finals[run.name] / finals[exact.name] - 1 if exact else 0.0
         text = (
-            f"{number(finals[run.name] / 1000, 1)}"
+            f"{_amount(finals[run.name] / 1000, 1)}"
             f"{f', {_signed(100 * above)}' if exact and run is not exact else ''}"
         )
         end = charts.label(
@@ -260,7 +282,7 @@ def costs(sources: Sources) -> Picture:
             dy=14 if finals[run.name] / 1000 > 0.85 * y.high else -5,
         )
         alt = (
-            f"{LABELS[run.name][0]}: cost {number(finals[run.name], 0)} after "
+            f"{LABELS[run.name][0]}: cost {_amount(finals[run.name], 0)} after "
             f"{number(float(run.time[-1]) + 1, 0)} s"
             + (f", {_signed(100 * above)} against the exact model" if exact else "")
         )
@@ -297,7 +319,12 @@ def costs(sources: Sources) -> Picture:
 
 
 def _signed(value: float) -> str:
-    return ("+" if value >= 0 else "") + percent(value, 2)
+    return ("+" if value >= 0 and not beyond_meaning(value, "%") else "") + percent(value, 2)
+
+
+def _amount(value: float, places: int) -> str:
+    """A cost; of one that only an unstable run has, the power of ten alone."""
+    return number(value, places) if abs(value) < 1e9 else short(value, 2)
 
 
 def inputs(sources: Sources) -> Picture:
@@ -306,17 +333,17 @@ def inputs(sources: Sources) -> Picture:
     title = "Inputs against their limits"
     if isinstance(recorded, Missing):
         return placeholder("inputs", title, recorded)
-    machine = sources.declared.machine
+    machine, span_s = sources.declared.machine, span(sources)
     low, high = min(i.low for i in machine.inputs), max(i.high for i in machine.inputs)
     room = 0.35 * (high - low)
     y = charts.Axis(low - room, high + room, ((low, number(low, 0)), (high, number(high, 0))))
 
     def draw(run: Run, column: int) -> list[Markup]:
-        panels, early = [], run.time <= SPAN_S
+        panels, early = [], run.time <= span_s
         for i, signal in enumerate(machine.inputs):
             last = i == len(machine.inputs) - 1
             frame = charts.Frame(
-                charts.linear(0, SPAN_S, ticks=3),
+                charts.linear(0, span_s, ticks=3),
                 y,
                 height=74 if last else 60,
                 below=16 if last else 4,
@@ -332,7 +359,7 @@ def inputs(sources: Sources) -> Picture:
             layers = [
                 charts.tint(frame, signal.low, signal.high),
                 charts.line(frame, run.time[early], command[early], steps=True),
-                charts.label(frame, SPAN_S, signal.high, signal.name, anchor="end", dy=10),
+                charts.label(frame, span_s, signal.high, signal.name, anchor="end", dy=10),
             ]
             panels.append(
                 charts.panel(
@@ -369,7 +396,7 @@ def inputs(sources: Sources) -> Picture:
         ),
         columns(sources, recorded, draw),
         (
-            f"Command in per cent over the first {SPAN_S:g} s as deployed; grey: "
+            f"Command in per cent over the first {span_s:g} s as deployed; grey: "
             "what the machine can give, to "
             "which a command is clipped. A command far outside runs along the edge."
         ),

@@ -78,6 +78,29 @@ class Sources(NamedTuple):
     files: Mapping[str, str]
     nightly: dict | Missing | None = None
 
+    @property
+    def recorded(self) -> bool:
+        """Whether the temperature loop's record is a user's, not that of the study's machine, simulated."""
+        return self.declared.everything.get("generate_probing", {}).get("source") == "recordings"
+
+    @property
+    def another_machine(self) -> bool:
+        """Whether the accepted run's temperature loop is of a machine with other inputs or outputs."""
+        if not isinstance(self.accepted, dict):
+            return False
+        plant = (self.accepted.get("params") or {}).get("plant")
+        if not isinstance(plant, dict):
+            return False
+        machine = self.declared.machine
+        return any(
+            {signal.get("name") for signal in plant.get(kind) or []} != {signal.name for signal in signals}
+            for kind, signals in (("inputs", machine.inputs), ("outputs", machine.outputs))
+        )
+
+    def zone(self, place: int) -> str:
+        """A zone by its number; of a user's machine by the name of its output."""
+        return self.declared.machine.outputs[place].name if self.recorded else f"zone {place + 1}"
+
     def source(self, *names: str) -> list[Source]:
         """Those of the files that could be read."""
         return [source for name in names for source in self.read.values() if source.name == name]

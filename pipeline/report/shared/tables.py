@@ -4,7 +4,17 @@ published, panel, weights, and the findings in words."""
 import math
 from typing import Any, NamedTuple
 
-from pipeline.report.shared.digits import MINUS, THIN, band, decimals, number, percent, quantity, short
+from pipeline.report.shared.digits import (
+    MINUS,
+    THIN,
+    band,
+    decimals,
+    number,
+    percent,
+    quantity,
+    short,
+    with_unit,
+)
 from pipeline.report.shared.sources import Sources, lookup
 from pipeline.report.shared.verdict import FAILED, UNDECIDED, Figure, Missing, Question, state
 from pipeline.report.shared.words import FIXED, explaining
@@ -113,7 +123,7 @@ def _row(question: Question, names: list[str], figures: list[Figure | Missing]) 
         if math.isinf(question.limit)
         else (
             f"{'≥' if question.at_least else '≤'} "
-            f"{quantity(question.limit, question.unit, min(limit_places, 1 if question.limit < 10 else 0))}"
+            f"{with_unit(question.limit, question.unit, min(limit_places, 1 if question.limit < 10 else 0))}"
         )
     )
     return Row(question.title, explaining(question.key), limit, cells)
@@ -124,7 +134,7 @@ def _cell(question: Question, figure: Figure, *, best: bool) -> Cell:
     places = 0 if samples and figure.value >= 10 else decimals(figure.low, figure.high, value=figure.value)
     held = state(question, figure) if math.isfinite(question.limit) else ""
     note = figure.note if question.key in ("data", "settled_error_degC") else ""
-    bands = band(figure.low, figure.high, places, beyond=question.beyond)
+    bands = band(figure.low, figure.high, places, unit=question.unit, beyond=question.beyond)
     below = [bands, note.split(" samples")[0], held if held == UNDECIDED else ""]
     return Cell(
         quantity(figure.value, question.unit, places, beyond=question.beyond),
@@ -331,7 +341,9 @@ def weights(sources: Sources) -> Weights:
     rows = [
         Diagonals(title, *([short(weight, 2) for weight in tuned[mode][key]] for key in ("q", "r")))
         for mode, title in names.items()
-        if mode in tuned and [len(tuned[mode][key]) for key in ("q", "r")] == [len(outputs), len(inputs)]
+        if mode in tuned
+        and not (sources.recorded and mode == "parity")
+        and [len(tuned[mode][key]) for key in ("q", "r")] == [len(outputs), len(inputs)]
     ]
     return Weights(None, outputs, inputs, rows)
 
@@ -357,7 +369,7 @@ def identified(sources: Sources) -> list[tuple[str, str]]:
             (
                 "Fit on the hold-out",
                 ", ".join(
-                    f"{name} {number(value, 1)}{THIN}%"
+                    f"{name} {quantity(value, '%', 1)}"
                     if isinstance(value, int | float)
                     else f"{name} {value}"
                     for name, value in fit.items()
@@ -371,7 +383,7 @@ def identified(sources: Sources) -> list[tuple[str, str]]:
         rows.append(
             (
                 f"Fit {metrics.get('ahead_steps', '')} steps ahead",
-                ", ".join(f"{name} {number(value, 1)}{THIN}%" for name, value in ahead.items()),
+                ", ".join(f"{name} {quantity(value, '%', 1)}" for name, value in ahead.items()),
             )
         )
     white = metrics.get("whiteness_passed")

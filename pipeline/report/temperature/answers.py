@@ -106,7 +106,7 @@ def _finite(value: float | None) -> float:
 
 def _zone(sources: Sources, figures: Mapping) -> str:
     zone = figures.get("zone")
-    return f"zone {zone + 1}" if isinstance(zone, int) else f"zone {zone}" if zone else ""
+    return sources.zone(zone) if isinstance(zone, int) else f"zone {zone}" if zone else ""
 
 
 def noise(sources: Sources) -> float:

@@ -8,7 +8,7 @@ import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import THIN, count, number, percent, short
+from pipeline.report.shared.digits import count, number, percent, quantity, short
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources, Table, lookup
 from pipeline.report.shared.verdict import Missing
@@ -305,26 +305,13 @@ def tuning(sources: Sources) -> Picture:
         return placeholder("tuning", title, table)
     best, optimum = lookup(metrics, "parity.best_cost_perfect_state"), lookup(metrics, "parity.optimum")
     cost, default = lookup(metrics, "practical.cost"), default_cost(metrics)
-    shown = [
-        _progress(
-            table,
-            "parity",
-            "The study’s objective",
-            "excess over the optimum in %, log",
-            optimum,
-            excess=True,
-        ),
-        _progress(
-            table,
-            "practical",
-            "The declared engineering cost",
-            "log; default: Q = R = I",
-            default,
-            excess=False,
-        ),
-    ]
+    head, small = "The declared engineering cost", "log; default: Q = R = I"
+    shown = [_progress(table, "practical", head, small, default, excess=False)]
+    if not sources.recorded:
+        head, small = "The study’s objective", "excess over the optimum in %, log"
+        shown.insert(0, _progress(table, "parity", head, small, optimum, excess=True))
     sentences = []
-    if not isinstance(best, Missing) and not isinstance(optimum, Missing):
+    if not sources.recorded and not isinstance(best, Missing) and not isinstance(optimum, Missing):
         excess = percent(100 * (best / optimum - 1), 2)
         sentences.append(
             f"On the study’s objective the search ends {excess} above the optimum, {number(optimum, 0)}, "
@@ -427,7 +414,7 @@ def holdout(sources: Sources) -> Picture:
         )
         time = machine.sample_time_s * np.arange(len(measured))
         fit = None if isinstance(fits, Missing) else fits.get(output.name)
-        small = "fit not measured" if fit is None else f"fit {number(fit, 1)}{THIN}%"
+        small = "fit not measured" if fit is None else f"fit {quantity(fit, '%', 1)}"
         alt = f"{output.name}: {small} in simulation on the hold-out"
         layers = [
             charts.line(frame, time, measured, "line seen"),

@@ -13,9 +13,11 @@ def findings(sources: Sources) -> list[tuple[str, str]]:
     """What a reader should take away, each with its figure; a figure
     that was not measured is said to be so."""
     evaluated, tuned = sources.metrics["evaluate_temperature"], sources.metrics["tune_weights"]
-    claims = [_flagged(sources), _claim(sources), _scaled(tuned), _algorithm_1(evaluated)]
-    claims += [_start(evaluated), _regret(tuned)]
-    claims.append(_printer(sources))
+    claims = [_flagged(sources)]
+    if not sources.recorded:
+        # of the study's machine, which a user's page is not about
+        claims += [_claim(sources), _scaled(tuned), _algorithm_1(evaluated), _start(evaluated)]
+    claims += [_regret(tuned), _printer(sources)]
     units = sources.declared.machine.sample_time_s
     if sources.declared.everything.get("generate_probing", {}).get("source") == "simulated":
         claims += [

@@ -4,10 +4,11 @@ import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
+from pipeline.report.identification.model import UNTRUSTED, trust
 from pipeline.report.shared.difference import Difference, Move, difference, moves
 from pipeline.report.shared.digits import count
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import Figure, Missing, Question, Verdict
+from pipeline.report.shared.verdict import OPEN, PASSED, Figure, Missing, Question, Verdict
 from pipeline.report.temperature.answers import CONTROLLERS, all_answers
 from pipeline.report.temperature.drifted import Drift, drift
 from pipeline.report.temperature.verdict import ANSWERS, decide, questions
@@ -16,7 +17,8 @@ NAMES = {"data_driven": "Data\u2011driven", "model_based": "Model\u2011based", "
 
 
 class Judgement(NamedTuple):
-    """What both pages say: questions, answers by controller and by role, the verdict, and the difference."""
+    """What both pages say: questions, answers by controller and by role, the verdict, and the difference;
+    None too where the accepted run is of another machine."""
 
     asked: list[Question]
     by_name: Mapping[str, Mapping[str, Figure | Missing]]
@@ -35,10 +37,30 @@ def judgement(sources: Sources) -> Judgement:
         name: {**answers, "drift": drifted.answer} for name, answers in all_answers(sources, asked).items()
     }
     roles = {role: by_name[name] for role, name in CONTROLLERS.items()}
-    changed = difference(sources)
+    changed = None if sources.another_machine else difference(sources)
     moves_of = moves(sources, asked, by_name) if changed else {}
     moved = {role: moves_of[name] for role, name in CONTROLLERS.items()} if changed else {}
-    return Judgement(asked, by_name, roles, decide("temperature", asked, roles), changed, moved, drifted)
+    verdict = decide("temperature", asked, roles)
+    if sources.recorded:
+        verdict = trust_first(verdict, trust(sources))
+    return Judgement(asked, by_name, roles, verdict, changed, moved, drifted)
+
+
+def trust_first(verdict: Verdict, model: Verdict) -> Verdict:
+    """The verdict on controllers that were judged on an identified model. Where that model is good for no
+    use, this comes before every rule that its figures pass or fail, and no controller is deployed."""
+    if not model.decision.startswith(UNTRUSTED):
+        return verdict
+    first = verdict._replace(lead=model.decision, reason=f"{model.lead} {model.reason}", rule="trust")
+    if verdict.state == PASSED:
+        return first._replace(
+            state=OPEN, decision="Do not decide yet.", remedy=_remedy(model, ""), winner=None
+        )
+    return first._replace(remedy=_remedy(model, f"On that model: {verdict.lead} {verdict.reason}"))
+
+
+def _remedy(model: Verdict, then: str) -> str:
+    return f"{model.remedy} {then}".strip()
 
 
 class RuleLine(NamedTuple):

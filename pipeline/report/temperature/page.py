@@ -56,8 +56,9 @@ def render(sources: Sources, judged: Judgement) -> str:
             trades.tradeoff(sources),
             trades.plants(sources),
         ],
+        simulated=not sources.recorded,
         learning=[
-            evidence.noise(sources),
+            *([] if sources.recorded else [evidence.noise(sources)]),
             evidence.orders(sources),
             evidence.holdout(sources),
             evidence.tuning(sources),
@@ -69,7 +70,14 @@ def render(sources: Sources, judged: Judgement) -> str:
         weights=tables.weights(sources),
         identified=tables.identified(sources),
         trusted=trust(sources),
-        words=words.chosen(sources, tuple(word for word in WORDS if word in shown or word not in SOME)),
+        words=words.chosen(
+            sources,
+            tuple(
+                word
+                for word in WORDS
+                if (word in shown or word not in SOME) and not (sources.recorded and word == "study")
+            ),
+        ),
         sources=list(sources.read.values()),
         absent=sources.absent,
         hashes=index_page.hashes(sources),

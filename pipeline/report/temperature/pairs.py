@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from pipeline.report.shared.digits import THIN, count, number, short
+from pipeline.report.shared.digits import LARGEST, THIN, count, number, short
 from pipeline.report.shared.sources import Sources, Table
 from pipeline.report.shared.verdict import Missing
 from pipeline.report.temperature.answers import CONTROLLERS, LABELS, noise
@@ -83,12 +83,23 @@ def _paired(
     return paired(costs[other].to_numpy(), costs[mine].to_numpy(), blocks, rng=np.random.default_rng(0))
 
 
+# a saving of more than this is against one that costs beyond 1,000 % more, as an unstable one does
+MOST = 100.0 - 100.0 / (1.0 + LARGEST["%"] / 100.0)
+
+
+def _apart(pair: Paired) -> bool:
+    """Whether the costs lie so far apart that their ratio is no measure, as of an unstable one."""
+    return not -LARGEST["%"] <= pair.improvement_percent <= MOST
+
+
 def _saving(pair: Paired) -> Saving:
     word = "less" if pair.improvement_percent >= 0 else "more"
     chance = min(pair.p, 1 - pair.p)
+    saved = f"{short(abs(pair.improvement_percent), 2)}{THIN}% {word}"
+    ends = f"{_signed(pair.low_percent)} to {_signed(pair.high_percent)}"
     return Saving(
-        saved=f"{short(abs(pair.improvement_percent), 2)}{THIN}% {word}",
-        band=f"{_signed(pair.low_percent)} to {_signed(pair.high_percent)}",
+        saved=f"{word}: beyond {number(LARGEST['%'], 0)}{THIN}% apart" if _apart(pair) else saved,
+        band="none" if _apart(pair) else ends,
         p=f"{short(chance, 2)}" if chance >= 1e-4 else "< 0.0001",
         cases=f"{number(pair.cases, 0)} on {count(pair.blocks, 'plant')}",
         sure=chance < LEVEL,
@@ -104,6 +115,9 @@ def _signed(percent: float) -> str:
 def _sentence(what: str, pair: Paired) -> str:
     saving = _saving(pair)
     name = what.split(",")[0]
+    if _apart(pair):
+        word, most = saving.saved.split(":")[0], number(LARGEST["%"], 0)
+        return f"{name}: data-driven has {word} than model-based, beyond {most}{THIN}% apart."
     if not saving.sure:
         return (
             f"{name}: no difference beyond chance between data-driven and model-based ({saving.saved}, p = "

@@ -16,7 +16,8 @@ from pipeline.report.shared.verdict import Missing
 
 def excitation(sources: Sources) -> Picture:
     """How strongly each input was moved, by frequency."""
-    metrics, title = sources.metrics["generate_probing"], "What the probing excites"
+    metrics = sources.metrics["generate_probing"]
+    title = "What the next experiment would excite" if sources.recorded else "What the probing excites"
     levels = lookup(metrics, "level_percent_per_band")
     if isinstance(levels, Missing):
         return placeholder("excitation", title, levels)
@@ -50,14 +51,13 @@ def excitation(sources: Sources) -> Picture:
     text = f"Exciting of order {order}: rank {rank} of {full}" + (
         "." if isinstance(condition, Missing) else f", condition {short(condition)}."
     )
-    text += (
-        ""
-        if isinstance(limited, Missing)
-        else (
-            f" {number(100 * limited, 0)}{THIN}% of all commands met a limit of amplitude, rate or machine; "
-            "what was applied is what is recorded."
+    if not isinstance(limited, Missing):
+        text += (
+            f" {number(100 * limited, 0)}{THIN}% of all commands met a limit of amplitude, rate or machine"
         )
-    )
+        text += "." if sources.recorded else "; what was applied is what is recorded."
+    if sources.recorded:
+        text = f"The experiment that is designed to be run next, not what was recorded. {text}"
     return Picture(
         "excitation",
         title,

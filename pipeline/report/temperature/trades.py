@@ -8,7 +8,7 @@ import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import THIN, count, number, percent, short
+from pipeline.report.shared.digits import LARGEST, THIN, count, number, percent, short
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources, Table, lookup
 from pipeline.report.shared.verdict import Missing
@@ -150,6 +150,8 @@ def candidates(sources: Sources) -> Picture:
         return placeholder("candidates", title, table)
     shown, sentences = [], []
     for mode, (head, small) in MODES.items():
+        if sources.recorded and mode == "parity":
+            continue
         rows = (
             (table["mode"] == mode)
             & np.isfinite(table["tracking_degC"])
@@ -288,7 +290,10 @@ def plants(sources: Sources) -> Picture:
         return placeholder(
             "plants", title, Missing("not measured", "the scorecard has no gap at this level of noise")
         )
-    y = charts.logarithmic(min(float(finite.min()), limit), max(float(finite.max()), limit))
+    # an unstable plant's gap would press all others against the axis: it is drawn at the edge
+    y = charts.logarithmic(
+        min(float(finite.min()), limit), max(min(float(finite.max()), LARGEST["%"]), limit)
+    )
     shown, costs = [], []
     for i, (name, gaps) in enumerate(worst.items()):
         of = len(gaps)
@@ -298,7 +303,7 @@ def plants(sources: Sources) -> Picture:
         frame = charts.Frame(
             charts.Axis(0.5, of + 0.5, ((1.0, "easiest"), (float(of), "hardest"))), y, height=130
         )
-        at, drawn = np.arange(1.0, of + 1), np.where(np.isfinite(gaps), gaps, y.high)
+        at, drawn = np.arange(1.0, of + 1), np.minimum(np.where(np.isfinite(gaps), gaps, y.high), y.high)
         inside = gaps <= limit
         layers = [
             charts.tint(frame, y.low, limit),
@@ -306,8 +311,9 @@ def plants(sources: Sources) -> Picture:
             charts.dots(frame, at[inside], drawn[inside], f"dot {page.MARKS[name]}", 2.6),
             charts.dots(frame, at[~inside], drawn[~inside], "gone", 3),
         ]
+        easiest = percent(float(gaps[0]), 2).replace(THIN, " ")
         alt = (
-            f"{LABELS[name][0]}: worst run of the easiest plant {short(float(gaps[0]), 2)} %, of the "
+            f"{LABELS[name][0]}: worst run of the easiest plant {easiest}, of the "
             f"hardest {hardest}; {over} of {of} plants beyond {limit:g} %"
         )
         panel = charts.panel(

@@ -5,7 +5,7 @@ import functools
 import math
 from collections.abc import Mapping, Sequence
 
-from pipeline.report.shared.digits import band, count, decimals, number, quantity
+from pipeline.report.shared.digits import band, count, decimals, number, quantity, with_unit
 from pipeline.report.shared.verdict import (
     FAILED,
     FAILED_FIRST,
@@ -253,7 +253,7 @@ BRIEF = {
 
 
 def _rule_allows(question: Question, places: int) -> str:
-    return f"at {'least' if question.at_least else 'most'} {quantity(question.limit, question.unit, places)}"
+    return f"at {'least' if question.at_least else 'most'} {with_unit(question.limit, question.unit, places)}"
 
 
 def reason(first: Rule, answers: Mapping[str, Answers]) -> str:
@@ -267,9 +267,8 @@ def reason(first: Rule, answers: Mapping[str, Answers]) -> str:
     if question.key == "data":
         return f"{figure.note} needed." if not figure.note.endswith(".") else figure.note
     places = row_places(question, [figure, answers["model_based"][question.key]])
-    value, limit = (
-        quantity(v, question.unit, places, beyond=question.beyond) for v in (figure.value, question.limit)
-    )
+    value = quantity(figure.value, question.unit, places, beyond=question.beyond)
+    limit = with_unit(question.limit, question.unit, places)
     settles = "never settles" if math.isinf(figure.value) else f"needs {value} to settle"
     sentence = {
         "gap_percent": f"It costs {value} more than the optimum; the rule allows {limit}.",
@@ -297,7 +296,8 @@ def undecided(question: Question, figure: Figure) -> str:
     than one run in twenty lies outside.
     """
     places = decimals(figure.low, figure.high, value=figure.value)
-    straddles = f"Its band, {band(figure.low, figure.high, places, beyond=question.beyond)}, straddles that"
+    ends = band(figure.low, figure.high, places, unit=question.unit, beyond=question.beyond)
+    straddles = f"Its band, {ends}, straddles that"
     runs = len(figure.runs)
     if not runs:
         return f"{straddles}; more runs would narrow it."
