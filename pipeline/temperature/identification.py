@@ -96,6 +96,7 @@ class Identified(NamedTuple):
     notes: list[str]
     feedback: ClosedLoop | None = None
     drift: float = 0.0
+    reasons: tuple[str, ...] = ()  # of the choice, among the notes
 
 
 class Settings(NamedTuple):
@@ -184,7 +185,8 @@ def within_limits(
     u: Segments, limits: tuple[Sequence[float], Sequence[float]], *, names: Sequence[str] = ()
 ) -> tuple[list[np.ndarray], list[str]]:
     """The inputs that the actuators could follow, min(max(u, low), high), and a
-    sentence for each input that was asked beyond its limits.
+    sentence for each input that was asked beyond its limits by more than a millionth of their range, which is
+    rounding of a scale.
 
     Clipping at a known limit loses nothing; masking the same samples would cut
     the record wherever the actuator stands at its stop.
@@ -196,9 +198,9 @@ def within_limits(
             f"limits: expected {m} low and {m} high limits with low < high but found {low.tolist()} and "
             f"{high.tolist()}; give one pair for each input"
         )
-    rows = np.vstack(u)
+    rows, rounding = np.vstack(u), 1e-6 * (high - low)
     for j in range(m):
-        beyond = int(((rows[:, j] < low[j]) | (rows[:, j] > high[j])).sum())
+        beyond = int(((rows[:, j] < low[j] - rounding[j]) | (rows[:, j] > high[j] + rounding[j])).sum())
         if beyond:
             notes.append(
                 f"{name_of(names, 'u', j)} was asked beyond {low[j]:g}..{high[j]:g} in {beyond} of "
@@ -230,7 +232,7 @@ def identify(
     if choice.table:
         validation = _validation(record, settings, feedback)
         rate = chosen_rate(record.u, record.y, choice.structure, choice.order, choice.fit, validation)
-    fitted = fitted._replace(feedback=feedback, drift=rate)
+    fitted = fitted._replace(feedback=feedback, drift=rate, reasons=tuple(reasons))
     return _with_remarks(fitted, record._replace(notes=record.notes + reasons), names)
 
 
@@ -257,8 +259,8 @@ def refit(
     exact = data is not None and windows(data)[1]
     choice = Choice(structure, identified.order, identified.fit, exact, table)
     fitted = _fit_all(record.u, record.y, choice, identified.plant.sample_time_s, max_radius)
-    fitted = fitted._replace(feedback=identified.feedback, drift=identified.drift)
-    return _with_remarks(fitted, record, names)
+    fitted = fitted._replace(feedback=identified.feedback, drift=identified.drift, reasons=identified.reasons)
+    return _with_remarks(fitted, record._replace(notes=[*record.notes, *identified.reasons]), names)
 
 
 class _Record(NamedTuple):
@@ -556,7 +558,7 @@ def _remarks(fitted: Identified, names: Sequence[str]) -> list[str]:
     radius = float(np.abs(np.linalg.eigvals(fitted.plant.A)).max())
     if radius > 1:
         notes.append(
-            f"the largest pole is at {radius:.5f}, outside the unit circle; refine with a limit, "
+            f"the largest pole is {radius - 1:.2g} outside the unit circle; refine with a limit, "
             "or record longer, before simulating far ahead"
         )
     return notes

@@ -30,7 +30,8 @@ class Holdout(NamedTuple):
     simulated, ahead: predictions (T, p) of each segment, the second NaN over its start-up; fit, ahead_fit (3,
     p): value and the ends of its 90 % band; held_fit (p,): the last value seen so many steps before, held,
     over the rows of ahead_fit. NaN where no segment outlasts the start-up. free_mean_fit (3, p): of the
-    simulation with the mean of each segment's error taken off, what another ambient alone would cost.
+    same simulation with the mean of each segment's error taken off, what another ambient alone would cost.
+    Its start is the simulation's: one fitted beside a free mean lets slow modes draw any ramp.
     drift_fit (3, p): of the simulation with a drift tracked up to so many steps before, NaN without one.
     """
 
@@ -132,7 +133,7 @@ def holdout(
     last = [
         np.where(np.isfinite(forecast), held(b, steps), np.nan) for b, forecast in zip(y, ahead, strict=True)
     ]
-    free = [_mean_removed(b, simulated(plant, a, b, means_removed=True)) for a, b in zip(u, y, strict=True)]
+    free = [_mean_removed(b, a) for a, b in zip(simulations, y, strict=True)]
     drifting = [
         simulated_with_drift(plant, a, b, drift, steps) if drift else np.full(b.shape, np.nan)
         for a, b in zip(u, y, strict=True)
@@ -141,6 +142,14 @@ def holdout(
         fit_with_band(y, part, block=block, rng=rng) for part in (simulations, ahead, last, free, drifting)
     ]
     return Holdout(simulations, ahead, fits[0], fits[1], fits[2][0], *fits[3:])
+
+
+def fit_of_held_inputs(plant: Plant, u: Segments, y: Segments) -> np.ndarray:
+    """NRMSE (p,) in percent of the free response alone: every input held at its mean over the segments, the
+    initial state of each fitted as in `simulated`."""
+    mean = np.vstack(u).mean(axis=0)
+    free = [simulated(plant, np.broadcast_to(mean, a.shape), b) for a, b in zip(u, y, strict=True)]
+    return fit_with_band(y, free, block=1, rng=np.random.default_rng(0), draws=1)[0]
 
 
 def _mean_removed(y: np.ndarray, predicted: np.ndarray) -> np.ndarray:
@@ -194,11 +203,18 @@ def two_points(responses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return tau, np.maximum(t63 - tau, 0.0)
 
 
-def steps(nominal: Plant, family: Sequence[Plant], longest: int, *, points: int = 120) -> Steps:
+def steps(
+    nominal: Plant,
+    family: Sequence[Plant],
+    longest: int,
+    *,
+    points: int = 120,
+    left_out: Sequence[Plant] = (),
+) -> Steps:
     """Step responses of a plant over its `horizon`, at most `points` + 1 of each, with gain, peak, time
-    constant and delay, beside the family's."""
+    constant and delay, beside the family's; `left_out` as in `spread_bands`."""
     samples = horizon(nominal, longest)
-    bands = spread_bands(nominal, family, samples + 1, level=LEVEL)
+    bands = spread_bands(nominal, family, samples + 1, level=LEVEL, left_out=left_out)
     at = np.abs(bands.nominal).argmax(axis=0)[None]
     gain, peak = (
         np.stack([part[-1] for part in bands[:3]]),
@@ -346,7 +362,7 @@ def first_order_rows(
         np.concatenate([part[:1], np.quantile(part[1:], ENDS, axis=0)]).reshape(3, -1)
         for part in (models.gain, sample_time_s * models.time_constant, sample_time_s * models.delay)
     ]
-    seen = (banded[0][1] * banded[0][2] > 0) & (banded[0][0] * banded[0][1] > 0)
+    seen = (banded[0][1] * banded[0][2] > 0) & (banded[0][0] * banded[0][1] > 0) & steps.significant.ravel()
     columns["seen"] = seen.tolist()
     for name, part in zip(("gain", "time_constant_s", "delay_s"), banded, strict=True):
         shown = part if name == "gain" else np.where(seen, part, np.nan)

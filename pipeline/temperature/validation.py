@@ -25,6 +25,11 @@ RESAMPLED_STEPS = (
     1  # of Gauss-Newton a resampled record: from a consistent start one is efficient (Le Cam 1956)
 )
 QUANTILE_99 = 2.5758  # of the standard normal, two-sided
+LEFT_OUT_BLOCKS = 8  # one in eight: each slow enough to differ, and seven degrees of freedom of their spread
+# errors of one step below this share of the output's movement are rounding: what colour they have is the
+# processor's, and no record of a sensor comes near (float32 resolves 1e-7)
+ROUNDING = 1e-8
+ADDS = 0.1  # of the error: what the inputs must take off that of the free response for a fit to be theirs
 
 
 class Spread(NamedTuple):
@@ -135,7 +140,8 @@ def residual_tests(
     Whiteness is Ljung and Box's test. Independence fails where a correlation at a lag from 0 on leaves the
     band widened for the number of lags (Bonferroni); correlation at negative lags only says that the record
     was taken in closed loop. There (`closed`) lag 0 says so too, as u(t) answers the error of y(t), and the
-    test begins at lag 1. Raises ValueError where the record has fewer than 4 lags of samples.
+    test begins at lag 1. Errors below `ROUNDING` of an output's movement count as none. Raises ValueError
+    where the record has fewer than 4 lags of samples.
     """
     if sum(len(a) for a in u) < 4 * lags:
         raise ValueError(
@@ -144,7 +150,9 @@ def residual_tests(
         )
     e, m, p = np.vstack(one_step_errors(plant, u, y)), plant.m, plant.p
     w = np.vstack(u)
-    e = (e - np.nanmean(e, axis=0)) / np.maximum(np.nanstd(e, axis=0), np.finfo(float).tiny)
+    size = np.nanstd(e, axis=0)
+    rounding = size < ROUNDING * np.nanstd(np.vstack(y), axis=0)
+    e = np.where(rounding, 0.0 * e, (e - np.nanmean(e, axis=0)) / np.maximum(size, np.finfo(float).tiny))
     w = (w - np.nanmean(w, axis=0)) / np.maximum(np.nanstd(w, axis=0), np.finfo(float).tiny)
     N = int(np.isfinite(e).all(axis=1).sum())
     auto = np.array([[_correlation(e[:, o], e[:, o], k) for k in range(lags + 1)] for o in range(p)])
@@ -244,6 +252,31 @@ def bootstrap_spread(
     return family
 
 
+def left_out_plants(u: Segments, y: Segments, identified, *, blocks: int = LEFT_OUT_BLOCKS) -> list[Plant]:
+    """The identified class of model fitted anew `blocks` times, each without one equal block of the record's
+    samples; none where what is left is too short for the window.
+
+    Their spread holds what a bootstrap under the model cannot: drift, and what no linear model has (the
+    jackknife of a block, Kuensch 1989).
+    """
+    ends = np.cumsum([len(a) for a in u])
+    edges = np.linspace(0, ends[-1], blocks + 1).round().astype(int)
+    plants = []
+    for low, high in zip(edges[:-1], edges[1:], strict=True):
+        left_u, left_y = [], []
+        for a, b, end in zip(u, y, ends, strict=True):
+            first, last = np.clip([low - end + len(a), high - end + len(a)], 0, len(a))
+            for part in (slice(0, first), slice(last, len(a))) if last > first else (slice(0, len(a)),):
+                if len(a[part]) > identified.past + 1:
+                    left_u.append(a[part])
+                    left_y.append(b[part])
+        try:
+            plants.append(_reidentified(left_u, left_y, identified, identified.order))
+        except ValueError:  # what is left of the record is too short
+            return []
+    return plants
+
+
 def _reidentified(u: Segments, y: Segments, identified, order: int) -> Plant:
     us, ys = shifted(u, y, identified.delays)
     direct = identified.feedthrough
@@ -263,14 +296,29 @@ def step_response(plant: Plant, steps: int) -> np.ndarray:
     )
 
 
-def spread_bands(nominal: Plant, family: Sequence[Plant], steps: int, *, level: float = 0.99) -> Spread:
-    """Bands of the step responses and the poles over a family of
-    plants; with few members the band is their range."""
+def spread_bands(
+    nominal: Plant,
+    family: Sequence[Plant],
+    steps: int,
+    *,
+    level: float = 0.99,
+    left_out: Sequence[Plant] = (),
+) -> Spread:
+    """Bands of the step responses and the poles over a family of plants; with few members the band is their
+    range.
+
+    They reach at least as far as Student's quantile of the jackknife's deviation over the `left_out` plants
+    (`left_out_plants`), where there are any.
+    """
     responses = np.stack([step_response(plant, steps) for plant in family])
     low, high = np.quantile(responses, [(1 - level) / 2, (1 + level) / 2], axis=0)
-    return Spread(
-        step_response(nominal, steps), low, high, [np.linalg.eigvals(plant.A) for plant in family], level
-    )
+    own, blocks = step_response(nominal, steps), len(left_out)
+    if blocks > 1:
+        others = np.stack([step_response(plant, steps) for plant in left_out])
+        deviation = np.sqrt((blocks - 1) * others.var(axis=0))
+        reach = scipy.stats.t.ppf((1 + level) / 2, blocks - 1) * deviation
+        low, high = np.minimum(low, own - reach), np.maximum(high, own + reach)
+    return Spread(own, low, high, [np.linalg.eigvals(plant.A) for plant in family], level)
 
 
 def advice(
@@ -280,39 +328,33 @@ def advice(
     *,
     outputs: Sequence[str],
     inputs: Sequence[str],
+    still_percent: np.ndarray | None = None,
+    order_given: bool = False,
 ) -> list[str]:
-    """A sentence for each test that failed: what was seen, where, and
-    what to do about it. Empty where everything passed."""
-    sentences, lags = [], tests.autocorrelation.shape[1] - 1
+    """A sentence for each kind of test that failed: what was seen, where most, and what to do about it. Empty
+    where everything passed.
+
+    `still_percent` (p,) is the fit with the inputs held. An order that was not given is no remedy: the rules
+    chose it.
+    """
+    sentences = _of_colour(tests, outputs, order_given) + _of_inputs_left(tests, outputs, inputs, order_given)
     for o, output in enumerate(outputs):
-        if not tests.whiteness_passed[o]:
-            lag = int(np.abs(tests.autocorrelation[o, 1:]).argmax()) + 1
-            remedy = (
-                "lengthen the window, or model the disturbance"
-                if lag <= 3
-                else "look for a periodic disturbance, or raise the order"
-            )
-            sentences.append(
-                f"the residuals of {output} are not white (correlation {tests.autocorrelation[o, lag]:+.2f} "
-                f"at lag {lag}): {remedy}"
-            )
-        for j, name in enumerate(inputs):
-            if not tests.independence_passed[o, j]:
-                lag = int(np.abs(tests.cross_correlation[o, j, lags:]).argmax())
-                sentences.append(
-                    f"the residuals of {output} correlate with {name} at lag {lag}: raise the order, "
-                    f"or check the dead time of {name}"
-                )
         if fit_percent[o] < 50:
             sentences.append(
                 f"the hold-out fit of {output} is {fit_percent[o]:.0f} %: "
                 "the model misses more than half of its movement; "
                 "look for an input or disturbance that is not recorded"
             )
+        if still_percent is not None and _inputs_add_nothing(fit_percent[o], still_percent[o]):
+            sentences.append(
+                f"the fit of {output} on the hold-out, {fit_percent[o]:.0f} %, is that of the free response "
+                f"alone: with every input held at its mean it is {still_percent[o]:.0f} %, so it does not "
+                "test what the inputs do; record stretches in which they move"
+            )
     for j, name in enumerate(inputs):
         if excited.per_input_rank[j] * excited.per_input_rank.size < excited.full:
             sentences.append(
-                f"{name} excites {excited.per_input_rank[j]} of "
+                f"input {name} excites {excited.per_input_rank[j]} of "
                 f"{excited.full // excited.per_input_rank.size} lags: move it at more frequencies, "
                 "or at shorter holds"
             )
@@ -322,3 +364,48 @@ def advice(
             "move one at a time, or with different sequences"
         )
     return sentences
+
+
+def _inputs_add_nothing(fit_percent: float, still_percent: float) -> bool:
+    """The recorded inputs take less than `ADDS` off the error of the free response."""
+    return 100.0 - fit_percent > (1.0 - ADDS) * (100.0 - still_percent)
+
+
+def _of_colour(tests: Residuals, outputs: Sequence[str], order_given: bool) -> list[str]:
+    """What the residuals show that are not white, the most coloured output named."""
+    failed = np.flatnonzero(~tests.whiteness_passed)
+    if not failed.size:
+        return []
+    o = int(failed[tests.whiteness[failed].argmax()])
+    lag = int(np.abs(tests.autocorrelation[o, 1:]).argmax()) + 1
+    near = "record what disturbs it as one of plant.disturbances, or record longer"
+    remedy = near if lag <= 3 else "look for a periodic disturbance"
+    remedy += ", or raise identify_plant.order" if order_given else ""
+    seen = f"(correlation {tests.autocorrelation[o, lag]:+.2f} at lag {lag})"
+    if failed.size == 1:
+        return [f"the residuals of {outputs[o]} are not white {seen}: {remedy}"]
+    return [
+        f"the residuals of {failed.size} of {len(outputs)} outputs are not white, most those of {outputs[o]} "
+        f"{seen}: {remedy}"
+    ]
+
+
+def _of_inputs_left(
+    tests: Residuals, outputs: Sequence[str], inputs: Sequence[str], order_given: bool
+) -> list[str]:
+    """What inputs leave in the residuals, the strongest pair named."""
+    failed, lags = ~tests.independence_passed, tests.autocorrelation.shape[1] - 1
+    if not failed.any():
+        return []
+    later = np.abs(tests.cross_correlation[:, :, lags:])
+    excess = np.where(failed, later.max(axis=2) / np.maximum(tests.cross_band, np.finfo(float).tiny), -1.0)
+    o, j = (int(k) for k in np.unravel_index(excess.argmax(), excess.shape))
+    where = f"{outputs[o]} correlate with {inputs[j]} at lag {int(later[o, j].argmax())}"
+    remedy = f"check the dead time of {inputs[j]}, and whether its effect is linear"
+    remedy += ", or raise identify_plant.order" if order_given else ""
+    if failed.sum() == 1:
+        return [f"the residuals of {where}: {remedy}"]
+    return [
+        f"the residuals follow inputs in {failed.sum()} of {failed.size} pairs of an output and an input; "
+        f"most, those of {where}: {remedy}"
+    ]

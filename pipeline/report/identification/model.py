@@ -287,7 +287,10 @@ def _inputs_left(sources: Sources) -> Rule:
         f"The errors of {output} still follow {against}: correlation "
         f"{_signed(table['correlation'][worst])} at lag {lag}, {short(excess, 2)} times its 99{THIN}% band."
     )
-    remedy = "Raise the order, or check the dead time of that input."
+    remedy = (
+        "Check the dead time of that input, and whether its effect is linear. Where identify_plant.order is "
+        "given, raise it."
+    )
     return _none(name, place, int(left.sum()), f"{output} after {against}", reason, remedy)
 
 

@@ -43,12 +43,14 @@ class _Record(NamedTuple):
 
 
 class _Judgement(NamedTuple):
-    """The chosen model on the last part of the record, and what the first part excites."""
+    """The chosen model on the last part of the record, and what the first part excites; `still` (p,): its fit
+    with the inputs held."""
 
     holdout: trust.Holdout
     residuals: validation.Residuals
     excitation: validation.Excitation
     samples: int
+    still: np.ndarray
 
 
 def identified(settings: IdentifyPlant, machine: Machine, path: str) -> IdentifiedPlant:
@@ -76,7 +78,11 @@ def identified(settings: IdentifyPlant, machine: Machine, path: str) -> Identifi
     # controllers are not told the disturbances: at their mean they are part of the offsets
     level = np.vstack(record.u).mean(axis=0)[inputs:]
     controlled, *family = (plant.at_disturbances(one, inputs, level) for one in (fitted.plant, *family))
-    steps = trust.steps(controlled, family, max(map(len, record.u)))
+    left_out = [
+        plant.at_disturbances(one, inputs, level)
+        for one in validation.left_out_plants(record.u, record.y, fitted)
+    ]
+    steps = trust.steps(controlled, family, max(map(len, record.u)), left_out=left_out)
     page_tables = {
         "order": (tables.ORDER, identification.rows(chosen)),
         **_judgement_tables(machine, last[1], judgement),
@@ -134,7 +140,8 @@ def _judged(
         chosen.plant, *last, lags=trust.residual_lags(last[0]), closed=closed
     )
     excitation = validation.excitation(first[0], chosen.past)
-    return _Judgement(holdout, residuals, excitation, sum(map(len, last[0])))
+    still = trust.fit_of_held_inputs(chosen.plant, *last)
+    return _Judgement(holdout, residuals, excitation, sum(map(len, last[0])), still)
 
 
 def _judgement_tables(
@@ -170,7 +177,7 @@ def _metrics(
     fitted: identification.Identified,
     judgement: _Judgement,
 ) -> dict[str, Any]:
-    holdout, residuals, excitation, holdout_samples = judgement
+    holdout, residuals, excitation, holdout_samples, still = judgement
     inputs, outputs = [s.name for s in machine.acting], [o.name for o in machine.outputs]
     return {
         "order": fitted.order,
@@ -187,13 +194,22 @@ def _metrics(
         "samples_cut": record.recorded - record.samples,
         "samples_holdout": holdout_samples,
         "delays": dict(zip(inputs, fitted.delays, strict=True)),
-        "notes": list(dict.fromkeys([*record.notes, *chosen.notes, *fitted.notes])),
+        "notes": list(dict.fromkeys([*record.notes, *fitted.notes])),
         "ahead_steps": settings.ahead_steps,
         **trust.fit_figures(holdout, outputs),
+        "fit_holdout_inputs_held": dict(zip(outputs, still.tolist(), strict=True)),
         **trust.outcome_figures(residuals, excitation, outputs, inputs),
         "controllable": plant.controllability(fitted.plant).passed,
         "largest_pole": np.abs(np.linalg.eigvals(fitted.plant.A)).max(),
-        "advice": validation.advice(residuals, excitation, holdout.fit[0], outputs=outputs, inputs=inputs),
+        "advice": validation.advice(
+            residuals,
+            excitation,
+            holdout.fit[0],
+            outputs=outputs,
+            inputs=inputs,
+            still_percent=still,
+            order_given=settings.order > 0,
+        ),
     }
 
 
