@@ -257,7 +257,8 @@ def bootstrap_spread(
 
 def left_out_plants(u: Segments, y: Segments, identified, *, blocks: int = LEFT_OUT_BLOCKS) -> list[Plant]:
     """The identified class of model fitted anew `blocks` times, each without one equal block of the record's
-    samples; none where what is left is too short for the window.
+    samples; none where what is left is too short for the window. A block without which some input hardly
+    moves on its own is passed over: what is left does not tell its effect.
 
     Their spread holds what a bootstrap under the model cannot: drift, and what no linear model has (the
     jackknife of a block, Kuensch 1989).
@@ -275,11 +276,25 @@ def left_out_plants(u: Segments, y: Segments, identified, *, blocks: int = LEFT_
                     left_y.append(b[part])
         if not left_u:
             return []
+        if not _still_moves(left_u, u):
+            continue
         try:
             plants.append(_reidentified(left_u, left_y, identified, identified.order))
         except ValueError:  # what is left of the record is too short
             return []
     return plants
+
+
+def _still_moves(left: Segments, u: Segments) -> bool:
+    """Whether the least independent movement of the inputs that are left is above a thousandth of that of
+    all of u."""
+    whole, part = np.vstack(u), np.vstack(left)
+    scale = np.maximum(whole.std(axis=0), np.finfo(float).tiny)
+    of_all, of_part = (
+        np.linalg.svd((w - w.mean(axis=0)) / scale, compute_uv=False)[-1] / np.sqrt(len(w))
+        for w in (whole, part)
+    )
+    return bool(of_part > 1e-3 * of_all)
 
 
 def _reidentified(u: Segments, y: Segments, identified, order: int) -> Plant:
@@ -354,7 +369,8 @@ def advice(
             sentences.append(
                 f"the fit of {output} on the hold-out, {fit_percent[o]:.0f} %, is that of the free response "
                 f"alone: with every input held at its mean in each stretch it is "
-                f"{still_percent[o]:.0f} %, so it does not test what the inputs do; record stretches in which they move"
+                f"{still_percent[o]:.0f} %, so it does not test what the inputs do; record stretches "
+                "in which they move"
             )
     lags = excited.full // excited.per_input_rank.size
     poor = [j for j, rank in enumerate(excited.per_input_rank) if rank < lags]

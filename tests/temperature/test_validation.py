@@ -233,6 +233,19 @@ def test_what_is_left_out_is_a_quarter_and_a_record_too_short_for_it_gives_no_pl
     assert left_out_plants([u[: model.past + 3]], [y[: model.past + 3]], model) == []
 
 
+def test_a_quarter_that_alone_moves_an_input_is_not_left_out():
+    true, u, _ = machine_beside_a_drift(0)
+    rng = np.random.default_rng(0)
+    u[:, 1] = 50.0
+    u[300:420, 1] = rng.choice([20.0, 80.0], 120)
+    rest = np.linalg.solve(np.eye(2) - true.A, true.B @ u[0] + true.b)
+    y = simulate(true, u, rest)[1] + 0.1 * rng.standard_normal((900, 2))
+    plants = left_out_plants([u], [y], identify([u], [y], sample_time_s=1.0, settings=Settings(order=2)))
+    assert len(plants) == 3
+    # without the passing over, the unknown column gave gains of 1e145
+    assert max(np.abs(step_response(one, 200)).max() for one in plants) < 2.0
+
+
 def test_bootstrap_is_repeatable_and_may_take_another_order():
     u, y = innovations_record(HEATER, 800, 0.1, 6)
     identified = identify([u], [y], sample_time_s=1.0, settings=Settings(order=2))
