@@ -145,10 +145,9 @@ def holdout(
 
 
 def fit_of_held_inputs(plant: Plant, u: Segments, y: Segments) -> np.ndarray:
-    """NRMSE (p,) in percent of the free response alone: every input held at its mean over the segments, the
-    initial state of each fitted as in `simulated`."""
-    mean = np.vstack(u).mean(axis=0)
-    free = [simulated(plant, np.broadcast_to(mean, a.shape), b) for a, b in zip(u, y, strict=True)]
+    """NRMSE (p,) in percent of the free response alone: every input held at its mean in each segment, the
+    initial state fitted as in `simulated`."""
+    free = [simulated(plant, np.broadcast_to(a.mean(axis=0), a.shape), b) for a, b in zip(u, y, strict=True)]
     return fit_with_band(y, free, block=1, rng=np.random.default_rng(0), draws=1)[0]
 
 

@@ -25,7 +25,10 @@ RESAMPLED_STEPS = (
     1  # of Gauss-Newton a resampled record: from a consistent start one is efficient (Le Cam 1956)
 )
 QUANTILE_99 = 2.5758  # of the standard normal, two-sided
-LEFT_OUT_BLOCKS = 8  # one in eight: each slow enough to differ, and seven degrees of freedom of their spread
+# Quarters: of 20 simulated machines, 90 % bands of gains held the truth in 98 % in white noise, 88 % beside a
+# drift and 96 % where it also hides an input that hardly moved. Eighths are short beside a drift: 98, 80 and
+# 94 %. The bootstrap alone: 81, 54 and 64 %
+LEFT_OUT_BLOCKS = 4
 # errors of one step below this share of the output's movement are rounding: what colour they have is the
 # processor's, and no record of a sensor comes near (float32 resolves 1e-7)
 ROUNDING = 1e-8
@@ -254,7 +257,8 @@ def bootstrap_spread(
 
 def left_out_plants(u: Segments, y: Segments, identified, *, blocks: int = LEFT_OUT_BLOCKS) -> list[Plant]:
     """The identified class of model fitted anew `blocks` times, each without one equal block of the record's
-    samples; none where what is left is too short for the window.
+    samples; none where what is left is too short for the window. A block without which some input hardly
+    moves on its own is passed over: what is left does not tell its effect.
 
     Their spread holds what a bootstrap under the model cannot: drift, and what no linear model has (the
     jackknife of a block, Kuensch 1989).
@@ -270,11 +274,27 @@ def left_out_plants(u: Segments, y: Segments, identified, *, blocks: int = LEFT_
                 if len(a[part]) > identified.past + 1:
                     left_u.append(a[part])
                     left_y.append(b[part])
+        if not left_u:
+            return []
+        if not _still_moves(left_u, u):
+            continue
         try:
             plants.append(_reidentified(left_u, left_y, identified, identified.order))
         except ValueError:  # what is left of the record is too short
             return []
     return plants
+
+
+def _still_moves(left: Segments, u: Segments) -> bool:
+    """Whether the least independent movement of the inputs that are left is above a thousandth of that of
+    all of u."""
+    whole, part = np.vstack(u), np.vstack(left)
+    scale = np.maximum(whole.std(axis=0), np.finfo(float).tiny)
+    of_all, of_part = (
+        np.linalg.svd((w - w.mean(axis=0)) / scale, compute_uv=False)[-1] / np.sqrt(len(w))
+        for w in (whole, part)
+    )
+    return bool(of_part > 1e-3 * of_all)
 
 
 def _reidentified(u: Segments, y: Segments, identified, order: int) -> Plant:
@@ -348,16 +368,18 @@ def advice(
         if still_percent is not None and _inputs_add_nothing(fit_percent[o], still_percent[o]):
             sentences.append(
                 f"the fit of {output} on the hold-out, {fit_percent[o]:.0f} %, is that of the free response "
-                f"alone: with every input held at its mean it is {still_percent[o]:.0f} %, so it does not "
-                "test what the inputs do; record stretches in which they move"
+                f"alone: with every input held at its mean in each stretch it is "
+                f"{still_percent[o]:.0f} %, so it does not test what the inputs do; record stretches "
+                "in which they move"
             )
-    for j, name in enumerate(inputs):
-        if excited.per_input_rank[j] * excited.per_input_rank.size < excited.full:
-            sentences.append(
-                f"input {name} excites {excited.per_input_rank[j]} of "
-                f"{excited.full // excited.per_input_rank.size} lags: move it at more frequencies, "
-                "or at shorter holds"
-            )
+    lags = excited.full // excited.per_input_rank.size
+    poor = [j for j, rank in enumerate(excited.per_input_rank) if rank < lags]
+    if poor:
+        shares = ", ".join(f"{inputs[j]} {excited.per_input_rank[j]}" for j in poor)
+        sentences.append(
+            f"of {lags} lags, some inputs excite fewer ({shares}): move them at more frequencies, or "
+            "at shorter holds"
+        )
     if excited.rank < excited.per_input_rank.sum():
         sentences.append(
             f"the inputs together excite {excited.rank} of {excited.full} directions: they move alike; "

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.moesp import moesp, moesp_singular_values, varx
-from pipeline.temperature.identification import Settings, identify, refit
+from pipeline.temperature.identification import Settings, identify, refit, within_limits
 from pipeline.temperature.order import (
     Candidate,
     Structure,
@@ -425,6 +425,29 @@ def test_an_actuator_asked_beyond_its_limit_is_taken_at_its_limit():
     # away: part of what the unclipped input says is not so
     assert markov_error_of(identified.plant, true) < 0.01 < markov_error_of(bent.plant, true)
     assert identified.notes[0].startswith("u1 was asked beyond 0..10 in ")
+
+
+def test_rounding_of_a_scale_is_not_beyond_a_limit():
+    u = [np.array([[0.392157 * 255], [0.0]])]  # 100.000035
+    clipped, notes = within_limits(u, ([0.0], [100.0]), names=["fan"])
+    assert notes == [] and clipped[0].max() == 100.0
+    assert within_limits([u[0] * 1.001], ([0.0], [100.0]), names=["fan"])[1] != []
+
+
+def test_a_refit_keeps_the_reasons_of_the_choice_and_remarks_on_its_own_poles():
+    rng = np.random.default_rng(0)
+    u = rng.standard_normal((600, 1))
+    y = np.zeros((600, 1))
+    for t in range(599):
+        y[t + 1] = 1.01 * y[t] + u[t]
+    grows = identify([u], [y], sample_time_s=1.0)
+    assert any("the largest pole is 0.01 outside the unit circle" in note for note in grows.notes)
+    assert "noise-free" in grows.notes[0]
+    calm = y.copy()
+    for t in range(599):
+        calm[t + 1] = 0.9 * calm[t] + u[t]
+    again = refit([u], [calm], grows)
+    assert again.notes == grows.notes[:1]
 
 
 def test_limits_of_another_number_than_the_inputs_are_refused():

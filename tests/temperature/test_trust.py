@@ -2,10 +2,11 @@ import numpy as np
 import pytest
 
 from benchmarks.identification import nrmse, predict_fit, simulate_fit
-from pipeline.temperature.plant import plant
+from pipeline.temperature.plant import plant, simulate
 from pipeline.temperature.trust import (
     dynamics_rows,
     fit_figures,
+    fit_of_held_inputs,
     fit_with_band,
     held,
     holdout,
@@ -62,6 +63,28 @@ def test_fits_are_those_of_validation_and_lie_in_their_bands():
     np.testing.assert_allclose(
         judged.held_fit, nrmse(np.vstack([b[37:] for b in ys]), np.vstack([b[37:] for b in last])), rtol=1e-12
     )
+
+
+def test_a_free_mean_moves_the_simulation_that_is_shown_and_draws_no_ramp():
+    t = np.arange(200.0)
+    slow = plant([[0.999]], [[0.001]], [[1.0]])
+    u = np.zeros((200, 1))
+    y = (3.0 - 0.02 * t)[:, None] + 0.02 * np.random.default_rng(0).standard_normal((200, 1))
+    judged = holdout(slow, [u], [y], 7, block=20, rng=np.random.default_rng(0))
+    moved = judged.simulated[0] + (y - judged.simulated[0]).mean(axis=0)
+    np.testing.assert_allclose(judged.free_mean_fit[0], nrmse(y, moved), rtol=1e-12)
+    # a state fitted beside a constant drew the ramp of 4 °C with a fit of 90 %
+    assert judged.free_mean_fit[0, 0] < 20
+
+
+def test_where_inputs_stand_still_the_fit_is_that_of_held_inputs_and_elsewhere_it_is_not():
+    u, y = innovations_record(HEATER, 600, 0.05, 3)
+    still = np.repeat(u[::100], 100, axis=0)
+    x = [simulate(HEATER, part, np.array([5.0, -3.0]))[1] for part in np.split(still, 6)]
+    judged = holdout(HEATER, np.split(still, 6), x, 7, block=20, rng=np.random.default_rng(0))
+    # both are the same simulation: rounding
+    np.testing.assert_allclose(fit_of_held_inputs(HEATER, np.split(still, 6), x), judged.fit[0], atol=1e-6)
+    assert fit_of_held_inputs(HEATER, [u[200:]], [y[200:]])[0] < 30
 
 
 def test_the_band_of_a_fit_holds_the_fit_of_another_hold_out_of_that_length_nine_times_in_ten():

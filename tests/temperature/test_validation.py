@@ -8,6 +8,7 @@ from pipeline.temperature.validation import (
     advice,
     bootstrap_spread,
     excitation,
+    left_out_plants,
     predicted_ahead,
     residual_tests,
     simulated,
@@ -115,10 +116,40 @@ def test_advice_names_the_output_the_input_and_the_lag():
         inputs=["heater_1", "heater_2"],
     )
     assert any(
-        s.startswith("the residuals of T2 correlate with heater_1 at lag 3: raise the order")
+        s.startswith("the residuals of T2 correlate with heater_1 at lag 3: check the dead time of heater_1")
         for s in sentences
     )
     assert not any("heater_2" in s for s in sentences)
+
+
+def test_pairs_are_grouped_and_the_order_is_a_remedy_only_where_it_was_given():
+    rng = np.random.default_rng(0)
+    u, e = rng.standard_normal((2000, 2)), rng.standard_normal((2000, 3))
+    still = plant(np.zeros((1, 1)), np.zeros((1, 2)), np.zeros((3, 1)))
+    tests = residual_tests(still, [u], [e + u[:, :1] + u[:, 1:]])
+    names = {"outputs": ["a", "b", "c"], "inputs": ["p", "q"]}
+    chosen = advice(tests, excitation([u], 5), np.full(3, 80.0), **names)
+    given = advice(tests, excitation([u], 5), np.full(3, 80.0), **names, order_given=True)
+    assert [s for s in chosen if "in 6 of 6 pairs" in s] == chosen
+    assert "raise" not in chosen[0] and given[0].endswith("or raise identify_plant.order")
+
+
+def test_a_fit_that_the_free_response_reaches_without_the_inputs_is_said_to_be_its_own():
+    u, y = innovations_record(HEATER, 2000, 0.01, 4)
+    passed, excited = residual_tests(HEATER, [u], [y]), excitation([u], 5)
+    names = {"outputs": ["T1"], "inputs": ["p", "q"]}
+    (sentence,) = advice(passed, excited, np.array([97.0]), still_percent=np.array([97.0]), **names)
+    assert sentence.startswith("the fit of T1 on the hold-out, 97 %, is that of the free response alone")
+    assert advice(passed, excited, np.array([97.0]), still_percent=np.array([20.0]), **names) == []
+
+
+def test_errors_at_rounding_are_no_residuals():
+    u = np.random.default_rng(0).integers(0, 2, (600, 2)).astype(float)
+    y = simulate(HEATER, u, np.zeros(2))[1]
+    # beyond the 25 lags a wave of 1e-10 of the movement is as coloured and as bound to an input as can be
+    tests = residual_tests(HEATER, [u], [y + 1e-10 * u[:, :1]])
+    assert tests.whiteness_passed.all() and tests.independence_passed.all()
+    assert not residual_tests(HEATER, [u], [y + 1e-4 * u[:, :1]]).independence_passed.all()
 
 
 def test_no_advice_where_everything_passed():
@@ -156,6 +187,63 @@ def test_bootstrap_gives_finite_stable_plants_whose_step_responses_hold_the_trut
     assert (width[5:] > 0).all()
     # 20 members: their range holds some 90 %; one width more on either side is far outside chance
     assert ((true >= bands.low - width - 1e-9) & (true <= bands.high + width + 1e-9)).all()
+
+
+def coupled_heaters(rng):
+    """Two zones that warm each other by some per cent; gains in °C per percent about 0.6."""
+    tau, gain, shared = rng.uniform(30, 70, 2), rng.uniform(0.4, 0.8, 2), rng.uniform(0.02, 0.15, 2)
+    A = np.diag(1 - 1 / tau) + np.diag(shared / tau) @ np.array([[0, 1.0], [1.0, 0]])
+    return plant(A, np.diag(gain / tau), np.eye(2), b=[0.2, 0.2])
+
+
+def machine_beside_a_drift(seed):
+    """(plant, u, y) of 900 samples; u2 moves by 10 % every 200 samples, which a common random walk of the
+    outputs hides, and u1 by 60 %."""
+    rng = np.random.default_rng(seed)
+    true = coupled_heaters(rng)
+    first = np.concatenate([np.full(rng.integers(20, 100), rng.choice([20.0, 80.0])) for _ in range(45)])[
+        :900
+    ]
+    u = np.column_stack([first, np.where((np.arange(900) // 200 + seed) % 2, 55.0, 45.0)])
+    rest = np.linalg.solve(np.eye(2) - true.A, true.B @ u[0] + true.b)
+    walk = np.cumsum(0.03 * rng.standard_normal(900))[:, None]
+    return true, u, simulate(true, u, rest)[1] + walk + 0.1 * rng.standard_normal((900, 2))
+
+
+def test_bands_of_gains_hold_the_truth_nine_times_in_ten_beside_a_drift_where_the_bootstrap_does_not():
+    wide, narrow = [], []
+    for seed in range(20):
+        true, u, y = machine_beside_a_drift(seed)
+        model = identify([u], [y], sample_time_s=1.0, settings=Settings(order=2))
+        family = bootstrap_spread([u], [y], model, count=20, order=3, rng=np.random.default_rng(0))
+        left_out = left_out_plants([u], [y], model)
+        gain = step_response(true, 200)[-1]
+        for plants, inside in (((), narrow), (left_out, wide)):
+            bands = spread_bands(model.plant, family, 200, level=0.9, left_out=plants)
+            inside.append((bands.low[-1] <= gain) & (gain <= bands.high[-1]))
+    # 80 gains of 20 machines, four of each alike: 99 % of binomials of 0.9 over 20 lie above 0.75
+    assert np.mean(wide) >= 0.8
+    assert np.mean(narrow) < np.mean(wide) - 0.1
+
+
+def test_what_is_left_out_is_a_quarter_and_a_record_too_short_for_it_gives_no_plants():
+    true, u, y = machine_beside_a_drift(0)
+    model = identify([u], [y], sample_time_s=1.0, settings=Settings(order=2))
+    assert len(left_out_plants([u[:450], u[450:]], [y[:450], y[450:]], model)) == 4
+    assert left_out_plants([u[: model.past + 3]], [y[: model.past + 3]], model) == []
+
+
+def test_a_quarter_that_alone_moves_an_input_is_not_left_out():
+    true, u, _ = machine_beside_a_drift(0)
+    rng = np.random.default_rng(0)
+    u[:, 1] = 50.0
+    u[300:420, 1] = rng.choice([20.0, 80.0], 120)
+    rest = np.linalg.solve(np.eye(2) - true.A, true.B @ u[0] + true.b)
+    y = simulate(true, u, rest)[1] + 0.1 * rng.standard_normal((900, 2))
+    plants = left_out_plants([u], [y], identify([u], [y], sample_time_s=1.0, settings=Settings(order=2)))
+    assert len(plants) == 3
+    # without the passing over, the unknown column gave gains of 1e145
+    assert max(np.abs(step_response(one, 200)).max() for one in plants) < 2.0
 
 
 def test_bootstrap_is_repeatable_and_may_take_another_order():

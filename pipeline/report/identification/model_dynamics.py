@@ -58,6 +58,7 @@ def steps(sources: Sources) -> Matrix:
     caption = (
         f"Answer in °C to one per cent of the input, over {short(end)}{THIN}s from rest; "
         f"the panels of an output share one scale. Band: 90{THIN}% of {plants}, "
+        "wider where fits without one quarter of the record differ more, "
         f"cut where it leaves the panel. τ: 1.5 times the way from 28.3 to 63.2{THIN}% of the largest "
         f"excursion; delay: what is left of the time to 63.2{THIN}%.{more}"
     )

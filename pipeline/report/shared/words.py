@@ -189,7 +189,8 @@ FIXED = {
     "identified_spread": (
         "Spread",
         "Plants identified anew from records rebuilt with resampled errors: "
-        "as different as the record allows, and one order higher.",
+        "as different as the record allows, and one order higher. Bands of step responses reach at least as "
+        "far as fits without one quarter of the record tell apart.",
     ),
     "on_off": (
         "On\u2011off control",
