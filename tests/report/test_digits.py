@@ -4,7 +4,18 @@ import math
 
 import pytest
 
-from pipeline.report.shared.digits import band, count, decimals, number, quantity, short, shortened, typeset
+from pipeline.report.shared.digits import (
+    band,
+    count,
+    decimals,
+    number,
+    percent,
+    quantity,
+    short,
+    shortened,
+    typeset,
+    with_unit,
+)
 
 
 @pytest.mark.parametrize(
@@ -33,6 +44,15 @@ def test_a_number_has_a_true_minus_thousands_and_no_negative_nothing():
 def test_a_quantity_has_a_narrow_space_before_its_unit_and_words_for_what_never_comes():
     assert quantity(0.724, "°C", 2) == "0.72\u202f°C"
     assert quantity(math.inf, "s", 2) == "never"
+
+
+def test_a_figure_beyond_all_meaning_is_a_word_and_a_declared_limit_is_not():
+    assert quantity(6.4e20, "%", 0) == percent(6.4e20) == quantity(math.inf, "%", 0) == "beyond 1,000\u202f%"
+    assert quantity(-9e15, "%", 1) == "below \u22121,000\u202f%"
+    assert quantity(1000.0, "%", 0) == with_unit(1000.0, "%", 0) == "1,000\u202f%"
+    assert with_unit(5000.0, "%", 0) == "5,000\u202f%" and quantity(5000.0, "s", 0) == "5,000\u202fs"
+    assert band(980.0, 4e12, 0, unit="%") == "980 to beyond 1,000\u202f%"
+    assert band(7e12, 8e12, 0, unit="%") == ""
 
 
 def test_a_band_has_an_en_dash_and_to_where_an_end_is_negative_or_in_words():
