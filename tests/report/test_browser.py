@@ -85,7 +85,7 @@ def test_a_page_says_the_same_without_a_script(shown, unscripted):
 def test_a_table_sorts_by_number_both_ways_and_back_and_what_has_no_value_stands_last(open_page):
     page = open_page("identification")
     place = page.locator("section", has=page.locator("#order")).last
-    head = place.locator("th", has_text="Error on left")
+    head = place.locator("th", has_text="Error on what was left out")
     cells = place.locator("tbody tr > :nth-child(4)")
     before = cells.all_inner_texts()
     # 50 %, 10 % and an order that was not tried

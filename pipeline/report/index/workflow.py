@@ -18,7 +18,7 @@ READS: dict[str, tuple[str, ...]] = {
     "identify_plant": ("ingest",),
     "tune_weights": ("identify_plant",),
     "learn_kernel": ("ingest",),
-    "evaluate_temperature": ("identify_plant", "learn_kernel", "tune_weights"),
+    "evaluate_temperature": ("ingest", "identify_plant", "learn_kernel", "tune_weights"),
     "train_ilc": (),
     "segment_library": ("train_ilc",),
     "compose_parts": ("segment_library", "train_ilc"),
