@@ -37,10 +37,11 @@ def heating():
 # ---- open or closed loop
 
 
-def test_an_open_loop_is_said_with_the_input_that_comes_nearest_to_feedback(project):
+def test_where_no_feedback_is_recognised_it_is_said_with_the_input_that_comes_nearest_to_feedback(project):
     text = page()
     assert (
-        "Recorded in open loop. No input answers past errors of the outputs: least p = 0.030, heater_2; "
+        "No feedback was recognised. No input is seen to answer past errors of the outputs: least p = 0.030, "
+        "heater_2; "
         "feedback is called below 0.00025." in text
     )
     assert "The fit in simulation flatters." not in text

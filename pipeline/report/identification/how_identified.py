@@ -60,13 +60,14 @@ def loop_state(sources: Sources) -> LoopState:
     nearest = min(p_values, key=p_values.get)
     threshold = f"; feedback is called below {short(level, 2)}" if level else ""
     test = (
-        f"No input answers past errors of the outputs: least {_p(p_values[nearest])}, {nearest}{threshold}."
+        f"No input is seen to answer past errors of the outputs: least {_p(p_values[nearest])}, "
+        f"{nearest}{threshold}."
     )
     follows = (
-        "No noise of the outputs is in the inputs, so that fits are not biased by feedback, and the fit in "
-        "simulation on the hold-out can be taken as it stands."
+        "The model is identified as from an open loop. A weak proportional controller whose set-point never "
+        "moves stays below this test: where the machine had one, believe the fit some steps ahead before the simulation."
     )
-    return LoopState(False, "Recorded in open loop.", test, follows)
+    return LoopState(False, "No feedback was recognised.", test, follows)
 
 
 def _closed_follows(sources: Sources) -> str:
