@@ -65,7 +65,8 @@ def loop_state(sources: Sources) -> LoopState:
     )
     follows = (
         "The model is identified as from an open loop. A weak proportional controller whose set-point never "
-        "moves stays below this test: where the machine had one, believe the fit some steps ahead before the simulation."
+        "moves stays below this test: where the machine had one, believe the fit some steps ahead before the "
+        "simulation."
     )
     return LoopState(False, "No feedback was recognised.", test, follows)
 
