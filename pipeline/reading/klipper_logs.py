@@ -83,7 +83,11 @@ def load_klippy(path: Path) -> WholeTable:
             if line % LINES_A_CHECK == 0:
                 check_values(path, len(log.times), len(log.columns))
     if not log.times or not log.columns:
-        what = f"{len(log.times)} Stats lines, none of a heater" if log.times else "no Stats line"
+        left_out = log.idle + log.garbled + log.cut
+        what = "no Stats line"
+        if log.times or left_out:
+            what = f"{len(log.times)} whole Stats lines of a printer at work, none of a heater"
+            what += f", and {left_out} that are idle, garbled or cut" if left_out else ""
         raise ValueError(
             f"{path}: line 2 on should hold Klipper's Stats lines with heaters, but the log has {what}; "
             "log while the heaters are on, or name another file"

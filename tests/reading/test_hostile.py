@@ -132,7 +132,7 @@ def test_damage_by_chance_gives_no_traceback_and_is_seen_where_there_are_checksu
     if kind in ("mcap", "parquet"):
         assert damaging.SILENT not in counts, counts
     # a broken digit in text without checksums is another digit
-    assert len(counts.get(damaging.REFUSED, [])) > 0
+    assert counts.get(damaging.REFUSED) or counts.get(damaging.NOTED), counts
 
 
 def test_a_child_killed_at_one_recording_costs_that_recording(tmp_path, monkeypatch):

@@ -135,11 +135,15 @@ def test_a_line_without_an_end_takes_no_memory_of_its_size(tmp_path, log):
         ),
         (
             "Starting Klippy...\nStats 1.0: gcodein=0 print_time=1.0 sysload=1\n",
-            "1 Stats lines, none of a heater",
+            "1 whole Stats lines of a printer at work, none of a heater",
+        ),
+        (
+            "Starting Klippy...\nStats 1.0: gcodein=0 heater_bed: target=60 temp=5 pwm=0.1\n",
+            "none of a heater, and 1 that are idle, garbled or cut",
         ),
         (print_log(TARGETS, longest_s=30, off=True), "but the log has no Stats line"),
     ],
-    ids=["no stats", "no heater", "cold"],
+    ids=["no stats", "no heater", "idle", "cold"],
 )
 def test_a_log_without_heaters_is_refused_in_one_sentence(tmp_path, text, sentence):
     path = write(tmp_path, text)
