@@ -44,7 +44,7 @@ def test_a_temperature_store_is_read_at_one_second_in_our_units(tmp_path, docume
         ('{"result": {"extruder": {"temperatures": [20.0, 21', "the JSON breaks there"),
         ('{"temperatures": 3}', "expected Moonraker's temperature store, a device with temperatures"),
         ('{"a": {"temperatures": []}}', "the table should have rows but has none"),
-        ('{"a": 1}', "is JSON without Moonraker's temperatures but should be MCAP, Parquet or CSV"),
+        ('{"a": 1}', "is JSON but should be MCAP, Parquet or CSV"),
     ],
     ids=["truncated", "no device", "empty", "other"],
 )

@@ -293,7 +293,7 @@ def test_zeros_after_a_power_failure_are_left_out_and_noted(tmp_path):
         ("t,u,y\n0,7\n8,1.5\n0,\n", "no row behind line 1 has a time and the 3 fields of the header"),
         ("name,owner\n" + "rig,bob\n" * 20, "the file has 21 lines of text and no data"),
         ("a word, and 3 more.\nThen nothing\n7 dwarfs,\n\nthe end of 1 tale\n" * 9, "is text but no table"),
-        ('{"t": 0, "u": 1}\n', "is JSON without Moonraker's temperatures but should be MCAP, Parquet or CSV"),
+        ('{"t": 0, "u": 1}\n', "is JSON but should be MCAP, Parquet or CSV"),
         (
             b"\x89PNG\r\n\x1a\n" + bytes(100),
             "is a PNG picture but should be MCAP, Parquet or CSV; name the recording",
