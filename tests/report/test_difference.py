@@ -123,3 +123,18 @@ def test_a_run_whose_pages_are_older_than_its_figures_is_not_accepted(accepted, 
         "the pages are of another run than reports/metrics/evaluate_temperature.json; run ./run dvc repro"
         in capsys.readouterr().err
     )
+
+
+def test_page_one_does_not_say_that_nothing_moved_where_a_model_based_figure_did(monkeypatch):
+    from types import SimpleNamespace
+
+    from pipeline.report.index import page as index
+
+    still, went = SimpleNamespace(moved=False, word="within noise"), SimpleNamespace(moved=True, word="worse")
+    judged = SimpleNamespace(
+        changed=SimpleNamespace(empty=False), moved={"data_driven": [still], "model_based": [went, still]}
+    )
+    monkeypatch.setattr(index, "_inputs", lambda changed: "Changed: code.")
+    sentence = index._change_sentence(judged, {}, [], (0, 0))
+    assert sentence.strong == "No figure of the data-driven controller moved beyond its noise."
+    assert sentence.text == "Model-based: 1 figure moved. Changed: code."

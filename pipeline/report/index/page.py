@@ -226,6 +226,13 @@ def _change_sentence(
         if parts or cases[1]
         else ""
     )
+    model_based = sum(move.moved for move in judged.moved["model_based"])
+    if not moved and model_based:
+        return ChangeSentence(
+            "No figure of the data-driven controller moved beyond its noise.",
+            f"Model-based: {count(model_based, 'figure')} moved. {_inputs(judged.changed)} "
+            f"{elsewhere if any(others) else ''}".strip(),
+        )
     if not moved:
         unchanged = judged.changed.empty and all(
             move.word in ("unchanged", "not measured", "failed") for move in judged.moved["data_driven"]
