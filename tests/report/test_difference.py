@@ -137,4 +137,4 @@ def test_page_one_does_not_say_that_nothing_moved_where_a_model_based_figure_did
     monkeypatch.setattr(index, "_inputs", lambda changed: "Changed: code.")
     sentence = index._change_sentence(judged, {}, [], (0, 0))
     assert sentence.strong == "No figure of the data-driven controller moved beyond its noise."
-    assert sentence.text == "Model-based: 1 figure moved. Changed: code."
+    assert sentence.text == "Model-based: one figure moved. Changed: code."
