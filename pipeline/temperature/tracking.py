@@ -270,10 +270,15 @@ def started_reached(law: Law, plant: Plant, *, forgets: float = 0.01) -> Law:
     third of the gap to the optimum on the study's plant, and five times the worst settling over the training
     panel, where input gains and heat loss differ (measured).
     """
+    inverse = reached_state(plant, forgets=forgets)
+    return law._replace(start_y=inverse, start=-inverse @ plant.d)
+
+
+def reached_state(plant: Plant, *, forgets: float = 0.01) -> np.ndarray:
+    """W C'(C W C')^-1 (n, p) of `started_reached`."""
     radius = max(1.0, np.abs(np.linalg.eigvals(plant.A)).max())
     W = scipy.linalg.solve_discrete_lyapunov((1 - forgets) / radius * plant.A, plant.B @ plant.B.T)
-    inverse = W @ plant.C.T @ np.linalg.pinv(plant.C @ W @ plant.C.T, hermitian=True)
-    return law._replace(start_y=inverse, start=-inverse @ plant.d)
+    return W @ plant.C.T @ np.linalg.pinv(plant.C @ W @ plant.C.T, hermitian=True)
 
 
 class Target(NamedTuple):
