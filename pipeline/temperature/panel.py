@@ -24,6 +24,7 @@ from pipeline.temperature.controller import (
     sinusoid,
     watched,
 )
+from pipeline.temperature.governor import Strength
 from pipeline.temperature.plant import Plant, hold_output, hold_state
 from pipeline.temperature.tracking import Law, reached_state
 
@@ -97,23 +98,13 @@ def drawn(
     return plants
 
 
-def corners(nominal: Sequence[Plant], spread: Spread) -> list[Plant]:
-    """The family that the governor guards: of each plant the strongest and quickest, in time and a sample
-    late."""
-    family = [
-        varied(
-            plant,
-            gains=np.full(plant.m, 1 + spread.input_gain),
-            slower=-spread.slower,
-            loss=0.0,
-            ambient=0.0,
-            late=late,
-            cells=False,
-        )
-        for plant in nominal
-        for late in (False, True)
-    ]
-    return padded(family)
+def corners(nominal: Sequence[Plant], spread: Spread) -> tuple[list[Plant], Strength]:
+    """The family that the governor guards: each plant in time and a sample late, and within what range its
+    inputs act."""
+    family = [delayed(plant, late) for plant in nominal for late in (False, True)]
+    weakest = (1 - spread.input_gain) / (1 + spread.slower)
+    strongest = (1 + spread.input_gain) / (1 - spread.slower)
+    return padded(family), Strength(weakest, strongest, spread.input_gain)
 
 
 def padded(plants: Sequence[Plant]) -> list[Plant]:
@@ -358,11 +349,11 @@ def figures(
     moving = np.isin(cases.kind, ("ramp", "sinusoid"))
     settling, overshoot = np.zeros(len(cases.plant)), np.zeros(len(cases.plant))
     for g in range(cases.begin.shape[1]):
-        for first in np.unique(cases.begin[:, g]):
-            rows = np.flatnonzero((cases.begin[:, g] == first) & (first < cases.steps))
+        ends = cases.begin[:, g + 1] if g + 1 < cases.begin.shape[1] else np.full(len(cases.plant), cases.steps)
+        for first, after in np.unique(np.column_stack([cases.begin[:, g], ends]), axis=0):
+            rows = np.flatnonzero((cases.begin[:, g] == first) & (ends == after) & (first < cases.steps))
             if not rows.size:
                 continue
-            after = cases.begin[rows[0], g + 1] if g + 1 < cases.begin.shape[1] else cases.steps
             outside = beyond[first:after, rows] > band
             last = np.where(outside.any(axis=0), len(outside) - outside[::-1].argmax(axis=0), 0).astype(float)
             last[outside[-1]] = np.inf
