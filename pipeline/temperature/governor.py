@@ -96,6 +96,7 @@ class Governor(NamedTuple):
 
 
 INSTANTS = 7
+LONGEST = 120
 SWEEPS = 8
 FORGETS = 0.005
 LEAK = 0.002
@@ -109,7 +110,7 @@ def governor(
     outputs: OutputLimits,
     strength: Strength,
     *,
-    tau: float = 1.0,
+    tau: float = 0.2,
     drift: float = 0.05,
 ) -> Governor:
     """The governor of a family of plants of one order (their feed-through made a delay), for inputs of any
@@ -133,7 +134,7 @@ def governor(
     )
 
 
-def instants(family: Sequence[Plant], *, longest: int = 120) -> np.ndarray:
+def instants(family: Sequence[Plant], *, longest: int = LONGEST) -> np.ndarray:
     """Steps ahead at which the members are looked at: now, then closer together at first, up to four times
     that after which the slowest pulse response has passed its peak, 16 at least."""
     peak = 1 + max(
@@ -156,7 +157,8 @@ def _watching(plant: Plant, strength: Strength, tau: float, drift: float) -> dic
     n, m, p = plant.n, plant.m, plant.p
     likely = reached_state(plant)
     A, C = _drifting(plant)
-    noise = scipy.linalg.block_diag(plant.B @ plant.B.T, drift**2 * tau * np.eye(p))
+    pulse = np.abs(markov_parameters(plant, LONGEST)).max(axis=0)
+    noise = scipy.linalg.block_diag(plant.B @ plant.B.T, drift**2 * np.diag((pulse**2).sum(axis=1)))
     P = riccati(A.T, C.T, noise, tau * np.eye(p))
     L = P @ C.T @ np.linalg.inv(C @ P @ C.T + tau * np.eye(p))
     less, none = strength.strongest - strength.weakest, np.zeros((p, m))
@@ -248,9 +250,10 @@ def observed(family: Governor, memory: np.ndarray, u: np.ndarray, y: np.ndarray)
 
 class Evidence(NamedTuple):
     """Of each member, case and output (f, s, p): the share of the way from strongest to weakest that the inputs
-    are at least, and at most; and whether the member counts (f, s)."""
+    are at least, by least squares, and at most; and whether the member counts (f, s)."""
 
     least: np.ndarray
+    middle: np.ndarray
     most: np.ndarray
     counts: np.ndarray
 
@@ -266,9 +269,8 @@ def evidence(family: Governor, memory: np.ndarray) -> Evidence:
     middle = np.clip(product * share, 0.0, 1.0)
     rest = (own - middle * (2 * product - middle * square)).sum(axis=2)
     counts = rest <= CONTRADICTED * rest.min(axis=0) + (family.doubt**2).sum()
-    return Evidence(
-        np.clip((product - doubt) * share, 0.0, 1.0), np.clip((product + doubt) * share, 0.0, 1.0), counts
-    )
+    least, most = (np.clip((product + off) * share, 0.0, 1.0) for off in (-doubt, doubt))
+    return Evidence(least, middle, most, counts)
 
 
 # ---- what it allows
@@ -291,18 +293,28 @@ def governed(
     free, lacks = (
         part.reshape(*part.shape[:2], y_star.shape[1], -1) for part in (ahead[:, :, :rows], ahead[:, :, rows:])
     )
-    strongest, range_ = family.strength.strongest, family.strength.strongest - family.strength.weakest
-    if np.isfinite(family.low).any():
-        bare = -(free - told.most[..., None] * lacks) - family.below.reshape(free.shape[0], 1, *free.shape[2:])
-        side = _Side(bare, strongest - range_ * told.most, family.fall, told.counts)
-        u = -_projected(side, -u, -high, np.broadcast_to(-family.low, free.shape[:3]))
-    if np.isfinite(family.high).any() or np.isfinite(family.overshoot):
-        target = y_star + family.overshoot
-        cap = np.minimum(family.high, np.where(free[..., 0] > target, np.inf, target))
-        bare = free - told.least[..., None] * lacks + family.above.reshape(free.shape[0], 1, *free.shape[2:])
-        side = _Side(bare, strongest - range_ * told.least, family.rise, told.counts)
+    now = free[..., 0] - told.middle * lacks[..., 0] + family.offset[:, None]
+    floor, cap = _walls(family, now, y_star)
+    per_member = (len(free), 1, *free.shape[2:])
+    strongest, less = family.strength.strongest, family.strength.strongest - family.strength.weakest
+    if np.isfinite(floor).any():
+        bare = -(free - told.most[..., None] * lacks) - family.below.reshape(per_member)
+        side = _Side(bare, strongest - less * told.most, family.fall, told.counts)
+        u = -_projected(side, -u, -high, -floor)
+    if np.isfinite(cap).any():
+        bare = free - told.least[..., None] * lacks + family.above.reshape(per_member)
+        side = _Side(bare, strongest - less * told.least, family.rise, told.counts)
         u = _projected(side, u, low, cap)
     return u
+
+
+def _walls(family: Governor, now: np.ndarray, y_star: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Floor and cap (f, s, p) in °C of outputs forecast `now` (f, s, p): low and high, and `overshoot` beyond
+    the target for an output that is not there yet."""
+    return (
+        np.maximum(family.low, np.minimum(now, y_star - family.overshoot)),
+        np.minimum(family.high, np.maximum(now, y_star + family.overshoot)),
+    )
 
 
 class _Side(NamedTuple):
@@ -336,10 +348,12 @@ def _swept(side: _Side, u: np.ndarray, low: np.ndarray, cap: np.ndarray) -> np.n
     m, case = u.shape[1], np.arange(s)
     rows = side.rows.reshape(f, m, p, h)
     # what hardly moves an output is not shut for its sake
-    helps = np.where(rows > WEAK * rows.max(axis=1, keepdims=True), rows, 0.0)
-    helps = np.maximum(helps, 0.0).transpose(2, 0, 3, 1).reshape(p, f * h, m)
-    room = cap[..., None] - np.where(side.counts[..., None, None], side.bare, -np.inf)
-    room = room / side.strength[..., None]
+    helps = np.where(rows > WEAK * np.maximum(rows, 0.0).max(axis=1, keepdims=True), rows, 0.0)
+    helps = np.maximum(helps, 0.0)
+    least = np.matmul(low, helps.reshape(f, m, -1)) + np.matmul(u, (rows - helps).reshape(f, m, -1))
+    room = (cap[..., None] - side.bare) / side.strength[..., None]
+    room = np.where(side.counts[..., None, None], np.maximum(room, least.reshape(room.shape)), np.inf)
+    helps = helps.transpose(2, 0, 3, 1).reshape(p, f * h, m)
     for _ in range(SWEEPS):
         before = u
         for j in range(p):
