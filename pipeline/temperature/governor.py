@@ -111,7 +111,7 @@ def governor(
     strength: Strength,
     *,
     tau: float = 0.2,
-    drift: float = 0.05,
+    drift: float = 0.08,
 ) -> Governor:
     """The governor of a family of plants of one order (their feed-through made a delay), for inputs of any
     `strength` within its range.
