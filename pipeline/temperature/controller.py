@@ -66,36 +66,28 @@ def sinusoid(mean: np.ndarray, amplitude: np.ndarray, period: float) -> Referenc
 # ---- what a law rests at
 
 
-class Aim(NamedTuple):
-    """Where a law rests under a reference: feed (m, k) and Y (p, k) of the module's formula.
+class Rest(NamedTuple):
+    """Inputs U w and outputs Y w on which a plant rests while the reference is H w: U (m, k), Y (p, k).
 
-    `miss` (p,) is y* - r of the constant part in °C. `binding` are the inputs (index, limit in percent) at a
-    limit where the reference is out of reach.
+    `miss` (p,) is y* - r of the constant part in °C. `binding` are the inputs (index, limit in percent) that
+    stand at a limit where the reference is out of reach.
     """
 
-    feed: np.ndarray
+    U: np.ndarray
     Y: np.ndarray
     miss: np.ndarray
     binding: tuple[tuple[int, float], ...]
 
 
-def aim(law: Law, model: Plant, reference: Reference, limits: Limits, *, tolerance: float = 0.01) -> Aim:
-    """The steady input of the constant part by a bounded quadratic programme (tracking.feasible_target), and of
-    what moves by the regulator equations X F = A X + B U, C X = H (Francis 1977), both on `model`.
-
-    Z is the law's memory on the way, Z F = A Z + B_u U + B_y Y + B_r H + [c 0], and feed = U + K Z + D Y.
-    """
-    F, H, k = reference.F, reference.H, len(reference.w0)
-    target = feasible_target(model, H[:, 0], limits.low, limits.high)
-    moving = H.copy()
-    moving[:, 0] = 0.0
-    U = _regulated(model, F, moving) if k > 1 else np.zeros((model.m, k))
-    Y = moving.copy()
+def rest(model: Plant, reference: Reference, limits: Limits, *, tolerance: float = 0.01) -> Rest:
+    """The steady input of the constant part by a bounded quadratic programme (tracking.feasible_target), and
+    of what moves by the regulator equations X F = A X + B U, C X = H (Francis 1977)."""
+    target = feasible_target(model, reference.H[:, 0], limits.low, limits.high)
+    Y = reference.H.copy()
+    Y[:, 0] = 0.0
+    U = np.zeros((model.m, Y.shape[1])) if Y.shape[1] == 1 else _regulated(model, reference.F, Y)
     U[:, 0] += target.u
     Y[:, 0] = target.y
-    drive = law.B_u @ U + law.B_y @ Y + law.B_r @ H
-    drive[:, 0] += law.c
-    Z = _sylvester(law.A, F, drive) if len(law.A) else np.zeros((0, k))
     binding = ()
     if np.abs(target.miss).max() > tolerance:
         binding = tuple(
@@ -104,7 +96,39 @@ def aim(law: Law, model: Plant, reference: Reference, limits: Limits, *, toleran
             for limit in (limits.low[i], limits.high[i])
             if abs(u - limit) < 1e-6 * (limits.high[i] - limits.low[i])
         )
-    return Aim(U + law.K @ Z + law.D @ Y, Y, target.miss, binding)
+    return Rest(U, Y, target.miss, binding)
+
+
+class Aim(NamedTuple):
+    """What a law adds to rest there: feed (m, k) and Y (p, k) of the module's formula."""
+
+    feed: np.ndarray
+    Y: np.ndarray
+
+
+def aim(law: Law, at: Rest, reference: Reference) -> Aim:
+    """feed = U + K Z + D Y, with the law's memory Z w on the way, Z F = A Z + B_u U + B_y Y + B_r H + [c 0]."""
+    shift = plain_shift(law)
+    if shift is not None:
+        Z = _shifted(shift, reference.F, np.vstack([at.U, at.Y]))
+    else:
+        drive = law.B_u @ at.U + law.B_y @ at.Y + law.B_r @ reference.H
+        drive[:, 0] += law.c
+        Z = _sylvester(law.A, reference.F, drive)
+    return Aim(at.U + law.K @ Z + law.D @ at.Y, at.Y)
+
+
+def _shifted(shift: np.ndarray, F: np.ndarray, acting: np.ndarray) -> np.ndarray:
+    """Z (q, k) of a memory that is a plain shift of `acting`, [U; Y]: entry by entry what it took over a sample
+    before, Z F = ..."""
+    q, back = len(shift), np.linalg.inv(F)
+    source = np.vstack([np.zeros((q, F.shape[0])), acting, np.zeros((1, F.shape[0]))])
+    waiting = set(range(q))
+    while waiting:
+        ready = [i for i in waiting if shift[i] not in waiting]
+        source[ready] = source[shift[ready]] @ back
+        waiting.difference_update(ready)
+    return source[:q]
 
 
 def _triangular(F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -167,13 +191,13 @@ def deployed(
     law: Law, limits: Limits, *, integral_limit: float, governor: Governor | None = None, holds: bool = False
 ) -> Deployed:
     back = np.linalg.pinv(-law.K_r) if np.any(law.K_r) else np.zeros(law.K_r.T.shape)
-    return Deployed(law, limits, integral_limit, back, _gather(law), governor, holds)
+    return Deployed(law, limits, integral_limit, back, plain_shift(law), governor, holds)
 
 
-def _gather(law: Law) -> np.ndarray | None:
+def plain_shift(law: Law) -> np.ndarray | None:
     """The shift of a window: every row of [A B_u B_y] one 1 or nothing, B_r and c zero."""
     rows = np.hstack([law.A, law.B_u, law.B_y, np.zeros((len(law.A), 1))])
-    if len(law.A) == 0 or np.any(law.B_r) or np.any(law.c) or not np.isin(rows, (0.0, 1.0)).all():
+    if np.any(law.B_r) or np.any(law.c) or not np.isin(rows, (0.0, 1.0)).all():
         return None
     if rows.sum(axis=1).max() > 1:
         return None
