@@ -33,7 +33,7 @@ def part(sources: Sources) -> StudyPart:
         _published(study),
         _honest(study),
         [_claim(study), _scaled(study), _algorithm_1(study), _start(study)],
-        [_noise(sources), _progress(sources), _candidates(sources)],
+        [_noise(sources), _parity(sources)],
         _weights(study),
         page.origin(sources.source("reproduce_study")),
     )
@@ -282,11 +282,9 @@ def _ranking(table: Table) -> str:
 
 # ---- the parity search
 
-HEAD = "The study’s objective"
 
-
-def _progress(sources: Sources) -> Picture:
-    """The best cost so far, above the optimum that is known."""
+def _parity(sources: Sources) -> Picture:
+    """The best cost so far above the optimum that is known, and what the candidates trade."""
     table, study, title = sources.tables["parity"], sources.metrics["reproduce_study"], "The search for (37)"
     if isinstance(table, Missing):
         return placeholder("parity", title, table)
@@ -297,28 +295,17 @@ def _progress(sources: Sources) -> Picture:
             f"On the study’s objective the search ends {percent(100 * (best / optimum - 1), 2)} above the "
             f"optimum, {number(optimum, 0)}, which Q = R = I itself reaches."
         )
+    head, tried = "The study’s objective", trades.search(table, lookup(study, "parity.trade"))
     return Picture(
         "parity",
         title,
         sentence,
-        [evidence.progress(table, HEAD, "excess over the optimum in %, log", optimum, excess=True)],
-        evidence.dots_and_line(table),
-        page.origin(sources.source("parity")),
-    )
-
-
-def _candidates(sources: Sources) -> Picture:
-    """Error against effort of everything that the search tried, with the optimum."""
-    table, title = sources.tables["parity"], "What its candidates trade"
-    if isinstance(table, Missing):
-        return placeholder("parity_candidates", title, table)
-    tried = trades.search(table, lookup(sources.metrics["reproduce_study"], "parity.trade"))
-    return Picture(
-        "parity_candidates",
-        title,
-        "",
-        [trades.searched(tried, HEAD, "state known, discounted")],
-        trades.TRADED,
+        [
+            evidence.progress(table, head, "excess over the optimum in %, log", optimum, excess=True),
+            trades.searched(tried, "What its candidates trade", "state known, discounted"),
+        ],
+        f"{evidence.dots_and_line(table)} Beside it: r.m.s. tracking error in °C, up, against r.m.s. "
+        "effort in per cent, across; line: the front; filled square: chosen; cross: the optimum, Q = R = I.",
         page.origin(sources.source("parity", "reproduce_study")),
     )
 

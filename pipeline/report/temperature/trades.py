@@ -156,18 +156,14 @@ def candidates(sources: Sources) -> Picture:
         title,
         " ".join(filter(None, sentences)),
         [searched(tried, head, small)],
-        f"{TRADED} The search minimises a cost, not one of "
+        "R.m.s. tracking error in °C, up, against r.m.s. effort in per cent, across. Small: "
+        "a candidate that worked; line: the front, candidates that no other beats in both; "
+        "filled square: chosen; ring: default weights; cross: the optimum, "
+        "a Riccati law that is told the plant and its state, unclipped. "
+        "The search minimises a cost, not one of "
         "these two alone, so that the chosen one need not lie on the front.",
         page.origin(sources.source("tuning", "tune_weights")),
     )
-
-
-TRADED = (
-    "R.m.s. tracking error in °C, up, against r.m.s. effort in per cent, across. Small: "
-    "a candidate that worked; line: the front, candidates that no other beats in both; "
-    "filled square: chosen; ring: default weights; cross: the optimum, "
-    "a Riccati law that is told the plant and its state, unclipped."
-)
 
 
 def search(rows: Table, trade: Any) -> Search:
