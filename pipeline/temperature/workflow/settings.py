@@ -211,8 +211,6 @@ class TuneWeights(Section):
     """Section `tune_weights`."""
 
     seed: int = Field(ge=0, le=2**31)
-    initial: int = Field(ge=4, le=5000)
-    evaluations: int = Field(ge=8, le=5000)
     practical_initial: int = Field(ge=4, le=5000)
     practical_evaluations: int = Field(ge=8, le=5000)
     acquisition: Literal["expected_improvement", "upper_confidence_bound"]
@@ -235,5 +233,18 @@ class EvaluateTemperature(Section):
     """Section `evaluate_temperature`."""
 
     seed: int = Field(ge=0, le=2**31)
-    data_sets: int = Field(ge=1, le=1000)
     report_noise_degC: float = Field(ge=0, le=50)
+
+
+class ReproduceStudy(Section):
+    """Section `reproduce_study`: the study's own part; the bounds are those of its search for Q and R."""
+
+    seed: int = Field(ge=0, le=2**31)
+    data_sets: int = Field(ge=1, le=1000)
+    initial: int = Field(ge=4, le=5000)
+    evaluations: int = Field(ge=8, le=5000)
+    acquisition: Literal["expected_improvement", "upper_confidence_bound"]
+    q_low: float = Field(gt=0, le=1e6)
+    q_high: float = Field(gt=0, le=1e6)
+    r_low: float = Field(gt=0, le=1e6)
+    r_high: float = Field(gt=0, le=1e6)

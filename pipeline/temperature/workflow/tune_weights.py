@@ -1,5 +1,4 @@
-"""What tune_weights does: Q and R by Bayesian optimisation, twice. Parity: the
-paper's (37) on its own machine. Practical: the declared engineering cost of the
+"""What tune_weights does: Q and R by Bayesian optimisation of the declared engineering cost of the
 identified plant on the training half of the panel."""
 
 from typing import Any, NamedTuple
@@ -7,17 +6,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from pipeline.temperature import engineering, judging, plant, scorecard, study, tuning
+from pipeline.temperature import engineering, judging, plant, scorecard, tuning
 from pipeline.temperature.tracking import model_based
 from pipeline.temperature.workflow.settings import Panel, Tracking, TuneWeights
 from pipeline.temperature.workflow.settings import Plant as Machine
 
-# of the paper's machine
-OUTPUTS, INPUTS = 5, 7
-
 
 class Tuned(NamedTuple):
-    """Weights of both modes, the candidates of both searches as columns, and metrics."""
+    """The weights, the candidates of the search as columns, and metrics."""
 
     weights: dict[str, Any]
     history: dict[str, Any]
@@ -25,7 +21,7 @@ class Tuned(NamedTuple):
 
 
 class Search(NamedTuple):
-    """A search, error and effort of its candidates (None for one that failed), and metrics of its mode."""
+    """A search, error and effort of its candidates (None for one that failed), and metrics."""
 
     result: tuning.Result
     trades: list[engineering.ErrorEffort | None]
@@ -35,7 +31,7 @@ class Search(NamedTuple):
 def tuned(
     settings: TuneWeights, machine: Machine, tracking: Tracking, panel: Panel, model: plant.Plant
 ) -> Tuned:
-    """Both searches; `model` is the identified plant, its feed-through one sample late."""
+    """The search; `model` is the identified plant, its feed-through one sample late."""
     model = plant.strictly_proper(model)
     training, reference = panel.training, np.array([o.reference for o in machine.outputs])
     scenarios = scorecard.panel(
@@ -48,43 +44,13 @@ def tuned(
         hold=panel.hold_steps,
         cells=False,
     )
-    parity = _parity(settings)
     practical = _practical(settings, machine, tracking, panel, model, scenarios)
     q, r, tau = np.split(practical.result.theta, [model.p, model.p + model.m])
-    theta = parity.result.theta
     return Tuned(
-        {
-            "practical": {"q": q, "r": r, "observer_tau": float(tau[0])},
-            "parity": {"q": theta[:OUTPUTS], "r": theta[OUTPUTS:]},
-        },
-        engineering.histories(
-            {"parity": parity.result, "practical": practical.result},
-            {"parity": parity.trades, "practical": practical.trades},
-        ),
-        {"parity": parity.metrics, "practical": practical.metrics},
+        {"practical": {"q": q, "r": r, "observer_tau": float(tau[0])}},
+        engineering.histories({"practical": practical.result}, {"practical": practical.trades}),
+        {"practical": practical.metrics},
     )
-
-
-def _parity(settings: TuneWeights) -> Search:
-    low, high = (
-        [q] * OUTPUTS + [r] * INPUTS
-        for q, r in ((settings.q_low, settings.r_low), (settings.q_high, settings.r_high))
-    )
-    result = _search(
-        "parity", study.tuning_objective, settings, settings.initial, settings.evaluations, low, high
-    )
-    trades = [
-        None if failed else engineering.ErrorEffort(*study.tuning_parts(theta))
-        for theta, failed in zip(result.history.theta, result.history.failed, strict=True)
-    ]
-    optimum = np.ones(OUTPUTS + INPUTS)
-    metrics = {
-        "best_cost_perfect_state": result.cost,
-        "optimum": study.tuning_objective(optimum),
-        "scaled_weights": study.scaled_weights(),
-        "trade": {"optimum": engineering.ErrorEffort(*study.tuning_parts(optimum))},
-    }
-    return Search(result, trades, metrics)
 
 
 def _practical(
