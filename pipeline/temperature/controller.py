@@ -108,27 +108,10 @@ class Aim(NamedTuple):
 
 def aim(law: Law, at: Rest, reference: Reference) -> Aim:
     """feed = U + K Z + D Y, with the law's memory Z w on the way, Z F = A Z + B_u U + B_y Y + B_r H + [c 0]."""
-    shift = plain_shift(law)
-    if shift is not None:
-        Z = _shifted(shift, reference.F, np.vstack([at.U, at.Y]))
-    else:
-        drive = law.B_u @ at.U + law.B_y @ at.Y + law.B_r @ reference.H
-        drive[:, 0] += law.c
-        Z = _sylvester(law.A, reference.F, drive)
+    drive = law.B_u @ at.U + law.B_y @ at.Y + law.B_r @ reference.H
+    drive[:, 0] += law.c
+    Z = _sylvester(law.A, reference.F, drive)
     return Aim(at.U + law.K @ Z + law.D @ at.Y, at.Y)
-
-
-def _shifted(shift: np.ndarray, F: np.ndarray, acting: np.ndarray) -> np.ndarray:
-    """Z (q, k) of a memory that is a plain shift of `acting`, [U; Y]: entry by entry what it took over a sample
-    before, Z F = ..."""
-    q, back = len(shift), np.linalg.inv(F)
-    source = np.vstack([np.zeros((q, F.shape[0])), acting, np.zeros((1, F.shape[0]))])
-    waiting = set(range(q))
-    while waiting:
-        ready = [i for i in waiting if shift[i] not in waiting]
-        source[ready] = source[shift[ready]] @ back
-        waiting.difference_update(ready)
-    return source[:q]
 
 
 def _triangular(F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -139,6 +122,8 @@ def _triangular(F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _sylvester(A: np.ndarray, F: np.ndarray, G: np.ndarray) -> np.ndarray:
     """X (n, k) with X F = A X + G, column by column of F's Schur form; a mode of A that F excites is taken to
     leak 1e-9 a step."""
+    if not len(A):
+        return G
     if len(F) == 1:
         return np.linalg.solve(_leaking(F[0, 0] * np.eye(len(A)) - A), G)
     S, V = _triangular(F)
@@ -182,7 +167,7 @@ class Deployed(NamedTuple):
     limits: Limits
     integral_limit: float
     back: np.ndarray
-    gather: np.ndarray | None
+    shift: int
     governor: Governor | None
     holds: bool = False
 
@@ -191,17 +176,35 @@ def deployed(
     law: Law, limits: Limits, *, integral_limit: float, governor: Governor | None = None, holds: bool = False
 ) -> Deployed:
     back = np.linalg.pinv(-law.K_r) if np.any(law.K_r) else np.zeros(law.K_r.T.shape)
-    return Deployed(law, limits, integral_limit, back, plain_shift(law), governor, holds)
+    return Deployed(law, limits, integral_limit, back, _shift(law.A), governor, holds)
 
 
-def plain_shift(law: Law) -> np.ndarray | None:
-    """The shift of a window: every row of [A B_u B_y] one 1 or nothing, B_r and c zero."""
-    rows = np.hstack([law.A, law.B_u, law.B_y, np.zeros((len(law.A), 1))])
-    if np.any(law.B_r) or np.any(law.c) or not np.isin(rows, (0.0, 1.0)).all():
-        return None
-    if rows.sum(axis=1).max() > 1:
-        return None
-    return np.where(rows.any(axis=1), rows.argmax(axis=1), rows.shape[1] - 1)
+def compact(law: Law, N: int) -> Law:
+    """The same law of a window of N past inputs and outputs (kernel.window_law) with N m numbers of memory
+    instead of N (m+p): z_i is what the lags from i on will still ask for,
+
+    z_i(t+1) = z_{i+1}(t) + K^u_i u(t) + K^y_i y(t), u = -z_1 - ..., and starts where the window would.
+    """
+    m, p = law.D.shape
+    of_u, of_y = (part.reshape(m, N, -1).transpose(1, 0, 2) for part in (law.K[:, : N * m], law.K[:, N * m :]))
+    left_u, left_y = (part[::-1].cumsum(axis=0)[::-1].reshape(N * m, -1) for part in (of_u, of_y))
+    return law._replace(
+        A=np.eye(N * m, k=m),
+        B_u=of_u.reshape(N * m, m),
+        B_y=of_y.reshape(N * m, p),
+        B_r=np.zeros((N * m, p)),
+        c=np.zeros(N * m),
+        K=np.eye(m, N * m),
+        start_u=left_u,
+        start_y=left_y,
+        start=np.zeros(N * m),
+    )
+
+
+def _shift(A: np.ndarray) -> int:
+    """k where A is a plain shift by k, 0 where it is none."""
+    k = int(np.flatnonzero(A[0])[0]) if len(A) and A[0].any() else 0
+    return k if k and np.array_equal(A, np.eye(len(A), k=k)) else 0
 
 
 class State(NamedTuple):
@@ -281,8 +284,9 @@ def _integrated(controller: Deployed, xi, error, u, wished):
 def _remembered(controller: Deployed, state: State, u, y, r):
     """z (s, q) and the family's x (f, s, n) a sample on."""
     law, family = controller.law, controller.governor
-    if controller.gather is not None:
-        z = np.concatenate([state.z, u, y, np.zeros((len(u), 1))], axis=1)[:, controller.gather]
+    z = u @ law.B_u.T + y @ law.B_y.T + r @ law.B_r.T + law.c
+    if controller.shift:
+        z[:, : -controller.shift] += state.z[:, controller.shift :]
     else:
-        z = state.z @ law.A.T + u @ law.B_u.T + y @ law.B_y.T + r @ law.B_r.T + law.c
+        z += state.z @ law.A.T
     return z, state.x if family is None else observed(family, state.x, u, y)
