@@ -66,36 +66,28 @@ def sinusoid(mean: np.ndarray, amplitude: np.ndarray, period: float) -> Referenc
 # ---- what a law rests at
 
 
-class Aim(NamedTuple):
-    """Where a law rests under a reference: feed (m, k) and Y (p, k) of the module's formula.
+class Rest(NamedTuple):
+    """Inputs U w and outputs Y w on which a plant rests while the reference is H w: U (m, k), Y (p, k).
 
-    `miss` (p,) is y* - r of the constant part in °C. `binding` are the inputs (index, limit in percent) at a
-    limit where the reference is out of reach.
+    `miss` (p,) is y* - r of the constant part in °C. `binding` are the inputs (index, limit in percent) that
+    stand at a limit where the reference is out of reach.
     """
 
-    feed: np.ndarray
+    U: np.ndarray
     Y: np.ndarray
     miss: np.ndarray
     binding: tuple[tuple[int, float], ...]
 
 
-def aim(law: Law, model: Plant, reference: Reference, limits: Limits, *, tolerance: float = 0.01) -> Aim:
-    """The steady input of the constant part by a bounded quadratic programme (tracking.feasible_target), and of
-    what moves by the regulator equations X F = A X + B U, C X = H (Francis 1977), both on `model`.
-
-    Z is the law's memory on the way, Z F = A Z + B_u U + B_y Y + B_r H + [c 0], and feed = U + K Z + D Y.
-    """
-    F, H, k = reference.F, reference.H, len(reference.w0)
-    target = feasible_target(model, H[:, 0], limits.low, limits.high)
-    moving = H.copy()
-    moving[:, 0] = 0.0
-    U = _regulated(model, F, moving) if k > 1 else np.zeros((model.m, k))
-    Y = moving.copy()
+def rest(model: Plant, reference: Reference, limits: Limits, *, tolerance: float = 0.01) -> Rest:
+    """The steady input of the constant part by a bounded quadratic programme (tracking.feasible_target), and
+    of what moves by the regulator equations X F = A X + B U, C X = H (Francis 1977)."""
+    target = feasible_target(model, reference.H[:, 0], limits.low, limits.high)
+    Y = reference.H.copy()
+    Y[:, 0] = 0.0
+    U = np.zeros((model.m, Y.shape[1])) if Y.shape[1] == 1 else _regulated(model, reference.F, Y)
     U[:, 0] += target.u
     Y[:, 0] = target.y
-    drive = law.B_u @ U + law.B_y @ Y + law.B_r @ H
-    drive[:, 0] += law.c
-    Z = _sylvester(law.A, F, drive) if len(law.A) else np.zeros((0, k))
     binding = ()
     if np.abs(target.miss).max() > tolerance:
         binding = tuple(
@@ -104,7 +96,22 @@ def aim(law: Law, model: Plant, reference: Reference, limits: Limits, *, toleran
             for limit in (limits.low[i], limits.high[i])
             if abs(u - limit) < 1e-6 * (limits.high[i] - limits.low[i])
         )
-    return Aim(U + law.K @ Z + law.D @ Y, Y, target.miss, binding)
+    return Rest(U, Y, target.miss, binding)
+
+
+class Aim(NamedTuple):
+    """What a law adds to rest there: feed (m, k) and Y (p, k) of the module's formula."""
+
+    feed: np.ndarray
+    Y: np.ndarray
+
+
+def aim(law: Law, at: Rest, reference: Reference) -> Aim:
+    """feed = U + K Z + D Y, with the law's memory Z w on the way, Z F = A Z + B_u U + B_y Y + B_r H + [c 0]."""
+    drive = law.B_u @ at.U + law.B_y @ at.Y + law.B_r @ reference.H
+    drive[:, 0] += law.c
+    Z = _sylvester(law.A, reference.F, drive)
+    return Aim(at.U + law.K @ Z + law.D @ at.Y, at.Y)
 
 
 def _triangular(F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -115,6 +122,8 @@ def _triangular(F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _sylvester(A: np.ndarray, F: np.ndarray, G: np.ndarray) -> np.ndarray:
     """X (n, k) with X F = A X + G, column by column of F's Schur form; a mode of A that F excites is taken to
     leak 1e-9 a step."""
+    if not len(A):
+        return G
     if len(F) == 1:
         return np.linalg.solve(_leaking(F[0, 0] * np.eye(len(A)) - A), G)
     S, V = _triangular(F)
@@ -158,7 +167,7 @@ class Deployed(NamedTuple):
     limits: Limits
     integral_limit: float
     back: np.ndarray
-    gather: np.ndarray | None
+    shift: int
     governor: Governor | None
     holds: bool = False
 
@@ -167,17 +176,35 @@ def deployed(
     law: Law, limits: Limits, *, integral_limit: float, governor: Governor | None = None, holds: bool = False
 ) -> Deployed:
     back = np.linalg.pinv(-law.K_r) if np.any(law.K_r) else np.zeros(law.K_r.T.shape)
-    return Deployed(law, limits, integral_limit, back, _gather(law), governor, holds)
+    return Deployed(law, limits, integral_limit, back, _shift(law.A), governor, holds)
 
 
-def _gather(law: Law) -> np.ndarray | None:
-    """The shift of a window: every row of [A B_u B_y] one 1 or nothing, B_r and c zero."""
-    rows = np.hstack([law.A, law.B_u, law.B_y, np.zeros((len(law.A), 1))])
-    if len(law.A) == 0 or np.any(law.B_r) or np.any(law.c) or not np.isin(rows, (0.0, 1.0)).all():
-        return None
-    if rows.sum(axis=1).max() > 1:
-        return None
-    return np.where(rows.any(axis=1), rows.argmax(axis=1), rows.shape[1] - 1)
+def compact(law: Law, N: int) -> Law:
+    """The same law of a window of N past inputs and outputs (kernel.window_law) with N m numbers of memory
+    instead of N (m+p): z_i is what the lags from i on will still ask for,
+
+    z_i(t+1) = z_{i+1}(t) + K^u_i u(t) + K^y_i y(t), u = -z_1 - ..., and starts where the window would.
+    """
+    m, p = law.D.shape
+    of_u, of_y = (part.reshape(m, N, -1).transpose(1, 0, 2) for part in (law.K[:, : N * m], law.K[:, N * m :]))
+    left_u, left_y = (part[::-1].cumsum(axis=0)[::-1].reshape(N * m, -1) for part in (of_u, of_y))
+    return law._replace(
+        A=np.eye(N * m, k=m),
+        B_u=of_u.reshape(N * m, m),
+        B_y=of_y.reshape(N * m, p),
+        B_r=np.zeros((N * m, p)),
+        c=np.zeros(N * m),
+        K=np.eye(m, N * m),
+        start_u=left_u,
+        start_y=left_y,
+        start=np.zeros(N * m),
+    )
+
+
+def _shift(A: np.ndarray) -> int:
+    """k where A is a plain shift by k, 0 where it is none."""
+    k = int(np.flatnonzero(A[0])[0]) if len(A) and A[0].any() else 0
+    return k if k and np.array_equal(A, np.eye(len(A), k=k)) else 0
 
 
 class State(NamedTuple):
@@ -259,6 +286,9 @@ def _integrated(controller: Deployed, xi, error, u, wished):
 def _remembered(controller: Deployed, z, u, y, r):
     """z (s, q) a sample on."""
     law = controller.law
-    if controller.gather is not None:
-        return np.concatenate([z, u, y, np.zeros((len(u), 1))], axis=1)[:, controller.gather]
-    return z @ law.A.T + u @ law.B_u.T + y @ law.B_y.T + r @ law.B_r.T + law.c
+    after = u @ law.B_u.T + y @ law.B_y.T + r @ law.B_r.T + law.c
+    if controller.shift:
+        after[:, : -controller.shift] += z[:, controller.shift :]
+    else:
+        after += z @ law.A.T
+    return after

@@ -116,10 +116,10 @@ def governor(
     """The governor of a family of plants of one order (their feed-through made a delay), for inputs of any
     `strength` within its range.
 
-    The observer takes process noise to come in by the inputs, sensors to be tau °C^2 per percent^2 noisier
+    Innovations are doubted by the sensors' noise, a tenth of a degree at least. The observer takes process noise to come in by the inputs, sensors to be tau °C^2 per percent^2 noisier
     than that, and the drift w to wander by `drift` of the sensors' noise a step.
     """
-    at = instants(family)
+    at, unsure = instants(family), np.maximum(outputs.margin, 0.1)
     members = [
         {**_watching(plant, strength, tau, drift), **_ahead(plant, limits, strength, at)} for plant in family
     ]
@@ -127,8 +127,8 @@ def governor(
         **{name: np.stack([member[name] for member in members]) for name in members[0]},
         low=outputs.low + outputs.margin,
         high=outputs.high - outputs.margin,
-        surprise=3 * outputs.margin,
-        doubt=4 * outputs.margin,
+        surprise=3 * unsure,
+        doubt=4 * unsure,
         strength=strength,
         overshoot=outputs.overshoot,
     )

@@ -16,11 +16,13 @@ from pipeline.temperature.controller import (
     Deployed,
     Limits,
     Reference,
+    Rest,
     aim,
     batch_step,
     constant,
     handed_over,
     ramp,
+    rest,
     sinusoid,
     watched,
 )
@@ -249,10 +251,18 @@ class Rollout(NamedTuple):
     measured: np.ndarray
 
 
-def aims(law: Law, model: Plant, cases: Cases, limits: Limits) -> list[Aim]:
-    """Where the law rests under each reference of the cases, then at each start."""
-    wanted = [*cases.references, *(constant(y) for y in cases.starts)]
-    return [aim(law, model, reference, limits) for reference in wanted]
+def rests(model: Plant, cases: Cases, limits: Limits) -> list[Rest]:
+    """Where a plant rests under each reference of the cases, then at each start."""
+    return [rest(model, reference, limits) for reference in _wanted(cases)]
+
+
+def aims(law: Law, at: Sequence[Rest], cases: Cases) -> list[Aim]:
+    """What a law adds to rest there, one by one."""
+    return [aim(law, one, reference) for one, reference in zip(at, _wanted(cases), strict=True)]
+
+
+def _wanted(cases: Cases) -> list[Reference]:
+    return [*cases.references, *(constant(y) for y in cases.starts)]
 
 
 def noise_of(cases: Cases) -> np.ndarray:
@@ -348,19 +358,18 @@ def figures(
     beyond = np.abs(off).max(axis=2)
     moving = np.isin(cases.kind, ("ramp", "sinusoid"))
     settling, overshoot = np.zeros(len(cases.plant)), np.zeros(len(cases.plant))
-    for g in range(cases.begin.shape[1]):
-        ends = cases.begin[:, g + 1] if g + 1 < cases.begin.shape[1] else np.full(len(cases.plant), cases.steps)
-        for first, after in np.unique(np.column_stack([cases.begin[:, g], ends]), axis=0):
-            rows = np.flatnonzero((cases.begin[:, g] == first) & (ends == after) & (first < cases.steps))
-            if not rows.size:
-                continue
-            outside = beyond[first:after, rows] > band
-            last = np.where(outside.any(axis=0), len(outside) - outside[::-1].argmax(axis=0), 0).astype(float)
-            last[outside[-1]] = np.inf
-            settling[rows] = np.maximum(settling[rows], last)
-            way = np.where(off[first, rows] <= 0, 1.0, -1.0)
-            past = (way * off[first:after, rows]).max(axis=(0, 2))
-            overshoot[rows] = np.maximum(overshoot[rows], past)
+    ends = np.column_stack([cases.begin[:, 1:], np.full(len(cases.plant), cases.steps)])
+    for first, after in {
+        (int(a), int(b)) for a, b in zip(cases.begin.ravel(), ends.ravel(), strict=True) if a < b
+    }:
+        rows = np.flatnonzero(((cases.begin == first) & (ends == after)).any(axis=1))
+        outside = beyond[first:after, rows] > band
+        last = np.where(outside.any(axis=0), len(outside) - outside[::-1].argmax(axis=0), 0).astype(float)
+        last[outside[-1]] = np.inf
+        settling[rows] = np.maximum(settling[rows], last)
+        way = np.where(off[first, rows] <= 0, 1.0, -1.0)
+        past = (way * off[first:after, rows]).max(axis=(0, 2))
+        overshoot[rows] = np.maximum(overshoot[rows], past)
     settling[moving], overshoot[moving] = np.nan, np.nan
     wished = (rollout.wished < limits.low - 1e-9) | (rollout.wished > limits.high + 1e-9)
     return Figures(

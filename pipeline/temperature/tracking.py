@@ -194,6 +194,25 @@ def policy_iteration(
     )
 
 
+def still_law(m: int, p: int) -> Law:
+    """A law that asks for nothing and remembers nothing: what doing nothing is judged as."""
+    none = np.zeros((0, 0))
+    return Law(
+        A=none,
+        B_u=np.zeros((0, m)),
+        B_y=np.zeros((0, p)),
+        B_r=np.zeros((0, p)),
+        c=np.zeros(0),
+        K=np.zeros((m, 0)),
+        D=np.zeros((m, p)),
+        K_r=np.zeros((m, p)),
+        k=np.zeros(m),
+        start_u=np.zeros((0, m)),
+        start_y=np.zeros((0, p)),
+        start=np.zeros(0),
+    )
+
+
 def stabilises(plant: Plant, K_x: np.ndarray) -> bool:
     """Whether every eigenvalue of A - B K_x lies inside the unit circle."""
     return bool(np.abs(np.linalg.eigvals(plant.A - plant.B @ K_x)).max() < 1)

@@ -116,8 +116,9 @@ def test_the_worst_case_is_the_largest_gap_over_plants_with_its_band_over_seeds(
     [
         "datasets/evaluate_temperature/scorecard.parquet",
         "datasets/evaluate_temperature/trajectories.parquet",
-        "datasets/evaluate_temperature/study.parquet",
         "datasets/evaluate_temperature/summary.json",
+        "datasets/reproduce_study/parity.parquet",
+        "datasets/reproduce_study/study.parquet",
         "datasets/learn_kernel/kernel.parquet",
         "datasets/learn_kernel/window.parquet",
         "datasets/identify_plant/plant.parquet",
@@ -133,6 +134,7 @@ def test_the_worst_case_is_the_largest_gap_over_plants_with_its_band_over_seeds(
         "reports/metrics/learn_kernel.json",
         "reports/metrics/tune_weights.json",
         "reports/metrics/evaluate_temperature.json",
+        "reports/metrics/reproduce_study.json",
     ],
 )
 @pytest.mark.parametrize("how", ["missing", "broken"])

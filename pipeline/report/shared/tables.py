@@ -1,20 +1,10 @@
-"""The tables of the temperature page: every controller on the common yardstick, the study's figures as
-published, panel, weights, and the findings in words."""
+"""The tables of the temperature page: every controller on the common yardstick, panel, weights, and what
+identification says."""
 
 import math
 from typing import Any, NamedTuple
 
-from pipeline.report.shared.digits import (
-    MINUS,
-    THIN,
-    band,
-    decimals,
-    number,
-    percent,
-    quantity,
-    short,
-    with_unit,
-)
+from pipeline.report.shared.digits import MINUS, THIN, band, decimals, number, quantity, short, with_unit
 from pipeline.report.shared.sources import Sources, lookup
 from pipeline.report.shared.verdict import FAILED, UNDECIDED, Figure, Missing, Question, state
 from pipeline.report.shared.words import FIXED, explaining
@@ -144,110 +134,6 @@ def _cell(question: Question, figure: Figure, *, best: bool) -> Cell:
     )
 
 
-# ---- as published
-
-CONVENTIONS = {
-    "model_based": (
-        "Model-based, Q = R = I",
-        (
-            "J counts the observer’s temperatures, not the barrel’s, its first stage twice; the observer "
-            "starts at 50 °C; “100” is the 100th sample."
-        ),
-    ),
-    "model_based_tuned": (
-        "Model-based, tuned",
-        "The same, and J weighs with the tuned Q and R: another currency. The fifth q is 0.0514, "
-        "not the printed 0.514.",
-    ),
-    "data_driven": (
-        "Data-driven, Q = R = I",
-        "Seven start-up steps first drive the barrel to 0 °C, and make 80 % of J; u′Ru is not discounted; "
-        "all data are divided by 1000.",
-    ),
-    "data_driven_tuned": (
-        "Data-driven, tuned",
-        "The same; J weighs u with R = I although the controller was tuned for another R.",
-    ),
-}
-
-
-class Reproduced(NamedTuple):
-    """A printed figure, ours, and how far apart they lie where that is more than a thousandth."""
-
-    printed: str
-    ours: str
-    off: str
-
-
-class Convention(NamedTuple):
-    """A column of the study and the way of counting that it takes."""
-
-    title: str
-    convention: str
-    cells: list[Reproduced]
-
-
-class Published(NamedTuple):
-    missing: Missing | None
-    rows: list[Convention]
-
-
-def published(sources: Sources) -> Published:
-    """The study's four columns, printed and reproduced, with the convention that it takes."""
-    printed, reproduced = (
-        lookup(sources.metrics["evaluate_temperature"], key) for key in ("printed", "as_published")
-    )
-    gap = next((part for part in (printed, reproduced) if isinstance(part, Missing)), None)
-    if gap:
-        return Published(gap, [])
-    rows = []
-    for key, (title, convention) in CONVENTIONS.items():
-        if key in printed and key in reproduced:
-            cells = [
-                _reproduced(printed[key][name], reproduced[key][name], places)
-                for name, places in (("J100", 1), ("J1000", 1), ("error", 4))
-            ]
-            rows.append(Convention(title, convention, cells))
-    return Published(None, rows)
-
-
-def _reproduced(theirs: float, ours: float, places: int) -> Reproduced:
-    off = abs(ours / theirs - 1)
-    return Reproduced(
-        number(theirs, places), number(ours, places), percent(100 * off, 2) if off > 1e-3 else ""
-    )
-
-
-def honest(sources: Sources) -> list[tuple[str, str]]:
-    """The same machine, counted once: true outputs, Q = R = I, from 20 °C."""
-    evaluated = sources.metrics["evaluate_temperature"]
-    items = (
-        ("optimal.J1000", "Exact optimum, J over 1,000 steps", 1),
-        ("observer.J1000", "Observer started from the first measurement", 1),
-        ("observer.J1000_from_50_degC", "Observer started at 50 °C, as published", 1),
-    )
-    rows = [
-        (
-            title,
-            value.state if isinstance(value := lookup(evaluated, key), Missing) else number(value, places),
-        )
-        for key, title, places in items
-    ]
-    gaps = (
-        ("kernel.gap", "Kernel, noise-free, 500 samples: gap"),
-        ("kernel.gap_window_6", "Kernel, window of 6, 1,610 samples: gap"),
-        ("kernel.any_reference_gap", "Kernel, 20 random references from 540 samples: worst gap"),
-        ("takeover.zero_history_gap", "Taking over with an empty history: gap"),
-    )
-    return rows + [
-        (
-            title,
-            value.state if isinstance(value := lookup(evaluated, key), Missing) else percent(100 * value, 2),
-        )
-        for key, title in gaps
-    ]
-
-
 # ---- what was declared
 
 
@@ -332,18 +218,16 @@ class Weights(NamedTuple):
 
 
 def weights(sources: Sources) -> Weights:
-    """The tuned weights of both modes; those of another machine are left out."""
+    """The tuned weights; those of another machine are left out."""
     tuned, machine = sources.tables["weights"], sources.declared.machine
     outputs, inputs = [o.name for o in machine.outputs], [i.name for i in machine.inputs]
     if isinstance(tuned, Missing):
         return Weights(tuned, outputs, inputs, [])
-    names = {"practical": "practical, deployed", "parity": "the study’s objective"}
+    names = {"practical": "practical, deployed"}
     rows = [
         Diagonals(title, *([short(weight, 2) for weight in tuned[mode][key]] for key in ("q", "r")))
         for mode, title in names.items()
-        if mode in tuned
-        and not (sources.recorded and mode == "parity")
-        and [len(tuned[mode][key]) for key in ("q", "r")] == [len(outputs), len(inputs)]
+        if mode in tuned and [len(tuned[mode][key]) for key in ("q", "r")] == [len(outputs), len(inputs)]
     ]
     return Weights(None, outputs, inputs, rows)
 

@@ -1,10 +1,9 @@
-"""The figures of the temperature page that show what the learning rests on: the routes under noise, lengths
-and orders, the hold-out, and the optimiser."""
+"""The figures of the temperature page that show what the learning rests on: lengths and orders, the hold-out,
+and the optimiser."""
 
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
@@ -12,95 +11,6 @@ from pipeline.report.shared.digits import count, number, percent, quantity, shor
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources, Table, lookup
 from pipeline.report.shared.verdict import Missing
-
-# ---- the learners under noise
-
-ROUTES = {
-    "window": ("Window + Riccati", "dd"),
-    "kernel": ("Kernel, raw window", "dd ring"),
-    "kernel_predicted_state": ("Kernel, predicted state", "dd ring"),
-}
-
-
-def noise(sources: Sources) -> Picture:
-    """Gap and error of each route, a dot a data set."""
-    table, title = sources.tables["study"], "What noise costs the learners"
-    if isinstance(table, Missing):
-        return placeholder("noise", title, table)
-    shown = [
-        Column(
-            f"{level:g} °C of noise",
-            "in the data, and under the controller",
-            "",
-            [
-                _cloud(table, level, "gap", 100.0, "gap to the optimum in %, log"),
-                _cloud(table, level, "error_degC", 1.0, "r.m.s. error over steps 500–1000 in °C, log"),
-            ],
-        )
-        for level in np.unique(table["noise_degC"])
-    ]
-    return Picture(
-        "noise",
-        title,
-        _ranking(table),
-        shown,
-        (
-            f"Each dot is one of {len(np.unique(table['data_set']))} data sets of 15,000 samples of the "
-            "study’s probing; the bar is their median. Learned from noisy data, judged on the true plant "
-            "under the same noise."
-        ),
-        page.origin(sources.source("study")),
-    )
-
-
-def _cloud(table: Table, level: float, column: str, factor: float, title: str) -> Markup:
-    values = factor * np.abs(table[column])
-    positive = values[np.isfinite(values) & (values > 0)]
-    x = charts.logarithmic(float(positive.min()), float(positive.max()))
-    y = charts.Axis(-0.5, len(ROUTES) - 0.5, ())
-    frame = charts.Frame(x, y, width=440, height=120, left=128, below=18, above=18, right=10)
-    layers, medians = [], []
-    for lane, (route, (name, css)) in enumerate(ROUTES.items()):
-        at = len(ROUTES) - 1 - lane
-        mine = values[(table["route"] == route) & (table["noise_degC"] == level)]
-        failed = int((~np.isfinite(mine)).sum())
-        mine = mine[np.isfinite(mine)]
-        layers.append(charts.label(frame, x.low, at, name, anchor="end", dx=-8, dy=3.5))
-        if len(mine):
-            spread = at + 0.28 * (np.arange(len(mine)) % 5 - 2) / 2
-            middle = float(np.median(mine))
-            px, top, bottom = float(frame.px(middle)), float(frame.py(at + 0.36)), float(frame.py(at - 0.36))
-            layers += [
-                charts.dots(frame, mine, spread, f"dot {css}"),
-                Markup('<line class="med" x1="{0:.1f}" x2="{0:.1f}" y1="{1:.1f}" y2="{2:.1f}"/>').format(
-                    px, top, bottom
-                ),
-            ]
-            medians.append(f"{name} {short(middle, 2)}" + (f" ({failed} unstable)" if failed else ""))
-        elif failed:
-            medians.append(f"{name}: unstable in all {failed}")
-    return charts.panel(
-        frame,
-        layers,
-        alt=f"At {level:g} °C of noise, median {title.split(',')[0]}: {', '.join(medians)}",
-        css="dd",
-        title=title,
-    )
-
-
-def _ranking(table: Table) -> str:
-    medians = pd.DataFrame(table).groupby(["noise_degC", "route"])["gap"].median().unstack("route")
-    ratios = medians.div(medians["window"], axis=0)
-    parts = [
-        f"at {level:g} °C the kernel on the raw window costs {number(raw, 0)} times the window’s gap, on "
-        f"the predicted state {number(predicted, 1)} times"
-        for level, raw, predicted in zip(
-            ratios.index, ratios["kernel"], ratios["kernel_predicted_state"], strict=True
-        )
-    ]
-    text = "; ".join(parts)
-    return f"{text[:1].upper()}{text[1:]}. All gaps are small; the order of the routes is what stays."
-
 
 # ---- lengths and orders
 
@@ -295,7 +205,7 @@ def _poles(sources: Sources) -> Column:
 
 
 def tuning(sources: Sources) -> Picture:
-    """The best cost so far in both modes, each beside its yardstick."""
+    """The best cost so far, beside that of the default weights."""
     table, metrics, title = (
         sources.tables["tuning"],
         sources.metrics["tune_weights"],
@@ -303,34 +213,32 @@ def tuning(sources: Sources) -> Picture:
     )
     if isinstance(table, Missing):
         return placeholder("tuning", title, table)
-    best, optimum = lookup(metrics, "parity.best_cost_perfect_state"), lookup(metrics, "parity.optimum")
+    rows = {name: values[table["mode"] == "practical"] for name, values in table.items()}
     cost, default = lookup(metrics, "practical.cost"), default_cost(metrics)
     head, small = "The declared engineering cost", "log; default: Q = R = I"
-    shown = [_progress(table, "practical", head, small, default, excess=False)]
-    if not sources.recorded:
-        head, small = "The study’s objective", "excess over the optimum in %, log"
-        shown.insert(0, _progress(table, "parity", head, small, optimum, excess=True))
-    sentences = []
-    if not sources.recorded and not isinstance(best, Missing) and not isinstance(optimum, Missing):
-        excess = percent(100 * (best / optimum - 1), 2)
-        sentences.append(
-            f"On the study’s objective the search ends {excess} above the optimum, {number(optimum, 0)}, "
-            "which Q = R = I itself reaches."
-        )
+    sentence = ""
     if not isinstance(cost, Missing) and not isinstance(default, Missing):
-        sentences.append(
+        sentence = (
             f"On the engineering cost it ends at {short(cost)}, the default weights at "
-            f"{short(default)}, both "
-            "on the training half of the panel."
+            f"{short(default)}, both on the training half of the panel."
         )
-    failed = int(np.isnan(table["cost"].astype(float)).sum())
-    caption = "Dots: candidates; line: best so far." + (
+    return Picture(
+        "tuning",
+        title,
+        sentence,
+        [progress(rows, head, small, default, excess=False)],
+        dots_and_line(rows),
+        page.origin(sources.source("tuning")),
+    )
+
+
+def dots_and_line(rows: Table) -> str:
+    """The caption of a search's progress."""
+    failed = int(np.isnan(rows["cost"].astype(float)).sum())
+    return "Dots: candidates; line: best so far." + (
         f" Vermillion at the foot: {count(failed, 'candidate')} that failed."
         if failed
         else " No candidate failed."
-    )
-    return Picture(
-        "tuning", title, " ".join(sentences), shown, caption, page.origin(sources.source("tuning"))
     )
 
 
@@ -344,17 +252,16 @@ def default_cost(metrics: Any) -> Any:
     )
 
 
-def _progress(table: Table, mode: str, head: str, small: str, level: Any, *, excess: bool) -> Column:
-    rows = table["mode"] == mode
-    if not rows.any() or isinstance(level, Missing):
+def progress(rows: Table, head: str, small: str, level: Any, *, excess: bool) -> Column:
+    """The candidates of one search beside a level: of the default weights, or with `excess` of the known
+    optimum, above which the costs are then drawn in per cent."""
+    if not len(rows["cost"]) or isinstance(level, Missing):
         return _holed(
             head,
             small,
-            level
-            if isinstance(level, Missing)
-            else Missing("not measured", f"no {mode} search was recorded"),
+            level if isinstance(level, Missing) else Missing("not measured", "no search was recorded"),
         )
-    at, cost, best = (table[name][rows].astype(float) for name in ("evaluation", "cost", "incumbent"))
+    at, cost, best = (rows[name].astype(float) for name in ("evaluation", "cost", "incumbent"))
     if excess:
         cost, best = (100 * (values / level - 1) for values in (cost, best))
     least = max(float(np.nanmin(best)), 1e-6)

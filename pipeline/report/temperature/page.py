@@ -5,7 +5,7 @@ from pipeline.report.identification.model import trust
 from pipeline.report.index import page as index_page
 from pipeline.report.shared import headline, page, pictures, tables, words
 from pipeline.report.shared.sources import Sources
-from pipeline.report.temperature import evidence, findings, pairs, recording, trades
+from pipeline.report.temperature import evidence, findings, pairs, recording, study, trades
 from pipeline.report.temperature.answers import aimed_unclipped, featured, repetitions
 from pipeline.report.temperature.judgement import Judgement, verdict_parts
 from pipeline.temperature.workflow.contestants import CONTESTANTS
@@ -45,8 +45,7 @@ def render(sources: Sources, judged: Judgement) -> str:
         yardstick=yardstick,
         aimed_unclipped=aimed_unclipped(sources, "there"),
         pairs=pairs.compared(sources),
-        published=tables.published(sources),
-        honest=tables.honest(sources),
+        study=study.part(sources),
         findings=findings.findings(sources),
         at_work=[
             pictures.trajectories(sources),
@@ -56,9 +55,7 @@ def render(sources: Sources, judged: Judgement) -> str:
             trades.tradeoff(sources),
             trades.plants(sources),
         ],
-        simulated=not sources.recorded,
         learning=[
-            *([] if sources.recorded else [evidence.noise(sources)]),
             evidence.orders(sources),
             evidence.holdout(sources),
             evidence.tuning(sources),
@@ -70,19 +67,11 @@ def render(sources: Sources, judged: Judgement) -> str:
         weights=tables.weights(sources),
         identified=tables.identified(sources),
         trusted=trust(sources),
-        words=words.chosen(
-            sources,
-            tuple(
-                word
-                for word in WORDS
-                if (word in shown or word not in SOME) and not (sources.recorded and word == "study")
-            ),
-        ),
+        words=words.chosen(sources, tuple(word for word in WORDS if word in shown or word not in SOME)),
         sources=list(sources.read.values()),
         absent=sources.absent,
         hashes=index_page.hashes(sources),
         from_scorecard=sources.source("scorecard", "evaluate_temperature"),
-        from_metrics=sources.source("evaluate_temperature"),
         from_quality=sources.source("quality"),
         from_weights=sources.source("weights"),
         from_model=sources.source("identify_plant", "plant"),

@@ -132,54 +132,53 @@ def _beating(points: dict[str, tuple[float, float]], name: str) -> list[str]:
 
 # ---- the candidates of the tuning
 
-MODES = {
-    "practical": ("The declared engineering cost", "mean over the training panel, as deployed"),
-    "parity": ("The study’s objective", "its own machine, state known, discounted"),
-}
+
+class Search(NamedTuple):
+    """Rows (effort, error) of the candidates that worked and of their front, and the named ones."""
+
+    points: np.ndarray
+    edge: np.ndarray
+    marks: dict[str, tuple[float, float]]
 
 
 def candidates(sources: Sources) -> Picture:
     """Error against effort of everything that the search tried, with the front, the
     chosen one, the default weights and the optimum."""
-    table, metrics, title = (
-        sources.tables["tuning"],
-        sources.metrics["tune_weights"],
-        "What the tuning’s candidates trade",
-    )
+    table, title = sources.tables["tuning"], "What the tuning’s candidates trade"
     if isinstance(table, Missing):
         return placeholder("candidates", title, table)
-    shown, sentences = [], []
-    for mode, (head, small) in MODES.items():
-        if sources.recorded and mode == "parity":
-            continue
-        rows = (
-            (table["mode"] == mode)
-            & np.isfinite(table["tracking_degC"])
-            & np.isfinite(table["effort_percent"])
-        )
-        if not rows.any():
-            gap = page.missing(Missing("not measured", f"no candidate of the {mode} search worked"))
-            shown.append(Column(head, small, "", [Markup('<div class="hole">{}</div>').format(gap)]))
-            continue
-        points = np.column_stack([table["effort_percent"][rows], table["tracking_degC"][rows]])
-        marks = _marks(points, table["chosen"][rows], lookup(metrics, f"{mode}.trade"))
-        edge = points[_best(points)]
-        shown.append(Column(head, small, "", [_searched(points, edge, marks, head)]))
-        if mode == "practical":
-            sentences = [_bought(marks), _beyond(marks, edge)]
+    rows = {name: values[table["mode"] == "practical"] for name, values in table.items()}
+    tried = search(rows, lookup(sources.metrics["tune_weights"], "practical.trade"))
+    head, small = "The declared engineering cost", "mean over the training panel, as deployed"
+    sentences = [_bought(tried.marks), _beyond(tried.marks, tried.edge)] if len(tried.points) else []
     return Picture(
         "candidates",
         title,
         " ".join(filter(None, sentences)),
-        shown,
+        [searched(tried, head, small)],
         "R.m.s. tracking error in °C, up, against r.m.s. effort in per cent, across. Small: "
         "a candidate that worked; line: the front, candidates that no other beats in both; "
         "filled square: chosen; ring: default weights; cross: the optimum, "
         "a Riccati law that is told the plant and its state, unclipped. "
-        "The searches minimise a cost, not one of "
+        "The search minimises a cost, not one of "
         "these two alone, so that the chosen one need not lie on the front.",
         page.origin(sources.source("tuning", "tune_weights")),
     )
+
+
+def search(rows: Table, trade: Any) -> Search:
+    """What one search tried; `trade` names default weights and optimum, as far as they are known."""
+    worked = np.isfinite(rows["tracking_degC"]) & np.isfinite(rows["effort_percent"])
+    points = np.column_stack([rows["effort_percent"][worked], rows["tracking_degC"][worked]])
+    return Search(points, points[_best(points)], _marks(points, rows["chosen"][worked], trade))
+
+
+def searched(tried: Search, head: str, small: str) -> Column:
+    """A search as a picture; in its place that nothing worked."""
+    if not len(tried.points):
+        gap = page.missing(Missing("not measured", "no candidate of the search worked"))
+        return Column(head, small, "", [Markup('<div class="hole">{}</div>').format(gap)])
+    return Column(head, small, "", [_searched(*tried, head)])
 
 
 def _marks(points: np.ndarray, chosen: np.ndarray, trade: Any) -> dict[str, tuple[float, float]]:
