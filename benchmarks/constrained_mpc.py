@@ -98,9 +98,7 @@ def member(model: Plant) -> Member:
         summed = summed + power
         power = model.A @ power
         free[h], drift[h] = model.C @ power, model.C @ summed
-    return Member(
-        model, free.reshape(-1, n), drift.reshape(-1, n), response.reshape(AHEAD * p, AHEAD * m)
-    )
+    return Member(model, free.reshape(-1, n), drift.reshape(-1, n), response.reshape(AHEAD * p, AHEAD * m))
 
 
 class Predictive:
@@ -217,7 +215,9 @@ def main() -> None:
         settling = figures["settling_s"]
         figures["within_bar"] = {key: bool((settling[key] or np.inf) <= bar[key]) for key in bar}
         print(name, figures)
-    RESULTS.write_text(json.dumps({"solver": "daqp 0.7.2", "mpc": results, "governed": laws}, indent=1) + "\n")
+    RESULTS.write_text(
+        json.dumps({"solver": "daqp 0.7.2", "mpc": results, "governed": laws}, indent=1) + "\n"
+    )
 
 
 if __name__ == "__main__":
