@@ -311,11 +311,13 @@ def governed(
 
 
 def _walls(family: Governor, now: np.ndarray, y_star: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Floor and cap (f, s, p) in °C of outputs forecast `now` (f, s, p): low and high, and `overshoot` beyond
-    the target for an output that is not there yet."""
+    """Floor and cap (f, s, p) in °C of outputs forecast `now` (f, s, p): low and high; and `overshoot` beyond
+    the target, or where an output is now that is there already. What is up to twice as far too hot goes back,
+    so that small errors of the forecast do not add up."""
+    above = y_star + family.overshoot
     return (
         np.maximum(family.low, np.minimum(now, y_star - family.overshoot)),
-        np.minimum(family.high, np.maximum(now, y_star + family.overshoot)),
+        np.minimum(family.high, np.where(now > above + family.overshoot, now, above)),
     )
 
 
