@@ -186,7 +186,9 @@ def compact(law: Law, N: int) -> Law:
     z_i(t+1) = z_{i+1}(t) + K^u_i u(t) + K^y_i y(t), u = -z_1 - ..., and starts where the window would.
     """
     m, p = law.D.shape
-    of_u, of_y = (part.reshape(m, N, -1).transpose(1, 0, 2) for part in (law.K[:, : N * m], law.K[:, N * m :]))
+    of_u, of_y = (
+        part.reshape(m, N, -1).transpose(1, 0, 2) for part in (law.K[:, : N * m], law.K[:, N * m :])
+    )
     left_u, left_y = (part[::-1].cumsum(axis=0)[::-1].reshape(N * m, -1) for part in (of_u, of_y))
     return law._replace(
         A=np.eye(N * m, k=m),

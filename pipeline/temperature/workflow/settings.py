@@ -152,6 +152,7 @@ class Panel(Section):
     settled_steps: int = Field(ge=10, le=5000)
     hold_steps: int = Field(ge=0, le=2000)
     band_degC: float = Field(gt=0, le=100)
+    settling_s: float = Field(gt=0, le=1e6)
     training: Half
     judging: Half
 
@@ -244,6 +245,18 @@ class EvaluateTemperature(Section):
 
     seed: int = Field(ge=0, le=2**31)
     resamples: int = Field(ge=20, le=100_000)
+
+
+class TemperatureRules(Section, extra="ignore"):
+    """Of section `report` what a rehearsal of the temperature loop is held against; settling_s null: as
+    panel.settling_s says on the study's machine, as the record says on another."""
+
+    settled_error_degC: float = Field(gt=0, le=1000)
+    settling_s: float | None = Field(gt=0, le=1e6)
+    overshoot_degC: float = Field(gt=0, le=1000)
+    at_limits_percent: float = Field(gt=0, le=100)
+    disk_margin: float = Field(gt=0, le=2)
+    delay_margin_s: float = Field(gt=0, le=1e6)
 
 
 class ReproduceStudy(Section):
