@@ -89,21 +89,27 @@ def pairing(
     """
     if plant.m < plant.p:
         raise ValueError(f"PI needs an input for each of the {plant.p} outputs; found {plant.m} inputs")
-    stretch, decayed = _stretch(plant, horizon)
+    fitted = rises(plant, horizon)
+    slope = np.array([[rise.slope for rise in row] for row in fitted])
+    stretch = _stretch(plant, horizon)[0]
     responses, *others = (_responses(member, stretch) for member in (plant, *family))
-    direction = _direction(responses, decayed)
-    # both ways are followed, so that a pair that is refused can be described
-    rises = [
-        [_rise(direction[o, i] * responses[:, o, i], direction[o, i]) for i in range(plant.m)]
-        for o in range(plant.p)
-    ]
-    slope = np.array([[rise.slope for rise in row] for row in rises])
-    certain = _certain(responses, rises, others)
-    inputs = _assigned(np.abs(slope) * (high - low), certain)
+    inputs = _assigned(np.abs(slope) * (high - low), _certain(responses, fitted, others))
     # the gain in percent per °C at which noise moves the input by its share: the inverse may be zero
     noise = np.zeros(plant.p) if noise_degC is None else noise_degC
     per_gain = noise / (NOISE_SHARE * (high - low)[inputs])
-    return _settings([rises[o][i] for o, i in enumerate(inputs)], inputs, per_gain, tuning)
+    return _settings([fitted[o][i] for o, i in enumerate(inputs)], inputs, per_gain, tuning)
+
+
+def rises(plant: Plant, horizon: int) -> list[list[Rise]]:
+    """The rise of each output (p lists) at a step of each input (m each), of a slope of its sign; `horizon`
+    as in `pairing`."""
+    stretch, decayed = _stretch(plant, horizon)
+    responses = _responses(plant, stretch)
+    direction = _direction(responses, decayed)
+    return [
+        [_rise(direction[o, i] * responses[:, o, i], direction[o, i]) for i in range(plant.m)]
+        for o in range(plant.p)
+    ]
 
 
 def _responses(plant: Plant, horizon: int) -> np.ndarray:
@@ -170,12 +176,12 @@ def _nearest(t, target, taus, delays) -> tuple[float, float]:
     return float(tau[best]), float(delay[best])
 
 
-def _certain(responses: np.ndarray, rises: list[list[Rise]], others: list[np.ndarray]) -> np.ndarray:
+def _certain(responses: np.ndarray, fitted: list[list[Rise]], others: list[np.ndarray]) -> np.ndarray:
     """Whether the sign of each pair (p, m) is certain: its excursions the other way are smaller than the
     response itself, and the mean of the rise has one sign over LEVEL of the family."""
     certain = np.zeros(responses.shape[1:], bool)
     for (o, i), _ in np.ndenumerate(certain):
-        rise, forward = rises[o][i], responses[:, o, i] * np.sign(rises[o][i].slope)
+        rise, forward = fitted[o][i], responses[:, o, i] * np.sign(fitted[o][i].slope)
         certain[o, i] = rise.slope != 0 and forward[: rise.until + 1].min() > -forward.max()
         if others and certain[o, i]:
             means = [np.sign(rise.slope) * one[: rise.until + 1, o, i].mean() for one in others]
@@ -205,10 +211,10 @@ def _assigned(effect: np.ndarray, certain: np.ndarray) -> np.ndarray:
     return inputs
 
 
-def _settings(rises: list[Rise], inputs: np.ndarray, per_gain: np.ndarray, tuning: Tuning) -> Pairing:
+def _settings(fitted: list[Rise], inputs: np.ndarray, per_gain: np.ndarray, tuning: Tuning) -> Pairing:
     """SIMC on each pair, with tau_c so long that no gain in percent per °C is above 1 / `per_gain` (p,)."""
     slope, tau, delay = (
-        np.array([getattr(rise, name) for rise in rises]) for name in ("slope", "time_constant", "delay")
+        np.array([getattr(rise, name) for rise in fitted]) for name in ("slope", "time_constant", "delay")
     )
     theta = np.maximum(delay + 0.5, 1.0)
     tau_c = np.maximum(tuning.tau_c_factor * theta, per_gain / np.abs(slope) - theta)
