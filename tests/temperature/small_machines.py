@@ -66,8 +66,8 @@ class MachineState(NamedTuple):
 
 
 def substeps(machine: SmallMachine) -> int:
-    """A sample is cut so that no step is longer than a third of the fastest lag or 1 s."""
-    return int(np.ceil(machine.sample_time_s / min(min(machine.lag_s) / 3, 1.0)))
+    """A sample is cut so that no step is longer than a third of the fastest lag or 2 s."""
+    return int(np.ceil(machine.sample_time_s / min(min(machine.lag_s) / 3, 2.0)))
 
 
 def slope(machine: SmallMachine, x: np.ndarray, u: np.ndarray) -> np.ndarray:
