@@ -107,12 +107,12 @@ def output_limits(machine: Machine) -> tuple[np.ndarray, np.ndarray]:
 def watchdog(
     machine: Machine, settings: Panel, family: Sequence[plant.Plant], noise: np.ndarray, overshoot: float
 ) -> governor.Governor:
-    """The governor of all contestants: three plants of the identified family at the corners of the panel's
-    spread; what it keeps from a limit is three deviations of the sensors' noise."""
+    """The governor of all contestants: the identified plant, in time and a sample late, with inputs that act as
+    the panel's spread has them; what it keeps from a limit is three deviations of the sensors' noise."""
     low, high = output_limits(machine)
-    guarded = panel.corners(family[:3], spread_of(settings))
+    guarded, strength = panel.corners(family[:1], spread_of(settings))
     limits = governor.OutputLimits(low, high, 3 * noise, overshoot)
-    return governor.governor(guarded, input_limits(machine), limits)
+    return governor.governor(guarded, input_limits(machine), limits, strength)
 
 
 def spread_of(settings: Panel) -> panel.Spread:
