@@ -1,5 +1,5 @@
-"""Probe the machine: writes datasets/generate_probing/probing.mcap (simulated), in the very format that a
-user's recordings come in, or next_experiment.csv (recordings), what to play on the machine next."""
+"""The next experiment: writes datasets/generate_probing/next_experiment.csv, what to play on the machine
+next."""
 
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow import generate_probing
@@ -10,12 +10,8 @@ def main() -> None:
     with artifacts.stage("generate_probing") as out:
         settings, machine = params.load(GenerateProbing, "generate_probing"), params.load(Plant, "plant")
         check_output_limits(machine, settings.source)
-        if settings.source == "recordings":
-            result = generate_probing.planned(settings, machine)
-            artifacts.write_csv(out / "next_experiment.csv", result.columns)
-        else:
-            result = generate_probing.probed(settings, machine)
-            artifacts.write_recording(out / "probing.mcap", result.time_s, result.signals)
+        result = generate_probing.planned(settings, machine)
+        artifacts.write_csv(out / "next_experiment.csv", result.columns)
         artifacts.write_metrics("generate_probing", result.metrics)
 
 

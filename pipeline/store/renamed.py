@@ -50,6 +50,13 @@ COLUMNS: dict[tuple[str, str], str] = {}
 # dotted keys of reports/metrics/<stage>.json, the stage first; a key stands for all below it, and * for any
 # one name, such as a material
 METRICS: dict[str, str] = {
+    "generate_probing.excitation_condition": "probe_machine.excitation_condition",
+    "generate_probing.excitation_full_rank": "probe_machine.excitation_full_rank",
+    "generate_probing.excitation_order": "probe_machine.excitation_order",
+    "generate_probing.excitation_rank": "probe_machine.excitation_rank",
+    "generate_probing.level_percent_per_band": "probe_machine.level_percent_per_band",
+    "generate_probing.limited_share": "probe_machine.limited_share",
+    "generate_probing.samples": "probe_machine.samples",
     "train_agent.ours": "train_agent.belief_dqn",
     "train_agent.ours_at_0.7": "train_agent.belief_dqn_at_0.7",
     "train_agent.parameters.ours": "train_agent.parameters.belief_dqn",

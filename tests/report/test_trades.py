@@ -81,7 +81,7 @@ def test_a_stage_is_as_accepted_made_anew_or_not_there(project):
     }
     artifacts.write_json("reports/accepted.json", {"metrics": metrics, "params": {}, "hashes": hashes})
     main()
-    assert "The results of 12 of 12 stages are those of the accepted run, to the byte." in Page(PAGE_ONE).text
+    assert "The results of 13 of 13 stages are those of the accepted run, to the byte." in Page(PAGE_ONE).text
     artifacts.write_json(
         "datasets/tune_weights/weights.json", {"practical": {"q": [1.0, 3.0], "r": [0.1, 0.2]}}
     )
