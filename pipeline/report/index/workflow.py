@@ -16,7 +16,7 @@ READS: dict[str, tuple[str, ...]] = {
     "probe_machine": (),
     "ingest": ("probe_machine",),
     "identify_plant": ("ingest",),
-    "generate_probing": (),
+    "generate_probing": ("ingest", "identify_plant"),
     "tune_weights": ("identify_plant",),
     "learn_kernel": ("ingest",),
     "evaluate_temperature": ("ingest", "identify_plant", "learn_kernel", "tune_weights"),
