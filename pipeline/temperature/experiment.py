@@ -30,11 +30,16 @@ from pipeline.temperature.forecast import (
     Start,
     ambient,
     answers,
+    band,
     closed_loop,
+    forecast,
     open_loop,
+    start,
     truncated,
 )
+from pipeline.temperature.order import LARGEST_RADIUS, stabilised
 from pipeline.temperature.plant import Plant, strictly_proper
+from pipeline.temperature.subspace import Segments
 from pipeline.temperature.tracking import Law, aimed, feasible_target, gains
 from pipeline.temperature.trust import horizon, two_points
 from pipeline.temperature.validation import step_response
@@ -43,6 +48,7 @@ ENOUGH = 0.8  # of the largest safe amplitude: what the centre gives up to come 
 SEEN = 0.05  # of an output's largest effect: pairs below it teach and are asked nothing
 HOLD = 0.5  # of the fastest time constant: the shortest hold of a binary sequence
 CORNERS = 3.0  # times the corner frequency: the highest line of a multisine
+LINES = 12  # of each input in a multisine at least: fewer are told by their own past
 SWITCHES = 20  # at least so many holds in an experiment, so that inputs move independently
 DRAWS = 30  # phases drawn for a multisine, of which the flattest is taken
 USEFUL = 0.3  # largest expected standard error of an input's strongest gain; beyond it nothing is learned
@@ -149,20 +155,39 @@ class Family(NamedTuple):
         return samples * self.model.sample_time_s
 
 
+def family_of(
+    plants: Sequence[Plant],
+    record: tuple[Segments, Segments],
+    *,
+    reach: np.ndarray,
+    longest: int,
+    doubt: Doubt,
+    names: Names,
+) -> Family:
+    """The family for experiments of at most `longest` samples on the machine of this record (u, y); reach
+    (m,) is each input's range.
+
+    A pole of the model outside the unit circle is drawn onto it, as in the bootstrap: no heated part heats
+    itself. Where the machine does run away, the model then misses the record, and the band says so. Raises
+    ValueError where no stretch of the record has all inputs.
+    """
+    plants = [stabilised(plant, LARGEST_RADIUS) for plant in plants]
+    speed = pace(plants, reach, longest)
+    begin = start(plants, *record, slowest=speed.slowest)
+    return Family(plants, speed, doubt, begin, band(plants[0], *record), names)
+
+
 def pace(plants: Sequence[Plant], reach: np.ndarray, longest: int) -> Pace:
     """How fast the family answers; reach (m,) is each input's range, longest the samples of an experiment."""
     samples = horizon(plants[0], longest)
     responses = [step_response(plant, samples + 1) for plant in plants]
     tau, delay = (np.median(part, axis=0) for part in zip(*map(two_points, responses), strict=True))
-    gain = np.median([part[np.abs(part).argmax(axis=0), *_grid(part)] for part in responses], axis=0)
+    peaks = [np.take_along_axis(part, np.abs(part).argmax(axis=0)[None], axis=0)[0] for part in responses]
+    gain = np.median(peaks, axis=0)
     effect = np.abs(gain) * reach
     seen = (effect > SEEN * effect.max(axis=1, keepdims=True)) & (tau > 0)
     shown = np.maximum(tau[seen], 1.0) if seen.any() else np.ones(1)
     return Pace(np.maximum(tau, 1.0), delay, gain, seen, float(shown.min()), float(shown.max()))
-
-
-def _grid(part: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return tuple(np.indices(part.shape[1:]))  # ty: ignore[invalid-return-type]
 
 
 # ---- the signal
@@ -193,9 +218,10 @@ def _binary(rng: np.random.Generator, samples: int, hold: int) -> np.ndarray:
 
 def _lines(samples: int, highest: np.ndarray) -> list[np.ndarray]:
     """Lines of the record for each input up to its highest frequency in rad a sample, none shared; at least
-    four each."""
+    LINES each."""
     m = len(highest)
-    last = np.clip(np.ceil(highest * samples / (2 * np.pi)), 4 * m, (samples - 1) // 2).astype(int)
+    last = np.ceil(highest * samples / (2 * np.pi))
+    last = np.clip(last, min(LINES * m, (samples - 1) // 2), (samples - 1) // 2).astype(int)
     return [np.arange(1 + j, end + 1, m) for j, end in enumerate(last)]
 
 
@@ -412,22 +438,23 @@ def design(family: Family, wish: Wish, limits: Limits, rng: np.random.Generator)
     step = limits.rate / max(wish.amplitude, limits.rate / 2)
     played = shaped(signal(rng, samples, wish, speed), rise, step)
     whole = answers(family.plants, family.begin, ramp, played)
-    best, shortest = None, max(4 * rise, int(5 * speed.fastest), 50)
-    first_reason = ""
-    while samples >= min(shortest, wish.samples):
+    best, most, reason = None, 0.0, ""
+    shortest = min(max(4 * rise, int(5 * speed.fastest), 50), wish.samples)
+    while samples >= shortest:
         reach = truncated(whole, samples) if samples < wish.samples else whole
         tried = _designed(family, reach, wish, limits, (ramp[:samples], played[:samples], rise))
-        first_reason = first_reason or tried.reason
-        if tried.lesson is not None and tried.written:
-            if best is None or tried.lesson.information > best[0].lesson.information:
-                best = tried, reach
-            cap = caps(family, reach, wish, limits)
-            if (tried.amplitude >= HALF * cap).all():
-                break
+        reason = reason or tried.reason
+        if best is None or (tried.lesson is not None and tried.written and tried.lesson.information > most):
+            best, most = (
+                tried,
+                tried.lesson.information if tried.lesson is not None and tried.written else 0.0,
+            )
+        if tried.written and (tried.amplitude >= HALF * caps(family, reach, wish, limits)).all():
+            break
         samples //= 2
     if best is None:
-        return tried._replace(reason=first_reason)
-    return best[0]
+        raise ValueError(f"generate_probing.samples is {wish.samples}, too few for an experiment; raise it")
+    return best if best.written else best._replace(reason=reason)
 
 
 def _nothing_left(family: Family, limits: Limits) -> str:
@@ -464,14 +491,23 @@ def _designed(
     else:
         return _left(family, reach, tried[0], limits)
     begin = family.begin
-    u = begin.u + ramp[:, None] * (centre - begin.u) + amplitude * played
+    for _ in range(STEPS):
+        u = np.clip(
+            begin.u + ramp[:, None] * (centre - begin.u) + amplitude * played, limits.low, limits.high
+        )
+        extremes = forecast(
+            family.plants, begin, u, doubt=family.doubt, fastest=family.pace.fastest, width=family.band.width
+        )
+        if within(extremes, limits):
+            break
+        amplitude = 0.9 * amplitude  # between the samples that the search looked at it was hotter
+    else:
+        return _left(family, reach, centre, limits)
     taught = lesson(u[rise:], family.pace, family.band.noise)
     target = reach.free[0, -1] + (begin.u - begin.answered) @ reach.step[0, :, -1]
     target = target + (centre - begin.u) @ reach.ramp[0, :, -1]
     reason = _teaches_little(family, amplitude, taught)
-    u = np.clip(u, limits.low, limits.high)[: 0 if reason else None]
-    extremes = _extremes(family, reach, centre, amplitude)
-    return Experiment(u, reason, extremes, centre, amplitude, target, taught)
+    return Experiment(u[: 0 if reason else None], reason, extremes, centre, amplitude, target, taught)
 
 
 def _teaches_little(family: Family, amplitude: np.ndarray, taught: Lesson) -> str:
@@ -531,7 +567,13 @@ def dither(family: Family, law: Law, wish: Wish, limits: Limits, rng: np.random.
     nothing, wide = np.zeros((0, m)), SIGMAS * family.band.noise
     for share in [0.5**k for k in range(STEPS)] + [0.0]:
         extremes, limited = closed_loop(
-            family.plants, loop, share * wanted * played, noise, doubt=family.doubt, disturbance=disturbance
+            family.plants,
+            loop,
+            share * wanted * played,
+            noise,
+            doubt=family.doubt,
+            disturbance=disturbance,
+            stop=Extremes(limits.y_high - wide, limits.y_low + wide) if share else None,
         )
         extremes = Extremes(extremes.highest + wide, extremes.lowest - wide)
         if share and within(extremes, limits):

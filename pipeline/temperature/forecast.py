@@ -19,7 +19,7 @@ from pipeline.temperature.validation import one_step_errors, simulated
 
 TAIL = 3000  # samples at the end of the record that the present state is taken from
 LATEST = 20  # samples at its very end by which each member is set right
-STORED = 2e7  # numbers of a family's responses that are held at once; beyond, every k-th sample is looked at
+STORED = 6e6  # numbers of a family's responses that are held at once; beyond, every k-th sample is looked at
 SURE = 0.99  # share of the record's simulation errors that the band holds
 SIGMAS = 3.0  # of the sensor's noise
 
@@ -108,7 +108,10 @@ def band(model: Plant, u: Segments, y: Segments) -> Band:
     ]
     us, ys = [us[k] for k in long_enough], [ys[k] for k in long_enough]
     errors = np.vstack([b - simulated(model, a, b) for a, b in zip(us, ys, strict=True)])
-    noise = np.nanstd(np.vstack(one_step_errors(model, us, ys)), axis=0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        ahead = np.nanstd(np.vstack(one_step_errors(model, us, ys)), axis=0)
+    # a predictor that runs away says nothing of the noise: what simulation misses is then its upper end
+    noise = np.fmin(ahead, np.nanstd(errors, axis=0))
     return Band(noise, np.nanquantile(np.abs(errors), SURE, axis=0))
 
 
@@ -178,13 +181,35 @@ def open_loop(
         + (centre - begin.u)[:, None, None] * family.ramp
         + amplitude[:, None, None] * family.probe
     )
-    late = np.zeros_like(of_each)
+    moved = ambient(doubt, family.at, fastest)[:, None] + width
+    return _bounds(family.free, of_each, family.at, doubt, moved)
+
+
+def forecast(
+    family: Sequence[Plant], begin: Start, u: np.ndarray, *, doubt: Doubt, fastest: float, width: np.ndarray
+) -> Extremes:
+    """Extremes under the inputs u (T, m) themselves, every sample looked at."""
+    at = np.arange(len(u))
+    held = np.column_stack([np.tile(begin.answered, (len(u), 1)), np.ones(len(u))])
+    moved = ambient(doubt, at, fastest)[:, None] + width
+    highest, lowest = np.full(len(width), -np.inf), np.full(len(width), np.inf)
+    for member, x0, bias in zip(family, begin.x, begin.bias, strict=True):
+        free = respond(simulation_form(member, []), held, x0)[1] + bias
+        own = _bounds(free[None], _alone(member, u - begin.answered)[None], at, doubt, moved)
+        highest, lowest = np.maximum(highest, own.highest), np.minimum(lowest, own.lowest)
+    return Extremes(highest, lowest)
+
+
+def _bounds(
+    free: np.ndarray, of_each: np.ndarray, at: np.ndarray, doubt: Doubt, moved: np.ndarray
+) -> Extremes:
+    """Extremes of free (members, k, p) and what each input adds, of_each (members, m, k, p), with the doubt
+    about gains and delay; moved (k, p) is what may come from elsewhere."""
+    reach = doubt.input_gain * np.abs(of_each).sum(axis=1) + moved
     if doubt.delay_steps:
-        lags = np.maximum(doubt.delay_steps / np.maximum(np.diff(family.at), 1), 1.0)[:, None]
-        late[:, :, 1:] = lags * np.abs(np.diff(of_each, axis=2))
-    middle = family.free + of_each.sum(axis=1)
-    reach = (doubt.input_gain * np.abs(of_each) + late).sum(axis=1)
-    reach += ambient(doubt, family.at, fastest)[:, None] + width
+        lags = np.maximum(doubt.delay_steps / np.maximum(np.diff(at), 1), 1.0)[:, None]
+        reach[:, 1:] += lags * np.abs(np.diff(of_each, axis=2)).sum(axis=1)
+    middle = free + of_each.sum(axis=1)
     return Extremes((middle + reach).max(axis=(0, 1)), (middle - reach).min(axis=(0, 1)))
 
 
@@ -208,6 +233,7 @@ def closed_loop(
     *,
     doubt: Doubt,
     disturbance: np.ndarray,
+    stop: Extremes | None = None,
 ) -> tuple[Extremes, float]:
     """Extremes of the true outputs while dither (T, m) is added to the commands of a controller that holds
     the reference, and the largest share of (sample, input) at a limit over the members; noise (T, p) is what
@@ -215,29 +241,38 @@ def closed_loop(
 
     Every member runs with all gains up, all down, and each alone up and down; with the ambient as it was, or
     moved by `disturbance` (T,) up with the gains and down with them; its inputs on time, and late. It starts
-    at rest, held by the law; a member that the law cannot hold there starts as near as it can.
+    at rest, held by the law; a member that the law cannot hold there starts as near as it can. The forecast
+    ends where an output leaves `stop`.
     """
     m = family[0].m
     gains = np.vstack([np.zeros((3, m)), np.ones(m), -np.ones(m), np.eye(m), -np.eye(m)])
     ambients = np.r_[0.0, 1.0, -1.0, 1.0, -1.0, np.zeros(2 * m)]
-    by_order: dict[int, list[Plant]] = {}
-    for member in family:
-        by_order.setdefault(member.n, []).extend(
-            member._replace(B=member.B * scale, D=member.D * scale) for scale in 1 + doubt.input_gain * gains
-        )
-    runs = [
-        _run(
-            plants, loop, (dither, noise, np.tile(ambients, len(plants) // len(ambients)), disturbance), late
-        )
-        for plants in by_order.values()
-        for late in sorted({0, doubt.delay_steps})
+    n = max(member.n for member in family)
+    plants = [
+        one._replace(B=one.B * scale, D=one.D * scale)
+        for one in (_padded(member, n) for member in family)
+        for scale in 1 + doubt.input_gain * gains
     ]
+    driven = dither, noise, np.tile(ambients, len(family)), disturbance
+    runs = [_run(plants, loop, driven, late, stop) for late in sorted({0, doubt.delay_steps})]
     highest, lowest = (pick([run[k] for run in runs], axis=0) for k, pick in ((0, np.max), (1, np.min)))
     return Extremes(highest, lowest), max(run[2] for run in runs)
 
 
+def _padded(plant: Plant, n: int) -> Plant:
+    """The plant with n states, those added at rest and unseen."""
+    more = n - plant.n
+    return plant._replace(
+        A=np.pad(plant.A, (0, more)),
+        B=np.pad(plant.B, ((0, more), (0, 0))),
+        C=np.pad(plant.C, ((0, 0), (0, more))),
+        b=np.pad(plant.b, (0, more)),
+        K=np.pad(plant.K, ((0, more), (0, 0))),
+    )
+
+
 def _run(
-    plants: Sequence[Plant], loop: Loop, driven: tuple[np.ndarray, ...], late: int
+    plants: Sequence[Plant], loop: Loop, driven: tuple[np.ndarray, ...], late: int, stop: Extremes | None
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Highest and lowest (p,), and the largest limited share, of plants of one order, run side by side."""
     law, r = loop.law, loop.reference
@@ -254,6 +289,8 @@ def _run(
         y += (disturbance[t] * ambients)[:, None]
         highest, lowest = np.maximum(highest, y.max(axis=0)), np.minimum(lowest, y.min(axis=0))
         if not np.abs(y).max() < 1e6:  # a loop that runs away has left every limit
+            break
+        if stop is not None and ((highest > stop.highest) | (lowest < stop.lowest)).any():
             break
         measured = y + noise[t]
         wanted = -z @ law.K.T - measured @ law.D.T - (r + xi) @ law.K_r.T - law.k + dither[t]

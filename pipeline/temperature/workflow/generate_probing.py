@@ -83,11 +83,10 @@ def _family(
 ) -> Family:
     low, high = input_limits(machine)
     doubt = forecast.Doubt(settings.doubt_input_gain, settings.doubt_ambient_degC, settings.doubt_delay_steps)
-    speed = experiment.pace(plants, high - low, settings.samples)
-    begin = forecast.start(plants, *record, slowest=speed.slowest)
-    band = forecast.band(plants[0], *record)
     names = experiment.Names([i.name for i in machine.inputs], [o.name for o in machine.outputs])
-    return Family(plants, speed, doubt, begin, band, names)
+    return experiment.family_of(
+        plants, record, reach=high - low, longest=settings.samples, doubt=doubt, names=names
+    )
 
 
 def _dithered(family: Family, wish: Wish, limits: Limits, seed: int) -> tuple[Dither | None, str]:
@@ -139,7 +138,9 @@ def _figures(
     }
     if not tried.written or tried.lesson is None:
         return figures
-    rank = excitation(tried.u, EXCITED)
+    # lags that span the fastest time constant: over closer ones a slow signal repeats itself
+    lag = max(round(family.pace.fastest / EXCITED), 1)
+    rank = excitation(tried.u[::lag], EXCITED)
     return figures | {
         "centre_percent": _by(inputs, tried.centre),
         "amplitude_percent": _by(inputs, tried.amplitude),
@@ -147,10 +148,11 @@ def _figures(
         "samples": len(tried.u),
         "seconds": family.seconds(len(tried.u)),
         "excitation_order": rank.order,
+        "excitation_lag_s": family.seconds(lag),
         "excitation_rank": rank.rank,
         "excitation_full_rank": rank.full,
         "excitation_condition": rank.condition if np.isfinite(rank.condition) else None,
-        "level_percent_per_band": rank.level,
+        "level_percent_per_band": excitation(tried.u, 1).level,
         "information": tried.lesson.information,
         "expected_error_percent": _errors(machine, family, tried.lesson),
         "expected_gap_percent": 100 * experiment.expected_gap(family.model, tried.lesson, gamma),
