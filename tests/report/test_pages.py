@@ -128,7 +128,7 @@ def test_the_worst_case_is_the_largest_gap_over_plants_with_its_band_over_seeds(
         "datasets/tune_weights/weights.json",
         "datasets/ingest/record.parquet",
         "datasets/ingest/quality.parquet",
-        "reports/metrics/generate_probing.json",
+        "reports/metrics/probe_machine.json",
         "reports/metrics/ingest.json",
         "reports/metrics/identify_plant.json",
         "reports/metrics/learn_kernel.json",

@@ -170,7 +170,8 @@ class Panel(Section):
 
 
 class GenerateProbing(Section):
-    """Section `generate_probing`."""
+    """Section `generate_probing`: how the study's machine is probed, and what is asked of the next
+    experiment. `doubt_...` is what the identified family does not hold."""
 
     source: Literal["simulated", "recordings"]
     seed: int = Field(ge=0, le=2**31)
@@ -186,6 +187,9 @@ class GenerateProbing(Section):
         | Annotated[list[Annotated[float, Field(ge=-100, le=100)]], Field(min_length=1, max_length=32)]
         | None
     )
+    doubt_input_gain: float = Field(ge=0, lt=1)
+    doubt_ambient_degC: float = Field(ge=0, le=200)
+    doubt_delay_steps: int = Field(ge=0, le=1000)
 
 
 class Ingest(Section):
