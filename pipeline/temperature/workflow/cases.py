@@ -170,7 +170,7 @@ def _half(
         questions,
         noise=noise,
         seed=half.seed,
-        steps=steps or settings.steps,
+        steps=round(half.length * (steps or settings.steps)),
         hold=settings.hold_steps,
         cells=cells,
     )
