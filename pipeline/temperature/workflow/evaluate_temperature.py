@@ -1,5 +1,5 @@
-"""What evaluate_temperature does: every contestant, tuned, as it would be deployed, on plants that nobody learned
-or tuned on; which is best, what tells model-based and data-driven apart, and which plant decides."""
+"""What evaluate_temperature does: every contestant, tuned, as it would be deployed, on plants that nobody
+learned or tuned on; which is best, what tells model-based and data-driven apart, and which plant decides."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -33,8 +33,8 @@ CONVENTION = (
 
 
 class JudgedContestant(NamedTuple):
-    """One contestant over all cases, its margins on every plant, its gaps in percent on the plants (None where
-    weights mean nothing to it), and the rollout."""
+    """One contestant over all cases, its margins on every plant, its gaps in percent on the plants (None
+    where weights mean nothing to it), and the rollout."""
 
     figures: panel.Figures
     costs: np.ndarray

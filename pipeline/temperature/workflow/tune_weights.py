@@ -1,5 +1,5 @@
-"""What tune_weights does: it tunes every contestant by itself, with the same search, budget and cost, on the same
-training half of the panel, as it would be deployed."""
+"""What tune_weights does: it tunes every contestant by itself, with the same search, budget and cost, on the
+same training half of the panel, as it would be deployed."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -17,9 +17,9 @@ from pipeline.temperature.workflow.settings import TuneWeights
 
 # of a parameter's range, in logarithms: so near to an end the search is called bound by it
 AT_BOUND = 0.02
-# of the cost, for a parameter moved from its start by its whole range: of two candidates as good as each other
-# the one nearer to the start is taken, so that a direction in which the cost is flat has one end, not two
-NEARER = 0.05
+# of the cost, for a parameter moved from its start by its whole range: of two candidates as good as each
+# other the one nearer to the start is taken, so that a direction in which the cost is flat has one end, not
+# two NEARER = 0.05
 
 
 class Tuned(NamedTuple):
