@@ -3,13 +3,12 @@ lies 3 °C above the reference: how long each takes to settle, and how often it 
 
 `./run --with daqp==0.7.2 python -m benchmarks.constrained_mpc` prints the figures beside the bars and writes
 benchmarks/results/constrained_mpc.json. Every controller plays the same 60 plants of the panel from 20 °C and
-from 90 °C. DAQP (Arnstrom, Bemporad, Axehill 2022) solves a quadratic programme each step. All MPC is told
-the state of the heated cells without noise; none of its limits is missed where it can be kept.
+from 90 °C. DAQP (Arnstrom, Bemporad, Axehill 2022) solves a quadratic programme each step. All MPC is told the
+state of the heated cells without noise; none of its limits is missed where it can be kept.
 
 * nominal: its model is the nominal plant, in time. No limit that holds for its model holds for the others.
 * family: it keeps the limit for weakest and strongest, in time and late: what the governor guards. The bar.
-* told: it is told each plant and all its state, which no controller of a machine is: what inputs allow at
-all.
+* told: it is told each plant and all its state, which no controller of a machine is: what inputs allow at all.
 
 The governed laws measure with noise of 0.1 °C and know the record only. Their weights are the study's
 identity with an integrator of 0.2 of the error a step, for none of these laws tuned on this panel.
@@ -134,8 +133,8 @@ class Predictive:
 
 
 def held(model: Plant, rest: np.ndarray) -> np.ndarray:
-    """The input of least norm that holds the model at the reference under a drift of `rest` (n,) a step, cut
-    to the limits."""
+    """The input of least norm that holds the model at the reference under a drift of `rest` (n,) a step, cut to
+    the limits."""
     balance = np.eye(model.n) - model.A
     per_u, at_rest = np.linalg.solve(balance, model.B), np.linalg.solve(balance, rest)
     return np.clip(np.linalg.pinv(model.C @ per_u) @ (REFERENCE - model.d - model.C @ at_rest), 0.0, 100.0)
@@ -172,8 +171,7 @@ def scaled(plant: Plant, strength: float, late: bool) -> Plant:
 
 
 def whole_family() -> list[Plant]:
-    """The nominal plant, then its weakest and strongest, in time and a sample late: what the governor
-    guards."""
+    """The nominal plant, then its weakest and strongest, in time and a sample late: what the governor guards."""
     _, strength = panel.corners([plants_of.baam()], SPREAD)
     range_ = (strength.weakest, strength.strongest)
     return [panel.delayed(plants_of.baam(), False)] + [

@@ -160,9 +160,8 @@ def _leaking(balance: np.ndarray) -> np.ndarray:
 
 class Deployed(NamedTuple):
     """A law with what it runs under: `integral_limit` °C is the largest error, and the largest
-    back-calculated shift, that the integrator sees; `back` (p, m) is P of the module's formula; `gather` (q,)
-    says which entry of [z; u; y; 0] each entry of z(t+1) is, where the memory is a plain shift, and is None
-    otherwise.
+    back-calculated shift, that the integrator sees; `back` (p, m) is P of the module's formula; `shift` is k
+    where the memory moves on by k entries, 0 where it is no plain shift.
 
     `holds`: it does nothing, and goes on with the input that it was handed."""
 

@@ -32,9 +32,9 @@ class Limits(NamedTuple):
 
 
 class OutputLimits(NamedTuple):
-    """low, high (p,) in °C, -inf and inf where none is declared; `margin` (p,) in °C is kept from both, for
-    the sensors' noise (three standard deviations); `overshoot` in °C: how far an output that is below its
-    target may be predicted beyond it."""
+    """low, high (p,) in °C, -inf and inf where none is declared; `margin` (p,) in °C is kept from both, for the
+    sensors' noise (three standard deviations); `overshoot` in °C: how far an output that is below its target
+    may be predicted beyond it."""
 
     low: np.ndarray
     high: np.ndarray
@@ -54,8 +54,8 @@ class Strength(NamedTuple):
 class Governor(NamedTuple):
     """A family of f plants with their observers, and the rows by which they look ahead; `governor` makes it.
 
-    A member remembers s = [x, w, xi, v] of size q = 2 (n + p). x is its state at its strongest and w (p) in
-    °C a step a drift that it cannot explain, so that steady disagreement vanishes (offset-free prediction); xi and
+    A member remembers s = [x, w, xi, v] of size q = 2 (n + p). x is its state at its strongest and w (p) in °C
+    a step a drift that it cannot explain, so that steady disagreement vanishes (offset-free prediction); xi and
     v are by how much less x and w would be at its weakest. Before y is measured s forecasts [C x + d, C xi]:
 
         s <- s + [e, clip(e + lambda C xi), C xi, clip(C xi)] correct,   s(t+1) = s move + u push + rest
@@ -116,9 +116,9 @@ def governor(
     """The governor of a family of plants of one order (their feed-through made a delay), for inputs of any
     `strength` within its range.
 
-    Innovations are doubted by the sensors' noise, a tenth of a degree at least. The observer takes process
-    noise to come in by the inputs, sensors to be tau °C^2 per percent^2 noisier than that, and the drift w to
-    wander by `drift` of the sensors' noise a step."""
+    Innovations are doubted by the sensors' noise, a tenth of a degree at least. The observer takes process noise to come in by the inputs, sensors to be tau °C^2 per percent^2 noisier
+    than that, and the drift w to wander by `drift` of the sensors' noise a step.
+    """
     at, unsure = instants(family), np.maximum(outputs.margin, 0.1)
     members = [
         {**_watching(plant, strength, tau, drift), **_ahead(plant, limits, strength, at)} for plant in family
@@ -178,8 +178,8 @@ def _watching(plant: Plant, strength: Strength, tau: float, drift: float) -> dic
 
 def _ahead(plant: Plant, limits: Limits, strength: Strength, at: np.ndarray) -> dict[str, np.ndarray]:
     """The rows of a Governor of one member. A rate limit slows the stop: inputs go from u to the limit on a
-    straight line that the slowest of them needs. An input that helps is taken to act less than one that
-    hurts, by what `each` leaves open."""
+    straight line that the slowest of them needs. An input that helps is taken to act less than one that hurts,
+    by what `each` leaves open."""
     n, m, p = plant.n, plant.m, plant.p
     A, C = _drifting(plant)
     B, b = np.vstack([plant.B, np.zeros((p, m))]), np.r_[plant.b, np.zeros(p)]
@@ -249,8 +249,8 @@ def observed(family: Governor, memory: np.ndarray, u: np.ndarray, y: np.ndarray)
 
 
 class Evidence(NamedTuple):
-    """Of each member, case and output (f, s, p): the share of the way from strongest to weakest that the
-    inputs are at least, by least squares, and at most; and whether the member counts (f, s)."""
+    """Of each member, case and output (f, s, p): the share of the way from strongest to weakest that the inputs
+    are at least, by least squares, and at most; and whether the member counts (f, s)."""
 
     least: np.ndarray
     middle: np.ndarray
@@ -282,10 +282,10 @@ def governed(
     """Commands (s, m) as near to u (s, m) as the rows allow, within low..high (s, m); the memory corrected by
     what was measured, y_star (s, p) targets.
 
-    Projections onto the most violated row of each output in turn. Only inputs whose lowering helps are
-    lowered for a high limit, and raised for a low one; the high limit has the last word. A limit that cannot
-    be kept is kept as far as the inputs go; an output beyond its target already, from above or by another's
-    doing, is left to the law.
+    Projections onto the most violated row of each output in turn. Only inputs whose lowering helps are lowered
+    for a high limit, and raised for a low one; the high limit has the last word. A limit that cannot be kept
+    is kept as far as the inputs go; an output beyond its target already, from above or by another's doing,
+    is left to the law.
     """
     q, rows = family.start.shape[2], family.above.shape[1]
     told = evidence(family, memory)

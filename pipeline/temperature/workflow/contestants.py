@@ -78,7 +78,7 @@ class Parameter(NamedTuple):
 
 EFFORT = Parameter("effort_weight", 0.1, 30.0, 1e5, of_effect=True)
 OBSERVER = Parameter("observer_tau", 1e-4, 0.1, 1e3, of_effect=True)
-INTEGRAL = Parameter("integral", 0.001, 0.02, 0.2)
+INTEGRAL = Parameter("integral", 0.001, 0.02, 0.8)
 Values = Mapping[str, float]
 
 

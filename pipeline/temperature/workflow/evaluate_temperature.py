@@ -27,8 +27,8 @@ FIGURES = {
     "rms": "rms_degC",
 }
 CONVENTION = (
-    "Q = R = I, discounted {gamma:g} a step, unclipped, without integrator and governor, from a plant at rest, "
-    "noise-free, against the Riccati law of the same plant that knows the state"
+    "Q = R = I, discounted {gamma:g} a step, unclipped, without integrator and governor, from a plant at "
+    "rest, noise-free, against the Riccati law of the same plant that knows the state"
 )
 
 

@@ -18,8 +18,8 @@ from pipeline.temperature.workflow.settings import TuneWeights
 # of a parameter's range, in logarithms: so near to an end the search is called bound by it
 AT_BOUND = 0.02
 # of the cost, for a parameter moved from its start by its whole range: of two candidates as good as each
-# other the one nearer to the start is taken, so that a direction in which the cost is flat has one end, not
-# two NEARER = 0.05
+# other the one nearer to the start is taken, so that a direction in which the cost is flat has one end
+NEARER = 0.05
 
 
 class Tuned(NamedTuple):
