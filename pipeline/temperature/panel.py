@@ -77,6 +77,12 @@ def varied(
     return delayed(changed, late)
 
 
+def hardest(plant: Plant, spread: Spread) -> Plant:
+    """The plant of the spread that bears least: all inputs strongest, quickest, and a sample late."""
+    gains = np.full(plant.m, 1 + spread.input_gain)
+    return varied(plant, gains=gains, slower=-spread.slower, loss=0.0, ambient=0.0, late=True, cells=False)
+
+
 def drawn(
     nominal: Sequence[Plant], count: int, spread: Spread, *, cells: bool, rng: np.random.Generator
 ) -> list[Plant]:
@@ -179,10 +185,12 @@ def asked(
     references = [constant(r) for r in questions.constants]
     rows = [("constant", a, [j]) for a in range(len(questions.starts)) for j in range(len(references))]
     middle = len(questions.starts) // 2
-    for kind, make, parts in (("ramp", ramp, questions.ramp), ("sinusoid", sinusoid, questions.sinusoid)):
-        if parts is not None:
-            rows.append((kind, middle, [len(references)]))
-            references.append(make(*parts))
+    if questions.ramp is not None:
+        rows.append(("ramp", middle, [len(references)]))
+        references.append(ramp(*questions.ramp))
+    if questions.sinusoid is not None:
+        rows.append(("sinusoid", middle, [len(references)]))
+        references.append(sinusoid(*questions.sinusoid))
     if questions.sequence is not None:
         rows.append(("sequence", middle, [len(references) + g for g in range(len(questions.sequence))]))
         references += [constant(r) for r in questions.sequence]

@@ -244,6 +244,7 @@ class TuneWeights(Section):
     allow_effort_percent: float = Field(gt=0, le=100)
     worst_case: float = Field(ge=0, le=1000)
     least_disk_margin: float = Field(ge=0, le=2)
+    least_delay_margin_s: float = Field(ge=0, le=1e6)
 
 
 class EvaluateTemperature(Section):
