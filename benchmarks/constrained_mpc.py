@@ -123,7 +123,7 @@ class Predictive:
         )
         aim = np.tile(held(self.members[0].model, rests[0]), AHEAD)
         f = 2 * (self.rows.T @ (free - np.tile(REFERENCE, len(free) // len(REFERENCE))) - 1e-3 * aim)
-        most = np.maximum(np.tile(REFERENCE + ABOVE, len(free) // len(REFERENCE)) - free, 0.0)
+        most = np.maximum(np.tile(REFERENCE + ABOVE, len(free) // len(REFERENCE)) - free, 0.05)
         upper = np.r_[np.full(inputs, 100.0), most]
         lower = np.r_[np.zeros(inputs), np.full(len(most), -1e30)]
         u, _, flag, _ = daqp.solve(self.H, f, self.rows, upper, lower, self.sense)

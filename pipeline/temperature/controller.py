@@ -296,3 +296,135 @@ def _remembered(controller: Deployed, z, u, y, r):
     else:
         after += z @ law.A.T
     return after
+
+
+# ---- what a machine runs
+
+
+class RunningController:
+    """One controller on one machine, a sample at a time.
+
+    In manual, `watch` each sample; then `hand_over` once, then `step` each sample. A reference is (p,) °C, or a
+    Reference that starts at the sample where it is first given. It is aimed at on `model` when it changes, and
+    the last AIMS of them are remembered. All else that it remembers is `saved` as arrays, from which `restore`
+    goes on bit by bit. `binding` are the inputs (index, limit in percent) because of which the reference is out
+    of reach.
+    """
+
+    AIMS = 64
+
+    def __init__(self, controller: Deployed, model: Plant):
+        law = controller.law
+        self.controller, self.model = controller, model
+        self.binding: tuple[tuple[int, float], ...] = ()
+        self._asks = np.hstack([law.K, law.D, law.K_r])
+        self._keeps = np.hstack([law.B_u, law.B_y, law.B_r, *([] if controller.shift else [law.A])])
+        self._rated = bool(np.isfinite(controller.limits.rate).any())
+        self._aims: dict[bytes, tuple[Rest, Aim]] = {}
+        self._state: State | None = None
+        self._reference: Reference | None = None
+        self._w, self._t = np.zeros(0), 0
+
+    def watch(self, u: np.ndarray, y: np.ndarray, r: np.ndarray) -> None:
+        """One sample in manual: inputs u (m,) applied, outputs y (p,) measured before, reference r (p,)."""
+        u, y, r = (np.asarray(part, float)[None] for part in (u, y, r))
+        self._state = watched(self.controller, self._state, u, y, r)
+
+    def hand_over(self, y: np.ndarray) -> None:
+        """From manual to the law without a bump, at outputs y (p,). Raises ValueError before the first watch."""
+        y = np.asarray(y, float)
+        here = self._aimed(constant(y))[1]
+        self._state = handed_over(self.controller, self._remembers(y), y[None], [here])
+
+    def step(self, y: np.ndarray, r: np.ndarray | Reference, t: int) -> np.ndarray:
+        """Inputs u (m,) to apply from outputs y (p,) measured at sample t under reference r, as batch_step has
+        them. Raises ValueError where y is not finite, or nothing was watched before."""
+        y = np.asarray(y, float)
+        state, (feed, y_star, now) = self._remembers(y), self._target(r, t)
+        controller, limits, before = self.controller, self.controller.limits, state.u[0]
+        if controller.holds:
+            return before.copy()
+        wished = feed - self._asks @ np.concatenate((state.z[0], y, state.xi[0]))
+        low, high, x, family = limits.low, limits.high, state.x, controller.governor
+        if self._rated:
+            low = np.maximum(low, np.minimum(before - limits.rate, limits.high))
+            high = np.minimum(high, np.maximum(before + limits.rate, limits.low))
+        u = np.minimum(np.maximum(wished, low), high)
+        if family is not None:
+            x = corrected(family, x, y[None])
+            u = governed(family, x, u[None], y_star[None], low[None], high[None])[0]
+            x = predicted(family, x, u[None])
+        xi = _integrated(controller, state.xi, (y_star - y)[None], u[None], wished[None])
+        self._state = State(self._kept(state.z[0], u, y, now)[None], xi, u[None], x)
+        return u.copy()
+
+    def saved(self) -> dict[str, np.ndarray]:
+        """All that it remembers, as arrays. Raises ValueError before the first watch."""
+        arrays = self._remembers(np.zeros(1))._asdict()
+        if self._reference is not None:
+            arrays |= {**self._reference._asdict(), "w": self._w, "t": np.array(self._t)}
+        return {name: np.array(part) for name, part in arrays.items()}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Goes on from what another of the same law and governor `saved`."""
+        self._state = State(*(np.array(arrays[name]) for name in State._fields))
+        self._reference = None
+        if "w" in arrays:
+            self._turned(Reference(*(np.array(arrays[name]) for name in Reference._fields)), int(arrays["t"]))
+            self._moved(np.array(arrays["w"]))
+
+    def _remembers(self, y: np.ndarray) -> State:
+        if self._state is None:
+            raise ValueError("the controller has seen no sample; call watch with each sample in manual first")
+        if not np.isfinite(y.sum()):
+            raise ValueError(
+                f"the controller expects finite temperatures in °C but measured {y}; "
+                "go to manual until every sensor answers"
+            )
+        return self._state
+
+    def _kept(self, z: np.ndarray, u: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
+        """z (q,) a sample on."""
+        shift, c = self.controller.shift, self.controller.law.c
+        if not shift:
+            return self._keeps @ np.concatenate((u, y, r, z)) + c
+        after = self._keeps @ np.concatenate((u, y, r)) + c
+        after[:-shift] += z[shift:]
+        return after
+
+    def _target(self, r: np.ndarray | Reference, t: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Feed (m,), target y* (p,) and reference (p,) at sample t."""
+        mine = self._reference
+        if isinstance(r, Reference):
+            if mine is None or not (r is mine or all(map(np.array_equal, r, mine))):
+                self._turned(r, t)
+        elif mine is None or len(self._w) > 1 or not (mine.H[:, 0] == r).all():
+            self._turned(constant(r), t)
+        if t < self._t:
+            raise ValueError(f"sample {t} comes after sample {self._t}; count samples upwards")
+        if len(self._w) > 1:
+            w = self._w
+            for _ in range(t - self._t):
+                w = self._reference.F @ w
+            self._moved(w)
+        self._t = t
+        return self._now
+
+    def _turned(self, reference: Reference, t: int) -> None:
+        self._reference = Reference(*(np.array(part, float) for part in reference))
+        at, self._aim = self._aimed(reference)
+        self.binding, self._t = at.binding, t
+        self._moved(reference.w0)
+
+    def _moved(self, w: np.ndarray) -> None:
+        self._w = w
+        self._now = self._aim.feed @ w, self._aim.Y @ w, self._reference.H @ w
+
+    def _aimed(self, reference: Reference) -> tuple[Rest, Aim]:
+        key = reference.F.tobytes() + reference.H.tobytes()
+        if key not in self._aims:
+            at = rest(self.model, reference, self.controller.limits)
+            if len(self._aims) >= self.AIMS:
+                del self._aims[next(iter(self._aims))]
+            self._aims[key] = at, aim(self.controller.law, at, reference)
+        return self._aims[key]
