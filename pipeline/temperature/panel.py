@@ -311,8 +311,9 @@ def rolled_out(controller: Deployed, cases: Cases, aimed: Sequence[Aim]) -> Roll
     def outputs(x):
         return (np.matmul(x.reshape(count, each, -1), C) + d).reshape(-1, p)
 
-    state, held = None, outputs(x)
-    for t in range(cases.hold):
+    held = outputs(x)
+    state = watched(controller, None, u, held + noise[0], r[0])
+    for t in range(1, cases.hold):
         state = watched(controller, state, u, held + noise[t], r[0])
     here = [aimed[len(cases.references) + a] for a in cases.start]
     state = handed_over(controller, state, held + noise[cases.hold], here)
