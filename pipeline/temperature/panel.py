@@ -77,12 +77,6 @@ def varied(
     return delayed(changed, late)
 
 
-def hardest(plant: Plant, spread: Spread) -> Plant:
-    """The plant of the spread that bears least: all inputs strongest, quickest, and a sample late."""
-    gains = np.full(plant.m, 1 + spread.input_gain)
-    return varied(plant, gains=gains, slower=-spread.slower, loss=0.0, ambient=0.0, late=True, cells=False)
-
-
 def drawn(
     nominal: Sequence[Plant], count: int, spread: Spread, *, cells: bool, rng: np.random.Generator
 ) -> list[Plant]:

@@ -27,12 +27,12 @@ class Rehearsal(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """What all contestants share, tuned and judged: the rehearsal, the hardest plant of the spread around
-    the identified one, limits of inputs and outputs (low, high (p,) in °C), the governor, the integrator's limit in °C, the settled window in steps,
+    """What all contestants share, tuned and judged: the rehearsal, the identified plant with all inputs a
+    sample late, limits of inputs and outputs (low, high (p,) in °C), the governor, the integrator's limit in °C, the settled window in steps,
     what the cost counts as one, the discount, and the sample time."""
 
     rehearsal: Rehearsal
-    hardest: plant.Plant
+    late: plant.Plant
     limits: governor.Limits
     output_limits: tuple[np.ndarray, np.ndarray]
     governor: governor.Governor
@@ -66,7 +66,7 @@ def shared(
     overshoot = tracking.governor_overshoot_degC * band
     return Setting(
         rehearsal,
-        panel.hardest(family[0], spread_of(settings)),
+        panel.delayed(family[0], late=True),
         input_limits(machine),
         output_limits(machine),
         watchdog(machine, settings, family, rehearsal.noise, overshoot),

@@ -322,7 +322,7 @@ def _number(value: float) -> float | None:
 
 def passes(figures: Mapping[str, Any], rules: TemperatureRules) -> bool:
     """Whether a contestant's figures hold the rules that a rehearsal can ask, at the 90 % quantile over all
-    cases, and margins on every plant."""
+    cases; stable on every plant, and margins of the median one."""
     limits = {
         "settled_error": rules.settled_error_degC,
         "settling": rules.settling_s,
@@ -335,8 +335,8 @@ def passes(figures: Mapping[str, Any], rules: TemperatureRules) -> bool:
     margins, stable = figures["margins"], figures["stable"]
     robust = margins is None or (
         stable["count"] == stable["of"]
-        and (margins["disk"]["worst"] or 0.0) >= rules.disk_margin
-        and (margins["delay_s"]["worst"] is None or margins["delay_s"]["worst"] >= rules.delay_margin_s)
+        and (margins["disk"]["median"] or 0.0) >= rules.disk_margin
+        and (margins["delay_s"]["median"] is None or margins["delay_s"]["median"] >= rules.delay_margin_s)
     )
     return quantiles and robust and figures["crossings"]["cases"] == 0
 
