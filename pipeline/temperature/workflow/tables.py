@@ -57,42 +57,70 @@ QUALITY = Schema(
 
 
 def trajectories(inputs: Sequence[_Signal], outputs: Sequence[_Signal]) -> Schema:
-    """One featured scenario of the panel under every controller, unclipped at the yardstick's weights and as
-    deployed: true outputs, commands, applied inputs."""
+    """Two cases of the comparison under every contestant, as deployed: true outputs with their references,
+    commands, and the inputs that the machine was given."""
     columns = [
-        Column("controller", TEXT, NONE, "which controller"),
+        Column("contestant", TEXT, NONE, "which contestant"),
         Column(
-            "mode", TEXT, NONE, "unclipped, or deployed: clipped to the limits, aimed at a feasible target"
+            "case_name", TEXT, NONE, "typical: of median cost; deciding: the case that the verdict rests on"
         ),
-        Column("time_s", FLOAT, "s", "time since the controller took over"),
-        Column("cost", FLOAT, NONE, "discounted cost so far, at the yardstick's weights", nullable=True),
+        Column("time_s", FLOAT, "s", "time since the contestant took over", low=0),
     ]
-    for name, share in (("low", "5th"), ("median", "50th"), ("high", "95th")):
-        meaning = (
-            f"worst zone's distance from its reference, {share} percentile of all runs on the nominal plant"
-        )
-        columns.append(Column(f"error_{name}_degC", FLOAT, "degC", meaning, low=0, nullable=True))
-    columns += [
-        Column(signal.name, FLOAT, signal.unit, f"true output {signal.name}", nullable=True)
-        for signal in outputs
-    ]
+    for signal in outputs:
+        columns += [
+            Column(signal.name, FLOAT, signal.unit, f"true output {signal.name}", nullable=True),
+            Column(f"{signal.name}_reference", FLOAT, signal.unit, f"what {signal.name} is to be"),
+        ]
     for signal in inputs:
-        columns.append(
-            Column(
-                f"{signal.name}_command",
-                FLOAT,
-                signal.unit,
-                f"{signal.name} as the controller asked",
-                nullable=True,
-            )
-        )
-        columns.append(
-            Column(
-                f"{signal.name}_applied", FLOAT, signal.unit, f"{signal.name} as it was given", nullable=True
-            )
-        )
-    return Schema("trajectories", 2, tuple(columns))
+        columns += [
+            Column(f"{signal.name}_command", FLOAT, signal.unit, f"{signal.name} as asked", nullable=True),
+            Column(f"{signal.name}_applied", FLOAT, signal.unit, f"{signal.name} as given", nullable=True),
+        ]
+    return Schema("trajectories", 3, tuple(columns))
 
+
+# every case that every contestant ran, as deployed, on true outputs
+CASES = Schema(
+    "cases",
+    1,
+    (
+        Column("contestant", TEXT, NONE, "which contestant"),
+        Column("case", INDEX, NONE, "number of the case, the same for every contestant", low=0),
+        Column("plant", INDEX, NONE, "plant of the panel", low=0),
+        Column("kind", TEXT, NONE, "reference: constant, ramp, sinusoid or sequence"),
+        Column("start_degC", FLOAT, "degC", "temperature that the plant was held at"),
+        Column(
+            "settled_error_degC",
+            FLOAT,
+            "degC",
+            "distance of the mean of the last 100 steps from the reference, worst output; missing where unstable",
+            low=0,
+            nullable=True,
+        ),
+        Column("settled_zone", TEXT, NONE, "that output"),
+        Column(
+            "settling_s",
+            FLOAT,
+            "s",
+            "last time outside the band about the reached reference; missing where it never settles",
+            low=0,
+            nullable=True,
+        ),
+        Column("overshoot_degC", FLOAT, "degC", "largest way past a reference", low=0, nullable=True),
+        Column("at_limits_percent", FLOAT, "percent", "share of the time at a limit of an input", 0, 100),
+        Column("energy_percent", FLOAT, "percent", "mean input given, over all inputs", nullable=True),
+        Column("rms_degC", FLOAT, "degC", "root mean square error, worst output", low=0, nullable=True),
+        Column("cost", FLOAT, NONE, "the declared engineering cost, as deployed", low=0, nullable=True),
+        Column(
+            "crossing_degC",
+            FLOAT,
+            "degC",
+            "furthest that an output went beyond plant.outputs.low or high; 0: never; missing: none declared",
+            low=0,
+            nullable=True,
+        ),
+    ),
+)
 
 SCORECARD = Schema(
     "scorecard",
