@@ -6,7 +6,6 @@ from pipeline.report.identification.model import flagged_sentence
 from pipeline.report.shared.digits import THIN, number, percent, short
 from pipeline.report.shared.sources import Sources, lookup
 from pipeline.report.shared.verdict import Missing
-from pipeline.report.temperature.evidence import default_cost
 
 
 def findings(sources: Sources) -> list[tuple[str, str]]:
@@ -17,7 +16,7 @@ def findings(sources: Sources) -> list[tuple[str, str]]:
     if not sources.recorded:
         # of the study's machine, which a user's page is not about
         claims += [_claim(sources), _scaled(tuned), _algorithm_1(evaluated), _start(evaluated)]
-    claims += [_regret(tuned), _printer(sources)]
+    claims.append(_printer(sources))
     units = sources.declared.machine.sample_time_s
     if sources.declared.everything.get("generate_probing", {}).get("source") == "simulated":
         claims += [
@@ -28,7 +27,7 @@ def findings(sources: Sources) -> list[tuple[str, str]]:
             ),
             (
                 "The probing is simulated, the judging is separate.",
-                "The record comes from the study’s machine, simulated within limits; every controller is "
+                "The record comes from the study’s machine, simulated within limits; every contestant is "
                 "judged on plants that nothing was fitted to. Nothing here is a claim about a real printer.",
             ),
         ]
@@ -64,21 +63,21 @@ def _printer(sources: Sources) -> tuple[str, str] | None:
     holds = f"The printer holds {'; '.join(gains)}, in % of duty, °C and s."
     simc = "The page of the identification sets it beside one by SIMC."
     evaluated = sources.metrics["evaluate_temperature"]
-    if isinstance(lookup(evaluated, "controllers.printer_pid"), Missing):
-        refused = lookup(evaluated, "refused.printer_pid")
-        why = "It was not judged." if isinstance(refused, Missing) else f"It was refused: {refused}."
-        return "The printer’s own PID is not among these controllers.", f"{holds} {why} {simc}"
+    if isinstance(lookup(evaluated, "contestants.printer_pid"), Missing):
+        reason = lookup(evaluated, "refused.printer_pid")
+        why = "It was not judged." if isinstance(reason, Missing) else f"It was refused: {reason}."
+        return "The printer’s own PID is not among these contestants.", f"{holds} {why} {simc}"
     return (
-        "The printer’s own PID is among these controllers, as it is.",
+        "The printer’s own PID is among these contestants, as it is.",
         f"{holds} It runs once in {sources.declared.machine.sample_time_s:g}{THIN}s here, as often as the "
-        f"others, and in Klipper every 0.3{THIN}s. It is told no model and no target, is not tuned, and "
-        f"the verdict does not choose it. {_held_stable(evaluated)}{simc}",
+        f"others, and in Klipper every 0.3{THIN}s. It is told no model and is not tuned. "
+        f"{_held_stable(evaluated)}{simc}",
     )
 
 
 def _held_stable(evaluated: Any) -> str:
     """A sentence where the printer's own PID does not hold every plant stable."""
-    plants = lookup(evaluated, "controllers.printer_pid.stable_plants")
+    plants = lookup(evaluated, "contestants.printer_pid.stable")
     if isinstance(plants, Missing) or plants["count"] == plants["of"]:
         return ""
     return (
@@ -138,24 +137,4 @@ def _start(evaluated: Any) -> tuple[str, str]:
         f"Starting the observer at 50 °C costs {percent(100 * (late / best - 1), 2)} for nothing.",
         "Starting it from the first measurement costs next to nothing, "
         "and asks for nothing that is not known.",
-    )
-
-
-def _regret(tuned: Any) -> tuple[str, str]:
-    regret, cost, identity = (
-        lookup(tuned, "practical.regret_identity"),
-        lookup(tuned, "practical.cost"),
-        default_cost(tuned),
-    )
-    if any(isinstance(v, Missing) for v in (regret, cost, identity)):
-        return "What tuning buys.", "Not measured."
-    return (
-        f"Practical tuning lowers the engineering cost by {percent(100 * (1 - cost / identity), 2)}, "
-        "and says what it pays.",
-        f"On the common yardstick the tuned weights cost {percent(100 * regret, 2)} more than the default "
-        "ones: settling, overshoot and "
-        + (
-            "limits are bought with quadratic cost. Gaps on these pages are at the yardstick’s weights, "
-            "unclipped; everything else is as deployed."
-        ),
     )
