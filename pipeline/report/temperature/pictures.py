@@ -189,9 +189,19 @@ def plants(sources: Sources) -> Picture:
     )
 
 
+def _costs(values: np.ndarray) -> charts.Axis:
+    """A scale of decades, but no wider than the costs; ticks at 1, 2 and 5."""
+    low, high = float(values.min()) / 1.05, float(values.max()) * 1.05
+    first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
+    steps = (1, 2, 5) if last - first <= 3 else (1,)
+    every = [k * 10.0**decade for decade in range(first, last + 1) for k in steps]
+    ticks = tuple((value, short(value, 1)) for value in every if low <= value <= high)
+    return charts.Axis(low, high, ticks, log=True)
+
+
 def _slopes(both: pd.DataFrame, a: str, b: str, finding: str) -> Markup:
     values = both.to_numpy().ravel()
-    y = charts.logarithmic(float(values.min()), float(values.max())) if len(values) else charts.linear(0, 1)
+    y = _costs(values) if len(values) else charts.linear(0, 1)
     frame = charts.Frame(
         charts.Axis(0, 1, ((0.15, heading(a)), (0.85, heading(b)))),
         y,
@@ -211,7 +221,7 @@ def _slopes(both: pd.DataFrame, a: str, b: str, finding: str) -> Markup:
 
 def _boxes(cases: pd.DataFrame, names: list[str]) -> Markup:
     values = cases["cost"].to_numpy()
-    x = charts.logarithmic(float(np.quantile(values, 0.01)), float(values.max()))
+    x = _costs(values)
     height = 34 * len(names) + 40
     frame = charts.Frame(
         x,

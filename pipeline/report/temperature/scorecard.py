@@ -184,17 +184,20 @@ def _beside(question: Question, own: Any, places: int) -> list[str]:
     """Median, and the worst case with its plant."""
     if question.key in ("disk", "delay_s"):
         median = entry(own, "margins", question.key, "median")
-        return [] if median is None else [f"median {worded(question, finite(median), places)}"]
+        plain = question._replace(unit="")
+        return [] if median is None else [f"median {worded(plain, finite(median), places)}"]
     figures = entry(own, question.key)
     if not isinstance(figures, Mapping):
         return []
     notes = []
-    if "median" in figures:
-        notes.append(f"median {worded(question, finite(figures['median']), places)}")
-    if "worst" in figures:
-        plant = entry(figures, "worst_case", "plant")
-        worst = worded(question, finite(figures["worst"]), places)
-        notes.append(f"worst {worst}{'' if plant is None else f', plant {plant}'}")
+    bare = question._replace(unit="")
+    for key in ("median", "worst"):
+        # what never settles on most cases does not in the worst either
+        if key in figures and (math.isfinite(finite(figures[key])) or math.isfinite(finite(figures["q90"]))):
+            notes.append(f"{key} {worded(bare, finite(figures[key]), places)}")
+    plant = entry(figures, "worst_case", "plant")
+    if "worst" in figures and plant is not None:
+        notes.append(f"on plant {plant}" if not notes else f"{notes.pop()}, plant {plant}")
     return notes
 
 

@@ -86,7 +86,7 @@ def questions(rules: ReportRules, compared: Mapping[str, Any]) -> list[Question]
         Question(7, "at_limits", "Time at limits", "%", rules.at_limits_percent, False, "time at limits"),
         Question(8, "disk", "Margin: disk", "", rules.disk_margin, True, "disk margin", "unlimited"),
         Question(8, "delay_s", "Margin: delay", "s", rules.delay_margin_s, True, "delay margin", "unlimited"),
-        Question(9, "crossings", "Cases beyond an output’s low or high", "", 0.0, False, "crossings"),
+        Question(9, "crossings", "Crossings of low or high", "", 0.0, False, "crossings"),
         Question(
             10, "data", "Data: samples, of those needed", "×", 1.0, True, "data sufficiency", "unlimited"
         ),
