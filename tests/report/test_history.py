@@ -238,5 +238,5 @@ def test_in_a_browser_it_says_nothing_on_the_console_and_sorts_by_a_figure(empty
     Path("reports/machine.js").write_text(MACHINE)
     page = open_page("history", folder=empty / "reports")
     page.locator("th button", has_text="Gap").click()
-    assert page.locator(".runs tbody td:nth-child(5)").all_inner_texts() == ["0.500", "2.00", "12.0"]
+    assert page.locator(".runs tbody td:nth-child(14)").all_inner_texts() == ["0.500", "2.00", "12.0"]
     assert page.console == [] and page.evaluate("document.documentElement.scrollWidth") <= 1280

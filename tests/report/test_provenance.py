@@ -21,9 +21,7 @@ def lock():
         Path("datasets") / name
         for name in ("compose_parts", "evaluate_temperature", "identify_plant", "ingest")
     ]
-    outs += [
-        Path("datasets") / name for name in ("learn_kernel", "segment_library", "train_ilc", "tune_weights")
-    ]
+    outs += [Path("datasets") / name for name in ("segment_library", "train_ilc", "tune_weights")]
     outs += [Path("datasets") / name for name in ("train_classifier", "train_agent", "evaluate_setpoint")]
     stages = {path.name: {"outs": [{"path": str(path), "md5": provenance.md5(path)}]} for path in outs}
     written = [*Path("reports").glob("*.html"), *Path("reports/metrics").glob("*.json")]

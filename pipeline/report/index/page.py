@@ -355,5 +355,5 @@ def difference_parts(sources: Sources, judged: Judgement) -> DifferenceParts:
         rest=[*still, drift, deposition_change.sentence(parts)],
         changed=changed,
         whose=heading(judged.subject),
-        empty=changed.empty and not moved,
+        empty=changed.empty and not moved and not all(word == "new" for word in rest),
     )

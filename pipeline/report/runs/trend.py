@@ -202,7 +202,8 @@ def _row(run: Revision, asked: Sequence[Question]) -> Row:
 
 
 def verdict_words(text: str) -> str:
-    """The verdict of an earlier version in today's words: it claimed more than simulated machines can show."""
+    """The verdict of an earlier version in today's words: it claimed more than simulated machines can
+    show."""
     if re.match(r"do not deploy", text, re.IGNORECASE):
         return "Failed the rules of its day."
     who = re.match(r"deploy(?: the (\S+) )?", text, re.IGNORECASE)

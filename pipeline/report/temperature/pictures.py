@@ -33,11 +33,14 @@ def case(sources: Sources, judgement: Judgement, name: str) -> Picture:
     table, title = sources.tables["trajectories"], CASES[name]
     if isinstance(table, Missing):
         return placeholder(name, title, table)
+    without = refused(sources.metrics)
     rows = {
         who: (table["contestant"] == who) & (table["case_name"] == name) for who in drawn(sources, judgement)
     }
     runs = {
-        who: {key: values[mask] for key, values in table.items()} for who, mask in rows.items() if mask.any()
+        who: {key: values[mask] for key, values in table.items()}
+        for who, mask in rows.items()
+        if mask.any() and who not in without
     }
     if not runs:
         return placeholder(
@@ -52,7 +55,7 @@ def case(sources: Sources, judgement: Judgement, name: str) -> Picture:
                 _commands(sources, who, runs[who], first=not shown),
             ]
             if who in runs
-            else [_hole(refused(sources.metrics).get(who, "no trajectory was recorded"))]
+            else [_hole(without.get(who, "no trajectory was recorded"))]
         )
         shown.append(Column(heading(who), kind(who), who, panels))
     return Picture(

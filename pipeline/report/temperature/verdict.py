@@ -305,7 +305,10 @@ def _not_passed(
 ) -> Verdict:
     first = first_in(subject.rules)
     failed = first.state == FAILED
-    who = f"No contestant passes; {in_a_sentence(subject.name)} comes closest."
+    # drift is of the machine, not of a contestant
+    who = (
+        "" if first.name == "drift" else f"No contestant passes; {in_a_sentence(subject.name)} comes closest."
+    )
     why = first.reason or _drift_sentence(first)
     open_too = [rule.name for rule in subject.rules if rule.state == OPEN and rule.name not in LATER]
     also = f"Open too: {', '.join(open_too)}." if failed and open_too else ""
@@ -325,7 +328,9 @@ def _not_passed(
 
 def _drift_sentence(rule: Rule) -> str:
     figure = rule.figure
-    return f"Drift is {rule.state}. {figure.sentence()}" if isinstance(figure, Missing) else ""
+    if not isinstance(figure, Missing):
+        return ""
+    return figure.sentence() if rule.state == FAILED else f"Drift is {rule.state}. {figure.sentence()}"
 
 
 def _closest_limit(standing: Standing) -> str:
