@@ -160,8 +160,16 @@ def _put(data: dict[str, Any], names: list[str], item: Any) -> None:
 
 
 def parameters(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The sections of a params file of an earlier version, with today's keys and choices."""
+    """The sections of a params file of an earlier version, with today's keys and choices, without what was
+    retired."""
     today = under_new_names(values, PARAMETERS)
+    for key in RETIRED:
+        *sections, name = key.split(".")
+        holder: Any = today
+        for section in sections:
+            holder = holder.get(section) if isinstance(holder, Mapping) else None
+        if isinstance(holder, dict):
+            holder.pop(name, None)
     for (key, old), new in CHOICES.items():
         *sections, name = key.split(".")
         holder: Any = today

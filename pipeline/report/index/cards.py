@@ -109,7 +109,7 @@ def temperature(sources: Sources, judged: Judgement) -> Card:
         moves="Heaters and motor to barrel temperatures",
         state=judged.verdict.decision.split(":")[0].rstrip("."),
         mark=judged.verdict.winner if passed else None,
-        win=(judged.best, f"{judged.pair.text} {judged.deciding}".strip()),
+        win=(f"{judged.verdict.decision}", f"{judged.pair.text} {judged.best} {judged.deciding}".strip()),
         caption=(
             f"Worst zone’s true error in a typical case, log scale {_FLOOR:g} to "
             f"{number(_CEILING, 0)}\u00a0°C. "

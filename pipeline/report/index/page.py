@@ -54,7 +54,6 @@ def render(sources: Sources, judged: Judgement) -> str:
         setting=setting(comparison(sources.metrics)),
         heads=heads(judged),
         pair=judged.pair,
-        deciding=judged.deciding,
         best=judged.best,
         change=ChangeSentence(ANOTHER)
         if sources.another_machine

@@ -196,8 +196,8 @@ def _beside(question: Question, own: Any, places: int) -> list[str]:
         if key in figures and (math.isfinite(finite(figures[key])) or math.isfinite(finite(figures["q90"]))):
             notes.append(f"{key} {worded(bare, finite(figures[key]), places)}")
     plant = entry(figures, "worst_case", "plant")
-    if "worst" in figures and plant is not None:
-        notes.append(f"on plant {plant}" if not notes else f"{notes.pop()}, plant {plant}")
+    if notes and "worst" in figures and plant is not None:
+        notes.append(f"{notes.pop()}, plant {plant}")
     return notes
 
 
