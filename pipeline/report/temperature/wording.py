@@ -47,6 +47,8 @@ def reason(rule: Rule, name: str = "") -> str:
     question, figure = rule.question, rule.figure
     if isinstance(figure, Missing):
         return figure.sentence()
+    if question is None:
+        return ""
     if question.key == "data":
         return f"{figure.note}."
     places = places_of(question, [figure])
