@@ -165,12 +165,7 @@ def settings() -> dict:
     }
     found["learn_kernel"] |= {"longest_window": 8}
     found["identify_plant"] |= {"max_order": 3}
-    found["tune_weights"] |= {
-        "initial": 4,
-        "evaluations": 8,
-        "practical_initial": 8,
-        "practical_evaluations": 14,
-    }
+    found["tune_weights"] |= {"practical_initial": 8, "practical_evaluations": 14}
     found["nightly"] = SETTINGS | {
         "loops": {
             "temperature": {

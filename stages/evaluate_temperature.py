@@ -1,6 +1,5 @@
-"""Judge every temperature controller on one panel: reads what the temperature stages wrote and
-datasets/published; writes datasets/evaluate_temperature: scorecard.parquet,
-trajectories.parquet, study.parquet and summary.json."""
+"""Judge every temperature controller on one panel: reads what the temperature stages wrote; writes
+datasets/evaluate_temperature: scorecard.parquet, trajectories.parquet and summary.json."""
 
 from pipeline.store import artifacts, params
 from pipeline.temperature.workflow import evaluate_temperature, tables
@@ -14,7 +13,6 @@ def main() -> None:
             params.load(Plant, "plant"),
         )
         tracking, panel = params.load(Tracking, "tracking"), params.load(Panel, "panel")
-        execution = params.load(params.Execution, "execution")
         simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
         evaluate_temperature.check(settings, panel)
         learned = evaluate_temperature.read_learned(
@@ -26,15 +24,12 @@ def main() -> None:
             machine,
         )
         judged = evaluate_temperature.judged(settings, machine, tracking, panel, learned, simulated=simulated)
-        studied = evaluate_temperature.studied(settings, execution, "datasets/published")
         artifacts.write_table(out / "scorecard.parquet", tables.SCORECARD, judged.scorecard)
         artifacts.write_table(out / "trajectories.parquet", *judged.trajectories)
-        artifacts.write_table(out / "study.parquet", tables.STUDY, studied.rows)
         artifacts.write_json(out / "summary.json", judged.summary)
         artifacts.write_metrics(
             "evaluate_temperature",
-            studied.figures
-            | {
+            {
                 "controllers": judged.summary["controllers"],
                 "refused": judged.refused,
                 "without_feed_forward": judged.without_feed_forward,

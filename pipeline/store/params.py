@@ -41,6 +41,7 @@ SECTIONS = (
     "plant",
     "printer",
     "report",
+    "reproduce_study",
     "segment_library",
     "tracking",
     "train_agent",

@@ -28,6 +28,7 @@ PARAMETERS: dict[str, str] = {
     ),
     "evaluate_setpoint.pixels.segment_s": "evaluate_setpoint.pixels.segment_mean_s",
     "evaluate_setpoint.segment": "evaluate_setpoint.segment_mean_decisions",
+    "evaluate_temperature.data_sets": "reproduce_study.data_sets",
     "panel.loss": "panel.extra_heat_loss_per_step",
     "train_agent.ours": "train_agent.belief_dqn",
     "train_agent.ours.filter.look": "train_agent.belief_dqn.filter.width_bias_std",
@@ -39,6 +40,8 @@ PARAMETERS: dict[str, str] = {
     "train_agent.paper": "train_agent.li_2025",
     "train_ilc.law": "train_ilc.model_inverse",
     "train_ilc.paper": "train_ilc.hoelzle_2009",
+    "tune_weights.evaluations": "reproduce_study.evaluations",
+    "tune_weights.initial": "reproduce_study.initial",
 }
 
 # dotted keys that nothing reads any more -> why, as the end of a sentence
@@ -56,6 +59,15 @@ COLUMNS: dict[tuple[str, str], str] = {}
 # dotted keys of reports/metrics/<stage>.json, the stage first; a key stands for all below it, and * for any
 # one name, such as a material
 METRICS: dict[str, str] = {
+    "evaluate_temperature.algorithm_1": "reproduce_study.algorithm_1",
+    "evaluate_temperature.as_published": "reproduce_study.as_published",
+    "evaluate_temperature.kernel": "reproduce_study.kernel",
+    "evaluate_temperature.kernel_predicted_state": "reproduce_study.kernel_predicted_state",
+    "evaluate_temperature.observer": "reproduce_study.observer",
+    "evaluate_temperature.optimal": "reproduce_study.optimal",
+    "evaluate_temperature.printed": "reproduce_study.printed",
+    "evaluate_temperature.takeover": "reproduce_study.takeover",
+    "evaluate_temperature.window": "reproduce_study.window",
     "train_agent.ours": "train_agent.belief_dqn",
     "train_agent.ours_at_0.7": "train_agent.belief_dqn_at_0.7",
     "train_agent.parameters.ours": "train_agent.parameters.belief_dqn",
@@ -66,6 +78,7 @@ METRICS: dict[str, str] = {
     "train_ilc.*.ours": "train_ilc.*.model_inverse",
     "train_ilc.*.paper": "train_ilc.*.hoelzle_2009_nominal",
     "train_ilc.*.paper_on_machine": "train_ilc.*.hoelzle_2009",
+    "tune_weights.parity": "reproduce_study.parity",
 }
 
 

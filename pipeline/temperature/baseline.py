@@ -3,8 +3,12 @@ model's step response (Skogestad 2003).
 
 It gets the care that our own laws get: the feasible target of the model as feed-forward, an integrator that
 the way up does not wind up, one input a zone.
+
+A step response is read where it has risen, not at its first samples: those of a model identified from a
+record are ripple. From them a two-heater kit got gains of the wrong sign on both loops.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,54 +17,215 @@ import scipy.optimize
 from pipeline.temperature.plant import Plant, markov_parameters, strictly_proper
 from pipeline.temperature.tracking import Controller, Law
 
+RISEN = 0.8  # of the largest excursion: up to there a response is fitted; later a slow tail would be tau
+LEVEL = 0.9  # of the band over a family that may not hold zero where a sign is certain
+WEAKEST = 1e-9  # of the strongest effect: below it an input does not move an output
+NOISE_SHARE = (
+    0.03  # of an input's range: 3 percent of duty a standard deviation wears no relay and heats nothing
+)
+MOST_POINTS = 150  # of a response in one fit
+LONGEST_TAU = 5.0  # times the stretch that is fitted: beyond it a straight line stands for every tau
+
 
 class Pairing(NamedTuple):
-    """Input of each output (p,), and SIMC's gain in percent per °C and reset time in samples of each pair;
-    inputs in no pair rest at their target."""
+    """Input of each output (p,), and SIMC's gain in percent per °C and reset time in samples of each pair
+    (p,); inputs in no pair rest at their target.
+
+    slope in °C per percent and sample, time_constant (infinite where the response is a ramp) and delay in
+    samples, each (p,): the first-order model of each pair that the settings come from.
+    """
 
     inputs: np.ndarray
     gain: np.ndarray
     reset: np.ndarray
+    slope: np.ndarray
+    time_constant: np.ndarray
+    delay: np.ndarray
 
 
-def pairing(plant: Plant, low: np.ndarray, high: np.ndarray, *, horizon: int) -> Pairing:
-    """Pairs whose full range heats fastest, one input an output; SIMC on the slope k'
-    and the dead time theta of each pair's step response:
+class Tuning(NamedTuple):
+    """What a search may change of SIMC, each a number or one an output (p,): tau_c = `tau_c_factor` times
+    max(theta, one sample); `gain_factor` multiplies K_c, `reset_factor` T_i."""
 
-    K_c = 1 / (k' (tau_c + theta)), T_i = 4 (tau_c + theta), tau_c = theta >= 1 sample: the rule for
-    near-integrating plants (Skogestad 2003, table 1). The slope is the secant over the second half of the way
-    to the point t* where the line from the step's origin touches the response; t* is no earlier than a
-    hundredth of `horizon`, so that a ripple of the first Markov parameters is not taken for the plant. Raises
-    ValueError where an output obeys no input of its own.
+    tau_c_factor: float | np.ndarray = 1.0
+    gain_factor: float | np.ndarray = 1.0
+    reset_factor: float | np.ndarray = 1.0
+
+
+SIMC = Tuning()
+
+
+class Rise(NamedTuple):
+    """slope tau (1 - exp(-(t - delay) / tau)), the model of one step response; samples, `until` the one up
+    to which it was fitted."""
+
+    slope: float
+    time_constant: float
+    delay: float
+    until: int
+
+
+def pairing(
+    plant: Plant,
+    low: np.ndarray,
+    high: np.ndarray,
+    *,
+    horizon: int,
+    family: Sequence[Plant] = (),
+    noise_degC: np.ndarray | None = None,
+    tuning: Tuning = SIMC,
+) -> Pairing:
+    """Pairs whose full ranges heat fastest (the largest product of slopes, which no unit changes), one input
+    an output, and SIMC on k = slope tau, tau and theta of each pair's step response:
+
+    K_c = tau / (k (tau_c + theta)), T_i = min(tau, 4 (tau_c + theta)), tau_c = max(theta, one sample)
+    (Skogestad 2003, table 1). A held input is late by half a sample, which theta counts; it is no less than
+    one. tau_c is longer where a standard deviation of the sensor's noise (p,) would otherwise move the input
+    by more than `NOISE_SHARE` of its range: so quick a loop is no longer what the record shows.
+
+    A pair counts where its sign is certain: its response goes one way, and the band of the rise over `family`
+    does not hold zero. Modes slower than 2 `horizon` samples count as integrators. Raises ValueError where an
+    output has no such input of its own.
     """
     if plant.m < plant.p:
         raise ValueError(f"PI needs an input for each of the {plant.p} outputs; found {plant.m} inputs")
-    rise = np.concatenate(
-        [np.zeros((1, plant.p, plant.m)), np.cumsum(markov_parameters(plant, horizon), axis=0)]
-    )
-    # the way an output goes in the end is its direction: a first answer
-    # the other way counts as dead time, as SIMC has it
-    forward = rise * np.where(rise[-1] < 0, -1.0, 1.0)
-    t = np.arange(horizon + 1)[:, None, None]
-    shortest = max(horizon // 100, 2)
-    touch = shortest + (forward[shortest:] / t[shortest:]).argmax(axis=0)
-    at, half = (np.take_along_axis(rise, when[None], axis=0)[0] for when in (touch, touch // 2))
-    slope = (at - half) / (touch - touch // 2)
-    effect = np.abs(slope) * (high - low)
-    outputs, inputs = scipy.optimize.linear_sum_assignment(-effect)
-    if (effect[outputs, inputs] <= 1e-9 * effect.max()).any():
-        raise ValueError(
-            f"PI needs an input for each of the {plant.p} outputs; "
-            "found an output that none of the free inputs moves"
+    fitted = rises(plant, horizon)
+    slope = np.array([[rise.slope for rise in row] for row in fitted])
+    stretch = _stretch(plant, horizon)[0]
+    responses, *others = (_responses(member, stretch) for member in (plant, *family))
+    inputs = _assigned(np.abs(slope) * (high - low), _certain(responses, fitted, others))
+    # the gain in percent per °C at which noise moves the input by its share: the inverse may be zero
+    noise = np.zeros(plant.p) if noise_degC is None else noise_degC
+    per_gain = noise / (NOISE_SHARE * (high - low)[inputs])
+    return _settings([fitted[o][i] for o, i in enumerate(inputs)], inputs, per_gain, tuning)
+
+
+def rises(plant: Plant, horizon: int) -> list[list[Rise]]:
+    """The rise of each output (p lists) at a step of each input (m each), of a slope of its sign; `horizon`
+    as in `pairing`."""
+    stretch, decayed = _stretch(plant, horizon)
+    responses = _responses(plant, stretch)
+    direction = _direction(responses, decayed)
+    return [
+        [_rise(direction[o, i] * responses[:, o, i], direction[o, i]) for i in range(plant.m)]
+        for o in range(plant.p)
+    ]
+
+
+def _responses(plant: Plant, horizon: int) -> np.ndarray:
+    """Step responses (horizon + 1, p, m) from rest, zero at the sample of the step."""
+    rise = np.cumsum(markov_parameters(strictly_proper(plant), horizon), axis=0)
+    return np.concatenate([np.zeros((1, *rise.shape[1:])), rise])
+
+
+def _stretch(plant: Plant, horizon: int) -> tuple[int, bool]:
+    """Samples over which responses are followed, and whether every mode has decayed by then: three time
+    constants of the slowest.
+
+    A mode twice as slow as `horizon` is an integrator to it, and has no end to look at: a tenth is followed,
+    so that the slope is that of the rise and not of what neighbours do much later (as `trust.horizon` does).
+    """
+    radius = np.abs(np.linalg.eigvals(strictly_proper(plant).A)).max()
+    slowest = -1 / np.log(np.clip(radius, 1e-6, 1 - 1e-12)) if radius < 1 else np.inf
+    if slowest > 2 * horizon:
+        return max(horizon // 10, min(20, horizon)), False
+    return max(int(np.ceil(3 * slowest)), 20), True
+
+
+def _direction(responses: np.ndarray, decayed: bool) -> np.ndarray:
+    """The way (p, m) that each output goes: in the end where modes have `decayed`; otherwise the way of its
+    largest excursion, as an end there is none. A first answer the other way counts as dead time."""
+    largest = np.take_along_axis(responses, np.abs(responses).argmax(axis=0)[None], axis=0)[0]
+    return np.where((responses[-1] if decayed else largest) < 0, -1.0, 1.0)
+
+
+def _rise(forward: np.ndarray, sign: float) -> Rise:
+    """The model of one response (horizon + 1,) that goes upward, fitted in least squares to where it first
+    reaches RISEN of its peak; `sign` turns the slope back."""
+    peak = int(forward.argmax())
+    if not forward[peak] > 0:
+        return Rise(0.0, np.inf, 0.0, len(forward) - 1)
+    until = max(int(np.argmax(forward >= RISEN * forward[peak])), min(5, len(forward) - 1))
+    t = np.unique(np.linspace(0, until, MOST_POINTS).round())
+    target = forward[t.astype(int)]
+    taus = np.r_[np.geomspace(0.5, LONGEST_TAU * until, 60), np.inf]
+    delays = np.unique((0.8 * until * np.linspace(0, 1, 50) ** 2).round())
+    tau, delay = _nearest(t, target, taus, delays)
+    if np.isfinite(tau):
+        taus = tau * np.geomspace(0.85, 1.15, 25)
+        width = np.diff(delays, prepend=0.0)[delays == delay].max() + 1
+        delays = np.r_[delay, np.clip(np.linspace(delay - width, delay + width, 25), 0.0, None)]
+        tau, delay = _nearest(t, target, taus, delays)
+    shape = _shapes(t, np.array([tau]), np.array([delay]))[:, 0]
+    return Rise(float(sign * (shape @ target) / (shape @ shape)), float(tau), float(delay), until)
+
+
+def _shapes(t: np.ndarray, tau: np.ndarray, delay: np.ndarray) -> np.ndarray:
+    """tau (1 - exp(-(t - delay) / tau)) of slope one (T, k); a ramp where tau is infinite."""
+    late = np.maximum(t[:, None] - delay, 0.0)
+    bounded = np.where(np.isfinite(tau), tau, 1.0)
+    return np.where(np.isfinite(tau), -bounded * np.expm1(-late / bounded), late)
+
+
+def _nearest(t, target, taus, delays) -> tuple[float, float]:
+    """tau and delay of the grid nearest in least squares, the slope free and not negative."""
+    delay, tau = (part.ravel() for part in np.meshgrid(delays, taus, indexing="ij"))
+    shapes = _shapes(t, tau, delay)
+    products = np.maximum(target @ shapes, 0.0)
+    best = int((products**2 / np.maximum(np.sum(shapes**2, axis=0), np.finfo(float).tiny)).argmax())
+    return float(tau[best]), float(delay[best])
+
+
+def _certain(responses: np.ndarray, fitted: list[list[Rise]], others: list[np.ndarray]) -> np.ndarray:
+    """Whether the sign of each pair (p, m) is certain: its excursions the other way are smaller than the
+    response itself, and the mean of the rise has one sign over LEVEL of the family."""
+    certain = np.zeros(responses.shape[1:], bool)
+    for (o, i), _ in np.ndenumerate(certain):
+        rise, forward = fitted[o][i], responses[:, o, i] * np.sign(fitted[o][i].slope)
+        certain[o, i] = rise.slope != 0 and forward[: rise.until + 1].min() > -forward.max()
+        if others and certain[o, i]:
+            means = [np.sign(rise.slope) * one[: rise.until + 1, o, i].mean() for one in others]
+            certain[o, i] = np.quantile(means, (1 - LEVEL) / 2) > 0
+    return certain
+
+
+def _assigned(effect: np.ndarray, certain: np.ndarray) -> np.ndarray:
+    """Input of each output (p,) with the largest product of effects (p, m). Raises ValueError where some
+    output is left without a certain one."""
+    moves = effect > WEAKEST * effect.max()
+    allowed = moves & certain
+    # one that is not allowed costs more than all that are could save
+    cost = -np.log(np.where(allowed, effect, 1.0))
+    worst = (np.ptp(cost[allowed]) + 1.0) * len(effect) if allowed.any() else 1.0
+    inputs = scipy.optimize.linear_sum_assignment(np.where(allowed, cost, cost.max() + worst))[1]
+    unpaired = np.flatnonzero(~allowed[np.arange(len(effect)), inputs])
+    if unpaired.size:
+        o = unpaired[0]
+        reason = (
+            f"the sign of the effect of input {int(np.where(moves[o], effect[o], 0).argmax()) + 1} on output "
+            f"{o + 1} is not certain; record longer holds of that input"
+            if moves[inputs].any() and (moves[o] & ~certain[o]).any()
+            else "an output that none of the free inputs moves"
         )
-    slope, at, touch = slope[outputs, inputs], at[outputs, inputs], touch[outputs, inputs]
-    theta = np.maximum(touch - at / slope, 1.0)
-    return Pairing(inputs, 1 / (2 * theta * slope), 8 * theta)
+        raise ValueError(f"PI needs an input for each of the {len(effect)} outputs; found {reason}")
+    return inputs
+
+
+def _settings(fitted: list[Rise], inputs: np.ndarray, per_gain: np.ndarray, tuning: Tuning) -> Pairing:
+    """SIMC on each pair, with tau_c so long that no gain in percent per °C is above 1 / `per_gain` (p,)."""
+    slope, tau, delay = (
+        np.array([getattr(rise, name) for rise in fitted]) for name in ("slope", "time_constant", "delay")
+    )
+    theta = np.maximum(delay + 0.5, 1.0)
+    tau_c = np.maximum(tuning.tau_c_factor * theta, per_gain / np.abs(slope) - theta)
+    gain = tuning.gain_factor / (slope * (tau_c + theta))
+    reset = tuning.reset_factor * np.minimum(tau, 4 * (tau_c + theta))
+    return Pairing(inputs, gain, reset, slope, tau, delay)
 
 
 def pi_law(pairs: Pairing, *, inputs: int) -> Law:
-    """u = u_target + K_c (r + xi - y) on each pair, xi(t+1) = xi + (r - y) /
-    T_i with the slowest pair's T_i; no other memory."""
+    """u = u_target + K_c (r + xi - y) on each pair, xi(t+1) = xi + (r - y) / T_i with each zone's own T_i;
+    no other memory."""
     p = len(pairs.inputs)
     to_input = np.zeros((inputs, p))
     to_input[pairs.inputs, np.arange(p)] = pairs.gain
@@ -78,12 +243,21 @@ def pi_law(pairs: Pairing, *, inputs: int) -> Law:
         start_u=np.zeros((0, inputs)),
         start_y=np.zeros((0, p)),
         start=np.zeros(0),
-        integral=1 / pairs.reset.max(),
+        integral=1 / pairs.reset,
     )
 
 
-def controller(plant: Plant, limits: tuple[np.ndarray, np.ndarray], *, horizon: int) -> Controller:
-    """PI a zone, tuned by SIMC; the weights mean nothing to it. `limits` low and high (m,)."""
-    plant = strictly_proper(plant)
-    law = pi_law(pairing(plant, *limits, horizon=horizon), inputs=plant.m)
-    return Controller("baseline", lambda q, r, integral: law, plant, own_feed_forward=False)
+def controller(
+    plant: Plant,
+    limits: tuple[np.ndarray, np.ndarray],
+    *,
+    horizon: int,
+    family: Sequence[Plant] = (),
+    noise_degC: np.ndarray | None = None,
+    tuning: Tuning = SIMC,
+) -> Controller:
+    """PI a zone, tuned by SIMC; the weights mean nothing to it. `limits` low and high (m,), the rest as in
+    `pairing`."""
+    pairs = pairing(plant, *limits, horizon=horizon, family=family, noise_degC=noise_degC, tuning=tuning)
+    law = pi_law(pairs, inputs=plant.m)
+    return Controller("baseline", lambda q, r, integral: law, strictly_proper(plant), own_feed_forward=False)

@@ -342,12 +342,40 @@ class Margins(NamedTuple):
 def margins(plants: Sequence[Plant], law: Law, *, grid: int = 240) -> list[Margins]:
     """Of each plant: disk margin 1 / max |S - I/2| (Seiler, Packard, Gahinet 2020, skew 0) and delay margin
     min (pi + arg lambda(L)) / omega over |lambda(L)| = 1."""
-    omega = np.concatenate(
-        [np.geomspace(1e-4, 0.3, grid // 2, endpoint=False), np.linspace(0.3, np.pi, grid - grid // 2)]
-    )
+    omega = _frequencies(grid)
     z = np.exp(1j * omega)
     K = law_response(law, z)
     return [_margins(plant, law, omega, z, K) for plant in plants]
+
+
+def disk_margin(plant: Plant, law: Law, *, grid: int = 80) -> float:
+    """The disk margin alone, of a loop that is stable: who has run it knows."""
+    z = np.exp(1j * _frequencies(grid))
+    K = law_response(law, z)
+    G = _response(plant, z)
+    return _disk(G @ K, K @ G)
+
+
+def _frequencies(grid: int) -> np.ndarray:
+    """rad a step: even in logarithms where loops of heaters cross, then even to pi."""
+    return np.concatenate(
+        [np.geomspace(1e-4, 0.3, grid // 2, endpoint=False), np.linspace(0.3, np.pi, grid - grid // 2)]
+    )
+
+
+def _response(plant: Plant, z: np.ndarray) -> np.ndarray:
+    return plant.C @ np.linalg.solve(
+        z[:, None, None] * np.eye(plant.n) - plant.A, np.broadcast_to(plant.B, (len(z), plant.n, plant.m))
+    )
+
+
+def _disk(*loops: np.ndarray) -> float:
+    return float(
+        min(
+            1 / _structured(np.linalg.inv(np.eye(L.shape[1]) + L) - np.eye(L.shape[1]) / 2).max()
+            for L in loops
+        )
+    )
 
 
 def _structured(M: np.ndarray, *, sweeps: int = 12) -> np.ndarray:
@@ -372,15 +400,11 @@ def _margins(plant: Plant, law: Law, omega: np.ndarray, z: np.ndarray, K: np.nda
     radius = np.abs(np.linalg.eigvals(closed_loop(plant, law))).max()
     if radius >= 1:
         return Margins(0.0, 0.0, False, float(radius))
-    G = plant.C @ np.linalg.solve(
-        z[:, None, None] * np.eye(plant.n) - plant.A, np.broadcast_to(plant.B, (len(z), plant.n, plant.m))
-    )
+    G = _response(plant, z)
     loops = (G @ K, K @ G)
-    disk = min(
-        1 / _structured(np.linalg.inv(np.eye(L.shape[1]) + L) - np.eye(L.shape[1]) / 2).max() for L in loops
-    )
+    disk = _disk(*loops)
     return Margins(
-        float(disk),
+        disk,
         _delay_margin(omega, np.linalg.eigvals(loops[0])) * plant.sample_time_s,
         True,
         float(radius),
@@ -408,8 +432,15 @@ def closed_loop(plant: Plant, law: Law) -> np.ndarray:
 
 
 def law_response(law: Law, z: np.ndarray) -> np.ndarray:
-    """Frequency response K (grid, m, p) of the law, u = -K(z) y, its memory fed with its own command; by one
-    Schur form, triangular at every frequency."""
+    """Frequency response K (grid, m, p) of the law, u = -K(z) y, its memory fed with its own command: of a
+    memory that is a plain shift (controller.compact) as polynomials in 1 / z, of any other by one Schur form,
+    triangular at every frequency."""
+    m, q = law.K.shape
+    if q and q % m == 0 and np.array_equal(law.A, np.eye(q, k=m)) and np.array_equal(law.K, np.eye(m, q)):
+        back = z[:, None] ** -np.arange(1, q // m + 1)
+        of_u, of_y = (np.einsum("gl,lij->gij", back, B.reshape(q // m, m, -1)) for B in (law.B_u, law.B_y))
+        of_xi = (-np.asarray(law.integral) / (z[:, None] - 1))[:, None, :] * law.K_r
+        return np.linalg.solve(np.eye(m) + of_u, of_y + law.D + of_xi)
     T, V = scipy.linalg.schur(law.A - law.B_u @ law.K, output="complex")
     from_y, from_xi = V.conj().T @ (law.B_y - law.B_u @ law.D), V.conj().T @ law.B_u @ law.K_r
     K, identity = law.K @ V, np.eye(len(T))

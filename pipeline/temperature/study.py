@@ -22,9 +22,10 @@ from pipeline.temperature.scorecard import (
     simulate,
 )
 from pipeline.temperature.tracking import Law, gains, observer_gain, observer_law
-from pipeline.temperature.tuning import fitness
+from pipeline.temperature.tuning import Result, fitness
 
-YARDSTICK = Yardstick(np.ones(5), np.ones(7), GAMMA)
+OUTPUTS, INPUTS = 5, 7
+YARDSTICK = Yardstick(np.ones(OUTPUTS), np.ones(INPUTS), GAMMA)
 AMPLITUDES, BANDWIDTH, VARIANCE = np.arange(100.0, 0.0, -10.0), 1.65, 1.5
 
 
@@ -239,9 +240,15 @@ def tuning_objective(theta: np.ndarray) -> float:
     )
 
 
-def tuning_parts(theta: np.ndarray) -> tuple[float, float]:
+class TuningParts(NamedTuple):
     """What tuning_objective adds up, each in its own unit: discounted r.m.s. error e in °C and effort u in
     percent, F = sum_t gamma^t (5 e^2 + 7 u^2)."""
+
+    tracking_degC: float
+    effort_percent: float
+
+
+def tuning_parts(theta: np.ndarray) -> TuningParts:
     plant, discount = baam(), GAMMA ** np.arange(101)
     best = gains(plant, np.diag(theta[:5]), np.diag(theta[5:]), GAMMA)
     x, squares = np.full(plant.n, 20.0), np.empty((101, 2))
@@ -250,7 +257,7 @@ def tuning_parts(theta: np.ndarray) -> tuple[float, float]:
         squares[t] = ((plant.C @ x + plant.D @ u + plant.d - REFERENCE) ** 2).mean(), (u**2).mean()
         x = plant.A @ x + plant.B @ u + plant.b
     error, effort = np.sqrt(discount @ squares / discount.sum())
-    return float(error), float(effort)
+    return TuningParts(float(error), float(effort))
 
 
 class ScaledWeights(NamedTuple):
@@ -273,3 +280,37 @@ def scaled_weights(scale: float = 0.4) -> ScaledWeights:
         for factor in (1.0, scale)
     ]
     return ScaledWeights(float(100 * (J[1] / J[0] - 1)), float(np.abs(one.K_x - other.K_x).max()))
+
+
+def candidates(result: Result) -> dict[str, list | np.ndarray]:
+    """The candidates of a search for the least (37) as columns, one row a candidate; NaN where one failed."""
+    history = result.history
+    parts = np.array(
+        [
+            (np.nan, np.nan) if failed else tuning_parts(theta)
+            for theta, failed in zip(history.theta, history.failed, strict=True)
+        ]
+    )
+    return {
+        "evaluation": np.arange(1, len(history.cost) + 1),
+        "cost": history.cost,
+        "incumbent": history.incumbent,
+        "tracking_degC": parts[:, 0],
+        "effort_percent": parts[:, 1],
+        "chosen": (history.theta == result.theta).all(axis=1),
+        "failure": list(history.failed),
+    }
+
+
+def parity_metrics(result: Result) -> dict:
+    """What a search for the least (37) ends at, beside its known optimum, Q = R = I, and the weights that it
+    recommends."""
+    optimum = np.ones(OUTPUTS + INPUTS)
+    return {
+        "best_cost_perfect_state": result.cost,
+        "optimum": tuning_objective(optimum),
+        "scaled_weights": scaled_weights(),
+        "trade": {"optimum": tuning_parts(optimum)},
+        "q": result.theta[:OUTPUTS],
+        "r": result.theta[OUTPUTS:],
+    }

@@ -194,6 +194,25 @@ def policy_iteration(
     )
 
 
+def still_law(m: int, p: int) -> Law:
+    """A law that asks for nothing and remembers nothing: what doing nothing is judged as."""
+    none = np.zeros((0, 0))
+    return Law(
+        A=none,
+        B_u=np.zeros((0, m)),
+        B_y=np.zeros((0, p)),
+        B_r=np.zeros((0, p)),
+        c=np.zeros(0),
+        K=np.zeros((m, 0)),
+        D=np.zeros((m, p)),
+        K_r=np.zeros((m, p)),
+        k=np.zeros(m),
+        start_u=np.zeros((0, m)),
+        start_y=np.zeros((0, p)),
+        start=np.zeros(0),
+    )
+
+
 def stabilises(plant: Plant, K_x: np.ndarray) -> bool:
     """Whether every eigenvalue of A - B K_x lies inside the unit circle."""
     return bool(np.abs(np.linalg.eigvals(plant.A - plant.B @ K_x)).max() < 1)
@@ -270,10 +289,15 @@ def started_reached(law: Law, plant: Plant, *, forgets: float = 0.01) -> Law:
     third of the gap to the optimum on the study's plant, and five times the worst settling over the training
     panel, where input gains and heat loss differ (measured).
     """
+    inverse = reached_state(plant, forgets=forgets)
+    return law._replace(start_y=inverse, start=-inverse @ plant.d)
+
+
+def reached_state(plant: Plant, *, forgets: float = 0.01) -> np.ndarray:
+    """W C'(C W C')^-1 (n, p) of `started_reached`."""
     radius = max(1.0, np.abs(np.linalg.eigvals(plant.A)).max())
     W = scipy.linalg.solve_discrete_lyapunov((1 - forgets) / radius * plant.A, plant.B @ plant.B.T)
-    inverse = W @ plant.C.T @ np.linalg.pinv(plant.C @ W @ plant.C.T, hermitian=True)
-    return law._replace(start_y=inverse, start=-inverse @ plant.d)
+    return W @ plant.C.T @ np.linalg.pinv(plant.C @ W @ plant.C.T, hermitian=True)
 
 
 class Target(NamedTuple):

@@ -142,11 +142,37 @@ def predictor(window: Window, sample_time_s: float = 1.0) -> Plant:
     )
 
 
+def observer_form(window: Window, sample_time_s: float = 1.0) -> tuple[Plant, np.ndarray]:
+    """The same predictor with N p states instead of N (m+p), and T (N p, N (m+p)) with x = T w.
+
+    x_i(t) = sum_{l >= i} A_l y(t - l + i - 1) + B_l u(t - l + i - 1), y = x_1 + theta_0, so that
+    x_i(t+1) = A_i y + B_i u + x_{i+1}: the observer canonical form of a VARX model (Kailath 1980, 2.1).
+    """
+    N, p = window.N, len(window.Theta)
+    m = window.Theta.shape[1] // N - p
+    B_l, A_l = (
+        part.reshape(p, N, -1).transpose(1, 0, 2)
+        for part in (window.Theta[:, : N * m], window.Theta[:, N * m :])
+    )
+    of_y, B = A_l.reshape(N * p, p), B_l.reshape(N * p, m)
+    C = np.eye(p, N * p)
+    A = np.eye(N * p, k=p) + of_y @ C
+    T = np.zeros((N * p, N * (m + p)))
+    for i in range(N):
+        for lag in range(N - i):
+            rows = slice(i * p, (i + 1) * p)
+            T[rows, lag * m : (lag + 1) * m] = B_l[i + lag]
+            T[rows, N * m + lag * p : N * m + (lag + 1) * p] = A_l[i + lag]
+    b = of_y @ window.theta_0
+    return make_plant(A, B, C, b=b, d=window.theta_0, K=of_y, sample_time_s=sample_time_s), T
+
+
 def law(window: Window, Q: np.ndarray, R: np.ndarray, gamma: float, *, integral: float = 0.0) -> Law:
     """Optimal tracking (3) of the predictor: u = -K w - K_r r - k on
     the window of past inputs and outputs."""
-    K_x, K_r, k, _ = gains(predictor(window), Q, R, gamma)
-    return window_law(K_x, K_r, k, window.N, integral=integral)
+    model, T = observer_form(window)
+    K_x, K_r, k, _ = gains(model, Q, R, gamma)
+    return window_law(K_x @ T, K_r, k, window.N, integral=integral)
 
 
 def controller(window: Window, gamma: float) -> Controller:
@@ -154,7 +180,7 @@ def controller(window: Window, gamma: float) -> Controller:
     return Controller(
         "window",
         lambda q, r, integral: law(window, np.diag(q), np.diag(r), gamma, integral=integral),
-        predictor(window),
+        observer_form(window)[0],
     )
 
 

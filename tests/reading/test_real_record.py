@@ -27,6 +27,7 @@ STAGES = (
     "learn_kernel",
     "tune_weights",
     "evaluate_temperature",
+    "reproduce_study",
     "report",
 )
 
@@ -57,9 +58,9 @@ KIT = {
 SMALL = {
     "panel.noise_degC": [0, 0.1],
     "panel.steps": 600,
-    "tune_weights.initial": 6,
-    "tune_weights.evaluations": 12,
-    "evaluate_temperature.data_sets": 1,
+    "reproduce_study.initial": 6,
+    "reproduce_study.evaluations": 12,
+    "reproduce_study.data_sets": 1,
 }
 
 
@@ -259,7 +260,7 @@ def test_a_folder_with_a_gap_a_missing_input_and_a_broken_file_goes_all_the_way(
     tree = project(
         root,
         tmp_path / "tree",
-        KIT | {"identify_plant.refinement": "validated", "evaluate_temperature.data_sets": 1},
+        KIT | {"identify_plant.refinement": "validated", "reproduce_study.data_sets": 1},
     )
     raw = tree / "datasets/raw/temperature"
     missing = lines[2500].split(",")

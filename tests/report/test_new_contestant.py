@@ -5,8 +5,8 @@ import re
 import pytest
 
 from pipeline.report.shared.page import MARKS
-from pipeline.report.temperature.contestants import CONTESTANTS
 from pipeline.store import artifacts
+from pipeline.temperature.workflow.contestants import CONTESTANTS
 from stages.report import main
 from tests.report import made
 from tests.report.test_pages import INDEX, TEMPERATURE, Page
@@ -50,7 +50,7 @@ def refused(project):
 def test_a_refused_contestant_is_named_with_its_reason_and_keeps_its_column_of_the_pictures(refused):
     text = Page(TEMPERATURE).text
     assert f"PI, tuned is refused: {refused}." in text
-    assert columns(TEMPERATURE.read_text(), "typical") == ["mb", "dd", "bl"]
+    assert columns(TEMPERATURE.read_text(), "typical") == ["mb", "dd", "bl hollow"]
     for path in (INDEX, TEMPERATURE):
         assert f"Failed. {refused}." in Page(path).text, path
     assert "dvc repro evaluate_temperature" not in TEMPERATURE.read_text()

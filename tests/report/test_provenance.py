@@ -23,6 +23,7 @@ def lock():
     ]
     outs += [Path("datasets") / name for name in ("segment_library", "train_ilc", "tune_weights")]
     outs += [Path("datasets") / name for name in ("train_classifier", "train_agent", "evaluate_setpoint")]
+    outs.append(Path("datasets/reproduce_study"))
     stages = {path.name: {"outs": [{"path": str(path), "md5": provenance.md5(path)}]} for path in outs}
     written = [*Path("reports").glob("*.html"), *Path("reports/metrics").glob("*.json")]
     stages["report"] = {

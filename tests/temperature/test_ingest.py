@@ -323,7 +323,7 @@ def test_a_dask_cluster_of_two_workers_gives_the_bytes_of_one_machine(tmp_path, 
 
 
 def test_what_the_cluster_computes_for_a_stage_is_what_this_machine_computes(cluster):
-    """The judging of learners on noisy data sets, as evaluate_temperature spreads it."""
+    """The judging of learners on noisy data sets, as reproduce_study spreads it."""
     rng = np.random.default_rng(0)
     sets_u, sets_y = study.data_sets(rng, 1500, 2)
     calls = [

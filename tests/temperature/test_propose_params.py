@@ -272,9 +272,7 @@ def test_the_printers_own_pid_is_judged_beside_the_others_and_swings_as_its_log_
     sections = yaml.safe_load(before)
     sections["panel"] |= {"steps": 300, "noise_degC": [0.1]}
     sections["panel"]["judging"] |= {"starts_degC": [40.0], "reference_offsets_degC": [0.0], "seeds": [1]}
-    sections["tune_weights"] |= {"initial": 5, "evaluations": 8, "practical_initial": 5}
-    sections["tune_weights"] |= {"practical_evaluations": 8}
-    sections["evaluate_temperature"]["data_sets"] = 1
+    sections["tune_weights"] |= {"practical_initial": 5, "practical_evaluations": 8}
     file.write_text(yaml.safe_dump(sections))
     run(printer, "learn_kernel", "tune_weights", "evaluate_temperature")
     file.write_text(before)

@@ -1,10 +1,23 @@
-"""What the learners reach on the study's machine, each beside its bar."""
+"""What the learners reach on the study's machine, each beside its bar; and the stage that no recording
+touches."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
-from pipeline.temperature import study
-from pipeline.temperature.published import REFERENCE
+from pipeline.store import artifacts, params
+from pipeline.temperature import study, tuning
+from pipeline.temperature.published import GAMMA, REFERENCE
+from pipeline.temperature.workflow import reproduce_study, tables
+from pipeline.temperature.workflow.settings import ReproduceStudy
+from tests.house import expected
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -107,3 +120,92 @@ def test_the_study_s_panel_holds_every_cell_at_20_degrees():
     cases = study.study_panel(REFERENCE[None], noise=0.1, seeds=(3,), hold=5)
     np.testing.assert_array_equal(cases.x0, np.full((1, 6), 20.0))
     assert (cases.steps, cases.hold, cases.seed.tolist(), cases.noise.tolist()) == (1000, 5, [3], [0.1])
+
+
+# ---- the parity search
+
+
+@pytest.mark.parametrize("theta", [np.ones(12), np.linspace(0.05, 0.9, 12)])
+def test_error_and_effort_add_up_to_the_studys_objective(theta):
+    error, effort = study.tuning_parts(theta)
+    total = (GAMMA ** np.arange(101)).sum() * (5 * error**2 + 7 * effort**2)
+    # the same run, by steps instead of by products of matrices
+    np.testing.assert_allclose(total, study.tuning_objective(theta), rtol=1e-9)
+
+
+def test_each_candidate_has_the_error_and_the_effort_that_make_its_cost_and_a_failed_one_none():
+    theta = np.stack([np.ones(12), np.full(12, 0.5), np.linspace(0.05, 0.9, 12)])
+    cost = np.array([study.tuning_objective(theta[0]), np.nan, study.tuning_objective(theta[2])])
+    history = tuning.History(theta, cost, ("", "no gain", ""), np.fmin.accumulate(cost))
+    table = study.candidates(tuning.Result(theta[0], float(cost[0]), history))
+    total = (GAMMA ** np.arange(101)).sum() * (
+        5 * table["tracking_degC"] ** 2 + 7 * table["effort_percent"] ** 2
+    )
+    np.testing.assert_allclose(total, cost, rtol=1e-9)  # by steps instead of by products; NaN where it failed
+    assert table["chosen"].tolist() == [True, False, False] and table["failure"] == ["", "no gain", ""]
+    assert list(table) == [column.name for column in tables.PARITY.columns]
+
+
+def test_the_parity_search_ends_near_the_known_optimum_with_weights_whose_cost_it_states():
+    search = reproduce_study._parity(params.load(ReproduceStudy, "reproduce_study", ROOT / "params.yaml"))
+    figures = study.parity_metrics(search)
+    theta = np.concatenate([figures["q"], figures["r"]])
+    assert (len(figures["q"]), len(figures["r"])) == (5, 7)
+    assert study.tuning_objective(theta) == figures["best_cost_perfect_state"]
+    # 1 to 34 of 151,820 over seeds, as tuning.py says; this seed 2
+    assert 0 <= figures["best_cost_perfect_state"] - figures["optimum"] < 35
+
+
+# ---- the stage
+
+
+def test_the_stage_reads_the_studys_draws_and_its_own_section_and_nothing_else():
+    entry = expected(ROOT, "reproduce_study")
+    assert [path for path in entry["deps"] if path.startswith(("datasets", "reports"))] == [
+        "datasets/published"
+    ]
+    assert entry["params"] == [{"params.expert.yaml": ["reproduce_study"]}]
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"r_low": 0.5}, "reproduce_study.r_low is 0.5 but must be less than reproduce_study.r_high, 0.4"),
+        ({"initial": 200}, "initial is 200 but must be at most reproduce_study.evaluations, 150"),
+    ],
+)
+def test_a_search_without_room_is_refused_in_one_sentence(change, sentence):
+    settings = params.load(ReproduceStudy, "reproduce_study", ROOT / "params.yaml").model_copy(update=change)
+    with pytest.raises(ValueError, match=f"{sentence}; change one of the two"):
+        reproduce_study.check(settings)
+
+
+def test_the_stage_runs_where_nobody_has_a_machine_or_a_recording(tmp_path):
+    """Without `plant`, `panel`, `tracking` and any artifact: the optimum is the known one all the same."""
+    (tmp_path / "datasets").mkdir()
+    for name in ("pipeline", "stages", "datasets/published"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    owner, expert = params.files(ROOT / "params.yaml").values()
+    for section in ("plant", "panel", "tracking"):
+        owner.pop(section, None)
+        expert.pop(section, None)
+    expert["reproduce_study"] |= {"data_sets": 1, "initial": 4, "evaluations": 8}
+    (tmp_path / "params.yaml").write_text(yaml.safe_dump(owner))
+    (tmp_path / "params.expert.yaml").write_text(yaml.safe_dump(expert))
+    ended = subprocess.run(
+        [sys.executable, "-m", "stages.reproduce_study"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONDONTWRITEBYTECODE": "1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert ended.returncode == 0, ended.stderr
+    figures = artifacts.read_json(tmp_path / "reports/metrics/reproduce_study.json")
+    assert figures["optimal"]["J1000"] == pytest.approx(151_875.28, abs=0.01)  # printed digits
+    assert figures["algorithm_1"] == {"failures": 106, "of": 300}
+    assert figures["window"]["noise_0_1"]["of"] == 1
+    folder = tmp_path / "datasets/reproduce_study"
+    assert len(artifacts.read_table(folder / "parity.parquet", tables.PARITY)["cost"]) == 8
+    assert len(artifacts.read_table(folder / "study.parquet", tables.STUDY)["gap"]) == 2 * len(study.ROUTES)

@@ -1,5 +1,6 @@
 """Page one: the verdict, the twelve answers, a card a loop, the difference, words, provenance."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -149,7 +150,12 @@ def _row(question: Question, judged: Judgement, unmoved: str) -> Answer:
     moved = move is not None and move.moved
     mine, other = (_state(question, figure) for _, figure in pair)
     # as it was declared: "10.000 %" reads as ten thousand where a point parts thousands
-    limit = with_unit(question.limit, question.unit, declared(question.limit))
+    limit = (
+        f"{'≥' if question.at_least else '≤'} "
+        f"{with_unit(question.limit, question.unit, declared(question.limit))}"
+        if math.isfinite(question.limit)
+        else "not resolved"
+    )
     return Answer(
         question.answer,
         question.key,
@@ -157,7 +163,7 @@ def _row(question: Question, judged: Judgement, unmoved: str) -> Answer:
         words.explaining(question.key),
         SUB.get(question.key, ""),
         [_cell(question, name, figure, places) for name, figure in pair],
-        limit="none" if question.key == "crossings" else f"{'≥' if question.at_least else '≤'} {limit}",
+        limit="none" if question.key == "crossings" else limit,
         state=mine,
         strip=charts.strip(question, [(heading(name), page.MARKS.get(name, "bl"), f) for name, f in pair]),
         change=move.text() if move else unmoved,

@@ -19,6 +19,7 @@ READS: dict[str, tuple[str, ...]] = {
     "tune_weights": ("identify_plant",),
     "learn_kernel": ("ingest",),
     "evaluate_temperature": ("ingest", "identify_plant", "learn_kernel", "tune_weights"),
+    "reproduce_study": (),
     "train_ilc": (),
     "segment_library": ("train_ilc",),
     "compose_parts": ("segment_library", "train_ilc"),

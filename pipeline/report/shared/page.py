@@ -11,9 +11,9 @@ from markupsafe import Markup, escape
 from pipeline.report.shared import digits
 from pipeline.report.shared.sources import Source
 from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, UNDECIDED, Missing
-from pipeline.report.temperature.contestants import CONTESTANTS
 from pipeline.store import artifacts
 from pipeline.store.printable import printable_page
+from pipeline.temperature.workflow.contestants import CONTESTANTS
 
 GLYPHS = {
     PASSED: "tick",

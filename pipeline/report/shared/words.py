@@ -5,7 +5,7 @@ from markupsafe import Markup, escape
 from pipeline.report.shared import page
 from pipeline.report.shared.digits import THIN
 from pipeline.report.shared.sources import Sources
-from pipeline.report.temperature.contestants import CONTESTANTS
+from pipeline.temperature.workflow.contestants import CONTESTANTS
 
 INDEX = (
     "rehearsal",
@@ -371,7 +371,10 @@ FIXED = {
         "The published work whose method this is; “as published” repeats its own way of "
         "counting, digit by digit.",
     ),
-} | {contestant.name: (contestant.heading, contestant.explanation) for contestant in CONTESTANTS}
+} | {
+    contestant.name: (contestant.word or contestant.heading, contestant.explanation)
+    for contestant in CONTESTANTS
+}
 
 
 def glossary(sources: Sources) -> dict[str, tuple[str, str]]:

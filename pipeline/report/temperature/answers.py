@@ -71,8 +71,7 @@ def of_contestant(metrics: Metrics, name: str, undeclared: Sequence[str] = ()) -
     gap = Missing(OPEN, "This figure is not in the scorecard", REPEAT)
     return {
         **{key: quantile(entry(figures, key)) or gap for key in QUANTILES},
-        "disk": _margin(figures, "disk") or gap,
-        "delay_s": _margin(figures, "delay_s") or gap,
+        **{key: _margin(figures, key) or _without_margin(figures, gap) for key in ("disk", "delay_s")},
         "crossings": crossings(figures, undeclared),
         "data": data(metrics, name),
     }
@@ -101,6 +100,13 @@ def _margin(figures: Any, key: str) -> Figure | None:
         return None
     worst = 0.0 if unstable(figures)[0] else finite(margin["worst"])
     return Figure(worst, worst, worst)
+
+
+def _without_margin(figures: Mapping[str, Any], gap: Missing) -> Missing:
+    """A contestant that closes no loop has no margin to lose."""
+    if "margins" in figures and figures["margins"] is None:
+        return Missing("not applicable", "it closes no loop")
+    return gap
 
 
 def crossings(figures: Any, undeclared: Sequence[str] = ()) -> Figure | Missing:

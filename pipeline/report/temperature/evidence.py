@@ -1,103 +1,15 @@
-"""What the learning rests on: the study's routes under noise, and the orders that identification compared."""
+"""What learning rests on: the orders that identification compared, and the course of a search."""
+
+from typing import Any
 
 import numpy as np
-import pandas as pd
 from markupsafe import Markup
 
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import number, percent, short
-from pipeline.report.shared.pictures import Column, Picture, placeholder
+from pipeline.report.shared.digits import count, number, percent, short
+from pipeline.report.shared.pictures import Column
 from pipeline.report.shared.sources import Sources, Table
 from pipeline.report.shared.verdict import Missing
-
-# ---- the learners under noise
-
-ROUTES = {
-    "window": ("Window + Riccati", "dd"),
-    "kernel": ("Kernel, raw window", "dd ring"),
-    "kernel_predicted_state": ("Kernel, predicted state", "dd ring"),
-}
-
-
-def noise(sources: Sources) -> Picture:
-    """Gap and error of each route, a dot a data set."""
-    table, title = sources.tables["study"], "What noise costs the learners"
-    if isinstance(table, Missing):
-        return placeholder("noise", title, table)
-    shown = [
-        Column(
-            f"{level:g} °C of noise",
-            "in the data, and under the controller",
-            "",
-            [
-                _cloud(table, level, "gap", 100.0, "gap to the optimum in %, log"),
-                _cloud(table, level, "error_degC", 1.0, "r.m.s. error over steps 500–1000 in °C, log"),
-            ],
-        )
-        for level in np.unique(table["noise_degC"])
-    ]
-    return Picture(
-        "noise",
-        title,
-        _ranking(table),
-        shown,
-        (
-            f"Each dot is one of {len(np.unique(table['data_set']))} data sets of 15,000 samples of the "
-            "study’s probing; the bar is their median. Learned from noisy data, judged on the true plant "
-            "under the same noise."
-        ),
-        page.origin(sources.source("study")),
-    )
-
-
-def _cloud(table: Table, level: float, column: str, factor: float, title: str) -> Markup:
-    values = factor * np.abs(table[column])
-    positive = values[np.isfinite(values) & (values > 0)]
-    x = charts.logarithmic(float(positive.min()), float(positive.max()))
-    y = charts.Axis(-0.5, len(ROUTES) - 0.5, ())
-    frame = charts.Frame(x, y, width=440, height=120, left=128, below=18, above=18, right=10)
-    layers, medians = [], []
-    for lane, (route, (name, css)) in enumerate(ROUTES.items()):
-        at = len(ROUTES) - 1 - lane
-        mine = values[(table["route"] == route) & (table["noise_degC"] == level)]
-        failed = int((~np.isfinite(mine)).sum())
-        mine = mine[np.isfinite(mine)]
-        layers.append(charts.label(frame, x.low, at, name, anchor="end", dx=-8, dy=3.5))
-        if len(mine):
-            spread = at + 0.28 * (np.arange(len(mine)) % 5 - 2) / 2
-            middle = float(np.median(mine))
-            px, top, bottom = float(frame.px(middle)), float(frame.py(at + 0.36)), float(frame.py(at - 0.36))
-            layers += [
-                charts.dots(frame, mine, spread, f"dot {css}"),
-                Markup('<line class="med" x1="{0:.1f}" x2="{0:.1f}" y1="{1:.1f}" y2="{2:.1f}"/>').format(
-                    px, top, bottom
-                ),
-            ]
-            medians.append(f"{name} {short(middle, 2)}" + (f" ({failed} unstable)" if failed else ""))
-        elif failed:
-            medians.append(f"{name}: unstable in all {failed}")
-    return charts.panel(
-        frame,
-        layers,
-        alt=f"At {level:g} °C of noise, median {title.split(',')[0]}: {', '.join(medians)}",
-        css="dd",
-        title=title,
-    )
-
-
-def _ranking(table: Table) -> str:
-    medians = pd.DataFrame(table).groupby(["noise_degC", "route"])["gap"].median().unstack("route")
-    ratios = medians.div(medians["window"], axis=0)
-    parts = [
-        f"at {level:g} °C the kernel on the raw window costs {number(raw, 0)} times the window’s gap, on "
-        f"the predicted state {number(predicted, 1)} times"
-        for level, raw, predicted in zip(
-            ratios.index, ratios["kernel"], ratios["kernel_predicted_state"], strict=True
-        )
-    ]
-    text = "; ".join(parts)
-    return f"{text[:1].upper()}{text[1:]}. All gaps are small; the order of the routes is what stays."
-
 
 # ---- orders, for the page of the identification
 
@@ -165,3 +77,64 @@ def left_out(sources: Sources) -> Column:
         outcome = f"order {at:g} leaves {percent(100 * least, 2)} of the variation unexplained"
     alt = f"Error on left-out blocks by order: {outcome}"
     return Column(head, small, "model_based", [charts.panel(frame, layers, alt=alt, css="mb")])
+
+
+# ---- the course of a search
+
+
+def dots_and_line(rows: Table) -> str:
+    """The caption of a search's progress."""
+    failed = int(np.isnan(rows["cost"].astype(float)).sum())
+    return "Dots: candidates; line: best so far." + (
+        f" Vermillion at the foot: {count(failed, 'candidate')} that failed."
+        if failed
+        else " No candidate failed."
+    )
+
+
+def progress(rows: Table, head: str, small: str, level: Any, *, excess: bool) -> Column:
+    """The candidates of one search beside a level: of the default weights, or with `excess` of the known
+    optimum, above which the costs are then drawn in per cent."""
+    if not len(rows["cost"]) or isinstance(level, Missing):
+        return _holed(
+            head,
+            small,
+            level if isinstance(level, Missing) else Missing("not measured", "no search was recorded"),
+        )
+    at, cost, best = (rows[name].astype(float) for name in ("evaluation", "cost", "incumbent"))
+    if excess:
+        cost, best = (100 * (values / level - 1) for values in (cost, best))
+    least = max(float(np.nanmin(best)), 1e-6)
+    frame = charts.Frame(
+        charts.linear(0, float(at[-1])),
+        charts.logarithmic(least, float(np.nanmax(cost))),
+        width=540,
+        height=190,
+        left=44,
+        above=20,
+    )
+    failed = at[np.isnan(cost)]
+    layers = [
+        charts.dots(frame, at, cost, "try", 1.8),
+        charts.line(frame, at, best, "line"),
+        charts.dots(frame, failed, np.full(len(failed), frame.y.low), "gone", 2),
+    ]
+    if not excess:
+        layers.append(charts.level(frame, level, "ref", f"default {short(level)}"))
+    end = float(best[-1])
+    layers.append(
+        charts.label(
+            frame,
+            float(at[-1]),
+            frame.y.high,
+            f"best {percent(end, 2)} above" if excess else f"best {short(end)}",
+            anchor="end",
+            dy=-6,
+        )
+    )
+    alt = f"{head}: after {count(len(at), 'evaluation')} " + (
+        f"the best is {percent(end, 2)} above the optimum"
+        if excess
+        else f"the best costs {short(end)}, the default weights {short(level)}"
+    )
+    return Column(head, small, "", [charts.panel(frame, layers, alt=alt, css="mb")])

@@ -3,7 +3,7 @@
 from typing import Any
 
 from pipeline.report.identification.model import flagged_sentence
-from pipeline.report.shared.digits import THIN, number, percent, short
+from pipeline.report.shared.digits import THIN, short
 from pipeline.report.shared.sources import Sources, lookup
 from pipeline.report.shared.verdict import Missing
 
@@ -11,12 +11,7 @@ from pipeline.report.shared.verdict import Missing
 def findings(sources: Sources) -> list[tuple[str, str]]:
     """What a reader should take away, each with its figure; a figure
     that was not measured is said to be so."""
-    evaluated, tuned = sources.metrics["evaluate_temperature"], sources.metrics["tune_weights"]
-    claims = [_flagged(sources)]
-    if not sources.recorded:
-        # of the study's machine, which a user's page is not about
-        claims += [_claim(sources), _scaled(tuned), _algorithm_1(evaluated), _start(evaluated)]
-    claims.append(_printer(sources))
+    claims = [_flagged(sources), _printer(sources)]
     units = sources.declared.machine.sample_time_s
     if sources.declared.everything.get("generate_probing", {}).get("source") == "simulated":
         claims += [
@@ -83,58 +78,4 @@ def _held_stable(evaluated: Any) -> str:
     return (
         f"It holds {plants['count']} of {plants['of']} plants stable: look whether the recorded duty swings "
         "between its limits. At Klipper’s own rate a loop near the edge may hold. "
-    )
-
-
-def _claim(sources: Sources) -> tuple[str, str] | None:
-    printed = lookup(sources.metrics["evaluate_temperature"], "printed")
-    if isinstance(printed, Missing):
-        return "“Better after tuning”.", f"Not measured. {printed.sentence()}"
-    model = 100 * (1 - printed["model_based_tuned"]["J100"] / printed["model_based"]["J100"])
-    data = 100 * (1 - printed["data_driven_tuned"]["J100"] / printed["data_driven"]["J100"])
-    return (
-        f"“{number(model, 1)} % and {number(data, 1)} % better after tuning” compares two currencies.",
-        (
-            "The cost before tuning is counted with Q = R = I, the cost after it with the tuned, smaller "
-            "weights. The objective that was tuned is the cost at Q = R = I, whose optimum is Q = R = I: no "
-            "weights can be better."
-        ),
-    )
-
-
-def _scaled(tuned: Any) -> tuple[str, str]:
-    change, apart = (
-        lookup(tuned, "parity.scaled_weights.change_percent"),
-        lookup(tuned, "parity.scaled_weights.gain_difference"),
-    )
-    if isinstance(change, Missing) or isinstance(apart, Missing):
-        return "The same controller, “improved”.", "Not measured: tune_weights did not try Q = R = 0.4 I."
-    return (
-        f"Q = R = 0.4 I “improves” the cost by {number(abs(change), 1)} % without changing the controller.",
-        f"Its gain differs from that of Q = R = I by {short(apart, 1)}, which is rounding; "
-        "every temperature and every input is the same.",
-    )
-
-
-def _algorithm_1(evaluated: Any) -> tuple[str, str]:
-    failed, of = lookup(evaluated, "algorithm_1.failures"), lookup(evaluated, "algorithm_1.of")
-    if isinstance(failed, Missing) or isinstance(of, Missing):
-        return "Algorithm 1 from random starts.", "Not measured."
-    return (
-        f"Algorithm 1 as published misses the stabilising gain in {failed} of {of} random starts.",
-        (
-            "It has no guard against a start that does not stabilise. The controllers here take the Riccati "
-            "equation’s solution instead, which needs no start."
-        ),
-    )
-
-
-def _start(evaluated: Any) -> tuple[str, str]:
-    best, late = lookup(evaluated, "optimal.J1000"), lookup(evaluated, "observer.J1000_from_50_degC")
-    if isinstance(best, Missing) or isinstance(late, Missing):
-        return "Where the observer starts.", "Not measured."
-    return (
-        f"Starting the observer at 50 °C costs {percent(100 * (late / best - 1), 2)} for nothing.",
-        "Starting it from the first measurement costs next to nothing, "
-        "and asks for nothing that is not known.",
     )

@@ -3,9 +3,9 @@ the study, words, provenance."""
 
 from pipeline.report.identification.model import trust
 from pipeline.report.index import page as index_page
-from pipeline.report.shared import headline, page, tables, words
+from pipeline.report.shared import headline, page, words
 from pipeline.report.shared.sources import Sources
-from pipeline.report.temperature import evidence, findings, pictures, recording, scorecard
+from pipeline.report.temperature import findings, pictures, recording, scorecard, study
 from pipeline.report.temperature.answers import judged as names_judged
 from pipeline.report.temperature.answers import refused
 from pipeline.report.temperature.contestants import BY_NAME
@@ -38,7 +38,6 @@ def render(sources: Sources, judged: Judgement) -> str:
     contestants = [
         name for name in (*names_judged(sources.metrics), *refused(sources.metrics)) if name in BY_NAME
     ]
-    listed = (word for word in WORDS if not (sources.recorded and word == "study"))
     relearned = sources.relearned if scorecard.relearned_date(sources) else None
     return page.render(
         "temperature.html",
@@ -57,21 +56,17 @@ def render(sources: Sources, judged: Judgement) -> str:
             pictures.plants(sources),
         ],
         findings=findings.findings(sources),
-        simulated=not sources.recorded,
-        published=tables.published(sources),
-        honest=tables.honest(sources),
-        noise=evidence.noise(sources),
+        study=study.part(sources),
         record=[recording.excitation(sources), recording.record(sources)],
         flaws=recording.flaws(sources),
         panel=scorecard.declared_panel(sources),
         weights=scorecard.weights(sources),
         trusted=trust(sources),
-        words=words.chosen(sources, (*dict.fromkeys(contestants), *listed)),
+        words=words.chosen(sources, (*dict.fromkeys(contestants), *WORDS)),
         sources=list(sources.read.values()),
         absent=sources.absent,
         hashes=index_page.hashes(sources),
         from_scorecard=sources.source("evaluate_temperature", "cases", "relearned"),
-        from_metrics=sources.source("evaluate_temperature"),
         from_quality=sources.source("quality"),
         from_weights=sources.source("weights"),
         from_model=sources.source("identify_plant", "plant"),

@@ -28,7 +28,7 @@ def pair_names(metrics: Metrics) -> tuple[str, str]:
 
 def pair_sentence(metrics: Metrics) -> PairSentence:
     """ "subspace + LQG costs 6 % less than the learned kernel on the same 60 plants (90 % interval 3-9 %,
-    p = 0.01)", or that there is no difference. `difference` is positive where a costs less."""
+    p = 0.01)", or that there is no difference. `difference` is that of the cheaper one."""
     pair = entry(comparison(metrics), "pair")
     a, b = pair_names(metrics)
     reason_of = refused(metrics).get(DATA_DRIVEN)
@@ -47,7 +47,7 @@ def pair_sentence(metrics: Metrics) -> PairSentence:
         interval = _interval(pair, sign=1)
         text = f"no difference beyond chance between {better} and {worse} on the same {plants} plants"
         return PairSentence(f"{head} {text}{_bracket(interval, chance)}.", None, instead)
-    sign = 1 if winner == a else -1
+    sign = 1 if finite(entry(pair, "difference")) >= 0 else -1
     gain = abs(finite(entry(pair, "difference")))
     amount = "far less" if not gain <= 90 else f"{number(gain, 0 if gain >= 10 else 1)} % less"
     interval = _interval(pair, sign=sign) if gain <= 90 else ""

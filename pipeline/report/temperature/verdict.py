@@ -73,9 +73,9 @@ def questions(rules: ReportRules, compared: Mapping[str, Any]) -> list[Question]
     """What every contestant is asked, in its fixed order. The comparison resolves three limits for the
     machine: those that were declared, or those of a recorded machine's own pace."""
 
-    def limit(name: str, declared: float) -> float:
+    def limit(name: str, declared: float | None) -> float:
         own = finite(entry(compared, "limits", name))
-        return own if math.isfinite(own) and own > 0 else declared
+        return own if math.isfinite(own) and own > 0 else math.inf if declared is None else declared
 
     settled = limit("settled_error_degC", rules.settled_error_degC)
     settling, overshoot = limit("settling_s", rules.settling_s), limit("overshoot_degC", rules.overshoot_degC)

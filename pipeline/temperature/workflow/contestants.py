@@ -1,90 +1,164 @@
-"""The table of contestants: every controller of the temperature comparison, in the order of the pages.
+"""The table of contestants: every controller of the temperature comparison, the simplest first.
 
-A new controller is its own file in pipeline/temperature/, its line in CONTESTANTS, and its settings. The
-stage designs from this table, and the pages take heading, mark and explanation from it. Methods are imported
+A new contestant is its own file in pipeline/temperature/, its line in CONTESTANTS, and its settings. Tuning and
+judging design from this table, and the pages take heading, mark and explanation from it. Methods are imported
 where one is designed: a page loads none.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from pipeline.temperature.workflow.settings import EvaluateTemperature
-
 if TYPE_CHECKING:
+    from pipeline.temperature.governor import Limits
     from pipeline.temperature.kernel import Regression
     from pipeline.temperature.plant import Plant
     from pipeline.temperature.printer_pid import HeaterPid
-    from pipeline.temperature.tracking import Controller
+    from pipeline.temperature.tracking import Law
     from pipeline.temperature.window import Window
 
 
 class Problem(NamedTuple):
     """What a controller may be designed from.
 
-    `plant` is identified and `window` learned from the record. `kernel` is None where the record does not
-    determine it, `truth` where nobody knows the plant, `printer_pid` empty where no recording tells the
-    PID of a printer. `limits` low and high (m,) in percent; `gamma` the
-    discount; `observer_tau` tuned, `exact_tau` for the true plant; `horizon` in steps.
+    `plant` is identified, its feed-through a delay, `family` its spread, and `window` learned from the record.
+    `kernel` is None where the record does not determine it, `truth` where nobody knows the plant, `printer_pid`
+    empty where no recording tells the PID of a printer. `gamma` is the discount, `integral` the declared share
+    of the error a step, `exact_tau` the paper's observer, `horizon` in steps, `noise` (p,) in °C.
     """
 
     plant: Plant
+    family: list[Plant]
     window: Window
     kernel: Regression | None
     truth: Plant | None
-    limits: tuple[np.ndarray, np.ndarray]
+    limits: Limits
     gamma: float
-    observer_tau: float
+    integral: float
     exact_tau: float
     horizon: int
-    settings: EvaluateTemperature
+    noise: np.ndarray
     printer_pid: tuple[HeaterPid, ...] = ()
 
+    @property
+    def effect(self) -> float:
+        """°C^2 per percent^2 by which the strongest input of the median output moves it in a step: the scale
+        of an effort weight."""
+        from pipeline.temperature.plant import markov_parameters
 
-def _model_based(problem: Problem) -> Controller:
-    from pipeline.temperature import tracking
-
-    return tracking.model_based(problem.plant, problem.gamma, tau=problem.observer_tau)
-
-
-def _window(problem: Problem) -> Controller:
-    from pipeline.temperature import window
-
-    return window.controller(problem.window, problem.gamma)
+        strongest = np.abs(markov_parameters(self.plant, min(self.horizon, 50))).max(axis=(0, 2))
+        return float(max(np.median(strongest), 1e-6)) ** 2
 
 
-def _kernel(problem: Problem) -> Controller | None:
-    """Its feasible targets come from the window that was learned from the same record."""
-    from pipeline.temperature import kernel, window
+class Design(NamedTuple):
+    """A contestant's law, and the plant on which its steady inputs are computed. `plain` designs the same
+    without integrator at the weights of the yardstick, and is None where weights mean nothing to it.
+    `governed`: the governor watches it. `holds`: it does nothing."""
 
-    if problem.kernel is None:
-        return None
-    return kernel.controller(problem.kernel, problem.gamma, window.predictor(problem.window))
-
-
-def _baseline(problem: Problem) -> Controller:
-    from pipeline.temperature import baseline
-
-    return baseline.controller(problem.plant, problem.limits, horizon=problem.horizon)
+    law: Law
+    model: Plant
+    plain: Callable[[], Law] | None = None
+    governed: bool = True
+    holds: bool = False
 
 
-def _printer_pid(problem: Problem) -> Controller | None:
+class Parameter(NamedTuple):
+    """What a search may set, between low and high, from the declared start; times the problem's effect where
+    `of_effect`."""
+
+    name: str
+    low: float
+    start: float
+    high: float
+    of_effect: bool = False
+
+
+EFFORT = Parameter("effort_weight", 0.1, 30.0, 1e5, of_effect=True)
+OBSERVER = Parameter("observer_tau", 1e-4, 0.1, 1e3, of_effect=True)
+INTEGRAL = Parameter("integral", 0.001, 0.02, 0.2)
+Values = Mapping[str, float]
+
+
+def weights(problem: Problem, values: Values) -> tuple[np.ndarray, np.ndarray]:
+    """diag(Q) = 1 and diag(R) = effort_weight: only their ratio acts."""
+    return np.ones(problem.plant.p), np.full(problem.plant.m, values["effort_weight"])
+
+
+def _unit(problem: Problem) -> tuple[np.ndarray, np.ndarray, float]:
+    return np.ones(problem.plant.p), np.ones(problem.plant.m), 0.0
+
+
+def _hold(problem: Problem, values: Values) -> Design:
+    from pipeline.temperature.tracking import still_law
+
+    return Design(still_law(problem.plant.m, problem.plant.p), problem.plant, governed=False, holds=True)
+
+
+def _printer_pid(problem: Problem, values: Values) -> Design | None:
     from pipeline.temperature import printer_pid
 
     if not problem.printer_pid:
         return None
-    return printer_pid.controller(problem.printer_pid, problem.plant, problem.limits)
+    limits = problem.limits.low, problem.limits.high
+    made = printer_pid.controller(problem.printer_pid, problem.plant, limits)
+    return Design(made.design(*_unit(problem)), made.model, governed=False)
 
 
-def _exact_model(problem: Problem) -> Controller | None:
+def _pi(problem: Problem, values: Values) -> Design:
+    from pipeline.temperature import baseline
+
+    made = baseline.controller(
+        problem.plant,
+        (problem.limits.low, problem.limits.high),
+        horizon=problem.horizon,
+        family=problem.family,
+        noise_degC=problem.noise,
+        tuning=baseline.Tuning(**values),
+    )
+    return Design(made.design(*_unit(problem)), made.model)
+
+
+def _subspace_lqg(problem: Problem, values: Values) -> Design:
+    from pipeline.temperature import tracking
+
+    made = tracking.model_based(problem.plant, problem.gamma, tau=values["observer_tau"])
+    law = made.design(*weights(problem, values), values["integral"])
+    return Design(law, made.model, lambda: made.design(*_unit(problem)))
+
+
+def _varx_riccati(problem: Problem, values: Values) -> Design:
+    from pipeline.temperature import controller, window
+
+    made, N = window.controller(problem.window, problem.gamma), problem.window.N
+    law = controller.compact(made.design(*weights(problem, values), values["integral"]), N)
+    return Design(law, made.model, lambda: made.design(*_unit(problem)))
+
+
+def _learned_kernel(problem: Problem, values: Values) -> Design | None:
+    """Its steady inputs come from the window that was learned from the same record."""
+    from pipeline.temperature import controller, kernel, window
+
+    if problem.kernel is None:
+        return None
+    made = kernel.controller(problem.kernel, problem.gamma, window.observer_form(problem.window)[0])
+    law = made.design(*weights(problem, values), values["integral"])
+    return Design(
+        controller.compact(law, problem.kernel.N), made.model, lambda: made.design(*_unit(problem))
+    )
+
+
+def _exact_model(problem: Problem, values: Values) -> Design | None:
     from pipeline.temperature import tracking
 
     if problem.truth is None:
         return None
-    return tracking.exact_model(problem.truth, problem.gamma, tau=problem.exact_tau)
+    made = tracking.model_based(problem.truth, problem.gamma, tau=values["observer_tau"])
+    law = made.design(*weights(problem, values), values["integral"])
+    paper = tracking.exact_model(problem.truth, problem.gamma, tau=problem.exact_tau)
+    return Design(law, made.model, lambda: paper.design(*_unit(problem)))
 
 
 class Contestant(NamedTuple):
@@ -92,21 +166,23 @@ class Contestant(NamedTuple):
 
     `heading` and `method` stand above its column, `explanation` among the words of the page, below `word`
     where the heading alone would say too little. `design` gives None where the record does not allow it, and
-    raises ValueError where the machine does not: the page shows that sentence in its column. `learned_from`
-    says whose need of samples is its own: the identified plant, the window, or the kernel.
+    raises ValueError where the machine does not: the page shows that sentence in its column. `parameters` are
+    what its search may set; none, and nothing is searched. `learned_from` says whose need of samples is its
+    own: the identified plant, the window, or the kernel.
 
-    `role`: the verdict chooses among the three roles. Without a role a controller is shown, judged and can be
-    the best of a row. A yardstick is shown beside the others and is never the best of a row. `mark` is the
-    class of its mark; one without takes the next free shape.
+    `role`: the pair that is answered for itself is model_based against data_driven. A yardstick is shown
+    beside the others and is never the best. `mark` is the class of its mark; one without takes the next free
+    shape.
     """
 
     name: str
     heading: str
     method: str
     explanation: str
-    design: Callable[[Problem], Controller | None]
-    learned_from: Literal["plant", "window", "kernel", ""]
-    role: Literal["data_driven", "model_based", "baseline", "yardstick", ""] = ""
+    design: Callable[[Problem, Values], Design | None]
+    parameters: tuple[Parameter, ...] = ()
+    learned_from: Literal["plant", "window", "kernel", ""] = ""
+    role: Literal["data_driven", "model_based", "indirect", "baseline", "yardstick", ""] = ""
     word: str = ""
     mark: Literal["dd", "mb", "bl", ""] = ""
     hollow: bool = False
@@ -114,49 +190,11 @@ class Contestant(NamedTuple):
 
 CONTESTANTS = (
     Contestant(
-        "model_based",
-        "Model-based",
-        "model + Riccati",
-        "A plant model is identified from the record; an observer estimates its state, "
-        "and the Riccati equation gives the gains.",
-        _model_based,
-        "plant",
-        role="model_based",
-        mark="mb",
-    ),
-    # the data-driven route: the record alone ranks it before the kernel
-    Contestant(
-        "window",
-        "Data-driven",
-        "window + Riccati",
-        "A long window of past inputs and outputs predicts the next output; the Riccati equation does the "
-        "rest. No order, no state to choose.",
-        _window,
-        "window",
-        role="data_driven",
-        word="Data-driven, window",
-        mark="dd",
-    ),
-    Contestant(
-        "kernel",
-        "Kernel",
-        "Algorithm 2",
-        "Algorithm 2 of the study: the value of state and action is fitted to the record directly, "
-        "and the gain is read off it.",
-        _kernel,
-        "kernel",
-        mark="dd",
-        hollow=True,
-    ),
-    Contestant(
-        "baseline",
-        "Baseline",
-        "PI per zone",
-        "One PI controller a zone, tuned by SIMC from the identified model, with the same feasible target.",
-        _baseline,
-        "plant",
-        role="baseline",
-        mark="bl",
+        "hold",
+        "Hold",
+        "do nothing",
+        "The inputs stay as they were handed over.",
+        _hold,
     ),
     # only where a recording is a Klipper log
     Contestant(
@@ -167,8 +205,69 @@ CONTESTANTS = (
         "time. It is not tuned and aims at no target: it starts at the input of the hold, and its "
         "integral rests while the duty is at a limit.",
         _printer_pid,
-        "",
         word="The printer’s own PID",
+    ),
+    Contestant(
+        "pi_simc",
+        "PI, SIMC",
+        "PI per zone",
+        "One PI controller a zone by SIMC’s rule from the identified model, with the same steady input, "
+        "limits, governor and hand-over as the others.",
+        _pi,
+        learned_from="plant",
+        role="baseline",
+        mark="bl",
+    ),
+    Contestant(
+        "pi",
+        "PI, tuned",
+        "PI per zone",
+        "The same, its gains and reset times tuned by the same search as the others.",
+        _pi,
+        (Parameter("gain_factor", 0.02, 1.0, 10.0), Parameter("reset_factor", 0.1, 1.0, 20.0)),
+        learned_from="plant",
+        mark="bl",
+        hollow=True,
+    ),
+    Contestant(
+        "subspace_lqg",
+        "subspace + LQG",
+        "model-based",
+        "A plant model is identified from the record; an observer estimates its state, "
+        "and the Riccati equation gives the gains.",
+        _subspace_lqg,
+        (EFFORT, OBSERVER, INTEGRAL),
+        learned_from="plant",
+        role="model_based",
+        word="subspace + LQG, model-based",
+        mark="mb",
+    ),
+    Contestant(
+        "varx_riccati",
+        "VARX + Riccati",
+        "data-driven, indirect",
+        "A long window of past inputs and outputs predicts the next output; the Riccati equation does the "
+        "rest. No order, no state to choose.",
+        _varx_riccati,
+        (EFFORT, INTEGRAL),
+        learned_from="window",
+        role="indirect",
+        word="VARX + Riccati, data-driven and indirect",
+        mark="dd",
+        hollow=True,
+    ),
+    Contestant(
+        "learned_kernel",
+        "learned kernel",
+        "data-driven, Algorithm 2",
+        "Algorithm 2 of the study: the value of state and action is fitted to the record directly, "
+        "and the gain is read off it. Its state is what the window predicts.",
+        _learned_kernel,
+        (EFFORT, INTEGRAL),
+        learned_from="kernel",
+        role="data_driven",
+        word="learned kernel, Algorithm 2, data-driven and direct",
+        mark="dd",
     ),
     Contestant(
         "exact_model",
@@ -176,32 +275,12 @@ CONTESTANTS = (
         "told the truth",
         "The model-based controller, told the true plant: what a perfect identification would give.",
         _exact_model,
-        "",
+        (EFFORT, OBSERVER, INTEGRAL),
         role="yardstick",
         mark="mb",
         hollow=True,
     ),
 )
-
-
-class Designed(NamedTuple):
-    """The controllers that the record and the machine allow, in the table's order, each by its name in the
-    table; `refused` says by name why others cannot be designed."""
-
-    controllers: list[Controller]
-    refused: dict[str, str]
-
-
-def controllers(problem: Problem, contestants: tuple[Contestant, ...] = CONTESTANTS) -> Designed:
-    """Every contestant designed for `problem`. One whose design raises ValueError is refused with that
-    reason, and the others go on."""
-    designed, refused = [], {}
-    for contestant in contestants:
-        try:
-            controller = contestant.design(problem)
-        except ValueError as reason:
-            refused[contestant.name] = str(reason)
-            continue
-        if controller is not None:
-            designed.append(controller._replace(name=contestant.name))
-    return Designed(designed, refused)
+BY_NAME = {contestant.name: contestant for contestant in CONTESTANTS}
+PAIR = ("subspace_lqg", "learned_kernel")
+INDIRECT = "varx_riccati"

@@ -1,26 +1,19 @@
 """What evaluate_temperature does: every temperature controller judged on one panel of plants, starts,
-references and noise; and the study's learners on many noisy data sets, beside the paper's figures."""
+references and noise."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from joblib import delayed
 from tqdm import tqdm
 
 from pipeline.store import artifacts
-from pipeline.store.execution import run_all
-from pipeline.store.params import Execution
 from pipeline.store.tables import Schema
-from pipeline.temperature import judging, kernel, plant, published, scorecard, study, window
+from pipeline.temperature import judging, kernel, plant, scorecard, window
 from pipeline.temperature.printer_pid import HeaterPid
 from pipeline.temperature.workflow import contestants, tables
-from pipeline.temperature.workflow.record import read_published
 from pipeline.temperature.workflow.settings import EvaluateTemperature, Panel, Tracking
 from pipeline.temperature.workflow.settings import Plant as Machine
-
-# samples of a data set of the study, and starts of its algorithm 1
-SAMPLES, STARTS = 15_000, 300
 
 
 class Learned(NamedTuple):
@@ -51,14 +44,6 @@ class Judged(NamedTuple):
     refused: dict[str, str]
     without_feed_forward: list[str]
     own_integral: dict[str, float]
-
-
-class Studied(NamedTuple):
-    """The learners on the study's machine: a row a noisy data set and
-    route, and their figures beside the paper's."""
-
-    rows: dict[str, list]
-    figures: dict[str, Any]
 
 
 def check(settings: EvaluateTemperature, panel: Panel) -> None:
@@ -233,28 +218,3 @@ def _scenarios(
         hold=panel.hold_steps,
         cells=truth is not None,
     )
-
-
-def studied(settings: EvaluateTemperature, execution: Execution, folder: str) -> Studied:
-    """`folder` has the draws behind the paper's figures."""
-    K0, u, y = read_published(folder)
-    sets_u, sets_y = study.data_sets(np.random.default_rng(settings.seed), SAMPLES, settings.data_sets)
-    work = [(noise, i) for noise in study.NOISE for i in range(settings.data_sets)]
-    calls = [delayed(study.under_noise)(sets_u[:, i], sets_y[:, i], noise=noise, seed=i) for noise, i in work]
-    results = list(
-        tqdm(
-            run_all(calls, execution),
-            total=len(work),
-            desc="evaluate_temperature: noisy data sets",
-            mininterval=2,
-        )
-    )
-    noisy, noise_free = (
-        study.rows(work, results),
-        study.noise_free(u[1:], y[1:], np.random.default_rng(settings.seed)),
-    )
-    failures = published.algorithm_1_failures(STARTS)
-    figures = study.metrics(
-        published.figures(K0, u, y), study.exact(), noise_free, noisy, failures=failures, starts=STARTS
-    )
-    return Studied(noisy, figures)

@@ -31,11 +31,13 @@ class Signal(Section):
 
 
 class Input(Signal):
-    """A heater or the motor; low and high are the limits of what the machine can give, in percent. `heats`:
-    no output can fall for good when it is raised."""
+    """A heater or the motor; low and high are the limits of what the machine can give, in percent, and
+    rate_percent_per_s how fast it may change; none: as fast as it is asked. `heats`: no output can fall for
+    good when it is raised."""
 
     low: float = Field(ge=-100, le=100)
     high: float = Field(ge=-100, le=100)
+    rate_percent_per_s: float | None = Field(default=None, gt=0, le=1e6)
     heats: bool = False
 
     @pydantic.model_validator(mode="after")
@@ -111,28 +113,43 @@ class Tracking(Section):
     yardstick_r: float = Field(gt=0, le=1e6)
     integral: float = Field(ge=0, le=1)
     integral_limit_degC: float = Field(gt=0, le=1000)
+    governor_overshoot_degC: float = Field(gt=0, le=1000)
     observer_tau: float = Field(gt=0, le=1000)
 
 
-class Half(Section):
-    """One half of the panel: temperatures that the plant is held at, references as offsets
-    from plant.outputs, and seeds of the sensor noise."""
+Degrees = Annotated[float, Field(ge=-273.15, le=1000)]
+Offsets = Annotated[list[Annotated[float, Field(ge=-500, le=500)]], Field(max_length=20)]
 
-    starts_degC: list[Annotated[float, Field(ge=-273.15, le=1000)]] = Field(min_length=1, max_length=20)
-    reference_offsets_degC: list[Annotated[float, Field(ge=-500, le=500)]] = Field(
-        min_length=1, max_length=20
-    )
-    seeds: list[Annotated[int, Field(ge=0, le=2**31)]] = Field(min_length=1, max_length=100)
+
+class Half(Section):
+    """One half of the panel: how many plants are drawn and from which seed, temperatures that they are held
+    at, and references as offsets from plant.outputs: constant ones, a sequence, a ramp that ends at the
+    reference, and a sinusoid about it."""
+
+    seed: int = Field(ge=0, le=2**31)
+    plants: int = Field(ge=2, le=100_000)
+    starts_degC: list[Degrees] = Field(min_length=1, max_length=20)
+    reference_offsets_degC: Offsets = Field(min_length=1)
+    sequence_offsets_degC: Offsets = []
+    ramp_degC_per_step: float = Field(default=0.0, ge=0, le=100)
+    sinusoid_degC: float = Field(default=0.0, ge=0, le=100)
+    sinusoid_steps: int = Field(default=600, ge=4, le=1_000_000)
 
 
 class Panel(Section):
-    """Section `panel`: the scenarios on which controllers are
-    compared; nothing is tuned on the judging half."""
+    """Section `panel`: the plants and cases on which controllers are compared; nothing is learned or tuned on
+    the judging half. Plants lie around the machine: input gains 1 +- input_gain each, its speed divided by 1
+    +- slower, up to extra_heat_loss_per_step more heat lost, a share `delayed` of them with inputs a sample
+    late, the ambient +- ambient_degC."""
 
-    noise_degC: list[Annotated[float, Field(ge=0, le=50)]] = Field(min_length=1, max_length=10)
+    noise_degC: float = Field(ge=0, le=50)
     input_gain: float = Field(gt=0, lt=1)
+    slower: float = Field(ge=0, lt=1)
     extra_heat_loss_per_step: float = Field(ge=0, lt=1)
+    delayed: float = Field(ge=0, le=1)
+    ambient_degC: float = Field(ge=0, le=200)
     steps: int = Field(ge=60, le=20000)
+    settled_steps: int = Field(ge=10, le=5000)
     hold_steps: int = Field(ge=0, le=2000)
     band_degC: float = Field(gt=0, le=100)
     training: Half
@@ -140,11 +157,10 @@ class Panel(Section):
 
     @pydantic.model_validator(mode="after")
     def _halves_differ(self):
-        same = sorted(set(self.training.seeds) & set(self.judging.seeds))
-        if same:
+        if self.training.seed == self.judging.seed:
             raise ValueError(
-                f"uses seed {same[0]} in the training and in the judging half; "
-                "give each half seeds of its own"
+                f"uses seed {self.training.seed} in the training and in the judging half; "
+                "give each half a seed of its own"
             )
         return self
 
@@ -211,17 +227,8 @@ class TuneWeights(Section):
     """Section `tune_weights`."""
 
     seed: int = Field(ge=0, le=2**31)
-    initial: int = Field(ge=4, le=5000)
-    evaluations: int = Field(ge=8, le=5000)
     practical_initial: int = Field(ge=4, le=5000)
     practical_evaluations: int = Field(ge=8, le=5000)
-    acquisition: Literal["expected_improvement", "upper_confidence_bound"]
-    q_low: float = Field(gt=0, le=1e6)
-    q_high: float = Field(gt=0, le=1e6)
-    r_low: float = Field(gt=0, le=1e6)
-    r_high: float = Field(gt=0, le=1e6)
-    tau_low: float = Field(gt=0, le=1e6)
-    tau_high: float = Field(gt=0, le=1e6)
     allow_settling_s: float = Field(gt=0, le=1e6)
     allow_overshoot_degC: float = Field(gt=0, le=1000)
     allow_settled_error_degC: float = Field(gt=0, le=1000)
@@ -232,8 +239,22 @@ class TuneWeights(Section):
 
 
 class EvaluateTemperature(Section):
-    """Section `evaluate_temperature`."""
+    """Section `evaluate_temperature`: the seed of its tests, and how often the plants are resampled for a
+    band."""
+
+    seed: int = Field(ge=0, le=2**31)
+    resamples: int = Field(ge=20, le=100_000)
+
+
+class ReproduceStudy(Section):
+    """Section `reproduce_study`: the study's own part; the bounds are those of its search for Q and R."""
 
     seed: int = Field(ge=0, le=2**31)
     data_sets: int = Field(ge=1, le=1000)
-    report_noise_degC: float = Field(ge=0, le=50)
+    initial: int = Field(ge=4, le=5000)
+    evaluations: int = Field(ge=8, le=5000)
+    acquisition: Literal["expected_improvement", "upper_confidence_bound"]
+    q_low: float = Field(gt=0, le=1e6)
+    q_high: float = Field(gt=0, le=1e6)
+    r_low: float = Field(gt=0, le=1e6)
+    r_high: float = Field(gt=0, le=1e6)

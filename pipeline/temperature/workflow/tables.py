@@ -164,11 +164,39 @@ STUDY = Schema(
     ),
 )
 
+PARITY = Schema(
+    "parity",
+    1,
+    (
+        Column("evaluation", COUNT, NONE, "counted from 1", low=1),
+        Column("cost", FLOAT, NONE, "the paper's (37); missing where this candidate failed", nullable=True),
+        Column(
+            "incumbent", FLOAT, NONE, "lowest cost so far; missing before the first success", nullable=True
+        ),
+        Column(
+            "tracking_degC",
+            FLOAT,
+            "degC",
+            "discounted r.m.s. tracking error of this candidate; missing where it failed",
+            nullable=True,
+        ),
+        Column(
+            "effort_percent",
+            FLOAT,
+            "percent",
+            "discounted r.m.s. effort of this candidate; missing where it failed",
+            nullable=True,
+        ),
+        Column("chosen", BOOL, NONE, "whether the search recommends this candidate"),
+        Column("failure", TEXT, NONE, "why the candidate failed; empty where it did not"),
+    ),
+)
+
 TUNING = Schema(
     "tuning",
     2,
     (
-        Column("mode", TEXT, NONE, "parity: the paper's (37); practical: the declared engineering cost"),
+        Column("mode", TEXT, NONE, "practical: the declared engineering cost"),
         Column("evaluation", COUNT, NONE, "counted from 1", low=1),
         Column("cost", FLOAT, NONE, "cost of this candidate; missing where it failed", nullable=True),
         Column(

@@ -1,171 +1,201 @@
-"""What tune_weights does: Q and R by Bayesian optimisation, twice. Parity: the
-paper's (37) on its own machine. Practical: the declared engineering cost of the
-identified plant on the training half of the panel."""
+"""What tune_weights does: it tunes every contestant by itself, with the same search, budget and cost, on the same
+training half of the panel, as it would be deployed."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from joblib import delayed
 from tqdm import tqdm
 
-from pipeline.temperature import engineering, judging, plant, scorecard, study, tuning
-from pipeline.temperature.tracking import model_based
-from pipeline.temperature.workflow.settings import Panel, Tracking, TuneWeights
-from pipeline.temperature.workflow.settings import Plant as Machine
+from pipeline.store.execution import run_all
+from pipeline.store.params import Execution
+from pipeline.temperature import comparison, controller, governor, panel, scorecard, tuning
+from pipeline.temperature.plant import Plant
+from pipeline.temperature.workflow import contestants
+from pipeline.temperature.workflow.settings import TuneWeights
 
-# of the paper's machine
-OUTPUTS, INPUTS = 5, 7
+# of a parameter's range, in logarithms: so near to an end the search is called bound by it
+AT_BOUND = 0.02
+# of the cost, for a parameter moved from its start by its whole range: of two candidates as good as each other
+# the one nearer to the start is taken, so that a direction in which the cost is flat has one end, not two
+NEARER = 0.05
+
+
+class Trial(NamedTuple):
+    """What every candidate of one run of tuning meets: the identified plant, the training cases, the limits,
+    the integrator's limit in °C, the governor, the band in °C, and what the cost counts as one."""
+
+    plant: Plant
+    cases: panel.Cases
+    limits: governor.Limits
+    integral_limit: float
+    governor: governor.Governor
+    band: float
+    settled: int
+    allowance: panel.Allowance
+    output_limits: tuple[np.ndarray, np.ndarray]
+    worst_case: float
+    least_disk_margin: float
 
 
 class Tuned(NamedTuple):
-    """Weights of both modes, the candidates of both searches as columns, and metrics."""
+    """The parameters of every contestant, the candidates as columns, metrics, and why others are refused."""
 
     weights: dict[str, Any]
     history: dict[str, Any]
     metrics: dict[str, Any]
 
 
-class Search(NamedTuple):
-    """A search, error and effort of its candidates (None for one that failed), and metrics of its mode."""
-
-    result: tuning.Result
-    trades: list[engineering.ErrorEffort | None]
-    metrics: dict[str, Any]
+def allowance(settings: TuneWeights, *, band: float, settling: float, sample_time_s: float) -> panel.Allowance:
+    """What the cost counts as one. `band` and `settling` are this machine's over the declared ones: a slow
+    machine is allowed its time, a small one its degrees."""
+    return panel.Allowance(
+        outside=settings.allow_settling_s * settling / sample_time_s,
+        overshoot=settings.allow_overshoot_degC * band,
+        settled_error=settings.allow_settled_error_degC * band,
+        at_limits=settings.allow_at_limits_percent,
+        energy=settings.allow_effort_percent,
+        rms=settings.allow_overshoot_degC * band,
+    )
 
 
 def tuned(
-    settings: TuneWeights, machine: Machine, tracking: Tracking, panel: Panel, model: plant.Plant
+    settings: TuneWeights, problem: contestants.Problem, trial: Trial, execution: Execution
 ) -> Tuned:
-    """Both searches; `model` is the identified plant, its feed-through one sample late."""
-    model = plant.strictly_proper(model)
-    training, reference = panel.training, np.array([o.reference for o in machine.outputs])
-    scenarios = scorecard.panel(
-        plant.spread(model, input_gain=panel.input_gain, extra_heat_loss=panel.extra_heat_loss_per_step),
-        starts=training.starts_degC,
-        references=[reference + offset for offset in training.reference_offsets_degC],
-        noise=panel.noise_degC,
-        seeds=training.seeds,
-        steps=panel.steps,
-        hold=panel.hold_steps,
-        cells=False,
+    """Every contestant with something to tune; one that cannot be designed at its start is refused."""
+    searched = [one for one in contestants.CONTESTANTS if one.parameters]
+    calls = [delayed(_searched)(one.name, settings, problem, trial) for one in searched]
+    results = dict(
+        tqdm(run_all(calls, execution), total=len(calls), desc="tune_weights: contestants", mininterval=2)
     )
-    parity = _parity(settings)
-    practical = _practical(settings, machine, tracking, panel, model, scenarios)
-    q, r, tau = np.split(practical.result.theta, [model.p, model.p + model.m])
-    theta = parity.result.theta
+    found = {name: result for name, result in results.items() if isinstance(result, tuning.Result)}
+    refused = {name: result for name, result in results.items() if isinstance(result, str)}
+    if not found:
+        raise ValueError(
+            "tune_weights: expected a controller that can be designed, found none: "
+            + "; ".join(f"{name}: {reason}" for name, reason in refused.items())
+            + "; record the machine longer, or change its inputs in section plant of params.yaml"
+        )
+    best = {name: _values(name, result, problem) for name, result in found.items()}
     return Tuned(
+        {"contestants": best},
+        _history(found, problem),
         {
-            "practical": {"q": q, "r": r, "observer_tau": float(tau[0])},
-            "parity": {"q": theta[:OUTPUTS], "r": theta[OUTPUTS:]},
+            "contestants": {
+                name: {key: value for key, value in one.items() if key not in ("q", "r")}
+                for name, one in best.items()
+            },
+            "refused": {name: reason for name, reason in refused.items() if reason},
         },
-        engineering.histories(
-            {"parity": parity.result, "practical": practical.result},
-            {"parity": parity.trades, "practical": practical.trades},
-        ),
-        {"parity": parity.metrics, "practical": practical.metrics},
     )
 
 
-def _parity(settings: TuneWeights) -> Search:
-    low, high = (
-        [q] * OUTPUTS + [r] * INPUTS
-        for q, r in ((settings.q_low, settings.r_low), (settings.q_high, settings.r_high))
-    )
-    result = _search(
-        "parity", study.tuning_objective, settings, settings.initial, settings.evaluations, low, high
-    )
-    trades = [
-        None if failed else engineering.ErrorEffort(*study.tuning_parts(theta))
-        for theta, failed in zip(result.history.theta, result.history.failed, strict=True)
-    ]
-    optimum = np.ones(OUTPUTS + INPUTS)
-    metrics = {
-        "best_cost_perfect_state": result.cost,
-        "optimum": study.tuning_objective(optimum),
-        "scaled_weights": study.scaled_weights(),
-        "trade": {"optimum": engineering.ErrorEffort(*study.tuning_parts(optimum))},
-    }
-    return Search(result, trades, metrics)
-
-
-def _practical(
-    settings: TuneWeights,
-    machine: Machine,
-    tracking: Tracking,
-    panel: Panel,
-    model: plant.Plant,
-    scenarios: scorecard.Panel,
-) -> Search:
-    limits = tuple(np.array([(i.low, i.high) for i in machine.inputs]).T)
-    allowance = scorecard.Allowance(
-        *(getattr(settings, f"allow_{name}") for name in scorecard.Allowance._fields[:-1]),
-        settings.worst_case,
-    )
-    deployment = judging.Deployment(limits, panel.band_degC, tracking.integral, tracking.integral_limit_degC)
-    figures_of = engineering.deployed(
-        model, scenarios, deployment, gamma=tracking.gamma, least_disk_margin=settings.least_disk_margin
-    )
-    error_effort: dict[bytes, engineering.ErrorEffort] = {}
+def _searched(
+    name: str, settings: TuneWeights, problem: contestants.Problem, trial: Trial
+) -> tuple[str, tuning.Result | str]:
+    """One search; a sentence where the contestant cannot be designed, empty where the record has it not."""
+    contestant = contestants.BY_NAME[name]
+    low, start, high = bounds(contestant, problem)
+    try:
+        design = contestant.design(problem, dict(zip(_names(contestant), start, strict=True)))
+    except ValueError as reason:
+        return name, str(reason)
+    if design is None:
+        return name, ""
+    rests = panel.rests(design.model, trial.cases, trial.limits)
 
     def cost(theta: np.ndarray) -> float:
-        result = figures_of(theta)
-        value = scorecard.engineering_cost(
-            result, scenarios.plant, allowance, longest_s=scenarios.steps * model.sample_time_s
-        )
-        error_effort[theta.tobytes()] = engineering.error_effort_of(result)
-        return value
+        made = contestant.design(problem, dict(zip(_names(contestant), theta, strict=True)))
+        far = np.log(theta / start) / np.log(high / low)
+        return _cost(made, rests, trial) * (1 + NEARER * float(far @ far))
 
-    low, high = _bounds(settings, model)
-    result = _search(
-        "practical", cost, settings, settings.practical_initial, settings.practical_evaluations, low, high
+    first = tuning.History(start[None], *_first(cost, start))
+    result = tuning.minimise(
+        cost,
+        low,
+        high,
+        tuning.SearchSettings(settings.practical_initial, settings.practical_evaluations),
+        rng=np.random.default_rng(settings.seed),
+        start=first,
     )
-    trades = [error_effort.get(theta.tobytes()) for theta in result.history.theta]
-    default = np.array(
-        [tracking.yardstick_q] * model.p + [tracking.yardstick_r] * model.m + [tracking.observer_tau]
+    return name, result
+
+
+def _first(cost, start: np.ndarray) -> tuple[np.ndarray, tuple[str, ...], np.ndarray]:
+    """The declared start as the first candidate."""
+    try:
+        value, reason = cost(start), ""
+    except ValueError as failure:
+        value, reason = np.nan, str(failure)
+    return np.array([value]), (reason,), np.array([value])
+
+
+def _cost(design: contestants.Design, rests: Sequence[controller.Rest], trial: Trial) -> float:
+    """The declared cost of a candidate; raises ValueError where its disk margin on the identified plant is
+    below the least: figures in simulation are no reason to give robustness away."""
+    disk = scorecard.disk_margin(trial.plant, design.law)
+    if not disk >= trial.least_disk_margin:
+        raise ValueError(f"the disk margin is {disk:.2f}, below the least of {trial.least_disk_margin:.2f}")
+    deployed = controller.deployed(
+        design.law, trial.limits, integral_limit=trial.integral_limit, governor=trial.governor
     )
-    yardstick = scorecard.Yardstick(*np.split(default[:-1], [model.p]), tracking.gamma)
-    q, r, tau = np.split(result.theta, [model.p, model.p + model.m])
-    observed = model_based(model, tracking.gamma, tau=float(tau[0]))
-    default_cost = engineering.value_or_none(cost, default)
-    metrics = {
+    rollout = panel.rolled_out(deployed, trial.cases, panel.aims(design.law, rests, trial.cases))
+    low, high = trial.output_limits
+    figures = panel.figures(
+        rollout, trial.cases, limits=trial.limits, low=low, high=high, band=trial.band, settled=trial.settled
+    )
+    costs = panel.costs(figures, trial.allowance)
+    return comparison.mean_and_worst(costs, trial.cases.plant, weight=trial.worst_case)
+
+
+def _names(contestant: contestants.Contestant) -> list[str]:
+    return [parameter.name for parameter in contestant.parameters]
+
+
+def bounds(
+    contestant: contestants.Contestant, problem: contestants.Problem
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lowest, start and highest of each parameter (d,)."""
+    scale = [problem.effect if one.of_effect else 1.0 for one in contestant.parameters]
+    table = np.array([(one.low, one.start, one.high) for one in contestant.parameters]).T * scale
+    return table[0], table[1], table[2]
+
+
+def _values(name: str, result: tuning.Result, problem: contestants.Problem) -> dict[str, Any]:
+    """The parameters by name, the weights that they stand for, the cost, and which of them lie at a bound."""
+    contestant = contestants.BY_NAME[name]
+    low, _, high = bounds(contestant, problem)
+    share = np.log(result.theta / low) / np.log(high / low)
+    values = dict(zip(_names(contestant), result.theta.tolist(), strict=True))
+    if "effort_weight" in values:
+        values["q"], values["r"] = (weight.tolist() for weight in contestants.weights(problem, values))
+    return values | {
         "cost": result.cost,
-        "cost_default": default_cost,
-        "regret_identity": engineering.yardstick_regret(observed, scenarios, yardstick, q, r),
+        "cost_at_start": None if np.isnan(result.history.cost[0]) else float(result.history.cost[0]),
         "failed": int(np.isnan(result.history.cost).sum()),
-        "q": q,
-        "r": r,
-        "observer_tau": float(tau[0]),
-        "trade": {
-            "default": error_effort.get(default.tobytes()),
-            "optimum": engineering.optimum_error_effort(
-                scenarios, yardstick, limits=limits, band=panel.band_degC
-            ),
-        },
+        "evaluations": len(result.history.cost),
+        "at_bound": [
+            key
+            for key, place in zip(_names(contestant), share, strict=True)
+            if not AT_BOUND < place < 1 - AT_BOUND
+        ],
     }
-    return Search(result, trades, metrics)
 
 
-def _bounds(settings: TuneWeights, model: plant.Plant) -> tuple[list[float], list[float]]:
-    """Lowest and highest [q; r; tau]."""
-    low = [settings.q_low] * model.p + [settings.r_low] * model.m + [settings.tau_low]
-    high = [settings.q_high] * model.p + [settings.r_high] * model.m + [settings.tau_high]
-    return low, high
-
-
-def _search(
-    name: str,
-    cost,
-    settings: TuneWeights,
-    initial: int,
-    evaluations: int,
-    low: list[float],
-    high: list[float],
-) -> tuning.Result:
-    with tqdm(total=evaluations, desc=f"tune_weights: {name}", unit="candidate", mininterval=2) as bar:
-        return tuning.minimise(
-            cost,
-            np.array(low),
-            np.array(high),
-            tuning.SearchSettings(initial, evaluations, settings.acquisition),
-            rng=np.random.default_rng(settings.seed),
-            on_step=lambda _: bar.update(),
-        )
+def _history(results: Mapping[str, tuning.Result], problem: contestants.Problem) -> dict[str, Any]:
+    """The candidates of all searches as columns, one row a candidate."""
+    columns: dict[str, list] = {
+        key: [] for key in ("contestant", "evaluation", "cost", "incumbent", "chosen", "failure", "values")
+    }
+    for name, result in results.items():
+        history, names = result.history, _names(contestants.BY_NAME[name])
+        for k, theta in enumerate(history.theta):
+            columns["contestant"].append(name)
+            columns["evaluation"].append(k + 1)
+            columns["cost"].append(history.cost[k])
+            columns["incumbent"].append(history.incumbent[k])
+            columns["chosen"].append(bool((theta == result.theta).all()))
+            columns["failure"].append(history.failed[k])
+            columns["values"].append(", ".join(f"{key} {value:.4g}" for key, value in zip(names, theta, strict=True)))
+    return columns

@@ -1,0 +1,124 @@
+"""The comparison: which contestant is best, what tells model-based and data-driven apart, and which plant
+decides. Cases of one plant stand or fall together: plants are the blocks of every test and of every band."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.statistics import Paired, paired
+
+LEVEL = 0.05
+
+
+class Choice(NamedTuple):
+    """`best` is None where nobody passes. `last` is the contestant that came nearest to replacing it, with the
+    test of that replacement: the best one as champion, the other as challenger."""
+
+    best: str | None
+    last: str | None
+    against: Paired | None
+
+
+def chosen(
+    costs: Mapping[str, np.ndarray], plant: np.ndarray, passes: Mapping[str, bool], *, seed: int
+) -> Choice:
+    """The first of those that pass, in the order of `costs` (simplest first), that no more complex one beats:
+    one replaces it where its costs (s,) are lower beyond chance, paired by plant, one-sided at LEVEL."""
+    best, last, against = None, None, None
+    for name in costs:
+        if not passes[name]:
+            continue
+        if best is None:
+            best = name
+            continue
+        result = between(costs[best], costs[name], plant, seed=seed)
+        if result.p < LEVEL:
+            best, last, against = name, None, None
+        elif against is None or result.p < against.p:
+            last, against = name, result
+    return Choice(best, last, against)
+
+
+def between(champion: np.ndarray, challenger: np.ndarray, plant: np.ndarray, *, seed: int) -> Paired:
+    """The challenger's improvement over the champion on the same cases, paired by plant."""
+    floor = 1e-9
+    return paired(
+        np.maximum(champion, floor),
+        np.maximum(challenger, floor),
+        [str(index) for index in plant],
+        rng=np.random.default_rng(seed),
+    )
+
+
+class Pair(NamedTuple):
+    """Of two contestants a and b the cheaper one beyond chance, None where nobody is; by how many percent of
+    the other's cost, with the ends of the 90 % interval and the two-sided p."""
+
+    a: str
+    b: str
+    winner: str | None
+    difference: float
+    low: float
+    high: float
+    p: float
+
+
+def pair(a: str, b: str, costs: Mapping[str, np.ndarray], plant: np.ndarray, *, seed: int) -> Pair:
+    """The pair's difference is that of the cheaper one, whether or not it is beyond chance."""
+    forward = between(costs[b], costs[a], plant, seed=seed)
+    backward = between(costs[a], costs[b], plant, seed=seed)
+    cheaper, result = (a, forward) if forward.improvement_percent >= 0 else (b, backward)
+    p = min(1.0, 2 * result.p)
+    winner = cheaper if p < LEVEL else None
+    return Pair(a, b, winner, result.improvement_percent, result.low_percent, result.high_percent, p)
+
+
+def deciding_plant(a: np.ndarray, b: np.ndarray, plant: np.ndarray) -> int:
+    """The plant on which the costs (s,) of two contestants differ most in the direction in which they differ
+    on the whole: without it the verdict is told too."""
+    ratio = np.log(np.maximum(a, 1e-9) / np.maximum(b, 1e-9))
+    by_plant = np.array([ratio[plant == index].mean() for index in np.unique(plant)])
+    return int(np.unique(plant)[(np.sign(by_plant.sum() or 1.0) * by_plant).argmax()])
+
+
+class Band(NamedTuple):
+    """Median and 90 % quantile over all cases, the 90 % band of that quantile with plants resampled as blocks,
+    the worst, and the case that has it; inf where a run never settles."""
+
+    median: float
+    q90: float
+    low: float
+    high: float
+    worst: float
+    worst_case: int
+
+
+def banded(values: np.ndarray, plant: np.ndarray, *, seed: int, resamples: int = 200) -> Band:
+    """Of a figure (s,); NaN where it does not apply. Less is better."""
+    applies = np.flatnonzero(~np.isnan(values))
+    values, plant = values[applies], plant[applies]
+    median, q90 = np.quantile(values, [0.5, 0.9], method="nearest")
+    blocks = [values[plant == index] for index in np.unique(plant)]
+    drawn = np.random.default_rng(seed).integers(0, len(blocks), (resamples, len(blocks)))
+    quantiles = [
+        np.quantile(np.concatenate([blocks[k] for k in row]), 0.9, method="nearest") for row in drawn
+    ]
+    low, high = np.quantile(quantiles, [0.05, 0.95], method="nearest")
+    worst = int(np.argmax(values))
+    return Band(float(median), float(q90), float(low), float(high), float(values[worst]), int(applies[worst]))
+
+
+def mean_and_worst(costs: np.ndarray, plant: np.ndarray, *, weight: float) -> float:
+    """One number for a search: the mean cost, and with `weight` that of the costliest quarter of the plants,
+    which moves smoothly where the single worst plant would jump."""
+    by_plant = np.sort([costs[plant == index].mean() for index in np.unique(plant)])
+    tail = by_plant[-max(1, len(by_plant) // 4) :].mean()
+    return float((by_plant.mean() + weight * tail) / (1 + weight))
+
+
+def rows(results: Mapping[str, Sequence[np.ndarray]], names: Sequence[str]) -> dict[str, np.ndarray | list]:
+    """Figures of several contestants as columns, contestant by contestant."""
+    columns = {name: np.concatenate([figures[k] for figures in results.values()]) for k, name in enumerate(names)}
+    count = len(next(iter(results.values()))[0])
+    return {"contestant": [name for name in results for _ in range(count)], **columns}

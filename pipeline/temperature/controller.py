@@ -1,0 +1,292 @@
+"""The controller as it runs on the machine: a law with its limits, its target, its integrator, its governor and
+its hand-over.
+
+One form for every contestant. `step` takes one sample, `batch_step` the same sample of many cases at once: the
+panel judges by the second what a machine would run by the first.
+
+With memory z, measured y, and the reference r(t) = H w(t), w(t+1) = F w(t) (seed 1, (2)):
+
+    u = feed w - K z - D y - K_r xi, cut to low..high and to `rate` a step, then by the governor
+    xi(t+1) = xi + integral (clip(y* - y) + clip(beyond(P (u - u wished))))
+    z(t+1) = A z + B_u u + B_y y + B_r r + c
+
+The target y* = Y w is the reference, or the nearest one that the inputs can hold. P = pinv(-K_r) says by how
+many °C another reference would have asked for the input that was applied: back-calculation, which acts on what
+lies beyond the integrator's own limit. What was applied, not what was wished, enters the memory.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from pipeline.temperature.governor import Governor, Limits, governed, observed, started
+from pipeline.temperature.plant import Plant
+from pipeline.temperature.tracking import Law, feasible_target
+
+# ---- references
+
+
+class Reference(NamedTuple):
+    """r(t) = H w(t) in °C, w(t+1) = F w(t), w(0) = w0 with w0[0] = 1 that stays: F (k, k), H (p, k), w0 (k,)."""
+
+    F: np.ndarray
+    H: np.ndarray
+    w0: np.ndarray
+
+    def states(self, steps: int) -> np.ndarray:
+        """w (steps, k)."""
+        w = np.empty((steps, len(self.w0)))
+        w[0] = self.w0
+        for t in range(1, steps):
+            w[t] = self.F @ w[t - 1]
+        return w
+
+
+def constant(r: np.ndarray) -> Reference:
+    """r (p,) °C for ever."""
+    return Reference(np.eye(1), np.asarray(r, float)[:, None], np.ones(1))
+
+
+def ramp(r: np.ndarray, slope: np.ndarray) -> Reference:
+    """r + slope t: r (p,) °C, slope (p,) °C a step."""
+    return Reference(np.array([[1.0, 0.0], [1.0, 1.0]]), np.column_stack([r, slope]), np.array([1.0, 0.0]))
+
+
+def sinusoid(mean: np.ndarray, amplitude: np.ndarray, period: float) -> Reference:
+    """mean + amplitude sin(2 pi t / period): mean, amplitude (p,) °C, period in steps."""
+    c, s = np.cos(2 * np.pi / period), np.sin(2 * np.pi / period)
+    F = scipy.linalg.block_diag(np.eye(1), np.array([[c, -s], [s, c]]))
+    return Reference(
+        F, np.column_stack([mean, np.zeros_like(amplitude), amplitude]), np.array([1.0, 1.0, 0.0])
+    )
+
+
+# ---- what a law rests at
+
+
+class Rest(NamedTuple):
+    """Inputs U w and outputs Y w on which a plant rests while the reference is H w: U (m, k), Y (p, k).
+
+    `miss` (p,) is y* - r of the constant part in °C. `binding` are the inputs (index, limit in percent) that
+    stand at a limit where the reference is out of reach.
+    """
+
+    U: np.ndarray
+    Y: np.ndarray
+    miss: np.ndarray
+    binding: tuple[tuple[int, float], ...]
+
+
+def rest(model: Plant, reference: Reference, limits: Limits, *, tolerance: float = 0.01) -> Rest:
+    """The steady input of the constant part by a bounded quadratic programme (tracking.feasible_target), and
+    of what moves by the regulator equations X F = A X + B U, C X = H (Francis 1977)."""
+    target = feasible_target(model, reference.H[:, 0], limits.low, limits.high)
+    Y = reference.H.copy()
+    Y[:, 0] = 0.0
+    U = np.zeros((model.m, Y.shape[1])) if Y.shape[1] == 1 else _regulated(model, reference.F, Y)
+    U[:, 0] += target.u
+    Y[:, 0] = target.y
+    binding = ()
+    if np.abs(target.miss).max() > tolerance:
+        binding = tuple(
+            (i, float(limit))
+            for i, u in enumerate(target.u)
+            for limit in (limits.low[i], limits.high[i])
+            if abs(u - limit) < 1e-6 * (limits.high[i] - limits.low[i])
+        )
+    return Rest(U, Y, target.miss, binding)
+
+
+class Aim(NamedTuple):
+    """What a law adds to rest there: feed (m, k) and Y (p, k) of the module's formula."""
+
+    feed: np.ndarray
+    Y: np.ndarray
+
+
+def aim(law: Law, at: Rest, reference: Reference) -> Aim:
+    """feed = U + K Z + D Y, with the law's memory Z w on the way, Z F = A Z + B_u U + B_y Y + B_r H + [c 0]."""
+    drive = law.B_u @ at.U + law.B_y @ at.Y + law.B_r @ reference.H
+    drive[:, 0] += law.c
+    Z = _sylvester(law.A, reference.F, drive)
+    return Aim(at.U + law.K @ Z + law.D @ at.Y, at.Y)
+
+
+def _triangular(F: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """S, V with F = V S V*, S upper triangular; as it is where F is the identity of one state."""
+    return (F + 0j, np.eye(1) + 0j) if len(F) == 1 else scipy.linalg.schur(F, output="complex")
+
+
+def _sylvester(A: np.ndarray, F: np.ndarray, G: np.ndarray) -> np.ndarray:
+    """X (n, k) with X F = A X + G, column by column of F's Schur form; a mode of A that F excites is taken to
+    leak 1e-9 a step."""
+    if not len(A):
+        return G
+    if len(F) == 1:
+        return np.linalg.solve(_leaking(F[0, 0] * np.eye(len(A)) - A), G)
+    S, V = _triangular(F)
+    X, right = np.zeros(G.shape, complex), G @ V
+    for j in range(len(S)):
+        X[:, j] = np.linalg.solve(_leaking(S[j, j] * np.eye(len(A)) - A), right[:, j] - X[:, :j] @ S[:j, j])
+    return (X @ V.conj().T).real
+
+
+def _regulated(model: Plant, F: np.ndarray, H: np.ndarray) -> np.ndarray:
+    """U (m, k), of least norm in each column of F's Schur form, with which the outputs follow H w."""
+    S, V = _triangular(F)
+    X, U = np.zeros((model.n, len(S)), complex), np.zeros((model.m, len(S)), complex)
+    wanted = H @ V
+    for j in range(len(S)):
+        past = X[:, :j] @ S[:j, j]
+        resolvent = np.linalg.solve(
+            _leaking(S[j, j] * np.eye(model.n) - model.A), np.column_stack([model.B, -past])
+        )
+        response = model.C @ resolvent[:, :-1] + model.D
+        U[:, j] = np.linalg.pinv(response) @ (wanted[:, j] - model.C @ resolvent[:, -1])
+        X[:, j] = resolvent[:, :-1] @ U[:, j] + resolvent[:, -1]
+    return (U @ V.conj().T).real
+
+
+def _leaking(balance: np.ndarray) -> np.ndarray:
+    return balance + 1e-9 * np.eye(len(balance)) if np.linalg.cond(balance) > 1e13 else balance
+
+
+# ---- the law, a sample at a time
+
+
+class Deployed(NamedTuple):
+    """A law with what it runs under: `integral_limit` °C is the largest error, and the largest back-calculated
+    shift, that the integrator sees; `back` (p, m) is P of the module's formula; `gather` (q,) says which entry
+    of [z; u; y; 0] each entry of z(t+1) is, where the memory is a plain shift, and is None otherwise.
+
+    `holds`: it does nothing, and goes on with the input that it was handed."""
+
+    law: Law
+    limits: Limits
+    integral_limit: float
+    back: np.ndarray
+    shift: int
+    governor: Governor | None
+    holds: bool = False
+
+
+def deployed(
+    law: Law, limits: Limits, *, integral_limit: float, governor: Governor | None = None, holds: bool = False
+) -> Deployed:
+    back = np.linalg.pinv(-law.K_r) if np.any(law.K_r) else np.zeros(law.K_r.T.shape)
+    return Deployed(law, limits, integral_limit, back, _shift(law.A), governor, holds)
+
+
+def compact(law: Law, N: int) -> Law:
+    """The same law of a window of N past inputs and outputs (kernel.window_law) with N m numbers of memory
+    instead of N (m+p): z_i is what the lags from i on will still ask for,
+
+    z_i(t+1) = z_{i+1}(t) + K^u_i u(t) + K^y_i y(t), u = -z_1 - ..., and starts where the window would.
+    """
+    m, p = law.D.shape
+    of_u, of_y = (part.reshape(m, N, -1).transpose(1, 0, 2) for part in (law.K[:, : N * m], law.K[:, N * m :]))
+    left_u, left_y = (part[::-1].cumsum(axis=0)[::-1].reshape(N * m, -1) for part in (of_u, of_y))
+    return law._replace(
+        A=np.eye(N * m, k=m),
+        B_u=of_u.reshape(N * m, m),
+        B_y=of_y.reshape(N * m, p),
+        B_r=np.zeros((N * m, p)),
+        c=np.zeros(N * m),
+        K=np.eye(m, N * m),
+        start_u=left_u,
+        start_y=left_y,
+        start=np.zeros(N * m),
+    )
+
+
+def _shift(A: np.ndarray) -> int:
+    """k where A is a plain shift by k, 0 where it is none."""
+    k = int(np.flatnonzero(A[0])[0]) if len(A) and A[0].any() else 0
+    return k if k and np.array_equal(A, np.eye(len(A), k=k)) else 0
+
+
+class State(NamedTuple):
+    """All that a controller remembers, to be saved and restored: z (s, q), xi (s, p), the input u (s, m) applied
+    last, and the states x (f, s, n) of the governor's family; s cases at once, one on a machine."""
+
+    z: np.ndarray
+    xi: np.ndarray
+    u: np.ndarray
+    x: np.ndarray
+
+
+def watched(controller: Deployed, state: State | None, u: np.ndarray, y: np.ndarray, r: np.ndarray) -> State:
+    """The state after one sample in manual: inputs u (s, m) applied, outputs y (s, p) measured before, and
+    reference r (s, p). The first one starts it."""
+    law, family = controller.law, controller.governor
+    if state is None:
+        z = u @ law.start_u.T + y @ law.start_y.T + law.start
+        x = np.zeros((0, len(u), 0)) if family is None else started(family, y)
+        state = State(z, np.zeros(y.shape), u, x)
+    z, x = _remembered(controller, state, u, y, r)
+    return State(z, state.xi, u, x)
+
+
+def handed_over(controller: Deployed, state: State, y: np.ndarray, here: Sequence[Aim]) -> State:
+    """The state in which the law takes over from manual without a bump: xi starts where the law, aimed at where
+    the machine is (`here`, an Aim of each case's y), would go on with the input of manual, up to
+    `integral_limit`. A conditional law starts its integral action at that input."""
+    law = controller.law
+    if controller.holds:
+        return state
+    if law.conditional:
+        return state._replace(xi=state.u @ controller.back.T)
+    feed = np.array([one.feed[:, 0] for one in here])
+    wished = feed - state.z @ law.K.T - y @ law.D.T
+    most = controller.integral_limit
+    return state._replace(xi=np.clip((state.u - wished) @ controller.back.T, -most, most))
+
+
+def batch_step(
+    controller: Deployed, state: State, y: np.ndarray, r: np.ndarray, feed: np.ndarray, y_star: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, State]:
+    """Inputs (s, m) to apply, inputs wished, and the state a sample on, from measured y, reference r, target
+    y_star (s, p) and feed w (s, m)."""
+    law, limits = controller.law, controller.limits
+    if controller.holds:
+        return state.u, state.u, state
+    wished = feed - state.z @ law.K.T - y @ law.D.T - state.xi @ law.K_r.T
+    low = np.maximum(limits.low, np.minimum(state.u - limits.rate, limits.high))
+    high = np.minimum(limits.high, np.maximum(state.u + limits.rate, limits.low))
+    u = np.minimum(np.maximum(wished, low), high)
+    if controller.governor is not None:
+        u = governed(controller.governor, state.x, u, y_star, low, high)
+    xi = _integrated(controller, state.xi, y_star - y, u, wished)
+    z, x = _remembered(controller, state, u, y, r)
+    return u, wished, State(z, xi, u, x)
+
+
+def _integrated(controller: Deployed, xi, error, u, wished):
+    """xi (s, p) a sample on: the module's formula, or conditional integration (tracking.Law)."""
+    law, most = controller.law, controller.integral_limit
+    if law.conditional:
+        after = xi + law.integral * error
+        inside = np.abs(u - wished) <= 0
+        within = (
+            np.clip(-after @ law.K_r.T, controller.limits.low, controller.limits.high) @ controller.back.T
+        )
+        return np.where(inside @ (law.K_r != 0), within, xi)
+    if not np.any(law.integral):
+        return xi
+    shift = (u - wished) @ controller.back.T
+    beyond = shift - np.minimum(np.maximum(shift, -most), most)
+    clipped = [np.minimum(np.maximum(one, -most), most) for one in (error, beyond)]
+    return xi + law.integral * (clipped[0] + clipped[1])
+
+
+def _remembered(controller: Deployed, state: State, u, y, r):
+    """z (s, q) and the family's x (f, s, n) a sample on."""
+    law, family = controller.law, controller.governor
+    z = u @ law.B_u.T + y @ law.B_y.T + r @ law.B_r.T + law.c
+    if controller.shift:
+        z[:, : -controller.shift] += state.z[:, controller.shift :]
+    else:
+        z += state.z @ law.A.T
+    return z, state.x if family is None else observed(family, state.x, u, y)

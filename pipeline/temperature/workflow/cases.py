@@ -1,0 +1,184 @@
+"""What a rehearsal asks, on whose plants: the declared panel on the study's machine; on somebody's records what
+follows from them by stated defaults (scenario_defaults.py)."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pipeline.temperature import governor, panel, plant, scenario_defaults
+from pipeline.temperature.workflow import record
+from pipeline.temperature.workflow.settings import Half, Panel
+from pipeline.temperature.workflow.settings import Plant as Machine
+
+
+class Rehearsal(NamedTuple):
+    """The two halves of the panel, and what counts on this machine: the band and the settling limit that
+    follow from its record (None: as declared), noise (p,) in °C, references out of reach, and in words where
+    it comes from."""
+
+    judging: panel.Cases
+    training: panel.Cases
+    band_degC: float
+    settling_s: float | None
+    noise: np.ndarray
+    infeasible: list[dict[str, Any]]
+    source: str
+
+
+def input_limits(machine: Machine) -> governor.Limits:
+    low, high = np.array([(i.low, i.high) for i in machine.inputs], float).T
+    rate = np.array([i.rate_percent_per_s or np.inf for i in machine.inputs]) * machine.sample_time_s
+    return governor.Limits(low, high, rate)
+
+
+def output_limits(machine: Machine) -> tuple[np.ndarray, np.ndarray]:
+    """low, high (p,) in °C; -inf and inf where none is declared."""
+    low = [-np.inf if o.low is None else o.low for o in machine.outputs]
+    high = [np.inf if o.high is None else o.high for o in machine.outputs]
+    return np.array(low), np.array(high)
+
+
+def watchdog(
+    machine: Machine, settings: Panel, family: Sequence[plant.Plant], noise: np.ndarray, overshoot: float
+) -> governor.Governor:
+    """The governor of all contestants: three plants of the identified family at the corners of the panel's
+    spread; what it keeps from a limit is three deviations of the sensors' noise."""
+    low, high = output_limits(machine)
+    guarded = panel.corners(family[:3], spread_of(settings))
+    limits = governor.OutputLimits(low, high, 3 * noise, overshoot)
+    return governor.governor(guarded, input_limits(machine), limits)
+
+
+def spread_of(settings: Panel) -> panel.Spread:
+    return panel.Spread(
+        settings.input_gain,
+        settings.slower,
+        settings.extra_heat_loss_per_step,
+        settings.delayed,
+        settings.ambient_degC,
+    )
+
+
+def declared(
+    settings: Panel, machine: Machine, truth: plant.Plant, identified: plant.Plant
+) -> Rehearsal:
+    """The study's machine: judged around the truth, tuned around what was identified."""
+    reference = np.array([o.reference for o in machine.outputs])
+    noise = np.full(len(reference), settings.noise_degC)
+    judging, training = (
+        _half(settings, half, [around], _questions(half, reference, settings.steps), noise, cells=cells)
+        for half, around, cells in (
+            (settings.judging, truth, True),
+            (settings.training, identified, False),
+        )
+    )
+    return Rehearsal(judging, training, settings.band_degC, None, noise, [], "declared")
+
+
+def _questions(half: Half, reference: np.ndarray, steps: int) -> panel.Questions:
+    def by_offset(offsets: Sequence[float]) -> np.ndarray:
+        return np.array([reference + offset for offset in offsets])
+
+    ones, slope = np.ones_like(reference), half.ramp_degC_per_step
+    return panel.Questions(
+        np.array([start * ones for start in half.starts_degC]),
+        by_offset(half.reference_offsets_degC),
+        (reference - slope * steps, slope * ones) if slope else None,
+        (reference - 3 * half.sinusoid_degC, half.sinusoid_degC * ones, float(half.sinusoid_steps))
+        if half.sinusoid_degC
+        else None,
+        by_offset(half.sequence_offsets_degC) if half.sequence_offsets_degC else None,
+    )
+
+
+def _half(
+    settings: Panel,
+    half: Half,
+    around: Sequence[plant.Plant],
+    questions: panel.Questions,
+    noise: np.ndarray,
+    *,
+    cells: bool,
+    steps: int | None = None,
+    spread: panel.Spread | None = None,
+) -> panel.Cases:
+    rng = np.random.default_rng(half.seed)
+    plants = panel.drawn(around, half.plants, spread or spread_of(settings), cells=cells, rng=rng)
+    return panel.asked(
+        panel.padded(plants),
+        questions,
+        noise=noise,
+        seed=half.seed,
+        steps=steps or settings.steps,
+        hold=settings.hold_steps,
+        cells=cells,
+    )
+
+
+def from_record(
+    settings: Panel, machine: Machine, identified: plant.Plant, family: Sequence[plant.Plant], path: str
+) -> Rehearsal:
+    """Somebody's machine: both halves are drawn around plants of the identified family, and starts,
+    references, band, settling limit and length follow from the record."""
+    u, y, recordings = record.read_recordings(path, machine.acting, machine.outputs)
+    u = [a[:, : len(machine.inputs)] for a in u]
+    low, high = output_limits(machine)
+    scale = scenario_defaults.machine_scale(u, y, identified, machine.sample_time_s, _numbered(recordings))
+    asked = scenario_defaults.defaults(
+        scale,
+        identified,
+        input_limits(machine)[:2],
+        np.array([o.reference for o in machine.outputs]),
+        low,
+        high,
+        machine.sample_time_s,
+    )
+    spread = spread_of(settings)
+    slowest = 1 - np.abs(np.linalg.eigvals(identified.A)).max()
+    spread = spread._replace(
+        extra_heat_loss=float(np.clip(0.2 * slowest, 0.0, spread.extra_heat_loss)),
+        ambient_degC=max(spread.ambient_degC, float(np.max(scale.ambient_degC_spread))),
+    )
+    lower = asked.references[-1]
+    swing = asked.references.mean(axis=0), asked.sinusoid.amplitude_degC, float(asked.sinusoid.period_steps)
+    questions = panel.Questions(
+        asked.starts, asked.references, (lower, asked.ramp_degC_per_step), swing, asked.sequence
+    )
+    middle = asked.starts.mean(axis=0, keepdims=True)
+    training = panel.Questions(middle, asked.references.mean(axis=0, keepdims=True), None, None, asked.sequence)
+    judging, trained = (
+        _half(
+            settings, half, around, question, scale.noise_degC, cells=False, steps=asked.steps, spread=spread
+        )
+        for half, around, question in (
+            (settings.judging, family[1::2], questions),
+            (settings.training, family[::2], training),
+        )
+    )
+    infeasible = [
+        {
+            "output": machine.outputs[one.output].name,
+            "asked_degC": one.asked_degC,
+            "reachable_degC": one.reachable_degC,
+            "binding": _binding(machine, one),
+        }
+        for one in asked.infeasible
+    ]
+    return Rehearsal(
+        judging, trained, asked.band_degC, asked.settling_s, scale.noise_degC, infeasible, "from the record"
+    )
+
+
+def _numbered(names: Sequence[str]) -> list[int]:
+    first = list(dict.fromkeys(names))
+    return [first.index(name) for name in names]
+
+
+def _binding(machine: Machine, one: scenario_defaults.Infeasible) -> str:
+    """What keeps a reference out of reach, in words."""
+    if one.input is None:
+        return {"inputs": "fewer inputs than references"}.get(one.limit, f"the declared {one.limit} limit")
+    signal = machine.inputs[one.input]
+    limit = signal.low if one.limit == "low" else signal.high
+    return f"{signal.name} at {limit:g} {signal.unit}"

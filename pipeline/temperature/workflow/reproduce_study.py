@@ -1,0 +1,85 @@
+"""What reproduce_study does: the study's own part, on its simulated machine, which no recording touches. Its
+figures as published; its learners on noise-free and on many noisy data sets; the starts of its Algorithm 1;
+and the parity search, Q and R by Bayesian optimisation of its fitness (37), whose optimum is known."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from joblib import delayed
+from tqdm import tqdm
+
+from pipeline.store.execution import run_all
+from pipeline.store.params import Execution
+from pipeline.temperature import published, study, tuning
+from pipeline.temperature.workflow.record import read_published
+from pipeline.temperature.workflow.settings import ReproduceStudy
+
+# samples of a data set of the study, and starts of its algorithm 1
+SAMPLES, STARTS = 15_000, 300
+
+
+class Reproduced(NamedTuple):
+    """A row a noisy data set and route, a row a candidate of the parity search, and the figures beside the
+    paper's."""
+
+    study: dict[str, list]
+    parity: dict[str, list | np.ndarray]
+    metrics: dict[str, Any]
+
+
+def check(settings: ReproduceStudy) -> None:
+    """Raises ValueError where the parity search has no room."""
+    for name in ("q", "r"):
+        low, high = getattr(settings, f"{name}_low"), getattr(settings, f"{name}_high")
+        if low >= high:
+            raise ValueError(
+                f"params.expert.yaml: reproduce_study.{name}_low is {low:g} but must be less than "
+                f"reproduce_study.{name}_high, {high:g}; change one of the two"
+            )
+    if settings.initial > settings.evaluations:
+        raise ValueError(
+            f"params.expert.yaml: reproduce_study.initial is {settings.initial} but must be at most "
+            f"reproduce_study.evaluations, {settings.evaluations}; change one of the two"
+        )
+
+
+def reproduced(settings: ReproduceStudy, execution: Execution, folder: str) -> Reproduced:
+    """`folder` has the draws behind the paper's figures."""
+    K0, u, y = read_published(folder)
+    rows = _noisy(settings, execution)
+    noise_free = study.noise_free(u[1:], y[1:], np.random.default_rng(settings.seed))
+    failures = published.algorithm_1_failures(STARTS)
+    figures = study.metrics(
+        published.figures(K0, u, y), study.exact(), noise_free, rows, failures=failures, starts=STARTS
+    )
+    search = _parity(settings)
+    return Reproduced(rows, study.candidates(search), figures | {"parity": study.parity_metrics(search)})
+
+
+def _noisy(settings: ReproduceStudy, execution: Execution) -> dict[str, list]:
+    """Gap and error of every route on every noisy data set."""
+    sets_u, sets_y = study.data_sets(np.random.default_rng(settings.seed), SAMPLES, settings.data_sets)
+    work = [(noise, i) for noise in study.NOISE for i in range(settings.data_sets)]
+    calls = [delayed(study.under_noise)(sets_u[:, i], sets_y[:, i], noise=noise, seed=i) for noise, i in work]
+    results = tqdm(
+        run_all(calls, execution), total=len(work), desc="reproduce_study: noisy data sets", mininterval=2
+    )
+    return study.rows(work, list(results))
+
+
+def _parity(settings: ReproduceStudy) -> tuning.Result:
+    low, high = (
+        np.repeat(ends, (study.OUTPUTS, study.INPUTS))
+        for ends in ((settings.q_low, settings.r_low), (settings.q_high, settings.r_high))
+    )
+    with tqdm(
+        total=settings.evaluations, desc="reproduce_study: parity", unit="candidate", mininterval=2
+    ) as bar:
+        return tuning.minimise(
+            study.tuning_objective,
+            low,
+            high,
+            tuning.SearchSettings(settings.initial, settings.evaluations, settings.acquisition),
+            rng=np.random.default_rng(settings.seed),
+            on_step=lambda _: bar.update(),
+        )
