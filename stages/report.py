@@ -21,6 +21,7 @@ from pipeline.temperature.workflow.settings import Plant
 
 # what the pages show of each stage: its figures, and its folder of tables
 METRICS = {
+    "probe_machine": "reports/metrics/probe_machine.json",
     "generate_probing": "reports/metrics/generate_probing.json",
     "ingest": "reports/metrics/ingest.json",
     "identify_plant": "reports/metrics/identify_plant.json",

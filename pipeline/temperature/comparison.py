@@ -119,6 +119,8 @@ def mean_and_worst(costs: np.ndarray, plant: np.ndarray, *, weight: float) -> fl
 
 def rows(results: Mapping[str, Sequence[np.ndarray]], names: Sequence[str]) -> dict[str, np.ndarray | list]:
     """Figures of several contestants as columns, contestant by contestant."""
-    columns = {name: np.concatenate([figures[k] for figures in results.values()]) for k, name in enumerate(names)}
+    columns = {
+        name: np.concatenate([figures[k] for figures in results.values()]) for k, name in enumerate(names)
+    }
     count = len(next(iter(results.values()))[0])
     return {"contestant": [name for name in results for _ in range(count)], **columns}

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from pipeline.temperature.governor import Governor, Limits, governed, observed, started
+from pipeline.temperature.governor import Governor, Limits, corrected, governed, observed, predicted, started
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.tracking import Law, feasible_target
 
@@ -186,7 +186,9 @@ def compact(law: Law, N: int) -> Law:
     z_i(t+1) = z_{i+1}(t) + K^u_i u(t) + K^y_i y(t), u = -z_1 - ..., and starts where the window would.
     """
     m, p = law.D.shape
-    of_u, of_y = (part.reshape(m, N, -1).transpose(1, 0, 2) for part in (law.K[:, : N * m], law.K[:, N * m :]))
+    of_u, of_y = (
+        part.reshape(m, N, -1).transpose(1, 0, 2) for part in (law.K[:, : N * m], law.K[:, N * m :])
+    )
     left_u, left_y = (part[::-1].cumsum(axis=0)[::-1].reshape(N * m, -1) for part in (of_u, of_y))
     return law._replace(
         A=np.eye(N * m, k=m),
@@ -209,7 +211,7 @@ def _shift(A: np.ndarray) -> int:
 
 class State(NamedTuple):
     """All that a controller remembers, to be saved and restored: z (s, q), xi (s, p), the input u (s, m) applied
-    last, and the states x (f, s, n) of the governor's family; s cases at once, one on a machine."""
+    last, and the memory x (f, s, n) of the governor's family; s cases at once, one on a machine."""
 
     z: np.ndarray
     xi: np.ndarray
@@ -225,8 +227,8 @@ def watched(controller: Deployed, state: State | None, u: np.ndarray, y: np.ndar
         z = u @ law.start_u.T + y @ law.start_y.T + law.start
         x = np.zeros((0, len(u), 0)) if family is None else started(family, y)
         state = State(z, np.zeros(y.shape), u, x)
-    z, x = _remembered(controller, state, u, y, r)
-    return State(z, state.xi, u, x)
+    x = state.x if family is None else observed(family, state.x, u, y)
+    return State(_remembered(controller, state.z, u, y, r), state.xi, u, x)
 
 
 def handed_over(controller: Deployed, state: State, y: np.ndarray, here: Sequence[Aim]) -> State:
@@ -256,11 +258,13 @@ def batch_step(
     low = np.maximum(limits.low, np.minimum(state.u - limits.rate, limits.high))
     high = np.minimum(limits.high, np.maximum(state.u + limits.rate, limits.low))
     u = np.minimum(np.maximum(wished, low), high)
-    if controller.governor is not None:
-        u = governed(controller.governor, state.x, u, y_star, low, high)
+    x, family = state.x, controller.governor
+    if family is not None:
+        x = corrected(family, x, y)
+        u = governed(family, x, u, y_star, low, high)
+        x = predicted(family, x, u)
     xi = _integrated(controller, state.xi, y_star - y, u, wished)
-    z, x = _remembered(controller, state, u, y, r)
-    return u, wished, State(z, xi, u, x)
+    return u, wished, State(_remembered(controller, state.z, u, y, r), xi, u, x)
 
 
 def _integrated(controller: Deployed, xi, error, u, wished):
@@ -281,12 +285,12 @@ def _integrated(controller: Deployed, xi, error, u, wished):
     return xi + law.integral * (clipped[0] + clipped[1])
 
 
-def _remembered(controller: Deployed, state: State, u, y, r):
-    """z (s, q) and the family's x (f, s, n) a sample on."""
-    law, family = controller.law, controller.governor
-    z = u @ law.B_u.T + y @ law.B_y.T + r @ law.B_r.T + law.c
+def _remembered(controller: Deployed, z, u, y, r):
+    """z (s, q) a sample on."""
+    law = controller.law
+    after = u @ law.B_u.T + y @ law.B_y.T + r @ law.B_r.T + law.c
     if controller.shift:
-        z[:, : -controller.shift] += state.z[:, controller.shift :]
+        after[:, : -controller.shift] += z[:, controller.shift :]
     else:
-        z += state.z @ law.A.T
-    return z, state.x if family is None else observed(family, state.x, u, y)
+        after += z @ law.A.T
+    return after

@@ -1,13 +1,26 @@
 """The governor: what keeps the predicted worst output of a family of plants within the limits of the outputs,
-whatever the law asks for."""
+whatever the law asks for.
+
+A braking distance in each output: the command moves as little as it must, so that from the next step on every
+member of the family that the record has not contradicted could still be stopped below `high` by its lowest
+inputs, and above `low` by its highest. In the terms of a reference governor (Garone, Di Cairano, Kolmanovsky
+2017): the reference moves to the one for which the law would have asked for that command, and back-calculation
+tells the integrator.
+
+A member does not know how strongly its inputs act, only within what range. Its forecast is linear in that
+strength, so that it carries two: the strongest, and what lies between strongest and weakest; least squares on
+its innovations tells, output by output, where between them the machine is. What a member explains worse than
+another, whatever its strength (a delay that is not there), does not count for a while.
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 
-from pipeline.temperature.plant import Plant
-from pipeline.temperature.tracking import reached_state, robust_observer_gain
+from pipeline.temperature.plant import Plant, markov_parameters
+from pipeline.temperature.tracking import reached_state, riccati
 
 
 class Limits(NamedTuple):
@@ -18,44 +31,10 @@ class Limits(NamedTuple):
     rate: np.ndarray
 
 
-class Governor(NamedTuple):
-    """What keeps the predicted worst output of a family of f plants within its limits.
-
-    The command moves as little as it must, so that from the next step on every member could still be stopped
-    below `high` by its lowest inputs, and above `low` by its highest. In the terms of a reference governor
-    (Garone, Di Cairano, Kolmanovsky 2017): the reference moves to the one for which the law would have asked
-    for that command, and back-calculation tells the integrator.
-
-    Each member has an observer x(t+1) = A x + B u + b + L (y - C x - d) of what is measured, started at
-    start y(0) + start_0. Its output h instants ahead is x free_x + free_0 + per_u u, above with lowest inputs
-    from the next step on and below with highest; rows run over outputs, then instants.
-
-    Shapes with n states, p outputs, h instants: A (f, n, n), B (f, n, m), C (f, p, n), b (f, n), d (f, p),
-    L (f, n, p), start (f, n, p), start_0 (f, n), free_x (f, n, p h), above_0, below_0 (f, p h),
-    per_u (f, p h, m); low, high (p,) °C, margin taken off. `overshoot` °C: how far a member may be predicted
-    beyond its target where that can be avoided.
-    """
-
-    A: np.ndarray
-    B: np.ndarray
-    C: np.ndarray
-    b: np.ndarray
-    d: np.ndarray
-    L: np.ndarray
-    start: np.ndarray
-    start_0: np.ndarray
-    free_x: np.ndarray
-    above_0: np.ndarray
-    below_0: np.ndarray
-    per_u: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    overshoot: float
-
-
 class OutputLimits(NamedTuple):
     """low, high (p,) in °C, -inf and inf where none is declared; `margin` (p,) in °C is kept from both, for the
-    sensors' noise; `overshoot` in °C as in Governor."""
+    sensors' noise (three standard deviations); `overshoot` in °C: how far an output that is below its target
+    may be predicted beyond it."""
 
     low: np.ndarray
     high: np.ndarray
@@ -63,120 +42,328 @@ class OutputLimits(NamedTuple):
     overshoot: float
 
 
-AHEAD = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48)
+class Strength(NamedTuple):
+    """All inputs act `weakest` to `strongest` times as they do on the member; beside that each input differs
+    from the others by a factor within 1 +- `each`."""
+
+    weakest: float
+    strongest: float
+    each: float
+
+
+class Governor(NamedTuple):
+    """A family of f plants with their observers, and the rows by which they look ahead; `governor` makes it.
+
+    A member remembers s = [x, w, xi, v] of size q = 2 (n + p). x is its state at its strongest and w (p) in °C
+    a step a drift that it cannot explain, so that steady disagreement vanishes (offset-free prediction); xi and
+    v are by how much less x and w would be at its weakest. Before y is measured s forecasts [C x + d, C xi]:
+
+        s <- s + [e, clip(e + lambda C xi), C xi, clip(C xi)] correct,   s(t+1) = s move + u push + rest
+
+    with innovation e = y - C x - d, lambda in 0..1 between strongest and weakest, and an observer of the
+    stationary Riccati equation. w and v see up to `surprise` only: what is larger belongs to a transient, and
+    there to the strength of the inputs.
+
+    Its output j, h instants ahead and at its strongest, is s ahead + above + strongest u rise, with lowest
+    inputs from the next step on, and with `below` and `fall` in their places with highest; the second half of
+    `ahead` tells what the weakest lacks. Rows run over outputs, then instants, of which the first is now.
+
+    Shapes: see (f, q, 2 p), offset (f, p), correct (f, 4 p, q), move (f, q, q), push (f, m, q), rest (f, q),
+    start (f, p, q), start_0 (f, q), ahead (f, q, 2 p h), above, below (f, p h), rise, fall (f, m, p h); low,
+    high, surprise, doubt (p,) in °C, margins taken off: `doubt` is by how much an innovation may be off for
+    reasons other than the inputs' strength.
+    """
+
+    see: np.ndarray
+    offset: np.ndarray
+    correct: np.ndarray
+    move: np.ndarray
+    push: np.ndarray
+    rest: np.ndarray
+    start: np.ndarray
+    start_0: np.ndarray
+    ahead: np.ndarray
+    above: np.ndarray
+    below: np.ndarray
+    rise: np.ndarray
+    fall: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    surprise: np.ndarray
+    doubt: np.ndarray
+    strength: Strength
+    overshoot: float
+
+
+INSTANTS = 7
+LONGEST = 120
 SWEEPS = 8
+FORGETS = 0.005
+LEAK = 0.002
+CONTRADICTED = 4.0
+WEAK = 0.05
 
 
-def governor(family: Sequence[Plant], limits: Limits, outputs: OutputLimits, *, tau: float = 1.0) -> Governor:
-    """The governor of a family of plants of one order (their feed-through made a delay). A rate limit slows
-    the stop: inputs go from u to the limit on a straight line that the slowest of them needs."""
-    span = limits.high - limits.low
-    columns = {name: [] for name in Governor._fields[:12]}
-    for plant in family:
-        inverse = reached_state(plant)
-        free_x, per_u, above, below = [], [], [], []
-        power, driven = np.eye(plant.n), np.zeros((plant.n, plant.m))
-        left, right_0 = np.zeros((plant.n, plant.m)), np.zeros(plant.n)
-        at = 0
-        for step in range(AHEAD[-1]):
-            share = np.maximum(0.0, 1.0 - step * limits.rate / span) if step else np.ones(plant.m)
-            power = plant.A @ power
-            driven = plant.A @ driven + plant.B * share
-            left = plant.A @ left + plant.B * (1.0 - share)
-            right_0 = plant.A @ right_0 + plant.b
-            if step + 1 == AHEAD[at]:
-                free_x.append(plant.C @ power)
-                per_u.append(plant.C @ driven)
-                above.append(plant.C @ (left @ limits.low + right_0) + plant.d)
-                below.append(plant.C @ (left @ limits.high + right_0) + plant.d)
-                at += 1
-        rows = plant.p * len(AHEAD)
-        parts = (
-            plant.A, plant.B, plant.C, plant.b, plant.d, robust_observer_gain(plant, tau),
-            inverse, -inverse @ plant.d,
-            np.stack(free_x, 1).reshape(rows, plant.n).T, np.stack(above, 1).reshape(rows),
-            np.stack(below, 1).reshape(rows), np.stack(per_u, 1).reshape(rows, plant.m),
-        )  # fmt: skip
-        for name, part in zip(columns, parts, strict=True):
-            columns[name].append(part)
+def governor(
+    family: Sequence[Plant],
+    limits: Limits,
+    outputs: OutputLimits,
+    strength: Strength,
+    *,
+    tau: float = 0.2,
+    drift: float = 0.08,
+) -> Governor:
+    """The governor of a family of plants of one order (their feed-through made a delay), for inputs of any
+    `strength` within its range.
+
+    Innovations are doubted by the sensors' noise, a tenth of a degree at least. The observer takes process noise to come in by the inputs, sensors to be tau °C^2 per percent^2 noisier
+    than that, and the drift w to wander by `drift` of the sensors' noise a step.
+    """
+    at, unsure = instants(family), np.maximum(outputs.margin, 0.1)
+    members = [
+        {**_watching(plant, strength, tau, drift), **_ahead(plant, limits, strength, at)} for plant in family
+    ]
     return Governor(
-        **{name: np.stack(parts) for name, parts in columns.items()},
+        **{name: np.stack([member[name] for member in members]) for name in members[0]},
         low=outputs.low + outputs.margin,
         high=outputs.high - outputs.margin,
+        surprise=3 * unsure,
+        doubt=4 * unsure,
+        strength=strength,
         overshoot=outputs.overshoot,
     )
 
 
-def governed(
-    governor: Governor, x: np.ndarray, u: np.ndarray, y_star: np.ndarray, low: np.ndarray, high: np.ndarray
-) -> np.ndarray:
-    """Commands (s, m) as near to u (s, m) as the rows of the governor allow, within low..high (s, m); x
-    (f, s, n) states of the members, y_star (s, p) targets.
-
-    Projections onto the most violated row of each output in turn. Only inputs whose lowering helps are lowered
-    for a high limit, and raised for a low one; the high limit has the last word. A limit that cannot be kept
-    is kept as far as the inputs go; an overshoot that cannot be avoided is let go.
-    """
-    cap = np.minimum(governor.high, y_star + governor.overshoot)
-    ahead = np.matmul(x, governor.free_x)
-    if np.isfinite(governor.low).any():
-        floor = np.broadcast_to(-governor.low, cap.shape)
-        u = -_projected(governor.per_u, -(ahead + governor.below_0[:, None]), -u, -high, floor, floor)
-    if np.isfinite(cap).any():
-        hard = np.broadcast_to(governor.high, cap.shape)
-        u = _projected(governor.per_u, ahead + governor.above_0[:, None], u, low, hard, cap)
-    return u
+def instants(family: Sequence[Plant], *, longest: int = LONGEST) -> np.ndarray:
+    """Steps ahead at which the members are looked at: now, then closer together at first, up to four times
+    that after which the slowest pulse response has passed its peak, 16 at least."""
+    peak = 1 + max(
+        int(np.abs(markov_parameters(plant, longest)).max(axis=(1, 2)).argmax()) for plant in family
+    )
+    last = min(max(4 * peak, 16), longest)
+    return np.r_[0, np.unique(np.round(np.geomspace(1, last, INSTANTS)).astype(int))]
 
 
-def _projected(per_u, free, u, low, hard, cap):
-    """`governed` for one side, free (f, s, p h) + per_u u <= hard, and <= cap (s, p) where that can be kept."""
-    f, s, rows = free.shape
-    value = (free + np.matmul(u, per_u.transpose(0, 2, 1))).reshape(f, s, cap.shape[1], -1)
-    touched = np.flatnonzero((value > cap[None, :, :, None]).any(axis=(0, 2, 3)))
-    if not touched.size:
-        return u
-    u = u.copy()
-    u[touched] = _swept(per_u, free[:, touched], u[touched], low[touched], hard[touched], cap[touched])
-    return u
+def _drifting(plant: Plant) -> tuple[np.ndarray, np.ndarray]:
+    """A, C of the state [x; w]: w (p) in °C a step warms the outputs along the state that inputs most likely
+    reach; it leaks, so that no mode of it stands still unseen."""
+    n, p = plant.n, plant.p
+    A = np.block([[plant.A, reached_state(plant)], [np.zeros((p, n)), (1 - LEAK) * np.eye(p)]])
+    return A, np.hstack([plant.C, np.zeros((p, p))])
 
 
-def _swept(per_u, free, u, low, hard, cap):
-    """The projections of `governed` for cases that a row touches: free (f, s, p h), u, low (s, m), hard, cap
-    (s, p)."""
-    f, s, rows = free.shape
-    p, m = cap.shape[1], u.shape[1]
-    h = rows // p
-    helps, hurts = np.maximum(per_u, 0.0), np.minimum(per_u, 0.0)
-    least = free + np.matmul(low, helps.transpose(0, 2, 1)) + np.matmul(u, hurts.transpose(0, 2, 1))
-    hard, cap = np.repeat(hard, h, axis=1), np.repeat(cap, h, axis=1)
-    cap = np.where(least <= cap, cap, np.maximum(hard, least)).reshape(f, s, p, h)
-    free, per_u, helps = (array.reshape(f, *shape) for array, shape in (
-        (free, (s, p, h)), (per_u, (p, h, m)), (helps, (p, h, m))
-    ))  # fmt: skip
-    case = np.arange(s)
-    for _ in range(SWEEPS):
-        for j in range(p):
-            excess = free[:, :, j] + np.matmul(u, per_u[:, j].transpose(0, 2, 1)) - cap[:, :, j]
-            excess = excess.transpose(1, 0, 2).reshape(s, f * h)
-            worst = excess.argmax(axis=1)
-            direction = helps[:, j].reshape(f * h, m)[worst] * (u > low)
-            size = (direction**2).sum(axis=1)
-            step = np.maximum(excess[case, worst], 0.0) / np.where(size > 0, size, np.inf)
-            u = np.maximum(u - step[:, None] * direction, low)
-    return u
+def _watching(plant: Plant, strength: Strength, tau: float, drift: float) -> dict[str, np.ndarray]:
+    """The part of a Governor by which one member follows the machine."""
+    n, m, p = plant.n, plant.m, plant.p
+    likely = reached_state(plant)
+    A, C = _drifting(plant)
+    pulse = np.abs(markov_parameters(plant, LONGEST)).max(axis=0)
+    noise = scipy.linalg.block_diag(plant.B @ plant.B.T, drift**2 * np.diag((pulse**2).sum(axis=1)))
+    P = riccati(A.T, C.T, noise, tau * np.eye(p))
+    L = P @ C.T @ np.linalg.inv(C @ P @ C.T + tau * np.eye(p))
+    less, none = strength.strongest - strength.weakest, np.zeros((p, m))
+    quick, slow = (np.vstack(parts) for parts in ((L[:n], 0 * L[n:]), (0 * L[:n], L[n:])))
+    one, other = np.array([[1.0], [0.0]]), np.array([[0.0], [1.0]])
+    return {
+        "see": scipy.linalg.block_diag(C, C).T,
+        "offset": plant.d,
+        "correct": np.hstack([np.kron(which, part) for which in (one, -other) for part in (quick, slow)]).T,
+        "move": scipy.linalg.block_diag(A, A).T,
+        "push": np.vstack([strength.strongest * plant.B, none, less * plant.B, none]).T,
+        "rest": np.r_[plant.b, np.zeros(n + 2 * p)],
+        "start": np.vstack([likely, np.zeros((n + 2 * p, p))]).T,
+        "start_0": np.r_[-likely @ plant.d, np.zeros(n + 2 * p)],
+    }
+
+
+def _ahead(plant: Plant, limits: Limits, strength: Strength, at: np.ndarray) -> dict[str, np.ndarray]:
+    """The rows of a Governor of one member. A rate limit slows the stop: inputs go from u to the limit on a
+    straight line that the slowest of them needs. An input that helps is taken to act less than one that hurts,
+    by what `each` leaves open."""
+    n, m, p = plant.n, plant.m, plant.p
+    A, C = _drifting(plant)
+    B, b = np.vstack([plant.B, np.zeros((p, m))]), np.r_[plant.b, np.zeros(p)]
+    rows = {name: [] for name in ("x", "u", "left", "right")}
+    power, driven, left, right = np.eye(n + p), np.zeros((n + p, m)), np.zeros((n + p, m)), np.zeros(n + p)
+    for step in range(at[-1] + 1):
+        if step in at:
+            for name, part in zip(rows, (power, driven, left, right), strict=True):
+                rows[name].append(C @ part)
+        share = np.maximum(0.0, 1.0 - step * limits.rate / (limits.high - limits.low)) if step else 1.0
+        power, driven = A @ power, A @ driven + B * share
+        left, right = A @ left + B * (1.0 - share), A @ right + b
+    x, u, left, right = (np.stack(rows[name], axis=1).reshape(p * len(at), -1) for name in rows)
+    most, least = strength.strongest, strength.weakest
+    rest, weaker = right[:, 0] + np.repeat(plant.d, len(at)), (1 - strength.each) / (1 + strength.each)
+    return {
+        "ahead": scipy.linalg.block_diag(x, x).T,
+        "above": rest + most * left @ limits.low,
+        "below": rest + least * left @ limits.high,
+        "rise": np.where(u < 0, weaker * u, u).T,
+        "fall": np.where(u < 0, u / weaker, u).T,
+    }
+
+
+# ---- what it remembers
 
 
 def started(family: Governor, y: np.ndarray) -> np.ndarray:
-    """States (f, s, n) of the members at measured outputs y (s, p)."""
-    return np.matmul(y, family.start.transpose(0, 2, 1)) + family.start_0[:, None]
+    """Memory (f, s, q + 4 p) of the members at measured outputs y (s, p): s of Governor, then four sums an
+    output, of -e C xi, (C xi)^2, |C xi| and e^2, older ones forgotten."""
+    memory = np.matmul(y, family.start) + family.start_0[:, None]
+    return np.concatenate([memory, np.zeros((*memory.shape[:2], 4 * y.shape[1]))], axis=2)
 
 
-def observed(family: Governor, x: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """States (f, s, n) a sample after inputs u (s, m) were applied where y (s, p) was measured."""
-    error = y - np.matmul(x, family.C.transpose(0, 2, 1)) - family.d[:, None]
-    return (
-        np.matmul(x, family.A.transpose(0, 2, 1))
-        + np.matmul(u, family.B.transpose(0, 2, 1))
-        + family.b[:, None]
-        + np.matmul(error, family.L.transpose(0, 2, 1))
+def corrected(family: Governor, memory: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The memory once outputs y (s, p) are measured."""
+    q, p = family.start.shape[2], y.shape[1]
+    s = memory[:, :, :q]
+    forecast = np.matmul(s, family.see)
+    e = y - family.offset[:, None] - forecast[:, :, :p]
+    lacks = forecast[:, :, p:]
+    after = np.empty_like(memory)
+    sums = (1 - FORGETS) * memory[:, :, q:]
+    for k, news in enumerate((-e * lacks, lacks * lacks, np.abs(lacks), e * e)):
+        sums[:, :, k * p : (k + 1) * p] += news
+    strength = np.clip(sums[:, :, :p] / (sums[:, :, p : 2 * p] + 1e-12), 0.0, 1.0)
+    left = e + strength * lacks
+    calm, lacks_calm = (np.minimum(np.maximum(v, -family.surprise), family.surprise) for v in (left, lacks))
+    news = np.concatenate([e, calm, lacks, lacks_calm], axis=2)
+    after[:, :, :q] = s + np.matmul(news, family.correct)
+    after[:, :, q:] = sums
+    return after
+
+
+def predicted(family: Governor, memory: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """The corrected memory a sample on, inputs u (s, m) applied."""
+    q = family.start.shape[2]
+    after = memory.copy()
+    after[:, :, :q] = np.matmul(memory[:, :, :q], family.move) + np.matmul(u, family.push)
+    after[:, :, :q] += family.rest[:, None]
+    return after
+
+
+def observed(family: Governor, memory: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The memory a sample after inputs u (s, m) were applied where y (s, p) was measured."""
+    return predicted(family, corrected(family, memory, y), u)
+
+
+class Evidence(NamedTuple):
+    """Of each member, case and output (f, s, p): the share of the way from strongest to weakest that the inputs
+    are at least, by least squares, and at most; and whether the member counts (f, s)."""
+
+    least: np.ndarray
+    middle: np.ndarray
+    most: np.ndarray
+    counts: np.ndarray
+
+
+def evidence(family: Governor, memory: np.ndarray) -> Evidence:
+    """What the innovations tell: least squares, every innovation up to `doubt` off in the direction that
+    matters. A member does not count where the best member's squares are a quarter of its own, and its own
+    more than noise."""
+    p = len(family.low)
+    sums = memory[:, :, -4 * p :]
+    product, square, size, own = (sums[:, :, k * p : (k + 1) * p] for k in range(4))
+    share, doubt = 1 / (square + 1e-12), family.doubt * size + 1e-9
+    middle = np.clip(product * share, 0.0, 1.0)
+    rest = (own - middle * (2 * product - middle * square)).sum(axis=2)
+    counts = rest <= CONTRADICTED * rest.min(axis=0) + (family.doubt**2).sum()
+    least, most = (np.clip((product + off) * share, 0.0, 1.0) for off in (-doubt, doubt))
+    return Evidence(least, middle, most, counts)
+
+
+# ---- what it allows
+
+
+def governed(
+    family: Governor, memory: np.ndarray, u: np.ndarray, y_star: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """Commands (s, m) as near to u (s, m) as the rows allow, within low..high (s, m); the memory corrected by
+    what was measured, y_star (s, p) targets.
+
+    Projections onto the most violated row of each output in turn. Only inputs whose lowering helps are lowered
+    for a high limit, and raised for a low one; the high limit has the last word. A limit that cannot be kept
+    is kept as far as the inputs go; an output beyond its target already, from above or by another's doing,
+    is left to the law.
+    """
+    q, rows = family.start.shape[2], family.above.shape[1]
+    told = evidence(family, memory)
+    ahead = np.matmul(memory[:, :, :q], family.ahead)
+    free, lacks = (
+        part.reshape(*part.shape[:2], y_star.shape[1], -1) for part in (ahead[:, :, :rows], ahead[:, :, rows:])
     )
+    now = free[..., 0] - told.middle * lacks[..., 0] + family.offset[:, None]
+    floor, cap = _walls(family, now, y_star)
+    per_member = (len(free), 1, *free.shape[2:])
+    strongest, less = family.strength.strongest, family.strength.strongest - family.strength.weakest
+    if np.isfinite(floor).any():
+        bare = -(free - told.most[..., None] * lacks) - family.below.reshape(per_member)
+        side = _Side(bare, strongest - less * told.most, family.fall, told.counts)
+        u = -_projected(side, -u, -high, -floor)
+    if np.isfinite(cap).any():
+        bare = free - told.least[..., None] * lacks + family.above.reshape(per_member)
+        side = _Side(bare, strongest - less * told.least, family.rise, told.counts)
+        u = _projected(side, u, low, cap)
+    return u
+
+
+def _walls(family: Governor, now: np.ndarray, y_star: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Floor and cap (f, s, p) in °C of outputs forecast `now` (f, s, p): low and high, and `overshoot` beyond
+    the target for an output that is not there yet."""
+    return (
+        np.maximum(family.low, np.minimum(now, y_star - family.overshoot)),
+        np.minimum(family.high, np.maximum(now, y_star + family.overshoot)),
+    )
+
+
+class _Side(NamedTuple):
+    """What is forecast from above, or negated from below: bare (f, s, p, h) without the command, of which
+    strength (f, s, p) times u rows (f, m, p h) is to come; members that count (f, s)."""
+
+    bare: np.ndarray
+    strength: np.ndarray
+    rows: np.ndarray
+    counts: np.ndarray
+
+    def of(self, cases: np.ndarray) -> "_Side":
+        return _Side(self.bare[:, cases], self.strength[:, cases], self.rows, self.counts[:, cases])
+
+
+def _projected(side: _Side, u: np.ndarray, low: np.ndarray, cap: np.ndarray) -> np.ndarray:
+    """`governed` for one side: bare + strength rows u <= cap (f, s, p) where that can be kept."""
+    driven = np.matmul(u, side.rows).reshape(side.bare.shape)
+    over = side.bare + side.strength[..., None] * driven > cap[..., None]
+    touched = np.flatnonzero((over.any(axis=(2, 3)) & side.counts).any(axis=0))
+    if not touched.size:
+        return u
+    u = u.copy()
+    u[touched] = _swept(side.of(touched), u[touched], low[touched], cap[:, touched])
+    return u
+
+
+def _swept(side: _Side, u: np.ndarray, low: np.ndarray, cap: np.ndarray) -> np.ndarray:
+    """The projections of `governed` for cases that a row touches: u, low (s, m), cap (f, s, p)."""
+    f, s, p, h = side.bare.shape
+    m, case = u.shape[1], np.arange(s)
+    rows = side.rows.reshape(f, m, p, h)
+    # what hardly moves an output is not shut for its sake
+    helps = np.where(rows > WEAK * np.maximum(rows, 0.0).max(axis=1, keepdims=True), rows, 0.0)
+    helps = np.maximum(helps, 0.0)
+    least = np.matmul(low, helps.reshape(f, m, -1)) + np.matmul(u, (rows - helps).reshape(f, m, -1))
+    room = (cap[..., None] - side.bare) / side.strength[..., None]
+    room = np.where(side.counts[..., None, None], np.maximum(room, least.reshape(room.shape)), np.inf)
+    helps = helps.transpose(2, 0, 3, 1).reshape(p, f * h, m)
+    for _ in range(SWEEPS):
+        before = u
+        for j in range(p):
+            excess = np.matmul(u, rows[:, :, j]) - room[:, :, j]
+            excess = excess.transpose(1, 0, 2).reshape(s, f * h)
+            worst = excess.argmax(axis=1)
+            direction = helps[j, worst] * (u > low)
+            size = (direction**2).sum(axis=1)
+            step = np.maximum(excess[case, worst], 0.0) / np.where(size > 0, size, np.inf)
+            u = np.maximum(u - step[:, None] * direction, low)
+        if np.abs(u - before).max() < 1e-9:
+            break
+    return u

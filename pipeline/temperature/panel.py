@@ -26,6 +26,7 @@ from pipeline.temperature.controller import (
     sinusoid,
     watched,
 )
+from pipeline.temperature.governor import Strength
 from pipeline.temperature.plant import Plant, hold_output, hold_state
 from pipeline.temperature.tracking import Law, reached_state
 
@@ -99,23 +100,13 @@ def drawn(
     return plants
 
 
-def corners(nominal: Sequence[Plant], spread: Spread) -> list[Plant]:
-    """The family that the governor guards: of each plant the strongest and quickest, in time and a sample
-    late."""
-    family = [
-        varied(
-            plant,
-            gains=np.full(plant.m, 1 + spread.input_gain),
-            slower=-spread.slower,
-            loss=0.0,
-            ambient=0.0,
-            late=late,
-            cells=False,
-        )
-        for plant in nominal
-        for late in (False, True)
-    ]
-    return padded(family)
+def corners(nominal: Sequence[Plant], spread: Spread) -> tuple[list[Plant], Strength]:
+    """The family that the governor guards: each plant in time and a sample late, and within what range its
+    inputs act."""
+    family = [delayed(plant, late) for plant in nominal for late in (False, True)]
+    weakest = (1 - spread.input_gain) / (1 + spread.slower)
+    strongest = (1 + spread.input_gain) / (1 - spread.slower)
+    return padded(family), Strength(weakest, strongest, spread.input_gain)
 
 
 def padded(plants: Sequence[Plant]) -> list[Plant]:

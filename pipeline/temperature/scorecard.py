@@ -404,10 +404,7 @@ def _margins(plant: Plant, law: Law, omega: np.ndarray, z: np.ndarray, K: np.nda
     loops = (G @ K, K @ G)
     disk = _disk(*loops)
     return Margins(
-        disk,
-        _delay_margin(omega, np.linalg.eigvals(loops[0])) * plant.sample_time_s,
-        True,
-        float(radius),
+        disk, _delay_margin(omega, np.linalg.eigvals(loops[0])) * plant.sample_time_s, True, float(radius)
     )
 
 

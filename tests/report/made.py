@@ -35,6 +35,32 @@ PRINTER_PID = {
     "most_percent": 100.0,
     "smooth_s": 1.0,
 }
+NEXT_EXPERIMENT = {
+    "written": True,
+    "reason": "",
+    "samples": 400,
+    "seconds": 400.0,
+    "highest_degC": {"zone_1": 118.0, "zone_2": 104.0},
+    "lowest_degC": {"zone_1": 88.0, "zone_2": 79.0},
+    "limit_degC": {"zone_1": {"low": 0.0, "high": 140.0}, "zone_2": {"low": 0.0, "high": 140.0}},
+    "target_degC": {"zone_1": 100.0, "zone_2": 90.0},
+    "start_degC": {"zone_1": 98.0, "zone_2": 89.0},
+    "centre_percent": {"heater_1": 40.0, "heater_2": 35.0},
+    "amplitude_percent": {"heater_1": 5.0, "heater_2": 4.0},
+    "excitation_order": 12,
+    "excitation_rank": 24,
+    "excitation_full_rank": 24,
+    "excitation_condition": 18.0,
+    "limited_share": 0.1,
+    "level_percent_per_band": [[0.3, 0.4]] * 8,
+    "information": 900.0,
+    "expected_error_percent": {
+        "zone_1": {"heater_1": {"gain": 1.2, "time_constant": 2.1}},
+        "zone_2": {"heater_2": {"gain": 1.6, "time_constant": 3.0}},
+    },
+    "expected_gap_percent": 0.02,
+}
+DITHER = {"written": False, "reason": "PI needs an input for each of the 2 outputs; found 1 inputs"}
 SCALED = {"change_percent": -60.0, "gain_difference": 1e-15}
 
 
@@ -124,7 +150,7 @@ def metrics():
         for name in ("model_based", "model_based_tuned", "data_driven", "data_driven_tuned")
     }
     return {
-        "generate_probing": {
+        "probe_machine": {
             "source": "simulated",
             "samples": 400,
             "excitation_order": 12,
@@ -133,6 +159,11 @@ def metrics():
             "excitation_condition": 18.0,
             "limited_share": 0.1,
             "level_percent_per_band": [[0.3, 0.4]] * 8,
+        },
+        "generate_probing": {
+            "source": "simulated",
+            "next_experiment": NEXT_EXPERIMENT,
+            "closed_loop": DITHER,
         },
         "ingest": {
             "recordings": 2,

@@ -121,7 +121,7 @@ def test_a_failed_rule_fails_the_verdict_and_its_row_only(project):
         "datasets/tune_weights/weights.json",
         "datasets/ingest/record.parquet",
         "datasets/ingest/quality.parquet",
-        "reports/metrics/generate_probing.json",
+        "reports/metrics/probe_machine.json",
         "reports/metrics/ingest.json",
         "reports/metrics/identify_plant.json",
         "reports/metrics/learn_kernel.json",

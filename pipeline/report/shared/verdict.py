@@ -17,8 +17,8 @@ UNJUDGED = "not applicable"
 
 class ReportRules(params.Section):
     """Section `report`: what a controller must hold to be ready; of the temperature loop at the 90 %
-    quantile of all cases, margins on the worst plant. The comparison resolves settling_s for the machine where
-    it is null."""
+    quantile of all cases, margins on the worst plant. The comparison resolves settling_s where it is
+    null."""
 
     settled_error_degC: float = Field(gt=0, le=1000)
     settling_s: float | None = Field(gt=0, le=1e6)

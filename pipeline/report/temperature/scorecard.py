@@ -115,7 +115,9 @@ def setting(compared: Mapping[str, Any]) -> str:
         for value, one in ((entry(compared, "plants"), "plant"), (entry(compared, "cases"), "case"))
     ]
     noise = entry(compared, "noise_degC")
-    parts.append(f"{noise:g}{THIN}°C of sensor noise" if isinstance(noise, int | float) else "")
+    levels = sorted({float(level) for level in (noise if isinstance(noise, list) else [noise]) if level})
+    listed = " to ".join(short(level, 2) for level in dict.fromkeys((levels[:1] + levels[-1:])))
+    parts.append(f"{listed}{THIN}°C of sensor noise" if listed else "")
     return ", ".join(filter(None, parts)) or "its panel"
 
 
@@ -308,6 +310,8 @@ def weights(sources: Sources) -> Weights:
 
 
 def _listed(value: Any) -> str:
+    if isinstance(value, list) and len(value) > 1 and len(set(map(str, value))) == 1:
+        return f"{_listed(value[0])} each"
     values = value if isinstance(value, list) else [value]
     return ", ".join(short(float(v), 3) if isinstance(v, int | float) else str(v) for v in values)
 

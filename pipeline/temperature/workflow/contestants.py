@@ -145,9 +145,7 @@ def _learned_kernel(problem: Problem, values: Values) -> Design | None:
         return None
     made = kernel.controller(problem.kernel, problem.gamma, window.observer_form(problem.window)[0])
     law = made.design(*weights(problem, values), values["integral"])
-    return Design(
-        controller.compact(law, problem.kernel.N), made.model, lambda: made.design(*_unit(problem))
-    )
+    return Design(controller.compact(law, problem.kernel.N), made.model, lambda: made.design(*_unit(problem)))
 
 
 def _exact_model(problem: Problem, values: Values) -> Design | None:
@@ -189,13 +187,7 @@ class Contestant(NamedTuple):
 
 
 CONTESTANTS = (
-    Contestant(
-        "hold",
-        "Hold",
-        "do nothing",
-        "The inputs stay as they were handed over.",
-        _hold,
-    ),
+    Contestant("hold", "Hold", "do nothing", "The inputs stay as they were handed over.", _hold),
     # only where a recording is a Klipper log
     Contestant(
         "printer_pid",

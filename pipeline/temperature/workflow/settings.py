@@ -152,6 +152,7 @@ class Panel(Section):
     settled_steps: int = Field(ge=10, le=5000)
     hold_steps: int = Field(ge=0, le=2000)
     band_degC: float = Field(gt=0, le=100)
+    settling_s: float = Field(gt=0, le=1e6)
     training: Half
     judging: Half
 
@@ -169,7 +170,8 @@ class Panel(Section):
 
 
 class GenerateProbing(Section):
-    """Section `generate_probing`."""
+    """Section `generate_probing`: how the study's machine is probed, and what is asked of the next
+    experiment. `doubt_...` is what the identified family does not hold."""
 
     source: Literal["simulated", "recordings"]
     seed: int = Field(ge=0, le=2**31)
@@ -185,6 +187,9 @@ class GenerateProbing(Section):
         | Annotated[list[Annotated[float, Field(ge=-100, le=100)]], Field(min_length=1, max_length=32)]
         | None
     )
+    doubt_input_gain: float = Field(ge=0, lt=1)
+    doubt_ambient_degC: float = Field(ge=0, le=200)
+    doubt_delay_steps: int = Field(ge=0, le=1000)
 
 
 class Ingest(Section):
@@ -244,6 +249,18 @@ class EvaluateTemperature(Section):
 
     seed: int = Field(ge=0, le=2**31)
     resamples: int = Field(ge=20, le=100_000)
+
+
+class TemperatureRules(Section, extra="ignore"):
+    """Of section `report` what a rehearsal of the temperature loop is held against; settling_s null: as
+    panel.settling_s says on the study's machine, as the record says on another."""
+
+    settled_error_degC: float = Field(gt=0, le=1000)
+    settling_s: float | None = Field(gt=0, le=1e6)
+    overshoot_degC: float = Field(gt=0, le=1000)
+    at_limits_percent: float = Field(gt=0, le=100)
+    disk_margin: float = Field(gt=0, le=2)
+    delay_margin_s: float = Field(gt=0, le=1e6)
 
 
 class ReproduceStudy(Section):

@@ -194,28 +194,15 @@ PARITY = Schema(
 
 TUNING = Schema(
     "tuning",
-    2,
+    3,
     (
-        Column("mode", TEXT, NONE, "practical: the declared engineering cost"),
-        Column("evaluation", COUNT, NONE, "counted from 1", low=1),
+        Column("contestant", TEXT, NONE, "whose search"),
+        Column("evaluation", COUNT, NONE, "counted from 1, the declared start", low=1),
         Column("cost", FLOAT, NONE, "cost of this candidate; missing where it failed", nullable=True),
         Column(
             "incumbent", FLOAT, NONE, "lowest cost so far; missing before the first success", nullable=True
         ),
-        Column(
-            "tracking_degC",
-            FLOAT,
-            "degC",
-            "r.m.s. tracking error of this candidate; missing where it failed",
-            nullable=True,
-        ),
-        Column(
-            "effort_percent",
-            FLOAT,
-            "percent",
-            "r.m.s. effort of this candidate; missing where it failed",
-            nullable=True,
-        ),
+        Column("values", TEXT, NONE, "its parameters"),
         Column("chosen", BOOL, NONE, "whether the search recommends this candidate"),
         Column("failure", TEXT, NONE, "why the candidate failed; empty where it did not"),
     ),
