@@ -4,7 +4,7 @@ of the comparison -> words, no page, no file."""
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from pipeline.report.shared.digits import band, decimals, number
+from pipeline.report.shared.digits import band, number
 from pipeline.report.temperature.answers import Metrics, comparison, entry, finite, judged, refused
 from pipeline.report.temperature.contestants import DATA_DRIVEN, INDIRECT, MODEL_BASED, in_a_sentence
 
@@ -59,8 +59,8 @@ def _interval(pair: Mapping[str, Any], *, sign: int) -> str:
     ends = sorted(sign * finite(entry(pair, end)) for end in ("low", "high"))
     if not all(abs(end) <= 1000 for end in ends):
         return ""
-    places = decimals(*ends, value=max(map(abs, ends)))
-    return f"90 % interval {band(*ends, min(places, 1)) or number(ends[0], min(places, 1))} %"
+    places = 0 if max(map(abs, ends)) >= 20 else 1
+    return f"90 % interval {band(*ends, places) or number(ends[0], places)} %"
 
 
 def _bracket(*parts: str) -> str:
@@ -74,7 +74,7 @@ def deciding_sentence(metrics: Metrics, winner: str | None) -> str:
     if not isinstance(case, Mapping) or entry(case, "plant") is None:
         return ""
     compared, plant = comparison(metrics), case["plant"]
-    kind = f", {_a(str(case['kind']))}" if case.get("kind") else ""
+    kind = f", {reference_of(case)}" if case.get("kind") else ""
     changes = []
     if entry(compared, "best") == winner and case.get("best_without") != winner:
         other = case.get("best_without")
@@ -89,8 +89,10 @@ def deciding_sentence(metrics: Metrics, winner: str | None) -> str:
     return f"Deciding case: plant {plant}{kind}. Without plant {plant} {without}."
 
 
-def _a(word: str) -> str:
-    return f"{'an' if word[:1] in 'aeiou' else 'a'} {word}"
+def reference_of(case: Mapping[str, Any]) -> str:
+    """ "a constant reference", "a ramp"."""
+    kind = str(case.get("kind") or "")
+    return f"a {kind}{' reference' if kind == 'constant' else ''}" if kind else ""
 
 
 # ---- bands over relearnings

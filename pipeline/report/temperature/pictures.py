@@ -15,7 +15,7 @@ from pipeline.report.shared.verdict import Missing
 from pipeline.report.temperature.answers import comparison, entry, judged, refused
 from pipeline.report.temperature.contestants import YARDSTICKS, heading, in_a_sentence, kind
 from pipeline.report.temperature.judgement import Judgement
-from pipeline.report.temperature.pairs import pair_names
+from pipeline.report.temperature.pairs import pair_names, reference_of
 
 CASES = {"typical": "A typical case", "deciding": "The case that decides"}
 # a cost or temperature beyond it is of a loop that is lost; it is drawn at the edge
@@ -46,13 +46,20 @@ def case(sources: Sources, judgement: Judgement, name: str) -> Picture:
         return placeholder(
             name, title, Missing("not measured", f"no trajectory of the {name} case was recorded")
         )
+    finding = _finding(sources, name, runs)
+    runs = _early(runs, next(q.limit for q in judgement.asked if q.key == "settling"))
     y = _temperatures(sources, list(runs.values()))
+    most = max(
+        float(np.nanmax(run[f"{i.name}_applied"]))
+        for run in runs.values()
+        for i in sources.declared.machine.inputs
+    )
     shown = []
     for who in rows:
         panels = (
             [
                 _heat(sources, who, runs[who], y, first=not shown),
-                _commands(sources, who, runs[who], first=not shown),
+                _commands(sources, who, runs[who], most, first=not shown),
             ]
             if who in runs
             else [_hole(without.get(who, "no trajectory was recorded"))]
@@ -61,13 +68,23 @@ def case(sources: Sources, judgement: Judgement, name: str) -> Picture:
     return Picture(
         name,
         title,
-        _finding(sources, name, runs),
+        finding,
         shown,
         "Above: true temperature of every zone in °C, dashed its reference. Below: every command in "
         "per cent as the "
-        "machine was given it; grey: its limits. Against time in s.",
+        "machine was given it; grey: within its limits. Against time in s.",
         page.origin(sources.source("trajectories")),
     )
+
+
+def _early(runs: dict[str, Table], settling_s: float) -> dict[str, Table]:
+    """Of constant references the first part, half as long again as settling may last; of others all of it."""
+    first = next(iter(runs.values()))
+    constant = all(np.ptp(values) == 0 for key, values in first.items() if key.endswith("_reference"))
+    span = 1.5 * settling_s if constant and math.isfinite(settling_s) else math.inf
+    return {
+        who: {key: values[run["time_s"] <= span] for key, values in run.items()} for who, run in runs.items()
+    }
 
 
 def _hole(why: str) -> Markup:
@@ -108,13 +125,14 @@ def _degrees(value: float) -> str:
     return f"{short(value, 2)} °C" if value < LARGEST else "too far to say 1 figure"
 
 
-def _commands(sources: Sources, who: str, run: Table, *, first: bool) -> Markup:
+def _commands(sources: Sources, who: str, run: Table, most: float, *, first: bool) -> Markup:
     machine, time = sources.declared.machine, run["time_s"]
     low, high = min(i.low for i in machine.inputs), max(i.high for i in machine.inputs)
-    room = 0.06 * (high - low)
-    y = charts.linear(low, high)._replace(low=low - room, high=high + room)
+    reach = min(high, most)
+    room = 0.08 * ((reach - low) or 1.0)
+    y = charts.linear(low, reach + room, ticks=3)._replace(low=low - room)
     frame = charts.Frame(charts.linear(0, float(time[-1]) or 1.0, ticks=3), y, width=360, height=130, left=32)
-    layers = [charts.tint(frame, low, high)]
+    layers = [charts.tint(frame, low, min(high, y.high))]
     layers += [
         charts.line(frame, time, run[f"{i.name}_applied"], "line thin", steps=True) for i in machine.inputs
     ]
@@ -139,7 +157,7 @@ def _finding(sources: Sources, name: str, runs: dict[str, Table]) -> str:
     where = ""
     decides = entry(comparison(sources.metrics), "deciding")
     if name == "deciding" and entry(decides, "plant") is not None:
-        where = f"Plant {decides['plant']}{', ' + str(decides['kind']) if decides.get('kind') else ''}. "
+        where = f"Plant {decides['plant']}{', ' + reference_of(decides) if decides.get('kind') else ''}. "
     if not parts:
         return f"{where}No contestant ends near its reference."
     return (

@@ -101,9 +101,8 @@ def _caption(sources: Sources) -> str:
     )
     return (
         f"As deployed on {setting(compared)}. Large: the 90{THIN}% quantile of all cases; small: "
-        f"{bands}; the "
-        "median; the worst case. Bold: best of a row, the exact model left aside. Vermillion: beyond "
-        "the limit. "
+        f"{bands}; the median; the worst case. Bold: best of a row, hold and the exact model left aside. "
+        "Vermillion: beyond the limit. "
         f"Limits: {entry(compared, 'limits', 'source') or 'declared'}."
     )
 
@@ -116,7 +115,7 @@ def setting(compared: Mapping[str, Any]) -> str:
     ]
     noise = entry(compared, "noise_degC")
     levels = sorted({float(level) for level in (noise if isinstance(noise, list) else [noise]) if level})
-    listed = " to ".join(short(level, 2) for level in dict.fromkeys((levels[:1] + levels[-1:])))
+    listed = " to ".join(short(level, 2) for level in dict.fromkeys(levels[:1] + levels[-1:]))
     parts.append(f"{listed}{THIN}°C of sensor noise" if listed else "")
     return ", ".join(filter(None, parts)) or "its panel"
 
@@ -136,7 +135,7 @@ def _row(sources: Sources, question: Question, names: list[str], judgement: Judg
     values = [
         figure.value
         for name, figure in zip(names, figures, strict=True)
-        if isinstance(figure, Figure) and name not in YARDSTICKS and math.isfinite(figure.value)
+        if isinstance(figure, Figure) and _competes(name) and math.isfinite(figure.value)
     ]
     best = (max if question.at_least else min)(values, default=math.nan)
     alike = len(set(values)) < 2 or question.key == "data"
@@ -149,6 +148,11 @@ def _row(sources: Sources, question: Question, names: list[str], judgement: Judg
         sign = "≥" if question.at_least else "≤"
         limit = f"{sign} {with_unit(question.limit, question.unit, declared(question.limit))}"
     return Row(question.key, question.title, word, limit, cells)
+
+
+def _competes(name: str) -> bool:
+    """Who may be the best of a row: neither who was told the truth, nor who does nothing."""
+    return name != "hold" and name not in YARDSTICKS
 
 
 def _cell(sources: Sources, question: Question, name: str, figure: Figure | Missing, *, best: bool) -> Cell:
@@ -170,7 +174,7 @@ def _cell(sources: Sources, question: Question, name: str, figure: Figure | Miss
         text,
         [note for note in notes if note],
         bad=held == FAILED,
-        best=best and name not in YARDSTICKS,
+        best=best and _competes(name),
         title=_worst_title(own, question.key),
     )
 
@@ -197,6 +201,10 @@ def _beside(question: Question, own: Any, places: int) -> list[str]:
         # what never settles on most cases does not in the worst either
         if key in figures and (math.isfinite(finite(figures[key])) or math.isfinite(finite(figures["q90"]))):
             notes.append(f"{key} {worded(bare, finite(figures[key]), places)}")
+    lost = entry(own, "never_settled_percent") if question.key == "settling" else None
+    if isinstance(lost, int | float) and lost > 0:
+        notes.append(f"{short(float(lost), 3)}{THIN}% of cases never")
+        return notes
     plant = entry(figures, "worst_case", "plant")
     if notes and "worst" in figures and plant is not None:
         notes.append(f"{notes.pop()}, plant {plant}")

@@ -37,7 +37,7 @@ from pipeline.report.temperature.answers import (
     unstable,
 )
 from pipeline.report.temperature.contestants import YARDSTICKS, heading, in_a_sentence
-from pipeline.report.temperature.pairs import pair_names, pair_sentence
+from pipeline.report.temperature.pairs import pair_names, pair_sentence, reference_of
 from pipeline.report.temperature.wording import name_first, places_of, reason, worded
 
 LOOP = "temperature"
@@ -312,18 +312,29 @@ def _not_passed(
     why = first.reason or _drift_sentence(first)
     open_too = [rule.name for rule in subject.rules if rule.state == OPEN and rule.name not in LATER]
     also = f"Open too: {', '.join(open_too)}." if failed and open_too else ""
+    where = _worst_case(metrics, subject.name, first) if failed else ""
     return Verdict(
         LOOP,
         FAILED if failed else OPEN,
         words.failed if failed else words.open,
         f"First {'failed' if failed else 'open'} rule: {first.name}.",
         " ".join(filter(None, [why, who])),
-        " ".join(filter(None, [also, "Keep what runs on the machine now." if words is TRIAL else ""])),
+        " ".join(filter(None, [where, also, "Keep what runs on the machine now." if words is TRIAL else ""])),
         group_of(first.name),
         None,
         note=pair_sentence(metrics).text,
         rules=lines,
     )
+
+
+def _worst_case(metrics: Metrics, name: str, rule: Rule) -> str:
+    """ "Its worst case: plant 48, a ramp." """
+    key = rule.question.key if rule.question else ""
+    case = entry(comparison(metrics), "contestants", name, key, "worst_case")
+    if not isinstance(case, Mapping) or case.get("plant") is None:
+        return ""
+    parts = [f"plant {case['plant']}", reference_of(case)]
+    return f"Its worst case: {', '.join(filter(None, parts))}."
 
 
 def _drift_sentence(rule: Rule) -> str:
@@ -363,7 +374,9 @@ def _worst_end(question: Question, figure: Figure) -> float:
 def best_sentence(metrics: Metrics, held: Mapping[str, Standing], winner: str | None) -> str:
     """The best of all contestants, beside the pair."""
     if winner is None:
-        return "Best of all: nobody passes every rule."
+        cheapest = entry(comparison(metrics), "best_reason", "leading")
+        costs = f" {name_first(cheapest)} costs least." if cheapest in held else ""
+        return f"Best of all: nobody passes every rule.{costs}"
     others = [
         in_a_sentence(name)
         for name, standing in held.items()
