@@ -96,7 +96,7 @@ CASES = Schema(
             "settled_error_degC",
             FLOAT,
             "degC",
-            "distance of the mean of the last 100 steps from the reference, worst output; missing where unstable",
+            "mean of the last 100 steps from the reference, worst output; missing where unstable",
             low=0,
             nullable=True,
         ),
