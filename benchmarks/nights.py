@@ -38,7 +38,7 @@ from pipeline.temperature.probing import InputLimits, OperatingPoint, prbs, prob
 reproduce = night._reproduce
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks/results/nights.json"
-STAGES = ("generate_probing", "ingest", "identify_plant", "learn_kernel", "tune_weights")
+STAGES = ("probe_machine", "ingest", "identify_plant", "generate_probing", "learn_kernel", "tune_weights")
 SAMPLES, KEPT, REFERENCE, NOISE_DEGC, AMBIENT_DEGC = 600, 4, np.array([120.0, 110.0]), 0.1, 20.0
 START = datetime.datetime(2030, 1, 1, 2, 0, tzinfo=datetime.UTC)
 TIME_CONSTANTS_S, GAINS = np.array([60.0, 90.0]), np.array([1.6, 1.2])

@@ -11,7 +11,7 @@ from pathlib import Path
 from pipeline.nightly import commands as nights
 from pipeline.store import artifacts, params
 from pipeline.store.printable import printable
-from pipeline.temperature.workflow.settings import Ingest, Panel
+from pipeline.temperature.workflow.settings import Ingest
 
 
 def accept(_: argparse.Namespace) -> None:
@@ -98,10 +98,8 @@ def history(arguments: argparse.Namespace) -> None:
     pages = [
         (path.stem, path.name) for path in sorted(Path("reports").glob("*.html")) if path.stem != "history"
     ]
-    rules, panel = params.load(ReportRules, "report"), params.load(Panel, "panel")
-    artifacts.write_text(
-        "reports/history.html", trend.render(found, rules, band_degC=panel.band_degC, pages=pages)
-    )
+    rules = params.load(ReportRules, "report")
+    artifacts.write_text("reports/history.html", trend.render(found, rules, pages=pages))
     print(f"reports/history.html: {len(found)} runs, the last {found[-1].commit[:8] or 'not committed'}")
 
 

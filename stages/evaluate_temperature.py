@@ -1,9 +1,17 @@
-"""Judge every temperature controller on one panel: reads what the temperature stages wrote; writes
-datasets/evaluate_temperature: scorecard.parquet, trajectories.parquet and summary.json."""
+"""Judge every temperature controller as it would be deployed: reads what the temperature stages wrote; writes
+datasets/evaluate_temperature: cases.parquet, trajectories.parquet and summary.json."""
 
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow import evaluate_temperature, tables
-from pipeline.temperature.workflow.settings import EvaluateTemperature, Panel, Plant, Tracking
+from pipeline.temperature import plant
+from pipeline.temperature.workflow import cases, evaluate_temperature, learned, tables
+from pipeline.temperature.workflow.settings import (
+    EvaluateTemperature,
+    Panel,
+    Plant,
+    TemperatureRules,
+    Tracking,
+    TuneWeights,
+)
 
 
 def main() -> None:
@@ -13,29 +21,36 @@ def main() -> None:
             params.load(Plant, "plant"),
         )
         tracking, panel = params.load(Tracking, "tracking"), params.load(Panel, "panel")
+        tuning, execution = (
+            params.load(TuneWeights, "tune_weights"),
+            params.load(params.Execution, "execution"),
+        )
         simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
-        evaluate_temperature.check(settings, panel)
-        learned = evaluate_temperature.read_learned(
+        made = learned.read_learned(
             "datasets/identify_plant/plant.parquet",
             "datasets/identify_plant/spread.parquet",
-            "datasets/tune_weights/weights.json",
             "datasets/learn_kernel",
             "datasets/ingest/printer_pid.json",
             machine,
         )
-        judged = evaluate_temperature.judged(settings, machine, tracking, panel, learned, simulated=simulated)
-        artifacts.write_table(out / "scorecard.parquet", tables.SCORECARD, judged.scorecard)
-        artifacts.write_table(out / "trajectories.parquet", *judged.trajectories)
-        artifacts.write_json(out / "summary.json", judged.summary)
-        artifacts.write_metrics(
-            "evaluate_temperature",
-            {
-                "controllers": judged.summary["controllers"],
-                "refused": judged.refused,
-                "without_feed_forward": judged.without_feed_forward,
-                "own_integral": judged.own_integral,
-            },
+        weights = evaluate_temperature.read_weights("datasets/tune_weights/weights.json", machine)
+        truth = plant.baam()._replace(sample_time_s=machine.sample_time_s) if simulated else None
+        family = [made.model, *made.spread]
+        rehearsal = cases.rehearsed(panel, machine, truth, family, "datasets/ingest/record.parquet")
+        setting = cases.shared(tuning, machine, tracking, panel, rehearsal, family)
+        problem = learned.problem(
+            made, tracking, setting.limits, truth, rehearsal.noise, horizon=rehearsal.judging.steps
         )
+        rules = evaluate_temperature.resolved(params.load(TemperatureRules, "report"), panel, rehearsal)
+        judged = evaluate_temperature.judged(settings, machine, setting, problem, weights, rules, execution)
+        artifacts.write_table(out / "cases.parquet", tables.CASES, judged.cases)
+        artifacts.write_table(
+            out / "trajectories.parquet",
+            tables.trajectories(machine.inputs, machine.outputs),
+            judged.trajectories,
+        )
+        artifacts.write_json(out / "summary.json", judged.summary)
+        artifacts.write_metrics("evaluate_temperature", judged.summary)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Recordings -> one table: reads datasets/generate_probing (simulated) or every file below
+"""Recordings -> one table: reads datasets/probe_machine (simulated) or every file below
 datasets/raw/temperature (recordings); writes datasets/ingest/record.parquet,
 quality.parquet and printer_pid.json. A recording that was processed before, with the same
 parameters and code, is taken from a memo; a broken one is quarantined with its reason."""
@@ -21,7 +21,7 @@ def main() -> None:
         source = params.value("generate_probing.source", one_of=("simulated", "recordings"))
         check_output_limits(machine, source)
         folder = Path(
-            {"simulated": "datasets/generate_probing", "recordings": "datasets/raw/temperature"}[source]
+            {"simulated": "datasets/probe_machine", "recordings": "datasets/raw/temperature"}[source]
         )
         spec = ingest.spec_of(settings, machine, source)
         budget = ingest.Budget(settings.longest_s, settings.largest_mb)

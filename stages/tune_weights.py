@@ -1,9 +1,10 @@
-"""Tune Q and R by Bayesian optimisation: reads datasets/identify_plant/plant.parquet; writes
-datasets/tune_weights/weights.json and history.parquet. No data stage is touched by new weights."""
+"""Tune every contestant by itself, by Bayesian optimisation: reads what identify_plant and learn_kernel
+wrote; writes datasets/tune_weights/weights.json and history.parquet. No data stage is touched by new
+weights."""
 
 from pipeline.store import artifacts, params
 from pipeline.temperature import plant
-from pipeline.temperature.workflow import tables, tune_weights
+from pipeline.temperature.workflow import cases, learned, tables, tune_weights
 from pipeline.temperature.workflow.settings import Panel, Plant, Tracking, TuneWeights
 
 
@@ -11,14 +12,27 @@ def main() -> None:
     with artifacts.stage("tune_weights") as out:
         settings, machine = params.load(TuneWeights, "tune_weights"), params.load(Plant, "plant")
         tracking, panel = params.load(Tracking, "tracking"), params.load(Panel, "panel")
-        shapes = {"D": (None, len(machine.outputs), len(machine.inputs))}
-        arrays = artifacts.read_arrays("datasets/identify_plant/plant.parquet", "plant", 1, shapes=shapes)
-        model = plant.restored(arrays)[0]
-        tuned = tune_weights.tuned(settings, machine, tracking, panel, model)
+        execution = params.load(params.Execution, "execution")
+        simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
+        made = learned.read_learned(
+            "datasets/identify_plant/plant.parquet",
+            "datasets/identify_plant/spread.parquet",
+            "datasets/learn_kernel",
+            "datasets/ingest/printer_pid.json",
+            machine,
+        )
+        truth = plant.baam()._replace(sample_time_s=machine.sample_time_s) if simulated else None
+        family = [made.model, *made.spread]
+        rehearsal = cases.rehearsed(panel, machine, truth, family, "datasets/ingest/record.parquet")
+        setting = cases.shared(settings, machine, tracking, panel, rehearsal, family)
+        problem = learned.problem(
+            made, tracking, setting.limits, truth, rehearsal.noise, horizon=rehearsal.training.steps
+        )
+        tuned = tune_weights.tuned(settings, problem, setting, execution)
         artifacts.write_json(out / "weights.json", tuned.weights)
         artifacts.write_table(out / "history.parquet", tables.TUNING, tuned.history)
         artifacts.write_learning_curve(
-            out / "live", tuned.history, of="mode", step="evaluation", figures=("cost", "incumbent")
+            out / "live", tuned.history, of="contestant", step="evaluation", figures=("cost", "incumbent")
         )
         artifacts.write_metrics("tune_weights", tuned.metrics)
 

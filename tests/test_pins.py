@@ -35,7 +35,7 @@ OUTSIDE = {
     "OPENCV_CPU_DISABLE": "AVX2",
     "OPENBLAS_NUM_THREADS": "2", "OMP_NUM_THREADS": "2", "NPROC": "1",
 }  # fmt: skip
-STAGES = ("generate_probing", "ingest", "identify_plant")
+STAGES = ("probe_machine", "ingest", "identify_plant", "generate_probing")
 SMALL = {
     "execution": {"jobs": 1},
     "generate_probing": {"samples": 2000},

@@ -44,6 +44,12 @@ PARAMETERS: dict[str, str] = {
     "tune_weights.initial": "reproduce_study.initial",
 }
 
+# dotted keys that nothing reads any more -> why, as the end of a sentence
+RETIRED: dict[str, str] = {
+    "report.gap_percent": "the gap to the optimum is shown and decides nothing",
+    "report.worst_case_gap_percent": "the rules are asked at the 90 % quantile of all cases",
+}
+
 # (dotted key of today, old choice) -> today's choice; of parameters that are one of several words
 CHOICES: dict[tuple[str, str], str] = {("segment_library.law", "ours"): "model_inverse"}
 
@@ -62,6 +68,13 @@ METRICS: dict[str, str] = {
     "evaluate_temperature.printed": "reproduce_study.printed",
     "evaluate_temperature.takeover": "reproduce_study.takeover",
     "evaluate_temperature.window": "reproduce_study.window",
+    "generate_probing.excitation_condition": "probe_machine.excitation_condition",
+    "generate_probing.excitation_full_rank": "probe_machine.excitation_full_rank",
+    "generate_probing.excitation_order": "probe_machine.excitation_order",
+    "generate_probing.excitation_rank": "probe_machine.excitation_rank",
+    "generate_probing.level_percent_per_band": "probe_machine.level_percent_per_band",
+    "generate_probing.limited_share": "probe_machine.limited_share",
+    "generate_probing.samples": "probe_machine.samples",
     "train_agent.ours": "train_agent.belief_dqn",
     "train_agent.ours_at_0.7": "train_agent.belief_dqn_at_0.7",
     "train_agent.parameters.ours": "train_agent.parameters.belief_dqn",
@@ -167,8 +180,16 @@ def _put(data: dict[str, Any], names: list[str], item: Any) -> None:
 
 
 def parameters(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The sections of a params file of an earlier version, with today's keys and choices."""
+    """The sections of a params file of an earlier version, with today's keys and choices, without what was
+    retired."""
     today = under_new_names(values, PARAMETERS)
+    for key in RETIRED:
+        *sections, name = key.split(".")
+        holder: Any = today
+        for section in sections:
+            holder = holder.get(section) if isinstance(holder, Mapping) else None
+        if isinstance(holder, dict):
+            holder.pop(name, None)
     for (key, old), new in CHOICES.items():
         *sections, name = key.split(".")
         holder: Any = today

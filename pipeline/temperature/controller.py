@@ -1,8 +1,8 @@
-"""The controller as it runs on the machine: a law with its limits, its target, its integrator, its governor and
-its hand-over.
+"""The controller as it runs on the machine: a law with its limits, its target, its integrator, its governor
+and its hand-over.
 
-One form for every contestant. `step` takes one sample, `batch_step` the same sample of many cases at once: the
-panel judges by the second what a machine would run by the first.
+One form for every contestant. `step` takes one sample, `batch_step` the same sample of many cases at once:
+the panel judges by the second what a machine would run by the first.
 
 With memory z, measured y, and the reference r(t) = H w(t), w(t+1) = F w(t) (seed 1, (2)):
 
@@ -11,8 +11,8 @@ With memory z, measured y, and the reference r(t) = H w(t), w(t+1) = F w(t) (see
     z(t+1) = A z + B_u u + B_y y + B_r r + c
 
 The target y* = Y w is the reference, or the nearest one that the inputs can hold. P = pinv(-K_r) says by how
-many °C another reference would have asked for the input that was applied: back-calculation, which acts on what
-lies beyond the integrator's own limit. What was applied, not what was wished, enters the memory.
+many °C another reference would have asked for the input that was applied: back-calculation, which acts on
+what lies beyond the integrator's own limit. What was applied, not what was wished, enters the memory.
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,8 @@ from pipeline.temperature.tracking import Law, feasible_target
 
 
 class Reference(NamedTuple):
-    """r(t) = H w(t) in °C, w(t+1) = F w(t), w(0) = w0 with w0[0] = 1 that stays: F (k, k), H (p, k), w0 (k,)."""
+    """r(t) = H w(t) in °C, w(t+1) = F w(t), w(0) = w0 with w0[0] = 1 that stays: F (k, k), H (p, k), w0
+    (k,)."""
 
     F: np.ndarray
     H: np.ndarray
@@ -107,7 +108,8 @@ class Aim(NamedTuple):
 
 
 def aim(law: Law, at: Rest, reference: Reference) -> Aim:
-    """feed = U + K Z + D Y, with the law's memory Z w on the way, Z F = A Z + B_u U + B_y Y + B_r H + [c 0]."""
+    """feed = U + K Z + D Y, with the law's memory Z w on the way, Z F = A Z + B_u U + B_y Y + B_r H + [c
+    0]."""
     drive = law.B_u @ at.U + law.B_y @ at.Y + law.B_r @ reference.H
     drive[:, 0] += law.c
     Z = _sylvester(law.A, reference.F, drive)
@@ -157,9 +159,9 @@ def _leaking(balance: np.ndarray) -> np.ndarray:
 
 
 class Deployed(NamedTuple):
-    """A law with what it runs under: `integral_limit` °C is the largest error, and the largest back-calculated
-    shift, that the integrator sees; `back` (p, m) is P of the module's formula; `gather` (q,) says which entry
-    of [z; u; y; 0] each entry of z(t+1) is, where the memory is a plain shift, and is None otherwise.
+    """A law with what it runs under: `integral_limit` °C is the largest error, and the largest
+    back-calculated shift, that the integrator sees; `back` (p, m) is P of the module's formula; `shift` is k
+    where the memory moves on by k entries, 0 where it is no plain shift.
 
     `holds`: it does nothing, and goes on with the input that it was handed."""
 
@@ -186,7 +188,9 @@ def compact(law: Law, N: int) -> Law:
     z_i(t+1) = z_{i+1}(t) + K^u_i u(t) + K^y_i y(t), u = -z_1 - ..., and starts where the window would.
     """
     m, p = law.D.shape
-    of_u, of_y = (part.reshape(m, N, -1).transpose(1, 0, 2) for part in (law.K[:, : N * m], law.K[:, N * m :]))
+    of_u, of_y = (
+        part.reshape(m, N, -1).transpose(1, 0, 2) for part in (law.K[:, : N * m], law.K[:, N * m :])
+    )
     left_u, left_y = (part[::-1].cumsum(axis=0)[::-1].reshape(N * m, -1) for part in (of_u, of_y))
     return law._replace(
         A=np.eye(N * m, k=m),
@@ -208,8 +212,8 @@ def _shift(A: np.ndarray) -> int:
 
 
 class State(NamedTuple):
-    """All that a controller remembers, to be saved and restored: z (s, q), xi (s, p), the input u (s, m) applied
-    last, and the memory x (f, s, n) of the governor's family; s cases at once, one on a machine."""
+    """All that a controller remembers, to be saved and restored: z (s, q), xi (s, p), the input u (s, m)
+    applied last, and the memory x (f, s, n) of the governor's family; s cases at once, one on a machine."""
 
     z: np.ndarray
     xi: np.ndarray
@@ -230,8 +234,8 @@ def watched(controller: Deployed, state: State | None, u: np.ndarray, y: np.ndar
 
 
 def handed_over(controller: Deployed, state: State, y: np.ndarray, here: Sequence[Aim]) -> State:
-    """The state in which the law takes over from manual without a bump: xi starts where the law, aimed at where
-    the machine is (`here`, an Aim of each case's y), would go on with the input of manual, up to
+    """The state in which the law takes over from manual without a bump: xi starts where the law, aimed at
+    where the machine is (`here`, an Aim of each case's y), would go on with the input of manual, up to
     `integral_limit`. A conditional law starts its integral action at that input."""
     law = controller.law
     if controller.holds:

@@ -58,10 +58,13 @@ class MachineScale(NamedTuple):
 
 
 class Infeasible(NamedTuple):
-    """A reference of output `output` that no steady input within its limits reaches: `reachable_degC` is the
-    nearest, `judged_degC` the reference in its place, with headroom. `input` is the one at its `limit` "low"
-    or "high" that would move it most; None where the limit is not of an input: "output low" or "output high"
-    of the machine's own limits, or "inputs", fewer than the references need."""
+    """A reference of output `output` that cannot be held, or not beside the others: `reachable_degC` is the
+    nearest within limits, `judged_degC` the reference in its place, with headroom.
+
+    `input` is the one at its `limit` "low" or "high" that would move it most; None where the limit is not of
+    an input: "output low" or "output high" of the machine's own limits, or "inputs", fewer than the
+    references need.
+    """
 
     output: int
     asked_degC: float
@@ -124,7 +127,7 @@ def machine_scale(
         low,
         high,
         (above - below) / 2,
-        _ambient_spread(u, y, model, np.minimum(taus, longest) / sample_time_s, recording_of_segment),
+        _ambient_spread(u, y, model, recording_of_segment),
     )
 
 
@@ -137,14 +140,12 @@ def _delays(model: Plant, moved: np.ndarray, horizon: int) -> np.ndarray:
     return np.array([rise.delay for rise in strongest])
 
 
-def _ambient_spread(u, y, model: Plant, tau: np.ndarray, recording_of_segment: Sequence[int]) -> np.ndarray:
-    """Largest less smallest mean error of simulation (p,) of the recordings. Of each segment the first time
-    constant is left out where it is longer than two: there a fitted start hides another room."""
+def _ambient_spread(u, y, model: Plant, recording_of_segment: Sequence[int]) -> np.ndarray:
+    """Largest less smallest mean error of simulation (p,) of the recordings, the start of each segment fitted
+    together with its mean: alone, the start would hide a part of another room."""
     errors: dict[int, list[np.ndarray]] = {}
     for a, b, recording in zip(u, y, recording_of_segment, strict=True):
-        error = b - simulated(model, a, b)
-        late = np.arange(len(b))[:, None] >= np.where(len(b) > 2 * tau, tau, 0.0)
-        errors.setdefault(int(recording), []).append(np.where(late, error, np.nan))
+        errors.setdefault(int(recording), []).append(b - simulated(model, a, b, means_removed=True))
     means = [np.nanmean(np.vstack(parts), axis=0) for parts in errors.values()]
     return np.ptp(np.stack(means), axis=0)
 
@@ -177,15 +178,22 @@ def defaults(
     starts = [_nearest(model, scale.low_degC + share * span, careful)[0] for share in START_SHARES]
     asked = np.asarray(asked_reference, float)
     reached, u = _nearest(model, asked, bounds)
-    missed = np.abs(reached - asked) > REACHED_DEGC
-    first = _nearest(model, asked, careful)[0] if missed.any() else asked
+    first, entries = asked, []
+    if (missed := np.abs(reached - asked) > REACHED_DEGC).any():
+        held_back = np.where(missed, _nearest(model, asked, careful)[0], asked)
+        first, u_first = _nearest(model, held_back, bounds)
+        # a zone within reach may need the heat of one that is held back
+        entries = [
+            _missed(model, int(o), asked, (reached, first), (u if missed[o] else u_first), bounds)
+            for o in np.flatnonzero(missed | (np.abs(first - asked) > REACHED_DEGC))
+        ]
     lower = _nearest(model, first - LOWER_SHARE * span, careful)[0]
     slowest, delay = float(scale.time_constant_s.max()), float(scale.delay_s.max())
     steps, notes = _steps(slowest, delay, sample_time_s)
     return CaseDefaults(
         starts=np.stack(starts),
         references=np.stack([first, lower]),
-        infeasible=[_missed(model, int(o), asked, reached, first, u, bounds) for o in np.flatnonzero(missed)],
+        infeasible=entries,
         settling_s=SETTLING[0] * slowest + SETTLING[1] * delay,
         band_degC=band,
         steps=steps,
@@ -286,19 +294,19 @@ def _missed(
     model: Plant,
     o: int,
     asked: np.ndarray,
-    reached: np.ndarray,
-    judged: np.ndarray,
+    reached_and_judged: tuple[np.ndarray, np.ndarray],
     u: np.ndarray,
     bounds: Bounds,
 ) -> Infeasible:
-    """What keeps output o from its reference: a declared limit of its own, or the input at its limit, in the
-    direction that would help, whose range moves it most."""
+    """What keeps output o from its reference: a declared limit of its own, or the input of u at its limit, in
+    the direction that would help, whose range moves it most."""
+    reached, judged = reached_and_judged
     figures = o, float(asked[o]), float(reached[o]), float(judged[o])
     if asked[o] > bounds.output_high[o]:
         return Infeasible(*figures, None, "output high")
     if asked[o] < bounds.output_low[o]:
         return Infeasible(*figures, None, "output low")
-    helps, slack = (asked[o] - reached[o]) * steady_map(model)[0][o], 1e-6 * (bounds.high - bounds.low)
+    helps, slack = (asked[o] - judged[o]) * steady_map(model)[0][o], 1e-6 * (bounds.high - bounds.low)
     stuck = np.where(helps > 0, u >= bounds.high - slack, u <= bounds.low + slack) & (helps != 0)
     if not stuck.any():
         return Infeasible(*figures, None, "inputs")

@@ -322,9 +322,11 @@ def feasible_target(
     """
     nearest = _steady(plant, r, low, high, 0.0)
     reach, slack, step = np.linalg.norm(nearest.miss) + tolerance, 0.0, (high - low).min() / 4
+    widest = 0.49 * (high - low).min()
     while step > 1e-3:
         wider = _steady(plant, r, low, high, slack + step)
-        if np.linalg.norm(wider.miss) <= reach:
+        # a target that the middle of the limits reaches as well has all the slack there is
+        if slack + step <= widest and np.linalg.norm(wider.miss) <= reach:
             nearest, slack = wider, slack + step
         else:
             step /= 2

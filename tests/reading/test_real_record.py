@@ -21,9 +21,10 @@ from pipeline.temperature.workflow.settings import Plant
 RECORD = "data/tclab_mlid_prbs/prbs.csv"
 SPIKE_S, SPIKE_DEGC = 1789, 40.718
 STAGES = (
-    "generate_probing",
+    "probe_machine",
     "ingest",
     "identify_plant",
+    "generate_probing",
     "learn_kernel",
     "tune_weights",
     "evaluate_temperature",

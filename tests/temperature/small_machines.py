@@ -66,8 +66,8 @@ class MachineState(NamedTuple):
 
 
 def substeps(machine: SmallMachine) -> int:
-    """A sample is cut so that no step is longer than a third of the fastest lag or 1 s."""
-    return int(np.ceil(machine.sample_time_s / min(min(machine.lag_s) / 3, 1.0)))
+    """A sample is cut so that no step is longer than a third of the fastest lag or 2 s."""
+    return int(np.ceil(machine.sample_time_s / min(min(machine.lag_s) / 3, 2.0)))
 
 
 def slope(machine: SmallMachine, x: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -84,10 +84,12 @@ def slope(machine: SmallMachine, x: np.ndarray, u: np.ndarray) -> np.ndarray:
 def at_rest(machine: SmallMachine, u: np.ndarray) -> MachineState:
     """The state that inputs u (m,) hold for ever; u of zeros is the machine switched off in its room."""
     n, x = len(machine.capacity), np.full(len(machine.capacity) + machine.p, machine.room_degC)
-    for _ in range(200):  # Newton by differences; the losses grow with temperature, so it settles
+    step = np.ones_like(x)
+    while np.abs(step).max() > 1e-9:  # Newton by differences; losses grow with temperature, so it settles
         f = slope(machine, x, u)
         J = np.column_stack([(slope(machine, x + 1e-4 * e, u) - f) / 1e-4 for e in np.eye(len(x))])
-        x = x - np.linalg.solve(J, f)
+        step = np.linalg.solve(J, f)
+        x = x - step
     dt = machine.sample_time_s / substeps(machine)
     return MachineState(x, tuple(np.full(round(d / dt) + 1, x[n + j]) for j, d in enumerate(machine.delay_s)))
 

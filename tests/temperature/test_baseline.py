@@ -137,6 +137,15 @@ def test_the_study_s_sensors_are_paired_with_heaters():
     np.testing.assert_array_equal(inputs[:3], [0, 1, 2])
 
 
+def test_the_study_s_settings_do_not_hang_on_how_long_its_responses_are_followed():
+    """Its responses turn back after some hundred samples; followed for 1,500, zone 2 once got a gain of the
+    wrong sign."""
+    short, long = (pairing(baam(), LOW, HIGH, horizon=horizon) for horizon in (600, 1500))
+    np.testing.assert_array_equal(short.inputs, long.inputs)
+    # a first-order lag fitted to 60 and to 150 samples of what is none
+    np.testing.assert_allclose(short.gain, long.gain, rtol=0.05)
+
+
 def test_the_law_is_the_pi_equation():
     pairs = pairing(baam(), LOW, HIGH, horizon=600)
     law = pi_law(pairs, inputs=7)

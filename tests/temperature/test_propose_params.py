@@ -238,7 +238,7 @@ def printer(root, tmp_path_factory):
         init(monkeypatch, "klippy.log", "--copy")
     expert = (tree / "params.expert.yaml").read_text()
     (tree / "params.expert.yaml").write_text(expert.replace("max_order: 12", "max_order: 4"))
-    return run(tree, "generate_probing", "ingest", "identify_plant")
+    return run(tree, "probe_machine", "ingest", "identify_plant", "generate_probing")
 
 
 def test_the_record_is_the_print_without_a_conversion(printer):

@@ -13,9 +13,10 @@ from pipeline.report.shared.verdict import Missing
 
 # stage -> stages that it reads, in the order of their lanes; tests hold it against dvc.yaml
 READS: dict[str, tuple[str, ...]] = {
-    "generate_probing": (),
-    "ingest": ("generate_probing",),
+    "probe_machine": (),
+    "ingest": ("probe_machine",),
     "identify_plant": ("ingest",),
+    "generate_probing": ("ingest", "identify_plant"),
     "tune_weights": ("identify_plant",),
     "learn_kernel": ("ingest",),
     "evaluate_temperature": ("ingest", "identify_plant", "learn_kernel", "tune_weights"),
@@ -32,9 +33,10 @@ OTHER = "other machine"
 CSS = {SAME: "same", CHANGED: "anew", GONE: "lost", FIRST: "same", OTHER: "anew"}
 # stages of the loop whose machine the accepted run may not share
 TEMPERATURE = (
-    "generate_probing",
+    "probe_machine",
     "ingest",
     "identify_plant",
+    "generate_probing",
     "tune_weights",
     "learn_kernel",
     "evaluate_temperature",

@@ -11,14 +11,19 @@ from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import THIN, count, number, short
 from pipeline.report.shared.pictures import Column, Picture, placeholder
 from pipeline.report.shared.sources import Sources, Table, lookup
-from pipeline.report.shared.verdict import Missing
+from pipeline.report.shared.verdict import UNJUDGED, Missing
 
 
 def excitation(sources: Sources) -> Picture:
     """How strongly each input was moved, by frequency."""
-    metrics = sources.metrics["generate_probing"]
+    stage = "generate_probing" if sources.recorded else "probe_machine"
+    metrics = sources.metrics[stage]
+    if sources.recorded:
+        metrics = lookup(metrics, "next_experiment")
     title = "What the next experiment would excite" if sources.recorded else "What the probing excites"
     levels = lookup(metrics, "level_percent_per_band")
+    if sources.recorded and lookup(metrics, "written") is False:
+        return placeholder("excitation", title, Missing(UNJUDGED, f"Not written: {metrics['reason']}"))
     if isinstance(levels, Missing):
         return placeholder("excitation", title, levels)
     levels, machine = np.array(levels), sources.declared.machine
@@ -64,7 +69,7 @@ def excitation(sources: Sources) -> Picture:
         text,
         shown,
         "R.m.s. level in per cent within equal bands of frequency, 0 to π rad a step.",
-        page.origin(sources.source("generate_probing")),
+        page.origin(sources.source(stage)),
     )
 
 

@@ -1,5 +1,5 @@
-"""What a rehearsal asks, on whose plants: the declared panel on the study's machine; on somebody's records what
-follows from them by stated defaults (scenario_defaults.py)."""
+"""What a rehearsal asks, on whose plants: the declared panel on the study's machine; on somebody's records
+what follows from them by stated defaults (scenario_defaults.py)."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.temperature import governor, panel, plant, scenario_defaults
 from pipeline.temperature.workflow import record
-from pipeline.temperature.workflow.settings import Half, Panel
+from pipeline.temperature.workflow.settings import Half, Panel, Tracking, TuneWeights
 from pipeline.temperature.workflow.settings import Plant as Machine
 
 
@@ -24,6 +24,71 @@ class Rehearsal(NamedTuple):
     noise: np.ndarray
     infeasible: list[dict[str, Any]]
     source: str
+
+
+class Setting(NamedTuple):
+    """What all contestants share, tuned and judged: the rehearsal, the identified plant with all inputs a
+    sample late, limits of inputs and outputs (low, high (p,) in °C), the governor, the integrator's limit in °C, the settled window in steps,
+    what the cost counts as one, the discount, and the sample time."""
+
+    rehearsal: Rehearsal
+    late: plant.Plant
+    limits: governor.Limits
+    output_limits: tuple[np.ndarray, np.ndarray]
+    governor: governor.Governor
+    integral_limit: float
+    settled: int
+    allowance: panel.Allowance
+    gamma: float
+    sample_time_s: float
+
+
+def shared(
+    tuning: TuneWeights,
+    machine: Machine,
+    tracking: Tracking,
+    settings: Panel,
+    rehearsal: Rehearsal,
+    family: Sequence[plant.Plant],
+) -> Setting:
+    """`family`: the identified plant first, then its spread."""
+    band = rehearsal.band_degC / settings.band_degC
+    late = (rehearsal.settling_s or settings.settling_s) / settings.settling_s
+    # a slow machine is allowed its time, a small one its degrees
+    allowance = panel.Allowance(
+        outside=tuning.allow_settling_s * late / machine.sample_time_s,
+        overshoot=tuning.allow_overshoot_degC * band,
+        settled_error=tuning.allow_settled_error_degC * band,
+        at_limits=tuning.allow_at_limits_percent,
+        energy=tuning.allow_effort_percent,
+        rms=tuning.allow_overshoot_degC * band,
+    )
+    overshoot = tracking.governor_overshoot_degC * band
+    return Setting(
+        rehearsal,
+        panel.delayed(family[0], late=True),
+        input_limits(machine),
+        output_limits(machine),
+        watchdog(machine, settings, family, rehearsal.noise, overshoot),
+        tracking.integral_limit_degC * band,
+        round(settings.settled_steps * rehearsal.judging.steps / settings.steps),
+        allowance,
+        tracking.gamma,
+        machine.sample_time_s,
+    )
+
+
+def rehearsed(
+    settings: Panel,
+    machine: Machine,
+    truth: plant.Plant | None,
+    family: Sequence[plant.Plant],
+    record_path: str,
+) -> Rehearsal:
+    """The declared panel where the true plant is known, otherwise what follows from the record."""
+    if truth is not None:
+        return declared(settings, machine, truth, family[0])
+    return from_record(settings, machine, family, record_path)
 
 
 def input_limits(machine: Machine) -> governor.Limits:
@@ -42,8 +107,8 @@ def output_limits(machine: Machine) -> tuple[np.ndarray, np.ndarray]:
 def watchdog(
     machine: Machine, settings: Panel, family: Sequence[plant.Plant], noise: np.ndarray, overshoot: float
 ) -> governor.Governor:
-    """The governor of all contestants: the identified plant, in time and a sample late, with inputs that act as
-    the panel's spread has them; what it keeps from a limit is three deviations of the sensors' noise."""
+    """The governor of all contestants: the identified plant, in time and a sample late, with inputs that act
+    as the panel's spread has them; what it keeps from a limit is three deviations of the sensors' noise."""
     low, high = output_limits(machine)
     guarded, strength = panel.corners(family[:1], spread_of(settings))
     limits = governor.OutputLimits(low, high, 3 * noise, overshoot)
@@ -60,18 +125,13 @@ def spread_of(settings: Panel) -> panel.Spread:
     )
 
 
-def declared(
-    settings: Panel, machine: Machine, truth: plant.Plant, identified: plant.Plant
-) -> Rehearsal:
+def declared(settings: Panel, machine: Machine, truth: plant.Plant, identified: plant.Plant) -> Rehearsal:
     """The study's machine: judged around the truth, tuned around what was identified."""
     reference = np.array([o.reference for o in machine.outputs])
     noise = np.full(len(reference), settings.noise_degC)
     judging, training = (
         _half(settings, half, [around], _questions(half, reference, settings.steps), noise, cells=cells)
-        for half, around, cells in (
-            (settings.judging, truth, True),
-            (settings.training, identified, False),
-        )
+        for half, around, cells in ((settings.judging, truth, True), (settings.training, identified, False))
     )
     return Rehearsal(judging, training, settings.band_degC, None, noise, [], "declared")
 
@@ -104,23 +164,26 @@ def _half(
     spread: panel.Spread | None = None,
 ) -> panel.Cases:
     rng = np.random.default_rng(half.seed)
-    plants = panel.drawn(around, half.plants, spread or spread_of(settings), cells=cells, rng=rng)
+    declared = spread or spread_of(settings)
+    scaled = panel.Spread(*(half.spread * value for value in declared))._replace(
+        delayed=min(half.spread * declared.delayed, 1.0)
+    )
+    plants = panel.drawn(around, half.plants, scaled, cells=cells, rng=rng)
     return panel.asked(
         panel.padded(plants),
         questions,
         noise=noise,
         seed=half.seed,
-        steps=steps or settings.steps,
+        steps=round(half.length * (steps or settings.steps)),
         hold=settings.hold_steps,
         cells=cells,
     )
 
 
-def from_record(
-    settings: Panel, machine: Machine, identified: plant.Plant, family: Sequence[plant.Plant], path: str
-) -> Rehearsal:
+def from_record(settings: Panel, machine: Machine, family: Sequence[plant.Plant], path: str) -> Rehearsal:
     """Somebody's machine: both halves are drawn around plants of the identified family, and starts,
     references, band, settling limit and length follow from the record."""
+    identified = family[0]
     u, y, recordings = record.read_recordings(path, machine.acting, machine.outputs)
     u = [a[:, : len(machine.inputs)] for a in u]
     low, high = output_limits(machine)
@@ -146,7 +209,9 @@ def from_record(
         asked.starts, asked.references, (lower, asked.ramp_degC_per_step), swing, asked.sequence
     )
     middle = asked.starts.mean(axis=0, keepdims=True)
-    training = panel.Questions(middle, asked.references.mean(axis=0, keepdims=True), None, None, asked.sequence)
+    training = panel.Questions(
+        middle, asked.references.mean(axis=0, keepdims=True), None, None, asked.sequence
+    )
     judging, trained = (
         _half(
             settings, half, around, question, scale.noise_degC, cells=False, steps=asked.steps, spread=spread

@@ -1,130 +1,190 @@
-"""What generate_probing does: the study's extruder, probed within limits from measured outputs
-only; or what to play on a user's machine next."""
+"""What generate_probing does: the next experiment on the identified family, forecast within plant.outputs.low
+and high, to be played instead of the controller or added to its commands; or one sentence why not."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.temperature.plant import baam
-from pipeline.temperature.probing import (
-    Excitation,
-    InputLimits,
-    OperatingPoint,
-    Probe,
-    excitation,
-    multisine,
-    prbs,
-    probe,
-)
-from pipeline.temperature.tracking import feasible_target
-from pipeline.temperature.workflow.settings import GenerateProbing, Plant
+from pipeline.temperature import baseline, experiment, forecast
+from pipeline.temperature.experiment import Dither, Experiment, Family, Limits, Wish
+from pipeline.temperature.plant import Plant as Model
+from pipeline.temperature.probing import excitation
+from pipeline.temperature.subspace import Segments
+from pipeline.temperature.trust import horizon
+from pipeline.temperature.workflow.probe_machine import given_centre, input_limits
+from pipeline.temperature.workflow.record import read_record
+from pipeline.temperature.workflow.settings import GenerateProbing, Plant, Tracking
+
+EXCITED = 12  # lags over which the experiment's excitation is counted
 
 
-class Planned(NamedTuple):
-    """Columns of the commands to play, and metrics."""
+class Designed(NamedTuple):
+    """Columns of the commands to play and of those to add to a controller's, empty where they are not safe,
+    and metrics."""
 
-    columns: dict[str, np.ndarray]
+    commands: dict[str, np.ndarray]
+    dither: dict[str, np.ndarray]
     metrics: dict[str, Any]
 
 
-class Probed(NamedTuple):
-    """The recording of the simulated machine, {name: (values (T,),
-    unit, meaning)} at time_s (T,), and metrics."""
-
-    time_s: np.ndarray
-    signals: dict[str, tuple[np.ndarray, str, str]]
-    metrics: dict[str, Any]
-
-
-def planned(settings: GenerateProbing, machine: Plant) -> Planned:
-    """The probing signal about a centre that the user gives, or the
-    middle of the limits, clipped to these."""
-    low, high = _limits(machine)
-    signal = _signal(settings, machine, np.random.default_rng(settings.seed))
-    centre = (low + high) / 2 if settings.centre_percent is None else _centre(settings, machine)
-    u = np.clip(centre + signal, low, high)
-    columns = {
-        "time_s": _time_s(settings, machine),
-        **{i.name: u[:, k] for k, i in enumerate(machine.inputs)},
-    }
-    return Planned(columns, _metrics(settings, excitation(u, 2), float((u != centre + signal).mean())))
-
-
-def probed(settings: GenerateProbing, machine: Plant) -> Probed:
-    """A run of the study's extruder. Raises ValueError where the machine is another."""
-    rng = np.random.default_rng(settings.seed)
-    signal = _signal(settings, machine, rng)
-    run = _simulated(settings, machine, signal, rng)
-    columns = zip([*machine.inputs, *machine.outputs], np.hstack([run.u, run.y]).T, strict=True)
-    signals = {
-        s.name: (values, s.unit, f"{s.name} of the study's extruder, simulated") for s, values in columns
-    }
-    return Probed(_time_s(settings, machine), signals, _metrics(settings, excitation(run.u, 12), run.limited))
-
-
-def _limits(machine: Plant) -> tuple[np.ndarray, np.ndarray]:
-    low, high = np.array([(i.low, i.high) for i in machine.inputs]).T
-    return low, high
-
-
-def _centre(settings: GenerateProbing, machine: Plant) -> np.ndarray:
-    """The operating point (m,) that the user gives: one number for all inputs, or one each."""
-    given = np.atleast_1d(np.asarray(settings.centre_percent, float))
-    if len(given) not in (1, len(machine.inputs)):
-        raise ValueError(
-            f"generate_probing.centre_percent has {len(given)} values, but plant has {len(machine.inputs)} "
-            "inputs; give one for each, or one number for all"
-        )
-    return np.broadcast_to(given, len(machine.inputs))
-
-
-def _signal(settings: GenerateProbing, machine: Plant, rng: np.random.Generator) -> np.ndarray:
-    shape = {
-        "amplitude": settings.amplitude_percent,
-        **({"shortest": settings.shortest_steps} if settings.signal == "prbs" else {}),
-    }
-    return {"multisine": multisine, "prbs": prbs}[settings.signal](
-        rng, settings.samples, len(machine.inputs), **shape
-    )
-
-
-def _time_s(settings: GenerateProbing, machine: Plant) -> np.ndarray:
-    return machine.sample_time_s * np.arange(settings.samples)
-
-
-def _simulated(
-    settings: GenerateProbing, machine: Plant, signal: np.ndarray, rng: np.random.Generator
-) -> Probe:
-    plant, (low, high) = baam()._replace(sample_time_s=machine.sample_time_s), _limits(machine)
-    if (len(machine.inputs), len(machine.outputs)) != (plant.m, plant.p):
-        raise ValueError(
-            f"params.yaml: plant names {len(machine.inputs)} inputs and {len(machine.outputs)} outputs, "
-            "but generate_probing.source: simulated is the "
-            f"study's extruder with {plant.m} and {plant.p}; set generate_probing.source: "
-            "recordings for your machine, "
-            "or restore the plant section"
-        )
-    target = feasible_target(plant, np.array([o.reference for o in machine.outputs]), low, high)
-    centre = target.u if settings.centre_percent is None else _centre(settings, machine)
-    feedback = settings.feedback_percent_per_degC * np.eye(plant.m, plant.p)
-    limits = InputLimits(
-        np.maximum(low, centre - settings.amplitude_percent),
-        np.minimum(high, centre + settings.amplitude_percent),
-        settings.rate_percent_per_step,
-    )
-    noise = settings.noise_degC * rng.standard_normal((len(signal), plant.p))
-    point = OperatingPoint(target.x, centre, target.y)
-    return probe(plant, signal, point, limits, feedback=feedback, noise=noise)
-
-
-def _metrics(settings: GenerateProbing, excited: Excitation, limited: float) -> dict[str, Any]:
-    return {
+def designed(
+    settings: GenerateProbing, machine: Plant, tracking: Tracking, plants: Sequence[Model], path: str
+) -> Designed:
+    """The next experiment of the machine whose record lies in `path`, on the identified `plants`, the model
+    first. Whatever makes it unsafe is a reason in the metrics, not an error."""
+    lacking = [o.name for o in machine.outputs if o.low is None or o.high is None]
+    if lacking:
+        return _refused(settings, f"declare low and high of {', '.join(lacking)} under plant.outputs")
+    limits, wish = _limits(settings, machine), _wish(settings, machine)
+    u, y = read_record(path, machine.acting, machine.outputs)
+    try:
+        family = _family(settings, machine, plants, ([a[:, : len(machine.inputs)] for a in u], y))
+        tried = experiment.design(family, wish, limits, np.random.default_rng(settings.seed))
+    except (ValueError, np.linalg.LinAlgError) as error:
+        return _refused(settings, " ".join(str(error).split()))
+    added, why_not = _dithered(family, wish, limits, settings.seed)
+    step, names = machine.sample_time_s, [i.name for i in machine.inputs]
+    metrics = {
         "source": settings.source,
-        "samples": settings.samples,
-        "excitation_order": excited.order,
-        "excitation_rank": excited.rank,
-        "excitation_full_rank": excited.full,
-        "excitation_condition": excited.condition if np.isfinite(excited.condition) else None,
-        "limited_share": limited,
-        "level_percent_per_band": excited.level,
+        "next_experiment": _figures(machine, limits, family, tried, tracking.gamma),
+        "closed_loop": {"written": False, "reason": why_not}
+        if added is None
+        else _dither_figures(machine, added),
+    }
+    dither = {} if added is None or added.reason else _columns(added.u, [f"{n}_dither" for n in names], step)
+    return Designed(_columns(tried.u, names, step) if tried.written else {}, dither, metrics)
+
+
+def _refused(settings: GenerateProbing, reason: str) -> Designed:
+    none = {"written": False, "reason": reason}
+    return Designed({}, {}, {"source": settings.source, "next_experiment": none, "closed_loop": none})
+
+
+def _limits(settings: GenerateProbing, machine: Plant) -> Limits:
+    y_low, y_high = np.array([(o.low, o.high) for o in machine.outputs], float).T
+    return Limits(*input_limits(machine), settings.rate_percent_per_step, y_low, y_high)
+
+
+def _wish(settings: GenerateProbing, machine: Plant) -> Wish:
+    reference = np.array([o.reference for o in machine.outputs], float)
+    return Wish(
+        reference,
+        settings.amplitude_percent,
+        settings.samples,
+        settings.signal,
+        settings.shortest_steps,
+        given_centre(settings, machine),
+    )
+
+
+def _family(
+    settings: GenerateProbing, machine: Plant, plants: Sequence[Model], record: tuple[Segments, Segments]
+) -> Family:
+    low, high = input_limits(machine)
+    doubt = forecast.Doubt(settings.doubt_input_gain, settings.doubt_ambient_degC, settings.doubt_delay_steps)
+    names = experiment.Names([i.name for i in machine.inputs], [o.name for o in machine.outputs])
+    return experiment.family_of(
+        plants, record, reach=high - low, longest=settings.samples, doubt=doubt, names=names
+    )
+
+
+def _dithered(family: Family, wish: Wish, limits: Limits, seed: int) -> tuple[Dither | None, str]:
+    """What may be added to the commands of a PI a zone, tuned by SIMC; None with the reason where the machine
+    has none."""
+    try:
+        rise = horizon(family.model, wish.samples)
+        controller = baseline.controller(family.model, (limits.low, limits.high), horizon=rise)
+        law = controller.design(np.ones(family.model.p), np.ones(family.model.m), 0.0)
+        return experiment.dither(family, law, wish, limits, np.random.default_rng(seed)), ""
+    except (ValueError, np.linalg.LinAlgError) as error:
+        return None, f"no simple controller to add it to: {' '.join(str(error).split())}"
+
+
+# ---- figures
+
+
+def _columns(u: np.ndarray, names: Sequence[str], sample_time_s: float) -> dict[str, np.ndarray]:
+    columns = {name: u[:, k] for k, name in enumerate(names)}
+    return {"time_s": sample_time_s * np.arange(len(u)), **columns}
+
+
+def _by(signals: Sequence, values: np.ndarray) -> dict[str, float | None]:
+    """{name: value}, None where it is not finite."""
+    return {
+        signal.name: float(value) if np.isfinite(value) else None
+        for signal, value in zip(signals, values, strict=True)
+    }
+
+
+def _figures(
+    machine: Plant, limits: Limits, family: Family, tried: Experiment, gamma: float
+) -> dict[str, Any]:
+    inputs, outputs, begin = machine.inputs, machine.outputs, family.begin
+    figures = {
+        "written": tried.written,
+        "reason": tried.reason,
+        "highest_degC": _by(outputs, tried.extremes.highest),
+        "lowest_degC": _by(outputs, tried.extremes.lowest),
+        "limit_degC": {
+            o.name: {"low": low, "high": high}
+            for o, low, high in zip(outputs, limits.y_low, limits.y_high, strict=True)
+        },
+        "band_degC": _by(outputs, family.band.width),
+        "doubt": family.doubt,
+        "start_percent": _by(inputs, begin.u),
+        "start_degC": _by(outputs, begin.y),
+        "slowest_time_constant_s": family.seconds(family.pace.slowest),
+    }
+    if not tried.written or tried.lesson is None:
+        return figures
+    # lags that span the fastest time constant: over closer ones a slow signal repeats itself
+    lag = max(round(family.pace.fastest / EXCITED), 1)
+    rank = excitation(tried.u[::lag], EXCITED)
+    return figures | {
+        "centre_percent": _by(inputs, tried.centre),
+        "amplitude_percent": _by(inputs, tried.amplitude),
+        "target_degC": _by(outputs, tried.target),
+        "samples": len(tried.u),
+        "seconds": family.seconds(len(tried.u)),
+        "excitation_order": rank.order,
+        "excitation_lag_s": family.seconds(lag),
+        "excitation_rank": rank.rank,
+        "excitation_full_rank": rank.full,
+        "excitation_condition": rank.condition if np.isfinite(rank.condition) else None,
+        "level_percent_per_band": excitation(tried.u, 1).level,
+        "information": tried.lesson.information,
+        "expected_error_percent": _errors(machine, family, tried.lesson),
+        "expected_gap_percent": 100 * experiment.expected_gap(family.model, tried.lesson, gamma),
+    }
+
+
+def _errors(machine: Plant, family: Family, taught: experiment.Lesson) -> dict[str, Any]:
+    """{output: {input: {gain, time_constant}}}: expected standard errors in percent of each seen pair."""
+    return {
+        output.name: {
+            signal.name: {
+                "gain": 100 * float(taught.gain_error[o, j]),
+                "time_constant": 100 * float(taught.time_constant_error[o, j]),
+            }
+            for j, signal in enumerate(machine.inputs)
+            if family.pace.seen[o, j]
+        }
+        for o, output in enumerate(machine.outputs)
+    }
+
+
+def _dither_figures(machine: Plant, added: Dither) -> dict[str, Any]:
+    figures = {"written": not added.reason, "reason": added.reason}
+    if added.extremes is not None:
+        figures |= {
+            "highest_degC": _by(machine.outputs, added.extremes.highest),
+            "lowest_degC": _by(machine.outputs, added.extremes.lowest),
+        }
+    if added.reason:
+        return figures
+    return figures | {
+        "amplitude_percent": _by(machine.inputs, added.amplitude),
+        "seconds": machine.sample_time_s * len(added.u),
+        "at_limits_percent": 100 * added.limited,
     }

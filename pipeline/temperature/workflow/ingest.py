@@ -72,7 +72,7 @@ class IngestSpec(NamedTuple):
 
 
 def spec_of(settings: Ingest, machine: Plant, source: str) -> IngestSpec:
-    """What section `ingest` asks for; what generate_probing wrote has our own names."""
+    """What section `ingest` asks for; what probe_machine wrote has our own names."""
     mapping = settings.mapping if source == "recordings" else {}
     return IngestSpec(
         machine,

@@ -30,7 +30,7 @@ SHIPPED: dict[str, Any] = {
         for name in (*(f"heater_{i}" for i in range(1, 7)), "motor")
     ],
     "plant.outputs": [
-        {"name": f"sensor_{i}", "unit": "degC", "reference": reference}
+        {"name": f"sensor_{i}", "unit": "degC", "reference": reference, "low": 0, "high": 250}
         for i, reference in enumerate((150, 160, 170, 175, 180), 1)
     ],
     "generate_probing.source": "simulated",

@@ -10,8 +10,11 @@ from pipeline.store.tables import BOOL, COUNT, FLOAT, INDEX, NONE, TEXT, Column,
 
 
 class _Signal(Protocol):
-    name: str
-    unit: str
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def unit(self) -> str: ...
 
 
 def record(inputs: Sequence[_Signal], outputs: Sequence[_Signal]) -> Schema:
@@ -93,7 +96,7 @@ CASES = Schema(
             "settled_error_degC",
             FLOAT,
             "degC",
-            "distance of the mean of the last 100 steps from the reference, worst output; missing where unstable",
+            "mean of the last 100 steps from the reference, worst output; missing where unstable",
             low=0,
             nullable=True,
         ),
@@ -194,28 +197,15 @@ PARITY = Schema(
 
 TUNING = Schema(
     "tuning",
-    2,
+    3,
     (
-        Column("mode", TEXT, NONE, "practical: the declared engineering cost"),
-        Column("evaluation", COUNT, NONE, "counted from 1", low=1),
+        Column("contestant", TEXT, NONE, "whose search"),
+        Column("evaluation", COUNT, NONE, "counted from 1, the declared start", low=1),
         Column("cost", FLOAT, NONE, "cost of this candidate; missing where it failed", nullable=True),
         Column(
             "incumbent", FLOAT, NONE, "lowest cost so far; missing before the first success", nullable=True
         ),
-        Column(
-            "tracking_degC",
-            FLOAT,
-            "degC",
-            "r.m.s. tracking error of this candidate; missing where it failed",
-            nullable=True,
-        ),
-        Column(
-            "effort_percent",
-            FLOAT,
-            "percent",
-            "r.m.s. effort of this candidate; missing where it failed",
-            nullable=True,
-        ),
+        Column("values", TEXT, NONE, "its parameters"),
         Column("chosen", BOOL, NONE, "whether the search recommends this candidate"),
         Column("failure", TEXT, NONE, "why the candidate failed; empty where it did not"),
     ),

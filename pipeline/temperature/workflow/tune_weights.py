@@ -1,5 +1,5 @@
-"""What tune_weights does: it tunes every contestant by itself, with the same search, budget and cost, on the same
-training half of the panel, as it would be deployed."""
+"""What tune_weights does: it tunes every contestant by itself, with the same search, budget and cost, on the
+same training half of the panel, as it would be deployed."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -10,33 +10,16 @@ from tqdm import tqdm
 
 from pipeline.store.execution import run_all
 from pipeline.store.params import Execution
-from pipeline.temperature import comparison, controller, governor, panel, scorecard, tuning
-from pipeline.temperature.plant import Plant
+from pipeline.temperature import comparison, controller, panel, scorecard, tuning
 from pipeline.temperature.workflow import contestants
+from pipeline.temperature.workflow.cases import Setting
 from pipeline.temperature.workflow.settings import TuneWeights
 
 # of a parameter's range, in logarithms: so near to an end the search is called bound by it
 AT_BOUND = 0.02
-# of the cost, for a parameter moved from its start by its whole range: of two candidates as good as each other
-# the one nearer to the start is taken, so that a direction in which the cost is flat has one end, not two
+# of the cost, for a parameter moved from its start by its whole range: of two candidates as good as each
+# other the one nearer to the start is taken, so that a direction in which the cost is flat has one end
 NEARER = 0.05
-
-
-class Trial(NamedTuple):
-    """What every candidate of one run of tuning meets: the identified plant, the training cases, the limits,
-    the integrator's limit in °C, the governor, the band in °C, and what the cost counts as one."""
-
-    plant: Plant
-    cases: panel.Cases
-    limits: governor.Limits
-    integral_limit: float
-    governor: governor.Governor
-    band: float
-    settled: int
-    allowance: panel.Allowance
-    output_limits: tuple[np.ndarray, np.ndarray]
-    worst_case: float
-    least_disk_margin: float
 
 
 class Tuned(NamedTuple):
@@ -47,25 +30,12 @@ class Tuned(NamedTuple):
     metrics: dict[str, Any]
 
 
-def allowance(settings: TuneWeights, *, band: float, settling: float, sample_time_s: float) -> panel.Allowance:
-    """What the cost counts as one. `band` and `settling` are this machine's over the declared ones: a slow
-    machine is allowed its time, a small one its degrees."""
-    return panel.Allowance(
-        outside=settings.allow_settling_s * settling / sample_time_s,
-        overshoot=settings.allow_overshoot_degC * band,
-        settled_error=settings.allow_settled_error_degC * band,
-        at_limits=settings.allow_at_limits_percent,
-        energy=settings.allow_effort_percent,
-        rms=settings.allow_overshoot_degC * band,
-    )
-
-
 def tuned(
-    settings: TuneWeights, problem: contestants.Problem, trial: Trial, execution: Execution
+    settings: TuneWeights, problem: contestants.Problem, setting: Setting, execution: Execution
 ) -> Tuned:
     """Every contestant with something to tune; one that cannot be designed at its start is refused."""
     searched = [one for one in contestants.CONTESTANTS if one.parameters]
-    calls = [delayed(_searched)(one.name, settings, problem, trial) for one in searched]
+    calls = [delayed(_searched)(one.name, settings, problem, setting) for one in searched]
     results = dict(
         tqdm(run_all(calls, execution), total=len(calls), desc="tune_weights: contestants", mininterval=2)
     )
@@ -92,7 +62,7 @@ def tuned(
 
 
 def _searched(
-    name: str, settings: TuneWeights, problem: contestants.Problem, trial: Trial
+    name: str, settings: TuneWeights, problem: contestants.Problem, setting: Setting
 ) -> tuple[str, tuning.Result | str]:
     """One search; a sentence where the contestant cannot be designed, empty where the record has it not."""
     contestant = contestants.BY_NAME[name]
@@ -103,12 +73,12 @@ def _searched(
         return name, str(reason)
     if design is None:
         return name, ""
-    rests = panel.rests(design.model, trial.cases, trial.limits)
+    rests = panel.rests(design.model, setting.rehearsal.training, setting.limits)
 
     def cost(theta: np.ndarray) -> float:
         made = contestant.design(problem, dict(zip(_names(contestant), theta, strict=True)))
         far = np.log(theta / start) / np.log(high / low)
-        return _cost(made, rests, trial) * (1 + NEARER * float(far @ far))
+        return _cost(made, rests, settings, setting) * (1 + NEARER * float(far @ far))
 
     first = tuning.History(start[None], *_first(cost, start))
     result = tuning.minimise(
@@ -131,22 +101,34 @@ def _first(cost, start: np.ndarray) -> tuple[np.ndarray, tuple[str, ...], np.nda
     return np.array([value]), (reason,), np.array([value])
 
 
-def _cost(design: contestants.Design, rests: Sequence[controller.Rest], trial: Trial) -> float:
-    """The declared cost of a candidate; raises ValueError where its disk margin on the identified plant is
-    below the least: figures in simulation are no reason to give robustness away."""
-    disk = scorecard.disk_margin(trial.plant, design.law)
-    if not disk >= trial.least_disk_margin:
-        raise ValueError(f"the disk margin is {disk:.2f}, below the least of {trial.least_disk_margin:.2f}")
+def _cost(
+    design: contestants.Design, rests: Sequence[controller.Rest], settings: TuneWeights, setting: Setting
+) -> float:
+    """The declared cost of a candidate. Raises ValueError where its margins on the identified plant, its inputs
+    a sample late, are below the least: figures in simulation are no reason to give robustness away."""
+    margin = scorecard.margins([setting.late], design.law, grid=80)[0]
+    if not (margin.disk >= settings.least_disk_margin and margin.delay_s >= settings.least_delay_margin_s):
+        raise ValueError(
+            f"on the identified plant, its inputs a sample late, the disk margin is {margin.disk:.2f} and the delay margin "
+            f"{margin.delay_s:.2f} s, where {settings.least_disk_margin:g} and "
+            f"{settings.least_delay_margin_s:g} s are the least"
+        )
+    cases, (low, high) = setting.rehearsal.training, setting.output_limits
     deployed = controller.deployed(
-        design.law, trial.limits, integral_limit=trial.integral_limit, governor=trial.governor
+        design.law, setting.limits, integral_limit=setting.integral_limit, governor=setting.governor
     )
-    rollout = panel.rolled_out(deployed, trial.cases, panel.aims(design.law, rests, trial.cases))
-    low, high = trial.output_limits
+    rollout = panel.rolled_out(deployed, cases, panel.aims(design.law, rests, cases))
     figures = panel.figures(
-        rollout, trial.cases, limits=trial.limits, low=low, high=high, band=trial.band, settled=trial.settled
+        rollout,
+        cases,
+        limits=setting.limits,
+        low=low,
+        high=high,
+        band=setting.rehearsal.band_degC,
+        settled=setting.settled,
     )
-    costs = panel.costs(figures, trial.allowance)
-    return comparison.mean_and_worst(costs, trial.cases.plant, weight=trial.worst_case)
+    costs = panel.costs(figures, setting.allowance)
+    return comparison.mean_and_worst(costs, cases.plant, weight=settings.worst_case)
 
 
 def _names(contestant: contestants.Contestant) -> list[str]:
@@ -197,5 +179,7 @@ def _history(results: Mapping[str, tuning.Result], problem: contestants.Problem)
             columns["incumbent"].append(history.incumbent[k])
             columns["chosen"].append(bool((theta == result.theta).all()))
             columns["failure"].append(history.failed[k])
-            columns["values"].append(", ".join(f"{key} {value:.4g}" for key, value in zip(names, theta, strict=True)))
+            columns["values"].append(
+                ", ".join(f"{key} {value:.4g}" for key, value in zip(names, theta, strict=True))
+            )
     return columns

@@ -1,0 +1,590 @@
+"""The next experiment: what to play on a machine so that it teaches most about gains and time constants while
+no output of any plant of the identified family leaves its limits.
+
+centre: A linear programme over the family: the centre and the common share of the wanted amplitudes that keep
+    every output within its limits at a few instants. First the largest share, then, at ENOUGH of it, the
+    centre whose temperatures are nearest to the references.
+signal: A random binary sequence that holds for a share of the fastest time constant that its input shows, or
+    a multisine up to a few times its corner frequency: no power where the plant does not answer.
+amplitude: Scaled down until the forecast (`forecast`) over the whole experiment stays within the limits; then
+    inputs that can move more without leaving them, one by one. Where a long experiment allows little, a
+    shorter one is tried: what hardly settles drifts away with time.
+teaches: Fisher information of gain and time constant of each pair that is seen, on first-order models.
+"""
+
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
+
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+
+from pipeline.temperature.first_order import response
+from pipeline.temperature.forecast import (
+    SIGMAS,
+    Answers,
+    Band,
+    Doubt,
+    Extremes,
+    Loop,
+    Start,
+    ambient,
+    answers,
+    band,
+    closed_loop,
+    forecast,
+    open_loop,
+    start,
+    truncated,
+)
+from pipeline.temperature.order import LARGEST_RADIUS, stabilised
+from pipeline.temperature.plant import Plant, strictly_proper
+from pipeline.temperature.subspace import Segments
+from pipeline.temperature.tracking import Law, aimed, feasible_target, gains
+from pipeline.temperature.trust import horizon, two_points
+from pipeline.temperature.validation import step_response
+
+ENOUGH = 0.8  # of the largest safe amplitude: what the centre gives up to come nearer to the references
+SEEN = 0.05  # of an output's largest effect: pairs below it teach and are asked nothing
+HOLD = 0.5  # of the fastest time constant: the shortest hold of a binary sequence
+CORNERS = 3.0  # times the corner frequency: the highest line of a multisine
+LINES = 12  # of each input in a multisine at least: fewer are told by their own past
+SWITCHES = 20  # at least so many holds in an experiment, so that inputs move independently
+DRAWS = 30  # phases drawn for a multisine, of which the flattest is taken
+USEFUL = 0.3  # largest expected standard error of an input's strongest gain; beyond it nothing is learned
+STEPS = 6  # halvings of each search for an amplitude
+HALF = 0.5  # of the wanted amplitudes: a shorter experiment is tried below it
+
+
+class Limits(NamedTuple):
+    """Of the inputs low and high (m,) in percent and rate in percent a step; of the outputs y_low and y_high
+    (p,) in °C."""
+
+    low: np.ndarray
+    high: np.ndarray
+    rate: float
+    y_low: np.ndarray
+    y_high: np.ndarray
+
+
+class Wish(NamedTuple):
+    """What is asked for: outputs near the reference (p,), amplitudes of at most `amplitude` percent, at most
+    `samples` samples of this kind of signal, no hold shorter than `shortest` samples; or a centre (m,)."""
+
+    reference: np.ndarray
+    amplitude: float
+    samples: int
+    signal: Literal["multisine", "prbs"]
+    shortest: int
+    centre: np.ndarray | None = None
+
+
+class Pace(NamedTuple):
+    """Time constants and delays (p, m) in samples, gains (p, m) in °C per percent, the median over the
+    family; `seen` (p, m): pairs that count; fastest and slowest time constant of those."""
+
+    time_constant: np.ndarray
+    delay: np.ndarray
+    gain: np.ndarray
+    seen: np.ndarray
+    fastest: float
+    slowest: float
+
+
+class Lesson(NamedTuple):
+    """What an experiment would teach: smallest eigenvalue of the Fisher information of the logarithms of gain
+    and time constant over all seen pairs, and their expected standard errors (p, m) as shares, NaN where not
+    seen."""
+
+    information: float
+    gain_error: np.ndarray
+    time_constant_error: np.ndarray
+
+
+class Experiment(NamedTuple):
+    """Inputs u (T, m) to play, empty with the reason where no safe experiment teaches anything; extremes of
+    every output over the family, in °C; the temperatures that the centre holds by the model, target (p,)."""
+
+    u: np.ndarray
+    reason: str
+    extremes: Extremes
+    centre: np.ndarray
+    amplitude: np.ndarray
+    target: np.ndarray
+    lesson: Lesson | None
+
+    @property
+    def written(self) -> bool:
+        return not self.reason
+
+
+class Dither(NamedTuple):
+    """What to add to the commands of the running controller, u (T, m), empty with the reason where it is not
+    safe; extremes, amplitude (m,), and the share of commands at a limit."""
+
+    u: np.ndarray
+    reason: str
+    extremes: Extremes | None
+    amplitude: np.ndarray
+    limited: float
+
+
+class Names(NamedTuple):
+    """Of inputs and outputs, for sentences."""
+
+    inputs: Sequence[str]
+    outputs: Sequence[str]
+
+
+class Family(NamedTuple):
+    """The identified plants, the model first; their pace; what they do not hold; where the record leaves the
+    machine; the band of noise and model error; and the signals' names."""
+
+    plants: Sequence[Plant]
+    pace: Pace
+    doubt: Doubt
+    begin: Start
+    band: Band
+    names: Names
+
+    @property
+    def model(self) -> Plant:
+        return self.plants[0]
+
+    def seconds(self, samples: float) -> float:
+        return samples * self.model.sample_time_s
+
+
+def family_of(
+    plants: Sequence[Plant],
+    record: tuple[Segments, Segments],
+    *,
+    reach: np.ndarray,
+    longest: int,
+    doubt: Doubt,
+    names: Names,
+) -> Family:
+    """The family for experiments of at most `longest` samples on the machine of this record (u, y); reach
+    (m,) is each input's range.
+
+    A pole of the model outside the unit circle is drawn onto it, as in the bootstrap: no heated part heats
+    itself. Where the machine does run away, the model then misses the record, and the band says so. Raises
+    ValueError where no stretch of the record has all inputs.
+    """
+    plants = [stabilised(plant, LARGEST_RADIUS) for plant in plants]
+    speed = pace(plants, reach, longest)
+    begin = start(plants, *record, slowest=speed.slowest)
+    return Family(plants, speed, doubt, begin, band(plants[0], *record), names)
+
+
+def pace(plants: Sequence[Plant], reach: np.ndarray, longest: int) -> Pace:
+    """How fast the family answers; reach (m,) is each input's range, longest the samples of an experiment."""
+    samples = horizon(plants[0], longest)
+    responses = [step_response(plant, samples + 1) for plant in plants]
+    tau, delay = (np.median(part, axis=0) for part in zip(*map(two_points, responses), strict=True))
+    peaks = [np.take_along_axis(part, np.abs(part).argmax(axis=0)[None], axis=0)[0] for part in responses]
+    gain = np.median(peaks, axis=0)
+    effect = np.abs(gain) * reach
+    seen = (effect > SEEN * effect.max(axis=1, keepdims=True)) & (tau > 0)
+    shown = np.maximum(tau[seen], 1.0) if seen.any() else np.ones(1)
+    return Pace(np.maximum(tau, 1.0), delay, gain, seen, float(shown.min()), float(shown.max()))
+
+
+# ---- the signal
+
+
+def own_pace(speed: Pace) -> np.ndarray:
+    """Fastest time constant (m,) in samples that each input shows; the fastest of all where it shows none."""
+    tau = np.where(speed.seen, speed.time_constant, np.inf).min(axis=0)
+    return np.where(np.isfinite(tau), tau, speed.fastest)
+
+
+def signal(rng: np.random.Generator, samples: int, wish: Wish, speed: Pace) -> np.ndarray:
+    """(samples, m) of amplitude 1 and about zero mean, with its power where each input is answered."""
+    tau = own_pace(speed)
+    if wish.signal == "prbs":
+        holds = np.clip(np.round(HOLD * tau), wish.shortest, max(samples // SWITCHES, wish.shortest))
+        return np.column_stack([_binary(rng, samples, int(hold)) for hold in holds])
+    lines = _lines(samples, CORNERS / tau)
+    return np.column_stack([_flattest(rng, samples, own) for own in lines])
+
+
+def _binary(rng: np.random.Generator, samples: int, hold: int) -> np.ndarray:
+    """+-1 in holds of equal length, as many up as down, in random order."""
+    count = -(-samples // hold)
+    bits = rng.permutation(np.arange(count) % 2)
+    return np.repeat(2.0 * bits - 1.0, hold)[:samples]
+
+
+def _lines(samples: int, highest: np.ndarray) -> list[np.ndarray]:
+    """Lines of the record for each input up to its highest frequency in rad a sample, none shared; at least
+    LINES each."""
+    m = len(highest)
+    last = np.ceil(highest * samples / (2 * np.pi))
+    last = np.clip(last, min(LINES * m, (samples - 1) // 2), (samples - 1) // 2).astype(int)
+    return [np.arange(1 + j, end + 1, m) for j, end in enumerate(last)]
+
+
+def _flattest(rng: np.random.Generator, samples: int, lines: np.ndarray) -> np.ndarray:
+    """The sum of these lines in equal power, of all phases drawn the one with the least peak, scaled to 1."""
+    best, least = np.zeros(samples), np.inf
+    for _ in range(DRAWS):
+        spectrum = np.zeros(samples // 2 + 1, complex)
+        spectrum[lines] = np.exp(2j * np.pi * rng.random(len(lines)))
+        drawn = np.fft.irfft(spectrum, samples)
+        peak = np.abs(drawn).max()
+        if peak < least * np.abs(drawn).std():
+            best, least = drawn / peak, peak / drawn.std()
+    return best
+
+
+def shaped(raw: np.ndarray, ramp: int, step: float) -> np.ndarray:
+    """The signal from the end of the ramp on, moving by at most `step` of its amplitude a sample."""
+    out, last = np.zeros_like(raw), np.zeros(raw.shape[1])
+    for t in range(ramp, len(raw)):
+        last = np.clip(raw[t], last - step, last + step)
+        out[t] = last
+    return out
+
+
+# ---- centre and amplitudes
+
+
+def caps(family: Family, reach: Answers, wish: Wish, limits: Limits) -> np.ndarray:
+    """Amplitudes (m,) that are wanted: the asked one, or what moves an output by half of what its limits
+    leave beside band and ambient; 0 where they leave nothing."""
+    spare = limits.y_high - limits.y_low - 2 * (family.band.width + family.doubt.ambient_degC)
+    peak = reach.peak.max(axis=0) * (1 + family.doubt.input_gain)
+    room = np.maximum(spare, 0.0)[:, None] / 2 / np.maximum(peak, np.finfo(float).tiny)
+    return np.minimum(np.minimum(wish.amplitude, (limits.high - limits.low) / 2), room.min(axis=0))
+
+
+def programme(
+    family: Family, reach: Answers, wish: Wish, limits: Limits, cap: np.ndarray, least: float | None
+) -> tuple[np.ndarray, float] | None:
+    """Centre (m,) and share of the wanted amplitudes by a linear programme; None where no centre is within
+    the limits even without a signal.
+
+    Unknowns [centre; w >= |centre - u|; q >= |y - reference|; share]. Without `least` the share is maximised;
+    with it the distance q from the references is minimised at a share of at least that.
+    """
+    m, p, begin, g = len(cap), len(limits.y_low), family.begin, family.doubt.input_gain
+    instants = np.unique(np.linspace(0, len(reach.at) - 1, 7).round().astype(int)[1:])
+    shift = begin.u - begin.answered
+    rise = reach.ramp[:, :, instants].transpose(0, 2, 3, 1).reshape(-1, m)
+    from_step = (reach.step[:, :, instants] * shift[:, None, None]).transpose(0, 2, 3, 1).reshape(-1, m)
+    at_u = reach.free[:, instants].reshape(-1) + from_step.sum(axis=1)
+    swing = (1 + g) * np.repeat(reach.peak[:, None], len(instants), axis=1).reshape(-1, m) @ cap
+    moved = ambient(family.doubt, reach.at[instants], family.pace.fastest)[:, None] + family.band.width
+    slack = np.tile(moved[None], (len(reach.free), 1, 1)).reshape(-1) + g * np.abs(from_step).sum(axis=1)
+    count = len(at_u)
+    high, low = (np.tile(side, count // p) for side in (limits.y_high, limits.y_low))
+    none = np.zeros((count, p))
+    # y = at_u + rise (centre - u), and the doubt about it
+    upper = np.hstack([rise, g * np.abs(rise), none, swing[:, None]])
+    lower = np.hstack([-rise, g * np.abs(rise), none, swing[:, None]])
+    rows = [upper, lower]
+    right = [high - slack - at_u + rise @ begin.u, at_u - slack - low - rise @ begin.u]
+    end = slice(count // len(reach.free) - p, count // len(reach.free))  # the model's last instant
+    eye, wide = np.eye(m), np.zeros((m, p))
+    for sign in (1.0, -1.0):
+        rows.append(np.hstack([sign * eye, -eye, wide, np.zeros((m, 1))]))
+        right.append(sign * begin.u)
+        rows.append(np.hstack([sign * rise[end], np.zeros((p, m)), -np.eye(p), np.zeros((p, 1))]))
+        right.append(sign * (wish.reference - at_u[end] + rise[end] @ begin.u))
+        rows.append(np.hstack([sign * eye, 0 * eye, wide, cap[:, None]]))
+        right.append(limits.high if sign > 0 else -limits.low)
+    cost = np.r_[
+        np.zeros(2 * m), np.zeros(p) if least is None else np.ones(p), -1.0 if least is None else 0.0
+    ]
+    bounds = [(None, None)] * m + [(0, None)] * (m + p) + [(least or 0.0, 1.0)]
+    found = scipy.optimize.linprog(cost, np.vstack(rows), np.concatenate(right), bounds=bounds)
+    if found.x is None:
+        return None
+    return np.clip(found.x[:m], limits.low, limits.high), float(found.x[-1])
+
+
+def centres(family: Family, reach: Answers, wish: Wish, limits: Limits, cap: np.ndarray) -> list[np.ndarray]:
+    """Centres (m,) to try in this order: the one that is given; else that of the linear programme, what holds
+    the references by the model, and the last inputs."""
+    if wish.centre is not None:
+        return [np.clip(wish.centre, limits.low, limits.high)]
+    held = feasible_target(family.model, wish.reference, limits.low, limits.high).u
+    fallback = [held, np.clip(family.begin.u, limits.low, limits.high)]
+    widest = programme(family, reach, wish, limits, cap, None)
+    if widest is None:
+        return fallback
+    nearest = programme(family, reach, wish, limits, cap, ENOUGH * widest[1])
+    return [(nearest or widest)[0], *fallback]
+
+
+def _extremes(family: Family, reach: Answers, centre: np.ndarray, amplitude: np.ndarray) -> Extremes:
+    return open_loop(
+        reach,
+        family.begin,
+        centre,
+        amplitude,
+        doubt=family.doubt,
+        fastest=family.pace.fastest,
+        width=family.band.width,
+    )
+
+
+def within(extremes: Extremes, limits: Limits) -> bool:
+    return bool((extremes.highest <= limits.y_high).all() and (extremes.lowest >= limits.y_low).all())
+
+
+def safe_amplitude(
+    family: Family, reach: Answers, centre: np.ndarray, limits: Limits, cap: np.ndarray
+) -> np.ndarray:
+    """The largest amplitudes (m,) found that stay within the limits: a common share of `cap` first, then each
+    input as far as it can beyond that; 0 where even the centre alone leaves them."""
+    room = np.minimum(cap, np.maximum(np.minimum(limits.high - centre, centre - limits.low), 0.0))
+
+    def largest(amplitude, toward):
+        """How far from `amplitude` toward `toward` is safe, between 0 and 1."""
+        safe, beyond = 0.0, 1.0
+        if within(_extremes(family, reach, centre, toward), limits):
+            return 1.0
+        for _ in range(STEPS):
+            middle = (safe + beyond) / 2
+            tried = amplitude + middle * (toward - amplitude)
+            safe, beyond = (
+                (middle, beyond)
+                if within(_extremes(family, reach, centre, tried), limits)
+                else (safe, middle)
+            )
+        return safe
+
+    amplitude = largest(0.0 * room, room) * room
+    if not amplitude.any() or (amplitude == room).all():
+        return amplitude
+    # the weakest first: it costs the others least
+    for j in np.argsort(reach.peak.max(axis=(0, 1)) * room):
+        toward = amplitude.copy()
+        toward[j] = room[j]
+        amplitude = amplitude + largest(amplitude, toward) * (toward - amplitude)
+    return amplitude
+
+
+# ---- what it teaches
+
+
+def lesson(u: np.ndarray, speed: Pace, noise: np.ndarray) -> Lesson:
+    """Of inputs u (T, m) about rest: with z the first-order answer of one pair, dy / d log K = z and
+    dy / d log tau by central differences; a constant of each output is projected out. noise (p,) in °C."""
+    information, errors = np.inf, np.full((2, *speed.seen.shape), np.nan)
+    for o, pairs in enumerate(speed.seen):
+        inputs = np.flatnonzero(pairs)
+        if not inputs.size:
+            continue
+        columns = []
+        for j in inputs:
+            tau, late, K = speed.time_constant[o, j], speed.delay[o, j], speed.gain[o, j]
+            up, down = (K * response(u[:, j], tau * scale, late, 1.0) for scale in (1.01, 0.99))
+            columns += [(up + down) / 2, (up - down) / 0.02]
+        J = np.column_stack(columns)
+        J = (J - J.mean(axis=0)) / max(noise[o], 1e-6)
+        values, vectors = np.linalg.eigh(J.T @ J)
+        information = min(information, float(values[0]))
+        variance = (vectors**2 / np.maximum(values, 1e-300)).sum(axis=1)
+        errors[:, o, inputs] = np.sqrt(variance).reshape(-1, 2).T
+    return Lesson(max(information, 0.0) if np.isfinite(information) else 0.0, errors[0], errors[1])
+
+
+def expected_gap(model: Plant, taught: Lesson, gamma: float) -> float:
+    """J / J* - 1, to second order, of linear-quadratic gains (Q = R = I) designed after the experiment: the
+    sum over its expected errors of each input's gain and of the time constants, one at a time. Started from
+    what the inputs move."""
+    plant = strictly_proper(model)
+    Q, R = np.eye(plant.p), np.eye(plant.m)
+
+    def cost(K: np.ndarray) -> float:
+        closed = np.sqrt(gamma) * (plant.A - plant.B @ K)
+        if np.abs(np.linalg.eigvals(closed)).max() >= 1:
+            return np.inf
+        P = scipy.linalg.solve_discrete_lyapunov(closed.T, plant.C.T @ Q @ plant.C + K.T @ R @ K)
+        return float(np.trace(plant.B.T @ P @ plant.B))
+
+    def designed(other: Plant) -> float:
+        return cost(gains(other, Q, R, gamma).K_x)
+
+    of_gain = np.nan_to_num(np.nanmin(np.where(np.isnan(taught.gain_error), 10.0, taught.gain_error), axis=0))
+    of_gain = np.minimum(of_gain, 0.9)
+    pace_errors = taught.time_constant_error[np.isfinite(taught.time_constant_error)]
+    of_pace = float(np.minimum(np.median(pace_errors), 0.9)) if pace_errors.size else 0.0
+    balance = np.eye(plant.n) - plant.A
+    others = [
+        plant._replace(B=plant.B * (1 + of_gain[j] * (np.arange(plant.m) == j))) for j in range(plant.m)
+    ]
+    others.append(plant._replace(A=np.eye(plant.n) - balance / (1 + of_pace), B=plant.B / (1 + of_pace)))
+    best = designed(plant)
+    return float(sum(designed(other) / best - 1 for other in others))
+
+
+# ---- the experiment
+
+
+def design(family: Family, wish: Wish, limits: Limits, rng: np.random.Generator) -> Experiment:
+    """The longest experiment that is safe and moves the machine by at least half of what is wanted; of
+    shorter ones the one that teaches most where none does."""
+    if reason := _nothing_left(family, limits):
+        nothing, unknown = np.zeros((0, family.model.m)), np.full(family.model.p, np.nan)
+        still = np.zeros(family.model.m)
+        return Experiment(nothing, reason, Extremes(unknown, unknown), still, still, unknown, None)
+    samples, speed = wish.samples, family.pace
+    rise = ramp_samples(limits, speed, samples)
+    ramp = np.clip((1.0 + np.arange(samples)) / rise, 0.0, 1.0)
+    step = limits.rate / max(wish.amplitude, limits.rate / 2)
+    played = shaped(signal(rng, samples, wish, speed), rise, step)
+    whole = answers(family.plants, family.begin, ramp, played)
+    best, most, reason = None, 0.0, ""
+    shortest = min(max(4 * rise, int(5 * speed.fastest), 50), wish.samples)
+    while samples >= shortest:
+        reach = truncated(whole, samples) if samples < wish.samples else whole
+        tried = _designed(family, reach, wish, limits, (ramp[:samples], played[:samples], rise))
+        reason = reason or tried.reason
+        if best is None or (tried.lesson is not None and tried.written and tried.lesson.information > most):
+            best, most = (
+                tried,
+                tried.lesson.information if tried.lesson is not None and tried.written else 0.0,
+            )
+        if tried.written and (tried.amplitude >= HALF * caps(family, reach, wish, limits)).all():
+            break
+        samples //= 2
+    if best is None:
+        raise ValueError(f"generate_probing.samples is {wish.samples}, too few for an experiment; raise it")
+    return best if best.written else best._replace(reason=reason)
+
+
+def _nothing_left(family: Family, limits: Limits) -> str:
+    """Why no experiment can be forecast: the model itself misses the record by what the limits are apart;
+    empty where it does not."""
+    spare = limits.y_high - limits.y_low - 2 * family.band.width
+    o = int(np.argmin(np.where(np.isfinite(spare), spare, -np.inf)))
+    if spare[o] > 0:
+        return ""
+    return (
+        f"the model's simulation misses the record of {family.names.outputs[o]} by "
+        f"{min(family.band.width[o], 1e4):.3g} degC, more than its limits leave: mend the identification"
+    )
+
+
+def ramp_samples(limits: Limits, speed: Pace, samples: int) -> int:
+    """Samples of the ramp: the whole range within the rate, and the fastest time constant; a quarter of the
+    experiment at most."""
+    needed = np.ceil((limits.high - limits.low).max() / limits.rate)
+    return int(max(min(max(needed, speed.fastest), samples / 4), min(needed, samples / 2), 1))
+
+
+def _designed(
+    family: Family, reach: Answers, wish: Wish, limits: Limits, shapes: tuple[np.ndarray, np.ndarray, int]
+) -> Experiment:
+    """The experiment of one length; shapes: ramp (T,), signal (T, m), and where the ramp ends."""
+    ramp, played, rise = shapes
+    cap = caps(family, reach, wish, limits)
+    tried = centres(family, reach, wish, limits, cap)
+    for centre in tried:
+        amplitude = safe_amplitude(family, reach, centre, limits, cap)
+        if amplitude.any():
+            break
+    else:
+        return _left(family, reach, tried[0], limits)
+    begin = family.begin
+    for _ in range(STEPS):
+        u = np.clip(
+            begin.u + ramp[:, None] * (centre - begin.u) + amplitude * played, limits.low, limits.high
+        )
+        extremes = forecast(
+            family.plants, begin, u, doubt=family.doubt, fastest=family.pace.fastest, width=family.band.width
+        )
+        if within(extremes, limits):
+            break
+        amplitude = 0.9 * amplitude  # between the samples that the search looked at it was hotter
+    else:
+        return _left(family, reach, centre, limits)
+    taught = lesson(u[rise:], family.pace, family.band.noise)
+    target = reach.free[0, -1] + (begin.u - begin.answered) @ reach.step[0, :, -1]
+    target = target + (centre - begin.u) @ reach.ramp[0, :, -1]
+    reason = _teaches_little(family, amplitude, taught)
+    return Experiment(u[: 0 if reason else None], reason, extremes, centre, amplitude, target, taught)
+
+
+def _teaches_little(family: Family, amplitude: np.ndarray, taught: Lesson) -> str:
+    """Why an experiment is not worth playing; empty where it is."""
+    error = np.where(np.isnan(taught.gain_error), np.inf, taught.gain_error).min(axis=0)
+    weak = np.flatnonzero((error > USEFUL) & family.pace.seen.any(axis=0))
+    if not weak.size:
+        return ""
+    j = int(weak[error[weak].argmax()])
+    return (
+        f"{family.names.inputs[j]} may move by {amplitude[j]:.2g} percent within the limits, which would "
+        f"leave its gain unknown by {100 * min(error[j], 10.0):.0f} % or more; widen plant.outputs low and "
+        "high, or measure with less noise"
+    )
+
+
+def _left(family: Family, reach: Answers, centre: np.ndarray, limits: Limits) -> Experiment:
+    """The refusal of an experiment whose centre alone leaves a limit, with the output that leaves it most."""
+    still = np.zeros(family.model.m)
+    extremes = _extremes(family, reach, centre, still)
+    above, below = extremes.highest - limits.y_high, limits.y_low - extremes.lowest
+    hot = above.max() >= below.max()
+    o = int((above if hot else below).argmax())
+    reached, limit = (extremes.highest[o], limits.y_high[o]) if hot else (extremes.lowest[o], limits.y_low[o])
+    slow = family.pace.slowest > HALF * reach.at[-1]
+    why = (
+        "the machine hardly settles by itself, so that small errors grow"
+        if slow
+        else f"{family.band.width[o]:.3g} degC of it are noise and model error, "
+        f"{family.doubt.ambient_degC:g} ambient"
+    )
+    reason = (
+        f"without its controller {family.names.outputs[o]} may {'reach' if hot else 'fall to'} "
+        f"{np.clip(reached, -1e4, 1e4):.0f} degC within {family.seconds(reach.at[-1] + 1):.0f} s even with "
+        f"no signal played, and its limit is {limit:g} degC: {why}"
+    )
+    nothing = np.zeros((0, family.model.m))
+    return Experiment(nothing, reason, extremes, centre, still, extremes.highest * np.nan, None)
+
+
+# ---- around the running controller
+
+
+def dither(family: Family, law: Law, wish: Wish, limits: Limits, rng: np.random.Generator) -> Dither:
+    """The signal to add to the commands of a controller such as `law` that holds the references, or the
+    nearest that the inputs can hold; its amplitudes are halved until the forecast around the family stays
+    within the limits."""
+    m, samples = family.model.m, wish.samples
+    rise = ramp_samples(limits, family.pace, samples)
+    step = limits.rate / max(wish.amplitude, limits.rate / 2)
+    played = shaped(signal(rng, samples, wish, family.pace), rise, step)
+    target = feasible_target(family.model, wish.reference, limits.low, limits.high)
+    loop = Loop(aimed(law, target.y, target.u, target.y), target.y, limits.low, limits.high)
+    noise = family.band.noise * rng.standard_normal((samples, family.model.p))
+    disturbance = ambient(family.doubt, np.arange(samples), family.pace.fastest)
+    wanted = np.full(m, min(wish.amplitude, *((limits.high - limits.low) / 2)))
+    nothing, wide = np.zeros((0, m)), SIGMAS * family.band.noise
+    for share in [0.5**k for k in range(STEPS)] + [0.0]:
+        extremes, limited = closed_loop(
+            family.plants,
+            loop,
+            share * wanted * played,
+            noise,
+            doubt=family.doubt,
+            disturbance=disturbance,
+            stop=Extremes(limits.y_high - wide, limits.y_low + wide) if share else None,
+        )
+        extremes = Extremes(extremes.highest + wide, extremes.lowest - wide)
+        if share and within(extremes, limits):
+            return Dither(share * wanted * played, "", extremes, share * wanted, limited)
+    if within(extremes, limits):
+        reason = f"a dither of {wanted.max() * 0.5 ** (STEPS - 1):.2g} percent already leaves the limits"
+        return Dither(nothing, reason, extremes, 0.0 * wanted, limited)
+    o = int(np.maximum(extremes.highest - limits.y_high, limits.y_low - extremes.lowest).argmax())
+    low, high = (np.clip(side[o], -1e4, 1e4) for side in (extremes.lowest, extremes.highest))
+    reason = (
+        f"over the family the controller itself lets {family.names.outputs[o]} go from {low:.0f} to "
+        f"{high:.0f} degC, and its limits are {limits.y_low[o]:g} and {limits.y_high[o]:g}"
+    )
+    return Dither(nothing, reason, extremes, 0.0 * wanted, limited)

@@ -1,0 +1,97 @@
+"""What the stages before left for tuning and judging: read once, checked, and made into the problem that
+contestants are designed from."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pipeline.store import artifacts
+from pipeline.temperature import kernel, plant, window
+from pipeline.temperature.governor import Limits
+from pipeline.temperature.printer_pid import HeaterPid
+from pipeline.temperature.workflow import contestants
+from pipeline.temperature.workflow.settings import Plant as Machine
+from pipeline.temperature.workflow.settings import Tracking
+
+
+class Learned(NamedTuple):
+    """What the stages before left: the identified plant, the window model, the kernel (None where the record
+    did not determine it), the plant's spread, and the printer's own PIDs (none where no recording tells
+    them)."""
+
+    model: plant.Plant
+    window: window.Window
+    kernel: kernel.Regression | None
+    spread: list[plant.Plant]
+    printer_pid: tuple[HeaterPid, ...] = ()
+
+
+def read_learned(
+    model_path: str, spread_path: str, learned_folder: str | Path, printer_pid_path: str, machine: Machine
+) -> Learned:
+    """What the stages before wrote. `learned_folder` has a kernel only where the record determines one.
+
+    Raises ValueError for a file of another machine than `machine`, as an earlier run leaves it."""
+    window_path, kernel_path = (
+        Path(learned_folder) / "window.parquet",
+        Path(learned_folder) / "kernel.parquet",
+    )
+    m, p = len(machine.inputs), len(machine.outputs)
+    plants = {"D": (None, p, m)}
+    return Learned(
+        plant.strictly_proper(
+            plant.restored(artifacts.read_arrays(model_path, "plant", 1, shapes=plants))[0]
+        ),
+        window.restored(
+            artifacts.read_arrays(window_path, "window", 1, shapes={"Theta": (p, None), "covariance": (p, p)})
+        ),
+        kernel.restored(artifacts.read_arrays(kernel_path, "kernel", 1))
+        if artifacts.exists(kernel_path)
+        else None,
+        [
+            plant.strictly_proper(one)
+            for one in plant.restored(artifacts.read_arrays(spread_path, "spread", 1, shapes=plants))
+        ],
+        _heater_pids(artifacts.read_json(printer_pid_path).get("heaters", []), machine),
+    )
+
+
+def _heater_pids(pids: list[dict[str, Any]], machine: Machine) -> tuple[HeaterPid, ...]:
+    """Those of heaters whose duty is an input of the machine and whose temperature an output."""
+    inputs, outputs = [i.name for i in machine.inputs], [o.name for o in machine.outputs]
+    return tuple(
+        HeaterPid(
+            inputs.index(pid["input"]),
+            outputs.index(pid["output"]),
+            *(pid[key] for key in ("Kp", "Ki", "Kd", "most_percent", "smooth_s")),
+        )
+        for pid in pids
+        if pid["input"] in inputs and pid["output"] in outputs
+    )
+
+
+def problem(
+    learned: Learned,
+    tracking: Tracking,
+    limits: Limits,
+    truth: plant.Plant | None,
+    noise: np.ndarray,
+    *,
+    horizon: int,
+) -> contestants.Problem:
+    """What contestants are designed from."""
+    return contestants.Problem(
+        plant=learned.model,
+        family=[learned.model, *learned.spread],
+        window=learned.window,
+        kernel=learned.kernel,
+        truth=truth,
+        limits=limits,
+        gamma=tracking.gamma,
+        integral=tracking.integral,
+        exact_tau=tracking.observer_tau,
+        horizon=horizon,
+        noise=noise,
+        printer_pid=learned.printer_pid,
+    )
