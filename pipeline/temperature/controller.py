@@ -330,10 +330,11 @@ class RunningController:
         u, y, r = (np.asarray(part, float)[None] for part in (u, y, r))
         self._state = watched(self.controller, self._state, u, y, r)
 
-    def hand_over(self, y: np.ndarray) -> None:
-        """From manual to the law without a bump, at outputs y (p,). Raises ValueError before any watch."""
+    def hand_over(self, y: np.ndarray, at: np.ndarray | None = None) -> None:
+        """From manual to the law without a bump, at outputs y (p,) measured now, where the machine stands at
+        `at` (p,), by itself y. Raises ValueError before any watch."""
         y = np.asarray(y, float)
-        here = self._aimed(constant(y))[1]
+        here = self._aimed(constant(y if at is None else at))[1]
         self._state = handed_over(self.controller, self._remembers(y), y[None], [here])
 
     def step(self, y: np.ndarray, r: np.ndarray | Reference, t: int) -> np.ndarray:
