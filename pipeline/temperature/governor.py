@@ -55,8 +55,8 @@ class Governor(NamedTuple):
     """A family of f plants with their observers, and the rows by which they look ahead; `governor` makes it.
 
     A member remembers s = [x, w, xi, v] of size q = 2 (n + p). x is its state at its strongest and w (p) in
-    °C a step a drift that it cannot explain, so that steady disagreement vanishes (offset-free prediction); xi
-    and v are by how much less x and w would be at its weakest. Before y is measured s forecasts
+    °C a step a drift that it cannot explain, so that steady disagreement vanishes (offset-free prediction);
+    xi and v are by how much less x and w would be at its weakest. Before y is measured s forecasts
     [C x + d, C xi]:
 
         s <- s + [e, clip(e + lambda C xi), C xi, clip(C xi)] correct,   s(t+1) = s move + u push + rest
@@ -103,7 +103,7 @@ SWEEPS = 8
 # percent by which rows are equal, or missed: one case by itself takes the same steps as among many
 EXACT = 1e-9
 # share of what the innovations told that is forgotten a step, and of the drift
-FORGETS, LEAK = 0.005, 0.002
+FORGETS, LEAK = 0.005, 1e-4
 # squares of innovations beyond those of the best member from which a member does not count
 CONTRADICTED = 4.0
 # an input that moves an output by less than this share of the strongest one is not held back for it
@@ -317,12 +317,12 @@ def governed(
 
 def _walls(family: Governor, now: np.ndarray, y_star: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Floor and cap (f, s, p) in °C of outputs forecast `now` (f, s, p): low and high; and `overshoot` beyond
-    the target, or where an output is now that is there already. What is up to twice as far too hot goes back,
-    so that small errors of the forecast do not add up."""
-    above = y_star + family.overshoot
+    the target, or where an output is now that is further off. What is up to twice as far off goes back, so
+    that small errors of the forecast do not add up."""
+    floor, cap = y_star - family.overshoot, y_star + family.overshoot
     return (
-        np.maximum(family.low, np.minimum(now, y_star - family.overshoot)),
-        np.minimum(family.high, np.where(now > above + family.overshoot, now, above)),
+        np.maximum(family.low, np.where(now < floor - family.overshoot, now, floor)),
+        np.minimum(family.high, np.where(now > cap + family.overshoot, now, cap)),
     )
 
 
