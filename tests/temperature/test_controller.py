@@ -244,7 +244,7 @@ def every_kind() -> panel.Questions:
 
 @pytest.mark.parametrize(
     "name, count, governed, limits",
-    [("lqg", 100, True, SLOW), ("varx", 50, True, LIMITS), ("pi", 50, False, SLOW)],
+    [("lqg", 50, True, SLOW), ("varx", 50, True, LIMITS), ("pi", 100, False, SLOW)],
 )
 def test_the_object_asks_for_what_the_panel_judged(name: str, count: int, governed: bool, limits: Limits):
     """200 cases in all, of every kind."""
