@@ -375,7 +375,7 @@ def _decided(
         "best_reason": {
             "passes": able,
             "leading": comparison.chosen(costs, block, dict.fromkeys(entrants, True), seed=seed).best,
-            "nearest": choice.last,
+            "nearest": choice.nearest,
             "improvement_percent": choice.against.improvement_percent if choice.against else None,
             "p": choice.against.p if choice.against else None,
         },
