@@ -176,9 +176,9 @@ def test_of_recordings_a_pass_is_ready_for_a_supervised_trial_and_nothing_more()
             "overshoots by 5.3 °C at the 90 % quantile of all cases; the rule allows 5.0 °C.",
         ),
         (
-            {"margins": {"disk": {"median": 0.6, "worst": 0.3}, "delay_s": {"median": 3.0, "worst": 2.0}}},
+            {"margins": {"disk": {"median": 0.3, "worst": 0.2}, "delay_s": {"median": 3.0, "worst": 2.0}}},
             "disk margin",
-            "has a disk margin of 0.30 on its worst plant; the rule asks for 0.40.",
+            "has a disk margin of 0.30 on the median plant; the rule asks for 0.40.",
         ),
         ({"stable": {"count": 3, "of": 6}}, "disk margin", "is unstable on 3 of 6 plants."),
         (
@@ -337,7 +337,7 @@ def random_comparison(rng):
         figures["cost"] = random_figure(rng, float(rng.uniform(1, 4)))
         figures["gap"] |= {"median_percent": float(10 ** rng.uniform(-3, 24)), "q90_percent": None}
         figures["crossings"]["cases"] = int(rng.choice([0, 0, 0, 3]))
-        figures["margins"]["disk"]["worst"] = float(rng.choice([0.1, 0.6]))
+        figures["margins"]["disk"]["median"] = float(rng.choice([0.1, 0.6]))
         figures["stable"]["count"] = int(rng.choice([made.PLANTS, made.PLANTS, 3]))
     names = [name for name in compared["order"] if name in compared["contestants"]]
     compared["best"] = rng.choice([*names, None])

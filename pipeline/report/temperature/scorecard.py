@@ -189,9 +189,9 @@ def _band(sources: Sources, question: Question, name: str, figure: Figure, place
 def _beside(question: Question, own: Any, places: int) -> list[str]:
     """Median, and the worst case with its plant."""
     if question.key in ("disk", "delay_s"):
-        median = entry(own, "margins", question.key, "median")
+        worst = entry(own, "margins", question.key, "worst")
         plain = question._replace(unit="")
-        return [] if median is None else [f"median {worded(plain, finite(median), places)}"]
+        return [] if worst is None else [f"worst {worded(plain, finite(worst), places)}"]
     figures = entry(own, question.key)
     if not isinstance(figures, Mapping):
         return []
