@@ -98,9 +98,7 @@ def member(model: Plant) -> Member:
         summed = summed + power
         power = model.A @ power
         free[h], drift[h] = model.C @ power, model.C @ summed
-    return Member(
-        model, free.reshape(-1, n), drift.reshape(-1, n), response.reshape(AHEAD * p, AHEAD * m)
-    )
+    return Member(model, free.reshape(-1, n), drift.reshape(-1, n), response.reshape(AHEAD * p, AHEAD * m))
 
 
 class Predictive:
@@ -125,7 +123,7 @@ class Predictive:
         )
         aim = np.tile(held(self.members[0].model, rests[0]), AHEAD)
         f = 2 * (self.rows.T @ (free - np.tile(REFERENCE, len(free) // len(REFERENCE))) - 1e-3 * aim)
-        most = np.maximum(np.tile(REFERENCE + ABOVE, len(free) // len(REFERENCE)) - free, 0.0)
+        most = np.maximum(np.tile(REFERENCE + ABOVE, len(free) // len(REFERENCE)) - free, 0.05)
         upper = np.r_[np.full(inputs, 100.0), most]
         lower = np.r_[np.zeros(inputs), np.full(len(most), -1e30)]
         u, _, flag, _ = daqp.solve(self.H, f, self.rows, upper, lower, self.sense)
@@ -217,7 +215,9 @@ def main() -> None:
         settling = figures["settling_s"]
         figures["within_bar"] = {key: bool((settling[key] or np.inf) <= bar[key]) for key in bar}
         print(name, figures)
-    RESULTS.write_text(json.dumps({"solver": "daqp 0.7.2", "mpc": results, "governed": laws}, indent=1) + "\n")
+    RESULTS.write_text(
+        json.dumps({"solver": "daqp 0.7.2", "mpc": results, "governed": laws}, indent=1) + "\n"
+    )
 
 
 if __name__ == "__main__":

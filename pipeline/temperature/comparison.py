@@ -12,8 +12,8 @@ LEVEL = 0.05
 
 
 class Choice(NamedTuple):
-    """`best` is None where nobody passes. `last` is the contestant that came nearest to replacing it, with the
-    test of that replacement: the best one as champion, the other as challenger."""
+    """`best` is None where nobody passes. `last` is the contestant that came nearest to replacing it, with
+    the test of that replacement: the best one as champion, the other as challenger."""
 
     best: str | None
     last: str | None
@@ -83,8 +83,8 @@ def deciding_plant(a: np.ndarray, b: np.ndarray, plant: np.ndarray) -> int:
 
 
 class Band(NamedTuple):
-    """Median and 90 % quantile over all cases, the 90 % band of that quantile with plants resampled as blocks,
-    the worst, and the case that has it; inf where a run never settles."""
+    """Median and 90 % quantile over all cases, the 90 % band of that quantile with plants resampled as
+    blocks, the worst, and the case that has it; inf where a run never settles."""
 
     median: float
     q90: float

@@ -433,7 +433,7 @@ def design(family: Family, wish: Wish, limits: Limits, rng: np.random.Generator)
         still = np.zeros(family.model.m)
         return Experiment(nothing, reason, Extremes(unknown, unknown), still, still, unknown, None)
     samples, speed = wish.samples, family.pace
-    rise = ramp_samples(limits, speed, samples)
+    rise = ramp_samples(limits, samples)
     ramp = np.clip((1.0 + np.arange(samples)) / rise, 0.0, 1.0)
     step = limits.rate / max(wish.amplitude, limits.rate / 2)
     played = shaped(signal(rng, samples, wish, speed), rise, step)
@@ -470,11 +470,10 @@ def _nothing_left(family: Family, limits: Limits) -> str:
     )
 
 
-def ramp_samples(limits: Limits, speed: Pace, samples: int) -> int:
-    """Samples of the ramp: the whole range within the rate, and the fastest time constant; a quarter of the
-    experiment at most."""
+def ramp_samples(limits: Limits, samples: int) -> int:
+    """Samples of the ramp: the widest range of an input within the rate, half of the experiment at most."""
     needed = np.ceil((limits.high - limits.low).max() / limits.rate)
-    return int(max(min(max(needed, speed.fastest), samples / 4), min(needed, samples / 2), 1))
+    return int(max(min(needed, samples / 2), 1))
 
 
 def _designed(
@@ -532,7 +531,8 @@ def _left(family: Family, reach: Answers, centre: np.ndarray, limits: Limits) ->
     hot = above.max() >= below.max()
     o = int((above if hot else below).argmax())
     reached, limit = (extremes.highest[o], limits.y_high[o]) if hot else (extremes.lowest[o], limits.y_low[o])
-    slow = family.pace.slowest > HALF * reach.at[-1]
+    radius = np.abs(np.linalg.eigvals(family.model.A)).max()
+    slow = -np.log(max(radius, np.finfo(float).tiny)) * reach.at[-1] < 1.0
     why = (
         "the machine hardly settles by itself, so that small errors grow"
         if slow
@@ -556,7 +556,7 @@ def dither(family: Family, law: Law, wish: Wish, limits: Limits, rng: np.random.
     nearest that the inputs can hold; its amplitudes are halved until the forecast around the family stays
     within the limits."""
     m, samples = family.model.m, wish.samples
-    rise = ramp_samples(limits, family.pace, samples)
+    rise = ramp_samples(limits, samples)
     step = limits.rate / max(wish.amplitude, limits.rate / 2)
     played = shaped(signal(rng, samples, wish, family.pace), rise, step)
     target = feasible_target(family.model, wish.reference, limits.low, limits.high)

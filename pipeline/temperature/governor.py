@@ -1,5 +1,5 @@
-"""The governor: what keeps the predicted worst output of a family of plants within the limits of the outputs,
-whatever the law asks for.
+"""The governor: what keeps the predicted worst output of a family of plants within the limits of the
+outputs, whatever the law asks for.
 
 A braking distance in each output: the command moves as little as it must, so that from the next step on every
 member of the family that the record has not contradicted could still be stopped below `high` by its lowest
@@ -111,13 +111,14 @@ def governor(
     strength: Strength,
     *,
     tau: float = 0.2,
-    drift: float = 0.08,
+    drift: float = 0.06,
 ) -> Governor:
     """The governor of a family of plants of one order (their feed-through made a delay), for inputs of any
     `strength` within its range.
 
-    Innovations are doubted by the sensors' noise, a tenth of a degree at least. The observer takes process noise to come in by the inputs, sensors to be tau °C^2 per percent^2 noisier
-    than that, and the drift w to wander by `drift` of the sensors' noise a step.
+    Innovations are doubted by the sensors' noise, a tenth of a degree at least. The observer takes process
+    noise to come in by the inputs, sensors to be tau °C^2 per percent^2 noisier than that, and the drift w to
+    wander a step by `drift` of what a percent of every input does at most.
     """
     at, unsure = instants(family), np.maximum(outputs.margin, 0.1)
     members = [
@@ -291,7 +292,8 @@ def governed(
     told = evidence(family, memory)
     ahead = np.matmul(memory[:, :, :q], family.ahead)
     free, lacks = (
-        part.reshape(*part.shape[:2], y_star.shape[1], -1) for part in (ahead[:, :, :rows], ahead[:, :, rows:])
+        part.reshape(*part.shape[:2], y_star.shape[1], -1)
+        for part in (ahead[:, :, :rows], ahead[:, :, rows:])
     )
     now = free[..., 0] - told.middle * lacks[..., 0] + family.offset[:, None]
     floor, cap = _walls(family, now, y_star)
@@ -309,11 +311,13 @@ def governed(
 
 
 def _walls(family: Governor, now: np.ndarray, y_star: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Floor and cap (f, s, p) in °C of outputs forecast `now` (f, s, p): low and high, and `overshoot` beyond
-    the target for an output that is not there yet."""
+    """Floor and cap (f, s, p) in °C of outputs forecast `now` (f, s, p): low and high; and `overshoot` beyond
+    the target, or where an output is now that is there already. What is up to twice as far too hot goes back,
+    so that small errors of the forecast do not add up."""
+    above = y_star + family.overshoot
     return (
         np.maximum(family.low, np.minimum(now, y_star - family.overshoot)),
-        np.minimum(family.high, np.maximum(now, y_star + family.overshoot)),
+        np.minimum(family.high, np.where(now > above + family.overshoot, now, above)),
     )
 
 

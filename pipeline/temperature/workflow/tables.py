@@ -10,8 +10,11 @@ from pipeline.store.tables import BOOL, COUNT, FLOAT, INDEX, NONE, TEXT, Column,
 
 
 class _Signal(Protocol):
-    name: str
-    unit: str
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def unit(self) -> str: ...
 
 
 def record(inputs: Sequence[_Signal], outputs: Sequence[_Signal]) -> Schema:
