@@ -253,7 +253,7 @@ def test_the_pair_is_decided_in_a_sentence_of_its_own():
     assert "the learned kernel costs 6.2 % less than subspace + LQG" in pair_sentence(stages).text
     assert "interval 3.1–9.4 %" in pair_sentence(stages).text
     pair |= {"winner": None, "p": 0.4, "low": -3.0, "high": 4.0}
-    assert "no difference beyond chance between subspace + LQG and the learned kernel" in (
+    assert "no difference at the 5 % level between subspace + LQG and the learned kernel" in (
         pair_sentence(stages).text
     )
 
@@ -295,7 +295,7 @@ def test_without_any_figures_the_verdict_is_open_and_says_what_to_run():
 
 def test_the_readme_shows_every_contestant_with_its_quantiles_and_the_verdict_of_the_pages():
     stages = metrics()
-    text = readme.block(stages, RULES, judge(stages).metrics())
+    text = readme.block(stages, RULES, judge(stages))
     assert "**Rehearsal passed: subspace + LQG.** Every rule measured so far passed on 6 simulated" in text
     assert "| settled error, worst zone, at most 0.5 °C | settling, at most 60 s |" in text
     assert "| subspace + LQG (model-based) | 0.10 °C | 6 s | 0.5 °C | 1.0 % | 2.00 | 0 |" in text

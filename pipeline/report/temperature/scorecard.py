@@ -321,7 +321,7 @@ def _listed(value: Any) -> str:
     if isinstance(value, list) and len(value) > 1 and len(set(map(str, value))) == 1:
         return f"{_listed(value[0])} each"
     values = value if isinstance(value, list) else [value]
-    return ", ".join(short(float(v), 3) if isinstance(v, int | float) else str(v) for v in values)
+    return ", ".join(short(v, 3) if isinstance(v, float) else str(v) for v in values)
 
 
 def declared_panel(sources: Sources) -> list[tuple[str, str]]:
