@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from pipeline.report.shared.digits import with_unit
+from pipeline.report.shared.digits import short, with_unit
 from pipeline.report.shared.verdict import (
     FAILED,
     FAILED_FIRST,
@@ -394,7 +394,7 @@ def _ahead(metrics: Metrics, winner: str) -> str:
         return ""
     nearest = in_a_sentence(entry(reason, "nearest"))
     if isinstance(p, int | float) and p < 0.05 and percent > 0:
-        return f", {short(percent, 2)}{THIN}% cheaper than {nearest}"
+        return f", {short(percent, 2)}\u00a0% cheaper than {nearest}"
     return f", the simplest; {nearest} is cheaper by no more than chance" if percent < 0 else f"; {nearest} is next"
 
 
