@@ -12,8 +12,8 @@ LEVEL = 0.05
 
 
 class Choice(NamedTuple):
-    """`best` is None where nobody passes; `nearest` is the cheapest of the others that pass, None where there is
-    none, and `against` the test of the best one against it."""
+    """`best` is None where nobody passes; `nearest` is the cheapest of the others that pass, None where
+    there is none, and `against` the test of the best one against it."""
 
     best: str | None
     nearest: str | None

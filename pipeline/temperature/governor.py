@@ -55,8 +55,8 @@ class Governor(NamedTuple):
     """A family of f plants with their observers, and the rows by which they look ahead; `governor` makes it.
 
     A member remembers s = [x, w, xi, v] of size q = 2 (n + p). x is its state at its strongest and w (p) in
-    °C a step a drift that it cannot explain, so that steady disagreement vanishes (offset-free prediction); xi
-    and v are by how much less x and w would be at its weakest. Before y is measured s forecasts
+    °C a step a drift that it cannot explain, so that steady disagreement vanishes (offset-free prediction);
+    xi and v are by how much less x and w would be at its weakest. Before y is measured s forecasts
     [C x + d, C xi]:
 
         s <- s + [e, clip(e + lambda C xi), C xi, clip(C xi)] correct,   s(t+1) = s move + u push + rest

@@ -387,7 +387,7 @@ def best_sentence(metrics: Metrics, held: Mapping[str, Standing], winner: str | 
 
 
 def _ahead(metrics: Metrics, winner: str) -> str:
-    """By how much the winner is cheaper than the cheapest of the others that pass, or that chance may be it."""
+    """By how much the winner is cheaper than the cheapest other that passes, or that chance may be it."""
     reason = entry(comparison(metrics), "best_reason")
     percent, p = entry(reason, "improvement_percent"), entry(reason, "p")
     if entry(comparison(metrics), "best") != winner or not isinstance(percent, int | float):
@@ -395,7 +395,8 @@ def _ahead(metrics: Metrics, winner: str) -> str:
     nearest = in_a_sentence(entry(reason, "nearest"))
     if isinstance(p, int | float) and p < 0.05 and percent > 0:
         return f", {short(percent, 2)}\u00a0% cheaper than {nearest}"
-    return f", the simplest; {nearest} is cheaper by no more than chance" if percent < 0 else f"; {nearest} is next"
+    chance = f", the simplest; {nearest} is cheaper by no more than chance"
+    return chance if percent < 0 else f"; {nearest} is next"
 
 
 def _listed(names: Sequence[str]) -> str:

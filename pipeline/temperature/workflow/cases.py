@@ -28,8 +28,8 @@ class Rehearsal(NamedTuple):
 
 class Setting(NamedTuple):
     """What all contestants share, tuned and judged: the rehearsal, the identified plant with all inputs a
-    sample late, limits of inputs and outputs (low, high (p,) in °C), the governor, the integrator's limit in °C, the settled window in steps,
-    what the cost counts as one, the discount, and the sample time."""
+    sample late, limits of inputs and outputs (low, high (p,) in °C), the governor, the integrator's limit in
+    °C, the settled window in steps, what the cost counts as one, the discount, and the sample time."""
 
     rehearsal: Rehearsal
     late: plant.Plant
