@@ -109,8 +109,8 @@ def _cost(
     margin = scorecard.margins([setting.late], design.law, grid=80)[0]
     if not (margin.disk >= settings.least_disk_margin and margin.delay_s >= settings.least_delay_margin_s):
         raise ValueError(
-            f"on the identified plant, its inputs a sample late, the disk margin is {margin.disk:.2f} and the "
-            f"delay margin {margin.delay_s:.2f} s, where {settings.least_disk_margin:g} and "
+            f"on the identified plant, its inputs a sample late, the disk margin is {margin.disk:.2f} and "
+            f"the delay margin {margin.delay_s:.2f} s, where {settings.least_disk_margin:g} and "
             f"{settings.least_delay_margin_s:g} s are the least"
         )
     cases, (low, high) = setting.rehearsal.training, setting.output_limits
