@@ -13,7 +13,7 @@ from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, Verdict
 from pipeline.report.temperature.judgement import trust_first
 from pipeline.store import artifacts
 from stages.report import main
-from tests.report.test_pages import INDEX, TEMPERATURE, Page, change, figures
+from tests.report.test_pages import IDENTIFICATION, INDEX, TEMPERATURE, Page, change, figures
 
 OF_THE_STUDY = (
     "As published",
@@ -98,6 +98,23 @@ def test_the_designed_probing_is_the_next_experiment_and_not_the_record(recorded
     text = Page(TEMPERATURE).text
     assert "What the next experiment would excite" in text and "not what was recorded" in text
     assert "what was applied is what is recorded" not in text
+
+
+def test_the_next_experiment_stands_beside_its_limits_or_says_why_there_is_none(recorded):
+    main()
+    text = Page(IDENTIFICATION).text
+    assert "zone_1 100 88.0 to 118 0 to 140" in text and "stay beside it" in text
+    assert "Nothing is written to add to a running controller: PI needs an input" in text
+    assert "What the next experiment would excite" in Page(TEMPERATURE).text
+    figures = artifacts.read_metrics("generate_probing")
+    reason = "without its controller zone_1 may reach 266 degC within 400 s"
+    figures["next_experiment"] = {"written": False, "reason": reason}
+    artifacts.write_metrics("generate_probing", figures)
+    main()
+    text = Page(IDENTIFICATION).text
+    assert "No experiment is written: without its controller zone_1 may reach 266 °C within 400 s." in text
+    assert "stay beside it" not in text
+    assert f"Not written: {reason}" in Page(TEMPERATURE).text
 
 
 def test_a_run_is_not_compared_with_the_accepted_run_of_another_machine(recorded, monkeypatch):

@@ -189,7 +189,8 @@ class Row(NamedTuple):
 def _row(run: Revision, asked: Sequence[Question]) -> Row:
     cells = []
     for question in asked:
-        names = (run.winner, "subspace_lqg", "window", "deposition")
+        # margins of earlier runs have today's keys, but are medians on the nominal plant
+        names = ("window",) if question in OLD else (run.winner, "subspace_lqg", "deposition")
         figure = next(filter(None, (_figure(run, name, question.key) for name in names)), None)
         if figure is None:
             cells.append(Cell("not measured"))

@@ -44,9 +44,12 @@ def pair_sentence(metrics: Metrics) -> PairSentence:
     chance = "" if p is None else f"p {'< 0.0001' if p < 1e-4 else f'= {number(p, 4 if p < 0.01 else 2)}'}"
     better, worse = (in_a_sentence(n) for n in ((a, b) if winner != b else (b, a)))
     if winner not in (a, b):
-        interval = _interval(pair, sign=1)
-        text = f"no difference beyond chance between {better} and {worse} on the same {plants} plants"
-        return PairSentence(f"{head} {text}{_bracket(interval, chance)}.", None, instead)
+        # a 90 % interval may leave out zero where p is between 0.05 and 0.1: the level is said
+        saved = abs(finite(entry(pair, "difference")))
+        interval = _interval(pair, sign=1) if saved <= 90 else ""
+        saves = f"the cheaper one saves {number(saved, 1)} %" if interval else ""
+        text = f"no difference at the 5 % level between {better} and {worse} on the same {plants} plants"
+        return PairSentence(f"{head} {text}{_bracket(saves, interval, chance)}.", None, instead)
     sign = 1 if finite(entry(pair, "difference")) >= 0 else -1
     gain = abs(finite(entry(pair, "difference")))
     amount = "far less" if not gain <= 90 else f"{number(gain, 0 if gain >= 10 else 1)} % less"

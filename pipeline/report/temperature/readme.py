@@ -1,11 +1,9 @@
-"""The temperature loop's figures as the README has them: metrics and verdict of the last run -> Markdown."""
+"""The temperature loop's figures as the README has them: metrics and verdict of a run -> Markdown."""
 
 import math
-from collections.abc import Mapping
-from typing import Any
 
-from pipeline.report.shared.verdict import Figure, Missing, Question, ReportRules
-from pipeline.report.temperature.answers import Metrics, comparison, entry, judged, of_contestant, refused
+from pipeline.report.shared.verdict import Figure, Missing, Question, ReportRules, Verdict
+from pipeline.report.temperature.answers import Metrics, comparison, judged, of_contestant, refused
 from pipeline.report.temperature.contestants import heading, kind
 from pipeline.report.temperature.pairs import deciding_sentence, pair_sentence
 from pipeline.report.temperature.scorecard import UNRULED, setting
@@ -16,8 +14,8 @@ SHOWN = ("settled_error", "settling", "overshoot", "at_limits", "cost", "crossin
 BEGIN, END = "<!-- temperature: written by ./run python -m tests.test_docs -->", "<!-- /temperature -->"
 
 
-def block(metrics: Metrics, rules: ReportRules, verdict: Mapping[str, Any]) -> str:
-    """What stands between BEGIN and END; `verdict` is that of reports/metrics/report.json."""
+def block(metrics: Metrics, rules: ReportRules, verdict: Verdict) -> str:
+    """What stands between BEGIN and END."""
     compared = comparison(metrics)
     names = judged(metrics)
     if not names:
@@ -25,9 +23,9 @@ def block(metrics: Metrics, rules: ReportRules, verdict: Mapping[str, Any]) -> s
     asked = {question.key: question for question in (*questions(rules, compared), *UNRULED)}
     shown = [asked[key] for key in SHOWN]
     lines = [
-        f"**{verdict['decision']}** {verdict['lead']} {verdict['reason']}",
+        f"**{verdict.decision}** {verdict.lead} {verdict.reason}",
         "",
-        f"{pair_sentence(metrics).text} {deciding_sentence(metrics, verdict.get('winner'))}".strip(),
+        f"{pair_sentence(metrics).text} {deciding_sentence(metrics, verdict.winner)}".strip(),
         "",
         f"As deployed on {setting(compared)}; 90 % quantile of all cases:",
         "",
@@ -60,12 +58,6 @@ def _cell(question: Question, figure: Figure | Missing) -> str:
 def _plain(text: str) -> str:
     """Spaces that a text file can be searched by."""
     return text.replace("\u202f", " ").replace("\u00a0", " ")
-
-
-def verdict_of(metrics: Metrics) -> Mapping[str, Any]:
-    """The verdict that the pages kept."""
-    kept = entry(metrics.get("report"), "verdict")
-    return kept if isinstance(kept, Mapping) else {"decision": "", "lead": "", "reason": ""}
 
 
 def rewritten(readme: str, text: str) -> str:

@@ -189,9 +189,9 @@ def _band(sources: Sources, question: Question, name: str, figure: Figure, place
 def _beside(question: Question, own: Any, places: int) -> list[str]:
     """Median, and the worst case with its plant."""
     if question.key in ("disk", "delay_s"):
-        median = entry(own, "margins", question.key, "median")
+        worst = entry(own, "margins", question.key, "worst")
         plain = question._replace(unit="")
-        return [] if median is None else [f"median {worded(plain, finite(median), places)}"]
+        return [] if worst is None else [f"worst {worded(plain, finite(worst), places)}"]
     figures = entry(own, question.key)
     if not isinstance(figures, Mapping):
         return []
@@ -321,7 +321,7 @@ def _listed(value: Any) -> str:
     if isinstance(value, list) and len(value) > 1 and len(set(map(str, value))) == 1:
         return f"{_listed(value[0])} each"
     values = value if isinstance(value, list) else [value]
-    return ", ".join(short(float(v), 3) if isinstance(v, int | float) else str(v) for v in values)
+    return ", ".join(short(v, 3) if isinstance(v, float) else str(v) for v in values)
 
 
 def declared_panel(sources: Sources) -> list[tuple[str, str]]:
