@@ -178,7 +178,7 @@ def _state(question: Question, figure: Figure | Missing) -> str:
     return PASSED if isinstance(figure, Missing) and figure.state == UNJUDGED else state(question, figure)
 
 
-SUB = {"at_limits": "clipped commands", "disk": "worst plant", "delay_s": "worst plant"}
+SUB = {"at_limits": "clipped commands", "disk": "median plant", "delay_s": "median plant"}
 
 
 def _cell(question: Question, name: str, figure: Figure | Missing, places: int) -> Cell:

@@ -94,12 +94,12 @@ def unstable(figures: Any) -> tuple[int, int]:
 
 
 def _margin(figures: Any, key: str) -> Figure | None:
-    """A margin on the worst plant; none of an unstable loop."""
+    """A margin on the median plant; none where any plant is not held stable."""
     margin = entry(figures, "margins", key)
-    if not isinstance(margin, Mapping) or "worst" not in margin:
+    if not isinstance(margin, Mapping) or "median" not in margin:
         return None
-    worst = 0.0 if unstable(figures)[0] else finite(margin["worst"])
-    return Figure(worst, worst, worst)
+    value = 0.0 if unstable(figures)[0] else finite(margin["median"])
+    return Figure(value, value, value)
 
 
 def _without_margin(figures: Mapping[str, Any], gap: Missing) -> Missing:

@@ -95,7 +95,7 @@ def _caption(sources: Sources) -> str:
     compared = comparison(sources.metrics)
     date = relearned_date(sources)
     bands = (
-        f"its band is over fresh relearnings of {date}"
+        f"its band is the range over {entry(sources.relearned, 'relearnings')} fresh relearnings of {date}"
         if date
         else "its band is of this one learned controller, plants resampled"
     )
@@ -124,8 +124,7 @@ def relearned_date(sources: Sources) -> str:
     """The date of the relearnings, where they are of this machine; else ""."""
     if sources.recorded or not isinstance(sources.relearned, dict):
         return ""
-    outputs = sources.relearned.get("outputs")
-    if outputs is not None and outputs != [output.name for output in sources.declared.machine.outputs]:
+    if entry(sources.relearned, "machine", "outputs") != [o.name for o in sources.declared.machine.outputs]:
         return ""
     return str(sources.relearned.get("date") or "")
 
@@ -189,9 +188,9 @@ def _band(sources: Sources, question: Question, name: str, figure: Figure, place
 def _beside(question: Question, own: Any, places: int) -> list[str]:
     """Median, and the worst case with its plant."""
     if question.key in ("disk", "delay_s"):
-        median = entry(own, "margins", question.key, "median")
+        worst = entry(own, "margins", question.key, "worst")
         plain = question._replace(unit="")
-        return [] if median is None else [f"median {worded(plain, finite(median), places)}"]
+        return ["median plant", *([] if worst is None else [f"worst {worded(plain, finite(worst), places)}"])]
     figures = entry(own, question.key)
     if not isinstance(figures, Mapping):
         return []

@@ -61,8 +61,8 @@ def reason(rule: Rule, name: str = "") -> str:
         "settling": f"{who} needs {value} to settle {quantile}; the rule allows {limit}.",
         "overshoot": f"{who} overshoots by {value} {quantile}; the rule allows {limit}.",
         "at_limits": f"{who} is at a limit {value} of the time {quantile}; the rule allows {limit}.",
-        "disk": f"{who} has a disk margin of {value} on its worst plant; the rule asks for {limit}.",
-        "delay_s": f"{who} bears {value} of extra delay on its worst plant; the rule asks for {limit}.",
+        "disk": f"{who} has a disk margin of {value} on the median plant; the rule asks for {limit}.",
+        "delay_s": f"{who} bears {value} of extra delay on the median plant; the rule asks for {limit}.",
         "crossings": f"{who} takes an output beyond its low or high: {value} {figure.note}.",
     }[question.key]
     if lost:
