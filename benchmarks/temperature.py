@@ -4,8 +4,8 @@ seeds, on other plants, and with less or more prior knowledge of how far plants 
 `./run python -m benchmarks.temperature` relearns everything from fresh records (probing, identification,
 kernel, tuning of every contestant, judging; each with seeds of its own, the panel's plants too), tunes five
 times on one record, and removes and adds the prior for all contestants alike. It writes
-benchmarks/results/temperature_relearned.json, from which the pages take the bands of the figures: the interval
-of the relearnings, smallest to largest, which a further one falls into with probability (n - 1) / (n + 1).
+benchmarks/results/temperature_relearned.json, from which the pages take the bands of the figures: the
+interval of the relearnings, smallest to largest, which a further one falls into with probability (n - 1) / (n + 1).
 `--relearnings 8 --jobs 2` makes fewer. `--fresh 8` only counts how many figures of 8 further relearnings the
 bands on file hold.
 """

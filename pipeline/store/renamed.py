@@ -29,6 +29,7 @@ PARAMETERS: dict[str, str] = {
     "evaluate_setpoint.pixels.segment_s": "evaluate_setpoint.pixels.segment_mean_s",
     "evaluate_setpoint.segment": "evaluate_setpoint.segment_mean_decisions",
     "evaluate_temperature.data_sets": "reproduce_study.data_sets",
+    "nightly.holdout.seeds": "nightly.holdout.seed",
     "panel.loss": "panel.extra_heat_loss_per_step",
     "train_agent.ours": "train_agent.belief_dqn",
     "train_agent.ours.filter.look": "train_agent.belief_dqn.filter.width_bias_std",
@@ -51,7 +52,11 @@ RETIRED: dict[str, str] = {
 }
 
 # (dotted key of today, old choice) -> today's choice; of parameters that are one of several words
-CHOICES: dict[tuple[str, str], str] = {("segment_library.law", "ours"): "model_inverse"}
+CHOICES: dict[tuple[str, str], str] = {
+    ("nightly.holdout.controller", "model_based"): "subspace_lqg",
+    ("nightly.holdout.controller", "window"): "varx_riccati",
+    ("segment_library.law", "ours"): "model_inverse",
+}
 
 # (table, old column) -> column; the table's version is raised with it
 COLUMNS: dict[tuple[str, str], str] = {}

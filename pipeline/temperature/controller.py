@@ -304,11 +304,11 @@ def _remembered(controller: Deployed, z, u, y, r):
 class RunningController:
     """One controller on one machine, a sample at a time.
 
-    In manual, `watch` each sample; then `hand_over` once, then `step` each sample. A reference is (p,) °C, or a
-    Reference that starts at the sample where it is first given. It is aimed at on `model` when it changes, and
-    the last AIMS of them are remembered. All else that it remembers is `saved` as arrays, from which `restore`
-    goes on bit by bit. `binding` are the inputs (index, limit in percent) because of which the reference is out
-    of reach.
+    In manual, `watch` each sample; then `hand_over` once, then `step` each sample. A reference is (p,) °C, or
+    a Reference that starts at the sample where it is first given. It is aimed at on `model` when it changes,
+    and the last AIMS of them are remembered. All else that it remembers is `saved` as arrays, from which
+    `restore` goes on bit by bit. `binding` are the inputs (index, limit in percent) because of which the
+    reference is out of reach.
     """
 
     AIMS = 64
@@ -331,14 +331,14 @@ class RunningController:
         self._state = watched(self.controller, self._state, u, y, r)
 
     def hand_over(self, y: np.ndarray) -> None:
-        """From manual to the law without a bump, at outputs y (p,). Raises ValueError before the first watch."""
+        """From manual to the law without a bump, at outputs y (p,). Raises ValueError before any watch."""
         y = np.asarray(y, float)
         here = self._aimed(constant(y))[1]
         self._state = handed_over(self.controller, self._remembers(y), y[None], [here])
 
     def step(self, y: np.ndarray, r: np.ndarray | Reference, t: int) -> np.ndarray:
-        """Inputs u (m,) to apply from outputs y (p,) measured at sample t under reference r, as batch_step has
-        them. Raises ValueError where y is not finite, or nothing was watched before."""
+        """Inputs u (m,) to apply from outputs y (p,) measured at sample t under reference r, as batch_step
+        has them. Raises ValueError where y is not finite, or nothing was watched before."""
         y = np.asarray(y, float)
         state, (feed, y_star, now) = self._remembers(y), self._target(r, t)
         controller, limits, before = self.controller, self.controller.limits, state.u[0]

@@ -384,9 +384,8 @@ def _margins(plant: Plant, law: Law, omega: np.ndarray, z: np.ndarray, K: np.nda
     disk = min(
         1 / _structured(np.linalg.inv(np.eye(L.shape[1]) + L) - np.eye(L.shape[1]) / 2).max() for L in loops
     )
-    return Margins(
-        float(disk), _delay_margin(omega, np.linalg.eigvals(loops[0])) * plant.sample_time_s, True, float(radius)
-    )
+    delay_s = _delay_margin(omega, np.linalg.eigvals(loops[0])) * plant.sample_time_s
+    return Margins(float(disk), delay_s, True, float(radius))
 
 
 def closed_loop(plant: Plant, law: Law) -> np.ndarray:

@@ -87,9 +87,8 @@ def test_a_hot_end_at_38_percent_is_never_driven_above_its_limit(heated, high, g
     family, x = heated
     tried = design(family, high)
     assert tried.written
-    # from now on each move acts with another gain, which is what is doubted
-    played = family.begin.u + gain * (tried.u - family.begin.u)
-    y = simulate(hot_end(), played, x)[1]
+    # from now on the heater has another gain, which is what is doubted
+    y = simulate(hot_end(), gain * tried.u, x)[1]
     warmed = DOUBT.ambient_degC * -np.expm1(-np.arange(len(y)) / TAU)  # by an ambient that moved at the start
     assert (y[:, 0] + warmed).max() <= high
     assert tried.extremes.lowest <= y.min() and y.max() <= tried.extremes.highest
@@ -124,11 +123,11 @@ def test_the_forecast_of_a_member_is_its_simulation_within_the_doubt(heated):
 def test_doubt_about_gains_is_exact_a_forecast_with_it_equals_the_worst_member(heated):
     family, _ = heated
     u = np.repeat([[38.0], [43.0], [33.0]], 300, axis=0)
-    still = of_model(family.begin)._replace(u=np.array([38.0]), answered=np.array([38.0]))
+    still = of_model(family.begin)
     doubt = forecast.Doubt(0.15, 0.0, 0)
     bound = forecast.forecast([hot_end()], still, u, doubt=doubt, fastest=1.0, width=np.zeros(1))
     more = forecast.forecast(
-        [hot_end()], still, 38.0 + 1.15 * (u - 38.0), doubt=doubt._replace(input_gain=0.0), fastest=1.0,
+        [hot_end()], still, 1.15 * u, doubt=doubt._replace(input_gain=0.0), fastest=1.0,
         width=np.zeros(1),
     )  # fmt: skip
     np.testing.assert_allclose(bound.highest, more.highest, rtol=1e-12)  # the same sums in another order

@@ -94,12 +94,13 @@ def unstable(figures: Any) -> tuple[int, int]:
 
 
 def _margin(figures: Any, key: str) -> Figure | None:
-    """A margin on the median plant; none where any plant is not held stable."""
+    """A margin of the median plant; none where a plant's loop is unstable. The panel's spread has gain, speed
+    and delay in it: a margin on its worst plant would ask for the same doubt twice."""
     margin = entry(figures, "margins", key)
     if not isinstance(margin, Mapping) or "median" not in margin:
         return None
-    value = 0.0 if unstable(figures)[0] else finite(margin["median"])
-    return Figure(value, value, value)
+    median = 0.0 if unstable(figures)[0] else finite(margin["median"])
+    return Figure(median, median, median)
 
 
 def _without_margin(figures: Mapping[str, Any], gap: Missing) -> Missing:

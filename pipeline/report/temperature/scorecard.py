@@ -307,7 +307,11 @@ def weights(sources: Sources) -> Weights:
     rows = [
         (
             heading(name),
-            "; ".join(f"{key} {_listed(value)}" for key, value in tuned[name].items() if key != "at_bound"),
+            "; ".join(
+                f"{key} {_listed(value)}"
+                for key, value in tuned[name].items()
+                if key != "at_bound" and value is not None
+            ),
         )
         for name in (*BY_NAME, *(name for name in tuned if name not in BY_NAME))
         if isinstance(tuned.get(name), Mapping)

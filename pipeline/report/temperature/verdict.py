@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from pipeline.report.shared.digits import with_unit
+from pipeline.report.shared.digits import short, with_unit
 from pipeline.report.shared.verdict import (
     FAILED,
     FAILED_FIRST,
@@ -284,7 +284,7 @@ def _passed(
     next_step = (
         "Next: a supervised trial, somebody at the machine throughout."
         if recorded
-        else "Next: record your own machine; nothing is claimed about a real one."
+        else "Next: record your own machine."
     )
     return Verdict(
         LOOP,
@@ -383,7 +383,20 @@ def best_sentence(metrics: Metrics, held: Mapping[str, Standing], winner: str | 
         if standing.passes and name != winner and name not in YARDSTICKS
     ]
     beside = f"; {_listed(others)} {'passes' if len(others) == 1 else 'pass'} too" if others else ""
-    return f"Best of all that pass: {in_a_sentence(winner)}{beside}."
+    return f"Best of all that pass: {in_a_sentence(winner)}{_ahead(metrics, winner)}{beside}."
+
+
+def _ahead(metrics: Metrics, winner: str) -> str:
+    """By how much the winner is cheaper than the cheapest other that passes, or that chance may be it."""
+    reason = entry(comparison(metrics), "best_reason")
+    percent, p = entry(reason, "improvement_percent"), entry(reason, "p")
+    if entry(comparison(metrics), "best") != winner or not isinstance(percent, int | float):
+        return ""
+    nearest = in_a_sentence(entry(reason, "nearest"))
+    if isinstance(p, int | float) and p < 0.05 and percent > 0:
+        return f", {short(percent, 2)}\u00a0% cheaper than {nearest}"
+    chance = f", the simplest; {nearest} is cheaper by no more than chance"
+    return chance if percent < 0 else f"; {nearest} is next"
 
 
 def _listed(names: Sequence[str]) -> str:

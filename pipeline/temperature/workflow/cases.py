@@ -28,8 +28,8 @@ class Rehearsal(NamedTuple):
 
 class Setting(NamedTuple):
     """What all contestants share, tuned and judged: the rehearsal, the identified plant with all inputs a
-    sample late, limits of inputs and outputs (low, high (p,) in °C), the governor, the integrator's limit in °C, the settled window in steps,
-    what the cost counts as one, the discount, and the sample time."""
+    sample late, limits of inputs and outputs (low, high (p,) in °C), the governor, the integrator's limit in
+    °C, the settled window in steps, what the cost counts as one, the discount, and the sample time."""
 
     rehearsal: Rehearsal
     late: plant.Plant
@@ -125,6 +125,12 @@ def spread_of(settings: Panel) -> panel.Spread:
     )
 
 
+def spread_around(settings: Panel, identified: plant.Plant) -> panel.Spread:
+    """The declared spread, with no more heat lost than is little beside what somebody's machine loses."""
+    spread, slowest = spread_of(settings), 1 - np.abs(np.linalg.eigvals(identified.A)).max()
+    return spread._replace(extra_heat_loss=float(np.clip(0.2 * slowest, 0.0, spread.extra_heat_loss)))
+
+
 def declared(settings: Panel, machine: Machine, truth: plant.Plant, identified: plant.Plant) -> Rehearsal:
     """The study's machine: judged around the truth, tuned around what was identified."""
     reference = np.array([o.reference for o in machine.outputs])
@@ -197,12 +203,8 @@ def from_record(settings: Panel, machine: Machine, family: Sequence[plant.Plant]
         high,
         machine.sample_time_s,
     )
-    spread = spread_of(settings)
-    slowest = 1 - np.abs(np.linalg.eigvals(identified.A)).max()
-    spread = spread._replace(
-        extra_heat_loss=float(np.clip(0.2 * slowest, 0.0, spread.extra_heat_loss)),
-        ambient_degC=max(spread.ambient_degC, float(np.max(scale.ambient_degC_spread))),
-    )
+    spread = spread_around(settings, identified)
+    spread = spread._replace(ambient_degC=max(spread.ambient_degC, float(np.max(scale.ambient_degC_spread))))
     lower = asked.references[-1]
     swing = asked.references.mean(axis=0), asked.sinusoid.amplitude_degC, float(asked.sinusoid.period_steps)
     questions = panel.Questions(

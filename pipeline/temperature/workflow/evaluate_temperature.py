@@ -116,7 +116,7 @@ def judged(
 ) -> Judged:
     """Every contestant on the judging half of the panel."""
     designs, refused = designed(problem, weights)
-    calls = [delayed(_judged_one)(name, design, setting) for name, design in designs.items()]
+    calls = [delayed(judged_one)(name, design, setting) for name, design in designs.items()]
     results = dict(
         tqdm(
             run_all(calls, execution),
@@ -152,7 +152,8 @@ def _not_tuned(weights: Mapping[str, Mapping[str, Any]], problem: contestants.Pr
     return {}
 
 
-def _judged_one(name: str, design: contestants.Design, setting: Setting) -> tuple[str, JudgedContestant]:
+def judged_one(name: str, design: contestants.Design, setting: Setting) -> tuple[str, JudgedContestant]:
+    """One contestant on the judging half, with its name."""
     cases = setting.rehearsal.judging
     deployed = controller.deployed(
         design.law,
@@ -375,7 +376,7 @@ def _decided(
         "best_reason": {
             "passes": able,
             "leading": comparison.chosen(costs, block, dict.fromkeys(entrants, True), seed=seed).best,
-            "nearest": choice.last,
+            "nearest": choice.nearest,
             "improvement_percent": choice.against.improvement_percent if choice.against else None,
             "p": choice.against.p if choice.against else None,
         },

@@ -104,13 +104,13 @@ def _first(cost, start: np.ndarray) -> tuple[np.ndarray, tuple[str, ...], np.nda
 def _cost(
     design: contestants.Design, rests: Sequence[controller.Rest], settings: TuneWeights, setting: Setting
 ) -> float:
-    """The declared cost of a candidate. Raises ValueError where its margins on the identified plant, its inputs
-    a sample late, are below the least: figures in simulation are no reason to give robustness away."""
+    """The declared cost of a candidate. Raises ValueError where its margins on the identified plant, its
+    inputs a sample late, are below the least: figures in simulation are no reason to give robustness away."""
     margin = scorecard.margins([setting.late], design.law, grid=80)[0]
     if not (margin.disk >= settings.least_disk_margin and margin.delay_s >= settings.least_delay_margin_s):
         raise ValueError(
-            f"on the identified plant, its inputs a sample late, the disk margin is {margin.disk:.2f} and the delay margin "
-            f"{margin.delay_s:.2f} s, where {settings.least_disk_margin:g} and "
+            f"on the identified plant, its inputs a sample late, the disk margin is {margin.disk:.2f} and the "
+            f"delay margin {margin.delay_s:.2f} s, where {settings.least_disk_margin:g} and "
             f"{settings.least_delay_margin_s:g} s are the least"
         )
     cases, (low, high) = setting.rehearsal.training, setting.output_limits
