@@ -152,7 +152,7 @@ class Panel(Section):
     ambient_degC: float = Field(ge=0, le=200)
     steps: int = Field(ge=60, le=20000)
     settled_steps: int = Field(ge=10, le=5000)
-    hold_steps: int = Field(ge=0, le=2000)
+    hold_steps: int = Field(ge=1, le=2000)
     band_degC: float = Field(gt=0, le=100)
     settling_s: float = Field(gt=0, le=1e6)
     training: Half
