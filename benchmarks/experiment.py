@@ -188,7 +188,7 @@ def judged(seed: int) -> dict[str, Any]:
         return row
     after = play(machine, np.vstack([u, tried.u]))[len(u) :]
     other = another_day(machine, u, tried.u, rng)
-    rise = experiment.ramp_samples(limits, family.pace, LONGEST)
+    rise = experiment.ramp_samples(limits, LONGEST)
     ours = information(machine, tried.u[rise:] - tried.centre)
     unsafe = {
         "multisine": multisine(rng, LONGEST, m, amplitude=AMPLITUDE),

@@ -45,6 +45,12 @@ PARAMETERS: dict[str, str] = {
     "tune_weights.initial": "reproduce_study.initial",
 }
 
+# dotted keys that nothing reads any more -> why, as the end of a sentence
+RETIRED: dict[str, str] = {
+    "report.gap_percent": "the gap to the optimum is shown and decides nothing",
+    "report.worst_case_gap_percent": "the rules are asked at the 90 % quantile of all cases",
+}
+
 # (dotted key of today, old choice) -> today's choice; of parameters that are one of several words
 CHOICES: dict[tuple[str, str], str] = {
     ("nightly.holdout.controller", "model_based"): "subspace_lqg",
@@ -179,8 +185,16 @@ def _put(data: dict[str, Any], names: list[str], item: Any) -> None:
 
 
 def parameters(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The sections of a params file of an earlier version, with today's keys and choices."""
+    """The sections of a params file of an earlier version, with today's keys and choices, without what was
+    retired."""
     today = under_new_names(values, PARAMETERS)
+    for key in RETIRED:
+        *sections, name = key.split(".")
+        holder: Any = today
+        for section in sections:
+            holder = holder.get(section) if isinstance(holder, Mapping) else None
+        if isinstance(holder, dict):
+            holder.pop(name, None)
     for (key, old), new in CHOICES.items():
         *sections, name = key.split(".")
         holder: Any = today

@@ -33,8 +33,8 @@ from pipeline.temperature.tracking import Law, reached_state
 
 class Spread(NamedTuple):
     """How far plants lie from the nominal one: input gains 1 +- input_gain each; A' = I + (A - I) / (1 + d),
-    B' = B / (1 + d), d within +- slower; A - l I, l from 0 to extra_heat_loss a step; all inputs one step late
-    in a share `delayed`; the ambient +- ambient_degC."""
+    B' = B / (1 + d), d within +- slower; A - l I, l from 0 to extra_heat_loss a step; all inputs one step
+    late in a share `delayed`; the ambient +- ambient_degC."""
 
     input_gain: float
     slower: float
@@ -65,8 +65,8 @@ def delayed(plant: Plant, late: bool) -> Plant:
 def varied(
     plant: Plant, *, gains: np.ndarray, slower: float, loss: float, ambient: float, late: bool, cells: bool
 ) -> Plant:
-    """One plant of the spread. An ambient warmer by `ambient` °C warms every cell by as much in the end, where
-    the states are `cells`, and every output otherwise."""
+    """One plant of the spread. An ambient warmer by `ambient` °C warms every cell by as much in the end,
+    where the states are `cells`, and every output otherwise."""
     identity = np.eye(plant.n)
     A = identity + (plant.A - identity) / (1 + slower)
     warmer = np.ones(plant.n) if cells else reached_state(plant) @ np.ones(plant.p)
@@ -127,8 +127,8 @@ def padded(plants: Sequence[Plant]) -> list[Plant]:
 
 class Questions(NamedTuple):
     """What every plant is asked, by zone: starts (a, p) and constant references (j, p) in °C, each start with
-    each; from the middle start a ramp (r (p,), slope (p,) in °C a step), a sinusoid (mean (p,), amplitude (p,),
-    period in steps) and a sequence (g, p) of references for equal times."""
+    each; from the middle start a ramp (r (p,), slope (p,) in °C a step), a sinusoid (mean (p,), amplitude
+    (p,), period in steps) and a sequence (g, p) of references for equal times."""
 
     starts: np.ndarray
     constants: np.ndarray
@@ -172,15 +172,17 @@ def asked(
     hold: int,
     cells: bool,
 ) -> Cases:
-    """The questions put to every plant. Where states are `cells`, a start holds every cell at one temperature,
-    otherwise every output; noise (p,) in °C."""
+    """The questions put to every plant. Where states are `cells`, a start holds every cell at one
+    temperature, otherwise every output; noise (p,) in °C."""
     references = [constant(r) for r in questions.constants]
     rows = [("constant", a, [j]) for a in range(len(questions.starts)) for j in range(len(references))]
     middle = len(questions.starts) // 2
-    for kind, make, parts in (("ramp", ramp, questions.ramp), ("sinusoid", sinusoid, questions.sinusoid)):
-        if parts is not None:
-            rows.append((kind, middle, [len(references)]))
-            references.append(make(*parts))
+    if questions.ramp is not None:
+        rows.append(("ramp", middle, [len(references)]))
+        references.append(ramp(*questions.ramp))
+    if questions.sinusoid is not None:
+        rows.append(("sinusoid", middle, [len(references)]))
+        references.append(sinusoid(*questions.sinusoid))
     if questions.sequence is not None:
         rows.append(("sequence", middle, [len(references) + g for g in range(len(questions.sequence))]))
         references += [constant(r) for r in questions.sequence]
@@ -238,8 +240,8 @@ def _held(plant: Plant, y: np.ndarray, cells: bool) -> tuple[np.ndarray, np.ndar
 
 
 class Rollout(NamedTuple):
-    """(steps, s, .): true outputs y, the reference r and the target y_star, inputs wished and applied; and what
-    the controller measured."""
+    """(steps, s, .): true outputs y, the reference r and the target y_star, inputs wished and applied; and
+    what the controller measured."""
 
     y: np.ndarray
     r: np.ndarray
@@ -301,8 +303,9 @@ def rolled_out(controller: Deployed, cases: Cases, aimed: Sequence[Aim]) -> Roll
     def outputs(x):
         return (np.matmul(x.reshape(count, each, -1), C) + d).reshape(-1, p)
 
-    state, held = None, outputs(x)
-    for t in range(cases.hold):
+    held = outputs(x)
+    state = watched(controller, None, u, held + noise[0], r[0])
+    for t in range(1, cases.hold):
         state = watched(controller, state, u, held + noise[t], r[0])
     here = [aimed[len(cases.references) + a] for a in cases.start]
     state = handed_over(controller, state, held + noise[cases.hold], here)
@@ -322,8 +325,8 @@ def rolled_out(controller: Deployed, cases: Cases, aimed: Sequence[Aim]) -> Roll
 
 
 class Figures(NamedTuple):
-    """An engineer's figures of each case (s,), of true outputs, worst zone: °C, steps, percent. Settling is inf
-    where the outputs are outside at the end, NaN where the reference moves; so is overshoot there."""
+    """An engineer's figures of each case (s,), of true outputs, worst zone: °C, steps, percent. Settling is
+    inf where the outputs are outside at the end, NaN where the reference moves; so is overshoot there."""
 
     settled_error: np.ndarray
     settled_zone: np.ndarray
@@ -347,9 +350,10 @@ def figures(
     settled: int = 100,
 ) -> Figures:
     """Settled error: |mean of the last `settled` steps - r|. Settling: the last step outside `band` °C of the
-    target, counted from each new reference, the longest of them. Overshoot: past the target in the direction of
-    the step. At limits: share of (input, step) wished outside. Energy: mean input. Crossing: how far y lies
-    beyond low, high (p,). Outside: steps outside the band, an edge of a fifth of it counted in part: smooth."""
+    target, counted from each new reference, the longest of them. Overshoot: past the target in the direction
+    of the step. At limits: share of (input, step) wished outside. Energy: mean input. Crossing: how far y
+    lies beyond low, high (p,). Outside: steps outside the band, an edge of a fifth of it counted in part:
+    smooth."""
     error = rollout.y - rollout.r
     late = np.abs((rollout.y - rollout.r)[-settled:].mean(axis=0))
     off = rollout.y - rollout.target
@@ -396,7 +400,8 @@ class Allowance(NamedTuple):
 
 
 def costs(results: Figures, allowance: Allowance) -> np.ndarray:
-    """The declared cost of each case (s,): the sum of figure / allowance of what applies to it; 1e4 at most."""
+    """The declared cost of each case (s,): the sum of figure / allowance of what applies to it; 1e4 at
+    most."""
     moving = np.isnan(results.overshoot)
     response = np.where(
         moving,

@@ -210,33 +210,10 @@ def margins(plants: Sequence[Plant], law: Law, *, grid: int = 240) -> list[Margi
     return [_margins(plant, law, omega, z, K) for plant in plants]
 
 
-def disk_margin(plant: Plant, law: Law, *, grid: int = 80) -> float:
-    """The disk margin alone, of a loop that is stable: who has run it knows."""
-    z = np.exp(1j * _frequencies(grid))
-    K = law_response(law, z)
-    G = _response(plant, z)
-    return _disk(G @ K, K @ G)
-
-
 def _frequencies(grid: int) -> np.ndarray:
     """rad a step: even in logarithms where loops of heaters cross, then even to pi."""
     return np.concatenate(
         [np.geomspace(1e-4, 0.3, grid // 2, endpoint=False), np.linspace(0.3, np.pi, grid - grid // 2)]
-    )
-
-
-def _response(plant: Plant, z: np.ndarray) -> np.ndarray:
-    return plant.C @ np.linalg.solve(
-        z[:, None, None] * np.eye(plant.n) - plant.A, np.broadcast_to(plant.B, (len(z), plant.n, plant.m))
-    )
-
-
-def _disk(*loops: np.ndarray) -> float:
-    return float(
-        min(
-            1 / _structured(np.linalg.inv(np.eye(L.shape[1]) + L) - np.eye(L.shape[1]) / 2).max()
-            for L in loops
-        )
     )
 
 
@@ -262,12 +239,15 @@ def _margins(plant: Plant, law: Law, omega: np.ndarray, z: np.ndarray, K: np.nda
     radius = np.abs(np.linalg.eigvals(closed_loop(plant, law))).max()
     if radius >= 1:
         return Margins(0.0, 0.0, False, float(radius))
-    G = _response(plant, z)
-    loops = (G @ K, K @ G)
-    disk = _disk(*loops)
-    return Margins(
-        disk, _delay_margin(omega, np.linalg.eigvals(loops[0])) * plant.sample_time_s, True, float(radius)
+    G = plant.C @ np.linalg.solve(
+        z[:, None, None] * np.eye(plant.n) - plant.A, np.broadcast_to(plant.B, (len(z), plant.n, plant.m))
     )
+    loops = (G @ K, K @ G)
+    disk = min(
+        1 / _structured(np.linalg.inv(np.eye(L.shape[1]) + L) - np.eye(L.shape[1]) / 2).max() for L in loops
+    )
+    delay_s = _delay_margin(omega, np.linalg.eigvals(loops[0])) * plant.sample_time_s
+    return Margins(float(disk), delay_s, True, float(radius))
 
 
 def closed_loop(plant: Plant, law: Law) -> np.ndarray:

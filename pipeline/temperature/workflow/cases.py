@@ -1,5 +1,5 @@
-"""What a rehearsal asks, on whose plants: the declared panel on the study's machine; on somebody's records what
-follows from them by stated defaults (scenario_defaults.py)."""
+"""What a rehearsal asks, on whose plants: the declared panel on the study's machine; on somebody's records
+what follows from them by stated defaults (scenario_defaults.py)."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -27,12 +27,12 @@ class Rehearsal(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """What all contestants share, tuned and judged: the rehearsal, the identified plant, limits of inputs and
-    outputs (low, high (p,) in °C), the governor, the integrator's limit in °C, the settled window in steps,
-    what the cost counts as one, the discount, and the sample time."""
+    """What all contestants share, tuned and judged: the rehearsal, the identified plant with all inputs a
+    sample late, limits of inputs and outputs (low, high (p,) in °C), the governor, the integrator's limit in
+    °C, the settled window in steps, what the cost counts as one, the discount, and the sample time."""
 
     rehearsal: Rehearsal
-    plant: plant.Plant
+    late: plant.Plant
     limits: governor.Limits
     output_limits: tuple[np.ndarray, np.ndarray]
     governor: governor.Governor
@@ -66,7 +66,7 @@ def shared(
     overshoot = tracking.governor_overshoot_degC * band
     return Setting(
         rehearsal,
-        family[0],
+        panel.delayed(family[0], late=True),
         input_limits(machine),
         output_limits(machine),
         watchdog(machine, settings, family, rehearsal.noise, overshoot),
@@ -107,8 +107,8 @@ def output_limits(machine: Machine) -> tuple[np.ndarray, np.ndarray]:
 def watchdog(
     machine: Machine, settings: Panel, family: Sequence[plant.Plant], noise: np.ndarray, overshoot: float
 ) -> governor.Governor:
-    """The governor of all contestants: the identified plant, in time and a sample late, with inputs that act as
-    the panel's spread has them; what it keeps from a limit is three deviations of the sensors' noise."""
+    """The governor of all contestants: the identified plant, in time and a sample late, with inputs that act
+    as the panel's spread has them; what it keeps from a limit is three deviations of the sensors' noise."""
     low, high = output_limits(machine)
     guarded, strength = panel.corners(family[:1], spread_of(settings))
     limits = governor.OutputLimits(low, high, 3 * noise, overshoot)
@@ -170,7 +170,11 @@ def _half(
     spread: panel.Spread | None = None,
 ) -> panel.Cases:
     rng = np.random.default_rng(half.seed)
-    plants = panel.drawn(around, half.plants, spread or spread_of(settings), cells=cells, rng=rng)
+    declared = spread or spread_of(settings)
+    scaled = panel.Spread(*(half.spread * value for value in declared))._replace(
+        delayed=min(half.spread * declared.delayed, 1.0)
+    )
+    plants = panel.drawn(around, half.plants, scaled, cells=cells, rng=rng)
     return panel.asked(
         panel.padded(plants),
         questions,

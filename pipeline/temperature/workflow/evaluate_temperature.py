@@ -1,5 +1,5 @@
-"""What evaluate_temperature does: every contestant, tuned, as it would be deployed, on plants that nobody learned
-or tuned on; which is best, what tells model-based and data-driven apart, and which plant decides."""
+"""What evaluate_temperature does: every contestant, tuned, as it would be deployed, on plants that nobody
+learned or tuned on; which is best, what tells model-based and data-driven apart, and which plant decides."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -27,14 +27,14 @@ FIGURES = {
     "rms": "rms_degC",
 }
 CONVENTION = (
-    "Q = R = I, discounted {gamma:g} a step, unclipped, without integrator and governor, from a plant at rest, "
-    "noise-free, against the Riccati law of the same plant that knows the state"
+    "Q = R = I, discounted {gamma:g} a step, unclipped, without integrator and governor, from a plant at "
+    "rest, noise-free, against the Riccati law of the same plant that knows the state"
 )
 
 
 class JudgedContestant(NamedTuple):
-    """One contestant over all cases, its margins on every plant, its gaps in percent on the plants (None where
-    weights mean nothing to it), and the rollout."""
+    """One contestant over all cases, its margins on every plant, its gaps in percent on the plants (None
+    where weights mean nothing to it), and the rollout."""
 
     figures: panel.Figures
     costs: np.ndarray
@@ -323,7 +323,7 @@ def _number(value: float) -> float | None:
 
 def passes(figures: Mapping[str, Any], rules: TemperatureRules) -> bool:
     """Whether a contestant's figures hold the rules that a rehearsal can ask, at the 90 % quantile over all
-    cases, and margins on every plant."""
+    cases; stable on every plant, and margins of the median one."""
     limits = {
         "settled_error": rules.settled_error_degC,
         "settling": rules.settling_s,
@@ -336,8 +336,8 @@ def passes(figures: Mapping[str, Any], rules: TemperatureRules) -> bool:
     margins, stable = figures["margins"], figures["stable"]
     robust = margins is None or (
         stable["count"] == stable["of"]
-        and (margins["disk"]["worst"] or 0.0) >= rules.disk_margin
-        and (margins["delay_s"]["worst"] is None or margins["delay_s"]["worst"] >= rules.delay_margin_s)
+        and (margins["disk"]["median"] or 0.0) >= rules.disk_margin
+        and (margins["delay_s"]["median"] is None or margins["delay_s"]["median"] >= rules.delay_margin_s)
     )
     return quantiles and robust and figures["crossings"]["cases"] == 0
 
@@ -376,7 +376,7 @@ def _decided(
         "best_reason": {
             "passes": able,
             "leading": comparison.chosen(costs, block, dict.fromkeys(entrants, True), seed=seed).best,
-            "nearest": choice.last,
+            "nearest": choice.nearest,
             "improvement_percent": choice.against.improvement_percent if choice.against else None,
             "p": choice.against.p if choice.against else None,
         },

@@ -34,8 +34,8 @@ def read_learned(
     printer_pid_path: str | Path | None,
     machine: Machine,
 ) -> Learned:
-    """What the stages before wrote. `learned_folder` has a kernel only where the record determines one; without
-    a path there is no spread, or no PID of a printer.
+    """What the stages before wrote. `learned_folder` has a kernel only where the record determines one;
+    without a path there is no spread, or no PID of a printer.
 
     Raises ValueError for a file of another machine than `machine`, as an earlier run leaves it."""
     window_path, kernel_path = (
