@@ -204,7 +204,7 @@ def _gaps(design: contestants.Design, setting: Setting) -> np.ndarray | None:
         cases.hold,
     )
     yardstick = scorecard.Yardstick(np.ones(p), np.ones(m), setting.gamma)
-    run = scorecard.simulate(scenarios, law, scorecard.feed_forward(scenarios, law, None), limits=None)
+    run = scorecard.simulate(scenarios, law)
     J, best = scorecard.cost(scenarios, run, yardstick), scorecard.optimum(scenarios, yardstick)
     gaps = 100.0 * scorecard.regret(J, best)
     return np.where(np.isfinite(gaps) & (gaps < 1e6), gaps, np.inf)
