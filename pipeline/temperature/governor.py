@@ -98,8 +98,8 @@ class Governor(NamedTuple):
 
 # instants ahead, and the last of them at most
 INSTANTS, LONGEST = 7, 120
-# projections over all outputs: inputs mostly move one output each, so that a few suffice
-SWEEPS = 8
+# projections over all outputs, and over both sides: inputs mostly move one output each, so that a few suffice
+SWEEPS, ROUNDS = 8, 3
 # percent by which rows are equal, or missed: one case by itself takes the same steps as among many
 EXACT = 1e-9
 # share of what the innovations told that is forgotten a step, and of the drift
@@ -304,14 +304,20 @@ def governed(
     floor, cap = _walls(family, now, y_star)
     per_member = (len(free), 1, *free.shape[2:])
     strongest, less = family.strength.strongest, family.strength.strongest - family.strength.weakest
-    if np.isfinite(floor).any():
-        bare = -(free - told.most[..., None] * lacks) - family.below.reshape(per_member)
-        side = _Side(bare, strongest - less * told.most, family.fall, told.counts)
-        u = -_projected(side, -u, -high, -floor)
-    if np.isfinite(cap).any():
-        bare = free - told.least[..., None] * lacks + family.above.reshape(per_member)
-        side = _Side(bare, strongest - less * told.least, family.rise, told.counts)
-        u = _projected(side, u, low, cap)
+    bare = -(free - told.most[..., None] * lacks) - family.below.reshape(per_member)
+    below = _Side(bare, strongest - less * told.most, family.fall, told.counts, -floor)
+    bare = free - told.least[..., None] * lacks + family.above.reshape(per_member)
+    above = _Side(bare, strongest - less * told.least, family.rise, told.counts, cap)
+    u, raised = _projected(below, -u, -high)
+    u, lowered = _projected(above, -u, low)
+    # where an input is lowered for one output and was raised for another, others may do what it did
+    both = np.intersect1d(raised, lowered, assume_unique=True)
+    if both.size:
+        below, above, one = below.of(both), above.of(both), u[both]
+        for _ in range(ROUNDS):
+            one = -_projected(below, -one, -high[both])[0]
+            one = _projected(above, one, low[both])[0]
+        u[both] = one
     return u
 
 
@@ -328,31 +334,33 @@ def _walls(family: Governor, now: np.ndarray, y_star: np.ndarray) -> tuple[np.nd
 
 class _Side(NamedTuple):
     """What is forecast from above, or negated from below: bare (f, s, p, h) without the command, of which
-    strength (f, s, p) times u rows (f, m, p h) is to come; members that count (f, s)."""
+    strength (f, s, p) times u rows (f, m, p h) is to come; members that count (f, s); the wall (f, s, p)."""
 
     bare: np.ndarray
     strength: np.ndarray
     rows: np.ndarray
     counts: np.ndarray
+    wall: np.ndarray
 
     def of(self, cases: np.ndarray) -> "_Side":
-        return _Side(self.bare[:, cases], self.strength[:, cases], self.rows, self.counts[:, cases])
+        bare, strength, rows, counts, wall = self
+        return _Side(bare[:, cases], strength[:, cases], rows, counts[:, cases], wall[:, cases])
 
 
-def _projected(side: _Side, u: np.ndarray, low: np.ndarray, cap: np.ndarray) -> np.ndarray:
-    """`governed` for one side: bare + strength rows u <= cap (f, s, p) where that can be kept."""
+def _projected(side: _Side, u: np.ndarray, low: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """u (s, m) of `governed` for one side: bare + strength rows u <= wall where that can be kept; and which
+    cases a row touched."""
     driven = np.matmul(u, side.rows).reshape(side.bare.shape)
-    over = side.bare + side.strength[..., None] * driven > cap[..., None]
+    over = side.bare + side.strength[..., None] * driven > side.wall[..., None]
     touched = np.flatnonzero((over.any(axis=(2, 3)) & side.counts).any(axis=0))
-    if not touched.size:
-        return u
-    u = u.copy()
-    u[touched] = _swept(side.of(touched), u[touched], low[touched], cap[:, touched])
-    return u
+    if touched.size:
+        u = u.copy()
+        u[touched] = _swept(side.of(touched), u[touched], low[touched])
+    return u, touched
 
 
-def _swept(side: _Side, u: np.ndarray, low: np.ndarray, cap: np.ndarray) -> np.ndarray:
-    """The projections of `governed` for cases that a row touches: u, low (s, m), cap (f, s, p)."""
+def _swept(side: _Side, u: np.ndarray, low: np.ndarray) -> np.ndarray:
+    """The projections of `governed` for cases that a row touches: u, low (s, m)."""
     f, s, p, h = side.bare.shape
     m = u.shape[1]
     rows = side.rows.reshape(f, m, p, h)
@@ -360,7 +368,7 @@ def _swept(side: _Side, u: np.ndarray, low: np.ndarray, cap: np.ndarray) -> np.n
     helps = np.where(rows > WEAK * np.maximum(rows, 0.0).max(axis=1, keepdims=True), rows, 0.0)
     helps = np.maximum(helps, 0.0)
     least = np.matmul(low, helps.reshape(f, m, -1)) + np.matmul(u, (rows - helps).reshape(f, m, -1))
-    room = (cap[..., None] - side.bare) / side.strength[..., None]
+    room = (side.wall[..., None] - side.bare) / side.strength[..., None]
     room = np.where(side.counts[..., None, None], np.maximum(room, least.reshape(room.shape)), np.inf)
     helps = helps.transpose(2, 0, 3, 1).reshape(p, f * h, m)
     for _ in range(SWEEPS):
