@@ -334,10 +334,11 @@ class RunningController:
         u, y, r = (np.asarray(part, float)[None] for part in (u, y, r))
         self._state = watched(self.controller, self._state, u, y, r)
 
-    def hand_over(self, y: np.ndarray) -> None:
-        """From manual to the law without a bump, at outputs y (p,). Raises ValueError before any watch."""
+    def hand_over(self, y: np.ndarray, at: np.ndarray | None = None) -> None:
+        """From manual to the law without a bump, at outputs y (p,) measured now, where the machine stands at
+        `at` (p,), by itself y. Raises ValueError before any watch."""
         y = np.asarray(y, float)
-        here = self._aimed(constant(y))[1]
+        here = self._aimed(constant(y if at is None else at))[1]
         self._state = handed_over(self.controller, self._remembers(y), y[None], [here])
 
     def step(self, y: np.ndarray, r: np.ndarray | Reference, t: int) -> np.ndarray:
@@ -374,8 +375,8 @@ class RunningController:
         self._state = State(*(np.array(arrays[name]) for name in State._fields))
         self._reference = None
         if "w" in arrays:
-            self._turned(Reference(*(np.array(arrays[name]) for name in Reference._fields)), int(arrays["t"]))
-            self._moved(np.array(arrays["w"]))
+            mine = Reference(*(np.array(arrays[name]) for name in Reference._fields))
+            self._moved(self._turned(mine, int(arrays["t"])), np.array(arrays["w"]))
 
     def _remembers(self, y: np.ndarray) -> State:
         if self._state is None:
@@ -400,29 +401,31 @@ class RunningController:
         """Feed (m,), target y* (p,) and reference (p,) at sample t."""
         mine = self._reference
         if isinstance(r, Reference):
-            if mine is None or not (r is mine or all(map(np.array_equal, r, mine))):
-                self._turned(r, t)
-        elif mine is None or len(self._w) > 1 or not (mine.H[:, 0] == r).all():
-            self._turned(constant(r), t)
+            same = mine is not None and (r is mine or all(map(np.array_equal, r, mine)))
+        else:
+            same = mine is not None and len(self._w) == 1 and bool((mine.H[:, 0] == r).all())
+        if mine is None or not same:
+            mine = self._turned(r if isinstance(r, Reference) else constant(r), t)
         if t < self._t:
             raise ValueError(f"sample {t} comes after sample {self._t}; count samples upwards")
         if len(self._w) > 1:
             w = self._w
             for _ in range(t - self._t):
-                w = self._reference.F @ w
-            self._moved(w)
+                w = mine.F @ w
+            self._moved(mine, w)
         self._t = t
         return self._now
 
-    def _turned(self, reference: Reference, t: int) -> None:
-        self._reference = Reference(*(np.array(part, float) for part in reference))
-        at, self._aim = self._aimed(reference)
+    def _turned(self, reference: Reference, t: int) -> Reference:
+        mine = self._reference = Reference(*(np.array(part, float) for part in reference))
+        at, self._aim = self._aimed(mine)
         self.binding, self._t = at.binding, t
-        self._moved(reference.w0)
+        self._moved(mine, mine.w0)
+        return mine
 
-    def _moved(self, w: np.ndarray) -> None:
+    def _moved(self, reference: Reference, w: np.ndarray) -> None:
         self._w = w
-        self._now = self._aim.feed @ w, self._aim.Y @ w, self._reference.H @ w
+        self._now = self._aim.feed @ w, self._aim.Y @ w, reference.H @ w
 
     def _aimed(self, reference: Reference) -> tuple[Rest, Aim]:
         key = reference.F.tobytes() + reference.H.tobytes()

@@ -100,8 +100,10 @@ class Governor(NamedTuple):
 INSTANTS, LONGEST = 7, 120
 # projections over all outputs: inputs mostly move one output each, so that a few suffice
 SWEEPS = 8
+# percent by which rows are equal, or missed: one case by itself takes the same steps as among many
+EXACT = 1e-9
 # share of what the innovations told that is forgotten a step, and of the drift
-FORGETS, LEAK = 0.005, 0.002
+FORGETS, LEAK = 0.005, 1e-4
 # squares of innovations beyond those of the best member from which a member does not count
 CONTRADICTED = 4.0
 # an input that moves an output by less than this share of the strongest one is not held back for it
@@ -315,12 +317,12 @@ def governed(
 
 def _walls(family: Governor, now: np.ndarray, y_star: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Floor and cap (f, s, p) in °C of outputs forecast `now` (f, s, p): low and high; and `overshoot` beyond
-    the target, or where an output is now that is there already. What is up to twice as far too hot goes back,
-    so that small errors of the forecast do not add up."""
-    above = y_star + family.overshoot
+    the target, or where an output is now that is further off. What is up to twice as far off goes back, so
+    that small errors of the forecast do not add up."""
+    floor, cap = y_star - family.overshoot, y_star + family.overshoot
     return (
-        np.maximum(family.low, np.minimum(now, y_star - family.overshoot)),
-        np.minimum(family.high, np.where(now > above + family.overshoot, now, above)),
+        np.maximum(family.low, np.where(now < floor - family.overshoot, now, floor)),
+        np.minimum(family.high, np.where(now > cap + family.overshoot, now, cap)),
     )
 
 
@@ -352,7 +354,7 @@ def _projected(side: _Side, u: np.ndarray, low: np.ndarray, cap: np.ndarray) -> 
 def _swept(side: _Side, u: np.ndarray, low: np.ndarray, cap: np.ndarray) -> np.ndarray:
     """The projections of `governed` for cases that a row touches: u, low (s, m), cap (f, s, p)."""
     f, s, p, h = side.bare.shape
-    m, case = u.shape[1], np.arange(s)
+    m = u.shape[1]
     rows = side.rows.reshape(f, m, p, h)
     # what hardly moves an output is not shut for its sake
     helps = np.where(rows > WEAK * np.maximum(rows, 0.0).max(axis=1, keepdims=True), rows, 0.0)
@@ -366,11 +368,12 @@ def _swept(side: _Side, u: np.ndarray, low: np.ndarray, cap: np.ndarray) -> np.n
         for j in range(p):
             excess = np.matmul(u, rows[:, :, j]) - room[:, :, j]
             excess = excess.transpose(1, 0, 2).reshape(s, f * h)
-            worst = excess.argmax(axis=1)
-            direction = helps[j, worst] * (u > low)
+            most = excess.max(axis=1)
+            worst = (excess >= most[:, None] - EXACT).argmax(axis=1)
+            direction = helps[j, worst] * (u > low + EXACT)
             size = (direction**2).sum(axis=1)
-            step = np.maximum(excess[case, worst], 0.0) / np.where(size > 0, size, np.inf)
+            step = np.where(most > EXACT, most, 0.0) / np.where(size > 0, size, np.inf)
             u = np.maximum(u - step[:, None] * direction, low)
-        if np.abs(u - before).max() < 1e-9:
+        if np.array_equal(u, before):
             break
     return u
