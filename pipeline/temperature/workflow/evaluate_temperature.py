@@ -86,7 +86,7 @@ def designed(
         }
         if None in values.values():
             if one.name != "exact_model" or problem.truth is not None:
-                refused[one.name] = "it could not be tuned: no candidate of its search worked"
+                refused[one.name] = _not_tuned(one, problem)
             continue
         try:
             design = one.design(problem, values)
@@ -134,7 +134,7 @@ def judged(
             for name, one in results.items()
         },
         "order": entrants,
-        "refused": {**_not_tuned(weights, problem), **refused},
+        "refused": refused,
     }
     decision = _decided(results, entrants, summary, rules, setting, settings.seed)
     summary |= decision
@@ -146,10 +146,20 @@ def judged(
     )
 
 
-def _not_tuned(weights: Mapping[str, Mapping[str, Any]], problem: contestants.Problem) -> dict[str, str]:
-    if problem.kernel is None and "learned_kernel" not in weights:
-        return {"learned_kernel": "the record does not determine the kernel (learn_kernel says why)"}
-    return {}
+def _not_tuned(one: contestants.Contestant, problem: contestants.Problem) -> str:
+    """Why no search has set a contestant's parameters: what its design says at the declared start, or that no
+    candidate worked."""
+    start = {
+        parameter.name: parameter.start * (problem.effect if parameter.of_effect else 1.0)
+        for parameter in one.parameters
+    }
+    try:
+        design = one.design(problem, start)
+    except ValueError as reason:
+        return str(reason)
+    if design is None:
+        return "the record does not determine the kernel (learn_kernel says why)"
+    return "it could not be tuned: no candidate of its search worked"
 
 
 def judged_one(name: str, design: contestants.Design, setting: Setting) -> tuple[str, JudgedContestant]:

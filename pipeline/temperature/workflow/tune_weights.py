@@ -81,14 +81,17 @@ def _searched(
         return _cost(made, rests, settings, setting) * (1 + NEARER * float(far @ far))
 
     first = tuning.History(start[None], *_first(cost, start))
-    result = tuning.minimise(
-        cost,
-        low,
-        high,
-        tuning.SearchSettings(settings.practical_initial, settings.practical_evaluations),
-        rng=np.random.default_rng(settings.seed),
-        start=first,
-    )
+    try:
+        result = tuning.minimise(
+            cost,
+            low,
+            high,
+            tuning.SearchSettings(settings.practical_initial, settings.practical_evaluations),
+            rng=np.random.default_rng(settings.seed),
+            start=first,
+        )
+    except ValueError as reason:  # no candidate worked
+        return name, str(reason)
     return name, result
 
 
