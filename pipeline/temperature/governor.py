@@ -1,11 +1,11 @@
-"""The governor: what keeps the predicted worst output of a family of plants within the limits of the outputs,
-whatever the law asks for.
+"""The governor: what keeps the predicted worst output of a family of plants within the limits of the
+outputs, whatever the law asks for.
 
 A braking distance in each output: the command moves as little as it must, so that from the next step on every
 member of the family that the record has not contradicted could still be stopped below `high` by its lowest
-inputs, and above `low` by its highest. In the terms of a reference governor (Garone, Di Cairano, Kolmanovsky
-2017): the reference moves to the one for which the law would have asked for that command, and back-calculation
-tells the integrator.
+inputs, and above `low` by its highest. In the terms of a reference governor (Garone, Di Cairano,
+Kolmanovsky 2017): the reference moves to the one for which the law would have asked for that command, and
+back-calculation tells the integrator.
 
 A member does not know how strongly its inputs act, only within what range. Its forecast is linear in that
 strength, so that it carries two: the strongest, and what lies between strongest and weakest; least squares on
@@ -32,9 +32,9 @@ class Limits(NamedTuple):
 
 
 class OutputLimits(NamedTuple):
-    """low, high (p,) in °C, -inf and inf where none is declared; `margin` (p,) in °C is kept from both, for the
-    sensors' noise (three standard deviations); `overshoot` in °C: how far an output that is below its target
-    may be predicted beyond it."""
+    """low, high (p,) in °C, -inf and inf where none is declared; `margin` (p,) in °C is kept from both, for
+    the sensors' noise (three standard deviations); `overshoot` in °C: how far an output may be predicted
+    beyond its target."""
 
     low: np.ndarray
     high: np.ndarray
@@ -54,9 +54,10 @@ class Strength(NamedTuple):
 class Governor(NamedTuple):
     """A family of f plants with their observers, and the rows by which they look ahead; `governor` makes it.
 
-    A member remembers s = [x, w, xi, v] of size q = 2 (n + p). x is its state at its strongest and w (p) in °C
-    a step a drift that it cannot explain, so that steady disagreement vanishes (offset-free prediction); xi and
-    v are by how much less x and w would be at its weakest. Before y is measured s forecasts [C x + d, C xi]:
+    A member remembers s = [x, w, xi, v] of size q = 2 (n + p). x is its state at its strongest and w (p) in
+    °C a step a drift that it cannot explain, so that steady disagreement vanishes (offset-free prediction); xi
+    and v are by how much less x and w would be at its weakest. Before y is measured s forecasts
+    [C x + d, C xi]:
 
         s <- s + [e, clip(e + lambda C xi), C xi, clip(C xi)] correct,   s(t+1) = s move + u push + rest
 
@@ -91,16 +92,25 @@ class Governor(NamedTuple):
     high: np.ndarray
     surprise: np.ndarray
     doubt: np.ndarray
+    near: np.ndarray
+    forgets: float
     strength: Strength
     overshoot: float
 
 
-INSTANTS = 7
-LONGEST = 120
+# instants ahead, and the last of them at most
+INSTANTS, LONGEST = 7, 120
+# projections over all outputs: inputs mostly move one output each, so that a few suffice
 SWEEPS = 8
-FORGETS = 0.005
-LEAK = 0.002
+# share of what the innovations told that is forgotten a step, and of the drift, and with them the observer's
+# constants: for a furthest look ahead of so many steps; a machine that needs more is watched as much longer
+FORGETS, LEAK, UNHURRIED = 0.005, 0.002, 16
+# squares of innovations beyond those of the best member from which a member does not count
 CONTRADICTED = 4.0
+# overshoots from its target within which an output has arrived; how many it may go beyond it then, where the
+# whole range of the inputs for one sample moves it by fewer overshoots than this
+ARRIVED, LET_GO, BARELY = 2.0, 4.0, 20.0
+# an input that moves an output by less than this share of the strongest one is not held back for it
 WEAK = 0.05
 
 
@@ -110,18 +120,24 @@ def governor(
     outputs: OutputLimits,
     strength: Strength,
     *,
-    tau: float = 0.2,
-    drift: float = 0.08,
+    tau: float = 0.16,
+    drift: float = 0.06,
 ) -> Governor:
     """The governor of a family of plants of one order (their feed-through made a delay), for inputs of any
     `strength` within its range.
 
-    Innovations are doubted by the sensors' noise, a tenth of a degree at least. The observer takes process noise to come in by the inputs, sensors to be tau °C^2 per percent^2 noisier
-    than that, and the drift w to wander by `drift` of the sensors' noise a step.
+    Innovations are doubted by the sensors' noise, a tenth of a degree at least. The observer takes process
+    noise to come in by the inputs, sensors to be tau °C^2 per percent^2 noisier than that, and the drift w to
+    wander a step by `drift` of what a percent of every input does at most.
     """
     at, unsure = instants(family), np.maximum(outputs.margin, 0.1)
+    slower = max(at[-1] / UNHURRIED, 1.0)
     members = [
-        {**_watching(plant, strength, tau, drift), **_ahead(plant, limits, strength, at)} for plant in family
+        {
+            **_watching(plant, strength, tau * slower**2, drift / slower, LEAK / slower),
+            **_ahead(plant, limits, strength, at),
+        }
+        for plant in family
     ]
     return Governor(
         **{name: np.stack([member[name] for member in members]) for name in members[0]},
@@ -129,9 +145,22 @@ def governor(
         high=outputs.high - outputs.margin,
         surprise=3 * unsure,
         doubt=4 * unsure,
+        near=_near(family[0], limits, outputs.overshoot, strength),
+        forgets=FORGETS / slower,
         strength=strength,
         overshoot=outputs.overshoot,
     )
+
+
+def _near(plant: Plant, limits: Limits, overshoot: float, strength: Strength) -> np.ndarray:
+    """How far (p,) in °C an output that has arrived at its target may be predicted beyond it.
+
+    `overshoot` where one sample can do much. Where it can do little, the law's own small moves are as large as
+    the forecast's errors, of which a tight wall would make a steady error.
+    """
+    pulse = np.abs(markov_parameters(plant, LONGEST)).max(axis=0)
+    most = strength.strongest * pulse @ (limits.high - limits.low)
+    return np.where(most < BARELY * overshoot, LET_GO, 1.0) * overshoot
 
 
 def instants(family: Sequence[Plant], *, longest: int = LONGEST) -> np.ndarray:
@@ -144,23 +173,26 @@ def instants(family: Sequence[Plant], *, longest: int = LONGEST) -> np.ndarray:
     return np.r_[0, np.unique(np.round(np.geomspace(1, last, INSTANTS)).astype(int))]
 
 
-def _drifting(plant: Plant) -> tuple[np.ndarray, np.ndarray]:
+def _drifting(plant: Plant, leak: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """A, C of the state [x; w]: w (p) in °C a step warms the outputs along the state that inputs most likely
     reach; it leaks, so that no mode of it stands still unseen."""
     n, p = plant.n, plant.p
-    A = np.block([[plant.A, reached_state(plant)], [np.zeros((p, n)), (1 - LEAK) * np.eye(p)]])
+    A = np.block([[plant.A, reached_state(plant)], [np.zeros((p, n)), (1 - leak) * np.eye(p)]])
     return A, np.hstack([plant.C, np.zeros((p, p))])
 
 
-def _watching(plant: Plant, strength: Strength, tau: float, drift: float) -> dict[str, np.ndarray]:
+def _watching(
+    plant: Plant, strength: Strength, tau: float, drift: float, leak: float
+) -> dict[str, np.ndarray]:
     """The part of a Governor by which one member follows the machine."""
     n, m, p = plant.n, plant.m, plant.p
     likely = reached_state(plant)
-    A, C = _drifting(plant)
-    pulse = np.abs(markov_parameters(plant, LONGEST)).max(axis=0)
-    noise = scipy.linalg.block_diag(plant.B @ plant.B.T, drift**2 * np.diag((pulse**2).sum(axis=1)))
-    P = riccati(A.T, C.T, noise, tau * np.eye(p))
-    L = P @ C.T @ np.linalg.inv(C @ P @ C.T + tau * np.eye(p))
+    A, C = _drifting(plant, leak)
+    pulse = (np.abs(markov_parameters(plant, LONGEST)).max(axis=0) ** 2).sum(axis=1)
+    noise = scipy.linalg.block_diag(plant.B @ plant.B.T, drift**2 * np.diag(pulse))
+    sensors = tau * pulse.mean() * np.eye(p)
+    P = riccati(A.T, C.T, noise, sensors)
+    L = P @ C.T @ np.linalg.inv(C @ P @ C.T + sensors)
     less, none = strength.strongest - strength.weakest, np.zeros((p, m))
     quick, slow = (np.vstack(parts) for parts in ((L[:n], 0 * L[n:]), (0 * L[:n], L[n:])))
     one, other = np.array([[1.0], [0.0]]), np.array([[0.0], [1.0]])
@@ -178,8 +210,8 @@ def _watching(plant: Plant, strength: Strength, tau: float, drift: float) -> dic
 
 def _ahead(plant: Plant, limits: Limits, strength: Strength, at: np.ndarray) -> dict[str, np.ndarray]:
     """The rows of a Governor of one member. A rate limit slows the stop: inputs go from u to the limit on a
-    straight line that the slowest of them needs. An input that helps is taken to act less than one that hurts,
-    by what `each` leaves open."""
+    straight line that the slowest of them needs. An input that helps is taken to act less than one that
+    hurts, by what `each` leaves open."""
     n, m, p = plant.n, plant.m, plant.p
     A, C = _drifting(plant)
     B, b = np.vstack([plant.B, np.zeros((p, m))]), np.r_[plant.b, np.zeros(p)]
@@ -222,7 +254,7 @@ def corrected(family: Governor, memory: np.ndarray, y: np.ndarray) -> np.ndarray
     e = y - family.offset[:, None] - forecast[:, :, :p]
     lacks = forecast[:, :, p:]
     after = np.empty_like(memory)
-    sums = (1 - FORGETS) * memory[:, :, q:]
+    sums = (1 - family.forgets) * memory[:, :, q:]
     for k, news in enumerate((-e * lacks, lacks * lacks, np.abs(lacks), e * e)):
         sums[:, :, k * p : (k + 1) * p] += news
     strength = np.clip(sums[:, :, :p] / (sums[:, :, p : 2 * p] + 1e-12), 0.0, 1.0)
@@ -249,8 +281,8 @@ def observed(family: Governor, memory: np.ndarray, u: np.ndarray, y: np.ndarray)
 
 
 class Evidence(NamedTuple):
-    """Of each member, case and output (f, s, p): the share of the way from strongest to weakest that the inputs
-    are at least, by least squares, and at most; and whether the member counts (f, s)."""
+    """Of each member, case and output (f, s, p): the share of the way from strongest to weakest that the
+    inputs are at least, by least squares, and at most; and whether the member counts (f, s)."""
 
     least: np.ndarray
     middle: np.ndarray
@@ -282,18 +314,20 @@ def governed(
     """Commands (s, m) as near to u (s, m) as the rows allow, within low..high (s, m); the memory corrected by
     what was measured, y_star (s, p) targets.
 
-    Projections onto the most violated row of each output in turn. Only inputs whose lowering helps are lowered
-    for a high limit, and raised for a low one; the high limit has the last word. A limit that cannot be kept
-    is kept as far as the inputs go; an output beyond its target already, from above or by another's doing,
-    is left to the law.
+    Projections onto the most violated row of each output in turn. Only inputs whose lowering helps are
+    lowered for a high limit, and raised for a low one; the high limit has the last word. What cannot be kept
+    is kept as far as those inputs go.
     """
     q, rows = family.start.shape[2], family.above.shape[1]
     told = evidence(family, memory)
     ahead = np.matmul(memory[:, :, :q], family.ahead)
     free, lacks = (
-        part.reshape(*part.shape[:2], y_star.shape[1], -1) for part in (ahead[:, :, :rows], ahead[:, :, rows:])
+        part.reshape(*part.shape[:2], y_star.shape[1], -1)
+        for part in (ahead[:, :, :rows], ahead[:, :, rows:])
     )
-    now = free[..., 0] - told.middle * lacks[..., 0] + family.offset[:, None]
+    # where an output is, is measured: how strong the inputs are is in doubt for what is still to come
+    free, lacks = free - (told.middle * lacks[..., 0])[..., None], lacks - lacks[..., :1]
+    now = free[..., 0] + family.offset[:, None]
     floor, cap = _walls(family, now, y_star)
     per_member = (len(free), 1, *free.shape[2:])
     strongest, less = family.strength.strongest, family.strength.strongest - family.strength.weakest
@@ -309,11 +343,17 @@ def governed(
 
 
 def _walls(family: Governor, now: np.ndarray, y_star: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Floor and cap (f, s, p) in °C of outputs forecast `now` (f, s, p): low and high, and `overshoot` beyond
-    the target for an output that is not there yet."""
+    """Floor and cap (f, s, p) in °C of outputs forecast `now` (f, s, p): low and high; and `overshoot` beyond
+    the target, `near` where an output has arrived at it, or where it is now if it is beyond that. What is a
+    further `overshoot` too hot goes back, so that small errors of the forecast do not add up."""
+    arriving, leaving = (
+        np.where(sign * (y_star - now) < ARRIVED * family.overshoot, family.near, family.overshoot)
+        for sign in (1.0, -1.0)
+    )
+    above = y_star + arriving
     return (
-        np.maximum(family.low, np.minimum(now, y_star - family.overshoot)),
-        np.minimum(family.high, np.maximum(now, y_star + family.overshoot)),
+        np.maximum(family.low, np.minimum(now, y_star - leaving)),
+        np.minimum(family.high, np.where(now > above + family.overshoot, now, above)),
     )
 
 
