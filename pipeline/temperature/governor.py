@@ -352,8 +352,8 @@ def _walls(family: Governor, now: np.ndarray, y_star: np.ndarray) -> tuple[np.nd
     )
     above = y_star + arriving
     return (
-        np.maximum(family.low, np.minimum(now, y_star - leaving)),
-        np.minimum(family.high, np.where(now > above + family.overshoot, now, above)),
+        np.maximum(family.low, np.where(now < y_star - leaving, -np.inf, y_star - leaving)),
+        np.minimum(family.high, np.where(now > above + family.overshoot, np.inf, above)),
     )
 
 

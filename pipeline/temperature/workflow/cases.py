@@ -63,7 +63,8 @@ def shared(
         energy=tuning.allow_effort_percent,
         rms=tuning.allow_overshoot_degC * band,
     )
-    overshoot = tracking.governor_overshoot_degC * band
+    # nearer to a reference than its noise no forecast can tell an overshoot
+    overshoot = max(tracking.governor_overshoot_degC * band, 3 * float(rehearsal.noise.max()))
     return Setting(
         rehearsal,
         family[0],
