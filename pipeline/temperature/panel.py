@@ -93,7 +93,9 @@ def paced(A: np.ndarray, slower: float) -> np.ndarray:
     # A = Z [T1 X; 0 T2] Z*: with T1 S - S T2 = -X the columns Z [I S; 0 I] span both subspaces
     decoupled = np.eye(n, dtype=complex)
     if 0 < slow < n:
-        decoupled[:slow, slow:] = scipy.linalg.solve_sylvester(T[:slow, :slow], -T[slow:, slow:], -T[:slow, slow:])
+        decoupled[:slow, slow:] = scipy.linalg.solve_sylvester(
+            T[:slow, :slow], -T[slow:, slow:], -T[:slow, slow:]
+        )
     basis = Z @ decoupled
     share = np.where(np.arange(n) < slow, 1 / (1 + slower), 1.0)
     return (basis * share @ np.linalg.inv(basis)).real

@@ -177,9 +177,20 @@ def _half(
     )
 
 
+# of the recorded span, by which the ambient is varied at most where recordings do not differ by more: what
+# spans 12 °C was not recorded in a room that may be 8 °C warmer
+AMBIENT_SHARE = 0.25
+
+
 def from_record(settings: Panel, machine: Machine, family: Sequence[plant.Plant], path: str) -> Rehearsal:
     """Somebody's machine: both halves are drawn around plants of the identified family, and starts,
-    references, band, settling limit and length follow from the record."""
+    references, band, settling limit and length follow from the record.
+
+    What a plant may differ by: the spread is a bootstrap of the record, every second member for each half,
+    and around each the panel's input gains, pace and delay. The ambient differs by the panel's, at most
+    AMBIENT_SHARE of the recorded span, or by as much as recordings of the same machine were found to differ.
+    More heat is lost by a fifth of what the slowest mode loses at most.
+    """
     identified = family[0]
     u, y, recordings = record.read_recordings(path, machine.acting, machine.outputs)
     u = [a[:, : len(machine.inputs)] for a in u]
@@ -198,7 +209,10 @@ def from_record(settings: Panel, machine: Machine, family: Sequence[plant.Plant]
     slowest = 1 - np.abs(np.linalg.eigvals(identified.A)).max()
     spread = spread._replace(
         extra_heat_loss=float(np.clip(0.2 * slowest, 0.0, spread.extra_heat_loss)),
-        ambient_degC=max(spread.ambient_degC, float(np.max(scale.ambient_degC_spread))),
+        ambient_degC=max(
+            min(spread.ambient_degC, AMBIENT_SHARE * float(np.min(scale.high_degC - scale.low_degC))),
+            float(np.max(scale.ambient_degC_spread)),
+        ),
     )
     lower = asked.references[-1]
     swing = asked.references.mean(axis=0), asked.sinusoid.amplitude_degC, float(asked.sinusoid.period_steps)

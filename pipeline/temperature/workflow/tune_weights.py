@@ -81,15 +81,17 @@ def _searched(
         return _cost(made, rests, settings, setting) * (1 + NEARER * float(far @ far))
 
     first = tuning.History(start[None], *_first(cost, start))
-    result = tuning.minimise(
-        cost,
-        low,
-        high,
-        tuning.SearchSettings(settings.practical_initial, settings.practical_evaluations),
-        rng=np.random.default_rng(settings.seed),
-        start=first,
-    )
-    return name, result
+    try:
+        return name, tuning.minimise(
+            cost,
+            low,
+            high,
+            tuning.SearchSettings(settings.practical_initial, settings.practical_evaluations),
+            rng=np.random.default_rng(settings.seed),
+            start=first,
+        )
+    except ValueError as reason:  # every candidate failed: the others go on
+        return name, str(reason)
 
 
 def _first(cost, start: np.ndarray) -> tuple[np.ndarray, tuple[str, ...], np.ndarray]:
