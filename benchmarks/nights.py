@@ -31,7 +31,7 @@ import yaml
 from pipeline.nightly import champion, judge, night, processes
 from pipeline.report.nightly.record import Night
 from pipeline.store import artifacts, params
-from pipeline.temperature import judging, scorecard
+from pipeline.temperature import panel
 from pipeline.temperature.plant import Plant, hold_output, plant
 from pipeline.temperature.probing import InputLimits, OperatingPoint, prbs, probe
 
@@ -160,8 +160,9 @@ def settings() -> dict:
     found["generate_probing"] |= {"source": "recordings", "samples": 100}
     found["panel"] |= {
         "steps": 150,
-        "noise_degC": [0.1],
-        "training": {"starts_degC": [60], "reference_offsets_degC": [0], "seeds": [101]},
+        "settled_steps": 40,
+        "training": found["panel"]["training"] | {"plants": 6},
+        "judging": found["panel"]["judging"] | {"plants": 6},
     }
     found["learn_kernel"] |= {"longest_window": 8}
     found["identify_plant"] |= {"max_order": 3}
@@ -175,7 +176,7 @@ def settings() -> dict:
             }
         },
         "holdout": SETTINGS["holdout"] | {"starts_degC": [50, 90], "reference_offsets_degC": [0, -10],
-        "seeds": [901, 902]},
+        "seed": 901, "plants": 16},
     }  # fmt: skip
     found["nightly"]["holdout"]["steps"] = 150
     return found
@@ -219,33 +220,28 @@ def play(index: int, columns: dict[str, np.ndarray] | None) -> tuple[int, str, N
 def true_cost(folder: Path) -> float:
     """What the controller below `folder` costs on the machine itself,
     over starts, references and seeds of its own."""
-    p = params.read()
-    made, _, weights = judge.controller(folder, p["nightly"]["holdout"]["controller"], p["tracking"]["gamma"])
-    limits = (np.zeros(2), np.full(2, 100.0))
-    plants = [machine(gain=(a, b)) for a, b in ((1, 1), (0.95, 1.05), (1.05, 0.95))]
-    scenarios = scorecard.panel(
-        plants,
-        starts=[40.0, 70.0, 100.0],
-        references=[REFERENCE + d for d in (0.0, -10.0, -20.0)],
-        noise=[NOISE_DEGC],
-        seeds=range(5),
+    from pipeline.nightly.settings import Nightly
+
+    holdout = params.load(Nightly, "nightly").holdout
+    plants = [machine(gain=gain) for gain in ((1, 1), (0.95, 1.05), (1.05, 0.95))] * 5
+    asked = panel.asked(
+        [panel.delayed(one, late=False) for one in plants],
+        panel.Questions(
+            np.array([[start] * 2 for start in (40.0, 70.0, 100.0)]),
+            REFERENCE - np.array([[0.0], [10.0], [20.0]]),
+            None,
+            None,
+            None,
+        ),
+        noise=np.full(2, NOISE_DEGC),
+        seed=0,
         steps=150,
         hold=30,
         cells=False,
     )
-    law = made.design(weights["q"], weights["r"], p["tracking"]["integral"])
-    run = scorecard.simulate(
-        scenarios, law, scorecard.feed_forward(scenarios, law, judging.targets(made.model, scenarios.r,
-        limits)), limits=limits,
-        integral_band=p["tracking"]["integral_limit_degC"],
-    )  # fmt: skip
-    allowance = scorecard.Allowance(
-        *(p["tune_weights"][f"allow_{name}"] for name in scorecard.Allowance._fields[:-1]), 0.0
-    )
-    figures = scorecard.figures(
-        scenarios, run, limits=limits, band=p["panel"]["band_degC"], sample_time_s=1.0
-    )
-    return scorecard.engineering_cost(figures, scenarios.plant, allowance, longest_s=150.0)
+    frozen = judge.frozen_panel(holdout)
+    frozen = frozen._replace(rehearsal=frozen.rehearsal._replace(judging=asked))
+    return float(judge.judged(frozen, folder, holdout.controller).costs.mean())
 
 
 # ---- scenarios
@@ -371,14 +367,12 @@ def planted(seed: int, folder: Path, with_dvc: bool) -> dict:
     rule = params.load(Nightly, "nightly")
     measured = judge.judge(rule.loops["temperature"], rule).measure
     own = Path("champion/temperature/tune_weights/weights.json")
-    weights = artifacts.read_json(own)
+    weights = artifacts.read_json(own)["contestants"]
+    mine = weights[rule.holdout.controller]
 
     def cost(share: float) -> float:
-        artifacts.write_json(
-            own,
-            weights
-            | {"practical": weights["practical"] | {"r": [r * share for r in weights["practical"]["r"]]}},
-        )
+        worse = mine | {"effort_weight": mine["effort_weight"] * share}
+        artifacts.write_json(own, {"contestants": weights | {rule.holdout.controller: worse}})
         return float(
             np.mean([value for _, value in measured(champion.FOLDER / "temperature").cases.values()])
         )

@@ -1,205 +1,216 @@
-"""Our kernel beside the published form of Algorithm 2, vectorised: CPU seconds on one
-core and peak memory above the imports, in one run.
+"""The temperature comparison done again: would its sentences stay true on another record, with other tuning
+seeds, on other plants, and with less or more prior knowledge of how far plants differ?
 
-`./run python -m benchmarks.temperature` prints the figures beside the bars and writes
-benchmarks/results/temperature.json. Each figure is the median of several fresh processes; the
-naive form, a minute and more, has one. Both forms get the same tuples (N = 6, 15,000 samples, the
-study's reference, mu = 1e-4) and make 500 iterations.
+`./run python -m benchmarks.temperature` relearns everything from fresh records (probing, identification,
+kernel, tuning of every contestant, judging; each with seeds of its own, the panel's plants too), tunes five
+times on one record, and removes and adds the prior for all contestants alike. It writes
+benchmarks/results/temperature_relearned.json, from which the pages take the bands of the figures: the
+interval of the relearnings, smallest to largest, which a further one falls into with probability (n - 1) /
+(n + 1). `--relearnings 8 --jobs 2` makes fewer. `--fresh 8` only counts how many figures of 8 further
+relearnings the bands on file hold.
 """
 
+import argparse
+import contextlib
+import datetime
+import io
 import json
 import os
-import resource
-import statistics
-import subprocess
-import sys
-import time
-from collections.abc import Callable
+import shutil
+import tempfile
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import joblib
 import numpy as np
+import yaml
 
-from pipeline.temperature.kernel import (
-    Tuples,
-    quadratic_gram,
-    regress,
-    tuples,
-    tuples_with_reference,
-    value_iteration,
-)
-from pipeline.temperature.plant import baam
-from pipeline.temperature.published import GAMMA, REFERENCE
-from pipeline.temperature.study import data_sets
-from pipeline.temperature.tracking import gains
-from tests.temperature import naive
-
-RESULTS = Path(__file__).parent / "results" / "temperature.json"
-SAMPLES, ITERATIONS, REPEATS = 15_000, 500, 5
-I5, I7 = np.eye(5), np.eye(7)
-
-
-def explicit() -> Tuples:
-    """The study's whole problem on its scaled data, with its reference in the state."""
-    u, y = data_sets(np.random.default_rng(1), SAMPLES, 1)
-    return tuples_with_reference([u[:, 0] / 1000], [y[:, 0] / 1000], 6, REFERENCE / 1000, I5)
-
-
-def short() -> Tuples:
-    """500 complete windows of 2, for any reference."""
-    u, y = data_sets(np.random.default_rng(1), 502, 1)
-    return tuples([u[:, 0]], [y[:, 0]], 2)
-
-
-def kernel_6() -> Callable[[], object]:
-    data = explicit()
-    # every row in the Gram matrix: none is dropped or thinned out on the way into it
-    assert len(data.s) == SAMPLES - 6
-    return lambda: value_iteration(
-        regress(data, mu=1e-4), I5, I7, GAMMA, tolerance=0.0, max_iterations=ITERATIONS
-    )
-
-
-def naive_6() -> Callable[[], object]:
-    data = explicit()
-    return lambda: naive.value_iteration(
-        data.s, data.u, data.e, data.s_next, I5, I7, GAMMA, mu=1e-4, iterations=ITERATIONS
-    )
-
-
-def kernel_2() -> Callable[[], object]:
-    data = short()
-    return lambda: value_iteration(regress(data), I5, I7, GAMMA)
-
-
-def retune_2() -> Callable[[], object]:
-    """New weights on what the data say: no pass over them."""
-    learned = regress(short())
-    rng = np.random.default_rng(2)
-    q, r = rng.uniform(0.01, 1.0, 5), rng.uniform(0.01, 0.4, 7)
-    return lambda: value_iteration(learned, np.diag(q), np.diag(r), GAMMA)
-
-
-def riccati_pair() -> Callable[[], object]:
-    plant = baam()
-    return lambda: gains(plant, I5, I7, GAMMA)
-
-
-# the case; how many processes; how often it is repeated in one, of which the median counts
-CASES = {
-    "kernel_6": (kernel_6, REPEATS, 1),
-    "naive_6": (naive_6, 1, 1),
-    "kernel_2": (kernel_2, REPEATS, 5),
-    "retune_2": (retune_2, REPEATS, 15),
-    "riccati": (riccati_pair, REPEATS, 200),
+RESULTS = Path(__file__).parent / "results" / "temperature_relearned.json"
+ROOT = Path(__file__).parent.parent
+STAGES = ("probe_machine", "ingest", "identify_plant", "learn_kernel", "tune_weights", "evaluate_temperature")
+FIGURES = ("settled_error", "settling", "overshoot", "at_limits", "energy", "cost", "rms")
+ENDS = ("median", "q90")
+# what a relearning changes: everything that is drawn
+SEEDS = ("generate_probing.seed", "identify_plant.seed", "tune_weights.seed", "panel.training.seed",
+         "panel.judging.seed")  # fmt: skip
+PRIORS: dict[str, dict[str, Any]] = {
+    # tuned on the identified plant alone, and windows learned for no other gain than the record's
+    "removed": {"panel.training.spread": 0.0, "learn_kernel.gain_spread": 0.0},
+    # half as much again as the panel, and windows learned for its whole spread of gains
+    "added": {"panel.training.spread": 1.5, "learn_kernel.gain_spread": 0.0866},
 }
 
 
-def peak_MB() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+def relearned(seeds: Mapping[str, int], changes: Mapping[str, Any], stages=STAGES, start: str = "") -> dict:
+    """evaluate_temperature.json of one run of the stages in a folder of its own; `start` is a folder whose
+    datasets it goes on from."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for file in ("params.yaml", "params.expert.yaml"):
+            values = yaml.safe_load((ROOT / file).read_text())
+            for dotted, value in {**seeds, **changes, "execution.jobs": 1}.items():
+                *parents, key = dotted.split(".")
+                place = values
+                for parent in parents:
+                    place = place.get(parent, {}) if isinstance(place, dict) else {}
+                if isinstance(place, dict) and key in place:
+                    place[key] = value
+                elif dotted in changes and parents[0] in values and file == "params.expert.yaml":
+                    place[key] = value
+            (folder / file).write_text(yaml.safe_dump(values))
+        (folder / "datasets/raw/temperature").mkdir(parents=True)
+        if start:
+            for done in STAGES[: STAGES.index(stages[0])]:
+                shutil.copytree(Path(start) / done, folder / "datasets" / done)
+        before = os.getcwd()
+        os.chdir(folder)
+        try:
+            for stage in stages:
+                module = __import__(f"stages.{stage}", fromlist=["main"])
+                with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+                    module.main()
+            return json.loads(Path("reports/metrics/evaluate_temperature.json").read_text()) | {
+                "tuned_cost": {
+                    key: one["cost"]
+                    for key, one in json.loads(Path("reports/metrics/tune_weights.json").read_text())[
+                        "contestants"
+                    ].items()
+                }
+            }
+        finally:
+            os.chdir(before)
 
 
-def measure(name: str) -> dict[str, float]:
-    """In this process: CPU seconds (median over `repeats`, the first left out where there are several), and
-    peak memory above the imports and above the tuples."""
-    case, _, repeats = CASES[name]
-    quadratic_gram(np.ones((2, 4)))
-    imports = peak_MB()
-    work = case()
-    tuples_made, seconds, result = peak_MB(), [], None
-    for _ in range(repeats):
-        started = time.process_time()
-        result = work()
-        seconds.append(time.process_time() - started)
-    iterations = getattr(result, "iterations", None)
-    if name == "kernel_6" and iterations != ITERATIONS:
-        raise ValueError(f"kernel_6 should make {ITERATIONS} iterations but made {iterations}")
+def figures(runs: list[dict]) -> dict[str, Any]:
+    """By contestant and figure the smallest, middle and largest median and 90 % quantile of the runs; None
+    where a run has none (never settles)."""
+    names = [name for name in runs[0]["contestants"] if all(name in run["contestants"] for run in runs)]
+    result: dict[str, Any] = {}
+    for name in names:
+        for figure in FIGURES:
+            for end in ENDS:
+                values = [run["contestants"][name][figure][end] for run in runs]
+                finite = np.array([np.inf if value is None else value for value in values])
+                low, middle, high = finite.min(), np.median(finite), finite.max()
+                result.setdefault(name, {}).setdefault(figure, {})[end] = {
+                    key: float(value) if np.isfinite(value) else None
+                    for key, value in (("low", low), ("median", middle), ("high", high))
+                }
+    return result
+
+
+def answers(runs: list[dict]) -> dict[str, Any]:
+    """How often each contestant was the best, and won the pair; and the largest differences of the runs."""
+
+    def counted(values: list) -> dict[str, int]:
+        return {str(value): values.count(value) for value in dict.fromkeys(values)}
+
     return {
-        "cpu_s": statistics.median(seconds[1:] or seconds),
-        "above_imports_MB": peak_MB() - imports,
-        "of_which_data_MB": tuples_made - imports,
+        "runs": len(runs),
+        "best": counted([run["best"] for run in runs]),
+        "leading": counted([run["best_reason"]["leading"] for run in runs]),
+        "pair_winner": counted([run["pair"]["winner"] for run in runs]),
+        "pair_difference_percent": [run["pair"]["difference"] for run in runs],
     }
 
 
-def fresh(name: str) -> dict[str, float]:
-    """`measure` in processes of their own, one BLAS thread each: the median of each figure."""
-    environment = os.environ | dict.fromkeys(
-        ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1"
-    )
-    runs = [
-        json.loads(
-            subprocess.run(
-                [sys.executable, "-m", "benchmarks.temperature", name],
-                env=environment,
-                check=True,
-                capture_output=True,
-                text=True,
-            ).stdout
+def spread_percent(runs: list[dict]) -> dict[str, Any]:
+    """Of runs on one record: by contestant the largest difference of the tuned cost, and of each 90 %
+    quantile, in percent of the smallest."""
+    result: dict[str, Any] = {}
+    for name in runs[0]["tuned_cost"]:
+        costs = np.array([run["tuned_cost"].get(name, np.nan) for run in runs])
+        mine = {"cost": float(100 * (costs.max() / costs.min() - 1))}
+        for figure in ("settled_error", "settling", "overshoot", "cost"):
+            values = np.array(
+                [
+                    run["contestants"][name][figure]["q90"] or np.inf
+                    for run in runs
+                    if name in run["contestants"]
+                ]
+            )
+            change = 100 * (values.max() / values.min() - 1) if np.isfinite(values).all() else np.inf
+            mine[f"q90_{figure}"] = float(change) if np.isfinite(change) else None
+        result[name] = mine
+    return result
+
+
+def cover(bands: Mapping[str, Any], runs: list[dict]) -> dict[str, Any]:
+    """The share of fresh runs inside each band, in percent: the mean over all bands and the smallest."""
+    shares = {}
+    for name, by_figure in bands.items():
+        for figure, by_end in by_figure.items():
+            band = by_end["q90"]
+            values = [run["contestants"].get(name, {}).get(figure, {}).get("q90") for run in runs]
+            low, high = (np.inf if band[key] is None else band[key] for key in ("low", "high"))
+            inside = [low <= (np.inf if value is None else value) <= high for value in values]
+            shares[f"{name}.{figure}"] = 100 * float(np.mean(inside))
+    return {
+        "fresh": len(runs),
+        "bands": len(shares),
+        "mean_percent": float(np.mean(list(shares.values()))),
+        "least_percent": float(min(shares.values())),
+        "least": min(shares, key=lambda key: shares[key]),
+    }
+
+
+def many(count: int, first: int, changes: Mapping[str, Any], jobs: int) -> list[dict]:
+    """`count` relearnings, everything drawn anew from seeds that begin with `first`."""
+    work = [dict.fromkeys(SEEDS, first + k) | {"panel.training.seed": 5000 + first + k} for k in range(count)]
+    return list(
+        joblib.Parallel(n_jobs=jobs, return_as="generator")(
+            joblib.delayed(relearned)(seeds, changes) for seeds in work
         )
-        for _ in range(CASES[name][1])
-    ]
-    return {key: statistics.median(run[key] for run in runs) for key in runs[0]}
+    )
 
 
-def bars(measured: dict[str, dict[str, float]]) -> list[tuple[str, float, float, bool]]:
-    """Figure, value, bar, and whether more is better."""
-    return [
-        (
-            "N = 6, 15,000 samples, 500 iterations: times faster than the naive form",
-            measured["naive_6"]["cpu_s"] / measured["kernel_6"]["cpu_s"],
-            50.0,
-            True,
-        ),
-        (
-            "N = 6, 15,000 samples: GB above the imports",
-            measured["kernel_6"]["above_imports_MB"] / 1024,
-            0.6,
-            False,
-        ),
-        ("N = 2, 500 samples: s", measured["kernel_2"]["cpu_s"], 0.05, False),
-        ("new weights: ms", 1000 * measured["retune_2"]["cpu_s"], 30.0, False),
-        ("Riccati gains of a pair (Q, R): ms", 1000 * measured["riccati"]["cpu_s"], 1.0, False),
-    ]
+def tuned_again(jobs: int) -> list[dict]:
+    """Five tuning seeds on the record of the accepted run (datasets/ of this checkout)."""
+    after = STAGES[STAGES.index("tune_weights") :]
+    return joblib.Parallel(n_jobs=jobs)(
+        joblib.delayed(relearned)({"tune_weights.seed": seed}, {}, after, str(ROOT / "datasets"))
+        for seed in range(1, 6)
+    )
 
 
 def main() -> None:
-    if len(sys.argv) > 1:
-        print(json.dumps(measure(sys.argv[1])))
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--relearnings", type=int, default=24)
+    parser.add_argument("--priors", type=int, default=4, help="relearnings without, and with more, prior")
+    parser.add_argument(
+        "--fresh", type=int, default=0, help="only: further relearnings against the file's bands"
+    )
+    parser.add_argument("--jobs", type=int, default=2)
+    chosen = parser.parse_args()
+    if chosen.fresh:
+        on_file = json.loads(RESULTS.read_text())
+        runs = many(chosen.fresh, 9000, {}, chosen.jobs)
+        on_file["cover"] = cover(on_file["contestants"], runs) | {"answers": answers(runs)}
+        RESULTS.write_text(json.dumps(on_file, indent=1) + "\n")
+        print(json.dumps(on_file["cover"], indent=1))
         return
-    measured = {}
-    for name in CASES:
-        print(f"{name} ...", file=sys.stderr, flush=True)
-        measured[name] = fresh(name)
-    for name, figures in measured.items():
-        print(
-            f"{name:10} {figures['cpu_s']:10.4f} CPU s {figures['above_imports_MB']:8.0f} "
-            "MB above the imports"
-        )
-    table = bars(measured)
-    for figure, value, bar, more in table:
-        held = value >= bar if more else value <= bar
-        print(
-            f"{figure}: {value:.3g}, bar {'at least' if more else 'at most'} {bar:g}: "
-            f"{'held' if held else 'MISSED'}"
-        )
+    runs = many(chosen.relearnings, 1000, {}, chosen.jobs)
+    again = tuned_again(chosen.jobs)
+    machine = yaml.safe_load((ROOT / "params.yaml").read_text())["plant"]
     result = {
-        "command": "./run python -m benchmarks.temperature",
-        "machine": {"cores": os.cpu_count(), "blas_threads": 1},
-        "cases": {
-            name: {key: float(f"{value:.3g}") for key, value in figures.items()}
-            for name, figures in measured.items()
+        "command": f"./run python -m benchmarks.temperature --relearnings {chosen.relearnings}",
+        "date": datetime.date.today().isoformat(),
+        "machine": {
+            "outputs": [o["name"] for o in machine["outputs"]],
+            "sample_time_s": machine["sample_time_s"],
         },
-        "figures": [
-            {
-                "figure": figure,
-                "value": float(f"{value:.3g}"),
-                "bar": bar,
-                "better": "more" if more else "less",
-            }
-            for figure, value, bar, more in table
-        ],
+        "relearnings": len(runs),
+        "holds_percent": 100 * (len(runs) - 1) / (len(runs) + 1),
+        "contestants": figures(runs),
+        "answers": answers(runs),
+        "five_tuning_seeds": answers(again) | {"spread_percent": spread_percent(again)},
+        "prior": {
+            name: answers(many(chosen.priors, 1000, changes, chosen.jobs)) for name, changes in PRIORS.items()
+        },
     }
-    RESULTS.parent.mkdir(exist_ok=True)
-    RESULTS.write_text(json.dumps(result, indent=2) + "\n")
+    RESULTS.write_text(json.dumps(result, indent=1) + "\n")
+    print(json.dumps({key: result[key] for key in ("answers", "five_tuning_seeds", "prior")}, indent=1))
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from pathlib import Path
 from pipeline.nightly import commands as nights
 from pipeline.store import artifacts, params
 from pipeline.store.printable import printable
-from pipeline.temperature.workflow.settings import Ingest, Panel
+from pipeline.temperature.workflow.settings import Ingest, Plant
 
 
 def accept(_: argparse.Namespace) -> None:
@@ -41,7 +41,7 @@ def accept(_: argparse.Namespace) -> None:
         "hashes": hashes,
         "code": code_files(("pipeline", "stages")),
     }
-    artifacts.write_json("reports/accepted.json", run | {"figures": _figures()})
+    artifacts.write_json("reports/accepted.json", run | _shown())
     print(
         f"reports/accepted.json: accepted {len(metrics)} stages' figures and {len(hashes)} artifacts; "
         "commit it to keep it"
@@ -59,11 +59,11 @@ def _today() -> dict[str, str]:
     }
 
 
-def _figures() -> dict:
-    """The figures with their bands as the pages show them; none where no page was made. Raises ValueError
-    where the pages are of another run."""
+def _shown() -> dict:
+    """What the pages show: figures with their bands, and which contestant of the temperature loop the verdict
+    chose; nothing where no page was made. Raises ValueError where the pages are of another run."""
     if not artifacts.exists("reports/metrics/report.json"):
-        return {}
+        return {"figures": {}, "winner": None}
     report = artifacts.read_metrics("report")
     stale = [
         path
@@ -75,7 +75,7 @@ def _figures() -> dict:
             f"reports: the pages are of another run than {stale[0]}; run ./run dvc repro, "
             "look at them, and accept then"
         )
-    return report["figures"]
+    return {"figures": report["figures"], "winner": report["verdict"]["winner"]}
 
 
 def verify(_: argparse.Namespace) -> None:
@@ -98,10 +98,8 @@ def history(arguments: argparse.Namespace) -> None:
     pages = [
         (path.stem, path.name) for path in sorted(Path("reports").glob("*.html")) if path.stem != "history"
     ]
-    rules, panel = params.load(ReportRules, "report"), params.load(Panel, "panel")
-    artifacts.write_text(
-        "reports/history.html", trend.render(found, rules, band_degC=panel.band_degC, pages=pages)
-    )
+    rules = params.load(ReportRules, "report")
+    artifacts.write_text("reports/history.html", trend.render(found, rules, pages=pages))
     print(f"reports/history.html: {len(found)} runs, the last {found[-1].commit[:8] or 'not committed'}")
 
 
@@ -129,6 +127,16 @@ def init(arguments: argparse.Namespace) -> None:
     if arguments.copy:
         propose_params.copy(arguments.recordings)
     print(propose_params.summary(initialised, changed, arguments.recordings, arguments.copy))
+
+
+def first_experiment(arguments: argparse.Namespace) -> None:
+    """A staircase for a machine of which there is no record yet: which input, which level, for how long, and
+    at which temperature to stop. No model is behind it."""
+    from pipeline.temperature.workflow import first_experiment as first
+
+    plan = first.staircase(params.load(Plant, "plant"), arguments.hold)
+    artifacts.write_csv(arguments.out, first.columns(plan))
+    print(first.instructions(plan, str(arguments.out)))
 
 
 def compose(arguments: argparse.Namespace) -> None:
@@ -209,6 +217,10 @@ def main() -> None:
         help="the sample time of recordings that do not say it",
     )
     command.set_defaults(run=init)
+    command = commands.add_parser("first-experiment", help=first_experiment.__doc__)
+    command.add_argument("--hold", type=float, default=300.0, help="seconds of a step at most (300)")
+    command.add_argument("--out", type=Path, default=Path("first_experiment.csv"), metavar="FILE")
+    command.set_defaults(run=first_experiment)
     command = commands.add_parser("compose", help=compose.__doc__)
     command.add_argument("part", type=Path, help="the part program (G-code)")
     command.add_argument("--out", type=Path, default=Path("."), help="folder for signal, tasks and report")

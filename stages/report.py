@@ -17,7 +17,7 @@ from pipeline.report.shared.verdict import ReportRules
 from pipeline.report.temperature import page as temperature_page
 from pipeline.report.temperature.judgement import judgement, shown
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow.settings import Panel, Plant, Tracking
+from pipeline.temperature.workflow.settings import Plant
 
 # what the pages show of each stage: its figures, and its folder of tables
 METRICS = {
@@ -39,7 +39,6 @@ METRICS = {
 FOLDERS = {
     "ingest": "datasets/ingest",
     "identify_plant": "datasets/identify_plant",
-    "learn_kernel": "datasets/learn_kernel",
     "tune_weights": "datasets/tune_weights",
     "evaluate_temperature": "datasets/evaluate_temperature",
     "reproduce_study": "datasets/reproduce_study",
@@ -54,13 +53,7 @@ FOLDERS = {
 
 def main() -> None:
     with artifacts.stage("report"):
-        declared = Declared(
-            params.load(ReportRules, "report"),
-            params.load(Plant, "plant"),
-            params.load(Panel, "panel"),
-            params.load(Tracking, "tracking"),
-            params.read(),
-        )
+        declared = Declared(params.load(ReportRules, "report"), params.load(Plant, "plant"), params.read())
         sources = collect(declared, METRICS, FOLDERS, "reports/accepted.json", ("pipeline", "stages"))
         judged = judgement(sources)
         pages = {

@@ -1,5 +1,6 @@
-"""Tune every contestant by itself, by Bayesian optimisation: reads what identify_plant and learn_kernel wrote;
-writes datasets/tune_weights/weights.json and history.parquet. No data stage is touched by new weights."""
+"""Tune every contestant by itself, by Bayesian optimisation: reads what identify_plant and learn_kernel
+wrote; writes datasets/tune_weights/weights.json and history.parquet. No data stage is touched by new
+weights."""
 
 from pipeline.store import artifacts, params
 from pipeline.temperature import plant

@@ -2,12 +2,18 @@
 
 import re
 import runpy
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pipeline import cli
+from pipeline.report.shared.verdict import ReportRules
+from pipeline.report.temperature import readme
+from pipeline.report.temperature.verdict import decide
 from pipeline.setpoint import score
+from pipeline.store import artifacts, params
+from pipeline.temperature.workflow.settings import Plant
 
 LOOPS = ("temperature", "deposition", "setpoint")
 
@@ -68,3 +74,43 @@ def test_the_version_is_one_and_the_same_wherever_it_stands(root, monkeypatch, c
     assert f'name = "beadline"\nversion = "{version}"\n' in (root / "uv.lock").read_text(encoding="utf-8")
     changes = (root / "CHANGELOG.md").read_text(encoding="utf-8")
     assert re.findall(r"^## \[(.*?)\]", changes, re.MULTILINE)[0] == version
+
+
+def readme_of_today(root: Path) -> str:
+    """README.md with the temperature loop's figures as reports/metrics has them, and the verdict that the
+    pages say of them."""
+    metrics = {
+        stage: artifacts.read_json(root / f"reports/metrics/{stage}.json")
+        for stage in ("evaluate_temperature", "identify_plant", "learn_kernel")
+    }
+    rules = params.load(ReportRules, "report", root / params.FILE)
+    machine = params.load(Plant, "plant", root / params.FILE)
+    accepted = artifacts.read_json(root / "reports/accepted.json")
+    verdict = decide(
+        metrics,
+        rules,
+        recorded=False,
+        undeclared=[output.name for output in machine.outputs if output.low is None or output.high is None],
+        incumbent=str(accepted.get("winner") or ""),
+    )
+    text = readme.block(metrics, rules, verdict)
+    return readme.rewritten((root / "README.md").read_text(encoding="utf-8"), text)
+
+
+def test_the_temperature_figures_of_the_readme_are_those_of_the_last_run(root):
+    assert (root / "README.md").read_text(encoding="utf-8") == readme_of_today(root), (
+        "run ./run python -m tests.test_docs, which writes them"
+    )
+
+
+def test_no_page_and_no_document_advises_to_deploy(root):
+    pages = [*(root / "pipeline/report/templates").glob("*"), *(root / "docs").glob("*"), root / "README.md"]
+    advice = re.compile(r"\bdeploy\b", re.IGNORECASE)
+    assert not [
+        path.name for path in pages if path.is_file() and advice.search(path.read_text(encoding="utf-8"))
+    ]
+
+
+if __name__ == "__main__":
+    here = Path(__file__).resolve().parents[1]
+    (here / "README.md").write_text(readme_of_today(here), encoding="utf-8")

@@ -1,7 +1,7 @@
 """A controller's files -> evidence: the temperature loop on a frozen panel of plants that nothing was learned
 from; any loop from a file of costs by case."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,8 +13,11 @@ from pipeline.nightly.decision import Evidence
 from pipeline.nightly.settings import HoldOut, Loop, Nightly, Rule
 from pipeline.setpoint.workflow import tables
 from pipeline.store import artifacts, params
-from pipeline.temperature.workflow import ingest
-from pipeline.temperature.workflow.settings import Panel, Plant, Tracking
+from pipeline.temperature import controller, panel, plant, window
+from pipeline.temperature import tracking as temperature_tracking
+from pipeline.temperature.workflow import cases, contestants, evaluate_temperature, ingest, learned
+from pipeline.temperature.workflow.settings import Panel, Tracking, TuneWeights
+from pipeline.temperature.workflow.settings import Plant as Machine
 
 MEMO = Path(".beadline/panel")
 
@@ -109,143 +112,203 @@ def _allowed(champion: Evidence, rule: Rule) -> dict[str, float]:
 
 
 class FrozenPanel(NamedTuple):
-    """What every controller of the temperature loop is judged on, night after night; `name` is the hash of
-    all that it was made from."""
+    """What every controller of the temperature loop is judged on, night after night: plants, starts,
+    references and noise, which are both halves of `rehearsal`, and the hold-out recordings; `name` is the
+    hash of all that they were made from."""
 
     name: str
-    machine: Plant
+    machine: Machine
     tracking: Tracking
-    band_degC: float
-    plants: list
-    scenarios: Any
-    allowance: Any
+    settings: Panel
+    tuning: TuneWeights
+    rehearsal: cases.Rehearsal
     records: list[tuple[np.ndarray, np.ndarray]]
 
-    @property
-    def limits(self) -> tuple[np.ndarray, np.ndarray]:
-        low, high = np.array([(i.low, i.high) for i in self.machine.inputs]).T
-        return low, high
+
+class NotComparable(ValueError):
+    """A controller that cannot be designed from its files, in one sentence."""
+
+
+# besides plant.parquet and window.parquet: what some contestants are designed from
+DESIGNED_FROM = {
+    "printer_pid": "ingest/printer_pid.json",
+    "pi_simc": "identify_plant/spread.parquet",
+    "pi": "identify_plant/spread.parquet",
+    "learned_kernel": "learn_kernel/kernel.parquet",
+}
 
 
 def _temperature(settings: Nightly) -> Callable[[Path], Evidence]:
-    """Closed loop on every plant of the frozen panel, from starts and to references of section
-    `nightly.holdout`, with its seeds; prediction on the hold-out recordings."""
-    panel = _frozen_panel(settings.holdout)
-    return lambda folder: _closed_loop(panel, folder, settings)
+    """Closed loop on every plant of the frozen panel, as deployed; prediction on the hold-out recordings."""
+    frozen = frozen_panel(settings.holdout)
+    return lambda folder: _closed_loop(frozen, folder, settings)
 
 
-def _frozen_panel(holdout: HoldOut) -> FrozenPanel:
-    from pipeline.temperature import plant, scorecard
-
-    machine, tracking = params.load(Plant, "plant"), params.load(Tracking, "tracking")
-    panel, weights = params.load(Panel, "panel"), params.read()["tune_weights"]
-    allowance = scorecard.Allowance(
-        *(float(weights[f"allow_{name}"]) for name in scorecard.Allowance._fields[:-1]), 0.0
-    )
+def frozen_panel(holdout: HoldOut) -> FrozenPanel:
+    """Plants drawn, with the seed of section `nightly.holdout`, around the true plant or around those of the
+    hold-out recordings, as far away as section `panel` says."""
+    machine, tracking = params.load(Machine, "plant"), params.load(Tracking, "tracking")
+    settings, tuning = params.load(Panel, "panel"), params.load(TuneWeights, "tune_weights")
     simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
     records = [] if simulated else _holdout_records(holdout, machine)
-    if simulated:
-        plants = plant.spread(
-            plant.baam()._replace(sample_time_s=machine.sample_time_s),
-            input_gain=panel.input_gain,
-            extra_heat_loss=panel.extra_heat_loss_per_step,
-        )
-        # between the declared plants: the panel that the stages judge on has the ends
-        plants = plant.spread(
-            plants[0], input_gain=0.6 * panel.input_gain, extra_heat_loss=0.6 * panel.extra_heat_loss_per_step
-        )
-    else:
-        plants = _panel_plants(records, machine)
+    truth = plant.baam()._replace(sample_time_s=machine.sample_time_s)
+    nominal = [truth] if simulated else _panel_plants(records, machine)
+    spread = cases.spread_of(settings) if simulated else cases.spread_around(settings, nominal[0])
+    rng = np.random.default_rng(holdout.seed)
+    plants = panel.padded(panel.drawn(nominal, holdout.plants, spread, cells=simulated, rng=rng))
+    noise = np.full(len(machine.outputs), holdout.noise_degC)
+    asked = panel.asked(
+        plants,
+        _questions(holdout, machine),
+        noise=noise,
+        seed=holdout.seed,
+        steps=holdout.steps,
+        hold=settings.hold_steps,
+        cells=simulated,
+    )
+    made_from = (
+        holdout.model_dump(),
+        [tuple(map(np.asarray, matrices)) for matrices in plants],
+        machine.model_dump(),
+        tracking.model_dump(),
+        settings.model_dump(exclude={"training", "judging"}),
+        {key: value for key, value in tuning.model_dump().items() if key.startswith("allow_")},
+    )
+    rehearsal = cases.Rehearsal(asked, asked, settings.band_degC, None, noise, [], "declared")
+    return FrozenPanel(joblib.hash(made_from), machine, tracking, settings, tuning, rehearsal, records)
+
+
+def _questions(holdout: HoldOut, machine: Machine) -> panel.Questions:
     reference = np.array([output.reference for output in machine.outputs])
-    scenarios = scorecard.panel(
-        plants, starts=holdout.starts_degC,
-        references=[reference + offset for offset in holdout.reference_offsets_degC],
-        noise=[holdout.noise_degC], seeds=holdout.seeds,
-        steps=holdout.steps, hold=panel.hold_steps, cells=simulated,
-    )  # fmt: skip
-    name = joblib.hash(
-        (
-            holdout.model_dump(),
-            [tuple(map(np.asarray, matrices)) for matrices in plants],
-            machine.model_dump(),
-            tracking.model_dump(),
-            panel.model_dump(),
-            tuple(allowance),
-        )
+    return panel.Questions(
+        np.array([start * np.ones_like(reference) for start in holdout.starts_degC]),
+        np.array([reference + offset for offset in holdout.reference_offsets_degC]),
+        None,
+        None,
+        None,
     )
-    return FrozenPanel(name, machine, tracking, panel.band_degC, plants, scenarios, allowance, records)
 
 
-def _closed_loop(panel: FrozenPanel, folder: Path, settings: Nightly) -> Evidence:
-    from pipeline.temperature import judging, scorecard
-
-    scenarios, limits, tracking = panel.scenarios, panel.limits, panel.tracking
-    made, predictor, weight = controller(folder, settings.holdout.controller, tracking.gamma)
-    law = made.design(weight["q"], weight["r"], tracking.integral)
-    aims = judging.targets(made.model, scenarios.r, limits)
-    rollout = scorecard.simulate(
-        scenarios,
-        law,
-        scorecard.feed_forward(scenarios, law, aims),
-        limits=limits,
-        integral_band=tracking.integral_limit_degC,
-    )
-    figures = scorecard.figures(
-        scenarios, rollout, limits=limits, band=panel.band_degC, sample_time_s=panel.machine.sample_time_s
-    )
-    costs = _costs(panel, figures)
-    cases = {
-        f"plant {p}, {start:g} °C to {r:g} °C, seed {seed}": (f"plant {p}", float(cost))
-        for p, start, r, seed, cost in zip(
-            scenarios.plant, scenarios.start, scenarios.r[:, 0], scenarios.seed, costs, strict=True
+def _closed_loop(frozen: FrozenPanel, folder: Path, settings: Nightly) -> Evidence:
+    result = judged(frozen, folder, settings.holdout.controller)
+    asked = frozen.rehearsal.judging
+    references = [asked.references[index].H[0, 0] for index in asked.asked[:, 0]]
+    evidence = {
+        f"plant {p}, {start:g} °C to {r:g} °C": (f"plant {p}", float(cost))
+        for p, start, r, cost in zip(
+            asked.plant, asked.starts[asked.start, 0], references, result.costs, strict=True
         )
     }
-    by_plant = [np.mean(np.array(costs)[scenarios.plant == p]) for p in np.unique(scenarios.plant)]
-    margins = scorecard.margins(panel.plants, law, grid=80)
-    smallest = min(margin.disk for margin in margins)
+    by_plant = [result.costs[asked.plant == p].mean() for p in np.unique(asked.plant)]
+    smallest = min(margin.disk for margin in result.margins)
     guards = {
         "worst_case": float(np.max(by_plant)),
-        "settled_error_degC": float(figures.settled_error_degC.max()),
+        "settled_error_degC": float(result.figures.settled_error.max()),
         "margin_short_of_least": max(settings.rule.least_disk_margin - smallest, 0.0),
-        "unstable_plants": float(sum(not margin.stable for margin in margins)),
+        "unstable_plants": float(sum(not margin.stable for margin in result.margins)),
     }
-    error = _prediction_error(predictor, panel.records)
-    return Evidence(panel.name, cases, guards | ({"holdout_error_degC": error} if error is not None else {}))
+    predictor = _predictor(folder, settings.holdout.controller, frozen.machine)
+    error = _prediction_error(predictor, frozen.records)
+    return Evidence(
+        frozen.name, evidence, guards | ({"holdout_error_degC": error} if error is not None else {})
+    )
 
 
-def _costs(panel: FrozenPanel, figures: Any) -> list[float]:
-    """The engineering cost of each case; infinite where it fails."""
-    from pipeline.temperature import scorecard
+def judged(frozen: FrozenPanel, folder: Path, name: str) -> evaluate_temperature.JudgedContestant:
+    """The contestant `name` whose files lie below `folder`, as it would be deployed: its own governor,
+    today's limits. Raises NotComparable where it cannot be designed from them."""
+    try:
+        design, setting = _designed(frozen, folder, name)
+    except ValueError as reason:
+        raise NotComparable(str(reason)) from None
+    # the gap to the optimum is for pages
+    return evaluate_temperature.judged_one(name, design._replace(plain=None), setting)[1]
 
-    costs, longest_s = [], panel.scenarios.steps * panel.machine.sample_time_s
-    for i in range(len(panel.scenarios.plant)):
-        of_case = type(figures)(*(figure[i : i + 1] for figure in figures))
-        plant_of_case = panel.scenarios.plant[i : i + 1]
-        try:
-            costs.append(
-                scorecard.engineering_cost(of_case, plant_of_case, panel.allowance, longest_s=longest_s)
+
+def _designed(frozen: FrozenPanel, folder: Path, name: str) -> tuple[contestants.Design, cases.Setting]:
+    machine, tracking = frozen.machine, frozen.tracking
+    made = _learned(folder, name, machine)
+    setting = cases.shared(
+        frozen.tuning, machine, tracking, frozen.settings, frozen.rehearsal, [made.model, *made.spread]
+    )
+    path = folder / "tune_weights/weights.json"
+    stored = artifacts.read_json(path)
+    if "contestants" not in stored and "practical" in stored:
+        return _of_version_0_1(path, name, stored["practical"], made, tracking), setting
+    contestant = contestants.BY_NAME[name]
+    mine = evaluate_temperature.read_weights(str(path), machine).get(name, {})
+    values = {one.name: mine.get(one.name) for one in contestant.parameters}
+    if lacking := [key for key, value in values.items() if value is None]:
+        raise ValueError(
+            f"{path}: expected {', '.join(lacking)} of {name}, which nightly.holdout.controller names, found "
+            f"none; name one of {', '.join(stored.get('contestants', {})) or 'those that it has'} there, or "
+            "let tune_weights tune it"
+        )
+    steps, noise = frozen.rehearsal.judging.steps, frozen.rehearsal.noise
+    problem = learned.problem(made, tracking, setting.limits, None, noise, horizon=steps)
+    design = contestant.design(problem, values)
+    if design is None:
+        raise ValueError(f"{folder}: expected what {name} is designed from, found that its record has none")
+    return design, setting
+
+
+def _learned(folder: Path, name: str, machine: Machine) -> learned.Learned:
+    """What a contestant is designed from; of what only some need, what lies there."""
+    own = DESIGNED_FROM.get(name)
+    if own and not (folder / own).exists():
+        raise ValueError(
+            f"{folder / own}: expected it, from which {name} of nightly.holdout.controller is designed, "
+            f"found none; add datasets/{own} to nightly.loops.temperature.artifacts, or name another one"
+        )
+    spread, pid = folder / "identify_plant/spread.parquet", folder / "ingest/printer_pid.json"
+    return learned.read_learned(
+        folder / "identify_plant/plant.parquet",
+        spread if spread.exists() else None,
+        folder / "learn_kernel",
+        pid if pid.exists() else None,
+        machine,
+    )
+
+
+def _of_version_0_1(
+    path: Path, name: str, practical: Mapping[str, Any], made: learned.Learned, tracking: Tracking
+) -> contestants.Design:
+    """The law of weights q (p,), r (m,) and observer_tau, which one search tuned for all controllers, with
+    the declared integral."""
+    expected = {"q": made.model.p, "r": made.model.m}
+    for key, count in expected.items():
+        if np.shape(practical.get(key, ())) != (count,):
+            raise ValueError(
+                f"{path}: expected practical.{key} with {count} weights, as its plant has them, found "
+                f"{practical.get(key)}; it cannot be compared"
             )
-        except ValueError:
-            costs.append(np.inf)
-    return costs
+    weights = np.array(practical["q"], float), np.array(practical["r"], float), tracking.integral
+    if name == "subspace_lqg" and "observer_tau" in practical:
+        own = temperature_tracking.model_based(made.model, tracking.gamma, tau=practical["observer_tau"])
+        return contestants.Design(own.design(*weights), own.model)
+    if name == "varx_riccati":
+        own = window.controller(made.window, tracking.gamma)
+        return contestants.Design(controller.compact(own.design(*weights), made.window.N), own.model)
+    raise ValueError(
+        f"{path}: expected parameters of {name}, which nightly.holdout.controller names, found those of an "
+        "earlier version, which had none; name subspace_lqg or varx_riccati there"
+    )
 
 
-def controller(folder: Path, which: str, gamma: float):
-    """The controller whose files lie below `folder`, the model that it predicts with, and its weights."""
-    from pipeline.temperature import plant, tracking, window
+def identified(folder: Path) -> plant.Plant:
+    """The plant that was identified with a controller whose files lie below `folder`."""
+    return plant.restored(artifacts.read_arrays(folder / "identify_plant/plant.parquet", "plant", 1))[0]
 
-    weights = {
-        name: np.array(value)
-        for name, value in artifacts.read_json(folder / "tune_weights/weights.json")["practical"].items()
-    }
-    model = plant.restored(artifacts.read_arrays(folder / "identify_plant/plant.parquet", "plant", 1))[0]
-    if which == "model_based":
-        return tracking.model_based(model, gamma, tau=float(weights["observer_tau"])), model, weights
+
+def _predictor(folder: Path, name: str, machine: Machine) -> plant.Plant:
+    """The model that a contestant predicts with: the window where it was learned from one."""
+    if contestants.BY_NAME[name].learned_from not in ("window", "kernel"):
+        return identified(folder)
     long = window.restored(artifacts.read_arrays(folder / "learn_kernel/window.parquet", "window", 1))
-    return window.controller(long, gamma), window.predictor(long, model.sample_time_s), weights
+    return window.predictor(long, machine.sample_time_s)
 
 
-def _holdout_records(h: HoldOut, machine: Plant) -> list[tuple[np.ndarray, np.ndarray]]:
+def _holdout_records(h: HoldOut, machine: Machine) -> list[tuple[np.ndarray, np.ndarray]]:
     """The hold-out recordings as gapless segments. Raises ValueError where there is none that can be read."""
     if not Path(h.recordings).is_dir():
         raise ValueError(
@@ -257,7 +320,7 @@ def _holdout_records(h: HoldOut, machine: Plant) -> list[tuple[np.ndarray, np.nd
 
 
 def record_segments(
-    folder: Path, machine: Plant, *, broken: dict[str, str] | None = None
+    folder: Path, machine: Machine, *, broken: dict[str, str] | None = None
 ) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
     """{recording: [(u, y), ...]} below a folder, read as the stage `ingest` reads, through its memo; reasons
     of those that cannot be read go to `broken`."""
@@ -287,7 +350,7 @@ def record_segments(
     return segments
 
 
-def _segments(record: dict[str, np.ndarray], machine: Plant) -> list[tuple[np.ndarray, np.ndarray]]:
+def _segments(record: dict[str, np.ndarray], machine: Machine) -> list[tuple[np.ndarray, np.ndarray]]:
     u, y = (
         np.stack(
             [np.where(record[f"{s.name}_masked"], np.nan, record[s.name]) for s in signals], axis=1
@@ -303,10 +366,10 @@ def _segments(record: dict[str, np.ndarray], machine: Plant) -> list[tuple[np.nd
     return pairs
 
 
-def _panel_plants(records: list[tuple[np.ndarray, np.ndarray]], machine: Plant):
+def _panel_plants(records: list[tuple[np.ndarray, np.ndarray]], machine: Machine):
     """The plants of the hold-out recordings: identified from them alone, and a bootstrap family around; kept,
     since neither recordings nor method change from night to night."""
-    from pipeline.temperature import identification, plant, validation
+    from pipeline.temperature import identification, validation
 
     p = params.read()["identify_plant"]
     key = joblib.hash((records, p["max_order"], p["offset"], p["spread_plants"], p["seed"]))

@@ -282,8 +282,11 @@ def _decide(settings: Nightly, name: str, present: Champion | None, work: Work) 
         reason = f"the challenger is that of {run}, which was rolled back by hand"
         return JudgedLoop(LoopDecision(KEPT, [reason]))
     judged = judge.judge(loop, settings)
-    challenger = judged.measure(Path("datasets"))
-    before = judged.measure(champion.FOLDER / name) if present else None
+    try:
+        challenger = judged.measure(Path("datasets"))
+        before = judged.measure(champion.FOLDER / name) if present else None
+    except judge.NotComparable as reason:
+        return JudgedLoop(LoopDecision(KEPT, [f"champion and challenger cannot be compared: {reason}"]))
     mean_cost = float(np.mean([cost for _, cost in challenger.cases.values()]))
     decision = decide(
         before,

@@ -189,7 +189,7 @@ def reference(loop: Loop, folder: Path, only: Sequence[str] = ()) -> dict[str, A
             for u, y in nights[0]
             for part, other in zip(np.array_split(u, PIECES), np.array_split(y, PIECES), strict=True)
         ]
-    _, model, _ = judge.controller(folder, "model_based", 0.99)
+    model = judge.identified(folder)
     asked, samples = drift.causes(model), int(np.median([sum(len(u) for u, _ in night) for night in nights]))
     try:
         own, slow = (
@@ -221,7 +221,7 @@ def _champions_reference(folder: Path) -> Reference | None:
     own, slow = (
         [drift.Estimate(*map(np.array, estimate)) for estimate in fields[key]] for key in ("own", "slow")
     )
-    _, model, _ = judge.controller(folder, "model_based", 0.99)
+    model = judge.identified(folder)
     return Reference(model, drift.causes(model), own, slow, fields["loop"])
 
 

@@ -47,17 +47,18 @@ class Rule(Section):
 
 
 class HoldOut(Section):
-    """The temperature loop's hold-out: which controller, on which scenarios, with seeds that no stage uses;
-    recordings of `recordings` make the plants."""
+    """The temperature loop's hold-out: which contestant runs on the machine, on how many plants, from which
+    starts to which references, with a seed that no stage uses; recordings of `recordings` make the plants."""
 
-    controller: Literal["window", "model_based"]
+    controller: Literal["printer_pid", "pi_simc", "pi", "subspace_lqg", "varx_riccati", "learned_kernel"]
     recordings: Path
     starts_degC: list[Annotated[float, Field(ge=-273.15, le=1000)]] = Field(min_length=1, max_length=20)
     reference_offsets_degC: list[Annotated[float, Field(ge=-500, le=500)]] = Field(
         min_length=1, max_length=20
     )
     noise_degC: float = Field(ge=0, le=50)
-    seeds: list[Annotated[int, Field(ge=0, le=2**31)]] = Field(min_length=1, max_length=100)
+    seed: int = Field(ge=0, le=2**31)
+    plants: int = Field(ge=2, le=100_000)
     steps: int = Field(ge=60, le=20000)
 
 

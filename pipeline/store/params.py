@@ -381,6 +381,9 @@ def _sentences(model: type[Section], section: str, errors: list) -> Iterator[tup
                 explained.add(renamed.new_name(old, renamed.PARAMETERS))
                 yield error["loc"], _renamed(old)
                 continue
+            if old in renamed.RETIRED:
+                yield error["loc"], f"{old} was retired: {renamed.RETIRED[old]}; remove the line"
+                continue
             parent = _at(model, tuple(above))
             is_section = isinstance(parent, type) and issubclass(parent, Section)
             names = tuple(parent.model_fields) if is_section else ()

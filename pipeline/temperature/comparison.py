@@ -1,7 +1,7 @@
 """The comparison: which contestant is best, what tells model-based and data-driven apart, and which plant
 decides. Cases of one plant stand or fall together: plants are the blocks of every test and of every band."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -12,11 +12,11 @@ LEVEL = 0.05
 
 
 class Choice(NamedTuple):
-    """`best` is None where nobody passes. `last` is the contestant that came nearest to replacing it, with the
-    test of that replacement: the best one as champion, the other as challenger."""
+    """`best` is None where nobody passes; `nearest` is the cheapest of the others that pass, None where
+    there is none, and `against` the test of the best one against it."""
 
     best: str | None
-    last: str | None
+    nearest: str | None
     against: Paired | None
 
 
@@ -25,19 +25,18 @@ def chosen(
 ) -> Choice:
     """The first of those that pass, in the order of `costs` (simplest first), that no more complex one beats:
     one replaces it where its costs (s,) are lower beyond chance, paired by plant, one-sided at LEVEL."""
-    best, last, against = None, None, None
-    for name in costs:
-        if not passes[name]:
-            continue
-        if best is None:
+    able = [name for name in costs if passes[name]]
+    if not able:
+        return Choice(None, None, None)
+    best = able[0]
+    for name in able[1:]:
+        if between(costs[best], costs[name], plant, seed=seed).p < LEVEL:
             best = name
-            continue
-        result = between(costs[best], costs[name], plant, seed=seed)
-        if result.p < LEVEL:
-            best, last, against = name, None, None
-        elif against is None or result.p < against.p:
-            last, against = name, result
-    return Choice(best, last, against)
+    others = [name for name in able if name != best]
+    if not others:
+        return Choice(best, None, None)
+    nearest = min(others, key=lambda name: float(costs[name].mean()))
+    return Choice(best, nearest, between(costs[nearest], costs[best], plant, seed=seed))
 
 
 def between(champion: np.ndarray, challenger: np.ndarray, plant: np.ndarray, *, seed: int) -> Paired:
@@ -83,8 +82,8 @@ def deciding_plant(a: np.ndarray, b: np.ndarray, plant: np.ndarray) -> int:
 
 
 class Band(NamedTuple):
-    """Median and 90 % quantile over all cases, the 90 % band of that quantile with plants resampled as blocks,
-    the worst, and the case that has it; inf where a run never settles."""
+    """Median and 90 % quantile over all cases, the 90 % band of that quantile with plants resampled as
+    blocks, the worst, and the case that has it; inf where a run never settles."""
 
     median: float
     q90: float
@@ -115,12 +114,3 @@ def mean_and_worst(costs: np.ndarray, plant: np.ndarray, *, weight: float) -> fl
     by_plant = np.sort([costs[plant == index].mean() for index in np.unique(plant)])
     tail = by_plant[-max(1, len(by_plant) // 4) :].mean()
     return float((by_plant.mean() + weight * tail) / (1 + weight))
-
-
-def rows(results: Mapping[str, Sequence[np.ndarray]], names: Sequence[str]) -> dict[str, np.ndarray | list]:
-    """Figures of several contestants as columns, contestant by contestant."""
-    columns = {
-        name: np.concatenate([figures[k] for figures in results.values()]) for k, name in enumerate(names)
-    }
-    count = len(next(iter(results.values()))[0])
-    return {"contestant": [name for name in results for _ in range(count)], **columns}

@@ -1,8 +1,8 @@
-"""The controller as it runs on the machine: a law with its limits, its target, its integrator, its governor and
-its hand-over.
+"""The controller as it runs on the machine: a law with its limits, its target, its integrator, its governor
+and its hand-over.
 
-One form for every contestant. `step` takes one sample, `batch_step` the same sample of many cases at once: the
-panel judges by the second what a machine would run by the first.
+One form for every contestant. `step` takes one sample, `batch_step` the same sample of many cases at once:
+the panel judges by the second what a machine would run by the first.
 
 With memory z, measured y, and the reference r(t) = H w(t), w(t+1) = F w(t) (seed 1, (2)):
 
@@ -11,8 +11,8 @@ With memory z, measured y, and the reference r(t) = H w(t), w(t+1) = F w(t) (see
     z(t+1) = A z + B_u u + B_y y + B_r r + c
 
 The target y* = Y w is the reference, or the nearest one that the inputs can hold. P = pinv(-K_r) says by how
-many °C another reference would have asked for the input that was applied: back-calculation, which acts on what
-lies beyond the integrator's own limit. What was applied, not what was wished, enters the memory.
+many °C another reference would have asked for the input that was applied: back-calculation, which acts on
+what lies beyond the integrator's own limit. What was applied, not what was wished, enters the memory.
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,8 @@ from pipeline.temperature.tracking import Law, feasible_target
 
 
 class Reference(NamedTuple):
-    """r(t) = H w(t) in °C, w(t+1) = F w(t), w(0) = w0 with w0[0] = 1 that stays: F (k, k), H (p, k), w0 (k,)."""
+    """r(t) = H w(t) in °C, w(t+1) = F w(t), w(0) = w0 with w0[0] = 1 that stays: F (k, k), H (p, k), w0
+    (k,)."""
 
     F: np.ndarray
     H: np.ndarray
@@ -107,7 +108,11 @@ class Aim(NamedTuple):
 
 
 def aim(law: Law, at: Rest, reference: Reference) -> Aim:
-    """feed = U + K Z + D Y, with the law's memory Z w on the way, Z F = A Z + B_u U + B_y Y + B_r H + [c 0]."""
+    """feed = U + K Z + D Y, with the law's memory Z w on the way, Z F = A Z + B_u U + B_y Y + B_r H + [c 0].
+    A conditional law aims at no target: it sees the reference itself, and its own integral is all its
+    feed."""
+    if law.conditional:
+        return Aim(-law.K_r @ reference.H, reference.H)
     drive = law.B_u @ at.U + law.B_y @ at.Y + law.B_r @ reference.H
     drive[:, 0] += law.c
     Z = _sylvester(law.A, reference.F, drive)
@@ -157,9 +162,9 @@ def _leaking(balance: np.ndarray) -> np.ndarray:
 
 
 class Deployed(NamedTuple):
-    """A law with what it runs under: `integral_limit` °C is the largest error, and the largest back-calculated
-    shift, that the integrator sees; `back` (p, m) is P of the module's formula; `gather` (q,) says which entry
-    of [z; u; y; 0] each entry of z(t+1) is, where the memory is a plain shift, and is None otherwise.
+    """A law with what it runs under: `integral_limit` °C is the largest error, and the largest
+    back-calculated shift, that the integrator sees; `back` (p, m) is P of the module's formula; `shift` is k
+    where the memory moves on by k entries, 0 where it is no plain shift.
 
     `holds`: it does nothing, and goes on with the input that it was handed."""
 
@@ -210,8 +215,8 @@ def _shift(A: np.ndarray) -> int:
 
 
 class State(NamedTuple):
-    """All that a controller remembers, to be saved and restored: z (s, q), xi (s, p), the input u (s, m) applied
-    last, and the memory x (f, s, n) of the governor's family; s cases at once, one on a machine."""
+    """All that a controller remembers, to be saved and restored: z (s, q), xi (s, p), the input u (s, m)
+    applied last, and the memory x (f, s, n) of the governor's family; s cases at once, one on a machine."""
 
     z: np.ndarray
     xi: np.ndarray
@@ -232,11 +237,12 @@ def watched(controller: Deployed, state: State | None, u: np.ndarray, y: np.ndar
 
 
 def handed_over(controller: Deployed, state: State, y: np.ndarray, here: Sequence[Aim]) -> State:
-    """The state in which the law takes over from manual without a bump: xi starts where the law, aimed at where
-    the machine is (`here`, an Aim of each case's y), would go on with the input of manual, up to
-    `integral_limit`. A conditional law starts its integral action at that input."""
+    """The state in which the law takes over from manual without a bump: xi starts where the law, aimed at
+    where the machine is (`here`, an Aim of each case's y), would go on with the input of manual, up to
+    `integral_limit`. A conditional law starts its integral action at that input; one without integral action
+    has nothing that could hold a start, or let it go."""
     law = controller.law
-    if controller.holds:
+    if controller.holds or not np.any(law.integral):
         return state
     if law.conditional:
         return state._replace(xi=state.u @ controller.back.T)
@@ -294,3 +300,138 @@ def _remembered(controller: Deployed, z, u, y, r):
     else:
         after += z @ law.A.T
     return after
+
+
+# ---- what a machine runs
+
+
+class RunningController:
+    """One controller on one machine, a sample at a time.
+
+    In manual, `watch` each sample; then `hand_over` once, then `step` each sample. A reference is (p,) °C, or
+    a Reference that starts at the sample where it is first given. It is aimed at on `model` when it changes,
+    and the last AIMS of them are remembered. All else that it remembers is `saved` as arrays, from which
+    `restore` goes on bit by bit. `binding` are the inputs (index, limit in percent) because of which the
+    reference is out of reach.
+    """
+
+    AIMS = 64
+
+    def __init__(self, controller: Deployed, model: Plant):
+        law = controller.law
+        self.controller, self.model = controller, model
+        self.binding: tuple[tuple[int, float], ...] = ()
+        self._asks = np.hstack([law.K, law.D, law.K_r])
+        self._keeps = np.hstack([law.B_u, law.B_y, law.B_r, *([] if controller.shift else [law.A])])
+        self._rated = bool(np.isfinite(controller.limits.rate).any())
+        self._aims: dict[bytes, tuple[Rest, Aim]] = {}
+        self._state: State | None = None
+        self._reference: Reference | None = None
+        self._w, self._t = np.zeros(0), 0
+
+    def watch(self, u: np.ndarray, y: np.ndarray, r: np.ndarray) -> None:
+        """One sample in manual: inputs u (m,) applied, outputs y (p,) measured before, reference r (p,)."""
+        u, y, r = (np.asarray(part, float)[None] for part in (u, y, r))
+        self._state = watched(self.controller, self._state, u, y, r)
+
+    def hand_over(self, y: np.ndarray, at: np.ndarray | None = None) -> None:
+        """From manual to the law without a bump, at outputs y (p,) measured now, where the machine stands at
+        `at` (p,), by itself y. Raises ValueError before any watch."""
+        y = np.asarray(y, float)
+        here = self._aimed(constant(y if at is None else at))[1]
+        self._state = handed_over(self.controller, self._remembers(y), y[None], [here])
+
+    def step(self, y: np.ndarray, r: np.ndarray | Reference, t: int) -> np.ndarray:
+        """Inputs u (m,) to apply from outputs y (p,) measured at sample t under reference r, as batch_step
+        has them. Raises ValueError where y is not finite, or nothing was watched before."""
+        y = np.asarray(y, float)
+        state, (feed, y_star, now) = self._remembers(y), self._target(r, t)
+        controller, limits, before = self.controller, self.controller.limits, state.u[0]
+        if controller.holds:
+            return before.copy()
+        wished = feed - self._asks @ np.concatenate((state.z[0], y, state.xi[0]))
+        low, high, x, family = limits.low, limits.high, state.x, controller.governor
+        if self._rated:
+            low = np.maximum(low, np.minimum(before - limits.rate, limits.high))
+            high = np.minimum(high, np.maximum(before + limits.rate, limits.low))
+        u = np.minimum(np.maximum(wished, low), high)
+        if family is not None:
+            x = corrected(family, x, y[None])
+            u = governed(family, x, u[None], y_star[None], low[None], high[None])[0]
+            x = predicted(family, x, u[None])
+        xi = _integrated(controller, state.xi, (y_star - y)[None], u[None], wished[None])
+        self._state = State(self._kept(state.z[0], u, y, now)[None], xi, u[None], x)
+        return u.copy()
+
+    def saved(self) -> dict[str, np.ndarray]:
+        """All that it remembers, as arrays. Raises ValueError before the first watch."""
+        arrays = self._remembers(np.zeros(1))._asdict()
+        if self._reference is not None:
+            arrays |= {**self._reference._asdict(), "w": self._w, "t": np.array(self._t)}
+        return {name: np.array(part) for name, part in arrays.items()}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Goes on from what another of the same law and governor `saved`."""
+        self._state = State(*(np.array(arrays[name]) for name in State._fields))
+        self._reference = None
+        if "w" in arrays:
+            mine = Reference(*(np.array(arrays[name]) for name in Reference._fields))
+            self._moved(self._turned(mine, int(arrays["t"])), np.array(arrays["w"]))
+
+    def _remembers(self, y: np.ndarray) -> State:
+        if self._state is None:
+            raise ValueError("the controller has seen no sample; call watch with each sample in manual first")
+        if not np.isfinite(y.sum()):
+            raise ValueError(
+                f"the controller expects finite temperatures in °C but measured {y}; "
+                "go to manual until every sensor answers"
+            )
+        return self._state
+
+    def _kept(self, z: np.ndarray, u: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
+        """z (q,) a sample on."""
+        shift, c = self.controller.shift, self.controller.law.c
+        if not shift:
+            return self._keeps @ np.concatenate((u, y, r, z)) + c
+        after = self._keeps @ np.concatenate((u, y, r)) + c
+        after[:-shift] += z[shift:]
+        return after
+
+    def _target(self, r: np.ndarray | Reference, t: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Feed (m,), target y* (p,) and reference (p,) at sample t."""
+        mine = self._reference
+        if isinstance(r, Reference):
+            same = mine is not None and (r is mine or all(map(np.array_equal, r, mine)))
+        else:
+            same = mine is not None and len(self._w) == 1 and bool((mine.H[:, 0] == r).all())
+        if mine is None or not same:
+            mine = self._turned(r if isinstance(r, Reference) else constant(r), t)
+        if t < self._t:
+            raise ValueError(f"sample {t} comes after sample {self._t}; count samples upwards")
+        if len(self._w) > 1:
+            w = self._w
+            for _ in range(t - self._t):
+                w = mine.F @ w
+            self._moved(mine, w)
+        self._t = t
+        return self._now
+
+    def _turned(self, reference: Reference, t: int) -> Reference:
+        mine = self._reference = Reference(*(np.array(part, float) for part in reference))
+        at, self._aim = self._aimed(mine)
+        self.binding, self._t = at.binding, t
+        self._moved(mine, mine.w0)
+        return mine
+
+    def _moved(self, reference: Reference, w: np.ndarray) -> None:
+        self._w = w
+        self._now = self._aim.feed @ w, self._aim.Y @ w, reference.H @ w
+
+    def _aimed(self, reference: Reference) -> tuple[Rest, Aim]:
+        key = reference.F.tobytes() + reference.H.tobytes()
+        if key not in self._aims:
+            at = rest(self.model, reference, self.controller.limits)
+            if len(self._aims) >= self.AIMS:
+                del self._aims[next(iter(self._aims))]
+            self._aims[key] = at, aim(self.controller.law, at, reference)
+        return self._aims[key]

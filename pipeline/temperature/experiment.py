@@ -44,7 +44,7 @@ from pipeline.temperature.tracking import Law, aimed, feasible_target, gains
 from pipeline.temperature.trust import horizon, two_points
 from pipeline.temperature.validation import step_response
 
-ENOUGH = 0.8  # of the largest safe amplitude: what the centre gives up to come nearer to the references
+ENOUGH = 0.5  # of the largest safe amplitude: the rest is given up to come nearer to the references
 SEEN = 0.05  # of an output's largest effect: pairs below it teach and are asked nothing
 HOLD = 0.5  # of the fastest time constant: the shortest hold of a binary sequence
 CORNERS = 3.0  # times the corner frequency: the highest line of a multisine
@@ -53,7 +53,7 @@ SWITCHES = 20  # at least so many holds in an experiment, so that inputs move in
 DRAWS = 30  # phases drawn for a multisine, of which the flattest is taken
 USEFUL = 0.3  # largest expected standard error of an input's strongest gain; beyond it nothing is learned
 STEPS = 6  # halvings of each search for an amplitude
-HALF = 0.5  # of the wanted amplitudes: a shorter experiment is tried below it
+FAIR = 0.4  # of the wanted amplitudes: a shorter experiment is tried below it
 
 
 class Limits(NamedTuple):
@@ -173,8 +173,7 @@ def family_of(
     """
     plants = [stabilised(plant, LARGEST_RADIUS) for plant in plants]
     speed = pace(plants, reach, longest)
-    begin = start(plants, *record, slowest=speed.slowest)
-    return Family(plants, speed, doubt, begin, band(plants[0], *record), names)
+    return Family(plants, speed, doubt, start(plants, *record), band(plants[0], *record), names)
 
 
 def pace(plants: Sequence[Plant], reach: np.ndarray, longest: int) -> Pace:
@@ -265,18 +264,19 @@ def programme(
     """Centre (m,) and share of the wanted amplitudes by a linear programme; None where no centre is within
     the limits even without a signal.
 
-    Unknowns [centre; w >= |centre - u|; q >= |y - reference|; share]. Without `least` the share is maximised;
+    Unknowns [centre; w >= |centre|; q >= |y - reference|; share]. Without `least` the share is maximised;
     with it the distance q from the references is minimised at a share of at least that.
     """
     m, p, begin, g = len(cap), len(limits.y_low), family.begin, family.doubt.input_gain
     instants = np.unique(np.linspace(0, len(reach.at) - 1, 7).round().astype(int)[1:])
-    shift = begin.u - begin.answered
     rise = reach.ramp[:, :, instants].transpose(0, 2, 3, 1).reshape(-1, m)
-    from_step = (reach.step[:, :, instants] * shift[:, None, None]).transpose(0, 2, 3, 1).reshape(-1, m)
+    from_step = (reach.step[:, :, instants] * begin.u[:, None, None]).transpose(0, 2, 3, 1).reshape(-1, m)
     at_u = reach.free[:, instants].reshape(-1) + from_step.sum(axis=1)
     swing = (1 + g) * np.repeat(reach.peak[:, None], len(instants), axis=1).reshape(-1, m) @ cap
     moved = ambient(family.doubt, reach.at[instants], family.pace.fastest)[:, None] + family.band.width
-    slack = np.tile(moved[None], (len(reach.free), 1, 1)).reshape(-1) + g * np.abs(from_step).sum(axis=1)
+    # the ramp answers as if the centre had come from zero; what the last inputs leave beside it dies away
+    beside = np.abs(from_step - rise * begin.u).sum(axis=1)
+    slack = np.tile(moved[None], (len(reach.free), 1, 1)).reshape(-1) + g * beside
     count = len(at_u)
     high, low = (np.tile(side, count // p) for side in (limits.y_high, limits.y_low))
     none = np.zeros((count, p))
@@ -289,7 +289,7 @@ def programme(
     eye, wide = np.eye(m), np.zeros((m, p))
     for sign in (1.0, -1.0):
         rows.append(np.hstack([sign * eye, -eye, wide, np.zeros((m, 1))]))
-        right.append(sign * begin.u)
+        right.append(np.zeros(m))
         rows.append(np.hstack([sign * rise[end], np.zeros((p, m)), -np.eye(p), np.zeros((p, 1))]))
         right.append(sign * (wish.reference - at_u[end] + rise[end] @ begin.u))
         rows.append(np.hstack([sign * eye, 0 * eye, wide, cap[:, None]]))
@@ -426,14 +426,14 @@ def expected_gap(model: Plant, taught: Lesson, gamma: float) -> float:
 
 
 def design(family: Family, wish: Wish, limits: Limits, rng: np.random.Generator) -> Experiment:
-    """The longest experiment that is safe and moves the machine by at least half of what is wanted; of
+    """The longest experiment that is safe and moves the machine by a fair share of what is wanted; of
     shorter ones the one that teaches most where none does."""
     if reason := _nothing_left(family, limits):
         nothing, unknown = np.zeros((0, family.model.m)), np.full(family.model.p, np.nan)
         still = np.zeros(family.model.m)
         return Experiment(nothing, reason, Extremes(unknown, unknown), still, still, unknown, None)
     samples, speed = wish.samples, family.pace
-    rise = ramp_samples(limits, speed, samples)
+    rise = ramp_samples(limits, samples)
     ramp = np.clip((1.0 + np.arange(samples)) / rise, 0.0, 1.0)
     step = limits.rate / max(wish.amplitude, limits.rate / 2)
     played = shaped(signal(rng, samples, wish, speed), rise, step)
@@ -449,7 +449,7 @@ def design(family: Family, wish: Wish, limits: Limits, rng: np.random.Generator)
                 tried,
                 tried.lesson.information if tried.lesson is not None and tried.written else 0.0,
             )
-        if tried.written and (tried.amplitude >= HALF * caps(family, reach, wish, limits)).all():
+        if tried.written and (tried.amplitude >= FAIR * caps(family, reach, wish, limits)).all():
             break
         samples //= 2
     if best is None:
@@ -470,11 +470,10 @@ def _nothing_left(family: Family, limits: Limits) -> str:
     )
 
 
-def ramp_samples(limits: Limits, speed: Pace, samples: int) -> int:
-    """Samples of the ramp: the whole range within the rate, and the fastest time constant; a quarter of the
-    experiment at most."""
+def ramp_samples(limits: Limits, samples: int) -> int:
+    """Samples of the ramp: the widest range of an input within the rate, half of the experiment at most."""
     needed = np.ceil((limits.high - limits.low).max() / limits.rate)
-    return int(max(min(max(needed, speed.fastest), samples / 4), min(needed, samples / 2), 1))
+    return int(max(min(needed, samples / 2), 1))
 
 
 def _designed(
@@ -504,7 +503,7 @@ def _designed(
     else:
         return _left(family, reach, centre, limits)
     taught = lesson(u[rise:], family.pace, family.band.noise)
-    target = reach.free[0, -1] + (begin.u - begin.answered) @ reach.step[0, :, -1]
+    target = reach.free[0, -1] + begin.u @ reach.step[0, :, -1]
     target = target + (centre - begin.u) @ reach.ramp[0, :, -1]
     reason = _teaches_little(family, amplitude, taught)
     return Experiment(u[: 0 if reason else None], reason, extremes, centre, amplitude, target, taught)
@@ -532,7 +531,8 @@ def _left(family: Family, reach: Answers, centre: np.ndarray, limits: Limits) ->
     hot = above.max() >= below.max()
     o = int((above if hot else below).argmax())
     reached, limit = (extremes.highest[o], limits.y_high[o]) if hot else (extremes.lowest[o], limits.y_low[o])
-    slow = family.pace.slowest > HALF * reach.at[-1]
+    radius = np.abs(np.linalg.eigvals(family.model.A)).max()
+    slow = -np.log(max(radius, np.finfo(float).tiny)) * reach.at[-1] < 1.0
     why = (
         "the machine hardly settles by itself, so that small errors grow"
         if slow
@@ -556,7 +556,7 @@ def dither(family: Family, law: Law, wish: Wish, limits: Limits, rng: np.random.
     nearest that the inputs can hold; its amplitudes are halved until the forecast around the family stays
     within the limits."""
     m, samples = family.model.m, wish.samples
-    rise = ramp_samples(limits, family.pace, samples)
+    rise = ramp_samples(limits, samples)
     step = limits.rate / max(wish.amplitude, limits.rate / 2)
     played = shaped(signal(rng, samples, wish, family.pace), rise, step)
     target = feasible_target(family.model, wish.reference, limits.low, limits.high)

@@ -1,9 +1,10 @@
 """How hot a family of plants gets under given inputs, open loop and around a running controller: the highest
 and the lowest of every output, with what the family itself does not hold.
 
-Open loop, an output of one member is linear in the inputs: what it does when they stay as they were, and the
-answer R_j to each of them alone. Its bounds are y +- (g sum_j |R_j| + sum_j |R_j(t) - R_j(t - delay)| +
-ambient (1 - e^(-t / tau)) + band), g the doubt about gains: exact in the gains, no narrower in the rest.
+Open loop, an output of one member is linear in the inputs: what is left of its state, and the answer R_j to
+each input alone from now on, M_j to that input's moves away from its last value. Its bounds are
+y +- (g sum_j |R_j| + sum_j |M_j(t) - M_j(t - delay)| + ambient (1 - e^(-t / tau)) + band), g the doubt about
+gains, which act on all heat from now on: exact in the gains, no narrower in the rest.
 """
 
 from collections.abc import Sequence
@@ -25,8 +26,8 @@ SIGMAS = 3.0  # of the sensor's noise
 
 
 class Doubt(NamedTuple):
-    """What a family identified from one record does not hold: input gains by 1 +- input_gain, the ambient by
-    +- ambient_degC as time goes on, inputs that act up to delay_steps later."""
+    """What a family identified from one record does not hold: input gains that are 1 +- input_gain times as
+    large from now on, an ambient that moves by +- ambient_degC, inputs that act up to delay_steps later."""
 
     input_gain: float
     ambient_degC: float
@@ -34,20 +35,19 @@ class Doubt(NamedTuple):
 
 
 class Start(NamedTuple):
-    """Where the record leaves the machine: its last inputs u (m,), the inputs `answered` (m,) that its
-    outputs y (p,) answer (the past, older ones forgotten), and state x (n,) and bias (p,) of each member."""
+    """Where the record leaves the machine: its last inputs u (m,) and outputs y (p,), and state x (n,) and
+    bias (p,) of each member."""
 
     u: np.ndarray
-    answered: np.ndarray
     y: np.ndarray
     x: list[np.ndarray]
     bias: list[np.ndarray]
 
 
 class Answers(NamedTuple):
-    """A family's outputs at the samples `at` (k,): `free` (members, k, p) with the inputs at those that were
-    answered; `step`, `ramp` and `probe` (members, m, k, p) to one percent of each input alone, held from the
-    start, risen along the ramp, or played as the probing signal. `peak` (members, p, m): the largest |probe|.
+    """A family's outputs at the samples `at` (k,): `free` (members, k, p) without any input; `step`, `ramp`
+    and `probe` (members, m, k, p) to one percent of each input alone, held from the start, risen along the
+    ramp, or played as the probing signal. `peak` (members, p, m): the largest |probe|.
     """
 
     at: np.ndarray
@@ -65,9 +65,9 @@ class Extremes(NamedTuple):
     lowest: np.ndarray
 
 
-def start(family: Sequence[Plant], u: Segments, y: Segments, *, slowest: float) -> Start:
-    """The end of a record u (T, m), y (T, p), masked samples NaN; `slowest` time constant in samples. Raises
-    ValueError where no stretch of it has all inputs."""
+def start(family: Sequence[Plant], u: Segments, y: Segments) -> Start:
+    """The end of a record u (T, m), y (T, p), masked samples NaN. Raises ValueError where no stretch of it
+    has all inputs."""
     us, ys = gapless(u, y)
     if not us:
         raise ValueError("no stretch of the record has all inputs, so nobody knows where the machine stands")
@@ -78,8 +78,7 @@ def start(family: Sequence[Plant], u: Segments, y: Segments, *, slowest: float) 
         states, shown = respond(model, v, estimate_state(model, v, last_y))
         x.append(model.F @ states[-1] + model.G @ v[-1])
         bias.append(_mean(last_y[-LATEST:] - shown[-LATEST:]))
-    weights = np.exp(-np.arange(len(last_u))[::-1] / max(slowest, 1.0))
-    return Start(last_u[-1], weights @ last_u / weights.sum(), _mean(last_y[-LATEST:]), x, bias)
+    return Start(last_u[-1], _mean(last_y[-LATEST:]), x, bias)
 
 
 def _mean(rows: np.ndarray) -> np.ndarray:
@@ -126,10 +125,10 @@ def answers(
     p = family[0].p
     stride = int(np.ceil(3 * len(family) * m * p * samples / stored))
     at = np.unique(np.r_[np.arange(0, samples, stride), samples - 1])
-    held = np.column_stack([np.tile(begin.answered, (samples, 1)), np.ones(samples)])
+    none = np.column_stack([np.zeros((samples, m)), np.ones(samples)])
     free, step, rise, probe, peak = [], [], [], [], []
     for member, x0, bias in zip(family, begin.x, begin.bias, strict=True):
-        free.append((respond(simulation_form(member, []), held, x0)[1] + bias)[at])
+        free.append((respond(simulation_form(member, []), none, x0)[1] + bias)[at])
         own = [_alone(member, np.ones((samples, m))), _alone(member, np.tile(ramp[:, None], (1, m)))]
         own.append(_alone(member, signal))
         peak.append(np.abs(own[2]).max(axis=1).T)
@@ -176,13 +175,10 @@ def open_loop(
 ) -> Extremes:
     """Extremes under the ramp from the last inputs to `centre` (m,) and the signal of `amplitude` (m,) about
     it; `width` (p,) is the band of noise and model error."""
-    of_each = (
-        (begin.u - begin.answered)[:, None, None] * family.step
-        + (centre - begin.u)[:, None, None] * family.ramp
-        + amplitude[:, None, None] * family.probe
-    )
+    moves = (centre - begin.u)[:, None, None] * family.ramp + amplitude[:, None, None] * family.probe
+    of_each = begin.u[:, None, None] * family.step + moves
     moved = ambient(doubt, family.at, fastest)[:, None] + width
-    return _bounds(family.free, of_each, family.at, doubt, moved)
+    return _bounds(family.free, of_each, moves, family.at, doubt, moved)
 
 
 def forecast(
@@ -190,25 +186,27 @@ def forecast(
 ) -> Extremes:
     """Extremes under the inputs u (T, m) themselves, every sample looked at."""
     at = np.arange(len(u))
-    held = np.column_stack([np.tile(begin.answered, (len(u), 1)), np.ones(len(u))])
+    none = np.column_stack([np.zeros_like(u), np.ones(len(u))])
     moved = ambient(doubt, at, fastest)[:, None] + width
     highest, lowest = np.full(len(width), -np.inf), np.full(len(width), np.inf)
     for member, x0, bias in zip(family, begin.x, begin.bias, strict=True):
-        free = respond(simulation_form(member, []), held, x0)[1] + bias
-        own = _bounds(free[None], _alone(member, u - begin.answered)[None], at, doubt, moved)
+        free = respond(simulation_form(member, []), none, x0)[1] + bias
+        answer, moves = _alone(member, u), _alone(member, u - begin.u)
+        own = _bounds(free[None], answer[None], moves[None], at, doubt, moved)
         highest, lowest = np.maximum(highest, own.highest), np.minimum(lowest, own.lowest)
     return Extremes(highest, lowest)
 
 
 def _bounds(
-    free: np.ndarray, of_each: np.ndarray, at: np.ndarray, doubt: Doubt, moved: np.ndarray
+    free: np.ndarray, of_each: np.ndarray, moves: np.ndarray, at: np.ndarray, doubt: Doubt, moved: np.ndarray
 ) -> Extremes:
     """Extremes of free (members, k, p) and what each input adds, of_each (members, m, k, p), with the doubt
-    about gains and delay; moved (k, p) is what may come from elsewhere."""
+    about its gain, and about the delay of its moves, of the same shape; moved (k, p) is what may come from
+    elsewhere."""
     reach = doubt.input_gain * np.abs(of_each).sum(axis=1) + moved
     if doubt.delay_steps:
         lags = np.maximum(doubt.delay_steps / np.maximum(np.diff(at), 1), 1.0)[:, None]
-        reach[:, 1:] += lags * np.abs(np.diff(of_each, axis=2)).sum(axis=1)
+        reach[:, 1:] += lags * np.abs(np.diff(moves, axis=2)).sum(axis=1)
     middle = free + of_each.sum(axis=1)
     return Extremes((middle + reach).max(axis=(0, 1)), (middle - reach).min(axis=(0, 1)))
 

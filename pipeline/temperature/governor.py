@@ -55,8 +55,8 @@ class Governor(NamedTuple):
     """A family of f plants with their observers, and the rows by which they look ahead; `governor` makes it.
 
     A member remembers s = [x, w, xi, v] of size q = 2 (n + p). x is its state at its strongest and w (p) in
-    °C a step a drift that it cannot explain, so that steady disagreement vanishes (offset-free prediction); xi
-    and v are by how much less x and w would be at its weakest. Before y is measured s forecasts
+    °C a step a drift that it cannot explain, so that steady disagreement vanishes (offset-free prediction);
+    xi and v are by how much less x and w would be at its weakest. Before y is measured s forecasts
     [C x + d, C xi]:
 
         s <- s + [e, clip(e + lambda C xi), C xi, clip(C xi)] correct,   s(t+1) = s move + u push + rest
@@ -102,9 +102,11 @@ class Governor(NamedTuple):
 INSTANTS, LONGEST = 7, 120
 # projections over all outputs: inputs mostly move one output each, so that a few suffice
 SWEEPS = 8
+# percent by which rows are equal, or missed: one case by itself takes the same steps as among many
+EXACT = 1e-9
 # share of what the innovations told that is forgotten a step, and of the drift, and with them the observer's
 # constants: for a furthest look ahead of so many steps; a machine that needs more is watched as much longer
-FORGETS, LEAK, UNHURRIED = 0.005, 0.002, 16
+FORGETS, LEAK, UNHURRIED = 0.005, 1e-4, 16
 # squares of innovations beyond those of the best member from which a member does not count
 CONTRADICTED = 4.0
 # overshoots from its target within which an output has arrived; how many it may go beyond it then, where the
@@ -127,8 +129,9 @@ def governor(
     `strength` within its range.
 
     Innovations are doubted by the sensors' noise, a tenth of a degree at least. The observer takes process
-    noise to come in by the inputs, sensors to be tau °C^2 per percent^2 noisier than that, and the drift w to
-    wander a step by `drift` of what a percent of every input does at most.
+    noise to come in by the inputs, sensors to be as much noisier as tau percent^2 of every input, and the drift
+    w to wander a step by `drift` of what a percent of every input does at most: the same for a machine of other
+    units. One that answers more slowly is watched as much longer, by the furthest instant ahead.
     """
     at, unsure = instants(family), np.maximum(outputs.margin, 0.1)
     slower = max(at[-1] / UNHURRIED, 1.0)
@@ -155,8 +158,8 @@ def governor(
 def _near(plant: Plant, limits: Limits, overshoot: float, strength: Strength) -> np.ndarray:
     """How far (p,) in °C an output that has arrived at its target may be predicted beyond it.
 
-    `overshoot` where one sample can do much. Where it can do little, the law's own small moves are as large as
-    the forecast's errors, of which a tight wall would make a steady error.
+    `overshoot` where one sample can do much. Where it can do little, the law's own small moves are as large
+    as the forecast's errors, of which a tight wall would make a steady error.
     """
     pulse = np.abs(markov_parameters(plant, LONGEST)).max(axis=0)
     most = strength.strongest * pulse @ (limits.high - limits.low)
@@ -344,16 +347,16 @@ def governed(
 
 def _walls(family: Governor, now: np.ndarray, y_star: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Floor and cap (f, s, p) in °C of outputs forecast `now` (f, s, p): low and high; and `overshoot` beyond
-    the target, `near` where an output has arrived at it, or where it is now if it is beyond that. What is a
-    further `overshoot` too hot goes back, so that small errors of the forecast do not add up."""
+    the target, `near` where an output has arrived at it. What is up to a further `overshoot` off goes back,
+    so that small errors of the forecast do not add up; what is further off is left to the law."""
     arriving, leaving = (
         np.where(sign * (y_star - now) < ARRIVED * family.overshoot, family.near, family.overshoot)
         for sign in (1.0, -1.0)
     )
-    above = y_star + arriving
+    floor, cap = y_star - leaving, y_star + arriving
     return (
-        np.maximum(family.low, np.where(now < y_star - leaving, -np.inf, y_star - leaving)),
-        np.minimum(family.high, np.where(now > above + family.overshoot, np.inf, above)),
+        np.maximum(family.low, np.where(now < floor - family.overshoot, -np.inf, floor)),
+        np.minimum(family.high, np.where(now > cap + family.overshoot, np.inf, cap)),
     )
 
 
@@ -385,7 +388,7 @@ def _projected(side: _Side, u: np.ndarray, low: np.ndarray, cap: np.ndarray) -> 
 def _swept(side: _Side, u: np.ndarray, low: np.ndarray, cap: np.ndarray) -> np.ndarray:
     """The projections of `governed` for cases that a row touches: u, low (s, m), cap (f, s, p)."""
     f, s, p, h = side.bare.shape
-    m, case = u.shape[1], np.arange(s)
+    m = u.shape[1]
     rows = side.rows.reshape(f, m, p, h)
     # what hardly moves an output is not shut for its sake
     helps = np.where(rows > WEAK * np.maximum(rows, 0.0).max(axis=1, keepdims=True), rows, 0.0)
@@ -399,11 +402,12 @@ def _swept(side: _Side, u: np.ndarray, low: np.ndarray, cap: np.ndarray) -> np.n
         for j in range(p):
             excess = np.matmul(u, rows[:, :, j]) - room[:, :, j]
             excess = excess.transpose(1, 0, 2).reshape(s, f * h)
-            worst = excess.argmax(axis=1)
-            direction = helps[j, worst] * (u > low)
+            most = excess.max(axis=1)
+            worst = (excess >= most[:, None] - EXACT).argmax(axis=1)
+            direction = helps[j, worst] * (u > low + EXACT)
             size = (direction**2).sum(axis=1)
-            step = np.maximum(excess[case, worst], 0.0) / np.where(size > 0, size, np.inf)
+            step = np.where(most > EXACT, most, 0.0) / np.where(size > 0, size, np.inf)
             u = np.maximum(u - step[:, None] * direction, low)
-        if np.abs(u - before).max() < 1e-9:
+        if np.array_equal(u, before):
             break
     return u

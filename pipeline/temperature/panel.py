@@ -31,13 +31,11 @@ from pipeline.temperature.governor import Strength
 from pipeline.temperature.plant import Plant, hold_output, hold_state
 from pipeline.temperature.tracking import Law, reached_state
 
-KINDS = ("constant", "ramp", "sinusoid", "sequence")
-
 
 class Spread(NamedTuple):
     """How far plants lie from the nominal one: input gains 1 +- input_gain each; A' = I + (A - I) / (1 + d),
-    B' = B / (1 + d), d within +- slower, in the modes of heat; A - l I, l from 0 to extra_heat_loss a step; all inputs one step late
-    in a share `delayed`; the ambient +- ambient_degC."""
+    B' = B / (1 + d), d within +- slower, in the modes of heat; A - l I, l from 0 to extra_heat_loss a step;
+    all inputs one step late in a share `delayed`; the ambient +- ambient_degC."""
 
     input_gain: float
     slower: float
@@ -68,9 +66,9 @@ def delayed(plant: Plant, late: bool) -> Plant:
 def varied(
     plant: Plant, *, gains: np.ndarray, slower: float, loss: float, ambient: float, late: bool, cells: bool
 ) -> Plant:
-    """One plant of the spread. An ambient warmer by `ambient` °C warms every cell by as much in the end, where
-    the states are `cells`, and every output otherwise. Of an identified plant only the modes of heat slow
-    down (`paced`)."""
+    """One plant of the spread. An ambient warmer by `ambient` °C warms every cell by as much in the end,
+    where the states are `cells`, and every output otherwise. Of an identified plant only the modes of heat
+    slow down (`paced`)."""
     identity = np.eye(plant.n)
     pace = identity / (1 + slower) if cells else paced(plant.A, slower)
     A = identity + pace @ (plant.A - identity)
@@ -81,8 +79,8 @@ def varied(
 
 
 def paced(A: np.ndarray, slower: float) -> np.ndarray:
-    """The pace P (n, n) by which A' = I + P (A - I), B' = P B, b' = P b have the steady state of A, B, b and heat
-    up 1 + slower times as slowly.
+    """The pace P (n, n) by which A' = I + P (A - I), B' = P B, b' = P b have the steady state of A, B, b and
+    heat up 1 + slower times as slowly.
 
     A mode of heat is one whose eigenvalue l has Re l > 0.3 and |Im l| <= |1 - Re l|: overdamped, or hardly
     less. P is 1 / (1 + slower) on their invariant subspace and 1 on that of the others: delays, sensors'
@@ -157,8 +155,8 @@ def padded(plants: Sequence[Plant]) -> list[Plant]:
 
 class Questions(NamedTuple):
     """What every plant is asked, by zone: starts (a, p) and constant references (j, p) in °C, each start with
-    each; from the middle start a ramp (r (p,), slope (p,) in °C a step), a sinusoid (mean (p,), amplitude (p,),
-    period in steps) and a sequence (g, p) of references for equal times."""
+    each; from the middle start a ramp (r (p,), slope (p,) in °C a step), a sinusoid (mean (p,), amplitude
+    (p,), period in steps) and a sequence (g, p) of references for equal times."""
 
     starts: np.ndarray
     constants: np.ndarray
@@ -202,15 +200,17 @@ def asked(
     hold: int,
     cells: bool,
 ) -> Cases:
-    """The questions put to every plant. Where states are `cells`, a start holds every cell at one temperature,
-    otherwise every output; noise (p,) in °C."""
+    """The questions put to every plant. Where states are `cells`, a start holds every cell at one
+    temperature, otherwise every output; noise (p,) in °C."""
     references = [constant(r) for r in questions.constants]
     rows = [("constant", a, [j]) for a in range(len(questions.starts)) for j in range(len(references))]
     middle = len(questions.starts) // 2
-    for kind, make, parts in (("ramp", ramp, questions.ramp), ("sinusoid", sinusoid, questions.sinusoid)):
-        if parts is not None:
-            rows.append((kind, middle, [len(references)]))
-            references.append(make(*parts))
+    if questions.ramp is not None:
+        rows.append(("ramp", middle, [len(references)]))
+        references.append(ramp(*questions.ramp))
+    if questions.sinusoid is not None:
+        rows.append(("sinusoid", middle, [len(references)]))
+        references.append(sinusoid(*questions.sinusoid))
     if questions.sequence is not None:
         rows.append(("sequence", middle, [len(references) + g for g in range(len(questions.sequence))]))
         references += [constant(r) for r in questions.sequence]
@@ -268,8 +268,8 @@ def _held(plant: Plant, y: np.ndarray, cells: bool) -> tuple[np.ndarray, np.ndar
 
 
 class Rollout(NamedTuple):
-    """(steps, s, .): true outputs y, the reference r and the target y_star, inputs wished and applied; and what
-    the controller measured."""
+    """(steps, s, .): true outputs y, the reference r and the target y_star, inputs wished and applied; and
+    what the controller measured."""
 
     y: np.ndarray
     r: np.ndarray
@@ -331,8 +331,9 @@ def rolled_out(controller: Deployed, cases: Cases, aimed: Sequence[Aim]) -> Roll
     def outputs(x):
         return (np.matmul(x.reshape(count, each, -1), C) + d).reshape(-1, p)
 
-    state, held = None, outputs(x)
-    for t in range(cases.hold):
+    held = outputs(x)
+    state = watched(controller, None, u, held + noise[0], r[0])
+    for t in range(1, cases.hold):
         state = watched(controller, state, u, held + noise[t], r[0])
     here = [aimed[len(cases.references) + a] for a in cases.start]
     state = handed_over(controller, state, held + noise[cases.hold], here)
@@ -352,8 +353,8 @@ def rolled_out(controller: Deployed, cases: Cases, aimed: Sequence[Aim]) -> Roll
 
 
 class Figures(NamedTuple):
-    """An engineer's figures of each case (s,), of true outputs, worst zone: °C, steps, percent. Settling is inf
-    where the outputs are outside at the end, NaN where the reference moves; so is overshoot there."""
+    """An engineer's figures of each case (s,), of true outputs, worst zone: °C, steps, percent. Settling is
+    inf where the outputs are outside at the end, NaN where the reference moves; so is overshoot there."""
 
     settled_error: np.ndarray
     settled_zone: np.ndarray
@@ -377,9 +378,10 @@ def figures(
     settled: int = 100,
 ) -> Figures:
     """Settled error: |mean of the last `settled` steps - r|. Settling: the last step outside `band` °C of the
-    target, counted from each new reference, the longest of them. Overshoot: past the target in the direction of
-    the step. At limits: share of (input, step) wished outside. Energy: mean input. Crossing: how far y lies
-    beyond low, high (p,). Outside: steps outside the band, an edge of a fifth of it counted in part: smooth."""
+    target, counted from each new reference, the longest of them. Overshoot: past the target in the direction
+    of the step. At limits: share of (input, step) wished outside. Energy: mean input. Crossing: how far y
+    lies beyond low, high (p,). Outside: steps outside the band, an edge of a fifth of it counted in part:
+    smooth."""
     error = rollout.y - rollout.r
     late = np.abs((rollout.y - rollout.r)[-settled:].mean(axis=0))
     off = rollout.y - rollout.target
@@ -426,7 +428,8 @@ class Allowance(NamedTuple):
 
 
 def costs(results: Figures, allowance: Allowance) -> np.ndarray:
-    """The declared cost of each case (s,): the sum of figure / allowance of what applies to it; 1e4 at most."""
+    """The declared cost of each case (s,): the sum of figure / allowance of what applies to it; 1e4 at
+    most."""
     moving = np.isnan(results.overshoot)
     response = np.where(
         moving,

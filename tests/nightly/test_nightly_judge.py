@@ -1,19 +1,24 @@
 """The judge: the same cases for both, seeds of its own, and figures that a worse controller cannot hide."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import yaml
 
+from benchmarks import nights
 from pipeline.deposition.workflow.tables import SCORES
-from pipeline.nightly import judge
+from pipeline.nightly import judge, night
 from pipeline.nightly.decision import KEPT, PROMOTED, Evidence, decide
-from pipeline.nightly.settings import Loop, Nightly
+from pipeline.nightly.settings import HoldOut, Loop, Nightly
+from pipeline.report.nightly.production import Champion, ChampionState, Installed
 from pipeline.setpoint.workflow import tables
 from pipeline.store import artifacts, params
 from pipeline.temperature import plant, window
 from pipeline.temperature.plant import baam, simulate
+from pipeline.temperature.workflow.contestants import CONTESTANTS
+from pipeline.temperature.workflow.settings import Tracking
 from tests.nightly.toy_nights import SETTINGS
 
 TEMPERATURE = {
@@ -25,8 +30,8 @@ TEMPERATURE = {
 
 @pytest.fixture
 def project(tmp_path, root, monkeypatch):
-    """params.yaml with a small panel, and controllers of the study's machine below `datasets` (weights 1 and
-    1) and `champion/temperature` (inputs cost a thousand times as much: it creeps)."""
+    """params.yaml with a small panel, and controllers of the study's machine below `datasets` (inputs cost 30
+    times what errors do) and `champion/temperature` (a hundred thousand times: it creeps)."""
     declared = params.read(root / "params.yaml")
     declared["nightly"] = SETTINGS | {
         "loops": {"temperature": TEMPERATURE},
@@ -38,12 +43,17 @@ def project(tmp_path, root, monkeypatch):
     u = rng.uniform(-5, 5, (800, 7))
     y = simulate(baam(), u, np.zeros(6))[1] + 0.05 * rng.standard_normal((800, 5))
     long = window.learn([u], [y], longest=4)
-    for folder, r in (("datasets", 1.0), ("champion/temperature", 1000.0)):
+    for folder, r in (("datasets", 30.0), ("champion/temperature", 1e5)):
         artifacts.write_arrays(f"{folder}/identify_plant/plant.parquet", "plant", 1, plant.stored([baam()]))
         artifacts.write_arrays(f"{folder}/learn_kernel/window.parquet", "window", 1, window.stored(long))
         artifacts.write_json(
             f"{folder}/tune_weights/weights.json",
-            {"practical": {"q": [1.0] * 5, "r": [r] * 7, "observer_tau": 1.0}},
+            {
+                "contestants": {
+                    "subspace_lqg": {"effort_weight": r, "observer_tau": 1.0, "integral": 0.02},
+                    "varx_riccati": {"effort_weight": r, "integral": 0.02},
+                }
+            },
         )
     return params.load(Nightly, "nightly")
 
@@ -58,8 +68,7 @@ def test_both_are_judged_on_the_same_cases_and_the_same_noise_every_time(project
         and challenger.panel == champion.panel
         and list(challenger.cases) == list(champion.cases)
     )
-    # nominal, 7 inputs up and down, and more heat loss
-    assert len({block for block, _ in challenger.cases.values()}) == 16
+    assert len({block for block, _ in challenger.cases.values()}) == project.holdout.plants
     # the one that creeps costs more in every block, and the rule says so both ways round
     rule = {"allowed": dict.fromkeys(champion.guards, 1e9), "alarms": [], "seed": 1}
     assert decide(champion, challenger, project.rule, **rule).decision == PROMOTED
@@ -67,12 +76,80 @@ def test_both_are_judged_on_the_same_cases_and_the_same_noise_every_time(project
 
 
 def test_another_panel_has_another_name(project):
-    other = project.model_copy(update={"holdout": project.holdout.model_copy(update={"seeds": [902]})})
+    other = project.model_copy(update={"holdout": project.holdout.model_copy(update={"seed": 902})})
     first, second = (
         judge.judge(settings.loops["temperature"], settings).measure(Path("datasets"))
         for settings in (project, other)
     )
     assert first.panel != second.panel
+
+
+@pytest.mark.parametrize("name", ["subspace_lqg", "varx_riccati"])
+def test_a_champion_of_version_0_1_is_judged_as_its_law_under_todays_limits_and_governor(project, name):
+    """Its law is that of the same weights today: to the last bit the same evidence."""
+    settings = project.model_copy(update={"holdout": project.holdout.model_copy(update={"controller": name})})
+    measure = judge.judge(settings.loops["temperature"], settings).measure
+    today = {
+        "effort_weight": 30.0,
+        "observer_tau": 1.0,
+        "integral": params.load(Tracking, "tracking").integral,
+    }
+    path = "champion/temperature/tune_weights/weights.json"
+    artifacts.write_json(path, {"contestants": {name: today}})
+    same = measure(Path("champion/temperature"))
+    artifacts.write_json(path, {"practical": {"q": [1.0] * 5, "r": [30.0] * 7, "observer_tau": 1.0}})
+    assert measure(Path("champion/temperature")) == same
+
+
+V01 = {"practical": {"q": [1.0] * 5, "r": [1.0] * 7, "observer_tau": 1.0}}
+SUBSPACE = {"contestants": {"subspace_lqg": {"effort_weight": 1.0, "observer_tau": 1.0, "integral": 0.02}}}
+
+
+@pytest.mark.parametrize(
+    ("name", "weights", "sentence"),
+    [
+        ("pi", V01, "of pi, which nightly.holdout.controller names, found those of an earlier version"),
+        ("varx_riccati", SUBSPACE, "expected effort_weight, integral of varx_riccati.*one of subspace_lqg"),
+        ("learned_kernel", V01, "kernel.parquet.*add datasets/learn_kernel/kernel.parquet to nightly.loops"),
+        ("subspace_lqg", {"practical": {"q": [1.0], "r": [1.0] * 7}}, r"practical.q with 5 weights.*\[1.0\]"),
+        ("subspace_lqg", {"contestants": {"subspace_lqg": {"q": [1.0]}}}, "q has 1 weights.*has 5 outputs"),
+    ],
+)
+def test_a_champion_that_cannot_be_designed_is_named_and_stays(project, name, weights, sentence):
+    settings = project.model_copy(update={"holdout": project.holdout.model_copy(update={"controller": name})})
+    for folder in ("datasets", "champion/temperature"):
+        artifacts.write_arrays(f"{folder}/identify_plant/spread.parquet", "spread", 1, plant.stored([baam()]))
+        artifacts.write_json(f"{folder}/tune_weights/weights.json", weights)
+    with pytest.raises(judge.NotComparable, match=sentence) as refused:
+        judge.judge(settings.loops["temperature"], settings).measure(Path("champion/temperature"))
+    assert "\n" not in str(refused.value)
+    present = Champion("night-0001", "", "", Installed({"md5": "0"}))
+    work = SimpleNamespace(state=ChampionState())
+    decided = night._decide(settings, "temperature", present, work).decision
+    assert decided.decision == KEPT and "cannot be compared: " in decided.reasons[0]
+
+
+def test_the_contestants_that_the_night_may_judge_are_all_but_doing_nothing_and_the_yardstick():
+    names = HoldOut.model_fields["controller"].annotation.__args__
+    assert set(names) == {one.name for one in CONTESTANTS} - {"hold", "exact_model"}
+
+
+def test_a_recorded_machines_panel_is_drawn_around_its_hold_out_recordings_once_and_for_all(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    Path("params.yaml").write_text(yaml.safe_dump(nights.settings()))
+    settings = params.load(Nightly, "nightly")
+    nights.write(Path(settings.holdout.recordings) / "calm.csv", nights.a_night(1, 0))
+    first, again = (judge.frozen_panel(settings.holdout) for _ in range(2))
+    assert first.name == again.name and len(first.records) == 1
+    truth = nights.machine()
+    rises = [
+        plant.markov_parameters(one, 200)[:, 0, 0].sum() / plant.markov_parameters(truth, 200)[:, 0, 0].sum()
+        for one in first.rehearsal.judging.plants
+    ]
+    # 1 +- 0.15 of the input, at the side of which loss, speed and a sample of delay move little
+    assert 0.6 < min(rises) < 0.95 and 1.02 < max(rises) < 1.3
 
 
 def test_a_controller_that_destabilises_a_plant_says_so(project):

@@ -70,8 +70,8 @@ SETTINGS = {
         "holdout_error_percent": 5,
     },
     "holdout": {
-        "controller": "window", "recordings": "datasets/holdout/temperature", "starts_degC": [20],
-        "reference_offsets_degC": [0], "noise_degC": 0.1, "seeds": [901],
+        "controller": "varx_riccati", "recordings": "datasets/holdout/temperature", "starts_degC": [20],
+        "reference_offsets_degC": [0], "noise_degC": 0.1, "seed": 901, "plants": 8,
         "steps": 300,
     },
     "drift": {

@@ -176,12 +176,14 @@ def test_the_same_record_in_another_format_is_the_same_record(kit, root, shared,
 # ---- what is learned from it
 
 
-def test_the_next_experiment_is_written_within_the_limits(kit):
+def test_the_next_experiment_is_forecast_within_the_limits_of_the_kit(kit):
+    told = metrics(kit, "generate_probing")["next_experiment"]
+    assert told["written"], told["reason"]
     table = pandas.read_csv(kit / "datasets/generate_probing/next_experiment.csv")
     assert list(table) == ["time_s", "heater_1", "heater_2"]
-    assert table[["heater_1", "heater_2"]].min().min() >= 0
-    assert table[["heater_1", "heater_2"]].max().max() <= 100
-    assert (table[["heater_1", "heater_2"]].std() > 0).all()
+    heaters = table[["heater_1", "heater_2"]]
+    assert heaters.min().min() >= 0 and heaters.max().max() <= 100 and (heaters.std() > 0).all()
+    assert all(0 <= told["lowest_degC"][name] and told["highest_degC"][name] <= 80 for name in ("T1", "T2"))
 
 
 def test_the_plant_is_judged_on_the_part_of_the_record_that_it_has_not_seen(kit):

@@ -1,5 +1,5 @@
 """A small project with every artifact that the pages show, made by
-hand: two inputs, two zones, five controllers."""
+hand: two inputs, two zones, seven contestants and the yardstick."""
 
 from pathlib import Path
 
@@ -22,7 +22,8 @@ from pipeline.temperature.workflow.settings import Plant
 from tests.report import made_setpoint
 
 ROOT = Path(__file__).resolve().parents[2]
-CONTROLLERS = ("model_based", "window", "kernel", "baseline", "exact_model")
+CONTESTANTS = ("hold", "pi_simc", "pi", "subspace_lqg", "varx_riccati", "learned_kernel", "exact_model")
+PLANTS, CASES = 6, 24
 HOSTILE = '"><script>alert(1)</script><img src=http://evil.example/x onerror=alert(2)>\u202egpj.mcap'
 PRINTER_PID = {
     "recording": "klippy.log",
@@ -61,30 +62,85 @@ NEXT_EXPERIMENT = {
 }
 DITHER = {"written": False, "reason": "PI needs an input for each of the 2 outputs; found 1 inputs"}
 SCALED = {"change_percent": -60.0, "gain_difference": 1e-15}
-TRADES = {
-    name: {"tracking_degC": e, "effort_percent": u}
-    for name, e, u in (("default", 8.0, 11.0), ("optimum", 4.0, 30.0))
-}
 
 
-def figure(median, low, high, **more):
-    return {"median": median, "low": low, "high": high, "worst": high, **more}
+def figure(q90, low, high, **more):
+    """A figure over all cases: its 90 % quantile with the band of that."""
+    case = {"case": 7, "plant": 3, "kind": "ramp", "start_degC": 20.0}
+    worst = None if q90 is None else 1.5 * q90
+    half = None if q90 is None else 0.5 * q90
+    return {"median": half, "q90": q90, "low": low, "high": high, "worst": worst, "worst_case": case} | more
 
 
-def controller(gap=0.4):
+def contestant(cost=2.0, **changed):
     """Figures that pass every rule of params.yaml."""
     return {
-        "gap_percent": figure(gap, 0.8 * gap, 1.3 * gap),
-        "settled_error_degC": figure(0.1, 0.05, 0.2, zone=1),
-        "settling_s": figure(6.0, 5.0, 8.0),
-        "overshoot_degC": figure(0.5, 0.3, 0.9),
-        "at_limits_percent": figure(1.0, 0.5, 2.0),
-        "tracking_degC": figure(4.0, 2.0, 6.0),
-        "effort_percent": figure(2.0, 1.0, 3.0),
-        "outside_limits_percent": figure(20.0, 18.0, 22.0),
-        "disk": figure(0.7, 0.6, 0.7),
-        "delay_s": figure(3.0, 2.5, 3.0),
-        "stable_plants": {"count": 2, "of": 2},
+        "settled_error": figure(0.1, 0.05, 0.2),
+        "settling": figure(6.0, 5.0, 8.0),
+        "overshoot": figure(0.5, 0.3, 0.9),
+        "at_limits": figure(1.0, 0.5, 2.0),
+        "energy": figure(30.0, 29.0, 31.0),
+        "cost": figure(cost, 0.9 * cost, 1.1 * cost),
+        "rms": figure(4.0, 3.0, 5.0),
+        "crossings": {"cases": 0, "of": CASES, "worst_degC": 0.0},
+        "never_settled_percent": 0.0,
+        "gap": {
+            "median_percent": 0.1,
+            "q90_percent": 0.4,
+            "convention": "Q = R = I, discounted 0.99, unclipped, without integrator, plant known at rest",
+        },
+        "margins": {"disk": {"median": 0.7, "worst": 0.6}, "delay_s": {"median": 3.0, "worst": 2.5}},
+        "stable": {"count": PLANTS, "of": PLANTS},
+        "tuned": {"observer_tau": 3.0},
+        "at_bound": [],
+        "evaluations": 60,
+    } | changed
+
+
+def comparison():
+    """The comparison as the stage writes it: subspace + LQG is the best, and wins the pair."""
+    costs = {"pi_simc": 5.0, "pi": 4.0, "subspace_lqg": 2.0, "varx_riccati": 2.1, "learned_kernel": 2.2}
+    held = {name: contestant(costs.get(name, 3.0)) for name in CONTESTANTS}
+    held["hold"] = contestant(9.0, settling=figure(None, None, None), settled_error=figure(80.0, 70.0, 90.0))
+    return {
+        "simulated": True,
+        "plants": PLANTS,
+        "cases": CASES,
+        "noise_degC": 0.1,
+        "seed": 1,
+        "steps": 600,
+        "sample_time_s": 1.0,
+        "band_degC": 1.0,
+        "contestants": held,
+        "order": list(CONTESTANTS),
+        "best": "subspace_lqg",
+        "best_reason": {"against": "pi", "p": 0.01, "difference": 40.0},
+        "pair": {
+            "a": "subspace_lqg",
+            "b": "learned_kernel",
+            "winner": "subspace_lqg",
+            "p": 0.012,
+            "difference": 6.2,
+            "low": 3.1,
+            "high": 9.4,
+            "plants": PLANTS,
+            "figures": {"settling": [6.0, 6.0], "overshoot": [0.5, 0.5], "settled_error": [0.1, 0.1]},
+        },
+        "deciding": {
+            "plant": 3,
+            "case": 7,
+            "kind": "ramp",
+            "best_without": "subspace_lqg",
+            "pair_without": "subspace_lqg",
+        },
+        "limits": {
+            "settled_error_degC": 0.5,
+            "settling_s": 60.0,
+            "overshoot_degC": 5.0,
+            "source": "declared",
+        },
+        "infeasible": [],
+        "refused": {},
     }
 
 
@@ -174,16 +230,8 @@ def metrics():
             "condition": 1e3,
             "candidates": {},
         },
-        "tune_weights": {
-            "practical": {
-                "cost": 2.0,
-                "cost_default": 8.0,
-                "regret_identity": 0.5,
-                "failed": 1,
-                "trade": TRADES,
-            }
-        },
-        "evaluate_temperature": {"controllers": {name: controller() for name in CONTROLLERS}},
+        "tune_weights": {"evaluations": 60},
+        "evaluate_temperature": comparison(),
         "reproduce_study": {
             "as_published": both,
             "printed": both,
@@ -196,7 +244,7 @@ def metrics():
                 "best_cost_perfect_state": 101.0,
                 "optimum": 100.0,
                 "scaled_weights": SCALED,
-                "trade": {"optimum": TRADES["optimum"]},
+                "trade": {"optimum": {"tracking_degC": 4.0, "effort_percent": 30.0}},
                 "q": [0.5, 0.25, 0.5, 0.5, 0.5],
                 "r": [0.5] * 7,
             },
@@ -242,48 +290,41 @@ def declared(root):
     sections["plant"] = {
         "sample_time_s": 1.0,
         "inputs": [{"name": f"heater_{i}", "unit": "percent", "low": 0, "high": 100} for i in (1, 2)],
-        "outputs": [{"name": f"zone_{i}", "unit": "degC", "reference": 100.0 + i} for i in (1, 2)],
-    }
-    sections["panel"] |= {
-        "noise_degC": [0.1],
-        "steps": 60,
-        "judging": {"starts_degC": [20], "reference_offsets_degC": [0], "seeds": [1, 2, 3]},
+        "outputs": [
+            {"name": f"zone_{i}", "unit": "degC", "reference": 100.0 + i, "low": 0, "high": 150}
+            for i in (1, 2)
+        ],
     }
     (root / "params.yaml").write_text(yaml.safe_dump(sections))
     return params.load(Plant, "plant", root / "params.yaml")
 
 
-def scorecard(worst):
-    """Two plants, three seeds; the second plant is the worst: `worst` by controller, in percent."""
-    rows = [(name, plant, seed) for name in CONTROLLERS for plant in (0, 1) for seed in (1, 2, 3)]
-    columns = {column.name: [0.0] * len(rows) for column in tables.SCORECARD.columns}
-    names, plants, seeds = zip(*rows, strict=True)
-    gap = [worst.get(name, 10.0) / 100 * (0.01 + 0.99 * plant + 0.0001 * seed) for name, plant, seed in rows]
+def cases():
+    """Every contestant on every case: four cases a plant, the cost of each by hand."""
+    rows = [(name, case) for name in CONTESTANTS for case in range(CASES)]
+    columns = {column.name: [0.0] * len(rows) for column in tables.CASES.columns}
     return columns | {
-        "controller": list(names),
-        "plant": np.array(plants, np.int32),
-        "seed": np.array(seeds),
-        "regret": gap,
-        "noise_degC": [0.1] * len(rows),
-        "start_degC": [20.0] * len(rows),
-        "reference_degC": [101.0] * len(rows),
+        "contestant": [name for name, _ in rows],
+        "case": np.array([case for _, case in rows], np.int32),
+        "plant": np.array([case // 4 for _, case in rows], np.int32),
+        "kind": ["constant"] * len(rows),
         "settled_zone": ["zone_1"] * len(rows),
+        "cost": [(2.0 + CONTESTANTS.index(name) % 3) * (1 + case / CASES) for name, case in rows],
     }
 
 
 def trajectories(machine, steps=60):
+    """Both cases of every contestant: 80 / 2^t - 0.05 below the references."""
     time = np.arange(float(steps))
-    names = [(name, mode) for name in CONTROLLERS for mode in ("unclipped", "deployed")]
+    names = [(name, case) for name in CONTESTANTS for case in ("typical", "deciding")]
     columns = {
-        "controller": [name for name, _ in names for _ in time],
-        "mode": [mode for _, mode in names for _ in time],
+        "contestant": [name for name, _ in names for _ in time],
+        "case_name": [case for _, case in names for _ in time],
         "time_s": np.tile(time, len(names)),
-        "cost": np.tile(1000.0 * (1 - 0.5 ** (time + 1)), len(names)),
     }
-    for end, factor in (("low", 0.5), ("median", 1.0), ("high", 2.0)):
-        columns[f"error_{end}_degC"] = np.tile(factor * np.abs(80 * 0.5**time - 0.05), len(names))
     for output in machine.outputs:
         columns[output.name] = np.tile(output.reference - 80.0 * 0.5**time + 0.05, len(names))
+        columns[f"{output.name}_reference"] = np.full(len(names) * steps, output.reference)
     for signal in machine.inputs:
         columns |= {
             f"{signal.name}_command": np.tile(50.0 * 0.5**time - 1.0, len(names)),
@@ -354,7 +395,7 @@ def model(machine):
     }
 
 
-def write(root, *, samples=400, recording="good.mcap", worst=None):
+def write(root, *, samples=400, recording="good.mcap"):
     """Every artifact below `root`, which is the working directory."""
     machine = declared(root)
     for stage, figures in metrics().items():
@@ -396,43 +437,19 @@ def write(root, *, samples=400, recording="good.mcap", worst=None):
     artifacts.write_table(data / "identify_plant/holdout.parquet", tables.holdout(machine.outputs), seen)
     for name, (schema, columns) in model(machine).items():
         artifacts.write_table(data / f"identify_plant/{name}.parquet", schema, columns)
-    table = np.array([[1, 8, -10.0], [2, 16, -30.0], [3, 24, -20.0]])
-    artifacts.write_arrays(
-        data / "learn_kernel/window.parquet", "window", 1, {"table": (table, "1", "criterion")}
-    )
-    artifacts.write_arrays(
-        data / "learn_kernel/kernel.parquet",
-        "kernel",
-        1,
-        {
-            "rank": (np.array(5), "1", "length of v"),
-            "singular_values": (np.array([9.0, 3.0, 1e-9]), "1", ""),
-            "u_scale": (np.ones(2), "1", ""),
-        },
-    )
-    history = {
-        "mode": ["practical"] * 3,
-        "evaluation": [1, 2, 3],
-        "cost": [9.0, np.nan, 2.0],
-        "incumbent": [9.0, 9.0, 2.0],
-        "tracking_degC": [9.0, np.nan, 5.0],
-        "effort_percent": [10.0, np.nan, 12.0],
-        "chosen": [False, False, True],
-        "failure": ["", HOSTILE, ""],
-    }
-    artifacts.write_table(data / "tune_weights/history.parquet", tables.TUNING, history)
     artifacts.write_json(
-        data / "tune_weights/weights.json", {"practical": {"q": [1.0, 2.0], "r": [0.1, 0.2]}}
+        data / "tune_weights/weights.json",
+        {"contestants": {"subspace_lqg": {"q": [1.0, 2.0], "r": [0.1, 0.2], "cost": 2.0, "at_bound": []}}},
     )
     artifacts.write_json(data / "ingest/printer_pid.json", {"heaters": [PRINTER_PID]})
     folder = data / "evaluate_temperature"
-    artifacts.write_table(folder / "scorecard.parquet", tables.SCORECARD, scorecard(worst or {}))
+    artifacts.write_table(folder / "cases.parquet", tables.CASES, cases())
     artifacts.write_table(
         folder / "trajectories.parquet",
         tables.trajectories(machine.inputs, machine.outputs),
         trajectories(machine),
     )
-    artifacts.write_json(folder / "summary.json", {"noise_degC": 0.1, "scenarios": 6, "plants": 2})
+    artifacts.write_json(folder / "summary.json", comparison())
     study()
     deposition()
     made_setpoint.write()

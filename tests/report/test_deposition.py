@@ -13,7 +13,7 @@ from pipeline.deposition.workflow.tables import SIGNALS
 from pipeline.store import artifacts, params
 from stages.report import main
 from tests.report import made
-from tests.report.test_pages import Page, change, figures
+from tests.report.test_pages import Page, change_all, figures
 
 PAGE, FOLDER = Path("reports/deposition.html"), Path("datasets/compose_parts")
 ARTIFACTS = [
@@ -212,7 +212,7 @@ def test_page_one_has_the_card_with_the_winner_in_words_and_the_worst_loop_as_it
         "The library by its priority rule: 12 %." in first.text
     )
     assert first.links.count("deposition.html") >= 3
-    assert "Deploy the data‑driven temperature controller." in first.text
+    assert "Rehearsal passed: subspace + LQG." in first.text
     made.deposition(
         {
             "on_off": (100.0, None, 60.0),
@@ -225,15 +225,13 @@ def test_page_one_has_the_card_with_the_winner_in_words_and_the_worst_loop_as_it
     text = Path("reports/index.html").read_text()
     assert (
         re.search(r"<h1.*?>(.*?)</h1>", text)[1]
-        == "Deploy temperature and setpoint; do not deploy deposition."
+        == "Rehearsal passed: temperature and setpoint; failed: deposition."
     )
     assert "Do not print these parts yet: the basis functions come closest." in text
 
 
 def test_two_loops_that_fail_are_both_named_in_the_headline(project):
-    change(
-        "evaluate_temperature", controllers__window__settled_error_degC=made.figure(0.72, 0.61, 0.84, zone=1)
-    )
+    change_all(settled_error=made.figure(0.72, 0.61, 0.84))
     made.deposition(
         {
             "on_off": (100.0, None, 60.0),
@@ -245,8 +243,8 @@ def test_two_loops_that_fail_are_both_named_in_the_headline(project):
     main()
     head, rest = Path("reports/index.html").read_text().split("</h1>")
     assert (
-        head.endswith("Deploy setpoint; do not deploy temperature or deposition.")
-        and "Do not deploy the data‑driven temperature controller." in rest
+        head.endswith("Rehearsal passed: setpoint; failed: temperature and deposition.")
+        and "<strong>Rehearsal failed.</strong>" in rest
     )
 
 

@@ -5,10 +5,11 @@ import re
 from pathlib import Path
 
 from pipeline.report.shared import provenance
-from pipeline.report.shared.verdict import Missing
-from pipeline.report.temperature.verdict import rule
-from pipeline.store import artifacts
+from pipeline.report.shared.verdict import FAILED, PASSED, Missing, ReportRules
+from pipeline.report.temperature.verdict import NEVER, decide
+from pipeline.store import artifacts, params
 from stages.report import main
+from tests.report import made
 from tests.report.test_pages import DEPOSITION, INDEX, TEMPERATURE, Page, figures
 
 NIGHT = Path("reports/metrics/nightly.json")
@@ -47,7 +48,7 @@ def test_no_alarm_passes_the_rule_and_names_what_moved_most_against_its_noise(pr
         night(figures=FIGURES)
         == "None found. Largest change of the machine: gain of heater_1, 3.2 % ± 4.1. night-0003, 2026-11-20"
     )
-    assert figures()["verdict"]["lead"] == "All five rules passed."
+    assert figures()["verdict"]["lead"] == "All rules passed on 6 simulated plants."
     assert 'href="nightly.html"' in INDEX.read_text()
 
 
@@ -82,7 +83,7 @@ def test_what_is_watched_is_undecided_and_a_night_without_recordings_measures_no
         "Perhaps. The noise of sensor_2 grew; an alarm where"
     )
     assert night().startswith("Not measured. The last night had no new recording")
-    assert figures()["verdict"]["lead"] == "It passes every rule measured so far."
+    assert figures()["verdict"]["lead"] == "Every rule measured so far passed on 6 simulated plants."
 
 
 def test_a_broken_file_of_the_night_is_said_so(project):
@@ -102,6 +103,11 @@ def test_a_later_night_is_no_change_of_what_the_pages_were_made_from(project):
     assert not any("nightly.json" in sentence for check in provenance.checks() for sentence in check.wrong)
 
 
-def test_drift_is_judged_by_the_night_alone():
-    assert rule("drift", [], {}).state == "not measured"
-    assert rule("drift", [], {"drift": Missing("failed", "")}).state == "failed"
+def test_drift_is_judged_by_the_night_alone_and_a_drifted_machine_fails(project):
+    main()
+    stages = made.metrics()
+    rules = params.load(ReportRules, "report")
+    open_drift = decide(stages, rules, recorded=False, drift=NEVER)
+    drifted = decide(stages, rules, recorded=False, drift=Missing("failed", "The machine has changed"))
+    assert (open_drift.state, drifted.state) == (PASSED, FAILED)
+    assert drifted.lead == "First failed rule: drift." and "The machine has changed." in drifted.reason

@@ -17,7 +17,7 @@ from stages import report
 from tests.report import made, made_setpoint
 from tests.report.conftest import populate
 from tests.report.test_browser import ANSWERS
-from tests.report.test_pages import change
+from tests.report.test_pages import change, change_all
 
 LONG = "the recording of the third night stops in the middle of a line, and nobody knows why " * 6
 
@@ -27,9 +27,7 @@ def fine():
 
 
 def temperature_failed():
-    change(
-        "evaluate_temperature", controllers__window__settled_error_degC=made.figure(0.72, 0.61, 0.84, zone=1)
-    )
+    change_all(settled_error=made.figure(0.72, 0.61, 0.84))
 
 
 def deposition_failed():

@@ -1,11 +1,11 @@
-"""Page one's sentence and its three rows: who may be deployed, in few
+"""Page one's sentence and its three rows: what is claimed of each, in few
 words, however long the sentences of the stages are."""
 
 from pipeline.report.shared.headline import LINE, LINES, Loop, _fitted, _lines, decision, state
 
 
 def loop(name="temperature", state="passed", reason="It costs 1 % more.", remedy=""):
-    return Loop(name, "heaters to barrel", state, "Deploy it.", "All five rules passed.", reason, remedy)
+    return Loop(name, "heaters to barrel", state, "Run it.", "All five rules passed.", reason, remedy)
 
 
 def three(*states):
@@ -15,21 +15,28 @@ def three(*states):
 
 
 def test_the_sentence_names_every_loop_once_by_what_may_be_done_with_it():
-    assert decision(three("passed", "passed", "passed")) == "Deploy all three loops."
+    assert decision(three("passed", "passed", "passed")) == "Rehearsal passed: all three loops."
     assert (
         decision(three("passed", "passed", "failed"))
-        == "Deploy temperature and deposition; do not deploy setpoint."
+        == "Rehearsal passed: temperature and deposition; failed: setpoint."
     )
     assert (
         decision(three("failed", "open", "not measured"))
-        == "Do not deploy temperature; deposition is undecided; setpoint is not measured."
+        == "Rehearsal failed: temperature; open: deposition; not measured: setpoint."
     )
-    assert (
-        decision(three("failed", "failed", "failed")) == "Do not deploy temperature, deposition or setpoint."
-    )
+    assert decision(three("failed", "failed", "failed")) == "Rehearsal failed: all three loops."
     assert (
         decision(three("open", "not measured", "not measured"))
-        == "Temperature is undecided; deposition and setpoint are not measured."
+        == "Rehearsal open: temperature; not measured: deposition and setpoint."
+    )
+
+
+def test_of_a_recorded_machine_a_loop_is_ready_for_a_trial_or_not():
+    ready, not_ready, rehearsed = three("passed", "open", "passed")
+    loops = [ready._replace(recorded=True), not_ready._replace(recorded=True), rehearsed]
+    assert (
+        decision(loops)
+        == "Ready for a supervised trial: temperature; not ready: deposition; rehearsal passed: setpoint."
     )
 
 
@@ -44,7 +51,7 @@ def test_sentences_of_any_length_fit_the_first_screen_and_what_is_cut_says_so():
     long = [loop(reason="x" * 900, remedy="Do this. " * 40)] * 3
     found = _fitted(long)
     assert sum(map(_lines, found)) <= LINES
-    assert all(one.reason.endswith("…") and one.decision == "Deploy it." for one in found)
+    assert all(one.reason.endswith("…") and one.decision == "Run it." for one in found)
 
 
 def test_remedies_come_whole_and_those_of_a_loop_that_did_not_pass_come_first():

@@ -26,10 +26,21 @@ def report(gap):
         name: {
             "gap_percent": {"median": k * gap, "low": 0.9 * k * gap, "high": 1.1 * k * gap},
             "settling_s": made.figure(6.0, 5.0, None),
+            "disk": {"median": 0.66, "low": 0.62, "high": 0.66},
         }
         for k, name in enumerate(("window", "model_based", "baseline"), 1)
     }
     return {"verdict": {"decision": f"Deploy, gap {gap:g}."}, "figures": figures}
+
+
+def of_today(settling):
+    """The pages' figures of a run of the comparison as deployed."""
+    ends = {"median": settling, "low": 0.9 * settling, "high": 1.1 * settling}
+    names = ("subspace_lqg", "learned_kernel", "pi")
+    return {
+        "verdict": {"decision": "Rehearsal passed: subspace + LQG.", "winner": "subspace_lqg"},
+        "figures": {name: {"settling": ends} for name in names},
+    }
 
 
 def commits(runs):
@@ -81,7 +92,7 @@ def test_two_hundred_revisions_are_drawn_within_ten_seconds_with_their_own_figur
     assert [run.subject for run in runs] == [f"run {k}" for k in range(200)]
     text = PAGE.read_text()
     assert (
-        text.count('<svg class="plot') == 12
+        text.count('<svg class="plot') == 9 + 2 + 3
         and len(re.findall(r"<tr><th scope=\"row\"><code>[0-9a-f]{8}</code>", text)) == 200
     )
     assert "data-driven from 1 % to 2.99 %" in text.replace("\u202f", " ")
@@ -104,7 +115,10 @@ def test_figures_that_are_not_committed_come_last_and_equal_ones_do_not_come_twi
 def test_a_revision_before_the_pages_kept_figures_is_read_from_its_scorecard_and_a_broken_one_leaves_a_gap(
     empty, monkeypatch
 ):
-    scorecard = {"controllers": {"window": made.controller(0.5)}}
+    scorecard = {
+        "controllers": {"window": {"gap_percent": {"median": 0.5, "low": 0.4, "high": 0.65, "worst": 0.65}}},
+        "contestants": {"pi": made.contestant(0.5)},
+    }
     parts = {
         "square": {
             "A": {
@@ -128,11 +142,12 @@ def test_a_revision_before_the_pages_kept_figures_is_read_from_its_scorecard_and
         ]
     )
     first, broken, new = history.revisions(9)
-    # by hand: the figures of made.controller, the largest gap of the
-    # spread, the worse material after learning
+    # by hand: the gap, the largest one of the spread, the quantile of today, the worse material after
+    # learning
     assert (
         first.figures["window"]["gap_percent"] == (0.5, 0.4, 0.65)
         and first.figures["window"]["worst_case_gap_percent"] == (0.65,) * 3
+        and first.figures["pi"]["cost"] == pytest.approx((0.5, 0.45, 0.55))
     )
     assert {key: f.value for key, f in first.figures["deposition"].items()} == {
         "flow_error_percent": 2.5,
@@ -142,6 +157,22 @@ def test_a_revision_before_the_pages_kept_figures_is_read_from_its_scorecard_and
     assert new.figures["window"]["settling_s"].high == np.inf
     command(monkeypatch)
     assert "not measured" in Page(PAGE).text
+
+
+def test_runs_before_and_after_the_comparison_as_deployed_stand_on_one_page_and_none_says_deploy(
+    empty, monkeypatch
+):
+    commits([("old", {"report.json": report(2.0)}), ("new", {"report.json": of_today(26.0)})])
+    command(monkeypatch)
+    page = Page(PAGE).text
+    assert "Temperature, earlier runs" in page and "Gap to the optimum" in page
+    assert "Rehearsal passed: subspace + LQG." in page and "Passed the rules of its day." in page
+    assert "deploy " not in page.lower() and "deploy," not in page.lower()
+    assert "Settling now 26 s" in page
+    # a figure of the one never stands in the line or column of the other
+    assert "0.660" not in page
+    runs = list(history.revisions(9))
+    assert "settling" not in runs[0].figures["window"] and runs[1].winner == "subspace_lqg"
 
 
 def test_a_hostile_subject_does_nothing(empty, monkeypatch):
@@ -209,5 +240,5 @@ def test_in_a_browser_it_says_nothing_on_the_console_and_sorts_by_a_figure(empty
     Path("reports/machine.js").write_text(MACHINE)
     page = open_page("history", folder=empty / "reports")
     page.locator("th button", has_text="Gap").click()
-    assert page.locator(".runs tbody td:nth-child(5)").all_inner_texts() == ["0.500", "2.00", "12.0"]
+    assert page.locator(".runs tbody td:nth-child(14)").all_inner_texts() == ["0.500", "2.00", "12.0"]
     assert page.console == [] and page.evaluate("document.documentElement.scrollWidth") <= 1280

@@ -197,14 +197,14 @@ def test_the_page_of_the_loop_says_whether_the_printers_own_pid_was_judged(proje
     change("evaluate_temperature", refused={"printer_pid": "found those of 1 heaters in the log"})
     main()
     text = Page(TEMPERATURE).text
-    assert "The printer’s own PID is not among these controllers." in text
+    assert "The printer’s own PID is not among these contestants." in text
     assert "It was refused: found those of 1 heaters in the log." in text
     assert "The printer holds heater_1 by Kp 8.00, Ki 0.400, Kd 40.0, in % of duty, °C and s." in text
-    monkeypatch.setattr(made, "CONTROLLERS", (*made.CONTROLLERS, "printer_pid"))
+    monkeypatch.setattr(made, "CONTESTANTS", (*made.CONTESTANTS, "printer_pid"))
     made.write(project)
     main()
     text = Page(TEMPERATURE).text
-    assert "The printer’s own PID is among these controllers, as it is." in text
+    assert "The printer’s own PID is among these contestants, as it is." in text
     assert "The printer’s own PID. Klipper’s PID with the gains of the printer’s configuration" in text
 
 

@@ -92,10 +92,10 @@ def test_the_first_failed_rule_is_said_in_words(project, metric, value, rule, se
         f"{sentence} By runs that settle and stay the agent comes closest." in text
     )
     assert PAGE.read_text().count('<tr class="fail"><th scope="row"><a') == 1
-    # page one says which loops may be deployed, and of this one why not
+    # page one says which loops passed, and of this one why not
     assert (
         re.search(r"<h1.*?>(.*?)</h1>", INDEX.read_text())[1]
-        == "Deploy temperature and deposition; do not deploy setpoint."
+        == "Rehearsal passed: temperature and deposition; failed: setpoint."
     )
     assert f"First failed rule: {rule}. {sentence}" in Page(INDEX).text
 
@@ -147,7 +147,8 @@ def test_before_the_stages_ran_the_page_and_the_card_say_so(project):
     assert "Run ./run dvc repro evaluate_setpoint." in text and "Run the agent" not in Page(INDEX).text
     # what was not measured takes no headline from a loop that was
     assert (
-        "Deploy temperature and deposition; setpoint is not measured." in INDEX.read_text().split("</h1>")[0]
+        "Rehearsal passed: temperature and deposition; not measured: setpoint."
+        in INDEX.read_text().split("</h1>")[0]
     )
 
 

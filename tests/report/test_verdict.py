@@ -1,7 +1,11 @@
-"""Rules and figures -> verdict: each state, in the words of the design."""
+"""Rules and figures -> verdict: each state, in the words of the design; and over many random comparisons
+never two sentences that contradict one another."""
 
+import copy
 import math
+import re
 
+import numpy as np
 import pytest
 
 from pipeline.report.deposition.verdict import verdict as deposition
@@ -23,20 +27,23 @@ from pipeline.report.shared.verdict import (
     share,
     state,
 )
+from pipeline.report.temperature import readme
+from pipeline.report.temperature.contestants import in_a_sentence
 from pipeline.report.temperature.judgement import judgement
-from pipeline.report.temperature.verdict import decide, questions, undecided, winner
-from pipeline.store import params
+from pipeline.report.temperature.pairs import deciding_sentence, pair_sentence, prior_sentence, relearned_band
+from pipeline.report.temperature.verdict import best_sentence, decide, questions, standings
+from pipeline.store import artifacts, params
 from stages import report
+from tests.report import made
+from tests.report.test_pages import INDEX, TEMPERATURE, Page
 
 RULES = ReportRules(
-    gap_percent=5.0,
     settled_error_degC=0.5,
     settling_s=60.0,
     overshoot_degC=5.0,
     at_limits_percent=10.0,
     disk_margin=0.4,
     delay_margin_s=1.0,
-    worst_case_gap_percent=50.0,
     flow_error_percent=6.0,
     line_volume_percent=3.0,
     above_whole_points=1.0,
@@ -48,47 +55,38 @@ RULES = ReportRules(
     ece_image=0.025,
     ece_window=0.04,
 )
-ASKED = questions(RULES, band_degC=1.0)
+ASKED = questions(RULES, {})
 BY_KEY = {question.key: question for question in ASKED}
 
 
-def answers(**changed):
-    """A controller that passes every rule, with some figures changed."""
-    good = {
-        "gap_percent": Figure(0.42, 0.31, 0.58),
-        "settled_error_degC": Figure(0.31, 0.26, 0.37, note="zone 4"),
-        "settling_s": Figure(9.0, 8.0, 10.0),
-        "overshoot_degC": Figure(0.9, 0.7, 1.2),
-        "at_limits_percent": Figure(6.1, 4.8, 7.9),
-        "disk": Figure(0.46, 0.43, 0.49),
-        "delay_s": Figure(3.1, 2.8, 3.3),
-        "worst_case_gap_percent": Figure(2.8, 2.3, 3.4),
-        "data": Figure(1.24, 1.24, 1.24, note="2,000 of 1,610"),
-    }
-    return good | changed
+def metrics(**changed):
+    """Metrics of all stages; `changed` are figures of every contestant."""
+    stages = made.metrics()
+    compared = stages["evaluate_temperature"]
+    for name in compared["contestants"]:
+        compared["contestants"][name] |= copy.deepcopy(changed)
+    return stages
 
 
-def roles(data_driven=None, model_based=None, baseline=None):
-    return {
-        "data_driven": data_driven or answers(),
-        "model_based": model_based or answers(),
-        "baseline": baseline or answers(),
-    }
+def judge(stages, **more):
+    return decide(stages, RULES, **({"recorded": False} | more))
 
 
 @pytest.mark.parametrize(
     ("key", "figure", "expected"),
     [
-        ("gap_percent", Figure(4.0, 3.0, 5.0), PASSED),
-        ("gap_percent", Figure(4.9, 4.0, 5.1), UNDECIDED),
-        ("gap_percent", Figure(7.0, 5.1, 9.0), FAILED),
+        ("overshoot", Figure(4.0, 3.0, 5.0), PASSED),
+        ("overshoot", Figure(4.9, 4.0, 5.1), UNDECIDED),
+        ("overshoot", Figure(7.0, 5.1, 9.0), FAILED),
         ("disk", Figure(0.5, 0.4, 0.5), PASSED),
         ("disk", Figure(0.5, 0.39, 0.5), UNDECIDED),
         ("disk", Figure(0.3, 0.2, 0.39), FAILED),
-        ("settling_s", Figure(math.inf, math.inf, math.inf), FAILED),
+        ("settling", Figure(math.inf, math.inf, math.inf), FAILED),
         ("delay_s", Figure(math.inf, math.inf, math.inf), PASSED),
-        ("gap_percent", Missing("not measured", "no run"), OPEN),
-        ("gap_percent", Missing("failed", "it broke"), FAILED),
+        ("crossings", Figure(0.0, 0.0, 0.0), PASSED),
+        ("crossings", Figure(1.0, 1.0, 1.0), FAILED),
+        ("overshoot", Missing("not measured", "no run"), OPEN),
+        ("overshoot", Missing("failed", "it broke"), FAILED),
     ],
 )
 def test_a_band_inside_passes_outside_fails_and_one_that_straddles_is_undecided(key, figure, expected):
@@ -130,102 +128,335 @@ def test_the_verdict_of_every_loop_has_the_same_fields(project, monkeypatch):
 
 
 def test_share_of_the_allowance_is_inverted_where_more_is_better():
-    assert share(BY_KEY["gap_percent"], 2.5) == 0.5
+    assert share(BY_KEY["overshoot"], 2.5) == 0.5
     assert share(BY_KEY["disk"], 0.8) == 0.5
     assert share(BY_KEY["disk"], 0.0) == math.inf
     assert share(BY_KEY["delay_s"], math.inf) == 0.0
+    # of what must not happen at all there is no allowance
+    assert share(BY_KEY["crossings"], 0.0) == 0.0 and share(BY_KEY["crossings"], 1.0) == math.inf
 
 
-def test_failed_names_the_first_failed_rule_its_figure_and_what_to_run_instead():
-    worse = answers(
-        settled_error_degC=Figure(0.72, 0.61, 0.84, note="zone 4"),
-        worst_case_gap_percent=Figure(90.0, 80.0, 99.0),
-    )
-    verdict = decide("temperature", ASKED, roles(data_driven=worse))
-    assert verdict.state == FAILED
-    assert verdict.decision == "Do not deploy the data\u2011driven temperature controller."
-    assert verdict.lead == "First failed rule: settled error."
-    assert verdict.reason == "Zone 4 settles 0.72\u202f°C from its reference; the rule allows 0.50\u202f°C."
-    assert verdict.remedy == "Keep the model-based controller: it passes every rule measured so far."
+# ---- the words
 
 
-def test_passed_says_so_with_what_is_closest_to_its_limit_and_never_counts_drift_as_passed():
-    verdict = decide("temperature", ASKED, roles(model_based=answers(gap_percent=Figure(9.0, 8.0, 10.0))))
-    assert verdict.state == PASSED
-    assert verdict.decision == "Deploy the data\u2011driven temperature controller."
-    assert verdict.lead == "It passes every rule measured so far."
-    assert verdict.remedy.startswith(
-        "Closest to its limit: disk margin, 0.46 of at least 0.40 (model-based: 0.46). "
-        "Drift is not measured. The nightly job measures it and has not run."
-    )
-    assert verdict.reason == "Model-based fails on gap."
+def test_passed_says_what_is_closest_to_its_limit_and_never_counts_drift_as_passed():
+    verdict = judge(metrics())
+    assert (verdict.state, verdict.winner) == (PASSED, "subspace_lqg")
+    assert verdict.decision == "Rehearsal passed: subspace + LQG."
+    assert verdict.lead == "Every rule measured so far passed on 6 simulated plants."
+    assert verdict.reason == "Closest to its limit: disk margin, 0.70 of at least 0.40."
+    assert verdict.remedy.startswith("Drift is not measured. The nightly job measures it and has not run.")
+    calm = judge(metrics(), drift=Figure(1.0, 0.0, 2.0))
+    assert calm.lead == "All rules passed on 6 simulated plants."
 
 
-def test_open_says_what_is_missing_and_how_much_more_of_it():
-    short_record = answers(data=Figure(0.43, 0.43, 0.43, note="700 of 1,610 samples; record 910 more."))
-    undecided_data = decide("temperature", ASKED, roles(data_driven=short_record))
-    assert (undecided_data.state, undecided_data.lead) == (FAILED, "First failed rule: data sufficiency.")
-    assert undecided_data.reason == "700 of 1,610 samples; record 910 more."
-    unmeasured = decide(
-        "temperature",
-        ASKED,
-        roles(
-            data_driven=answers(gap_percent=Missing("not measured", "The scorecard is not there", "Run it"))
+def test_of_recordings_a_pass_is_ready_for_a_supervised_trial_and_nothing_more():
+    verdict = judge(metrics(), recorded=True)
+    assert verdict.decision == "Ready for a supervised trial: subspace + LQG."
+    assert verdict.remedy.endswith("Next: a supervised trial, somebody at the machine throughout.")
+    assert judge(metrics(overshoot=made.figure(9.0, 8.0, 10.0)), recorded=True).decision == "Not ready."
+
+
+@pytest.mark.parametrize(
+    ("figure", "rule", "sentence"),
+    [
+        (
+            {"settled_error": made.figure(0.72, 0.61, 0.84)},
+            "settled error",
+            "settles 0.72 °C from its reference at the 90 % quantile of all cases; the rule allows 0.50 °C.",
         ),
-    )
-    assert (unmeasured.state, unmeasured.decision) == (OPEN, "Do not decide yet.")
-    assert unmeasured.reason == "The scorecard is not there. Run it."
-    assert unmeasured.remedy.startswith("Until then keep the model-based controller")
-
-
-def test_where_no_controller_passes_it_says_so_and_names_the_first_rule_of_each():
-    bad = answers(gap_percent=Figure(9.0, 8.0, 10.0))
-    verdict = decide("temperature", ASKED, roles(bad, bad, answers(disk=Figure(0.1, 0.1, 0.1))))
+        (
+            {"settling": made.figure(None, None, None)},
+            "settling",
+            "never settles at the 90 % quantile of all cases; the rule allows 60 s.",
+        ),
+        (
+            {"overshoot": made.figure(5.33, 5.1, 5.6)},
+            "overshoot",
+            "overshoots by 5.3 °C at the 90 % quantile of all cases; the rule allows 5.0 °C.",
+        ),
+        (
+            {"margins": {"disk": {"median": 0.3, "worst": 0.2}, "delay_s": {"median": 3.0, "worst": 2.0}}},
+            "disk margin",
+            "has a disk margin of 0.30 on the median plant; the rule asks for 0.40.",
+        ),
+        ({"stable": {"count": 3, "of": 6}}, "disk margin", "is unstable on 3 of 6 plants."),
+        (
+            {"crossings": {"cases": 4, "of": 24, "worst_degC": 3.0}},
+            "crossings",
+            "takes an output beyond its low or high: 4 of 24 cases.",
+        ),
+    ],
+)
+def test_failed_names_the_first_failed_rule_with_figure_and_limit(figure, rule, sentence):
+    verdict = judge(metrics(**figure))
+    assert (verdict.state, verdict.decision) == (FAILED, "Rehearsal failed.")
+    assert verdict.lead == f"First failed rule: {rule}."
+    reason = verdict.reason.replace("\u202f", " ")
+    assert reason == f"Subspace + LQG {sentence} No contestant passes; subspace + LQG comes closest."
     assert verdict.winner is None
-    assert (
-        "No controller passes: the model-based one fails on gap, the baseline one fails on limits."
-        in verdict.remedy
+
+
+def test_an_undeclared_limit_leaves_the_rule_open_and_an_open_rule_does_not_pass():
+    verdict = judge(metrics(), undeclared=("zone_1", "zone_2"))
+    assert (verdict.state, verdict.winner) == (OPEN, None)
+    assert verdict.decision == "Rehearsal open."
+    assert verdict.lead == "First open rule: crossings."
+    assert verdict.reason.startswith(
+        "low and high of zone_1, zone_2 are not declared. "
+        "Declare low and high below plant.outputs in params.yaml."
     )
 
 
-def test_the_winner_has_the_smallest_settled_error_and_within_noise_the_smallest_gap():
-    assert winner(ASKED, roles(baseline=answers(settled_error_degC=Figure(0.1, 0.09, 0.11)))) == "baseline"
-    assert winner(ASKED, roles(model_based=answers(gap_percent=Figure(0.1, 0.09, 0.11)))) == "model_based"
-    noisier_gap = answers(gap_percent=Figure(0.4, 0.3, 0.5), worst_case_gap_percent=Figure(26.0, 25.0, 27.0))
-    assert winner(ASKED, roles(model_based=noisier_gap, baseline=noisier_gap)) == "data_driven"
+def test_a_band_that_straddles_its_limit_does_not_pass():
+    verdict = judge(metrics(overshoot=made.figure(4.9, 4.5, 5.6)))
+    assert verdict.state == OPEN and verdict.lead == "First open rule: overshoot."
+    assert "The band of that quantile, 4.5–5.6, straddles the limit." in verdict.reason
+
+
+def test_where_another_contestant_passes_that_one_is_named_and_ties_go_to_the_simpler():
+    stages = metrics()
+    compared = stages["evaluate_temperature"]
+    compared["contestants"]["subspace_lqg"]["overshoot"] = made.figure(9.0, 8.0, 10.0)
+    # by cost: varx_riccati 2.1 (1.89 to 2.31), learned_kernel 2.2; the first of both is the simpler
+    assert judge(stages).winner == "varx_riccati"
+    compared["contestants"]["pi"]["cost"] = made.figure(2.2, 2.0, 2.4)
+    assert judge(stages).winner == "pi"
+
+
+def test_who_runs_today_stays_where_nobody_is_better_beyond_the_bands():
+    stages = metrics()
+    # varx_riccati costs 2.1 (1.89 to 2.31), the best 2.0 (1.8 to 2.2); pi costs 4.0 (3.6 to 4.4)
+    verdict = judge(stages, incumbent="varx_riccati")
+    assert verdict.winner == "varx_riccati"
+    assert "It runs today, and subspace + LQG is not better beyond the bands." in verdict.reason
+    assert judge(stages, incumbent="pi").winner == "subspace_lqg"
+    assert judge(stages, incumbent="window").winner == "subspace_lqg"
+
+
+def test_limits_are_those_that_the_comparison_resolved_for_the_machine():
+    stages = metrics(settling=made.figure(120.0, 110.0, 130.0))
+    assert judge(stages).state == FAILED
+    stages["evaluate_temperature"]["limits"] |= {"settling_s": 400.0, "source": "from the record"}
+    assert judge(stages).state == PASSED
+
+
+def test_the_pair_is_decided_in_a_sentence_of_its_own():
+    stages = metrics()
+    pair = stages["evaluate_temperature"]["pair"]
+    assert pair_sentence(stages).text == (
+        "Model-based against data-driven: subspace + LQG costs 6.2 % less than the learned kernel on "
+        "the same "
+        "6 plants (90 % interval 3.1–9.4 %, p = 0.01)."
+    )
+    pair |= {"winner": "learned_kernel", "difference": 6.2, "low": 3.1, "high": 9.4}
+    assert "the learned kernel costs 6.2 % less than subspace + LQG" in pair_sentence(stages).text
+    assert "interval 3.1–9.4 %" in pair_sentence(stages).text
+    pair |= {"winner": None, "p": 0.4, "low": -3.0, "high": 4.0}
+    assert "no difference at the 5 % level between subspace + LQG and the learned kernel" in (
+        pair_sentence(stages).text
+    )
+
+
+def test_the_deciding_case_is_told_and_the_verdict_without_it():
+    stages = metrics()
     assert (
-        winner(
-            ASKED,
-            roles(
-                data_driven=answers(gap_percent=Figure(9.0, 8.0, 10.0)),
-                model_based=answers(disk=Figure(0.1, 0.1, 0.1)),
-            ),
+        deciding_sentence(stages, "subspace_lqg")
+        == "Deciding case: plant 3, a ramp. Without plant 3 the same."
+    )
+    stages["evaluate_temperature"]["deciding"] |= {"best_without": "pi", "pair_without": None}
+    assert deciding_sentence(stages, "subspace_lqg") == (
+        "Deciding case: plant 3, a ramp. Without plant 3 the best would be PI, tuned and the pair would be "
+        "undecided."
+    )
+
+
+FRESH = {
+    "date": "2026-11-23",
+    "machine": {"outputs": ["zone_1", "zone_2"], "sample_time_s": 1.0},
+    "relearnings": 24,
+    "contestants": {"pi": {"settling": {"q90": {"low": 5.0, "median": 6.0, "high": 900.0}}}},
+    "answers": {"pair_winner": {"subspace_lqg": 20, "None": 4}},
+    "prior": {
+        "removed": {"pair_winner": {"learned_kernel": 3, "subspace_lqg": 1}},
+        "added": {"pair_winner": {"subspace_lqg": 4}},
+    },
+}
+
+
+def test_bands_over_relearnings_stand_in_where_they_were_made_and_a_turning_prior_is_said():
+    assert relearned_band(FRESH, "pi", "settling") == (5.0, 900.0, "2026-11-23")
+    assert relearned_band(FRESH, "pi", "overshoot") is None
+    assert relearned_band(None, "pi", "settling") is None
+    assert prior_sentence(FRESH, "subspace_lqg") == (
+        "Over 24 relearnings the pair went to subspace + LQG in 20, to nobody in 4. With the prior of plant "
+        "uncertainty removed it turns: to the learned kernel in 3 of 4."
+    )
+    assert prior_sentence(None, "subspace_lqg") == ""
+
+
+def test_the_page_takes_bands_of_relearnings_of_this_machine_with_their_date_and_of_no_other(project):
+    path = "benchmarks/results/temperature_relearned.json"
+    artifacts.write_json(path, FRESH)
+    report.main()
+    text = Page(TEMPERATURE).text
+    assert "its band is the range over 24 fresh relearnings of 2026-11-23" in text
+    assert "5–900" in text and "Over 24 relearnings the pair went to" in text
+    artifacts.write_json(path, FRESH | {"machine": {"outputs": ["bed"]}})
+    report.main()
+    text = Page(TEMPERATURE).text
+    assert "its band is of this one learned controller, plants resampled" in text and "5–900" not in text
+
+
+def test_without_any_figures_the_verdict_is_open_and_says_what_to_run():
+    gone = Missing("not measured", "evaluate_temperature.json is not there", "Run it")
+    verdict = judge(made.metrics() | {"evaluate_temperature": gone})
+    assert (verdict.state, verdict.decision) == (OPEN, "Rehearsal open.")
+    assert verdict.reason == "evaluate_temperature.json is not there. Run it."
+
+
+def test_the_readme_shows_every_contestant_with_its_quantiles_and_the_verdict_of_the_pages():
+    stages = metrics()
+    text = readme.block(stages, RULES, judge(stages))
+    assert "**Rehearsal passed: subspace + LQG.** Every rule measured so far passed on 6 simulated" in text
+    assert "| settled error, worst zone, at most 0.5 °C | settling, at most 60 s |" in text
+    assert "| subspace + LQG (model-based) | 0.10 °C | 6 s | 0.5 °C | 1.0 % | 2.00 | 0 |" in text
+    assert "| Hold (do nothing) | 80 °C | never settles |" in text
+    whole = readme.rewritten(f"a\n{readme.BEGIN}\nold\n{readme.END}\nb\n", text)
+    assert whole == f"a\n{text}\nb\n"
+    with pytest.raises(ValueError, match="README.md: expected the lines"):
+        readme.rewritten("no block", text)
+
+
+# ---- over many comparisons
+
+
+def random_figure(rng, allowed):
+    """A figure that passes, straddles, fails, is lost, or says nothing, against what is allowed."""
+    kind = rng.choice(["passed", "passed", "passed", "straddles", "failed", "lost", "huge"])
+    if kind == "lost":
+        return made.figure(None, None, None)
+    scale = {"passed": 0.3, "straddles": 1.0, "failed": 3.0, "huge": 1e12}[kind] * allowed
+    return made.figure(scale, 0.8 * scale, 1.3 * scale)
+
+
+def random_comparison(rng):
+    """Metrics of the contract’s shape: each rule passed, undecided, failed or open."""
+    compared = made.comparison()
+    for name in list(compared["contestants"]):
+        if name != "exact_model" and rng.random() < 0.1:
+            del compared["contestants"][name]
+            compared["refused"][name] = "the record does not determine it"
+            continue
+        figures = compared["contestants"][name]
+        for key, allowed in (
+            ("settled_error", 0.5),
+            ("settling", 60.0),
+            ("overshoot", 5.0),
+            ("at_limits", 10.0),
+        ):
+            figures[key] = random_figure(rng, allowed)
+        figures["cost"] = random_figure(rng, float(rng.uniform(1, 4)))
+        figures["gap"] |= {"median_percent": float(10 ** rng.uniform(-3, 24)), "q90_percent": None}
+        figures["crossings"]["cases"] = int(rng.choice([0, 0, 0, 3]))
+        figures["margins"]["disk"]["median"] = float(rng.choice([0.1, 0.6]))
+        figures["stable"]["count"] = int(rng.choice([made.PLANTS, made.PLANTS, 3]))
+    names = [name for name in compared["order"] if name in compared["contestants"]]
+    compared["best"] = rng.choice([*names, None])
+    pair = compared["pair"]
+    if not {pair["a"], pair["b"]} <= set(names):
+        compared["pair"] = None
+    else:
+        winner = rng.choice([pair["a"], pair["b"], None])
+        size = float(10 ** rng.uniform(-2, 6))
+        low = size * (0.5 if winner else -0.5)
+        pair |= {"winner": winner, "difference": size, "low": low, "high": 1.5 * size}
+        compared["deciding"] |= {"pair_without": rng.choice([pair["a"], pair["b"], None])}
+    compared["deciding"] |= {"best_without": rng.choice([*names, None])}
+    return compared
+
+
+SEEDS = range(300)
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_no_two_sentences_contradict_one_another_whatever_passes_fails_or_is_open(recorded):
+    states = set()
+    for seed in SEEDS:
+        rng = np.random.default_rng(seed)
+        stages = made.metrics()
+        compared = stages["evaluate_temperature"] = random_comparison(rng)
+        undeclared = ("zone_1",) if rng.random() < 0.2 else ()
+        incumbent = str(rng.choice(["", "pi", "subspace_lqg"]))
+        verdict = judge(stages, recorded=recorded, undeclared=undeclared, incumbent=incumbent)
+        held = standings(stages, RULES, undeclared=undeclared)
+        states.add(verdict.state)
+        passing = [name for name, one in held.items() if one.passes and name != "exact_model"]
+        assert (verdict.state == PASSED) == bool(passing) == (verdict.winner in passing), seed
+        assert (verdict.winner is None) == (not passing)
+        # the first contestant’s column of rules says what the sentence says
+        mine = [line[0].state for line in verdict.rules if line[0].name != "drift"]
+        assert all(one == PASSED for one in mine) == (verdict.state == PASSED), seed
+        assert (FAILED in mine) == (verdict.state == FAILED), seed
+        assert (verdict.rule == "") == (verdict.state == PASSED)
+        best = best_sentence(stages, held, verdict.winner)
+        if verdict.winner:
+            assert in_a_sentence(verdict.winner) in best and "nobody" not in best
+        else:
+            assert best == "Best of all: nobody passes every rule."
+        pair, decided = pair_sentence(stages), deciding_sentence(stages, verdict.winner)
+        assert pair.winner == ((compared["pair"] or {}).get("winner")), seed
+        assert ("costs" in pair.text) == (pair.winner is not None)
+        assert not ("the same" in decided and ("would" in decided))
+        said = " ".join(
+            [
+                verdict.decision,
+                verdict.lead,
+                verdict.reason,
+                verdict.remedy,
+                best,
+                pair.text,
+                pair.note,
+                decided,
+            ]
         )
-        == "baseline"
-    )
+        words_of_numbers_are_readable(said)
+    assert states == {PASSED, FAILED, OPEN}
 
 
-def test_where_the_better_controller_is_the_other_one_the_verdict_deploys_that():
-    verdict = decide(
-        "temperature", ASKED, roles(model_based=answers(settled_error_degC=Figure(0.1, 0.09, 0.11)))
-    )
-    assert verdict.decision == "Deploy the model\u2011based temperature controller."
-    assert (
-        verdict.reason
-        == "Data-driven passes too; the settled error decides: 0.10\u202f°C against 0.31\u202f°C."
-    )
+def words_of_numbers_are_readable(text):
+    assert not re.search(r"\b(nan|inf|None)\b|[Dd]eploy\b", text), text
+    numbers = [float(n.replace(",", "")) for n in re.findall(r"(?<![\w.#])\d[\d,]*(?:\.\d+)?(?![\w.])", text)]
+    assert all(number <= 1e4 for number in numbers), text
+    assert not re.search(r"10[⁰¹²³⁴⁵⁶⁷⁸⁹]{2}", text), text
 
 
-def test_an_undecided_figure_says_how_many_more_runs_would_decide():
-    runs = (1.0,) * 21 + (9.0,) * 3
-    said = undecided(BY_KEY["gap_percent"], Figure(1.0, 1.0, 9.0, runs))
-    # share outside p = 1/8, allowed 1/20: 1.645^2 p (1 - p) / (p - 1/20)^2 = 52.6, so 53 - 24 = 29
-    assert said.endswith("3 of 24 runs lie outside; 29 more runs would decide.")
-    many = undecided(BY_KEY["gap_percent"], Figure(9.0, 1.0, 9.0, (1.0,) * 10 + (9.0,) * 14))
-    assert many.endswith("14 of 24 runs lie outside, and more runs would not change that.")
+@pytest.mark.parametrize("seed", range(8))
+def test_a_page_of_any_comparison_prints_no_number_beyond_meaning_and_never_says_deploy(project, seed):
+    artifacts.write_metrics("evaluate_temperature", {
+        **made.metrics()["evaluate_temperature"], **random_comparison(np.random.default_rng(seed))
+    })  # fmt: skip
+    report.main()
+    page = Page(TEMPERATURE).text
+    shown = page[: page.index("Findings in plain words")]
+    words_of_numbers_are_readable(shown)
+    first = Page(INDEX).text
+    assert not re.search(r"\b(nan|inf|None)\b|\b[Dd]eploy\b", first)
+    decision = artifacts.read_metrics("report")["verdict"]["decision"]
+    assert shown.count(decision.rstrip(".")) >= 2 and decision in first  # title and head
 
 
 def test_the_rules_are_read_from_params_with_bounds(tmp_path):
-    (tmp_path / "params.yaml").write_text("report: {gap_percent: -1}\n")
-    with pytest.raises(ValueError, match=r"report.gap_percent is -1 but must be more than 0"):
+    (tmp_path / "params.yaml").write_text("report: {disk_margin: -1}\n")
+    with pytest.raises(ValueError, match=r"report.disk_margin is -1 but must be more than 0"):
         params.load(ReportRules, "report", tmp_path / "params.yaml")
+
+
+@pytest.mark.parametrize("key", ["gap_percent", "worst_case_gap_percent"])
+def test_an_old_params_file_is_told_in_one_sentence_that_a_rule_was_retired(tmp_path, key):
+    rules = RULES.model_dump() | {key: 5.0}
+    lines = "".join(f"  {name}: {value}\n" for name, value in rules.items())
+    (tmp_path / "params.yaml").write_text(f"report:\n{lines}")
+    with pytest.raises(ValueError, match=rf"report.{key} was retired: .*; remove the line") as refused:
+        params.load(ReportRules, "report", tmp_path / "params.yaml")
+    assert len(str(refused.value).splitlines()) == 1

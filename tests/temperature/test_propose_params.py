@@ -12,7 +12,7 @@ from pipeline import cli
 from pipeline.store import artifacts, params
 from pipeline.store.params_text import replaced
 from pipeline.temperature.time_scale import time_constant
-from pipeline.temperature.workflow import generate_probing, propose_params, tables
+from pipeline.temperature.workflow import probe_machine, propose_params, tables
 from pipeline.temperature.workflow.settings import GenerateProbing, IdentifyPlant, Panel, Plant, TuneWeights
 from tests.reading.klipper_machine import BED, EXTRUDER, print_log
 from tests.reading.test_real_record import project, run
@@ -96,30 +96,24 @@ def test_limits_that_no_file_tells_are_left_to_a_person_and_asked_for_by_the_sta
     assert "plant.outputs: temperature_1 should have low and high" in asked
 
 
-def test_the_next_experiment_moves_a_slow_machine_more_than_its_noise_and_no_hotter_than_before(
-    tree, monkeypatch
+def test_the_next_experiment_is_asked_at_the_machines_pace_and_its_centre_left_to_the_model(
+    tree, monkeypatch, capsys
 ):
     rng, tau = np.random.default_rng(1), 200.0
     u = np.repeat(rng.choice([10.0, 30.0], (20, 2)), 200, axis=0)
-
-    def temperatures(u, start):
-        y = np.full((len(u) + 1, 2), start)
-        for t in range(len(u)):
-            y[t + 1] = y[t] + (20 + u[t] @ np.array([[3.0, 0.5], [0.5, 3.0]]) - y[t]) / tau
-        return y[:-1]
-
-    recorded = temperatures(u, 90.0) + rng.normal(0, 0.1, (len(u), 2))
-    rows = np.column_stack([np.arange(len(u)), u, recorded])
+    y = np.full((len(u) + 1, 2), 90.0)
+    for t in range(len(u)):
+        y[t + 1] = y[t] + (20 + u[t] @ np.array([[3.0, 0.5], [0.5, 3.0]]) - y[t]) / tau
+    rows = np.column_stack([np.arange(len(u)), u, y[:-1] + rng.normal(0, 0.1, (len(u), 2))])
     header = "time_s,heater_1_pct,heater_2_pct,zone_1_C,zone_2_C"
     np.savetxt(tree / "rig.csv", rows, delimiter=",", header=header, comments="", fmt="%.3f")
     init(monkeypatch, "rig.csv")
-    settings, machine = params.load(GenerateProbing, "generate_probing"), params.load(Plant, "plant")
-    plan = generate_probing.planned(settings, machine).columns
-    played = np.column_stack([plan["heater_1"], plan["heater_2"]])
-    answer = temperatures(played, 90.0)
-    # the middle of the limits, 50 %, would hold 195 °C; a quarter of the recorded movement allows for chance
-    assert answer.max() < recorded.max() + 0.25 * np.ptp(recorded)
-    assert (answer.std(axis=0) > 50 * 0.1).all()
+    assert "is written only where its forecast stays within low and high" in capsys.readouterr().out
+    settings = params.load(GenerateProbing, "generate_probing")
+    assert settings.centre_percent is None and settings.signal == "prbs"
+    assert settings.amplitude_percent <= 10.0  # no wider than the inputs moved
+    assert 50 <= settings.shortest_steps <= 150  # half of 200 s, found within a half
+    assert settings.samples >= 2000  # 20 time constants, found within a half
 
 
 def test_an_operating_point_for_each_input_is_refused_where_there_are_more_inputs(tree, monkeypatch):
@@ -127,7 +121,7 @@ def test_an_operating_point_for_each_input_is_refused_where_there_are_more_input
     (tree / "params.expert.yaml").write_text(text.replace("centre_percent: null", "centre_percent: [20, 30]"))
     settings, machine = params.load(GenerateProbing, "generate_probing"), params.load(Plant, "plant")
     with pytest.raises(ValueError, match="centre_percent has 2 values, but plant has 7 inputs; give one"):
-        generate_probing.planned(settings, machine)
+        probe_machine.given_centre(settings, machine)
 
 
 def test_the_sample_time_of_a_record_without_one_is_given_and_all_times_follow(tree, monkeypatch, capsys):
@@ -287,3 +281,16 @@ def test_the_printers_own_pid_is_judged_beside_the_others_and_swings_as_its_log_
     assert figures["own_integral"]["printer_pid"] == pytest.approx(1.08 / 23.28, rel=1e-9)
     assert figures["controllers"]["model_based"]["stable_plants"]["count"] == 20
     assert "printer_pid" not in figures["without_feed_forward"]
+
+
+def test_what_to_play_next_on_the_printer_is_forecast_within_its_limits_or_left_out_with_a_reason(printer):
+    machine = params.load(Plant, "plant", printer / "params.yaml")
+    figures = artifacts.read_json(printer / "reports/metrics/generate_probing.json")
+    for key, file in (("next_experiment", "next_experiment"), ("closed_loop", "next_experiment_closed_loop")):
+        told = figures[key]
+        assert (printer / f"datasets/generate_probing/{file}.csv").exists() == told["written"]
+        assert told["written"] or len(told["reason"]) > 20
+        if told["written"]:
+            for o in machine.outputs:
+                assert o.low <= told["lowest_degC"][o.name] <= told["highest_degC"][o.name] <= o.high
+    assert artifacts.read_json(printer / "datasets/generate_probing/forecast.json") == figures

@@ -7,7 +7,13 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from pipeline.report.identification import heater_table, how_identified, model_dynamics, model_errors
+from pipeline.report.identification import (
+    heater_table,
+    how_identified,
+    model_dynamics,
+    model_errors,
+    next_experiment,
+)
 from pipeline.report.identification.model import LEAST_FIT, Fit, ahead_words, fits, trust
 from pipeline.report.index import page as index_page
 from pipeline.report.shared import charts, page, words
@@ -71,6 +77,8 @@ def render(sources: Sources) -> str:
         poles=model_dynamics.poles(sources),
         pole_rows=model_dynamics.pole_table(sources),
         excitation=model_dynamics.excitation(sources),
+        planned=next_experiment.next_experiment(sources),
+        from_planned=sources.source("generate_probing"),
         losses=losses(sources),
         used=used(sources),
         from_metrics=sources.source("identify_plant", "holdout", "residuals"),

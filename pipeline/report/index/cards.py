@@ -2,7 +2,7 @@
 figures. A loop that is not measured keeps its frame."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,16 +13,7 @@ from pipeline.report.deposition import rules as deposition_rules
 from pipeline.report.deposition import verdict as deposition_verdict
 from pipeline.report.identification.model import trust
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import (
-    beyond_meaning,
-    decimals,
-    number,
-    percent,
-    quantity,
-    shortened,
-    with_unit,
-)
-from pipeline.report.shared.pictures import CARD_SPAN_S, span
+from pipeline.report.shared.digits import number, percent, shortened
 from pipeline.report.shared.sources import Source, Sources, Table
 from pipeline.report.shared.verdict import (
     FAILED,
@@ -34,12 +25,16 @@ from pipeline.report.shared.verdict import (
     Question,
     ReportRules,
     Verdict,
-    row_places,
     state,
 )
-from pipeline.report.temperature.answers import CONTROLLERS, LABELS, featured, without_figures
-from pipeline.report.temperature.judgement import NAMES, Judgement
-from pipeline.report.temperature.verdict import rules
+from pipeline.report.temperature.answers import comparison, refused
+from pipeline.report.temperature.contestants import heading, kind
+from pipeline.report.temperature.judgement import Judgement
+from pipeline.report.temperature.pairs import pair_names
+from pipeline.report.temperature.scorecard import UNRULED, setting
+from pipeline.report.temperature.wording import OFF_THE_SCALE, places_of, worded
+
+NAMES = {"data_driven": "Data\u2011driven", "model_based": "Model\u2011based", "baseline": "Baseline"}
 
 # composer of the deposition loop -> its place in the card
 ROLE = {
@@ -94,46 +89,58 @@ class Card(NamedTuple):
 
 def heads(roles: Sequence[str], methods: Sequence[str]) -> list[Head]:
     """The roles of a card, each with its method."""
-    return [
-        Head(role, LABELS[CONTROLLERS[role]][0], method) for role, method in zip(roles, methods, strict=True)
-    ]
+    return [Head(role, NAMES[role], method) for role, method in zip(roles, methods, strict=True)]
 
 
 def temperature(sources: Sources, judged: Judgement) -> Card:
-    order = ("model_based", "data_driven", "baseline")
-    answers, allowed = judged.roles, sources.declared.rules
+    """The pair and one beside it: the contestant that the verdict is about, or PI."""
+    pair = pair_names(sources.metrics)
+    order = (*pair, "pi" if judged.subject in pair else judged.subject)
+    asked = {question.key: question for question in (*judged.asked, *UNRULED)}
     rows = []
-    for key in ("settled_error_degC", "gap_percent", "settling_s"):
-        question = next(q for q in judged.asked if q.key == key)
-        rows.append(Row(question.title, _card_cells(question, [answers[role][key] for role in order])))
-    kernel = judged.by_name.get("kernel", {}).get("gap_percent")
+    for key in ("settled_error", "settling", "cost"):
+        figures = [judged.answers.get(name, {}).get(key, NOT_JUDGED) for name in order]
+        rows.append(Row(asked[key].title, _card_cells(asked[key], figures)))
+    passed = judged.verdict.state == PASSED
     return Card(
         id="temperature",
         name="Temperature",
         link="temperature.html",
         moves="Heaters and motor to barrel temperatures",
-        state=f"Run {ROLES[judged.verdict.winner]}" if judged.verdict.winner else "Run none of them",
-        mark=judged.verdict.winner,
-        win=_win(sources, judged),
+        state=judged.verdict.decision.split(":")[0].rstrip("."),
+        mark=judged.verdict.winner if passed else None,
+        win=(f"{judged.verdict.decision}", f"{judged.pair.text} {judged.best} {judged.deciding}".strip()),
         caption=(
-            f"Worst zone’s true error over {span(sources, CARD_SPAN_S):g} s, log scale "
-            f"{_FLOOR:g} to {number(_CEILING, 0)}\u00a0°C: "
-            f"{featured(sources)}. Grey: what the rule allows once settled."
+            f"Worst zone’s true error in a typical case, log scale {_FLOOR:g} to "
+            f"{number(_CEILING, 0)}\u00a0°C. "
+            f"Grey: what the rule allows once settled. Figures: 90\u00a0% quantile of {_setting(sources)}."
         ),
         panels=[
-            _spark(sources, judged, role, limit=allowed.settled_error_degC, named=i == 0)
-            for i, role in enumerate(order)
+            _spark(sources, name, limit=asked["settled_error"].limit, named=i == 0)
+            for i, name in enumerate(order)
         ],
-        heads=heads(order, [LABELS[CONTROLLERS[role]][1] for role in order]),
+        heads=[Head(name, heading(name), kind(name)) for name in order],
         rows=rows,
-        note=_kernel_note(kernel, sources),
-        sources=sources.source("evaluate_temperature", "scorecard", "trajectories"),
+        note=judged.pair.note
+        or (
+            "Judged on plants of the identified spread."
+            if sources.recorded
+            else "Simulated plants on which nothing was fitted."
+        ),
+        sources=sources.source("evaluate_temperature", "trajectories"),
         model=trust(sources),
     )
 
 
+NOT_JUDGED = Missing(OPEN, "It was not judged")
+
+
+def _setting(sources: Sources) -> str:
+    return setting(comparison(sources.metrics))
+
+
 def _card_cells(question: Question, figures: Sequence[Figure | Missing]) -> list[Cell]:
-    places = row_places(question, figures[:2])
+    places = places_of(question, figures[:2])
     values = [f.value if isinstance(f, Figure) else math.inf for f in figures]
     best = min(values)
     cells = []
@@ -141,80 +148,32 @@ def _card_cells(question: Question, figures: Sequence[Figure | Missing]) -> list
         if isinstance(figure, Missing):
             cells.append(Cell(figure.state, best=False, bad=False))
             continue
-        mine = min(places, decimals(0, 0, value=value)) if math.isfinite(value) else places
-        text = quantity(value, question.unit, mine, beyond=question.beyond)
-        leads = text == quantity(best, question.unit, mine) and math.isfinite(best)
-        leads = leads and not beyond_meaning(best, question.unit)
-        cells.append(Cell(text, leads, bad=state(question, figure) == FAILED))
+        text = worded(question, value, places)
+        ruled = math.isfinite(question.limit)
+        leads = math.isfinite(best) and text == worded(question, best, places) and text != OFF_THE_SCALE
+        cells.append(Cell(text, leads, bad=ruled and state(question, figure) == FAILED))
     return cells
-
-
-def _win(sources: Sources, judged: Judgement) -> tuple[str, str]:
-    """The winner in words, with its figure and its price."""
-    best = judged.verdict.winner
-    settled = next(q for q in judged.asked if q.key == "settled_error_degC")
-    if best is None:
-        if judged.verdict.rule == "trust":
-            return "No controller wins.", "They were judged on a model that is not trusted."
-        return "No controller wins.", "Not one of them passes its rules."
-    mine = judged.roles[best]["settled_error_degC"]
-    places = row_places(settled, [mine])
-    holds = f"It holds every zone within {quantity(mine.high, '°C', places)} of its reference."
-    others = []
-    for role in ("data_driven", "model_based", "baseline"):
-        if role != best:
-            judged_rules = rules(judged.asked, judged.roles[role])
-            first = next((rule for rule in judged_rules if rule.state != PASSED and rule.question), None)
-            if refused := without_figures(sources, CONTROLLERS[role]):
-                others.append(f"{NAMES[role]} could not be designed: {refused.sentence()}")
-            elif first:
-                others.append(
-                    f"{NAMES[role]} {'fails' if first.state == FAILED else 'is open'} on "
-                    f"{_on(first.question, judged.roles[role])}."
-                )
-            else:
-                others.append(f"{NAMES[role]} passes too.")
-    name = "The baseline" if best == "baseline" else NAMES[best]
-    return f"{name} wins.", " ".join([holds, *others])
-
-
-def _on(question: Question, answers: Mapping[str, Figure | Missing]) -> str:
-    figure = answers[question.key]
-    name = {"worst_case_gap_percent": "its worst plant", "gap_percent": "the gap", "data": "data"}.get(
-        question.key, question.title[:1].lower() + question.title[1:]
-    )
-    if isinstance(figure, Missing):
-        return f"{name}, {figure.state}"
-    places = min(decimals(figure.low, figure.high, value=figure.value), 2)
-    return (
-        f"{name}: {quantity(figure.value, question.unit, places, beyond=question.beyond)} of "
-        f"{with_unit(question.limit, question.unit, 0 if question.limit >= 10 else places)}"
-    )
 
 
 _FLOOR, _CEILING = 0.01, 300.0
 
 
-def _spark(sources: Sources, judged: Judgement, role: str, *, limit: float, named: bool) -> Markup:
-    table = sources.tables["trajectories"]
-    figure = judged.roles[role]["settled_error_degC"]
-    error = _worst_error(sources, table, CONTROLLERS[role])
+def _spark(sources: Sources, name: str, *, limit: float, named: bool) -> Markup:
+    error = _worst_error(sources, sources.tables["trajectories"], name)
     if isinstance(error, Missing):
         return Markup('<div class="hole">{}</div>').format(page.missing(error))
     time, values = error
-    settled = (
-        "not judged" if isinstance(figure, Missing) else f"settled error {quantity(figure.value, '°C', 3)}"
-    )
+    last = f"{number(float(values[-1]), 2)} °C" if values[-1] <= 1e4 else "too far to say"
     alt = (
-        f"{ROLES[role].capitalize()}: worst zone {number(float(values[-1]), 2)} °C from its reference "
+        f"{heading(name)}: worst zone {last} from its reference "
         f"after {number(float(time[-1]), 0)} s, {'above' if values[-1] > limit else 'below'} the {limit:g} "
-        f"°C limit; {settled}"
+        "°C limit"
     )
     return charts.spark(
         time,
         values,
         charts.logarithmic(_FLOOR, _CEILING)._replace(low=_FLOOR, high=_CEILING),
-        css=page.MARKS[role],
+        css=page.MARKS.get(name, "bl"),
         limit=limit,
         alt=alt,
         limit_label=f"limit {limit:g}" if named else "",
@@ -225,38 +184,16 @@ def _spark(sources: Sources, judged: Judgement, role: str, *, limit: float, name
 def _worst_error(
     sources: Sources, table: Table | Missing, name: str
 ) -> tuple[np.ndarray, np.ndarray] | Missing:
+    if reason := refused(sources.metrics).get(name):
+        return Missing(FAILED, reason)
     if isinstance(table, Missing):
         return table
-    rows = (table["controller"] == name) & (table["mode"] == "deployed")
+    rows = (table["contestant"] == name) & (table["case_name"] == "typical")
     if not rows.any():
-        return without_figures(sources, name) or Missing("not measured", f"no trajectory of {name}")
-    offset = sources.declared.panel.judging.reference_offsets_degC[0]
-    errors = np.stack(
-        [np.abs(table[o.name][rows] - o.reference - offset) for o in sources.declared.machine.outputs]
-    )
-    time = table["time_s"][rows]
-    early = time <= span(sources, CARD_SPAN_S)
-    return time[early], errors.max(axis=0)[early]
-
-
-def _kernel_note(gap: Figure | Missing | None, sources: Sources) -> str:
-    noise = (
-        "Simulated plants on which nothing was fitted."
-        if sources.declared.everything.get("generate_probing", {}).get("source") == "simulated"
-        else "Judged on plants of the identified spread."
-    )
-    if isinstance(gap, Figure):
-        return (
-            "Algorithm 2’s kernel, learned from the same record, costs "
-            f"{quantity(gap.value, '%', decimals(gap.low, gap.high, value=gap.value))} "
-            "more than the optimum: "
-            f"see the temperature page. {noise}"
-        )
-    # the same sentence as in the table of all controllers
-    gap = without_figures(sources, "kernel") or gap
-    if gap is not None and gap.state == FAILED:
-        return f"Algorithm 2’s kernel failed: {gap.sentence()}"
-    return f"Algorithm 2’s kernel: not measured. {noise}"
+        return Missing(OPEN, f"no trajectory of {heading(name)}")
+    outputs = sources.declared.machine.outputs
+    errors = np.stack([np.abs(table[o.name][rows] - table[f"{o.name}_reference"][rows]) for o in outputs])
+    return table["time_s"][rows], np.nan_to_num(errors.max(axis=0), nan=_CEILING)
 
 
 def deposition(sources: Sources) -> Card:

@@ -1,5 +1,6 @@
 """Page one: the verdict, the twelve answers, a card a loop, the difference, words, provenance."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -12,23 +13,24 @@ from pipeline.report.setpoint import card as setpoint_card
 from pipeline.report.setpoint import change as setpoint_change
 from pipeline.report.shared import charts, headline, page, words
 from pipeline.report.shared.difference import Difference, Move
-from pipeline.report.shared.digits import band, beyond_meaning, count, decimals, declared, quantity, with_unit
+from pipeline.report.shared.digits import count, declared, quantity, with_unit
 from pipeline.report.shared.sources import Sources, digest
 from pipeline.report.shared.verdict import (
     OPEN,
     PASSED,
-    ROLES,
     UNDECIDED,
+    UNJUDGED,
     Figure,
     Missing,
     Question,
     row_places,
     state,
 )
-from pipeline.report.temperature import pairs
-from pipeline.report.temperature.answers import repetitions
-from pipeline.report.temperature.judgement import NAMES, Judgement, verdict_parts
-from pipeline.report.temperature.verdict import BRIEF, drift_state
+from pipeline.report.temperature.answers import comparison
+from pipeline.report.temperature.contestants import heading, in_a_sentence
+from pipeline.report.temperature.judgement import Judgement, heads, verdict_parts
+from pipeline.report.temperature.scorecard import setting
+from pipeline.report.temperature.wording import banded, places_of, worded
 
 
 def render(sources: Sources, judged: Judgement) -> str:
@@ -50,22 +52,23 @@ def render(sources: Sources, judged: Judgement) -> str:
         claim=f"{headline.claim(sources)} {_drifts(judged)}",
         rules=verdict_parts(judged).rules,
         answers=_rows(sources, judged),
-        repetitions=repetitions(sources),
-        seeds=len(sources.declared.panel.judging.seeds),
+        setting=setting(comparison(sources.metrics)),
+        heads=heads(judged),
+        pair=judged.pair,
+        best=judged.best,
         change=ChangeSentence(ANOTHER)
         if sources.another_machine
         else _change_sentence(
             judged, sources.accepted, _deposition_moves(sources), setpoint_change.moved_cases(sources)
         ),
         drift=judged.drifted,
-        drift_state=drift_state(judged.roles["data_driven"]),
+        drift_state=drift_state(judged),
         hashes=hashes(sources),
         cards=[
             cards.temperature(sources, judged),
             cards.deposition(sources),
             setpoint_card.setpoint(sources),
         ],
-        paired=pairs.compared(sources).finding,
         difference=difference_parts(sources, judged),
         workflow=workflow.figure(sources),
         from_accepted=sources.source("accepted"),
@@ -88,10 +91,16 @@ def _accepted(sources: Sources) -> dict[str, str]:
 
 def _drifts(judged: Judgement) -> str:
     """Drift of the three loops in a sentence; only the temperature loop's is measured, by the nightly job."""
-    if drift_state(judged.roles["data_driven"]) in (OPEN, UNDECIDED):
+    if drift_state(judged) in (OPEN, UNDECIDED):
         return "Drift is not measured in any loop."
     word = judged.drifted.word
     return f"Drift: temperature {word[:1].lower()}{word[1:].rstrip('.')}, not measured in the others."
+
+
+def drift_state(judged: Judgement) -> str:
+    """Passed where the nightly job measured drift and found none, otherwise its word for it."""
+    answer = judged.drifted.answer
+    return answer.state if isinstance(answer, Missing) else PASSED
 
 
 # ---- the answers
@@ -103,13 +112,14 @@ class Cell(NamedTuple):
     css: str
     name: str
     state: str
+    mark: str
     missing: Missing | None = None
     value: str = ""
     band: str = ""
 
 
 class Answer(NamedTuple):
-    """A row of the answers. `moved` and `worse` since the accepted run; `quiet`: both controllers pass, and
+    """A row of the answers. `moved` and `worse` since the accepted run; `quiet`: both contestants pass, and
     nothing moved."""
 
     n: int
@@ -134,67 +144,53 @@ def _rows(sources: Sources, judged: Judgement) -> list[Answer]:
 
 def _row(question: Question, judged: Judgement, unmoved: str) -> Answer:
     """`unmoved`: why nothing is compared, where nothing is."""
-    pair = [(role, judged.roles[role][question.key]) for role in ("data_driven", "model_based")]
-    places = row_places(question, [figure for _, figure in pair])
-    move = next((m for m in judged.moved.get("data_driven", []) if m.question == question), None)
+    pair = [(name, judged.answers[name][question.key]) for name in (judged.subject, judged.rival)]
+    places = places_of(question, [figure for _, figure in pair])
+    move = next((m for m in judged.moved.get(judged.subject, []) if m.question.key == question.key), None)
     moved = move is not None and move.moved
-    learned, designed = (state(question, figure) for _, figure in pair)
+    mine, other = (_state(question, figure) for _, figure in pair)
     # as it was declared: "10.000 %" reads as ten thousand where a point parts thousands
-    limit = with_unit(question.limit, question.unit, declared(question.limit))
+    limit = (
+        f"{'≥' if question.at_least else '≤'} "
+        f"{with_unit(question.limit, question.unit, declared(question.limit))}"
+        if math.isfinite(question.limit)
+        else "not resolved"
+    )
     return Answer(
         question.answer,
         question.key,
         question.title,
         words.explaining(question.key),
-        _sub(question, pair),
-        [_cell(question, role, figure, places) for role, figure in pair],
-        limit=f"{'≥' if question.at_least else '≤'} {limit}",
-        state=learned,
-        strip=charts.strip(question, [(ROLES[role], page.MARKS[role], figure) for role, figure in pair]),
+        SUB.get(question.key, ""),
+        [_cell(question, name, figure, places) for name, figure in pair],
+        limit="none" if question.key == "crossings" else limit,
+        state=mine,
+        strip=charts.strip(question, [(heading(name), page.MARKS.get(name, "bl"), f) for name, f in pair]),
         change=move.text() if move else unmoved,
         moved=moved,
-        worse=moved and move.word == "worse" and learned != PASSED,
-        quiet=learned == designed == PASSED and not moved,
+        worse=moved and move.word == "worse" and mine != PASSED,
+        quiet=mine == other == PASSED and not moved,
     )
 
 
-def _sub(question: Question, pair: Sequence[tuple[str, Figure | Missing]]) -> str:
-    notes = list(dict.fromkeys(figure.note for _, figure in pair if isinstance(figure, Figure)))
-    if question.key == "settled_error_degC":
-        return ", ".join(
-            filter(None, [notes[0] if notes else "", *(n.removeprefix("zone ") for n in notes[1:])])
-        )
-    return {
-        "gap_percent": "",
-        "at_limits_percent": "clipped commands",
-        "disk": "more is safer",
-        "delay_s": "more is safer",
-    }.get(question.key, "")
+def _state(question: Question, figure: Figure | Missing) -> str:
+    """A contestant that learns nothing needs no data."""
+    return PASSED if isinstance(figure, Missing) and figure.state == UNJUDGED else state(question, figure)
 
 
-def _cell(question: Question, role: str, figure: Figure | Missing, places: int) -> Cell:
-    cell = Cell(page.MARKS[role], NAMES[role], state(question, figure))
+SUB = {"at_limits": "clipped commands", "disk": "median plant", "delay_s": "median plant"}
+
+
+def _cell(question: Question, name: str, figure: Figure | Missing, places: int) -> Cell:
+    cell = Cell(page.MARKS.get(name, "bl"), heading(name), _state(question, figure), name)
     if isinstance(figure, Missing):
         return cell._replace(missing=figure)
     return cell._replace(
-        value=quantity(figure.value, question.unit, places, beyond=question.beyond),
+        value=worded(question, figure.value, places),
         band=figure.note.split(" samples")[0].replace(" of ", " / ")
-        if question.key == "data"
-        else band(figure.low, figure.high, places, unit=question.unit, beyond=question.beyond)
-        or _finer(figure, question),
+        if question.key in ("data", "crossings")
+        else banded(question, figure, places),
     )
-
-
-def _finer(figure: Figure, question: Question) -> str:
-    """A band that the row's decimals do not show, with those that do;
-    runs that are all alike are said to be."""
-    return band(
-        figure.low,
-        figure.high,
-        decimals(figure.low, figure.high, value=figure.value),
-        unit=question.unit,
-        beyond=question.beyond,
-    ) or ("" if beyond_meaning(figure.value, question.unit) else "all alike")
 
 
 ANOTHER = "The accepted run is of another machine: nothing to compare."
@@ -219,34 +215,35 @@ def _change_sentence(
         return ChangeSentence(
             "First run: nothing to compare with.", "./run beadline accept marks this one as good."
         )
-    moved = [move for move in judged.moved["data_driven"] if move.moved]
+    mine = judged.moved.get(judged.subject, [])
+    moved = [move for move in mine if move.moved]
     others = sum(move.moved for move in parts), cases[0]
     elsewhere = (
         f"Deposition: {others[0]} of {len(parts)} moved. Setpoint: {others[1]} of {cases[1]}."
         if parts or cases[1]
         else ""
     )
-    model_based = sum(move.moved for move in judged.moved["model_based"])
-    if not moved and model_based:
+    theirs = sum(move.moved for move in judged.moved.get(judged.rival, []))
+    beside = f"{_inputs(judged.changed)} {elsewhere if any(others) else ''}".strip()
+    if not moved and theirs:
         return ChangeSentence(
-            "No figure of the data-driven controller moved beyond its noise.",
-            f"Model-based: {count(model_based, 'figure')} moved. {_inputs(judged.changed)} "
-            f"{elsewhere if any(others) else ''}".strip(),
+            f"No figure of {in_a_sentence(judged.subject)} moved beyond its noise.",
+            f"{heading(judged.rival)[:1].upper()}{heading(judged.rival)[1:]}: "
+            f"{count(theirs, 'figure')} moved. "
+            f"{beside}",
         )
+    if mine and all(move.word in ("new", OPEN, "failed") for move in mine):
+        return ChangeSentence(f"The accepted run has no figures of {in_a_sentence(judged.subject)}.", beside)
     if not moved:
         unchanged = judged.changed.empty and all(
-            move.word in ("unchanged", "not measured", "failed") for move in judged.moved["data_driven"]
+            move.word in ("unchanged", OPEN, "failed", UNJUDGED) for move in mine
         )
         if unchanged and not any(others):
             return ChangeSentence("Nothing changed; no figure moved.")
         loop = "of this loop " if any(others) else ""
-        return ChangeSentence(
-            f"No figure {loop}moved beyond its noise.",
-            f"{_inputs(judged.changed)} {elsewhere if any(others) else ''}".strip(),
-        )
+        return ChangeSentence(f"No figure {loop}moved beyond its noise.", beside)
     groups = [
-        (word, [BRIEF[move.question.key] for move in moved if move.word == word])
-        for word in ("worse", "better")
+        (word, [move.question.rule for move in moved if move.word == word]) for word in ("worse", "better")
     ]
     listed = "; ".join(f"{word}: {', '.join(names)}" for word, names in groups if names)
     sentences = [
@@ -282,13 +279,13 @@ def hashes(sources: Sources) -> list[tuple[str, str]]:
     """Short digests by which two pages can be told to be of one run."""
     data, figures = (
         next((s.sha256 for path, s in sources.read.items() if path.endswith(end)), "missing")
-        for end in ("ingest/record.parquet", "evaluate_temperature/scorecard.parquet")
+        for end in ("ingest/record.parquet", "evaluate_temperature/cases.parquet")
     )
     return [
         ("data", data[:8]),
         ("parameters", digest(sources.declared.everything)[:8]),
         ("code", sources.code[:8]),
-        ("scorecard", figures[:8]),
+        ("cases", figures[:8]),
     ]
 
 
@@ -316,6 +313,7 @@ class DifferenceParts(NamedTuple):
     moved: Sequence[MovedFigure] = ()
     rest: Sequence[str] = ()
     changed: Difference | None = None
+    whose: str = ""
     empty: bool = False
 
 
@@ -327,7 +325,7 @@ def _moved(role: str, move: Move) -> MovedFigure:
     return MovedFigure(
         question.title,
         "data_driven" if role == "deposition" else role,
-        "composer in use" if role == "deposition" else NAMES[role],
+        "composer in use" if role == "deposition" else heading(role),
         move.word,
         worse=move.word == "worse" and state(question, move.now) != PASSED,
         before=quantity(move.before.value, question.unit, places, beyond=question.beyond),
@@ -337,8 +335,8 @@ def _moved(role: str, move: Move) -> MovedFigure:
 
 
 def difference_parts(sources: Sources, judged: Judgement) -> DifferenceParts:
-    """What changed, and the figures that moved: of both controllers of the temperature loop, and of the
-    composer in use of the deposition loop."""
+    """What changed, and the figures that moved: of both contestants of the temperature loop that are shown,
+    and of the composer in use of the deposition loop."""
     accepted, changed = sources.accepted, judged.changed
     if sources.another_machine:
         reason = f"{ANOTHER} Its inputs or outputs have other names than those of plant in params.yaml"
@@ -347,12 +345,13 @@ def difference_parts(sources: Sources, judged: Judgement) -> DifferenceParts:
     parts = _deposition_moves(sources)
     if isinstance(accepted, Missing) or changed is None:
         return DifferenceParts(missing=accepted if isinstance(accepted, Missing) else None)
-    by_role = {role: judged.moved[role] for role in ("data_driven", "model_based")} | {"deposition": parts}
+    by_role = {name: judged.moved.get(name, []) for name in (judged.subject, judged.rival)}
+    by_role |= {"deposition": parts}
     moved = [_moved(role, move) for role, moves in by_role.items() for move in moves if move.moved]
     rest: dict[str, list[str]] = {}
-    for move in judged.moved["data_driven"]:
+    for move in judged.moved.get(judged.subject, []):
         if not move.moved:
-            rest.setdefault(move.word, []).append(BRIEF[move.question.key])
+            rest.setdefault(move.word, []).append(move.question.rule)
     still = [f"{word[:1].upper()}{word[1:]}: {', '.join(names)}." for word, names in rest.items()]
     drift = "Not measured in either run: drift." if sources.nightly is None else ""
     return DifferenceParts(
@@ -360,5 +359,6 @@ def difference_parts(sources: Sources, judged: Judgement) -> DifferenceParts:
         moved=moved,
         rest=[*still, drift, deposition_change.sentence(parts)],
         changed=changed,
-        empty=changed.empty and not moved,
+        whose=heading(judged.subject),
+        empty=changed.empty and not moved and not all(word == "new" for word in rest),
     )

@@ -26,13 +26,14 @@ class Figure(NamedTuple):
 
 class Revision(NamedTuple):
     """One revision: commit (empty for files that are not committed), date, subject, the verdict's sentence,
-    and {controller: {key: figure}}."""
+    {contestant: {key: figure}}, and who won; runs before the comparison as deployed have other names."""
 
     commit: str
     date: str
     subject: str
     verdict: str
     figures: Mapping[str, Mapping[str, Figure]]
+    winner: str = ""
 
 
 def revisions(most: int) -> Iterator[Revision]:
@@ -109,7 +110,10 @@ def _revision(commit: str, date: str, subject: str, files: Mapping[str, dict]) -
     figures = {name: _figures(ends) for name, ends in _dict(report, "figures").items()}
     figures = figures or _judged(metrics["evaluate_temperature"])
     figures["deposition"] = _deposition(metrics["compose_parts"], metrics["train_ilc"])
-    return Revision(commit, date, subject, str(_dict(report, "verdict").get("decision", "")), figures)
+    verdict = _dict(report, "verdict")
+    return Revision(
+        commit, date, subject, str(verdict.get("decision", "")), figures, str(verdict.get("winner") or "")
+    )
 
 
 def _dict(data: Any, key: str) -> dict:
@@ -134,13 +138,23 @@ def _figure(ends: Any) -> Figure | None:
 def _judged(metrics: dict) -> dict[str, dict[str, Figure]]:
     """The scorecard's figures, for revisions before the pages kept their figures. The worst case has no
     band."""
-    figures = {}
+    figures = {name: _contestant(own) for name, own in _dict(metrics, "contestants").items()}
     for name, ends in _dict(metrics, "controllers").items():
         figures[name] = _figures(ends)
         worst = _dict(ends, "gap_percent").get("worst")
         if isinstance(worst, int | float):
             figures[name]["worst_case_gap_percent"] = Figure(worst, worst, worst)
     return figures
+
+
+def _contestant(own: Any) -> dict[str, Figure]:
+    """The quantiles of one contestant with their bands."""
+    quantiles = {
+        key: {"median": ends.get("q90"), "low": ends.get("low"), "high": ends.get("high")}
+        for key, ends in (own.items() if isinstance(own, dict) else ())
+        if isinstance(ends, dict) and "q90" in ends
+    }
+    return _figures(quantiles)
 
 
 def _deposition(parts: dict, laws: dict) -> dict[str, Figure]:

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 from pipeline.report.shared.digits import MINUS, THIN, beyond_meaning, count, decimals, number, short
 from pipeline.report.shared.sources import NIGHTLY, Sources, digest
 from pipeline.report.shared.verdict import Figure, Missing, Question
-from pipeline.report.temperature.answers import all_answers
 
 
 class Move(NamedTuple):
@@ -172,36 +171,17 @@ def _flat(prefix: str, data: Any) -> Iterator[tuple[str, Any]]:
         yield from _flat(place, value)
 
 
-def accepted_answers(sources: Sources, asked: list[Question]) -> Mapping[str, Mapping[str, Figure | Missing]]:
-    """The figures of an accepted run that kept none with their bands: from its metrics alone, no tables."""
-    gone = Missing("not measured", "the accepted run keeps no table")
-    metrics = {stage: sources.accepted.get("metrics", {}).get(stage, gone) for stage in sources.metrics}
-    return all_answers(sources._replace(metrics=metrics, tables=dict.fromkeys(sources.tables, gone)), asked)
-
-
 def moves(
     sources: Sources, asked: list[Question], answers: Mapping[str, Mapping[str, Figure | Missing]]
 ) -> dict[str, list[Move]]:
-    """{controller: every figure against the accepted run's}; unchanged is what
-    the metrics alone say, moved what the bands say."""
-    if sources.accepted.get("figures"):
-        before, plain = _recorded(sources.accepted["figures"]), answers
-    else:
-        before = accepted_answers(sources, asked)
-        plain = all_answers(
-            sources._replace(tables=dict.fromkeys(sources.tables, Missing("not measured", ""))), asked
-        )
+    """{controller: every figure against the accepted run's}. A run that kept none of a figure, such as one of
+    an earlier comparison, leaves it new."""
+    before = _recorded(sources.accepted.get("figures") or {})
     return {
         name: [
-            _move(
-                question,
-                before.get(name, {}).get(question.key),
-                plain[name][question.key],
-                answers[name][question.key],
-            )
-            for question in asked
+            _move(question, before.get(name, {}).get(question.key), mine[question.key]) for question in asked
         ]
-        for name in answers
+        for name, mine in answers.items()
     }
 
 
@@ -216,14 +196,12 @@ def _recorded(figures: Mapping[str, Any]) -> dict[str, dict[str, Figure | Missin
     }
 
 
-def _move(
-    question: Question, before: Figure | Missing | None, plain: Figure | Missing, now: Figure | Missing
-) -> Move:
+def _move(question: Question, before: Figure | None, now: Figure | Missing) -> Move:
     if isinstance(now, Missing):
         return Move(question, None, now, False, now.state)
-    if before is None or isinstance(before, Missing):
+    if before is None:
         return Move(question, None, now, False, "new")
-    if isinstance(plain, Figure) and before[:3] == plain[:3]:
+    if before[:3] == now[:3]:
         return Move(question, before, now, False, "unchanged")
     if now.low <= before.high and before.low <= now.high:
         return Move(question, before, now, False, "within noise")

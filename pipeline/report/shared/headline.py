@@ -20,8 +20,8 @@ LINES, LINE = 11, 72
 
 
 class Loop(NamedTuple):
-    """One loop: its state (passed, failed, open, not measured), and whole
-    sentences; `lead` is bold and vermillion where it failed."""
+    """One loop: its state (passed, failed, open, not measured), and whole sentences; `lead` is bold and
+    vermillion where it failed. `recorded`: judged from recordings of the machine, not on simulated ones."""
 
     name: str
     moves: str
@@ -30,6 +30,7 @@ class Loop(NamedTuple):
     lead: str
     reason: str
     remedy: str
+    recorded: bool = False
 
 
 def loops(sources: Sources, judged: Judgement) -> list[Loop]:
@@ -39,7 +40,16 @@ def loops(sources: Sources, judged: Judgement) -> list[Loop]:
     parts, camera = deposition_verdict.verdict(sources), setpoint_verdict.verdict(sources)
     return _fitted(
         [
-            Loop("temperature", MOVES[0], mine.word, mine.decision, mine.lead, mine.reason, mine.remedy),
+            Loop(
+                "temperature",
+                MOVES[0],
+                mine.word,
+                mine.decision,
+                mine.lead,
+                mine.reason,
+                mine.remedy,
+                sources.recorded,
+            ),
             *(
                 Loop(
                     verdict.loop,
@@ -49,6 +59,7 @@ def loops(sources: Sources, judged: Judgement) -> list[Loop]:
                     verdict.lead,
                     _first(verdict.reason),
                     verdict.remedy,
+                    not simulated(sources, verdict.loop),
                 )
                 for verdict, moves in zip((parts, camera), MOVES[1:], strict=True)
             ),
@@ -124,26 +135,29 @@ def claim(sources: Sources, names: Sequence[str] = NAMES) -> str:
     return f"{text[:1].upper()}{text[1:]}."
 
 
+# what is claimed of loops, by whether their machine was recorded and by state
+CLAIMS = (
+    (True, ("passed",), "ready for a supervised trial"),
+    (True, ("failed", "open"), "not ready"),
+    (False, ("passed",), "rehearsal passed"),
+    (False, ("failed",), "rehearsal failed"),
+    (False, ("open",), "rehearsal open"),
+)
+
+
 def decision(loops: Sequence[Loop]) -> str:
-    """ "Deploy temperature and deposition; do not deploy setpoint." """
-    groups = {
-        state: [loop.name for loop in loops if loop.state == state]
-        for state in ("passed", "failed", "open", ABSENT)
-    }
-    if len(groups["passed"]) == len(loops):
-        return "Deploy all three loops."
-    parts = [
-        f"deploy {_listed(groups['passed'], 'and')}" if groups["passed"] else "",
-        f"do not deploy {_listed(groups['failed'], 'or')}" if groups["failed"] else "",
-        f"{_listed(groups['open'], 'and')} {_is(groups['open'])} undecided" if groups["open"] else "",
-        f"{_listed(groups[ABSENT], 'and')} {_is(groups[ABSENT])} not measured" if groups[ABSENT] else "",
-    ]
-    text = "; ".join(filter(None, parts))
+    """ "Rehearsal passed: temperature and deposition; failed: setpoint." """
+    parts: list[str] = []
+    for recorded, states, words in CLAIMS:
+        names = [loop.name for loop in loops if loop.recorded == recorded and loop.state in states]
+        if names:
+            again = words.startswith("rehearsal") and any("rehearsal" in part for part in parts)
+            listed = "all three loops" if len(names) == len(NAMES) else _listed(names, "and")
+            parts.append(f"{words.removeprefix('rehearsal ') if again else words}: {listed}")
+    absent = [loop.name for loop in loops if loop.state == ABSENT]
+    parts += [f"not measured: {_listed(absent, 'and')}"] if absent else []
+    text = "; ".join(parts)
     return f"{text[:1].upper()}{text[1:]}."
-
-
-def _is(names: Sequence[str]) -> str:
-    return "is" if len(names) == 1 else "are"
 
 
 def _listed(names: Sequence[str], word: str) -> str:

@@ -33,13 +33,14 @@ SHAPES = {
     "bow": "0 0,50% 50%,100% 0,100% 100%,50% 50%,0 100%",
 }
 _unmarked = [contestant.name for contestant in CONTESTANTS if not contestant.mark]
-# role or controller -> class of its mark: circle data-driven, square model-based, ring baseline
+# role or contestant -> class of its mark: circle data-driven, square model-based, ring baseline; hollow
+# circle: another learned one of a loop
 MARKS = (
-    {"data_driven": "dd", "model_based": "mb", "baseline": "bl"}
+    {"data_driven": "dd", "model_based": "mb", "baseline": "bl", "kernel": "dd"}
     | {contestant.name: contestant.mark for contestant in CONTESTANTS if contestant.mark}
     | dict(zip(_unmarked, itertools.cycle(SHAPES), strict=False))
 )
-HOLLOW = {contestant.name for contestant in CONTESTANTS if contestant.hollow}
+HOLLOW = {"kernel", *(contestant.name for contestant in CONTESTANTS if contestant.hollow)}
 
 
 @functools.cache
@@ -95,7 +96,7 @@ def glyph(state: str) -> Markup:
 
 
 def mark(controller: str) -> Markup:
-    css = MARKS[controller] + (" hollow" if controller in HOLLOW else "")
+    css = MARKS.get(controller, "bl") + (" hollow" if controller in HOLLOW else "")
     if css in SHAPES:
         return Markup(
             '<span class="mk {}" style="background:var(--ink);clip-path:polygon({})" '

@@ -34,7 +34,7 @@ from pipeline.setpoint.workflow.tables import (
 )
 from pipeline.store import artifacts
 from pipeline.temperature.workflow import tables as schemas
-from pipeline.temperature.workflow.settings import Panel, Plant, Tracking
+from pipeline.temperature.workflow.settings import Plant
 
 Table = dict[str, np.ndarray]
 
@@ -45,8 +45,6 @@ class Declared(NamedTuple):
 
     rules: ReportRules
     machine: Plant
-    panel: Panel
-    tracking: Tracking
     everything: dict[str, Any]
 
 
@@ -65,7 +63,8 @@ class Source(NamedTuple):
 class Sources(NamedTuple):
     """`metrics` by stage and `tables` by name, each with a Missing where it could not be read; `read`: what
     was; `absent`: what was not, by path; `accepted`: the last accepted run, or None; `files`: digest of each
-    file of code; `nightly`: what the last night measured, None before the first.
+    file of code; `nightly`: what the last night measured, None before the first; `relearned`: bands over
+    fresh relearnings of the study's machine, None where nobody made them.
     """
 
     declared: Declared
@@ -77,6 +76,7 @@ class Sources(NamedTuple):
     code: str
     files: Mapping[str, str]
     nightly: dict | Missing | None = None
+    relearned: dict | Missing | None = None
 
     @property
     def recorded(self) -> bool:
@@ -109,6 +109,9 @@ class Sources(NamedTuple):
 # what the nightly job writes after the pages: no dependency of theirs (DVC would ask for it before the first
 # night), they show the night before
 NIGHTLY = "reports/metrics/nightly.json"
+# the benchmark's accepted result: of the study's machine, and made by hand, so that it is no dependency
+# either
+RELEARNED = "benchmarks/results/temperature_relearned.json"
 
 
 def collect(
@@ -132,8 +135,6 @@ def collect(
     for name, stage, file, kind, reader in _tables(declared.machine):
         path = f"{folders[stage]}/{file}"
         tables[name] = _read(read, path, name, stage, kind, reader)
-        if name == "kernel" and not artifacts.exists(path):
-            tables[name] = _refusal(figures[stage]) or tables[name]
         if name == "printer_pid" and not tables[name]:
             del read[path]
         elif isinstance(tables[name], Missing):
@@ -152,15 +153,16 @@ def collect(
         if artifacts.exists(NIGHTLY)
         else None
     )
+    relearned = (
+        _read(read, RELEARNED, "relearned", "benchmark", "relearned", artifacts.read_json)
+        if artifacts.exists(RELEARNED)
+        else None
+    )
     folders_of_code = digest({folder: artifacts.sha256(folder) for folder in code})
     files = code_files(code)
-    return Sources(declared, figures, tables, read, absent, before or None, folders_of_code, files, night)
-
-
-def _refusal(learned: dict | Missing) -> Missing | None:
-    """Why learn_kernel wrote no kernel.parquet: where it refused one, running it again would give none."""
-    refused = None if isinstance(learned, Missing) else learned.get("refused")
-    return Missing("failed", str(refused)) if refused else None
+    return Sources(
+        declared, figures, tables, read, absent, before or None, folders_of_code, files, night, relearned
+    )
 
 
 def code_files(folders: tuple[str, ...]) -> dict[str, str]:
@@ -217,12 +219,9 @@ def _tables(machine: Plant) -> list[tuple[str, str, str, str, Callable[[str], An
         ("first_order", "identify_plant", "first_order.parquet", *table(schemas.FIRST_ORDER)),
         ("poles", "identify_plant", "poles.parquet", *table(schemas.POLES)),
         ("levels", "identify_plant", "levels.parquet", *table(schemas.LEVELS)),
-        ("window", "learn_kernel", "window.parquet", *arrays("window")),
-        ("kernel", "learn_kernel", "kernel.parquet", *arrays("kernel")),
-        ("tuning", "tune_weights", "history.parquet", *table(schemas.TUNING)),
         ("weights", "tune_weights", "weights.json", "weights", artifacts.read_json),
         ("summary", "evaluate_temperature", "summary.json", "summary", artifacts.read_json),
-        ("scorecard", "evaluate_temperature", "scorecard.parquet", *table(schemas.SCORECARD)),
+        ("cases", "evaluate_temperature", "cases.parquet", *table(schemas.CASES)),
         (
             "trajectories",
             "evaluate_temperature",

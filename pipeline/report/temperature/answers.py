@@ -1,218 +1,174 @@
-"""Artifacts -> the answers of page one: median and 90 % band of each figure, for each controller."""
+"""Metrics of the stages -> the figures of each contestant that the rules are asked of: as deployed, over all
+plants, at the 90 % quantile with the band of that quantile. No page, no file."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-import pandas as pd
+from pipeline.report.shared.digits import number
+from pipeline.report.shared.verdict import OPEN, Figure, Missing
+from pipeline.report.temperature.contestants import BY_NAME, YARDSTICKS, heading
 
-from pipeline.report.shared.digits import DASH, number
-from pipeline.report.shared.sources import Sources, Table, lookup
-from pipeline.report.shared.verdict import ROLES, Figure, Missing, Question
-from pipeline.temperature.workflow.contestants import CONTESTANTS
-
-# role on page one -> the controller's name in the artifacts
-CONTROLLERS = {
-    role: next(contestant.name for contestant in CONTESTANTS if contestant.role == role) for role in ROLES
-}
-# controllers in the order of the pages, each with heading and method
-LABELS = {contestant.name: (contestant.heading, contestant.method) for contestant in CONTESTANTS}
-# shown beside the others, never the best of them
-YARDSTICKS = {contestant.name for contestant in CONTESTANTS if contestant.role == "yardstick"}
-LEARNED_FROM = {contestant.name: contestant.learned_from for contestant in CONTESTANTS}
-RUNS = {
-    "gap_percent": ("regret", 100.0),
-    "settled_error_degC": ("settled_error_degC", 1.0),
-    "settling_s": ("settling_s", 1.0),
-    "overshoot_degC": ("overshoot_degC", 1.0),
-    "at_limits_percent": ("at_limits_percent", 1.0),
-}
+Metrics = Mapping[str, Any]  # {stage: its metrics, or why there are none}
+REPEAT = "Run ./run dvc repro evaluate_temperature"
+# figures of the scorecard that come as median and quantile
+QUANTILES = ("settled_error", "settling", "overshoot", "at_limits", "energy", "cost")
 
 
-def all_answers(sources: Sources, asked: list[Question]) -> dict[str, dict[str, Figure | Missing]]:
-    """{controller: {key: figure}} of every controller that was judged,
-    and of the three roles whether they were or not."""
-    judged = lookup(sources.metrics["evaluate_temperature"], "controllers", what="the scorecard")
-    names = list(dict.fromkeys([*CONTROLLERS.values(), *([] if isinstance(judged, Missing) else judged)]))
+def entry(data: Any, *names: str) -> Any:
+    """data[name][name]...; None where any of them is not there."""
+    for name in names:
+        data = data.get(name) if isinstance(data, Mapping) else None
+    return data
+
+
+def comparison(metrics: Metrics) -> Mapping[str, Any]:
+    """The metrics of the comparison; {} where there are none."""
+    compared = metrics.get("evaluate_temperature")
+    return compared if isinstance(compared, Mapping) else {}
+
+
+def judged(metrics: Metrics) -> list[str]:
+    """Contestants with figures, in the declared order of simplicity, the yardstick last."""
+    compared = comparison(metrics)
+    names = list(entry(compared, "contestants") or {})
+    declared = [name for name in entry(compared, "order") or BY_NAME if name in names]
+    listed = [*declared, *(name for name in names if name not in declared)]
+    return [name for name in listed if name not in YARDSTICKS] + [n for n in listed if n in YARDSTICKS]
+
+
+def refused(metrics: Metrics) -> dict[str, str]:
+    """Why contestants could not take part, by name."""
+    reasons = {name: str(why) for name, why in (entry(comparison(metrics), "refused") or {}).items()}
+    kernel = entry(metrics.get("learn_kernel"), "refused")
+    if kernel and "learned_kernel" not in (entry(comparison(metrics), "contestants") or {}):
+        reasons.setdefault("learned_kernel", str(kernel))
+    return reasons
+
+
+def finite(value: Any) -> float:
+    """A number of the metrics; null, and what is no number, is without end."""
+    numeric = isinstance(value, int | float) and not isinstance(value, bool)
+    return float(value) if numeric and math.isfinite(value) else math.inf
+
+
+def quantile(figures: Any) -> Figure | None:
+    """The 90 % quantile with its band; None where the figure is not there."""
+    if not isinstance(figures, Mapping) or "q90" not in figures:
+        return None
+    value = finite(figures["q90"])
+    low, high = (finite(figures.get(end, figures["q90"])) for end in ("low", "high"))
+    return Figure(value, min(low, value), max(high, value))
+
+
+def of_contestant(metrics: Metrics, name: str, undeclared: Sequence[str] = ()) -> dict[str, Figure | Missing]:
+    """{key: figure} of one contestant; `undeclared` are outputs without low and high."""
+    figures = entry(comparison(metrics), "contestants", name)
+    if figures is None:
+        gap = _without(metrics, name)
+        keys = (*QUANTILES, "disk", "delay_s", "crossings")
+        return dict.fromkeys(keys, gap) | {"data": data(metrics, name)}
+    gap = Missing(OPEN, "This figure is not in the scorecard", REPEAT)
     return {
-        name: {question.key: _answer(sources, judged, name, question) for question in asked} for name in names
+        **{key: quantile(entry(figures, key)) or gap for key in QUANTILES},
+        **{key: _margin(figures, key) or _without_margin(figures, gap) for key in ("disk", "delay_s")},
+        "crossings": crossings(figures, undeclared),
+        "data": data(metrics, name),
     }
 
 
-def without_figures(sources: Sources, name: str) -> Missing | None:
-    """Why a controller has no figures. None where it could not take part: nobody knows the true plant.
-
-    The kernel's place stays where the record does not determine one.
-    """
-    refused = lookup(sources.metrics["evaluate_temperature"], f"refused.{name}")
-    if isinstance(refused, Missing) and LEARNED_FROM[name] == "kernel":
-        refused = lookup(sources.metrics["learn_kernel"], "refused")
-        if isinstance(refused, Missing):
-            return Missing("not measured", "there is no kernel", "Run ./run dvc repro learn_kernel")
-    return None if isinstance(refused, Missing) else Missing("failed", str(refused))
+def _without(metrics: Metrics, name: str) -> Missing:
+    """Why a contestant has no figures: refused, or nothing was measured."""
+    compared = metrics.get("evaluate_temperature")
+    if reason := refused(metrics).get(name):
+        return Missing("failed", reason)
+    if isinstance(compared, Missing):
+        return compared
+    return Missing(OPEN, f"{heading(name)} is not among what the stage measured", REPEAT)
 
 
-def aimed_unclipped(sources: Sources, where: str) -> str:
-    """ "Baseline has no feed-forward of its own and aims at the feasible target here too."; empty where every
-    controller has its own."""
-    listed = lookup(sources.metrics["evaluate_temperature"], "without_feed_forward")
-    names = [] if isinstance(listed, Missing) else [LABELS[name][0] for name in LABELS if name in listed]
-    if not names:
-        return ""
-    *others, last = names
-    if others:
-        every = f"{', '.join(others)} and {last}"
-        return f"{every} have no feed-forward of their own and aim at the feasible target {where} too."
-    return f"{last} has no feed-forward of its own and aims at the feasible target {where} too."
+def unstable(figures: Any) -> tuple[int, int]:
+    """(plants that a contestant does not hold stable, plants)."""
+    stable, of = (entry(figures, "stable", key) for key in ("count", "of"))
+    return (of - stable, of) if isinstance(stable, int) and isinstance(of, int) else (0, 0)
 
 
-def own_integral(sources: Sources) -> str:
-    """ " (Baseline: its own)" where some controller's integral action is not the declared one; empty where
-    all have that."""
-    shares = lookup(sources.metrics["evaluate_temperature"], "own_integral")
-    if isinstance(shares, Missing):
-        return ""
-    own = [f"{LABELS[name][0]}: {'its own' if shares[name] else 'none'}" for name in LABELS if name in shares]
-    return f" ({'; '.join(own)})" if own else ""
+def _margin(figures: Any, key: str) -> Figure | None:
+    """A margin of the median plant; none where a plant's loop is unstable. The panel's spread has gain, speed
+    and delay in it: a margin on its worst plant would ask for the same doubt twice."""
+    margin = entry(figures, "margins", key)
+    if not isinstance(margin, Mapping) or "median" not in margin:
+        return None
+    median = 0.0 if unstable(figures)[0] else finite(margin["median"])
+    return Figure(median, median, median)
 
 
-def _answer(sources: Sources, judged: Any, name: str, question: Question) -> Figure | Missing:
-    if question.key == "data":
-        return _data(sources, name)
-    of_controller = lookup(judged, name, what=f"{LABELS.get(name, (name,))[0]}")
-    if isinstance(of_controller, Missing):
-        return without_figures(sources, name) or of_controller
-    if question.key == "worst_case_gap_percent":
-        return worst_case(sources.tables["scorecard"], name, noise(sources), of_controller.get("gap_percent"))
-    figures = of_controller.get(question.key)
-    if figures is None:
+def _without_margin(figures: Mapping[str, Any], gap: Missing) -> Missing:
+    """A contestant that closes no loop has no margin to lose."""
+    if "margins" in figures and figures["margins"] is None:
+        return Missing("not applicable", "it closes no loop")
+    return gap
+
+
+def crossings(figures: Any, undeclared: Sequence[str] = ()) -> Figure | Missing:
+    """Cases in which a true output leaves its declared low or high."""
+    if undeclared:
+        names = ", ".join(undeclared)
         return Missing(
-            "not measured",
-            f"{question.title} is not in the scorecard",
-            "Run ./run dvc repro evaluate_temperature",
+            OPEN,
+            f"low and high of {names} are not declared",
+            "Declare low and high below plant.outputs in params.yaml",
         )
-    note = _zone(sources, figures) if question.key == "settled_error_degC" else ""
-    return Figure(
-        *(_finite(figures.get(end)) for end in ("median", "low", "high")),
-        runs=_runs(sources, name, question.key),
-        note=note,
-    )
+    cases, of = (entry(figures, "crossings", key) for key in ("cases", "of"))
+    if not isinstance(cases, int):
+        return Missing(OPEN, "Crossings of the outputs’ limits are not in the scorecard", REPEAT)
+    return Figure(float(cases), float(cases), float(cases), note=f"of {number(finite(of), 0)} cases")
 
 
-def _finite(value: float | None) -> float:
-    return math.inf if value is None else float(value)
+# ---- the data
 
 
-def _zone(sources: Sources, figures: Mapping) -> str:
-    zone = figures.get("zone")
-    return sources.zone(zone) if isinstance(zone, int) else f"zone {zone}" if zone else ""
-
-
-def noise(sources: Sources) -> float:
-    """The noise level that the figures were judged at, in °C."""
-    level = lookup(sources.tables["summary"], "noise_degC")
-    if not isinstance(level, Missing):
-        return level
-    return sources.declared.everything.get("evaluate_temperature", {}).get(
-        "report_noise_degC", sources.declared.panel.noise_degC[0]
-    )
-
-
-def _mine(table: Table, name: str, noise: float) -> np.ndarray:
-    return (table["controller"] == name) & (table["noise_degC"] == noise)
-
-
-def _runs(sources: Sources, name: str, key: str) -> tuple[float, ...]:
-    """The repetitions on the nominal plant, a run that never settles as infinity."""
-    table = sources.tables["scorecard"]
-    if isinstance(table, Missing) or key not in RUNS:
-        return ()
-    column, factor = RUNS[key]
-    values = factor * table[column][_mine(table, name, noise(sources)) & (table["plant"] == 0)]
-    return tuple(np.where(np.isnan(values), math.inf, values).tolist())
-
-
-def worst_case(table: Table | Missing, name: str, noise: float, summary: Mapping | None) -> Figure | Missing:
-    """The largest gap over plants, starts and references, in percent;
-    its band is over the seeds of the noise."""
-    if isinstance(table, Missing):
-        worst = (summary or {}).get("worst")
-        return table if worst is None else Figure(worst, worst, worst)
-    runs = pd.DataFrame(table)[_mine(table, name, noise)]
-    if runs.empty:
-        return Missing("not measured", f"the scorecard has no run of {name} at {noise:g} °C of noise")
-    gap = 100.0 * runs["regret"].fillna(math.inf)
-    worst = gap.groupby(runs["seed"]).max().to_numpy()
-    low, value, high = np.quantile(worst, [0.05, 0.5, 0.95], method="nearest")
-    return Figure(
-        float(value), float(low), float(high), tuple(worst.tolist()), f"{runs['plant'].nunique()} plants"
-    )
-
-
-def _data(sources: Sources, name: str) -> Figure | Missing:
-    """Samples of the record over the samples that a controller needs: for its noise, and for its unknowns."""
-    learned, machine = sources.metrics["learn_kernel"], sources.declared.machine
-    learned_from = LEARNED_FROM.get(name, "")
+def data(metrics: Metrics, name: str) -> Figure | Missing:
+    """Samples of the record over the samples that a contestant needs: for its noise, and for its unknowns."""
+    learned = metrics.get("learn_kernel")
+    learned_from = BY_NAME[name].learned_from if name in BY_NAME else "plant"
     if learned_from == "kernel":
-        needed, samples = lookup(learned, "samples_needed"), lookup(learned, "samples")
-        if isinstance(needed, Missing) and isinstance(learned, dict) and learned.get("refused"):
-            return Missing("failed", str(learned["refused"]))
-        return _of(samples, needed)
+        if entry(learned, "refused") and entry(learned, "samples_needed") is None:
+            return Missing("failed", str(entry(learned, "refused")))
+        return _of(learned, entry(learned, "samples"), entry(learned, "samples_needed"))
     if learned_from == "window":
-        samples, noise, past = (
-            lookup(learned, key) for key in ("samples", "samples_needed_for_noise", "window")
-        )
-        missing = next((part for part in (samples, noise, past) if isinstance(part, Missing)), None)
-        unknowns = 0 if missing else past * (len(machine.inputs) + len(machine.outputs)) + 1
-        return missing or _of(samples, max(noise, unknowns))
+        noise, past = entry(learned, "samples_needed_for_noise"), entry(learned, "window")
+        needed = None if noise is None or past is None else max(noise, _unknowns(metrics, past))
+        return _of(learned, entry(learned, "samples"), needed)
     if learned_from == "plant":
-        return _model_data(sources)
-    return Missing("not applicable", f"{LABELS.get(name, (name,))[0]} learns nothing from the record")
+        return _model_data(metrics)
+    return Missing("not applicable", f"{heading(name)} learns nothing from the record")
 
 
-def _model_data(sources: Sources) -> Figure | Missing:
+def _unknowns(metrics: Metrics, past: int) -> int:
+    """Unknowns of one output's regression on `past` samples of every signal and a constant."""
+    model = metrics.get("identify_plant")
+    return past * sum(len(entry(model, key) or ()) for key in ("delays", "fit_holdout")) + 1
+
+
+def _model_data(metrics: Metrics) -> Figure | Missing:
     """The model has fewer unknowns than the window, so that noise asks no more of it; its
-    own first step, a long VARX, asks for its unknowns.
-    """
-    identified, machine = sources.metrics["identify_plant"], sources.declared.machine
-    samples, past = lookup(identified, "rows"), lookup(identified, "past")
-    needed = lookup(identified, "samples_needed")
-    if isinstance(needed, Missing) and not isinstance(past, Missing):
-        noise = lookup(sources.metrics["learn_kernel"], "samples_needed_for_noise")
-        needed = (
-            noise
-            if isinstance(noise, Missing)
-            else max(noise, past * (len(machine.inputs) + len(machine.outputs)) + 1)
-        )
-    return _of(samples, needed)
+    own first step, a long VARX, asks for its unknowns."""
+    model = metrics.get("identify_plant")
+    past, needed = entry(model, "past"), entry(model, "samples_needed")
+    noise = entry(metrics.get("learn_kernel"), "samples_needed_for_noise")
+    if needed is None and past is not None and noise is not None:
+        needed = max(noise, _unknowns(metrics, past))
+    return _of(model, entry(model, "rows"), needed)
 
 
-def _of(samples: Any, needed: Any) -> Figure | Missing:
-    missing = next((part for part in (samples, needed) if isinstance(part, Missing)), None)
-    if missing or not needed:
-        return missing or Missing("not measured", "the number of samples that are needed is not known")
+def _of(stage: Any, samples: Any, needed: Any) -> Figure | Missing:
+    if isinstance(stage, Missing):
+        return stage
+    if samples is None or not needed:
+        return Missing(OPEN, "the number of samples that are needed is not known")
     ratio, more = samples / needed, max(needed - samples, 0)
-    note = f"{number(samples, 0)} of {number(needed, 0)}" + (
-        f" samples; record {number(more, 0)} more." if more else ""
+    note = f"{number(samples, 0)} of {number(needed, 0)} samples" + (
+        f"; record {number(more, 0)} more" if more else ""
     )
     return Figure(ratio, ratio, ratio, note=note)
-
-
-def repetitions(sources: Sources) -> str:
-    """ "24 runs: 3 starts x 2 references x 4 seeds"."""
-    half = sources.declared.panel.judging
-    parts = len(half.starts_degC), len(half.reference_offsets_degC), len(half.seeds)
-    return f"{math.prod(parts)} runs: {parts[0]} starts × {parts[1]} references × {parts[2]} seeds"
-
-
-def featured(sources: Sources) -> str:
-    """The scenario of the pictures, in words."""
-    panel = sources.declared.panel
-    offset = panel.judging.reference_offsets_degC[0]
-    references = [o.reference + offset for o in sources.declared.machine.outputs]
-    ends = f"{number(min(references), 0)}{DASH}{number(max(references), 0)}"
-    return (
-        f"nominal plant, held at {panel.judging.starts_degC[0]:g} °C, then sent to {ends} °C; sensor noise "
-        f"{noise(sources):g} °C"
-    )

@@ -3,16 +3,15 @@
 from typing import Any
 
 from pipeline.report.identification.model import flagged_sentence
-from pipeline.report.shared.digits import THIN, percent, short
+from pipeline.report.shared.digits import THIN, short
 from pipeline.report.shared.sources import Sources, lookup
 from pipeline.report.shared.verdict import Missing
-from pipeline.report.temperature.evidence import default_cost
 
 
 def findings(sources: Sources) -> list[tuple[str, str]]:
     """What a reader should take away, each with its figure; a figure
     that was not measured is said to be so."""
-    claims = [_flagged(sources), _regret(sources.metrics["tune_weights"]), _printer(sources)]
+    claims = [_flagged(sources), _printer(sources)]
     units = sources.declared.machine.sample_time_s
     if sources.declared.everything.get("generate_probing", {}).get("source") == "simulated":
         claims += [
@@ -23,7 +22,7 @@ def findings(sources: Sources) -> list[tuple[str, str]]:
             ),
             (
                 "The probing is simulated, the judging is separate.",
-                "The record comes from the study’s machine, simulated within limits; every controller is "
+                "The record comes from the study’s machine, simulated within limits; every contestant is "
                 "judged on plants that nothing was fitted to. Nothing here is a claim about a real printer.",
             ),
         ]
@@ -59,44 +58,24 @@ def _printer(sources: Sources) -> tuple[str, str] | None:
     holds = f"The printer holds {'; '.join(gains)}, in % of duty, °C and s."
     simc = "The page of the identification sets it beside one by SIMC."
     evaluated = sources.metrics["evaluate_temperature"]
-    if isinstance(lookup(evaluated, "controllers.printer_pid"), Missing):
-        refused = lookup(evaluated, "refused.printer_pid")
-        why = "It was not judged." if isinstance(refused, Missing) else f"It was refused: {refused}."
-        return "The printer’s own PID is not among these controllers.", f"{holds} {why} {simc}"
+    if isinstance(lookup(evaluated, "contestants.printer_pid"), Missing):
+        reason = lookup(evaluated, "refused.printer_pid")
+        why = "It was not judged." if isinstance(reason, Missing) else f"It was refused: {reason}."
+        return "The printer’s own PID is not among these contestants.", f"{holds} {why} {simc}"
     return (
-        "The printer’s own PID is among these controllers, as it is.",
+        "The printer’s own PID is among these contestants, as it is.",
         f"{holds} It runs once in {sources.declared.machine.sample_time_s:g}{THIN}s here, as often as the "
-        f"others, and in Klipper every 0.3{THIN}s. It is told no model and no target, is not tuned, and "
-        f"the verdict does not choose it. {_held_stable(evaluated)}{simc}",
+        f"others, and in Klipper every 0.3{THIN}s. It is told no model and is not tuned. "
+        f"{_held_stable(evaluated)}{simc}",
     )
 
 
 def _held_stable(evaluated: Any) -> str:
     """A sentence where the printer's own PID does not hold every plant stable."""
-    plants = lookup(evaluated, "controllers.printer_pid.stable_plants")
+    plants = lookup(evaluated, "contestants.printer_pid.stable")
     if isinstance(plants, Missing) or plants["count"] == plants["of"]:
         return ""
     return (
         f"It holds {plants['count']} of {plants['of']} plants stable: look whether the recorded duty swings "
         "between its limits. At Klipper’s own rate a loop near the edge may hold. "
-    )
-
-
-def _regret(tuned: Any) -> tuple[str, str]:
-    regret, cost, identity = (
-        lookup(tuned, "practical.regret_identity"),
-        lookup(tuned, "practical.cost"),
-        default_cost(tuned),
-    )
-    if any(isinstance(v, Missing) for v in (regret, cost, identity)):
-        return "What tuning buys.", "Not measured."
-    return (
-        f"Practical tuning lowers the engineering cost by {percent(100 * (1 - cost / identity), 2)}, "
-        "and says what it pays.",
-        f"On the common yardstick the tuned weights cost {percent(100 * regret, 2)} more than the default "
-        "ones: settling, overshoot and "
-        + (
-            "limits are bought with quadratic cost. Gaps on these pages are at the yardstick’s weights, "
-            "unclipped; everything else is as deployed."
-        ),
     )

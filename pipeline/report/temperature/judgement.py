@@ -1,4 +1,5 @@
-"""What both pages say of the temperature loop: questions, answers, verdict, and how the figures moved."""
+"""What both pages say of the temperature loop: questions, figures by contestant, verdict, and how the figures
+moved since the accepted run."""
 
 import math
 from collections.abc import Mapping
@@ -8,54 +9,107 @@ from pipeline.report.identification.model import UNTRUSTED, trust
 from pipeline.report.shared.difference import Difference, Move, difference, moves
 from pipeline.report.shared.digits import count
 from pipeline.report.shared.sources import Sources
-from pipeline.report.shared.verdict import OPEN, PASSED, Figure, Missing, Question, Verdict
-from pipeline.report.temperature.answers import CONTROLLERS, all_answers
+from pipeline.report.shared.verdict import OPEN, PASSED, Answers, Figure, Question, Verdict
+from pipeline.report.temperature.answers import comparison, of_contestant
+from pipeline.report.temperature.contestants import YARDSTICKS, heading, kind
 from pipeline.report.temperature.drifted import Drift, drift
-from pipeline.report.temperature.verdict import ANSWERS, decide, questions
-
-NAMES = {"data_driven": "Data\u2011driven", "model_based": "Model\u2011based", "baseline": "Baseline"}
+from pipeline.report.temperature.pairs import PairSentence, deciding_sentence, pair_names, pair_sentence
+from pipeline.report.temperature.verdict import (
+    GROUPS,
+    Standing,
+    best_sentence,
+    choose,
+    closest,
+    decide,
+    questions,
+    rival,
+    standings,
+)
 
 
 class Judgement(NamedTuple):
-    """What both pages say: questions, answers by controller and by role, the verdict, and the difference;
-    None too where the accepted run is of another machine."""
+    """What both pages say.
+
+    `subject` is the contestant that the verdict is about, the best or the closest to passing; `rival` stands
+    beside it. `held` are all contestants before the rules. `changed` is None without an accepted run, and
+    where that is of another machine.
+    """
 
     asked: list[Question]
-    by_name: Mapping[str, Mapping[str, Figure | Missing]]
-    roles: Mapping[str, Mapping[str, Figure | Missing]]
+    held: Mapping[str, Standing]
+    subject: str
+    rival: str
+    answers: Mapping[str, Answers]
     verdict: Verdict
+    pair: PairSentence
+    deciding: str
+    best: str
     changed: Difference | None
     moved: Mapping[str, list[Move]]
     drifted: Drift
 
 
 def judgement(sources: Sources) -> Judgement:
-    asked = questions(sources.declared.rules, band_degC=sources.declared.panel.band_degC)
+    metrics, rules = sources.metrics, sources.declared.rules
     drifted = drift(sources)
-    # of the machine, and so of every controller that was learned from its record
-    by_name = {
-        name: {**answers, "drift": drifted.answer} for name, answers in all_answers(sources, asked).items()
-    }
-    roles = {role: by_name[name] for role, name in CONTROLLERS.items()}
+    undeclared = undeclared_outputs(sources)
+    asked = questions(rules, comparison(metrics))
+    held = standings(metrics, rules, undeclared=undeclared, drift=drifted.answer)
+    incumbent = incumbent_of(sources)
+    best = choose(metrics, held, incumbent)
+    competing = [name for name in held if name not in YARDSTICKS]
+    subject = best or (closest(held) if competing else pair_names(metrics)[0])
+    beside = rival(metrics, subject)
+    answers = {name: of_contestant(metrics, name, undeclared) for name in (*held, subject, beside)}
     changed = None if sources.another_machine else difference(sources)
-    moves_of = moves(sources, asked, by_name) if changed else {}
-    moved = {role: moves_of[name] for role, name in CONTROLLERS.items()} if changed else {}
-    verdict = decide("temperature", asked, roles)
+    moved = moves(sources, asked, answers) if changed else {}
+    verdict = decide(
+        metrics,
+        rules,
+        recorded=sources.recorded,
+        undeclared=undeclared,
+        drift=drifted.answer,
+        incumbent=incumbent,
+    )
     if sources.recorded:
         verdict = trust_first(verdict, trust(sources))
-    return Judgement(asked, by_name, roles, verdict, changed, moved, drifted)
+    return Judgement(
+        asked,
+        held,
+        subject,
+        beside,
+        answers,
+        verdict,
+        pair_sentence(metrics),
+        deciding_sentence(metrics, best),
+        best_sentence(metrics, held, best),
+        changed,
+        moved,
+        drifted,
+    )
+
+
+def undeclared_outputs(sources: Sources) -> list[str]:
+    """Outputs whose lowest or highest allowed temperature nobody declared."""
+    outputs = sources.declared.machine.outputs
+    return [output.name for output in outputs if output.low is None or output.high is None]
+
+
+def incumbent_of(sources: Sources) -> str:
+    """The contestant that the accepted run of this machine chose; "" where it chose none."""
+    if not isinstance(sources.accepted, dict) or sources.another_machine:
+        return ""
+    return str(sources.accepted.get("winner") or "")
 
 
 def trust_first(verdict: Verdict, model: Verdict) -> Verdict:
-    """The verdict on controllers that were judged on an identified model. Where that model is good for no
-    use, this comes before every rule that its figures pass or fail, and no controller is deployed."""
+    """The verdict on contestants that were judged on an identified model. Where that model is good for no
+    use, this comes before every rule that its figures pass or fail, and nothing is ready."""
     if not model.decision.startswith(UNTRUSTED):
         return verdict
     first = verdict._replace(lead=model.decision, reason=f"{model.lead} {model.reason}", rule="trust")
     if verdict.state == PASSED:
-        return first._replace(
-            state=OPEN, decision="Do not decide yet.", remedy=_remedy(model, ""), winner=None
-        )
+        return first._replace(state=OPEN, decision="Not ready.", remedy=_remedy(model, ""), winner=None)
     return first._replace(remedy=_remedy(model, f"On that model: {verdict.lead} {verdict.reason}"))
 
 
@@ -64,12 +118,20 @@ def _remedy(model: Verdict, then: str) -> str:
 
 
 class RuleLine(NamedTuple):
-    """A rule with the number of its answers, and its state for the two controllers that compete."""
+    """A rule with the number of its answers, and its state for the two contestants that are shown."""
 
     rule: str
     answers: str
-    states: tuple[str, str]
+    states: tuple[str, ...]
     first: bool
+
+
+class RulesHead(NamedTuple):
+    """The contestant above a column of rules or answers."""
+
+    mark: str
+    name: str
+    kind: str
 
 
 class VerdictParts(NamedTuple):
@@ -80,9 +142,14 @@ class VerdictParts(NamedTuple):
     lead: str
     reason: str
     remedy: str
+    heads: list[RulesHead]
     rules: list[RuleLine]
     claim: str
     changed: str
+
+
+def heads(judged: Judgement) -> list[RulesHead]:
+    return [RulesHead(name, heading(name), kind(name)) for name in (judged.subject, judged.rival)]
 
 
 def verdict_parts(judged: Judgement, *, claim: str = "") -> VerdictParts:
@@ -90,12 +157,12 @@ def verdict_parts(judged: Judgement, *, claim: str = "") -> VerdictParts:
     verdict = judged.verdict
     rules = [
         RuleLine(
-            learned.name[:1].upper() + learned.name[1:],
-            ANSWERS[learned.name],
-            (learned.state, designed.state),
-            first=learned.name == verdict.rule,
+            line[0].name[:1].upper() + line[0].name[1:],
+            GROUPS[line[0].name][1],
+            tuple(rule.state for rule in line),
+            first=line[0].name == verdict.rule,
         )
-        for learned, designed, _ in verdict.rules
+        for line in verdict.rules
     ]
     parameters = judged.changed.parameters if judged.changed else []
     changed = f"{count(len(parameters), 'parameter').capitalize()} changed since the accepted run"
@@ -105,6 +172,7 @@ def verdict_parts(judged: Judgement, *, claim: str = "") -> VerdictParts:
         verdict.lead,
         verdict.reason,
         verdict.remedy,
+        heads(judged),
         rules,
         claim,
         changed if parameters else "",
@@ -117,9 +185,9 @@ def shown(judged: Judgement) -> dict[str, dict[str, dict[str, float | None]]]:
         name: {
             key: {"median": _plain(f.value), "low": _plain(f.low), "high": _plain(f.high)}
             for key, f in answers.items()
-            if isinstance(f, Figure) and key != "drift"
+            if isinstance(f, Figure)
         }
-        for name, answers in judged.by_name.items()
+        for name, answers in judged.answers.items()
     }
 
 

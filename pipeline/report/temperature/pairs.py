@@ -1,129 +1,149 @@
-"""Two controllers on the very same cases: what the data-driven one saves against each of the others, with a
-sign-flip test over plants (pipeline/statistics.py)."""
+"""Model-based against data-driven in a sentence, the case that decides, and bands over relearnings. Metrics
+of the comparison -> words, no page, no file."""
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
-import numpy as np
-import pandas as pd
-
-from pipeline.report.shared.digits import LARGEST, THIN, count, number, short
-from pipeline.report.shared.sources import Sources, Table
-from pipeline.report.shared.verdict import Missing
-from pipeline.report.temperature.answers import CONTROLLERS, LABELS, noise
-from pipeline.statistics import Paired, paired
-
-LEVEL = 0.05
-# what makes two runs the same case
-CASE = ["plant", "start_degC", "reference_degC", "seed"]
-# what is compared: column of the scorecard, and what makes a cost above zero of it
-COSTS = (
-    # J / J*, of which J* is the same for both
-    ("Cost on the yardstick, unclipped", lambda runs: 1.0 + runs["regret"]),
-    ("R.m.s. tracking error, as deployed", lambda runs: runs["tracking_degC"]),
-)
+from pipeline.report.shared.digits import band, number
+from pipeline.report.temperature.answers import Metrics, comparison, entry, finite, judged, refused
+from pipeline.report.temperature.contestants import DATA_DRIVEN, INDIRECT, MODEL_BASED, in_a_sentence
 
 
-class Saving(NamedTuple):
-    """What the data-driven controller saves, with its band, the chance of it, and on how many cases."""
+class PairSentence(NamedTuple):
+    """Model-based against data-driven: the answer in words, and whether they are told apart."""
 
-    saved: str
-    band: str
-    p: str
-    cases: str
-    sure: bool
+    text: str
+    winner: str | None
+    note: str = ""
 
 
-class Against(NamedTuple):
-    """A row of the page: which controller, which cost, and what is saved against it."""
-
-    name: str
-    title: str
-    what: str
-    saving: Saving
-
-
-class Comparison(NamedTuple):
-    missing: Missing | None
-    rows: list[Against]
-    finding: str
+def pair_names(metrics: Metrics) -> tuple[str, str]:
+    """The model-based contestant and the data-driven one; the indirect one where the kernel is refused."""
+    pair = entry(comparison(metrics), "pair")
+    if isinstance(pair, Mapping) and {"a", "b"} <= pair.keys():
+        return str(pair["a"]), str(pair["b"])
+    without_kernel = DATA_DRIVEN in refused(metrics) and INDIRECT in judged(metrics)
+    return MODEL_BASED, INDIRECT if without_kernel else DATA_DRIVEN
 
 
-def compared(sources: Sources) -> Comparison:
-    """A row for each of the others and each cost; every case is one plant, start,
-    reference and seed, and cases of a plant are one block."""
-    table = sources.tables["scorecard"]
-    if isinstance(table, Missing):
-        return Comparison(table, [], "")
-    mine, level = CONTROLLERS["data_driven"], noise(sources)
-    rows, sentences = [], []
-    for name in (name for name in LABELS if name != mine):
-        for what, cost in COSTS:
-            pair = _paired(table, name, mine, level, cost)
-            if pair is None:
-                continue
-            rows.append(Against(name, LABELS[name][0], what, _saving(pair)))
-            if name == CONTROLLERS["model_based"]:
-                sentences.append(_sentence(what, pair))
-    gap = None if rows else Missing("not measured", "no two controllers ran the same cases with finite costs")
-    return Comparison(gap, rows, " ".join(sentences))
+def pair_sentence(metrics: Metrics) -> PairSentence:
+    """ "subspace + LQG costs 6 % less than the learned kernel on the same 60 plants (90 % interval 3-9 %,
+    p = 0.01)", or that there is no difference. `difference` is that of the cheaper one."""
+    pair = entry(comparison(metrics), "pair")
+    a, b = pair_names(metrics)
+    reason_of = refused(metrics).get(DATA_DRIVEN)
+    instead = f"The learned kernel is refused: {reason_of}." if reason_of and b != DATA_DRIVEN else ""
+    kind = "data-driven" if b == DATA_DRIVEN else "data-driven, indirect"
+    head = f"Model-based against {kind}:"
+    if not isinstance(pair, Mapping):
+        gap = refused(metrics).get(a) or refused(metrics).get(b) or "not measured"
+        return PairSentence(f"{head} {gap.rstrip('.')}.", None, instead)
+    plants = entry(pair, "plants") or entry(comparison(metrics), "plants")
+    winner = entry(pair, "winner")
+    p = entry(pair, "p")
+    chance = "" if p is None else f"p {'< 0.0001' if p < 1e-4 else f'= {number(p, 4 if p < 0.01 else 2)}'}"
+    better, worse = (in_a_sentence(n) for n in ((a, b) if winner != b else (b, a)))
+    if winner not in (a, b):
+        # a 90 % interval may leave out zero where p is between 0.05 and 0.1: the level is said
+        saved = abs(finite(entry(pair, "difference")))
+        interval = _interval(pair, sign=1) if saved <= 90 else ""
+        saves = f"the cheaper one saves {number(saved, 1)} %" if interval else ""
+        text = f"no difference at the 5 % level between {better} and {worse} on the same {plants} plants"
+        return PairSentence(f"{head} {text}{_bracket(saves, interval, chance)}.", None, instead)
+    sign = 1 if finite(entry(pair, "difference")) >= 0 else -1
+    gain = abs(finite(entry(pair, "difference")))
+    amount = "far less" if not gain <= 90 else f"{number(gain, 0 if gain >= 10 else 1)} % less"
+    interval = _interval(pair, sign=sign) if gain <= 90 else ""
+    text = f"{better} costs {amount} than {worse} on the same {plants} plants"
+    return PairSentence(f"{head} {text}{_bracket(interval, chance)}.", str(winner), instead)
 
 
-def _paired(
-    table: Table, other: str, mine: str, level: float, cost: Callable[[pd.DataFrame], pd.Series]
-) -> Paired | None:
-    """Costs of the two, case by case; None where one of them lost a run, or ran other cases."""
-    runs = pd.DataFrame(table)
-    runs = runs[runs["controller"].isin([other, mine]) & (runs["noise_degC"] == level)]
-    costs = cost(runs).groupby([runs[key] for key in [*CASE, "controller"]]).mean().unstack("controller")
-    if not {other, mine} <= set(costs) or not (np.isfinite(costs) & (costs > 0)).all(axis=None):
-        return None
-    blocks = [f"{plant:g}" for plant in costs.index.get_level_values("plant")]
-    # the draws are for more blocks than all signs can be tried of; a fixed generator keeps the page the same
-    return paired(costs[other].to_numpy(), costs[mine].to_numpy(), blocks, rng=np.random.default_rng(0))
+def _interval(pair: Mapping[str, Any], *, sign: int) -> str:
+    ends = sorted(sign * finite(entry(pair, end)) for end in ("low", "high"))
+    if not all(abs(end) <= 1000 for end in ends):
+        return ""
+    places = 0 if max(map(abs, ends)) >= 20 else 1
+    return f"90 % interval {band(*ends, places) or number(ends[0], places)} %"
 
 
-# a saving of more than this is against one that costs beyond 1,000 % more, as an unstable one does
-MOST = 100.0 - 100.0 / (1.0 + LARGEST["%"] / 100.0)
+def _bracket(*parts: str) -> str:
+    inside = ", ".join(filter(None, parts))
+    return f" ({inside})" if inside else ""
 
 
-def _apart(pair: Paired) -> bool:
-    """Whether the costs lie so far apart that their ratio is no measure, as of an unstable one."""
-    return not -LARGEST["%"] <= pair.improvement_percent <= MOST
-
-
-def _saving(pair: Paired) -> Saving:
-    word = "less" if pair.improvement_percent >= 0 else "more"
-    chance = min(pair.p, 1 - pair.p)
-    saved = f"{short(abs(pair.improvement_percent), 2)}{THIN}% {word}"
-    ends = f"{_signed(pair.low_percent)} to {_signed(pair.high_percent)}"
-    return Saving(
-        saved=f"{word}: beyond {number(LARGEST['%'], 0)}{THIN}% apart" if _apart(pair) else saved,
-        band="none" if _apart(pair) else ends,
-        p=f"{short(chance, 2)}" if chance >= 1e-4 else "< 0.0001",
-        cases=f"{number(pair.cases, 0)} on {count(pair.blocks, 'plant')}",
-        sure=chance < LEVEL,
-    )
-
-
-def _signed(percent: float) -> str:
-    """Positive: the data-driven one costs less."""
-    text = short(abs(percent), 2)
-    return f"−{text}" if percent < 0 and text != "0" else text
-
-
-def _sentence(what: str, pair: Paired) -> str:
-    saving = _saving(pair)
-    name = what.split(",")[0]
-    if _apart(pair):
-        word, most = saving.saved.split(":")[0], number(LARGEST["%"], 0)
-        return f"{name}: data-driven has {word} than model-based, beyond {most}{THIN}% apart."
-    if not saving.sure:
-        return (
-            f"{name}: no difference beyond chance between data-driven and model-based ({saving.saved}, p = "
-            f"{saving.p})."
+def deciding_sentence(metrics: Metrics, winner: str | None) -> str:
+    """Which case decides, and the verdict without its plant."""
+    case = entry(comparison(metrics), "deciding")
+    if not isinstance(case, Mapping) or entry(case, "plant") is None:
+        return ""
+    compared, plant = comparison(metrics), case["plant"]
+    kind = f", {reference_of(case)}" if case.get("kind") else ""
+    changes = []
+    if entry(compared, "best") == winner and case.get("best_without") != winner:
+        other = case.get("best_without")
+        changes.append(f"the best would be {in_a_sentence(other)}" if other else "nobody would pass")
+    pair = entry(compared, "pair", "winner")
+    if case.get("pair_without") != pair:
+        other = case.get("pair_without")
+        changes.append(
+            f"the pair would go to {in_a_sentence(other)}" if other else "the pair would be undecided"
         )
-    return (
-        f"{name}: on the same {saving.cases} data-driven has {saving.saved} than model-based (90{THIN}% "
-        f"interval {saving.band}{THIN}%)."
-    )
+    without = " and ".join(changes) if changes else "the same"
+    return f"Deciding case: plant {plant}{kind}. Without plant {plant} {without}."
+
+
+def reference_of(case: Mapping[str, Any]) -> str:
+    """ "a constant reference", "a ramp"."""
+    kind = str(case.get("kind") or "")
+    return f"a {kind}{' reference' if kind == 'constant' else ''}" if kind else ""
+
+
+# ---- bands over relearnings
+
+
+class RelearnedBand(NamedTuple):
+    low: float
+    high: float
+    date: str
+
+
+def relearned_band(relearned: Any, name: str, figure: str) -> RelearnedBand | None:
+    """The band of a figure over fresh relearnings (benchmarks/results/temperature_relearned.json); None where
+    none were made."""
+    ends = entry(relearned, "contestants", name, figure, "q90")
+    if not isinstance(ends, Mapping) or not {"low", "high"} <= ends.keys():
+        return None
+    return RelearnedBand(finite(ends["low"]), finite(ends["high"]), str(entry(relearned, "date") or ""))
+
+
+def prior_sentence(relearned: Any, winner: str | None) -> str:
+    """How the pair ended over the relearnings, and where the prior of plant uncertainty, removed or added for
+    all, turns its winner; "" without relearnings."""
+    sentences = []
+    counts = _winners(entry(relearned, "answers", "pair_winner"))
+    if counts:
+        shares = [f"{_who(name)} in {number(times, 0)}" for name, times in counts.items()]
+        runs = sum(counts.values())
+        sentences.append(f"Over {number(runs, 0)} relearnings the pair went to {', to '.join(shares)}.")
+    for change in ("removed", "added"):
+        counts = _winners(entry(relearned, "prior", change, "pair_winner"))
+        mine = winner or str(None)
+        turned = {name: times for name, times in counts.items() if name != mine}
+        if turned and sum(turned.values()) > counts.get(mine, 0):
+            shares = [f"{_who(name)} in {number(times, 0)}" for name, times in turned.items()]
+            sentences.append(
+                f"With the prior of plant uncertainty {change} it turns: to {', to '.join(shares)} of "
+                f"{number(sum(counts.values()), 0)}."
+            )
+    return " ".join(sentences)
+
+
+def _winners(counts: Any) -> dict[str, int]:
+    """{winner: times}; "None" stands for no difference."""
+    if not isinstance(counts, Mapping):
+        return {}
+    return {str(name): times for name, times in counts.items() if isinstance(times, int)}
+
+
+def _who(name: str) -> str:
+    return "nobody" if name == str(None) else in_a_sentence(name)

@@ -1,18 +1,22 @@
-"""Rules and figures of the temperature loop -> verdict: which controller to run, the first rule that
-failed or is open, and what to do instead. No page, no file."""
+"""Metrics and rules of the temperature loop -> verdict: whether the best contestant passes, the first rule
+that failed or is open, and what to do. Pure: no page, no file.
 
-import functools
+The night reads the same record: `decide` is a function of metrics and rules alone. Which contestant runs
+today is told to it as `incumbent`; no stage that judges knows it.
+"""
+
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
-from pipeline.report.shared.digits import band, count, decimals, number, quantity, with_unit
+from pipeline.report.shared.digits import short, with_unit
 from pipeline.report.shared.verdict import (
     FAILED,
     FAILED_FIRST,
     OPEN,
     PASSED,
-    ROLES,
     UNDECIDED,
+    UNJUDGED,
     Answers,
     Figure,
     Missing,
@@ -21,294 +25,379 @@ from pipeline.report.shared.verdict import (
     Rule,
     Verdict,
     deciding,
-    row_places,
     share,
 )
+from pipeline.report.temperature.answers import (
+    Metrics,
+    comparison,
+    entry,
+    finite,
+    judged,
+    of_contestant,
+    unstable,
+)
+from pipeline.report.temperature.contestants import YARDSTICKS, heading, in_a_sentence
+from pipeline.report.temperature.pairs import pair_names, pair_sentence, reference_of
+from pipeline.report.temperature.wording import name_first, places_of, reason, worded
 
-RULES = ("gap", "settled error", "limits", "data sufficiency", "drift")
-ANSWERS = {"gap": "2", "settled error": "4", "limits": "5\u20139", "data sufficiency": "10", "drift": "11"}
+LOOP = "temperature"
 NEVER = Missing(OPEN, "The nightly job measures it and has not run")
+# the five lines of the head of a page, the rules in each, and the answers of page one that show them
+GROUPS = {
+    "settled error": (("settled error",), "4"),
+    "limits": (("settling", "overshoot", "time at limits", "disk margin", "delay margin"), "5\u20138"),
+    "crossings": (("crossings",), "9"),
+    "data sufficiency": (("data sufficiency",), "10"),
+    "drift": (("drift",), "11"),
+}
+# rules without which a contestant may pass: only the machine itself shows drift, once the controller runs
+LATER = ("drift",)
 
 
-def questions(rules: ReportRules, *, band_degC: float) -> list[Question]:
-    """Answers 2 and 4 to 10, in their fixed order."""
+class Words(NamedTuple):
+    """What a verdict may say: of simulated machines never more than that a rehearsal passed."""
+
+    passed: str
+    failed: str
+    open: str
+
+
+REHEARSAL = Words("Rehearsal passed: {}.", "Rehearsal failed.", "Rehearsal open.")
+TRIAL = Words("Ready for a supervised trial: {}.", "Not ready.", "Not ready.")
+
+
+# ---- the rules
+
+
+def questions(rules: ReportRules, compared: Mapping[str, Any]) -> list[Question]:
+    """What every contestant is asked, in its fixed order. The comparison resolves three limits for the
+    machine: those that were declared, or those of a recorded machine's own pace."""
+
+    def limit(name: str, declared: float | None) -> float:
+        own = finite(entry(compared, "limits", name))
+        return own if math.isfinite(own) and own > 0 else math.inf if declared is None else declared
+
+    settled = limit("settled_error_degC", rules.settled_error_degC)
+    settling, overshoot = limit("settling_s", rules.settling_s), limit("overshoot_degC", rules.overshoot_degC)
     return [
-        Question(2, "gap_percent", "Gap to the optimum", "%", rules.gap_percent, False, "gap"),
-        Question(
-            4,
-            "settled_error_degC",
-            "Worst settled zone error",
-            "°C",
-            rules.settled_error_degC,
-            False,
-            "settled error",
-        ),
-        Question(
-            5,
-            "settling_s",
-            f"Settling to within {number(band_degC, decimals(0, 0, value=band_degC))}\u00a0°C",
-            "s",
-            rules.settling_s,
-            False,
-            "limits",
-        ),
-        Question(6, "overshoot_degC", "Overshoot", "°C", rules.overshoot_degC, False, "limits"),
-        Question(7, "at_limits_percent", "Time at limits", "%", rules.at_limits_percent, False, "limits"),
-        Question(8, "disk", "Margin: disk", "", rules.disk_margin, True, "limits", "unlimited"),
-        Question(8, "delay_s", "Margin: delay", "s", rules.delay_margin_s, True, "limits", "unlimited"),
-        Question(
-            9,
-            "worst_case_gap_percent",
-            "Worst case over plant spread",
-            "%",
-            rules.worst_case_gap_percent,
-            False,
-            "limits",
-        ),
+        Question(4, "settled_error", "Settled error, worst zone", "°C", settled, False, "settled error"),
+        Question(5, "settling", "Settling", "s", settling, False, "settling"),
+        Question(6, "overshoot", "Overshoot", "°C", overshoot, False, "overshoot"),
+        Question(7, "at_limits", "Time at limits", "%", rules.at_limits_percent, False, "time at limits"),
+        Question(8, "disk", "Margin: disk", "", rules.disk_margin, True, "disk margin", "unlimited"),
+        Question(8, "delay_s", "Margin: delay", "s", rules.delay_margin_s, True, "delay margin", "unlimited"),
+        Question(9, "crossings", "Crossings of low or high", "", 0.0, False, "crossings"),
         Question(
             10, "data", "Data: samples, of those needed", "×", 1.0, True, "data sufficiency", "unlimited"
         ),
     ]
 
 
-def rule(name: str, asked: Sequence[Question], answers: Answers) -> Rule:
-    """The rule for one controller: of its questions the one that decides, the first where all passed.
-    Drift is no question of a limit: the nightly job says whether there is any."""
-    if name == "drift":
-        return Rule(name, None, answers.get("drift", NEVER))
-    mine = [Rule(name, question, answers[question.key]) for question in asked if question.rule == name]
-    return deciding(mine) or next(iter(mine), Rule(name, None, Missing(OPEN, "Nothing is asked")))
+def rules_of(
+    asked: Sequence[Question], answers: Answers, drift: Figure | Missing, name: str = ""
+) -> list[Rule]:
+    """Every rule for one contestant, drift last; `name` speaks in the sentences."""
+    held = []
+    for question in asked:
+        figure = answers[question.key]
+        if isinstance(figure, Missing) and figure.state == UNJUDGED:
+            held.append(Rule(question.rule, None, Figure(math.inf, math.inf, math.inf), text=figure.reason))
+        else:
+            rule = Rule(question.rule, question, figure, place=question.key)
+            held.append(rule._replace(reason="" if rule.state == PASSED else reason(rule, name)))
+    return [*held, Rule("drift", None, drift)]
 
 
-def rules(asked: Sequence[Question], answers: Answers) -> list[Rule]:
-    """The five rules, in their fixed order."""
-    return [rule(name, asked, answers) for name in RULES]
-
-
-def passes(judged: Sequence[Rule]) -> bool:
-    """Every rule; drift may be open, for only the machine itself shows it, once the controller runs on it."""
+def passes(held: Sequence[Rule]) -> bool:
     return all(
-        rule.state == PASSED or (rule.name == "drift" and rule.state in (OPEN, UNDECIDED)) for rule in judged
+        rule.state == PASSED or (rule.name in LATER and rule.state in (OPEN, UNDECIDED)) for rule in held
     )
 
 
-# what tells two controllers apart that both pass, in this order, where their bands separate
-PREFERENCE = ("settled_error_degC", "gap_percent", "worst_case_gap_percent")
+def first_in(held: Sequence[Rule]) -> Rule | None:
+    """The rule that is named: the first that failed, else the first that is open; drift only where it
+    failed. None where the contestant passes."""
+    binding = [rule for rule in held if rule.name not in LATER or rule.state == FAILED]
+    return deciding(binding, FAILED_FIRST)
 
 
-def preferred(answers: Mapping[str, Answers], a: str, b: str) -> tuple[str, str]:
-    """The better of two roles, and the figure that tells them apart; an
-    empty text where only the medians of the gap do."""
-    for key in PREFERENCE:
-        of_a, of_b = answers[a][key], answers[b][key]
-        if of_a.high < of_b.low or of_b.high < of_a.low:
-            return (a if of_a.value < of_b.value else b), key
-    return (a if answers[a]["gap_percent"].value <= answers[b]["gap_percent"].value else b), ""
+def grouped(held: Sequence[Rule]) -> list[Rule]:
+    """One rule a line of GROUPS: the one that decides in it, its first where all passed."""
+    lines = []
+    for group, (names, _) in GROUPS.items():
+        mine = [rule for rule in held if rule.name in names]
+        lines.append((deciding(mine, FAILED_FIRST) or mine[0])._replace(name=group))
+    return lines
 
 
-def winner(asked: Sequence[Question], answers: Mapping[str, Answers]) -> str | None:
-    """Of the controllers that pass, the one with the smallest settled error. Within its noise the smallest
-    gap decides, then the smallest worst case.
+def group_of(rule: str) -> str:
+    return next((group for group, (names, _) in GROUPS.items() if rule in names), rule)
+
+
+# ---- who is judged
+
+
+class Standing(NamedTuple):
+    """One contestant before the rules."""
+
+    name: str
+    answers: Answers
+    rules: list[Rule]
+
+    @property
+    def passes(self) -> bool:
+        return passes(self.rules)
+
+
+def standings(
+    metrics: Metrics, rules: ReportRules, *, undeclared: Sequence[str] = (), drift: Figure | Missing = NEVER
+) -> dict[str, Standing]:
+    """Every contestant that was judged, in the order of simplicity, the yardstick last."""
+    asked = questions(rules, comparison(metrics))
+    held = {}
+    for name in judged(metrics):
+        answers = of_contestant(metrics, name, undeclared)
+        own = [
+            rule._replace(reason=_unstable_sentence(metrics, name) or rule.reason)
+            if rule.state == FAILED and rule.name in ("settled error", "disk margin", "delay margin")
+            else rule
+            for rule in rules_of(asked, answers, drift, name)
+        ]
+        held[name] = Standing(name, answers, own)
+    return held
+
+
+def _unstable_sentence(metrics: Metrics, name: str) -> str:
+    lost, of = unstable(entry(comparison(metrics), "contestants", name))
+    return f"{name_first(name)} is unstable on {lost} of {of} plants." if lost else ""
+
+
+def choose(metrics: Metrics, held: Mapping[str, Standing], incumbent: str = "") -> str | None:
+    """Who should run: the best that passes, ties to the simpler; the incumbent where none is better beyond
+    the bands of the cost. None where nobody passes."""
+    fit = [name for name, standing in held.items() if standing.passes and name not in YARDSTICKS]
+    if not fit:
+        return None
+    best = entry(comparison(metrics), "best")
+    if best not in fit:
+        cheapest = min(fit, key=lambda name: _cost(held[name]).value)
+        best = next(name for name in fit if _cost(held[name]).low <= _cost(held[cheapest]).high)
+    if incumbent in fit and _cost(held[incumbent]).low <= _cost(held[best]).high:
+        return incumbent
+    return best
+
+
+def _cost(standing: Standing) -> Figure:
+    cost = standing.answers["cost"]
+    return cost if isinstance(cost, Figure) else Figure(math.inf, math.inf, math.inf)
+
+
+def closest(held: Mapping[str, Standing]) -> str:
+    """Of contestants that do not pass, the one with the fewest rules against it, then of the lowest cost."""
+
+    def against(name: str) -> tuple[int, int, float]:
+        states = [rule.state for rule in held[name].rules if rule.name not in LATER]
+        return states.count(FAILED), len(states) - states.count(PASSED), _cost(held[name]).value
+
+    competing = [name for name in held if name not in YARDSTICKS and name != "hold"]
+    return min(competing or held, key=against)
+
+
+def rival(metrics: Metrics, subject: str) -> str:
+    """Who stands beside the contestant that the verdict is about: the other one of the pair, else its
+    model-based one."""
+    a, b = pair_names(metrics)
+    return b if subject == a else a
+
+
+# ---- the verdict
+
+
+def decide(
+    metrics: Metrics,
+    rules: ReportRules,
+    *,
+    recorded: bool,
+    undeclared: Sequence[str] = (),
+    drift: Figure | Missing = NEVER,
+    incumbent: str = "",
+) -> Verdict:
+    """The verdict on the temperature loop; `undeclared` are outputs without low and high.
+
+    `rules` of the verdict has a line for each of GROUPS with the contestant that it is about and its rival.
     """
-    fit = [role for role in ROLES if passes(rules(asked, answers[role]))]
-    return functools.reduce(lambda best, role: preferred(answers, best, role)[0], fit) if fit else None
+    words = TRIAL if recorded else REHEARSAL
+    held = standings(metrics, rules, undeclared=undeclared, drift=drift)
+    if not held or set(held) <= set(YARDSTICKS):
+        return _nothing(metrics, rules, words, drift)
+    best = choose(metrics, held, incumbent)
+    subject = best or closest(held)
+    beside = rival(metrics, subject)
+    asked = questions(rules, comparison(metrics))
+    theirs = (
+        held[beside].rules
+        if beside in held
+        else rules_of(asked, of_contestant(metrics, beside, undeclared), drift, beside)
+    )
+    lines = tuple(zip(grouped(held[subject].rules), grouped(theirs), strict=True))
+    if best:
+        return _passed(metrics, held[best], words, lines, incumbent, recorded=recorded)
+    return _not_passed(metrics, held[subject], words, lines)
 
 
-def decide(loop: str, asked: Sequence[Question], answers: Mapping[str, Answers]) -> Verdict:
-    """The verdict on the data-driven controller of a loop, with what to run instead
-    where it does not pass or is not the best that does."""
-    judged = {role: rules(asked, answers[role]) for role in ROLES}
-    best, lines = winner(asked, answers), tuple(zip(*judged.values(), strict=True))
-    mine = judged["data_driven"]
-    if passes(mine):
-        return _deploy(loop, asked, answers, judged, best)._replace(rules=lines)
-    first = deciding(mine, FAILED_FIRST)
-    failed = first.state == FAILED
-    keep = (
-        f"{'Keep' if failed else 'Until then keep'} the {ROLES[best]} controller: {_record(judged[best])}."
-        if best
-        else _none_passes(judged)
+def _nothing(metrics: Metrics, rules: ReportRules, words: Words, drift: Figure | Missing) -> Verdict:
+    asked, (a, b) = questions(rules, comparison(metrics)), pair_names(metrics)
+    pair = [rules_of(asked, of_contestant(metrics, name), drift, name) for name in (a, b)]
+    lines = tuple(zip(*map(grouped, pair), strict=True))
+    gap = metrics.get("evaluate_temperature")
+    why = gap if isinstance(gap, Missing) else Missing(OPEN, "No contestant was judged")
+    first = GROUPS_FIRST
+    return Verdict(
+        LOOP, OPEN, words.open, f"First open rule: {first}.", why.sentence(), "", first, None, rules=lines
+    )
+
+
+GROUPS_FIRST = next(iter(GROUPS))
+
+
+def _passed(
+    metrics: Metrics,
+    winner: Standing,
+    words: Words,
+    lines: tuple[tuple[Rule, ...], ...],
+    incumbent: str,
+    *,
+    recorded: bool,
+) -> Verdict:
+    compared = comparison(metrics)
+    everything = all(rule.state == PASSED for rule in winner.rules)
+    plants = f"{entry(compared, 'plants')} {'plants' if recorded else 'simulated plants'}"
+    lead = f"{'All rules' if everything else 'Every rule measured so far'} passed on {plants}."
+    drift = winner.rules[-1]
+    best = entry(compared, "best")
+    stays = (
+        f"It runs today, and {in_a_sentence(best)} is not better beyond the bands."
+        if winner.name == incumbent != best and best
+        else ""
+    )
+    later = "" if everything or not isinstance(drift.figure, Missing) else _drift_sentence(drift)
+    next_step = (
+        "Next: a supervised trial, somebody at the machine throughout."
+        if recorded
+        else "Next: record your own machine."
     )
     return Verdict(
-        loop=loop,
-        state=FAILED if failed else OPEN,
-        decision=f"Do not deploy the data\u2011driven {loop} controller." if failed else "Do not decide yet.",
-        lead=f"First {'failed' if failed else 'open'} rule: {first.name}.",
-        reason=reason(first, answers),
-        remedy=keep,
-        rule=first.name,
-        winner=best,
+        LOOP,
+        PASSED,
+        words.passed.format(heading(winner.name)),
+        lead,
+        " ".join(filter(None, [_closest_limit(winner), stays])),
+        " ".join(filter(None, [later, next_step])),
+        "",
+        winner.name,
+        note=pair_sentence(metrics).text,
         rules=lines,
     )
 
 
-def _deploy(
-    loop: str,
-    asked: Sequence[Question],
-    answers: Mapping[str, Answers],
-    judged: Mapping[str, Sequence[Rule]],
-    best: str,
+def _not_passed(
+    metrics: Metrics, subject: Standing, words: Words, lines: tuple[tuple[Rule, ...], ...]
 ) -> Verdict:
-    all_pass = all(rule.state == PASSED for rule in judged[best])
-    other = "model_based" if best == "data_driven" else "data_driven"
-    drift = "" if all_pass else f"Drift is {drift_state(answers[best])}. {_drift_sentence(answers[best])}"
-    against = deciding(rule for rule in judged[other] if rule.name != "drift")
-    apart = (
-        _difference(asked, answers, best, other)
-        if against is None
-        else f"{_name(other)} {'fails' if against.state == FAILED else 'is open'} on {against.name}."
+    first = first_in(subject.rules)
+    failed = first.state == FAILED
+    # drift is of the machine, not of a contestant
+    who = (
+        "" if first.name == "drift" else f"No contestant passes; {in_a_sentence(subject.name)} comes closest."
     )
+    why = first.reason or _drift_sentence(first)
+    open_too = [rule.name for rule in subject.rules if rule.state == OPEN and rule.name not in LATER]
+    also = f"Open too: {', '.join(open_too)}." if failed and open_too else ""
+    where = _worst_case(metrics, subject.name, first) if failed else ""
     return Verdict(
-        loop=loop,
-        state=PASSED,
-        decision=f"Deploy the {ROLES[best].replace('-', chr(0x2011))} {loop} controller.",
-        lead="All five rules passed." if all_pass else "It passes every rule measured so far.",
-        reason=apart,
-        remedy=f"{_closest(asked, answers, best, other)} {drift}".strip(),
-        rule="",
-        winner=best,
+        LOOP,
+        FAILED if failed else OPEN,
+        words.failed if failed else words.open,
+        f"First {'failed' if failed else 'open'} rule: {first.name}.",
+        " ".join(filter(None, [why, who])),
+        " ".join(filter(None, [where, also, "Keep what runs on the machine now." if words is TRIAL else ""])),
+        group_of(first.name),
+        None,
+        note=pair_sentence(metrics).text,
+        rules=lines,
     )
 
 
-def _closest(asked: Sequence[Question], answers: Mapping[str, Answers], best: str, other: str) -> str:
-    """The figure of the best controller that is closest to its limit, beside the other's."""
-    question, figure = min(
-        ((q, answers[best][q.key]) for q in asked if q.rule != "data sufficiency"),
-        key=lambda pair: -share(pair[0], _worst_end(*pair)),
-    )
-    places = row_places(question, [answers[role][question.key] for role in ("data_driven", "model_based")])
-    theirs = answers[other][question.key]
-    beside = (
-        f" ({ROLES[other]}: {quantity(theirs.value, question.unit, places, beyond=question.beyond)})"
-        if isinstance(theirs, Figure)
-        else ""
-    )
+def _worst_case(metrics: Metrics, name: str, rule: Rule) -> str:
+    """ "Its worst case: plant 48, a ramp." """
+    key = rule.question.key if rule.question else ""
+    case = entry(comparison(metrics), "contestants", name, key, "worst_case")
+    if not isinstance(case, Mapping) or case.get("plant") is None:
+        return ""
+    parts = [f"plant {case['plant']}", reference_of(case)]
+    return f"Its worst case: {', '.join(filter(None, parts))}."
+
+
+def _drift_sentence(rule: Rule) -> str:
+    figure = rule.figure
+    if not isinstance(figure, Missing):
+        return ""
+    return figure.sentence() if rule.state == FAILED else f"Drift is {rule.state}. {figure.sentence()}"
+
+
+def _closest_limit(standing: Standing) -> str:
+    """The figure that is closest to its limit."""
+    asked = [
+        (rule.question, rule.figure)
+        for rule in standing.rules
+        if rule.question is not None
+        and rule.question.limit
+        and rule.question.key != "data"
+        and isinstance(rule.figure, Figure)
+    ]
+    if not asked:
+        return ""
+    question, figure = min(asked, key=lambda pair: -share(pair[0], _worst_end(*pair)))
+    places = places_of(question, [figure])
     return (
-        f"Closest to its limit: {BRIEF[question.key]}, "
-        f"{quantity(figure.value, question.unit, places, beyond=question.beyond)} of "
-        f"{_rule_allows(question, places)}{beside}."
+        f"Closest to its limit: {question.rule}, {worded(question, figure.value, places)} of "
+        f"at {'least' if question.at_least else 'most'} {with_unit(question.limit, question.unit, places)}."
     )
-
-
-def _name(role: str) -> str:
-    return ROLES[role][:1].upper() + ROLES[role][1:]
-
-
-def drift_state(answers: Answers) -> str:
-    """Passed where the nightly job measured drift and found none, otherwise its word for it."""
-    return rule("drift", (), answers).state
-
-
-def _drift_sentence(answers: Answers) -> str:
-    drift = answers.get("drift", NEVER)
-    return drift.sentence() if isinstance(drift, Missing) else NEVER.sentence()
-
-
-def _difference(asked: Sequence[Question], answers: Mapping[str, Answers], best: str, other: str) -> str:
-    """Why the better of two that pass is the better one."""
-    key = preferred(answers, best, other)[1]
-    if not key:
-        return f"{_name(other)} passes too and is as good within noise; the smaller median gap decides."
-    alike = [BRIEF[figure] for figure in PREFERENCE[: PREFERENCE.index(key)]]
-    noise = f"{' and '.join(alike)} {'is' if len(alike) == 1 else 'are'} within noise, so " if alike else ""
-    question = next(q for q in asked if q.key == key)
-    mine, theirs = answers[best][key], answers[other][key]
-    places = min(decimals(figure.low, figure.high, value=figure.value) for figure in (mine, theirs))
-    figures = [quantity(figure.value, question.unit, places) for figure in (theirs, mine)]
-    return f"{_name(other)} passes too; {noise}the {BRIEF[key]} decides: {figures[1]} against {figures[0]}."
 
 
 def _worst_end(question: Question, figure: Figure) -> float:
     return figure.low if question.at_least else figure.high
 
 
-def _record(judged: Sequence[Rule]) -> str:
-    return (
-        "it passes all five rules"
-        if all(rule.state == PASSED for rule in judged)
-        else "it passes every rule measured so far"
-    )
+# ---- beside the verdict
 
 
-def _none_passes(judged: Mapping[str, Sequence[Rule]]) -> str:
-    first = {role: deciding(judged[role], FAILED_FIRST) for role in ("model_based", "baseline")}
+def best_sentence(metrics: Metrics, held: Mapping[str, Standing], winner: str | None) -> str:
+    """The best of all contestants, beside the pair."""
+    if winner is None:
+        cheapest = entry(comparison(metrics), "best_reason", "leading")
+        costs = f" {name_first(cheapest)} costs least." if cheapest in held else ""
+        return f"Best of all: nobody passes every rule.{costs}"
     others = [
-        f"the {ROLES[role]} one {'fails' if rule.state == FAILED else 'is open'} on {rule.name}"
-        for role, rule in first.items()
+        in_a_sentence(name)
+        for name, standing in held.items()
+        if standing.passes and name != winner and name not in YARDSTICKS
     ]
-    return f"No controller passes: {', '.join(others)}. Keep what runs on the machine now."
+    beside = f"; {_listed(others)} {'passes' if len(others) == 1 else 'pass'} too" if others else ""
+    return f"Best of all that pass: {in_a_sentence(winner)}{_ahead(metrics, winner)}{beside}."
 
 
-BRIEF = {
-    "gap_percent": "gap",
-    "settled_error_degC": "settled error",
-    "settling_s": "settling",
-    "overshoot_degC": "overshoot",
-    "at_limits_percent": "time at limits",
-    "disk": "disk margin",
-    "delay_s": "delay margin",
-    "worst_case_gap_percent": "worst case over plant spread",
-    "data": "data",
-}
+def _ahead(metrics: Metrics, winner: str) -> str:
+    """By how much the winner is cheaper than the cheapest other that passes, or that chance may be it."""
+    reason = entry(comparison(metrics), "best_reason")
+    percent, p = entry(reason, "improvement_percent"), entry(reason, "p")
+    if entry(comparison(metrics), "best") != winner or not isinstance(percent, int | float):
+        return ""
+    nearest = in_a_sentence(entry(reason, "nearest"))
+    if isinstance(p, int | float) and p < 0.05 and percent > 0:
+        return f", {short(percent, 2)}\u00a0% cheaper than {nearest}"
+    chance = f", the simplest; {nearest} is cheaper by no more than chance"
+    return chance if percent < 0 else f"; {nearest} is next"
 
 
-def _rule_allows(question: Question, places: int) -> str:
-    return f"at {'least' if question.at_least else 'most'} {with_unit(question.limit, question.unit, places)}"
-
-
-def reason(first: Rule, answers: Mapping[str, Answers]) -> str:
-    """The data-driven controller's figure of a rule that failed or is
-    open, and its limit, in one or two sentences."""
-    question, figure = first.question, first.figure
-    if question is None:
-        return _drift_sentence(answers["data_driven"])
-    if isinstance(figure, Missing):
-        return figure.sentence()
-    if question.key == "data":
-        return f"{figure.note} needed." if not figure.note.endswith(".") else figure.note
-    places = row_places(question, [figure, answers["model_based"][question.key]])
-    value = quantity(figure.value, question.unit, places, beyond=question.beyond)
-    limit = with_unit(question.limit, question.unit, places)
-    settles = "never settles" if math.isinf(figure.value) else f"needs {value} to settle"
-    sentence = {
-        "gap_percent": f"It costs {value} more than the optimum; the rule allows {limit}.",
-        "settled_error_degC": (
-            f"{figure.note[:1].upper()}{figure.note[1:] or 'The worst zone'} settles {value} from its "
-            f"reference; the rule allows {limit}."
-        ),
-        "settling_s": f"It {settles}; the rule allows {limit}.",
-        "overshoot_degC": f"It overshoots by {value}; the rule allows {limit}.",
-        "at_limits_percent": (
-            f"Its commands lie beyond the limits {value} of the time; the rule allows {limit}."
-        ),
-        "disk": f"Its disk margin is {value}; the rule asks for {limit}.",
-        "delay_s": f"It bears {value} of extra delay; the rule asks for {limit}.",
-        "worst_case_gap_percent": (
-            f"In the worst case of the plant spread it costs {value} more than the optimum; "
-            f"the rule allows {limit}."
-        ),
-    }[question.key]
-    return sentence if first.state == FAILED else f"{sentence} {undecided(question, figure)}"
-
-
-def undecided(question: Question, figure: Figure) -> str:
-    """What more runs would do for a band that straddles its limit: enough of them tell, at 95 %, whether more
-    than one run in twenty lies outside.
-    """
-    places = decimals(figure.low, figure.high, value=figure.value)
-    ends = band(figure.low, figure.high, places, unit=question.unit, beyond=question.beyond)
-    straddles = f"Its band, {ends}, straddles that"
-    runs = len(figure.runs)
-    if not runs:
-        return f"{straddles}; more runs would narrow it."
-    outside = sum(
-        (run < question.limit) if question.at_least else (run > question.limit) for run in figure.runs
-    )
-    share_outside, allowed = outside / runs, 0.05
-    if share_outside <= allowed:
-        return f"{straddles}; {outside} of {runs} runs lie outside."
-    needed = math.ceil(1.645**2 * share_outside * (1 - share_outside) / (share_outside - allowed) ** 2)
-    if needed <= runs:
-        return f"{straddles}: {outside} of {runs} runs lie outside, and more runs would not change that."
-    more = count(needed - runs, "more run", "more runs")
-    return f"{straddles}: {outside} of {runs} runs lie outside; {more} would decide."
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -1,5 +1,5 @@
-"""What a rehearsal asks, on whose plants: the declared panel on the study's machine; on somebody's records what
-follows from them by stated defaults (scenario_defaults.py)."""
+"""What a rehearsal asks, on whose plants: the declared panel on the study's machine; on somebody's records
+what follows from them by stated defaults (scenario_defaults.py)."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -27,12 +27,12 @@ class Rehearsal(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """What all contestants share, tuned and judged: the rehearsal, the identified plant, limits of inputs and
-    outputs (low, high (p,) in °C), the governor, the integrator's limit in °C, the settled window in steps,
-    what the cost counts as one, the discount, and the sample time."""
+    """What all contestants share, tuned and judged: the rehearsal, the identified plant with all inputs a
+    sample late, limits of inputs and outputs (low, high (p,) in °C), the governor, the integrator's limit in
+    °C, the settled window in steps, what the cost counts as one, the discount, and the sample time."""
 
     rehearsal: Rehearsal
-    plant: plant.Plant
+    late: plant.Plant
     limits: governor.Limits
     output_limits: tuple[np.ndarray, np.ndarray]
     governor: governor.Governor
@@ -67,7 +67,7 @@ def shared(
     overshoot = max(tracking.governor_overshoot_degC * band, 3 * float(rehearsal.noise.max()))
     return Setting(
         rehearsal,
-        family[0],
+        panel.delayed(family[0], late=True),
         input_limits(machine),
         output_limits(machine),
         watchdog(machine, settings, family, rehearsal.noise, overshoot),
@@ -108,8 +108,8 @@ def output_limits(machine: Machine) -> tuple[np.ndarray, np.ndarray]:
 def watchdog(
     machine: Machine, settings: Panel, family: Sequence[plant.Plant], noise: np.ndarray, overshoot: float
 ) -> governor.Governor:
-    """The governor of all contestants: the identified plant, in time and a sample late, with inputs that act as
-    the panel's spread has them; what it keeps from a limit is three deviations of the sensors' noise."""
+    """The governor of all contestants: the identified plant, in time and a sample late, with inputs that act
+    as the panel's spread has them; what it keeps from a limit is three deviations of the sensors' noise."""
     low, high = output_limits(machine)
     guarded, strength = panel.corners(family[:1], spread_of(settings))
     limits = governor.OutputLimits(low, high, 3 * noise, overshoot)
@@ -124,6 +124,12 @@ def spread_of(settings: Panel) -> panel.Spread:
         settings.delayed,
         settings.ambient_degC,
     )
+
+
+def spread_around(settings: Panel, identified: plant.Plant) -> panel.Spread:
+    """The declared spread, with no more heat lost than is little beside what somebody's machine loses."""
+    spread, slowest = spread_of(settings), 1 - np.abs(np.linalg.eigvals(identified.A)).max()
+    return spread._replace(extra_heat_loss=float(np.clip(0.2 * slowest, 0.0, spread.extra_heat_loss)))
 
 
 def declared(settings: Panel, machine: Machine, truth: plant.Plant, identified: plant.Plant) -> Rehearsal:
@@ -165,7 +171,11 @@ def _half(
     spread: panel.Spread | None = None,
 ) -> panel.Cases:
     rng = np.random.default_rng(half.seed)
-    plants = panel.drawn(around, half.plants, spread or spread_of(settings), cells=cells, rng=rng)
+    declared = spread or spread_of(settings)
+    scaled = panel.Spread(*(half.spread * value for value in declared))._replace(
+        delayed=min(half.spread * declared.delayed, 1.0)
+    )
+    plants = panel.drawn(around, half.plants, scaled, cells=cells, rng=rng)
     return panel.asked(
         panel.padded(plants),
         questions,
@@ -205,14 +215,12 @@ def from_record(settings: Panel, machine: Machine, family: Sequence[plant.Plant]
         high,
         machine.sample_time_s,
     )
-    spread = spread_of(settings)
-    slowest = 1 - np.abs(np.linalg.eigvals(identified.A)).max()
+    spread = spread_around(settings, identified)
     spread = spread._replace(
-        extra_heat_loss=float(np.clip(0.2 * slowest, 0.0, spread.extra_heat_loss)),
         ambient_degC=max(
             min(spread.ambient_degC, AMBIENT_SHARE * float(np.min(scale.high_degC - scale.low_degC))),
             float(np.max(scale.ambient_degC_spread)),
-        ),
+        )
     )
     lower = asked.references[-1]
     swing = asked.references.mean(axis=0), asked.sinusoid.amplitude_degC, float(asked.sinusoid.period_steps)

@@ -1,8 +1,8 @@
 """The table of contestants: every controller of the temperature comparison, the simplest first.
 
-A new contestant is its own file in pipeline/temperature/, its line in CONTESTANTS, and its settings. Tuning and
-judging design from this table, and the pages take heading, mark and explanation from it. Methods are imported
-where one is designed: a page loads none.
+A new contestant is its own file in pipeline/temperature/, its line in CONTESTANTS, and its settings. Tuning
+and judging design from this table, and the pages take heading, mark and explanation from it. Methods are
+imported where one is designed: a page loads none.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 class Problem(NamedTuple):
     """What a controller may be designed from.
 
-    `plant` is identified, its feed-through a delay, `family` its spread, and `window` learned from the record.
-    `kernel` is None where the record does not determine it, `truth` where nobody knows the plant, `printer_pid`
-    empty where no recording tells the PID of a printer. `gamma` is the discount, `integral` the declared share
-    of the error a step, `exact_tau` the paper's observer, `horizon` in steps, `noise` (p,) in °C.
-    """
+    `plant` is identified, its feed-through a delay, `family` its spread, and `window` learned from the
+    record. `kernel` is None where the record does not determine it, `truth` where nobody knows the plant,
+    `printer_pid` empty where no recording tells the PID of a printer. `gamma` is the discount, `integral` the
+    declared share of the error a step, `exact_tau` the paper's observer, `horizon` in steps, `noise` (p,) in
+    °C."""
 
     plant: Plant
     family: list[Plant]
@@ -78,7 +78,7 @@ class Parameter(NamedTuple):
 
 EFFORT = Parameter("effort_weight", 0.1, 30.0, 1e5, of_effect=True)
 OBSERVER = Parameter("observer_tau", 1e-4, 0.1, 1e3, of_effect=True)
-INTEGRAL = Parameter("integral", 0.001, 0.02, 0.2)
+INTEGRAL = Parameter("integral", 0.001, 0.02, 0.8)
 Values = Mapping[str, float]
 
 

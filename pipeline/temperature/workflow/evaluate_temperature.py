@@ -1,5 +1,5 @@
-"""What evaluate_temperature does: every contestant, tuned, as it would be deployed, on plants that nobody learned
-or tuned on; which is best, what tells model-based and data-driven apart, and which plant decides."""
+"""What evaluate_temperature does: every contestant, tuned, as it would be deployed, on plants that nobody
+learned or tuned on; which is best, what tells model-based and data-driven apart, and which plant decides."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -27,8 +27,8 @@ FIGURES = {
     "rms": "rms_degC",
 }
 CONVENTION = (
-    "Q = R = I, discounted {gamma:g} a step, unclipped, without integrator and governor, from a plant at rest, "
-    "noise-free, against the Riccati law of the same plant that knows the state"
+    "Q = R = I, discounted {gamma:g} a step, unclipped, without integrator and governor, from a plant at "
+    "rest, noise-free, against the Riccati law of the same plant that knows the state"
 )
 
 
@@ -36,8 +36,8 @@ KERNEL_UNDETERMINED = "the record does not determine the kernel (learn_kernel sa
 
 
 class JudgedContestant(NamedTuple):
-    """One contestant over all cases, its margins on every plant, its gaps in percent on the plants (None where
-    weights mean nothing to it), and the rollout."""
+    """One contestant over all cases, its margins on every plant, its gaps in percent on the plants (None
+    where weights mean nothing to it), and the rollout."""
 
     figures: panel.Figures
     costs: np.ndarray
@@ -72,8 +72,8 @@ def read_weights(path: str, machine: Machine) -> dict[str, dict[str, Any]]:
 
 
 def resolved(rules: TemperatureRules, panel: Panel, rehearsal: Rehearsal) -> TemperatureRules:
-    """The rules with a settling time: as declared, else as the record says, else the panel's. A machine that is
-    faster than the panel's needs less margin of delay, in proportion: of 1 s the whole of a hair dryer is over."""
+    """The rules with a settling time: as declared, else as the record says, else the panel's. A machine that
+    is faster than the panel's needs less margin of delay, in proportion: a hair dryer answers within 1 s."""
     settling = rules.settling_s or rehearsal.settling_s or panel.settling_s
     faster = min((rehearsal.settling_s or panel.settling_s) / panel.settling_s, 1.0)
     return rules.model_copy(update={"settling_s": settling, "delay_margin_s": faster * rules.delay_margin_s})
@@ -134,7 +134,7 @@ def judged(
 ) -> Judged:
     """Every contestant on the judging half of the panel."""
     designs, refused = designed(problem, weights)
-    calls = [delayed(_judged_one)(name, design, setting) for name, design in designs.items()]
+    calls = [delayed(judged_one)(name, design, setting) for name, design in designs.items()]
     results = dict(
         tqdm(
             run_all(calls, execution),
@@ -164,7 +164,8 @@ def judged(
     )
 
 
-def _judged_one(name: str, design: contestants.Design, setting: Setting) -> tuple[str, JudgedContestant]:
+def judged_one(name: str, design: contestants.Design, setting: Setting) -> tuple[str, JudgedContestant]:
+    """One contestant on the judging half, with its name."""
     cases = setting.rehearsal.judging
     deployed = controller.deployed(
         design.law,
@@ -215,7 +216,7 @@ def _gaps(design: contestants.Design, setting: Setting) -> np.ndarray | None:
         cases.hold,
     )
     yardstick = scorecard.Yardstick(np.ones(p), np.ones(m), setting.gamma)
-    run = scorecard.simulate(scenarios, law, scorecard.feed_forward(scenarios, law, None), limits=None)
+    run = scorecard.simulate(scenarios, law)
     J, best = scorecard.cost(scenarios, run, yardstick), scorecard.optimum(scenarios, yardstick)
     gaps = 100.0 * scorecard.regret(J, best)
     return np.where(np.isfinite(gaps) & (gaps < 1e6), gaps, np.inf)
@@ -334,7 +335,7 @@ def _number(value: float) -> float | None:
 
 def passes(figures: Mapping[str, Any], rules: TemperatureRules) -> bool:
     """Whether a contestant's figures hold the rules that a rehearsal can ask, at the 90 % quantile over all
-    cases, and margins on every plant."""
+    cases; stable on every plant, and margins of the median one."""
     limits = {
         "settled_error": rules.settled_error_degC,
         "settling": rules.settling_s,
@@ -347,8 +348,8 @@ def passes(figures: Mapping[str, Any], rules: TemperatureRules) -> bool:
     margins, stable = figures["margins"], figures["stable"]
     robust = margins is None or (
         stable["count"] == stable["of"]
-        and (margins["disk"]["worst"] or 0.0) >= rules.disk_margin
-        and (margins["delay_s"]["worst"] is None or margins["delay_s"]["worst"] >= rules.delay_margin_s)
+        and (margins["disk"]["median"] or 0.0) >= rules.disk_margin
+        and (margins["delay_s"]["median"] is None or margins["delay_s"]["median"] >= rules.delay_margin_s)
     )
     return quantiles and robust and figures["crossings"]["cases"] == 0
 
@@ -387,7 +388,7 @@ def _decided(
         "best_reason": {
             "passes": able,
             "leading": comparison.chosen(costs, block, dict.fromkeys(entrants, True), seed=seed).best,
-            "nearest": choice.last,
+            "nearest": choice.nearest,
             "improvement_percent": choice.against.improvement_percent if choice.against else None,
             "p": choice.against.p if choice.against else None,
         },

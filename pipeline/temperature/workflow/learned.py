@@ -28,9 +28,14 @@ class Learned(NamedTuple):
 
 
 def read_learned(
-    model_path: str, spread_path: str, learned_folder: str | Path, printer_pid_path: str, machine: Machine
+    model_path: str | Path,
+    spread_path: str | Path | None,
+    learned_folder: str | Path,
+    printer_pid_path: str | Path | None,
+    machine: Machine,
 ) -> Learned:
-    """What the stages before wrote. `learned_folder` has a kernel only where the record determines one.
+    """What the stages before wrote. `learned_folder` has a kernel only where the record determines one;
+    without a path there is no spread, or no PID of a printer.
 
     Raises ValueError for a file of another machine than `machine`, as an earlier run leaves it."""
     window_path, kernel_path = (
@@ -52,8 +57,12 @@ def read_learned(
         [
             plant.strictly_proper(one)
             for one in plant.restored(artifacts.read_arrays(spread_path, "spread", 1, shapes=plants))
-        ],
-        _heater_pids(artifacts.read_json(printer_pid_path).get("heaters", []), machine),
+        ]
+        if spread_path
+        else [],
+        _heater_pids(artifacts.read_json(printer_pid_path).get("heaters", []), machine)
+        if printer_pid_path
+        else (),
     )
 
 

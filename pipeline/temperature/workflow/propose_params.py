@@ -1,8 +1,8 @@
 """What `beadline init` does: recordings of a new machine -> the values of the params files that fit it.
 
 The mapping and the signals are those that `inspect` proposes. Times follow from the slowest and the fastest
-output's time constant, temperatures from what was recorded. What a rehearsal asks, and how fast it must settle,
-is not written: it follows from the record wherever recordings are the source (scenario_defaults).
+output's time constant, temperatures from what was recorded. What a rehearsal asks, and how fast it must
+settle, is not written: it follows from the record wherever recordings are the source (scenario_defaults).
 """
 
 import shutil
@@ -39,7 +39,6 @@ SHIPPED: dict[str, Any] = {
     "generate_probing.samples": 6000,
     "generate_probing.amplitude_percent": 5.0,
     "generate_probing.shortest_steps": 1,
-    "generate_probing.centre_percent": None,
     "ingest.mapping": {},
     "ingest.time": "",
     "ingest.max_gap_s": 5.0,
@@ -53,13 +52,12 @@ MOVES_PERCENT, PROBING_SAMPLES = (1.0, 20.0), (300, 100_000)
 
 class Scale(NamedTuple):
     """The machine's pace and range: time constants in s by output, the sample time that suits them, the
-    lowest and highest temperature of the record, and mean and standard deviation of each input."""
+    lowest and highest temperature of the record, and the standard deviation of each input."""
 
     time_constants_s: dict[str, float]
     sample_time_s: float
     coldest_degC: float
     hottest_degC: float
-    input_mean_percent: list[float]
     input_spread_percent: list[float]
 
 
@@ -146,14 +144,7 @@ def _scale(paths: Sequence[Path], proposal: Proposal) -> Scale:
     lows = [np.nanmin(np.concatenate(segments)) for segments in y.values()]
     highs = [np.nanmax(np.concatenate(segments)) for segments in y.values()]
     rows = np.vstack(u)
-    return Scale(
-        constants,
-        sample_time,
-        float(np.min(lows)),
-        float(np.max(highs)),
-        rows.mean(axis=0).tolist(),
-        rows.std(axis=0).tolist(),
-    )
+    return Scale(constants, sample_time, float(np.min(lows)), float(np.max(highs)), rows.std(axis=0).tolist())
 
 
 def _gap_s(sample_time_s: float) -> float:
@@ -185,15 +176,14 @@ def _values(proposal: Proposal, scale: Scale) -> dict[str, list[str]]:
 
 
 def _next_experiment(scale: Scale) -> dict[str, list[str]]:
-    """A random binary sequence at the machine's pace, about the inputs' mean and no wider than they moved.
+    """A random binary sequence at the machine's pace, no wider than the inputs moved; its centre is left to
+    the identified model.
 
-    About the inputs' mean a linear plant keeps the mean of the recorded temperatures; the middle of the
-    limits may hold far more. Switching every half of the fastest time constant puts the power where outputs
+    Switching every half of the fastest time constant puts the power where outputs
     answer. It lasts for 20 of the slowest, and for 60 chances to switch.
     """
     fastest, slowest = (pick(scale.time_constants_s.values()) for pick in (min, max))
     moves = [spread for spread in scale.input_spread_percent if spread >= MOVES_PERCENT[0]]
-    centre = ", ".join(f"{round(mean, 1) + 0.0:.1f}" for mean in scale.input_mean_percent)
     hold = int(np.clip(round(fastest / 2 / scale.sample_time_s), 1, 10_000))
     samples = int(np.clip(max(np.ceil(20 * slowest / scale.sample_time_s), 60 * hold), *PROBING_SAMPLES))
     return {
@@ -203,7 +193,6 @@ def _next_experiment(scale: Scale) -> dict[str, list[str]]:
             repr(float(f"{np.clip(min(moves, default=0.0), *MOVES_PERCENT):.2g}"))
         ],
         "generate_probing.shortest_steps": [str(hold)],
-        "generate_probing.centre_percent": [f"[{centre}]"],
     }
 
 
@@ -229,7 +218,7 @@ def _open_questions(proposal: Proposal, scale: Scale, *, timed: bool) -> list[st
     questions.append(f"plant.outputs reference, where each should settle: now {', '.join(references)} °C")
     questions.append(
         "generate_probing: whether the machine may be moved so; the next experiment switches each input "
-        "about its recorded mean, by less where a forecast would leave plant.outputs low or high"
+        "by at most amplitude_percent, and is written only where its forecast stays within low and high"
     )
     paces = [f"{name} {float(f'{tau:.2g}'):g} s" for name, tau in scale.time_constants_s.items()]
     questions.append(f"report: whether the rules suit you; the time constants are {', '.join(paces)}")

@@ -123,13 +123,14 @@ Offsets = Annotated[list[Annotated[float, Field(ge=-500, le=500)]], Field(max_le
 
 class Half(Section):
     """One half of the panel: how many plants are drawn and from which seed, how long a case is as a share of
-    panel.steps, temperatures that they are held
+    panel.steps, how much of the declared spread the plants have, temperatures that they are held
     at, and references as offsets from plant.outputs: constant ones, a sequence, a ramp that ends at the
     reference, and a sinusoid about it."""
 
     seed: int = Field(ge=0, le=2**31)
     plants: int = Field(ge=2, le=100_000)
     length: float = Field(default=1.0, gt=0, le=1)
+    spread: float = Field(default=1.0, ge=0, le=4)
     starts_degC: list[Degrees] = Field(min_length=1, max_length=20)
     reference_offsets_degC: Offsets = Field(min_length=1)
     sequence_offsets_degC: Offsets = []
@@ -152,7 +153,7 @@ class Panel(Section):
     ambient_degC: float = Field(ge=0, le=200)
     steps: int = Field(ge=60, le=20000)
     settled_steps: int = Field(ge=10, le=5000)
-    hold_steps: int = Field(ge=0, le=2000)
+    hold_steps: int = Field(ge=1, le=2000)
     band_degC: float = Field(gt=0, le=100)
     settling_s: float = Field(gt=0, le=1e6)
     training: Half
@@ -243,6 +244,7 @@ class TuneWeights(Section):
     allow_effort_percent: float = Field(gt=0, le=100)
     worst_case: float = Field(ge=0, le=1000)
     least_disk_margin: float = Field(ge=0, le=2)
+    least_delay_margin_s: float = Field(ge=0, le=1e6)
 
 
 class EvaluateTemperature(Section):

@@ -10,8 +10,11 @@ from pipeline.store.tables import BOOL, COUNT, FLOAT, INDEX, NONE, TEXT, Column,
 
 
 class _Signal(Protocol):
-    name: str
-    unit: str
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def unit(self) -> str: ...
 
 
 def record(inputs: Sequence[_Signal], outputs: Sequence[_Signal]) -> Schema:
@@ -93,7 +96,7 @@ CASES = Schema(
             "settled_error_degC",
             FLOAT,
             "degC",
-            "distance of the mean of the last 100 steps from the reference, worst output; missing where unstable",
+            "mean of the last 100 steps from the reference, worst output; missing where unstable",
             low=0,
             nullable=True,
         ),

@@ -1,5 +1,5 @@
-"""What tune_weights does: it tunes every contestant by itself, with the same search, budget and cost, on the same
-training half of the panel, as it would be deployed."""
+"""What tune_weights does: it tunes every contestant by itself, with the same search, budget and cost, on the
+same training half of the panel, as it would be deployed."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -17,8 +17,8 @@ from pipeline.temperature.workflow.settings import TuneWeights
 
 # of a parameter's range, in logarithms: so near to an end the search is called bound by it
 AT_BOUND = 0.02
-# of the cost, for a parameter moved from its start by its whole range: of two candidates as good as each other
-# the one nearer to the start is taken, so that a direction in which the cost is flat has one end, not two
+# of the cost, for a parameter moved from its start by its whole range: of two candidates as good as each
+# other the one nearer to the start is taken, so that a direction in which the cost is flat has one end
 NEARER = 0.05
 
 
@@ -106,12 +106,14 @@ def _first(cost, start: np.ndarray) -> tuple[np.ndarray, tuple[str, ...], np.nda
 def _cost(
     design: contestants.Design, rests: Sequence[controller.Rest], settings: TuneWeights, setting: Setting
 ) -> float:
-    """The declared cost of a candidate; raises ValueError where its disk margin on the identified plant is
-    below the least: figures in simulation are no reason to give robustness away."""
-    disk = scorecard.disk_margin(setting.plant, design.law)
-    if not disk >= settings.least_disk_margin:
+    """The declared cost of a candidate. Raises ValueError where its margins on the identified plant, its
+    inputs a sample late, are below the least: figures in simulation are no reason to give robustness away."""
+    margin = scorecard.margins([setting.late], design.law, grid=80)[0]
+    if not (margin.disk >= settings.least_disk_margin and margin.delay_s >= settings.least_delay_margin_s):
         raise ValueError(
-            f"the disk margin is {disk:.2f}, below the least of {settings.least_disk_margin:.2f}"
+            f"on the identified plant, its inputs a sample late, the disk margin is {margin.disk:.2f} and "
+            f"the delay margin {margin.delay_s:.2f} s, where {settings.least_disk_margin:g} and "
+            f"{settings.least_delay_margin_s:g} s are the least"
         )
     cases, (low, high) = setting.rehearsal.training, setting.output_limits
     deployed = controller.deployed(

@@ -1,0 +1,277 @@
+"""Three large pictures of the temperature page: a typical case and the deciding one under the contestants
+that matter, and how the pair compares plant by plant."""
+
+import math
+
+import numpy as np
+import pandas as pd
+from markupsafe import Markup
+
+from pipeline.report.shared import charts, page
+from pipeline.report.shared.digits import THIN, count, number, short
+from pipeline.report.shared.pictures import Column, Picture, placeholder
+from pipeline.report.shared.sources import Sources, Table
+from pipeline.report.shared.verdict import Missing
+from pipeline.report.temperature.answers import comparison, entry, judged, refused
+from pipeline.report.temperature.contestants import YARDSTICKS, heading, in_a_sentence, kind
+from pipeline.report.temperature.judgement import Judgement
+from pipeline.report.temperature.pairs import pair_names, reference_of
+
+CASES = {"typical": "A typical case", "deciding": "The case that decides"}
+# a cost or temperature beyond it is of a loop that is lost; it is drawn at the edge
+LARGEST = 1e4
+
+
+def drawn(sources: Sources, judgement: Judgement) -> list[str]:
+    """Who is drawn: the pair, the best, and PI, in the order of simplicity."""
+    wanted = {*pair_names(sources.metrics), judgement.subject, "pi"}
+    return [name for name in (*judged(sources.metrics), *refused(sources.metrics)) if name in wanted]
+
+
+def case(sources: Sources, judgement: Judgement, name: str) -> Picture:
+    """Temperatures with their references and commands of one case, a column a contestant."""
+    table, title = sources.tables["trajectories"], CASES[name]
+    if isinstance(table, Missing):
+        return placeholder(name, title, table)
+    without = refused(sources.metrics)
+    rows = {
+        who: (table["contestant"] == who) & (table["case_name"] == name) for who in drawn(sources, judgement)
+    }
+    runs = {
+        who: {key: values[mask] for key, values in table.items()}
+        for who, mask in rows.items()
+        if mask.any() and who not in without
+    }
+    if not runs:
+        return placeholder(
+            name, title, Missing("not measured", f"no trajectory of the {name} case was recorded")
+        )
+    finding = _finding(sources, name, runs)
+    runs = _early(runs, next(q.limit for q in judgement.asked if q.key == "settling"))
+    y = _temperatures(sources, list(runs.values()))
+    most = max(
+        float(np.nanmax(run[f"{i.name}_applied"]))
+        for run in runs.values()
+        for i in sources.declared.machine.inputs
+    )
+    shown = []
+    for who in rows:
+        panels = (
+            [
+                _heat(sources, who, runs[who], y, first=not shown),
+                _commands(sources, who, runs[who], most, first=not shown),
+            ]
+            if who in runs
+            else [_hole(without.get(who, "no trajectory was recorded"))]
+        )
+        shown.append(Column(heading(who), kind(who), who, panels))
+    return Picture(
+        name,
+        title,
+        finding,
+        shown,
+        "Above: true temperature of every zone in °C, dashed its reference. Below: every command in "
+        "per cent as the "
+        "machine was given it; grey: within its limits. Against time in s.",
+        page.origin(sources.source("trajectories")),
+    )
+
+
+def _early(runs: dict[str, Table], settling_s: float) -> dict[str, Table]:
+    """Of constant references the first part, half as long again as settling may last; of others all of it."""
+    first = next(iter(runs.values()))
+    constant = all(np.ptp(values) == 0 for key, values in first.items() if key.endswith("_reference"))
+    span = 1.5 * settling_s if constant and math.isfinite(settling_s) else math.inf
+    return {
+        who: {key: values[run["time_s"] <= span] for key, values in run.items()} for who, run in runs.items()
+    }
+
+
+def _hole(why: str) -> Markup:
+    return Markup('<div class="hole">{}</div>').format(page.missing(Missing("failed", why)))
+
+
+def _temperatures(sources: Sources, runs: list[Table]) -> charts.Axis:
+    names = [o.name for o in sources.declared.machine.outputs]
+    values = np.concatenate([run[key] for run in runs for n in names for key in (n, f"{n}_reference")])
+    values = values[np.isfinite(values) & (np.abs(values) < LARGEST)]
+    if not len(values):
+        return charts.linear(0, 1)
+    room = 0.04 * (float(values.max() - values.min()) or 1.0)
+    return charts.linear(float(values.min()) - room, float(values.max()) + room)
+
+
+def _heat(sources: Sources, who: str, run: Table, y: charts.Axis, *, first: bool) -> Markup:
+    time, outputs = run["time_s"], sources.declared.machine.outputs
+    frame = charts.Frame(charts.linear(0, float(time[-1]) or 1.0, ticks=3), y, width=360, height=210, left=32)
+    past, zone = _past(run, [o.name for o in outputs])
+    layers = [charts.line(frame, time, run[f"{o.name}_reference"], "ref") for o in outputs]
+    layers += [charts.line(frame, time, np.clip(run[o.name], -LARGEST, LARGEST), "line") for o in outputs]
+    alt = f"{heading(who)}: {zone} ends {_degrees(past)} from its reference, worst of {len(outputs)} zones"
+    return charts.panel(
+        frame, layers, alt=alt, css=page.MARKS.get(who, "bl"), title="°C" if first else "", units=("s", "°C")
+    )
+
+
+def _past(run: Table, names: list[str]) -> tuple[float, str]:
+    """Largest distance from a reference over the last tenth of a run, and whose."""
+    last = slice(9 * len(run["time_s"]) // 10, None)
+    apart = {name: float(np.abs(np.mean((run[name] - run[f"{name}_reference"])[last]))) for name in names}
+    zone = max(apart, key=lambda name: apart[name] if math.isfinite(apart[name]) else math.inf)
+    return apart[zone], zone
+
+
+def _degrees(value: float) -> str:
+    return f"{short(value, 2)} °C" if value < LARGEST else "too far to say 1 figure"
+
+
+def _commands(sources: Sources, who: str, run: Table, most: float, *, first: bool) -> Markup:
+    machine, time = sources.declared.machine, run["time_s"]
+    low, high = min(i.low for i in machine.inputs), max(i.high for i in machine.inputs)
+    reach = min(high, most)
+    room = 0.08 * ((reach - low) or 1.0)
+    y = charts.linear(low, reach + room, ticks=3)._replace(low=low - room)
+    frame = charts.Frame(charts.linear(0, float(time[-1]) or 1.0, ticks=3), y, width=360, height=130, left=32)
+    layers = [charts.tint(frame, low, min(high, y.high))]
+    layers += [
+        charts.line(frame, time, run[f"{i.name}_applied"], "line thin", steps=True) for i in machine.inputs
+    ]
+    given = np.stack([run[f"{i.name}_applied"] for i in machine.inputs])
+    at = np.stack(
+        [(run[f"{i.name}_applied"] <= i.low) | (run[f"{i.name}_applied"] >= i.high) for i in machine.inputs]
+    )
+    alt = (
+        f"{heading(who)}: commands from {number(float(np.nanmin(given)), 0)} to "
+        f"{number(float(np.nanmax(given)), 0)} %, "
+        f"at a limit {number(100 * float(at.mean()), 1)} % of the time"
+    )
+    return charts.panel(
+        frame, layers, alt=alt, css=page.MARKS.get(who, "bl"), title="%" if first else "", units=("s", "%")
+    )
+
+
+def _finding(sources: Sources, name: str, runs: dict[str, Table]) -> str:
+    names = [o.name for o in sources.declared.machine.outputs]
+    ends = {who: _past(run, names)[0] for who, run in runs.items()}
+    parts = [f"{in_a_sentence(who)} {_degrees(value)}" for who, value in ends.items() if value < LARGEST]
+    where = ""
+    decides = entry(comparison(sources.metrics), "deciding")
+    if name == "deciding" and entry(decides, "plant") is not None:
+        where = f"Plant {decides['plant']}{', ' + reference_of(decides) if decides.get('kind') else ''}. "
+    if not parts:
+        return f"{where}No contestant ends near its reference."
+    return (
+        f"{where}Mean distance of the worst zone from its reference over the last tenth: {', '.join(parts)}."
+    )
+
+
+# ---- plant by plant
+
+
+def plants(sources: Sources) -> Picture:
+    """Cost of the pair on every plant, a line a plant; and the cost of all cases of each contestant."""
+    table, title = sources.tables["cases"], "Plant by plant"
+    if isinstance(table, Missing):
+        return placeholder("plants", title, table)
+    cases = pd.DataFrame({key: table[key] for key in ("contestant", "plant", "cost")})
+    cases = cases[np.isfinite(cases["cost"]) & (cases["cost"] > 0) & (cases["cost"] < 1e9)]
+    a, b = pair_names(sources.metrics)
+    by_plant = cases.groupby(["plant", "contestant"])["cost"].mean().unstack("contestant")
+    shown = []
+    finding = "The pair did not run the same plants."
+    if {a, b} <= set(by_plant):
+        both = by_plant[[a, b]].dropna()
+        cheaper = int((both[a] < both[b]).sum())
+        finding = (
+            f"{heading(a)[:1].upper()}{heading(a)[1:]} costs less than {in_a_sentence(b)} on {cheaper} of "
+            f"{count(len(both), 'plant')}."
+        )
+        shown.append(
+            Column("The pair", "mean cost on each plant, a line a plant", "", [_slopes(both, a, b, finding)])
+        )
+    names = [
+        name
+        for name in judged(sources.metrics)
+        if name in set(cases["contestant"]) and name not in YARDSTICKS
+    ]
+    if not names:
+        return placeholder("plants", title, Missing("not measured", "no case has a cost"))
+    shown.append(Column("All contestants", "cost of every case", "", [_boxes(cases, names)]))
+    return Picture(
+        "plants",
+        title,
+        finding,
+        shown,
+        f"Cost as deployed, log scale. Left: ink where model-based costs less, blue where data-driven "
+        "does. Right: bar "
+        f"from the 5{THIN}% to the 95{THIN}% quantile, box the middle half, line the median, dot the "
+        f"90{THIN}% quantile.",
+        page.origin(sources.source("cases")),
+    )
+
+
+def _costs(values: np.ndarray) -> charts.Axis:
+    """A scale of decades, but no wider than the costs; ticks at 1, 2 and 5."""
+    low, high = float(values.min()) / 1.05, float(values.max()) * 1.05
+    first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
+    steps = (1, 2, 5) if last - first <= 3 else (1,)
+    every = [k * 10.0**decade for decade in range(first, last + 1) for k in steps]
+    ticks = tuple((value, short(value, 1)) for value in every if low <= value <= high)
+    return charts.Axis(low, high, ticks, log=True)
+
+
+def _slopes(both: pd.DataFrame, a: str, b: str, finding: str) -> Markup:
+    values = both.to_numpy().ravel()
+    y = _costs(values) if len(values) else charts.linear(0, 1)
+    frame = charts.Frame(
+        charts.Axis(0, 1, ((0.15, heading(a)), (0.85, heading(b)))),
+        y,
+        width=420,
+        height=300,
+        left=44,
+        above=20,
+    )
+    layers = []
+    for one, other in both.to_numpy():
+        css = "line thin dd" if other < one else "line thin"
+        layers.append(charts.line(frame, [0.15, 0.85], [one, other], css))
+    layers.append(charts.dots(frame, np.full(len(both), 0.15), both[a].to_numpy(), "dot", 2.2))
+    layers.append(charts.dots(frame, np.full(len(both), 0.85), both[b].to_numpy(), "dot dd", 2.2))
+    return charts.panel(frame, layers, alt=finding, css="mb slopes", title="cost, log")
+
+
+def _boxes(cases: pd.DataFrame, names: list[str]) -> Markup:
+    values = cases["cost"].to_numpy()
+    x = _costs(values)
+    height = 34 * len(names) + 40
+    frame = charts.Frame(
+        x,
+        charts.Axis(-0.5, len(names) - 0.5, ()),
+        width=560,
+        height=height,
+        left=130,
+        above=10,
+        below=22,
+        right=14,
+    )
+    layers, words = [], []
+    for lane, name in enumerate(names):
+        at, mine = len(names) - 1 - lane, cases[cases["contestant"] == name]["cost"].to_numpy()
+        low, first, middle, third, nine, high = np.quantile(mine, [0.05, 0.25, 0.5, 0.75, 0.9, 0.95])
+        a, b, c, d, e = (float(frame.px(v)) for v in (low, first, middle, third, high))
+        y = float(frame.py(at))
+        layers += [
+            charts.label(frame, x.low, at, heading(name), anchor="end", dx=-8, dy=3.5),
+            Markup('<line class="ax" x1="{:.1f}" x2="{:.1f}" y1="{:.1f}" y2="{:.1f}"/>').format(a, e, y, y),
+            Markup('<rect class="allow" x="{:.1f}" width="{:.1f}" y="{:.1f}" height="14"/>').format(
+                b, d - b, y - 7
+            ),
+            Markup('<line class="med" x1="{:.1f}" x2="{:.1f}" y1="{:.1f}" y2="{:.1f}"/>').format(
+                c, c, y - 8, y + 8
+            ),
+            charts.dots(frame, [nine], [at], f"dot {page.MARKS.get(name, '')}", 3.2),
+        ]
+        words.append(f"{heading(name)} {short(float(middle), 2)}")
+    return charts.panel(
+        frame, layers, alt=f"Median cost of all cases: {', '.join(words)}", css="mb wide", title=""
+    )

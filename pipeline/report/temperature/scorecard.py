@@ -1,0 +1,351 @@
+"""The table of the temperature page: every contestant as deployed over all plants, median and 90 %
+quantile, and what stands below it: the gap with its convention, bounds that bind, who was refused."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from pipeline.report.shared.digits import THIN, count, declared, number, short, with_unit
+from pipeline.report.shared.sources import Sources
+from pipeline.report.shared.verdict import FAILED, UNDECIDED, Figure, Missing, Question, state
+from pipeline.report.temperature.answers import comparison, entry, finite, judged, refused, unstable
+from pipeline.report.temperature.contestants import BY_NAME, YARDSTICKS, heading, in_a_sentence, kind
+from pipeline.report.temperature.judgement import Judgement
+from pipeline.report.temperature.pairs import relearned_band
+from pipeline.report.temperature.wording import banded, places_of, worded
+
+# figures without a rule
+UNRULED = (
+    Question(0, "energy", "Energy, mean input", "%", math.inf, False, ""),
+    Question(0, "cost", "Cost as deployed", "", math.inf, False, ""),
+)
+ORDER = (
+    "settled_error",
+    "settling",
+    "overshoot",
+    "at_limits",
+    "energy",
+    "cost",
+    "crossings",
+    "disk",
+    "delay_s",
+    "data",
+)
+
+
+class Head(NamedTuple):
+    """A contestant above its column."""
+
+    mark: str
+    name: str
+    kind: str
+
+
+class Cell(NamedTuple):
+    """The 90 % quantile, and in small type its band, the median and the worst case; `title` says more."""
+
+    value: str
+    notes: Sequence[str] = ()
+    bad: bool = False
+    best: bool = False
+    title: str = ""
+
+
+class Row(NamedTuple):
+    """A figure of every contestant, with the word that explains it and the rule's limit."""
+
+    key: str
+    title: str
+    word: str
+    limit: str
+    cells: list[Cell]
+
+
+class Scorecard(NamedTuple):
+    """Rows are figures, columns contestants. `below` are sentences that stand under the table."""
+
+    missing: Missing | None
+    heads: list[Head]
+    rows: list[Row]
+    caption: str
+    below: list[str]
+
+
+def scorecard(sources: Sources, judgement: Judgement, words: Mapping[str, str]) -> Scorecard:
+    """Every contestant that was judged, in the order of simplicity, and those that were refused."""
+    metrics = sources.metrics
+    compared = comparison(metrics)
+    names = judged(metrics)
+    if not names:
+        gap = metrics["evaluate_temperature"]
+        why = gap if isinstance(gap, Missing) else Missing("not measured", "No contestant was judged")
+        return Scorecard(why, [], [], "", [])
+    asked = {question.key: question for question in (*judgement.asked, *UNRULED)}
+    rows = [_row(sources, asked[key], names, judgement, words.get(key, "")) for key in ORDER if key in asked]
+    return Scorecard(
+        None,
+        [Head(name, heading(name), kind(name)) for name in names],
+        rows,
+        _caption(sources),
+        [*filter(None, [_gap(compared, names), _at_bound(compared, names)]), *_refused(sources)],
+    )
+
+
+def _caption(sources: Sources) -> str:
+    compared = comparison(sources.metrics)
+    date = relearned_date(sources)
+    bands = (
+        f"its band is the range over {entry(sources.relearned, 'relearnings')} fresh relearnings of {date}"
+        if date
+        else "its band is of this one learned controller, plants resampled"
+    )
+    return (
+        f"As deployed on {setting(compared)}. Large: the 90{THIN}% quantile of all cases; small: "
+        f"{bands}; the median; the worst case. Bold: best of a row, hold and the exact model left aside. "
+        "Vermillion: beyond the limit. "
+        f"Limits: {entry(compared, 'limits', 'source') or 'declared'}."
+    )
+
+
+def setting(compared: Mapping[str, Any]) -> str:
+    """ "60 plants, 900 cases, 0.1 °C of noise"."""
+    parts = [
+        count(value, one) if isinstance(value, int) else ""
+        for value, one in ((entry(compared, "plants"), "plant"), (entry(compared, "cases"), "case"))
+    ]
+    noise = entry(compared, "noise_degC")
+    levels = sorted({float(level) for level in (noise if isinstance(noise, list) else [noise]) if level})
+    listed = " to ".join(short(level, 2) for level in dict.fromkeys(levels[:1] + levels[-1:]))
+    parts.append(f"{listed}{THIN}°C of sensor noise" if listed else "")
+    return ", ".join(filter(None, parts)) or "its panel"
+
+
+def relearned_date(sources: Sources) -> str:
+    """The date of the relearnings, where they are of this machine; else ""."""
+    if sources.recorded or not isinstance(sources.relearned, dict):
+        return ""
+    if entry(sources.relearned, "machine", "outputs") != [o.name for o in sources.declared.machine.outputs]:
+        return ""
+    return str(sources.relearned.get("date") or "")
+
+
+def _row(sources: Sources, question: Question, names: list[str], judgement: Judgement, word: str) -> Row:
+    figures = [judgement.answers[name][question.key] for name in names]
+    values = [
+        figure.value
+        for name, figure in zip(names, figures, strict=True)
+        if isinstance(figure, Figure) and _competes(name) and math.isfinite(figure.value)
+    ]
+    best = (max if question.at_least else min)(values, default=math.nan)
+    alike = len(set(values)) < 2 or question.key == "data"
+    cells = [
+        _cell(sources, question, name, figure, best=not alike and getattr(figure, "value", None) == best)
+        for name, figure in zip(names, figures, strict=True)
+    ]
+    limit = "none" if question.key == "crossings" else ""
+    if not limit and math.isfinite(question.limit):
+        sign = "≥" if question.at_least else "≤"
+        limit = f"{sign} {with_unit(question.limit, question.unit, declared(question.limit))}"
+    return Row(question.key, question.title, word, limit, cells)
+
+
+def _competes(name: str) -> bool:
+    """Who may be the best of a row: neither who was told the truth, nor who does nothing."""
+    return name != "hold" and name not in YARDSTICKS
+
+
+def _cell(sources: Sources, question: Question, name: str, figure: Figure | Missing, *, best: bool) -> Cell:
+    if isinstance(figure, Missing):
+        return Cell(figure.state, bad=figure.state == FAILED, title=figure.sentence())
+    own = entry(comparison(sources.metrics), "contestants", name)
+    held = state(question, figure) if math.isfinite(question.limit) else ""
+    places = places_of(question, [figure])
+    lost, of = unstable(own)
+    text = worded(question, figure.value, places)
+    if lost and (text == "unstable" or question.key in ("disk", "delay_s")):
+        text = f"unstable on {lost} of {of} plants"
+    notes = [held if held == UNDECIDED else ""]
+    if question.key in ("crossings", "data"):
+        notes.insert(0, figure.note.split(" samples")[0])
+    else:
+        notes = [_band(sources, question, name, figure, places), *_beside(question, own, places), *notes]
+    return Cell(
+        text,
+        [note for note in notes if note],
+        bad=held == FAILED,
+        best=best and _competes(name),
+        title=_worst_title(own, question.key),
+    )
+
+
+def _band(sources: Sources, question: Question, name: str, figure: Figure, places: int) -> str:
+    fresh = relearned_band(sources.relearned, name, question.key) if relearned_date(sources) else None
+    if fresh:
+        figure = Figure(figure.value, fresh.low, fresh.high)
+    return banded(question, figure, places)
+
+
+def _beside(question: Question, own: Any, places: int) -> list[str]:
+    """Median, and the worst case with its plant."""
+    if question.key in ("disk", "delay_s"):
+        worst = entry(own, "margins", question.key, "worst")
+        plain = question._replace(unit="")
+        return ["median plant", *([] if worst is None else [f"worst {worded(plain, finite(worst), places)}"])]
+    figures = entry(own, question.key)
+    if not isinstance(figures, Mapping):
+        return []
+    notes = []
+    bare = question._replace(unit="")
+    for key in ("median", "worst"):
+        # what never settles on most cases does not in the worst either
+        if key in figures and (math.isfinite(finite(figures[key])) or math.isfinite(finite(figures["q90"]))):
+            notes.append(f"{key} {worded(bare, finite(figures[key]), places)}")
+    lost = entry(own, "never_settled_percent") if question.key == "settling" else None
+    if isinstance(lost, int | float) and lost > 0:
+        notes.append(f"{short(float(lost), 3)}{THIN}% of cases never")
+        return notes
+    plant = entry(figures, "worst_case", "plant")
+    if notes and "worst" in figures and plant is not None:
+        notes.append(f"{notes.pop()}, plant {plant}")
+    return notes
+
+
+def _worst_title(own: Any, key: str) -> str:
+    """ "Worst case 412: plant 17, ramp, from 20 °C"."""
+    case = entry(own, key, "worst_case")
+    if not isinstance(case, Mapping):
+        return ""
+    start = case.get("start_degC")
+    parts = [
+        f"plant {case['plant']}" if "plant" in case else "",
+        str(case.get("kind") or ""),
+        f"from {start:g}{THIN}°C" if isinstance(start, int | float) and abs(start) < 1e4 else "",
+    ]
+    return f"Worst case {case.get('case', '')}: {', '.join(filter(None, parts))}"
+
+
+# ---- below the table
+
+
+def _gap(compared: Mapping[str, Any], names: list[str]) -> str:
+    """The gap of every contestant with its convention in the same line; it decides nothing."""
+    question = Question(0, "gap", "", "%", math.inf, False, "")
+    parts, conventions = [], {}
+    for name in names:
+        gap = entry(compared, "contestants", name, "gap")
+        if not isinstance(gap, Mapping) or name in YARDSTICKS:
+            continue
+        ends = [worded(question, finite(gap.get(key)), 2) for key in ("median_percent", "q90_percent")]
+        conventions[str(gap.get("convention") or "")] = None
+        parts.append(
+            f"{in_a_sentence(name)} {ends[0]}"
+            if ends[0] == ends[1]
+            else f"{in_a_sentence(name)} {ends[0]}, {ends[1]} at the 90{THIN}% quantile"
+        )
+    if not parts:
+        return ""
+    convention = "; ".join(filter(None, conventions))
+    return (
+        f"Gap to the optimum ({convention or 'convention not recorded'}; no rule asks for it): "
+        f"{'; '.join(parts)}."
+    )
+
+
+def _at_bound(compared: Mapping[str, Any], names: list[str]) -> str:
+    """Tuned values that lie at a bound of the search."""
+    bound = {name: entry(compared, "contestants", name, "at_bound") or [] for name in names}
+    parts = [
+        f"{in_a_sentence(name)}: {', '.join(map(str, values))}" for name, values in bound.items() if values
+    ]
+    return (
+        f"At a bound of the search, so that a wider one may be better: {'; '.join(parts)}." if parts else ""
+    )
+
+
+def _refused(sources: Sources) -> list[str]:
+    return [
+        f"{heading(name)[:1].upper()}{heading(name)[1:]} is refused: {why.rstrip('.')}."
+        for name, why in refused(sources.metrics).items()
+    ]
+
+
+def infeasible(sources: Sources) -> list[str]:
+    """References that the machine cannot hold, each with the actuator that binds."""
+    sentences = []
+    for one in entry(comparison(sources.metrics), "infeasible") or []:
+        asked, reachable = (finite(one.get(key)) for key in ("asked_degC", "reachable_degC"))
+        if not (abs(asked) < 1e4 and abs(reachable) < 1e4):
+            continue
+        sentences.append(
+            f"{one.get('output')} cannot hold {number(asked, 1)}{THIN}°C: at most about "
+            f"{number(reachable, 1)}"
+            f"{THIN}°C is within reach, {one.get('binding')}."
+            if reachable < asked
+            else f"{one.get('output')} cannot hold {number(asked, 1)}{THIN}°C: "
+            f"{number(reachable, 1)}{THIN}°C is "
+            f"the nearest within reach, {one.get('binding')}."
+        )
+    return sentences
+
+
+# ---- what was tuned and declared
+
+
+class Weights(NamedTuple):
+    """A line of tuned values for each contestant."""
+
+    missing: Missing | None
+    rows: list[tuple[str, str]]
+
+
+def weights(sources: Sources) -> Weights:
+    """The tuned values of every contestant, from the weights that were stored."""
+    table = sources.tables["weights"]
+    if isinstance(table, Missing):
+        return Weights(table, [])
+    tuned = entry(table, "contestants") or {}
+    rows = [
+        (
+            heading(name),
+            "; ".join(
+                f"{key} {_listed(value)}"
+                for key, value in tuned[name].items()
+                if key != "at_bound" and value is not None
+            ),
+        )
+        for name in (*BY_NAME, *(name for name in tuned if name not in BY_NAME))
+        if isinstance(tuned.get(name), Mapping)
+    ]
+    gap = None if rows else Missing("not measured", "no contestant was tuned")
+    return Weights(gap, rows)
+
+
+def _listed(value: Any) -> str:
+    if isinstance(value, list) and len(value) > 1 and len(set(map(str, value))) == 1:
+        return f"{_listed(value[0])} each"
+    values = value if isinstance(value, list) else [value]
+    return ", ".join(short(v, 3) if isinstance(v, float) else str(v) for v in values)
+
+
+def declared_panel(sources: Sources) -> list[tuple[str, str]]:
+    """How contestants were compared."""
+    compared, machine = comparison(sources.metrics), sources.declared.machine
+    step, steps = machine.sample_time_s, entry(compared, "steps")
+    rows = [
+        ("Judged on", setting(compared)),
+        ("Run", f"{steps} steps of {step:g}{THIN}s" if steps else ""),
+        (
+            "Settled",
+            f"within {compared['band_degC']:g}{THIN}°C for good; the settled error is of the mean of "
+            "the last 100 steps"
+            if isinstance(compared.get("band_degC"), int | float)
+            else "",
+        ),
+        ("References", ", ".join(f"{o.name} {o.reference:g}" for o in machine.outputs) + f"{THIN}°C"),
+        (
+            "Limits of inputs",
+            f"{min(i.low for i in machine.inputs):g} to {max(i.high for i in machine.inputs):g}{THIN}%",
+        ),
+        ("Seed", str(compared["seed"]) if "seed" in compared else ""),
+    ]
+    return [row for row in rows if row[1]]
