@@ -122,16 +122,16 @@ def governor(
     outputs: OutputLimits,
     strength: Strength,
     *,
-    tau: float = 0.16,
+    tau: float = 0.5,
     drift: float = 0.06,
 ) -> Governor:
     """The governor of a family of plants of one order (their feed-through made a delay), for inputs of any
     `strength` within its range.
 
     Innovations are doubted by the sensors' noise, a tenth of a degree at least. The observer takes process
-    noise to come in by the inputs, sensors to be as much noisier as tau percent^2 of every input, and the drift
-    w to wander a step by `drift` of what a percent of every input does at most: the same for a machine of other
-    units. One that answers more slowly is watched as much longer, by the furthest instant ahead.
+    noise to come in by the inputs, sensors to be as much noisier as tau percent^2 of every input, and the
+    drift w to wander a step by `drift` of what a percent of every input does at most: the same whatever the
+    units. A machine that answers more slowly is watched as much longer, by the furthest instant ahead.
     """
     at, unsure = instants(family), np.maximum(outputs.margin, 0.1)
     slower = max(at[-1] / UNHURRIED, 1.0)
