@@ -29,7 +29,8 @@ class Rehearsal(NamedTuple):
 class Setting(NamedTuple):
     """What all contestants share, tuned and judged: the rehearsal, the identified plant with all inputs a
     sample late, limits of inputs and outputs (low, high (p,) in °C), the governor, the integrator's limit in
-    °C, the settled window in steps, what the cost counts as one, the discount, and the sample time."""
+    °C, the settled window in steps, what the cost counts as one, the discount, the sample time, and the share
+    of the declared delay margins that is asked here (`faster`)."""
 
     rehearsal: Rehearsal
     late: plant.Plant
@@ -41,6 +42,13 @@ class Setting(NamedTuple):
     allowance: panel.Allowance
     gamma: float
     sample_time_s: float
+    faster: float
+
+
+def faster(settings: Panel, rehearsal: Rehearsal) -> float:
+    """Share of a declared delay margin that is asked of a machine: less than one of one that must settle sooner
+    than the panel's. The whole answer of a hair dryer is over within 1 s."""
+    return min((rehearsal.settling_s or settings.settling_s) / settings.settling_s, 1.0)
 
 
 def shared(
@@ -76,6 +84,7 @@ def shared(
         allowance,
         tracking.gamma,
         machine.sample_time_s,
+        faster(settings, rehearsal),
     )
 
 

@@ -13,7 +13,7 @@ from pipeline.store.execution import run_all
 from pipeline.store.params import Execution
 from pipeline.temperature import comparison, controller, panel, scorecard
 from pipeline.temperature.workflow import contestants, tune_weights
-from pipeline.temperature.workflow.cases import Rehearsal, Setting
+from pipeline.temperature.workflow.cases import Rehearsal, Setting, faster
 from pipeline.temperature.workflow.settings import EvaluateTemperature, Panel, TemperatureRules
 from pipeline.temperature.workflow.settings import Plant as Machine
 
@@ -72,11 +72,11 @@ def read_weights(path: str, machine: Machine) -> dict[str, dict[str, Any]]:
 
 
 def resolved(rules: TemperatureRules, panel: Panel, rehearsal: Rehearsal) -> TemperatureRules:
-    """The rules with a settling time: as declared, else as the record says, else the panel's. A machine that
-    is faster than the panel's needs less margin of delay, in proportion: a hair dryer answers within 1 s."""
+    """The rules with a settling time: as declared, else as the record says, else the panel's; and with a
+    fast machine's delay margin (cases.faster)."""
     settling = rules.settling_s or rehearsal.settling_s or panel.settling_s
-    faster = min((rehearsal.settling_s or panel.settling_s) / panel.settling_s, 1.0)
-    return rules.model_copy(update={"settling_s": settling, "delay_margin_s": faster * rules.delay_margin_s})
+    delay_margin_s = faster(panel, rehearsal) * rules.delay_margin_s
+    return rules.model_copy(update={"settling_s": settling, "delay_margin_s": delay_margin_s})
 
 
 def designed(
