@@ -96,10 +96,10 @@ class Governor(NamedTuple):
     overshoot: float
 
 
-# instants ahead, and the last of them at most
-INSTANTS, LONGEST = 7, 120
+# steps ahead at most
+LONGEST = 120
 # projections over all outputs, and over both sides: inputs mostly move one output each, so that a few suffice
-SWEEPS, ROUNDS = 8, 3
+SWEEPS, ROUNDS = 8, 2
 # percent by which rows are equal, or missed: one case by itself takes the same steps as among many
 EXACT = 1e-9
 # share of what the innovations told that is forgotten a step, and of the drift
@@ -141,14 +141,15 @@ def governor(
     )
 
 
-def instants(family: Sequence[Plant], *, longest: int = LONGEST) -> np.ndarray:
-    """Steps ahead at which the members are looked at: now, then closer together at first, up to four times
-    that after which the slowest pulse response has passed its peak, 16 at least."""
-    peak = 1 + max(
-        int(np.abs(markov_parameters(plant, longest)).max(axis=(1, 2)).argmax()) for plant in family
+def instants(family: Sequence[Plant]) -> np.ndarray:
+    """Steps ahead at which the members are looked at: now; from that on at which the pulse response of an
+    output is first at its peak in ever wider steps, to four times that at which the last one is, 16 at least."""
+    peaks = np.concatenate(
+        [1 + np.abs(markov_parameters(plant, LONGEST)).max(axis=2).argmax(axis=0) for plant in family]
     )
-    last = min(max(4 * peak, 16), longest)
-    return np.r_[0, np.unique(np.round(np.geomspace(1, last, INSTANTS)).astype(int))]
+    last = min(max(4 * int(peaks.max()), 16), LONGEST)
+    wider = peaks.min() + np.r_[0, 2 ** np.arange(8)]
+    return np.unique(np.r_[0, wider[wider < last], last])
 
 
 def _drifting(plant: Plant) -> tuple[np.ndarray, np.ndarray]:
