@@ -142,8 +142,8 @@ def governor(
 
 
 def instants(family: Sequence[Plant]) -> np.ndarray:
-    """Steps ahead at which the members are looked at: now; from that on at which the pulse response of an
-    output is first at its peak in ever wider steps, to four times that at which the last one is, 16 at least."""
+    """Steps ahead at which the members are looked at: now; and in ever wider steps from that at which a pulse
+    response is first at its peak, to four times that at which the last one is, 16 at least."""
     peaks = np.concatenate(
         [1 + np.abs(markov_parameters(plant, LONGEST)).max(axis=2).argmax(axis=0) for plant in family]
     )
@@ -373,8 +373,11 @@ def _swept(side: _Side, u: np.ndarray, low: np.ndarray) -> np.ndarray:
     room = np.where(side.counts[..., None, None], np.maximum(room, least.reshape(room.shape)), np.inf)
     helps = helps.transpose(2, 0, 3, 1).reshape(p, f * h, m)
     for _ in range(SWEEPS):
-        before = u
-        for j in range(p):
+        over = np.matmul(u, side.rows).reshape(room.shape) - room
+        at_fault = np.flatnonzero((over > EXACT).any(axis=(0, 1, 3)))
+        if not at_fault.size:
+            break
+        for j in at_fault:
             excess = np.matmul(u, rows[:, :, j]) - room[:, :, j]
             excess = excess.transpose(1, 0, 2).reshape(s, f * h)
             most = excess.max(axis=1)
@@ -383,6 +386,4 @@ def _swept(side: _Side, u: np.ndarray, low: np.ndarray) -> np.ndarray:
             size = (direction**2).sum(axis=1)
             step = np.where(most > EXACT, most, 0.0) / np.where(size > 0, size, np.inf)
             u = np.maximum(u - step[:, None] * direction, low)
-        if np.array_equal(u, before):
-            break
     return u
