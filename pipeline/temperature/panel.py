@@ -31,6 +31,8 @@ from pipeline.temperature.governor import Strength
 from pipeline.temperature.plant import Plant, hold_output, hold_state
 from pipeline.temperature.tracking import Law, reached_state
 
+KINDS = ("constant", "ramp", "sinusoid", "sequence")
+
 
 class Spread(NamedTuple):
     """How far plants lie from the nominal one: input gains 1 +- input_gain each; A' = I + (A - I) / (1 + d),
