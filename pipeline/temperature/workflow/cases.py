@@ -46,7 +46,7 @@ class Setting(NamedTuple):
 
 
 def faster(settings: Panel, rehearsal: Rehearsal) -> float:
-    """Share of a declared delay margin that is asked of a machine: less than one of one that must settle sooner
+    """Share of a declared delay margin that is asked of a machine: below 1 for one that must settle sooner
     than the panel's. The whole answer of a hair dryer is over within 1 s."""
     return min((rehearsal.settling_s or settings.settling_s) / settings.settling_s, 1.0)
 
@@ -98,7 +98,8 @@ def rehearsed(
     """The declared panel where the true plant is known, otherwise what follows from the record."""
     if truth is not None:
         return declared(settings, machine, truth, family[0])
-    return from_record(settings, machine, family, record_path)
+    u, y, recordings = record.read_recordings(record_path, machine.acting, machine.outputs)
+    return from_record(settings, machine, family, Recorded(u, y, _numbered(recordings)))
 
 
 def input_limits(machine: Machine) -> governor.Limits:
@@ -201,7 +202,18 @@ def _half(
 AMBIENT_SHARE = 0.25
 
 
-def from_record(settings: Panel, machine: Machine, family: Sequence[plant.Plant], path: str) -> Rehearsal:
+class Recorded(NamedTuple):
+    """Segments u (T, m and more: disturbances follow the inputs) in percent and y (T, p) in °C, and the
+    number of the recording of each."""
+
+    u: list[np.ndarray]
+    y: list[np.ndarray]
+    recordings: list[int]
+
+
+def from_record(
+    settings: Panel, machine: Machine, family: Sequence[plant.Plant], recorded: Recorded
+) -> Rehearsal:
     """Somebody's machine: both halves are drawn around plants of the identified family, and starts,
     references, band, settling limit and length follow from the record.
 
@@ -211,10 +223,11 @@ def from_record(settings: Panel, machine: Machine, family: Sequence[plant.Plant]
     More heat is lost by a fifth of what the slowest mode loses at most.
     """
     identified = family[0]
-    u, y, recordings = record.read_recordings(path, machine.acting, machine.outputs)
-    u = [a[:, : len(machine.inputs)] for a in u]
+    u = [a[:, : len(machine.inputs)] for a in recorded.u]
     low, high = output_limits(machine)
-    scale = scenario_defaults.machine_scale(u, y, identified, machine.sample_time_s, _numbered(recordings))
+    scale = scenario_defaults.machine_scale(
+        u, recorded.y, identified, machine.sample_time_s, recorded.recordings
+    )
     asked = scenario_defaults.defaults(
         scale,
         identified,
