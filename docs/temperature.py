@@ -8,11 +8,10 @@ The temperature stages do the same with recordings, tuned weights and a panel of
 import matplotlib
 import numpy as np
 
-from pipeline.temperature import judging, kernel, plant, probing, study, tracking, window
+from pipeline.temperature import controller, kernel, panel, plant, probing, study, tracking, window
 from pipeline.temperature.baseline import pairing, pi_law
 from pipeline.temperature.identification import Settings, identify
 from pipeline.temperature.published import K_DATA
-from pipeline.temperature.scorecard import feed_forward, simulate
 
 matplotlib.use("Agg")
 from matplotlib import pyplot  # noqa: E402  a figure without a screen
@@ -49,17 +48,22 @@ pi_simc = pi_law(pairing(model, low, high, horizon=1000), inputs=machine.m)
 
 # %% The yardstick: cost above the optimum that knows the true state, from 20 °C, without limits.
 references = np.array([[150.0, 160.0, 170.0, 175.0, 180.0]])
-panel = study.study_panel(references, noise=0.1, hold=30)
-gaps = {name: float(study.gap(law, panel)[0]) for name, law in laws.items()}
+scenarios = study.study_panel(references, noise=0.1, hold=30)
+gaps = {name: float(study.gap(law, scenarios)[0]) for name, law in laws.items()}
 for name, gap in gaps.items():
     print(f"{name:15} {100 * gap:9.4f} % above the optimum")
 
 # %% As deployed: heaters give 0 to 100 %, and every law aims at the nearest temperatures that can be held.
-targets = judging.targets(model, panel.r, (low, high))
+limits = controller.Limits(low, high, rate=np.full(machine.m, np.inf))
+questions = panel.Questions(np.full((1, machine.p), 20.0), references, None, None, None)
+true = panel.delayed(machine, late=False)
+cases = panel.asked([true], questions, noise=np.full(machine.p, 0.1), seed=1, steps=1000, hold=30, cells=True)
+rests = panel.rests(model, cases, limits)
 figure, axes = pyplot.subplots(2, 2, figsize=(9, 6), sharex=True, sharey=True)
 runs = {}
 for axis, (name, law) in zip(axes.flat, (laws | {"PI, SIMC": pi_simc}).items(), strict=True):
-    runs[name] = simulate(panel, law, feed_forward(panel, law, targets), limits=(low, high))
+    deployed = controller.deployed(law, limits, integral_limit=1.0)
+    runs[name] = panel.rolled_out(deployed, cases, panel.aims(law, rests, cases))
     axis.plot(runs[name].y[:, 0])
     axis.set_prop_cycle(None)
     axis.plot(np.tile([0, len(runs[name].y)], (machine.p, 1)).T, np.tile(references[0], (2, 1)), ":")

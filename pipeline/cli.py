@@ -41,7 +41,7 @@ def accept(_: argparse.Namespace) -> None:
         "hashes": hashes,
         "code": code_files(("pipeline", "stages")),
     }
-    artifacts.write_json("reports/accepted.json", run | {"figures": _figures()})
+    artifacts.write_json("reports/accepted.json", run | _shown())
     print(
         f"reports/accepted.json: accepted {len(metrics)} stages' figures and {len(hashes)} artifacts; "
         "commit it to keep it"
@@ -59,11 +59,11 @@ def _today() -> dict[str, str]:
     }
 
 
-def _figures() -> dict:
-    """The figures with their bands as the pages show them; none where no page was made. Raises ValueError
-    where the pages are of another run."""
+def _shown() -> dict:
+    """What the pages show: figures with their bands, and which contestant of the temperature loop the verdict
+    chose; nothing where no page was made. Raises ValueError where the pages are of another run."""
     if not artifacts.exists("reports/metrics/report.json"):
-        return {}
+        return {"figures": {}, "winner": None}
     report = artifacts.read_metrics("report")
     stale = [
         path
@@ -75,7 +75,7 @@ def _figures() -> dict:
             f"reports: the pages are of another run than {stale[0]}; run ./run dvc repro, "
             "look at them, and accept then"
         )
-    return report["figures"]
+    return {"figures": report["figures"], "winner": report["verdict"]["winner"]}
 
 
 def verify(_: argparse.Namespace) -> None:

@@ -12,7 +12,10 @@ def main() -> None:
     with artifacts.stage("learn_kernel") as out:
         settings, machine = params.load(LearnKernel, "learn_kernel"), params.load(Plant, "plant")
         tracking, panel = params.load(Tracking, "tracking"), params.load(Panel, "panel")
-        learned = learn_kernel.learned(settings, machine, tracking, panel, "datasets/ingest/record.parquet")
+        simulated = params.value("generate_probing.source", one_of=("simulated", "recordings")) == "simulated"
+        learned = learn_kernel.learned(
+            settings, machine, tracking, panel, "datasets/ingest/record.parquet", simulated=simulated
+        )
         artifacts.write_arrays(out / "window.parquet", "window", 1, window.stored(learned.window))
         if learned.best.learned is not None:
             artifacts.write_arrays(out / "kernel.parquet", "kernel", 1, learned.best.learned.stored())

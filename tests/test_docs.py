@@ -91,7 +91,7 @@ def readme_of_today(root: Path) -> str:
         rules,
         recorded=False,
         undeclared=[output.name for output in machine.outputs if output.low is None or output.high is None],
-        incumbent=str(accepted["metrics"].get("report", {}).get("verdict", {}).get("winner") or ""),
+        incumbent=str(accepted.get("winner") or ""),
     )
     text = readme.block(metrics, rules, verdict)
     return readme.rewritten((root / "README.md").read_text(encoding="utf-8"), text)

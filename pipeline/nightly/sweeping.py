@@ -39,7 +39,7 @@ def sweep(settings: Sequence[str], target: str, metric: str) -> str:
     if not key:
         raise ValueError(
             "sweep: expected a metric as STAGE:dotted.key, such as "
-            f"tune_weights:practical.cost, found {metric}"
+            f"tune_weights:contestants.subspace_lqg.cost, found {metric}"
         )
     import pandas as pd
 

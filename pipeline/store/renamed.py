@@ -47,8 +47,18 @@ PARAMETERS: dict[str, str] = {
 
 # dotted keys that nothing reads any more -> why, as the end of a sentence
 RETIRED: dict[str, str] = {
+    "evaluate_temperature.report_noise_degC": "panel.noise_degC is the one level of noise",
+    "panel.judging.seeds": "panel.judging.seed draws plants and noise",
+    "panel.training.seeds": "panel.training.seed draws plants and noise",
     "report.gap_percent": "the gap to the optimum is shown and decides nothing",
     "report.worst_case_gap_percent": "the rules are asked at the 90 % quantile of all cases",
+    "tune_weights.acquisition": "every contestant has the same search, expected improvement",
+    "tune_weights.q_high": "each contestant has parameters of its own (workflow/contestants.py)",
+    "tune_weights.q_low": "each contestant has parameters of its own (workflow/contestants.py)",
+    "tune_weights.r_high": "each contestant has parameters of its own (workflow/contestants.py)",
+    "tune_weights.r_low": "each contestant has parameters of its own (workflow/contestants.py)",
+    "tune_weights.tau_high": "each contestant has parameters of its own (workflow/contestants.py)",
+    "tune_weights.tau_low": "each contestant has parameters of its own (workflow/contestants.py)",
 }
 
 # (dotted key of today, old choice) -> today's choice; of parameters that are one of several words

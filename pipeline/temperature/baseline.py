@@ -260,4 +260,4 @@ def controller(
     `pairing`."""
     pairs = pairing(plant, *limits, horizon=horizon, family=family, noise_degC=noise_degC, tuning=tuning)
     law = pi_law(pairs, inputs=plant.m)
-    return Controller("baseline", lambda q, r, integral: law, strictly_proper(plant), own_feed_forward=False)
+    return Controller("baseline", lambda q, r, integral: law, strictly_proper(plant))

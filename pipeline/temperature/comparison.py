@@ -1,7 +1,7 @@
 """The comparison: which contestant is best, what tells model-based and data-driven apart, and which plant
 decides. Cases of one plant stand or fall together: plants are the blocks of every test and of every band."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -114,12 +114,3 @@ def mean_and_worst(costs: np.ndarray, plant: np.ndarray, *, weight: float) -> fl
     by_plant = np.sort([costs[plant == index].mean() for index in np.unique(plant)])
     tail = by_plant[-max(1, len(by_plant) // 4) :].mean()
     return float((by_plant.mean() + weight * tail) / (1 + weight))
-
-
-def rows(results: Mapping[str, Sequence[np.ndarray]], names: Sequence[str]) -> dict[str, np.ndarray | list]:
-    """Figures of several contestants as columns, contestant by contestant."""
-    columns = {
-        name: np.concatenate([figures[k] for figures in results.values()]) for k, name in enumerate(names)
-    }
-    count = len(next(iter(results.values()))[0])
-    return {"contestant": [name for name in results for _ in range(count)], **columns}

@@ -108,8 +108,11 @@ class Aim(NamedTuple):
 
 
 def aim(law: Law, at: Rest, reference: Reference) -> Aim:
-    """feed = U + K Z + D Y, with the law's memory Z w on the way, Z F = A Z + B_u U + B_y Y + B_r H + [c
-    0]."""
+    """feed = U + K Z + D Y, with the law's memory Z w on the way, Z F = A Z + B_u U + B_y Y + B_r H + [c 0].
+    A conditional law aims at no target: it sees the reference itself, and its own integral is all its
+    feed."""
+    if law.conditional:
+        return Aim(-law.K_r @ reference.H, reference.H)
     drive = law.B_u @ at.U + law.B_y @ at.Y + law.B_r @ reference.H
     drive[:, 0] += law.c
     Z = _sylvester(law.A, reference.F, drive)
@@ -236,9 +239,10 @@ def watched(controller: Deployed, state: State | None, u: np.ndarray, y: np.ndar
 def handed_over(controller: Deployed, state: State, y: np.ndarray, here: Sequence[Aim]) -> State:
     """The state in which the law takes over from manual without a bump: xi starts where the law, aimed at
     where the machine is (`here`, an Aim of each case's y), would go on with the input of manual, up to
-    `integral_limit`. A conditional law starts its integral action at that input."""
+    `integral_limit`. A conditional law starts its integral action at that input; one without integral action
+    has nothing that could hold a start, or let it go."""
     law = controller.law
-    if controller.holds:
+    if controller.holds or not np.any(law.integral):
         return state
     if law.conditional:
         return state._replace(xi=state.u @ controller.back.T)

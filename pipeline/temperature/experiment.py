@@ -44,7 +44,7 @@ from pipeline.temperature.tracking import Law, aimed, feasible_target, gains
 from pipeline.temperature.trust import horizon, two_points
 from pipeline.temperature.validation import step_response
 
-ENOUGH = 0.8  # of the largest safe amplitude: what the centre gives up to come nearer to the references
+ENOUGH = 0.5  # of the largest safe amplitude: the rest is given up to come nearer to the references
 SEEN = 0.05  # of an output's largest effect: pairs below it teach and are asked nothing
 HOLD = 0.5  # of the fastest time constant: the shortest hold of a binary sequence
 CORNERS = 3.0  # times the corner frequency: the highest line of a multisine
@@ -53,7 +53,7 @@ SWITCHES = 20  # at least so many holds in an experiment, so that inputs move in
 DRAWS = 30  # phases drawn for a multisine, of which the flattest is taken
 USEFUL = 0.3  # largest expected standard error of an input's strongest gain; beyond it nothing is learned
 STEPS = 6  # halvings of each search for an amplitude
-HALF = 0.5  # of the wanted amplitudes: a shorter experiment is tried below it
+FAIR = 0.4  # of the wanted amplitudes: a shorter experiment is tried below it
 
 
 class Limits(NamedTuple):
@@ -426,7 +426,7 @@ def expected_gap(model: Plant, taught: Lesson, gamma: float) -> float:
 
 
 def design(family: Family, wish: Wish, limits: Limits, rng: np.random.Generator) -> Experiment:
-    """The longest experiment that is safe and moves the machine by at least half of what is wanted; of
+    """The longest experiment that is safe and moves the machine by a fair share of what is wanted; of
     shorter ones the one that teaches most where none does."""
     if reason := _nothing_left(family, limits):
         nothing, unknown = np.zeros((0, family.model.m)), np.full(family.model.p, np.nan)
@@ -449,7 +449,7 @@ def design(family: Family, wish: Wish, limits: Limits, rng: np.random.Generator)
                 tried,
                 tried.lesson.information if tried.lesson is not None and tried.written else 0.0,
             )
-        if tried.written and (tried.amplitude >= HALF * caps(family, reach, wish, limits)).all():
+        if tried.written and (tried.amplitude >= FAIR * caps(family, reach, wish, limits)).all():
             break
         samples //= 2
     if best is None:

@@ -92,6 +92,8 @@ class Governor(NamedTuple):
     high: np.ndarray
     surprise: np.ndarray
     doubt: np.ndarray
+    near: np.ndarray
+    forgets: float
     strength: Strength
     overshoot: float
 
@@ -102,10 +104,14 @@ LONGEST = 120
 SWEEPS, ROUNDS = 8, 2
 # percent by which rows are equal, or missed: one case by itself takes the same steps as among many
 EXACT = 1e-9
-# share of what the innovations told that is forgotten a step, and of the drift
-FORGETS, LEAK = 0.005, 1e-4
+# share of what the innovations told that is forgotten a step, and of the drift, and with them the observer's
+# constants: for a furthest look ahead of so many steps; a machine that needs more is watched as much longer
+FORGETS, LEAK, UNHURRIED = 0.005, 1e-4, 16
 # squares of innovations beyond those of the best member from which a member does not count
 CONTRADICTED = 4.0
+# overshoots from its target within which an output has arrived; how many it may go beyond it then, where the
+# whole range of the inputs for one sample moves it by fewer overshoots than this
+ARRIVED, LET_GO, BARELY = 2.0, 4.0, 20.0
 # an input that moves an output by less than this share of the strongest one is not held back for it
 WEAK = 0.05
 
@@ -116,19 +122,25 @@ def governor(
     outputs: OutputLimits,
     strength: Strength,
     *,
-    tau: float = 0.2,
+    tau: float = 0.5,
     drift: float = 0.06,
 ) -> Governor:
     """The governor of a family of plants of one order (their feed-through made a delay), for inputs of any
     `strength` within its range.
 
     Innovations are doubted by the sensors' noise, a tenth of a degree at least. The observer takes process
-    noise to come in by the inputs, sensors to be tau °C^2 per percent^2 noisier than that, and the drift w to
-    wander a step by `drift` of what a percent of every input does at most.
+    noise to come in by the inputs, sensors to be as much noisier as tau percent^2 of every input, and the
+    drift w to wander a step by `drift` of what a percent of every input does at most: the same whatever the
+    units. A machine that answers more slowly is watched as much longer, by the furthest instant ahead.
     """
     at, unsure = instants(family), np.maximum(outputs.margin, 0.1)
+    slower = max(at[-1] / UNHURRIED, 1.0)
     members = [
-        {**_watching(plant, strength, tau, drift), **_ahead(plant, limits, strength, at)} for plant in family
+        {
+            **_watching(plant, strength, tau * slower**2, drift / slower, LEAK / slower),
+            **_ahead(plant, limits, strength, at),
+        }
+        for plant in family
     ]
     return Governor(
         **{name: np.stack([member[name] for member in members]) for name in members[0]},
@@ -136,39 +148,56 @@ def governor(
         high=outputs.high - outputs.margin,
         surprise=3 * unsure,
         doubt=4 * unsure,
+        near=_near(family[0], limits, outputs.overshoot, strength),
+        forgets=FORGETS / slower,
         strength=strength,
         overshoot=outputs.overshoot,
     )
 
 
+def _near(plant: Plant, limits: Limits, overshoot: float, strength: Strength) -> np.ndarray:
+    """How far (p,) in °C an output that has arrived at its target may be predicted beyond it.
+
+    `overshoot` where one sample can do much. Where it can do little, the law's own small moves are as large
+    as the forecast's errors, of which a tight wall would make a steady error.
+    """
+    pulse = np.abs(markov_parameters(plant, LONGEST)).max(axis=0)
+    most = strength.strongest * pulse @ (limits.high - limits.low)
+    return np.where(most < BARELY * overshoot, LET_GO, 1.0) * overshoot
+
+
 def instants(family: Sequence[Plant]) -> np.ndarray:
-    """Steps ahead at which the members are looked at: now; and in ever wider steps from that at which a pulse
-    response is first at its peak, to four times that at which the last one is, 16 at least."""
-    peaks = np.concatenate(
-        [1 + np.abs(markov_parameters(plant, LONGEST)).max(axis=2).argmax(axis=0) for plant in family]
-    )
-    last = min(max(4 * int(peaks.max()), 16), LONGEST)
-    wider = peaks.min() + np.r_[0, 2 ** np.arange(8)]
+    """Steps ahead at which the members are looked at: now; and in ever wider steps from that at which an
+    output's pulse response is first at its peak, to four times that after which the strongest of the slowest
+    member is, 16 at least."""
+    pulses = [np.abs(markov_parameters(plant, LONGEST)).max(axis=2) for plant in family]
+    first = 1 + min(int(pulse.argmax(axis=0).min()) for pulse in pulses)
+    peak = 1 + max(int(pulse.max(axis=1).argmax()) for pulse in pulses)
+    last = min(max(4 * peak, 16), LONGEST)
+    wider = first + np.r_[0, 2 ** np.arange(7)]
     return np.unique(np.r_[0, wider[wider < last], last])
 
 
-def _drifting(plant: Plant) -> tuple[np.ndarray, np.ndarray]:
+def _drifting(plant: Plant, leak: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """A, C of the state [x; w]: w (p) in °C a step warms the outputs along the state that inputs most likely
     reach; it leaks, so that no mode of it stands still unseen."""
     n, p = plant.n, plant.p
-    A = np.block([[plant.A, reached_state(plant)], [np.zeros((p, n)), (1 - LEAK) * np.eye(p)]])
+    A = np.block([[plant.A, reached_state(plant)], [np.zeros((p, n)), (1 - leak) * np.eye(p)]])
     return A, np.hstack([plant.C, np.zeros((p, p))])
 
 
-def _watching(plant: Plant, strength: Strength, tau: float, drift: float) -> dict[str, np.ndarray]:
+def _watching(
+    plant: Plant, strength: Strength, tau: float, drift: float, leak: float
+) -> dict[str, np.ndarray]:
     """The part of a Governor by which one member follows the machine."""
     n, m, p = plant.n, plant.m, plant.p
     likely = reached_state(plant)
-    A, C = _drifting(plant)
-    pulse = np.abs(markov_parameters(plant, LONGEST)).max(axis=0)
-    noise = scipy.linalg.block_diag(plant.B @ plant.B.T, drift**2 * np.diag((pulse**2).sum(axis=1)))
-    P = riccati(A.T, C.T, noise, tau * np.eye(p))
-    L = P @ C.T @ np.linalg.inv(C @ P @ C.T + tau * np.eye(p))
+    A, C = _drifting(plant, leak)
+    pulse = (np.abs(markov_parameters(plant, LONGEST)).max(axis=0) ** 2).sum(axis=1)
+    noise = scipy.linalg.block_diag(plant.B @ plant.B.T, drift**2 * np.diag(pulse))
+    sensors = tau * pulse.mean() * np.eye(p)
+    P = riccati(A.T, C.T, noise, sensors)
+    L = P @ C.T @ np.linalg.inv(C @ P @ C.T + sensors)
     less, none = strength.strongest - strength.weakest, np.zeros((p, m))
     quick, slow = (np.vstack(parts) for parts in ((L[:n], 0 * L[n:]), (0 * L[:n], L[n:])))
     one, other = np.array([[1.0], [0.0]]), np.array([[0.0], [1.0]])
@@ -230,7 +259,7 @@ def corrected(family: Governor, memory: np.ndarray, y: np.ndarray) -> np.ndarray
     e = y - family.offset[:, None] - forecast[:, :, :p]
     lacks = forecast[:, :, p:]
     after = np.empty_like(memory)
-    sums = (1 - FORGETS) * memory[:, :, q:]
+    sums = (1 - family.forgets) * memory[:, :, q:]
     for k, news in enumerate((-e * lacks, lacks * lacks, np.abs(lacks), e * e)):
         sums[:, :, k * p : (k + 1) * p] += news
     strength = np.clip(sums[:, :, :p] / (sums[:, :, p : 2 * p] + 1e-12), 0.0, 1.0)
@@ -301,7 +330,9 @@ def governed(
         part.reshape(*part.shape[:2], y_star.shape[1], -1)
         for part in (ahead[:, :, :rows], ahead[:, :, rows:])
     )
-    now = free[..., 0] - told.middle * lacks[..., 0] + family.offset[:, None]
+    # where an output is, is measured: how strong the inputs are is in doubt for what is still to come
+    free, lacks = free - (told.middle * lacks[..., 0])[..., None], lacks - lacks[..., :1]
+    now = free[..., 0] + family.offset[:, None]
     floor, cap = _walls(family, now, y_star)
     per_member = (len(free), 1, *free.shape[2:])
     strongest, less = family.strength.strongest, family.strength.strongest - family.strength.weakest
@@ -324,12 +355,16 @@ def governed(
 
 def _walls(family: Governor, now: np.ndarray, y_star: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Floor and cap (f, s, p) in °C of outputs forecast `now` (f, s, p): low and high; and `overshoot` beyond
-    the target, or where an output is now that is further off. What is up to twice as far off goes back, so
-    that small errors of the forecast do not add up."""
-    floor, cap = y_star - family.overshoot, y_star + family.overshoot
+    the target, `near` where an output has arrived at it. What is up to a further `overshoot` off goes back,
+    so that small errors of the forecast do not add up; what is further off is left to the law."""
+    arriving, leaving = (
+        np.where(sign * (y_star - now) < ARRIVED * family.overshoot, family.near, family.overshoot)
+        for sign in (1.0, -1.0)
+    )
+    floor, cap = y_star - leaving, y_star + arriving
     return (
-        np.maximum(family.low, np.where(now < floor - family.overshoot, now, floor)),
-        np.minimum(family.high, np.where(now > cap + family.overshoot, now, cap)),
+        np.maximum(family.low, np.where(now < floor - family.overshoot, -np.inf, floor)),
+        np.minimum(family.high, np.where(now > cap + family.overshoot, np.inf, cap)),
     )
 
 

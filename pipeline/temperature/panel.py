@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy.linalg
 
 from pipeline.temperature.controller import (
     Aim,
@@ -30,13 +31,11 @@ from pipeline.temperature.governor import Strength
 from pipeline.temperature.plant import Plant, hold_output, hold_state
 from pipeline.temperature.tracking import Law, reached_state
 
-KINDS = ("constant", "ramp", "sinusoid", "sequence")
-
 
 class Spread(NamedTuple):
     """How far plants lie from the nominal one: input gains 1 +- input_gain each; A' = I + (A - I) / (1 + d),
-    B' = B / (1 + d), d within +- slower; A - l I, l from 0 to extra_heat_loss a step; all inputs one step
-    late in a share `delayed`; the ambient +- ambient_degC."""
+    B' = B / (1 + d), d within +- slower, in the modes of heat; A - l I, l from 0 to extra_heat_loss a step;
+    all inputs one step late in a share `delayed`; the ambient +- ambient_degC."""
 
     input_gain: float
     slower: float
@@ -68,13 +67,40 @@ def varied(
     plant: Plant, *, gains: np.ndarray, slower: float, loss: float, ambient: float, late: bool, cells: bool
 ) -> Plant:
     """One plant of the spread. An ambient warmer by `ambient` °C warms every cell by as much in the end,
-    where the states are `cells`, and every output otherwise."""
+    where the states are `cells`, and every output otherwise. Of an identified plant only the modes of heat
+    slow down (`paced`)."""
     identity = np.eye(plant.n)
-    A = identity + (plant.A - identity) / (1 + slower)
+    pace = identity / (1 + slower) if cells else paced(plant.A, slower)
+    A = identity + pace @ (plant.A - identity)
     warmer = np.ones(plant.n) if cells else reached_state(plant) @ np.ones(plant.p)
-    b = plant.b / (1 + slower) + (identity - A) @ warmer * ambient
-    changed = plant._replace(A=A - loss * identity, B=plant.B * gains / (1 + slower), b=b)
+    b = pace @ plant.b + (identity - A) @ warmer * ambient
+    changed = plant._replace(A=A - loss * identity, B=pace @ plant.B * gains, b=b)
     return delayed(changed, late)
+
+
+def paced(A: np.ndarray, slower: float) -> np.ndarray:
+    """The pace P (n, n) by which A' = I + P (A - I), B' = P B, b' = P b have the steady state of A, B, b and
+    heat up 1 + slower times as slowly.
+
+    A mode of heat is one whose eigenvalue l has Re l > 0.3 and |Im l| <= |1 - Re l|: overdamped, or hardly
+    less. P is 1 / (1 + slower) on their invariant subspace and 1 on that of the others: delays, sensors'
+    noise and what rings stand for no heat, and I + (A - I) / (1 + slower) would make them unstable.
+    """
+    n = len(A)
+    T, Z, slow = scipy.linalg.schur(A, output="complex", sort=_of_heat)
+    # A = Z [T1 X; 0 T2] Z*: with T1 S - S T2 = -X the columns Z [I S; 0 I] span both subspaces
+    decoupled = np.eye(n, dtype=complex)
+    if 0 < slow < n:
+        decoupled[:slow, slow:] = scipy.linalg.solve_sylvester(
+            T[:slow, :slow], -T[slow:, slow:], -T[:slow, slow:]
+        )
+    basis = Z @ decoupled
+    share = np.where(np.arange(n) < slow, 1 / (1 + slower), 1.0)
+    return (basis * share @ np.linalg.inv(basis)).real
+
+
+def _of_heat(eigenvalue: complex) -> bool:
+    return bool(eigenvalue.real > 0.3 and abs(eigenvalue.imag) <= abs(1 - eigenvalue.real))
 
 
 def drawn(

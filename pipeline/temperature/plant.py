@@ -268,20 +268,6 @@ def hold_output(plant: Plant, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return point[:n], point[n:]
 
 
-def spread(
-    nominal: Plant, *, input_gain: float, extra_heat_loss: float, scale: Sequence[float] = (-1.0, 1.0)
-) -> list[Plant]:
-    """The declared family around a plant: the plant itself, each column of B by
-    1 +- input_gain, and A - extra_heat_loss I, in that order."""
-    family = [nominal]
-    for column in range(nominal.m):
-        for sign in scale:
-            B = nominal.B.copy()
-            B[:, column] *= 1 + sign * input_gain
-            family.append(nominal._replace(B=B))
-    return [*family, nominal._replace(A=nominal.A - extra_heat_loss * np.eye(nominal.n))]
-
-
 def stored(plants: Sequence[Plant]) -> dict[str, tuple[np.ndarray, str, str]]:
     """Plants of one order as named arrays with unit and meaning, stacked along the first axis, for an
     artifact; `restored` reads them back."""

@@ -1,8 +1,6 @@
-"""One panel, one yardstick, every controller: the same plants, starts, references and noise; costs only under
-the same weights, judged by true outputs.
-
-Two runs of every scenario: unclipped, where the discrete Riccati equation gives the optimum (regret J / J* -
-1), and with inputs clipped to the machine's limits, where an engineer's figures are read off.
+"""One panel, one yardstick, every law: unclipped and without integrator, where the discrete Riccati equation
+gives the optimum (regret J / J* - 1); costs only under the same weights, judged by true outputs. Then the
+margins of a law on a plant. What a controller does as deployed is panel.py's.
 """
 
 from collections.abc import Sequence
@@ -13,7 +11,7 @@ import scipy.linalg
 import scipy.sparse
 
 from pipeline.temperature.plant import Plant, hold_output, hold_state
-from pipeline.temperature.tracking import Gains, Law, aimed, gains
+from pipeline.temperature.tracking import Gains, Law, gains
 
 
 class Panel(NamedTuple):
@@ -52,27 +50,10 @@ class Cost(NamedTuple):
 
 
 class PanelRun(NamedTuple):
-    """True outputs y, commanded and applied inputs (steps, scenarios, p or m),
-    and the sensors' errors that the controller saw."""
+    """True outputs y and inputs u (steps, scenarios, p or m)."""
 
     y: np.ndarray
-    command: np.ndarray
     u: np.ndarray
-
-
-class Figures(NamedTuple):
-    """An engineer's figures of each scenario (scenarios,): °C, seconds, percent; NaN in settling_s where the
-    outputs never stay within the band."""
-
-    tracking_degC: np.ndarray
-    effort_percent: np.ndarray
-    settled_error_degC: np.ndarray
-    settled_zone: np.ndarray
-    settling_s: np.ndarray
-    overshoot_degC: np.ndarray
-    at_limits_percent: np.ndarray
-    input_low_percent: np.ndarray
-    input_high_percent: np.ndarray
 
 
 def panel(
@@ -129,27 +110,15 @@ def disturbances(panel: Panel) -> np.ndarray:
     )
 
 
-def simulate(
-    panel: Panel,
-    law: Law,
-    k: np.ndarray,
-    *,
-    limits: tuple[np.ndarray, np.ndarray] | None,
-    integral_band: float = np.inf,
-) -> PanelRun:
-    """Every scenario at once under one law with feed-forward k (scenarios, m); limits (low, high) in percent
-    clip what is applied and what enters the memory.
-
-    The outer integrator xi sees errors no larger than `integral_band`
-    °C, so that the way up winds nothing up.
-    """
+def simulate(panel: Panel, law: Law) -> PanelRun:
+    """Every scenario at once under one law with its own feed-forward; nothing limits the inputs, and xi stays
+    zero."""
     A, B, C, b, d = (
         np.stack([getattr(panel.plants[i], name) for i in panel.plant]) for name in ("A", "B", "C", "b", "d")
     )
     steps, (scenarios, p) = panel.steps, panel.r.shape
-    y, command = np.empty((steps, scenarios, p)), np.empty((steps, scenarios, law.K.shape[0]))
-    applied, noise = np.empty_like(command), disturbances(panel)
-    x, xi = panel.x0.copy(), _xi_at_start(law, panel)
+    y, u = np.empty((steps, scenarios, p)), np.empty((steps, scenarios, law.K.shape[0]))
+    x, noise = panel.x0.copy(), disturbances(panel)
     held = np.einsum("sij,sj->si", C, x) + d
     z = panel.u0 @ law.start_u.T + (held + noise[0]) @ law.start_y.T + law.start
     # the memory of a window is a shift: as a sparse matrix it costs a copy, not a product
@@ -160,54 +129,13 @@ def simulate(
     for t in range(steps):
         y[t] = np.einsum("sij,sj->si", C, x) + d
         measured = y[t] + noise[t]
-        u = -(z @ law.K.T + measured @ law.D.T + (panel.r + xi) @ law.K_r.T + k)
-        command[t] = u
-        u = u if limits is None else np.clip(u, *limits)
-        applied[t] = u
-        z = z @ memory + u @ law.B_u.T + measured @ law.B_y.T + panel.r @ law.B_r.T + law.c
-        if law.conditional:
-            xi = _conditional(law, xi, panel.r - measured, command[t], limits)
-        elif np.any(law.integral):
-            xi += law.integral * np.clip(panel.r - measured, -integral_band, integral_band)
-        x = np.einsum("sij,sj->si", A, x) + np.einsum("sij,sj->si", B, u) + b
+        u[t] = -(z @ law.K.T + measured @ law.D.T + panel.r @ law.K_r.T + law.k)
+        z = z @ memory + u[t] @ law.B_u.T + measured @ law.B_y.T + panel.r @ law.B_r.T + law.c
+        x = np.einsum("sij,sj->si", A, x) + np.einsum("sij,sj->si", B, u[t]) + b
         if not np.abs(x).max() < 1e9:
             x = np.clip(np.nan_to_num(x), -1e9, 1e9)
             z = np.clip(np.nan_to_num(z), -1e9, 1e9)
-    return PanelRun(y, command, applied)
-
-
-def _xi_at_start(law: Law, panel: Panel) -> np.ndarray:
-    """xi (scenarios, p): zero, or where a conditional law's integral action is the input of the hold."""
-    if not law.conditional:
-        return np.zeros(panel.r.shape)
-    return panel.u0 @ np.linalg.pinv(-law.K_r).T
-
-
-def _conditional(
-    law: Law,
-    xi: np.ndarray,
-    error: np.ndarray,
-    command: np.ndarray,
-    limits: tuple[np.ndarray, np.ndarray] | None,
-) -> np.ndarray:
-    """xi (scenarios, p) a step on under conditional integration, one input an output."""
-    after = xi + law.integral * error
-    if limits is None:
-        return after
-    inside = (command >= limits[0]) & (command <= limits[1])
-    within = np.clip(-after @ law.K_r.T, *limits) @ np.linalg.pinv(-law.K_r).T
-    return np.where(inside @ (law.K_r != 0), within, xi)
-
-
-def feed_forward(
-    panel: Panel, law: Law, targets: dict[bytes, tuple[np.ndarray, np.ndarray]] | None
-) -> np.ndarray:
-    """k (scenarios, m): the law's own, or, with the steady (u, y) of each reference in `targets`, the one
-    that rests there (tracking.feasible_target)."""
-    if targets is None:
-        return np.tile(law.k, (len(panel.r), 1))
-    rest = {key: aimed(law, np.frombuffer(key), *target).k for key, target in targets.items()}
-    return np.stack([rest[r.tobytes()] for r in panel.r])
+    return PanelRun(y, u)
 
 
 def cost(panel: Panel, run: PanelRun, yardstick: Yardstick) -> Cost:
@@ -219,15 +147,10 @@ def cost(panel: Panel, run: PanelRun, yardstick: Yardstick) -> Cost:
 
 def optimum(panel: Panel, yardstick: Yardstick) -> Cost:
     """J* of every scenario: the Riccati law of its own plant, which knows the state, unclipped."""
-    return cost(panel, optimum_run(panel, yardstick), yardstick)
-
-
-def optimum_run(panel: Panel, yardstick: Yardstick) -> PanelRun:
-    """The run behind J*."""
     best = [
         gains(plant, np.diag(yardstick.q), np.diag(yardstick.r), yardstick.gamma) for plant in panel.plants
     ]
-    return _state_feedback(panel, best)
+    return cost(panel, _state_feedback(panel, best), yardstick)
 
 
 def _state_feedback(panel: Panel, best: Sequence[Gains]) -> PanelRun:
@@ -242,7 +165,7 @@ def _state_feedback(panel: Panel, best: Sequence[Gains]) -> PanelRun:
         y[t] = np.einsum("sij,sj->si", C, x) + d
         u[t] = -np.einsum("sij,sj->si", K_x, x) - feed
         x = np.einsum("sij,sj->si", A, x) + np.einsum("sij,sj->si", B, u[t]) + b
-    return PanelRun(y, u, u)
+    return PanelRun(y, u)
 
 
 def regret(J: Cost, best: Cost) -> np.ndarray:
@@ -261,67 +184,6 @@ def regret(J: Cost, best: Cost) -> np.ndarray:
 
 def _short(values: np.ndarray) -> str:
     return np.array2string(np.asarray(values), precision=3, threshold=4, edgeitems=2)
-
-
-def figures(
-    panel: Panel, run: PanelRun, *, limits: tuple[np.ndarray, np.ndarray], band: float, sample_time_s: float
-) -> Figures:
-    """What an engineer reads off a run. Settled: the mean error over the last third, of the worst zone.
-    Settling: the first time after which every zone stays within `band` °C of its reference. Overshoot: past
-    the reference, in the direction of the step. At limits: share of (input, step) with a command outside."""
-    error = run.y - panel.r
-    late = error[2 * len(error) // 3 :].mean(axis=0)
-    outside = (np.abs(error) > band).any(axis=2)
-    last = len(outside) - outside[::-1].argmax(axis=0)
-    settling = np.where(outside.any(axis=0), last, 0).astype(float)
-    settling[outside[-1]] = np.nan
-    past = np.where(panel.r - run.y[0] >= 0, 1.0, -1.0) * error
-    beyond = (run.command < limits[0]) | (run.command > limits[1])
-    return Figures(
-        tracking_degC=np.sqrt((error**2).mean(axis=(0, 2))),
-        effort_percent=np.sqrt((run.u**2).mean(axis=(0, 2))),
-        settled_error_degC=np.abs(late).max(axis=1),
-        settled_zone=np.abs(late).argmax(axis=1),
-        settling_s=settling * sample_time_s,
-        overshoot_degC=np.maximum(past.max(axis=(0, 2)), 0.0),
-        at_limits_percent=100.0 * beyond.mean(axis=(0, 2)),
-        input_low_percent=run.u.min(axis=(0, 2)),
-        input_high_percent=run.u.max(axis=(0, 2)),
-    )
-
-
-class Allowance(NamedTuple):
-    """What the engineering cost counts as one: seconds of settling, °C of overshoot and of settled error,
-    percent of commands outside the limits and of effort."""
-
-    settling_s: float
-    overshoot_degC: float
-    settled_error_degC: float
-    at_limits_percent: float
-    effort_percent: float
-    worst_case: float
-
-
-def engineering_cost(results: Figures, plant: np.ndarray, allowance: Allowance, *, longest_s: float) -> float:
-    """The declared cost of practical tuning: mean over scenarios of figure / allowance, summed, plus
-    `worst_case` times that of the worst plant.
-
-    A run that never settles counts as one that settles at the end of the panel. Raises ValueError where a run
-    leaves every scale: the candidate has failed.
-    """
-    settling = np.where(np.isnan(results.settling_s), longest_s, results.settling_s)
-    parts = [
-        settling / allowance.settling_s,
-        results.overshoot_degC / allowance.overshoot_degC,
-        results.settled_error_degC / allowance.settled_error_degC,
-        results.at_limits_percent / allowance.at_limits_percent,
-        results.effort_percent / allowance.effort_percent,
-    ]
-    each = np.sum(parts, axis=0)
-    if not (np.isfinite(each).all() and results.tracking_degC.max() < 1e4):
-        raise ValueError("the loop is unstable on a plant of the training panel")
-    worst = max(each[plant == index].mean() for index in np.unique(plant))
-    return float((each.mean() + allowance.worst_case * worst) / (1 + allowance.worst_case))
 
 
 # ---- margins

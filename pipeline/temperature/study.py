@@ -11,16 +11,7 @@ from pipeline.temperature.kernel import Kernel, exact_gains, regress, tuples, va
 from pipeline.temperature.plant import baam
 from pipeline.temperature.probing import study_probe, study_signal
 from pipeline.temperature.published import GAMMA, K_DATA, PRINTED, REFERENCE, TAU, Figures
-from pipeline.temperature.scorecard import (
-    Panel,
-    Yardstick,
-    cost,
-    feed_forward,
-    optimum,
-    panel,
-    regret,
-    simulate,
-)
+from pipeline.temperature.scorecard import Panel, Yardstick, cost, optimum, panel, regret, simulate
 from pipeline.temperature.tracking import Law, gains, observer_gain, observer_law
 from pipeline.temperature.tuning import Result, fitness
 
@@ -48,7 +39,7 @@ def study_panel(
 
 def gap(law: Law, scenarios: Panel) -> np.ndarray:
     """J / J* - 1 of each scenario, unclipped, Q = R = I."""
-    run = simulate(scenarios, law, feed_forward(scenarios, law, None), limits=None)
+    run = simulate(scenarios, law)
     return regret(cost(scenarios, run, YARDSTICK), optimum(scenarios, YARDSTICK))
 
 
@@ -93,16 +84,7 @@ def exact() -> Exact:
     K, K_r = exact_gains(plant, best, 2)
     history = window_law(K, K_r, best.k, 2)
     empty = history._replace(start_u=np.zeros_like(history.start_u))
-    J = [
-        float(
-            cost(
-                scenarios,
-                simulate(scenarios, run, feed_forward(scenarios, run, None), limits=None),
-                YARDSTICK,
-            ).J[0]
-        )
-        for run in (law, from_50)
-    ]
+    J = [float(cost(scenarios, simulate(scenarios, run), YARDSTICK).J[0]) for run in (law, from_50)]
     return Exact(
         float(optimum(scenarios, YARDSTICK).J[0]),
         float(optimum(short, YARDSTICK).J[0]),
@@ -154,7 +136,7 @@ def under_noise(
     )
     result = {}
     for name, law in zip(ROUTES, laws, strict=True):
-        run = simulate(scenarios, law, feed_forward(scenarios, law, None), limits=None)
+        run = simulate(scenarios, law)
         late = (run.y - scenarios.r)[500:]
         result[name] = (
             float(regret(cost(scenarios, run, YARDSTICK), optimum(scenarios, YARDSTICK))[0]),
@@ -274,7 +256,7 @@ def scaled_weights(scale: float = 0.4) -> ScaledWeights:
     plant, scenarios = baam(), study_panel(REFERENCE[None])
     one, other = (gains(plant, factor * np.eye(5), factor * np.eye(7), GAMMA) for factor in (1.0, scale))
     law = observer_law(plant, other, observer_gain(plant, TAU))
-    run = simulate(scenarios, law, feed_forward(scenarios, law, None), limits=None)
+    run = simulate(scenarios, law)
     J = [
         cost(scenarios, run, Yardstick(np.full(5, factor), np.full(7, factor), GAMMA)).J[0]
         for factor in (1.0, scale)

@@ -62,15 +62,11 @@ class Controller(NamedTuple):
     """One way to control. `design(q, r, integral)` gives its law for weights diag(q), diag(r); `integral` is
     the outer integrator's share of the error a step, 0 in the unclipped run. Its feasible targets are
     computed on `model`.
-
-    `own_feed_forward`: the law's own feed-forward is part of its unclipped optimum. A law that has none
-    (k = 0) aims at the feasible target there too.
     """
 
     name: str
     design: Callable[[np.ndarray, np.ndarray, float], Law]
     model: Plant
-    own_feed_forward: bool = True
 
 
 def riccati(

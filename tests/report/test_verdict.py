@@ -144,7 +144,7 @@ def test_passed_says_what_is_closest_to_its_limit_and_never_counts_drift_as_pass
     assert (verdict.state, verdict.winner) == (PASSED, "subspace_lqg")
     assert verdict.decision == "Rehearsal passed: subspace + LQG."
     assert verdict.lead == "Every rule measured so far passed on 6 simulated plants."
-    assert verdict.reason == "Closest to its limit: disk margin, 0.60 of at least 0.40."
+    assert verdict.reason == "Closest to its limit: disk margin, 0.70 of at least 0.40."
     assert verdict.remedy.startswith("Drift is not measured. The nightly job measures it and has not run.")
     calm = judge(metrics(), drift=Figure(1.0, 0.0, 2.0))
     assert calm.lead == "All rules passed on 6 simulated plants."
@@ -271,19 +271,41 @@ def test_the_deciding_case_is_told_and_the_verdict_without_it():
     )
 
 
+FRESH = {
+    "date": "2026-11-23",
+    "machine": {"outputs": ["zone_1", "zone_2"], "sample_time_s": 1.0},
+    "relearnings": 24,
+    "contestants": {"pi": {"settling": {"q90": {"low": 5.0, "median": 6.0, "high": 900.0}}}},
+    "answers": {"pair_winner": {"subspace_lqg": 20, "None": 4}},
+    "prior": {
+        "removed": {"pair_winner": {"learned_kernel": 3, "subspace_lqg": 1}},
+        "added": {"pair_winner": {"subspace_lqg": 4}},
+    },
+}
+
+
 def test_bands_over_relearnings_stand_in_where_they_were_made_and_a_turning_prior_is_said():
-    fresh = {
-        "date": "2026-11-23",
-        "contestants": {"pi": {"settling": {"q90": {"low": 5.0, "high": 9.0}}}},
-        "prior": {"removed": {"pair_winner": "learned_kernel"}, "added": {"pair_winner": "subspace_lqg"}},
-    }
-    assert relearned_band(fresh, "pi", "settling") == (5.0, 9.0, "2026-11-23")
-    assert relearned_band(fresh, "pi", "overshoot") is None
+    assert relearned_band(FRESH, "pi", "settling") == (5.0, 900.0, "2026-11-23")
+    assert relearned_band(FRESH, "pi", "overshoot") is None
     assert relearned_band(None, "pi", "settling") is None
-    assert prior_sentence(fresh, "subspace_lqg") == (
-        "The pair’s winner turns with the prior of plant uncertainty: removed, the learned kernel wins."
+    assert prior_sentence(FRESH, "subspace_lqg") == (
+        "Over 24 relearnings the pair went to subspace + LQG in 20, to nobody in 4. With the prior of plant "
+        "uncertainty removed it turns: to the learned kernel in 3 of 4."
     )
     assert prior_sentence(None, "subspace_lqg") == ""
+
+
+def test_the_page_takes_bands_of_relearnings_of_this_machine_with_their_date_and_of_no_other(project):
+    path = "benchmarks/results/temperature_relearned.json"
+    artifacts.write_json(path, FRESH)
+    report.main()
+    text = Page(TEMPERATURE).text
+    assert "its band is the range over 24 fresh relearnings of 2026-11-23" in text
+    assert "5–900" in text and "Over 24 relearnings the pair went to" in text
+    artifacts.write_json(path, FRESH | {"machine": {"outputs": ["bed"]}})
+    report.main()
+    text = Page(TEMPERATURE).text
+    assert "its band is of this one learned controller, plants resampled" in text and "5–900" not in text
 
 
 def test_without_any_figures_the_verdict_is_open_and_says_what_to_run():

@@ -36,8 +36,8 @@ def test_no_two_stages_share_a_place_and_every_arrow_points_right():
     at = workflow.places(workflow.READS)
     assert len(set(at.values())) == len(at)
     assert all(at[read][0] < at[stage][0] for stage, found in workflow.READS.items() for read in found)
-    # evaluate_temperature reads identify_plant by way of tune_weights too: one arrow is enough
-    assert workflow.reduced(workflow.READS)["evaluate_temperature"] == ["learn_kernel", "tune_weights"]
+    # evaluate_temperature reads what tune_weights reads: one arrow is enough
+    assert workflow.reduced(workflow.READS)["evaluate_temperature"] == ["tune_weights"]
 
 
 def test_a_stage_is_as_accepted_made_anew_or_not_there(project):
@@ -53,7 +53,7 @@ def test_a_stage_is_as_accepted_made_anew_or_not_there(project):
     }
     artifacts.write_json("reports/accepted.json", {"metrics": metrics, "params": {}, "hashes": hashes})
     main()
-    assert "The results of 12 of 12 stages are those of the accepted run, to the byte." in Page(PAGE_ONE).text
+    assert "The results of 14 of 14 stages are those of the accepted run, to the byte." in Page(PAGE_ONE).text
     artifacts.write_json("datasets/tune_weights/weights.json", {"contestants": {"pi": {"cost": 3.0}}})
     Path("datasets/segment_library/library.parquet").unlink()
     main()

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 
 from pipeline.temperature.baseline import NOISE_SHARE, Tuning, pairing, pi_law
-from pipeline.temperature.plant import baam, plant, spread
+from pipeline.temperature.plant import baam, plant
 from pipeline.temperature.published import REFERENCE
-from pipeline.temperature.scorecard import feed_forward, figures, panel, simulate
-from pipeline.temperature.tracking import feasible_target
 
 LOW, HIGH = np.zeros(7), np.full(7, 100.0)
 
@@ -155,27 +153,6 @@ def test_the_law_is_the_pi_equation():
     expected[pairs.inputs] = pairs.gain * (r + xi - y)
     np.testing.assert_allclose(u, expected, atol=1e-12)  # rounding at 100 percent
     np.testing.assert_allclose(law.integral, 1 / pairs.reset)  # each zone its own
-
-
-def test_the_baseline_settles_on_every_plant_of_the_spread():
-    plants = spread(baam(), input_gain=0.15, extra_heat_loss=0.005)
-    scenarios = panel(
-        plants, starts=[20.0], references=[REFERENCE], noise=[0.0], seeds=[0], steps=600, hold=0, cells=True
-    )
-    law, target = (
-        pi_law(pairing(baam(), LOW, HIGH, horizon=600), inputs=7),
-        feasible_target(baam(), REFERENCE, LOW, HIGH),
-    )
-    run = simulate(
-        scenarios,
-        law,
-        feed_forward(scenarios, law, {REFERENCE.tobytes(): (target.u, target.y)}),
-        limits=(LOW, HIGH),
-        integral_band=1.0,
-    )
-    results = figures(scenarios, run, limits=(LOW, HIGH), band=1.0, sample_time_s=1.0)
-    assert results.settled_error_degC.max() < 1.0
-    assert not np.isnan(results.settling_s).any()
 
 
 def test_an_output_that_no_free_input_moves_is_refused():

@@ -5,11 +5,15 @@ import sys
 import numpy as np
 import pandas
 import pytest
+import yaml
 
 from pipeline import cli
+from pipeline.store import artifacts, params
 from pipeline.temperature import baseline, experiment, forecast, tracking
 from pipeline.temperature.experiment import Limits, Names, Wish
 from pipeline.temperature.plant import hold_output, plant, simulate
+from pipeline.temperature.workflow import generate_probing, tables
+from pipeline.temperature.workflow.settings import GenerateProbing, Plant, Tracking
 from tests.temperature.test_propose_params import tree  # noqa: F401  the params files as shipped
 
 DOUBT = forecast.Doubt(0.15, 8.0, 1)
@@ -174,6 +178,55 @@ def test_an_amplitude_that_teaches_nothing_is_not_written(heated):
     noisy = noisy._replace(band=forecast.Band(np.array([30.0]), np.array([0.1])))
     tried = experiment.design(noisy, wish(200.0, samples=120), limits(0.0, 320.0), np.random.default_rng(1))
     assert not tried.written and "would leave its gain unknown" in tried.reason
+
+
+def test_without_declared_limits_nothing_is_written_and_the_reason_says_what_to_declare(tree):  # noqa: F811
+    text = (tree / "params.yaml").read_text().replace("reference: 150, low: 0, high: 250", "reference: 150")
+    (tree / "params.yaml").write_text(text)
+    loaded = [
+        params.load(model, section)
+        for model, section in (
+            (GenerateProbing, "generate_probing"),
+            (Plant, "plant"),
+            (Tracking, "tracking"),
+        )
+    ]
+    made = generate_probing.designed(*loaded, [], "no record is opened")
+    assert not made.commands and not made.dither
+    for key in ("next_experiment", "closed_loop"):
+        assert made.metrics[key]["reason"] == "declare low and high of sensor_1 under plant.outputs"
+
+
+def test_a_machine_without_an_input_for_each_output_is_offered_no_dither_and_told_why(tree):  # noqa: F811
+    sections = yaml.safe_load((tree / "params.yaml").read_text())
+    sections["plant"]["inputs"] = sections["plant"]["inputs"][:1]
+    sections["plant"]["outputs"] = [
+        {"name": f"zone_{k}", "unit": "degC", "reference": 60, "low": 0, "high": 150} for k in (1, 2)
+    ]
+    (tree / "params.yaml").write_text(yaml.safe_dump(sections))
+    machine = params.load(Plant, "plant")
+    A = np.diag([0.98, 0.99])
+    two = plant(A, [[0.02], [0.01]], np.eye(2), b=(np.eye(2) - A) @ np.full(2, ROOM))
+    u = 30 + 5 * np.repeat(np.random.default_rng(0).choice([-1.0, 1.0], (12, 1)), 50, axis=0)
+    y = simulate(two, u, hold_output(two, np.full(2, 55.0))[0])[1]
+    y += 0.05 * np.random.default_rng(1).standard_normal(y.shape)
+    columns = {
+        "recording": ["rig"] * len(u),
+        "segment": np.zeros(len(u), int),
+        "time_s": np.arange(len(u)) * 1.0,
+    }
+    for name, values in zip(("heater_1", "zone_1", "zone_2"), (u[:, 0], *y.T), strict=True):
+        columns |= {name: values, f"{name}_masked": np.zeros(len(u), bool)}
+    artifacts.write_table(tree / "record.parquet", tables.record(machine.inputs, machine.outputs), columns)
+    settings = params.load(GenerateProbing, "generate_probing")
+    tracking_section = params.load(Tracking, "tracking")
+    made = generate_probing.designed(
+        settings, machine, tracking_section, [two, two], str(tree / "record.parquet")
+    )
+    assert made.metrics["next_experiment"]["written"], made.metrics["next_experiment"]["reason"]
+    assert list(made.commands) == ["time_s", "heater_1"] and not made.dither
+    assert "PI needs an input for each of the 2 outputs" in made.metrics["closed_loop"]["reason"]
+    artifacts.write_metrics("generate_probing", made.metrics)  # every figure is one that JSON knows
 
 
 # ---- worth playing

@@ -19,7 +19,6 @@ from pipeline.temperature.plant import (
     observability,
     plant,
     simulate,
-    spread,
     strictly_proper,
 )
 
@@ -138,15 +137,6 @@ def test_the_holding_input_of_an_output_rests_there_and_is_the_smallest(machine)
 def test_an_integrator_holds_its_output_too():
     x, u = hold_output(plant([[1.0]], [[2.0]], [[1.0]]), np.array([150.0]))
     np.testing.assert_allclose([x[0], u[0]], [150.0, 0.0], atol=1e-10)  # rounding at 150 °C
-
-
-def test_the_declared_spread_is_each_column_of_B_both_ways_and_one_more_loss():
-    family = spread(baam(), input_gain=0.15, extra_heat_loss=0.005)
-    assert len(family) == 1 + 2 * 7 + 1
-    np.testing.assert_allclose(family[5].B[:, 2], 0.85 * baam().B[:, 2])
-    np.testing.assert_allclose(family[6].B[:, 2], 1.15 * baam().B[:, 2])
-    np.testing.assert_array_equal(np.delete(family[6].B, 2, axis=1), np.delete(baam().B, 2, axis=1))
-    np.testing.assert_array_equal(family[-1].A, baam().A - 0.005 * np.eye(6))
 
 
 def test_stored_plants_come_back_as_they_were():

@@ -3,14 +3,19 @@
 import numpy as np
 import pytest
 
+from pipeline.temperature import panel
+from pipeline.temperature.controller import Limits, Rest, aim, constant, deployed
 from pipeline.temperature.plant import Plant
 from pipeline.temperature.printer_pid import HeaterPid, controller, law
-from pipeline.temperature.scorecard import Panel, closed_loop, disturbances, law_response, panel, simulate
+from pipeline.temperature.scorecard import closed_loop, law_response
 
 BED = HeaterPid(input=1, output=0, Kp=21.2, Ki=0.30, Kd=372.0, most_percent=100.0, smooth_s=1.0)
 HOT = HeaterPid(input=0, output=1, Kp=8.7, Ki=0.42, Kd=44.7, most_percent=100.0, smooth_s=1.0)
 LIMITS = np.zeros(2), np.full(2, 100.0)
+ANY_RATE, UNLIMITED = np.full(2, np.inf), Limits(np.full(2, -np.inf), np.full(2, np.inf), np.full(2, np.inf))
 AMBIENT = 24.0
+# it aims at no target, so that where the machine would rest says nothing to it
+NOWHERE = Rest(np.full((2, 1), np.nan), np.full((2, 1), np.nan), np.full(2, np.nan), ())
 
 
 def heaters(sample_time_s: float) -> Plant:
@@ -59,30 +64,42 @@ class Klipper:
         return bounded
 
 
-def warm_up(machine: Plant, *, noise: float, steps: int = 900) -> Panel:
-    return panel(
-        [machine],
-        starts=[40.0],
-        references=[[60.0, 200.0]],
-        noise=[noise],
-        seeds=[3],
+def warm_up(machine: Plant, *, noise: float, steps: int = 900, to=(60.0, 200.0)) -> panel.Cases:
+    """From a hold at 40 °C, of which the law sees one sample."""
+    questions = panel.Questions(np.full((1, 2), 40.0), np.array([to]), None, None, None)
+    return panel.asked(
+        [panel.delayed(machine, late=False)],
+        questions,
+        noise=np.full(2, noise),
+        seed=3,
         steps=steps,
-        hold=0,
+        hold=1,
         cells=False,
     )
 
 
-def by_the_formula(cases: Panel, sample_time_s: float, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Temperatures and duties (steps, 2) under Klipper's own words, from the hold of the panel."""
-    machine, x, y, u = cases.plants[0], cases.x0[0], [], []
+def run_of(cases: panel.Cases, made, limits: Limits) -> panel.Rollout:
+    aims = [aim(made, NOWHERE, reference) for reference in (*cases.references, constant(cases.starts[0]))]
+    return panel.rolled_out(deployed(made, limits, integral_limit=1.0), cases, aims)
+
+
+def by_the_formula(
+    cases: panel.Cases, sample_time_s: float, noise: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Temperatures and duties (steps, 2) under Klipper's own words, from the hold of the panel; noise (1 +
+    steps, 2)."""
+    machine, x, y, u, r = cases.plants[0], cases.x0[0], [], [], cases.references[0].H[:, 0]
     first = machine.C @ x + noise[0]
     pids = {pid.input: Klipper(pid, first[pid.output], cases.u0[0][pid.input]) for pid in (BED, HOT)}
+    for pid in pids.values():
+        # the sample of the hold is once more the one before the first
+        pid.slope(first[pid.pid.output], sample_time_s)
     for t in range(cases.steps):
         y.append(machine.C @ x)
-        measured, duty = y[-1] + noise[t], np.zeros(2)
+        measured, duty = y[-1] + noise[1 + t], np.zeros(2)
         for i, heater in pids.items():
             at = heater.pid.output
-            duty[i] = heater.update(measured[at], cases.r[0][at], sample_time_s)
+            duty[i] = heater.update(measured[at], r[at], sample_time_s)
         u.append(duty)
         x = machine.A @ x + machine.B @ duty + machine.b
     return np.array(y), np.array(u)
@@ -92,14 +109,8 @@ def by_the_formula(cases: Panel, sample_time_s: float, noise: np.ndarray) -> tup
 @pytest.mark.parametrize("noise", [0.0, 0.1])
 def test_the_law_warms_the_heaters_as_klippers_formula_does(sample_time_s, noise):
     cases = warm_up(heaters(sample_time_s), noise=noise)
-    run = simulate(
-        cases,
-        law((BED, HOT), sample_time_s=sample_time_s),
-        np.zeros((1, 2)),
-        limits=LIMITS,
-        integral_band=1.0,
-    )
-    y, u = by_the_formula(cases, sample_time_s, disturbances(cases)[:, 0])
+    run = run_of(cases, law((BED, HOT), sample_time_s=sample_time_s), Limits(*LIMITS, ANY_RATE))
+    y, u = by_the_formula(cases, sample_time_s, panel.noise_of(cases)[:, 0])
     assert (u == 100).mean() > 0.05  # the way up is at the limit
     # rounding, some 1e-12 a step, over 900 steps of a loop that forgets
     np.testing.assert_allclose(run.u[:, 0], u, atol=1e-7)
@@ -109,9 +120,9 @@ def test_the_law_warms_the_heaters_as_klippers_formula_does(sample_time_s, noise
 def test_where_klipper_holds_the_integral_before_the_duty_and_we_after_it_they_part_by_little():
     """A heater too weak for its target: its integral goes up to its limit."""
     machine = heaters(0.9)
-    cases = warm_up(machine, noise=0.0)._replace(r=np.array([[140.0, 200.0]]))
-    run = simulate(cases, law((BED, HOT), sample_time_s=0.9), np.zeros((1, 2)), limits=LIMITS)
-    y, _ = by_the_formula(cases, 0.9, np.zeros((cases.steps, 2)))
+    cases = warm_up(machine, noise=0.0, to=(140.0, 200.0))
+    run = run_of(cases, law((BED, HOT), sample_time_s=0.9), Limits(*LIMITS, ANY_RATE))
+    y, _ = by_the_formula(cases, 0.9, np.zeros((1 + cases.steps, 2)))
     np.testing.assert_allclose(run.y[:, 0], y, atol=0.1)  # a tenth of the band that counts as settled
 
 
@@ -150,7 +161,7 @@ def test_without_limits_the_errors_obey_the_characteristic_polynomial_of_the_clo
     """Cayley and Hamilton: what the margins are computed on is what runs."""
     machine, made = heaters(1.0), law((BED, HOT), sample_time_s=1.0)
     polynomial = np.poly(closed_loop(machine, made))
-    run = simulate(warm_up(machine, noise=0.0, steps=300), made, np.zeros((1, 2)), limits=None)
+    run = run_of(warm_up(machine, noise=0.0, steps=300), made, UNLIMITED)
     for error in (run.y[:, 0] - [60, 200]).T:
         # rounding of errors up to 160 °C under coefficients up to 30
         assert abs(np.convolve(error, polynomial, mode="valid")).max() < 1e-8

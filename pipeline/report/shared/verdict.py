@@ -17,7 +17,7 @@ UNJUDGED = "not applicable"
 
 class ReportRules(params.Section):
     """Section `report`: what a controller must hold to be ready; of the temperature loop at the 90 %
-    quantile of all cases, margins on the worst plant. The comparison resolves settling_s where it is
+    quantile of all cases, margins on the median plant. The comparison resolves settling_s where it is
     null."""
 
     settled_error_degC: float = Field(gt=0, le=1000)

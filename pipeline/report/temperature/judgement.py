@@ -8,7 +8,7 @@ from typing import NamedTuple
 from pipeline.report.identification.model import UNTRUSTED, trust
 from pipeline.report.shared.difference import Difference, Move, difference, moves
 from pipeline.report.shared.digits import count
-from pipeline.report.shared.sources import Sources, lookup
+from pipeline.report.shared.sources import Sources
 from pipeline.report.shared.verdict import OPEN, PASSED, Answers, Figure, Question, Verdict
 from pipeline.report.temperature.answers import comparison, of_contestant
 from pipeline.report.temperature.contestants import YARDSTICKS, heading, kind
@@ -99,8 +99,7 @@ def incumbent_of(sources: Sources) -> str:
     """The contestant that the accepted run of this machine chose; "" where it chose none."""
     if not isinstance(sources.accepted, dict) or sources.another_machine:
         return ""
-    winner = lookup(sources.accepted, "metrics.report.verdict.winner")
-    return winner if isinstance(winner, str) else ""
+    return str(sources.accepted.get("winner") or "")
 
 
 def trust_first(verdict: Verdict, model: Verdict) -> Verdict:

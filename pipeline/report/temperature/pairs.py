@@ -117,13 +117,33 @@ def relearned_band(relearned: Any, name: str, figure: str) -> RelearnedBand | No
 
 
 def prior_sentence(relearned: Any, winner: str | None) -> str:
-    """Where the prior of plant uncertainty, removed or added for all, turns the pair's winner."""
-    turned = []
+    """How the pair ended over the relearnings, and where the prior of plant uncertainty, removed or added for
+    all, turns its winner; "" without relearnings."""
+    sentences = []
+    counts = _winners(entry(relearned, "answers", "pair_winner"))
+    if counts:
+        shares = [f"{_who(name)} in {number(times, 0)}" for name, times in counts.items()]
+        runs = sum(counts.values())
+        sentences.append(f"Over {number(runs, 0)} relearnings the pair went to {', to '.join(shares)}.")
     for change in ("removed", "added"):
-        result = entry(relearned, "prior", change)
-        if isinstance(result, Mapping) and "pair_winner" in result and result["pair_winner"] != winner:
-            other = result["pair_winner"]
-            turned.append(f"{change}, {in_a_sentence(other) if other else 'nobody'} wins")
-    if not turned:
-        return ""
-    return f"The pair’s winner turns with the prior of plant uncertainty: {', '.join(turned)}."
+        counts = _winners(entry(relearned, "prior", change, "pair_winner"))
+        mine = winner or str(None)
+        turned = {name: times for name, times in counts.items() if name != mine}
+        if turned and sum(turned.values()) > counts.get(mine, 0):
+            shares = [f"{_who(name)} in {number(times, 0)}" for name, times in turned.items()]
+            sentences.append(
+                f"With the prior of plant uncertainty {change} it turns: to {', to '.join(shares)} of "
+                f"{number(sum(counts.values()), 0)}."
+            )
+    return " ".join(sentences)
+
+
+def _winners(counts: Any) -> dict[str, int]:
+    """{winner: times}; "None" stands for no difference."""
+    if not isinstance(counts, Mapping):
+        return {}
+    return {str(name): times for name, times in counts.items() if isinstance(times, int)}
+
+
+def _who(name: str) -> str:
+    return "nobody" if name == str(None) else in_a_sentence(name)

@@ -95,7 +95,7 @@ def _caption(sources: Sources) -> str:
     compared = comparison(sources.metrics)
     date = relearned_date(sources)
     bands = (
-        f"its band is over fresh relearnings of {date}"
+        f"its band is the range over {entry(sources.relearned, 'relearnings')} fresh relearnings of {date}"
         if date
         else "its band is of this one learned controller, plants resampled"
     )
@@ -124,8 +124,7 @@ def relearned_date(sources: Sources) -> str:
     """The date of the relearnings, where they are of this machine; else ""."""
     if sources.recorded or not isinstance(sources.relearned, dict):
         return ""
-    outputs = sources.relearned.get("outputs")
-    if outputs is not None and outputs != [output.name for output in sources.declared.machine.outputs]:
+    if entry(sources.relearned, "machine", "outputs") != [o.name for o in sources.declared.machine.outputs]:
         return ""
     return str(sources.relearned.get("date") or "")
 
@@ -191,7 +190,7 @@ def _beside(question: Question, own: Any, places: int) -> list[str]:
     if question.key in ("disk", "delay_s"):
         worst = entry(own, "margins", question.key, "worst")
         plain = question._replace(unit="")
-        return [] if worst is None else [f"worst {worded(plain, finite(worst), places)}"]
+        return ["median plant", *([] if worst is None else [f"worst {worded(plain, finite(worst), places)}"])]
     figures = entry(own, question.key)
     if not isinstance(figures, Mapping):
         return []
@@ -308,7 +307,11 @@ def weights(sources: Sources) -> Weights:
     rows = [
         (
             heading(name),
-            "; ".join(f"{key} {_listed(value)}" for key, value in tuned[name].items() if key != "at_bound"),
+            "; ".join(
+                f"{key} {_listed(value)}"
+                for key, value in tuned[name].items()
+                if key != "at_bound" and value is not None
+            ),
         )
         for name in (*BY_NAME, *(name for name in tuned if name not in BY_NAME))
         if isinstance(tuned.get(name), Mapping)

@@ -284,7 +284,7 @@ def _passed(
     next_step = (
         "Next: a supervised trial, somebody at the machine throughout."
         if recorded
-        else "Next: record your own machine; nothing is claimed about a real one."
+        else "Next: record your own machine."
     )
     return Verdict(
         LOOP,

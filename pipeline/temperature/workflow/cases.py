@@ -29,7 +29,8 @@ class Rehearsal(NamedTuple):
 class Setting(NamedTuple):
     """What all contestants share, tuned and judged: the rehearsal, the identified plant with all inputs a
     sample late, limits of inputs and outputs (low, high (p,) in °C), the governor, the integrator's limit in
-    °C, the settled window in steps, what the cost counts as one, the discount, and the sample time."""
+    °C, the settled window in steps, what the cost counts as one, the discount, the sample time, and the share
+    of the declared delay margins that is asked here (`faster`)."""
 
     rehearsal: Rehearsal
     late: plant.Plant
@@ -41,6 +42,13 @@ class Setting(NamedTuple):
     allowance: panel.Allowance
     gamma: float
     sample_time_s: float
+    faster: float
+
+
+def faster(settings: Panel, rehearsal: Rehearsal) -> float:
+    """Share of a declared delay margin that is asked of a machine: less than one of one that must settle
+    sooner than the panel's. The whole answer of a hair dryer is over within 1 s."""
+    return min((rehearsal.settling_s or settings.settling_s) / settings.settling_s, 1.0)
 
 
 def shared(
@@ -63,7 +71,8 @@ def shared(
         energy=tuning.allow_effort_percent,
         rms=tuning.allow_overshoot_degC * band,
     )
-    overshoot = tracking.governor_overshoot_degC * band
+    # nearer to a reference than its noise no forecast can tell an overshoot
+    overshoot = max(tracking.governor_overshoot_degC * band, 3 * float(rehearsal.noise.max()))
     return Setting(
         rehearsal,
         panel.delayed(family[0], late=True),
@@ -75,6 +84,7 @@ def shared(
         allowance,
         tracking.gamma,
         machine.sample_time_s,
+        faster(settings, rehearsal),
     )
 
 
@@ -186,9 +196,20 @@ def _half(
     )
 
 
+# of the recorded span, by which the ambient is varied at most where recordings do not differ by more: what
+# spans 12 °C was not recorded in a room that may be 8 °C warmer
+AMBIENT_SHARE = 0.25
+
+
 def from_record(settings: Panel, machine: Machine, family: Sequence[plant.Plant], path: str) -> Rehearsal:
     """Somebody's machine: both halves are drawn around plants of the identified family, and starts,
-    references, band, settling limit and length follow from the record."""
+    references, band, settling limit and length follow from the record.
+
+    What a plant may differ by: the spread is a bootstrap of the record, every second member for each half,
+    and around each the panel's input gains, pace and delay. The ambient differs by the panel's, at most
+    AMBIENT_SHARE of the recorded span, or by as much as recordings of the same machine were found to differ.
+    More heat is lost by a fifth of what the slowest mode loses at most.
+    """
     identified = family[0]
     u, y, recordings = record.read_recordings(path, machine.acting, machine.outputs)
     u = [a[:, : len(machine.inputs)] for a in u]
@@ -204,7 +225,12 @@ def from_record(settings: Panel, machine: Machine, family: Sequence[plant.Plant]
         machine.sample_time_s,
     )
     spread = spread_around(settings, identified)
-    spread = spread._replace(ambient_degC=max(spread.ambient_degC, float(np.max(scale.ambient_degC_spread))))
+    spread = spread._replace(
+        ambient_degC=max(
+            min(spread.ambient_degC, AMBIENT_SHARE * float(np.min(scale.high_degC - scale.low_degC))),
+            float(np.max(scale.ambient_degC_spread)),
+        )
+    )
     lower = asked.references[-1]
     swing = asked.references.mean(axis=0), asked.sinusoid.amplitude_degC, float(asked.sinusoid.period_steps)
     questions = panel.Questions(

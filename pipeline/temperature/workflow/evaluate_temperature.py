@@ -12,8 +12,8 @@ from pipeline.store import artifacts
 from pipeline.store.execution import run_all
 from pipeline.store.params import Execution
 from pipeline.temperature import comparison, controller, panel, scorecard
-from pipeline.temperature.workflow import contestants
-from pipeline.temperature.workflow.cases import Rehearsal, Setting
+from pipeline.temperature.workflow import contestants, tune_weights
+from pipeline.temperature.workflow.cases import Rehearsal, Setting, faster
 from pipeline.temperature.workflow.settings import EvaluateTemperature, Panel, TemperatureRules
 from pipeline.temperature.workflow.settings import Plant as Machine
 
@@ -30,6 +30,9 @@ CONVENTION = (
     "Q = R = I, discounted {gamma:g} a step, unclipped, without integrator and governor, from a plant at "
     "rest, noise-free, against the Riccati law of the same plant that knows the state"
 )
+
+
+KERNEL_UNDETERMINED = "the record does not determine the kernel (learn_kernel says why)"
 
 
 class JudgedContestant(NamedTuple):
@@ -69,9 +72,11 @@ def read_weights(path: str, machine: Machine) -> dict[str, dict[str, Any]]:
 
 
 def resolved(rules: TemperatureRules, panel: Panel, rehearsal: Rehearsal) -> TemperatureRules:
-    """The rules with a settling time: as declared, else as the record says, else the panel's."""
+    """The rules with a settling time: as declared, else as the record says, else the panel's; and with a
+    fast machine's delay margin (cases.faster)."""
     settling = rules.settling_s or rehearsal.settling_s or panel.settling_s
-    return rules.model_copy(update={"settling_s": settling})
+    delay_margin_s = faster(panel, rehearsal) * rules.delay_margin_s
+    return rules.model_copy(update={"settling_s": settling, "delay_margin_s": delay_margin_s})
 
 
 def designed(
@@ -85,8 +90,8 @@ def designed(
             parameter.name: weights.get(one.name, {}).get(parameter.name) for parameter in one.parameters
         }
         if None in values.values():
-            if one.name != "exact_model" or problem.truth is not None:
-                refused[one.name] = "it could not be tuned: no candidate of its search worked"
+            if reason := untuned(one, problem):
+                refused[one.name] = reason
             continue
         try:
             design = one.design(problem, values)
@@ -103,6 +108,19 @@ def designed(
             "or change its inputs in section plant of params.yaml"
         )
     return designs, refused
+
+
+def untuned(one: contestants.Contestant, problem: contestants.Problem) -> str:
+    """Why a contestant has no tuned parameters; empty where it is no contestant here."""
+    start = tune_weights.bounds(one, problem)[1]
+    try:
+        values = {parameter.name: value for parameter, value in zip(one.parameters, start, strict=True)}
+        design = one.design(problem, values)
+    except ValueError as reason:
+        return str(reason)
+    if design is None:
+        return KERNEL_UNDETERMINED if one.role == "data_driven" else ""
+    return "no candidate of its search was stable with the least disk margin of tune_weights"
 
 
 def judged(
@@ -134,7 +152,7 @@ def judged(
             for name, one in results.items()
         },
         "order": entrants,
-        "refused": {**_not_tuned(weights, problem), **refused},
+        "refused": refused,
     }
     decision = _decided(results, entrants, summary, rules, setting, settings.seed)
     summary |= decision
@@ -144,12 +162,6 @@ def judged(
         _trajectories(results, shown, setting, machine),
         summary,
     )
-
-
-def _not_tuned(weights: Mapping[str, Mapping[str, Any]], problem: contestants.Problem) -> dict[str, str]:
-    if problem.kernel is None and "learned_kernel" not in weights:
-        return {"learned_kernel": "the record does not determine the kernel (learn_kernel says why)"}
-    return {}
 
 
 def judged_one(name: str, design: contestants.Design, setting: Setting) -> tuple[str, JudgedContestant]:
@@ -204,7 +216,7 @@ def _gaps(design: contestants.Design, setting: Setting) -> np.ndarray | None:
         cases.hold,
     )
     yardstick = scorecard.Yardstick(np.ones(p), np.ones(m), setting.gamma)
-    run = scorecard.simulate(scenarios, law, scorecard.feed_forward(scenarios, law, None), limits=None)
+    run = scorecard.simulate(scenarios, law)
     J, best = scorecard.cost(scenarios, run, yardstick), scorecard.optimum(scenarios, yardstick)
     gaps = 100.0 * scorecard.regret(J, best)
     return np.where(np.isfinite(gaps) & (gaps < 1e6), gaps, np.inf)

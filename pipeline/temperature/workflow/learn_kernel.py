@@ -21,8 +21,16 @@ class Learned(NamedTuple):
     metrics: dict[str, Any]
 
 
-def learned(settings: LearnKernel, machine: Plant, tracking: Tracking, panel: Panel, path: str) -> Learned:
-    """Window and kernel of the record in `path`. Raises ValueError where it has too little to learn from."""
+COLD_SHARE = 0.1  # quantile of the recorded temperatures at which a check run starts on somebody's machine
+
+
+def learned(
+    settings: LearnKernel, machine: Plant, tracking: Tracking, panel: Panel, path: str, *, simulated: bool
+) -> Learned:
+    """Window and kernel of the record in `path`. Raises ValueError where it has too little to learn from.
+
+    Candidates are compared on a run from the panel's first training start on the `simulated` machine, and
+    from the cold end of what was recorded on another."""
     yardstick = Yardstick(
         np.full(len(machine.outputs), tracking.yardstick_q),
         np.full(len(machine.inputs), tracking.yardstick_r),
@@ -35,7 +43,8 @@ def learned(settings: LearnKernel, machine: Plant, tracking: Tracking, panel: Pa
         identification.check_inputs(u, offset=settings.offset, names=[i.name for i in machine.inputs])
         identification.check_outputs(y, names=[o.name for o in machine.outputs])
     reference = np.array([o.reference for o in machine.outputs])
-    check = CheckRun(panel.training.starts_degC[0], reference, panel.steps)
+    start = panel.training.starts_degC[0] if simulated else float(np.nanquantile(np.vstack(y), COLD_SHARE))
+    check = CheckRun(start, reference, panel.steps)
     long = window.learn(
         u, y, longest=settings.longest_window, offset=settings.offset, gain_spread=settings.gain_spread
     )

@@ -1,7 +1,8 @@
 """What `beadline init` does: recordings of a new machine -> the values of the params files that fit it.
 
 The mapping and the signals are those that `inspect` proposes. Times follow from the slowest and the fastest
-output's time constant, temperatures from what was recorded.
+output's time constant, temperatures from what was recorded. What a rehearsal asks, and how fast it must
+settle, is not written: it follows from the record wherever recordings are the source (scenario_defaults).
 """
 
 import shutil
@@ -40,15 +41,10 @@ SHIPPED: dict[str, Any] = {
     "generate_probing.shortest_steps": 1,
     "ingest.mapping": {},
     "ingest.time": "",
-    "panel.steps": 600,
-    "panel.training.starts_degC": [20, 70],
-    "panel.judging.starts_degC": [20, 45, 90],
-    "panel.judging.reference_offsets_degC": [0, -15],
-    "report.settling_s": 60.0,
+    "ingest.max_gap_s": 5.0,
     "report.overshoot_degC": 5.0,
-    "tune_weights.allow_settling_s": 15.0,
 }
-FEWEST_STEPS, MOST_STEPS = 300, 3000
+GAP_SAMPLES = 3  # shortest gap of samples that ends a segment
 ABSOLUTE_ZERO_DEGC = -273.15
 # the next experiment: no move smaller or larger, in percent; samples that the stage takes
 MOVES_PERCENT, PROBING_SAMPLES = (1.0, 20.0), (300, 100_000)
@@ -130,7 +126,7 @@ def _scale(paths: Sequence[Path], proposal: Proposal) -> Scale:
     for path in paths:
         raw = read(path, sources, time=proposal.time)
         table = resample(
-            raw, sample_time_s=interval, inputs=inputs, outputs=list(y), max_gap_s=max(5.0, 3 * interval)
+            raw, sample_time_s=interval, inputs=inputs, outputs=list(y), max_gap_s=_gap_s(interval)
         )
         for segment in np.unique(table.segment):
             rows = table.segment == segment
@@ -151,22 +147,20 @@ def _scale(paths: Sequence[Path], proposal: Proposal) -> Scale:
     return Scale(constants, sample_time, float(np.min(lows)), float(np.max(highs)), rows.std(axis=0).tolist())
 
 
+def _gap_s(sample_time_s: float) -> float:
+    return max(SHIPPED["ingest.max_gap_s"], GAP_SAMPLES * sample_time_s)
+
+
 # ---- values
 
 
 def _values(proposal: Proposal, scale: Scale) -> dict[str, list[str]]:
-    """The lines of each key; times scale with the slowest output, temperatures with what was recorded."""
-    slowest, outputs = (
-        max(scale.time_constants_s.values()),
-        [s for s in proposal.signals if s.role == "output"],
-    )
-    # all outputs are held at one temperature at the start: between the coldest and their lowest reference
+    """The lines of each key."""
+    outputs = [s for s in proposal.signals if s.role == "output"]
+    # a machine that is only ever warmed by 20 °C may not overshoot by five
     coldest = max(scale.coldest_degC, ABSOLUTE_ZERO_DEGC)
     reference = min(s.reference for s in outputs if s.reference is not None)
     reach = max(min(reference, scale.hottest_degC) - coldest, 1.0)
-    starts = [round(coldest + share * reach, 1) for share in (0.1, 0.6, 0.2, 0.5, 0.9)]
-    steps = int(np.clip(round(3 * slowest / scale.sample_time_s, -1), FEWEST_STEPS, MOST_STEPS))
-    settling = float(f"{slowest:.2g}")
     input_lines, output_lines = plant_lines(proposal)
     return {
         "plant.sample_time_s": [repr(scale.sample_time_s)],
@@ -176,13 +170,8 @@ def _values(proposal: Proposal, scale: Scale) -> dict[str, list[str]]:
         **_next_experiment(scale),
         "ingest.mapping": mapping_lines(proposal),
         "ingest.time": [proposal.time or '""'],
-        "panel.steps": [str(steps)],
-        "panel.training.starts_degC": [f"[{starts[0]}, {starts[1]}]"],
-        "panel.judging.starts_degC": [f"[{starts[2]}, {starts[3]}, {starts[4]}]"],
-        "panel.judging.reference_offsets_degC": [f"[0, {round(-0.1 * reach, 1)}]"],
-        "report.settling_s": [repr(settling)],
+        "ingest.max_gap_s": [repr(_gap_s(scale.sample_time_s))],
         "report.overshoot_degC": [repr(float(f"{max(0.5, 0.05 * reach):.1g}"))],
-        "tune_weights.allow_settling_s": [repr(settling / 4)],
     }
 
 
