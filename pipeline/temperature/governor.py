@@ -122,7 +122,7 @@ def governor(
     outputs: OutputLimits,
     strength: Strength,
     *,
-    tau: float = 0.5,
+    tau: float = 0.2,
     drift: float = 0.06,
 ) -> Governor:
     """The governor of a family of plants of one order (their feed-through made a delay), for inputs of any
