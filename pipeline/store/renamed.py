@@ -29,7 +29,6 @@ PARAMETERS: dict[str, str] = {
     "evaluate_setpoint.pixels.segment_s": "evaluate_setpoint.pixels.segment_mean_s",
     "evaluate_setpoint.segment": "evaluate_setpoint.segment_mean_decisions",
     "evaluate_temperature.data_sets": "reproduce_study.data_sets",
-    "nightly.holdout.seeds": "nightly.holdout.seed",
     "panel.loss": "panel.extra_heat_loss_per_step",
     "train_agent.ours": "train_agent.belief_dqn",
     "train_agent.ours.filter.look": "train_agent.belief_dqn.filter.width_bias_std",
@@ -48,6 +47,7 @@ PARAMETERS: dict[str, str] = {
 # dotted keys that nothing reads any more -> why, as the end of a sentence
 RETIRED: dict[str, str] = {
     "evaluate_temperature.report_noise_degC": "panel.noise_degC is the one level of noise",
+    "nightly.holdout.seeds": "nightly.holdout.seed draws plants and noise",
     "panel.judging.seeds": "panel.judging.seed draws plants and noise",
     "panel.training.seeds": "panel.training.seed draws plants and noise",
     "report.gap_percent": "the gap to the optimum is shown and decides nothing",
