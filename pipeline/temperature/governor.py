@@ -105,8 +105,7 @@ SWEEPS, ROUNDS = 8, 2
 # percent by which rows are equal, or missed: one case by itself takes the same steps as among many
 EXACT = 1e-9
 # share of what the innovations told that is forgotten a step, and of the drift, and with them the observer's
-# constants: for a machine whose strongest answer has come in so many steps; a slower one is watched as much
-# longer
+# constants: for a furthest look ahead of so many steps; a machine that needs more is watched as much longer
 FORGETS, LEAK, UNHURRIED = 0.005, 1e-4, 16
 # squares of innovations beyond those of the best member from which a member does not count
 CONTRADICTED = 4.0
@@ -132,10 +131,10 @@ def governor(
     Innovations are doubted by the sensors' noise, a tenth of a degree at least. The observer takes process
     noise to come in by the inputs, sensors to be as much noisier as tau percent^2 of every input, and the
     drift w to wander a step by `drift` of what a percent of every input does at most: the same whatever the
-    units. A machine that answers more slowly is watched as much longer, by when its strongest answer peaks.
+    units. A machine that answers more slowly is watched as much longer, by the furthest instant ahead.
     """
     at, unsure = instants(family), np.maximum(outputs.margin, 0.1)
-    slower = max(_answers(family) / UNHURRIED, 1.0)
+    slower = max(at[-1] / UNHURRIED, 1.0)
     members = [
         {
             **_watching(plant, strength, tau * slower**2, drift / slower, LEAK / slower),
@@ -154,13 +153,6 @@ def governor(
         strength=strength,
         overshoot=outputs.overshoot,
     )
-
-
-def _answers(family: Sequence[Plant]) -> int:
-    """Four times the samples after which the strongest pulse response has passed its peak, of the slowest
-    member."""
-    peaks = [int(np.abs(markov_parameters(plant, LONGEST)).max(axis=(1, 2)).argmax()) for plant in family]
-    return min(4 * (1 + max(peaks)), LONGEST)
 
 
 def _near(plant: Plant, limits: Limits, overshoot: float, strength: Strength) -> np.ndarray:
