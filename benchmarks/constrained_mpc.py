@@ -142,7 +142,8 @@ def held(model: Plant, rest: np.ndarray) -> np.ndarray:
 
 def predictive(cases: panel.Cases, models: Callable[[Plant], list[Plant]]) -> dict:
     """Figures of the panel under MPC whose members for each plant are models(plant). It is told the heated
-    cells; what a member's forecast of them missed is a drift to it, a fifth of the news a step."""
+    cells; what a member's forecast of them missed is a drift to it, a fifth of the news a step, and of 1 °C
+    at most: more belongs to gains and delays."""
     y = np.empty((MPC_STEPS, len(cases.plant), 5))
     u = np.empty((MPC_STEPS, len(cases.plant), 7))
     cells = plants_of.baam().n
@@ -159,7 +160,7 @@ def predictive(cases: panel.Cases, models: Callable[[Plant], list[Plant]]) -> di
             x = truth.A @ x + truth.B @ before + truth.b
             for one, state, drift in zip(mpc.members, states, drifts, strict=True):
                 forecast = one.model.A @ state + one.model.B @ before + one.model.b + drift
-                drift[:cells] += 0.2 * (x[:cells] - forecast[:cells])
+                drift[:cells] += 0.2 * np.clip(x[:cells] - forecast[:cells], -1.0, 1.0)
     return figures_of(y, u)
 
 

@@ -29,7 +29,6 @@ PARAMETERS: dict[str, str] = {
     "evaluate_setpoint.pixels.segment_s": "evaluate_setpoint.pixels.segment_mean_s",
     "evaluate_setpoint.segment": "evaluate_setpoint.segment_mean_decisions",
     "evaluate_temperature.data_sets": "reproduce_study.data_sets",
-    "nightly.holdout.seeds": "nightly.holdout.seed",
     "panel.loss": "panel.extra_heat_loss_per_step",
     "train_agent.ours": "train_agent.belief_dqn",
     "train_agent.ours.filter.look": "train_agent.belief_dqn.filter.width_bias_std",
@@ -47,8 +46,19 @@ PARAMETERS: dict[str, str] = {
 
 # dotted keys that nothing reads any more -> why, as the end of a sentence
 RETIRED: dict[str, str] = {
+    "evaluate_temperature.report_noise_degC": "panel.noise_degC is the one level of noise",
+    "nightly.holdout.seeds": "nightly.holdout.seed draws plants and noise",
+    "panel.judging.seeds": "panel.judging.seed draws plants and noise",
+    "panel.training.seeds": "panel.training.seed draws plants and noise",
     "report.gap_percent": "the gap to the optimum is shown and decides nothing",
     "report.worst_case_gap_percent": "the rules are asked at the 90 % quantile of all cases",
+    "tune_weights.acquisition": "every contestant has the same search, expected improvement",
+    "tune_weights.q_high": "each contestant has parameters of its own (workflow/contestants.py)",
+    "tune_weights.q_low": "each contestant has parameters of its own (workflow/contestants.py)",
+    "tune_weights.r_high": "each contestant has parameters of its own (workflow/contestants.py)",
+    "tune_weights.r_low": "each contestant has parameters of its own (workflow/contestants.py)",
+    "tune_weights.tau_high": "each contestant has parameters of its own (workflow/contestants.py)",
+    "tune_weights.tau_low": "each contestant has parameters of its own (workflow/contestants.py)",
 }
 
 # (dotted key of today, old choice) -> today's choice; of parameters that are one of several words

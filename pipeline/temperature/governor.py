@@ -98,10 +98,10 @@ class Governor(NamedTuple):
     overshoot: float
 
 
-# instants ahead, and the last of them at most
-INSTANTS, LONGEST = 7, 120
-# projections over all outputs: inputs mostly move one output each, so that a few suffice
-SWEEPS = 8
+# steps ahead at most
+LONGEST = 120
+# projections over all outputs, and over both sides: inputs mostly move one output each, so that a few suffice
+SWEEPS, ROUNDS = 8, 2
 # percent by which rows are equal, or missed: one case by itself takes the same steps as among many
 EXACT = 1e-9
 # share of what the innovations told that is forgotten a step, and of the drift, and with them the observer's
@@ -166,14 +166,15 @@ def _near(plant: Plant, limits: Limits, overshoot: float, strength: Strength) ->
     return np.where(most < BARELY * overshoot, LET_GO, 1.0) * overshoot
 
 
-def instants(family: Sequence[Plant], *, longest: int = LONGEST) -> np.ndarray:
-    """Steps ahead at which the members are looked at: now, then closer together at first, up to four times
-    that after which the slowest pulse response has passed its peak, 16 at least."""
-    peak = 1 + max(
-        int(np.abs(markov_parameters(plant, longest)).max(axis=(1, 2)).argmax()) for plant in family
+def instants(family: Sequence[Plant]) -> np.ndarray:
+    """Steps ahead at which the members are looked at: now; and in ever wider steps from that at which a pulse
+    response is first at its peak, to four times that at which the last one is, 16 at least."""
+    peaks = np.concatenate(
+        [1 + np.abs(markov_parameters(plant, LONGEST)).max(axis=2).argmax(axis=0) for plant in family]
     )
-    last = min(max(4 * peak, 16), longest)
-    return np.r_[0, np.unique(np.round(np.geomspace(1, last, INSTANTS)).astype(int))]
+    last = min(max(4 * int(peaks.max()), 16), LONGEST)
+    wider = peaks.min() + np.r_[0, 2 ** np.arange(8)]
+    return np.unique(np.r_[0, wider[wider < last], last])
 
 
 def _drifting(plant: Plant, leak: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -334,14 +335,20 @@ def governed(
     floor, cap = _walls(family, now, y_star)
     per_member = (len(free), 1, *free.shape[2:])
     strongest, less = family.strength.strongest, family.strength.strongest - family.strength.weakest
-    if np.isfinite(floor).any():
-        bare = -(free - told.most[..., None] * lacks) - family.below.reshape(per_member)
-        side = _Side(bare, strongest - less * told.most, family.fall, told.counts)
-        u = -_projected(side, -u, -high, -floor)
-    if np.isfinite(cap).any():
-        bare = free - told.least[..., None] * lacks + family.above.reshape(per_member)
-        side = _Side(bare, strongest - less * told.least, family.rise, told.counts)
-        u = _projected(side, u, low, cap)
+    bare = -(free - told.most[..., None] * lacks) - family.below.reshape(per_member)
+    below = _Side(bare, strongest - less * told.most, family.fall, told.counts, -floor)
+    bare = free - told.least[..., None] * lacks + family.above.reshape(per_member)
+    above = _Side(bare, strongest - less * told.least, family.rise, told.counts, cap)
+    u, raised = _projected(below, -u, -high)
+    u, lowered = _projected(above, -u, low)
+    # where an input is lowered for one output and was raised for another, others may do what it did
+    both = np.intersect1d(raised, lowered, assume_unique=True)
+    if both.size:
+        below, above, one = below.of(both), above.of(both), u[both]
+        for _ in range(ROUNDS):
+            one = -_projected(below, -one, -high[both])[0]
+            one = _projected(above, one, low[both])[0]
+        u[both] = one
     return u
 
 
@@ -362,31 +369,33 @@ def _walls(family: Governor, now: np.ndarray, y_star: np.ndarray) -> tuple[np.nd
 
 class _Side(NamedTuple):
     """What is forecast from above, or negated from below: bare (f, s, p, h) without the command, of which
-    strength (f, s, p) times u rows (f, m, p h) is to come; members that count (f, s)."""
+    strength (f, s, p) times u rows (f, m, p h) is to come; members that count (f, s); the wall (f, s, p)."""
 
     bare: np.ndarray
     strength: np.ndarray
     rows: np.ndarray
     counts: np.ndarray
+    wall: np.ndarray
 
     def of(self, cases: np.ndarray) -> "_Side":
-        return _Side(self.bare[:, cases], self.strength[:, cases], self.rows, self.counts[:, cases])
+        bare, strength, rows, counts, wall = self
+        return _Side(bare[:, cases], strength[:, cases], rows, counts[:, cases], wall[:, cases])
 
 
-def _projected(side: _Side, u: np.ndarray, low: np.ndarray, cap: np.ndarray) -> np.ndarray:
-    """`governed` for one side: bare + strength rows u <= cap (f, s, p) where that can be kept."""
+def _projected(side: _Side, u: np.ndarray, low: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """u (s, m) of `governed` for one side: bare + strength rows u <= wall where that can be kept; and which
+    cases a row touched."""
     driven = np.matmul(u, side.rows).reshape(side.bare.shape)
-    over = side.bare + side.strength[..., None] * driven > cap[..., None]
+    over = side.bare + side.strength[..., None] * driven > side.wall[..., None]
     touched = np.flatnonzero((over.any(axis=(2, 3)) & side.counts).any(axis=0))
-    if not touched.size:
-        return u
-    u = u.copy()
-    u[touched] = _swept(side.of(touched), u[touched], low[touched], cap[:, touched])
-    return u
+    if touched.size:
+        u = u.copy()
+        u[touched] = _swept(side.of(touched), u[touched], low[touched])
+    return u, touched
 
 
-def _swept(side: _Side, u: np.ndarray, low: np.ndarray, cap: np.ndarray) -> np.ndarray:
-    """The projections of `governed` for cases that a row touches: u, low (s, m), cap (f, s, p)."""
+def _swept(side: _Side, u: np.ndarray, low: np.ndarray) -> np.ndarray:
+    """The projections of `governed` for cases that a row touches: u, low (s, m)."""
     f, s, p, h = side.bare.shape
     m = u.shape[1]
     rows = side.rows.reshape(f, m, p, h)
@@ -394,12 +403,15 @@ def _swept(side: _Side, u: np.ndarray, low: np.ndarray, cap: np.ndarray) -> np.n
     helps = np.where(rows > WEAK * np.maximum(rows, 0.0).max(axis=1, keepdims=True), rows, 0.0)
     helps = np.maximum(helps, 0.0)
     least = np.matmul(low, helps.reshape(f, m, -1)) + np.matmul(u, (rows - helps).reshape(f, m, -1))
-    room = (cap[..., None] - side.bare) / side.strength[..., None]
+    room = (side.wall[..., None] - side.bare) / side.strength[..., None]
     room = np.where(side.counts[..., None, None], np.maximum(room, least.reshape(room.shape)), np.inf)
     helps = helps.transpose(2, 0, 3, 1).reshape(p, f * h, m)
     for _ in range(SWEEPS):
-        before = u
-        for j in range(p):
+        over = np.matmul(u, side.rows).reshape(room.shape) - room
+        at_fault = np.flatnonzero((over > EXACT).any(axis=(0, 1, 3)))
+        if not at_fault.size:
+            break
+        for j in at_fault:
             excess = np.matmul(u, rows[:, :, j]) - room[:, :, j]
             excess = excess.transpose(1, 0, 2).reshape(s, f * h)
             most = excess.max(axis=1)
@@ -408,6 +420,4 @@ def _swept(side: _Side, u: np.ndarray, low: np.ndarray, cap: np.ndarray) -> np.n
             size = (direction**2).sum(axis=1)
             step = np.where(most > EXACT, most, 0.0) / np.where(size > 0, size, np.inf)
             u = np.maximum(u - step[:, None] * direction, low)
-        if np.array_equal(u, before):
-            break
     return u

@@ -132,9 +132,16 @@ def test_every_parameter_of_version_0_1_is_known_today(root):
     assert [key for key in keys(old) if key not in today] == []
 
 
+# tables whose rows are of something else today: a search for each contestant, one candidate a row
+OF_SOMETHING_ELSE = {"tuning"}
+
+
 def test_every_column_of_version_0_1_is_known_today():
     """A column that is gone for another reason would need another version's reader."""
     for table, names in artifacts.read_json(OLD / "columns.json").items():
+        if table in OF_SOMETHING_ELSE:
+            assert SCHEMAS[table].version > 2
+            continue
         new = renamed.columns(table)
         today = [column.name for column in SCHEMAS[table].columns]
         assert [new.get(name, name) for name in names if new.get(name, name) not in today] == [], table
@@ -143,7 +150,10 @@ def test_every_column_of_version_0_1_is_known_today():
 def test_an_accepted_run_of_version_0_1_is_read_under_todays_names(root, measured):
     run = artifacts.read_accepted(OLD / "accepted.json")
     assert set(keys(run["params"])) <= set(keys(params.read(root / params.FILE)))
-    assert [key for key in keys(run["metrics"]) if not has(measured, key.split("."))] == []
+    # the old comparison was of other controllers on other plants: history shows it as of its day
+    gone = ("evaluate_temperature.controllers", "tune_weights.practical")
+    lost = [key for key in keys(run["metrics"]) if not has(measured, key.split("."))]
+    assert [key for key in lost if not key.startswith(gone)] == []
     # no figure is lost or altered on the way
     old = artifacts.read_json(OLD / "accepted.json")
     assert sorted(map(str, leaves(run["metrics"]))) == sorted(map(str, leaves(old["metrics"])))

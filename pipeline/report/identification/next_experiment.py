@@ -76,9 +76,13 @@ def _taught(told: Mapping[str, Any]) -> str:
     return (
         f"It would leave gains unknown by at most {short(gain, 2)}{THIN}% and time constants by "
         f"{short(pace, 2)}{THIN}% (standard errors on first-order models, the worst of {len(errors)} pairs); "
-        f"rank {told['excitation_rank']} of {told['excitation_full_rank']}, expected gap of a controller "
-        f"{short(told['expected_gap_percent'], 2)}{THIN}%."
+        f"rank {told['excitation_rank']} of {told['excitation_full_rank']}{_gap(told)}."
     )
+
+
+def _gap(told: Mapping[str, Any]) -> str:
+    gap = told["expected_gap_percent"]
+    return "" if gap is None else f", expected gap of a controller {short(gap, 2)}{THIN}%"
 
 
 def _around(added: Mapping[str, Any]) -> str:

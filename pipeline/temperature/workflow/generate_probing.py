@@ -139,8 +139,10 @@ def _figures(
     if not tried.written or tried.lesson is None:
         return figures
     # lags that span the fastest time constant: over closer ones a slow signal repeats itself
-    lag = max(round(family.pace.fastest / EXCITED), 1)
-    rank = excitation(tried.u[::lag], EXCITED)
+    most = len(tried.u) // (len(inputs) + 1)
+    order = max(min(EXCITED, most), 1)
+    lag = max(min(round(family.pace.fastest / EXCITED), most // order), 1)
+    rank = excitation(tried.u[::lag], order)
     return figures | {
         "centre_percent": _by(inputs, tried.centre),
         "amplitude_percent": _by(inputs, tried.amplitude),
@@ -155,8 +157,17 @@ def _figures(
         "level_percent_per_band": excitation(tried.u, 1).level,
         "information": tried.lesson.information,
         "expected_error_percent": _errors(machine, family, tried.lesson),
-        "expected_gap_percent": 100 * experiment.expected_gap(family.model, tried.lesson, gamma),
+        "expected_gap_percent": _gap_percent(family, tried.lesson, gamma),
     }
+
+
+def _gap_percent(family: Family, taught: experiment.Lesson, gamma: float) -> float | None:
+    """None where no controller of the perturbed model holds the machine."""
+    try:
+        gap = experiment.expected_gap(family.model, taught, gamma)
+    except (ValueError, np.linalg.LinAlgError):
+        return None
+    return 100 * gap if np.isfinite(gap) else None
 
 
 def _errors(machine: Plant, family: Family, taught: experiment.Lesson) -> dict[str, Any]:

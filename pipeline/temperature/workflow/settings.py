@@ -129,14 +129,14 @@ class Half(Section):
 
     seed: int = Field(ge=0, le=2**31)
     plants: int = Field(ge=2, le=100_000)
-    length: float = Field(default=1.0, gt=0, le=1)
-    spread: float = Field(default=1.0, ge=0, le=4)
+    length: float = Field(gt=0, le=1)
+    spread: float = Field(ge=0, le=4)
     starts_degC: list[Degrees] = Field(min_length=1, max_length=20)
     reference_offsets_degC: Offsets = Field(min_length=1)
-    sequence_offsets_degC: Offsets = []
-    ramp_degC_per_step: float = Field(default=0.0, ge=0, le=100)
-    sinusoid_degC: float = Field(default=0.0, ge=0, le=100)
-    sinusoid_steps: int = Field(default=600, ge=4, le=1_000_000)
+    sequence_offsets_degC: Offsets
+    ramp_degC_per_step: float = Field(ge=0, le=100)
+    sinusoid_degC: float = Field(ge=0, le=100)
+    sinusoid_steps: int = Field(ge=4, le=1_000_000)
 
 
 class Panel(Section):

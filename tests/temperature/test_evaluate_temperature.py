@@ -1,0 +1,354 @@
+"""Both stages that compare contestants, on six plants of the study's machine: what is told follows from the
+rows, who cannot take part is named, and what was asked twice is answered twice alike."""
+
+import json
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from pipeline.store import artifacts, params
+from pipeline.temperature import comparison, window
+from pipeline.temperature.kernel import regress
+from pipeline.temperature.plant import baam
+from pipeline.temperature.study import data_sets
+from pipeline.temperature.workflow import cases, evaluate_temperature, learned, tables, tune_weights
+from pipeline.temperature.workflow.contestants import BY_NAME, CONTESTANTS, PAIR, Problem
+from pipeline.temperature.workflow.settings import (
+    EvaluateTemperature,
+    Panel,
+    Plant,
+    TemperatureRules,
+    Tracking,
+    TuneWeights,
+)
+
+FILE = Path(__file__).resolve().parents[2] / "params.yaml"
+# the study's machine is no printer
+EVERYBODY = [contestant.name for contestant in CONTESTANTS if contestant.name != "printer_pid"]
+
+
+def section(kind, name: str):
+    return params.load(kind, name, FILE)
+
+
+class Small(NamedTuple):
+    machine: Plant
+    setting: cases.Setting
+    problem: Problem
+
+    @property
+    def weights(self) -> dict[str, dict[str, float]]:
+        """Every parameter at its declared start."""
+        return {
+            one.name: {
+                p.name: p.start * (self.problem.effect if p.of_effect else 1.0) for p in one.parameters
+            }
+            for one in CONTESTANTS
+            if one.parameters
+        }
+
+
+@cache
+def small(inputs: int = 7) -> Small:
+    """The study's machine with its first inputs, six plants in each half, and what a record of 1,500 samples
+    of slight noise teaches."""
+    machine = section(Plant, "plant")
+    machine = machine.model_copy(update={"inputs": machine.inputs[:inputs]})
+    truth = baam()._replace(B=baam().B[:, :inputs], D=baam().D[:, :inputs])
+    halves = section(Panel, "panel")
+    half = {"plants": 6, "starts_degC": [120.0, 150.0], "reference_offsets_degC": [0.0]}
+    halves = halves.model_copy(
+        update={
+            "steps": 120,
+            "settled_steps": 20,
+            "judging": halves.judging.model_copy(update=half | {"sinusoid_steps": 120}),
+            "training": halves.training.model_copy(update=half | {"length": 1.0}),
+        }
+    )
+    u, _ = data_sets(np.random.default_rng(7), 1500, 1)
+    u, x, y = u[:, 0, :inputs], np.full(6, 50.0), []
+    for applied in u:
+        y.append(truth.C @ x)
+        x = truth.A @ x + truth.B @ applied
+    y = np.array(y) + 0.01 * np.random.default_rng(8).standard_normal((1500, 5))
+    long = window.learn([u], [y], longest=8, gain_spread=0.05)
+    kernel = regress(window.predicted_tuples(long, [u], [y]))
+    made = learned.Learned(truth, long, kernel, [truth])
+    tracking = section(Tracking, "tracking")
+    rehearsal = cases.declared(halves, machine, truth, truth)
+    setting = cases.shared(
+        section(TuneWeights, "tune_weights"), machine, tracking, halves, rehearsal, [truth, truth]
+    )
+    problem = learned.problem(made, tracking, setting.limits, truth, rehearsal.noise, horizon=120)
+    return Small(machine, setting, problem)
+
+
+def judged(given: Small, weights=None, *, jobs: int = 1) -> evaluate_temperature.Judged:
+    execution = params.Execution(backend="loky", jobs=jobs, scheduler="")
+    rules = evaluate_temperature.resolved(
+        section(TemperatureRules, "report"), section(Panel, "panel"), given.setting.rehearsal
+    )
+    return evaluate_temperature.judged(
+        section(EvaluateTemperature, "evaluate_temperature"),
+        given.machine,
+        given.setting,
+        given.problem,
+        given.weights if weights is None else weights,
+        rules,
+        execution,
+    )
+
+
+def written(result: evaluate_temperature.Judged, machine: Plant, folder: Path) -> dict[str, bytes]:
+    """The bytes of all files of the stage."""
+    artifacts.write_table(folder / "cases.parquet", tables.CASES, result.cases)
+    shown = tables.trajectories(machine.inputs, machine.outputs)
+    artifacts.write_table(folder / "trajectories.parquet", shown, result.trajectories)
+    artifacts.write_json(folder / "summary.json", result.summary)
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+@pytest.fixture(scope="module")
+def given():
+    return small()
+
+
+@pytest.fixture(scope="module")
+def result(given):
+    return judged(given)
+
+
+@pytest.fixture(scope="module")
+def stored(result, given, tmp_path_factory):
+    """cases.parquet and summary.json, read back."""
+    folder = tmp_path_factory.mktemp("evaluate_temperature")
+    written(result, given.machine, folder)
+    rows = artifacts.read_table(folder / "cases.parquet", tables.CASES)
+    return {name: np.array(column) for name, column in rows.items()}, json.loads(
+        (folder / "summary.json").read_text()
+    )
+
+
+def of(rows, name: str) -> dict[str, np.ndarray]:
+    mine = rows["contestant"] == name
+    return {key: column[mine] for key, column in rows.items()}
+
+
+# ---- what is told follows from the rows
+
+
+def test_every_contestant_meets_the_same_cases_and_doing_nothing_is_among_them(stored):
+    rows, summary = stored
+    assert summary["order"] == [name for name in EVERYBODY if name != "exact_model"]
+    assert list(summary["contestants"]) == EVERYBODY and summary["order"][0] == "hold"
+    shared = ("case", "plant", "kind", "start_degC")
+    first = of(rows, "hold")
+    assert len(first["case"]) == summary["cases"] == 6 * (2 + 3) and summary["plants"] == 6
+    for name in EVERYBODY:
+        for key in shared:
+            np.testing.assert_array_equal(of(rows, name)[key], first[key])
+    assert summary["contestants"]["hold"]["settling"]["q90"] is None
+
+
+@pytest.mark.parametrize("name", EVERYBODY)
+def test_the_deciding_figures_of_the_summary_are_those_of_the_rows(stored, name):
+    rows, summary = stored
+    settings, mine = section(EvaluateTemperature, "evaluate_temperature"), of(rows, name)
+    moves = np.isin(mine["kind"], ["ramp", "sinusoid"])
+    assert np.isnan(mine["settling_s"][moves]).all() and np.isnan(mine["overshoot_degC"][moves]).all()
+    for figure, column in evaluate_temperature.FIGURES.items():
+        applies = ~moves if figure in ("settling", "overshoot") else np.ones(len(moves), bool)
+        values = np.where(np.isnan(mine[column]), np.inf, mine[column])[applies]
+        told = summary["contestants"][name][figure]
+        ranked = np.sort(values)
+        middle = int(np.round((len(ranked) - 1) / 2 - 1e-9)), int(np.round((len(ranked) - 1) / 2 + 1e-9))
+        assert told["median"] in [number(ranked[place]) for place in middle], figure
+        assert told["q90"] == number(ranked[round(0.9 * (len(ranked) - 1))]), figure
+        assert told["worst"] == number(ranked[-1]), figure
+        band = comparison.banded(
+            values, mine["plant"][applies], seed=settings.seed, resamples=settings.resamples
+        )
+        assert (told["low"], told["high"]) == (number(band.low), number(band.high)), figure
+        worst = told["worst_case"]
+        at = np.flatnonzero(mine["case"] == worst["case"])[0]
+        assert number(np.where(np.isnan(mine[column]), np.inf, mine[column])[at]) == told["worst"]
+        assert (worst["plant"], worst["kind"]) == (mine["plant"][at], mine["kind"][at])
+    never = np.isnan(mine["settling_s"][~moves]).mean()
+    assert summary["contestants"][name]["never_settled_percent"] == pytest.approx(100 * never)
+
+
+def number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def without(rows, plant: int | None):
+    """{contestant: costs}, and the plant of each case, of all plants but one."""
+    first = of(rows, "hold")["plant"]
+    left = np.ones(len(first), bool) if plant is None else first != plant
+    names = [name for name in EVERYBODY if name != "exact_model"]
+    return {name: of(rows, name)["cost"][left] for name in names}, first[left]
+
+
+def test_best_pair_and_deciding_plant_follow_from_the_costs_of_the_rows(stored):
+    rows, summary = stored
+    seed, able = section(EvaluateTemperature, "evaluate_temperature").seed, summary["best_reason"]["passes"]
+    costs, plant = without(rows, None)
+    assert summary["best"] == comparison.chosen(costs, plant, able, seed=seed).best
+    pair = comparison.pair(*PAIR, costs, plant, seed=seed)._asdict()
+    assert {key: summary["pair"][key] for key in pair} == pair
+    decides = comparison.deciding_plant(costs[PAIR[0]], costs[PAIR[1]], plant)
+    assert summary["deciding"]["plant"] == decides
+    others, left = without(rows, decides)
+    assert summary["deciding"]["best_without"] == comparison.chosen(others, left, able, seed=seed).best
+    assert summary["deciding"]["pair_without"] == comparison.pair(*PAIR, others, left, seed=seed).winner
+
+
+def test_a_contestant_passes_by_its_ninety_percent_quantiles_and_breaks_a_rule_by_any_one_of_them(stored):
+    _, summary = stored
+    rules = section(TemperatureRules, "report").model_copy(update={"settling_s": 1e6, "delay_margin_s": 1e-3})
+    good = summary["contestants"]["subspace_lqg"] | {"crossings": {"cases": 0}, "margins": None}
+    good |= {name: {"q90": 0.0} for name in ("settled_error", "settling", "overshoot", "at_limits")}
+    assert evaluate_temperature.passes(good, rules)
+    for name in ("settled_error", "settling", "overshoot", "at_limits"):
+        for beyond in (1e7, None):
+            assert not evaluate_temperature.passes(good | {name: {"q90": beyond}}, rules), name
+    assert not evaluate_temperature.passes(good | {"crossings": {"cases": 1}}, rules)
+    margins = {"disk": {"median": 0.01, "worst": 0.01}, "delay_s": {"median": None, "worst": None}}
+    assert not evaluate_temperature.passes(good | {"margins": margins}, rules)
+
+
+def test_the_shown_trajectories_are_of_a_typical_and_of_the_deciding_case(stored, result, given):
+    rows, summary = stored
+    shown = {key: np.array(column) for key, column in result.trajectories.items()}
+    assert set(shown["case_name"]) == {"typical", "deciding"}
+    steps, output = given.setting.rehearsal.judging.steps, given.machine.outputs[0].name
+    assert len(shown["time_s"]) == 2 * steps * len(EVERYBODY)
+    mine = (shown["contestant"] == "subspace_lqg") & (shown["case_name"] == "deciding")
+    deciding = of(rows, "subspace_lqg")
+    at = summary["deciding"]["case"]
+    assert deciding["kind"][at] == summary["deciding"]["kind"]
+    # the mean of the first output is one of those of which the worst counts
+    late = np.abs((shown[output] - shown[f"{output}_reference"])[mine][-20:].mean())
+    assert late <= deciding["settled_error_degC"][at] + 1e-9
+    for signal in given.machine.inputs:
+        applied = shown[f"{signal.name}_applied"][mine]
+        assert applied.min() >= signal.low - 1e-9 and applied.max() <= signal.high + 1e-9
+
+
+# ---- who takes part
+
+
+def test_each_name_and_each_role_of_the_verdict_stands_once():
+    roles = [contestant.role for contestant in CONTESTANTS if contestant.role]
+    assert len(BY_NAME) == len(CONTESTANTS)
+    assert sorted(roles) == ["baseline", "data_driven", "indirect", "model_based", "yardstick"]
+
+
+def test_with_three_inputs_for_five_outputs_pi_is_refused_with_the_reason_and_the_others_go_on():
+    few = small(3)
+    weights = {name: values for name, values in few.weights.items() if name != "pi"}
+    summary = judged(few, weights).summary
+    why = "PI needs an input for each of the 5 outputs; found 3 inputs"
+    assert summary["refused"] == {"pi_simc": why, "pi": why}
+    assert summary["order"] == ["hold", "subspace_lqg", "varx_riccati", "learned_kernel"]
+
+
+def test_where_the_record_does_not_determine_the_kernel_the_pair_is_against_the_indirect_one(given):
+    without_kernel = given._replace(problem=given.problem._replace(kernel=None))
+    weights = {name: values for name, values in without_kernel.weights.items() if name != "learned_kernel"}
+    summary = judged(without_kernel, weights).summary
+    assert list(summary["refused"]) == ["learned_kernel"]
+    assert "does not determine the kernel" in summary["refused"]["learned_kernel"]
+    assert (summary["pair"]["a"], summary["pair"]["b"]) == ("subspace_lqg", "varx_riccati")
+
+
+def test_one_whose_search_never_worked_is_refused_and_the_others_go_on(given):
+    weights = {name: values for name, values in given.weights.items() if name != "varx_riccati"}
+    summary = judged(given, weights).summary
+    assert summary["refused"] == {"varx_riccati": "it could not be tuned: no candidate of its search worked"}
+    assert "varx_riccati" not in summary["contestants"] and "learned_kernel" in summary["contestants"]
+
+
+def test_where_nobody_can_be_designed_the_stage_says_so_with_each_reason(given, monkeypatch):
+    def no(problem, values):
+        raise ValueError("too short")
+
+    table = [one if one.name == "hold" else one._replace(design=no) for one in CONTESTANTS]
+    monkeypatch.setattr(evaluate_temperature.contestants, "CONTESTANTS", table)
+    sentence = "found none: .*subspace_lqg: too short; .*record the machine longer, or change its inputs"
+    with pytest.raises(ValueError, match=sentence):
+        judged(given)
+
+
+# ---- the same twice
+
+
+def test_one_job_and_two_write_the_same_bytes(given, result, tmp_path):
+    one = written(result, given.machine, tmp_path / "one")
+    two = written(judged(given, jobs=2), given.machine, tmp_path / "two")
+    assert one == two and len(one) == 3
+
+
+# ---- tune_weights
+
+
+@pytest.fixture(scope="module")
+def tuned(given):
+    return tuning_of(given)
+
+
+def tuning_of(given: Small, jobs: int = 1) -> tune_weights.Tuned:
+    settings = section(TuneWeights, "tune_weights").model_copy(
+        update={"practical_initial": 4, "practical_evaluations": 6}
+    )
+    execution = params.Execution(backend="loky", jobs=jobs, scheduler="")
+    return tune_weights.tuned(settings, given.problem, given.setting, execution)
+
+
+def test_every_contestant_is_searched_with_the_same_budget_from_its_declared_start(given, tuned):
+    rows = {key: np.array(column) for key, column in tuned.history.items()}
+    searched = [one.name for one in CONTESTANTS if one.parameters]
+    assert list(tuned.weights["contestants"]) == searched
+    for name in searched:
+        mine = rows["contestant"] == name
+        np.testing.assert_array_equal(rows["evaluation"][mine], np.arange(1, 7))
+        assert rows["chosen"][mine].sum() == 1
+        start = ", ".join(f"{key} {value:.4g}" for key, value in given.weights[name].items())
+        assert rows["values"][mine][0] == start
+        assert tuned.weights["contestants"][name]["evaluations"] == 6
+
+
+def test_a_chosen_candidate_is_no_dearer_than_the_start_and_lies_within_its_bounds(given, tuned):
+    for name, values in tuned.weights["contestants"].items():
+        if values["cost_at_start"] is not None:
+            assert values["cost"] <= values["cost_at_start"], name
+        low, _, high = tune_weights.bounds(BY_NAME[name], given.problem)
+        theta = np.array([values[p.name] for p in BY_NAME[name].parameters])
+        assert (theta >= low * (1 - 1e-12)).all() and (theta <= high * (1 + 1e-12)).all(), name
+        share = np.log(theta / low) / np.log(high / low)
+        beside = [p.name for p, place in zip(BY_NAME[name].parameters, share, strict=True)
+                  if min(place, 1 - place) <= tune_weights.AT_BOUND]  # fmt: skip
+        assert values["at_bound"] == beside, name
+
+
+def test_what_was_tuned_is_what_is_judged(given, tuned):
+    summary = judged(given, tuned.weights["contestants"]).summary
+    for name, values in tuned.weights["contestants"].items():
+        told = summary["contestants"][name]["tuned"]
+        assert told == {p.name: values[p.name] for p in BY_NAME[name].parameters}
+
+
+def test_a_contestant_that_cannot_be_designed_is_refused_by_its_search_and_the_others_are_tuned():
+    made = tuning_of(small(3))
+    assert made.metrics["refused"] == {"pi": "PI needs an input for each of the 5 outputs; found 3 inputs"}
+    assert {"subspace_lqg", "varx_riccati"} <= made.weights["contestants"].keys()
+
+
+def test_one_of_whose_candidates_none_works_is_refused_with_the_last_reason_and_the_others_are_tuned(given):
+    shaky = given.problem.window._replace(Theta=-given.problem.window.Theta)
+    made = tuning_of(given._replace(problem=given.problem._replace(window=shaky)))
+    assert "the disk margin is" in made.metrics["refused"]["varx_riccati"]
+    assert {"pi", "subspace_lqg"} <= made.weights["contestants"].keys()
