@@ -52,13 +52,13 @@ KIT = {
             ("T2", "T2_C", "degC"),
         )
     },
-    "panel.training.starts_degC": [30],
-    "panel.judging": {"starts_degC": [25, 40], "reference_offsets_degC": [0, -5], "seeds": [1]},
 }
 # fewer of the same, so that the test is short
 SMALL = {
-    "panel.noise_degC": [0, 0.1],
-    "panel.steps": 600,
+    "panel.judging.plants": 12,
+    "panel.training.plants": 4,
+    "tune_weights.practical_initial": 6,
+    "tune_weights.practical_evaluations": 10,
     "reproduce_study.initial": 6,
     "reproduce_study.evaluations": 12,
     "reproduce_study.data_sets": 1,
@@ -222,20 +222,37 @@ def test_the_kernel_is_learned_or_refused_with_its_reason(kit):
     assert figures["window"] >= 1
 
 
-def test_every_controller_is_judged_on_the_spread_and_the_model_based_and_the_window_hold(kit):
-    controllers = metrics(kit, "evaluate_temperature")["controllers"]
-    assert {"model_based", "window", "baseline"} <= set(controllers)
-    assert "exact_model" not in controllers  # nobody knows the true plant
-    for name in ("model_based", "window"):
-        judged = controllers[name]
-        assert judged["stable_plants"] == {"count": 20, "of": 20}
-        assert judged["gap_percent"]["median"] < 5  # the verdict's own rule (report.gap_percent)
-        assert (
-            judged["settled_error_degC"]["median"] < 2
-        )  # twice panel.band_degC: 12 candidates are no tuning yet
-        assert judged["disk"]["worst"] > 0
-    # the simple rule must at least push the right way: against the nominal model's early answer it did not
-    assert controllers["baseline"]["disk"]["median"] > 0
+def test_every_contestant_is_judged_as_deployed_on_plants_of_the_record(kit):
+    figures = metrics(kit, "evaluate_temperature")
+    judged = figures["contestants"]
+    assert {"hold", "pi_simc", "pi", "subspace_lqg", "varx_riccati"} <= set(judged)
+    assert "exact_model" not in judged  # nobody knows the true plant
+    assert not figures["simulated"] and figures["plants"] == 12
+    for name in ("pi_simc", "subspace_lqg", "varx_riccati"):
+        # half of what the rule lets a controller miss at its 90 % quantile: 10 candidates are no tuning yet
+        assert judged[name]["settled_error"]["median"] < 0.25
+        assert judged[name]["margins"]["disk"]["median"] > 0
+
+
+def test_the_kit_is_judged_by_its_own_time_and_noise(kit):
+    """A kit that needs 200 s for one time constant is not held to the 60 s of the study's machine."""
+    figures = metrics(kit, "evaluate_temperature")
+    assert figures["limits"]["source"] == "from the record"
+    assert 300 < figures["limits"]["settling_s"] < 1200  # three of its time constants of some 200 s
+    assert figures["band_degC"] < 0.5  # three deviations of a sensor that is right to 0.1 °C
+    assert figures["infeasible"] == []
+
+
+def test_no_figure_of_a_verdict_is_beyond_meaning(kit):
+    def numbers(part):
+        if isinstance(part, dict):
+            return [number for value in part.values() for number in numbers(value)]
+        if isinstance(part, list):
+            return [number for value in part for number in numbers(value)]
+        return [part] if isinstance(part, (int, float)) else []
+
+    # nothing here is a million of its unit; what has no end is null
+    assert max(abs(number) for number in numbers(metrics(kit, "evaluate_temperature"))) < 1e6
 
 
 # ---- what the reader sees
@@ -260,11 +277,7 @@ def test_the_pages_show_the_spike_the_signals_and_nothing_from_the_network(kit):
 @pytest.mark.slow
 def test_a_folder_with_a_gap_a_missing_input_and_a_broken_file_goes_all_the_way(root, shared, tmp_path):
     header, *lines = shared(RECORD).read_text().splitlines()
-    tree = project(
-        root,
-        tmp_path / "tree",
-        KIT | {"identify_plant.refinement": "validated", "reproduce_study.data_sets": 1},
-    )
+    tree = project(root, tmp_path / "tree", KIT | SMALL | {"identify_plant.refinement": "validated"})
     raw = tree / "datasets/raw/temperature"
     missing = lines[2500].split(",")
     missing[1] = ""
@@ -288,8 +301,8 @@ def test_a_folder_with_a_gap_a_missing_input_and_a_broken_file_goes_all_the_way(
     assert (
         min(figures["fit_holdout"].values()) > 50
     )  # less record than the whole, in pieces; half of the movement is a model still
-    judged = metrics(tree, "evaluate_temperature")["controllers"]["model_based"]
-    assert judged["disk"]["median"] > 0
-    # it holds on its own kind of plant and on nine of ten of a bootstrap family's
-    # members, whose tails no controller was promised to hold
-    assert judged["stable_plants"]["count"] >= 18
+    judged = metrics(tree, "evaluate_temperature")["contestants"]["subspace_lqg"]
+    assert judged["margins"]["disk"]["median"] > 0
+    # it holds on its own kind of plant and on three of four around a bootstrap family's members, whose tails
+    # no controller was promised to hold
+    assert judged["stable"]["count"] >= 0.75 * judged["stable"]["of"]
