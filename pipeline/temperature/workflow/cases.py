@@ -274,9 +274,18 @@ def from_record(
     training = panel.Questions(
         middle, asked.references.mean(axis=0, keepdims=True), None, None, asked.sequence
     )
-    made = {"cells": False, "steps": asked.steps, "spread": spread, "limits": limits}
     judging, trained = (
-        _half(settings, half, around, question, scale.noise_degC, **made)
+        _half(
+            settings,
+            half,
+            around,
+            question,
+            scale.noise_degC,
+            cells=False,
+            steps=asked.steps,
+            spread=spread,
+            limits=limits,
+        )
         for half, around, question in (
             (settings.judging, family[1::2], questions),
             (settings.training, family[::2], training),
