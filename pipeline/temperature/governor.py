@@ -98,10 +98,10 @@ class Governor(NamedTuple):
     overshoot: float
 
 
-# instants ahead, and the last of them at most
-INSTANTS, LONGEST = 7, 120
+# steps ahead at most
+LONGEST = 120
 # projections over all outputs, and over both sides: inputs mostly move one output each, so that a few suffice
-SWEEPS, ROUNDS = 8, 3
+SWEEPS, ROUNDS = 8, 2
 # percent by which rows are equal, or missed: one case by itself takes the same steps as among many
 EXACT = 1e-9
 # share of what the innovations told that is forgotten a step, and of the drift, and with them the observer's
@@ -166,14 +166,15 @@ def _near(plant: Plant, limits: Limits, overshoot: float, strength: Strength) ->
     return np.where(most < BARELY * overshoot, LET_GO, 1.0) * overshoot
 
 
-def instants(family: Sequence[Plant], *, longest: int = LONGEST) -> np.ndarray:
-    """Steps ahead at which the members are looked at: now, then closer together at first, up to four times
-    that after which the slowest pulse response has passed its peak, 16 at least."""
-    peak = 1 + max(
-        int(np.abs(markov_parameters(plant, longest)).max(axis=(1, 2)).argmax()) for plant in family
+def instants(family: Sequence[Plant]) -> np.ndarray:
+    """Steps ahead at which the members are looked at: now; and in ever wider steps from that at which a pulse
+    response is first at its peak, to four times that at which the last one is, 16 at least."""
+    peaks = np.concatenate(
+        [1 + np.abs(markov_parameters(plant, LONGEST)).max(axis=2).argmax(axis=0) for plant in family]
     )
-    last = min(max(4 * peak, 16), longest)
-    return np.r_[0, np.unique(np.round(np.geomspace(1, last, INSTANTS)).astype(int))]
+    last = min(max(4 * int(peaks.max()), 16), LONGEST)
+    wider = peaks.min() + np.r_[0, 2 ** np.arange(8)]
+    return np.unique(np.r_[0, wider[wider < last], last])
 
 
 def _drifting(plant: Plant, leak: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -406,8 +407,11 @@ def _swept(side: _Side, u: np.ndarray, low: np.ndarray) -> np.ndarray:
     room = np.where(side.counts[..., None, None], np.maximum(room, least.reshape(room.shape)), np.inf)
     helps = helps.transpose(2, 0, 3, 1).reshape(p, f * h, m)
     for _ in range(SWEEPS):
-        before = u
-        for j in range(p):
+        over = np.matmul(u, side.rows).reshape(room.shape) - room
+        at_fault = np.flatnonzero((over > EXACT).any(axis=(0, 1, 3)))
+        if not at_fault.size:
+            break
+        for j in at_fault:
             excess = np.matmul(u, rows[:, :, j]) - room[:, :, j]
             excess = excess.transpose(1, 0, 2).reshape(s, f * h)
             most = excess.max(axis=1)
@@ -416,6 +420,4 @@ def _swept(side: _Side, u: np.ndarray, low: np.ndarray) -> np.ndarray:
             size = (direction**2).sum(axis=1)
             step = np.where(most > EXACT, most, 0.0) / np.where(size > 0, size, np.inf)
             u = np.maximum(u - step[:, None] * direction, low)
-        if np.array_equal(u, before):
-            break
     return u

@@ -31,7 +31,7 @@ from pipeline.temperature.governor import Strength
 from pipeline.temperature.plant import Plant, hold_output, hold_state
 from pipeline.temperature.tracking import Law, reached_state
 
-KINDS = ("constant", "ramp", "sinusoid", "sequence")
+RESTLESS = 1e-8  # reciprocal condition of I - A below which a plant has no rest of its own
 
 
 class Spread(NamedTuple):
@@ -201,9 +201,10 @@ def asked(
     steps: int,
     hold: int,
     cells: bool,
+    limits: Limits | None = None,
 ) -> Cases:
     """The questions put to every plant. Where states are `cells`, a start holds every cell at one
-    temperature, otherwise every output; noise (p,) in °C."""
+    temperature, otherwise every output, or what comes nearest within `limits`; noise (p,) in °C."""
     references = [constant(r) for r in questions.constants]
     rows = [("constant", a, [j]) for a in range(len(questions.starts)) for j in range(len(references))]
     middle = len(questions.starts) // 2
@@ -224,7 +225,7 @@ def asked(
     x0, u0 = [], []
     for plant in plants:
         for _, a, _ in rows:
-            state, held = _held(plant, questions.starts[a], cells)
+            state, held = _held(plant, questions.starts[a], cells, limits)
             x0.append(state)
             u0.append(held)
     count = len(plants)
@@ -247,8 +248,9 @@ def asked(
     )
 
 
-def _held(plant: Plant, y: np.ndarray, cells: bool) -> tuple[np.ndarray, np.ndarray]:
-    """State and input of a plant of `delayed` held at outputs y (p,), or at cells of y[0] °C."""
+def _held(plant: Plant, y: np.ndarray, cells: bool, limits: Limits | None) -> tuple[np.ndarray, np.ndarray]:
+    """State and input of a plant of `delayed` held at outputs y (p,), or at cells of y[0] °C; where inputs
+    would have to leave `limits`, at rest under the nearest within."""
     n = plant.n - plant.m
     late = bool(np.any(plant.A[:n, n:]))
     inner = plant._replace(
@@ -263,7 +265,13 @@ def _held(plant: Plant, y: np.ndarray, cells: bool) -> tuple[np.ndarray, np.ndar
         u = hold_state(inner, x)
     else:
         x, u = hold_output(inner, y)
-    return np.r_[x, u], u
+    if limits is None:
+        return np.r_[x, u], u
+    within, balance = np.clip(u, limits.low, limits.high), np.eye(n) - inner.A
+    # a plant that nearly integrates drifts slowly from where it is, and has no rest worth a start
+    if np.any(within != u) and np.linalg.cond(balance) < 1 / RESTLESS:
+        x = np.linalg.solve(balance, inner.B @ within + inner.b)
+    return np.r_[x, within], within
 
 
 # ---- what comes out

@@ -36,6 +36,9 @@ PERIOD = (
 REACHED_DEGC = 0.1  # a reference that is missed by less is reached: no sensor here shows it
 # of an input's limit, in a reference that is not the owner's: with 15 % less gain it can still be held
 HEADROOM = 0.15
+FLOOR_SHARE = (
+    0.05  # of an input's range above its lowest: in a room that is a little warmer it can still be held
+)
 BEYOND = 1e3  # times as dear as missing a reference: crossing a declared limit of an output
 LEAK = 1e-9  # a step, by which a plant that only integrates is taken to leak, so that it has a steady state
 
@@ -217,9 +220,10 @@ class Bounds(NamedTuple):
 
 
 def _drawn_in(bounds: Bounds, band: float) -> Bounds:
-    """Limits with HEADROOM of the inputs towards zero, and outputs the band within theirs, or in the middle
-    where that is less than the band away."""
-    low = np.where(bounds.low < 0, (1 - HEADROOM) * bounds.low, bounds.low)
+    """Limits with HEADROOM of the inputs towards zero, FLOOR_SHARE above a lowest of zero or more, and
+    outputs the band within theirs, or in the middle where that is less than the band away."""
+    raised = bounds.low + FLOOR_SHARE * (bounds.high - bounds.low)
+    low = np.where(bounds.low < 0, (1 - HEADROOM) * bounds.low, raised)
     high = np.where(bounds.high > 0, np.maximum((1 - HEADROOM) * bounds.high, low), bounds.high)
     room = np.minimum(band, (bounds.output_high - bounds.output_low) / 2)
     return Bounds(low, high, bounds.output_low + room, bounds.output_high - room)

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.temperature import governor, panel, plant, scenario_defaults
+from pipeline.temperature import governor, panel, plant, scenario_defaults, tracking
 from pipeline.temperature.workflow import record
 from pipeline.temperature.workflow.settings import Half, Panel, Tracking, TuneWeights
 from pipeline.temperature.workflow.settings import Plant as Machine
@@ -46,8 +46,8 @@ class Setting(NamedTuple):
 
 
 def faster(settings: Panel, rehearsal: Rehearsal) -> float:
-    """Share of a declared delay margin that is asked of a machine: less than one of one that must settle
-    sooner than the panel's. The whole answer of a hair dryer is over within 1 s."""
+    """Share of a declared delay margin that is asked of a machine: below 1 for one that must settle sooner
+    than the panel's. The whole answer of a hair dryer is over within 1 s."""
     return min((rehearsal.settling_s or settings.settling_s) / settings.settling_s, 1.0)
 
 
@@ -98,7 +98,8 @@ def rehearsed(
     """The declared panel where the true plant is known, otherwise what follows from the record."""
     if truth is not None:
         return declared(settings, machine, truth, family[0])
-    return from_record(settings, machine, family, record_path)
+    u, y, recordings = record.read_recordings(record_path, machine.acting, machine.outputs)
+    return from_record(settings, machine, family, Recorded(u, y, _numbered(recordings)))
 
 
 def input_limits(machine: Machine) -> governor.Limits:
@@ -178,6 +179,7 @@ def _half(
     cells: bool,
     steps: int | None = None,
     spread: panel.Spread | None = None,
+    limits: governor.Limits | None = None,
 ) -> panel.Cases:
     rng = np.random.default_rng(half.seed)
     declared = spread or spread_of(settings)
@@ -193,44 +195,76 @@ def _half(
         steps=round(half.length * (steps or settings.steps)),
         hold=settings.hold_steps,
         cells=cells,
+        limits=limits,
     )
 
 
 # of the recorded span, by which the ambient is varied at most where recordings do not differ by more: what
 # spans 12 °C was not recorded in a room that may be 8 °C warmer
 AMBIENT_SHARE = 0.25
+HOLDABLE = (1.0, 0.75, 0.5, 0.25, 0.1)  # shares of it that are tried
 
 
-def from_record(settings: Panel, machine: Machine, family: Sequence[plant.Plant], path: str) -> Rehearsal:
+def _ambient(
+    spread: panel.Spread,
+    scale: scenario_defaults.MachineScale,
+    identified: plant.Plant,
+    limits: governor.Limits,
+    references: np.ndarray,
+) -> float:
+    """By how many °C the ambient of a plant may differ: as the panel says, at most AMBIENT_SHARE of the
+    recorded span, and no further than the references (j, p) can still be held, which no controller could
+    mend; but by as much as recordings of the same machine were found to differ."""
+
+    def missed(warmer: float) -> float:
+        moved = identified._replace(d=identified.d + warmer)
+        at = [tracking.feasible_target(moved, r, limits.low, limits.high) for r in references]
+        return max(float(np.abs(target.miss).max()) for target in at)
+
+    most = min(spread.ambient_degC, AMBIENT_SHARE * float(np.min(scale.high_degC - scale.low_degC)))
+    tolerated = missed(0.0) + scenario_defaults.REACHED_DEGC
+    held = [
+        share * most for share in HOLDABLE if max(map(missed, (share * most, -share * most))) <= tolerated
+    ]
+    return max(max(held, default=0.0), float(np.max(scale.ambient_degC_spread)))
+
+
+class Recorded(NamedTuple):
+    """Segments u (T, m and more: disturbances follow the inputs) in percent and y (T, p) in °C, and the
+    number of the recording of each."""
+
+    u: list[np.ndarray]
+    y: list[np.ndarray]
+    recordings: list[int]
+
+
+def from_record(
+    settings: Panel, machine: Machine, family: Sequence[plant.Plant], recorded: Recorded
+) -> Rehearsal:
     """Somebody's machine: both halves are drawn around plants of the identified family, and starts,
     references, band, settling limit and length follow from the record.
 
     What a plant may differ by: the spread is a bootstrap of the record, every second member for each half,
-    and around each the panel's input gains, pace and delay. The ambient differs by the panel's, at most
-    AMBIENT_SHARE of the recorded span, or by as much as recordings of the same machine were found to differ.
-    More heat is lost by a fifth of what the slowest mode loses at most.
+    and around each the panel's input gains, pace and delay. The ambient differs by `_ambient`. More heat is
+    lost by a fifth of what the slowest mode loses at most.
     """
     identified = family[0]
-    u, y, recordings = record.read_recordings(path, machine.acting, machine.outputs)
-    u = [a[:, : len(machine.inputs)] for a in u]
-    low, high = output_limits(machine)
-    scale = scenario_defaults.machine_scale(u, y, identified, machine.sample_time_s, _numbered(recordings))
+    u = [a[:, : len(machine.inputs)] for a in recorded.u]
+    (low, high), limits = output_limits(machine), input_limits(machine)
+    scale = scenario_defaults.machine_scale(
+        u, recorded.y, identified, machine.sample_time_s, recorded.recordings
+    )
     asked = scenario_defaults.defaults(
         scale,
         identified,
-        input_limits(machine)[:2],
+        (limits.low, limits.high),
         np.array([o.reference for o in machine.outputs]),
         low,
         high,
         machine.sample_time_s,
     )
     spread = spread_around(settings, identified)
-    spread = spread._replace(
-        ambient_degC=max(
-            min(spread.ambient_degC, AMBIENT_SHARE * float(np.min(scale.high_degC - scale.low_degC))),
-            float(np.max(scale.ambient_degC_spread)),
-        )
-    )
+    spread = spread._replace(ambient_degC=_ambient(spread, scale, identified, limits, asked.references))
     lower = asked.references[-1]
     swing = asked.references.mean(axis=0), asked.sinusoid.amplitude_degC, float(asked.sinusoid.period_steps)
     questions = panel.Questions(
@@ -240,10 +274,9 @@ def from_record(settings: Panel, machine: Machine, family: Sequence[plant.Plant]
     training = panel.Questions(
         middle, asked.references.mean(axis=0, keepdims=True), None, None, asked.sequence
     )
+    made = {"cells": False, "steps": asked.steps, "spread": spread, "limits": limits}
     judging, trained = (
-        _half(
-            settings, half, around, question, scale.noise_degC, cells=False, steps=asked.steps, spread=spread
-        )
+        _half(settings, half, around, question, scale.noise_degC, **made)
         for half, around, question in (
             (settings.judging, family[1::2], questions),
             (settings.training, family[::2], training),
