@@ -112,7 +112,7 @@ CASES = Schema(
         Column("overshoot_degC", FLOAT, "degC", "largest way past a reference", low=0, nullable=True),
         Column("at_limits_percent", FLOAT, "percent", "share of the time at a limit of an input", 0, 100),
         Column("energy_percent", FLOAT, "percent", "mean input given, over all inputs", nullable=True),
-        Column("rms_degC", FLOAT, "degC", "root mean square error, worst output", low=0, nullable=True),
+        Column("rms_degC", FLOAT, "degC", "root mean square error, over all outputs", low=0, nullable=True),
         Column("cost", FLOAT, NONE, "the declared engineering cost, as deployed", low=0, nullable=True),
         Column(
             "crossing_degC",
