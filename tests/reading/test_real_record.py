@@ -277,11 +277,7 @@ def test_the_pages_show_the_spike_the_signals_and_nothing_from_the_network(kit):
 @pytest.mark.slow
 def test_a_folder_with_a_gap_a_missing_input_and_a_broken_file_goes_all_the_way(root, shared, tmp_path):
     header, *lines = shared(RECORD).read_text().splitlines()
-    tree = project(
-        root,
-        tmp_path / "tree",
-        KIT | SMALL | {"identify_plant.refinement": "validated"},
-    )
+    tree = project(root, tmp_path / "tree", KIT | SMALL | {"identify_plant.refinement": "validated"})
     raw = tree / "datasets/raw/temperature"
     missing = lines[2500].split(",")
     missing[1] = ""
@@ -294,7 +290,7 @@ def test_a_folder_with_a_gap_a_missing_input_and_a_broken_file_goes_all_the_way(
             *lines[3460:3500],
             *lines[3520:],
         ],
-        "broken.csv": [*lines[:10], *lines[:10]],
+        "broken.csv": [*lines[:10], *lines[5:15]],  # its time goes back by five samples
     }.items():
         (raw / name).write_text("\n".join([header, *part]) + "\n")
     run(tree, *STAGES)
