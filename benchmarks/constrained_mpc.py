@@ -10,8 +10,9 @@ the state of the heated cells without noise.
 * family: it keeps the limit for weakest and strongest, in time and late: what the governor guards. The bar.
 * told: it is told each plant and all its state, as no controller of a machine is: what inputs allow at all.
 
-The governed laws measure with noise of 0.1 °C and know the record only. Their weights are the study's
-identity with an integrator of 0.2 of the error a step, for none of these laws tuned on this panel.
+The governed laws measure with noise of 0.1 °C and know the record only. Their weights are not searched: the
+study's identity, with the best of four integrators tried on this panel (0.02 to 0.2 of the error a step). The
+governor's own constants were set on these 60 plants too; tests/temperature/test_governor.py has others.
 """
 
 import json

@@ -122,7 +122,7 @@ def governor(
     outputs: OutputLimits,
     strength: Strength,
     *,
-    tau: float = 0.5,
+    tau: float = 0.2,
     drift: float = 0.06,
 ) -> Governor:
     """The governor of a family of plants of one order (their feed-through made a delay), for inputs of any
@@ -167,13 +167,14 @@ def _near(plant: Plant, limits: Limits, overshoot: float, strength: Strength) ->
 
 
 def instants(family: Sequence[Plant]) -> np.ndarray:
-    """Steps ahead at which the members are looked at: now; and in ever wider steps from that at which a pulse
-    response is first at its peak, to four times that at which the last one is, 16 at least."""
-    peaks = np.concatenate(
-        [1 + np.abs(markov_parameters(plant, LONGEST)).max(axis=2).argmax(axis=0) for plant in family]
-    )
-    last = min(max(4 * int(peaks.max()), 16), LONGEST)
-    wider = peaks.min() + np.r_[0, 2 ** np.arange(8)]
+    """Steps ahead at which the members are looked at: now; and in ever wider steps from that at which an
+    output's pulse response is first at its peak, to four times that after which the strongest of the slowest
+    member is, 16 at least."""
+    pulses = [np.abs(markov_parameters(plant, LONGEST)).max(axis=2) for plant in family]
+    first = 1 + min(int(pulse.argmax(axis=0).min()) for pulse in pulses)
+    peak = 1 + max(int(pulse.max(axis=1).argmax()) for pulse in pulses)
+    last = min(max(4 * peak, 16), LONGEST)
+    wider = first + np.r_[0, 2 ** np.arange(7)]
     return np.unique(np.r_[0, wider[wider < last], last])
 
 

@@ -31,7 +31,6 @@ from pipeline.temperature.governor import Strength
 from pipeline.temperature.plant import Plant, hold_output, hold_state
 from pipeline.temperature.tracking import Law, reached_state
 
-KINDS = ("constant", "ramp", "sinusoid", "sequence")
 RESTLESS = 1e-8  # reciprocal condition of I - A below which a plant has no rest of its own
 
 

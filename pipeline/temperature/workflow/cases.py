@@ -46,8 +46,8 @@ class Setting(NamedTuple):
 
 
 def faster(settings: Panel, rehearsal: Rehearsal) -> float:
-    """Share of a declared delay margin that is asked of a machine: less than one of one that must settle
-    sooner than the panel's. The whole answer of a hair dryer is over within 1 s."""
+    """Share of a declared delay margin that is asked of a machine: below 1 for one that must settle sooner
+    than the panel's. The whole answer of a hair dryer is over within 1 s."""
     return min((rehearsal.settling_s or settings.settling_s) / settings.settling_s, 1.0)
 
 
@@ -284,9 +284,18 @@ def from_record(
     training = panel.Questions(
         middle, asked.references.mean(axis=0, keepdims=True), None, None, asked.sequence
     )
-    made = {"cells": False, "steps": asked.steps, "spread": spread, "limits": limits}
     judging, trained = (
-        _half(settings, half, around, question, scale.noise_degC, **made)
+        _half(
+            settings,
+            half,
+            around,
+            question,
+            scale.noise_degC,
+            cells=False,
+            steps=asked.steps,
+            spread=spread,
+            limits=limits,
+        )
         for half, around, question in (
             (settings.judging, family[1::2], questions),
             (settings.training, family[::2], training),
