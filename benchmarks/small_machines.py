@@ -45,6 +45,7 @@ SHARED = Path(os.environ.get("BEADLINE_SHARED", "/work/shared")) / "data"
 PLANTS = {"judging": 12, "training": 6}
 BUDGET = {"practical_initial": 6, "practical_evaluations": 10}
 LIMIT_SHARE = 0.3  # of the recorded span, by which outputs may leave what was recorded
+RUN_SHARE = 0.7  # of the samples of a real record, below where its outputs are to settle
 SETTLED_SHARE = 6  # the last sixth of a run is its settled part, as in the panel
 
 
@@ -69,22 +70,23 @@ class Rehearsed(NamedTuple):
 
 
 def real_records() -> dict[str, Recording]:
-    """Records of real machines; none where the folder is absent."""
+    """Records of real machines, and RUN_SHARE of the recorded temperatures as what is asked for; none where
+    the folder is absent."""
     if not SHARED.is_dir():
         return {}
     lab, binary = SHARED / "tclab_apmonitor", SHARED / "tclab_mlid_prbs" / "prbs.csv"
     prbs = np.genfromtxt(binary, delimiter=",", skip_header=1)
     dryer = np.loadtxt(SHARED / "daisy_a" / "dryer.dat")
-    return {
-        "real kit, steps": Recording(
-            *resampled(lab / "energy_balance_mimo.csv", 1.0, ([1, 2], [3, 4])), 1.0, [50.0, 45.0]
-        ),
-        "real kit, random": Recording(
-            *resampled(lab / "second_order_mimo.csv", 3.0, ([1, 2], [3, 4])), 3.0, [50.0, 45.0]
-        ),
-        "real kit, binary": Recording(prbs[:, 1:3], prbs[:, 3:5], 1.0, [50.0, 45.0]),
+    made = {
+        "real kit, steps": (*resampled(lab / "energy_balance_mimo.csv", 1.0, ([1, 2], [3, 4])), 1.0),
+        "real kit, random": (*resampled(lab / "second_order_mimo.csv", 3.0, ([1, 2], [3, 4])), 3.0),
+        "real kit, binary": (prbs[:, 1:3], prbs[:, 3:5], 1.0),
         # volts: ten times as many, as if percent and °C
-        "real hair dryer": Recording(10 * dryer[:, :1], 10 * dryer[:, 1:], 0.08, [50.0]),
+        "real hair dryer": (10 * dryer[:, :1], 10 * dryer[:, 1:], 0.08),
+    }
+    return {
+        name: Recording(u, y, step, np.quantile(y, RUN_SHARE, axis=0).tolist())
+        for name, (u, y, step) in made.items()
     }
 
 

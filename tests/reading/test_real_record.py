@@ -290,7 +290,7 @@ def test_a_folder_with_a_gap_a_missing_input_and_a_broken_file_goes_all_the_way(
             *lines[3460:3500],
             *lines[3520:],
         ],
-        "broken.csv": [*lines[:10], *lines[:10]],
+        "broken.csv": [*lines[:10], *lines[5:15]],  # its time goes back by five samples
     }.items():
         (raw / name).write_text("\n".join([header, *part]) + "\n")
     run(tree, *STAGES)

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.temperature import governor, panel, plant, scenario_defaults, tracking
+from pipeline.temperature import governor, identification, panel, plant, scenario_defaults, tracking
 from pipeline.temperature.workflow import record
 from pipeline.temperature.workflow.settings import Half, Panel, Tracking, TuneWeights
 from pipeline.temperature.workflow.settings import Plant as Machine
@@ -98,8 +98,7 @@ def rehearsed(
     """The declared panel where the true plant is known, otherwise what follows from the record."""
     if truth is not None:
         return declared(settings, machine, truth, family[0])
-    u, y, recordings = record.read_recordings(record_path, machine.acting, machine.outputs)
-    return from_record(settings, machine, family, Recorded(u, y, _numbered(recordings)))
+    return from_record(settings, machine, family, read_recorded(record_path, machine))
 
 
 def input_limits(machine: Machine) -> governor.Limits:
@@ -236,6 +235,17 @@ class Recorded(NamedTuple):
     u: list[np.ndarray]
     y: list[np.ndarray]
     recordings: list[int]
+
+
+def read_recorded(path: str, machine: Machine) -> Recorded:
+    """The record of ingest, in pieces without a missing input."""
+    segments = record.read_recordings(path, machine.acting, machine.outputs)
+    pieces = [
+        (u, y, number)
+        for a, b, number in zip(*segments[:2], _numbered(segments[2]), strict=True)
+        for u, y in zip(*identification.gapless([a], [b]), strict=True)
+    ]
+    return Recorded(*(list(part) for part in zip(*pieces, strict=True)))
 
 
 def from_record(

@@ -120,7 +120,7 @@ def untuned(one: contestants.Contestant, problem: contestants.Problem) -> str:
         return str(reason)
     if design is None:
         return KERNEL_UNDETERMINED if one.role == "data_driven" else ""
-    return "no candidate of its search was stable with the least disk margin of tune_weights"
+    return "it could not be tuned: no candidate of its search kept the least margins of tune_weights"
 
 
 def judged(
