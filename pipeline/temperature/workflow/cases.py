@@ -301,18 +301,24 @@ def from_record(
             (settings.training, family[::2], training),
         )
     )
-    infeasible = [
-        {
-            "output": machine.outputs[one.output].name,
-            "asked_degC": one.asked_degC,
-            "reachable_degC": one.reachable_degC,
-            "binding": _binding(machine, one),
-        }
-        for one in asked.infeasible
-    ]
     return Rehearsal(
-        judging, trained, asked.band_degC, asked.settling_s, scale.noise_degC, infeasible, "from the record"
+        judging,
+        trained,
+        asked.band_degC,
+        asked.settling_s,
+        scale.noise_degC,
+        [_out_of_reach(machine, one) for one in asked.infeasible],
+        "from the record",
     )
+
+
+def _out_of_reach(machine: Machine, one: scenario_defaults.Infeasible) -> dict[str, Any]:
+    return {
+        "output": machine.outputs[one.output].name,
+        "asked_degC": one.asked_degC,
+        "reachable_degC": one.reachable_degC,
+        "binding": _binding(machine, one),
+    }
 
 
 def _numbered(names: Sequence[str]) -> list[int]:
