@@ -200,11 +200,12 @@ def _closed_loop(frozen: FrozenPanel, folder: Path, settings: Nightly) -> Eviden
         )
     }
     by_plant = [result.costs[asked.plant == p].mean() for p in np.unique(asked.plant)]
-    smallest = min(margin.disk for margin in result.margins)
+    # as the page asks: stable on every plant, and the margin of the median one
+    disk = float(np.median([margin.disk for margin in result.margins]))
     guards = {
         "worst_case": float(np.max(by_plant)),
         "settled_error_degC": float(result.figures.settled_error.max()),
-        "margin_short_of_least": max(settings.rule.least_disk_margin - smallest, 0.0),
+        "margin_short_of_least": max(settings.rule.least_disk_margin - disk, 0.0),
         "unstable_plants": float(sum(not margin.stable for margin in result.margins)),
     }
     predictor = _predictor(folder, settings.holdout.controller, frozen.machine)

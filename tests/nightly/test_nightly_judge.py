@@ -152,6 +152,14 @@ def test_a_recorded_machines_panel_is_drawn_around_its_hold_out_recordings_once_
     assert 0.6 < min(rises) < 0.95 and 1.02 < max(rises) < 1.3
 
 
+def test_the_margin_that_guards_is_that_of_the_median_plant_as_the_page_asks(project):
+    margins = judge.judged(judge.frozen_panel(project.holdout), Path("datasets"), "varx_riccati").margins
+    strict = project.model_copy(update={"rule": project.rule.model_copy(update={"least_disk_margin": 1.9})})
+    guards = judge.judge(strict.loops["temperature"], strict).measure(Path("datasets")).guards
+    assert guards["margin_short_of_least"] == 1.9 - np.median([margin.disk for margin in margins])
+    assert len({margin.disk for margin in margins}) == project.holdout.plants
+
+
 def test_a_controller_that_destabilises_a_plant_says_so(project):
     learned = window.restored(artifacts.read_arrays("datasets/learn_kernel/window.parquet", "window", 1))
     Theta = learned.Theta.copy()

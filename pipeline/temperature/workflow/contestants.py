@@ -26,9 +26,8 @@ class Problem(NamedTuple):
 
     `plant` is identified, its feed-through a delay, `family` its spread, and `window` learned from the
     record. `kernel` is None where the record does not determine it, `truth` where nobody knows the plant,
-    `printer_pid` empty where no recording tells the PID of a printer. `gamma` is the discount, `integral` the
-    declared share of the error a step, `exact_tau` the paper's observer, `horizon` in steps, `noise` (p,) in
-    °C."""
+    `printer_pid` empty where no recording tells the PID of a printer. `gamma` is the discount, `exact_tau`
+    the paper's observer, `horizon` in steps, `noise` (p,) in °C."""
 
     plant: Plant
     family: list[Plant]
@@ -37,7 +36,6 @@ class Problem(NamedTuple):
     truth: Plant | None
     limits: Limits
     gamma: float
-    integral: float
     exact_tau: float
     horizon: int
     noise: np.ndarray

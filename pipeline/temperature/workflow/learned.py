@@ -98,7 +98,6 @@ def problem(
         truth=truth,
         limits=limits,
         gamma=tracking.gamma,
-        integral=tracking.integral,
         exact_tau=tracking.observer_tau,
         horizon=horizon,
         noise=noise,

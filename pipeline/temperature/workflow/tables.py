@@ -112,7 +112,7 @@ CASES = Schema(
         Column("overshoot_degC", FLOAT, "degC", "largest way past a reference", low=0, nullable=True),
         Column("at_limits_percent", FLOAT, "percent", "share of the time at a limit of an input", 0, 100),
         Column("energy_percent", FLOAT, "percent", "mean input given, over all inputs", nullable=True),
-        Column("rms_degC", FLOAT, "degC", "root mean square error, worst output", low=0, nullable=True),
+        Column("rms_degC", FLOAT, "degC", "root mean square error, over all outputs", low=0, nullable=True),
         Column("cost", FLOAT, NONE, "the declared engineering cost, as deployed", low=0, nullable=True),
         Column(
             "crossing_degC",
@@ -122,36 +122,6 @@ CASES = Schema(
             low=0,
             nullable=True,
         ),
-    ),
-)
-
-SCORECARD = Schema(
-    "scorecard",
-    1,
-    (
-        Column("controller", TEXT, NONE, "which controller"),
-        Column("plant", INDEX, NONE, "plant of the spread, 0 the nominal one", low=0),
-        Column("start_degC", FLOAT, "degC", "temperature that the plant was held at"),
-        Column("reference_degC", FLOAT, "degC", "reference of the first output"),
-        Column("noise_degC", FLOAT, "degC", "standard deviation of the noise that the controller saw", low=0),
-        Column("seed", COUNT, NONE, "seed of that noise", low=0),
-        Column("regret", FLOAT, NONE, "J / J* - 1 at the yardstick's weights, unclipped", nullable=True),
-        Column("outside_percent", FLOAT, "percent", "unclipped commands outside the limits", 0, 100),
-        Column("tracking_degC", FLOAT, "degC", "root mean square error as deployed", low=0),
-        Column("effort_percent", FLOAT, "percent", "root mean square input as deployed", low=0),
-        Column("settled_error_degC", FLOAT, "degC", "mean error over the last third, worst zone", low=0),
-        Column("settled_zone", TEXT, NONE, "that zone"),
-        Column(
-            "settling_s",
-            FLOAT,
-            "s",
-            "time until every zone stays within the band; missing where one never does",
-            nullable=True,
-        ),
-        Column("overshoot_degC", FLOAT, "degC", "largest way past a reference", low=0),
-        Column("at_limits_percent", FLOAT, "percent", "commands beyond the limits as deployed", 0, 100),
-        Column("input_low_percent", FLOAT, "percent", "lowest input given"),
-        Column("input_high_percent", FLOAT, "percent", "highest input given"),
     ),
 )
 
