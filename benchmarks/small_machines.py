@@ -308,10 +308,10 @@ def printed(name: str, one: dict[str, Any]) -> str:
 
 def main() -> None:
     wanted = sys.argv[1:]
-    entries = [(one.name, of_machine(one), one) for one in MACHINES]
-    entries += [(name, recording, None) for name, recording in real_records().items()]
+    made = [(one.name, of_machine(one), one) for one in MACHINES]
+    real = [(name, recording, None) for name, recording in real_records().items()]
     result = {}
-    for name, recording, machine in entries:
+    for name, recording, machine in (*made, *real):
         if wanted and name not in wanted:
             continue
         result[name] = row(recording, machine)

@@ -168,6 +168,15 @@ def _questions(half: Half, reference: np.ndarray, steps: int) -> panel.Questions
     )
 
 
+class Own(NamedTuple):
+    """What follows from a record in place of the panel's: steps of a case, how far plants lie from the
+    nominal one, and limits of the inputs, within which starts are held."""
+
+    steps: int
+    spread: panel.Spread
+    limits: governor.Limits
+
+
 def _half(
     settings: Panel,
     half: Half,
@@ -176,12 +185,10 @@ def _half(
     noise: np.ndarray,
     *,
     cells: bool,
-    steps: int | None = None,
-    spread: panel.Spread | None = None,
-    limits: governor.Limits | None = None,
+    own: Own | None = None,
 ) -> panel.Cases:
     rng = np.random.default_rng(half.seed)
-    declared = spread or spread_of(settings)
+    declared = own.spread if own else spread_of(settings)
     scaled = panel.Spread(*(half.spread * value for value in declared))._replace(
         delayed=min(half.spread * declared.delayed, 1.0)
     )
@@ -191,10 +198,10 @@ def _half(
         questions,
         noise=noise,
         seed=half.seed,
-        steps=round(half.length * (steps or settings.steps)),
+        steps=round(half.length * (own.steps if own else settings.steps)),
         hold=settings.hold_steps,
         cells=cells,
-        limits=limits,
+        limits=own.limits if own else None,
     )
 
 
@@ -292,9 +299,7 @@ def from_record(
             question,
             scale.noise_degC,
             cells=False,
-            steps=asked.steps,
-            spread=spread,
-            limits=limits,
+            own=Own(asked.steps, spread, limits),
         )
         for half, around, question in (
             (settings.judging, family[1::2], questions),
@@ -307,23 +312,27 @@ def from_record(
         asked.band_degC,
         asked.settling_s,
         scale.noise_degC,
-        [_out_of_reach(machine, one) for one in asked.infeasible],
+        _infeasible(machine, asked),
         "from the record",
     )
-
-
-def _out_of_reach(machine: Machine, one: scenario_defaults.Infeasible) -> dict[str, Any]:
-    return {
-        "output": machine.outputs[one.output].name,
-        "asked_degC": one.asked_degC,
-        "reachable_degC": one.reachable_degC,
-        "binding": _binding(machine, one),
-    }
 
 
 def _numbered(names: Sequence[str]) -> list[int]:
     first = list(dict.fromkeys(names))
     return [first.index(name) for name in names]
+
+
+def _infeasible(machine: Machine, asked: scenario_defaults.CaseDefaults) -> list[dict[str, Any]]:
+    """References out of reach, and what binds."""
+    return [
+        {
+            "output": machine.outputs[one.output].name,
+            "asked_degC": one.asked_degC,
+            "reachable_degC": one.reachable_degC,
+            "binding": _binding(machine, one),
+        }
+        for one in asked.infeasible
+    ]
 
 
 def _binding(machine: Machine, one: scenario_defaults.Infeasible) -> str:
