@@ -304,6 +304,34 @@ def _remembered(controller: Deployed, z, u, y, r):
 
 # ---- what a machine runs
 
+REFERENCES = "references in °C"
+
+
+def _vector(values: np.ndarray, count: int, what: str) -> np.ndarray:
+    values = np.asarray(values, float)
+    if values.shape != (count,):
+        raise ValueError(
+            f"the controller expects {count} {what} but was given an array of shape {values.shape}; "
+            "give it those of the machine that it was designed for, in the order of section plant"
+        )
+    return values
+
+
+def _finite(values: np.ndarray, count: int, what: str) -> np.ndarray:
+    values = _vector(values, count, what)
+    if not np.isfinite(values).all():
+        raise ValueError(
+            f"the controller expects finite {what} but was given {values}; keep the last ones that were"
+        )
+    return values
+
+
+def _shapes(controller: Deployed) -> dict[str, tuple[int, ...]]:
+    """The shapes of State on one machine."""
+    (m, p), family = controller.law.D.shape, controller.governor
+    x = (0, 1, 0) if family is None else (len(family.start), 1, family.start.shape[2] + 4 * p)
+    return dict(zip(State._fields, ((1, len(controller.law.A)), (1, p), (1, m), x), strict=True))
+
 
 class RunningController:
     """One controller on one machine, a sample at a time.
@@ -330,22 +358,25 @@ class RunningController:
         self._w, self._t = np.zeros(0), 0
 
     def watch(self, u: np.ndarray, y: np.ndarray, r: np.ndarray) -> None:
-        """One sample in manual: inputs u (m,) applied, outputs y (p,) measured before, reference r (p,)."""
-        u, y, r = (np.asarray(part, float)[None] for part in (u, y, r))
-        self._state = watched(self.controller, self._state, u, y, r)
+        """One sample in manual: inputs u (m,) applied, outputs y (p,) measured before, reference r (p,).
+        Raises ValueError for another number of them, or one that is not finite, and remembers nothing."""
+        m, p = self.controller.law.D.shape
+        u, r = _finite(u, m, "inputs in percent"), _finite(r, p, REFERENCES)
+        self._state = watched(self.controller, self._state, u[None], self._measured(y)[None], r[None])
 
     def hand_over(self, y: np.ndarray, at: np.ndarray | None = None) -> None:
         """From manual to the law without a bump, at outputs y (p,) measured now, where the machine stands at
         `at` (p,), by itself y. Raises ValueError before any watch."""
-        y = np.asarray(y, float)
+        y = self._measured(y)
         here = self._aimed(constant(y if at is None else at))[1]
-        self._state = handed_over(self.controller, self._remembers(y), y[None], [here])
+        self._state = handed_over(self.controller, self._remembers(), y[None], [here])
 
     def step(self, y: np.ndarray, r: np.ndarray | Reference, t: int) -> np.ndarray:
         """Inputs u (m,) to apply from outputs y (p,) measured at sample t under reference r, as batch_step
-        has them. Raises ValueError where y is not finite, or nothing was watched before."""
-        y = np.asarray(y, float)
-        state, (feed, y_star, now) = self._remembers(y), self._target(r, t)
+        has them. Raises ValueError where y or r is not finite or of another machine, where t falls, or
+        nothing was watched before."""
+        y, state = self._measured(y), self._remembers()
+        feed, y_star, now = self._target(r, t)
         controller, limits, before = self.controller, self.controller.limits, state.u[0]
         if controller.holds:
             return before.copy()
@@ -365,28 +396,45 @@ class RunningController:
 
     def saved(self) -> dict[str, np.ndarray]:
         """All that it remembers, as arrays. Raises ValueError before the first watch."""
-        arrays = self._remembers(np.zeros(1))._asdict()
+        arrays = self._remembers()._asdict()
         if self._reference is not None:
             arrays |= {**self._reference._asdict(), "w": self._w, "t": np.array(self._t)}
         return {name: np.array(part) for name, part in arrays.items()}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Goes on from what another of the same law and governor `saved`."""
-        self._state = State(*(np.array(arrays[name]) for name in State._fields))
+        """Goes on from what another of the same law and governor `saved`. Raises ValueError where its arrays
+        are not those of this law and governor, or not finite."""
+        mine = {name: np.array(arrays[name]) for name in State._fields if name in arrays}
+        given, expected = {name: part.shape for name, part in mine.items()}, _shapes(self.controller)
+        if given != expected:
+            raise ValueError(
+                f"the controller expects to be restored from arrays of shapes {expected} but was given "
+                f"{given}; restore what a controller of the same law and governor saved"
+            )
+        if lost := [name for name, part in mine.items() if not np.isfinite(part).all()]:
+            raise ValueError(
+                f"the controller expects finite numbers to be restored from but {', '.join(lost)} has some "
+                "that are not; restore an older save, or start with watch"
+            )
+        self._state = State(**mine)
         self._reference = None
         if "w" in arrays:
-            mine = Reference(*(np.array(arrays[name]) for name in Reference._fields))
-            self._moved(self._turned(mine, int(arrays["t"])), np.array(arrays["w"]))
+            reference = Reference(*(np.array(arrays[name]) for name in Reference._fields))
+            self._moved(self._turned(reference, int(arrays["t"])), np.array(arrays["w"]))
 
-    def _remembers(self, y: np.ndarray) -> State:
+    def _remembers(self) -> State:
         if self._state is None:
             raise ValueError("the controller has seen no sample; call watch with each sample in manual first")
+        return self._state
+
+    def _measured(self, y: np.ndarray) -> np.ndarray:
+        y = _vector(y, self.controller.law.D.shape[1], "temperatures in °C")
         if not np.isfinite(y.sum()):
             raise ValueError(
                 f"the controller expects finite temperatures in °C but measured {y}; "
                 "go to manual until every sensor answers"
             )
-        return self._state
+        return y
 
     def _kept(self, z: np.ndarray, u: np.ndarray, y: np.ndarray, r: np.ndarray) -> np.ndarray:
         """z (q,) a sample on."""
@@ -400,14 +448,15 @@ class RunningController:
     def _target(self, r: np.ndarray | Reference, t: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Feed (m,), target y* (p,) and reference (p,) at sample t."""
         mine = self._reference
+        if mine is not None and t < self._t:
+            raise ValueError(f"sample {t} comes after sample {self._t}; count samples upwards")
         if isinstance(r, Reference):
             same = mine is not None and (r is mine or all(map(np.array_equal, r, mine)))
         else:
+            r = _vector(r, self.controller.law.D.shape[1], REFERENCES)
             same = mine is not None and len(self._w) == 1 and bool((mine.H[:, 0] == r).all())
         if mine is None or not same:
             mine = self._turned(r if isinstance(r, Reference) else constant(r), t)
-        if t < self._t:
-            raise ValueError(f"sample {t} comes after sample {self._t}; count samples upwards")
         if len(self._w) > 1:
             w = self._w
             for _ in range(t - self._t):
@@ -417,8 +466,10 @@ class RunningController:
         return self._now
 
     def _turned(self, reference: Reference, t: int) -> Reference:
-        mine = self._reference = Reference(*(np.array(part, float) for part in reference))
+        mine = Reference(*(np.array(part, float) for part in reference))
+        _finite(mine.H @ mine.w0, self.controller.law.D.shape[1], REFERENCES)
         at, self._aim = self._aimed(mine)
+        self._reference = mine
         self.binding, self._t = at.binding, t
         self._moved(mine, mine.w0)
         return mine

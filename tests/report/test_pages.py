@@ -305,7 +305,7 @@ def test_first_run_equal_runs_and_a_moved_figure(project):
         contestants__subspace_lqg__overshoot=made.figure(0.6, 0.4, 1.0),
     )
     Path("params.yaml").write_text(
-        Path("params.yaml").read_text().replace("disk_margin: 0.4", "disk_margin: 0.41", 1)
+        Path("params.yaml").read_text().replace("  disk_margin: 0.4", "  disk_margin: 0.41", 1)
     )
     Path("pipeline/code.py").write_text("2\n")
     main()

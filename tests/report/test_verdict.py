@@ -144,10 +144,21 @@ def test_passed_says_what_is_closest_to_its_limit_and_never_counts_drift_as_pass
     assert (verdict.state, verdict.winner) == (PASSED, "subspace_lqg")
     assert verdict.decision == "Rehearsal passed: subspace + LQG."
     assert verdict.lead == "Every rule measured so far passed on 6 simulated plants."
-    assert verdict.reason == "Closest to its limit: disk margin, 0.70 of at least 0.40."
+    assert verdict.reason == "Closest to its limit: disk margin of the median plant, 0.70 of at least 0.40."
     assert verdict.remedy.startswith("Drift is not measured. The nightly job measures it and has not run.")
     calm = judge(metrics(), drift=Figure(1.0, 0.0, 2.0))
     assert calm.lead == "All rules passed on 6 simulated plants."
+
+
+def test_a_pass_on_the_median_plant_names_the_margins_that_the_worst_plant_lacks():
+    stages = metrics()
+    margins = stages["evaluate_temperature"]["contestants"]["subspace_lqg"]["margins"]
+    margins["disk"]["worst"], margins["delay_s"]["worst"] = 0.18, 0.41
+    verdict = judge(stages)
+    assert verdict.state == PASSED
+    assert verdict.reason.replace("\u202f", " ").endswith(
+        "Below the limit on the worst plant: disk margin 0.18 of 0.40, delay margin 0.41 s of 1.00 s."
+    )
 
 
 def test_of_recordings_a_pass_is_ready_for_a_supervised_trial_and_nothing_more():

@@ -300,6 +300,66 @@ def test_what_a_controller_cannot_run_on_is_refused_in_a_sentence():
         controller.step(np.full(5, 150.0), REFERENCE, 6)
 
 
+def in_control(count: int = 5, *, governed: bool = False) -> RunningController:
+    ready = deployed(lqg(baam()), LIMITS, integral_limit=1.0, governor=guard() if governed else None)
+    controller = RunningController(ready, baam())
+    controller.watch(np.full(7, 0.4), np.full(5, 150.0), REFERENCE)
+    controller.step(np.full(5, 150.0), REFERENCE, count)
+    return controller
+
+
+@pytest.mark.parametrize(
+    ("u", "y", "r", "message"),
+    [
+        (np.full(7, np.nan), np.full(5, 150.0), REFERENCE, "expects finite inputs in percent"),
+        (np.full(7, 0.4), np.full(5, np.nan), REFERENCE, "go to manual until every sensor answers"),
+        (np.full(7, 0.4), np.full(5, 150.0), REFERENCE * np.nan, "expects finite references in °C"),
+        (np.full(3, 0.4), np.full(5, 150.0), REFERENCE, "expects 7 inputs in percent"),
+        (np.full(7, 0.4), np.full(1, 150.0), REFERENCE, "expects 5 temperatures in °C"),
+    ],
+)
+def test_a_sample_in_manual_that_is_none_is_refused_and_not_remembered(u, y, r, message):
+    controller, other = in_control(), in_control()
+    with pytest.raises(ValueError, match=message):
+        controller.watch(u, y, r)
+    for name, part in other.saved().items():
+        np.testing.assert_array_equal(controller.saved()[name], part)
+
+
+@pytest.mark.parametrize(
+    ("reference", "message"),
+    [
+        (REFERENCE[:3], "expects 5 references in °C"),
+        (180.0, "expects 5 references in °C"),
+        (constant(REFERENCE[:2]), "expects 5 references in °C"),
+        (REFERENCE * np.nan, "expects finite references in °C"),
+    ],
+)
+def test_a_reference_that_is_none_is_refused_and_the_last_one_stays(reference, message):
+    controller, other = in_control(), in_control()
+    with pytest.raises(ValueError, match=message):
+        controller.step(np.full(5, 150.0), reference, 6)
+    y = np.full(5, 151.0)
+    np.testing.assert_array_equal(controller.step(y, REFERENCE, 6), other.step(y, REFERENCE, 6))
+
+
+def test_time_that_runs_backwards_is_refused_with_a_new_reference_too():
+    with pytest.raises(ValueError, match="sample 4 comes after sample 5; count samples upwards"):
+        in_control().step(np.full(5, 150.0), REFERENCE + 1, 4)
+
+
+@pytest.mark.parametrize("governed", [True, False])
+def test_a_state_of_another_controller_is_refused(governed: bool):
+    arrays = in_control(governed=not governed).saved()
+    with pytest.raises(ValueError, match="restore what a controller of the same law and governor saved"):
+        in_control(governed=governed).restore(arrays)
+    own = in_control(governed=governed).saved()
+    with pytest.raises(ValueError, match="restore what a controller of the same law and governor saved"):
+        in_control(governed=governed).restore({"z": own["z"]})
+    with pytest.raises(ValueError, match="but xi has some that are not"):
+        in_control(governed=governed).restore(own | {"xi": own["xi"] * np.nan})
+
+
 def test_a_state_is_four_arrays():
     controller = RunningController(deployed(lqg(baam()), LIMITS, integral_limit=1.0), baam())
     controller.watch(np.full(7, 0.4), np.full(5, 150.0), REFERENCE)

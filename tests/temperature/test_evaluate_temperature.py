@@ -353,3 +353,40 @@ def test_one_of_whose_candidates_none_works_is_refused_with_the_last_reason_and_
     made = tuning_of(given._replace(problem=given.problem._replace(window=shaky)))
     assert "the disk margin is" in made.metrics["refused"]["varx_riccati"]
     assert {"pi", "subspace_lqg"} <= made.weights["contestants"].keys()
+
+
+# ---- weights
+
+
+@pytest.mark.parametrize(
+    ("stored", "message"),
+    [
+        (
+            {"practical": {"q": [1.0] * 5, "r": [1.0] * 7}},
+            "found practical, as in a file of an older version",
+        ),
+        ({"contestants": {}}, "expected contestants with their tuned parameters"),
+        ([], "expected contestants with their tuned parameters, found none"),
+        ({"contestants": {"pi": {"q": 3}}}, "expected a list of weights in contestants.pi.q, found 3"),
+        ({"contestants": {"pi": 3}}, "expected parameters by name in contestants.pi, found 3"),
+        ({"contestants": {"pi": {"gain_factor": 1.0}}}, "contestants.pi.reset_factor .* found None"),
+        (
+            {"contestants": {"pi": {"gain_factor": float("nan"), "reset_factor": 1.0}}},
+            "gain_factor .* found nan",
+        ),
+        ({"contestants": {"pi": {"gain_factor": -1.0, "reset_factor": 1.0}}}, "gain_factor .* found -1.0"),
+    ],
+)
+def test_weights_that_are_none_are_refused_in_a_sentence(given, tmp_path, stored, message):
+    path = tmp_path / "weights.json"
+    path.write_text(json.dumps(stored))
+    with pytest.raises(ValueError, match=message) as refusal:
+        evaluate_temperature.read_weights(str(path), given.machine)
+    assert str(path) in str(refusal.value) and "\n" not in str(refusal.value)
+
+
+def test_a_kernel_that_was_tuned_and_is_no_longer_determined_is_named_as_refused(given):
+    problem = given.problem._replace(kernel=None)
+    designs, refused = evaluate_temperature.designed(problem, given.weights)
+    assert "learned_kernel" not in designs
+    assert refused == {"learned_kernel": evaluate_temperature.KERNEL_UNDETERMINED}

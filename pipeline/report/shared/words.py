@@ -73,7 +73,8 @@ FIXED = {
     "pair": (
         "The pair",
         "The model-based contestant against the data-driven one, tuned with the same budget and cost, on the "
-        "same plants: a paired test over plants.",
+        "same plants: a paired test over plants. The percentage is of the typical ratio of their costs "
+        "(geometric mean, every case counts alike); the 90 % quantiles of the table are of the dear cases.",
     ),
     "crossings": (
         "Crossings",
@@ -131,7 +132,8 @@ FIXED = {
     "accepted": ("Accepted run", "The last run that a person marked as good with ./run beadline accept."),
     "at_limits": (
         "Time at limits",
-        "Share of all commands beyond what the machine can give; they are clipped to it.",
+        "Share of all commands beyond what the machine can give. A controller’s are clipped to it; doing "
+        "nothing goes on with the inputs of the start, below 0 where only that holds the start still.",
     ),
     "trusted": (
         "Trusted",

@@ -46,8 +46,12 @@ def case(sources: Sources, judgement: Judgement, name: str) -> Picture:
         return placeholder(
             name, title, Missing("not measured", f"no trajectory of the {name} case was recorded")
         )
-    finding = _finding(sources, name, runs)
-    runs = _early(runs, next(q.limit for q in judgement.asked if q.key == "settling"))
+    settled = entry(comparison(sources.metrics), "settled_steps")
+    ends = {
+        who: _past(run, [o.name for o in sources.declared.machine.outputs], settled)
+        for who, run in runs.items()
+    }
+    whole, runs = runs, _early(runs, next(q.limit for q in judgement.asked if q.key == "settling"))
     y = _temperatures(sources, list(runs.values()))
     most = max(
         float(np.nanmax(run[f"{i.name}_applied"]))
@@ -58,7 +62,7 @@ def case(sources: Sources, judgement: Judgement, name: str) -> Picture:
     for who in rows:
         panels = (
             [
-                _heat(sources, who, runs[who], y, first=not shown),
+                _heat(sources, who, runs[who], y, ends[who], first=not shown),
                 _commands(sources, who, runs[who], most, first=not shown),
             ]
             if who in runs
@@ -68,11 +72,10 @@ def case(sources: Sources, judgement: Judgement, name: str) -> Picture:
     return Picture(
         name,
         title,
-        finding,
+        _finding(sources, name, ends),
         shown,
-        "Above: true temperature of every zone in °C, dashed its reference. Below: every command in "
-        "per cent as the "
-        "machine was given it; grey: within its limits. Against time in s.",
+        f"{_extent(whole, runs)}Above: true temperature of every zone in °C, dashed its reference. Below: "
+        "every command in per cent as the machine was given it; grey: within its limits. Against time in s.",
         page.origin(sources.source("trajectories")),
     )
 
@@ -85,6 +88,12 @@ def _early(runs: dict[str, Table], settling_s: float) -> dict[str, Table]:
     return {
         who: {key: values[run["time_s"] <= span] for key, values in run.items()} for who, run in runs.items()
     }
+
+
+def _extent(whole: dict[str, Table], runs: dict[str, Table]) -> str:
+    """What part of the runs is drawn; "" where all of it is."""
+    drawn_s, all_s = (next(iter(part.values()))["time_s"][-1] for part in (runs, whole))
+    return f"The first {short(drawn_s, 2)} of {short(all_s, 2)} s. " if drawn_s < all_s else ""
 
 
 def _hole(why: str) -> Markup:
@@ -101,10 +110,12 @@ def _temperatures(sources: Sources, runs: list[Table]) -> charts.Axis:
     return charts.linear(float(values.min()) - room, float(values.max()) + room)
 
 
-def _heat(sources: Sources, who: str, run: Table, y: charts.Axis, *, first: bool) -> Markup:
+def _heat(
+    sources: Sources, who: str, run: Table, y: charts.Axis, end: tuple[float, str], *, first: bool
+) -> Markup:
     time, outputs = run["time_s"], sources.declared.machine.outputs
     frame = charts.Frame(charts.linear(0, float(time[-1]) or 1.0, ticks=3), y, width=360, height=210, left=32)
-    past, zone = _past(run, [o.name for o in outputs])
+    past, zone = end
     layers = [charts.line(frame, time, run[f"{o.name}_reference"], "ref") for o in outputs]
     layers += [charts.line(frame, time, np.clip(run[o.name], -LARGEST, LARGEST), "line") for o in outputs]
     alt = f"{heading(who)}: {zone} ends {_degrees(past)} from its reference, worst of {len(outputs)} zones"
@@ -113,9 +124,11 @@ def _heat(sources: Sources, who: str, run: Table, y: charts.Axis, *, first: bool
     )
 
 
-def _past(run: Table, names: list[str]) -> tuple[float, str]:
-    """Largest distance from a reference over the last tenth of a run, and whose."""
-    last = slice(9 * len(run["time_s"]) // 10, None)
+def _past(run: Table, names: list[str], settled: object) -> tuple[float, str]:
+    """The settled error of a run, over as many steps as the rule's (a tenth where that is not known): how far
+    the furthest zone's mean lies from its reference, and whose it is."""
+    steps = settled if isinstance(settled, int) else len(run["time_s"]) // 10
+    last = slice(-max(steps, 1), None)
     apart = {name: float(np.abs(np.mean((run[name] - run[f"{name}_reference"])[last]))) for name in names}
     zone = max(apart, key=lambda name: apart[name] if math.isfinite(apart[name]) else math.inf)
     return apart[zone], zone
@@ -150,19 +163,15 @@ def _commands(sources: Sources, who: str, run: Table, most: float, *, first: boo
     )
 
 
-def _finding(sources: Sources, name: str, runs: dict[str, Table]) -> str:
-    names = [o.name for o in sources.declared.machine.outputs]
-    ends = {who: _past(run, names)[0] for who, run in runs.items()}
-    parts = [f"{in_a_sentence(who)} {_degrees(value)}" for who, value in ends.items() if value < LARGEST]
+def _finding(sources: Sources, name: str, ends: dict[str, tuple[float, str]]) -> str:
+    parts = [f"{in_a_sentence(who)} {_degrees(value)}" for who, (value, _) in ends.items() if value < LARGEST]
     where = ""
     decides = entry(comparison(sources.metrics), "deciding")
     if name == "deciding" and entry(decides, "plant") is not None:
         where = f"Plant {decides['plant']}{', ' + reference_of(decides) if decides.get('kind') else ''}. "
     if not parts:
         return f"{where}No contestant ends near its reference."
-    return (
-        f"{where}Mean distance of the worst zone from its reference over the last tenth: {', '.join(parts)}."
-    )
+    return f"{where}Settled error of the worst zone: {', '.join(parts)}."
 
 
 # ---- plant by plant

@@ -50,6 +50,8 @@ GROUPS = {
     "data sufficiency": (("data sufficiency",), "10"),
     "drift": (("drift",), "11"),
 }
+# judged on the median plant
+MARGINS = ("disk", "delay_s")
 # rules without which a contestant may pass: only the machine itself shows drift, once the controller runs
 LATER = ("drift",)
 
@@ -291,7 +293,7 @@ def _passed(
         PASSED,
         words.passed.format(heading(winner.name)),
         lead,
-        " ".join(filter(None, [_closest_limit(winner), stays])),
+        " ".join(filter(None, [_closest_limit(winner), _worst_margins(compared, winner), stays])),
         " ".join(filter(None, [later, next_step])),
         "",
         winner.name,
@@ -358,10 +360,25 @@ def _closest_limit(standing: Standing) -> str:
         return ""
     question, figure = min(asked, key=lambda pair: -share(pair[0], _worst_end(*pair)))
     places = places_of(question, [figure])
+    whose = " of the median plant" if question.key in MARGINS else ""
     return (
-        f"Closest to its limit: {question.rule}, {worded(question, figure.value, places)} of "
+        f"Closest to its limit: {question.rule}{whose}, {worded(question, figure.value, places)} of "
         f"at {'least' if question.at_least else 'most'} {with_unit(question.limit, question.unit, places)}."
     )
+
+
+def _worst_margins(compared: Mapping[str, Any], winner: Standing) -> str:
+    """The margins of the worst plant where they are below the limits, which hold for the median plant."""
+    parts = []
+    for rule in winner.rules:
+        question = rule.question
+        if question is None or question.key not in MARGINS:
+            continue
+        worst = finite(entry(compared, "contestants", winner.name, "margins", question.key, "worst"))
+        if worst < question.limit:
+            least = with_unit(question.limit, question.unit, 2)
+            parts.append(f"{question.rule} {with_unit(worst, question.unit, 2)} of {least}")
+    return f"Below the limit on the worst plant: {', '.join(parts)}." if parts else ""
 
 
 def _worst_end(question: Question, figure: Figure) -> float:

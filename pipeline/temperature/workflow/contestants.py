@@ -212,7 +212,8 @@ CONTESTANTS = (
         "pi",
         "PI, tuned",
         "PI per zone",
-        "The same, its gains and reset times tuned by the same search as the others.",
+        "The same, its gains and reset times tuned by the same search as the others, which keeps the least "
+        "margins of tune_weights; SIMC’s rule need not, so that it may be the cheaper one.",
         _pi,
         (Parameter("gain_factor", 0.02, 1.0, 10.0), Parameter("reset_factor", 0.1, 1.0, 20.0)),
         learned_from="plant",
@@ -263,7 +264,8 @@ CONTESTANTS = (
         "exact_model",
         "Exact model",
         "told the truth",
-        "The model-based controller, told the true plant: what a perfect identification would give.",
+        "The model-based controller, told the true plant. The plants that it is judged on differ from that "
+        "one too, so that it is a yardstick and no bound: another may be cheaper.",
         _exact_model,
         (EFFORT, OBSERVER, INTEGRAL),
         role="yardstick",

@@ -55,18 +55,43 @@ class Judged(NamedTuple):
 
 
 def read_weights(path: str, machine: Machine) -> dict[str, dict[str, Any]]:
-    """The tuned parameters by contestant. Raises ValueError for a file of another machine."""
-    weights = artifacts.read_json(path).get("contestants", {})
+    """The tuned parameters by contestant. Raises ValueError for a file of another machine or of an older
+    version, and for a parameter that is no number above 0."""
+    stored = artifacts.read_json(path)
+    weights = stored.get("contestants") if isinstance(stored, dict) else None
+    if not isinstance(weights, dict) or not weights:
+        keys = ", ".join(stored) if isinstance(stored, dict) and not weights else ""
+        raise ValueError(
+            f"{path}: expected contestants with their tuned parameters, found {keys or 'none'}, as in a file "
+            f"of an older version or not of tune_weights; {artifacts.remedy(path)}"
+        )
     for name, values in weights.items():
+        if not isinstance(values, dict):
+            raise ValueError(
+                f"{path}: expected parameters by name in contestants.{name}, found {values}; "
+                f"{artifacts.remedy(path)}"
+            )
         for key, count, what in (
             ("q", len(machine.outputs), "outputs"),
             ("r", len(machine.inputs), "inputs"),
         ):
+            if not isinstance(values.get(key, []), list):
+                raise ValueError(
+                    f"{path}: expected a list of weights in contestants.{name}.{key}, found {values[key]}; "
+                    f"{artifacts.remedy(path)}"
+                )
             if len(values.get(key, [0] * count)) != count:
                 raise ValueError(
                     f"{path}: contestants.{name}.{key} has {len(values[key])} weights but the machine in "
                     f"params.yaml has {count} {what}, so that the file is of another machine or another run; "
                     f"{artifacts.remedy(path)}"
+                )
+        for parameter in contestants.BY_NAME[name].parameters if name in contestants.BY_NAME else ():
+            value = values.get(parameter.name)
+            if not (isinstance(value, int | float) and 0 < value < float("inf")):
+                raise ValueError(
+                    f"{path}: expected contestants.{name}.{parameter.name} to be a number above 0, found "
+                    f"{value}; {artifacts.remedy(path)}"
                 )
     return weights
 
@@ -100,6 +125,8 @@ def designed(
             continue
         if design is not None:
             designs[one.name] = design
+        elif one.role == "data_driven":
+            refused[one.name] = KERNEL_UNDETERMINED
     if set(designs) <= {"hold"}:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in refused.items())
         raise ValueError(
