@@ -210,6 +210,22 @@ def defaults(
     )
 
 
+def unreachable(
+    model: Plant,
+    limits: tuple[np.ndarray, np.ndarray],
+    asked_reference: np.ndarray,
+    output_low: np.ndarray,
+    output_high: np.ndarray,
+) -> list[Infeasible]:
+    """References that a machine cannot hold where they are judged as they were asked; arguments as
+    `defaults`."""
+    bounds = Bounds(*limits, _declared(output_low, -np.inf), _declared(output_high, np.inf))
+    asked = np.asarray(asked_reference, float)
+    reached, u = _nearest(model, asked, bounds)
+    missed = np.flatnonzero(np.abs(reached - asked) > REACHED_DEGC)
+    return [_missed(model, int(o), asked, (reached, reached), u, bounds) for o in missed]
+
+
 class Bounds(NamedTuple):
     """Limits of inputs (m,) in percent and of outputs (p,) in °C, infinite where none is declared."""
 

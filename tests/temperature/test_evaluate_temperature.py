@@ -390,3 +390,21 @@ def test_a_kernel_that_was_tuned_and_is_no_longer_determined_is_named_as_refused
     designs, refused = evaluate_temperature.designed(problem, given.weights)
     assert "learned_kernel" not in designs
     assert refused == {"learned_kernel": evaluate_temperature.KERNEL_UNDETERMINED}
+
+
+def test_a_reference_that_the_declared_machine_cannot_hold_is_named_with_what_binds(given):
+    halves = section(Panel, "panel")
+    half = {"plants": 2, "starts_degC": [120.0]}
+    halves = halves.model_copy(
+        update={name: getattr(halves, name).model_copy(update=half) for name in ("judging", "training")}
+    )
+    truth = given.problem.plant
+    assert cases.declared(halves, given.machine, baam(), truth).infeasible == []
+    weak = [signal.model_copy(update={"high": 0.5}) for signal in given.machine.inputs]
+    missed = cases.declared(
+        halves, given.machine.model_copy(update={"inputs": weak}), baam(), truth
+    ).infeasible
+    assert [one["output"] for one in missed]
+    for one in missed:
+        assert one["reachable_degC"] < one["asked_degC"] - 0.1
+        assert one["binding"].endswith("at 0.5 percent")

@@ -149,7 +149,13 @@ def declared(settings: Panel, machine: Machine, truth: plant.Plant, identified: 
         _half(settings, half, [around], _questions(half, reference, settings.steps), noise, cells=cells)
         for half, around, cells in ((settings.judging, truth, True), (settings.training, identified, False))
     )
-    return Rehearsal(judging, training, settings.band_degC, None, noise, [], "declared")
+    limits = input_limits(machine)
+    missed = scenario_defaults.unreachable(
+        truth, (limits.low, limits.high), reference, *output_limits(machine)
+    )
+    return Rehearsal(
+        judging, training, settings.band_degC, None, noise, _infeasible(machine, missed), "declared"
+    )
 
 
 def _questions(half: Half, reference: np.ndarray, steps: int) -> panel.Questions:
@@ -312,7 +318,7 @@ def from_record(
         asked.band_degC,
         asked.settling_s,
         scale.noise_degC,
-        _infeasible(machine, asked),
+        _infeasible(machine, asked.infeasible),
         "from the record",
     )
 
@@ -322,7 +328,7 @@ def _numbered(names: Sequence[str]) -> list[int]:
     return [first.index(name) for name in names]
 
 
-def _infeasible(machine: Machine, asked: scenario_defaults.CaseDefaults) -> list[dict[str, Any]]:
+def _infeasible(machine: Machine, missed: list[scenario_defaults.Infeasible]) -> list[dict[str, Any]]:
     """References out of reach, and what binds."""
     return [
         {
@@ -331,7 +337,7 @@ def _infeasible(machine: Machine, asked: scenario_defaults.CaseDefaults) -> list
             "reachable_degC": one.reachable_degC,
             "binding": _binding(machine, one),
         }
-        for one in asked.infeasible
+        for one in missed
     ]
 
 
