@@ -150,6 +150,17 @@ def test_passed_says_what_is_closest_to_its_limit_and_never_counts_drift_as_pass
     assert calm.lead == "All rules passed on 6 simulated plants."
 
 
+def test_a_pair_of_which_one_was_refused_is_told_as_refused_and_not_as_no_difference():
+    stages = metrics()
+    compared = stages["evaluate_temperature"]
+    nothing = dict.fromkeys(("winner", "difference", "low", "high", "p"))
+    compared["pair"] = {"a": "subspace_lqg", "b": "learned_kernel", "plants": 6, "figures": {}} | nothing
+    compared["refused"] = {"subspace_lqg": "it could not be tuned"}
+    assert pair_sentence(stages).text == "Model-based against data-driven: it could not be tuned."
+    compared["refused"] = {}
+    assert pair_sentence(stages).text == "Model-based against data-driven: not measured."
+
+
 def test_a_pass_on_the_median_plant_names_the_margins_that_the_worst_plant_lacks():
     stages = metrics()
     margins = stages["evaluate_temperature"]["contestants"]["subspace_lqg"]["margins"]

@@ -35,7 +35,7 @@ def pair_sentence(metrics: Metrics) -> PairSentence:
     instead = f"The learned kernel is refused: {reason_of}." if reason_of and b != DATA_DRIVEN else ""
     kind = "data-driven" if b == DATA_DRIVEN else "data-driven, indirect"
     head = f"Model-based against {kind}:"
-    if not isinstance(pair, Mapping):
+    if not isinstance(pair, Mapping) or (pair.get("winner") is None and pair.get("difference") is None):
         gap = refused(metrics).get(a) or refused(metrics).get(b) or "not measured"
         return PairSentence(f"{head} {gap.rstrip('.')}.", None, instead)
     plants = entry(pair, "plants") or entry(comparison(metrics), "plants")
