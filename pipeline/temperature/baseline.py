@@ -84,8 +84,8 @@ def pairing(
     by more than `NOISE_SHARE` of its range: so quick a loop is no longer what the record shows.
 
     A pair counts where its sign is certain: its response goes one way, and the band of the rise over `family`
-    does not hold zero. Modes slower than 2 `horizon` samples count as integrators. Raises ValueError where an
-    output has no such input of its own.
+    does not hold zero. Modes slower than a third of `horizon` count as integrators. Raises ValueError where
+    an output has no such input of its own.
     """
     if plant.m < plant.p:
         raise ValueError(f"PI needs an input for each of the {plant.p} outputs; found {plant.m} inputs")
@@ -122,12 +122,13 @@ def _stretch(plant: Plant, horizon: int) -> tuple[int, bool]:
     """Samples over which responses are followed, and whether every mode has decayed by then: three time
     constants of the slowest.
 
-    A mode twice as slow as `horizon` is an integrator to it, and has no end to look at: a tenth is followed,
+    A mode that does not come to rest within `horizon`, three of its time constants, has no end to look at: a
+    tenth is followed,
     so that the slope is that of the rise and not of what neighbours do much later (as `trust.horizon` does).
     """
     radius = np.abs(np.linalg.eigvals(strictly_proper(plant).A)).max()
     slowest = -1 / np.log(np.clip(radius, 1e-6, 1 - 1e-12)) if radius < 1 else np.inf
-    if slowest > 2 * horizon:
+    if 3 * slowest > horizon:
         return max(horizon // 10, min(20, horizon)), False
     return max(int(np.ceil(3 * slowest)), 20), True
 

@@ -78,7 +78,7 @@ def small(inputs: int = 7) -> Small:
     kernel = regress(window.predicted_tuples(long, [u], [y]))
     made = learned.Learned(truth, long, kernel, [truth])
     tracking = section(Tracking, "tracking")
-    rehearsal = cases.declared(halves, machine, truth, truth)
+    rehearsal = cases.declared(halves, machine, truth, [truth])
     setting = cases.shared(
         section(TuneWeights, "tune_weights"), machine, tracking, halves, rehearsal, [truth, truth]
     )
@@ -399,10 +399,10 @@ def test_a_reference_that_the_declared_machine_cannot_hold_is_named_with_what_bi
         update={name: getattr(halves, name).model_copy(update=half) for name in ("judging", "training")}
     )
     truth = given.problem.plant
-    assert cases.declared(halves, given.machine, baam(), truth).infeasible == []
+    assert cases.declared(halves, given.machine, baam(), [truth]).infeasible == []
     weak = [signal.model_copy(update={"high": 0.5}) for signal in given.machine.inputs]
     missed = cases.declared(
-        halves, given.machine.model_copy(update={"inputs": weak}), baam(), truth
+        halves, given.machine.model_copy(update={"inputs": weak}), baam(), [truth]
     ).infeasible
     assert [one["output"] for one in missed]
     for one in missed:

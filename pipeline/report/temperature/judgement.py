@@ -10,7 +10,7 @@ from pipeline.report.shared.difference import Difference, Move, difference, move
 from pipeline.report.shared.digits import count
 from pipeline.report.shared.sources import Sources
 from pipeline.report.shared.verdict import OPEN, PASSED, Answers, Figure, Question, Verdict
-from pipeline.report.temperature.answers import comparison, of_contestant
+from pipeline.report.temperature.answers import comparison, entry, of_contestant
 from pipeline.report.temperature.contestants import YARDSTICKS, heading, kind
 from pipeline.report.temperature.drifted import Drift, drift
 from pipeline.report.temperature.pairs import PairSentence, deciding_sentence, pair_names, pair_sentence
@@ -49,6 +49,15 @@ class Judgement(NamedTuple):
     drifted: Drift
 
 
+def relearned_date(sources: Sources) -> str:
+    """The date of the relearnings, where they are of this machine; else ""."""
+    if sources.recorded or not isinstance(sources.relearned, dict):
+        return ""
+    if entry(sources.relearned, "machine", "outputs") != [o.name for o in sources.declared.machine.outputs]:
+        return ""
+    return str(sources.relearned.get("date") or "")
+
+
 def judgement(sources: Sources) -> Judgement:
     metrics, rules = sources.metrics, sources.declared.rules
     drifted = drift(sources)
@@ -56,7 +65,8 @@ def judgement(sources: Sources) -> Judgement:
     asked = questions(rules, comparison(metrics))
     held = standings(metrics, rules, undeclared=undeclared, drift=drifted.answer)
     incumbent = incumbent_of(sources)
-    best = choose(metrics, held, incumbent)
+    relearned = sources.relearned if relearned_date(sources) else None
+    best = choose(metrics, held, incumbent, relearned)
     competing = [name for name in held if name not in YARDSTICKS]
     subject = best or (closest(held) if competing else pair_names(metrics)[0])
     beside = rival(metrics, subject)
@@ -70,6 +80,7 @@ def judgement(sources: Sources) -> Judgement:
         undeclared=undeclared,
         drift=drifted.answer,
         incumbent=incumbent,
+        relearned=relearned,
     )
     if sources.recorded:
         verdict = trust_first(verdict, trust(sources))

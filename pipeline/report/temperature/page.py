@@ -9,7 +9,7 @@ from pipeline.report.temperature import findings, pictures, recording, scorecard
 from pipeline.report.temperature.answers import judged as names_judged
 from pipeline.report.temperature.answers import refused
 from pipeline.report.temperature.contestants import BY_NAME
-from pipeline.report.temperature.judgement import Judgement, verdict_parts
+from pipeline.report.temperature.judgement import Judgement, relearned_date, verdict_parts
 from pipeline.report.temperature.pairs import prior_sentence
 
 WORDS = (
@@ -38,7 +38,7 @@ def render(sources: Sources, judged: Judgement) -> str:
     contestants = [
         name for name in (*names_judged(sources.metrics), *refused(sources.metrics)) if name in BY_NAME
     ]
-    relearned = sources.relearned if scorecard.relearned_date(sources) else None
+    relearned = sources.relearned if relearned_date(sources) else None
     return page.render(
         "temperature.html",
         here="temperature",

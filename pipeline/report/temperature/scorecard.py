@@ -10,7 +10,7 @@ from pipeline.report.shared.sources import Sources
 from pipeline.report.shared.verdict import FAILED, UNDECIDED, Figure, Missing, Question, state
 from pipeline.report.temperature.answers import comparison, entry, finite, judged, refused, unstable
 from pipeline.report.temperature.contestants import BY_NAME, YARDSTICKS, heading, in_a_sentence, kind
-from pipeline.report.temperature.judgement import Judgement
+from pipeline.report.temperature.judgement import Judgement, relearned_date
 from pipeline.report.temperature.pairs import relearned_band
 from pipeline.report.temperature.wording import banded, places_of, worded
 
@@ -118,15 +118,6 @@ def setting(compared: Mapping[str, Any]) -> str:
     listed = " to ".join(short(level, 2) for level in dict.fromkeys(levels[:1] + levels[-1:]))
     parts.append(f"{listed}{THIN}°C of sensor noise" if listed else "")
     return ", ".join(filter(None, parts)) or "its panel"
-
-
-def relearned_date(sources: Sources) -> str:
-    """The date of the relearnings, where they are of this machine; else ""."""
-    if sources.recorded or not isinstance(sources.relearned, dict):
-        return ""
-    if entry(sources.relearned, "machine", "outputs") != [o.name for o in sources.declared.machine.outputs]:
-        return ""
-    return str(sources.relearned.get("date") or "")
 
 
 def _row(sources: Sources, question: Question, names: list[str], judgement: Judgement, word: str) -> Row:

@@ -174,9 +174,24 @@ def _unstable_sentence(metrics: Metrics, name: str) -> str:
     return f"{name_first(name)} is unstable on {lost} of {of} plants." if lost else ""
 
 
-def choose(metrics: Metrics, held: Mapping[str, Standing], incumbent: str = "") -> str | None:
+# of the relearnings in which a contestant is to be the best before it is named for that
+STEADY = 0.8
+
+
+def best_in(relearned: Any) -> dict[str, int]:
+    """How many relearnings from fresh records each contestant was the best of; empty without relearnings."""
+    counts = entry(relearned, "answers", "best")
+    if not isinstance(counts, Mapping):
+        return {}
+    return {str(name): times for name, times in counts.items() if isinstance(times, int) and name != "None"}
+
+
+def choose(
+    metrics: Metrics, held: Mapping[str, Standing], incumbent: str = "", relearned: Any = None
+) -> str | None:
     """Who should run: the best that passes, ties to the simpler; the incumbent where none is better beyond
-    the bands of the cost. None where nobody passes."""
+    the bands of the cost. Where fresh records make others the best as well, the simplest of those is named.
+    None where nobody passes."""
     fit = [name for name, standing in held.items() if standing.passes and name not in YARDSTICKS]
     if not fit:
         return None
@@ -184,6 +199,9 @@ def choose(metrics: Metrics, held: Mapping[str, Standing], incumbent: str = "") 
     if best not in fit:
         cheapest = min(fit, key=lambda name: _cost(held[name]).value)
         best = next(name for name in fit if _cost(held[name]).low <= _cost(held[cheapest]).high)
+    counts = best_in(relearned)
+    if counts and counts.get(best, 0) < STEADY * sum(counts.values()):
+        best = next((name for name in fit if name in counts), best)
     if incumbent in fit and _cost(held[incumbent]).low <= _cost(held[best]).high:
         return incumbent
     return best
@@ -223,8 +241,10 @@ def decide(
     undeclared: Sequence[str] = (),
     drift: Figure | Missing = NEVER,
     incumbent: str = "",
+    relearned: Any = None,
 ) -> Verdict:
-    """The verdict on the temperature loop; `undeclared` are outputs without low and high.
+    """The verdict on the temperature loop; `undeclared` are outputs without low and high, `relearned` what
+    benchmarks/results/temperature_relearned.json has of this machine.
 
     `rules` of the verdict has a line for each of GROUPS with the contestant that it is about and its rival.
     """
@@ -232,7 +252,7 @@ def decide(
     held = standings(metrics, rules, undeclared=undeclared, drift=drift)
     if not held or set(held) <= set(YARDSTICKS):
         return _nothing(metrics, rules, words, drift)
-    best = choose(metrics, held, incumbent)
+    best = choose(metrics, held, incumbent, relearned)
     subject = best or closest(held)
     beside = rival(metrics, subject)
     asked = questions(rules, comparison(metrics))
@@ -243,8 +263,22 @@ def decide(
     )
     lines = tuple(zip(grouped(held[subject].rules), grouped(theirs), strict=True))
     if best:
-        return _passed(metrics, held[best], words, lines, incumbent, recorded=recorded)
+        verdict = _passed(metrics, held[best], words, lines, incumbent, recorded=recorded)
+        return verdict._replace(reason=" ".join(filter(None, [verdict.reason, turning(relearned)])))
     return _not_passed(metrics, held[subject], words, lines)
+
+
+def turning(relearned: Any) -> str:
+    """How often which contestant was the best of a relearning, where that turns with the record; else ""."""
+    counts = dict(sorted(best_in(relearned).items(), key=lambda one: -one[1]))
+    runs = sum(counts.values())
+    if not counts or max(counts.values()) >= STEADY * runs:
+        return ""
+    listed = _listed([f"{in_a_sentence(name)} in {times}" for name, times in counts.items()])
+    return (
+        f"Which is best turns with the record: of {runs} relearnings from fresh records {listed}, so that "
+        "the simplest of them is named."
+    )
 
 
 def _nothing(metrics: Metrics, rules: ReportRules, words: Words, drift: Figure | Missing) -> Verdict:

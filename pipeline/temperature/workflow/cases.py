@@ -97,7 +97,7 @@ def rehearsed(
 ) -> Rehearsal:
     """The declared panel where the true plant is known, otherwise what follows from the record."""
     if truth is not None:
-        return declared(settings, machine, truth, family[0])
+        return declared(settings, machine, truth, family)
     return from_record(settings, machine, family, read_recorded(record_path, machine))
 
 
@@ -141,13 +141,16 @@ def spread_around(settings: Panel, identified: plant.Plant) -> panel.Spread:
     return spread._replace(extra_heat_loss=float(np.clip(0.2 * slowest, 0.0, spread.extra_heat_loss)))
 
 
-def declared(settings: Panel, machine: Machine, truth: plant.Plant, identified: plant.Plant) -> Rehearsal:
-    """The study's machine: judged around the truth, tuned around what was identified."""
+def declared(
+    settings: Panel, machine: Machine, truth: plant.Plant, family: Sequence[plant.Plant]
+) -> Rehearsal:
+    """The study's machine: judged around the truth, tuned around the identified family, so that no controller
+    may lean on what one identification got wrong."""
     reference = np.array([o.reference for o in machine.outputs])
     noise = np.full(len(reference), settings.noise_degC)
     judging, training = (
-        _half(settings, half, [around], _questions(half, reference, settings.steps), noise, cells=cells)
-        for half, around, cells in ((settings.judging, truth, True), (settings.training, identified, False))
+        _half(settings, half, around, _questions(half, reference, settings.steps), noise, cells=cells)
+        for half, around, cells in ((settings.judging, [truth], True), (settings.training, family, False))
     )
     limits = input_limits(machine)
     missed = scenario_defaults.unreachable(
