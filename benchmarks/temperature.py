@@ -191,9 +191,8 @@ def main() -> None:
         print(json.dumps(on_file["cover"], indent=1))
         return
     runs = many(chosen.relearnings, 1000, {}, chosen.jobs)
-    again = tuned_again(chosen.jobs)
     machine = yaml.safe_load((ROOT / "params.yaml").read_text())["plant"]
-    result = {
+    result: dict[str, Any] = {
         "command": f"./run python -m benchmarks.temperature --relearnings {chosen.relearnings}",
         "date": datetime.date.today().isoformat(),
         "machine": {
@@ -204,13 +203,18 @@ def main() -> None:
         "holds_percent": 100 * (len(runs) - 1) / (len(runs) + 1),
         "contestants": figures(runs),
         "answers": answers(runs),
-        "five_tuning_seeds": answers(again) | {"spread_percent": spread_percent(again)},
-        "prior": {
-            name: answers(many(chosen.priors, 1000, changes, chosen.jobs)) for name, changes in PRIORS.items()
-        },
     }
+    # each part is on file before the next begins
     RESULTS.write_text(json.dumps(result, indent=1) + "\n")
-    print(json.dumps({key: result[key] for key in ("answers", "five_tuning_seeds", "prior")}, indent=1))
+    again = tuned_again(chosen.jobs)
+    result["five_tuning_seeds"] = answers(again) | {"spread_percent": spread_percent(again)}
+    RESULTS.write_text(json.dumps(result, indent=1) + "\n")
+    if chosen.priors:
+        result["prior"] = {
+            name: answers(many(chosen.priors, 1000, changes, chosen.jobs)) for name, changes in PRIORS.items()
+        }
+        RESULTS.write_text(json.dumps(result, indent=1) + "\n")
+    print(json.dumps({key: result.get(key) for key in ("answers", "five_tuning_seeds", "prior")}, indent=1))
 
 
 if __name__ == "__main__":
