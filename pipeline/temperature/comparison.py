@@ -109,8 +109,9 @@ def banded(values: np.ndarray, plant: np.ndarray, *, seed: int, resamples: int =
 
 
 def mean_and_worst(costs: np.ndarray, plant: np.ndarray, *, weight: float) -> float:
-    """One number for a search: the mean cost, and with `weight` that of the costliest quarter of the plants,
-    which moves smoothly where the single worst plant would jump."""
-    by_plant = np.sort([costs[plant == index].mean() for index in np.unique(plant)])
+    """One number for a search: the geometric mean of the plants' costs, as the paired test counts them, and
+    with `weight` that of the costliest quarter, which moves smoothly where the single worst plant would jump.
+    One plant that no controller holds cannot set the gains of all."""
+    by_plant = np.sort([np.log(max(costs[plant == index].mean(), 1e-9)) for index in np.unique(plant)])
     tail = by_plant[-max(1, len(by_plant) // 4) :].mean()
-    return float((by_plant.mean() + weight * tail) / (1 + weight))
+    return float(np.exp((by_plant.mean() + weight * tail) / (1 + weight)))
