@@ -96,7 +96,7 @@ def _caption(sources: Sources) -> str:
     date = relearned_date(sources)
     bands = (
         f"its band is the range over {entry(sources.relearned, 'relearnings')} fresh relearnings of {date}"
-        if date
+        if date and entry(sources.relearned, "contestants")
         else "its band is of this one learned controller, plants resampled"
     )
     return (
