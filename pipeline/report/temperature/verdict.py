@@ -434,6 +434,12 @@ def best_sentence(metrics: Metrics, held: Mapping[str, Standing], winner: str | 
         if standing.passes and name != winner and name not in YARDSTICKS
     ]
     beside = f"; {_listed(others)} {'passes' if len(others) == 1 else 'pass'} too" if others else ""
+    cheapest = entry(comparison(metrics), "best")
+    if cheapest in held and cheapest != winner:
+        return (
+            f"On this record {in_a_sentence(cheapest)} is the best{_ahead(metrics, cheapest)}; "
+            f"named is {in_a_sentence(winner)}{beside}."
+        )
     return f"Best of all that pass: {in_a_sentence(winner)}{_ahead(metrics, winner)}{beside}."
 
 
