@@ -301,17 +301,21 @@ def loads(name: str, tree: ast.AST) -> Iterator[tuple[str, str]]:
 
 
 def paths(stage: str, name: str, tree: ast.Module) -> tuple[set[str], set[str]]:
-    """Literal paths in datasets/ and reports/ that are read, and those that are written."""
+    """Literal paths in datasets/, reports/ and benchmarks/results/ that are read; those that are written."""
     written, read = set(), set()
     targets = {
         id(call.args[0]) for call, _, function in calls(tree) if function.startswith("write_") and call.args
     }
     for node in ast.walk(tree):
-        if isinstance(node, ast.JoinedStr) and re.match(r"f['\"](datasets|reports)/", ast.unparse(node)):
+        if isinstance(node, ast.JoinedStr) and re.match(
+            r"f['\"](datasets|reports|benchmarks/results)/", ast.unparse(node)
+        ):
             raise AssertionError(
                 f"{name}:{node.lineno} {ast.unparse(node)}: write the path out, so that one can grep for it"
             )
-        if isinstance(node, ast.Constant) and re.fullmatch(r"(datasets|reports)/[\w./-]+", str(node.value)):
+        if isinstance(node, ast.Constant) and re.fullmatch(
+            r"(datasets|reports|benchmarks/results)/[\w./-]+", str(node.value)
+        ):
             (written if id(node) in targets else read).add(node.value.rstrip("/"))
     read |= {
         f"reports/metrics/{literal(name, call, 0)}.json"

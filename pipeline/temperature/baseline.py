@@ -84,7 +84,7 @@ def pairing(
     by more than `NOISE_SHARE` of its range: so quick a loop is no longer what the record shows.
 
     A pair counts where its sign is certain: its response goes one way, and the band of the rise over `family`
-    does not hold zero. Modes slower than a third of `horizon` count as integrators. Raises ValueError where
+    does not hold zero. Modes slower than 2 `horizon` samples count as integrators. Raises ValueError where
     an output has no such input of its own.
     """
     if plant.m < plant.p:
@@ -106,6 +106,14 @@ def rises(plant: Plant, horizon: int) -> list[list[Rise]]:
     stretch, decayed = _stretch(plant, horizon)
     responses = _responses(plant, stretch)
     direction = _direction(responses, decayed)
+    if decayed and stretch > horizon:
+        # beyond `horizon` an identified slow mode may turn an answer round: where it turns that of an
+        # output's strongest input, responses are followed as of an integrator
+        early = _responses(plant, _tenth(horizon))
+        strongest = np.abs(early[-1]).argmax(axis=1)
+        first, outputs = _direction(early, False), np.arange(plant.p)
+        if (first[outputs, strongest] != direction[outputs, strongest]).any():
+            responses, direction = early, first
     return [
         [_rise(direction[o, i] * responses[:, o, i], direction[o, i]) for i in range(plant.m)]
         for o in range(plant.p)
@@ -122,15 +130,18 @@ def _stretch(plant: Plant, horizon: int) -> tuple[int, bool]:
     """Samples over which responses are followed, and whether every mode has decayed by then: three time
     constants of the slowest.
 
-    A mode that does not come to rest within `horizon`, three of its time constants, has no end to look at: a
-    tenth is followed,
+    A mode twice as slow as `horizon` is an integrator to it, and has no end to look at: a tenth is followed,
     so that the slope is that of the rise and not of what neighbours do much later (as `trust.horizon` does).
     """
     radius = np.abs(np.linalg.eigvals(strictly_proper(plant).A)).max()
     slowest = -1 / np.log(np.clip(radius, 1e-6, 1 - 1e-12)) if radius < 1 else np.inf
-    if 3 * slowest > horizon:
-        return max(horizon // 10, min(20, horizon)), False
+    if slowest > 2 * horizon:
+        return _tenth(horizon), False
     return max(int(np.ceil(3 * slowest)), 20), True
+
+
+def _tenth(horizon: int) -> int:
+    return max(horizon // 10, min(20, horizon))
 
 
 def _direction(responses: np.ndarray, decayed: bool) -> np.ndarray:

@@ -174,9 +174,10 @@ def test_cases_taken_for_plants_of_their_own_would_make_the_band_too_narrow():
 # ---- one number for a search
 
 
-def test_a_searchs_cost_is_the_mean_and_the_costliest_quarter_by_hand():
+def test_a_searchs_cost_is_the_geometric_mean_and_the_costliest_quarter_by_hand():
     plant = np.repeat(np.arange(8), 2)
     by_plant = np.array([1.0, 2, 3, 4, 5, 6, 7, 12])
     values = np.repeat(by_plant, 2) * np.tile([0.5, 1.5], 8)
-    assert mean_and_worst(values, plant, weight=0.5) == pytest.approx((5.0 + 0.5 * 9.5) / 1.5)
-    assert mean_and_worst(values, plant, weight=0.0) == pytest.approx(5.0)
+    mean, tail = np.log(by_plant).mean(), np.log([7.0, 12.0]).mean()
+    assert mean_and_worst(values, plant, weight=0.5) == pytest.approx(np.exp((mean + 0.5 * tail) / 1.5))
+    assert mean_and_worst(values, plant, weight=0.0) == pytest.approx(np.exp(mean))

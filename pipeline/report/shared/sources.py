@@ -109,9 +109,6 @@ class Sources(NamedTuple):
 # what the nightly job writes after the pages: no dependency of theirs (DVC would ask for it before the first
 # night), they show the night before
 NIGHTLY = "reports/metrics/nightly.json"
-# the benchmark's accepted result: of the study's machine, and made by hand, so that it is no dependency
-# either
-RELEARNED = "benchmarks/results/temperature_relearned.json"
 
 
 def collect(
@@ -120,6 +117,7 @@ def collect(
     folders: Mapping[str, str],
     accepted: str,
     code: tuple[str, ...],
+    relearnings: str = "",
 ) -> Sources:
     """Reads the metrics files and the folders of stages, {stage: path} each. What is missing or broken is no
     error here: its place on the page says so.
@@ -154,8 +152,8 @@ def collect(
         else None
     )
     relearned = (
-        _read(read, RELEARNED, "relearned", "benchmark", "relearned", artifacts.read_json)
-        if artifacts.exists(RELEARNED)
+        _read(read, relearnings, "relearned", "benchmark", "relearned", artifacts.read_json)
+        if relearnings and artifacts.exists(relearnings)
         else None
     )
     folders_of_code = digest({folder: artifacts.sha256(folder) for folder in code})
