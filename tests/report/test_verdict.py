@@ -251,7 +251,7 @@ def test_who_runs_today_stays_where_nobody_is_better_beyond_the_bands():
     # varx_riccati costs 2.1 (1.89 to 2.31), the best 2.0 (1.8 to 2.2); pi costs 4.0 (3.6 to 4.4)
     verdict = judge(stages, incumbent="varx_riccati")
     assert verdict.winner == "varx_riccati"
-    assert "It runs today, and subspace + LQG is not better beyond the bands." in verdict.reason
+    assert "The accepted run named it, and subspace + LQG is not better beyond the bands." in verdict.reason
     assert judge(stages, incumbent="pi").winner == "subspace_lqg"
     assert judge(stages, incumbent="window").winner == "subspace_lqg"
 

@@ -312,7 +312,7 @@ def _passed(
     drift = winner.rules[-1]
     best = entry(compared, "best")
     stays = (
-        f"It runs today, and {in_a_sentence(best)} is not better beyond the bands."
+        f"The accepted run named it, and {in_a_sentence(best)} is not better beyond the bands."
         if winner.name == incumbent != best and best
         else ""
     )
