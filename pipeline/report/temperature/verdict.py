@@ -264,7 +264,7 @@ def decide(
     lines = tuple(zip(grouped(held[subject].rules), grouped(theirs), strict=True))
     if best:
         verdict = _passed(metrics, held[best], words, lines, incumbent, recorded=recorded)
-        return verdict._replace(reason=" ".join(filter(None, [verdict.reason, turning(relearned)])))
+        return verdict._replace(reason=" ".join(filter(None, [turning(relearned), verdict.reason])))
     return _not_passed(metrics, held[subject], words, lines)
 
 
