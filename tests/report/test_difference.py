@@ -10,7 +10,7 @@ from pipeline import cli
 from pipeline.store import artifacts, renamed
 from stages.report import main
 from tests.report import made
-from tests.report.test_pages import INDEX, Page, change
+from tests.report.test_pages import INDEX, TEMPERATURE, Page, change
 
 DEPOSITION = Path("reports/deposition.html")
 SCORES = {
@@ -59,7 +59,7 @@ def test_who_was_chosen_is_accepted_and_stays_where_nobody_is_better_beyond_the_
     # VARX + Riccati costs 2.1 (1.89 to 2.31), the best 2.0 (1.8 to 2.2)
     artifacts.write_json("reports/accepted.json", run | {"winner": "varx_riccati"})
     main()
-    text = Page(INDEX).text
+    text = Page(TEMPERATURE).text
     assert "Rehearsal passed: VARX + Riccati." in text
     assert "The accepted run named it, and subspace + LQG is not better beyond the bands." in text
 
@@ -77,7 +77,7 @@ def test_a_parameter_that_was_renamed_since_the_accepted_run_has_not_changed(acc
 
 def test_a_changed_parameter_code_file_and_artifact_are_each_named(accepted):
     Path("params.yaml").write_text(
-        Path("params.yaml").read_text().replace("disk_margin: 0.4", "disk_margin: 0.41", 1)
+        Path("params.yaml").read_text().replace(" disk_margin: 0.4", " disk_margin: 0.41", 1)
     )
     Path("stages/code.py").write_text("2\n")
     artifacts.write_json("datasets/tune_weights/weights.json", {"contestants": {"pi": {"cost": 3.0}}})
