@@ -40,7 +40,7 @@ from tests.temperature import small_machines
 from tests.temperature.small_machines import MACHINES, SmallMachine
 
 RESULTS = Path(__file__).parent / "results" / "small_machines.json"
-SHARED = Path(os.environ.get("BEADLINE_SHARED", "/work/shared")) / "data"
+SHARED = Path(os.environ.get("BEADLINE_SHARED", "../shared")) / "data"
 # few of everything, so that all machines take less than four minutes on one core
 PLANTS = {"judging": 12, "training": 6}
 BUDGET = {"practical_initial": 6, "practical_evaluations": 10}
