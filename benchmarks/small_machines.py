@@ -150,9 +150,7 @@ def rehearsed(recording: Recording) -> Rehearsed:
     recorded = cases.Recorded([recording.u], [recording.y], [0])
     rehearsal = cases.from_record(panel, machine, family, recorded)
     setting = cases.shared(tuning, machine, tracking, panel, rehearsal, family)
-    problem = learned.problem(
-        made, tracking, setting.limits, None, rehearsal.noise, horizon=rehearsal.judging.steps
-    )
+    problem = learned.problem(made, tracking, setting, None)
     execution = params.load(params.Execution, "execution").model_copy(update={"jobs": 1})
     weights = tune_weights.tuned(tuning, problem, setting, execution).weights["contestants"]
     rules = evaluate_temperature.resolved(params.load(TemperatureRules, "report"), panel, rehearsal)
@@ -189,14 +187,10 @@ def driven(
     """The true machine under a contestant as deployed: handed over from rest near `start` (p,), then held to
     r (p,) for as long as a case of the panel lasts."""
     design, setting = of.designs[name], of.setting
-    deployed = controller.deployed(
-        design.law,
-        setting.limits,
-        integral_limit=setting.integral_limit,
-        governor=setting.governor if design.governed else None,
-        holds=design.holds,
+    running, rng = (
+        controller.RunningController(cases.as_deployed(design, setting), design.model),
+        np.random.default_rng(3),
     )
-    running, rng = controller.RunningController(deployed, design.model), np.random.default_rng(3)
     u = rest_input(machine, start)
     state, judging = small_machines.at_rest(machine, u), setting.rehearsal.judging
     begun = small_machines.true_outputs(state)

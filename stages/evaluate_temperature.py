@@ -38,9 +38,7 @@ def main() -> None:
         family = [made.model, *made.spread]
         rehearsal = cases.rehearsed(panel, machine, truth, family, "datasets/ingest/record.parquet")
         setting = cases.shared(tuning, machine, tracking, panel, rehearsal, family)
-        problem = learned.problem(
-            made, tracking, setting.limits, truth, rehearsal.noise, horizon=rehearsal.judging.steps
-        )
+        problem = learned.problem(made, tracking, setting, truth)
         rules = evaluate_temperature.resolved(params.load(TemperatureRules, "report"), panel, rehearsal)
         judged = evaluate_temperature.judged(settings, machine, setting, problem, weights, rules, execution)
         artifacts.write_table(out / "cases.parquet", tables.CASES, judged.cases)

@@ -25,9 +25,7 @@ def main() -> None:
         family = [made.model, *made.spread]
         rehearsal = cases.rehearsed(panel, machine, truth, family, "datasets/ingest/record.parquet")
         setting = cases.shared(settings, machine, tracking, panel, rehearsal, family)
-        problem = learned.problem(
-            made, tracking, setting.limits, truth, rehearsal.noise, horizon=rehearsal.training.steps
-        )
+        problem = learned.problem(made, tracking, setting, truth)
         tuned = tune_weights.tuned(settings, problem, setting, execution)
         artifacts.write_json(out / "weights.json", tuned.weights)
         artifacts.write_table(out / "history.parquet", tables.TUNING, tuned.history)

@@ -245,8 +245,12 @@ def _designed(frozen: FrozenPanel, folder: Path, name: str) -> tuple[contestants
             f"none; name one of {', '.join(stored.get('contestants', {})) or 'those that it has'} there, or "
             "let tune_weights tune it"
         )
-    steps, noise = frozen.rehearsal.judging.steps, frozen.rehearsal.noise
-    problem = learned.problem(made, tracking, setting.limits, None, noise, horizon=steps)
+    # what it was tuned for, not what it is judged by
+    of = stored.get("design", {})
+    problem = learned.problem(made, tracking, setting, None)._replace(
+        horizon=int(of.get("horizon_steps", frozen.settings.steps)),
+        noise=np.array(of.get("noise_degC", frozen.rehearsal.noise), float),
+    )
     design = contestant.design(problem, values)
     if design is None:
         raise ValueError(f"{folder}: expected what {name} is designed from, found that its record has none")

@@ -266,3 +266,26 @@ def test_the_temperature_loop_allows_its_worst_case_and_its_hold_out_a_percentag
         "settled_error_degC": rule.settled_error_degC,
         "holdout_error_degC": pytest.approx(0.05),
     }
+
+
+def test_a_controller_is_designed_for_what_it_was_tuned_for_not_for_the_nights_cases(project, monkeypatch):
+    """PI's gains depend on the horizon that its responses are followed over: a night of shorter cases would
+    judge another PI than the pages."""
+    artifacts.write_arrays("datasets/identify_plant/spread.parquet", "spread", 1, plant.stored([baam()] * 2))
+    path = "datasets/tune_weights/weights.json"
+    stored = artifacts.read_json(path)
+    designed_for = []
+    pi = judge.contestants.BY_NAME["pi_simc"]
+
+    def watched(problem, values):
+        designed_for.append((problem.horizon, problem.noise.tolist()))
+        return pi.design(problem, values)
+
+    monkeypatch.setitem(judge.contestants.BY_NAME, "pi_simc", pi._replace(design=watched))
+    frozen = judge.frozen_panel(project.holdout)
+    artifacts.write_json(path, stored | {"design": {"horizon_steps": 450, "noise_degC": [0.3] * 5}})
+    judge.judged(frozen, Path("datasets"), "pi_simc")
+    artifacts.write_json(path, stored)  # of a version that did not say so
+    judge.judged(frozen, Path("datasets"), "pi_simc")
+    assert designed_for[0] == (450, [0.3] * 5)
+    assert designed_for[1][0] == frozen.settings.steps != frozen.rehearsal.judging.steps

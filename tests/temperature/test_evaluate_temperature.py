@@ -82,7 +82,7 @@ def small(inputs: int = 7) -> Small:
     setting = cases.shared(
         section(TuneWeights, "tune_weights"), machine, tracking, halves, rehearsal, [truth, truth]
     )
-    problem = learned.problem(made, tracking, setting.limits, truth, rehearsal.noise, horizon=120)
+    problem = learned.problem(made, tracking, setting, truth)
     return Small(machine, setting, problem)
 
 

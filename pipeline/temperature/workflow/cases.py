@@ -6,8 +6,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.temperature import governor, identification, panel, plant, scenario_defaults, tracking
+from pipeline.temperature import (
+    controller,
+    governor,
+    identification,
+    panel,
+    plant,
+    scenario_defaults,
+    tracking,
+)
 from pipeline.temperature.workflow import record
+from pipeline.temperature.workflow.contestants import Design
 from pipeline.temperature.workflow.settings import Half, Panel, Tracking, TuneWeights
 from pipeline.temperature.workflow.settings import Plant as Machine
 
@@ -86,6 +95,35 @@ def shared(
         machine.sample_time_s,
         faster(settings, rehearsal),
     )
+
+
+def as_deployed(design: Design, setting: Setting) -> controller.Deployed:
+    """A contestant with what all of them run under."""
+    return controller.deployed(
+        design.law,
+        setting.limits,
+        integral_limit=setting.integral_limit,
+        governor=setting.governor if design.governed else None,
+        holds=design.holds,
+    )
+
+
+def played(
+    design: Design, rests: Sequence[controller.Rest], asked: panel.Cases, setting: Setting
+) -> tuple[panel.Rollout, panel.Figures]:
+    """A contestant over one half of the panel, as deployed; `rests` from panel.rests of its model."""
+    rollout = panel.rolled_out(as_deployed(design, setting), asked, panel.aims(design.law, rests, asked))
+    low, high = setting.output_limits
+    figures = panel.figures(
+        rollout,
+        asked,
+        limits=setting.limits,
+        low=low,
+        high=high,
+        band=setting.rehearsal.band_degC,
+        settled=setting.settled,
+    )
+    return rollout, figures
 
 
 def rehearsed(

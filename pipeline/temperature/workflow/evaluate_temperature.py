@@ -11,9 +11,9 @@ from tqdm import tqdm
 from pipeline.store import artifacts
 from pipeline.store.execution import run_all
 from pipeline.store.params import Execution
-from pipeline.temperature import comparison, controller, panel, scorecard
+from pipeline.temperature import comparison, panel, scorecard
 from pipeline.temperature.workflow import contestants, tune_weights
-from pipeline.temperature.workflow.cases import Rehearsal, Setting, faster
+from pipeline.temperature.workflow.cases import Rehearsal, Setting, faster, played
 from pipeline.temperature.workflow.settings import EvaluateTemperature, Panel, TemperatureRules
 from pipeline.temperature.workflow.settings import Plant as Machine
 
@@ -194,25 +194,7 @@ def judged(
 def judged_one(name: str, design: contestants.Design, setting: Setting) -> tuple[str, JudgedContestant]:
     """One contestant on the judging half, with its name."""
     cases = setting.rehearsal.judging
-    deployed = controller.deployed(
-        design.law,
-        setting.limits,
-        integral_limit=setting.integral_limit,
-        governor=setting.governor if design.governed else None,
-        holds=design.holds,
-    )
-    rests = panel.rests(design.model, cases, setting.limits)
-    rollout = panel.rolled_out(deployed, cases, panel.aims(design.law, rests, cases))
-    low, high = setting.output_limits
-    figures = panel.figures(
-        rollout,
-        cases,
-        limits=setting.limits,
-        low=low,
-        high=high,
-        band=setting.rehearsal.band_degC,
-        settled=setting.settled,
-    )
+    rollout, figures = played(design, panel.rests(design.model, cases, setting.limits), cases, setting)
     margins = [] if design.holds else scorecard.margins(cases.plants, design.law, grid=80)
     return name, JudgedContestant(
         figures, panel.costs(figures, setting.allowance), margins, _gaps(design, setting), rollout

@@ -4,13 +4,11 @@ contestants are designed from."""
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from pipeline.store import artifacts
 from pipeline.temperature import kernel, plant, window
-from pipeline.temperature.governor import Limits
 from pipeline.temperature.printer_pid import HeaterPid
 from pipeline.temperature.workflow import contestants
+from pipeline.temperature.workflow.cases import Setting
 from pipeline.temperature.workflow.settings import Plant as Machine
 from pipeline.temperature.workflow.settings import Tracking
 
@@ -81,25 +79,20 @@ def _heater_pids(pids: list[dict[str, Any]], machine: Machine) -> tuple[HeaterPi
 
 
 def problem(
-    learned: Learned,
-    tracking: Tracking,
-    limits: Limits,
-    truth: plant.Plant | None,
-    noise: np.ndarray,
-    *,
-    horizon: int,
+    learned: Learned, tracking: Tracking, setting: Setting, truth: plant.Plant | None
 ) -> contestants.Problem:
-    """What contestants are designed from."""
+    """What contestants are designed from: the same for tuning and for judging, whatever the length of their
+    cases."""
     return contestants.Problem(
         plant=learned.model,
         family=[learned.model, *learned.spread],
         window=learned.window,
         kernel=learned.kernel,
         truth=truth,
-        limits=limits,
+        limits=setting.limits,
         gamma=tracking.gamma,
         exact_tau=tracking.observer_tau,
-        horizon=horizon,
-        noise=noise,
+        horizon=setting.rehearsal.judging.steps,
+        noise=setting.rehearsal.noise,
         printer_pid=learned.printer_pid,
     )

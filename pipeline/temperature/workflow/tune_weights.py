@@ -12,7 +12,7 @@ from pipeline.store.execution import run_all
 from pipeline.store.params import Execution
 from pipeline.temperature import comparison, controller, panel, scorecard, tuning
 from pipeline.temperature.workflow import contestants
-from pipeline.temperature.workflow.cases import Setting
+from pipeline.temperature.workflow.cases import Setting, played
 from pipeline.temperature.workflow.settings import TuneWeights
 
 # of a parameter's range, in logarithms: so near to an end the search is called bound by it
@@ -49,7 +49,10 @@ def tuned(
         )
     best = {name: _values(name, result, problem) for name, result in found.items()}
     return Tuned(
-        {"contestants": best},
+        {
+            "design": {"horizon_steps": problem.horizon, "noise_degC": problem.noise.tolist()},
+            "contestants": best,
+        },
         _history(found, problem),
         {
             "contestants": {
@@ -116,22 +119,10 @@ def _cost(
             f"the delay margin {margin.delay_s:.2f} s, where {settings.least_disk_margin:g} and "
             f"{least_delay_s:g} s are the least"
         )
-    cases, (low, high) = setting.rehearsal.training, setting.output_limits
-    deployed = controller.deployed(
-        design.law, setting.limits, integral_limit=setting.integral_limit, governor=setting.governor
-    )
-    rollout = panel.rolled_out(deployed, cases, panel.aims(design.law, rests, cases))
-    figures = panel.figures(
-        rollout,
-        cases,
-        limits=setting.limits,
-        low=low,
-        high=high,
-        band=setting.rehearsal.band_degC,
-        settled=setting.settled,
-    )
+    training = setting.rehearsal.training
+    figures = played(design, rests, training, setting)[1]
     costs = panel.costs(figures, setting.allowance)
-    return comparison.mean_and_worst(costs, cases.plant, weight=settings.worst_case)
+    return comparison.mean_and_worst(costs, training.plant, weight=settings.worst_case)
 
 
 def _names(contestant: contestants.Contestant) -> list[str]:
