@@ -356,15 +356,16 @@ def governed(
 def _walls(family: Governor, now: np.ndarray, y_star: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Floor and cap (f, s, p) in °C of outputs forecast `now` (f, s, p): low and high; and `overshoot` beyond
     the target, `near` where an output has arrived at it. What is up to a further `overshoot` off goes back,
-    so that small errors of the forecast do not add up; what is further off is left to the law."""
+    so that small errors of the forecast do not add up; what is further off comes back as the law says, and
+    goes no further away."""
     arriving, leaving = (
         np.where(sign * (y_star - now) < ARRIVED * family.overshoot, family.near, family.overshoot)
         for sign in (1.0, -1.0)
     )
     floor, cap = y_star - leaving, y_star + arriving
     return (
-        np.maximum(family.low, np.where(now < floor - family.overshoot, -np.inf, floor)),
-        np.minimum(family.high, np.where(now > cap + family.overshoot, np.inf, cap)),
+        np.maximum(family.low, np.where(now < floor - family.overshoot, now, floor)),
+        np.minimum(family.high, np.where(now > cap + family.overshoot, now, cap)),
     )
 
 

@@ -114,6 +114,16 @@ def test_one_row_is_met_by_the_least_change():
     np.testing.assert_allclose(u, 50.0 - (150.0 - 55.0) / 5 * np.array([2.0, 1.0]), rtol=1e-9)
 
 
+def test_an_output_far_beyond_its_target_comes_back_as_the_law_says_and_goes_no_further_away():
+    """3 degC above: 0.95 60 + 0.5 u = 60 at u = 6; below that the command is the law's."""
+    outputs = OutputLimits(np.full(1, -np.inf), np.full(1, 100.0), np.zeros(1), 0.5)
+    family = governor([HEATER], ONE, outputs, Strength(1.0, 1.0, 0.0))
+    memory = started(family, np.full((2, 1), 60.0))
+    most, low, target = np.full((2, 1), 10.0), np.zeros((2, 1)), np.full((2, 1), 57.0)
+    u = governed(family, memory, np.array([[10.0], [4.0]]), target, low, most)
+    np.testing.assert_allclose(u[:, 0], [6.0, 4.0], rtol=1e-9)
+
+
 def test_cases_are_governed_alike_alone_and_among_many():
     family, rng = study_guard(), np.random.default_rng(2)
     y = REFERENCE + rng.uniform(-60, 1, (40, 5))
