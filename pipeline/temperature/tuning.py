@@ -496,3 +496,38 @@ def minimise(
         if on_step is not None and index >= len(start.cost):
             on_step(history)
     return _recommended(search, history, kernel)
+
+
+def polished(
+    cost: Callable[[np.ndarray], float],
+    found: Result,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    *,
+    evaluations: int,
+    side: float = 1 / 8,
+) -> Result:
+    """The best of `found` after a pattern search of so many `evaluations` more (Hooke and Jeeves 1961): one
+    log-weight after the other a step up and down, the step first `side` of its range and halved where none of
+    them is better.
+
+    It needs neither a slope nor a model of the cost, which knows least at a wall beyond which candidates
+    fail, where an optimum often lies.
+    """
+    span, history, best = np.log(upper / lower), found.history, found.cost
+    point = np.log(found.theta / lower) / span
+    ways = [sign * way for way in np.eye(len(lower)) for sign in (1.0, -1.0)]
+    last, left = len(history.cost) + evaluations, list(ways)
+    while len(history.cost) < last:
+        if not left:
+            side, left = side / 2, list(ways)
+        way = left.pop(0)
+        there = np.clip(point + side * way, 0.0, 1.0)
+        theta = np.clip(lower * (upper / lower) ** there, lower, upper)
+        value, reason = _evaluated(cost, theta)
+        history = _extended(history, theta, value, reason)
+        if value < best:
+            point, best = there, value
+            left = [way, *(other for other in ways if other is not way)]
+    theta = history.theta[np.nanargmin(history.cost)]
+    return Result(theta, best, history)

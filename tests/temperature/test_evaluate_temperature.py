@@ -303,7 +303,7 @@ def tuned(given):
 
 def tuning_of(given: Small, jobs: int = 1) -> tune_weights.Tuned:
     settings = section(TuneWeights, "tune_weights").model_copy(
-        update={"practical_initial": 4, "practical_evaluations": 6}
+        update={"practical_initial": 4, "practical_evaluations": 9}
     )
     execution = params.Execution(backend="loky", jobs=jobs, scheduler="")
     return tune_weights.tuned(settings, given.problem, given.setting, execution)
@@ -315,11 +315,11 @@ def test_every_contestant_is_searched_with_the_same_budget_from_its_declared_sta
     assert list(tuned.weights["contestants"]) == searched
     for name in searched:
         mine = rows["contestant"] == name
-        np.testing.assert_array_equal(rows["evaluation"][mine], np.arange(1, 7))
+        np.testing.assert_array_equal(rows["evaluation"][mine], np.arange(1, 10))
         assert rows["chosen"][mine].sum() == 1
         start = ", ".join(f"{key} {value:.4g}" for key, value in given.weights[name].items())
         assert rows["values"][mine][0] == start
-        assert tuned.weights["contestants"][name]["evaluations"] == 6
+        assert tuned.weights["contestants"][name]["evaluations"] == 9
 
 
 def test_a_chosen_candidate_is_no_dearer_than_the_start_and_lies_within_its_bounds(given, tuned):

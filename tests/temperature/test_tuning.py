@@ -365,3 +365,20 @@ def test_a_search_that_cannot_be_made_is_refused_in_one_sentence(change, sentenc
     arguments = {"lower": [0.1, 0.1], "upper": [1.0, 1.0], "settings": tuning.SearchSettings(4, 8)} | change
     with pytest.raises(ValueError, match=sentence):
         tuning.minimise(np.sum, rng=np.random.default_rng(0), **arguments)
+
+
+def test_a_pattern_search_goes_on_to_an_optimum_against_a_wall_within_its_evaluations():
+    """min of log(a)^2 + log(a b)^2 where a < 2 fails: on the wall, at b = 1 / 2."""
+
+    def cost(theta: np.ndarray) -> float:
+        if theta[0] < 2.0:
+            raise ValueError("beyond the wall")
+        return float(np.log(theta[0]) ** 2 + np.log(theta.prod()) ** 2)
+
+    lower, upper, theta = np.full(2, 0.01), np.full(2, 100.0), np.array([9.0, 3.0])
+    first = tuning.History(theta[None], np.array([cost(theta)]), ("",), np.array([cost(theta)]))
+    found = tuning.polished(cost, tuning.Result(theta, first.cost[0], first), lower, upper, evaluations=60)
+    assert len(found.history.cost) == 61
+    assert found.cost == cost(found.theta) == np.nanmin(found.history.cost)
+    assert found.cost < 1.02 * np.log(2.0) ** 2
+    assert np.isnan(found.history.cost).any()

@@ -74,9 +74,9 @@ class Parameter(NamedTuple):
     of_effect: bool = False
 
 
-EFFORT = Parameter("effort_weight", 0.1, 30.0, 1e5, of_effect=True)
-OBSERVER = Parameter("observer_tau", 1e-4, 0.1, 1e3, of_effect=True)
-INTEGRAL = Parameter("integral", 0.001, 0.02, 0.8)
+EFFORT = Parameter("effort_weight", 0.3, 5.0, 3e3, of_effect=True)
+OBSERVER = Parameter("observer_tau", 0.01, 1.0, 100.0, of_effect=True)
+INTEGRAL = Parameter("integral", 0.004, 0.04, 0.4)
 Values = Mapping[str, float]
 
 

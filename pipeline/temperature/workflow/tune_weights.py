@@ -20,6 +20,8 @@ AT_BOUND = 0.02
 # of the cost, for a parameter moved from its start by its whole range: of two candidates as good as each
 # other the one nearer to the start is taken, so that a direction in which the cost is flat has one end
 NEARER = 0.05
+# of the candidates, the last, by a pattern search from the best: without it two seeds end 6 % apart
+POLISHED = 1 / 3
 
 
 class Tuned(NamedTuple):
@@ -84,15 +86,18 @@ def _searched(
         return _cost(made, rests, settings, setting) * (1 + NEARER * float(far @ far))
 
     first = tuning.History(start[None], *_first(cost, start))
+    initial, evaluations = settings.practical_initial, settings.practical_evaluations
+    last = min(round(POLISHED * evaluations), evaluations - initial)
     try:
-        return name, tuning.minimise(
+        found = tuning.minimise(
             cost,
             low,
             high,
-            tuning.SearchSettings(settings.practical_initial, settings.practical_evaluations),
+            tuning.SearchSettings(initial, evaluations - last),
             rng=np.random.default_rng(settings.seed),
             start=first,
         )
+        return name, tuning.polished(cost, found, low, high, evaluations=last)
     except ValueError as reason:  # every candidate failed: the others go on
         return name, str(reason)
 
