@@ -1,11 +1,13 @@
 """Sixty nights of the nightly job on a made-up machine: recordings as CSV in the users' format, one a night,
 with seeds; then drift, bad nights and a planted challenger.
 
-`nice ./run python -m benchmarks.nights [null|alarms|drift|bad|planted ...]` plays the scenarios
-named (default: all), prints the figures beside the bars, and writes benchmarks/results/nights.json.
-Each night is `pipeline.nightly.night.nightly` itself in a git repository of its own; only `dvc
-repro` is replaced by a call of the same stages in one process, because starting five of them takes
-longer than their work. `--dvc` plays it with `dvc repro`.
+`nice ./run python -m benchmarks.nights [null|alarms|drift|bad|planted|screened ...]` plays the
+scenarios named (default: null, drift, bad, planted), prints the figures beside the bars, and writes
+benchmarks/results/nights.json. Each night is `pipeline.nightly.night.nightly` itself in a git
+repository of its own; only `dvc repro` is replaced by a call of the same stages in one process,
+because starting five of them takes longer than their work. `--dvc` plays it with `dvc repro`.
+`screened` are the nights of `benchmarks.screened_nights`, which learn nothing: creeping and stepping
+faults in a minute and a half.
 
 The machine: two heated zones (60 and 90 s, 1.6 and 1.2 °C per percent) that warm each other, 20 °C around
 them give or take 0.5 °C a night, 0.1 °C of sensor noise. The judge of all is the machine itself: what a
@@ -28,7 +30,7 @@ import numpy as np
 import scipy.linalg
 import yaml
 
-from pipeline.nightly import champion, judge, night, processes
+from pipeline.nightly import champion, judge, night, processes, promoting
 from pipeline.report.nightly.record import Night
 from pipeline.store import artifacts, params
 from pipeline.temperature import panel
@@ -139,6 +141,8 @@ def project(folder: Path, seed: int, *, recordings: int = 4, with_dvc: bool = Fa
     subprocess.run(["git", "add", "-A"], check=True)
     subprocess.run(["git", "commit", "-q", "-m", "project"], check=True)
     night._reproduce = reproduce if with_dvc else _stages
+    # here challengers are held against champions alone: no stage makes the figures of the pages
+    promoting.verdicts_of = lambda settings, night: ({}, night)
 
 
 def settings() -> dict:
@@ -203,7 +207,7 @@ def _stages(_, run: str) -> None:
         finally:
             os._exit(status)
     if os.waitpid(child, 0)[1]:
-        raise ValueError(f"dvc repro failed: {processes._sentence(log.read_text())}")
+        raise ValueError(f"dvc repro failed: {processes.sentence(log.read_text())}")
 
 
 def play(index: int, columns: dict[str, np.ndarray] | None) -> tuple[int, str, Night]:
@@ -411,6 +415,11 @@ def main() -> None:
     whole = a.folder or Path(tempfile.mkdtemp(prefix="nights-"))
     for name in a.scenarios:
         print(name, flush=True)
+        if name == "screened":
+            from benchmarks import screened_nights
+
+            screened_nights.play_and_keep([a.seed])
+            continue
         call = {
             "null": lambda f: null(a.seed, a.nights, f, a.dvc),
             "alarms": lambda f: null(a.seed, a.nights, f, a.dvc, learn=False),

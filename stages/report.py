@@ -12,6 +12,7 @@ from pipeline.report.deposition import page as deposition_page
 from pipeline.report.identification import page as identification_page
 from pipeline.report.index import page as index_page
 from pipeline.report.setpoint import page as setpoint_page
+from pipeline.report.shared import headline
 from pipeline.report.shared.sources import Declared, collect, digest
 from pipeline.report.shared.verdict import ReportRules
 from pipeline.report.temperature import page as temperature_page
@@ -76,6 +77,9 @@ def main() -> None:
             "report",
             {
                 "verdict": judged.verdict.metrics(),
+                "verdicts": {
+                    loop: verdict.metrics() for loop, verdict in headline.verdicts(sources, judged).items()
+                },
                 "figures": shown(judged),
                 "bytes": {name: len(text.encode()) for name, text in pages.items()},
                 "pictures": {name: text.count('role="img"') for name, text in pages.items()},

@@ -5,7 +5,7 @@ import datetime
 from pathlib import Path
 
 from pipeline.nightly import champion, guarding, remembered, screening, watch
-from pipeline.nightly.processes import commit, dvc
+from pipeline.nightly.processes import check_attached, commit, dvc
 from pipeline.nightly.settings import Loop, Nightly
 from pipeline.report.nightly.production import DRIFT_ACCEPTED
 from pipeline.store import artifacts, params
@@ -16,6 +16,7 @@ def accept(loop: str, why: str) -> str:
     reason. Raises ValueError where the loop has no alarm."""
     settings = params.load(Nightly, "nightly")
     with guarding.alone():
+        check_attached()
         state, last = champion.read(), remembered.last()
         recordings = last.drift.drifted.get(loop, [])
         if loop not in state.champions or not recordings:

@@ -3,6 +3,7 @@ checked, put back to an earlier one bit by bit."""
 
 import hashlib
 import json
+import os
 import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,8 +11,15 @@ from typing import Any
 
 import yaml
 
-from pipeline.nightly.processes import dvc, fresh_index, git
-from pipeline.report.nightly.production import ROLLED_BACK, Champion, ChampionState, HistoryLine, Installed
+from pipeline.nightly.processes import dvc, fresh_index, git, names
+from pipeline.report.nightly.production import (
+    DRIFT_ACCEPTED,
+    ROLLED_BACK,
+    Champion,
+    ChampionState,
+    HistoryLine,
+    Installed,
+)
 from pipeline.store import artifacts
 
 FILE, FOLDER = Path("champion.json"), Path("champion")
@@ -29,13 +37,60 @@ def of_branch(branch: str) -> ChampionState:
 
 
 def write(state: ChampionState) -> None:
+    """champion.json; on the disk, with the pointers and the files that it speaks of, before this returns."""
     artifacts.write_json(FILE, state.written())
+    for path in (*map(Path, paths()), *_files(FOLDER), *_cached(state)):
+        if path.exists():
+            _sync(path)
+    for folder in (Path(), *([FOLDER, *(path for path in FOLDER.rglob("*") if path.is_dir())])):
+        if folder.is_dir():
+            _sync(folder)
+
+
+def _sync(path: Path) -> None:
+    """Waits until a file or a folder's entries are on the disk, which a rename alone does not ask for."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _cached(state: ChampionState) -> list[Path]:
+    """Where DVC's own cache keeps the champions' files, which `put_back` takes them from."""
+    champions = state.folders.values()
+    hashes = {md5 for champion in champions for md5 in (champion.md5, *champion.installed.files.values())}
+    return [Path(".dvc/cache/files/md5") / md5[:2] / md5[2:] for md5 in sorted(hashes)]
+
+
+def write_state(state: ChampionState, place: Path) -> None:
+    """champion.json and the pointers of what it names, and no others, below `place`."""
+    artifacts.write_json(place / FILE, state.written())
+    for pointer in (place / FOLDER).glob("*.dvc"):
+        if pointer.stem not in state.folders:
+            pointer.unlink()
+    for folder, champion in state.folders.items():
+        write_pointer(folder, champion, place)
+
+
+def write_pointer(loop: str, champion: Champion, place: Path = Path()) -> None:
+    """champion/<loop>.dvc of this champion, below `place`, and its line in champion/.gitignore."""
+    folder = place / FOLDER
+    outs = {"outs": [dict(champion.installed.folder)]}
+    artifacts.write_text(folder / f"{loop}.dvc", yaml.safe_dump(outs, sort_keys=False))
+    ignored = folder / ".gitignore"
+    lines = ignored.read_text(encoding="utf-8").splitlines() if ignored.exists() else []
+    if f"/{loop}" not in lines:
+        artifacts.write_text(ignored, "\n".join([*lines, f"/{loop}"]) + "\n")
 
 
 def md5s(folder: Path) -> dict[str, str]:
     """{path below the folder: MD5}, the hash that DVC's cache goes by."""
-    files = sorted(file for file in folder.rglob("*") if file.is_file()) if folder.is_dir() else []
-    return {file.relative_to(folder).as_posix(): _md5(file) for file in files}
+    return {file.relative_to(folder).as_posix(): _md5(file) for file in _files(folder)}
+
+
+def _files(folder: Path) -> list[Path]:
+    return sorted(file for file in folder.rglob("*") if file.is_file()) if folder.is_dir() else []
 
 
 def _md5(path: Path) -> str:
@@ -75,6 +130,13 @@ def install(loop: str, files: Sequence[str], beside: Mapping[str, Any]) -> Insta
     _swap(new, FOLDER / loop)
     dvc("add", "--quiet", str(FOLDER / loop))
     return Installed(pointer(loop), md5s(FOLDER / loop), locked(files))
+
+
+def removed(folder: str) -> None:
+    """champion/<folder> and its pointer are gone; DVC's cache keeps the files."""
+    if (FOLDER / f"{folder}.dvc").exists():
+        dvc("remove", "--quiet", str(FOLDER / f"{folder}.dvc"))
+    shutil.rmtree(FOLDER / folder, ignore_errors=True)
 
 
 def md5_of(files: Sequence[str]) -> dict[str, str]:
@@ -133,36 +195,60 @@ def in_production(
         champion,
         before.installed.files if before and event == ROLLED_BACK else None,
     )
-    return ChampionState({**state.champions, loop: champion}, (*state.history, line))
+    champions = {**state.champions, loop: champion}
+    return state._replace(champions=champions, history=(*state.history, line))
 
 
 # ---- the way back
 
 
 def paths() -> list[str]:
-    """What a commit of the champion holds."""
-    return [str(FILE), f"{FOLDER}/.gitignore", *sorted(str(path) for path in FOLDER.glob("*.dvc"))]
+    """What a commit of the champion holds; a pointer that is gone is committed as gone."""
+    tracked = {path for path in names("ls-files", "--", str(FOLDER)) if path.endswith(".dvc")}
+    return [
+        str(FILE),
+        f"{FOLDER}/.gitignore",
+        *sorted(tracked | {str(path) for path in FOLDER.glob("*.dvc")}),
+    ]
+
+
+def standing(state: ChampionState, loop: str) -> list[tuple[int, Champion]]:
+    """Champions of a loop in the order in which they were promoted, the present one last, each with the
+    number of its line in the history. One that was rolled back is none of them any more, unless it was put
+    back."""
+    stack: list[tuple[int, Champion]] = []
+    for number, line in enumerate(state.history):
+        if line.loop != loop:
+            continue
+        if line.event == ROLLED_BACK:
+            # down to the one that was put back; where that had gone itself, it comes on top
+            at = [k for k, (_, champion) in enumerate(stack) if champion.md5 == line.champion.md5]
+            stack = stack[: at[-1] + 1] if at else [*stack, (number, line.champion)]
+        elif line.event == DRIFT_ACCEPTED and stack:
+            stack[-1] = (stack[-1][0], line.champion)
+        else:
+            stack.append((number, line.champion))
+    return stack
 
 
 def earlier(state: ChampionState, run: str, loop: str) -> dict[str, Champion]:
-    """{loop: champion} to go back to: those that were in production in `run`. Where `run` is empty, those
-    before the present ones. Raises ValueError where there is none, or no such loop."""
+    """{loop: champion} to go back to: those that were in production in `run`. Where `run` is empty, the one
+    before the present one: of the loop whose present one was promoted last, unless `loop` is named. Raises
+    ValueError where there is none, or no such loop."""
     if loop and loop not in state.champions:
         loops = ", ".join(state.champions) or "none"
         raise ValueError(
             f"{FILE}: expected a loop with a champion, found {loop}; loops with a champion are: {loops}"
         )
     history = [line for line in state.history if not loop or line.loop == loop]
-    champions: dict[str, Champion] = {}
-    for line in history:
-        if line.run == run or (not run and line.champion.md5 != state.champions[line.loop].md5):
-            champions[line.loop] = line.champion
-    if run and champions:
+    if run:
+        champions = {line.loop: line.champion for line in history if line.run == run}
+    else:
+        stacks = {name: standing(state, name) for name in ([loop] if loop else state.champions)}
+        latest = max(((stack[-1][0], name) for name, stack in stacks.items() if len(stack) > 1), default=None)
+        champions = {latest[1]: stacks[latest[1]][-2][1]} if latest else {}
+    if champions:
         return champions
-    if not run and champions:
-        # only what was changed last goes back, unless a loop was named
-        last = next(line.loop for line in reversed(history) if line.loop in champions)
-        return {last: champions[last]}
     runs = ", ".join(dict.fromkeys(f"{line.run} ({line.loop})" for line in state.history)) or "none"
     raise ValueError(
         f"{FILE}: expected {f'a champion of {run}' if run else 'an earlier champion'} to go back to, "
@@ -175,7 +261,7 @@ def put_back(loop: str, champion: Champion) -> None:
     not what it was, and leaves the present champion then."""
     path = FOLDER / f"{loop}.dvc"
     present = path.read_bytes() if path.exists() else b""
-    artifacts.write_text(path, yaml.safe_dump({"outs": [dict(champion.installed.folder)]}, sort_keys=False))
+    write_pointer(loop, champion)
     try:
         _fetch(path)
         wrong = sorted(set(md5s(FOLDER / loop).items()) ^ set(champion.installed.files.items()))
@@ -202,12 +288,12 @@ def as_committed() -> list[str]:
     """Puts champion.json, champion/*.dvc and the folders back to what HEAD says, which is what a killed
     promotion never was; what it mended, as sentences."""
     mended = []
-    head = set(git("ls-tree", "-r", "--name-only", "HEAD", "--", str(FILE), str(FOLDER)).splitlines())
+    head = set(names("ls-tree", "-r", "--name-only", "HEAD", "--", str(FILE), str(FOLDER)))
     for path in {*head, *paths()}:
         if path not in head and Path(path).exists():
             Path(path).unlink()
             mended.append(f"{path} was never committed and is removed")
-    changed = git("diff", "--name-only", "HEAD", "--", str(FILE), str(FOLDER)).splitlines() if head else []
+    changed = names("diff", "--name-only", "HEAD", "--", str(FILE), str(FOLDER)) if head else []
     if changed:
         git("checkout", "-q", "HEAD", "--", *changed)
         mended.append(f"{', '.join(changed)} put back to the last commit")
@@ -215,7 +301,7 @@ def as_committed() -> list[str]:
         fresh_index([str(FILE), str(FOLDER)])
     for unfinished in (*FOLDER.glob(".*.new"), *FOLDER.glob(".*.old")):
         shutil.rmtree(unfinished)
-    champions = read().champions
+    champions = read().folders
     for loop, champion in champions.items():
         if md5s(FOLDER / loop) != champion.installed.files:
             put_back(loop, champion)

@@ -15,6 +15,9 @@ def nightly(arguments: argparse.Namespace) -> None:
     if arguments.accept_drift:
         print(printable(accepting.accept(*arguments.accept_drift)))
         return
+    if arguments.merge_only:
+        print(printable(merging.merge(arguments.merge_only)))
+        return
     if arguments.merge:
         print(printable(merging.merge(arguments.merge)))
     status, summary = night.watchdog() if arguments.watch else night.nightly()
@@ -47,6 +50,9 @@ def add(commands) -> None:
     )
     command.add_argument(
         "--merge", metavar="BRANCH", default="", help="merge the nights of another branch first"
+    )
+    command.add_argument(
+        "--merge-only", metavar="BRANCH", default="", help="merge them, and end without a night"
     )
     command.add_argument(
         "--accept-drift",

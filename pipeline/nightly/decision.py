@@ -7,6 +7,7 @@ import numpy as np
 
 from pipeline.nightly.settings import Rule
 from pipeline.report.nightly.record import FIRST, KEPT, PROMOTED, Guard, LoopDecision
+from pipeline.report.shared.digits import THIN, beyond_meaning
 from pipeline.report.shared.night import Alarm
 from pipeline.statistics import Paired, blocks_needed, paired
 
@@ -55,7 +56,7 @@ def decide(
     if against:
         return LoopDecision(KEPT, against, test, guards)
     better = (
-        f"{test.improvement_percent:.1f} % better ({test.low_percent:.1f} to {test.high_percent:.1f} %, "
+        f"{_percent(test.improvement_percent)} better ({_band(test.low_percent, test.high_percent)}, "
         f"{_chance(test)}) on {test.cases} cases of {test.blocks} blocks"
     )
     return LoopDecision(PROMOTED, [better, "no guard is worse"], test, guards)
@@ -82,6 +83,16 @@ def _unfit(challenger: Evidence) -> list[str]:
     ]
 
 
+def _percent(value: float) -> str:
+    """ "5.0 %"; "beyond 1,000 %" where the figure says nothing."""
+    return beyond_meaning(value, "%").replace(THIN, " ") or f"{value:.1f} %"
+
+
+def _band(low: float, high: float) -> str:
+    """ "4.0 to 6.0 %"."""
+    return f"{_percent(low) if beyond_meaning(low, '%') else f'{low:.1f}'} to {_percent(high)}"
+
+
 def _chance(test: Paired) -> str:
     return "p < 0.0001" if test.p < 1e-4 else f"p = {test.p:.2g}"
 
@@ -92,14 +103,12 @@ def _against(test: Paired, rule: Rule) -> list[str]:
             f"{test.blocks} blocks cannot tell at level {rule.level:g}; "
             f"at least {blocks_needed(rule.level)} are needed"
         ]
-    margin = (
-        f"{test.improvement_percent:.1f} % ({test.low_percent:.1f} to {test.high_percent:.1f} %, "
-        f"{_chance(test)})"
-    )
+    band = _band(test.low_percent, test.high_percent)
+    margin = f"{_percent(test.improvement_percent)} ({band}, {_chance(test)})"
     if test.improvement_percent <= 0:
         return [
-            f"the challenger is no better: its cases cost {-test.improvement_percent:.1f} % more "
-            f"({-test.high_percent:.1f} to {-test.low_percent:.1f} %)"
+            f"the challenger is no better: its cases cost {_percent(-test.improvement_percent)} more "
+            f"({_band(-test.high_percent, -test.low_percent)})"
         ]
     if test.improvement_percent < rule.least_improvement_percent:
         return [

@@ -1,19 +1,23 @@
-"""Has the plant changed since the champion was made? The champion's own observer on the new record, asked in
-the words of an engineer: gains, time constants, offsets, noise.
+"""Has the machine changed since the champion was made? Rival changes of one recording, each fitted by itself,
+and the one named that explains most: a gain, a time constant, a delay, a heater's cap, a sensor's offset.
 
-The local approach to change detection (Benveniste, Basseville and Moustakides 1987; Basseville 1998): with e
-the one-step errors of the champion's model on the record, and psi = d y-hat / d theta their sensitivity to a
-change of one physical parameter, the change that the record asks for is
+The generalised likelihood ratio (Willsky and Jones 1976; Basseville and Nikiforov 1993, ch. 4). The
+champion's model predicts the outputs of the recording under a change theta of one cause c; what is left goes
+through the observer's filter S(q) = I - C (qI - A + K C)^-1 K, which makes it the one-step errors, and
 
-    theta = (sum psi' S^-1 psi)^-1 sum psi' S^-1 e,     S the errors' variance, output by output,
+    J_c = min over theta, z of |S (y - y-hat(theta)) - Z z|^2 / variance + |z / spread|^2
 
-psi and e taken free of the initial state and of each output's mean, which say nothing of the plant.
-Its variance is that of the record's own blocks, so that coloured errors count as what they are.
-What the model gets wrong on every record cancels: the estimate on the new record is held against
-those on the records that the champion was made of.
+counts it. z is what says nothing of the machine: each segment's initial state, the air around (a
+level and a slow course, which warm every output alike), and the level by which honest nights differ, output
+by output. Their spreads are those of the champion's own recordings (a mixed model; Robinson 1991).
+J_0 - J_c is what the cause explains. The largest is named, made part of the prediction, and the rest asked
+again, so that one change hides no other.
+
+A level thus counts in °C of the steady output whatever the observer, and a gain by its dynamics and
+its level together.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -22,44 +26,128 @@ import scipy.stats
 
 from pipeline.temperature.plant import Plant, clip_spectral_radius
 from pipeline.temperature.refinement import Predictor, free_response, linear_recurrence
-from pipeline.temperature.tracking import robust_observer_gain
 
-STEP = 0.02  # relative change by which sensitivities are taken: small beside 10 %, large beside rounding
-BLOCKS = 24  # into which a record is cut for the variance of an estimate
-# the slow observer forgets in an eighth of the record: long enough to tell a gain from a time constant,
-# short enough to pass a slow disturbance over
-MEMORY = 8
-# a gain explains so much more than a time constant, or the other way round, or the record cannot tell
-TELLING = 1.3
+BLOCKS = 12  # into which a record is cut for the variance of an estimate
+SHORTEST = 96  # samples of a record that is asked
+COURSE = 8  # degree of the polynomial that the air around may follow within a segment
+LONGEST_DELAY = 64  # samples; a longer one is a mistake of the record
+GAIN_LIMITS, RATE_LIMITS, OFFSET_LIMITS = (-0.98, 0.6), (-0.6, 1.5), (-60.0, 60.0)
+STEPS = {"gain": 0.02, "time constant": 0.02, "delay": 1.0, "late sensor": 1.0, "offset": 0.1}
+SURE = 5.0  # a cause is named from so many sigmas on, squared: what it explains beyond the noise
+# of what the first cause explains, a second one must explain so much: less is what the model gets wrong of it
+REMAINDER = 0.004
+RIVALS = 4.0  # a rival that explains less by up to this (two sigmas squared) is named too
+# by so much more than the champion's own errors must draughts explain a record: they also cover what changed
+DRAUGHTY = 30.0
+SEASON = 20.0  # °C by which another season's air may differ
+UNLIKE = 0.1  # share of the air's course by which one output may follow it otherwise than the others
+CAUSE = 10.0  # by so much more must a cause explain than another season's air
+MOST = 3  # causes of one record
 
 Segments = Sequence[tuple[np.ndarray, np.ndarray]]
 
 
 class Cause(NamedTuple):
-    """One way in which a plant can change: kind (gain or time constant) of what
-    answers to an input, by number; -1 where all do."""
+    """One way in which a machine can change: kind, and the number of the input (gain, time
+    constant, delay, saturation) or output (offset, late sensor); -1 for all."""
 
     kind: str
     channel: int
 
 
-class Estimate(NamedTuple):
-    """Of one record: change (causes,) of each parameter as a share, each as if it alone had changed, its
-    standard deviation, and the fall of the weighted squared error that it explains; mean (p,) and logarithm
-    of the variance (p,) of the errors, each with its standard deviation."""
+class Changes(NamedTuple):
+    """Of a machine against the model: share of each gain (m,), of each rate (m,), delay in samples (m,), the
+    most that acts of each input (m,), then offset in °C (p,) and lateness in samples (p,) of each output."""
 
-    change: np.ndarray
-    deviation: np.ndarray
-    explained: np.ndarray
-    mean: np.ndarray
-    mean_deviation: np.ndarray
-    log_variance: np.ndarray
-    log_variance_deviation: np.ndarray
+    gain: np.ndarray
+    rate: np.ndarray
+    delay: np.ndarray
+    cap: np.ndarray
+    offset: np.ndarray
+    late: np.ndarray
+
+    @classmethod
+    def none(cls, m: int, p: int) -> "Changes":
+        zeros = np.zeros(m)
+        return cls(zeros, zeros, zeros, np.full(m, np.inf), np.zeros(p), np.zeros(p))
+
+
+FIELD = {
+    "gain": "gain",
+    "time constant": "rate",
+    "delay": "delay",
+    "saturation": "cap",
+    "offset": "offset",
+    "late sensor": "late",
+}
+
+
+class Scale(NamedTuple):
+    """What honest records scatter by: variance (p,) of the one-step errors, standard deviation of the air
+    around between nights, and (p,) of each output's level between nights; mean level of each output in °C
+    (p,)."""
+
+    variance: np.ndarray
+    ambient: float
+    level: np.ndarray
+    mean_level: np.ndarray
+
+
+class Surroundings(NamedTuple):
+    """How restless a record is: standard deviation in °C of the course of the air within it, and of what
+    draughts take from one sample to the next, in percent of each input; then whether the air may be farther
+    from the champion's nights than those are from each other."""
+
+    course: float
+    draught: float
+    another_season: bool = True
+
+
+# from a closed room to an open door; the record itself says which (empirical Bayes)
+RESTLESS = Surroundings(5.0, 0.0)
+ROOMS = (
+    Surroundings(0.2, 0.0), Surroundings(1.0, 0.0), RESTLESS,
+    Surroundings(1.0, 0.5), Surroundings(1.0, 2.0),
+)  # fmt: skip
+
+
+class Fit(NamedTuple):
+    """Of one cause, as if it alone had changed: `value` in the unit of `Changes`, its standard deviation, and
+    the fall of the weighted squared error that it explains."""
+
+    cause: Cause
+    value: float
+    deviation: float
+    explained: float
 
 
 def causes(plant: Plant) -> list[Cause]:
-    """The gain from each input and from all, then the time constants in the same order."""
-    return [Cause(kind, channel) for kind in ("gain", "time constant") for channel in (*range(plant.m), -1)]
+    """Every cause that a record is asked for: those of inputs with all together last, those of outputs."""
+    inputs = [
+        Cause(kind, j)
+        for kind in ("gain", "time constant", "delay")
+        for j in (*range(plant.m), *([-1] if plant.m > 1 else []))
+    ]
+    return [
+        *inputs,
+        *(Cause("saturation", j) for j in range(plant.m)),
+        *(Cause("offset", i) for i in range(plant.p)),
+        *(Cause("late sensor", i) for i in range(plant.p) if plant.p > 1),
+    ]
+
+
+def with_change(changes: Changes, cause: Cause, value: float) -> Changes:
+    """`changes` with that of one cause moved by `value`; a saturation is set to it."""
+    name = FIELD[cause.kind]
+    moved = getattr(changes, name).copy()
+    at = slice(None) if cause.channel < 0 else cause.channel
+    if cause.kind == "gain":
+        moved[at] = (1 + moved[at]) * (1 + value) - 1
+    elif cause.kind == "saturation":
+        moved[at] = value
+    else:
+        moved[at] = moved[at] + value
+    return changes._replace(**{name: moved})
 
 
 def faster(plant: Plant, share: float) -> Plant:
@@ -86,145 +174,493 @@ def faster(plant: Plant, share: float) -> Plant:
     return plant._replace(A=eye - (eye - plant.A) * rate, B=plant.B * rate, b=plant.b * rate)
 
 
-def errors(plant: Plant, K: np.ndarray, u: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """e (T, p) = y - y-hat of the observer x(t+1) = A x + B u + b + K e with gain K from x = 0; NaN in y is
-    passed over by the model's own prediction."""
-    e = np.empty_like(y)
-    if np.isfinite(y).all():
-        drive = u @ (plant.B - K @ plant.D).T + (plant.b - K @ plant.d) + y @ K.T
-        x = linear_recurrence(plant.A - K @ plant.C, drive, np.zeros(plant.n))[:-1]
-        return y - x @ plant.C.T - u @ plant.D.T - plant.d
-    x = np.zeros(plant.n)
-    for t in range(len(y)):
-        e[t] = y[t] - plant.C @ x - plant.D @ u[t] - plant.d
-        x = plant.A @ x + plant.B @ u[t] + plant.b + K @ np.nan_to_num(e[t])
-    return e
+# ---- what the model predicts
 
 
-def observer(plant: Plant, samples: int) -> np.ndarray:
-    """The model's own Kalman gain where it has one that is stable, and the slow observer otherwise."""
-    own = plant.K
-    stable = np.abs(own).max() > 0 and np.abs(np.linalg.eigvals(plant.A - own @ plant.C)).max() < 1
-    return own if stable else slow_observer(plant, samples)
+def respond(plant: Plant, j: int, u: np.ndarray) -> np.ndarray:
+    """y (T, p) of input j alone, u (T,), from the equilibrium under u(0)."""
+    x0 = np.linalg.solve(np.eye(plant.n) - plant.A, plant.B[:, j] * u[0])
+    x = linear_recurrence(plant.A, np.outer(u, plant.B[:, j]), x0)[:-1]
+    return x @ plant.C.T + np.outer(u, plant.D[:, j])
 
 
-def slow_observer(plant: Plant, samples: int) -> np.ndarray:
-    """The observer of `tracking.robust_observer_gain` whose slowest
-    mode forgets in 1 / MEMORY of the record."""
-    wanted = max(1.0 - MEMORY / samples, 0.5)
-    taus = np.geomspace(1e-2, 1e7, 19)
-    gains = [robust_observer_gain(plant, tau) for tau in taus]
-    radii = [np.abs(np.linalg.eigvals(plant.A - K @ plant.C)).max() for K in gains]
-    return gains[int(np.abs(np.array(radii) - wanted).argmin())]
+def shifted(values: np.ndarray, samples: float) -> np.ndarray:
+    """values (T, ...) so many samples later, between samples by a straight line; the ends are held."""
+    at = np.clip(np.arange(len(values)) - samples, 0, len(values) - 1)
+    low = np.floor(at).astype(int)
+    high, share = np.minimum(low + 1, len(values) - 1), at - low
+    share = share.reshape(-1, *[1] * (values.ndim - 1))
+    return (1 - share) * values[low] + share * values[high]
 
 
-def estimate(
-    plant: Plant, records: Segments, asked: Sequence[Cause], K: np.ndarray, variance: np.ndarray | None = None
-) -> Estimate:
-    """What the record's segments (u (T, m), y (T, p)) say of each cause.
-    Raises ValueError where they are too short for it."""
-    p = plant.p
-    parts = [(*_free(plant, K, u, y, asked), len(y)) for u, y in records if len(y) >= 4 * plant.n + 8]
-    if sum(part[2] for part in parts) < 4 * BLOCKS:
+class Machine:
+    """The champion's model, ready to be asked: a plant that is stable over the record, its observer's
+    gain K (n, p), and what it has already worked out."""
+
+    def __init__(self, plant: Plant, samples: int):
+        self.plant = plant._replace(A=clip_spectral_radius(plant.A, 1.0 - 1.0 / max(samples, 10)))
+        own = plant.K
+        stable = np.abs(np.linalg.eigvals(self.plant.A - own @ plant.C)).max() < 1
+        self.K = own if stable else np.zeros_like(own)
+        self._faster: dict[float, Plant] = {0.0: self.plant}
+        self._gains: dict[float, np.ndarray] = {0.0: self.K}
+
+    def gain(self, draught: float, variance: np.ndarray) -> np.ndarray:
+        """Kalman's gain (n, p) where draughts take so many percent from each input, sample by sample."""
+        if draught not in self._gains:
+            A, C, B = self.plant.A, self.plant.C, self.plant.B
+            Q = draught**2 * B @ B.T + self.K @ np.diag(variance) @ self.K.T + 1e-9 * np.eye(len(A))
+            try:
+                P = scipy.linalg.solve_discrete_are(A.T, C.T, Q, np.diag(variance))
+            except (
+                np.linalg.LinAlgError
+            ):  # a mode on the unit circle that no output shows: draughts are not asked
+                P = None
+            forgets = None if P is None else A @ P @ C.T @ np.linalg.inv(C @ P @ C.T + np.diag(variance))
+            self._gains[draught] = self.K if forgets is None else forgets
+        return self._gains[draught]
+
+    def faster(self, share: float) -> Plant:
+        if share not in self._faster:
+            self._faster[share] = faster(self.plant, share)
+        return self._faster[share]
+
+    def innovation(self, values: np.ndarray, K: np.ndarray) -> np.ndarray:
+        """S(q) values (T, p): what the observer of gain K does not foresee of an error of the output."""
+        if not K.any():
+            return values
+        x = linear_recurrence(self.plant.A - K @ self.plant.C, values @ K.T, np.zeros(self.plant.n))[:-1]
+        return values - x @ self.plant.C.T
+
+
+class Segment(NamedTuple):
+    """Of a record: u (T, m), y (T, p), where y was measured (T, p), the answers of inputs worked out so
+    far, its own nuisances with the rows that hold them to their spread, and their orthonormal basis."""
+
+    u: np.ndarray
+    y: np.ndarray
+    measured: np.ndarray
+    answers: dict[tuple, np.ndarray]
+    columns: np.ndarray
+    basis: np.ndarray
+
+
+class Record(NamedTuple):
+    """Segments held against a machine at a scale, by an observer of gain K; `basis` is that of the outputs'
+    levels, which all segments share, and `common` (N, p) those levels before they were made orthonormal."""
+
+    machine: Machine
+    scale: Scale
+    K: np.ndarray
+    segments: list[Segment]
+    basis: np.ndarray
+    common: np.ndarray
+
+
+def record(machine: Machine, segments: Segments, scale: Scale, room: Surroundings = RESTLESS) -> Record:
+    """A record ready to be asked. Raises ValueError where it is too short."""
+    plant = machine.plant
+    long = [(u, y) for u, y in segments if len(y) >= 4 * plant.n + 8]
+    if sum(len(y) for _, y in long) < SHORTEST:
         raise ValueError(
-            f"drift: expected records of at least {4 * BLOCKS} samples to hold against the champion, "
-            f"found {sum(part[2] for part in parts)}; record longer"
+            f"drift: expected records of at least {SHORTEST} samples to hold against the champion, "
+            f"found {sum(len(y) for _, y in long)}; record longer"
         )
-    e, psi = (
-        np.concatenate([part[0] for part in parts]),
-        np.concatenate([part[1] for part in parts]),
-    )  # (T, p), (T, p, causes)
-    mask = np.isfinite(e)
-    e, psi = np.where(mask, e, 0.0), np.where(mask[:, :, None], psi, 0.0)
-    raw_mean = np.array(
-        [np.average(e[:, i], weights=mask[:, i]) if mask[:, i].any() else 0.0 for i in range(p)]
-    )
-    centred = np.where(mask, e - raw_mean, 0.0)
-    counts = np.maximum(mask.sum(axis=0), 2)
-    own = np.maximum((centred**2).sum(axis=0) / (counts - 1), 1e-12)
-    variance = own if variance is None else variance
-    score = np.einsum("tpc,tp->tc", psi, centred / variance)
-    information = np.einsum("tpc,p->c", psi**2, 1 / variance)
-    alone = np.maximum(information, 1e-12)
-    change = score.sum(axis=0) / alone
-    # robust to colour: the spread of the blocks' own scores about what the estimate leaves
-    residual_score = score - np.einsum("tpc,p->tc", psi**2, 1 / variance) * change
-    sums = np.stack([part.sum(axis=0) for part in np.array_split(residual_score, BLOCKS)])
-    deviation = np.sqrt(np.maximum((sums**2).sum(axis=0) * BLOCKS / (BLOCKS - 1), information)) / alone
-    blocks = [
-        (part, on) for part, on in zip(np.array_split(e, BLOCKS), np.array_split(mask, BLOCKS), strict=True)
+    scale = _in(scale, room)
+    K, none = machine.gain(room.draught, scale.variance), np.zeros((0, 0))
+    made, bare = [], Record(machine, scale, K, [], none, none)
+    for u, y in long:
+        measured = np.isfinite(y)
+        nuisance = _weighted(bare, _own_nuisances(machine, len(y), scale, room.course), measured)
+        columns = _held(nuisance, plant.n)
+        made.append(Segment(u, y, measured, {}, columns, np.linalg.qr(columns)[0]))
+    bare, level = bare._replace(segments=made), np.diag(scale.level)
+    parts = [
+        _weighted(bare, np.broadcast_to(level, (len(one.y), *level.shape)), one.measured) for one in made
     ]
-    means = np.stack([part.sum(axis=0) / np.maximum(on.sum(axis=0), 1) for part, on in blocks])
-    powers = np.stack(
-        [
-            (np.where(on, part - raw_mean, 0.0) ** 2).sum(axis=0) / np.maximum(on.sum(axis=0), 1)
-            for part, on in blocks
-        ]
-    )
-    return Estimate(
-        change, deviation, change**2 * information, raw_mean, means.std(axis=0, ddof=1) / np.sqrt(BLOCKS),
-        np.log(own),
-        powers.std(axis=0, ddof=1) / np.sqrt(BLOCKS) / own,
-    )  # fmt: skip
+    common = _freed(bare, parts)
+    return bare._replace(basis=np.linalg.qr(_held(common, 0))[0], common=common)
 
 
-def _free(
-    plant: Plant, K: np.ndarray, u: np.ndarray, y: np.ndarray, asked: Sequence[Cause]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Errors (T, p) and sensitivities (T, p, causes) of one segment, free of the initial
-    state; sensitivities also of each output's mean."""
-    e = errors(plant, K, u, y)
-    quick, slow = faster(plant, STEP), faster(plant, -STEP)
-    dA, dB = (quick.A - slow.A) / (2 * STEP), (quick.B - slow.B) / (2 * STEP)
-    forgets = plant.A - K @ plant.C
-    # what each input alone has done to the state, about its mean; the
-    # observer's state would bring its noise along
-    moved, A = u - u.mean(axis=0), clip_spectral_radius(plant.A, 1.0 - 1.0 / len(u))
-    gains = [
-        _passed(plant, K, forgets, np.outer(u[:, j], plant.B[:, j]), np.outer(u[:, j], plant.D[:, j]))
-        for j in range(plant.m)
+def _in(scale: Scale, room: Surroundings) -> Scale:
+    """The scale where the air is restless, or of another season: outputs follow it alike, but not exactly."""
+    ambient = max(scale.ambient, SEASON) if room.another_season else scale.ambient
+    apart = np.hypot(UNLIKE * room.course, 0.5 * UNLIKE * SEASON if room.another_season else 0.0)
+    return scale._replace(ambient=ambient, level=np.hypot(scale.level, apart))
+
+
+def _own_nuisances(machine: Machine, T: int, scale: Scale, course: float) -> np.ndarray:
+    """(T, p, n + 1 + COURSE): what the state at the start does, then level and courses of the air around,
+    which warms like inputs that would raise every steady output by 1 °C."""
+    plant = machine.plant
+    A = plant.A
+    start = free_response(Predictor(A, np.zeros((plant.n, 1)), plant.C, np.zeros((plant.p, 1)), []), T)
+    size = np.maximum(np.sqrt((start**2).mean(axis=(0, 1))), 1e-12)
+    steady = plant.C @ np.linalg.solve(np.eye(plant.n) - A, plant.B) + plant.D
+    heat = np.linalg.lstsq(steady, np.ones(plant.p), rcond=None)[0]
+    air = plant._replace(B=(plant.B @ heat)[:, None], D=(plant.D @ heat)[:, None])
+    at = np.linspace(-1.0, 1.0, T)
+    courses = [
+        course * respond(air, 0, np.polynomial.legendre.Legendre.basis(degree)(at))
+        for degree in range(1, COURSE + 1)
     ]
-    times = []
+    level = np.full((T, plant.p), scale.ambient)
+    return np.concatenate([start / size, np.stack([level, *courses], axis=2)], axis=2)
+
+
+def _weighted(record: Record, values: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """values (T, p, k) in °C as one-step errors in their own standard deviation, (T p, k); what was not
+    measured counts nothing."""
+    T, p, k = values.shape
+    made = np.stack([record.machine.innovation(values[:, :, c], record.K) for c in range(k)], axis=2)
+    made = made / np.sqrt(record.scale.variance)[:, None] * measured[:, :, None]
+    return made.reshape(T * p, k)
+
+
+def _held(columns: np.ndarray, free: int) -> np.ndarray:
+    """Columns (N, k) with k rows below that hold all but the first `free` to unit variance."""
+    k = columns.shape[1]
+    return np.vstack([columns, np.diag(np.concatenate([np.full(free, 1e-6), np.ones(k - free)]))])
+
+
+def _freed(record: Record, parts: Sequence[np.ndarray]) -> np.ndarray:
+    """parts (T p, k) of each segment free of its own nuisances, one below the other."""
+    freed = []
+    for one, part in zip(record.segments, parts, strict=True):
+        Q = one.basis
+        padded = np.vstack([part, np.zeros((len(Q) - len(part), part.shape[1]))])
+        freed.append(padded - Q @ (Q.T @ padded))
+    return np.concatenate(freed)
+
+
+def predicted(machine: Machine, one: Segment, changes: Changes) -> np.ndarray:
+    """y-hat (T, p) of a segment with these changes."""
+    plant = machine.plant
+    y = np.tile(plant.C @ np.linalg.solve(np.eye(plant.n) - plant.A, plant.b) + plant.d, (len(one.u), 1))
     for j in range(plant.m):
-        x = linear_recurrence(A, np.outer(moved[:, j], plant.B[:, j]), np.zeros(plant.n))[:-1]
-        times.append(_passed(plant, K, forgets, x @ dA.T + np.outer(moved[:, j], dB[:, j]), None))
-    parts = {("gain", -1): np.sum(gains, axis=0), ("time constant", -1): np.sum(times, axis=0)}
-    columns = [
-        parts.get(tuple(cause), (gains if cause.kind == "gain" else times)[cause.channel]) for cause in asked
+        cap = float(changes.cap[j]) if changes.cap[j] < one.u[:, j].max() else np.inf
+        key = (j, float(changes.rate[j]), cap)
+        if key not in one.answers:
+            if len(one.answers) > 60:
+                one.answers.clear()
+            one.answers[key] = respond(machine.faster(key[1]), j, np.minimum(one.u[:, j], cap))
+        answer = one.answers[key]
+        y += (1 + changes.gain[j]) * (shifted(answer, changes.delay[j]) if changes.delay[j] else answer)
+    for i in np.flatnonzero(changes.late):
+        y[:, i] = shifted(y[:, i], changes.late[i])
+    return y + changes.offset
+
+
+def left(record: Record, changes: Changes) -> np.ndarray:
+    """The one-step errors (N,) under these changes, in their own standard deviation and free of every
+    nuisance, with what those cost."""
+    freed = _freed(record, _errors(record, changes))[:, 0]
+    Q = record.basis
+    padded = np.concatenate([freed, np.zeros(len(Q) - len(freed))])
+    return padded - Q @ (Q.T @ padded)
+
+
+def _errors(record: Record, changes: Changes) -> list[np.ndarray]:
+    """(T p, 1) of each segment before any nuisance is taken off."""
+    parts = []
+    for one in record.segments:
+        error = one.y - predicted(record.machine, one, changes) - record.scale.mean_level
+        error = _bridged(error, one.measured)
+        parts.append(_weighted(record, error[:, :, None], one.measured))
+    return parts
+
+
+def _bridged(error: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """What was not measured by a straight line between its neighbours."""
+    if measured.all():
+        return error
+    error, at = error.copy(), np.arange(len(error))
+    for i in range(error.shape[1]):
+        there = measured[:, i]
+        error[:, i] = np.interp(at, at[there], error[there, i]) if there.any() else 0.0
+    return error
+
+
+def by_output(record: Record, rest: np.ndarray) -> np.ndarray:
+    """(samples, p) in °C of errors (N,) that `left` gave; NaN where nothing was measured."""
+    parts, at, p = [], 0, record.machine.plant.p
+    for one in record.segments:
+        part = rest[at : at + one.y.size].reshape(-1, p) * np.sqrt(record.scale.variance)
+        parts.append(np.where(one.measured, part, np.nan))
+        at += len(one.basis)
+    return np.concatenate(parts)
+
+
+def room_of(
+    machine: Machine, segments: Segments, scale: Scale, changes: Changes
+) -> tuple[Scale, Surroundings]:
+    """The surroundings under which what is left of the record is likeliest, and the scale there: of draughts
+    the one-step errors are larger than the champion's own, and the record itself says by how much."""
+    likeliest = (np.inf, scale, RESTLESS)
+    for room in ROOMS:
+        there = scale
+        if room.draught:
+            asked = record(machine, segments, scale, room)
+            errors = by_output(asked, left(asked, changes))
+            there = scale._replace(variance=np.nanmean(errors**2, axis=0) + 1e-9)
+        asked = record(machine, segments, there, room)
+        e = left(asked, changes)
+        samples = sum(one.measured.sum(axis=0) for one in asked.segments)
+        cost = float(e @ e + samples @ np.log(there.variance)) + _log_determinant(asked)
+        cost += DRAUGHTY if room.draught else 0.0
+        likeliest = min(likeliest, (cost, there, room), key=lambda found: found[0])
+    return likeliest[1], likeliest[2]
+
+
+def _log_determinant(record: Record) -> float:
+    """log det of the errors' covariance by what the nuisances add to it."""
+    R = [np.linalg.qr(one.columns, mode="r") for one in record.segments]
+    R.append(np.linalg.qr(_held(record.common, 0), mode="r"))
+    return float(sum(2 * np.log(np.abs(np.diag(one))).sum() for one in R))
+
+
+def levels(record: Record, changes: Changes) -> tuple[float, np.ndarray]:
+    """°C by which the air around differs from what the model knows, and each output's own level (p,)."""
+    errors, k = _errors(record, changes), record.common.shape[1]
+    freed = _freed(record, errors)[:, 0]
+    rows = np.vstack([record.common, np.eye(k)])
+    share = np.linalg.lstsq(rows, np.concatenate([freed, np.zeros(k)]), rcond=None)[0]
+    n, airs, weights = record.machine.plant.n, [], []
+    for one, error in zip(record.segments, errors, strict=True):
+        level = np.broadcast_to(np.diag(record.scale.level), (len(one.y), k, k))
+        own = error[:, 0] - _weighted(record, level, one.measured) @ share
+        airs.append(np.linalg.solve(one.columns.T @ one.columns, one.columns.T @ _padded(own, one))[n])
+        weights.append(len(one.y))
+    return float(np.average(airs, weights=weights)) * record.scale.ambient, share * record.scale.level
+
+
+def air_deviation(record: Record) -> float:
+    """Standard deviation in °C of the air's level that `levels` gives."""
+    n, longest = record.machine.plant.n, max(record.segments, key=lambda one: len(one.y))
+    known = np.linalg.inv(longest.columns.T @ longest.columns)[n, n]
+    return float(np.sqrt(known)) * record.scale.ambient
+
+
+def _padded(values: np.ndarray, one: Segment) -> np.ndarray:
+    return np.concatenate([values, np.zeros(len(one.columns) - len(values))])
+
+
+# ---- one cause
+
+
+def _limits(cause: Cause) -> tuple[float, float]:
+    delay = (-0.25 * LONGEST_DELAY, float(LONGEST_DELAY))
+    return {
+        "gain": GAIN_LIMITS, "time constant": RATE_LIMITS, "offset": OFFSET_LIMITS,
+        "delay": delay, "late sensor": delay,
+    }[cause.kind]  # fmt: skip
+
+
+def fitted(record: Record, changes: Changes, cause: Cause, start: np.ndarray | None = None) -> Fit:
+    """The change of one cause that explains most beside `changes` (Gauss and Newton's steps); `start` (N,)
+    are the errors left without it."""
+    before = left(record, changes) if start is None else start
+    if cause.kind == "saturation":
+        return _capped(record, changes, cause, before)
+    low, high = _limits(cause)
+    step, value, J = STEPS[cause.kind], 0.0, float(before @ before)
+    e, whole = before, J
+    if cause.kind in ("delay", "late sensor"):
+        for guess in (6.0, 20.0, 40.0):
+            there = left(record, with_change(changes, cause, guess))
+            if (cost := float(there @ there)) < J:
+                e, value, J = there, guess, cost
+    psi = e - left(record, with_change(changes, cause, value + step))
+    for _ in range(6):
+        move = step * float(psi @ e) / max(float(psi @ psi), 1e-30)
+        tried = float(np.clip(value + move, low, high))
+        there = left(record, with_change(changes, cause, tried))
+        if (cost := float(there @ there)) >= J:
+            break
+        done = J - cost < 0.01
+        e, value, J = there, tried, cost
+        psi = e - left(record, with_change(changes, cause, value + step))
+        if done:
+            break
+    return Fit(cause, value, _deviation(psi / step, e), whole - J)
+
+
+def _deviation(psi: np.ndarray, e: np.ndarray) -> float:
+    """Standard deviation of an estimate with sensitivity psi (N,) and errors e (N,): no less than white ones
+    give, and robust to colour by the blocks' own scores."""
+    information = max(float(psi @ psi), 1e-30)
+    scores = np.array([float(a @ b) for a, b in zip(_blocks(psi), _blocks(e), strict=True)])
+    return float(np.sqrt(max((scores**2).sum() * BLOCKS / (BLOCKS - 1), information)) / information)
+
+
+def _blocks(values: np.ndarray) -> list[np.ndarray]:
+    return np.array_split(values, BLOCKS)
+
+
+def _capped(record: Record, changes: Changes, cause: Cause, before: np.ndarray) -> Fit:
+    """The level above which an input has no effect: the best of a fine grid, then Newton's steps."""
+    j = cause.channel
+    u = np.concatenate([one.u[:, j] for one in record.segments])
+    low, high = float(u.min()), float(u.max())
+    whole = float(before @ before)
+    if high - low < 1e-6:
+        return Fit(cause, high, 1.0, 0.0)
+    grid = np.linspace(high, low - 0.5 * (high - low), 25)[1:]
+
+    def cost(level: float) -> float:
+        e = left(record, with_change(changes, cause, level))
+        return float(e @ e)
+
+    costs = [cost(level) for level in grid]
+    best, width = int(np.argmin(costs)), float(grid[0] - grid[1])
+    level, J = float(grid[best]), costs[best]
+    for _ in range(6):
+        width /= 2
+        J, level = min((J, level), *((cost(level + side), level + side) for side in (-width, width)))
+    e = left(record, with_change(changes, cause, level))
+    step = 0.05 * (high - low)
+    psi = (left(record, with_change(changes, cause, level - step)) - e) / step
+    return Fit(cause, level, _deviation(psi, e), max(whole - J, 0.0))
+
+
+def above(segments: Segments, j: int, level: float) -> float:
+    """Percent of the samples in which more than `level` is asked of input j."""
+    return 100 * float(np.mean(np.concatenate([u[:, j] for u, _ in segments]) > level))
+
+
+def moved(record: Record, changes: Changes, now: Changes) -> np.ndarray:
+    """°C (p,) by which the outputs' level differs between two states of the machine under the record's
+    inputs."""
+    parts = [
+        predicted(record.machine, one, now) - predicted(record.machine, one, changes)
+        for one in record.segments
     ]
-    gamma = free_response_of(plant, K, len(y))
-    psi = np.stack(columns, axis=2)
-    mask = np.isfinite(e).all(axis=1)
-    # the initial state and each output's mean are fitted along, and taken off both
-    T, p, n = gamma.shape
-    nuisance = np.concatenate([gamma, np.broadcast_to(np.eye(p), (T, p, p))], axis=2)[mask].reshape(-1, n + p)
-    both = np.concatenate([np.nan_to_num(e)[:, :, None], np.nan_to_num(psi)], axis=2)[mask].reshape(
-        -1, 1 + len(asked)
-    )
-    fitted = np.linalg.lstsq(nuisance, both, rcond=1e-10)[0]
-    start = np.einsum("tpn,nc->tpc", gamma, fitted[:n])
-    e = e - start[:, :, 0]
-    return e, psi - start[:, :, 1:] - fitted[n:, 1:]
+    return np.abs(np.concatenate(parts).mean(axis=0))
 
 
-def free_response_of(plant: Plant, K: np.ndarray, T: int) -> np.ndarray:
-    """[C; CF; ...] (T, p, n) with F = A - K C."""
-    return free_response(
-        Predictor(plant.A - K @ plant.C, np.zeros((plant.n, 1)), plant.C, np.zeros((plant.p, 1)), []), T
-    )
+def alone(record: Record, changes: Changes) -> list[Fit]:
+    """Every cause, each as if it alone had changed."""
+    before = left(record, changes)
+    return [fitted(record, changes, cause, before) for cause in causes(record.machine.plant)]
 
 
-def _passed(
-    plant: Plant, K: np.ndarray, forgets: np.ndarray, drive: np.ndarray, straight: np.ndarray | None
-) -> np.ndarray:
-    """d y-hat (T, p) of the observer where its state is driven by
-    `drive` (T, n) and its output by `straight` (T, p)."""
-    through = drive if straight is None else drive - straight @ K.T
-    y = linear_recurrence(forgets, through, np.zeros(plant.n))[:-1] @ plant.C.T
-    return y if straight is None else y + straight
+# ---- the causes that explain the record
 
 
-# ---- the new record against those of the champion
+class Named(NamedTuple):
+    """A change that explains the record, with the rivals that it cannot be told from; `sigmas` is how sure
+    it is that something changed."""
+
+    fit: Fit
+    rivals: list[Fit]
+    sigmas: float
+
+
+class Explanation(NamedTuple):
+    """Of a record: the causes that are named, the largest first, what the others seem beside them, all
+    changes together, and the errors (N,) left."""
+
+    named: list[Named]
+    others: list[Fit]
+    changes: Changes
+    left: np.ndarray
+
+
+def explain(record: Record, changes: Changes, usual: Mapping[Cause, float]) -> Explanation:
+    """Names what changed beside `changes`, one cause after the other; `usual` is what each cause explains of
+    the champion's own records at most, which is no change of the machine."""
+    now, fits, found = changes, alone(record, changes), []
+    for _ in range(MOST):
+        least = np.array([max(SURE**2, 2 * usual.get(fit.cause, 0.0)) for fit in fits])
+        worth = np.array([fit.explained for fit in fits])
+        if found:
+            least = np.maximum(least, REMAINDER * found[0].fit.explained)
+        surely = np.array([abs(_from_none(fit)) >= SURE for fit in fits])
+        worth = np.where((worth > least) & surely, worth, -np.inf)
+        best = int(worth.argmax())
+        if not np.isfinite(worth[best]):
+            break
+        if fits[best].cause.kind == "late sensor":
+            best = _rather_transport(fits, worth, best)
+        rivals = [
+            fit
+            for k, fit in enumerate(fits)
+            if k != best and worth[best] - worth[k] < RIVALS * _colour(fits[best])
+        ]
+        found.append(Named(fits[best], rivals, np.sqrt(worth[best])))
+        now = with_change(now, fits[best].cause, fits[best].value)
+        before = left(record, now)
+        taken = {named.fit.cause for named in found}
+        fits = [fitted(record, now, fit.cause, before) for fit in fits if fit.cause not in taken]
+    if len(found) > 1:
+        found, now = _polished(record, changes, found)
+    return Explanation(found, fits, now, left(record, now))
+
+
+def explain_segments(
+    machine: Machine, segments: Segments, scale: Scale, changes: Changes, usual: Mapping[Cause, float]
+) -> tuple[Record, Explanation]:
+    """A record explained in the surroundings that it was made in: asked first in restless ones, which
+    cost the least to take for calm. What only another season's air tells from a change of the machine is
+    decided by what explains more."""
+    asked = record(machine, segments, scale)
+    explained = explain(asked, changes, usual)
+    there, room = room_of(machine, segments, scale, explained.changes)
+    if room != RESTLESS:
+        asked = record(machine, segments, there, room)
+        explained = explain(asked, changes, usual)
+    same = record(machine, segments, there, room._replace(another_season=False))
+    rest = left(same, explained.changes)
+    if not explained.named and float(rest @ rest - explained.left @ explained.left) < SURE**2:
+        return same, explained._replace(left=rest)
+    within = explain(same, changes, usual)
+    return min((same, within), (asked, explained), key=_cost)
+
+
+def _cost(told: tuple[Record, Explanation]) -> float:
+    record, explained = told
+    unlikely = float(explained.left @ explained.left) + _log_determinant(record)
+    return unlikely + CAUSE * len(explained.named)
+
+
+def _rather_transport(fits: Sequence[Fit], worth: np.ndarray, best: int) -> int:
+    """The delay of an input where a late sensor explains no more: transport is the commoner cause."""
+    for k, fit in enumerate(fits):
+        if fit.cause.kind == "delay" and worth[best] - worth[k] < RIVALS * _colour(fits[best]):
+            return k
+    return best
+
+
+def _from_none(fit: Fit) -> float:
+    """Sigmas of a change from none; a cap has none to be measured from."""
+    if fit.cause.kind == "saturation":
+        return np.sqrt(fit.explained)
+    return fit.value / fit.deviation
+
+
+def _colour(fit: Fit) -> float:
+    """Variance of the estimate in that of white errors, from 1 on."""
+    if fit.cause.kind == "saturation":
+        return 1.0
+    return max(1.0, fit.explained * (fit.deviation / max(abs(fit.value), 1e-12)) ** 2)
+
+
+def _polished(record: Record, changes: Changes, found: list[Named]) -> tuple[list[Named], Changes]:
+    """Several causes fitted beside each other, in turns."""
+    fits = [named.fit for named in found]
+    for _ in range(3):
+        for k, fit in enumerate(fits):
+            others = changes
+            for other in fits[:k] + fits[k + 1 :]:
+                others = with_change(others, other.cause, other.value)
+            fits[k] = fitted(record, others, fit.cause)
+    together = changes
+    for fit in fits:
+        together = with_change(together, fit.cause, fit.value)
+    return [named._replace(fit=fit) for named, fit in zip(found, fits, strict=True)], together
+
+
+# ---- a figure against those of the champion's nights
 
 
 class Shift(NamedTuple):
@@ -261,99 +697,3 @@ def shift(
     degrees = spread**4 / (own**2 / freedom + scatter**2 / max(nights - 1, 1))
     tail = np.maximum(scipy.stats.t.sf(np.abs(t), degrees), 1e-290)
     return Shift(value, before.mean(axis=0), spread, np.sign(t) * scipy.stats.norm.isf(tail))
-
-
-def explained(shifted: Shift, estimated: Estimate) -> np.ndarray:
-    """(causes,): the weighted squared error that each change explains; causes are rivals for the same error,
-    and the largest is the likeliest."""
-    information = estimated.explained / np.maximum(estimated.change**2, 1e-30)
-    return (shifted.value - shifted.reference) ** 2 * information
-
-
-def named(fits: np.ndarray, own: np.ndarray, slow: np.ndarray) -> list[int]:
-    """The causes that the record names: none where none of them `fits` (causes,), one, or gain and time
-    constant of one input where it cannot tell those apart.
-
-    own and slow (causes,) are what each explains under the two observers: the first finds the input, the
-    second, which remembers longer, tells steady from slow.
-    """
-    if not fits.any():
-        return []
-    half = len(own) // 2
-    channel = int(np.where(fits, own, -np.inf).argmax()) % half
-    gain, time_constant = slow[channel], slow[channel + half]
-    if max(gain, time_constant) < TELLING * min(gain, time_constant):
-        return [channel, channel + half]
-    return [channel if gain > time_constant else channel + half]
-
-
-# ---- what is wrong with a record itself
-
-
-class Mistake(NamedTuple):
-    """A mistake that makes the record fit the champion: what it is in words, and how far the errors fall with
-    it undone: `error_share` of them is left."""
-
-    words: str
-    error_share: float
-
-
-def mistakes(
-    plant: Plant,
-    u: np.ndarray,
-    y: np.ndarray,
-    *,
-    inputs: Sequence[str],
-    outputs: Sequence[str],
-    scale: np.ndarray,
-    gross: float,
-) -> list[Mistake]:
-    """Swapped sensors, swapped inputs and wrong units that explain the record better than taking it at its
-    word, the best first; `scale` (p,) is the errors' usual size. The first of the list is the record as it
-    is, with its mean squared error; alone where that is below `gross`, for then nothing is wrong.
-
-    `error_share` is the mean squared error with the mistake undone, as a share of that without. The observer
-    starts settled, so that a wrong level is an error too.
-    """
-    K = observer(plant, len(y))
-
-    def misfit(a: np.ndarray, b: np.ndarray) -> float:
-        e = errors(plant, K, a, b)
-        gamma = free_response_of(plant, K, len(b))
-        measured = np.isfinite(e)
-        x0 = np.linalg.lstsq(gamma[measured], e[measured], rcond=1e-10)[0]
-        rest = (e - gamma @ x0) / scale
-        # bounded, so that one wild channel does not drown the others
-        return float(np.mean(np.minimum(rest[measured] ** 2, 1e4)))
-
-    as_is, suspects = misfit(u, y), []
-    if as_is < gross:
-        return [Mistake("", as_is)]
-    for names, signals, word, other in ((outputs, y, "sensors", u), (inputs, u, "inputs", y)):
-        for i in range(len(names)):
-            for j in range(i):
-                swapped = signals.copy()
-                swapped[:, [i, j]] = swapped[:, [j, i]]
-                pair = (other, swapped) if word == "sensors" else (swapped, other)
-                suspects.append(
-                    Mistake(f"the {word} {names[j]} and {names[i]} are swapped", misfit(*pair) / as_is)
-                )
-    for name, undo in (("°F", lambda c: (c - 32) / 1.8), ("K", lambda c: c - 273.15)):
-        suspects.append(
-            Mistake(f"every sensor is in {name} where °C is declared", misfit(u, undo(y)) / as_is)
-        )
-        for i, output in enumerate(outputs):
-            undone = y.copy()
-            undone[:, i] = undo(y[:, i])
-            suspects.append(Mistake(f"{output} is in {name} where °C is declared", misfit(u, undone) / as_is))
-    for factor, words in ((100.0, "shares of 1"), (100.0 / 255.0, "counts of 255")):
-        suspects.append(
-            Mistake(f"every input is in {words} where percent is declared", misfit(factor * u, y) / as_is)
-        )
-        for j, name in enumerate(inputs):
-            undone = u.copy()
-            undone[:, j] *= factor
-            suspects.append(
-                Mistake(f"{name} is in {words} where percent is declared", misfit(undone, y) / as_is)
-            )
-    return [Mistake("", as_is), *sorted(suspects, key=lambda mistake: mistake.error_share)]

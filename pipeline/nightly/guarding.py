@@ -1,22 +1,33 @@
-"""One night at a time, and a clean table: the lock, what a killed night left, room on the
-disk, and what a failed night changed put back."""
+"""One night at a time, and a clean table: the lock, what a killed night left, files that are broken, room on
+the disk, and what a failed night changed put back."""
 
 import contextlib
 import fcntl
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import yaml
 
-from pipeline.nightly import champion
-from pipeline.nightly.processes import STATE, TOKEN, dvc, end_orphans, fresh_index, git, stale_git_locks
+from pipeline.nightly import champion, remembered
+from pipeline.nightly.processes import (
+    STATE,
+    TOKEN,
+    commit,
+    dvc,
+    end_orphans,
+    fresh_index,
+    git,
+    stale_git_locks,
+)
 from pipeline.store import artifacts
 
 LOCK, RUNNING, RESERVE, BEFORE = STATE / "lock", STATE / "running.json", STATE / "reserve", STATE / "before"
 RESERVE_BYTES = 1 << 20
-METRICS = Path("reports/metrics")
+METRICS, LOCKED = Path("reports/metrics"), "dvc.lock"
+MARKERS = ("<<<<<<< ", ">>>>>>> ", "||||||| ")
 
 
 class BusyError(ValueError):
@@ -26,7 +37,22 @@ class BusyError(ValueError):
 @contextlib.contextmanager
 def alone() -> Iterator[list[str]]:
     """The night's lock, and what the one before left behind, as sentences. Raises BusyError where another
-    night holds it; the kernel lets go when a process dies."""
+    night holds it."""
+    with locked():
+        mended = mend()
+        RUNNING.touch()
+        try:
+            yield mended
+        except ValueError:  # refused in a sentence, not killed
+            RUNNING.unlink(missing_ok=True)
+            raise
+        RUNNING.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def locked() -> Iterator[None]:
+    """The night's lock alone. Raises BusyError where another night holds it; the kernel lets go when a
+    process dies."""
     STATE.mkdir(exist_ok=True)
     if not (STATE / ".gitignore").exists():
         artifacts.write_text(STATE / ".gitignore", "*\n")
@@ -42,21 +68,14 @@ def alone() -> Iterator[list[str]]:
             ) from None
         os.ftruncate(descriptor, 0)
         os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
-        mended = _after_a_kill()
         os.environ[TOKEN] = str(Path.cwd())
-        RUNNING.touch()
-        try:
-            yield mended
-        except ValueError:  # refused in a sentence, not killed
-            RUNNING.unlink(missing_ok=True)
-            raise
-        RUNNING.unlink(missing_ok=True)
+        yield
     finally:
         os.environ.pop(TOKEN, None)
         os.close(descriptor)
 
 
-def _after_a_kill() -> list[str]:
+def mend() -> list[str]:
     """What a night that never ended left: its processes, git's locks,
     an index beside the user's, half a promotion."""
     killed = RUNNING.exists()
@@ -84,9 +103,86 @@ def _after_a_kill() -> list[str]:
     return mended
 
 
-def ready(least_free_mb: float) -> None:
-    """Raises ValueError where a night cannot end well: no git, a merge or rebase half done, too little room.
-    Keeps a reserve that a full disk's report is written from."""
+def broken_champion() -> list[str]:
+    """What is wrong with champion.json as it lies here, as sentences; a broken one is set aside, and put back
+    as the last commit has it, or as the last one that has a whole one. Raises ValueError where none has."""
+    try:
+        champion.read()
+        return []
+    except remembered.MISSHAPEN as error:
+        sentence = f"{error}".removesuffix(f"; {artifacts.remedy(champion.FILE)}")
+        sentence = f"{sentence}; {remembered.set_aside(champion.FILE)}"
+    whole = _last_whole_champion()
+    if whole == "HEAD":
+        return [f"{sentence}, and put back to the last commit"]
+    paths = [str(champion.FILE), str(champion.FOLDER)]
+    there = git("ls-tree", "-r", "--name-only", whole, "--", *paths).splitlines()
+    git("checkout", "-q", whole, "--", *there)
+    commit(champion.paths(), f"champion: as of {whole[:12]}, for champion.json was broken")
+    return [f"{sentence}, and put back to that of commit {whole[:12]}"]
+
+
+def _last_whole_champion() -> str:
+    """HEAD, or the last commit before it whose champion.json can be read. Raises ValueError where there is
+    none."""
+    for revision in ("HEAD", *git("rev-list", "HEAD", "--", str(champion.FILE)).splitlines()):
+        with contextlib.suppress(*remembered.MISSHAPEN):
+            if champion.of_branch(revision).champions or revision == "HEAD":
+                return revision
+    raise ValueError(f"{champion.FILE}: no commit has a whole one; look at git log {champion.FILE}")
+
+
+def whole_text(*names: str) -> None:
+    """Raises ValueError, with file, line and remedy, where a file that the night is made from is missing or
+    is not text, or where git's markers of a merge still stand in it."""
+    for name in names:
+        path = Path(name)
+        if not path.is_file():
+            raise ValueError(f"{name} is missing; restore it with git checkout HEAD -- {name}")
+        try:
+            lines = path.read_text(encoding="utf-8").splitlines()
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{name}: byte {error.start} is not UTF-8; {_remedy(name)}") from None
+        if marked := next((k for k, line in enumerate(lines, 1) if line.startswith(MARKERS)), 0):
+            raise ValueError(
+                f"{name}: line {marked}: a merge was left half done, and its marker "
+                f"{lines[marked - 1][:7]} still stands there; {_remedy(name)}"
+            )
+
+
+def whole_wiring() -> None:
+    """Raises ValueError where dvc.yaml or dvc.lock is broken, in a sentence that dvc would not say."""
+    for name in ("dvc.yaml", *([LOCKED] if Path(LOCKED).exists() else [])):
+        whole_text(name)
+        if problem := _no_stages(Path(name).read_text(encoding="utf-8")):
+            raise ValueError(f"{name}: {problem}; {_remedy(name)}")
+
+
+def _no_stages(text: str) -> str:
+    """What is wrong with the text of a dvc.yaml or dvc.lock, empty where nothing is."""
+    try:
+        entries = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
+        return f"line {mark.line + 1}: {problem}" if mark else " ".join(str(error).split())
+    stages = (entries.get("stages") or {}) if isinstance(entries, dict) else entries or {}
+    whole = isinstance(stages, dict) and all(isinstance(stage, dict) for stage in stages.values())
+    return "" if whole else "expected stages with keys below them, found none"
+
+
+def _remedy(name: str) -> str:
+    """How a broken file is mended: by its last whole version, where git has one."""
+    for revision in ("HEAD", *git("rev-list", "HEAD", "--", name, check=False).splitlines()):
+        text = git("show", f"{revision}:{name}", check=False)
+        marked = any(line.startswith(MARKERS) for line in text.splitlines())
+        if text and not marked and not _no_stages(text):
+            return f"mend it, or take its last whole version (git checkout {revision[:12]} -- {name})"
+    return "keep one of its two sides, and take the markers out"
+
+
+def unmerged() -> None:
+    """Raises ValueError where there is no git, or a merge or rebase is half done: nothing may be put right
+    then."""
     if not git("rev-parse", "--verify", "-q", "HEAD", check=False):
         raise ValueError(
             "expected a git repository with at least one commit, found none; run git init, "
@@ -99,11 +195,17 @@ def ready(least_free_mb: float) -> None:
                 f"a {word} is under way in git; finish it (or give it up with git {word} "
                 "--abort), and run it again"
             )
+
+
+def ready(least_free_mb: float) -> None:
+    """Raises ValueError where a night cannot end well: dvc's files are broken, or there is too little room.
+    Keeps a reserve that a full disk's report is written from."""
+    whole_wiring()
     free = shutil.disk_usage(Path()).free / 1e6
     if free < least_free_mb:
         raise ValueError(
             f"the disk has {free:.0f} MB left, but a night needs {least_free_mb:g} MB "
-            "(nightly.least_free_mb); free some space, or run dvc gc --all-commits"
+            "(nightly.least_free_mb); free some space, or set nightly.keep_gb lower"
         )
     if not RESERVE.exists() or RESERVE.stat().st_size < RESERVE_BYTES:
         artifacts.write_text(RESERVE, "0" * RESERVE_BYTES)
@@ -119,18 +221,30 @@ def remember_before() -> None:
             shutil.copyfile(path, BEFORE / path)
 
 
-def back_to_before() -> list[str]:
-    """A failed night changes nothing but the report: dvc.lock, metrics and
-    what stages wrote to datasets are as before it."""
+def back_to_before(*, only: Collection[str] | None = None) -> list[str]:
+    """A failed night changes nothing but the report: dvc.lock, metrics and what stages wrote to datasets are
+    as before it. `only`: of these stages, those of the loops that failed; the others' stay as they are."""
+    wiring = {} if only is None else _stages_of("dvc.yaml")
+    names = None if only is None else {path for stage in only for path in _metrics(wiring.get(stage, {}))}
     for path in METRICS.glob("*.json"):
-        if not (BEFORE / path).exists() and path.name != "nightly.json":
+        ours = path.name != "nightly.json" if names is None else path.as_posix() in names
+        if ours and not (BEFORE / path).exists():
             path.unlink()
-    for path in (file for file in BEFORE.rglob("*") if file.is_file()):
-        shutil.copyfile(path, path.relative_to(BEFORE))
-    if not (BEFORE / "dvc.lock").exists():
-        Path("dvc.lock").unlink(missing_ok=True)
-        return []
-    stages = (yaml.safe_load(Path("dvc.lock").read_text(encoding="utf-8")) or {}).get("stages")
+    for path in (file.relative_to(BEFORE) for file in BEFORE.rglob("*") if file.is_file()):
+        if path.as_posix() != LOCKED and (names is None or path.as_posix() in names):
+            _put(BEFORE / path, path)
+    before = _stages_of(BEFORE / LOCKED)
+    if only is not None:
+        now = {name: entry for name, entry in _stages_of(LOCKED).items() if name not in only}
+        entries = now | {name: entry for name, entry in before.items() if name in only}
+        artifacts.write_text(
+            LOCKED, yaml.safe_dump({"schema": "2.0", "stages": entries}, sort_keys=False, allow_unicode=True)
+        )
+    elif (BEFORE / LOCKED).exists():
+        _put(BEFORE / LOCKED, Path(LOCKED))
+    else:
+        Path(LOCKED).unlink(missing_ok=True)
+    stages = [name for name in before if only is None or name in only]
     if not stages:
         return []
     try:
@@ -142,3 +256,19 @@ def back_to_before() -> list[str]:
             "the next dvc repro makes them again"
         ]
     return []
+
+
+def _put(source: Path, target: Path) -> None:
+    with artifacts.beside(target) as temporary:
+        shutil.copyfile(source, temporary)
+
+
+def _stages_of(path: str | Path) -> dict[str, Any]:
+    """The stages of dvc.yaml or of a dvc.lock; none where there is no such file."""
+    text = Path(path).read_text(encoding="utf-8") if Path(path).exists() else ""
+    return (yaml.safe_load(text) or {}).get("stages") or {}
+
+
+def _metrics(stage: Mapping[str, Any]) -> list[str]:
+    entries = stage.get("metrics", [])
+    return [name for entry in entries for name in (entry if isinstance(entry, dict) else [entry])]

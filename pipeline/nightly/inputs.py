@@ -1,15 +1,18 @@
 """What a night depends on, as one digest, so that a night with nothing new ends in seconds; which recordings
-are new, and where those go that cannot be learned from."""
+are new, and where those go that cannot be learned from; what of it no commit holds."""
 
 import hashlib
 import itertools
+import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 import yaml
 
-from pipeline.nightly.settings import Loop
+from pipeline.nightly.processes import LITERAL, changed, names
+from pipeline.nightly.settings import Loop, Nightly
+from pipeline.reading import excluded
 from pipeline.reading.signatures import METADATA
 from pipeline.store import artifacts, params
 
@@ -80,14 +83,15 @@ def contents(hashes: Hashes, places: list[str]) -> dict[str, str]:
 def digest(digests: Mapping[str, str]) -> str:
     """One digest over names and contents."""
     total = hashlib.sha256()
-    for name, content in digests.items():
+    for name, content in sorted(digests.items()):
         total.update(f"{name}\0{content}\n".encode())
     return total.hexdigest()
 
 
 def recordings(digests: Mapping[str, str], loop: Loop) -> dict[str, str]:
     """{path: digest} of the recordings below a loop's folder, of all that was found; notes and files of dvc
-    are none. A bag of ROS 2 is one recording, as `ingest` reads it, under the path of its folder."""
+    are none, nor is what is excluded. A bag of ROS 2 is one recording, as `ingest` reads it, under the path
+    of its folder."""
     folder, notes = loop.recordings, (".md", ".txt", ".yaml", ".dvc")
     below = {name: content for name, content in digests.items() if folder and within(name, folder)}
     bags: dict[str, dict[str, str]] = {}
@@ -102,7 +106,13 @@ def recordings(digests: Mapping[str, str], loop: Loop) -> dict[str, str]:
             bags[bag][name] = content
         elif not name.lower().endswith(notes):
             single[name] = content
-    return single | {bag: digest(files) for bag, files in bags.items()}
+    every = single | {bag: digest(files) for bag, files in bags.items()}
+    left_out = {path.as_posix() for path in excluded.excluded(folder)} if folder else set()
+    return {
+        name: content
+        for name, content in every.items()
+        if name not in left_out and not any(within(name, other) for other in left_out)
+    }
 
 
 def within(name: str, folder: str) -> bool:
@@ -110,15 +120,89 @@ def within(name: str, folder: str) -> bool:
     return name.startswith(f"{folder}/")
 
 
+# ---- what cannot be learned from
+
+
 def quarantine(path: str, loop: str, reason: str) -> str:
-    """Moves the recording, a file or a bag, unchanged, to datasets/quarantine, where no stage looks and git
-    does not either, its reason beside it; nothing there is overwritten. The reason."""
-    name, folder = Path(path), QUARANTINE / loop
-    folder.mkdir(parents=True, exist_ok=True)
+    """Sets a recording aside, a file or a bag, and returns the reason. It is moved, unchanged, to
+    datasets/quarantine, where no stage looks and git does not either, its reason beside it; nothing there is
+    overwritten. What git or DVC keeps stays where it is, and is listed in excluded.yaml of its loop's
+    folder."""
+    if kept_by := keeper(Path(path)):
+        folder = params.load(Nightly, "nightly").loops[loop].recordings
+        excluded.exclude(path, folder, reason)
+        return f"{reason} ({kept_by} keeps it: it stays, and is listed in {folder}/{excluded.FILE})"
+    name, aside = Path(path), QUARANTINE / loop
+    aside.mkdir(parents=True, exist_ok=True)
     if not (QUARANTINE / ".gitignore").exists():
         artifacts.write_text(QUARANTINE / ".gitignore", "*\n")
-    names = itertools.chain([name.name], (f"{name.stem}.{k}{name.suffix}" for k in itertools.count(2)))
-    target = next(folder / free for free in names if not (folder / free).exists())
+    free = itertools.chain([name.name], (f"{name.stem}.{k}{name.suffix}" for k in itertools.count(2)))
+    target = next(aside / free_name for free_name in free if not (aside / free_name).exists())
     shutil.move(path, target)
     artifacts.write_text(f"{target}.reason.txt", reason + "\n")
     return reason
+
+
+def keeper(path: Path) -> str:
+    """Who has a version of what lies here: git, DVC, or nobody, which is empty."""
+    try:
+        if names("ls-files", "--", str(path), env=LITERAL):
+            return "git"
+    except ValueError:  # no repository, or the path leads out of it
+        return ""
+    for folder in (path, *path.parents):
+        pointer = folder.with_name(f"{folder.name}.dvc") if folder.name else Path()
+        if pointer.is_file():
+            return "DVC" if _holds(pointer, path.relative_to(folder).as_posix()) else ""
+    return ""
+
+
+def _holds(pointer: Path, name: str) -> bool:
+    """Whether the folder or file of a DVC pointer has a version with this path in it. Where the cache lacks
+    the list of the folder's files that cannot be told, and it is taken to: what stays is not lost."""
+    md5 = str(yaml.safe_load(pointer.read_text(encoding="utf-8"))["outs"][0]["md5"])
+    files = Path(".dvc/cache/files/md5") / md5[:2] / md5[2:]
+    if not md5.endswith(".dir") or not files.is_file():
+        return True
+    held = [entry["relpath"] for entry in json.loads(files.read_text(encoding="utf-8"))]
+    return any(file == name or file.startswith(f"{name}/") for file in held)
+
+
+def after_quarantine(
+    digests: Mapping[str, str], quarantined: Collection[str], loops: Mapping[str, Loop], hashes: Hashes
+) -> dict[str, str]:
+    """`digests` once these recordings are set aside: without those that were moved, and with the lists of
+    those that stayed. Of what has come meanwhile nothing."""
+    moved = [name for name in quarantined if not Path(name).exists()]
+    left = {
+        name: content
+        for name, content in digests.items()
+        if name not in moved and not any(within(name, bag) for bag in moved)
+    }
+    lists = [Path(loop.recordings) / excluded.FILE for loop in loops.values() if loop.recordings]
+    return left | {path.as_posix(): hashes.of(path) for path in lists if path.is_file()}
+
+
+# ---- what no commit holds
+
+
+def recorded_places(settings: Nightly) -> list[str]:
+    """Where recordings lie; of a folder that DVC keeps, git keeps the pointer alone."""
+    places = [*(loop.recordings for loop in settings.loops.values()), settings.holdout.recordings]
+    return [
+        pointer if Path(pointer := f"{place}.dvc").exists() else place
+        for place in dict.fromkeys(places)
+        if place
+    ]
+
+
+def uncommitted(settings: Nightly) -> tuple[str, ...]:
+    """Code, parameters and other sources that differ from the last commit, or are in none. What a night's own
+    commit holds, recordings among it, is none of these."""
+    own = ["dvc.lock", "reports", "champion.json", "champion", "datasets/.gitignore"]
+    own += recorded_places(settings) + [
+        loop.recordings for loop in settings.loops.values() if loop.recordings
+    ]
+    code = [name for name in sources() if not any(name == place or within(name, place) for place in own)]
+    paths = {*changed(), *(changed(*code, untracked="all") if code else ())}
+    return tuple(sorted(p for p in paths if not any(p == place or within(p, place) for place in own)))

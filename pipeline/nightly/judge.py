@@ -20,25 +20,28 @@ from pipeline.temperature.workflow.settings import Panel, Tracking, TuneWeights
 from pipeline.temperature.workflow.settings import Plant as Machine
 
 MEMO = Path(".beadline/panel")
+PAGE, EARLIER = "page", "varx_riccati"  # of nightly.holdout.controller
 
 
 class Judge(NamedTuple):
-    """`measure(folder)`: the evidence on a controller whose files lie below it (datasets, or
-    champion/<loop>); `allowed(champion)`: how much worse each guard may be."""
+    """`measure(folder, contestant)`: the evidence on a controller whose files lie below the folder (datasets,
+    or champion/<loop>); of the temperature loop, on the contestant of that name, `declared` where it is left
+    out. `allowed(champion)`: how much worse each guard may be."""
 
-    measure: Callable[[Path], Evidence]
+    measure: Callable[..., Evidence]
     allowed: Callable[[Evidence], dict[str, float]]
 
 
 def judge(loop: Loop, settings: Nightly) -> Judge:
     if loop.judge == "cases":
         name = loop.cases.removeprefix("datasets/")
-        return Judge(lambda folder: _cases(folder / name)[0], lambda _: _cases(Path(loop.cases))[1])
+        return Judge(lambda folder, _="": _cases(folder / name)[0], lambda _: _cases(Path(loop.cases))[1])
     percent = settings.rule.worst_case_percent / 100
     if loop.judge in ("deposition", "setpoint"):
         measure = {"deposition": _deposition, "setpoint": _setpoint}[loop.judge]
         return Judge(
-            measure, lambda champion: {name: percent * value for name, value in champion.guards.items()}
+            lambda folder, _="": measure(folder),
+            lambda champion: {name: percent * value for name, value in champion.guards.items()},
         )
     return Judge(_temperature(settings), lambda champion: _allowed(champion, settings.rule))
 
@@ -138,10 +141,17 @@ DESIGNED_FROM = {
 }
 
 
-def _temperature(settings: Nightly) -> Callable[[Path], Evidence]:
+def _temperature(settings: Nightly) -> Callable[..., Evidence]:
     """Closed loop on every plant of the frozen panel, as deployed; prediction on the hold-out recordings."""
     frozen = frozen_panel(settings.holdout)
-    return lambda folder: _closed_loop(frozen, folder, settings)
+    own = declared(settings.holdout)
+    return lambda folder, contestant=own: _closed_loop(frozen, folder, contestant, settings.rule)
+
+
+def declared(holdout: HoldOut) -> str:
+    """The contestant that section nightly.holdout names; where it leaves that to the page, the one that ran
+    before champion.json said which."""
+    return EARLIER if holdout.controller == PAGE else holdout.controller
 
 
 def frozen_panel(holdout: HoldOut) -> FrozenPanel:
@@ -189,8 +199,8 @@ def _questions(holdout: HoldOut, machine: Machine) -> panel.Questions:
     )
 
 
-def _closed_loop(frozen: FrozenPanel, folder: Path, settings: Nightly) -> Evidence:
-    result = judged(frozen, folder, settings.holdout.controller)
+def _closed_loop(frozen: FrozenPanel, folder: Path, contestant: str, rule: Rule) -> Evidence:
+    result = judged(frozen, folder, contestant)
     asked = frozen.rehearsal.judging
     references = [asked.references[index].H[0, 0] for index in asked.asked[:, 0]]
     evidence = {
@@ -205,10 +215,10 @@ def _closed_loop(frozen: FrozenPanel, folder: Path, settings: Nightly) -> Eviden
     guards = {
         "worst_case": float(np.max(by_plant)),
         "settled_error_degC": float(result.figures.settled_error.max()),
-        "margin_short_of_least": max(settings.rule.least_disk_margin - disk, 0.0),
+        "margin_short_of_least": max(rule.least_disk_margin - disk, 0.0),
         "unstable_plants": float(sum(not margin.stable for margin in result.margins)),
     }
-    predictor = _predictor(folder, settings.holdout.controller, frozen.machine)
+    predictor = _predictor(folder, contestant, frozen.machine)
     error = _prediction_error(predictor, frozen.records)
     return Evidence(
         frozen.name, evidence, guards | ({"holdout_error_degC": error} if error is not None else {})
@@ -241,9 +251,9 @@ def _designed(frozen: FrozenPanel, folder: Path, name: str) -> tuple[contestants
     values = {one.name: mine.get(one.name) for one in contestant.parameters}
     if lacking := [key for key, value in values.items() if value is None]:
         raise ValueError(
-            f"{path}: expected {', '.join(lacking)} of {name}, which nightly.holdout.controller names, found "
-            f"none; name one of {', '.join(stored.get('contestants', {})) or 'those that it has'} there, or "
-            "let tune_weights tune it"
+            f"{path}: expected {', '.join(lacking)} of {name}, found none; let tune_weights tune it, or name "
+            f"one of {', '.join(stored.get('contestants', {})) or 'those that it has'} in "
+            "nightly.holdout.controller"
         )
     # what it was tuned for, not what it is judged by
     of = stored.get("design", {})
@@ -262,8 +272,8 @@ def _learned(folder: Path, name: str, machine: Machine) -> learned.Learned:
     own = DESIGNED_FROM.get(name)
     if own and not (folder / own).exists():
         raise ValueError(
-            f"{folder / own}: expected it, from which {name} of nightly.holdout.controller is designed, "
-            f"found none; add datasets/{own} to nightly.loops.temperature.artifacts, or name another one"
+            f"{folder / own}: expected it, from which {name} is designed, found none; add datasets/{own} to "
+            "nightly.loops.temperature.artifacts, or name another one in nightly.holdout.controller"
         )
     spread, pid = folder / "identify_plant/spread.parquet", folder / "ingest/printer_pid.json"
     return learned.read_learned(
@@ -295,8 +305,8 @@ def _of_version_0_1(
         own = window.controller(made.window, tracking.gamma)
         return contestants.Design(controller.compact(own.design(*weights), made.window.N), own.model)
     raise ValueError(
-        f"{path}: expected parameters of {name}, which nightly.holdout.controller names, found those of an "
-        "earlier version, which had none; name subspace_lqg or varx_riccati there"
+        f"{path}: expected parameters of {name}, found those of an earlier version, which had none; name "
+        "subspace_lqg or varx_riccati in nightly.holdout.controller"
     )
 
 

@@ -6,26 +6,39 @@ aside; 75: another night is at work.
 
 import datetime
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import numpy as np
-
-from pipeline.nightly import champion, guarding, inputs, remembered, watch
-from pipeline.nightly.processes import STATE, commit, dvc, git
+from pipeline.nightly import (
+    branches,
+    champion,
+    guarding,
+    inputs,
+    remembered,
+    reporting,
+    reproducing,
+    retention,
+    watch,
+)
+from pipeline.nightly.processes import STATE, changed, check_attached, commit, dvc, git
 from pipeline.nightly.remembered import METRICS, DriftMemory, Remembered
+from pipeline.nightly.reproducing import Reproduced
 from pipeline.nightly.settings import Loop, Nightly
 from pipeline.report.nightly import record
-from pipeline.report.nightly.production import ROLLED_BACK, Champion, ChampionMetrics, ChampionState, Lineage
-from pipeline.report.nightly.record import KEPT, LoopDecision, Night
+from pipeline.report.nightly.production import ROLLED_BACK, ChampionState, Lineage
+from pipeline.report.nightly.record import LoopDecision, Night
 from pipeline.store import artifacts, params
 
-OK, FAILED, DRIFTED, QUARANTINED, BUSY = 0, 1, 3, 4, 75
-NIGHTS = STATE / "nights.json"
-LONGEST_HISTORY = 1000
-# what ends a night in a sentence; anything else is a mistake of this program, and shows its traceback
-REFUSALS = (ValueError, OSError, np.linalg.LinAlgError)
+OK, FAILED, BUSY = reporting.OK, reporting.FAILED, reporting.BUSY
+DRIFTED, QUARANTINED = reporting.DRIFTED, reporting.QUARANTINED
+# the loop whose recordings are learned from where this parameter says so
+RECORDED = "recordings"
+SOURCES = {
+    "temperature": "generate_probing.source",
+    "deposition": "train_ilc.source",
+    "setpoint": "train_classifier.source",
+}
 
 
 class Job(NamedTuple):
@@ -42,7 +55,8 @@ class Work(NamedTuple):
     """A night under way: its record, what it is made from {path: digest}, new recordings {loop: {path:
     digest}}, the memory of drift, and what is in production.
 
-    `moved` are inputs that changed while the stages ran. `done`: no further step follows.
+    `moved` are inputs that changed while the stages ran. `lost` is {loop: why its stages failed}. `done`: no
+    further step follows.
     """
 
     night: Night
@@ -51,63 +65,126 @@ class Work(NamedTuple):
     new: Mapping[str, Mapping[str, str]] = {}
     state: ChampionState = ChampionState()
     moved: tuple[str, ...] = ()
+    lost: Mapping[str, str] = {}
     done: bool = False
 
     def ended(self, outcome: str, *reasons: str) -> "Work":
         return self._replace(night=self.night.ended(outcome, *reasons), done=True)
 
     def failed(self, error: Exception) -> "Work":
-        return self.ended(record.FAILED, " ".join(str(error).split()))
+        """The night after what ended it. A night that has made its commit stays what it was, and is repeated
+        in the morning after."""
+        why = reporting.told(error, self.night.run)
+        if self.night.commit:
+            return self._replace(night=self.night._replace(unpushed=True).noted(why), done=True)
+        nothing = self.night._replace(decisions={}, promoted=(), branch="")
+        return self._replace(night=nothing).ended(record.FAILED, why)
 
 
 def nightly(now: datetime.datetime | None = None) -> tuple[int, str]:
-    """Exit status and the one-line summary of a night. Raises
-    ValueError where the parameters do not say what to do."""
-    settings = params.load(Nightly, "nightly")
+    """Exit status and the one-line summary of a night. Whatever happens, somebody is told."""
     started = now or datetime.datetime.now(datetime.UTC)
     try:
-        with guarding.alone() as mended:
-            return _night(settings, started, mended)
+        with guarding.locked():
+            return _night(started)
     except guarding.BusyError as busy:
         return BUSY, f"nightly: refused: {busy}"
+    except Exception as error:  # nothing may end a night without a word
+        return reporting.last_resort(error, started)
 
 
-def _night(settings: Nightly, now: datetime.datetime, mended: Iterable[str]) -> tuple[int, str]:
-    last, clock = remembered.last(), time.monotonic()
-    number = last.night + 1
-    night = Night(number, f"night-{number:04d}", watch.stamp(now)).noted(*mended)
+def _night(now: datetime.datetime) -> tuple[int, str]:
+    clock = time.monotonic()
+    last, aside = remembered.opened()
+    night = Night(last.night + 1, f"night-{last.night + 1:04d}", watch.stamp(now))
+    settings, refused = reporting.settings_or_known(last, night.run)
     if last.success and now < datetime.datetime.fromisoformat(last.success):
         night = night.noted(
             f"the clock was set back: it is {night.when}, and the last success was at {last.success}"
         )
-    overdue = watch.overdue(now, settings.watch_h) if last.success else ""
-    job = Job(settings, last, inputs.Hashes(last.hashes))
-    work = Work(night, last.drift)
-    try:
-        guarding.ready(settings.least_free_mb)
-    except REFUSALS as error:
-        work = work.failed(error)
-    work = _worked(job, work)
+    overdue = watch.overdue(now, last.success, settings.watch_h) if last.success and settings else ""
+    job = Job(settings, last, inputs.Hashes(last.hashes)) if settings else None
+    work, mended = _mended(Work(night, last.drift), [*aside, *refused])
+    if mended:
+        guarding.RUNNING.touch()
+    if job and not work.done:
+        work = _worked(job, work)
     if work.night.outcome == record.FAILED:
         guarding.RESERVE.unlink(missing_ok=True)  # on a full disk, what follows is written from it
     night = work.night._replace(seconds=round(time.monotonic() - clock, 1))
     night = night.noted(f"watch: {overdue}") if overdue else night
-    return _report(job, work._replace(night=night))
+    tonight = _to_remember(job, work) if job else last._replace(night=night.number)
+    told = reporting.report(night, tonight, settings)
+    if mended:
+        guarding.RUNNING.unlink(missing_ok=True)
+    return told
 
 
 # ---- the night, step by step
 
 
+def _mended(work: Work, broken: Sequence[str]) -> tuple[Work, bool]:
+    """What a killed night left, put right; whether that could be done. The night ends where a file that it
+    works by is broken, which its sentences say."""
+    whole, broken = True, list(broken)
+    try:
+        guarding.unmerged()
+    except Exception as error:
+        return work.ended(record.FAILED, *broken, reporting.told(error, work.night.run)), False
+    for mend in (guarding.broken_champion, guarding.mend):
+        try:
+            said = mend()
+        except Exception as error:
+            whole = False
+            broken.append(reporting.told(error, work.night.run))
+            continue
+        if mend is guarding.broken_champion:
+            broken += said
+        else:
+            work = work._replace(night=work.night.noted(*said))
+    return (work.ended(record.FAILED, *dict.fromkeys(broken)) if broken else work), whole
+
+
 def _worked(job: Job, work: Work) -> Work:
-    """The night itself. Each step returns the work with more in it; one that is refused ends the night, which
+    """The night itself. Each step returns the work with more in it; one that fails ends the night, which
     keeps what the steps before it came to."""
-    for step in (_unchanged, _compared, _screened, _learned, _put_back, _restarted, _committed, _pushed):
+    steps = (
+        *(_ready, _unchanged, _compared, _screened, _learned, _put_back, _restarted),
+        *(_committed, _pushed, _freed),
+    )
+    for step in steps:
         if work.done:
             break
         try:
-            work = step(job, work)
-        except REFUSALS as error:
+            work = step(_sound(job, work.lost), work)
+        except Exception as error:  # refused in a sentence, or a mistake of this program
             work = work.failed(error)
+            # until the stages have run nothing is changed, and after that production may be
+            work = _undone(work) if step in (_committed, _pushed, _freed) else work
+    return work
+
+
+def _undone(work: Work, *undo: Callable[[], list[str]]) -> Work:
+    """What a failed night changed is put back, production last."""
+    for back in (*undo, champion.as_committed):
+        try:
+            work = work._replace(night=work.night.noted(*back()))
+        except Exception as error:
+            work = work._replace(night=work.night.noted(reporting.told(error, work.night.run)))
+    return work
+
+
+def _sound(job: Job, lost: Mapping[str, str]) -> Job:
+    """The job without the loops whose stages failed: nothing of them is judged or committed."""
+    if not lost:
+        return job
+    loops = {name: loop for name, loop in job.settings.loops.items() if name not in lost}
+    return job._replace(settings=job.settings.model_copy(update={"loops": loops}))
+
+
+def _ready(job: Job, work: Work) -> Work:
+    guarding.ready(job.settings.least_free_mb)
+    branches.check(job.settings)
     return work
 
 
@@ -130,7 +207,9 @@ def _compared(job: Job, work: Work) -> Work:
         for name, loop in job.settings.loops.items()
     }
     paths = {name: sorted(recordings) for name, recordings in new.items() if recordings}
-    return work._replace(new=new, night=work.night._replace(new_recordings=paths))
+    night = work.night._replace(new_recordings=paths)
+    unused = [_unused(job.settings.loops[name], recordings) for name, recordings in paths.items()]
+    return work._replace(new=new, night=night.noted(*filter(None, unused)))
 
 
 def _screened(job: Job, work: Work) -> Work:
@@ -140,11 +219,7 @@ def _screened(job: Job, work: Work) -> Work:
     state, night = champion.read(), work.night
     screened = screening.look(job.settings, state.champions, work.new, work.memory, night=night.number)
     quarantined = {**night.quarantined, **screened.drift.quarantined}
-    digests = {
-        name: content
-        for name, content in work.digests.items()
-        if name not in quarantined and not any(inputs.within(name, bag) for bag in quarantined)
-    }
+    digests = inputs.after_quarantine(work.digests, quarantined, job.settings.loops, job.hashes)
     work = Work(
         night._replace(screened=True, drift=screened.drift, quarantined=quarantined),
         screened.memory,
@@ -161,7 +236,9 @@ def _learned(job: Job, work: Work) -> Work:
     """Runs the stages, and judges what they made. What a refused run changed is put back."""
     guarding.remember_before()
     try:
-        _reproduce(job.settings, work.night.run)
+        # the pages of tonight show tonight's drift, and judge by it
+        artifacts.write_json(METRICS, work.night.metrics(work.state))
+        reproduced = _reproduce(job.settings, work.night.run) or Reproduced()
         # what came or changed meanwhile may be in some stages and not in others, and
         # nobody has looked whether it is fit to learn from
         now = inputs.contents(job.hashes, _places(job.settings))
@@ -171,10 +248,22 @@ def _learned(job: Job, work: Work) -> Work:
                 f"{moved[0]} changed{' again' if job.restarted else ''} while the stages ran; "
                 "start the night when nothing is recorded or edited"
             )
-        return work._replace(moved=moved) if moved else _judge(job, work)
-    except REFUSALS as error:
-        mended = guarding.back_to_before() + champion.as_committed()
-        return work._replace(night=work.night.noted(*mended)).failed(error)
+        if moved:
+            return work._replace(moved=moved)
+        work = work._replace(lost=reproduced.lost, night=work.night.noted(*reproduced.notes))
+        return _with_lost(_judge(_sound(job, work.lost), work))
+    except Exception as error:
+        return _undone(work.failed(error), guarding.back_to_before)
+
+
+def _with_lost(work: Work) -> Work:
+    """The night's record with the loops whose stages failed, told first; their champions stay."""
+    lost = {
+        name: LoopDecision(record.FAILED, [f"its champion stays: {why}"]) for name, why in work.lost.items()
+    }
+    night = work.night._replace(decisions={**lost, **work.night.decisions})
+    reasons = [f"{name}: {decision.decision}, {decision.reasons[0]}" for name, decision in lost.items()]
+    return work._replace(night=night.ended(night.outcome, *reasons, *night.reasons))
 
 
 def _put_back(job: Job, work: Work) -> Work:
@@ -215,98 +304,50 @@ def _new(digests: Mapping[str, str], loop: Loop, before: Mapping[str, str]) -> d
     }
 
 
-def _reproduce(settings: Nightly, run: str) -> None:
-    log = STATE / "logs" / f"{run}.log"
+def _unused(loop: Loop, recordings: Sequence[str]) -> str:
+    """That new recordings of a loop are not learned from, and what would change that; empty where they
+    are."""
+    section, _, key = SOURCES.get(loop.judge, "").partition(".")
+    source = params.read().get(section, {}).get(key, RECORDED)
+    if source == RECORDED:
+        return ""
+    first, more = ", ".join(recordings[:3]), f" and {len(recordings) - 3} more" if len(recordings) > 3 else ""
+    dotted = f"{section}.{key}"
+    return (
+        f"{first}{more} {'is' if len(recordings) == 1 else 'are'} not used, for {dotted} is {source}; "
+        f"set {dotted}: {RECORDED} in {params.home(dotted)} to learn from what is recorded"
+    )
+
+
+def _reproduce(settings: Nightly, run: str) -> Reproduced:
     for loop in settings.loops.values():
         # large recordings are DVC's: the pointer beside the folder moves with it
         if loop.recordings and Path(f"{loop.recordings}.dvc").exists():
             dvc("add", "--quiet", loop.recordings)
-    dvc("repro", log=log, limit_s=settings.longest_h * 3600)
     for old in sorted((STATE / "logs").glob("*.log"))[:-60]:
         old.unlink()
+    return reproducing.reproduce(settings.loops, run, limit_s=settings.longest_h * 3600)
 
 
 # ---- champion and challenger
 
 
-class JudgedLoop(NamedTuple):
-    """What was decided of a loop's challenger, and what it measured; None where it was not measured."""
-
-    decision: LoopDecision
-    metrics: ChampionMetrics | None = None
-
-
 def _judge(job: Job, work: Work) -> Work:
-    """Each loop's challenger against its champion; production with those that are promoted, whose files lie
-    in champion/<loop> by then."""
-    state, night = work.state, work.night
-    decisions: dict[str, LoopDecision] = {}
-    lineage = _lineage(job.settings, work.digests)
-    for name in job.settings.loops:
-        decision, metrics = _decide(job.settings, name, state.champions.get(name), work)
-        decisions[name] = decision
-        if decision.promotes:
-            promoted = _install(job.settings, name, night, decision)
-            promoted = promoted._replace(metrics=metrics, lineage=lineage)
-            state = champion.in_production(state, name, promoted, event=decision.decision)
-    promoted_loops = tuple(name for name, decision in decisions.items() if decision.promotes)
-    night = night._replace(decisions=decisions, promoted=promoted_loops).ended(
-        record.PROMOTED if promoted_loops else KEPT,
-        *(f"{name}: {reason}" for name, decision in decisions.items() for reason in decision.reasons),
+    """Each loop's challenger before the rules of its page and against its champion, and what is promoted."""
+    from pipeline.nightly import promoting
+
+    night, state = promoting.judged(
+        job.settings, work.night, work.state, lineage=lambda: _lineage(job.settings, work.digests)
     )
-    return work._replace(state=state, night=night)
-
-
-def _install(settings: Nightly, name: str, night: Night, decision: LoopDecision) -> Champion:
-    """Copies the challenger and the reference of its recordings to champion/<loop>."""
-    from pipeline.nightly import screening
-
-    loop = settings.loops[name]
-    reference = screening.reference(loop, Path("datasets"))
-    beside = {screening.REFERENCE: reference} if reference else {}
-    files = champion.install(name, loop.artifacts, beside)
-    return Champion(night.run, night.when, "; ".join(decision.reasons), files)
-
-
-def _decide(settings: Nightly, name: str, present: Champion | None, work: Work) -> JudgedLoop:
-    from pipeline.nightly import judge
-    from pipeline.nightly.decision import decide
-
-    loop = settings.loops[name]
-    if lacking := champion.missing(loop.artifacts):
-        reason = f"the challenger lacks {lacking[0]}; its stage did not write it"
-        return JudgedLoop(LoopDecision(KEPT, [reason]))
-    if present and champion.same(present.installed.files, loop.artifacts):
-        return JudgedLoop(LoopDecision(KEPT, ["the challenger is the champion, byte for byte"]))
-    if run := champion.rolled_back(work.state, name, loop.artifacts):
-        reason = f"the challenger is that of {run}, which was rolled back by hand"
-        return JudgedLoop(LoopDecision(KEPT, [reason]))
-    judged = judge.judge(loop, settings)
-    try:
-        challenger = judged.measure(Path("datasets"))
-        before = judged.measure(champion.FOLDER / name) if present else None
-    except judge.NotComparable as reason:
-        return JudgedLoop(LoopDecision(KEPT, [f"champion and challenger cannot be compared: {reason}"]))
-    mean_cost = float(np.mean([cost for _, cost in challenger.cases.values()]))
-    decision = decide(
-        before,
-        challenger,
-        settings.rule,
-        allowed=judged.allowed(before) if before else {},
-        alarms=work.night.drift.of(name).alarms,
-        seed=work.night.number,
-    )
-    return JudgedLoop(decision, ChampionMetrics(challenger.panel, mean_cost, challenger.guards))
+    return work._replace(night=night, state=state)
 
 
 def _lineage(settings: Nightly, made_from: Mapping[str, str]) -> Lineage:
     """What the challengers were made from: the commit, what lay
     uncommitted on it, dvc.lock, parameters and recordings."""
-    changed = [line[3:] for line in git("status", "--porcelain", "--untracked-files=no").splitlines()]
-    nights_own = ("reports/", "champion")
     return Lineage(
         commit=git("rev-parse", "HEAD"),
-        uncommitted=tuple(path for path in changed if path != "dvc.lock" and not path.startswith(nights_own)),
+        uncommitted=inputs.uncommitted(settings),
         dvc_lock=artifacts.sha256("dvc.lock"),
         params={
             name: artifacts.sha256(name) for name in (params.FILE, params.EXPERT) if artifacts.exists(name)
@@ -318,42 +359,59 @@ def _lineage(settings: Nightly, made_from: Mapping[str, str]) -> Lineage:
 # ---- the commit, which is the promotion
 
 
-def _branch(settings: Nightly, night: Night) -> str:
-    """The branch that a promotion waits on; empty where the night's commit is HEAD's."""
-    return settings.branch if settings.promotion == "branch" and night.promoted else ""
-
-
 def _committed(job: Job, work: Work) -> Work:
-    settings, night = job.settings, work.night
-    if night.promoted:
-        champion.write(work.state)
-    tracked = _tracked(settings, promoted=bool(night.promoted))
+    """The night's commit: of HEAD; or on a branch beside what waits there, where promotions wait."""
+    settings = job.settings
+    work = work._replace(night=work.night.noted(*_uncommitted(settings)))
+    there = branches.waiting(settings)
+    night, state = work.night, work.state
+    moved = state != champion.read()  # a champion or a candidate
+    if settings.promotion == "branch":
+        night, state = branches.beside(night, state, there)
+        night = night.noted(*branches.told(settings, night, there))
+        night = night._replace(branch=settings.branch if night.promoted else "")
+        moved = moved and bool(night.promoted or night.candidates)
+    if moved:
+        champion.write(state)
+    tracked = _tracked(settings, promoted=moved)
     elsewhere = [path for path in tracked if path != str(METRICS) and Path(path).exists()]
-    changed = bool(git("status", "--porcelain", "--", *elsewhere)) or night.promoted
-    branch = _branch(settings, night)
-    if not changed or not (branch or settings.promotion == "at_once"):
+    # of the metrics, the night's own change every night
+    anything = moved or set(changed(*elsewhere, untracked="normal")) - {str(METRICS)}
+    work = work._replace(night=night)
+    if not anything or (settings.promotion == "branch" and not moved):
         return work
-    artifacts.write_json(METRICS, night.metrics(work.state))
+    artifacts.write_json(METRICS, night.metrics(state))
     outcome = f"promoted {', '.join(night.promoted)}" if night.promoted else "kept the champions"
     message = f"nightly {night.run}: {outcome}\n\n" + "\n".join(night.reasons)
-    return work._replace(night=night._replace(commit=commit(tracked, message, branch=branch)))
+    if settings.promotion == "branch":
+        made = branches.committed(settings, tracked, message, night, there)
+    else:
+        made = commit(tracked, message)
+    return work._replace(night=night._replace(commit=made))
+
+
+def _uncommitted(settings: Nightly) -> list[str]:
+    """That the night's result cannot be made again from its commit, where sources lie there uncommitted."""
+    paths = inputs.uncommitted(settings)
+    if not paths:
+        return []
+    more = f" and {len(paths) - 3} more" if len(paths) > 3 else ""
+    return [f"not committed: {', '.join(paths[:3])}{more}; no commit alone makes this night's result again"]
 
 
 def _tracked(settings: Nightly, *, promoted: bool) -> list[str]:
     """What a night's commit holds."""
-    recordings = [*(loop.recordings for loop in settings.loops.values()), settings.holdout.recordings]
     return [
         "dvc.lock",
         "reports/metrics",
         "datasets/.gitignore",
-        # of a folder that DVC keeps, git keeps the pointer alone
-        *(pointer if Path(pointer := f"{place}.dvc").exists() else place for place in recordings if place),
+        *inputs.recorded_places(settings),
         *(champion.paths() if promoted else []),
     ]
 
 
 def _pushed(job: Job, work: Work) -> Work:
-    """The artifacts to the remote; where the promotion waits on a branch, production as it was."""
+    """The artifacts to the remote; where promotions wait on a branch, production as it was."""
     settings, night = job.settings, work.night
     if settings.remote:
         try:
@@ -362,120 +420,50 @@ def _pushed(job: Job, work: Work) -> Work:
             night = night._replace(unpushed=True).noted(
                 f"the artifacts are not on remote {settings.remote}: {error}; the next night tries again"
             )
-    if branch := _branch(settings, night):
-        night = night.noted(f"the promotion waits on branch {branch}: git merge {branch}")
+    if settings.promotion == "branch":
         champion.as_committed()
     return work._replace(night=night)
 
 
-# ---- what is remembered and reported
+def _freed(job: Job, work: Work) -> Work:
+    """DVC's cache within nightly.keep_gb."""
+    return work._replace(night=work.night.noted(*retention.freed(job.settings.keep_gb)))
 
 
-def _report(job: Job, work: Work) -> tuple[int, str]:
-    """State, page, alarm; the exit status and the summary. On a disk without room the summary still comes."""
-    night, settings = work.night, job.settings
-    status = _status(night)
-    troubles: list[str] = []
-    try:
-        _remember(job, work)
-        if night.outcome != record.NOTHING_NEW:
-            from pipeline.report.nightly import page
-
-            artifacts.write_text("reports/nightly.html", page.render(nights(), champion.read(), settings))
-    except OSError as error:
-        troubles.append(str(error))
-    if status != OK:
-        kind, reasons = _alarm(night, status)
-        details = {
-            "night": night.run,
-            "when": night.when,
-            "status": status,
-            "drift": night.drift_written(),
-            "quarantined": dict(night.quarantined),
-            "log": f".beadline/logs/{night.run}.log",
-        }
-        troubles += watch.wake(kind, reasons, details, command=settings.alarm, webhook=settings.webhook)
-    return status, _summary(night, troubles)
+# ---- what is remembered
 
 
-def _status(night: Night) -> int:
-    """What a scheduler is told: the gravest of what the night met."""
-    if night.outcome == record.FAILED or night.unpushed:
-        return FAILED
-    if night.drift.alarms:
-        return DRIFTED
-    return QUARANTINED if night.quarantined else OK
-
-
-def _alarm(night: Night, status: int) -> tuple[str, list[str]]:
-    """What somebody is woken for, and why."""
-    if status == FAILED:  # or could not push, which its notes say
-        return "failed", list(night.reasons if night.outcome == record.FAILED else night.notes)
-    if status == DRIFTED:
-        return "drift", [alarm.cause for alarm in night.drift.alarms]
-    return "quarantined", list(night.quarantined.values())
-
-
-def _remember(job: Job, work: Work) -> None:
+def _to_remember(job: Job, work: Work) -> Remembered:
     night, last = work.night, job.last
+    known = job.settings.model_dump(mode="json")
     if night.outcome == record.FAILED:
         # a recording of a failed night is new again the next one, and must not count as two
-        remembered.remember(last._replace(night=night.number, unpushed=night.unpushed, hashes=job.hashes.now))
-    else:
-        if night.outcome != record.NOTHING_NEW and not night.commit:
-            artifacts.write_json(METRICS, night.metrics(champion.read()))
-        tonight = Remembered(
-            night=night.number,
-            # a clock that was set back must not make the last success look older than it is
-            success=max(night.when, last.success or ""),
-            inputs=inputs.digest(work.digests),
-            unpushed=night.unpushed,
-            recordings={
-                name: inputs.recordings(work.digests, loop) for name, loop in job.settings.loops.items()
-            },
-            drift=work.memory,
-            hashes=job.hashes.now,
+        return last._replace(
+            night=night.number, unpushed=night.unpushed, hashes=job.hashes.now or last.hashes, settings=known
         )
-        remembered.remember(tonight)
-    artifacts.write_json(NIGHTS, [*_rows(), night.written()][-LONGEST_HISTORY:])
-
-
-def _rows() -> list[dict[str, Any]]:
-    return artifacts.read_json(NIGHTS) if NIGHTS.exists() else []
+    return Remembered(
+        night=night.number,
+        # a clock that was set back must not make the last success look older than it is
+        success=last.success if work.lost else max(night.when, last.success or ""),
+        # a night that lost a loop is repeated
+        inputs=None if work.lost else inputs.digest(work.digests),
+        unpushed=night.unpushed,
+        recordings={name: inputs.recordings(work.digests, loop) for name, loop in job.settings.loops.items()},
+        drift=work.memory,
+        hashes=job.hashes.now,
+        settings=known,
+    )
 
 
 def nights() -> list[Night]:
     """Every night that this checkout remembers, the oldest first."""
-    return [Night.read(row) for row in _rows()]
-
-
-def _summary(night: Night, troubles: list[str]) -> str:
-    alarms = [alarm.cause for alarm in night.drift.alarms]
-    parts = [f"nightly: {night.run} {night.outcome}"]
-    if night.promoted:
-        parts.append(f"promoted {', '.join(night.promoted)}")
-    if alarms:
-        parts.append(f"drift: {'; '.join(alarms)}")
-    if not (night.promoted or alarms) or night.outcome == record.FAILED:
-        parts.append("; ".join(night.reasons))
-    if night.quarantined:
-        parts.append("quarantined: " + "; ".join(night.quarantined.values()))
-    text = " ".join(" | ".join([*parts, *night.notes, *troubles, f"{night.seconds:g} s"]).split())
-    return text if len(text) <= 1000 else text[:999] + "…"
+    return remembered.nights()
 
 
 def watchdog() -> tuple[int, str]:
-    """Whether somebody should look, because no night has succeeded for too long; the alarm goes out with it.
-    Takes no lock: a night that hangs is seen too."""
-    settings, now = params.load(Nightly, "nightly"), datetime.datetime.now(datetime.UTC)
-    late = watch.overdue(now, settings.watch_h)
-    if not late:
-        return OK, f"nightly: watch: the last success was at {remembered.last().success}"
-    STATE.mkdir(exist_ok=True)
-    troubles = watch.wake(
-        "watch", [late], {"when": watch.stamp(now)}, command=settings.alarm, webhook=settings.webhook
-    )
-    return FAILED, " | ".join([f"nightly: watch: {late}", *troubles])
+    """Whether somebody should look: no night has succeeded for too long, or what nights work by is broken.
+    The alarm goes out with it. Takes no lock: a night that hangs is seen too."""
+    return reporting.watchdog(datetime.datetime.now(datetime.UTC))
 
 
 # ---- the way back
@@ -485,6 +473,7 @@ def rollback(run: str, loop: str) -> str:
     """Puts the champion of an earlier run back into production, bit by bit, and says what was done."""
     params.load(Nightly, "nightly")
     with guarding.alone():
+        check_attached()
         state = champion.read()
         earlier = champion.earlier(state, run, loop)
         when = watch.stamp(datetime.datetime.now(datetime.UTC))

@@ -11,6 +11,7 @@ from pipeline.deposition.workflow import trial_files
 from pipeline.nightly import camera_drift
 from pipeline.nightly.inputs import quarantine
 from pipeline.nightly.settings import Drift
+from pipeline.reading.excluded import readable
 from pipeline.report.shared.night import Alarm, LoopDrift
 from pipeline.store import params
 
@@ -27,7 +28,8 @@ def of_trials(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[An
     """[median, deviation, frames] of each of the last `most` trials below `folder`
     whose pictures show a bead; `only` those named."""
     rows = []
-    paths = [path for path in sorted(folder.rglob("*.mcap")) if not only or path.as_posix() in only]
+    trials = readable(sorted(folder.rglob("*.mcap")), folder)
+    paths = [path for path in trials if not only or path.as_posix() in only]
     for path in paths[-most:]:
         try:
             stats = _frame_stats(trial_files.read_trial(path, unreadable_share=1.0))

@@ -15,22 +15,62 @@ TOKEN = "BEADLINE_NIGHT"
 FALLBACK = {"GIT_AUTHOR_NAME": "beadline nightly", "GIT_AUTHOR_EMAIL": "nightly@beadline.invalid"}
 
 
-def git(*arguments: str, env: dict[str, str] | None = None, check: bool = True) -> str:
-    """Standard output of `git ...`. Raises ValueError with git's last
-    line where it fails and `check` is on."""
+# commits are on the disk before the night says so: git's default leaves loose objects in memory
+DURABLE = {"core.fsync": "all"}
+# a recording may be called [1].csv, which git would take for a pattern
+LITERAL = {"GIT_LITERAL_PATHSPECS": "1"}
+
+
+def git(*arguments: str, env: dict[str, str] | None = None, check: bool = True, place: str = "") -> str:
+    """Standard output of `git ...`, in the worktree `place` where it is named. Raises ValueError with git's
+    last line where it fails and `check` is on."""
+    return _output(arguments, env or {}, check=check, place=place).strip()
+
+
+def names(*arguments: str, env: dict[str, str] | None = None) -> list[str]:
+    """The paths that `git ... -z` prints, whatever characters they have. Raises ValueError where it fails."""
+    command, *rest = arguments
+    return [
+        name for name in _output((command, "-z", *rest), env or {}, check=True, place="").split("\0") if name
+    ]
+
+
+def changed(*places: str, untracked: str = "no") -> list[str]:
+    """Paths below `places` (none: everywhere) that differ from the last commit; both names of one that was
+    renamed. `untracked` is git's word: no, normal or all."""
+    entries = iter(names("status", "--porcelain", f"--untracked-files={untracked}", "--", *places))
+    paths = []
+    for entry in entries:
+        paths.append(entry[3:])  # two letters and a blank, either letter a blank too
+        if "R" in entry[:2] or "C" in entry[:2]:
+            paths.append(next(entries))
+    return paths
+
+
+def _output(arguments: Sequence[str], env: dict[str, str], *, check: bool, place: str) -> str:
     ended = subprocess.run(
-        ["git", *arguments],
+        ["git", *(("-C", place) if place else ()), *arguments],
         check=False,
         capture_output=True,
-        text=True,
-        env=os.environ | (env or {}),
+        encoding="utf-8",
+        errors="surrogateescape",  # as Python names files whose names are no text
+        env=os.environ | env,
         stdin=subprocess.DEVNULL,
     )
     if check and ended.returncode:
         raise ValueError(
             f"git {arguments[0]} failed: {_last(ended.stderr) or f'exit status {ended.returncode}'}"
         )
-    return ended.stdout.strip() if ended.returncode == 0 else ""
+    return ended.stdout if ended.returncode == 0 else ""
+
+
+def configured(settings: dict[str, str]) -> dict[str, str]:
+    """The environment in which git goes by these settings, beside those that the environment has already."""
+    before = int(os.environ.get("GIT_CONFIG_COUNT", "0") or 0)
+    env = {"GIT_CONFIG_COUNT": str(before + len(settings))}
+    for number, (key, value) in enumerate(settings.items(), start=before):
+        env |= {f"GIT_CONFIG_KEY_{number}": key, f"GIT_CONFIG_VALUE_{number}": value}
+    return env
 
 
 def dvc(*arguments: str, log: Path | None = None, limit_s: float = 3600) -> str:
@@ -62,11 +102,11 @@ def dvc(*arguments: str, log: Path | None = None, limit_s: float = 3600) -> str:
             child.wait()
     text = target.read_text(encoding="utf-8", errors="replace")
     if status:
-        raise ValueError(f"dvc {arguments[0]} failed: {_sentence(text)}")
+        raise ValueError(f"dvc {arguments[0]} failed: {sentence(text)}")
     return text
 
 
-def _sentence(text: str) -> str:
+def sentence(text: str) -> str:
     """Of what dvc and its stages printed: the stage's own sentence
     where it has one, dvc's last error otherwise."""
     lines = [line.strip() for line in text.replace("\r", "\n").splitlines() if line.strip()]
@@ -92,19 +132,39 @@ def identity() -> dict[str, str]:
     return author | {key.replace("AUTHOR", "COMMITTER"): value for key, value in author.items()}
 
 
-def commit(paths: Sequence[str], message: str, *, branch: str = "") -> str:
-    """A commit of these paths as they are on disk, on top of HEAD; moves HEAD, or `branch` where it is named.
-    Its hash, empty where nothing differs.
+def contains(later: str, earlier: str) -> bool:
+    """Whether commit `earlier` is `later`, or lies behind it."""
+    return git("merge-base", earlier, later, check=False) == git("rev-parse", f"{earlier}^{{commit}}")
+
+
+def check_attached() -> None:
+    """Raises ValueError where HEAD is on no branch: what is committed there is lost with the next
+    checkout."""
+    if not git("symbolic-ref", "-q", "HEAD", check=False):
+        raise ValueError(
+            "expected a branch to be checked out, found a detached HEAD, where the night's commit would be "
+            "lost; "
+            "git switch to the branch that is in production, and run it again"
+        )
+
+
+def commit(paths: Sequence[str], message: str, *, branch: str = "", tip: str = "") -> str:
+    """A commit of these paths as they are on disk over HEAD's tree. It moves HEAD; or `branch` where that is
+    named, whose last commit so far is `tip`, and which then holds all that HEAD and `tip` hold. Its hash,
+    empty where nothing differs. Raises ValueError where HEAD is to move and is on no branch.
 
     Built beside the user's index, so that what is staged stays staged; the last
     step is one reference that moves whole or not at all.
     """
+    if not branch:
+        check_attached()
     base = git("rev-parse", "HEAD")
     index = Path(git("rev-parse", "--git-dir")) / f"beadline-index.{os.getpid()}"
-    env = {"GIT_INDEX_FILE": str(index.resolve())}
+    durable = configured(DURABLE)
+    env = {"GIT_INDEX_FILE": str(index.resolve())} | durable
     try:
         git("read-tree", base, env=env)
-        tracked = set(git("ls-files", "--", *paths).splitlines())
+        tracked = names("ls-files", "--", *paths, env=env)
         there = [
             path
             for path in paths
@@ -115,13 +175,22 @@ def commit(paths: Sequence[str], message: str, *, branch: str = "") -> str:
         tree = git("write-tree", env=env)
     finally:
         index.unlink(missing_ok=True)
-    if tree == git("rev-parse", f"{base}^{{tree}}"):
+    if tree == git("rev-parse", f"{tip or base}^{{tree}}"):
         return ""
-    made = git("commit-tree", tree, "-p", base, "-m", message, env=identity())
+    parents = [
+        parent
+        for parent, other in ((base, tip), (tip, base))
+        if parent and not (other and parent != other and contains(other, parent))
+    ]
+    made = git(
+        "commit-tree", tree, *(word for parent in dict.fromkeys(parents) for word in ("-p", parent)),
+        "-m", message, env=identity() | durable,
+    )  # fmt: skip
     if branch:
-        git("update-ref", "-m", message, f"refs/heads/{branch}", made)
+        before = git("rev-parse", "-q", "--verify", f"refs/heads/{branch}", check=False)
+        git("update-ref", "-m", message, f"refs/heads/{branch}", made, before or "0" * len(made), env=durable)
     else:
-        git("update-ref", "-m", message, "HEAD", made, base)
+        git("update-ref", "-m", message, "HEAD", made, base, env=durable)
         fresh_index(paths)
     return made
 

@@ -48,9 +48,12 @@ class Rule(Section):
 
 class HoldOut(Section):
     """The temperature loop's hold-out: which contestant runs on the machine, on how many plants, from which
-    starts to which references, with a seed that no stage uses; recordings of `recordings` make the plants."""
+    starts to which references, with a seed that no stage uses; recordings of `recordings` make the plants.
+    `page`: the contestant that the page names."""
 
-    controller: Literal["printer_pid", "pi_simc", "pi", "subspace_lqg", "varx_riccati", "learned_kernel"]
+    controller: Literal[
+        "page", "printer_pid", "pi_simc", "pi", "subspace_lqg", "varx_riccati", "learned_kernel"
+    ]
     recordings: Path
     starts_degC: list[Annotated[float, Field(ge=-273.15, le=1000)]] = Field(min_length=1, max_length=20)
     reference_offsets_degC: list[Annotated[float, Field(ge=-500, le=500)]] = Field(
@@ -63,13 +66,18 @@ class HoldOut(Section):
 
 
 class Drift(Section):
-    """Alarm where a figure leaves its band by `alarm_sigmas` at once, or by `watch_sigmas` two nights
-    running; and never for less than what matters."""
+    """What matters of each figure, and how sure the night must be. A change of the machine is an alarm where
+    its estimate, pooled over nights, is past its limit by `limit_sigmas`; a picture or the closed loop where
+    it leaves its band by `alarm_sigmas` at once, or by `watch_sigmas` two nights running."""
 
+    limit_sigmas: float = Field(ge=0, le=100)
     alarm_sigmas: float = Field(gt=1, le=100)
     watch_sigmas: float = Field(gt=1, le=100)
     parameter_percent: float = Field(gt=0, le=1000)
+    time_constant_percent: float = Field(gt=0, le=1000)
+    delay_s: float = Field(gt=0, le=10000)
     offset_degC: float = Field(gt=0, le=1000)
+    ambient_degC: float = Field(gt=0, le=1000)
     noise_percent: float = Field(gt=0, le=1000)
     effort_percent: float = Field(gt=0, le=100)
     at_limits_points: float = Field(gt=0, le=100)
@@ -89,6 +97,8 @@ class Nightly(Section):
     watch_h: float = Field(gt=0, le=10000)
     alarm: str = Field(max_length=1000)
     webhook: str = Field(max_length=1000)
+    heartbeat: str = Field(max_length=1000)
+    keep_gb: float = Field(ge=0, le=1e6)
     loops: dict[Annotated[str, Field(min_length=1, max_length=40)], Loop]
     rule: Rule
     holdout: HoldOut

@@ -1,31 +1,79 @@
-"""Who is woken, and when nobody ran: the alarm's JSON file, its
-command and webhook, and the age of the last success."""
+"""Who is woken, and when nobody ran: the alarm's JSON file, its command and webhook, the heartbeat, and the
+age of the last success."""
 
+import contextlib
 import datetime
 import json
 import os
 import shlex
+import signal
 import subprocess
+import tempfile
+import threading
+import time
 import urllib.error
+import urllib.parse
 import urllib.request
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
-from pipeline.nightly import remembered
 from pipeline.nightly.processes import STATE
+from pipeline.nightly.settings import Nightly
 from pipeline.store import artifacts
 
 ALARM = STATE / "alarm.json"
+# a try at a server, the pause before the second, and the alarm's command: all that waking may take is bounded
+ASKED_S, PAUSE_S, COMMAND_S = 20.0, 2.0, 60.0
+
+
+class Routes(NamedTuple):
+    """How somebody is told: the alarm's command and webhook, and the heartbeat of nights that went well."""
+
+    alarm: str = ""
+    webhook: str = ""
+    heartbeat: str = ""
+
+
+def routes(known: Nightly | None) -> Routes:
+    """Those of the environment, so that no secret stands in a file; otherwise those of the parameters, where
+    these can be read."""
+    written = Routes(known.alarm, known.webhook, known.heartbeat) if known else Routes()
+    return Routes(
+        *(os.environ.get(f"BEADLINE_{key.upper()}") or getattr(written, key) for key in Routes._fields)
+    )
+
+
+def shown(settings: Nightly) -> Nightly:
+    """The settings as a page may show them: of a URL the server, of a command its first word."""
+    told = routes(settings)
+    public = {
+        "webhook": _server(told.webhook),
+        "heartbeat": _server(told.heartbeat),
+        "alarm": _word(told.alarm),
+    }
+    return settings.model_copy(update=public)
+
+
+def _server(url: str) -> str:
+    """Of a URL what is no secret; empty where there is none."""
+    try:
+        parts = urllib.parse.urlsplit(url)
+        return f"{parts.scheme}://{parts.hostname}" if parts.hostname else "a URL" if url else ""
+    except ValueError:
+        return "a URL"
+
+
+def _word(command: str) -> str:
+    return command.split()[0] if command.split() else ""
 
 
 def stamp(now: datetime.datetime) -> str:
     return now.astimezone(datetime.UTC).isoformat(timespec="seconds")
 
 
-def overdue(now: datetime.datetime, watch_h: float) -> str:
+def overdue(now: datetime.datetime, success: str | None, watch_h: float) -> str:
     """Why somebody should look: the last success is older than `watch_h` hours,
     or lies in the future; empty where all is well."""
-    success = remembered.last().success
     if success is None:
         return "no night has ever succeeded; run ./run beadline nightly, and look at its schedule"
     age_h = (now - datetime.datetime.fromisoformat(success)).total_seconds() / 3600
@@ -42,41 +90,94 @@ def overdue(now: datetime.datetime, watch_h: float) -> str:
     return ""
 
 
-def wake(
-    kind: str, reasons: list[str], details: Mapping[str, Any], *, command: str, webhook: str
-) -> list[str]:
-    """Writes the alarm, runs `command FILE`, posts the file to `webhook`; what went wrong on the way, as
-    sentences, for an alarm that fails must not hide the night."""
-    alarm = {"schema": "alarm", "version": 1, "kind": kind, "reasons": reasons, **details}
-    troubles = []
+# ---- waking
+
+
+def wake(kind: str, reasons: Sequence[str], details: Mapping[str, Any], told: Routes) -> list[str]:
+    """Writes the alarm, runs the command with its path, posts it to the webhook; what went wrong on the way,
+    as sentences, for an alarm that fails must not hide the night."""
+    said = f"beadline: {details.get('night', 'nightly')}: {kind}: {'; '.join(reasons)}"
+    alarm = {"schema": "alarm", "version": 1, "kind": kind, "text": said, "reasons": list(reasons), **details}
     text = json.dumps(alarm, indent=2, ensure_ascii=False, default=str)
+    troubles = []
     try:
         artifacts.write_text(ALARM, text + "\n")
     except OSError as error:
         troubles.append(f"the alarm could not be written: {error}")
-    if command:
-        try:
-            ended = subprocess.run(
-                [*shlex.split(command), str(ALARM)],
-                check=False,
-                input=text,
-                text=True,
-                capture_output=True,
-                timeout=60,
-                env={**os.environ, "BEADLINE_ALARM": kind},
-            )
-            if ended.returncode:
-                troubles.append(
-                    f"nightly.alarm: {command} ended with status {ended.returncode}: "
-                    f"{ended.stderr.strip()[-200:]}"
-                )
-        except (OSError, ValueError, subprocess.TimeoutExpired) as error:
-            troubles.append(f"nightly.alarm: {error}")
-    if webhook:
-        try:
-            request = urllib.request.Request(webhook, text.encode(), {"Content-Type": "application/json"})
-            with urllib.request.urlopen(request, timeout=20):
-                pass
-        except (OSError, ValueError, urllib.error.URLError) as error:
-            troubles.append(f"nightly.webhook: {webhook}: {error}")
+    if told.alarm and (trouble := _commanded(told.alarm, kind)):
+        troubles.append(f"nightly.alarm: {_word(told.alarm)} {trouble}")
+    if told.webhook and (trouble := _asked(told.webhook, text.encode("utf-8", "replace"))):
+        troubles.append(f"nightly.webhook: {_server(told.webhook)}: {trouble}")
     return troubles
+
+
+def beat(told: Routes) -> list[str]:
+    """Tells the heartbeat's URL that a night went well; what went wrong, as sentences."""
+    trouble = _asked(told.heartbeat) if told.heartbeat else ""
+    return [f"nightly.heartbeat: {_server(told.heartbeat)}: {trouble}"] if trouble else []
+
+
+def _commanded(command: str, kind: str) -> str:
+    """Why the command did not do its work, empty where it did. It reads the alarm from its input too."""
+    with tempfile.TemporaryFile() as said:
+        try:
+            alarm = ALARM.open("rb") if ALARM.exists() else None
+            with alarm or contextlib.nullcontext():
+                child = subprocess.Popen(
+                    [*shlex.split(command), str(ALARM)],
+                    stdin=alarm or subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    stderr=said,
+                    start_new_session=True,
+                    env={**os.environ, "BEADLINE_ALARM_KIND": kind},
+                )
+        except (OSError, ValueError) as error:
+            return f"could not be started: {getattr(error, 'strerror', None) or error}"
+        try:
+            status = child.wait(COMMAND_S)
+        except subprocess.TimeoutExpired:
+            os.killpg(child.pid, signal.SIGKILL)
+            child.wait()
+            return f"was ended after {COMMAND_S:g} s"
+        said.seek(0)
+        words = " ".join(said.read().decode(errors="replace").split())[-200:]
+    return f"ended with status {status}: {words}" if status else ""
+
+
+def _asked(url: str, body: bytes | None = None) -> str:
+    """Asks a server, once more after a pause where it fails; why it failed, empty where it did not."""
+    if not (trouble := _tried(url, body)):
+        return ""
+    time.sleep(PAUSE_S)
+    return _tried(url, body) and f"{trouble} (tried twice)"
+
+
+def _tried(url: str, body: bytes | None) -> str:
+    """One try, within ASKED_S: in a thread, for a server's name or its headers byte by byte
+    take as long as they like."""
+    troubles = [f"no answer within {ASKED_S:g} s"]
+
+    def ask() -> None:
+        try:
+            headers = {"Content-Type": "application/json"} if body else {}
+            request = urllib.request.Request(url, body, {"User-Agent": "beadline", **headers})
+            with urllib.request.urlopen(request, timeout=ASKED_S):
+                troubles.clear()
+        except Exception as error:  # whatever it is, it must not hide the night, nor tell the URL
+            troubles[:] = [_refusal(error)]
+
+    thread = threading.Thread(target=ask, daemon=True)
+    thread.start()
+    thread.join(ASKED_S)
+    return troubles[0] if troubles else ""
+
+
+def _refusal(error: Exception) -> str:
+    """Why a server could not be asked, without its URL, which may hold a secret."""
+    if isinstance(error, urllib.error.HTTPError):
+        return f"it answered with status {error.code}"
+    if isinstance(error, urllib.error.URLError) and isinstance(error.reason, OSError):
+        return error.reason.strerror or type(error.reason).__name__
+    if isinstance(error, OSError):
+        return error.strerror or type(error).__name__
+    return "this is no URL of the form https://server/path"

@@ -54,13 +54,6 @@ class WholeTable(NamedTuple):
         ]
 
 
-def plain_table(
-    values: dict[str, np.ndarray], place: Callable[[int], str], notes: Sequence[Note] = ()
-) -> WholeTable:
-    """A table of numbers alone, whose time is one of its columns."""
-    return WholeTable(values, {}, None, "", place, list(notes), {}, {}, {})
-
-
 def select(path: Path, table: WholeTable, wanted: Sequence[str], time: str) -> tuple[Columns, list[Note]]:
     """The wanted columns on the clock that `time` names: "" for the table's own, a column, or "every 1 s".
 

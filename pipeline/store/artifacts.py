@@ -444,7 +444,9 @@ def beside(path: str | Path) -> Iterator[Path]:
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
+        _on_disk(temporary)
         temporary.replace(place)
+        _on_disk(place.parent)
     except OSError as error:
         raise OSError(
             f"{target} cannot be written ({os.strerror(error.errno or 0)}); {_mend(error, target.parent)}"
@@ -452,6 +454,17 @@ def beside(path: str | Path) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def _on_disk(path: Path) -> None:
+    """Waits until a file, or the names in a folder, would outlast a power cut; some 5 ms each."""
+    if path.is_dir() and os.name == "nt":
+        return  # Windows opens no folder
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def _mend(error: OSError, folder: Path) -> str:

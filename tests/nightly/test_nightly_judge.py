@@ -1,7 +1,6 @@
 """The judge: the same cases for both, seeds of its own, and figures that a worse controller cannot hide."""
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,10 +8,12 @@ import yaml
 
 from benchmarks import nights
 from pipeline.deposition.workflow.tables import SCORES
-from pipeline.nightly import judge, night
+from pipeline.nightly import judge, promoting
 from pipeline.nightly.decision import KEPT, PROMOTED, Evidence, decide
 from pipeline.nightly.settings import HoldOut, Loop, Nightly
+from pipeline.report.nightly import page as nightly_page
 from pipeline.report.nightly.production import Champion, ChampionState, Installed
+from pipeline.report.nightly.record import Night
 from pipeline.setpoint.workflow import tables
 from pipeline.store import artifacts, params
 from pipeline.temperature import plant, window
@@ -108,7 +109,7 @@ SUBSPACE = {"contestants": {"subspace_lqg": {"effort_weight": 1.0, "observer_tau
 @pytest.mark.parametrize(
     ("name", "weights", "sentence"),
     [
-        ("pi", V01, "of pi, which nightly.holdout.controller names, found those of an earlier version"),
+        ("pi", V01, "of pi, found those of an earlier version"),
         ("varx_riccati", SUBSPACE, "expected effort_weight, integral of varx_riccati.*one of subspace_lqg"),
         ("learned_kernel", V01, "kernel.parquet.*add datasets/learn_kernel/kernel.parquet to nightly.loops"),
         ("subspace_lqg", {"practical": {"q": [1.0], "r": [1.0] * 7}}, r"practical.q with 5 weights.*\[1.0\]"),
@@ -117,6 +118,7 @@ SUBSPACE = {"contestants": {"subspace_lqg": {"effort_weight": 1.0, "observer_tau
 )
 def test_a_champion_that_cannot_be_designed_is_named_and_stays(project, name, weights, sentence):
     settings = project.model_copy(update={"holdout": project.holdout.model_copy(update={"controller": name})})
+    settings.loops["temperature"].artifacts.extend(promoting.OPTIONAL)
     for folder in ("datasets", "champion/temperature"):
         artifacts.write_arrays(f"{folder}/identify_plant/spread.parquet", "spread", 1, plant.stored([baam()]))
         artifacts.write_json(f"{folder}/tune_weights/weights.json", weights)
@@ -124,14 +126,15 @@ def test_a_champion_that_cannot_be_designed_is_named_and_stays(project, name, we
         judge.judge(settings.loops["temperature"], settings).measure(Path("champion/temperature"))
     assert "\n" not in str(refused.value)
     present = Champion("night-0001", "", "", Installed({"md5": "0"}))
-    work = SimpleNamespace(state=ChampionState())
-    decided = night._decide(settings, "temperature", present, work).decision
+    state = ChampionState({"temperature": present})
+    quiet = Night(2, "night-0002", "2030-01-01T02:00:00+00:00")
+    decided = promoting.decided(settings, "temperature", quiet, state, None).decision
     assert decided.decision == KEPT and "cannot be compared: " in decided.reasons[0]
 
 
 def test_the_contestants_that_the_night_may_judge_are_all_but_doing_nothing_and_the_yardstick():
     names = HoldOut.model_fields["controller"].annotation.__args__
-    assert set(names) == {one.name for one in CONTESTANTS} - {"hold", "exact_model"}
+    assert set(names) == {one.name for one in CONTESTANTS} - {"hold", "exact_model"} | {judge.PAGE}
 
 
 def test_a_recorded_machines_panel_is_drawn_around_its_hold_out_recordings_once_and_for_all(
@@ -289,3 +292,20 @@ def test_a_controller_is_designed_for_what_it_was_tuned_for_not_for_the_nights_c
     judge.judged(frozen, Path("datasets"), "pi_simc")
     assert designed_for[0] == (450, [0.3] * 5)
     assert designed_for[1][0] == frozen.settings.steps != frozen.rehearsal.judging.steps
+
+
+def test_figures_beyond_meaning_are_words_in_the_night_s_sentences(project):
+    champion, useless = (
+        Evidence("a", {f"case {k}": (f"plant {k}", cost) for k in range(8)}, {"worst_case": cost})
+        for cost in (1.0, np.inf)
+    )
+    decided = decide(champion, useless, project.rule, allowed={}, alarms=[], seed=1)
+    assert decided.reasons[0] == (
+        "the challenger is no better: its cases cost beyond 1,000 % more (beyond 1,000 % to beyond 1,000 %)"
+    )
+    page = nightly_page.render(
+        [Night(1, "night-0001", "2030-01-01T02:00:00+00:00", decisions={"temperature": decided})],
+        ChampionState(),
+        project,
+    )
+    assert "cases cost beyond 1,000\u202f% more" in page and "99,900" not in page and "99900" not in page

@@ -7,11 +7,22 @@ import numpy as np
 import pytest
 
 from pipeline.deposition.workflow.tables import SCORES
-from pipeline.nightly import accepting, champion, inputs, night, remembered, screening, watch
+from pipeline.nightly import (
+    accepting,
+    champion,
+    inputs,
+    night,
+    promoting,
+    remembered,
+    reporting,
+    screening,
+    watch,
+)
 from pipeline.nightly.remembered import DriftMemory
 from pipeline.nightly.settings import Nightly
 from pipeline.report.nightly.record import Night
 from pipeline.report.shared.night import Alarm, LoopDrift, NightDrift
+from pipeline.report.shared.verdict import PASSED, Verdict
 from pipeline.setpoint.workflow import tables
 from pipeline.store import artifacts, params
 from tests.nightly.toy_nights import Project, entered
@@ -29,10 +40,19 @@ def empty(tmp_path_factory):
 
 @pytest.fixture
 def project(empty, tmp_path, monkeypatch):
-    """A project with one loop, whose stages score what the test says in place of `dvc repro`."""
+    """A project with one loop, whose stages score what the test says in place of `dvc repro`, and whose pages
+    pass."""
     copy = entered(empty, tmp_path / "toy", monkeypatch)
+    monkeypatch.setattr(
+        promoting, "verdicts_of", lambda settings, night: (dict(map(passing, settings.loops)), night)
+    )
     Path("dvc.lock").write_text("schema: '2.0'\nstages: {}\n")
     return copy
+
+
+def passing(loop: str) -> tuple[str, Verdict]:
+    said = "Rehearsal passed: ours.", "All six rules passed.", "", "", ""
+    return loop, Verdict(loop, PASSED, *said, winner="ours", subject="ours", rehearsal=True)
 
 
 def deposition(cost: float, guard: float) -> None:
@@ -99,8 +119,10 @@ def test_a_better_challenger_is_promoted_and_a_worse_one_or_one_with_a_worse_gua
             decided,
         )
         assert champion.read().champions[loop].run == ("night-0005" if k >= 4 else "night-0001")
-    # production holds what was promoted, not what was scored last
-    metrics = champion.read().champions[loop].metrics
+    # production holds what was promoted, not what was scored last, and says on what it was judged
+    present = champion.read().champions[loop]
+    assert present.rehearsal and present.contestant == "ours"
+    metrics = present.metrics
     assert metrics and metrics.mean_cost == pytest.approx(8.0 + 0.35 + (1.0 if loop == "setpoint" else 0.0))
 
 
@@ -138,7 +160,7 @@ def test_the_gravest_of_a_night_is_its_exit_status():
     set_aside = quiet._replace(quarantined={"a.csv": "reason"})
     drifted = set_aside._replace(drift=NightDrift({"toy": LoopDrift.none("toy")._replace(alarms=[alarm])}))
     gravest = (quiet, set_aside, drifted, drifted.ended("failed"), quiet._replace(unpushed=True))
-    assert [night._status(record) for record in gravest] == [0, 4, 3, 1, 1]
+    assert [reporting.exit_status(record) for record in gravest] == [0, 4, 3, 1, 1]
 
 
 def test_drift_that_is_meant_is_accepted_by_hand_and_the_champion_stays(project, monkeypatch):
@@ -189,14 +211,14 @@ def test_an_alarm_of_the_setpoint_camera_changes_nothing_for_another_loop(projec
         for loop in ("deposition", "setpoint")
     }
     project.set(loops=both)
-    monkeypatch.setattr(night, "_reproduce", lambda *_: (deposition(10.0, 2.0), setpoint(10.0, 2.0)))
+    monkeypatch.setattr(night, "_reproduce", lambda *_: (deposition(10.0, 2.0), setpoint(10.0, 2.0)) and None)
     assert night.nightly()[0] == night.OK
     raised = Alarm(
         "setpoint", "setpoint: contrast", "print_8.csv", "the line stands out by 25 gray levels", 9.0
     )
     memory = DriftMemory((), (raised,), {"setpoint": ["print_8.csv"]}, night=1)
     remembered.remember(remembered.last()._replace(drift=memory))
-    monkeypatch.setattr(night, "_reproduce", lambda *_: (deposition(5.0, 2.0), setpoint(5.0, 2.0)))
+    monkeypatch.setattr(night, "_reproduce", lambda *_: (deposition(5.0, 2.0), setpoint(5.0, 2.0)) and None)
     Path("learn.py").write_text("# something is new\n")
     status, summary = night.nightly()
     tonight = night.nights()[-1]

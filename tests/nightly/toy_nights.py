@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from pipeline.store import params
+
 ROOT = Path(__file__).resolve().parents[2]
 
 LEARN = """
@@ -54,9 +56,10 @@ stages:
     outs: [datasets/evaluate: {persist: true}]
 """
 
-SETTINGS = {
+# the project's own keys, so that a new one is here at once; what a toy needs otherwise stands below
+SETTINGS = params.read(ROOT / "params.yaml")["nightly"] | {
     "promotion": "at_once", "branch": "nightly", "remote": "", "longest_h": 0.1, "least_free_mb": 1,
-    "watch_h": 36, "alarm": "", "webhook": "",
+    "watch_h": 36, "alarm": "", "webhook": "", "heartbeat": "", "keep_gb": 0,
     "loops": {
         "toy": {
             "artifacts": ["datasets/learn/model.json", "datasets/learn/weights.bin",
@@ -64,21 +67,10 @@ SETTINGS = {
             "cases": "datasets/evaluate/cases.json", "recordings": "datasets/raw/toy",
         }
     },
-    "rule": {
-        "level": 0.01, "least_improvement_percent": 5, "worst_case_percent": 5, "settled_error_degC": 0.05,
-        "least_disk_margin": 0.5,
-        "holdout_error_percent": 5,
-    },
-    "holdout": {
-        "controller": "varx_riccati", "recordings": "datasets/holdout/temperature", "starts_degC": [20],
-        "reference_offsets_degC": [0], "noise_degC": 0.1, "seed": 901, "plants": 8,
-        "steps": 300,
-    },
-    "drift": {
-        "alarm_sigmas": 5, "watch_sigmas": 3, "parameter_percent": 4, "offset_degC": 0.5, "noise_percent": 50,
-        "effort_percent": 5, "at_limits_points": 10,
-        "camera_px": 2, "contrast_percent": 15, "balance_points": 20,
-    },
+}  # fmt: skip
+SETTINGS["rule"] |= {"least_disk_margin": 0.5}
+SETTINGS["holdout"] |= {
+    "starts_degC": [20], "reference_offsets_degC": [0], "plants": 8, "steps": 300
 }  # fmt: skip
 
 
@@ -134,7 +126,8 @@ class Project:
     def beadline(self, *arguments: str) -> subprocess.CompletedProcess:
         return self.run(sys.executable, "-m", "pipeline.cli", *arguments, check=False)
 
-    def start(self) -> subprocess.Popen:
+    def start(self, **how) -> subprocess.Popen:
+        """A night under way; `how` is handed to Popen."""
         return subprocess.Popen(
             [sys.executable, "-m", "pipeline.cli", "nightly"],
             cwd=self.folder,
@@ -142,6 +135,7 @@ class Project:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
+            **how,
         )
 
     def night(self) -> subprocess.CompletedProcess:
@@ -152,8 +146,11 @@ class Project:
 
     def champion(self) -> dict:
         """As the last commit has it."""
+        return self.champion_of("toy")
+
+    def champion_of(self, loop: str) -> dict:
         shown = self.run("git", "show", "HEAD:champion.json", check=False)
-        return json.loads(shown.stdout)["champions"]["toy"] if shown.returncode == 0 else {}
+        return json.loads(shown.stdout)["champions"].get(loop, {}) if shown.returncode == 0 else {}
 
     def production(self) -> dict[str, bytes]:
         return self.production_of("toy")

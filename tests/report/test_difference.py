@@ -55,13 +55,13 @@ def test_two_equal_runs_give_an_empty_difference(accepted):
 def test_who_was_chosen_is_accepted_and_stays_where_nobody_is_better_beyond_the_bands(accepted):
     run = artifacts.read_json("reports/accepted.json")
     assert run["winner"] == "subspace_lqg"
-    assert "The accepted run named it" not in Page(INDEX).text
+    assert "It was named before" not in Page(INDEX).text
     # VARX + Riccati costs 2.1 (1.89 to 2.31), the best 2.0 (1.8 to 2.2)
     artifacts.write_json("reports/accepted.json", run | {"winner": "varx_riccati"})
     main()
     text = Page(TEMPERATURE).text
     assert "Rehearsal passed: VARX + Riccati." in text
-    assert "The accepted run named it, and subspace + LQG is not better beyond the bands." in text
+    assert "It was named before, and subspace + LQG is not better beyond the bands." in text
 
 
 def test_a_parameter_that_was_renamed_since_the_accepted_run_has_not_changed(accepted, monkeypatch):

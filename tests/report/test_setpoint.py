@@ -44,12 +44,12 @@ def lost(**percent):
 def test_the_default_is_named_with_its_worst_case_and_its_lead_over_the_next(project):
     text = page()
     # by hand: 100 - 1.5 (0.2 + 5 x 0.1) = 98.95, and 97.6 for the next
-    assert "Run the agent by default. All six rules passed." in text
+    assert "Rehearsal passed: the agent. All six rules passed." in text
     assert (
         "In its worst case (the paper’s simulator, accuracy 70 %, clog) 99.0 % of 2,100 runs settle "
         "and stay, 1.1 points more than of the next, the baseline “Bayes, robust”" in text
     )
-    assert re.search(r"<title>(.*?) ·", PAGE.read_text())[1] == "Setpoint: Run the agent by default"
+    assert re.search(r"<title>(.*?) ·", PAGE.read_text())[1] == "Setpoint: Rehearsal passed: the agent"
 
 
 def test_what_may_be_claimed_stands_in_the_verdict_and_on_page_one(project):
@@ -68,7 +68,7 @@ def test_a_baseline_may_win_and_then_the_page_says_how_far_the_agent_came(projec
     made_setpoint.scoreboard(lost(our_agent=(1.0, 2.0)))
     made_setpoint.choice("Bayes, robust", margin=9.0)
     text = page()
-    assert "Run the baseline “Bayes, robust” by default. All six rules passed." in text
+    assert "Rehearsal passed: the baseline “Bayes, robust”. All six rules passed." in text
     # 100 - 1.5 (1 + 10) = 83.5, behind the sequential test's 88.6
     assert "9.0 points more than of the next, the baseline “sequential test”" in text
     assert "The agent did not earn it: 83.5 % (the paper’s simulator, accuracy 70 %, clog)." in text
@@ -88,7 +88,7 @@ def test_the_first_failed_rule_is_said_in_words(project, metric, value, rule, se
     change("train_classifier", **{metric: value})
     text = page()
     assert (
-        f"Do not let the camera steer a printer yet. First failed rule: {rule}. "
+        f"Rehearsal failed. First failed rule: {rule}. "
         f"{sentence} By runs that settle and stay the agent comes closest." in text
     )
     assert PAGE.read_text().count('<tr class="fail"><th scope="row"><a') == 1
@@ -105,7 +105,7 @@ def test_a_share_that_straddles_its_limit_is_undecided_and_says_how_many_runs_wo
     text = page()
     # 98.0 % of 210 runs: 95.1 to 99.2; 1.96^2 x 0.98 x 0.02 / 0.01^2 = 753, rounded up to two digits
     assert (
-        "Do not decide yet. First open rule: settles, worst case. Best, by runs that settle and stay, "
+        "Rehearsal open. First open rule: settles, worst case. Best, by runs that settle and stay, "
         "is the agent: in its worst case" in text
     )
     assert (
@@ -143,8 +143,11 @@ def test_before_the_stages_ran_the_page_and_the_card_say_so(project):
     for path in [*ARTIFACTS, *(f"reports/metrics/{stage}.json" for stage in made_setpoint.metrics())]:
         Path(path).unlink()
     text = page()
-    assert "Let nobody set flow and temperature by this loop yet. No controller was chosen." in text
-    assert "Run ./run dvc repro evaluate_setpoint." in text and "Run the agent" not in Page(INDEX).text
+    assert "Rehearsal open. No controller was chosen." in text
+    assert (
+        "Run ./run dvc repro evaluate_setpoint." in text
+        and "Rehearsal passed: the agent" not in Page(INDEX).text
+    )
     # what was not measured takes no headline from a loop that was
     assert (
         "Rehearsal passed: temperature and deposition; not measured: setpoint."

@@ -251,9 +251,43 @@ def test_who_runs_today_stays_where_nobody_is_better_beyond_the_bands():
     # varx_riccati costs 2.1 (1.89 to 2.31), the best 2.0 (1.8 to 2.2); pi costs 4.0 (3.6 to 4.4)
     verdict = judge(stages, incumbent="varx_riccati")
     assert verdict.winner == "varx_riccati"
-    assert "The accepted run named it, and subspace + LQG is not better beyond the bands." in verdict.reason
+    assert "It was named before, and subspace + LQG is not better beyond the bands." in verdict.reason
     assert judge(stages, incumbent="pi").winner == "subspace_lqg"
     assert judge(stages, incumbent="window").winner == "subspace_lqg"
+
+
+@pytest.mark.parametrize(
+    ("counts", "named", "said"),
+    [
+        ({"subspace_lqg": 9, "pi": 1}, "subspace_lqg", ""),
+        (
+            {"pi": 9, "subspace_lqg": 1},
+            "pi",
+            "Of 10 relearnings from fresh records PI, tuned was the best in 9; of this one subspace + LQG "
+            "is.",
+        ),
+        (
+            {"subspace_lqg": 6, "pi": 4},
+            "pi",
+            "Which is best turns with the record: of 10 relearnings from fresh records subspace + LQG in 6 "
+            "and PI, tuned in 4, so that the simplest of them is named.",
+        ),
+    ],
+)
+def test_of_relearnings_the_one_that_is_best_in_most_is_named_else_the_simplest(counts, named, said):
+    stages = metrics()
+    stages["evaluate_temperature"]["best"] = "subspace_lqg"
+    relearned = {"answers": {"best": counts}}
+    verdict = judge(stages, relearned=relearned, incumbent="hold")
+    assert verdict.winner == named
+    assert said in verdict.reason
+    assert ("relearnings" in verdict.reason) == bool(said)
+    # whose cost lies within the bands of the one that would be named, and was named before, stays
+    if named == "subspace_lqg":
+        return
+    stayed = judge(stages, relearned=relearned, incumbent="subspace_lqg")
+    assert stayed.winner == "subspace_lqg"
+    assert "the one that was named before stays" in stayed.reason and "the simplest" not in stayed.reason
 
 
 def test_limits_are_those_that_the_comparison_resolved_for_the_machine():

@@ -475,6 +475,20 @@ def test_a_bug_and_an_interrupt_are_passed_on_and_nothing_is_touched(project, la
     assert sorted(path.name for path in project.rglob(".*")) == []
 
 
+def test_a_file_is_on_the_disk_before_it_takes_its_name_and_the_name_after(project, monkeypatch):
+    Path("a.json").write_text("1")
+    synced, sync = [], os.fsync
+
+    def watched(descriptor):
+        folder = Path(os.readlink(f"/proc/self/fd/{descriptor}")).is_dir()
+        synced.append(("folder" if folder else "file", Path("a.json").read_text()))
+        sync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", watched)
+    artifacts.write_json("a.json", 2)
+    assert synced == [("file", "1"), ("folder", "2\n")]
+
+
 @pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space"), KeyboardInterrupt()])
 def test_a_writer_that_fails_half_way_leaves_the_last_good_file_alone(project, monkeypatch, error):
     artifacts.write_table("scores.parquet", SCORES, scores())

@@ -16,6 +16,7 @@ from pipeline.deposition.training import LawSettings, Noise, TrainingCase, Trial
 from pipeline.deposition.workflow import laws, trial_files, trial_video
 from pipeline.deposition.workflow.settings import Camera, Material, Printer, TrainIlc
 from pipeline.deposition.workflow.trial_video import MeasuredTrial, SimulatedMachine
+from pipeline.reading.excluded import readable
 from pipeline.reading.plain_files import check_plain_files
 from pipeline.store.artifacts import about
 from pipeline.store.execution import run_all
@@ -73,7 +74,7 @@ def shown(
     """A few frames of the first and the last trial of each material in out/frames, and a row for each."""
     paths = sorted((out / "recordings").glob("*.mcap"))
     if settings.source == "recordings":
-        paths = trial_video.first_and_last(sorted(Path(recorded).rglob("[!.]*.mcap")), camera)
+        paths = trial_video.first_and_last(_trials(Path(recorded)), camera)
     frames = run_all([delayed(trial_video.shown)(path, out / "frames", camera) for path in paths], execution)
     return [row for rows in frames for row in rows]
 
@@ -287,7 +288,7 @@ def _recorded(
     """
     check_plain_files(folder)
     by_routine: dict[tuple[str, int], dict[int, tuple[Path, MeasuredTrial]]] = {}
-    for path in sorted(file for file in folder.rglob("*.mcap") if not file.name.startswith(".")):
+    for path in _trials(folder):
         conditions = trial_files.read_trial(path, unreadable_share=camera.unreadable_share).conditions
         if conditions is None:
             raise ValueError(
@@ -314,6 +315,10 @@ def _recorded(
                 "or renumber the others"
             )
     return {key: [trials[j][1] for j in sorted(trials)] for key, trials in sorted(by_routine.items())}
+
+
+def _trials(folder: Path) -> list[Path]:
+    return readable(sorted(folder.rglob("[!.]*.mcap")), folder)
 
 
 def _routine(

@@ -23,6 +23,8 @@ from pipeline.report.shared.verdict import (
     FAILED,
     OPEN,
     PASSED,
+    REHEARSAL,
+    TRIAL,
     UNJUDGED,
     Missing,
     Rule,
@@ -43,7 +45,7 @@ def verdict(sources: Sources) -> Verdict:
         return Verdict(
             loop="deposition",
             state=OPEN,
-            decision="Do not print by this loop yet.",
+            decision=(TRIAL if real(sources) else REHEARSAL).open,
             lead="Nothing was composed.",
             reason=parts.sentence(),
             remedy="",
@@ -79,10 +81,10 @@ def verdict(sources: Sources) -> Verdict:
 
 
 def _decision(state: str, use: str, machine: bool) -> str:
+    words = TRIAL if machine else REHEARSAL
     if state == PASSED:
-        return f"{'By forecast, t' if machine else 'T'}his machine prints these parts: use {USE[use]}."
-    start = "Do not print these parts yet" if state == FAILED else "Do not decide yet"
-    return f"{start}: {USE[use]} {'come' if use == OURS else 'comes'} closest."
+        return words.passed.format(USE[use])
+    return f"{words.of(state).rstrip('.')}: {USE[use]} {'come' if use == OURS else 'comes'} closest."
 
 
 def _lead(sources: Sources, state: str, first: Rule | None, judged: int, *, condition: bool, use: str) -> str:

@@ -19,7 +19,6 @@ from pipeline.report.shared.verdict import (
     FAILED,
     OPEN,
     PASSED,
-    ROLES,
     Figure,
     Missing,
     Question,
@@ -209,7 +208,7 @@ def deposition(sources: Sources) -> Card:
         name="Deposition",
         link="deposition.html",
         moves="Plunger command to flow at the nozzle",
-        state=f"Run {ROLES[role]}" if judged.state == PASSED else "Do not print yet",
+        state=judged.decision.split(":")[0].rstrip("."),
         mark=role if judged.state == PASSED else None,
         win=_deposition_win(structures, judged, role),
         caption=(

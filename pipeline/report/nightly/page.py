@@ -2,19 +2,20 @@
 production when, and whether anybody is watching."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from markupsafe import Markup
 
 from pipeline.nightly.settings import Nightly
 from pipeline.report.nightly import record
-from pipeline.report.nightly.production import ChampionState, HistoryLine
+from pipeline.report.nightly.production import Champion, ChampionState, HistoryLine
 from pipeline.report.nightly.record import Guard, LoopDecision, Night
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import count, number, short
+from pipeline.report.shared.digits import beyond_meaning, count, number, quantity, short
 from pipeline.report.shared.night import PLANT
 from pipeline.report.shared.verdict import FAILED, OPEN, PASSED
+from pipeline.report.temperature.contestants import heading
 from pipeline.statistics import Paired
 
 SHOWN = 40  # nights in the table, the newest first
@@ -46,7 +47,8 @@ def render(nights: Sequence[Night], state: ChampionState, settings: Nightly) -> 
         here="nightly",
         title=_head(tonight)[0],
         verdict=_verdict(tonight),
-        champions=_champions(state),
+        champions=_champions(state.champions),
+        candidates=_champions(state.candidates),
         decisions=[_decision(name, decision) for name, decision in tonight.decisions.items()],
         drift=_drift(measured, settings) if measured else None,
         alarms=tonight.drift.alarms,
@@ -81,15 +83,26 @@ def _watch(nights: Sequence[Night], settings: Nightly) -> dict[str, str]:
 def _head(night: Night) -> tuple[str, str]:
     """The decision in a sentence, and whether it is as it should be."""
     drifted, promoted = _drifted(night), ", ".join(night.promoted)
+    where = f" on branch {night.branch}, not yet in production" if night.branch else ""
     if night.outcome == record.FAILED:
         return "The night failed; the champions stay.", FAILED
     if drifted:
         what = "The machine has drifted" if drifted == [PLANT] else f"Drift of {', '.join(drifted)}"
-        return (f"{what}; promoted: {promoted}." if promoted else f"{what}; the champions stay."), FAILED
+        return (
+            f"{what}; promoted{where}: {promoted}." if promoted else f"{what}; the champions stay."
+        ), FAILED
     if night.outcome == record.QUARANTINED:
         return "Bad recordings are set aside; the champions stay.", FAILED
-    head = f"Promoted: {promoted}." if promoted else "The champions stay."
-    return (f"{head} Bad recordings are set aside.", FAILED) if night.quarantined else (head, PASSED)
+    candidates = ", ".join(night.candidates)
+    head = f"Promoted{where}: {promoted}." if promoted else "The champions stay."
+    if candidates:
+        passes = f"{candidates} {'do' if len(night.candidates) > 1 else 'does'} not pass"
+        head = f"{head} {passes[:1].upper()}{passes[1:]}." if promoted else f"Nothing is promoted: {passes}."
+    if night.lost:
+        return f"The stages of {', '.join(night.lost)} failed. {head}", FAILED
+    if night.quarantined:
+        return f"{head} Bad recordings are set aside.", FAILED
+    return head, OPEN if candidates and not promoted else PASSED
 
 
 def _drifted(night: Night) -> list[str]:
@@ -108,7 +121,7 @@ def _verdict(night: Night) -> dict[str, Any]:
         else [*_reasons(night), *night.quarantined.values()]
     )
     return {
-        "state": "failed" if kind == FAILED else "passed",
+        "state": {FAILED: "failed", PASSED: "passed"}.get(kind, "open"),
         "decision": head,
         "lead": f"{night.run}, {_when(night.when)}:",
         "reason": "; ".join(reasons),
@@ -129,13 +142,17 @@ def _remedy(night: Night, drifted: Sequence[str]) -> str:
             "Nothing of what is in production has changed. "
             f"The log is .beadline/logs/{night.run}.log; mend the cause, and the next night works."
         ),
-        record.PROMOTED: "To go back: ./run beadline rollback.",
+        record.PROMOTED: (
+            f"To put it into production: ./run beadline nightly --merge {night.branch}."
+            if night.branch
+            else "To go back: ./run beadline rollback."
+        ),
     }.get(night.outcome, "")
     if not night.quarantined:
         return remedy
     set_aside = (
         "They lie in datasets/quarantine, unchanged, each with its reason beside it; mend them and put them "
-        "back."
+        "back. What git or DVC keeps lies where it was, listed in excluded.yaml; mend it there."
     )
     return f"{remedy} {set_aside}".strip()
 
@@ -150,10 +167,18 @@ def _reasons(night: Night, *, without: Sequence[str] = ()) -> list[str]:
     return by_loop if by_loop or without else list(night.reasons)
 
 
-def _champions(state: ChampionState) -> list[dict[str, str]]:
+def _champions(champions: Mapping[str, Champion]) -> list[dict[str, str]]:
+    """Champions or candidates: whose files, since when, and what runs as it."""
     return [
-        {"loop": name, "run": champion.run, "since": _when(champion.since or champion.when)}
-        for name, champion in state.champions.items()
+        {
+            "loop": name,
+            "run": champion.run,
+            "since": _when(champion.since or champion.when),
+            "contestant": heading(champion.contestant),
+            "rehearsal": "rehearsal" if champion.rehearsal else "",
+            "verdict": champion.verdict,
+        }
+        for name, champion in champions.items()
     ]
 
 
@@ -162,7 +187,8 @@ def _decision(name: str, decision: LoopDecision) -> dict[str, Any]:
     return {
         "loop": name,
         "decision": decision.decision,
-        "reasons": decision.reasons,
+        "reasons": decision.reasons if decision.decision != record.CANDIDATE else decision.reasons[1:],
+        "page": decision.verdict,
         "paired": _paired(decision.paired),
         "guards": guards,
         "compared": any(guard["champion"] for guard in guards),
@@ -189,11 +215,12 @@ def _worse_than_allowed(guard: Guard) -> bool:
 def _paired(test: Paired | None) -> str:
     if not test:
         return ""
-    low, high = number(test.low_percent, 1), number(test.high_percent, 1)
+    low, high = quantity(test.low_percent, "%", 1), quantity(test.high_percent, "%", 1)
     word = "less" if test.improvement_percent >= 0 else "more"
+    saving = quantity(abs(test.improvement_percent), "%", 1)
     return (
-        f"The challenger's cases cost {number(abs(test.improvement_percent), 1)} % {word} (90 % interval "
-        f"of the saving {low} to {high} %); chance alone does as well with "
+        f"The challenger's cases cost {saving} {word} (90 % interval "
+        f"of the saving {low} to {high}); chance alone does as well with "
         f"probability {short(test.p, 2)}, by a sign-flip test over {count(test.blocks, 'block')} of "
         f"{count(test.cases, 'case')}."
     )
@@ -207,7 +234,8 @@ def _rule(settings: Nightly) -> str:
     r = settings.rule
     return (
         f"Promoted is what is at least {r.least_improvement_percent:g} % better, at level {r.level:g}, with "
-        "no guard worse than is allowed, on a night without drift; otherwise the champion stays."
+        "no guard worse than is allowed, on a night without drift; otherwise the champion stays. What does "
+        "not pass the rules of its loop's page is a candidate: kept in champion/LOOP.candidate, and not run."
     )
 
 
@@ -218,18 +246,22 @@ def _drift(night: Night, settings: Nightly) -> dict[str, Any]:
     path, figures = list(night.drift.figures.items())[-1]
     limit = settings.drift.parameter_percent
     rows = [
-        {"name": name, "value": f"{number(change.percent, 1)} %",
-        "band": f"± {number(change.band_percent, 1)}", "sigmas": number(change.sigmas, 1),
+        {"name": name, "value": quantity(change.percent, "%", 1),
+        "band": f"± {quantity(change.band_percent, '%', 1)}", "sigmas": number(change.sigmas, 1),
          "svg": _interval(name, change.percent, change.band_percent, limit),
          "bad": abs(change.percent) >= limit and abs(change.sigmas) >= settings.drift.watch_sigmas}
         for name, change in figures.parameters.items()
     ]  # fmt: skip
     innovation = [
-        {"name": output, "noise": f"{number(errors.noise_percent, 0)} %",
-        "noise_sigmas": number(errors.noise_sigmas, 1), "mean": f"{short(errors.mean_degC, 2)} °C",
-         "mean_sigmas": number(errors.mean_sigmas, 1)}
+        {
+            "name": output,
+            "noise": quantity(errors.noise_percent, "%", 0),
+            "noise_sigmas": number(errors.noise_sigmas, 1),
+            "mean": beyond_meaning(errors.mean_degC, "°C") or f"{short(errors.mean_degC, 2)} °C",
+            "mean_sigmas": number(errors.mean_sigmas, 1),
+        }
         for output, errors in figures.innovation.items()
-    ]  # fmt: skip
+    ]
     by_sigmas = ((abs(change.sigmas), name, change) for name, change in figures.closed_loop.items())
     worst = sorted(by_sigmas, reverse=True)[:6]
     return {
@@ -268,9 +300,7 @@ def _interval(name: str, value: float, half: float, limit: float) -> Markup:
         'width="7" height="7"/></svg>'
     ).format(
         name,
-        number(value, 1),
-        number(value - half, 1),
-        number(value + half, 1),
+        *(beyond_meaning(part, "%") or number(part, 1) for part in (value, value - half, value + half)),
         f"{limit:g}",
         at[3],
         at[4] - at[3],
@@ -322,8 +352,8 @@ def _pictures(nights: Sequence[Night], settings: Nightly) -> list[dict[str, Any]
 
 def _row(night: Night) -> dict[str, Any]:
     causes = [alarm.cause for alarm in night.drift.alarms]
-    state = OPEN if night.outcome == record.NOTHING_NEW else PASSED
-    if night.outcome == record.FAILED or night.quarantined or causes:
+    state = OPEN if night.outcome in (record.NOTHING_NEW, record.CANDIDATE) else PASSED
+    if night.outcome == record.FAILED or night.lost or night.quarantined or causes:
         state = FAILED
     reasons = "; ".join([*_reasons(night), *night.quarantined.values()])
     return {

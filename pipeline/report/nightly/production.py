@@ -7,6 +7,11 @@ from typing import Any, NamedTuple
 ROLLED_BACK, DRIFT_ACCEPTED = "rolled back", "drift accepted"  # events of the history, beside promotions
 
 
+def candidate_of(loop: str) -> str:
+    """The folder below champion/ that a loop's candidate lies in."""
+    return f"{loop}.candidate"
+
+
 class Lineage(NamedTuple):
     """What a champion was made from: the commit, and what lay uncommitted on it. Then SHA-256 of dvc.lock, of
     the files of parameters, and of each loop's recordings by path."""
@@ -36,17 +41,22 @@ class Installed(NamedTuple):
 
 
 class ChampionMetrics(NamedTuple):
-    """What the judge measured of a champion when it was promoted: the panel's name, mean cost of its cases,
-    and {guard: figure}."""
+    """What the judge measured of a champion when it was promoted: the panel's name, mean cost of its cases
+    (None where one of them fails), and {guard: figure}."""
 
     panel: str
-    mean_cost: float
+    mean_cost: float | None
     guards: Mapping[str, float]
 
 
 class Champion(NamedTuple):
     """One loop's champion: the night that promoted it, when and why, its files, figures and lineage. `since`
-    is the time of a rollback to it, empty where there was none."""
+    is the time of a rollback to it, empty where there was none.
+
+    `contestant` is the controller that runs, by its name on the pages; of earlier versions it is empty.
+    `rehearsal`: it was judged on simulated data alone. `verdict` is what the page said of it then. A
+    candidate is written alike: a challenger that the page's rules kept out of production.
+    """
 
     run: str
     when: str
@@ -55,6 +65,9 @@ class Champion(NamedTuple):
     metrics: ChampionMetrics | None = None
     lineage: Lineage = Lineage()
     since: str = ""
+    contestant: str = ""
+    rehearsal: bool = False
+    verdict: str = ""
 
     @property
     def md5(self) -> str:
@@ -72,6 +85,9 @@ class Champion(NamedTuple):
             ChampionMetrics(metrics["panel"], metrics["mean_cost"], metrics["guards"]) if metrics else None,
             Lineage.read(fields.get("lineage", {})),
             fields.get("since", ""),
+            fields.get("contestant", ""),
+            fields.get("rehearsal", False),
+            fields.get("verdict", ""),
         )
 
     def written(self) -> dict[str, Any]:
@@ -82,7 +98,10 @@ class Champion(NamedTuple):
             **self.installed._asdict(),
             "metrics": self.metrics._asdict() if self.metrics else {},
             "lineage": self.lineage.written(),
-        } | ({"since": self.since} if self.since else {})
+        } | self._where_set("since", "contestant", "rehearsal", "verdict")
+
+    def _where_set(self, *names: str) -> dict[str, Any]:
+        return {name: value for name in names if (value := getattr(self, name))}
 
 
 class HistoryLine(NamedTuple):
@@ -112,17 +131,28 @@ class HistoryLine(NamedTuple):
 
 
 class ChampionState(NamedTuple):
-    """champion.json: {loop: champion}, and every change of production, the oldest first."""
+    """champion.json: {loop: champion}, and every change of production, the oldest first. `candidates`: of
+    each loop the last challenger that did not pass the page's rules; its files lie in
+    champion/<loop>.candidate, and nothing runs them."""
 
     champions: Mapping[str, Champion] = {}
     history: tuple[HistoryLine, ...] = ()
+    candidates: Mapping[str, Champion] = {}
+
+    @property
+    def folders(self) -> dict[str, Champion]:
+        """What lies below champion/, by folder."""
+        return {**self.champions, **{candidate_of(loop): one for loop, one in self.candidates.items()}}
 
     @classmethod
     def read(cls, fields: Mapping[str, Any]) -> "ChampionState":
         """Raises ValueError where the file lacks a field that production cannot be known without."""
         try:
             champions = {loop: Champion.read(entry) for loop, entry in fields["champions"].items()}
-            return cls(champions, tuple(map(HistoryLine.read, fields["history"])))
+            candidates = {
+                loop: Champion.read(entry) for loop, entry in (fields.get("candidates") or {}).items()
+            }
+            return cls(champions, tuple(map(HistoryLine.read, fields["history"])), candidates)
         except (KeyError, TypeError, AttributeError) as error:
             raise ValueError(
                 "champion.json: expected champions and history, each with run, when and folder, "
@@ -130,9 +160,10 @@ class ChampionState(NamedTuple):
             ) from None
 
     def written(self) -> dict[str, Any]:
+        candidates = {loop: candidate.written() for loop, candidate in self.candidates.items()}
         return {
             "schema": "champion",
             "version": 1,
             "champions": {loop: champion.written() for loop, champion in self.champions.items()},
             "history": [line.written() for line in self.history],
-        }
+        } | ({"candidates": candidates} if candidates else {})

@@ -1,18 +1,21 @@
 """The record of a night: what .beadline/nights.json and reports/metrics/nightly.json hold, and what the page
 reads."""
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from pipeline.report.nightly.production import ChampionState
+from pipeline.report.nightly.production import Champion, ChampionState
 from pipeline.report.shared import night as drift_records
 from pipeline.report.shared.night import NightDrift
+from pipeline.report.shared.verdict import Verdict
 
 if TYPE_CHECKING:  # it imports scipy, and a night with nothing new is done without
     from pipeline.statistics import Paired
 
 PROMOTED, KEPT, FIRST = "promoted", "kept", "first champion"
-# how a night ends; PROMOTED and KEPT too
+CANDIDATE = "candidate"  # of a challenger that does not pass the page's rules of its loop
+# how a night ends; PROMOTED, KEPT and CANDIDATE too
 FAILED, QUARANTINED, NOTHING_NEW = "failed", "quarantined", "nothing new"
 
 # ---- what was decided
@@ -28,14 +31,15 @@ class Guard(NamedTuple):
 
 
 class LoopDecision(NamedTuple):
-    """What was decided of one loop's challenger, and why: promoted, kept or first champion. `paired` is the
-    test of challenger against champion, None where they were not compared. `guards` go by name, None where
-    nothing was judged."""
+    """What was decided of one loop's challenger, and why: promoted, kept, first champion or candidate.
+    `paired` is the test of challenger against champion, None where they were not compared. `guards` go by
+    name, None where nothing was judged. `verdict` is the page's on this loop, None where it has no page."""
 
     decision: str
     reasons: list[str]
     paired: "Paired | None" = None
     guards: Mapping[str, Guard] | None = None
+    verdict: Verdict | None = None
 
     @property
     def promotes(self) -> bool:
@@ -47,7 +51,9 @@ class LoopDecision(NamedTuple):
             name: Guard(*(figures.get(key) for key in Guard._fields))
             for name, figures in fields.get("guards", {}).items()
         }
-        return cls(fields["decision"], fields["reasons"], _paired(fields.get("paired")), guards)
+        page = fields.get("verdict")
+        verdict = Verdict.read(page.get("loop", ""), page) if page else None
+        return cls(fields["decision"], fields["reasons"], _paired(fields.get("paired")), guards, verdict)
 
     def written(self) -> dict[str, Any]:
         fields: dict[str, Any] = {"decision": self.decision, "reasons": self.reasons}
@@ -57,9 +63,23 @@ class LoopDecision(NamedTuple):
             # a first champion has a challenger's figure alone
             keys = Guard._fields if self.paired else ("challenger",)
             fields["guards"] = {
-                name: {key: getattr(guard, key) for key in keys} for name, guard in self.guards.items()
+                name: {key: _finite(getattr(guard, key)) for key in keys}
+                for name, guard in self.guards.items()
             }
+        if self.verdict:
+            fields["verdict"] = {"loop": self.verdict.loop, **self.verdict.metrics()}
         return fields
+
+
+def _finite(figure: float | None) -> float | None:
+    """JSON knows no infinity."""
+    return figure if figure is not None and math.isfinite(figure) else None
+
+
+def _placed(champion: Champion) -> dict[str, Any]:
+    """A champion or a candidate as the night's metrics have it."""
+    names = ("run", "when", "why", "contestant", "rehearsal")
+    return {name: getattr(champion, name) for name in names}
 
 
 def _paired(test: Mapping[str, Any] | None) -> "Paired | None":
@@ -79,7 +99,8 @@ class Night(NamedTuple):
     Its number, name and time; how it ended, and why. What was new by loop, and whether that was held against
     the champions (`screened`). The drift of every loop, and the reason of each recording that was set aside.
     What was decided of each loop, and which were promoted. The commit, whether its artifacts have yet to
-    reach the remote, and how long it took in s (None while it runs).
+    reach the remote, and how long it took in s (None while it runs). The branch that its promotions wait on,
+    empty where they are in production.
     """
 
     number: int
@@ -97,6 +118,21 @@ class Night(NamedTuple):
     commit: str = ""
     unpushed: bool = False
     seconds: float | None = None
+    branch: str = ""
+
+    @property
+    def lost(self) -> list[str]:
+        """The loops whose stages failed."""
+        return [name for name, decision in self.decisions.items() if decision.decision == FAILED]
+
+    @property
+    def candidates(self) -> dict[str, str]:
+        """The loops whose challenger is a candidate, and what the page says of each."""
+        return {
+            name: "; ".join(decision.reasons)
+            for name, decision in self.decisions.items()
+            if decision.decision == CANDIDATE
+        }
 
     def noted(self, *notes: str) -> "Night":
         return self._replace(notes=(*self.notes, *notes))
@@ -127,6 +163,7 @@ class Night(NamedTuple):
             commit=fields.get("commit", ""),
             unpushed=fields.get("unpushed", False),
             seconds=fields.get("seconds"),
+            branch=fields.get("branch", ""),
         )
 
     def written(self) -> dict[str, Any]:
@@ -143,22 +180,23 @@ class Night(NamedTuple):
             fields["decisions"] = self._decisions_written()
             fields["promoted"] = list(self.promoted)
         fields["reasons"] = list(self.reasons)
-        later = {"commit": self.commit, "unpushed": self.unpushed}
+        later = {"commit": self.commit, "unpushed": self.unpushed, "branch": self.branch}
         fields |= {name: value for name, value in later.items() if value}
         return fields | ({} if self.seconds is None else {"seconds": self.seconds})
 
     def metrics(self, state: ChampionState) -> dict[str, Any]:
         """As reports/metrics/nightly.json has it, with what is in production."""
-        production = {
-            name: {"run": champion.run, "when": champion.when, "why": champion.why}
-            for name, champion in state.champions.items()
-        }
+        production, candidates = (
+            {name: _placed(champion) for name, champion in champions.items()}
+            for champions in (state.champions, state.candidates)
+        )
         return {
             "decision": self.outcome,
             "reasons": list(self.reasons),
             "decisions": self._decisions_written(),
             "drift": self.drift_written(),
             "champion": production,
+            "candidates": candidates,
             "night": self.number,
             "run": self.run,
             "when": self.when,

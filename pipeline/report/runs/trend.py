@@ -10,7 +10,7 @@ from markupsafe import Markup
 
 from pipeline.report.runs.history import Figure, Revision
 from pipeline.report.shared import charts, page
-from pipeline.report.shared.digits import count, decimals, quantity, short
+from pipeline.report.shared.digits import beyond_meaning, count, decimals, quantity, short
 from pipeline.report.shared.verdict import Question, ReportRules
 from pipeline.report.temperature.verdict import questions
 
@@ -195,10 +195,10 @@ def _row(run: Revision, asked: Sequence[Question]) -> Row:
         if figure is None:
             cells.append(Cell("not measured"))
             continue
-        beyond = figure.value < question.limit if question.at_least else figure.value > question.limit
         finite = math.isfinite(figure.value)
-        text = short(figure.value, 3) if finite else question.beyond
-        cells.append(Cell(text, figure.value if finite else "", beyond))
+        beyond = figure.value < question.limit if question.at_least else figure.value > question.limit
+        text = beyond_meaning(figure.value, question.unit) or short(figure.value, 3)
+        cells.append(Cell(text if finite else question.beyond, figure.value if finite else "", beyond))
     return Row(run.commit[:8], run.date[:10], run.date, run.subject, verdict_words(run.verdict), cells)
 
 

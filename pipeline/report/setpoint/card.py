@@ -11,7 +11,6 @@ from pipeline.report.index.cards import Card, Cell, Row, heads, unbuilt
 from pipeline.report.setpoint.agent import CASES
 from pipeline.report.setpoint.verdict import (
     BASELINE,
-    OPEN,
     PASSED,
     Board,
     board,
@@ -58,14 +57,13 @@ def setpoint(sources: Sources) -> Card:
     rules = sources.declared.rules
     passed, winner = judged.state == PASSED, ROLES[role]
     who_wins = "The baseline" if role == "baseline" else winner.capitalize().replace("-", "\u2011")
-    state = f"Run {winner}" if passed else "Do not decide yet" if judged.state == OPEN else "Do not steer yet"
     sparks = zip((who[role] for role in ORDER), ("mb", "dd", "bl"), strict=True)
     return Card(
         id="setpoint",
         name="Setpoint",
         link="setpoint.html",
         moves="Nozzle camera to flow and temperature setpoints",
-        state=state,
+        state=judged.decision.split(":")[0].rstrip("."),
         mark=role if passed else None,
         win=(f"{who_wins} wins.", _win(scores, judged.winner)) if passed else (judged.lead, judged.reason),
         caption="Flow’s distance from 100\u00a0%, 90th percentile of 21 starts over 100 decisions, log "

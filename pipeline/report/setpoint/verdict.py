@@ -15,6 +15,8 @@ from pipeline.report.shared.verdict import (
     FAILED,
     OPEN,
     PASSED,
+    REHEARSAL,
+    TRIAL,
     UNDECIDED,
     Figure,
     Missing,
@@ -336,13 +338,13 @@ def verdict(sources: Sources) -> Verdict:
     anything is claimed."""
     scores = board(sources)
     recorded = sources.declared.everything.get("train_classifier", {}).get("source") == "recordings"
-    claim = CLAIM_RECORDED if recorded else CLAIM
+    claim, words = (CLAIM_RECORDED, TRIAL) if recorded else (CLAIM, REHEARSAL)
     if isinstance(scores, Missing) or not scores.default:
         gap = scores if isinstance(scores, Missing) else sources.tables["choice"]
         return Verdict(
             loop="setpoint",
             state=OPEN,
-            decision="Let nobody set flow and temperature by this loop yet.",
+            decision=words.open,
             lead="No controller was chosen.",
             reason=gap.sentence()
             if isinstance(gap, Missing)
@@ -360,7 +362,7 @@ def verdict(sources: Sources) -> Verdict:
     settled = Verdict(
         loop="setpoint",
         state=PASSED,
-        decision=f"Run {name} by default.",
+        decision=words.passed.format(name),
         lead=f"All {count(len(asked), 'rule')} passed.",
         reason=summary(sources, scores),
         remedy="",
@@ -374,7 +376,7 @@ def verdict(sources: Sources) -> Verdict:
     failed = first.state == FAILED
     return settled._replace(
         state=ended,
-        decision=f"{'Do not let the camera steer a printer yet' if failed else 'Do not decide yet'}.",
+        decision=words.of(ended),
         lead=f"First {'failed' if failed else 'open'} rule: {first.name[:1].lower()}{first.name[1:]}.",
         reason=_closest(name, first),
         remedy=_conditions(asked, claim == CLAIM),

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from pipeline.report.deposition import verdict as deposition_verdict
 from pipeline.report.setpoint import verdict as setpoint_verdict
 from pipeline.report.shared.sources import Sources
+from pipeline.report.shared.verdict import Verdict
 from pipeline.report.temperature.judgement import Judgement
 
 NAMES = ("temperature", "deposition", "setpoint")
@@ -33,11 +34,21 @@ class Loop(NamedTuple):
     recorded: bool = False
 
 
+def verdicts(sources: Sources, judged: Judgement) -> dict[str, Verdict]:
+    """The verdict of each loop, which the pages show and the nightly job obeys."""
+    each = (judged.verdict, deposition_verdict.verdict(sources), setpoint_verdict.verdict(sources))
+    return {
+        verdict.loop: verdict._replace(
+            subject=verdict.subject or verdict.winner or "", rehearsal=simulated(sources, verdict.loop)
+        )
+        for verdict in each
+    }
+
+
 def loops(sources: Sources, judged: Judgement) -> list[Loop]:
     """Temperature, deposition, setpoint, each as short as page one has
     room for; the loop's own page has the whole."""
-    mine = judged.verdict
-    parts, camera = deposition_verdict.verdict(sources), setpoint_verdict.verdict(sources)
+    mine, parts, camera = verdicts(sources, judged).values()
     return _fitted(
         [
             Loop(

@@ -8,7 +8,9 @@ PLANT = "temperature"  # the loop whose recordings tell of the plant's parameter
 
 class Alarm(NamedTuple):
     """A change of one loop: the key by which the next night knows it again, and the recording that shows it.
-    Then its cause in words, how sure it is in sigmas, and what follows from it in words."""
+    Then its cause in words, how many sigmas it is from no change, and what follows from it in words. `kind`
+    and `channel` are the cause for a machine to read, empty where it has none: gain, time constant, delay,
+    saturation, offset, noise, ambient, or several with "or" between; a signal's name, or "every input"."""
 
     loop: str
     key: str
@@ -16,6 +18,8 @@ class Alarm(NamedTuple):
     cause: str
     sigmas: float
     consequences: tuple[str, ...] = ()
+    kind: str = ""
+    channel: str = ""
 
 
 class ParameterChange(NamedTuple):
@@ -27,8 +31,8 @@ class ParameterChange(NamedTuple):
 
 
 class InnovationChange(NamedTuple):
-    """Of one output: by how much the observer's one-step errors scatter more in percent, and by how much
-    their mean has moved in °C; both also in sigmas."""
+    """Of one output: by how much its noise has grown in percent, and by how many °C of its steady level it is
+    off what the model expects of it; both also in sigmas."""
 
     noise_percent: float
     noise_sigmas: float
@@ -123,7 +127,8 @@ class NightDrift(NamedTuple):
 
 
 def written(alarm: Alarm) -> dict[str, Any]:
-    return alarm._asdict() | {"consequences": list(alarm.consequences)}
+    named = {key: value for key, value in alarm._asdict().items() if value or key not in ("kind", "channel")}
+    return named | {"consequences": list(alarm.consequences)}
 
 
 def alarm_of(entry: Mapping[str, Any]) -> Alarm:
@@ -135,6 +140,8 @@ def alarm_of(entry: Mapping[str, Any]) -> Alarm:
         str(entry.get("cause", "")),
         entry.get("sigmas", 0.0),
         tuple(entry.get("consequences", ())),
+        str(entry.get("kind", "")),
+        str(entry.get("channel", "")),
     )
 
 

@@ -3,7 +3,7 @@ and the verdict. No page, no file."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from pydantic import Field
 
@@ -177,12 +177,29 @@ def overall(states: Sequence[str]) -> str:
 # ---- the verdict
 
 
+class Words(NamedTuple):
+    """What a verdict may say: of simulated machines never more than that a rehearsal passed."""
+
+    passed: str
+    failed: str
+    open: str
+
+    def of(self, state: str) -> str:
+        """The word for a verdict in this state, `passed` with a place for the controller."""
+        return {PASSED: self.passed, FAILED: self.failed}.get(state, self.open)
+
+
+REHEARSAL = Words("Rehearsal passed: {}.", "Rehearsal failed.", "Rehearsal open.")
+TRIAL = Words("Ready for a supervised trial: {}.", "Not ready.", "Not ready.")
+
+
 class Verdict(NamedTuple):
     """What is decided on one loop, and by which rule.
 
     `state` is passed, failed or not measured. Decision, lead, reason, remedy and note are whole sentences.
     `rule` names the rule that decides, "" where all passed. `winner` is the controller that should run.
-    `rules` has a line for each rule, and in it an entry for each controller that is shown.
+    `rules` has a line for each rule, and in it an entry for each controller that is shown. `subject` is the
+    controller that the verdict is about, passed or not; `rehearsal`: it was judged on simulated data.
     """
 
     loop: str
@@ -195,13 +212,37 @@ class Verdict(NamedTuple):
     winner: str | None
     note: str = ""
     rules: tuple[tuple[Rule, ...], ...] = ()
+    subject: str = ""
+    rehearsal: bool = False
 
     @property
     def word(self) -> str:
         """Passed, failed or open: the class of the verdict on a page."""
         return {PASSED: "passed", FAILED: "failed"}.get(self.state, "open")
 
-    def metrics(self) -> dict[str, str | None]:
+    @property
+    def sentence(self) -> str:
+        """The decision, and the rule that decided it: "Rehearsal failed. First failed rule: settling." """
+        return f"{self.decision} {self.lead}".strip()
+
+    def metrics(self) -> dict[str, str | bool | None]:
         """What reports/metrics/report.json keeps of it."""
-        names = ("state", "decision", "lead", "reason", "remedy", "rule", "winner")
-        return {name: getattr(self, name) for name in names}
+        return {name: getattr(self, name) for name in WRITTEN}
+
+    @classmethod
+    def read(cls, loop: str, fields: Mapping[str, Any]) -> "Verdict":
+        """What `metrics` wrote. Of a file that somebody edited, what is missing is empty, and open."""
+        text = {name: str(fields.get(name) or "") for name in WRITTEN}
+        verdict = cls(
+            loop, text["state"] or OPEN, text["decision"], text["lead"], text["reason"], "", "", None
+        )
+        return verdict._replace(
+            remedy=text["remedy"],
+            rule=text["rule"],
+            winner=text["winner"] or None,
+            subject=text["subject"],
+            rehearsal=bool(fields.get("rehearsal")),
+        )
+
+
+WRITTEN = ("state", "decision", "lead", "reason", "remedy", "rule", "winner", "subject", "rehearsal")

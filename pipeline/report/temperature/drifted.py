@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from pipeline.report.shared import night
-from pipeline.report.shared.digits import number
+from pipeline.report.shared.digits import beyond_meaning, number
 from pipeline.report.shared.sources import Sources
 from pipeline.report.shared.verdict import FAILED, OPEN, UNDECIDED, Figure, Missing
 from pipeline.report.temperature.verdict import NEVER
@@ -52,7 +52,8 @@ def drift(sources: Sources) -> Drift:
         answer = Missing(OPEN, "The last night had no new recording of the machine to measure it on")
         return Drift(answer, "Not measured.", answer.sentence(), when)
     name, percent, half = most
-    text = f"Largest change of the machine: {name}, {number(percent, 1)} % ± {number(half, 1)}."
+    size, band = beyond_meaning(percent, "%") or f"{number(percent, 1)} %", beyond_meaning(half, "%")
+    text = f"Largest change of the machine: {name}, {size} ± {band or number(half, 1)}."
     return Drift(Figure(percent, percent - half, percent + half, note=text), "None found.", text, when)
 
 

@@ -58,7 +58,8 @@ def relearned_date(sources: Sources) -> str:
     return str(sources.relearned.get("date") or "")
 
 
-def judgement(sources: Sources) -> Judgement:
+def judgement(sources: Sources, *, named: str = "") -> Judgement:
+    """What the pages say; where somebody has `named` the contestant that runs, the verdict is about it."""
     metrics, rules = sources.metrics, sources.declared.rules
     drifted = drift(sources)
     undeclared = undeclared_outputs(sources)
@@ -81,6 +82,7 @@ def judgement(sources: Sources) -> Judgement:
         drift=drifted.answer,
         incumbent=incumbent,
         relearned=relearned,
+        named=named,
     )
     if sources.recorded:
         verdict = trust_first(verdict, trust(sources))
@@ -107,7 +109,12 @@ def undeclared_outputs(sources: Sources) -> list[str]:
 
 
 def incumbent_of(sources: Sources) -> str:
-    """The contestant that the accepted run of this machine chose; "" where it chose none."""
+    """The contestant in production, as the nightly job wrote it, else the one that the accepted run of this
+    machine chose; "" where there is neither."""
+    if isinstance(sources.nightly, dict):
+        runs = entry(sources.nightly, "champion", "temperature", "contestant")
+        if runs and isinstance(runs, str):
+            return runs
     if not isinstance(sources.accepted, dict) or sources.another_machine:
         return ""
     return str(sources.accepted.get("winner") or "")

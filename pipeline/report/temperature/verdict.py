@@ -15,6 +15,8 @@ from pipeline.report.shared.verdict import (
     FAILED_FIRST,
     OPEN,
     PASSED,
+    REHEARSAL,
+    TRIAL,
     UNDECIDED,
     UNJUDGED,
     Answers,
@@ -24,6 +26,7 @@ from pipeline.report.shared.verdict import (
     ReportRules,
     Rule,
     Verdict,
+    Words,
     deciding,
     share,
 )
@@ -54,18 +57,6 @@ GROUPS = {
 MARGINS = ("disk", "delay_s")
 # rules without which a contestant may pass: only the machine itself shows drift, once the controller runs
 LATER = ("drift",)
-
-
-class Words(NamedTuple):
-    """What a verdict may say: of simulated machines never more than that a rehearsal passed."""
-
-    passed: str
-    failed: str
-    open: str
-
-
-REHEARSAL = Words("Rehearsal passed: {}.", "Rehearsal failed.", "Rehearsal open.")
-TRIAL = Words("Ready for a supervised trial: {}.", "Not ready.", "Not ready.")
 
 
 # ---- the rules
@@ -200,11 +191,17 @@ def choose(
         cheapest = min(fit, key=lambda name: _cost(held[name]).value)
         best = next(name for name in fit if _cost(held[name]).low <= _cost(held[cheapest]).high)
     counts = best_in(relearned)
-    if counts and counts.get(best, 0) < STEADY * sum(counts.values()):
-        best = next((name for name in fit if name in counts), best)
+    if counts:
+        steady = [name for name in fit if _steady(counts, name)]
+        best = next(iter(steady or [name for name in fit if name in counts]), best)
     if incumbent in fit and _cost(held[incumbent]).low <= _cost(held[best]).high:
         return incumbent
     return best
+
+
+def _steady(counts: Mapping[str, int], name: str) -> bool:
+    """Whether a contestant was the best of enough relearnings to be named for that."""
+    return counts.get(name, 0) >= STEADY * sum(counts.values())
 
 
 def _cost(standing: Standing) -> Figure:
@@ -242,18 +239,23 @@ def decide(
     drift: Figure | Missing = NEVER,
     incumbent: str = "",
     relearned: Any = None,
+    named: str = "",
 ) -> Verdict:
     """The verdict on the temperature loop; `undeclared` are outputs without low and high, `relearned` what
-    benchmarks/results/temperature_relearned.json has of this machine.
+    benchmarks/results/temperature_relearned.json has of this machine. Where somebody has `named` the
+    contestant that runs, the verdict is about that one alone.
 
     `rules` of the verdict has a line for each of GROUPS with the contestant that it is about and its rival.
     """
     words = TRIAL if recorded else REHEARSAL
     held = standings(metrics, rules, undeclared=undeclared, drift=drift)
-    if not held or set(held) <= set(YARDSTICKS):
-        return _nothing(metrics, rules, words, drift)
-    best = choose(metrics, held, incumbent, relearned)
-    subject = best or closest(held)
+    if not held or set(held) <= set(YARDSTICKS) or (named and named not in held):
+        return _nothing(metrics, rules, words, drift, named)
+    if named:
+        best = named if held[named].passes else None
+    else:
+        best = choose(metrics, held, incumbent, relearned)
+    subject = best or named or closest(held)
     beside = rival(metrics, subject)
     asked = questions(rules, comparison(metrics))
     theirs = (
@@ -263,34 +265,50 @@ def decide(
     )
     lines = tuple(zip(grouped(held[subject].rules), grouped(theirs), strict=True))
     if best:
-        verdict = _passed(metrics, held[best], words, lines, incumbent, recorded=recorded)
-        return verdict._replace(reason=" ".join(filter(None, [turning(relearned), verdict.reason])))
-    return _not_passed(metrics, held[subject], words, lines)
+        without = choose(metrics, held, "", relearned)
+        turns = "" if named else turning(metrics, relearned, stays=best == incumbent != without)
+        verdict = _passed(metrics, held[best], words, lines, "" if turns else incumbent, recorded=recorded)
+        return verdict._replace(reason=" ".join(filter(None, [turns, verdict.reason])))
+    return _not_passed(metrics, held[subject], words, lines, named=bool(named))
 
 
-def turning(relearned: Any) -> str:
-    """How often which contestant was the best of a relearning, where that turns with the record; else ""."""
+def turning(metrics: Metrics, relearned: Any, *, stays: bool) -> str:
+    """How often which contestant was the best of a relearning, where that turns with the record or is not the
+    best of this one; else "". Who was named before may be the one that `stays`."""
     counts = dict(sorted(best_in(relearned).items(), key=lambda one: -one[1]))
-    runs = sum(counts.values())
-    if not counts or max(counts.values()) >= STEADY * runs:
+    runs, of_record = sum(counts.values()), entry(comparison(metrics), "best")
+    steady = next((name for name in counts if _steady(counts, name)), "")
+    if not counts or (steady and of_record in (steady, None)):
         return ""
+    if steady:
+        return (
+            f"Of {runs} relearnings from fresh records {in_a_sentence(steady)} was the best in "
+            f"{counts[steady]}; of this one {in_a_sentence(of_record)} is{_STAYS if stays else '.'}"
+        )
     listed = _listed([f"{in_a_sentence(name)} in {times}" for name, times in counts.items()])
     return (
-        f"Which is best turns with the record: of {runs} relearnings from fresh records {listed}, so that "
-        "the simplest of them is named."
+        f"Which is best turns with the record: of {runs} relearnings from fresh records {listed}"
+        f"{_STAYS if stays else ', so that the simplest of them is named.'}"
     )
 
 
-def _nothing(metrics: Metrics, rules: ReportRules, words: Words, drift: Figure | Missing) -> Verdict:
+_STAYS = "; the one that was named before stays, as nobody is better beyond the bands."
+
+
+def _nothing(
+    metrics: Metrics, rules: ReportRules, words: Words, drift: Figure | Missing, named: str
+) -> Verdict:
     asked, (a, b) = questions(rules, comparison(metrics)), pair_names(metrics)
     pair = [rules_of(asked, of_contestant(metrics, name), drift, name) for name in (a, b)]
     lines = tuple(zip(*map(grouped, pair), strict=True))
     gap = metrics.get("evaluate_temperature")
-    why = gap if isinstance(gap, Missing) else Missing(OPEN, "No contestant was judged")
+    nobody = f"{name_first(named)} was not judged" if named else "No contestant was judged"
+    why = gap if isinstance(gap, Missing) else Missing(OPEN, nobody)
     first = GROUPS_FIRST
-    return Verdict(
+    verdict = Verdict(
         LOOP, OPEN, words.open, f"First open rule: {first}.", why.sentence(), "", first, None, rules=lines
     )
+    return verdict._replace(subject=named or a)
 
 
 GROUPS_FIRST = next(iter(GROUPS))
@@ -312,7 +330,7 @@ def _passed(
     drift = winner.rules[-1]
     best = entry(compared, "best")
     stays = (
-        f"The accepted run named it, and {in_a_sentence(best)} is not better beyond the bands."
+        f"It was named before, and {in_a_sentence(best)} is not better beyond the bands."
         if winner.name == incumbent != best and best
         else ""
     )
@@ -333,18 +351,22 @@ def _passed(
         winner.name,
         note=pair_sentence(metrics).text,
         rules=lines,
+        subject=winner.name,
     )
 
 
 def _not_passed(
-    metrics: Metrics, subject: Standing, words: Words, lines: tuple[tuple[Rule, ...], ...]
+    metrics: Metrics, subject: Standing, words: Words, lines: tuple[tuple[Rule, ...], ...], *, named: bool
 ) -> Verdict:
     first = first_in(subject.rules)
     failed = first.state == FAILED
-    # drift is of the machine, not of a contestant
-    who = (
-        "" if first.name == "drift" else f"No contestant passes; {in_a_sentence(subject.name)} comes closest."
+    comes = (
+        f"{name_first(subject.name)} is named to run, and does not pass."
+        if named
+        else f"No contestant passes; {in_a_sentence(subject.name)} comes closest."
     )
+    # drift is of the machine, not of a contestant
+    who = "" if first.name == "drift" else comes
     why = first.reason or _drift_sentence(first)
     open_too = [rule.name for rule in subject.rules if rule.state == OPEN and rule.name not in LATER]
     also = f"Open too: {', '.join(open_too)}." if failed and open_too else ""
@@ -360,6 +382,7 @@ def _not_passed(
         None,
         note=pair_sentence(metrics).text,
         rules=lines,
+        subject=subject.name,
     )
 
 

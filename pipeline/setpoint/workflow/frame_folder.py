@@ -17,6 +17,7 @@ import joblib
 import numpy as np
 from tqdm import tqdm
 
+from pipeline.reading.excluded import readable
 from pipeline.reading.signals import Note
 from pipeline.setpoint import nozzle_scene
 from pipeline.setpoint.key_area import SHAPE
@@ -130,7 +131,7 @@ def read_folder(folder: Path, options: ReadOptions, execution: Execution, *, mem
     """
     there = _images(folder)
     files = {
-        ending: sorted(folder / name for name in there if name.lower().endswith(ending))
+        ending: readable(sorted(folder / name for name in there if name.lower().endswith(ending)), folder)
         for ending in (".csv", ".mcap")
     }
     for path in (*files[".csv"], *files[".mcap"]):
@@ -164,7 +165,7 @@ def read_folder(folder: Path, options: ReadOptions, execution: Execution, *, mem
         for log, (_, notes), why, pieces in zip(logs, listed, reasons, calls, strict=True)
     ]
     parts += [_of_recording(path, film) for path, film in zip(recordings, results, strict=True)]
-    read = {path.relative_to(folder).as_posix() for paths in files.values() for path in paths}
+    read = {name for name in there if name.lower().endswith(tuple(files))}
     unread = there.difference(read, *(images for images, _ in listed))
     return _joined(folder, parts, copies + _unread(folder, unread))
 

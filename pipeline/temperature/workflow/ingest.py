@@ -13,6 +13,7 @@ from typing import NamedTuple
 import joblib
 import numpy as np
 
+from pipeline.reading import excluded
 from pipeline.reading.formats import file_format
 from pipeline.reading.isolated import Budget, isolated
 from pipeline.reading.klipper_logs import printer_heaters
@@ -115,6 +116,7 @@ def process(
         and path.suffix.lower() not in {".md", ".yaml", ".dvc"}
         and path.name.lower() not in {"readme.txt", "license.txt", "source.txt", "notes.txt"}
     )
+    files = excluded.readable(files, folder)
     if not files:
         raise ValueError(
             f"{folder}: expected at least one recording (CSV, Parquet or MCAP), found none; copy one there, "

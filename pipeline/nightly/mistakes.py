@@ -1,0 +1,145 @@
+"""Mistakes of recording: a record that is not what it says it is.
+
+Swapped sensors or inputs, °F or K for °C, a factor of ten, a clock that is shifted between inputs and
+outputs. One is believed only where undoing it explains the record BETTER times as well as taking it at its
+word, what is left is no more than on an honest record, and no change of the machine explains as much: a
+drifted machine must never be silenced as a badly written record.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.nightly import baseline, drift
+from pipeline.nightly.baseline import Baseline
+from pipeline.nightly.drift import Machine, Segments
+
+BETTER = 30.0  # by which the mean squared error must fall
+HONEST = 2.0  # of the largest of the champion's own records: what an honest one may leave
+AS_MUCH = 2.0  # a change of the machine that leaves up to so much more explains as much
+ROOM = drift.RESTLESS._replace(another_season=False)  # the air is not 48 °C warmer: that is °F
+FARTHEST = 128  # samples by which a clock is looked for
+
+Undo = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+class Mistake(NamedTuple):
+    """What is wrong with a record in words, the record with that undone, and by how much its mean squared
+    error falls."""
+
+    words: str
+    undone: Segments
+    better: float
+
+
+def found(
+    machine: Machine, segments: Segments, own: Baseline, *, inputs: Sequence[str], outputs: Sequence[str]
+) -> Mistake | None:
+    """The mistake that was made in writing a record; None where it is what it says, or where a change of the
+    machine explains it as well. Raises ValueError where the record is too short."""
+    asked = drift.record(machine, segments, own.scale, ROOM)
+    as_is, honest = baseline.misfit(asked, own.changes), HONEST * float(max(own.misfit.max(), 1.0))
+    if as_is < BETTER:
+        return None
+    left, words, undone = _best(machine, segments, own, inputs, outputs)
+    if left > honest or as_is < BETTER * left:
+        return None
+    samples = sum(int(one.measured.sum()) for one in asked.segments)
+    every_delay = drift.Cause("delay", -1)  # which is a shifted clock by another name
+    explained = [fit.explained for fit in drift.alone(asked, own.changes) if fit.cause != every_delay]
+    if as_is - max(explained) / samples < AS_MUCH * left:
+        return None
+    return Mistake(words, undone, as_is / left)
+
+
+def _best(
+    machine: Machine, segments: Segments, own: Baseline, inputs: Sequence[str], outputs: Sequence[str]
+) -> tuple[float, str, Segments]:
+    """Of every mistake: what is left with it undone, its words, and the record undone; the least first."""
+
+    def left(undone: Segments) -> float:
+        try:
+            return baseline.misfit(drift.record(machine, undone, own.scale, ROOM), own.changes)
+        except ValueError:  # nothing is left of it
+            return np.inf
+
+    tried = []
+    for words, undo in (*_swaps(inputs, outputs), *_units(inputs, outputs)):
+        undone = [undo(u, y) for u, y in segments]
+        tried.append((left(undone), words, undone))
+    tried.append(_clock(segments, left, machine.plant.sample_time_s))
+    return min(tried, key=lambda one: one[0])
+
+
+def _swaps(inputs: Sequence[str], outputs: Sequence[str]) -> Iterator[tuple[str, Undo]]:
+    for i in range(len(outputs)):
+        for j in range(i):
+            words = f"the sensors {outputs[j]} and {outputs[i]} are swapped"
+            yield words, lambda u, y, at=(i, j): (u, _swapped(y, at))
+    for i in range(len(inputs)):
+        for j in range(i):
+            words = f"the inputs {inputs[j]} and {inputs[i]} are swapped"
+            yield words, lambda u, y, at=(i, j): (_swapped(u, at), y)
+
+
+def _swapped(values: np.ndarray, at: tuple[int, int]) -> np.ndarray:
+    values = values.copy()
+    values[:, list(at)] = values[:, list(at)[::-1]]
+    return values
+
+
+def _units(inputs: Sequence[str], outputs: Sequence[str]) -> Iterator[tuple[str, Undo]]:
+    """Wrong units and factors, of every signal and of each."""
+    every = slice(None)
+    sensors = (
+        ("in °F where °C is declared", 1 / 1.8, -32 / 1.8),
+        ("in K where °C is declared", 1.0, -273.15),
+        ("written 10 times too large", 0.1, 0.0),
+        ("written 10 times too small", 10.0, 0.0),
+    )
+    heaters = (
+        ("in shares of 1 where percent is declared", 100.0),
+        ("in counts of 255 where percent is declared", 100 / 255),
+        ("written 10 times too large", 0.1),
+        ("written 10 times too small", 10.0),
+    )
+    for at, name in ((every, "every sensor"), *enumerate(outputs)):
+        for unit, factor, offset in sensors:
+            change = (at, factor, offset)
+            yield f"{name} is {unit}", lambda u, y, change=change: (u, _scaled(y, *change))
+    for at, name in ((every, "every input"), *enumerate(inputs)):
+        for unit, factor in heaters:
+            change = (at, factor, 0.0)
+            yield f"{name} is {unit}", lambda u, y, change=change: (_scaled(u, *change), y)
+
+
+def _scaled(values: np.ndarray, at: int | slice, factor: float, offset: float) -> np.ndarray:
+    values = values.copy()
+    values[:, at] = factor * values[:, at] + offset
+    return values
+
+
+def _clock(
+    segments: Segments, left: Callable[[Segments], float], sample_time_s: float
+) -> tuple[float, str, Segments]:
+    """Outputs written so many samples later than inputs, or earlier: the best of a grid, then of its
+    neighbours."""
+    grid = [k * side for k in (2, *range(4, FARTHEST + 1, 4)) for side in (1, -1)]
+    costs = {k: left(_moved(segments, k)) for k in grid}
+    at, step = min(costs, key=costs.__getitem__), 2
+    while step:
+        for k in (at - step, at + step):
+            if k and k not in costs:
+                costs[k] = left(_moved(segments, k))
+        at, step = min(costs, key=costs.__getitem__), step // 2
+    word = "late" if at > 0 else "early"
+    words = f"the clock of the outputs is {abs(at) * sample_time_s:g} s {word} against that of the inputs"
+    return costs[at], words, _moved(segments, at)
+
+
+def _moved(segments: Segments, late: int) -> Segments:
+    """The outputs brought forward by so many samples; what has no partner is left out."""
+    if late > 0:
+        return [(u[:-late], y[late:]) for u, y in segments if len(y) > late]
+    return [(u[-late:], y[:late]) for u, y in segments if len(y) > -late]

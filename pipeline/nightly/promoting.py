@@ -1,0 +1,228 @@
+"""Champion and challenger of each loop. A challenger that does not pass the rules of its page is a candidate,
+which nothing runs; one that passes goes in production where it is better than the champion, or there is none.
+"""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.nightly import champion, judge, screening
+from pipeline.nightly.decision import decide
+from pipeline.nightly.processes import STATE, dvc
+from pipeline.nightly.settings import Loop, Nightly
+from pipeline.report.nightly import record
+from pipeline.report.nightly.production import Champion, ChampionMetrics, ChampionState, Lineage, candidate_of
+from pipeline.report.nightly.record import CANDIDATE, KEPT, LoopDecision, Night
+from pipeline.report.shared import headline
+from pipeline.report.shared.sources import Declared, Sources, collect
+from pipeline.report.shared.verdict import PASSED, ReportRules, Verdict
+from pipeline.report.temperature.judgement import judgement
+from pipeline.store import artifacts, params
+from pipeline.temperature.workflow.settings import Plant
+
+# stages whose metrics the pages show; those before `learn_kernel` have no tables there
+MEASURED = (
+    "probe_machine", "generate_probing", "learn_kernel", "ingest", "identify_plant", "tune_weights",
+    "evaluate_temperature", "reproduce_study", "train_ilc", "segment_library", "compose_parts",
+    "train_classifier", "train_agent", "evaluate_setpoint",
+)  # fmt: skip
+REPORT = "reports/metrics/report.json"
+ACCEPTED, RELEARNED = "reports/accepted.json", "benchmarks/results/temperature_relearned.json"
+# artifacts that only some contestants are designed from, and that a record may not determine
+OPTIONAL = {f"datasets/{path}" for path in judge.DESIGNED_FROM.values()}
+
+
+class JudgedLoop(NamedTuple):
+    """What was decided of a loop's challenger, and what it measured; None where it was not measured."""
+
+    decision: LoopDecision
+    metrics: ChampionMetrics | None = None
+
+
+def judged(
+    settings: Nightly, night: Night, state: ChampionState, *, lineage: Callable[[], Lineage]
+) -> tuple[Night, ChampionState]:
+    """The night with a decision on each loop; what is in production, and the candidates beside it. Their
+    files lie in champion/<loop> and champion/<loop>.candidate by then."""
+    verdicts, night = verdicts_of(settings, night)
+    made_from = lineage()  # with the lock of the pages, where they were made anew
+    decisions: dict[str, LoopDecision] = {}
+    for name in settings.loops:
+        verdict = verdicts.get(name)
+        decision, metrics = decided(settings, name, night, state, verdict)
+        decisions[name] = decision = decision._replace(verdict=verdict)
+        if decision.promotes or decision.decision == CANDIDATE:
+            state = _placed(settings, name, night, state, JudgedLoop(decision, metrics), made_from)
+        if name in state.candidates and verdict is not None and verdict.state == PASSED:
+            state = _without_candidate(state, name)
+    promoted = tuple(name for name, decision in decisions.items() if decision.promotes)
+    night = night._replace(decisions=decisions, promoted=promoted)
+    outcome = record.PROMOTED if promoted else CANDIDATE if night.candidates else KEPT
+    reasons = (f"{name}: {reason}" for name, decision in decisions.items() for reason in decision.reasons)
+    return night.ended(outcome, *reasons), state
+
+
+# ---- the pages
+
+
+def verdicts_of(settings: Nightly, night: Night) -> tuple[dict[str, Verdict], Night]:
+    """The verdict of each loop that has a page, from the files that the pages are made of; the night with a
+    note where the pages are of other files. A loop that is judged by a file of costs has none: its rules are
+    the guards of that file. Where nightly.holdout.controller names a contestant, the temperature loop's
+    verdict is about that one."""
+    loops = [name for name, loop in settings.loops.items() if loop.judge != "cases"]
+    if not loops:
+        return {}, night
+    sources, named = page_sources(), settings.holdout.controller
+    each = headline.verdicts(sources, judgement(sources))
+    night = _as_the_pages_say(each, night)
+    if named != judge.PAGE:
+        each = headline.verdicts(sources, judgement(sources, named=named))
+    return {name: each[name] for name in loops}, night
+
+
+def page_sources() -> Sources:
+    """What the stage `report` reads."""
+    declared = Declared(params.load(ReportRules, "report"), params.load(Plant, "plant"), params.read())
+    return collect(
+        declared,
+        {stage: f"reports/metrics/{stage}.json" for stage in MEASURED},
+        {stage: f"datasets/{stage}" for stage in MEASURED},
+        ACCEPTED,
+        (),
+        RELEARNED,
+    )
+
+
+def _as_the_pages_say(pages: Mapping[str, Verdict], night: Night) -> Night:
+    """Makes the pages anew where they were made before drift or production changed, so that they say what the
+    night goes by."""
+    if not artifacts.exists(REPORT):
+        return night
+    shown = artifacts.read_json(REPORT).get("verdicts") or {}
+    if all(shown.get(loop) == verdict.metrics() for loop, verdict in pages.items()):
+        return night
+    try:
+        dvc("repro", "--single-item", "--force", "report", log=STATE / "logs" / f"{night.run}-report.log")
+    except ValueError as error:
+        return night.noted(f"the pages are not of tonight ({error}); run ./run dvc repro --force report")
+    return night
+
+
+# ---- one loop
+
+
+def decided(
+    settings: Nightly, name: str, night: Night, state: ChampionState, verdict: Verdict | None
+) -> JudgedLoop:
+    """What becomes of the challenger of one loop, with what it measured; `verdict` is None where the loop has
+    no page."""
+    loop, present = settings.loops[name], state.champions.get(name)
+    files, contestant = there(loop), verdict.subject if verdict else _declared(settings, name)
+    if lacking := champion.missing([path for path in loop.artifacts if path not in OPTIONAL]):
+        return _kept(f"the challenger lacks {lacking[0]}; its stage did not write it")
+    passes = verdict is None or verdict.state == PASSED
+    same = present is not None and champion.same(present.installed.files, files)
+    if same and (not passes or runs(settings, name, present, contestant) == contestant):
+        does_not = "" if passes else f", which does not pass: {verdict.sentence}"
+        return _kept(f"the challenger is the champion, byte for byte{does_not}")
+    if run := champion.rolled_back(state, name, files):
+        return _kept(f"the challenger is that of {run}, which was rolled back by hand")
+    judging = judge.judge(loop, settings)
+    if not passes:
+        return _candidate(judging, verdict, state.candidates.get(name), files)
+    own = f"datasets/{judge.DESIGNED_FROM[contestant]}" if contestant in judge.DESIGNED_FROM else ""
+    if own and own not in loop.artifacts:
+        return _kept(
+            f"{contestant} is designed from {own}, which the champion would lack; add it to "
+            f"nightly.loops.{name}.artifacts"
+        )
+    try:
+        challenger = judging.measure(Path("datasets"), contestant)
+        before = None
+        if present:
+            before = judging.measure(champion.FOLDER / name, runs(settings, name, present, contestant))
+    except judge.NotComparable as reason:
+        return _kept(f"champion and challenger cannot be compared: {reason}")
+    decision = decide(
+        before,
+        challenger,
+        settings.rule,
+        allowed=judging.allowed(before) if before else {},
+        alarms=night.drift.of(name).alarms,
+        seed=night.number,
+    )
+    return JudgedLoop(decision, _metrics(challenger))
+
+
+def there(loop: Loop) -> list[str]:
+    """The artifacts of a loop without the optional ones that its record did not determine."""
+    return [path for path in loop.artifacts if path not in OPTIONAL or Path(path).is_file()]
+
+
+def runs(settings: Nightly, loop: str, present: Champion, contestant: str) -> str:
+    """The contestant that a champion runs as. One of an earlier version did not say: of the temperature loop
+    it is what nightly.holdout.controller said, of the others whatever the challenger is."""
+    return present.contestant or _declared(settings, loop) or contestant
+
+
+def _declared(settings: Nightly, loop: str) -> str:
+    return judge.declared(settings.holdout) if settings.loops[loop].judge == "temperature" else ""
+
+
+def _kept(reason: str) -> JudgedLoop:
+    return JudgedLoop(LoopDecision(KEPT, [reason]))
+
+
+def _metrics(evidence: judge.Evidence) -> ChampionMetrics:
+    mean_cost = float(np.mean([cost for _, cost in evidence.cases.values()]))
+    guards = {name: figure for name, figure in evidence.guards.items() if np.isfinite(figure)}
+    return ChampionMetrics(evidence.panel, mean_cost if np.isfinite(mean_cost) else None, guards)
+
+
+def _candidate(
+    judging: judge.Judge, verdict: Verdict, before: Champion | None, files: list[str]
+) -> JudgedLoop:
+    """A challenger that the page's rules keep out of production, with what it measures all the same."""
+    decision = LoopDecision(CANDIDATE, [verdict.sentence])
+    if before and before.contestant == verdict.subject and champion.same(before.installed.files, files):
+        return JudgedLoop(decision, before.metrics)
+    try:
+        evidence = judging.measure(Path("datasets"), verdict.subject)
+    except ValueError as reason:
+        return JudgedLoop(decision._replace(reasons=[verdict.sentence, f"not measured: {reason}"]))
+    guards = {name: record.Guard(None, figure, None) for name, figure in evidence.guards.items()}
+    return JudgedLoop(decision._replace(guards=guards), _metrics(evidence))
+
+
+# ---- what lies in champion/
+
+
+def _placed(
+    settings: Nightly, name: str, night: Night, state: ChampionState, judged: JudgedLoop, lineage: Lineage
+) -> ChampionState:
+    """The state with a challenger in production or as the candidate; its files lie in that folder then."""
+    decision, metrics = judged
+    files, verdict, waits = there(settings.loops[name]), decision.verdict, not decision.promotes
+    before = state.candidates.get(name) if waits else None
+    if before and champion.same(before.installed.files, files):
+        installed, run, when, lineage = before.installed, before.run, before.when, before.lineage
+    else:
+        reference = None if waits else screening.reference(settings.loops[name], Path("datasets"))
+        beside = {screening.REFERENCE: reference} if reference else {}
+        installed = champion.install(candidate_of(name) if waits else name, files, beside)
+        run, when = night.run, night.when
+    one = Champion(run, when, "; ".join(decision.reasons), installed, metrics, lineage)
+    if verdict:
+        one = one._replace(contestant=verdict.subject, rehearsal=verdict.rehearsal, verdict=verdict.sentence)
+    if waits:
+        return state._replace(candidates={**state.candidates, name: one})
+    return champion.in_production(state, name, one, event=decision.decision)
+
+
+def _without_candidate(state: ChampionState, name: str) -> ChampionState:
+    """The state after a challenger has passed: what did not pass before it is of no more use."""
+    champion.removed(candidate_of(name))
+    return state._replace(candidates={loop: one for loop, one in state.candidates.items() if loop != name})

@@ -1,0 +1,529 @@
+"""The temperature loop's part of a night: new recordings held against those of the champion. A record that is
+not what it says is set aside, and what it says of the machine, put right, counts all the same."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pipeline.nightly import baseline, drift, judge, mistakes, pictures
+from pipeline.nightly.baseline import Baseline
+from pipeline.nightly.camera_drift import Change
+from pipeline.nightly.drift import Cause, Explanation, Fit, Machine, Record, Segments
+from pipeline.nightly.inputs import quarantine
+from pipeline.nightly.settings import Drift, Loop
+from pipeline.report.shared.night import (
+    Alarm,
+    ClosedLoopChange,
+    InnovationChange,
+    LoopDrift,
+    ParameterChange,
+    RecordingFigures,
+)
+from pipeline.store import artifacts, params
+from pipeline.temperature.workflow.settings import Plant
+
+REFERENCE = "reference.json"  # in the champion's folder
+PIECES = 4  # into which a single record of the champion is cut, to stand for nights
+NIGHTS = 12  # of the champion's own recordings that a new one is held against
+# a rival so far past its limit, in units of it, is said before the likeliest cause, which is within its own
+AHEAD = 2.0
+LONGEST = 7200  # samples of a record that are asked, its last ones
+POOLED = 3  # nights over which an estimate is pooled
+# several nights tell how the air around scatters from one to the next, pieces of one do not
+NIGHTS_FLOORS, PIECES_FLOORS = baseline.Floors(0.03, 0.25), baseline.Floors(0.2, 2.0)
+# mean offset of the champion's own nights, in units of drift.offset_degC, up to which they count as a
+# closed loop at the references
+SETTLED = 5.0
+PARTS = 4  # of a record, whose scatter tells how well its closed-loop figures are known
+
+
+class Reference(NamedTuple):
+    """What the champion's own recordings said of its model, and their closed-loop figures; `digest` is that
+    of reference.json, by which the memory of the nights knows it again."""
+
+    machine: Machine
+    own: Baseline
+    loop: list[dict[str, list[list[float]]]]
+    digest: str
+
+
+class Estimate(NamedTuple):
+    """A change that one night named: size in the unit of its limit, and its standard deviation."""
+
+    amount: float
+    deviation: float
+
+
+class Found(NamedTuple):
+    """A change of one recording: kind and channel for a machine to read, words for a person, the estimate and
+    the limit that it is held against."""
+
+    kind: str
+    channel: str
+    words: str
+    estimate: Estimate
+    limit: float
+
+    @property
+    def key(self) -> str:
+        kind = self.kind.split(" or ")[0]
+        return f"{kind} of {self.channel}" if self.channel else kind
+
+
+Nights = list[dict[str, Estimate]]  # of the nights before, the last one last: what each of them named
+
+
+class Screened(NamedTuple):
+    """The loop's drift, and what the next night must remember of this one (see `DriftMemory.recent`)."""
+
+    drift: LoopDrift
+    recent: dict[str, Any] | None
+
+
+# ---- the champion's own recordings
+
+
+def reference(loop: Loop, folder: Path, only: Sequence[str] = ()) -> dict[str, Any] | None:
+    """champion/<loop>/reference.json of the model below `folder`, from the loop's recordings, or `only` those
+    named; None where they are none, or too short."""
+    machine = params.load(Plant, "plant")
+    records = judge.record_segments(Path(loop.recordings), machine, broken={})
+    named = [path.removeprefix(f"{loop.recordings}/") for path in only] or sorted(records)
+    nights = [_last(records[path]) for path in named if records.get(path)][-NIGHTS:]
+    floors = NIGHTS_FLOORS if len(nights) > 1 else PIECES_FLOORS
+    if len(nights) == 1:
+        nights = [
+            [(part, other)]
+            for u, y in nights[0]
+            for part, other in zip(np.array_split(u, PIECES), np.array_split(y, PIECES), strict=True)
+        ]
+    try:
+        own = baseline.measured(Machine(judge.identified(folder), _samples(nights)), nights, floors)
+    except ValueError:
+        return None
+    return {
+        "schema": "reference",
+        "version": baseline.VERSION,
+        "samples": _samples(nights),
+        "own": own.written(),
+        "loop": [_closed_loop(night, machine) for night in nights],
+    }
+
+
+def _read_reference(folder: Path) -> Reference | None:
+    path = folder / REFERENCE
+    fields = artifacts.read_json(path) if path.exists() else {}
+    if fields.get("version") != baseline.VERSION:
+        return None
+    machine = Machine(judge.identified(folder), fields["samples"])
+    return Reference(machine, Baseline.read(fields["own"]), fields["loop"], artifacts.sha256(path))
+
+
+def _last(segments: Segments) -> Segments:
+    """The last LONGEST samples of a record: they tell enough, and a night has other things to do."""
+    kept, left = [], LONGEST
+    for u, y in reversed(segments):
+        if left > 0:
+            kept.append((u[-left:], y[-left:]))
+            left -= len(u)
+    return kept[::-1]
+
+
+def _samples(nights: Sequence[Segments]) -> int:
+    """Of a typical night."""
+    return int(np.median([sum(len(u) for u, _ in night) for night in nights]))
+
+
+# ---- a night's recordings
+
+
+class Named(NamedTuple):
+    """Names of the machine's signals."""
+
+    inputs: list[str]
+    outputs: list[str]
+
+
+def look(
+    limits: Drift,
+    name: str,
+    folder: str,
+    new: Sequence[str],
+    champion: Path | None,
+    pending: set[str],
+    recent: Mapping[str, Any],
+) -> Screened:
+    """Drift of loop `name` by its new recordings below `folder`, against the champion's; `recent` is what the
+    nights before named. What cannot be read, or is not what it says, is set aside."""
+    drifted = LoopDrift.none(name)
+    if not Path(folder).is_dir():
+        return Screened(drifted, None)
+    machine, broken = params.load(Plant, "plant"), {}
+    records = judge.record_segments(Path(folder), machine, broken=broken)
+    for path, reason in broken.items():
+        if f"{folder}/{path}" in new:
+            drifted.quarantined[f"{folder}/{path}"] = quarantine(f"{folder}/{path}", name, reason)
+    good = [
+        path
+        for path in new
+        if path not in drifted.quarantined and records.get(path.removeprefix(f"{folder}/"))
+    ]
+    if champion is None or not good:
+        return Screened(drifted, None)
+    held = _read_reference(champion)
+    if held is None:
+        drifted.notes.append(
+            f"{name}: the champion has no reference of its own recordings that this version reads: drift was "
+            "not measured; the next promotion makes one"
+        )
+        return Screened(drifted, None)
+    nights = _nights(recent, held.digest)
+    for path in good:
+        segments = _last(records[path.removeprefix(f"{folder}/")])
+        try:
+            drifted = _one(limits, drifted, path, segments, held, machine, nights, pending)
+        except ValueError as error:
+            drifted.notes.append(f"{path}: {error}")
+    return Screened(drifted, {"reference": held.digest, "nights": [_written(night) for night in nights]})
+
+
+def _nights(recent: Mapping[str, Any], digest: str) -> Nights:
+    """What the nights before named, where they were held against the same reference."""
+    if recent.get("reference") != digest:
+        return []
+    return [{key: Estimate(*pair) for key, pair in night.items()} for night in recent.get("nights", [])]
+
+
+def _written(night: Mapping[str, Estimate]) -> dict[str, list[float]]:
+    return {key: [round(float(part), 6) for part in estimate] for key, estimate in night.items()}
+
+
+def _one(
+    limits: Drift,
+    drifted: LoopDrift,
+    path: str,
+    segments: Segments,
+    held: Reference,
+    machine: Plant,
+    nights: Nights,
+    pending: set[str],
+) -> LoopDrift:
+    """The loop's drift with what one recording says; it joins `nights`."""
+    names = Named([i.name for i in machine.inputs], [o.name for o in machine.outputs])
+    mistake = mistakes.found(held.machine, segments, held.own, inputs=names.inputs, outputs=names.outputs)
+    if mistake:
+        reason = (
+            f"{path}: {mistake.words}: undone, the record fits the champion's model {mistake.better:.0f} "
+            "times better; mend it and put it back"
+        )
+        drifted.quarantined[path] = quarantine(path, drifted.loop, reason)
+        segments = mistake.undone
+    measured = _measure(limits, segments, held, machine, names)
+    drifted.figures[path] = measured.figures
+    nights.append({found.key: found.estimate for found in measured.found})
+    del nights[:-POOLED]
+    told = [cause.words for cause in measured.loop]
+    alarms, watched = list(drifted.alarms), list(drifted.watched)
+    for found in measured.found:
+        sure = _past_limit([night.get(found.key) for night in nights], found.limit)
+        if abs(found.estimate.amount) < found.limit and sure < limits.limit_sigmas:
+            continue
+        estimate = found.estimate
+        sigmas = float(np.clip(estimate.amount / max(estimate.deviation, 1e-9), -999.0, 999.0))
+        alarm = Alarm(
+            drifted.loop, f"{drifted.loop}: {found.key}", path, found.words, round(sigmas, 1), tuple(told),
+            found.kind, found.channel,
+        )  # fmt: skip
+        (alarms if sure >= limits.limit_sigmas else watched).append(alarm)
+    drifted = drifted._replace(alarms=alarms, watched=watched)
+    if alarms or watched:
+        return drifted
+    return pictures.with_alarms(drifted, limits, path, measured.loop, pending)
+
+
+def _past_limit(estimates: Sequence[Estimate | None], limit: float) -> float:
+    """How surely a change is past its limit, in sigmas: the largest of the last nights' evidence together, of
+    the last one, the last two, and so on while they agree in sign (Page's test; Page 1954)."""
+    largest, total, sign = -np.inf, 0.0, 0.0
+    for k, estimate in enumerate(reversed(estimates), 1):
+        if estimate is None or sign * estimate.amount < 0:
+            break
+        sign = np.sign(estimate.amount)
+        total += (abs(estimate.amount) - limit) / max(estimate.deviation, 1e-9)
+        largest = max(largest, total / np.sqrt(k))
+    return float(largest)
+
+
+# ---- one recording
+
+
+class Measured(NamedTuple):
+    """Of one recording: figures for the page, what changed, and what the closed loop does otherwise beyond
+    what those changes and the air around bring."""
+
+    figures: RecordingFigures
+    found: list[Found]
+    loop: list[Change]
+
+
+def _measure(limits: Drift, segments: Segments, held: Reference, machine: Plant, names: Named) -> Measured:
+    own, asked = held.own, drift.causes(held.machine.plant)
+    record, explained = drift.explain_segments(
+        held.machine, segments, own.scale, own.changes, own.usual(asked)
+    )
+    found = [_found(limits, named, record, held, segments, names) for named in explained.named]
+    noise, louder = _noise(limits, record, explained, held, names)
+    air = drift.levels(record, explained.changes)[0]
+    if abs(air) > limits.ambient_degC:
+        found.append(_air(limits, air, record, held))
+    effect = drift.moved(record, own.changes, explained.changes) + abs(air)
+    loop = _loop(limits, _closed_loop(segments, machine), held, names, effect, asked=not found)
+    figures = RecordingFigures(
+        _parameters(record, explained, held, names), noise, loop.figures, loop.not_applicable
+    )
+    return Measured(figures, [*found, *louder], loop.causes)
+
+
+def _name(cause: Cause, names: Named) -> str:
+    of = names.outputs if cause.kind in ("offset", "late sensor") else names.inputs
+    return of[cause.channel] if cause.channel >= 0 else "every input"
+
+
+def _amount(fit: Fit, held: Reference, segments: Segments) -> Estimate:
+    """A fit in the unit of its limit: percent, s, °C, or percent of the record."""
+    cause, value, deviation = fit.cause, fit.value, fit.deviation
+    if cause.kind == "saturation":
+        least, most = (drift.above(segments, cause.channel, value + side * deviation) for side in (1, -1))
+        return Estimate(drift.above(segments, cause.channel, value), max((most - least) / 2, 0.5))
+    at = drift.causes(held.machine.plant).index(cause)
+    among = drift.shift(
+        np.array([value]), np.array([deviation]),
+        held.own.values[:, [at]], held.own.deviations[:, [at]],
+    )  # fmt: skip
+    moved, deviation = float(among.value[0] - among.reference[0]), float(among.deviation[0])
+    if cause.kind == "gain":
+        return Estimate(100 * moved, 100 * deviation)
+    if cause.kind == "time constant":
+        longer = 1 / (1 + max(moved, -0.9))
+        return Estimate(100 * (longer - 1), 100 * deviation * longer**2)
+    if cause.kind in ("delay", "late sensor"):
+        step = held.machine.plant.sample_time_s
+        return Estimate(moved * step, deviation * step)
+    return Estimate(moved, deviation)
+
+
+def _found(
+    limits: Drift, named: drift.Named, record: Record, held: Reference, segments: Segments, names: Named
+) -> Found:
+    """What is said of a named change. Where the record cannot tell it from another, and that one is far past
+    its own limit, the other is said first."""
+    told = []
+    for fit in (named.fit, *named.rivals):
+        estimate, name = _amount(fit, held, segments), _name(fit.cause, names)
+        told.append(
+            Found(
+                _kind(fit.cause),
+                name,
+                _words(fit, estimate.amount, name),
+                estimate,
+                _limit(limits, fit.cause),
+            )
+        )
+    first = max(told, key=_past)
+    if _past(first) < AHEAD or _past(told[0]) >= 1:
+        first = told[0]
+    told = [first, *(one for one in told if one is not first)]
+    rest = ": this record cannot tell which" if len(told) > 1 else ""
+    kinds = dict.fromkeys(one.kind for one in told)
+    return first._replace(kind=" or ".join(kinds), words=", or ".join(one.words for one in told) + rest)
+
+
+def _past(found: Found) -> float:
+    """The change in units of its limit."""
+    return abs(found.estimate.amount) / found.limit
+
+
+def _limit(limits: Drift, cause: Cause) -> float:
+    return {
+        "gain": limits.parameter_percent, "time constant": limits.time_constant_percent,
+        "delay": limits.delay_s, "offset": limits.offset_degC, "saturation": limits.at_limits_points,
+    }[_kind(cause)]  # fmt: skip
+
+
+def _kind(cause: Cause) -> str:
+    return "delay" if cause.kind == "late sensor" else cause.kind
+
+
+def _words(fit: Fit, amount: float, name: str) -> str:
+    kind = fit.cause.kind
+    if kind == "gain":
+        return f"the gain from {name} has changed by {amount:+.1f} %"
+    if kind == "time constant":
+        return f"the time constants of what answers to {name} have changed by {amount:+.1f} %"
+    if kind == "saturation":
+        return (
+            f"{name} no longer gives more than {fit.value:.0f} %: more was asked of it in {amount:.0f} % of "
+            "the record"
+        )
+    if kind == "offset":
+        return (
+            f"{name} reads {amount:+.1f} °C from what it did: its offset, or the heat lost there, has changed"
+        )
+    verb, word = ("reads" if kind == "late sensor" else "acts"), ("later" if amount > 0 else "earlier")
+    return f"{name} {verb} {abs(amount):.1f} s {word} than it did"
+
+
+def _air(limits: Drift, air: float, record: Record, held: Reference) -> Found:
+    word = "warmer" if air > 0 else "colder"
+    words = (
+        f"it is {abs(air):.0f} °C {word} around the machine than on the champion's own nights, or every "
+        "sensor reads so much from what it did"
+    )
+    deviation = float(np.hypot(drift.air_deviation(record), held.own.scale.ambient))
+    return Found("ambient", "", words, Estimate(air, deviation), limits.ambient_degC)
+
+
+def _noise(
+    limits: Drift, record: Record, explained: Explanation, held: Reference, names: Named
+) -> tuple[dict[str, InnovationChange], list[Found]]:
+    """Noise of each output, and by how many degrees of its steady level it is off what the champion's nights
+    had; then the noises that have changed."""
+    value, deviation = baseline.noise(drift.by_output(record, explained.left))
+    noise = drift.shift(value, deviation, held.own.noise, held.own.noise_deviation)
+    air, own = drift.levels(record, held.own.changes)
+    ratio = np.exp(0.5 * (noise.value - noise.reference))
+    figures, found = {}, []
+    for i, output in enumerate(names.outputs):
+        percent, sigmas = 100 * float(ratio[i] - 1), float(noise.sigmas[i])
+        level = air + own[i]
+        known = np.hypot(held.own.scale.ambient, held.own.scale.level[i])
+        figures[output] = InnovationChange(percent, sigmas, float(level), float(level / known))
+        word = "grown" if percent > 0 else "fallen"
+        words = f"the noise of {output} has {word} by {abs(percent):.0f} %"
+        # of a logarithm of a variance
+        estimate = Estimate(percent, 50 * float(ratio[i] * noise.deviation[i]))
+        if abs(percent) > 0.5 * limits.noise_percent and abs(sigmas) >= drift.SURE:
+            found.append(Found("noise", output, words, estimate, limits.noise_percent))
+    return figures, found
+
+
+def _parameters(
+    record: Record, explained: Explanation, held: Reference, names: Named
+) -> dict[str, ParameterChange]:
+    """{cause: change in percent, half of its 90 % band, sigmas} of gains and time constants: what was named,
+    and what the others seem beside it."""
+    fits = {fit.cause: fit for fit in (*explained.others, *(named.fit for named in explained.named))}
+    changes = {}
+    for cause in drift.causes(held.machine.plant):
+        if cause.kind in ("gain", "time constant"):
+            percent, deviation = _amount(fits[cause], held, ())
+            changes[f"{cause.kind} from {_name(cause, names).replace('every input', 'all inputs')}"] = (
+                ParameterChange(percent, 1.645 * deviation, percent / max(deviation, 1e-9))
+            )
+    return changes
+
+
+# ---- the closed loop
+
+
+def _closed_loop(segments: Segments, machine: Plant) -> dict[str, list[list[float]]]:
+    """Offset of each output from its reference after the first third in °C, root mean square of each input
+    and its share of samples at a limit, both in percent: [figures, their standard deviations], from PARTS of
+    the record, which are longer than what a loop remembers."""
+    u, y = (np.concatenate([pair[k] for pair in segments]) for k in (0, 1))
+    reference, low, high = (
+        np.array([o.reference for o in machine.outputs]),
+        *np.array([(i.low, i.high) for i in machine.inputs]).T,
+    )
+    late, limited = (y - reference)[len(y) // 3 :], 100.0 * ((u <= low + 1e-9) | (u >= high - 1e-9))
+    effort = np.sqrt((u**2).mean(axis=0))
+    return {
+        "offset_degC": _mean(late),
+        "effort_percent": [
+            effort.tolist(),
+            (np.array(_mean(u**2)[1]) / np.maximum(2 * effort, 1e-9)).tolist(),
+        ],
+        "at_limits_percent": _mean(limited),
+    }
+
+
+def _mean(values: np.ndarray) -> list[list[float]]:
+    """Mean (k,) of values (T, k) that are there, and its standard deviation from the means of PARTS."""
+    parts = np.ma.masked_invalid(values)
+    means = np.ma.stack([part.mean(axis=0) for part in np.array_split(parts, PARTS)])
+    return [
+        parts.mean(axis=0).filled(0.0).tolist(),
+        (means.std(axis=0, ddof=1) / np.sqrt(PARTS)).filled(0.0).tolist(),
+    ]
+
+
+class LoopChanges(NamedTuple):
+    """Of the closed loop: figures by name, what has changed, and why it was not asked, if it was not."""
+
+    figures: dict[str, ClosedLoopChange]
+    causes: list[Change]
+    not_applicable: str = ""
+
+
+def _loop(
+    limits: Drift,
+    now: Mapping[str, list[list[float]]],
+    held: Reference,
+    names: Named,
+    effect: np.ndarray,
+    *,
+    asked: bool,
+) -> LoopChanges:
+    """Offset, effort and share at limits against the champion's own nights; not asked where those were not
+    settled at the references. `effect` (p,) are the °C that the changes of the machine and the air around
+    bring: what they explain is not counted again; `asked` is whether the machine is as it was."""
+    usual = {key: np.array([night[key] for night in held.loop]) for key in now}
+    offset = usual["offset_degC"][:, 0].mean(axis=0)
+    unsure = np.sqrt((usual["offset_degC"][:, 1] ** 2).mean(axis=0) / len(held.loop))
+    if (np.abs(offset) > SETTLED * limits.offset_degC + 2 * unsure).any():
+        return LoopChanges(
+            {}, [], "the champion's own recordings are not of a loop settled at the references"
+        )
+    figures, causes = {}, []
+    for key, (sentence, least, allowed) in _asked(limits, held, names, effect).items():
+        of = names.outputs if key == "offset_degC" else names.inputs
+        moved = _loop_shift(now[key], usual[key], least)
+        for k, (name, by) in enumerate(zip(of, moved.value - moved.reference, strict=True)):
+            figures[f"{name} {key}"] = ClosedLoopChange(float(by), float(moved.sigmas[k]))
+            beyond = abs(by) - least - (allowed[k] if asked else 0.0)
+            if beyond > 0:
+                words = f"closed loop: {name} {sentence.format(f'{by:+.2g}')}"
+                sigmas = float(moved.sigmas[k]) * beyond / abs(by) if asked else float(moved.sigmas[k])
+                causes.append(Change(f"{key} of {name}", words, sigmas))
+    return LoopChanges(figures, causes)
+
+
+def _asked(
+    limits: Drift, held: Reference, names: Named, effect: np.ndarray
+) -> dict[str, tuple[str, float, np.ndarray]]:
+    """By figure of the closed loop: its sentence, what matters, and what the machine's changes may bring."""
+    plant = held.machine.plant
+    steady = np.abs(plant.C @ np.linalg.solve(np.eye(plant.n) - plant.A, plant.B) + plant.D)
+    strongest = steady.argmax(axis=0)
+    points = effect[strongest] / np.maximum(steady[strongest, np.arange(plant.m)], 1e-9)
+    none = np.zeros(plant.m)
+    return {
+        "offset_degC": ("settles {} °C from where it did", limits.offset_degC, effect),
+        "effort_percent": ("needs {} points of effort more than it did", limits.effort_percent, points),
+        "at_limits_percent": (
+            "is at a limit {} points more of the time than it was", limits.at_limits_points, none,
+        ),
+    }  # fmt: skip
+
+
+def _loop_shift(now: list[list[float]], usual: np.ndarray, least: float) -> drift.Shift:
+    """Of one figure against those of the champion's nights (nights, 2, signals)."""
+    # a figure counts as known to a sixth of what matters at best, so that
+    # nights that agree by chance make no alarm of a trifle
+    own = np.maximum([*usual[:, 1], now[1]], least / 6)
+    # a few parts of one night say little of how well a mean is known: those of all nights say it
+    # together; a short or restless night is known less well
+    pooled = np.maximum(np.sqrt((own**2).mean(axis=0)), own[-1])
+    return drift.shift(np.array(now[0]), pooled, usual[:, 0], own[:-1], freedom=(PARTS - 1) * len(own))

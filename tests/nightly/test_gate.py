@@ -1,0 +1,550 @@
+"""The night obeys the page: whatever the metrics say, both speak of one verdict, and only what passes is put
+in production; the rest is a candidate."""
+
+import contextlib
+import html
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.deposition.workflow.tables import SCORES
+from pipeline.nightly import champion, judge, night, promoting, reporting, screening
+from pipeline.nightly.decision import Evidence
+from pipeline.nightly.settings import Nightly
+from pipeline.report.index import page as index_page
+from pipeline.report.nightly import page as nightly_page
+from pipeline.report.nightly.production import Champion, ChampionState, Installed, Lineage
+from pipeline.report.nightly.record import CANDIDATE, FIRST, KEPT, PROMOTED, Night
+from pipeline.report.shared.digits import typeset
+from pipeline.report.shared.verdict import FAILED, OPEN, PASSED, ReportRules, Verdict
+from pipeline.report.temperature.judgement import judgement
+from pipeline.store import artifacts, params
+from stages import report
+from tests.conftest import ROOT
+from tests.nightly.toy_nights import Project, entered
+from tests.report import made, made_setpoint
+from tests.report.conftest import populate
+
+LOOPS = {
+    "temperature": ["datasets/identify_plant/plant.parquet", "datasets/tune_weights/weights.json"],
+    "deposition": ["datasets/segment_library/library.parquet"],
+    "setpoint": ["datasets/train_classifier/windows.parquet"],
+}
+ABSENT = "absent"  # nothing was judged, and so everything is open
+TONIGHT = Night(7, "night-0007", "2030-01-09T02:00:00+00:00", seconds=1.0)
+NIGHTLY = "reports/metrics/nightly.json"
+
+
+@pytest.fixture(scope="module")
+def passing(tmp_path_factory):
+    """A folder with every artifact that the pages show, all loops passing; what each of its files holds."""
+    folder = tmp_path_factory.mktemp("passing")
+    with contextlib.chdir(folder):
+        populate(folder)
+    return folder, {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def project(passing, monkeypatch):
+    """That folder as the working directory, as it was made. Nothing is copied to champion/, and no contestant
+    is played: what a challenger costs is half of what a champion does."""
+    folder, files = passing
+    monkeypatch.chdir(folder)
+    for path in {path for path in folder.rglob("*") if path.is_file()} - files.keys():
+        path.unlink()
+    for path, content in files.items():
+        if not path.exists() or path.stat().st_size != len(content) or path.read_bytes() != content:
+            path.write_bytes(content)
+
+    def measure(folder, contestant=""):
+        cost = 2.0 if Path(folder).parts[0] == "champion" else 1.0
+        return Evidence("panel", {f"case {k}": (f"plant {k}", cost) for k in range(8)}, {"worst_case": cost})
+
+    monkeypatch.setattr(judge, "judge", lambda *_: judge.Judge(measure, lambda _: {"worst_case": 0.1}))
+    monkeypatch.setattr(screening, "reference", lambda *_: None)
+    monkeypatch.setattr(champion, "removed", lambda _: None)
+    installed = Installed({"md5": "0"})
+    monkeypatch.setattr(
+        champion, "install", lambda _, files, __: installed._replace(files=champion.md5_of(files))
+    )
+    return folder
+
+
+def settings(**holdout) -> Nightly:
+    declared = params.load(Nightly, "nightly", ROOT / "params.yaml")
+    loops = {
+        name: loop.model_copy(update={"artifacts": LOOPS[name]}) for name, loop in declared.loops.items()
+    }
+    changed = {"loops": loops, "holdout": declared.holdout.model_copy(update=holdout)}
+    return declared.model_copy(update=changed)
+
+
+def other(run="night-0003") -> Champion:
+    """A champion or a candidate with other files."""
+    return Champion(run, TONIGHT.when, "", Installed({"md5": "1"}, {"weights.json": "1"}))
+
+
+# ---- metrics files: each rule passed, exactly at its limit, undecided, failed, open
+
+
+def contestants(stages):
+    compared = stages["evaluate_temperature"]["contestants"]
+    return [compared[name] for name in compared if name not in ("hold", "exact_model")]
+
+
+def banded(key, limit):
+    """A figure of every contestant: inside its limit, at it, across it, beyond it, endless, missing."""
+
+    def to(value, low, high):
+        return lambda stages: [
+            one.update({key: made.figure(value, low, high)}) for one in contestants(stages)
+        ]
+
+    return [
+        (PASSED, to(0.5 * limit, 0.4 * limit, 0.6 * limit)),
+        (PASSED, to(0.9 * limit, 0.8 * limit, limit)),
+        (OPEN, to(limit, 0.9 * limit, 1.1 * limit)),
+        (FAILED, to(1.2 * limit, 1.1 * limit, 1.3 * limit)),
+        (FAILED, to(1e24, 1e23, 1e25)),
+        (FAILED, to(None, None, None)),
+        (OPEN, lambda stages: [one.pop(key, None) for one in contestants(stages)]),
+    ]
+
+
+def margin(key, least):
+    def to(value):
+        return lambda stages: [one["margins"].update({key: value}) for one in contestants(stages)]
+
+    at = [(PASSED, 2.0 * least), (PASSED, least), (FAILED, np.nextafter(least, 0)), (FAILED, 0.0)]
+    return [
+        *((state, to({"median": value, "worst": 0.5 * value})) for state, value in at),
+        (OPEN, lambda stages: [one["margins"].pop(key, None) for one in contestants(stages)]),
+    ]
+
+
+def counted(cases):
+    return lambda stages: [one.update(crossings={"cases": cases, "of": 24}) for one in contestants(stages)]
+
+
+def drift(key):
+    alarm = {"loop": "temperature", "key": "k", "recording": "a.csv", "cause": "the gain fell", "sigmas": 9.0}
+    written = {"alarms": [], "watched": [], "figures": {}} | ({key: [alarm]} if key else {})
+    return lambda _: artifacts.write_json(NIGHTLY, {"run": "night-0006", "when": "", "drift": written})
+
+
+def temperature(rules: ReportRules):
+    return [
+        banded("settled_error", rules.settled_error_degC),
+        banded("settling", 60.0),
+        banded("overshoot", rules.overshoot_degC),
+        banded("at_limits", rules.at_limits_percent),
+        margin("disk", rules.disk_margin),
+        margin("delay_s", rules.delay_margin_s),
+        [(PASSED, counted(0)), (FAILED, counted(1)), (OPEN, counted(None))],
+        [(FAILED, lambda stages: [one.update(stable={"count": 5, "of": 6}) for one in contestants(stages)])],
+        [(ABSENT, lambda stages: stages.pop("evaluate_temperature"))],
+        [(PASSED, drift("")), (PASSED, drift("watched")), (FAILED, drift("alarms"))],
+    ]
+
+
+def deposition(rules: ReportRules):
+    whole = 1.5
+
+    def scores(**changed):
+        ours = {"error": 2.0, "line": 1.0, "whole": whole} | changed
+        rows = [
+            ("square", "A", "on_off", False, 100.0, None, 60.0),
+            ("square", "A", "priority", False, 50.0, 11.0, 9.0),
+            ("square", "A", "basis", True, ours["error"], 2.5, ours["line"]),
+            ("square", "A", "ilc", False, ours["whole"], None, 0.5),
+        ]
+        table = made._columns(SCORES, rows if ours["whole"] else rows[:-1])
+        return lambda _: artifacts.write_table("datasets/compose_parts/scores.parquet", SCORES, table)
+
+    def learned(ratio):
+        return lambda stages: stages["train_ilc"]["A"]["pixels"].update(best_ratio=ratio)
+
+    def conformance(**changed):
+        path = "datasets/compose_parts/conformance.json"
+        said = json.loads(Path(path).read_text())
+        return lambda _: artifacts.write_json(path, {"square": said["square"] | changed})
+
+    most, line, above = rules.flow_error_percent, rules.line_volume_percent, rules.above_whole_points
+    return [
+        [
+            (PASSED, scores(error=most, whole=most)),
+            (FAILED, scores(error=np.nextafter(most, 99), whole=most)),
+            (PASSED, scores(line=line)),
+            (FAILED, scores(line=np.nextafter(line, 99))),
+            (OPEN, scores(line=np.nan)),
+            (PASSED, scores(whole=2.0 - above)),
+            (FAILED, scores(whole=1.99 - above)),
+            (OPEN, scores(whole=None)),
+        ],
+        [
+            (PASSED, learned(0.01 * rules.learned_percent)),
+            (FAILED, learned(0.3)),
+            (FAILED, learned(1e24)),
+            (OPEN, lambda stages: stages.pop("train_ilc")),
+        ],
+        [
+            (PASSED, conformance(refused=[])),
+            (FAILED, conformance(refused=[{"line": 7, "why": "no such word"}])),
+        ],
+        [(ABSENT, lambda _: Path("datasets/compose_parts/scores.parquet").unlink())],
+    ]
+
+
+def setpoint(rules: ReportRules):
+    def lost(percent, runs=made_setpoint.RUNS):
+        return lambda _: made_setpoint.scoreboard({"our agent": (percent, 0.0)}, runs)
+
+    def image(percent, low, high):
+        def change(stages):
+            seen = stages["train_classifier"]
+            seen["image_accuracy"] = percent / 100
+            seen["intervals_percent"]["image"] = [low, high]
+
+        return change
+
+    def error(key, value):
+        return lambda stages: stages["train_classifier"].update({key: value})
+
+    least = 100 * rules.image_accuracy
+    return [
+        [(PASSED, lost(0.1)), (FAILED, lost(20.0)), (OPEN, lost(2.0, 50))],
+        [
+            (PASSED, image(least + 2, least, least + 4)),
+            (OPEN, image(least + 1, least - 1, least + 3)),
+            (FAILED, image(least - 2, least - 3, least - 0.5)),
+        ],
+        [(PASSED, error("ece_image", rules.ece_image)), (FAILED, error("ece_image", 0.2))],
+        [(PASSED, error("ece_window", rules.ece_window)), (OPEN, error("ece_window", None))],
+        [(ABSENT, lambda _: Path("datasets/evaluate_setpoint/choice.json").unlink())],
+    ]
+
+
+def worst(states) -> str:
+    return OPEN if ABSENT in states else next((state for state in (FAILED, OPEN) if state in states), PASSED)
+
+
+def written(rng) -> dict[str, str]:
+    """Metrics files with none to two rules of each loop changed; the state that each loop has by them."""
+    rules = params.load(ReportRules, "report", ROOT / "params.yaml")
+    stages = made.metrics() | made.deposition_metrics() | made_setpoint.metrics()
+    expected = {}
+    for loop, each in (("temperature", temperature), ("deposition", deposition), ("setpoint", setpoint)):
+        asked = each(rules)
+        chosen = rng.choice(len(asked), rng.choice([0, 1, 1, 2]), replace=False)
+        changes = [asked[k][rng.integers(len(asked[k]))] for k in sorted(chosen)]
+        for _, change in changes:
+            if "evaluate_temperature" in stages or loop != "temperature":
+                change(stages)
+        expected[loop] = worst([state for state, _ in changes])
+    for stage in (*made.metrics(), *made.deposition_metrics(), *made_setpoint.metrics()):
+        Path(f"reports/metrics/{stage}.json").unlink(missing_ok=True)
+    for stage, figures in stages.items():
+        artifacts.write_metrics(stage, figures)
+    return expected
+
+
+def words(page: str) -> str:
+    """What a page says, without its tags, styles and scripts."""
+    body = re.sub(r"<(style|script).*?</\1>", "", page, flags=re.DOTALL)
+    return " ".join(html.unescape(re.sub(r"<[^>]+>", "", body)).replace("\u202f", " ").split())
+
+
+def said(text: str) -> str:
+    return " ".join(typeset(text).replace("\u202f", " ").split())
+
+
+def section(page: str, loop: str) -> str:
+    """What nightly.html says of one loop."""
+    after = page.split(f'px">{loop}: ')[1]
+    return words(re.split(r"<h3|</section>", after)[0])
+
+
+@pytest.mark.parametrize("seed", range(100))
+def test_page_and_night_never_disagree(project, seed):
+    rng = np.random.default_rng([18, seed])
+    expected, asked = written(rng), settings()
+    before = ChampionState(
+        {loop: other() for loop in LOOPS if rng.random() < 0.5},
+        candidates={loop: other("night-0005") for loop in LOOPS if rng.random() < 0.5},
+    )
+    tonight, after = promoting.judged(asked, TONIGHT, before, lineage=Lineage)
+    sources = promoting.page_sources()
+    index = words(index_page.render(sources, judgement(sources)))
+    page = nightly_page.render([tonight], after, asked)
+    summary = reporting.summary(tonight, [])
+    one_line = index.split(" Rehearsal", 1)[0] + index  # the head is the title too
+    assert {loop: tonight.decisions[loop].verdict.state for loop in LOOPS} == expected
+    for loop, decision in tonight.decisions.items():
+        verdict, passed = decision.verdict, expected[loop] == PASSED
+        promotes = PROMOTED if loop in before.champions else FIRST
+        # the night promotes what the page passes, and nothing else
+        assert decision.decision == (promotes if passed else CANDIDATE), (loop, decision)
+        assert (loop in after.candidates) == (not passed)
+        assert (loop in tonight.promoted) == passed
+        # one sentence, on both pages
+        assert said(verdict.decision) in index and said(verdict.lead) in index
+        mine = section(page, loop)
+        assert said(verdict.sentence) in mine
+        # and none that contradicts it
+        assert verdict.decision.startswith("Rehearsal passed") == passed
+        assert (f"candidate {loop}: {verdict.sentence}" in summary) == (not passed)
+        assert ("Rehearsal passed" in mine) == passed and ("Rehearsal failed" in mine) == (
+            expected[loop] == FAILED
+        )
+        assert (f"candidate of {loop}, not run" in words(page)) == (not passed)
+        assert re.search(rf"Promoted: [^.]*\b{loop}", words(page)) is None or passed
+        kept = after.champions.get(loop) if not passed else None
+        assert kept == (before.champions.get(loop) if not passed else None)
+        mine_in_production = after.champions[loop] if passed else after.candidates[loop]
+        assert mine_in_production.rehearsal and mine_in_production.contestant == verdict.subject
+        assert mine_in_production.verdict == verdict.sentence
+    head = re.search(r"Rehearsal (?:passed|failed|open): .*?\.", one_line)
+    passed = sorted(loop for loop, state in expected.items() if state == PASSED)
+    first = head[0] if head else ""
+    named = re.search(r"Rehearsal passed: (.*?)[;.]", first)
+    listed = (
+        list(LOOPS)
+        if named and "all three loops" in named[1]
+        else [loop for loop in LOOPS if named and loop in named[1]]
+    )
+    assert sorted(listed) == passed, (first, expected)
+    assert not re.search(r"\d{7,} ?%|e\+?\d+ ?%", words(page) + summary)
+
+
+def test_the_night_reads_what_the_pages_are_made_of():
+    assert {stage: f"reports/metrics/{stage}.json" for stage in promoting.MEASURED} == {
+        stage: report.METRICS[stage] for stage in promoting.MEASURED
+    }
+    assert set(promoting.MEASURED) == set(report.METRICS) >= set(report.FOLDERS)
+    assert all(folder == f"datasets/{stage}" for stage, folder in report.FOLDERS.items())
+
+
+def test_the_report_keeps_the_verdict_of_each_loop_as_the_night_reads_it(project, monkeypatch):
+    report.main()
+    made_anew = []
+    monkeypatch.setattr(promoting, "dvc", lambda *command, **_: made_anew.append(command))
+    verdicts, tonight = promoting.verdicts_of(settings(), TONIGHT)
+    kept = artifacts.read_metrics("report")
+    assert kept["verdicts"] == {loop: verdict.metrics() for loop, verdict in verdicts.items()}
+    assert {name: kept["verdict"][name] for name in kept["verdict"]} == verdicts["temperature"].metrics() | {
+        "rehearsal": False
+    }
+    assert made_anew == [] and tonight == TONIGHT
+    # the drift that they were made with is over since: they are made anew, so that both say the same
+    drift("alarms")(None)
+    promoting.verdicts_of(settings(), TONIGHT)
+    assert made_anew == [("repro", "--single-item", "--force", "report")]
+
+
+def test_pages_that_cannot_be_made_anew_are_told_and_the_night_goes_on(project, monkeypatch):
+    report.main()
+    drift("alarms")(None)
+
+    def refused(*_, **__):
+        raise ValueError("dvc repro failed: no room")
+
+    monkeypatch.setattr(promoting, "dvc", refused)
+    verdicts, tonight = promoting.verdicts_of(settings(), TONIGHT)
+    assert verdicts["temperature"].state == FAILED
+    assert tonight.notes == (
+        "the pages are not of tonight (dvc repro failed: no room); run ./run dvc repro --force report",
+    )
+
+
+def test_a_contestant_that_is_named_to_run_must_pass_itself(project):
+    stages = made.metrics()
+    own = stages["evaluate_temperature"]["contestants"]["varx_riccati"]
+    assert promoting.verdicts_of(settings(controller="varx_riccati"), TONIGHT)[0]["temperature"].winner == (
+        "varx_riccati"
+    )
+    own["overshoot"] = made.figure(9.0, 8.0, 10.0)
+    artifacts.write_metrics("evaluate_temperature", stages["evaluate_temperature"])
+    by_page, named = (
+        promoting.verdicts_of(settings(controller=name), TONIGHT)[0]["temperature"]
+        for name in ("page", "varx_riccati")
+    )
+    assert (by_page.state, by_page.winner) == (PASSED, "subspace_lqg")
+    assert named.state == FAILED and named.subject == "varx_riccati" and named.winner is None
+    assert named.sentence == "Rehearsal failed. First failed rule: overshoot."
+    assert "VARX + Riccati is named to run, and does not pass." in named.reason
+    tonight, after = promoting.judged(
+        settings(controller="varx_riccati"), TONIGHT, ChampionState(), lineage=Lineage
+    )
+    assert tonight.decisions["temperature"].decision == CANDIDATE
+    assert after.candidates["temperature"].contestant == "varx_riccati"
+    # one that was not judged at all is open
+    lost = promoting.verdicts_of(settings(controller="printer_pid"), TONIGHT)[0]["temperature"]
+    assert lost.state == OPEN and lost.subject == "printer_pid" and "was not judged" in lost.reason
+
+
+def test_what_runs_stays_where_the_page_finds_nobody_better_beyond_the_bands(project):
+    """The page's incumbent is the champion's contestant, where there is one."""
+    assert promoting.verdicts_of(settings(), TONIGHT)[0]["temperature"].winner == "subspace_lqg"
+    present = other()._replace(contestant="varx_riccati")
+    state = ChampionState({"temperature": present})
+    artifacts.write_json(NIGHTLY, TONIGHT.metrics(state))
+    tonight, after = promoting.judged(settings(), TONIGHT, state, lineage=Lineage)
+    assert tonight.decisions["temperature"].verdict.winner == "varx_riccati"
+    assert after.champions["temperature"].contestant == "varx_riccati"
+
+
+def test_the_champion_and_the_challenger_are_each_judged_as_their_own_contestant(project, monkeypatch):
+    asked = []
+
+    def measure(folder, contestant=""):
+        asked.append((str(folder), contestant))
+        return Evidence("panel", {f"case {k}": (f"plant {k}", 1.0) for k in range(8)}, {"worst_case": 1.0})
+
+    monkeypatch.setattr(judge, "judge", lambda *_: judge.Judge(measure, lambda _: {}))
+    verdict = promoting.verdicts_of(settings(), TONIGHT)[0]["temperature"]
+    for present in (other()._replace(contestant="pi_simc"), other()):
+        state = ChampionState({"temperature": present})
+        promoting.decided(settings(), "temperature", TONIGHT, state, verdict)
+    # one that was promoted before champion.json said so is what the night judged then
+    assert asked == [
+        ("datasets", "subspace_lqg"),
+        ("champion/temperature", "pi_simc"),
+        ("datasets", "subspace_lqg"),
+        ("champion/temperature", "varx_riccati"),
+    ]
+
+
+def test_the_same_files_as_another_contestant_are_another_challenger(project):
+    verdict = promoting.verdicts_of(settings(), TONIGHT)[0]["temperature"]
+    files = Installed({"md5": "0"}, champion.md5_of(LOOPS["temperature"]))
+    decisions = {
+        contestant: promoting.decided(
+            settings(),
+            "temperature",
+            TONIGHT,
+            ChampionState({"temperature": other()._replace(installed=files, contestant=contestant)}),
+            said,
+        ).decision
+        for contestant, said in (
+            ("subspace_lqg", verdict),
+            ("pi_simc", verdict),
+            (
+                "pi",
+                verdict._replace(state=FAILED, decision="Rehearsal failed.", lead="First failed rule: x."),
+            ),
+        )
+    }
+    assert [one.decision for one in decisions.values()] == [KEPT, PROMOTED, KEPT]
+    assert decisions["subspace_lqg"].reasons == ["the challenger is the champion, byte for byte"]
+    assert decisions["pi"].reasons == [
+        "the challenger is the champion, byte for byte, which does not pass: "
+        "Rehearsal failed. First failed rule: x."
+    ]
+
+
+def test_a_champion_that_would_lack_what_it_is_designed_from_is_not_promoted(project):
+    verdict = promoting.verdicts_of(settings(), TONIGHT)[0]["temperature"]._replace(subject="pi_simc")
+    decided = promoting.decided(settings(), "temperature", TONIGHT, ChampionState(), verdict).decision
+    assert decided.decision == KEPT and decided.reasons == [
+        "pi_simc is designed from datasets/identify_plant/spread.parquet, which the champion would lack; add "
+        "it to nightly.loops.temperature.artifacts"
+    ]
+
+
+def test_the_artifacts_hold_what_every_contestant_is_designed_from():
+    artifacts_of = set(params.load(Nightly, "nightly", ROOT / "params.yaml").loops["temperature"].artifacts)
+    assert promoting.OPTIONAL <= artifacts_of
+    # of these, a record may not determine some
+    loop = params.load(Nightly, "nightly", ROOT / "params.yaml").loops["temperature"]
+    assert set(loop.artifacts) - set(promoting.there(loop)) == {
+        path for path in promoting.OPTIONAL if not Path(path).is_file()
+    }
+
+
+# ---- in a repository
+
+
+@pytest.fixture
+def played(tmp_path, monkeypatch):
+    """A repository with one loop, whose page says what the test says."""
+    Project(tmp_path / "empty").make()
+    entered(Project(tmp_path / "empty"), tmp_path / "toy", monkeypatch)
+    Path("dvc.lock").write_text("schema: '2.0'\nstages: {}\n")
+    copy = Project(tmp_path / "toy")
+    own = {"judge": "deposition", "cases": "", "recordings": "", "artifacts": ["datasets/compose_parts/x"]}
+    copy.set(loops={"deposition": own})
+    evidence = Evidence("panel", {f"case {k}": (f"part {k}", 1.0) for k in range(8)}, {"worst": np.inf})
+    monkeypatch.setattr(judge, "judge", lambda *_: judge.Judge(lambda *_: evidence, lambda _: {"worst": 1.0}))
+    monkeypatch.setattr(screening, "reference", lambda *_: None)
+    return copy
+
+
+def test_a_candidate_is_kept_beside_the_champions_until_a_challenger_passes(played, monkeypatch):
+    words_of = {
+        FAILED: ("Rehearsal failed.", "First failed rule: flow error."),
+        PASSED: ("Rehearsal passed: the basis functions.", "All six rules passed."),
+    }
+
+    def a_night(number, files, state):
+        artifact = Path("datasets/compose_parts/x")
+        artifact.parent.mkdir(parents=True, exist_ok=True)
+
+        def reproduced(_, run):
+            # the pages that the stages make show the drift of this very night
+            assert artifacts.read_json(NIGHTLY)["run"] == run == f"night-{number:04d}"
+            artifact.write_text(files)
+
+        monkeypatch.setattr(night, "_reproduce", reproduced)
+        verdict = Verdict("deposition", state, *words_of[state], "", "", "", "basis", subject="basis")
+        verdict = verdict._replace(rehearsal=True)
+        monkeypatch.setattr(
+            promoting, "verdicts_of", lambda settings, night: ({"deposition": verdict}, night)
+        )
+        Path("learn.py").write_text(f"# night {number}\n")
+        status, summary = night.nightly()
+        assert status == night.OK, summary
+        return summary, json.loads(played.run("git", "show", "HEAD:champion.json").stdout)
+
+    summary, state = a_night(1, "one", FAILED)
+    assert "candidate deposition: Rehearsal failed. First failed rule: flow error." in summary
+    assert "promoted" not in summary
+    candidate = state["candidates"]["deposition"]
+    assert not state["champions"] and not state["history"]
+    assert candidate["run"] == "night-0001" and candidate["files"] and candidate["lineage"]["commit"]
+    assert (candidate["contestant"], candidate["rehearsal"]) == ("basis", True)
+    assert candidate["why"] == candidate["verdict"] == "Rehearsal failed. First failed rule: flow error."
+    assert candidate["metrics"]["mean_cost"] == 1.0
+    assert played.production_of("deposition.candidate") == {"compose_parts/x": b"one"}
+    # the same challenger again stays the candidate of the night that made it, and its files are as they were
+    before = played.head()
+    _, state = a_night(2, "one", FAILED)
+    assert played.head() == before  # nothing moved, and nothing is committed
+    assert state["candidates"]["deposition"]["run"] == "night-0001"
+    # the next one takes its place
+    _, state = a_night(3, "two", FAILED)
+    assert state["candidates"]["deposition"]["run"] == "night-0003"
+    assert played.production_of("deposition.candidate") == {"compose_parts/x": b"two"}
+    # a killed night's candidate is put back as it was committed
+    Path("champion/deposition.candidate/compose_parts/x").write_text("half")
+    assert any("put back to night-0003" in sentence for sentence in champion.as_committed())
+    assert played.production_of("deposition.candidate") == {"compose_parts/x": b"two"}
+    summary, state = a_night(4, "two", PASSED)
+    assert "promoted deposition" in summary and "candidate" not in summary
+    assert "candidates" not in state and state["champions"]["deposition"]["rehearsal"]
+    assert state["champions"]["deposition"]["contestant"] == "basis"
+    assert played.production_of("deposition") == {"compose_parts/x": b"two"}
+    assert not Path("champion/deposition.candidate").exists()
+    tracked = played.run("git", "ls-files", "champion").stdout.split()
+    assert tracked == ["champion/.gitignore", "champion/deposition.dvc"]
+    # a challenger that does not pass leaves the champion alone
+    summary, state = a_night(5, "three", FAILED)
+    assert state["champions"]["deposition"]["run"] == "night-0004"
+    assert state["candidates"]["deposition"]["run"] == "night-0005"
+    assert played.production_of("deposition") == {"compose_parts/x": b"two"}
+    page = words(Path("reports/nightly.html").read_text())
+    assert "Nothing is promoted: deposition does not pass." in page and "Rehearsal failed." in page
+    assert champion.as_committed() == []
+    assert not [line for line in played.dirty() if "champion" in line]
