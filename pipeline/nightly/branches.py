@@ -5,6 +5,7 @@ the branch, on top of those that wait there already, so that none is lost; mergi
 them into production, with the history of all.
 """
 
+from pathlib import Path
 from typing import NamedTuple
 
 from pipeline.nightly import champion
@@ -27,12 +28,25 @@ def check(settings: Nightly) -> None:
     """Raises ValueError where a night's commit would be lost, or would move a branch under the checkout."""
     if settings.promotion == "at_once":
         check_attached()
-    elif git("symbolic-ref", "-q", "HEAD", check=False) == f"refs/heads/{settings.branch}":
+        return
+    branch = settings.branch
+    if not git("check-ref-format", "--branch", branch, check=False):
+        raise ValueError(f"nightly.branch: expected the name of a branch, found {branch!r}; write nightly")
+    if where := _checked_out(branch):
         raise ValueError(
-            f"nightly.branch: expected a branch apart from the one that is in production, found "
-            f"{settings.branch}, "
-            "which is checked out; git switch to the other one, or name another branch"
+            f"nightly.branch: expected a branch apart from the one that is in production, found {branch}, "
+            f"which is checked out in {where}; git switch to the other one there, or name another branch"
         )
+
+
+def _checked_out(branch: str) -> str:
+    """The folder in which a branch is checked out, this or another worktree; empty where it is in none."""
+    for entry in git("worktree", "list", "--porcelain").split("\n\n"):
+        folder, *lines = entry.splitlines()
+        place = folder.removeprefix("worktree ")
+        if f"branch refs/heads/{branch}" in lines and Path(place).exists():
+            return place
+    return ""
 
 
 def waiting(settings: Nightly) -> Waiting:

@@ -243,6 +243,8 @@ def earlier(state: ChampionState, run: str, loop: str) -> dict[str, Champion]:
     history = [line for line in state.history if not loop or line.loop == loop]
     if run:
         champions = {line.loop: line.champion for line in history if line.run == run}
+        if champions and all(state.champions[name].md5 == former.md5 for name, former in champions.items()):
+            raise ValueError(f"{FILE}: {run} is in production already; nothing is to be put back")
     else:
         stacks = {name: standing(state, name) for name in ([loop] if loop else state.champions)}
         latest = max(((stack[-1][0], name) for name, stack in stacks.items() if len(stack) > 1), default=None)
@@ -297,7 +299,8 @@ def as_committed() -> list[str]:
     if changed:
         git("checkout", "-q", "HEAD", "--", *changed)
         mended.append(f"{', '.join(changed)} put back to the last commit")
-    if mended:
+    if mended or names("diff", "--cached", "--name-only", "HEAD", "--", str(FILE), str(FOLDER)):
+        # where git's index was locked after a promotion, it still stages the champion before
         fresh_index([str(FILE), str(FOLDER)])
     for unfinished in (*FOLDER.glob(".*.new"), *FOLDER.glob(".*.old")):
         shutil.rmtree(unfinished)

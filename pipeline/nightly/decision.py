@@ -66,6 +66,8 @@ def _first(challenger: Evidence) -> LoopDecision:
     """Where there is no champion, a challenger that is fit becomes one."""
     failing = [case for case, (_, cost) in challenger.cases.items() if not np.isfinite(cost)]
     reasons = _unfit(challenger)
+    if not challenger.cases:
+        reasons.append("it was judged on no case")
     if failing:
         reasons.append(f"{len(failing)} of {len(challenger.cases)} cases fail, such as {failing[0]}")
     guards = {name: Guard(None, figure, None) for name, figure in challenger.guards.items()}
@@ -79,18 +81,23 @@ def _unfit(challenger: Evidence) -> list[str]:
     return [
         f"{name} is {figure:g}; none is allowed"
         for name, figure in challenger.guards.items()
-        if name.startswith("unstable") and figure > 0
+        if name.startswith("unstable") and not figure <= 0
     ]
 
 
 def _percent(value: float) -> str:
     """ "5.0 %"; "beyond 1,000 %" where the figure says nothing."""
-    return beyond_meaning(value, "%").replace(THIN, " ") or f"{value:.1f} %"
+    return beyond_meaning(value, "%").replace(THIN, " ") or f"{_tenths(value)} %"
+
+
+def _tenths(value: float) -> str:
+    """ "5.0"; of what rounds to nothing no sign."""
+    return f"{round(value, 1) + 0.0:.1f}"
 
 
 def _band(low: float, high: float) -> str:
     """ "4.0 to 6.0 %"."""
-    return f"{_percent(low) if beyond_meaning(low, '%') else f'{low:.1f}'} to {_percent(high)}"
+    return f"{_percent(low) if beyond_meaning(low, '%') else _tenths(low)} to {_percent(high)}"
 
 
 def _chance(test: Paired) -> str:

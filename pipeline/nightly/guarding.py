@@ -26,6 +26,7 @@ from pipeline.store import artifacts
 
 LOCK, RUNNING, RESERVE, BEFORE = STATE / "lock", STATE / "running.json", STATE / "reserve", STATE / "before"
 RESERVE_BYTES = 1 << 20
+LOCKED_S = 3600.0  # no git holds a lock for so long
 METRICS, LOCKED = Path("reports/metrics"), "dvc.lock"
 MARKERS = ("<<<<<<< ", ">>>>>>> ", "||||||| ")
 
@@ -37,8 +38,9 @@ class BusyError(ValueError):
 @contextlib.contextmanager
 def alone() -> Iterator[list[str]]:
     """The night's lock, and what the one before left behind, as sentences. Raises BusyError where another
-    night holds it."""
+    night holds it, and ValueError where a merge is half done."""
     with locked():
+        unmerged()
         mended = mend()
         RUNNING.touch()
         try:
@@ -53,6 +55,11 @@ def alone() -> Iterator[list[str]]:
 def locked() -> Iterator[None]:
     """The night's lock alone. Raises BusyError where another night holds it; the kernel lets go when a
     process dies."""
+    if STATE.exists() and not STATE.is_dir():
+        raise ValueError(
+            f"{STATE}: expected the folder in which nights are remembered, found a file; "
+            "move it away, and run it again"
+        )
     STATE.mkdir(exist_ok=True)
     if not (STATE / ".gitignore").exists():
         artifacts.write_text(STATE / ".gitignore", "*\n")
@@ -85,9 +92,6 @@ def mend() -> list[str]:
             mended.append(
                 f"the night before was killed and had left {ended} processes running; they were ended"
             )
-        for path in stale_git_locks():
-            path.unlink(missing_ok=True)
-            mended.append(f"{path} was left by a killed git and is removed")
         for pattern in (
             ".champion.json.*",
             "champion/.*.dvc.*",
@@ -97,6 +101,9 @@ def mend() -> list[str]:
             for path in Path().glob(pattern):
                 path.unlink(missing_ok=True)
         mended.append("the night before was killed")
+    for path in stale_git_locks(older_than_s=0 if killed else LOCKED_S):
+        path.unlink(missing_ok=True)
+        mended.append(f"{path} was left by a killed git and is removed")
     mended += champion.as_committed()
     if killed:
         fresh_index(["dvc.lock", str(METRICS), str(champion.FILE), str(champion.FOLDER)])
@@ -181,15 +188,21 @@ def _remedy(name: str) -> str:
 
 
 def unmerged() -> None:
-    """Raises ValueError where there is no git, or a merge or rebase is half done: nothing may be put right
-    then."""
+    """Raises ValueError where there is no git, or a merge, a rebase or the like is half done: nothing may be
+    put right then."""
     if not git("rev-parse", "--verify", "-q", "HEAD", check=False):
         raise ValueError(
             "expected a git repository with at least one commit, found none; run git init, "
             "and commit the project"
         )
     folder = Path(git("rev-parse", "--git-dir"))
-    for name, word in (("MERGE_HEAD", "merge"), ("rebase-merge", "rebase"), ("rebase-apply", "rebase")):
+    for name, word in (
+        ("MERGE_HEAD", "merge"),
+        ("rebase-merge", "rebase"),
+        ("rebase-apply", "rebase"),
+        ("CHERRY_PICK_HEAD", "cherry-pick"),
+        ("REVERT_HEAD", "revert"),
+    ):
         if (folder / name).exists():
             raise ValueError(
                 f"a {word} is under way in git; finish it (or give it up with git {word} "

@@ -4,6 +4,7 @@ are new, and where those go that cannot be learned from; what of it no commit ho
 import hashlib
 import itertools
 import json
+import os
 import shutil
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -59,20 +60,40 @@ class Hashes:
         stamp = [status.st_size, status.st_mtime_ns, status.st_ino]
         before = self.remembered.get(str(path))
         same = bool(before) and before[:3] == stamp
-        self.now[str(path)] = before if same else [*stamp, artifacts.sha256(path)]
+        try:
+            self.now[str(path)] = before if same else [*stamp, artifacts.sha256(path)]
+        except OSError as error:
+            raise ValueError(
+                f"{path} cannot be read ({error.strerror}); make it readable, or move it away"
+            ) from None
         return self.now[str(path)][3]
 
     def below(self, place: str) -> dict[str, str]:
         """{path: digest} of a file, or of every file below a folder that a stage would read."""
         path = Path(place)
-        files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
         relevant = [
             file
-            for file in files
+            for file in ([path] if path.is_file() else sorted(path.rglob("*")))
             if not any(part.startswith(".") or part == "__pycache__" for part in file.parts)
             and file.suffix != ".pyc"
+            and not file.is_dir()
         ]
+        for file in relevant:
+            _check(file)
         return {file.as_posix(): self.of(file) for file in relevant}
+
+
+def _check(file: Path) -> None:
+    """Raises ValueError where the name of a file is no text, which no JSON can hold, or where it is none that
+    can be read to its end."""
+    try:
+        file.as_posix().encode()
+    except UnicodeEncodeError:
+        shown = os.fsencode(file).decode("utf-8", "backslashreplace")
+        raise ValueError(f"{shown}: expected a name in UTF-8, found bytes that are none; rename it") from None
+    if not file.is_file():
+        found = "a link that leads nowhere" if file.is_symlink() else "a pipe or a device"
+        raise ValueError(f"{file}: expected a file, found {found}; move it away")
 
 
 def contents(hashes: Hashes, places: list[str]) -> dict[str, str]:

@@ -56,14 +56,24 @@ def _cases(path: Path) -> tuple[Evidence, dict[str, float]]:
             for name, case in declared["cases"].items()
         }
         guards = {name: float(guard["value"]) for name, guard in declared["guards"].items()}
-        return Evidence(str(declared["panel"]), cases, guards), {
-            name: float(guard["allowed"]) for name, guard in declared["guards"].items()
-        }
-    except (KeyError, TypeError, AttributeError) as error:
+        allowed = {name: float(guard["allowed"]) for name, guard in declared["guards"].items()}
+        evidence = Evidence(str(declared["panel"]), cases, guards)
+    except KeyError as error:
+        raise ValueError(f"{path}: {_EXPECTED}, found no {error}; let its stage write it") from None
+    except (TypeError, AttributeError, ValueError) as error:
+        raise ValueError(f"{path}: {_EXPECTED}, found another form ({error}); mend its stage") from None
+    wrong = [f"{name} costs {cost:g}" for name, (_, cost) in cases.items() if not cost > 0]
+    for name, figures in (("value", guards), ("allowed", allowed)):
+        wrong += [f"{name} {figure:g} of {guard}" for guard, figure in figures.items() if np.isnan(figure)]
+    if wrong or not cases:
         raise ValueError(
-            f"{path}: expected panel, cases with block and cost, and guards with value and allowed, "
-            f"found no {error}; let its stage write them"
-        ) from None
+            f"{path}: expected cases with costs above 0, and guards with numbers, found "
+            f"{wrong[0] if wrong else 'no case'}; mend its stage"
+        )
+    return evidence, allowed
+
+
+_EXPECTED = "expected panel, cases with block and cost, and guards with value and allowed"
 
 
 def _deposition(folder: Path) -> Evidence:
@@ -98,7 +108,7 @@ def _setpoint(folder: Path) -> Evidence:
     return Evidence(
         joblib.hash(sorted(lost)),
         {name: (name, cost) for name, cost in lost.items()},
-        {"worst_unsettled_percent": max(lost.values()), "slowest_p90_steps": float(slow)},
+        {"worst_unsettled_percent": max(lost.values(), default=np.nan), "slowest_p90_steps": float(slow)},
     )
 
 

@@ -443,16 +443,23 @@ def _to_remember(job: Job, work: Work) -> Remembered:
         )
     return Remembered(
         night=night.number,
-        # a clock that was set back must not make the last success look older than it is
-        success=last.success if work.lost else max(night.when, last.success or ""),
+        success=last.success if night.lost else _success(night.when, last.success, job.settings.watch_h),
         # a night that lost a loop is repeated
-        inputs=None if work.lost else inputs.digest(work.digests),
+        inputs=None if night.lost else inputs.digest(work.digests),
         unpushed=night.unpushed,
         recordings={name: inputs.recordings(work.digests, loop) for name, loop in job.settings.loops.items()},
         drift=work.memory,
         hashes=job.hashes.now,
         settings=known,
     )
+
+
+def _success(when: str, before: str | None, watch_h: float) -> str:
+    """The time of the last success. A clock that was set back does not make it older, unless the one before
+    lies so far ahead that the watchdog would wait for it: one of the two clocks was wrong."""
+    if before and watch.hours_since(before, datetime.datetime.fromisoformat(when)) < -watch_h:
+        return when
+    return max(when, before or "")
 
 
 def nights() -> list[Night]:

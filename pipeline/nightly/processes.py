@@ -6,6 +6,7 @@ import shlex
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,9 +22,13 @@ DURABLE = {"core.fsync": "all"}
 LITERAL = {"GIT_LITERAL_PATHSPECS": "1"}
 
 
+class TooLongError(ValueError):
+    """What was run took longer than it may, and was ended."""
+
+
 def git(*arguments: str, env: dict[str, str] | None = None, check: bool = True, place: str = "") -> str:
     """Standard output of `git ...`, in the worktree `place` where it is named. Raises ValueError with git's
-    last line where it fails and `check` is on."""
+    own reason where it fails and `check` is on."""
     return _output(arguments, env or {}, check=check, place=place).strip()
 
 
@@ -59,7 +64,7 @@ def _output(arguments: Sequence[str], env: dict[str, str], *, check: bool, place
     )
     if check and ended.returncode:
         raise ValueError(
-            f"git {arguments[0]} failed: {_last(ended.stderr) or f'exit status {ended.returncode}'}"
+            f"git {arguments[0]} failed: {_reason(ended.stderr) or f'exit status {ended.returncode}'}"
         )
     return ended.stdout if ended.returncode == 0 else ""
 
@@ -74,8 +79,8 @@ def configured(settings: dict[str, str]) -> dict[str, str]:
 
 
 def dvc(*arguments: str, log: Path | None = None, limit_s: float = 3600) -> str:
-    """What `dvc ...` printed. Raises ValueError with its own sentence where it fails or takes longer than
-    `limit_s`; its whole process group ends with it."""
+    """What `dvc ...` printed. Raises ValueError with its own sentence where it fails, and TooLongError
+    where it takes longer than `limit_s`; its whole process group ends with it."""
     command = [sys.executable, "-m", "dvc", *arguments]
     target = log or STATE / "dvc.log"
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -93,7 +98,7 @@ def dvc(*arguments: str, log: Path | None = None, limit_s: float = 3600) -> str:
     try:
         status = child.wait(limit_s)
     except subprocess.TimeoutExpired:
-        raise ValueError(
+        raise TooLongError(
             f"dvc {shlex.join(arguments)} was ended after {limit_s / 3600:.2g} h (nightly.longest_h)"
         ) from None
     finally:
@@ -119,8 +124,10 @@ def sentence(text: str) -> str:
     return reason if own or not before else f"{before[-1]} ({reason})"
 
 
-def _last(text: str) -> str:
-    return next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "")
+def _reason(text: str) -> str:
+    """What git died of; its last line where it does not say so."""
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    return ([line for line in lines if line.startswith(("fatal:", "error:"))] or lines or [""])[-1]
 
 
 # ---- commits
@@ -231,7 +238,7 @@ def end_orphans() -> int:
     return len(pids)
 
 
-def stale_git_locks() -> list[Path]:
+def stale_git_locks(*, older_than_s: float) -> list[Path]:
     """Lock files of git where no git is at work in this repository: a
     killed one's, which git itself never removes."""
     if not Path("/proc/self").exists() or any(_works_here(entry) for entry in Path("/proc").glob("[0-9]*")):
@@ -241,6 +248,7 @@ def stale_git_locks() -> list[Path]:
         path
         for pattern in ("*.lock", "refs/heads/**/*.lock", "beadline-index.*")
         for path in folder.glob(pattern)
+        if time.time() - path.stat().st_mtime >= older_than_s
     ]
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.nightly import champion, judge, screening
+from pipeline.nightly import champion, judge, reporting, screening
 from pipeline.nightly.decision import decide
 from pipeline.nightly.processes import STATE, dvc
 from pipeline.nightly.settings import Loop, Nightly
@@ -45,18 +45,27 @@ def judged(
     settings: Nightly, night: Night, state: ChampionState, *, lineage: Callable[[], Lineage]
 ) -> tuple[Night, ChampionState]:
     """The night with a decision on each loop; what is in production, and the candidates beside it. Their
-    files lie in champion/<loop> and champion/<loop>.candidate by then."""
+    files lie in champion/<loop> and champion/<loop>.candidate by then. Raises ValueError where no loop can be
+    judged."""
     verdicts, night = verdicts_of(settings, night)
     made_from = lineage()  # with the lock of the pages, where they were made anew
     decisions: dict[str, LoopDecision] = {}
     for name in settings.loops:
         verdict = verdicts.get(name)
-        decision, metrics = decided(settings, name, night, state, verdict)
+        try:
+            decision, metrics = decided(settings, name, night, state, verdict)
+        except reporting.REFUSALS as error:  # what cannot be judged stops no other loop
+            why = reporting.told(error, night.run)
+            decision = LoopDecision(record.FAILED, [f"it cannot be judged, and its champion stays: {why}"])
+            metrics = None
         decisions[name] = decision = decision._replace(verdict=verdict)
         if decision.promotes or decision.decision == CANDIDATE:
             state = _placed(settings, name, night, state, JudgedLoop(decision, metrics), made_from)
         if name in state.candidates and verdict is not None and verdict.state == PASSED:
             state = _without_candidate(state, name)
+    if all(decision.decision == record.FAILED for decision in decisions.values()):
+        whys = (f"{name}: {decision.reasons[0]}" for name, decision in decisions.items())
+        raise ValueError("; ".join(whys))
     promoted = tuple(name for name, decision in decisions.items() if decision.promotes)
     night = night._replace(decisions=decisions, promoted=promoted)
     outcome = record.PROMOTED if promoted else CANDIDATE if night.candidates else KEPT

@@ -20,7 +20,10 @@ from pipeline.store import artifacts
 LAST, NIGHTS, METRICS = STATE / "last.json", STATE / "nights.json", Path("reports/metrics/nightly.json")
 LONGEST_HISTORY = 1000
 # how a file that is JSON, but not what was written there, shows itself when it is read
-MISSHAPEN = (ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError)
+MISSHAPEN = (
+    *(ValueError, KeyError, TypeError, AttributeError, IndexError, RecursionError),
+    IsADirectoryError,
+)
 T = TypeVar("T")
 
 

@@ -26,7 +26,7 @@ REFUSALS = (ValueError, OSError, np.linalg.LinAlgError)
 
 def told(error: Exception, run: str) -> str:
     """An error in one sentence. The traceback of a mistake of this program goes to the night's log."""
-    said = " ".join(str(error).split())
+    said = " ".join((artifacts.reason(error) if isinstance(error, OSError) else str(error)).split())
     if isinstance(error, REFUSALS) and not isinstance(error, UnicodeError):
         return said or type(error).__name__
     log = STATE / "logs" / f"{run}.log"
@@ -192,6 +192,5 @@ def watchdog(now: datetime.datetime) -> tuple[int, str]:
         reasons, settings, last = [told(error, "watch")], None, Remembered()
     if not reasons:
         return OK, f"nightly: watch: the last success was at {last.success}"
-    STATE.mkdir(exist_ok=True)
     troubles = watch.wake("watch", reasons, {"when": watch.stamp(now)}, watch.routes(settings))
     return FAILED, " | ".join([f"nightly: watch: {'; '.join(reasons)}", *troubles])

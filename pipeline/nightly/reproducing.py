@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from pipeline.nightly import guarding
-from pipeline.nightly.processes import STATE, dvc, sentence
+from pipeline.nightly.processes import STATE, TooLongError, dvc, sentence
 from pipeline.nightly.settings import Loop
 
 
@@ -79,11 +79,14 @@ def _upstream(stage: str, reads: Mapping[str, set[str]]) -> frozenset[str]:
 
 def reproduce(loops: Mapping[str, Loop], run: str, *, limit_s: float) -> Reproduced:
     """Runs the stages. Of a loop whose stages failed all is as it was before the night. Raises ValueError
-    where every loop failed, or a stage of none, or dvc itself."""
+    where every loop failed, or a stage of none, or dvc itself, and where
+    they take longer than `limit_s`."""
     log = STATE / "logs" / f"{run}.log"
     try:
         dvc("repro", "--keep-going", log=log, limit_s=limit_s)
         return Reproduced()
+    except TooLongError:
+        raise  # no stage is to blame by what it printed
     except ValueError:
         if not (failed := _failed(wires := wiring(loops))):
             raise

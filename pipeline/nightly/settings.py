@@ -1,13 +1,23 @@
 """Section `nightly` of the parameters: when to promote, what is drift, who is woken."""
 
+import re
 from typing import Annotated, Literal
 
 import pydantic
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from pipeline.store.params import Section
 
+
+def _in_the_project(path: str) -> str:
+    """The path of an artifact. Raises ValueError where its copy would not lie in champion/."""
+    if path.startswith(("/", "~")) or ".." in path.split("/"):
+        raise ValueError("but must lie in the project's folder; let a stage write it there")
+    return path
+
+
 Path = Annotated[str, Field(min_length=1, max_length=300)]
+Artifact = Annotated[Path, AfterValidator(_in_the_project)]
 
 
 class Loop(Section):
@@ -15,7 +25,7 @@ class Loop(Section):
     panel of its own (temperature), what its stage scored on cases that nothing was trained on
     (deposition, setpoint), or a file of costs by case."""
 
-    artifacts: list[Path] = Field(min_length=1, max_length=50)
+    artifacts: list[Artifact] = Field(min_length=1, max_length=50)
     judge: Literal["temperature", "deposition", "setpoint", "cases"]
     cases: str = Field(max_length=300)
     recordings: str = Field(max_length=300)
@@ -109,6 +119,11 @@ class Nightly(Section):
         if not self.loops:
             raise ValueError("has no loops; name at least one, with its artifacts and judge")
         for name, loop in self.loops.items():
+            if not re.fullmatch(r"\w[\w-]*", name):
+                raise ValueError(
+                    f"has loop {name!r}, which cannot be the name of a folder in champion/; "
+                    "name it by letters, digits, _ and -"
+                )
             # pages and alarms go by the name: a loop's drift must not be read as another's
             if loop.judge != "cases" and loop.judge != name:
                 raise ValueError(

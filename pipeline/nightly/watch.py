@@ -1,7 +1,6 @@
 """Who is woken, and when nobody ran: the alarm's JSON file, its command and webhook, the heartbeat, and the
 age of the last success."""
 
-import contextlib
 import datetime
 import json
 import os
@@ -71,12 +70,17 @@ def stamp(now: datetime.datetime) -> str:
     return now.astimezone(datetime.UTC).isoformat(timespec="seconds")
 
 
+def hours_since(when: str, now: datetime.datetime) -> float:
+    """Hours from a time as `stamp` writes it; below 0 where that lies in the future."""
+    return (now - datetime.datetime.fromisoformat(when)).total_seconds() / 3600
+
+
 def overdue(now: datetime.datetime, success: str | None, watch_h: float) -> str:
     """Why somebody should look: the last success is older than `watch_h` hours,
     or lies in the future; empty where all is well."""
     if success is None:
         return "no night has ever succeeded; run ./run beadline nightly, and look at its schedule"
-    age_h = (now - datetime.datetime.fromisoformat(success)).total_seconds() / 3600
+    age_h = hours_since(success, now)
     if age_h < -0.1:
         return (
             f"the clock is wrong: the last success, {success}, is {-age_h:.1f} h from now in the future; "
@@ -104,7 +108,7 @@ def wake(kind: str, reasons: Sequence[str], details: Mapping[str, Any], told: Ro
         artifacts.write_text(ALARM, text + "\n")
     except OSError as error:
         troubles.append(f"the alarm could not be written: {error}")
-    if told.alarm and (trouble := _commanded(told.alarm, kind)):
+    if told.alarm and (trouble := _commanded(told.alarm, kind, text.encode("utf-8", "replace"))):
         troubles.append(f"nightly.alarm: {_word(told.alarm)} {trouble}")
     if told.webhook and (trouble := _asked(told.webhook, text.encode("utf-8", "replace"))):
         troubles.append(f"nightly.webhook: {_server(told.webhook)}: {trouble}")
@@ -117,31 +121,30 @@ def beat(told: Routes) -> list[str]:
     return [f"nightly.heartbeat: {_server(told.heartbeat)}: {trouble}"] if trouble else []
 
 
-def _commanded(command: str, kind: str) -> str:
-    """Why the command did not do its work, empty where it did. It reads the alarm from its input too."""
+def _commanded(command: str, kind: str, alarm: bytes) -> str:
+    """Why the command did not do its work, empty where it did. It reads the alarm from its input too, which
+    needs no file."""
     with tempfile.TemporaryFile() as said:
         try:
-            alarm = ALARM.open("rb") if ALARM.exists() else None
-            with alarm or contextlib.nullcontext():
-                child = subprocess.Popen(
-                    [*shlex.split(command), str(ALARM)],
-                    stdin=alarm or subprocess.DEVNULL,
-                    stdout=subprocess.DEVNULL,
-                    stderr=said,
-                    start_new_session=True,
-                    env={**os.environ, "BEADLINE_ALARM_KIND": kind},
-                )
+            child = subprocess.Popen(
+                [*shlex.split(command), str(ALARM)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.DEVNULL,
+                stderr=said,
+                start_new_session=True,
+                env={**os.environ, "BEADLINE_ALARM_KIND": kind},
+            )
         except (OSError, ValueError) as error:
             return f"could not be started: {getattr(error, 'strerror', None) or error}"
         try:
-            status = child.wait(COMMAND_S)
+            child.communicate(alarm, COMMAND_S)
         except subprocess.TimeoutExpired:
             os.killpg(child.pid, signal.SIGKILL)
             child.wait()
             return f"was ended after {COMMAND_S:g} s"
         said.seek(0)
         words = " ".join(said.read().decode(errors="replace").split())[-200:]
-    return f"ended with status {status}: {words}" if status else ""
+    return f"ended with status {child.returncode}: {words}" if child.returncode else ""
 
 
 def _asked(url: str, body: bytes | None = None) -> str:
@@ -161,8 +164,13 @@ def _tried(url: str, body: bytes | None) -> str:
         try:
             headers = {"Content-Type": "application/json"} if body else {}
             request = urllib.request.Request(url, body, {"User-Agent": "beadline", **headers})
-            with urllib.request.urlopen(request, timeout=ASKED_S):
-                troubles.clear()
+            if request.type not in ("http", "https"):
+                raise ValueError(request.type)  # a file of this machine wakes nobody
+            asked = request.full_url
+            with urllib.request.urlopen(request, timeout=ASKED_S) as answer:
+                # on the way to another URL the alarm is lost
+                sent_on = body is not None and answer.url != asked
+            troubles[:] = ["it sends on to another URL; write that one"] if sent_on else []
         except Exception as error:  # whatever it is, it must not hide the night, nor tell the URL
             troubles[:] = [_refusal(error)]
 

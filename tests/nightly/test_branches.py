@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from pipeline.nightly import branches, champion, inputs, merging, night, processes
+from pipeline.nightly import accepting, branches, champion, inputs, merging, night, processes
 from pipeline.nightly.settings import Nightly
 from pipeline.reading import excluded
 from pipeline.report.nightly.production import Champion, ChampionState, Installed
@@ -341,6 +341,40 @@ def test_the_branch_of_promotions_cannot_be_the_one_in_production(by_branch):
     by_branch.set(promotion="branch", branch="main")
     status, summary = night.nightly()
     assert status == night.FAILED and "nightly.branch: expected a branch apart from" in summary
+    by_branch.set(promotion="branch", branch="a..b")
+    status, summary = night.nightly()
+    assert status == night.FAILED and "nightly.branch: expected the name of a branch, found 'a..b'" in summary
+
+
+def test_a_branch_that_is_checked_out_in_another_worktree_is_not_moved_under_it(by_branch):
+    by_branch.run("git", "branch", "nightly")
+    place = by_branch.folder.parent / "elsewhere"
+    by_branch.run("git", "worktree", "add", "-q", str(place), "nightly")
+    by_branch.record("second", BETTER[0])
+    status, summary = night.nightly()
+    assert status == night.FAILED and f"found nightly, which is checked out in {place}" in summary
+    assert by_branch.run("git", "-C", str(place), "status", "--porcelain").stdout == ""
+    shutil.rmtree(place)  # git still lists it
+    status, summary = night.nightly()
+    assert status == night.OK and "promoted toy on branch nightly" in summary
+
+
+@pytest.mark.parametrize("word", ["merge", "cherry-pick"])
+def test_nothing_is_rolled_back_while_something_is_half_done_in_git(project, word):
+    for branch in ("other", "main"):
+        project.run("git", "checkout", "-q", *(["-b"] if branch == "other" else []), branch)
+        Path("note").write_text(branch)
+        project.run("git", "add", "note")
+        project.run("git", "commit", "-qm", branch)
+    project.run("git", word, "other", check=False)
+    head, production = project.head(), project.production()
+    for by_hand in (lambda: night.rollback("", ""), lambda: accepting.accept("toy", "meant")):
+        with pytest.raises(ValueError, match=f"a {word} is under way in git"):
+            by_hand()
+    status, summary = night.nightly()
+    assert status == night.FAILED and f"a {word} is under way in git" in summary
+    project.run("git", word, "--abort")
+    assert project.head() == head and project.production() == production
 
 
 def test_what_lay_uncommitted_is_told_and_remembered_by_its_whole_name(project):

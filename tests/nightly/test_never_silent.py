@@ -134,12 +134,19 @@ def works_again(project: Project, run: str) -> None:
         ("last.json", ""),
         ("last.json", '{"night": 1, "drift": {"drifted": ["no"]}}'),
         ("nights.json", "<<<<<<< HEAD"),
+        ("nights.json", None),
+        ("last.json", None),
     ],
 )
 def test_broken_state_is_set_aside_and_costs_one_repeated_night(project, file, text):
-    (project.folder / ".beadline" / file).write_text(text)
+    broken, aside = Path(".beadline", file), Path(f".beadline/{file}.broken")
+    if text is None:
+        broken.unlink()
+        broken.mkdir()
+    else:
+        broken.write_text(text)
     told(project, f".beadline/{file}", f"set aside as .beadline/{file}.broken")
-    assert (project.folder / f".beadline/{file}.broken").read_text() == text
+    assert aside.is_dir() if text is None else aside.read_text() == text
     assert [n.run for n in night.nights()][-1] == "night-0002"
     works_again(project, "night-0003")
 
@@ -299,6 +306,19 @@ def test_a_commit_that_fails_leaves_the_champion_of_the_commit_before(project, m
 # ---- loops
 
 
+def test_stages_that_take_too_long_are_ended_and_that_is_said(project):
+    alarm = json.loads(Path("params.yaml").read_text())["nightly"]["alarm"]
+    project.set(longest_h=0.001, alarm=alarm)
+    Path("slow.txt").write_text("60")
+    project.record("second", [9.5])
+    began = time.monotonic()
+    told(project, "dvc repro --keep-going was ended after 0.001 h (nightly.longest_h)")
+    assert time.monotonic() - began < 50
+    Path("slow.txt").unlink()
+    project.set(alarm=alarm)
+    works_again(project, "night-0003")
+
+
 def test_a_loop_that_fails_stops_no_other_and_is_told(two):
     before, lock = two.production_of("other"), Path("dvc.lock").read_text()
     bad = Path("datasets/raw/other/bad.csv")
@@ -315,7 +335,7 @@ def test_a_loop_that_fails_stops_no_other_and_is_told(two):
     assert stage["other"] == yaml_stages(lock)["other"] and stage["learn"] != yaml_stages(lock)["learn"]
     assert two.dirty() == ["?? datasets/raw/other/bad.csv"]
     assert Path("datasets/pages.txt").read_text() == "1 4"
-    assert "The stages of other failed. Promoted: toy." in Path("reports/nightly.html").read_text()
+    assert "Failed: other. Promoted: toy." in Path("reports/nightly.html").read_text()
     # told every night until it is mended
     assert night.nightly()[0] == night.FAILED
     bad.unlink()
@@ -323,6 +343,28 @@ def test_a_loop_that_fails_stops_no_other_and_is_told(two):
     status, summary = night.nightly()
     assert status == night.OK and "promoted other" in summary
     assert "nothing new" in night.nightly()[1]
+
+
+def test_a_loop_that_cannot_be_judged_stops_no_other_and_is_told(two):
+    before = two.production_of("other")
+    stage = Path("other.py").read_text()
+    Path("other.py").write_text(stage.replace("1 + abs(mean - 10)", "mean - mean"))
+    two.run("git", "commit", "-qam", "costs of 0")
+    two.record("better", [9.0, 9.0, 9.0])
+    status, summary = night.nightly()
+    assert status == night.FAILED and "promoted toy" in summary
+    assert (
+        "other: it cannot be judged, and its champion stays: datasets/other/cases.json: expected" in summary
+    )
+    assert "found case 0 costs 0" in summary and "found case 0 costs 0" in Path("woken.json").read_text()
+    assert two.production_of("other") == before and two.champion()["run"] == "night-0003"
+    assert "Failed: other. Promoted: toy." in Path("reports/nightly.html").read_text()
+    assert night.nightly()[0] == night.FAILED  # told every night until it is mended
+    Path("other.py").write_text(stage)
+    two.run("git", "commit", "-qam", "costs again")
+    Path("datasets/raw/other/good.csv").write_text("7")
+    status, summary = night.nightly()
+    assert status == night.OK and "promoted other" in summary
 
 
 def test_the_stages_of_a_later_loop_run_where_an_earlier_one_fails_half_way(two):
@@ -430,7 +472,7 @@ def test_the_webhook_gets_a_text_and_is_tried_once_more(tmp_path, monkeypatch, q
     assert json.loads(body) == json.loads(watch.ALARM.read_text())
 
 
-@pytest.mark.parametrize("kind", ["hangs", "refuses", "fails", "no URL", "no server"])
+@pytest.mark.parametrize("kind", ["hangs", "refuses", "fails", "no URL", "no server", "file"])
 def test_a_server_that_does_not_answer_takes_a_bounded_time_and_its_url_is_not_told(
     tmp_path, monkeypatch, quick, kind
 ):
@@ -441,6 +483,7 @@ def test_a_server_that_does_not_answer_takes_a_bounded_time_and_its_url_is_not_t
         "refuses": lambda: "http://127.0.0.1:9/hook/s3cret?token=t0ken",
         "no URL": lambda: "s3cret-t0ken",
         "no server": lambda: "http://user:t0ken@s3cret:nan/",
+        "file": lambda: Path("t0ken").absolute().as_uri() if Path("t0ken").write_text("s3cret") else "",
     }[kind]()
     began = time.monotonic()
     troubles = watch.wake("failed", ["no room"], {}, watch.Routes(webhook=url, heartbeat=url)) + watch.beat(
@@ -449,6 +492,85 @@ def test_a_server_that_does_not_answer_takes_a_bounded_time_and_its_url_is_not_t
     assert time.monotonic() - began < 4 * 0.5 + 2
     assert len(troubles) == 2 and "nightly.webhook" in troubles[0] and "nightly.heartbeat" in troubles[1]
     assert "s3cret" not in str(troubles).replace("http://s3cret", "") and "t0ken" not in str(troubles)
+
+
+def test_an_alarm_that_is_sent_on_to_another_url_has_not_arrived(tmp_path, monkeypatch, quick):
+    monkeypatch.chdir(tmp_path)
+
+    class SendsOn(http.server.BaseHTTPRequestHandler):
+        def do_GET(self):  # what a POST becomes on its way to another URL: without its body
+            self.send_response(200 if self.path == "/there" else 302)
+            self.send_header("Location", "/there")
+            self.end_headers()
+
+        do_POST = do_GET
+
+        def log_message(self, *_):
+            pass
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), SendsOn)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    url = f"http://127.0.0.1:{server.server_port}/s3cret"
+    (trouble,) = watch.wake("failed", ["no room"], {}, watch.Routes(webhook=url))
+    assert "it sends on to another URL" in trouble and "s3cret" not in trouble
+    assert watch.beat(watch.Routes(heartbeat=url)) == []
+
+
+def test_where_no_alarm_can_be_written_the_command_reads_it_all_the_same(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path(".beadline").write_text("a file in the place of the folder")
+    status, summary = night.nightly()
+    assert status == night.FAILED and summary.startswith(
+        "nightly: nightly failed | .beadline: expected the folder in which nights are remembered, "
+        "found a file; move it away, and run it again"
+    )
+    code = "import sys; open('woken.json','w').write(sys.stdin.read())"
+    (trouble,) = watch.wake(
+        "failed", ["no room"] * 50_000, {}, watch.Routes(alarm=f'{sys.executable} -c "{code}"')
+    )
+    assert "the alarm could not be written" in trouble
+    assert json.loads(Path("woken.json").read_text())["reasons"][-1] == "no room"
+
+
+def test_a_recording_whose_name_is_no_text_is_named_and_the_night_after_its_renaming_works(project):
+    odd = os.fsencode("datasets/raw/toy") + b"/caf\xe9.csv"
+    Path(os.fsdecode(odd)).write_text("9")
+    told(
+        project,
+        r"datasets/raw/toy/caf\xe9.csv: expected a name in UTF-8, found bytes that are none; rename it",
+    )
+    os.rename(odd, "datasets/raw/toy/café.csv")
+    works_again(project, "night-0003")
+
+
+@pytest.mark.parametrize(
+    ("target", "words"),
+    [
+        ("/nowhere/b.csv", "b.csv: expected a file, found a link that leads nowhere; move it away"),
+        ("b.csv", "b.csv: expected a file, found a link that leads nowhere; move it away"),  # to itself
+        ("", "b.csv: expected a file, found a pipe or a device; move it away"),
+        ("/proc/self/mem", "b.csv cannot be read (Input/output error); make it readable, or move it away"),
+    ],
+)
+def test_a_recording_that_cannot_be_read_to_its_end_is_named_before_anything_waits_for_it(
+    project, target, words
+):
+    odd = Path("datasets/raw/toy/b.csv")
+    odd.symlink_to(target) if target else os.mkfifo(odd)
+    told(project, words)
+
+
+@pytest.mark.parametrize("artifact", ["../secret.json", "/etc/hostname", "datasets/../../x", "~/x"])
+def test_an_artifact_outside_the_project_is_refused(artifact):
+    changed = SETTINGS["loops"]["toy"] | {"artifacts": ["datasets/evaluate/cases.json", artifact]}
+    with pytest.raises(ValueError, match="must lie in the project's folder"):
+        Nightly.model_validate(SETTINGS | {"loops": {"toy": changed}})
+
+
+@pytest.mark.parametrize("name", ["../evil", "a/b", ".hidden", "toy.candidate", "-x", "two words"])
+def test_a_loop_whose_name_is_no_folder_in_champion_is_refused(name):
+    with pytest.raises(ValueError, match=f"has loop '{name}'"):
+        Nightly.model_validate(SETTINGS | {"loops": {name: SETTINGS["loops"]["toy"]}})
 
 
 def test_an_alarm_command_that_hangs_is_ended_and_does_not_tell_its_arguments(tmp_path, monkeypatch):

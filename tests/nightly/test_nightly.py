@@ -22,6 +22,7 @@ from pipeline.nightly import (
     night,
     processes,
     remembered,
+    reporting,
     screening,
     sweeping,
     watch,
@@ -273,13 +274,25 @@ def test_too_little_room_ends_the_night_before_it_begins(project):
 def test_a_clock_that_was_set_back_is_said_and_does_not_make_the_last_success_older(project):
     success = remembered.last().success
     project.record("second", [9.0, 9.0, 9.0])
-    status, summary = night.nightly(datetime.datetime.fromisoformat(success) - 30 * TOMORROW)
+    status, summary = night.nightly(datetime.datetime.fromisoformat(success) - 0.5 * TOMORROW)
     assert (
         status == night.OK
         and "the clock was set back" in summary
         and project.champion()["run"] == "night-0002"
     )
     assert remembered.last().success == success
+
+
+def test_one_night_by_a_clock_of_another_century_does_not_hold_the_watchdog_for_good(project):
+    today = datetime.datetime.fromisoformat(remembered.last().success) + TOMORROW
+    for _ in range(2):
+        night.nightly(datetime.datetime(2100, 1, 1, tzinfo=datetime.UTC))
+        assert remembered.last().success.startswith("2100")
+        assert night.nightly(today)[0] == night.OK
+        status, summary = reporting.watchdog(today)
+        assert status == night.OK and f"the last success was at {today.isoformat()}" in summary
+    night.nightly(datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC))
+    assert night.nightly(today)[0] == night.OK and remembered.last().success == today.isoformat()
 
 
 def test_a_promotion_that_was_killed_before_its_commit_never_was(project):
@@ -317,6 +330,18 @@ def test_gits_lock_left_by_a_killed_night_does_not_stop_the_next_one(project):
 
 
 @pytest.mark.slow
+def test_a_lock_of_a_git_that_died_by_day_leaves_no_promotion_staged_backwards(project):
+    lock = project.folder / ".git/index.lock"
+    lock.touch()  # as old as a git that may be at work
+    project.record("second", [9.0] * 3)
+    assert night.nightly()[0] == night.OK and project.champion()["run"] == "night-0002" and lock.exists()
+    os.utime(lock, (time.time() - 7200,) * 2)
+    project.record("third", [10.0])
+    _, summary = night.nightly()
+    assert "index.lock was left by a killed git and is removed" in summary and not lock.exists()
+    assert not [line for line in project.dirty() if "champion" in line]
+
+
 def test_a_commit_leaves_alone_what_the_user_has_staged(project):
     (project.folder / "mine.txt").write_text("half done")
     project.run("git", "add", "mine.txt")
@@ -395,6 +420,13 @@ def test_rollback_of_an_unknown_loop_names_the_loops(project):
     ):
         night.rollback("", "foo")
     assert not guarding.RUNNING.exists()
+
+
+def test_rollback_to_what_is_in_production_is_no_rollback(project):
+    head = project.head()
+    with pytest.raises(ValueError, match="champion.json: night-0001 is in production already"):
+        night.rollback("night-0001", "")
+    assert project.head() == head and not guarding.RUNNING.exists()
 
 
 def test_rollback_to_an_unknown_run_names_the_known_ones(project):

@@ -9,7 +9,7 @@ import yaml
 from benchmarks import nights
 from pipeline.deposition.workflow.tables import SCORES
 from pipeline.nightly import judge, promoting
-from pipeline.nightly.decision import KEPT, PROMOTED, Evidence, decide
+from pipeline.nightly.decision import FIRST, KEPT, PROMOTED, Evidence, decide
 from pipeline.nightly.settings import HoldOut, Loop, Nightly
 from pipeline.report.nightly import page as nightly_page
 from pipeline.report.nightly.production import Champion, ChampionState, Installed
@@ -234,6 +234,45 @@ def test_a_file_of_cases_that_lacks_its_costs_is_refused(project):
         match="expected panel, cases with block and cost, and guards with value and allowed, found no 'cost'",
     ):
         judge.judge(loop, project).measure(Path("datasets"))
+
+
+@pytest.mark.parametrize(
+    ("cases", "guard", "found"),
+    [
+        ('{"one": {"block": "b", "cost": 0}}', "1", "found one costs 0"),
+        ('{"one": {"block": "b", "cost": NaN}}', "1", "found one costs nan"),
+        ('{"one": {"block": "b", "cost": -1e308}}', "1", "found one costs -1e\\+308"),
+        ('{"one": {"block": "b", "cost": "x"}}', "1", "found another form"),
+        ('{"one": {"block": "b", "cost": 1}}', "NaN", "found value nan of unstable"),
+        ('{"one": {"block": "b", "cost": 1}}', '"x"', "found another form"),
+        ("{}", "1", "found no case"),
+        ("[]", "1", "found another form"),
+    ],
+)
+def test_a_file_of_cases_that_says_nothing_promotes_nothing(project, cases, guard, found):
+    guards = f'{{"unstable": {{"value": {guard}, "allowed": 0}}}}'
+    text = f'{{"panel": "a", "cases": {cases}, "guards": {guards}}}'
+    artifacts.write_text("datasets/cases.json", text)
+    loop = Loop(artifacts=["datasets/cases.json"], judge="cases", cases="datasets/cases.json", recordings="")
+    with pytest.raises(ValueError, match=f"^datasets/cases.json: expected .*{found}"):
+        judge.judge(loop, project).measure(Path("datasets"))
+
+
+def test_what_costs_the_same_is_no_better_by_nothing_and_not_by_minus_nothing(project):
+    same = Evidence("a", {f"case {k}": (f"plant {k}", 1.0 + k) for k in range(8)}, {})
+    made = decide(same, same, project.rule, allowed={}, alarms=[], seed=1)
+    assert made.reasons == ["the challenger is no better: its cases cost 0.0 % more (0.0 to 0.0 %)"]
+
+
+def test_a_first_champion_needs_a_case_and_a_count_of_unstable_plants(project):
+    fit = Evidence("a", {"one": ("b", 1.0)}, {"unstable_plants": 0.0})
+    for challenger, decision in (
+        (fit, FIRST),
+        (fit._replace(cases={}), KEPT),
+        (fit._replace(guards={"unstable_plants": np.nan}), KEPT),
+    ):
+        made = decide(None, challenger, project.rule, allowed={}, alarms=[], seed=1)
+        assert made.decision == decision, made
 
 
 @pytest.mark.parametrize("loop", ["deposition", "setpoint"])

@@ -99,7 +99,7 @@ def _head(night: Night) -> tuple[str, str]:
         passes = f"{candidates} {'do' if len(night.candidates) > 1 else 'does'} not pass"
         head = f"{head} {passes[:1].upper()}{passes[1:]}." if promoted else f"Nothing is promoted: {passes}."
     if night.lost:
-        return f"The stages of {', '.join(night.lost)} failed. {head}", FAILED
+        return f"Failed: {', '.join(night.lost)}. {head}", FAILED
     if night.quarantined:
         return f"{head} Bad recordings are set aside.", FAILED
     return head, OPEN if candidates and not promoted else PASSED

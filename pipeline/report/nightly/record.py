@@ -122,7 +122,7 @@ class Night(NamedTuple):
 
     @property
     def lost(self) -> list[str]:
-        """The loops whose stages failed."""
+        """The loops whose stages failed, or that could not be judged."""
         return [name for name, decision in self.decisions.items() if decision.decision == FAILED]
 
     @property
