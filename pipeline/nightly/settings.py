@@ -10,14 +10,14 @@ from pipeline.store.params import Section
 
 
 def _in_the_project(path: str) -> str:
-    """The path of an artifact. Raises ValueError where its copy would not lie in champion/."""
+    """A path that the night copies or moves. Raises ValueError where it lies elsewhere."""
     if path.startswith(("/", "~")) or ".." in path.split("/"):
-        raise ValueError("but must lie in the project's folder; let a stage write it there")
+        raise ValueError("but must lie in the project's folder")
     return path
 
 
-Path = Annotated[str, Field(min_length=1, max_length=300)]
-Artifact = Annotated[Path, AfterValidator(_in_the_project)]
+Inside = AfterValidator(_in_the_project)
+Path = Annotated[str, Field(min_length=1, max_length=300), Inside]
 
 
 class Loop(Section):
@@ -25,10 +25,10 @@ class Loop(Section):
     panel of its own (temperature), what its stage scored on cases that nothing was trained on
     (deposition, setpoint), or a file of costs by case."""
 
-    artifacts: list[Artifact] = Field(min_length=1, max_length=50)
+    artifacts: list[Path] = Field(min_length=1, max_length=50)
     judge: Literal["temperature", "deposition", "setpoint", "cases"]
     cases: str = Field(max_length=300)
-    recordings: str = Field(max_length=300)
+    recordings: Annotated[str, Field(max_length=300), Inside]
 
     @pydantic.model_validator(mode="after")
     def _cases_have_a_file(self):

@@ -28,9 +28,10 @@ from pipeline.report.shared.verdict import (
     state,
 )
 from pipeline.report.temperature import readme
+from pipeline.report.temperature.answers import relearned_band
 from pipeline.report.temperature.contestants import in_a_sentence
 from pipeline.report.temperature.judgement import judgement
-from pipeline.report.temperature.pairs import deciding_sentence, pair_sentence, prior_sentence, relearned_band
+from pipeline.report.temperature.pairs import deciding_sentence, pair_sentence, prior_sentence
 from pipeline.report.temperature.verdict import best_sentence, decide, questions, standings
 from pipeline.store import artifacts, params
 from stages import report
@@ -290,6 +291,18 @@ def test_of_relearnings_the_one_that_is_best_in_most_is_named_else_the_simplest(
     assert "the one that was named before stays" in stayed.reason and "the simplest" not in stayed.reason
 
 
+def test_what_relearnings_may_break_does_not_pass_and_another_is_named():
+    """One relearning in which it never settles leaves the rule undecided, whatever this record came to."""
+    never = {"contestants": {"subspace_lqg": {"settling": {"q90": {"low": 20.0, "high": None}}}}}
+    stages = metrics()
+    assert judge(stages).winner == "subspace_lqg"
+    verdict = judge(stages, relearned=never)
+    assert verdict.winner not in (None, "subspace_lqg")
+    held = standings(stages, RULES, relearned=never)
+    settling = next(rule for rule in held["subspace_lqg"].rules if rule.name == "settling")
+    assert settling.state == UNDECIDED and not held["subspace_lqg"].passes
+
+
 def test_limits_are_those_that_the_comparison_resolved_for_the_machine():
     stages = metrics(settling=made.figure(120.0, 110.0, 130.0))
     assert judge(stages).state == FAILED
@@ -341,7 +354,7 @@ FRESH = {
 
 
 def test_bands_over_relearnings_stand_in_where_they_were_made_and_a_turning_prior_is_said():
-    assert relearned_band(FRESH, "pi", "settling") == (5.0, 900.0, "2026-11-23")
+    assert relearned_band(FRESH, "pi", "settling") == (5.0, 900.0)
     assert relearned_band(FRESH, "pi", "overshoot") is None
     assert relearned_band(None, "pi", "settling") is None
     assert prior_sentence(FRESH, "subspace_lqg") == (

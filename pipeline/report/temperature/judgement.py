@@ -64,14 +64,14 @@ def judgement(sources: Sources, *, named: str = "") -> Judgement:
     drifted = drift(sources)
     undeclared = undeclared_outputs(sources)
     asked = questions(rules, comparison(metrics))
-    held = standings(metrics, rules, undeclared=undeclared, drift=drifted.answer)
-    incumbent = incumbent_of(sources)
     relearned = sources.relearned if relearned_date(sources) else None
+    held = standings(metrics, rules, undeclared=undeclared, drift=drifted.answer, relearned=relearned)
+    incumbent = incumbent_of(sources)
     best = choose(metrics, held, incumbent, relearned)
     competing = [name for name in held if name not in YARDSTICKS]
     subject = best or (closest(held) if competing else pair_names(metrics)[0])
     beside = rival(metrics, subject)
-    answers = {name: of_contestant(metrics, name, undeclared) for name in (*held, subject, beside)}
+    answers = {name: of_contestant(metrics, name, undeclared, relearned) for name in (*held, subject, beside)}
     changed = None if sources.another_machine else difference(sources)
     moved = moves(sources, asked, answers) if changed else {}
     verdict = decide(

@@ -1,5 +1,5 @@
-"""Model-based against data-driven in a sentence, the case that decides, and bands over relearnings. Metrics
-of the comparison -> words, no page, no file."""
+"""Model-based against data-driven in a sentence, the case that decides, and how the pair ended over
+relearnings. Metrics of the comparison -> words, no page, no file."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -98,22 +98,7 @@ def reference_of(case: Mapping[str, Any]) -> str:
     return f"a {kind}{' reference' if kind == 'constant' else ''}" if kind else ""
 
 
-# ---- bands over relearnings
-
-
-class RelearnedBand(NamedTuple):
-    low: float
-    high: float
-    date: str
-
-
-def relearned_band(relearned: Any, name: str, figure: str) -> RelearnedBand | None:
-    """The band of a figure over fresh relearnings (benchmarks/results/temperature_relearned.json); None where
-    none were made."""
-    ends = entry(relearned, "contestants", name, figure, "q90")
-    if not isinstance(ends, Mapping) or not {"low", "high"} <= ends.keys():
-        return None
-    return RelearnedBand(finite(ends["low"]), finite(ends["high"]), str(entry(relearned, "date") or ""))
+# ---- over relearnings
 
 
 def prior_sentence(relearned: Any, winner: str | None) -> str:

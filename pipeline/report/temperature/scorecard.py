@@ -11,7 +11,6 @@ from pipeline.report.shared.verdict import FAILED, UNDECIDED, Figure, Missing, Q
 from pipeline.report.temperature.answers import comparison, entry, finite, judged, refused, unstable
 from pipeline.report.temperature.contestants import BY_NAME, YARDSTICKS, heading, in_a_sentence, kind
 from pipeline.report.temperature.judgement import Judgement, relearned_date
-from pipeline.report.temperature.pairs import relearned_band
 from pipeline.report.temperature.wording import banded, places_of, worded
 
 # figures without a rule
@@ -159,7 +158,7 @@ def _cell(sources: Sources, question: Question, name: str, figure: Figure | Miss
     if question.key in ("crossings", "data"):
         notes.insert(0, figure.note.split(" samples")[0])
     else:
-        notes = [_band(sources, question, name, figure, places), *_beside(question, own, places), *notes]
+        notes = [banded(question, figure, places), *_beside(question, own, places), *notes]
     return Cell(
         text,
         [note for note in notes if note],
@@ -167,13 +166,6 @@ def _cell(sources: Sources, question: Question, name: str, figure: Figure | Miss
         best=best and _competes(name),
         title=_worst_title(own, question.key),
     )
-
-
-def _band(sources: Sources, question: Question, name: str, figure: Figure, places: int) -> str:
-    fresh = relearned_band(sources.relearned, name, question.key) if relearned_date(sources) else None
-    if fresh:
-        figure = Figure(figure.value, fresh.low, fresh.high)
-    return banded(question, figure, places)
 
 
 def _beside(question: Question, own: Any, places: int) -> list[str]:

@@ -143,13 +143,18 @@ class Standing(NamedTuple):
 
 
 def standings(
-    metrics: Metrics, rules: ReportRules, *, undeclared: Sequence[str] = (), drift: Figure | Missing = NEVER
+    metrics: Metrics,
+    rules: ReportRules,
+    *,
+    undeclared: Sequence[str] = (),
+    drift: Figure | Missing = NEVER,
+    relearned: Any = None,
 ) -> dict[str, Standing]:
     """Every contestant that was judged, in the order of simplicity, the yardstick last."""
     asked = questions(rules, comparison(metrics))
     held = {}
     for name in judged(metrics):
-        answers = of_contestant(metrics, name, undeclared)
+        answers = of_contestant(metrics, name, undeclared, relearned)
         own = [
             rule._replace(reason=_unstable_sentence(metrics, name) or rule.reason)
             if rule.state == FAILED and rule.name in ("settled error", "disk margin", "delay margin")
@@ -248,7 +253,7 @@ def decide(
     `rules` of the verdict has a line for each of GROUPS with the contestant that it is about and its rival.
     """
     words = TRIAL if recorded else REHEARSAL
-    held = standings(metrics, rules, undeclared=undeclared, drift=drift)
+    held = standings(metrics, rules, undeclared=undeclared, drift=drift, relearned=relearned)
     if not held or set(held) <= set(YARDSTICKS) or (named and named not in held):
         return _nothing(metrics, rules, words, drift, named)
     if named:
@@ -261,7 +266,7 @@ def decide(
     theirs = (
         held[beside].rules
         if beside in held
-        else rules_of(asked, of_contestant(metrics, beside, undeclared), drift, beside)
+        else rules_of(asked, of_contestant(metrics, beside, undeclared, relearned), drift, beside)
     )
     lines = tuple(zip(grouped(held[subject].rules), grouped(theirs), strict=True))
     if best:
