@@ -39,6 +39,7 @@ REMAINDER = 0.004
 RIVALS = 4.0  # a rival that explains less by up to this (two sigmas squared) is named too
 # by so much more than the champion's own errors must draughts explain a record: they also cover what changed
 DRAUGHTY = 30.0
+CALM = 0.2  # °C of the course of the air in a closed room
 SEASON = 20.0  # °C by which another season's air may differ
 UNLIKE = 0.1  # share of the air's course by which one output may follow it otherwise than the others
 CAUSE = 10.0  # by so much more must a cause explain than another season's air
@@ -102,11 +103,16 @@ class Surroundings(NamedTuple):
     draught: float
     another_season: bool = True
 
+    @property
+    def calm(self) -> bool:
+        """As still as any room, and the air as on the champion's own nights."""
+        return self.course <= CALM and not self.draught and not self.another_season
+
 
 # from a closed room to an open door; the record itself says which (empirical Bayes)
 RESTLESS = Surroundings(5.0, 0.0)
 ROOMS = (
-    Surroundings(0.2, 0.0), Surroundings(1.0, 0.0), RESTLESS,
+    Surroundings(CALM, 0.0), Surroundings(1.0, 0.0), RESTLESS,
     Surroundings(1.0, 0.5), Surroundings(1.0, 2.0),
 )  # fmt: skip
 
@@ -246,11 +252,13 @@ class Segment(NamedTuple):
 
 
 class Record(NamedTuple):
-    """Segments held against a machine at a scale, by an observer of gain K; `basis` is that of the outputs'
-    levels, which all segments share, and `common` (N, p) those levels before they were made orthonormal."""
+    """Segments held against a machine at a scale, in a room, by an observer of gain K; `basis` is that of the
+    outputs' levels, which all segments share, and `common` (N, p) those levels before they were made
+    orthonormal."""
 
     machine: Machine
     scale: Scale
+    room: Surroundings
     K: np.ndarray
     segments: list[Segment]
     basis: np.ndarray
@@ -268,7 +276,7 @@ def record(machine: Machine, segments: Segments, scale: Scale, room: Surrounding
         )
     scale = _in(scale, room)
     K, none = machine.gain(room.draught, scale.variance), np.zeros((0, 0))
-    made, bare = [], Record(machine, scale, K, [], none, none)
+    made, bare = [], Record(machine, scale, room, K, [], none, none)
     for u, y in long:
         measured = np.isfinite(y)
         nuisance = _weighted(bare, _own_nuisances(machine, len(y), scale, room.course), measured)
@@ -612,7 +620,7 @@ def explain_segments(
     same = record(machine, segments, there, room._replace(another_season=False))
     rest = left(same, explained.changes)
     if not explained.named and float(rest @ rest - explained.left @ explained.left) < SURE**2:
-        return same, explained._replace(left=rest)
+        return same, Explanation([], alone(same, changes), changes, rest)
     within = explain(same, changes, usual)
     return min((same, within), (asked, explained), key=_cost)
 

@@ -31,7 +31,8 @@ class DriftMemory(NamedTuple):
     """Of the last night with recordings: keys of what was watched or raised an alarm, and its alarms.
     `drifted` are the recordings of each loop since its alarm; `night` is 0 before the first. `recent` is what
     the last nights named of each loop: {loop: {"reference": digest of what they were held against, "nights":
-    [{change: [size, standard deviation]}]}}, over which a change is pooled."""
+    [{change: [size, standard deviation]}]}}, over which a change is pooled; "seeming" is the same of
+    what nights left unnamed."""
 
     pending: tuple[str, ...] = ()
     alarms: tuple[Alarm, ...] = ()

@@ -31,6 +31,8 @@ NIGHTS = 12  # of the champion's own recordings that a new one is held against
 AHEAD = 2.0
 LONGEST = 7200  # samples of a record that are asked, its last ones
 POOLED = 3  # nights over which an estimate is pooled
+# sigmas from which on nights that each leave a change unnamed name it together; it is past its limit besides
+TOGETHER = 4.0
 # several nights tell how the air around scatters from one to the next, pieces of one do not
 NIGHTS_FLOORS, PIECES_FLOORS = baseline.Floors(0.03, 0.25), baseline.Floors(0.2, 2.0)
 # mean offset of the champion's own nights, in units of drift.offset_degC, up to which they count as a
@@ -72,7 +74,15 @@ class Found(NamedTuple):
         return f"{kind} of {self.channel}" if self.channel else kind
 
 
-Nights = list[dict[str, Estimate]]  # of the nights before, the last one last: what each of them named
+class Night(NamedTuple):
+    """Of one night, by the key of the change: what it named, and where it named nothing in calm air, what
+    each change would be as if it alone had come about."""
+
+    named: dict[str, Estimate]
+    seeming: dict[str, Estimate]
+
+
+Nights = list[Night]  # the last one last
 
 
 class Screened(NamedTuple):
@@ -186,14 +196,24 @@ def look(
             drifted = _one(limits, drifted, path, segments, held, machine, nights, pending)
         except ValueError as error:
             drifted.notes.append(f"{path}: {error}")
-    return Screened(drifted, {"reference": held.digest, "nights": [_written(night) for night in nights]})
+    recent = {
+        "nights": [_written(night.named) for night in nights],
+        "seeming": [_written(night.seeming) for night in nights],
+    }
+    return Screened(drifted, {"reference": held.digest, **recent})
 
 
 def _nights(recent: Mapping[str, Any], digest: str) -> Nights:
-    """What the nights before named, where they were held against the same reference."""
+    """The nights before, where they were held against the same reference."""
     if recent.get("reference") != digest:
         return []
-    return [{key: Estimate(*pair) for key, pair in night.items()} for night in recent.get("nights", [])]
+    named = recent.get("nights", [])
+    seeming = recent.get("seeming", [{}] * len(named))
+    return [Night(_estimates(one), _estimates(other)) for one, other in zip(named, seeming, strict=True)]
+
+
+def _estimates(night: Mapping[str, Sequence[float]]) -> dict[str, Estimate]:
+    return {key: Estimate(*pair) for key, pair in night.items()}
 
 
 def _written(night: Mapping[str, Estimate]) -> dict[str, list[float]]:
@@ -222,12 +242,18 @@ def _one(
         segments = mistake.undone
     measured = _measure(limits, segments, held, machine, names)
     drifted.figures[path] = measured.figures
-    nights.append({found.key: found.estimate for found in measured.found})
+    nights.append(Night({found.key: found.estimate for found in measured.found}, measured.seeming))
     del nights[:-POOLED]
+    singly = [
+        (found, _past_limit([night.named.get(found.key) for night in nights], found.limit))
+        for found in measured.found
+    ]
+    pooled = [
+        (found, _past_limit([found.estimate], found.limit)) for found in together(limits, nights, held, names)
+    ]
     told = [cause.words for cause in measured.loop]
     alarms, watched = list(drifted.alarms), list(drifted.watched)
-    for found in measured.found:
-        sure = _past_limit([night.get(found.key) for night in nights], found.limit)
+    for found, sure in (*pooled, *singly):
         if abs(found.estimate.amount) < found.limit and sure < limits.limit_sigmas:
             continue
         estimate = found.estimate
@@ -256,15 +282,52 @@ def _past_limit(estimates: Sequence[Estimate | None], limit: float) -> float:
     return float(largest)
 
 
+def together(limits: Drift, nights: Nights, held: Reference, names: Named) -> list[Found]:
+    """What the last nights name together where the last one by itself names nothing: the change whose mean
+    over two or more of them, weighted by what each knows, explains most (fixed effects; Basseville and
+    Nikiforov 1993, ch. 2.4). Empty where none is TOGETHER sigmas from none."""
+    causes = drift.causes(held.machine.plant)
+    usual, best = held.own.usual(causes), (TOGETHER**2, [])
+    for count in range(2, len(nights) + 1):
+        means = [
+            (cause, mean)
+            for cause in causes
+            if (mean := _mean_of(nights[-count:], _key(cause, names)))
+            and _worth(mean) > 2 * count * usual[cause]
+        ]
+        means.sort(key=lambda one: -_worth(one[1]))
+        if means and (most := _worth(means[0][1])) > best[0]:
+            rivals = [one for one in means if most - _worth(one[1]) < drift.RIVALS]
+            best = most, [_said(limits, cause, mean, names) for cause, mean in rivals]
+    return [_likeliest(best[1])] if best[1] else []
+
+
+def _mean_of(nights: Nights, key: str) -> Estimate | None:
+    """Mean of a change over the nights that know of it, weighted by what they know; None where the last one
+    does not, or no other does."""
+    known = [night.named.get(key) or night.seeming.get(key) for night in nights]
+    if nights[-1].seeming.get(key) is None or sum(one is not None for one in known) < 2:
+        return None
+    weights = np.array([1 / max(one.deviation, 1e-9) ** 2 for one in known if one])
+    amounts = np.array([one.amount for one in known if one])
+    return Estimate(float(weights @ amounts / weights.sum()), float(weights.sum() ** -0.5))
+
+
+def _worth(estimate: Estimate) -> float:
+    """What a change explains: its sigmas from none, squared."""
+    return (estimate.amount / estimate.deviation) ** 2
+
+
 # ---- one recording
 
 
 class Measured(NamedTuple):
-    """Of one recording: figures for the page, what changed, and what the closed loop does otherwise beyond
-    what those changes and the air around bring."""
+    """Of one recording: figures for the page, what changed, what each change would be where none is named,
+    and what the closed loop does otherwise beyond what those changes and the air around bring."""
 
     figures: RecordingFigures
     found: list[Found]
+    seeming: dict[str, Estimate]
     loop: list[Change]
 
 
@@ -283,7 +346,17 @@ def _measure(limits: Drift, segments: Segments, held: Reference, machine: Plant,
     figures = RecordingFigures(
         _parameters(record, explained, held, names), noise, loop.figures, loop.not_applicable
     )
-    return Measured(figures, [*found, *louder], loop.causes)
+    return Measured(figures, [*found, *louder], _seeming(record, explained, held, names), loop.causes)
+
+
+def _seeming(record: Record, explained: Explanation, held: Reference, names: Named) -> dict[str, Estimate]:
+    """What each change would be as if it alone had come about, where none is named and the air is calm: what
+    restless air does to a level is much the same every night, and no mean takes it away. A cap has no size
+    to take a mean of."""
+    if explained.named or not record.room.calm:
+        return {}
+    fits = [fit for fit in explained.others if fit.cause.kind != "saturation"]
+    return {_key(fit.cause, names): _amount(fit, held, ()) for fit in fits}
 
 
 def _name(cause: Cause, names: Named) -> str:
@@ -317,20 +390,23 @@ def _amount(fit: Fit, held: Reference, segments: Segments) -> Estimate:
 def _found(
     limits: Drift, named: drift.Named, record: Record, held: Reference, segments: Segments, names: Named
 ) -> Found:
-    """What is said of a named change. Where the record cannot tell it from another, and that one is far past
-    its own limit, the other is said first."""
+    """What is said of a named change, and of what the record cannot tell it from."""
     told = []
     for fit in (named.fit, *named.rivals):
-        estimate, name = _amount(fit, held, segments), _name(fit.cause, names)
-        told.append(
-            Found(
-                _kind(fit.cause),
-                name,
-                _words(fit, estimate.amount, name),
-                estimate,
-                _limit(limits, fit.cause),
-            )
-        )
+        told.append(_said(limits, fit.cause, _amount(fit, held, segments), names, fit.value))
+    return _likeliest(told)
+
+
+def _said(limits: Drift, cause: Cause, estimate: Estimate, names: Named, cap: float = np.nan) -> Found:
+    """A change in words; `cap` in percent is the level of a saturation."""
+    name = _name(cause, names)
+    words = _words(cause, estimate.amount, name, cap)
+    return Found(_kind(cause), name, words, estimate, _limit(limits, cause))
+
+
+def _likeliest(told: Sequence[Found]) -> Found:
+    """Rivals, the likeliest first, as one: where one of them is far past its own limit and the likeliest is
+    not, it is said first."""
     first = max(told, key=_past)
     if _past(first) < AHEAD or _past(told[0]) >= 1:
         first = told[0]
@@ -352,19 +428,23 @@ def _limit(limits: Drift, cause: Cause) -> float:
     }[_kind(cause)]  # fmt: skip
 
 
+def _key(cause: Cause, names: Named) -> str:
+    return f"{_kind(cause)} of {_name(cause, names)}"
+
+
 def _kind(cause: Cause) -> str:
     return "delay" if cause.kind == "late sensor" else cause.kind
 
 
-def _words(fit: Fit, amount: float, name: str) -> str:
-    kind = fit.cause.kind
+def _words(cause: Cause, amount: float, name: str, cap: float) -> str:
+    kind = cause.kind
     if kind == "gain":
         return f"the gain from {name} has changed by {amount:+.1f} %"
     if kind == "time constant":
         return f"the time constants of what answers to {name} have changed by {amount:+.1f} %"
     if kind == "saturation":
         return (
-            f"{name} no longer gives more than {fit.value:.0f} %: more was asked of it in {amount:.0f} % of "
+            f"{name} no longer gives more than {cap:.0f} %: more was asked of it in {amount:.0f} % of "
             "the record"
         )
     if kind == "offset":

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from benchmarks import nights
-from pipeline.nightly import inputs, screening, temperature_drift
+from pipeline.nightly import drift, inputs, screening, temperature_drift
 from pipeline.nightly.remembered import DriftMemory
 from pipeline.nightly.settings import Nightly
 from pipeline.report.shared.night import Alarm
@@ -185,6 +185,66 @@ def test_what_nights_agree_in_is_pooled_and_what_was_held_against_another_refere
     other = memory._replace(recent={"temperature": memory.recent["temperature"] | {"reference": "another"}})
     assert len(look(nights.a_night(1, 621), memory).memory.recent["temperature"]["nights"]) == 2
     assert len(look(nights.a_night(1, 621), other).memory.recent["temperature"]["nights"]) == 1
+
+
+def known(made):
+    """Limits, reference and names that a night of the champion is held against."""
+    held = temperature_drift._read_reference(made / "champion/temperature")
+    names = temperature_drift.Named(["heater_1", "heater_2"], ["sensor_1", "sensor_2"])
+    return params.load(Nightly, "nightly").drift, held, names
+
+
+def seeming(**estimates):
+    """A night that named nothing."""
+    changes = {name.replace("_of_", " of "): estimate for name, estimate in estimates.items()}
+    return temperature_drift.Night({}, {key: temperature_drift.Estimate(*e) for key, e in changes.items()})
+
+
+def test_what_each_night_leaves_unnamed_several_name_together(look, made):
+    limits, held, names = known(made)
+    faint = seeming(offset_of_sensor_1=(0.6, 0.33), offset_of_sensor_2=(-1.3, 0.33))
+    assert temperature_drift.together(limits, [faint], held, names) == []
+    (found,) = temperature_drift.together(limits, [faint, faint], held, names)
+    assert found.key == "offset of sensor_2" and "sensor_2 reads -1.3 °C" in found.words
+    assert found.estimate == pytest.approx((-1.3, 0.33 / 2**0.5))
+    # of two nights that do not agree nothing is left, and a night that named something else is no witness
+    turned, other = seeming(offset_of_sensor_2=(1.3, 0.33)), temperature_drift.Night({}, {})
+    assert temperature_drift.together(limits, [turned, faint], held, names) == []
+    assert temperature_drift.together(limits, [other, faint], held, names) == []
+    assert temperature_drift.together(limits, [faint, faint, other], held, names) == []
+    alike = seeming(offset_of_sensor_1=(1.25, 0.33), offset_of_sensor_2=(-1.3, 0.33))
+    (found,) = temperature_drift.together(limits, [alike, alike], held, names)
+    assert found.key == "offset of sensor_2" and "or sensor_1 reads +1.2" in found.words
+
+
+def test_an_offset_that_no_single_night_is_sure_of_is_found_by_the_second(look, monkeypatch):
+    monkeypatch.setattr(drift, "SURE", 40.0)  # a night of this machine alone knows an offset to 0.06 °C
+
+    def reads_low(k):
+        columns = nights.a_night(1, k)
+        return columns | {"sensor_2": columns["sensor_2"] - 1.0}
+
+    first = look(reads_low(630))
+    assert first.drift.alarms == [] and first.memory.recent["temperature"]["nights"] == [{}]
+    second = look(reads_low(631), DriftMemory.read(json.loads(json.dumps(first.memory.written()))))
+    (alarm,) = second.drift.alarms
+    assert (alarm.kind, alarm.channel) == ("offset", "sensor_2"), alarm
+    # the memory of an older version knows what nights named, not what they left unnamed
+    older = {key: value for key, value in first.memory.recent["temperature"].items() if key != "seeming"}
+    blind = look(reads_low(631), first.memory._replace(recent={"temperature": older}))
+    assert blind.drift.alarms == [] and len(blind.memory.recent["temperature"]["seeming"]) == 2
+
+
+def test_what_restless_air_makes_a_change_seem_is_not_pooled(look):
+    def seems(columns):
+        return look(columns).memory.recent["temperature"]["seeming"][0]
+
+    good = nights.a_night(1, 640)
+    course = 4.0 * np.sin(2 * np.pi * np.arange(len(good["sensor_1"])) / 400)
+    assert "offset of sensor_1" in seems(good)
+    warmed = {name: good[name] + course for name in ("sensor_1", "sensor_2")}
+    assert seems(good | warmed) == {}
+    assert seems(nights.a_night(1, 641, colder_degC=4.0)) == {}
 
 
 def test_of_a_long_record_its_last_samples_are_asked():
