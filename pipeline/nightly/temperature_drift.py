@@ -33,6 +33,7 @@ LONGEST = 7200  # samples of a record that are asked, its last ones
 POOLED = 3  # nights over which an estimate is pooled
 # sigmas from which on nights that each leave a change unnamed name it together; it is past its limit besides
 TOGETHER = 4.0
+CONTRADICTED = 9.0  # squares of deviations from their mean, for each night but one: beyond, they disagree
 # several nights tell how the air around scatters from one to the next, pieces of one do not
 NIGHTS_FLOORS, PIECES_FLOORS = baseline.Floors(0.03, 0.25), baseline.Floors(0.2, 2.0)
 # mean offset of the champion's own nights, in units of drift.offset_degC, up to which they count as a
@@ -304,13 +305,16 @@ def together(limits: Drift, nights: Nights, held: Reference, names: Named) -> li
 
 def _mean_of(nights: Nights, key: str) -> Estimate | None:
     """Mean of a change over the nights that know of it, weighted by what they know; None where the last one
-    does not, or no other does."""
+    does not, no other does, or they contradict each other (Cochran 1954): what came may have gone."""
     known = [night.named.get(key) or night.seeming.get(key) for night in nights]
     if nights[-1].seeming.get(key) is None or sum(one is not None for one in known) < 2:
         return None
     weights = np.array([1 / max(one.deviation, 1e-9) ** 2 for one in known if one])
     amounts = np.array([one.amount for one in known if one])
-    return Estimate(float(weights @ amounts / weights.sum()), float(weights.sum() ** -0.5))
+    mean = float(weights @ amounts / weights.sum())
+    if weights @ (amounts - mean) ** 2 > CONTRADICTED * (len(amounts) - 1):
+        return None
+    return Estimate(mean, float(weights.sum() ** -0.5))
 
 
 def _worth(estimate: Estimate) -> float:

@@ -184,7 +184,7 @@ def test_never_settling_is_said_in_words(project):
     change_all(settling=made.figure(None, 12.0, None))
     main()
     text = INDEX.read_text()
-    assert '<span class="v">never settles</span><span class="b">12\u202fs to never settles</span>' in text
+    assert '<span class="v">never settles</span><span class="b">12\u202fs to never</span>' in text
     assert "Subspace + LQG never settles at the 90 % quantile of all cases" in Page(INDEX).text
 
 

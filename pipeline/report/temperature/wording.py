@@ -33,7 +33,7 @@ def banded(question: Question, figure: Figure, places: int) -> str:
     """The band of a figure, "" where it is none or one of its ends says nothing."""
     ends = worded(question, figure.low, places), worded(question, figure.high, places)
     if OFF_THE_SCALE in ends or any(map(math.isinf, (figure.low, figure.high))):
-        return "" if ends[0] == ends[1] else " to ".join(ends)
+        return "" if ends[0] == ends[1] else " to ".join(ends).replace("never settles", "never")
     return band(figure.low, figure.high, places, unit=question.unit)
 
 
