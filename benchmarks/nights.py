@@ -30,7 +30,8 @@ import numpy as np
 import scipy.linalg
 import yaml
 
-from pipeline.nightly import champion, judge, night, processes, promoting
+from pipeline.nightly import champion, judge, night, processes, promoting, remembered
+from pipeline.nightly.reproducing import Reproduced
 from pipeline.report.nightly.record import Night
 from pipeline.store import artifacts, params
 from pipeline.temperature import panel
@@ -180,13 +181,13 @@ def settings() -> dict:
             }
         },
         "holdout": SETTINGS["holdout"] | {"starts_degC": [50, 90], "reference_offsets_degC": [0, -10],
-        "seed": 901, "plants": 16},
+        "seed": 901, "plants": 16, "controller": "varx_riccati"},
     }  # fmt: skip
     found["nightly"]["holdout"]["steps"] = 150
     return found
 
 
-def _stages(_, run: str) -> None:
+def _stages(_, run: str) -> Reproduced:
     """The stages in one forked process, in place of `dvc repro`."""
     log = Path(".beadline/logs") / f"{run}.log"
     log.parent.mkdir(parents=True, exist_ok=True)
@@ -208,6 +209,7 @@ def _stages(_, run: str) -> None:
             os._exit(status)
     if os.waitpid(child, 0)[1]:
         raise ValueError(f"dvc repro failed: {processes.sentence(log.read_text())}")
+    return Reproduced()
 
 
 def play(index: int, columns: dict[str, np.ndarray] | None) -> tuple[int, str, Night]:
@@ -218,7 +220,7 @@ def play(index: int, columns: dict[str, np.ndarray] | None) -> tuple[int, str, N
             old.unlink()
         write(Path(f"datasets/raw/temperature/shift_{index:03d}.csv"), columns)
     status, said = night.nightly(START + datetime.timedelta(days=index))
-    return status, said, night.nights()[-1]
+    return status, said, remembered.nights()[-1]
 
 
 def true_cost(folder: Path) -> float:
@@ -258,7 +260,7 @@ def null(seed: int, count: int, folder: Path, with_dvc: bool, *, learn: bool = T
     promotions, alarms, worse, costs, seconds = [], [], 0, [], []
     for k in range(4, 4 + count):
         if k == 5 and not learn:
-            night._reproduce = lambda *_: None
+            night._reproduce = lambda *_: Reproduced()
         before = true_cost(champion.FOLDER / "temperature") if champion.read().champions else None
         began = time.monotonic()
         status, said, tonight = play(k, a_night(seed, k) if k > 4 else None)
@@ -286,9 +288,8 @@ def drifted(seed: int, folder: Path, with_dvc: bool) -> dict:
     status, said, _ = play(4, None)
     assert status == night.OK, said
     os.chdir("/")
-    night._reproduce = lambda *_: (
-        None
-    )  # drift is found before anything is learned, and the challenger is not asked for here
+    # drift is found before anything is learned, and the challenger is not asked for here
+    night._reproduce = lambda *_: Reproduced()
     found = {}
     for name, changes in {
         "gain of heater_1 -10 %": {"gain": (0.9, 1.0)}, "gain of heater_1 +10 %": {"gain": (1.1, 1.0)},

@@ -10,7 +10,7 @@ def nightly(arguments: argparse.Namespace) -> None:
     """The nightly job: new recordings, dvc repro, judge, promote or keep. Exit status 0: promoted, kept, or
     nothing new; 1: failed, nothing in production has changed; 3: drift alarm; 4: done, but recordings were
     set aside; 75: refused, another night is at work."""
-    from pipeline.nightly import accepting, merging, night
+    from pipeline.nightly import accepting, merging, night, reporting
 
     if arguments.accept_drift:
         print(printable(accepting.accept(*arguments.accept_drift)))
@@ -20,7 +20,7 @@ def nightly(arguments: argparse.Namespace) -> None:
         return
     if arguments.merge:
         print(printable(merging.merge(arguments.merge)))
-    status, summary = night.watchdog() if arguments.watch else night.nightly()
+    status, summary = reporting.watchdog() if arguments.watch else night.nightly()
     print(printable(summary), file=sys.stderr if status else sys.stdout)
     sys.exit(status)
 

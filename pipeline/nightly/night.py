@@ -238,7 +238,7 @@ def _learned(job: Job, work: Work) -> Work:
     try:
         # the pages of tonight show tonight's drift, and judge by it
         artifacts.write_json(METRICS, work.night.metrics(work.state))
-        reproduced = _reproduce(job.settings, work.night.run) or Reproduced()
+        reproduced = _reproduce(job.settings, work.night.run)
         # what came or changed meanwhile may be in some stages and not in others, and
         # nobody has looked whether it is fit to learn from
         now = inputs.contents(job.hashes, _places(job.settings))
@@ -460,17 +460,6 @@ def _success(when: str, before: str | None, watch_h: float) -> str:
     if before and watch.hours_since(before, datetime.datetime.fromisoformat(when)) < -watch_h:
         return when
     return max(when, before or "")
-
-
-def nights() -> list[Night]:
-    """Every night that this checkout remembers, the oldest first."""
-    return remembered.nights()
-
-
-def watchdog() -> tuple[int, str]:
-    """Whether somebody should look: no night has succeeded for too long, or what nights work by is broken.
-    The alarm goes out with it. Takes no lock: a night that hangs is seen too."""
-    return reporting.watchdog(datetime.datetime.now(datetime.UTC))
 
 
 # ---- the way back

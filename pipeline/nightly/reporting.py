@@ -175,8 +175,10 @@ def last_resort(error: Exception, now: datetime.datetime) -> tuple[int, str]:
     return FAILED, summary(night, troubles)
 
 
-def watchdog(now: datetime.datetime) -> tuple[int, str]:
-    """Whether somebody should look; the alarm goes out with it."""
+def watchdog(now: datetime.datetime | None = None) -> tuple[int, str]:
+    """Whether somebody should look: no night has succeeded for too long, or what nights work by is broken.
+    The alarm goes out with it. Takes no lock: a night that hangs is seen too."""
+    now = now or datetime.datetime.now(datetime.UTC)
     try:
         reasons, last = remembered.broken(), Remembered()
         try:

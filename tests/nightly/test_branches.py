@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from pipeline.nightly import accepting, branches, champion, inputs, merging, night, processes
+from pipeline.nightly import accepting, branches, champion, inputs, merging, night, processes, remembered
 from pipeline.nightly.settings import Nightly
 from pipeline.reading import excluded
 from pipeline.report.nightly.production import Champion, ChampionState, Installed
@@ -27,10 +27,7 @@ BETTER = [[10.4] * 3, [10.0] * 6, [9.4] * 12]
 @pytest.fixture(scope="module")
 def first(tmp_path_factory):
     """The project after its first night, whose champion is in production; promotions wait from now on."""
-    project = Project(tmp_path_factory.mktemp("nights") / "toy").make()
-    ended = project.night()
-    assert ended.returncode == 0 and "promoted toy" in ended.stdout, ended
-    return project
+    return Project(tmp_path_factory.mktemp("nights") / "toy").make().promoted()
 
 
 @pytest.fixture
@@ -817,5 +814,5 @@ def test_a_new_recording_reruns_in_a_night_only_the_stages_that_read_it(project)
     project.record("second", [11.0] * 3)  # the mean is as before
     status, summary = night.nightly()
     assert status == night.OK, summary
-    log = (project.folder / f".beadline/logs/{night.nights()[-1].run}.log").read_text()
+    log = (project.folder / f".beadline/logs/{remembered.nights()[-1].run}.log").read_text()
     assert re.findall(r"Running stage '(\w+)'", log) == ["learn"]

@@ -13,6 +13,7 @@ import pytest
 from pipeline.deposition.workflow.tables import SCORES
 from pipeline.nightly import champion, judge, night, promoting, reporting, screening
 from pipeline.nightly.decision import Evidence
+from pipeline.nightly.reproducing import Reproduced
 from pipeline.nightly.settings import Nightly
 from pipeline.report.index import page as index_page
 from pipeline.report.nightly import page as nightly_page
@@ -496,6 +497,7 @@ def test_a_candidate_is_kept_beside_the_champions_until_a_challenger_passes(play
             # the pages that the stages make show the drift of this very night
             assert artifacts.read_json(NIGHTLY)["run"] == run == f"night-{number:04d}"
             artifact.write_text(files)
+            return Reproduced()
 
         monkeypatch.setattr(night, "_reproduce", reproduced)
         verdict = Verdict("deposition", state, *words_of[state], "", "", "", "basis", subject="basis")

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.nightly import champion, guarding, night, remembered, reproducing, retention, watch
+from pipeline.nightly import champion, guarding, night, remembered, reporting, reproducing, retention, watch
 from pipeline.nightly.settings import Nightly
 from pipeline.report.nightly import page
 from pipeline.store import params
@@ -71,9 +71,7 @@ def first(tmp_path_factory):
     project.set(alarm=command)
     (project.folder / ".gitignore").write_text("/reports/*.html\n/woken.json\n")
     project.run("git", "commit", "-qam", "an alarm")
-    ended = project.night()
-    assert ended.returncode == 0 and "promoted toy" in ended.stdout, ended
-    return project
+    return project.promoted()
 
 
 @pytest.fixture
@@ -94,9 +92,7 @@ def second_loop(first, tmp_path_factory):
     two.set(loops=LOOPS, alarm=json.loads((first.folder / "params.yaml").read_text())["nightly"]["alarm"])
     two.run("git", "add", "-A")
     two.run("git", "commit", "-q", "-m", "a second loop")
-    ended = two.night()
-    assert ended.returncode == 0 and "promoted other" in ended.stdout, ended
-    return two
+    return two.promoted("other")
 
 
 @pytest.fixture
@@ -147,7 +143,7 @@ def test_broken_state_is_set_aside_and_costs_one_repeated_night(project, file, t
         broken.write_text(text)
     told(project, f".beadline/{file}", f"set aside as .beadline/{file}.broken")
     assert aside.is_dir() if text is None else aside.read_text() == text
-    assert [n.run for n in night.nights()][-1] == "night-0002"
+    assert [n.run for n in remembered.nights()][-1] == "night-0002"
     works_again(project, "night-0003")
 
 
@@ -614,7 +610,7 @@ def test_the_watchdog_sees_broken_files(project, file):
     if alarm:
         os.environ[alarm] = json.loads(Path("params.yaml").read_text())["nightly"]["alarm"]
     try:
-        status, summary = night.watchdog()
+        status, summary = reporting.watchdog()
     finally:
         os.environ.pop(alarm, None)
     assert status == night.FAILED and Path(file).name in summary
@@ -639,7 +635,7 @@ def test_a_recording_that_is_not_used_says_which_parameter_would_use_it(project)
         "datasets/raw/deposition/trial.mcap is not used, for train_ilc.source is simulated; set "
         "train_ilc.source: recordings in params.yaml to learn from what is recorded"
     )
-    assert sentence in night.nights()[-1].notes
+    assert sentence in remembered.nights()[-1].notes
     settings = params.load(Nightly, "nightly").loops["deposition"]
     sections["train_ilc"]["source"] = "recordings"
     Path("params.yaml").write_text(json.dumps(sections))

@@ -36,10 +36,7 @@ TOMORROW = datetime.timedelta(days=1)
 @pytest.fixture(scope="module")
 def first(tmp_path_factory):
     """The project after its first night: mean 11, the champion of night-0001."""
-    project = Project(tmp_path_factory.mktemp("nights") / "toy").make()
-    ended = project.night()
-    assert ended.returncode == 0 and "promoted toy" in ended.stdout, ended
-    return project
+    return Project(tmp_path_factory.mktemp("nights") / "toy").make().promoted()
 
 
 @pytest.fixture
@@ -134,10 +131,11 @@ def test_what_changes_while_the_stages_run_is_learned_whole_or_not_at_all(
     lock, learn, late = (project.folder / "dvc.lock").read_bytes(), night._reproduce, iter(range(times))
 
     def meanwhile(*given):
-        learn(*given)
+        reproduced = learn(*given)
         for k in itertools.islice(late, 1):  # after stage learn has read, as a printer that goes on recording
             project.record(f"late_{k}", [9.0])
             project.set(watch_h=48 + k)
+        return reproduced
 
     monkeypatch.setattr(night, "_reproduce", meanwhile)
     status, summary = night.nightly()
@@ -145,7 +143,7 @@ def test_what_changes_while_the_stages_run_is_learned_whole_or_not_at_all(
         assert status == night.OK, summary
         assert status == night.OK and "promoted toy" in summary
         assert json.loads((project.folder / "datasets/learn/model.json").read_text()) == (33 + 18) / 5
-        assert night.nights()[-1].notes[:1] == (
+        assert remembered.nights()[-1].notes[:1] == (
             "datasets/raw/toy/late_0.csv, params.yaml changed while the stages ran: "
             "the night began once again",
         )
@@ -180,11 +178,11 @@ def test_a_recording_that_comes_while_others_are_judged_is_looked_at_tonight_or_
     monkeypatch.setattr(screening, "look", looked)
     monkeypatch.setattr(night, "_judge", judged)
     assert night.nightly()[0] == night.OK
-    tonight = night.nights()[-1].new_recordings["toy"]
+    tonight = remembered.nights()[-1].new_recordings["toy"]
     assert tonight == ["datasets/raw/toy/second.csv", "datasets/raw/toy/while_looking.csv"]
     monkeypatch.setattr(night, "_judge", judge)
     assert night.nightly()[0] == night.OK
-    assert night.nights()[-1].new_recordings == {"toy": ["datasets/raw/toy/while_judging.csv"]}
+    assert remembered.nights()[-1].new_recordings == {"toy": ["datasets/raw/toy/while_judging.csv"]}
 
 
 @pytest.mark.parametrize("lock", [None, "schema: '2.0'\nstages: {}\n", ""])
@@ -204,10 +202,11 @@ def test_code_that_changes_while_the_stages_run_ends_the_night(project, monkeypa
     learn = night._reproduce
 
     def meanwhile(*given):
-        learn(*given)
+        reproduced = learn(*given)
         (project.folder / "learn.py").write_text(
             (project.folder / "learn.py").read_text() + "# pulled meanwhile\n"
         )
+        return reproduced
 
     project.record("second", [9.0])
     monkeypatch.setattr(night, "_reproduce", meanwhile)
@@ -393,7 +392,7 @@ def test_the_watchdog_wakes_somebody_when_the_last_success_is_old(project):
         alarm=f"{sys.executable} -c \"import sys,shutil; shutil.copy(sys.argv[1], 'woken.json')\"",
     )
     time.sleep(0.5)
-    status, summary = night.watchdog()
+    status, summary = reporting.watchdog()
     assert status == night.FAILED and "nightly.watch_h allows 0.0001 h" in summary
     woken = json.loads((project.folder / "woken.json").read_text())
     assert woken["kind"] == "watch" and "last success was" in woken["reasons"][0]

@@ -19,6 +19,7 @@ from pipeline.nightly import (
     watch,
 )
 from pipeline.nightly.remembered import DriftMemory
+from pipeline.nightly.reproducing import Reproduced
 from pipeline.nightly.settings import Nightly
 from pipeline.report.nightly.record import Night
 from pipeline.report.shared.night import Alarm, LoopDrift, NightDrift
@@ -53,6 +54,11 @@ def project(empty, tmp_path, monkeypatch):
 def passing(loop: str) -> tuple[str, Verdict]:
     said = "Rehearsal passed: ours.", "All six rules passed.", "", "", ""
     return loop, Verdict(loop, PASSED, *said, winner="ours", subject="ours", rehearsal=True)
+
+
+def played(*_: None) -> Reproduced:
+    """Stages that did what they were played to do."""
+    return Reproduced()
 
 
 def deposition(cost: float, guard: float) -> None:
@@ -109,11 +115,11 @@ def test_a_better_challenger_is_promoted_and_a_worse_one_or_one_with_a_worse_gua
         (10.0, 2.0, "kept", "the challenger is no better"),
     ]
     for k, (cost, guard, decision, reason) in enumerate(nights):
-        monkeypatch.setattr(night, "_reproduce", lambda *_, of=(cost, guard): score(*of))
+        monkeypatch.setattr(night, "_reproduce", lambda *_, of=(cost, guard): played(score(*of)))
         project.record(f"night {k}", [10.0])
         Path("learn.py").write_text(f"# night {k}\n")  # something is new
         status, summary = night.nightly()
-        decided = night.nights()[-1].decisions[loop]
+        decided = remembered.nights()[-1].decisions[loop]
         assert status == night.OK and decided.decision == decision and reason in " ".join(decided.reasons), (
             summary,
             decided,
@@ -137,7 +143,7 @@ def test_a_recording_that_cannot_be_read_is_set_aside_and_the_scheduler_is_told(
             }
         }
     )
-    monkeypatch.setattr(night, "_reproduce", lambda *_: deposition(10.0, 2.0))
+    monkeypatch.setattr(night, "_reproduce", lambda *_: played(deposition(10.0, 2.0)))
     assert night.nightly()[0] == night.OK
     broken = Path("datasets/raw/deposition/trial_7.mcap")
     broken.parent.mkdir(parents=True)
@@ -174,7 +180,7 @@ def test_drift_that_is_meant_is_accepted_by_hand_and_the_champion_stays(project,
             }
         }
     )
-    monkeypatch.setattr(night, "_reproduce", lambda *_: deposition(10.0, 2.0))
+    monkeypatch.setattr(night, "_reproduce", lambda *_: played(deposition(10.0, 2.0)))
     assert night.nightly()[0] == night.OK
     with pytest.raises(
         ValueError,
@@ -211,17 +217,17 @@ def test_an_alarm_of_the_setpoint_camera_changes_nothing_for_another_loop(projec
         for loop in ("deposition", "setpoint")
     }
     project.set(loops=both)
-    monkeypatch.setattr(night, "_reproduce", lambda *_: (deposition(10.0, 2.0), setpoint(10.0, 2.0)) and None)
+    monkeypatch.setattr(night, "_reproduce", lambda *_: played(deposition(10.0, 2.0), setpoint(10.0, 2.0)))
     assert night.nightly()[0] == night.OK
     raised = Alarm(
         "setpoint", "setpoint: contrast", "print_8.csv", "the line stands out by 25 gray levels", 9.0
     )
     memory = DriftMemory((), (raised,), {"setpoint": ["print_8.csv"]}, night=1)
     remembered.remember(remembered.last()._replace(drift=memory))
-    monkeypatch.setattr(night, "_reproduce", lambda *_: (deposition(5.0, 2.0), setpoint(5.0, 2.0)) and None)
+    monkeypatch.setattr(night, "_reproduce", lambda *_: played(deposition(5.0, 2.0), setpoint(5.0, 2.0)))
     Path("learn.py").write_text("# something is new\n")
     status, summary = night.nightly()
-    tonight = night.nights()[-1]
+    tonight = remembered.nights()[-1]
     # the setpoint loop, whose camera it is, keeps its champion; the other is promoted as on any night
     assert status == night.DRIFTED and tonight.promoted == ("deposition",), summary
     assert tonight.drift.of("setpoint").alarms == [raised] and tonight.drift.of("deposition").alarms == []

@@ -141,6 +141,12 @@ class Project:
     def night(self) -> subprocess.CompletedProcess:
         return self.beadline("nightly")
 
+    def promoted(self, loop: str = "toy") -> "Project":
+        """The project after a night that put what it learned into production."""
+        ended = self.night()
+        assert ended.returncode == 0 and f"promoted {loop}" in ended.stdout, ended
+        return self
+
     def head(self) -> str:
         return self.run("git", "rev-parse", "HEAD").stdout.strip()
 

@@ -271,7 +271,7 @@ def test_who_runs_today_stays_where_nobody_is_better_beyond_the_bands():
             {"subspace_lqg": 6, "pi": 4},
             "pi",
             "Which is best turns with the record: of 10 relearnings from fresh records subspace + LQG in 6 "
-            "and PI, tuned in 4, so that the simplest of them is named.",
+            "and PI, tuned in 4, so that the simplest of them that passes is named.",
         ),
     ],
 )
@@ -299,6 +299,9 @@ def test_what_relearnings_may_break_does_not_pass_and_another_is_named():
     verdict = judge(stages, relearned=never)
     assert verdict.winner not in (None, "subspace_lqg")
     held = standings(stages, RULES, relearned=never)
+    assert (
+        "Subspace + LQG is the best of this record and does not pass: settling undecided." in verdict.reason
+    )
     settling = next(rule for rule in held["subspace_lqg"].rules if rule.name == "settling")
     assert settling.state == UNDECIDED and not held["subspace_lqg"].passes
 

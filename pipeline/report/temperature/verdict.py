@@ -271,13 +271,27 @@ def decide(
     lines = tuple(zip(grouped(held[subject].rules), grouped(theirs), strict=True))
     if best:
         without = choose(metrics, held, "", relearned)
-        turns = "" if named else turning(metrics, relearned, stays=best == incumbent != without)
-        verdict = _passed(metrics, held[best], words, lines, "" if turns else incumbent, recorded=recorded)
-        return verdict._replace(reason=" ".join(filter(None, [turns, verdict.reason])))
+        turns = "" if named else turning(metrics, held, best, relearned, stays=best == incumbent != without)
+        lost = "" if named else _beaten(metrics, held)
+        verdict = _passed(
+            metrics, held[best], words, lines, "" if turns or lost else incumbent, recorded=recorded
+        )
+        return verdict._replace(reason=" ".join(filter(None, [lost, turns, verdict.reason])))
     return _not_passed(metrics, held[subject], words, lines, named=bool(named))
 
 
-def turning(metrics: Metrics, relearned: Any, *, stays: bool) -> str:
+def _beaten(metrics: Metrics, held: Mapping[str, Standing]) -> str:
+    """Why the best of this record is not named, where it is one that does not pass; else ""."""
+    best = entry(comparison(metrics), "best")
+    first = first_in(held[best].rules) if best in held else None
+    if first is None:
+        return ""
+    return f"{name_first(best)} is the best of this record and does not pass: {first.name} is {first.state}."
+
+
+def turning(
+    metrics: Metrics, held: Mapping[str, Standing], winner: str, relearned: Any, *, stays: bool
+) -> str:
     """How often which contestant was the best of a relearning, where that turns with the record or is not the
     best of this one; else "". Who was named before may be the one that `stays`."""
     counts = dict(sorted(best_in(relearned).items(), key=lambda one: -one[1]))
@@ -291,9 +305,11 @@ def turning(metrics: Metrics, relearned: Any, *, stays: bool) -> str:
             f"{counts[steady]}; of this one {in_a_sentence(of_record)} is{_STAYS if stays else '.'}"
         )
     listed = _listed([f"{in_a_sentence(name)} in {times}" for name, times in counts.items()])
+    simplest = next((name for name, standing in held.items() if standing.passes and name in counts), "")
+    tail = ", so that the simplest of them that passes is named." if winner == simplest else "."
     return (
         f"Which is best turns with the record: of {runs} relearnings from fresh records {listed}"
-        f"{_STAYS if stays else ', so that the simplest of them is named.'}"
+        f"{_STAYS if stays else tail}"
     )
 
 
