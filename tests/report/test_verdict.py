@@ -300,7 +300,8 @@ def test_what_relearnings_may_break_does_not_pass_and_another_is_named():
     assert verdict.winner not in (None, "subspace_lqg")
     held = standings(stages, RULES, relearned=never)
     assert (
-        "Subspace + LQG is the best of this record and does not pass: settling undecided." in verdict.reason
+        "Subspace + LQG is the best of this record and does not pass: settling is undecided."
+        in verdict.reason
     )
     settling = next(rule for rule in held["subspace_lqg"].rules if rule.name == "settling")
     assert settling.state == UNDECIDED and not held["subspace_lqg"].passes
