@@ -357,14 +357,15 @@ def _walls(family: Governor, now: np.ndarray, y_star: np.ndarray) -> tuple[np.nd
     """Floor and cap (f, s, p) in °C of outputs forecast `now` (f, s, p): low and high; and `overshoot` beyond
     the target, `near` where an output has arrived at it. What is up to a further `overshoot` off goes back,
     so that small errors of the forecast do not add up; what is further off comes back as the law says, and
-    goes no further away."""
+    what is too hot gets no hotter. What is far too cold is left to the law: to keep it from cooling, inputs
+    of other outputs would have to heat, which those outputs' caps forbid, and both would swing."""
     arriving, leaving = (
         np.where(sign * (y_star - now) < ARRIVED * family.overshoot, family.near, family.overshoot)
         for sign in (1.0, -1.0)
     )
     floor, cap = y_star - leaving, y_star + arriving
     return (
-        np.maximum(family.low, np.where(now < floor - family.overshoot, now, floor)),
+        np.maximum(family.low, np.where(now < floor - family.overshoot, -np.inf, floor)),
         np.minimum(family.high, np.where(now > cap + family.overshoot, now, cap)),
     )
 

@@ -11,6 +11,7 @@ import pytest
 from pipeline.report.deposition.verdict import verdict as deposition
 from pipeline.report.identification.model import trust
 from pipeline.report.setpoint.verdict import verdict as setpoint
+from pipeline.report.shared.sources import read_relearned
 from pipeline.report.shared.verdict import (
     FAILED,
     OPEN,
@@ -533,3 +534,12 @@ def test_an_old_params_file_is_told_in_one_sentence_that_a_rule_was_retired(tmp_
     with pytest.raises(ValueError, match=rf"report.{key} was retired: .*; remove the line") as refused:
         params.load(ReportRules, "report", tmp_path / "params.yaml")
     assert len(str(refused.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("text", ["not json", "[1]", '{"machine": 3, "contestants": {}, "answers": {}}'])
+def test_relearnings_that_cannot_be_read_are_refused_not_left_out(tmp_path, text):
+    """Without them the bands would be narrower, and no place on the page would say so."""
+    path = tmp_path / "relearned.json"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=r"relearned\.json.*(whole JSON|expected an object)"):
+        read_relearned(str(path))

@@ -114,7 +114,7 @@ def test_one_row_is_met_by_the_least_change():
     np.testing.assert_allclose(u, 50.0 - (150.0 - 55.0) / 5 * np.array([2.0, 1.0]), rtol=1e-9)
 
 
-def test_an_output_far_beyond_its_target_comes_back_as_the_law_says_and_goes_no_further_away():
+def test_what_is_far_too_hot_comes_back_as_the_law_says_and_gets_no_hotter():
     """3 degC above: 0.95 60 + 0.5 u = 60 at u = 6; below that the command is the law's."""
     outputs = OutputLimits(np.full(1, -np.inf), np.full(1, 100.0), np.zeros(1), 0.5)
     family = governor([HEATER], ONE, outputs, Strength(1.0, 1.0, 0.0))
@@ -122,6 +122,21 @@ def test_an_output_far_beyond_its_target_comes_back_as_the_law_says_and_goes_no_
     most, low, target = np.full((2, 1), 10.0), np.zeros((2, 1)), np.full((2, 1), 57.0)
     u = governed(family, memory, np.array([[10.0], [4.0]]), target, low, most)
     np.testing.assert_allclose(u[:, 0], [6.0, 4.0], rtol=1e-9)
+
+
+def test_a_zone_that_its_own_heater_cannot_warm_is_not_warmed_by_its_neighbours():
+    """Two zones that heat each other by a third. Zone 2 is 8 degC too cold and cools at its heater's full
+    power; zone 1 has arrived, and stays with what its law asks."""
+    plant = make_plant(
+        np.diag([0.95, 0.95]), np.array([[0.3, 0.1], [0.1, 0.3]]), np.eye(2), b=np.array([0.1, 0.1])
+    )
+    limits = Limits(np.zeros(2), np.array([20.0, 2.5]), np.full(2, np.inf))
+    outputs = OutputLimits(np.full(2, -np.inf), np.full(2, 80.0), np.full(2, 0.3), 0.5)
+    family = governor([plant], limits, outputs, Strength(1.0, 1.0, 0.0))
+    memory = started(family, np.array([[50.0, 37.0]]))
+    asked, target = np.array([[7.16, 2.5]]), np.array([[50.0, 45.0]])
+    u = governed(family, memory, asked, target, np.zeros((1, 2)), limits.high[None])
+    np.testing.assert_allclose(u, asked, rtol=1e-9)
 
 
 def test_cases_are_governed_alike_alone_and_among_many():

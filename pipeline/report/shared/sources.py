@@ -120,7 +120,8 @@ def collect(
     relearnings: str = "",
 ) -> Sources:
     """Reads the metrics files and the folders of stages, {stage: path} each. What is missing or broken is no
-    error here: its place on the page says so.
+    error here: its place on the page says so. Only relearnings that cannot be read raise ValueError: without
+    them every band would be narrower than it is, in a place that shows none.
     """
     read: dict[str, Source] = {}
     absent: dict[str, Missing] = {}
@@ -151,11 +152,12 @@ def collect(
         if artifacts.exists(NIGHTLY)
         else None
     )
-    relearned = (
-        _read(read, relearnings, "relearned", "benchmark", "relearned", artifacts.read_json)
-        if relearnings and artifacts.exists(relearnings)
-        else None
-    )
+    relearned = None
+    if relearnings and artifacts.exists(relearnings):
+        relearned = read_relearned(relearnings)
+        read[relearnings] = Source(
+            "relearned", relearnings, "benchmark", "relearned", artifacts.sha256(relearnings)
+        )
     folders_of_code = digest({folder: artifacts.sha256(folder) for folder in code})
     files = code_files(code)
     return Sources(
@@ -298,6 +300,17 @@ def _read(
         return Missing("failed", str(error))
     read[path] = Source(name, path, stage, schema, artifacts.sha256(path))
     return content
+
+
+def read_relearned(path: str) -> dict:
+    """What benchmarks.temperature --relearnings wrote. Raises ValueError where it is not whole."""
+    found, needed = artifacts.read_json(path), ("machine", "contestants", "answers")
+    if not isinstance(found, Mapping) or not all(isinstance(found.get(key), Mapping) for key in needed):
+        raise ValueError(
+            f"{path}: expected an object with {', '.join(needed)}, each an object itself; bring it back with "
+            f"git checkout {path}, or delete it: bands then hold this record alone"
+        )
+    return dict(found)
 
 
 def lookup(data: Any, dotted: str, *, what: str = "") -> Any:
