@@ -334,13 +334,17 @@ def _gather(commands: Commands, state: State, refusals: Refusals, out: Gathered)
     arc = np.isin(key, (20, 30)) & ~_none(word, "XYIJR")
     centre, angle, length = _arcs(commands, before, after, arc, state, refusals)
     firmware = np.isin(key, (100, 110)) & _none(word, "PLXYZ")  # with P or L: temperatures and offsets
-    columns = _driven(commands, motion, relative, bare, tool, state) | _switched(key, word, state, refusals, line)
+    columns = _driven(commands, motion, relative, bare, tool, state) | _switched(
+        key, word, state, refusals, line
+    )
     feed, acceleration, pause = _pace(key, word, motion, dwell, state)
     flow, volumetric = _flow(key, word, tool, state)
     what = np.select([home, dwell, changes, firmware & (key == 100), firmware],
                      [Kind.HOME, Kind.DWELL, Kind.TOOL, Kind.RETRACT, Kind.UNRETRACT], 0)  # fmt: skip
     some = functools.reduce(
-        operator.or_, (np.abs(e) > TINY for e in columns.values() if e.dtype == float), np.zeros(len(key), bool)
+        operator.or_,
+        (np.abs(e) > TINY for e in columns.values() if e.dtype == float),
+        np.zeros(len(key), bool),
     )
     moved = (np.abs(after - before) > TINY).any(axis=1) | arc
     rows = motion & np.isfinite(length) & (moved | some) | (what > 0)
@@ -673,7 +677,10 @@ def _arcs(
     for where, why in (
         (plane, "expected arcs in the plane of X and Y (G17), found one under G18 or G19"),
         (absolute, "expected I and J from the start of the arc (G91.1), found G90.1"),
-        (off & ~plane & ~absolute, "expected an arc with both ends on its circle, found none; check I, J or R"),
+        (
+            off & ~plane & ~absolute,
+            "expected an arc with both ends on its circle, found none; check I, J or R",
+        ),
     ):
         _refuse(refusals, line[at], where, why)
     centre[at], angle[at] = c, way * sweep

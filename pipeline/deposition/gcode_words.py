@@ -60,7 +60,9 @@ class Words(NamedTuple):
 
 
 CHUNK = 1 << 18  # bytes read at once: what stays in the processor's cache
-LONGEST = 1 << 16  # characters of one line: thumbnails and settings keep to hundreds, a slicer's notes to thousands
+LONGEST = (
+    1 << 16
+)  # characters of one line: thumbnails and settings keep to hundreds, a slicer's notes to thousands
 LETTER, POINT, SPACE, NEWLINE, DIGIT, SIGN = range(1, 7)
 SETS = (bytes(c for c in range(128) if chr(c).isalpha()), b".", b" \t\v\f", b"\n", b"0123456789", b"+-")
 CLASSES = bytes(next((k for k, of in enumerate(SETS, 1) if c in of), 0) for c in range(256))
