@@ -129,6 +129,7 @@ KNOWN = {
     "waits": "M400 M0 M1 M25 M226 M600 M601",
 }
 BECOMES = {word: what for what, words in KNOWN.items() for word in words.split()}
+CUBIC = b";FLAVOR:UltiGCode"  # Cura's word for machines whose E counts mm^3
 DIAMETERS = (b"filament_diameter", b"filamentDiameters", b"fiber_dia_mm", b"Filament Diameter")
 
 
@@ -151,6 +152,7 @@ class State:
         self.switch: dict[str, bool] = {}
         self.flow: dict[int, float] = {}
         self.volumetric: dict[int, bool] = {}
+        self.cubic = False  # E counts mm^3 where no M200 says otherwise
         self.diameter: dict[int, float] = {}
 
 
@@ -176,7 +178,7 @@ class Gathered:
         self.beside: dict[str, list[int]] = {}  # letters beside moves: count and first line
         self.others: list[tuple[int, str]] = []
         self.applied: dict[int, list[int]] = {}
-        self.filled, self.told_lines, self.words = 0, 0, 0
+        self.filled, self.words = 0, 0
 
 
 def parse(text: str | bytes, *, extruder: str = "") -> Program:
@@ -187,7 +189,7 @@ def parse(text: str | bytes, *, extruder: str = "") -> Program:
     G, M or T word; and for an extruder that the program does not have.
     """
     data, refusals, state, out = text_bytes(text), Refusals(), State(), Gathered()
-    lines = data.count(b"\n")
+    lines, state.cubic = data.count(b"\n"), CUBIC in data[:4096]
     gmt = np.frombuffer(b"GMT", np.uint8)
     for words in chunks(data, refusals):
         out.words += int(np.isin(words.letter, gmt).sum())
@@ -471,7 +473,7 @@ def _flow(key, word, tool, state: State) -> tuple[np.ndarray, np.ndarray]:
     for k in np.unique(np.append(tool, named[percent | sizes])).tolist():
         k, mine = int(k), tool == k
         share = _held(word["S"] / 100, percent & (named == k), state.flow.get(k, 1.0))
-        cubic = _held(counts, sizes & (named == k), state.volumetric.get(k, False)).astype(bool)
+        cubic = _held(counts, sizes & (named == k), state.volumetric.get(k, state.cubic)).astype(bool)
         flow[mine], volumetric[mine] = share[mine], cubic[mine]
         state.flow[k], state.volumetric[k] = float(share[-1]), bool(cubic[-1])
     return flow, volumetric
@@ -622,7 +624,7 @@ def _accounted(lines: int, filled: int, moved, other, refused) -> Accounted:
     moved = np.setdiff1d(moved, refused)
     other = np.setdiff1d(np.setdiff1d(other, refused), moved)
     held = len(refused) + len(moved) + len(other)
-    return Accounted(lines - max(filled, held), len(moved), max(filled - held, 0), len(other), len(refused))
+    return Accounted(lines - filled, len(moved), filled - held, len(other), len(refused))
 
 
 def _said(data: bytes) -> dict[int, float]:

@@ -67,6 +67,7 @@ LETTER, POINT, SPACE, NEWLINE, DIGIT, SIGN = range(1, 7)
 SETS = (bytes(c for c in range(128) if chr(c).isalpha()), b".", b" \t\v\f", b"\n", b"0123456789", b"+-")
 CLASSES = bytes(next((k for k, of in enumerate(SETS, 1) if c in of), 0) for c in range(256))
 CONTROL = bytes([*range(9), *range(14, 32), 127])
+BINARY = re.compile(b"[" + re.escape(CONTROL) + b"]")
 POWERS = 10.0 ** np.arange(17)
 TAIL = re.compile(rb";[^\n]*")
 COMMENT = re.compile(rb";[^\n]*|\((?:[^()\n]|\((?:[^()\n]|\([^()\n]*\))*\))*\)")
@@ -99,7 +100,8 @@ def text_bytes(text: str | bytes) -> bytes:
     for at in range(0, len(data), CHUNK):
         some = data[at : at + CHUNK]
         if len(some) - len(some.translate(None, CONTROL)) > 8 + len(some) / 100:
-            where = f"at its byte {at}" if at else f"beginning {data[:4]!r}"
+            first = at + BINARY.search(some).start()  # ty: ignore[possibly-missing-attribute]
+            where = f"at its byte {first:,}" if first > 64 else f"beginning {data[:4]!r}"
             raise ValueError(
                 f"the program is binary, {where}: expected G-code as text; "
                 "export it as plain .gcode, unpacked"
@@ -152,7 +154,7 @@ def _chunk(body: bytes, first: int, refusals: Refusals) -> tuple[Words, int]:
     """Words of a chunk of whole lines, and the number of its lines."""
     columns, odd, count = _regular(body, first)
     line, extra, others = columns[0], [], []
-    filled = len(odd) + (np.count_nonzero(np.diff(line)) + 1 if len(line) else 0)
+    filled = len(odd) + (int(np.count_nonzero(np.diff(line))) + 1 if len(line) else 0)
     texts = body.decode("latin-1").split("\n") if len(odd) else []
     for k in odd.tolist():
         pairs, unknown, why = _odd(texts[k])
