@@ -142,7 +142,7 @@ def first_experiment(arguments: argparse.Namespace) -> None:
 def compose(arguments: argparse.Namespace) -> None:
     """A part program into plunger commands (CSV, Parquet, MCAP, G-code with leads), tasks and lines as
     Parquet, and whether it will print."""
-    from pipeline.deposition.workflow import compose_parts, exports
+    from pipeline.deposition.workflow import compose_parts, exports, part_programs
     from pipeline.deposition.workflow.segment_library import read_learned
     from pipeline.deposition.workflow.settings import ComposeParts, Printer
 
@@ -151,7 +151,7 @@ def compose(arguments: argparse.Namespace) -> None:
             f"--out {arguments.out}: should be a folder but is a file; name a folder, "
             "which is made where it is missing"
         )
-    asked = exports.asked(
+    asked = part_programs.asked(
         scale=arguments.scale, speed=arguments.speed, filament_mm=arguments.filament_mm,
         extruder=arguments.extruder, bead=arguments.bead,
     )  # fmt: skip
@@ -162,7 +162,7 @@ def compose(arguments: argparse.Namespace) -> None:
     printer, settings = params.load(Printer, "printer"), params.load(ComposeParts, "compose_parts")
     part = compose_parts.compose(arguments.part, learned, printer, settings, asked)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    files = compose_parts.write(part, arguments.out, formats)
+    files = exports.write(part, arguments.out, formats)
     print(compose_parts.summary_lines(part))
     print("written: " + ", ".join(str(file) for file in files))
 

@@ -169,16 +169,40 @@ class Commands(NamedTuple):
 
 class Gathered:
     """What the chunks leave: columns of the moves, E by every letter and every switch that may drive the
-    extrusion, the lines of their words, and what else was found."""
+    extrusion, the lines of their words, and what else was found. Columns have room for a move a line, and
+    take memory only where they are written."""
 
-    def __init__(self) -> None:
-        self.rows: list[tuple[np.ndarray, ...]] = []
-        self.driven: dict[str, dict[int, np.ndarray]] = {}  # by letter or switch: chunk -> column
+    def __init__(self, lines: int) -> None:
+        self.rows, self.room = 0, lines + 1
+        self.columns: list[np.ndarray] = []
+        self.driven: dict[str, np.ndarray] = {}  # by letter or switch
         self.lines_of: dict[str, list[tuple[int, str]]] = {}  # words of a letter alone or of a switch
         self.beside: dict[str, list[int]] = {}  # letters beside moves: count and first line
         self.others: list[tuple[int, str]] = []
         self.applied: dict[int, list[int]] = {}
         self.filled, self.words = 0, 0
+
+    def add(self, columns: tuple[np.ndarray, ...], driven: dict[str, np.ndarray]) -> None:
+        """The moves of a chunk behind those before; what drives E is nothing where it was not seen."""
+        self.columns = self.columns or [np.zeros((self.room, *c.shape[1:]), c.dtype) for c in columns]
+        for name in driven.keys() - self.driven.keys():
+            self.driven[name] = np.zeros(self.room, driven[name].dtype)
+        to = self.rows + len(columns[0])
+        if to > self.room:  # several commands in many lines
+            self.room = 2 * to
+            self.columns = [_longer(column, self.room) for column in self.columns]
+            self.driven = {name: _longer(column, self.room) for name, column in self.driven.items()}
+        for whole, column in zip(self.columns, columns, strict=True):
+            whole[self.rows : to] = column
+        for name, column in driven.items():
+            self.driven[name][self.rows : to] = column
+        self.rows = to
+
+
+def _longer(column: np.ndarray, room: int) -> np.ndarray:
+    longer = np.zeros((room, *column.shape[1:]), column.dtype)
+    longer[: len(column)] = column
+    return longer
 
 
 def parse(text: str | bytes, *, extruder: str = "") -> Program:
@@ -188,14 +212,14 @@ def parse(text: str | bytes, *, extruder: str = "") -> Program:
     Raises ValueError, in one sentence, for what is no G-code text at all: binary, empty, or without a single
     G, M or T word; and for an extruder that the program does not have.
     """
-    data, refusals, state, out = text_bytes(text), Refusals(), State(), Gathered()
+    data, refusals, state = text_bytes(text), Refusals(), State()
     lines, state.cubic = data.count(b"\n"), CUBIC in data[:4096]
-    gmt = np.frombuffer(b"GMT", np.uint8)
+    out, gmt = Gathered(lines), np.frombuffer(b"GMT", np.uint8)
     for words in chunks(data, refusals):
         out.words += int(np.isin(words.letter, gmt).sum())
         out.filled += words.filled
         out.others += words.others
-        if len(words.line):
+        if len(words.line) or not out.columns:
             _gather(_commands(words, state, refusals), state, refusals, out)
     if not out.words:
         raise no_program(lines)
@@ -348,15 +372,14 @@ def _gather(commands: Commands, state: State, refusals: Refusals, out: Gathered)
         (np.abs(e) > TINY for e in columns.values() if e.dtype == float),
         np.zeros(len(key), bool),
     )
-    moved = (np.abs(after - before) > TINY).any(axis=1) | arc
-    rows = motion & np.isfinite(length) & (moved | some) | (what > 0)
-    chunk = len(out.rows)
-    for name, column in columns.items():
-        out.driven.setdefault(name, {})[chunk] = column[rows]
-    out.rows.append(tuple(column[rows] for column in (
-        line, what.astype(np.int8), before, after, length, feed, tool, centre, angle, pause, acceleration,
-        flow, volumetric,
-    )))  # fmt: skip
+    travel = np.abs(after - before) > TINY
+    planar, vertical = travel[:, :2].any(axis=1) | arc, travel[:, 2]
+    rows = motion & np.isfinite(length) & (planar | vertical | some) | (what > 0)
+    found = (
+        line, before, after, length, feed, tool, centre, angle, pause, acceleration, flow, volumetric,
+        what.astype(np.int8), planar, vertical,
+    )  # fmt: skip
+    out.add(tuple(column[rows] for column in found), {name: e[rows] for name, e in columns.items()})
     state.relative = bool(relative[-1])
     _words_left(commands, motion, selects | firmware, out)
 
@@ -480,7 +503,7 @@ def _flow(key, word, tool, state: State) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _words_left(commands: Commands, motion: np.ndarray, meant: np.ndarray, out: Gathered) -> None:
-    """Words that are no moves, letters beside moves, and the words that may turn out to switch or to drive."""
+    """Words that are no moves, letters beside moves, and words that may turn out to switch or to drive."""
     line, key, word, _, lead = commands
     switching = np.isin(key, SWITCHING)
     left = np.flatnonzero(~(np.isin(key, MEANT) | meant | switching) & (key != REFUSED))
@@ -514,49 +537,24 @@ _cached_name = functools.cache(_name)
 
 def _moved(out: Gathered, asked: str) -> tuple[Moves, tuple[str, ...], np.ndarray, np.ndarray]:
     """The moves of all chunks, what drives their extrusion, M221's factor and M200's mode of each."""
-    count = [len(rows[0]) for rows in out.rows]
-    columns = []
-    for k in range(13):
-        columns.append(np.concatenate([rows[k] for rows in out.rows]) if out.rows else _empty()[k])
-    out.rows.clear()
-    line, what, start, end, length, feed, tool, centre, angle, pause, acceleration, flow, volumetric = columns
-    travel = np.abs(end - start) > TINY
-    planar, vertical = travel[:, :2].any(axis=1) | (angle != 0), travel[:, 2]
-    motion = what == 0
-    driven = {name: _joined(parts, count) for name, parts in out.driven.items()}
-    driver = _driver(driven, planar & motion, asked)
-    e = np.zeros(len(line))
+    line, start, end, length, feed, tool, centre, angle, pause, acceleration, flow, volumetric = (
+        column[: out.rows] for column in out.columns[:12]
+    )
+    what, planar, vertical = (column[: out.rows] for column in out.columns[12:])
+    driven = {name: column[: out.rows] for name, column in out.driven.items()}
+    driver = _driver(driven, planar & (what == 0), asked)
+    e = np.zeros(out.rows)
     for name in driver:
         e += driven[name] if driven[name].dtype == float else 0.0
-    if any(driven[name].dtype == bool for name in driver):
-        on = functools.reduce(operator.or_, (driven[name] for name in driver))
-        e = np.where(on & motion, length, 0.0)
-    del driven
+    switches = [driven[name] for name in driver if driven[name].dtype == bool]
+    if switches:
+        e = np.where(np.logical_or.reduce(switches) & (what == 0), length, 0.0)
     kind = _kinds(what, planar, vertical, e)
     keep = (what > 0) | planar | vertical | (np.abs(e) > TINY)
     moves = (line, kind, start, end, length, e, feed, tool, centre, angle, pause, acceleration)
     if not keep.all():
         moves, flow, volumetric = tuple(column[keep] for column in moves), flow[keep], volumetric[keep]
     return Moves(*moves), driver, flow, volumetric
-
-
-def _empty() -> tuple[np.ndarray, ...]:
-    """Columns of no moves."""
-    none, flat = np.zeros(0), np.zeros((0, 3))
-    whole = np.zeros(0, int)
-    return (whole, whole.astype(np.int8), flat, flat, none, none, whole, flat[:, :2], none, none, none, none,
-            none.astype(bool))  # fmt: skip
-
-
-def _joined(parts: dict[int, np.ndarray], count: list[int]) -> np.ndarray:
-    """A column over all chunks; nothing before it was first seen, and E nothing where it was absent."""
-    kind = next(iter(parts.values())).dtype
-    whole = np.zeros(sum(count), kind)
-    at = np.append(0, np.cumsum(count))
-    for chunk, column in parts.items():
-        whole[at[chunk] : at[chunk + 1]] = column
-    parts.clear()
-    return whole
 
 
 def _driver(driven: dict[str, np.ndarray], planar: np.ndarray, asked: str) -> tuple[str, ...]:

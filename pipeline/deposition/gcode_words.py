@@ -1,4 +1,4 @@
-"""Bytes of a part program -> words (line, letter, value), chunk by chunk, whatever dialect or damage they hold.
+"""Bytes of a part program -> words (line, letter, value), chunk by chunk, whatever their dialect or damage.
 
 Lines made of letters with numbers are read together, eight digits in three multiplications;
 the few others (macros, free text, checksums) one by one.
@@ -7,7 +7,6 @@ the few others (macros, free text, checksums) one by one.
 import functools
 import operator
 import re
-import sys
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -24,7 +23,7 @@ class Refusal(NamedTuple):
 
 
 class Refusals:
-    """What was refused so far: by kind of reason the first line with its sentence, and every line's number."""
+    """What was refused so far: by kind of reason its first line and sentence, and all lines' numbers."""
 
     def __init__(self) -> None:
         self.kinds: dict[str, Refusal] = {}
@@ -100,7 +99,7 @@ def text_bytes(text: str | bytes) -> bytes:
     for at in range(0, len(data), CHUNK):
         some = data[at : at + CHUNK]
         if len(some) - len(some.translate(None, CONTROL)) > 8 + len(some) / 100:
-            first = at + BINARY.search(some).start()  # ty: ignore[possibly-missing-attribute]
+            first = at + next(found.start() for found in BINARY.finditer(some))
             where = f"at its byte {first:,}" if first > 64 else f"beginning {data[:4]!r}"
             raise ValueError(
                 f"the program is binary, {where}: expected G-code as text; "
@@ -155,11 +154,12 @@ def _chunk(body: bytes, first: int, refusals: Refusals) -> tuple[Words, int]:
     columns, odd, count = _regular(body, first)
     line, extra, others = columns[0], [], []
     filled = len(odd) + (int(np.count_nonzero(np.diff(line))) + 1 if len(line) else 0)
+    same: dict[str, str] = {}  # one object a word: a word may stand there a million times
     texts = body.decode("latin-1").split("\n") if len(odd) else []
     for k in odd.tolist():
         pairs, unknown, why = _odd(texts[k])
         extra += [(first + k, ord(letter), value) for letter, value in pairs]
-        others += [(first + k, sys.intern(unknown))] if unknown else []
+        others += [(first + k, same.setdefault(unknown, unknown))] if unknown else []
         if why:
             refusals.add([first + k], why)
     if extra:
@@ -242,7 +242,7 @@ def _odd(text: str) -> tuple[list[tuple[str, float]], str, str]:
     while at < len(text):
         match = WORD.match(text, at)
         letter, number, end = (match[1].upper(), match[2], match.end()) if match else ("", None, at)
-        if number and words and match.start(1) > at and (exponent := EXPONENT.match(text, end)):
+        if match and number and words and match.start(1) > at and (exponent := EXPONENT.match(text, end)):
             number, end = (
                 number + exponent[0],
                 exponent.end(),

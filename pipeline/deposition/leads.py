@@ -77,20 +77,19 @@ def _places(moves: Moves, time_s, begins, ends, signal, ahead: int, Ts: float) -
 def bends(u: np.ndarray, tolerance: float) -> np.ndarray:
     """Indices (K,) of samples, the first and the last among them, between which straight lines stay within
     `tolerance` of u (T,): each line as long as the cone of slopes from its start allows."""
-    kept, start, low, high = [0], 0, -np.inf, np.inf
+    kept, start, last, low, high = [0], 0, 0, -np.inf, np.inf
     flat = np.flatnonzero(np.append(True, np.abs(np.diff(u)) > 0))  # runs of equal values have two ends
-    inner = np.union1d(flat, np.maximum(flat - 1, 0))
-    values = u[inner].tolist()
-    for k, value in zip(inner.tolist(), values, strict=True):
-        if k <= start:
+    inner = np.union1d(flat, [*np.maximum(flat - 1, 0), len(u) - 1])
+    for k, value in zip(inner.tolist(), u[inner].tolist(), strict=True):
+        if k == 0:
             continue
-        slope, wide = (value - u[start]) / (k - start), tolerance / (k - start)
+        slope = (value - u[start]) / (k - start)
         if not low <= slope <= high:
-            start = before
-            kept.append(start)
-            slope, wide = (value - u[start]) / (k - start), tolerance / (k - start)
-            low, high = -np.inf, np.inf
-        low, high, before = max(low, slope - wide), min(high, slope + wide), k
+            kept.append(last)
+            start, low, high = last, -np.inf, np.inf
+            slope = (value - u[start]) / (k - start)
+        wide = tolerance / (k - start)
+        low, high, last = max(low, slope - wide), min(high, slope + wide), k
     return np.unique(np.append(kept, len(u) - 1))
 
 

@@ -1,6 +1,6 @@
 """A reader of G-code that shares no code with the project's: one line at a time, one character at a time, as
-the RepRap wiki ("G-code": fields, checking, G0-G4, G10, G11, G20, G21, G28, G90-G92, M82, M83, M200, M220, M221,
-T) and Marlin's pages of the same words have it. Slow and plain, to be held against columns.
+the RepRap wiki ("G-code": fields, checking, G0-G4, G10, G11, G20, G21, G28, G90-G92, M82, M83, M200, M220,
+M221, T) and Marlin's pages of the same words have it. Slow and plain, to be held against columns.
 """
 
 import cmath
@@ -8,7 +8,8 @@ import math
 from typing import NamedTuple
 
 SETTING = {
-    "G17", "G18", "G19", "G20", "G21", "G90", "G91", "G92", "G91.1", "M82", "M83", "M200", "M204", "M220", "M221",
+    "G17", "G18", "G19", "G20", "G21", "G90", "G91", "G92", "G91.1", "M82", "M83", "M200", "M204", "M220",
+    "M221",
 }  # fmt: skip
 
 

@@ -2,7 +2,7 @@
 judged where the machine is known, and reported."""
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +13,7 @@ from pipeline.deposition import composition, conformance, evaluation, extrusion,
 from pipeline.deposition.composition import Composed, Learned, PartSettings
 from pipeline.deposition.conformance import Conformance
 from pipeline.deposition.evaluation import Judging, Score
-from pipeline.deposition.workflow import exports, laws
+from pipeline.deposition.workflow import laws, part_programs
 from pipeline.deposition.workflow.segment_library import finite_or_none
 from pipeline.deposition.workflow.settings import ComposeParts, Printer, TrainIlc
 from pipeline.deposition.workflow.tables import LINES, SCORES, SIGNALS, TASKS
@@ -95,7 +95,7 @@ def compose(
     learned: Learned,
     printer: Printer,
     settings: ComposeParts,
-    asked: exports.Asked = exports.AS_IT_IS,
+    asked: part_programs.Asked = part_programs.AS_IT_IS,
 ) -> Part:
     """A part program, composed. Raises ValueError naming the file, and the line where there is one."""
     learned_s = learned.library.sample_time_s
@@ -105,8 +105,8 @@ def compose(
             f"at {learned_s:g} s; "
             "learn it again with ./run dvc repro"
         )
-    program = exports.read(path, asked)
-    extruded = exports.extruded(program, printer, asked)
+    program = part_programs.read(path, asked)
+    extruded = part_programs.extruded(program, printer, asked)
     with artifacts.about(path):
         planned = motion.plan(
             program.moves, acceleration=printer.acceleration_mm_per_s2,
@@ -136,24 +136,11 @@ def compose(
             largest_error_percent=settings.largest_error_percent,
             refusals=program.refusals,
         )
-        report = exports.in_percent(
+        report = part_programs.in_percent(
             report, program.moves, composed, shortest_s=settings.shortest_s,
             least_mm3=printer.bead_area_mm2 * printer.nozzle_mm,
         )  # fmt: skip
     return Part(path.stem, program, planned, composed, report, printer, extruded)
-
-
-def write(part: Part, folder: Path, formats: Collection[str] = ("csv",)) -> list[Path]:
-    """The commands of all tools in each format, tasks and lines as Parquet, and the
-    conformance report as JSON, beside one another in `folder`."""
-    files = exports.write_commands(folder, part.name, part.program, part.planned, part.composed, formats)
-    tables = ((TASKS, task_rows(part)), (LINES, line_rows(part)))
-    for schema, columns in tables:
-        files.append(folder / f"{part.name}.{schema.name}.parquet")
-        artifacts.write_table(files[-1], schema, columns)
-    files.append(folder / f"{part.name}.conformance.json")
-    artifacts.write_json(files[-1], report(part))
-    return files
 
 
 def summary_lines(part: Part) -> str:
@@ -201,7 +188,7 @@ def summary_lines(part: Part) -> str:
             f"{int(np.sum(lines.shorter_than_lead))} lines belong to runs shorter than the lead of Stop: "
             "the priority rule would not print them"
         )
-    text += exports.summary(part.program, part.extruded, part.printer) + exports.refused(checks)
+    text += part_programs.summary(part.program, part.extruded, part.printer) + part_programs.refused(checks)
     return "\n".join(text)
 
 
@@ -308,7 +295,7 @@ def report(part: Part) -> dict[str, Any]:
         },
         "refused": refused,
         "unknown_words": len(part.program.other_line),
-        "program": exports.told(part.program, part.extruded, part.printer),
+        "program": part_programs.told(part.program, part.extruded, part.printer),
     }
 
 
