@@ -123,6 +123,7 @@ def compose(
             printer.limit,
         )
         materials = {material.tool: material.name for material in printer.materials}
+        part_programs.check_duration(program.moves, planned)
         # a printed line is as long as the declared bead would be of the volume that E asks for
         beads = extrusion.as_lengths(program, extruded, bead_area_mm2=printer.bead_area_mm2)
         composed = composition.compose(learned, beads, planned, part_settings, materials=materials)
@@ -294,7 +295,7 @@ def report(part: Part) -> dict[str, Any]:
             name: finite_or_none(value) for name, value in _by_material(part, checks.ramp_that_would_do_s)
         },
         "refused": refused,
-        "unknown_words": len(part.program.other_line),
+        "unknown_words": sum(one.count for one in part.program.told if not one.what),
         "program": part_programs.told(part.program, part.extruded, part.printer),
     }
 

@@ -10,11 +10,12 @@ from pipeline.deposition import extrusion, gcode
 from pipeline.deposition.composition import Composed
 from pipeline.deposition.conformance import Conformance
 from pipeline.deposition.extrusion import Extruded
+from pipeline.deposition.motion import Motion
 from pipeline.deposition.workflow.settings import Printer
 from pipeline.reading.plain_files import check_plain_file
 from pipeline.store import artifacts
 
-LARGEST_MB = 1000
+LARGEST_MB, LONGEST_H = 1000, 72
 SHOWN = 12  # refusals and words told in the summary
 
 
@@ -79,6 +80,17 @@ def extruded(program: gcode.Program, printer: Printer, asked: Asked = AS_IT_IS) 
     if asked.declared_bead:
         return found._replace(source=dict.fromkeys(found.source, "the declared bead was asked for"))
     return found
+
+
+def check_duration(moves: gcode.Moves, planned: Motion) -> None:
+    """Raises ValueError, naming the line, for a plan that is longer than any print: an F or a dwell slipped."""
+    hours = float(planned.duration_s.sum()) / 3600
+    if not hours <= LONGEST_H:
+        slow = int(planned.duration_s.argmax())
+        raise ValueError(
+            f"expected a print of at most {LONGEST_H} h, found {hours:.3g} h, of which line {moves.line[slow]} "
+            f"takes {planned.duration_s[slow] / 3600:.3g} h; check its F or its dwell, or cut the program"
+        )
 
 
 def in_percent(
