@@ -350,6 +350,6 @@ def test_learning_is_what_its_parts_are():
 def test_a_limit_that_no_law_can_meet_is_refused_with_the_ramp_that_would_do(project, capsys):
     printer = params.load(Printer, "printer")
     # 1.2 times the steady command, where ramps of 0.15 s need about (1 + 0.8 / 0.15) times it
-    declare({"printer.limit_mm": 1.2 * printer.steady_flow / 1.08, "train_ilc.worst_ratio": 0.1})
+    declare({"printer.drive.amplitude_mm": 1.2 * printer.steady_flow / 1.08, "train_ilc.worst_ratio": 0.1})
     message = refusal("train_ilc", capsys)
     assert "headroom" in message and "ramps of" in message and "would do" in message

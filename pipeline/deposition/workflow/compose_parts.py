@@ -112,7 +112,7 @@ def compose(path: Path, learned: Learned, printer: Printer, settings: ComposePar
         planned = motion.plan(
             program.moves, acceleration=printer.acceleration_mm_per_s2,
             junction_deviation_mm=printer.junction_deviation_mm,
-            speed_limit=printer.speed_limit_mm_per_s, unset_feed=printer.speed_mm_per_s,
+            speed_limit=printer.gantry_speed_limit_mm_per_s, unset_feed=printer.speed_mm_per_s,
             tool_change_s=printer.tool_change_s,
         )  # fmt: skip
         part_settings = PartSettings(
@@ -121,7 +121,7 @@ def compose(path: Path, learned: Learned, printer: Printer, settings: ComposePar
             printer.ramp_s,
             settings.corner_deg,
             settings.longest_pause_s,
-            printer.limit,
+            printer.limits,
         )
         materials = {material.tool: material.name for material in printer.materials}
         composed = composition.compose(learned, program, planned, part_settings, materials=materials)
@@ -130,7 +130,7 @@ def compose(path: Path, learned: Learned, printer: Printer, settings: ComposePar
             learned,
             bead_area_mm2=printer.bead_area_mm2,
             ramp_s=printer.ramp_s,
-            limit=printer.limit,
+            drive=printer.limits,
             shortest_s=settings.shortest_s,
             largest_error_percent=settings.largest_error_percent,
             refusals=program.refusals,
@@ -187,7 +187,7 @@ def summary_lines(part: Part) -> str:
             do = (
                 f"ramps of {ramp:.2f} s would do"
                 if math.isfinite(ramp)
-                else "no ramp would do: print slower, or raise printer.limit_mm"
+                else "no ramp would do: print slower, or take a drive of more than printer.drive declares"
             )
             text.append(
                 f"  the command reaches its limit {sat.share_percent:.1f} % of the printing time (peak "

@@ -368,7 +368,14 @@ def _resume(
             "check the units of the command, "
             "the calibration and the frames' size, or write the gain as it is"
         )
-    rows = ilc.table(trials, routine.r, steady=float(u0.max()), limit=settings.limit, rise=settings.rise)
+    rows = ilc.table(
+        trials,
+        routine.r,
+        steady=float(u0.max()),
+        drive=settings.drive,
+        sample_time_s=settings.sample_time_s,
+        rise=settings.rise,
+    )
     return TrialSequence("pixels", routine, trials, rows, law.model), step
 
 
