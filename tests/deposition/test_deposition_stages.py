@@ -21,7 +21,7 @@ from pipeline.store import artifacts, params
 ROOT = Path(__file__).parents[2]
 STAGES = ("train_ilc", "segment_library", "compose_parts")
 # short phases and one material: the whole of it in seconds
-SHORT = {"off_s": 1.0, "on_s": 2.5, "tail_s": 2.0}
+SHORT = {"off_s": 1.0, "on_s": 4.0, "tail_s": 2.0}
 SMALL = {
     "printer.reference": {"speed_mm_per_s": 8.0, "pause_s": 0.6, **SHORT},
     "printer.routines": [
@@ -350,6 +350,7 @@ def test_learning_is_what_its_parts_are():
 def test_a_limit_that_no_law_can_meet_is_refused_with_the_ramp_that_would_do(project, capsys):
     printer = params.load(Printer, "printer")
     # 1.2 times the steady command, where ramps of 0.15 s need about (1 + 0.8 / 0.15) times it
-    declare({"printer.drive.amplitude_mm": 1.2 * printer.steady_flow / 1.08, "train_ilc.worst_ratio": 0.1})
+    drive = {"amplitude_mm": 1.2 * printer.steady_flow / 1.08, "speed_mm_per_s": 20.0, "backlash_mm": 0.05}
+    declare({"printer.drive": drive, "train_ilc.worst_ratio": 0.1})
     message = refusal("train_ilc", capsys)
     assert "headroom" in message and "ramps of" in message and "would do" in message

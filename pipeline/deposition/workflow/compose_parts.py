@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from pipeline.deposition import composition, conformance, evaluation, gcode, motion
-from pipeline.deposition.composition import Composed, Learned, PartSettings
+from pipeline.deposition import composition, conformance, drive, evaluation, gcode, motion
+from pipeline.deposition.composition import Composed, Learned, PartSettings, Stream
 from pipeline.deposition.conformance import Conformance
 from pipeline.deposition.evaluation import Judging, Score
 from pipeline.deposition.workflow import laws
@@ -321,14 +321,21 @@ def _by_material(part: Part, of_tool: dict[int, Any]) -> list[tuple[str, Any]]:
 
 def figures(judged: Sequence[tuple[Part, Sequence[Score]]]) -> dict[str, Any]:
     """By part, material and composer: the error of the true flow in % of on-off
-    control's, the worst line's volume, and which was chosen."""
+    control's, the worst line's volume, and which was chosen; and what its command asks of the drive."""
     return {
         part.name: {
             stream.material: _by_composer([score for score in scores if score.stream == i])
+            | _asked(stream, part.composed.sample_time_s)
             for i, stream in enumerate(part.composed.streams)
         }
         for part, scores in judged
     }
+
+
+def _asked(stream: Stream, sample_time_s: float) -> dict[str, float]:
+    """The largest command and speed of the signal as it is sent."""
+    most = drive.asked(stream.u, sample_time_s=sample_time_s)
+    return {"largest_command_mm": most.command_mm, "largest_speed_mm_per_s": most.speed_mm_per_s}
 
 
 def _by_composer(scores: Sequence[Score]) -> dict[str, Any]:
