@@ -88,3 +88,14 @@ def test_a_learned_command_within_amplitude_and_speed_beats_one_that_is_obeyed_a
     slewed = obeyed(ilc.inverse(x, model, sample_time_s=TS), DRIVE, sample_time_s=TS)
     near, cut = (np.linalg.norm(flow(model, v, sample_time_s=TS) - PULSES) for v in (u, slewed))
     assert near < 0.8 * cut
+    # nearest within the amplitude alone, then slewed: it sets out too late
+    crawling = DRIVE._replace(speed_mm_per_s=4.0)
+    late = ilc.command(x, PULSES, model, drive=Drive(10.0, np.inf, 0.0), sample_time_s=TS)
+    near, cut = (
+        np.linalg.norm(flow(model, v, sample_time_s=TS) - PULSES)
+        for v in (
+            ilc.command(x, PULSES, model, drive=crawling, sample_time_s=TS),
+            obeyed(late, crawling, sample_time_s=TS),
+        )
+    )
+    assert near < 0.9 * cut
