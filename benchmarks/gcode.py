@@ -48,7 +48,8 @@ if sys.argv[1] == "read":
 else:
     sys.argv = ["beadline", "compose", path, "--out", sys.argv[3]]
     cli.main()
-print(f"\\n{time.perf_counter() - begin:.2f} {time.process_time() - cpu:.2f} {peak() - imports:.0f} {peak():.0f}")
+seconds, cpu = time.perf_counter() - begin, time.process_time() - cpu
+print(f"\\n{seconds:.2f} {cpu:.2f} {peak() - imports:.0f} {peak():.0f}")
 """
 LIMITS = {
     "acceleration": 500.0,

@@ -427,4 +427,4 @@ def _printed(sources: Sources) -> Pair:
 def _listed(refused: Any) -> list[str]:
     if isinstance(refused, str):
         return [refused]
-    return [f"line {line['line']}, {line['why']}" for line in refused]
+    return [f"line {line['line']}, {line['why']}" for line in refused for _ in range(line.get("count", 1))]
