@@ -8,7 +8,8 @@ import scipy.ndimage
 import scipy.signal
 
 from pipeline.deposition import reachable
-from pipeline.deposition.extruder import DAMPING, Extruder, lagged, ramp
+from pipeline.deposition.chain import Identified, fronts
+from pipeline.deposition.extruder import DAMPING, Extruder, ramp
 
 # the yield is loaded this long before the flow begins and kept through gaps of twice that: long against the
 # lag, short against a pause between lines
@@ -46,13 +47,13 @@ def loaded(r: np.ndarray, margin_s: float, sample_time_s: float) -> np.ndarray:
     return np.clip(near, 0.0, 1.0)
 
 
-def advance(extruder: Extruder, sample_time_s: float) -> np.ndarray:
+def advance(extruder: Extruder | Identified, sample_time_s: float) -> np.ndarray:
     """Centred impulse response of conj(H) / (|H|^2 + FLOOR), scaled to gain 1, with H
-    of delay and lag: what comes late is sent ahead."""
+    of delay and lags: what comes late is sent ahead."""
     half = round(SPAN_S / sample_time_s)
     impulse = np.zeros(4 * half)
     impulse[0] = 1.0
-    H = np.fft.rfft(lagged(impulse, extruder.delay_s, extruder.lag_hz, sample_time_s))
+    H = np.fft.rfft(fronts([Identified(*extruder)], impulse[None], sample_time_s)[0, 0])
     h = np.roll(np.fft.irfft(np.conj(H) / (np.abs(H) ** 2 + FLOOR), len(impulse)), half)[: 2 * half + 1]
     return h / h.sum()
 
@@ -88,8 +89,10 @@ def compose(
     """
     if not np.any(r > 0):
         return np.zeros(len(r))
+    extruder = Identified(*extruder)
     x = r + extruder.yield_ * loaded(r, LOAD_S, sample_time_s)
-    v, ahead = _inverse(extruder, x, sample_time_s), advance(extruder, sample_time_s)
+    p = pressed_of(extruder, x)
+    v, ahead = _inverse(extruder, p, sample_time_s), advance(extruder, sample_time_s)
     if np.abs(scipy.signal.oaconvolve(v, ahead, "same")).max() > limit:
         v, ahead = _nearest(extruder, v, r, limit, sample_time_s), shift(extruder, sample_time_s)
     if extruder.play > 0:
@@ -101,18 +104,39 @@ def compose(
     return np.clip(scipy.signal.oaconvolve(v, ahead, "same"), -limit, limit)
 
 
-def _modes(extruder: Extruder, sample_time_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Gain and pole of the fast and of the creeping mode: each is
-    m(t+1) = pole m(t) + gain v(t), and x their sum."""
+def pressed_of(extruder: Identified, x: np.ndarray) -> np.ndarray:
+    """p (T,) in mm whose flow without yield is x (T,) >= 0: `chain.flow_of` undone."""
+    if extruder.exponent == 1.0:
+        return x / extruder.gain
+    full = extruder.gain * extruder.level
+    return extruder.level * np.maximum(x / full, 0.0) ** (1 / extruder.exponent)
+
+
+def _modes(extruder: Identified, sample_time_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Share and pole of the fast and of the creeping mode: each is
+    m(t+1) = pole m(t) + share v(t), and p their sum."""
     poles = np.exp(-sample_time_s / np.array([extruder.time_constant_s, extruder.creep_time_s]))
-    return extruder.gain * np.array([1 - extruder.creep_share, extruder.creep_share]) * (1 - poles), poles
+    return np.array([1 - extruder.creep_share, extruder.creep_share]) * (1 - poles), poles
 
 
-def _inverse(extruder: Extruder, x: np.ndarray, sample_time_s: float) -> np.ndarray:
-    """v (T,), held between samples, that brings both modes together to x at every next sample."""
+def _inverse(extruder: Identified, p: np.ndarray, sample_time_s: float) -> np.ndarray:
+    """v (T,), held between samples, that brings both modes together to p at every next sample."""
     (g, h), (a, b) = _modes(extruder, sample_time_s)
-    v = scipy.signal.lfilter(np.convolve([1.0, -a], [1.0, -b]), [g + h, -g * b - h * a], x)
-    return np.append(v[1:], x[-1] / extruder.gain)
+    if extruder.fall_ratio == 1.0:
+        v = scipy.signal.lfilter(np.convolve([1.0, -a], [1.0, -b]), [g + h, -g * b - h * a], p)
+        return np.append(v[1:], p[-1])
+    d, c = math.exp(-sample_time_s / (extruder.time_constant_s * extruder.fall_ratio)), extruder.creep_share
+    fast = slow = 0.0
+    out = []
+    for wanted in [*p[1:].tolist(), float(p[-1])]:
+        v = (wanted - (1 - c) * a * fast - b * c * slow) / (g + h)
+        pole = a
+        if v < fast:
+            v = (wanted - (1 - c) * d * fast - b * c * slow) / ((1 - c) * (1 - d) + h)
+            pole = d
+        fast, slow = v + (fast - v) * pole, v + (slow - v) * b
+        out.append(v)
+    return np.array(out)
 
 
 def _nearest(
@@ -121,6 +145,7 @@ def _nearest(
     """v (T,) within +-limit whose fast mode comes nearest to that of the unlimited v; below
     the yield, where no flow is wanted, it is free."""
     (g, _), (a, _) = _modes(extruder, sample_time_s)
+    g *= extruder.gain
     fast = scipy.signal.lfilter([g], [1.0, -a], v)
     reached = reachable.nearest(fast, np.append(r[1:], 0.0) <= 0, pole=a, bound=g * limit)
     return np.clip((reached - a * np.append(0.0, reached[:-1])) / g, -limit, limit)
