@@ -42,8 +42,10 @@ HIGH = np.array([math.log(1e3), math.log(100.0), 1.0, 3.0, 0.3, 0.5, 0.5, math.l
 # steps of the Jacobian, small against what a trial can tell and large against rounding
 STEP = np.array([1e-3, 1e-3, 1e-3, 1e-2, 1e-3, 1e-3, 2e-3, 1e-2, 1e-3, 2e-3, 1e-3])
 # what every chain has, and what it may have beside it: each kept only where trials left out prefer it
-ALWAYS = (0, 1, 2, 3, 4, 5)
+ALWAYS = (0, 1, 2, 4, 5)
 EXTRAS = {"creep": (6, 7), "fall": (8,), "second_lag": (9,), "exponent": (10,)}
+# the second-order lag, which is left away where rows left out do not miss it
+LAG, LAG_AT = "lag", 3
 AVERAGE_S = 0.2
 # a measured flow wanders from trial to trial: changes slower than this
 # are trusted less than white noise would be
@@ -52,9 +54,9 @@ DRIFT_S = 4.0
 MEMBERS = 32
 # below so many rows a walk in plain numbers is faster than one in arrays
 FEW_ROWS = 48
-# an extra is kept where the squared innovations of routines left out fall by this share, and by so many of
-# the standard deviations of that fall over their rows
-MARGIN, CLEAR = 0.002, 2.0
+# an extra is kept where the squared innovations of routines left out fall by this share, some fifty times
+# what a useless one takes of white noise, and fall in so many of the routines
+MARGIN, AGREE = 0.002, 0.75
 # steps of a fit that sets out from the fit to all rows
 REFITS = 3
 # a chain whose squared innovations are so many times the least is one that the trials can tell
@@ -182,22 +184,19 @@ def simulate(
     extruders: Sequence[Extruder | Identified], u: np.ndarray, *, sample_time_s: float
 ) -> np.ndarray:
     """Flow (P, N, T) of each of P extruders under the rows u (N, T),
-    each from rest: extruder.flow for many at once."""
+    each from rest: extruder.flow for many at once, where that has the structure."""
     those = [Identified(*e) for e in extruders]
     x = fronts(those, u, sample_time_s)
     x = backlash(x, np.array([e.play for e in those])[:, None])
     rise = np.exp([-sample_time_s / e.time_constant_s for e in those])
     fall = np.exp([-sample_time_s / (e.time_constant_s * e.fall_ratio) for e in those])
-    uneven = np.flatnonzero(rise != fall)
-    p = np.empty_like(x)
-    if uneven.size:
+    if np.any(rise != fall):
         rows = u.shape[0]
-        walked = asymmetric(
-            x[uneven].reshape(-1, u.shape[1]), np.repeat(rise[uneven], rows), np.repeat(fall[uneven], rows)
-        )
-        p[uneven] = walked.reshape(len(uneven), *u.shape)
-    for k in np.flatnonzero(rise == fall):
-        p[k] = first_order(x[k], those[k].time_constant_s, sample_time_s)
+        p = asymmetric(x.reshape(-1, x.shape[-1]), np.repeat(rise, rows), np.repeat(fall, rows))
+        p = p.reshape(x.shape)
+    else:
+        each = zip(x, those, strict=True)
+        p = np.stack([first_order(v, e.time_constant_s, sample_time_s) for v, e in each])
     for k, e in enumerate(those):
         if e.creep_share > 0:
             slow = first_order(x[k], e.creep_time_s, sample_time_s)
@@ -303,13 +302,14 @@ def _stepped(
     A = H[np.ix_(moves, moves)]
     A = A + damping * np.diag(np.diag(A) + 1e-12 * np.trace(A))
     out[free[moves]] -= np.linalg.solve(A, g[moves])
-    return np.clip(out, LOW, HIGH)
+    out[free] = np.clip(out[free], LOW[free], HIGH[free])
+    return out
 
 
 def fit(problem: Problem, z: np.ndarray, free: np.ndarray, *, evaluations: int) -> Fit:
     """The unknowns with those in `free` moved to the least sum of squared innovations of simulated - measured
     flow (output error; Levenberg 1944 and Marquardt 1963 within bounds)."""
-    best, damping = _normal(problem, np.clip(z, LOW, HIGH), free), 1e-4
+    best, damping = _normal(problem, z, free), 1e-4
     for _ in range(evaluations):
         H, g = best.H.sum(axis=0), best.g.sum(axis=0)
         candidate = _normal(problem, _stepped(best.z, free, H, g, damping), free)
@@ -364,7 +364,7 @@ class Candidate(NamedTuple):
 
 
 def _free(extras: Sequence[str]) -> np.ndarray:
-    return np.array(sorted({*ALWAYS, *(i for name in extras for i in EXTRAS[name])}))
+    return np.array(sorted({*ALWAYS, *(i for name in extras for i in (EXTRAS | {LAG: (LAG_AT,)})[name])}))
 
 
 def _candidate(
@@ -376,18 +376,19 @@ def _candidate(
     return Candidate(extras, fitted, np.sum(white**2, axis=1))
 
 
-def _prefers(better: Candidate, than: Candidate) -> bool:
-    """Whether rows left out prefer one structure: their squared innovations fall by MARGIN, and the mean of
-    the rows' relative falls is clear of its scatter."""
-    fall = np.log(than.unseen / better.unseen)
-    clear = fall.mean() > CLEAR * np.std(fall, ddof=1) / math.sqrt(len(fall))
-    return bool(clear and better.unseen.sum() < (1 - MARGIN) * than.unseen.sum())
+def _prefers(better: Candidate, than: Candidate, folds: np.ndarray) -> bool:
+    """Whether what was left out prefers one structure: its squared innovations fall by MARGIN in all, and
+    fall in AGREE of the folds."""
+    fall = than.unseen - better.unseen
+    agree = np.mean(np.bincount(folds, weights=fall)[np.unique(folds)] > 0)
+    return bool(agree >= AGREE and fall.sum() > MARGIN * than.unseen.sum())
 
 
 def choose(problem: Problem, folds: np.ndarray) -> list[Candidate]:
     """Forward selection: the extras whose fit promises most are tried in turn, and each is kept where rows
-    left out prefer it. All structures that were tried, the chosen one first."""
-    kept = _candidate(problem, (), _start(problem), folds, 40)
+    left out prefer it; last the lag goes where they do not miss it. All structures that were tried, the chosen
+    one first."""
+    kept = _candidate(problem, (LAG,), _start(problem), folds, 40)
     tried = []
     while True:
         promising = []
@@ -403,13 +404,18 @@ def choose(problem: Problem, folds: np.ndarray) -> list[Candidate]:
             if promised > (1 - MARGIN) * kept.fitted.cost.sum():
                 continue
             candidate = _candidate(problem, (*kept.extras, name), z, folds, 12)
-            if _prefers(candidate, kept):
+            if _prefers(candidate, kept, folds):
                 tried.append(kept)
                 kept = candidate
                 break
             tried.append(candidate)
         else:
-            return [kept, *tried]
+            break
+    z = kept.fitted.z.copy()
+    z[2] += DAMPING / (math.pi * math.exp(z[LAG_AT]))
+    z[LAG_AT] = math.inf
+    simpler = _candidate(problem, kept.extras[1:], z, folds, 12)
+    return [kept, simpler, *tried] if _prefers(kept, simpler, folds) else [simpler, kept, *tried]
 
 
 def _with(z: np.ndarray, extra: str) -> np.ndarray:
@@ -439,21 +445,30 @@ def averaged(error: np.ndarray, observable: np.ndarray, sample_time_s: float) ->
     )
 
 
+def _within(fitted: Fit, away: np.ndarray) -> np.ndarray:
+    """The unknowns moved by `away` (free,), within their bounds."""
+    z, free = fitted.z.copy(), fitted.free
+    z[free] = np.clip(z[free] + away, LOW[free], HIGH[free])
+    return z
+
+
 def _members(problem: Problem, fitted: Fit) -> list[np.ndarray]:
     """MEMBERS vectors of unknowns that the trials cannot tell from the best: z +- what leaving out each
     trial moves, the signs balanced over members (balanced repeated replication, McCarthy 1969).
 
     Where a bound or a bend makes that worse than UNLIKELY, a member comes nearer."""
     clusters = np.arange(len(fitted.cost)) % (MEMBERS - 1)
-    moved = np.array([fitted.without(clusters == k) - fitted.z for k in np.unique(clusters)])
+    moved = np.zeros((clusters.max() + 1, len(fitted.free)))
+    for k in range(len(moved)):
+        moved[k] = fitted.without(clusters == k)[fitted.free] - fitted.z[fitted.free]
     away = scipy.linalg.hadamard(MEMBERS)[:, 1 : len(moved) + 1] @ moved
     most, far = UNLIKELY * fitted.cost.sum(), np.ones(MEMBERS, bool)
     while far.any():
-        z = list(np.clip(fitted.z + away[far], LOW, HIGH))
+        z = [_within(fitted, one) for one in away[far]]
         cost = np.sum(problem.white(problem.flows(z) - problem.rows.y) ** 2, axis=(1, 2))
         far[far] = cost > most
         away[far] /= 2
-    return list(np.clip(fitted.z + away, LOW, HIGH))
+    return [_within(fitted, one) for one in away]
 
 
 def identify(trainings: Sequence[Training], *, sample_time_s: float) -> Chain:
