@@ -419,7 +419,7 @@ def choose(problem: Problem, folds: np.ndarray) -> list[Candidate]:
 
 
 def _with(z: np.ndarray, extra: str) -> np.ndarray:
-    """The unknowns with an extra set out from where it shows: a second lag takes half of all that is late."""
+    """The unknowns with an extra set out from where it shows: a second lag takes half of what is late."""
     out = z.copy()
     if extra == "creep":
         out[6] = 0.05
