@@ -154,13 +154,17 @@ def compose(arguments: argparse.Namespace) -> None:
     learned = read_learned(
         "datasets/segment_library/library.parquet", "datasets/segment_library/learned.json"
     )
-    part = compose_parts.compose(
-        arguments.part, learned, params.load(Printer, "printer"), params.load(ComposeParts, "compose_parts")
-    )
+    printer, settings = params.load(Printer, "printer"), params.load(ComposeParts, "compose_parts")
+    part = compose_parts.compose(arguments.part, learned, printer, settings)
     arguments.out.mkdir(parents=True, exist_ok=True)
     files = compose_parts.write(part, arguments.out)
     print(compose_parts.summary_lines(part))
     print("written: " + ", ".join(str(file) for file in files))
+    if arguments.verify:
+        from pipeline.deposition.workflow import verify_part
+
+        print(verify_part.write(part, learned, printer, settings, arguments.out))
+        print(verify_part.write_next(part, learned, printer, arguments.part.parent, arguments.out))
 
 
 def calibrate_tip(arguments: argparse.Namespace) -> None:
@@ -224,6 +228,9 @@ def main() -> None:
     command = commands.add_parser("compose", help=compose.__doc__)
     command.add_argument("part", type=Path, help="the part program (G-code)")
     command.add_argument("--out", type=Path, default=Path("."), help="folder for signal, tasks and report")
+    command.add_argument(
+        "--verify", action="store_true", help="also the shortest print that shows whether the forecast holds"
+    )
     command.set_defaults(run=compose)
     command = commands.add_parser("calibrate-tip", help=calibrate_tip.__doc__)
     command.add_argument("image", type=Path, help="a frame of the nozzle's camera")

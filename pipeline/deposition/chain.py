@@ -386,7 +386,7 @@ def _prefers(better: Candidate, than: Candidate, folds: np.ndarray) -> bool:
 
 def choose(problem: Problem, folds: np.ndarray) -> list[Candidate]:
     """Forward selection: the extras whose fit promises most are tried in turn, and each is kept where rows
-    left out prefer it; last the lag goes where they do not miss it. All structures that were tried, the chosen
+    left out prefer it; last the lag goes where they do not miss it. All structures tried, the chosen
     one first."""
     kept = _candidate(problem, (LAG,), _start(problem), folds, 40)
     tried = []

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from pipeline.deposition import basis
-from pipeline.deposition.drive import Drive
 from pipeline.deposition.chain import Identified
+from pipeline.deposition.drive import Drive
 from pipeline.deposition.extruder import Extruder, draw, lagged, ramp
 from tests.deposition.trained import TS, percent_of_on_off, protocol
 
