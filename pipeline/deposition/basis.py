@@ -8,6 +8,7 @@ import scipy.ndimage
 import scipy.signal
 
 from pipeline.deposition import reachable
+from pipeline.deposition.drive import UNLIMITED, Drive, follows, obeyed
 from pipeline.deposition.extruder import DAMPING, Extruder, lagged, ramp
 
 # the yield is loaded this long before the flow begins and kept through gaps of twice that: long against the
@@ -57,11 +58,16 @@ def advance(extruder: Extruder, sample_time_s: float) -> np.ndarray:
     return h / h.sum()
 
 
+def mean_lag_s(extruder: Extruder) -> float:
+    """The mean delay in s of the second-order lag, 2 zeta / w."""
+    return DAMPING / (math.pi * extruder.lag_hz)
+
+
 def shift(extruder: Extruder, sample_time_s: float) -> np.ndarray:
     """Centred impulse response that sends a signal ahead by the delay and the
     mean delay of the lag, and never beyond its limits."""
     half = round(SPAN_S / sample_time_s)
-    late = min((extruder.delay_s + DAMPING / (math.pi * extruder.lag_hz)) / sample_time_s, half - 1.0)
+    late = min((extruder.delay_s + mean_lag_s(extruder)) / sample_time_s, half - 1.0)
     h = np.zeros(2 * half + 1)
     whole = math.floor(late)
     h[half - whole - 1 : half - whole + 1] = late - whole, 1 - late + whole
@@ -69,7 +75,7 @@ def shift(extruder: Extruder, sample_time_s: float) -> np.ndarray:
 
 
 def compose(
-    extruder: Extruder, r: np.ndarray, *, sample_time_s: float, limit: float = math.inf
+    extruder: Extruder, r: np.ndarray, *, sample_time_s: float, drive: Drive = UNLIMITED
 ) -> np.ndarray:
     """The command u (T,) in mm for the wanted flow r (T,) in mm^3/s, as functions of r and of the
     on-indicator p, with x = r + yield p:
@@ -83,22 +89,22 @@ def compose(
     through the play wherever that stands, so that its mean position is the command's (Zames and Shneydor
     1976); q lets it die out after a stop.
 
-    Where |u| would exceed `limit`, the command whose flow comes
+    Where the drive cannot follow u, the command whose flow comes
     nearest: it sets out early and catches up late.
     """
     if not np.any(r > 0):
         return np.zeros(len(r))
     x = r + extruder.yield_ * loaded(r, LOAD_S, sample_time_s)
     v, ahead = _inverse(extruder, x, sample_time_s), advance(extruder, sample_time_s)
-    if np.abs(scipy.signal.oaconvolve(v, ahead, "same")).max() > limit:
-        v, ahead = _nearest(extruder, v, r, limit, sample_time_s), shift(extruder, sample_time_s)
+    if not follows(scipy.signal.oaconvolve(v, ahead, "same"), drive, sample_time_s=sample_time_s):
+        v, ahead = reached(extruder, v, r, drive, sample_time_s), shift(extruder, sample_time_s)
     if extruder.play > 0:
         v += (
             extruder.play
             * loaded(r, DITHER_S, sample_time_s)
             * np.sin(2 * np.pi * DITHER_HZ * sample_time_s * np.arange(len(r)))
         )
-    return np.clip(scipy.signal.oaconvolve(v, ahead, "same"), -limit, limit)
+    return obeyed(scipy.signal.oaconvolve(v, ahead, "same"), drive, sample_time_s=sample_time_s)
 
 
 def _modes(extruder: Extruder, sample_time_s: float) -> tuple[np.ndarray, np.ndarray]:
@@ -115,12 +121,18 @@ def _inverse(extruder: Extruder, x: np.ndarray, sample_time_s: float) -> np.ndar
     return np.append(v[1:], x[-1] / extruder.gain)
 
 
-def _nearest(
-    extruder: Extruder, v: np.ndarray, r: np.ndarray, limit: float, sample_time_s: float
+def reached(
+    extruder: Extruder, v: np.ndarray, r: np.ndarray, drive: Drive, sample_time_s: float
 ) -> np.ndarray:
-    """v (T,) within +-limit whose fast mode comes nearest to that of the unlimited v; below
-    the yield, where no flow is wanted, it is free."""
+    """v (T,) that the drive can follow whose fast mode comes nearest to that of the unlimited v; below
+    the yield, where no flow r (T,) is wanted, it is free. Delay and lag lie before v."""
     (g, _), (a, _) = _modes(extruder, sample_time_s)
     fast = scipy.signal.lfilter([g], [1.0, -a], v)
-    reached = reachable.nearest(fast, np.append(r[1:], 0.0) <= 0, pole=a, bound=g * limit)
-    return np.clip((reached - a * np.append(0.0, reached[:-1])) / g, -limit, limit)
+    x = reachable.nearest(
+        fast,
+        np.append(r[1:], 0.0) <= 0,
+        pole=a,
+        bound=g * drive.amplitude_mm,
+        step=g * drive.speed_mm_per_s * sample_time_s,
+    )
+    return obeyed((x - a * np.append(0.0, x[:-1])) / g, drive, sample_time_s=sample_time_s)

@@ -9,6 +9,7 @@ import numpy as np
 
 from pipeline.deposition import basis
 from pipeline.deposition.chain import Chain, averaged, forecast, identify, simulate
+from pipeline.deposition.drive import Drive, at_limit, follows, obeyed
 from pipeline.deposition.gcode import Kind, Program
 from pipeline.deposition.library import (
     CORNER,
@@ -58,14 +59,14 @@ class Learned(NamedTuple):
 class PartSettings(NamedTuple):
     """How a part is printed: nozzle in mm; the wanted flow is bead area x printing speed, its steps shaped by
     two boxes of ramp_s; a junction is a Corner from corner_deg on; a longer halt than longest_pause_s ends a
-    run; |u| <= limit (mm)."""
+    run; and the drive."""
 
     nozzle_mm: float
     bead_area_mm2: float
     ramp_s: float
     corner_deg: float
     longest_pause_s: float
-    limit: float
+    drive: Drive
 
 
 class Prediction(NamedTuple):
@@ -83,7 +84,7 @@ class Prediction(NamedTuple):
 class Stream(NamedTuple):
     """One tool's share of a part, all (T,): wanted flow r (mm^3/s), the same before its steps were shaped,
     command u (mm), predicted flow y and that of on-off control; the composer that u is from, and the share of
-    the time that u is at the limit."""
+    the time that u is at a limit of the drive."""
 
     tool: int
     material: str
@@ -222,13 +223,11 @@ def _rms(a: np.ndarray) -> float:
     return math.sqrt(np.mean(np.square(a)))
 
 
-def _command(composer: str, library: Library, share: Share, limit: float) -> np.ndarray:
-    """u (T,) in mm of one composer for one tool's share of a part; |u| <= limit."""
-    material = share.material
+def _command(composer: str, library: Library, share: Share, drive: Drive) -> np.ndarray:
+    """u (T,) in mm of one composer for one tool's share of a part, which the drive can follow."""
+    material, Ts = share.material, library.sample_time_s
     if composer == BASIS:
-        return basis.compose(
-            material.chain.extruder, share.r, sample_time_s=library.sample_time_s, limit=limit
-        )
+        return basis.compose(material.chain.extruder, share.r, sample_time_s=Ts, drive=drive)
     by = priority if composer == PRIORITY else superposition
     u = by(
         library,
@@ -239,10 +238,19 @@ def _command(composer: str, library: Library, share: Share, limit: float) -> np.
         share.tool,
         samples=len(share.r),
     )
-    return np.clip(u, -limit, limit)
+    if follows(u, drive, sample_time_s=Ts):
+        return u
+    return basis.reached(material.chain.extruder, u, _sent_ahead(share, Ts), drive, Ts)
 
 
-def commands(learned: Learned, composed: Composed, stream: Stream, *, limit: float) -> dict[str, np.ndarray]:
+def _sent_ahead(share: Share, Ts: float) -> np.ndarray:
+    """The wanted flow (T,) at the time when a command for it is sent: earlier by delay and lag of the
+    chain."""
+    extruder, t = share.material.chain.extruder, np.arange(len(share.r)) * Ts
+    return np.interp(t + extruder.delay_s + basis.mean_lag_s(extruder), t, share.r, right=0.0)
+
+
+def commands(learned: Learned, composed: Composed, stream: Stream, *, drive: Drive) -> dict[str, np.ndarray]:
     """The command (T,) of every composer for one stream of a part, to set beside the chosen one."""
     material = next(
         one
@@ -250,19 +258,19 @@ def commands(learned: Learned, composed: Composed, stream: Stream, *, limit: flo
         if (one.material, one.nozzle_mm) == (stream.material, stream.nozzle_mm)
     )
     share = Share(stream.tool, material, stream.r, composed.tasks, composed.lines)
-    return {name: _command(name, learned.library, share, limit) for name in COMPOSERS}
+    return {name: _command(name, learned.library, share, drive) for name in COMPOSERS}
 
 
-def _judge(library: Library, share: Share, limit: float) -> dict[str, float]:
+def _judge(library: Library, share: Share, drive: Drive) -> dict[str, float]:
     """Predicted error of each composer in % of on-off control's, over the first
     EXCERPT_S from where this tool begins to print."""
     Ts, extruder = library.sample_time_s, share.material.chain.extruder
     excerpt = _excerpt(share, Ts)
-    on_off = _on_off(excerpt, limit)
+    on_off = _on_off(excerpt, drive, Ts)
     yardstick = _rms(forecast(extruder, on_off, sample_time_s=Ts) - excerpt.r)
     percent = {}
     for name in COMPOSERS:
-        u = _command(name, library, excerpt, limit)
+        u = _command(name, library, excerpt, drive)
         error = _rms(forecast(extruder, u, sample_time_s=Ts) - excerpt.r)
         own = share.material.chain.held_out_percent if name == BASIS else share.material.learned_percent
         percent[name] = 100 * math.hypot(error, own / 100 * share.r.max()) / max(yardstick, 1e-12)
@@ -284,9 +292,9 @@ def _excerpt(share: Share, Ts: float) -> Share:
     return share._replace(r=r[begin:upto], tasks=tasks, lines=lines)
 
 
-def _on_off(share: Share, limit: float) -> np.ndarray:
+def _on_off(share: Share, drive: Drive, Ts: float) -> np.ndarray:
     """u (T,) in mm of on-off control, as the first trial set out: r over the gain known then."""
-    return np.clip(share.r / share.material.on_off_gain, -limit, limit)
+    return obeyed(share.r / share.material.on_off_gain, drive, sample_time_s=Ts)
 
 
 def compose(
@@ -298,7 +306,7 @@ def compose(
     material or nozzle that was not learned, where nothing is printed, and, with its line number, where the
     program would go from Steady-State to No-Flow without a Stop.
     """
-    library, limit, moves = learned.library, settings.limit, program.moves
+    library, drive, moves = learned.library, settings.drive, program.moves
     Ts, marks = library.sample_time_s, library.marks
     lines = printed_lines(
         moves, motion, corner_deg=settings.corner_deg, longest_pause_s=settings.longest_pause_s
@@ -323,13 +331,13 @@ def compose(
         r = basis.boxed(unshaped, settings.ramp_s, Ts)
         r[r < 1e-9 * r.max()] = 0.0  # rounding of the sums behind the rate
         share = Share(tool, material, r, tasks, lines)
-        percents = _judge(library, share, limit)
+        percents = _judge(library, share, drive)
         best = min(percents, key=percents.__getitem__)
         predictions += [
             Prediction(tool, material.material, name, percent, name == best)
             for name, percent in percents.items()
         ]
-        streams.append(_stream(library, share, unshaped, best, limit))
+        streams.append(_stream(library, share, unshaped, best, drive))
         for name in (START, STOP, CORNER, STEADY):
             at = _of(tasks, tool, name)
             error[at] = nearest(
@@ -358,11 +366,11 @@ def _material(
     )
 
 
-def _stream(library: Library, share: Share, unshaped: np.ndarray, composer: str, limit: float) -> Stream:
+def _stream(library: Library, share: Share, unshaped: np.ndarray, composer: str, drive: Drive) -> Stream:
     """The share by one composer: its command, and the flows that the chain predicts for it and for on-off."""
-    material, u = share.material, _command(composer, library, share, limit)
-    rows = np.stack([u, _on_off(share, limit)])
-    y, on_off = simulate([material.chain.extruder], rows, sample_time_s=library.sample_time_s)[0]
+    material, u, Ts = share.material, _command(composer, library, share, drive), library.sample_time_s
+    rows = np.stack([u, _on_off(share, drive, Ts)])
+    y, on_off = simulate([material.chain.extruder], rows, sample_time_s=Ts)[0]
     return Stream(
         share.tool,
         material.material,
@@ -373,5 +381,5 @@ def _stream(library: Library, share: Share, unshaped: np.ndarray, composer: str,
         u,
         y,
         on_off,
-        float(np.mean(np.abs(u) >= limit)),
+        float(np.mean(at_limit(u, drive, sample_time_s=Ts))),
     )

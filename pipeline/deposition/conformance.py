@@ -10,6 +10,7 @@ import numpy as np
 from pipeline.deposition import basis
 from pipeline.deposition.chain import forecast
 from pipeline.deposition.composition import BASIS, EXCERPT_S, MARGIN_S, Composed, Learned
+from pipeline.deposition.drive import Drive, asked, at_limit, follows, obeyed
 from pipeline.deposition.extruder import Extruder
 from pipeline.deposition.gcode import Refusal
 from pipeline.deposition.library import STOP, Library
@@ -38,12 +39,16 @@ class LineVolumes(NamedTuple):
 
 
 class Saturation(NamedTuple):
-    """What a limit does to one flow with one ramp: peak of the unlimited command over the steady one, share
-    of the printing time at the limit, and r.m.s. error of the best command within it in % of that of on-off
-    control r / on_off_gain; `enough` is whether the limit is never reached."""
+    """What a drive does to one flow with one ramp: its limits (inf where there is none) and beside them the
+    largest unlimited command (mm) and its speed (mm/s); peak of that command over the steady one, share of
+    the printing time at a limit, and r.m.s. error of the best command within them in % of that of on-off
+    control r / on_off_gain; `enough` is whether the drive can follow the unlimited command."""
 
     ramp_s: float
-    limit: float
+    amplitude_mm: float
+    speed_mm_per_s: float
+    largest_command_mm: float
+    largest_speed_mm_per_s: float
     peak_over_steady: float
     share_percent: float
     rms_percent_of_on_off: float
@@ -76,7 +81,7 @@ def conform(
     *,
     bead_area_mm2: float,
     ramp_s: float,
-    limit: float,
+    drive: Drive,
     shortest_s: float,
     largest_error_percent: float,
     refusals: Sequence[Refusal] = (),
@@ -96,7 +101,7 @@ def conform(
         )
         first = int(np.argmax(stream.unshaped > 0))
         some = stream.unshaped[max(0, first - round(MARGIN_S / Ts)) : first + round(EXCERPT_S / Ts)]
-        settings = {"ramp_s": ramp_s, "limit": limit, "sample_time_s": Ts}
+        settings = {"ramp_s": ramp_s, "drive": drive, "sample_time_s": Ts}
         saturations[stream.tool] = saturation(
             material.chain.extruder, some, on_off_gain=material.on_off_gain, **settings
         )
@@ -168,27 +173,38 @@ def saturation(
     *,
     on_off_gain: float,
     ramp_s: float,
-    limit: float,
+    drive: Drive,
     sample_time_s: float,
 ) -> Saturation:
-    """What |u| <= limit (mm) does to the wanted flow (T,) with its steps
+    """What the drive does to the wanted flow (T,) with its steps
     shaped by two boxes of ramp_s: forecast by the chain."""
     r = basis.boxed(unshaped, ramp_s, sample_time_s)
     free = basis.compose(extruder, r, sample_time_s=sample_time_s)
-    u = basis.compose(extruder, r, sample_time_s=sample_time_s, limit=limit)
-    steady, peak = (r.max() + extruder.yield_) / extruder.gain, float(np.abs(free).max())
-    on_off = forecast(extruder, np.clip(r / on_off_gain, -limit, limit), sample_time_s=sample_time_s) - r
+    u = basis.compose(extruder, r, sample_time_s=sample_time_s, drive=drive)
+    steady, most = (r.max() + extruder.yield_) / extruder.gain, asked(free, sample_time_s=sample_time_s)
+    first = obeyed(r / on_off_gain, drive, sample_time_s=sample_time_s)
+    on_off = forecast(extruder, first, sample_time_s=sample_time_s) - r
     error = forecast(extruder, u, sample_time_s=sample_time_s) - r
     ratio = math.sqrt(np.sum(error**2) / max(np.sum(on_off**2), 1e-300))
-    share = np.mean(np.abs(u[r > 0]) >= 0.999 * limit)
-    return Saturation(ramp_s, limit, peak / steady, 100 * float(share), 100 * ratio, peak <= limit)
+    share = np.mean(at_limit(u, drive, sample_time_s=sample_time_s)[r > 0])
+    return Saturation(
+        ramp_s,
+        drive.amplitude_mm,
+        drive.speed_mm_per_s,
+        most.command_mm,
+        most.speed_mm_per_s,
+        most.command_mm / steady,
+        100 * float(share),
+        100 * ratio,
+        follows(free, drive, sample_time_s=sample_time_s),
+    )
 
 
 def ramp_that_would_do(
-    extruder: Extruder, unshaped: np.ndarray, *, ramp_s: float, limit: float, sample_time_s: float
+    extruder: Extruder, unshaped: np.ndarray, *, ramp_s: float, drive: Drive, sample_time_s: float
 ) -> float:
-    """The shortest ramp in s, ramp_s or longer, whose command stays within the
-    limit (mm); inf where none up to LONGEST_RAMP_S does.
+    """The shortest ramp in s, ramp_s or longer, whose command the drive can follow;
+    inf where none up to LONGEST_RAMP_S does.
 
     The peak falls with the ramp, about as (1 + tau / ramp) x steady: bisected to 1 %.
     """
@@ -197,7 +213,8 @@ def ramp_that_would_do(
 
     def does(ramp):
         r = basis.boxed(room, ramp, sample_time_s)
-        return bool(np.abs(basis.compose(extruder, r, sample_time_s=sample_time_s)).max() <= limit)
+        u = basis.compose(extruder, r, sample_time_s=sample_time_s)
+        return follows(u, drive, sample_time_s=sample_time_s)
 
     if does(ramp_s):
         return ramp_s

@@ -13,6 +13,7 @@ import scipy.ndimage
 import scipy.signal
 
 from pipeline.deposition import reachable
+from pipeline.deposition.drive import Drive, asked, at_limit, follows, obeyed
 from pipeline.deposition.extruder import Extruder, flow, frequency_response, pressed
 from pipeline.deposition.trial_model import TrialModel, identify
 
@@ -114,30 +115,27 @@ def hoelzle_law(
     q: Callable[..., np.ndarray],
     settings: HoelzleSettings,
     *,
-    limit: float,
+    drive: Drive,
     sample_time_s: float,
 ) -> Law:
     """u_{j+1} = Q (u_j + L e_j) of the last trial (Hoelzle 2009, eq. 2); q is
     `zero_phase` or takes the same, the model the nominal (1).
 
-    u_j is what the drive applied, so that nothing winds up at the
-    limit; e_j = 0 where the flow was not observable.
+    u_j is what the drive applied, so that nothing winds up at its
+    limits; e_j = 0 where the flow was not observable.
     """
     b, a = _slow_inverse(model, settings, sample_time_s)
 
     def law(trials: Sequence[Trial]) -> np.ndarray:
         u, y, _ = trials[-1]
         e = np.where(np.isfinite(y), r - y, 0.0)
-        return np.clip(
-            q(
-                u + scipy.signal.lfilter(b, a, e),
-                order=settings.order,
-                cutoff_hz=settings.cutoff_hz,
-                sample_time_s=sample_time_s,
-            ),
-            -limit,
-            limit,
+        following = q(
+            u + scipy.signal.lfilter(b, a, e),
+            order=settings.order,
+            cutoff_hz=settings.cutoff_hz,
+            sample_time_s=sample_time_s,
         )
+        return obeyed(following, drive, sample_time_s=sample_time_s)
 
     return law
 
@@ -189,22 +187,27 @@ def disturbance(
 
 
 def command(
-    x: np.ndarray, r: np.ndarray, model: Extruder, *, limit: float, sample_time_s: float
+    x: np.ndarray, r: np.ndarray, model: Extruder, *, drive: Drive, sample_time_s: float
 ) -> np.ndarray:
-    """u (T,) in mm that presses x (T,) out of the model; where that takes more than `limit`, the u whose flow
+    """u (T,) in mm that presses x (T,) out of the model; where the drive cannot follow that, the u whose flow
     comes nearest (`reachable.nearest`)."""
     u = inverse(x, model, sample_time_s=sample_time_s)
-    if np.abs(u).max() <= limit:
+    if follows(u, drive, sample_time_s=sample_time_s):
         return u
     a = math.exp(-sample_time_s / model.time_constant_s)
     scale, t = model.gain * (1 - a), np.arange(len(x)) * sample_time_s
     # u(t) shows in the flow one sample and the delay later
     later = t + sample_time_s + model.delay_s
     free = np.interp(later, t, r) <= 0
-    v = reachable.nearest(np.interp(later, t, x), free, pole=a, bound=scale * limit)
-    return np.clip(
-        np.diff(v, prepend=0.0) / scale + np.concatenate([[0.0], v[:-1]]) / model.gain, -limit, limit
+    v = reachable.nearest(
+        np.interp(later, t, x),
+        free,
+        pole=a,
+        bound=scale * drive.amplitude_mm,
+        step=scale * drive.speed_mm_per_s * sample_time_s,
     )
+    u = np.diff(v, prepend=0.0) / scale + np.concatenate([[0.0], v[:-1]]) / model.gain
+    return obeyed(u, drive, sample_time_s=sample_time_s)
 
 
 class InverseLaw:
@@ -219,8 +222,8 @@ class InverseLaw:
     learned commands show the extruder as it will be driven.
     """
 
-    def __init__(self, r: np.ndarray, settings: InverseSettings, *, limit: float, sample_time_s: float):
-        self.r, self.settings, self.limit, self.sample_time_s = r, settings, limit, sample_time_s
+    def __init__(self, r: np.ndarray, settings: InverseSettings, *, drive: Drive, sample_time_s: float):
+        self.r, self.settings, self.drive, self.sample_time_s = r, settings, drive, sample_time_s
         self.q = {"order": settings.order, "cutoff_hz": settings.cutoff_hz, "sample_time_s": sample_time_s}
         self._first: list[Trial] = []
         self.model: TrialModel | None = None
@@ -241,7 +244,7 @@ class InverseLaw:
             trials, self.r, self.model, floor=self.settings.floor, sample_time_s=self.sample_time_s
         )
         x = zero_phase(wanted(self.r, extruder.yield_, sample_time_s=self.sample_time_s) - d, **self.q)
-        return command(x, self.r, extruder, limit=self.limit, sample_time_s=self.sample_time_s)
+        return command(x, self.r, extruder, drive=self.drive, sample_time_s=self.sample_time_s)
 
 
 # ---- before anything runs
@@ -258,13 +261,14 @@ def gamma(Q: np.ndarray, L: np.ndarray, P: np.ndarray) -> np.ndarray:
 
 
 class ActuatorHeadroom(NamedTuple):
-    """What a limit on the command leaves: peak and steady command (mm) that r needs, the least error as a
-    share of trial 0's, and the ramp that would do."""
+    """What the drive leaves: peak (mm) and speed (mm/s) of the command that r needs, its steady command (mm),
+    the least error as a share of trial 0's, and the ramp that would do."""
 
     peak: float
     steady: float
     ratio: float
     ramp_s: float
+    speed: float
 
 
 def actuator_headroom(
@@ -274,14 +278,14 @@ def actuator_headroom(
     *,
     order: int,
     cutoff_hz: float,
-    limit: float,
+    drive: Drive,
     sample_time_s: float,
 ) -> ActuatorHeadroom:
-    """Headroom of the drive over the model for r (T,): the least error is that of the nearest flow within
-    the limit, as a share of what u0 (T,) leaves.
+    """Headroom of the drive over the model for r (T,): the least error is that of the nearest flow that the
+    drive can follow, as a share of what u0 (T,) leaves. Its backlash, which is learned, is left out.
 
-    ramp_s solves (1 + tau / t_ramp) steady = limit; it is infinite
-    where the limit does not even hold the steady flow.
+    ramp_s is the longer of what solves (1 + tau / t_ramp) steady = amplitude and (1 + tau / t_ramp) steady /
+    t_ramp = speed; it is infinite where the amplitude does not even hold the steady flow.
     """
     x = zero_phase(
         wanted(r, model.yield_, sample_time_s=sample_time_s),
@@ -289,27 +293,45 @@ def actuator_headroom(
         cutoff_hz=cutoff_hz,
         sample_time_s=sample_time_s,
     )
-    peak, steady = (
-        np.abs(inverse(x, model, sample_time_s=sample_time_s)).max(),
-        (r.max() + model.yield_) / model.gain,
+    needed = asked(inverse(x, model, sample_time_s=sample_time_s), sample_time_s=sample_time_s)
+    steady = float((r.max() + model.yield_) / model.gain)
+    best, first = (
+        rms(r - flow(model, u, sample_time_s=sample_time_s))
+        for u in (
+            command(x, r, model, drive=drive, sample_time_s=sample_time_s),
+            obeyed(u0, drive, sample_time_s=sample_time_s),
+        )
     )
-    best = flow(
-        model, command(x, r, model, limit=limit, sample_time_s=sample_time_s), sample_time_s=sample_time_s
-    )
-    first = flow(model, u0, sample_time_s=sample_time_s, limit=limit)
-    ramp_s = model.time_constant_s / (limit / steady - 1) if limit > steady else math.inf
-    return ActuatorHeadroom(float(peak), float(steady), rms(r - best) / rms(r - first), ramp_s)
+    ramp_s = max(_ramp_of_amplitude(drive, steady, model), _ramp_of_speed(drive, steady, model))
+    return ActuatorHeadroom(needed.command_mm, steady, best / first, ramp_s, needed.speed_mm_per_s)
 
 
-def check_headroom(headroom: ActuatorHeadroom, *, limit: float, worst_ratio: float) -> None:
+def _ramp_of_amplitude(drive: Drive, steady: float, model: Extruder) -> float:
+    """The ramp in s whose peak command is the amplitude, (1 + tau / ramp) steady; 0 without a limit."""
+    over = drive.amplitude_mm / steady
+    return model.time_constant_s / (over - 1) if over > 1 else math.inf
+
+
+def _ramp_of_speed(drive: Drive, steady: float, model: Extruder) -> float:
+    """The ramp in s over which the command goes to (1 + tau / ramp) steady at the speed; 0 without a
+    limit."""
+    rate = drive.speed_mm_per_s / steady
+    if math.isinf(rate):
+        return 0.0
+    return (1 + math.sqrt(1 + 4 * model.time_constant_s * rate)) / (2 * rate)
+
+
+def check_headroom(headroom: ActuatorHeadroom, *, drive: Drive, worst_ratio: float) -> None:
     """Raises ValueError where no law can come below `worst_ratio` of trial 0's
     error: the sentence names the ramp that would do."""
     if headroom.ratio <= worst_ratio:
         return
     needs = (
         f"these ramps need a peak command of {headroom.peak / headroom.steady:.1f} x steady "
-        f"and the limit is {limit / headroom.steady:.1f} x"
+        f"and the limit is {drive.amplitude_mm / headroom.steady:.1f} x"
     )
+    if headroom.speed > drive.speed_mm_per_s:
+        needs += f", and {headroom.speed:.0f} mm/s where the drive has {drive.speed_mm_per_s:g} mm/s"
     do = (
         f"ramps of {headroom.ramp_s:.2f} s would do"
         if math.isfinite(headroom.ramp_s)
@@ -424,9 +446,11 @@ class Row(NamedTuple):
     rolled_back: bool
 
 
-def table(trials: Sequence[Trial], r: np.ndarray, *, steady: float, limit: float, rise: float) -> list[Row]:
-    """A row a trial; `steady` is the steady command in mm, saturated the share of time at the limit,
-    rolled_back whether the trial was left for a better one."""
+def table(
+    trials: Sequence[Trial], r: np.ndarray, *, steady: float, drive: Drive, sample_time_s: float, rise: float
+) -> list[Row]:
+    """A row a trial; `steady` is the steady command in mm, saturated the share of time at a limit of the
+    drive, rolled_back whether the trial was left for a better one."""
     measured = [rms(r - trial.y) for trial in trials]
     true = [np.nan if trial.truth is None else rms(r - trial.truth) for trial in trials]
     risen = judge(measured, rise=rise).risen
@@ -440,7 +464,7 @@ def table(trials: Sequence[Trial], r: np.ndarray, *, steady: float, limit: float
                 measured[j],
                 ratio,
                 float(np.abs(u).max() / steady),
-                float(np.mean(np.abs(u) >= 0.999 * limit)),
+                float(np.mean(at_limit(u, drive, sample_time_s=sample_time_s))),
                 risen[j],
             )
         )

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.deposition import ilc
+from pipeline.deposition.drive import Drive, obeyed
 from pipeline.deposition.extruder import Extruder, Routine, disturb, draw, flow, frequency_response
 from pipeline.deposition.ilc import Law, Trial
 from pipeline.deposition.trial_model import deviations
@@ -16,11 +17,11 @@ FREQUENCIES = 2000
 
 
 class LawSettings(NamedTuple):
-    """What both laws are built from: sample time in s; limit of the command in mm (infinite where there is
-    none); the settings of each law; `rise` of the error, as share of trial 0's, that counts as one."""
+    """What both laws are built from: sample time in s; the drive; the settings of each law; `rise` of the
+    error, as share of trial 0's, that counts as one."""
 
     sample_time_s: float
-    limit: float
+    drive: Drive
     hoelzle_2009: ilc.HoelzleSettings
     model_inverse: ilc.InverseSettings
     rise: float
@@ -74,7 +75,7 @@ def hoelzle_2009(routine: Routine, nominal: Extruder, settings: LawSettings) -> 
         nominal,
         ilc.zero_phase,
         settings.hoelzle_2009,
-        limit=settings.limit,
+        drive=settings.drive,
         sample_time_s=settings.sample_time_s,
     )
 
@@ -82,7 +83,7 @@ def hoelzle_2009(routine: Routine, nominal: Extruder, settings: LawSettings) -> 
 def model_inverse(routine: Routine, settings: LawSettings) -> ilc.InverseLaw:
     """The inverse of the model identified from the first trials."""
     return ilc.InverseLaw(
-        routine.r, settings.model_inverse, limit=settings.limit, sample_time_s=settings.sample_time_s
+        routine.r, settings.model_inverse, drive=settings.drive, sample_time_s=settings.sample_time_s
     )
 
 
@@ -93,11 +94,11 @@ def simulated(
     the measured one with what does not repeat."""
 
     def measure(u: np.ndarray) -> Trial:
-        truth = flow(plant, u, sample_time_s=settings.sample_time_s, limit=settings.limit)
+        truth = flow(plant, u, sample_time_s=settings.sample_time_s, drive=settings.drive)
         y = disturb(
             truth, rng, steady_flow=steady_flow, white=noise.white, drift=noise.drift, gain=noise.gain
         )
-        return Trial(np.clip(u, -settings.limit, settings.limit), y, truth)
+        return Trial(obeyed(u, settings.drive, sample_time_s=settings.sample_time_s), y, truth)
 
     return measure
 
@@ -116,7 +117,14 @@ def run_trials(
     """`trials` updates from on-off control, with roll-back (`ilc.learn`)."""
     u0 = on_off(routine.r, nominal)
     done = ilc.learn(law, measure, u0, routine.r, trials=trials, rise=settings.rise, on_step=on_step)
-    rows = ilc.table(done, routine.r, steady=float(u0.max()), limit=settings.limit, rise=settings.rise)
+    rows = ilc.table(
+        done,
+        routine.r,
+        steady=float(u0.max()),
+        drive=settings.drive,
+        sample_time_s=settings.sample_time_s,
+        rise=settings.rise,
+    )
     return TrialSequence(name, routine, done, rows, getattr(law, "model", None))
 
 
@@ -230,7 +238,7 @@ def convergence_of_model_inverse(
 def actuator_headroom(
     routine: Routine, nominal: Extruder, *, worst_ratio: float, settings: LawSettings
 ) -> ilc.ActuatorHeadroom:
-    """What the limit of the command leaves of the routine, on the nominal model, before anything
+    """What the drive leaves of the routine, on the nominal model, before anything
     runs. Raises ValueError where no law can come below worst_ratio of the error of on-off
     control; the sentence names the ramp that would do."""
     headroom = ilc.actuator_headroom(
@@ -239,10 +247,10 @@ def actuator_headroom(
         nominal,
         order=settings.model_inverse.order,
         cutoff_hz=settings.model_inverse.cutoff_hz,
-        limit=settings.limit,
+        drive=settings.drive,
         sample_time_s=settings.sample_time_s,
     )
-    ilc.check_headroom(headroom, limit=settings.limit, worst_ratio=worst_ratio)
+    ilc.check_headroom(headroom, drive=settings.drive, worst_ratio=worst_ratio)
     return headroom
 
 

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from pipeline.deposition import composition, conformance, evaluation, gcode, motion
-from pipeline.deposition.composition import Composed, Learned, PartSettings
+from pipeline.deposition import composition, conformance, drive, evaluation, gcode, motion
+from pipeline.deposition.composition import Composed, Learned, PartSettings, Stream
 from pipeline.deposition.conformance import Conformance
 from pipeline.deposition.evaluation import Judging, Score
 from pipeline.deposition.workflow import laws
@@ -112,7 +112,7 @@ def compose(path: Path, learned: Learned, printer: Printer, settings: ComposePar
         planned = motion.plan(
             program.moves, acceleration=printer.acceleration_mm_per_s2,
             junction_deviation_mm=printer.junction_deviation_mm,
-            speed_limit=printer.speed_limit_mm_per_s, unset_feed=printer.speed_mm_per_s,
+            speed_limit=printer.gantry_speed_limit_mm_per_s, unset_feed=printer.speed_mm_per_s,
             tool_change_s=printer.tool_change_s,
         )  # fmt: skip
         part_settings = PartSettings(
@@ -121,7 +121,7 @@ def compose(path: Path, learned: Learned, printer: Printer, settings: ComposePar
             printer.ramp_s,
             settings.corner_deg,
             settings.longest_pause_s,
-            printer.limit,
+            printer.limits,
         )
         materials = {material.tool: material.name for material in printer.materials}
         composed = composition.compose(learned, program, planned, part_settings, materials=materials)
@@ -130,7 +130,7 @@ def compose(path: Path, learned: Learned, printer: Printer, settings: ComposePar
             learned,
             bead_area_mm2=printer.bead_area_mm2,
             ramp_s=printer.ramp_s,
-            limit=printer.limit,
+            drive=printer.limits,
             shortest_s=settings.shortest_s,
             largest_error_percent=settings.largest_error_percent,
             refusals=program.refusals,
@@ -187,7 +187,7 @@ def summary_lines(part: Part) -> str:
             do = (
                 f"ramps of {ramp:.2f} s would do"
                 if math.isfinite(ramp)
-                else "no ramp would do: print slower, or raise printer.limit_mm"
+                else "no ramp would do: print slower, or take a drive of more than printer.drive declares"
             )
             text.append(
                 f"  the command reaches its limit {sat.share_percent:.1f} % of the printing time (peak "
@@ -321,14 +321,21 @@ def _by_material(part: Part, of_tool: dict[int, Any]) -> list[tuple[str, Any]]:
 
 def figures(judged: Sequence[tuple[Part, Sequence[Score]]]) -> dict[str, Any]:
     """By part, material and composer: the error of the true flow in % of on-off
-    control's, the worst line's volume, and which was chosen."""
+    control's, the worst line's volume, and which was chosen; and what its command asks of the drive."""
     return {
         part.name: {
             stream.material: _by_composer([score for score in scores if score.stream == i])
+            | _asked(stream, part.composed.sample_time_s)
             for i, stream in enumerate(part.composed.streams)
         }
         for part, scores in judged
     }
+
+
+def _asked(stream: Stream, sample_time_s: float) -> dict[str, float]:
+    """The largest command and speed of the signal as it is sent."""
+    most = drive.asked(stream.u, sample_time_s=sample_time_s)
+    return {"largest_command_mm": most.command_mm, "largest_speed_mm_per_s": most.speed_mm_per_s}
 
 
 def _by_composer(scores: Sequence[Score]) -> dict[str, Any]:

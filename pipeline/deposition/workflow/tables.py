@@ -41,7 +41,7 @@ TRIALS = Schema(
             low=0,
         ),
         Column("peak_over_steady", FLOAT, NONE, "largest command as multiple of the steady one", low=0),
-        Column("saturated", FLOAT, NONE, "share of time at the limit of the command", 0, 1),
+        Column("saturated", FLOAT, NONE, "share of time at a limit of the drive", 0, 1),
         Column("rolled_back", BOOL, NONE, "the error rose, and the next command went back to the best trial"),
     ),
 )

@@ -10,6 +10,7 @@ from joblib import delayed
 from tqdm import tqdm
 
 from pipeline.deposition import bead, ilc, training
+from pipeline.deposition.drive import obeyed
 from pipeline.deposition.extruder import Extruder, Routine, draw
 from pipeline.deposition.ilc import Trial
 from pipeline.deposition.training import LawSettings, Noise, TrainingCase, TrialSequence, on_off
@@ -358,7 +359,8 @@ def _resume(
     u0 = on_off(routine.r, nominal)
     trials = [one.trial for one in measured]
     if not trials:
-        return None, ilc.Step(u0, 0, False, False)
+        first = obeyed(u0, settings.drive, sample_time_s=settings.sample_time_s)
+        return None, ilc.Step(first, 0, False, False)
     law = training.model_inverse(routine, settings)
     step = ilc.next_step(trials, routine.r, law, rise=settings.rise)
     gain_ratio = law.model.extruder.gain / nominal.gain if law.model else 1.0
@@ -368,7 +370,14 @@ def _resume(
             "check the units of the command, "
             "the calibration and the frames' size, or write the gain as it is"
         )
-    rows = ilc.table(trials, routine.r, steady=float(u0.max()), limit=settings.limit, rise=settings.rise)
+    rows = ilc.table(
+        trials,
+        routine.r,
+        steady=float(u0.max()),
+        drive=settings.drive,
+        sample_time_s=settings.sample_time_s,
+        rise=settings.rise,
+    )
     return TrialSequence("pixels", routine, trials, rows, law.model), step
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from pipeline.report.deposition.rules import MARK, NAMES, PAPER, real
+from pipeline.report.deposition.rules import MARK, NAMES, PAPER, asked_of_the_drive, real
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import MINUS, THIN, count, number, percent, short, shortened
 from pipeline.report.shared.pictures import Column, Picture, placeholder
@@ -382,6 +382,7 @@ class Forecast(NamedTuple):
     lines: str
     short: str
     peak: str
+    speed: str
     limit: str
     share: str
     bad: bool
@@ -409,6 +410,7 @@ def forecasts(sources: Sources) -> Forecasts:
 def _forecast(part: str, material: str, report: dict[str, Any]) -> Forecast:
     """One stream out of the conformance report of its part."""
     drive = report["saturation"][material]
+    asked = asked_of_the_drive(part, material, drive)
     ramp = report.get("ramp_that_would_do_s", {}).get(material)
     composer = report.get("composer", {}).get(material, "")
     if drive["enough"]:
@@ -423,10 +425,11 @@ def _forecast(part: str, material: str, report: dict[str, Any]) -> Forecast:
         time=number(float(report.get("duration_s", 0.0)), 1),
         lines=f"{report.get('printed_lines', 0):,} in {report.get('runs', 0):,}",
         short=number(float(report.get("shorter_than_lead", 0)), 0),
-        peak=f"{short(float(drive['peak_over_steady']), 2)} ×",
-        limit="none set" if drive.get("limit") is None else f"{drive['limit']:g}{THIN}mm",
-        share=percent(float(drive["share_percent"]), 2),
-        bad=not drive["enough"],
+        peak=f"{short(asked.command_mm, 2)} ({short(float(drive['peak_over_steady']), 2)} ×)",
+        speed=short(asked.speed_mm_per_s, 2),
+        limit="not declared" if asked.limit() == "declared" else asked.limit(),
+        share=percent(asked.share, 2),
+        bad=not asked.enough,
         ramp=remedy,
     )
 
