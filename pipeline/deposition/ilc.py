@@ -16,7 +16,7 @@ from pipeline.deposition import reachable
 from pipeline.deposition.drive import Drive, asked, at_limit, follows, obeyed
 from pipeline.deposition.extruder import Extruder, flow, frequency_response
 from pipeline.deposition.trial_filter import Repeating, repeating
-from pipeline.deposition.trial_model import TrialModel, identify_with_lag
+from pipeline.deposition.trial_model import TrialModel, identify_with_lag, lag_delay_s
 
 # of the steady gain squared: only keeps the inverse finite where half
 # a sample of delay makes a zero, far above any Q
@@ -173,8 +173,9 @@ def command(
         return u
     a = math.exp(-sample_time_s / model.time_constant_s)
     scale, t = model.gain * (1 - a), np.arange(len(x)) * sample_time_s
-    # u(t) shows in the flow one sample and the delay later
-    later = t + sample_time_s + model.delay_s
+    # u(t) shows in the flow one sample and the delay later; what is reached at a limit is slow, and a lag
+    # makes that late
+    later = t + sample_time_s + model.delay_s + lag_delay_s(model.lag_hz)
     free = np.interp(later, t, r) <= 0
     v = reachable.nearest(
         np.interp(later, t, x),

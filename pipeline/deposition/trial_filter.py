@@ -33,9 +33,9 @@ class Smoother(Protocol):
 
 
 class Repeating(NamedTuple):
-    """y = max(gain (G u + disturbance) - yield, 0): the disturbance (T,) in mm^3/s, the gain of the next trial
-    over the model's as forecast; `weight`, the least weight of a new trial that was chosen, and `follower`,
-    what follows the gain (0 its mean, k the k-th of FOLLOWERS)."""
+    """y = max(gain (G u + disturbance) - yield, 0): the disturbance (T,) in mm^3/s, the gain of the next
+    trial over the model's as forecast; `weight`, the least weight of a new trial that was chosen, and
+    `follower`, what follows the gain (0 its mean, k the k-th of FOLLOWERS)."""
 
     disturbance: np.ndarray
     gain: float
@@ -53,12 +53,12 @@ def repeating(
     smooth: Smoother,
     sample_time_s: float,
 ) -> Repeating:
-    """Of the commands u (J, T) in mm and flows y (J, T) in mm^3/s of all trials, NaN where not observable, for
-    the wanted flow r (T,).
+    """Of the commands u (J, T) in mm and flows y (J, T) in mm^3/s of all trials, NaN where not observable,
+    for the wanted flow r (T,).
 
-    A Kalman filter over trials with the weight k_j = max(1/j, least), d <- d + k_j ((y + yield) / g_j - (G u_j
-    + d)), g_j the gain of trial j by least squares of its flow; the first trials in full and with g = 1. A
-    static machine wants 1/j. On one that changes a faster weight foretells the next trial better, of the
+    A Kalman filter over trials with the weight k_j = max(1/j, least), d <- d + k_j ((y + yield) / g_j -
+    (G u_j + d)), g_j the gain of trial j by least squares of its flow; the first trials in full and with g =
+    1. A static machine wants 1/j. On one that changes a faster weight foretells the next trial better, of the
     disturbance by its Q-filtered innovation, of the gain by that of ln g_j: this evidence chooses
     (exponential smoothing and its trend: Holt 1957; chosen by one-step errors: Gardner 2006).
 
@@ -83,9 +83,7 @@ def repeating(
     forecasts = gain_forecasts(log_gain[chosen])
     errors = (forecasts[:, FIRST:trials] - log_gain[chosen, FIRST:]) ** 2
     follower = _foretold_best(errors, GAIN_MARGIN)
-    return Repeating(
-        d[chosen], float(np.exp(forecasts[follower, trials])), float(least[chosen]), follower
-    )
+    return Repeating(d[chosen], float(np.exp(forecasts[follower, trials])), float(least[chosen]), follower)
 
 
 def gain_forecasts(log_gain: np.ndarray) -> np.ndarray:
