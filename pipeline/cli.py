@@ -165,6 +165,11 @@ def compose(arguments: argparse.Namespace) -> None:
     files = exports.write(part, arguments.out, formats)
     print(compose_parts.summary_lines(part))
     print("written: " + ", ".join(str(file) for file in files))
+    if arguments.verify:
+        from pipeline.deposition.workflow import verify_part
+
+        print(verify_part.write(part, learned, printer, settings, arguments.out))
+        print(verify_part.write_next(part, learned, printer, arguments.part.parent, arguments.out))
 
 
 def calibrate_tip(arguments: argparse.Namespace) -> None:
@@ -253,6 +258,9 @@ def main() -> None:
         choices=("e", "declared"),
         default="e",
         help="volume of a line: by E where it counts, or the declared bead's (e)",
+    )
+    command.add_argument(
+        "--verify", action="store_true", help="also the shortest print that shows whether the forecast holds"
     )
     command.set_defaults(run=compose)
     command = commands.add_parser("calibrate-tip", help=calibrate_tip.__doc__)

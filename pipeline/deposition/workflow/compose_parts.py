@@ -154,16 +154,7 @@ def summary_lines(part: Part) -> str:
         f"the gantry sets out {composed.lead_in_s:.2f} s after the signal"
     )
     for stream in composed.streams:
-        predicted = {
-            q.composer: q.rms_percent_of_on_off for q in composed.predictions if q.tool == stream.tool
-        }
-        others = ", ".join(
-            f"{name} {percent:.1f} %" for name, percent in sorted(predicted.items(), key=lambda item: item[1])
-        )
-        text.append(
-            f"T{stream.tool} {stream.material}: by {stream.composer}; predicted flow error, "
-            f"of on-off control's: {others}"
-        )
+        text.append(forecast_sentence(composed, stream))
         sat = checks.saturation[stream.tool]
         if not sat.enough:
             ramp = checks.ramp_that_would_do_s[stream.tool]
@@ -191,6 +182,18 @@ def summary_lines(part: Part) -> str:
     text += part_programs.summary(part.program, part.extruded, part.printer)
     text += part_programs.refused(checks, part.program)
     return "\n".join(text)
+
+
+def forecast_sentence(composed: Composed, stream: Stream) -> str:
+    """The forecast of each composer in words, the least upper end first, or why it is not judged."""
+    intervals = sorted(
+        (q for q in composed.predictions if q.tool == stream.tool), key=lambda prediction: prediction.high
+    )
+    others = ", ".join(f"{q.composer} {q.low:.1f} to {q.high:.1f} %" for q in intervals)
+    text = f"T{stream.tool} {stream.material}: by {stream.composer}; "
+    if not stream.judged.judged:
+        return f"{text}forecast not judged: {stream.judged.reason}; to judge it, {stream.judged.trial}"
+    return f"{text}flow error forecast (90 %), of on-off control's: {others}"
 
 
 # ---- as tables
@@ -284,12 +287,11 @@ def report(part: Part) -> dict[str, Any]:
         "composer": {stream.material: stream.composer for stream in composed.streams},
         "predicted_percent": {
             p.material: {
-                q.composer: finite_or_none(q.rms_percent_of_on_off)
-                for q in composed.predictions
-                if q.material == p.material
+                q.composer: finite_or_none(q.median) for q in composed.predictions if q.material == p.material
             }
             for p in composed.predictions
         },
+        "forecast": {stream.material: forecast_of(composed, stream) for stream in composed.streams},
         "saturation": {
             name: {key: finite_or_none(value) for key, value in one._asdict().items()}
             for name, one in _by_material(part, checks.saturation)
@@ -313,11 +315,39 @@ def figures(judged: Sequence[tuple[Part, Sequence[Score]]]) -> dict[str, Any]:
     return {
         part.name: {
             stream.material: _by_composer([score for score in scores if score.stream == i])
+            | _forecast(part.composed, stream, [score for score in scores if score.stream == i])
             | _asked(stream, part.composed.sample_time_s)
             for i, stream in enumerate(part.composed.streams)
         }
         for part, scores in judged
     }
+
+
+def forecast_of(composed: Composed, stream: Stream) -> dict[str, Any]:
+    """Forecast error of the signal as it is sent, in % of on-off control's, and whether it may be
+    believed."""
+    chosen = next(q for q in composed.predictions if q.tool == stream.tool and q.chosen)
+    return {
+        "low": finite_or_none(chosen.low),
+        "median": finite_or_none(chosen.median),
+        "high": finite_or_none(chosen.high),
+        "composers": {
+            q.composer: {"low": finite_or_none(q.low), "high": finite_or_none(q.high)}
+            for q in composed.predictions
+            if q.tool == stream.tool
+        },
+    } | stream.judged._asdict()
+
+
+def _forecast(composed: Composed, stream: Stream, scores: Sequence[Score]) -> dict[str, Any]:
+    """The forecast beside the true error, which a simulated machine has, and whether it may be believed."""
+    told = forecast_of(composed, stream)
+    del told["composers"]
+    judged = {name: told.pop(name) for name in ("judged", "reason", "trial")}
+    simulated = any(score.composer == evaluation.FULL_PART_ILC for score in scores)
+    true = next((score.rms_percent_of_on_off for score in scores if score.chosen), None)
+    figures = {"forecast": told, "judged": judged}
+    return figures | ({"true": true} if simulated and true is not None else {})
 
 
 def _asked(stream: Stream, sample_time_s: float) -> dict[str, float]:

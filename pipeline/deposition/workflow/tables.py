@@ -182,7 +182,7 @@ TASKS = Schema(
 )
 LINES = Schema(
     "lines",
-    1,
+    2,
     (
         Column("part", TEXT, NONE, "part program"),
         Column("line", COUNT, NONE, "line of the program", low=0),
@@ -195,5 +195,7 @@ LINES = Schema(
         Column("on_off_mm3", FLOAT, "mm^3", "predicted volume of on-off control"),
         Column("error_percent", FLOAT, "percent", "predicted less planned; missing for dots", nullable=True),
         Column("shorter_than_lead", BOOL, NONE, "its whole run is shorter than the lead of Stop"),
+        Column("low_percent", FLOAT, "percent", "lower end of the error's 90 % interval", nullable=True),
+        Column("high_percent", FLOAT, "percent", "upper end of the error's 90 % interval", nullable=True),
     ),
 )
