@@ -289,4 +289,4 @@ def test_a_print_of_days_is_a_slip_named_with_its_line(tmp_path, machine):
     with pytest.raises(
         ValueError, match=r"job\.gcode: expected a print of at most 72 h, .* of which line 5 "
     ):
-        part(tmp_path, machine, "G21\nG90\nM83\nG1 X9 E9 F480\nG1 X10 E1 F0.0001\n")
+        part(tmp_path, machine, "G21\nG90\nM83\nG1 X9 E9 F480\nG1 X100 E91 F0.001\n")
