@@ -4,6 +4,7 @@ of the drive, and the loop with roll-back."""
 import numpy as np
 import pytest
 
+from benchmarks import foreign_deposition, foreign_extruders
 from benchmarks.ilc import causal_q
 from benchmarks.norm_optimal import norm_optimal_law
 from pipeline.deposition import ilc
@@ -307,7 +308,25 @@ def test_the_norm_optimal_law_learns_too():
     assert percent[2] < 20 and percent[15] < 6
 
 
+def test_a_machine_of_third_order_is_learned_because_its_lag_is_identified():
+    plant = foreign_deposition.plant("third_order", "B", 1)
+    percent = foreign_deposition.learned(plant, "B", 1, "model_inverse").percent
+    # 6 and still falling slowly where all that is late is taken for delay
+    assert percent[5] < 4 and percent[15:].max() < 3
+
+
 # ---- limits
+
+
+def test_a_limit_just_above_the_steady_command_leaves_no_more_than_any_command_within_it_must():
+    plant, amplitude = foreign_deposition.plant("plain", "B", 2), 3 * STEADY / MATERIALS["B"].gain
+    drive = Drive(amplitude, np.inf, 0.0)
+    exact = Extruder(plant.gain, plant.tau_up_s, plant.delay_s)
+    assert 2 < amplitude * plant.gain / STEADY < 2.2  # this plant's steady command is larger than the nominal
+    u = ilc.command(R, R, exact, drive=drive, sample_time_s=TS)
+    error = ilc.rms(R - foreign_extruders.flow(plant, u, sample_time_s=TS))
+    # by another method: a bounded quadratic program
+    assert error <= 1.01 * foreign_deposition.reachable_error(plant, u, drive)
 
 
 def test_the_forecast_says_what_the_limit_will_leave():
@@ -396,6 +415,13 @@ def test_a_machine_that_gives_another_error_for_the_best_command_has_changed():
     assert ilc.judge([100.0, 40.0, 75.0, 70.0, 81.0], rise=0.1).repeat
     twice = ilc.judge([100.0, 40.0, 75.0, 70.0, 30.0, 45.0, 46.0], rise=0.1)
     assert (twice.restarts, twice.keep, twice.best) == ([2, 5], [5, 6], 5)
+
+
+def test_what_the_trials_scatter_anyway_is_no_rise():
+    scattered = [100.0, 30.0, 5.0, 14.0, 6.0, 13.0, 5.0, 14.0]
+    assert not ilc.judge([*scattered, 18.0], rise=0.1).repeat  # beyond 5 + 10, within 9.5 + 3 x 6.7
+    assert ilc.judge([*scattered, 40.0], rise=0.1).repeat
+    assert ilc.judge([100.0, 30.0, 5.0, 5.1, 4.9, 5.0, 5.2, 5.0, 18.0], rise=0.1).repeat
 
 
 def test_the_law_of_a_changed_machine_is_given_its_trials_alone_and_after_one_rise_half_its_step():
