@@ -394,12 +394,12 @@ def judge(errors: Sequence[float], *, rise: float) -> LearningState:
 
 
 def _scattered(errors: list[float]) -> float:
-    """The largest error that the scatter of these explains: median and SCATTER standard deviations, by the
-    median deviation; 0 of fewer than four."""
+    """The largest error that the scatter of these explains: their median and SCATTER standard deviations,
+    told from the changes between them, which are small where an error creeps up; 0 of fewer than four."""
     if len(errors) < 4:
         return 0.0
-    median = float(np.median(errors))
-    return median + SCATTER * 1.4826 * float(np.median(np.abs(np.array(errors) - median)))
+    deviation = 1.4826 * float(np.median(np.abs(np.diff(errors)))) / math.sqrt(2)
+    return float(np.median(errors)) + SCATTER * deviation
 
 
 def next_step(trials: Sequence[Trial], r: np.ndarray, law: Law, *, rise: float) -> Step:

@@ -419,9 +419,11 @@ def test_a_machine_that_gives_another_error_for_the_best_command_has_changed():
 
 def test_what_the_trials_scatter_anyway_is_no_rise():
     scattered = [100.0, 30.0, 5.0, 14.0, 6.0, 13.0, 5.0, 14.0]
-    assert not ilc.judge([*scattered, 18.0], rise=0.1).repeat  # beyond 5 + 10, within 9.5 + 3 x 6.7
+    assert not ilc.judge([*scattered, 18.0], rise=0.1).repeat  # beyond 5 + 10, within 9.5 + 3 x 8.4
     assert ilc.judge([*scattered, 40.0], rise=0.1).repeat
     assert ilc.judge([100.0, 30.0, 5.0, 5.1, 4.9, 5.0, 5.2, 5.0, 18.0], rise=0.1).repeat
+    creeping = [100.0, 30.0, *(5 + 1.5 * j for j in range(7)), 15.5]
+    assert ilc.judge(creeping, rise=0.1).repeat
 
 
 def test_the_law_of_a_changed_machine_is_given_its_trials_alone_and_after_one_rise_half_its_step():
