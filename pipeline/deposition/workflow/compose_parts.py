@@ -114,6 +114,7 @@ def compose(path: Path, learned: Learned, printer: Printer, settings: ComposePar
             junction_deviation_mm=printer.junction_deviation_mm,
             speed_limit=printer.gantry_speed_limit_mm_per_s, unset_feed=printer.speed_mm_per_s,
             tool_change_s=printer.tool_change_s,
+            printing_acceleration=laws.printing_acceleration(printer, learned, program.moves),
         )  # fmt: skip
         part_settings = PartSettings(
             printer.nozzle_mm,

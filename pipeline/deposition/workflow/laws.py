@@ -1,11 +1,14 @@
 """What train_ilc and compose_parts both stand on: the laws' settings and the noise of
 section train_ilc, and the extruders of models.json."""
 
+import math
 from typing import Any
 
 import numpy as np
 
+from pipeline.deposition.composition import Learned
 from pipeline.deposition.extruder import Extruder
+from pipeline.deposition.gcode import Kind, Moves
 from pipeline.deposition.ilc import HoelzleSettings, InverseSettings
 from pipeline.deposition.training import LawSettings, Noise
 from pipeline.deposition.workflow.settings import Printer, TrainIlc
@@ -20,6 +23,21 @@ def law_settings(settings: TrainIlc, printer: Printer) -> LawSettings:
         HoelzleSettings(hoelzle.learning_gain, hoelzle.fast_zero_s, hoelzle.order, hoelzle.cutoff_hz),
         InverseSettings(inverse.identify_trials, inverse.floor, inverse.order, inverse.cutoff_hz),
         inverse.rise,
+    )
+
+
+def printing_acceleration(printer: Printer, learned: Learned, moves: Moves) -> float:
+    """mm/s^2 for the printed moves of a part, such that the drive follows the flow of each of its materials,
+    as identified, at the part's highest printing speed; inf where the drive follows any."""
+    prints = (moves.kind == Kind.EXTRUDE) & (moves.length > 0)
+    feeds = np.where(np.isfinite(moves.feed), moves.feed, printer.speed_mm_per_s)[prints]
+    names = {one.name for one in printer.materials if one.tool in set(moves.tool[prints].tolist())}
+    chains = [one.chain.extruder for one in learned.materials if one.material in names]
+    if not chains:
+        return math.inf
+    return printer.printing_acceleration(
+        [Extruder(e.gain, e.time_constant_s, yield_=e.yield_) for e in chains],
+        min(float(feeds.max()), printer.gantry_speed_limit_mm_per_s),
     )
 
 

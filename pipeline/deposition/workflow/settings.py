@@ -1,13 +1,15 @@
 """Sections `printer` and `camera` of the parameters: the deposition loop's
 machine, its materials, and what looks at the bead."""
 
+import math
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import pydantic
 from pydantic import Field
 
-from pipeline.deposition import drive
-from pipeline.deposition.extruder import Routine, routine
+from pipeline.deposition import drive, reachable
+from pipeline.deposition.extruder import Extruder, Routine, routine
 from pipeline.store.params import Section
 
 
@@ -49,6 +51,7 @@ class Printer(Section):
     bead_area_mm2: float = Field(gt=0, le=100)
     speed_mm_per_s: float = Field(gt=0, le=1000)
     ramp_s: float = Field(gt=0, le=60)
+    longest_ramp_s: float | None = Field(default=None, gt=0, le=60)
     drive: Drive | None
     acceleration_mm_per_s2: float = Field(gt=0, le=1e6)
     junction_deviation_mm: float = Field(ge=0, le=10)
@@ -82,15 +85,45 @@ class Printer(Section):
         """Wanted flow of a line at full speed, mm^3/s."""
         return self.bead_area_mm2 * self.speed_mm_per_s
 
+    @property
+    def nominals(self) -> list[Extruder]:
+        """The materials' extruders as known beforehand."""
+        return [Extruder(one.gain_mm3_per_s_per_mm, one.time_constant_s) for one in self.materials]
+
+    def printing_acceleration(self, extruders: Sequence[Extruder], speed_mm_per_s: float) -> float:
+        """mm/s^2 with which the gantry may reach a printing speed such that the drive follows the flow of
+        each of the extruders (`reachable.ramp_that_loses_little`, at most longest_ramp_s); inf where none is
+        asked for."""
+        if self.longest_ramp_s is None:
+            return math.inf
+        ramps = [
+            reachable.ramp_that_loses_little(
+                extruder, self.limits, steady_flow=self.bead_area_mm2 * speed_mm_per_s, ramp_s=self.ramp_s,
+                longest_s=self.longest_ramp_s, sample_time_s=self.sample_time_s,
+            )
+            for extruder in extruders
+        ]  # fmt: skip
+        # whole hundredths of a second, as the page names it
+        slow_s = min(
+            math.ceil(100 * max(ramps)) / 100 if max(ramps) < math.inf else math.inf, self.longest_ramp_s
+        )
+        return speed_mm_per_s / slow_s if slow_s else math.inf
+
     def trained(self) -> list[Routine]:
-        """The training routines: the reference, on which laws are compared, and those of the library."""
+        """The training routines: the reference, on which laws are compared, and those of the library. Where
+        the drive asks for longer ramps of the gantry, it rests as long in the pause, between them."""
+        trainings = [self.reference, *self.routines]
+        acceleration = self.printing_acceleration(self.nominals, max(t.speed_mm_per_s for t in trainings))
+        slow_s = [round(t.speed_mm_per_s / acceleration, 9) for t in trainings]
+        # the same for all speeds, so that these are compared at one pause
+        longer_s = max(slow_s)
         return [
             routine(
-                off_s=t.off_s, on_s=t.on_s, pause_s=t.pause_s, tail_s=t.tail_s, speed=t.speed_mm_per_s,
-                bead_area_mm2=self.bead_area_mm2,
-                ramp_s=self.ramp_s, sample_time_s=self.sample_time_s,
+                off_s=t.off_s, on_s=t.on_s, pause_s=t.pause_s + longer_s, tail_s=t.tail_s,
+                speed=t.speed_mm_per_s, bead_area_mm2=self.bead_area_mm2,
+                ramp_s=self.ramp_s, gantry_ramp_s=slow, sample_time_s=self.sample_time_s,
             )
-            for t in [self.reference, *self.routines]
+            for t, slow in zip(trainings, slow_s, strict=True)
         ]  # fmt: skip
 
 
