@@ -138,8 +138,8 @@ def line_volumes(composed: Composed, library: Library, *, bead_area_mm2: float) 
         a, b = lines.begin_s[mine], lines.end_s[mine]
         middle = (b[:-1] + a[1:]) / 2
         start, stop = (
-            np.maximum(a - REACH_S, np.append(-np.inf, middle)),
-            np.minimum(b + REACH_S, np.append(middle, np.inf)),
+            np.maximum(a - lines.early_s[mine] - REACH_S, np.append(-np.inf, middle)),
+            np.minimum(b + lines.late_s[mine] + REACH_S, np.append(middle, np.inf)),
         )
         predicted[mine] = volume_between(stream.y, start, stop, sample_time_s=Ts)
         on_off[mine] = volume_between(stream.on_off, start, stop, sample_time_s=Ts)

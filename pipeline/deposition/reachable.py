@@ -159,7 +159,7 @@ def nearest_response(
                 slack = 1 - v * v
                 gradient += _back(2 * barrier * v / slack / most, taps)
                 _add_squares(band, 2 * barrier * (1 + v * v) / slack**2 / most**2, taps)
-            dz = -scipy.linalg.solveh_banded(band, gradient, lower=True, check_finite=False)
+            dz = -_solved(band, gradient)
             # every bound holds: at most 0.95 of the way to the nearest
             reach = max(_reach(_of(z, taps) / most, _of(dz, taps) / most) for taps, most in within)
             length = min(1.0, 0.95 / max(reach, 1e-300))
@@ -168,6 +168,21 @@ def nearest_response(
                 break
         barrier *= 0.1
     return c * z
+
+
+def _solved(band: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+    """Newton's step (N,) of the lower bands (B, N); a larger diagonal where rounding makes them indefinite
+    (poles near 1 in a row): a shorter step of the same descent."""
+    for share in (0.0, 1e-13, 1e-11, 1e-9):
+        try:
+            whole = np.vstack([band[:1] * (1 + share), band[1:]])
+            return scipy.linalg.solveh_banded(whole, gradient, lower=True, check_finite=False)
+        except np.linalg.LinAlgError:
+            continue
+    raise ValueError(
+        "reachable: the taps of output and command leave the response undetermined; "
+        "expected poles inside the unit circle"
+    )
 
 
 def _changes(taps: Taps) -> Taps:

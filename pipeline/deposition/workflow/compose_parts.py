@@ -109,13 +109,7 @@ def compose(path: Path, learned: Learned, printer: Printer, settings: ComposePar
                 f"line {first.line}: {first.why}; it was left out, "
                 "and nothing of the program that could be read prints"
             )
-        planned = motion.plan(
-            program.moves, acceleration=printer.acceleration_mm_per_s2,
-            junction_deviation_mm=printer.junction_deviation_mm,
-            speed_limit=printer.gantry_speed_limit_mm_per_s, unset_feed=printer.speed_mm_per_s,
-            tool_change_s=printer.tool_change_s,
-            printing_acceleration=laws.printing_acceleration(printer, learned, program.moves),
-        )  # fmt: skip
+        planned = laws.planned(program.moves, printer, learned)
         part_settings = PartSettings(
             printer.nozzle_mm,
             printer.bead_area_mm2,
@@ -136,6 +130,9 @@ def compose(path: Path, learned: Learned, printer: Printer, settings: ComposePar
             largest_error_percent=settings.largest_error_percent,
             refusals=program.refusals,
         )
+        if not all(one.enough for one in report.saturation.values()):
+            ramp_s = laws.ramp_that_would_do(program.moves, printer, learned)
+            report = report._replace(ramp_that_would_do_s=dict.fromkeys(report.saturation, ramp_s))
     return Part(path.stem, program, planned, composed, report)
 
 

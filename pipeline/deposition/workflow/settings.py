@@ -90,36 +90,32 @@ class Printer(Section):
         """The materials' extruders as known beforehand."""
         return [Extruder(one.gain_mm3_per_s_per_mm, one.time_constant_s) for one in self.materials]
 
-    def printing_acceleration(self, extruders: Sequence[Extruder], speed_mm_per_s: float) -> float:
-        """mm/s^2 with which the gantry may reach a printing speed such that the drive follows the flow of
-        each of the extruders (`reachable.ramp_that_loses_little`, at most longest_ramp_s); inf where none is
-        asked for."""
-        if self.longest_ramp_s is None:
-            return math.inf
+    def slow_s(self, extruders: Sequence[Extruder], speed_mm_per_s: float, longest_s: float) -> float:
+        """Seconds in which the gantry may reach a printing speed such that the drive follows the flow of each
+        of the extruders (`reachable.ramp_that_loses_little`), in whole hundredths; at most longest_s."""
         ramps = [
             reachable.ramp_that_loses_little(
                 extruder, self.limits, steady_flow=self.bead_area_mm2 * speed_mm_per_s, ramp_s=self.ramp_s,
-                longest_s=self.longest_ramp_s, sample_time_s=self.sample_time_s,
+                longest_s=longest_s, sample_time_s=self.sample_time_s,
             )
             for extruder in extruders
         ]  # fmt: skip
-        # whole hundredths of a second, as the page names it
-        slow_s = min(
-            math.ceil(100 * max(ramps)) / 100 if max(ramps) < math.inf else math.inf, self.longest_ramp_s
-        )
-        return speed_mm_per_s / slow_s if slow_s else math.inf
+        longest = min(max(ramps), longest_s)
+        return min(math.ceil(100 * longest) / 100, longest_s)
 
     def trained(self) -> list[Routine]:
         """The training routines: the reference, on which laws are compared, and those of the library. Where
         the drive asks for longer ramps of the gantry, it rests as long in the pause, between them."""
         trainings = [self.reference, *self.routines]
-        acceleration = self.printing_acceleration(self.nominals, max(t.speed_mm_per_s for t in trainings))
-        slow_s = [round(t.speed_mm_per_s / acceleration, 9) for t in trainings]
-        # the same for all speeds, so that these are compared at one pause
-        longer_s = max(slow_s)
+        fastest = max(t.speed_mm_per_s for t in trainings)
+        # the pause is longer by this at all speeds, so that these are compared at one pause
+        longer_s = (
+            0.0 if self.longest_ramp_s is None else self.slow_s(self.nominals, fastest, self.longest_ramp_s)
+        )
+        slow_s = [round(longer_s * t.speed_mm_per_s / fastest, 9) for t in trainings]
         return [
             routine(
-                off_s=t.off_s, on_s=t.on_s, pause_s=t.pause_s + longer_s, tail_s=t.tail_s,
+                off_s=t.off_s, on_s=t.on_s, pause_s=round(t.pause_s + longer_s, 9), tail_s=t.tail_s,
                 speed=t.speed_mm_per_s, bead_area_mm2=self.bead_area_mm2,
                 ramp_s=self.ramp_s, gantry_ramp_s=slow, sample_time_s=self.sample_time_s,
             )
