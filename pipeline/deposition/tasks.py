@@ -22,8 +22,9 @@ STEP_S = 0.02
 
 class Lines(NamedTuple):
     """Every printed line (L,): its number in the program, its move, its tool, the run that it belongs to,
-    begin and end in s, length in mm, cruising speed in mm/s. Where the gantry takes STEP_S or longer from rest
-    to that speed, the line begins in the middle, early_s after it sets out, and ends late_s before it rests.
+    begin and end in s, length in mm, cruising speed in mm/s. Where the gantry takes STEP_S or longer from
+    rest to that speed, the line begins in the middle, early_s after it sets out, and ends late_s before it
+    rests.
 
     first and last tell whether it begins or ends its run; pause_s is the time lost at the junction after it
     (halts in place and slowing down), and corner whether that is a Corner.
@@ -114,8 +115,8 @@ def sequence(lines: Lines, *, end_s: float) -> Tasks:
     """The tasks in their order: No-Flow, then for each run Start, Steady-State, (Corner, Steady-State)...,
     Stop, and No-Flow or, to another tool, Dwell.
 
-    A task's event is where the gantry begins it, or is in the middle of its ramp: the signals are sent ahead of it
-    by their leads, which is what looking ahead is for.
+    A task's event is where the gantry begins it, or is in the middle of its ramp: the signals are sent ahead
+    of it by their leads, which is what looking ahead is for.
     """
     n = len(lines.line)
     switched = np.append(lines.tool[1:] != lines.tool[:-1], False)

@@ -324,6 +324,7 @@ def figures(judged: Sequence[tuple[Part, Sequence[Score]]]) -> dict[str, Any]:
         part.name: {
             stream.material: _by_composer([score for score in scores if score.stream == i])
             | _asked(stream, part.composed.sample_time_s)
+            | {"least_reachable_percent": part.conformance.saturation[stream.tool].least_percent}
             for i, stream in enumerate(part.composed.streams)
         }
         for part, scores in judged
