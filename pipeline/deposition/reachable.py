@@ -70,9 +70,11 @@ def ramp_that_loses_little(
 
     if loses_little(0.0):
         return 0.0
-    if not loses_little(longest_s):
-        return math.inf
-    low, high = 0.0, longest_s
+    low, high = 0.0, min(0.1, longest_s)
+    while not loses_little(high):
+        if high == longest_s:
+            return math.inf
+        low, high = high, min(2 * high, longest_s)
     while high - low > 0.01 * high:
         middle = (low + high) / 2
         low, high = (low, middle) if loses_little(middle) else (middle, high)
