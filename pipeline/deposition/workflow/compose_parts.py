@@ -13,7 +13,7 @@ from pipeline.deposition import composition, conformance, drive, evaluation, gco
 from pipeline.deposition.composition import Composed, Learned, PartSettings, Stream
 from pipeline.deposition.conformance import Conformance
 from pipeline.deposition.evaluation import Judging, Score
-from pipeline.deposition.workflow import laws
+from pipeline.deposition.workflow import laws, part_motion
 from pipeline.deposition.workflow.segment_library import finite_or_none
 from pipeline.deposition.workflow.settings import ComposeParts, Printer, TrainIlc
 from pipeline.deposition.workflow.tables import LINES, SCORES, SIGNALS, TASKS
@@ -109,7 +109,7 @@ def compose(path: Path, learned: Learned, printer: Printer, settings: ComposePar
                 f"line {first.line}: {first.why}; it was left out, "
                 "and nothing of the program that could be read prints"
             )
-        planned = laws.planned(program.moves, printer, learned)
+        planned = part_motion.planned(program.moves, printer, learned)
         part_settings = PartSettings(
             printer.nozzle_mm,
             printer.bead_area_mm2,
@@ -131,7 +131,7 @@ def compose(path: Path, learned: Learned, printer: Printer, settings: ComposePar
             refusals=program.refusals,
         )
         if not all(one.enough for one in report.saturation.values()):
-            ramp_s = laws.ramp_that_would_do(program.moves, printer, learned)
+            ramp_s = part_motion.ramp_that_would_do(program.moves, printer, learned)
             report = report._replace(ramp_that_would_do_s=dict.fromkeys(report.saturation, ramp_s))
     return Part(path.stem, program, planned, composed, report)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pipeline.deposition import gcode
-from pipeline.deposition.workflow import laws
+from pipeline.deposition.workflow import part_motion
 from pipeline.deposition.workflow.settings import Drive, Printer
 from pipeline.store import params
 from tests.deposition.trained import NOZZLE, PLANT, learned
@@ -28,11 +28,11 @@ def printed(name, plan):
 
 
 def test_ramps_lengthen_until_the_drive_follows_the_part_and_short_lines_need_longer_ones():
-    long, short = (laws.planned(moves(name), PRINTER, learned(PLANT)) for name in ("fig9", "dashes"))
+    long, short = (part_motion.planned(moves(name), PRINTER, learned(PLANT)) for name in ("fig9", "dashes"))
     ramps = [8.0 / printed(name, plan).max() for name, plan in (("fig9", long), ("dashes", short))]
     assert 0.5 < ramps[0] < 1.7 and 1.3 * ramps[0] < ramps[1] < 4.0
     for name, ramp_s in zip(("fig9", "dashes"), ramps, strict=True):
-        assert laws.ramp_that_would_do(moves(name), PRINTER, learned(PLANT)) == pytest.approx(
+        assert part_motion.ramp_that_would_do(moves(name), PRINTER, learned(PLANT)) == pytest.approx(
             ramp_s, rel=0.02
         )  # bisected to 1 %
     # travel stays as quick as the gantry goes
@@ -41,7 +41,7 @@ def test_ramps_lengthen_until_the_drive_follows_the_part_and_short_lines_need_lo
 
 @pytest.mark.parametrize("changes", [{"drive": None}, {"longest_ramp_s": None}])
 def test_without_a_drive_or_where_ramps_are_not_to_lengthen_the_gantry_is_as_quick_as_it_goes(changes):
-    plan = laws.planned(moves("dashes"), PRINTER.model_copy(update=changes), learned(PLANT))
+    plan = part_motion.planned(moves("dashes"), PRINTER.model_copy(update=changes), learned(PLANT))
     assert np.all(plan.acceleration == PRINTER.acceleration_mm_per_s2)
     assert all(
         np.array_equal(a.r, b.r)
@@ -55,13 +55,13 @@ def test_without_a_drive_or_where_ramps_are_not_to_lengthen_the_gantry_is_as_qui
 
 def test_ramps_end_at_the_longest_that_is_allowed_and_the_one_that_would_do_is_named_beyond():
     short = PRINTER.model_copy(update={"longest_ramp_s": 0.5})
-    assert 8.0 / printed("dashes", laws.planned(moves("dashes"), short, learned(PLANT))).max() == 0.5
-    assert laws.ramp_that_would_do(moves("dashes"), short, learned(PLANT)) > 1.0
+    assert 8.0 / printed("dashes", part_motion.planned(moves("dashes"), short, learned(PLANT))).max() == 0.5
+    assert part_motion.ramp_that_would_do(moves("dashes"), short, learned(PLANT)) > 1.0
     weak = PRINTER.model_copy(
         update={"drive": Drive(amplitude_mm=1.0, speed_mm_per_s=20.0, backlash_mm=0.05)}
     )
     # less than the steady command of its lines, about 2.6 mm
-    assert laws.ramp_that_would_do(moves("fig9"), weak, learned(PLANT)) == math.inf
+    assert part_motion.ramp_that_would_do(moves("fig9"), weak, learned(PLANT)) == math.inf
 
 
 def test_the_training_routines_lengthen_alike_and_rest_as_long_in_their_pause():
