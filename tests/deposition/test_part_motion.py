@@ -37,12 +37,14 @@ def test_ramps_lengthen_until_the_drive_follows_the_part_and_short_lines_need_lo
         )  # bisected to 1 %
     # travel stays as quick as the gantry goes
     assert long.acceleration.max() == PRINTER.acceleration_mm_per_s2
+    assert part_motion.slowed_to(long, moves("fig9")) == pytest.approx(8.0 / ramps[0])
 
 
 @pytest.mark.parametrize("changes", [{"drive": None}, {"longest_ramp_s": None}])
 def test_without_a_drive_or_where_ramps_are_not_to_lengthen_the_gantry_is_as_quick_as_it_goes(changes):
     plan = part_motion.planned(moves("dashes"), PRINTER.model_copy(update=changes), learned(PLANT))
     assert np.all(plan.acceleration == PRINTER.acceleration_mm_per_s2)
+    assert part_motion.slowed_to(plan, moves("dashes")) is None
     assert all(
         np.array_equal(a.r, b.r)
         for a, b in zip(

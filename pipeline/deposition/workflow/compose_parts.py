@@ -168,6 +168,12 @@ def summary_lines(part: Part) -> str:
         f"{duration:.1f} s; "
         f"the gantry sets out {composed.lead_in_s:.2f} s after the signal"
     )
+    slow = part_motion.slowed_to(part.planned, part.program.moves)
+    if slow is not None:
+        text.append(
+            f"for the drive, printed lines begin and end at rest and change speed at {slow:.3g} mm/s^2: "
+            f"run the gantry so (M204 P{slow:.3g}), as the signal was made for it"
+        )
     for stream in composed.streams:
         predicted = {
             q.composer: q.rms_percent_of_on_off for q in composed.predictions if q.tool == stream.tool
@@ -289,6 +295,7 @@ def report(part: Part) -> dict[str, Any]:
         "printed_lines": len(lines.line),
         "runs": int(composed.lines.run[-1]) + 1,
         "duration_s": len(composed.streams[0].r) * composed.sample_time_s,
+        "printing_acceleration_mm_per_s2": part_motion.slowed_to(part.planned, part.program.moves),
         "worst_line_volume_percent": finite_or_none(checks.worst_line_volume_percent),
         "judged_lines": checks.judged,
         "shorter_than_lead": int(np.sum(lines.shorter_than_lead)),

@@ -26,6 +26,14 @@ def planned(moves: Moves, printer: Printer, learned: Learned) -> motion.Motion:
     return _followed(moves, printer, learned, printer.longest_ramp_s)[0]
 
 
+def slowed_to(plan: motion.Motion, moves: Moves) -> float | None:
+    """mm/s^2 at which the printed moves change speed where that is less than the program's and the travel's
+    own; None where none is slowed down."""
+    own = np.fmin(moves.acceleration, plan.acceleration.max(initial=0.0))
+    slowed = _prints(moves) & (plan.acceleration < own)
+    return float(plan.acceleration[slowed].max()) if slowed.any() else None
+
+
 def ramp_that_would_do(moves: Moves, printer: Printer, learned: Learned) -> float:
     """The time in s, to a fifth, in which the gantry comes to the part's highest printing speed such that the
     drive follows its flow; inf where none up to LONGEST_RAMP_S does."""
