@@ -90,6 +90,8 @@ def test_the_forecast_of_saturation_is_within_3_points_of_the_plant(ramp_s):
             100 * true / on_off, abs=3.0
         )  # points: the bar
         assert forecast.enough == (forecast.share_percent == 0.0)
+        # the composer beside the nearest flow within the drive, which knows no lag: one overshoots by 5 %
+        assert forecast.enough or 0.95 < forecast.rms_percent_of_on_off / forecast.least_percent < 1.2
 
 
 def test_the_peak_is_about_1_plus_tau_over_ramp():
