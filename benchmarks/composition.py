@@ -178,7 +178,7 @@ def one(plant: Extruder, name: str, rng: np.random.Generator) -> dict[str, float
         for composer, u in commands.items():
             out[f"{structure}.{composer}"] = percent(plant, nominal, u, stream.r)
         for prediction in made.predictions:
-            out[f"{structure}.{prediction.composer}_predicted"] = prediction.rms_percent_of_on_off
+            out[f"{structure}.{prediction.composer}_predicted"] = prediction.median
         out[f"{structure}.over_ilc"] = out[f"{structure}.chosen"] - out[f"{structure}.ilc"]
         true = made._replace(streams=(stream._replace(y=flow(plant, stream.u, sample_time_s=TS)),))
         volumes = line_volumes(true, learned.library, bead_area_mm2=AREA)

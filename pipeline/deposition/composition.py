@@ -1,5 +1,5 @@
 """Part program -> plunger command without learning again: the paper's priority rule, superposition, and basis
-functions; the one that predicts best is taken."""
+functions; the one whose forecast is least at its upper end is taken."""
 
 import math
 from collections.abc import Sequence
@@ -7,9 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.deposition import basis
-from pipeline.deposition.chain import Chain, averaged, forecast, identify, simulate
+from pipeline.deposition import basis, forecast
+from pipeline.deposition.chain import Chain, averaged, identify, simulate
 from pipeline.deposition.drive import Drive, at_limit, follows, obeyed
+from pipeline.deposition.forecast import Covered, Judged, Missed
 from pipeline.deposition.gcode import Kind, Program
 from pipeline.deposition.library import (
     CORNER,
@@ -39,13 +40,16 @@ EXCERPT_S = 600.0
 class Material(NamedTuple):
     """What was learned of one material and nozzle: its chain, the gain (mm^3/s per mm) by
     which on-off control set out in the first trial, and the error of the learned trials
-    themselves in % of the steady flow (means over 0.2 s)."""
+    themselves in % of the steady flow (means over 0.2 s); what fits without a routine missed on it, and what
+    the routines covered."""
 
     material: str
     nozzle_mm: float
     chain: Chain
     on_off_gain: float
     learned_percent: float
+    missed: Missed
+    covered: Covered
 
 
 class Learned(NamedTuple):
@@ -70,20 +74,22 @@ class PartSettings(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """Predicted r.m.s. error of one composer on one tool's share of a part: the chain's
-    forecast together with the composer's own error on trials it did not see, in % of the
-    forecast of on-off control; `chosen` is the least."""
+    """Forecast r.m.s. error of one composer on one tool's share of a part, in % of that of on-off control:
+    90 % of what may come out lies between low and high. `chosen` is the composer with the least `high`."""
 
     tool: int
     material: str
     composer: str
-    rms_percent_of_on_off: float
+    low: float
+    median: float
+    high: float
     chosen: bool
 
 
 class Stream(NamedTuple):
     """One tool's share of a part, all (T,): wanted flow r (mm^3/s), the same before its steps were shaped,
-    command u (mm), predicted flow y and that of on-off control; the composer that u is from, and the share of
+    command u (mm), predicted flow y and that of on-off control; the composer that u is from, whether its
+    forecast may be believed, and the share of
     the time that u is at a limit of the drive."""
 
     tool: int
@@ -96,6 +102,7 @@ class Stream(NamedTuple):
     y: np.ndarray
     on_off: np.ndarray
     saturated: float
+    judged: Judged
 
 
 class Share(NamedTuple):
@@ -142,12 +149,15 @@ def learn(trainings: Sequence[Training], *, sample_time_s: float) -> Learned:
                 )
             )
         )
+        chain = identify(mine, sample_time_s=sample_time_s)
         materials.append(
             Material(
                 *key,
-                identify(mine, sample_time_s=sample_time_s),
+                chain,
                 gain,
                 100 * math.sqrt(np.mean(np.square(left))),
+                forecast.missed(mine, chain, sample_time_s=sample_time_s),
+                forecast.covered(mine, sample_time_s=sample_time_s),
             )
         )
     return Learned(library, tuple(materials), check(trainings, library))
@@ -219,10 +229,6 @@ def superposition(
     return u
 
 
-def _rms(a: np.ndarray) -> float:
-    return math.sqrt(np.mean(np.square(a)))
-
-
 def _command(composer: str, library: Library, share: Share, drive: Drive) -> np.ndarray:
     """u (T,) in mm of one composer for one tool's share of a part, which the drive can follow."""
     material, Ts = share.material, library.sample_time_s
@@ -261,20 +267,20 @@ def commands(learned: Learned, composed: Composed, stream: Stream, *, drive: Dri
     return {name: _command(name, learned.library, share, drive) for name in COMPOSERS}
 
 
-def _judge(library: Library, share: Share, drive: Drive) -> dict[str, float]:
-    """Predicted error of each composer in % of on-off control's, over the first
-    EXCERPT_S from where this tool begins to print."""
-    Ts, extruder = library.sample_time_s, share.material.chain.extruder
+def _judge(library: Library, share: Share, drive: Drive) -> dict[str, forecast.Interval]:
+    """Forecast error of each composer in % of on-off control's, over the first EXCERPT_S from where this tool
+    begins to print: all by the same members and residuals."""
+    Ts, material = library.sample_time_s, share.material
     excerpt = _excerpt(share, Ts)
-    on_off = _on_off(excerpt, drive, Ts)
-    yardstick = _rms(forecast(extruder, on_off, sample_time_s=Ts) - excerpt.r)
-    percent = {}
-    for name in COMPOSERS:
-        u = _command(name, library, excerpt, drive)
-        error = _rms(forecast(extruder, u, sample_time_s=Ts) - excerpt.r)
-        own = share.material.chain.held_out_percent if name == BASIS else share.material.learned_percent
-        percent[name] = 100 * math.hypot(error, own / 100 * share.r.max()) / max(yardstick, 1e-12)
-    return percent
+
+    def flows(u):
+        return forecast.flows(material.chain, material.missed, u, excerpt.r, sample_time_s=Ts)
+
+    on_off = flows(_on_off(excerpt, drive, Ts))
+    return {
+        name: forecast.error_percent(flows(_command(name, library, excerpt, drive)), on_off, excerpt.r)
+        for name in COMPOSERS
+    }
 
 
 def _excerpt(share: Share, Ts: float) -> Share:
@@ -332,9 +338,9 @@ def compose(
         r[r < 1e-9 * r.max()] = 0.0  # rounding of the sums behind the rate
         share = Share(tool, material, r, tasks, lines)
         percents = _judge(library, share, drive)
-        best = min(percents, key=percents.__getitem__)
+        best = min(percents, key=lambda name: percents[name].high)
         predictions += [
-            Prediction(tool, material.material, name, percent, name == best)
+            Prediction(tool, material.material, name, *percent, name == best)
             for name, percent in percents.items()
         ]
         streams.append(_stream(library, share, unshaped, best, drive))
@@ -382,4 +388,5 @@ def _stream(library: Library, share: Share, unshaped: np.ndarray, composer: str,
         y,
         on_off,
         float(np.mean(at_limit(u, drive, sample_time_s=Ts))),
+        forecast.judged(material.missed, material.covered, share.r, sample_time_s=Ts),
     )

@@ -7,9 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.deposition import basis, reachable
-from pipeline.deposition.chain import forecast
-from pipeline.deposition.composition import BASIS, EXCERPT_S, MARGIN_S, Composed, Learned
+from pipeline.deposition import basis, forecast, reachable
+from pipeline.deposition.chain import Identified
+from pipeline.deposition.chain import forecast as predicted_flow
+from pipeline.deposition.composition import BASIS, EXCERPT_S, MARGIN_S, Composed, Learned, Material, Stream
 from pipeline.deposition.drive import Drive, asked, at_limit, obeyed
 from pipeline.deposition.extruder import Extruder
 from pipeline.deposition.gcode import Refusal
@@ -24,7 +25,8 @@ LONGEST_RAMP_S = 10.0
 class LineVolumes(NamedTuple):
     """Every printed line, all (L,): number in the program, tool, begin and duration in s, length in mm,
     planned volume (bead area x length), predicted volume and that of on-off control in mm^3, error in % of
-    the plan, and whether its whole run is shorter than the Stop lead."""
+    the plan, whether its whole run is shorter than the Stop lead, and the 90 % interval of its error in % of
+    the plan."""
 
     line: np.ndarray
     tool: np.ndarray
@@ -36,6 +38,8 @@ class LineVolumes(NamedTuple):
     on_off_mm3: np.ndarray
     error_percent: np.ndarray
     shorter_than_lead: np.ndarray
+    low_percent: np.ndarray
+    high_percent: np.ndarray
 
 
 class Saturation(NamedTuple):
@@ -92,15 +96,12 @@ def conform(
     tasks whose signal the library only guesses (predicted error above largest_error_percent, or
     unknown), where the library's signals are used."""
     lines = line_volumes(composed, learned.library, bead_area_mm2=bead_area_mm2)
+    lines = _intervals(lines, composed, learned)
     judged = lines.duration_s >= shortest_s - 1e-9
     Ts = composed.sample_time_s
     saturations, ramps = {}, {}
     for stream in composed.streams:
-        material = next(
-            material
-            for material in learned.materials
-            if (material.material, material.nozzle_mm) == (stream.material, stream.nozzle_mm)
-        )
+        material = _material(learned, stream)
         first = int(np.argmax(stream.unshaped > 0))
         some = stream.unshaped[max(0, first - round(MARGIN_S / Ts)) : first + round(EXCERPT_S / Ts)]
         settings = {"ramp_s": ramp_s, "drive": drive, "sample_time_s": Ts}
@@ -126,6 +127,41 @@ def conform(
     return Conformance(lines, worst, int(judged.sum()), saturations, ramps, sorted(refused))
 
 
+def _intervals(lines: LineVolumes, composed: Composed, learned: Learned) -> LineVolumes:
+    """The lines with the 90 % interval of each one's volume, of what the streams' forecasts may come to."""
+    low, high = lines.low_percent.copy(), lines.high_percent.copy()
+    for stream in composed.streams:
+        material = _material(learned, stream)
+        mine, start, stop = _reaches(composed, stream.tool)
+        made = forecast.flows(
+            material.chain, material.missed, stream.u, stream.r, sample_time_s=composed.sample_time_s
+        )
+        volumes = [volume_between(y, start, stop, sample_time_s=composed.sample_time_s) for y in made]
+        off = 100 * (np.array(volumes) / lines.planned_mm3[mine] - 1)
+        low[mine], _, high[mine] = forecast.interval(off)
+    return lines._replace(low_percent=low, high_percent=high)
+
+
+def _material(learned: Learned, stream: Stream) -> Material:
+    """What was learned of the stream's material with its nozzle."""
+    return next(
+        material
+        for material in learned.materials
+        if (material.material, material.nozzle_mm) == (stream.material, stream.nozzle_mm)
+    )
+
+
+def _reaches(composed: Composed, tool: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The lines of a tool, and from when to when in s the flow is theirs: to the middles of the gaps to
+    their neighbours, at most REACH_S from their ends."""
+    mine = np.flatnonzero(composed.lines.tool == tool)
+    a, b = composed.lines.begin_s[mine], composed.lines.end_s[mine]
+    middle = (b[:-1] + a[1:]) / 2
+    start = np.maximum(a - composed.lines.early_s[mine] - REACH_S, np.append(-np.inf, middle))
+    stop = np.minimum(b + composed.lines.late_s[mine] + REACH_S, np.append(middle, np.inf))
+    return mine, start, stop
+
+
 def line_volumes(composed: Composed, library: Library, *, bead_area_mm2: float) -> LineVolumes:
     """A row for each printed line, in their order: the flow between the middles of the gaps to its neighbours
     of the same tool, at most REACH_S from its ends."""
@@ -134,13 +170,7 @@ def line_volumes(composed: Composed, library: Library, *, bead_area_mm2: float) 
     run_s = np.bincount(lines.run, weights=np.where(lines.last, lines.end_s, 0.0)) - begin
     predicted, on_off = np.zeros(len(lines.line)), np.zeros(len(lines.line))
     for stream in composed.streams:
-        mine = np.flatnonzero(lines.tool == stream.tool)
-        a, b = lines.begin_s[mine], lines.end_s[mine]
-        middle = (b[:-1] + a[1:]) / 2
-        start, stop = (
-            np.maximum(a - lines.early_s[mine] - REACH_S, np.append(-np.inf, middle)),
-            np.minimum(b + lines.late_s[mine] + REACH_S, np.append(middle, np.inf)),
-        )
+        mine, start, stop = _reaches(composed, stream.tool)
         predicted[mine] = volume_between(stream.y, start, stop, sample_time_s=Ts)
         on_off[mine] = volume_between(stream.on_off, start, stop, sample_time_s=Ts)
     planned = bead_area_mm2 * lines.length
@@ -156,6 +186,8 @@ def line_volumes(composed: Composed, library: Library, *, bead_area_mm2: float) 
         on_off,
         error,
         short,
+        np.full(len(error), np.nan),
+        np.full(len(error), np.nan),
     )
 
 
@@ -170,7 +202,7 @@ def volume_between(
 
 
 def saturation(
-    extruder: Extruder,
+    extruder: Extruder | Identified,
     unshaped: np.ndarray,
     *,
     on_off_gain: float,
@@ -187,10 +219,10 @@ def saturation(
     steady, most = (r.max() + extruder.yield_) / extruder.gain, asked(free, sample_time_s=sample_time_s)
     first = obeyed(r / on_off_gain, drive, sample_time_s=sample_time_s)
     on_off, limited, unlimited = (
-        float(np.linalg.norm(forecast(extruder, command, sample_time_s=sample_time_s) - r))
+        float(np.linalg.norm(predicted_flow(extruder, command, sample_time_s=sample_time_s) - r))
         for command in (first, u, free)
     )
-    least = float(np.linalg.norm(reachable.flow(extruder, r, drive, sample_time_s) - r))
+    least = float(np.linalg.norm(reachable.flow(_plain(extruder), r, drive, sample_time_s) - r))
     share = np.mean(at_limit(u, drive, sample_time_s=sample_time_s)[r > 0])
     on_off = max(on_off, 1e-300)
     return Saturation(
@@ -208,17 +240,26 @@ def saturation(
 
 
 def ramp_that_would_do(
-    extruder: Extruder, unshaped: np.ndarray, *, ramp_s: float, drive: Drive, sample_time_s: float
+    extruder: Extruder | Identified,
+    unshaped: np.ndarray,
+    *,
+    ramp_s: float,
+    drive: Drive,
+    sample_time_s: float,
 ) -> float:
     """The shortest time in s in which the gantry comes to the highest speed of the wanted flow (T,), its
     steps shaped by two boxes of ramp_s, such that the drive follows a line
     (`reachable.ramp_that_loses_little`); inf where none up to LONGEST_RAMP_S does."""
-    plain = Extruder(extruder.gain, extruder.time_constant_s, yield_=extruder.yield_)
     return reachable.ramp_that_loses_little(
-        plain,
+        _plain(extruder),
         drive,
         steady_flow=float(unshaped.max()),
         ramp_s=ramp_s,
         longest_s=LONGEST_RAMP_S,
         sample_time_s=sample_time_s,
     )
+
+
+def _plain(extruder: Extruder | Identified) -> Extruder:
+    """Its gain, time constant and yield: what a drive's limits stand against."""
+    return Extruder(extruder.gain, extruder.time_constant_s, yield_=extruder.yield_)

@@ -47,7 +47,8 @@ class Judging(NamedTuple):
 def evaluate(learned: Learned, composed: Composed, judging: Judging, rng: np.random.Generator) -> list[Score]:
     """Scores of all composers on all streams.
 
-    On a real machine the identified chain forecasts the flow, and full-part ILC is left out.
+    On a real machine nobody knows the true flow: a composer scores the upper end of its forecast, its flow is
+    the chain's, and full-part ILC is left out.
     """
     scores, Ts, drive = [], judging.laws.sample_time_s, judging.laws.drive
     for i, stream in enumerate(composed.streams):
@@ -58,9 +59,7 @@ def evaluate(learned: Learned, composed: Composed, judging: Judging, rng: np.ran
         )
         if plant:
             by_composer[FULL_PART_ILC] = _full_part_ilc(plant, nominal, stream, judging, rng)
-        predicted = {
-            p.composer: p.rms_percent_of_on_off for p in composed.predictions if p.tool == stream.tool
-        }
+        predicted = {p.composer: p for p in composed.predictions if p.tool == stream.tool}
         yardstick = np.nan
         for name, u in by_composer.items():
             y = (
@@ -71,10 +70,10 @@ def evaluate(learned: Learned, composed: Composed, judging: Judging, rng: np.ran
             error = float(np.linalg.norm(y - stream.r))
             yardstick = error if name == ON_OFF else yardstick
             worst = _worst_line(learned, composed, i, y, judging)
-            percent = 100 * error / max(yardstick, 1e-12)
-            scores.append(
-                Score(i, name, name == stream.composer, percent, predicted.get(name, np.nan), worst, y)
-            )
+            told = predicted.get(name)
+            percent = told.high if told and not plant else 100 * error / max(yardstick, 1e-12)
+            middle = told.median if told else np.nan
+            scores.append(Score(i, name, name == stream.composer, percent, middle, worst, y))
     return scores
 
 

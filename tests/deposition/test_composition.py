@@ -88,7 +88,7 @@ def test_the_prediction_of_each_composer_is_near_its_true_error():
             for prediction in made.predictions:
                 if prediction.material == stream.material:
                     error = percent_of_on_off(PLANT, true[prediction.composer], stream.r)
-                    assert prediction.rms_percent_of_on_off == pytest.approx(
+                    assert prediction.median == pytest.approx(
                         error, rel=0.15, abs=1.5
                     )  # predicted from trials alone
             chosen = [p for p in made.predictions if p.chosen and p.material == stream.material]

@@ -372,12 +372,15 @@ def _signed(value: float) -> str:
 
 
 class Forecast(NamedTuple):
-    """What one stream of a part asks of the drive, in words."""
+    """What one stream of a part comes to, with 90 % certainty, and what it asks of the drive, in words."""
 
     part: str
     material: str
     mark: str
     composer: str
+    interval: str
+    why: str
+    measured: str
     time: str
     lines: str
     short: str
@@ -423,6 +426,7 @@ def _forecast(part: str, material: str, report: dict[str, Any]) -> Forecast:
         material,
         MARK.get(composer, "baseline"),
         NAMES.get(composer, composer),
+        *_told(report.get("forecast", {}).get(material)),
         time=number(float(report.get("duration_s", 0.0)), 1),
         lines=f"{report.get('printed_lines', 0):,} in {report.get('runs', 0):,}",
         short=number(float(report.get("shorter_than_lead", 0)), 0),
@@ -439,6 +443,17 @@ def _forecast(part: str, material: str, report: dict[str, Any]) -> Forecast:
 def _beside(error: float | None, least: float | None) -> str:
     """A flow error, and in brackets the least that any command within the drive leaves."""
     return "" if error is None else percent(error, 2) + ("" if least is None else f" ({percent(least, 2)})")
+
+
+def _told(forecast: dict[str, Any] | None) -> tuple[str, str, str]:
+    """The forecast interval, or why it is not judged and what would judge it; and what was measured."""
+    if forecast is None:
+        return "none", "", ""
+    measured = forecast.get("measured_percent")
+    beside = "" if measured is None else f"measured {percent(float(measured), 2)}"
+    if not forecast["judged"]:
+        return "not judged", f"{forecast['reason']}; to judge it, {forecast['trial']}", beside
+    return f"{percent(forecast['low'], 2)} to {percent(forecast['high'], 2)}", "", beside
 
 
 class Refusal(NamedTuple):

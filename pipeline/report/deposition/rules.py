@@ -66,12 +66,16 @@ HEADS = ("Data\u2011driven", "The paper", "model_based")
 
 
 class Score(NamedTuple):
-    """r.m.s. flow error in % of on-off control's, true where the machine is simulated; the same as forecast;
-    largest volume error of a line in %."""
+    """r.m.s. flow error in % of on-off control's, true where the machine is simulated, else the upper end of
+    its forecast; the middle of the forecast; largest volume error of a line in %; the forecast's 90 %
+    interval, and whether it may be believed."""
 
     error: float
     predicted: float | None
     worst_line: float | None
+    low: float | None = None
+    high: float | None = None
+    judged: bool = True
 
 
 class Structure(NamedTuple):
@@ -83,6 +87,14 @@ class Structure(NamedTuple):
     scores: Mapping[str, Score]
     chosen: str
     asked: ReportRules
+    simulated: bool = True
+    why: str = ""
+    trial: str = ""
+
+    def open(self) -> bool:
+        """Whether nothing tells how the chosen composer does: its forecast is not to be believed, and the
+        true flow is not known."""
+        return not self.simulated and not self.scores[self.chosen].judged
 
     def best(self) -> str:
         """The composer, on-off control too, with the least error; what
@@ -96,7 +108,7 @@ class Structure(NamedTuple):
     def state(self) -> str:
         """Of the composer that was chosen, by flow and volume."""
         score = self.scores.get(self.chosen)
-        if score is None:
+        if score is None or self.open():
             return OPEN
         return (
             FAILED
@@ -112,22 +124,39 @@ def structures(sources: Sources) -> list[Structure] | Missing:
     if isinstance(table, Missing):
         return table
     groups = pd.DataFrame(table).groupby(["part", "material"], sort=False)
-    parts = [_structure(rows, sources.declared.rules) for _, rows in groups]
+    conformance = sources.tables["conformance"]
+    told = {} if isinstance(conformance, Missing) else conformance
+    parts = [_structure(rows, sources.declared.rules, told) for _, rows in groups]
     return parts or Missing("not measured", "no part was composed", "Copy a part program to datasets/parts")
 
 
-def _structure(rows: pd.DataFrame, rules: ReportRules) -> Structure:
-    """One material of one part from its rows of the scores; a composer without an error is left out."""
+def _structure(rows: pd.DataFrame, rules: ReportRules, conformance: Mapping[str, Any]) -> Structure:
+    """One material of one part from its rows of the scores and its forecast in the conformance report; a
+    composer without an error is left out."""
     judged = rows.dropna(subset="rms_percent_of_on_off")
+    part, material = rows.part.iloc[0], rows.material.iloc[0]
+    forecast = conformance.get(part, {}).get("forecast", {}).get(material, {})
     scores = {
         row.composer: Score(
-            row.rms_percent_of_on_off, _finite(row.predicted_percent), _finite(row.worst_line_volume_percent)
+            row.rms_percent_of_on_off,
+            _finite(row.predicted_percent),
+            _finite(row.worst_line_volume_percent),
+            *(forecast.get("composers", {}).get(row.composer, {}).get(end) for end in ("low", "high")),
+            judged=forecast.get("judged", True),
         )
         for row in judged.itertuples()
     }
     chosen = judged.composer[judged.chosen.astype(bool)]
-    part, material = rows.part.iloc[0], rows.material.iloc[0]
-    return Structure(part, material, scores, "" if chosen.empty else chosen.iloc[-1], rules)
+    return Structure(
+        part,
+        material,
+        scores,
+        "" if chosen.empty else chosen.iloc[-1],
+        rules,
+        simulated="ilc" in scores,
+        why=forecast.get("reason", ""),
+        trial=forecast.get("trial", ""),
+    )
 
 
 def _finite(figure: float) -> float | None:
@@ -210,6 +239,11 @@ def _flow(parts: Sequence[Structure], limit: float) -> Pair:
         remedy="Run more trials, or train the speeds and pauses of that part (printer.routines).",
     )
     texts = [OPEN if pair is None else percent(pair[0], 2) for pair in pairs]
+    unknown = next((part for part in parts if part.chosen in part.scores and part.open()), None)
+    if unknown:
+        reason = f"What {where(unknown)} comes to is not judged: {unknown.why}."
+        rule = rule._replace(reason=reason, remedy=f"To judge it, {unknown.trial}.")
+        return _pair(rule, [Missing(OPEN, "")] * 2, ["not judged"] * 2)
     return _pair(rule, [_measured(pair) for pair in pairs], texts)
 
 
