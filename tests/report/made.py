@@ -616,6 +616,7 @@ def _composed(time, wanted, scores):
         "peak_over_steady": 20.0,
         "share_percent": 0.0,
         "rms_percent_of_on_off": 0.1,
+        "least_percent": 0.0,
         "enough": True,
     }
     report = {

@@ -1,13 +1,15 @@
 """Sections `printer` and `camera` of the parameters: the deposition loop's
 machine, its materials, and what looks at the bead."""
 
+import math
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import pydantic
 from pydantic import Field
 
-from pipeline.deposition import drive
-from pipeline.deposition.extruder import Routine, routine
+from pipeline.deposition import drive, reachable
+from pipeline.deposition.extruder import Extruder, Routine, routine
 from pipeline.store.params import Section
 
 
@@ -49,6 +51,7 @@ class Printer(Section):
     bead_area_mm2: float = Field(gt=0, le=100)
     speed_mm_per_s: float = Field(gt=0, le=1000)
     ramp_s: float = Field(gt=0, le=60)
+    longest_ramp_s: float | None = Field(default=None, gt=0, le=60)
     drive: Drive | None
     acceleration_mm_per_s2: float = Field(gt=0, le=1e6)
     junction_deviation_mm: float = Field(ge=0, le=10)
@@ -83,15 +86,41 @@ class Printer(Section):
         """Wanted flow of a line at full speed, mm^3/s."""
         return self.bead_area_mm2 * self.speed_mm_per_s
 
+    @property
+    def nominals(self) -> list[Extruder]:
+        """The materials' extruders as known beforehand."""
+        return [Extruder(one.gain_mm3_per_s_per_mm, one.time_constant_s) for one in self.materials]
+
+    def slow_s(self, extruders: Sequence[Extruder], speed_mm_per_s: float, longest_s: float) -> float:
+        """Seconds in which the gantry may reach a printing speed such that the drive follows the flow of each
+        of the extruders (`reachable.ramp_that_loses_little`), in whole hundredths; at most longest_s."""
+        ramps = [
+            reachable.ramp_that_loses_little(
+                extruder, self.limits, steady_flow=self.bead_area_mm2 * speed_mm_per_s, ramp_s=self.ramp_s,
+                longest_s=longest_s, sample_time_s=self.sample_time_s,
+            )
+            for extruder in extruders
+        ]  # fmt: skip
+        longest = min(max(ramps), longest_s)
+        return min(math.ceil(100 * longest) / 100, longest_s)
+
     def trained(self) -> list[Routine]:
-        """The training routines: the reference, on which laws are compared, and those of the library."""
+        """The training routines: the reference, on which laws are compared, and those of the library. Where
+        the drive asks for longer ramps of the gantry, it rests as long in the pause, between them."""
+        trainings = [self.reference, *self.routines]
+        fastest = max(t.speed_mm_per_s for t in trainings)
+        # the pause is longer by this at all speeds, so that these are compared at one pause
+        longer_s = (
+            0.0 if self.longest_ramp_s is None else self.slow_s(self.nominals, fastest, self.longest_ramp_s)
+        )
+        slow_s = [round(longer_s * t.speed_mm_per_s / fastest, 9) for t in trainings]
         return [
             routine(
-                off_s=t.off_s, on_s=t.on_s, pause_s=t.pause_s, tail_s=t.tail_s, speed=t.speed_mm_per_s,
-                bead_area_mm2=self.bead_area_mm2,
-                ramp_s=self.ramp_s, sample_time_s=self.sample_time_s,
+                off_s=t.off_s, on_s=t.on_s, pause_s=round(t.pause_s + longer_s, 9), tail_s=t.tail_s,
+                speed=t.speed_mm_per_s, bead_area_mm2=self.bead_area_mm2,
+                ramp_s=self.ramp_s, gantry_ramp_s=slow, sample_time_s=self.sample_time_s,
             )
-            for t in [self.reference, *self.routines]
+            for t, slow in zip(trainings, slow_s, strict=True)
         ]  # fmt: skip
 
 
