@@ -332,7 +332,10 @@ def test_what_was_learned_survives_being_stored(finished):
     again = restored(
         {name: np.array(values, object) for name, values in table.items()}, json.loads(json.dumps(rest))
     )
-    assert again.materials == learned.materials and again.library.marks == learned.library.marks
+    assert again.library.marks == learned.library.marks
+    for a, b in zip(again.materials, learned.materials, strict=True):
+        np.testing.assert_array_equal(a.missed.by_place, b.missed.by_place)
+        assert a._replace(missed=None) == b._replace(missed=None) and a.missed[1:] == b.missed[1:]
     for a, b in zip(again.library.columns, learned.library.columns, strict=True):
         np.testing.assert_array_equal(a.signal, b.signal)
         assert a[:-1] == b[:-1]
