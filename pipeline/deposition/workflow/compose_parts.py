@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from pipeline.deposition import composition, conformance, drive, evaluation, gcode, motion
+from pipeline.deposition import composition, conformance, drive, evaluation, extrusion, gcode, motion
 from pipeline.deposition.composition import Composed, Learned, PartSettings, Stream
 from pipeline.deposition.conformance import Conformance
 from pipeline.deposition.evaluation import Judging, Score
-from pipeline.deposition.workflow import laws
+from pipeline.deposition.workflow import laws, part_programs
 from pipeline.deposition.workflow.segment_library import finite_or_none
 from pipeline.deposition.workflow.settings import ComposeParts, Printer, TrainIlc
 from pipeline.deposition.workflow.tables import LINES, SCORES, SIGNALS, TASKS
@@ -28,6 +28,8 @@ class Part(NamedTuple):
     planned: motion.Motion
     composed: Composed
     conformance: Conformance
+    printer: Printer
+    extruded: extrusion.Extruded
 
 
 def compose_all(
@@ -88,7 +90,13 @@ def judged(
 # ---- one part
 
 
-def compose(path: Path, learned: Learned, printer: Printer, settings: ComposeParts) -> Part:
+def compose(
+    path: Path,
+    learned: Learned,
+    printer: Printer,
+    settings: ComposeParts,
+    asked: part_programs.Asked = part_programs.AS_IT_IS,
+) -> Part:
     """A part program, composed. Raises ValueError naming the file, and the line where there is one."""
     learned_s = learned.library.sample_time_s
     if learned_s != printer.sample_time_s:
@@ -97,18 +105,9 @@ def compose(path: Path, learned: Learned, printer: Printer, settings: ComposePar
             f"at {learned_s:g} s; "
             "learn it again with ./run dvc repro"
         )
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise ValueError(f"{path} cannot be read ({error.strerror}); name a part program (G-code)") from None
+    program = part_programs.read(path, asked)
+    extruded = part_programs.extruded(program, printer, asked)
     with artifacts.about(path):
-        program = gcode.parse(data)
-        if program.refusals and not np.any(program.moves.kind == gcode.Kind.EXTRUDE):
-            first = program.refusals[0]
-            raise ValueError(
-                f"line {first.line}: {first.why}; it was left out, "
-                "and nothing of the program that could be read prints"
-            )
         planned = motion.plan(
             program.moves, acceleration=printer.acceleration_mm_per_s2,
             junction_deviation_mm=printer.junction_deviation_mm,
@@ -124,7 +123,10 @@ def compose(path: Path, learned: Learned, printer: Printer, settings: ComposePar
             printer.limits,
         )
         materials = {material.tool: material.name for material in printer.materials}
-        composed = composition.compose(learned, program, planned, part_settings, materials=materials)
+        part_programs.check_duration(program.moves, planned)
+        # a printed line is as long as the declared bead would be of the volume that E asks for
+        beads = extrusion.as_lengths(program, extruded, bead_area_mm2=printer.bead_area_mm2)
+        composed = composition.compose(learned, beads, planned, part_settings, materials=materials)
         report = conformance.conform(
             composed,
             learned,
@@ -135,29 +137,11 @@ def compose(path: Path, learned: Learned, printer: Printer, settings: ComposePar
             largest_error_percent=settings.largest_error_percent,
             refusals=program.refusals,
         )
-    return Part(path.stem, program, planned, composed, report)
-
-
-def write(part: Part, folder: Path) -> list[Path]:
-    """The commands of all tools and the tasks as CSV, and the conformance
-    report as JSON, beside one another in `folder`."""
-    composed = part.composed
-    signal = {"time_s": np.arange(len(composed.streams[0].u)) * composed.sample_time_s}
-    signal |= {f"T{stream.tool}_{stream.material}_mm": stream.u for stream in composed.streams}
-    files = [folder / f"{part.name}.{kind}" for kind in ("signal.csv", "tasks.csv", "conformance.json")]
-    artifacts.write_csv(files[0], signal)
-    artifacts.write_csv(files[1], task_rows(part))
-    lines = line_rows(part)
-    rows = [
-        {
-            name: finite_or_none(values[i].item() if hasattr(values[i], "item") else values[i])
-            for name, values in lines.items()
-            if name != "part"
-        }
-        for i in range(len(lines["line"]))
-    ]
-    artifacts.write_json(files[2], report(part) | {"lines": rows})
-    return files
+        report = part_programs.in_percent(
+            report, program.moves, composed, shortest_s=settings.shortest_s,
+            least_mm3=printer.bead_area_mm2 * printer.nozzle_mm,
+        )  # fmt: skip
+    return Part(path.stem, program, planned, composed, report, printer, extruded)
 
 
 def summary_lines(part: Part) -> str:
@@ -185,7 +169,7 @@ def summary_lines(part: Part) -> str:
                 f"{sat.peak_over_steady:.1f} x steady); {do}"
             )
     if checks.judged:
-        worst = int(np.argmax(np.where(lines.duration_s >= 0, np.abs(lines.error_percent), 0)))
+        worst = int(np.argmax(np.nan_to_num(np.abs(lines.error_percent))))
         text.append(
             f"volume of {checks.judged} lines within {checks.worst_line_volume_percent:.1f} % of the plan; "
             f"of all lines the worst is line {lines.line[worst]}: {lines.error_percent[worst]:+.1f} % of "
@@ -196,7 +180,7 @@ def summary_lines(part: Part) -> str:
             f"{int(np.sum(lines.shorter_than_lead))} lines belong to runs shorter than the lead of Stop: "
             "the priority rule would not print them"
         )
-    text += [f"line {one.line}: {one.why}" for one in checks.refused]
+    text += part_programs.summary(part.program, part.extruded, part.printer) + part_programs.refused(checks)
     return "\n".join(text)
 
 
@@ -313,7 +297,8 @@ def report(part: Part) -> dict[str, Any]:
             name: finite_or_none(value) for name, value in _by_material(part, checks.ramp_that_would_do_s)
         },
         "refused": refused,
-        "unknown_words": len(part.program.other_line),
+        "unknown_words": sum(one.count for one in part.program.told if not one.what),
+        "program": part_programs.told(part.program, part.extruded, part.printer),
     }
 
 

@@ -54,6 +54,7 @@ class Printer(Section):
     junction_deviation_mm: float = Field(ge=0, le=10)
     gantry_speed_limit_mm_per_s: float = Field(gt=0, le=10_000)
     tool_change_s: float = Field(ge=0, le=3600)
+    filament_mm: float | None = Field(gt=0, le=200)
     materials: list[Material] = Field(min_length=1, max_length=20)
     reference: Training
     routines: list[Training] = Field(max_length=20)

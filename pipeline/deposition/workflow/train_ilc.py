@@ -102,8 +102,8 @@ def _model(model: ilc.TrialModel | None) -> dict[str, float] | None:
         return None
     e = model.extruder
     return {
-        "gain": e.gain, "time_constant_s": e.time_constant_s, "delay_s": e.delay_s, "yield": e.yield_,
-        "noise": model.noise,
+        "gain": e.gain, "time_constant_s": e.time_constant_s, "delay_s": e.delay_s,
+        "lag_hz": e.lag_hz, "yield": e.yield_, "noise": model.noise,
         "fit_percent": model.fit_percent,
     }  # fmt: skip
 
@@ -360,7 +360,7 @@ def _resume(
     trials = [one.trial for one in measured]
     if not trials:
         first = obeyed(u0, settings.drive, sample_time_s=settings.sample_time_s)
-        return None, ilc.Step(first, 0, False, False)
+        return None, ilc.Step(first, 0, False, [])
     law = training.model_inverse(routine, settings)
     step = ilc.next_step(trials, routine.r, law, rise=settings.rise)
     gain_ratio = law.model.extruder.gain / nominal.gain if law.model else 1.0
@@ -413,7 +413,7 @@ def recordings(folder: Path, following: Path, work: Work) -> Part:
                 "next": name,
                 "best_trial": step.best,
                 "rolled_back": step.rolled_back,
-                "stopped": step.stopped,
+                "restarts": step.restarts,
             }
             if sequence:
                 part.sequences[key], part.measured[key] = [sequence], list(measured)

@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.deposition import forecast, verification
 from pipeline.deposition.composition import Composed, Learned, Material, Stream
-from pipeline.deposition.workflow import compose_parts
+from pipeline.deposition.workflow import compose_parts, exports
 from pipeline.deposition.workflow.compose_parts import Part
 from pipeline.deposition.workflow.settings import ComposeParts, Printer
 from pipeline.store import artifacts
@@ -44,7 +44,7 @@ def write(part: Part, learned: Learned, printer: Printer, settings: ComposeParts
         path = folder / f"{part.name}_verify_{stream.material}.gcode"
         path.write_text(made.text, encoding="utf-8")
         composed = compose_parts.compose(path, learned, printer, settings)
-        files = compose_parts.write(composed, folder)
+        files = exports.write(composed, folder)
         events = ", ".join(window.event for window in hardest)
         told.append(
             f"verification of {part.name}, {stream.material}: {events} in {made.duration_s:.0f} s: {path}, "
