@@ -99,7 +99,7 @@ def program(name: str, chosen: Sequence[Window], lines: Lines, tool: int, *, bea
     """The part program of the windows: each line as long and as fast as in the part (of one longer than two
     plateaus the ends), each pause and gap as long, along x; the nozzle goes on through a gap."""
     text = [f"; verifies {name}, T{tool}: {', '.join(window.event for window in chosen)}"]
-    text += ["G21", "G90", "M83", f"T{tool}", "G0 X0 Y0 Z0.3 F600"]
+    text += ["; filament_diameter = 1.75", "G21", "G90", "M83", f"T{tool}", "G0 X0 Y0 Z0.3 F600"]
     x = y = duration = 0.0
     for window in chosen:
         for place, k in enumerate(window.lines):

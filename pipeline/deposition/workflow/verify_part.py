@@ -42,7 +42,7 @@ def write(part: Part, learned: Learned, printer: Printer, settings: ComposeParts
             part.name, hardest, part.composed.lines, stream.tool, bead_area_mm2=printer.bead_area_mm2
         )
         path = folder / f"{part.name}_verify_{stream.material}.gcode"
-        path.write_text(made.text, encoding="utf-8")
+        artifacts.write_text(path, made.text)
         composed = compose_parts.compose(path, learned, printer, settings)
         files = exports.write(composed, folder)
         events = ", ".join(window.event for window in hardest)
