@@ -19,7 +19,7 @@ OUTER_MM, BORE_MM = 0.6, 0.4
 
 class Eye(NamedTuple):
     """angle_deg: in which direction of the picture the line trails from the tip (0 right, 90 down); tip in px
-    of the picture; edge_bias_px: by how much a bead looks wider than it is, `widening` more for each mm that
+    of the picture; jpeg: quality of the frames, 0 for none; edge_bias_px: by how much a bead looks wider than it is, `widening` more for each mm that
     it is wider than 0.9; a frame stamped t shows the machine at t - latency_s."""
 
     angle_deg: float = 0.0
@@ -36,7 +36,7 @@ class Eye(NamedTuple):
     blur_px: float = 1.3
     noise: float = 3.0
     specular: float = 60.0
-    jpeg: int = 95
+    jpeg: int = 0
 
 
 def tip_of(eye: Eye) -> tuple[float, float]:
@@ -44,10 +44,7 @@ def tip_of(eye: Eye) -> tuple[float, float]:
     if eye.tip is not None:
         return eye.tip
     a = math.radians(eye.angle_deg)
-    reach = 0.4 * min(
-        eye.width / max(abs(math.cos(a)), 1e-9),
-        eye.height / max(abs(math.sin(a)), 1e-9),
-    )
+    reach = 0.4 * min(eye.width / max(abs(math.cos(a)), 1e-9), eye.height / max(abs(math.sin(a)), 1e-9))
     return (eye.width / 2 - reach * math.cos(a), eye.height / 2 - reach * math.sin(a))
 
 
@@ -91,6 +88,8 @@ class Stage:
         picture = cv2.add(picture, self.light, dtype=cv2.CV_16S)
         picture = cv2.add(picture, self.bank[at : at + picture.size].reshape(picture.shape), dtype=cv2.CV_8U)
         cv2.circle(picture, (round(tx), round(ty)), round(OUTER_MM / eye.mm_per_px), 35, -1, cv2.LINE_AA)
+        if not eye.jpeg:
+            return picture
         ok, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, eye.jpeg])
         assert ok
         return cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)

@@ -121,9 +121,7 @@ def gray(frame: np.ndarray) -> np.ndarray:
     return frame.reshape(frame.shape[:2])
 
 
-def measure(
-    frame: np.ndarray, *, columns: tuple[int, int], longest_blur_px: float, sign: int = 0
-) -> Bead:
+def measure(frame: np.ndarray, *, columns: tuple[int, int], longest_blur_px: float, sign: int = 0) -> Bead:
     """The bead's width in every block of 8 columns of frame[:, first:last] (`columns`: the part that the
     nozzle does not hide), the line along the image's x.
 

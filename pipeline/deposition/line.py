@@ -21,7 +21,7 @@ REACH_PX, SIDE_PX = 64, 3
 # parts of the line's length in which its contrast must hold, and how many must be in the picture
 PARTS, FEWEST_PARTS = 10, 4
 # widths of the bands that are tried, in px of the small picture
-BANDS = (3, 4, 6, 9, 13, 19, 28, 40, 60)
+BANDS = (3, 4, 5, *range(6, 78, 3))
 # a band is a line where its contrast is so many levels and so many deviations of its parts
 LEAST_CONTRAST, LEAST_SCORE = 6.0, 4.0
 # what is no part of the picture
@@ -126,51 +126,64 @@ def _band(small: np.ndarray, centre, turn: float, *, hidden: float, from_tip: bo
     count = inside[:, : n * length].reshape(2 * half, n, length).sum(axis=2)
     sums, counts = (np.cumsum(np.pad(part, ((1, 0), (0, 0))), axis=0) for part in (value, count))
     best = _Band(0.0, turn, 0.0, 0.0, 0.0, 0.0, 0.0)
+    edges = {inner: _steps(sums, counts, inner, length) for inner in (2, SIDE_PX)}
     for width in BANDS:
-        one = _best_of_width(sums, counts, width, length, half if from_tip else -1, sign)
+        inner = 2 if width < 2 * SIDE_PX else SIDE_PX
+        one = _best_of_width(*edges[inner], width, half if from_tip else -1, sign)
         if one is not None and one[0] > best.energy:
             energy, row, along, contrast, score = one
             offset = row + width / 2 - half - 0.5
-            best = _Band(energy, turn, offset, first + along, width, contrast, score)
+            best = _Band(energy, turn, offset, first + length * along, width, contrast, score)
     return best
 
 
-def _best_of_width(sums, counts, width: int, length: int, through: int, sign: int):
-    """(energy, first row, middle along the columns, contrast, score) of the best band of one width, through
-    the row `through` where that is not negative."""
-    side, gap = SIDE_PX, 1
-    rows = len(sums) - 1 - width - 2 * (side + gap)
-    if rows < 1:
+def _steps(sums: np.ndarray, counts: np.ndarray, inner: int, length: int) -> tuple[np.ndarray, np.ndarray]:
+    """(rows + 1, parts) each: by how much the rows after a boundary are above those before it, and those
+    before it above those after it; `inner` rows on the bead's side, SIDE_PX beyond a row's gap on the
+    ground's. NaN where not all of them are in the picture."""
+    size = len(sums) - 1
+
+    def mean(shift: int, rows: int) -> np.ndarray:
+        out = np.full(sums.shape, np.nan)
+        first = np.arange(max(-shift, 0), min(size - rows - shift, size) + 1)
+        low, high = first + shift, first + shift + rows
+        some = counts[high] - counts[low]
+        whole = some >= 0.9 * rows * length
+        out[first] = np.where(whole, (sums[high] - sums[low]) / np.maximum(some, 1), np.nan)
+        return out
+
+    before = mean(0, inner) - mean(-1 - SIDE_PX, SIDE_PX)
+    after = mean(-inner, inner) - mean(1, SIDE_PX)
+    return before, after
+
+
+def _best_of_width(before, after, width: int, through: int, sign: int):
+    """(energy, first row, middle in parts of the length, contrast, score) of the best band of one width,
+    through the row `through` where that is not negative."""
+    if width >= len(before):
         return None
-    start = side + gap + np.arange(rows)
-
-    def mean(a, b):
-        some = counts[b] - counts[a]
-        whole = some >= 0.9 * (b - a)[:, None] * length
-        return np.where(whole, (sums[b] - sums[a]) / np.maximum(some, 1), np.nan)
-
-    inner = min(side, (width + 1) // 2)
-    over, under = mean(start - gap - side, start - gap), mean(start + width + gap, start + width + gap + side)
-    up, down = mean(start, start + inner) - over, mean(start + width - inner, start + width) - under
-    contrast = np.where(up * down > 0, np.sign(up) * np.minimum(np.abs(up), np.abs(down)), 0 * up * down)
-    seen = np.isfinite(contrast)
-    parts = seen.sum(axis=1)
+    up, down = before[:-width], after[width:]
+    both = np.minimum(np.abs(up), np.abs(down))
+    contrast = np.where(np.isnan(both), np.nan, np.where(up * down > 0, np.copysign(both, up), 0.0))
+    seen = ~np.isnan(contrast)
+    parts, filled = seen.sum(axis=1), np.where(seen, contrast, 0.0)
     some = np.maximum(parts, 1)
-    average = np.nansum(contrast, axis=1) / some
-    spread = np.sqrt(np.nansum(np.square(contrast - average[:, None]), axis=1) / some)
+    average = filled.sum(axis=1) / some
+    spread = np.sqrt(np.maximum(np.square(filled).sum(axis=1) / some - average**2, 0.0))
     lasting = np.maximum(np.abs(average) - spread, 0.0)
     energy = np.where(parts >= FEWEST_PARTS, lasting**2 * math.sqrt(width), 0.0)
     if sign:
         energy = np.where(sign * average > 0, energy, 0.0)
     if through >= 0:
-        energy = np.where(np.abs(start + width / 2 - through) <= np.clip(width / 4, 1.5, 4.0), energy, 0.0)
+        beside = np.abs(np.arange(len(energy)) + width / 2 - through)
+        energy = np.where(beside <= np.clip(width / 4, 1.5, 4.0), energy, 0.0)
     k = int(np.argmax(energy))
     if energy[k] <= 0:
         return None
-    weight = np.nan_to_num(np.abs(contrast[k])) * seen[k]
-    along = length * (weight @ (np.arange(len(weight)) + 0.5)) / max(weight.sum(), 1e-9)
+    weight = np.abs(filled[k])
+    along = float(weight @ (np.arange(len(weight)) + 0.5) / max(weight.sum(), 1e-9))
     score = abs(average[k]) * math.sqrt(parts[k]) / max(spread[k], 0.5)
-    return float(energy[k]), float(start[k]), float(along), float(average[k]), float(score)
+    return float(energy[k]), float(k), along, float(average[k]), float(score)
 
 
 @functools.lru_cache(maxsize=64)
@@ -196,9 +209,53 @@ def turned(frame: np.ndarray, pose: Pose) -> np.ndarray:
     )
 
 
-def pose_on(line: Line, *, reach: float = 3.0) -> Pose:
-    """The pose in which only the line and its surroundings are left: `reach` widths of it along the line and
-    across. A line narrower than the windows of an edge is enlarged."""
+def pose_on(
+    line: Line, shape: tuple[int, int], *, ahead_px: float = math.inf, behind_px: float = math.inf
+) -> Pose:
+    """The pose in which only the line and its surroundings are left: half its width again on both sides, and
+    as much of its length, up to `longest_px`, as lies with them inside of the frame (rows, columns). A line
+    narrower than the windows of an edge is enlarged."""
     scale = max(1.0, round(WIDE_PX / line.width_px))
-    size = max(math.ceil(reach * line.width_px * scale), LEAST_PX)
-    return Pose(line.angle_deg, line.x, line.y, size / 2 - 0.5, size / 2 - 0.5, size, size, scale)
+    half = math.ceil(max(line.width_px * scale, LEAST_PX / 2) * 0.9) + 8
+    pose = Pose(line.angle_deg, line.x, line.y, 0.0, half - 0.5, 2 * half, LEAST_PX, scale)
+    most = [math.floor(min(math.hypot(*shape), limit) * scale) for limit in (ahead_px, behind_px)]
+    ahead = span(pose, shape, (0, most[0]), half)[1]
+    back = pose._replace(angle_deg=line.angle_deg + 180)
+    behind = span(back, shape, (0, most[1]), half)[1]
+    return pose._replace(column=float(behind), columns=max(ahead + behind, LEAST_PX))
+
+
+def span(pose: Pose, shape: tuple[int, int], columns: tuple[int, int], half: float) -> tuple[int, int]:
+    """The first and one past the last of the first run of `columns`, counted from the pose's point, that lie
+    inside of the frame (rows, columns) over `half` rows on both sides; twice the same where none does."""
+    M = matrix(pose._replace(column=0.0, row=0.0))
+    steps = np.arange(*columns)
+    ones = np.ones(len(steps))
+    corners = [np.column_stack([steps, r * ones, ones]) @ M.T for r in (-half, half)]
+    h, w = shape
+    inside = np.all([np.all((at > -1) & (at < (w, h)), axis=1) for at in corners], axis=0)
+    first = int(np.argmax(np.append(inside, True)))
+    return columns[0] + first, columns[0] + first + int(np.argmin(np.append(inside[first:], False)))
+
+
+def foot(line: Line, x: float, y: float) -> tuple[float, float]:
+    """The point of the line that is nearest to (x, y)."""
+    a = math.radians(line.angle_deg)
+    along = (x - line.x) * math.cos(a) + (y - line.y) * math.sin(a)
+    return line.x + along * math.cos(a), line.y + along * math.sin(a)
+
+
+def with_room(pose: Pose, shape: tuple[int, int], columns: tuple[int, int]) -> Pose:
+    """The pose with its line in the middle of as many rows as lie inside of the frame (rows, columns) over
+    `columns`, at least LEAST_PX and at most the frame's diagonal."""
+    h, w = shape
+    M = matrix(pose._replace(row=0.0))
+    first, last = columns[0], columns[1] - 1
+
+    def inside(half: float) -> bool:
+        corners = np.array([[c, r, 1.0] for c in (first, last) for r in (-half, half)]) @ M.T
+        return bool(np.all((corners > -1) & (corners < (w, h))))
+
+    most = math.floor(math.hypot(h, w) / 2)
+    half = next((r for r in range(most, LEAST_PX // 2 - 1, -1) if inside(r)), LEAST_PX // 2)
+    return pose._replace(row=half - 0.5, rows=2 * half)
