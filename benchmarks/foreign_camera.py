@@ -1,5 +1,5 @@
-"""A camera beside the nozzle that shares no code with pipeline/deposition/rendering.py: a printed stage, drawn
-once, of which each frame is one affine view, turned, mirrored and late as the camera is.
+"""A camera beside the nozzle that shares no code with pipeline/deposition/rendering.py: a printed stage,
+drawn once, of which each frame is one affine view, turned, mirrored and late as the camera is.
 
 Beads are dark or light, with a specular line and a shadow at one edge that makes them look wider; the ground
 is plain, striped, grained, or lit from one side.
@@ -19,8 +19,9 @@ OUTER_MM, BORE_MM = 0.6, 0.4
 
 class Eye(NamedTuple):
     """angle_deg: in which direction of the picture the line trails from the tip (0 right, 90 down); tip in px
-    of the picture; jpeg: quality of the frames, 0 for none; edge_bias_px: by how much a bead looks wider than it is, `widening` more for each mm that
-    it is wider than 0.9; a frame stamped t shows the machine at t - latency_s."""
+    of the picture; jpeg: quality of the frames, 0 for none; edge_bias_px: by how much a bead looks wider than
+    it is, `widening` more for each mm that it is wider than 0.9; a frame stamped t shows the machine at
+    t - latency_s."""
 
     angle_deg: float = 0.0
     mirrored: bool = False

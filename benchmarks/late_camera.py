@@ -1,8 +1,8 @@
-"""A machine learns its reference routine through a camera that nobody drew for it: turned, late, before dark or
-light beads on four grounds, whose edges look wider than they are; calibrated on pictures of five lines.
+"""A machine learns its reference routine through a camera that nobody drew for it: turned, late, before dark
+or light beads on four grounds, whose edges look wider than they are; calibrated on pictures of five lines.
 
-`./run python -m benchmarks.late_camera` (`--only 0,3` for some cases, `--trials 4` for a look) prints the true
-error, the latency told and the flow's bias, and writes benchmarks/results/late_camera.json.
+`./run python -m benchmarks.late_camera` (`--only 0,3` for some cases, `--trials 4` for a look) prints the
+true error, the latency told and the flow's bias, and writes benchmarks/results/late_camera.json.
 """
 
 import argparse
@@ -17,8 +17,7 @@ import numpy as np
 
 from benchmarks.foreign_camera import GROUNDS, Eye, Stage, tip_of, trial
 from pipeline.deposition import training
-from pipeline.deposition.extruder import disturb, draw, flow
-from pipeline.deposition.extruder import Extruder
+from pipeline.deposition.extruder import Extruder, disturb, draw, flow
 from pipeline.deposition.ilc import Trial
 from pipeline.deposition.workflow import calibrate_camera, laws, trial_files, trial_video
 from pipeline.deposition.workflow.settings import Camera, Printer, TrainIlc
@@ -26,7 +25,7 @@ from pipeline.store import params
 
 RESULTS = Path(__file__).parent / "results" / "late_camera.json"
 WIDTHS_MM = (0.5, 0.7, 0.9, 1.1, 1.3)
-# what the issue asks for
+# at most
 BARS = {"true_error_percent": 4.0, "latency_error_ms": 5.0, "flow_bias_percent": 1.5}
 HZ, PICTURES, TRIALS = 30, 3, 15
 WHITE, DRIFT, GAIN = 0.03, 0.01, 0.01

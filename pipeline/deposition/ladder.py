@@ -1,5 +1,5 @@
-"""A printed ladder, lines of known widths, into what a camera needs: the size of a pixel, the direction of the
-line, and by how much beads of each width look wider than they are.
+"""A printed ladder, lines of known widths, into what a camera needs: the size of a pixel, the direction of
+the line, and by how much beads of each width look wider than they are.
 """
 
 import math
@@ -43,11 +43,30 @@ def rungs(
     *,
     tip: tuple[float, float] | None,
     hidden_px: float,
-    sign: int,
     longest_blur_px: float,
 ) -> list[Rung]:
     """The `count` lines of one picture that stand out most, measured; fewer where it shows fewer. One line is
-    sought at the nozzle's tip where that is given."""
+    sought at the nozzle's tip where that is given. Several are all light or all dark: what lies between them
+    is one fewer."""
+    if count == 1:
+        return _of_sign(frame, 1, tip=tip, hidden_px=hidden_px, sign=0, longest_blur_px=longest_blur_px)
+    both = [
+        _of_sign(frame, count, tip=tip, hidden_px=hidden_px, sign=sign, longest_blur_px=longest_blur_px)
+        for sign in (1, -1)
+    ]
+    return max(both, key=lambda found: sum(not rung.reason for rung in found))
+
+
+def _of_sign(
+    frame: np.ndarray,
+    count: int,
+    *,
+    tip: tuple[float, float] | None,
+    hidden_px: float,
+    sign: int,
+    longest_blur_px: float,
+) -> list[Rung]:
+    """The lines of one colour: 1 light, -1 dark, 0 either."""
     mask = np.zeros(frame.shape[:2], bool)
     if tip is not None and count > 1:
         cv2.circle(hidden := mask.astype(np.uint8), (round(tip[0]), round(tip[1])), round(hidden_px), 1, -1)
@@ -108,10 +127,11 @@ def calibrated(
 ) -> Ladder:
     """From pictures (N,) of lines of known widths: scale, direction and edge bias by width.
 
-    mm_per_px is the size of a pixel where something that has no edges tells it, the pitch of the ladder or
-    the gantry's travel; else it is the slope of known over measured widths, so that the mean bias is the same
-    at all of them. Directions `from_tip` count over the whole circle, others to half of it. Raises ValueError for fewer than three different widths, for a measurement that failed and
-    for widths that do not grow with the known ones.
+    mm_per_px is the size of a pixel where something that has no edges tells it, such as the pitch of the
+    ladder; else it is the slope of known over measured widths, so that the mean bias is the same at all of
+    them. Directions `from_tip` count over the whole circle, others to half of it. Raises ValueError for fewer
+    than three different widths, for a measurement that failed and for widths that do not grow with the known
+    ones.
     """
     known, px = np.asarray(known_mm, float), np.asarray(measured_px, float)
     fit = bead.calibrate(px, known)

@@ -1,9 +1,9 @@
-"""How late a camera's pictures are against the gantry, from the pictures' own motion: nothing of the extruder
-enters.
+"""How late a camera's pictures are against the gantry, from the pictures' own motion: nothing of the
+extruder enters.
 
-What lies on the stage is seen by many frames at many columns. With the right latency L all readings of a place
-s = x(t - L) + (column - nozzle_column) mm_per_px agree; with a wrong one they part wherever the gantry's speed
-changes. At an even speed a latency is a shift of the stage and is not seen.
+What lies on the stage is seen by many frames at many columns. With the right latency L all readings of a
+place s = x(t - L) + (column - nozzle_column) mm_per_px agree; with a wrong one they part wherever the
+gantry's speed changes. At an even speed a latency is a shift of the stage and is not seen.
 """
 
 import math
@@ -19,7 +19,9 @@ NEAR_S = 0.6
 # a change of speed, as share of the highest
 CHANGE = 0.05
 # neighbouring readings err alike: the formal deviation is too small by about this factor
-INFLATION = 3.0
+INFLATION = 8.0
+# no latency that is more than so many steps away may come so near to the best, in scatters of the sum
+APART, DISTINCT = 3, 2.0
 # a travel of more readings than this is in another unit
 LONGEST_CELLS = 1e6
 
@@ -77,7 +79,10 @@ def estimate(time_s: np.ndarray, signals: np.ndarray, gantry: Gantry, *, step_mm
     grid = np.arange(EARLIEST_S, LATEST_S + STEP_S / 2, STEP_S)
     misses = np.array([miss(L) for L in grid])
     k = int(np.argmin(misses))
-    if k in (0, len(grid) - 1):
+    # of noise alone the sum of squares scatters by this much from one latency to another
+    scatter = misses[k] * math.sqrt(2 / values.size)
+    others = misses[np.abs(np.arange(len(grid)) - k) > APART]
+    if k in (0, len(grid) - 1) or others.min() < misses[k] + DISTINCT * scatter:
         return UNTOLD
     near = grid[k] + np.array([-0.8, -0.4, 0.0, 0.4, 0.8]) * STEP_S
     curve = np.polyfit(near - grid[k], [miss(L) for L in near], 2)
@@ -85,7 +90,9 @@ def estimate(time_s: np.ndarray, signals: np.ndarray, gantry: Gantry, *, step_mm
         return UNTOLD
     best = float(np.clip(-curve[1] / (2 * curve[0]), -STEP_S, STEP_S))
     least = max(float(np.polyval(curve, best)), 1e-9)
-    free = values.size - values.shape[1] * (np.ptp(gantry.position_mm) / cells + values.shape[2])
+    x = np.interp(times - grid[k], gantry.time_s, gantry.position_mm)
+    places = len(np.unique(np.floor((x[:, None] + along) / cells)))
+    free = values.size - values.shape[1] * places
     variance = least / max(free, 1.0)
     deviation = INFLATION * math.sqrt(variance / curve[0])
     return Latency(float(grid[k]) + best, deviation)

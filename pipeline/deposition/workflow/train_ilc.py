@@ -230,12 +230,12 @@ def _in_pictures(
         on_step=on_step,
     )
     figures = training.figures(sequence, rise=work.laws.rise) | _flow_errors(measured, routine)
-    figures |= trial_video.latency_figures(measured)
+    told = trial_video.latency_figures(measured)
     return Part(
         {(name, 0): [sequence]},
         {(name, 0): measured},
         {name: {"calibration": calibration._asdict()}},
-        {name: {"pixels": figures}},
+        {name: {"pixels": figures | told}},
     )
 
 

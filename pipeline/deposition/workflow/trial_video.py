@@ -131,8 +131,8 @@ def measure_trial(
     """The trial of a recording on the clock of its routine; its frames are read once, and kept in `memo`.
 
     The camera's latency is that of section `camera`; without one, what the motion in the pictures of this
-    recording and of `earlier` ones tells, none where it is not told. Raises ValueError, naming the file, where
-    it says nothing of its conditions or shows no bead.
+    recording and of `earlier` ones tells, none where it is not told. Raises ValueError, naming the file,
+    where it says nothing of its conditions or shows no bead.
     """
     recording = trial_readings.opened(path, camera)
     conditions = _checked_conditions(path, recording)
@@ -183,7 +183,7 @@ def _of_camera(camera: Camera, told: Sequence[Latency]) -> Latency:
     return together if together.deviation_s <= LATENCY_KNOWN_S else latency.UNTOLD
 
 
-def latency_figures(measured: Sequence[MeasuredTrial]) -> dict[str, float | None]:
+def latency_figures(measured: Sequence[MeasuredTrial]) -> dict[str, Any]:
     """How late the camera is, as it was corrected in the last trial, and its standard deviation, s; None
     where the pictures do not tell it: then flow near corners and pauses may err by all of it."""
     last = measured[-1].of_camera
@@ -257,9 +257,8 @@ def _widths_mm(
         rejected = _counts(readings.reasons)
         reasons = ", ".join(f"{reason} in {count}" for reason, count in sorted(rejected.items()))
         raise ValueError(
-            f"{path}: none of {len(readings.time_s)} frames shows a usable bead ({reasons}); check light, focus, "
-            "calibration and camera.columns, "
-            "or record the trial again"
+            f"{path}: none of {len(readings.time_s)} frames shows a usable bead ({reasons}); "
+            "check light, focus, calibration and camera.columns, or record the trial again"
         )
     true_px = width_px(readings.widths, camera)
     return np.where(readings.widths == 0, 0.0, (true_px - conditions.offset_px) / conditions.px_per_mm)

@@ -1,5 +1,5 @@
-"""`beadline calibrate-camera`: pictures of printed lines of known widths into section `camera` of params.yaml,
-and a page that shows what was measured in them.
+"""`beadline calibrate-camera`: pictures of printed lines of known widths into section `camera` of
+params.yaml, and a page that shows what was measured in them.
 """
 
 import base64
@@ -25,7 +25,7 @@ from pipeline.store.params_text import replaced
 
 # frames of a recording that are measured, spread over it
 SAMPLE = 12
-# around the nozzle's rim so much more is not measured, and so many columns of the turned picture lie before it
+# around the nozzle's rim so much more is not measured; so many columns of the turned picture lie before it
 RIM, COLUMN = 1.15, 30
 # a line may become so much wider than the widest one, and beside it the ground is looked at, px
 WIDER, BESIDE_PX = 1.15, 36
@@ -104,9 +104,12 @@ def calibrated(
         for frame in frames:
             wanted = len(widths) if together else 1
             found = ladder.rungs(
-                bead.gray(frame), wanted, tip=asked.tip_px, hidden_px=rim_px,
-                sign=0 if together else trial_readings.sign_of(camera), longest_blur_px=camera.longest_blur_px,
-            )  # fmt: skip
+                bead.gray(frame),
+                wanted,
+                tip=asked.tip_px,
+                hidden_px=rim_px,
+                longest_blur_px=camera.longest_blur_px,
+            )
             _check(asked.images[k], found, widths if together else widths[k : k + 1])
             found = sorted(found, key=lambda rung: rung.width_px)
             known = sorted(widths) if together else widths[k : k + 1]
@@ -126,15 +129,15 @@ def _check(path: Path, found: Sequence[Rung], widths: Sequence[float]) -> None:
     named = ", ".join(f"{width:g}" for width in widths)
     if len(found) < len(widths):
         raise ValueError(
-            f"{path}: expected {len(widths)} line{'s' * (len(widths) > 1)} ({named} mm) but found {len(found)} "
-            "that stand out from their ground along their length; light them from one side, or name a picture "
-            "each"
+            f"{path}: expected {len(widths)} line{'s' * (len(widths) > 1)} ({named} mm) but found "
+            f"{len(found)} that stand out from their ground along their length; light them from one side, "
+            "or name a picture each"
         )
     for rung in found:
         if rung.reason:
             raise ValueError(
-                f"{path}: the line at {rung.found.x:.0f}, {rung.found.y:.0f} px ({named} mm) cannot be measured: "
-                f"{rung.reason}; see that both of its edges are in the picture and sharp"
+                f"{path}: the line at {rung.found.x:.0f}, {rung.found.y:.0f} px ({named} mm) cannot be "
+                f"measured: {rung.reason}; see that both of its edges are in the picture and sharp"
             )
 
 
@@ -186,9 +189,9 @@ def _values(
     first, last = (COLUMN + at for at in line.span(pose, size, (hidden, math.floor(math.hypot(*size))), half))
     if last - first < BLOCK * FEWEST_BLOCKS:
         raise ValueError(
-            f"calibrate-camera: of the line from the tip at {asked.tip_px[0]:g}, {asked.tip_px[1]:g} px on, towards "
-            f"{direction:.0f} degrees, only {max(last - first, 0)} columns lie in the picture with both edges; "
-            "check --tip, or turn the camera"
+            f"calibrate-camera: of the line from the tip at {asked.tip_px[0]:g}, {asked.tip_px[1]:g} px on, "
+            f"towards {direction:.0f} degrees, only {max(last - first, 0)} columns lie in the picture with "
+            "both edges; check --tip, or turn the camera"
         )
     return values | {
         "mm_per_px": -abs(values["mm_per_px"]),
@@ -315,4 +318,4 @@ def _one_each(rungs: Sequence[tuple[float, np.ndarray, Rung]]) -> list[tuple[flo
 
 def _embedded(picture: np.ndarray) -> str:
     """A PNG inside the page."""
-    return "data:image/png;base64," + base64.b64encode(cv2.imencode(".png", picture)[1]).decode()
+    return "data:image/png;base64," + base64.b64encode(cv2.imencode(".png", picture)[1].tobytes()).decode()
