@@ -9,12 +9,14 @@ import scipy.signal
 
 from pipeline.deposition import reachable
 from pipeline.deposition.chain import Identified, fronts
-from pipeline.deposition.drive import UNLIMITED, Drive, follows, obeyed
+from pipeline.deposition.drive import UNLIMITED, Drive, asked, follows, obeyed
 from pipeline.deposition.extruder import DAMPING, Extruder, ramp
 
 # the yield is loaded this long before the flow begins and kept through gaps of twice that: long against the
 # lag, short against a pause between lines
 LOAD_S = 0.25
+# or, where the drive cannot follow that, over so many times as long: below the yield nothing flows
+LOADS = (1, 2, 4, 8)
 # dither: slow enough to pass a lag of a few Hz, fast enough that a time constant of
 # seconds leaves some 0.1 % of the steady flow of it
 DITHER_HZ = 2.5
@@ -92,24 +94,40 @@ def compose(
     stands, so that its mean position is the command's (Zames and Shneydor 1976); q lets it die out after
     a stop.
 
-    Where the drive cannot follow u, the command whose flow comes
-    nearest: it sets out early and catches up late.
+    The yield is loaded over as long as the drive needs. Where it cannot follow u even so, the command whose
+    flow comes nearest: it sets out early and catches up late. What the dither takes is left of the limits.
     """
     if not np.any(r > 0):
         return np.zeros(len(r))
     extruder = Identified(*extruder)
+    ahead, dithered = advance(extruder, sample_time_s), dither(extruder, r, sample_time_s)
+    u = np.zeros(len(r))
+    for times in LOADS if extruder.yield_ > 0 else LOADS[:1]:
+        x = r + extruder.yield_ * loaded(r, times * LOAD_S, sample_time_s)
+        v = _inverse(extruder, pressed_of(extruder, x), sample_time_s)
+        u = scipy.signal.oaconvolve(v + dithered, ahead, "same")
+        if follows(u, drive, sample_time_s=sample_time_s):
+            return u
     x = r + extruder.yield_ * loaded(r, LOAD_S, sample_time_s)
-    p = pressed_of(extruder, x)
-    v, ahead = _inverse(extruder, p, sample_time_s), advance(extruder, sample_time_s)
-    if not follows(scipy.signal.oaconvolve(v, ahead, "same"), drive, sample_time_s=sample_time_s):
-        v, ahead = reached(extruder, v, r, drive, sample_time_s), shift(extruder, sample_time_s)
-    if extruder.play > 0:
-        v += (
-            extruder.play
-            * loaded(r, DITHER_S, sample_time_s)
-            * np.sin(2 * np.pi * DITHER_HZ * sample_time_s * np.arange(len(r)))
-        )
-    return obeyed(scipy.signal.oaconvolve(v, ahead, "same"), drive, sample_time_s=sample_time_s)
+    v = _inverse(extruder, pressed_of(extruder, x), sample_time_s)
+    ahead = shift(extruder, sample_time_s)
+    v = reached(extruder, v, r, _beside(dithered, ahead, drive, sample_time_s), sample_time_s)
+    return obeyed(scipy.signal.oaconvolve(v + dithered, ahead, "same"), drive, sample_time_s=sample_time_s)
+
+
+def dither(extruder: Extruder | Identified, r: np.ndarray, sample_time_s: float) -> np.ndarray:
+    """q(t) sin(2 pi f t) (T,) in mm, as wide as the play; q fades after a stop."""
+    fading = extruder.play * loaded(r, DITHER_S, sample_time_s)
+    return fading * np.sin(2 * np.pi * DITHER_HZ * sample_time_s * np.arange(len(r)))
+
+
+def _beside(dithered: np.ndarray, ahead: np.ndarray, drive: Drive, sample_time_s: float) -> Drive:
+    """What the dither, sent ahead, leaves of the drive; never less than half of it."""
+    takes = asked(scipy.signal.oaconvolve(dithered, ahead, "same"), sample_time_s=sample_time_s)
+    return drive._replace(
+        amplitude_mm=max(drive.amplitude_mm - takes.command_mm, drive.amplitude_mm / 2),
+        speed_mm_per_s=max(drive.speed_mm_per_s - takes.speed_mm_per_s, drive.speed_mm_per_s / 2),
+    )
 
 
 def pressed_of(extruder: Identified, x: np.ndarray) -> np.ndarray:
@@ -150,16 +168,20 @@ def _inverse(extruder: Identified, p: np.ndarray, sample_time_s: float) -> np.nd
 def reached(
     extruder: Extruder | Identified, v: np.ndarray, r: np.ndarray, drive: Drive, sample_time_s: float
 ) -> np.ndarray:
-    """v (T,) that the drive can follow whose fast mode comes nearest to that of the unlimited v; below
-    the yield, where no flow r (T,) is wanted, it is free. Delay and lag lie before v."""
-    (share, _), (a, _) = _modes(Identified(*extruder), sample_time_s)
-    g = share * extruder.gain
-    fast = scipy.signal.lfilter([g], [1.0, -a], v)
+    """v (T,) that the drive can follow whose fast mode comes nearest to that of the unlimited v; where no
+    flow r (T,) is wanted only what rises above the yield costs. Delay and lag lie before v."""
+    extruder = Identified(*extruder)
+    (share, creeping), (a, b) = _modes(extruder, sample_time_s)
+    g, h = share * extruder.gain, creeping * extruder.gain
+    fast, slow = (scipy.signal.lfilter([gain], [1.0, -pole], v) for gain, pole in ((g, a), (h, b)))
+    still = extruder.gain * pressed_of(extruder, np.array(extruder.yield_))
+    free = np.append(r[1:], 0.0) <= 0
     x = reachable.nearest(
-        fast,
-        np.append(r[1:], 0.0) <= 0,
+        np.where(free, np.maximum(fast, still - slow), fast),
+        free,
         pole=a,
         bound=g * drive.amplitude_mm,
         step=g * drive.speed_mm_per_s * sample_time_s,
+        rest=fast,
     )
     return obeyed((x - a * np.append(0.0, x[:-1])) / g, drive, sample_time_s=sample_time_s)

@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.deposition import basis, forecast
+from pipeline.deposition import basis, forecast, reachable
 from pipeline.deposition.chain import Identified
 from pipeline.deposition.chain import forecast as predicted_flow
 from pipeline.deposition.composition import BASIS, EXCERPT_S, MARGIN_S, Composed, Learned, Material, Stream
-from pipeline.deposition.drive import Drive, asked, at_limit, follows, obeyed
+from pipeline.deposition.drive import Drive, asked, at_limit, obeyed
 from pipeline.deposition.extruder import Extruder
 from pipeline.deposition.gcode import Refusal
 from pipeline.deposition.library import STOP, Library
@@ -45,8 +45,9 @@ class LineVolumes(NamedTuple):
 class Saturation(NamedTuple):
     """What a drive does to one flow with one ramp: its limits (inf where there is none) and beside them the
     largest unlimited command (mm) and its speed (mm/s); peak of that command over the steady one, share of
-    the printing time at a limit, and r.m.s. error of the best command within them in % of that of on-off
-    control r / on_off_gain; `enough` is whether the drive can follow the unlimited command."""
+    the printing time at a limit, and r.m.s. error of the composed command within them in % of that of on-off
+    control r / on_off_gain; least_percent is that of the nearest flow that the drive can reach, and enough
+    whether the drive adds at most `reachable.LOSS` of on-off's to the error of the unlimited command."""
 
     ramp_s: float
     amplitude_mm: float
@@ -56,6 +57,7 @@ class Saturation(NamedTuple):
     peak_over_steady: float
     share_percent: float
     rms_percent_of_on_off: float
+    least_percent: float
     enough: bool
 
 
@@ -68,8 +70,8 @@ class Refused(NamedTuple):
 
 class Conformance(NamedTuple):
     """The report on a part: its lines, the worst error in % among the `judged` lines of at least shortest_s,
-    for each tool the saturation with the ramp as it is and the ramp in s that would do (its own where none is
-    needed, inf where none does), and what was refused."""
+    for each tool the saturation with the ramp as it is and the ramp of the gantry in s with which the drive
+    would follow a line (inf where none does), and what was refused."""
 
     lines: LineVolumes
     worst_line_volume_percent: float
@@ -155,8 +157,9 @@ def _reaches(composed: Composed, tool: int) -> tuple[np.ndarray, np.ndarray, np.
     mine = np.flatnonzero(composed.lines.tool == tool)
     a, b = composed.lines.begin_s[mine], composed.lines.end_s[mine]
     middle = (b[:-1] + a[1:]) / 2
-    start = np.maximum(a - REACH_S, np.append(-np.inf, middle))
-    return mine, start, np.minimum(b + REACH_S, np.append(middle, np.inf))
+    start = np.maximum(a - composed.lines.early_s[mine] - REACH_S, np.append(-np.inf, middle))
+    stop = np.minimum(b + composed.lines.late_s[mine] + REACH_S, np.append(middle, np.inf))
+    return mine, start, stop
 
 
 def line_volumes(composed: Composed, library: Library, *, bead_area_mm2: float) -> LineVolumes:
@@ -210,14 +213,18 @@ def saturation(
     """What the drive does to the wanted flow (T,) with its steps
     shaped by two boxes of ramp_s: forecast by the chain."""
     r = basis.boxed(unshaped, ramp_s, sample_time_s)
+    r[r < 1e-9 * r.max(initial=0.0)] = 0.0  # rounding of the sums behind the rate
     free = basis.compose(extruder, r, sample_time_s=sample_time_s)
     u = basis.compose(extruder, r, sample_time_s=sample_time_s, drive=drive)
     steady, most = (r.max() + extruder.yield_) / extruder.gain, asked(free, sample_time_s=sample_time_s)
     first = obeyed(r / on_off_gain, drive, sample_time_s=sample_time_s)
-    on_off = predicted_flow(extruder, first, sample_time_s=sample_time_s) - r
-    error = predicted_flow(extruder, u, sample_time_s=sample_time_s) - r
-    ratio = math.sqrt(np.sum(error**2) / max(np.sum(on_off**2), 1e-300))
+    on_off, limited, unlimited = (
+        float(np.linalg.norm(predicted_flow(extruder, command, sample_time_s=sample_time_s) - r))
+        for command in (first, u, free)
+    )
+    least = float(np.linalg.norm(reachable.flow(_plain(extruder), r, drive, sample_time_s) - r))
     share = np.mean(at_limit(u, drive, sample_time_s=sample_time_s)[r > 0])
+    on_off = max(on_off, 1e-300)
     return Saturation(
         ramp_s,
         drive.amplitude_mm,
@@ -226,8 +233,9 @@ def saturation(
         most.speed_mm_per_s,
         most.command_mm / steady,
         100 * float(share),
-        100 * ratio,
-        follows(free, drive, sample_time_s=sample_time_s),
+        100 * limited / on_off,
+        100 * least / on_off,
+        limited - unlimited <= reachable.LOSS * on_off,
     )
 
 
@@ -239,25 +247,19 @@ def ramp_that_would_do(
     drive: Drive,
     sample_time_s: float,
 ) -> float:
-    """The shortest ramp in s, ramp_s or longer, whose command the drive can follow;
-    inf where none up to LONGEST_RAMP_S does.
+    """The shortest time in s in which the gantry comes to the highest speed of the wanted flow (T,), its
+    steps shaped by two boxes of ramp_s, such that the drive follows a line
+    (`reachable.ramp_that_loses_little`); inf where none up to LONGEST_RAMP_S does."""
+    return reachable.ramp_that_loses_little(
+        _plain(extruder),
+        drive,
+        steady_flow=float(unshaped.max()),
+        ramp_s=ramp_s,
+        longest_s=LONGEST_RAMP_S,
+        sample_time_s=sample_time_s,
+    )
 
-    The peak falls with the ramp, about as (1 + tau / ramp) x steady: bisected to 1 %.
-    """
 
-    room = np.pad(unshaped, math.ceil(LONGEST_RAMP_S / sample_time_s))
-
-    def does(ramp):
-        r = basis.boxed(room, ramp, sample_time_s)
-        u = basis.compose(extruder, r, sample_time_s=sample_time_s)
-        return follows(u, drive, sample_time_s=sample_time_s)
-
-    if does(ramp_s):
-        return ramp_s
-    low, high = ramp_s, LONGEST_RAMP_S
-    if not does(high):
-        return math.inf
-    while high > 1.01 * low:
-        middle = math.sqrt(low * high)
-        low, high = (low, middle) if does(middle) else (middle, high)
-    return high
+def _plain(extruder: Extruder | Identified) -> Extruder:
+    """Its gain, time constant and yield: what a drive's limits stand against."""
+    return Extruder(extruder.gain, extruder.time_constant_s, yield_=extruder.yield_)

@@ -65,6 +65,21 @@ def ramp(t: np.ndarray, width_s: float) -> np.ndarray:
     return np.where(s < 0, (1 + s) ** 2 / 2, 1 - (1 - s) ** 2 / 2)
 
 
+def ramp_of_gantry(t: np.ndarray, width_s: float, gantry_s: float) -> np.ndarray:
+    """`ramp` where the gantry takes gantry_s from rest to its speed, evenly: the mean of `ramp` over that
+    time around t; gantry_s 0 is `ramp` itself."""
+    if gantry_s == 0:
+        return ramp(t, width_s)
+    early, late = (_ramp_sum(np.asarray(t, float) + half, width_s) for half in (-gantry_s / 2, gantry_s / 2))
+    return np.clip((late - early) / gantry_s, 0.0, 1.0)
+
+
+def _ramp_sum(t: np.ndarray, width_s: float) -> np.ndarray:
+    """The integral of `ramp` up to t, in s."""
+    s = np.clip(t / width_s, -1.0, 1.0)
+    return width_s * np.where(s < 0, (1 + s) ** 3 / 6, s + (1 - s) ** 3 / 6) + np.maximum(t - width_s, 0.0)
+
+
 def routine(
     *,
     off_s: float,
@@ -74,24 +89,25 @@ def routine(
     speed: float,
     bead_area_mm2: float,
     ramp_s: float,
+    gantry_ramp_s: float = 0.0,
     sample_time_s: float,
 ) -> Routine:
-    """Off, on, pause, on, off: r = bead area x speed while printing. `speed` in mm/s;
-    two boxes of `ramp_s` shape every change of speed.
+    """Off, on, pause, on, off: r = bead area x speed while printing. `speed` in mm/s; the gantry changes it
+    in gantry_ramp_s, evenly, and two boxes of `ramp_s` shape every change beside.
 
     Raises ValueError where a ramp does not fit before the start or after the
     stop; ramps longer than the pause leave a dip of it.
     """
-    shortest = min(off_s, tail_s)
-    if not 0 < ramp_s <= shortest:
+    shortest, before = min(off_s, tail_s), ramp_s + gantry_ramp_s / 2
+    if not (0 < ramp_s and 0 <= gantry_ramp_s and before <= shortest):
         raise ValueError(
             f"routine: expected a ramp above 0 s and at most {shortest:g} s, "
-            f"the shorter of the phases before the start and after the stop, but found {ramp_s:g} s; "
+            f"the shorter of the phases before the start and after the stop, but found {before:g} s; "
             "shorten the ramp or lengthen them"
         )
     events = np.cumsum([off_s, on_s, pause_s, on_s])
     t = np.arange(round((events[-1] + tail_s) / sample_time_s)) * sample_time_s
-    start, halt, go, stop = (ramp(t - event, ramp_s) for event in events)
+    start, halt, go, stop = (ramp_of_gantry(t - event, ramp_s, gantry_ramp_s) for event in events)
     share = start - halt + go - stop
     moving = 1 - halt + go
     r = bead_area_mm2 * speed * np.where(share > 1e-12, share, 0.0)

@@ -54,6 +54,7 @@ def plan(
     speed_limit: float,
     unset_feed: float,
     tool_change_s: float,
+    printing_acceleration: float = np.inf,
 ) -> Motion:
     """The fastest motion within the limits: each move's feed, speed_limit in mm/s, acceleration in mm/s^2
     (the program's own where that is lower), and at corners
@@ -63,9 +64,12 @@ def plan(
     with theta the angle between the legs (pi straight on), delta the junction deviation (Jeon, "Improving
     grbl: cornering algorithm", 2011) and l the shorter leg (Klipper's bound for curves in short legs). Arcs
     keep v^2 <= a r. Dwells, tool changes (tool_change_s) and E alone begin and end at rest; unset_feed (mm/s)
-    is for moves before the first F. Raises ValueError for limits that are not positive.
+    is for moves before the first F. Where a printing_acceleration in mm/s^2 is given, moves that print speed
+    up and slow down no faster, and begin and end at rest beside moves that do not. Raises ValueError for
+    limits that are not positive.
     """
     limits = {"acceleration": acceleration, "speed_limit": speed_limit, "unset_feed": unset_feed}
+    limits |= {"printing_acceleration": printing_acceleration}
     for name, limit in limits.items():
         if not limit > 0:
             raise ValueError(f"motion: expected {name} > 0, found {limit:g}; set it to the machine's own")
@@ -79,7 +83,13 @@ def plan(
     cap = np.minimum(
         _corner(turn, moves.length, a, junction_deviation_mm), np.minimum(top, np.append(0.0, top[:-1]))
     )
-    entry, leave = _look_ahead(np.where(np.isfinite(turn), cap, 0.0), 2 * a * travel)
+    prints = runs & (moves.kind == Kind.EXTRUDE)
+    rests = ~np.isfinite(turn)
+    if np.isfinite(printing_acceleration):
+        # the corners' speeds are the gantry's own: only along the path it is held back
+        a = np.where(prints, np.minimum(a, printing_acceleration), a)
+        rests |= np.append(False, prints[1:] != prints[:-1])
+    entry, leave = _look_ahead(np.where(rests, 0.0, cap), 2 * a * travel)
     cruise = np.maximum(np.minimum(top, (entry + leave) / 2 + a * travel), np.maximum(entry, leave))
     entry, leave, cruise = np.sqrt(entry), np.sqrt(leave), np.sqrt(cruise)
     ramp = np.stack([cruise - entry, cruise - leave]) / a

@@ -16,11 +16,15 @@ DWELL = "Dwell"
 # would stand still with the plunger pressing
 HALTS = ("M0", "M1", "M2", "M25", "M30", "M112", "M226", "M600", "M601", "PAUSE", "CANCEL_PRINT")
 TINY_S = 1e-6
+# quicker than this, a change of speed is a step
+STEP_S = 0.02
 
 
 class Lines(NamedTuple):
     """Every printed line (L,): its number in the program, its move, its tool, the run that it belongs to,
-    begin and end in s, length in mm, cruising speed in mm/s.
+    begin and end in s, length in mm, cruising speed in mm/s. Where the gantry takes STEP_S or longer from
+    rest to that speed, the line begins in the middle, early_s after it sets out, and ends late_s before it
+    rests.
 
     first and last tell whether it begins or ends its run; pause_s is the time lost at the junction after it
     (halts in place and slowing down), and corner whether that is a Corner.
@@ -38,6 +42,8 @@ class Lines(NamedTuple):
     last: np.ndarray
     pause_s: np.ndarray
     corner: np.ndarray
+    early_s: np.ndarray
+    late_s: np.ndarray
 
 
 class Tasks(NamedTuple):
@@ -84,19 +90,24 @@ def printed_lines(moves: Moves, motion: Motion, *, corner_deg: float, longest_pa
     turned = np.append(np.nan_to_num(motion.turn[at[1:]]) >= np.radians(corner_deg) - 1e-9, False)
     corner = joined[1:] & (turned | (np.append(halt, 0.0) > TINY_S))
     first, last = ~joined[:-1], ~joined[1:]
+    # the flow's step lies in the middle of its ramp, as the training routine has it
+    rests = np.stack([first, last | corner])
+    early, late = np.where(rests & (slowing >= STEP_S / 2), slowing, 0.0)
     return Lines(
         moves.line[at],
         at,
         moves.tool[at],
         np.cumsum(first) - 1,
-        begin,
-        end,
+        begin + early,
+        end - late,
         moves.length[at],
         speed,
         first,
         last,
         lost,
         corner,
+        early,
+        late,
     )
 
 
@@ -104,8 +115,8 @@ def sequence(lines: Lines, *, end_s: float) -> Tasks:
     """The tasks in their order: No-Flow, then for each run Start, Steady-State, (Corner, Steady-State)...,
     Stop, and No-Flow or, to another tool, Dwell.
 
-    A task's event is where the gantry begins it: the signals are sent ahead of it
-    by their leads, which is what looking ahead is for.
+    A task's event is where the gantry begins it, or is in the middle of its ramp: the signals are sent ahead
+    of it by their leads, which is what looking ahead is for.
     """
     n = len(lines.line)
     switched = np.append(lines.tool[1:] != lines.tool[:-1], False)

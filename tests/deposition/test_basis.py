@@ -6,7 +6,7 @@ import pytest
 
 from pipeline.deposition import basis
 from pipeline.deposition.chain import Identified
-from pipeline.deposition.drive import Drive
+from pipeline.deposition.drive import Drive, at_limit, follows
 from pipeline.deposition.extruder import Extruder, draw, lagged, ramp
 from tests.deposition.trained import TS, percent_of_on_off, protocol
 
@@ -96,6 +96,24 @@ def test_a_command_within_its_limit_comes_nearest_and_beats_cutting():
     np.testing.assert_array_equal(
         basis.compose(plant, r, sample_time_s=TS, drive=Drive(np.abs(free).max() * 1.0001, np.inf, 0.0)), free
     )  # a limit that is not met changes nothing
+
+
+def test_the_yield_is_loaded_over_as_long_as_the_drive_needs_and_the_flow_stays_exact(monkeypatch):
+    plant = Extruder(0.9, 2.7, delay_s=0.1, lag_hz=4.0, play=0.02, yield_=0.24)
+    r, drive = protocol(ramp_s=1.2, pause_s=3).r, Drive(10.0, 30.0, 0.0)
+    assert not follows(basis.compose(plant, r, sample_time_s=TS), drive, sample_time_s=TS)
+    u = basis.compose(plant, r, sample_time_s=TS, drive=drive)
+    assert follows(u, drive, sample_time_s=TS) and percent_of_on_off(plant, u, r) < 0.2
+    monkeypatch.setattr(basis, "LOAD_S", 1.0)  # the third of LOADS: nothing but the load is slower
+    np.testing.assert_array_equal(u, basis.compose(plant, r, sample_time_s=TS))
+
+
+def test_what_the_dither_takes_is_left_of_the_limits():
+    plant = Extruder(0.9, 4.5, delay_s=0.1, lag_hz=4.0, play=0.2, yield_=0.1)
+    drive = Drive(5 * STEADY / plant.gain, 40.0, 0.0)
+    u = basis.compose(plant, protocol().r, sample_time_s=TS, drive=drive)
+    # a dither that is cut is no dither: 16 % of the time where nothing is left for it
+    assert np.mean(at_limit(u, drive, sample_time_s=TS)) < 0.03
 
 
 def test_no_flow_wanted_is_no_command():

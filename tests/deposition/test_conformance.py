@@ -15,6 +15,7 @@ from pipeline.deposition.conformance import (
 from pipeline.deposition.drive import UNLIMITED, Drive, obeyed
 from pipeline.deposition.extruder import Extruder, flow
 from pipeline.deposition.gcode import Refusal
+from pipeline.deposition.reachable import LOSS, lost
 from tests.deposition.test_composition import composed, of_part
 from tests.deposition.trained import AREA, NOMINAL, PLANT, RAMP, TS, learned, protocol
 
@@ -89,6 +90,8 @@ def test_the_forecast_of_saturation_is_within_3_points_of_the_plant(ramp_s):
             100 * true / on_off, abs=3.0
         )  # points: the bar
         assert forecast.enough == (forecast.share_percent == 0.0)
+        # the composer beside the nearest flow within the drive, which knows no lag: one overshoots by 5 %
+        assert forecast.enough or 0.95 < forecast.rms_percent_of_on_off / forecast.least_percent < 1.2
 
 
 def test_the_peak_is_about_1_plus_tau_over_ramp():
@@ -104,13 +107,15 @@ def test_the_ramp_that_would_do_does_and_a_shorter_one_does_not():
     chain, on = learned(PLANT).materials[0].chain.extruder, protocol(ramp_s=1e-9).r
     limit = 8 * on.max() / chain.gain
     ramp_s = ramp_that_would_do(chain, on, ramp_s=RAMP, drive=Drive(limit, np.inf, 0.0), sample_time_s=TS)
-    peaks = [
-        np.abs(basis.compose(chain, basis.boxed(on, x, TS), sample_time_s=TS)).max()
-        for x in (ramp_s, 0.97 * ramp_s)
+    plain = Extruder(chain.gain, chain.time_constant_s, yield_=chain.yield_)
+    losses = [
+        lost(plain, protocol(gantry_ramp_s=x, pause_s=0.6 + x).r, Drive(limit, np.inf, 0.0), TS)
+        for x in (ramp_s, 0.8 * ramp_s)
     ]
-    assert peaks[0] <= limit < peaks[1]
+    # the routine starts and stops twice, at a pause, where the line does once
+    assert losses[0] <= 1.3 * LOSS < losses[1]
     assert (
-        ramp_that_would_do(chain, on, ramp_s=RAMP, drive=Drive(1e3, np.inf, 0.0), sample_time_s=TS) == RAMP
+        ramp_that_would_do(chain, on, ramp_s=RAMP, drive=Drive(1e3, np.inf, 0.0), sample_time_s=TS) == 0.0
     )  # none is needed
     assert (
         ramp_that_would_do(

@@ -17,6 +17,7 @@ from pipeline.deposition.extruder import (
     lagged,
     pressed,
     ramp,
+    ramp_of_gantry,
     routine,
 )
 
@@ -202,6 +203,19 @@ def test_a_ramp_is_a_step_after_two_moving_averages():
     np.testing.assert_allclose(
         ramp(t, 0.15)[inside], step[inside], atol=2e-3
     )  # the boxes are whole samples wide
+
+
+def test_the_gantry_s_ramp_is_the_ramp_averaged_over_its_time_and_has_its_slope():
+    t = np.arange(-300, 301) * 0.01
+    mean = np.mean([ramp(t - shift, 0.15) for shift in np.linspace(-0.6, 0.6, 2401)], axis=0)
+    np.testing.assert_allclose(ramp_of_gantry(t, 0.15, 1.2), mean, atol=1e-3)  # 2400 points of a mean
+    np.testing.assert_array_equal(ramp_of_gantry(t, 0.15, 0.0), ramp(t, 0.15))
+    assert ramp_of_gantry(np.array([0.0, 0.3]), 0.15, 1.2) == pytest.approx([0.5, 0.75])
+    slow = reference(gantry_ramp_s=1.2, pause_s=1.8)
+    line = (slow.time_s > slow.start_s + 1) & (slow.time_s < slow.stop_s - 1)  # around the pause
+    np.testing.assert_allclose(slow.r[line], 0.304 * slow.speed[line], atol=1e-12)
+    assert np.abs(np.diff(slow.speed)).max() / TS == pytest.approx(8.0 / 1.2)
+    assert slow.r.sum() == pytest.approx(reference(pause_s=1.8).r.sum(), rel=1e-4)
 
 
 def test_a_ramp_longer_than_the_phase_before_the_start_is_refused():

@@ -190,3 +190,20 @@ def test_a_feed_that_is_a_slip_is_named_with_its_line():
         ValueError, match="expected at most 278 h, found .* h, of which line 2 takes .* s; check its F"
     ):
         motion.sampled(plan, moves, sample_time_s=0.02)
+
+
+def test_printed_moves_change_speed_no_faster_than_asked_and_rest_beside_travel():
+    text = "M83\nG91\nG1 X20 E1 F600\nG0 X20\nG1 X20 E1\nG1 Y20 E1\nG0 Y20"
+    moves, plan = planned(text, printing_acceleration=5.0)
+    prints = moves.kind == Kind.EXTRUDE
+    assert prints.tolist() == [True, False, True, True, False]
+    np.testing.assert_array_equal(plan.acceleration[prints], 5.0)
+    np.testing.assert_array_equal(plan.acceleration[~prints], A)
+    # straight on from printing to travel, where nothing else would slow it down
+    assert plan.exit[0] == plan.entry[1] == plan.exit[1] == plan.entry[2] == 0.0
+    # 10 mm/s need 10 mm each way: the first line just comes to its feed, in 2 s
+    assert plan.cruise[0] == pytest.approx(10.0) and plan.ramp_s[0, 0] == pytest.approx(2.0)
+    # the corner itself is the gantry's own
+    quick = planned(text)[1]
+    assert plan.exit[2] == pytest.approx(quick.exit[2]) and 0 < plan.exit[2] < 10
+    assert quick.exit[0] == pytest.approx(10.0)

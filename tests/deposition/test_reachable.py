@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from pipeline.deposition.reachable import nearest
+from pipeline.deposition.drive import UNLIMITED, Drive
+from pipeline.deposition.extruder import Extruder, routine
+from pipeline.deposition.reachable import LOSS, lost, nearest, nearest_response, ramp_that_loses_little
 
 
 def pulse(N):
@@ -54,6 +56,64 @@ def test_with_a_speed_it_is_within_reach_too_and_as_near_as_a_general_solver_get
     assert np.all(A @ x <= most)
     # the barrier stops within 4 N 1e-7 of the least cost, in its own unit of at most 1
     assert abs(np.sum((x - target) ** 2) / 2 - best.fun) <= 4 * N * 1e-7
+
+
+@pytest.mark.parametrize("wandering", [False, True])
+def test_any_linear_response_is_as_near_as_a_general_solver_gets(wandering):
+    """Two modes, as creep or a second lag has; and a pole that changes with time, as up and down apart."""
+    N, step = 50, 0.6
+    target = pulse(N) + 0.05 * np.random.default_rng(2).standard_normal(N)
+    if wandering:
+        pole = np.where(np.arange(N) % 20 < 10, 0.9, 0.8)
+        command, output = [1 / (1 - pole), -pole / (1 - pole)], [0.7, 0.3]
+    else:
+        command, output = np.poly([0.9, 0.7]).tolist(), [0.05, 0.02, -0.04]
+    A, B = (
+        sum(np.diag(np.broadcast_to(tap, N)[k:], -k) for k, tap in enumerate(taps))
+        for taps in (command, output)
+    )
+    bound = 1.5 if wandering else 2.0
+    S = A - np.vstack([np.zeros(N), A[:-1]])
+    rows, most = np.vstack([A, S, -A, -S]), np.tile(np.repeat([bound, step], N), 2)
+    z = nearest_response(target, np.zeros(N, bool), output=output, command=command, bound=bound, step=step)
+    assert np.all(rows @ z <= most) and np.isclose(np.abs(A @ z).max(), bound, rtol=1e-3)
+    # no direction that the limits leave open comes nearer: a bounded least squares on v = A z, projected
+    best = scipy.optimize.minimize(
+        lambda v: np.sum((B @ np.linalg.solve(A, v) - target) ** 2) / 2,
+        A @ z * 0.9,
+        jac=lambda v: np.linalg.solve(A.T, B.T @ (B @ np.linalg.solve(A, v) - target)),
+        method="SLSQP",
+        bounds=[(-bound, bound)] * N,
+        constraints={"type": "ineq", "fun": lambda v: step - np.abs(np.diff(v, prepend=0.0))},
+        options={"maxiter": 500, "ftol": 1e-12},
+    )
+    cost = np.sum((B @ z - target) ** 2) / 2
+    assert best.success and abs(cost - best.fun) <= 1e-3 * best.fun
+
+
+def test_the_ramp_that_loses_little_does_and_a_shorter_one_loses_more():
+    extruder, drive = Extruder(0.89, 4.5, yield_=0.1), Drive(10.0, 20.0, 0.05)
+
+    def ramp_s(steady_flow=2.432, drive=drive):
+        return ramp_that_loses_little(
+            extruder, drive, steady_flow=steady_flow, ramp_s=0.15, longest_s=5.0, sample_time_s=0.02
+        )
+
+    longer = ramp_s()
+    # a line as the training routine begins it; peak (1 + tau / ramp) x steady is the amplitude at 1.7 s
+    lines = [
+        routine(
+            off_s=9, on_s=6 + x, pause_s=9, tail_s=9, speed=8.0, bead_area_mm2=0.304, ramp_s=0.15,
+            gantry_ramp_s=x, sample_time_s=0.02,
+        ).r
+        for x in (longer, 0.8 * longer)
+    ]  # fmt: skip
+    assert 1.0 < longer < 1.7
+    losses = [lost(extruder, r, drive, 0.02) for r in lines]
+    assert losses[0] < 1.2 * LOSS < losses[1]
+    assert ramp_s(steady_flow=1.5) < 0.7 * longer  # slower printing needs less
+    assert ramp_s(drive=UNLIMITED) == 0.0
+    assert ramp_s(drive=Drive(2.5, 20.0, 0.0)) == np.inf  # not even the steady flow
 
 
 def test_a_speed_that_is_not_met_changes_nothing_that_counts_and_no_limits_nothing_at_all():

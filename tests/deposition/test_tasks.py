@@ -206,3 +206,16 @@ def test_a_halt_of_the_machine_in_the_middle_of_a_run_is_refused_with_its_line()
 def test_a_program_that_prints_nothing_is_refused():
     with pytest.raises(ValueError, match="tasks: expected lines that print but found none among 1 moves"):
         read("G21\nG90\nG0 X10 Y0 F480")
+
+
+def test_where_the_gantry_starts_slowly_a_line_begins_and_ends_in_the_middle_of_its_ramps():
+    text = "G21\nG90\nM83\nT0\nG0 X10 F480\nG1 X40 E1\nG0 X80\nG4 P3000"
+    program, quick, lines = read(text)
+    slow = plan(program.moves, **MACHINE, printing_acceleration=4.0)  # 8 mm/s in 2 s
+    later = printed_lines(program.moves, slow, **RULES)
+    assert lines.early_s.tolist() == lines.late_s.tolist() == [0.0]
+    assert later.early_s == pytest.approx([1.0]) and later.late_s == pytest.approx([1.0])
+    assert later.begin_s - slow.begin_s[lines.move] == pytest.approx([1.0])
+    # between the middles of its ramps the line is as long as without them
+    assert later.end_s - later.begin_s == pytest.approx(30.0 / 8.0)
+    assert lines.begin_s == pytest.approx(quick.begin_s[lines.move])

@@ -19,7 +19,7 @@ INVERSE = ilc.InverseSettings(identify_trials=3, floor=0.1, order=4, cutoff_hz=5
 SPEEDS, PAUSES = (8.0, 5.0), (0.6, 0.3)
 
 
-def protocol(speed=8.0, pause_s=0.6, ramp_s=RAMP, on_s=6):
+def protocol(speed=8.0, pause_s=0.6, ramp_s=RAMP, on_s=6, gantry_ramp_s=0.0):
     return routine(
         off_s=4,
         on_s=on_s,
@@ -28,6 +28,7 @@ def protocol(speed=8.0, pause_s=0.6, ramp_s=RAMP, on_s=6):
         speed=speed,
         bead_area_mm2=AREA,
         ramp_s=ramp_s,
+        gantry_ramp_s=gantry_ramp_s,
         sample_time_s=TS,
     )
 

@@ -256,8 +256,10 @@ def deposition_metrics():
     def law(ratio, **more):
         return {
             "ratio_trial_2": ratio,
+            "last_ratio": ratio,
             "best_ratio": ratio,
             "best_trial": 2,
+            "restarts": [],
             "trials": 2,
             "peak_over_steady": 20.0,
             "saturated": 0.0,
@@ -614,6 +616,7 @@ def _composed(time, wanted, scores):
         "peak_over_steady": 20.0,
         "share_percent": 0.0,
         "rms_percent_of_on_off": 0.1,
+        "least_percent": 0.0,
         "enough": True,
     }
     report = {

@@ -68,6 +68,19 @@ def test_the_composer_with_the_least_worst_error_is_named_with_its_figure_yardst
     )
 
 
+def test_the_last_error_decides_not_the_best_and_a_machine_that_changed_is_named(project):
+    metrics = made.deposition_metrics()["train_ilc"]
+    metrics["A"]["pixels"] |= {"last_ratio": 0.5, "best_ratio": 0.03, "restarts": [1]}
+    artifacts.write_metrics("train_ilc", metrics)
+    text = page()
+    assert "The error after learning is still 50 % of trial 0’s" in text
+    assert (
+        "Model inversion through pictures, material A: the machine changed at trial 1, and was learned anew."
+        in text
+    )
+    assert "Model inversion ends at A 2.0 %" in text and "The paper’s law ends at A 40 %" in text
+
+
 def test_where_the_simple_rule_is_as_good_it_wins(project):
     made.deposition(
         {
@@ -137,6 +150,7 @@ DRIVEN = {
     "peak_over_steady": 20.0,
     "share_percent": 12.0,
     "rms_percent_of_on_off": 40.0,
+    "least_percent": 38.0,
     "enough": False,
 }
 
@@ -147,11 +161,31 @@ def test_a_command_that_the_drive_cannot_follow_fails_with_its_limits_and_the_ra
     assert "First failed rule: the drive follows." in text
     assert (
         "square, material A, asks for 45 mm, 900 mm/s; the drive gives 10 mm, 20 mm/s, is at a limit 12 % of "
-        "the printing time" in text
+        "the printing time, and the best signal within it leaves 38 % of on‑off control’s flow error." in text
     )
-    assert "Ramps of 1.25 s would do (printer.ramp_s)." in text
+    assert "Ramps of 1.25 s would do (printer.longest_ramp_s)." in text
+    assert "40 % (38 %)" in text
     conformance(ramp_that_would_do_s={"A": None})
     assert "no ramp would do" in page()
+
+
+def test_where_the_drive_cannot_follow_a_signal_is_held_against_the_best_reachable(project):
+    """45 % is far above what is allowed where the drive follows; 38 % is the best that it leaves."""
+    for error, failed in ((45.0, 1), (46.0, 2)):
+        made.deposition(
+            {
+                "on_off": (100.0, None, 60.0),
+                "priority": (60.0, 55.0, 9.0),
+                "basis": (error, 40.0, 9.0),
+                "ilc": (error, None, 9.0),
+            }
+        )
+        conformance(saturation={"A": DRIVEN}, ramp_that_would_do_s={"A": 1.25})
+        text = page()
+        assert "Near the best reachable" in text and f"{error / 38:.2f} ×" in text
+        # the flow error itself is not asked for: the drive fails, and only then the signal
+        assert PAGE.read_text().count('<tr class="fail"><th scope="row"><a') == failed
+        assert "First failed rule: the drive follows." in text
 
 
 @pytest.mark.parametrize("source", ["simulated", "recordings"])

@@ -13,7 +13,7 @@ from pipeline.deposition import composition, conformance, drive, evaluation, ext
 from pipeline.deposition.composition import Composed, Learned, PartSettings, Stream
 from pipeline.deposition.conformance import Conformance
 from pipeline.deposition.evaluation import Judging, Score
-from pipeline.deposition.workflow import laws, part_programs
+from pipeline.deposition.workflow import laws, part_motion, part_programs
 from pipeline.deposition.workflow.segment_library import finite_or_none
 from pipeline.deposition.workflow.settings import ComposeParts, Printer, TrainIlc
 from pipeline.deposition.workflow.tables import LINES, SCORES, SIGNALS, TASKS
@@ -123,12 +123,7 @@ def compose(
     program = part_programs.read(path, asked)
     extruded = part_programs.extruded(program, printer, asked)
     with artifacts.about(path):
-        planned = motion.plan(
-            program.moves, acceleration=printer.acceleration_mm_per_s2,
-            junction_deviation_mm=printer.junction_deviation_mm,
-            speed_limit=printer.gantry_speed_limit_mm_per_s, unset_feed=printer.speed_mm_per_s,
-            tool_change_s=printer.tool_change_s,
-        )  # fmt: skip
+        planned = part_motion.planned(program.moves, printer, learned)
         part_settings = PartSettings(
             printer.nozzle_mm,
             printer.bead_area_mm2,
@@ -150,8 +145,10 @@ def compose(
             drive=printer.limits,
             shortest_s=settings.shortest_s,
             largest_error_percent=settings.largest_error_percent,
-            refusals=program.refusals,
         )
+        if not all(one.enough for one in report.saturation.values()):
+            ramp_s = part_motion.ramp_that_would_do(program.moves, printer, learned)
+            report = report._replace(ramp_that_would_do_s=dict.fromkeys(report.saturation, ramp_s))
         report = part_programs.in_percent(
             report, program.moves, composed, shortest_s=settings.shortest_s,
             least_mm3=printer.bead_area_mm2 * printer.nozzle_mm,
@@ -169,6 +166,12 @@ def summary_lines(part: Part) -> str:
         f"{duration:.1f} s; "
         f"the gantry sets out {composed.lead_in_s:.2f} s after the signal"
     )
+    slow = part_motion.slowed_to(part.planned, part.program.moves)
+    if slow is not None:
+        text.append(
+            f"for the drive, printed lines begin and end at rest and change speed at {slow:.3g} mm/s^2: "
+            f"run the gantry so (M204 P{slow:.3g}), as the signal was made for it"
+        )
     for stream in composed.streams:
         text.append(forecast_sentence(composed, stream))
         sat = checks.saturation[stream.tool]
@@ -195,7 +198,8 @@ def summary_lines(part: Part) -> str:
             f"{int(np.sum(lines.shorter_than_lead))} lines belong to runs shorter than the lead of Stop: "
             "the priority rule would not print them"
         )
-    text += part_programs.summary(part.program, part.extruded, part.printer) + part_programs.refused(checks)
+    text += part_programs.summary(part.program, part.extruded, part.printer)
+    text += part_programs.refused(checks, part.program)
     return "\n".join(text)
 
 
@@ -287,12 +291,16 @@ def reports(done: Sequence[tuple[Part, Sequence[Score]]], refused: dict[str, str
 def report(part: Part) -> dict[str, Any]:
     """What the conformance report says, as JSON."""
     checks, composed = part.conformance, part.composed
-    lines, refused = checks.lines, [one._asdict() for one in checks.refused]
+    lines, refused = (
+        checks.lines,
+        [one._asdict() for one in part_programs.grouped(checks, part.program.refusals)],
+    )
     return {
         "lines_of_the_program": part.program.lines,
         "printed_lines": len(lines.line),
         "runs": int(composed.lines.run[-1]) + 1,
         "duration_s": len(composed.streams[0].r) * composed.sample_time_s,
+        "printing_acceleration_mm_per_s2": part_motion.slowed_to(part.planned, part.program.moves),
         "worst_line_volume_percent": finite_or_none(checks.worst_line_volume_percent),
         "judged_lines": checks.judged,
         "shorter_than_lead": int(np.sum(lines.shorter_than_lead)),
@@ -329,6 +337,7 @@ def figures(judged: Sequence[tuple[Part, Sequence[Score]]]) -> dict[str, Any]:
             stream.material: _by_composer([score for score in scores if score.stream == i])
             | _forecast(part.composed, stream, [score for score in scores if score.stream == i])
             | _asked(stream, part.composed.sample_time_s)
+            | {"least_reachable_percent": part.conformance.saturation[stream.tool].least_percent}
             for i, stream in enumerate(part.composed.streams)
         }
         for part, scores in judged

@@ -1,14 +1,16 @@
 """Sections `printer` and `camera` of the parameters: the deposition loop's
 machine, its materials, and what looks at the bead."""
 
+import math
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import pydantic
 from pydantic import Field
 
-from pipeline.deposition import drive
-from pipeline.deposition.extruder import Routine, routine
-from pipeline.store.params import Section
+from pipeline.deposition import drive, reachable
+from pipeline.deposition.extruder import Extruder, Routine, routine
+from pipeline.store.params import Mapped, Section
 
 
 class Material(Section):
@@ -49,6 +51,7 @@ class Printer(Section):
     bead_area_mm2: float = Field(gt=0, le=100)
     speed_mm_per_s: float = Field(gt=0, le=1000)
     ramp_s: float = Field(gt=0, le=60)
+    longest_ramp_s: float | None = Field(default=None, gt=0, le=60)
     drive: Drive | None
     acceleration_mm_per_s2: float = Field(gt=0, le=1e6)
     junction_deviation_mm: float = Field(ge=0, le=10)
@@ -83,28 +86,78 @@ class Printer(Section):
         """Wanted flow of a line at full speed, mm^3/s."""
         return self.bead_area_mm2 * self.speed_mm_per_s
 
+    @property
+    def nominals(self) -> list[Extruder]:
+        """The materials' extruders as known beforehand."""
+        return [Extruder(one.gain_mm3_per_s_per_mm, one.time_constant_s) for one in self.materials]
+
+    def slow_s(self, extruders: Sequence[Extruder], speed_mm_per_s: float, longest_s: float) -> float:
+        """Seconds in which the gantry may reach a printing speed such that the drive follows the flow of each
+        of the extruders (`reachable.ramp_that_loses_little`), in whole hundredths; at most longest_s."""
+        ramps = [
+            reachable.ramp_that_loses_little(
+                extruder, self.limits, steady_flow=self.bead_area_mm2 * speed_mm_per_s, ramp_s=self.ramp_s,
+                longest_s=longest_s, sample_time_s=self.sample_time_s,
+            )
+            for extruder in extruders
+        ]  # fmt: skip
+        longest = min(max(ramps), longest_s)
+        return min(math.ceil(100 * longest) / 100, longest_s)
+
     def trained(self) -> list[Routine]:
-        """The training routines: the reference, on which laws are compared, and those of the library."""
+        """The training routines: the reference, on which laws are compared, and those of the library. Where
+        the drive asks for longer ramps of the gantry, it rests as long in the pause, between them."""
+        trainings = [self.reference, *self.routines]
+        fastest = max(t.speed_mm_per_s for t in trainings)
+        # the pause is longer by this at all speeds, so that these are compared at one pause
+        longer_s = (
+            0.0 if self.longest_ramp_s is None else self.slow_s(self.nominals, fastest, self.longest_ramp_s)
+        )
+        slow_s = [round(longer_s * t.speed_mm_per_s / fastest, 9) for t in trainings]
         return [
             routine(
-                off_s=t.off_s, on_s=t.on_s, pause_s=t.pause_s, tail_s=t.tail_s, speed=t.speed_mm_per_s,
-                bead_area_mm2=self.bead_area_mm2,
-                ramp_s=self.ramp_s, sample_time_s=self.sample_time_s,
+                off_s=t.off_s, on_s=t.on_s, pause_s=round(t.pause_s + longer_s, 9), tail_s=t.tail_s,
+                speed=t.speed_mm_per_s, bead_area_mm2=self.bead_area_mm2,
+                ramp_s=self.ramp_s, gantry_ramp_s=slow, sample_time_s=self.sample_time_s,
             )
-            for t in [self.reference, *self.routines]
+            for t, slow in zip(trainings, slow_s, strict=True)
         ]  # fmt: skip
+
+
+class TrialTopics(Section):
+    """Topics of a machine's own recordings of trials: the camera's (empty: the only one), the clock
+    (log_time, publish_time, or a stamp's field), and the mapping of our signals."""
+
+    image: str = Field(max_length=300)
+    time: str = Field(max_length=300)
+    mapping: dict[str, Mapped]
+
+
+Pixel = Annotated[float, Field(ge=-100_000, le=100_000)]
 
 
 class Camera(Section):
     """Section `camera`: where it looks, how it was calibrated, and,
-    for simulated trials, how hard the pictures are."""
+    for simulated trials, how hard the pictures are.
+
+    A picture is turned by rotation_deg, so that this direction of it runs along the columns, and put with
+    tip_px upon nozzle_column, before it is measured. edge_bias_px is by how much beads of known_widths_mm
+    look wider than they are.
+    """
 
     frames_per_s: float = Field(gt=0, le=1000)
     mm_per_px: float = Field(gt=-10, lt=10)
+    rotation_deg: float | None = Field(ge=-360, le=360)
+    tip_px: list[Pixel] | None = Field(min_length=2, max_length=2)
     nozzle_column: float = Field(ge=-10_000, le=10_000)
     columns: list[Annotated[int, Field(ge=0, le=10_000)]] = Field(min_length=2, max_length=2)
+    mask_px: list[Annotated[list[Pixel], Field(min_length=2, max_length=2)]] = Field(max_length=100)
+    bead: Literal["light", "dark", ""]
     contact_angle_deg: float = Field(gt=0, lt=180)
     known_widths_mm: list[Annotated[float, Field(gt=0, le=100)]] = Field(min_length=3, max_length=20)
+    edge_bias_px: list[Annotated[float, Field(ge=-50, le=50)]] = Field(max_length=20)
+    latency_s: float | None = Field(ge=-1, le=1)
+    topics: TrialTopics
     width_deviation_mm: float = Field(ge=0, le=10)
     longest_blur_px: float = Field(gt=0, le=50)
     unreadable_share: float = Field(ge=0, le=1)
@@ -123,7 +176,22 @@ class Camera(Section):
                 f"has columns {self.columns[0]} to {self.columns[1]}; give the first and, behind it, "
                 "the last that is measured"
             )
+        if self.edge_bias_px and len(self.edge_bias_px) != len(self.known_widths_mm):
+            raise ValueError(
+                f"has {len(self.edge_bias_px)} edge_bias_px for {len(self.known_widths_mm)} known_widths_mm; "
+                "give one each, or [] where the camera is not calibrated"
+            )
+        if any(
+            wider <= width
+            for width, wider in zip(self.known_widths_mm, self.known_widths_mm[1:], strict=False)
+        ):
+            raise ValueError("has known_widths_mm that do not grow; sort them, edge_bias_px with them")
         return self
+
+    @property
+    def nozzle_radius_px(self) -> float:
+        """From the tip on so much of the line is hidden, px: measured columns begin there."""
+        return max(abs(self.columns[0] - self.nozzle_column), 0.0)
 
 
 # ---- a section a stage

@@ -389,6 +389,7 @@ class Forecast(NamedTuple):
     limit: str
     share: str
     bad: bool
+    error: str
     ramp: str
 
 
@@ -434,8 +435,14 @@ def _forecast(part: str, material: str, report: dict[str, Any]) -> Forecast:
         limit="not declared" if asked.limit() == "declared" else asked.limit(),
         share=percent(asked.share, 2),
         bad=not asked.enough,
+        error=_beside(drive.get("rms_percent_of_on_off"), drive.get("least_percent")),
         ramp=remedy,
     )
+
+
+def _beside(error: float | None, least: float | None) -> str:
+    """A flow error, and in brackets the least that any command within the drive leaves."""
+    return "" if error is None else percent(error, 2) + ("" if least is None else f" ({percent(least, 2)})")
 
 
 def _told(forecast: dict[str, Any] | None) -> tuple[str, str, str]:

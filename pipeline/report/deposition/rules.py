@@ -29,6 +29,8 @@ OURS, LIBRARY = "basis", "priority"
 # the rule that stays open on any machine until its drive is declared
 DRIVE = "The drive follows"
 FLOW = "Flow error"
+# where it does not, a signal may leave so many times the least error that any command within it leaves
+NEAR_THE_BEST = 1.2
 # simplest first
 COMPOSERS = ("on_off", "priority", "superposition", "basis")
 NAMES = {
@@ -189,14 +191,18 @@ Pair = tuple[Rule, Rule]
 
 
 def rules(sources: Sources, parts: Sequence[Structure]) -> tuple[Pair, ...]:
-    asked = sources.declared.rules
+    """The drive first. Where it cannot follow, a signal is held against the best that any command could reach
+    within it, elsewhere against the flow that is wanted."""
+    asked, bound = sources.declared.rules, _bound(sources)
+    followed = [part for part in parts if (part.part, part.material) not in bound]
     return (
-        _flow(parts, asked.flow_error_percent),
-        _line(parts, asked.line_volume_percent),
+        _drive(sources),
+        *([_near(parts, bound)] if bound else []),
+        _flow(followed, asked.flow_error_percent),
+        _line(followed, asked.line_volume_percent),
         _above(parts, asked.above_whole_points),
         _learning(sources),
         _convergence(sources),
-        _drive(sources),
         _printed(sources),
     )
 
@@ -310,7 +316,9 @@ def _most_above(parts: Sequence[Structure], name: str) -> tuple[float, Structure
 def _learning(sources: Sources) -> Pair:
     limit, shares = sources.declared.rules.learned_percent, []
     for laws in (("pixels", "model_inverse"), ("hoelzle_2009",)):
-        ratios = next((ratios for law in laws if (ratios := _each(sources, f"{law}.best_ratio"))), None)
+        # metrics of before name the best alone
+        keys = [f"{law}.{which}_ratio" for law in laws for which in ("last", "best")]
+        ratios = next((ratios for key in keys if (ratios := _each(sources, key))), None)
         shares.append(None if ratios is None else 100 * max(ratios))
     texts = [OPEN if share is None else percent(share, 2) for share in shares]
     rule = _at_most(
@@ -427,16 +435,65 @@ def _drive(sources: Sources) -> Pair:
         )
         return _pair(rule, [Missing(OPEN, "")] * 2, [worst.text()] * 2)
     ramp = conformance[worst.part].get("ramp_that_would_do_s", {}).get(worst.material)
+    least = _bound(sources).get((worst.part, worst.material))
+    best = (
+        "no signal can make up for it"
+        if least is None
+        else (f"the best signal within it leaves {percent(least, 2)} of on\u2011off control’s flow error")
+    )
     rule = rule._replace(
         reason=(
             f"{place}, asks for {worst.text()}; the drive gives {worst.limit()}, is at a limit "
-            f"{percent(worst.share, 2)} of the printing time, and no signal can make up for it."
+            f"{percent(worst.share, 2)} of the printing time, and {best}."
         ),
         remedy="Print slower, or take a stronger drive (printer.drive): no ramp would do."
         if ramp is None
-        else f"Ramps of {ramp:.2f}{THIN}s would do (printer.ramp_s).",
+        else f"Ramps of {ramp:.2f}{THIN}s would do (printer.longest_ramp_s).",
     )
     return _pair(rule, [count_of(sum(not stream.enough for stream in streams))] * 2, [worst.text()] * 2)
+
+
+def _bound(sources: Sources) -> dict[tuple[str, str], float]:
+    """The least error in % of on-off control's that any command leaves, by part and material, of the streams
+    that the drive cannot follow."""
+    conformance = sources.tables["conformance"]
+    if isinstance(conformance, Missing):
+        return {}
+    return {
+        (part, material): float(saturation["least_percent"])
+        for part, report in conformance.items()
+        for material, saturation in report.get("saturation", {}).items()
+        if not saturation["enough"] and saturation.get("least_percent") is not None
+    }
+
+
+def _near(parts: Sequence[Structure], bound: Mapping[tuple[str, str], float]) -> Pair:
+    """Where the drive cannot follow: the error over the least that any command within it leaves."""
+    pairs = []
+    for name in (OURS, LIBRARY):
+        ratios = [
+            (part.scores[name].error / max(bound[part.part, part.material], 1e-9), part)
+            for part in parts
+            if (part.part, part.material) in bound and name in part.scores
+        ]
+        pairs.append(max(ratios, key=lambda pair: pair[0], default=None))
+    ours = pairs[0]
+    rule = _at_most(
+        "Near the best reachable",
+        NEAR_THE_BEST,
+        limit=f"≤ {NEAR_THE_BEST:g} ×",
+        place="saturation",
+        reason=""
+        if ours is None
+        else (
+            f"{where(ours[1])} keeps {percent(ours[1].scores[OURS].error, 2)} of on\u2011off control’s flow "
+            f"error, and the best command within the drive "
+            f"{percent(bound[ours[1].part, ours[1].material], 2)}."
+        ),
+        remedy="Learn that part itself, or run more trials.",
+    )
+    texts = [OPEN if pair is None else f"{number(pair[0], 2)} ×" for pair in pairs]
+    return _pair(rule, [_measured(pair) for pair in pairs], texts)
 
 
 def _printed(sources: Sources) -> Pair:
@@ -462,4 +519,4 @@ def _printed(sources: Sources) -> Pair:
 def _listed(refused: Any) -> list[str]:
     if isinstance(refused, str):
         return [refused]
-    return [f"line {line['line']}, {line['why']}" for line in refused]
+    return [f"line {line['line']}, {line['why']}" for line in refused for _ in range(line.get("count", 1))]
