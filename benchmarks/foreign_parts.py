@@ -166,8 +166,11 @@ def one(kind: str, number: int, material: str) -> list[dict]:
 
 
 def judged(plant: Plant, trainings: list[Training], kind: str, material: str) -> list[dict]:
-    """Both parts, learned from the trainings and printed by the plant."""
-    learned = learn(trainings, sample_time_s=TS)
+    """Both parts, learned from the trainings and printed by the plant; where nothing is learned, why."""
+    try:
+        learned = learn(trainings, sample_time_s=TS)
+    except ValueError as error:
+        return [{"kind": kind, "material": material, "refused": str(error)}]
     structure = "+".join(learned.materials[0].chain.structure)
     rows = []
     for part in PARTS:
@@ -187,7 +190,10 @@ def share(rows: list[dict], of: list[dict]) -> float | None:
 
 
 def summary(rows: list[dict]) -> dict:
-    """By kind, and the bars of the issue over the foreign kinds and the family."""
+    """By kind, and the bars of the issue over the foreign kinds and the family; plants of which nothing was
+    learned are counted apart."""
+    refused = [row for row in rows if "refused" in row]
+    rows = [row for row in rows if "refused" not in row]
     by_kind = {}
     for kind in dict.fromkeys(row["kind"] for row in rows):
         mine = [row for row in rows if row["kind"] == kind]
@@ -205,7 +211,7 @@ def summary(rows: list[dict]) -> dict:
             if told
             else None,
         }  # fmt: skip
-    return {"by_kind": by_kind, "bars": bars(rows)}
+    return {"refused": refused, "by_kind": by_kind, "bars": bars(rows)}
 
 
 def bars(rows: list[dict]) -> dict:
