@@ -166,8 +166,11 @@ def one(kind: str, number: int, material: str) -> list[dict]:
 
 
 def judged(plant: Plant, trainings: list[Training], kind: str, material: str) -> list[dict]:
-    """Both parts, learned from the trainings and printed by the plant."""
-    learned = learn(trainings, sample_time_s=TS)
+    """Both parts, learned from the trainings and printed by the plant; where nothing is learned, why."""
+    try:
+        learned = learn(trainings, sample_time_s=TS)
+    except ValueError as error:
+        return [{"kind": kind, "material": material, "refused": str(error)}]
     structure = "+".join(learned.materials[0].chain.structure)
     rows = []
     for part in PARTS:
@@ -177,18 +180,20 @@ def judged(plant: Plant, trainings: list[Training], kind: str, material: str) ->
     return rows
 
 
-def within(rows: list[dict]) -> float:
-    """Share in % of rows whose true error lies in its interval."""
-    inside = [row["low"] <= row["true"] <= row["high"] for row in rows]
-    return round(100 * float(np.mean(inside)), 1) if rows else float("nan")
+def within(rows: list[dict]) -> float | None:
+    """Share in % of rows whose true error lies in its interval; None without rows."""
+    return share([row for row in rows if row["low"] <= row["true"] <= row["high"]], rows)
 
 
-def share(rows: list[dict], of: list[dict]) -> float:
-    return round(100 * len(rows) / len(of), 1) if of else float("nan")
+def share(rows: list[dict], of: list[dict]) -> float | None:
+    return round(100 * len(rows) / len(of), 1) if of else None
 
 
 def summary(rows: list[dict]) -> dict:
-    """By kind, and the bars of the issue over the foreign kinds and the family."""
+    """By kind, and the bars of the issue over the foreign kinds and the family; plants of which nothing was
+    learned are counted apart."""
+    refused = [row for row in rows if "refused" in row]
+    rows = [row for row in rows if "refused" not in row]
     by_kind = {}
     for kind in dict.fromkeys(row["kind"] for row in rows):
         mine = [row for row in rows if row["kind"] == kind]
@@ -198,14 +203,15 @@ def summary(rows: list[dict]) -> dict:
             for part in PARTS
             for name in ("true", "low", "median", "high")
         }
-        lines = float(np.mean([row["lines_within"] for row in told])) if told else float("nan")
         by_kind[kind] = table | {
             "dashes_true_worst": round(max(row["true"] for row in mine if row["part"] == "dashes"), 2),
             "covered_percent": within(told),
             "not_judged_percent": share([r for r in mine if not r["judged"]], mine),
-            "lines_covered_percent": round(100 * lines, 1),
+            "lines_covered_percent": round(100 * float(np.mean([row["lines_within"] for row in told])), 1)
+            if told
+            else None,
         }  # fmt: skip
-    return {"by_kind": by_kind, "bars": bars(rows)}
+    return {"refused": refused, "by_kind": by_kind, "bars": bars(rows)}
 
 
 def bars(rows: list[dict]) -> dict:

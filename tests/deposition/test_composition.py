@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.deposition import basis, gcode
+from pipeline.deposition import basis, evaluation, gcode, ilc, training
 from pipeline.deposition.composition import (
     BASIS,
     PRIORITY,
@@ -17,13 +17,17 @@ from pipeline.deposition.composition import (
     priority,
     superposition,
 )
+from pipeline.deposition.conformance import conform
 from pipeline.deposition.drive import UNLIMITED, Drive, follows, obeyed
 from pipeline.deposition.library import Basis, Library
 from pipeline.deposition.library import learned as learned_command
 from pipeline.deposition.motion import plan
+from pipeline.deposition.workflow import compose_parts
 from tests.deposition.trained import (
     AREA,
     CREEPING,
+    INVERSE,
+    NOMINAL,
     NOZZLE,
     PLANT,
     RAMP,
@@ -58,6 +62,9 @@ def composed(text, plant=PLANT, materials=None, **changes):
 
 def of_part(name, plant=PLANT, **changes):
     return composed((PARTS / f"{name}.gcode").read_text(), plant, **changes)
+
+
+LAWS = training.LawSettings(TS, UNLIMITED, ilc.HoelzleSettings(0.25, 0.03, 2, 3.0), INVERSE, 0.1)
 
 
 # ---- errors on structures that were not trained (issue's bars beside them)
@@ -261,3 +268,31 @@ def test_a_program_that_would_jump_from_steady_state_to_no_flow_is_refused_with_
         ),
     ):
         compose(learned(PLANT), program, motion, PART, materials={0: "A", 1: "B"})
+
+
+def test_on_a_machine_whose_flow_nobody_knows_a_composer_scores_the_upper_end_of_its_forecast():
+    made = of_part("dashes")
+    plain = evaluation.Judging({"A": NOMINAL}, {}, LAWS, training.Noise(0, 0, 0), 1, AREA, 0.4)
+    scores = evaluation.evaluate(learned(PLANT), made, plain, np.random.default_rng(0))
+    told = {prediction.composer: prediction for prediction in made.predictions}
+    assert {score.composer for score in scores} == {"on_off", *told}
+    for score in scores[1:]:
+        assert score.rms_percent_of_on_off == told[score.composer].high > score.predicted_percent
+    # and the line furthest off is that of the interval, not that of the chain that made the command
+    checks = conform(
+        made, learned(PLANT), bead_area_mm2=AREA, ramp_s=RAMP, drive=UNLIMITED, shortest_s=0.4,
+        largest_error_percent=20.0,
+    )  # fmt: skip
+    ends = np.abs([checks.lines.low_percent, checks.lines.high_percent]).max()
+    assert np.all(checks.lines.low_percent <= checks.lines.high_percent)
+    part = compose_parts.Part("dashes", None, None, made, checks, None, None)
+    chosen = next(score for score in compose_parts.upper_ends(part, scores, plain) if score.chosen)
+    assert chosen.worst_line_volume_percent == ends > checks.worst_line_volume_percent
+
+
+def test_the_composer_with_the_least_upper_end_is_chosen():
+    for name in ("fig9", "dashes"):
+        told = of_part(name).predictions
+        for material in {prediction.material for prediction in told}:
+            mine = [prediction for prediction in told if prediction.material == material]
+            assert [one for one in mine if one.chosen] == [min(mine, key=lambda one: one.high)]

@@ -229,6 +229,47 @@ def test_the_figures_of_a_real_machine_are_said_to_be_forecasts(project):
     assert "NaN" not in text and "nan" not in text.lower().split()
 
 
+def unjudged():
+    told = artifacts.read_json(FOLDER / "conformance.json")["square"]["forecast"]["A"]
+    reason, trial = "the part prints at 100 mm/s", "add a training routine"
+    conformance(forecast={"A": told | {"judged": False, "reason": reason, "trial": trial}})
+
+
+def test_a_forecast_is_shown_as_its_interval_and_never_as_its_middle(project):
+    text = page()
+    assert "forecast 0.40 % to 3.1 %" in text and "forecast 10 % to 14 %" in text
+    assert "forecast 2.5" not in text and "forecast 11" not in text
+    conformance(forecast={})  # of a version that knew no interval: no bare number
+    assert "forecast 2.5" not in page()
+
+
+def test_a_forecast_that_is_not_judged_says_so_with_its_reason_and_trial(project):
+    unjudged()
+    text = page()
+    assert "forecast not judged" in text and "forecast 0.40" not in text
+    assert "the part prints at 100 mm/s; to judge it, add a training routine" in text
+    # the true flow of a simulated machine is known all the same
+    assert "Rehearsal passed" in text
+
+
+def test_on_a_real_machine_a_part_that_is_not_judged_leaves_the_rule_open(project):
+    sections = params.read("params.yaml")
+    sections["train_ilc"]["source"] = "recordings"
+    Path("params.yaml").write_text(yaml.safe_dump(sections))
+    made.deposition({"on_off": (100.0, None, 60.0), "priority": (12.0, 12.0, 9.0), "basis": (2.0, 2.0, 1.0)})
+    assert "Ready for a supervised trial" in page()
+    unjudged()
+    text = page()
+    assert "Ready for a supervised trial" not in text
+    assert "is not judged: the part prints at 100 mm/s." in text
+
+
+def test_what_was_measured_of_a_print_stands_beside_its_forecast(project):
+    told = artifacts.read_json(FOLDER / "conformance.json")["square"]["forecast"]["A"]
+    conformance(forecast={"A": told | {"measured_percent": 2.2}})
+    assert "0.40 % to 3.1 % measured 2.2 %" in page()
+
+
 @pytest.mark.parametrize("path", ARTIFACTS)
 @pytest.mark.parametrize("how", ["missing", "broken"])
 def test_what_is_missing_or_broken_is_said_in_its_place(project, path, how):

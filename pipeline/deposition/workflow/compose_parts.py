@@ -82,9 +82,24 @@ def judged(
     )
     rng = np.random.default_rng(settings.seed)
     return [
-        (part, evaluation.evaluate(learned, part.composed, judging, rng))
+        (part, upper_ends(part, evaluation.evaluate(learned, part.composed, judging, rng), judging))
         for part in tqdm(parts, desc="compose_parts: parts", mininterval=2)
     ]
+
+
+def upper_ends(part: Part, scores: Sequence[Score], judging: Judging) -> list[Score]:
+    """The scores; of a machine whose true flow nobody knows the worst line of the chosen composer is the
+    farther end of its interval, for the flow of the chain that made the command is no measure of it."""
+    lines, streams = part.conformance.lines, part.composed.streams
+    long_enough = lines.duration_s >= judging.shortest_s - 1e-9
+    ends = np.maximum(np.abs(lines.low_percent), np.abs(lines.high_percent))
+    out = []
+    for score in scores:
+        mine = long_enough & (lines.tool == streams[score.stream].tool)
+        real = score.chosen and streams[score.stream].material not in judging.plants
+        worst = float(ends[mine].max()) if real and mine.any() else score.worst_line_volume_percent
+        out.append(score._replace(worst_line_volume_percent=worst))
+    return out
 
 
 # ---- one part

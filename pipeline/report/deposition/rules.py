@@ -28,6 +28,7 @@ SAME = 0.5
 OURS, LIBRARY = "basis", "priority"
 # the rule that stays open on any machine until its drive is declared
 DRIVE = "The drive follows"
+FLOW = "Flow error"
 # where it does not, a signal may leave so many times the least error that any command within it leaves
 NEAR_THE_BEST = 1.2
 # simplest first
@@ -226,7 +227,7 @@ def _measured(pair: tuple[float, Any] | None) -> Figure | Missing:
 def _flow(parts: Sequence[Structure], limit: float) -> Pair:
     pairs = [worst(parts, name) for name in (OURS, LIBRARY)]
     rule = _at_most(
-        "Flow error",
+        FLOW,
         limit,
         limit=f"≤ {limit:g}{THIN}%",
         place="scoreboard",

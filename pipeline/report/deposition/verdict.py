@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pipeline.report.deposition.rules import (
     COMPOSERS,
     DRIVE,
+    FLOW,
     OURS,
     SAME,
     USE,
@@ -61,9 +62,10 @@ def verdict(sources: Sources) -> Verdict:
     asked = [line[column] for line in lines if use == OURS or line[column].name not in OF_THE_LAW]
     unjudged = [rule for rule in asked if rule.state == UNJUDGED]
     judged = [rule for rule in asked if rule.state != UNJUDGED]
-    # what cannot be measured on a machine's own trials does not hold them up; a drive can be declared
+    # what cannot be measured on a machine's own trials does not hold them up; a drive can be declared, and a
+    # forecast that is not judged has a trial that judges it
     state = overall(
-        [rule.state for rule in judged if not machine or rule.state != OPEN or rule.name == DRIVE]
+        [rule.state for rule in judged if not machine or rule.state != OPEN or rule.name in (DRIVE, FLOW)]
     )
     state = FAILED if use == "on_off" else state
     first = None if state == PASSED else deciding(judged)

@@ -241,7 +241,9 @@ FIXED = {
     ),
     "forecast": (
         "Forecast",
-        "What the identified chain predicts before anything is printed. "
+        "The 90 % interval of what may come out, before anything is printed: of the chains that the trials "
+        "cannot tell apart, with what they missed on routines left out. Not judged: the trials do not tell; "
+        "the reason and the trial that would tell stand beside it. "
         "True figures come from a simulated machine that nothing was fitted to.",
     ),
     "lead": (
