@@ -27,6 +27,7 @@ from pipeline.deposition.composition import (
     superposition,
 )
 from pipeline.deposition.conformance import conform, line_volumes, saturation
+from pipeline.deposition.drive import UNLIMITED, Drive, obeyed
 from pipeline.deposition.extruder import Extruder, disturb, draw, flow, routine
 from pipeline.deposition.library import CORNER, NO_FLOW, START, STEADY, STOP, Training
 from pipeline.deposition.motion import plan
@@ -46,7 +47,7 @@ MACHINE = {
     "unset_feed": 8.0,
     "tool_change_s": 2.0,
 }
-PART = PartSettings(NOZZLE, AREA, RAMP, corner_deg=30.0, longest_pause_s=1.0, limit=np.inf)
+PART = PartSettings(NOZZLE, AREA, RAMP, corner_deg=30.0, longest_pause_s=1.0, drive=UNLIMITED)
 BARS = {
     "tic_tac_toe": (3.0, 5.0),
     "dashes": (6.0, 6.0),
@@ -91,15 +92,19 @@ def forbidden(tasks: Sequence[str], tools: Sequence[int]) -> np.ndarray:
 
 
 def learned_trials(
-    plant: Extruder, nominal: Extruder, r: np.ndarray, rng: np.random.Generator, *, limit: float = np.inf
+    plant: Extruder, nominal: Extruder, r: np.ndarray, rng: np.random.Generator, *, drive: Drive = UNLIMITED
 ) -> list[ilc.Trial]:
-    law = ilc.InverseLaw(r, INVERSE, limit=limit, sample_time_s=TS)
+    law = ilc.InverseLaw(r, INVERSE, drive=drive, sample_time_s=TS)
 
     def measure(u):
-        y = flow(plant, u, sample_time_s=TS, limit=limit)
-        return ilc.Trial(np.clip(u, -limit, limit), disturb(y, rng, steady_flow=float(r.max()), **NOISE), y)
+        y = flow(plant, u, sample_time_s=TS, drive=drive)
+        return ilc.Trial(
+            obeyed(u, drive, sample_time_s=TS), disturb(y, rng, steady_flow=float(r.max()), **NOISE), y
+        )
 
-    return ilc.learn(law, measure, np.clip(r / nominal.gain, -limit, limit), r, trials=UPDATES, rise=0.1)
+    return ilc.learn(
+        law, measure, obeyed(r / nominal.gain, drive, sample_time_s=TS), r, trials=UPDATES, rise=0.1
+    )
 
 
 def train(plant: Extruder, name: str, rng: np.random.Generator) -> list[Training]:
@@ -173,7 +178,7 @@ def one(plant: Extruder, name: str, rng: np.random.Generator) -> dict[str, float
         for composer, u in commands.items():
             out[f"{structure}.{composer}"] = percent(plant, nominal, u, stream.r)
         for prediction in made.predictions:
-            out[f"{structure}.{prediction.composer}_predicted"] = prediction.rms_percent_of_on_off
+            out[f"{structure}.{prediction.composer}_predicted"] = prediction.median
         out[f"{structure}.over_ilc"] = out[f"{structure}.chosen"] - out[f"{structure}.ilc"]
         true = made._replace(streams=(stream._replace(y=flow(plant, stream.u, sample_time_s=TS)),))
         volumes = line_volumes(true, learned.library, bead_area_mm2=AREA)
@@ -255,17 +260,17 @@ def saturations(plants: int) -> dict:
                 on = protocol(8.0, 0.6, 1e-9)
                 r = basis.boxed(on, ramp_s, TS)
                 for times in (3.0, 5.0, 10.0, 20.0):
-                    limit = times * r.max() / nominal.gain
+                    drive = Drive(times * r.max() / nominal.gain, np.inf, 0.0)
                     predicted = saturation(
-                        extruder, on, on_off_gain=nominal.gain, ramp_s=ramp_s, limit=limit, sample_time_s=TS
+                        extruder, on, on_off_gain=nominal.gain, ramp_s=ramp_s, drive=drive, sample_time_s=TS
                     )
                     on_off = np.linalg.norm(
-                        flow(plant, np.clip(r / nominal.gain, -limit, limit), sample_time_s=TS) - r
+                        flow(plant, obeyed(r / nominal.gain, drive, sample_time_s=TS), sample_time_s=TS) - r
                     )
-                    u = basis.compose(extruder, r, sample_time_s=TS, limit=limit)
+                    u = basis.compose(extruder, r, sample_time_s=TS, drive=drive)
                     forecast = predicted.rms_percent_of_on_off
-                    same = 100 * np.linalg.norm(flow(plant, u, sample_time_s=TS, limit=limit) - r) / on_off
-                    trials = learned_trials(plant, nominal, r, rng, limit=limit)
+                    same = 100 * np.linalg.norm(flow(plant, u, sample_time_s=TS, drive=drive) - r) / on_off
+                    trials = learned_trials(plant, nominal, r, rng, drive=drive)
                     law = 100 * np.mean([np.linalg.norm(t.truth - r) for t in trials[-3:]]) / on_off
                     rows.append((name, ramp_s, times, forecast, float(same), float(law)))
     return {
@@ -320,7 +325,7 @@ def speed(learned: Learned) -> dict:
             learned,
             bead_area_mm2=AREA,
             ramp_s=RAMP,
-            limit=np.inf,
+            drive=UNLIMITED,
             shortest_s=0.4,
             largest_error_percent=20.0,
         )

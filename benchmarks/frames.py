@@ -21,6 +21,7 @@ import numpy as np
 
 from pipeline.deposition import ilc
 from pipeline.deposition.bead import Calibration, area, calibrate, measure, measure_all
+from pipeline.deposition.drive import UNLIMITED
 from pipeline.deposition.extruder import Extruder, disturb, draw, flow, routine
 from pipeline.deposition.flow import Flow, View, estimate, sections
 from pipeline.deposition.rendering import HARD, NOMINAL, Camera, Scene
@@ -237,9 +238,11 @@ def learned(name: str, plant: Extruder, scene: Scene, seed: int, trials: int) ->
         estimated = flow_through_camera(camera, laid, calibration)
         return ilc.Trial(u, np.where(estimated.observable, estimated.flow, np.nan), Q)
 
-    law = ilc.InverseLaw(R.r, INVERSE, limit=np.inf, sample_time_s=TS)
+    law = ilc.InverseLaw(R.r, INVERSE, drive=UNLIMITED, sample_time_s=TS)
     done = ilc.learn(law, run, R.r / MATERIALS[name].gain, R.r, trials=trials, rise=0.05)
-    rows = ilc.table(done, R.r, steady=NOMINAL_FLOW / MATERIALS[name].gain, limit=np.inf, rise=0.05)
+    rows = ilc.table(
+        done, R.r, steady=NOMINAL_FLOW / MATERIALS[name].gain, drive=UNLIMITED, sample_time_s=TS, rise=0.05
+    )
     ratios = [round(100 * row.ratio, 2) for row in rows]
     return ratios + [ratios[-1]] * (trials + 1 - len(ratios))
 

@@ -3,12 +3,17 @@ the clock; the gantry's plan on a long job.
 
 `./run python -m benchmarks.gcode` prints the figures beside their bars and writes
 benchmarks/results/gcode.json. The programs are made here, seeded: one path, written as each slicer writes it,
-with its start and end scripts; what they extrude and how far they print is known from the making. gcodeparser
-(group `peers`) reads the same text where it can. Times are CPU seconds, the best of five.
+with its start and end scripts; what they extrude and how far they print is known from the making. The tests'
+reader of one line at a time, which shares no code, reads the same text, as gcodeparser does (group `peers`)
+where it can. Times are CPU seconds, the best of five; jobs run in processes of their own, in seconds of the
+clock and MB above the imports. `beadline compose` needs the library of a finished run.
 """
 
 import importlib.util
 import json
+import subprocess
+import sys
+import tempfile
 import time
 import warnings
 from pathlib import Path
@@ -16,11 +21,35 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.deposition import gcode, motion
+from pipeline.deposition import extrusion, gcode, motion
 from pipeline.deposition.gcode import Kind
+from tests.deposition.reprap_reader import Reader
 
 RESULTS = Path(__file__).parent / "results" / "gcode.json"
-BARS = {"lines_per_s": 400_000, "refused_share": 1e-3, "extruded_error": 1e-3, "job_s": 0.7}
+BARS = {
+    "lines_per_s": 400_000, "refused_share": 1e-3, "extruded_error": 1e-3, "job_s": 0.7,
+    "reader_length_error": 1e-6, "reader_volume_error": 1e-3,
+    "compose_62k_s": 2.0, "compose_62k_mb": 250, "million_lines_mb": 600,
+}  # fmt: skip
+# a process of its own: seconds and MB of what it does, above those of its imports
+WATCHED = """
+import re, sys, time
+from pathlib import Path
+from pipeline import cli
+from pipeline.deposition import gcode, motion
+from pipeline.deposition.workflow import compose_parts, exports
+# of this process alone: the peak that getrusage tells began in its parent
+peak = lambda: int(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) / 1024
+imports, begin, cpu, path = peak(), time.perf_counter(), time.process_time(), sys.argv[2]
+if sys.argv[1] == "read":
+    program = gcode.parse(Path(path).read_bytes())
+    motion.plan(program.moves, acceleration=500.0, junction_deviation_mm=0.02, speed_limit=200.0,
+                unset_feed=25.0, tool_change_s=2.0)
+else:
+    sys.argv = ["beadline", "compose", path, "--out", sys.argv[3]]
+    cli.main()
+print(f"\\n{time.perf_counter() - begin:.2f} {time.process_time() - cpu:.2f} {peak() - imports:.0f} {peak():.0f}")
+"""
 LIMITS = {
     "acceleration": 500.0,
     "junction_deviation_mm": 0.02,
@@ -269,7 +298,62 @@ def read(name: str, dialect: Dialect, runs: int) -> dict:
         "length_error": float(abs(m.length[out].sum() / program.printed - 1)),
         "lines_per_s": round(program_read.lines / seconds),
     }
+    # the reader follows one letter or one pin; valves that open by words of their own are not RepRap's
+    if program_read.extruder == "E":
+        row |= by_reader(program.text, {})
     return row | peer(program, m)
+
+
+def by_reader(text: str, options: dict) -> dict:
+    """Our columns against the tests' reader: whether every line is accounted for alike, the largest relative
+    difference of a length, and of a volume by E."""
+    program, read = gcode.parse(text), Reader({0: 1.75, 1: 1.75}, **options).run(text)
+    m, classes = program.moves, program.accounted._asdict()
+    same = classes == {name: read.classes.count(name) for name in classes}
+    alike = m.line.tolist() == [row.line for row in read.rows]
+    if not alike:
+        return {"every_line_accounted": False}
+    length = np.array([row.length for row in read.rows])
+    volume = np.array([row.volume for row in read.rows])
+    ours = extrusion.volumes(program, {0: 1.75, 1: 1.75})
+    lettered = bool(program.extruder) and program.extruder.isalpha()
+    return {
+        "every_line_accounted": same,
+        "reader_length_error": float(np.max(np.abs(m.length - length) / np.maximum(length, 1e-3))),
+        "reader_volume_error": float(np.max(np.abs(ours - volume) / np.maximum(np.abs(volume), 1e-3)))
+        if lettered
+        else 0.0,
+    }
+
+
+def slicer_job(lines: int) -> str:
+    """Lines as a slicer writes them: legs of 1 mm at 20 mm/s, 120 to a run, E for a filament of 1.75 mm."""
+    rng = np.random.default_rng(5)
+    out, at = ["G21", "G90", "M83", "G28", "; filament_diameter = 1.75"], np.array([100.0, 100.0])
+    while len(out) < lines:
+        at = np.round(rng.uniform(20, 180, 2), 3)
+        out += [f"G1 X{at[0]:.3f} Y{at[1]:.3f} F4800", "G1 E.8 F1500", "G1 F1200"]
+        steps = np.round(rng.normal(0, 0.7, (120, 2)), 3)
+        e, path = np.hypot(*steps.T) * 0.304 / 2.405, np.cumsum(steps, axis=0) + at
+        out += [f"G1 X{x:.3f} Y{y:.3f} E{k:.5f}" for (x, y), k in zip(path.tolist(), e.tolist(), strict=True)]
+        out.append("G1 E-.8 F2100")
+    return "\n".join(out[:lines]) + "\n"
+
+
+def watched(what: str, text: str) -> dict:
+    """Seconds and MB of a process that reads, or composes, such a program."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "job.gcode"
+        path.write_text(text)
+        done = subprocess.run(
+            [sys.executable, "-c", WATCHED, what, str(path), folder],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+    names = ("seconds", "cpu_seconds", "mb_above_imports", "mb")
+    figures = map(float, done.stdout.split("\n")[-2].split())
+    return {"lines": text.count("\n"), **dict(zip(names, figures, strict=True))}
 
 
 def peer(program: Made, moves: gcode.Moves) -> dict:
@@ -344,11 +428,20 @@ def main() -> None:
     text = plain(400_000)
     _, seconds = best(lambda: gcode.parse(text))
     dialects = {name: read(name, dialect, runs=400) for name, dialect in DIALECTS.items()}
+    million = slicer_job(1_000_000)
     result = {
         "plain": {"lines": 400_000, "seconds": round(seconds, 3), "lines_per_s": round(400_000 / seconds)},
         "job": job(62_000),
+        "compose_62k": watched("compose", slicer_job(62_000)),
+        "read_million": watched("read", million),
+        "compose_million": watched("compose", million),
         "dialects": dialects,
         "worst": {
+            "reader_length_error": max(row.get("reader_length_error", 0.0) for row in dialects.values()),
+            "reader_volume_error": max(row.get("reader_volume_error", 0.0) for row in dialects.values()),
+            "lines_not_accounted": [
+                name for name, row in dialects.items() if row.get("every_line_accounted") is False
+            ],
             "refused_share": max(row["refused"] / row["lines"] for row in dialects.values()),
             "extruded_error": max(row["extruded_error"] for row in dialects.values()),
         },

@@ -18,6 +18,7 @@ import scipy.signal
 
 from benchmarks import norm_optimal
 from pipeline.deposition import ilc
+from pipeline.deposition.drive import UNLIMITED, Drive, obeyed
 from pipeline.deposition.extruder import Extruder, disturb, draw, flow, frequency_response, pressed, routine
 from pipeline.deposition.trial_model import identify
 
@@ -76,7 +77,7 @@ def run(
     *,
     trials: int,
     seed: int,
-    limit: float,
+    drive: Drive,
     rise: float,
     noise=NOISE,
 ) -> list[ilc.Row]:
@@ -85,17 +86,19 @@ def run(
     rng = np.random.default_rng(seed)
 
     def measure(u):
-        y = flow(plant, u, sample_time_s=TS, limit=limit)
-        return ilc.Trial(np.clip(u, -limit, limit), disturb(y, rng, steady_flow=STEADY, **noise), y)
+        y = flow(plant, u, sample_time_s=TS, drive=drive)
+        return ilc.Trial(obeyed(u, drive, sample_time_s=TS), disturb(y, rng, steady_flow=STEADY, **noise), y)
 
-    done = ilc.learn(law, measure, np.clip(r / nominal.gain, -limit, limit), r, trials=trials, rise=rise)
-    rows = ilc.table(done, r, steady=STEADY / nominal.gain, limit=limit, rise=rise)
+    done = ilc.learn(
+        law, measure, obeyed(r / nominal.gain, drive, sample_time_s=TS), r, trials=trials, rise=rise
+    )
+    rows = ilc.table(done, r, steady=STEADY / nominal.gain, drive=drive, sample_time_s=TS, rise=rise)
     best = min(rows, key=lambda row: row.rms_measured)
     return rows + [best] * (trials + 1 - len(rows))
 
 
 def hoelzle_2009(name: str, r: np.ndarray, q=ilc.zero_phase) -> ilc.Law:
-    return ilc.hoelzle_law(r, MATERIALS[name], q, HOELZLE, limit=np.inf, sample_time_s=TS)
+    return ilc.hoelzle_law(r, MATERIALS[name], q, HOELZLE, drive=UNLIMITED, sample_time_s=TS)
 
 
 def percent(rows: list[ilc.Row], trial: int) -> float:
@@ -107,7 +110,7 @@ def hoelzle_figures(seeds: int) -> dict[str, Any]:
     the maximum over 200 plants of the family."""
     r, f, out = reference(), np.linspace(0.0, 24.9, 4000), {}
     Q = ilc.magnitude(f, sample_time_s=TS, **HOELZLE_Q) ** 2
-    settings = {"limit": np.inf, "rise": NO_ROLL_BACK}
+    settings = {"drive": UNLIMITED, "rise": NO_ROLL_BACK}
     for name, nominal in MATERIALS.items():
         L = ilc.hoelzle_filter(f, nominal, HOELZLE, sample_time_s=TS)
         row: dict[str, Any] = {}
@@ -140,7 +143,7 @@ def hoelzle_figures(seeds: int) -> dict[str, Any]:
             r,
             trials=120,
             seed=0,
-            limit=np.inf,
+            drive=UNLIMITED,
             rise=ROLL_BACK,
         )
         row["delay_150_ms_with_roll_back_ends_at"] = round(
@@ -183,8 +186,8 @@ def inverse_figures(count: int, seeds: int) -> dict[str, Any]:
         limited = variant.startswith("limited")
         r, rows, gammas, start = reference(0.5 if limited else 0.15), [], [], time.process_time()
         for i, (name, plant) in enumerate(family(seed, count, creep_share)):
-            limit = 10 * STEADY / MATERIALS[name].gain if limited else np.inf
-            law = ilc.InverseLaw(r, INVERSE, limit=limit, sample_time_s=TS)
+            drive = Drive(10 * STEADY / MATERIALS[name].gain, np.inf, 0.0) if limited else UNLIMITED
+            law = ilc.InverseLaw(r, INVERSE, drive=drive, sample_time_s=TS)
             rows.append(
                 run(
                     plant,
@@ -193,7 +196,7 @@ def inverse_figures(count: int, seeds: int) -> dict[str, Any]:
                     r,
                     trials=trials,
                     seed=1000 * seed + i,
-                    limit=limit,
+                    drive=drive,
                     rise=ROLL_BACK,
                 )
             )
@@ -221,9 +224,9 @@ def norm_optimal_law_figures(count: int) -> dict[str, Any]:
             sample_time_s=TS,
         )
         law = norm_optimal.norm_optimal_law(
-            r, model.extruder, R_u=1e-5, R_d=1e-3, limit=np.inf, sample_time_s=TS
+            r, model.extruder, R_u=1e-5, R_d=1e-3, drive=UNLIMITED, sample_time_s=TS
         )
-        rows.append(run(plant, MATERIALS[name], law, r, trials=15, seed=i, limit=np.inf, rise=ROLL_BACK))
+        rows.append(run(plant, MATERIALS[name], law, r, trials=15, seed=i, drive=UNLIMITED, rise=ROLL_BACK))
     return spread(rows, {2: 20.0, 3: 10.0, 15: 3.0})
 
 
@@ -268,12 +271,12 @@ def headroom_figures(count: int) -> dict[str, Any]:
             r, rows_of_plants = reference(ramp_s), []
             for i, (name, plant) in enumerate(family(70, count)):
                 nominal = MATERIALS[name]
-                limit = times * STEADY / nominal.gain
-                law = ilc.InverseLaw(r, INVERSE, limit=limit, sample_time_s=TS)
-                rows = run(plant, nominal, law, r, trials=10, seed=i, limit=limit, rise=ROLL_BACK)
-                u0 = np.clip(r / nominal.gain, -limit, limit)
+                drive = Drive(times * STEADY / nominal.gain, np.inf, 0.0)
+                law = ilc.InverseLaw(r, INVERSE, drive=drive, sample_time_s=TS)
+                rows = run(plant, nominal, law, r, trials=10, seed=i, drive=drive, rise=ROLL_BACK)
+                u0 = obeyed(r / nominal.gain, drive, sample_time_s=TS)
                 forecast = ilc.actuator_headroom(
-                    r, u0, law.model.extruder, order=4, cutoff_hz=5.0, limit=limit, sample_time_s=TS
+                    r, u0, law.model.extruder, order=4, cutoff_hz=5.0, drive=drive, sample_time_s=TS
                 )
                 rows_of_plants.append((percent(rows, 10), 100 * forecast.ratio, 100 * rows[10].saturated))
             real, predicted, saturated = np.array(rows_of_plants).T

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
+from pipeline.deposition.drive import Drive, obeyed
 from pipeline.deposition.extruder import Extruder, lag_filter
 from pipeline.deposition.ilc import Law, Trial
 
@@ -107,7 +108,7 @@ def step(plan: Plan, u: np.ndarray, e: np.ndarray) -> np.ndarray:
 
 
 def norm_optimal_law(
-    r: np.ndarray, model: Extruder, *, R_u: float, R_d: float, limit: float, sample_time_s: float
+    r: np.ndarray, model: Extruder, *, R_u: float, R_d: float, drive: Drive, sample_time_s: float
 ) -> Law:
     """u_{j+1} = u_j + argmin |e - G du|^2 + |u + du|_Ru^2 + |du|_Rd^2 of the last trial; R_u and R_d as
     shares of the squared steady gain of the model."""
@@ -121,6 +122,7 @@ def norm_optimal_law(
 
     def law(trials: Sequence[Trial]) -> np.ndarray:
         u, y, _ = trials[-1]
-        return np.clip(u + step(prepared, u, np.where(np.isfinite(y), r - y, 0.0)), -limit, limit)
+        following = u + step(prepared, u, np.where(np.isfinite(y), r - y, 0.0))
+        return obeyed(following, drive, sample_time_s=sample_time_s)
 
     return law

@@ -9,6 +9,7 @@ import matplotlib
 import numpy as np
 
 from pipeline.deposition import ilc
+from pipeline.deposition.drive import UNLIMITED
 from pipeline.deposition.extruder import Extruder, disturb, flow, frequency_response, routine
 
 matplotlib.use("Agg")
@@ -51,10 +52,10 @@ print(f"gamma on the nominal model: {float(ilc.gamma(Q, L, P[None])[0]):.3f}")
 
 # %% Trial 0 is on-off control, u = r / K; ten updates follow from what was measured.
 inverse = ilc.InverseSettings(identify_trials=2, floor=0.1, order=4, cutoff_hz=5.0)
-drive = {"limit": np.inf, "sample_time_s": Ts}
+on_this_machine = {"drive": UNLIMITED, "sample_time_s": Ts}
 laws = {
-    "Hoelzle 2009": ilc.hoelzle_law(r, nominal, ilc.zero_phase, hoelzle, **drive),
-    "model inverse": ilc.InverseLaw(r, inverse, **drive),
+    "Hoelzle 2009": ilc.hoelzle_law(r, nominal, ilc.zero_phase, hoelzle, **on_this_machine),
+    "model inverse": ilc.InverseLaw(r, inverse, **on_this_machine),
 }
 trials = {
     name: ilc.learn(law, print_trial, r / nominal.gain, r, trials=10, rise=0.1) for name, law in laws.items()

@@ -140,9 +140,9 @@ def first_experiment(arguments: argparse.Namespace) -> None:
 
 
 def compose(arguments: argparse.Namespace) -> None:
-    """A part program into plunger commands: signal and tasks as CSV,
-    and whether it will print, line by line."""
-    from pipeline.deposition.workflow import compose_parts
+    """A part program into plunger commands (CSV, Parquet, MCAP, G-code with leads), tasks and lines as
+    Parquet, and whether it will print."""
+    from pipeline.deposition.workflow import compose_parts, exports, part_programs
     from pipeline.deposition.workflow.segment_library import read_learned
     from pipeline.deposition.workflow.settings import ComposeParts, Printer
 
@@ -151,16 +151,25 @@ def compose(arguments: argparse.Namespace) -> None:
             f"--out {arguments.out}: should be a folder but is a file; name a folder, "
             "which is made where it is missing"
         )
+    asked = part_programs.asked(
+        scale=arguments.scale, speed=arguments.speed, filament_mm=arguments.filament_mm,
+        extruder=arguments.extruder, bead=arguments.bead,
+    )  # fmt: skip
+    formats = exports.formats(arguments.formats)
     learned = read_learned(
         "datasets/segment_library/library.parquet", "datasets/segment_library/learned.json"
     )
-    part = compose_parts.compose(
-        arguments.part, learned, params.load(Printer, "printer"), params.load(ComposeParts, "compose_parts")
-    )
+    printer, settings = params.load(Printer, "printer"), params.load(ComposeParts, "compose_parts")
+    part = compose_parts.compose(arguments.part, learned, printer, settings, asked)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    files = compose_parts.write(part, arguments.out)
+    files = exports.write(part, arguments.out, formats)
     print(compose_parts.summary_lines(part))
     print("written: " + ", ".join(str(file) for file in files))
+    if arguments.verify:
+        from pipeline.deposition.workflow import verify_part
+
+        print(verify_part.write(part, learned, printer, settings, arguments.out))
+        print(verify_part.write_next(part, learned, printer, arguments.part.parent, arguments.out))
 
 
 def calibrate_tip(arguments: argparse.Namespace) -> None:
@@ -239,6 +248,35 @@ def main() -> None:
     command = commands.add_parser("compose", help=compose.__doc__)
     command.add_argument("part", type=Path, help="the part program (G-code)")
     command.add_argument("--out", type=Path, default=Path("."), help="folder for signal, tasks and report")
+    command.add_argument(
+        "--as",
+        dest="formats",
+        default="csv",
+        metavar="csv,parquet,mcap,gcode",
+        help="the commands' formats; gcode: with leads, for machines that play no signal (csv)",
+    )
+    command.add_argument(
+        "--scale", type=float, default=1.0, help="X, Y and Z times this, E's volume with them (1)"
+    )
+    command.add_argument("--speed", type=float, default=1.0, help="feeds times this (1)")
+    command.add_argument(
+        "--filament-mm",
+        type=float,
+        metavar="MM",
+        help="diameter of what E pushes; default: as the program says",
+    )
+    command.add_argument(
+        "--extruder", default="", metavar="WORD", help="what drives the extrusion: E, U, 'M42 P4', ..."
+    )
+    command.add_argument(
+        "--bead",
+        choices=("e", "declared"),
+        default="e",
+        help="volume of a line: by E where it counts, or the declared bead's (e)",
+    )
+    command.add_argument(
+        "--verify", action="store_true", help="also the shortest print that shows whether the forecast holds"
+    )
     command.set_defaults(run=compose)
     command = commands.add_parser("calibrate-tip", help=calibrate_tip.__doc__)
     command.add_argument("image", type=Path, help="a frame of the nozzle's camera")

@@ -4,7 +4,7 @@ tasks.parquet, lines.parquet, scores.parquet and conformance.json."""
 
 from pathlib import Path
 
-from pipeline.deposition.workflow import compose_parts
+from pipeline.deposition.workflow import compose_parts, verify_part
 from pipeline.deposition.workflow.segment_library import read_learned
 from pipeline.deposition.workflow.settings import ComposeParts, Printer, TrainIlc
 from pipeline.deposition.workflow.tables import LINES, SCORES, SIGNALS, TASKS
@@ -27,7 +27,10 @@ def main() -> None:
         rows = compose_parts.rows(done)
         for name, schema in (("signals", SIGNALS), ("scores", SCORES), ("tasks", TASKS), ("lines", LINES)):
             artifacts.write_table(out / f"{name}.parquet", schema, rows[name])
-        artifacts.write_json(out / "conformance.json", compose_parts.reports(done, refused))
+        reports = verify_part.with_measured(
+            compose_parts.reports(done, refused), parts, Path("datasets/parts")
+        )
+        artifacts.write_json(out / "conformance.json", reports)
         artifacts.write_metrics("compose_parts", compose_parts.figures(done) | {"refused": refused})
 
 

@@ -19,7 +19,9 @@ def main() -> None:
         table, rest = segment_library.stored(learned)
         artifacts.write_table(out / "library.parquet", LIBRARY, table)
         artifacts.write_json(out / "learned.json", rest)
-        artifacts.write_metrics("segment_library", {"columns": len(table["task"]), **rest})
+        artifacts.write_metrics(
+            "segment_library", {"columns": len(table["task"]), **segment_library.figures(rest)}
+        )
 
 
 if __name__ == "__main__":

@@ -8,7 +8,9 @@ import scipy.ndimage
 import scipy.signal
 
 from pipeline.deposition import reachable
-from pipeline.deposition.extruder import DAMPING, Extruder, lagged, ramp
+from pipeline.deposition.chain import Identified, fronts
+from pipeline.deposition.drive import UNLIMITED, Drive, follows, obeyed
+from pipeline.deposition.extruder import DAMPING, Extruder, ramp
 
 # the yield is loaded this long before the flow begins and kept through gaps of twice that: long against the
 # lag, short against a pause between lines
@@ -46,22 +48,27 @@ def loaded(r: np.ndarray, margin_s: float, sample_time_s: float) -> np.ndarray:
     return np.clip(near, 0.0, 1.0)
 
 
-def advance(extruder: Extruder, sample_time_s: float) -> np.ndarray:
+def advance(extruder: Extruder | Identified, sample_time_s: float) -> np.ndarray:
     """Centred impulse response of conj(H) / (|H|^2 + FLOOR), scaled to gain 1, with H
-    of delay and lag: what comes late is sent ahead."""
+    of delay and lags: what comes late is sent ahead."""
     half = round(SPAN_S / sample_time_s)
     impulse = np.zeros(4 * half)
     impulse[0] = 1.0
-    H = np.fft.rfft(lagged(impulse, extruder.delay_s, extruder.lag_hz, sample_time_s))
+    H = np.fft.rfft(fronts([Identified(*extruder)], impulse[None], sample_time_s)[0, 0])
     h = np.roll(np.fft.irfft(np.conj(H) / (np.abs(H) ** 2 + FLOOR), len(impulse)), half)[: 2 * half + 1]
     return h / h.sum()
 
 
-def shift(extruder: Extruder, sample_time_s: float) -> np.ndarray:
+def mean_lag_s(extruder: Extruder | Identified) -> float:
+    """The mean delay in s of the lags: 2 zeta / w of the second-order one."""
+    return DAMPING / (math.pi * extruder.lag_hz) + Identified(*extruder).second_lag_s
+
+
+def shift(extruder: Extruder | Identified, sample_time_s: float) -> np.ndarray:
     """Centred impulse response that sends a signal ahead by the delay and the
     mean delay of the lag, and never beyond its limits."""
     half = round(SPAN_S / sample_time_s)
-    late = min((extruder.delay_s + DAMPING / (math.pi * extruder.lag_hz)) / sample_time_s, half - 1.0)
+    late = min((extruder.delay_s + mean_lag_s(extruder)) / sample_time_s, half - 1.0)
     h = np.zeros(2 * half + 1)
     whole = math.floor(late)
     h[half - whole - 1 : half - whole + 1] = late - whole, 1 - late + whole
@@ -69,7 +76,7 @@ def shift(extruder: Extruder, sample_time_s: float) -> np.ndarray:
 
 
 def compose(
-    extruder: Extruder, r: np.ndarray, *, sample_time_s: float, limit: float = math.inf
+    extruder: Extruder | Identified, r: np.ndarray, *, sample_time_s: float, drive: Drive = UNLIMITED
 ) -> np.ndarray:
     """The command u (T,) in mm for the wanted flow r (T,) in mm^3/s, as functions of r and of the
     on-indicator p, with x = r + yield p:
@@ -77,50 +84,81 @@ def compose(
     u(t) = advance * [ rate x'(t) + level x(t) + slow <x>(t) + play
     q(t) sin(2 pi f t) ], <x> = x / (sigma s + 1)
 
-    The weights invert the chain: with c the creeping share, sigma = (1 - c) T + c tau, rate = tau T / (sigma
-    K), level = (tau + T - tau T / sigma) / (sigma K) and level + slow = 1 / K; without creep rate = tau / K,
-    level = 1 / K, slow = 0. Computed in its exact discrete form. The dither is as wide as the play: it walks
+    The weights invert the chain (for an exponent, of the pressed x that gives r; where flow falls otherwise
+    than it rises, with the time constant of each sample's direction): with c the creeping share, sigma = (1 -
+    c) T + c tau, rate = tau T / (sigma K), level = (tau + T - tau T / sigma) / (sigma K) and level + slow = 1
+    / K; without creep rate = tau / K, level = 1 / K, slow = 0. Computed in its exact discrete form. The dither is as wide as the play: it walks
     through the play wherever that stands, so that its mean position is the command's (Zames and Shneydor
     1976); q lets it die out after a stop.
 
-    Where |u| would exceed `limit`, the command whose flow comes
+    Where the drive cannot follow u, the command whose flow comes
     nearest: it sets out early and catches up late.
     """
     if not np.any(r > 0):
         return np.zeros(len(r))
+    extruder = Identified(*extruder)
     x = r + extruder.yield_ * loaded(r, LOAD_S, sample_time_s)
-    v, ahead = _inverse(extruder, x, sample_time_s), advance(extruder, sample_time_s)
-    if np.abs(scipy.signal.oaconvolve(v, ahead, "same")).max() > limit:
-        v, ahead = _nearest(extruder, v, r, limit, sample_time_s), shift(extruder, sample_time_s)
+    p = pressed_of(extruder, x)
+    v, ahead = _inverse(extruder, p, sample_time_s), advance(extruder, sample_time_s)
+    if not follows(scipy.signal.oaconvolve(v, ahead, "same"), drive, sample_time_s=sample_time_s):
+        v, ahead = reached(extruder, v, r, drive, sample_time_s), shift(extruder, sample_time_s)
     if extruder.play > 0:
         v += (
             extruder.play
             * loaded(r, DITHER_S, sample_time_s)
             * np.sin(2 * np.pi * DITHER_HZ * sample_time_s * np.arange(len(r)))
         )
-    return np.clip(scipy.signal.oaconvolve(v, ahead, "same"), -limit, limit)
+    return obeyed(scipy.signal.oaconvolve(v, ahead, "same"), drive, sample_time_s=sample_time_s)
 
 
-def _modes(extruder: Extruder, sample_time_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Gain and pole of the fast and of the creeping mode: each is
-    m(t+1) = pole m(t) + gain v(t), and x their sum."""
+def pressed_of(extruder: Identified, x: np.ndarray) -> np.ndarray:
+    """p (T,) in mm whose flow without yield is x (T,) >= 0: `chain.flow_of` undone."""
+    if extruder.exponent == 1.0:
+        return x / extruder.gain
+    full = extruder.gain * extruder.level
+    return extruder.level * np.maximum(x / full, 0.0) ** (1 / extruder.exponent)
+
+
+def _modes(extruder: Identified, sample_time_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Share and pole of the fast and of the creeping mode: each is
+    m(t+1) = pole m(t) + share v(t), and p their sum."""
     poles = np.exp(-sample_time_s / np.array([extruder.time_constant_s, extruder.creep_time_s]))
-    return extruder.gain * np.array([1 - extruder.creep_share, extruder.creep_share]) * (1 - poles), poles
+    return np.array([1 - extruder.creep_share, extruder.creep_share]) * (1 - poles), poles
 
 
-def _inverse(extruder: Extruder, x: np.ndarray, sample_time_s: float) -> np.ndarray:
-    """v (T,), held between samples, that brings both modes together to x at every next sample."""
+def _inverse(extruder: Identified, p: np.ndarray, sample_time_s: float) -> np.ndarray:
+    """v (T,), held between samples, that brings both modes together to p at every next sample."""
     (g, h), (a, b) = _modes(extruder, sample_time_s)
-    v = scipy.signal.lfilter(np.convolve([1.0, -a], [1.0, -b]), [g + h, -g * b - h * a], x)
-    return np.append(v[1:], x[-1] / extruder.gain)
+    if extruder.fall_ratio == 1.0:
+        v = scipy.signal.lfilter(np.convolve([1.0, -a], [1.0, -b]), [g + h, -g * b - h * a], p)
+        return np.append(v[1:], p[-1])
+    d, c = math.exp(-sample_time_s / (extruder.time_constant_s * extruder.fall_ratio)), extruder.creep_share
+    fast = slow = 0.0
+    out = []
+    for wanted in [*p[1:].tolist(), float(p[-1])]:
+        v = (wanted - (1 - c) * a * fast - b * c * slow) / (g + h)
+        pole = a
+        if v < fast:
+            v = (wanted - (1 - c) * d * fast - b * c * slow) / ((1 - c) * (1 - d) + h)
+            pole = d
+        fast, slow = v + (fast - v) * pole, v + (slow - v) * b
+        out.append(v)
+    return np.array(out)
 
 
-def _nearest(
-    extruder: Extruder, v: np.ndarray, r: np.ndarray, limit: float, sample_time_s: float
+def reached(
+    extruder: Extruder | Identified, v: np.ndarray, r: np.ndarray, drive: Drive, sample_time_s: float
 ) -> np.ndarray:
-    """v (T,) within +-limit whose fast mode comes nearest to that of the unlimited v; below
-    the yield, where no flow is wanted, it is free."""
-    (g, _), (a, _) = _modes(extruder, sample_time_s)
+    """v (T,) that the drive can follow whose fast mode comes nearest to that of the unlimited v; below
+    the yield, where no flow r (T,) is wanted, it is free. Delay and lag lie before v."""
+    (share, _), (a, _) = _modes(Identified(*extruder), sample_time_s)
+    g = share * extruder.gain
     fast = scipy.signal.lfilter([g], [1.0, -a], v)
-    reached = reachable.nearest(fast, np.append(r[1:], 0.0) <= 0, pole=a, bound=g * limit)
-    return np.clip((reached - a * np.append(0.0, reached[:-1])) / g, -limit, limit)
+    x = reachable.nearest(
+        fast,
+        np.append(r[1:], 0.0) <= 0,
+        pole=a,
+        bound=g * drive.amplitude_mm,
+        step=g * drive.speed_mm_per_s * sample_time_s,
+    )
+    return obeyed((x - a * np.append(0.0, x[:-1])) / g, drive, sample_time_s=sample_time_s)

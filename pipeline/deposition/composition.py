@@ -1,5 +1,5 @@
 """Part program -> plunger command without learning again: the paper's priority rule, superposition, and basis
-functions; the one that predicts best is taken."""
+functions; the one whose forecast is least at its upper end is taken."""
 
 import math
 from collections.abc import Sequence
@@ -7,8 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.deposition import basis
-from pipeline.deposition.chain import Chain, averaged, forecast, identify, simulate
+from pipeline.deposition import basis, forecast
+from pipeline.deposition.chain import Chain, averaged, identify, simulate
+from pipeline.deposition.drive import Drive, at_limit, follows, obeyed
+from pipeline.deposition.forecast import Covered, Judged, Missed
 from pipeline.deposition.gcode import Kind, Program
 from pipeline.deposition.library import (
     CORNER,
@@ -38,13 +40,16 @@ EXCERPT_S = 600.0
 class Material(NamedTuple):
     """What was learned of one material and nozzle: its chain, the gain (mm^3/s per mm) by
     which on-off control set out in the first trial, and the error of the learned trials
-    themselves in % of the steady flow (means over 0.2 s)."""
+    themselves in % of the steady flow (means over 0.2 s); what fits without a routine missed on it, and what
+    the routines covered."""
 
     material: str
     nozzle_mm: float
     chain: Chain
     on_off_gain: float
     learned_percent: float
+    missed: Missed
+    covered: Covered
 
 
 class Learned(NamedTuple):
@@ -58,32 +63,34 @@ class Learned(NamedTuple):
 class PartSettings(NamedTuple):
     """How a part is printed: nozzle in mm; the wanted flow is bead area x printing speed, its steps shaped by
     two boxes of ramp_s; a junction is a Corner from corner_deg on; a longer halt than longest_pause_s ends a
-    run; |u| <= limit (mm)."""
+    run; and the drive."""
 
     nozzle_mm: float
     bead_area_mm2: float
     ramp_s: float
     corner_deg: float
     longest_pause_s: float
-    limit: float
+    drive: Drive
 
 
 class Prediction(NamedTuple):
-    """Predicted r.m.s. error of one composer on one tool's share of a part: the chain's
-    forecast together with the composer's own error on trials it did not see, in % of the
-    forecast of on-off control; `chosen` is the least."""
+    """Forecast r.m.s. error of one composer on one tool's share of a part, in % of that of on-off control:
+    90 % of what may come out lies between low and high. `chosen` is the composer with the least `high`."""
 
     tool: int
     material: str
     composer: str
-    rms_percent_of_on_off: float
+    low: float
+    median: float
+    high: float
     chosen: bool
 
 
 class Stream(NamedTuple):
     """One tool's share of a part, all (T,): wanted flow r (mm^3/s), the same before its steps were shaped,
-    command u (mm), predicted flow y and that of on-off control; the composer that u is from, and the share of
-    the time that u is at the limit."""
+    command u (mm), predicted flow y and that of on-off control; the composer that u is from, whether its
+    forecast may be believed, and the share of
+    the time that u is at a limit of the drive."""
 
     tool: int
     material: str
@@ -95,6 +102,7 @@ class Stream(NamedTuple):
     y: np.ndarray
     on_off: np.ndarray
     saturated: float
+    judged: Judged
 
 
 class Share(NamedTuple):
@@ -141,12 +149,15 @@ def learn(trainings: Sequence[Training], *, sample_time_s: float) -> Learned:
                 )
             )
         )
+        chain = identify(mine, sample_time_s=sample_time_s)
         materials.append(
             Material(
                 *key,
-                identify(mine, sample_time_s=sample_time_s),
+                chain,
                 gain,
                 100 * math.sqrt(np.mean(np.square(left))),
+                forecast.missed(mine, chain, sample_time_s=sample_time_s),
+                forecast.covered(mine, sample_time_s=sample_time_s),
             )
         )
     return Learned(library, tuple(materials), check(trainings, library))
@@ -218,17 +229,11 @@ def superposition(
     return u
 
 
-def _rms(a: np.ndarray) -> float:
-    return math.sqrt(np.mean(np.square(a)))
-
-
-def _command(composer: str, library: Library, share: Share, limit: float) -> np.ndarray:
-    """u (T,) in mm of one composer for one tool's share of a part; |u| <= limit."""
-    material = share.material
+def _command(composer: str, library: Library, share: Share, drive: Drive) -> np.ndarray:
+    """u (T,) in mm of one composer for one tool's share of a part, which the drive can follow."""
+    material, Ts = share.material, library.sample_time_s
     if composer == BASIS:
-        return basis.compose(
-            material.chain.extruder, share.r, sample_time_s=library.sample_time_s, limit=limit
-        )
+        return basis.compose(material.chain.extruder, share.r, sample_time_s=Ts, drive=drive)
     by = priority if composer == PRIORITY else superposition
     u = by(
         library,
@@ -239,10 +244,19 @@ def _command(composer: str, library: Library, share: Share, limit: float) -> np.
         share.tool,
         samples=len(share.r),
     )
-    return np.clip(u, -limit, limit)
+    if follows(u, drive, sample_time_s=Ts):
+        return u
+    return basis.reached(material.chain.extruder, u, _sent_ahead(share, Ts), drive, Ts)
 
 
-def commands(learned: Learned, composed: Composed, stream: Stream, *, limit: float) -> dict[str, np.ndarray]:
+def _sent_ahead(share: Share, Ts: float) -> np.ndarray:
+    """The wanted flow (T,) at the time when a command for it is sent: earlier by delay and lag of the
+    chain."""
+    extruder, t = share.material.chain.extruder, np.arange(len(share.r)) * Ts
+    return np.interp(t + extruder.delay_s + basis.mean_lag_s(extruder), t, share.r, right=0.0)
+
+
+def commands(learned: Learned, composed: Composed, stream: Stream, *, drive: Drive) -> dict[str, np.ndarray]:
     """The command (T,) of every composer for one stream of a part, to set beside the chosen one."""
     material = next(
         one
@@ -250,23 +264,23 @@ def commands(learned: Learned, composed: Composed, stream: Stream, *, limit: flo
         if (one.material, one.nozzle_mm) == (stream.material, stream.nozzle_mm)
     )
     share = Share(stream.tool, material, stream.r, composed.tasks, composed.lines)
-    return {name: _command(name, learned.library, share, limit) for name in COMPOSERS}
+    return {name: _command(name, learned.library, share, drive) for name in COMPOSERS}
 
 
-def _judge(library: Library, share: Share, limit: float) -> dict[str, float]:
-    """Predicted error of each composer in % of on-off control's, over the first
-    EXCERPT_S from where this tool begins to print."""
-    Ts, extruder = library.sample_time_s, share.material.chain.extruder
+def _judge(library: Library, share: Share, drive: Drive) -> dict[str, forecast.Interval]:
+    """Forecast error of each composer in % of on-off control's, over the first EXCERPT_S from where this tool
+    begins to print: all by the same members and residuals."""
+    Ts, material = library.sample_time_s, share.material
     excerpt = _excerpt(share, Ts)
-    on_off = _on_off(excerpt, limit)
-    yardstick = _rms(forecast(extruder, on_off, sample_time_s=Ts) - excerpt.r)
-    percent = {}
-    for name in COMPOSERS:
-        u = _command(name, library, excerpt, limit)
-        error = _rms(forecast(extruder, u, sample_time_s=Ts) - excerpt.r)
-        own = share.material.chain.held_out_percent if name == BASIS else share.material.learned_percent
-        percent[name] = 100 * math.hypot(error, own / 100 * share.r.max()) / max(yardstick, 1e-12)
-    return percent
+
+    def flows(u):
+        return forecast.flows(material.chain, material.missed, u, excerpt.r, sample_time_s=Ts)
+
+    on_off = flows(_on_off(excerpt, drive, Ts))
+    return {
+        name: forecast.error_percent(flows(_command(name, library, excerpt, drive)), on_off, excerpt.r)
+        for name in COMPOSERS
+    }
 
 
 def _excerpt(share: Share, Ts: float) -> Share:
@@ -284,9 +298,9 @@ def _excerpt(share: Share, Ts: float) -> Share:
     return share._replace(r=r[begin:upto], tasks=tasks, lines=lines)
 
 
-def _on_off(share: Share, limit: float) -> np.ndarray:
+def _on_off(share: Share, drive: Drive, Ts: float) -> np.ndarray:
     """u (T,) in mm of on-off control, as the first trial set out: r over the gain known then."""
-    return np.clip(share.r / share.material.on_off_gain, -limit, limit)
+    return obeyed(share.r / share.material.on_off_gain, drive, sample_time_s=Ts)
 
 
 def compose(
@@ -298,7 +312,7 @@ def compose(
     material or nozzle that was not learned, where nothing is printed, and, with its line number, where the
     program would go from Steady-State to No-Flow without a Stop.
     """
-    library, limit, moves = learned.library, settings.limit, program.moves
+    library, drive, moves = learned.library, settings.drive, program.moves
     Ts, marks = library.sample_time_s, library.marks
     lines = printed_lines(
         moves, motion, corner_deg=settings.corner_deg, longest_pause_s=settings.longest_pause_s
@@ -323,13 +337,13 @@ def compose(
         r = basis.boxed(unshaped, settings.ramp_s, Ts)
         r[r < 1e-9 * r.max()] = 0.0  # rounding of the sums behind the rate
         share = Share(tool, material, r, tasks, lines)
-        percents = _judge(library, share, limit)
-        best = min(percents, key=percents.__getitem__)
+        percents = _judge(library, share, drive)
+        best = min(percents, key=lambda name: percents[name].high)
         predictions += [
-            Prediction(tool, material.material, name, percent, name == best)
+            Prediction(tool, material.material, name, *percent, name == best)
             for name, percent in percents.items()
         ]
-        streams.append(_stream(library, share, unshaped, best, limit))
+        streams.append(_stream(library, share, unshaped, best, drive))
         for name in (START, STOP, CORNER, STEADY):
             at = _of(tasks, tool, name)
             error[at] = nearest(
@@ -358,11 +372,11 @@ def _material(
     )
 
 
-def _stream(library: Library, share: Share, unshaped: np.ndarray, composer: str, limit: float) -> Stream:
+def _stream(library: Library, share: Share, unshaped: np.ndarray, composer: str, drive: Drive) -> Stream:
     """The share by one composer: its command, and the flows that the chain predicts for it and for on-off."""
-    material, u = share.material, _command(composer, library, share, limit)
-    rows = np.stack([u, _on_off(share, limit)])
-    y, on_off = simulate([material.chain.extruder], rows, sample_time_s=library.sample_time_s)[0]
+    material, u, Ts = share.material, _command(composer, library, share, drive), library.sample_time_s
+    rows = np.stack([u, _on_off(share, drive, Ts)])
+    y, on_off = simulate([material.chain.extruder], rows, sample_time_s=Ts)[0]
     return Stream(
         share.tool,
         material.material,
@@ -373,5 +387,6 @@ def _stream(library: Library, share: Share, unshaped: np.ndarray, composer: str,
         u,
         y,
         on_off,
-        float(np.mean(np.abs(u) >= limit)),
+        float(np.mean(at_limit(u, drive, sample_time_s=Ts))),
+        forecast.judged(material.missed, material.covered, share.r, sample_time_s=Ts),
     )

@@ -7,9 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.deposition import basis
-from pipeline.deposition.chain import forecast
-from pipeline.deposition.composition import BASIS, EXCERPT_S, MARGIN_S, Composed, Learned
+from pipeline.deposition import basis, forecast
+from pipeline.deposition.chain import Identified
+from pipeline.deposition.chain import forecast as predicted_flow
+from pipeline.deposition.composition import BASIS, EXCERPT_S, MARGIN_S, Composed, Learned, Material, Stream
+from pipeline.deposition.drive import Drive, asked, at_limit, follows, obeyed
 from pipeline.deposition.extruder import Extruder
 from pipeline.deposition.gcode import Refusal
 from pipeline.deposition.library import STOP, Library
@@ -23,7 +25,8 @@ LONGEST_RAMP_S = 10.0
 class LineVolumes(NamedTuple):
     """Every printed line, all (L,): number in the program, tool, begin and duration in s, length in mm,
     planned volume (bead area x length), predicted volume and that of on-off control in mm^3, error in % of
-    the plan, and whether its whole run is shorter than the Stop lead."""
+    the plan, whether its whole run is shorter than the Stop lead, and the 90 % interval of its error in % of
+    the plan."""
 
     line: np.ndarray
     tool: np.ndarray
@@ -35,15 +38,21 @@ class LineVolumes(NamedTuple):
     on_off_mm3: np.ndarray
     error_percent: np.ndarray
     shorter_than_lead: np.ndarray
+    low_percent: np.ndarray
+    high_percent: np.ndarray
 
 
 class Saturation(NamedTuple):
-    """What a limit does to one flow with one ramp: peak of the unlimited command over the steady one, share
-    of the printing time at the limit, and r.m.s. error of the best command within it in % of that of on-off
-    control r / on_off_gain; `enough` is whether the limit is never reached."""
+    """What a drive does to one flow with one ramp: its limits (inf where there is none) and beside them the
+    largest unlimited command (mm) and its speed (mm/s); peak of that command over the steady one, share of
+    the printing time at a limit, and r.m.s. error of the best command within them in % of that of on-off
+    control r / on_off_gain; `enough` is whether the drive can follow the unlimited command."""
 
     ramp_s: float
-    limit: float
+    amplitude_mm: float
+    speed_mm_per_s: float
+    largest_command_mm: float
+    largest_speed_mm_per_s: float
     peak_over_steady: float
     share_percent: float
     rms_percent_of_on_off: float
@@ -76,7 +85,7 @@ def conform(
     *,
     bead_area_mm2: float,
     ramp_s: float,
-    limit: float,
+    drive: Drive,
     shortest_s: float,
     largest_error_percent: float,
     refusals: Sequence[Refusal] = (),
@@ -85,18 +94,15 @@ def conform(
     tasks whose signal the library only guesses (predicted error above largest_error_percent, or
     unknown), where the library's signals are used."""
     lines = line_volumes(composed, learned.library, bead_area_mm2=bead_area_mm2)
+    lines = _intervals(lines, composed, learned)
     judged = lines.duration_s >= shortest_s - 1e-9
     Ts = composed.sample_time_s
     saturations, ramps = {}, {}
     for stream in composed.streams:
-        material = next(
-            material
-            for material in learned.materials
-            if (material.material, material.nozzle_mm) == (stream.material, stream.nozzle_mm)
-        )
+        material = _material(learned, stream)
         first = int(np.argmax(stream.unshaped > 0))
         some = stream.unshaped[max(0, first - round(MARGIN_S / Ts)) : first + round(EXCERPT_S / Ts)]
-        settings = {"ramp_s": ramp_s, "limit": limit, "sample_time_s": Ts}
+        settings = {"ramp_s": ramp_s, "drive": drive, "sample_time_s": Ts}
         saturations[stream.tool] = saturation(
             material.chain.extruder, some, on_off_gain=material.on_off_gain, **settings
         )
@@ -119,6 +125,40 @@ def conform(
     return Conformance(lines, worst, int(judged.sum()), saturations, ramps, sorted(refused))
 
 
+def _intervals(lines: LineVolumes, composed: Composed, learned: Learned) -> LineVolumes:
+    """The lines with the 90 % interval of each one's volume, of what the streams' forecasts may come to."""
+    low, high = lines.low_percent.copy(), lines.high_percent.copy()
+    for stream in composed.streams:
+        material = _material(learned, stream)
+        mine, start, stop = _reaches(composed, stream.tool)
+        made = forecast.flows(
+            material.chain, material.missed, stream.u, stream.r, sample_time_s=composed.sample_time_s
+        )
+        volumes = [volume_between(y, start, stop, sample_time_s=composed.sample_time_s) for y in made]
+        off = 100 * (np.array(volumes) / lines.planned_mm3[mine] - 1)
+        low[mine], _, high[mine] = forecast.interval(off)
+    return lines._replace(low_percent=low, high_percent=high)
+
+
+def _material(learned: Learned, stream: Stream) -> Material:
+    """What was learned of the stream's material with its nozzle."""
+    return next(
+        material
+        for material in learned.materials
+        if (material.material, material.nozzle_mm) == (stream.material, stream.nozzle_mm)
+    )
+
+
+def _reaches(composed: Composed, tool: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The lines of a tool, and from when to when in s the flow is theirs: to the middles of the gaps to
+    their neighbours, at most REACH_S from their ends."""
+    mine = np.flatnonzero(composed.lines.tool == tool)
+    a, b = composed.lines.begin_s[mine], composed.lines.end_s[mine]
+    middle = (b[:-1] + a[1:]) / 2
+    start = np.maximum(a - REACH_S, np.append(-np.inf, middle))
+    return mine, start, np.minimum(b + REACH_S, np.append(middle, np.inf))
+
+
 def line_volumes(composed: Composed, library: Library, *, bead_area_mm2: float) -> LineVolumes:
     """A row for each printed line, in their order: the flow between the middles of the gaps to its neighbours
     of the same tool, at most REACH_S from its ends."""
@@ -127,13 +167,7 @@ def line_volumes(composed: Composed, library: Library, *, bead_area_mm2: float) 
     run_s = np.bincount(lines.run, weights=np.where(lines.last, lines.end_s, 0.0)) - begin
     predicted, on_off = np.zeros(len(lines.line)), np.zeros(len(lines.line))
     for stream in composed.streams:
-        mine = np.flatnonzero(lines.tool == stream.tool)
-        a, b = lines.begin_s[mine], lines.end_s[mine]
-        middle = (b[:-1] + a[1:]) / 2
-        start, stop = (
-            np.maximum(a - REACH_S, np.append(-np.inf, middle)),
-            np.minimum(b + REACH_S, np.append(middle, np.inf)),
-        )
+        mine, start, stop = _reaches(composed, stream.tool)
         predicted[mine] = volume_between(stream.y, start, stop, sample_time_s=Ts)
         on_off[mine] = volume_between(stream.on_off, start, stop, sample_time_s=Ts)
     planned = bead_area_mm2 * lines.length
@@ -149,6 +183,8 @@ def line_volumes(composed: Composed, library: Library, *, bead_area_mm2: float) 
         on_off,
         error,
         short,
+        np.full(len(error), np.nan),
+        np.full(len(error), np.nan),
     )
 
 
@@ -163,32 +199,48 @@ def volume_between(
 
 
 def saturation(
-    extruder: Extruder,
+    extruder: Extruder | Identified,
     unshaped: np.ndarray,
     *,
     on_off_gain: float,
     ramp_s: float,
-    limit: float,
+    drive: Drive,
     sample_time_s: float,
 ) -> Saturation:
-    """What |u| <= limit (mm) does to the wanted flow (T,) with its steps
+    """What the drive does to the wanted flow (T,) with its steps
     shaped by two boxes of ramp_s: forecast by the chain."""
     r = basis.boxed(unshaped, ramp_s, sample_time_s)
     free = basis.compose(extruder, r, sample_time_s=sample_time_s)
-    u = basis.compose(extruder, r, sample_time_s=sample_time_s, limit=limit)
-    steady, peak = (r.max() + extruder.yield_) / extruder.gain, float(np.abs(free).max())
-    on_off = forecast(extruder, np.clip(r / on_off_gain, -limit, limit), sample_time_s=sample_time_s) - r
-    error = forecast(extruder, u, sample_time_s=sample_time_s) - r
+    u = basis.compose(extruder, r, sample_time_s=sample_time_s, drive=drive)
+    steady, most = (r.max() + extruder.yield_) / extruder.gain, asked(free, sample_time_s=sample_time_s)
+    first = obeyed(r / on_off_gain, drive, sample_time_s=sample_time_s)
+    on_off = predicted_flow(extruder, first, sample_time_s=sample_time_s) - r
+    error = predicted_flow(extruder, u, sample_time_s=sample_time_s) - r
     ratio = math.sqrt(np.sum(error**2) / max(np.sum(on_off**2), 1e-300))
-    share = np.mean(np.abs(u[r > 0]) >= 0.999 * limit)
-    return Saturation(ramp_s, limit, peak / steady, 100 * float(share), 100 * ratio, peak <= limit)
+    share = np.mean(at_limit(u, drive, sample_time_s=sample_time_s)[r > 0])
+    return Saturation(
+        ramp_s,
+        drive.amplitude_mm,
+        drive.speed_mm_per_s,
+        most.command_mm,
+        most.speed_mm_per_s,
+        most.command_mm / steady,
+        100 * float(share),
+        100 * ratio,
+        follows(free, drive, sample_time_s=sample_time_s),
+    )
 
 
 def ramp_that_would_do(
-    extruder: Extruder, unshaped: np.ndarray, *, ramp_s: float, limit: float, sample_time_s: float
+    extruder: Extruder | Identified,
+    unshaped: np.ndarray,
+    *,
+    ramp_s: float,
+    drive: Drive,
+    sample_time_s: float,
 ) -> float:
-    """The shortest ramp in s, ramp_s or longer, whose command stays within the
-    limit (mm); inf where none up to LONGEST_RAMP_S does.
+    """The shortest ramp in s, ramp_s or longer, whose command the drive can follow;
+    inf where none up to LONGEST_RAMP_S does.
 
     The peak falls with the ramp, about as (1 + tau / ramp) x steady: bisected to 1 %.
     """
@@ -197,7 +249,8 @@ def ramp_that_would_do(
 
     def does(ramp):
         r = basis.boxed(room, ramp, sample_time_s)
-        return bool(np.abs(basis.compose(extruder, r, sample_time_s=sample_time_s)).max() <= limit)
+        u = basis.compose(extruder, r, sample_time_s=sample_time_s)
+        return follows(u, drive, sample_time_s=sample_time_s)
 
     if does(ramp_s):
         return ramp_s

@@ -9,6 +9,7 @@ from pipeline.deposition import ilc, training
 from pipeline.deposition.chain import forecast
 from pipeline.deposition.composition import Composed, Learned, Stream, commands
 from pipeline.deposition.conformance import line_volumes
+from pipeline.deposition.drive import obeyed
 from pipeline.deposition.extruder import Extruder, Routine, flow
 from pipeline.deposition.training import LawSettings, Noise
 
@@ -46,34 +47,33 @@ class Judging(NamedTuple):
 def evaluate(learned: Learned, composed: Composed, judging: Judging, rng: np.random.Generator) -> list[Score]:
     """Scores of all composers on all streams.
 
-    On a real machine the identified chain forecasts the flow, and full-part ILC is left out.
+    On a real machine nobody knows the true flow: a composer scores the upper end of its forecast, its flow is
+    the chain's, and full-part ILC is left out.
     """
-    scores, Ts, limit = [], judging.laws.sample_time_s, judging.laws.limit
+    scores, Ts, drive = [], judging.laws.sample_time_s, judging.laws.drive
     for i, stream in enumerate(composed.streams):
         nominal, plant = judging.nominals[stream.material], judging.plants.get(stream.material)
         chain = next(one.chain.extruder for one in learned.materials if one.material == stream.material)
-        by_composer = {ON_OFF: np.clip(stream.r / nominal.gain, -limit, limit)} | commands(
-            learned, composed, stream, limit=limit
+        by_composer = {ON_OFF: obeyed(stream.r / nominal.gain, drive, sample_time_s=Ts)} | commands(
+            learned, composed, stream, drive=drive
         )
         if plant:
             by_composer[FULL_PART_ILC] = _full_part_ilc(plant, nominal, stream, judging, rng)
-        predicted = {
-            p.composer: p.rms_percent_of_on_off for p in composed.predictions if p.tool == stream.tool
-        }
+        predicted = {p.composer: p for p in composed.predictions if p.tool == stream.tool}
         yardstick = np.nan
         for name, u in by_composer.items():
             y = (
-                flow(plant, u, sample_time_s=Ts, limit=limit)
+                flow(plant, u, sample_time_s=Ts, drive=drive)
                 if plant
                 else forecast(chain, u, sample_time_s=Ts)
             )
             error = float(np.linalg.norm(y - stream.r))
             yardstick = error if name == ON_OFF else yardstick
             worst = _worst_line(learned, composed, i, y, judging)
-            percent = 100 * error / max(yardstick, 1e-12)
-            scores.append(
-                Score(i, name, name == stream.composer, percent, predicted.get(name, np.nan), worst, y)
-            )
+            told = predicted.get(name)
+            percent = told.high if told and not plant else 100 * error / max(yardstick, 1e-12)
+            middle = told.median if told else np.nan
+            scores.append(Score(i, name, name == stream.composer, percent, middle, worst, y))
     return scores
 
 

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import scipy.signal
 
+from pipeline.deposition.drive import UNLIMITED, Drive, obeyed
+
 # damping of the second-order lag: a position loop tuned without overshoot to speak of
 DAMPING = 0.7
 # off by these shares, either way: gain and time constant
@@ -19,9 +21,9 @@ PLAY, YIELD = (0.01, 0.04), (0.02, 0.10)
 class Extruder(NamedTuple):
     """Plunger command u (mm) -> flow y (mm^3/s), in this order:
 
-    saturation |u| <= limit; transport delay; lag w^2 / (s^2 + 2 zeta w s + w^2); play (backlash of full width
-    `play`, mm of command); K ((1 - c) / (tau s + 1) + c / (T s + 1)), c the share of the gain that creeps
-    with T; yield dead band y = max(x - yield, 0), mm^3/s.
+    the drive's limits and backlash; transport delay; lag w^2 / (s^2 + 2 zeta w s + w^2); play (backlash of
+    full width `play`, mm of command); K ((1 - c) / (tau s + 1) + c / (T s + 1)), c the share of the gain that
+    creeps with T; yield dead band y = max(x - yield, 0), mm^3/s.
 
     `gain` K in mm^3/s per mm. The defaults are the nominal model (1):
     no delay, no lag, no play, no yield, no creep.
@@ -155,6 +157,13 @@ def backlash(x: np.ndarray, play: float) -> np.ndarray:
     return np.array(out)
 
 
+def _played(x: np.ndarray, play: float) -> np.ndarray:
+    """`backlash` on x (..., T), none where the play is 0."""
+    if play <= 0:
+        return x
+    return np.apply_along_axis(backlash, -1, x, play) if x.ndim > 1 else backlash(x, play)
+
+
 def _modes(extruder: Extruder) -> list[tuple[float, float]]:
     """(share of the gain, time constant) of the parallel first-order modes."""
     c = extruder.creep_share
@@ -162,17 +171,17 @@ def _modes(extruder: Extruder) -> list[tuple[float, float]]:
 
 
 def pressed(
-    extruder: Extruder, u: np.ndarray, *, sample_time_s: float, limit: float = math.inf
+    extruder: Extruder, u: np.ndarray, *, sample_time_s: float, drive: Drive = UNLIMITED
 ) -> np.ndarray:
     """x (..., T) in mm^3/s from rest: the flow that the command u (..., T) in mm would press out if the ink
     had no yield; below the yield nothing comes.
 
-    u is held between samples and cut at +-limit, as the drive would. Each block takes the
-    one before it as held at its mean over the sample.
+    u is held between samples, and the drive does what it can of it. Its backlash comes before delay and lag,
+    in series with the extruder's own play. Each block takes the one before it as held at its mean over the
+    sample.
     """
-    v = lagged(np.clip(u, -limit, limit), extruder.delay_s, extruder.lag_hz, sample_time_s)
-    if extruder.play > 0:
-        v = np.apply_along_axis(backlash, -1, v, extruder.play) if v.ndim > 1 else backlash(v, extruder.play)
+    v = _played(obeyed(u, drive, sample_time_s=sample_time_s), drive.backlash_mm)
+    v = _played(lagged(v, extruder.delay_s, extruder.lag_hz, sample_time_s), extruder.play)
     x = np.zeros(v.shape)
     for share, tau in _modes(extruder):
         a = math.exp(-sample_time_s / tau)
@@ -180,10 +189,10 @@ def pressed(
     return x
 
 
-def flow(extruder: Extruder, u: np.ndarray, *, sample_time_s: float, limit: float = math.inf) -> np.ndarray:
+def flow(extruder: Extruder, u: np.ndarray, *, sample_time_s: float, drive: Drive = UNLIMITED) -> np.ndarray:
     """True flow y = max(x - yield, 0) (T,) in mm^3/s under the command u (T,) in
-    mm from rest, cut at +-limit; x as in `pressed`."""
-    return np.maximum(pressed(extruder, u, sample_time_s=sample_time_s, limit=limit) - extruder.yield_, 0.0)
+    mm from rest, as the drive follows it; x as in `pressed`."""
+    return np.maximum(pressed(extruder, u, sample_time_s=sample_time_s, drive=drive) - extruder.yield_, 0.0)
 
 
 def frequency_response(extruder: Extruder, frequency_hz: np.ndarray, *, sample_time_s: float) -> np.ndarray:

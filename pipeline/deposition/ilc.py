@@ -1,28 +1,28 @@
 """Iterative learning control of the flow: the paper's law (Hoelzle 2009, eq. 2), the inverse of the
 identified model averaged over trials, the convergence test before anything runs, what the limits of the drive
-allow, and the learning loop with roll-back."""
+allow, and the learning loop, which rolls back, and restarts on a machine that changed."""
 
 import functools
 import math
+import operator
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import scipy.fft
-import scipy.ndimage
 import scipy.signal
 
 from pipeline.deposition import reachable
-from pipeline.deposition.extruder import Extruder, flow, frequency_response, pressed
-from pipeline.deposition.trial_model import TrialModel, identify
+from pipeline.deposition.drive import Drive, asked, at_limit, follows, obeyed
+from pipeline.deposition.extruder import Extruder, flow, frequency_response
+from pipeline.deposition.trial_filter import Repeating, repeating
+from pipeline.deposition.trial_model import TrialModel, identify_with_lag, lag_delay_s
 
 # of the steady gain squared: only keeps the inverse finite where half
 # a sample of delay makes a zero, far above any Q
 EPSILON = 1e-9
 # the ink is brought to its yield over this time before flow is wanted, and let down over it afterwards
 YIELD_LEAD_S = 0.4
-# ooze is told from noise on the mean flow over this time, which has a fraction of the noise
-OOZE_S = 0.5
 
 
 class Trial(NamedTuple):
@@ -114,30 +114,27 @@ def hoelzle_law(
     q: Callable[..., np.ndarray],
     settings: HoelzleSettings,
     *,
-    limit: float,
+    drive: Drive,
     sample_time_s: float,
 ) -> Law:
     """u_{j+1} = Q (u_j + L e_j) of the last trial (Hoelzle 2009, eq. 2); q is
     `zero_phase` or takes the same, the model the nominal (1).
 
-    u_j is what the drive applied, so that nothing winds up at the
-    limit; e_j = 0 where the flow was not observable.
+    u_j is what the drive applied, so that nothing winds up at its
+    limits; e_j = 0 where the flow was not observable.
     """
     b, a = _slow_inverse(model, settings, sample_time_s)
 
     def law(trials: Sequence[Trial]) -> np.ndarray:
         u, y, _ = trials[-1]
         e = np.where(np.isfinite(y), r - y, 0.0)
-        return np.clip(
-            q(
-                u + scipy.signal.lfilter(b, a, e),
-                order=settings.order,
-                cutoff_hz=settings.cutoff_hz,
-                sample_time_s=sample_time_s,
-            ),
-            -limit,
-            limit,
+        following = q(
+            u + scipy.signal.lfilter(b, a, e),
+            order=settings.order,
+            cutoff_hz=settings.cutoff_hz,
+            sample_time_s=sample_time_s,
         )
+        return obeyed(following, drive, sample_time_s=sample_time_s)
 
     return law
 
@@ -166,105 +163,101 @@ def wanted(r: np.ndarray, yield_: float, *, sample_time_s: float) -> np.ndarray:
     return r + yield_ * np.where(r > 0, 1.0, np.minimum(near, 1.0))
 
 
-def disturbance(
-    trials: Sequence[Trial], r: np.ndarray, model: TrialModel, *, floor: float, sample_time_s: float
-) -> np.ndarray:
-    """d (T,) in mm^3/s, what repeats beyond the model: x = G u + d, y = max(x - yield, 0); a Kalman filter
-    over trials with the weight k_j = max(1/j, floor).
-
-    d <- d + k_j (y + yield - (G u_j + d)), the first two trials in full: the command moves far after trial 0.
-    Nothing is learned where the flow was not observable, nor where none is wanted, predicted or seen: below
-    the yield y says nothing of x, and noise would be summed up trial after trial.
-    """
-    extruder, d = model.extruder, np.zeros(len(r))
-    y = np.array([trial.y for trial in trials])
-    observable, y = np.isfinite(y), np.nan_to_num(y)
-    linear = pressed(extruder, np.array([trial.u for trial in trials]), sample_time_s=sample_time_s)
-    oozing = scipy.ndimage.uniform_filter1d(y, max(round(OOZE_S / sample_time_s), 1)) > model.noise
-    for j in range(len(trials)):
-        x = linear[j] + d
-        flowing = (r > 0) | (x > extruder.yield_) | oozing[j]
-        d = d + max(1 / max(j, 1), floor) * np.where(observable[j] & flowing, y[j] + extruder.yield_ - x, 0.0)
-    return d
-
-
 def command(
-    x: np.ndarray, r: np.ndarray, model: Extruder, *, limit: float, sample_time_s: float
+    x: np.ndarray, r: np.ndarray, model: Extruder, *, drive: Drive, sample_time_s: float
 ) -> np.ndarray:
-    """u (T,) in mm that presses x (T,) out of the model; where that takes more than `limit`, the u whose flow
+    """u (T,) in mm that presses x (T,) out of the model; where the drive cannot follow that, the u whose flow
     comes nearest (`reachable.nearest`)."""
     u = inverse(x, model, sample_time_s=sample_time_s)
-    if np.abs(u).max() <= limit:
+    if follows(u, drive, sample_time_s=sample_time_s):
         return u
     a = math.exp(-sample_time_s / model.time_constant_s)
     scale, t = model.gain * (1 - a), np.arange(len(x)) * sample_time_s
-    # u(t) shows in the flow one sample and the delay later
-    later = t + sample_time_s + model.delay_s
+    # u(t) shows in the flow one sample and the delay later; what is reached at a limit is slow, and a lag
+    # makes that late
+    later = t + sample_time_s + model.delay_s + lag_delay_s(model.lag_hz)
     free = np.interp(later, t, r) <= 0
-    v = reachable.nearest(np.interp(later, t, x), free, pole=a, bound=scale * limit)
-    return np.clip(
-        np.diff(v, prepend=0.0) / scale + np.concatenate([[0.0], v[:-1]]) / model.gain, -limit, limit
+    v = reachable.nearest(
+        np.interp(later, t, x),
+        free,
+        pole=a,
+        bound=scale * drive.amplitude_mm,
+        step=scale * drive.speed_mm_per_s * sample_time_s,
     )
+    u = np.diff(v, prepend=0.0) / scale + np.concatenate([[0.0], v[:-1]]) / model.gain
+    return obeyed(u, drive, sample_time_s=sample_time_s)
 
 
 class InverseLaw:
-    """The model inverse, u_{j+1} = Q sum_i w_i (u_i + L e_i) over all trials i <= j, L the inverse of the
-    model identified from the first ones; it remembers that model.
+    """The model inverse, u_{j+1} = Q sum_i w_i (u_i + L e_i) over the trials i <= j that it is given, L the
+    inverse of the model identified from the first of them; it remembers that model.
 
-    Written with the average d of what the model misses: u_{j+1} = Q L (r + yield - d), the same thing, and
-    for one trial Q (u + L e). The weights w_i average what does not repeat; Q stays outside, so that it
-    erodes nothing as they fall, and |1 - k + k Q (1 - L P)| < 1 wherever |Q (1 - L P)| < 1, for any k.
+    Written with the average d of what the model misses: u_{j+1} = L Q ((r + yield) / g - d), the same thing
+    where the gain g of the next trial is 1, and for one trial Q (u + L e). The weights w_i average what does
+    not repeat, and follow what changes (`trial_filter.repeating`); Q stays outside, so that it erodes nothing
+    as they fall, and |1 - k + k Q (1 - L P)| < 1 wherever |Q (1 - L P)| < 1, for any k.
 
     `identify_trials` trials are identified together: beyond the on-off trial 0 the first
     learned commands show the extruder as it will be driven.
     """
 
-    def __init__(self, r: np.ndarray, settings: InverseSettings, *, limit: float, sample_time_s: float):
-        self.r, self.settings, self.limit, self.sample_time_s = r, settings, limit, sample_time_s
+    def __init__(self, r: np.ndarray, settings: InverseSettings, *, drive: Drive, sample_time_s: float):
+        self.r, self.settings, self.drive, self.sample_time_s = r, settings, drive, sample_time_s
         self.q = {"order": settings.order, "cutoff_hz": settings.cutoff_hz, "sample_time_s": sample_time_s}
         self._first: list[Trial] = []
         self.model: TrialModel | None = None
+        self.repeating: Repeating | None = None
 
     def __call__(self, trials: Sequence[Trial]) -> np.ndarray:
-        first = list(trials[: self.settings.identify_trials])
-        if (
-            self.model is None
-            or len(first) != len(self._first)
-            or any(a is not b for a, b in zip(first, self._first, strict=True))
-        ):
-            self._first, self.model = (
-                first,
-                identify([t.u for t in first], [t.y for t in first], sample_time_s=self.sample_time_s),
-            )
-        extruder = self.model.extruder
-        d = disturbance(
-            trials, self.r, self.model, floor=self.settings.floor, sample_time_s=self.sample_time_s
+        model = self._identified(list(trials[: self.settings.identify_trials]))
+        self.repeating = repeating(
+            np.array([trial.u for trial in trials]),
+            np.array([trial.y for trial in trials]),
+            self.r,
+            model,
+            floor=self.settings.floor,
+            smooth=lambda x: zero_phase(x, **self.q),
+            sample_time_s=self.sample_time_s,
         )
-        x = zero_phase(wanted(self.r, extruder.yield_, sample_time_s=self.sample_time_s) - d, **self.q)
-        return command(x, self.r, extruder, limit=self.limit, sample_time_s=self.sample_time_s)
+        d, gain, extruder = self.repeating.disturbance, self.repeating.gain, model.extruder
+        x = wanted(self.r, extruder.yield_, sample_time_s=self.sample_time_s) / gain - d
+        return command(
+            zero_phase(x, **self.q), self.r, extruder, drive=self.drive, sample_time_s=self.sample_time_s
+        )
+
+    def _identified(self, first: list[Trial]) -> TrialModel:
+        """The model of the trials `first`, identified once."""
+        same = len(first) == len(self._first) and all(map(operator.is_, first, self._first))
+        if self.model is None or not same:
+            u, y = [trial.u for trial in first], [trial.y for trial in first]
+            self._first = first
+            self.model = identify_with_lag(u, y, sample_time_s=self.sample_time_s)
+        return self.model
 
 
 # ---- before anything runs
 
 
-def gamma(Q: np.ndarray, L: np.ndarray, P: np.ndarray) -> np.ndarray:
-    """max over frequency of |Q (1 - L P)|: below 1 the error shrinks monotonically, above 1 it grows in the
-    end (Bristow, Tharayil and Alleyne 2006).
+def gamma(Q: np.ndarray, L: np.ndarray, P: np.ndarray, delta: np.ndarray | float = 0.0) -> np.ndarray:
+    """max over frequency and over all |Delta'(f)| <= delta(f) of |Q (1 - L P (1 + Delta'))|, which is |Q| (|1
+    - L P| + |L P| delta): below 1 the error shrinks monotonically, above 1 it grows in the end (Bristow,
+    Tharayil and Alleyne 2006; with the multiplicative uncertainty delta, de Roover and Bosgra 2000).
 
-    Q (F,) is |Q|^2 where Q runs both ways; L (F,); P (F,) or (plants, F), with all
+    Q (F,) is |Q|^2 where Q runs both ways; L (F,); delta (F,); P (F,) or (plants, F), with all
     the delay there is: the result is one number a plant.
     """
-    return np.max(np.abs(Q * (1 - L * P)), axis=-1)
+    return np.max(np.abs(Q) * (np.abs(1 - L * P) + np.abs(L * P) * delta), axis=-1)
 
 
 class ActuatorHeadroom(NamedTuple):
-    """What a limit on the command leaves: peak and steady command (mm) that r needs, the least error as a
-    share of trial 0's, and the ramp that would do."""
+    """What the drive leaves: peak (mm) and speed (mm/s) of the command that r needs, its steady command (mm),
+    the least error as a share of trial 0's, and the ramp that would do."""
 
     peak: float
     steady: float
     ratio: float
     ramp_s: float
+    speed: float
 
 
 def actuator_headroom(
@@ -274,14 +267,14 @@ def actuator_headroom(
     *,
     order: int,
     cutoff_hz: float,
-    limit: float,
+    drive: Drive,
     sample_time_s: float,
 ) -> ActuatorHeadroom:
-    """Headroom of the drive over the model for r (T,): the least error is that of the nearest flow within
-    the limit, as a share of what u0 (T,) leaves.
+    """Headroom of the drive over the model for r (T,): the least error is that of the nearest flow that the
+    drive can follow, as a share of what u0 (T,) leaves. Its backlash, which is learned, is left out.
 
-    ramp_s solves (1 + tau / t_ramp) steady = limit; it is infinite
-    where the limit does not even hold the steady flow.
+    ramp_s is the longer of what solves (1 + tau / t_ramp) steady = amplitude and (1 + tau / t_ramp) steady /
+    t_ramp = speed; it is infinite where the amplitude does not even hold the steady flow.
     """
     x = zero_phase(
         wanted(r, model.yield_, sample_time_s=sample_time_s),
@@ -289,27 +282,45 @@ def actuator_headroom(
         cutoff_hz=cutoff_hz,
         sample_time_s=sample_time_s,
     )
-    peak, steady = (
-        np.abs(inverse(x, model, sample_time_s=sample_time_s)).max(),
-        (r.max() + model.yield_) / model.gain,
+    needed = asked(inverse(x, model, sample_time_s=sample_time_s), sample_time_s=sample_time_s)
+    steady = float((r.max() + model.yield_) / model.gain)
+    best, first = (
+        rms(r - flow(model, u, sample_time_s=sample_time_s))
+        for u in (
+            command(x, r, model, drive=drive, sample_time_s=sample_time_s),
+            obeyed(u0, drive, sample_time_s=sample_time_s),
+        )
     )
-    best = flow(
-        model, command(x, r, model, limit=limit, sample_time_s=sample_time_s), sample_time_s=sample_time_s
-    )
-    first = flow(model, u0, sample_time_s=sample_time_s, limit=limit)
-    ramp_s = model.time_constant_s / (limit / steady - 1) if limit > steady else math.inf
-    return ActuatorHeadroom(float(peak), float(steady), rms(r - best) / rms(r - first), ramp_s)
+    ramp_s = max(_ramp_of_amplitude(drive, steady, model), _ramp_of_speed(drive, steady, model))
+    return ActuatorHeadroom(needed.command_mm, steady, best / first, ramp_s, needed.speed_mm_per_s)
 
 
-def check_headroom(headroom: ActuatorHeadroom, *, limit: float, worst_ratio: float) -> None:
+def _ramp_of_amplitude(drive: Drive, steady: float, model: Extruder) -> float:
+    """The ramp in s whose peak command is the amplitude, (1 + tau / ramp) steady; 0 without a limit."""
+    over = drive.amplitude_mm / steady
+    return model.time_constant_s / (over - 1) if over > 1 else math.inf
+
+
+def _ramp_of_speed(drive: Drive, steady: float, model: Extruder) -> float:
+    """The ramp in s over which the command goes to (1 + tau / ramp) steady at the speed; 0 without a
+    limit."""
+    rate = drive.speed_mm_per_s / steady
+    if math.isinf(rate):
+        return 0.0
+    return (1 + math.sqrt(1 + 4 * model.time_constant_s * rate)) / (2 * rate)
+
+
+def check_headroom(headroom: ActuatorHeadroom, *, drive: Drive, worst_ratio: float) -> None:
     """Raises ValueError where no law can come below `worst_ratio` of trial 0's
     error: the sentence names the ramp that would do."""
     if headroom.ratio <= worst_ratio:
         return
     needs = (
         f"these ramps need a peak command of {headroom.peak / headroom.steady:.1f} x steady "
-        f"and the limit is {limit / headroom.steady:.1f} x"
+        f"and the limit is {drive.amplitude_mm / headroom.steady:.1f} x"
     )
+    if headroom.speed > drive.speed_mm_per_s:
+        needs += f", and {headroom.speed:.0f} mm/s where the drive has {drive.speed_mm_per_s:g} mm/s"
     do = (
         f"ramps of {headroom.ramp_s:.2f} s would do"
         if math.isfinite(headroom.ramp_s)
@@ -325,13 +336,13 @@ def check_headroom(headroom: ActuatorHeadroom, *, limit: float, worst_ratio: flo
 
 
 class Step(NamedTuple):
-    """The next command u (T,) in mm; best is the trial with the least measured error; stopped: u is that
-    trial's command, and learning is over."""
+    """Next command u (T,) in mm; the best trial of the machine as it is now; whether the last trial rose, so
+    that u goes back to the best; and the trials at which the machine was found changed."""
 
     u: np.ndarray
     best: int
     rolled_back: bool
-    stopped: bool
+    restarts: list[int]
 
 
 def rms(e: np.ndarray) -> float:
@@ -341,38 +352,51 @@ def rms(e: np.ndarray) -> float:
 
 
 class LearningState(NamedTuple):
-    """The trials to learn from, the one with the least error, whether each has risen, and whether two have
-    without a better one between: learning is over."""
+    """The trials to learn from, those of the machine as it is now without those that rose; the one of them
+    with the least error; whether each trial has risen; the first trial after each change of the machine;
+    whether the next trial repeats the best command; and how often the law's step is halved."""
 
     keep: list[int]
     best: int
     risen: list[bool]
-    stopped: bool
+    restarts: list[int]
+    repeat: bool
+    halvings: int
 
 
 def judge(errors: Sequence[float], *, rise: float) -> LearningState:
-    """Which trials to learn from: one whose error exceeds the best so far by more than `rise` of trial 0's
-    has risen, and all since the best are left."""
-    keep, best, rises, risen = [0], 0, 0, [False]
+    """What the trials so far say of machine and law: a trial has risen whose error exceeds the best by more
+    than `rise` of trial 0's.
+
+    The trial after a rise repeats the best command, and this tells a law from a machine. Where the error of
+    old comes back, the law went too far, or that trial was spoilt: the trial is left out, and the law's steps
+    are halved until as many trials did not rise. Where the repeat rises too, the machine changed: what was
+    learned before the first of the two is left.
+    """
+    keep, best, risen, restarts = [0], 0, [False], []
+    repeat, halvings = False, 0
     for j in range(1, len(errors)):
         risen.append(errors[j] > errors[best] + rise * errors[0])
-        if risen[j]:
-            rises, keep = rises + 1, keep[: keep.index(best) + 1]
+        if repeat and risen[j]:
+            restarts.append(j - 1)
+            keep, best = [j - 1, j], min(j - 1, j, key=errors.__getitem__)
+            repeat, halvings = False, 0
+        elif risen[j]:
+            repeat = True
         else:
             keep.append(j)
-        if errors[j] < errors[best]:
-            best, rises = j, 0
-        if rises == 2:
-            return LearningState(keep, best, risen + [False] * (len(errors) - j - 1), True)
-    return LearningState(keep, best, risen, False)
+            best = min(best, j, key=errors.__getitem__)
+            repeat, halvings = False, halvings + 1 if repeat else max(halvings - 1, 0)
+    return LearningState(keep, best, risen, restarts, repeat, halvings)
 
 
 def next_step(trials: Sequence[Trial], r: np.ndarray, law: Law, *, rise: float) -> Step:
     """What follows from the trials so far; nothing else is remembered,
     so that a folder of recordings can be continued.
 
-    After a trial that has risen (`judge`) the next command goes back to the best trial and takes half the
-    law's step from there; after the second, with no better trial between, learning stops at the best.
+    After a trial that has risen (`judge`) the best command is repeated. If the machine changed, the law is
+    given the trials since alone, and so identifies its model anew; otherwise it goes on, at first with half
+    its step from the best. Learning never stops.
     """
     for j, (u, y, _) in enumerate(trials):
         if u.shape != r.shape or y.shape != r.shape or not np.isfinite(y).any():
@@ -381,11 +405,14 @@ def next_step(trials: Sequence[Trial], r: np.ndarray, law: Law, *, rise: float) 
                 f"some of it observable, but found {u.shape} and {y.shape} "
                 f"with {np.isfinite(y).sum()} observable; leave the trial out or record it again"
             )
-    keep, best, risen, stopped = judge([rms(r - trial.y) for trial in trials], rise=rise)
-    if stopped:
-        return Step(trials[best].u, best, True, True)
-    u = law([trials[i] for i in keep])
-    return Step((u + trials[best].u) / 2 if risen[-1] else u, best, risen[-1], False)
+    state = judge([rms(r - trial.y) for trial in trials], rise=rise)
+    best = trials[state.best].u
+    u = law([trials[i] for i in state.keep])
+    if state.repeat:
+        u = best
+    elif state.halvings:
+        u = best + (u - best) / 2**state.halvings
+    return Step(u, state.best, state.risen[-1], state.restarts)
 
 
 def learn(
@@ -398,15 +425,11 @@ def learn(
     rise: float,
     on_step: Callable[[Trial], None] = lambda trial: None,
 ) -> list[Trial]:
-    """Trial 0 with u0 and at most `trials` updates; ends early where the
-    loop stops. `measure` runs one command on a plant."""
+    """Trial 0 with u0 and `trials` updates. `measure` runs one command on a plant."""
     done = [measure(u0)]
     on_step(done[0])
     while len(done) <= trials:
-        step = next_step(done, r, law, rise=rise)
-        if step.stopped:
-            break
-        done.append(measure(step.u))
+        done.append(measure(next_step(done, r, law, rise=rise).u))
         on_step(done[-1])
     return done
 
@@ -424,9 +447,11 @@ class Row(NamedTuple):
     rolled_back: bool
 
 
-def table(trials: Sequence[Trial], r: np.ndarray, *, steady: float, limit: float, rise: float) -> list[Row]:
-    """A row a trial; `steady` is the steady command in mm, saturated the share of time at the limit,
-    rolled_back whether the trial was left for a better one."""
+def table(
+    trials: Sequence[Trial], r: np.ndarray, *, steady: float, drive: Drive, sample_time_s: float, rise: float
+) -> list[Row]:
+    """A row a trial; `steady` is the steady command in mm, saturated the share of time at a limit of the
+    drive, rolled_back whether the trial was left for a better one."""
     measured = [rms(r - trial.y) for trial in trials]
     true = [np.nan if trial.truth is None else rms(r - trial.truth) for trial in trials]
     risen = judge(measured, rise=rise).risen
@@ -440,7 +465,7 @@ def table(trials: Sequence[Trial], r: np.ndarray, *, steady: float, limit: float
                 measured[j],
                 ratio,
                 float(np.abs(u).max() / steady),
-                float(np.mean(np.abs(u) >= 0.999 * limit)),
+                float(np.mean(at_limit(u, drive, sample_time_s=sample_time_s))),
                 risen[j],
             )
         )

@@ -7,6 +7,7 @@ import numpy as np
 
 from pipeline.deposition.gcode import Kind, Moves
 
+BLOCK = 1 << 17  # samples worked on at once
 MOST = 50_000_000  # samples of one signal, 11 days at 50 Hz: beyond it a feed or a dwell is a slip
 
 
@@ -161,8 +162,20 @@ def sampled(motion: Motion, moves: Moves, *, sample_time_s: float) -> Signal:
         )
     count = int(np.ceil(end[-1] / sample_time_s)) if len(end) else 0
     upto = np.minimum(np.ceil(end / sample_time_s).astype(int), count)
-    move = np.repeat(np.arange(len(end)), np.diff(upto, prepend=0))
-    time_s = np.arange(count) * sample_time_s
+    move = np.repeat(np.arange(len(end), dtype=np.int32), np.diff(upto, prepend=0))
+    position, speed, share = np.empty((count, 3)), np.empty(count), np.empty(count)
+    for at in range(0, count, BLOCK):  # the columns between are many: a block of them at a time
+        some = slice(at, min(at + BLOCK, count))
+        time_s = np.arange(some.start, some.stop) * sample_time_s
+        position[some], speed[some], share[some] = _at(motion, moves, move[some], time_s)
+    signal = Signal(np.arange(count) * sample_time_s, position, speed, np.zeros(0), move, share)
+    return signal._replace(e_rate=rate(signal, moves.e, sample_time_s=sample_time_s))
+
+
+def _at(
+    motion: Motion, moves: Moves, move: np.ndarray, time_s: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Position (T, 3), speed (T,) and share (T,) of its way of each move (T,) at time_s (T,)."""
     since = time_s - motion.begin_s[move]
     left = motion.duration_s[move] - since
     up, down, cruise, a = (
@@ -178,13 +191,13 @@ def sampled(motion: Motion, moves: Moves, *, sample_time_s: float) -> Signal:
     still = cruise * left - a * (down**2 - late**2 + early**2) / 2
     travel = motion.travel[move]
     done = np.where(since < left, done, travel - still)
-    share = np.clip(np.divide(done, travel, out=np.zeros(count), where=travel > 0), 0.0, 1.0)
-    position = moves.start[move] + share[:, None] * (moves.end - moves.start)[move]
+    share = np.clip(np.divide(done, travel, out=np.zeros(len(move)), where=travel > 0), 0.0, 1.0)
+    begin = moves.start[move]
+    position = begin + share[:, None] * (moves.end[move] - begin)
     arc = np.flatnonzero(moves.angle[move])
     if len(arc):
         position[arc, :2] = _on_arc(moves, move[arc], share[arc])
-    signal = Signal(time_s, position, np.where(moves.length[move] > 0, speed, 0.0), np.zeros(0), move, share)
-    return signal._replace(e_rate=rate(signal, moves.e, sample_time_s=sample_time_s))
+    return position, np.where(moves.length[move] > 0, speed, 0.0), share
 
 
 def _on_arc(moves: Moves, move: np.ndarray, share: np.ndarray) -> np.ndarray:

@@ -7,20 +7,22 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.deposition import ilc
+from pipeline.deposition.drive import Drive, obeyed
 from pipeline.deposition.extruder import Extruder, Routine, disturb, draw, flow, frequency_response
 from pipeline.deposition.ilc import Law, Trial
 from pipeline.deposition.trial_model import deviations
+from pipeline.deposition.unmodelled import unmodelled
 
 # the frequencies of the convergence test reach to half the sampling rate
 FREQUENCIES = 2000
 
 
 class LawSettings(NamedTuple):
-    """What both laws are built from: sample time in s; limit of the command in mm (infinite where there is
-    none); the settings of each law; `rise` of the error, as share of trial 0's, that counts as one."""
+    """What both laws are built from: sample time in s; the drive; the settings of each law; `rise` of the
+    error, as share of trial 0's, that counts as one."""
 
     sample_time_s: float
-    limit: float
+    drive: Drive
     hoelzle_2009: ilc.HoelzleSettings
     model_inverse: ilc.InverseSettings
     rise: float
@@ -55,8 +57,8 @@ class TrainingCase(NamedTuple):
 
 
 class Convergence(NamedTuple):
-    """gamma of the nominal plant and of each plant of the family (N,), of the
-    paper's law; below 1 the error shrinks at every trial."""
+    """gamma of the nominal plant and of each plant of the family (N,); below 1 the error shrinks at every
+    trial."""
 
     nominal: float
     family: np.ndarray
@@ -74,7 +76,7 @@ def hoelzle_2009(routine: Routine, nominal: Extruder, settings: LawSettings) -> 
         nominal,
         ilc.zero_phase,
         settings.hoelzle_2009,
-        limit=settings.limit,
+        drive=settings.drive,
         sample_time_s=settings.sample_time_s,
     )
 
@@ -82,7 +84,7 @@ def hoelzle_2009(routine: Routine, nominal: Extruder, settings: LawSettings) -> 
 def model_inverse(routine: Routine, settings: LawSettings) -> ilc.InverseLaw:
     """The inverse of the model identified from the first trials."""
     return ilc.InverseLaw(
-        routine.r, settings.model_inverse, limit=settings.limit, sample_time_s=settings.sample_time_s
+        routine.r, settings.model_inverse, drive=settings.drive, sample_time_s=settings.sample_time_s
     )
 
 
@@ -93,11 +95,11 @@ def simulated(
     the measured one with what does not repeat."""
 
     def measure(u: np.ndarray) -> Trial:
-        truth = flow(plant, u, sample_time_s=settings.sample_time_s, limit=settings.limit)
+        truth = flow(plant, u, sample_time_s=settings.sample_time_s, drive=settings.drive)
         y = disturb(
             truth, rng, steady_flow=steady_flow, white=noise.white, drift=noise.drift, gain=noise.gain
         )
-        return Trial(np.clip(u, -settings.limit, settings.limit), y, truth)
+        return Trial(obeyed(u, settings.drive, sample_time_s=settings.sample_time_s), y, truth)
 
     return measure
 
@@ -116,7 +118,14 @@ def run_trials(
     """`trials` updates from on-off control, with roll-back (`ilc.learn`)."""
     u0 = on_off(routine.r, nominal)
     done = ilc.learn(law, measure, u0, routine.r, trials=trials, rise=settings.rise, on_step=on_step)
-    rows = ilc.table(done, routine.r, steady=float(u0.max()), limit=settings.limit, rise=settings.rise)
+    rows = ilc.table(
+        done,
+        routine.r,
+        steady=float(u0.max()),
+        drive=settings.drive,
+        sample_time_s=settings.sample_time_s,
+        rise=settings.rise,
+    )
     return TrialSequence(name, routine, done, rows, getattr(law, "model", None))
 
 
@@ -152,29 +161,21 @@ def train(
     return sequences
 
 
-def ratio_at(sequence: TrialSequence, trial: int, *, rise: float) -> float:
-    """Error after so many updates as share of trial 0's; where learning
-    stopped before, that of the trial that it stopped at."""
-    if trial < len(sequence.rows):
-        return sequence.rows[trial].ratio
-    return sequence.rows[ilc.judge([row.rms_measured for row in sequence.rows], rise=rise).best].ratio
-
-
-def figures(sequence: TrialSequence, *, rise: float) -> dict[str, float]:
-    """The ratios that the loop is judged by, the least of all trials, and what the command needs."""
-    ratios = {
-        f"ratio_trial_{j}": ratio_at(sequence, j, rise=rise)
-        for j in (2, 3, 4, 8, 15, 30)
-        if j < len(sequence.rows) or len(sequence.rows) > 30
-    }
-    best = min(sequence.rows, key=lambda row: row.ratio)
-    peak = max(row.peak_over_steady for row in sequence.rows)
-    return ratios | {
+def figures(sequence: TrialSequence, *, rise: float) -> dict[str, float | list[int]]:
+    """The ratios that the loop is judged by: at some trials, of the last, and the least of the machine as it
+    is now; the trials at which it was found changed, and what the command needs."""
+    rows = sequence.rows
+    restarts = ilc.judge([row.rms_measured for row in rows], rise=rise).restarts
+    now = rows[restarts[-1] if restarts else 0 :]
+    best = min(now, key=lambda row: row.ratio)
+    return {f"ratio_trial_{j}": rows[j].ratio for j in (2, 3, 4, 8, 15, 30) if j < len(rows)} | {
+        "last_ratio": rows[-1].ratio,
         "best_ratio": best.ratio,
         "best_trial": best.trial,
-        "trials": len(sequence.rows) - 1,
-        "peak_over_steady": peak,
-        "saturated": sequence.rows[-1].saturated,
+        "restarts": restarts,
+        "trials": len(rows) - 1,
+        "peak_over_steady": max(row.peak_over_steady for row in rows),
+        "saturated": rows[-1].saturated,
     }
 
 
@@ -201,36 +202,44 @@ def convergence(
 def convergence_of_model_inverse(
     sequence: TrialSequence, rng: np.random.Generator, noise: Noise, *, plants: int, settings: LawSettings
 ) -> Convergence:
-    """gamma = max |Q (1 - L P)| of the model inverse once its model is identified: of that model, and over
-    plants that the first trials cannot tell from it."""
-    e, first = sequence.model.extruder, sequence.trials[: settings.model_inverse.identify_trials]
+    """gamma = max |Q| (|1 - L P| + |L P Delta|) of the model inverse once its model is identified: of that
+    model, and over plants that the first trials cannot tell from it.
+
+    That is the largest |Q (1 - L P (1 + Delta'))| of all |Delta'(f)| <= |Delta(f)|, and Delta is what the
+    model leaves of the trials that identified it and of the next one, which it has not seen
+    (`unmodelled.unmodelled`).
+    """
+    e, law, Ts = sequence.model.extruder, settings.model_inverse, settings.sample_time_s
+    first = _first_trials(sequence, law.identify_trials + 1, settings)
+    u, y = [t.u for t in first], [t.y for t in first]
+    n = law.identify_trials
     spread = deviations(
-        sequence.model,
-        [t.u for t in first],
-        [t.y for t in first],
-        drift=noise.drift,
-        trial_gain=noise.gain,
-        sample_time_s=settings.sample_time_s,
+        sequence.model, u[:n], y[:n], drift=noise.drift, trial_gain=noise.gain, sample_time_s=Ts
     )
     near = np.array([e.gain, e.time_constant_s, e.delay_s]) + np.array(spread[:3]) * rng.standard_normal(
         (plants, 3)
     )
-    f = np.linspace(0.0, 0.5 / settings.sample_time_s, FREQUENCIES)
-    law = settings.model_inverse
-    Q = ilc.magnitude(f, order=law.order, cutoff_hz=law.cutoff_hz, sample_time_s=settings.sample_time_s) ** 2
-    L = ilc.inverse_filter(f, e, sample_time_s=settings.sample_time_s)
-    family = [Extruder(K, tau, max(delay, 0.0)) for K, tau, delay in np.maximum(near, 1e-6).tolist()]
-    P = np.stack(
-        [frequency_response(plant, f, sample_time_s=settings.sample_time_s) for plant in [e, *family]]
-    )
-    gammas = ilc.gamma(Q, L, P)
+    f = np.linspace(0.0, 0.5 / Ts, FREQUENCIES)
+    Q = ilc.magnitude(f, order=law.order, cutoff_hz=law.cutoff_hz, sample_time_s=Ts) ** 2
+    L = ilc.inverse_filter(f, e, sample_time_s=Ts)
+    family = [
+        Extruder(K, tau, max(delay, 0.0), e.lag_hz) for K, tau, delay in np.maximum(near, 1e-6).tolist()
+    ]
+    P = np.stack([frequency_response(plant, f, sample_time_s=Ts) for plant in [e, *family]])
+    gammas = ilc.gamma(Q, L, P, unmodelled(sequence.model, u, y, f, sample_time_s=Ts))
     return Convergence(float(gammas[0]), gammas[1:])
+
+
+def _first_trials(sequence: TrialSequence, count: int, settings: LawSettings) -> list[Trial]:
+    """The first trials of the machine as it is now: of them the model was identified."""
+    state = ilc.judge([row.rms_measured for row in sequence.rows], rise=settings.rise)
+    return [sequence.trials[j] for j in state.keep[:count]]
 
 
 def actuator_headroom(
     routine: Routine, nominal: Extruder, *, worst_ratio: float, settings: LawSettings
 ) -> ilc.ActuatorHeadroom:
-    """What the limit of the command leaves of the routine, on the nominal model, before anything
+    """What the drive leaves of the routine, on the nominal model, before anything
     runs. Raises ValueError where no law can come below worst_ratio of the error of on-off
     control; the sentence names the ramp that would do."""
     headroom = ilc.actuator_headroom(
@@ -239,10 +248,10 @@ def actuator_headroom(
         nominal,
         order=settings.model_inverse.order,
         cutoff_hz=settings.model_inverse.cutoff_hz,
-        limit=settings.limit,
+        drive=settings.drive,
         sample_time_s=settings.sample_time_s,
     )
-    ilc.check_headroom(headroom, limit=settings.limit, worst_ratio=worst_ratio)
+    ilc.check_headroom(headroom, drive=settings.drive, worst_ratio=worst_ratio)
     return headroom
 
 

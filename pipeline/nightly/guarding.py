@@ -3,8 +3,10 @@ the disk, and what a failed night changed put back."""
 
 import contextlib
 import fcntl
+import json
 import os
 import shutil
+import time
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -104,10 +106,27 @@ def mend() -> list[str]:
     for path in stale_git_locks(older_than_s=0 if killed else LOCKED_S):
         path.unlink(missing_ok=True)
         mended.append(f"{path} was left by a killed git and is removed")
+    mended += unreadable_rwlock()
     mended += champion.as_committed()
     if killed:
         fresh_index(["dvc.lock", str(METRICS), str(champion.FILE), str(champion.FOLDER)])
     return mended
+
+
+def unreadable_rwlock() -> list[str]:
+    """DVC's list of who reads and writes, where a DVC was killed in the middle of writing it: every later DVC
+    refuses to start, and none mends it. One that is just being written is whole a second later."""
+    path = Path(".dvc/tmp/rwlock")
+    for wait_s in (1.0, 0.0):
+        try:
+            json.loads(path.read_bytes())
+            return []
+        except FileNotFoundError:
+            return []
+        except ValueError:
+            time.sleep(wait_s)
+    path.unlink(missing_ok=True)
+    return [f"{path} was left half written by a killed DVC and is removed"]
 
 
 def broken_champion() -> list[str]:

@@ -30,6 +30,8 @@ PARAMETERS: dict[str, str] = {
     "evaluate_setpoint.segment": "evaluate_setpoint.segment_mean_decisions",
     "evaluate_temperature.data_sets": "reproduce_study.data_sets",
     "panel.loss": "panel.extra_heat_loss_per_step",
+    "printer.limit_mm": "printer.drive.amplitude_mm",
+    "printer.speed_limit_mm_per_s": "printer.gantry_speed_limit_mm_per_s",
     "train_agent.ours": "train_agent.belief_dqn",
     "train_agent.ours.filter.look": "train_agent.belief_dqn.filter.width_bias_std",
     "train_agent.ours.filter.looks": "train_agent.belief_dqn.filter.width_bias_levels",

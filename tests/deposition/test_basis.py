@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 
 from pipeline.deposition import basis
+from pipeline.deposition.chain import Identified
+from pipeline.deposition.drive import Drive
 from pipeline.deposition.extruder import Extruder, draw, lagged, ramp
 from tests.deposition.trained import TS, percent_of_on_off, protocol
 
@@ -44,7 +46,7 @@ def test_the_weights_are_those_of_the_docstring():
     for k in range(len(x) - 1):
         slow[k + 1] = a * slow[k] + (1 - a) * x[k]
     expected = rate * np.gradient(x, 0.001) + level * x + (1 / K - level) * slow
-    u = basis._inverse(Extruder(K, tau, creep_share=c, creep_time_s=T), x, 0.001)
+    u = basis._inverse(Identified(K, tau, creep_share=c, creep_time_s=T), x / K, 0.001)
     np.testing.assert_allclose(
         u[:2400], expected[:2400], atol=0.01 * expected.max()
     )  # 1 ms steps against derivatives; the cut at 2.5 s left out
@@ -83,15 +85,16 @@ def test_what_is_sent_ahead_arrives_in_time():
 def test_a_command_within_its_limit_comes_nearest_and_beats_cutting():
     plant, r = Extruder(0.9, 4.5, delay_s=0.1, lag_hz=4.0, play=0.05, yield_=0.1), protocol().r
     limit = 5 * STEADY / plant.gain
+    drive = Drive(limit, np.inf, 0.0)
     within, cut = (
-        basis.compose(plant, r, sample_time_s=TS, limit=limit),
+        basis.compose(plant, r, sample_time_s=TS, drive=drive),
         np.clip(basis.compose(plant, r, sample_time_s=TS), -limit, limit),
     )
     assert np.abs(within).max() <= limit
     assert percent_of_on_off(plant, within, r) < 0.5 * percent_of_on_off(plant, cut, r)
     free = basis.compose(plant, r, sample_time_s=TS)
     np.testing.assert_array_equal(
-        basis.compose(plant, r, sample_time_s=TS, limit=np.abs(free).max() * 1.0001), free
+        basis.compose(plant, r, sample_time_s=TS, drive=Drive(np.abs(free).max() * 1.0001, np.inf, 0.0)), free
     )  # a limit that is not met changes nothing
 
 

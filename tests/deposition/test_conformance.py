@@ -12,6 +12,7 @@ from pipeline.deposition.conformance import (
     saturation,
     volume_between,
 )
+from pipeline.deposition.drive import UNLIMITED, Drive, obeyed
 from pipeline.deposition.extruder import Extruder, flow
 from pipeline.deposition.gcode import Refusal
 from tests.deposition.test_composition import composed, of_part
@@ -20,7 +21,7 @@ from tests.deposition.trained import AREA, NOMINAL, PLANT, RAMP, TS, learned, pr
 REPORT = {
     "bead_area_mm2": AREA,
     "ramp_s": RAMP,
-    "limit": np.inf,
+    "drive": UNLIMITED,
     "shortest_s": 0.4,
     "largest_error_percent": 20.0,
 }
@@ -77,11 +78,13 @@ def test_the_forecast_of_saturation_is_within_3_points_of_the_plant(ramp_s):
     on = protocol(ramp_s=1e-9).r
     r = basis.boxed(on, ramp_s, TS)
     for times in (3.0, 5.0, 10.0, 20.0):
-        limit = times * r.max() / NOMINAL.gain
-        forecast = saturation(chain, on, on_off_gain=gain, ramp_s=ramp_s, limit=limit, sample_time_s=TS)
-        u = basis.compose(chain, r, sample_time_s=TS, limit=limit)
-        true = np.linalg.norm(flow(PLANT, u, sample_time_s=TS, limit=limit) - r)
-        on_off = np.linalg.norm(flow(PLANT, np.clip(r / NOMINAL.gain, -limit, limit), sample_time_s=TS) - r)
+        drive = Drive(times * r.max() / NOMINAL.gain, np.inf, 0.0)
+        forecast = saturation(chain, on, on_off_gain=gain, ramp_s=ramp_s, drive=drive, sample_time_s=TS)
+        u = basis.compose(chain, r, sample_time_s=TS, drive=drive)
+        true = np.linalg.norm(flow(PLANT, u, sample_time_s=TS, drive=drive) - r)
+        on_off = np.linalg.norm(
+            flow(PLANT, obeyed(r / NOMINAL.gain, drive, sample_time_s=TS), sample_time_s=TS) - r
+        )
         assert forecast.rms_percent_of_on_off == pytest.approx(
             100 * true / on_off, abs=3.0
         )  # points: the bar
@@ -91,7 +94,7 @@ def test_the_forecast_of_saturation_is_within_3_points_of_the_plant(ramp_s):
 def test_the_peak_is_about_1_plus_tau_over_ramp():
     plant, on = Extruder(1.0, 3.0), protocol(ramp_s=1e-9).r
     for ramp_s in (0.3, 0.6, 1.2):
-        forecast = saturation(plant, on, on_off_gain=1.0, ramp_s=ramp_s, limit=np.inf, sample_time_s=TS)
+        forecast = saturation(plant, on, on_off_gain=1.0, ramp_s=ramp_s, drive=UNLIMITED, sample_time_s=TS)
         # the slope is steepest in the middle, where half of the flow
         # is there: 1/2 + tau / ramp; dt of 0.02 s blunts it
         assert forecast.peak_over_steady == pytest.approx(0.5 + 3.0 / ramp_s, rel=0.05)
@@ -100,15 +103,19 @@ def test_the_peak_is_about_1_plus_tau_over_ramp():
 def test_the_ramp_that_would_do_does_and_a_shorter_one_does_not():
     chain, on = learned(PLANT).materials[0].chain.extruder, protocol(ramp_s=1e-9).r
     limit = 8 * on.max() / chain.gain
-    ramp_s = ramp_that_would_do(chain, on, ramp_s=RAMP, limit=limit, sample_time_s=TS)
+    ramp_s = ramp_that_would_do(chain, on, ramp_s=RAMP, drive=Drive(limit, np.inf, 0.0), sample_time_s=TS)
     peaks = [
         np.abs(basis.compose(chain, basis.boxed(on, x, TS), sample_time_s=TS)).max()
         for x in (ramp_s, 0.97 * ramp_s)
     ]
     assert peaks[0] <= limit < peaks[1]
-    assert ramp_that_would_do(chain, on, ramp_s=RAMP, limit=1e3, sample_time_s=TS) == RAMP  # none is needed
     assert (
-        ramp_that_would_do(chain, on, ramp_s=RAMP, limit=0.5 * on.max() / chain.gain, sample_time_s=TS)
+        ramp_that_would_do(chain, on, ramp_s=RAMP, drive=Drive(1e3, np.inf, 0.0), sample_time_s=TS) == RAMP
+    )  # none is needed
+    assert (
+        ramp_that_would_do(
+            chain, on, ramp_s=RAMP, drive=Drive(0.5 * on.max() / chain.gain, np.inf, 0.0), sample_time_s=TS
+        )
         == np.inf
     )  # not even the steady flow
 

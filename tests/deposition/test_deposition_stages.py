@@ -11,11 +11,12 @@ import pytest
 import yaml
 
 from pipeline.deposition.bead import Calibration
+from pipeline.deposition.drive import Drive, asked, follows
 from pipeline.deposition.extruder import draw, flow
 from pipeline.deposition.training import Noise
 from pipeline.deposition.workflow import train_ilc, trial_files, trial_video
 from pipeline.deposition.workflow.settings import Camera, Printer
-from pipeline.deposition.workflow.tables import TASKS
+from pipeline.deposition.workflow.tables import LESSONS, TASKS
 from pipeline.store import artifacts, params
 
 ROOT = Path(__file__).parents[2]
@@ -23,6 +24,8 @@ STAGES = ("train_ilc", "segment_library", "compose_parts")
 # short phases and one material: the whole of it in seconds
 SHORT = {"off_s": 1.0, "on_s": 2.5, "tail_s": 2.0}
 SMALL = {
+    # a drive that follows all, so that the bars are those of the laws and composers
+    "printer.drive": {"amplitude_mm": 1e3, "speed_mm_per_s": 1e5, "backlash_mm": 0.0},
     "printer.reference": {"speed_mm_per_s": 8.0, "pause_s": 0.6, **SHORT},
     "printer.routines": [
         {"speed_mm_per_s": 8.0, "pause_s": 0.6, **SHORT},
@@ -350,9 +353,34 @@ def test_learning_is_what_its_parts_are():
     assert joint.metrics == {"A": {"gamma": 1, "pixels": 2}, "B": {}}
 
 
+def test_every_command_that_is_learned_with_obeys_the_declared_drive(project):
+    drive = {"amplitude_mm": 6.0, "speed_mm_per_s": 8.0, "backlash_mm": 0.05}
+    declare({"printer.drive": drive, "train_ilc.worst_ratio": 1.0, "train_ilc.trials": 2})
+    stage("train_ilc")
+    printer = params.load(Printer, "printer")
+    # slower than on-off control's own ramps
+    assert 8.0 < asked(printer.trained()[0].r / 1.08, sample_time_s=printer.sample_time_s).speed_mm_per_s
+    table = artifacts.read_table("datasets/train_ilc/lessons.parquet", LESSONS)
+    commands, step = np.array(table["command_mm"]), 8.0 * printer.sample_time_s
+    first = np.array(table["time_s"]) == 0.0
+    moves = np.where(first, commands, np.diff(commands, prepend=0.0))
+    assert 5.9 < np.abs(commands).max() <= 6.0
+    assert 0.999 * step < np.abs(moves).max() <= step * (1 + 1e-9)
+    figures = json.loads(Path("reports/metrics/train_ilc.json").read_text())["A"]
+    assert figures["model_inverse"]["saturated"] > 0
+    declare({"train_ilc.source": "recordings"})
+    stage("train_ilc")
+    following = sorted(Path("datasets/train_ilc/next").glob("*.csv"))
+    assert len(following) == 3
+    for path in following:
+        u = np.loadtxt(path, delimiter=",", skiprows=1)[:, 1]
+        assert follows(u, Drive(**drive), sample_time_s=printer.sample_time_s)
+
+
 def test_a_limit_that_no_law_can_meet_is_refused_with_the_ramp_that_would_do(project, capsys):
     printer = params.load(Printer, "printer")
     # 1.2 times the steady command, where ramps of 0.15 s need about (1 + 0.8 / 0.15) times it
-    declare({"printer.limit_mm": 1.2 * printer.steady_flow / 1.08, "train_ilc.worst_ratio": 0.1})
+    drive = {"amplitude_mm": 1.2 * printer.steady_flow / 1.08, "speed_mm_per_s": 20.0, "backlash_mm": 0.05}
+    declare({"printer.drive": drive, "train_ilc.worst_ratio": 0.1})
     message = refusal("train_ilc", capsys)
     assert "headroom" in message and "ramps of" in message and "would do" in message

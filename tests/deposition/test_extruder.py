@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 
+from pipeline.deposition.drive import Drive
 from pipeline.deposition.extruder import (
     Extruder,
     backlash,
@@ -101,7 +102,8 @@ def test_below_the_yield_nothing_flows_and_above_it_the_yield_is_missing():
 def test_the_drive_cuts_the_command_at_its_limit():
     u = np.linspace(-9, 9, 500)
     np.testing.assert_array_equal(
-        flow(A, u, sample_time_s=TS, limit=3.0), flow(A, np.clip(u, -3, 3), sample_time_s=TS)
+        flow(A, u, sample_time_s=TS, drive=Drive(3.0, np.inf, 0.0)),
+        flow(A, np.clip(u, -3, 3), sample_time_s=TS),
     )
 
 

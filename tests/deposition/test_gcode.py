@@ -2,6 +2,7 @@
 each dialect's traps by hand, and what is refused."""
 
 import re
+import time
 from pathlib import Path
 
 import numpy as np
@@ -251,7 +252,8 @@ def test_accelerations_of_both_firmwares_are_kept_with_the_moves():
 def test_checksums_are_checked():
     good, bad = "N3 T0*57", "N4 G1 X5*12"
     program = parse(f"{good}\n{bad}\nN5 G1 X7 *92\nG1 X8\n")
-    assert [r.line for r in program.refusals] == [2, 3]
+    assert program.refused_line.tolist() == [2, 3]
+    assert [(r.line, r.count) for r in program.refusals] == [(2, 2)], "one kind, told once"
     assert "expected the checksum 12 of the line, found" in program.refusals[0].why
     assert program.moves.end[:, 0].tolist() == [8]
 
@@ -352,7 +354,9 @@ def test_words_that_change_the_tool(text, tools):
 @pytest.mark.parametrize(
     ("on", "off", "name"),
     [
-        ("M42 P4 S255", "M42 P4 S0", "M42"),
+        ("M42 P4 S255", "M42 P4 S0", "M42 P4"),
+        ("M42 S255", "M42 S0", "M42"),
+        ("M42 P4 M1 S255", "M42 P4 M1 S0", "M42 P4"),
         ("M760", "M761", "M760"),
         ("M7", "M9", "M7"),
         ("M8", "M9", "M7"),
@@ -499,6 +503,131 @@ def test_damaged_text_never_raises_and_never_jumps(damage, random):
         and np.isfinite(program.moves.e).all()
     )
     assert (np.diff(program.moves.line) >= 0).all() and (program.moves.length >= 0).all()
+
+
+def test_refusals_of_one_kind_are_told_once_with_their_number():
+    program = parse("G1 X1\n" + "G1 X Y5\nG5 X1\n" * 400 + "G1 X2\n")
+    assert [(r.line, r.count) for r in program.refusals] == [(2, 400), (3, 400)]
+    assert program.refusals[0].why.endswith("found 'X Y5' (and 399 more such)")
+    assert program.accounted.refused == len(program.refused_line) == 800
+
+
+@pytest.mark.parametrize("beside", ["X5", "Y2 Z1"])
+def test_axes_beside_a_switch_are_refused_and_the_switch_is_not_lost(beside):
+    program = parse(f"G0 X1\nM42 P4 S255 {beside}\nG1 X9\nM42 P4 S0\nG0 X0\n")
+    assert "no X, Y or Z beside an M word" in program.refusals[0].why and program.refusals[0].line == 2
+    assert program.moves.e.tolist() == [0, 8, 0]
+
+
+def test_foreign_words_beside_a_pin_are_refused():
+    program = parse("G0 X1\nM42 P4 C1 S255\nG1 X9\n")
+    assert "P and S beside M42" in program.refusals[0].why and program.extruder == "M42 P4"
+
+
+# ---- what slicers set beside moves
+
+
+@pytest.mark.parametrize("axis", ["U", "E", "A", "V", "W"])
+def test_g92_of_an_axis_touches_that_axis_alone(axis):
+    m = moves(f"G92 X5\nG1 X15 Y3 Z1 U2\nG92 {axis}0\nG1 X16 Y3 Z1\nG92\nG1 X1\n")
+    assert m.end.tolist() == [[10, 3, 1], [11, 3, 1], [12, 3, 1]]  # G92 alone names all of them
+
+
+def test_g92_of_e_leaves_a_plunger_where_it_is():
+    assert moves("G1 X1 U2\nG92 E0\nG1 X2 U3\nG92 U0\nG1 X3 U3\n").e.tolist() == [2, 1, 3]
+
+
+def test_a_tool_cap_is_no_extruder_and_hides_no_valve():
+    program = parse("C1 S0\nT1\nC1 S255\nG0 X1\nM42 P16 S255\nG1 X4 Y4\nM42 P16 S0\nG0 X0\n")
+    assert program.extruder == "M42 P16" and program.moves.e.tolist() == [0, 0, 5, 0]
+    assert program.other_word.tolist() == ["C1", "C1"] and program.other_line.tolist() == [1, 3]
+
+
+def test_a_lamp_that_stays_on_is_no_valve_and_a_pin_may_be_asked_for():
+    text = "M42 P17 S255\nG0 X1\nM42 P16 S255\nG1 X4\nM42 P16 S0\nG0 X9\n"
+    program = parse(text)
+    assert program.extruder == "M42 P16" and program.moves.e.tolist() == [0, 3, 0]
+    assert [(t.word, t.count) for t in program.told] == [("M42", 1)]
+    assert parse(text, extruder="M42 P17").moves.e.tolist() == [1, 3, 5]
+    with pytest.raises(ValueError, match=r"driven by U; found M42 P16, M42 P17"):
+        parse(text, extruder="U")
+
+
+def test_speed_and_flow_percent_apply_from_their_line_on():
+    text = (
+        "M83\nG1 X1 E1 F600\nM220 S50\nM221 S90\nG1 X2 E1\nM220 B\nM220 S200\nG1 X3 E1\nM220 R\n"
+        "M221 T1 S80\nG1 X4 E1\nT1\nG1 X5 E1\n"
+    )
+    program = parse(text)
+    assert program.moves.feed.tolist() == [10, 5, 20, 5, 5, 5]
+    assert program.flow.tolist() == [1, 0.9, 0.9, 0.9, 0.8, 0.8]
+    assert {(t.word, t.count, t.line) for t in program.told} == {("M220", 4, 3), ("M221", 2, 4)}
+
+
+def test_words_that_are_no_moves_are_told_once_each():
+    text = "M486 S0\nEXCLUDE_OBJECT_START NAME=a\nFOO A=1\nG1 X1 E1\n" * 300 + "EXCLUDE_OBJECT NAME=a\n"
+    told = {one.word: one for one in parse(text).told}
+    assert {word: (one.count, one.line) for word, one in told.items()} == {
+        "M486": (300, 1), "EXCLUDE_OBJECT_START": (300, 2), "FOO": (300, 3), "EXCLUDE_OBJECT": (1, 1201),
+    }  # fmt: skip
+    assert told["FOO"].what == "" and "here it is composed" in told["EXCLUDE_OBJECT"].what
+
+
+def test_a_rotary_letter_beside_moves_is_told():
+    program = parse("G1 X1 E1 C5\nG1 X2 E2 C6\n")
+    assert program.extruder == "E" and program.moves.e.tolist() == [1, 1]
+    assert [(t.word, t.count, t.line) for t in program.told] == [("C", 2, 1)]
+
+
+# ---- hostile and damaged files: one sentence, in bounded time and memory
+
+
+GOOD = "G21\nM83\n" + "G1 X1 Y1 E.1\nG1 X2 Y2 E.1\n" * 9
+
+
+@pytest.mark.parametrize(
+    ("data", "why"),
+    [
+        (b"G1 X1\n" * 40_000 + bytes(400_000), "binary, at its byte 240,000"),
+        (bytes(30_000_000), "binary, beginning"),
+        (b"some words of a log\n" * 60_000, "without a G, M or T word"),
+        (b"1.5,2.5\n" * 60_000, "without a G, M or T word"),
+        (b"A" * 100_000_000, "without a G, M or T word"),
+        ("M83\nG1 X1 E1\n".encode("utf-16-le") * 9, "binary"),
+    ],
+)
+def test_what_cannot_be_a_program_is_refused_in_bounded_time(data, why):
+    start = time.process_time()
+    with pytest.raises(ValueError, match=why) as refused:
+        parse(data)
+    assert "\n" not in str(refused.value)
+    # a second a hundred MB on the slowest machine seen; what is quadratic takes minutes
+    assert time.process_time() - start < 10
+
+
+@pytest.mark.parametrize(
+    "long", ["G1 X1 " * 20_000_000, "(" * 100_000_000, "G1 " + "X1.5" * 25_000_000, "\0" * 5]
+)
+def test_a_damaged_line_costs_itself_alone(long):
+    program = parse(GOOD + long + "\n" + GOOD)
+    assert program.refused_line.tolist() == [21] and len(program.moves.line) == 36
+    assert program.accounted.refused == 1 and sum(program.accounted) == program.lines == 41
+
+
+def test_a_long_comment_is_none_of_a_line_s_length():
+    program = parse(GOOD + "G1 X7 E1 ; " + "x" * 1_000_000 + "\n; " + "y" * 1_000_000 + "\n")
+    assert program.refusals == [] and program.moves.line[-1] == 21 and sum(program.accounted) == program.lines
+
+
+@pytest.mark.parametrize("number", ["1e+308", "9" * 400, "nan", "inf", "-1e+999", "1e+9", "0x10", "1,5"])
+def test_numbers_that_no_machine_has_are_refused(number):
+    program = parse(f"G1 X1 Y1\nG1 X{number}\nG1 X2 Y2\n")
+    assert program.refused_line.tolist() == [2] and np.isfinite(program.moves.end).all()
+
+
+def test_a_million_damaged_lines_are_one_refusal():
+    program = parse("G1 X1\n" + "G1 X Y5\n" * 100_000)
+    assert len(program.refusals) == 1 and program.accounted.refused == 100_000
 
 
 # ---- the parts, and other people's programs

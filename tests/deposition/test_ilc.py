@@ -7,6 +7,7 @@ import pytest
 from benchmarks.ilc import causal_q
 from benchmarks.norm_optimal import norm_optimal_law
 from pipeline.deposition import ilc
+from pipeline.deposition.drive import UNLIMITED, Drive, obeyed
 from pipeline.deposition.extruder import Extruder, disturb, draw, flow, frequency_response, pressed, routine
 from pipeline.deposition.trial_model import identify
 
@@ -42,29 +43,33 @@ def family(seed, count):
         )
 
 
-def machine(plant, seed=0, limit=np.inf, noise=NOISE, sample_time_s=TS, run=flow):
+def machine(plant, seed=0, drive=UNLIMITED, noise=NOISE, sample_time_s=TS, run=flow):
     rng = np.random.default_rng(seed)
 
     def measure(u):
-        y = run(plant, u, sample_time_s=sample_time_s, limit=limit)
-        return ilc.Trial(np.clip(u, -limit, limit), disturb(y, rng, steady_flow=STEADY, **noise), y)
+        y = run(plant, u, sample_time_s=sample_time_s, drive=drive)
+        return ilc.Trial(
+            obeyed(u, drive, sample_time_s=sample_time_s), disturb(y, rng, steady_flow=STEADY, **noise), y
+        )
 
     return measure
 
 
-def hoelzle_2009(nominal, q=ilc.zero_phase, limit=np.inf):
-    return ilc.hoelzle_law(R, nominal, q, HOELZLE, limit=limit, sample_time_s=TS)
+def hoelzle_2009(nominal, q=ilc.zero_phase, drive=UNLIMITED):
+    return ilc.hoelzle_law(R, nominal, q, HOELZLE, drive=drive, sample_time_s=TS)
 
 
-def model_inverse(r=R, limit=np.inf, sample_time_s=TS, **changes):
-    return ilc.InverseLaw(r, INVERSE._replace(**changes), limit=limit, sample_time_s=sample_time_s)
+def model_inverse(r=R, drive=UNLIMITED, sample_time_s=TS, **changes):
+    return ilc.InverseLaw(r, INVERSE._replace(**changes), drive=drive, sample_time_s=sample_time_s)
 
 
-def ratios(law, measure, nominal, trials, r=R, limit=np.inf, rise=0.1):
+def ratios(law, measure, nominal, trials, r=R, drive=UNLIMITED, rise=0.1):
     """Percent of trial 0, (trials + 1,), by the true flow; a loop that
     stopped goes on with its best command."""
-    done = ilc.learn(law, measure, np.clip(r / nominal.gain, -limit, limit), r, trials=trials, rise=rise)
-    rows = ilc.table(done, r, steady=STEADY / nominal.gain, limit=limit, rise=rise)
+    done = ilc.learn(
+        law, measure, obeyed(r / nominal.gain, drive, sample_time_s=TS), r, trials=trials, rise=rise
+    )
+    rows = ilc.table(done, r, steady=STEADY / nominal.gain, drive=drive, sample_time_s=TS, rise=rise)
     best = min(rows, key=lambda row: row.rms_measured)
     return 100 * np.array([row.ratio for row in rows] + [best.ratio] * (trials + 1 - len(rows)))
 
@@ -129,7 +134,7 @@ def test_gamma_is_the_factor_by_which_the_worst_sine_shrinks():
     t = np.arange(6000) * TS
     u = np.sin(2 * np.pi * worst * t)
     y = flow(plant._replace(yield_=-1e6), u, sample_time_s=TS) - 1e6
-    law = ilc.hoelzle_law(np.zeros(6000), nominal, ilc.zero_phase, HOELZLE, limit=np.inf, sample_time_s=TS)
+    law = ilc.hoelzle_law(np.zeros(6000), nominal, ilc.zero_phase, HOELZLE, drive=UNLIMITED, sample_time_s=TS)
     after = law([ilc.Trial(u, y)])[2500:3500]
     assert np.sqrt(np.mean(after**2) / 0.5) == pytest.approx(
         ilc.gamma(Q, L, P), rel=0.01
@@ -225,15 +230,15 @@ def test_the_model_inverse_on_a_dozen_plants_of_the_family():
 
 def test_the_model_inverse_within_ten_times_the_steady_command_and_half_second_ramps():
     r = reference(0.5)
-    limits = {name: 10 * STEADY / nominal.gain for name, nominal in MATERIALS.items()}
+    drives = {name: Drive(10 * STEADY / nominal.gain, np.inf, 0.0) for name, nominal in MATERIALS.items()}
     percent = [
         ratios(
-            model_inverse(r, limits[name]),
-            machine(plant, i, limits[name]),
+            model_inverse(r, drives[name]),
+            machine(plant, i, drives[name]),
             MATERIALS[name],
             15,
             r,
-            limits[name],
+            drives[name],
         )[15]
         for i, (name, plant) in enumerate(family(12, 8))
     ]
@@ -263,9 +268,9 @@ def test_other_materials_sample_times_and_ramps_are_learned_alike(
     assert percent[2] <= 20 and percent[3] <= 10 and percent[15] <= 3
 
 
-def thinning(plant, u, *, sample_time_s, limit):
+def thinning(plant, u, *, sample_time_s, drive):
     """A plant that no model here can be: flow as pressure to the power 0.7."""
-    x = flow(plant._replace(yield_=0.0), u, sample_time_s=sample_time_s, limit=limit) / STEADY
+    x = flow(plant._replace(yield_=0.0), u, sample_time_s=sample_time_s, drive=drive) / STEADY
     return STEADY * x**0.7
 
 
@@ -301,7 +306,7 @@ def test_the_norm_optimal_law_learns_too():
     name, plant = next(family(15, 1))
     u0 = R / MATERIALS[name].gain
     model = identify([u0], [machine(plant)(u0).y], sample_time_s=TS).extruder
-    law = norm_optimal_law(R, model, R_u=1e-5, R_d=1e-3, limit=np.inf, sample_time_s=TS)
+    law = norm_optimal_law(R, model, R_u=1e-5, R_d=1e-3, drive=UNLIMITED, sample_time_s=TS)
     percent = ratios(law, machine(plant), MATERIALS[name], 15)
     assert percent[2] < 20 and percent[15] < 6
 
@@ -312,11 +317,11 @@ def test_the_norm_optimal_law_learns_too():
 def test_the_forecast_says_what_the_limit_will_leave():
     name, plant = "B", next(p for n, p in family(16, 2) if n == "B")
     for times in (5, 20):
-        limit = times * STEADY / MATERIALS[name].gain
-        law, u0 = model_inverse(limit=limit), np.clip(R / MATERIALS[name].gain, -limit, limit)
-        percent = ratios(law, machine(plant, limit=limit), MATERIALS[name], 8, limit=limit)[8]
+        drive = Drive(times * STEADY / MATERIALS[name].gain, np.inf, 0.0)
+        law, u0 = model_inverse(drive=drive), obeyed(R / MATERIALS[name].gain, drive, sample_time_s=TS)
+        percent = ratios(law, machine(plant, drive=drive), MATERIALS[name], 8, drive=drive)[8]
         forecast = ilc.actuator_headroom(
-            R, u0, law.model.extruder, order=4, cutoff_hz=5.0, limit=limit, sample_time_s=TS
+            R, u0, law.model.extruder, order=4, cutoff_hz=5.0, drive=drive, sample_time_s=TS
         )
         assert percent == pytest.approx(100 * forecast.ratio, abs=3.0)  # the bar
 
@@ -324,7 +329,13 @@ def test_the_forecast_says_what_the_limit_will_leave():
 def test_the_peak_that_a_ramp_needs_follows_the_rule_of_thumb():
     model = Extruder(0.89, 4.5, 0.1)
     headroom = ilc.actuator_headroom(
-        reference(0.5), reference(0.5) / 0.89, model, order=4, cutoff_hz=5.0, limit=99.0, sample_time_s=TS
+        reference(0.5),
+        reference(0.5) / 0.89,
+        model,
+        order=4,
+        cutoff_hz=5.0,
+        drive=Drive(99.0, np.inf, 0.0),
+        sample_time_s=TS,
     )
     assert headroom.peak / headroom.steady == pytest.approx(
         1 + 4.5 / 0.5, rel=0.1
@@ -334,7 +345,7 @@ def test_the_peak_that_a_ramp_needs_follows_the_rule_of_thumb():
 def test_a_command_never_leaves_its_limit_and_ends_nearer_than_one_that_is_cut():
     model, limit = Extruder(0.89, 4.5, 0.1), 5 * STEADY / 0.89
     x = ilc.zero_phase(R, order=4, cutoff_hz=5.0, sample_time_s=TS)
-    u = ilc.command(x, R, model, limit=limit, sample_time_s=TS)
+    u = ilc.command(x, R, model, drive=Drive(limit, np.inf, 0.0), sample_time_s=TS)
     cut = np.clip(ilc.inverse(x, model, sample_time_s=TS), -limit, limit)
     assert np.abs(u).max() <= limit
     near, far = (ilc.rms(R - flow(model, v, sample_time_s=TS)) for v in (u, cut))
@@ -356,12 +367,14 @@ def test_limits_that_no_law_can_meet_are_refused_with_the_ramp_that_would_do():
             r"above the steady command",
         ),
     ):
-        limit = times * STEADY / 0.89
-        headroom = ilc.actuator_headroom(R, u0, model, order=4, cutoff_hz=5.0, limit=limit, sample_time_s=TS)
+        drive = Drive(times * STEADY / 0.89, np.inf, 0.0)
+        headroom = ilc.actuator_headroom(R, u0, model, order=4, cutoff_hz=5.0, drive=drive, sample_time_s=TS)
         with pytest.raises(ValueError, match=sentence):
-            ilc.check_headroom(headroom, limit=limit, worst_ratio=0.2)
-    wide = ilc.actuator_headroom(R, u0, model, order=4, cutoff_hz=5.0, limit=100 * STEADY, sample_time_s=TS)
-    ilc.check_headroom(wide, limit=100 * STEADY, worst_ratio=0.2)
+            ilc.check_headroom(headroom, drive=drive, worst_ratio=0.2)
+    wide = ilc.actuator_headroom(
+        R, u0, model, order=4, cutoff_hz=5.0, drive=Drive(100 * STEADY, np.inf, 0.0), sample_time_s=TS
+    )
+    ilc.check_headroom(wide, drive=Drive(100 * STEADY, np.inf, 0.0), worst_ratio=0.2)
     assert wide.ratio < 0.01  # what a Q of 5 Hz takes off these ramps
 
 
@@ -400,7 +413,9 @@ def test_a_folder_of_trials_continues_where_the_loop_left():
 def test_the_table_says_what_each_trial_was():
     u, r = np.array([0.0, 2.0, -2.0, 1.0]), np.ones(4)
     trials = [ilc.Trial(u, r - 0.5, r - 0.4), ilc.Trial(u / 2, np.array([0.9, np.nan, 1.1, 0.9]), r - 0.1)]
-    first, second = ilc.table(trials, r, steady=0.5, limit=2.0, rise=0.1)
+    first, second = ilc.table(
+        trials, r, steady=0.5, drive=Drive(2.0, np.inf, 0.0), sample_time_s=TS, rise=0.1
+    )
     assert first == ilc.Row(0, pytest.approx(0.4), pytest.approx(0.5), 1.0, 4.0, 0.5, False)
     assert second == ilc.Row(1, pytest.approx(0.1), pytest.approx(0.1), pytest.approx(0.25), 2.0, 0.0, False)
 

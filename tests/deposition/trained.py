@@ -7,6 +7,7 @@ import numpy as np
 
 from pipeline.deposition import ilc
 from pipeline.deposition.composition import Learned, learn
+from pipeline.deposition.drive import UNLIMITED
 from pipeline.deposition.extruder import Extruder, disturb, flow, routine
 from pipeline.deposition.library import Training
 
@@ -38,7 +39,7 @@ def trainings(plant: Extruder, material: str = "A", updates: int = 12) -> tuple[
         for pause in PAUSES:
             training_routine = protocol(speed, pause, on_s=11)
             steady_flow = float(training_routine.r.max())
-            law = ilc.InverseLaw(training_routine.r, INVERSE, limit=np.inf, sample_time_s=TS)
+            law = ilc.InverseLaw(training_routine.r, INVERSE, drive=UNLIMITED, sample_time_s=TS)
 
             def measure(u, steady_flow=steady_flow):
                 y = flow(plant, u, sample_time_s=TS)

@@ -341,6 +341,17 @@ def test_a_lock_of_a_git_that_died_by_day_leaves_no_promotion_staged_backwards(p
     assert not [line for line in project.dirty() if "champion" in line]
 
 
+@pytest.mark.parametrize("content", ["", '{"write": {"/a": {"pi'])
+def test_what_a_killed_dvc_left_half_written_stops_no_night(project, content):
+    """DVC itself refuses to start ever after."""
+    rwlock = project.folder / ".dvc/tmp/rwlock"
+    rwlock.write_text(content)
+    project.record("second", [9.0] * 3)
+    status, summary = night.nightly()
+    assert status == night.OK and "rwlock was left half written by a killed DVC and is removed" in summary
+    assert project.champion()["run"] == "night-0002" and json.loads(rwlock.read_text()) is not None
+
+
 def test_a_commit_leaves_alone_what_the_user_has_staged(project):
     (project.folder / "mine.txt").write_text("half done")
     project.run("git", "add", "mine.txt")

@@ -607,7 +607,10 @@ def _composed(time, wanted, scores):
     artifacts.write_table(folder / "lines.parquet", LINES, _columns(LINES, lines))
     enough = {
         "ramp_s": 0.15,
-        "limit": None,
+        "amplitude_mm": 100.0,
+        "speed_mm_per_s": 5000.0,
+        "largest_command_mm": 45.0,
+        "largest_speed_mm_per_s": 900.0,
         "peak_over_steady": 20.0,
         "share_percent": 0.0,
         "rms_percent_of_on_off": 0.1,

@@ -48,10 +48,7 @@ def conformance(**values):
 
 def test_the_composer_with_the_least_worst_error_is_named_with_its_figure_yardsticks_and_price(project):
     text = page()
-    assert (
-        "Rehearsal passed: the basis functions. All six rules that can be judged passed, "
-        "where the drive can give 20 times the steady command." in text
-    )
+    assert "Rehearsal passed: the basis functions. All seven rules passed." in text
     assert (
         "Basis functions leave at most 2.0 % of on‑off control’s flow error (square, A); "
         "library by its priority rule 12 %" in text
@@ -83,10 +80,7 @@ def test_where_the_simple_rule_is_as_good_it_wins(project):
     )
     conformance(shorter_than_lead=0)
     # 2.4 % is within half a point of 2.0 %: the simpler one is taken
-    assert (
-        "Rehearsal passed: the library by its priority rule. All four rules that can be judged passed."
-        in page()
-    )
+    assert "Rehearsal passed: the library by its priority rule. All five rules passed." in page()
 
 
 def test_on_off_control_may_win_and_then_nothing_is_to_be_printed_by_this_loop(project):
@@ -134,21 +128,49 @@ def test_the_first_failed_rule_is_said_in_words(project, basis, rule, sentence):
     assert PAGE.read_text().count('<tr class="fail"><th scope="row"><a') == 1
 
 
-def test_a_command_at_its_limit_fails_with_the_ramp_that_would_do(project):
-    enough = {
-        "ramp_s": 0.15,
-        "limit": 5.0,
-        "peak_over_steady": 20.0,
-        "share_percent": 12.0,
-        "rms_percent_of_on_off": 40.0,
-        "enough": False,
-    }
-    conformance(saturation={"A": enough}, ramp_that_would_do_s={"A": 1.25})
+DRIVEN = {
+    "ramp_s": 0.15,
+    "amplitude_mm": 10.0,
+    "speed_mm_per_s": 20.0,
+    "largest_command_mm": 45.0,
+    "largest_speed_mm_per_s": 900.0,
+    "peak_over_steady": 20.0,
+    "share_percent": 12.0,
+    "rms_percent_of_on_off": 40.0,
+    "enough": False,
+}
+
+
+def test_a_command_that_the_drive_cannot_follow_fails_with_its_limits_and_the_ramp_that_would_do(project):
+    conformance(saturation={"A": DRIVEN}, ramp_that_would_do_s={"A": 1.25})
     text = page()
+    assert "First failed rule: the drive follows." in text
     assert (
-        "First failed rule: time at the command’s limit." in text
-        and "Ramps of 1.25 s would do (printer.ramp_s)." in text
+        "square, material A, asks for 45 mm, 900 mm/s; the drive gives 10 mm, 20 mm/s, is at a limit 12 % of "
+        "the printing time" in text
     )
+    assert "Ramps of 1.25 s would do (printer.ramp_s)." in text
+    conformance(ramp_that_would_do_s={"A": None})
+    assert "no ramp would do" in page()
+
+
+@pytest.mark.parametrize("source", ["simulated", "recordings"])
+def test_without_a_declared_drive_the_verdict_is_open_and_says_what_to_declare(project, source):
+    sections = params.read("params.yaml")
+    sections["train_ilc"]["source"] = source
+    Path("params.yaml").write_text(yaml.safe_dump(sections))
+    undeclared = DRIVEN | {"amplitude_mm": None, "speed_mm_per_s": None, "share_percent": 0.0, "enough": True}
+    conformance(saturation={"A": undeclared})
+    text = page()
+    assert "First open rule: the drive follows." in text
+    assert "goes to 45 mm, 900 mm/s, and no drive is declared." in text
+    assert "Declare the drive (printer.drive)." in text
+
+
+def test_a_report_of_an_earlier_version_is_open_and_says_which_stage_to_run(project):
+    old = {key: value for key, value in DRIVEN.items() if "mm" not in key} | {"limit": None}
+    conformance(saturation={"A": old})
+    assert "Run ./run dvc repro compose_parts." in page()
 
 
 def test_refused_lines_are_shown_with_their_number_and_fail(project):

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from pipeline.deposition import composition, conformance, evaluation, gcode, motion
-from pipeline.deposition.composition import Composed, Learned, PartSettings
+from pipeline.deposition import composition, conformance, drive, evaluation, extrusion, gcode, motion
+from pipeline.deposition.composition import Composed, Learned, PartSettings, Stream
 from pipeline.deposition.conformance import Conformance
 from pipeline.deposition.evaluation import Judging, Score
-from pipeline.deposition.workflow import laws
+from pipeline.deposition.workflow import laws, part_programs
 from pipeline.deposition.workflow.segment_library import finite_or_none
 from pipeline.deposition.workflow.settings import ComposeParts, Printer, TrainIlc
 from pipeline.deposition.workflow.tables import LINES, SCORES, SIGNALS, TASKS
@@ -28,6 +28,8 @@ class Part(NamedTuple):
     planned: motion.Motion
     composed: Composed
     conformance: Conformance
+    printer: Printer
+    extruded: extrusion.Extruded
 
 
 def compose_all(
@@ -88,7 +90,13 @@ def judged(
 # ---- one part
 
 
-def compose(path: Path, learned: Learned, printer: Printer, settings: ComposeParts) -> Part:
+def compose(
+    path: Path,
+    learned: Learned,
+    printer: Printer,
+    settings: ComposeParts,
+    asked: part_programs.Asked = part_programs.AS_IT_IS,
+) -> Part:
     """A part program, composed. Raises ValueError naming the file, and the line where there is one."""
     learned_s = learned.library.sample_time_s
     if learned_s != printer.sample_time_s:
@@ -97,22 +105,13 @@ def compose(path: Path, learned: Learned, printer: Printer, settings: ComposePar
             f"at {learned_s:g} s; "
             "learn it again with ./run dvc repro"
         )
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise ValueError(f"{path} cannot be read ({error.strerror}); name a part program (G-code)") from None
+    program = part_programs.read(path, asked)
+    extruded = part_programs.extruded(program, printer, asked)
     with artifacts.about(path):
-        program = gcode.parse(data)
-        if program.refusals and not np.any(program.moves.kind == gcode.Kind.EXTRUDE):
-            first = program.refusals[0]
-            raise ValueError(
-                f"line {first.line}: {first.why}; it was left out, "
-                "and nothing of the program that could be read prints"
-            )
         planned = motion.plan(
             program.moves, acceleration=printer.acceleration_mm_per_s2,
             junction_deviation_mm=printer.junction_deviation_mm,
-            speed_limit=printer.speed_limit_mm_per_s, unset_feed=printer.speed_mm_per_s,
+            speed_limit=printer.gantry_speed_limit_mm_per_s, unset_feed=printer.speed_mm_per_s,
             tool_change_s=printer.tool_change_s,
         )  # fmt: skip
         part_settings = PartSettings(
@@ -121,43 +120,28 @@ def compose(path: Path, learned: Learned, printer: Printer, settings: ComposePar
             printer.ramp_s,
             settings.corner_deg,
             settings.longest_pause_s,
-            printer.limit,
+            printer.limits,
         )
         materials = {material.tool: material.name for material in printer.materials}
-        composed = composition.compose(learned, program, planned, part_settings, materials=materials)
+        part_programs.check_duration(program.moves, planned)
+        # a printed line is as long as the declared bead would be of the volume that E asks for
+        beads = extrusion.as_lengths(program, extruded, bead_area_mm2=printer.bead_area_mm2)
+        composed = composition.compose(learned, beads, planned, part_settings, materials=materials)
         report = conformance.conform(
             composed,
             learned,
             bead_area_mm2=printer.bead_area_mm2,
             ramp_s=printer.ramp_s,
-            limit=printer.limit,
+            drive=printer.limits,
             shortest_s=settings.shortest_s,
             largest_error_percent=settings.largest_error_percent,
             refusals=program.refusals,
         )
-    return Part(path.stem, program, planned, composed, report)
-
-
-def write(part: Part, folder: Path) -> list[Path]:
-    """The commands of all tools and the tasks as CSV, and the conformance
-    report as JSON, beside one another in `folder`."""
-    composed = part.composed
-    signal = {"time_s": np.arange(len(composed.streams[0].u)) * composed.sample_time_s}
-    signal |= {f"T{stream.tool}_{stream.material}_mm": stream.u for stream in composed.streams}
-    files = [folder / f"{part.name}.{kind}" for kind in ("signal.csv", "tasks.csv", "conformance.json")]
-    artifacts.write_csv(files[0], signal)
-    artifacts.write_csv(files[1], task_rows(part))
-    lines = line_rows(part)
-    rows = [
-        {
-            name: finite_or_none(values[i].item() if hasattr(values[i], "item") else values[i])
-            for name, values in lines.items()
-            if name != "part"
-        }
-        for i in range(len(lines["line"]))
-    ]
-    artifacts.write_json(files[2], report(part) | {"lines": rows})
-    return files
+        report = part_programs.in_percent(
+            report, program.moves, composed, shortest_s=settings.shortest_s,
+            least_mm3=printer.bead_area_mm2 * printer.nozzle_mm,
+        )  # fmt: skip
+    return Part(path.stem, program, planned, composed, report, printer, extruded)
 
 
 def summary_lines(part: Part) -> str:
@@ -171,30 +155,21 @@ def summary_lines(part: Part) -> str:
         f"the gantry sets out {composed.lead_in_s:.2f} s after the signal"
     )
     for stream in composed.streams:
-        predicted = {
-            q.composer: q.rms_percent_of_on_off for q in composed.predictions if q.tool == stream.tool
-        }
-        others = ", ".join(
-            f"{name} {percent:.1f} %" for name, percent in sorted(predicted.items(), key=lambda item: item[1])
-        )
-        text.append(
-            f"T{stream.tool} {stream.material}: by {stream.composer}; predicted flow error, "
-            f"of on-off control's: {others}"
-        )
+        text.append(forecast_sentence(composed, stream))
         sat = checks.saturation[stream.tool]
         if not sat.enough:
             ramp = checks.ramp_that_would_do_s[stream.tool]
             do = (
                 f"ramps of {ramp:.2f} s would do"
                 if math.isfinite(ramp)
-                else "no ramp would do: print slower, or raise printer.limit_mm"
+                else "no ramp would do: print slower, or take a drive of more than printer.drive declares"
             )
             text.append(
                 f"  the command reaches its limit {sat.share_percent:.1f} % of the printing time (peak "
                 f"{sat.peak_over_steady:.1f} x steady); {do}"
             )
     if checks.judged:
-        worst = int(np.argmax(np.where(lines.duration_s >= 0, np.abs(lines.error_percent), 0)))
+        worst = int(np.argmax(np.nan_to_num(np.abs(lines.error_percent))))
         text.append(
             f"volume of {checks.judged} lines within {checks.worst_line_volume_percent:.1f} % of the plan; "
             f"of all lines the worst is line {lines.line[worst]}: {lines.error_percent[worst]:+.1f} % of "
@@ -205,8 +180,20 @@ def summary_lines(part: Part) -> str:
             f"{int(np.sum(lines.shorter_than_lead))} lines belong to runs shorter than the lead of Stop: "
             "the priority rule would not print them"
         )
-    text += [f"line {one.line}: {one.why}" for one in checks.refused]
+    text += part_programs.summary(part.program, part.extruded, part.printer) + part_programs.refused(checks)
     return "\n".join(text)
+
+
+def forecast_sentence(composed: Composed, stream: Stream) -> str:
+    """The forecast of each composer in words, the least upper end first, or why it is not judged."""
+    intervals = sorted(
+        (q for q in composed.predictions if q.tool == stream.tool), key=lambda prediction: prediction.high
+    )
+    others = ", ".join(f"{q.composer} {q.low:.1f} to {q.high:.1f} %" for q in intervals)
+    text = f"T{stream.tool} {stream.material}: by {stream.composer}; "
+    if not stream.judged.judged:
+        return f"{text}forecast not judged: {stream.judged.reason}; to judge it, {stream.judged.trial}"
+    return f"{text}flow error forecast (90 %), of on-off control's: {others}"
 
 
 # ---- as tables
@@ -297,12 +284,11 @@ def report(part: Part) -> dict[str, Any]:
         "composer": {stream.material: stream.composer for stream in composed.streams},
         "predicted_percent": {
             p.material: {
-                q.composer: finite_or_none(q.rms_percent_of_on_off)
-                for q in composed.predictions
-                if q.material == p.material
+                q.composer: finite_or_none(q.median) for q in composed.predictions if q.material == p.material
             }
             for p in composed.predictions
         },
+        "forecast": {stream.material: forecast_of(composed, stream) for stream in composed.streams},
         "saturation": {
             name: {key: finite_or_none(value) for key, value in one._asdict().items()}
             for name, one in _by_material(part, checks.saturation)
@@ -311,7 +297,8 @@ def report(part: Part) -> dict[str, Any]:
             name: finite_or_none(value) for name, value in _by_material(part, checks.ramp_that_would_do_s)
         },
         "refused": refused,
-        "unknown_words": len(part.program.other_line),
+        "unknown_words": sum(one.count for one in part.program.told if not one.what),
+        "program": part_programs.told(part.program, part.extruded, part.printer),
     }
 
 
@@ -321,14 +308,49 @@ def _by_material(part: Part, of_tool: dict[int, Any]) -> list[tuple[str, Any]]:
 
 def figures(judged: Sequence[tuple[Part, Sequence[Score]]]) -> dict[str, Any]:
     """By part, material and composer: the error of the true flow in % of on-off
-    control's, the worst line's volume, and which was chosen."""
+    control's, the worst line's volume, and which was chosen; and what its command asks of the drive."""
     return {
         part.name: {
             stream.material: _by_composer([score for score in scores if score.stream == i])
+            | _forecast(part.composed, stream, [score for score in scores if score.stream == i])
+            | _asked(stream, part.composed.sample_time_s)
             for i, stream in enumerate(part.composed.streams)
         }
         for part, scores in judged
     }
+
+
+def forecast_of(composed: Composed, stream: Stream) -> dict[str, Any]:
+    """Forecast error of the signal as it is sent, in % of on-off control's, and whether it may be
+    believed."""
+    chosen = next(q for q in composed.predictions if q.tool == stream.tool and q.chosen)
+    return {
+        "low": finite_or_none(chosen.low),
+        "median": finite_or_none(chosen.median),
+        "high": finite_or_none(chosen.high),
+        "composers": {
+            q.composer: {"low": finite_or_none(q.low), "high": finite_or_none(q.high)}
+            for q in composed.predictions
+            if q.tool == stream.tool
+        },
+    } | stream.judged._asdict()
+
+
+def _forecast(composed: Composed, stream: Stream, scores: Sequence[Score]) -> dict[str, Any]:
+    """The forecast beside the true error, which a simulated machine has, and whether it may be believed."""
+    told = forecast_of(composed, stream)
+    del told["composers"]
+    judged = {name: told.pop(name) for name in ("judged", "reason", "trial")}
+    simulated = any(score.composer == evaluation.FULL_PART_ILC for score in scores)
+    true = next((score.rms_percent_of_on_off for score in scores if score.chosen), None)
+    figures = {"forecast": told, "judged": judged}
+    return figures | ({"true": true} if simulated and true is not None else {})
+
+
+def _asked(stream: Stream, sample_time_s: float) -> dict[str, float]:
+    """The largest command and speed of the signal as it is sent."""
+    most = drive.asked(stream.u, sample_time_s=sample_time_s)
+    return {"largest_command_mm": most.command_mm, "largest_speed_mm_per_s": most.speed_mm_per_s}
 
 
 def _by_composer(scores: Sequence[Score]) -> dict[str, Any]:

@@ -16,7 +16,7 @@ def law_settings(settings: TrainIlc, printer: Printer) -> LawSettings:
     hoelzle, inverse = settings.hoelzle_2009, settings.model_inverse
     return LawSettings(
         printer.sample_time_s,
-        printer.limit,
+        printer.limits,
         HoelzleSettings(hoelzle.learning_gain, hoelzle.fast_zero_s, hoelzle.order, hoelzle.cutoff_hz),
         InverseSettings(inverse.identify_trials, inverse.floor, inverse.order, inverse.cutoff_hz),
         inverse.rise,

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from pipeline.deposition import composition
-from pipeline.deposition.chain import Chain
+from pipeline.deposition.chain import Chain, Identified
 from pipeline.deposition.composition import Learned
-from pipeline.deposition.extruder import Extruder, Routine
+from pipeline.deposition.extruder import Routine
+from pipeline.deposition.forecast import Covered, Missed
 from pipeline.deposition.library import Basis, Check, Library, Training
 from pipeline.deposition.workflow.settings import Printer, SegmentLibrary
 from pipeline.deposition.workflow.tables import LESSONS, LIBRARY
@@ -75,10 +76,25 @@ def stored(learned: Learned) -> tuple[dict[str, list], dict[str, Any]]:
 
 
 def _material_as_json(material: composition.Material) -> dict[str, Any]:
-    values = material._asdict()
-    del values["chain"]
-    chain = material.chain._asdict() | {"extruder": finite(material.chain.extruder._asdict())}
-    return finite(values) | {"chain": finite(chain)}
+    values, chain = material._asdict(), material.chain._asdict()
+    for name in ("left_out", "members"):
+        chain[name] = [finite(one._asdict()) for one in chain[name]]
+    chain |= {"extruder": finite(material.chain.extruder._asdict()), "structure": list(chain["structure"])}
+    missed = finite(material.missed._asdict()) | {"by_place": material.missed.by_place.tolist()}
+    return finite(values) | {
+        "chain": finite(chain), "missed": missed, "covered": material.covered._asdict()
+    }  # fmt: skip
+
+
+def figures(rest: dict[str, Any]) -> dict[str, Any]:
+    """The rest as metrics: without the chains that the trials cannot tell apart and what they missed place by
+    place."""
+    materials = []
+    for material in rest["materials"]:
+        chain = {k: v for k, v in material["chain"].items() if k not in ("left_out", "members")}
+        missed = {k: v for k, v in material["missed"].items() if k != "by_place"}
+        materials.append(material | {"chain": chain, "missed": missed})
+    return rest | {"materials": materials}
 
 
 def finite(values: dict[str, Any]) -> dict[str, Any]:
@@ -112,15 +128,29 @@ def restored(table: dict[str, np.ndarray], rest: dict[str, Any]) -> Learned:
     )
     materials = []
     for material in rest["materials"]:
-        extruder = material["chain"]["extruder"]
-        extruder = Extruder(**{key: math.inf if value is None else value for key, value in extruder.items()})
-        chain = Chain(**(material["chain"] | {"extruder": extruder}))
-        materials.append(composition.Material(**(material | {"chain": chain})))
+        chain, missed = material["chain"], material["missed"]
+        several = {name: tuple(_identified(one) for one in chain[name]) for name in ("left_out", "members")}
+        chain |= several | {
+            "extruder": _identified(chain["extruder"]),
+            "structure": tuple(chain["structure"]),
+        }
+        missed |= {name: math.nan for name in ("ratio", "changed") if missed[name] is None}
+        missed |= {"by_place": np.array(missed["by_place"], float)}
+        known = {
+            "chain": Chain(**chain),
+            "missed": Missed(**missed),
+            "covered": Covered(**material["covered"]),
+        }
+        materials.append(composition.Material(**(material | known)))
     checks = [
         Check(**(check | {"percent": math.nan if check["percent"] is None else check["percent"]}))
         for check in rest["checks"]
     ]
     return Learned(library, tuple(materials), checks)
+
+
+def _identified(values: dict[str, float | None]) -> Identified:
+    return Identified(**{key: math.inf if value is None else value for key, value in values.items()})
 
 
 def read_learned(table: str, rest: str) -> Learned:

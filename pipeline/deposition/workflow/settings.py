@@ -1,12 +1,12 @@
 """Sections `printer` and `camera` of the parameters: the deposition loop's
 machine, its materials, and what looks at the bead."""
 
-import math
 from typing import Annotated, Literal
 
 import pydantic
 from pydantic import Field
 
+from pipeline.deposition import drive
 from pipeline.deposition.extruder import Routine, routine
 from pipeline.store.params import Mapped, Section
 
@@ -31,6 +31,14 @@ class Training(Section):
     tail_s: float = Field(gt=0, le=600)
 
 
+class Drive(Section):
+    """What the plunger's drive can do: largest |command|, largest speed, and backlash."""
+
+    amplitude_mm: float = Field(gt=0, le=1e6)
+    speed_mm_per_s: float = Field(gt=0, le=1e6)
+    backlash_mm: float = Field(ge=0, le=1000)
+
+
 class Printer(Section):
     """Section `printer`: nozzle, bead, speed, limits of motion and of
     the plunger, and the materials with their tools."""
@@ -41,11 +49,12 @@ class Printer(Section):
     bead_area_mm2: float = Field(gt=0, le=100)
     speed_mm_per_s: float = Field(gt=0, le=1000)
     ramp_s: float = Field(gt=0, le=60)
-    limit_mm: float | None = Field(gt=0, le=1e6)
+    drive: Drive | None
     acceleration_mm_per_s2: float = Field(gt=0, le=1e6)
     junction_deviation_mm: float = Field(ge=0, le=10)
-    speed_limit_mm_per_s: float = Field(gt=0, le=10_000)
+    gantry_speed_limit_mm_per_s: float = Field(gt=0, le=10_000)
     tool_change_s: float = Field(ge=0, le=3600)
+    filament_mm: float | None = Field(gt=0, le=200)
     materials: list[Material] = Field(min_length=1, max_length=20)
     reference: Training
     routines: list[Training] = Field(max_length=20)
@@ -63,9 +72,11 @@ class Printer(Section):
         return self
 
     @property
-    def limit(self) -> float:
-        """Largest command in mm; infinite where the drive has no limit that matters."""
-        return math.inf if self.limit_mm is None else self.limit_mm
+    def limits(self) -> drive.Drive:
+        """The drive that commands obey; unlimited where none is declared."""
+        if self.drive is None:
+            return drive.UNLIMITED
+        return drive.Drive(self.drive.amplitude_mm, self.drive.speed_mm_per_s, self.drive.backlash_mm)
 
     @property
     def steady_flow(self) -> float:

@@ -41,7 +41,7 @@ TRIALS = Schema(
             low=0,
         ),
         Column("peak_over_steady", FLOAT, NONE, "largest command as multiple of the steady one", low=0),
-        Column("saturated", FLOAT, NONE, "share of time at the limit of the command", 0, 1),
+        Column("saturated", FLOAT, NONE, "share of time at a limit of the drive", 0, 1),
         Column("rolled_back", BOOL, NONE, "the error rose, and the next command went back to the best trial"),
     ),
 )
@@ -182,7 +182,7 @@ TASKS = Schema(
 )
 LINES = Schema(
     "lines",
-    1,
+    2,
     (
         Column("part", TEXT, NONE, "part program"),
         Column("line", COUNT, NONE, "line of the program", low=0),
@@ -190,10 +190,12 @@ LINES = Schema(
         Column("begin_s", FLOAT, "s", "begin"),
         Column("duration_s", FLOAT, "s", "duration", low=0),
         Column("length_mm", FLOAT, "mm", "length", low=0),
-        Column("planned_mm3", FLOAT, "mm^3", "planned volume: bead area x length", low=0),
+        Column("planned_mm3", FLOAT, "mm^3", "planned volume: by E, else bead area x length", low=0),
         Column("predicted_mm3", FLOAT, "mm^3", "predicted volume"),
         Column("on_off_mm3", FLOAT, "mm^3", "predicted volume of on-off control"),
-        Column("error_percent", FLOAT, "percent", "predicted less planned"),
+        Column("error_percent", FLOAT, "percent", "predicted less planned; missing for dots", nullable=True),
         Column("shorter_than_lead", BOOL, NONE, "its whole run is shorter than the lead of Stop"),
+        Column("low_percent", FLOAT, "percent", "lower end of the error's 90 % interval", nullable=True),
+        Column("high_percent", FLOAT, "percent", "upper end of the error's 90 % interval", nullable=True),
     ),
 )

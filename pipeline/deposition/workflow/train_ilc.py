@@ -10,6 +10,7 @@ from joblib import delayed
 from tqdm import tqdm
 
 from pipeline.deposition import bead, ilc, training
+from pipeline.deposition.drive import obeyed
 from pipeline.deposition.extruder import Extruder, Routine, draw
 from pipeline.deposition.ilc import Trial
 from pipeline.deposition.training import LawSettings, Noise, TrainingCase, TrialSequence, on_off
@@ -102,8 +103,8 @@ def _model(model: ilc.TrialModel | None) -> dict[str, float] | None:
         return None
     e = model.extruder
     return {
-        "gain": e.gain, "time_constant_s": e.time_constant_s, "delay_s": e.delay_s, "yield": e.yield_,
-        "noise": model.noise,
+        "gain": e.gain, "time_constant_s": e.time_constant_s, "delay_s": e.delay_s,
+        "lag_hz": e.lag_hz, "yield": e.yield_, "noise": model.noise,
         "fit_percent": model.fit_percent,
     }  # fmt: skip
 
@@ -371,7 +372,8 @@ def _resume(
     u0 = on_off(routine.r, nominal)
     trials = [one.trial for one in measured]
     if not trials:
-        return None, ilc.Step(u0, 0, False, False)
+        first = obeyed(u0, settings.drive, sample_time_s=settings.sample_time_s)
+        return None, ilc.Step(first, 0, False, [])
     law = training.model_inverse(routine, settings)
     step = ilc.next_step(trials, routine.r, law, rise=settings.rise)
     gain_ratio = law.model.extruder.gain / nominal.gain if law.model else 1.0
@@ -381,7 +383,14 @@ def _resume(
             "check the units of the command, "
             "the calibration and the frames' size, or write the gain as it is"
         )
-    rows = ilc.table(trials, routine.r, steady=float(u0.max()), limit=settings.limit, rise=settings.rise)
+    rows = ilc.table(
+        trials,
+        routine.r,
+        steady=float(u0.max()),
+        drive=settings.drive,
+        sample_time_s=settings.sample_time_s,
+        rise=settings.rise,
+    )
     return TrialSequence("pixels", routine, trials, rows, law.model), step
 
 
@@ -417,7 +426,7 @@ def recordings(folder: Path, following: Path, work: Work) -> Part:
                 "next": name,
                 "best_trial": step.best,
                 "rolled_back": step.rolled_back,
-                "stopped": step.stopped,
+                "restarts": step.restarts,
             }
             if sequence:
                 part.sequences[key], part.measured[key] = [sequence], list(measured)

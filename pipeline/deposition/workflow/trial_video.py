@@ -10,6 +10,7 @@ import numpy as np
 import scipy.signal
 
 from pipeline.deposition import bead, flow, latency, rendering
+from pipeline.deposition.drive import obeyed
 from pipeline.deposition.extruder import Extruder, Routine, disturb
 from pipeline.deposition.extruder import flow as true_flow
 from pipeline.deposition.ilc import Trial
@@ -102,7 +103,7 @@ def simulate_recording(
     flow alone.
     """
     printer, camera, noise = machine.printer, machine.camera, machine.noise
-    truth = true_flow(machine.plant, u, sample_time_s=printer.sample_time_s, limit=printer.limit)
+    truth = true_flow(machine.plant, u, sample_time_s=printer.sample_time_s, drive=printer.limits)
     laid = np.maximum(
         disturb(
             truth, rng, steady_flow=routine.r.max(), white=noise.white, drift=noise.drift, gain=noise.gain
@@ -114,7 +115,7 @@ def simulate_recording(
         nozzle_mm=(printer.nozzle_mm / 2, printer.nozzle_outer_mm / 2),
         contact_angle_deg=camera.contact_angle_deg,
     )  # fmt: skip
-    applied = np.clip(u, -printer.limit, printer.limit)
+    applied = obeyed(u, printer.limits, sample_time_s=printer.sample_time_s)
     signals = trial_files.Signals(routine.time_s, routine.position, routine.speed, applied, truth)
     trial_files.write_trial(path, conditions, pictures, signals, encoding=camera.encoding)
 

@@ -20,6 +20,7 @@ from pipeline.report.deposition.rules import (
     NAMES,
     OURS,
     PAPER,
+    Score,
     Structure,
     gamma,
     real,
@@ -197,7 +198,7 @@ def _answer(structure: Structure, move: Move | None) -> Answer:
                 css,
                 NAMES[name],
                 percent(scores[name].error, 2) if name in scores else "not measured",
-                _forecast(scores[name].predicted) if name in scores else "",
+                _forecast(scores[name]) if name in scores else "",
                 bad=name in scores and scores[name].error > limit,
                 best=name == best,
             )
@@ -211,8 +212,15 @@ def _answer(structure: Structure, move: Move | None) -> Answer:
     )
 
 
-def _forecast(value: float | None) -> str:
-    return "" if value is None else f"forecast {percent(value, 2)}"
+def _forecast(score: Score) -> str:
+    """The 90 % interval of the forecast; never its middle alone."""
+    if score.predicted is None:
+        return ""
+    if not score.judged:
+        return "forecast not judged"
+    if score.low is None or score.high is None:
+        return ""
+    return f"forecast {percent(score.low, 2)} to {percent(score.high, 2)}"
 
 
 class Cell(NamedTuple):
@@ -270,7 +278,7 @@ def _cell(structure: Structure, name: str) -> Cell:
     line, asked = score.worst_line, structure.asked
     return Cell(
         percent(score.error, 2),
-        _forecast(score.predicted),
+        _forecast(score),
         "no line long enough" if line is None else f"worst line {percent(line, 2)}",
         best=name == structure.best(),
         bad=score.error > asked.flow_error_percent and name != "on_off",

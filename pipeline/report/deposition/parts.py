@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from pipeline.report.deposition.rules import MARK, NAMES, PAPER, real
+from pipeline.report.deposition.rules import MARK, NAMES, PAPER, asked_of_the_drive, real
 from pipeline.report.shared import charts, page
 from pipeline.report.shared.digits import MINUS, THIN, count, number, percent, short, shortened
 from pipeline.report.shared.pictures import Column, Picture, placeholder
@@ -372,16 +372,20 @@ def _signed(value: float) -> str:
 
 
 class Forecast(NamedTuple):
-    """What one stream of a part asks of the drive, in words."""
+    """What one stream of a part comes to, with 90 % certainty, and what it asks of the drive, in words."""
 
     part: str
     material: str
     mark: str
     composer: str
+    interval: str
+    why: str
+    measured: str
     time: str
     lines: str
     short: str
     peak: str
+    speed: str
     limit: str
     share: str
     bad: bool
@@ -409,6 +413,7 @@ def forecasts(sources: Sources) -> Forecasts:
 def _forecast(part: str, material: str, report: dict[str, Any]) -> Forecast:
     """One stream out of the conformance report of its part."""
     drive = report["saturation"][material]
+    asked = asked_of_the_drive(part, material, drive)
     ramp = report.get("ramp_that_would_do_s", {}).get(material)
     composer = report.get("composer", {}).get(material, "")
     if drive["enough"]:
@@ -420,15 +425,28 @@ def _forecast(part: str, material: str, report: dict[str, Any]) -> Forecast:
         material,
         MARK.get(composer, "baseline"),
         NAMES.get(composer, composer),
+        *_told(report.get("forecast", {}).get(material)),
         time=number(float(report.get("duration_s", 0.0)), 1),
         lines=f"{report.get('printed_lines', 0):,} in {report.get('runs', 0):,}",
         short=number(float(report.get("shorter_than_lead", 0)), 0),
-        peak=f"{short(float(drive['peak_over_steady']), 2)} ×",
-        limit="none set" if drive.get("limit") is None else f"{drive['limit']:g}{THIN}mm",
-        share=percent(float(drive["share_percent"]), 2),
-        bad=not drive["enough"],
+        peak=f"{short(asked.command_mm, 2)} ({short(float(drive['peak_over_steady']), 2)} ×)",
+        speed=short(asked.speed_mm_per_s, 2),
+        limit="not declared" if asked.limit() == "declared" else asked.limit(),
+        share=percent(asked.share, 2),
+        bad=not asked.enough,
         ramp=remedy,
     )
+
+
+def _told(forecast: dict[str, Any] | None) -> tuple[str, str, str]:
+    """The forecast interval, or why it is not judged and what would judge it; and what was measured."""
+    if forecast is None:
+        return "none", "", ""
+    measured = forecast.get("measured_percent")
+    beside = "" if measured is None else f"measured {percent(float(measured), 2)}"
+    if not forecast["judged"]:
+        return "not judged", f"{forecast['reason']}; to judge it, {forecast['trial']}", beside
+    return f"{percent(forecast['low'], 2)} to {percent(forecast['high'], 2)}", "", beside
 
 
 class Refusal(NamedTuple):

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
-from pipeline.report.shared.digits import THIN, count, number, percent
+from pipeline.report.shared.digits import THIN, count, number, percent, short
 from pipeline.report.shared.sources import Sources, lookup
 from pipeline.report.shared.verdict import (
     BELOW_ONE,
@@ -26,6 +26,8 @@ from pipeline.report.shared.verdict import (
 # errors closer than this, in points of on-off control's, are one: the simpler composer is taken
 SAME = 0.5
 OURS, LIBRARY = "basis", "priority"
+# the rule that stays open on any machine until its drive is declared
+DRIVE = "The drive follows"
 # simplest first
 COMPOSERS = ("on_off", "priority", "superposition", "basis")
 NAMES = {
@@ -62,12 +64,16 @@ HEADS = ("Data\u2011driven", "The paper", "model_based")
 
 
 class Score(NamedTuple):
-    """r.m.s. flow error in % of on-off control's, true where the machine is simulated; the same as forecast;
-    largest volume error of a line in %."""
+    """r.m.s. flow error in % of on-off control's, true where the machine is simulated, else the upper end of
+    its forecast; the middle of the forecast; largest volume error of a line in %; the forecast's 90 %
+    interval, and whether it may be believed."""
 
     error: float
     predicted: float | None
     worst_line: float | None
+    low: float | None = None
+    high: float | None = None
+    judged: bool = True
 
 
 class Structure(NamedTuple):
@@ -79,6 +85,14 @@ class Structure(NamedTuple):
     scores: Mapping[str, Score]
     chosen: str
     asked: ReportRules
+    simulated: bool = True
+    why: str = ""
+    trial: str = ""
+
+    def open(self) -> bool:
+        """Whether nothing tells how the chosen composer does: its forecast is not to be believed, and the
+        true flow is not known."""
+        return not self.simulated and not self.scores[self.chosen].judged
 
     def best(self) -> str:
         """The composer, on-off control too, with the least error; what
@@ -92,7 +106,7 @@ class Structure(NamedTuple):
     def state(self) -> str:
         """Of the composer that was chosen, by flow and volume."""
         score = self.scores.get(self.chosen)
-        if score is None:
+        if score is None or self.open():
             return OPEN
         return (
             FAILED
@@ -108,22 +122,39 @@ def structures(sources: Sources) -> list[Structure] | Missing:
     if isinstance(table, Missing):
         return table
     groups = pd.DataFrame(table).groupby(["part", "material"], sort=False)
-    parts = [_structure(rows, sources.declared.rules) for _, rows in groups]
+    conformance = sources.tables["conformance"]
+    told = {} if isinstance(conformance, Missing) else conformance
+    parts = [_structure(rows, sources.declared.rules, told) for _, rows in groups]
     return parts or Missing("not measured", "no part was composed", "Copy a part program to datasets/parts")
 
 
-def _structure(rows: pd.DataFrame, rules: ReportRules) -> Structure:
-    """One material of one part from its rows of the scores; a composer without an error is left out."""
+def _structure(rows: pd.DataFrame, rules: ReportRules, conformance: Mapping[str, Any]) -> Structure:
+    """One material of one part from its rows of the scores and its forecast in the conformance report; a
+    composer without an error is left out."""
     judged = rows.dropna(subset="rms_percent_of_on_off")
+    part, material = rows.part.iloc[0], rows.material.iloc[0]
+    forecast = conformance.get(part, {}).get("forecast", {}).get(material, {})
     scores = {
         row.composer: Score(
-            row.rms_percent_of_on_off, _finite(row.predicted_percent), _finite(row.worst_line_volume_percent)
+            row.rms_percent_of_on_off,
+            _finite(row.predicted_percent),
+            _finite(row.worst_line_volume_percent),
+            *(forecast.get("composers", {}).get(row.composer, {}).get(end) for end in ("low", "high")),
+            judged=forecast.get("judged", True),
         )
         for row in judged.itertuples()
     }
     chosen = judged.composer[judged.chosen.astype(bool)]
-    part, material = rows.part.iloc[0], rows.material.iloc[0]
-    return Structure(part, material, scores, "" if chosen.empty else chosen.iloc[-1], rules)
+    return Structure(
+        part,
+        material,
+        scores,
+        "" if chosen.empty else chosen.iloc[-1],
+        rules,
+        simulated="ilc" in scores,
+        why=forecast.get("reason", ""),
+        trial=forecast.get("trial", ""),
+    )
 
 
 def _finite(figure: float) -> float | None:
@@ -164,7 +195,7 @@ def rules(sources: Sources, parts: Sequence[Structure]) -> tuple[Pair, ...]:
         _above(parts, asked.above_whole_points),
         _learning(sources),
         _convergence(sources),
-        _limit(sources),
+        _drive(sources),
         _printed(sources),
     )
 
@@ -202,6 +233,11 @@ def _flow(parts: Sequence[Structure], limit: float) -> Pair:
         remedy="Run more trials, or train the speeds and pauses of that part (printer.routines).",
     )
     texts = [OPEN if pair is None else percent(pair[0], 2) for pair in pairs]
+    unknown = next((part for part in parts if part.chosen in part.scores and part.open()), None)
+    if unknown:
+        reason = f"What {where(unknown)} comes to is not judged: {unknown.why}."
+        rule = rule._replace(reason=reason, remedy=f"To judge it, {unknown.trial}.")
+        return _pair(rule, [Missing(OPEN, "")] * 2, ["not judged"] * 2)
     return _pair(rule, [_measured(pair) for pair in pairs], texts)
 
 
@@ -322,56 +358,84 @@ def _convergence(sources: Sources) -> Pair:
     return ours if values else ours._replace(question=None), paper
 
 
-class Saturated(NamedTuple):
-    """One stream of a part: the share of its time at the command's limit in %, whether the drive gives
-    enough, and whether a limit is declared."""
+class Asked(NamedTuple):
+    """One stream of a part: the largest command (mm) and speed (mm/s) that it asks for, the drive's limits
+    beside them (None: not declared), the share of its time at a limit in %, and whether the drive follows."""
 
     part: str
     material: str
+    command_mm: float
+    speed_mm_per_s: float
+    amplitude_mm: float | None
+    limit_mm_per_s: float | None
     share: float
     enough: bool
-    limited: bool
+
+    def text(self) -> str:
+        """Largest command and speed."""
+        return f"{short(self.command_mm, 2)}{THIN}mm, {short(self.speed_mm_per_s, 2)}{THIN}mm/s"
+
+    def limit(self) -> str:
+        """The drive's own."""
+        if self.amplitude_mm is None or self.limit_mm_per_s is None:
+            return "declared"
+        return f"{self.amplitude_mm:g}{THIN}mm, {self.limit_mm_per_s:g}{THIN}mm/s"
 
 
-def _limit(sources: Sources) -> Pair:
-    conformance = sources.tables["conformance"]
-    if isinstance(conformance, Missing):
-        rule = _at_most("Command limit", 0, limit="0", place="saturation", reason=conformance.sentence())
-        return _pair(rule, [conformance._replace(state=OPEN)] * 2, [OPEN] * 2)
-    shares = [
-        Saturated(part, name, float(drive["share_percent"]), drive["enough"], drive.get("limit") is not None)
-        for part, report in conformance.items()
-        for name, drive in report.get("saturation", {}).items()
-    ]
-    if not shares:
-        rule = _at_most("Command limit", 0, limit="0", place="saturation", reason="No part was composed.")
-        return _pair(rule, [Missing(OPEN, "")] * 2, [OPEN] * 2)
-    worst = max(shares, key=lambda stream: (not stream.enough, stream.share))
-    too_little = sum(not stream.enough for stream in shares)
-    limited = any(stream.limited for stream in shares)
-    text = percent(worst.share, 2) if not worst.enough else f"0{THIN}%" if limited else "no limit set"
-    ramp = (
-        lookup(conformance, f"{worst.part}.ramp_that_would_do_s.{worst.material}")
-        if "." not in worst.part
-        else Missing("not measured", "")
+def asked_of_the_drive(part: str, material: str, saturation: Mapping[str, Any]) -> Asked:
+    """One stream out of the conformance report of its part; nan where an earlier version wrote it."""
+    limits = (saturation.get(key) for key in ("amplitude_mm", "speed_mm_per_s"))
+    return Asked(
+        part,
+        material,
+        float(saturation.get("largest_command_mm", math.nan)),
+        float(saturation.get("largest_speed_mm_per_s", math.nan)),
+        *(None if limit is None else float(limit) for limit in limits),
+        float(saturation["share_percent"]),
+        bool(saturation["enough"]),
     )
-    rule = _at_most(
-        "Time at the command’s limit",
-        0,
-        limit=f"0{THIN}%",
-        place="saturation",
+
+
+def _drive(sources: Sources) -> Pair:
+    """Whether the drive follows every command as it is asked for; open until a drive is declared."""
+    conformance = sources.tables["conformance"]
+    rule = _at_most(DRIVE, 0, limit="declared", place="saturation")
+    if isinstance(conformance, Missing):
+        rule = rule._replace(reason=conformance.sentence())
+        return _pair(rule, [conformance._replace(state=OPEN)] * 2, [OPEN] * 2)
+    streams = [
+        asked_of_the_drive(part, material, saturation)
+        for part, report in conformance.items()
+        for material, saturation in report.get("saturation", {}).items()
+    ]
+    if not streams:
+        return _pair(rule._replace(reason="No part was composed."), [Missing(OPEN, "")] * 2, [OPEN] * 2)
+    if any(math.isnan(stream.command_mm) for stream in streams):
+        rule = rule._replace(
+            reason="The conformance report is of an earlier version and names no command.",
+            remedy="Run ./run dvc repro compose_parts.",
+        )
+        return _pair(rule, [Missing(OPEN, "")] * 2, [OPEN] * 2)
+    worst = max(streams, key=lambda stream: (not stream.enough, stream.command_mm, stream.speed_mm_per_s))
+    rule = rule._replace(limit=worst.limit())
+    place = f"{worst.part}, material {worst.material}"
+    if any(stream.limit() == "declared" for stream in streams):
+        rule = rule._replace(
+            reason=f"The command for {place}, goes to {worst.text()}, and no drive is declared.",
+            remedy="Declare the drive (printer.drive).",
+        )
+        return _pair(rule, [Missing(OPEN, "")] * 2, [worst.text()] * 2)
+    ramp = conformance[worst.part].get("ramp_that_would_do_s", {}).get(worst.material)
+    rule = rule._replace(
         reason=(
-            f"The command for {worst.part}, material {worst.material}, is at its limit "
+            f"{place}, asks for {worst.text()}; the drive gives {worst.limit()}, is at a limit "
             f"{percent(worst.share, 2)} of the printing time, and no signal can make up for it."
         ),
-        remedy="Print slower, or raise printer.limit_mm: no ramp would do."
-        if isinstance(ramp, Missing)
+        remedy="Print slower, or take a stronger drive (printer.drive): no ramp would do."
+        if ramp is None
         else f"Ramps of {ramp:.2f}{THIN}s would do (printer.ramp_s).",
     )
-    if too_little or limited:
-        return _pair(rule, [count_of(too_little)] * 2, [text] * 2)
-    # before the drive's limit is declared, nothing can be asked
-    return _pair(rule._replace(question=None), [Missing(UNJUDGED, "")] * 2, [text] * 2)
+    return _pair(rule, [count_of(sum(not stream.enough for stream in streams))] * 2, [worst.text()] * 2)
 
 
 def _printed(sources: Sources) -> Pair:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 from pipeline.report.deposition.rules import (
     COMPOSERS,
+    DRIVE,
     OURS,
     SAME,
     USE,
@@ -60,19 +61,20 @@ def verdict(sources: Sources) -> Verdict:
     asked = [line[column] for line in lines if use == OURS or line[column].name not in OF_THE_LAW]
     unjudged = [rule for rule in asked if rule.state == UNJUDGED]
     judged = [rule for rule in asked if rule.state != UNJUDGED]
-    # what cannot be measured on a machine's own trials does not hold them up
-    state = overall([rule.state for rule in judged if not (machine and rule.state == OPEN)])
+    # what cannot be measured on a machine's own trials does not hold them up; a drive can be declared
+    state = overall(
+        [rule.state for rule in judged if not machine or rule.state != OPEN or rule.name == DRIVE]
+    )
     state = FAILED if use == "on_off" else state
     first = None if state == PASSED else deciding(judged)
-    lacking = [first.remedy if first else "", _unlimited(sources) if unjudged else ""]
     summary = _summary(parts, use, machine)
     return Verdict(
         loop="deposition",
         state=state,
         decision=_decision(state, use, machine),
-        lead=_lead(sources, state, first, len(judged), condition=bool(unjudged), use=use),
+        lead=_lead(state, first, len(judged), condition=bool(unjudged)),
         reason=f"{first.reason} {summary}" if first and first.reason and column == 0 else summary,
-        remedy=" ".join(filter(None, lacking)),
+        remedy=first.remedy if first else "",
         rule=first.name if first else "",
         winner=use,
         note=_price(sources, parts),
@@ -87,24 +89,14 @@ def _decision(state: str, use: str, machine: bool) -> str:
     return f"{words.of(state).rstrip('.')}: {USE[use]} {'come' if use == OURS else 'comes'} closest."
 
 
-def _lead(sources: Sources, state: str, first: Rule | None, judged: int, *, condition: bool, use: str) -> str:
+def _lead(state: str, first: Rule | None, judged: int, *, condition: bool) -> str:
     """How many rules passed, and on what condition; or the first that did not."""
     if state != PASSED:
         if first is None:
             return "Nothing beats on\u2011off control."
         word = "failed" if state == FAILED else "open"
         return f"First {word} rule: {first.name[:1].lower()}{first.name[1:]}."
-    peak = _peak(sources) if condition and use == OURS else 0.0
-    drive = f", where the drive can give {number(peak, 0)} times the steady command" if peak else ""
-    return f"All {count(judged, 'rule')} {'that can be judged ' if condition else ''}passed{drive}."
-
-
-def _unlimited(sources: Sources) -> str:
-    """Before the command's limit is declared, how far the command goes is a condition of the verdict."""
-    peak = (
-        f": the command peaks at {number(peak, 0)} times the steady one" if (peak := _peak(sources)) else ""
-    )
-    return f"Not judged: time at the command’s limit. Declare the drive’s limit (printer.limit_mm){peak}."
+    return f"All {count(judged, 'rule')} {'that can be judged ' if condition else ''}passed."
 
 
 def _peak(sources: Sources) -> float:
