@@ -63,6 +63,7 @@ def calibrated(eye: Eye, camera: Camera, printer: Printer, rng: np.random.Genera
 def learned(eye: Eye, number: int, trials: int) -> dict[str, Any]:
     """Figures of one camera: `trials` updates from on-off control through recordings."""
     settings, printer = params.load(TrainIlc, "train_ilc"), params.load(Printer, "printer")
+    printer = printer.model_copy(update={"drive": None})  # what the camera costs, not the drive
     rng = np.random.default_rng([19, number])
     camera = calibrated(eye, params.load(Camera, "camera"), printer, rng)
     material, routine = printer.materials[0], printer.trained()[0]
@@ -77,7 +78,7 @@ def learned(eye: Eye, number: int, trials: int) -> dict[str, Any]:
     )
 
     def measure(u: np.ndarray) -> Trial:
-        truth = flow(plant, u, sample_time_s=printer.sample_time_s, limit=printer.limit)
+        truth = flow(plant, u, sample_time_s=printer.sample_time_s, drive=printer.limits)
         laid = np.maximum(
             disturb(truth, rng, steady_flow=routine.r.max(), white=WHITE, drift=DRIFT, gain=GAIN), 0.0
         )
@@ -111,7 +112,7 @@ def learned(eye: Eye, number: int, trials: int) -> dict[str, Any]:
     return eye._asdict() | {
         "rotation_deg": camera.rotation_deg,
         "edge_bias_told_px": camera.edge_bias_px,
-        "true_error_percent": 100 * training.ratio_at(done, trials, rise=settings.model_inverse.rise),
+        "true_error_percent": 100 * done.rows[-1].ratio,
         "ratios": [round(row.ratio, 5) for row in done.rows],
         "latency_told_s": last.latency_s,
         "latency_error_ms": 1e3 * abs(last.latency_s - eye.latency_s),

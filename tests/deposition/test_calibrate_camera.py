@@ -10,6 +10,7 @@ import pytest
 
 from benchmarks.foreign_camera import Eye, Stage, tip_of
 from pipeline import cli
+from pipeline.deposition.workflow import trial_files
 from pipeline.deposition.workflow.settings import Camera
 from pipeline.store import params
 
@@ -93,6 +94,22 @@ def test_one_picture_of_all_lines_gives_the_scale_by_their_pitch(calibrate):
     )
     assert np.array(eval(values["edge_bias_px"])) == pytest.approx([1, 1, 1], abs=0.4)
     assert "0.01 mm per px, from the pitch of the ladder" in said.replace("0.0100", "0.01")
+
+
+def test_recordings_of_the_lines_do_in_place_of_pictures(calibrate, pictures):
+    """All frames of a recording count, and their scatter is told."""
+    names = []
+    for k, picture in enumerate(pictures):
+        frame = cv2.imread(picture, cv2.IMREAD_GRAYSCALE)
+        time = np.arange(10) * 0.1
+        noisy = ((t, frame + np.uint8(i % 3)) for i, t in enumerate(time[:5]))
+        names.append(f"line_{k}.mcap")
+        signals = trial_files.Signals(time, 8 * time, np.full(10, 8.0), np.zeros(10))
+        conditions = trial_files.Conditions("A", "0.6", 0, "", 8.0, 0.6, 0.3, 95.0, 0.0, 90.0, -0.0105, 30.0)
+        trial_files.write_trial(names[-1], conditions, noisy, signals, encoding="png")
+    status, said, wrong = calibrate(*names, "--widths", "0.5,0.9,1.2")
+    assert (status, wrong) == (0, "")
+    assert "15 lines measured, repeated to 0.0" in said
 
 
 @pytest.mark.parametrize(

@@ -129,3 +129,13 @@ def test_the_mapping_of_topics_reaches_a_recording_of_other_names(turned):
         )
         with pytest.raises(ValueError, match=words):
             trial_readings.opened(turned, wrong)
+
+
+def test_without_a_tip_a_level_line_stays_as_it_lies_and_an_askew_one_is_turned_by_what_its_frames_show(
+    tmp_path,
+):
+    camera = settings(tip_px=None, rotation_deg=None)
+    for angle in (0.0, 25.0):
+        path = recorded(tmp_path / f"{angle:g}.mcap", EYE._replace(angle_deg=angle, ground="striped"))
+        pose = trial_readings.pose_of(trial_readings.opened(path, camera), camera)
+        assert (pose is None) if not angle else pose.angle_deg == pytest.approx(angle, abs=2)
