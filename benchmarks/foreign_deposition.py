@@ -4,7 +4,7 @@ paper's law and a norm-optimal law, what a limited drive leaves, and what is sai
 `./run python -m benchmarks.foreign_deposition` prints the tables with their bars and writes the key
 "learning" of benchmarks/results/foreign_deposition.json; `... 5` takes 5 plants of each kind and material.
 Trial j is after j updates; ratios are the r.m.s. error of the true flow in percent of trial 0's, which is
-on-off control's. About nine minutes on one core.
+on-off control's. About five minutes on one core.
 """
 
 import json

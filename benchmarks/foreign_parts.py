@@ -1,11 +1,11 @@
 """Parts composed for, and forecast on, extruders of kinds that the chain did not draw: is what comes out
 within the 90 % intervals, how often is a forecast not judged, and how far off are the dashes?
 
-`./run python -m benchmarks.foreign_parts` trains 20 plants a kind, 10 a material (four routines of 13 trials
-by the model inverse, noise by foreign_extruders.seen), composes both parts, and writes
-benchmarks/results/foreign_parts.json; `... foreign_parts 2` takes 2 a material and writes nothing. The drive
-is unlimited. Errors are r.m.s. of the true flow in % of on-off control's. Kinds in OUTSIDE have what the chain
-has no parameter for, or everything at once; those in CHANGING change while they learn.
+`./run python -m benchmarks.foreign_parts` trains 20 plants a kind, 10 a material (four routines of 13
+trials by the model inverse, noise by foreign_extruders.seen), composes both parts, and writes
+benchmarks/results/foreign_parts.json; `... foreign_parts 2` takes 2 a material and writes nothing. The
+drive is unlimited. Errors are r.m.s. of the true flow in % of on-off control's. Kinds in OUTSIDE have
+what the chain has no parameter for, or everything at once; those in CHANGING change while they learn.
 """
 
 import json

@@ -51,7 +51,7 @@ P = frequency_response(nominal, f, sample_time_s=Ts)
 print(f"gamma on the nominal model: {float(ilc.gamma(Q, L, P[None])[0]):.3f}")
 
 # %% Trial 0 is on-off control, u = r / K; ten updates follow from what was measured.
-inverse = ilc.InverseSettings(identify_trials=2, floor=0.1, order=4, cutoff_hz=5.0)
+inverse = ilc.InverseSettings(identify_trials=3, floor=0.1, order=4, cutoff_hz=5.0)
 on_this_machine = {"drive": UNLIMITED, "sample_time_s": Ts}
 laws = {
     "Hoelzle 2009": ilc.hoelzle_law(r, nominal, ilc.zero_phase, hoelzle, **on_this_machine),

@@ -191,6 +191,21 @@ def calibrate_tip(arguments: argparse.Namespace) -> None:
     print(calibrate(arguments.image, out, arguments.tip, least_score=least_score, topic=topic))
 
 
+def calibrate_camera(arguments: argparse.Namespace) -> None:
+    """Pictures of printed lines of known widths into section camera of params.yaml:
+    size of a pixel, rotation, measured columns, edge bias by width; and a page."""
+    from pipeline.deposition.workflow import calibrate_camera as camera
+
+    asked = camera.Asked(
+        arguments.images,
+        camera.numbers(arguments.widths, "--widths", "0.5,0.9,1.3"),
+        camera.pixel(arguments.tip),
+        arguments.pitch,
+    )
+    out = arguments.out or Path(f"{arguments.images[0].stem}.camera.html")
+    print(camera.calibrate(asked, out, write=arguments.write))
+
+
 def version() -> str:
     """The version that pyproject.toml beside the code states; without one, that of the installed package."""
     project = Path(__file__).resolve().parents[1] / "pyproject.toml"
@@ -270,6 +285,23 @@ def main() -> None:
     )
     command.add_argument("--out", type=Path, metavar="FILE", help="the page; default IMAGE.tip.html here")
     command.set_defaults(run=calibrate_tip)
+    command = commands.add_parser("calibrate-camera", help=calibrate_camera.__doc__)
+    command.add_argument(
+        "images", type=Path, nargs="+", metavar="PICTURE",
+        help="a picture or an MCAP recording for each line, or one picture of all lines",
+    )  # fmt: skip
+    command.add_argument(
+        "--widths", required=True, metavar="MM,MM,MM", help="the lines' widths in the order of the pictures"
+    )
+    command.add_argument("--tip", default="", metavar="X,Y", help="the nozzle's tip in pixels")
+    command.add_argument(
+        "--pitch", type=float, default=float("nan"), metavar="MM", help="distance of lines in one picture"
+    )
+    command.add_argument("--write", action="store_true", help="write the values into params.yaml")
+    command.add_argument(
+        "--out", type=Path, metavar="FILE", help="the page; default PICTURE.camera.html here"
+    )
+    command.set_defaults(run=calibrate_camera)
     nights.add(commands)
     arguments = parser.parse_args()
     try:

@@ -121,20 +121,21 @@ def gray(frame: np.ndarray) -> np.ndarray:
     return frame.reshape(frame.shape[:2])
 
 
-def measure(frame: np.ndarray, *, columns: tuple[int, int], longest_blur_px: float) -> Bead:
+def measure(frame: np.ndarray, *, columns: tuple[int, int], longest_blur_px: float, sign: int = 0) -> Bead:
     """The bead's width in every block of 8 columns of frame[:, first:last] (`columns`: the part that the
     nozzle does not hide), the line along the image's x.
 
     Profile of each block less the background between its ends; outermost significant run; half level of the
     plateau beside the edge, clipped at the bead's median so that the specular line cannot lift it, and
-    extrapolated to the edge against shading. Bright and dark beads alike. A frame without a usable bead comes
+    extrapolated to the edge against shading. Bright and dark beads alike, or those of one `sign` (1 bright,
+    -1 dark) where the colour is known and shadows lie about. A frame without a usable bead comes
     back with its reason; one that is no image, or too small, raises ValueError.
     """
-    return measure_all([frame], columns=columns, longest_blur_px=longest_blur_px)[0]
+    return measure_all([frame], columns=columns, longest_blur_px=longest_blur_px, sign=sign)[0]
 
 
 def measure_all(
-    frames: Sequence[np.ndarray], *, columns: tuple[int, int], longest_blur_px: float
+    frames: Sequence[np.ndarray], *, columns: tuple[int, int], longest_blur_px: float, sign: int = 0
 ) -> list[Bead]:
     """`measure` of each frame, all of one size and kind: the same numbers, each in
     a third of the time where sixteen come together."""
@@ -149,7 +150,7 @@ def measure_all(
     g = edges.profiles(frames, columns)
     n = g.shape[1]
     where = columns[0] + BLOCK * np.arange(n) + (BLOCK - 1) / 2
-    coarse = edges.coarse(g, np.iinfo(frames[0].dtype).max / 255)
+    coarse = edges.coarse(g, np.iinfo(frames[0].dtype).max / 255, sign)
     # most frames of a trial are bare
     (top, bottom), blur = (
         edges.fine(g, coarse) if coarse.solid.any() else (coarse.rows, np.full(len(frames), math.nan))

@@ -86,7 +86,7 @@ class CoarseEdges(NamedTuple):
     saturated: np.ndarray
 
 
-def coarse(g: np.ndarray, level: float) -> CoarseEdges:
+def coarse(g: np.ndarray, level: float, bead_sign: int = 0) -> CoarseEdges:
     """The outermost run above half the plateau in each block, on rows averaged by four.
 
     Background is the straight line between the means of the first and the last sixteenth of the rows; its
@@ -103,7 +103,7 @@ def coarse(g: np.ndarray, level: float) -> CoarseEdges:
     d = c - margins @ line
     step, plateau, sign = np.empty(k), np.empty(k), np.empty(k)
     for i in range(k):
-        step[i], plateau[i], sign[i] = _plateau(d[i], m, level)
+        step[i], plateau[i], sign[i] = _plateau(d[i], m, level, bead_sign)
         if sign[i] < 0:
             d[i] *= -1
     half = (plateau / 2).astype(np.float32)[:, None, None]
@@ -126,7 +126,7 @@ def coarse(g: np.ndarray, level: float) -> CoarseEdges:
     )
 
 
-def _plateau(d: np.ndarray, m: int, level: float) -> tuple[float, float, float]:
+def _plateau(d: np.ndarray, m: int, level: float, bead_sign: int) -> tuple[float, float, float]:
     """Of one frame: median of the significant steps, median of what reaches STEEP of them, sign of the bead;
     NONE and 1 where nothing is significant."""
     noise = max(math.hypot(cv2.norm(d[:, :m]), cv2.norm(d[:, -m:])) / math.sqrt(2 * m * len(d)), level / 2)
@@ -138,7 +138,8 @@ def _plateau(d: np.ndarray, m: int, level: float) -> tuple[float, float, float]:
     step = float(np.partition(steps, len(steps) // 2)[len(steps) // 2])
     threshold = max(STEEP * step, SIGNIFICANT * noise)
     up, down = d > threshold, d < -threshold
-    sign, rows = (1.0, up) if np.count_nonzero(up) >= np.count_nonzero(down) else (-1.0, down)
+    light = bead_sign > 0 or (bead_sign == 0 and np.count_nonzero(up) >= np.count_nonzero(down))
+    sign, rows = (1.0, up) if light else (-1.0, down)
     values = np.abs(d[rows])
     if not len(values):
         return NONE, NONE, 1.0

@@ -102,6 +102,12 @@ UNSUPPORTED = {
     50: "G5 is not supported; export arcs or lines",
     921: "G92.1 is not supported; write G92 and the coordinates",
 }
+# words whose numbers are taken as they stand: key, letters, least and largest
+BOUNDS = (
+    (M + 2000, "D", 0.0, 200.0), (M + 2200, "S", 1.0, 10_000.0), (M + 2210, "S", 0.0, 10_000.0),
+    (M + 2040, "PS", 0.0, 1e9),
+)  # fmt: skip
+SLOWEST = 1e-3  # mm/min
 LETTERS = "XYZEABCUIJRFPSTLD"
 AXIS = np.isin(np.arange(256), np.frombuffer(b"XYZEABCUIJRF", np.uint8))
 DRIVERS = "EUABC"
@@ -304,6 +310,13 @@ def _with_words(commands: Commands, block, letter, value, state: State, refusals
     _refuse(refusals, line, twice, "expected each letter once in a command, found one twice; write two lines")
     for code, why in UNSUPPORTED.items():
         _refuse(refusals, line, key == code, why)
+    wild = np.zeros(len(key), bool)
+    for code, letters, low, high in BOUNDS:
+        for c in letters:
+            outside = np.isfinite(word[c]) & ~((word[c] >= low) & (word[c] <= high))
+            wild |= (key == code) & (outside | np.isinf(word[c]))
+    wild |= np.isin(key, MOTION) & (word["F"] > 0) & (word["F"] < SLOWEST)
+    _refuse(refusals, line, wild, "expected a number that a machine can take, found one far outside")
     chained = (key >= M) & (key < T) & np.isin((key - M) / 10, CHAINED)
     axes = chained & ~_none(word, "XYZ")
     _refuse(refusals, line, axes, "expected no X, Y or Z beside an M word, found some; write two lines")
@@ -311,7 +324,7 @@ def _with_words(commands: Commands, block, letter, value, state: State, refusals
         known += np.bincount(block[letter == ord("M")], minlength=len(key)) - (key >= M) * (key < T)
         why = "expected P and S beside M42, found other words; the pin is switched without them"
         _refuse(refusals, line, pins & (known < words) & ~axes, why)
-    key[twice | np.isin(key, tuple(UNSUPPORTED))] = REFUSED
+    key[twice | wild | np.isin(key, tuple(UNSUPPORTED))] = REFUSED
     return commands
 
 

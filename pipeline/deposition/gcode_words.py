@@ -22,6 +22,9 @@ class Refusal(NamedTuple):
     count: int = 1
 
 
+NUMBERS = dict.fromkeys(map(ord, "0123456789."))  # what tells two reasons of one kind apart
+
+
 class Refusals:
     """What was refused so far: by kind of reason its first line and sentence, and all lines' numbers."""
 
@@ -32,7 +35,7 @@ class Refusals:
     def add(self, lines: Sequence[int], why: str) -> None:
         if not len(lines):
             return
-        kind = re.sub(r"\d+", "#", why.partition(", found")[0])
+        kind = why.partition(", found")[0].translate(NUMBERS)
         held = self.kinds.get(kind, Refusal(lines[0], why, 0))
         first = (lines[0], why) if lines[0] < held.line else held[:2]
         self.kinds[kind] = Refusal(*first, held.count + len(lines))

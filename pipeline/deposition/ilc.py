@@ -21,6 +21,8 @@ from pipeline.deposition.trial_model import TrialModel, identify_with_lag, lag_d
 # of the steady gain squared: only keeps the inverse finite where half
 # a sample of delay makes a zero, far above any Q
 EPSILON = 1e-9
+# a trial that lies within so many standard deviations of the last ones, of so many, has not risen
+SCATTER, SCATTER_TRIALS = 3.0, 10
 # the ink is brought to its yield over this time before flow is wanted, and let down over it afterwards
 YIELD_LEAD_S = 0.4
 
@@ -366,7 +368,7 @@ class LearningState(NamedTuple):
 
 def judge(errors: Sequence[float], *, rise: float) -> LearningState:
     """What the trials so far say of machine and law: a trial has risen whose error exceeds the best by more
-    than `rise` of trial 0's.
+    than `rise` of trial 0's, and what the trials before it scatter.
 
     The trial after a rise repeats the best command, and this tells a law from a machine. Where the error of
     old comes back, the law went too far, or that trial was spoilt: the trial is left out, and the law's steps
@@ -376,7 +378,8 @@ def judge(errors: Sequence[float], *, rise: float) -> LearningState:
     keep, best, risen, restarts = [0], 0, [False], []
     repeat, halvings = False, 0
     for j in range(1, len(errors)):
-        risen.append(errors[j] > errors[best] + rise * errors[0])
+        usual = _scattered([errors[i] for i in keep[2:]][-SCATTER_TRIALS:])
+        risen.append(errors[j] > max(errors[best] + rise * errors[0], usual))
         if repeat and risen[j]:
             restarts.append(j - 1)
             keep, best = [j - 1, j], min(j - 1, j, key=errors.__getitem__)
@@ -388,6 +391,15 @@ def judge(errors: Sequence[float], *, rise: float) -> LearningState:
             best = min(best, j, key=errors.__getitem__)
             repeat, halvings = False, halvings + 1 if repeat else max(halvings - 1, 0)
     return LearningState(keep, best, risen, restarts, repeat, halvings)
+
+
+def _scattered(errors: list[float]) -> float:
+    """The largest error that the scatter of these explains: their median and SCATTER standard deviations,
+    told from the changes between them, which are small where an error creeps up; 0 of fewer than four."""
+    if len(errors) < 4:
+        return 0.0
+    deviation = 1.4826 * float(np.median(np.abs(np.diff(errors)))) / math.sqrt(2)
+    return float(np.median(errors)) + SCATTER * deviation
 
 
 def next_step(trials: Sequence[Trial], r: np.ndarray, law: Law, *, rise: float) -> Step:

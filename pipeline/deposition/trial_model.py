@@ -112,9 +112,9 @@ def identify_with_lag(
 ) -> TrialModel:
     """As `identify`, with what is late as delay and second-order lag (`Extruder.lag_hz`).
 
-    min over (K, tau, delay, lag, yield) of sum (max(x - yield, 0) - y)^2 + (noise ln(lag /
-    USUAL_LAG_HZ) / LAG_SPREAD)^2: a prior, for a first trial leaves a valley between delay and lag. Without a lag the
-    inverse is wrong by half a turn on a machine of third order.
+    min over (K, tau, delay, lag, yield) of sum (max(x - yield, 0) - y)^2 + (noise ln(lag / USUAL_LAG_HZ) /
+    LAG_SPREAD)^2: a prior, for a first trial leaves a valley between delay and lag. Without a lag the inverse
+    is wrong by half a turn on a machine of third order.
     """
     first = _first_order(u, y, sample_time_s=sample_time_s, yield_=None)
     u, y = [np.asarray(a, float) for a in u], [np.asarray(b, float) for b in y]

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 import scipy.ndimage
 
-from pipeline.deposition import basis
+from pipeline.deposition import basis, ilc
 from pipeline.deposition.chain import Identified
-from pipeline.deposition.chain import forecast as chain_flow
-from pipeline.deposition.drive import Drive
+from pipeline.deposition.drive import Drive, obeyed
+from pipeline.deposition.extruder import Extruder
 from pipeline.deposition.forecast import BINS, CORNER, NAMES, START, STOP, places
 from pipeline.deposition.tasks import Lines
 
@@ -21,8 +21,10 @@ SPREAD_S, WINDOW_S = 0.4, 6.0
 REST_S, PLATEAU_S = 3.0, 3.0
 # the track is turned after so many mm, on the next line so far beside it
 TRACK_MM, BESIDE_MM = 100.0, 5.0
-# what a print lacked is learned as a mean over this; below this share of the highest flow it is no ooze
-SMOOTH_S, OOZE = 0.1, 0.02
+# a pause shorter than this is none
+SHORTEST_S = 0.005
+# of what a print lacked so much is learned at once, below so many Hz
+SHARE, CUTOFF_HZ, ORDER = 0.5, 2.0, 2
 FILAMENT_MM2 = math.pi * 1.75**2 / 4
 
 
@@ -97,7 +99,7 @@ def program(name: str, chosen: Sequence[Window], lines: Lines, tool: int, *, bea
     """The part program of the windows: each line as long and as fast as in the part (of one longer than two
     plateaus the ends), each pause and gap as long, along x; the nozzle goes on through a gap."""
     text = [f"; verifies {name}, T{tool}: {', '.join(window.event for window in chosen)}"]
-    text += ["G21", "G90", "M83", f"T{tool}", "G0 X0 Y0 Z0.3 F600"]
+    text += ["; filament_diameter = 1.75", "G21", "G90", "M83", f"T{tool}", "G0 X0 Y0 Z0.3 F600"]
     x = y = duration = 0.0
     for window in chosen:
         for place, k in enumerate(window.lines):
@@ -109,7 +111,7 @@ def program(name: str, chosen: Sequence[Window], lines: Lines, tool: int, *, bea
                 break
             following = window.lines[place + 1]
             if lines.run[following] == lines.run[k]:
-                if lines.corner[k]:
+                if lines.corner[k] and lines.pause_s[k] > SHORTEST_S:
                     text.append(f"G4 P{1000 * max(float(lines.pause_s[k]), 0.0):.0f}")
                     duration += float(lines.pause_s[k])
                 continue
@@ -132,14 +134,14 @@ def next_command(
     extruder: Identified, u: np.ndarray, y: np.ndarray, r: np.ndarray, *, drive: Drive, sample_time_s: float
 ) -> np.ndarray:
     """The command (T,) in mm after a print of the part with u (T,) whose flow was measured as y (T,), NaN
-    where it was not seen: u + P^-1 S (r - y) with P the chain, undone as a whole, and S a mean over SMOOTH_S,
-    so that white noise is learned at a fraction (Bristow 2006, eq. 3)."""
+    where it was not seen: u + SHARE P^-1 Q (r - y) with P the chain's gain, time constant and delays, and Q a
+    zero-phase low-pass (Bristow 2006, eq. 3); cut to what the drive can do."""
     lacked = np.where(np.isfinite(y), r - y, 0.0)
-    lacked = scipy.ndimage.uniform_filter1d(lacked, max(round(SMOOTH_S / sample_time_s), 1))
-    wanted = np.maximum(chain_flow(extruder, u, sample_time_s=sample_time_s) + lacked, 0.0)
-    # where no flow is wanted and none came, none is asked for
-    wanted = np.where((r > 0) | (np.abs(lacked) > OOZE * r.max()), wanted, 0.0)
-    return basis.compose(extruder, wanted, sample_time_s=sample_time_s, drive=drive)
+    smooth = ilc.zero_phase(lacked, order=ORDER, cutoff_hz=CUTOFF_HZ, sample_time_s=sample_time_s)
+    late = extruder.delay_s + basis.mean_lag_s(extruder)
+    model = Extruder(extruder.gain, extruder.time_constant_s, late)
+    more = ilc.inverse(smooth, model, sample_time_s=sample_time_s)
+    return obeyed(u + SHARE * more, drive, sample_time_s=sample_time_s)
 
 
 def measured_percent(y: np.ndarray, on_off: np.ndarray, r: np.ndarray) -> float:

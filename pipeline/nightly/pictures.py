@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pipeline.deposition.workflow import trial_files
+from pipeline.deposition.workflow import trial_files, trial_readings
 from pipeline.nightly import camera_drift
 from pipeline.nightly.inputs import quarantine
 from pipeline.nightly.settings import Drift
@@ -16,6 +16,7 @@ from pipeline.report.shared.night import Alarm, LoopDrift
 from pipeline.store import params
 
 if TYPE_CHECKING:
+    from pipeline.deposition.workflow.settings import Camera
     from pipeline.setpoint.workflow.settings import TrainClassifier
 
 FRAMES = 40  # pictures of a recording that are looked at
@@ -27,16 +28,23 @@ FRAMES = 40  # pictures of a recording that are looked at
 def of_trials(folder: Path, most: int, only: Sequence[str] = ()) -> list[list[Any]]:
     """[median, deviation, frames] of each of the last `most` trials below `folder`
     whose pictures show a bead; `only` those named."""
-    rows = []
+    rows, camera = [], _camera()
     trials = readable(sorted(folder.rglob("*.mcap")), folder)
     paths = [path for path in trials if not only or path.as_posix() in only]
     for path in paths[-most:]:
         try:
-            stats = _frame_stats(trial_files.read_trial(path, unreadable_share=1.0))
+            stats = _frame_stats(trial_readings.opened(path, camera))
         except ValueError:
             continue
         rows.append([stats.mean.tolist(), stats.deviation.tolist(), stats.frames])
     return rows
+
+
+def _camera() -> "Camera":
+    """Section `camera`, through whose topics a trial is read, however many of its frames can be."""
+    from pipeline.deposition.workflow.settings import Camera
+
+    return params.load(Camera, "camera").model_copy(update={"unreadable_share": 1.0})
 
 
 def _frame_stats(trial: trial_files.Trial) -> camera_drift.FrameStats:
@@ -52,14 +60,14 @@ def trials_drift(
 ) -> LoopDrift:
     """Of new trials: those that cannot be read are set aside, the others' pictures held against those of
     `reference`."""
-    drifted = LoopDrift.none(loop)
+    drifted, camera = LoopDrift.none(loop), _camera()
     before = [
         camera_drift.FrameStats(np.array(mean), np.array(deviation), frames)
         for mean, deviation, frames in reference.get("camera", [])
     ]
     for path in (path for path in paths if path.lower().endswith(".mcap")):
         try:
-            trial = trial_files.read_trial(path, unreadable_share=1.0)
+            trial = trial_readings.opened(path, camera)
         except ValueError as error:
             drifted.quarantined[path] = quarantine(path, loop, str(error))
             continue

@@ -11,6 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from pipeline.deposition import extrusion, gcode, leads, motion
+from pipeline.deposition.conformance import Refused
 from pipeline.deposition.gcode import Kind
 from pipeline.deposition.workflow import compose_parts, exports, part_programs
 from pipeline.deposition.workflow.settings import ComposeParts, Printer
@@ -272,3 +273,20 @@ def test_pipes_and_large_files_are_refused_without_being_read(tmp_path, monkeypa
         part_programs.read(tmp_path / "large.gcode")
     with pytest.raises(ValueError, match="name a part program"):
         part_programs.read(tmp_path / "none.gcode")
+
+
+def test_what_the_library_lacks_is_told_once_a_task_with_the_number_of_its_lines(tmp_path, machine):
+    done = part(tmp_path, machine, TWO)
+    many = [Refused(k, f"the library lacks Corner at {k} mm/s; an error of {k} %") for k in range(40, 90)]
+    many += [Refused(7, "the library lacks Stop at 8 mm/s")]
+    program = gcode.parse("G1 X1\n" + "G1 X Y\n" * 3)
+    kinds = part_programs.grouped(done.conformance._replace(refused=many), program.refusals)
+    assert [(one.line, one.count) for one in kinds] == [(2, 3), (7, 1), (40, 50)]
+    assert kinds[2].why == "the library lacks Corner at 40 mm/s; an error of 40 % (and 49 more such)"
+
+
+def test_a_print_of_days_is_a_slip_named_with_its_line(tmp_path, machine):
+    with pytest.raises(
+        ValueError, match=r"job\.gcode: expected a print of at most 72 h, .* of which line 5 "
+    ):
+        part(tmp_path, machine, "G21\nG90\nM83\nG1 X9 E9 F480\nG1 X100 E91 F0.001\n")

@@ -625,6 +625,16 @@ def test_numbers_that_no_machine_has_are_refused(number):
     assert program.refused_line.tolist() == [2] and np.isfinite(program.moves.end).all()
 
 
+@pytest.mark.parametrize(
+    "word",
+    ["M220 S0", "M220 S1e+300", "M221 S-5", "M221 S1e+99", "M200 D1e+300", "M204 P1e+999", "G1 X5 F1e-30"],
+)
+def test_settings_that_no_machine_takes_are_refused(word):
+    program = parse(f"G1 X1 E1 F600\n{word}\nG1 X2 E2\n")
+    assert program.refused_line.tolist() == [2] and program.moves.feed.tolist() == [10, 10]
+    assert program.flow.tolist() == [1, 1] and not program.volumetric.any()
+
+
 def test_a_million_damaged_lines_are_one_refusal():
     program = parse("G1 X1\n" + "G1 X Y5\n" * 100_000)
     assert len(program.refusals) == 1 and program.accounted.refused == 100_000

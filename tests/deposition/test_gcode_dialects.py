@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from benchmarks.gcode import DIALECTS, made
-from pipeline.deposition import extrusion
+from pipeline.deposition import extrusion, gcode_words
 from pipeline.deposition.gcode import Kind, parse
 from tests.deposition.reprap_reader import Reader
 
@@ -185,3 +185,46 @@ def test_long_programs_of_slicers_are_read_as_by_a_reader_of_one_line_at_a_time(
     program = made(DIALECTS[name], np.random.default_rng(3), runs=1300)
     assert len(program.text) > 2 * 2**18
     held(program.text, {0: 1.75, 1: 1.75})
+
+
+HANDED_ON = """G20
+G91
+M83
+T1
+M221 S50
+M220 S200
+M204 P300
+G1 X1 Y1 F60 E1
+M200 D2
+G92 X5 E3
+G1 X1 E1
+G90
+G1 X2 Y2 E1
+M42 P4 S255
+G18
+G2 X3 Y3 I1
+G17
+G3 X3 Y3 I1 J0
+M220 R
+X4
+G28 X
+G1 X1 E-1
+G1 Z1
+G1 X2 E2
+"""
+
+
+@pytest.mark.parametrize("name", [*WRITTEN, "handed_on"])
+def test_what_a_line_leaves_in_force_is_handed_on_from_chunk_to_chunk(name, monkeypatch):
+    text = WRITTEN.get(name, HANDED_ON)
+    whole = parse(text)
+    monkeypatch.setattr(gcode_words, "CHUNK", 1)  # a line a chunk
+    cut = parse(text)
+    for a, b in zip(whole.moves, cut.moves, strict=True):
+        # sums are taken in another order
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-9)
+    assert cut.flow.tolist() == whole.flow.tolist() and cut.volumetric.tolist() == whole.volumetric.tolist()
+    assert (cut.told, cut.refusals, cut.accounted, cut.extruder) == (
+        whole.told, whole.refusals, whole.accounted, whole.extruder,
+    )  # fmt: skip
+    assert cut.diameter_mm == whole.diameter_mm and cut.other_word.tolist() == whole.other_word.tolist()

@@ -4,6 +4,7 @@ of the drive, and the loop with roll-back."""
 import numpy as np
 import pytest
 
+from benchmarks import foreign_deposition, foreign_extruders
 from benchmarks.ilc import causal_q
 from benchmarks.norm_optimal import norm_optimal_law
 from pipeline.deposition import ilc
@@ -64,14 +65,12 @@ def model_inverse(r=R, drive=UNLIMITED, sample_time_s=TS, **changes):
 
 
 def ratios(law, measure, nominal, trials, r=R, drive=UNLIMITED, rise=0.1):
-    """Percent of trial 0, (trials + 1,), by the true flow; a loop that
-    stopped goes on with its best command."""
+    """Percent of trial 0, (trials + 1,), by the true flow."""
     done = ilc.learn(
         law, measure, obeyed(r / nominal.gain, drive, sample_time_s=TS), r, trials=trials, rise=rise
     )
     rows = ilc.table(done, r, steady=STEADY / nominal.gain, drive=drive, sample_time_s=TS, rise=rise)
-    best = min(rows, key=lambda row: row.rms_measured)
-    return 100 * np.array([row.ratio for row in rows] + [best.ratio] * (trials + 1 - len(rows)))
+    return 100 * np.array([row.ratio for row in rows])
 
 
 # ---- Q
@@ -145,11 +144,9 @@ def test_gamma_of_the_model_inverse_stays_far_below_one_on_every_plant_of_the_fa
     Q = ilc.magnitude(F, order=4, cutoff_hz=5.0, sample_time_s=TS) ** 2
     for i, (name, plant) in enumerate(family(5, 12)):
         law, measure = model_inverse(), machine(plant, seed=i)
-        law([measure(R / MATERIALS[name].gain)])
+        law(ilc.learn(law, measure, R / MATERIALS[name].gain, R, trials=2, rise=0.1))
         L = ilc.inverse_filter(F, law.model.extruder, sample_time_s=TS)
-        assert (
-            ilc.gamma(Q, L, frequency_response(plant, F, sample_time_s=TS)) < 0.8
-        )  # 0.45 to 0.6 were seen after one trial
+        assert ilc.gamma(Q, L, frequency_response(plant, F, sample_time_s=TS)) < 0.8  # 0.1 to 0.4 are usual
 
 
 # ---- the paper's law
@@ -311,7 +308,25 @@ def test_the_norm_optimal_law_learns_too():
     assert percent[2] < 20 and percent[15] < 6
 
 
+def test_a_machine_of_third_order_is_learned_because_its_lag_is_identified():
+    plant = foreign_deposition.plant("third_order", "B", 1)
+    percent = foreign_deposition.learned(plant, "B", 1, "model_inverse").percent
+    # 6 and still falling slowly where all that is late is taken for delay
+    assert percent[5] < 4 and percent[15:].max() < 3
+
+
 # ---- limits
+
+
+def test_a_limit_just_above_the_steady_command_leaves_no_more_than_any_command_within_it_must():
+    plant, amplitude = foreign_deposition.plant("plain", "B", 2), 3 * STEADY / MATERIALS["B"].gain
+    drive = Drive(amplitude, np.inf, 0.0)
+    exact = Extruder(plant.gain, plant.tau_up_s, plant.delay_s)
+    assert 2 < amplitude * plant.gain / STEADY < 2.2  # this plant's steady command is larger than the nominal
+    u = ilc.command(R, R, exact, drive=drive, sample_time_s=TS)
+    error = ilc.rms(R - foreign_extruders.flow(plant, u, sample_time_s=TS))
+    # by another method: a bounded quadratic program
+    assert error <= 1.01 * foreign_deposition.reachable_error(plant, u, drive)
 
 
 def test_the_forecast_says_what_the_limit_will_leave():
@@ -381,32 +396,112 @@ def test_limits_that_no_law_can_meet_are_refused_with_the_ramp_that_would_do():
 # ---- the loop
 
 
-def test_trials_that_rise_are_left_by_hand():
-    # trial 2 rises above 40 + 10, the best is 1; 3 is better again; 4 and 5 rise
-    state = ilc.judge([100.0, 40.0, 55.0, 30.0, 45.0, 60.0, 20.0], rise=0.1)
-    assert state == ilc.LearningState(
-        keep=[0, 1, 3], best=3, risen=[False, False, True, False, True, True, False], stopped=True
-    )
-    assert ilc.judge([100.0, 40.0, 49.0, 48.0], rise=0.1) == ilc.LearningState(
-        [0, 1, 2, 3], 1, [False] * 4, False
-    )
+def test_a_rise_is_followed_by_the_best_command_and_the_machine_that_gives_the_old_error_is_the_same():
+    # the best is 1; trial 2 rises above 40 + 10; 3 repeats the best and gives what it gave
+    risen = ilc.judge([100.0, 40.0, 55.0], rise=0.1)
+    assert risen == ilc.LearningState([0, 1], 1, [False, False, True], [], repeat=True, halvings=0)
+    same = ilc.judge([100.0, 40.0, 55.0, 41.0], rise=0.1)
+    assert same == ilc.LearningState([0, 1, 3], 1, [False, False, True, False], [], False, halvings=1)
+    after = ilc.judge([100.0, 40.0, 55.0, 41.0, 39.0], rise=0.1)
+    assert (after.keep, after.best, after.halvings) == ([0, 1, 3, 4], 4, 0)
 
 
-def test_after_a_rise_the_next_command_is_half_a_step_from_the_best_and_after_two_the_best():
-    r = np.ones(4)
-    trials = [ilc.Trial(np.full(4, float(j)), r - error) for j, error in enumerate((1.0, 0.4, 0.9))]
-    step = ilc.next_step(trials, r, lambda trials: trials[-1].u + 2, rise=0.1)
-    assert (step.best, step.rolled_back, step.stopped) == (1, True, False)
-    np.testing.assert_array_equal(step.u, np.full(4, 2.0))  # best 1, law 1 + 2, half way
-    step = ilc.next_step([*trials, ilc.Trial(step.u, r - 0.8)], r, lambda trials: trials[-1].u + 2, rise=0.1)
-    assert step.stopped and step.best == 1
-    np.testing.assert_array_equal(step.u, np.ones(4))
+def test_a_machine_that_gives_another_error_for_the_best_command_has_changed():
+    # 2 rises, and so does the best command again in 3: what is left is 2 and 3, of which 3 is the better
+    changed = ilc.judge([100.0, 40.0, 75.0, 70.0], rise=0.1)
+    assert changed == ilc.LearningState([2, 3], 3, [False, False, True, True], [2], False, 0)
+    # trials are held against the machine as it is now: 65 is no rise, 81 is
+    assert ilc.judge([100.0, 40.0, 75.0, 70.0, 65.0], rise=0.1).keep == [2, 3, 4]
+    assert ilc.judge([100.0, 40.0, 75.0, 70.0, 81.0], rise=0.1).repeat
+    twice = ilc.judge([100.0, 40.0, 75.0, 70.0, 30.0, 45.0, 46.0], rise=0.1)
+    assert (twice.restarts, twice.keep, twice.best) == ([2, 5], [5, 6], 5)
+
+
+def test_what_the_trials_scatter_anyway_is_no_rise():
+    scattered = [100.0, 30.0, 5.0, 14.0, 6.0, 13.0, 5.0, 14.0]
+    assert not ilc.judge([*scattered, 18.0], rise=0.1).repeat  # beyond 5 + 10, within 9.5 + 3 x 8.4
+    assert ilc.judge([*scattered, 40.0], rise=0.1).repeat
+    assert ilc.judge([100.0, 30.0, 5.0, 5.1, 4.9, 5.0, 5.2, 5.0, 18.0], rise=0.1).repeat
+    creeping = [100.0, 30.0, *(5 + 1.5 * j for j in range(7)), 15.5]
+    assert ilc.judge(creeping, rise=0.1).repeat
+
+
+def test_the_law_of_a_changed_machine_is_given_its_trials_alone_and_after_one_rise_half_its_step():
+    r, given = np.ones(4), []
+
+    def law(trials):
+        given.append([float(trial.u[0]) for trial in trials])
+        return trials[-1].u + 2
+
+    def step(*errors):
+        return ilc.next_step(
+            [ilc.Trial(np.full(4, float(j)), r - error) for j, error in enumerate(errors)], r, law, rise=0.1
+        )
+
+    again = step(1.0, 0.4, 0.9)
+    assert (again.best, again.rolled_back, again.restarts) == (1, True, [])
+    np.testing.assert_array_equal(again.u, np.full(4, 1.0))  # the best command
+    half = step(1.0, 0.4, 0.9, 0.41)
+    np.testing.assert_array_equal(half.u, np.full(4, 3.0))  # best 1, law 3 + 2, half way
+    changed = step(1.0, 0.4, 0.9, 0.8)
+    assert (changed.restarts, changed.best, given[-1]) == ([2], 3, [2.0, 3.0])
+    np.testing.assert_array_equal(changed.u, np.full(4, 5.0))
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.2])
+def test_a_gain_that_steps_is_learned_anew_within_three_trials_and_learning_goes_on(factor):
+    name, plant = next(family(17, 1))
+    old, new = machine(plant), machine(plant._replace(gain=factor * plant.gain), seed=1)
+    count = iter(range(40))
+    measure = lambda u: (old if next(count) < 10 else new)(u)  # noqa: E731
+    done = ilc.learn(model_inverse(), measure, R / MATERIALS[name].gain, R, trials=20, rise=0.1)
+    percent = np.array([100 * ilc.rms(R - t.truth) / ilc.rms(R - done[0].truth) for t in done])
+    assert ilc.judge([ilc.rms(R - t.y) for t in done], rise=0.1).restarts == [10]
+    assert len(done) == 21 and percent[10] > 25 and percent[12:].max() <= 5 and percent[20] < 2.5
+
+
+@pytest.mark.parametrize("drift", [-0.01, 0.01])
+def test_a_gain_that_drifts_one_percent_a_trial_is_followed_and_no_change_is_called(drift):
+    name, plant = next(family(18, 1))
+    count = iter(range(40))
+
+    def measure(u):
+        j = next(count)
+        return machine(plant._replace(gain=plant.gain * (1 + drift) ** j), seed=j)(u)
+
+    done = ilc.learn(model_inverse(), measure, R / MATERIALS[name].gain, R, trials=30, rise=0.1)
+    percent = np.array([100 * ilc.rms(R - t.truth) / ilc.rms(R - done[0].truth) for t in done])
+    # a mean over the trials would be 20 % behind at the end
+    assert np.median(percent[10:]) < 3 and percent[10:].max() < 6
+    assert ilc.judge([ilc.rms(R - t.y) for t in done], rise=0.1).restarts == []
+
+
+def test_one_spoilt_trial_is_left_out_and_taken_for_no_change():
+    name, plant = next(family(19, 1))
+    count, whole = iter(range(40)), machine(plant)
+
+    def measure(u):
+        trial = whole(u)
+        return trial._replace(y=0.6 * trial.y) if next(count) == 8 else trial
+
+    done = ilc.learn(model_inverse(), measure, R / MATERIALS[name].gain, R, trials=15, rise=0.1)
+    state = ilc.judge([ilc.rms(R - t.y) for t in done], rise=0.1)
+    percent = [100 * ilc.rms(R - t.truth) / ilc.rms(R - done[0].truth) for t in done]
+    assert state.restarts == [] and 8 not in state.keep
+    np.testing.assert_array_equal(
+        done[9].u, done[ilc.judge([ilc.rms(R - t.y) for t in done[:9]], rise=0.1).best].u
+    )
+    assert max(percent[9:]) < 4
 
 
 def test_a_folder_of_trials_continues_where_the_loop_left():
     name, plant = next(family(17, 1))
-    done = ilc.learn(model_inverse(), machine(plant), R / MATERIALS[name].gain, R, trials=5, rise=0.1)
-    for j in (1, 3, 5):
+    # the trials before the rise, the repeat, and those of the machine that changed
+    old, new = machine(plant), machine(plant._replace(gain=1.3 * plant.gain), seed=1)
+    count = iter(range(9))
+    measure = lambda u: (old if next(count) < 5 else new)(u)  # noqa: E731
+    done = ilc.learn(model_inverse(), measure, R / MATERIALS[name].gain, R, trials=8, rise=0.1)
+    for j in range(1, 9):
         np.testing.assert_array_equal(ilc.next_step(done[:j], R, model_inverse(), rise=0.1).u, done[j].u)
 
 

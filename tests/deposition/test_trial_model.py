@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from pipeline.deposition.extruder import Extruder, disturb, draw, flow, lagged, routine
-from pipeline.deposition.trial_model import deviations, directions, identify
+from pipeline.deposition.trial_model import deviations, directions, identify, identify_with_lag, lag_delay_s
 
 TS = 0.02
 R = routine(
@@ -40,6 +40,32 @@ def test_without_noise_the_four_parameters_are_found():
         parameters(model.extruder), parameters(TRUE), rtol=1e-4
     )  # the solver stops at 1e-7 of the cost
     assert model.fit_percent > 99.9
+
+
+@pytest.mark.parametrize("lag_hz", [0.7, 3.0, 8.0])
+def test_two_trials_of_which_one_was_learned_tell_delay_and_lag_apart(lag_hz):
+    true, rng = TRUE._replace(lag_hz=lag_hz), np.random.default_rng(4)
+    pushed = U + 1.7 * np.gradient(U, TS)
+    y = [disturb(flow(true, u, sample_time_s=TS), rng, steady_flow=STEADY, **NOISE) for u in (U, pushed)]
+    model = identify_with_lag([U, pushed], y, sample_time_s=TS)
+    assert model.extruder.lag_hz == pytest.approx(lag_hz, rel=0.25)
+    late = model.extruder.delay_s + lag_delay_s(model.extruder.lag_hz)
+    assert late == pytest.approx(true.delay_s + lag_delay_s(lag_hz), abs=0.02)
+    assert model.extruder.time_constant_s == pytest.approx(true.time_constant_s, rel=0.05)
+
+
+def test_one_trial_leaves_the_lag_where_plungers_usually_have_it():
+    true = TRUE._replace(delay_s=0.2)
+    y = disturb(flow(true, U, sample_time_s=TS), np.random.default_rng(4), steady_flow=STEADY, **NOISE)
+    model = identify_with_lag([U], [y], sample_time_s=TS).extruder
+    assert 1.5 < model.lag_hz < 6
+    assert model.delay_s + lag_delay_s(model.lag_hz) == pytest.approx(0.2, abs=0.04)
+
+
+def test_a_flow_that_does_not_follow_the_command_is_refused_with_a_lag_too():
+    noise = 0.5 + 0.5 * np.random.default_rng(0).random(len(R))
+    with pytest.raises(ValueError, match=r"expected a flow that (follows|rises with) the command"):
+        identify_with_lag([U], [noise], sample_time_s=TS)
 
 
 @pytest.mark.parametrize(

@@ -256,8 +256,10 @@ def deposition_metrics():
     def law(ratio, **more):
         return {
             "ratio_trial_2": ratio,
+            "last_ratio": ratio,
             "best_ratio": ratio,
             "best_trial": 2,
+            "restarts": [],
             "trials": 2,
             "peak_over_steady": 20.0,
             "saturated": 0.0,
@@ -601,8 +603,8 @@ def _composed(time, wanted, scores):
         folder / "tasks.parquet", TASKS, _columns(TASKS, [("square", "Start", 0, 3, 1.0, 1.0, 8.0, 0.0, 0.0)])
     )
     lines = [
-        ("square", 3, 0, 1.0, 2.0, 16.0, 4.0, 3.8, 1.0, -5.0, False),
-        ("square", 7, 0, 3.0, 0.2, 1.6, 0.4, 0.4, 0.1, 0.0, True),
+        ("square", 3, 0, 1.0, 2.0, 16.0, 4.0, 3.8, 1.0, -5.0, False, -6.0, -4.0),
+        ("square", 7, 0, 3.0, 0.2, 1.6, 0.4, 0.4, 0.1, 0.0, True, -1.0, 1.0),
     ]
     artifacts.write_table(folder / "lines.parquet", LINES, _columns(LINES, lines))
     enough = {
@@ -623,6 +625,17 @@ def _composed(time, wanted, scores):
         "duration_s": 4.0,
         "shorter_than_lead": 1,
         "composer": {"A": "basis"},
+        "forecast": {
+            "A": {
+                "low": 0.4,
+                "median": 2.5,
+                "high": 3.1,
+                "composers": {"basis": {"low": 0.4, "high": 3.1}, "priority": {"low": 10.0, "high": 14.0}},
+                "judged": True,
+                "reason": "",
+                "trial": "",
+            }
+        },
         "refused": [],
         "unknown_words": 1,
     }

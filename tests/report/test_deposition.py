@@ -68,6 +68,19 @@ def test_the_composer_with_the_least_worst_error_is_named_with_its_figure_yardst
     )
 
 
+def test_the_last_error_decides_not_the_best_and_a_machine_that_changed_is_named(project):
+    metrics = made.deposition_metrics()["train_ilc"]
+    metrics["A"]["pixels"] |= {"last_ratio": 0.5, "best_ratio": 0.03, "restarts": [1]}
+    artifacts.write_metrics("train_ilc", metrics)
+    text = page()
+    assert "The error after learning is still 50 % of trial 0’s" in text
+    assert (
+        "Model inversion through pictures, material A: the machine changed at trial 1, and was learned anew."
+        in text
+    )
+    assert "Model inversion ends at A 2.0 %" in text and "The paper’s law ends at A 40 %" in text
+
+
 def test_where_the_simple_rule_is_as_good_it_wins(project):
     made.deposition(
         {

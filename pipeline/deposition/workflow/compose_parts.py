@@ -130,7 +130,6 @@ def compose(
             drive=printer.limits,
             shortest_s=settings.shortest_s,
             largest_error_percent=settings.largest_error_percent,
-            refusals=program.refusals,
         )
         if not all(one.enough for one in report.saturation.values()):
             ramp_s = part_motion.ramp_that_would_do(program.moves, printer, learned)
@@ -184,7 +183,8 @@ def summary_lines(part: Part) -> str:
             f"{int(np.sum(lines.shorter_than_lead))} lines belong to runs shorter than the lead of Stop: "
             "the priority rule would not print them"
         )
-    text += part_programs.summary(part.program, part.extruded, part.printer) + part_programs.refused(checks)
+    text += part_programs.summary(part.program, part.extruded, part.printer)
+    text += part_programs.refused(checks, part.program)
     return "\n".join(text)
 
 
@@ -276,7 +276,10 @@ def reports(done: Sequence[tuple[Part, Sequence[Score]]], refused: dict[str, str
 def report(part: Part) -> dict[str, Any]:
     """What the conformance report says, as JSON."""
     checks, composed = part.conformance, part.composed
-    lines, refused = checks.lines, [one._asdict() for one in checks.refused]
+    lines, refused = (
+        checks.lines,
+        [one._asdict() for one in part_programs.grouped(checks, part.program.refusals)],
+    )
     return {
         "lines_of_the_program": part.program.lines,
         "printed_lines": len(lines.line),

@@ -1,6 +1,7 @@
 """A part program as it is found: read, resized, with the volumes that E wants, and told in words."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,6 +11,7 @@ from pipeline.deposition import extrusion, gcode
 from pipeline.deposition.composition import Composed
 from pipeline.deposition.conformance import Conformance
 from pipeline.deposition.extrusion import Extruded
+from pipeline.deposition.gcode_words import Refusals
 from pipeline.deposition.motion import Motion
 from pipeline.deposition.workflow.settings import Printer
 from pipeline.reading.plain_files import check_plain_file
@@ -72,7 +74,8 @@ def extruded(program: gcode.Program, printer: Printer, asked: Asked = AS_IT_IS) 
     """The volume of every move: by E where its diameter is known, else the declared bead's."""
     if asked.declared_bead:
         program = program._replace(extruder="")
-    declared = {} if printer.filament_mm is None else {m.tool: printer.filament_mm for m in printer.materials}
+    mm, tools = printer.filament_mm, [material.tool for material in printer.materials]
+    declared = {} if mm is None else dict.fromkeys(tools, mm)
     found = extrusion.wanted(
         program, bead_area_mm2=printer.bead_area_mm2, asked_mm=asked.filament_mm,
         declared_mm=declared, scale=asked.scale,
@@ -83,13 +86,14 @@ def extruded(program: gcode.Program, printer: Printer, asked: Asked = AS_IT_IS) 
 
 
 def check_duration(moves: gcode.Moves, planned: Motion) -> None:
-    """Raises ValueError, naming the line, for a plan that is longer than any print: an F or a dwell slipped."""
+    """Raises ValueError, naming the line, for a plan longer than any print: an F or a dwell slipped."""
     hours = float(planned.duration_s.sum()) / 3600
     if not hours <= LONGEST_H:
         slow = int(planned.duration_s.argmax())
         raise ValueError(
-            f"expected a print of at most {LONGEST_H} h, found {hours:.3g} h, of which line {moves.line[slow]} "
-            f"takes {planned.duration_s[slow] / 3600:.3g} h; check its F or its dwell, or cut the program"
+            f"expected a print of at most {LONGEST_H} h, found {hours:.3g} h, of which line "
+            f"{moves.line[slow]} takes {planned.duration_s[slow] / 3600:.3g} h; check its F or its dwell, "
+            "or cut the program"
         )
 
 
@@ -104,6 +108,15 @@ def in_percent(
     worst = float(np.abs(error[judged]).max()) if judged.any() else math.nan
     lines = lines._replace(length_mm=moves.length[composed.lines.move], error_percent=error)
     return report._replace(lines=lines, judged=int(judged.sum()), worst_line_volume_percent=worst)
+
+
+def grouped(report: Conformance, refusals: Sequence[gcode.Refusal]) -> list[gcode.Refusal]:
+    """What was not composed as it stands, by kind, each with its first line and how many there are: what
+    the report refuses, and what the reader did."""
+    kinds = Refusals()
+    for one in report.refused:
+        kinds.add([one.line], one.why)
+    return sorted([*kinds.grouped(), *refusals])
 
 
 # ---- in words
@@ -146,12 +159,11 @@ def difference(one: extrusion.Difference, bead_area_mm2: float) -> str:
     )
 
 
-def refused(report: Conformance) -> list[str]:
-    """The refusals, the first SHOWN of them."""
-    lines = [f"line {one.line}: {one.why}" for one in report.refused[:SHOWN]]
-    return lines + (
-        [f"and {len(report.refused) - SHOWN:,} more in the report"] if len(report.refused) > SHOWN else []
-    )
+def refused(report: Conformance, program: gcode.Program) -> list[str]:
+    """The refusals by kind, the first SHOWN of them."""
+    kinds = grouped(report, program.refusals)
+    more = [f"and {len(kinds) - SHOWN:,} more kinds in the report"] if len(kinds) > SHOWN else []
+    return [f"line {one.line}: {one.why}" for one in kinds[:SHOWN]] + more
 
 
 def told(program: gcode.Program, found: Extruded, printer: Printer) -> dict[str, Any]:

@@ -128,14 +128,12 @@ def restored(table: dict[str, np.ndarray], rest: dict[str, Any]) -> Learned:
     )
     materials = []
     for material in rest["materials"]:
-        chain, missed = material["chain"], material["missed"]
-        several = {name: tuple(_identified(one) for one in chain[name]) for name in ("left_out", "members")}
-        chain |= several | {
-            "extruder": _identified(chain["extruder"]),
-            "structure": tuple(chain["structure"]),
-        }
+        chain, missed = dict(material["chain"]), dict(material["missed"])
+        for name in ("left_out", "members"):
+            chain[name] = tuple(_identified(one) for one in chain[name])
+        chain |= {"extruder": _identified(chain["extruder"]), "structure": tuple(chain["structure"])}
         missed |= {name: math.nan for name in ("ratio", "changed") if missed[name] is None}
-        missed |= {"by_place": np.array(missed["by_place"], float)}
+        missed["by_place"] = np.array(missed["by_place"], float)
         known = {
             "chain": Chain(**chain),
             "missed": Missed(**missed),

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from pipeline.deposition import drive, reachable
 from pipeline.deposition.extruder import Extruder, Routine, routine
-from pipeline.store.params import Section
+from pipeline.store.params import Mapped, Section
 
 
 class Material(Section):
@@ -124,16 +124,40 @@ class Printer(Section):
         ]  # fmt: skip
 
 
+class TrialTopics(Section):
+    """Topics of a machine's own recordings of trials: the camera's (empty: the only one), the clock
+    (log_time, publish_time, or a stamp's field), and the mapping of our signals."""
+
+    image: str = Field(max_length=300)
+    time: str = Field(max_length=300)
+    mapping: dict[str, Mapped]
+
+
+Pixel = Annotated[float, Field(ge=-100_000, le=100_000)]
+
+
 class Camera(Section):
     """Section `camera`: where it looks, how it was calibrated, and,
-    for simulated trials, how hard the pictures are."""
+    for simulated trials, how hard the pictures are.
+
+    A picture is turned by rotation_deg, so that this direction of it runs along the columns, and put with
+    tip_px upon nozzle_column, before it is measured. edge_bias_px is by how much beads of known_widths_mm
+    look wider than they are.
+    """
 
     frames_per_s: float = Field(gt=0, le=1000)
     mm_per_px: float = Field(gt=-10, lt=10)
+    rotation_deg: float | None = Field(ge=-360, le=360)
+    tip_px: list[Pixel] | None = Field(min_length=2, max_length=2)
     nozzle_column: float = Field(ge=-10_000, le=10_000)
     columns: list[Annotated[int, Field(ge=0, le=10_000)]] = Field(min_length=2, max_length=2)
+    mask_px: list[Annotated[list[Pixel], Field(min_length=2, max_length=2)]] = Field(max_length=100)
+    bead: Literal["light", "dark", ""]
     contact_angle_deg: float = Field(gt=0, lt=180)
     known_widths_mm: list[Annotated[float, Field(gt=0, le=100)]] = Field(min_length=3, max_length=20)
+    edge_bias_px: list[Annotated[float, Field(ge=-50, le=50)]] = Field(max_length=20)
+    latency_s: float | None = Field(ge=-1, le=1)
+    topics: TrialTopics
     width_deviation_mm: float = Field(ge=0, le=10)
     longest_blur_px: float = Field(gt=0, le=50)
     unreadable_share: float = Field(ge=0, le=1)
@@ -152,7 +176,22 @@ class Camera(Section):
                 f"has columns {self.columns[0]} to {self.columns[1]}; give the first and, behind it, "
                 "the last that is measured"
             )
+        if self.edge_bias_px and len(self.edge_bias_px) != len(self.known_widths_mm):
+            raise ValueError(
+                f"has {len(self.edge_bias_px)} edge_bias_px for {len(self.known_widths_mm)} known_widths_mm; "
+                "give one each, or [] where the camera is not calibrated"
+            )
+        if any(
+            wider <= width
+            for width, wider in zip(self.known_widths_mm, self.known_widths_mm[1:], strict=False)
+        ):
+            raise ValueError("has known_widths_mm that do not grow; sort them, edge_bias_px with them")
         return self
+
+    @property
+    def nozzle_radius_px(self) -> float:
+        """From the tip on so much of the line is hidden, px: measured columns begin there."""
+        return max(abs(self.columns[0] - self.nozzle_column), 0.0)
 
 
 # ---- a section a stage

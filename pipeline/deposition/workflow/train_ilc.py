@@ -14,7 +14,7 @@ from pipeline.deposition.drive import obeyed
 from pipeline.deposition.extruder import Extruder, Routine, draw
 from pipeline.deposition.ilc import Trial
 from pipeline.deposition.training import LawSettings, Noise, TrainingCase, TrialSequence, on_off
-from pipeline.deposition.workflow import laws, trial_files, trial_video
+from pipeline.deposition.workflow import laws, trial_files, trial_readings, trial_video
 from pipeline.deposition.workflow.settings import Camera, Material, Printer, TrainIlc
 from pipeline.deposition.workflow.trial_video import MeasuredTrial, SimulatedMachine
 from pipeline.reading.excluded import readable
@@ -74,6 +74,7 @@ def shown(
 ) -> list[dict[str, Any]]:
     """A few frames of the first and the last trial of each material in out/frames, and a row for each."""
     paths = sorted((out / "recordings").glob("*.mcap"))
+    camera = trial_video.simulated(camera) if settings.source == "simulated" else camera
     if settings.source == "recordings":
         paths = trial_video.first_and_last(_trials(Path(recorded)), camera)
     frames = run_all([delayed(trial_video.shown)(path, out / "frames", camera) for path in paths], execution)
@@ -192,7 +193,7 @@ def _in_pictures(
     Every trial is one recording in `folder`, written and read back; those of the first and last trial are
     kept. `rngs` draw what the camera sees, and what does not repeat.
     """
-    name, camera, routine = material.name, work.camera, case.routines[0]
+    name, camera, routine = material.name, trial_video.simulated(work.camera), case.routines[0]
     scene = trial_video.scene(camera, rngs[0])
     calibration = trial_video.calibrate(scene, camera, rngs[0])
     machine = SimulatedMachine(case.plant, work.printer, camera, scene, work.noise)
@@ -211,7 +212,10 @@ def _in_pictures(
             calibration=calibration,
         )
         trial_video.simulate_recording(path, conditions, machine, routine, u, rngs[1])
-        measured.append(trial_video.measure_trial(path, routine, printer=work.printer, camera=camera))
+        earlier = [one.latency for one in measured]
+        measured.append(
+            trial_video.measure_trial(path, routine, printer=work.printer, camera=camera, earlier=earlier)
+        )
         if j > 1:
             (folder / f"{name}_{j - 1:02d}.mcap").unlink()
         return measured[-1].trial
@@ -227,11 +231,12 @@ def _in_pictures(
         on_step=on_step,
     )
     figures = training.figures(sequence, rise=work.laws.rise) | _flow_errors(measured, routine)
+    told = trial_video.latency_figures(measured)
     return Part(
         {(name, 0): [sequence]},
         {(name, 0): measured},
         {name: {"calibration": calibration._asdict()}},
-        {name: {"pixels": figures}},
+        {name: {"pixels": figures | told}},
     )
 
 
@@ -289,8 +294,9 @@ def _recorded(
     """
     check_plain_files(folder)
     by_routine: dict[tuple[str, int], dict[int, tuple[Path, MeasuredTrial]]] = {}
-    for path in _trials(folder):
-        conditions = trial_files.read_trial(path, unreadable_share=camera.unreadable_share).conditions
+    told = {path: trial_video.told_latency(path, camera, trial_readings.MEMO) for path in _trials(folder)}
+    for path in told:
+        conditions = trial_readings.opened(path, camera).conditions
         if conditions is None:
             raise ValueError(
                 f"{path}: expected the metadata record {trial_files.SCHEMA} with material "
@@ -305,7 +311,14 @@ def _recorded(
                 f"{path}: trial {number} of material {material} is in {trials[number][0]} too; "
                 "keep one of the two"
             )
-        measured = trial_video.measure_trial(path, routines[index], printer=printer, camera=camera)
+        measured = trial_video.measure_trial(
+            path,
+            routines[index],
+            printer=printer,
+            camera=camera,
+            memo=trial_readings.MEMO,
+            earlier=[latency for other, latency in told.items() if other != path],
+        )
         trials[number] = (path, measured)
     for (material, index), trials in by_routine.items():
         lacking = sorted(set(range(max(trials))) - set(trials))
@@ -419,7 +432,7 @@ def recordings(folder: Path, following: Path, work: Work) -> Part:
                 part.sequences[key], part.measured[key] = [sequence], list(measured)
                 figures["pixels" if index == 0 else f"pixels_{index}"] = training.figures(
                     sequence, rise=work.laws.rise
-                )
+                ) | trial_video.latency_figures(measured)
                 models["identified" if index == 0 else f"identified_{index}"] = _model(sequence.model)
         part.metrics[material.name], part.models[material.name] = figures, models
     return part

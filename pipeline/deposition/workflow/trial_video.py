@@ -1,8 +1,7 @@
 """A trial in pictures: the recording of a simulated machine, and the flow that a law learns from, measured
 from a recording, ours or a machine's own."""
 
-import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,33 +9,38 @@ import cv2
 import numpy as np
 import scipy.signal
 
-from pipeline.deposition import bead, flow, rendering
+from pipeline.deposition import bead, flow, latency, rendering
 from pipeline.deposition.drive import obeyed
 from pipeline.deposition.extruder import Extruder, Routine, disturb
 from pipeline.deposition.extruder import flow as true_flow
 from pipeline.deposition.ilc import Trial
+from pipeline.deposition.latency import Latency
 from pipeline.deposition.training import Noise
-from pipeline.deposition.workflow import trial_files
-from pipeline.deposition.workflow.settings import Camera, Material, Printer
-from pipeline.store.artifacts import about, write_jpeg
+from pipeline.deposition.workflow import trial_files, trial_readings
+from pipeline.deposition.workflow.settings import Camera, Material, Printer, TrialTopics
+from pipeline.deposition.workflow.trial_readings import Readings
+from pipeline.store.artifacts import write_jpeg
 
 SCENES = {"nominal": rendering.NOMINAL, "hard": rendering.HARD}
 # a recording may begin and end so much later and earlier than its routine
 SLACK_S = 0.2
-# frames measured together
-TOGETHER = 16
+# a latency known to this is taken off; one that is less known is told to be unknown
+LATENCY_KNOWN_S = 0.005
 # frames of each known width, spread over the stage
 CALIBRATION_FRAMES = 12
 
 
 class MeasuredTrial(NamedTuple):
     """One trial measured from its frames: the trial as a law sees it, the flow with its uncertainty, the
-    number of frames, and frames without a usable bead by reason."""
+    number of frames, frames without a usable bead by reason, and the camera's latency: as these frames tell
+    it, and as it was corrected."""
 
     trial: Trial
     flow: flow.Flow
     frames: int
     rejected: dict[str, int]
+    latency: Latency
+    of_camera: Latency
 
 
 class SimulatedMachine(NamedTuple):
@@ -116,20 +120,35 @@ def simulate_recording(
     trial_files.write_trial(path, conditions, pictures, signals, encoding=camera.encoding)
 
 
-def measure_trial(path: str | Path, routine: Routine, *, printer: Printer, camera: Camera) -> MeasuredTrial:
-    """The trial of a recording on the clock of its routine. Raises ValueError, naming the file, where it
-    says nothing of its conditions or shows no bead."""
-    recording = trial_files.read_trial(path, unreadable_share=camera.unreadable_share)
+def measure_trial(
+    path: str | Path,
+    routine: Routine,
+    *,
+    printer: Printer,
+    camera: Camera,
+    memo: Path | None = None,
+    earlier: Sequence[Latency] = (),
+) -> MeasuredTrial:
+    """The trial of a recording on the clock of its routine; its frames are read once, and kept in `memo`.
+
+    The camera's latency is that of section `camera`; without one, what the motion in the pictures of this
+    recording and of `earlier` ones tells, none where it is not told. Raises ValueError, naming the file,
+    where it says nothing of its conditions or shows no bead.
+    """
+    recording = trial_readings.opened(path, camera)
     conditions = _checked_conditions(path, recording)
     late = _late(*recording.signals["position_mm"], routine)
+    readings = trial_readings.read(recording, camera, memo=memo)
+    of_camera = _of_camera(camera, [*earlier, readings.latency])
     recording = recording._replace(
         signals={name: (time_s - late, values) for name, (time_s, values) in recording.signals.items()}
     )
     signals = _on_routine_clock(path, recording, routine)
-    times, columns, widths, rejected = _widths(path, recording, conditions, camera, late)
+    widths = _widths_mm(path, readings, conditions, camera)
     try:
         sections = flow.sections(
-            np.interp(times, *recording.signals["position_mm"]), columns, np.array(widths),
+            np.interp(readings.time_s - late - of_camera.latency_s, *recording.signals["position_mm"]),
+            readings.columns, widths,
             view=flow.View(conditions.mm_per_px, conditions.nozzle_column),
             nozzle_radius_mm=printer.nozzle_mm / 2, contact_angle_deg=conditions.contact_angle_deg,
         )  # fmt: skip
@@ -147,7 +166,37 @@ def measure_trial(path: str | Path, routine: Routine, *, printer: Printer, camer
     # within a pause only its volume was measured: a law learns nothing there
     y = np.where(estimate.observable, estimate.flow, np.nan)
     trial = Trial(signals["command_mm"], y, signals.get("flow_mm3_per_s"))
-    return MeasuredTrial(trial, estimate, len(times), rejected)
+    return MeasuredTrial(
+        trial, estimate, len(readings.time_s), _counts(readings.reasons), readings.latency, of_camera
+    )
+
+
+def told_latency(path: str | Path, camera: Camera, memo: Path | None) -> Latency:
+    """The camera's latency as one recording tells it."""
+    return trial_readings.read(trial_readings.opened(path, camera), camera, memo=memo).latency
+
+
+def _of_camera(camera: Camera, told: Sequence[Latency]) -> Latency:
+    """The latency that is taken off: as given, or as the recordings together tell it to LATENCY_KNOWN_S."""
+    if camera.latency_s is not None:
+        return Latency(camera.latency_s, 0.0)
+    together = latency.pooled(told)
+    return together if together.deviation_s <= LATENCY_KNOWN_S else latency.UNTOLD
+
+
+def latency_figures(measured: Sequence[MeasuredTrial]) -> dict[str, Any]:
+    """How late the camera is, as it was corrected in the last trial, and its standard deviation, s; None
+    where the pictures do not tell it: then flow near corners and pauses may err by all of it."""
+    last = measured[-1].of_camera
+    told = np.isfinite(last.deviation_s)
+    return {
+        "latency_s": last.latency_s if told else None,
+        "latency_deviation_s": last.deviation_s if told else None,
+    }
+
+
+def _counts(reasons: Sequence[str]) -> dict[str, int]:
+    return {reason: list(reasons).count(reason) for reason in dict.fromkeys(reasons) if reason}
 
 
 def _checked_conditions(path: str | Path, recording: trial_files.Trial) -> trial_files.Conditions:
@@ -198,48 +247,41 @@ def _on_routine_clock(
     return signals
 
 
-def _widths(
-    path: str | Path,
-    recording: trial_files.Trial,
-    conditions: trial_files.Conditions,
-    camera: Camera,
-    late: float,
-) -> tuple[list[float], np.ndarray, list[np.ndarray], dict[str, int]]:
-    """Times of the frames, measured columns (m,), widths (m,) in mm of each frame, and counts of rejected
-    frames by reason. Raises ValueError where no frame shows a usable bead."""
-    rejected: dict[str, int] = {}
-    times, columns, widths = [], None, []
-    for time, one in _beads(recording, camera):
-        times.append(time - late)
-        columns = one.columns
-        widths.append(
-            np.where(one.widths == 0, 0.0, (one.widths - conditions.offset_px) / conditions.px_per_mm)
-        )
-        if one.reason:
-            rejected[one.reason] = rejected.get(one.reason, 0) + 1
-    if not times:
+def _widths_mm(
+    path: str | Path, readings: Readings, conditions: trial_files.Conditions, camera: Camera
+) -> np.ndarray:
+    """Widths (F, m) in mm of each frame: less what a bead of this width looks wider than it is, through the
+    scale of the recording. Raises ValueError where no frame shows a usable bead."""
+    if not len(readings.time_s):
         raise ValueError(f"{path}: expected frames but none could be read; record the trial again")
-    if not any(np.any(width > 0) for width in widths):
+    if not (readings.widths > 0).any():
+        rejected = _counts(readings.reasons)
         reasons = ", ".join(f"{reason} in {count}" for reason, count in sorted(rejected.items()))
         raise ValueError(
-            f"{path}: none of {len(times)} frames shows a usable bead ({reasons}); check light, focus, "
-            "calibration and camera.columns, "
-            "or record the trial again"
+            f"{path}: none of {len(readings.time_s)} frames shows a usable bead ({reasons}); "
+            "check light, focus, calibration and camera.columns, or record the trial again"
         )
-    return times, columns, widths, rejected
+    true_px = width_px(readings.widths, camera)
+    return np.where(readings.widths == 0, 0.0, (true_px - conditions.offset_px) / conditions.px_per_mm)
 
 
-def _beads(recording: trial_files.Trial, camera: Camera) -> Iterator[tuple[float, bead.Bead]]:
-    """Beads of a few frames at a time: memory stays flat, and what a
-    frame costs beyond its decoding is shared."""
-    frames = iter(recording.frames)
-    while batch := list(itertools.islice(frames, TOGETHER)):
-        times, pictures = zip(*batch, strict=True)
-        with about(recording.path):
-            beads = bead.measure_all(
-                pictures, columns=tuple(camera.columns), longest_blur_px=camera.longest_blur_px
-            )
-        yield from zip(times, beads, strict=True)
+def width_px(measured_px: np.ndarray, camera: Camera) -> np.ndarray:
+    """Widths in px without the edge bias that calibration found, straight between the known widths."""
+    if not camera.edge_bias_px:
+        return measured_px
+    bias = np.array(camera.edge_bias_px)
+    return measured_px - np.interp(
+        measured_px, np.array(camera.known_widths_mm) / abs(camera.mm_per_px) + bias, bias
+    )
+
+
+def simulated(camera: Camera) -> Camera:
+    """The camera of a simulated machine, which stands straight and errs as `calibrate` finds."""
+    straight = {
+        "rotation_deg": 0.0, "tip_px": None, "mask_px": [], "bead": "", "edge_bias_px": [],
+        "topics": TrialTopics(image="", time="", mapping={}),
+    }  # fmt: skip
+    return camera.model_copy(update=straight)
 
 
 def _late(time_s: np.ndarray, position: np.ndarray, routine: Routine) -> float:
@@ -288,7 +330,7 @@ def first_and_last(paths: Sequence[Path], camera: Camera) -> list[Path]:
     trial of each material, in the order of their names."""
     by_material: dict[str, list[tuple[int, Path]]] = {}
     for path in paths:
-        conditions = trial_files.read_trial(path, unreadable_share=camera.unreadable_share).conditions
+        conditions = trial_readings.opened(path, camera).conditions
         if conditions:
             by_material.setdefault(conditions.material, []).append((conditions.trial, path))
     return sorted({path for trials in by_material.values() for _, path in (min(trials), max(trials))})
@@ -298,16 +340,17 @@ def shown(path: Path, folder: Path, camera: Camera) -> list[dict[str, Any]]:
     """Writes a few frames of a recording with the measured edges drawn in as JPEG to `folder`, start, steady
     line, corner, and the first that was rejected for each reason, and returns a row for each: where it is
     from, what was measured, and why it was rejected."""
-    recording = trial_files.read_trial(path, unreadable_share=camera.unreadable_share)
-    conditions, beads = recording.conditions, list(_beads(recording, camera))
+    recording = trial_readings.opened(path, camera)
+    conditions = recording.conditions
+    beads = [(time, one) for time, _, one in trial_readings.beads(recording, camera)]
     if conditions is None or not beads:
         return []
     places = _places(recording, beads, camera)
     rows = []
-    for k, (time, frame) in enumerate(recording.frames):
+    for k, (time, frame, one) in enumerate(trial_readings.beads(recording, camera)):
         if k not in places:
             continue
-        one, name = beads[k][1], f"{path.stem}_{k:05d}.jpg"
+        name = f"{path.stem}_{k:05d}.jpg"
         _save(folder / name, bead.drawn(frame, one), one)
         rows.append(
             {
@@ -320,7 +363,8 @@ def shown(path: Path, folder: Path, camera: Camera) -> list[dict[str, Any]]:
                 "time_s": round(time, 6),
                 "reason": one.reason,
                 "blur_px": one.blur_px,
-                "width_mm": (one.width - conditions.offset_px) / conditions.px_per_mm,
+                "width_mm": float(width_px(np.array(one.width), camera) - conditions.offset_px)
+                / conditions.px_per_mm,
                 "deviation_px": one.deviation,
             }
         )

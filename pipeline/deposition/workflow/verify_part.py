@@ -42,7 +42,7 @@ def write(part: Part, learned: Learned, printer: Printer, settings: ComposeParts
             part.name, hardest, part.composed.lines, stream.tool, bead_area_mm2=printer.bead_area_mm2
         )
         path = folder / f"{part.name}_verify_{stream.material}.gcode"
-        path.write_text(made.text, encoding="utf-8")
+        artifacts.write_text(path, made.text)
         composed = compose_parts.compose(path, learned, printer, settings)
         files = exports.write(composed, folder)
         events = ", ".join(window.event for window in hardest)
@@ -135,9 +135,9 @@ def read_measured(path: Path, samples: int, sample_time_s: float) -> Measured:
 
 
 def next_command(part: Part, learned: Learned, printer: Printer, folder: Path) -> dict[str, np.ndarray]:
-    """For each material whose print was measured the command (T,) in mm of the next one: the inverse of what
-    the chain makes of the command that was printed, and what the print lacked of the wanted flow. That
-    command is the composed one, unless the file tells another."""
+    """For each material whose print was measured the command (T,) in mm of the next one: that which was
+    printed, and beside it what makes up for half of what the print lacked. That command is the composed one,
+    unless the file tells another."""
     commands = {}
     for stream in part.composed.streams:
         path = folder / measured_name(part.name, stream.material)

@@ -80,20 +80,25 @@ def errors(sources: Sources) -> Picture:
     def draw(law: str, column: int) -> list[Markup]:
         return [
             _error_panel(
-                curves[law][material], law, material, last, machine, column == i == 0, i == len(materials) - 1
+                curves[law][material],
+                law,
+                material,
+                last,
+                machine,
+                column == i == 0,
+                i == len(materials) - 1,
+                _restarts(sources, law, material),
             )
             for i, material in enumerate(materials)
             if material in curves[law]
         ]
 
     shown = _columns(laws, draw)
-    ends = {
-        law: [
-            f"{material} {percent(100 * float(mine['ratio'].min()), 2)}" for material, mine in of_law.items()
-        ]
+    text = "; ".join(
+        f"{LAWS[law][0]} ends at {', '.join(_ends(sources, law, of_law))}"
         for law, of_law in curves.items()
-    }
-    text = "; ".join(f"{LAWS[law][0]} reaches {', '.join(best)}" for law, best in ends.items() if best)
+        if of_law
+    )
     floor = (
         "Line: error measured from pictures; nobody knows the true flow of a real machine."
         if machine
@@ -103,16 +108,56 @@ def errors(sources: Sources) -> Picture:
     return Picture(
         "learning-error",
         title,
-        f"{text}.",
+        f"{text}.{_changes(sources, curves)}",
         shown,
         f"{floor} In % of trial 0’s, log scale, against the trial; the lines at 20 and 10 are the guides. "
-        "Filled dot: the best trial.",
+        "Filled dot: the best trial of the machine as it is now.",
         page.origin(sources.source("trials")),
     )
 
 
+def _restarts(sources: Sources, law: str, material: str) -> list[int]:
+    """The trials at which a machine was found changed on the reference routine; none in metrics of before."""
+    metrics = sources.metrics["train_ilc"]
+    of_law = metrics.get(material, {}).get(law, {}) if isinstance(metrics, dict) else {}
+    return [int(trial) for trial in of_law.get("restarts", [])]
+
+
+def _now(mine: Table, restarts: list[int]) -> np.ndarray:
+    """Which rows are of the machine as it is now."""
+    return mine["trial"] >= (restarts[-1] if restarts else 0)
+
+
+def _ends(sources: Sources, law: str, of_law: dict[str, Table]) -> list[str]:
+    """The last error of each material, and the best where it differs."""
+    texts = []
+    for material, mine in of_law.items():
+        now = 100 * mine["ratio"][_now(mine, _restarts(sources, law, material))]
+        last, best = percent(float(now[-1]), 2), percent(float(now.min()), 2)
+        texts.append(f"{material} {last}" + ("" if last == best else f" (best {best})"))
+    return texts
+
+
+def _changes(sources: Sources, curves: dict[str, dict[str, Table]]) -> str:
+    """Where a machine was found changed, a sentence each."""
+    return "".join(
+        f" {LAWS[law][0]}, material {material}: the machine changed at trial "
+        f"{', '.join(str(trial) for trial in restarts)}, and was learned anew."
+        for law, of_law in curves.items()
+        for material in of_law
+        if (restarts := _restarts(sources, law, material))
+    )
+
+
 def _error_panel(
-    mine: Table, law: str, material: str, last: int, machine: bool, titled: bool, bottom: bool
+    mine: Table,
+    law: str,
+    material: str,
+    last: int,
+    machine: bool,
+    titled: bool,
+    bottom: bool,
+    restarts: list[int],
 ) -> Markup:
     """Errors of one law on one material against the trial."""
     name, css = LAWS[law][0], LAWS[law][2]
@@ -122,10 +167,12 @@ def _error_panel(
     )
     trial, true = mine["trial"], 100 * mine["ratio"]
     measured = 100 * mine["rms_measured"] / max(float(mine["rms_measured"][0]), 1e-12)
-    best = int(np.argmin(true))
+    best = int(np.argmin(np.where(_now(mine, restarts), true, np.inf)))
     below = np.flatnonzero(true < 20)
     since = f"below 20 % from trial {int(trial[below[0]])}" if len(below) else "never below 20 %"
+    changed = f"; the machine changed at trial {', '.join(map(str, restarts))}" if restarts else ""
     layers = [
+        *(charts.interval(frame, at - 0.15, at + 0.15) for at in restarts),
         charts.level(frame, 20, "lim"),
         charts.level(frame, 10, "lim"),
         *([charts.dots(frame, trial, measured, "try", 1.8)] if not machine else []),
@@ -137,7 +184,7 @@ def _error_panel(
         frame,
         layers,
         alt=f"{name}, material {material}: {percent(float(true[best]), 2)} of trial 0’s error at "
-        f"best, at trial {int(trial[best])}; {since}",
+        f"best, at trial {int(trial[best])}; {percent(float(true[-1]), 2)} at the last; {since}{changed}",
         css=css,
         title="% of trial 0, log" if titled else "",
         x_ticks=bottom,

@@ -132,7 +132,7 @@ def _beforehand(sources: Sources) -> str:
     if before is None:
         return (
             "The convergence of the paper’s law was not tested beforehand; the model inversion identifies "
-            "the machine in its first trials and goes back to the best one where the error rises."
+            "the machine in its first trials, and repeats the best command where the error rises."
         )
     return (
         "Tested before anything ran: with γ = max |Q² (1 − L P)| below 1 the paper’s law shrinks the error "
@@ -140,8 +140,9 @@ def _beforehand(sources: Sources) -> str:
         f"{number(before['gamma_worst'], 2)} over its family, above 1 on "
         f"{percent(before['gamma_above_1_percent'], 2)} of it: there the law may look fine for a dozen "
         "trials and then diverge. "
-        "The model inversion identifies the machine in its first trials, and goes back to the best one "
-        "where the error rises."
+        "The model inversion identifies the machine in its first trials; its γ counts what its model leaves "
+        "of them, too. Where the error rises it repeats the best command, and where that rises too "
+        "it learns anew."
     )
 
 

@@ -315,7 +315,9 @@ def _most_above(parts: Sequence[Structure], name: str) -> tuple[float, Structure
 def _learning(sources: Sources) -> Pair:
     limit, shares = sources.declared.rules.learned_percent, []
     for laws in (("pixels", "model_inverse"), ("hoelzle_2009",)):
-        ratios = next((ratios for law in laws if (ratios := _each(sources, f"{law}.best_ratio"))), None)
+        # metrics of before name the best alone
+        keys = [f"{law}.{which}_ratio" for law in laws for which in ("last", "best")]
+        ratios = next((ratios for key in keys if (ratios := _each(sources, key))), None)
         shares.append(None if ratios is None else 100 * max(ratios))
     texts = [OPEN if share is None else percent(share, 2) for share in shares]
     rule = _at_most(
@@ -516,4 +518,4 @@ def _printed(sources: Sources) -> Pair:
 def _listed(refused: Any) -> list[str]:
     if isinstance(refused, str):
         return [refused]
-    return [f"line {line['line']}, {line['why']}" for line in refused]
+    return [f"line {line['line']}, {line['why']}" for line in refused for _ in range(line.get("count", 1))]

@@ -169,7 +169,7 @@ def _deposition(parts: dict, laws: dict) -> dict[str, Figure]:
     ]
     used = [_dict(stream, str(stream.get("chosen"))) for stream in streams]
     learned = [
-        _dict(material, law).get("best_ratio")
+        _dict(material, law).get("last_ratio", _dict(material, law).get("best_ratio"))
         for material in laws.values()
         for law in ("pixels", "model_inverse")
         if _dict(material, law)
