@@ -186,7 +186,7 @@ def judged(printer: Printer, section: TrainIlc, kind: str, index: int, plant: in
     Ts, r = both.sample_time_s, routine.r
     sequence = learned(e, nominal, routine, both, rng)
     errors = [rms(r - trial.truth) for trial in sequence.trials]
-    at_30 = training.ratio_at(sequence, TRIALS, rise=both.rise) * errors[0]
+    at_30 = errors[-1]
     last = sequence.trials[-1].u
     least = [
         rms(r - flow(e._replace(stick_mm=0.0), best(e, r, drive, Ts, start), sample_time_s=Ts))

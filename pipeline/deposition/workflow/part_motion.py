@@ -6,16 +6,19 @@ import math
 import numpy as np
 
 from pipeline.deposition import basis, motion, reachable
-from pipeline.deposition.composition import EXCERPT_S, MARGIN_S, Learned
+from pipeline.deposition.composition import MARGIN_S, Learned
 from pipeline.deposition.conformance import LONGEST_RAMP_S
 from pipeline.deposition.drive import UNLIMITED
 from pipeline.deposition.extruder import Extruder
 from pipeline.deposition.gcode import Kind, Moves
 from pipeline.deposition.reachable import LOSS
+from pipeline.deposition.workflow import part_programs
 from pipeline.deposition.workflow.settings import Printer
 
 # a part's ramps grow by this factor until the drive follows, from a first one of so many seconds
 LONGER, FIRST_S = 1.2, 0.1
+# judged on as much of each tool's printing, so that a long job costs no more than a short one
+JUDGED_S = 300.0
 
 
 def planned(moves: Moves, printer: Printer, learned: Learned) -> motion.Motion:
@@ -58,15 +61,19 @@ def _followed(
     """The plan with the shortest ramps up to longest_s that the drive follows, and these in s: inf, beside
     the plan with the longest, where it follows none."""
     extruders, speed = _extruders(moves, printer, learned), _printing_speed(moves, printer)
+    quick = _plan(moves, printer, math.inf)
+    part_programs.check_duration(moves, quick)
     if printer.limits == UNLIMITED or not extruders:
-        return _plan(moves, printer, math.inf), 0.0
+        return quick, 0.0
+    begins = [quick.begin_s[np.argmax(_prints(moves) & (moves.tool == tool))] for tool in extruders]
+    excerpt = Moves(*(column[: np.searchsorted(quick.begin_s, max(begins) + JUDGED_S)] for column in moves))
     ramp_s = printer.slow_s(list(extruders.values()), speed, longest_s)
     # short lines and corners ask for more than the single line that the ramp is chosen on
     while True:
-        plan = _plan(moves, printer, speed / ramp_s if ramp_s else math.inf)
-        follows = _lost(plan, moves, printer, extruders) <= LOSS
+        acceleration = speed / ramp_s if ramp_s else math.inf
+        follows = _lost(_plan(excerpt, printer, acceleration), excerpt, printer, extruders) <= LOSS
         if follows or ramp_s >= longest_s:
-            return plan, ramp_s if follows else math.inf
+            return _plan(moves, printer, acceleration), ramp_s if follows else math.inf
         ramp_s = min(max(LONGER * ramp_s, FIRST_S), longest_s)
 
 
@@ -96,7 +103,7 @@ def _printing_speed(moves: Moves, printer: Printer) -> float:
 
 
 def _lost(plan: motion.Motion, moves: Moves, printer: Printer, extruders: dict[int, Extruder]) -> float:
-    """The most that the drive takes of a tool's flow (`reachable.lost`) in the first EXCERPT_S of its
+    """The most that the drive takes of a tool's flow (`reachable.lost`) in the first JUDGED_S of its
     printing."""
     Ts, shares = printer.sample_time_s, []
     signal = motion.sampled(plan, moves, sample_time_s=Ts)
@@ -104,7 +111,7 @@ def _lost(plan: motion.Motion, moves: Moves, printer: Printer, extruders: dict[i
         printed = np.where((moves.kind == Kind.EXTRUDE) & (moves.tool == tool), moves.length, 0.0)
         r = printer.bead_area_mm2 * motion.rate(signal, printed, sample_time_s=Ts)
         begin = int(np.argmax(r > 0))
-        excerpt = np.pad(r[begin : begin + round(EXCERPT_S / Ts)], round(MARGIN_S / Ts))
+        excerpt = np.pad(r[begin : begin + round(JUDGED_S / Ts)], round(MARGIN_S / Ts))
         r = basis.boxed(excerpt, printer.ramp_s, Ts)
         r[r < 1e-9 * r.max()] = 0.0
         shares.append(reachable.lost(extruder, r, printer.limits, Ts))
