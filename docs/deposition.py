@@ -67,7 +67,7 @@ for name, done in trials.items():
     print(f"{name:14} r.m.s. error, share of trial 0:", ratios[name].round(3))
 
 # %% The figure: the error from trial to trial, and the flow of the first and of the last trial.
-figure, (left, right) = pyplot.subplots(1, 2, figsize=(10, 4))
+figure, (left, right) = pyplot.subplots(1, 2, figsize=(10, 4), layout="tight")
 for name, ratio in ratios.items():
     left.semilogy(ratio, "o-", label=name)
 left.set(xlabel="trial", ylabel="r.m.s. error, share of trial 0")
@@ -77,5 +77,4 @@ for values, label in ((r, "wanted"), (learned[0].truth, "on-off"), (learned[-1].
 right.set(xlabel="time in s", ylabel="flow in mm³/s")
 for axis in (left, right):
     axis.legend()
-figure.tight_layout()
 figure.savefig("deposition.svg")
