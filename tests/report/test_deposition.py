@@ -241,6 +241,7 @@ def unjudged():
 def test_a_forecast_is_shown_as_its_interval_and_never_as_its_middle(project):
     text = page()
     assert "forecast 0.40 % to 3.1 %" in text and "forecast 10 % to 14 %" in text
+    assert "0.40–3.10" in text  # on the first screen as short as a band
     assert "forecast 2.5" not in text and "forecast 11" not in text
     conformance(forecast={})  # of a version that knew no interval: no bare number
     assert "forecast 2.5" not in page()

@@ -199,7 +199,7 @@ def _answer(structure: Structure, move: Move | None) -> Answer:
                 css,
                 NAMES[name],
                 percent(scores[name].error, 2) if name in scores else "not measured",
-                _forecast(scores[name]) if name in scores else "",
+                _interval(scores[name]) if name in scores else "",
                 bad=name in scores and scores[name].error > limit,
                 best=name == best,
             )
@@ -211,6 +211,13 @@ def _answer(structure: Structure, move: Move | None) -> Answer:
         line_bad=line is not None and line > structure.asked.line_volume_percent,
         change=Change("first run") if move is None else Change(move.text(), move.moved, move.word == "worse"),
     )
+
+
+def _interval(score: Score) -> str:
+    """The forecast beside a figure of the first screen, as short as a band of the other pages."""
+    if score.predicted is None or (score.judged and (score.low is None or score.high is None)):
+        return ""
+    return f"{number(score.low, 2)}–{number(score.high, 2)}" if score.judged else "not judged"
 
 
 def _forecast(score: Score) -> str:

@@ -450,7 +450,15 @@ def _drive(sources: Sources) -> Pair:
         if ramp is None
         else f"Ramps of {ramp:.2f}{THIN}s would do (printer.longest_ramp_s).",
     )
-    return _pair(rule, [count_of(sum(not stream.enough for stream in streams))] * 2, [worst.text()] * 2)
+    # where it follows what is asked for, up to a little: how much that little is
+    leaves = [
+        saturation.get("least_percent")
+        for report in conformance.values()
+        for saturation in report.get("saturation", {}).values()
+    ]
+    followed = worst.enough and all(share is not None for share in leaves)
+    text = f"leaves {percent(max(leaves), 2)}" if followed else worst.text()
+    return _pair(rule, [count_of(sum(not stream.enough for stream in streams))] * 2, [text] * 2)
 
 
 def _bound(sources: Sources) -> dict[tuple[str, str], float]:
