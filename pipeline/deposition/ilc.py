@@ -168,8 +168,9 @@ def inverse(x: np.ndarray, model: Extruder, *, sample_time_s: float) -> np.ndarr
 
 
 def known_share(frequency_hz: np.ndarray, model: Extruder) -> np.ndarray:
-    """T(f) (F,) = 1 / (1 + (|lag(f)|^-4 - 1) / LAG_INVERSE^4), |lag|^2 = 1 / (1 + (f / lag_hz)^4): what is kept
-    of Q where the inverse of the model's lag amplifies. One half where it does so by LAG_INVERSE; 1 without.
+    """T(f) (F,) = 1 / (1 + (|lag|^-4 - 1) / LAG_INVERSE^4), |lag(f)|^2 = 1 / (1 + (f / lag_hz)^4): what is
+    kept of Q where the inverse of the model's lag amplifies. One half where it does so by LAG_INVERSE; 1 of a
+    model without a lag.
 
     A lag of few Hz is hardly identified beyond its own frequency, and stands for lags of another order; its
     inverse would amplify noise without end, and diverge where |Q (1 - L P)| > 1.

@@ -350,7 +350,7 @@ def test_the_inverse_of_a_slow_lag_is_bounded_and_a_fast_lag_is_inverted_as_it_w
     lag = np.abs(frequency_response(slow, F, sample_time_s=TS))
     lag /= np.abs(frequency_response(slow._replace(lag_hz=np.inf), F, sample_time_s=TS))
     share = ilc.known_share(F, slow)
-    assert (share / lag)[F < 15].max() < 0.8 * ilc.LAG_INVERSE  # beyond, the sampled lag has no more than noise
+    assert (share / lag)[F < 15].max() < 0.8 * ilc.LAG_INVERSE  # beyond, T has fallen below 1e-6
     assert share[F < 1].min() > 0.99 and share[F > 5].max() < 0.01
     assert ilc.known_share(F, fast)[F < 5].min() > 0.99
     assert (ilc.known_share(F, slow._replace(lag_hz=np.inf)) == 1).all()
@@ -378,7 +378,7 @@ def test_what_a_law_learns_of_a_disturbed_trial_is_bounded_by_what_its_model_ask
     model = law.model.extruder
     x = law._smooth(ilc.wanted(R, model.yield_, sample_time_s=TS), model)
     alone = ilc.inverse(x, model, sample_time_s=TS)
-    assert np.abs(u).max() < ilc.MOST * np.abs(alone).max()
+    assert np.abs(u).max() < 1.5 * np.abs(alone).max()  # 6 without the bound
 
 
 def test_a_limit_just_above_the_steady_command_leaves_no_more_than_any_command_within_it_must():
