@@ -7,7 +7,7 @@ import pytest
 from benchmarks import foreign_deposition, foreign_extruders
 from benchmarks.ilc import causal_q
 from benchmarks.norm_optimal import norm_optimal_law
-from pipeline.deposition import ilc
+from pipeline.deposition import ilc, training
 from pipeline.deposition.drive import UNLIMITED, Drive, obeyed
 from pipeline.deposition.extruder import Extruder, disturb, draw, flow, frequency_response, pressed, routine
 from pipeline.deposition.trial_model import identify
@@ -322,27 +322,53 @@ def longer_routine(speed, pause_s):
     return routine(
         off_s=4, on_s=14, pause_s=pause_s, tail_s=8, speed=speed, bead_area_mm2=0.304, ramp_s=0.15,
         sample_time_s=TS,
-    ).r  # fmt: skip
+    )  # fmt: skip
 
 
-@pytest.mark.parametrize("speed, pause_s", [(8.0, 0.6), (5.0, 0.3)])
-def test_a_machine_of_third_order_is_not_driven_wild_on_a_longer_routine(speed, pause_s):
-    r, rng = longer_routine(speed, pause_s), np.random.default_rng(0)
-    foreign = foreign_extruders.ForeignExtruder(
-        "third_order", 0.998, 5.24, 5.24, 0.119, 2.44, lags_s=(0.0615, 0.173)
+def third_order_learned(task, trials):
+    """The law and its trials on a machine with lags of 0.06 and 0.17 s."""
+    foreign, rng = (
+        foreign_extruders.ForeignExtruder(
+            "third_order", 0.998, 5.24, 5.24, 0.119, 2.44, lags_s=(0.0615, 0.173)
+        ),
+        np.random.default_rng(0),
     )
 
     def measure(u):
         y = foreign_extruders.flow(foreign, u, sample_time_s=TS)
-        return ilc.Trial(u, foreign_extruders.seen(y, rng, steady_flow=r.max()), y)
+        return ilc.Trial(u, foreign_extruders.seen(y, rng, steady_flow=task.r.max()), y)
 
-    law = model_inverse(r, identify_trials=2)
-    trials = ilc.learn(law, measure, r / 0.89, r, trials=12, rise=0.1)
+    law = model_inverse(task.r, identify_trials=2)
+    return law, ilc.learn(law, measure, task.r / 0.89, task.r, trials=trials, rise=0.1)
+
+
+@pytest.mark.parametrize("speed, pause_s", [(8.0, 0.6), (5.0, 0.3)])
+def test_a_machine_of_third_order_is_not_driven_wild_on_a_longer_routine(speed, pause_s):
+    task = longer_routine(speed, pause_s)
+    law, trials = third_order_learned(task, 12)
     assert law.model.extruder.lag_hz < 1.2  # the two lags, taken for one of 0.85 Hz
-    error = np.array([ilc.rms(r - trial.truth) for trial in trials])
+    error = np.array([ilc.rms(task.r - trial.truth) for trial in trials])
     assert error[-1] < 0.06 * error[0] and error[-1] < 1.5 * error[1:].min()
     # what the ramps need of a machine of these lags is 70 times the steady command
     assert max(np.abs(trial.u).max() for trial in trials) < 100 * trials[0].u.max()
+
+
+def test_the_convergence_test_counts_where_q_ends(monkeypatch):
+    task = longer_routine(8.0, 0.6)
+    law, trials = third_order_learned(task, 2)
+    rows = ilc.table(trials, task.r, steady=1.0, drive=UNLIMITED, sample_time_s=TS, rise=0.1)
+    sequence = training.TrialSequence("model_inverse", task, trials, rows, law.model)
+    settings = training.LawSettings(TS, UNLIMITED, HOELZLE, law.settings, 0.1)
+
+    def gamma():
+        rng, noise = np.random.default_rng(0), training.Noise(0.03, 0.01, 0.01)
+        return training.convergence_of_model_inverse(
+            sequence, rng, noise, plants=2, settings=settings
+        ).nominal
+
+    ending = gamma()
+    monkeypatch.setattr(ilc, "known_share", lambda f, model: np.ones_like(f))
+    assert ending < 0.9 * gamma()
 
 
 def test_the_inverse_of_a_slow_lag_is_bounded_and_a_fast_lag_is_inverted_as_it_was():
