@@ -17,12 +17,22 @@ from pipeline.deposition.drive import Drive, asked, at_limit, follows, obeyed
 from pipeline.deposition.extruder import Extruder, flow, frequency_response
 from pipeline.deposition.trial_filter import Repeating, repeating
 from pipeline.deposition.trial_model import TrialModel, identify_with_lag, lag_delay_s
+from pipeline.deposition.unmodelled import SMOOTHED_HZ
 
 # of the steady gain squared: only keeps the inverse finite where half
 # a sample of delay makes a zero, far above any Q
 EPSILON = 1e-9
+# where the inverse of the model's lag amplifies by so much, half of Q is kept: there the lag of a machine of
+# another order is off by a factor of 3 and a quarter of a turn (lags of 0.06 and 0.17 s, taken for 0.84 Hz)
+LAG_INVERSE = 10.0
+# no frequency of the learned command has more than this times what the model alone asks for: a machine whose
+# response there is a third of the model's is still learned
+MOST = 3.0
 # a trial that lies within so many standard deviations of the last ones, of so many, has not risen
 SCATTER, SCATTER_TRIALS = 3.0, 10
+# but beyond so many times the best error it has, however the last ones scatter: a scatter that grows would
+# let the next one grow more
+FAR = 3.0
 # the ink is brought to its yield over this time before flow is wanted, and let down over it afterwards
 YIELD_LEAD_S = 0.4
 
@@ -157,6 +167,41 @@ def inverse(x: np.ndarray, model: Extruder, *, sample_time_s: float) -> np.ndarr
     ]
 
 
+def known_share(frequency_hz: np.ndarray, model: Extruder) -> np.ndarray:
+    """T(f) (F,) = 1 / (1 + (|lag|^-4 - 1) / LAG_INVERSE^4), |lag(f)|^2 = 1 / (1 + (f / lag_hz)^4): what is
+    kept of Q where the inverse of the model's lag amplifies. One half where it does so by LAG_INVERSE; 1 of a
+    model without a lag.
+
+    A lag of few Hz is hardly identified beyond its own frequency, and stands for lags of another order; its
+    inverse would amplify noise without end, and diverge where |Q (1 - L P)| > 1.
+    """
+    return 1 / (1 + ((1 + (frequency_hz / model.lag_hz) ** 4) ** 2 - 1) / LAG_INVERSE**4)
+
+
+def known(x: np.ndarray, model: Extruder, *, sample_time_s: float) -> np.ndarray:
+    """T x (..., T) without phase (`known_share`)."""
+    if math.isinf(model.lag_hz):
+        return x
+    n = scipy.fft.next_fast_len(x.shape[-1] + round(1 / sample_time_s), real=True)
+    share = known_share(np.fft.rfftfreq(n, sample_time_s), model)
+    return np.fft.irfft(share * np.fft.rfft(x, n), n)[..., : x.shape[-1]]
+
+
+def bounded(x: np.ndarray, learned: np.ndarray, *, sample_time_s: float) -> np.ndarray:
+    """`learned` (T,) with at no frequency more than MOST times the amplitude of x (T,), both summed over the
+    SMOOTHED_HZ around it; as it is where it has nowhere more.
+
+    So no command grows without bound, whatever the machine is: |u| <= MOST |L Q x|, and L Q is known.
+    """
+    n = scipy.fft.next_fast_len(len(x) + round(1 / sample_time_s), real=True)
+    spectra = np.fft.rfft([x, learned], n)
+    near = np.ones(max(round(SMOOTHED_HZ * n * sample_time_s), 1))
+    # summed one by one: a running sum loses what is small beside the lowest frequencies
+    asked, given = (np.sqrt(np.convolve(np.abs(one) ** 2, near, "same")) for one in spectra)
+    kept = np.minimum(MOST * asked, given) / np.maximum(given, np.finfo(float).tiny)
+    return np.fft.irfft(spectra[1] * kept, n)[: len(x)]
+
+
 def wanted(r: np.ndarray, yield_: float, *, sample_time_s: float) -> np.ndarray:
     """x (T,) in mm^3/s that gives the flow r: r + yield while ink is wanted, brought up to the yield just
     before and let down just after; r, yield in mm^3/s."""
@@ -197,7 +242,9 @@ class InverseLaw:
     Written with the average d of what the model misses: u_{j+1} = L Q ((r + yield) / g - d), the same thing
     where the gain g of the next trial is 1, and for one trial Q (u + L e). The weights w_i average what does
     not repeat, and follow what changes (`trial_filter.repeating`); Q stays outside, so that it erodes nothing
-    as they fall, and |1 - k + k Q (1 - L P)| < 1 wherever |Q (1 - L P)| < 1, for any k.
+    as they fall, and |1 - k + k Q (1 - L P)| < 1 wherever |Q (1 - L P)| < 1, for any k. Q ends earlier where
+    the model's lag would have to be inverted far above its frequency (`known_share`), and what is learned is
+    bounded by what the model alone asks for (`bounded`).
 
     `identify_trials` trials are identified together: beyond the on-off trial 0 the first
     learned commands show the extruder as it will be driven.
@@ -218,14 +265,17 @@ class InverseLaw:
             self.r,
             model,
             floor=self.settings.floor,
-            smooth=lambda x: zero_phase(x, **self.q),
+            smooth=lambda x: self._smooth(x, model.extruder),
             sample_time_s=self.sample_time_s,
         )
         d, gain, extruder = self.repeating.disturbance, self.repeating.gain, model.extruder
-        x = wanted(self.r, extruder.yield_, sample_time_s=self.sample_time_s) / gain - d
-        return command(
-            zero_phase(x, **self.q), self.r, extruder, drive=self.drive, sample_time_s=self.sample_time_s
-        )
+        x = self._smooth(wanted(self.r, extruder.yield_, sample_time_s=self.sample_time_s) / gain, extruder)
+        x = bounded(x, x - self._smooth(d, extruder), sample_time_s=self.sample_time_s)
+        return command(x, self.r, extruder, drive=self.drive, sample_time_s=self.sample_time_s)
+
+    def _smooth(self, x: np.ndarray, model: Extruder) -> np.ndarray:
+        """T Q x (..., T): below the law's cut-off, and where the model's lag is known (`known_share`)."""
+        return known(zero_phase(x, **self.q), model, sample_time_s=self.sample_time_s)
 
     def _identified(self, first: list[Trial]) -> TrialModel:
         """The model of the trials `first`, identified once."""
@@ -368,7 +418,7 @@ class LearningState(NamedTuple):
 
 def judge(errors: Sequence[float], *, rise: float) -> LearningState:
     """What the trials so far say of machine and law: a trial has risen whose error exceeds the best by more
-    than `rise` of trial 0's, and what the trials before it scatter.
+    than `rise` of trial 0's, and what the trials before it scatter or FAR times the best.
 
     The trial after a rise repeats the best command, and this tells a law from a machine. Where the error of
     old comes back, the law went too far, or that trial was spoilt: the trial is left out, and the law's steps
@@ -379,7 +429,7 @@ def judge(errors: Sequence[float], *, rise: float) -> LearningState:
     repeat, halvings = False, 0
     for j in range(1, len(errors)):
         usual = _scattered([errors[i] for i in keep[2:]][-SCATTER_TRIALS:])
-        risen.append(errors[j] > max(errors[best] + rise * errors[0], usual))
+        risen.append(errors[j] > max(errors[best] + rise * errors[0], min(usual, FAR * errors[best])))
         if repeat and risen[j]:
             restarts.append(j - 1)
             keep, best = [j - 1, j], min(j - 1, j, key=errors.__getitem__)

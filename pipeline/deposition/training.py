@@ -221,6 +221,7 @@ def convergence_of_model_inverse(
     )
     f = np.linspace(0.0, 0.5 / Ts, FREQUENCIES)
     Q = ilc.magnitude(f, order=law.order, cutoff_hz=law.cutoff_hz, sample_time_s=Ts) ** 2
+    Q = Q * ilc.known_share(f, e)
     L = ilc.inverse_filter(f, e, sample_time_s=Ts)
     family = [
         Extruder(K, tau, max(delay, 0.0), e.lag_hz) for K, tau, delay in np.maximum(near, 1e-6).tolist()
