@@ -166,7 +166,7 @@ def deposition(rules: ReportRules):
         return lambda _: artifacts.write_table("datasets/compose_parts/scores.parquet", SCORES, table)
 
     def learned(ratio):
-        return lambda stages: stages["train_ilc"]["A"]["pixels"].update(best_ratio=ratio)
+        return lambda stages: stages["train_ilc"]["A"]["pixels"].update(last_ratio=ratio, best_ratio=ratio)
 
     def conformance(**changed):
         path = "datasets/compose_parts/conformance.json"
