@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from pipeline.deposition.workflow.tables import SCORES
 from pipeline.nightly import (
@@ -143,6 +144,12 @@ def test_a_recording_that_cannot_be_read_is_set_aside_and_the_scheduler_is_told(
             }
         }
     )
+    root = Path(__file__).resolve().parents[2]
+    camera = {}
+    for sections in params.files(root / "params.yaml").values():
+        camera |= sections["camera"]
+    with Path("params.yaml").open("a") as file:
+        yaml.safe_dump({"camera": camera}, file)
     monkeypatch.setattr(night, "_reproduce", lambda *_: played(deposition(10.0, 2.0)))
     assert night.nightly()[0] == night.OK
     broken = Path("datasets/raw/deposition/trial_7.mcap")
