@@ -1,11 +1,11 @@
 """Deposition and setpoint, from what their stages scored to what is in production: a better challenger goes
 in, a worse one or one with a worse guard does not."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 from pipeline.deposition.workflow.tables import SCORES
 from pipeline.nightly import (
@@ -148,16 +148,17 @@ def test_a_recording_that_cannot_be_read_is_set_aside_and_the_scheduler_is_told(
     camera = {}
     for sections in params.files(root / "params.yaml").values():
         camera |= sections["camera"]
-    with Path("params.yaml").open("a") as file:
-        yaml.safe_dump({"camera": camera}, file)
+    said = json.loads(Path("params.yaml").read_text())
+    Path("params.yaml").write_text(json.dumps(said | {"camera": camera}))
     monkeypatch.setattr(night, "_reproduce", lambda *_: played(deposition(10.0, 2.0)))
-    assert night.nightly()[0] == night.OK
+    status, summary = night.nightly()
+    assert status == night.OK, summary
     broken = Path("datasets/raw/deposition/trial_7.mcap")
     broken.parent.mkdir(parents=True)
     broken.write_bytes(b"\x89MCAP0\r\n half a file")
     Path("learn.py").write_text("# something else is new\n")
     status, summary = night.nightly()
-    assert status == night.QUARANTINED == 4 and "trial_7.mcap" in summary
+    assert status == night.QUARANTINED == 4 and "trial_7.mcap" in summary, summary
     assert not broken.exists() and (inputs.QUARANTINE / "deposition/trial_7.mcap").read_bytes().endswith(
         b"half a file"
     )
