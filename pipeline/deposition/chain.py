@@ -127,7 +127,8 @@ def backlash(x: np.ndarray, play: np.ndarray) -> np.ndarray:
     low, high = np.full(rows * blocks, -np.inf), np.full(rows * blocks, np.inf)
     if blocks > 1:
         for step in steps:
-            low, high = np.clip(low, step - half, step + half), np.clip(high, step - half, step + half)
+            a, b = step - half, step + half  # np.clip takes twice as long
+            low, high = np.minimum(np.maximum(low, a), b), np.minimum(np.maximum(high, a), b)
     start, y = np.zeros((rows, blocks)), np.zeros(rows)
     for k, (a, b) in enumerate(zip(low.reshape(rows, blocks).T, high.reshape(rows, blocks).T, strict=True)):
         start[:, k] = y

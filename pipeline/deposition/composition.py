@@ -11,7 +11,7 @@ from pipeline.deposition import basis, forecast
 from pipeline.deposition.chain import Chain, averaged, identify, simulate
 from pipeline.deposition.drive import Drive, at_limit, follows, obeyed
 from pipeline.deposition.forecast import Covered, Judged, Missed
-from pipeline.deposition.gcode import Kind, Program
+from pipeline.deposition.gcode import Kind, Moves, Program
 from pipeline.deposition.library import (
     CORNER,
     START,
@@ -323,17 +323,14 @@ def compose(
         halts=halting(program.other_line, program.other_word),
         switch_s=marks[STOP][1] + marks[START][0],
     )
-    signal = sampled(motion, moves, sample_time_s=Ts)
     ahead = math.ceil(max(0.0, MARGIN_S - lines.begin_s[0]) / Ts)
-    behind = math.ceil(MARGIN_S / Ts)
+    wanted = _wanted(moves, motion, settings, ahead, Ts)
     lines = lines._replace(begin_s=lines.begin_s + ahead * Ts, end_s=lines.end_s + ahead * Ts)
-    samples = ahead + len(signal.time_s) + behind
+    samples = len(next(iter(wanted.values())))
     tasks = sequence(lines, end_s=samples * Ts)
     error, streams, predictions = np.zeros(len(tasks.task)), [], []
-    for tool in np.unique(lines.tool).tolist():
+    for tool, unshaped in wanted.items():
         material = _material(learned, materials, tool, settings.nozzle_mm, lines)
-        printed = np.where((moves.kind == Kind.EXTRUDE) & (moves.tool == tool), moves.length, 0.0)
-        unshaped = settings.bead_area_mm2 * np.pad(rate(signal, printed, sample_time_s=Ts), (ahead, behind))
         r = basis.boxed(unshaped, settings.ramp_s, Ts)
         r[r < 1e-9 * r.max()] = 0.0  # rounding of the sums behind the rate
         share = Share(tool, material, r, tasks, lines)
@@ -350,6 +347,22 @@ def compose(
                 library, name, material.material, settings.nozzle_mm, tasks.speed[at], tasks.pause_s[at]
             ).error_percent
     return Composed(tuple(streams), tasks, lines, error, predictions, ahead * Ts, Ts)
+
+
+def _wanted(
+    moves: Moves, motion: Motion, settings: PartSettings, ahead: int, Ts: float
+) -> dict[int, np.ndarray]:
+    """Wanted flow (T,) in mm^3/s of each tool that prints, before its steps are shaped, with `ahead` samples
+    of rest before the gantry sets out and MARGIN_S after the end."""
+    signal = sampled(motion, moves, sample_time_s=Ts, rates_only=True)
+    prints, around = (moves.kind == Kind.EXTRUDE) & (moves.length > 0), (ahead, math.ceil(MARGIN_S / Ts))
+    return {
+        tool: settings.bead_area_mm2
+        * np.pad(
+            rate(signal, np.where(prints & (moves.tool == tool), moves.length, 0.0), sample_time_s=Ts), around
+        )
+        for tool in np.unique(moves.tool[prints]).tolist()
+    }
 
 
 def _material(
@@ -375,8 +388,10 @@ def _material(
 def _stream(library: Library, share: Share, unshaped: np.ndarray, composer: str, drive: Drive) -> Stream:
     """The share by one composer: its command, and the flows that the chain predicts for it and for on-off."""
     material, u, Ts = share.material, _command(composer, library, share, drive), library.sample_time_s
-    rows = np.stack([u, _on_off(share, drive, Ts)])
-    y, on_off = simulate([material.chain.extruder], rows, sample_time_s=Ts)[0]
+    y, on_off = (
+        simulate([material.chain.extruder], command[None], sample_time_s=Ts)[0, 0]
+        for command in (u, _on_off(share, drive, Ts))
+    )
     return Stream(
         share.tool,
         material.material,

@@ -133,12 +133,14 @@ def _intervals(lines: LineVolumes, composed: Composed, learned: Learned) -> Line
     for stream in composed.streams:
         material = _material(learned, stream)
         mine, start, stop = _reaches(composed, stream.tool)
-        made = forecast.flows(
+        planned = lines.planned_mm3[mine]
+        made = forecast.each_flow(
             material.chain, material.missed, stream.u, stream.r, sample_time_s=composed.sample_time_s
         )
-        volumes = [volume_between(y, start, stop, sample_time_s=composed.sample_time_s) for y in made]
-        off = 100 * (np.array(volumes) / lines.planned_mm3[mine] - 1)
-        low[mine], _, high[mine] = forecast.interval(off)
+        low[mine], high[mine] = forecast.ends(
+            100 * (volume_between(y, start, stop, sample_time_s=composed.sample_time_s) / planned - 1)
+            for y in made
+        )
     return lines._replace(low_percent=low, high_percent=high)
 
 

@@ -3,7 +3,7 @@ missed on routines left out, carried to the part by kind of event and time since
 judged."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -28,7 +28,7 @@ BEYOND, LONGER = 1.25, 3.0
 # of the residual a member carries none, all, or twice: a part excites other shares of it than the routines
 CARRIED = (0.0, 1.0, 2.0)
 # the range of 32 members holds 94 % of what they are drawn from; on plants of other kinds it was to hold 85 %
-QUANTILES = (0.0, 0.5, 1.0)
+QUANTILES = (0.0, 0.5, 1.0)  # `ends` counts on the first and the last
 # a longer stream is forecast by fewer members
 LONG, FEW = 30_000, 16
 
@@ -211,20 +211,36 @@ def _asked(covered: Covered, r: np.ndarray, sample_time_s: float) -> Judged:
 def flows(chain: Chain, missed: Missed, u: np.ndarray, r: np.ndarray, *, sample_time_s: float) -> np.ndarray:
     """What may come out (M, T) of the command u (T,) for the wanted flow r (T,): the flow of each member of
     the chain less what one routine left out missed, by place and in proportion to the flow wanted near by."""
+    return np.stack(list(each_flow(chain, missed, u, r, sample_time_s=sample_time_s)))
+
+
+def each_flow(
+    chain: Chain, missed: Missed, u: np.ndarray, r: np.ndarray, *, sample_time_s: float
+) -> Iterator[np.ndarray]:
+    """`flows`, one row (T,) after the other."""
     members = chain.members if len(r) <= LONG else chain.members[:: len(chain.members) // FEW]
     place, near = places(r, sample_time_s), round(NEAR_S / sample_time_s)
     local = scipy.ndimage.maximum_filter1d(r, 2 * near + 1, mode="constant")
-    out = np.empty((len(members), len(r)))
     for k, member in enumerate(members):
         flow = simulate([member], u[None], sample_time_s=sample_time_s)[0, 0]
         residual = missed.by_place[k % len(missed.by_place)][place] * local
-        out[k] = np.maximum(flow - CARRIED[k % len(CARRIED)] * residual, 0.0)
-    return out
+        yield np.maximum(flow - CARRIED[k % len(CARRIED)] * residual, 0.0)
 
 
 def interval(values: np.ndarray) -> np.ndarray:
     """The quantiles (3, ...) of values (M, ...): low, median, high."""
     return np.quantile(values, QUANTILES, axis=0)
+
+
+def ends(values: Iterable[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Low and high (...) of `interval`, of values (...) that come one after the other."""
+    rows = iter(values)
+    low = np.array(next(rows))
+    high = low.copy()
+    for row in rows:
+        np.minimum(low, row, out=low)
+        np.maximum(high, row, out=high)
+    return low, high
 
 
 def error_percent(made: np.ndarray, on_off: np.ndarray, r: np.ndarray) -> Interval:

@@ -159,9 +159,10 @@ def _look_ahead(cap: np.ndarray, gain: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return v[:-1], v[1:]
 
 
-def sampled(motion: Motion, moves: Moves, *, sample_time_s: float) -> Signal:
-    """The plan at t = 0, Ts, 2 Ts, ..., the last at most one Ts before its end. Raises
-    ValueError where that is more than MOST samples."""
+def sampled(motion: Motion, moves: Moves, *, sample_time_s: float, rates_only: bool = False) -> Signal:
+    """The plan at t = 0, Ts, 2 Ts, ..., the last at most one Ts before its end; with `rates_only` no more
+    than `rate` needs, move and share, the other columns empty. Raises ValueError where that is more than MOST
+    samples."""
     end = motion.begin_s + motion.duration_s
     if len(end) and end[-1] > MOST * sample_time_s:
         slow = motion.duration_s.argmax()
@@ -173,11 +174,16 @@ def sampled(motion: Motion, moves: Moves, *, sample_time_s: float) -> Signal:
     count = int(np.ceil(end[-1] / sample_time_s)) if len(end) else 0
     upto = np.minimum(np.ceil(end / sample_time_s).astype(int), count)
     move = np.repeat(np.arange(len(end), dtype=np.int32), np.diff(upto, prepend=0))
-    position, speed, share = np.empty((count, 3)), np.empty(count), np.empty(count)
+    kept = 0 if rates_only else count
+    position, speed, share = np.empty((kept, 3)), np.empty(kept), np.empty(count)
     for at in range(0, count, BLOCK):  # the columns between are many: a block of them at a time
         some = slice(at, min(at + BLOCK, count))
         time_s = np.arange(some.start, some.stop) * sample_time_s
-        position[some], speed[some], share[some] = _at(motion, moves, move[some], time_s)
+        places, speeds, share[some] = _at(motion, moves, move[some], time_s)
+        if not rates_only:
+            position[some], speed[some] = places, speeds
+    if rates_only:
+        return Signal(np.zeros(0), position, speed, np.zeros(0), move, share)
     signal = Signal(np.arange(count) * sample_time_s, position, speed, np.zeros(0), move, share)
     return signal._replace(e_rate=rate(signal, moves.e, sample_time_s=sample_time_s))
 

@@ -3,7 +3,7 @@ on little is lost to it."""
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import scipy.linalg
@@ -19,6 +19,12 @@ LOSS = 0.02
 # of Newton's method at one barrier: 12 were too few for a limit of twice the steady command, and left 25 %
 # more error than there need be
 MOST_STEPS = 50
+# a longer signal is solved in pieces, each as far as MARGIN beyond its end, where what follows no longer
+# counts; where the next piece begins off by more than JOINED, in the unit of x, the margin doubles
+LONG, PIECE, MARGIN, JOINED = 8192, 8192, 512, 0.02
+# of the interior-point method on a piece: mean product of slack and multiplier at its begin and end, the
+# share of it that a step aims at, and of the way to the nearest bound that it goes
+FIRST_GAP, LAST_GAP, AIM, MOST_OF_WAY = 30.0, 1e-6, 0.2, 0.99
 
 
 def nearest(
@@ -39,6 +45,8 @@ def nearest(
     """
     if not (math.isfinite(bound) or math.isfinite(step)):
         return np.array(target, float)
+    if len(target) > LONG:
+        return in_pieces(target, free, pole=pole, bound=bound, step=step, rest=rest)
     return nearest_response(
         target, free, output=(1.0,), command=(1.0, -pole), bound=bound, step=step, rest=rest
     )
@@ -88,6 +96,13 @@ def flow(extruder: Extruder, r: np.ndarray, drive: Drive, sample_time_s: float) 
     """The flow (T,) in mm^3/s nearest to r (T,) that the drive lets the extruder's gain, time constant and
     yield press out; its delay and lag, which a command can be sent ahead of, its play and creep are left
     out (a lag overshoots its input by 5 %, so that a percent more may be in reach)."""
+    return _pressed(nearest, extruder, r, drive, sample_time_s)
+
+
+def _pressed(
+    nearest: Callable[..., np.ndarray], extruder: Extruder, r: np.ndarray, drive: Drive, sample_time_s: float
+) -> np.ndarray:
+    """`flow` by `nearest` or `in_pieces`."""
     a, yield_ = math.exp(-sample_time_s / extruder.time_constant_s), extruder.yield_
     scale = extruder.gain * (1 - a)
     x = nearest(
@@ -105,7 +120,7 @@ def lost(extruder: Extruder, r: np.ndarray, drive: Drive, sample_time_s: float) 
     control r / K without limits."""
     a = math.exp(-sample_time_s / extruder.time_constant_s)
     on_off = np.linalg.norm(scipy.signal.lfilter([0.0, 1 - a], [1.0, -a], r) - r)
-    least = np.linalg.norm(flow(extruder, r, drive, sample_time_s) - r)
+    least = np.linalg.norm(_pressed(in_pieces, extruder, r, drive, sample_time_s) - r)
     return float(least / max(on_off, 1e-300))
 
 
@@ -173,6 +188,130 @@ def nearest_response(
                 break
         barrier *= 0.1
     return c * z
+
+
+def in_pieces(
+    target: np.ndarray,
+    free: np.ndarray,
+    *,
+    pole: float,
+    bound: float,
+    step: float = math.inf,
+    rest: np.ndarray | None = None,
+    piece: int = PIECE,
+    margin: int = MARGIN,
+) -> np.ndarray:
+    """`nearest` quicker, within 1e-3 of the bound: piece by piece, each from where the one before ends, so that x keeps the
+    limits across the joins, and with so much of what follows that the piece does not change with more. At
+    least one limit is finite."""
+    N, c = len(target), min(bound, step / (1 - pole))
+    below = target if rest is None else rest
+    x, begin, before, ahead = np.empty(N), 0, 0, None
+    while True:
+        upto = min(begin + piece + margin, N)
+        first, second = (x[begin - k] / c if begin else 0.0 for k in (1, 2))
+        z = _piece(
+            target[begin:upto] / c, free[begin:upto], below[begin:upto] / c, pole=pole,
+            bound=bound / c, step=step / c, x=first, v=first - pole * second,
+        )  # fmt: skip
+        if ahead is not None and not _same(z, ahead, free[begin:upto]):
+            begin, margin, ahead = before, 2 * margin, None
+            continue
+        if upto == N:
+            x[begin:] = c * z
+            return x
+        x[begin : begin + piece], ahead = c * z[:piece], z[piece:]
+        before, begin = begin, begin + piece
+
+
+def _same(z: np.ndarray, ahead: np.ndarray, free: np.ndarray) -> bool:
+    """Whether a piece begins as the one before foretold; where nothing is wanted, what lies below is not
+    determined."""
+    n = min(8, len(ahead), len(z))
+    return bool(np.all(free[:n] | (np.abs(z[:n] - ahead[:n]) <= JOINED)))
+
+
+def _piece(
+    s: np.ndarray,
+    free: np.ndarray,
+    below: np.ndarray,
+    *,
+    pole: float,
+    bound: float,
+    step: float,
+    x: float,
+    v: float,
+) -> np.ndarray:
+    """x (N,) nearest to s (N,), or `below` where `free`, that goes on from the last x and v within the
+    limits.
+
+    A primal-dual interior-point method on slack and multiplier of each limit (Wright 1997, Primal-Dual
+    Interior-Point Methods), with half the iterations of the barrier's, each as O(N).
+    """
+    most = np.array([[1 / bound], [1 / step]])  # a limit that there is not: 0
+    # it sets out within the limits: the command goes to 0 at half of the speed
+    slow = min(step / 2, abs(v))
+    command = math.copysign(1.0, v) * np.maximum(abs(v) - slow * np.arange(1, len(s) + 1), 0.0)
+    z = scipy.signal.lfilter([1.0], [1.0, -pole], command, zi=[pole * x])[0]
+    share = most * np.stack([command, np.diff(command, prepend=v)])
+    slack = np.concatenate([1 - share, 1 + share])
+    force, gap, aim = FIRST_GAP / slack, FIRST_GAP, AIM
+    gone, nowhere = np.empty_like(slack), not free.any()
+    for _ in range(2 * MOST_STEPS):
+        low = free & (z <= s)
+        w = 1.0 if nowhere else np.where(low, 1e-3, 1.0)
+        gradient = z - s if nowhere else w * (z - np.where(low, below, s))
+        near = 1 / slack
+        firm, pull = force * near, aim * gap * (near[:2] - near[2:]) * most
+        firm = (firm[:2] + firm[2:]) * most**2
+        gradient += _sent(pull[0] + _sent(pull[1], 1.0), pole)
+        dz = -_solved(_band(w, firm, pole), gradient)
+        dv = _change(dz, pole)
+        dv = most * np.stack([dv, _change(dv, 1.0)])
+        # shares of slack and force: what a step takes of the one and of the other
+        np.multiply(dv, near[:2], out=gone[:2])
+        np.multiply(-dv, near[2:], out=gone[2:])
+        grown = aim * gap / (force * slack) - 1 + gone
+        length = min(1.0, MOST_OF_WAY / max(gone.max(), -grown.min()))
+        z += length * dz
+        dv *= length
+        slack[:2] -= dv
+        slack[2:] += dv
+        grown *= length
+        force += force * grown
+        gap = float(np.vdot(force, slack)) / slack.size
+        if gap < LAST_GAP:
+            break
+        aim = min(max((1 - length) ** 2, AIM), 0.8)
+    return z
+
+
+def _change(z: np.ndarray, pole: float) -> np.ndarray:
+    """z(t) - pole z(t-1) (N,), from rest."""
+    v = z.copy()
+    v[1:] -= pole * z[:-1]
+    return v
+
+
+def _sent(y: np.ndarray, pole: float) -> np.ndarray:
+    """The transpose of `_change` on y (N,)."""
+    z = y.copy()
+    z[:-1] -= pole * y[1:]
+    return z
+
+
+def _band(w: np.ndarray | float, firm: np.ndarray, pole: float) -> np.ndarray:
+    """Lower bands (3, N) of diag(w) + A' (diag(firm[0]) + C' diag(firm[1]) C) A, C the matrix of
+    `_change` with pole 1 and A that with `pole`; firm (2, N)."""
+    a, band = pole, np.zeros((3, firm.shape[1]))
+    still, next_ = firm[0] + firm[1], firm[1, 1:]
+    still[:-1] += next_  # the inner bands: still, and -next_ beside it
+    band[0] = still + w
+    band[0, :-1] += a * (2 * next_ + a * still[1:])
+    band[1, :-1] = -next_ - a * still[1:]
+    band[1, :-2] -= a * a * next_[1:]
+    band[2, :-2] = a * next_[1:]
+    return band
 
 
 def _solved(band: np.ndarray, gradient: np.ndarray) -> np.ndarray:

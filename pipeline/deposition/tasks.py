@@ -118,23 +118,19 @@ def sequence(lines: Lines, *, end_s: float) -> Tasks:
     A task's event is where the gantry begins it, or is in the middle of its ramp: the signals are sent ahead
     of it by their leads, which is what looking ahead is for.
     """
-    n = len(lines.line)
     switched = np.append(lines.tool[1:] != lines.tool[:-1], False)
     flat = lines.first | np.concatenate([[False], lines.corner[:-1]])
-    gap = np.where(switched, DWELL, NO_FLOW)
-    parts = [
-        (lines.first, 0, START, lines.begin_s),
-        (flat, 1, STEADY, lines.begin_s),
-        (lines.corner, 2, CORNER, lines.end_s),
-        (lines.last, 3, STOP, lines.end_s),
-        (lines.last, 4, gap, lines.end_s),
+    # by their rank on a line
+    calls = (lines.first, flat, lines.corner, lines.last, lines.last)
+    order = np.sort(np.concatenate([5 * np.flatnonzero(mask) + rank for rank, mask in enumerate(calls)]))
+    which, rank = np.divmod(order, 5)
+    del order
+    # names once, not a copy a task
+    task = np.array([START, STEADY, CORNER, STOP, NO_FLOW, DWELL], object)[
+        rank + ((rank == 4) & switched[which])
     ]
-    order = np.concatenate([5 * np.flatnonzero(mask) + rank for mask, rank, _, _ in parts])
-    order, by = np.sort(order), np.argsort(order, kind="stable")
-    which = order // 5
-    task = np.concatenate([np.broadcast_to(np.asarray(name), n)[mask] for mask, _, name, _ in parts])[by]
-    begin = np.concatenate([times[mask] for mask, _, _, times in parts])[by]
-    pause = np.where(task == CORNER, lines.pause_s[which], 0.0)
+    begin = np.where(rank < 2, lines.begin_s[which], lines.end_s[which])
+    pause = np.where(rank == 2, lines.pause_s[which], 0.0)
     columns = [
         task,
         lines.tool[which],
@@ -146,7 +142,7 @@ def sequence(lines: Lines, *, end_s: float) -> Tasks:
     ]
     if lines.begin_s[0] > TINY_S:
         ahead = (NO_FLOW, lines.tool[0], lines.line[0], 0.0, lines.begin_s[0], lines.speed[0], 0.0)
-        columns = [np.concatenate([[value], column]) for value, column in zip(ahead, columns, strict=True)]
+        columns = [np.insert(column, 0, value) for value, column in zip(ahead, columns, strict=True)]
     return Tasks(*columns)
 
 
