@@ -124,6 +124,7 @@ def backlash(x: np.ndarray, play: np.ndarray) -> np.ndarray:
     padded = np.pad(x.reshape(rows, length), ((0, 0), (0, blocks * block - length)), mode="edge")
     half = np.repeat(np.broadcast_to(play, x.shape[:-1]).ravel() / 2, blocks)
     steps = np.ascontiguousarray(padded.reshape(rows * blocks, block).T)
+    del padded
     low, high = np.full(rows * blocks, -np.inf), np.full(rows * blocks, np.inf)
     if blocks > 1:
         for step in steps:
@@ -136,6 +137,7 @@ def backlash(x: np.ndarray, play: np.ndarray) -> np.ndarray:
     y, out = start.ravel(), np.empty_like(steps)
     for step, row in zip(steps, out, strict=True):
         y = np.minimum(np.maximum(y, step - half), step + half, out=row)
+    del steps, step
     return out.T.reshape(rows, blocks * block)[:, :length].reshape(x.shape)
 
 

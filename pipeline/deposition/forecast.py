@@ -219,12 +219,16 @@ def each_flow(
 ) -> Iterator[np.ndarray]:
     """`flows`, one row (T,) after the other."""
     members = chain.members if len(r) <= LONG else chain.members[:: len(chain.members) // FEW]
-    place, near = places(r, sample_time_s), round(NEAR_S / sample_time_s)
+    place, near = places(r, sample_time_s).astype(np.uint8), round(NEAR_S / sample_time_s)
     local = scipy.ndimage.maximum_filter1d(r, 2 * near + 1, mode="constant")
     for k, member in enumerate(members):
         flow = simulate([member], u[None], sample_time_s=sample_time_s)[0, 0]
-        residual = missed.by_place[k % len(missed.by_place)][place] * local
-        yield np.maximum(flow - CARRIED[k % len(CARRIED)] * residual, 0.0)
+        residual = missed.by_place[k % len(missed.by_place)][place]
+        residual *= local
+        residual *= CARRIED[k % len(CARRIED)]
+        flow -= residual
+        del residual
+        yield np.maximum(flow, 0.0, out=flow)
 
 
 def interval(values: np.ndarray) -> np.ndarray:

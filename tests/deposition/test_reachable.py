@@ -6,7 +6,14 @@ import scipy.optimize
 
 from pipeline.deposition.drive import UNLIMITED, Drive
 from pipeline.deposition.extruder import Extruder, routine
-from pipeline.deposition.reachable import LOSS, lost, nearest, nearest_response, ramp_that_loses_little
+from pipeline.deposition.reachable import (
+    LOSS,
+    in_pieces,
+    lost,
+    nearest,
+    nearest_response,
+    ramp_that_loses_little,
+)
 
 
 def pulse(N):
@@ -136,3 +143,44 @@ def test_where_no_flow_is_wanted_only_what_lies_above_costs():
 
     assert cost(flow) < 0.999 * cost(tied)
     assert np.abs(rates(flow, 0.95)).max() <= 0.08
+
+
+def test_in_pieces_a_long_signal_comes_as_near_as_solved_at_once():
+    """Lines at random, most of which the drive cannot follow, and what no line wants left free."""
+    rng, pole, bound, step = np.random.default_rng(3), 0.9934, 0.05, 0.0018
+    wanted = np.repeat(rng.choice([0.0, 2.4, 3.2], 50, p=[0.2, 0.4, 0.4]), rng.integers(20, 500, 50))
+    free, target = wanted == 0, wanted + 0.08
+    low = np.where(free, 0.0, target)
+    whole = nearest_response(
+        target, free, output=(1.0,), command=(1.0, -pole), bound=bound, step=step, rest=low
+    )
+    quick = in_pieces(target, free, pole=pole, bound=bound, step=step, rest=low, piece=2000)
+
+    def cost(x):
+        return np.sum(np.where(free, np.maximum(x - target, 0.0), x - target) ** 2)
+
+    v = rates(quick, pole)
+    assert np.abs(v).max() <= bound * (1 + 1e-6)  # across the joins too
+    assert np.abs(np.diff(v, prepend=0.0)).max() <= step * (1 + 1e-6)
+    assert np.mean(np.abs(np.diff(v)) > 0.99 * step) > 0.1
+    assert abs(cost(quick) / cost(whole) - 1) <= 1e-5
+    np.testing.assert_allclose(quick[~free], whole[~free], atol=5e-3 * bound)
+
+
+def test_a_margin_too_short_for_what_follows_is_doubled():
+    """A flow that the drive must set out for 300 samples ahead, begun just behind a join."""
+    pole, bound, N = 0.995, 0.01, 3000
+    target = np.where(np.arange(N) >= 1060, 1.5, 0.5)
+    none = np.zeros(N, bool)
+    whole = nearest(target, none, pole=pole, bound=bound)
+    quick = in_pieces(target, none, pole=pole, bound=bound, piece=1000, margin=20)
+    np.testing.assert_allclose(quick, whole, atol=0.03 * bound)
+
+
+@pytest.mark.parametrize(("bound", "step"), [(0.05, np.inf), (np.inf, 0.002)])
+def test_in_pieces_one_limit_is_enough(bound, step):
+    target, none = 3 * pulse(9000), np.zeros(9000, bool)
+    quick = in_pieces(target, none, pole=0.99, bound=bound, step=step)
+    whole = nearest_response(target, none, output=(1.0,), command=(1.0, -0.99), bound=bound, step=step)
+    np.testing.assert_allclose(quick, whole, atol=5e-3 * 0.05)
+    np.testing.assert_array_equal(nearest(target, none, pole=0.99, bound=bound, step=step), quick)

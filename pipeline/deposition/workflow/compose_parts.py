@@ -251,12 +251,7 @@ def score_rows(part: Part, scores: Sequence[Score]) -> dict[str, list]:
 
 def task_rows(part: Part) -> dict[str, np.ndarray]:
     tasks = part.composed.tasks
-    values = [
-        np.full(len(tasks.task), part.name, object),
-        tasks.task.astype(object),
-        *tasks[1:],
-        part.composed.error_percent,
-    ]
+    values = [np.full(len(tasks.task), part.name, object), *tasks, part.composed.error_percent]
     return dict(zip([column.name for column in TASKS.columns], values, strict=True))
 
 

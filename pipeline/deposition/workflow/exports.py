@@ -34,9 +34,10 @@ def write(part: Part, folder: Path, formats: Collection[str] = ("csv",)) -> list
     """The commands of all tools in each format, tasks and lines as Parquet, and the conformance report as
     JSON, beside one another in `folder`."""
     files = _commands(part, folder, formats)
-    for schema, columns in ((TASKS, compose_parts.task_rows(part)), (LINES, compose_parts.line_rows(part))):
+    # one after the other: a long part's tables are as long as itself
+    for schema, rows in ((TASKS, compose_parts.task_rows), (LINES, compose_parts.line_rows)):
         files.append(folder / f"{part.name}.{schema.name}.parquet")
-        artifacts.write_table(files[-1], schema, columns)
+        artifacts.write_table(files[-1], schema, rows(part))
     files.append(folder / f"{part.name}.conformance.json")
     artifacts.write_json(files[-1], compose_parts.report(part))
     return files
