@@ -219,7 +219,7 @@ def each_flow(
 ) -> Iterator[np.ndarray]:
     """`flows`, one row (T,) after the other."""
     members = chain.members if len(r) <= LONG else chain.members[:: len(chain.members) // FEW]
-    place, near = places(r, sample_time_s).astype(np.uint8), round(NEAR_S / sample_time_s)
+    place, near = places(r, sample_time_s).astype(np.int16), round(NEAR_S / sample_time_s)
     local = scipy.ndimage.maximum_filter1d(r, 2 * near + 1, mode="constant")
     for k, member in enumerate(members):
         flow = simulate([member], u[None], sample_time_s=sample_time_s)[0, 0]

@@ -74,6 +74,14 @@ def test_what_was_missed_is_carried_to_its_event_in_proportion_to_the_flow():
     np.testing.assert_allclose(added, np.repeat([[0.0], [0.1], [0.2]], 10, axis=1), atol=1e-12)
 
 
+def test_the_ends_of_rows_that_come_one_by_one_are_those_of_the_interval():
+    values = np.random.default_rng(4).standard_normal((7, 40))
+    kept = values.copy()
+    low, _, high = forecast.interval(values)
+    np.testing.assert_array_equal(forecast.ends(iter(values)), (low, high))
+    np.testing.assert_array_equal(values, kept)
+
+
 def test_the_routines_themselves_are_judged():
     assert all(judged(t.r) == forecast.Judged(True, "", "") for t in trainings(PLANT))
 

@@ -77,6 +77,8 @@ def test_samples_follow_the_plan(program):
     ):
         assert spent.sum() * Ts == pytest.approx(amount.sum(), rel=1e-12, abs=1e-12)
     mean = motion.rate(signal, moves.length, sample_time_s=Ts)
+    less = motion.sampled(plan, moves, sample_time_s=Ts, rates_only=True)
+    np.testing.assert_array_equal(motion.rate(less, moves.length, sample_time_s=Ts), mean)
     # the mean speed over a sample lies within a Ts / 2 of the trapezoid's at
     # both ends, and more only where a ramp turns inside
     np.testing.assert_allclose(mean[:-1], (signal.speed[1:] + signal.speed[:-1]) / 2, atol=A * Ts / 2)
