@@ -20,8 +20,8 @@ LOSS = 0.02
 # more error than there need be
 MOST_STEPS = 50
 # a longer signal is solved in pieces, each as far as MARGIN beyond its end, where what follows no longer
-# counts; where the limits hold the next piece otherwise by more than JOINED, in the unit of x or as a share,
-# the margin doubles
+# counts; where the limits hold the next piece otherwise by more than JOINED, in the unit of x or as a share
+# of the most, the margin doubles, up to a PIECE
 LONG, PIECE, MARGIN, JOINED = 8192, 8192, 512, 0.02
 # of the interior-point method on a piece: mean product of slack and multiplier at its begin and end, the
 # share of it that a step aims at, and of the way to the nearest bound that it goes
@@ -207,7 +207,7 @@ def in_pieces(
     not change with more. At least one limit is finite."""
     N, c = len(target), min(bound, step / (1 - pole))
     below = target if rest is None else rest
-    x, begin, before, ahead = np.empty(N), 0, 0, None
+    x, begin, before, ahead, least = np.empty(N), 0, 0, None, margin
     while True:
         upto = min(begin + piece + margin, N)
         first, second = (x[begin - k] / c if begin else 0.0 for k in (1, 2))
@@ -215,9 +215,10 @@ def in_pieces(
             target[begin:upto] / c, free[begin:upto], below[begin:upto] / c, pole=pole,
             bound=bound / c, step=step / c, x=first, v=first - pole * second,
         )  # fmt: skip
-        if ahead is not None and not _same(hold, ahead):
+        if ahead is not None and margin < piece and not _same(hold, ahead):
             begin, margin, ahead = before, 2 * margin, None
             continue
+        margin = margin if ahead is None else max(least, margin // 2)
         if upto == N:
             x[begin:] = c * z
             return x
@@ -230,7 +231,7 @@ def _same(hold: np.ndarray, ahead: np.ndarray) -> bool:
     on what lies before by nothing else."""
     n = min(8, hold.shape[1], ahead.shape[1])
     off = np.abs(hold[:, :n] - ahead[:, :n])
-    return bool(np.all(off <= JOINED * np.maximum(1.0, np.abs(hold[:, :n]))))
+    return bool(off.max() <= JOINED * max(1.0, np.abs(hold[:, :n]).max()))
 
 
 def _piece(
