@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 import yaml
 
-from pipeline.deposition.workflow import tables
+from pipeline.deposition import extrusion, gcode
+from pipeline.deposition.workflow import part_programs, tables
+from pipeline.deposition.workflow.settings import Printer
 from pipeline.deposition.workflow.tables import SIGNALS
 from pipeline.report.deposition import rules
 from pipeline.report.shared.verdict import OPEN
 from pipeline.store import artifacts, params
 from stages.report import main
+from tests.conftest import ROOT
 from tests.report import made
 from tests.report.test_pages import Page, change_all, figures
 
@@ -432,3 +435,53 @@ def test_a_long_job_stays_within_the_size_of_a_page(project):
     main()
     # the limit of a page: 1.5 MB
     assert figures()["bytes"]["deposition"] <= 1_500_000
+
+
+def test_what_e_asks_for_stands_beside_the_declared_bead_with_the_difference(project):
+    """60 mm of lines with 6 mm of a filament of 1.75 mm: 6 pi 1.75^2 / 4 = 14.43 mm^3, of which 10 mm^3 are
+    what a bead of 10 / 60 mm^2 holds. The second tool's diameter is not known."""
+    program = gcode.parse("M82\nG1 X0 F600\nG1 X30 E3\nG1 X60 E6\nT1\nG1 X90 E9\n")
+    bead = 10 / 60
+    by_e = extrusion.wanted(program, bead_area_mm2=bead, declared_mm={0: 1.75})
+    printer = params.load(Printer, "printer", ROOT / "params.yaml").model_copy(update={"bead_area_mm2": bead})
+    conformance(program=part_programs.told(program, by_e, printer))
+    text = page()
+    assert "E gives the volumes of 1 of two tools; it asks for 1.44 times the declared bead’s." in text
+    assert (
+        "square T0 volumes by E, diameter 1.75 mm, as declared 14.43 10.00 +44 % 0.241 to 0.241, half" in text
+    )
+    assert "square T1 declared bead: the diameter of what E pushes is not known not told" in text
+    # the declared bead's volumes, where no diameter is known; of a report that did not count E, the stage
+    nothing = extrusion.wanted(program, bead_area_mm2=bead)
+    conformance(program=part_programs.told(program, nothing, printer))
+    assert "No line’s volume is E’s: each is its length times the declared bead’s area." in page()
+    report = artifacts.read_json(FOLDER / "conformance.json")["square"]
+    artifacts.write_json(
+        FOLDER / "conformance.json", {"square": {k: v for k, v in report.items() if k != "program"}}
+    )
+    assert "the conformance report is of an earlier version" in page().split("What E asks for")[1]
+
+
+def filmed_with(**values):
+    metrics = made.deposition_metrics()["train_ilc"]
+    metrics["A"]["pixels"] |= values
+    artifacts.write_metrics("train_ilc", metrics)
+
+
+def test_the_cameras_latency_stands_with_its_interval_beside_the_plants_delay(project):
+    filmed_with(latency_s=0.04, latency_deviation_s=0.001)
+    text = page()
+    assert "40.0 ms (38.4 to 41.6) 100 ms" in text and "do not tell how late" not in text
+    sections = params.read("params.yaml")
+    sections["camera"] = sections.get("camera", {}) | {"latency_s": 0.04}
+    Path("params.yaml").write_text(yaml.safe_dump(sections))
+    filmed_with(latency_s=0.04, latency_deviation_s=0.0)
+    assert "40.0 ms, as declared 100 ms" in page()
+
+
+def test_a_latency_that_the_pictures_do_not_tell_is_said(project):
+    filmed_with(latency_s=None, latency_deviation_s=None)
+    text = page()
+    assert "The pictures of material A do not tell how late the camera is against the gantry" in text
+    assert "not told: declare camera.latency_s 100 ms" in text
+    assert '<td class="bad">not told: declare camera.latency_s</td>' in PAGE.read_text()

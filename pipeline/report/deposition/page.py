@@ -98,6 +98,7 @@ def render(sources: Sources) -> str:
         stretches=deposition_parts.stretches(sources),
         lines=deposition_parts.lines(sources),
         forecasts=deposition_parts.forecasts(sources),
+        extruded=deposition_parts.extruded(sources),
         refused=deposition_parts.refused(sources),
         declared=declared(sources),
         words=words.chosen(sources, WORDS),
@@ -105,7 +106,7 @@ def render(sources: Sources) -> str:
         absent=sources.absent,
         hashes=hashes(sources),
         from_scores=sources.source("scores", "compose_parts"),
-        from_film=sources.source("filmed", "models", "train_ilc"),
+        from_film=sources.source("filmed", "models", "train_ilc", "learned"),
         from_library=sources.source("library", "learned", "models"),
         from_lines=sources.source("lines", "conformance"),
     )
