@@ -10,7 +10,6 @@ import numpy as np
 from pipeline.deposition.gcode import Kind, Moves
 from pipeline.deposition.motion import Motion, sampled
 
-
 # how near the gantry is to its planned place at any time, mm: a sixteenth of a nozzle
 WAY_MM = 0.05
 
@@ -39,8 +38,8 @@ def legs(
 ) -> Legs:
     """Legs that follow the commands u (T,) of each tool, linear between their samples, within tolerance_mm,
     and the gantry's path exactly but for arcs, which get a leg a sample; along it the gantry is within WAY_MM
-    of where it is planned at that time, so that a long ramp is several legs of rising feed. The gantry sets out lead_in_s
-    behind the first sample."""
+    of where it is planned at that time, so that a long ramp is several legs of rising feed. The gantry sets
+    out lead_in_s behind the first sample."""
     Ts, n = sample_time_s, max(len(u) for u in commands.values())
     changes = np.flatnonzero(moves.kind == Kind.TOOL)
     begins, ends = lead_in_s + motion.begin_s, lead_in_s + motion.begin_s + motion.duration_s

@@ -230,8 +230,8 @@ def test_leads_prime_ahead_of_a_line_and_let_back_ahead_of_its_end(tmp_path, mac
 
 
 def test_a_lengthened_ramp_is_several_legs_of_rising_feed(tmp_path, machine):
-    """A drive of 10 mm that reverses at 20 mm/s makes the gantry speed up over a second: at each end of a leg,
-    and between them, it is where it is planned at that time."""
+    """A drive of 10 mm and 20 mm/s makes the gantry speed up over a second: at each end of a leg, and between
+    them, it is where it is planned at that time."""
     done = part(tmp_path, machine, line(machine[0].bead_area_mm2, length=60))
     moves, planned, n = done.program.moves, done.planned, len(done.composed.streams[0].u)
     assert part_motion.slowed_to(planned, moves) is not None
