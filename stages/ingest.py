@@ -29,6 +29,8 @@ def main() -> None:
         record, quality, metrics = ingest.collect(
             results, machine, strict=settings.strict or "--strict" in sys.argv
         )
+        done = ingest.work_done(results)
+        print(f"ingest: {done['processed']} recordings read, {done['reused']} taken from the memo")
         artifacts.write_table(out / "record.parquet", record.schema, record.columns)
         artifacts.write_table(out / "quality.parquet", quality.schema, quality.columns)
         artifacts.write_json(out / "printer_pid.json", ingest.printer_pids(folder, results, spec))

@@ -3,10 +3,13 @@ tests only when they are asked for."""
 
 import os
 import shutil
+import sys
 from pathlib import Path
 
 import hypothesis
 import pytest
+
+from pipeline import cli
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT / os.environ.get("BEADLINE_SHARED", "../shared")
@@ -49,6 +52,24 @@ def shared():
         return SHARED / name
 
     return path
+
+
+@pytest.fixture
+def beadline(tmp_path, monkeypatch, capfd):
+    """beadline("inspect", "a.csv") in an empty folder: status, what was printed, and what was said of
+    errors."""
+    monkeypatch.chdir(tmp_path)
+
+    def command(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["beadline", *arguments])
+        status = 0
+        try:
+            cli.main()
+        except SystemExit as ended:
+            status = ended.code
+        return status, *capfd.readouterr()
+
+    return command
 
 
 def pytest_collection_modifyitems(config, items):

@@ -317,6 +317,9 @@ def _with_words(commands: Commands, block, letter, value, state: State, refusals
             wild |= (key == code) & (outside | np.isinf(word[c]))
     wild |= np.isin(key, MOTION) & (word["F"] > 0) & (word["F"] < SLOWEST)
     _refuse(refusals, line, wild, "expected a number that a machine can take, found one far outside")
+    settings = ~wild & np.isin(key, (M + 2000, M + 2040, M + 2200, M + 2210)) & np.isfinite(word["E"])
+    why = "expected no E beside M200, M204, M220 or M221, found one; write numbers without an exponent"
+    _refuse(refusals, line, settings, why)
     chained = (key >= M) & (key < T) & np.isin((key - M) / 10, CHAINED)
     axes = chained & ~_none(word, "XYZ")
     _refuse(refusals, line, axes, "expected no X, Y or Z beside an M word, found some; write two lines")
@@ -324,7 +327,7 @@ def _with_words(commands: Commands, block, letter, value, state: State, refusals
         known += np.bincount(block[letter == ord("M")], minlength=len(key)) - (key >= M) * (key < T)
         why = "expected P and S beside M42, found other words; the pin is switched without them"
         _refuse(refusals, line, pins & (known < words) & ~axes, why)
-    key[twice | wild | np.isin(key, tuple(UNSUPPORTED))] = REFUSED
+    key[twice | wild | settings | np.isin(key, tuple(UNSUPPORTED))] = REFUSED
     return commands
 
 

@@ -75,6 +75,8 @@ TAIL = re.compile(rb";[^\n]*")
 COMMENT = re.compile(rb";[^\n]*|\((?:[^()\n]|\((?:[^()\n]|\([^()\n]*\))*\))*\)")
 WORD = re.compile(r"\s*([A-Za-z])\s*([+-]?(?:\d+\.?\d*|\.\d+))?")
 EXPONENT = re.compile(r"[eE][+-]\d+(?![\d.])")
+# a number with an exponent that has no sign: its e is read as a word
+UNSIGNED = re.compile(r"(?=([A-Za-z]\s*([+-]?(?:\d+\.?\d*|\.\d+)[eE]\d+)(?![\d.])))")
 MACRO = re.compile(r"[A-Za-z_][A-Za-z_]{2,}[\w.]*(?=[\s=]|$)|if\b")
 ACCELERATION = re.compile(r"SET_VELOCITY_LIMIT\b.*\bACCEL\s*=\s*(\d+\.?\d*)", re.IGNORECASE)
 ACTIVATE = re.compile(r"ACTIVATE_EXTRUDER\b.*\bEXTRUDER\s*=\s*extruder(\d*)", re.IGNORECASE)
@@ -200,9 +202,11 @@ def _regular(body: bytes, first: int) -> tuple[list[np.ndarray], np.ndarray, int
 
     bad = (whole + part == 0) | (whole > 8) | (part > 8) | (whole + part > 15)
     # an e between a number and a signed number: an exponent, or the next word? the odd path decides
-    bad |= (capital == ord("E")) & signed & ((kinds[letter - 1] == DIGIT) | (kinds[letter - 1] == POINT))
+    e, line = capital == ord("E"), newlines[k]
+    behind = e & ((kinds[letter - 1] == DIGIT) | (kinds[letter - 1] == POINT))
+    # without a sign it is a word, as in X1E2; beside another E the odd path says which of both it was
+    bad |= behind & (signed | (np.bincount(line[e], minlength=newlines[-1])[line] > 1))
     odd = np.zeros(newlines[-1], bool)
-    line = newlines[k]
     odd[line[bad]] = True
     before = np.roll(kinds, 1)
     stray = (
@@ -263,7 +267,20 @@ def _odd(text: str) -> tuple[list[tuple[str, float]], str, str]:
         at = end
         if letter == "M" and owner[1] not in CHAINED and owner[1] not in TAKEN:
             break  # the rest of the line is its own, free text often
+    if strict and (why := _exponent(text, words)):
+        return [], "", why
     return words, host, ""
+
+
+def _exponent(text: str, words: Sequence[tuple[str, float]]) -> str:
+    """Why a command with two words E cannot be read, where one of them is an exponent without a sign."""
+    found = list(UNSIGNED.finditer(text)) if sum(letter == "E" for letter, _ in words) > 1 else []
+    if not found:
+        return ""
+    largest = max(found, key=lambda match: abs(float(match[2])))
+    if not abs(float(largest[2])) < LARGEST:
+        return f"expected numbers below {LARGEST:g}, found {largest[1]:.24}"
+    return f"expected numbers without an exponent, found {largest[1]:.24}; write the number out"
 
 
 def _checked(text: str) -> tuple[str, str]:

@@ -10,6 +10,9 @@ import numpy as np
 from pipeline.deposition.gcode import Kind, Moves
 from pipeline.deposition.motion import Motion, sampled
 
+# how near the gantry is to its planned place at any time, mm: a sixteenth of a nozzle
+WAY_MM = 0.05
+
 
 class Legs(NamedTuple):
     """K legs in their order: the tool in use, where the gantry ends (K, 3) in mm, the plunger's place at
@@ -34,8 +37,9 @@ def legs(
     tolerance_mm: float,
 ) -> Legs:
     """Legs that follow the commands u (T,) of each tool, linear between their samples, within tolerance_mm,
-    and the gantry's path exactly but for arcs, which get a leg a sample. The gantry sets out lead_in_s
-    behind the first sample."""
+    and the gantry's path exactly but for arcs, which get a leg a sample; along it the gantry is within WAY_MM
+    of where it is planned at that time, so that a long ramp is several legs of rising feed. The gantry sets
+    out lead_in_s behind the first sample."""
     Ts, n = sample_time_s, max(len(u) for u in commands.values())
     changes = np.flatnonzero(moves.kind == Kind.TOOL)
     begins, ends = lead_in_s + motion.begin_s, lead_in_s + motion.begin_s + motion.duration_s
@@ -52,7 +56,8 @@ def legs(
     signal = sampled(motion, moves, sample_time_s=Ts)
     ahead = round(lead_in_s / Ts)
     curved = np.flatnonzero(moves.angle[signal.move] != 0) + ahead
-    nodes = np.union1d(bends(u, tolerance_mm), curved[curved < n])
+    nodes = np.unique(np.concatenate([bends(u, tolerance_mm), bends(_way(signal.position, ahead, n), WAY_MM),
+                                      curved[curved < n]]))  # fmt: skip
     time_s = np.unique(np.concatenate([nodes * Ts, ends, begins, bounds]))
     time_s = time_s[np.append(True, np.diff(time_s) > 1e-9)]
     place = _places(moves, time_s, begins, ends, signal, ahead, Ts)
@@ -61,6 +66,12 @@ def legs(
     in_change = np.searchsorted(begins[changes], time_s[:-1] + 1e-9, side="right") - 1
     change = (in_change >= 0) & (time_s[:-1] + 1e-9 < np.append(ends[changes], -np.inf)[in_change])
     return Legs(tool, place[1:], value[1:], np.diff(time_s), change, lost)
+
+
+def _way(position: np.ndarray, ahead: int, n: int) -> np.ndarray:
+    """The way (n,) in mm that the gantry has gone, place by place (P, 3), at the samples of the commands."""
+    gone = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1)))
+    return gone[np.clip(np.arange(n) - ahead, 0, len(gone) - 1)]
 
 
 def _places(moves: Moves, time_s, begins, ends, signal, ahead: int, Ts: float) -> np.ndarray:

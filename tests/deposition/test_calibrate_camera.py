@@ -1,7 +1,7 @@
 """`beadline calibrate-camera`: lines of known widths into params.yaml, whose other lines stay, and a page."""
 
+import functools
 import shutil
-import sys
 from pathlib import Path
 
 import cv2
@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from benchmarks.foreign_camera import Eye, Stage, tip_of
-from pipeline import cli
 from pipeline.deposition.workflow import trial_files
 from pipeline.deposition.workflow.settings import Camera
 from pipeline.store import params
@@ -22,22 +21,11 @@ EYE = Eye(
 
 
 @pytest.fixture
-def calibrate(tmp_path, monkeypatch, capfd):
+def calibrate(beadline, tmp_path):
     """calibrate("a.png", ...): status, what was printed, and what was said of errors."""
-    monkeypatch.chdir(tmp_path)
     for name in (params.FILE, params.EXPERT):
         shutil.copy(ROOT / name, tmp_path)
-
-    def command(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["beadline", "calibrate-camera", *arguments])
-        status = 0
-        try:
-            cli.main()
-        except SystemExit as ended:
-            status = ended.code
-        return status, *capfd.readouterr()
-
-    return command
+    return functools.partial(beadline, "calibrate-camera")
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ import pytest
 from pipeline.deposition import extrusion, gcode, leads, motion
 from pipeline.deposition.conformance import Refused
 from pipeline.deposition.gcode import Kind
-from pipeline.deposition.workflow import compose_parts, exports, part_programs
+from pipeline.deposition.workflow import compose_parts, exports, part_motion, part_programs
 from pipeline.deposition.workflow.settings import ComposeParts, Printer
 from pipeline.store import params
 from tests.deposition.trained import NOZZLE, PLANT, TS, learned
@@ -227,6 +227,31 @@ def test_leads_prime_ahead_of_a_line_and_let_back_ahead_of_its_end(tmp_path, mac
     assert peak > 0.5 * steady, "the plunger is pressed before the line begins"
     before_end = np.cumsum(m.e)[(m.end[:, 0] > 60) & (m.end[:, 0] <= 64.9)]
     assert before_end.min() < 0.5 * steady, "and let back before it ends"
+
+
+def test_a_lengthened_ramp_is_several_legs_of_rising_feed(tmp_path, machine):
+    """A drive of 10 mm and 20 mm/s makes the gantry speed up over a second: at each end of a leg, and between
+    them, it is where it is planned at that time."""
+    done = part(tmp_path, machine, line(machine[0].bead_area_mm2, length=60))
+    moves, planned, n = done.program.moves, done.planned, len(done.composed.streams[0].u)
+    assert part_motion.slowed_to(planned, moves) is not None
+    found = leads.legs(
+        moves,
+        planned,
+        {0: np.zeros(n)},
+        lead_in_s=done.composed.lead_in_s,
+        sample_time_s=TS,
+        tolerance_mm=1.0,
+    )
+    ends = np.cumsum(found.duration_s)
+    signal = motion.sampled(planned, moves, sample_time_s=TS)
+    x = np.interp(
+        signal.time_s + done.composed.lead_in_s, np.append(0, ends), np.append(0, found.position[:, 0])
+    )
+    assert np.abs(x - signal.position[:, 0]).max() <= leads.WAY_MM + 1e-6
+    feeds = [float(word[1:]) for row in leads.program(found) for word in row.split() if word[0] == "F"]
+    begin = int(np.argmin(feeds))  # the travel to it is faster
+    assert len(feeds) > begin + 4 and np.all(np.diff(feeds[begin : begin + 5]) > 50)
 
 
 def test_bends_keep_straight_lines_within_the_tolerance():

@@ -626,6 +626,33 @@ def test_numbers_that_no_machine_has_are_refused(number):
 
 
 @pytest.mark.parametrize(
+    ("line", "why"),
+    [
+        ("G1 X10 E1e400", "expected numbers below 1e+09, found E1e400"),
+        ("G1X10E1e400", "expected numbers below 1e+09, found E1e400"),
+        ("G1 X1e999 E1", "expected numbers below 1e+09, found X1e999"),
+        ("G92 E1e400", "expected numbers below 1e+09, found E1e400"),
+        ("G1 X10 E1e3", "expected numbers without an exponent, found E1e3; write the number out"),
+        ("G1 X10 F-inf", "expected letters with a number each, found 'F-inf'"),
+        ("G1 X10 E1 E2", "expected each letter once in a command, found one twice; write two lines"),
+        (
+            "M204 P1e400",
+            "expected no E beside M200, M204, M220 or M221, found one; write numbers without an exponent",
+        ),
+    ],
+)
+def test_a_number_that_cannot_be_read_is_refused_for_its_own_reason(line, why):
+    program = parse(f"M83\nG1 X1 E1 F600\n{line}\nG1 X20 E1\n")
+    assert [(one.line, one.why) for one in program.refusals] == [(3, why)]
+    assert program.moves.end[:, 0].tolist() == [1, 20] and program.moves.feed.tolist() == [10, 10]
+
+
+def test_an_e_right_behind_a_number_is_a_word_of_a_compact_line():
+    program = parse("M83\nG1X10E1F600\nG1X2E3\nG1 X5E2\ng1x6e4\n")
+    assert program.refusals == [] and program.moves.e.tolist() == [1, 3, 2, 4]
+
+
+@pytest.mark.parametrize(
     "word",
     ["M220 S0", "M220 S1e+300", "M221 S-5", "M221 S1e+99", "M200 D1e+300", "M204 P1e+999", "G1 X5 F1e-30"],
 )

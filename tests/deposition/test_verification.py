@@ -2,6 +2,8 @@
 next command."""
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from benchmarks import foreign_parts
@@ -16,6 +18,7 @@ from pipeline.deposition.tasks import printed_lines
 from pipeline.deposition.workflow import verify_part
 from tests.deposition.test_composition import MACHINE, composed, of_part
 from tests.deposition.trained import AREA, NOMINAL, PLANT, TS, learned, percent_of_on_off
+from tests.mcap_writing import Written
 
 LONG = "G21\nG90\nM83\nT0\nG0 X0 Y0 F480\n" + "".join(
     f"G1 X{x} E1\nG0 X{x + 40}\n" for x in range(200, 2000, 240)
@@ -128,7 +131,7 @@ def written(tmp_path, text):
 def test_a_measured_print_is_read_at_the_clock_of_the_command(tmp_path):
     path = written(tmp_path, "time_s,flow_mm3_per_s\n0.02,1\n0.04,2\n0.06,3\n")
     y, u = verify_part.read_measured(path, 5, 0.02)
-    np.testing.assert_allclose(y, [np.nan, np.nan, 2.0, 3.0, np.nan])
+    np.testing.assert_allclose(y, [np.nan, 1.0, 2.0, 3.0, np.nan])
     assert u is None
     path = written(tmp_path, "time_s,flow_mm3_per_s,command_mm\n0,1,5\n0.03,2,8\n0.06,3,8\n")
     np.testing.assert_allclose(verify_part.read_measured(path, 3, 0.02).u, [5.0, 7.0, 8.0])
@@ -146,3 +149,83 @@ def test_a_measured_print_is_read_at_the_clock_of_the_command(tmp_path):
 def test_a_measured_print_that_cannot_be_read_is_refused_with_its_row(tmp_path, text, message):
     with pytest.raises(ValueError, match=message):
         verify_part.read_measured(written(tmp_path, text), 5, 0.02)
+
+
+TODAY_S = 1_790_000_000.25
+
+
+def recorded(path, *, command=True, start_s=TODAY_S, flow="flow_mm3_per_s"):
+    """A print as a machine records it, topics with rates of their own, the camera's first 0.5 s before the
+    plunger's; the flow is 10 t, the command 5 + 2 t after the plunger's first message."""
+    made = Written()
+    meter, plunger = made.topic("/flow_meter", "json"), made.topic("/plunger", "json")
+    for k in range(60):
+        made.message(meter, start_s + k / 37, {flow: 10 * (k / 37 - 0.5), "valve": 1.0})
+    for k in range(25 if command else 0):
+        made.message(plunger, start_s + 0.5 + k / 25, {"displacement_mm": 5 + 2 * k / 25})
+    path.write_bytes(made.bytes())
+    return path
+
+
+def test_a_recorded_print_is_read_from_the_plungers_first_message_on(tmp_path):
+    y, u = verify_part.read_measured(recorded(tmp_path / "dashes_A_measured.mcap"), 100, 0.02)
+    clock = 0.02 * np.arange(100)
+    seen = clock < 59 / 37 - 0.5
+    np.testing.assert_allclose(y[seen], 10 * clock[seen], atol=1e-5)
+    assert np.isnan(y[~seen]).all() and seen.sum() == 55
+    np.testing.assert_allclose(u, np.minimum(5 + 2 * clock, 5 + 2 * 24 / 25), atol=1e-5)
+    # without the plunger nothing tells when a clock of the calendar was 0; one that begins there does
+    with pytest.raises(ValueError, match=r"expected the command, /plunger:displacement_mm, for its first"):
+        verify_part.read_measured(recorded(tmp_path / "a.mcap", command=False), 100, 0.02)
+    y, u = verify_part.read_measured(recorded(tmp_path / "b.mcap", command=False, start_s=0.0), 100, 0.02)
+    assert u is None and y[50] == pytest.approx(10 * (1.0 - 0.5), abs=1e-5)
+
+
+def test_a_measured_print_may_be_a_parquet_table(tmp_path):
+    path, time_s = tmp_path / "dashes_A_measured.parquet", np.array([0.0, 0.03, 0.06])
+    columns = {"flow_mm3_per_s": [1.0, 2, 3], "time_s": time_s, "command_mm": [5.0, 8, 8], "note": ["a"] * 3}
+    pq.write_table(pa.table(columns), path)
+    y, u = verify_part.read_measured(path, 5, 0.02)
+    np.testing.assert_allclose(y[:4], [1, 1 + 2 / 3, 2 + 1 / 3, 3], atol=1e-12)
+    assert np.isnan(y[4])
+    np.testing.assert_allclose(u, [5, 7, 8, 8, 8])
+    pq.write_table(pa.table({name: columns[name] for name in ("time_s", "flow_mm3_per_s")}), path)
+    assert verify_part.read_measured(path, 4, 0.02).u is None
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda path: recorded(path, flow="q"), "flow_mm3_per_s"),
+        (lambda path: path.write_bytes(b"time_s,flow_mm3_per_s\n0,1\n"), "begin no mcap file"),
+        (lambda path: path.write_bytes(recorded(path).read_bytes()[:200]), "copy the recording again"),
+        (
+            lambda path: pq.write_table(pa.table({"time_s": [0.0], "flow_mm3_per_s": [1.0]}), path),
+            "two samples",
+        ),
+        (
+            lambda path: pq.write_table(
+                pa.table(
+                    {"time_s": [0.0, 1, 2], "flow_mm3_per_s": [1.0, 1, 1], "command_mm": [1, None, 2.0]}
+                ),
+                path,
+            ),
+            "expected a number in each row of command_mm",
+        ),
+    ],
+)
+def test_a_recorded_print_that_cannot_be_read_is_refused_in_one_sentence(tmp_path, make, message):
+    path = tmp_path / "dashes_A_measured.mcap"
+    make(path)
+    with pytest.raises(ValueError, match=message) as refused:
+        verify_part.read_measured(path, 5, 0.02)
+    assert str(path) in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_of_two_measured_prints_none_is_guessed(tmp_path):
+    assert verify_part.measured_path(tmp_path, "dashes", "A") is None
+    path = recorded(tmp_path / "dashes_A_measured.mcap")
+    assert verify_part.measured_path(tmp_path, "dashes", "A") == path
+    written(tmp_path, "time_s,flow_mm3_per_s\n0,1\n")
+    with pytest.raises(ValueError, match=r"found dashes_A_measured.csv and dashes_A_measured.mcap; keep one"):
+        verify_part.measured_path(tmp_path, "dashes", "A")

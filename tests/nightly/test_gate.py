@@ -173,6 +173,8 @@ def deposition(rules: ReportRules):
         said = json.loads(Path(path).read_text())
         return lambda _: artifacts.write_json(path, {"square": said["square"] | changed})
 
+    untold = {"low": 0.4, "high": 3.1, "judged": False, "reason": "too fast", "trial": "train it"}
+    unjudged = {"A": untold | {"composers": {}}}
     most, line, above = rules.flow_error_percent, rules.line_volume_percent, rules.above_whole_points
     return [
         [
@@ -194,6 +196,7 @@ def deposition(rules: ReportRules):
         [
             (PASSED, conformance(refused=[])),
             (FAILED, conformance(refused=[{"line": 7, "why": "no such word"}])),
+            (OPEN, conformance(forecast=unjudged)),
         ],
         [(ABSENT, lambda _: Path("datasets/compose_parts/scores.parquet").unlink())],
     ]

@@ -165,15 +165,7 @@ def metrics():
             "next_experiment": NEXT_EXPERIMENT,
             "closed_loop": DITHER,
         },
-        "ingest": {
-            "recordings": 2,
-            "processed": 2,
-            "reused": 0,
-            "quarantined": 1,
-            "samples": 400,
-            "segments": 1,
-            "findings": {},
-        },
+        "ingest": {"recordings": 2, "quarantined": 1, "samples": 400, "segments": 1, "findings": {}},
         "identify_plant": {
             "order": 2,
             "past": 5,

@@ -1,14 +1,13 @@
 """`beadline calibrate-tip`: the page, what it says of a frame, and a click in a real browser."""
 
+import functools
 import re
-import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from pipeline import cli
 from pipeline.setpoint import key_area
 from tests.nozzle_folders import LEAST, expected, scenes
 from tests.setpoint.test_frame_mcap import film, foreign
@@ -19,21 +18,10 @@ def declare(least_score: float | str) -> None:
 
 
 @pytest.fixture
-def calibrate(tmp_path, monkeypatch, capfd):
+def calibrate(beadline):
     """calibrate("a.png", "--tip", "1,2"): status, what was printed, and what was said of errors."""
-    monkeypatch.chdir(tmp_path)
     declare(LEAST)
-
-    def command(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["beadline", "calibrate-tip", *arguments])
-        status = 0
-        try:
-            cli.main()
-        except SystemExit as ended:
-            status = ended.code
-        return status, *capfd.readouterr()
-
-    return command
+    return functools.partial(beadline, "calibrate-tip")
 
 
 @pytest.fixture

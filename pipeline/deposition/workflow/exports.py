@@ -89,7 +89,7 @@ def with_leads(part: Part) -> str:
     )  # fmt: skip
     head = [
         f"; {letter} is the plunger's place in mm (absolute), no filament; it moves ahead of the lines.",
-        "; Feeds are means over each leg: firmware that rounds them off by its own acceleration comes late.",
+        "; Feeds are means over short legs, ramps too: a firmware that accelerates slower comes late.",
     ]
     if found.lost_mm > LEAD_SHARE * peak:
         head.append(f"; Left out: {found.lost_mm:.3g} mm of a tool's command while another tool was in use.")

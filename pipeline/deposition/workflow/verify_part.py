@@ -13,9 +13,16 @@ from pipeline.deposition.composition import Composed, Learned, Material, Stream
 from pipeline.deposition.workflow import compose_parts, exports
 from pipeline.deposition.workflow.compose_parts import Part
 from pipeline.deposition.workflow.settings import ComposeParts, Printer
+from pipeline.deposition.workflow.trial_files import COMMAND as COMMAND_TOPIC
+from pipeline.reading import recordings
+from pipeline.reading.formats import file_format
+from pipeline.reading.mcap_columns import topics
+from pipeline.reading.parquet_files import parquet_columns
+from pipeline.reading.signals import Source
 from pipeline.store import artifacts
 
 COLUMNS, COMMAND = ("time_s", "flow_mm3_per_s"), "command_mm"
+ENDINGS = (".csv", ".parquet", ".mcap")
 
 
 class Measured(NamedTuple):
@@ -53,7 +60,8 @@ def write(part: Part, learned: Learned, printer: Printer, settings: ComposeParts
         told.append(compose_parts.forecast_sentence(composed.composed, composed.composed.streams[0]))
         told.append(
             f"print it; copy it and its measured flow, as {measured_name(path.stem, stream.material)} with "
-            f"columns {' and '.join(COLUMNS)}, to datasets/parts: the page then shows it beside the forecast"
+            f"columns {' and '.join(COLUMNS)} (or .parquet, or .mcap with the plunger's topic), to "
+            "datasets/parts: the page then shows it beside the forecast"
         )
     return "\n".join(told)
 
@@ -75,9 +83,22 @@ def _material(learned: Learned, stream: Stream) -> Material:
 # ---- what was measured
 
 
-def measured_name(part: str, material: str) -> str:
+def measured_name(part: str, material: str, ending: str = ".csv") -> str:
     """The file that holds the measured flow of a part's print."""
-    return f"{part}_{material}_measured.csv"
+    return f"{part}_{material}_measured{ending}"
+
+
+def measured_path(folder: Path, part: str, material: str) -> Path | None:
+    """The file in `folder` with the measured flow of a part's print, whatever its form; None where there is
+    none. Raises ValueError where there are two."""
+    paths = [folder / measured_name(part, material, ending) for ending in ENDINGS]
+    there = [path for path in paths if path.exists()]
+    if len(there) > 1:
+        names = " and ".join(path.name for path in there)
+        raise ValueError(
+            f"{folder}: expected one measured print of {part}, {material}, found {names}; keep one"
+        )
+    return there[0] if there else None
 
 
 def with_measured(reports: dict[str, Any], parts: Sequence[Part], folder: Path) -> dict[str, Any]:
@@ -85,8 +106,8 @@ def with_measured(reports: dict[str, Any], parts: Sequence[Part], folder: Path) 
     measured."""
     for part in parts:
         for stream in part.composed.streams:
-            path = folder / measured_name(part.name, stream.material)
-            if path.exists():
+            path = measured_path(folder, part.name, stream.material)
+            if path:
                 y = read_measured(path, len(stream.r), part.composed.sample_time_s).y
                 with artifacts.about(path):
                     percent = verification.measured_percent(y, stream.on_off, stream.r)
@@ -95,9 +116,56 @@ def with_measured(reports: dict[str, Any], parts: Sequence[Part], folder: Path) 
 
 
 def read_measured(path: Path, samples: int, sample_time_s: float) -> Measured:
-    """A measured print, (samples,) at the clock of the command, time 0 where the command begins; the flow is
-    NaN before the first and after the last row, and in gaps longer than five samples. Raises ValueError
-    naming file and row."""
+    """A measured print, (samples,) at the clock of the command; the flow is NaN before the first, after the
+    last row and in gaps longer than five samples. Time 0 is where the command begins: of a table as it
+    stands, of an MCAP recording the first message of the plunger. Raises ValueError naming file and place."""
+    flow, command = _rows(path) if path.suffix == ".csv" else _recorded(path)
+    t, y = flow
+    clock = np.arange(samples) * sample_time_s
+    after = np.clip(np.searchsorted(t, clock), 1, len(t) - 1)
+    seen = (clock >= t[0] - 1e-9) & (clock <= t[-1] + 1e-9)
+    seen &= t[after] - t[after - 1] <= 5 * max(sample_time_s, float(np.median(np.diff(t))))
+    u = None if command is None else np.interp(clock, *command)
+    if u is not None and not np.isfinite(u).all():
+        raise ValueError(
+            f"{path}: expected a number in each row of {COMMAND}, found some without; fill them in"
+        )
+    return Measured(np.where(seen, np.interp(clock, t, y), np.nan), u)
+
+
+# a signal on its own clock: time_s (n,), rising, and its values (n,)
+Series = tuple[np.ndarray, np.ndarray]
+
+
+def _recorded(path: Path) -> tuple[Series, Series | None]:
+    """Flow and, where it has one, command of a Parquet table or an MCAP recording."""
+    kind, wanted = file_format(path), [Source(COLUMNS[1], COLUMNS[1], "mm^3/s")]
+    if kind == "mcap":
+        plunger = topics(path).get(COMMAND_TOPIC.source.partition(":")[0])
+        wanted += [COMMAND_TOPIC] if plunger and plunger.count else []
+    elif kind == "parquet":
+        wanted += [Source(COMMAND, COMMAND, "mm")] * any(one.name == COMMAND for one in parquet_columns(path))
+    else:
+        raise ValueError(f"{path}: expected a Parquet table or an MCAP recording, found {kind}; name it so")
+    raw = recordings.read(path, wanted, time="" if kind == "mcap" else COLUMNS[0])
+    if raw.breaks:
+        raise ValueError(f"{path}: its clock starts over after {raw.breaks[0]:g} s; keep one print of it")
+    flow, command = raw.signals[COLUMNS[1]], raw.signals.get(COMMAND)
+    start = 0.0
+    if kind == "mcap" and command is not None:
+        start = float(command[0][0])
+    elif any(note.kind == "clock" for note in raw.notes):
+        raise ValueError(
+            f"{path}: expected the command, {COMMAND_TOPIC.source}, for its first message is time 0 of the "
+            "flow; record it too, or write a table with time 0 where the command begins"
+        )
+    if len(flow[0]) < 2:
+        raise ValueError(f"{path}: expected at least two samples of {COLUMNS[1]}, found {len(flow[0])}")
+    return (flow[0] - start, flow[1]), None if command is None else (command[0] - start, command[1])
+
+
+def _rows(path: Path) -> tuple[Series, Series | None]:
+    """Flow and, where it has one, command of a CSV table."""
     with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.reader(file))
     names = tuple(name.strip() for name in rows[0]) if rows else ()
@@ -123,12 +191,7 @@ def read_measured(path: Path, samples: int, sample_time_s: float) -> Measured:
         raise ValueError(
             f"{path}: expected at least two rows whose {COLUMNS[0]} rises; sort them, and leave out repeats"
         )
-    clock = np.arange(samples) * sample_time_s
-    after = np.searchsorted(t, clock)
-    near = (after > 0) & (after < len(t))
-    gap = np.where(near, t[np.minimum(after, len(t) - 1)] - t[np.maximum(after - 1, 0)], np.inf)
-    seen = gap <= 5 * max(sample_time_s, float(np.median(np.diff(t))))
-    return Measured(np.where(seen, np.interp(clock, t, y), np.nan), np.interp(clock, t, u[0]) if u else None)
+    return (t, y), (t, u[0]) if u else None
 
 
 # ---- learning on
@@ -140,8 +203,8 @@ def next_command(part: Part, learned: Learned, printer: Printer, folder: Path) -
     unless the file tells another."""
     commands = {}
     for stream in part.composed.streams:
-        path = folder / measured_name(part.name, stream.material)
-        if path.exists():
+        path = measured_path(folder, part.name, stream.material)
+        if path:
             measured = read_measured(path, len(stream.r), part.composed.sample_time_s)
             commands[stream.material] = verification.next_command(
                 _material(learned, stream).chain.extruder,

@@ -566,11 +566,15 @@ class Filmed(NamedTuple):
     observable: str
     outliers: str
     calibration: str
+    latency: str
+    untold: bool
+    delay: str
 
 
 class Camera(NamedTuple):
     missing: Missing | None = None
     rows: Sequence[Filmed] = ()
+    untold: str = ""
 
 
 def camera(sources: Sources) -> Camera:
@@ -587,11 +591,13 @@ def camera(sources: Sources) -> Camera:
         observable=("observable", "mean"),
         outliers=("outliers", "sum"),
     )  # fmt: skip
-    return Camera(None, [_filmed(row, models) for row in by_material.itertuples()])
+    rows = [_filmed(row, models, sources) for row in by_material.itertuples()]
+    return Camera(None, rows, ", ".join(row.material for row in rows if row.untold))
 
 
-def _filmed(row: Any, models: dict[str, Any] | Missing) -> Filmed:
+def _filmed(row: Any, models: dict[str, Any] | Missing, sources: Sources) -> Filmed:
     """One material's sums, in words."""
+    latency, untold = _latency(sources, row.Index)
     return Filmed(
         row.Index,
         count(row.trials, "trial"),
@@ -602,7 +608,44 @@ def _filmed(row: Any, models: dict[str, Any] | Missing) -> Filmed:
         percent(100 * row.observable, 3),
         number(row.outliers, 0),
         _calibration(models, row.Index),
+        latency,
+        untold,
+        _delay(sources, row.Index),
     )
+
+
+def _latency(sources: Sources, material: str) -> tuple[str, bool]:
+    """How late the camera is against the gantry, with its 90 % interval, of each routine that was learned
+    through pictures; and whether the pictures of one do not tell it, so that nothing was corrected."""
+    metrics = sources.metrics["train_ilc"]
+    laws = {} if isinstance(metrics, Missing) else metrics.get(material, {})
+    figures = [
+        figures for law, figures in laws.items() if law.startswith("pixels") and "latency_s" in figures
+    ]
+    untold = any(each["latency_s"] is None for each in figures)
+    given = sources.declared.everything.get("camera", {}).get("latency_s") is not None
+    texts = [_late(each["latency_s"], each.get("latency_deviation_s"), given) for each in figures]
+    return "; ".join(dict.fromkeys(texts)) or "not measured", untold
+
+
+def _late(latency_s: float | None, deviation_s: float | None, given: bool) -> str:
+    if latency_s is None:
+        return "not told: declare camera.latency_s"
+    late = 1000 * latency_s
+    if given or deviation_s is None:
+        return f"{number(late, 1)}{THIN}ms, as declared"
+    wide = 1645 * deviation_s
+    return f"{number(late, 1)}{THIN}ms ({number(late - wide, 1)} to {number(late + wide, 1)})"
+
+
+def _delay(sources: Sources, material: str) -> str:
+    """The identified delay from plunger to flow, which is not the camera's."""
+    learned = lookup(sources.tables["learned"], "materials")
+    chains = (
+        [] if isinstance(learned, Missing) else [m["chain"] for m in learned if m["material"] == material]
+    )
+    delay_s = lookup(chains[0], "extruder.delay_s") if chains else Missing("not measured", "")
+    return "not measured" if isinstance(delay_s, Missing) else f"{number(1000 * delay_s, 0)}{THIN}ms"
 
 
 def _reasons(texts: Iterable[str]) -> str:

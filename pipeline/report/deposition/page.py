@@ -18,6 +18,7 @@ from pipeline.report.deposition.rules import (
     LIBRARY,
     MARK,
     NAMES,
+    NOT_JUDGED,
     OURS,
     PAPER,
     Score,
@@ -97,6 +98,7 @@ def render(sources: Sources) -> str:
         stretches=deposition_parts.stretches(sources),
         lines=deposition_parts.lines(sources),
         forecasts=deposition_parts.forecasts(sources),
+        extruded=deposition_parts.extruded(sources),
         refused=deposition_parts.refused(sources),
         declared=declared(sources),
         words=words.chosen(sources, WORDS),
@@ -104,7 +106,7 @@ def render(sources: Sources) -> str:
         absent=sources.absent,
         hashes=hashes(sources),
         from_scores=sources.source("scores", "compose_parts"),
-        from_film=sources.source("filmed", "models", "train_ilc"),
+        from_film=sources.source("filmed", "models", "train_ilc", "learned"),
         from_library=sources.source("library", "learned", "models"),
         from_lines=sources.source("lines", "conformance"),
     )
@@ -183,13 +185,15 @@ def _answer(structure: Structure, move: Move | None) -> Answer:
         (
             NAMES[name],
             css,
-            Figure(*3 * (scores[name].error,)) if name in scores else Missing("not measured", "no score"),
+            Figure(*3 * (scores[name].error,))
+            if name in scores and not structure.unknown()
+            else Missing("not measured", "no score"),
         )
         for name, css in ((OURS, "dd"), (LIBRARY, "mb"), ("ilc", "acc"))
     ]
     chosen = scores.get(structure.chosen)
-    line = chosen.worst_line if chosen else None
-    best = structure.best()
+    line = chosen.worst_line if chosen and not structure.unknown() else None
+    best = "" if structure.unknown() else structure.best()
     return Answer(
         structure.part,
         structure.material,
@@ -198,26 +202,35 @@ def _answer(structure: Structure, move: Move | None) -> Answer:
             Reading(
                 css,
                 NAMES[name],
-                percent(scores[name].error, 2) if name in scores else "not measured",
-                _interval(scores[name]) if name in scores else "",
-                bad=name in scores and scores[name].error > limit,
+                _value(structure, name),
+                _interval(scores[name]) if name in scores and not structure.unknown() else "",
+                bad=name in scores and scores[name].error > limit and not structure.unknown(),
                 best=name == best,
             )
             for css, name in (("dd", OURS), ("mb", LIBRARY))
         ],
         whole=percent(scores["ilc"].error, 2) if "ilc" in scores else "none",
         strip=charts.strip(question, shown, (9, 25, 17)),
-        line="no line" if line is None else percent(line, 2),
+        line=NOT_JUDGED if structure.unknown() else "no line" if line is None else f"±{percent(line, 2)}",
         line_bad=line is not None and line > structure.asked.line_volume_percent,
         change=Change("first run") if move is None else Change(move.text(), move.moved, move.word == "worse"),
     )
+
+
+def _value(structure: Structure, name: str) -> str:
+    """The flow error of a composer; of a real machine no figure that its forecast does not stand behind."""
+    if name not in structure.scores:
+        return "not measured"
+    if structure.unknown() and name != "on_off":
+        return NOT_JUDGED
+    return percent(structure.scores[name].error, 2)
 
 
 def _interval(score: Score) -> str:
     """The forecast beside a figure of the first screen, as short as a band of the other pages."""
     if score.predicted is None or (score.judged and (score.low is None or score.high is None)):
         return ""
-    return f"{number(score.low, 2)}–{number(score.high, 2)}" if score.judged else "not judged"
+    return f"{number(score.low, 2)}–{number(score.high, 2)}" if score.judged else NOT_JUDGED
 
 
 def _forecast(score: Score) -> str:
@@ -284,6 +297,8 @@ def _cell(structure: Structure, name: str) -> Cell:
     if score is None:
         return Cell()
     line, asked = score.worst_line, structure.asked
+    if structure.unknown() and name != "on_off":
+        return Cell(NOT_JUDGED, chosen=name == structure.chosen)
     return Cell(
         percent(score.error, 2),
         _forecast(score),

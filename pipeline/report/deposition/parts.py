@@ -456,6 +456,65 @@ def _told(forecast: dict[str, Any] | None) -> tuple[str, str, str]:
     return f"{percent(forecast['low'], 2)} to {percent(forecast['high'], 2)}", "", beside
 
 
+class Tool(NamedTuple):
+    """What one tool of a part presses out, by E and by the declared bead, in words."""
+
+    part: str
+    tool: str
+    source: str
+    by_e: str = "not told"
+    declared: str = ""
+    difference: str = ""
+    area: str = ""
+
+
+class Tools(NamedTuple):
+    missing: Missing | None = None
+    rows: Sequence[Tool] = ()
+    summary: str = ""
+
+
+def extruded(sources: Sources) -> Tools:
+    """By part and tool the volume that E asks for beside the declared bead's, or why E does not count."""
+    conformance = sources.tables["conformance"]
+    if isinstance(conformance, Missing):
+        return Tools(conformance)
+    told = [(part, report["program"]) for part, report in conformance.items() if "program" in report]
+    if not told:
+        return Tools(Missing("not measured", "the conformance report is of an earlier version",
+                             "Run ./run dvc repro compose_parts"))  # fmt: skip
+    rows, shares = [], []
+    for part, program in told:
+        found = {f"T{one['tool']}": one for one in program["e_beside_declared_bead"]}
+        rows += [_tool(part, tool, source, found.get(tool)) for tool, source in program["volumes"].items()]
+        shares += [one["by_e_mm3"] / one["declared_mm3"] for one in found.values() if one["declared_mm3"] > 0]
+    if not shares:
+        return Tools(
+            None, rows, "No line’s volume is E’s: each is its length times the declared bead’s area."
+        )
+    times = " to ".join(dict.fromkeys(short(share, 3) for share in (min(shares), max(shares))))
+    summary = (
+        f"E gives the volumes of {len(shares)} of {count(len(rows), 'tool')}; it asks for {times} times the "
+        "declared bead’s."
+    )
+    return Tools(None, rows, summary)
+
+
+def _tool(part: str, tool: str, source: str, one: dict[str, Any] | None) -> Tool:
+    if one is None:
+        return Tool(part, tool, source)
+    by_e, declared, (low, middle, high) = one["by_e_mm3"], one["declared_mm3"], one["area_mm2"]
+    return Tool(
+        part,
+        tool,
+        source,
+        short(by_e, 4),
+        short(declared, 4),
+        _signed(100 * (by_e / declared - 1)) if declared > 0 else "",
+        f"{short(low, 3)} to {short(high, 3)}, half of the length below {short(middle, 3)}",
+    )
+
+
 class Refusal(NamedTuple):
     part: str
     where: str

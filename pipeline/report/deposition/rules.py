@@ -26,11 +26,12 @@ from pipeline.report.shared.verdict import (
 # errors closer than this, in points of on-off control's, are one: the simpler composer is taken
 SAME = 0.5
 OURS, LIBRARY = "basis", "priority"
-# the rule that stays open on any machine until its drive is declared
-DRIVE = "The drive follows"
+# rules that may stay open on any machine: until its drive is declared, until a trial judges the forecast
+DRIVE, FORECAST = "The drive follows", "Every forecast judged"
 FLOW = "Flow error"
 # where it does not, a signal may leave so many times the least error that any command within it leaves
 NEAR_THE_BEST = 1.2
+NOT_JUDGED = "not judged"
 # simplest first
 COMPOSERS = ("on_off", "priority", "superposition", "basis")
 NAMES = {
@@ -62,6 +63,8 @@ MARK = {
     "on_off": "baseline",
     "ilc": "kernel",
 }
+# in the place of a forecast that a report of an earlier version does not have
+NO_FORECAST = {"reason": "the conformance report has none", "trial": "run ./run dvc repro compose_parts"}
 # what the two columns of its rules are, and the mark of the second
 HEADS = ("Data\u2011driven", "The paper", "model_based")
 
@@ -92,10 +95,14 @@ class Structure(NamedTuple):
     why: str = ""
     trial: str = ""
 
-    def open(self) -> bool:
+    def judged(self) -> bool:
+        """Whether the forecast may be believed; of a part of which nothing was chosen there is none."""
+        return self.chosen not in self.scores or self.scores[self.chosen].judged
+
+    def unknown(self) -> bool:
         """Whether nothing tells how the chosen composer does: its forecast is not to be believed, and the
         true flow is not known."""
-        return not self.simulated and not self.scores[self.chosen].judged
+        return not self.simulated and not self.judged()
 
     def best(self) -> str:
         """The composer, on-off control too, with the least error; what
@@ -107,16 +114,16 @@ class Structure(NamedTuple):
         )
 
     def state(self) -> str:
-        """Of the composer that was chosen, by flow and volume."""
+        """Of the composer that was chosen, by flow, volume, and whether its forecast is judged."""
         score = self.scores.get(self.chosen)
-        if score is None or self.open():
+        if score is None or self.unknown():
             return OPEN
-        return (
-            FAILED
-            if score.error > self.asked.flow_error_percent
+        if (
+            score.error > self.asked.flow_error_percent
             or (score.worst_line or 0.0) > self.asked.line_volume_percent
-            else PASSED
-        )
+        ):
+            return FAILED
+        return PASSED if score.judged else OPEN
 
 
 def structures(sources: Sources) -> list[Structure] | Missing:
@@ -136,14 +143,14 @@ def _structure(rows: pd.DataFrame, rules: ReportRules, conformance: Mapping[str,
     composer without an error is left out."""
     judged = rows.dropna(subset="rms_percent_of_on_off")
     part, material = rows.part.iloc[0], rows.material.iloc[0]
-    forecast = conformance.get(part, {}).get("forecast", {}).get(material, {})
+    forecast = conformance.get(part, {}).get("forecast", {}).get(material, NO_FORECAST)
     scores = {
         row.composer: Score(
             row.rms_percent_of_on_off,
             _finite(row.predicted_percent),
             _finite(row.worst_line_volume_percent),
             *(forecast.get("composers", {}).get(row.composer, {}).get(end) for end in ("low", "high")),
-            judged=forecast.get("judged", True),
+            judged=bool(forecast.get("judged")),
         )
         for row in judged.itertuples()
     }
@@ -191,12 +198,13 @@ Pair = tuple[Rule, Rule]
 
 
 def rules(sources: Sources, parts: Sequence[Structure]) -> tuple[Pair, ...]:
-    """The drive first. Where it cannot follow, a signal is held against the best that any command could reach
-    within it, elsewhere against the flow that is wanted."""
+    """The drive first, then what may be believed. Where the drive cannot follow, a signal is held against the
+    best that any command could reach within it, elsewhere against the flow that is wanted."""
     asked, bound = sources.declared.rules, _bound(sources)
     followed = [part for part in parts if (part.part, part.material) not in bound]
     return (
         _drive(sources),
+        _forecast(parts),
         *([_near(parts, bound)] if bound else []),
         _flow(followed, asked.flow_error_percent),
         _line(followed, asked.line_volume_percent),
@@ -220,6 +228,13 @@ def _at_most(name: str, most: float, **words: str) -> Rule:
     return Rule(name, Question(0, "", name, "", most, False, name), Missing(OPEN, ""), **words)
 
 
+def _of_known(rule: Rule, parts: Sequence[Structure], pairs: Sequence[Any], texts: Sequence[str]) -> Pair:
+    """The rule with its figures (value, where), open where one of the parts is not known."""
+    if any(part.unknown() for part in parts):
+        return _pair(rule._replace(reason="", remedy=""), [Missing(OPEN, "")] * 2, [NOT_JUDGED] * 2)
+    return _pair(rule, [_measured(pair) for pair in pairs], texts)
+
+
 def _measured(pair: tuple[float, Any] | None) -> Figure | Missing:
     return Missing(OPEN, "") if pair is None else count_of(pair[0])
 
@@ -240,12 +255,26 @@ def _flow(parts: Sequence[Structure], limit: float) -> Pair:
         remedy="Run more trials, or train the speeds and pauses of that part (printer.routines).",
     )
     texts = [OPEN if pair is None else percent(pair[0], 2) for pair in pairs]
-    unknown = next((part for part in parts if part.chosen in part.scores and part.open()), None)
-    if unknown:
-        reason = f"What {where(unknown)} comes to is not judged: {unknown.why}."
-        rule = rule._replace(reason=reason, remedy=f"To judge it, {unknown.trial}.")
-        return _pair(rule, [Missing(OPEN, "")] * 2, ["not judged"] * 2)
-    return _pair(rule, [_measured(pair) for pair in pairs], texts)
+    return _of_known(rule, parts, pairs, texts)
+
+
+def _forecast(parts: Sequence[Structure]) -> Pair:
+    """Whether every forecast may be believed; open where one is not judged, simulated or not: a rehearsal
+    does not pass what would not be printed on a machine without another trial."""
+    rule = _at_most(FORECAST, 0, limit="all", place="saturation")
+    left = [part for part in parts if not part.judged()]
+    if not parts:
+        return _pair(rule._replace(reason="No part was composed."), [Missing(OPEN, "")] * 2, [OPEN] * 2)
+    if not left:
+        return _pair(rule, [count_of(0)] * 2, ["all"] * 2)
+    first, others = left[0], [f"{part.part} ({part.material})" for part in left[1:]]
+    also = f" Nor is that of {', '.join(others[:3])}" if others else ""
+    also += f" and {len(others) - 3} more" if len(others) > 3 else ""
+    rule = rule._replace(
+        reason=f"The forecast of {where(first)} is not judged: {first.why}.{also}{'.' if also else ''}",
+        remedy=f"To judge it, {first.trial}.",
+    )
+    return _pair(rule, [Missing(OPEN, "")] * 2, [f"{len(left)} of {len(parts)} not"] * 2)
 
 
 def where(structure: Structure) -> str:
@@ -268,7 +297,7 @@ def _line(parts: Sequence[Structure], limit: float) -> Pair:
         remedy="Print that line slower, or longer: the table of lines names it.",
     )
     texts = [OPEN if pair is None else f"±{percent(pair[0], 2)}" for pair in pairs]
-    return _pair(rule, [_measured(pair) for pair in pairs], texts)
+    return _of_known(rule, parts, pairs, texts)
 
 
 def _worst_line(parts: Sequence[Structure], name: str) -> tuple[float, Structure] | None:
@@ -477,12 +506,12 @@ def _bound(sources: Sources) -> dict[tuple[str, str], float]:
 
 def _near(parts: Sequence[Structure], bound: Mapping[tuple[str, str], float]) -> Pair:
     """Where the drive cannot follow: the error over the least that any command within it leaves."""
-    pairs = []
+    bounded, pairs = [part for part in parts if (part.part, part.material) in bound], []
     for name in (OURS, LIBRARY):
         ratios = [
             (part.scores[name].error / max(bound[part.part, part.material], 1e-9), part)
-            for part in parts
-            if (part.part, part.material) in bound and name in part.scores
+            for part in bounded
+            if name in part.scores
         ]
         pairs.append(max(ratios, key=lambda pair: pair[0], default=None))
     ours = pairs[0]
@@ -501,7 +530,7 @@ def _near(parts: Sequence[Structure], bound: Mapping[tuple[str, str], float]) ->
         remedy="Learn that part itself, or run more trials.",
     )
     texts = [OPEN if pair is None else f"{number(pair[0], 2)} ×" for pair in pairs]
-    return _pair(rule, [_measured(pair) for pair in pairs], texts)
+    return _of_known(rule, bounded, pairs, texts)
 
 
 def _printed(sources: Sources) -> Pair:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pipeline.report.deposition.rules import (
     COMPOSERS,
     DRIVE,
-    FLOW,
+    FORECAST,
     OURS,
     SAME,
     USE,
@@ -37,6 +37,8 @@ from pipeline.report.shared.verdict import (
 
 # what the library by its priority rule is not held against: the paper's law is not what it was learned by
 OF_THE_LAW = ("Convergence test", "Learned to")
+# what no composer changes, and what each machine can settle: declare its drive, judge the forecast by a trial
+SHARED = (DRIVE, FORECAST)
 
 
 def verdict(sources: Sources) -> Verdict:
@@ -65,17 +67,18 @@ def verdict(sources: Sources) -> Verdict:
     # what cannot be measured on a machine's own trials does not hold them up; a drive can be declared, and a
     # forecast that is not judged has a trial that judges it
     state = overall(
-        [rule.state for rule in judged if not machine or rule.state != OPEN or rule.name in (DRIVE, FLOW)]
+        [rule.state for rule in judged if not machine or rule.state != OPEN or rule.name in SHARED]
     )
     state = FAILED if use == "on_off" else state
     first = None if state == PASSED else deciding(judged)
+    told = first is not None and first.reason and (column == 0 or first.name in SHARED)
     summary = _summary(parts, use, machine)
     return Verdict(
         loop="deposition",
         state=state,
-        decision=_decision(state, use, machine),
+        decision=_decision(state, use if worst(_known(parts), use) else "", machine),
         lead=_lead(state, first, len(judged), condition=bool(unjudged)),
-        reason=f"{first.reason} {summary}" if first and first.reason and column == 0 else summary,
+        reason=f"{first.reason} {summary}" if told else summary,
         remedy=first.remedy if first else "",
         rule=first.name if first else "",
         winner=use,
@@ -84,8 +87,16 @@ def verdict(sources: Sources) -> Verdict:
     )
 
 
+def _known(parts: Sequence[Structure]) -> list[Structure]:
+    """The parts of which it is known what they come to."""
+    return [part for part in parts if not part.unknown()]
+
+
 def _decision(state: str, use: str, machine: bool) -> str:
+    """The decision; which composer comes closest only where that is known of any part."""
     words = TRIAL if machine else REHEARSAL
+    if not use:
+        return words.of(state)
     if state == PASSED:
         return words.passed.format(USE[use])
     return f"{words.of(state).rstrip('.')}: {USE[use]} {'come' if use == OURS else 'comes'} closest."
@@ -115,7 +126,11 @@ def _peak(sources: Sources) -> float:
 def _summary(parts: Sequence[Structure], use: str, machine: bool) -> str:
     """The composer in use with its figure and its yardsticks: on-off control, the
     others, and what learning each structure reaches."""
-    error, place = worst(parts, use)
+    parts = _known(parts)
+    found = worst(parts, use)
+    if found is None:
+        return "What the parts come to is not known."
+    error, place = found
     others = [
         f"{_bare(name)} {percent(pair[0], 2)}"
         for name in COMPOSERS

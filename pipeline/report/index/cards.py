@@ -238,6 +238,7 @@ def _deposition_rows(structures: Sequence[deposition_rules.Structure], allowed: 
         [
             (structure.part, name, score.error, score.worst_line)
             for structure in structures
+            if not structure.unknown()
             for name, score in structure.scores.items()
         ],
         columns=["part", "composer", "error", "line"],

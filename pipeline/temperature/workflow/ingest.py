@@ -337,14 +337,20 @@ def collect(results: Sequence[Result], machine: Plant, *, strict: bool) -> tuple
         of[str(kind)] = of.get(str(kind), 0) + int(count)
     metrics = {
         "recordings": len(results),
-        "processed": sum(not r.reused and not r.reason for r in results),
-        "reused": sum(r.reused for r in results),
         "quarantined": len(broken),
         "samples": len(record["time_s"]),
         "segments": int(_segments(record)),
         "findings": counts,
     }
     return Columns(schema, record), Columns(tables.QUALITY, quality), metrics
+
+
+def work_done(results: Sequence[Result]) -> dict[str, int]:
+    """How many recordings were processed and how many the memo gave: of this run alone, so no metric."""
+    return {
+        "processed": sum(not r.reused and not r.reason for r in results),
+        "reused": sum(r.reused for r in results),
+    }
 
 
 def printer_pids(folder: Path, results: Sequence[Result], spec: IngestSpec) -> dict[str, list[dict]]:
