@@ -15,6 +15,7 @@ import scipy.stats
 import sklearn.covariance
 
 from pipeline.setpoint.classifier import Labelled, Prediction
+from pipeline.setpoint.nozzle_scene import BORDERS
 from pipeline.setpoint.recorded import WindowTable
 
 CLASSES = 3
@@ -98,17 +99,61 @@ def hard_shares(log_p: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return np.where(m > 0, counts / np.maximum(m, 1), 1 / CLASSES)
 
 
+class FlowCalibration(NamedTuple):
+    """What turns the flows that frames show into that of a window: `scale` multiplies the deviation of each
+    frame, `correlation` is that of the errors of one segment's frames."""
+
+    scale: float
+    correlation: float
+
+
+class WindowFlow(NamedTuple):
+    """Of w windows: flow_seen (w,) in percent of nominal, its relative standard deviation spread (w,), and
+    the probabilities prob (w, 3) of under, good, over. Without a valid frame: NaN, NaN and 1/3 each."""
+
+    flow_seen: np.ndarray
+    spread: np.ndarray
+    prob: np.ndarray
+
+
+def window_flow(
+    log_flow: np.ndarray, deviation: np.ndarray, valid: np.ndarray, fitted: FlowCalibration
+) -> WindowFlow:
+    """The flow of w windows from log(flow / 100 %) of their frames with its deviation, and valid (w, length).
+
+    log flow_seen is the mean of the m valid frames weighted by v_i = deviation_i^-2. Frames of one segment
+    repeat each other: spread^2 = scale^2 / mean v_i (1 + (m - 1) correlation) / m (design effect; Kish 1965).
+    """
+    m = valid.sum(axis=1)
+    some = m > 0
+    weight = np.where(valid, deviation, np.inf) ** -2.0
+    total = np.where(some, weight.sum(axis=1), np.nan)
+    mean = np.where(valid, weight * np.where(valid, log_flow, 0.0), 0.0).sum(axis=1) / total
+    spread = fitted.scale * np.sqrt((1 + np.maximum(m - 1, 0) * fitted.correlation) / total)
+    prob = np.full((len(m), CLASSES), 1 / CLASSES)
+    prob[some] = class_probabilities(mean[some], spread[some])
+    return WindowFlow(100 * np.exp(mean), spread, prob)
+
+
+def class_probabilities(log_flow: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """(n, 3) P(flow below 90 %, 90 to 110 %, above) under Normal(log_flow, spread) of log(flow / 100 %)."""
+    low, high = (np.log(border / 100) for border in BORDERS)
+    under = scipy.special.ndtr((low - log_flow) / spread)
+    over = scipy.special.ndtr((log_flow - high) / spread)
+    # as the difference of the nearer tails: 1 - under - over loses its digits far from 100 %
+    good = np.where(
+        log_flow > 0,
+        scipy.special.ndtr((high - log_flow) / spread) - under,
+        scipy.special.ndtr((log_flow - low) / spread) - over,
+    )
+    return np.stack([under, np.maximum(good, 0.0), over], axis=1)
+
+
 def recorded(
-    log_p: np.ndarray,
-    valid: np.ndarray,
-    flow: np.ndarray,
-    segment: np.ndarray,
-    *,
-    correlation: float,
-    flow_edges: np.ndarray,
+    seen: WindowFlow, flow: np.ndarray, segment: np.ndarray, *, flow_edges: np.ndarray
 ) -> WindowTable:
-    """Windows (w, length, 3) of segments printed at flow (w,) percent as the simulator draws them again;
-    windows without a valid frame are left out.
+    """What was seen in w windows of segments (w,) printed at flow (w,) percent, as the simulator draws it
+    again; windows without a valid frame are left out.
 
     flow_edges (bins + 1,) in percent; raises ValueError where a flow lies outside them.
     """
@@ -119,10 +164,12 @@ def recorded(
             f"flows are expected within {flow_edges[0]:g} .. {flow_edges[-1]:g} % but {outside.sum()} are "
             f"not, the first {flow[outside][0]:g}; widen the bins"
         )
-    mask = valid.any(axis=1)
-    prob = window_probabilities(log_p[mask], valid[mask], correlation)
-    flow_bin = np.clip(np.searchsorted(flow_edges, flow[mask], side="right") - 1, 0, len(flow_edges) - 2)
-    return WindowTable(prob, prob.argmax(axis=1), flow_bin, np.asarray(segment)[mask], flow_edges)
+    some = np.isfinite(seen.flow_seen)
+    seen, flow = WindowFlow(*(values[some] for values in seen)), flow[some]
+    flow_bin = np.clip(np.searchsorted(flow_edges, flow, side="right") - 1, 0, len(flow_edges) - 2)
+    named = seen.prob.argmax(axis=1)
+    bins = flow_bin, np.asarray(segment)[some], flow_edges
+    return WindowTable(seen.prob, named, *bins, seen.flow_seen, seen.spread, flow)
 
 
 # ---- how true the probabilities are

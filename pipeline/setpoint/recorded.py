@@ -18,7 +18,8 @@ from pipeline.setpoint.simulator import Conditions, Windows
 
 class WindowTable(NamedTuple):
     """n windows of a classifier: shares p (n, 3) of under, good, over, sum 1; named class (n,) 0, 1, 2;
-    flow_bin (n,) 0 .. bins - 1; segment (n,) any integers.
+    flow_bin (n,) 0 .. bins - 1; segment (n,) any integers; flow_seen (n,) in percent of nominal, the flow
+    that the window shows, with its relative standard deviation spread (n,); flow (n,) the true one, percent.
 
     flow_edges (bins + 1,) in percent, rising; flows outside take the outermost bin. Every bin needs a window;
     a segment may occur in one bin or in many. Bins of 2.5 % from 70 to 130 % and wider ones beyond let a
@@ -30,6 +31,9 @@ class WindowTable(NamedTuple):
     flow_bin: np.ndarray
     segment: np.ndarray
     flow_edges: np.ndarray
+    flow_seen: np.ndarray
+    spread: np.ndarray
+    flow: np.ndarray
 
 
 class _Ranked(NamedTuple):

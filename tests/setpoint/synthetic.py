@@ -27,4 +27,6 @@ def synthetic_table(rng: np.random.Generator, *, segments: int, windows: int) ->
     )
     shares = np.exp(np.clip(logits - logits.max(axis=1, keepdims=True), -8, 0))
     shares /= shares.sum(axis=1, keepdims=True)
-    return WindowTable(shares, shares.argmax(axis=1), flow_bin, segment, edges)
+    # what the errors of 5 and 3 % above add up to
+    spread = np.full(len(flow), np.hypot(0.05, 0.03))
+    return WindowTable(shares, shares.argmax(axis=1), flow_bin, segment, edges, shown, spread, flow)

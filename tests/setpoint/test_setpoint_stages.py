@@ -35,7 +35,7 @@ from pipeline.setpoint.workflow.tables import (
     SCOREBOARD,
     WINDOWS,
 )
-from pipeline.setpoint.workflow.windows import edges, window_rows, window_tables
+from pipeline.setpoint.workflow.windows import WINDOW_PARTS, edges, window_rows, window_tables
 from pipeline.store import artifacts, params
 from pipeline.store.artifacts import read_weights, write_weights
 from pipeline.store.params import Execution
@@ -122,9 +122,7 @@ def stored(project) -> Path:
         params.load(TrainClassifier, "train_classifier"),
         CalibratedClassifier(vision_transformer(SMALL_SIZE, np.random.default_rng(0)), known),
     )
-    tables = {
-        part: synthetic_table(np.random.default_rng(1), segments=1, windows=2) for part in ("learn", "judge")
-    }
+    tables = {part: synthetic_table(np.random.default_rng(1), segments=1, windows=2) for part in WINDOW_PARTS}
     artifacts.write_table(out / "windows.parquet", WINDOWS, window_rows(tables))
     return project
 
@@ -247,7 +245,7 @@ def test_the_calibrated_classifier_survives_being_stored(simulated, project):
 def test_window_tables_survive_being_written(simulated, tmp_path):
     made = {
         part: synthetic_table(np.random.default_rng(k), segments=3, windows=2)
-        for k, part in enumerate(("learn", "judge"))
+        for k, part in enumerate(WINDOW_PARTS)
     }
     artifacts.write_table(tmp_path / "windows.parquet", WINDOWS, window_rows(made))
     found = window_tables(artifacts.read_table(tmp_path / "windows.parquet", WINDOWS))

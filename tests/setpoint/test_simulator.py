@@ -215,6 +215,9 @@ def test_a_sticky_segment_keeps_its_look_when_the_flow_moves_to_another_bin():
         np.array([0, 0, 1, 1]),
         np.array([7, 3, 7, 3]),
         np.array([20.0, 100.0, 310.0]),
+        np.array([50.0, 150.0] * 2),
+        np.full(4, 0.07),
+        np.array([60.0, 60.0, 140.0, 140.0]),
     )
     moves = standing()
     moves[:, 0] = 4
