@@ -28,6 +28,16 @@ def temperature_move(observation: Observation) -> jax.Array:
     return nearest(TEMPERATURE_MOVES, BEST_TEMPERATURE - observation.target)
 
 
+@cache
+def nothing() -> Controller:
+    """Leaves the setpoints as they are, whatever the camera shows: the yardstick of harm. No parameters."""
+
+    def act(parameters: tuple, memory: tuple, observation: Observation, key: jax.Array) -> tuple[tuple, Action]:
+        return memory, Action(jnp.int32(STAND), jnp.int32(STAND))
+
+    return Controller(lambda: (), act)
+
+
 class Proportional(NamedTuple):
     """gain: percent of flow by unit of p_0 - p_2; time_constant of the
     filter in decisions, 1 is no memory."""
