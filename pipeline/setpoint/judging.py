@@ -132,6 +132,11 @@ def all_cases(runs: int, *, segment_mean_decisions: float) -> dict[str, Case]:
     return {name: Case(conditions) for name, conditions in asked.items()} | harm
 
 
+def counts(case: str) -> bool:
+    """Whether a case is of the wrong starts, by which controllers are ranked; the good ones tell harm."""
+    return not case.startswith(("perfect", "in band"))
+
+
 def cameras() -> dict[str, Camera]:
     """The camera right, of another make, at fault, and with borders moved, by what a case's name ends in."""
     scale, exponent = OTHER_CAMERA
