@@ -114,6 +114,9 @@ class RobustFilter(Section):
     hazard: float = Field(ge=0, lt=1)
     move_cost: float = Field(ge=0, le=10)
     outside_cost: float = Field(ge=0, le=1000)
+    move_fixed_cost: float = Field(ge=0, le=100)
+    known_start_share: float = Field(ge=0, lt=1)
+    known_start_std: float = Field(gt=0, le=1)
 
     def hypotheses(self) -> int:
         return len(self.gains) * (len(self.accuracies) + self.width_bias_levels)
@@ -175,6 +178,9 @@ class ClassFilter(Section):
     hazard: float = Field(ge=0, lt=1)
     move_cost: float = Field(ge=0, le=10)
     outside_cost: float = Field(ge=0, le=1000)
+    move_fixed_cost: float = Field(ge=0, le=100)
+    known_start_share: float = Field(ge=0, lt=1)
+    known_start_std: float = Field(gt=0, le=1)
 
 
 class Baselines(Section):
